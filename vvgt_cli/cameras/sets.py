@@ -1,0 +1,86 @@
+"""View sets: the Fibonacci sphere of the conventions, and orbits."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from vvgt_cli.cameras.types import Camera
+
+GOLDEN = (1 + math.sqrt(5)) / 2
+SET_SHIFT = {"train": 0.5, "check": 0.83, "test": 0.13}
+SET_VIEWS = {"train": 24, "check": 4, "test": 10}
+RADIUS = 3.0
+FIELD_OF_VIEW = 40.0  # degrees, vertical
+SIZE = 400  # pixels
+
+
+def look_at(
+    eye: Sequence[float] | np.ndarray,
+    *,
+    target: Sequence[float] = (0.0, 0.0, 0.0),
+    up: Sequence[float] = (0.0, 0.0, 1.0),
+    width: int = SIZE,
+    height: int = SIZE,
+    fov: float = FIELD_OF_VIEW,
+    name: str = "view",
+) -> Camera:
+    """Camera at ``eye`` looking at ``target`` (unit frame), vertical field of view in degrees."""
+    eye = np.asarray(eye, dtype=np.float64)
+    forward = np.asarray(target, dtype=np.float64) - eye
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, np.asarray(up, dtype=np.float64))
+    if np.linalg.norm(right) < 1e-9:  # looking along `up`: any right-hand axis will do
+        right = np.cross(forward, (0.0, 1.0, 0.0) if abs(forward[1]) < 0.9 else (1.0, 0.0, 0.0))
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])  # rows: x right, y down, z forward
+    focal = height / (2 * math.tan(math.radians(fov) / 2))
+    return Camera(rotation, -rotation @ eye, focal, focal, width / 2, height / 2, width, height, name)
+
+
+def fibonacci_views(
+    count: int, shift: float, *, size: int = SIZE, radius: float = RADIUS, fov: float = FIELD_OF_VIEW, name: str = "view"
+) -> list[Camera]:
+    """``count`` square views on the Fibonacci sphere (conventions: Default views)."""
+    cameras = []
+    for i in range(count):
+        z = 0.9 * (1 - (2 * i + 1) / count)
+        azimuth = 2 * math.pi * ((i / GOLDEN + shift) % 1.0)
+        ring = math.sqrt(1 - z * z)
+        eye = (radius * ring * math.cos(azimuth), radius * ring * math.sin(azimuth), radius * z)
+        cameras.append(look_at(eye, width=size, height=size, fov=fov, name=f"{name}_{i:03d}"))
+    return cameras
+
+
+def default_views(
+    which: str,
+    count: int | None = None,
+    *,
+    size: int = SIZE,
+    radius: float = RADIUS,
+    fov: float = FIELD_OF_VIEW,
+) -> list[Camera]:
+    """The ``train`` (24), ``check`` (4) or ``test`` (10) set: no two share a view."""
+    return fibonacci_views(
+        SET_VIEWS[which] if count is None else count, SET_SHIFT[which], size=size, radius=radius, fov=fov, name=which
+    )
+
+
+def orbit_views(
+    count: int,
+    *,
+    elevation: float = 20.0,
+    size: int = SIZE,
+    radius: float = RADIUS,
+    fov: float = FIELD_OF_VIEW,
+) -> list[Camera]:
+    """``count`` views on a circle around +z at ``elevation`` degrees."""
+    height, ring = radius * math.sin(math.radians(elevation)), radius * math.cos(math.radians(elevation))
+    cameras = []
+    for i in range(count):
+        azimuth = 2 * math.pi * i / count
+        eye = (ring * math.cos(azimuth), ring * math.sin(azimuth), height)
+        cameras.append(look_at(eye, width=size, height=size, fov=fov, name=f"orbit_{i:03d}"))
+    return cameras

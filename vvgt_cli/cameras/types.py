@@ -1,0 +1,65 @@
+"""`Camera`: a pinhole with OpenCV axes, in the unit frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vvgt_cli.errors import DataError
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Pinhole camera, OpenCV axes (x right, y down, z forward), pixel centres at integer + 0.5.
+
+    Attributes:
+        rotation: (3, 3) float64 R of ``x_camera = R x_unit + t``, orthonormal, determinant +1.
+        translation: (3,) float64 t, unit-frame lengths.
+        fx, fy, cx, cy: intrinsics in pixels.
+        width, height: image size in pixels.
+        name: file stem of the view.
+    """
+
+    rotation: np.ndarray
+    translation: np.ndarray
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+    name: str = "view"
+
+    def __post_init__(self) -> None:
+        rotation = np.asarray(self.rotation, dtype=np.float64)
+        translation = np.asarray(self.translation, dtype=np.float64)
+        if rotation.shape != (3, 3) or translation.shape != (3,):
+            raise DataError(f"camera {self.name}: R {rotation.shape}, t {translation.shape}; expected (3, 3) and (3,)")
+        if not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
+            raise DataError(f"camera {self.name}: pose is not finite")
+        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-5) or np.linalg.det(rotation) < 0:
+            raise DataError(f"camera {self.name}: rotation is not orthonormal with determinant +1")
+        if min(self.width, self.height) < 1 or not (self.fx > 0 and self.fy > 0):
+            raise DataError(
+                f"camera {self.name}: {self.width} x {self.height} px, focal {self.fx}, {self.fy}; expected > 0"
+            )
+        object.__setattr__(self, "rotation", rotation)
+        object.__setattr__(self, "translation", translation)
+
+    @property
+    def position(self) -> np.ndarray:
+        """Centre of projection in the unit frame, (3,)."""
+        return -self.rotation.T @ self.translation
+
+    def resized(self, factor: float) -> Camera:
+        """The same view with ``factor`` times the pixels along each axis."""
+        return replace(
+            self,
+            fx=self.fx * factor,
+            fy=self.fy * factor,
+            cx=self.cx * factor,
+            cy=self.cy * factor,
+            width=round(self.width * factor),
+            height=round(self.height * factor),
+        )

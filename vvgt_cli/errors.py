@@ -1,0 +1,22 @@
+"""The two errors a user can meet: each message says what was read, what was expected, what to try."""
+
+
+class VvgtError(Exception):
+    """Base of every error that the command line shows as one line.
+
+    ``exit_code`` is the process's exit status: 1 for data, 2 for usage.
+    """
+
+    exit_code = 1
+
+
+class DataError(VvgtError):
+    """A file or an array is not what it must be (exit status 1)."""
+
+    exit_code = 1
+
+
+class UsageError(VvgtError):
+    """The call itself is wrong: options that contradict, a name that does not exist (exit status 2)."""
+
+    exit_code = 2
