@@ -1,0 +1,182 @@
+"""The header of a 3DGS `.ply`: parsed and checked before a byte of data is touched."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.gaussians.frames import up_matrix
+
+REST_COUNTS = {0: 0, 9: 1, 24: 2, 45: 3}  # f_rest properties: 3 ((degree + 1)^2 - 1)
+REQUIRED = (
+    *("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
+    *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+)
+_BASIC = {"char": "i1", "uchar": "u1", "short": "<i2", "ushort": "<u2", "int": "<i4", "uint": "<u4"}
+_SIZED = {"int8": "i1", "uint8": "u1", "int16": "<i2", "uint16": "<u2", "int32": "<i4", "uint32": "<u4"}
+_TYPES = _BASIC | _SIZED | {"float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8"}
+_ADVICE = "expected a binary little-endian 3DGS .ply, as vvgt and SuperSplat write it"
+
+
+@dataclass(frozen=True)
+class PlyHeader:
+    """What the header says.
+
+    Attributes:
+        size: bytes up to and including the line `end_header`.
+        count: vertices.
+        dtype: one vertex, little-endian, packed.
+        sh_degree: spherical-harmonics degree that the file carries (0 to 3).
+        comments: comment lines, without the word.
+        frame: "unit" or "world"; "unit" where no comment says otherwise.
+        scale, centre: of the volume's `UnitFrame`, where the comments give them.
+        up: volume axis that was turned up, "none" where no comment says otherwise.
+        unit_distance, unit_distance_label: what opacity referred to, None where not recorded.
+        version: of the vvgt that wrote it, None for other programs.
+    """
+
+    size: int
+    count: int
+    dtype: np.dtype
+    sh_degree: int
+    comments: tuple[str, ...] = ()
+    frame: str = "unit"
+    scale: float | None = None
+    centre: tuple[float, float, float] | None = None
+    up: str = "none"
+    unit_distance: float | None = None
+    unit_distance_label: str | None = None
+    version: str | None = None
+
+
+def _split(content: bytes, name: str) -> tuple[list[str], int]:
+    """Header lines and the header's size in bytes."""
+    if not content.startswith((b"ply\n", b"ply\r\n")):
+        raise DataError(f"{name}: starts with {content[:8]!r}, not with 'ply'; {_ADVICE}")
+    position = 0
+    lines: list[str] = []
+    while True:
+        end = content.find(b"\n", position)
+        if end < 0:
+            raise DataError(f"{name}: no 'end_header' in the first {len(content)} bytes; {_ADVICE}")
+        try:
+            line = content[position:end].decode("utf-8").strip()
+        except UnicodeDecodeError:
+            raise DataError(f"{name}: the header is not text; {_ADVICE}") from None
+        position = end + 1
+        if line == "end_header":
+            return lines, position
+        lines.append(line)
+
+
+def _vertex_count(words: list[str], name: str) -> int:
+    if len(words) != 3 or words[1] != "vertex":
+        raise DataError(
+            f"{name}: element {' '.join(words[1:])!r}; expected one element, 'vertex' "
+            "(a mesh, or a compressed .ply? try splat-transform to convert it)"
+        )
+    if not (words[2].isdecimal() and words[2].isascii() and len(words[2]) < 16):
+        raise DataError(f"{name}: vertex count {words[2]!r}; expected a whole number")
+    return int(words[2])
+
+
+def _property(words: list[str], fields: dict[str, str], name: str) -> None:
+    if len(words) != 3 or words[1] not in _TYPES:
+        raise DataError(f"{name}: property {' '.join(words[1:])!r}; expected a scalar type and a name")
+    if words[2] in fields:
+        raise DataError(f"{name}: property {words[2]!r} stands twice in the header")
+    if words[2] in REQUIRED and _TYPES[words[1]] != "<f4":
+        raise DataError(f"{name}: property {words[2]} is {words[1]}; expected float")
+    fields[words[2]] = _TYPES[words[1]]
+
+
+def _sh_degree(fields: dict[str, str], name: str) -> int:
+    missing = [field for field in REQUIRED if field not in fields]
+    if missing:
+        raise DataError(f"{name}: no {', '.join(missing)} among its {len(fields)} properties; {_ADVICE}")
+    rest = sum(field.startswith("f_rest_") for field in fields)
+    if rest not in REST_COUNTS:
+        raise DataError(f"{name}: {rest} f_rest properties; expected {', '.join(map(str, REST_COUNTS))}")
+    return REST_COUNTS[rest]
+
+
+def parse_header(content: bytes, name: str) -> PlyHeader:
+    """Parse the first bytes of a file.
+
+    Args:
+        content: the file's beginning, holding the whole header.
+        name: what errors call the file.
+
+    Raises:
+        DataError: another magic, format, element, property or type than a 3DGS `.ply` has.
+    """
+    lines, size = _split(content, name)
+    formats, count, comments = [], None, []
+    fields: dict[str, str] = {}
+    for line in lines[1:]:
+        words = line.split()
+        if not words or words[0] == "obj_info":
+            continue
+        if words[0] == "comment":
+            comments.append(line[len("comment") :].strip())
+        elif words[0] == "format":
+            formats.append(" ".join(words[1:]))
+        elif words[0] == "element" and count is None:
+            count = _vertex_count(words, name)
+        elif words[0] == "property" and count is not None:
+            _property(words, fields, name)
+        else:
+            raise DataError(f"{name}: header line {line[:60]!r}; {_ADVICE}")
+    if formats != ["binary_little_endian 1.0"]:
+        raise DataError(f"{name}: format {', '.join(formats) or 'missing'}; expected binary_little_endian 1.0")
+    if count is None:
+        raise DataError(f"{name}: no element vertex; {_ADVICE}")
+    degree = _sh_degree(fields, name)
+    dtype = np.dtype(list(fields.items()))
+    return PlyHeader(size, count, dtype, degree, tuple(comments), **_provenance(comments, name))
+
+
+def _provenance(comments: list[str], name: str) -> dict:
+    """Fields of `PlyHeader` that our own comments carry."""
+    found: dict = {}
+    for comment in comments:
+        words = comment.split()
+        if len(words) < 2 or words[0] != "vvgt":
+            continue
+        try:
+            found |= _one_comment(words[1:])
+        except (ValueError, IndexError, UsageError):
+            raise DataError(f"{name}: comment {comment[:80]!r} is not one that vvgt writes") from None
+    if found.get("frame") == "world" and "scale" not in found:
+        raise DataError(f"{name}: in world space, but its comments do not hold scale and centre")
+    return found
+
+
+def _one_comment(words: list[str]) -> dict:
+    if words[0] == "frame":
+        if words[1] not in ("unit", "world"):
+            raise ValueError(words[1])
+        if len(words) == 2:
+            return {"frame": words[1]}
+        if (words[2], words[4]) != ("scale", "centre") or len(words) != 8:
+            raise ValueError(words)
+        scale, *centre = _finite([words[3], *words[5:8]])
+        if scale <= 0:
+            raise ValueError(scale)
+        return {"frame": words[1], "scale": scale, "centre": tuple(centre)}
+    if words[0] == "up":
+        up_matrix(words[1])
+        return {"up": words[1]}
+    if words[0] == "unit-distance":
+        return {"unit_distance": _finite([words[1]])[0], "unit_distance_label": " ".join(words[2:])}
+    return {"version": words[0]}
+
+
+def _finite(words: list[str]) -> list[float]:
+    values = [float(word) for word in words]
+    if not all(math.isfinite(value) for value in values):
+        raise ValueError(words)
+    return values

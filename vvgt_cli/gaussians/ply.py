@@ -1,0 +1,244 @@
+"""The standard 3DGS `.ply`: writer, and a reader that checks what it is given (docs/conventions.md)."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from vvgt_cli import __version__
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.gaussians.frames import rescale, turn, up_matrix
+from vvgt_cli.gaussians.header import REST_COUNTS, PlyHeader, parse_header
+from vvgt_cli.gaussians.types import SH_C0, Gaussians
+from vvgt_cli.volume.types import UnitFrame
+
+FRAMES = ("unit", "world")
+_HEADER_LIMIT = 1 << 16  # bytes; a header longer than this is not one
+
+
+@dataclass(frozen=True)
+class PlyOptions:
+    """What is written and how.
+
+    Attributes:
+        frame: "unit" (box-centred, longest edge 2) or "world" (the volume's physical space).
+        up: volume axis that points up in viewers, one of `frames.UP_NAMES`.
+        sh_degree: 0 to 3; bands above 0 are written as zeros, for loaders that insist on them.
+        comments: write the transform, the unit distance and the version before `end_header`.
+        unit_frame: frame of the volume; needed for "world", recorded in the comments otherwise.
+        unit_distance: world length that opacity refers to, recorded in the comments.
+        unit_distance_label: how that distance was chosen, one word.
+    """
+
+    frame: str = "unit"
+    up: str = "none"
+    sh_degree: int = 0
+    comments: bool = True
+    unit_frame: UnitFrame | None = None
+    unit_distance: float | None = None
+    unit_distance_label: str = "given"
+
+    def __post_init__(self) -> None:
+        up_matrix(self.up)
+        if self.frame not in FRAMES:
+            raise UsageError(f"frame {self.frame!r}: expected one of {', '.join(FRAMES)}")
+        if self.sh_degree not in REST_COUNTS.values():
+            raise UsageError(f"SH degree {self.sh_degree}: expected 0 to 3")
+        if self.frame == "world" and self.unit_frame is None:
+            raise UsageError("frame 'world' needs the volume's unit frame")
+
+
+def colors_to_f_dc(colors: np.ndarray) -> np.ndarray:
+    """Display RGB (K, 3) float32 to SH band 0, ``(rgb - 0.5) / SH_C0``, rounded once from float64.
+
+    With `f_dc_to_colors` a generalised inverse pair: ``W(R(W(c))) == W(c)`` and ``R(W(R(f))) == R(f)`` bit by
+    bit. At every magnitude one of the two grids is the finer by at least 1.13, so the trip through it is
+    exact; ``R(W(c)) == c`` itself holds for c in (0.25, 1.5], where the grid of f_dc is the finer one.
+    """
+    with np.errstate(over="ignore"):
+        return ((colors.astype(np.float64) - 0.5) / SH_C0).astype(np.float32)
+
+
+def f_dc_to_colors(f_dc: np.ndarray) -> np.ndarray:
+    """SH band 0 (K, 3) float32 to display RGB, ``0.5 + SH_C0 * f_dc``, rounded once from float64."""
+    return (0.5 + SH_C0 * f_dc.astype(np.float64)).astype(np.float32)
+
+
+def as_stored(gaussians: Gaussians) -> Gaussians:
+    """The Gaussians that a unit-frame file will give back: colours rounded as the file rounds them."""
+    return Gaussians(
+        gaussians.means,
+        gaussians.log_scales,
+        gaussians.quaternions,
+        gaussians.opacity_logits,
+        f_dc_to_colors(colors_to_f_dc(gaussians.colors)),
+    )
+
+
+def property_names(sh_degree: int = 0) -> list[str]:
+    """Property order of the file; all float32."""
+    rest = next(count for count, degree in REST_COUNTS.items() if degree == sh_degree)
+    return [
+        *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
+        *(f"f_rest_{i}" for i in range(rest)),
+        *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+    ]
+
+
+def _comments(options: PlyOptions) -> list[str]:
+    lines = [f"comment vvgt {__version__}"]
+    frame = f"comment vvgt frame {options.frame}"
+    if options.unit_frame is not None:
+        centre = " ".join(repr(float(c)) for c in options.unit_frame.centre)
+        frame += f" scale {float(options.unit_frame.scale)!r} centre {centre}"
+    lines += [frame, f"comment vvgt up {options.up}"]
+    if options.unit_distance is not None:
+        lines.append(f"comment vvgt unit-distance {float(options.unit_distance)!r} {options.unit_distance_label}")
+    return lines
+
+
+def write_ply(target: str | Path | BinaryIO, gaussians: Gaussians, options: PlyOptions | None = None) -> int:
+    """Write ``gaussians`` (unit frame) to a path or a binary stream; returns the bytes written.
+
+    A path is written as it is given: callers that must not leave a partial file pass the temporary name of
+    `vvgt_cli.files.atomic_write`. The bytes depend on the arguments and the version only.
+
+    Raises:
+        DataError: no Gaussians, or a value that float32 cannot hold in the chosen frame.
+    """
+    options = options or PlyOptions()
+    if not len(gaussians):
+        raise DataError("no Gaussians to write: a .ply needs at least one")
+    _check_rotations(gaussians, "Gaussians to write")
+    placed = turn(gaussians, options.up)
+    if options.frame == "world":
+        assert options.unit_frame is not None  # PlyOptions has checked it
+        centre = up_matrix(options.up) @ np.array(options.unit_frame.centre)
+        placed = rescale(placed, 1 / options.unit_frame.scale, np.zeros(3), centre)
+    f_dc = colors_to_f_dc(placed.colors)
+    if not np.isfinite(f_dc).all():
+        raise DataError("colours too large for float32 spherical harmonics; expected values near [0, 1]")
+    names = property_names(options.sh_degree)
+    rows = np.zeros((len(placed), len(names)), dtype="<f4")  # (K, properties)
+    rows[:, 0:3] = placed.means
+    rows[:, 6:9] = f_dc
+    rows[:, -8] = placed.opacity_logits
+    rows[:, -7:-4] = placed.log_scales
+    rows[:, -4:] = placed.quaternions
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(placed)}"]  # some loaders count lines
+    lines += [f"property float {name}" for name in names]
+    lines += [*(_comments(options) if options.comments else []), "end_header", ""]
+    header = "\n".join(lines).encode("ascii")
+    if isinstance(target, str | Path):
+        with open(target, "wb") as stream:
+            stream.write(header)
+            rows.tofile(stream)
+    else:
+        target.write(header)
+        target.write(rows.tobytes())
+    return len(header) + rows.nbytes
+
+
+def _rows(source: str | Path | BinaryIO, name: str) -> tuple[PlyHeader, np.ndarray]:
+    """Header and structured rows; the size is checked before anything is allocated."""
+    if isinstance(source, str | Path):
+        with open(source, "rb") as stream:
+            header = parse_header(stream.read(_HEADER_LIMIT), name)
+            size = stream.seek(0, io.SEEK_END)
+            _check_size(header, size, name)
+            if not header.count:
+                return header, np.zeros(0, header.dtype)
+            rows = np.memmap(stream, dtype=header.dtype, mode="r", offset=header.size, shape=(header.count,))
+        return header, rows
+    content = source.read()
+    header = parse_header(content[:_HEADER_LIMIT], name)
+    _check_size(header, len(content), name)
+    return header, np.frombuffer(content, dtype=header.dtype, count=header.count, offset=header.size)
+
+
+def _check_size(header: PlyHeader, size: int, name: str) -> None:
+    expected = header.size + header.count * header.dtype.itemsize
+    if size != expected:
+        what = "truncated" if size < expected else "followed by data that is not Gaussians"
+        raise DataError(
+            f"{name}: {size} bytes, but its header promises {header.count} vertices of {header.dtype.itemsize} "
+            f"bytes ({expected} bytes in all): the file is {what}"
+        )
+
+
+def read_ply(source: str | Path | BinaryIO) -> tuple[Gaussians, PlyHeader]:
+    """Read a 3DGS `.ply` from a path or a binary stream, in the frame that the file is in.
+
+    Properties are found by name, so files of other programs in another order are read too; spherical
+    harmonics above degree 0 are left out (``header.sh_degree`` tells).
+
+    Raises:
+        DataError: not a binary little-endian 3DGS `.ply`, of another size than its header says, or with
+            values that are not finite.
+    """
+    name = str(source) if isinstance(source, str | Path) else getattr(source, "name", "stream")
+    header, rows = _rows(source, str(name))
+
+    def columns(*names: str) -> np.ndarray:
+        return np.stack([rows[n] for n in names], axis=-1).astype(np.float32)
+
+    try:
+        gaussians = Gaussians(
+            columns("x", "y", "z"),
+            columns("scale_0", "scale_1", "scale_2"),
+            columns("rot_0", "rot_1", "rot_2", "rot_3"),
+            np.array(rows["opacity"], dtype=np.float32),
+            f_dc_to_colors(columns("f_dc_0", "f_dc_1", "f_dc_2")),
+        )
+    except DataError as error:
+        raise DataError(f"{name}: {error}") from None
+    _check_rotations(gaussians, str(name))
+    return gaussians, header
+
+
+def _check_rotations(gaussians: Gaussians, name: str) -> None:
+    zero = int(np.count_nonzero(~gaussians.quaternions.any(axis=1)))
+    if zero:
+        raise DataError(f"{name}: {zero} of {len(gaussians)} rotation quaternions are zero; expected any other norm")
+
+
+def in_unit_frame(gaussians: Gaussians, header: PlyHeader) -> Gaussians:
+    """Undo the frame and the up rotation that the file's comments name (without comments: as they are)."""
+    if header.frame == "world":
+        assert header.scale is not None  # parse_header has checked it
+        shift = up_matrix(header.up) @ np.array(header.centre)
+        gaussians = rescale(gaussians, header.scale, -shift, np.zeros(3))
+    return turn(gaussians, header.up, inverse=True)
+
+
+def opacity(gaussians: Gaussians) -> np.ndarray:
+    """Peak alpha (K,) float64 of the logits."""
+    return 1 / (1 + np.exp(-np.clip(gaussians.opacity_logits.astype(np.float64), -700, 700)))
+
+
+def describe(gaussians: Gaussians, header: PlyHeader) -> dict[str, object]:
+    """What `vvgt info` says about a `.ply`: counts, frame, box and the spread of sizes and opacities."""
+    summary: dict[str, object] = {
+        "gaussians": len(gaussians),
+        "bytes": header.size + header.count * header.dtype.itemsize,
+        "bytes_per_gaussian": header.dtype.itemsize,
+        "sh_degree": header.sh_degree,
+        "frame": header.frame,
+        "up": header.up,
+        "unit_distance": header.unit_distance,
+        "unit_distance_label": header.unit_distance_label,
+        "version": header.version,
+    }
+    if len(gaussians):
+        sigma = np.exp(np.clip(gaussians.log_scales.astype(np.float64), -700, 700))
+        for key, values in (("sigma", sigma), ("opacity", opacity(gaussians))):
+            summary[key] = [float(f"{q:.6g}") for q in np.percentile(values, (0, 50, 100))]
+        summary["box_min"] = [float(v) for v in gaussians.means.min(axis=0)]
+        summary["box_max"] = [float(v) for v in gaussians.means.max(axis=0)]
+        summary["color_min"] = [float(v) for v in gaussians.colors.min(axis=0)]
+        summary["color_max"] = [float(v) for v in gaussians.colors.max(axis=0)]
+    return summary
