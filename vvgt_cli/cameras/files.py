@@ -1,0 +1,160 @@
+"""View sets in files: nerfstudio's `transforms.json`, and the Blender style that it grew from.
+
+Matrices are OpenGL camera-to-world (+x right, +y up, looking along -z); ours are OpenCV world-to-camera. World is
+the unit frame, which is what `vvgt` writes unless told otherwise.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from vvgt_cli.cameras.types import Camera
+from vvgt_cli.errors import DataError
+
+OPENGL = np.diag([1.0, -1.0, -1.0])  # camera axes OpenCV <-> OpenGL
+MAX_SIDE = 16384  # pixels; 4 GiB of float RGBA
+_PINHOLE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
+_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+
+
+def camera_to_opengl(camera: Camera) -> np.ndarray:
+    """OpenGL camera-to-world matrix (4, 4) float64 of an OpenCV world-to-camera pose."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = camera.rotation.T @ OPENGL
+    matrix[:3, 3] = camera.position
+    return matrix
+
+
+def opengl_to_pose(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """OpenCV world-to-camera rotation (3, 3) and translation (3,) of an OpenGL camera-to-world matrix (4, 4)."""
+    rotation = OPENGL @ matrix[:3, :3].T
+    return rotation, -rotation @ matrix[:3, 3]
+
+
+def transforms_json(cameras: Sequence[Camera], *, suffix: str = ".png", ply_file_path: str | None = None) -> str:
+    """The text of a `transforms.json` for ``cameras``; images are ``NAME + suffix`` beside it.
+
+    Intrinsics stand at the top where all cameras share them, and in each frame where they do not.
+    """
+    intrinsics = [{"fl_x": c.fx, "fl_y": c.fy, "cx": c.cx, "cy": c.cy, "w": c.width, "h": c.height} for c in cameras]
+    shared = bool(intrinsics) and all(i == intrinsics[0] for i in intrinsics)
+    document: dict[str, Any] = {"camera_model": "OPENCV", **(intrinsics[0] if shared else {})}
+    if ply_file_path:
+        document["ply_file_path"] = ply_file_path
+    document["frames"] = [
+        {
+            "file_path": f"{camera.name}{suffix}",
+            **({} if shared else own),
+            "transform_matrix": camera_to_opengl(camera).tolist(),
+        }
+        for camera, own in zip(cameras, intrinsics, strict=True)
+    ]
+    return json.dumps(document, indent=1) + "\n"
+
+
+def read_cameras(path: str | Path, size: int | None = None) -> list[Camera]:
+    """Cameras of a `transforms.json` (nerfstudio or Blender style), in the file's order.
+
+    Args:
+        path: the file.
+        size: image height in pixels; views are scaled to it. Needed where the file holds no ``w`` and ``h``.
+
+    Raises:
+        DataError: not JSON, no frames, a lens with distortion, a pose that is not a rigid motion, no image size.
+    """
+    name = Path(path).name
+    try:
+        document = json.loads(Path(path).read_text("utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{name}: not JSON ({error}); expected a transforms.json") from None
+    frames = document.get("frames") if isinstance(document, dict) else None
+    if not isinstance(frames, list) or not frames:
+        raise DataError(f"{name}: no list 'frames'; expected a transforms.json (nerfstudio or Blender style)")
+    cameras: list[Camera] = []
+    taken: set[str] = set()
+    for i, frame in enumerate(frames):
+        if not isinstance(frame, dict):
+            raise DataError(f"{name}: frame {i} is not an object")
+        camera = _camera(document | frame, f"{name}: frame {i}", i, size)
+        if camera.name in taken:
+            raise DataError(f"{name}: frame {i}: a second image called {camera.name!r}; expected a name a view")
+        taken.add(camera.name)
+        cameras.append(camera)
+    return cameras
+
+
+def _camera(entry: dict[str, Any], name: str, index: int, size: int | None) -> Camera:
+    """One frame with the document's shared entries under its own."""
+    model = str(entry.get("camera_model", "OPENCV"))
+    if model not in _PINHOLE:
+        raise DataError(f"{name}: camera model {model!r}; expected a pinhole ({', '.join(_PINHOLE)})")
+    bent = [key for key in _DISTORTION if entry.get(key)]
+    if bent:
+        raise DataError(f"{name}: lens distortion ({', '.join(bent)}); expected a pinhole: undistort the set first")
+    matrix = _matrix(entry.get("transform_matrix"), name)
+    width, height, fx, fy, cx, cy = _lens(entry, name, size)
+    stem = PurePosixPath(str(entry.get("file_path", f"view_{index:03d}"))).stem or f"view_{index:03d}"
+    rotation, translation = opengl_to_pose(matrix)
+    try:
+        camera = Camera(rotation, translation, fx, fy, cx, cy, width, height, stem)
+    except DataError as error:
+        raise DataError(f"{name}: {error}") from None
+    if size is None or size == height:
+        return camera
+    return camera.resized(size / height)
+
+
+def _matrix(value: Any, name: str) -> np.ndarray:
+    try:
+        matrix = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        matrix = np.zeros(0)
+    if matrix.shape == (3, 4):
+        matrix = np.vstack([matrix, (0, 0, 0, 1)])
+    if matrix.shape != (4, 4) or not np.allclose(matrix[3], (0, 0, 0, 1)):
+        raise DataError(f"{name}: 'transform_matrix' is not a 4 x 4 camera-to-world matrix with last row 0 0 0 1")
+    return matrix
+
+
+def _number(entry: dict[str, Any], key: str, name: str) -> float | None:
+    value = entry.get(key)
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise DataError(f"{name}: {key} is {value!r}; expected a number")
+    return float(value)
+
+
+def _lens(entry: dict[str, Any], name: str, size: int | None) -> tuple[int, int, float, float, float, float]:
+    """width, height, fx, fy, cx, cy in pixels."""
+    width, height = _number(entry, "w", name), _number(entry, "h", name)
+    if width is None or height is None:
+        if size is None:
+            raise DataError(f"{name}: no image size 'w' and 'h'; give one with --size")
+        width = height = float(size)
+    if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
+        raise DataError(f"{name}: {width:g} x {height:g} px; expected 1 to {MAX_SIDE} along a side")
+    fx, fy = _number(entry, "fl_x", name), _number(entry, "fl_y", name)
+    angle_x, angle_y = _number(entry, "camera_angle_x", name), _number(entry, "camera_angle_y", name)
+    if fx is None and angle_x is not None and 0 < angle_x < math.pi:
+        fx = width / (2 * math.tan(angle_x / 2))
+    if fy is None and angle_y is not None and 0 < angle_y < math.pi:
+        fy = height / (2 * math.tan(angle_y / 2))
+    fx, fy = fx or fy, fy or fx
+    if fx is None or fy is None:
+        raise DataError(f"{name}: no focal length; expected 'fl_x' in pixels, or 'camera_angle_x' in radians")
+    cx, cy = _number(entry, "cx", name), _number(entry, "cy", name)
+    return (
+        round(width),
+        round(height),
+        fx,
+        fy,
+        width / 2 if cx is None else cx,
+        height / 2 if cy is None else cy,
+    )
