@@ -1,0 +1,103 @@
+"""`Scene`: a volume under a transfer function, laid out for the kernels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vvgt_cli.transfer.tables import OpticalTables, build_tables
+from vvgt_cli.transfer.types import TransferFunctionLike
+from vvgt_cli.volume import Volume
+
+BRICK_BITS = 3
+BRICK = 1 << BRICK_BITS  # voxels along the edge of a brick of the empty-space map
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What every later stage reads.
+
+    Attributes:
+        volume: the source.
+        tf: the transfer function, in data values.
+        unit_distance: world length that the function's opacity refers to.
+        values: (nz, ny, nx) uint8, uint16 or float32 stored values in native byte order (a view where possible).
+        tables: optics over stored values, extinction per unit-frame length.
+        empty: (bz, by, bx) uint8 Chebyshev distance, in bricks, to the nearest brick with extinction (0: has some).
+        half, step: (3,) float64 half extents and voxel edges in the unit frame, (x, y, z).
+    """
+
+    volume: Volume
+    tf: TransferFunctionLike
+    unit_distance: float
+    values: np.ndarray
+    tables: OpticalTables
+    empty: np.ndarray
+    half: np.ndarray
+    step: np.ndarray
+
+    @classmethod
+    def build(
+        cls,
+        volume: Volume,
+        tf: TransferFunctionLike,
+        unit_distance: float,
+        value_range: tuple[float, float] | None = None,
+        bins: int | None = None,
+    ) -> Scene:
+        """Prepare ``volume`` under ``tf``; ``value_range`` (data values) saves a pass over the data where it is known."""
+        from vvgt_cli.dvr import bricks
+
+        frame = volume.unit_frame()
+        values, slope, intercept = kernel_values(volume)
+        ranges = bricks.brick_ranges(values)  # (bz, by, bx, 2) stored values
+        if value_range is None:
+            ends = [slope * float(np.nanmin(ranges[..., 0])) + intercept, slope * float(np.nanmax(ranges[..., 1])) + intercept]
+            value_range = (min(ends), max(ends))
+        tables = build_tables(
+            tf,
+            value_range,
+            slope=slope,
+            intercept=intercept,
+            unit_distance=unit_distance,
+            world_per_unit=1 / frame.scale,
+            bins=bins,
+        )
+        empty = bricks.empty_distance(ranges, tables)
+        return cls(volume, tf, unit_distance, values, tables, empty, np.array(frame.half), np.array(frame.step))
+
+
+def kernel_values(volume: Volume) -> tuple[np.ndarray, float, float]:
+    """Stored values as uint8, uint16 or float32, with the slope and intercept that make them data values.
+
+    Types that float32 cannot hold (32-bit integers and up, doubles) are shifted and scaled in float64 by slabs first,
+    so that ranges of 1e-30 and 1e30 keep 24 bits.
+    """
+    data = volume.data
+    if data.dtype == np.bool_:
+        data = data.view(np.uint8)
+    if data.dtype in (np.uint8, np.uint16) and data.dtype.isnative:
+        return np.ascontiguousarray(data).view(np.ndarray), volume.slope, volume.intercept
+    out = np.empty(data.shape, np.float32)
+    if data.dtype.itemsize <= 2:  # exact in float32
+        for z in range(len(data)):
+            out[z] = data[z]
+        return out, volume.slope, volume.intercept
+    lo, hi = _finite_range(data)
+    if data.dtype == np.float32 and data.dtype.isnative and max(abs(lo), abs(hi)) < 1e30 and hi - lo > 1e-30:
+        return np.ascontiguousarray(data).view(np.ndarray), volume.slope, volume.intercept
+    half_width = hi / 2 - lo / 2 or 0.5  # halves: hi - lo may overflow
+    for z in range(len(data)):
+        with np.errstate(invalid="ignore", over="ignore"):
+            out[z] = (data[z].astype(np.float64) / 2 - lo / 2) / half_width
+    return out, volume.slope * 2 * half_width, volume.slope * lo + volume.intercept
+
+
+def _finite_range(data: np.ndarray) -> tuple[float, float]:
+    lo, hi = np.inf, -np.inf
+    for slab in data:
+        finite = slab[np.isfinite(slab)] if slab.dtype.kind == "f" else slab
+        if finite.size:
+            lo, hi = min(lo, float(finite.min())), max(hi, float(finite.max()))
+    return (lo, hi) if hi >= lo else (0.0, 0.0)

@@ -1,0 +1,6 @@
+"""EWA splatting."""
+
+from vvgt_cli.splat.render import Projection, gather, project, render
+from vvgt_cli.splat.reference import render_reference
+
+__all__ = ["Projection", "gather", "project", "render", "render_reference"]
