@@ -1,5 +1,9 @@
 """Volumes and their readers."""
 
+from vvgt_cli.volume import examples, inviwo, metaimage, nifti, nrrd, raw, slc, tiff, vtk_legacy, vtk_xml  # noqa: F401
+from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.registry import read_volume
+from vvgt_cli.volume.stats import Statistics, slabs, statistics
 from vvgt_cli.volume.types import UnitFrame, Volume
 
-__all__ = ["UnitFrame", "Volume"]
+__all__ = ["ReadOptions", "Statistics", "UnitFrame", "Volume", "read_volume", "slabs", "statistics"]

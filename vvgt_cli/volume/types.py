@@ -56,9 +56,7 @@ class Volume:
 
     def __post_init__(self) -> None:
         if self.data.ndim != 3 or min(self.data.shape) < 1:
-            raise DataError(
-                f"{self.name}: array of shape {self.data.shape}; expected three axes (z, y, x), none empty"
-            )
+            raise DataError(f"{self.name}: array of shape {self.data.shape}; expected three axes (z, y, x), none empty")
         if self.data.dtype.kind not in "iufb":
             raise DataError(f"{self.name}: values of type {self.data.dtype}; expected integers or floats")
         if len(self.spacing) != 3 or not all(math.isfinite(s) and s > 0 for s in self.spacing):

@@ -1,0 +1,244 @@
+"""Blocks of numbers in files: mapped where stored plainly, unpacked within bounds where compressed.
+
+Headers may lie, so every size is checked against the file, and against free memory, before anything is allocated.
+"""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import math
+import mmap
+import os
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from vvgt_cli.errors import DataError
+
+# The most that each coding can expand: deflate 258 bytes from 2 bits, bzip2 about 900 kB from some 40 bytes.
+MAX_RATIO = {"gzip": 1040, "zlib": 1040, "bzip2": 25000}
+_CHUNK = 1 << 20
+
+
+def count(shape: tuple[int, ...]) -> int:
+    """Product of a shape in exact integers (headers can overflow 64 bits)."""
+    return math.prod(int(n) for n in shape)
+
+
+def size_text(n_bytes: int) -> str:
+    """Bytes for people: ``1234 bytes`` or ``3.2 GiB``."""
+    return f"{n_bytes} bytes" if n_bytes < 1 << 20 else f"{n_bytes} bytes ({n_bytes / 2**30:.3g} GiB)"
+
+
+def free_memory() -> int | None:
+    """Bytes of memory that can still be had, or None where the system does not say."""
+    try:
+        with open("/proc/meminfo", encoding="ascii") as lines:
+            for line in lines:
+                if line.startswith("MemAvailable:"):
+                    return int(line.split()[1]) * 1024
+    except (OSError, ValueError, IndexError):
+        pass
+    try:
+        return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (OSError, ValueError, AttributeError):
+        return None
+
+
+def check_memory(need: int, what: str) -> None:
+    """Raise `DataError` if ``need`` bytes exceed the free memory."""
+    free = free_memory()
+    if free is not None and need > free:
+        raise DataError(
+            f"{what}: needs {size_text(need)} of memory, {size_text(free)} are free; "
+            "try a machine with more, or store it uncompressed (raw or .nhdr files are mapped, not loaded)"
+        )
+
+
+class _ZlibStream:
+    """``read(n)`` over a zlib stream in a file; never holds more than it was asked for."""
+
+    def __init__(self, file: IO[bytes]) -> None:
+        self._file = file
+        self._engine = zlib.decompressobj()
+
+    def read(self, n: int) -> bytes:
+        while not self._engine.eof:
+            data = self._engine.unconsumed_tail or self._file.read(_CHUNK)
+            out = self._engine.decompress(data, n)
+            if out:
+                return out
+            if not data:
+                raise EOFError("the compressed data end too early")
+        return b""
+
+
+_OPENERS: dict[str, Callable[[IO[bytes]], Any]] = {
+    "gzip": lambda file: gzip.GzipFile(fileobj=file),
+    "bzip2": lambda file: bz2.BZ2File(file),
+    "zlib": _ZlibStream,
+}
+
+
+def load_block(
+    path: Path, dtype: np.dtype, shape: tuple[int, ...], *, offset: int = 0, encoding: str = "raw", skip: int = 0
+) -> np.ndarray:
+    """The block of ``shape`` and ``dtype`` at byte ``offset`` of a file.
+
+    Args:
+        path: the file.
+        dtype: with its byte order.
+        shape: numpy order (slowest first).
+        offset: bytes before the (possibly compressed) block; -1 means that the block ends the file (raw only).
+        encoding: ``raw`` (memory-mapped, read-only), ``gzip``, ``zlib``, ``bzip2`` or ``text``.
+        skip: decompressed bytes to skip.
+
+    Returns:
+        `np.memmap` for ``raw``, else an array in memory.
+
+    Raises:
+        DataError: the file is too short, the block cannot come from so few bytes, or memory does not suffice.
+    """
+    need = count(shape) * dtype.itemsize
+    size = path.stat().st_size
+    if offset < 0:
+        offset = size - need
+    if encoding == "raw":
+        offset += skip
+        if need < 1 or offset < 0 or offset + need > size:
+            raise _too_short(path, size, shape, dtype, max(offset, 0))
+        return np.memmap(path, dtype=dtype, mode="r", offset=offset, shape=shape)
+    if encoding == "text":
+        if count(shape) > size:
+            raise _too_short(path, size, shape, dtype, offset)
+        values = parse_numbers(path.read_bytes(), offset, count(shape), dtype, path.name)
+        return values.reshape(shape)
+    return _unpack(path, dtype, shape, offset, encoding, skip)
+
+
+def _too_short(path: Path, size: int, shape: tuple[int, ...], dtype: np.dtype, offset: int) -> DataError:
+    dims = " x ".join(str(n) for n in reversed(shape))
+    need = count(shape) * dtype.itemsize + offset
+    return DataError(
+        f"{path.name}: the file has {size_text(size)}; {dims} values of {dtype.name} after {offset} bytes need "
+        f"{size_text(need)}; check that the file is whole and that its header's sizes and type are right"
+    )
+
+
+def _unpack(path: Path, dtype: np.dtype, shape: tuple[int, ...], offset: int, encoding: str, skip: int) -> np.ndarray:
+    need = count(shape) * dtype.itemsize
+    packed = path.stat().st_size - offset
+    if packed <= 0 or need + skip > packed * MAX_RATIO[encoding] + 4096:
+        raise DataError(
+            f"{path.name}: {size_text(max(packed, 0))} of {encoding} data cannot hold the {size_text(need + skip)} "
+            "that its header declares; check the header's sizes and type"
+        )
+    check_memory(need, path.name)
+    with open(path, "rb") as file:
+        file.seek(offset)
+        try:
+            stream = _OPENERS[encoding](file)
+            read_discard(stream, skip)
+            out, filled = fill(stream, need)
+            if filled == need:
+                stream.read(1)  # reaches the trailer, and with it the checksum
+        except (OSError, EOFError, zlib.error) as error:
+            raise DataError(f"{path.name}: damaged {encoding} data ({error}); try to fetch the file again") from error
+    if filled < need:
+        raise DataError(
+            f"{path.name}: its {encoding} data hold {size_text(filled + skip)}, its header declares "
+            f"{size_text(need + skip)}; check the header's sizes and type"
+        )
+    return out.view(dtype).reshape(shape)
+
+
+def read_discard(stream: Any, n: int) -> None:
+    """Read and drop ``n`` bytes of a stream (fewer if it ends)."""
+    while n > 0:
+        got = len(stream.read(min(n, _CHUNK)))
+        if not got:
+            return
+        n -= got
+
+
+def fill(stream: Any, need: int) -> tuple[np.ndarray, int]:
+    """Read up to ``need`` bytes of a stream.
+
+    Returns:
+        (need,) uint8 and how many of them were read.
+    """
+    out = np.empty(need, np.uint8)
+    view = memoryview(out)  # type: ignore[arg-type]
+    filled = 0
+    while filled < need:
+        chunk = stream.read(min(_CHUNK, need - filled))
+        if not chunk:
+            break
+        view[filled : filled + len(chunk)] = chunk
+        filled += len(chunk)
+    return out, filled
+
+
+def tokens(text: bytes | mmap.mmap, start: int, n: int, name: str) -> Iterator[tuple[list[bytes], int]]:
+    """``n`` white-space separated words of ``text`` from ``start`` on, in windows.
+
+    Yields:
+        (words, position behind them).
+
+    Raises:
+        DataError: too few words.
+    """
+    missing, position = n, start
+    while missing:
+        window = text[position : position + _CHUNK]
+        if not window:
+            raise DataError(f"{name}: the text holds {n - missing} values, expected {n}; check that the file is whole")
+        if position + len(window) < len(text):
+            cut = max(window.rfind(c) for c in (b" ", b"\n", b"\t", b"\r"))
+            window = window[: cut + 1] or window
+        words = window.split(None, missing)
+        position += len(window)
+        if len(words) > missing:
+            position -= len(words.pop())
+        missing -= len(words)
+        yield words, position
+
+
+def parse_numbers(text: bytes | mmap.mmap, start: int, n: int, dtype: np.dtype, name: str) -> np.ndarray:
+    """``n`` numbers of white-space separated text from ``start`` on, (n,) in native byte order.
+
+    Raises:
+        DataError: too few numbers, something that is no number, or one that the type cannot hold.
+    """
+    native = dtype.newbyteorder("=")
+    parts = [np.empty(0, native)]
+    for words, _ in tokens(text, start, n, name):
+        try:
+            parts.append(np.array(words, dtype="S").astype(native))
+        except (ValueError, OverflowError) as error:
+            raise DataError(f"{name}: the text is not a list of {native.name} numbers ({error})") from error
+    return np.concatenate(parts)
+
+
+def data_file(header: Path, named: str) -> Path:
+    """The data file that a detached header names; it must lie in the header's folder.
+
+    Raises:
+        DataError: a path that leaves the folder, or a file that does not exist.
+    """
+    relative = Path(named)
+    target = header.parent / relative
+    homes = {header.parent.resolve(), header.resolve().parent}
+    inside = not relative.is_absolute() and ".." not in relative.parts
+    if not named or not inside or not any(target.resolve().is_relative_to(home) for home in homes):
+        raise DataError(
+            f"{header.name}: its data file is {named!r}; expected a file in the header's own folder (copy or move "
+            "it there and name it without a path)"
+        )
+    if not target.is_file():
+        raise DataError(f"{header.name}: its data file {named!r} does not exist beside it; expected {target}")
+    return target

@@ -1,0 +1,224 @@
+"""NIfTI-1 and NIfTI-2, single files (``.nii``, ``.nii.gz``) and pairs (``.hdr`` + ``.img``).
+
+Read here because VTK's reader leaves slope and intercept to the caller. Plain files are memory-mapped.
+Format: nifti1.h and nifti2.h (NIMH); scaling as section "DATA SCALING" has it: slope 0 means none.
+"""
+
+from __future__ import annotations
+
+import gzip
+import math
+import struct
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from vvgt_cli.errors import DataError
+from vvgt_cli.volume.blocks import load_block
+from vvgt_cli.volume.components import select_component
+from vvgt_cli.volume.headers import unit_rows
+from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.registry import Reader, register, volume_name
+from vvgt_cli.volume.types import IDENTITY, Volume
+
+_DTYPES = {
+    2: "u1",
+    4: "i2",
+    8: "i4",
+    16: "f4",
+    64: "f8",
+    256: "i1",
+    512: "u2",
+    768: "u4",
+    1024: "i8",
+    1280: "u8",
+}
+_OTHERS = {
+    1: "bits",
+    32: "complex64",
+    128: "RGB colours",
+    1536: "128-bit floats",
+    1792: "complex128",
+    2048: "complex256",
+    2304: "RGBA colours",
+}
+_MAGIC = {b"n+1\0": True, b"ni1\0": False, b"n+2\0": True, b"ni2\0": False}
+
+
+@dataclass(frozen=True)
+class Header:
+    """What a NIfTI header says: ``dims`` fastest first, ``pixdim`` with pixdim[0], sform rows 3 x 4."""
+
+    dims: tuple[int, ...]
+    dtype: np.dtype
+    single: bool
+    offset: int
+    slope: float
+    intercept: float
+    pixdim: tuple[float, ...]
+    qform: tuple[float, ...] | None
+    sform: tuple[float, ...] | None
+
+
+def _order(head: bytes) -> tuple[str, int] | None:
+    """Byte order and version, from sizeof_hdr."""
+    for order in "<>":
+        if len(head) >= 348 and struct.unpack_from(order + "i", head)[0] == 348:
+            return order, 1
+        if len(head) >= 540 and struct.unpack_from(order + "i", head)[0] == 540:
+            return order, 2
+    return None
+
+
+def _sniff(head: bytes) -> bool:
+    found = _order(head)
+    return found is not None and head[(344 if found[1] == 1 else 4) :][:4] in _MAGIC
+
+
+def parse_header(head: bytes, name: str) -> Header:
+    """Parse the first 348 (NIfTI-1) or 540 (NIfTI-2) bytes.
+
+    Raises:
+        DataError: no NIfTI header, a type without real numbers, or sizes below 1.
+    """
+    found = _order(head)
+    if found is None or not _sniff(head):
+        raise DataError(f"{name}: no NIfTI header (348 or 540 bytes with the magic n+1, ni1, n+2 or ni2)")
+    order, version = found
+
+    def get(fmt: str, at: int) -> tuple:
+        return struct.unpack_from(order + fmt, head, at)
+
+    if version == 1:
+        magic, dim, (code,), pixdim = head[344:348], get("8h", 40), get("h", 70), get("8f", 76)
+        offset, slope, intercept = get("3f", 108)
+        q_code, s_code = get("2h", 252)
+        quatern, sform = get("6f", 256), get("12f", 280)
+    else:
+        magic, dim, (code,), pixdim = head[4:8], get("8q", 16), get("h", 12), get("8d", 104)
+        (offset,), (slope, intercept) = get("q", 168), get("2d", 176)
+        q_code, s_code = get("2i", 344)
+        quatern, sform = get("6d", 352), get("12d", 400)
+    if not 1 <= dim[0] <= 7 or min(dim[1 : dim[0] + 1]) < 1:
+        raise DataError(f"{name}: dim {dim}; expected 1 to 7 axes of at least 1 voxel each")
+    if code not in _DTYPES:
+        raise DataError(
+            f"{name}: values are {_OTHERS.get(code, f'of unknown type {code}')}; expected real numbers (convert it "
+            "to one channel first)"
+        )
+    if not math.isfinite(offset) or offset < 0:
+        raise DataError(f"{name}: vox_offset {offset}; expected 0 or more")
+    slope, intercept = _scaling(slope, intercept, name)
+    single = _MAGIC[magic]
+    least = {1: 352, 2: 544}[version] if single else 0
+    return Header(
+        dim[1 : dim[0] + 1],
+        np.dtype(order + _DTYPES[code]),
+        single,
+        max(int(offset), least),
+        slope,
+        intercept,
+        pixdim,
+        quatern if q_code > 0 else None,
+        sform if s_code > 0 else None,
+    )
+
+
+def _scaling(slope: float, intercept: float, name: str) -> tuple[float, float]:
+    """Slope and intercept; slope 0 or NaN means that the values are not scaled."""
+    if slope == 0 or math.isnan(slope):
+        return 1.0, 0.0
+    if not math.isfinite(slope) or not math.isfinite(intercept):
+        raise DataError(f"{name}: scl_slope {slope}, scl_inter {intercept}; expected finite numbers")
+    return slope, intercept
+
+
+def _orientation(header: Header) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Direction (row-major) and origin: sform, else qform, else none (nifti1.h, methods 3, 2, 1)."""
+    if header.sform is not None and all(map(math.isfinite, header.sform)):
+        m = header.sform
+        columns = [[m[4 * row + column] for row in range(3)] for column in range(3)]
+        return unit_rows(columns)[1], (m[3], m[7], m[11])
+    if header.qform is not None and all(map(math.isfinite, header.qform)):
+        b, c, d, *origin = header.qform
+        a = math.sqrt(max(0.0, 1.0 - (b * b + c * c + d * d)))
+        flip = -1.0 if header.pixdim[0] < 0 else 1.0
+        rows = (
+            (a * a + b * b - c * c - d * d, 2 * (b * c - a * d), flip * 2 * (b * d + a * c)),
+            (2 * (b * c + a * d), a * a + c * c - b * b - d * d, flip * 2 * (c * d - a * b)),
+            (2 * (b * d - a * c), 2 * (c * d + a * b), flip * (a * a + d * d - b * b - c * c)),
+        )
+        return tuple(v for row in rows for v in row), tuple(origin)
+    return IDENTITY, (0.0, 0.0, 0.0)
+
+
+def _read_head(path: Path) -> tuple[bytes, bool]:
+    with open(path, "rb") as file:
+        head = file.read(540)
+    if head[:2] != b"\x1f\x8b":
+        return head, False
+    try:
+        with gzip.open(path, "rb") as unzipped:
+            return unzipped.read(540), True
+    except (OSError, EOFError, zlib.error) as error:
+        raise DataError(f"{path}: damaged gzip data ({error}); try to fetch the file again") from error
+
+
+def _image_file(path: Path) -> tuple[Path, bool]:
+    """The ``.img`` (or ``.img.gz``) of a pair's header."""
+    stem = path.name[:-3] if path.name.endswith(".gz") else path.name
+    for suffix in (".img", ".img.gz"):
+        image = path.with_name(stem.rsplit(".", 1)[0] + suffix)
+        if image.is_file():
+            return image, suffix.endswith(".gz")
+    raise DataError(f"{path}: the header of a pair, without its .img file beside it")
+
+
+def read_nifti(path: Path, options: ReadOptions) -> Volume:
+    """Read a NIfTI file. Axes beyond the third (time, vectors) are components; plain files are memory-mapped.
+
+    Spacing is pixdim's; sform or qform give direction and origin (metadata); slope and intercept go into the volume.
+
+    Raises:
+        DataError: a header that is damaged or does not fit the data, colours or complex values.
+        UsageError: several time steps or components and none chosen.
+    """
+    head, zipped = _read_head(path)
+    header = parse_header(head, str(path))
+    source, offset = path, header.offset
+    if not header.single:
+        source, zipped = _image_file(path)
+    spatial = (*header.dims, 1, 1)[:3]
+    rest = math.prod(header.dims[3:])
+    component = options.component
+    if isinstance(component, int) and component < rest > 1:  # only that one need be unpacked
+        offset += component * math.prod(spatial) * header.dtype.itemsize
+        rest, component = 1, None
+    shape = (rest, *reversed(spatial))  # (c, z, y, x)
+    if zipped:
+        block = load_block(source, header.dtype, shape, encoding="gzip", skip=offset)
+    else:
+        block = load_block(source, header.dtype, shape, offset=offset)
+    field, (slope, intercept) = select_component(
+        np.moveaxis(block, 0, -1),
+        component,
+        str(path),
+        label="the series" if rest > 1 else "",
+        scaling=(header.slope, header.intercept),
+    )
+    steps = tuple(p if n > 1 or p else 1.0 for p, n in zip(header.pixdim[1:4], spatial, strict=True))
+    direction, origin = _orientation(header)
+    return Volume(
+        field,
+        options.spacing_or(steps),
+        origin,  # type: ignore[arg-type]
+        direction,
+        volume_name(path),
+        slope,
+        intercept,
+    )
+
+
+register(Reader("NIfTI", (".nii", ".nii.gz", ".hdr"), _sniff, read_nifti, unzips=True))

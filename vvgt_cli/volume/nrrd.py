@@ -1,0 +1,194 @@
+"""NRRD, attached (``.nrrd``) and detached (``.nhdr``): raw (memory-mapped), gzip, bzip2 and text encodings.
+
+Format: https://teem.sourceforge.net/nrrd/format.html
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from vvgt_cli.errors import DataError
+from vvgt_cli.volume.blocks import data_file, load_block
+from vvgt_cli.volume.components import select_component
+from vvgt_cli.volume.headers import MAX_HEADER, Fields, unit_rows
+from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.registry import Reader, register, volume_name
+from vvgt_cli.volume.types import IDENTITY, Volume
+
+_TYPES = {
+    "i1": "signed char, int8, int8_t",
+    "u1": "uchar, unsigned char, uint8, uint8_t",
+    "i2": "short, short int, signed short, signed short int, int16, int16_t",
+    "u2": "ushort, unsigned short, unsigned short int, uint16, uint16_t",
+    "i4": "int, signed int, int32, int32_t",
+    "u4": "uint, unsigned int, uint32, uint32_t",
+    "i8": "longlong, long long, long long int, signed long long, signed long long int, int64, int64_t",
+    "u8": "ulonglong, unsigned long long, unsigned long long int, uint64, uint64_t",
+    "f4": "float",
+    "f8": "double",
+}
+_DTYPE = {name: code for code, names in _TYPES.items() for name in names.split(", ")}
+_ENCODINGS = {
+    "raw": "raw",
+    "gzip": "gzip",
+    "gz": "gzip",
+    "bzip2": "bzip2",
+    "bz2": "bzip2",
+    "text": "text",
+    "txt": "text",
+    "ascii": "text",
+}
+_SPATIAL_KINDS = {"domain", "space", "???", "none"}
+
+
+def read_header(path: Path) -> tuple[Fields, int]:
+    """The fields of a NRRD header, and the position behind its blank line (the file's end if detached).
+
+    Raises:
+        DataError: not a NRRD file, or a header without an end.
+    """
+    with open(path, "rb") as file:
+        if not file.readline(MAX_HEADER).startswith(b"NRRD000"):
+            raise DataError(f"{path}: does not begin with NRRD000; expected a NRRD file")
+        fields = Fields(path.name)
+        while line := file.readline(MAX_HEADER):
+            if file.tell() > MAX_HEADER:
+                raise DataError(f"{path}: no blank line ends its header; check that the file is whole")
+            text = line.decode("utf-8", "replace").strip()
+            if not text:
+                break
+            key, colon, value = text.partition(":")
+            if not text.startswith("#") and colon and not value.startswith("="):
+                fields[key.strip().lower().replace("centerings", "centers")] = value.strip()
+        return fields, file.tell()
+
+
+def _dtype(fields: Fields, encoding: str) -> np.dtype:
+    name = " ".join(fields.need("type").lower().split())
+    if name not in _DTYPE:
+        raise DataError(f"{fields.name}: values of type {name!r}; expected one of int8 ... uint64, float, double")
+    dtype = np.dtype(_DTYPE[name])
+    if dtype.itemsize > 1 and encoding != "text":
+        endian = fields.need("endian").lower()
+        if endian not in ("little", "big"):
+            raise DataError(f"{fields.name}: endian is {endian!r}; expected little or big")
+        dtype = dtype.newbyteorder("<" if endian == "little" else ">")
+    return dtype
+
+
+def _vectors(fields: Fields, n: int) -> list[list[float] | None]:
+    """Space directions of the n axes: a vector of three, or None for an axis that is not spatial."""
+    tokens = fields["space directions"].replace("(", " (").replace(")", ") ").split()
+    joined, inside = [], ""
+    for token in tokens:
+        inside += token
+        if inside.startswith("(") and not inside.endswith(")"):
+            continue
+        joined.append(inside)
+        inside = ""
+    if len(joined) != n:
+        raise DataError(f"{fields.name}: space directions {fields['space directions']!r}; expected {n} axes")
+    out: list[list[float] | None] = []
+    for token in joined:
+        vector = None if token == "none" else fields.floats("space directions", token.strip("()"))
+        out.append(vector and [*vector, 0.0, 0.0][:3])
+    return out
+
+
+def _component_axis(fields: Fields, sizes: list[int], vectors: list[list[float] | None] | None) -> int | None:
+    """Index (fastest first) of the axis that holds components, or None.
+
+    Raises:
+        DataError: more axes than three in space and one of components.
+    """
+    kinds = fields.get("kinds", "").lower().split()
+    odd = [k for k, vector in enumerate(vectors) if vector is None] if vectors else []
+    if not odd and len(kinds) == len(sizes):
+        odd = [k for k, kind in enumerate(kinds) if kind not in _SPATIAL_KINDS]
+    if not odd and len(sizes) == 4:
+        odd = [0 if sizes[0] <= sizes[3] else 3]
+    if len(sizes) - len(odd) not in (2, 3) or len(odd) > 1:
+        raise DataError(
+            f"{fields.name}: axes of sizes {sizes}, of which {len(odd)} are not spatial; expected two or three "
+            "spatial axes and at most one of components"
+        )
+    return odd[0] if odd else None
+
+
+def _geometry(
+    fields: Fields, vectors: list[list[float] | None] | None, axis: int | None, n: int
+) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
+    """Spacing (x, y, z), direction (row-major) and origin."""
+    spacing: tuple[float, ...] = (1.0,) * 3
+    direction: tuple[float, ...] = IDENTITY
+    if vectors is not None:
+        spatial = [v for k, v in enumerate(vectors) if k != axis and v is not None]
+        if len(spatial) == 2:
+            spatial.append([0.0, 0.0, 1.0])
+        spacing, direction = unit_rows(spatial)
+    elif "spacings" in fields:
+        words = [w for k, w in enumerate(fields["spacings"].split()) if k != axis]
+        values = fields.floats("spacings", " ".join("1" if w.lower() == "nan" else w for w in words))
+        spacing = (*values, 1.0, 1.0)[:3]
+    origin: tuple[float, ...] = (0.0,) * 3
+    if "space origin" in fields and "none" not in fields["space origin"]:
+        origin = (*fields.floats("space origin", fields["space origin"].strip("() ")), 0.0, 0.0)[:3]
+    return spacing, direction, origin
+
+
+def _line_skip(path: Path, offset: int, lines: int) -> int:
+    with open(path, "rb") as file:
+        file.seek(offset)
+        for _ in range(lines):
+            if not file.readline():
+                raise DataError(f"{path.name}: shorter than its 'line skip' of {lines} lines")
+        return file.tell()
+
+
+def read_nrrd(path: Path, options: ReadOptions) -> Volume:
+    """Read a NRRD file; raw encoding is memory-mapped.
+
+    Raises:
+        DataError: a header that is incomplete or does not fit the data, a data file outside the header's folder.
+        UsageError: several components and none chosen.
+    """
+    fields, offset = read_header(path)
+    encoding = _ENCODINGS.get(fields.need("encoding").lower())
+    if encoding is None:
+        raise DataError(f"{path}: encoding {fields['encoding']!r}; expected {', '.join(sorted(_ENCODINGS))}")
+    dtype = _dtype(fields, encoding)
+    sizes = fields.sizes("sizes", fields.need("sizes"))
+    if len(sizes) != fields.integer("dimension", len(sizes)):
+        raise DataError(f"{path}: dimension {fields['dimension']} but sizes {fields['sizes']!r}")
+    source = path
+    named = fields.get("data file") or fields.get("datafile")
+    if named is not None:
+        if named.startswith("LIST") or "%" in named:
+            raise DataError(f"{path}: its data lie in several files; expected one (try teem: unu save -f nrrd)")
+        source, offset = data_file(path, named), 0
+    offset = _line_skip(source, offset, fields.integer("line skip", 0))
+    skip = fields.integer("byte skip", 0)
+    if skip < -1 or (skip == -1 and encoding != "raw"):
+        raise DataError(f"{path}: byte skip {skip} with encoding {encoding}; expected 0 or more (-1 with raw only)")
+    shape = tuple(reversed(sizes))
+    if skip == -1:
+        block = load_block(source, dtype, shape, offset=-1)
+    else:
+        block = load_block(source, dtype, shape, offset=offset, encoding=encoding, skip=skip)
+    return _volume(path, fields, block, sizes, options)
+
+
+def _volume(path: Path, fields: Fields, block: np.ndarray, sizes: list[int], options: ReadOptions) -> Volume:
+    vectors = _vectors(fields, len(sizes)) if "space directions" in fields else None
+    axis = _component_axis(fields, sizes, vectors)
+    block = block[..., None] if axis is None else np.moveaxis(block, len(sizes) - 1 - axis, -1)
+    if block.ndim == 3:
+        block = block[None]
+    field, _ = select_component(block, options.component, str(path), label=f"axis {axis}" if axis is not None else "")
+    spacing, direction, origin = _geometry(fields, vectors, axis, len(sizes))
+    return Volume(field, options.spacing_or(spacing), origin, direction, volume_name(path))  # type: ignore[arg-type]
+
+
+register(Reader("NRRD", (".nrrd", ".nhdr"), lambda head: head.startswith(b"NRRD000"), read_nrrd))

@@ -1,0 +1,110 @@
+"""`ReadOptions`: what a caller may say about a volume beyond its file."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from vvgt_cli.errors import UsageError
+
+DTYPES = (
+    "int8",
+    "uint8",
+    "int16",
+    "uint16",
+    "int32",
+    "uint32",
+    "int64",
+    "uint64",
+    "float16",
+    "float32",
+    "float64",
+)
+_ALIASES = {
+    "char": "int8",
+    "uchar": "uint8",
+    "byte": "uint8",
+    "short": "int16",
+    "ushort": "uint16",
+    "int": "int32",
+    "uint": "uint32",
+    "half": "float16",
+    "float": "float32",
+    "double": "float64",
+}
+
+
+@dataclass(frozen=True)
+class ReadOptions:
+    """How to read a volume; every field left at ``None`` (or 0) means "as the file says".
+
+    Attributes:
+        dims: voxels along (x, y, z) of a raw file.
+        dtype: a name of `DTYPES` (or a C-like alias such as ``ushort``) for a raw file.
+        byte_order: ``little`` or ``big`` for a raw file (default little).
+        header_bytes: bytes to skip at the start of a raw file.
+        spacing: voxel edges (x, y, z) in world units; overrides the file's.
+        array: name of the array, for formats that hold several.
+        component: index of a component, or ``magnitude``, for arrays that have several.
+
+    Raises:
+        UsageError: a value out of its range.
+    """
+
+    dims: tuple[int, int, int] | None = None
+    dtype: str | None = None
+    byte_order: str | None = None
+    header_bytes: int = 0
+    spacing: tuple[float, float, float] | None = None
+    array: str | None = None
+    component: int | str | None = None
+
+    def __post_init__(self) -> None:
+        if self.dims is not None and (len(self.dims) != 3 or min(self.dims) < 1):
+            raise UsageError(f"--dims {self.dims}: expected three whole numbers of at least 1, as --dims 256 256 128")
+        if self.dtype is not None:
+            parse_dtype(self.dtype)
+        if self.byte_order not in (None, "little", "big"):
+            raise UsageError(f"--byte-order {self.byte_order}: expected little or big")
+        if self.header_bytes < 0:
+            raise UsageError(f"--header-bytes {self.header_bytes}: expected 0 or more")
+        if self.spacing is not None and not (
+            len(self.spacing) == 3 and all(math.isfinite(s) and s > 0 for s in self.spacing)
+        ):
+            raise UsageError(f"--spacing {self.spacing}: expected three positive numbers, as --spacing 1 1 2.5")
+        component = self.component
+        if isinstance(component, str) and component != "magnitude":
+            raise UsageError(f"--component {component}: expected an index (0, 1, ...) or magnitude")
+        if isinstance(component, int) and component < 0:
+            raise UsageError(f"--component {component}: expected an index of at least 0, or magnitude")
+
+    @property
+    def raw_flags(self) -> list[str]:
+        """The flags in use that only a raw file takes."""
+        given = {
+            "--dims": self.dims is not None,
+            "--dtype": self.dtype is not None,
+            "--byte-order": self.byte_order is not None,
+            "--header-bytes": self.header_bytes != 0,
+        }
+        return [flag for flag, used in given.items() if used]
+
+    def spacing_or(self, declared: tuple[float, ...]) -> tuple[float, float, float]:
+        """The spacing asked for, else the file's (x, y, z): signs are orientation and dropped."""
+        if self.spacing is not None:
+            return self.spacing
+        return tuple(abs(float(s)) for s in declared)  # type: ignore[return-value]
+
+
+def parse_dtype(name: str, byte_order: str | None = None) -> np.dtype:
+    """numpy dtype for a name of `DTYPES` or an alias; little-endian unless told.
+
+    Raises:
+        UsageError: unknown name.
+    """
+    key = _ALIASES.get(name.strip().lower(), name.strip().lower())
+    if key not in DTYPES:
+        raise UsageError(f"--dtype {name}: expected one of {', '.join(DTYPES)}")
+    return np.dtype(key).newbyteorder(">" if byte_order == "big" else "<")

@@ -1,0 +1,183 @@
+"""The registry of readers: formats are found by content first, then by name.
+
+A reader is a module that ends in one ``register(Reader(...))``; a scheme (``example:``) is one
+``register_scheme(name, function)``.
+"""
+
+from __future__ import annotations
+
+import gzip
+import re
+import struct
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.types import Volume
+
+HEAD_BYTES = 4096
+
+
+@dataclass(frozen=True)
+class Reader:
+    """A volume format.
+
+    Attributes:
+        name: for messages.
+        suffixes: lower-case endings of file names, with the dot.
+        sniff: does a file with these first `HEAD_BYTES` (unzipped) bytes have this format?
+        read: path and options to volume.
+        unzips: reads gzip-compressed files by itself.
+        named_arrays: takes ``--array``.
+        raw_layout: takes dims, dtype, byte order and header bytes.
+    """
+
+    name: str
+    suffixes: tuple[str, ...]
+    sniff: Callable[[bytes], bool]
+    read: Callable[[Path, ReadOptions], Volume]
+    unzips: bool = False
+    named_arrays: bool = False
+    raw_layout: bool = False
+
+
+Scheme = Callable[[str, ReadOptions], Volume]
+
+_READERS: list[Reader] = []
+_SCHEMES: dict[str, Scheme] = {}
+
+
+def register(reader: Reader) -> Reader:
+    """Add a reader; the earlier one wins where two recognise a file."""
+    if any(not s.startswith(".") or s != s.lower() for s in reader.suffixes):
+        raise ValueError(f"{reader.name}: suffixes must be lower case and start with a dot")
+    if reader.name in (r.name for r in _READERS):
+        raise ValueError(f"{reader.name}: registered twice")
+    _READERS.append(reader)
+    return reader
+
+
+def register_scheme(name: str, open_scheme: Scheme) -> None:
+    """Make ``NAME:rest`` a source: ``open_scheme(rest, options) -> Volume``."""
+    _SCHEMES[name] = open_scheme
+
+
+def known_suffixes() -> list[str]:
+    """Every file-name ending that a reader is registered for."""
+    return [suffix for reader in _READERS for suffix in reader.suffixes]
+
+
+def volume_name(path: Path) -> str:
+    """Short name of a file: without folder, known endings and the raw layout in its name."""
+    name = path.name
+    for suffix in sorted(known_suffixes(), key=len, reverse=True):
+        if name.lower().endswith(suffix):
+            name = name[: -len(suffix)]
+            break
+    name = re.sub(r"_\d+x\d+x\d+_u?(int|float)\d+$", "", name)
+    return name or path.name
+
+
+def read_volume(source: str, options: ReadOptions | None = None) -> Volume:
+    """Read a volume from a file, from standard input (``-``, raw bytes) or from a registered scheme.
+
+    Args:
+        source: a path, ``-`` or ``scheme:rest``.
+        options: see `ReadOptions`.
+
+    Returns:
+        The volume; memory-mapped where the format stores plain values.
+
+    Raises:
+        DataError: no such file, an unknown format, a damaged file, sizes that do not fit.
+        UsageError: options that the format does not take, or a choice (array, component, dims) that is missing.
+    """
+    options = options or ReadOptions()
+    if source == "-":
+        from vvgt_cli.volume.raw import read_stdin
+
+        return read_stdin(options)
+    scheme, colon, rest = source.partition(":")
+    if colon and scheme in _SCHEMES:
+        return _SCHEMES[scheme](rest, options)
+    path = Path(source)
+    head = _head(path, source)
+    reader = _find(path, head, options)
+    _check_options(reader, source, options)
+    try:
+        return reader.read(path, options)
+    except (OSError, ValueError, struct.error, LookupError, ArithmeticError, EOFError, zlib.error) as error:
+        text = " ".join(str(error).split()) or type(error).__name__
+        raise DataError(f"{source}: damaged {reader.name} file ({text}); check that it is whole") from error
+    except MemoryError as error:
+        raise DataError(f"{source}: not enough memory to read it; try a machine with more") from error
+
+
+def _head(path: Path, source: str) -> bytes:
+    """First bytes of a file; raises `DataError` if there are none to be had."""
+    if path.is_dir():
+        raise DataError(f"{source}: a folder; expected a volume file ({', '.join(known_suffixes())})")
+    try:
+        with open(path, "rb") as file:
+            head = file.read(HEAD_BYTES)
+    except FileNotFoundError:
+        hint = "" if ":" not in source else f" (schemes: {', '.join(s + ':' for s in _SCHEMES)})"
+        raise DataError(f"{source}: no such file; expected a volume file, - or example:NAME{hint}") from None
+    except (OSError, ValueError) as error:
+        raise DataError(f"{source}: cannot be read ({getattr(error, 'strerror', None) or error})") from error
+    if not head:
+        raise DataError(f"{source}: the file is empty; expected a volume")
+    return head
+
+
+def _by_content(path: Path, head: bytes) -> tuple[Reader | None, bool]:
+    """The first reader that recognises the head, and whether the file is gzip-compressed."""
+    zipped = head[:2] == b"\x1f\x8b"
+    if zipped:
+        try:
+            with gzip.open(path, "rb") as file:
+                head = file.read(HEAD_BYTES)
+        except (OSError, EOFError, zlib.error):
+            return None, True
+    return next((r for r in _READERS if r.sniff(head)), None), zipped
+
+
+def _by_name(path: Path) -> Reader | None:
+    name = path.name.lower()
+    fits = [(len(s), r) for r in _READERS for s in r.suffixes if name.endswith(s)]
+    return max(fits, key=lambda fit: fit[0])[1] if fits else None
+
+
+def _find(path: Path, head: bytes, options: ReadOptions) -> Reader:
+    from vvgt_cli.volume import raw
+
+    named = _by_name(path)
+    found, zipped = _by_content(path, head)
+    if found is not None and found is not named and (options.dims or raw.parse_name(path.name)):
+        return raw.READER  # a raw volume may begin with any bytes; where its layout is stated, believe that
+    if found is not None:
+        if zipped and not found.unzips:
+            raise DataError(f"{path}: a gzip-compressed {found.name} file; unpack it first (gunzip)")
+        return found
+    if options.dims:
+        return raw.READER
+    if named is not None:
+        return named
+    raise DataError(
+        f"{path}: not a format that is known by content or name; expected {', '.join(known_suffixes())}, or a raw "
+        "file with --dims X Y Z --dtype TYPE"
+    )
+
+
+def _check_options(reader: Reader, source: str, options: ReadOptions) -> None:
+    if not reader.raw_layout and options.raw_flags:
+        raise UsageError(
+            f"{source}: a {reader.name} file, which states its own layout; leave out {' '.join(options.raw_flags)}"
+        )
+    if options.array is not None and not reader.named_arrays:
+        raise UsageError(
+            f"{source}: a {reader.name} file, which has one array without a name; leave out --array {options.array}"
+        )

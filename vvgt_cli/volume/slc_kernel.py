@@ -1,0 +1,42 @@
+"""Run-length decoder of SLC planes (numba; imported only when a compressed SLC file is read)."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+
+@numba.njit(cache=True)
+def decode_plane(packed: np.ndarray, out: np.ndarray) -> int:
+    """Decode one plane, never past either end.
+
+    Each run is a byte: 7 bits of count (0 ends the plane), and the top bit set if that many literal bytes follow,
+    else one byte follows that repeats.
+
+    Args:
+        packed: (m,) uint8.
+        out: (n,) uint8, written.
+
+    Returns:
+        Voxels written, or -1 if the runs leave ``packed`` or ``out``.
+    """
+    i = 0
+    o = 0
+    while i < packed.size:
+        n = packed[i] & 127
+        if n == 0:
+            return o
+        if o + n > out.size:
+            return -1
+        if packed[i] & 128:
+            if i + n >= packed.size:
+                return -1
+            out[o : o + n] = packed[i + 1 : i + 1 + n]
+            i += 1 + n
+        else:
+            if i + 1 >= packed.size:
+                return -1
+            out[o : o + n] = packed[i + 1]
+            i += 2
+        o += n
+    return o

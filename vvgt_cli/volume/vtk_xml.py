@@ -1,0 +1,274 @@
+"""VTK XML images (``.vti``), read by VTK; a plain (raw, appended) array is memory-mapped instead.
+
+The XML is scanned first: sizes are checked against the file before VTK allocates, and VTK's messages, which go to the
+terminal otherwise, become one error.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from xml.parsers import expat
+
+import numpy as np
+
+from vvgt_cli.errors import DataError
+from vvgt_cli.volume.blocks import check_memory, count, load_block, size_text
+from vvgt_cli.volume.components import ArrayInfo, choose_array, select_component
+from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.registry import Reader, register, volume_name
+from vvgt_cli.volume.types import IDENTITY, Volume
+
+_DTYPES = {
+    "int8": "i1",
+    "uint8": "u1",
+    "int16": "i2",
+    "uint16": "u2",
+    "int32": "i4",
+    "uint32": "u4",
+    "int64": "i8",
+    "uint64": "u8",
+    "float32": "f4",
+    "float64": "f8",
+    "bit": "u1",
+}
+# Most that a byte of the file can stand for: deflate 1032, LZ4 255, LZMA some 7000; "0 " for a double in text.
+_RATIO = {"": 4, "vtkZLibDataCompressor": 1040, "vtkLZ4DataCompressor": 256, "vtkLZMADataCompressor": 10000}
+_CHUNK = 1 << 16
+
+
+@dataclass
+class _Scan:
+    """What the XML says; arrays are those of the first piece."""
+
+    kind: str = ""
+    root: dict[str, str] = field(default_factory=dict)
+    image: dict[str, str] = field(default_factory=dict)
+    pieces: int = 0
+    where: str = ""
+    active: dict[str, str] = field(default_factory=dict)
+    arrays: list[tuple[ArrayInfo, dict[str, str]]] = field(default_factory=list)
+    appended: str = ""
+    data_start: int = -1
+
+
+def scan(path: Path) -> _Scan:
+    """Scan the elements of a VTK XML file, up to its appended data.
+
+    Raises:
+        DataError: not well-formed, or not a VTKFile.
+    """
+    found = _Scan()
+    parser = expat.ParserCreate()
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        if tag == "VTKFile":
+            found.root, found.kind = attributes, attributes.get("type", "")
+        elif tag == "ImageData":
+            found.image = attributes
+        elif tag == "Piece":
+            found.pieces += 1
+        elif tag in ("PointData", "CellData"):
+            found.where = tag[:-4].lower()
+            found.active[found.where] = attributes.get("Scalars", "")
+        elif tag == "DataArray" and found.where and found.pieces == 1:
+            _note_array(found, attributes)
+        elif tag == "AppendedData":
+            found.appended, found.data_start = attributes.get("encoding", ""), parser.CurrentByteIndex
+
+    def end(tag: str) -> None:
+        if tag in ("PointData", "CellData"):
+            found.where = ""
+
+    parser.StartElementHandler, parser.EndElementHandler = start, end
+    with open(path, "rb") as file:
+        try:
+            while found.data_start < 0 and (chunk := file.read(_CHUNK)):
+                parser.Parse(chunk)
+        except expat.ExpatError as error:
+            if found.data_start < 0:
+                raise DataError(f"{path}: its XML is damaged ({error}); check that the file is whole") from error
+        if found.data_start >= 0:
+            file.seek(found.data_start)
+            mark = file.read(4096).find(b"_")
+            found.data_start = found.data_start + mark + 1 if mark >= 0 else -1
+    return found
+
+
+def _note_array(found: _Scan, attributes: dict[str, str]) -> None:
+    dtype = _DTYPES.get(attributes.get("type", "").lower())
+    if dtype is None:
+        return
+    components = int(attributes.get("NumberOfComponents", "1"))
+    if components < 1:
+        raise DataError(f"array {attributes.get('Name')!r} has {components} components")
+    name = attributes.get("Name", "")
+    active = bool(name) and name == found.active.get(found.where)
+    info = ArrayInfo(name, found.where, components, np.dtype(dtype).name, active)
+    found.arrays.append((info, attributes))
+
+
+def _numbers(text: str, n: int, path: Path, what: str) -> list[float]:
+    try:
+        values = [float(t) for t in text.split()]
+    except ValueError:
+        values = []
+    if len(values) != n:
+        raise DataError(f"{path}: {what} is {text!r}; expected {n} numbers")
+    return values
+
+
+@dataclass(frozen=True)
+class _Grid:
+    """Dims, spacing, origin (x, y, z) of the values, direction row-major."""
+
+    dims: tuple[int, ...]
+    spacing: tuple[float, ...]
+    origin: tuple[float, ...]
+    direction: tuple[float, ...]
+
+
+def _grid(found: _Scan, where: str, path: Path) -> _Grid:
+    """The grid of points, or of cell centres (half a voxel further, one fewer along each axis)."""
+    image = found.image
+    extent = [int(e) for e in _numbers(image.get("WholeExtent", ""), 6, path, "WholeExtent")]
+    dims = [extent[2 * k + 1] - extent[2 * k] + 1 for k in range(3)]
+    if min(dims) < 1:
+        raise DataError(f"{path}: WholeExtent {extent} is empty; expected at least one voxel along each axis")
+    spacing = _numbers(image.get("Spacing", "1 1 1"), 3, path, "Spacing")
+    origin = _numbers(image.get("Origin", "0 0 0"), 3, path, "Origin")
+    direction = IDENTITY
+    if "Direction" in image:
+        direction = tuple(_numbers(image["Direction"], 9, path, "Direction"))  # type: ignore[assignment]
+    first = [float(extent[2 * k]) for k in range(3)]
+    if where == "cell":
+        first = [f + 0.5 if d > 1 else f for f, d in zip(first, dims, strict=True)]
+        dims = [max(d - 1, 1) for d in dims]
+    step = [f * s for f, s in zip(first, spacing, strict=True)]
+    origin = [o + sum(direction[3 * row + k] * step[k] for k in range(3)) for row, o in enumerate(origin)]
+    return _Grid(tuple(dims), tuple(spacing), tuple(origin), direction)
+
+
+def read_vti(path: Path, options: ReadOptions) -> Volume:
+    """Read a VTK XML image: point data, or cell data on the grid of cell centres.
+
+    Raises:
+        DataError: another dataset than an image, damaged, or sizes that the file cannot hold.
+        UsageError: a choice of array or component that is missing or does not exist.
+    """
+    found = scan(path)
+    if found.kind != "ImageData" or not found.image:
+        raise DataError(
+            f"{path}: a VTK file of type {found.kind or 'unknown'}; expected ImageData (.vti); resample it first "
+            "(ParaView: Resample To Image)"
+        )
+    info, attributes = found.arrays[choose_array([a for a, _ in found.arrays], options.array, str(path))]
+    grid = _grid(found, info.where, path)
+    shape = (*reversed(grid.dims), info.components)
+    _check_size(found, info, count(shape), path)
+    values = _mapped(found, attributes, info, shape, path)
+    if values is None:
+        values = _by_vtk(path, info, shape)
+    component, _ = select_component(values, options.component, str(path), label=f"array {info.name!r}")
+    return Volume(
+        component,
+        options.spacing_or(grid.spacing),
+        grid.origin,  # type: ignore[arg-type]
+        grid.direction,
+        volume_name(path),
+    )
+
+
+def _check_size(found: _Scan, info: ArrayInfo, n_values: int, path: Path) -> None:
+    need = n_values * np.dtype(info.dtype).itemsize
+    size = path.stat().st_size
+    compressor = found.root.get("compressor", "")
+    if compressor not in _RATIO:
+        raise DataError(f"{path}: compressor {compressor!r}; expected one of {', '.join(filter(None, _RATIO))}")
+    if need > size * _RATIO[compressor]:
+        raise DataError(
+            f"{path}: {size_text(size)} cannot hold the {size_text(need)} of array {info.name!r} that its header "
+            "declares; check that the file is whole"
+        )
+    check_memory(need, str(path))
+
+
+def _mapped(
+    found: _Scan, attributes: dict[str, str], info: ArrayInfo, shape: tuple[int, ...], path: Path
+) -> np.ndarray | None:
+    """The array memory-mapped, if it is stored plainly, in one piece."""
+    plain = found.appended == "raw" and not found.root.get("compressor") and found.data_start >= 0
+    if not plain or found.pieces != 1 or attributes.get("format") != "appended" or attributes["type"] == "Bit":
+        return None
+    order = ">" if found.root.get("byte_order") == "BigEndian" else "<"
+    word = np.dtype(order + ("u8" if found.root.get("header_type") == "UInt64" else "u4"))
+    start = found.data_start + int(attributes.get("offset", "0"))
+    dtype = np.dtype(order + np.dtype(info.dtype).str[1:])
+    declared = int(load_block(path, word, (1,), offset=start)[0])
+    if start < found.data_start or declared != count(shape) * dtype.itemsize:
+        raise DataError(
+            f"{path}: array {info.name!r} stores {declared} bytes, its header declares {count(shape) * dtype.itemsize}"
+        )
+    return load_block(path, dtype, shape, offset=start + word.itemsize)
+
+
+@contextmanager
+def quiet_vtk() -> Iterator[Any]:
+    """Keep VTK's messages from the terminal; yields a function that returns them as one line."""
+    from vtkmodules.vtkCommonCore import vtkLogger, vtkOutputWindow, vtkStringOutputWindow
+
+    window, before = vtkStringOutputWindow(), vtkOutputWindow.GetInstance()
+    verbosity = vtkLogger.GetCurrentVerbosityCutoff()
+    vtkOutputWindow.SetInstance(window)
+    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
+
+    def message() -> str:
+        # "ERROR: In file, line n\nclass (0x..): text"
+        texts = re.findall(r"\(0x[0-9a-f]+\): ([^\n]+)", window.GetOutput() or "")
+        return texts[0].strip() if texts else ""
+
+    try:
+        yield message
+    finally:
+        vtkOutputWindow.SetInstance(before)
+        vtkLogger.SetStderrVerbosity(verbosity)
+
+
+def _by_vtk(path: Path, info: ArrayInfo, shape: tuple[int, ...]) -> np.ndarray:
+    """(nz, ny, nx, c) values by vtkXMLImageDataReader, without a copy."""
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+    from vtkmodules.vtkIOXML import vtkXMLImageDataReader
+
+    with quiet_vtk() as message:
+        reader = vtkXMLImageDataReader()
+        reader.SetFileName(str(path))
+        reader.UpdateInformation()
+        for where, selection in (
+            ("point", reader.GetPointDataArraySelection()),
+            ("cell", reader.GetCellDataArraySelection()),
+        ):
+            selection.DisableAllArrays()
+            if where == info.where:
+                selection.EnableArray(info.name)
+        reader.Update()
+        image = reader.GetOutput()
+        data = image.GetPointData() if info.where == "point" else image.GetCellData()
+        array = data.GetArray(info.name) if info.name else data.GetArray(0)
+        error = message()
+    if error or reader.GetErrorCode() or array is None:
+        raise DataError(f"{path}: VTK cannot read array {info.name!r} ({error or 'no message'}); is the file whole?")
+    values = vtk_to_numpy(array)
+    if values.size != count(shape):
+        raise DataError(f"{path}: array {info.name!r} has {values.size} values; expected {count(shape)}")
+    return values.reshape(shape)
+
+
+def _sniff(head: bytes) -> bool:
+    return re.search(rb"^\s*(?:<\?xml[^>]*>\s*)?(?:<!--.*?-->\s*)*<VTKFile\s", head, re.DOTALL) is not None
+
+
+register(Reader("VTK XML", (".vti",), _sniff, read_vti, named_arrays=True))
