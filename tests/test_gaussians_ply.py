@@ -177,7 +177,7 @@ def test_options_and_values_that_cannot_be_written():
     with pytest.raises(UsageError, match="0 to 3"):
         PlyOptions(sh_degree=4)
     with pytest.raises(UsageError, match="unit frame"):
-        PlyOptions(frame="world")
+        write_ply(io.BytesIO(), random_gaussians(), PlyOptions(frame="world"))
     with pytest.raises(UsageError, match="expected one of none"):
         PlyOptions(up="w")
     nothing = random_gaussians().take(np.zeros(0, int))

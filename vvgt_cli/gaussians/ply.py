@@ -48,8 +48,6 @@ class PlyOptions:
             raise UsageError(f"frame {self.frame!r}: expected one of {', '.join(FRAMES)}")
         if self.sh_degree not in REST_COUNTS.values():
             raise UsageError(f"SH degree {self.sh_degree}: expected 0 to 3")
-        if self.frame == "world" and self.unit_frame is None:
-            raise UsageError("frame 'world' needs the volume's unit frame")
 
 
 def colors_to_f_dc(colors: np.ndarray) -> np.ndarray:
@@ -109,6 +107,7 @@ def write_ply(target: str | Path | BinaryIO, gaussians: Gaussians, options: PlyO
 
     Raises:
         DataError: no Gaussians, or a value that float32 cannot hold in the chosen frame.
+        UsageError: the frame is "world" and no unit frame is given.
     """
     options = options or PlyOptions()
     if not len(gaussians):
@@ -116,7 +115,8 @@ def write_ply(target: str | Path | BinaryIO, gaussians: Gaussians, options: PlyO
     _check_rotations(gaussians, "Gaussians to write")
     placed = turn(gaussians, options.up)
     if options.frame == "world":
-        assert options.unit_frame is not None  # PlyOptions has checked it
+        if options.unit_frame is None:
+            raise UsageError("frame 'world' needs the volume's unit frame: pass PlyOptions(unit_frame=...)")
         centre = up_matrix(options.up) @ np.array(options.unit_frame.centre)
         placed = rescale(placed, 1 / options.unit_frame.scale, np.zeros(3), centre)
     f_dc = colors_to_f_dc(placed.colors)

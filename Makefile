@@ -1,0 +1,29 @@
+# make test | lint | long | ci
+VENV ?= .venv-test
+PYTHON ?= python3
+
+.PHONY: test lint format long ci
+
+$(VENV)/bin/pytest: pyproject.toml constraints.txt
+	[ -x $(VENV)/bin/python ] || $(PYTHON) -m venv $(VENV)
+	$(VENV)/bin/pip install -q --disable-pip-version-check -c constraints.txt -e '.[test]'
+	touch $@
+
+test: $(VENV)/bin/pytest
+	$(VENV)/bin/pytest
+
+lint: $(VENV)/bin/pytest
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/ruff format --check .
+	$(VENV)/bin/mypy
+
+format: $(VENV)/bin/pytest
+	$(VENV)/bin/ruff format .
+	$(VENV)/bin/ruff check --fix .
+
+# The checks that take too long for every change: tests marked `long`, and property tests with 100 times the examples.
+long: $(VENV)/bin/pytest
+	HYPOTHESIS_PROFILE=long $(VENV)/bin/pytest --long
+
+ci:
+	.ci/run

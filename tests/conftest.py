@@ -1,0 +1,62 @@
+"""Shared fixtures: the command line in-process, the `long` marker, hypothesis profiles."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import hypothesis
+import pytest
+
+from vvgt_cli.cli.main import run
+
+hypothesis.settings.register_profile("default", max_examples=100, deadline=None)
+hypothesis.settings.register_profile("long", max_examples=10_000, deadline=None)
+hypothesis.settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "default"))
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--long", action="store_true", help="run the tests marked long too")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.addinivalue_line("markers", "long: takes too long for every change (make long)")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if not config.getoption("--long"):
+        for item in items:
+            if "long" in item.keywords:
+                item.add_marker(pytest.mark.skip(reason="long: pass --long"))
+
+
+@dataclass
+class Result:
+    """What a command line did."""
+
+    code: int
+    out: bytes
+    err: str
+
+    @property
+    def error(self) -> str:
+        """The error's one line, checked to be one."""
+        lines = [line for line in self.err.splitlines() if line.startswith("vvgt: error: ")]
+        assert len(lines) == 1, self.err
+        assert "Traceback" not in self.err
+        assert self.err.splitlines()[-1] == lines[0], self.err
+        return lines[0]
+
+
+@pytest.fixture
+def vvgt(capfdbinary: pytest.CaptureFixture[bytes]) -> Callable[..., Result]:
+    """Run a command line in this process; output is captured at the file descriptors, so VTK's is seen too."""
+
+    def call(*args: object) -> Result:
+        capfdbinary.readouterr()
+        code = run([str(arg) for arg in args])
+        out, err = capfdbinary.readouterr()
+        return Result(code, out, err.decode())
+
+    return call

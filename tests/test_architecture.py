@@ -1,0 +1,141 @@
+"""The rules of the house: import order of the rooms, sizes of files and functions, where heavy imports sit."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+PACKAGE = ROOT / "vvgt_cli"
+ROOMS = (
+    *("errors", "progress", "files", "volume", "transfer", "cameras", "images", "metrics", "gaussians", "synth", "dvr"),
+    *("splat", "vbm", "network", "optimize", "training", "report", "pipeline", "cli"),
+)
+HEAVY = {
+    *("numba", "vtk", "vtkmodules", "pyvista", "onnxruntime", "torch", "matplotlib", "OpenImageIO", "OpenEXR"),
+    *("scipy", "nibabel", "gsplat", "lpips"),
+}
+# Modules that hold numba kernels: their importers import them inside the functions that call them.
+KERNELS = {"numba"}
+MAX_FILE, MAX_FUNCTION = 400, 60
+FILES = sorted(PACKAGE.rglob("*.py"))
+TESTS = sorted((ROOT / "tests").glob("*.py"))
+
+
+def name(path: Path) -> str:
+    return path.relative_to(ROOT).as_posix()
+
+
+def room(module: str) -> str:
+    """Room of a dotted module name inside the package; "" for the package itself."""
+    return module.split(".")[1] if "." in module else ""
+
+
+def imports(tree: ast.AST) -> Iterator[tuple[ast.stmt, str]]:
+    """Every imported module (dotted), anywhere in the file."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from ((node, alias.name) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, "imports are absolute here"
+            if node.module == "vvgt_cli":
+                yield from ((node, f"vvgt_cli.{alias.name}") for alias in node.names)
+            else:
+                yield node, node.module or ""
+
+
+def module_level(tree: ast.Module) -> list[ast.stmt]:
+    """Statements that run on import, into `if` and `try` but not under TYPE_CHECKING."""
+    found: list[ast.stmt] = []
+    waiting: list[ast.stmt] = list(tree.body)
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            continue
+        if isinstance(node, ast.If | ast.Try | ast.With | ast.ClassDef):
+            waiting += node.body
+        found.append(node)
+    return found
+
+
+@pytest.mark.parametrize("path", FILES, ids=name)
+def test_a_room_imports_only_from_rooms_before_it(path):
+    own = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+    if own == "__init__":
+        return
+    assert own in ROOMS, f"{own} is not a room"
+    for node, module in imports(ast.parse(path.read_text("utf-8"))):
+        if module.startswith("vvgt_cli.") and room(module) != "__version__":
+            assert ROOMS.index(room(module)) <= ROOMS.index(own), f"line {node.lineno}: {own} imports {module}"
+
+
+@pytest.mark.parametrize("path", FILES, ids=name)
+def test_heavy_imports_sit_where_they_are_used(path):
+    tree = ast.parse(path.read_text("utf-8"))
+    top = {id(node) for node in module_level(tree)}
+    for node, module in imports(tree):
+        package = module.split(".")[0]
+        if id(node) in top and package in HEAVY:
+            assert package in KERNELS, f"line {node.lineno}: {module} is imported at module level"
+
+
+def test_modules_with_kernels_are_not_imported_at_module_level_outside_kernels():
+    trees = {path: ast.parse(path.read_text("utf-8")) for path in FILES}
+    dotted = {path: ".".join(path.relative_to(ROOT).with_suffix("").parts) for path in FILES}
+    kernels = {
+        dotted[path]
+        for path, tree in trees.items()
+        if any(id(node) in set(map(id, module_level(tree))) and module.split(".")[0] == "numba"
+               for node, module in imports(tree))
+    }  # fmt: skip
+    for path, tree in trees.items():
+        top = {id(node) for node in module_level(tree)}
+        if dotted[path] in kernels:
+            continue
+        for node, module in imports(tree):
+            assert not (id(node) in top and module in kernels), f"{name(path)}:{node.lineno} imports {module}"
+
+
+@pytest.mark.parametrize("path", FILES + TESTS, ids=name)
+def test_files_and_functions_are_short(path):
+    text = path.read_text("utf-8")
+    assert text.count("\n") <= MAX_FILE
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            length = (node.end_lineno or node.lineno) - node.lineno + 1
+            assert length <= MAX_FUNCTION, f"{node.name}: {length} lines"
+
+
+@pytest.mark.parametrize("path", FILES, ids=name)
+def test_every_module_says_what_it_is(path):
+    assert ast.get_docstring(ast.parse(path.read_text("utf-8")))
+
+
+def loaded(*code: str) -> set[str]:
+    """Top-level packages in a fresh interpreter after running the lines."""
+    lines = [*code, "import sys", "print(' '.join(sorted({m.split('.')[0] for m in sys.modules})))"]
+    run = subprocess.run([sys.executable, "-c", "\n".join(lines)], cwd=ROOT, capture_output=True, text=True, check=True)
+    return set(run.stdout.splitlines()[-1].split())
+
+
+def test_help_loads_click_and_nothing_heavier():
+    modules = loaded("from vvgt_cli.cli.main import run", "assert run(['--help']) == 0")
+    assert "click" in modules
+    assert not modules & (HEAVY | {"numpy"})
+
+
+@pytest.mark.parametrize("command", ["convert", "init", "render", "evaluate", "info"])
+def test_a_commands_help_is_as_light(command):
+    modules = loaded("from vvgt_cli.cli.main import run", f"assert run(['{command}', '--help']) == 0")
+    assert not modules & (HEAVY | {"numpy"})
+
+
+def test_every_room_imports_without_the_heavy_packages():
+    rooms = [path.parent.name for path in PACKAGE.glob("*/__init__.py")]
+    modules = loaded(*(f"import vvgt_cli.{room}" for room in rooms))
+    assert not modules & HEAVY

@@ -1,0 +1,44 @@
+"""`vvgt convert`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import click
+
+from vvgt_cli.cli.fit import fit_options, ply_options
+from vvgt_cli.cli.options import common_options, overwrite_option, read_options, tf_options
+from vvgt_cli.progress import Console
+
+
+@click.command("convert", short_help="Volume and transfer function to .ply.")
+@click.argument("volume")
+@click.option("-o", "--output", required=True, metavar="OUT.ply", help="File to write; - is standard output.")
+@fit_options
+@ply_options
+@tf_options
+@read_options
+@click.option("--report", metavar="R.json", help="Write times and errors of every stage as JSON; - is standard output.")
+@click.option("--preview", metavar="P.png", help="Write reference, ours and difference of three test views.")
+@overwrite_option
+@common_options
+def command(volume: str, console: Console, **options: Any) -> None:
+    """Convert VOLUME into a standard 3D Gaussian Splatting .ply.
+
+    VOLUME is a file (raw with a header or with --dims and --dtype, NRRD, NIfTI, MetaImage, VTK, TIFF, ...),
+    "example:NAME" for one of the volumes that come with the program, or "-" for raw values on standard
+    input. Without --tf a function is made from the histogram.
+
+    The Gaussians are made for images of --size pixels and scored on ten test views that nothing was fitted
+    to; the error is printed.
+
+    \b
+    Examples:
+      vvgt convert example:frog -o frog.ply --preview frog.png
+      vvgt convert head.nrrd --tf bone.json -o head.ply --max-gaussians 50000
+      vvgt convert - --dims 64 64 93 --dtype uint16 -o - < head.raw > head.ply
+    """
+    from vvgt_cli.cli.fit import convert_request
+    from vvgt_cli.pipeline.convert import convert
+
+    convert(convert_request(volume, **options), console)

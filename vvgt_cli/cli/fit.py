@@ -1,0 +1,77 @@
+"""Options of the commands that make Gaussians, and the request that they add up to."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from vvgt_cli.cli.options import group
+
+if TYPE_CHECKING:
+    from vvgt_cli.pipeline.convert import ConvertRequest
+    from vvgt_cli.pipeline.source import SourceRequest
+
+fit_options = group(
+    "fit",
+    max_gaussians=click.option(
+        "--max-gaussians", type=click.IntRange(1, 100_000_000), default=100_000, show_default=True, metavar="K",
+        help="Budget: no more Gaussians than this.",
+    ),
+    size=click.option(
+        "--size", type=click.IntRange(16, 8192), default=400, show_default=True, metavar="PX",
+        help="Image size that the file is made for; viewers widen every splat by a third of a pixel.",
+    ),
+    init=click.option(
+        "--init", type=click.Choice(["vbm", "wavelet", "uniform"]), default="vbm", show_default=True,
+        help="Closed form: multi-resolution moments, one isotropic Gaussian a wavelet atom, or random samples.",
+    ),
+    seed=click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of random samples."),
+)  # fmt: skip
+
+ply_options = group(
+    "ply",
+    frame=click.option(
+        "--frame", type=click.Choice(["unit", "world"]), default="unit", show_default=True,
+        help="Box centred with longest edge 2, or the volume's physical space.",
+    ),
+    up=click.option(
+        "--up", type=click.Choice(["none", "x", "-x", "y", "-y", "z", "-z"]), default="none", show_default=True,
+        help="Volume axis that viewers show upwards; none leaves the axes as they are.",
+    ),
+    sh_degree=click.option(
+        "--sh-degree", type=click.IntRange(0, 3), default=0, show_default=True,
+        help="Pad the file with zero harmonics up to this degree, for loaders that insist on them.",
+    ),
+    comments=click.option("--no-comments", "comments", is_flag=True, default=True, flag_value=False,
+        help="Leave frame, unit distance and version out of the header."),
+)  # fmt: skip
+
+
+def source_request(volume: str, read: dict[str, Any], optics: dict[str, Any]) -> SourceRequest:
+    """What the shared options of `options.py` add up to."""
+    from vvgt_cli.pipeline.source import SourceRequest
+    from vvgt_cli.volume.options import ReadOptions
+
+    return SourceRequest(volume, ReadOptions(**read), optics["tf"], optics["tf_range"], optics["opacity_unit_distance"])
+
+
+def convert_request(
+    volume: str,
+    *,
+    output: str,
+    fit: dict[str, Any],
+    ply: dict[str, Any],
+    read: dict[str, Any],
+    optics: dict[str, Any],
+    overwrite: bool,
+    report: str | None = None,
+    preview: str | None = None,
+) -> ConvertRequest:
+    """The request that the options of `convert` and `init` add up to."""
+    from vvgt_cli.gaussians import PlyOptions
+    from vvgt_cli.pipeline.convert import ConvertRequest, FitOptions
+
+    return ConvertRequest(
+        source_request(volume, read, optics), output, FitOptions(**fit), PlyOptions(**ply), report, preview, overwrite
+    )

@@ -1,0 +1,50 @@
+"""`vvgt info`."""
+
+from __future__ import annotations
+
+import click
+
+from vvgt_cli.cli.options import common_options, read_options
+from vvgt_cli.progress import Console
+
+
+@click.command("info", short_help="What a volume, transfer function, view set or .ply holds.")
+@click.argument("file")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of lines.")
+@read_options
+@common_options
+def command(file: str, as_json: bool, read: dict, console: Console) -> None:
+    """Say what FILE holds, found out from its content: a volume, a transfer function, a view set
+    (transforms.json) or a .ply of Gaussians.
+
+    \b
+    Examples:
+      vvgt info example:frog
+      vvgt info frog.ply --json | jq .gaussians
+    """
+    from vvgt_cli.pipeline.inspect import inspect
+    from vvgt_cli.pipeline.record import plain
+    from vvgt_cli.volume.options import ReadOptions
+
+    facts = plain(inspect(file, ReadOptions(**read)))
+    if as_json:
+        import json
+
+        click.echo(json.dumps(facts, indent=2, allow_nan=False))
+        return
+    width = max(map(len, facts)) + 2
+    for key, value in facts.items():
+        click.echo(f"{key:<{width}}{_text(value)}")
+
+
+def _text(value: object) -> str:
+    """A value as a line shows it."""
+    if isinstance(value, list):
+        return " ".join(map(_text, value)) if value else "-"
+    if isinstance(value, dict):
+        return ", ".join(f"{key} {_text(item)}" for key, item in value.items()) or "-"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    return "-" if value is None else str(value)

@@ -1,0 +1,37 @@
+"""`vvgt init`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import click
+
+from vvgt_cli.cli.fit import fit_options, ply_options
+from vvgt_cli.cli.options import common_options, overwrite_option, read_options, tf_options
+from vvgt_cli.progress import Console
+
+
+@click.command("init", short_help="The closed form alone: no image is rendered.")
+@click.argument("volume")
+@click.option("-o", "--output", required=True, metavar="OUT.ply", help="File to write; - is standard output.")
+@fit_options
+@ply_options
+@tf_options
+@read_options
+@click.option("--report", metavar="R.json", help="Write the times of every stage as JSON; - is standard output.")
+@overwrite_option
+@common_options
+def command(volume: str, console: Console, **options: Any) -> None:
+    """Turn VOLUME into Gaussians in closed form, without rendering an image.
+
+    The first stage of 'vvgt convert', for a quick look or as the start of an optimisation elsewhere. What
+    'convert' does beyond it: colours and masses mended by views of the volume, and a score.
+
+    \b
+    Example:
+      vvgt init example:frog -o frog-init.ply --max-gaussians 20000
+    """
+    from vvgt_cli.cli.fit import convert_request
+    from vvgt_cli.pipeline.convert import initialise_only
+
+    initialise_only(convert_request(volume, **options), console)

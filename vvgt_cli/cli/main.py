@@ -1,0 +1,113 @@
+"""`vvgt`: the group of commands, and the one place where errors become a line and an exit status."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+import traceback
+from collections.abc import Sequence
+
+import click
+
+from vvgt_cli import __version__
+from vvgt_cli.errors import VvgtError
+
+COMMANDS = {
+    "convert": "vvgt_cli.cli.convert",
+    "init": "vvgt_cli.cli.init",
+    "render": "vvgt_cli.cli.render",
+    "evaluate": "vvgt_cli.cli.evaluate",
+    "info": "vvgt_cli.cli.info",
+    "tf": "vvgt_cli.cli.tf",
+}
+INTERRUPTED = 130  # 128 + SIGINT, as shells report it
+BROKEN_PIPE = 141  # 128 + SIGPIPE
+DEBUG = "VVGT_TRACEBACK"
+
+
+class LazyGroup(click.Group):
+    """Imports a subcommand's module when it is asked for."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in COMMANDS:
+            return None
+        return importlib.import_module(COMMANDS[cmd_name]).command
+
+
+@click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, "-V", "--version", prog_name="vvgt", message="%(prog)s %(version)s")
+def cli() -> None:
+    """Turn a scientific volume and a transfer function into a 3D Gaussian Splatting .ply.
+
+    Standard output carries data, standard error the talk; "-" stands for either stream where a file
+    is asked for. No file is overwritten without --overwrite. Exit status: 0 done, 1 a file or its
+    data is not what it must be, 2 the call itself is wrong, 130 interrupted.
+    """
+
+
+def _fail(message: str, code: int) -> int:
+    print(f"vvgt: error: {' '.join(message.split())}", file=sys.stderr)
+    return code
+
+
+def _usage(error: click.ClickException) -> int:
+    context = getattr(error, "ctx", None)
+    hint = f" (see '{context.command_path} --help')" if context else ""
+    return _fail(error.format_message() + hint, error.exit_code)
+
+
+def _os_error(error: OSError) -> str:
+    what = error.strerror or str(error) or type(error).__name__
+    return f"{error.filename}: {what}" if error.filename else what
+
+
+def _silence_stdout() -> None:
+    """Keep the interpreter from flushing into a closed pipe at exit."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def run(args: Sequence[str] | None = None) -> int:
+    """Run a command line and return its exit status; every error is one line on standard error."""
+    try:
+        cli.main(args=list(args) if args is not None else None, prog_name="vvgt", standalone_mode=False)
+        sys.stdout.flush()
+        return 0
+    except BaseException as error:
+        if os.environ.get(DEBUG):
+            traceback.print_exc()
+        return _status(error)
+
+
+def _status(error: BaseException) -> int:
+    if isinstance(error, click.exceptions.NoArgsIsHelpError):  # a call without a command
+        print(error.format_message(), file=sys.stderr)
+        return error.exit_code
+    if isinstance(error, click.ClickException):
+        return _usage(error)
+    if isinstance(error, VvgtError):
+        return _fail(str(error), error.exit_code)
+    if isinstance(error, BrokenPipeError):
+        _silence_stdout()
+        return BROKEN_PIPE
+    if isinstance(error, OSError):
+        return _fail(_os_error(error), 1)
+    if isinstance(error, MemoryError):
+        return _fail("out of memory: try fewer Gaussians, a smaller --size, or a smaller volume", 1)
+    if isinstance(error, KeyboardInterrupt | click.Abort):
+        return _fail("interrupted", INTERRUPTED)
+    if isinstance(error, SystemExit):
+        return error.code if isinstance(error.code, int) else 1
+    return _fail(f"internal: {type(error).__name__}: {error} (a bug; {DEBUG}=1 shows where)", 1)
+
+
+def main() -> None:
+    """Entry point of the `vvgt` command."""
+    sys.exit(run())
+
+
+if __name__ == "__main__":
+    main()

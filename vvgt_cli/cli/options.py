@@ -1,0 +1,157 @@
+"""Options that several commands share, each defined once."""
+
+from __future__ import annotations
+
+import functools
+import os
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import click
+
+from vvgt_cli.progress import Console
+
+Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
+THREAD_VARIABLES = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "SLURM_CPUS_PER_TASK")
+
+
+def group(name: str, **options: Decorator) -> Decorator:
+    """Several options as one keyword argument, a dict by option name.
+
+    Keeps commands from carrying a dozen parameters: ``group("read", dims=click.option(...))`` calls the
+    command with ``read={"dims": ...}``.
+    """
+
+    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
+        @functools.wraps(function)
+        def wrapper(*args: Any, **kwargs: Any) -> Any:
+            kwargs[name] = {key: kwargs.pop(key) for key in options}
+            return function(*args, **kwargs)
+
+        decorated: Callable[..., Any] = wrapper
+        for option in reversed(options.values()):
+            decorated = option(decorated)
+        return decorated
+
+    return decorate
+
+
+def _unit_distance(ctx: click.Context, param: click.Parameter, value: str | None) -> str | None:
+    """A positive number, or one of the two names."""
+    if value is None or value in ("paraview", "mean-spacing"):
+        return value
+    try:
+        number = float(value)
+    except ValueError:
+        number = 0.0
+    if not 0 < number < float("inf"):
+        raise click.BadParameter(f"{value!r}: expected a length > 0, 'paraview' or 'mean-spacing'")
+    return value
+
+
+def _tf_range(ctx: click.Context, param: click.Parameter, value: str) -> str:
+    """'data', 'rescale' or LO,HI with LO < HI."""
+    if value in ("data", "rescale"):
+        return value
+    try:
+        lo, hi = (float(word) for word in value.split(","))
+        good = float("-inf") < lo < hi < float("inf")
+    except ValueError:
+        good = False
+    if not good:
+        raise click.BadParameter(f"{value!r}: expected 'data', 'rescale', or two numbers LO,HI with LO < HI")
+    return value
+
+
+def _component(ctx: click.Context, param: click.Parameter, value: str | None) -> int | str | None:
+    if value is None or value == "magnitude":
+        return value
+    if not (value.isascii() and value.isdecimal()):
+        raise click.BadParameter(f"{value!r}: expected a component's number from 0, or 'magnitude'")
+    return int(value)
+
+
+read_options = group(
+    "read",
+    dims=click.option("--dims", nargs=3, type=click.IntRange(1), metavar="X Y Z", help="Voxels of a raw file."),
+    dtype=click.option("--dtype", metavar="TYPE", help="Type of a raw file's values: uint8, int16, float32, ..."),
+    byte_order=click.option("--byte-order", type=click.Choice(["little", "big"]), help="Of a raw file."),
+    header_bytes=click.option(
+        "--header-bytes", type=click.IntRange(0), default=0, metavar="N", help="Bytes before a raw file's values."
+    ),
+    spacing=click.option(
+        "--spacing", nargs=3, type=float, metavar="X Y Z", help="Voxel edges, in place of the file's."
+    ),
+    array=click.option("--array", metavar="NAME", help="Which array, where the file holds several."),
+    component=click.option(
+        "--component", metavar="N|magnitude", callback=_component, help="Which component of a vector array."
+    ),
+)
+
+tf_range_option = click.option(
+    "--tf-range", default="data", show_default=True, metavar="data|rescale|LO,HI", callback=_tf_range,
+    help="Where the function's nodes lie: at their own data values, stretched to the data's range, or to LO,HI.",
+)  # fmt: skip
+
+tf_options = group(
+    "optics",
+    tf=click.option(
+        "--tf", metavar="TF",
+        help="Transfer function: a file, or a matplotlib colour map's name. Default: from the histogram.",
+    ),
+    tf_range=tf_range_option,
+    opacity_unit_distance=click.option(
+        "--opacity-unit-distance", metavar="LENGTH|paraview|mean-spacing", callback=_unit_distance,
+        help="Distance that the function's opacity refers to. Default: the function's own, else paraview.",
+    ),
+)  # fmt: skip
+
+overwrite_option = click.option("--overwrite", is_flag=True, help="Replace files that exist.")
+
+
+def default_threads() -> int:
+    """Threads without `--threads`: the first of `THREAD_VARIABLES` that holds a number, else the CPUs we may use."""
+    for variable in THREAD_VARIABLES:
+        value = os.environ.get(variable, "").split(",")[0].strip()
+        if value.isascii() and value.isdecimal() and int(value) > 0:
+            return int(value)
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def set_threads(count: int) -> None:
+    """Let the kernels run on ``count`` threads; before numba is imported where that is still possible."""
+    if "numba" in sys.modules:
+        import numba
+        from numba.core import config
+
+        numba.set_num_threads(min(count, config.NUMBA_NUM_THREADS))
+        return
+    os.environ["NUMBA_NUM_THREADS"] = str(count)
+    os.environ["OMP_NUM_THREADS"] = str(count)
+
+
+def _threads(ctx: click.Context, param: click.Parameter, value: int | None) -> None:
+    if not ctx.resilient_parsing:
+        set_threads(value or default_threads())
+
+
+def common_options(function: Callable[..., Any]) -> Callable[..., Any]:
+    """``--threads`` and ``--quiet``; the command gets a ``console``."""
+
+    @click.option(
+        "--threads",
+        type=click.IntRange(1, 1024),
+        metavar="N",
+        callback=_threads,
+        expose_value=False,
+        help="CPU threads. Default: OMP_NUM_THREADS, SLURM_CPUS_PER_TASK, or all that may be used.",
+    )
+    @click.option("-q", "--quiet", is_flag=True, help="Say nothing on standard error but errors.")
+    @functools.wraps(function)
+    def wrapper(*args: Any, quiet: bool, **kwargs: Any) -> Any:
+        return function(*args, console=Console(quiet), **kwargs)  # fmt: skip
+
+    return wrapper

@@ -1,0 +1,50 @@
+"""`vvgt render`."""
+
+from __future__ import annotations
+
+import click
+
+from vvgt_cli.cli.options import common_options, overwrite_option
+from vvgt_cli.progress import Console
+
+
+@click.command("render", short_help="Pictures of a .ply.")
+@click.argument("ply", metavar="OUT.ply")
+@click.option("--camera", metavar="FILE", help="Views of a transforms.json (in the unit frame).")
+@click.option("--orbit", type=click.IntRange(1, 10_000), metavar="N", help="N views on a circle around +z.")
+@click.option("--size", type=click.IntRange(1, 16384), metavar="PX", help="Image height. Default: the file's, or 400.")
+@click.option("-o", "--output", required=True, metavar="DIR", help="Directory for the images; made if it is not there.")
+@click.option("--exr", is_flag=True, help="Write float EXR (premultiplied RGBA) beside each PNG.")
+@click.option(
+    "--background", type=float, nargs=3, metavar="R G B", help="Put the PNG over this colour. Default: transparent."
+)
+@overwrite_option
+@common_options
+def command(
+    ply: str,
+    camera: str | None,
+    orbit: int | None,
+    size: int | None,
+    output: str,
+    exr: bool,
+    background: tuple[float, float, float] | None,
+    overwrite: bool,
+    console: Console,
+) -> None:
+    """Render the Gaussians of OUT.ply as the standard viewers do, one PNG a view, and a transforms.json.
+
+    OUT.ply may be "-" for standard input. Give the views with --camera or with --orbit.
+
+    \b
+    Examples:
+      vvgt render frog.ply --orbit 36 --size 800 -o turn
+      vvgt convert example:frog -o - | vvgt render - --orbit 8 -o turn
+    """
+    from vvgt_cli.errors import UsageError
+    from vvgt_cli.pipeline.render import RenderRequest, render_file
+
+    if (camera is None) == (orbit is None):
+        raise UsageError("give the views with either --camera FILE or --orbit N")
+    if background is not None and not all(0 <= c <= 1 for c in background):
+        raise UsageError(f"--background {' '.join(map(str, background))}: expected three numbers in [0, 1]")
+    render_file(RenderRequest(ply, output, camera, orbit, size, exr, background, overwrite), console)

@@ -1,0 +1,1 @@
+"""Whole runs: which stages a scene needs, what each took, and what came of it."""

@@ -1,0 +1,254 @@
+"""`convert` and `init`: volume and transfer function in, `.ply` out, stage by stage."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vvgt_cli.cameras import default_views
+from vvgt_cli.errors import DataError
+from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored, write_ply
+from vvgt_cli.pipeline.outputs import STDOUT, Output, check_outputs, write_file, write_text
+from vvgt_cli.pipeline.record import ConversionReport, Run
+from vvgt_cli.pipeline.source import Source, SourceRequest, load
+from vvgt_cli.progress import Console
+
+if TYPE_CHECKING:
+    from vvgt_cli.cameras import Camera
+    from vvgt_cli.dvr import Scene
+    from vvgt_cli.metrics import Scores
+
+PREVIEW_ROWS = 3  # test views in the preview
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """What the Gaussians are made for.
+
+    Attributes:
+        max_gaussians: budget K.
+        size: pixels along an image's edge that the file is made for.
+        init: "vbm", "wavelet" or "uniform".
+        seed: of whatever draws random numbers.
+    """
+
+    max_gaussians: int = 100_000
+    size: int = 400
+    init: str = "vbm"
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class ConvertRequest:
+    """A whole conversion.
+
+    Attributes:
+        source: what to read.
+        output: `.ply` to write, "-" for standard output.
+        fit: what the Gaussians are made for.
+        ply: how the file is written; the unit frame and distance are filled in from the source.
+        report: JSON to write, "-" for standard output, None for none.
+        preview: PNG to write (reference, ours, difference of a few test views), None for none.
+        overwrite: replace files that exist.
+    """
+
+    source: SourceRequest
+    output: str
+    fit: FitOptions = field(default_factory=FitOptions)
+    ply: PlyOptions = field(default_factory=PlyOptions)
+    report: str | None = None
+    preview: str | None = None
+    overwrite: bool = False
+
+    def outputs(self) -> list[Output]:
+        """Everything that will be written."""
+        outputs = [Output("-o", self.output, (".ply",))]
+        if self.report:
+            outputs.append(Output("--report", self.report, (".json",), binary=False))
+        if self.preview:
+            outputs.append(Output("--preview", self.preview, (".png",)))
+        return outputs
+
+
+def convert(request: ConvertRequest, console: Console | None = None) -> ConversionReport:
+    """Volume to `.ply`: closed form, then what the training views can mend, scored on the test views.
+
+    Raises:
+        UsageError: an output that may not be written; found before anything is read.
+        DataError: input that is not what it must be, or a scene that shows nothing.
+    """
+    run = Run(console or Console(), ConversionReport("convert"))
+    source, scene = _begin(run, request)
+    gaussians = _closed_form(run, scene, request.fit)
+    gaussians = _back_project(run, scene, gaussians, request.fit)
+    gaussians = as_stored(gaussians)  # what is scored is what the file holds
+    scores = _score(run, scene, gaussians, request)
+    run.report.scores = asdict(scores)
+    return _finish(run, request, source, gaussians)
+
+
+def initialise_only(request: ConvertRequest, console: Console | None = None) -> ConversionReport:
+    """Volume to `.ply` by the closed form alone: no image is rendered.
+
+    Raises:
+        UsageError, DataError: as `convert`.
+    """
+    run = Run(console or Console(), ConversionReport("init"))
+    source, scene = _begin(run, request)
+    gaussians = _closed_form(run, scene, request.fit)
+    return _finish(run, request, source, as_stored(gaussians))
+
+
+def _begin(run: Run, request: ConvertRequest) -> tuple[Source, Scene]:
+    """Check the outputs, read, and lay the volume out for the kernels."""
+    check_outputs(request.outputs(), [request.source.volume, request.source.tf], request.overwrite)
+    with run.stage("read") as stage:
+        source = load(request.source)
+        stage.note = describe_source(source)
+    with run.stage("scene"):
+        scene = source.scene()
+    run.report.volume = volume_record(source)
+    run.report.transfer_function = tf_record(source, request.source)
+    run.report.options = asdict(request.fit) | {
+        "frame": request.ply.frame, "up": request.ply.up, "sh_degree": request.ply.sh_degree,
+    }  # fmt: skip
+    return source, scene
+
+
+def describe_source(source: Source) -> str:
+    """One line: grid, type, values, function, unit distance."""
+    volume, numbers = source.volume, source.statistics
+    grid = " x ".join(map(str, volume.dims))
+    holes = [f"{n} {what} (transparent)" for n, what in ((numbers.nan_count, "NaN"), (numbers.inf_count, "inf")) if n]
+    values = ", ".join([f"values {numbers.lo:g} to {numbers.hi:g}", *holes])
+    distance = f"opacity per {source.unit_distance:g} ({source.unit_label})"
+    return f"{volume.name}: {grid} {volume.data.dtype.name}, {values}; {source.tf.name}: {distance}"
+
+
+def volume_record(source: Source) -> dict[str, Any]:
+    """The volume as reports show it."""
+    volume, numbers = source.volume, source.statistics
+    return {
+        "name": volume.name,
+        "dims": volume.dims,
+        "dtype": volume.data.dtype.name,
+        "spacing": volume.spacing,
+        "range": (numbers.lo, numbers.hi),
+        "nan": numbers.nan_count,
+        "inf": numbers.inf_count,
+    }
+
+
+def tf_record(source: Source, request: SourceRequest) -> dict[str, Any]:
+    """The transfer function as reports show it."""
+    return {
+        "name": source.tf.name,
+        "given": request.tf is not None,
+        "tf_range": request.tf_range,
+        "nodes": source.tf.node_range(),
+        "unit_distance": source.unit_distance,
+        "unit_distance_label": source.unit_label,
+    }
+
+
+def _closed_form(run: Run, scene: Scene, fit: FitOptions) -> Gaussians:
+    from vvgt_cli.vbm import VbmOptions, initialise
+
+    options = VbmOptions(max_gaussians=fit.max_gaussians, size=fit.size, method=fit.init, seed=fit.seed)
+    with run.stage("closed form") as stage:
+        gaussians = initialise(scene, options, progress=run.console.bar("closed form"))
+        if not len(gaussians):
+            raise DataError(
+                f"{scene.volume.name} under {scene.tf.name}: nothing visible from any view; "
+                "expected opacity above 0 where the data are (try 'vvgt tf show TF -o tf.png --volume VOLUME')"
+            )
+        stage.note = f"{len(gaussians)} Gaussians ({fit.init})"
+    return gaussians
+
+
+def _views(run: Run, scene: Scene, cameras: list[Camera], label: str) -> np.ndarray:
+    """Reference images (n, h, w, 4) of the scene."""
+    from vvgt_cli.dvr import RenderSettings, render_views
+
+    return render_views(scene, cameras, RenderSettings(), progress=run.console.bar(label))
+
+
+def _splats(gaussians: Gaussians, cameras: list[Camera]) -> np.ndarray:
+    from vvgt_cli.splat import render
+
+    return np.stack([render(gaussians, camera) for camera in cameras])
+
+
+def _back_project(run: Run, scene: Scene, gaussians: Gaussians, fit: FitOptions) -> Gaussians:
+    """Colour and mass from the training views, kept if the check views agree."""
+    from vvgt_cli.metrics import score_views
+    from vvgt_cli.vbm import backproject
+
+    train, check = default_views("train", size=fit.size), default_views("check", size=fit.size)
+    with run.stage("views") as stage:
+        images = _views(run, scene, train + check, "views")
+        stage.note = f"{len(train)} to fit to, {len(check)} to check by, {fit.size} px"
+    reference = images[len(train) :]
+    with run.stage("back-projection") as stage:
+        before = score_views(reference, _splats(gaussians, check)).psnr
+        mended = backproject(gaussians, train, images[: len(train)])
+        after = score_views(reference, _splats(mended, check)).psnr
+        stage.kept = after > before
+        stage.note = f"from {before:.2f} dB"
+        stage.psnr = after
+    return mended if stage.kept else gaussians
+
+
+def _score(run: Run, scene: Scene, gaussians: Gaussians, request: ConvertRequest) -> Scores:
+    """Scores on the test views, and the preview."""
+    from vvgt_cli.metrics import score_views
+
+    cameras = default_views("test", size=request.fit.size)
+    with run.stage("test views") as stage:
+        reference = _views(run, scene, cameras, "test views")
+        ours = _splats(gaussians, cameras)
+        scores = score_views(reference, ours)
+        stage.note = f"PSNR {scores.psnr:.2f} dB over {len(cameras)} views, {request.fit.size} px"
+    if request.preview:
+        rows = np.linspace(0, len(cameras) - 1, PREVIEW_ROWS).round().astype(int)
+        write_preview(request.preview, reference[rows], ours[rows], request.overwrite)
+    return scores
+
+
+def write_preview(path: str, reference: np.ndarray, ours: np.ndarray, overwrite: bool) -> None:
+    """A PNG with a row a view: reference, ours, difference; images (n, h, w, 4) premultiplied."""
+    from vvgt_cli.images import side_by_side, write_png
+
+    sheet = np.concatenate([side_by_side(a, b) for a, b in zip(reference, ours, strict=True)])
+    write_file(path, overwrite, lambda temporary: write_png(temporary, sheet))
+
+
+def _finish(run: Run, request: ConvertRequest, source: Source, gaussians: Gaussians) -> ConversionReport:
+    """Write the file, then the report."""
+    ply = replace(
+        request.ply,
+        unit_frame=source.volume.unit_frame(),
+        unit_distance=source.unit_distance,
+        unit_distance_label=source.unit_label,
+    )
+    report = run.report
+    with run.stage("write") as stage:
+        if request.output == STDOUT:
+            report.bytes = write_ply(sys.stdout.buffer, gaussians, ply)
+            sys.stdout.buffer.flush()
+        else:
+
+            def write(temporary: Path) -> None:
+                report.bytes = write_ply(temporary, gaussians, ply)
+
+            write_file(request.output, request.overwrite, write)
+        report.gaussians = len(gaussians)
+        stage.note = f"{request.output}: {len(gaussians)} Gaussians, {report.bytes / 1e6:.1f} MB"
+    run.finish()
+    if request.report:
+        write_text(request.report, report.to_json(), request.overwrite)
+    return report

@@ -1,0 +1,136 @@
+"""`evaluate`: a `.ply` against the volume it was made from, at several sizes, on the test views."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vvgt_cli.cameras import default_views
+from vvgt_cli.errors import UsageError
+from vvgt_cli.gaussians import PlyHeader
+from vvgt_cli.pipeline.convert import describe_source, tf_record, volume_record
+from vvgt_cli.pipeline.record import ConversionReport, Run, Stage, document
+from vvgt_cli.pipeline.render import STDIN, open_gaussians
+from vvgt_cli.pipeline.source import SourceRequest, load
+from vvgt_cli.progress import Console
+
+if TYPE_CHECKING:
+    from vvgt_cli.dvr import Scene
+
+
+@dataclass(frozen=True)
+class EvaluateRequest:
+    """What to score.
+
+    Attributes:
+        ply: Gaussians, "-" for standard input.
+        source: the volume and the function that they were made from.
+        size: pixels along an image's edge at 1x.
+        scales: multiples of the size to score at.
+    """
+
+    ply: str
+    source: SourceRequest
+    size: int = 400
+    scales: tuple[int, ...] = (1, 2, 4)
+
+
+@dataclass
+class Evaluation:
+    """Scores by scale, with what they were measured on; `to_json` is documented in docs/report.md."""
+
+    gaussians: int
+    size: int
+    views: int
+    volume: dict[str, Any]
+    transfer_function: dict[str, Any]
+    reference_psnr: float
+    scores: dict[str, dict[str, Any]] = field(default_factory=dict)
+    stages: list[Stage] = field(default_factory=list)
+    seconds: float = 0.0
+
+    def to_json(self) -> str:
+        """JSON with machine and versions."""
+        return document("vvgt-evaluation", asdict(self))
+
+    def table(self) -> str:
+        """The scores as text: a row a number, a column a scale."""
+        scales = list(self.scores)
+        rows = [("", *(f"{scale} ({self.size * int(scale[:-1])} px)" for scale in scales))]
+        for key in next(iter(self.scores.values())):
+            values = [self.scores[scale][key] for scale in scales]
+            rows.append((key.replace("_", " "), *map(_cell, values)))
+        width = max(len(row[0]) for row in rows) + 2
+        lines = [f"{row[0]:<{width}}" + "".join(f"{cell:>16}" for cell in row[1:]) for row in rows]
+        lines.append(f"{'reference against itself, PSNR':<{width}}{_cell(self.reference_psnr)} dB, view 1 at 1x")
+        return "\n".join(line.rstrip() for line in lines) + "\n"
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.4f}" if isinstance(value, float) else str(value)
+
+
+def _request(request: EvaluateRequest, header: PlyHeader) -> SourceRequest:
+    """The source, with the file's own unit distance where none is asked for."""
+    if request.source.unit_distance is not None or header.unit_distance is None:
+        return request.source
+    return replace(request.source, unit_distance=repr(header.unit_distance))
+
+
+def evaluate(request: EvaluateRequest, console: Console | None = None) -> Evaluation:
+    """Score a `.ply` against its volume.
+
+    Raises:
+        UsageError, DataError: inputs that are not what they must be.
+    """
+    if request.ply == STDIN == request.source.volume:
+        raise UsageError("both OUT.ply and --volume are '-': standard input holds one of them")
+    run = Run(console or Console(), ConversionReport("evaluate"))
+    with run.stage("read") as stage:
+        gaussians, header = open_gaussians(request.ply, run.console)
+        source_request = _request(request, header)
+        source = load(source_request)
+        stage.note = f"{len(gaussians)} Gaussians; {describe_source(source)}"
+    with run.stage("scene"):
+        scene = source.scene()
+    with run.stage("reference") as stage:
+        own = _reference_psnr(scene, request.size)
+        stage.note = f"its own error {own:.1f} dB"
+    evaluation = Evaluation(
+        len(gaussians), request.size, len(default_views("test")), volume_record(source),
+        tf_record(source, source_request), own,
+    )  # fmt: skip
+    for scale in sorted(set(request.scales)):
+        with run.stage(f"test views {scale}x") as stage:
+            scores = _scores(run, scene, gaussians, request.size * scale, scale)
+            evaluation.scores[f"{scale}x"] = scores
+            stage.note = f"PSNR {scores['psnr']:.2f} dB"
+    evaluation.stages = run.report.stages
+    evaluation.seconds = run.finish().seconds
+    return evaluation
+
+
+def _scores(run: Run, scene: Scene, gaussians: Any, size: int, scale: int) -> dict[str, Any]:
+    """Every number of docs/conventions.md, "Units of a report", at one size."""
+    from vvgt_cli.dvr import REFERENCE, render_views
+    from vvgt_cli.metrics import score_views
+    from vvgt_cli.splat import render
+
+    cameras = default_views("test", size=size)
+    reference = render_views(scene, cameras, REFERENCE, progress=run.console.bar(f"test views {scale}x"))
+    return asdict(score_views(reference, np.stack([render(gaussians, camera) for camera in cameras])))
+
+
+def _reference_psnr(scene: Scene, size: int) -> float:
+    """PSNR of the reference's first test view against half the step and twice the rays along a pixel's edge."""
+    from vvgt_cli.dvr import REFERENCE, render_view
+    from vvgt_cli.metrics import score_views
+
+    camera = default_views("test", size=size)[0]
+    finer = replace(REFERENCE, step=REFERENCE.step / 2, samples=2 * REFERENCE.samples)
+    images = [render_view(scene, camera, settings)[None] for settings in (finer, REFERENCE)]
+    return float(score_views(images[0], images[1]).psnr)

@@ -1,0 +1,91 @@
+"""What a file holds, for `vvgt info`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+from vvgt_cli.cameras.files import read_cameras
+from vvgt_cli.errors import DataError
+from vvgt_cli.gaussians import describe, read_ply
+from vvgt_cli.pipeline.outputs import STDOUT
+from vvgt_cli.volume.options import ReadOptions
+
+_HEAD = 65536  # bytes that tell a view set from a transfer function
+
+
+def inspect(file: str, read: ReadOptions) -> dict[str, Any]:
+    """Facts about a volume, a transfer function, a view set or a `.ply`, by key; the first key is "kind".
+
+    Raises:
+        DataError, UsageError: as the reader of that kind.
+    """
+    if file == STDOUT or file.startswith("example:"):
+        return _volume(file, read)
+    path = Path(file)
+    if path.is_dir():
+        raise DataError(f"{file}: is a directory; expected a volume, a transfer function, a view set or a .ply")
+    if not path.exists():
+        raise DataError(f"{file}: no such file; expected a volume, a transfer function, a view set or a .ply")
+    with path.open("rb") as stream:
+        head = stream.read(_HEAD)
+    if head.startswith((b"ply\n", b"ply\r")):
+        return {"kind": "gaussians", "name": path.name, **describe(*read_ply(path))}
+    if path.suffix.lower() == ".json" or head.lstrip()[:1] in (b"{", b"["):
+        if b'"frames"' in head:
+            return _views(path)
+        return _transfer_function(file)
+    return _volume(file, read)
+
+
+def _views(path: Path) -> dict[str, Any]:
+    cameras = read_cameras(path)
+    first = cameras[0]
+    return {
+        "kind": "views",
+        "name": path.name,
+        "views": len(cameras),
+        "sizes": sorted({f"{c.width} x {c.height}" for c in cameras}),
+        "focal": [first.fx, first.fy],
+        "distance": [
+            min(float((c.position**2).sum() ** 0.5) for c in cameras),
+            max(float((c.position**2).sum() ** 0.5) for c in cameras),
+        ],
+    }
+
+
+def _transfer_function(file: str) -> dict[str, Any]:
+    from vvgt_cli.transfer import read_transfer_function
+
+    tf = read_transfer_function(file)
+    lo, hi = tf.node_range()
+    return {"kind": "transfer function", "name": tf.name, "nodes": [lo, hi]}
+
+
+def _volume(file: str, read: ReadOptions) -> dict[str, Any]:
+    from vvgt_cli.synth.sources import open_volume
+    from vvgt_cli.transfer import unit_distance
+    from vvgt_cli.volume.statistics import statistics
+
+    volume = open_volume(file, read)
+    numbers = statistics(volume)
+    return {
+        "kind": "volume",
+        "name": volume.name,
+        "dims": volume.dims,
+        "dtype": volume.data.dtype.name,
+        "byte_order": sys.byteorder
+        if volume.data.dtype.isnative
+        else {"little": "big", "big": "little"}[sys.byteorder],
+        "bytes": volume.data.nbytes,
+        "spacing": volume.spacing,
+        "origin": volume.origin,
+        "direction": volume.direction,
+        "extent": volume.extent,
+        "scaling": [volume.slope, volume.intercept],
+        "range": [numbers.lo, numbers.hi],
+        "nan": numbers.nan_count,
+        "inf": numbers.inf_count,
+        "unit_distance": {name: unit_distance(name, volume, None)[0] for name in ("paraview", "mean-spacing")},
+    }

@@ -1,0 +1,112 @@
+"""`render`: pictures of a `.ply`, and the view set that they were made with."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from vvgt_cli.cameras import Camera, orbit_views
+from vvgt_cli.cameras.files import read_cameras, transforms_json
+from vvgt_cli.cameras.sets import SIZE
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.gaussians import Gaussians, PlyHeader, in_unit_frame, read_ply
+from vvgt_cli.pipeline.outputs import STDOUT, write_file, write_text
+from vvgt_cli.pipeline.record import ConversionReport, Run
+from vvgt_cli.progress import Console
+
+STDIN = STDOUT
+VIEWS_FILE = "transforms.json"
+
+
+@dataclass(frozen=True)
+class RenderRequest:
+    """Pictures to make.
+
+    Attributes:
+        ply: Gaussians, "-" for standard input.
+        output: directory for the images.
+        camera: view-set file, or None.
+        orbit: number of views on a circle, or None; one of the two is given.
+        size: image height in pixels, None for the view set's own.
+        exr: write EXR too.
+        background: RGB in [0, 1] that PNGs stand on, None for transparent.
+        overwrite: replace images that exist.
+    """
+
+    ply: str
+    output: str
+    camera: str | None = None
+    orbit: int | None = None
+    size: int | None = None
+    exr: bool = False
+    background: tuple[float, float, float] | None = None
+    overwrite: bool = False
+
+    def cameras(self) -> list[Camera]:
+        """The views asked for."""
+        if self.camera is not None:
+            return read_cameras(self.camera, self.size)
+        return orbit_views(self.orbit or 0, size=self.size or SIZE)
+
+
+def open_gaussians(source: str, console: Console) -> tuple[Gaussians, PlyHeader]:
+    """Read a `.ply` (or standard input) into the unit frame, and say what was left out.
+
+    Raises:
+        DataError: not a 3DGS `.ply`, or one without Gaussians.
+    """
+    gaussians, header = read_ply(sys.stdin.buffer if source == STDIN else source)
+    if not len(gaussians):
+        raise DataError(f"{source}: holds no Gaussians; expected at least one")
+    if header.sh_degree and not header.version:
+        console.say(f"{source}: spherical harmonics of degree {header.sh_degree}; only the base colour is used")
+    return in_unit_frame(gaussians, header), header
+
+
+def _check_directory(request: RenderRequest, names: list[str]) -> None:
+    directory = Path(request.output)
+    if directory.exists() and not directory.is_dir():
+        raise UsageError(f"-o {directory}: is a file; expected a directory for the images")
+    if not directory.parent.is_dir():
+        raise UsageError(f"-o {directory}: no directory {directory.parent}; make it first")
+    if request.overwrite:
+        return
+    for name in names:
+        if (directory / name).exists():
+            raise UsageError(f"-o {directory}: {name} exists; choose another directory or pass --overwrite")
+
+
+def render_file(request: RenderRequest, console: Console | None = None) -> int:
+    """Write one PNG (and EXR) a view and `transforms.json`; returns the number of views.
+
+    Raises:
+        UsageError: an image exists, or the directory cannot be.
+        DataError: a `.ply` or view set that is not one.
+    """
+    from vvgt_cli.images import over, write_exr, write_png
+    from vvgt_cli.splat import render
+
+    console = console or Console()
+    run = Run(console, ConversionReport("render"))
+    cameras = request.cameras()
+    names = [f"{c.name}.png" for c in cameras] + ([f"{c.name}.exr" for c in cameras] if request.exr else [])
+    _check_directory(request, [*names, VIEWS_FILE])
+    with run.stage("read") as stage:
+        gaussians, header = open_gaussians(request.ply, console)
+        stage.note = f"{len(gaussians)} Gaussians, {header.frame} frame"
+    directory = Path(request.output)
+    directory.mkdir(exist_ok=True)
+    with run.stage("render") as stage:
+        bar = console.bar("render")
+        for done, camera in enumerate(cameras, 1):
+            image = render(gaussians, camera)
+            if request.exr:
+                write_file(f"{directory / camera.name}.exr", request.overwrite, lambda p, i=image: write_exr(p, i))
+            shown = image if request.background is None else over(image, request.background)
+            write_file(f"{directory / camera.name}.png", request.overwrite, lambda p, i=shown: write_png(p, i))
+            if bar:
+                bar(done, len(cameras))
+        write_text(str(directory / VIEWS_FILE), transforms_json(cameras), request.overwrite)
+        stage.note = f"{len(cameras)} views of {cameras[0].width} x {cameras[0].height} px in {directory}"
+    return len(cameras)
