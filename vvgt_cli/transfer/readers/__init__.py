@@ -1,0 +1,48 @@
+"""Transfer functions from files and names: `read_transfer_function`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.transfer.function import TransferFunction
+from vvgt_cli.transfer.readers import colormap_name, minimal, paraview
+from vvgt_cli.transfer.readers.fields import load_json
+
+FORMATS = (paraview, minimal)  # each: matches(parsed) -> bool, read(parsed, what, pick) -> TransferFunction
+
+__all__ = ["read_transfer_function"]
+
+
+def read_transfer_function(source: str) -> TransferFunction:
+    """Read a transfer function; the format of a file is told by its content.
+
+    Args:
+        source: path of a ParaView preset (JSON; ``presets.json#Name`` picks one of several) or of our
+            minimal JSON (`vvgt_cli.transfer.readers.minimal`), or a matplotlib colour-map name with an
+            opacity ramp, ``NAME[:LO,HI[:MAX]]`` (`vvgt_cli.transfer.readers.colormap_name`).
+
+    Returns:
+        The function; `vvgt_cli.transfer.resolve.resolve` puts it on the data.
+
+    Raises:
+        DataError: the file is not a transfer function, or a faulty one.
+        UsageError: neither a file nor a colour-map name.
+    """
+    path, pick = Path(source), ""
+    if not path.exists() and "#" in source:
+        head, _, pick = source.rpartition("#")
+        path = Path(head)
+    if path.is_dir():
+        raise UsageError(f"{path} is a folder; expected a transfer-function file or a colour-map name")
+    if not path.exists():
+        if pick or "/" in source or "\\" in source or Path(source).suffix.lower() in (".json", ".xml", ".itf", ".vp"):
+            raise UsageError(f"{path}: no such file; expected a transfer function (ParaView preset JSON, minimal JSON)")
+        return colormap_name.read(source)
+    parsed = load_json(path)
+    for reader in FORMATS:
+        if reader.matches(parsed):
+            return reader.read(parsed, str(path), pick)
+    raise DataError(
+        f"{path}: JSON, but not a transfer function; expected a ParaView preset (RGBPoints) or an object with points"
+    )

@@ -1,0 +1,90 @@
+"""Checked access to parsed JSON: every error names the file and the field."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vvgt_cli.errors import DataError
+
+MAX_BYTES = 16 * 2**20
+
+
+def load_json(path: Path) -> Any:
+    """Parse a UTF-8 JSON file of at most 16 MiB.
+
+    Raises:
+        DataError: too large, not readable, not UTF-8, not JSON.
+    """
+    try:
+        size = path.stat().st_size
+        if size > MAX_BYTES:
+            raise DataError(f"{path}: {size} bytes; expected a transfer function of at most 16 MiB")
+        with path.open("rb") as file:
+            raw = file.read(MAX_BYTES + 1)
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror or error})") from error
+    if len(raw) > MAX_BYTES:
+        raise DataError(f"{path}: more than 16 MiB; expected a transfer function")
+    try:
+        return json.loads(raw.decode("utf-8-sig"))
+    except UnicodeDecodeError as error:
+        raise DataError(
+            f"{path}: not text (byte {error.start} is not UTF-8); expected a JSON transfer function"
+        ) from error
+    except json.JSONDecodeError as error:
+        raise DataError(
+            f"{path}: not JSON (line {error.lineno}, column {error.colno}: {error.msg}); "
+            "expected a ParaView preset or a minimal transfer function"
+        ) from error
+    except (RecursionError, ValueError) as error:  # nested too deep; an integer of thousands of digits
+        raise DataError(f"{path}: JSON that cannot be a transfer function (too deep, or a number too long)") from error
+
+
+def number(what: str, value: Any) -> float:
+    """A finite float, or DataError."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise DataError(f"{what}: {_shown(value)}; expected a number")
+    try:
+        result = float(value)
+    except OverflowError:
+        result = math.inf
+    if not math.isfinite(result):
+        raise DataError(f"{what}: {_shown(value)}; expected a finite number")
+    return result
+
+
+def table(what: str, value: Any, width: int, columns: str) -> np.ndarray:
+    """A flat list of numbers as rows of ``width``, (n, width) float64, n >= 1.
+
+    Raises:
+        DataError: not a list, empty, a length that ``width`` does not divide, an entry that is no finite number.
+    """
+    if not isinstance(value, list) or not value or len(value) % width:
+        found = f"a list of {len(value)}" if isinstance(value, list) else _shown(value)
+        raise DataError(f"{what}: {found}; expected a flat list of {columns}, {width} numbers a node")
+    return np.array([number(f"{what}[{i}]", v) for i, v in enumerate(value)]).reshape(-1, width)
+
+
+def rgb(what: str, value: Any) -> tuple[float, float, float]:
+    """Three numbers in [0, 1], or DataError."""
+    if not isinstance(value, list) or len(value) != 3:
+        raise DataError(f"{what}: {_shown(value)}; expected three numbers in [0, 1]")
+    red, green, blue = (number(what, v) for v in value)
+    if not (0 <= red <= 1 and 0 <= green <= 1 and 0 <= blue <= 1):
+        raise DataError(f"{what}: {_shown(value)}; expected three numbers in [0, 1]")
+    return red, green, blue
+
+
+def named(what: str, error: DataError) -> DataError:
+    """The same error with the file's name in front."""
+    return DataError(f"{what}: {error}")
+
+
+def _shown(value: Any) -> str:
+    text = repr(value) if not isinstance(value, (list, dict)) else json.dumps(value, default=str)
+    return text if len(text) <= 40 else text[:37] + "..."
