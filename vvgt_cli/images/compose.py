@@ -1,0 +1,76 @@
+"""Images over a background, beside each other, and as a sheet."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from vvgt_cli.errors import DataError
+
+BLACK = (0.0, 0.0, 0.0)
+
+
+def over(rgba: np.ndarray, background: float | Sequence[float] | np.ndarray = BLACK) -> np.ndarray:
+    """Premultiplied (..., 4) over a colour, a grey or an image (..., 3) -> (..., 3) float32, not clipped."""
+    rgba = np.asarray(rgba, dtype=np.float32)
+    if rgba.shape[-1:] != (4,):
+        raise DataError(f"image of shape {rgba.shape}; expected four channels, premultiplied RGBA")
+    return rgba[..., :3] + (1 - rgba[..., 3:]) * np.asarray(background, dtype=np.float32)
+
+
+def _rgb(image: np.ndarray, background: Sequence[float]) -> np.ndarray:
+    """(h, w, 3) float32 in [0, 1] of an RGB or premultiplied RGBA image."""
+    image = np.asarray(image, dtype=np.float32)
+    if image.ndim != 3 or image.shape[2] not in (3, 4):
+        raise DataError(f"image of shape {image.shape}; expected (height, width, 3) or (height, width, 4)")
+    return np.clip(over(image, background) if image.shape[2] == 4 else image, 0, 1)
+
+
+def side_by_side(
+    reference: np.ndarray, ours: np.ndarray, gain: float = 8.0, background: Sequence[float] = BLACK
+) -> np.ndarray:
+    """reference | ours | gain x absolute difference, (h, 3 w, 3) float32 in [0, 1].
+
+    Args:
+        reference, ours: (h, w, 3) RGB or (h, w, 4) premultiplied RGBA, of one size.
+        gain: factor of the difference.
+        background: what RGBA images are put over.
+
+    Raises:
+        DataError: shapes that differ or are no images.
+    """
+    left, right = _rgb(reference, background), _rgb(ours, background)
+    if left.shape != right.shape:
+        raise DataError(f"images of {left.shape[:2]} and {right.shape[:2]} pixels; expected the same size")
+    return np.concatenate([left, right, np.clip(gain * np.abs(left - right), 0, 1)], axis=1)
+
+
+def contact_sheet(
+    images: Sequence[np.ndarray], columns: int | None = None, gap: int = 4, background: Sequence[float] = BLACK
+) -> np.ndarray:
+    """Images of one size in rows, ``gap`` pixels apart, (rows, columns) -> (H, W, 3) float32 in [0, 1].
+
+    Args:
+        images: (h, w, 3) RGB or (h, w, 4) premultiplied RGBA each; at least one.
+        columns: images a row; default: the square root of their number, rounded up.
+        background: behind RGBA images, in the gaps and in places left over.
+
+    Raises:
+        DataError: no images, sizes that differ, ``columns`` below 1.
+    """
+    tiles = [_rgb(image, background) for image in images]
+    if not tiles or len({tile.shape for tile in tiles}) != 1:
+        raise DataError(f"{len(tiles)} images of {len({t.shape for t in tiles})} sizes; expected some, of one size")
+    columns = int(np.ceil(np.sqrt(len(tiles)))) if columns is None else columns
+    if columns < 1:
+        raise DataError(f"{columns} columns; expected at least one")
+    columns = min(columns, len(tiles))
+    rows = -(-len(tiles) // columns)
+    height, width, _ = tiles[0].shape
+    sheet = np.empty((rows * (height + gap) - gap, columns * (width + gap) - gap, 3), dtype=np.float32)
+    sheet[:] = background
+    for i, tile in enumerate(tiles):
+        y, x = i // columns * (height + gap), i % columns * (width + gap)
+        sheet[y : y + height, x : x + width] = tile
+    return sheet
