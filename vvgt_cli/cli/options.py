@@ -37,33 +37,6 @@ def group(name: str, **options: Decorator) -> Decorator:
     return decorate
 
 
-def _unit_distance(ctx: click.Context, param: click.Parameter, value: str | None) -> str | None:
-    """A positive number, or one of the two names."""
-    if value is None or value in ("paraview", "mean-spacing"):
-        return value
-    try:
-        number = float(value)
-    except ValueError:
-        number = 0.0
-    if not 0 < number < float("inf"):
-        raise click.BadParameter(f"{value!r}: expected a length > 0, 'paraview' or 'mean-spacing'")
-    return value
-
-
-def _tf_range(ctx: click.Context, param: click.Parameter, value: str) -> str:
-    """'data', 'rescale' or LO,HI with LO < HI."""
-    if value in ("data", "rescale"):
-        return value
-    try:
-        lo, hi = (float(word) for word in value.split(","))
-        good = float("-inf") < lo < hi < float("inf")
-    except ValueError:
-        good = False
-    if not good:
-        raise click.BadParameter(f"{value!r}: expected 'data', 'rescale', or two numbers LO,HI with LO < HI")
-    return value
-
-
 def _component(ctx: click.Context, param: click.Parameter, value: str | None) -> int | str | None:
     if value is None or value == "magnitude":
         return value
@@ -90,7 +63,7 @@ read_options = group(
 )
 
 tf_range_option = click.option(
-    "--tf-range", default="data", show_default=True, metavar="data|rescale|LO,HI", callback=_tf_range,
+    "--tf-range", default="data", show_default=True, metavar="data|rescale|LO,HI",
     help="Where the function's nodes lie: at their own data values, stretched to the data's range, or to LO,HI.",
 )  # fmt: skip
 
@@ -102,7 +75,7 @@ tf_options = group(
     ),
     tf_range=tf_range_option,
     opacity_unit_distance=click.option(
-        "--opacity-unit-distance", metavar="LENGTH|paraview|mean-spacing", callback=_unit_distance,
+        "--opacity-unit-distance", metavar="LENGTH|paraview|mean-spacing",
         help="Distance that the function's opacity refers to. Default: the function's own, else paraview.",
     ),
 )  # fmt: skip

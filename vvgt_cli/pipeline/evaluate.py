@@ -13,7 +13,7 @@ from vvgt_cli.gaussians import PlyHeader
 from vvgt_cli.pipeline.convert import describe_source, tf_record, volume_record
 from vvgt_cli.pipeline.record import ConversionReport, Run, Stage, document
 from vvgt_cli.pipeline.render import STDIN, open_gaussians
-from vvgt_cli.pipeline.source import SourceRequest, load
+from vvgt_cli.pipeline.source import Source, SourceRequest, load
 from vvgt_cli.progress import Console
 
 if TYPE_CHECKING:
@@ -74,11 +74,12 @@ def _cell(value: Any) -> str:
     return f"{value:.4f}" if isinstance(value, float) else str(value)
 
 
-def _request(request: EvaluateRequest, header: PlyHeader) -> SourceRequest:
+def _load(request: SourceRequest, header: PlyHeader) -> Source:
     """The source, with the file's own unit distance where none is asked for."""
-    if request.source.unit_distance is not None or header.unit_distance is None:
-        return request.source
-    return replace(request.source, unit_distance=repr(header.unit_distance))
+    if request.unit_distance is not None or header.unit_distance is None:
+        return load(request)
+    source = load(replace(request, unit_distance=repr(header.unit_distance)))
+    return replace(source, unit_label=f"{header.unit_distance_label}, as the .ply records")
 
 
 def evaluate(request: EvaluateRequest, console: Console | None = None) -> Evaluation:
@@ -92,8 +93,7 @@ def evaluate(request: EvaluateRequest, console: Console | None = None) -> Evalua
     run = Run(console or Console(), ConversionReport("evaluate"))
     with run.stage("read") as stage:
         gaussians, header = open_gaussians(request.ply, run.console)
-        source_request = _request(request, header)
-        source = load(source_request)
+        source = _load(request.source, header)
         stage.note = f"{len(gaussians)} Gaussians; {describe_source(source)}"
     with run.stage("scene"):
         scene = source.scene()
@@ -102,7 +102,7 @@ def evaluate(request: EvaluateRequest, console: Console | None = None) -> Evalua
         stage.note = f"its own error {own:.1f} dB"
     evaluation = Evaluation(
         len(gaussians), request.size, len(default_views("test")), volume_record(source),
-        tf_record(source, source_request), own,
+        tf_record(source, request.source), own,
     )  # fmt: skip
     for scale in sorted(set(request.scales)):
         with run.stage(f"test views {scale}x") as stage:

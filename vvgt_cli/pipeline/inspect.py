@@ -9,9 +9,10 @@ from typing import Any
 from vvgt_cli.cameras.files import read_cameras
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import describe, read_ply
-from vvgt_cli.pipeline.outputs import STDOUT
+from vvgt_cli.pipeline.render import STDIN
 from vvgt_cli.volume.options import ReadOptions
 
+_PLY = (b"ply\n", b"ply\r")
 _HEAD = 65536  # bytes that tell a view set from a transfer function
 
 
@@ -21,7 +22,9 @@ def inspect(file: str, read: ReadOptions) -> dict[str, Any]:
     Raises:
         DataError, UsageError: as the reader of that kind.
     """
-    if file == STDOUT or file.startswith("example:"):
+    if file == STDIN and sys.stdin.buffer.peek(4).startswith(_PLY):  # type: ignore[attr-defined]
+        return {"kind": "gaussians", "name": "standard input", **describe(*read_ply(sys.stdin.buffer))}
+    if file == STDIN or file.startswith("example:"):
         return _volume(file, read)
     path = Path(file)
     if path.is_dir():
@@ -30,7 +33,7 @@ def inspect(file: str, read: ReadOptions) -> dict[str, Any]:
         raise DataError(f"{file}: no such file; expected a volume, a transfer function, a view set or a .ply")
     with path.open("rb") as stream:
         head = stream.read(_HEAD)
-    if head.startswith((b"ply\n", b"ply\r")):
+    if head.startswith(_PLY):
         return {"kind": "gaussians", "name": path.name, **describe(*read_ply(path))}
     if path.suffix.lower() == ".json" or head.lstrip()[:1] in (b"{", b"["):
         if b'"frames"' in head:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from vvgt_cli.errors import UsageError
 from vvgt_cli.volume import Volume
 from vvgt_cli.volume.options import ReadOptions
 
@@ -61,13 +62,23 @@ def load(request: SourceRequest) -> Source:
         UsageError: options that do not fit the file.
     """
     from vvgt_cli.synth.sources import open_volume
-    from vvgt_cli.transfer import check_visible, from_histogram, read_transfer_function, resolve, unit_distance
+    from vvgt_cli.transfer import (
+        check_visible,
+        from_histogram,
+        parse_tf_range,
+        read_transfer_function,
+        resolve,
+        unit_distance,
+    )
     from vvgt_cli.volume.statistics import statistics
 
+    tf_range = parse_tf_range(request.tf_range)
     tf = read_transfer_function(request.tf) if request.tf else None  # small: its errors come first
+    if tf is None and tf_range != "data":
+        raise UsageError("--tf-range says where the nodes of a function lie; it needs --tf")
     volume = open_volume(request.volume, request.read)
-    numbers = statistics(volume)
-    tf = resolve(tf, numbers, request.tf_range) if tf else from_histogram(numbers)
     distance, label = unit_distance(request.unit_distance, volume, tf)
+    numbers = statistics(volume)
+    tf = resolve(tf, numbers, tf_range) if tf else from_histogram(numbers)
     check_visible(tf, numbers)
     return Source(volume, numbers, tf, distance, label)

@@ -1,0 +1,184 @@
+"""Bad calls and bad input: the exit status, one line, and nothing left behind."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vvgt_cli import __version__
+from vvgt_cli.cli import main
+from vvgt_cli.cli.options import THREAD_VARIABLES, default_threads
+from vvgt_cli.errors import DataError
+
+ROOT = Path(__file__).parent.parent
+RAW = ("--dims", 8, 8, 8, "--dtype", "uint8")
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """An empty working directory with a raw volume and two transfer functions."""
+    monkeypatch.chdir(tmp_path)
+    np.arange(512, dtype=np.uint16).astype(np.uint8).tofile("v.raw")
+    points = [{"x": 0, "rgb": [1, 0, 0], "opacity": 0.1}, {"x": 255, "rgb": [0, 0, 1], "opacity": 0.9}]
+    Path("good.json").write_text(json.dumps({"range": [0, 255], "points": points}))
+    clear = [{**point, "opacity": 0} for point in points]
+    Path("clear.json").write_text(json.dumps({"range": [0, 255], "points": clear}))
+    Path("broken.json").write_text('{"range": [0, 255], "points": [')
+    Path("not.ply").write_bytes(b"solid cube\n")
+    return tmp_path
+
+
+CONVERT = ("convert", "v.raw", *RAW, "-o", "out.ply")
+# (command line, exit status, what the line must say)
+CASES = {
+    "missing volume": (("convert", "no.raw", *RAW, "-o", "out.ply"), 1, "no.raw"),
+    "size": (("convert", "v.raw", "--dims", 9, 8, 8, "--dtype", "uint8", "-o", "out.ply"), 1, "512"),
+    "no dims": (("convert", "v.raw", "-o", "out.ply"), None, "--dims"),
+    "dims": (("convert", "v.raw", "--dims", 0, 8, 8, "--dtype", "uint8", "-o", "out.ply"), 2, "--dims"),
+    "dtype": (("convert", "v.raw", "--dims", 8, 8, 8, "--dtype", "uint9", "-o", "out.ply"), 2, "uint9"),
+    "example": (("convert", "example:unicorn", "-o", "out.ply"), 2, "unicorn"),
+    "spacing": ((*CONVERT, "--spacing", 1, 0, 1), 2, "spacing"),
+    "component": ((*CONVERT, "--component", "all"), 2, "component"),
+    "missing tf": ((*CONVERT, "--tf", "no.json"), None, "no.json"),
+    "broken tf": ((*CONVERT, "--tf", "broken.json"), 1, "broken.json"),
+    "unknown map": ((*CONVERT, "--tf", "octarine"), None, "octarine"),
+    "clear tf": ((*CONVERT, "--tf", "clear.json"), 1, "255"),
+    "tf range": ((*CONVERT, "--tf", "good.json", "--tf-range", "5,1"), 2, "--tf-range"),
+    "tf range alone": ((*CONVERT, "--tf-range", "0,1"), 2, "--tf"),
+    "unit distance": ((*CONVERT, "--opacity-unit-distance", "-1"), 2, "--opacity-unit-distance"),
+    "unknown option": ((*CONVERT, "--fast"), 2, "--fast"),
+    "unknown command": (("transmogrify",), 2, "transmogrify"),
+    "no output": (("convert", "v.raw", *RAW), 2, "--output"),
+    "budget": ((*CONVERT, "--max-gaussians", 0), 2, "--max-gaussians"),
+    "method": ((*CONVERT, "--init", "magic"), 2, "magic"),
+    "degree": ((*CONVERT, "--sh-degree", 4), 2, "--sh-degree"),
+    "no directory": (("convert", "v.raw", *RAW, "-o", "no/out.ply"), 2, "no"),
+    "suffix": (("convert", "v.raw", *RAW, "-o", "out.splat"), 2, ".ply"),
+    "a directory": (("convert", "v.raw", *RAW, "-o", "."), 2, "."),
+    "preview suffix": ((*CONVERT, "--preview", "p.jpg"), 2, ".png"),
+    "same place": ((*CONVERT, "--report", "-", "-o", "-"), 2, "both"),
+    "over an input": (("convert", "v.ply", *RAW, "-o", "v.ply", "--overwrite"), 2, "input"),
+    "ply": (("info", "not.ply"), None, "not.ply"),
+    "render no ply": (("render", "not.ply", "--orbit", 2, "-o", "d"), 1, "not.ply"),
+    "render missing": (("render", "no.ply", "--orbit", 2, "-o", "d"), 1, "no.ply"),
+    "render no views": (("render", "not.ply", "-o", "d"), 2, "--orbit"),
+    "render both": (("render", "not.ply", "-o", "d", "--orbit", 1, "--camera", "c.json"), 2, "either"),
+    "render background": (("render", "not.ply", "-o", "d", "--orbit", 1, "--background", 0, 0, 255), 2, "[0, 1]"),
+    "render cameras": (("render", "not.ply", "-o", "d", "--camera", "good.json"), 1, "frames"),
+    "evaluate missing": (("evaluate", "no.ply", "--volume", "v.raw", *RAW), 1, "no.ply"),
+    "evaluate both": (("evaluate", "-", "--volume", "-", *RAW), 2, "standard input"),
+    "info missing": (("info", "no.raw"), 1, "no.raw"),
+    "info directory": (("info", "."), 1, "directory"),
+    "show suffix": (("tf", "show", "good.json", "-o", "a.txt"), 2, ".png"),
+    "show broken": (("tf", "show", "broken.json", "-o", "a.png"), 1, "broken.json"),
+    "show no volume": (("tf", "show", "good.json", "-o", "a.png", "--tf-range", "0,1"), 2, "--volume"),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_bad_input_gets_one_line_and_leaves_nothing(case, folder, vvgt):
+    args, code, message = CASES[case]
+    before = {path: path.stat().st_mtime_ns for path in folder.iterdir()}
+    result = vvgt(*args)
+    assert result.code in ((1, 2) if code is None else (code,)), result.err
+    assert message in result.error
+    assert "internal" not in result.error
+    assert result.out == b""
+    assert {path: path.stat().st_mtime_ns for path in folder.iterdir()} == before
+
+
+@pytest.mark.parametrize("option", ["-o", "--report", "--preview"])
+def test_nothing_is_overwritten_unasked(option, folder, vvgt):
+    outputs = {"-o": "a.ply", "--report": "a.json", "--preview": "a.png"}
+    taken = Path(outputs[option])
+    taken.write_bytes(b"mine")
+    result = vvgt("convert", "v.raw", *RAW, *(word for pair in outputs.items() for word in pair))
+    assert result.code == 2
+    assert taken.name in result.error
+    assert "--overwrite" in result.error
+    assert taken.read_bytes() == b"mine"
+    assert {path.name for path in folder.glob("a.*")} == {taken.name}
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_a_directory_that_is_not_writable(folder, vvgt):
+    locked = folder / "locked"
+    locked.mkdir(mode=0o500)
+    assert "not writable" in vvgt("convert", "v.raw", *RAW, "-o", locked / "a.ply").error
+
+
+def test_version_and_help(vvgt):
+    assert vvgt("--version").out.decode() == f"vvgt {__version__}\n"
+    text = vvgt("--help").out.decode()
+    for command in main.COMMANDS:
+        assert f"\n  {command} " in text
+    assert vvgt("convert", "-h").code == 0
+    assert vvgt().code == 2
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "message"),
+    [
+        (DataError("a\nb"), 1, "a b"),
+        (FileNotFoundError(2, "No such file", "x.raw"), 1, "x.raw: No such file"),
+        (MemoryError(), 1, "out of memory"),
+        (KeyboardInterrupt(), 130, "interrupted"),
+        (ZeroDivisionError("oops"), 1, "internal: ZeroDivisionError: oops"),
+    ],
+)
+def test_every_exception_becomes_a_line(error, code, message, vvgt, monkeypatch):
+    def fail(*args, **kwargs):
+        raise error
+
+    monkeypatch.setattr(main.cli, "main", fail)
+    result = vvgt("info", "x")
+    assert (result.code, message in result.error) == (code, True)
+
+
+def test_traceback_on_request(vvgt, monkeypatch):
+    monkeypatch.setenv("VVGT_TRACEBACK", "1")
+    assert "Traceback" in vvgt("info", "no.raw").err
+
+
+def test_a_closed_pipe_is_quiet(folder):
+    Path("many.json").write_text("[" + "0," * 10 + "0]")
+    code = "import sys; from vvgt_cli.cli.main import run; sys.exit(run(['info', 'example:blob:8']))"
+    reader, writer = os.pipe()
+    os.close(reader)
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        [sys.executable, "-c", code], stdout=writer, stderr=subprocess.PIPE, env=environment, check=False
+    )
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (141, b"")
+
+
+def test_threads_come_from_the_environment(monkeypatch):
+    for variable in THREAD_VARIABLES:
+        monkeypatch.delenv(variable, raising=False)
+    assert default_threads() == len(os.sched_getaffinity(0))
+    monkeypatch.setenv("SLURM_CPUS_PER_TASK", "7")
+    assert default_threads() == 7
+    monkeypatch.setenv("OMP_NUM_THREADS", "3,1")
+    assert default_threads() == 3
+    monkeypatch.setenv("OMP_NUM_THREADS", "many")
+    assert default_threads() == 7
+
+
+def test_threads_reach_numba_before_it_is_imported():
+    code = "; ".join(
+        [
+            "from vvgt_cli.cli.main import run",
+            "run(['info', 'example:blob:8', '--threads', '1'])",
+            "import numba",
+            "print('threads', numba.get_num_threads())",
+        ]
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "threads 1"

@@ -1,0 +1,82 @@
+"""The documentation holds what the program has: a page a command, every option, links that lead somewhere."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+import click
+import pytest
+
+from vvgt_cli.cli.main import COMMANDS, cli
+
+ROOT = Path(__file__).parent.parent
+PAGES = sorted([ROOT / "README.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").rglob("*.md"), *ROOT.glob("examples/*.md")])
+
+
+def commands():
+    """(page name, command) of every command, those of groups with their group's page."""
+    context = click.Context(cli)
+    for name in COMMANDS:
+        command = cli.get_command(context, name)
+        if isinstance(command, click.Group):
+            yield from ((name, sub) for sub in command.commands.values())
+        else:
+            yield name, command
+
+
+def options(command):
+    return [option for parameter in command.params if isinstance(parameter, click.Option) for option in parameter.opts]
+
+
+@pytest.mark.parametrize(("page", "command"), list(commands()), ids=lambda value: getattr(value, "name", value))
+def test_every_command_has_a_page_with_its_options_and_no_others(page, command):
+    text = (ROOT / "docs" / "commands" / f"{page}.md").read_text("utf-8")
+    table = [row.split(" | ")[0] for row in text.splitlines() if row.startswith("| `-")]
+    named = re.findall(r"(?<![\w-])-{1,2}[a-z][\w-]*", " ".join(re.findall(r"`(-[^`]*)`", " ".join(table))))
+    assert {name for name in named if not re.fullmatch(r"-[xyz]", name)} == set(options(command))
+    for example in re.findall(r"^vvgt (.*)$", text, re.M):
+        for option in re.findall(r"(?<!\S)(--[a-z-]+|-[a-z])(?=\s|$)", example.split(" | ")[0]):
+            owner = example.split()[0]
+            assert any(option in options(sub) for name, sub in commands() if name == owner), f"{example}: {option}"
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_links_lead_somewhere(path):
+    for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", path.read_text("utf-8")):
+        if "://" not in target:
+            assert (path.parent / target).exists(), target
+
+
+def test_readme_has_the_two_commands_each_on_a_line_with_its_own_set_up():
+    lines = [
+        line for line in (ROOT / "README.md").read_text("utf-8").splitlines() if line.startswith("python3 -m venv")
+    ]
+    assert len(lines) == 2
+    assert re.search(r"bin/vvgt convert example:\S+ .*-o \S+\.ply", lines[0])
+    assert re.search(r"bin/pytest$", lines[1])
+    for line in lines:
+        assert "-c constraints.txt" in line
+
+
+def test_examples_are_listed_and_executable_by_bash():
+    listed = (ROOT / "examples" / "README.md").read_text("utf-8")
+    scripts = sorted(ROOT.glob("examples/*.sh"))
+    assert scripts
+    for script in scripts:
+        assert f"`{script.name}`" in listed
+        assert script.read_text().startswith("#!/usr/bin/env bash")
+        assert os.access(script, os.X_OK)
+
+
+def test_constraints_pin_every_dependency_of_the_package():
+    pins = dict(line.split("==") for line in (ROOT / "constraints.txt").read_text().splitlines() if "==" in line)
+    assert all(re.fullmatch(r"[\w.]+", version) for version in pins.values())
+    names = {re.sub(r"[-_.]+", "-", name).lower() for name in pins}
+    import tomllib
+
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    wanted = project["dependencies"] + project["optional-dependencies"]["test"]
+    for requirement in wanted:
+        assert re.sub(r"[-_.]+", "-", re.match(r"[\w.-]+", requirement)[0]).lower() in names, requirement
