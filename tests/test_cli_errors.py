@@ -136,7 +136,7 @@ def test_every_exception_becomes_a_line(error, code, message, vvgt, monkeypatch)
     def fail(*args, **kwargs):
         raise error
 
-    monkeypatch.setattr(main.cli, "main", fail)
+    monkeypatch.setattr(main.cli, "invoke", fail)
     result = vvgt("info", "x")
     assert (result.code, message in result.error) == (code, True)
 

@@ -51,7 +51,7 @@ ply_options = group(
 def source_request(volume: str, read: dict[str, Any], optics: dict[str, Any]) -> SourceRequest:
     """What the shared options of `options.py` add up to."""
     from vvgt_cli.pipeline.source import SourceRequest
-    from vvgt_cli.volume.options import ReadOptions
+    from vvgt_cli.volume import ReadOptions
 
     return SourceRequest(volume, ReadOptions(**read), optics["tf"], optics["tf_range"], optics["opacity_unit_distance"])
 

@@ -24,7 +24,7 @@ def command(file: str, as_json: bool, read: dict, console: Console) -> None:
     """
     from vvgt_cli.pipeline.inspect import inspect
     from vvgt_cli.pipeline.record import plain
-    from vvgt_cli.volume.options import ReadOptions
+    from vvgt_cli.volume import ReadOptions
 
     facts = plain(inspect(file, ReadOptions(**read)))
     if as_json:

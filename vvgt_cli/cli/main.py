@@ -73,7 +73,9 @@ def _silence_stdout() -> None:
 def run(args: Sequence[str] | None = None) -> int:
     """Run a command line and return its exit status; every error is one line on standard error."""
     try:
-        cli.main(args=list(args) if args is not None else None, prog_name="vvgt", standalone_mode=False)
+        # not cli.main: it would turn a broken pipe and an interrupt into statuses of its own
+        with cli.make_context("vvgt", list(sys.argv[1:] if args is None else args)) as context:
+            cli.invoke(context)
         sys.stdout.flush()
         return 0
     except BaseException as error:
@@ -83,6 +85,8 @@ def run(args: Sequence[str] | None = None) -> int:
 
 
 def _status(error: BaseException) -> int:
+    if isinstance(error, click.exceptions.Exit):  # after --help and --version
+        return error.exit_code
     if isinstance(error, click.exceptions.NoArgsIsHelpError):  # a call without a command
         print(error.format_message(), file=sys.stderr)
         return error.exit_code
@@ -97,7 +101,7 @@ def _status(error: BaseException) -> int:
         return _fail(_os_error(error), 1)
     if isinstance(error, MemoryError):
         return _fail("out of memory: try fewer Gaussians, a smaller --size, or a smaller volume", 1)
-    if isinstance(error, KeyboardInterrupt | click.Abort):
+    if isinstance(error, KeyboardInterrupt):
         return _fail("interrupted", INTERRUPTED)
     if isinstance(error, SystemExit):
         return error.code if isinstance(error.code, int) else 1

@@ -31,6 +31,6 @@ def show(
       vvgt tf show bone.json -o bone.png --volume head.nrrd
     """
     from vvgt_cli.pipeline.show import show_transfer_function
-    from vvgt_cli.volume.options import ReadOptions
+    from vvgt_cli.volume import ReadOptions
 
     show_transfer_function(tf, output, volume, ReadOptions(**read), tf_range, overwrite)

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import sys
 from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from vvgt_cli.cameras import default_views
 from vvgt_cli.errors import DataError
+from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored, write_ply
-from vvgt_cli.pipeline.outputs import STDOUT, Output, check_outputs, write_file, write_text
+from vvgt_cli.pipeline.outputs import STDOUT, Output, check_outputs, write_text
 from vvgt_cli.pipeline.record import ConversionReport, Run
 from vvgt_cli.pipeline.source import Source, SourceRequest, load
 from vvgt_cli.progress import Console
@@ -224,7 +224,7 @@ def write_preview(path: str, reference: np.ndarray, ours: np.ndarray, overwrite:
     from vvgt_cli.images import side_by_side, write_png
 
     sheet = np.concatenate([side_by_side(a, b) for a, b in zip(reference, ours, strict=True)])
-    write_file(path, overwrite, lambda temporary: write_png(temporary, sheet))
+    write_png(path, sheet, overwrite)
 
 
 def _finish(run: Run, request: ConvertRequest, source: Source, gaussians: Gaussians) -> ConversionReport:
@@ -241,11 +241,8 @@ def _finish(run: Run, request: ConvertRequest, source: Source, gaussians: Gaussi
             report.bytes = write_ply(sys.stdout.buffer, gaussians, ply)
             sys.stdout.buffer.flush()
         else:
-
-            def write(temporary: Path) -> None:
+            with atomic_write(request.output, request.overwrite) as temporary:
                 report.bytes = write_ply(temporary, gaussians, ply)
-
-            write_file(request.output, request.overwrite, write)
         report.gaussians = len(gaussians)
         stage.note = f"{request.output}: {len(gaussians)} Gaussians, {report.bytes / 1e6:.1f} MB"
     run.finish()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import sys
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from vvgt_cli.cameras.files import read_cameras
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import describe, read_ply
 from vvgt_cli.pipeline.render import STDIN
-from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume import ReadOptions
 
 _PLY = (b"ply\n", b"ply\r")
 _HEAD = 65536  # bytes that tell a view set from a transfer function
@@ -22,7 +23,7 @@ def inspect(file: str, read: ReadOptions) -> dict[str, Any]:
     Raises:
         DataError, UsageError: as the reader of that kind.
     """
-    if file == STDIN and sys.stdin.buffer.peek(4).startswith(_PLY):  # type: ignore[attr-defined]
+    if file == STDIN and _head_of_stdin().startswith(_PLY):
         return {"kind": "gaussians", "name": "standard input", **describe(*read_ply(sys.stdin.buffer))}
     if file == STDIN or file.startswith("example:"):
         return _volume(file, read)
@@ -40,6 +41,12 @@ def inspect(file: str, read: ReadOptions) -> dict[str, Any]:
             return _views(path)
         return _transfer_function(file)
     return _volume(file, read)
+
+
+def _head_of_stdin() -> bytes:
+    """First bytes of standard input, left to be read."""
+    stream = sys.stdin.buffer
+    return stream.peek(4) if isinstance(stream, io.BufferedReader) else b""
 
 
 def _views(path: Path) -> dict[str, Any]:
@@ -69,7 +76,7 @@ def _transfer_function(file: str) -> dict[str, Any]:
 def _volume(file: str, read: ReadOptions) -> dict[str, Any]:
     from vvgt_cli.synth.sources import open_volume
     from vvgt_cli.transfer import unit_distance
-    from vvgt_cli.volume.statistics import statistics
+    from vvgt_cli.volume import statistics
 
     volume = open_volume(file, read)
     numbers = statistics(volume)

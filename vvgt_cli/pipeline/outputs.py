@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -75,11 +75,5 @@ def write_text(path: str, text: str, overwrite: bool) -> None:
     if path == STDOUT:
         sys.stdout.write(text)
         return
-    with atomic_write(Path(path), overwrite=overwrite) as temporary:
-        Path(temporary).write_text(text, "utf-8")
-
-
-def write_file(path: str, overwrite: bool, write: Callable[[Path], object]) -> None:
-    """Call ``write`` with a temporary path that takes the name ``path`` once it is whole."""
-    with atomic_write(Path(path), overwrite=overwrite) as temporary:
-        write(Path(temporary))
+    with atomic_write(path, overwrite) as temporary:
+        temporary.write_text(text, "utf-8")

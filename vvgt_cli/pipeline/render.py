@@ -11,7 +11,7 @@ from vvgt_cli.cameras.files import read_cameras, transforms_json
 from vvgt_cli.cameras.sets import SIZE
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import Gaussians, PlyHeader, in_unit_frame, read_ply
-from vvgt_cli.pipeline.outputs import STDOUT, write_file, write_text
+from vvgt_cli.pipeline.outputs import STDOUT, write_text
 from vvgt_cli.pipeline.record import ConversionReport, Run
 from vvgt_cli.progress import Console
 
@@ -102,9 +102,9 @@ def render_file(request: RenderRequest, console: Console | None = None) -> int:
         for done, camera in enumerate(cameras, 1):
             image = render(gaussians, camera)
             if request.exr:
-                write_file(f"{directory / camera.name}.exr", request.overwrite, lambda p, i=image: write_exr(p, i))
+                write_exr(directory / f"{camera.name}.exr", image, camera=camera, overwrite=request.overwrite)
             shown = image if request.background is None else over(image, request.background)
-            write_file(f"{directory / camera.name}.png", request.overwrite, lambda p, i=shown: write_png(p, i))
+            write_png(directory / f"{camera.name}.png", shown, request.overwrite)
             if bar:
                 bar(done, len(cameras))
         write_text(str(directory / VIEWS_FILE), transforms_json(cameras), request.overwrite)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from vvgt_cli.errors import UsageError
-from vvgt_cli.pipeline.outputs import STDOUT, Output, check_outputs, write_file
-from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.pipeline.outputs import STDOUT, Output, check_outputs
+from vvgt_cli.volume import ReadOptions
 
 
 def show_transfer_function(
@@ -17,7 +17,7 @@ def show_transfer_function(
     """
     from vvgt_cli.synth.sources import open_volume
     from vvgt_cli.transfer import draw, read_transfer_function, resolve
-    from vvgt_cli.volume.statistics import statistics
+    from vvgt_cli.volume import statistics
 
     if output == STDOUT:
         raise UsageError("-o -: a picture goes to a file; expected a name ending in .png")
@@ -29,4 +29,4 @@ def show_transfer_function(
     if volume is not None:
         numbers = statistics(open_volume(volume, read))
         function = resolve(function, numbers, tf_range)
-    write_file(output, overwrite, lambda temporary: draw(function, numbers, temporary))
+    draw(function, numbers, output, overwrite)

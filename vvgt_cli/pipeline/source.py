@@ -6,12 +6,10 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from vvgt_cli.errors import UsageError
-from vvgt_cli.volume import Volume
-from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume import ReadOptions, Statistics, Volume
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
-    from vvgt_cli.volume.statistics import Statistics
 
 
 @dataclass(frozen=True)
@@ -62,15 +60,9 @@ def load(request: SourceRequest) -> Source:
         UsageError: options that do not fit the file.
     """
     from vvgt_cli.synth.sources import open_volume
-    from vvgt_cli.transfer import (
-        check_visible,
-        from_histogram,
-        parse_tf_range,
-        read_transfer_function,
-        resolve,
-        unit_distance,
-    )
-    from vvgt_cli.volume.statistics import statistics
+    from vvgt_cli.transfer import check_visible, from_histogram, read_transfer_function, resolve, unit_distance
+    from vvgt_cli.transfer.resolve import parse_tf_range
+    from vvgt_cli.volume import statistics
 
     tf_range = parse_tf_range(request.tf_range)
     tf = read_transfer_function(request.tf) if request.tf else None  # small: its errors come first
