@@ -34,7 +34,7 @@ class ArrayInfo:
 
 
 def choose_array(infos: Sequence[ArrayInfo], wanted: str | None, source: str) -> int:
-    """Index of the array to read: by name, else the active scalars, else the only one.
+    """Index of the array to read: by name, else the active scalars, else the only one; point data before cell data.
 
     Raises:
         DataError: there are no arrays.
@@ -42,14 +42,15 @@ def choose_array(infos: Sequence[ArrayInfo], wanted: str | None, source: str) ->
     """
     if not infos:
         raise DataError(f"{source}: the image has no numeric point or cell array; expected at least one")
-    listing = "; ".join(str(info) for info in infos)
+    order = sorted(range(len(infos)), key=lambda index: infos[index].where == "cell")
+    listing = "; ".join(str(infos[index]) for index in order)
     if wanted is not None:
-        for index, info in enumerate(infos):
-            if info.name == wanted:
+        for index in order:
+            if infos[index].name == wanted:
                 return index
         raise UsageError(f"{source}: no array {wanted!r}; it has {listing}; choose one with --array NAME")
-    for index, info in enumerate(infos):
-        if info.active:
+    for index in order:
+        if infos[index].active:
             return index
     if len(infos) == 1:
         return 0

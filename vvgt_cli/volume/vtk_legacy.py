@@ -20,7 +20,7 @@ from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.registry import Reader, register, volume_name
 from vvgt_cli.volume.types import Volume
 
-# vtkIdType is stored as int; long is that of a 64-bit machine.
+# vtkIdType is stored as int; long is that of a 64-bit machine; colour is our name for COLOR_SCALARS in text, 0 to 1.
 _TYPES = {
     "bit": "",
     "char": "i1",
@@ -35,6 +35,7 @@ _TYPES = {
     "vtktypeint64": "i8",
     "vtktypeuint64": "u8",
     "vtkidtype": "i4",
+    "colour": "u1",
     "float": "f4",
     "double": "f8",
 }
@@ -86,9 +87,9 @@ class _Parser:
         if not (self.line() or "").lower().startswith("# vtk datafile version"):
             raise self.bad("does not begin with '# vtk DataFile Version'")
         self.line()
-        coding = (self.line() or "").upper()
+        coding = " ".join(self.words() or []).upper()
         if coding not in ("ASCII", "BINARY"):
-            raise self.bad(f"third line is {coding[:40]!r}; expected ASCII or BINARY")
+            raise self.bad(f"coding is {coding[:40]!r}; expected ASCII or BINARY")
         self.binary = coding == "BINARY"
         kind = self.words() or ["nothing"]
         if kind[-1].upper() not in ("STRUCTURED_POINTS", "IMAGE_DATA"):
@@ -115,8 +116,7 @@ class _Parser:
         elif key == "SCALARS":
             self.scalars(words)
         elif key == "COLOR_SCALARS":
-            kind = "unsigned_char" if self.binary else "float"
-            self.array(words[1], kind, int(words[2]), self.tuples, active=False)
+            self.array(words[1], "unsigned_char" if self.binary else "colour", int(words[2]), self.tuples, active=True)
         elif key == "TEXTURE_COORDINATES":
             self.array(words[1], words[3], int(words[2]), self.tuples, active=False)
         elif key in _FIXED:
@@ -191,6 +191,9 @@ def _values(parser: _Parser, array: _Array, shape: tuple[int, int, int]) -> np.n
     n = array.tuples * array.info.components
     if not parser.binary:
         dtype = np.dtype(_TYPES[array.type] or "u1")
+        if array.type == "colour":
+            shares = parse_numbers(parser.text, array.start, n, np.dtype("f4"), parser.path.name)
+            return np.round(np.clip(shares, 0, 1) * 255).astype(np.uint8).reshape(full)
         return parse_numbers(parser.text, array.start, n, dtype, parser.path.name).reshape(full)
     if array.type == "bit":
         packed = np.frombuffer(parser.text[array.start : array.start + (n + 7) // 8], np.uint8)

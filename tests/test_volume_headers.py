@@ -1,0 +1,343 @@
+"""Text headers beside or before raw data: NRRD, MetaImage, Inviwo."""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.volume import ReadOptions, read_volume
+
+VALUES = np.random.default_rng(1).integers(-30000, 30000, (3, 4, 5), np.int16)
+NRRD_TYPES = {
+    "int8": "i1",
+    "uchar": "u1",
+    "short": "i2",
+    "unsigned short": "u2",
+    "int": "i4",
+    "uint32": "u4",
+    "long long int": "i8",
+    "uint64": "u8",
+    "float": "f4",
+    "double": "f8",
+}
+
+
+def nrrd(fields: dict[str, object], data: bytes = b"") -> bytes:
+    base: dict[str, object] = {"type": "short", "dimension": 3, "sizes": "5 4 3", "endian": "little", "encoding": "raw"}
+    lines = ["NRRD0005", "# a comment", "key:=a value"]
+    lines += [f"{k}: {v}" for k, v in (base | fields).items() if v is not None]
+    return ("\n".join(lines) + "\n\n").encode() + data
+
+
+def write(path: Path, data: bytes) -> str:
+    path.write_bytes(data)
+    return str(path)
+
+
+@pytest.mark.parametrize(("name", "code"), NRRD_TYPES.items())
+@pytest.mark.parametrize("endian", ["little", "big"])
+def test_nrrd_types(tmp_path: Path, name: str, code: str, endian: str) -> None:
+    values = np.arange(60).reshape(3, 4, 5).astype((">" if endian == "big" else "<") + code)
+    volume = read_volume(write(tmp_path / "v.nrrd", nrrd({"type": name, "endian": endian}, values.tobytes())))
+    assert volume.data.dtype == values.dtype
+    assert isinstance(volume.data, np.memmap)
+    np.testing.assert_array_equal(volume.data, values)
+
+
+@pytest.mark.parametrize("detached", [False, True])
+@pytest.mark.parametrize(
+    ("encoding", "pack"),
+    [
+        ("raw", bytes),
+        ("gzip", gzip.compress),
+        ("bz2", bz2.compress),
+        ("ascii", lambda b: " ".join(map(str, np.frombuffer(b, "<i2"))).encode()),
+    ],
+)
+def test_nrrd_encodings(tmp_path: Path, detached: bool, encoding: str, pack) -> None:
+    data = pack(VALUES.astype("<i2").tobytes())
+    if detached:
+        (tmp_path / "v.bin").write_bytes(data)
+        source = write(tmp_path / "v.nhdr", nrrd({"encoding": encoding, "data file": "v.bin"}))
+    else:
+        source = write(tmp_path / "v.nrrd", nrrd({"encoding": encoding}, data))
+    volume = read_volume(source)
+    np.testing.assert_array_equal(volume.data, VALUES)
+    assert isinstance(volume.data, np.memmap) == (encoding == "raw")
+
+
+def test_nrrd_skips(tmp_path: Path) -> None:
+    body = VALUES.astype("<i2").tobytes()
+    (tmp_path / "v.raw").write_bytes(b"one\ntwo\n" + b"abc" + body)
+    for fields in ({"line skip": 2, "byte skip": 3}, {"byte skip": 11}, {"byte skip": -1}):
+        source = write(tmp_path / "v.nhdr", nrrd({"data file": "v.raw"} | fields))
+        np.testing.assert_array_equal(read_volume(source).data, VALUES)
+    packed = nrrd({"encoding": "gzip", "byte skip": 3}, gzip.compress(b"abc" + body))
+    np.testing.assert_array_equal(read_volume(write(tmp_path / "z.nrrd", packed)).data, VALUES)
+
+
+def test_nrrd_geometry(tmp_path: Path) -> None:
+    body = VALUES.astype("<i2").tobytes()
+    volume = read_volume(write(tmp_path / "a.nrrd", nrrd({"spacings": "0.5 -2 nan"}, body)))
+    assert volume.spacing == (0.5, 2.0, 1.0)
+    fields = {"space": "RAS", "space directions": "(0,2,0) (-3, 0, 0) (0,0,4)", "space origin": "(1,2,3)"}
+    volume = read_volume(write(tmp_path / "b.nrrd", nrrd(fields, body)))
+    assert volume.spacing == (2.0, 3.0, 4.0)
+    assert volume.origin == (1.0, 2.0, 3.0)
+    assert volume.direction == (0, -1, 0, 1, 0, 0, 0, 0, 1)
+    assert read_volume(str(tmp_path / "b.nrrd"), ReadOptions(spacing=(7, 8, 9))).spacing == (7, 8, 9)
+    zero = write(tmp_path / "c.nrrd", nrrd({"spacings": "0 1 1"}, body))
+    with pytest.raises(DataError, match="try --spacing X Y Z"):
+        read_volume(zero)
+    assert read_volume(zero, ReadOptions(spacing=(1, 1, 1))).spacing == (1, 1, 1)
+
+
+@pytest.mark.parametrize(
+    ("fields", "axis"),
+    [
+        ({"sizes": "2 5 4 3", "kinds": "vector domain domain domain"}, 0),
+        ({"sizes": "5 4 3 2", "kinds": "domain domain domain list"}, 3),
+        ({"sizes": "2 5 4 3", "space directions": "none (1,0,0) (0,1,0) (0,0,1)"}, 0),
+        ({"sizes": "2 5 4 3"}, 0),
+    ],
+)
+def test_nrrd_components(tmp_path: Path, fields: dict, axis: int) -> None:
+    both = np.stack([VALUES, VALUES // 3])  # (c, z, y, x)
+    stored = np.moveaxis(both, 0, 3 - axis).astype("<i2")
+    source = write(tmp_path / "v.nrrd", nrrd(fields | {"dimension": 4}, stored.tobytes()))
+    with pytest.raises(UsageError, match=r"2 components of type int16.*--component 0 to 1, or --component magnitude"):
+        read_volume(source)
+    for c in (0, 1):
+        np.testing.assert_array_equal(read_volume(source, ReadOptions(component=c)).data, both[c])
+    norm = read_volume(source, ReadOptions(component="magnitude")).data
+    assert norm.dtype == np.float32
+    np.testing.assert_allclose(norm, np.hypot(both[0].astype(float), both[1]), rtol=1e-6)
+    with pytest.raises(UsageError, match="not component 2"):
+        read_volume(source, ReadOptions(component=2))
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"sizes": "5 4 999999999999"}, "the file has"),
+        ({"sizes": "5 4 4"}, "the file has"),
+        ({"sizes": "5 4 4", "encoding": "gzip"}, "damaged gzip data"),
+        ({"sizes": "5 4 0"}, "whole numbers of at least 1"),
+        ({"sizes": "5 4 many"}, "whole numbers of at least 1"),
+        ({"sizes": "5 4"}, "dimension 3 but sizes"),
+        ({"dimension": 5, "sizes": "1 2 2 3 5"}, "spatial axes"),
+        ({"type": "block"}, "type 'block'"),
+        ({"endian": None}, "no field 'endian'"),
+        ({"endian": "middle"}, "expected little or big"),
+        ({"encoding": "hex"}, "encoding 'hex'"),
+        ({"byte skip": -2}, "byte skip -2"),
+        ({"space directions": "(1,0,0) (0,1,0)"}, "expected 3 axes"),
+        ({"data file": "/etc/passwd"}, "header's own folder"),
+        ({"data file": "../v.raw"}, "header's own folder"),
+        ({"data file": "none.raw"}, "does not exist beside it"),
+        ({"data file": "v%02d.raw 0 9 1"}, "several files"),
+    ],
+)
+def test_nrrd_lies(tmp_path: Path, fields: dict, message: str) -> None:
+    source = write(tmp_path / "v.nrrd", nrrd(fields, VALUES.astype("<i2").tobytes()))
+    with pytest.raises(DataError, match=message) as caught:
+        read_volume(source)
+    assert "\n" not in str(caught.value)
+
+
+def test_gzip_bomb_is_refused_before_unpacking(tmp_path: Path) -> None:
+    source = write(
+        tmp_path / "v.nrrd", nrrd({"encoding": "gzip", "sizes": "100000 100000 100000"}, gzip.compress(b"0"))
+    )
+    with pytest.raises(DataError, match="cannot hold"):
+        read_volume(source)
+
+
+def test_data_file_may_not_leave_through_a_link(tmp_path: Path) -> None:
+    outside, home = tmp_path / "outside.raw", tmp_path / "home"
+    outside.write_bytes(VALUES.astype("<i2").tobytes())
+    home.mkdir()
+    (home / "v.raw").symlink_to(outside)
+    source = write(home / "v.nhdr", nrrd({"data file": "v.raw"}))
+    with pytest.raises(DataError, match="header's own folder"):
+        read_volume(source)
+    (tmp_path / "v.nhdr").symlink_to(home / "w.nhdr")  # a link to both is fine
+    write(home / "w.nhdr", nrrd({"data file": "w.raw"}))
+    (home / "w.raw").write_bytes(outside.read_bytes())
+    (tmp_path / "w.raw").symlink_to(home / "w.raw")
+    np.testing.assert_array_equal(read_volume(str(tmp_path / "v.nhdr")).data, VALUES)
+
+
+def meta(fields: dict[str, object]) -> bytes:
+    base: dict[str, object] = {
+        "ObjectType": "Image",
+        "NDims": 3,
+        "DimSize": "5 4 3",
+        "ElementType": "MET_SHORT",
+        "ElementDataFile": "v.raw",
+    }
+    merged = {k: v for k, v in (base | fields).items() if v is not None}
+    last = merged.pop("ElementDataFile", None)
+    lines = [f"{k} = {v}\n" for k, v in merged.items()]
+    return "".join(lines + ([f"ElementDataFile = {last}\n"] if last else [])).encode()
+
+
+@pytest.mark.parametrize("key", ["BinaryDataByteOrderMSB", "ElementByteOrderMSB"])
+@pytest.mark.parametrize("big", [False, True])
+@pytest.mark.parametrize("header", [0, 7, -1])
+def test_metaimage(tmp_path: Path, key: str, big: bool, header: int) -> None:
+    stored = VALUES.astype(">i2" if big else "<i2")
+    (tmp_path / "v.raw").write_bytes(b"\0" * (7 if header else 0) + stored.tobytes())
+    fields = {key: big, "HeaderSize": header, "ElementSpacing": "1 2 3.5", "Offset": "4 5 6"}
+    volume = read_volume(write(tmp_path / "v.mhd", meta(fields)))
+    assert isinstance(volume.data, np.memmap)
+    assert (volume.spacing, volume.origin) == ((1, 2, 3.5), (4, 5, 6))
+    np.testing.assert_array_equal(volume.data, VALUES)
+
+
+def test_metaimage_local_compressed_and_text(tmp_path: Path) -> None:
+    body = VALUES.astype("<i2").tobytes()
+    local = meta({"ElementDataFile": "LOCAL"}) + body
+    volume = read_volume(write(tmp_path / "a.mha", local))
+    assert isinstance(volume.data, np.memmap)
+    np.testing.assert_array_equal(volume.data, VALUES)
+    packed = meta({"ElementDataFile": "LOCAL", "CompressedData": True}) + zlib.compress(body)
+    np.testing.assert_array_equal(read_volume(write(tmp_path / "b.mha", packed)).data, VALUES)
+    with pytest.raises(DataError, match="damaged zlib"):
+        read_volume(write(tmp_path / "c.mha", packed[:-20]))
+    text = meta({"ElementDataFile": "LOCAL", "BinaryData": False}) + b" ".join(b"%d" % v for v in VALUES.ravel())
+    np.testing.assert_array_equal(read_volume(write(tmp_path / "d.mha", text)).data, VALUES)
+
+
+def test_metaimage_components_and_steps(tmp_path: Path) -> None:
+    channels = np.stack([VALUES, VALUES // 2, VALUES // 5], -1).astype("<i2")
+    (tmp_path / "v.raw").write_bytes(channels.tobytes())
+    source = write(tmp_path / "v.mhd", meta({"ElementNumberOfChannels": 3}))
+    with pytest.raises(UsageError, match="3 components"):
+        read_volume(source)
+    np.testing.assert_array_equal(read_volume(source, ReadOptions(component=2)).data, channels[..., 2])
+    steps = np.moveaxis(channels, -1, 0).copy()
+    (tmp_path / "v.raw").write_bytes(steps.tobytes())
+    source = write(tmp_path / "t.mhd", meta({"NDims": 4, "DimSize": "5 4 3 3", "ElementSpacing": "1 2 3 9"}))
+    volume = read_volume(source, ReadOptions(component=1))
+    np.testing.assert_array_equal(volume.data, steps[1])
+    assert volume.spacing == (1, 2, 3)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"DimSize": "5 4 99999999999"}, "the file has"),
+        ({"NDims": 2}, "NDims 2"),
+        ({"ElementType": "MET_STRING"}, "ElementType MET_STRING"),
+        ({"ElementDataFile": "../v.raw"}, "header's own folder"),
+        ({"ElementDataFile": "LIST"}, "several files"),
+        ({"ElementDataFile": None}, "no ElementDataFile"),
+        ({"ElementNumberOfChannels": 0}, "expected at least 1"),
+        ({"HeaderSize": -7}, "HeaderSize -7"),
+        ({"ElementSpacing": "1 one 1"}, "3 finite numbers"),
+    ],
+)
+def test_metaimage_lies(tmp_path: Path, fields: dict, message: str) -> None:
+    (tmp_path / "v.raw").write_bytes(VALUES.tobytes())
+    with pytest.raises(DataError, match=message):
+        read_volume(write(tmp_path / "v.mhd", meta(fields)))
+
+
+def dat(fields: dict[str, object]) -> bytes:
+    base: dict[str, object] = {"RawFile": "v.raw", "Resolution": "5 4 3", "Format": "INT16"}
+    return "".join(f"{k}: {v}\n" for k, v in (base | fields).items() if v is not None).encode()
+
+
+def test_inviwo(tmp_path: Path) -> None:
+    (tmp_path / "v.raw").write_bytes(b"abc" + VALUES.astype(">i2").tobytes())
+    fields = {
+        "ByteOffset": 3,
+        "ByteOrder": "BigEndian",
+        "BasisVector1": "10 0 0",
+        "BasisVector2": "0 -2 0",
+        "BasisVector3": "0 0 9 # edges of the box",
+        "Offset": "1 2 3",
+    }
+    volume = read_volume(write(tmp_path / "v.dat", dat(fields)))
+    assert isinstance(volume.data, np.memmap)
+    np.testing.assert_array_equal(volume.data, VALUES)
+    assert (volume.spacing, volume.origin) == ((2, 0.5, 3), (1, 2, 3))
+    assert volume.direction == (1, 0, 0, 0, -1, 0, 0, 0, 1)
+
+
+def test_inviwo_old_names_scaling_and_sequences(tmp_path: Path) -> None:
+    (tmp_path / "v.raw").write_bytes(VALUES.tobytes())
+    fields = {"RawFile": None, "ObjectFileName": "v.raw", "Format": "SHORT", "SliceThickness": "1 1 2.5"}
+    volume = read_volume(write(tmp_path / "a.dat", dat(fields | {"DataRange": "0 1000", "ValueRange": "-1 1"})))
+    assert volume.spacing == (1, 1, 2.5)
+    assert volume.slope * 500 + volume.intercept == pytest.approx(0)
+    assert volume.slope * 1000 + volume.intercept == pytest.approx(1)
+    source = write(tmp_path / "b.dat", dat({"Resolution": "5 4 1", "Sequences": 3}))
+    with pytest.raises(UsageError, match="3 components"):
+        read_volume(source)
+    np.testing.assert_array_equal(read_volume(source, ReadOptions(component=2)).data, VALUES[2:])
+    source = write(tmp_path / "c.dat", dat({"Resolution": "5 2 3", "Format": "Vec2INT16"}))
+    np.testing.assert_array_equal(
+        read_volume(source, ReadOptions(component=1)).data, VALUES.reshape(3, 2, 5, 2)[..., 1]
+    )
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"Format": "FLOAT8"}, "Format 'FLOAT8'"),
+        ({"Resolution": None}, "no field 'resolution'"),
+        ({"Resolution": "5 4"}, "expected three numbers"),
+        ({"Resolution": "5 4 400"}, "the file has"),
+        ({"RawFile": "/etc/passwd"}, "header's own folder"),
+        ({"ByteOffset": "x"}, "whole number"),
+    ],
+)
+def test_inviwo_lies(tmp_path: Path, fields: dict, message: str) -> None:
+    (tmp_path / "v.raw").write_bytes(VALUES.tobytes())
+    with pytest.raises(DataError, match=message):
+        read_volume(write(tmp_path / "v.dat", dat(fields)))
+
+
+@pytest.mark.parametrize("kind", ["nrrd", "mha"])
+def test_vtk_writes_what_we_read(tmp_path: Path, kind: str) -> None:
+    from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
+    from vtkmodules.vtkCommonDataModel import vtkImageData
+    from vtkmodules.vtkIOImage import vtkMetaImageReader, vtkMetaImageWriter, vtkNrrdReader
+
+    image = vtkImageData()
+    image.SetDimensions(5, 4, 3)
+    image.SetSpacing(0.5, 1, 2)
+    image.SetOrigin(1, 2, 3)
+    image.GetPointData().SetScalars(numpy_to_vtk(VALUES.ravel()))
+    path = tmp_path / f"v.{kind}"
+    if kind == "mha":
+        writer = vtkMetaImageWriter()
+        writer.SetInputData(image)
+        writer.SetFileName(str(path))
+        writer.Write()
+        reader = vtkMetaImageReader()
+    else:
+        fields = {
+            "kinds": "domain domain domain",  # without them VTK takes the first axis for components
+            "space dimension": 3,
+            "space directions": "(0.5,0,0) (0,1,0) (0,0,2)",
+            "space origin": "(1,2,3)",
+        }
+        path.write_bytes(nrrd(fields, VALUES.astype("<i2").tobytes()))
+        reader = vtkNrrdReader()
+    reader.SetFileName(str(path))
+    reader.Update()
+    volume = read_volume(str(path))
+    np.testing.assert_array_equal(volume.data, VALUES)
+    theirs = vtk_to_numpy(reader.GetOutput().GetPointData().GetScalars())
+    np.testing.assert_array_equal(volume.data.ravel(), theirs)
+    assert volume.spacing == reader.GetOutput().GetSpacing() == (0.5, 1, 2)
+    assert volume.origin == reader.GetOutput().GetOrigin() == (1, 2, 3)

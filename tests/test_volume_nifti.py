@@ -1,0 +1,173 @@
+"""NIfTI against nibabel: types, byte orders, scaling, geometry, series."""
+
+from __future__ import annotations
+
+import gzip
+from pathlib import Path
+
+import nibabel as nib
+import numpy as np
+import pytest
+
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.volume import ReadOptions, Volume, read_volume
+
+TYPES = ["u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8"]
+VALUES = np.random.default_rng(2).integers(0, 100, (5, 4, 3))  # nibabel's axes: x, y, z
+
+
+def data_values(volume: Volume) -> np.ndarray:
+    """slope * stored + intercept, in nibabel's axes (x, y, z)."""
+    return (volume.data.astype(np.float64) * volume.slope + volume.intercept).transpose(2, 1, 0)
+
+
+def save(path: Path, values: np.ndarray, *, version: int = 1, slope: float = 1, inter: float = 0, order: str = "<"):
+    kind = {1: nib.Nifti1Image, 2: nib.Nifti2Image}[version]
+    header = kind.header_class(endianness=order)
+    header.set_data_dtype(values.dtype.newbyteorder(order))
+    image = kind(values, np.diag([2, 3, 4, 1]), header)
+    image.header.set_slope_inter(slope, inter)
+    image.to_filename(path)
+    return str(path)
+
+
+@pytest.mark.parametrize("code", TYPES)
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("version", [1, 2])
+def test_types(tmp_path: Path, code: str, order: str, version: int) -> None:
+    source = save(tmp_path / "v.nii", VALUES.astype(code), version=version, order=order)
+    volume = read_volume(source)
+    expected = nib.load(source)
+    assert isinstance(volume.data, np.memmap)
+    assert volume.data.dtype == expected.get_data_dtype()
+    np.testing.assert_array_equal(data_values(volume), expected.get_fdata())
+    assert volume.spacing == tuple(map(float, expected.header.get_zooms()))
+
+
+@pytest.mark.parametrize("version", [1, 2])
+@pytest.mark.parametrize("suffix", [".nii", ".nii.gz"])
+@pytest.mark.parametrize(("slope", "inter"), [(2.5, -7.0), (-0.125, 3.0), (1.0, 10.0)])
+def test_stored_value_scaling(tmp_path: Path, version: int, suffix: str, slope: float, inter: float) -> None:
+    """nibabel scales on reading, as the format demands; VTK's reader does not."""
+    source = save(tmp_path / f"v{suffix}", VALUES.astype("i2"), version=version, slope=slope, inter=inter)
+    volume = read_volume(source)
+    assert (volume.slope, volume.intercept) == (slope, inter)
+    np.testing.assert_allclose(data_values(volume), nib.load(source).get_fdata(), rtol=1e-12)
+
+
+@pytest.mark.parametrize("slope", [0.0, float("nan")])
+def test_slope_zero_is_no_scaling(tmp_path: Path, slope: float) -> None:
+    source = save(tmp_path / "v.nii", VALUES.astype("i2"))
+    patch(source, 112, np.array([slope, 5], "<f4"))
+    volume = read_volume(source)
+    assert (volume.slope, volume.intercept) == (1, 0)
+    np.testing.assert_array_equal(data_values(volume), nib.load(source).get_fdata())
+
+
+def patch(source: str, at: int, values: np.ndarray) -> None:
+    """Overwrite bytes of a file."""
+    body = bytearray(Path(source).read_bytes())
+    body[at : at + values.nbytes] = values.tobytes()
+    Path(source).write_bytes(body)
+
+
+def affine(rotation: np.ndarray, zooms: list[float]) -> np.ndarray:
+    out = np.eye(4)
+    out[:3, :3] = rotation @ np.diag(zooms)
+    out[:3, 3] = [10, -20, 30]
+    return out
+
+
+@pytest.mark.parametrize("method", ["sform", "qform"])
+@pytest.mark.parametrize("flip", [1, -1])
+def test_geometry(tmp_path: Path, method: str, flip: int) -> None:
+    c, s = np.cos(0.3), np.sin(0.3)
+    rotation = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]]) @ np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0.0]])
+    rotation[:, 2] *= flip
+    image = nib.Nifti1Image(VALUES.astype("u1"), None)
+    getattr(image, f"set_{method}")(affine(rotation, [2, 3, 4]), code=1)
+    image.header.set_zooms((2, 3, 4))
+    image.to_filename(tmp_path / "v.nii")
+    volume = read_volume(str(tmp_path / "v.nii"))
+    np.testing.assert_allclose(np.reshape(volume.direction, (3, 3)), rotation, atol=1e-6)
+    np.testing.assert_allclose(volume.origin, [10, -20, 30], rtol=1e-6)
+    assert volume.spacing == (2, 3, 4)
+
+
+def test_spacing_signs_and_zeros(tmp_path: Path) -> None:
+    source = save(tmp_path / "v.nii", VALUES.astype("u1"))
+    patch(source, 80, np.array([-2, 3, 0], "<f4"))
+    with pytest.raises(DataError, match="try --spacing X Y Z"):
+        read_volume(source)
+    assert read_volume(source, ReadOptions(spacing=(1, 1, 2))).spacing == (1, 1, 2)
+    patch(source, 88, np.array([-4], "<f4"))
+    assert read_volume(source).spacing == (2, 3, 4)
+
+
+@pytest.mark.parametrize("suffix", [".nii", ".nii.gz"])
+def test_series(tmp_path: Path, suffix: str) -> None:
+    series = np.stack([VALUES, VALUES + 100], -1).astype("i2")
+    source = save(tmp_path / f"v{suffix}", series, slope=0.5, inter=-3)
+    with pytest.raises(UsageError, match="the series has 2 components"):
+        read_volume(source)
+    expected = nib.load(source).get_fdata()
+    for step in (0, 1):
+        volume = read_volume(source, ReadOptions(component=step))
+        np.testing.assert_array_equal(data_values(volume), expected[..., step])
+        assert isinstance(volume.data, np.memmap) == (suffix == ".nii")
+    norm = read_volume(source, ReadOptions(component="magnitude"))
+    np.testing.assert_allclose(data_values(norm), np.linalg.norm(expected, axis=-1), rtol=1e-6)
+    single = save(tmp_path / f"one{suffix}", series[..., :1])
+    np.testing.assert_array_equal(data_values(read_volume(single)), series[..., 0])
+
+
+def test_pair(tmp_path: Path) -> None:
+    image = nib.Nifti1Pair(VALUES.astype("i2"), np.eye(4))
+    image.to_filename(tmp_path / "v.img")
+    np.testing.assert_array_equal(data_values(read_volume(str(tmp_path / "v.hdr"))), VALUES)
+    (tmp_path / "v.img").unlink()
+    with pytest.raises(DataError, match=r"without its .img file"):
+        read_volume(str(tmp_path / "v.hdr"))
+
+
+def test_content_beats_name(tmp_path: Path) -> None:
+    source = save(tmp_path / "v.nii", VALUES.astype("u1"))
+    wrong = tmp_path / "v.tif"
+    wrong.write_bytes(Path(source).read_bytes())
+    np.testing.assert_array_equal(data_values(read_volume(str(wrong))), VALUES)
+
+
+@pytest.mark.parametrize(
+    ("at", "values", "message"),
+    [
+        (40, np.array([3, 32767, 32767, 32767], "<i2"), "the file has"),
+        (40, np.array([3, 5, 0, 3], "<i2"), "at least 1 voxel"),
+        (40, np.array([9], "<i2"), "1 to 7 axes"),
+        (70, np.array([128], "<i2"), "RGB colours"),
+        (70, np.array([32], "<i2"), "complex64"),
+        (70, np.array([7], "<i2"), "unknown type 7"),
+        (108, np.array([np.nan], "<f4"), "vox_offset"),
+        (108, np.array([1e9], "<f4"), "the file has"),
+        (112, np.array([np.inf], "<f4"), "scl_slope inf"),
+        (344, np.array([0], "<i4"), "no NIfTI header"),
+    ],
+)
+def test_lies(tmp_path: Path, at: int, values: np.ndarray, message: str) -> None:
+    source = save(tmp_path / "v.nii", VALUES.astype("u1"))
+    patch(source, at, values)
+    with pytest.raises(DataError, match=message) as caught:
+        read_volume(source)
+    assert "\n" not in str(caught.value)
+
+
+def test_gzip_damage(tmp_path: Path) -> None:
+    source = Path(save(tmp_path / "v.nii.gz", VALUES.astype("u1")))
+    body = source.read_bytes()
+    source.write_bytes(body[:-30])
+    with pytest.raises(DataError, match="gzip"):
+        read_volume(str(source))
+    plain = bytearray(gzip.decompress(body))
+    plain[42:48] = np.array([32767] * 3, "<i2").tobytes()
+    source.write_bytes(gzip.compress(bytes(plain)))
+    with pytest.raises(DataError, match="cannot hold"):
+        read_volume(str(source))

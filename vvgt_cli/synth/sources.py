@@ -1,0 +1,55 @@
+"""The entry for every volume source: files, ``-`` and ``example:`` names, the analytic ones among them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+
+from vvgt_cli.errors import UsageError
+from vvgt_cli.synth import analytic
+from vvgt_cli.volume.examples import Maker, register_example
+from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.registry import read_volume
+from vvgt_cli.volume.types import Volume
+
+_SIZE = re.compile(r"(\d{1,6})(?:x(\d{1,6})x(\d{1,6}))?")
+
+
+def _sized(name: str, make: Callable[[analytic.Size], Volume], default: int) -> Maker:
+    def open_analytic(rest: str, options: ReadOptions) -> Volume:
+        match = _SIZE.fullmatch(rest or str(default))
+        if match is None:
+            raise UsageError(f"example:{name}:{rest}: expected a size, as example:{name}:64 or example:{name}:64x48x32")
+        if options.array is not None or options.component not in (None, 0):
+            raise UsageError(f"example:{name}: one unnamed scalar array; leave out --array and --component")
+        x, y, z = (int(match[1]), int(match[2] or match[1]), int(match[3] or match[1]))
+        volume = make((x, y, z))
+        return volume if options.spacing is None else replace(volume, spacing=options.spacing)
+
+    return open_analytic
+
+
+for _name, _make, _default in (
+    ("marschner-lobb", analytic.marschner_lobb, 64),
+    ("blob", analytic.blob, 64),
+    ("slab", analytic.slab, 64),
+    ("sphere", analytic.sphere, 64),
+    ("checkerboard", analytic.checkerboard, 32),
+    ("random", analytic.random_field, 64),
+):
+    register_example(_name, _sized(_name, _make, _default))
+
+
+def open_volume(source: str, options: ReadOptions | None = None) -> Volume:
+    """Open a volume: a file, ``-`` (raw bytes from standard input) or ``example:NAME[:SIZE]``.
+
+    Args:
+        source: see above.
+        options: see `ReadOptions`.
+
+    Raises:
+        DataError: see `read_volume`.
+        UsageError: see `read_volume`; also an example that does not exist (the error lists those that do).
+    """
+    return read_volume(source, options or ReadOptions())
