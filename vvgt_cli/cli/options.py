@@ -100,7 +100,7 @@ def set_threads(count: int) -> None:
         import numba
         from numba.core import config
 
-        numba.set_num_threads(min(count, config.NUMBA_NUM_THREADS))
+        numba.set_num_threads(min(count, config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
         return
     os.environ["NUMBA_NUM_THREADS"] = str(count)
     os.environ["OMP_NUM_THREADS"] = str(count)

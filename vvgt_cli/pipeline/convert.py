@@ -194,9 +194,9 @@ def _back_project(run: Run, scene: Scene, gaussians: Gaussians, fit: FitOptions)
         stage.note = f"{len(train)} to fit to, {len(check)} to check by, {fit.size} px"
     reference = images[len(train) :]
     with run.stage("back-projection") as stage:
-        before = score_views(reference, _splats(gaussians, check)).psnr
+        before = score_views(reference, _splats(gaussians, check), perceptual=False).psnr
         mended = backproject(gaussians, train, images[: len(train)])
-        after = score_views(reference, _splats(mended, check)).psnr
+        after = score_views(reference, _splats(mended, check), perceptual=False).psnr
         stage.kept = after > before
         stage.note = f"from {before:.2f} dB"
         stage.psnr = after
@@ -211,12 +211,17 @@ def _score(run: Run, scene: Scene, gaussians: Gaussians, request: ConvertRequest
     with run.stage("test views") as stage:
         reference = _views(run, scene, cameras, "test views")
         ours = _splats(gaussians, cameras)
-        scores = score_views(reference, ours)
-        stage.note = f"PSNR {scores.psnr:.2f} dB over {len(cameras)} views, {request.fit.size} px"
+        scores = score_views(reference, ours, perceptual=request.report is not None)
+        stage.note = f"{psnr_note(scores.psnr, scores.psnr_foreground)}, {len(cameras)} views of {request.fit.size} px"
     if request.preview:
         rows = np.linspace(0, len(cameras) - 1, PREVIEW_ROWS).round().astype(int)
         write_preview(request.preview, reference[rows], ours[rows], request.overwrite)
     return scores
+
+
+def psnr_note(whole: float, foreground: float | None) -> str:
+    """PSNR as stages print it."""
+    return f"PSNR {whole:.2f} dB" + ("" if foreground is None else f" (foreground {foreground:.2f} dB)")
 
 
 def write_preview(path: str, reference: np.ndarray, ours: np.ndarray, overwrite: bool) -> None:

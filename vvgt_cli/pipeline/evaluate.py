@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from vvgt_cli.cameras import default_views
 from vvgt_cli.errors import UsageError
-from vvgt_cli.gaussians import PlyHeader
-from vvgt_cli.pipeline.convert import describe_source, tf_record, volume_record
+from vvgt_cli.gaussians import Gaussians, PlyHeader
+from vvgt_cli.pipeline.convert import describe_source, psnr_note, tf_record, volume_record
 from vvgt_cli.pipeline.record import ConversionReport, Run, Stage, document
 from vvgt_cli.pipeline.render import STDIN, open_gaussians
 from vvgt_cli.pipeline.source import Source, SourceRequest, load
@@ -60,6 +58,8 @@ class Evaluation:
         scales = list(self.scores)
         rows = [("", *(f"{scale} ({self.size * int(scale[:-1])} px)" for scale in scales))]
         for key in next(iter(self.scores.values())):
+            if key == "per_view":
+                continue
             values = [self.scores[scale][key] for scale in scales]
             rows.append((key.replace("_", " "), *map(_cell, values)))
         width = max(len(row[0]) for row in rows) + 2
@@ -108,29 +108,34 @@ def evaluate(request: EvaluateRequest, console: Console | None = None) -> Evalua
         with run.stage(f"test views {scale}x") as stage:
             scores = _scores(run, scene, gaussians, request.size * scale, scale)
             evaluation.scores[f"{scale}x"] = scores
-            stage.note = f"PSNR {scores['psnr']:.2f} dB"
+            stage.note = psnr_note(scores["psnr"], scores["psnr_foreground"])
     evaluation.stages = run.report.stages
     evaluation.seconds = run.finish().seconds
     return evaluation
 
 
-def _scores(run: Run, scene: Scene, gaussians: Any, size: int, scale: int) -> dict[str, Any]:
-    """Every number of docs/conventions.md, "Units of a report", at one size."""
-    from vvgt_cli.dvr import REFERENCE, render_views
-    from vvgt_cli.metrics import score_views
+def _scores(run: Run, scene: Scene, gaussians: Gaussians, size: int, scale: int) -> dict[str, Any]:
+    """Every number of docs/conventions.md, "Units of a report", at one size; one view in memory at a time."""
+    from vvgt_cli.dvr import REFERENCE, render_view
+    from vvgt_cli.metrics import mean_scores, score_view
     from vvgt_cli.splat import render
 
     cameras = default_views("test", size=size)
-    reference = render_views(scene, cameras, REFERENCE, progress=run.console.bar(f"test views {scale}x"))
-    return asdict(score_views(reference, np.stack([render(gaussians, camera) for camera in cameras])))
+    bar = run.console.bar(f"test views {scale}x")
+    views = []
+    for camera in cameras:
+        views.append(score_view(render_view(scene, camera, REFERENCE), render(gaussians, camera)))
+        if bar:
+            bar(len(views), len(cameras))
+    return asdict(mean_scores(views))
 
 
 def _reference_psnr(scene: Scene, size: int) -> float:
     """PSNR of the reference's first test view against half the step and twice the rays along a pixel's edge."""
     from vvgt_cli.dvr import REFERENCE, render_view
-    from vvgt_cli.metrics import score_views
+    from vvgt_cli.metrics import score_view
 
     camera = default_views("test", size=size)[0]
     finer = replace(REFERENCE, step=REFERENCE.step / 2, samples=2 * REFERENCE.samples)
-    images = [render_view(scene, camera, settings)[None] for settings in (finer, REFERENCE)]
-    return float(score_views(images[0], images[1]).psnr)
+    images = [render_view(scene, camera, settings) for settings in (finer, REFERENCE)]
+    return score_view(images[0], images[1], perceptual=False).psnr

@@ -1,0 +1,241 @@
+"""The commands end to end on small volumes."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vvgt_cli.cameras.files import read_cameras
+from vvgt_cli.gaussians import in_unit_frame, read_ply
+from vvgt_cli.images import read_exr, read_png
+
+ROOT = Path(__file__).parent.parent
+SMALL = ("--max-gaussians", 300, "--size", 48)
+SOURCE = "example:marschner-lobb:24"
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    points = [
+        {"x": 0, "rgb": [0.1, 0.2, 0.9], "opacity": 0},
+        {"x": 0.5, "rgb": [0.9, 0.8, 0.2], "opacity": 0.2},
+        {"x": 1, "rgb": [0.9, 0.1, 0.1], "opacity": 0.6},
+    ]
+    Path("tf.json").write_text(json.dumps({"range": [0, 1], "points": points}))
+    return tmp_path
+
+
+@pytest.fixture(scope="module")
+def converted(tmp_path_factory):
+    """One conversion with every output, and its standard error."""
+    folder = tmp_path_factory.mktemp("converted")
+    args = ["convert", SOURCE, *SMALL, "-o", "a.ply", "--report", "a.json", "--preview", "a.png"]
+    done = run_python(args, folder)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == b""
+    return folder, done.stderr.decode()
+
+
+def run_python(args, folder, stdin=None):
+    command = [sys.executable, "-m", "vvgt_cli.cli.main", *map(str, args)]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    return subprocess.run(command, cwd=folder, input=stdin, capture_output=True, env=environment, check=False)
+
+
+def test_convert_leaves_file_report_and_preview(converted):
+    folder, talk = converted
+    gaussians, header = read_ply(folder / "a.ply")
+    assert 0 < len(gaussians) <= 300
+    assert (header.frame, header.up, header.unit_distance_label) == ("unit", "none", "paraview")
+    assert np.abs(gaussians.means).max() < 1.2
+    report = json.loads((folder / "a.json").read_text())
+    assert (report["format"], report["schema"], report["command"]) == ("vvgt-conversion", 1, "convert")
+    assert report["gaussians"] == len(gaussians)
+    assert report["bytes"] == (folder / "a.ply").stat().st_size
+    assert report["scores"]["psnr"] > 15
+    assert report["volume"]["dims"] == [24, 24, 24]
+    assert report["transfer_function"]["given"] is False
+    assert report["seconds"] >= sum(stage["seconds"] for stage in report["stages"]) * 0.99
+    assert report["versions"]["vvgt"] == header.version
+    assert read_png(folder / "a.png").shape == (3 * 48, 3 * 48, 3)
+    lines = talk.splitlines()
+    assert [line[:16].strip() for line in lines] == [stage["name"] for stage in report["stages"]]
+    assert f"PSNR {report['scores']['psnr']:.2f} dB" in talk
+    assert "\r" not in talk  # no bars where nobody watches
+
+
+def test_the_report_page_names_every_field(converted):
+    page = (ROOT / "docs" / "report.md").read_text()
+
+    def names(value):
+        if isinstance(value, dict):
+            for key, item in value.items():
+                yield key
+                yield from names(item)
+        elif isinstance(value, list):
+            for item in value:
+                yield from names(item)
+
+    report = json.loads((converted[0] / "a.json").read_text())
+    report.pop("versions")  # a package a key
+    missing = {name for name in names(report) if f"`{name}`" not in page}
+    assert not missing
+
+
+def test_the_same_command_gives_the_same_bytes(converted, vvgt):
+    folder, _ = converted
+    again = vvgt("convert", SOURCE, *SMALL, "-o", folder / "b.ply", "--quiet")
+    assert (again.code, again.err, again.out) == (0, "", b"")
+    assert (folder / "a.ply").read_bytes() == (folder / "b.ply").read_bytes()
+
+
+def test_convert_to_standard_output(converted, vvgt):
+    result = vvgt("convert", SOURCE, *SMALL, "-o", "-", "-q")
+    assert result.out == (converted[0] / "a.ply").read_bytes()
+
+
+def test_report_to_standard_output(folder, vvgt):
+    result = vvgt("init", SOURCE, *SMALL, "-o", "a.ply", "--report", "-")
+    report = json.loads(result.out)
+    assert (report["command"], report["scores"]) == ("init", None)
+    assert report["gaussians"] == len(read_ply("a.ply")[0])
+
+
+@pytest.mark.parametrize("method", ["vbm", "wavelet", "uniform"])
+def test_init_has_three_methods(method, folder, vvgt):
+    result = vvgt("init", SOURCE, *SMALL, "--tf", "tf.json", "--init", method, "-o", "a.ply")
+    assert result.code == 0, result.err
+    assert method in result.err
+    assert 0 < len(read_ply("a.ply")[0]) <= 300
+
+
+def test_the_seed_draws_other_samples(folder, vvgt):
+    outputs = [
+        vvgt("init", SOURCE, *SMALL, "--init", "uniform", "--seed", seed, "-o", "-", "-q").out for seed in (0, 0, 1)
+    ]
+    assert outputs[0] == outputs[1] != outputs[2]
+
+
+def test_frames_agree(folder, vvgt):
+    options = ("init", SOURCE, *SMALL, "--spacing", 2, 1, 0.5, "--tf", "tf.json", "-q", "-o")
+    assert vvgt(*options, "unit.ply").code == 0
+    assert vvgt(*options, "world.ply", "--frame", "world", "--up", "z", "--sh-degree", 3).code == 0
+    unit, _ = read_ply("unit.ply")
+    world, header = read_ply("world.ply")
+    assert (header.frame, header.up, header.sh_degree) == ("world", "z", 3)
+    np.testing.assert_allclose(in_unit_frame(world, header).means, unit.means, atol=1e-5)
+    assert vvgt(*options, "bare.ply", "--no-comments").code == 0
+    assert b"comment" not in Path("bare.ply").read_bytes().split(b"end_header")[0]
+
+
+def test_a_world_file_renders_like_the_unit_one(folder, vvgt):
+    for frame in ("unit", "world"):
+        vvgt("init", SOURCE, *SMALL, "--frame", frame, "--up", "x", "-o", f"{frame}.ply", "-q")
+        assert vvgt("render", f"{frame}.ply", "--orbit", 2, "--size", 40, "--exr", "-o", frame, "-q").code == 0
+    a, b = (read_exr(folder / frame / "orbit_001.exr")[0] for frame in ("unit", "world"))
+    assert a[..., 3].max() > 0.1
+    np.testing.assert_allclose(a, b, atol=2e-2)  # a splat at the 1/255 cut may fall on either side
+
+
+def test_render_writes_views_that_render_again(converted, folder, vvgt):
+    ply = converted[0] / "a.ply"
+    assert vvgt("render", ply, "--orbit", 3, "--size", 40, "--background", 1, 1, 1, "-o", "turn").code == 0
+    assert sorted(path.name for path in Path("turn").iterdir()) == [
+        *(f"orbit_{i:03d}.png" for i in range(3)),
+        "transforms.json",
+    ]
+    assert read_png("turn/orbit_000.png").shape == (40, 40, 3)
+    assert len(read_cameras("turn/transforms.json")) == 3
+    taken = vvgt("render", ply, "--orbit", 3, "--size", 40, "-o", "turn")
+    assert (taken.code, "exists" in taken.error) == (2, True)
+    again = vvgt("render", ply, "--camera", "turn/transforms.json", "--size", 20, "-o", "again")
+    assert again.code == 0, again.err
+    assert read_png("again/orbit_002.png").shape == (20, 20, 4)
+
+
+def test_pipes(folder, vvgt):
+    values = (np.indices((12, 12, 12)).sum(axis=0) * 7).astype(np.uint8)
+    options = ["--dims", 12, 12, 12, "--dtype", "uint8", *SMALL, "-o", "-", "-q"]
+    made = run_python(["init", "-", *options], folder, values.tobytes())
+    assert made.returncode == 0, made.stderr
+    count = len(read_ply(io.BytesIO(made.stdout))[0])
+    facts = run_python(["info", "-", "--json"], folder, made.stdout)
+    assert json.loads(facts.stdout)["gaussians"] == count
+    drawn = run_python(["render", "-", "--orbit", 1, "--size", 20, "-o", "d"], folder, made.stdout)
+    assert drawn.returncode == 0, drawn.stderr
+    assert Path("d/orbit_000.png").exists()
+
+
+def test_evaluate_scores_every_scale(converted, vvgt):
+    ply = converted[0] / "a.ply"
+    options = ("evaluate", ply, "--volume", SOURCE, "--size", 48, "--scale", 1, "--scale", 2)
+    document = json.loads(vvgt(*options, "--json").out)
+    assert list(document["scores"]) == ["1x", "2x"]
+    assert document["format"] == "vvgt-evaluation"
+    assert document["reference_psnr"] > 30
+    report = json.loads((converted[0] / "a.json").read_text())
+    # another reference (finer steps), so close but not the same
+    assert document["scores"]["1x"]["psnr"] == pytest.approx(report["scores"]["psnr"], abs=1)
+    assert document["transfer_function"]["unit_distance"] == report["transfer_function"]["unit_distance"]
+    page = (ROOT / "docs" / "report.md").read_text()
+    assert all(f"`{name}`" in page for name in (*document, *document["scores"]["1x"]))
+    table = vvgt(*options, "--quiet")
+    assert table.err == ""
+    assert f"{document['scores']['2x']['psnr']:.4f}" in table.out.decode()
+
+
+def test_a_scene_without_anything_to_see_is_an_error(folder, vvgt):
+    values = np.zeros((9, 9, 9), np.float32)
+    values[2:7, 2:7, 2:7] = np.nan  # transparent, and so is all that is interpolated with it
+    values[4, 4, 4] = 1
+    values.tofile("v.raw")
+    points = [{"x": x, "rgb": [1, 1, 1], "opacity": float(x > 0.5)} for x in (0, 0.5, 0.51, 1)]
+    Path("high.json").write_text(json.dumps({"range": [0, 1], "points": points}))
+    raw = ("v.raw", "--dims", 9, 9, 9, "--dtype", "float32")
+    result = vvgt("convert", *raw, "--tf", "high.json", *SMALL, "-o", "a.ply")
+    assert (result.code, "nothing visible" in result.error) == (1, True)
+    assert not Path("a.ply").exists()
+
+
+def test_info_on_every_kind(converted, folder, vvgt):
+    kinds = {
+        SOURCE: "volume",
+        "tf.json": "transfer function",
+        str(converted[0] / "a.ply"): "gaussians",
+    }
+    for file, kind in kinds.items():
+        result = vvgt("info", file)
+        assert result.code == 0, result.err
+        assert result.out.decode().splitlines()[0].split(None, 1) == ["kind", kind]
+        assert json.loads(vvgt("info", file, "--json").out)["kind"] == kind
+    vvgt("render", converted[0] / "a.ply", "--orbit", 2, "--size", 16, "-o", "d")
+    assert json.loads(vvgt("info", "d/transforms.json", "--json").out)["views"] == 2
+
+
+def test_tf_show_draws(folder, vvgt):
+    assert vvgt("tf", "show", "tf.json", "-o", "a.png").code == 0
+    assert vvgt("tf", "show", "tf.json", "-o", "b.png", "--volume", SOURCE).code == 0
+    a, b = read_png("a.png"), read_png("b.png")
+    assert a.shape == b.shape
+    assert np.abs(a - b).max() > 0.1  # the histogram behind
+
+
+def test_an_interrupted_run_leaves_nothing(folder, vvgt, monkeypatch):
+    import vvgt_cli.pipeline.convert as pipeline
+
+    def stop(stream, *args):
+        Path(stream).write_bytes(b"half")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(pipeline, "write_ply", stop)
+    result = vvgt("init", SOURCE, *SMALL, "-o", "a.ply")
+    assert (result.code, "interrupted" in result.err) == (130, True)
+    assert [path.name for path in folder.iterdir()] == ["tf.json"]
