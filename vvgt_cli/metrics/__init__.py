@@ -1,0 +1,8 @@
+"""PSNR, SSIM and FLIP as the conventions define them."""
+
+from vvgt_cli.metrics.flip import flip, flip_map
+from vvgt_cli.metrics.psnr import psnr
+from vvgt_cli.metrics.scores import Scores, ViewScore, mean_scores, score_view, score_views
+from vvgt_cli.metrics.ssim import ssim
+
+__all__ = ["Scores", "ViewScore", "flip", "flip_map", "mean_scores", "psnr", "score_view", "score_views", "ssim"]
