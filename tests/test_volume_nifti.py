@@ -149,7 +149,7 @@ def test_content_beats_name(tmp_path: Path) -> None:
         (108, np.array([np.nan], "<f4"), "vox_offset"),
         (108, np.array([1e9], "<f4"), "the file has"),
         (112, np.array([np.inf], "<f4"), "scl_slope inf"),
-        (344, np.array([0], "<i4"), "no NIfTI header"),
+        (344, np.array([0], "<i4"), "named like a NIfTI file"),
     ],
 )
 def test_lies(tmp_path: Path, at: int, values: np.ndarray, message: str) -> None:

@@ -113,4 +113,4 @@ def read_inviwo(path: Path, options: ReadOptions) -> Volume:
     )
 
 
-register(Reader("Inviwo .dat", (".dat",), lambda head: _START.search(head) is not None, read_inviwo))
+register(Reader("Inviwo .dat", (".dat",), lambda head: _START.search(head) is not None, read_inviwo, by_name=True))

@@ -138,4 +138,6 @@ def _load(fields: Fields, source: Path, dtype: np.dtype, shape: tuple[int, ...],
     return load_block(source, dtype, shape, offset=-1 if header == -1 else start + header)
 
 
-register(Reader("MetaImage", (".mha", ".mhd"), lambda head: _START.match(head) is not None, read_metaimage))
+register(
+    Reader("MetaImage", (".mha", ".mhd"), lambda head: _START.match(head) is not None, read_metaimage, by_name=True)
+)

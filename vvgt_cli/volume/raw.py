@@ -105,4 +105,6 @@ def read_stdin(options: ReadOptions, stream: IO[bytes] | None = None) -> Volume:
     return _volume(data.view(dtype).reshape(dims[::-1]), "stdin", "standard input", options)
 
 
-READER = register(Reader("raw", (".raw", ".raw.gz"), lambda head: False, read_raw, unzips=True, raw_layout=True))
+READER = register(
+    Reader("raw", (".raw", ".raw.gz"), lambda head: False, read_raw, unzips=True, raw_layout=True, by_name=True)
+)

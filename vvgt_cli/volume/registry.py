@@ -33,6 +33,7 @@ class Reader:
         unzips: reads gzip-compressed files by itself.
         named_arrays: takes ``--array``.
         raw_layout: takes dims, dtype, byte order and header bytes.
+        by_name: tried on a file that only its name speaks for (formats without a fixed beginning).
     """
 
     name: str
@@ -42,6 +43,7 @@ class Reader:
     unzips: bool = False
     named_arrays: bool = False
     raw_layout: bool = False
+    by_name: bool = False
 
 
 Scheme = Callable[[str, ReadOptions], Volume]
@@ -118,9 +120,9 @@ def read_volume(source: str, options: ReadOptions | None = None) -> Volume:
 
 def _head(path: Path, source: str) -> bytes:
     """First bytes of a file; raises `DataError` if there are none to be had."""
-    if path.is_dir():
-        raise DataError(f"{source}: a folder; expected a volume file ({', '.join(known_suffixes())})")
     try:
+        if path.is_dir():
+            raise DataError(f"{source}: a folder; expected a volume file ({', '.join(known_suffixes())})")
         with open(path, "rb") as file:
             head = file.read(HEAD_BYTES)
     except FileNotFoundError:
@@ -164,8 +166,13 @@ def _find(path: Path, head: bytes, options: ReadOptions) -> Reader:
         return found
     if options.dims:
         return raw.READER
-    if named is not None:
+    if named is not None and named.by_name:
         return named
+    if named is not None:
+        raise DataError(
+            f"{path}: named like a {named.name} file, but its content is of no known format; expected a whole "
+            f"{named.name} file, or raw values with --dims X Y Z --dtype TYPE"
+        )
     raise DataError(
         f"{path}: not a format that is known by content or name; expected {', '.join(known_suffixes())}, or a raw "
         "file with --dims X Y Z --dtype TYPE"

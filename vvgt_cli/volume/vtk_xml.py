@@ -76,7 +76,7 @@ def scan(path: Path) -> _Scan:
             found.where = tag[:-4].lower()
             found.active[found.where] = attributes.get("Scalars", "")
         elif tag == "DataArray" and found.where and found.pieces == 1:
-            _note_array(found, attributes)
+            _note_array(found, attributes, path)
         elif tag == "AppendedData":
             found.appended, found.data_start = attributes.get("encoding", ""), parser.CurrentByteIndex
 
@@ -99,13 +99,13 @@ def scan(path: Path) -> _Scan:
     return found
 
 
-def _note_array(found: _Scan, attributes: dict[str, str]) -> None:
+def _note_array(found: _Scan, attributes: dict[str, str], path: Path) -> None:
     dtype = _DTYPES.get(attributes.get("type", "").lower())
     if dtype is None:
         return
     components = int(attributes.get("NumberOfComponents", "1"))
     if components < 1:
-        raise DataError(f"array {attributes.get('Name')!r} has {components} components")
+        raise DataError(f"{path}: array {attributes.get('Name')!r} has {components} components")
     name = attributes.get("Name", "")
     active = bool(name) and name == found.active.get(found.where)
     info = ArrayInfo(name, found.where, components, np.dtype(dtype).name, active)

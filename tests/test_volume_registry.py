@@ -1,0 +1,176 @@
+"""How a format is found, what an option may do to it, and how errors read."""
+
+from __future__ import annotations
+
+import gzip
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from vvgt_cli.errors import DataError, UsageError, VvgtError
+from vvgt_cli.synth import open_volume
+from vvgt_cli.volume import ReadOptions, read_volume
+from vvgt_cli.volume.blocks import parse_numbers
+from vvgt_cli.volume.registry import Reader, known_suffixes, register, volume_name
+
+NRRD = b"NRRD0004\ntype: uchar\ndimension: 3\nsizes: 2 2 2\nencoding: raw\n\n" + bytes(range(8))
+HEADS = (
+    NRRD,
+    b"NDims = 3\nDimSize = 2 2 2\nElementType = MET_UCHAR\nElementDataFile = LOCAL\n" + bytes(8),
+    b"RawFile: v.raw\nResolution: 2 2 2\nFormat: UINT8\n",
+    b"# vtk DataFile Version 3.0\nt\nBINARY\nDATASET STRUCTURED_POINTS\nDIMENSIONS 2 2 2\nORIGIN 0 0 0\nSPACING 1 1 1\n"
+    b"POINT_DATA 8\nSCALARS s char\nLOOKUP_TABLE default\n" + bytes(8),
+    b"11111\n2 2 2 8\n1 1 1\n1 1 1 1\n1 1 X...3 X\x08\x01\0" + b"3 X\x04\x01\0" * 2,
+    b"II*\0\x08\0\0\0\x02\0\0\x01\x04\0\x01\0\0\0\x02\0\0\0\x01\x01\x04\0\x01\0\0\0\x02\0\0\0\0\0\0\0",
+    (348).to_bytes(4, "little") + bytes(36) + np.array([3, 2, 2, 2, 1, 1, 1, 1], "<i2").tobytes() + bytes(14)
+    + np.array([2, 8], "<i2").tobytes() + bytes(2) + np.ones(8, "<f4").tobytes() + np.array([352], "<f4").tobytes()
+    + bytes(232) + b"n+1\0" + bytes(12),
+    b'<?xml version="1.0"?>\n<VTKFile type="ImageData" byte_order="LittleEndian"><ImageData WholeExtent="0 1 0 1 0 1" '
+    b'Origin="0 0 0" Spacing="1 1 1"><Piece Extent="0 1 0 1 0 1"><PointData><DataArray type="UInt8" Name="a" '
+    b'format="ascii">1 2 3 4 5 6 7 8</DataArray></PointData></Piece></ImageData></VTKFile>',
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["v.nrrd", "v.dat", "v.vti", "v", "v.unknown"])
+def test_content_before_name(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes(NRRD)
+    assert read_volume(str(tmp_path / name)).data.ravel().tolist() == list(range(8))
+
+
+@pytest.mark.parametrize("suffix", sorted(set(known_suffixes())))
+def test_a_name_with_the_wrong_content_is_one_clear_line(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"v{suffix}"
+    path.write_bytes(b"nothing that any format begins with")
+    with pytest.raises(VvgtError, match=r"expected|no field|has no ElementDataFile|unknown layout") as caught:
+        read_volume(str(path))
+    assert "\n" not in str(caught.value)
+
+
+@settings(max_examples=400, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    head=st.sampled_from(HEADS),
+    edits=st.lists(st.tuples(st.integers(0, 400), st.binary(max_size=4)), max_size=4),
+    cut=st.integers(0, 500),
+)
+def test_damaged_files_end_in_one_line(tmp_path: Path, head: bytes, edits: list[tuple[int, bytes]], cut: int) -> None:
+    body = bytearray(head)
+    for at, new in edits:
+        at %= len(body)
+        body[at : at + len(new)] = new
+    path = tmp_path / "v"
+    path.write_bytes(body[: cut or None])
+    try:
+        volume = read_volume(str(path))
+    except VvgtError as error:
+        message = str(error)
+    else:
+        message = f"v: {volume.data.size} voxels"
+    assert message.startswith((str(path), "v: "))
+    assert "\n" not in message
+    assert len(message) < 1000
+
+
+def test_the_undamaged_heads_are_read(tmp_path: Path) -> None:
+    (tmp_path / "v.raw").write_bytes(bytes(8))
+    for k, head in enumerate(HEADS):
+        path = tmp_path / f"v{k}"
+        path.write_bytes(head)
+        if head.startswith(b"II*"):  # directories without pixels
+            with pytest.raises(DataError, match="damaged"):
+                read_volume(str(path))
+        elif head.startswith(b"11111"):  # its first plane has 8 voxels, 4 were declared
+            with pytest.raises(DataError, match="plane 0 of 2"):
+                read_volume(str(path))
+        elif b"n+1\0" in head:
+            path.write_bytes(head[:352].ljust(352, b"\0") + bytes(8))
+            assert read_volume(str(path)).dims == (2, 2, 2)
+        else:
+            assert read_volume(str(path)).dims == (2, 2, 2)
+
+
+def test_what_cannot_be_opened(tmp_path: Path) -> None:
+    for source, message in (
+        (tmp_path / "none.raw", "no such file"),
+        (tmp_path, "a folder; expected a volume file"),
+        ("examples:frog", "schemes: example:"),
+        ("x" * 5000, "cannot be read"),
+        ("a\0b", "cannot be read"),
+    ):
+        with pytest.raises(DataError, match=message):
+            read_volume(str(source))
+    (tmp_path / "empty.nii").touch()
+    with pytest.raises(DataError, match="the file is empty"):
+        read_volume(str(tmp_path / "empty.nii"))
+    (tmp_path / "v.xyz").write_bytes(b"what is this")
+    with pytest.raises(DataError, match=r"not a format that is known.*\.nrrd.*--dims X Y Z --dtype TYPE"):
+        read_volume(str(tmp_path / "v.xyz"))
+    (tmp_path / "v.nrrd.gz").write_bytes(gzip.compress(NRRD))
+    with pytest.raises(DataError, match="gzip-compressed NRRD file; unpack it first"):
+        read_volume(str(tmp_path / "v.nrrd.gz"))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (ReadOptions(dims=(2, 2, 2), dtype="uint8"), "states its own layout; leave out --dims --dtype"),
+        (ReadOptions(byte_order="big"), "leave out --byte-order"),
+        (ReadOptions(header_bytes=4), "leave out --header-bytes"),
+        (ReadOptions(array="a"), "leave out --array a"),
+        (ReadOptions(component="magnitude"), "1 component of type uint8; leave out --component"),
+    ],
+)
+def test_options_that_would_do_nothing_are_refused(tmp_path: Path, options: ReadOptions, message: str) -> None:
+    (tmp_path / "v.nrrd").write_bytes(NRRD)
+    with pytest.raises(UsageError, match=message):
+        read_volume(str(tmp_path / "v.nrrd"), options)
+
+
+def test_names() -> None:
+    for name, expected in (
+        ("bonsai.nii.gz", "bonsai"),
+        ("head_64x64x93_uint16.raw", "head"),
+        ("V.NRRD", "V"),
+        ("4x4x4_uint8.raw", "4x4x4_uint8"),
+        ("plain", "plain"),
+    ):
+        assert volume_name(Path(name)) == expected
+
+
+def test_the_registry_checks_itself() -> None:
+    with pytest.raises(ValueError, match="registered twice"):
+        register(Reader("NRRD", (".x",), lambda head: False, lambda path, options: None))  # type: ignore[arg-type,return-value]
+    with pytest.raises(ValueError, match="lower case"):
+        register(Reader("new", ("X",), lambda head: False, lambda path, options: None))  # type: ignore[arg-type,return-value]
+
+
+def test_numbers_across_windows(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("vvgt_cli.volume.blocks._CHUNK", 7)
+    text = b" ".join(b"%d" % v for v in range(100)) + b"\n"
+    np.testing.assert_array_equal(parse_numbers(text, 0, 100, np.dtype("u1"), "t"), np.arange(100))
+    with pytest.raises(DataError, match="holds 100 values, expected 101"):
+        parse_numbers(text, 0, 101, np.dtype("u1"), "t")
+
+
+@pytest.mark.parametrize(
+    ("name", "dims", "dtype"), [("frog", (500, 470, 136), "uint8"), ("channels", (250, 250, 100), "int64")]
+)
+def test_bundled_examples(name: str, dims: tuple[int, int, int], dtype: str) -> None:
+    volume = open_volume(f"example:{name}")
+    assert volume.dims == dims
+    assert volume.data.dtype == dtype
+    assert volume.data.max() > volume.data.min()
+
+
+def test_reading_loads_nothing_heavy(tmp_path: Path) -> None:
+    (tmp_path / "v.nrrd").write_bytes(NRRD)
+    code = (
+        "import sys\nfrom vvgt_cli.synth import open_volume\nopen_volume(sys.argv[1])\nopen_volume('example:blob:8')\n"
+        "heavy = {'numba', 'vtkmodules', 'vtk', 'pyvista', 'OpenImageIO', 'matplotlib', 'scipy'} & set(sys.modules)\n"
+        "assert not heavy, heavy"
+    )
+    subprocess.run([sys.executable, "-c", code, str(tmp_path / "v.nrrd")], check=True, cwd=Path(__file__).parent.parent)
