@@ -79,6 +79,12 @@ def test_values_at_the_limits_of_float64() -> None:
     assert np.isfinite(found.edges).all()
 
 
+@pytest.mark.parametrize("dtype", ["uint8", "int32"])
+def test_scaling_beyond_float64_is_an_error(dtype: str) -> None:
+    with pytest.raises(DataError, match="check the scaling"):
+        statistics(Volume(np.arange(8, dtype=dtype).reshape(2, 2, 2), slope=1e308))
+
+
 def test_slabs_are_views_where_they_can_be() -> None:
     data = np.arange(60, dtype="<i4").reshape(3, 4, 5)
     parts = list(slabs(Volume(data), 40))

@@ -83,6 +83,24 @@ def test_vti_compressors(tmp_path: Path, compressor: str, mode: str) -> None:
     assert volume.data.base is not None, "a view of VTK's memory"
 
 
+def test_vti_in_pieces(tmp_path: Path) -> None:
+    """Two pieces that share the plane z = 1, as parallel writers make them."""
+
+    def piece(first: int, last: int) -> str:
+        text = " ".join(map(str, VALUES[first : last + 1].ravel()))
+        return (
+            f'<Piece Extent="0 4 0 3 {first} {last}"><PointData Scalars="a"><DataArray type="Int32" Name="a" '
+            f'format="ascii">{text}</DataArray></PointData></Piece>'
+        )
+
+    path = tmp_path / "v.vti"
+    path.write_text(
+        '<VTKFile type="ImageData" byte_order="LittleEndian"><ImageData WholeExtent="0 4 0 3 0 2" Origin="0 0 0" '
+        f'Spacing="1 1 1">{piece(0, 1)}{piece(1, 2)}</ImageData></VTKFile>'
+    )
+    np.testing.assert_array_equal(read_volume(str(path)).data, VALUES)
+
+
 def test_vti_extent_and_direction(tmp_path: Path) -> None:
     data = image(a=VALUES.astype("u1"))
     data.SetExtent(2, 6, -1, 2, 0, 2)
@@ -343,7 +361,7 @@ def test_tiff_as_vtk_writes_and_reads_it(tmp_path: Path, code: str) -> None:
     writer = vtkTIFFWriter()
     writer.SetInputData(data)
     writer.SetFileName(str(tmp_path / "v.tiff"))
-    writer.SetCompressionToDeflate()
+    writer.SetCompressionToPackBits()
     writer.Write()
     volume = read_volume(str(tmp_path / "v.tiff"))
     np.testing.assert_array_equal(volume.data, VALUES)

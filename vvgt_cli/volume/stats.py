@@ -56,24 +56,35 @@ def statistics(volume: Volume) -> Statistics:
     """Statistics of a volume's data values; memory stays within a few slabs.
 
     Raises:
-        DataError: no voxel has a finite value.
+        DataError: no voxel has a finite value, or the scaling makes values infinite.
     """
     if volume.data.dtype.kind in "iub" and volume.data.dtype.itemsize <= 2:
         counts, first = _count_integers(volume)
         used = np.nonzero(counts)[0]
-        values = (used + first).astype(np.float64) * volume.slope + volume.intercept
+        with np.errstate(over="ignore"):
+            values = (used + first).astype(np.float64) * volume.slope + volume.intercept
         lo, hi = float(values.min()), float(values.max())
+        _check_range(lo, hi, volume)
         edges = _edges(lo, hi)
         bins = _bins(values, float(edges[0]), float(edges[-1]))
         histogram = np.bincount(bins, weights=counts[used], minlength=BINS).astype(np.int64)
         return Statistics(lo, hi, 0, 0, histogram, edges)
     lo, hi, nan_count, inf_count = _range(volume)
+    _check_range(lo, hi, volume)
     edges = _edges(lo, hi)
     histogram = np.zeros(BINS, np.int64)
     for _, slab in slabs(volume):
         values = _finite(slab, volume)
         histogram += np.bincount(_bins(values, float(edges[0]), float(edges[-1])), minlength=BINS)
     return Statistics(lo, hi, nan_count, inf_count, histogram, edges)
+
+
+def _check_range(lo: float, hi: float, volume: Volume) -> None:
+    if not (np.isfinite(lo) and np.isfinite(hi)):
+        raise DataError(
+            f"{volume.name}: data values {volume.slope:g} * stored + {volume.intercept:g} reach from {lo:g} to {hi:g}; "
+            "expected finite numbers; check the scaling in the file's header"
+        )
 
 
 def _edges(lo: float, hi: float) -> np.ndarray:
