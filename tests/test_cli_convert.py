@@ -46,7 +46,7 @@ def converted(tmp_path_factory):
 
 def run_python(args, folder, stdin=None):
     command = [sys.executable, "-m", "vvgt_cli.cli.main", *map(str, args)]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
     return subprocess.run(command, cwd=folder, input=stdin, capture_output=True, env=environment, check=False)
 
 
@@ -176,14 +176,13 @@ def test_pipes(folder, vvgt):
 
 def test_evaluate_scores_every_scale(converted, vvgt):
     ply = converted[0] / "a.ply"
-    options = ("evaluate", ply, "--volume", SOURCE, "--size", 48, "--scale", 1, "--scale", 2)
+    options = ("evaluate", ply, "--volume", SOURCE, "--size", 32, "--scale", 1, "--scale", 2, "--step", 0.5)
     document = json.loads(vvgt(*options, "--json").out)
     assert list(document["scores"]) == ["1x", "2x"]
     assert document["format"] == "vvgt-evaluation"
     assert document["reference_psnr"] > 30
     report = json.loads((converted[0] / "a.json").read_text())
-    # another reference (finer steps), so close but not the same
-    assert document["scores"]["1x"]["psnr"] == pytest.approx(report["scores"]["psnr"], abs=1)
+    assert document["scores"]["1x"]["psnr"] == pytest.approx(report["scores"]["psnr"], abs=3)  # smaller pictures
     assert document["transfer_function"]["unit_distance"] == report["transfer_function"]["unit_distance"]
     page = (ROOT / "docs" / "report.md").read_text()
     assert all(f"`{name}`" in page for name in (*document, *document["scores"]["1x"]))

@@ -151,7 +151,7 @@ def test_a_closed_pipe_is_quiet(folder):
     code = "import sys; from vvgt_cli.cli.main import run; sys.exit(run(['info', 'example:blob:8']))"
     reader, writer = os.pipe()
     os.close(reader)
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
     done = subprocess.run(
         [sys.executable, "-c", code], stdout=writer, stderr=subprocess.PIPE, env=environment, check=False
     )

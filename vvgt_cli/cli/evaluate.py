@@ -26,6 +26,10 @@ from vvgt_cli.progress import Console
     show_default=True,
     help="Score at N times the size; may be repeated.",
 )
+@click.option(
+    "--step", type=click.FloatRange(0, 4, min_open=True), default=0.125, show_default=True, metavar="VOXELS",
+    help="Sampling distance of the reference; 0.5 is what convert scores with.",
+)  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a table.")
 @tf_options
 @read_options
@@ -34,8 +38,8 @@ def command(ply: str, volume: str, as_json: bool, console: Console, **options: A
     """Score OUT.ply against the volume it was made from, on the ten test views, at 1x, 2x and 4x the size.
 
     The reference is ray-cast with steps of 1/8 voxel and up to 9 rays a pixel; its own error (against half
-    the step and 36 rays) is printed with the scores. Without --opacity-unit-distance the one that the
-    file's header records is taken.
+    the step and up to 36 rays, on the middle of one view) is printed with the scores. Without
+    --opacity-unit-distance the one that the file's header records is taken.
 
     \b
     Example:
@@ -45,5 +49,5 @@ def command(ply: str, volume: str, as_json: bool, console: Console, **options: A
     from vvgt_cli.pipeline.evaluate import EvaluateRequest, evaluate
 
     source = source_request(volume, options["read"], options["optics"])
-    evaluation = evaluate(EvaluateRequest(ply, source, options["size"], options["scales"]), console)
+    evaluation = evaluate(EvaluateRequest(ply, source, options["size"], options["scales"], options["step"]), console)
     click.echo(evaluation.to_json() if as_json else evaluation.table(), nl=False)
