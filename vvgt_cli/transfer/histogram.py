@@ -15,7 +15,9 @@ from vvgt_cli.transfer.resolve import StatisticsLike
 NAME = "automatic (histogram)"
 DOMINANT = 0.25  # share of the voxels from which a peak counts as a background
 SIDE = 0.02  # share of the foreground that a side of the background must hold to be shown
-MAX_PEAKS = 2  # padding and air, at most
+SIDE_WIDTH = 0.125  # share of the value range that it must span: less is padding or clipping
+PADDING_BINS = 2  # a first peak this narrow, at the low end, may be padding with the air peak behind it
+BEHIND_AIR = 0.2  # share of the voxels other than padding that must lie behind a peak for it to be air
 OPACITY = ((0.0, 0.0), (0.5, 0.06), (0.9, 0.25), (1.0, 0.7))  # by rank among the foreground's values
 # Lightness rises from 35 to 97 (CIE L*), hue from blue over red to pale yellow: visible on black from the start
 COLORS = np.array(
@@ -35,7 +37,7 @@ def from_histogram(statistics: StatisticsLike) -> TransferFunction:
 
     The peak that holds most voxels is background: its foot is found by the triangle method (Zack, Rogers,
     Latt 1977), on each side that leads to more data. A second dominant peak right behind it (air behind
-    padding) is skipped too. Opacity and colour then follow half the value, half its rank among what is
+    narrow padding) is skipped too. Opacity and colour then follow half the value, half its rank among what is
     left. Data without a dominant peak are shown whole.
 
     Args:
@@ -55,15 +57,13 @@ def from_histogram(statistics: StatisticsLike) -> TransferFunction:
     if lo == hi:  # a box of one value: seen through
         return TransferFunction(NAME, PiecewiseOpacity(np.array([lo]), np.array([0.1])), _color_map(np.array([lo])))
     first, last = _background(counts)
-    left, right = counts[:first].sum(), counts[last:].sum()
-    both = left + right
+    left, right = (_worth_showing(side, counts) for side in (slice(0, first), slice(last, None)))
+    if not (left or right):
+        first = last = 0
     nodes: list[tuple[float, float]] = []
-    if both > 0 and left >= SIDE * both:
-        below = _ramp(counts[:first][::-1], edges[: first + 1][::-1])
-        nodes += below[::-1]
-    elif first > 0:
-        nodes.append((float(edges[first]), 0.0))
-    if both > 0 and right >= SIDE * both:
+    if left:
+        nodes += _ramp(counts[:first][::-1], edges[: first + 1][::-1])[::-1]
+    if right or not left:
         nodes += _ramp(counts[last:], edges[last:])
     x, y = np.array(nodes).T
     order = np.argsort(x, kind="stable")
@@ -71,21 +71,26 @@ def from_histogram(statistics: StatisticsLike) -> TransferFunction:
     return TransferFunction(NAME, PiecewiseOpacity(x[order], y[order]), _color_map(_color_nodes(counts, edges, *shown)))
 
 
+def _worth_showing(side: slice, counts: np.ndarray) -> bool:
+    """Whether a side of the background is wide and full enough to be more than padding or stray voxels."""
+    inside = counts[side]
+    # of the foreground as a whole: all but the voxels of the highest bin, which is always background
+    return inside.size >= SIDE_WIDTH * counts.size and inside.sum() >= SIDE * (counts.sum() - counts.max()) > 0
+
+
 def _background(counts: np.ndarray) -> tuple[int, int]:
     """Bins [first, last) of the background; an empty range at 0 when no peak dominates."""
     total = counts.sum()
-    bins = counts.size
     first, last = _peak(counts)
-    if counts[first:last].sum() < DOMINANT * total or counts[:first].sum() + counts[last:].sum() == 0:
+    if counts[first:last].sum() < DOMINANT * total:
         return 0, 0
-    for _ in range(MAX_PEAKS - 1):
-        rest = counts[last:]
-        if first > bins // 8 or rest.sum() == 0:  # only padding at the low end hides an air peak
-            break
+    rest = counts[last:]
+    if first == 0 and last <= PADDING_BINS and rest.sum() > 0:
         a, b = _peak(rest)
-        if rest[a:b].sum() < DOMINANT * total or a > bins // 4 or rest[b:].sum() < SIDE * rest.sum():
-            break
-        last += b
+        behind = rest[b:].sum()
+        apart = 0 < a <= counts.size // 2  # at 0 it is the padding's own falling tail
+        if apart and rest[a:b].sum() >= DOMINANT * total and behind >= BEHIND_AIR * rest.sum():
+            last += b
     return first, last
 
 

@@ -59,17 +59,18 @@ def _limits(tf: TransferFunction, statistics: StatisticsLike | None) -> tuple[fl
 
 
 def _draw_curve(axes: Any, tf: TransferFunction, x: np.ndarray) -> None:
-    from matplotlib.collections import PolyCollection
+    from matplotlib.patches import Polygon
 
     y = tf.opacity(x)
-    strips = [[(a, 0), (a, p), (b, q), (b, 0)] for a, b, p, q in zip(x[:-1], x[1:], y[:-1], y[1:], strict=True)]
-    colors = tf.color(0.5 * (x[:-1] + x[1:]))
-    axes.add_collection(PolyCollection(strips, facecolors=colors, edgecolors=colors, linewidths=0.3))
+    colors = tf.color(np.linspace(x[0], x[-1], SAMPLES))[None]  # (1, SAMPLES, 3)
+    outline = np.concatenate([[(x[0], 0)], np.column_stack([x, y]), [(x[-1], 0)]])
+    under = Polygon(outline, closed=True, transform=axes.transData)
+    axes.imshow(colors, aspect="auto", extent=(x[0], x[-1], 0, 1.02), clip_path=under, zorder=1)
     nodes = tf.opacity_nodes
     axes.plot(x, y, color="black", linewidth=1.2)
     axes.plot(nodes.x, nodes.y, "o", color="black", markerfacecolor="white", markersize=4, clip_on=False)
     bar = axes.inset_axes((0, -0.045, 1, 0.03), transform=axes.transAxes)
-    bar.imshow(tf.color(np.linspace(x[0], x[-1], SAMPLES))[None], aspect="auto", extent=(0, 1, 0, 1))
+    bar.imshow(colors, aspect="auto", extent=(0, 1, 0, 1))
     bar.set_axis_off()
     axes.tick_params(axis="x", pad=10)
 

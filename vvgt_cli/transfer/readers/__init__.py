@@ -29,6 +29,8 @@ def read_transfer_function(source: str) -> TransferFunction:
         DataError: the file is not a transfer function, or a faulty one.
         UsageError: neither a file nor a colour-map name.
     """
+    if not source.strip():
+        raise UsageError("an empty name; expected a transfer-function file or a colour-map name")
     path, pick = Path(source), ""
     if not path.exists() and "#" in source:
         head, _, pick = source.rpartition("#")
