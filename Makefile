@@ -6,7 +6,7 @@ PYTHON ?= python3
 
 $(VENV)/bin/pytest: pyproject.toml constraints.txt
 	[ -x $(VENV)/bin/python ] || $(PYTHON) -m venv $(VENV)
-	$(VENV)/bin/pip install -q --disable-pip-version-check -c constraints.txt -e '.[test]'
+	$(VENV)/bin/pip install -qq --disable-pip-version-check -c constraints.txt -e '.[test]'
 	touch $@
 
 test: $(VENV)/bin/pytest

@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from vvgt_cli.cameras import Camera, default_views, look_at, orbit_views
@@ -20,7 +20,6 @@ def same_camera(a: Camera, b: Camera, atol=1e-12):
     assert a.name == b.name
 
 
-@settings(max_examples=100, deadline=None)
 @given(st.lists(st.floats(-5, 5), min_size=3, max_size=3).filter(lambda e: np.linalg.norm(e) > 0.1))
 def test_pose_round_trip(eye):
     camera = look_at(eye)
