@@ -113,6 +113,12 @@ def test_a_directory_that_is_not_writable(folder, vvgt):
     assert "not writable" in vvgt("convert", "v.raw", *RAW, "-o", locked / "a.ply").error
 
 
+def test_a_size_that_does_not_fit_in_memory(folder, vvgt, monkeypatch):
+    monkeypatch.setattr("vvgt_cli.pipeline.convert.free_memory", lambda: 2**28)
+    result = vvgt("convert", "v.raw", *RAW, "-o", "a.ply", "--size", 2000)
+    assert (result.code, "--size 2000" in result.error) == (2, True)
+
+
 def test_version_and_help(vvgt):
     assert vvgt("--version").out.decode() == f"vvgt {__version__}\n"
     text = vvgt("--help").out.decode()

@@ -9,20 +9,24 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vvgt_cli.cameras import default_views
-from vvgt_cli.errors import DataError
+from vvgt_cli.cameras.sets import SET_VIEWS
+from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored, write_ply
 from vvgt_cli.pipeline.outputs import STDOUT, Output, check_outputs, write_text
 from vvgt_cli.pipeline.record import ConversionReport, Run
+from vvgt_cli.pipeline.score import psnr_note, score_test_views
 from vvgt_cli.pipeline.source import Source, SourceRequest, load
 from vvgt_cli.progress import Console
+from vvgt_cli.volume.blocks import free_memory
 
 if TYPE_CHECKING:
     from vvgt_cli.cameras import Camera
     from vvgt_cli.dvr import Scene
     from vvgt_cli.metrics import Scores
 
-PREVIEW_ROWS = 3  # test views in the preview
+VIEW_BYTES = 2 * 16  # a pixel: float32 RGBA, and as much again while views are stacked
+PREVIEW_VIEWS = (0, 4, 9)  # test views in the preview: from above, from the side, from below
 
 
 @dataclass(frozen=True)
@@ -82,13 +86,14 @@ def convert(request: ConvertRequest, console: Console | None = None) -> Conversi
         DataError: input that is not what it must be, or a scene that shows nothing.
     """
     run = Run(console or Console(), ConversionReport("convert"))
+    _check_memory(request.fit.size)
     source, scene = _begin(run, request)
     gaussians = _closed_form(run, scene, request.fit)
     gaussians = _back_project(run, scene, gaussians, request.fit)
     gaussians = as_stored(gaussians)  # what is scored is what the file holds
-    scores = _score(run, scene, gaussians, request)
+    scores, sheet = _score(run, scene, gaussians, request)
     run.report.scores = asdict(scores)
-    return _finish(run, request, source, gaussians)
+    return _finish(run, request, source, gaussians, sheet)
 
 
 def initialise_only(request: ConvertRequest, console: Console | None = None) -> ConversionReport:
@@ -101,6 +106,17 @@ def initialise_only(request: ConvertRequest, console: Console | None = None) -> 
     source, scene = _begin(run, request)
     gaussians = _closed_form(run, scene, request.fit)
     return _finish(run, request, source, as_stored(gaussians))
+
+
+def _check_memory(size: int) -> None:
+    """Refuse a size whose training and check views would not fit."""
+    views = SET_VIEWS["train"] + SET_VIEWS["check"]
+    need, free = views * size * size * VIEW_BYTES, free_memory()
+    if free is not None and need > free:
+        raise UsageError(
+            f"--size {size}: {views} views need {need / 2**30:.1f} GiB of memory, {free / 2**30:.1f} GiB are free; "
+            "try a smaller size, or 'vvgt init', which renders none"
+        )
 
 
 def _begin(run: Run, request: ConvertRequest) -> tuple[Source, Scene]:
@@ -170,27 +186,21 @@ def _closed_form(run: Run, scene: Scene, fit: FitOptions) -> Gaussians:
     return gaussians
 
 
-def _views(run: Run, scene: Scene, cameras: list[Camera], label: str) -> np.ndarray:
-    """Reference images (n, h, w, 4) of the scene."""
-    from vvgt_cli.dvr import RenderSettings, render_views
-
-    return render_views(scene, cameras, RenderSettings(), progress=run.console.bar(label))
-
-
-def _splats(gaussians: Gaussians, cameras: list[Camera]) -> np.ndarray:
+def _splats(gaussians: Gaussians, cameras: list[Camera]) -> list[np.ndarray]:
     from vvgt_cli.splat import render
 
-    return np.stack([render(gaussians, camera) for camera in cameras])
+    return [render(gaussians, camera) for camera in cameras]
 
 
 def _back_project(run: Run, scene: Scene, gaussians: Gaussians, fit: FitOptions) -> Gaussians:
     """Colour and mass from the training views, kept if the check views agree."""
+    from vvgt_cli.dvr import RenderSettings, render_views
     from vvgt_cli.metrics import score_views
     from vvgt_cli.vbm import backproject
 
     train, check = default_views("train", size=fit.size), default_views("check", size=fit.size)
     with run.stage("views") as stage:
-        images = _views(run, scene, train + check, "views")
+        images = render_views(scene, train + check, RenderSettings(), progress=run.console.bar("views"))
         stage.note = f"{len(train)} to fit to, {len(check)} to check by, {fit.size} px"
     reference = images[len(train) :]
     with run.stage("back-projection") as stage:
@@ -203,37 +213,30 @@ def _back_project(run: Run, scene: Scene, gaussians: Gaussians, fit: FitOptions)
     return mended if stage.kept else gaussians
 
 
-def _score(run: Run, scene: Scene, gaussians: Gaussians, request: ConvertRequest) -> Scores:
-    """Scores on the test views, and the preview."""
-    from vvgt_cli.metrics import score_views
+def _score(run: Run, scene: Scene, gaussians: Gaussians, request: ConvertRequest) -> tuple[Scores, np.ndarray | None]:
+    """Scores on the test views, and the preview's sheet where one is asked for."""
+    from vvgt_cli.dvr import RenderSettings
 
-    cameras = default_views("test", size=request.fit.size)
     with run.stage("test views") as stage:
-        reference = _views(run, scene, cameras, "test views")
-        ours = _splats(gaussians, cameras)
-        scores = score_views(reference, ours, perceptual=request.report is not None)
-        stage.note = f"{psnr_note(scores.psnr, scores.psnr_foreground)}, {len(cameras)} views of {request.fit.size} px"
-    if request.preview:
-        rows = np.linspace(0, len(cameras) - 1, PREVIEW_ROWS).round().astype(int)
-        write_preview(request.preview, reference[rows], ours[rows], request.overwrite)
-    return scores
+        scores, sheet = score_test_views(
+            scene,
+            gaussians,
+            request.fit.size,
+            RenderSettings(),
+            perceptual=request.report is not None,
+            keep=PREVIEW_VIEWS if request.preview else (),
+            progress=run.console.bar("test views"),
+        )
+        stage.note = f"{psnr_note(scores)}, {scores.views} views of {request.fit.size} px"
+    return scores, sheet
 
 
-def psnr_note(whole: float, foreground: float | None) -> str:
-    """PSNR as stages print it."""
-    return f"PSNR {whole:.2f} dB" + ("" if foreground is None else f" (foreground {foreground:.2f} dB)")
+def _finish(
+    run: Run, request: ConvertRequest, source: Source, gaussians: Gaussians, sheet: np.ndarray | None = None
+) -> ConversionReport:
+    """Write the file, then the preview and the report."""
+    from vvgt_cli.images import write_png
 
-
-def write_preview(path: str, reference: np.ndarray, ours: np.ndarray, overwrite: bool) -> None:
-    """A PNG with a row a view: reference, ours, difference; images (n, h, w, 4) premultiplied."""
-    from vvgt_cli.images import side_by_side, write_png
-
-    sheet = np.concatenate([side_by_side(a, b) for a, b in zip(reference, ours, strict=True)])
-    write_png(path, sheet, overwrite)
-
-
-def _finish(run: Run, request: ConvertRequest, source: Source, gaussians: Gaussians) -> ConversionReport:
-    """Write the file, then the report."""
     ply = replace(
         request.ply,
         unit_frame=source.volume.unit_frame(),
@@ -248,6 +251,8 @@ def _finish(run: Run, request: ConvertRequest, source: Source, gaussians: Gaussi
         else:
             with atomic_write(request.output, request.overwrite) as temporary:
                 report.bytes = write_ply(temporary, gaussians, ply)
+        if request.preview and sheet is not None:
+            write_png(request.preview, sheet, request.overwrite)
         report.gaussians = len(gaussians)
         stage.note = f"{request.output}: {len(gaussians)} Gaussians, {report.bytes / 1e6:.1f} MB"
     run.finish()

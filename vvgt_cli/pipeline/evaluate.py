@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 from vvgt_cli.cameras import default_views
 from vvgt_cli.errors import UsageError
-from vvgt_cli.gaussians import Gaussians, PlyHeader
-from vvgt_cli.pipeline.convert import describe_source, psnr_note, tf_record, volume_record
+from vvgt_cli.gaussians import PlyHeader
+from vvgt_cli.pipeline.convert import describe_source, tf_record, volume_record
 from vvgt_cli.pipeline.record import ConversionReport, Run, Stage, document
 from vvgt_cli.pipeline.render import STDIN, open_gaussians
+from vvgt_cli.pipeline.score import psnr_note, score_test_views
 from vvgt_cli.pipeline.source import Source, SourceRequest, load
 from vvgt_cli.progress import Console
 
@@ -91,6 +92,8 @@ def evaluate(request: EvaluateRequest, console: Console | None = None) -> Evalua
     Raises:
         UsageError, DataError: inputs that are not what they must be.
     """
+    from vvgt_cli.dvr import REFERENCE
+
     if request.ply == STDIN == request.source.volume:
         raise UsageError("both OUT.ply and --volume are '-': standard input holds one of them")
     run = Run(console or Console(), ConversionReport("evaluate"))
@@ -109,29 +112,14 @@ def evaluate(request: EvaluateRequest, console: Console | None = None) -> Evalua
     )  # fmt: skip
     for scale in sorted(set(request.scales)):
         with run.stage(f"test views {scale}x") as stage:
-            scores = _scores(run, scene, gaussians, request, scale)
-            evaluation.scores[f"{scale}x"] = scores
-            stage.note = psnr_note(scores["psnr"], scores["psnr_foreground"])
+            bar = run.console.bar(f"test views {scale}x")
+            settings = replace(REFERENCE, step=request.step)
+            scores, _ = score_test_views(scene, gaussians, request.size * scale, settings, progress=bar)
+            evaluation.scores[f"{scale}x"] = asdict(scores)
+            stage.note = psnr_note(scores)
     evaluation.stages = run.report.stages
     evaluation.seconds = run.finish().seconds
     return evaluation
-
-
-def _scores(run: Run, scene: Scene, gaussians: Gaussians, request: EvaluateRequest, scale: int) -> dict[str, Any]:
-    """Every number of docs/conventions.md, "Units of a report", at one size; one view in memory at a time."""
-    from vvgt_cli.dvr import REFERENCE, render_view
-    from vvgt_cli.metrics import mean_scores, score_view
-    from vvgt_cli.splat import render
-
-    settings = replace(REFERENCE, step=request.step)
-    cameras = default_views("test", size=request.size * scale)
-    bar = run.console.bar(f"test views {scale}x")
-    views = []
-    for camera in cameras:
-        views.append(score_view(render_view(scene, camera, settings), render(gaussians, camera)))
-        if bar:
-            bar(len(views), len(cameras))
-    return asdict(mean_scores(views))
 
 
 def _reference_psnr(scene: Scene, request: EvaluateRequest) -> float:

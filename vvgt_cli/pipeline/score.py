@@ -1,0 +1,63 @@
+"""Gaussians against the volume on the test views: one view in memory at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vvgt_cli.cameras import default_views
+from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.progress import ProgressCallback
+
+if TYPE_CHECKING:
+    from vvgt_cli.dvr import RenderSettings, Scene
+    from vvgt_cli.metrics import Scores
+
+
+def score_test_views(
+    scene: Scene,
+    gaussians: Gaussians,
+    size: int,
+    settings: RenderSettings,
+    *,
+    perceptual: bool = True,
+    keep: Collection[int] = (),
+    progress: ProgressCallback | None = None,
+) -> tuple[Scores, np.ndarray | None]:
+    """Scores on the test views at ``size`` px (docs/conventions.md, "Units of a report").
+
+    Args:
+        scene, gaussians: what is compared.
+        size: pixels along an image's edge.
+        settings: of the reference.
+        perceptual: SSIM and FLIP too.
+        keep: numbers of views to draw.
+        progress: called after each view.
+
+    Returns:
+        (scores, sheet): a row a kept view, reference, ours and 8 x their difference, (h, w, 3) float32 in
+        [0, 1]; None where none is kept.
+    """
+    from vvgt_cli.dvr import render_view
+    from vvgt_cli.images import side_by_side
+    from vvgt_cli.metrics import mean_scores, score_view
+    from vvgt_cli.splat import render
+
+    cameras = default_views("test", size=size)
+    views, rows = [], []
+    for i, camera in enumerate(cameras):
+        reference, ours = render_view(scene, camera, settings), render(gaussians, camera)
+        views.append(score_view(reference, ours, perceptual=perceptual))
+        if i in keep:
+            rows.append(side_by_side(reference, ours))
+        if progress:
+            progress(i + 1, len(cameras))
+    return mean_scores(views), np.concatenate(rows) if rows else None
+
+
+def psnr_note(scores: Scores) -> str:
+    """PSNR as stages print it."""
+    foreground = scores.psnr_foreground
+    return f"PSNR {scores.psnr:.2f} dB" + ("" if foreground is None else f" (foreground {foreground:.2f} dB)")
