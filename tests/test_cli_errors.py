@@ -125,7 +125,10 @@ def test_version_and_help(vvgt):
     for command in main.COMMANDS:
         assert f"\n  {command} " in text
     assert vvgt("convert", "-h").code == 0
-    assert vvgt().code == 2
+    for nothing_said in ((), ("tf",)):
+        result = vvgt(*nothing_said)
+        assert (result.code, result.out) == (2, b"")
+        assert "Commands:" in result.err
 
 
 @pytest.mark.parametrize(
@@ -188,3 +191,25 @@ def test_threads_reach_numba_before_it_is_imported():
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "threads 1"
+
+
+def test_termination_removes_the_temporary_file(folder):
+    code = "\n".join(
+        [
+            "import os, signal, sys",
+            "import vvgt_cli.pipeline.outputs as outputs",
+            "from vvgt_cli.cli import main",
+            "def work(args=None):",
+            "    with outputs.atomic_write('a.txt') as temporary:",
+            "        temporary.write_text('half')",
+            "        os.kill(os.getpid(), signal.SIGTERM)",
+            "main.cli.invoke = work",
+            "sys.argv[1:] = ['info', 'x']",
+            "main.main()",
+        ]
+    )
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
+    before = sorted(folder.iterdir())
+    done = subprocess.run([sys.executable, "-c", code], cwd=folder, env=environment, check=False)
+    assert done.returncode == 143
+    assert sorted(folder.iterdir()) == before

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import signal
 import sys
 import traceback
 from collections.abc import Sequence
@@ -108,8 +109,14 @@ def _status(error: BaseException) -> int:
     return _fail(f"internal: {type(error).__name__}: {error} (a bug; {DEBUG}=1 shows where)", 1)
 
 
+def _terminate(number: int, frame: object) -> None:
+    """End as an exception does, so that temporary files are removed."""
+    sys.exit(128 + number)
+
+
 def main() -> None:
     """Entry point of the `vvgt` command."""
+    signal.signal(signal.SIGTERM, _terminate)
     sys.exit(run())
 
 
