@@ -135,7 +135,7 @@ def _alpha(u, v, a, b, c, opacity, x, y):
 
 @nb.njit(parallel=True, cache=True, fastmath=True)
 def blend(start, members, extent, flat, colors, tiles_x, image):
-    """Front-to-back blending of every tile into ``image`` (height, width, 4) float32, premultiplied RGBA."""
+    """Front-to-back blending of every tile into ``image`` (height, width, 4) float32; linear in ``colors`` (K, 3)."""
     height, width = image.shape[:2]
     for tile in nb.prange(start.shape[0] - 1):
         ox, oy = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
@@ -145,7 +145,7 @@ def blend(start, members, extent, flat, colors, tiles_x, image):
         for entry in range(start[tile], start[tile + 1]):
             k = members[entry]
             u, v, a, b, c, opacity = flat[k, 0] - ox, flat[k, 1] - oy, flat[k, 2], flat[k, 3], flat[k, 4], flat[k, 5]
-            red, green, blue = max(colors[k, 0], f32(0)), max(colors[k, 1], f32(0)), max(colors[k, 2], f32(0))
+            red, green, blue = colors[k, 0], colors[k, 1], colors[k, 2]
             left, right = max(extent[k, 0] - ox, 0), min(extent[k, 2] - ox, TILE)
             for y in range(max(extent[k, 1] - oy, 0), min(extent[k, 3] - oy, TILE)):
                 x0, x1 = _row_span(u, v, a, b, c, opacity, f32(y), left, right)

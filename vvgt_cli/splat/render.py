@@ -58,14 +58,20 @@ def project(gaussians: Gaussians, camera: Camera) -> Projection:
     return Projection(flat, extent, start, members, slots, first, tiles_x)
 
 
-def render(gaussians: Gaussians, camera: Camera, projection: Projection | None = None) -> np.ndarray:
-    """(height, width, 4) float32 premultiplied RGBA over nothing (conventions: Gaussians)."""
+def blend(projection: Projection, colors: np.ndarray, height: int, width: int) -> np.ndarray:
+    """(height, width, 4) float32 premultiplied RGBA, linear in ``colors`` (K, 3) float32, which may be negative."""
     from vvgt_cli.splat import kernel
 
-    p = projection or project(gaussians, camera)
-    image = np.zeros((camera.height, camera.width, 4), np.float32)
-    kernel.blend(p.start, p.members, p.extent, p.flat, gaussians.colors, p.tiles_x, image)
+    p = projection
+    image = np.zeros((height, width, 4), np.float32)
+    kernel.blend(p.start, p.members, p.extent, p.flat, np.ascontiguousarray(colors, np.float32), p.tiles_x, image)
     return image
+
+
+def render(gaussians: Gaussians, camera: Camera, projection: Projection | None = None) -> np.ndarray:
+    """(height, width, 4) float32 premultiplied RGBA over nothing (conventions: Gaussians); negative colours are 0."""
+    p = projection or project(gaussians, camera)
+    return blend(p, np.maximum(gaussians.colors, 0), camera.height, camera.width)
 
 
 def gather(projection: Projection, fields: np.ndarray, out: np.ndarray) -> None:
