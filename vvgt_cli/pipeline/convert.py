@@ -24,7 +24,10 @@ if TYPE_CHECKING:
     from vvgt_cli.cameras import Camera
     from vvgt_cli.dvr import Scene
     from vvgt_cli.metrics import Scores
+    from vvgt_cli.vbm import Start
 
+FIT_VIEWS = {"step": 1.0, "samples": 1}  # one ray a pixel: pixel-integrated views fit no better (docs/log.md)
+SCORE_VIEWS = {"step": 1.0, "samples": 2}
 VIEW_BYTES = 2 * 16  # a pixel: float32 RGBA, and as much again while views are stacked
 PREVIEW_VIEWS = (0, 4, 9)  # test views in the preview: from above, from the side, from below
 
@@ -88,8 +91,8 @@ def convert(request: ConvertRequest, console: Console | None = None) -> Conversi
     run = Run(console or Console(), ConversionReport("convert"))
     _check_memory(request.fit.size)
     source, scene = _begin(run, request)
-    gaussians = _closed_form(run, scene, request.fit)
-    gaussians = _back_project(run, scene, gaussians, request.fit)
+    start = _closed_form(run, scene, request.fit)
+    gaussians = _back_project(run, scene, start, request.fit)
     gaussians = as_stored(gaussians)  # what is scored is what the file holds
     scores, sheet = _score(run, scene, gaussians, request)
     run.report.scores = asdict(scores)
@@ -104,8 +107,8 @@ def initialise_only(request: ConvertRequest, console: Console | None = None) -> 
     """
     run = Run(console or Console(), ConversionReport("init"))
     source, scene = _begin(run, request)
-    gaussians = _closed_form(run, scene, request.fit)
-    return _finish(run, request, source, as_stored(gaussians))
+    start = _closed_form(run, scene, request.fit)
+    return _finish(run, request, source, as_stored(start.gaussians))
 
 
 def _check_memory(size: int) -> None:
@@ -171,19 +174,19 @@ def tf_record(source: Source, request: SourceRequest) -> dict[str, Any]:
     }
 
 
-def _closed_form(run: Run, scene: Scene, fit: FitOptions) -> Gaussians:
+def _closed_form(run: Run, scene: Scene, fit: FitOptions) -> Start:
     from vvgt_cli.vbm import VbmOptions, initialise
 
     options = VbmOptions(max_gaussians=fit.max_gaussians, size=fit.size, method=fit.init, seed=fit.seed)
     with run.stage("closed form") as stage:
-        gaussians = initialise(scene, options, progress=run.console.bar("closed form"))
-        if not len(gaussians):
+        start = initialise(scene, options, progress=run.console.bar("closed form"))
+        if not len(start.gaussians):
             raise DataError(
                 f"{scene.volume.name} under {scene.tf.name}: nothing visible from any view; "
                 "expected opacity above 0 where the data are (try 'vvgt tf show TF -o tf.png --volume VOLUME')"
             )
-        stage.note = f"{len(gaussians)} Gaussians ({fit.init})"
-    return gaussians
+        stage.note = f"{len(start.gaussians)} Gaussians ({fit.init})"
+    return start
 
 
 def _splats(gaussians: Gaussians, cameras: list[Camera]) -> list[np.ndarray]:
@@ -192,25 +195,25 @@ def _splats(gaussians: Gaussians, cameras: list[Camera]) -> list[np.ndarray]:
     return [render(gaussians, camera) for camera in cameras]
 
 
-def _back_project(run: Run, scene: Scene, gaussians: Gaussians, fit: FitOptions) -> Gaussians:
-    """Colour and mass from the training views, kept if the check views agree."""
+def _back_project(run: Run, scene: Scene, start: Start, fit: FitOptions) -> Gaussians:
+    """What the training views can mend, kept if the check views agree."""
     from vvgt_cli.dvr import RenderSettings, render_views
     from vvgt_cli.metrics import score_views
     from vvgt_cli.vbm import backproject
 
     train, check = default_views("train", size=fit.size), default_views("check", size=fit.size)
     with run.stage("views") as stage:
-        images = render_views(scene, train + check, RenderSettings(), progress=run.console.bar("views"))
+        images = render_views(scene, train, RenderSettings(**FIT_VIEWS), progress=run.console.bar("views"))
+        reference = render_views(scene, check, RenderSettings(**SCORE_VIEWS))
         stage.note = f"{len(train)} to fit to, {len(check)} to check by, {fit.size} px"
-    reference = images[len(train) :]
     with run.stage("back-projection") as stage:
-        before = score_views(reference, _splats(gaussians, check), perceptual=False).psnr
-        mended = backproject(gaussians, train, images[: len(train)])
+        before = score_views(reference, _splats(start.gaussians, check), perceptual=False).psnr
+        mended, how = backproject(start, train, images, progress=run.console.bar("back-projection"))
         after = score_views(reference, _splats(mended, check), perceptual=False).psnr
         stage.kept = after > before
-        stage.note = f"from {before:.2f} dB"
+        stage.note = f"{how}; from {before:.2f} dB on the check views"
         stage.psnr = after
-    return mended if stage.kept else gaussians
+    return mended if stage.kept else start.gaussians
 
 
 def _score(run: Run, scene: Scene, gaussians: Gaussians, request: ConvertRequest) -> tuple[Scores, np.ndarray | None]:
@@ -222,7 +225,7 @@ def _score(run: Run, scene: Scene, gaussians: Gaussians, request: ConvertRequest
             scene,
             gaussians,
             request.fit.size,
-            RenderSettings(),
+            RenderSettings(**SCORE_VIEWS),
             perceptual=request.report is not None,
             keep=PREVIEW_VIEWS if request.preview else (),
             progress=run.console.bar("test views"),

@@ -14,8 +14,8 @@ from vvgt_cli.dvr.kernel import FLAGS, _leap, box_span, mean_optics, sample, tab
 from vvgt_cli.dvr.render import camera_arrays
 from vvgt_cli.dvr.scene import BRICK_BITS, Scene
 
-MAX_CELLS = 1 << 22
-MAX_WORKERS = 8  # each has a grid of its own, so that sums need no atomics
+MAX_CELLS = 1 << 24
+MAX_GRID = 1 << 25  # cells of all workers together: each has a grid of its own, so that sums need no atomics
 
 
 @dataclass(frozen=True)
@@ -32,73 +32,85 @@ class Visibility:
     largest: np.ndarray
     exponent: int
 
+    def at(self, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Mean and largest transmittance (n,) at positions (n, 3) in voxels (x, y, z) from the box's corner."""
+        top = np.array(self.mean.shape[::-1]) - 1
+        x, y, z = np.clip(np.floor(position / (1 << self.exponent)).astype(np.int64), 0, top).T
+        return self.mean[z, y, x], self.largest[z, y, x]
+
+
+@nb.njit(cache=True, fastmath=FLAGS, inline="never")
+def _cell(x, y, z, inv_cell, grid):
+    """Grid cell of a point in voxel coordinates."""
+    return (
+        min(int(max(z + 0.5, 0.0) * inv_cell), grid.shape[1] - 1),
+        min(int(max(y + 0.5, 0.0) * inv_cell), grid.shape[2] - 1),
+        min(int(max(x + 0.5, 0.0) * inv_cell), grid.shape[3] - 1),
+    )
+
+
+@nb.njit(cache=True, fastmath=FLAGS, inline="never")
+def _deposit(values, lo, inv_width, nodes, cumulative, empty, px, py, pz, dx, dy, dz, step, inv_cell, grid):
+    """March p + t d and add to ``grid`` (3, cz, cy, cx): optical depth, its seen part, largest transmittance.
+
+    What lies behind an opaque front adds to the depth only: it is there, and not seen.
+    """
+    nz, ny, nx = values.shape
+    bins = nodes.shape[0] - 1
+    t0, t1 = box_span(px, py, pz, dx, dy, dz, nx, ny, nz)
+    if not t1 > t0:
+        return
+    count = max(int(math.ceil((t1 - t0) * math.sqrt(dx * dx + dy * dy + dz * dz) / step)), 1)
+    dt = (t1 - t0) / count
+    trans, u0, known, i = 1.0, 0.0, False, 0
+    while i < count:
+        t = t0 + i * dt
+        x, y, z = px + t * dx, py + t * dy, pz + t * dz
+        bi = min(max(int(x), 0), nx - 1) >> BRICK_BITS
+        bj = min(max(int(y), 0), ny - 1) >> BRICK_BITS
+        bk = min(max(int(z), 0), nz - 1) >> BRICK_BITS
+        reach = int(empty[bk, bj, bi])
+        if reach > 0:
+            j = int((min(_leap(px, py, pz, dx, dy, dz, reach, bi, bj, bk), t1) - t0) / dt)
+            if j > i:
+                i, known = j, False
+                continue
+        if not known:
+            u0 = table_coordinate(sample(values, x, y, z), lo, inv_width, bins)
+        t += dt
+        u1 = table_coordinate(sample(values, px + t * dx, py + t * dy, pz + t * dz), lo, inv_width, bins)
+        if u0 >= 0.0 and u1 >= 0.0:
+            depth = mean_optics(u0, u1, nodes, cumulative, bins)[3] * dt
+            if depth > 0.0:
+                t -= 0.5 * dt
+                k, j, c = _cell(px + t * dx, py + t * dy, pz + t * dz, inv_cell, grid)
+                after = trans * math.exp(-depth)
+                grid[0, k, j, c] += depth
+                grid[1, k, j, c] += trans - after
+                grid[2, k, j, c] = max(grid[2, k, j, c], trans)
+                trans = after
+        u0, known = u1, True
+        i += 1
+
 
 @nb.njit(parallel=True, cache=True, fastmath=FLAGS)
 def _march(values, lo, inv_width, nodes, cumulative, empty, eyes, bases, lenses, size, step, inv_cell, grids):
-    """Rays of all views; ``grids`` (workers, 3, cz, cy, cx) float32: depth, seen depth, largest transmittance."""
-    nz, ny, nx = values.shape
-    bins = nodes.shape[0] - 1
+    """Rays of all views, dealt over the workers; ``grids`` (workers, 3, cz, cy, cx) float32."""
     workers = grids.shape[0]
     for worker in nb.prange(workers):
         for job in range(worker, eyes.shape[0] * size, workers):
             view, row = job // size, job % size
-            px, py, pz = eyes[view, 0], eyes[view, 1], eyes[view, 2]
-            basis, lens = bases[view], lenses[view]
+            eye, basis, lens = eyes[view], bases[view], lenses[view]
             for col in range(size):
                 a, b = (col + 0.5 - lens[2]) * lens[0], (row + 0.5 - lens[3]) * lens[1]
                 norm = 1.0 / math.sqrt(a * a + b * b + 1.0)
                 dx = (basis[0, 0] * a + basis[1, 0] * b + basis[2, 0]) * norm
                 dy = (basis[0, 1] * a + basis[1, 1] * b + basis[2, 1]) * norm
                 dz = (basis[0, 2] * a + basis[1, 2] * b + basis[2, 2]) * norm
-                t0, t1 = box_span(px, py, pz, dx, dy, dz, nx, ny, nz)
-                if not t1 > t0:
-                    continue
-                count = max(int(math.ceil((t1 - t0) * math.sqrt(dx * dx + dy * dy + dz * dz) / step)), 1)
-                dt = (t1 - t0) / count
-                trans, u0, known, i = 1.0, 0.0, False, 0
-                while i < count and trans > 1e-4:
-                    t = t0 + i * dt
-                    x, y, z = px + t * dx, py + t * dy, pz + t * dz
-                    bi = min(max(int(x), 0), nx - 1) >> BRICK_BITS
-                    bj = min(max(int(y), 0), ny - 1) >> BRICK_BITS
-                    bk = min(max(int(z), 0), nz - 1) >> BRICK_BITS
-                    reach = int(empty[bk, bj, bi])
-                    if reach > 0:
-                        j = int((min(_leap(px, py, pz, dx, dy, dz, reach, bi, bj, bk), t1) - t0) / dt)
-                        if j > i:
-                            i, known = j, False
-                            continue
-                    if not known:
-                        u0 = table_coordinate(sample(values, x, y, z), lo, inv_width, bins)
-                    t += dt
-                    u1 = table_coordinate(sample(values, px + t * dx, py + t * dy, pz + t * dz), lo, inv_width, bins)
-                    if u0 >= 0.0 and u1 >= 0.0:
-                        depth = mean_optics(u0, u1, nodes, cumulative, bins)[3] * dt
-                        if depth > 0.0:
-                            t -= 0.5 * dt
-                            ci = min(int(max(px + t * dx + 0.5, 0.0) * inv_cell), grids.shape[4] - 1)
-                            cj = min(int(max(py + t * dy + 0.5, 0.0) * inv_cell), grids.shape[3] - 1)
-                            ck = min(int(max(pz + t * dz + 0.5, 0.0) * inv_cell), grids.shape[2] - 1)
-                            after = trans * math.exp(-depth)
-                            grids[worker, 0, ck, cj, ci] += depth
-                            grids[worker, 1, ck, cj, ci] += trans - after
-                            if trans > grids[worker, 2, ck, cj, ci]:
-                                grids[worker, 2, ck, cj, ci] = trans
-                            trans = after
-                    u0, known = u1, True
-                    i += 1
-                # what lies behind is not seen: its depth is deposited as unseen by the next loop
-                while i < count:
-                    t = t0 + (i + 0.5) * dt
-                    ci = min(int(max(px + t * dx + 0.5, 0.0) * inv_cell), grids.shape[4] - 1)
-                    cj = min(int(max(py + t * dy + 0.5, 0.0) * inv_cell), grids.shape[3] - 1)
-                    ck = min(int(max(pz + t * dz + 0.5, 0.0) * inv_cell), grids.shape[2] - 1)
-                    u = table_coordinate(
-                        sample(values, px + t * dx, py + t * dy, pz + t * dz), lo, inv_width, bins
-                    )
-                    if u >= 0.0:
-                        grids[worker, 0, ck, cj, ci] += mean_optics(u, u, nodes, cumulative, bins)[3] * dt
-                    i += 1
+                _deposit(
+                    values, lo, inv_width, nodes, cumulative, empty,
+                    eye[0], eye[1], eye[2], dx, dy, dz, step, inv_cell, grids[worker],
+                )  # fmt: skip
 
 
 def visibility(scene: Scene, cameras: Sequence[Camera], step: float = 1.0) -> Visibility:
@@ -107,7 +119,7 @@ def visibility(scene: Scene, cameras: Sequence[Camera], step: float = 1.0) -> Vi
     while math.prod(-(-n >> exponent) if exponent else n for n in scene.values.shape) > MAX_CELLS:
         exponent += 1
     shape = tuple(-(-n // (1 << exponent)) for n in scene.values.shape)
-    workers = min(nb.get_num_threads(), MAX_WORKERS)
+    workers = max(min(nb.get_num_threads(), MAX_GRID // math.prod(shape)), 1)
     grids = np.zeros((workers, 3, *shape), np.float32)
     arrays = [camera_arrays(scene, camera) for camera in cameras]
     tables = scene.tables

@@ -1,0 +1,174 @@
+"""The stage itself: moments, visibility, pyramid, choice of cells, Gaussians; and what views can mend."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vvgt_cli.cameras import Camera, default_views
+from vvgt_cli.cameras.sets import FIELD_OF_VIEW, RADIUS
+from vvgt_cli.dvr.scene import BRICK, Scene
+from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.splat import render
+from vvgt_cli.vbm.fit import image_errors, solve_colors
+from vvgt_cli.vbm.inset import Opaque, opaque_field
+from vvgt_cli.vbm.moments import base_cells, exponents
+from vvgt_cli.vbm.shape import ROUND, STYLES, SurfaceStyle, cell_gaussians
+from vvgt_cli.vbm.tree import Tree, build_tree, select, split
+from vvgt_cli.vbm.visibility import visibility
+
+MAX_BASE_CELLS = 5_000_000  # 136 bytes of moments each, as much again for the pyramid
+FINEST = -2  # base cells of a quarter voxel at most
+MIN_CELL = 1.2  # pixels: a smaller base cell cannot be told from its neighbours
+MARCH_SIZE = 200  # pixels of the visibility march
+REFINE_FROM = 0.5  # share of the budget given out before views say where the error is
+REFINE_ROUNDS = 2
+REFINE_VIEWS = 8
+TWICE = 1.25  # weight of the error at twice the size: averaging hides part of it
+
+Progress = Callable[[int, int], None]
+
+
+def pixel_width(size: int) -> float:
+    """Width of a pixel at the volume's centre in the default views, unit frame."""
+    return 2 * RADIUS * math.tan(math.radians(FIELD_OF_VIEW) / 2) / size
+
+
+@dataclass(frozen=True)
+class ClosedForm:
+    """A scene's pyramid, ready to be cut for any budget.
+
+    Attributes:
+        tree: moments of every cell that some view sees.
+        opaque: where bodies are opaque.
+        voxel: finest voxel edge, unit frame.
+        pixel: a pixel's width at the centre, unit frame.
+        budget: most Gaussians.
+    """
+
+    tree: Tree
+    opaque: Opaque
+    voxel: float
+    pixel: float
+    budget: int
+
+    def gaussians(self, ids: np.ndarray | None = None, style: SurfaceStyle = ROUND) -> Gaussians:
+        """Gaussians of the given cells, by default of those that the moments alone choose."""
+        ids = select(self.tree, self.budget) if ids is None else ids
+        return cell_gaussians(self.tree, ids, self.voxel, self.pixel, self.opaque, style)
+
+    def refined(self, cameras: Sequence[Camera], views: np.ndarray, style: SurfaceStyle) -> np.ndarray:
+        """Cells for the budget: half of it by the moments, then those with the largest image error are split."""
+        start = int(self.budget * REFINE_FROM)
+        ids = select(self.tree, start)
+        for done in range(1, REFINE_ROUNDS + 1):
+            gaussians = solve_colors(self.gaussians(ids, style), cameras, views, rounds=1)
+            error = image_errors(gaussians, cameras, views)
+            room = start + (self.budget - start) * done // REFINE_ROUNDS - len(ids)
+            inner = np.flatnonzero(self.tree.children[ids] > 0)
+            order = inner[np.argsort(-error[inner], kind="stable")]
+            growth = np.cumsum(self.tree.children[ids[order]] - 1)
+            ids = split(self.tree, ids, order[: np.searchsorted(growth, room, "right")])
+        return ids
+
+
+def closed_form(
+    scene: Scene, budget: int, size: int, cameras: Sequence[Camera] | None = None, progress: Progress | None = None
+) -> ClosedForm:
+    """Moments, visibility and pyramid of a scene.
+
+    Args:
+        scene: volume under a transfer function.
+        budget: most Gaussians.
+        size: image edge in pixels that the file is made for.
+        cameras: what may see the scene; by default the training views.
+        progress: called after each of the four parts.
+    """
+    step = np.asarray(scene.step)
+    tick = progress or (lambda done, total: None)
+    seen = visibility(scene, cameras or default_views("train", size=MARCH_SIZE))
+    tick(1, 4)
+    cells = base_cells(scene, exponents(step, base_level(scene, pixel_width(size))))
+    tick(2, 4)
+    opaque = opaque_field(cells, step, np.asarray(scene.half))
+    tree = build_tree(cells, seen, step)
+    tick(3, 4)
+    return ClosedForm(tree, opaque, float(step.min()), pixel_width(size), budget)
+
+
+def base_level(scene: Scene, pixel: float) -> int:
+    """Finest level whose base cells fit the memory bound and are not finer than the images can tell."""
+    voxels = _visible_voxels(scene)
+    finest = math.log2(MIN_CELL * pixel / float(scene.step.min()))
+    level = max(FINEST, min(0, math.floor(finest)))
+    while voxels * 8.0**-level > MAX_BASE_CELLS:
+        level += 1
+    return level
+
+
+def _visible_voxels(scene: Scene, samples: int = 256) -> float:
+    """About how many voxels have extinction: bricks that do, times the share in a sample of them."""
+    bricks = np.argwhere(scene.empty == 0) * BRICK
+    if not len(bricks):
+        return 0.0
+    chosen = bricks[np.linspace(0, len(bricks) - 1, min(samples, len(bricks))).astype(np.int64)]
+    tables = scene.tables
+    share = []
+    for z, y, x in chosen:
+        block = scene.values[z : z + BRICK + 1, y : y + BRICK + 1, x : x + BRICK + 1]
+        u = tables.coordinate(block)
+        visible = np.isfinite(u) & (tables.nodes[np.nan_to_num(u).astype(np.int64), 3] > 0)
+        share.append(visible.mean())
+    return float(np.mean(share)) * len(bricks) * BRICK**3
+
+
+def fit(
+    form: ClosedForm, cameras: Sequence[Camera], views: np.ndarray, progress: Progress | None = None
+) -> tuple[Gaussians, str]:
+    """The best of a few ways to cut the pyramid, judged on every third view, then coloured by all of them.
+
+    Tried: cells by moments or refined by image error, and where bodies are opaque three styles of surface.
+
+    Args:
+        form: what to cut.
+        cameras, views: training views, (n, h, w, 4) float32 premultiplied.
+        progress: called after each way and at the end.
+
+    Returns:
+        The Gaussians and one line that says which way was taken.
+    """
+    few = np.arange(0, len(cameras), max(len(cameras) // REFINE_VIEWS, 1))
+    some, images = [cameras[i] for i in few], views[few]
+    styles = STYLES if form.opaque.any else {"": ROUND}
+    ways = [(name, refine) for name in styles for refine in (False, True)]
+    tick = progress or (lambda done, total: None)
+    best: tuple[float, Gaussians, str] | None = None
+    for number, (name, refine) in enumerate(ways):
+        ids = form.refined(some, images, styles[name]) if refine else select(form.tree, form.budget)
+        gaussians = solve_colors(form.gaussians(ids, styles[name]), some, images, rounds=1)
+        loss = _loss(gaussians, some, images)
+        if best is None or loss < best[0]:
+            how = f"cells by {'image error' if refine else 'moments'}" + (f", {name} surfaces" if name else "")
+            best = loss, gaussians, how
+        tick(number + 1, len(ways) + 1)
+    assert best is not None
+    gaussians = solve_colors(best[1], cameras, views)
+    tick(len(ways) + 1, len(ways) + 1)
+    return gaussians, best[2]
+
+
+def _loss(gaussians: Gaussians, cameras: Sequence[Camera], views: np.ndarray) -> float:
+    """Mean squared colour error at the views' size, plus `TWICE` times that at twice the size (averaged 2 x 2).
+
+    A file that leans on the renderer's 0.3 px looks right at one size only.
+    """
+    once = twice = 0.0
+    for camera, view in zip(cameras, views, strict=True):
+        large = render(gaussians, camera.resized(2))
+        halved = large.reshape(camera.height, 2, camera.width, 2, 4).mean(axis=(1, 3))
+        once += float(np.mean((render(gaussians, camera) - view)[..., :3] ** 2))
+        twice += float(np.mean((halved - view)[..., :3] ** 2))
+    return (once + TWICE * twice) / len(cameras)

@@ -1,0 +1,47 @@
+"""From optical mass to a splat's peak alpha.
+
+A splat blends ``alpha = o g`` with g a Gaussian of projected covariance S, and so takes away the optical depth
+``-ln(1 - o g)``, whose integral over the image is ``Li2(o) 2 pi sqrt(det S)``. It must equal the optical mass M that the
+Gaussian stands for. Viewers cut alpha below 1/255, which loses ``2 pi sqrt(det S) / 255``: it is added back.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+
+from vvgt_cli.splat.constants import DILATION, MAX_ALPHA, MIN_ALPHA
+
+
+@functools.cache
+def _table() -> tuple[np.ndarray, np.ndarray]:
+    """o on [0, 0.99] and Li2(o) = sum o^k / k^2 there (700 terms: the rest is below 1e-7)."""
+    o = np.linspace(0, MAX_ALPHA, 2001)
+    k = np.arange(1, 701, dtype=np.float64)
+    return o, (o[:, None] ** k / k**2).sum(axis=1)
+
+
+def dilogarithm(o: np.ndarray) -> np.ndarray:
+    """Li2(o) for o in [0, 0.99], any shape."""
+    return np.interp(o, *_table())
+
+
+def inverse_dilogarithm(y: np.ndarray) -> np.ndarray:
+    """o in [0, 0.99] with Li2(o) = y; 0.99 where y is larger than Li2(0.99) = 1.59."""
+    o, li2 = _table()
+    return np.interp(y, li2, o)
+
+
+def peak_opacity(mass: np.ndarray, variances: np.ndarray, pixel: float) -> np.ndarray:
+    """Peak alpha (n,) in [0, 0.99] of Gaussians with optical mass (n,) and principal variances (n, 3).
+
+    3DGS has one opacity for all views: the mean over the views along the three principal axes, weighted by the projected
+    areas. ``pixel`` is a pixel's width at the Gaussian (unit-frame lengths): the renderer's dilation counts.
+    """
+    wide = variances + DILATION * pixel**2  # (n, 3)
+    areas = (
+        2 * np.pi * np.sqrt(np.stack([wide[:, 1] * wide[:, 2], wide[:, 0] * wide[:, 2], wide[:, 0] * wide[:, 1]], 1))
+    )
+    opacity = inverse_dilogarithm(mass[:, None] / areas + MIN_ALPHA)
+    return np.minimum((opacity * areas).sum(axis=1) / areas.sum(axis=1), MAX_ALPHA)
