@@ -11,9 +11,12 @@ from vvgt_cli.dvr.scene import BRICK, BRICK_BITS
 
 OPAQUE = 1e-5  # transmittance at which a ray ends: half a step of 16-bit output
 SUB_DEPTH = 0.3  # optical depth of a sub-segment: colour is constant within one
+PARTS = 32  # the most sub-segments; at the largest extinctions what lies behind the first few is not seen
 FLAGS = {"contract", "nsz", "arcp", "afn"}  # no nnan/ninf: non-finite voxels are data
 
-_jit = nb.njit(cache=True, fastmath=FLAGS, inline="never")
+U = nb.uint64
+
+_jit = nb.njit(cache=True, fastmath=FLAGS, error_model="numpy")
 
 
 @_jit
@@ -23,16 +26,16 @@ def sample(values, x, y, z):
     x = min(max(x, 0.0), nx - 1.0)
     y = min(max(y, 0.0), ny - 1.0)
     z = min(max(z, 0.0), nz - 1.0)
-    i, j, k = nb.uint64(x), nb.uint64(y), nb.uint64(z)  # unsigned: no wrap-around tests on the eight loads
+    i, j, k = int(x), int(y), int(z)
     fx, fy, fz = x - i, y - j, z - k
-    i1 = min(i + nb.uint64(1), nb.uint64(nx - 1))
-    j1 = min(j + nb.uint64(1), nb.uint64(ny - 1))
-    k1 = min(k + nb.uint64(1), nb.uint64(nz - 1))
     gx, gy = 1.0 - fx, 1.0 - fy
-    c00 = values[k, j, i] * gx + values[k, j, i1] * fx
-    c01 = values[k, j1, i] * gx + values[k, j1, i1] * fx
-    c10 = values[k1, j, i] * gx + values[k1, j, i1] * fx
-    c11 = values[k1, j1, i] * gx + values[k1, j1, i1] * fx
+    # unsigned: no wrap-around tests on the eight loads
+    i1, j1, k1 = U(min(i + 1, nx - 1)), U(min(j + 1, ny - 1)), U(min(k + 1, nz - 1))
+    i0, j0, k0 = U(i), U(j), U(k)
+    c00 = values[k0, j0, i0] * gx + values[k0, j0, i1] * fx
+    c01 = values[k0, j1, i0] * gx + values[k0, j1, i1] * fx
+    c10 = values[k1, j0, i0] * gx + values[k1, j0, i1] * fx
+    c11 = values[k1, j1, i0] * gx + values[k1, j1, i1] * fx
     return (c00 * gy + c01 * fy) * (1.0 - fz) + (c10 * gy + c11 * fy) * fz
 
 
@@ -47,28 +50,31 @@ def table_coordinate(value, lo, inv_width, bins):
 @_jit
 def _integrals(u, nodes, cumulative, bins):
     """Integrals over [0, u] of (tau r, tau g, tau b, tau): trapezoid, exact where tau is linear within a bin."""
-    i = nb.uint64(min(int(u), bins - 1))
-    f = u - i
+    index = min(int(u), bins - 1)
+    f = u - index
+    i, j = U(index), U(index + 1)
     h = 0.5 * f * f
     f -= h
     return (
-        cumulative[i, 0] + f * nodes[i, 0] + h * nodes[i + 1, 0],
-        cumulative[i, 1] + f * nodes[i, 1] + h * nodes[i + 1, 1],
-        cumulative[i, 2] + f * nodes[i, 2] + h * nodes[i + 1, 2],
-        cumulative[i, 3] + f * nodes[i, 3] + h * nodes[i + 1, 3],
+        cumulative[i, 0] + f * nodes[i, 0] + h * nodes[j, 0],
+        cumulative[i, 1] + f * nodes[i, 1] + h * nodes[j, 1],
+        cumulative[i, 2] + f * nodes[i, 2] + h * nodes[j, 2],
+        cumulative[i, 3] + f * nodes[i, 3] + h * nodes[j, 3],
     )
 
 
 @_jit
 def point_optics(u, nodes, bins):
     """(tau r, tau g, tau b, tau) at one table coordinate."""
-    i = nb.uint64(min(int(u), bins - 1))
-    f = u - i
+    index = min(int(u), bins - 1)
+    f = u - index
+    g = 1.0 - f
+    i, j = U(index), U(index + 1)
     return (
-        nodes[i, 0] + f * (nodes[i + 1, 0] - nodes[i, 0]),
-        nodes[i, 1] + f * (nodes[i + 1, 1] - nodes[i, 1]),
-        nodes[i, 2] + f * (nodes[i + 1, 2] - nodes[i, 2]),
-        nodes[i, 3] + f * (nodes[i + 1, 3] - nodes[i, 3]),
+        g * nodes[i, 0] + f * nodes[j, 0],
+        g * nodes[i, 1] + f * nodes[j, 1],
+        g * nodes[i, 2] + f * nodes[j, 2],
+        g * nodes[i, 3] + f * nodes[j, 3],
     )
 
 
@@ -81,22 +87,6 @@ def mean_optics(u0, u1, nodes, cumulative, bins):
     r0, g0, b0, a0 = _integrals(u0, nodes, cumulative, bins)
     r1, g1, b1, a1 = _integrals(u1, nodes, cumulative, bins)
     return (r1 - r0) * inv, (g1 - g0) * inv, (b1 - b0) * inv, (a1 - a0) * inv
-
-
-@_jit
-def _leap(px, py, pz, dx, dy, dz, reach, bi, bj, bk):
-    """Ray parameter at which the empty cube of bricks around (bi, bj, bk) ends, from the ray's origin p."""
-    t = np.inf
-    if dx != 0.0:
-        face = (bi + reach) * BRICK if dx > 0 else (bi - reach + 1) * BRICK
-        t = min(t, (face - px) / dx)
-    if dy != 0.0:
-        face = (bj + reach) * BRICK if dy > 0 else (bj - reach + 1) * BRICK
-        t = min(t, (face - py) / dy)
-    if dz != 0.0:
-        face = (bk + reach) * BRICK if dz > 0 else (bk - reach + 1) * BRICK
-        t = min(t, (face - pz) / dz)
-    return t
 
 
 @_jit
@@ -114,97 +104,146 @@ def box_span(px, py, pz, dx, dy, dz, nx, ny, nz):
 
 
 @_jit
-def cast(values, lo, inv_width, nodes, cumulative, empty, px, py, pz, dx, dy, dz, step):
+def absorbed(depth):
+    """(1 - exp(-x)) / x for x >= 0; the series' error is below 1e-10."""
+    if depth > 0.35:
+        return (1.0 - math.exp(-depth)) / depth
+    p = 1 / 5040 - depth * (1 / 40320 - depth * (1 / 362880))
+    return 1.0 - depth * (
+        1 / 2 - depth * (1 / 6 - depth * (1 / 24 - depth * (1 / 120 - depth * (1 / 720 - depth * p))))
+    )
+
+
+@_jit
+def _composite(u0, u1, dt, nodes, cumulative, bins, state):
+    """``state`` (r, g, b, T) behind a segment of length dt along which the table coordinate goes from u0 to u1."""
+    red, green, blue, trans = state
+    width = u1 - u0
+    if abs(width) < 0.5:
+        r, g, b, tau = point_optics(0.5 * (u0 + u1), nodes, bins)
+        f = absorbed(tau * dt) * trans * dt
+        return red + f * r, green + f * g, blue + f * b, trans - f * tau
+    scale = dt / width
+    r0, g0, b0, a0 = _integrals(u0, nodes, cumulative, bins)
+    r1, g1, b1, a1 = _integrals(u1, nodes, cumulative, bins)
+    depth = (a1 - a0) * scale
+    parts = min(int(depth / SUB_DEPTH) + 1, PARTS)
+    for part in range(1, parts + 1):
+        if parts > 1:
+            r1, g1, b1, a1 = _integrals(u0 + width * (part / parts), nodes, cumulative, bins)
+        f = absorbed(max((a1 - a0) * scale, 0.0)) * trans * scale
+        red += f * (r1 - r0)
+        green += f * (g1 - g0)
+        blue += f * (b1 - b0)
+        trans -= f * (a1 - a0)
+        r0, g0, b0, a0 = r1, g1, b1, a1
+    return red, green, blue, max(trans, 0.0)
+
+
+@_jit
+def _inverse(d):
+    """1 / d, or so large for d = 0 that a face across that axis is never reached."""
+    return 1.0 / d if d != 0.0 else 1e300
+
+
+@_jit
+def _exit(px, py, pz, ix, iy, iz, reach, bi, bj, bk):
+    """Ray parameter at which the cube of bricks within ``reach`` of (bi, bj, bk) ends; ix, iy, iz: `_inverse`."""
+    x = (bi + reach if ix > 0.0 else bi - reach + 1) * BRICK
+    y = (bj + reach if iy > 0.0 else bj - reach + 1) * BRICK
+    z = (bk + reach if iz > 0.0 else bk - reach + 1) * BRICK
+    return min((x - px) * ix, (y - py) * iy, (z - pz) * iz)
+
+
+@_jit
+def _leap(px, py, pz, dx, dy, dz, reach, bi, bj, bk):
+    """Ray parameter at which the empty cube of bricks around (bi, bj, bk) ends, from the ray's origin p."""
+    return _exit(px, py, pz, _inverse(dx), _inverse(dy), _inverse(dz), reach, bi, bj, bk)
+
+
+@_jit
+def cast(values, lo, inv_width, nodes, cumulative, dark, empty, px, py, pz, dx, dy, dz, step):
     """Premultiplied (r, g, b, alpha) along p + t d in voxel coordinates, t in unit-frame lengths.
 
-    ``step`` is the sampling distance in voxels (along the ray, in voxel coordinates).
+    ``step`` is the sampling distance in voxels (along the ray, in voxel coordinates); ``dark``: `OpticalTables.dark`.
     """
     nz, ny, nx = values.shape
     bins = nodes.shape[0] - 1
-    red = green = blue = 0.0
-    trans = 1.0
+    state = (0.0, 0.0, 0.0, 1.0)
     t0, t1 = box_span(px, py, pz, dx, dy, dz, nx, ny, nz)
     if not t1 > t0:
-        return red, green, blue, 0.0
-    count = max(int(math.ceil((t1 - t0) * math.sqrt(dx * dx + dy * dy + dz * dz) / step)), 1)
+        return 0.0, 0.0, 0.0, 0.0
+    count = max(math.ceil((t1 - t0) * math.sqrt(dx * dx + dy * dy + dz * dz) / step), 1)
     dt = (t1 - t0) / count
+    ix, iy, iz = _inverse(dx), _inverse(dy), _inverse(dz)
+    u0 = -1.0  # -1: no sample there, or not finite
+    inside = -1.0  # up to here the ray stays in a brick that is not empty
     i = 0
-    u0, known = 0.0, False
-    while i < count:
+    while True:
         t = t0 + i * dt
         x, y, z = px + t * dx, py + t * dy, pz + t * dz
-        bi = min(max(int(x), 0), nx - 1) >> BRICK_BITS
-        bj = min(max(int(y), 0), ny - 1) >> BRICK_BITS
-        bk = min(max(int(z), 0), nz - 1) >> BRICK_BITS
-        reach = int(empty[nb.uint64(bk), nb.uint64(bj), nb.uint64(bi)])
-        if reach > 0:
-            j = int((min(_leap(px, py, pz, dx, dy, dz, reach, bi, bj, bk), t1) - t0) / dt)
-            if j > i:
-                i = j
-                known = False
-                continue
-        if not known:
-            u0 = table_coordinate(sample(values, x, y, z), lo, inv_width, bins)
-        t += dt
-        u1 = table_coordinate(sample(values, px + t * dx, py + t * dy, pz + t * dz), lo, inv_width, bins)
-        if u0 >= 0.0 and u1 >= 0.0:
-            r, g, b, tau = mean_optics(u0, u1, nodes, cumulative, bins)
-            depth = tau * dt
-            if depth > 0.0:
-                parts = 1
-                if depth > SUB_DEPTH and abs(u1 - u0) > 0.5:
-                    parts = min(int(depth / SUB_DEPTH) + 1, 32)
-                for part in range(parts):
-                    if parts > 1:
-                        ua = u0 + (u1 - u0) * part / parts
-                        ub = u0 + (u1 - u0) * (part + 1) / parts
-                        r, g, b, tau = mean_optics(ua, ub, nodes, cumulative, bins)
-                        depth = tau * dt / parts
-                    if depth > 0.0:
-                        alpha = -math.expm1(-depth)
-                        weight = trans * alpha / tau
-                        red += weight * r
-                        green += weight * g
-                        blue += weight * b
-                        trans *= 1.0 - alpha
-                if trans < OPAQUE:
-                    break
-        u0, known = u1, True
+        u1 = table_coordinate(sample(values, x, y, z), lo, inv_width, bins)
+        first = min(u0, u1)
+        if first >= 0.0 and max(u0, u1) > dark[U(int(first))]:
+            state = _composite(u0, u1, dt, nodes, cumulative, bins, state)
+        if i >= count or state[3] < OPAQUE:
+            return state[0], state[1], state[2], 1.0 - state[3]
+        u0 = u1
         i += 1
-    return red, green, blue, 1.0 - trans
+        if t >= inside:
+            bi = min(max(int(x), 0), nx - 1) >> BRICK_BITS
+            bj = min(max(int(y), 0), ny - 1) >> BRICK_BITS
+            bk = min(max(int(z), 0), nz - 1) >> BRICK_BITS
+            reach = int(empty[U(bk), U(bj), U(bi)])
+            inside = _exit(px, py, pz, ix, iy, iz, max(reach, 1), bi, bj, bk)
+            if reach > 0:
+                last = int((min(inside, t1) - t0) / dt)  # the last sample in the empty cube
+                inside = -1.0
+                if last >= i:
+                    i, u0 = last, -1.0
 
 
-@nb.njit(parallel=True, cache=True, fastmath=FLAGS)
-def render_rows(values, lo, inv_width, nodes, cumulative, empty, eye, basis, lens, step, order, grid, mask, out):
+@_jit
+def _pixel(values, lo, inv_width, nodes, cumulative, dark, empty, eye, basis, lens, step, col, row, grid, known):
+    """Sums over ``grid`` x ``grid`` rays of a pixel; with ``known`` the central one is left out."""
+    acc0 = acc1 = acc2 = acc3 = 0.0
+    for ray in range(grid * grid):
+        if known and 2 * ray + 1 == grid * grid:
+            continue
+        a = (col + (ray % grid + 0.5) / grid - lens[2]) * lens[0]
+        b = (row + (ray // grid + 0.5) / grid - lens[3]) * lens[1]
+        norm = 1.0 / math.sqrt(a * a + b * b + 1.0)
+        dx = (basis[0, 0] * a + basis[1, 0] * b + basis[2, 0]) * norm
+        dy = (basis[0, 1] * a + basis[1, 1] * b + basis[2, 1]) * norm
+        dz = (basis[0, 2] * a + basis[1, 2] * b + basis[2, 2]) * norm
+        red, green, blue, alpha = cast(
+            values, lo, inv_width, nodes, cumulative, dark, empty, eye[0], eye[1], eye[2], dx, dy, dz, step
+        )
+        acc0, acc1, acc2, acc3 = acc0 + red, acc1 + green, acc2 + blue, acc3 + alpha
+    return acc0, acc1, acc2, acc3
+
+
+@nb.njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
+def render_rows(
+    values, lo, inv_width, nodes, cumulative, dark, empty, eye, basis, lens, step, order, grid, mask, known, out
+):
     """Render one view into ``out`` (h, w, 4) float32 with ``grid`` x ``grid`` rays a pixel where ``mask`` is set.
 
     ``eye`` (3,) and ``basis`` (3, 3: rows right, down, forward) are in voxel coordinates per unit-frame length;
-    ``lens`` is (1/fx, 1/fy, cx, cy); ``order`` permutes rows so that contiguous chunks of threads are balanced.
+    ``lens`` is (1/fx, 1/fy, cx, cy); ``order`` permutes rows so that contiguous chunks of threads are balanced;
+    ``known`` says that ``out`` holds the central ray's result already and that ``grid`` is odd.
     """
     height, width = out.shape[:2]
+    scale = 1.0 / (grid * grid)
     for index in nb.prange(height):
         row = order[index]
         for col in range(width):
             if not mask[row, col]:
                 continue
-            acc0 = acc1 = acc2 = acc3 = 0.0
-            for sy in range(grid):
-                for sx in range(grid):
-                    a = (col + (sx + 0.5) / grid - lens[2]) * lens[0]
-                    b = (row + (sy + 0.5) / grid - lens[3]) * lens[1]
-                    norm = 1.0 / math.sqrt(a * a + b * b + 1.0)
-                    dx = (basis[0, 0] * a + basis[1, 0] * b + basis[2, 0]) * norm
-                    dy = (basis[0, 1] * a + basis[1, 1] * b + basis[2, 1]) * norm
-                    dz = (basis[0, 2] * a + basis[1, 2] * b + basis[2, 2]) * norm
-                    r, g, bl, al = cast(
-                        values, lo, inv_width, nodes, cumulative, empty, eye[0], eye[1], eye[2], dx, dy, dz, step
-                    )
-                    acc0 += r
-                    acc1 += g
-                    acc2 += bl
-                    acc3 += al
-            scale = 1.0 / (grid * grid)
-            out[row, col, 0] = acc0 * scale
-            out[row, col, 1] = acc1 * scale
-            out[row, col, 2] = acc2 * scale
-            out[row, col, 3] = acc3 * scale
+            pixel = out[row, col]
+            red, green, blue, alpha = _pixel(
+                values, lo, inv_width, nodes, cumulative, dark, empty, eye, basis, lens, step, col, row, grid, known
+            )
+            if known:
+                red, green, blue, alpha = red + pixel[0], green + pixel[1], blue + pixel[2], alpha + pixel[3]
+            pixel[0], pixel[1], pixel[2], pixel[3] = red * scale, green * scale, blue * scale, alpha * scale

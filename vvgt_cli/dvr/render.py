@@ -82,17 +82,17 @@ def render_view(scene: Scene, camera: Camera, settings: RenderSettings | None = 
     order = row_order(camera.height)
     first = 1 if settings.adaptive else settings.samples
 
-    def trace(grid: int, mask: np.ndarray) -> None:
+    def trace(grid: int, mask: np.ndarray, known: bool) -> None:
         render_rows(
-            scene.values, tables.lo, tables.inv_width, tables.nodes, tables.cumulative, scene.empty,
-            eye, basis, lens, settings.step, order, grid, mask, out,
+            scene.values, tables.lo, tables.inv_width, tables.nodes, tables.cumulative, tables.dark, scene.empty,
+            eye, basis, lens, settings.step, order, grid, mask, known, out,
         )  # fmt: skip
 
-    trace(first, everywhere)
+    trace(first, everywhere, False)
     if settings.adaptive and settings.samples > 1:
         mask = edges(out)
         if mask.any():
-            trace(settings.samples, mask)
+            trace(settings.samples, mask, settings.samples % 2 == 1)
     return out
 
 

@@ -46,14 +46,17 @@ class Scene:
         value_range: tuple[float, float] | None = None,
         bins: int | None = None,
     ) -> Scene:
-        """Prepare ``volume`` under ``tf``; ``value_range`` (data values) saves a pass over the data where it is known."""
+        """Prepare ``volume`` under ``tf``; ``value_range`` (data values), where it is known, is taken as it is."""
         from vvgt_cli.dvr import bricks
 
         frame = volume.unit_frame()
         values, slope, intercept = kernel_values(volume)
         ranges = bricks.brick_ranges(values)  # (bz, by, bx, 2) stored values
         if value_range is None:
-            ends = [slope * float(np.nanmin(ranges[..., 0])) + intercept, slope * float(np.nanmax(ranges[..., 1])) + intercept]
+            ends = [
+                slope * float(np.nanmin(ranges[..., 0])) + intercept,
+                slope * float(np.nanmax(ranges[..., 1])) + intercept,
+            ]
             value_range = (min(ends), max(ends))
         tables = build_tables(
             tf,
@@ -71,27 +74,40 @@ class Scene:
 def kernel_values(volume: Volume) -> tuple[np.ndarray, float, float]:
     """Stored values as uint8, uint16 or float32, with the slope and intercept that make them data values.
 
-    Types that float32 cannot hold (32-bit integers and up, doubles) are shifted and scaled in float64 by slabs first,
-    so that ranges of 1e-30 and 1e30 keep 24 bits.
+    The array is C-contiguous, in native byte order and read-only (kernels compile once, for mapped files and arrays
+    in memory alike); it is a view of the volume's where that has such values already. Types that float32 cannot
+    hold (32-bit integers and up, doubles) are shifted and scaled in float64 by slabs, so that ranges of 1e-30 and
+    1e30 keep 24 bits. NaN stays, infinities stay or become NaN: neither is drawn.
     """
     data = volume.data
     if data.dtype == np.bool_:
         data = data.view(np.uint8)
-    if data.dtype in (np.uint8, np.uint16) and data.dtype.isnative:
-        return np.ascontiguousarray(data).view(np.ndarray), volume.slope, volume.intercept
-    out = np.empty(data.shape, np.float32)
-    if data.dtype.itemsize <= 2:  # exact in float32
-        for z in range(len(data)):
-            out[z] = data[z]
-        return out, volume.slope, volume.intercept
+    kind = data.dtype.newbyteorder("=")
+    if kind in (np.uint8, np.uint16):
+        return _read_only(data, kind), volume.slope, volume.intercept
+    if kind.itemsize <= 2:  # exact in float32
+        return _read_only(data, np.dtype(np.float32)), volume.slope, volume.intercept
     lo, hi = _finite_range(data)
-    if data.dtype == np.float32 and data.dtype.isnative and max(abs(lo), abs(hi)) < 1e30 and hi - lo > 1e-30:
-        return np.ascontiguousarray(data).view(np.ndarray), volume.slope, volume.intercept
+    if kind == np.float32 and max(abs(lo), abs(hi)) < 1e30 and hi / 2 - lo / 2 > 1e-30:
+        return _read_only(data, kind), volume.slope, volume.intercept
     half_width = hi / 2 - lo / 2 or 0.5  # halves: hi - lo may overflow
+    out = np.empty(data.shape, np.float32)
     for z in range(len(data)):
         with np.errstate(invalid="ignore", over="ignore"):
             out[z] = (data[z].astype(np.float64) / 2 - lo / 2) / half_width
-    return out, volume.slope * 2 * half_width, volume.slope * lo + volume.intercept
+    return _read_only(out, out.dtype), volume.slope * 2 * half_width, volume.slope * lo + volume.intercept
+
+
+def _read_only(data: np.ndarray, dtype: np.dtype) -> np.ndarray:
+    """``data`` as a read-only, aligned, C-contiguous array of ``dtype``; copied (slab by slab) only where it is not."""
+    if data.dtype == dtype and data.flags.c_contiguous and data.flags.aligned:
+        out = data.view(np.ndarray)
+    else:
+        out = np.empty(data.shape, dtype)
+        for z in range(len(data)):
+            out[z] = data[z]
+    out.flags.writeable = False
+    return out
 
 
 def _finite_range(data: np.ndarray) -> tuple[float, float]:

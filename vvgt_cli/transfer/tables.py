@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -28,12 +28,21 @@ class OpticalTables:
         inv_width: bins per stored unit (negative where the stored scaling's slope is).
         nodes: (n + 1, 4) float64, tau * (r, g, b) and tau at the bin edges, per unit-frame length.
         cumulative: (n + 1, 4) float64, integral over u of the same (trapezoid: exact for linear tau within a bin).
+        dark: (n + 1,) float64, the u up to which extinction is zero from bin i on: [u0, u1] is transparent if and only
+            if u1 <= dark[floor(u0)].
     """
 
     lo: float
     inv_width: float
     nodes: np.ndarray
     cumulative: np.ndarray
+    dark: np.ndarray = field(init=False)
+
+    def __post_init__(self) -> None:
+        count = len(self.nodes)
+        positive = np.where(self.nodes[:, 3] > 0, np.arange(count), count + 1)
+        dark = np.minimum.accumulate(positive[::-1])[::-1] - 1.0
+        object.__setattr__(self, "dark", np.ascontiguousarray(dark))
 
     @property
     def bins(self) -> int:
