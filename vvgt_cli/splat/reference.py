@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from vvgt_cli.cameras import Camera
@@ -55,16 +57,14 @@ def project(gaussians: Gaussians, camera: Camera) -> tuple[np.ndarray, np.ndarra
     return centres, flat, z
 
 
-def render_reference(gaussians: Gaussians, camera: Camera) -> np.ndarray:
-    """(height, width, 4) float64 premultiplied RGBA: front-to-back blending in order of the centres' depth."""
+def weights(gaussians: Gaussians, camera: Camera) -> Iterator[tuple[int, np.ndarray]]:
+    """Front-to-back blending in order of the centres' depth: Gaussian k and its weight T alpha, (height, width)."""
     centres, flat, depths = project(gaussians, camera)
     opacity = 1 / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64)))
-    colors = np.maximum(gaussians.colors.astype(np.float64), 0)
     px, py = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    image = np.zeros((camera.height, camera.width, 3))
     trans = np.ones((camera.height, camera.width))
     alive = np.ones_like(trans, dtype=bool)
-    for k in np.argsort(gaussians_depth_key(depths), kind="stable"):
+    for k in np.argsort(depths.astype(np.float32), kind="stable"):  # float32: ties as the fast kernel has them
         if not np.isfinite(centres[k, 0]):
             continue
         inverse = np.linalg.inv(flat[k])
@@ -74,12 +74,23 @@ def render_reference(gaussians: Gaussians, camera: Camera) -> np.ndarray:
         alpha[alpha < MIN_ALPHA] = 0
         after = trans * (1 - alpha)
         alive &= (after >= MIN_TRANSMITTANCE) | (alpha == 0)
-        weight = np.where(alive, alpha * trans, 0)
-        image += weight[..., None] * colors[k]
+        yield int(k), np.where(alive, alpha * trans, 0)
         trans = np.where(alive, after, trans)
-    return np.concatenate([image, 1 - trans[..., None]], axis=-1)
 
 
-def gaussians_depth_key(depths: np.ndarray) -> np.ndarray:
-    """Depths as the fast kernel sorts them: float32, so that both break ties alike."""
-    return depths.astype(np.float32)
+def render_reference(gaussians: Gaussians, camera: Camera) -> np.ndarray:
+    """(height, width, 4) float64 premultiplied RGBA; negative colours are 0."""
+    colors = np.maximum(gaussians.colors.astype(np.float64), 0)
+    image = np.zeros((camera.height, camera.width, 4))
+    for k, weight in weights(gaussians, camera):
+        image += weight[..., None] * np.append(colors[k], 1.0)
+    return image
+
+
+def gather_reference(gaussians: Gaussians, camera: Camera, fields: np.ndarray) -> np.ndarray:
+    """(K, 5) float64 sums over all pixels of w and of w x ``fields`` (4, height, width), w = T alpha."""
+    out = np.zeros((len(gaussians), 5))
+    for k, weight in weights(gaussians, camera):
+        out[k, 0] = weight.sum()
+        out[k, 1:] = (weight * fields).sum(axis=(1, 2))
+    return out

@@ -42,7 +42,7 @@ def _misses(y, a, b, c, u, v, floor):
     """Whether the largest exponent along pixel row y of the tile is below ``floor``."""
     dy = f32(y) + _HALF - v
     h = b * dy
-    dx = min(max(-_HALF * h / a, _HALF - u), f32(TILE - 0.5) - u)
+    dx = min(max(_HALF * h / (f32(1e-30) - a), _HALF - u), f32(TILE - 0.5) - u)  # a <= 0, and may underflow to 0
     return (a * dx + h) * dx + c * dy * dy < floor
 
 

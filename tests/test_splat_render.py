@@ -1,0 +1,162 @@
+"""The splatter against its float64 twin, the adjointness of `blend` and `gather`, and the corners of both."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vvgt_cli.cameras.sets import look_at
+from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.splat import blend, gather, gather_reference, project, render, render_reference
+from vvgt_cli.splat.constants import MIN_ALPHA
+
+EYE = (2.0, -1.7, 1.1)
+# Where alpha crosses 1/255, or T 1e-4, float32 may decide otherwise than float64: such a pixel is off by a 1/255 at
+# most, or by the last splat's weight, T alpha <= 0.0099.
+JUMP, TIGHT = 0.01, 3e-5
+
+
+def camera(width=64, height=64, eye=EYE, fov=40.0):
+    return look_at(eye, width=width, height=height, fov=fov)
+
+
+def cloud(count, seed=0, scale=0.05, spread=0.3, logit=0.0, box=0.6):
+    rng = np.random.default_rng(seed)
+    return Gaussians(
+        rng.uniform(-box, box, (count, 3)),
+        np.log(scale) + rng.normal(0, spread, (count, 3)),
+        rng.normal(size=(count, 4)),
+        logit + rng.normal(0, 2, count),
+        rng.uniform(-0.3, 1.2, (count, 3)),
+    )
+
+
+def taken(gaussians, order):
+    fields = ("means", "log_scales", "quaternions", "opacity_logits", "colors")
+    return Gaussians(*(getattr(gaussians, field)[order] for field in fields))
+
+
+def assert_close(image, reference, tight=TIGHT):
+    error = np.abs(image - reference)
+    assert error.max() <= JUMP
+    assert (error > tight).mean() <= 2e-3
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("size", [(64, 64), (1, 1), (17, 49), (80, 15)])
+def test_random_clouds_match_the_twin(seed, size):
+    g, c = cloud(300, seed), camera(*size)
+    assert_close(render(g, c), render_reference(g, c))
+
+
+@pytest.mark.parametrize("axes", [(0.8, 1e-4, 1e-4), (0.8, 0.8, 1e-4), (1e-6, 1e-6, 1e-6), (3.0, 3.0, 3.0)])
+def test_needles_pancakes_points_and_giants_match_the_twin(axes):
+    g = cloud(60, 1)
+    g = Gaussians(g.means, np.log(np.tile(axes, (60, 1))), g.quaternions, g.opacity_logits, g.colors)
+    c = camera()
+    assert_close(render(g, c), render_reference(g, c), tight=1e-3)  # float32 cancels in the exponent of a long needle
+
+
+def test_an_eye_inside_the_cloud_sees_what_is_ahead():
+    g, c = cloud(400, 2, scale=0.02), camera(eye=(0.1, 0.05, 0.0), fov=90.0)
+    image = render(g, c)
+    assert_close(image, render_reference(g, c))
+    behind = (g.means @ c.rotation.T + c.translation)[:, 2] <= 0.01
+    assert 50 < behind.sum() < 350
+    assert np.array_equal(image, render(taken(g, ~behind), c))
+
+
+def test_alpha_is_clamped_at_99_percent():
+    g = Gaussians(np.zeros((1, 3)), np.full((1, 3), np.log(0.5)), [[1, 0, 0, 0]], [30.0], [[1, 0.5, -1]])
+    image = render(g, camera(33, 33))
+    np.testing.assert_allclose(image[16, 16], [0.99, 0.495, 0, 0.99], atol=1e-6)
+
+
+def test_a_splat_below_one_255th_is_not_drawn():
+    for alpha, seen in ((MIN_ALPHA * 0.99, False), (MIN_ALPHA * 1.01, True)):
+        logit = np.log(alpha / (1 - alpha))
+        g = Gaussians(np.zeros((1, 3)), np.full((1, 3), np.log(0.5)), [[1, 0, 0, 0]], [logit], [[1, 1, 1]])
+        assert render(g, camera(33, 33)).any() == seen
+
+
+@pytest.mark.parametrize("logit", [-3.0, 6.0])
+def test_thousands_of_layers_end_pixels_as_the_twin_does(logit):
+    g, c = cloud(3000, 3, scale=0.3, logit=logit, box=0.2), camera(20, 20)
+    image = render(g, c)
+    assert_close(image, render_reference(g, c))
+    assert image[..., 3].min() >= 0
+    assert image[..., 3].max() <= 1 - 1e-4 + 1e-6
+
+
+def test_the_norm_of_a_quaternion_does_not_matter():
+    g, c = cloud(200, 4), camera()
+    factors = np.geomspace(1e-12, 1e12, 200)[:, None]
+    scaled = Gaussians(g.means, g.log_scales, g.quaternions * factors, g.opacity_logits, g.colors)
+    np.testing.assert_allclose(render(scaled, c), render(g, c), atol=JUMP)
+    assert_close(render(scaled, c), render(g, c))
+
+
+def test_no_gaussians_and_one():
+    assert not render(cloud(0), camera()).any()
+    out = np.zeros((0, 5))
+    gather(project(cloud(0), camera()), np.ones((4, 64, 64), np.float32), out)
+    g = cloud(1, 5, scale=0.2, box=0.1, logit=3.0)
+    assert render(g, camera()).max() > 0.1
+    assert_close(render(g, camera()), render_reference(g, camera()))
+
+
+def test_the_order_in_the_file_does_not_matter():
+    g, c = cloud(500, 6), camera()
+    order = np.random.default_rng(0).permutation(500)
+    assert np.array_equal(render(g, c), render(taken(g, order), c))
+
+
+def test_the_same_call_gives_the_same_bytes():
+    g, c = cloud(500, 7), camera()
+    assert render(g, c).tobytes() == render(g, c).tobytes()
+    field = np.random.default_rng(0).normal(size=(4, 64, 64)).astype(np.float32)
+    first, second = np.zeros((500, 5)), np.zeros((500, 5))
+    gather(project(g, c), field, first)
+    gather(project(g, c), field, second)
+    assert first.tobytes() == second.tobytes()
+
+
+def test_unusable_gaussians_are_left_out():
+    g, c = cloud(4, 8, scale=0.2, box=0.1, logit=3.0), camera()
+    log_scales = g.log_scales.copy()
+    log_scales[1] = 400.0  # the covariance overflows
+    odd = Gaussians(g.means, log_scales, g.quaternions, g.opacity_logits, g.colors)
+    assert np.array_equal(render(odd, c), render(taken(g, [0, 2, 3]), c))
+    log_scales[1] = 40.0  # it does not, but its inverse is 0 in float32: alpha is the same in every pixel
+    assert np.isfinite(render(Gaussians(g.means, log_scales, g.quaternions, g.opacity_logits, g.colors), c)).all()
+
+
+def test_blend_is_linear_in_colours_and_does_not_clamp():
+    g, c = cloud(300, 9), camera()
+    p = project(g, c)
+    rng = np.random.default_rng(0)
+    a, b = (rng.normal(size=(300, 3)).astype(np.float32) for _ in range(2))
+    both = blend(p, 2 * a - 3 * b, c.height, c.width)[..., :3]
+    parts = 2 * blend(p, a, c.height, c.width)[..., :3] - 3 * blend(p, b, c.height, c.width)[..., :3]
+    assert both.min() < -0.5
+    np.testing.assert_allclose(both, parts, atol=2e-5)
+
+
+@pytest.mark.parametrize("size", [(64, 64), (33, 18)])
+def test_gather_matches_the_twin_and_is_the_adjoint_of_blend(size):
+    g, c = cloud(400, 10), camera(*size)
+    p = project(g, c)
+    rng = np.random.default_rng(0)
+    field = rng.normal(size=(4, c.height, c.width)).astype(np.float32)
+    out = np.ones((400, 5))  # added to, not overwritten
+    gather(p, field, out)
+    reference = gather_reference(g, c, field.astype(np.float64))
+    np.testing.assert_allclose(out - 1, reference, atol=5 * JUMP)
+    assert (np.abs(out - 1 - reference) > 3e-3).mean() < 0.01
+    colors = rng.normal(size=(400, 3)).astype(np.float32)
+    image = blend(p, colors, c.height, c.width).astype(np.float64)
+    left = (image[..., :3] * field[:3].transpose(1, 2, 0)).sum()
+    right = (colors * (out[:, 1:4] - 1)).sum()
+    scale = np.abs(image[..., :3] * field[:3].transpose(1, 2, 0)).sum()
+    assert abs(left - right) < 1e-6 * scale  # the same float32 weights in both
+    np.testing.assert_allclose(image[..., 3].sum(), (out[:, 0] - 1).sum(), rtol=1e-5)
