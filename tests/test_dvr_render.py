@@ -1,0 +1,284 @@
+"""The ray caster against its float64 twin, closed forms, and hostile volumes."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from vvgt_cli.cameras.sets import look_at
+from vvgt_cli.dvr import RenderSettings, Scene, render_view, render_view_reference, render_views
+from vvgt_cli.errors import UsageError
+from vvgt_cli.transfer.colormap import ColorMap
+from vvgt_cli.transfer.opacity import PiecewiseOpacity
+from vvgt_cli.transfer.tables import extinction
+from vvgt_cli.volume import Volume
+
+ONE_RAY = RenderSettings(samples=1)
+FINE = RenderSettings(step=0.125, samples=1)
+
+
+class Function:
+    """Linear opacity and colour between nodes; conforms to `TransferFunctionLike`."""
+
+    name = "test"
+
+    def __init__(self, x, opacity, rgb=None):
+        self.x = np.asarray(x, float)
+        self.y = np.asarray(opacity, float)
+        self.rgb = np.ones((len(self.x), 3)) * (1.0, 0.5, 0.25) if rgb is None else np.asarray(rgb, float)
+
+    def opacity(self, x):
+        return np.interp(x, self.x, self.y)
+
+    def color(self, x):
+        return np.stack([np.interp(x, self.x, self.rgb[:, k]) for k in range(3)], -1)
+
+    def node_range(self):
+        return self.x[0], self.x[-1]
+
+    def breakpoints(self):
+        return self.x
+
+
+class LinearExtinction(Function):
+    """Extinction, not opacity, linear in the scalar on [0, 1]: ``tau = peak x`` per unit distance 1."""
+
+    def __init__(self, peak):
+        super().__init__([0, 1], [0, 1])
+        self.peak = peak
+
+    def opacity(self, x):
+        return -np.expm1(-self.peak * np.clip(x, 0, 1))
+
+
+RAINBOW = Function([0, 0.3, 0.5, 1], [0, 0, 0.6, 0.2], [[0, 0, 1], [0, 1, 0], [1, 1, 0], [1, 0, 0]])
+
+
+def camera(width=24, height=24, eye=(2.2, -1.6, 1.1), fov=40.0, **options):
+    return look_at(eye, width=width, height=height, fov=fov, **options)
+
+
+def field(shape=(9, 8, 10), seed=0):
+    return np.random.default_rng(seed).uniform(0, 1, shape)
+
+
+def smooth(n=24):
+    z, y, x = np.meshgrid(*[np.linspace(-1, 1, n)] * 3, indexing="ij")
+    return np.exp(-2 * (x * x + 1.5 * y * y + 0.7 * z * z) + 0.4 * np.sin(3 * x + y))
+
+
+def assert_sane(image):
+    assert np.isfinite(image).all()
+    assert image.min() >= 0
+    assert image[..., 3].max() <= 1
+    assert (image[..., :3] <= image[..., 3:] + 1e-6).all()  # colours here are at most 1
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("spacing", [(1, 1, 1), (0.5, 1, 3)])
+def test_random_fields_match_the_twin(seed, spacing):
+    scene = Scene.build(Volume(field(seed=seed), spacing), RAINBOW, 1.0)
+    reference = render_view_reference(scene, camera(), step=1 / 64)
+    errors = [np.abs(render_view(scene, camera(), RenderSettings(s, samples=1)) - reference) for s in (1 / 8, 1 / 32)]
+    assert errors[1].max() < 1e-3
+    assert errors[1].mean() < 5e-5
+    assert errors[0].mean() > 8 * errors[1].mean()  # second order, and towards the twin
+
+
+@pytest.mark.parametrize("size", [(1, 1), (31, 7)])
+def test_any_image_size_matches_the_twin(size):
+    scene = Scene.build(Volume(smooth(10)), RAINBOW, 1.0)
+    image = render_view(scene, camera(*size), FINE)
+    np.testing.assert_allclose(image, render_view_reference(scene, camera(*size), step=1 / 32), atol=3e-3)
+
+
+@pytest.mark.parametrize("depth", [1e-6, 1e-3, 1.0, 5.0])
+@pytest.mark.parametrize("step", [0.25, 1.0, 4.0])
+def test_a_homogeneous_slab_is_exact_at_any_step(depth, step):
+    tau = depth / 2  # per unit-frame length, along a box of 2
+    volume = Volume(np.full((4, 4, 8), 3.0))
+    opacity = -math.expm1(-tau * 0.25)  # per voxel of edge 2 / 8
+    scene = Scene.build(volume, Function([0, 1], [opacity, opacity]), 1.0)
+    image = render_view(scene, camera(1, 1, (5, 0, 0)), RenderSettings(step=step, samples=1))
+    alpha = -math.expm1(-depth)
+    np.testing.assert_allclose(image[0, 0], np.array([1, 0.5, 0.25, 1]) * alpha, rtol=2e-7)
+
+
+@pytest.mark.parametrize("step", [0.5, 1.0])
+def test_a_linear_ramp_of_extinction_is_exact_at_steps_that_meet_the_voxels(step):
+    n, peak = 9, 0.3
+    volume = Volume(np.broadcast_to(np.linspace(0, 1, n), (n, n, n)).copy())
+    scene = Scene.build(volume, LinearExtinction(peak), 1.0)
+    depth = peak * (0.5 * (n - 1) + 0.5)  # the ramp between the centres, and the rim of value 1; voxels of edge 1
+    image = render_view(scene, camera(1, 1, (-5, 0, 0)), RenderSettings(step=step, samples=1))
+    assert abs(image[0, 0, 3] + math.expm1(-depth)) < 1e-6
+    np.testing.assert_allclose(image[0, 0, :3], image[0, 0, 3] * np.array([1, 0.5, 0.25]), rtol=1e-6)
+
+
+def test_the_optical_depth_of_a_gaussian_blob_comes_with_the_square_of_the_voxel():
+    sigma, peak, errors, sizes = 0.25, 4.0, [], (16, 32, 64)
+    exact = peak * sigma * math.sqrt(2 * math.pi) * math.erf(1 / (sigma * math.sqrt(2)))
+    for n in sizes:
+        at = (np.arange(n) + 0.5) * 2 / n - 1
+        z, y, x = np.meshgrid(at, at, at, indexing="ij")
+        volume = Volume(np.exp(-(x * x + y * y + z * z) / (2 * sigma**2)), (2 / n, 2 / n, 2 / n))
+        scene = Scene.build(volume, LinearExtinction(peak), 1.0, bins=4096)
+        image = render_view(scene, camera(1, 1, (5, 0, 0)), RenderSettings(step=0.25, samples=1))
+        errors.append(abs(-math.log1p(-float(image[0, 0, 3])) - exact))
+    order = -np.polyfit(np.log(sizes), np.log(errors), 1)[0]
+    assert abs(order - 2) < 0.2  # of trilinear interpolation
+    # The ray passes half-way between four columns: h^2 / 8 of the second derivative -1 / sigma^2 across, twice.
+    assert errors[-1] == pytest.approx(exact * (2 / 64) ** 2 / 8 * 2 / sigma**2, rel=0.05)
+
+
+def test_the_order_of_convergence_in_the_step_is_two():
+    scene = Scene.build(Volume(smooth(12)), Function([0, 1], [0, 0.5], [[0, 0, 1], [1, 0, 0]]), 1.0)
+    exact = render_view(scene, camera(), RenderSettings(step=1 / 256, samples=1)).astype(float)
+    steps = np.array([1 / 2, 1 / 4, 1 / 8, 1 / 16])
+    errors = [
+        np.sqrt(np.mean((render_view(scene, camera(), RenderSettings(step=s, samples=1)) - exact) ** 2)) for s in steps
+    ]
+    order = np.polyfit(np.log(steps), np.log(errors), 1)[0]
+    assert abs(order - 2) < 0.2
+
+
+@pytest.mark.parametrize("per_voxel", 10.0 ** np.arange(-6, 7, 2))
+def test_a_step_function_of_any_optical_depth_is_stable_and_accurate(per_voxel):
+    opacity = min(-math.expm1(-per_voxel), 1.0)
+    step = Function([0, 0.5, np.nextafter(0.5, 1), 1], [0, 0, opacity, opacity], np.ones((4, 3)))
+    scene = Scene.build(Volume(smooth(10)), step, 1.0, bins=65536)
+    half, fine = render_view(scene, camera(), ONE_RAY), render_view(scene, camera(), FINE)
+    assert_sane(half)
+    reference = render_view_reference(scene, camera(), step=1 / 32)
+    scale = max(1 - math.exp(-min(per_voxel, 11.5) * 5), 1e-12)
+    assert np.abs(half - reference).mean() < 0.01 * scale
+    assert np.abs(fine - reference).mean() < 0.003 * scale
+
+
+def test_opacity_one_is_capped_so_that_it_has_a_limit():
+    scene = Scene.build(Volume(np.ones((6, 6, 6))), Function([0, 1], [1, 1], np.ones((2, 3))), 1.0)
+    image = render_view(scene, camera(9, 9), ONE_RAY)
+    assert_sane(image)
+    np.testing.assert_allclose(image[4, 4], 1, atol=2e-5)
+    assert scene.tables.largest_extinction() == pytest.approx(extinction(np.array([1.0]), 1.0)[0] * 3)
+
+
+@pytest.mark.parametrize(
+    ("shape", "spacing"),
+    [((1, 1, 1), (1, 1, 1)), ((1, 7, 9), (1, 1, 1)), ((7, 1, 9), (1, 1, 1)), ((2, 2, 2), (1, 1000, 1)),
+     ((5, 6, 4), (1000, 1, 1)), ((5, 6, 4), (1e-30, 1e-30, 1e-30)), ((5, 6, 4), (1e30, 1e30, 1e30))],
+)  # fmt: skip
+def test_odd_shapes_and_spacings_match_the_twin(shape, spacing):
+    scene = Scene.build(Volume(field(shape, 3), spacing), RAINBOW, float(np.mean(spacing)))
+    image = render_view(scene, camera(12, 12), FINE)
+    assert_sane(image)
+    reference = render_view_reference(scene, camera(12, 12), step=1 / 16 if max(spacing) != 1000 else 1 / 2)
+    assert np.abs(image - reference).mean() < 2e-3
+
+
+@pytest.mark.parametrize("factor", [1e-30, 1.0, 1e30, 1e300])
+@pytest.mark.parametrize("offset", [0.0, 5.0])
+def test_the_scale_of_the_values_does_not_matter(factor, offset):
+    data = field((6, 7, 8), 4)
+    plain = Scene.build(Volume(data), RAINBOW, 1.0)
+    function = Function((RAINBOW.x + offset) * factor, RAINBOW.y, RAINBOW.rgb)
+    scaled = Scene.build(Volume((data + offset) * factor), function, 1.0)
+    np.testing.assert_allclose(render_view(scaled, camera(), FINE), render_view(plain, camera(), FINE), atol=2e-4)
+
+
+@pytest.mark.parametrize("eye", [(0.1, 0.2, -0.3), (0.999, 0.0, 0.0), (0.0, 0.0, 0.0)])
+def test_an_eye_inside_the_volume_matches_the_twin(eye):
+    scene = Scene.build(Volume(field((8, 8, 8), 5)), Function([0, 1], [0, 0.3]), 1.0)
+    c = look_at(eye, target=(0.2, -0.9, 0.4), width=16, height=16, fov=80)
+    np.testing.assert_allclose(render_view(scene, c, FINE), render_view_reference(scene, c, step=1 / 32), atol=2e-3)
+
+
+@pytest.mark.parametrize("eye", [(4, 0, 0), (0, -4, 0), (0, 0, 4), (0, 0, -4)])
+def test_rays_along_the_axes_match_the_twin(eye):
+    scene = Scene.build(Volume(field((8, 8, 8), 6)), RAINBOW, 1.0)
+    c = camera(5, 5, eye)  # the middle pixel's ray has two components of 0
+    np.testing.assert_allclose(render_view(scene, c, FINE), render_view_reference(scene, c, step=1 / 32), atol=5e-3)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_voxels_that_are_not_finite_are_transparent(bad):
+    data = field((8, 8, 8), 7)
+    data[2:4, 3:5, 2:6] = bad
+    scene = Scene.build(Volume(data), Function([0, 1], [0.2, 0.4]), 1.0)
+    image = render_view(scene, camera(), FINE)
+    assert_sane(image)
+    reference = render_view_reference(scene, camera(), step=1 / 32)
+    assert np.abs(image - reference).mean() < 0.01  # a segment that ends in such a cell is dropped whole
+    whole = Scene.build(Volume(field((8, 8, 8), 7)), Function([0, 1], [0.2, 0.4]), 1.0)
+    assert render_view(whole, camera(), FINE)[..., 3].sum() > image[..., 3].sum() + 1
+
+
+def test_nothing_but_nan_is_nothing():
+    scene = Scene.build(Volume(np.full((5, 5, 5), np.nan)), Function([0, 1], [0.5, 0.5]), 1.0, value_range=(0, 1))
+    assert not render_view(scene, camera(), ONE_RAY).any()
+
+
+def test_leaping_over_empty_space_changes_nothing():
+    data = np.zeros((40, 33, 50))
+    data[10:14, 20:30, 33:36] = field((4, 10, 3), 8)
+    data[36:, :3, :5] = 0.8
+    scene = Scene.build(Volume(data), RAINBOW, 1.0)
+    assert scene.empty.max() > 1
+    full = Scene(**{**vars(scene), "empty": np.zeros_like(scene.empty)})
+    for eye in ((2.2, -1.6, 1.1), (3, 0, 0), (0, 0, -3), (0.1, 0.1, 0.1)):
+        c = camera(32, 32, eye)
+        leaping = render_view(scene, c, ONE_RAY)
+        np.testing.assert_allclose(leaping, render_view(full, c, ONE_RAY), atol=1e-6)
+
+
+@pytest.mark.parametrize("value", [0.0, 0.5, 7.0])
+def test_a_constant_volume_takes_one_value_of_the_function(value):
+    scene = Scene.build(Volume(np.full((4, 4, 4), value)), RAINBOW, 1.0)
+    image = render_view(scene, camera(1, 1, (5, 0, 0)), ONE_RAY)
+    expected = 1 - (1 - RAINBOW.opacity(value)) ** 4
+    np.testing.assert_allclose(image[0, 0, 3], expected, atol=1e-6)
+    np.testing.assert_allclose(image[0, 0, :3], expected * RAINBOW.color(np.array([value]))[0], atol=1e-5)
+
+
+@pytest.mark.parametrize("samples", [2, 3])
+def test_grids_of_rays_average_and_adaptive_ones_spare_flat_parts_of_the_picture(samples):
+    scene = Scene.build(Volume(smooth(10)), Function([0, 0.5, 0.51, 1], [0, 0, 0.5, 0.5]), 1.0)
+    c = camera(48, 48)
+    every = render_view(scene, c, RenderSettings(step=0.25, samples=samples, adaptive=False))
+    reference = render_view_reference(scene, c, step=1 / 16, samples=samples)
+    assert np.abs(every - reference).mean() < 1e-3
+    adaptive = render_view(scene, c, RenderSettings(step=0.25, samples=samples))
+    single = render_view(scene, c, RenderSettings(step=0.25, samples=1))
+    same = np.abs(adaptive - every).max(axis=-1) < 2e-7
+    kept = (adaptive == single).all(axis=-1)
+    assert (same | kept).all()
+    assert not same.all()
+    assert not kept.all()
+    assert np.abs(adaptive - every).max() < 0.02
+
+
+def test_views_are_the_same_bytes_every_time_and_report_progress():
+    scene = Scene.build(Volume(smooth(10)), RAINBOW, 1.0)
+    seen = []
+    first = render_views(scene, [camera(), camera()], progress=lambda *state: seen.append(state))
+    assert first.shape == (2, 24, 24, 4)
+    assert first[0].tobytes() == first[1].tobytes() == render_view(scene, camera()).tobytes()
+    assert seen == [(1, 2), (2, 2)]
+
+
+@pytest.mark.parametrize("options", [{"step": 0}, {"step": 5}, {"step": math.nan}, {"samples": 0}, {"samples": 17}])
+def test_settings_are_checked(options):
+    with pytest.raises(UsageError, match="expected"):
+        RenderSettings(**options)
+
+
+def test_the_package_functions_render_too():
+    from vvgt_cli.transfer.function import TransferFunction
+
+    opacity = PiecewiseOpacity(np.array([0.0, 1.0]), np.array([0.0, 0.5]))
+    colors = ColorMap(np.array([0.0, 1.0]), np.array([[0.0, 0, 1], [1, 0, 0]]))
+    scene = Scene.build(Volume(smooth(8)), TransferFunction("t", opacity, colors), 1.0)
+    image = render_view(scene, camera(), FINE)
+    np.testing.assert_allclose(image, render_view_reference(scene, camera(), step=1 / 32), atol=1e-3)

@@ -1,0 +1,140 @@
+"""Scenes: stored values of every type, the empty-space map, the optical tables."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vvgt_cli.cameras.sets import look_at
+from vvgt_cli.dvr import RenderSettings, Scene, render_view
+from vvgt_cli.dvr.scene import BRICK, kernel_values
+from vvgt_cli.transfer.tables import MAX_OPACITY, build_tables, extinction
+from vvgt_cli.volume import Volume
+
+TYPES = ["b1", "u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f2", "f4", "f8"]
+
+
+class Ramp:
+    """Opacity 0 up to ``first``, then linear to 0.5 at ``last``; red to blue."""
+
+    name = "ramp"
+
+    def __init__(self, first, last):
+        self.first, self.last = first, last
+
+    def opacity(self, x):
+        return np.interp(x, [self.first, self.last], [0, 0.5])
+
+    def color(self, x):
+        f = np.interp(x, [self.first, self.last], [0, 1])
+        return np.stack([1 - f, 0 * f, f], -1)
+
+    def node_range(self):
+        return self.first, self.last
+
+
+def view(volume, tf):
+    camera = look_at((2, -1.5, 1), width=16, height=16)
+    return render_view(Scene.build(volume, tf, 1.0), camera, RenderSettings(samples=1))
+
+
+@pytest.mark.parametrize("kind", TYPES)
+def test_every_type_and_byte_order_gives_the_same_picture(kind):
+    top = 1 if kind == "b1" else 100
+    data = np.random.default_rng(0).integers(0, top + 1, (6, 5, 7))
+    tf = Ramp(0.2 * top, 0.9 * top)
+    expected = view(Volume(data.astype(np.float32)), tf)
+    assert expected.max() > 0.1
+    for order in "<>":
+        picture = view(Volume(data.astype(order + kind)), tf)
+        np.testing.assert_allclose(picture, expected, atol=2e-6)
+
+
+@pytest.mark.parametrize(("slope", "intercept"), [(0.5, -3.0), (-2.0, 7.0), (1e-20, 0.0)])
+@pytest.mark.parametrize("kind", ["u1", "i4", "f8"])
+def test_stored_value_scaling_is_applied(kind, slope, intercept):
+    data = np.random.default_rng(1).integers(0, 100, (6, 5, 7)).astype(kind)
+    ends = sorted((slope * 20 + intercept, slope * 90 + intercept))
+    scaled = view(Volume(data, slope=slope, intercept=intercept), Ramp(*ends))
+    plain = view(Volume(slope * data.astype(np.float64) + intercept), Ramp(*ends))
+    assert plain.max() > 0.1
+    np.testing.assert_allclose(scaled, plain, atol=1e-5)
+
+
+def test_kernel_values_are_native_contiguous_read_only_and_shared_where_they_can_be(tmp_path):
+    base = np.random.default_rng(2).integers(0, 100, (4, 5, 6))
+    for kind in ("u1", "u2", "f4"):
+        data = base.astype(kind)
+        values, *_ = kernel_values(Volume(data))
+        assert np.shares_memory(values, data)
+        assert data.flags.writeable
+        path = tmp_path / kind
+        path.write_bytes(b"x" + data.tobytes())  # at an odd offset
+        mapped = np.memmap(path, kind, "r", 1, data.shape)
+        variants = [mapped, data[::-1, :, ::-1][::-1, :, ::-1], np.asfortranarray(data), data.astype(">" + kind)]
+        for variant in variants:
+            values, *_ = kernel_values(Volume(variant))
+            np.testing.assert_array_equal(values, data)
+            assert values.dtype.isnative
+            assert values.flags.c_contiguous
+            assert values.flags.aligned
+            assert not values.flags.writeable
+
+
+def test_doubles_keep_24_bits_of_their_range():
+    data = 1e9 + np.random.default_rng(3).uniform(0, 1, (4, 4, 4))
+    values, slope, intercept = kernel_values(Volume(data))
+    np.testing.assert_allclose(slope * (values.astype(np.float64)) + intercept, data, atol=3e-7)
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1), (8, 9, 17), (30, 16, 25)])
+def test_the_empty_map_is_the_distance_to_the_nearest_visible_brick(shape):
+    rng = np.random.default_rng(4)
+    data = np.where(rng.uniform(size=shape) < 0.002, 200, rng.integers(0, 50, shape)).astype(np.uint8)
+    data[0, 0, 0] = 200
+    scene = Scene.build(Volume(data), Ramp(100, 150), 1.0)
+    assert scene.empty.shape == tuple(-(-n // BRICK) for n in shape)
+    visible = np.zeros(scene.empty.shape, bool)
+    for brick in np.ndindex(visible.shape):
+        visible[brick] = (data[tuple(slice(b * BRICK, b * BRICK + BRICK + 1) for b in brick)] > 100).any()
+    places = np.argwhere(visible)
+    for brick in np.ndindex(visible.shape):
+        assert scene.empty[brick] == np.abs(places - brick).max(axis=1).min()
+
+
+def test_bricks_without_a_finite_voxel_are_empty():
+    data = np.full((8, 8, 24), np.nan, np.float32)
+    data[:, :, 20:] = 1
+    scene = Scene.build(Volume(data), Ramp(0, 0.5), 1.0)
+    np.testing.assert_array_equal(scene.empty, [[[2, 1, 0]]])
+
+
+@pytest.mark.parametrize("slope", [1.0, -0.25])
+def test_tables_hold_the_function_and_its_integral(slope):
+    tf = Ramp(2.0, 5.0)
+    tables = build_tables(tf, (0, 9), slope=slope, intercept=1.0, unit_distance=0.5, world_per_unit=3.0)
+    x = np.linspace(2, 5, tables.bins + 1)
+    tau = extinction(tf.opacity(x), 0.5) * 3
+    np.testing.assert_allclose(tables.nodes, np.column_stack([tf.color(x) * tau[:, None], tau]), atol=1e-12)
+    np.testing.assert_allclose(tables.coordinate((x - 1) / slope), np.arange(tables.bins + 1), atol=1e-8)
+    assert tables.cumulative[-1, 3] == pytest.approx(np.trapezoid(tau))
+    assert tables.largest_extinction() == pytest.approx(-np.log(0.5) / 0.5 * 3)
+
+
+def test_dark_spans_are_where_extinction_vanishes():
+    class Bumps(Ramp):
+        def opacity(self, x):
+            return np.interp(x, [0, 2, 3, 4, 6, 6.5, 7, 10], [0, 0, 0.5, 0, 0, 0.2, 0, 0])
+
+    tables = build_tables(Bumps(0, 10), (0, 10), unit_distance=1, world_per_unit=1, bins=80)
+    tau = tables.nodes[:, 3]
+    for first in range(80):
+        for last in range(first + 1, 81):
+            assert (tau[first : last + 1] > 0).any() == (last > tables.dark[first])
+
+
+def test_extinction_is_capped_where_opacity_is_one():
+    largest = -np.log(1 - MAX_OPACITY) / 2
+    assert extinction(np.array([0.0, 1.0, 2.0]), 2.0) == pytest.approx([0, largest, largest])
+        [0, -np.log(1 - MAX_OPACITY) / 2] * 1 + [5.7564627]
+    )
