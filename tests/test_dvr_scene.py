@@ -136,5 +136,3 @@ def test_dark_spans_are_where_extinction_vanishes():
 def test_extinction_is_capped_where_opacity_is_one():
     largest = -np.log(1 - MAX_OPACITY) / 2
     assert extinction(np.array([0.0, 1.0, 2.0]), 2.0) == pytest.approx([0, largest, largest])
-        [0, -np.log(1 - MAX_OPACITY) / 2] * 1 + [5.7564627]
-    )
