@@ -36,6 +36,8 @@ class RenderSettings:
 
 
 REFERENCE = RenderSettings(step=0.125, samples=3)
+FIT_VIEWS = RenderSettings(step=1.0, samples=1)  # one ray a pixel: pixel-integrated views fit no better
+SCORE_VIEWS = RenderSettings(step=1.0, samples=2)
 
 
 def camera_arrays(scene: Scene, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
