@@ -1,7 +1,7 @@
 """The plain wavelet-to-Gaussian bank: one isotropic surrogate an atom, for comparison (`--init wavelet`).
 
-The Haar pyramid of the extinction is cut where its detail energy is large; each remaining scaling atom (a box of edge H)
-becomes the isotropic Gaussian that the transition bank holds for it: the least-squares fit to the box.
+The Haar pyramid of the extinction is cut where its detail energy is large; each remaining scaling atom (a box of edge
+H) becomes the isotropic Gaussian that the transition bank holds for it: the least-squares fit to the box.
 """
 
 from __future__ import annotations
@@ -36,13 +36,24 @@ def box_surrogate() -> tuple[float, float]:
 
 
 def detail_energy(tree: Tree) -> np.ndarray:
-    """(n,) energy of a cell's seven Haar details: children's squared density minus the parent's, times volume."""
+    """(n,) largest energy of a cell's seven Haar details or those of any cell in it; 0 for base cells.
+
+    The energy is the children's squared density minus the cell's own, times volume. A cell whose children are alike has
+    none, and is still split where something finer in it has some.
+    """
     mass, volume = tree.moments[:, 0], tree.edge.prod(axis=1)
     energy = np.zeros(len(tree))
     np.add.at(energy, tree.parent[:-1], (mass**2 / volume)[:-1])
     energy -= mass**2 / volume
     energy[tree.children == 0] = 0
-    return np.maximum(energy, 0) * np.sqrt(tree.largest)
+    energy = np.maximum(energy, 0) * np.sqrt(tree.largest)
+    inner = np.flatnonzero(tree.children > 0)
+    while len(inner):  # once a level, upwards; the segments of reduceat are the children of each inner cell
+        raised = np.maximum(energy[inner], np.maximum.reduceat(energy, tree.first[inner]))
+        if np.array_equal(raised, energy[inner]):
+            break
+        energy[inner] = raised
+    return energy
 
 
 def wavelet_gaussians(tree: Tree, budget: int, pixel: float) -> Gaussians:
