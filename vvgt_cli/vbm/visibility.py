@@ -15,6 +15,7 @@ from vvgt_cli.dvr.render import camera_arrays
 from vvgt_cli.dvr.scene import BRICK_BITS, Scene
 
 MAX_CELLS = 1 << 24
+MIN_RAYS = 8  # that meet a cell: with fewer, some cells are met by none and count as hidden
 MAX_GRID = 1 << 25  # cells of all workers together: each has a grid of its own, so that sums need no atomics
 
 
@@ -60,7 +61,7 @@ def _deposit(values, lo, inv_width, nodes, cumulative, empty, px, py, pz, dx, dy
     t0, t1 = box_span(px, py, pz, dx, dy, dz, nx, ny, nz)
     if not t1 > t0:
         return
-    count = max(int(math.ceil((t1 - t0) * math.sqrt(dx * dx + dy * dy + dz * dz) / step)), 1)
+    count = max(math.ceil((t1 - t0) * math.sqrt(dx * dx + dy * dy + dz * dz) / step), 1)
     dt = (t1 - t0) / count
     trans, u0, known, i = 1.0, 0.0, False, 0
     while i < count:
@@ -113,10 +114,19 @@ def _march(values, lo, inv_width, nodes, cumulative, empty, eyes, bases, lenses,
                 )  # fmt: skip
 
 
+def _rays_a_cell(scene: Scene, cameras: Sequence[Camera], exponent: int) -> float:
+    """How many rays of all views meet a cell near the centre, on average over directions."""
+    x, y, z = np.minimum(1 << exponent, scene.values.shape[::-1]) * scene.step
+    area = (x * y + y * z + z * x) / 2  # a convex body shows a quarter of its surface
+    return sum(area * camera.fx * camera.fy / max(float(camera.position @ camera.position), 1) for camera in cameras)
+
+
 def visibility(scene: Scene, cameras: Sequence[Camera], step: float = 1.0) -> Visibility:
     """March every camera (square images of one size) and return what is seen of each cell of a grid."""
     exponent = 0
-    while math.prod(-(-n >> exponent) if exponent else n for n in scene.values.shape) > MAX_CELLS:
+    while math.prod(-(-n // (1 << exponent)) for n in scene.values.shape) > MAX_CELLS or (
+        _rays_a_cell(scene, cameras, exponent) < MIN_RAYS and 1 << exponent < max(scene.values.shape)
+    ):
         exponent += 1
     shape = tuple(-(-n // (1 << exponent)) for n in scene.values.shape)
     workers = max(min(nb.get_num_threads(), MAX_GRID // math.prod(shape)), 1)
