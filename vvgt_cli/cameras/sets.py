@@ -41,7 +41,13 @@ def look_at(
 
 
 def fibonacci_views(
-    count: int, shift: float, *, size: int = SIZE, radius: float = RADIUS, fov: float = FIELD_OF_VIEW, name: str = "view"
+    count: int,
+    shift: float,
+    *,
+    size: int = SIZE,
+    radius: float = RADIUS,
+    fov: float = FIELD_OF_VIEW,
+    name: str = "view",
 ) -> list[Camera]:
     """``count`` square views on the Fibonacci sphere (conventions: Default views)."""
     cameras = []

@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from vvgt_cli.metrics import Scores
     from vvgt_cli.vbm import Start
 
-FIT_VIEWS = {"step": 1.0, "samples": 1}  # one ray a pixel: pixel-integrated views fit no better (docs/log.md)
-SCORE_VIEWS = {"step": 1.0, "samples": 2}
 VIEW_BYTES = 2 * 16  # a pixel: float32 RGBA, and as much again while views are stacked
 PREVIEW_VIEWS = (0, 4, 9)  # test views in the preview: from above, from the side, from below
 
@@ -197,14 +195,15 @@ def _splats(gaussians: Gaussians, cameras: list[Camera]) -> list[np.ndarray]:
 
 def _back_project(run: Run, scene: Scene, start: Start, fit: FitOptions) -> Gaussians:
     """What the training views can mend, kept if the check views agree."""
-    from vvgt_cli.dvr import RenderSettings, render_views
+    from vvgt_cli.dvr import render_views
+    from vvgt_cli.dvr.render import FIT_VIEWS, SCORE_VIEWS
     from vvgt_cli.metrics import score_views
     from vvgt_cli.vbm import backproject
 
     train, check = default_views("train", size=fit.size), default_views("check", size=fit.size)
     with run.stage("views") as stage:
-        images = render_views(scene, train, RenderSettings(**FIT_VIEWS), progress=run.console.bar("views"))
-        reference = render_views(scene, check, RenderSettings(**SCORE_VIEWS))
+        images = render_views(scene, train, FIT_VIEWS, progress=run.console.bar("views"))
+        reference = render_views(scene, check, SCORE_VIEWS)
         stage.note = f"{len(train)} to fit to, {len(check)} to check by, {fit.size} px"
     with run.stage("back-projection") as stage:
         before = score_views(reference, _splats(start.gaussians, check), perceptual=False).psnr
@@ -218,14 +217,14 @@ def _back_project(run: Run, scene: Scene, start: Start, fit: FitOptions) -> Gaus
 
 def _score(run: Run, scene: Scene, gaussians: Gaussians, request: ConvertRequest) -> tuple[Scores, np.ndarray | None]:
     """Scores on the test views, and the preview's sheet where one is asked for."""
-    from vvgt_cli.dvr import RenderSettings
+    from vvgt_cli.dvr.render import SCORE_VIEWS
 
     with run.stage("test views") as stage:
         scores, sheet = score_test_views(
             scene,
             gaussians,
             request.fit.size,
-            RenderSettings(**SCORE_VIEWS),
+            SCORE_VIEWS,
             perceptual=request.report is not None,
             keep=PREVIEW_VIEWS if request.preview else (),
             progress=run.console.bar("test views"),

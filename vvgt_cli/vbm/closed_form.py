@@ -17,10 +17,10 @@ from vvgt_cli.vbm.fit import image_errors, solve_colors
 from vvgt_cli.vbm.inset import Opaque, opaque_field
 from vvgt_cli.vbm.moments import base_cells, exponents
 from vvgt_cli.vbm.shape import ROUND, STYLES, SurfaceStyle, cell_gaussians
-from vvgt_cli.vbm.tree import Tree, build_tree, select, split
-from vvgt_cli.vbm.visibility import visibility
+from vvgt_cli.vbm.tree import Leaves, Tree, build_tree, leaves_of, select, split
+from vvgt_cli.vbm.visibility import Visibility, visibility
 
-MAX_BASE_CELLS = 5_000_000  # 136 bytes of moments each, as much again for the pyramid
+MAX_BASE_CELLS = 2_500_000  # 104 bytes of moments each, twice that for the pyramid
 FINEST = -2  # base cells of a quarter voxel at most
 MIN_CELL = 1.2  # pixels: a smaller base cell cannot be told from its neighbours
 MARCH_SIZE = 200  # pixels of the visibility march
@@ -42,6 +42,8 @@ class ClosedForm:
     """A scene's pyramid, ready to be cut for any budget.
 
     Attributes:
+        scene: volume under its transfer function.
+        seen: what the cameras see of it.
         tree: moments of every cell that some view sees.
         opaque: where bodies are opaque.
         voxel: finest voxel edge, unit frame.
@@ -49,30 +51,34 @@ class ClosedForm:
         budget: most Gaussians.
     """
 
+    scene: Scene
+    seen: Visibility
     tree: Tree
     opaque: Opaque
     voxel: float
     pixel: float
     budget: int
 
-    def gaussians(self, ids: np.ndarray | None = None, style: SurfaceStyle = ROUND) -> Gaussians:
-        """Gaussians of the given cells, by default of those that the moments alone choose."""
-        ids = select(self.tree, self.budget) if ids is None else ids
-        return cell_gaussians(self.tree, ids, self.voxel, self.pixel, self.opaque, style)
+    def gaussians(self, style: SurfaceStyle = ROUND) -> Gaussians:
+        """Gaussians of the cells that the moments alone choose."""
+        return self._of(leaves_of(self.tree, select(self.tree, self.budget)), style)
 
-    def refined(self, cameras: Sequence[Camera], views: np.ndarray, style: SurfaceStyle) -> np.ndarray:
-        """Cells for the budget: half of it by the moments, then those with the largest image error are split."""
-        start = int(self.budget * REFINE_FROM)
-        ids = select(self.tree, start)
+    def _of(self, leaves: Leaves, style: SurfaceStyle) -> Gaussians:
+        return cell_gaussians(leaves, self.voxel, self.pixel, self.opaque, style)
+
+    def refined(self, cameras: Sequence[Camera], views: np.ndarray, style: SurfaceStyle) -> Gaussians:
+        """Gaussians for the budget: half by the moments, then the cells with the largest image error are split."""
+        start = max(int(self.budget * REFINE_FROM), 1)
+        leaves = leaves_of(self.tree, select(self.tree, start))
+        smallest = max(2 * MIN_CELL * self.pixel, 2.0 ** (FINEST + 1) * self.voxel)  # edge of a cell to split
         for done in range(1, REFINE_ROUNDS + 1):
-            gaussians = solve_colors(self.gaussians(ids, style), cameras, views, rounds=1)
+            gaussians = solve_colors(self._of(leaves, style), cameras, views, rounds=1)
             error = image_errors(gaussians, cameras, views)
-            room = start + (self.budget - start) * done // REFINE_ROUNDS - len(ids)
-            inner = np.flatnonzero(self.tree.children[ids] > 0)
-            order = inner[np.argsort(-error[inner], kind="stable")]
-            growth = np.cumsum(self.tree.children[ids[order]] - 1)
-            ids = split(self.tree, ids, order[: np.searchsorted(growth, room, "right")])
-        return ids
+            room = start + (self.budget - start) * done // REFINE_ROUNDS - len(leaves)
+            order = np.argsort(-error, kind="stable")
+            order = order[leaves.edge[order].min(axis=1) >= smallest]
+            leaves = split(self.tree, leaves, order, room, self.scene, self.seen)
+        return self._of(leaves, style)
 
 
 def closed_form(
@@ -96,7 +102,7 @@ def closed_form(
     opaque = opaque_field(cells, step, np.asarray(scene.half))
     tree = build_tree(cells, seen, step)
     tick(3, 4)
-    return ClosedForm(tree, opaque, float(step.min()), pixel_width(size), budget)
+    return ClosedForm(scene, seen, tree, opaque, float(step.min()), pixel_width(size), budget)
 
 
 def base_level(scene: Scene, pixel: float) -> int:
@@ -104,7 +110,8 @@ def base_level(scene: Scene, pixel: float) -> int:
     voxels = _visible_voxels(scene)
     finest = math.log2(MIN_CELL * pixel / float(scene.step.min()))
     level = max(FINEST, min(0, math.floor(finest)))
-    while voxels * 8.0**-level > MAX_BASE_CELLS:
+    # a long voxel holds more cells than 8^-level
+    while voxels / np.prod(2.0 ** exponents(scene.step, level)) > MAX_BASE_CELLS:
         level += 1
     return level
 
@@ -116,11 +123,18 @@ def _visible_voxels(scene: Scene, samples: int = 256) -> float:
         return 0.0
     chosen = bricks[np.linspace(0, len(bricks) - 1, min(samples, len(bricks))).astype(np.int64)]
     tables = scene.tables
+    positive = np.concatenate([[0], np.cumsum(tables.nodes[:, 3] > 0)])
     share = []
     for z, y, x in chosen:
-        block = scene.values[z : z + BRICK + 1, y : y + BRICK + 1, x : x + BRICK + 1]
-        u = tables.coordinate(block)
-        visible = np.isfinite(u) & (tables.nodes[np.nan_to_num(u).astype(np.int64), 3] > 0)
+        u = tables.coordinate(scene.values[z : z + BRICK + 1, y : y + BRICK + 1, x : x + BRICK + 1])
+        u = np.where(np.isfinite(u), u, 0)
+        low, high = u, u
+        for axis in range(3):  # range over the corners of each cube of eight voxels
+            if u.shape[axis] > 1:
+                n = low.shape[axis]
+                low = np.minimum(np.take(low, range(n - 1), axis), np.take(low, range(1, n), axis))
+                high = np.maximum(np.take(high, range(n - 1), axis), np.take(high, range(1, n), axis))
+        visible = positive[np.ceil(high).astype(np.int64) + 1] > positive[np.floor(low).astype(np.int64)]
         share.append(visible.mean())
     return float(np.mean(share)) * len(bricks) * BRICK**3
 
@@ -140,15 +154,15 @@ def fit(
     Returns:
         The Gaussians and one line that says which way was taken.
     """
-    few = np.arange(0, len(cameras), max(len(cameras) // REFINE_VIEWS, 1))
-    some, images = [cameras[i] for i in few], views[few]
+    few = range(0, len(cameras), max(len(cameras) // REFINE_VIEWS, 1))
+    some, images = [cameras[i] for i in few], views[list(few)]
     styles = STYLES if form.opaque.any else {"": ROUND}
     ways = [(name, refine) for name in styles for refine in (False, True)]
     tick = progress or (lambda done, total: None)
     best: tuple[float, Gaussians, str] | None = None
     for number, (name, refine) in enumerate(ways):
-        ids = form.refined(some, images, styles[name]) if refine else select(form.tree, form.budget)
-        gaussians = solve_colors(form.gaussians(ids, styles[name]), some, images, rounds=1)
+        cut = form.refined(some, images, styles[name]) if refine else form.gaussians(styles[name])
+        gaussians = solve_colors(cut, some, images, rounds=1)
         loss = _loss(gaussians, some, images)
         if best is None or loss < best[0]:
             how = f"cells by {'image error' if refine else 'moments'}" + (f", {name} surfaces" if name else "")

@@ -13,11 +13,12 @@ from dataclasses import dataclass
 import numba as nb
 import numpy as np
 
-from vvgt_cli.dvr.kernel import FLAGS, mean_optics, sample, table_coordinate
+from vvgt_cli.dvr.kernel import FLAGS, mean_optics, table_coordinate
 from vvgt_cli.dvr.scene import BRICK, Scene
 
 # columns of a moment row: M, M x, M y, M z, M xx, M xy, M xz, M yy, M yz, M zz, M r, M g, M b
 MOMENTS = 13
+FINEST_CUT = -4
 CHUNK_CELLS = 1 << 20  # cells of the dense scratch buffer
 
 
@@ -40,12 +41,35 @@ class Cells:
 
 
 @nb.njit(cache=True, fastmath=FLAGS, inline="never")
-def _gradient_width(values, x, y, z, dx, dy, dz):
-    """Spread of the scalar over a box of edges (dx, dy, dz) voxels: root of the summed squared differences."""
-    gx = sample(values, x + 0.5 * dx, y, z) - sample(values, x - 0.5 * dx, y, z)
-    gy = sample(values, x, y + 0.5 * dy, z) - sample(values, x, y - 0.5 * dy, z)
-    gz = sample(values, x, y, z + 0.5 * dz) - sample(values, x, y, z - 0.5 * dz)
-    return math.sqrt(gx * gx + gy * gy + gz * gz)
+def _value_and_spread(values, x, y, z, dx, dy, dz):
+    """Trilinear value at voxel coordinates, and its spread over a box of edges (dx, dy, dz) voxels around there.
+
+    The spread is the root of the summed squared differences over the box, from the gradient of the same eight voxels.
+    NaN where a voxel is not finite.
+    """
+    nz, ny, nx = values.shape
+    # no spread in the rim before the first voxel centre (beyond the last one both neighbours are the same voxel)
+    dx, dy, dz = dx if x > 0.0 else 0.0, dy if y > 0.0 else 0.0, dz if z > 0.0 else 0.0
+    x = min(max(x, 0.0), nx - 1.0)
+    y = min(max(y, 0.0), ny - 1.0)
+    z = min(max(z, 0.0), nz - 1.0)
+    i, j, k = nb.uint64(x), nb.uint64(y), nb.uint64(z)
+    fx, fy, fz = x - i, y - j, z - k
+    i1 = min(i + nb.uint64(1), nb.uint64(nx - 1))
+    j1 = min(j + nb.uint64(1), nb.uint64(ny - 1))
+    k1 = min(k + nb.uint64(1), nb.uint64(nz - 1))
+    a000, a001 = np.float64(values[k, j, i]), np.float64(values[k, j, i1])
+    a010, a011 = np.float64(values[k, j1, i]), np.float64(values[k, j1, i1])
+    a100, a101 = np.float64(values[k1, j, i]), np.float64(values[k1, j, i1])
+    a110, a111 = np.float64(values[k1, j1, i]), np.float64(values[k1, j1, i1])
+    c00, c01 = a000 + (a001 - a000) * fx, a010 + (a011 - a010) * fx
+    c10, c11 = a100 + (a101 - a100) * fx, a110 + (a111 - a110) * fx
+    c0, c1 = c00 + (c01 - c00) * fy, c10 + (c11 - c10) * fy
+    g0, g1 = (a001 - a000) + (a011 - a010 - a001 + a000) * fy, (a101 - a100) + (a111 - a110 - a101 + a100) * fy
+    gx = (g0 + (g1 - g0) * fz) * dx
+    gy = ((c01 - c00) + (c11 - c10 - c01 + c00) * fz) * dy
+    gz = (c1 - c0) * dz
+    return c0 + (c1 - c0) * fz, math.sqrt(gx * gx + gy * gy + gz * gz)
 
 
 @nb.njit(parallel=True, cache=True, fastmath=FLAGS)
@@ -76,12 +100,10 @@ def _brick_moments(values, lo, inv_width, nodes, cumulative, bricks, cells, poin
                                 x = bricks[b, 0] + cx * cell_voxels[0] + (px + 0.5) * dx - 0.5
                                 if x > nx - 0.5:
                                     continue
-                                s = sample(values, x, y, z)
-                                if not (abs(s) < np.inf):
+                                s, w = _value_and_spread(values, x, y, z, dx, dy, dz)
+                                w *= 0.5
+                                if not (abs(s) < np.inf and w < np.inf):
                                     continue
-                                w = 0.5 * _gradient_width(values, x, y, z, dx, dy, dz)
-                                if not (w < np.inf):
-                                    w = 0.0
                                 u0 = table_coordinate(s - w, lo, inv_width, bins)
                                 u1 = table_coordinate(s + w, lo, inv_width, bins)
                                 r, g, bl, tau = mean_optics(u0, u1, nodes, cumulative, bins)
@@ -109,9 +131,12 @@ def _brick_moments(values, lo, inv_width, nodes, cumulative, bricks, cells, poin
 
 
 def exponents(step: np.ndarray, level: int) -> np.ndarray:
-    """Per-axis exponents that make cells of about ``2^level`` x the finest voxel edge, as cubic as powers of two allow."""
+    """Per-axis exponents of cells of about ``2^level`` x the finest voxel edge, as cubic as powers of two allow.
+
+    No voxel is cut into more than ``2^-FINEST_CUT`` along an axis: trilinear matter has nothing to show below that.
+    """
     target = float(step.min()) * 2.0**level
-    return np.round(np.log2(target / step)).astype(np.int64)
+    return np.maximum(np.round(np.log2(target / step)), FINEST_CUT).astype(np.int64)
 
 
 def morton(index: np.ndarray) -> np.ndarray:
@@ -154,6 +179,23 @@ def base_cells(scene: Scene, exponent: np.ndarray, points_per_voxel: int = 2) ->
     moments = np.concatenate(kept_moments) if kept_moments else np.empty((0, MOMENTS))
     order = np.argsort(morton(index), kind="stable")
     return Cells(index[order], moments[order], cell_voxels * scene.step, exponent)
+
+
+# offsets (x, y, z) of a cell's children, x fastest
+CHILDREN = np.array([(x, y, z) for z in (0, 1) for y in (0, 1) for x in (0, 1)], np.int32)
+
+
+def cell_moments(scene: Scene, corners: np.ndarray, edge: np.ndarray, points_per_voxel: int = 2) -> np.ndarray:
+    """Moments (n, 8, 13) of the children of cells of ``edge`` (3,) voxels, ``corners`` (n, 3) voxels from the box's."""
+    tables = scene.tables
+    child = edge / 2
+    points = np.maximum(np.round(child * points_per_voxel), 2).astype(np.int64)
+    out = np.empty((len(corners), 2, 2, 2, MOMENTS))
+    _brick_moments(
+        scene.values, tables.lo, tables.inv_width, tables.nodes, tables.cumulative,
+        np.ascontiguousarray(corners, np.float64), np.full(3, 2), points, child, scene.half, scene.step, out,
+    )  # fmt: skip
+    return out.reshape(len(corners), 8, MOMENTS)
 
 
 def _active_blocks(scene: Scene, block: np.ndarray) -> np.ndarray:

@@ -1,8 +1,8 @@
 """From optical mass to a splat's peak alpha.
 
 A splat blends ``alpha = o g`` with g a Gaussian of projected covariance S, and so takes away the optical depth
-``-ln(1 - o g)``, whose integral over the image is ``Li2(o) 2 pi sqrt(det S)``. It must equal the optical mass M that the
-Gaussian stands for. Viewers cut alpha below 1/255, which loses ``2 pi sqrt(det S) / 255``: it is added back.
+``-ln(1 - o g)``, whose integral over the image is ``Li2(o) 2 pi sqrt(det S)``. It must equal the optical mass M that
+the Gaussian stands for. Viewers cut alpha below 1/255, which loses ``2 pi sqrt(det S) / 255``: it is added back.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ def inverse_dilogarithm(y: np.ndarray) -> np.ndarray:
 def peak_opacity(mass: np.ndarray, variances: np.ndarray, pixel: float) -> np.ndarray:
     """Peak alpha (n,) in [0, 0.99] of Gaussians with optical mass (n,) and principal variances (n, 3).
 
-    3DGS has one opacity for all views: the mean over the views along the three principal axes, weighted by the projected
-    areas. ``pixel`` is a pixel's width at the Gaussian (unit-frame lengths): the renderer's dilation counts.
+    3DGS has one opacity for all views: the mean over the views along the three principal axes, weighted by the
+    projected areas. ``pixel`` is a pixel's width at the Gaussian (unit-frame lengths): the renderer's dilation counts.
     """
     wide = variances + DILATION * pixel**2  # (n, 3)
     areas = (

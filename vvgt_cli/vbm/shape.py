@@ -9,7 +9,7 @@ import numpy as np
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.vbm.inset import Opaque, inset
 from vvgt_cli.vbm.opacity import peak_opacity
-from vvgt_cli.vbm.tree import SEEN, Tree, central
+from vvgt_cli.vbm.tree import SEEN, Leaves, central
 
 FLOOR = 0.05  # smallest standard deviation, in the smaller of voxel and cell edge
 TRANSLUCENT_SPREAD = 1.5  # what a cell that its mass fills adds to its second moment; nothing across a sheet
@@ -40,25 +40,23 @@ ROUND = SurfaceStyle(tangent=0.4, normal=0.6, chord=20, dilation=0.15)  # smooth
 STYLES = {"round": ROUND, "middle": MIDDLE, "sharp": SHARP}
 
 
-def cell_gaussians(
-    tree: Tree, ids: np.ndarray, voxel: float, pixel: float, opaque: Opaque, style: SurfaceStyle
-) -> Gaussians:
+def cell_gaussians(leaves: Leaves, voxel: float, pixel: float, opaque: Opaque, style: SurfaceStyle) -> Gaussians:
     """One Gaussian a cell.
 
     Args:
-        tree, ids: the cells.
+        leaves: the cells.
         voxel: finest voxel edge, unit frame.
         pixel: a pixel's width at the volume's centre, unit frame.
         opaque: where bodies are opaque; their surfaces are moved inwards.
         style: of opaque surfaces.
 
-    The centre is the centroid of the extinction, the covariance its second moment times a spread (1 + min(1, 12 w / H^2)
-    x 1.5 where the cell is translucent, `OPAQUE_SPREAD` where it is not), the colour the seen mean, the opacity that of
-    the mass (`peak_opacity`).
+    The centre is the centroid of the extinction, the covariance its second moment times a spread (1 + 1.5 min(1,
+    12 w / H^2) where the cell is translucent, `OPAQUE_SPREAD` where it is not), the colour the seen mean, the opacity
+    that of the mass (`peak_opacity`).
     """
-    moments = tree.moments[ids]
+    moments = leaves.moments
     mass, mean, cov = central(moments)
-    edge = np.cbrt(tree.edge[ids].prod(axis=1))
+    edge = np.cbrt(leaves.edge.prod(axis=1))
     variances, axes = np.linalg.eigh(cov)  # ascending
     variances = np.maximum(variances, 1e-20)
     solid = -np.expm1(-2 * mass / edge**2)[:, None]
@@ -90,7 +88,7 @@ def make_gaussians(
 
 
 def quaternions(axes: np.ndarray) -> np.ndarray:
-    """Rotation matrices (n, 3, 3) (columns; a reflection is undone on the first) -> unit quaternions (w, x, y, z) (n, 4)."""
+    """Rotations (n, 3, 3) (a reflection is undone on the first column) -> unit quaternions (w, x, y, z) (n, 4)."""
     m = axes.copy()
     m[np.linalg.det(axes) < 0, :, 0] *= -1
     xx, yy, zz = m[:, 0, 0], m[:, 1, 1], m[:, 2, 2]

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vvgt_cli.vbm.moments import MOMENTS, Cells, morton
+from vvgt_cli.dvr.scene import Scene
+from vvgt_cli.vbm.moments import CHILDREN, MOMENTS, Cells, cell_moments, morton
 from vvgt_cli.vbm.visibility import Visibility
 
 HIDDEN = 1e-3  # cells that no view sees with more transmittance are dropped
@@ -22,6 +23,7 @@ class Tree:
         moments: (n, 17) float64: the 13 of `Cells`, then the same cells' seen mass and seen r, g, b
             (weighted by the mean transmittance T over the views).
         largest: (n,) float64 largest transmittance over the views.
+        index: (n, 3) int32 cell indices (x, y, z) from the box's corner, in cells of the row's own size.
         edge: (n, 3) float64 cell edges, unit-frame lengths.
         first: (n,) int64 first child of each cell; children are contiguous.
         children: (n,) int64 number of children, 0 for base cells.
@@ -30,6 +32,7 @@ class Tree:
 
     moments: np.ndarray
     largest: np.ndarray
+    index: np.ndarray
     edge: np.ndarray
     first: np.ndarray
     children: np.ndarray
@@ -52,7 +55,7 @@ def build_tree(cells: Cells, seen: Visibility, step: np.ndarray) -> Tree:
     counts = [len(code) for code in codes]
     total = sum(counts)
     moments, top = np.empty((total, COLUMNS)), np.empty(total)
-    edge, parent = np.empty((total, 3)), np.empty(total, np.int64)
+    index, edge, parent = np.empty((total, 3), np.int32), np.empty((total, 3)), np.empty(total, np.int64)
     first, children = np.zeros(total, np.int64), np.zeros(total, np.int64)
     base = moments[: counts[0]]
     np.take(cells.moments, keep, axis=0, out=base[:, :MOMENTS])
@@ -60,6 +63,7 @@ def build_tree(cells: Cells, seen: Visibility, step: np.ndarray) -> Tree:
     base[:, SEEN + 1 :] = base[:, 10:13] * mean[keep, None]
     top[: counts[0]] = largest[keep]
     edge[: counts[0]] = cells.edge
+    index[: counts[0]] = cells.index[keep]
     offset = 0
     for level, start in enumerate(starts):
         here = slice(offset, offset + counts[level])
@@ -67,12 +71,13 @@ def build_tree(cells: Cells, seen: Visibility, step: np.ndarray) -> Tree:
         np.add.reduceat(moments[here], start, axis=0, out=moments[up])
         np.maximum.reduceat(top[here], start, out=top[up])
         edge[up] = cells.edge * 2.0 ** (level + 1)
+        index[up] = index[here][start] >> 1
         first[up] = offset + start
         children[up] = np.diff(np.append(start, counts[level]))
         parent[here] = up.start + np.repeat(np.arange(counts[level + 1]), children[up])
         offset = here.stop
     parent[offset:] = np.arange(offset, total)
-    return Tree(moments, top, edge, first, children, parent)
+    return Tree(moments, top, index, edge, first, children, parent)
 
 
 def central(moments: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -97,25 +102,41 @@ def split_score(tree: Tree) -> np.ndarray:
 
 
 def select(tree: Tree, budget: int, score: np.ndarray | None = None) -> np.ndarray:
-    """At most ``budget`` cells that cover the scene: split while the score is above a threshold found by search.
+    """At most ``budget`` cells that cover the scene: split while the score is above a threshold found by bisection.
 
     Returns ids into the tree, ascending. A cell is split only where all above it are.
     """
-    if not len(tree):
+    if not len(tree) or budget < 1:
         return np.empty(0, np.int64)
-    score = split_score(tree) if score is None else score
-    capped = _cap_by_ancestors(tree, score)
+    capped = _cap_by_ancestors(tree, split_score(tree) if score is None else score)
     above = capped[tree.parent]
     above[-1] = np.inf  # the root is there at any threshold
     inner = tree.children > 0
-    entries, exits = np.sort(above), np.sort(capped[inner])
-    # cells that exist at threshold t minus those split further
-    thresholds = np.unique(capped)
-    exist = len(entries) - np.searchsorted(entries, thresholds, "right")
-    split = len(exits) - np.searchsorted(exits, thresholds, "right")
-    fits = np.flatnonzero(exist - split <= budget)
-    threshold = thresholds[fits[0]] if len(fits) else np.inf
+    # cells at threshold t: those whose parent is split, minus those split themselves; only large scores can matter
+    split_scores = capped[inner]
+    kept = min(len(split_scores), budget)  # every split adds a cell, or replaces one by an only child
+    while True:
+        floor = np.partition(split_scores, len(split_scores) - kept)[len(split_scores) - kept] if kept else np.inf
+        exits, entries = np.sort(split_scores[split_scores >= floor]), np.sort(above[above >= floor])
+        if kept == len(split_scores) or _cells_above(entries, exits, floor) > budget:
+            break
+        kept = min(2 * kept, len(split_scores))
+    thresholds = np.unique(exits)
+    low, high = -1, len(thresholds) - 1  # at thresholds[high] nothing but the root is left
+    while high - low > 1:
+        middle = (low + high) // 2
+        fits = _cells_above(entries, exits, thresholds[middle]) <= budget
+        low, high = (low, middle) if fits else (middle, high)
+    threshold = thresholds[high] if len(thresholds) else -np.inf  # the root alone
+    if high == 0 and len(thresholds) and len(tree) - inner.sum() <= budget:
+        threshold = -np.inf  # even all base cells fit
     return np.flatnonzero((above > threshold) & ((capped <= threshold) | ~inner))
+
+
+def _cells_above(entries: np.ndarray, exits: np.ndarray, threshold: float) -> int:
+    """Number of cells when all with a score above ``threshold`` are split (both arrays ascending)."""
+    exist = len(entries) - np.searchsorted(entries, threshold, "right")
+    return int(exist - (len(exits) - np.searchsorted(exits, threshold, "right")))
 
 
 def _cap_by_ancestors(tree: Tree, score: np.ndarray) -> np.ndarray:
@@ -133,11 +154,86 @@ def _cap_by_ancestors(tree: Tree, score: np.ndarray) -> np.ndarray:
     return capped
 
 
-def split(tree: Tree, ids: np.ndarray, which: np.ndarray) -> np.ndarray:
-    """Replace the cells ``ids[which]`` by their children; ids ascending."""
-    chosen = ids[which]
-    counts = tree.children[chosen]
-    inside = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
-    kept = np.ones(len(ids), bool)
-    kept[which] = False
-    return np.sort(np.concatenate([ids[kept], np.repeat(tree.first[chosen], counts) + inside]))
+@dataclass(frozen=True)
+class Leaves:
+    """Cells that become Gaussians, one each: rows of a tree, or cells below its base.
+
+    Attributes:
+        moments: (k, 17), as in `Tree`.
+        index: (k, 3) int32, as in `Tree`.
+        edge: (k, 3) float64, as in `Tree`.
+        node: (k,) int64 row of the tree, -1 below its base.
+    """
+
+    moments: np.ndarray
+    index: np.ndarray
+    edge: np.ndarray
+    node: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.node)
+
+    def take(self, which: np.ndarray) -> Leaves:
+        return Leaves(self.moments[which], self.index[which], self.edge[which], self.node[which])
+
+
+def leaves_of(tree: Tree, ids: np.ndarray) -> Leaves:
+    """The rows ``ids`` of a tree."""
+    return Leaves(tree.moments[ids], tree.index[ids], tree.edge[ids], ids)
+
+
+def split(tree: Tree, leaves: Leaves, order: np.ndarray, room: int, scene: Scene, seen: Visibility) -> Leaves:
+    """Replace leaves by their children, in the given order, until ``room`` more leaves are there.
+
+    Children come from the tree, or are integrated from the volume below its base. Leaves without visible children stay.
+    """
+    order = order[: max(room, 0)]  # every split but that of an only child's parent adds one or more
+    inside = (leaves.node[order] >= 0) & (tree.children[np.maximum(leaves.node[order], 0)] > 0)
+    counts = np.zeros(len(order), np.int64)
+    counts[inside] = tree.children[leaves.node[order[inside]]]
+    below = np.flatnonzero(~inside)
+    if len(below):  # integrate no more than can be used: most have at least three visible children
+        below = below[: np.searchsorted(np.cumsum(np.where(inside, counts - 1, 2)), room, "right") + 1]
+        owner, grown = _children_below(leaves.take(order[below]), scene, seen)
+        counts[below] = np.bincount(owner, minlength=len(below))
+    splits = np.flatnonzero(counts > 0)
+    splits = splits[: np.searchsorted(np.cumsum(counts[splits] - 1), room, "right")]
+    parts = []
+    if len(below):
+        parts.append(grown.take(np.flatnonzero(np.isin(below[owner], splits))))
+    nodes = leaves.node[order[splits[inside[splits]]]]
+    many = tree.children[nodes]
+    offsets = np.arange(many.sum()) - np.repeat(np.cumsum(many) - many, many)
+    parts.append(leaves_of(tree, np.repeat(tree.first[nodes], many) + offsets))
+    kept = np.ones(len(leaves), bool)
+    kept[order[splits]] = False
+    parts.insert(0, leaves.take(np.flatnonzero(kept)))
+    fields = ("moments", "index", "edge", "node")
+    return Leaves(*(np.concatenate([getattr(part, field) for part in parts]) for field in fields))
+
+
+def _children_below(leaves: Leaves, scene: Scene, seen: Visibility) -> tuple[np.ndarray, Leaves]:
+    """Visible children of cells at or below a tree's base: their parents (n,), ascending, and themselves."""
+    step = np.asarray(scene.step)
+    owners, found = [], []
+    for edge in np.unique(leaves.edge, axis=0):
+        chosen = np.flatnonzero((leaves.edge == edge).all(axis=1))
+        moments = cell_moments(scene, leaves.index[chosen] * (edge / step), edge / step)  # (n, 8, 13)
+        index = 2 * leaves.index[chosen][:, None, :] + CHILDREN  # (n, 8, 3)
+        mean, largest = seen.at(((index + 0.5) * (edge / 2 / step)).reshape(-1, 3))
+        keep = (moments[..., 0] > 0) & (largest.reshape(-1, 8) > HIDDEN)
+        rows = with_seen(moments[keep], mean[keep.ravel()])
+        owners.append(np.repeat(chosen, keep.sum(axis=1)))
+        found.append(
+            Leaves(rows, index[keep], np.broadcast_to(edge / 2, (len(rows), 3)), np.full(len(rows), -1, np.int64))
+        )
+    owner = np.concatenate(owners)
+    fields = ("moments", "index", "edge", "node")
+    together = Leaves(*(np.concatenate([getattr(part, field) for part in found]) for field in fields))
+    order = np.argsort(owner, kind="stable")
+    return owner[order], together.take(order)
+
+
+def with_seen(moments: np.ndarray, mean: np.ndarray) -> np.ndarray:
+    """Moments (n, 13) and mean transmittance (n,) -> (n, 17) with the seen mass and colour."""
+    return np.concatenate([moments, moments[:, [0, 10, 11, 12]] * mean[:, None]], axis=1)
