@@ -29,8 +29,8 @@ def command(volume: str, console: Console, **options: Any) -> None:
     "example:NAME" for one of the volumes that come with the program, or "-" for raw values on standard
     input. Without --tf a function is made from the histogram.
 
-    The Gaussians are made for images of --size pixels and scored on ten test views that nothing was fitted
-    to; the error is printed.
+    The Gaussians are made for images of --size pixels and scored on three test views that nothing was fitted
+    to (ten with --report); the error is printed.
 
     \b
     Examples:

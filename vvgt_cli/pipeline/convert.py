@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from vvgt_cli.vbm import Start
 
 VIEW_BYTES = 2 * 16  # a pixel: float32 RGBA, and as much again while views are stacked
-PREVIEW_VIEWS = (0, 4, 9)  # test views in the preview: from above, from the side, from below
+PREVIEW_VIEWS = (0, 4, 9)  # test views of the preview, and of the score without a report: above, side, below
 
 
 @dataclass(frozen=True)
@@ -196,14 +196,14 @@ def _splats(gaussians: Gaussians, cameras: list[Camera]) -> list[np.ndarray]:
 def _back_project(run: Run, scene: Scene, start: Start, fit: FitOptions) -> Gaussians:
     """What the training views can mend, kept if the check views agree."""
     from vvgt_cli.dvr import render_views
-    from vvgt_cli.dvr.render import FIT_VIEWS, SCORE_VIEWS
+    from vvgt_cli.dvr.render import FIT_VIEWS
     from vvgt_cli.metrics import score_views
     from vvgt_cli.vbm import backproject
 
     train, check = default_views("train", size=fit.size), default_views("check", size=fit.size)
     with run.stage("views") as stage:
         images = render_views(scene, train, FIT_VIEWS, progress=run.console.bar("views"))
-        reference = render_views(scene, check, SCORE_VIEWS)
+        reference = render_views(scene, check, FIT_VIEWS)
         stage.note = f"{len(train)} to fit to, {len(check)} to check by, {fit.size} px"
     with run.stage("back-projection") as stage:
         before = score_views(reference, _splats(start.gaussians, check), perceptual=False).psnr
@@ -227,6 +227,7 @@ def _score(run: Run, scene: Scene, gaussians: Gaussians, request: ConvertRequest
             SCORE_VIEWS,
             perceptual=request.report is not None,
             keep=PREVIEW_VIEWS if request.preview else (),
+            only=None if request.report else PREVIEW_VIEWS,
             progress=run.console.bar("test views"),
         )
         stage.note = f"{psnr_note(scores)}, {scores.views} views of {request.fit.size} px"

@@ -24,6 +24,7 @@ def score_test_views(
     *,
     perceptual: bool = True,
     keep: Collection[int] = (),
+    only: Collection[int] | None = None,
     progress: ProgressCallback | None = None,
 ) -> tuple[Scores, np.ndarray | None]:
     """Scores on the test views at ``size`` px (docs/conventions.md, "Units of a report").
@@ -34,6 +35,7 @@ def score_test_views(
         settings: of the reference.
         perceptual: SSIM and FLIP too.
         keep: numbers of views to draw.
+        only: numbers of the views to score; None for all ten.
         progress: called after each view.
 
     Returns:
@@ -46,14 +48,16 @@ def score_test_views(
     from vvgt_cli.splat import render
 
     cameras = default_views("test", size=size)
+    numbers = sorted(range(len(cameras)) if only is None else only)
     views, rows = [], []
-    for i, camera in enumerate(cameras):
+    for done, i in enumerate(numbers):
+        camera = cameras[i]
         reference, ours = render_view(scene, camera, settings), render(gaussians, camera)
         views.append(score_view(reference, ours, perceptual=perceptual))
         if i in keep:
             rows.append(side_by_side(reference, ours))
         if progress:
-            progress(i + 1, len(cameras))
+            progress(done + 1, len(numbers))
     return mean_scores(views), np.concatenate(rows) if rows else None
 
 

@@ -23,7 +23,7 @@ from vvgt_cli.vbm.visibility import Visibility, visibility
 MAX_BASE_CELLS = 2_500_000  # 104 bytes of moments each, twice that for the pyramid
 FINEST = -2  # base cells of a quarter voxel at most
 MIN_CELL = 1.2  # pixels: a smaller base cell cannot be told from its neighbours
-MARCH_SIZE = 200  # pixels of the visibility march
+MARCH_SIZE = 160  # pixels of the visibility march
 REFINE_FROM = 0.5  # share of the budget given out before views say where the error is
 REFINE_ROUNDS = 2
 REFINE_VIEWS = 8

@@ -17,6 +17,7 @@ from vvgt_cli.dvr.kernel import sample
 from vvgt_cli.vbm.moments import Cells
 
 OPAQUE_DEPTH = 5.0  # optical depth a voxel at which a cell counts as wholly opaque; half of it is the surface
+MAX_FIELD = 1 << 26  # cells of the opacity field; finer scenes are averaged down to it
 FLAT = 0.02  # change of opacity over a cell below which there is no surface to speak of
 
 
@@ -48,21 +49,28 @@ def opaque_field(cells: Cells, step: np.ndarray, half: np.ndarray) -> Opaque:
     if not len(depth) or depth.max() < 0.5:
         none = np.empty((0, 0, 0), np.float32)
         return Opaque(none, none, cells.edge, half)
-    shape = np.ceil(2 * half / cells.edge - 1e-6).astype(np.int64)
-    field = np.zeros(shape[::-1], np.float32)
-    x, y, z = cells.index.T
-    field[z, y, x] = np.minimum(depth, 1)
-    return Opaque(field, _blur(_blur(field)), cells.edge, half)
+    edge, index = cells.edge, cells.index
+    fraction = np.minimum(depth, 1)
+    while math.prod(np.ceil(2 * half / edge - 1e-6)) > MAX_FIELD:
+        edge, index, fraction = edge * 2, index >> 1, fraction / 8
+    field = np.zeros(np.ceil(2 * half / edge - 1e-6).astype(np.int64)[::-1], np.float32)
+    np.add.at(field, (index[:, 2], index[:, 1], index[:, 0]), fraction.astype(np.float32))
+    smooth = field.copy()
+    _blur(smooth)
+    _blur(smooth)
+    return Opaque(field, smooth, edge, half)
 
 
-def _blur(field: np.ndarray) -> np.ndarray:
-    """[1, 2, 1] / 4 along each axis, edges clamped."""
+def _blur(field: np.ndarray) -> None:
+    """[1, 2, 1] / 4 along each axis in place, edges clamped."""
     for axis in range(3):
-        first, last = np.take(field, [0], axis), np.take(field, [-1], axis)
-        below = np.concatenate([first, np.delete(field, -1, axis)], axis) if field.shape[axis] > 1 else field
-        above = np.concatenate([np.delete(field, 0, axis), last], axis) if field.shape[axis] > 1 else field
-        field = 0.5 * field + 0.25 * (below + above)
-    return field
+        rows = np.moveaxis(field, axis, 0)
+        before = rows[0].copy()
+        for i in range(len(rows)):
+            here = rows[i].copy()
+            after = rows[min(i + 1, len(rows) - 1)]
+            rows[i] = 0.5 * here + 0.25 * (before + after)
+            before = here
 
 
 @nb.njit(cache=True, inline="never")

@@ -73,7 +73,7 @@ def _value_and_spread(values, x, y, z, dx, dy, dz):
 
 
 @nb.njit(parallel=True, cache=True, fastmath=FLAGS)
-def _brick_moments(values, lo, inv_width, nodes, cumulative, bricks, cells, points, cell_voxels, half, step, out):
+def _brick_moments(values, lo, inv_width, nodes, cumulative, dark, bricks, cells, points, cell_voxels, half, step, out):
     """Moments of the ``cells`` (x, y, z) cells of each brick with ``points`` (x, y, z) points a cell.
 
     ``bricks`` (n, 3) origins in voxels (x, y, z); ``out`` (n, cells z, cells y, cells x, 13).
@@ -106,6 +106,8 @@ def _brick_moments(values, lo, inv_width, nodes, cumulative, bricks, cells, poin
                                     continue
                                 u0 = table_coordinate(s - w, lo, inv_width, bins)
                                 u1 = table_coordinate(s + w, lo, inv_width, bins)
+                                if max(u0, u1) <= dark[int(min(u0, u1))]:
+                                    continue
                                 r, g, bl, tau = mean_optics(u0, u1, nodes, cumulative, bins)
                                 if not tau > 0.0:
                                     continue
@@ -168,7 +170,7 @@ def base_cells(scene: Scene, exponent: np.ndarray, points_per_voxel: int = 2) ->
         part = origins[first : first + chunk]
         out = scratch[: len(part)]
         _brick_moments(
-            scene.values, tables.lo, tables.inv_width, tables.nodes, tables.cumulative, part.astype(np.float64),
+            scene.values, tables.lo, tables.inv_width, tables.nodes, tables.cumulative, tables.dark, part.astype(np.float64),
             cells, points, cell_voxels, scene.half, scene.step, out,
         )  # fmt: skip
         at = np.argwhere(out[..., 0] > 0)  # block, z, y, x
@@ -192,7 +194,7 @@ def cell_moments(scene: Scene, corners: np.ndarray, edge: np.ndarray, points_per
     points = np.maximum(np.round(child * points_per_voxel), 2).astype(np.int64)
     out = np.empty((len(corners), 2, 2, 2, MOMENTS))
     _brick_moments(
-        scene.values, tables.lo, tables.inv_width, tables.nodes, tables.cumulative,
+        scene.values, tables.lo, tables.inv_width, tables.nodes, tables.cumulative, tables.dark,
         np.ascontiguousarray(corners, np.float64), np.full(3, 2), points, child, scene.half, scene.step, out,
     )  # fmt: skip
     return out.reshape(len(corners), 8, MOMENTS)

@@ -51,7 +51,7 @@ def _cell(x, y, z, inv_cell, grid):
 
 
 @nb.njit(cache=True, fastmath=FLAGS, inline="never")
-def _deposit(values, lo, inv_width, nodes, cumulative, empty, px, py, pz, dx, dy, dz, step, inv_cell, grid):
+def _deposit(values, lo, inv_width, nodes, cumulative, dark, empty, px, py, pz, dx, dy, dz, step, inv_cell, grid):
     """March p + t d and add to ``grid`` (3, cz, cy, cx): optical depth, its seen part, largest transmittance.
 
     What lies behind an opaque front adds to the depth only: it is there, and not seen.
@@ -80,7 +80,7 @@ def _deposit(values, lo, inv_width, nodes, cumulative, empty, px, py, pz, dx, dy
             u0 = table_coordinate(sample(values, x, y, z), lo, inv_width, bins)
         t += dt
         u1 = table_coordinate(sample(values, px + t * dx, py + t * dy, pz + t * dz), lo, inv_width, bins)
-        if u0 >= 0.0 and u1 >= 0.0:
+        if u0 >= 0.0 and u1 >= 0.0 and max(u0, u1) > dark[int(min(u0, u1))]:
             depth = mean_optics(u0, u1, nodes, cumulative, bins)[3] * dt
             if depth > 0.0:
                 t -= 0.5 * dt
@@ -95,7 +95,7 @@ def _deposit(values, lo, inv_width, nodes, cumulative, empty, px, py, pz, dx, dy
 
 
 @nb.njit(parallel=True, cache=True, fastmath=FLAGS)
-def _march(values, lo, inv_width, nodes, cumulative, empty, eyes, bases, lenses, size, step, inv_cell, grids):
+def _march(values, lo, inv_width, nodes, cumulative, dark, empty, eyes, bases, lenses, size, step, inv_cell, grids):
     """Rays of all views, dealt over the workers; ``grids`` (workers, 3, cz, cy, cx) float32."""
     workers = grids.shape[0]
     for worker in nb.prange(workers):
@@ -109,7 +109,7 @@ def _march(values, lo, inv_width, nodes, cumulative, empty, eyes, bases, lenses,
                 dy = (basis[0, 1] * a + basis[1, 1] * b + basis[2, 1]) * norm
                 dz = (basis[0, 2] * a + basis[1, 2] * b + basis[2, 2]) * norm
                 _deposit(
-                    values, lo, inv_width, nodes, cumulative, empty,
+                    values, lo, inv_width, nodes, cumulative, dark, empty,
                     eye[0], eye[1], eye[2], dx, dy, dz, step, inv_cell, grids[worker],
                 )  # fmt: skip
 
@@ -134,7 +134,7 @@ def visibility(scene: Scene, cameras: Sequence[Camera], step: float = 1.0) -> Vi
     arrays = [camera_arrays(scene, camera) for camera in cameras]
     tables = scene.tables
     _march(
-        scene.values, tables.lo, tables.inv_width, tables.nodes, tables.cumulative, scene.empty,
+        scene.values, tables.lo, tables.inv_width, tables.nodes, tables.cumulative, tables.dark, scene.empty,
         np.stack([a[0] for a in arrays]), np.stack([a[1] for a in arrays]), np.stack([a[2] for a in arrays]),
         cameras[0].width, step, 1.0 / (1 << exponent), grids,
     )  # fmt: skip
