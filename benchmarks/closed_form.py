@@ -73,7 +73,7 @@ def measure(scene: Scene, method: str, budget: int, step: float) -> dict[str, fl
 
 def table(path: str) -> str:
     """The CSV as a Markdown table."""
-    rows = list(csv.DictReader(Path(path).open(newline="")))
+    rows = list(csv.DictReader(Path(path).read_text().splitlines()))
     columns = ["scene", "method", *FIELDS, *SECONDS]
     lines = ["| " + " | ".join(columns) + " |", "| --- " * len(columns) + "|"]
     lines += ["| " + " | ".join(row[c] for c in columns) + " |" for row in rows]

@@ -27,7 +27,7 @@ MARCH_SIZE = 160  # pixels of the visibility march
 REFINE_FROM = 0.5  # share of the budget given out before views say where the error is
 REFINE_ROUNDS = 2
 REFINE_VIEWS = 8
-TWICE = 1.25  # weight of the error at twice the size: averaging hides part of it
+TWICE = 1.25  # weight of the error at twice the size where styles of surface compete
 
 Progress = Callable[[int, int], None]
 
@@ -163,7 +163,7 @@ def fit(
     for number, (name, refine) in enumerate(ways):
         cut = form.refined(some, images, styles[name]) if refine else form.gaussians(styles[name])
         gaussians = solve_colors(cut, some, images, rounds=1)
-        loss = _loss(gaussians, some, images)
+        loss = _loss(gaussians, some, images, TWICE if form.opaque.any else 0.0)
         if best is None or loss < best[0]:
             how = f"cells by {'image error' if refine else 'moments'}" + (f", {name} surfaces" if name else "")
             best = loss, gaussians, how
@@ -174,15 +174,16 @@ def fit(
     return gaussians, best[2]
 
 
-def _loss(gaussians: Gaussians, cameras: Sequence[Camera], views: np.ndarray) -> float:
-    """Mean squared colour error at the views' size, plus `TWICE` times that at twice the size (averaged 2 x 2).
+def _loss(gaussians: Gaussians, cameras: Sequence[Camera], views: np.ndarray, twice: float) -> float:
+    """Mean squared colour error at the views' size, plus ``twice`` times that at twice the size (averaged 2 x 2).
 
     A file that leans on the renderer's 0.3 px looks right at one size only.
     """
-    once = twice = 0.0
+    total = 0.0
     for camera, view in zip(cameras, views, strict=True):
-        large = render(gaussians, camera.resized(2))
-        halved = large.reshape(camera.height, 2, camera.width, 2, 4).mean(axis=(1, 3))
-        once += float(np.mean((render(gaussians, camera) - view)[..., :3] ** 2))
-        twice += float(np.mean((halved - view)[..., :3] ** 2))
-    return (once + TWICE * twice) / len(cameras)
+        total += float(np.mean((render(gaussians, camera) - view)[..., :3] ** 2))
+        if twice:
+            large = render(gaussians, camera.resized(2))
+            halved = large.reshape(camera.height, 2, camera.width, 2, 4).mean(axis=(1, 3))
+            total += twice * float(np.mean((halved - view)[..., :3] ** 2))
+    return total / len(cameras)

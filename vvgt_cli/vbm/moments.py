@@ -170,8 +170,8 @@ def base_cells(scene: Scene, exponent: np.ndarray, points_per_voxel: int = 2) ->
         part = origins[first : first + chunk]
         out = scratch[: len(part)]
         _brick_moments(
-            scene.values, tables.lo, tables.inv_width, tables.nodes, tables.cumulative, tables.dark, part.astype(np.float64),
-            cells, points, cell_voxels, scene.half, scene.step, out,
+            scene.values, tables.lo, tables.inv_width, tables.nodes, tables.cumulative, tables.dark,
+            part.astype(np.float64), cells, points, cell_voxels, scene.half, scene.step, out,
         )  # fmt: skip
         at = np.argwhere(out[..., 0] > 0)  # block, z, y, x
         kept_moments.append(out[at[:, 0], at[:, 1], at[:, 2], at[:, 3]])
