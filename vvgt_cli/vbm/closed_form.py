@@ -20,8 +20,8 @@ from vvgt_cli.vbm.shape import ROUND, STYLES, SurfaceStyle, cell_gaussians
 from vvgt_cli.vbm.tree import Leaves, Tree, build_tree, leaves_of, select, split
 from vvgt_cli.vbm.visibility import Visibility, visibility
 
-MAX_BASE_CELLS = 2_500_000  # 104 bytes of moments each, twice that for the pyramid
-FINEST = -2  # base cells of a quarter voxel at most
+MAX_BASE_CELLS = 5_000_000  # an upper bound: half of them are there, as a rule; 104 bytes each, twice for the pyramid
+FINEST = -2  # cells of a quarter voxel at most
 MIN_CELL = 1.2  # pixels: a smaller base cell cannot be told from its neighbours
 MARCH_SIZE = 160  # pixels of the visibility march
 REFINE_FROM = 0.5  # share of the budget given out before views say where the error is

@@ -35,7 +35,7 @@ class SurfaceStyle:
 
 
 SHARP = SurfaceStyle(tangent=0.05, normal=0.05, chord=15, dilation=0.3)  # rough and thin bodies
-MIDDLE = SurfaceStyle(tangent=0.3, normal=0.3, chord=15, dilation=0.2)
+MIDDLE = SurfaceStyle(tangent=0.3, normal=0.2, chord=15, dilation=0.22)
 ROUND = SurfaceStyle(tangent=0.4, normal=0.6, chord=20, dilation=0.15)  # smooth bodies: no holes at larger sizes
 STYLES = {"round": ROUND, "middle": MIDDLE, "sharp": SHARP}
 
