@@ -8,6 +8,7 @@ import numba as nb
 import numpy as np
 
 from vvgt_cli.dvr.scene import BRICK, BRICK_BITS
+from vvgt_cli.jit import inlined
 
 OPAQUE = 1e-5  # transmittance at which a ray ends: half a step of 16-bit output
 SUB_DEPTH = 0.3  # optical depth of a sub-segment: colour is constant within one
@@ -16,7 +17,7 @@ FLAGS = {"contract", "nsz", "arcp", "afn"}  # no nnan/ninf: non-finite voxels ar
 
 U = nb.uint64
 
-_jit = nb.njit(cache=True, fastmath=FLAGS, error_model="numpy")
+_jit = inlined(fastmath=FLAGS, error_model="numpy")
 
 
 @_jit

@@ -12,6 +12,7 @@ import math
 import numba as nb
 import numpy as np
 
+from vvgt_cli.jit import inlined
 from vvgt_cli.splat.constants import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, TILE
 
 f32, U = np.float32, nb.uint64
@@ -26,7 +27,7 @@ _EXP = tuple(
     for c in (0.9999926580422791, 0.49986938813311016, 0.16589198457717946, 0.03960749971954136, 0.005739152125547126)
 )
 
-_jit = nb.njit(cache=True, fastmath=True, error_model="numpy")
+_jit = inlined(fastmath=True, error_model="numpy")
 _parallel = nb.njit(cache=True, fastmath=True, error_model="numpy", parallel=True)
 
 

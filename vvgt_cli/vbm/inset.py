@@ -14,6 +14,7 @@ import numba as nb
 import numpy as np
 
 from vvgt_cli.dvr.kernel import sample
+from vvgt_cli.jit import inlined
 from vvgt_cli.vbm.moments import Cells
 
 OPAQUE_DEPTH = 5.0  # optical depth a voxel at which a cell counts as wholly opaque; half of it is the surface
@@ -73,7 +74,7 @@ def _blur(field: np.ndarray) -> None:
             before = here
 
 
-@nb.njit(cache=True, inline="never")
+@inlined()
 def _run(field, x, y, z, dx, dy, dz, limit, inside):
     """Steps along d, from 1 to ``limit``, before the field leaves (``inside``) or enters the body; limit if never."""
     for i in range(1, limit):

@@ -15,6 +15,7 @@ import numpy as np
 
 from vvgt_cli.dvr.kernel import FLAGS, mean_optics, table_coordinate
 from vvgt_cli.dvr.scene import BRICK, Scene
+from vvgt_cli.jit import inlined
 
 # columns of a moment row: M, M x, M y, M z, M xx, M xy, M xz, M yy, M yz, M zz, M r, M g, M b
 MOMENTS = 13
@@ -40,7 +41,7 @@ class Cells:
     exponent: np.ndarray
 
 
-@nb.njit(cache=True, fastmath=FLAGS, inline="never")
+@inlined(fastmath=FLAGS)
 def _value_and_spread(values, x, y, z, dx, dy, dz):
     """Trilinear value at voxel coordinates, and its spread over a box of edges (dx, dy, dz) voxels around there.
 

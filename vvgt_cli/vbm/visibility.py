@@ -13,6 +13,7 @@ from vvgt_cli.cameras import Camera
 from vvgt_cli.dvr.kernel import FLAGS, _leap, box_span, mean_optics, sample, table_coordinate
 from vvgt_cli.dvr.render import camera_arrays
 from vvgt_cli.dvr.scene import BRICK_BITS, Scene
+from vvgt_cli.jit import inlined
 
 MAX_CELLS = 1 << 24
 MIN_RAYS = 8  # that meet a cell: with fewer, some cells are met by none and count as hidden
@@ -40,7 +41,7 @@ class Visibility:
         return self.mean[z, y, x], self.largest[z, y, x]
 
 
-@nb.njit(cache=True, fastmath=FLAGS, inline="never")
+@inlined(fastmath=FLAGS)
 def _cell(x, y, z, inv_cell, grid):
     """Grid cell of a point in voxel coordinates."""
     return (
@@ -50,7 +51,7 @@ def _cell(x, y, z, inv_cell, grid):
     )
 
 
-@nb.njit(cache=True, fastmath=FLAGS, inline="never")
+@inlined(fastmath=FLAGS)
 def _deposit(values, lo, inv_width, nodes, cumulative, dark, empty, px, py, pz, dx, dy, dz, step, inv_cell, grid):
     """March p + t d and add to ``grid`` (3, cz, cy, cx): optical depth, its seen part, largest transmittance.
 
