@@ -1,0 +1,63 @@
+"""One switch over the programs that can render a `Scene`: the numba kernel, torch on CUDA, VTK."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from vvgt_cli.cameras import Camera
+from vvgt_cli.dvr.render import RenderSettings, render_view
+from vvgt_cli.dvr.scene import Scene
+from vvgt_cli.errors import UsageError
+
+RENDERERS = ("cpu", "cuda", "vtk")
+
+
+def view_renderer(
+    renderer: str, scene: Scene, settings: RenderSettings | None = None, *, shade: bool = False
+) -> Callable[[Camera], np.ndarray]:
+    """A function from a camera to its view, (height, width, 4) float32, premultiplied RGBA over nothing.
+
+    What a renderer prepares once a scene (uploads, pipelines) is prepared here, so views can be asked for one by one.
+
+    Args:
+        renderer: ``cpu`` (the numba kernel), ``cuda`` (torch, the same definition) or ``vtk`` (VTK's own picture).
+        scene: the volume under its function.
+        settings: step and rays a pixel; VTK takes the step and shoots one ray a pixel.
+        shade: light the volume as VTK does; only ``vtk`` can.
+
+    Raises:
+        UsageError: an unknown renderer, ``shade`` with another than ``vtk``, a package that is not installed.
+        DataError: no CUDA device, or no off-screen OpenGL, on this machine.
+    """
+    settings = settings or RenderSettings()
+    if renderer not in RENDERERS:
+        raise UsageError(f"renderer {renderer!r}; expected one of {', '.join(RENDERERS)}")
+    if shade and renderer != "vtk":
+        raise UsageError(f"the {renderer} renderer has no lighting; leave it out, or use the vtk renderer")
+    if renderer == "cpu":
+        return lambda camera: render_view(scene, camera, settings)
+    raise UsageError(f"the {renderer} renderer is not built in; use cpu")
+
+
+def render_views_with(
+    renderer: str,
+    scene: Scene,
+    cameras: Sequence[Camera],
+    settings: RenderSettings | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    *,
+    shade: bool = False,
+) -> np.ndarray:
+    """Views of one size: (n, height, width, 4) float32, premultiplied; arguments and errors as `view_renderer`.
+
+    ``progress(done, total)`` is called after each view.
+    """
+    draw = view_renderer(renderer, scene, settings, shade=shade)
+    images = []
+    for i, camera in enumerate(cameras):
+        images.append(draw(camera))
+        if progress:
+            progress(i + 1, len(cameras))
+    return np.stack(images)
