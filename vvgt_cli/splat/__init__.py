@@ -1,6 +1,17 @@
-"""EWA splatting."""
+"""EWA splatting, with gradients."""
 
-from vvgt_cli.splat.reference import gather_reference, render_reference
-from vvgt_cli.splat.render import Projection, blend, gather, project, render
+from vvgt_cli.splat.reference import gather_reference, render_backward_reference, render_reference
+from vvgt_cli.splat.render import Gradients, Projection, blend, gather, project, render, render_backward
 
-__all__ = ["Projection", "blend", "gather", "gather_reference", "project", "render", "render_reference"]
+__all__ = [
+    "Gradients",
+    "Projection",
+    "blend",
+    "gather",
+    "gather_reference",
+    "project",
+    "render",
+    "render_backward",
+    "render_backward_reference",
+    "render_reference",
+]

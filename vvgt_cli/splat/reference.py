@@ -57,8 +57,11 @@ def project(gaussians: Gaussians, camera: Camera) -> tuple[np.ndarray, np.ndarra
     return centres, flat, z
 
 
-def weights(gaussians: Gaussians, camera: Camera) -> Iterator[tuple[int, np.ndarray]]:
-    """Front-to-back blending in order of the centres' depth: Gaussian k and its weight T alpha, (height, width)."""
+def layers(gaussians: Gaussians, camera: Camera) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+    """Front to back in order of the centres' depth: Gaussian k, its alpha and the transmittance T in front of it.
+
+    Both (height, width) float64; alpha is 0 where nothing is drawn: below the cut, and in pixels that have ended.
+    """
     centres, flat, depths = project(gaussians, camera)
     opacity = 1 / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64)))
     px, py = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
@@ -72,10 +75,16 @@ def weights(gaussians: Gaussians, camera: Camera) -> Iterator[tuple[int, np.ndar
         power = 0.5 * (inverse[0, 0] * dx * dx + inverse[1, 1] * dy * dy) + inverse[0, 1] * dx * dy
         alpha = np.minimum(MAX_ALPHA, opacity[k] * np.exp(-power))
         alpha[alpha < MIN_ALPHA] = 0
-        after = trans * (1 - alpha)
-        alive &= (after >= MIN_TRANSMITTANCE) | (alpha == 0)
-        yield int(k), np.where(alive, alpha * trans, 0)
-        trans = np.where(alive, after, trans)
+        alive &= (trans * (1 - alpha) >= MIN_TRANSMITTANCE) | (alpha == 0)
+        alpha = np.where(alive, alpha, 0)
+        yield int(k), alpha, trans
+        trans = trans * (1 - alpha)
+
+
+def weights(gaussians: Gaussians, camera: Camera) -> Iterator[tuple[int, np.ndarray]]:
+    """Gaussian k and its weight T alpha, (height, width), front to back."""
+    for k, alpha, trans in layers(gaussians, camera):
+        yield k, trans * alpha
 
 
 def render_reference(gaussians: Gaussians, camera: Camera) -> np.ndarray:
@@ -94,3 +103,91 @@ def gather_reference(gaussians: Gaussians, camera: Camera, fields: np.ndarray) -
         out[k, 0] = weight.sum()
         out[k, 1:] = (weight * fields).sum(axis=(1, 2))
     return out
+
+
+def image_gradients(
+    gaussians: Gaussians, camera: Camera, grad: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Gradients with respect to what is on the screen, of a loss whose gradient to the picture is ``grad`` (h, w, 4).
+
+    Back to front: with B the picture behind a splat, seen without what is in front, the picture is
+    ``... + T (alpha (c, 1) + (1 - alpha) B)``, so that dL/dalpha = T ((c, 1) - B) . grad.
+
+    Returns:
+        centres (K, 2), inverse projected covariances (K, 2, 2) symmetric, opacity logits (K,), colours (K, 3).
+    """
+    count = len(gaussians)
+    centres, flat, _ = project(gaussians, camera)
+    opacity = 1 / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64)))
+    pixels = np.stack(np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5), -1)
+    colors = np.column_stack([np.maximum(gaussians.colors.astype(np.float64), 0), np.ones(count)])
+    out = np.zeros((count, 2)), np.zeros((count, 2, 2)), np.zeros(count), np.zeros((count, 4))
+    behind = np.zeros((camera.height, camera.width, 4))
+    for k, alpha, trans in reversed(list(layers(gaussians, camera))):
+        out[3][k] = ((trans * alpha)[..., None] * grad).sum(axis=(0, 1))
+        slope = trans * ((colors[k] - behind) * grad).sum(axis=-1)  # dL/dalpha
+        slope[(alpha == 0) | (alpha == MAX_ALPHA)] = 0
+        moved = slope * alpha  # dL/d(exponent), and dL/d(log opacity)
+        d, inverse = pixels - centres[k], np.linalg.inv(flat[k])
+        out[0][k] = (moved[..., None] * (d @ inverse)).sum(axis=(0, 1))
+        out[1][k] = -0.5 * np.einsum("yx,yxi,yxj->ij", moved, d, d)
+        out[2][k] = moved.sum() * (1 - opacity[k])
+        behind = alpha[..., None] * colors[k] + (1 - alpha)[..., None] * behind
+    return *out[:3], np.where(gaussians.colors >= 0, out[3][:, :3], 0)
+
+
+def space_gradients(
+    gaussians: Gaussians, camera: Camera, centres: np.ndarray, inverses: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Gradients with respect to means (K, 3) and covariances (K, 3, 3), given those of `image_gradients`."""
+    means, spatial = np.zeros((len(gaussians), 3)), np.zeros((len(gaussians), 3, 3))
+    points = gaussians.means.astype(np.float64) @ camera.rotation.T + camera.translation
+    local = camera.rotation @ covariances(gaussians) @ camera.rotation.T
+    for k, (x, y, z) in enumerate(points):
+        if not z > NEAR:
+            continue
+        fx, fy = camera.fx, camera.fy
+        jacobian = np.array([[fx / z, 0, -fx * x / z**2], [0, fy / z, -fy * y / z**2]])
+        inverse = np.linalg.inv(jacobian @ local[k] @ jacobian.T + DILATION * np.eye(2))
+        flat = -inverse @ inverses[k] @ inverse  # d(S^-1) = -S^-1 dS S^-1
+        spatial[k] = camera.rotation.T @ jacobian.T @ flat @ jacobian @ camera.rotation
+        lens = 2 * flat @ jacobian @ local[k]  # dL/dJ
+        by_x = np.array([[0, 0, -fx / z**2], [0, 0, 0]])  # dJ/dx
+        by_y = np.array([[0, 0, 0], [0, 0, -fy / z**2]])
+        by_z = np.array([[-fx / z**2, 0, 2 * fx * x / z**3], [0, -fy / z**2, 2 * fy * y / z**3]])
+        bent = [(lens * by).sum() for by in (by_x, by_y, by_z)]
+        means[k] = camera.rotation.T @ (jacobian.T @ centres[k] + bent)
+    return means, spatial
+
+
+def render_backward_reference(gaussians: Gaussians, camera: Camera, grad: np.ndarray) -> dict[str, np.ndarray]:
+    """`render_backward` in float64: dL/d(field) for each field of `Gaussians`; ``grad`` (h, w, 4) dL/d(picture)."""
+    centres, inverses, logits, colors = image_gradients(gaussians, camera, grad)
+    means, spatial = space_gradients(gaussians, camera, centres, inverses)
+    scales = np.exp(gaussians.log_scales.astype(np.float64))
+    factors = rotations(gaussians.quaternions) * scales[:, None, :]
+    to_factors = 2 * spatial @ factors  # Sigma = M M^T
+    to_rotations = to_factors * scales[:, None, :]
+    norms = np.linalg.norm(gaussians.quaternions.astype(np.float64), axis=1, keepdims=True)
+    unit = gaussians.quaternions / norms
+    to_unit = np.einsum("kij,kqij->kq", to_rotations, rotation_derivatives(unit))
+    return {
+        "means": means,
+        "log_scales": (to_factors * factors).sum(axis=1),
+        "quaternions": (to_unit - (to_unit * unit).sum(axis=1, keepdims=True) * unit) / norms,
+        "opacity_logits": logits,
+        "colors": colors,
+    }
+
+
+def rotation_derivatives(unit: np.ndarray) -> np.ndarray:
+    """(K, 4, 3, 3) derivatives of the rotation matrix by w, x, y, z of unit quaternions (K, 4)."""
+    w, x, y, z = unit.T
+    o = np.zeros_like(w)
+    tables = (
+        [[o, -z, y], [z, o, -x], [-y, x, o]],
+        [[o, y, z], [y, -2 * x, -w], [z, w, -2 * x]],
+        [[-2 * y, x, w], [x, o, z], [-w, z, -2 * y]],
+        [[-2 * z, -w, x], [w, -2 * z, y], [x, y, o]],
+    )
+    return 2 * np.moveaxis(np.array(tables), -1, 0)

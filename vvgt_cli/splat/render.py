@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,26 +38,38 @@ def project(gaussians: Gaussians, camera: Camera) -> Projection:
     """EWA projection and depth-sorted tile lists."""
     from vvgt_cli.splat import kernel
 
-    count = len(gaussians)
+    g = gaussians
+    return _projected(kernel.project, (g.means, g.log_scales, g.quaternions, g.opacity_logits), camera)
+
+
+def project_factors(means: np.ndarray, factors: np.ndarray, logits: np.ndarray, camera: Camera) -> Projection:
+    """`project` for covariances ``M M^T``: means (K, 3), factors (K, 3, 3) M, logits (K,), all float32."""
+    from vvgt_cli.splat import kernel
+
+    return _projected(kernel.project_factors, (means, factors, logits), camera)
+
+
+def _projected(kernel_project: Callable[..., None], arrays: tuple[np.ndarray, ...], camera: Camera) -> Projection:
+    """Run one of the projecting kernels, sort by depth, file into tiles."""
+    import numba
+
+    from vvgt_cli.splat import kernel
+
+    count = len(arrays[0])
     flat = np.zeros((count, 6), np.float32)
-    depth = np.zeros(count, np.float32)
-    extent = np.zeros((count, 4), np.int32)
-    lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height], np.float64)
-    kernel.project(
-        gaussians.means,
-        gaussians.log_scales,
-        gaussians.quaternions,
-        gaussians.opacity_logits,
-        np.ascontiguousarray(camera.rotation),
-        np.ascontiguousarray(camera.translation),
-        lens,
-        flat,
-        depth,
-        extent,
-    )
+    depth = np.empty(count, np.float32)
+    extent = np.empty((count, 4), np.int32)
+    kernel_project(*arrays, *pose(camera), flat, depth, extent)
     tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
-    start, members, slots, first = kernel.tile_lists(depth_order(depth), extent, tiles_x, tiles_y)
+    order = depth_order(depth)
+    start, members, slots, first = kernel.tile_lists(order, extent, tiles_x, tiles_y, numba.get_num_threads())
     return Projection(flat, extent, start, members, slots, first, tiles_x, deal(np.diff(start)))
+
+
+def pose(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rotation (3, 3), translation (3,) and lens (fx, fy, cx, cy, width, height) as kernels take them, float64."""
+    lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height], np.float64)
+    return np.ascontiguousarray(camera.rotation), np.ascontiguousarray(camera.translation), lens
 
 
 def depth_order(depth: np.ndarray) -> np.ndarray:
@@ -101,3 +114,89 @@ def gather(projection: Projection, fields: np.ndarray, out: np.ndarray) -> None:
     fields = np.ascontiguousarray(fields, np.float32)
     tiles.gather(p.tiles, p.start, p.members, p.slots, p.extent, p.flat, p.tiles_x, fields, pairs)
     tiles.reduce_pairs(p.first, pairs, out)
+
+
+@dataclass(frozen=True)
+class Gradients:
+    """dL/d(field) of each field of `Gaussians`, float32 of the same shapes."""
+
+    means: np.ndarray
+    log_scales: np.ndarray
+    quaternions: np.ndarray
+    opacity_logits: np.ndarray
+    colors: np.ndarray
+
+
+def render_backward(
+    gaussians: Gaussians, camera: Camera, projection: Projection, image: np.ndarray, grad: np.ndarray
+) -> Gradients:
+    """Gradients of a loss with respect to Gaussians, given those with respect to their picture.
+
+    Zero where the forward pass does not move: a Gaussian that is not seen, an alpha at its clamp 0.99 or below the cut,
+    a pixel that has ended, a colour below 0. Steps of the cut and of the order of depths are not differentiated.
+
+    Args:
+        gaussians, camera: as given to `render`.
+        projection, image: of the forward pass.
+        grad: (height, width, 4) dL/d(image), premultiplied RGBA.
+    """
+    from vvgt_cli.splat import backward
+
+    g, p = gaussians, projection
+    pairs = moments(p, g.colors, image, grad)
+    shapes = (g.means, g.log_scales, g.quaternions, g.opacity_logits, g.colors)
+    out = Gradients(*(np.empty_like(array) for array in shapes))
+    backward.standard(
+        p.first, pairs, p.extent, p.flat, g.means, g.log_scales, g.quaternions, g.colors, *pose(camera),
+        out.means, out.log_scales, out.quaternions, out.opacity_logits, out.colors,
+    )  # fmt: skip
+    return out
+
+
+def moments(projection: Projection, colors: np.ndarray, image: np.ndarray, grad: np.ndarray) -> np.ndarray:
+    """(pairs, 9) float32: what the gradient needs of each (tile, Gaussian) pair, see `backward.moments`."""
+    from vvgt_cli.splat import backward
+
+    p = projection
+    pairs = np.empty((len(p.members), backward.SUMS), np.float32)
+    grad = np.ascontiguousarray(grad, np.float32)
+    backward.moments(p.tiles, p.start, p.members, p.slots, p.extent, p.flat, colors, p.tiles_x, image, grad, pairs)
+    return pairs
+
+
+@dataclass(frozen=True)
+class FrameGradients:
+    """Gradients for steps in each Gaussian's own frame, ``mu += M d``, ``M <- M (I + E)``, E symmetric.
+
+    Attributes:
+        frame: (K, 9) float32 d (3), then E: xx, yy, zz, xy, xz, yz; one off the diagonal stands for both entries.
+        opacity_logits: (K,) float32.
+        colors: (K, 3) float32.
+    """
+
+    frame: np.ndarray
+    opacity_logits: np.ndarray
+    colors: np.ndarray
+
+
+def own_frame_backward(
+    means: np.ndarray,
+    factors: np.ndarray,
+    colors: np.ndarray,
+    camera: Camera,
+    projection: Projection,
+    pairs: np.ndarray,
+) -> FrameGradients:
+    """The gradient for covariances ``M M^T``: means (K, 3), factors (K, 3, 3) M, colours (K, 3), all float32.
+
+    ``projection`` from `project_factors`, ``pairs`` from `moments`.
+    """
+    from vvgt_cli.splat import backward
+
+    p, count = projection, len(means)
+    out = FrameGradients(*(np.empty(shape, np.float32) for shape in ((count, 9), (count,), (count, 3))))
+    backward.own_frame(
+        p.first, pairs, p.extent, p.flat, means, factors, colors, *pose(camera),
+        out.frame, out.opacity_logits, out.colors,
+    )  # fmt: skip
+    return out

@@ -60,13 +60,19 @@ def _rows(y0, y1, a, b, c, u, v, opacity):
 
 
 @_jit
-def _pixel(t, dx, a, h, q, opacity):
-    """Weight T alpha of a pixel and its transmittance afterwards; a pixel that has ended keeps T with a minus."""
+def _alpha(dx, a, h, q, opacity):
+    """Opacity of a pixel, neither clamped nor cut."""
     e = max((a * dx + h) * dx + q, _FLOOR)
     p = f32(1) + e * (_EXP[0] + e * (_EXP[1] + e * (_EXP[2] + e * (_EXP[3] + e * _EXP[4]))))
     p *= p
     p *= p
-    alpha = min(opacity * p * p, _MAX_A)
+    return opacity * p * p
+
+
+@_jit
+def _pixel(t, dx, a, h, q, opacity):
+    """Weight T alpha of a pixel and its transmittance afterwards; a pixel that has ended keeps T with a minus."""
+    alpha = min(_alpha(dx, a, h, q, opacity), _MAX_A)
     weight = alpha * t if alpha >= _MIN_A else _ZERO
     after = t - weight
     ended = after < _MIN_T

@@ -1,0 +1,280 @@
+"""Numba kernels of the gradient: sums over pixels of each Gaussian, then back through the projection.
+
+The first half works as `tiles` does, front to back and with the same early end: what lies behind a splat is the whole
+pixel less what has been blended, so nothing but the picture is kept from the forward pass. Equations: docs/optimize.md.
+Twin: `reference.render_backward_reference`.
+"""
+
+from __future__ import annotations
+
+import numba as nb
+import numpy as np
+
+from vvgt_cli.jit import inlined
+from vvgt_cli.splat.constants import TILE
+from vvgt_cli.splat.kernel import rotation_column, to_camera, turned, unit_quaternion
+from vvgt_cli.splat.tiles import (
+    _AREA,
+    _HALF,
+    _MAX_A,
+    _MIN_A,
+    _MIN_T,
+    _P1,
+    _P2,
+    _P3,
+    _P4,
+    _P5,
+    _ZERO,
+    U,
+    _all_ended,
+    _alpha,
+    _eighth,
+    _jit,
+    _open,
+    _parallel,
+    _rows,
+    f32,
+)  # fmt: skip
+
+SUMS = 9  # of G = alpha dL/dalpha: 1, dx, dy, dx^2, dx dy, dy^2; of the weight: x dL/d(r, g, b)
+_T = U(TILE)
+_A0, _A1, _A2 = U(6 * _AREA), U(6 * _AREA + TILE), U(6 * _AREA + 2 * TILE)
+_A3, _A4, _A5 = U(6 * _AREA + 3 * TILE), U(6 * _AREA + 4 * TILE), U(6 * _AREA + 5 * TILE)
+_END = U(6 * _AREA + 6 * TILE)
+_exact = inlined()
+
+
+@_jit
+def _sweep(y0, y1, k, colors, a, b, c, u, v, opacity, buf):
+    """One Gaussian over rows [y0, y1): sums a column into the six rows behind the planes."""
+    red, green, blue = max(colors[k, 0], _ZERO), max(colors[k, 1], _ZERO), max(colors[k, 2], _ZERO)
+    for i in range(_A0, _END):
+        buf[i] = _ZERO
+    for y in range(y0, y1):
+        dy = f32(np.int32(y)) + _HALF - v
+        h, q = b * dy, c * dy * dy
+        for i in range(_T):
+            j = y * _T + i
+            raw = _alpha(f32(np.int32(i)) + _HALF - u, a, h, q, opacity)
+            t = buf[j]
+            weight = min(raw, _MAX_A) * t if raw >= _MIN_A else _ZERO
+            after = t - weight
+            ended = after < _MIN_T
+            weight = _ZERO if ended else weight
+            own = red * buf[j + _P2] + green * buf[j + _P3] + blue * buf[j + _P4] + buf[j + _P5]
+            behind = buf[j + _P1] - weight * own
+            g = weight * (own - behind / after)
+            g = g if raw < _MAX_A else _ZERO
+            buf[j] = -abs(t) if ended else after
+            buf[j + _P1] = behind
+            buf[_A0 + i] += g
+            g *= dy
+            buf[_A1 + i] += g
+            buf[_A2 + i] += g * dy
+            buf[_A3 + i] += weight * buf[j + _P2]
+            buf[_A4 + i] += weight * buf[j + _P3]
+            buf[_A5 + i] += weight * buf[j + _P4]
+
+
+@_jit
+def _moments_tile(entries, slots, extent, flat, colors, ox, oy, buf, pairs):
+    """The nine sums of each of the Gaussians ``entries``, in their order, into their rows of ``pairs``."""
+    done = entries.shape[0]
+    for index in range(entries.shape[0]):
+        if (index & 31) == 31 and _all_ended(buf):
+            done = index
+            break
+        k = entries[index]
+        a, b, c, u, v, opacity = _eighth(flat, k, f32(ox), f32(oy))
+        y0, y1 = _rows(extent[k, 1] - oy, extent[k, 3] - oy, a, b, c, u, v, opacity)
+        _sweep(y0, y1, k, colors, a, b, c, u, v, opacity, buf)
+        s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = s8 = _ZERO
+        for i in range(_T):  # type: ignore[assignment]
+            dx = f32(np.int32(i)) + _HALF - u
+            s0 += buf[_A0 + i]
+            s1 += buf[_A0 + i] * dx
+            s2 += buf[_A1 + i]
+            s3 += buf[_A0 + i] * dx * dx
+            s4 += buf[_A1 + i] * dx
+            s5 += buf[_A2 + i]
+            s6 += buf[_A3 + i]
+            s7 += buf[_A4 + i]
+            s8 += buf[_A5 + i]
+        slot = slots[index]
+        pairs[slot, 0], pairs[slot, 1], pairs[slot, 2], pairs[slot, 3], pairs[slot, 4] = s0, s1, s2, s3, s4
+        pairs[slot, 5], pairs[slot, 6], pairs[slot, 7], pairs[slot, 8] = s5, s6, s7, s8
+    for index in range(done, entries.shape[0]):
+        pairs[slots[index]] = _ZERO
+
+
+@_parallel
+def moments(tiles, start, members, slots, extent, flat, colors, tiles_x, image, grad, pairs):
+    """For each (tile, Gaussian) pair: its nine `SUMS` into ``pairs`` (n, 9) float32.
+
+    ``image`` (h, w, 4) is what `tiles.blend` made of ``colors`` clamped at 0, ``grad`` (h, w, 4) dL/d(image), float32.
+    """
+    height, width = image.shape[:2]
+    for index in nb.prange(tiles.shape[0]):
+        tile = tiles[index]
+        ox, oy = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
+        w, h = min(TILE, width - ox), min(TILE, height - oy)
+        buf = np.zeros(6 * _AREA + 6 * TILE, np.float32)  # transmittance, what is behind, dL/d(r, g, b, a); sums
+        _open(buf, w, h)
+        for y in range(h):
+            for x in range(w):
+                behind = _ZERO
+                for f in range(4):
+                    g = grad[oy + y, ox + x, f]
+                    behind += image[oy + y, ox + x, f] * g
+                    buf[U((f + 2) * _AREA + y * TILE + x)] = g
+                buf[U(_AREA + y * TILE + x)] = behind
+        span = slice(start[tile], start[tile + 1])
+        _moments_tile(members[span], slots[span], extent, flat, colors, ox, oy, buf, pairs)
+
+
+@_exact
+def _total(first, pairs, k, total):
+    """Sum of Gaussian k's pairs into ``total`` (9,) float64, in a fixed order."""
+    for i in range(SUMS):
+        total[i] = 0.0
+    for p in range(first[k], first[k + 1]):
+        for i in range(SUMS):
+            total[i] += pairs[p, i]
+
+
+@_exact
+def _screen(flat, k, total):
+    """Gradients with respect to the projected centre (u, v) and the projected covariance (H, symmetric)."""
+    a, b, c = np.float64(flat[k, 2]), np.float64(flat[k, 3]), np.float64(flat[k, 4])
+    du, dv = a * total[1] + b * total[2], b * total[1] + c * total[2]
+    p0, p1 = a * total[3] + b * total[4], a * total[4] + b * total[5]  # conic x second moments
+    q0, q1 = b * total[3] + c * total[4], b * total[4] + c * total[5]
+    return du, dv, 0.5 * (p0 * a + p1 * b), 0.5 * (p0 * b + p1 * c), 0.5 * (q0 * b + q1 * c)
+
+
+@_exact
+def _center(x, y, z, fx, fy, du, dv, d00, d02, d11, d12):
+    """Gradient with respect to the centre in camera coordinates; d is the gradient of the Jacobian J."""
+    inv = 1.0 / z
+    jx, jy, jxz, jyz = fx * inv, fy * inv, -fx * x * inv * inv, -fy * y * inv * inv
+    dx = jx * (du - d02 * inv)
+    dy = jy * (dv - d12 * inv)
+    dz = jxz * du + jyz * dv - (jx * d00 + jy * d11 + 2.0 * (jxz * d02 + jyz * d12)) * inv
+    return dx, dy, dz
+
+
+@_exact
+def _colors_and_logit(k, flat, colors, total, out_logits, out_colors):
+    out_logits[k] = total[0] * (1.0 - flat[k, 5])
+    for i in range(3):
+        out_colors[k, i] = total[6 + i] if colors[k, i] >= 0.0 else 0.0
+
+
+@nb.njit(parallel=True, cache=True)
+def own_frame(first, pairs, extent, flat, means, factors, colors, rot, trans, lens, out_frame, out_logits, out_colors):
+    """Gradients for steps in each Gaussian's own frame: mu += M d, M <- M (I + E), E symmetric.
+
+    ``out_frame`` (K, 9) float32: d (3), then E: xx, yy, zz, xy, xz, yz (an entry off the diagonal stands for both).
+    """
+    fx, fy = lens[0], lens[1]
+    for k in nb.prange(means.shape[0]):
+        out_frame[k] = 0.0
+        out_logits[k] = 0.0
+        out_colors[k] = 0.0
+        if extent[k, 2] <= extent[k, 0]:
+            continue
+        total = np.empty(SUMS)
+        _total(first, pairs, k, total)
+        _colors_and_logit(k, flat, colors, total, out_logits, out_colors)
+        x, y, z = to_camera(means, k, rot, trans)
+        du, dv, h00, h01, h11 = _screen(flat, k, total)
+        jx, jy, jxz, jyz = fx / z, fy / z, -fx * x / (z * z), -fy * y / (z * z)
+        axes = np.empty((5, 3))  # columns of W M, and of N = J W M
+        d00 = d02 = d11 = d12 = 0.0
+        for i in range(3):
+            v0, v1, v2 = turned(
+                rot, np.float64(factors[k, 0, i]), np.float64(factors[k, 1, i]), np.float64(factors[k, 2, i])
+            )
+            n0, n1 = jx * v0 + jxz * v2, jy * v1 + jyz * v2
+            e0, e1 = 2.0 * (h00 * n0 + h01 * n1), 2.0 * (h01 * n0 + h11 * n1)  # dL/dN
+            d00, d02, d11, d12 = d00 + e0 * v0, d02 + e0 * v2, d11 + e1 * v1, d12 + e1 * v2
+            axes[0, i], axes[1, i], axes[2, i], axes[3, i], axes[4, i] = v0, v1, v2, n0, n1
+        dx, dy, dz = _center(x, y, z, fx, fy, du, dv, d00, d02, d11, d12)
+        for i in range(3):
+            out_frame[k, i] = dx * axes[0, i] + dy * axes[1, i] + dz * axes[2, i]
+            e0 = 2.0 * (h00 * axes[3, i] + h01 * axes[4, i])
+            e1 = 2.0 * (h01 * axes[3, i] + h11 * axes[4, i])
+            for j in range(i, 3):
+                entry = e0 * axes[3, j] + e1 * axes[4, j]
+                out_frame[k, 3 + i if i == j else 5 + i + j] = entry if i == j else 2.0 * entry
+
+
+@_exact
+def _quaternion(w, a, b, c, n, dr, out):
+    """Gradient with respect to a quaternion of any norm, from that of its rotation matrix ``dr`` (3, 3)."""
+    gw = 2 * (a * (dr[2, 1] - dr[1, 2]) + b * (dr[0, 2] - dr[2, 0]) + c * (dr[1, 0] - dr[0, 1]))
+    ga = 2 * (
+        w * (dr[2, 1] - dr[1, 2])
+        + b * (dr[0, 1] + dr[1, 0])
+        + c * (dr[0, 2] + dr[2, 0])
+        - 2 * a * (dr[1, 1] + dr[2, 2])
+    )
+    gb = 2 * (
+        w * (dr[0, 2] - dr[2, 0])
+        + a * (dr[0, 1] + dr[1, 0])
+        + c * (dr[1, 2] + dr[2, 1])
+        - 2 * b * (dr[0, 0] + dr[2, 2])
+    )
+    gc = 2 * (
+        w * (dr[1, 0] - dr[0, 1])
+        + a * (dr[0, 2] + dr[2, 0])
+        + b * (dr[1, 2] + dr[2, 1])
+        - 2 * c * (dr[0, 0] + dr[1, 1])
+    )
+    along = gw * w + ga * a + gb * b + gc * c
+    out[0], out[1], out[2], out[3] = (
+        (gw - along * w) * n,
+        (ga - along * a) * n,
+        (gb - along * b) * n,
+        (gc - along * c) * n,
+    )
+
+
+@nb.njit(parallel=True, cache=True)
+def standard(
+    first, pairs, extent, flat, means, log_scales, quats, colors, rot, trans, lens,
+    out_means, out_scales, out_quats, out_logits, out_colors,
+):  # fmt: skip
+    """Gradients with respect to the fields of `Gaussians`, float32 arrays of their shapes."""
+    fx, fy = lens[0], lens[1]
+    for k in nb.prange(means.shape[0]):
+        out_means[k] = 0.0
+        out_scales[k] = 0.0
+        out_quats[k] = 0.0
+        out_logits[k] = 0.0
+        out_colors[k] = 0.0
+        if extent[k, 2] <= extent[k, 0]:
+            continue
+        total = np.empty(SUMS)
+        _total(first, pairs, k, total)
+        _colors_and_logit(k, flat, colors, total, out_logits, out_colors)
+        x, y, z = to_camera(means, k, rot, trans)
+        du, dv, h00, h01, h11 = _screen(flat, k, total)
+        jx, jy, jxz, jyz = fx / z, fy / z, -fx * x / (z * z), -fy * y / (z * z)
+        w, a, b, c, n = unit_quaternion(quats, k)
+        dr = np.empty((3, 3))
+        d00 = d02 = d11 = d12 = 0.0
+        for i in range(3):
+            v0, v1, v2 = turned(rot, *rotation_column(w, a, b, c, i))
+            s = np.exp(np.float64(log_scales[k, i]))
+            n0, n1 = (jx * v0 + jxz * v2) * s, (jy * v1 + jyz * v2) * s
+            e0, e1 = 2.0 * (h00 * n0 + h01 * n1), 2.0 * (h01 * n0 + h11 * n1)
+            out_scales[k, i] = e0 * n0 + e1 * n1
+            e0, e1 = e0 * s, e1 * s
+            d00, d02, d11, d12 = d00 + e0 * v0, d02 + e0 * v2, d11 + e1 * v1, d12 + e1 * v2
+            for j in range(3):  # (J W)^T dL/dN, times s: gradient of the rotation's column
+                dr[j, i] = rot[0, j] * jx * e0 + rot[1, j] * jy * e1 + rot[2, j] * (jxz * e0 + jyz * e1)
+        dx, dy, dz = _center(x, y, z, fx, fy, du, dv, d00, d02, d11, d12)
+        for j in range(3):
+            out_means[k, j] = rot[0, j] * dx + rot[1, j] * dy + rot[2, j] * dz
+        _quaternion(w, a, b, c, n, dr, out_quats[k])
