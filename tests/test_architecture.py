@@ -13,8 +13,8 @@ import pytest
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "vvgt_cli"
 ROOMS = (
-    *("errors", "progress", "files", "volume", "transfer", "cameras", "images", "metrics", "gaussians", "synth", "dvr"),
-    *("splat", "vbm", "network", "optimize", "training", "report", "pipeline", "cli"),
+    *("errors", "progress", "files", "jit", "volume", "transfer", "cameras", "images", "metrics", "gaussians", "synth"),
+    *("dvr", "splat", "vbm", "network", "optimize", "training", "report", "pipeline", "cli"),
 )
 HEAVY = {
     *("numba", "vtk", "vtkmodules", "pyvista", "onnxruntime", "torch", "matplotlib", "OpenImageIO", "OpenEXR"),
