@@ -8,9 +8,9 @@ from vvgt_cli.cli.options import common_options, overwrite_option, read_options,
 from vvgt_cli.progress import Console
 
 
-@click.group("tf", short_help="Look at transfer functions.")
+@click.group("tf", short_help="Look at transfer functions, or have some made.")
 def command() -> None:
-    """Look at transfer functions."""
+    """Look at transfer functions, or have some made."""
 
 
 @command.command("show", short_help="Draw a transfer function over a histogram.")
@@ -34,3 +34,30 @@ def show(
     from vvgt_cli.volume import ReadOptions
 
     show_transfer_function(tf, output, volume, ReadOptions(**read), tf_range, overwrite)
+
+
+@command.command("suggest", short_help="Make functions that show a range of values each.")
+@click.argument("volume")
+@click.option(
+    "-n", "--number", type=click.IntRange(1, 100), default=10, show_default=True, metavar="N", help="Functions to make."
+)
+@click.option("-o", "--output", required=True, metavar="DIR", help="Directory for the files; made if it is not there.")
+@read_options
+@overwrite_option
+@common_options
+def suggest(volume: str, number: int, output: str, read: dict, overwrite: bool, console: Console) -> None:
+    """Write N transfer functions for VOLUME, each of which shows one range of its values in a colour of its own.
+
+    The ranges follow from the histogram: the background is left out, the rest is shared evenly, half by value
+    and half by number of voxels. The files are minimal JSON, to be used as they are or edited; their paths go
+    to standard output.
+
+    \b
+    Example:
+      vvgt tf suggest head.nrrd -n 10 -o bands
+    """
+    from vvgt_cli.pipeline.suggest import suggest_transfer_functions
+    from vvgt_cli.volume import ReadOptions
+
+    for path in suggest_transfer_functions(volume, number, output, ReadOptions(**read), overwrite, console):
+        click.echo(path)

@@ -56,7 +56,7 @@ def from_histogram(statistics: StatisticsLike) -> TransferFunction:
         raise DataError("the data have no finite voxel; expected some to choose a transfer function from")
     if lo == hi:  # a box of one value: seen through
         return TransferFunction(NAME, PiecewiseOpacity(np.array([lo]), np.array([0.1])), _color_map(np.array([lo])))
-    first, last = _background(counts)
+    first, last = background_bins(counts)
     left, right = (_worth_showing(side, counts) for side in (slice(0, first), slice(last, None)))
     if not (left or right):
         first = last = 0
@@ -78,7 +78,7 @@ def _worth_showing(side: slice, counts: np.ndarray) -> bool:
     return inside.size >= SIDE_WIDTH * counts.size and inside.sum() >= SIDE * (counts.sum() - counts.max()) > 0
 
 
-def _background(counts: np.ndarray) -> tuple[int, int]:
+def background_bins(counts: np.ndarray) -> tuple[int, int]:
     """Bins [first, last) of the background; an empty range at 0 when no peak dominates."""
     total = counts.sum()
     first, last = _peak(counts)
