@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -37,56 +38,111 @@ def opengl_to_pose(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return rotation, -rotation @ matrix[:3, 3]
 
 
-def transforms_json(cameras: Sequence[Camera], *, suffix: str = ".png", ply_file_path: str | None = None) -> str:
+@dataclass(frozen=True)
+class Frame:
+    """One view of a view-set file.
+
+    Attributes:
+        camera: pose and lens, unit frame.
+        file_path: its image as the file has it; the Blender style leaves the suffix out.
+        test: whether the file keeps it for testing (nerfstudio's ``test_filenames``).
+    """
+
+    camera: Camera
+    file_path: str
+    test: bool = False
+
+
+def transforms_json(
+    cameras: Sequence[Camera],
+    *,
+    suffix: str = ".png",
+    ply_file_path: str | None = None,
+    paths: Sequence[str] | None = None,
+    splits: dict[str, list[str]] | None = None,
+) -> str:
     """The text of a `transforms.json` for ``cameras``; images are ``NAME + suffix`` beside it.
 
     Intrinsics stand at the top where all cameras share them, and in each frame where they do not.
+
+    Args:
+        cameras: in the order of the frames.
+        suffix: of the images.
+        ply_file_path: point cloud to start from (nerfstudio, OpenSplat).
+        paths: images in place of ``NAME + suffix``.
+        splits: nerfstudio's split: ``{"train": paths, "val": paths, "test": paths}``.
     """
-    intrinsics = [{"fl_x": c.fx, "fl_y": c.fy, "cx": c.cx, "cy": c.cy, "w": c.width, "h": c.height} for c in cameras]
-    shared = bool(intrinsics) and all(i == intrinsics[0] for i in intrinsics)
-    document: dict[str, Any] = {"camera_model": "OPENCV", **(intrinsics[0] if shared else {})}
+    paths = [f"{camera.name}{suffix}" for camera in cameras] if paths is None else paths
+    document: dict[str, Any] = {"camera_model": "OPENCV"}
     if ply_file_path:
         document["ply_file_path"] = ply_file_path
+    document.update({f"{split}_filenames": names for split, names in (splits or {}).items()})
+    return _document(document, cameras, paths, [_lens_record(camera) for camera in cameras])
+
+
+def blender_json(cameras: Sequence[Camera], paths: Sequence[str]) -> str:
+    """The text of a Blender-style `transforms_train.json`: ``camera_angle_x``, and image paths without a suffix.
+
+    Size and focal lengths stand beside the angle, for readers that know them.
+    """
+    angle = [{"camera_angle_x": 2 * math.atan(c.width / (2 * c.fx))} for c in cameras]
+    lenses = [a | _lens_record(camera) for a, camera in zip(angle, cameras, strict=True)]
+    return _document({}, cameras, paths, lenses)
+
+
+def _lens_record(c: Camera) -> dict[str, Any]:
+    return {"fl_x": c.fx, "fl_y": c.fy, "cx": c.cx, "cy": c.cy, "w": c.width, "h": c.height}
+
+
+def _document(
+    head: dict[str, Any], cameras: Sequence[Camera], paths: Sequence[str], lenses: Sequence[dict[str, Any]]
+) -> str:
+    shared = bool(lenses) and all(lens == lenses[0] for lens in lenses)
+    document = head | (lenses[0] if shared else {})
     document["frames"] = [
-        {
-            "file_path": f"{camera.name}{suffix}",
-            **({} if shared else own),
-            "transform_matrix": camera_to_opengl(camera).tolist(),
-        }
-        for camera, own in zip(cameras, intrinsics, strict=True)
+        {"file_path": path, **({} if shared else lens), "transform_matrix": camera_to_opengl(camera).tolist()}
+        for camera, path, lens in zip(cameras, paths, lenses, strict=True)
     ]
     return json.dumps(document, indent=1) + "\n"
 
 
 def read_cameras(path: str | Path, size: int | None = None) -> list[Camera]:
-    """Cameras of a `transforms.json` (nerfstudio or Blender style), in the file's order.
+    """Cameras of a `transforms.json`, as `read_frames` has them."""
+    return [frame.camera for frame in read_frames(path, size)]
+
+
+def read_frames(path: str | Path, size: int | None = None) -> list[Frame]:
+    """Views of a `transforms.json` (nerfstudio or Blender style), in the file's order.
 
     Args:
         path: the file.
         size: image height in pixels; views are scaled to it. Needed where the file holds no ``w`` and ``h``.
 
     Raises:
-        DataError: not JSON, no frames, a lens with distortion, a pose that is not a rigid motion, no image size.
+        DataError: not JSON, no frames, a lens with distortion, a pose that is not a rigid motion, no image size,
+            two images of one name.
     """
     name = Path(path).name
     try:
         document = json.loads(Path(path).read_text("utf-8"))
     except (ValueError, RecursionError) as error:
         raise DataError(f"{name}: not JSON ({error}); expected a transforms.json") from None
-    frames = document.get("frames") if isinstance(document, dict) else None
-    if not isinstance(frames, list) or not frames:
+    entries = document.get("frames") if isinstance(document, dict) else None
+    if not isinstance(entries, list) or not entries:
         raise DataError(f"{name}: no list 'frames'; expected a transforms.json (nerfstudio or Blender style)")
-    cameras: list[Camera] = []
+    kept = document.get("test_filenames") or []
+    frames: list[Frame] = []
     taken: set[str] = set()
-    for i, frame in enumerate(frames):
-        if not isinstance(frame, dict):
+    for i, entry in enumerate(entries):
+        if not isinstance(entry, dict):
             raise DataError(f"{name}: frame {i} is not an object")
-        camera = _camera(document | frame, f"{name}: frame {i}", i, size)
+        camera = _camera(document | entry, f"{name}: frame {i}", i, size)
         if camera.name in taken:
             raise DataError(f"{name}: frame {i}: a second image called {camera.name!r}; expected a name a view")
         taken.add(camera.name)
-        cameras.append(camera)
-    return cameras
+        file_path = str(entry.get("file_path", camera.name))
+        frames.append(Frame(camera, file_path, isinstance(kept, list) and file_path in kept))
+    return frames
 
 
 def _camera(entry: dict[str, Any], name: str, index: int, size: int | None) -> Camera:

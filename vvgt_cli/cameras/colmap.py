@@ -1,0 +1,87 @@
+"""View sets as COLMAP keeps them: `cameras.bin`, `images.bin` and `points3D.bin`; and points as a `.ply`.
+
+COLMAP's conventions are ours: world-to-camera poses, OpenCV axes, the upper left pixel's centre at (0.5, 0.5).
+Layout of the files: COLMAP's documentation, "Output Format", binary.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Sequence
+
+import numpy as np
+
+from vvgt_cli.cameras.types import Camera
+
+PINHOLE = 1  # COLMAP's number of the camera model with fx, fy, cx, cy
+
+
+def colmap_model(
+    cameras: Sequence[Camera], names: Sequence[str], points: np.ndarray, colors: np.ndarray
+) -> dict[str, bytes]:
+    """The three files of a COLMAP model by name; points are seen by no image (tracks are empty).
+
+    Args:
+        cameras: views; those that share a lens share a COLMAP camera.
+        names: image files, relative to COLMAP's folder of images.
+        points: (n, 3) positions, unit frame.
+        colors: (n, 3) RGB in [0, 1], clipped.
+    """
+    keys = [(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy) for camera in cameras]
+    numbers = {key: number for number, key in enumerate(dict.fromkeys(keys), 1)}
+    intrinsics = [struct.pack("<iiQQ4d", number, PINHOLE, *key) for key, number in numbers.items()]
+    images = [
+        struct.pack("<i7di", i, *quaternion(camera.rotation), *camera.translation, numbers[key])
+        + name.encode() + b"\0" + struct.pack("<Q", 0)
+        for i, (camera, key, name) in enumerate(zip(cameras, keys, names, strict=True), 1)
+    ]  # fmt: skip
+    table = np.zeros(len(points), [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("n", "<u8")])
+    table["id"] = np.arange(1, len(points) + 1)
+    table["xyz"], table["rgb"] = points, _bytes(colors)
+    count = struct.Struct("<Q").pack
+    return {
+        "cameras.bin": count(len(intrinsics)) + b"".join(intrinsics),
+        "images.bin": count(len(images)) + b"".join(images),
+        "points3D.bin": count(len(table)) + table.tobytes(),
+    }
+
+
+def point_cloud_ply(points: np.ndarray, colors: np.ndarray) -> bytes:
+    """A `.ply` point cloud: x y z nx ny nz (float, normals zero) and red green blue (uchar), little-endian.
+
+    In that order nerfstudio, OpenSplat and the original 3DGS code (which insists on normals) all read it.
+
+    Args:
+        points: (n, 3) positions, unit frame.
+        colors: (n, 3) RGB in [0, 1], clipped.
+    """
+    table = np.zeros(len(points), [("xyz", "<f4", 3), ("normal", "<f4", 3), ("rgb", "u1", 3)])
+    table["xyz"], table["rgb"] = points, _bytes(colors)
+    properties = [f"property float {name}" for name in ("x", "y", "z", "nx", "ny", "nz")]
+    properties += [f"property uchar {name}" for name in ("red", "green", "blue")]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}", *properties, "end_header", ""]
+    return "\n".join(header).encode() + table.tobytes()
+
+
+def quaternion(rotation: np.ndarray) -> tuple[float, float, float, float]:
+    """Unit quaternion (w, x, y, z), w >= 0, of a rotation matrix (3, 3).
+
+    Bar-Itzhack (2000): the eigenvector of a symmetric matrix, well conditioned for every angle.
+    """
+    r = np.asarray(rotation, dtype=np.float64)
+    k = np.array(
+        [
+            [r[0, 0] + r[1, 1] + r[2, 2], r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]],
+            [0, r[0, 0] - r[1, 1] - r[2, 2], r[1, 0] + r[0, 1], r[2, 0] + r[0, 2]],
+            [0, 0, r[1, 1] - r[0, 0] - r[2, 2], r[2, 1] + r[1, 2]],
+            [0, 0, 0, r[2, 2] - r[0, 0] - r[1, 1]],
+        ]
+    )
+    w, x, y, z = np.linalg.eigh(k, UPLO="U")[1][:, -1]
+    sign = math.copysign(1.0, w)
+    return float(sign * w), float(sign * x), float(sign * y), float(sign * z)
+
+
+def _bytes(colors: np.ndarray) -> np.ndarray:
+    return np.rint(np.clip(colors, 0, 1) * 255).astype(np.uint8)
