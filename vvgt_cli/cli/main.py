@@ -18,6 +18,7 @@ COMMANDS = {
     "convert": "vvgt_cli.cli.convert",
     "init": "vvgt_cli.cli.init",
     "render": "vvgt_cli.cli.render",
+    "render-views": "vvgt_cli.cli.render_views",
     "evaluate": "vvgt_cli.cli.evaluate",
     "info": "vvgt_cli.cli.info",
     "tf": "vvgt_cli.cli.tf",

@@ -67,6 +67,11 @@ tf_range_option = click.option(
     help="Where the function's nodes lie: at their own data values, stretched to the data's range, or to LO,HI.",
 )  # fmt: skip
 
+unit_distance_option = click.option(
+    "--opacity-unit-distance", metavar="LENGTH|paraview|mean-spacing",
+    help="Distance that the function's opacity refers to. Default: the function's own, else paraview.",
+)  # fmt: skip
+
 tf_options = group(
     "optics",
     tf=click.option(
@@ -74,10 +79,7 @@ tf_options = group(
         help="Transfer function: a file, or a matplotlib colour map's name. Default: from the histogram.",
     ),
     tf_range=tf_range_option,
-    opacity_unit_distance=click.option(
-        "--opacity-unit-distance", metavar="LENGTH|paraview|mean-spacing",
-        help="Distance that the function's opacity refers to. Default: the function's own, else paraview.",
-    ),
+    opacity_unit_distance=unit_distance_option,
 )  # fmt: skip
 
 overwrite_option = click.option("--overwrite", is_flag=True, help="Replace files that exist.")

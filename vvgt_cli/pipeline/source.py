@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -59,18 +60,30 @@ def load(request: SourceRequest) -> Source:
         DataError: a file that is not what it must be, or a function that shows nothing of this volume.
         UsageError: options that do not fit the file.
     """
+    return load_all(request, (request.tf,))[0]
+
+
+def load_all(request: SourceRequest, tfs: Sequence[str | None]) -> list[Source]:
+    """One volume under each of several functions; ``request.tf`` is not used.
+
+    Raises:
+        DataError, UsageError: as `load`.
+    """
     from vvgt_cli.synth.sources import open_volume
     from vvgt_cli.transfer import check_visible, from_histogram, read_transfer_function, resolve, unit_distance
     from vvgt_cli.transfer.resolve import parse_tf_range
     from vvgt_cli.volume import statistics
 
     tf_range = parse_tf_range(request.tf_range)
-    tf = read_transfer_function(request.tf) if request.tf else None  # small: its errors come first
-    if tf is None and tf_range != "data":
+    functions = [read_transfer_function(tf) if tf else None for tf in tfs]  # small: their errors come first
+    if None in functions and tf_range != "data":
         raise UsageError("--tf-range says where the nodes of a function lie; it needs --tf")
     volume = open_volume(request.volume, request.read)
-    distance, label = unit_distance(request.unit_distance, volume, tf)
+    distances = [unit_distance(request.unit_distance, volume, tf) for tf in functions]
     numbers = statistics(volume)
-    tf = resolve(tf, numbers, tf_range) if tf else from_histogram(numbers)
-    check_visible(tf, numbers)
-    return Source(volume, numbers, tf, distance, label)
+    sources = []
+    for tf, (distance, label) in zip(functions, distances, strict=True):
+        shown = resolve(tf, numbers, tf_range) if tf else from_histogram(numbers)
+        check_visible(shown, numbers)
+        sources.append(Source(volume, numbers, shown, distance, label))
+    return sources

@@ -1,0 +1,201 @@
+"""`vvgt render-views`, run by run: resumed, refused, started afresh, and in parts."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from tests.view_sets import BASE, SMALL, TF, VOLUME, make_views
+from vvgt_cli.errors import DataError
+from vvgt_cli.pipeline.manifest import Manifest, Shard, cameras_digest, read_manifest, volume_digest
+from vvgt_cli.pipeline.render_views import CameraRequest
+from vvgt_cli.volume import Volume
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A finished folder; read only."""
+    return make_views(tmp_path_factory)
+
+
+@pytest.fixture
+def copied(made, tmp_path):
+    return shutil.copytree(made, tmp_path / "views")
+
+
+def stamps(folder):
+    return {path.relative_to(folder): path.stat().st_mtime_ns for path in folder.rglob("*.*") if path.is_file()}
+
+
+def test_the_same_command_renders_nothing_again(vvgt, copied):
+    before = stamps(copied)
+    result = vvgt(*BASE, "-o", copied)
+    assert result.code == 0
+    assert "5 views, 0 to render here" in result.err
+    assert stamps(copied) == before
+
+
+def test_a_missing_and_a_cut_and_a_changed_file_are_made_again(vvgt, copied, made):
+    before = stamps(copied)
+    (copied / "train" / "train_000.exr").unlink()
+    cut, changed = copied / "test" / "test_001.png", copied / "images" / "train_002.png"
+    cut.write_bytes(cut.read_bytes()[:-20])
+    changed.write_bytes(changed.read_bytes()[:-1] + b"x")
+    (copied / "transforms_test.json").write_text("{}")
+    assert "3 to render here" in vvgt(*BASE, "-o", copied).err
+    for path in made.rglob("*.*"):
+        if path.is_file():
+            assert (copied / path.relative_to(made)).read_bytes() == path.read_bytes(), path.name
+    after = stamps(copied)
+    kept = {path for path, stamp in before.items() if after[path] == stamp}
+    assert {"train_001.exr", "test_000.png", "points3d.ply", "transforms.json"} <= {path.name for path in kept}
+
+
+def test_a_run_that_is_killed_goes_on(vvgt, tmp_path, made, monkeypatch):
+    from vvgt_cli.dvr import backends
+
+    drawn, real = [], backends.render_view
+
+    def dying(scene, camera, settings=None):
+        if len(drawn) == 2:
+            raise KeyboardInterrupt
+        drawn.append(camera.name)
+        return real(scene, camera, settings)
+
+    call = (*BASE, "-o", tmp_path / "v")
+    monkeypatch.setattr(backends, "render_view", dying)
+    assert vvgt(*call).code == 130
+    assert drawn == ["train_000", "train_001"]
+    before = stamps(tmp_path / "v")
+    assert not any(path.name.startswith(".") for path in before)
+    monkeypatch.setattr(backends, "render_view", real)
+    assert "3 to render here" in vvgt(*call).err
+    after = stamps(tmp_path / "v")
+    assert all(after[path] == stamp for path, stamp in before.items() if path.name != "manifest.json")
+    for path in made.rglob("*.exr"):
+        assert (tmp_path / "v" / path.relative_to(made)).read_bytes() == path.read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("--step", 0.25), "step 0.5 there, 0.25 here"),
+        (("--size", 32), "size 24 x 24 there, 32 x 32 here"),
+        (("--tf", "magma"), "another transfer function"),
+        (("--opacity-unit-distance", 0.5), "opacity unit distance"),
+        (("--samples", 2), "samples adaptive there, 2 here"),
+        (("--views", 4), "views 3 there, 4 here, other cameras"),
+        (("--radius", 2.5), "other cameras"),
+        (("--half",), "half False there, True here"),
+        (("--background", 0, 0, 0), "background 1.0 0.0 0.5 there, 0.0 0.0 0.0 here"),
+        (("--spacing", 1, 1, 2), "another volume"),
+    ],
+)
+def test_another_run_is_refused_and_told_what_differs(vvgt, made, change, message):
+    before = stamps(made)
+    base = ["render-views", VOLUME, *SMALL, "--background", 1, 0, 0.5]
+    result = vvgt(*base, *(() if change[0] == "--tf" else ("--tf", TF)), *change, "-o", made)
+    assert result.code == 2
+    assert message in result.error
+    assert "--overwrite" in result.error
+    assert stamps(made) == before
+
+
+def test_overwrite_starts_afresh_and_leaves_what_is_not_ours(vvgt, copied):
+    (copied / "notes.txt").write_text("mine")
+    result = vvgt(
+        "render-views", VOLUME, "--tf", TF, "--views", 2, "--test-views", 0, "--size", 20, "-o", copied, "--overwrite"
+    )
+    assert result.code == 0
+    assert sorted(path.name for path in (copied / "train").iterdir()) == [
+        f"train_00{i}.{suffix}" for i in range(2) for suffix in ("exr", "png")
+    ]
+    assert not (copied / "transforms_test.json").exists()
+    assert not list((copied / "test").iterdir())
+    assert (copied / "notes.txt").read_text() == "mine"
+
+
+def test_files_that_no_manifest_knows_are_not_replaced(vvgt, tmp_path):
+    (tmp_path / "v").mkdir()
+    (tmp_path / "v" / "transforms.json").write_text("mine")
+    result = vvgt(*BASE, "-o", tmp_path / "v")
+    assert result.code == 2
+    assert "transforms.json exists, and no manifest" in result.error
+    assert [path.name for path in (tmp_path / "v").iterdir()] == ["transforms.json"]
+    for text in ("{", "[]", '{"format": "other"}', '{"files": {"../x": {"bytes": 1, "sha256": ""}}}'):
+        (tmp_path / "v" / "manifest.json").write_text(text)
+        result = vvgt(*BASE, "-o", tmp_path / "v")
+        assert result.code == 1
+        assert "not a manifest" in result.error
+    assert (tmp_path / "v" / "transforms.json").read_text() == "mine"
+
+
+def test_a_manifest_that_names_files_outside_is_refused(tmp_path):
+    entry = {"bytes": 4, "sha256": "0"}
+    for name in ("../x", "/x", "a/../../x"):
+        path = tmp_path / "manifest.json"
+        path.write_text(
+            json.dumps({"format": "vvgt-views", "schema": 1, "hash": "", "settings": {}, "files": {name: entry}})
+        )
+        with pytest.raises(DataError, match="not a manifest"):
+            read_manifest(path)
+
+
+def test_shards_together_are_the_whole(vvgt, tmp_path, made):
+    folder = tmp_path / "v"
+    call = (*BASE, "-o", folder)
+    rendered = []
+    for i in (3, 1, 2):
+        result = vvgt(*call, "--shard", f"{i}/3")
+        assert result.code == 0
+        rendered.append(len(list(folder.rglob("*.exr"))))
+        assert (folder / "contact.png").exists() == (i == 2)  # whoever finds every view
+        assert (folder / "transforms.json").exists() == (i != 3)  # the first part describes the set
+    assert rendered == [1, 3, 5]
+    for path in made.rglob("*.*"):
+        if path.is_file() and path.name != "manifest.json":
+            assert (folder / path.relative_to(made)).read_bytes() == path.read_bytes(), path.name
+    assert sorted(path.name for path in folder.glob("manifest*")) == [f"manifest-{i}-of-3.json" for i in (1, 2, 3)]
+    before = stamps(folder)
+    assert "5 views, 0 to render here" in vvgt(*call).err
+    after = stamps(folder)
+    assert {path: after[path] for path in before} == before
+    assert "another" in vvgt("render-views", VOLUME, "--tf", "magma", *SMALL, "-o", folder, "--shard", "1/3").error
+
+
+def test_digests_tell_contents_apart():
+    data = np.arange(24, dtype=np.uint8).reshape(2, 3, 4)
+    base = volume_digest(Volume(data))
+    assert volume_digest(Volume(data.copy(), name="other", origin=(1, 2, 3))) == base
+    assert volume_digest(Volume(data.astype(np.int8))) != base
+    assert volume_digest(Volume(data.reshape(3, 2, 4))) != base
+    assert volume_digest(Volume(data, spacing=(1, 1, 2))) != base
+    assert volume_digest(Volume(data, slope=2.0)) != base
+    assert volume_digest(Volume(data.astype(">i2"))) == volume_digest(Volume(data.astype("<i2")))
+    changed = data.copy()
+    changed[1, 2, 3] += 1
+    assert volume_digest(Volume(changed)) != base
+    cameras = [view.camera for view in CameraRequest(views=2, test_views=0, size=30).make()]
+    assert cameras_digest(cameras) == cameras_digest([camera.resized(2) for camera in cameras])
+    assert cameras_digest(cameras) != cameras_digest(cameras[::-1])
+
+
+def test_shards_share_views_out_without_overlap():
+    parts = [[j for j in range(11) if Shard(i, 4).holds(j)] for i in range(1, 5)]
+    assert sorted(j for part in parts for j in part) == list(range(11))
+    assert max(map(len, parts)) - min(map(len, parts)) <= 1
+
+
+def test_complete_needs_the_recorded_bytes(tmp_path):
+    manifest = Manifest(tmp_path, {"a": 1})
+    (tmp_path / "x").write_bytes(b"1234")
+    assert not manifest.complete("x")
+    manifest.record(["x"])
+    assert manifest.complete("x")
+    (tmp_path / "x").write_bytes(b"1235")
+    assert manifest.complete("x", content=False)
+    assert not manifest.complete("x")
+    again = Manifest(tmp_path, {"a": 1})
+    again.open(["x"], overwrite=False)
+    assert again.files == manifest.files

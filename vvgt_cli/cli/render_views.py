@@ -1,0 +1,141 @@
+"""`vvgt render-views`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import click
+
+from vvgt_cli.cli.options import (
+    common_options,
+    group,
+    read_options,
+    tf_range_option,
+    unit_distance_option,
+)
+from vvgt_cli.progress import Console
+
+
+def _samples(ctx: click.Context, param: click.Parameter, value: str) -> int | None:
+    if value == "adaptive":
+        return None
+    if not (value.isascii() and value.isdecimal() and 1 <= int(value) <= 16):
+        raise click.BadParameter(f"{value!r}: expected 'adaptive', or 1 to 16 rays along a pixel's edge")
+    return int(value)
+
+
+camera_options = group(
+    "cameras",
+    kind=click.option(
+        "--cameras", "kind", default="sphere", show_default=True, metavar="sphere|orbit|FILE",
+        help="Fibonacci sphere, a circle around +z, or the views of a transforms.json (in the unit frame).",
+    ),
+    views=click.option("--views", type=click.IntRange(1, 10_000), metavar="N", help="Training views. Default: 24."),
+    test_views=click.option(
+        "--test-views", type=click.IntRange(0, 10_000), metavar="N",
+        help="Test views, on a sphere of their own; 0 for none. Default: 10.",
+    ),
+    size=click.option(
+        "--size", type=click.IntRange(16, 16384), metavar="PX", help="Image height. Default: the file's, or 400."
+    ),
+    fov=click.option(
+        "--fov", type=click.FloatRange(0, 180, min_open=True, max_open=True), metavar="DEGREES",
+        help="Vertical field of view. Default: 40.",
+    ),
+    radius=click.option(
+        "--radius", type=click.FloatRange(0, 1000, min_open=True), metavar="R",
+        help="Distance from the centre, where the volume's longest edge is 2. Default: 3.",
+    ),
+)  # fmt: skip
+
+image_options = group(
+    "layout",
+    format=click.option(
+        "--format", type=click.Choice(["both", "exr", "png"]), default="both", show_default=True,
+        help="EXR (float, exact), PNG (8 bits, with a COLMAP model), or both.",
+    ),
+    half=click.option("--half", is_flag=True, help="EXR in 16 bits: half the size, three digits."),
+    background=click.option(
+        "--background", type=click.FloatRange(0, 1), nargs=3, default=(0.0, 0.0, 0.0), metavar="R G B",
+        help="Behind the opaque images for COLMAP and the contact sheet. Default: black.",
+    ),
+)  # fmt: skip
+
+ray_options = group(
+    "rays",
+    renderer=click.option(
+        "--renderer", type=click.Choice(["cpu", "cuda", "vtk"]), default="cpu", show_default=True,
+        help="Our kernels on the CPU or with torch on CUDA, or VTK's ray caster.",
+    ),
+    samples=click.option(
+        "--samples", default="adaptive", show_default=True, callback=_samples, metavar="adaptive|N",
+        help="Rays a pixel: 3 x 3 where neighbours differ and one elsewhere, or N x N everywhere.",
+    ),
+    step=click.option(
+        "--step", type=click.FloatRange(0, 4, min_open=True), default=0.5, show_default=True, metavar="VOXELS",
+        help="Sampling distance along a ray.",
+    ),
+)  # fmt: skip
+
+optics_options = group(
+    "optics",
+    tf=click.option(
+        "--tf", multiple=True, metavar="TF",
+        help="Transfer function: a file, or a matplotlib colour map's name; may be repeated. "
+        "Default: from the histogram.",
+    ),
+    tf_range=tf_range_option,
+    opacity_unit_distance=unit_distance_option,
+)  # fmt: skip
+
+
+@click.command("render-views", short_help="Calibrated views of a volume, for trainers.")
+@click.argument("volume")
+@click.option("-o", "--output", required=True, metavar="DIR", help="Directory for the views; made if it is not there.")
+@camera_options
+@image_options
+@ray_options
+@optics_options
+@read_options
+@click.option("--shard", default="1/1", metavar="I/N", help="Render part I of N, for job arrays; I counts from 1.")
+@click.option("--overwrite", is_flag=True, help="Start afresh where another run's views are.")
+@common_options
+def command(
+    volume: str,
+    output: str,
+    cameras: dict[str, Any],
+    layout: dict[str, Any],
+    rays: dict[str, Any],
+    optics: dict[str, Any],
+    read: dict[str, Any],
+    shard: str,
+    overwrite: bool,
+    console: Console,
+) -> None:
+    """Render views of VOLUME with known cameras, and the files that 3DGS trainers start from.
+
+    DIR gets EXR and PNG images, transforms.json (nerfstudio), transforms_train.json and transforms_test.json
+    (Blender style), a COLMAP model, a point cloud to start from and a contact sheet. With several --tf each
+    function gets DIR/NAME of its own. The same command again renders only what is missing or damaged; another
+    one is refused, unless --overwrite is given.
+
+    \b
+    Examples:
+      vvgt render-views head.nrrd --tf bone.json -o views
+      vvgt render-views head.nrrd --tf bone.json --tf skin.json -o views --views 36 --size 800
+      vvgt render-views head.nrrd --tf bone.json -o views --shard $SLURM_ARRAY_TASK_ID/8
+    """
+    from vvgt_cli.errors import UsageError
+    from vvgt_cli.pipeline.render_views import CameraRequest, ViewsRequest, parse_shard, render_view_sets
+    from vvgt_cli.pipeline.source import SourceRequest
+    from vvgt_cli.pipeline.view_files import Layout
+    from vvgt_cli.volume import ReadOptions
+
+    if layout["half"] and layout["format"] == "png":
+        raise UsageError("--half is of EXR, which --format png leaves out; leave out one of the two")
+    source = SourceRequest(volume, ReadOptions(**read), None, optics["tf_range"], optics["opacity_unit_distance"])
+    request = ViewsRequest(
+        source, optics["tf"], output, CameraRequest(**cameras), Layout(**layout),
+        shard=parse_shard(shard), overwrite=overwrite, **rays,
+    )  # fmt: skip
+    render_view_sets(request, console)
