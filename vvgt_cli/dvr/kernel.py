@@ -7,12 +7,15 @@ import math
 import numba as nb
 import numpy as np
 
+from vvgt_cli.dvr.runs import RUN, sample_run, stack_run
 from vvgt_cli.dvr.scene import BRICK, BRICK_BITS
 from vvgt_cli.jit import inlined
 
-OPAQUE = 1e-5  # transmittance at which a ray ends: half a step of 16-bit output
+OPAQUE = 1e-3  # times step^2, as the error of integration goes: the transmittance at which a ray ends
 SUB_DEPTH = 0.3  # optical depth of a sub-segment: colour is constant within one
 PARTS = 32  # the most sub-segments; at the largest extinctions what lies behind the first few is not seen
+UNKNOWN = (0.0, 0.0, 0.0, -1.0)  # of integrals that were not looked up
+TILE = 16  # pixels along the edge of a tile: its rays share what they read
 FLAGS = {"contract", "nsz", "arcp", "afn"}  # no nnan/ninf: non-finite voxels are data
 
 U = nb.uint64
@@ -116,19 +119,25 @@ def absorbed(depth):
 
 
 @_jit
-def _composite(u0, u1, dt, nodes, cumulative, bins, state):
-    """``state`` (r, g, b, T) behind a segment of length dt along which the table coordinate goes from u0 to u1."""
-    red, green, blue, trans = state
+def _composite(u0, u1, dt, nodes, cumulative, bins, light, start):
+    """``light`` (r, g, b, T) behind a segment of length dt along which the table coordinate goes from u0 to u1.
+
+    ``start`` holds `_integrals` at u0, or -1 as its last entry where they are not known. Returns the new light and the
+    integrals at u1 in the same form.
+    """
+    red, green, blue, trans = light
+    r0, g0, b0, a0 = start
     width = u1 - u0
     if abs(width) < 0.5:
         r, g, b, tau = point_optics(0.5 * (u0 + u1), nodes, bins)
         f = absorbed(tau * dt) * trans * dt
-        return red + f * r, green + f * g, blue + f * b, trans - f * tau
+        return (red + f * r, green + f * g, blue + f * b, trans - f * tau), UNKNOWN
     scale = dt / width
-    r0, g0, b0, a0 = _integrals(u0, nodes, cumulative, bins)
+    if a0 < 0.0:
+        r0, g0, b0, a0 = _integrals(u0, nodes, cumulative, bins)
     r1, g1, b1, a1 = _integrals(u1, nodes, cumulative, bins)
-    depth = (a1 - a0) * scale
-    parts = min(int(depth / SUB_DEPTH) + 1, PARTS)
+    end = r1, g1, b1, a1
+    parts = min(int((a1 - a0) * scale / SUB_DEPTH) + 1, PARTS)
     for part in range(1, parts + 1):
         if parts > 1:
             r1, g1, b1, a1 = _integrals(u0 + width * (part / parts), nodes, cumulative, bins)
@@ -138,7 +147,7 @@ def _composite(u0, u1, dt, nodes, cumulative, bins, state):
         blue += f * (b1 - b0)
         trans -= f * (a1 - a0)
         r0, g0, b0, a0 = r1, g1, b1, a1
-    return red, green, blue, max(trans, 0.0)
+    return (red, green, blue, max(trans, 0.0)), end
 
 
 @_jit
@@ -163,6 +172,40 @@ def _leap(px, py, pz, dx, dy, dz, reach, bi, bj, bk):
 
 
 @_jit
+def _brick(p, d, t, n):
+    """Brick along one axis in which the ray p + t d is, clamped to the volume."""
+    return min(max(int(p + t * d), 0), n - 1) >> BRICK_BITS
+
+
+@_jit
+def _skip(shape, empty, px, py, pz, dx, dy, dz, ix, iy, iz, t0, dt, count, i):
+    """The sample from which on, after sample i, the ray may meet something visible; > count: none.
+
+    Leaps from one empty cube of bricks to the next while what lies between is empty too: bricks that share a face make
+    a box, and a cube of more than one brick holds the brick that the ray comes from. The last sample in empty space is
+    returned, where the next segment starts.
+    """
+    nz, ny, nx = shape
+    bi, bj, bk = _brick(px, dx, t0 + i * dt, nx), _brick(py, dy, t0 + i * dt, ny), _brick(pz, dz, t0 + i * dt, nz)
+    reach = int(empty[U(bk), U(bj), U(bi)])
+    if reach == 0:
+        return i
+    while True:
+        i = max(int((_exit(px, py, pz, ix, iy, iz, reach, bi, bj, bk) - t0) / dt), i)
+        if i >= count:
+            return count + 1
+        t = t0 + i * dt
+        bi, bj, bk = _brick(px, dx, t, nx), _brick(py, dy, t, ny), _brick(pz, dz, t, nz)
+        t = t0 + (i + 1) * dt
+        ci, cj, ck = _brick(px, dx, t, nx), _brick(py, dy, t, ny), _brick(pz, dz, t, nz)
+        reach = int(empty[U(ck), U(cj), U(ci)])
+        if reach == 0 or (reach == 1 and abs(ci - bi) + abs(cj - bj) + abs(ck - bk) > 1):
+            return i
+        i += 1
+        bi, bj, bk = ci, cj, ck
+
+
+@_jit
 def cast(values, lo, inv_width, nodes, cumulative, dark, empty, px, py, pz, dx, dy, dz, step):
     """Premultiplied (r, g, b, alpha) along p + t d in voxel coordinates, t in unit-frame lengths.
 
@@ -170,38 +213,41 @@ def cast(values, lo, inv_width, nodes, cumulative, dark, empty, px, py, pz, dx, 
     """
     nz, ny, nx = values.shape
     bins = nodes.shape[0] - 1
-    state = (0.0, 0.0, 0.0, 1.0)
+    flat = values.reshape(-1)
+    run = nb.carray(stack_run(), RUN)
+    light = (0.0, 0.0, 0.0, 1.0)
     t0, t1 = box_span(px, py, pz, dx, dy, dz, nx, ny, nz)
     if not t1 > t0:
         return 0.0, 0.0, 0.0, 0.0
     count = max(math.ceil((t1 - t0) * math.sqrt(dx * dx + dy * dy + dz * dz) / step), 1)
     dt = (t1 - t0) / count
+    opaque = OPAQUE * min(step * step, 1.0)
     ix, iy, iz = _inverse(dx), _inverse(dy), _inverse(dz)
-    u0 = -1.0  # -1: no sample there, or not finite
-    inside = -1.0  # up to here the ray stays in a brick that is not empty
+    u0, known = -1.0, UNKNOWN  # -1: no sample there, or not finite
     i = 0
     while True:
+        start = _skip(values.shape, empty, px, py, pz, dx, dy, dz, ix, iy, iz, t0, dt, count, i)
+        if start > count:
+            return light[0], light[1], light[2], 1.0 - light[3]
+        if start > i:
+            u0, i = -1.0, start
         t = t0 + i * dt
-        x, y, z = px + t * dx, py + t * dy, pz + t * dz
-        u1 = table_coordinate(sample(values, x, y, z), lo, inv_width, bins)
-        first = min(u0, u1)
-        if first >= 0.0 and max(u0, u1) > dark[U(int(first))]:
-            state = _composite(u0, u1, dt, nodes, cumulative, bins, state)
-        if i >= count or state[3] < OPAQUE:
-            return state[0], state[1], state[2], 1.0 - state[3]
-        u0 = u1
-        i += 1
-        if t >= inside:
-            bi = min(max(int(x), 0), nx - 1) >> BRICK_BITS
-            bj = min(max(int(y), 0), ny - 1) >> BRICK_BITS
-            bk = min(max(int(z), 0), nz - 1) >> BRICK_BITS
-            reach = int(empty[U(bk), U(bj), U(bi)])
-            inside = _exit(px, py, pz, ix, iy, iz, max(reach, 1), bi, bj, bk)
-            if reach > 0:
-                last = int((min(inside, t1) - t0) / dt)  # the last sample in the empty cube
-                inside = -1.0
-                if last >= i:
-                    i, u0 = last, -1.0
+        sample_run(
+            values, flat, px + t * dx, py + t * dy, pz + t * dz, dx * dt, dy * dt, dz * dt, lo, inv_width, bins, run
+        )
+        for n in range(min(RUN, count + 1 - i)):
+            u1 = run[n]
+            first = min(u0, u1)
+            if first >= 0.0 and max(u0, u1) > dark[U(int(first))]:
+                light, known = _composite(u0, u1, dt, nodes, cumulative, bins, light, known)
+                if light[3] < opaque:
+                    return light[0], light[1], light[2], 1.0 - light[3]
+            else:
+                known = UNKNOWN
+            u0 = u1
+        i += RUN
+        if i > count:
+            return light[0], light[1], light[2], 1.0 - light[3]
 
 
 @_jit
@@ -225,26 +271,28 @@ def _pixel(values, lo, inv_width, nodes, cumulative, dark, empty, eye, basis, le
 
 
 @nb.njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
-def render_rows(
+def render_tiles(
     values, lo, inv_width, nodes, cumulative, dark, empty, eye, basis, lens, step, order, grid, mask, known, out
 ):
     """Render one view into ``out`` (h, w, 4) float32 with ``grid`` x ``grid`` rays a pixel where ``mask`` is set.
 
     ``eye`` (3,) and ``basis`` (3, 3: rows right, down, forward) are in voxel coordinates per unit-frame length;
-    ``lens`` is (1/fx, 1/fy, cx, cy); ``order`` permutes rows so that contiguous chunks of threads are balanced;
-    ``known`` says that ``out`` holds the central ray's result already and that ``grid`` is odd.
+    ``lens`` is (1/fx, 1/fy, cx, cy); ``order`` permutes the tiles (row-major) so that contiguous chunks of threads are
+    balanced; ``known`` says that ``out`` holds the central ray's result already and that ``grid`` is odd.
     """
     height, width = out.shape[:2]
+    across = (width + TILE - 1) // TILE
     scale = 1.0 / (grid * grid)
-    for index in nb.prange(height):
-        row = order[index]
-        for col in range(width):
-            if not mask[row, col]:
-                continue
-            pixel = out[row, col]
-            red, green, blue, alpha = _pixel(
-                values, lo, inv_width, nodes, cumulative, dark, empty, eye, basis, lens, step, col, row, grid, known
-            )
-            if known:
-                red, green, blue, alpha = red + pixel[0], green + pixel[1], blue + pixel[2], alpha + pixel[3]
-            pixel[0], pixel[1], pixel[2], pixel[3] = red * scale, green * scale, blue * scale, alpha * scale
+    for index in nb.prange(len(order)):
+        top, left = order[index] // across * TILE, order[index] % across * TILE
+        for row in range(top, min(top + TILE, height)):
+            for col in range(left, min(left + TILE, width)):
+                if not mask[row, col]:
+                    continue
+                pixel = out[row, col]
+                red, green, blue, alpha = _pixel(
+                    values, lo, inv_width, nodes, cumulative, dark, empty, eye, basis, lens, step, col, row, grid, known
+                )
+                if known:
+                    red, green, blue, alpha = red + pixel[0], green + pixel[1], blue + pixel[2], alpha + pixel[3]
+                pixel[0], pixel[1], pixel[2], pixel[3] = red * scale, green * scale, blue * scale, alpha * scale

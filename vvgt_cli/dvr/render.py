@@ -48,12 +48,14 @@ def camera_arrays(scene: Scene, camera: Camera) -> tuple[np.ndarray, np.ndarray,
     return eye, basis, lens
 
 
-def row_order(height: int) -> np.ndarray:
-    """Rows dealt out over the threads like cards, so that equal chunks have equal work."""
+def tile_order(height: int, width: int) -> np.ndarray:
+    """Tiles dealt out over the threads like cards, so that equal chunks have equal work."""
     import numba
 
-    threads = numba.get_num_threads()
-    return np.concatenate([np.arange(first, height, threads) for first in range(threads)])
+    from vvgt_cli.dvr.kernel import TILE
+
+    count, threads = -(-height // TILE) * -(-width // TILE), numba.get_num_threads()
+    return np.concatenate([np.arange(first, count, threads) for first in range(threads)])
 
 
 def edges(image: np.ndarray) -> np.ndarray:
@@ -74,18 +76,18 @@ def edges(image: np.ndarray) -> np.ndarray:
 
 def render_view(scene: Scene, camera: Camera, settings: RenderSettings | None = None) -> np.ndarray:
     """One view: (height, width, 4) float32, premultiplied RGBA over nothing."""
-    from vvgt_cli.dvr.kernel import render_rows
+    from vvgt_cli.dvr.kernel import render_tiles
 
     settings = settings or RenderSettings()
     tables = scene.tables
     eye, basis, lens = camera_arrays(scene, camera)
     out = np.zeros((camera.height, camera.width, 4), np.float32)
     everywhere = np.ones(out.shape[:2], bool)
-    order = row_order(camera.height)
+    order = tile_order(camera.height, camera.width)
     first = 1 if settings.adaptive else settings.samples
 
     def trace(grid: int, mask: np.ndarray, known: bool) -> None:
-        render_rows(
+        render_tiles(
             scene.values, tables.lo, tables.inv_width, tables.nodes, tables.cumulative, tables.dark, scene.empty,
             eye, basis, lens, settings.step, order, grid, mask, known, out,
         )  # fmt: skip
