@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from tests.view_sets import BACKGROUND, BASE, TF, VOLUME, make_views
-from vvgt_cli.cameras.files import camera_to_opengl, read_cameras
+from vvgt_cli.cameras import look_at
+from vvgt_cli.cameras.files import camera_to_opengl, read_cameras, transforms_json
 from vvgt_cli.dvr import RenderSettings, render_view
 from vvgt_cli.errors import DataError
 from vvgt_cli.images import over, read_exr, read_png
@@ -213,6 +214,32 @@ def test_cameras_of_a_file_with_their_split(vvgt, tmp_path, made):
     assert images.shape == (3, 16, 16, 4)
     assert len(load_views(tmp_path / "v", "test")[0]) == 2
     np.testing.assert_allclose(cameras[1].rotation, read_cameras(made / "transforms.json")[1].rotation, atol=1e-12)
+
+
+def test_cameras_of_several_sizes_share_a_contact_sheet(vvgt, tmp_path):
+    views = [
+        look_at((0, -3, 1), width=40, height=16, name="wide"),
+        look_at((3, 0, 1), width=16, height=400, name="tall"),
+    ]
+    (tmp_path / "t.json").write_text(transforms_json(views))
+    call = ("render-views", VOLUME, "--tf", TF, "--cameras", tmp_path / "t.json", "-o", tmp_path / "v")
+    assert vvgt(*call).code == 0
+    document = json.loads((tmp_path / "v" / "transforms.json").read_text())
+    assert [(frame["w"], frame["h"]) for frame in document["frames"]] == [(40, 16), (16, 400)]
+    assert "camera_angle_x" in json.loads((tmp_path / "v" / "transforms_train.json").read_text())["frames"][1]
+    sheet = read_png(tmp_path / "v" / "contact.png")
+    assert sheet.shape == (133, 40 + 4 + 40, 3)  # the tall one at a third
+    assert all(tile.max() > 0.1 for tile in (sheet[:, :40], sheet[:, 44:]))
+    with pytest.raises(DataError, match="2 sizes"):
+        load_views(tmp_path / "v")
+    kept = json.loads((tmp_path / "t.json").read_text())
+    kept["test_filenames"] = ["wide.png", "tall.png"]
+    (tmp_path / "t.json").write_text(json.dumps(kept))
+    assert "expected some to train on" in vvgt(*call).error
+    for frame, name in zip(kept["frames"], ("a.1.png", "a_1.png"), strict=True):
+        frame["file_path"] = name
+    (tmp_path / "t.json").write_text(json.dumps(kept))
+    assert "two views become 'a_1'" in vvgt(*call).error
 
 
 def test_orbit():

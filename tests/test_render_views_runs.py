@@ -69,12 +69,34 @@ def test_a_run_that_is_killed_goes_on(vvgt, tmp_path, made, monkeypatch):
     assert drawn == ["train_000", "train_001"]
     before = stamps(tmp_path / "v")
     assert not any(path.name.startswith(".") for path in before)
+    (tmp_path / "v" / "test" / ".test_000.0123abcd.exr").write_text("left by a run that was killed outright")
     monkeypatch.setattr(backends, "render_view", real)
     assert "3 to render here" in vvgt(*call).err
     after = stamps(tmp_path / "v")
+    assert not any(path.name.startswith(".") for path in after)
     assert all(after[path] == stamp for path, stamp in before.items() if path.name != "manifest.json")
     for path in made.rglob("*.exr"):
         assert (tmp_path / "v" / path.relative_to(made)).read_bytes() == path.read_bytes()
+
+
+def test_a_renderer_that_is_not_there_leaves_nothing(vvgt, tmp_path, monkeypatch):
+    from vvgt_cli.dvr import backends
+
+    def refuse(renderer, scene, settings):
+        raise DataError(f"no device for {renderer}")
+
+    monkeypatch.setattr(backends, "view_renderer", refuse)
+    assert "no device for cuda" in vvgt(*BASE, "--renderer", "cuda", "-o", tmp_path / "v").error
+    assert not (tmp_path / "v").exists()
+
+
+def test_views_that_see_nothing_leave_nothing(vvgt, tmp_path):
+    tf = '{"points": [{"x": 0.9999, "opacity": 0}, {"x": 1, "opacity": 1e-9, "rgb": [1, 0, 0]}]}'
+    (tmp_path / "tf.json").write_text(tf)
+    result = vvgt("render-views", VOLUME, "--tf", tmp_path / "tf.json", *SMALL, "-o", tmp_path / "v")
+    assert result.code == 1
+    assert "visible" in result.error
+    assert not (tmp_path / "v").exists()
 
 
 @pytest.mark.parametrize(

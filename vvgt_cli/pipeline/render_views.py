@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from vvgt_cli import __version__
-from vvgt_cli.cameras import default_views, orbit_views
+from vvgt_cli.cameras import Camera, default_views, orbit_views
 from vvgt_cli.cameras.files import read_frames
 from vvgt_cli.cameras.sets import FIELD_OF_VIEW, RADIUS, SET_VIEWS, SIZE
 from vvgt_cli.errors import DataError, UsageError
@@ -225,46 +227,54 @@ def _plan(request: ViewsRequest, views: list[View], folders: list[Path], sources
 
 
 def _work(run: Run, request: ViewsRequest, job: _Job, views: list[View]) -> None:
-    """Whatever is missing of one function's folder."""
+    """Whatever is missing of one function's folder; nothing is written before all that may fail early has not."""
+    from vvgt_cli.dvr import RenderSettings
+    from vvgt_cli.dvr.backends import view_renderer
+
     manifest, layout = job.manifest, request.layout
-    for name in ("", *layout.folders(views)):
-        (job.folder / name).mkdir(parents=True, exist_ok=True)
-    if not (job.folder / request.shard.manifest).exists():
-        manifest.record()
-    texts = layout.descriptions(views)
-    _write(manifest, {name: texts[name] for name in job.files if name in texts})
-    models = [name for name in job.files if name not in texts]
+    built = layout.descriptions(views)
+    models = any(name not in built for name in job.files)
     if job.pending or models:
         with run.stage("scene") as stage:
             scene = job.source.scene()
             stage.note = f"{job.source.tf.name}, opacity per {job.source.unit_distance:g} ({job.source.unit_label})"
+    if job.pending:
+        samples, adaptive = request.samples or RenderSettings.samples, request.samples is None
+        draw = view_renderer(request.renderer, scene, RenderSettings(request.step, samples, adaptive))
     if models:
         with run.stage("points") as stage:
             points, colors = start_points(scene, views[0].camera.height)
             if not len(points):
                 raise DataError(f"{scene.volume.name} under {scene.tf.name}: nothing visible from any view")
-            built = layout.models(views, points, colors)
-            _write(manifest, {name: built[name] for name in models})
+            built |= layout.models(views, points, colors)
             stage.note = f"{len(points)} points to start from"
+    for name in ("", *layout.folders(views)):
+        (job.folder / name).mkdir(parents=True, exist_ok=True)
+    if job.files or not (job.folder / request.shard.manifest).exists():
+        manifest.record()  # first: it claims the folder
+        _write(manifest, {name: built[name] for name in job.files})
     if job.pending:
-        _render(run, request, job, scene)
+        _render(run, request, job, draw)
     _contact(run, job, layout, views)
 
 
-def _render(run: Run, request: ViewsRequest, job: _Job, scene: Any) -> None:
-    from vvgt_cli.dvr import RenderSettings
-    from vvgt_cli.dvr.backends import view_renderer
-
-    samples, adaptive = request.samples or RenderSettings.samples, request.samples is None
-    settings = RenderSettings(request.step, samples, adaptive)
+def _render(run: Run, request: ViewsRequest, job: _Job, draw: Callable[[Camera], np.ndarray]) -> None:
+    _sweep(job, request.layout)
     with run.stage("views") as stage:
-        draw, bar = view_renderer(request.renderer, scene, settings), run.console.bar("views")
+        bar = run.console.bar("views")
         for done, view in enumerate(job.pending, 1):
             job.manifest.record(request.layout.write(job.folder, view, draw(view.camera)))
             if bar:
                 bar(done, len(job.pending))
         camera = job.pending[0].camera
         stage.note = f"{len(job.pending)} views of {camera.width} x {camera.height} px in {job.folder}"
+
+
+def _sweep(job: _Job, layout: Layout) -> None:
+    """Remove the temporary files of this part's views that a run killed outright has left."""
+    for path in (job.folder / name for view in job.pending for name in layout.files(view)):
+        for left in path.parent.glob(f".{path.stem}.{'[0-9a-f]' * 8}{path.suffix}"):
+            left.unlink(missing_ok=True)
 
 
 def _contact(run: Run, job: _Job, layout: Layout, views: list[View]) -> None:
@@ -285,8 +295,7 @@ def _write(manifest: Manifest, files: dict[str, bytes]) -> None:
     for name, data in files.items():
         with atomic_write(manifest.folder / name, overwrite=True) as temporary:
             temporary.write_bytes(data)
-    if files:
-        manifest.record(files)
+    manifest.record(files)
 
 
 def parse_shard(text: str) -> Shard:
