@@ -38,7 +38,13 @@ def view_renderer(
         raise UsageError(f"the {renderer} renderer has no lighting; leave it out, or use the vtk renderer")
     if renderer == "cpu":
         return lambda camera: render_view(scene, camera, settings)
-    raise UsageError(f"the {renderer} renderer is not built in; use cpu")
+    if renderer == "cuda":
+        from vvgt_cli.dvr import cuda
+
+        return cuda.view_renderer(scene, settings)
+    from vvgt_cli.dvr import vtk
+
+    return vtk.view_renderer(scene, settings, shade)
 
 
 def render_views_with(

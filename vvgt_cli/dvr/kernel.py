@@ -214,7 +214,7 @@ def cast(values, lo, inv_width, nodes, cumulative, dark, empty, px, py, pz, dx, 
     nz, ny, nx = values.shape
     bins = nodes.shape[0] - 1
     flat = values.reshape(-1)
-    run = nb.carray(stack_run(), RUN)
+    run = nb.carray(stack_run(), RUN)  # type: ignore[call-arg]
     light = (0.0, 0.0, 0.0, 1.0)
     t0, t1 = box_span(px, py, pz, dx, dy, dz, nx, ny, nz)
     if not t1 > t0:

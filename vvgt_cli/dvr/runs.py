@@ -16,7 +16,7 @@ from vvgt_cli.jit import inlined
 
 RUN = 16  # samples of a run: one vector of AVX-512 float32, two of AVX2
 
-F, I, U = nb.float32, nb.int32, nb.uint64
+F, N, U = nb.float32, nb.int32, nb.uint64
 
 
 @intrinsic
@@ -39,7 +39,7 @@ def _base(p, v, n):
 
     Counted from there, float32 keeps positions to 1e-5 voxels in a volume of any size.
     """
-    base = min(max(int(math.floor(min(p, p + (RUN - 1) * v))), 0), n - 1)
+    base = min(max(math.floor(min(p, p + (RUN - 1) * v)), 0), n - 1)
     return base, F(p - base), F(n - 1 - base)
 
 
@@ -58,14 +58,14 @@ def sample_run(values, flat, px, py, pz, vx, vy, vz, lo, inv_width, bins, out):
     row = nb.int64(nx)
     slab = row * nb.int64(ny)
     first = bz * slab + by * row + bx
-    last_i, last_j, last_k = I(nx - 1 - bx), I(ny - 1 - by), I(nz - 1 - bz)
+    last_i, last_j, last_k = N(nx - 1 - bx), N(ny - 1 - by), N(nz - 1 - bz)
     top = float(bins)
     for n in range(RUN):
-        s = F(I(n))
+        s = F(N(n))
         x = min(max(x0 + s * dx, F(0)), x_top)
         y = min(max(y0 + s * dy, F(0)), y_top)
         z = min(max(z0 + s * dz, F(0)), z_top)
-        i, j, k = I(x), I(y), I(z)
+        i, j, k = N(x), N(y), N(z)
         fx, fy, fz = x - F(i), y - F(j), z - F(k)
         right = U(1 if i < last_i else 0)
         a = U(first + nb.int64(k) * slab + nb.int64(j) * row + nb.int64(i))
