@@ -11,6 +11,7 @@ from vvgt_cli.jit import inlined
 from vvgt_cli.splat.constants import DILATION, MIN_ALPHA, NEAR, TILE
 
 _jit = inlined()
+SHIFT = TILE.bit_length() - 1
 
 
 @_jit
@@ -155,8 +156,8 @@ def tile_lists(order, extent, tiles_x, tiles_y, workers):
             k = order[index]
             if extent[k, 2] <= extent[k, 0]:
                 continue
-            x0, x1 = extent[k, 0] // TILE, (extent[k, 2] - 1) // TILE + 1
-            y0, y1 = extent[k, 1] // TILE, (extent[k, 3] - 1) // TILE + 1
+            x0, x1 = extent[k, 0] >> SHIFT, ((extent[k, 2] - 1) >> SHIFT) + 1
+            y0, y1 = extent[k, 1] >> SHIFT, ((extent[k, 3] - 1) >> SHIFT) + 1
             first[k + 1] = (x1 - x0) * (y1 - y0)
             for ty in range(y0, y1):
                 for tx in range(x0, x1):
@@ -179,8 +180,8 @@ def tile_lists(order, extent, tiles_x, tiles_y, workers):
             slot = first[k]
             if extent[k, 2] <= extent[k, 0]:
                 continue
-            for ty in range(extent[k, 1] // TILE, (extent[k, 3] - 1) // TILE + 1):
-                for tx in range(extent[k, 0] // TILE, (extent[k, 2] - 1) // TILE + 1):
+            for ty in range(extent[k, 1] >> SHIFT, ((extent[k, 3] - 1) >> SHIFT) + 1):
+                for tx in range(extent[k, 0] >> SHIFT, ((extent[k, 2] - 1) >> SHIFT) + 1):
                     place = fill[worker, ty * tiles_x + tx]
                     members[place] = k
                     slots[place] = slot

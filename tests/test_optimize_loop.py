@@ -1,0 +1,155 @@
+"""Refinement as a whole: it gets nearer, never returns less than it was given, stops when told, repeats to the byte."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vvgt_cli.cameras import default_views
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.metrics import psnr
+from vvgt_cli.optimize import OptimizeOptions, optimize
+from vvgt_cli.optimize.states import OwnFrame
+from vvgt_cli.splat import render
+from vvgt_cli.splat.reference import covariances
+
+FIELDS = ("means", "log_scales", "quaternions", "opacity_logits", "colors")
+CAMERAS, CHECKS = default_views("train", 6, size=48), default_views("check", 2, size=48)
+
+
+def truth(count=40):
+    rng = np.random.default_rng(0)
+    return Gaussians(
+        rng.uniform(-0.6, 0.6, (count, 3)),
+        np.log(0.12) + rng.normal(0, 0.4, (count, 3)),
+        rng.normal(size=(count, 4)),
+        rng.normal(0.5, 1, count),
+        rng.uniform(0, 1, (count, 3)),
+    )
+
+
+def shaken(g, size=0.05):
+    rng = np.random.default_rng(1)
+    means, scales, logits, colors = (
+        array + size * factor * rng.normal(size=array.shape)
+        for array, factor in ((g.means, 0.5), (g.log_scales, 4), (g.opacity_logits, 6), (g.colors, 2))
+    )
+    return Gaussians(means, scales, g.quaternions, logits, colors)
+
+
+def views(g, cameras):
+    return np.stack([render(g, camera) for camera in cameras])
+
+
+def score(g, cameras, images):
+    return float(np.mean([psnr(i[..., :3], render(g, c)[..., :3]) for c, i in zip(cameras, images, strict=True)]))
+
+
+@pytest.fixture(scope="module")
+def scene():
+    g = truth()
+    return shaken(g), views(g, CAMERAS), (CHECKS, views(g, CHECKS))
+
+
+@pytest.mark.parametrize(
+    ("options", "gain"),
+    [
+        (OptimizeOptions(steps=60), 4.0),
+        (OptimizeOptions(steps=60, l1=1.0, l2=0.0), 3.0),
+        (OptimizeOptions(steps=60, ssim=0.2), 3.0),
+        (OptimizeOptions(steps=60, method="adam"), 2.0),
+    ],
+)
+def test_views_that_were_not_trained_on_come_nearer(scene, options, gain):
+    start, images, check = scene
+    result, record = optimize(start, CAMERAS, images, options, check)
+    assert score(result, *check) > score(start, *check) + gain
+    assert record.psnr_after == pytest.approx(score(result, *check), abs=0.02)
+    assert record.psnr_before == pytest.approx(score(start, *check), abs=0.02)
+    assert score(result, CAMERAS, images) > score(start, CAMERAS, images) + gain
+
+
+def test_alpha_is_fitted_where_colour_says_nothing(scene):
+    start, images, _ = scene
+    dark = Gaussians(start.means, start.log_scales, start.quaternions, start.opacity_logits, np.zeros((len(start), 3)))
+    black = images * np.float32([0, 0, 0, 1])
+    result, _ = optimize(dark, CAMERAS, black, OptimizeOptions(steps=60))
+    errors = [np.mean([np.mean((render(g, c) - i)[..., 3] ** 2) for c, i in zip(CAMERAS, images, strict=True)])
+              for g in (dark, result)]  # fmt: skip
+    assert errors[1] < errors[0]
+
+
+@pytest.mark.parametrize("method", ["frame", "adam"])
+def test_nothing_worse_than_the_input_is_returned(scene, method):
+    start, images, check = scene
+    misled = np.zeros_like(images)
+    result, record = optimize(start, CAMERAS, misled, OptimizeOptions(steps=20, method=method, check_every=5), check)
+    assert score(result, *check) >= score(start, *check)
+    assert record.reason == "no gain"
+    assert record.steps < 20
+    if record.kept == 0:
+        assert result is start
+
+
+def test_it_stops_when_told(scene):
+    start, images, check = scene
+    same, record = optimize(start, CAMERAS, images, OptimizeOptions(steps=0), check)
+    assert same is start
+    assert record.psnr_after == record.psnr_before
+    _, record = optimize(start, CAMERAS, images, OptimizeOptions(time_budget=0.0), check)
+    assert (record.reason, record.steps) == ("time", 0)
+    goal = score(start, *check) + 1
+    _, record = optimize(start, CAMERAS, images, OptimizeOptions(target_psnr=goal, check_every=5), check)
+    assert record.reason == "target"
+    assert record.steps < 200
+    assert record.psnr_after >= goal
+
+
+def test_the_same_run_gives_the_same_bytes(scene):
+    start, images, check = scene
+    runs = [optimize(start, CAMERAS, images, OptimizeOptions(steps=10), check)[0] for _ in range(2)]
+    for field in FIELDS:
+        assert getattr(runs[0], field).tobytes() == getattr(runs[1], field).tobytes()
+
+
+def test_steps_leave_the_input_alone(scene):
+    start, images, _ = scene
+    before = [getattr(start, field).copy() for field in FIELDS]
+    optimize(start, CAMERAS, images, OptimizeOptions(steps=3))
+    optimize(start, CAMERAS, images, OptimizeOptions(steps=3, method="adam"))
+    assert all(np.array_equal(getattr(start, field), kept) for field, kept in zip(FIELDS, before, strict=True))
+
+
+def test_factors_and_back_keep_the_covariance():
+    g = truth(200)
+    back = OwnFrame(g, CAMERAS).gaussians()
+    np.testing.assert_allclose(covariances(back), covariances(g), atol=1e-6)
+    flat = Gaussians(
+        g.means, np.where([True, True, False], g.log_scales, -11), g.quaternions, g.opacity_logits, g.colors
+    )
+    np.testing.assert_allclose(covariances(OwnFrame(flat, CAMERAS).gaussians()), covariances(flat), atol=1e-6)
+
+
+def test_no_gaussians_stay_none(scene):
+    _, images, check = scene
+    none = truth(0)
+    assert len(optimize(none, CAMERAS, images, OptimizeOptions(steps=2), check)[0]) == 0
+
+
+def test_wrong_views_and_options_are_refused(scene):
+    start, images, check = scene
+    with pytest.raises(DataError, match="5 training images for 6 cameras"):
+        optimize(start, CAMERAS, images[:5])
+    with pytest.raises(DataError, match="check view"):
+        optimize(start, CAMERAS, images, check=(CHECKS, check[1][:, :40]))
+    for wrong in (
+        {"method": "sgd"},
+        {"steps": -1},
+        {"l2": 0.0},
+        {"alpha": -1.0},
+        {"check_every": 0},
+        {"time_budget": -1},
+    ):
+        with pytest.raises(UsageError):
+            OptimizeOptions(**wrong)

@@ -1,0 +1,75 @@
+"""Gradients of the loss: against central differences, and SSIM's value against a plain float64 twin."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vvgt_cli.metrics import ssim
+from vvgt_cli.metrics.ssim import C1, C2
+from vvgt_cli.optimize.loss import loss_gradient
+from vvgt_cli.optimize.ssim import KERNEL, add_ssim_gradient
+
+
+def pictures(height=31, width=26, seed=0):
+    rng = np.random.default_rng(seed)
+    smooth = np.cumsum(rng.normal(0, 0.1, (height, width, 4)), axis=1)
+    image = np.clip(0.5 + smooth, 0, 1)
+    return image, np.clip(image + rng.normal(0, 0.2, image.shape), 0, 1)
+
+
+def blurred(plane):
+    """Separable correlation in float64 with zeros beyond the border."""
+    kernel = KERNEL.astype(np.float64)
+    for axis in (0, 1):
+        plane = np.apply_along_axis(lambda line: np.convolve(line, kernel)[5:-5], axis, plane)
+    return plane
+
+
+def ssim_twin(image, target):
+    """Sum over pixels and RGB of SSIM (Wang et al. 2004), each window weighted with zeros outside, float64."""
+    total = 0.0
+    for c in range(3):
+        x, y = image[..., c], target[..., c]
+        m, n = blurred(x), blurred(y)
+        s, t, both = blurred(x * x) - m * m, blurred(y * y) - n * n, blurred(x * y) - m * n
+        total += ((2 * m * n + C1) * (2 * both + C2) / ((m * m + n * n + C1) * (s + t + C2))).sum()
+    return total
+
+
+def test_the_kernels_ssim_is_the_twins_and_inside_the_border_the_metrics():
+    x, y = pictures()
+    got = add_ssim_gradient(np.float32(x), np.float32(y), 1.0, np.zeros(x.shape, np.float32))
+    assert abs(got - ssim_twin(x, y) / (3 * x[..., 0].size)) < 1e-4
+    wide = np.zeros((80, 80, 4)), np.zeros((80, 80, 4))
+    for full, part in zip(wide, (x, y), strict=True):
+        full[20 : 20 + x.shape[0], 20 : 20 + x.shape[1]] = part
+    whole = add_ssim_gradient(*(np.float32(w) for w in wide), 1.0, np.zeros((80, 80, 4), np.float32))
+    inside = (1 - ssim(*(w[..., :3] for w in wide))) * 70 * 70  # beyond 5 pixels from the border both are blank
+    assert abs((1 - whole) * 80 * 80 - inside) < 1e-3 * inside
+
+
+@pytest.mark.parametrize("size", [(31, 26), (7, 5), (1, 1)])
+def test_ssim_gradient_is_the_twins_slope(size):
+    x, y = (p.astype(np.float32) for p in pictures(*size))
+    grad = np.full(x.shape, 2.0, np.float32)
+    add_ssim_gradient(x, y, 0.7, grad)
+    assert (grad[..., 3] == 2).all()  # added to, and alpha untouched
+    rng = np.random.default_rng(1)
+    for _ in range(10):
+        d = rng.normal(size=x.shape) * 1e-4
+        slope = -0.7 * (ssim_twin(x + d, y) - ssim_twin(x - d, y)) / 2
+        assert (
+            abs(((grad - 2)[..., :3] * d[..., :3]).sum() - slope)
+            < 2e-3 * np.abs((grad - 2)[..., :3] * d[..., :3]).sum()
+        )
+
+
+def test_pixel_losses_by_hand():
+    image, target = np.zeros((1, 2, 4), np.float32), np.zeros((1, 2, 4), np.float32)
+    image[0, 0] = 0.5, 0.0, 0.25, 0.5
+    target[0, 1, 1] = 1.0
+    grad = np.empty_like(image)
+    squares = loss_gradient(image, target, np.float32(1), np.float32(2), np.float32(0.5), grad)
+    assert squares == pytest.approx(0.25 + 0.0625 + 1.0 + 0.5 * 0.25)
+    np.testing.assert_allclose(grad[0], [[3, 0, 2, 1.5], [0, -5, 0, 0]])

@@ -1,0 +1,110 @@
+"""Image-space refinement: gradient descent on Gaussians until their pictures match given views."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from vvgt_cli.errors import UsageError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from vvgt_cli.cameras import Camera
+    from vvgt_cli.gaussians import Gaussians
+
+METHODS = ("frame", "adam")
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class OptimizeOptions:
+    """How to descend, and when to stop.
+
+    Attributes:
+        steps: of one view each, at most; rates fall to zero over them.
+        method: "frame" steps in each Gaussian's own frame, "adam" on the file's fields with the rates of 3DGS.
+        time_budget: seconds after which no step is begun; rates fall to zero over it if it ends first. Runs with one
+            do not repeat to the byte.
+        target_psnr: dB on the check views at which to stop.
+        l1, l2, ssim: weights of the sums over pixels and RGB of |r|, r^2 and 1 - SSIM.
+        alpha: weight of the alpha channel's |r| and r^2 beside a colour channel's.
+        check_every: steps between two looks at the check views.
+        patience: looks in a row without a gain of 0.01 dB after which to stop.
+        seed: of the order of views.
+    """
+
+    steps: int = 200
+    method: str = "frame"
+    time_budget: float | None = None
+    target_psnr: float | None = None
+    l1: float = 0.0
+    l2: float = 1.0
+    ssim: float = 0.0
+    alpha: float = 0.5
+    check_every: int = 25
+    patience: int = 3
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.method not in METHODS:
+            raise UsageError(f"method {self.method!r}; expected one of {', '.join(METHODS)}")
+        if self.steps < 0:
+            raise UsageError(f"{self.steps} steps; expected 0 or more")
+        if min(self.check_every, self.patience) < 1:
+            raise UsageError(f"check every {self.check_every} steps, patience {self.patience}; expected at least 1")
+        if self.time_budget is not None and not self.time_budget >= 0:
+            raise UsageError(f"time budget {self.time_budget} s; expected 0 or more")
+        if not min(self.l1, self.l2, self.ssim, self.alpha) >= 0 or self.l1 + self.l2 + self.ssim <= 0:
+            raise UsageError("weights of the loss: expected none below 0 and one of l1, l2, ssim above")
+
+
+@dataclass
+class OptimizeRecord:
+    """What a run did.
+
+    Attributes:
+        steps: taken, and ``kept``: the step whose Gaussians were returned (0: the input).
+        seconds: wall time.
+        reason: why it ended: "steps", "time", "target", "no gain".
+        psnr_before, psnr_after: dB on the check views; None without any.
+        checks: (step, seconds, dB) of each look at the check views.
+    """
+
+    steps: int = 0
+    kept: int = 0
+    seconds: float = 0.0
+    reason: str = "steps"
+    psnr_before: float | None = None
+    psnr_after: float | None = None
+    checks: list[tuple[int, float, float]] = field(default_factory=list)
+
+
+def optimize(
+    gaussians: Gaussians,
+    cameras: Sequence[Camera],
+    images: np.ndarray,
+    options: OptimizeOptions | None = None,
+    check: tuple[Sequence[Camera], np.ndarray] | None = None,
+    progress: Progress | None = None,
+) -> tuple[Gaussians, OptimizeRecord]:
+    """Descend on the difference between pictures of Gaussians and views.
+
+    Args:
+        gaussians: where to start.
+        cameras, images: training views, (n, h, w, 4) float32 premultiplied.
+        options: how, and when to stop.
+        check: cameras and images to judge by: what is returned is the best that they have seen, the input included.
+            Without them the last step's Gaussians are returned.
+        progress: called after each step.
+
+    Raises:
+        DataError: no views, or images that do not fit their cameras.
+    """
+    from vvgt_cli.optimize.loop import run
+
+    return run(gaussians, cameras, images, options or OptimizeOptions(), check, progress)
+
+
+__all__ = ["METHODS", "OptimizeOptions", "OptimizeRecord", "optimize"]

@@ -1,0 +1,25 @@
+"""Numba kernel of the loss: its gradient with respect to the picture, and how far the picture is off."""
+
+from __future__ import annotations
+
+import numba as nb
+import numpy as np
+
+
+@nb.njit(parallel=True, cache=True)
+def loss_gradient(image, target, l1, l2, alpha_weight, grad):
+    """Fill ``grad`` (h, w, 4) with the gradient of ``sum l1 |r| + l2 r^2`` over RGB, alpha's share weighted.
+
+    ``image``, ``target`` (h, w, 4) float32. Returns the sum of r^2, alpha's weighted too.
+    """
+    height, width = image.shape[:2]
+    squares = np.zeros(height)
+    for y in nb.prange(height):
+        for x in range(width):
+            for f in range(4):
+                r = image[y, x, f] - target[y, x, f]
+                weight = alpha_weight if f == 3 else np.float32(1)
+                slope = np.float32(2) * l2 * r + (l1 if r > 0 else -l1 if r < 0 else np.float32(0))
+                grad[y, x, f] = weight * slope
+                squares[y] += np.float64(weight * r * r)
+    return squares.sum()

@@ -1,0 +1,110 @@
+"""What is descended on: a state renders itself, takes steps, and can be put back to where it was."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from vvgt_cli.cameras import Camera
+from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.splat import Projection, project, render_backward
+from vvgt_cli.splat.reference import rotations
+from vvgt_cli.splat.render import moments, own_frame_backward, project_factors
+
+WARM_UP = 3  # steps
+SMALLEST = 1e-7  # standard deviation, unit frame
+
+
+class OwnFrame:
+    """Covariance ``M M^T``; steps ``mu += M d``, ``M <- M (I + E + E^2 / 2)``, and of opacity logits and colours.
+
+    Rates go with the root of the running error of the pictures: the nearer, the smaller.
+    """
+
+    RATES = np.array([0.05, 0.02, 0.01, 0.05, 0.01])  # d, E on and off the diagonal, logit, colour
+    CLIPS = np.array([0.5, 1.0, 0.3])  # d, logit, E
+    ERROR, LARGEST = 0.05, 1.5
+    BETAS = 0.6, 0.999
+
+    def __init__(self, gaussians: Gaussians, cameras: Sequence[Camera]) -> None:
+        from vvgt_cli.optimize import steps
+
+        scales = np.exp(gaussians.log_scales.astype(np.float64))
+        self.arrays = (
+            gaussians.means.copy(),
+            np.ascontiguousarray(rotations(gaussians.quaternions) * scales[:, None, :], np.float32),
+            gaussians.opacity_logits.copy(),
+            np.maximum(gaussians.colors, 0),
+        )
+        self.first, self.second = (np.zeros((len(gaussians), steps.COUNT), np.float32) for _ in range(2))
+        self.pixel = float(np.median([np.linalg.norm(camera.position) / camera.fx for camera in cameras]))
+        self.step = 0
+
+    @property
+    def colors(self) -> np.ndarray:
+        return self.arrays[3]
+
+    def project(self, camera: Camera) -> Projection:
+        means, factors, logits, _ = self.arrays
+        return project_factors(means, factors, logits, camera)
+
+    def descend(
+        self, camera: Camera, projection: Projection, image: np.ndarray, grad: np.ndarray, error: float, pace: float
+    ) -> None:
+        """One step; ``error`` RMS of the pictures so far, ``pace`` in [0, 1] of the schedule."""
+        from vvgt_cli.optimize import steps
+
+        means, factors, _, colors = self.arrays
+        pairs = moments(projection, colors, image, grad)
+        slopes = own_frame_backward(means, factors, colors, camera, projection, pairs)
+        self.step += 1
+        pace *= min(self.LARGEST, np.sqrt(error / self.ERROR)) * min(1.0, self.step / WARM_UP)
+        steps.own_frame(
+            slopes.frame, slopes.opacity_logits, slopes.colors, self.RATES * pace, self.CLIPS, self.pixel,
+            *self.BETAS, self.step, *self.arrays, self.first, self.second,
+        )  # fmt: skip
+
+    def gaussians(self) -> Gaussians:
+        """As a file has them: singular values and vectors of M."""
+        from vvgt_cli.vbm.shape import quaternions
+
+        means, factors, logits, colors = self.arrays
+        axes, scales, _ = np.linalg.svd(factors.astype(np.float64))
+        return Gaussians(means, np.log(np.maximum(scales, SMALLEST)), quaternions(axes), logits, colors)
+
+
+class Fields:
+    """Adam on the fields of `Gaussians` with the rates of 3DGS (Kerbl et al. 2023), nothing else of theirs."""
+
+    RATES = (5e-4, 5e-3, 1e-3, 5e-2, 2.5e-3 * 0.28209479177387814)  # lengths: 1.6e-4 x an extent of 3.3
+    BETAS = 0.9, 0.999
+
+    def __init__(self, gaussians: Gaussians, cameras: Sequence[Camera]) -> None:
+        g = gaussians
+        fields = (g.means, g.log_scales, g.quaternions, g.opacity_logits, g.colors)
+        self.arrays = tuple(array.copy() for array in fields)
+        self.running = [(np.zeros(array.size, np.float32), np.zeros(array.size, np.float32)) for array in fields]
+        self.step = 0
+
+    @property
+    def colors(self) -> np.ndarray:
+        return np.maximum(self.arrays[4], 0)
+
+    def project(self, camera: Camera) -> Projection:
+        return project(self.gaussians(), camera)
+
+    def descend(
+        self, camera: Camera, projection: Projection, image: np.ndarray, grad: np.ndarray, error: float, pace: float
+    ) -> None:
+        """One step; the error does not matter, nor does the schedule: 3DGS' rates are constant over so few steps."""
+        from vvgt_cli.optimize import steps
+
+        slopes = render_backward(self.gaussians(), camera, projection, image, grad)
+        self.step += 1
+        found = (slopes.means, slopes.log_scales, slopes.quaternions, slopes.opacity_logits, slopes.colors)
+        for array, slope, rate, (first, second) in zip(self.arrays, found, self.RATES, self.running, strict=True):
+            steps.adam(array.reshape(-1), slope.reshape(-1), rate, *self.BETAS, self.step, first, second)
+
+    def gaussians(self) -> Gaussians:
+        return Gaussians(*self.arrays)
