@@ -3,11 +3,11 @@
     python benchmarks/dvr_vtk.py SCENES.tsv DATA_DIR TF_DIR -o docs/dvr-vtk.csv
     python benchmarks/dvr_vtk.py --table docs/dvr-vtk.csv
 
-vtkFixedPointVolumeRayCastMapper with linear interpolation, as displayed; the same number of threads, one ray a pixel on
-both sides, the same mean distance between samples. Volumes are padded by a transparent voxel, so that VTK's box (between
-the outer centres) and ours show the same. Times are medians over the views, VTK's of a whole `Render`; `ratio` is the
-median over alternated pairs. Errors are of RGB in 8 bits against our kernel at 1/16 voxel. `needed` counts the samples in
-visible matter before a ray is opaque (every eighth pixel, by the float64 twin), `floor_ms` their arithmetic.
+vtkFixedPointVolumeRayCastMapper with linear interpolation, as displayed; the same number of threads, one ray a pixel
+on both sides, the same mean distance between samples. Volumes are padded by a transparent voxel, so that VTK's box
+(between the outer centres) and ours show the same. Times are medians over the views, VTK's of a whole `Render`; `ratio`
+is the median over alternated pairs. Errors are of RGB in 8 bits against our kernel at 1/16 voxel. `needed` counts the
+samples in visible matter before a ray is opaque (every eighth pixel, by the float64 twin), `floor_ms` their arithmetic.
 """
 
 from __future__ import annotations

@@ -1,0 +1,156 @@
+"""Renderers behind one switch: torch against the float64 twin, VTK against the kernel, errors of one line."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vvgt_cli.cameras.sets import look_at
+from vvgt_cli.dvr import RenderSettings, Scene, render_view_reference, render_views
+from vvgt_cli.dvr import vtk as vtk_renderer
+from vvgt_cli.dvr.backends import render_views_with
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.transfer.colormap import ColorMap
+from vvgt_cli.transfer.function import TransferFunction
+from vvgt_cli.transfer.opacity import PiecewiseOpacity
+from vvgt_cli.volume import Volume
+
+FINE = RenderSettings(step=0.25, samples=1)
+NODES = np.array([0.0, 0.3, 0.5, 1.0])
+COLORS = np.array([[0, 0, 1], [0, 1, 0], [1, 1, 0], [1, 0, 0]], float)
+
+
+def scene(spacing=(1.0, 1.0, 1.5), bad=False):
+    z, y, x = np.meshgrid(*[np.linspace(-1, 1, n) for n in (16, 20, 24)], indexing="ij")
+    data = np.exp(-2 * (x * x + 1.5 * y * y + 0.7 * z * z) + 0.4 * np.sin(3 * x + y)).astype(np.float32)
+    if bad:
+        data[4:6, 8:10, 12] = np.nan
+    opacity = PiecewiseOpacity(NODES, np.array([0, 0, 0.6, 0.2]))
+    return Scene.build(Volume(data, spacing), TransferFunction("t", opacity, ColorMap(NODES, COLORS)), 1.0)
+
+
+def view(width=40, height=32, eye=(2.2, -1.6, 1.1)):
+    return look_at(eye, width=width, height=height, fov=40)
+
+
+def torch_view(device, made, camera, settings):
+    from vvgt_cli.dvr.cuda import view_renderer
+
+    return view_renderer(made, settings, device)(camera)
+
+
+@pytest.fixture(params=["cpu", "cuda"])
+def device(request):
+    torch = pytest.importorskip("torch")
+    if request.param == "cuda" and not torch.cuda.is_available():
+        pytest.skip("no CUDA device")
+    return request.param
+
+
+@pytest.mark.parametrize("eye", [(2.2, -1.6, 1.1), (4, 0, 0), (0.1, 0.2, -0.3)])
+@pytest.mark.parametrize("bad", [False, True])
+def test_torch_matches_the_twin(device, eye, bad):
+    made, camera = scene(bad=bad), view(13, 13, eye)  # from (4, 0, 0) the middle ray is parallel to two axes
+    image = torch_view(device, made, camera, RenderSettings(step=0.125, samples=1))
+    assert image.dtype == np.float32
+    assert np.isfinite(image).all()
+    error = np.abs(image - render_view_reference(made, camera, step=1 / 16))
+    assert error.mean() < 5e-4
+    assert bad or error.max() < 5e-3  # a segment that ends in a cell with NaN is dropped whole
+
+
+def test_torch_integrates_pixels_as_the_kernel_does(device):
+    made, camera = scene(), view()
+    for settings in (RenderSettings(step=0.5), RenderSettings(step=0.5, samples=2, adaptive=False)):
+        kernel = render_views(made, [camera], settings)[0]
+        np.testing.assert_allclose(torch_view(device, made, camera, settings), kernel, atol=5e-3)  # sub-segments differ
+
+
+def test_the_kernel_is_the_cpu_renderer():
+    made, cameras, seen = scene(), [view(), view(eye=(0, 3, 1))], []
+    images = render_views_with("cpu", made, cameras, FINE, progress=lambda *state: seen.append(state))
+    assert images.tobytes() == render_views(made, cameras, FINE).tobytes()
+    assert seen == [(1, 2), (2, 2)]
+
+
+def test_what_a_renderer_cannot_do_is_said_in_one_line(monkeypatch):
+    with pytest.raises(UsageError, match=r"renderer 'gpu'; expected one of cpu, cuda, vtk"):
+        render_views_with("gpu", scene(), [view()])
+    with pytest.raises(UsageError, match="no lighting"):
+        render_views_with("cpu", scene(), [view()], shade=True)
+    monkeypatch.setitem(sys.modules, "torch", None)
+    with pytest.raises(UsageError, match=r"needs torch; install vvgt\[cuda\]"):
+        render_views_with("cuda", scene(), [view()])
+
+
+def test_a_machine_without_cuda_is_told_so():
+    torch = pytest.importorskip("torch")
+    if torch.cuda.is_available():
+        pytest.skip("this machine has CUDA")
+    with pytest.raises(DataError, match="no CUDA device"):
+        render_views_with("cuda", scene(), [view()])
+
+
+def test_a_machine_without_opengl_is_told_so(monkeypatch):
+    monkeypatch.setattr(vtk_renderer, "PROBE", "raise SystemExit(3)")
+    with pytest.raises(DataError, match="no off-screen OpenGL; install EGL or OSMesa"):
+        render_views_with("vtk", scene(), [view()])
+
+
+VTK_VIEWS = """
+import sys
+import numpy as np
+from test_dvr_backends import FINE, decentred, scene, view
+from vvgt_cli.dvr.backends import view_renderer
+draw, lit = (view_renderer("vtk", scene(), FINE, shade=shade) for shade in (False, True))
+np.savez(sys.argv[1], plain=draw(view()), decentred=draw(decentred()), lit=lit(view()))
+"""
+
+
+def decentred():
+    camera = view()
+    return replace(camera, cx=camera.cx - 5, cy=camera.cy + 3, fy=camera.fy * 1.2)
+
+
+@pytest.fixture(scope="module")
+def from_vtk(tmp_path_factory):
+    """VTK's views, drawn by a process of its own: VTK may crash where OpenGL is incomplete."""
+    try:
+        vtk_renderer.require_opengl()
+    except DataError as error:
+        pytest.skip(str(error))
+    path = tmp_path_factory.mktemp("vtk") / "views.npz"
+    folders = os.pathsep.join([str(Path(__file__).parent), *filter(None, [os.environ.get("PYTHONPATH")])])
+    done = subprocess.run(
+        [sys.executable, "-c", VTK_VIEWS, path],
+        capture_output=True,
+        text=True,
+        env=os.environ | {"PYTHONPATH": folders},
+    )
+    assert done.returncode == 0, done.stderr
+    return np.load(path)
+
+
+def decibels(a, b):
+    """PSNR of two images in 8 bits."""
+    a, b = (np.round(255 * np.clip(i, 0, 1)) / 255 for i in (a, b))
+    return -10 * np.log10(np.mean((a - b) ** 2))
+
+
+@pytest.mark.parametrize(("name", "camera"), [("plain", view()), ("decentred", decentred())])
+def test_vtk_agrees_with_the_kernel(from_vtk, name, camera):
+    ours = render_views(scene(), [camera], FINE)[0]
+    assert from_vtk[name].dtype == np.float32
+    assert decibels(from_vtk[name][..., :3], ours[..., :3]) > 45
+    assert decibels(from_vtk[name][..., 3], ours[..., 3]) > 45
+
+
+def test_vtk_lights_only_where_asked(from_vtk):
+    assert np.abs(from_vtk["lit"][..., :3] - from_vtk["plain"][..., :3]).max() > 0.1
+    np.testing.assert_allclose(from_vtk["lit"][..., 3], from_vtk["plain"][..., 3], atol=0.02)
