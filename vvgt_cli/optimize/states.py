@@ -22,7 +22,7 @@ class OwnFrame:
     Rates go with the root of the running error of the pictures: the nearer, the smaller.
     """
 
-    RATES = np.array([0.05, 0.02, 0.01, 0.05, 0.01])  # d, E on and off the diagonal, logit, colour
+    RATES = np.array([0.05, 0.025, 0.0125, 0.03, 0.008])  # d, E on and off the diagonal, logit, colour
     CLIPS = np.array([0.5, 1.0, 0.3])  # d, logit, E
     ERROR, LARGEST = 0.05, 1.5
     BETAS = 0.6, 0.999

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 import numba as nb
-import numpy as np
 
 from vvgt_cli.jit import inlined
+from vvgt_cli.splat.constants import DILATION
 
 EPSILON = 1e-15
 COUNT = 13  # own frame: d (3), E (6), opacity logit, colour (3)
@@ -26,6 +26,29 @@ def _adam(g, k, i, first, second, beta1, beta2, fix1, fix2):
 @_jit
 def _clip(value, bound):
     return min(max(value, -bound), bound)
+
+
+@_jit
+def _gain(factors, k, i, pixel):
+    """How much further axis i may go than one of many pixels: the dilation hides part of its step, at most 3."""
+    size = factors[k, 0, i] ** 2 + factors[k, 1, i] ** 2 + factors[k, 2, i] ** 2
+    return math.sqrt(min(1 + DILATION * pixel * pixel / max(size, 1e-30), 9.0))
+
+
+@_jit
+def _directions(frame, k, first, second, beta1, beta2, fix1, fix2):
+    """Adam's directions of d (3) and E (6)."""
+    return (
+        _adam(frame[k, 0], k, 0, first, second, beta1, beta2, fix1, fix2),
+        _adam(frame[k, 1], k, 1, first, second, beta1, beta2, fix1, fix2),
+        _adam(frame[k, 2], k, 2, first, second, beta1, beta2, fix1, fix2),
+        _adam(frame[k, 3], k, 3, first, second, beta1, beta2, fix1, fix2),
+        _adam(frame[k, 4], k, 4, first, second, beta1, beta2, fix1, fix2),
+        _adam(frame[k, 5], k, 5, first, second, beta1, beta2, fix1, fix2),
+        _adam(frame[k, 6], k, 6, first, second, beta1, beta2, fix1, fix2),
+        _adam(frame[k, 7], k, 7, first, second, beta1, beta2, fix1, fix2),
+        _adam(frame[k, 8], k, 8, first, second, beta1, beta2, fix1, fix2),
+    )
 
 
 @nb.njit(parallel=True, cache=True)
@@ -49,39 +72,27 @@ def own_frame(
     """mu += M d, M <- M (I + E + E^2 / 2): d, E, logit and colour by Adam; ``step`` counts from 1.
 
     ``rates`` (5,): d, E on and off the diagonal, logit, colour. ``clips`` (3,): d, logit, E. ``pixel`` is a pixel's
-    width at the scene: an axis of s pixels moves the picture by s^2 / (s^2 + 0.3) of what it would undilated.
+    width at the scene.
     """
     fix1, fix2 = 1 / (1 - beta1**step), 1 / (1 - beta2**step)
     for k in nb.prange(means.shape[0]):
-        gain = np.empty(3)
-        d = np.empty(3)
-        e = np.empty((3, 3))
+        p0, p1, p2 = _gain(factors, k, 0, pixel), _gain(factors, k, 1, pixel), _gain(factors, k, 2, pixel)
+        d0, d1, d2, a0, a1, a2, b0, b1, b2 = _directions(frame, k, first, second, beta1, beta2, fix1, fix2)
+        d0, d1, d2 = (_clip(d0 * rates[0] * p0, clips[0]), _clip(d1 * rates[0] * p1, clips[0]),
+                      _clip(d2 * rates[0] * p2, clips[0]))  # fmt: skip
+        a0, a1, a2 = (_clip(a0 * rates[1] * min(p0 * p0, 4.0), clips[2]),
+                      _clip(a1 * rates[1] * min(p1 * p1, 4.0), clips[2]),
+                      _clip(a2 * rates[1] * min(p2 * p2, 4.0), clips[2]))  # fmt: skip
+        b0, b1, b2 = (_clip(b0 * rates[2] * min(p0 * p1, 4.0), clips[2]),
+                      _clip(b1 * rates[2] * min(p0 * p2, 4.0), clips[2]),
+                      _clip(b2 * rates[2] * min(p1 * p2, 4.0), clips[2]))  # fmt: skip
         for i in range(3):
-            size = factors[k, 0, i] ** 2 + factors[k, 1, i] ** 2 + factors[k, 2, i] ** 2
-            gain[i] = math.sqrt(min(1 + 0.3 * pixel * pixel / max(size, 1e-30), 9.0))
-        for i in range(3):
-            d[i] = _adam(frame[k, i], k, i, first, second, beta1, beta2, fix1, fix2) * rates[0] * gain[i]
-            d[i] = -_clip(d[i], clips[0])
-            grown = _adam(frame[k, 3 + i], k, 3 + i, first, second, beta1, beta2, fix1, fix2) * rates[1]
-            e[i, i] = -_clip(grown * min(gain[i] * gain[i], 4.0), clips[2])
-        for i in range(2):
-            for j in range(i + 1, 3):
-                n = 5 + i + j
-                sheared = _adam(frame[k, n], k, n, first, second, beta1, beta2, fix1, fix2) * rates[2]
-                e[i, j] = -_clip(sheared * min(gain[i] * gain[j], 4.0), clips[2])
-                e[j, i] = e[i, j]
-        m = np.empty((3, 3))
-        for i in range(3):
-            for j in range(3):
-                m[i, j] = factors[k, i, j]
-        for i in range(3):
-            means[k, i] += m[i, 0] * d[0] + m[i, 1] * d[1] + m[i, 2] * d[2]
-            for j in range(3):
-                change = 0.0
-                for n in range(3):
-                    half = e[n, j] + 0.5 * (e[n, 0] * e[0, j] + e[n, 1] * e[1, j] + e[n, 2] * e[2, j])
-                    change += m[i, n] * half
-                factors[k, i, j] = m[i, j] + change
+            m0, m1, m2 = factors[k, i, 0], factors[k, i, 1], factors[k, i, 2]
+            means[k, i] -= m0 * d0 + m1 * d1 + m2 * d2
+            e0, e1, e2 = m0 * a0 + m1 * b0 + m2 * b1, m0 * b0 + m1 * a1 + m2 * b2, m0 * b1 + m1 * b2 + m2 * a2  # M E
+            factors[k, i, 0] = m0 - e0 + 0.5 * (e0 * a0 + e1 * b0 + e2 * b1)
+            factors[k, i, 1] = m1 - e1 + 0.5 * (e0 * b0 + e1 * a1 + e2 * b2)
+            factors[k, i, 2] = m2 - e2 + 0.5 * (e0 * b1 + e1 * b2 + e2 * a2)
         turn = _adam(logit_grad[k], k, 9, first, second, beta1, beta2, fix1, fix2) * rates[3]
         logits[k] -= _clip(turn, clips[1])
         for i in range(3):

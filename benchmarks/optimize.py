@@ -1,0 +1,167 @@
+"""Refinement: time of a step's parts, and what steps gain on a list of scenes.
+
+    python benchmarks/optimize.py parts [VOLUME ...] [--gaussians K]
+    PYTHONPATH=. python benchmarks/optimize.py gain SCENES.tsv DATA_DIR TF_DIR -o CSV [--steps N] [--method frame|adam]
+
+`parts` prints milliseconds with one and with two threads (medians of alternated repeats, 400 px) and a floor: the
+arithmetic of the tile rows that the Gaussians' pixel boxes cover, for forward and backward pass (none of it is saved
+where pixels end early, so opaque scenes may lie below). `gain` starts from the closed form of each scene; references as
+in `closed_form.py`, training views and check views with 2 x 2 rays where neighbours differ.
+"""
+
+from __future__ import annotations
+
+import csv
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import click
+import numba
+import numpy as np
+from closed_form import read_options
+from floors import alternate, flops, machine
+from splat import PIXEL_FLOPS, covered_pixels, sampled
+
+from vvgt_cli.cameras import default_views
+from vvgt_cli.dvr import render_views
+from vvgt_cli.dvr.render import SCORE_VIEWS
+from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.metrics import score_views
+from vvgt_cli.optimize import OptimizeOptions, optimize
+from vvgt_cli.optimize.loss import loss_gradient
+from vvgt_cli.optimize.ssim import add_ssim_gradient
+from vvgt_cli.optimize.states import OwnFrame
+from vvgt_cli.optimize.steps import own_frame
+from vvgt_cli.pipeline.source import SourceRequest, load
+from vvgt_cli.splat import blend, render
+from vvgt_cli.splat.kernel import project_factors, tile_lists
+from vvgt_cli.splat.render import depth_order, moments, own_frame_backward, pose
+from vvgt_cli.synth import open_volume
+from vvgt_cli.vbm import VbmOptions, backproject, initialise
+
+REPEATS = 9
+BACKWARD_FLOPS = 60  # a pixel: the forward's 30, colour against gradient 8, what is behind 5, nine sums 12, division
+
+
+def part_calls(gaussians: Gaussians, target: np.ndarray) -> dict[str, Callable[[], object]]:
+    """The parts of a step, each as a call of its own on fixed input."""
+    camera = default_views("train")[3]
+    state = OwnFrame(gaussians, [camera])
+    means, factors, logits, colors = state.arrays
+    p = state.project(camera)
+    depth = np.linalg.norm(means - camera.position, axis=1).astype(np.float32)
+    scratch = p.flat.copy(), depth.copy(), p.extent.copy()
+    order = depth_order(depth)
+    image = blend(p, colors, camera.height, camera.width)
+    grad = np.empty_like(image)
+    weights = np.float32(0), np.float32(1), np.float32(0.5)
+    loss_gradient(image, target, *weights, grad)
+    pairs = moments(p, colors, image, grad)
+    slopes = own_frame_backward(means, factors, colors, camera, p, pairs)
+    still = np.zeros(5), state.CLIPS, state.pixel, *state.BETAS, 1  # rates 0: the scene stays as it is
+    tiles_y = -(-camera.height // 16)
+    return {
+        "project": lambda: project_factors(means, factors, logits, *pose(camera), *scratch),
+        "sort": lambda: depth_order(depth),
+        "file into tiles": lambda: tile_lists(order, p.extent, p.tiles_x, tiles_y, numba.get_num_threads()),
+        "blend": lambda: blend(p, colors, camera.height, camera.width),
+        "loss": lambda: loss_gradient(image, target, *weights, grad),
+        "(ssim)": lambda: add_ssim_gradient(image, target, 0.2, np.zeros_like(grad)),
+        "moments": lambda: moments(p, colors, image, grad),
+        "gradients": lambda: own_frame_backward(means, factors, colors, camera, p, pairs),
+        "update": lambda: own_frame(
+            slopes.frame, slopes.opacity_logits, slopes.colors, *still, *state.arrays, state.first, state.second
+        ),
+    }
+
+
+@click.group()
+def main() -> None:
+    """Benchmarks of refinement."""
+
+
+@main.command()
+@click.argument("volumes", nargs=-1)
+@click.option("--gaussians", "count", default=100_000)
+def parts(volumes: tuple[str, ...], count: int) -> None:
+    """Milliseconds of a step's parts."""
+    print(machine())
+    rate = flops(np.float32)
+    most = numba.get_num_threads()
+    for name in volumes or ("example:frog", "example:channels"):
+        gaussians = sampled(open_volume(name), count)
+        camera = default_views("train")[3]
+        target = render(gaussians, camera) * np.float32(0.9)
+        columns = []
+        for threads in (1, most):
+            numba.set_num_threads(threads)
+            columns.append(alternate(part_calls(gaussians, target), REPEATS))
+        pixels = covered_pixels(OwnFrame(gaussians, [camera]).project(camera))
+        print(f"{name}: {len(gaussians)} Gaussians, {pixels / 1e6:.0f} million pixels; 1 thread, {most} threads")
+        for part in columns[0]:
+            print(f"  {part:<16}" + "".join(f"{column[part] * 1e3:9.2f}" for column in columns) + " ms")
+        for label, chosen in (
+            ("forward", ("project", "sort", "file into tiles", "blend")),
+            ("step", [part for part in columns[0] if part[0] != "("]),
+        ):
+            sums = [sum(column[part] for part in chosen) * 1e3 for column in columns]
+            print(f"  {label:<16}" + "".join(f"{value:9.2f}" for value in sums) + " ms")
+        floor = pixels * (PIXEL_FLOPS + BACKWARD_FLOPS) / rate * 1e3
+        print(f"  floor           {floor:9.2f} ms with {most} threads (flops, no early end)")
+
+
+def gain_row(scene, options: OptimizeOptions, budget: int) -> dict[str, str]:  # type: ignore[no-untyped-def]
+    """Closed form, refinement, and the scores of both on the test views."""
+    train, check, test = (default_views(which) for which in ("train", "check", "test"))
+    images, judge, reference = (render_views(scene, cameras, SCORE_VIEWS) for cameras in (train, check, test))
+    start, _ = backproject(initialise(scene, VbmOptions(max_gaussians=budget)), train, images)
+    began = time.perf_counter()
+    result, record = optimize(start, train, images, options, (check, judge))
+    seconds = time.perf_counter() - began
+    before, after = (
+        score_views(reference, (render(g, camera) for camera in test), perceptual=g is result) for g in (start, result)
+    )
+    numbers = {
+        "before": before.psnr, "psnr": after.psnr, "alpha_before": before.psnr_alpha, "psnr_alpha": after.psnr_alpha,
+        "ssim": after.ssim, "check_before": record.psnr_before, "check": record.psnr_after, "seconds": seconds,
+    }  # fmt: skip
+    texts = {key: f"{value:.3f}" for key, value in numbers.items() if value is not None}
+    return texts | {"steps": str(record.steps), "kept": str(record.kept), "reason": record.reason}
+
+
+@main.command()
+@click.argument("paths", nargs=3)
+@click.option("-o", "--output", required=True, help="CSV to write.")
+@click.option("--only", multiple=True, help="Scenes to measure (default: all).")
+@click.option("--steps", default=200)
+@click.option("--method", default="frame")
+@click.option("--max-gaussians", default=100_000)
+def gain(paths, output, only, steps, method, max_gaussians):
+    """PSNR before and after, a row a scene."""
+    scenes, data, functions = map(Path, paths)
+    rows = []
+    for line in scenes.read_text().splitlines():
+        if line.startswith("#") or not line.strip():
+            continue
+        name, volume, options, function = line.split("\t")
+        if only and name not in only:
+            continue
+        request = SourceRequest(
+            volume=str(data / volume),
+            tf=str(functions / function),
+            read=read_options(options),
+            unit_distance="mean-spacing",
+        )
+        row = gain_row(load(request).scene(), OptimizeOptions(steps=steps, method=method), max_gaussians)
+        rows.append({"scene": name, "method": method, **row})
+        print(rows[-1], file=sys.stderr)
+        with open(output, "w", newline="") as file:
+            writer = csv.DictWriter(file, list(rows[0]))
+            writer.writeheader()
+            writer.writerows(rows)
+
+
+if __name__ == "__main__":
+    main()
