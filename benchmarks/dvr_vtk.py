@@ -1,7 +1,7 @@
 """Our ray caster against VTK's CPU mapper, alternating in one run: a CSV row each, and docs/dvr.md's table.
 
-    python benchmarks/dvr_vtk.py SCENES.tsv DATA_DIR TF_DIR -o docs/dvr-vtk.csv
-    python benchmarks/dvr_vtk.py --table docs/dvr-vtk.csv
+    PYTHONPATH=. python benchmarks/dvr_vtk.py SCENES.tsv DATA_DIR TF_DIR -o docs/dvr-vtk.csv
+    PYTHONPATH=. python benchmarks/dvr_vtk.py --table docs/dvr-vtk.csv
 
 vtkFixedPointVolumeRayCastMapper with linear interpolation, as displayed; the same number of threads, one ray a pixel
 on both sides, the same mean distance between samples. Volumes are padded by a transparent voxel, so that VTK's box
