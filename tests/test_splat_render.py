@@ -8,7 +8,7 @@ import pytest
 from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.splat import blend, gather, gather_reference, project, render, render_reference
-from vvgt_cli.splat.constants import MIN_ALPHA
+from vvgt_cli.splat.constants import DILATION, MIN_ALPHA
 from vvgt_cli.splat.render import deal, depth_order
 
 EYE = (2.0, -1.7, 1.1)
@@ -168,3 +168,11 @@ def test_depths_sort_stably_and_tiles_are_dealt_out_whole():
     depth = np.float32(rng.choice([0, 1e-30, 0.5, 1, 1.0000001, 3e38], 2000) * rng.integers(1, 3, 2000) / 2)
     np.testing.assert_array_equal(depth_order(depth), np.argsort(depth, kind="stable"))
     np.testing.assert_array_equal(np.sort(deal(rng.integers(0, 9, 101))), np.arange(101))
+
+
+def test_a_quarter_of_the_dilation_shows_twice_the_size_averaged():
+    g, c = cloud(60, 11, scale=0.05), camera()
+    large = render(g, c.resized(2)).reshape(c.height, 2, c.width, 2, 4).mean(axis=(1, 3))
+    near = render(g, c, project(g, c, DILATION / 4))
+    far = render(g, c)
+    assert np.abs(near - large).mean() < 0.25 * np.abs(far - large).mean()

@@ -8,6 +8,7 @@ import pytest
 from vvgt_cli.cameras import default_views
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.splat import blend, project, render
+from vvgt_cli.splat.constants import DILATION
 from vvgt_cli.vbm import fit as fit_module
 from vvgt_cli.vbm.fit import BRIGHTEST, PRIOR, image_errors, solve_colors
 
@@ -58,6 +59,12 @@ def objective(gaussians: Gaussians, start: Gaussians, views: np.ndarray) -> np.n
     return residual + PRIOR * ((gaussians.colors.astype(np.float64) - start.colors) ** 2).sum(axis=0)
 
 
+@pytest.fixture
+def all_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fit_module, "ENOUGH", 0.0)
+
+
+@pytest.mark.usefixtures("all_rounds")
 def test_twin_of_the_normal_equations() -> None:
     """Enough rounds end at the dense solution of (A'A + PRIOR) c = A' v + PRIOR c0."""
     truth = cloud(24)
@@ -70,6 +77,7 @@ def test_twin_of_the_normal_equations() -> None:
     np.testing.assert_allclose(solved.colors, expected, atol=2e-4)
 
 
+@pytest.mark.usefixtures("all_rounds")
 def test_known_colours_come_back(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fit_module, "PRIOR", 1e-4)
     truth = cloud(24)
@@ -82,6 +90,7 @@ def test_known_colours_come_back(monkeypatch: pytest.MonkeyPatch) -> None:
         np.testing.assert_array_equal(getattr(solved, field), getattr(truth, field))
 
 
+@pytest.mark.usefixtures("all_rounds")
 def test_every_round_lowers_the_objective() -> None:
     truth = cloud(300, seed=3)
     start, views = with_colors(truth, 0.5), pictures(truth)
@@ -151,9 +160,27 @@ def test_repeats_to_the_byte_and_reports() -> None:
     truth = cloud(300, seed=3)
     start, views = with_colors(truth, 0.5), pictures(truth)
     seen = []
-    first = solve_colors(start, CAMERAS, views, progress=lambda done, total: seen.append((done, total)))
+    first = solve_colors(start, CAMERAS, views, 3, progress=lambda done, total: seen.append((done, total)))
     assert seen == [(1, 3), (2, 3), (3, 3)]
-    assert first.colors.tobytes() == solve_colors(start, CAMERAS, views).colors.tobytes()
+    assert first.colors.tobytes() == solve_colors(start, CAMERAS, views, 3).colors.tobytes()
+
+
+def test_rounds_end_where_they_gain_little() -> None:
+    truth = cloud(24)
+    seen: list[tuple[int, int]] = []
+    solve_colors(truth, CAMERAS, pictures(truth), 9, progress=lambda done, total: seen.append((done, total)))
+    assert seen == [(9, 9)]  # nothing to gain: one round
+
+
+@pytest.mark.usefixtures("all_rounds")
+def test_views_that_count_at_twice_the_size_draw_the_colours_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every view counted so: the solution for the smaller dilation."""
+    monkeypatch.setattr(fit_module, "PRIOR", 1e-4)
+    truth = cloud(24)
+    views = np.stack([blend(project(truth, c, DILATION / 4), truth.colors, 40, 40) for c in CAMERAS])
+    near = solve_colors(with_colors(truth, 0.5), CAMERAS, views, 30, twice_every=1)
+    far = solve_colors(with_colors(truth, 0.5), CAMERAS, views, 30)
+    assert np.abs(near.colors - truth.colors).mean() < 0.5 * np.abs(far.colors - truth.colors).mean()
 
 
 def test_image_errors() -> None:

@@ -8,7 +8,7 @@ import numba as nb
 import numpy as np
 
 from vvgt_cli.jit import inlined
-from vvgt_cli.splat.constants import DILATION, MIN_ALPHA, NEAR, TILE
+from vvgt_cli.splat.constants import MIN_ALPHA, NEAR, TILE
 
 _jit = inlined()
 SHIFT = TILE.bit_length() - 1
@@ -60,12 +60,12 @@ def _clear(k, depth, extent):
 
 
 @_jit
-def _place(k, x, y, z, sxx, sxy, syy, opacity, lens, flat, depth, extent):
+def _place(k, x, y, z, sxx, sxy, syy, opacity, lens, dilation, flat, depth, extent):
     """Fill row k of ``flat``, ``depth`` and ``extent`` from centre, 2D covariance (without dilation) and opacity."""
     fx, fy, cx, cy, width, height = lens
     inv = 1.0 / z
-    sxx += DILATION
-    syy += DILATION
+    sxx += dilation
+    syy += dilation
     det = sxx * syy - sxy * sxy
     if not (det > 0.0 and det < np.inf):
         return
@@ -84,11 +84,12 @@ def _place(k, x, y, z, sxx, sxy, syy, opacity, lens, flat, depth, extent):
 
 
 @nb.njit(parallel=True, cache=True)
-def project(means, log_scales, quats, logits, rot, trans, lens, flat, depth, extent):
+def project(means, log_scales, quats, logits, rot, trans, lens, dilation, flat, depth, extent):
     """EWA projection of every Gaussian.
 
-    ``lens`` (fx, fy, cx, cy, width, height). Fills ``flat`` (K, 6) float32: centre x, y, conic a, b, c, opacity;
-    ``depth`` (K,) float32; ``extent`` (K, 4) int32: pixel box x0, y0, x1, y1 (empty where nothing is seen).
+    ``lens`` (fx, fy, cx, cy, width, height); ``dilation`` px^2 on the diagonal. Fills ``flat`` (K, 6) float32: centre
+    x, y, conic a, b, c, opacity; ``depth`` (K,) float32; ``extent`` (K, 4) int32: pixel box x0, y0, x1, y1 (empty where
+    nothing is seen).
     """
     fx, fy = lens[0], lens[1]
     for k in nb.prange(means.shape[0]):
@@ -111,11 +112,11 @@ def project(means, log_scales, quats, logits, rot, trans, lens, flat, depth, ext
             sxx += px * px
             sxy += px * py
             syy += py * py
-        _place(k, x, y, z, sxx, sxy, syy, opacity, lens, flat, depth, extent)
+        _place(k, x, y, z, sxx, sxy, syy, opacity, lens, dilation, flat, depth, extent)
 
 
 @nb.njit(parallel=True, cache=True)
-def project_factors(means, factors, logits, rot, trans, lens, flat, depth, extent):
+def project_factors(means, factors, logits, rot, trans, lens, dilation, flat, depth, extent):
     """`project` for covariances ``M M^T`` given by ``factors`` (K, 3, 3) M."""
     fx, fy = lens[0], lens[1]
     for k in nb.prange(means.shape[0]):
@@ -136,7 +137,7 @@ def project_factors(means, factors, logits, rot, trans, lens, flat, depth, exten
             sxx += px * px
             sxy += px * py
             syy += py * py
-        _place(k, x, y, z, sxx, sxy, syy, opacity, lens, flat, depth, extent)
+        _place(k, x, y, z, sxx, sxy, syy, opacity, lens, dilation, flat, depth, extent)
 
 
 @nb.njit(parallel=True, cache=True)

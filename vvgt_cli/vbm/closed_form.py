@@ -12,7 +12,8 @@ from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.cameras.sets import FIELD_OF_VIEW, RADIUS
 from vvgt_cli.dvr.scene import BRICK, Scene
 from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.splat import render
+from vvgt_cli.splat import project, render
+from vvgt_cli.splat.constants import DILATION
 from vvgt_cli.vbm.fit import image_errors, solve_colors
 from vvgt_cli.vbm.inset import Opaque, opaque_field
 from vvgt_cli.vbm.moments import base_cells, exponents
@@ -24,10 +25,11 @@ MAX_BASE_CELLS = 5_000_000  # an upper bound: half of them are there, as a rule;
 FINEST = -2  # cells of a quarter voxel at most
 MIN_CELL = 1.2  # pixels: a smaller base cell cannot be told from its neighbours
 MARCH_SIZE = 160  # pixels of the visibility march
-REFINE_FROM = 0.5  # share of the budget given out before views say where the error is
+REFINE_FROM = 0.3  # share of the budget given out before views say where the error is
 REFINE_ROUNDS = 2
 REFINE_VIEWS = 8
-TWICE = 1.25  # weight of the error at twice the size where styles of surface compete
+TWICE = 0.6  # weight of the error at twice the size where styles of surface compete
+TWICE_EVERY = 6  # of so many views one counts as seen at twice its size when colours are solved
 
 Progress = Callable[[int, int], None]
 
@@ -169,7 +171,7 @@ def fit(
             best = loss, gaussians, how
         tick(number + 1, len(ways) + 1)
     assert best is not None
-    gaussians = solve_colors(best[1], cameras, views)
+    gaussians = solve_colors(best[1], cameras, views, twice_every=TWICE_EVERY)
     tick(len(ways) + 1, len(ways) + 1)
     return gaussians, best[2]
 
@@ -183,7 +185,6 @@ def _loss(gaussians: Gaussians, cameras: Sequence[Camera], views: np.ndarray, tw
     for camera, view in zip(cameras, views, strict=True):
         total += float(np.mean((render(gaussians, camera) - view)[..., :3] ** 2))
         if twice:
-            large = render(gaussians, camera.resized(2))
-            halved = large.reshape(camera.height, 2, camera.width, 2, 4).mean(axis=(1, 3))
+            halved = render(gaussians, camera, project(gaussians, camera, DILATION / 4))
             total += twice * float(np.mean((halved - view)[..., :3] ** 2))
     return total / len(cameras)

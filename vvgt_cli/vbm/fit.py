@@ -9,20 +9,23 @@ import numpy as np
 from vvgt_cli.cameras import Camera
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.splat import Projection, blend, gather, project, render
+from vvgt_cli.splat.constants import DILATION
 
 SEEN = 1e-2  # blending weight (pixels, over all views) below which views say nothing about a splat
 PRIOR = 1.0  # pixels of weight that the closed form's colour counts for
+ROUNDS = 6
+ENOUGH = 0.005  # share of the squared error below which another round is not worth its time
 BRIGHTEST = 2.0  # colours are kept in [0, 2]: more would flare up where other views thin the splats in front
 
 Progress = Callable[[int, int], None]
 
 
 def image_errors(gaussians: Gaussians, cameras: Sequence[Camera], views: np.ndarray) -> np.ndarray:
-    """(K,) sum over views and pixels of blending weight x absolute colour error; ``views`` (n, h, w, 4)."""
+    """(K,) sum over views and pixels of blending weight x absolute error of RGB and alpha; ``views`` (n, h, w, 4)."""
     sums = np.zeros((len(gaussians), 5))
     for camera, view in zip(cameras, views, strict=True):
         projection = project(gaussians, camera)
-        error = np.abs(view - render(gaussians, camera, projection))[..., :3].sum(axis=-1)
+        error = np.abs(view - render(gaussians, camera, projection)).sum(axis=-1)
         gather(projection, np.ascontiguousarray(np.broadcast_to(error, (4, *error.shape)), np.float32), sums)
     return sums[:, 1]
 
@@ -31,17 +34,22 @@ def solve_colors(
     gaussians: Gaussians,
     cameras: Sequence[Camera],
     views: np.ndarray,
-    rounds: int = 3,
+    rounds: int = ROUNDS,
     progress: Progress | None = None,
+    twice_every: int = 0,
 ) -> Gaussians:
     """Least-squares colours by preconditioned conjugate gradients: images are linear in them.
 
     Minimises ``sum |blend(c) - view|^2 + PRIOR |c - c0|^2`` over all views and RGB; ``views`` (n, h, w, 4) float32
     premultiplied. The preconditioner is the blending weight of each splat, so that one round is the normalised
-    back-projection of the residual.
+    back-projection of the residual. Rounds end early where one lowers the squared error by less than `ENOUGH`. Every
+    ``twice_every``-th view (0: none) counts as seen at twice its size.
     """
     count = len(gaussians)
-    projections = [project(gaussians, camera) for camera in cameras]
+    projections = [
+        project(gaussians, camera, DILATION / 4 if twice_every and i % twice_every == twice_every - 1 else DILATION)
+        for i, camera in enumerate(cameras)
+    ]
     start = gaussians.colors.astype(np.float64)
     colors = start.copy()
     residuals = [_residual(p, view, colors) for p, view in zip(projections, views, strict=True)]
@@ -50,16 +58,20 @@ def solve_colors(
     gradient = sums[:, 1:4]  # (K, 3)
     direction = gradient / weight
     slope = (gradient * direction).sum(axis=0)
+    error = sum(float(np.vdot(r, r)) for r in residuals)
     for done in range(rounds):
         images = [_forward(p, direction, view.shape) for p, view in zip(projections, views, strict=True)]
         curvature = sum((image.astype(np.float64) ** 2).sum(axis=(0, 1)) for image in images)
         curvature = curvature + PRIOR * (direction**2).sum(axis=0)
         length = np.where(curvature > 0, slope / np.where(curvature > 0, curvature, 1), 0)
         colors += length * direction
+        gained = float((length * slope).sum())  # an exact line search lowers the squared error by this
+        last = done == rounds - 1 or gained <= ENOUGH * error
         if progress:
-            progress(done + 1, rounds)
-        if done == rounds - 1:
+            progress(rounds if last else done + 1, rounds)
+        if last:
             break
+        error -= gained
         for residual, image in zip(residuals, images, strict=True):
             residual -= length.astype(np.float32) * image
         gradient = _back(projections, residuals, count)[:, 1:4] - PRIOR * (colors - start)
