@@ -17,6 +17,7 @@ from vvgt_cli.errors import VvgtError
 COMMANDS = {
     "convert": "vvgt_cli.cli.convert",
     "init": "vvgt_cli.cli.init",
+    "optimize": "vvgt_cli.cli.optimize",
     "render": "vvgt_cli.cli.render",
     "render-views": "vvgt_cli.cli.render_views",
     "evaluate": "vvgt_cli.cli.evaluate",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from vvgt_cli.errors import UsageError
 
@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from vvgt_cli.cameras import Camera
     from vvgt_cli.gaussians import Gaussians
 
-METHODS = ("frame", "adam")
+METHODS = ("frame", "adam", "3dgs")
+LOSS_3DGS = {"l1": 0.8, "l2": 0.0, "ssim": 0.2, "alpha": 0.0}
 Progress = Callable[[int, int], None]
 
 
@@ -23,20 +24,23 @@ class OptimizeOptions:
     """How to descend, and when to stop.
 
     Attributes:
-        steps: of one view each, at most; rates fall to zero over them.
-        method: "frame" steps in each Gaussian's own frame, "adam" on the file's fields with the rates of 3DGS.
-        time_budget: seconds after which no step is begun; rates fall to zero over it if it ends first. Runs with one
-            do not repeat to the byte.
+        steps: of one view each, at most; rates fall to zero over them. None: as many as the time budget allows.
+        method: "frame" steps in each Gaussian's own frame, "adam" on the file's fields with the rates of 3DGS, "3dgs"
+            as that, and the number of Gaussians grows and shrinks as in 3DGS.
+        max_gaussians: that "3dgs" may grow to; None: as many as it begins with.
+        time_budget: seconds from the first step on after which no other is begun; rates fall to zero over it if it
+            ends first. Runs with one do not repeat to the byte.
         target_psnr: dB on the check views at which to stop.
         l1, l2, ssim: weights of the sums over pixels and RGB of |r|, r^2 and 1 - SSIM.
         alpha: weight of the alpha channel's |r| and r^2 beside a colour channel's.
         check_every: steps between two looks at the check views.
         patience: looks in a row without a gain of 0.01 dB after which to stop.
-        seed: of the order of views.
+        seed: of the order of views, and of what "3dgs" draws.
     """
 
-    steps: int = 200
+    steps: int | None = 200
     method: str = "frame"
+    max_gaussians: int | None = None
     time_budget: float | None = None
     target_psnr: float | None = None
     l1: float = 0.0
@@ -50,7 +54,9 @@ class OptimizeOptions:
     def __post_init__(self) -> None:
         if self.method not in METHODS:
             raise UsageError(f"method {self.method!r}; expected one of {', '.join(METHODS)}")
-        if self.steps < 0:
+        if self.steps is None and self.time_budget is None:
+            raise UsageError("neither steps nor a time budget; expected one of them")
+        if self.steps is not None and self.steps < 0:
             raise UsageError(f"{self.steps} steps; expected 0 or more")
         if min(self.check_every, self.patience) < 1:
             raise UsageError(f"check every {self.check_every} steps, patience {self.patience}; expected at least 1")
@@ -58,6 +64,11 @@ class OptimizeOptions:
             raise UsageError(f"time budget {self.time_budget} s; expected 0 or more")
         if not min(self.l1, self.l2, self.ssim, self.alpha) >= 0 or self.l1 + self.l2 + self.ssim <= 0:
             raise UsageError("weights of the loss: expected none below 0 and one of l1, l2, ssim above")
+
+    @classmethod
+    def of(cls, method: str, **options: Any) -> OptimizeOptions:
+        """Options with the loss that belongs to a method: squares, or 3DGS' 0.8 L1 + 0.2 (1 - SSIM) of RGB alone."""
+        return cls(method=method, **((LOSS_3DGS | options) if method == "3dgs" else options))
 
 
 @dataclass
@@ -67,7 +78,7 @@ class OptimizeRecord:
     Attributes:
         steps: taken, and ``kept``: the step whose Gaussians were returned (0: the input).
         seconds: wall time.
-        reason: why it ended: "steps", "time", "target", "no gain".
+        reason: why it ended: "steps", "time", "target", "no gain", "interrupted".
         psnr_before, psnr_after: dB on the check views; None without any.
         checks: (step, seconds, dB) of each look at the check views.
     """
@@ -88,6 +99,7 @@ def optimize(
     options: OptimizeOptions | None = None,
     check: tuple[Sequence[Camera], np.ndarray] | None = None,
     progress: Progress | None = None,
+    stop: Callable[[], bool] | None = None,
 ) -> tuple[Gaussians, OptimizeRecord]:
     """Descend on the difference between pictures of Gaussians and views.
 
@@ -97,14 +109,15 @@ def optimize(
         options: how, and when to stop.
         check: cameras and images to judge by: what is returned is the best that they have seen, the input included.
             Without them the last step's Gaussians are returned.
-        progress: called after each step.
+        progress: called after each step with the steps taken and expected.
+        stop: asked before each step; True ends the run as a time budget would.
 
     Raises:
         DataError: no views, or images that do not fit their cameras.
     """
     from vvgt_cli.optimize.loop import run
 
-    return run(gaussians, cameras, images, options or OptimizeOptions(), check, progress)
+    return run(gaussians, cameras, images, options or OptimizeOptions(), check, progress, stop)
 
 
 __all__ = ["METHODS", "OptimizeOptions", "OptimizeRecord", "optimize"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.metrics import psnr
 from vvgt_cli.optimize import OptimizeOptions, OptimizeRecord, Progress
+from vvgt_cli.optimize.densify import Densified
 from vvgt_cli.optimize.states import Fields, OwnFrame
 from vvgt_cli.splat import blend
 
@@ -30,46 +31,59 @@ def run(
     options: OptimizeOptions,
     check: Check | None,
     progress: Progress | None,
+    stop: Callable[[], bool] | None,
 ) -> tuple[Gaussians, OptimizeRecord]:
     """`optimize` without its defaults."""
     for name, (some, views) in {"training": (cameras, images), "check": check or (cameras, images)}.items():
         _fit(name, some, views)
-    began = time.perf_counter()
+    entered = time.perf_counter()
     record = OptimizeRecord()
-    state: State = (OwnFrame if options.method == "frame" else Fields)(gaussians, cameras)
+    state = begin(gaussians, cameras, options)
     judge = _Judge(state, check, record)
     error, speed, order = None, 1.0, views_in_turn(len(cameras), options.seed)
     judge.look(0.0)
     record.psnr_before = judge.best
-    while record.steps < options.steps:
+    began = time.perf_counter()
+    while True:
         elapsed = time.perf_counter() - began
-        if options.time_budget is not None and elapsed >= options.time_budget:
-            record.reason = "time"
+        reason = _reason(options, judge, elapsed, stop)
+        if reason:
+            record.reason = reason
             break
         view = next(order)
-        share = max(record.steps / options.steps, elapsed / options.time_budget if options.time_budget else 0.0)
-        error = step(state, cameras[view], images[view], options, error, speed * _pace(share))
+        share = _share(options, record.steps, elapsed)
+        error = step(state, cameras[view], images[view], options, error, share, speed)
         record.steps += 1
         if progress:
-            progress(record.steps, options.steps)
-        if check and (record.steps % options.check_every == 0 or record.steps == options.steps):
-            if not judge.look(time.perf_counter() - began):
-                speed *= SLOWER
-            if options.target_psnr is not None and judge.best is not None and judge.best >= options.target_psnr:
-                record.reason = "target"
-                break
-            if judge.idle >= options.patience:
-                record.reason = "no gain"
-                break
+            progress(record.steps, _expected(options, record.steps, elapsed))
+        if record.steps % options.check_every == 0 and not judge.look(time.perf_counter() - began):
+            speed *= SLOWER
+    judge.look(time.perf_counter() - began)
     result = judge.result(gaussians)
-    record.seconds = time.perf_counter() - began
+    record.seconds = time.perf_counter() - entered
     return result, record
 
 
+def begin(gaussians: Gaussians, cameras: Sequence[Camera], options: OptimizeOptions) -> State:
+    """What the method descends on."""
+    if options.method == "3dgs":
+        return Densified(gaussians, cameras, options)
+    return (OwnFrame if options.method == "frame" else Fields)(gaussians, cameras)
+
+
 def step(
-    state: State, camera: Camera, target: np.ndarray, options: OptimizeOptions, error: float | None, pace: float
+    state: State,
+    camera: Camera,
+    target: np.ndarray,
+    options: OptimizeOptions,
+    error: float | None,
+    share: float,
+    speed: float,
 ) -> float:
-    """Forward, loss, backward, update for one view; takes and returns the running RMS error."""
+    """Forward, loss, backward, update for one view; takes and returns the running RMS error.
+
+    ``share`` in [0, 1] of the run lies behind; rates are multiplied by ``speed``.
+    """
     from vvgt_cli.optimize.loss import loss_gradient
     from vvgt_cli.optimize.ssim import add_ssim_gradient
 
@@ -82,7 +96,7 @@ def step(
         add_ssim_gradient(image, target, options.ssim, grad)
     now = math.sqrt(squares / ((3 + options.alpha) * camera.height * camera.width))
     error = now if error is None else MEMORY * error + (1 - MEMORY) * now
-    state.descend(camera, projection, image, grad, error, pace)
+    state.descend(camera, projection, image, grad, error, share, speed)
     return error
 
 
@@ -93,9 +107,30 @@ def views_in_turn(count: int, seed: int) -> Iterator[int]:
         yield from map(int, rng.permutation(count))
 
 
-def _pace(share: float) -> float:
-    """Half a cosine over the run."""
-    return 0.5 * (1 + math.cos(math.pi * min(share, 1.0)))
+def _share(options: OptimizeOptions, steps: int, elapsed: float) -> float:
+    """Of the run that lies behind, by steps or by time, whichever is more."""
+    by_steps = steps / options.steps if options.steps else 0.0
+    by_time = elapsed / options.time_budget if options.time_budget else 0.0
+    return min(max(by_steps, by_time), 1.0)
+
+
+def _expected(options: OptimizeOptions, steps: int, elapsed: float) -> int:
+    """Steps in all, as far as can be told."""
+    share = _share(options, steps, elapsed)
+    return max(steps, round(steps / share)) if options.time_budget and share > 0 else options.steps or steps
+
+
+def _reason(options: OptimizeOptions, judge: _Judge, elapsed: float, stop: Callable[[], bool] | None) -> str | None:
+    """Why to stop before the next step; None to go on."""
+    if options.steps is not None and judge.record.steps >= options.steps:
+        return "steps"
+    if options.time_budget is not None and elapsed >= options.time_budget:
+        return "time"
+    if options.target_psnr is not None and judge.best is not None and judge.best >= options.target_psnr:
+        return "target"
+    if judge.idle >= options.patience and judge.state.STEADY:
+        return "no gain"
+    return "interrupted" if stop and stop() else None
 
 
 def _fit(name: str, cameras: Sequence[Camera], images: np.ndarray) -> None:
@@ -117,32 +152,37 @@ class _Judge:
         self.idle = 0
 
     def look(self, seconds: float) -> bool:
-        """Score the state; True if it is the best so far. One that is worse is put back to the best."""
-        if self.check is None:
+        """Score the state, unless that has been done; True if it is the best so far.
+
+        One that is worse is put back to the best, where the method is one that never needs to get worse.
+        """
+        record = self.record
+        if self.check is None or (record.checks and record.checks[-1][0] == record.steps):
             return True
         scores = []
         for camera, view in zip(*self.check, strict=True):
             image = blend(self.state.project(camera), self.state.colors, camera.height, camera.width)
             scores.append(psnr(view[..., :3], image[..., :3]))
         now, self.idle = float(np.mean(scores)), self.idle + 1
-        self.record.checks.append((self.record.steps, seconds, now))
+        record.checks.append((record.steps, seconds, now))
         if self.best is None or now > self.best + GAIN:
             self.idle = 0
         if self.best is None or now > self.best:
-            self.best, self.kept, self.record.kept = now, tuple(a.copy() for a in self.state.arrays), self.record.steps
+            self.best, self.kept, record.kept = now, tuple(a.copy() for a in self.state.arrays), record.steps
             return True
-        assert self.kept is not None
-        for array, kept in zip(self.state.arrays, self.kept, strict=True):
-            array[...] = kept
+        if self.state.STEADY:
+            self._put_back()
         return False
+
+    def _put_back(self) -> None:
+        assert self.kept is not None
+        self.state.arrays = tuple(kept.copy() for kept in self.kept)
 
     def result(self, start: Gaussians) -> Gaussians:
         """The best state as Gaussians; the input itself where nothing was better."""
-        record = self.record
-        record.psnr_after = self.best
+        self.record.psnr_after = self.best
         if self.check is None:
-            record.kept = record.steps
-        elif self.kept is not None:
-            for array, kept in zip(self.state.arrays, self.kept, strict=True):
-                array[...] = kept
-        return self.state.gaussians() if record.kept else start
+            self.record.kept = self.record.steps
+        else:
+            self._put_back()
+        return self.state.gaussians() if self.record.kept else start

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
 
 from vvgt_cli.cameras import Camera
 from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.splat import Projection, project, render_backward
+from vvgt_cli.splat import Projection, project
 from vvgt_cli.splat.reference import rotations
-from vvgt_cli.splat.render import moments, own_frame_backward, project_factors
+from vvgt_cli.splat.render import fields_backward, moments, own_frame_backward, project_factors
 
 WARM_UP = 3  # steps
 SMALLEST = 1e-7  # standard deviation, unit frame
@@ -26,12 +27,13 @@ class OwnFrame:
     CLIPS = np.array([0.5, 1.0, 0.3])  # d, logit, E
     ERROR, LARGEST = 0.05, 1.5
     BETAS = 0.6, 0.999
+    STEADY = True  # it can be put back to where it was best, and a run without gain is at its end
 
     def __init__(self, gaussians: Gaussians, cameras: Sequence[Camera]) -> None:
         from vvgt_cli.optimize import steps
 
         scales = np.exp(gaussians.log_scales.astype(np.float64))
-        self.arrays = (
+        self.arrays: tuple[np.ndarray, ...] = (
             gaussians.means.copy(),
             np.ascontiguousarray(rotations(gaussians.quaternions) * scales[:, None, :], np.float32),
             gaussians.opacity_logits.copy(),
@@ -50,19 +52,27 @@ class OwnFrame:
         return project_factors(means, factors, logits, camera)
 
     def descend(
-        self, camera: Camera, projection: Projection, image: np.ndarray, grad: np.ndarray, error: float, pace: float
+        self,
+        camera: Camera,
+        projection: Projection,
+        image: np.ndarray,
+        grad: np.ndarray,
+        error: float,
+        share: float,
+        speed: float,
     ) -> None:
-        """One step; ``error`` RMS of the pictures so far, ``pace`` in [0, 1] of the schedule."""
+        """One step; ``error`` RMS of the pictures so far, ``share`` of the run behind, ``speed`` a factor of rates."""
         from vvgt_cli.optimize import steps
 
-        means, factors, _, colors = self.arrays
+        means, factors, logits, colors = self.arrays
         pairs = moments(projection, colors, image, grad)
         slopes = own_frame_backward(means, factors, colors, camera, projection, pairs)
         self.step += 1
-        pace *= min(self.LARGEST, np.sqrt(error / self.ERROR)) * min(1.0, self.step / WARM_UP)
+        pace = speed * 0.5 * (1 + math.cos(math.pi * share))  # half a cosine over the run
+        pace *= min(self.LARGEST, math.sqrt(error / self.ERROR)) * min(1.0, self.step / WARM_UP)
         steps.own_frame(
             slopes.frame, slopes.opacity_logits, slopes.colors, self.RATES * pace, self.CLIPS, self.pixel,
-            *self.BETAS, self.step, *self.arrays, self.first, self.second,
+            *self.BETAS, self.step, means, factors, logits, colors, self.first, self.second,
         )  # fmt: skip
 
     def gaussians(self) -> Gaussians:
@@ -79,12 +89,13 @@ class Fields:
 
     RATES = (5e-4, 5e-3, 1e-3, 5e-2, 2.5e-3 * 0.28209479177387814)  # lengths: 1.6e-4 x an extent of 3.3
     BETAS = 0.9, 0.999
+    STEADY = True
 
     def __init__(self, gaussians: Gaussians, cameras: Sequence[Camera]) -> None:
         g = gaussians
         fields = (g.means, g.log_scales, g.quaternions, g.opacity_logits, g.colors)
-        self.arrays = tuple(array.copy() for array in fields)
-        self.running = [(np.zeros(array.size, np.float32), np.zeros(array.size, np.float32)) for array in fields]
+        self.arrays: tuple[np.ndarray, ...] = tuple(array.copy() for array in fields)
+        self.running = [(np.zeros_like(array), np.zeros_like(array)) for array in fields]
         self.step = 0
 
     @property
@@ -95,16 +106,28 @@ class Fields:
         return project(self.gaussians(), camera)
 
     def descend(
-        self, camera: Camera, projection: Projection, image: np.ndarray, grad: np.ndarray, error: float, pace: float
+        self,
+        camera: Camera,
+        projection: Projection,
+        image: np.ndarray,
+        grad: np.ndarray,
+        error: float,
+        share: float,
+        speed: float,
     ) -> None:
         """One step; the error does not matter, nor does the schedule: 3DGS' rates are constant over so few steps."""
+        self.update(camera, projection, moments(projection, self.arrays[4], image, grad), self.RATES)
+
+    def update(self, camera: Camera, projection: Projection, pairs: np.ndarray, rates: Sequence[float]) -> None:
+        """Adam with ``rates`` for the fields, from the `moments` of a picture."""
         from vvgt_cli.optimize import steps
 
-        slopes = render_backward(self.gaussians(), camera, projection, image, grad)
+        slopes = fields_backward(self.gaussians(), camera, projection, pairs)
         self.step += 1
         found = (slopes.means, slopes.log_scales, slopes.quaternions, slopes.opacity_logits, slopes.colors)
-        for array, slope, rate, (first, second) in zip(self.arrays, found, self.RATES, self.running, strict=True):
-            steps.adam(array.reshape(-1), slope.reshape(-1), rate, *self.BETAS, self.step, first, second)
+        for array, slope, rate, (first, second) in zip(self.arrays, found, rates, self.running, strict=True):
+            values, moment, square = array.reshape(-1), first.reshape(-1), second.reshape(-1)
+            steps.adam(values, slope.reshape(-1), rate, *self.BETAS, self.step, moment, square)
 
     def gaussians(self) -> Gaussians:
         return Gaussians(*self.arrays)

@@ -26,7 +26,7 @@ class Stage:
     Attributes:
         name: what was done.
         seconds: wall time.
-        psnr: dB on the check views after it, None where none was rendered.
+        psnr: dB on the check views after it, None where none was rendered; ``psnr_before`` before it, where measured.
         kept: False where the stage did not lower the error and was dropped.
         note: what else there is to say, one line.
     """
@@ -36,6 +36,7 @@ class Stage:
     psnr: float | None = None
     kept: bool = True
     note: str = ""
+    psnr_before: float | None = None
 
     def detail(self) -> str:
         """The stage's result as the console shows it."""
@@ -49,14 +50,15 @@ class Stage:
 
 @dataclass
 class ConversionReport:
-    """What `vvgt convert` and `vvgt init` did; `to_json` is the `--report` file.
+    """What `vvgt convert`, `vvgt init` and `vvgt optimize` did; `to_json` is the `--report` file.
 
     Attributes:
-        command: "convert" or "init".
+        command: "convert", "init" or "optimize".
         volume, transfer_function, options: what went in, plain values.
         stages: in the order they ran.
         gaussians, bytes: of the file written.
         scores: on the test views, None for `init`.
+        refinement: what gradient descent did (`vvgt_cli.optimize.OptimizeRecord`), None without it.
         seconds: wall time of the whole run, without the interpreter's start.
     """
 
@@ -68,6 +70,7 @@ class ConversionReport:
     gaussians: int = 0
     bytes: int = 0
     scores: dict[str, Any] | None = None
+    refinement: dict[str, Any] | None = None
     seconds: float = 0.0
 
     def to_json(self) -> str:

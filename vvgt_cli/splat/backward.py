@@ -152,6 +152,18 @@ def _screen(flat, k, total):
     return du, dv, 0.5 * (p0 * a + p1 * b), 0.5 * (p0 * b + p1 * c), 0.5 * (q0 * b + q1 * c)
 
 
+@nb.njit(parallel=True, cache=True)
+def screen(first, pairs, flat, out):
+    """Length of the gradient with respect to each projected centre (pixels) into ``out`` (K,); 0 where none shows."""
+    for k in nb.prange(flat.shape[0]):
+        out[k] = 0.0
+        if first[k + 1] > first[k]:
+            total = np.empty(SUMS)
+            _total(first, pairs, k, total)
+            du, dv, _, _, _ = _screen(flat, k, total)
+            out[k] = np.sqrt(du * du + dv * dv)
+
+
 @_exact
 def _center(x, y, z, fx, fy, du, dv, d00, d02, d11, d12):
     """Gradient with respect to the centre in camera coordinates; d is the gradient of the Jacobian J."""

@@ -1,0 +1,164 @@
+"""`vvgt optimize`: nearer to the views, never worse, stopped by budgets and by Ctrl-C with a valid file."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vvgt_cli.cli.main import run
+from vvgt_cli.gaussians import PlyOptions, read_ply, write_ply
+from vvgt_cli.pipeline.optimize import load_sets
+from vvgt_cli.volume.types import UnitFrame
+
+SCENE = ("example:blob:16", "--tf", "viridis")
+ROOT = Path(__file__).parent.parent
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """`views` (9 to train on, 2 to test) and `in.ply`; to be read only."""
+    folder = tmp_path_factory.mktemp("optimize")
+    small = ("--views", "9", "--test-views", "2", "--size", "32", "--format", "exr")
+    assert run(["render-views", *SCENE, *small, "-o", str(folder / "views"), "-q"]) == 0
+    shape = ("--size", "32", "--max-gaussians", "100", "--up", "z", "--sh-degree", "1", "--frame", "world")
+    assert run(["init", *SCENE, *shape, "-o", str(folder / "in.ply"), "-q"]) == 0
+    return folder
+
+
+@pytest.fixture
+def call(folder, tmp_path, monkeypatch, vvgt):
+    monkeypatch.chdir(tmp_path)
+    return lambda *args: vvgt("optimize", folder / "in.ply", "--views", folder / "views", "-o", "out.ply", *args)
+
+
+def test_a_file_comes_nearer_and_keeps_its_layout(folder, call):
+    result = call("--steps", 30, "--report", "r.json")
+    assert result.code == 0, result.err
+    report = json.loads(Path("r.json").read_text())
+    stages = {stage["name"]: stage for stage in report["stages"]}
+    assert list(stages) == ["read", "views", "refinement", "test views", "write"]
+    assert stages["refinement"]["psnr"] > stages["refinement"]["psnr_before"] + 3
+    assert report["refinement"]["steps"] == 30
+    assert report["refinement"]["checks"][0][2] == stages["refinement"]["psnr_before"]
+    assert report["scores"]["views"] == 2
+    before, after = read_ply(folder / "in.ply")[1], read_ply("out.ply")[1]
+    assert before == after  # count, frame, up, harmonics, unit distance: all that the header says
+    assert [line.split()[0] for line in result.err.splitlines()] == ["read", "views", "refinement", "test", "write"]
+    assert "every 8th training view, held out" in result.err
+
+
+@pytest.mark.parametrize("method", ["adam", "3dgs"])
+def test_methods_to_compare_with(call, method):
+    assert call("--steps", 20, "--method", method, "--report", "-", "-q").code == 0
+    assert read_ply("out.ply")[1].count <= 100
+
+
+def test_a_file_of_another_program_gets_no_comments(folder, call, vvgt, tmp_path):
+    gaussians = read_ply(folder / "in.ply")[0]
+    write_ply(tmp_path / "plain.ply", gaussians, PlyOptions(comments=False))
+    result = vvgt("optimize", "plain.ply", "--views", folder / "views", "--steps", 0, "-o", "-", "-q")
+    assert result.out == (tmp_path / "plain.ply").read_bytes()
+
+
+def test_what_is_worse_is_not_written(folder, vvgt, tmp_path, monkeypatch):
+    """One view again and again to train on, whatever the camera; true views to decide by."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(folder / "views", "mixed")
+    shutil.copy("mixed/transforms_test.json", "mixed/transforms_check.json")
+    for image in Path("mixed/train").glob("*.exr"):
+        shutil.copy(folder / "views/train/train_000.exr", image)
+    assert vvgt("optimize", folder / "in.ply", "--views", folder / "views", "--steps", 40, "-o", "good.ply").code == 0
+    args = ("good.ply", "--views", "mixed", "--steps", 400, "-o", "out.ply", "--report", "r.json")
+    result = vvgt("optimize", *args)
+    assert (result.code, "ended early" in result.err) == (0, True), result.err
+    stage = json.loads(Path("r.json").read_text())["stages"][2]
+    assert stage["psnr"] >= stage["psnr_before"]
+    assert stage["kept"] == (stage["psnr"] > stage["psnr_before"])
+    _, check, remark = load_sets("mixed")
+    assert (len(check.cameras), remark) == (2, "")
+
+
+def test_a_target_and_a_time_budget_end_a_run(call):
+    result = call("--steps", 500, "--target-psnr", 1)
+    assert (result.code, "0 steps" in result.err, "target reached" in result.err) == (0, True, True)
+    result = call("--time-budget", 1e-9, "--overwrite")
+    assert (result.code, "time is up" in result.err) == (0, True)
+
+
+def test_the_same_command_gives_the_same_bytes(call):
+    files = []
+    for _ in range(2):
+        assert call("--steps", 8, "--overwrite", "-q").code == 0
+        files.append(Path("out.ply").read_bytes())
+    assert files[0] == files[1]
+
+
+CASES = {
+    "no views": (("in.ply", "--views", "none", "--steps", 1, "-o", "o.ply"), 1, "none/transforms_train.json"),
+    "no ply": (("no.ply", "--views", "views", "--steps", 1, "-o", "o.ply"), 1, "no.ply"),
+    "no budget": (("in.ply", "--views", "views", "-o", "o.ply"), 2, "--steps N or --time-budget"),
+    "two budgets": (("in.ply", "--views", "views", "--steps", 1, "--time-budget", 1, "-o", "o.ply"), 2, "one of the"),
+    "over itself": (("in.ply", "--views", "views", "--steps", 1, "-o", "in.ply", "--overwrite"), 2, "input"),
+    "suffix": (("in.ply", "--views", "views", "--steps", 1, "-o", "o.splat"), 2, ".ply"),
+    "limit": (("in.ply", "--views", "views", "--steps", 1, "-o", "o.ply", "--max-gaussians", 9), 2, "--method 3dgs"),
+    "method": (("in.ply", "--views", "views", "--steps", 1, "-o", "o.ply", "--method", "sgd"), 2, "sgd"),
+    "one view": (("in.ply", "--views", "one", "--steps", 1, "-o", "o.ply"), 1, "two or more"),
+    "broken view": (("in.ply", "--views", "broken", "--steps", 1, "-o", "o.ply"), 1, "train_001.exr"),
+    "no cameras": (("in.ply", "--views", "empty", "--steps", 1, "-o", "o.ply"), 1, "frames"),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_bad_input_gets_one_line_and_leaves_nothing(case, folder, tmp_path, monkeypatch, vvgt):
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(folder / "in.ply", "in.ply")
+    for name in ("views", "one", "broken", "empty"):
+        shutil.copytree(folder / "views", name)
+    (tmp_path / "broken/train/train_001.exr").write_bytes(b"v/1\x01")
+    for name, count in (("one", 1), ("empty", 0)):
+        path = tmp_path / name / "transforms_train.json"
+        content = json.loads(path.read_text())
+        path.write_text(json.dumps(content | {"frames": content["frames"][:count]}))
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
+    args, code, message = CASES[case]
+    result = vvgt("optimize", *args)
+    assert (result.code, message in result.error, result.out) == (code, True, b""), result.err
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()} == before
+
+
+@pytest.mark.skipif(os.name == "nt", reason="SIGINT")
+def test_ctrl_c_writes_what_there_is(folder, tmp_path):
+    code = "import sys; from vvgt_cli.cli.main import main; main()"
+    args = [folder / "in.ply", "--views", folder / "views", "--steps", 10**7, "-o", tmp_path / "out.ply"]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
+    child = subprocess.Popen(
+        [sys.executable, "-c", code, "optimize", *map(str, args)], stderr=subprocess.PIPE, env=environment, text=True
+    )
+    assert child.stderr is not None
+    said = [child.stderr.readline(), child.stderr.readline()]  # read, views: the descent begins
+    assert said[1].startswith("views"), said
+    time.sleep(1)
+    child.send_signal(signal.SIGINT)
+    rest = child.communicate(timeout=120)[1]
+    assert child.returncode == 0, rest
+    assert "interrupted" in rest
+    assert read_ply(tmp_path / "out.ply")[1].count == read_ply(folder / "in.ply")[1].count
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out.ply"]
+
+
+def test_the_frame_of_a_file_is_kept_where_it_was_made_elsewhere(folder, call, tmp_path, vvgt):
+    unit_frame = UnitFrame(0.5, (1, 1, 1), (1, 1, 1), (3.0, -2.0, 9.0))
+    write_ply(tmp_path / "far.ply", read_ply(folder / "in.ply")[0], PlyOptions("world", "x", unit_frame=unit_frame))
+    assert vvgt("optimize", "far.ply", "--views", folder / "views", "--steps", 0, "-o", "same.ply", "-q").code == 0
+    far, same = read_ply(tmp_path / "far.ply"), read_ply(tmp_path / "same.ply")
+    assert far[1] == same[1]
+    np.testing.assert_allclose(same[0].means, far[0].means, rtol=1e-5)

@@ -1,0 +1,224 @@
+"""`optimize`: Gaussians refined by gradient descent on views, and the stage of `convert` that does it."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vvgt_cli.cameras import Camera
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.files import atomic_write
+from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions, as_stored, write_ply
+from vvgt_cli.images.viewset import load_views
+from vvgt_cli.optimize import OptimizeOptions, OptimizeRecord, optimize
+from vvgt_cli.pipeline.outputs import STDOUT, Output, check_outputs, write_text
+from vvgt_cli.pipeline.record import ConversionReport, Run
+from vvgt_cli.pipeline.render import open_gaussians
+from vvgt_cli.pipeline.score import psnr_note
+from vvgt_cli.progress import Console
+from vvgt_cli.volume.types import UnitFrame
+
+if TYPE_CHECKING:
+    from vvgt_cli.metrics import Scores
+
+HOLD_OUT = 8  # of so many training views one decides, where the folder has no check views
+REASONS = {
+    "steps": "", "time": "time is up", "target": "target reached", "no gain": "ended early: no gain any more",
+    "interrupted": "interrupted",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Views:
+    """Cameras and what they see, (n, h, w, 4) float32 premultiplied."""
+
+    cameras: list[Camera]
+    images: np.ndarray
+
+    def take(self, index: np.ndarray) -> Views:
+        """Some of them."""
+        return Views([self.cameras[i] for i in index], self.images[index])
+
+
+@dataclass(frozen=True)
+class OptimizeRequest:
+    """A whole refinement.
+
+    Attributes:
+        ply: Gaussians to start from, "-" for standard input.
+        views: folder that `render-views` wrote.
+        output: `.ply` to write, "-" for standard output.
+        options: how to descend, and when to stop.
+        report: JSON to write, "-" for standard output, None for none.
+        overwrite: replace files that exist.
+    """
+
+    ply: str
+    views: str
+    output: str
+    options: OptimizeOptions
+    report: str | None = None
+    overwrite: bool = False
+
+    def outputs(self) -> list[Output]:
+        """Everything that will be written."""
+        report = [Output("--report", self.report, (".json",), binary=False)] if self.report else []
+        return [Output("-o", self.output, (".ply",)), *report]
+
+
+def optimize_file(request: OptimizeRequest, console: Console | None = None) -> ConversionReport:
+    """Refine a `.ply`: fitted to the training views, decided by the check views, reported on the test views.
+
+    Raises:
+        UsageError: an output that may not be written; found before anything is read.
+        DataError: a `.ply` or a folder of views that is not one.
+    """
+    run = Run(console or Console(), ConversionReport("optimize"))
+    check_outputs(request.outputs(), [request.ply], request.overwrite)
+    with run.stage("read") as stage:
+        start, header = open_gaussians(request.ply, run.console)
+        stage.note = f"{len(start)} Gaussians, {header.frame} frame"
+    with run.stage("views") as stage:
+        train, check, held_out = load_sets(request.views)
+        test = Views(*load_views(request.views, "test")) if _has(request.views, "test") else None
+        stage.note = f"{len(train.cameras)} to fit to, {len(check.cameras)} to check by{held_out}"
+    run.report.options = asdict(request.options)
+    gaussians = refine(run, start, train, check, request.options)
+    if test is not None:
+        _score(run, test, start, gaussians)
+    _write(run, request, gaussians, header)
+    run.finish()
+    if request.report:
+        write_text(request.report, run.report.to_json(), request.overwrite)
+    return run.report
+
+
+def load_sets(folder: str) -> tuple[Views, Views, str]:
+    """Training and check views, and a remark where the check views were taken from the training views.
+
+    Raises:
+        DataError: not a folder of views.
+    """
+    train = Views(*load_views(folder, "train"))
+    if _has(folder, "check"):
+        return train, Views(*load_views(folder, "check")), ""
+    count = len(train.cameras)
+    if count < 2:
+        raise DataError(f"{folder}: {count} training view; expected two or more: one of them decides what is kept")
+    held = np.arange(min(HOLD_OUT, count) - 1, count, HOLD_OUT)
+    rest = np.setdiff1d(np.arange(count), held)
+    return train.take(rest), train.take(held), f" (every {HOLD_OUT}th training view, held out)"
+
+
+def _has(folder: str, split: str) -> bool:
+    return (Path(folder) / f"transforms_{split}.json").is_file()
+
+
+def refine(run: Run, start: Gaussians, train: Views, check: Views, options: OptimizeOptions) -> Gaussians:
+    """The stage: the best that the check views have seen, as a file holds it; the input where nothing was better."""
+    with run.stage("refinement") as stage, interruption(run.console) as stop:
+        result, record = optimize(
+            start,
+            train.cameras,
+            train.images,
+            options,
+            (check.cameras, check.images),
+            progress=run.console.bar("refinement"),
+            stop=stop,
+        )
+        stage.kept = record.kept > 0
+        stage.psnr_before, stage.psnr = record.psnr_before, record.psnr_after
+        stage.note = _note(record, options)
+    run.report.refinement = asdict(record) | {"method": options.method}
+    return as_stored(result)
+
+
+def _note(record: OptimizeRecord, options: OptimizeOptions) -> str:
+    parts = [f"{record.steps} steps ({options.method})"]
+    if 0 < record.kept < record.steps:
+        parts.append(f"best after {record.kept}")
+    if REASONS[record.reason]:
+        parts.append(REASONS[record.reason])
+    return ", ".join(parts) + f"; from {record.psnr_before:.2f} dB on the check views"
+
+
+@contextmanager
+def interruption(console: Console) -> Iterator[Callable[[], bool]]:
+    """Within the block a first interrupt (Ctrl-C) only makes the given function return True; a second one ends all."""
+    stopped = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield stopped.is_set  # handlers belong to the main thread
+        return
+
+    def note(number: int, frame: object) -> None:
+        stopped.set()
+        signal.signal(signal.SIGINT, before)
+        console.say("interrupted: what there is will be written; once more to leave without")
+
+    before = signal.signal(signal.SIGINT, note)
+    try:
+        yield stopped.is_set
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _score(run: Run, test: Views, start: Gaussians, gaussians: Gaussians) -> None:
+    with run.stage("test views") as stage:
+        before, after = _mean(test, start, perceptual=False), _mean(test, gaussians, perceptual=True)
+        run.report.scores = asdict(after)
+        stage.note = f"{psnr_note(after)}, from {before.psnr:.2f} dB, {after.views} views"
+
+
+def _mean(test: Views, gaussians: Gaussians, perceptual: bool) -> Scores:
+    from vvgt_cli.metrics import score_views
+    from vvgt_cli.splat import render
+
+    return score_views(test.images, (render(gaussians, camera) for camera in test.cameras), perceptual=perceptual)
+
+
+def _ply_options(header: PlyHeader) -> PlyOptions:
+    """What makes a file laid out, placed and commented as the one read was."""
+    frame = None
+    if header.scale is not None and header.centre is not None:
+        frame = UnitFrame(header.scale, (1, 1, 1), (1, 1, 1), header.centre)  # of which scale and centre are written
+    return PlyOptions(
+        frame=header.frame,
+        up=header.up,
+        sh_degree=header.sh_degree,
+        comments=header.version is not None,
+        unit_frame=frame,
+        unit_distance=header.unit_distance,
+        unit_distance_label=header.unit_distance_label or "given",
+    )
+
+
+def _write(run: Run, request: OptimizeRequest, gaussians: Gaussians, header: PlyHeader) -> None:
+    options, report = _ply_options(header), run.report
+    with run.stage("write") as stage:
+        if request.output == STDOUT:
+            report.bytes = write_ply(sys.stdout.buffer, gaussians, options)
+            sys.stdout.buffer.flush()
+        else:
+            with atomic_write(request.output, request.overwrite) as temporary:
+                report.bytes = write_ply(temporary, gaussians, options)
+        report.gaussians = len(gaussians)
+        stage.note = f"{request.output}: {len(gaussians)} Gaussians, {report.bytes / 1e6:.1f} MB"
+
+
+def budget(steps: int | None, seconds: float | None) -> dict[str, int | float | None]:
+    """Options of the budget, of which there is one.
+
+    Raises:
+        UsageError: both, or none.
+    """
+    if (steps is None) == (seconds is None):
+        raise UsageError("give --steps N or --time-budget SECONDS, one of the two")
+    return {"steps": steps, "time_budget": seconds}
