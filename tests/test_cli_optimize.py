@@ -135,7 +135,6 @@ def test_bad_input_gets_one_line_and_leaves_nothing(case, folder, tmp_path, monk
     assert {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()} == before
 
 
-@pytest.mark.skipif(os.name == "nt", reason="SIGINT")
 def test_ctrl_c_writes_what_there_is(folder, tmp_path):
     code = "import sys; from vvgt_cli.cli.main import main; main()"
     args = [folder / "in.ply", "--views", folder / "views", "--steps", 10**7, "-o", tmp_path / "out.ply"]
@@ -162,3 +161,16 @@ def test_the_frame_of_a_file_is_kept_where_it_was_made_elsewhere(folder, call, t
     far, same = read_ply(tmp_path / "far.ply"), read_ply(tmp_path / "same.ply")
     assert far[1] == same[1]
     np.testing.assert_allclose(same[0].means, far[0].means, rtol=1e-5)
+
+
+def test_convert_refines_after_the_closed_form(tmp_path, vvgt):
+    small = ("--size", 32, "--max-gaussians", 100, "--report", tmp_path / "r.json")
+    result = vvgt("convert", *SCENE, *small, "--steps", 30, "-o", tmp_path / "a.ply")
+    assert result.code == 0, result.err
+    report = json.loads((tmp_path / "r.json").read_text())
+    stages = {stage["name"]: stage for stage in report["stages"]}
+    assert stages["refinement"]["psnr_before"] == pytest.approx(stages["back-projection"]["psnr"], abs=0.01)
+    assert stages["refinement"]["psnr"] > stages["refinement"]["psnr_before"] + 1
+    assert report["scores"]["psnr"] > stages["refinement"]["psnr_before"]
+    assert report["options"]["steps"] == report["refinement"]["steps"] == 30
+    assert "48 to fit to" in stages["views"]["note"]

@@ -15,6 +15,10 @@ from vvgt_cli.progress import Console
 @click.argument("volume")
 @click.option("-o", "--output", required=True, metavar="OUT.ply", help="File to write; - is standard output.")
 @fit_options
+@click.option(
+    "--steps", type=click.IntRange(0, 10_000_000), default=0, show_default=True, metavar="N",
+    help="Steps of gradient descent after the closed form, one view each; 0 for none.",
+)  # fmt: skip
 @ply_options
 @tf_options
 @read_options
@@ -30,12 +34,13 @@ def command(volume: str, console: Console, **options: Any) -> None:
     input. Without --tf a function is made from the histogram.
 
     The Gaussians are made for images of --size pixels and scored on three test views that nothing was fitted
-    to (ten with --report); the error is printed.
+    to (ten with --report); the error is printed. --steps refines them further by gradient descent; Ctrl-C
+    ends that stage only.
 
     \b
     Examples:
       vvgt convert example:frog -o frog.ply --preview frog.png
-      vvgt convert head.nrrd --tf bone.json -o head.ply --max-gaussians 50000
+      vvgt convert head.nrrd --tf bone.json -o head.ply --max-gaussians 50000 --steps 200
       vvgt convert - --dims 64 64 93 --dtype uint16 -o - < head.raw > head.ply
     """
     from vvgt_cli.cli.fit import convert_request

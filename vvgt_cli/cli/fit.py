@@ -67,11 +67,18 @@ def convert_request(
     overwrite: bool,
     report: str | None = None,
     preview: str | None = None,
+    steps: int = 0,
 ) -> ConvertRequest:
     """The request that the options of `convert` and `init` add up to."""
     from vvgt_cli.gaussians import PlyOptions
     from vvgt_cli.pipeline.convert import ConvertRequest, FitOptions
 
     return ConvertRequest(
-        source_request(volume, read, optics), output, FitOptions(**fit), PlyOptions(**ply), report, preview, overwrite
+        source_request(volume, read, optics),
+        output,
+        FitOptions(**fit, steps=steps),
+        PlyOptions(**ply),
+        report,
+        preview,
+        overwrite,
     )

@@ -13,6 +13,8 @@ from vvgt_cli.cameras.sets import SET_VIEWS
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored, write_ply
+from vvgt_cli.optimize import OptimizeOptions
+from vvgt_cli.pipeline.optimize import Views, refine
 from vvgt_cli.pipeline.outputs import STDOUT, Output, check_outputs, write_text
 from vvgt_cli.pipeline.record import ConversionReport, Run
 from vvgt_cli.pipeline.score import psnr_note, score_test_views
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
     from vvgt_cli.vbm import Start
 
 VIEW_BYTES = 2 * 16  # a pixel: float32 RGBA, and as much again while views are stacked
+REFINE_VIEWS = 48  # training views of gradient descent; the closed form takes every second of them
 PREVIEW_VIEWS = (0, 4, 9)  # test views of the preview, and of the score without a report: above, side, below
 
 
@@ -39,12 +42,18 @@ class FitOptions:
         size: pixels along an image's edge that the file is made for.
         init: "vbm", "wavelet" or "uniform".
         seed: of whatever draws random numbers.
+        steps: of gradient descent after the closed form.
     """
 
     max_gaussians: int = 100_000
     size: int = 400
     init: str = "vbm"
     seed: int = 0
+    steps: int = 0
+
+    def views(self) -> int:
+        """Training views: more of them where gradient descent would learn them by heart."""
+        return REFINE_VIEWS if self.steps else SET_VIEWS["train"]
 
 
 @dataclass(frozen=True)
@@ -80,17 +89,21 @@ class ConvertRequest:
 
 
 def convert(request: ConvertRequest, console: Console | None = None) -> ConversionReport:
-    """Volume to `.ply`: closed form, then what the training views can mend, scored on the test views.
+    """Volume to `.ply`: closed form, what the training views can mend, gradient descent; scored on the test views.
 
     Raises:
         UsageError: an output that may not be written; found before anything is read.
         DataError: input that is not what it must be, or a scene that shows nothing.
     """
     run = Run(console or Console(), ConversionReport("convert"))
-    _check_memory(request.fit.size)
+    _check_memory(request.fit)
     source, scene = _begin(run, request)
     start = _closed_form(run, scene, request.fit)
-    gaussians = _back_project(run, scene, start, request.fit)
+    train, check = _views(run, scene, request.fit)
+    gaussians = _back_project(run, start, train.take(range(0, len(train), 2)) if request.fit.steps else train, check)
+    if request.fit.steps:
+        options = OptimizeOptions(steps=request.fit.steps, seed=request.fit.seed)
+        gaussians = refine(run, gaussians, train, check, options)
     gaussians = as_stored(gaussians)  # what is scored is what the file holds
     scores, sheet = _score(run, scene, gaussians, request)
     run.report.scores = asdict(scores)
@@ -109,13 +122,13 @@ def initialise_only(request: ConvertRequest, console: Console | None = None) -> 
     return _finish(run, request, source, as_stored(start.gaussians))
 
 
-def _check_memory(size: int) -> None:
+def _check_memory(fit: FitOptions) -> None:
     """Refuse a size whose training and check views would not fit."""
-    views = SET_VIEWS["train"] + SET_VIEWS["check"]
-    need, free = views * size * size * VIEW_BYTES, free_memory()
+    views = fit.views() + SET_VIEWS["check"]
+    need, free = views * fit.size**2 * VIEW_BYTES, free_memory()
     if free is not None and need > free:
         raise UsageError(
-            f"--size {size}: {views} views need {need / 2**30:.1f} GiB of memory, {free / 2**30:.1f} GiB are free; "
+            f"--size {fit.size}: {views} views need {need / 2**30:.1f} GiB of memory, {free / 2**30:.1f} GiB are free; "
             "try a smaller size, or 'vvgt init', which renders none"
         )
 
@@ -193,25 +206,33 @@ def _splats(gaussians: Gaussians, cameras: list[Camera]) -> list[np.ndarray]:
     return [render(gaussians, camera) for camera in cameras]
 
 
-def _back_project(run: Run, scene: Scene, start: Start, fit: FitOptions) -> Gaussians:
-    """What the training views can mend, kept if the check views agree."""
+def _views(run: Run, scene: Scene, fit: FitOptions) -> tuple[Views, Views]:
+    """Training and check views; pixel-integrated for gradient descent, which would follow the jags of single rays."""
     from vvgt_cli.dvr import render_views
-    from vvgt_cli.dvr.render import FIT_VIEWS
+    from vvgt_cli.dvr.render import FIT_VIEWS, SCORE_VIEWS
+
+    train, check = default_views("train", fit.views(), size=fit.size), default_views("check", size=fit.size)
+    settings = SCORE_VIEWS if fit.steps else FIT_VIEWS
+    with run.stage("views") as stage:
+        images = render_views(scene, train, settings, progress=run.console.bar("views"))
+        reference = render_views(scene, check, settings)
+        stage.note = f"{len(train)} to fit to, {len(check)} to check by, {fit.size} px"
+    return Views(train, images), Views(check, reference)
+
+
+def _back_project(run: Run, start: Start, train: Views, check: Views) -> Gaussians:
+    """What the training views can mend, kept if the check views agree."""
     from vvgt_cli.metrics import score_views
     from vvgt_cli.vbm import backproject
 
-    train, check = default_views("train", size=fit.size), default_views("check", size=fit.size)
-    with run.stage("views") as stage:
-        images = render_views(scene, train, FIT_VIEWS, progress=run.console.bar("views"))
-        reference = render_views(scene, check, FIT_VIEWS)
-        stage.note = f"{len(train)} to fit to, {len(check)} to check by, {fit.size} px"
     with run.stage("back-projection") as stage:
-        before = score_views(reference, _splats(start.gaussians, check), perceptual=False).psnr
-        mended, how = backproject(start, train, images, progress=run.console.bar("back-projection"))
-        after = score_views(reference, _splats(mended, check), perceptual=False).psnr
+        before = score_views(check.images, _splats(start.gaussians, check.cameras), perceptual=False).psnr
+        bar = run.console.bar("back-projection")
+        mended, how = backproject(start, train.cameras, train.images, progress=bar)
+        after = score_views(check.images, _splats(mended, check.cameras), perceptual=False).psnr
         stage.kept = after > before
         stage.note = f"{how}; from {before:.2f} dB on the check views"
-        stage.psnr = after
+        stage.psnr_before, stage.psnr = before, after
     return mended if stage.kept else start.gaussians
 
 

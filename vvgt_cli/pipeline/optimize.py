@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -43,9 +43,12 @@ class Views:
     cameras: list[Camera]
     images: np.ndarray
 
-    def take(self, index: np.ndarray) -> Views:
+    def __len__(self) -> int:
+        return len(self.cameras)
+
+    def take(self, index: Sequence[int] | np.ndarray) -> Views:
         """Some of them."""
-        return Views([self.cameras[i] for i in index], self.images[index])
+        return Views([self.cameras[i] for i in index], self.images[list(index)])
 
 
 @dataclass(frozen=True)
@@ -89,7 +92,7 @@ def optimize_file(request: OptimizeRequest, console: Console | None = None) -> C
     with run.stage("views") as stage:
         train, check, held_out = load_sets(request.views)
         test = Views(*load_views(request.views, "test")) if _has(request.views, "test") else None
-        stage.note = f"{len(train.cameras)} to fit to, {len(check.cameras)} to check by{held_out}"
+        stage.note = f"{len(train)} to fit to, {len(check)} to check by{held_out}"
     run.report.options = asdict(request.options)
     gaussians = refine(run, start, train, check, request.options)
     if test is not None:
@@ -110,7 +113,7 @@ def load_sets(folder: str) -> tuple[Views, Views, str]:
     train = Views(*load_views(folder, "train"))
     if _has(folder, "check"):
         return train, Views(*load_views(folder, "check")), ""
-    count = len(train.cameras)
+    count = len(train)
     if count < 2:
         raise DataError(f"{folder}: {count} training view; expected two or more: one of them decides what is kept")
     held = np.arange(min(HOLD_OUT, count) - 1, count, HOLD_OUT)
