@@ -11,7 +11,7 @@ import pytest
 from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.dvr import RenderSettings, Scene, render_view, render_view_reference
 from vvgt_cli.dvr.reference import march, trilinear
-from vvgt_cli.dvr.runs import RUN, sample_run, stack_run
+from vvgt_cli.dvr.runs import RUN, first_value, sample_run, stack_run
 from vvgt_cli.transfer.colormap import ColorMap
 from vvgt_cli.transfer.function import TransferFunction
 from vvgt_cli.transfer.opacity import PiecewiseOpacity
@@ -130,10 +130,10 @@ def test_stiff_functions_stay_bounded_whatever_comes_together(per_voxel, edge, f
 
 @nb.njit
 def _runs(values, starts, speeds, out):
-    run = nb.carray(stack_run(), RUN)
+    run = stack_run()
     for i in range(len(starts)):
         p, v = starts[i], speeds[i]
-        sample_run(values, values.reshape(-1), p[0], p[1], p[2], v[0], v[1], v[2], 0.0, 1.0, 65536, run)
+        sample_run(values, first_value(values), p[0], p[1], p[2], v[0], v[1], v[2], 0.0, 1.0, 65536, run)
         for n in range(RUN):
             out[i, n] = run[n]
 
@@ -147,7 +147,8 @@ def test_runs_of_samples_match_the_twin(kind, shape):
     starts = rng.uniform(-1, 1, (200, 3)) + rng.uniform(0, 1, (200, 3)) * size  # some leave the volume
     speeds = rng.uniform(-1, 1, (200, 3)) * rng.choice([0.0, 0.1, 4.0], (200, 3))
     out = np.empty((200, RUN))
-    _runs(data, starts, speeds, out)
+    stored = data if shape[2] > 1 else data.astype(np.float32)  # as `kernel_values` does
+    _runs(stored, starts, speeds, out)
     points = starts[:, None] + np.arange(RUN)[:, None] * speeds[:, None]
     exact = trilinear(Volume(data), points.reshape(-1, 3)).reshape(200, RUN)
     np.testing.assert_allclose(out, exact, atol=200 * 2e-5)  # positions within a run to 1e-5 voxels, three axes

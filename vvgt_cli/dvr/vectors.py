@@ -1,0 +1,94 @@
+"""Four float64 as one vector register in numba kernels: a row of a table of optics in one load.
+
+LLVM leaves arithmetic on tuples of four floats scalar; as one value of vector type it takes a quarter of the
+instructions.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from llvmlite import ir
+from numba import extending, types
+from numba.core.errors import TypingError
+from numba.extending import models, register_model
+
+intrinsic: Any = extending.intrinsic  # called without its first argument, which type checkers do not know
+DOUBLE = ir.DoubleType()
+QUAD = ir.VectorType(DOUBLE, 4)
+FLAGS = ("contract", "nsz")
+
+
+class QuadType(types.Type):
+    """Type of `row` and of what is computed from it."""
+
+    def __init__(self) -> None:
+        super().__init__(name="Quad")
+
+
+quad = QuadType()
+
+
+@register_model(QuadType)
+class _QuadModel(models.PrimitiveModel):
+    def __init__(self, manager: Any, kind: Any) -> None:
+        super().__init__(manager, kind, QUAD)
+
+
+def _splat(builder: Any, scalar: Any) -> Any:
+    one = builder.insert_element(ir.Constant(QUAD, ir.Undefined), scalar, ir.Constant(ir.IntType(32), 0))
+    zeros = ir.Constant(ir.VectorType(ir.IntType(32), 4), [0] * 4)
+    return builder.shuffle_vector(one, ir.Constant(QUAD, ir.Undefined), zeros)
+
+
+@intrinsic
+def row(typingctx: Any, table: Any, index: Any) -> Any:
+    """Row ``index`` (unsigned, in range) of a C-contiguous float64 array (n, 4)."""
+    if not (isinstance(table, types.Array) and (table.dtype, table.ndim, table.layout) == (types.float64, 2, "C")):
+        raise TypingError(f"rows are taken from C-contiguous float64 tables, not from {table}")
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        array = context.make_array(signature.args[0])(context, builder, args[0])
+        at = builder.shl(args[1], ir.Constant(args[1].type, 2))
+        start = builder.gep(array.data, [at])
+        return builder.load(builder.bitcast(start, QUAD.as_pointer()), align=8)
+
+    return quad(table, index), codegen
+
+
+@intrinsic
+def zeros4(typingctx: Any) -> Any:
+    """(0, 0, 0, 0)."""
+    return quad(), lambda context, builder, signature, args: ir.Constant(QUAD, [0.0] * 4)
+
+
+@intrinsic
+def lane(typingctx: Any, vector: Any, index: Any) -> Any:
+    """Entry ``index`` of a vector."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.extract_element(args[0], builder.trunc(args[1], ir.IntType(32)))
+
+    return types.float64(quad, types.int64), codegen
+
+
+@intrinsic
+def add(typingctx: Any, a: Any, b: Any) -> Any:
+    """a + b."""
+    return quad(quad, quad), lambda context, builder, signature, args: builder.fadd(*args, flags=FLAGS)
+
+
+@intrinsic
+def sub(typingctx: Any, a: Any, b: Any) -> Any:
+    """a - b."""
+    return quad(quad, quad), lambda context, builder, signature, args: builder.fsub(*args, flags=FLAGS)
+
+
+@intrinsic
+def scale(typingctx: Any, a: Any, b: Any) -> Any:
+    """Float ``a`` times vector ``b``."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.fmul(_splat(builder, args[0]), args[1], flags=FLAGS)
+
+    return quad(types.float64, quad), codegen
