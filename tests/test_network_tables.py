@@ -1,0 +1,229 @@
+"""Curves, windows, pooling and neighbours against plain Python; what the network is given, against the cameras."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from vvgt_cli.cameras import default_views
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.network import NAMED, GeometryConfig, ImageConfig, NetworkConfig
+from vvgt_cli.network import tables as tb
+from vvgt_cli.network.curves import CURVES, curve_code, hilbert, interleave
+from vvgt_cli.network.prepare import filter_matrix, pack, prepare, quaternion, resize, unpack, view_arrays
+from vvgt_cli.network.runtime import spread
+
+SMALL = NAMED["small"]
+
+
+def scene(count: int, seed: int = 0, spread: float = 1.0) -> Gaussians:
+    rng = np.random.default_rng(seed)
+    means = rng.uniform(-spread, spread, (count, 3))
+    return Gaussians(
+        means, rng.normal(-4, 0.3, (count, 3)), rng.normal(size=(count, 4)), rng.normal(size=count),
+        rng.random((count, 3)),
+    )  # fmt: skip
+
+
+def test_interleave_is_the_bits_of_three_numbers_in_turn():
+    cells = np.random.default_rng(0).integers(0, 1 << 20, (50, 3))
+    for cell, code in zip(cells, interleave(cells), strict=True):
+        bits = "".join(f"{cell[axis] >> bit & 1}" for bit in reversed(range(20)) for axis in range(3))
+        assert code == int(bits, 2)
+
+
+@pytest.mark.parametrize("bits", [1, 2, 3, 4])
+def test_hilbert_visits_every_cell_once_and_never_jumps(bits):
+    side = 1 << bits
+    cells = np.stack(np.meshgrid(*[np.arange(side)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    codes = hilbert(cells, bits)
+    assert sorted(codes) == list(range(side**3))
+    path = cells[np.argsort(codes)]
+    assert (np.abs(np.diff(path, axis=0)).sum(axis=1) == 1).all()
+
+
+def test_transposed_curves_swap_two_axes():
+    cells = np.random.default_rng(1).integers(0, 8, (20, 3))
+    for curve in CURVES[1::2]:
+        plain = curve_code(cells[:, [1, 0, 2]], 3, curve.removesuffix("-trans"))
+        assert np.array_equal(curve_code(cells, 3, curve), plain)
+        assert not np.array_equal(curve_code(cells, 3, curve), curve_code(cells, 3, curve.removesuffix("-trans")))
+
+
+@given(st.integers(1, 300), st.integers(0, 5), st.sampled_from([1, 3, 16]))
+def test_every_pool_at_least_halves_and_keeps_mean_positions(count, seed, coarse):
+    means = scene(count, seed).means
+    means = np.round(means * coarse).astype(np.float32) / coarse  # many share a place
+    means = means[tb.canonical_order(means)]
+    stage = tb.Stage(tb.quantise(means), tb.BITS, means, np.ones(count, np.int64))
+    whole = np.arange(count)
+    for _ in range(4):
+        after, parents = tb.pool(stage)
+        assert len(after.cells) <= max(len(stage.cells) // 2, 1)
+        assert np.array_equal(np.unique(parents), np.arange(len(after.cells)))
+        assert np.array_equal(stage.cells >> stage.bits - after.bits, after.cells[parents])
+        whole = parents[whole]
+        for cell in range(len(after.cells)):
+            assert np.allclose(after.positions[cell], means[whole == cell].mean(axis=0), atol=1e-5)
+        assert after.counts.sum() == count
+        stage = after
+
+
+def test_neighbours_are_the_cells_around():
+    cells = np.unique(np.random.default_rng(2).integers(0, 8, (150, 3)), axis=0)
+    cells = cells[np.argsort(interleave(cells))]
+    stage = tb.Stage(cells, 3, np.zeros((len(cells), 3), np.float32), np.ones(len(cells), np.int64))
+    where = {tuple(cell): i for i, cell in enumerate(cells)}
+    expected = [[where.get(tuple(cell + offset), len(cells)) for offset in tb.OFFSETS] for cell in cells]
+    assert np.array_equal(tb.neighbours(stage), expected)
+
+
+@given(st.integers(1, 400), st.integers(1, 64))
+def test_each_point_reads_its_own_slot_of_one_window(count, size):
+    order = np.random.default_rng(count).permutation(count)
+    members, slots = tb.windows(order, size)
+    assert members.shape[1] == min(size, count)
+    assert np.array_equal(members.reshape(-1)[slots], np.arange(count))
+    place = np.argsort(order)
+    assert (np.ptp(place[members], axis=1) == members.shape[1] - 1).all()  # neighbours along the order
+
+
+def test_the_order_of_the_input_does_not_matter_ties_included():
+    rows = pack(scene(200))
+    rows[50:100, :3] = rows[0, :3]  # one place, other parameters
+    rows[150:160] = rows[149]  # exact duplicates
+    order = np.random.default_rng(3).permutation(200)
+    assert np.array_equal(rows[tb.canonical_order(rows)], rows[order][tb.canonical_order(rows[order])])
+
+
+def test_blocks_go_through_the_four_curves():
+    config = replace(SMALL.geometry, depths=(2, 1, 1, 1, 1))
+    curves = [curve for group in tb.block_curves(config) for curve in group]
+    assert curves == [CURVES[i % 4] for i in range(10)]
+    assert set(tb.build(scene(300).means, SMALL.geometry)) >= {"positions", "parents_3", "neighbours_4", "windows_0_z"}
+
+
+def test_packing_keeps_the_gaussian_and_one_sign_of_the_quaternion():
+    gaussians = scene(50)
+    flipped = replace(gaussians, quaternions=-3 * gaussians.quaternions)
+    assert np.allclose(pack(gaussians), pack(flipped), atol=1e-7)
+    back = unpack(pack(gaussians))
+    cosine = np.abs((back.quaternions * gaussians.quaternions).sum(axis=1))
+    assert np.allclose(cosine, np.linalg.norm(gaussians.quaternions, axis=1), rtol=1e-6)
+    assert np.array_equal(back.means, gaussians.means)
+
+
+def test_matrices_project_as_the_cameras_do():
+    cameras = default_views("train", 5, size=64)
+    points = scene(30).means
+    arrays = view_arrays(cameras)
+    for camera, matrix, eye in zip(cameras, arrays["matrices"], arrays["eyes"], strict=True):
+        seen = points @ camera.rotation.T + camera.translation
+        u = (camera.fx * seen[:, 0] / seen[:, 2] + camera.cx) / camera.width
+        v = (camera.fy * seen[:, 1] / seen[:, 2] + camera.cy) / camera.height
+        p = points @ matrix[:, :3].T + matrix[:, 3]
+        assert np.allclose(p[:, :2] / p[:, 2:], np.column_stack([u, v]), atol=1e-6)
+        assert np.allclose(p[:, 2], seen[:, 2], atol=1e-6)
+        assert np.allclose(eye, camera.position, atol=1e-6)
+
+
+def test_poses_hold_translation_rotation_and_field_of_view():
+    camera = default_views("check")[1]
+    pose = view_arrays([camera])["poses"][0]
+    w, x, y, z = pose[3:7]
+    rotation = np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ])  # fmt: skip
+    assert np.allclose(rotation, camera.rotation, atol=1e-6)
+    assert w >= 0
+    assert np.allclose(pose[7:], np.radians(40))
+    half_turn = np.diag([-1.0, 1.0, -1.0])
+    assert np.allclose(np.abs(quaternion(half_turn)), [0, 0, 1, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize(("old", "new"), [(10, 10), (32, 14), (7, 28), (400, 224)])
+def test_resizing_keeps_constants_and_ramps(old, new):
+    weights = filter_matrix(old, new)
+    assert np.allclose(weights.sum(axis=1), 1, atol=1e-6)
+    ramp = weights @ ((np.arange(old) + 0.5) / old).astype(np.float32)
+    inner = slice(1 + new // old, -1 - new // old)  # the edge is clamped
+    assert np.allclose(ramp[inner], ((np.arange(new) + 0.5) / new)[inner], atol=0.02)
+    image = np.ones((old, old + 3, 4), np.float32)
+    assert np.allclose(resize(image, new), 1, atol=1e-5)
+
+
+def test_far_apart_views_are_chosen_whatever_their_order():
+    cameras = default_views("train")
+    chosen = spread(cameras, 6)
+    assert len(set(chosen)) == 6
+    assert spread(cameras, 30) == list(range(24))
+    order = np.random.default_rng(0).permutation(24)
+    mixed = spread([cameras[i] for i in order], 6)
+    assert sorted(order[mixed]) == chosen
+    eyes = np.array([camera.position for camera in cameras])[chosen]
+    gaps = np.linalg.norm(eyes[:, None] - eyes[None], axis=2) + 10 * np.eye(6)
+    assert gaps.min() > 2  # on a sphere of radius 3
+
+
+def test_scene_arrays_hold_what_the_switches_ask_for():
+    config = replace(SMALL, image=replace(SMALL.image, size=28), rendering=True,
+                     geometry=replace(SMALL.geometry, gradients=True))  # fmt: skip
+    gaussians, cameras = scene(40, spread=0.5), default_views("train", 2, size=32)
+    images = np.zeros((2, 32, 32, 4), np.float32)
+    prepared = prepare(gaussians, cameras, images, config)
+    assert prepared.views["images"].shape == (2, 8, 28, 28)
+    assert prepared.views["images"][:, 4:].max() > 0.01  # the rendering
+    assert prepared.gradients is not None
+    assert prepared.gradients.shape == (40, 14)
+    flipped = replace(gaussians, quaternions=-2 * gaussians.quaternions)
+    assert np.allclose(prepare(flipped, cameras, images, config).gradients, prepared.gradients, atol=1e-4)
+    # black targets: a brighter colour raises the error, for every Gaussian that is seen
+    assert (prepared.gradients[:, 11:] >= 0).all()
+    assert prepared.gradients[:, 11:].max() > 0
+    restored = prepared.restore(prepared.rows)
+    assert np.array_equal(restored.means, gaussians.means)
+
+
+def test_configs_survive_the_way_through_plain_values():
+    import json
+
+    for config in NAMED.values():
+        assert NetworkConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d: d["image"].pop("width"), "width"),
+        (lambda d: d.update(extra=1), "extra"),
+        (lambda d: d["geometry"].update(window="x"), "window|<"),
+        (lambda d: d["geometry"].update(widths=[32]), "widths"),
+        (lambda d: d["image"].update(size=100), "patch"),
+        (lambda d: d["image"].update(taps=[9]), "taps"),
+    ],
+)
+def test_a_config_that_makes_no_network_is_refused(change, message):
+    values = SMALL.to_dict()
+    change(values)
+    with pytest.raises(DataError, match=message):
+        NetworkConfig.from_dict(values)
+
+
+def test_other_values_are_refused():
+    with pytest.raises(UsageError, match="wo_everything"):
+        NetworkConfig(variant="wo_everything")
+    with pytest.raises(DataError, match="multiple"):
+        GeometryConfig(heads=(3, 3, 3, 3, 3))
+    with pytest.raises(DataError, match="4 a head"):
+        ImageConfig(width=150)
+    with pytest.raises(DataError, match="no Gaussians"):
+        prepare(scene(0), [], np.zeros((0, 8, 8, 4)), SMALL)
+    with pytest.raises(DataError, match="no views"):
+        prepare(scene(3), [], np.zeros((0, 8, 8, 4)), SMALL)

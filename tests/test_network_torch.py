@@ -1,0 +1,219 @@
+"""The network in torch: identity at the start, symmetries, attention against a naive twin, gradients everywhere."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import pytest
+from network_models import FED, TINY, as_rows, scene
+
+from vvgt_cli.cameras import default_views
+from vvgt_cli.network import NAMED
+from vvgt_cli.network.prepare import pack, prepare, view_arrays
+
+torch = pytest.importorskip("torch")
+
+from vvgt_cli.network import epipolar, head, layers  # noqa: E402
+from vvgt_cli.network.export import shaken  # noqa: E402
+from vvgt_cli.network.geometry import NeighbourConv  # noqa: E402
+from vvgt_cli.network.model import Vvgt  # noqa: E402
+
+
+def tensors(arrays):
+    return {name: torch.from_numpy(np.array(array)) for name, array in arrays.items()}
+
+
+def network(config=TINY, *, random=True):
+    torch.manual_seed(0)
+    made = Vvgt(config).eval()
+    return shaken(made) if random else made
+
+
+def run(model, gaussians, cameras, images):
+    prepared = prepare(gaussians, cameras, images, model.config)
+    with torch.inference_mode():
+        return prepared.restore(model(tensors(prepared.arrays())).numpy())
+
+
+@pytest.mark.parametrize("config", [TINY, FED, replace(TINY, variant="wo_vbm"), replace(TINY, variant="wo_vgf")])
+def test_without_training_the_output_is_the_input(config):
+    gaussians, cameras, images = scene()
+    out = run(network(config, random=False), gaussians, cameras, images)
+    assert np.abs(as_rows(out)[:, :6] - as_rows(gaussians)[:, :6]).max() == 0
+    assert np.abs(pack(out) - pack(gaussians)).max() < 2e-7  # quaternions are normalised again
+
+
+@pytest.mark.parametrize("config", [TINY, FED])
+def test_permuting_gaussians_permutes_the_output(config):
+    gaussians, cameras, images = scene(count=150)
+    model = network(config)
+    order = np.random.default_rng(1).permutation(150)
+    out = as_rows(run(model, gaussians, cameras, images))
+    # the splatter sums what it feeds in another order
+    atol = 0 if config is TINY else 1e-4
+    assert np.allclose(as_rows(run(model, gaussians.take(order), cameras, images)), out[order], atol=atol, rtol=0)
+    assert np.abs(out - as_rows(gaussians)).max() > 0.01
+
+
+def test_permuting_views_changes_nothing_and_their_images_matter():
+    gaussians, cameras, images = scene(views=3)
+    model = network()
+    out = as_rows(run(model, gaussians, cameras, images))
+    turned = as_rows(run(model, gaussians, [cameras[i] for i in (2, 0, 1)], images[[2, 0, 1]]))
+    assert np.allclose(turned, out, atol=2e-5)
+    crossed = as_rows(run(model, gaussians, cameras, images[[2, 0, 1]]))
+    assert np.abs(crossed - out).max() > 1e-4  # views and cameras belong together
+
+
+@pytest.mark.parametrize("config", [TINY, FED, replace(TINY, geometry=replace(TINY.geometry, head="direct")),
+                                    replace(TINY, variant="wo_vgf"), replace(TINY, variant="wo_3dt")])  # fmt: skip
+def test_gradients_reach_every_parameter(config):
+    gaussians, cameras, images = scene()
+    model = network(config).train()
+    out = model(tensors(prepare(gaussians, cameras, images, config).arrays()))
+    weights = torch.randn(out.shape, generator=torch.Generator().manual_seed(0))
+    (out * weights).sum().backward()
+    for name, parameter in model.named_parameters():
+        assert parameter.grad is not None, name
+        assert torch.isfinite(parameter.grad).all(), name
+        assert parameter.grad.abs().max() > 0, name
+
+
+def test_attention_is_softmax_of_products():
+    torch.manual_seed(0)
+    module = layers.Attention(16, 2, qk_norm=True)
+    x = torch.randn(3, 7, 16)
+    q, k, v = module.qkv(x).chunk(3, dim=-1)
+    mixed = torch.empty(3, 7, 16)
+    for batch, h in product(range(3), range(2)):
+        part = slice(8 * h, 8 * h + 8)
+        scores = module.q_norm(q[batch, :, part]) @ module.k_norm(k[batch, :, part]).T / 8**0.5
+        mixed[batch, :, part] = torch.softmax(scores, dim=-1) @ v[batch, :, part]
+    assert torch.allclose(module(x), module.proj(mixed), atol=1e-6)
+
+
+def test_rope_makes_products_depend_on_the_difference_of_places():
+    cos, sin = layers.axial_rope(6, special=2, width=16)
+    q, k = torch.randn(2, 1, 16)
+    turned_q, turned_k = layers.turn(q, (cos, sin)), layers.turn(k, (cos, sin))  # (38, 16): at every place
+    products = turned_q @ turned_k.T
+    at = lambda row, column: 2 + 6 * row + column  # noqa: E731
+    assert torch.allclose(products[at(1, 2), at(3, 1)], products[at(2, 4), at(4, 3)], atol=1e-5)
+    assert not torch.allclose(products[at(1, 2), at(3, 1)], products[at(1, 2), at(1, 3)], atol=1e-3)
+    assert torch.allclose(turned_q[0], q[0])  # special tokens are not turned
+
+
+def naive_epipolar(module, x, points, matrices, eyes, maps):
+    """Eq. 7 with all keys of a token side by side, one token at a time, torch's own bilinear sampling."""
+    uv, seen = epipolar.project(points, matrices)
+    bias = module.bias(points, eyes, seen)
+    query = module.query(module.norm(x))
+    out = torch.zeros_like(x)
+    for token in range(len(x)):
+        logits, values = [], []
+        for view, (scale, of_scale) in product(range(len(matrices)), enumerate(maps)):
+            if not seen[view, token]:
+                continue
+            for layer in range(module.layers):
+                image = of_scale[view, :, :, layer].permute(2, 0, 1)[None]  # (1, c, h, w)
+                number = scale * module.layers + layer
+                kv = module.key_values[number](module.map_norms[number](image[0].permute(1, 2, 0))).permute(2, 0, 1)
+                place = (2 * uv[view, token] - 1).reshape(1, 1, 1, 2)
+                sampled = torch.nn.functional.grid_sample(
+                    kv[None], place, mode="bilinear", padding_mode="border", align_corners=False
+                )[0, :, 0, 0]
+                logits.append(query[token] @ sampled[: module.inner] / module.inner**0.5 + bias[view, token])
+                values.append(sampled[module.inner :])
+        if logits:
+            weights = torch.softmax(torch.stack(logits), dim=0)
+            out[token] = module.out(weights @ torch.stack(values))
+    return out
+
+
+def epipolar_case(points):
+    torch.manual_seed(1)
+    module = shaken(epipolar.EpipolarCrossAttention(16, 8, 2, 8))
+    views = tensors(view_arrays(default_views("train", 4, size=40)))
+    maps = [torch.randn(4, 3 * f, 3 * f, 2, 8) for f in (1, 2, 4)]
+    return module, torch.randn(len(points), 16), points, views["matrices"], views["eyes"], maps
+
+
+def test_epipolar_attention_against_a_materialised_twin():
+    points = torch.from_numpy(np.random.default_rng(0).uniform(-1.6, 1.6, (40, 3)).astype(np.float32))
+    points = torch.cat([points, torch.tensor([[0.0, 0.0, 40.0], [0.0, 0.0, 2.99]])])  # seen by few or none
+    module, *rest = epipolar_case(points)
+    with torch.no_grad():
+        seen = epipolar.project(points, rest[2])[1]
+        assert 0 < seen.float().mean() < 1
+        assert not seen[:, -2].any()
+        assert torch.allclose(module(*rest), naive_epipolar(module, *rest), atol=1e-5)
+        assert (module(*rest)[-2] == 0).all()
+
+
+def test_the_bias_orders_views_by_distance():
+    module, _, points, _, eyes, _ = epipolar_case(torch.tensor([[0.3, -0.2, 0.5]]))
+    seen = torch.ones(4, 1, dtype=torch.bool)
+    with torch.no_grad():
+        for raw in (-3.0, 0.0, 3.0):
+            module.raw_beta.fill_(raw)
+            bias = module.bias(points, eyes, seen)[:, 0]
+            nearest_first = torch.argsort((eyes - points).norm(dim=1))
+            assert (bias[nearest_first].diff() < 0).all()
+        beta = torch.nn.functional.softplus(torch.tensor(3.0))
+        assert torch.allclose(bias, -beta * (eyes - points).norm(dim=1) / 3**0.5, atol=1e-5)
+
+
+def test_projection_against_the_cameras():
+    cameras = default_views("test", size=50)
+    points = np.random.default_rng(0).uniform(-1.5, 1.5, (40, 3)).astype(np.float32)
+    uv, seen = epipolar.project(torch.from_numpy(points), tensors(view_arrays(cameras))["matrices"])
+    for i, c in enumerate(cameras):
+        x, y, z = (points @ c.rotation.T + c.translation).T
+        u, v = c.fx * x / z + c.cx, c.fy * y / z + c.cy
+        inside = (z > 0.01) & (u >= 0) & (u <= c.width) & (v >= 0) & (v <= c.height)
+        assert np.array_equal(seen[i].numpy(), inside)
+        assert np.allclose(uv[i].numpy()[inside], np.column_stack([u / c.width, v / c.height])[inside], atol=1e-5)
+
+
+def test_neighbour_convolution_is_a_sum_over_those_that_are_there():
+    module = NeighbourConv(4)
+    x, table = torch.randn(5, 4), torch.randint(0, 6, (5, 27))
+    expected = torch.zeros(5, 4)
+    for i, j in product(range(5), range(27)):
+        if table[i, j] < 5:
+            expected[i] += x[table[i, j]] * module.weight[j]
+    assert torch.allclose(module(x, table), expected, atol=1e-5)
+
+
+def test_the_head_moves_along_the_gaussians_own_axes():
+    gaussians, _, _ = scene(count=20)
+    rows = torch.from_numpy(pack(gaussians))
+    module = head.GaussianHead(TINY.geometry)
+    with torch.no_grad():
+        module.last.bias[:3] = torch.tensor([50.0, 0.0, 0.0])  # as far along the first axis as it goes
+        out = module(torch.randn(20, 8), rows)
+    moved = (out - rows)[:, :3]
+    axis = head.rotation(rows[:, 6:10])[:, :, 0]
+    assert torch.allclose(moved, 2 * rows[:, 3:4].exp() * axis, atol=1e-6)
+    assert torch.allclose(out[:, 3:], rows[:, 3:], atol=1e-6)
+
+
+def test_gaussians_a_pixel_stand_on_their_rays():
+    config = replace(TINY, variant="wo_3dt")
+    gaussians, cameras, images = scene(views=2)
+    with torch.inference_mode():
+        out = network(config)(tensors(prepare(gaussians, cameras, images, config).arrays())).numpy()
+    side = 4 * config.image.grid
+    assert out.shape == (2 * side * side, 14)
+    for i, c in enumerate(cameras):
+        x, y, z = (out[i * side * side :][: side * side, :3] @ c.rotation.T + c.translation).T
+        v, u = np.divmod(np.arange(side * side), side)
+        assert np.allclose((c.fx * x / z + c.cx) / c.width, (u + 0.5) / side, atol=1e-4)
+        assert np.allclose((c.fy * y / z + c.cy) / c.height, (v + 0.5) / side, atol=1e-4)
+        assert (z > 0).all()
+
+
+def test_small_is_small():
+    assert 5.0e6 < sum(parameter.numel() for parameter in Vvgt(NAMED["small"]).parameters()) < 6.2e6

@@ -1,0 +1,129 @@
+"""Model cards: what an exported model is, and whether the files beside the card are the ones it speaks of."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from vvgt_cli import __version__
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.network.config import SCALES, NetworkConfig
+
+FORMAT, SCHEMA = "vvgt-model", 1  # the schema is raised when a graph's input or output changes its meaning
+CARD = "card.json"
+MODELS = Path(__file__).parents[2] / "models"
+MAPS = [f"maps_{scale}" for scale in range(SCALES)]
+IMAGE_INPUTS = ["images", "poses"]
+OUTPUT = "gaussians_out"
+
+
+@dataclass
+class ModelCard:
+    """A model's card, `card.json` in its folder.
+
+    Attributes:
+        name: the folder's.
+        config: of the network, `NetworkConfig.to_dict`.
+        parameters: learned numbers.
+        training: what it was trained on and how; from the checkpoint.
+        commit: of the program that trained it.
+        metrics: its measured gain; from the checkpoint.
+        opset: of ONNX.
+        storage: "float32" or "float16", of the weights; arithmetic is float32.
+        difference: largest deviation of onnxruntime from torch, see `vvgt_cli.network.export.difference`.
+        graphs: by "image" and "geometry": file, bytes, sha256, inputs, outputs.
+        version: of the program that exported it.
+    """
+
+    name: str
+    config: dict[str, Any]
+    parameters: int
+    training: dict[str, Any]
+    commit: str
+    metrics: dict[str, Any]
+    opset: int
+    storage: str
+    difference: float
+    graphs: dict[str, dict[str, Any]] = field(default_factory=dict)
+    version: str = __version__
+
+    def to_json(self) -> str:
+        """The card's text."""
+        return json.dumps({"format": FORMAT, "schema": SCHEMA, **asdict(self)}, indent=2, allow_nan=False) + "\n"
+
+    @property
+    def network(self) -> NetworkConfig:
+        """The configuration, checked."""
+        return NetworkConfig.from_dict(self.config)
+
+
+def graph_record(path: Path, inputs: list[str], outputs: list[str]) -> dict[str, Any]:
+    """A graph's entry in the card."""
+    content = path.read_bytes()
+    digest = hashlib.sha256(content).hexdigest()
+    return {"file": path.name, "bytes": len(content), "sha256": digest, "inputs": inputs, "outputs": outputs}
+
+
+def find_model(name: str) -> Path:
+    """Folder of a model: a path, or the name of one that comes with the program.
+
+    Raises:
+        UsageError: there is none.
+    """
+    for folder in (Path(name), MODELS / name):
+        if (folder / CARD).is_file():
+            return folder
+    if Path(name).is_dir():
+        raise UsageError(f"model {name}: the folder has no {CARD}; expected one that 'vvgt export' wrote")
+    shipped = sorted(path.parent.name for path in MODELS.glob(f"*/{CARD}"))
+    known = f"; shipped are {', '.join(shipped)}" if shipped else "; none is shipped with this version"
+    raise UsageError(f"model {name}: no such folder{known}; expected a folder that 'vvgt export' wrote")
+
+
+def read_card(folder: Path) -> ModelCard:
+    """Read a card and check that the graphs beside it are whole.
+
+    Raises:
+        DataError: not a card, of another schema, or a graph that is missing or not the one the card speaks of.
+    """
+    path = folder / CARD
+    try:
+        document = json.loads(path.read_text("utf-8"))
+        kind, schema = document.pop("format"), document.pop("schema")
+    except (OSError, ValueError, KeyError, AttributeError, TypeError) as error:
+        raise DataError(f"{path}: not a model card ({error}); expected one that 'vvgt export' wrote") from None
+    if kind != FORMAT or schema != SCHEMA:
+        raise DataError(
+            f"{path}: {kind} of schema {schema}, written by version {document.get('version')}; this is version "
+            f"{__version__} and reads {FORMAT} of schema {SCHEMA}: export the checkpoint again"
+        )
+    try:
+        card = ModelCard(**document)
+        wanted = {"geometry", "image"} if card.network.has_images else {"geometry"}
+        if set(card.graphs) != wanted:
+            raise ValueError(f"graphs {sorted(card.graphs)}, expected {sorted(wanted)}")
+        for record in card.graphs.values():
+            check_graph(folder, record)
+    except (TypeError, KeyError, ValueError) as error:
+        raise DataError(f"{path}: {error}; export the checkpoint again") from None
+    return card
+
+
+def check_graph(folder: Path, record: dict[str, Any]) -> None:
+    """See that a graph's file is there, whole, and the one that was exported.
+
+    Raises:
+        DataError: it is not.
+    """
+    path = folder / str(record["file"])
+    if path.parent != folder or not path.is_file():
+        raise DataError(f"{path}: no such file, but the model's card names it; fetch or export the model again")
+    size = path.stat().st_size
+    if size != record["bytes"]:
+        raise DataError(f"{path}: {size} bytes, its card says {record['bytes']}: truncated or replaced; fetch it again")
+    with path.open("rb") as file:
+        if hashlib.file_digest(file, "sha256").hexdigest() != record["sha256"]:
+            raise DataError(f"{path}: its content is not what its card says (sha256); fetch or export the model again")

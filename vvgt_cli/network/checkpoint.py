@@ -1,0 +1,96 @@
+"""Checkpoints: a network's configuration and weights in one file, loaded without running what is in it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from vvgt_cli.errors import DataError
+from vvgt_cli.network.config import NetworkConfig
+from vvgt_cli.network.model import Vvgt
+
+FORMAT, SCHEMA = "vvgt-checkpoint", 1
+
+
+@dataclass
+class Checkpoint:
+    """A trained network.
+
+    Attributes:
+        network: with its weights.
+        training: what it was trained on and how, plain values.
+        metrics: its measured gain, plain values.
+        commit: of the program that trained it.
+    """
+
+    network: Vvgt
+    training: dict[str, Any] = field(default_factory=dict)
+    metrics: dict[str, Any] = field(default_factory=dict)
+    commit: str = "unknown"
+
+    def to_dict(self) -> dict[str, Any]:
+        """What the file holds; a trainer may add keys of its own."""
+        return {
+            "format": FORMAT,
+            "schema": SCHEMA,
+            "config": self.network.config.to_dict(),
+            "state": self.network.state_dict(),
+            "training": self.training,
+            "metrics": self.metrics,
+            "commit": self.commit,
+        }
+
+
+def save_checkpoint(path: str | Path, checkpoint: Checkpoint) -> None:
+    """Write a checkpoint to ``path`` as it is given (`vvgt_cli.files.atomic_write` makes it whole or none)."""
+    torch.save(checkpoint.to_dict(), path)
+
+
+def load_checkpoint(path: str | Path) -> Checkpoint:
+    """Read a checkpoint; tensors and plain values only, no pickled code is run.
+
+    Raises:
+        DataError: not a checkpoint, of another schema, or weights that do not fit the configuration.
+    """
+    if not Path(path).is_file():
+        raise DataError(f"{path}: no such file; expected a checkpoint")
+    try:
+        document = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # torch raises its own, pickle's, zipfile's and more
+        reason = str(error).splitlines()[0][:120]
+        raise DataError(f"{path}: not a checkpoint, or damaged ({type(error).__name__}: {reason})") from None
+    if not isinstance(document, dict) or document.get("format") != FORMAT:
+        raise DataError(f"{path}: not a checkpoint of this program; expected one that training wrote")
+    if document.get("schema") != SCHEMA:
+        raise DataError(f"{path}: checkpoint of schema {document.get('schema')}; this version reads schema {SCHEMA}")
+    try:
+        network = Vvgt(NetworkConfig.from_dict(document["config"]))
+        load_weights(network, document["state"], str(path))
+        return Checkpoint(network.eval(), document["training"], document["metrics"], str(document["commit"]))
+    except KeyError as error:
+        raise DataError(f"{path}: checkpoint without {error}; it was not written whole") from None
+
+
+def load_weights(module: torch.nn.Module, state: dict[str, Tensor], name: str) -> None:
+    """Load weights, every name and shape checked.
+
+    Raises:
+        DataError: a weight that is missing, unknown, of another shape, or not finite.
+    """
+    own = module.state_dict()
+    missing, unknown = sorted(set(own) - set(state)), sorted(set(state) - set(own))
+    if missing or unknown:
+        shown = ", ".join([*(f"no {key}" for key in missing[:2]), *(f"unknown {key}" for key in unknown[:2])])
+        raise DataError(
+            f"{name}: {len(missing)} weights missing, {len(unknown)} unknown ({shown}); expected {len(own)} weights"
+        )
+    for key, value in state.items():
+        if value.shape != own[key].shape:
+            raise DataError(f"{name}: {key} is {tuple(value.shape)}; expected {tuple(own[key].shape)}")
+        if not torch.isfinite(value).all():
+            raise DataError(f"{name}: {key} is not finite; the training that wrote it had failed")
+    module.load_state_dict(state)

@@ -1,0 +1,96 @@
+"""Heads: features to the parameters of Gaussians (Eq. 6), and the ablation that predicts them a pixel."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from vvgt_cli.gaussians.types import SH_C0
+from vvgt_cli.network.config import PARAMETERS, GeometryConfig
+from vvgt_cli.network.layers import ZeroLinear
+
+SPLIT = (3, 3, 4, 1, 3)  # mean, log-scale, quaternion, opacity logit, colour
+TYPICAL_LOG_SCALE = -4.0  # 1/50 of half the longest edge
+
+
+def rotation(quaternions: Tensor) -> Tensor:
+    """(n, 3, 3) of unit quaternions (n, 4), (w, x, y, z)."""
+    w, x, y, z = quaternions.unbind(-1)
+    rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]  # fmt: skip
+    return torch.stack(rows, dim=-1).reshape(-1, 3, 3)
+
+
+def describe(gaussians: Tensor) -> Tensor:
+    """Input features (K, 14) of Gaussians (K, 14): each of a size near 1.
+
+    The level of the closed form's cell is the mean log-scale but for a constant, which these hold.
+    """
+    mean, log_scale, quaternion, logit, color = gaussians.split(SPLIT, dim=-1)
+    scale = (log_scale - TYPICAL_LOG_SCALE) / 2
+    return torch.cat([mean, scale, quaternion, logit / 4, 2 * color - 1], dim=-1)
+
+
+class GaussianHead(nn.Module):
+    """Features (K, width) and the Gaussians they belong to (K, 14) -> Gaussians (K, 14).
+
+    The last layer is zero: a network without training returns its input ("residual"). "direct" is Eq. 6 as printed,
+    an offset of the centre and all else predicted.
+    """
+
+    def __init__(self, config: GeometryConfig) -> None:
+        super().__init__()
+        width = config.decoder_widths[0]
+        self.direct, self.reach = config.head == "direct", config.reach
+        self.norm = nn.LayerNorm(width)
+        self.hidden = nn.Linear(width, width)
+        self.last = ZeroLinear(width, PARAMETERS)
+
+    def forward(self, x: Tensor, gaussians: Tensor) -> Tensor:
+        step = self.last(functional.gelu(self.hidden(self.norm(x)))).split(SPLIT, dim=-1)
+        mean, log_scale, quaternion, logit, color = gaussians.split(SPLIT, dim=-1)
+        own = self.reach * log_scale.exp() * torch.tanh(step[0])  # (K, 3) along the Gaussian's axes
+        moved = mean + (rotation(quaternion) @ own[..., None])[..., 0]
+        if self.direct:
+            unit = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=x.dtype, device=x.device)
+            turned = functional.normalize(unit + step[2], dim=-1)
+            return torch.cat([moved, TYPICAL_LOG_SCALE + step[1], turned, step[3], 0.5 + SH_C0 * step[4]], dim=-1)
+        grown = log_scale + 2 * torch.tanh(step[1])  # at most a factor e^2 either way
+        turned = functional.normalize(quaternion + step[2], dim=-1)
+        return torch.cat([moved, grown, turned, logit + step[3], color + SH_C0 * step[4]], dim=-1)
+
+
+class PixelHead(nn.Module):
+    """Gaussians a pixel of the finest map (the ablation "w/o 3DT", after AnySplat): one on each pixel's ray.
+
+    Depths run from `CLOSE` to the far side of the unit cube's ball; a scale of 1 covers its pixel.
+    """
+
+    CLOSE = 0.01
+
+    def __init__(self, map_width: int, layers: int) -> None:
+        super().__init__()
+        self.norm = nn.LayerNorm(layers * map_width)
+        self.hidden = nn.Linear(layers * map_width, map_width)
+        self.last = nn.Linear(map_width, 12)  # depth 1, log-scale 3, quaternion 4, logit 1, colour 3
+
+    def forward(self, finest: Tensor, matrices: Tensor, eyes: Tensor) -> Tensor:
+        """Finest maps (n, h, w, L, c), matrices (n, 3, 4), eyes (n, 3) -> (n * h * w, 14)."""
+        count, height, width = finest.shape[:3]
+        out = self.last(functional.gelu(self.hidden(self.norm(finest.flatten(3)))))  # (n, h, w, 12)
+        v, u = torch.meshgrid((torch.arange(height) + 0.5) / height, (torch.arange(width) + 0.5) / width, indexing="ij")
+        pixels = torch.stack([u, v, torch.ones_like(u)], dim=-1).reshape(1, -1, 3).to(out)  # (1, h * w, 3)
+        rays = pixels @ torch.linalg.inv(matrices[:, :, :3]).transpose(1, 2)  # (n, h * w, 3), depth 1
+        far = eyes.norm(dim=-1)[:, None, None] + math.sqrt(3)  # (n, 1, 1)
+        out = out.reshape(count, -1, 12)  # (n, h * w, 12)
+        depth = self.CLOSE + (far - self.CLOSE) * torch.sigmoid(out[..., :1])
+        mean = eyes[:, None] + depth * rays
+        footprint = depth * rays.norm(dim=-1, keepdim=True) / width
+        unit = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=out.dtype, device=out.device)
+        turned = functional.normalize(unit + out[..., 4:8], dim=-1)
+        parts = [mean, footprint.log() + out[..., 1:4], turned, out[..., 8:9], 0.5 + SH_C0 * out[..., 9:]]
+        return torch.cat(parts, dim=-1).reshape(-1, 14)

@@ -1,0 +1,184 @@
+"""From Gaussians, cameras and views to the network's arrays, in numpy: what both torch and onnxruntime are given."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vvgt_cli.cameras import Camera
+from vvgt_cli.errors import DataError
+from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.network import tables
+from vvgt_cli.network.config import NetworkConfig
+
+UNIT_RADIUS = math.sqrt(3)  # half-diagonal of the unit frame's cube
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """The network's input.
+
+    Attributes:
+        config: of the network.
+        views: ``images`` (n, channels, size, size), ``poses`` (n, 9), ``matrices`` (n, 3, 4), ``eyes`` (n, 3);
+            nothing for a network that reads no views.
+        rows: (K, 14) Gaussians in canonical order.
+        gradients: (K, 14), None for a network that takes none.
+        order: (K,) row of the given Gaussians that each of ``rows`` is.
+    """
+
+    config: NetworkConfig
+    views: dict[str, np.ndarray]
+    rows: np.ndarray
+    gradients: np.ndarray | None
+    order: np.ndarray
+
+    def part(self, start: int = 0, stop: int | None = None) -> dict[str, np.ndarray]:
+        """What the geometry side is given of rows [start, stop): ``gaussians``, ``gradients`` and the tables."""
+        rows = self.rows[start:stop]
+        arrays = {"gaussians": rows, **tables.build(rows[:, :3], self.config.geometry)}
+        if self.gradients is not None:
+            arrays["gradients"] = self.gradients[start:stop]
+        return arrays
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """All that `Vvgt.forward` is given."""
+        return self.views | (self.part() if self.config.has_geometry else {})
+
+    def restore(self, rows: np.ndarray) -> Gaussians:
+        """The network's output (K, 14) as Gaussians in the order that was given."""
+        given = np.empty_like(rows)
+        given[self.order] = rows
+        return unpack(given)
+
+
+def pack(gaussians: Gaussians) -> np.ndarray:
+    """(K, 14) float32; quaternions of norm 1, of q and -q (one rotation) the one with the first non-zero above 0."""
+    q = gaussians.quaternions.astype(np.float64)
+    q /= np.linalg.norm(q, axis=1, keepdims=True)
+    first = np.take_along_axis(q, (q != 0).argmax(axis=1)[:, None], axis=1)
+    q *= np.sign(first)
+    columns = [gaussians.means, gaussians.log_scales, q, gaussians.opacity_logits[:, None], gaussians.colors]
+    return np.concatenate(columns, axis=1, dtype=np.float32, casting="same_kind")
+
+
+def unpack(rows: np.ndarray) -> Gaussians:
+    """The inverse of `pack`."""
+    return Gaussians(rows[:, :3], rows[:, 3:6], rows[:, 6:10], rows[:, 10], rows[:, 11:])
+
+
+def prepare(gaussians: Gaussians, cameras: Sequence[Camera], images: np.ndarray, config: NetworkConfig) -> Prepared:
+    """Everything that the network is given for a scene.
+
+    Args:
+        gaussians: to be improved, unit frame.
+        cameras, images: views, (n, h, w, 4) float32 premultiplied, of any size.
+        config: of the network.
+
+    Raises:
+        DataError: no Gaussians, or no views for a network that needs some.
+    """
+    if not len(gaussians):
+        raise DataError("no Gaussians: the network needs at least one")
+    needs_views = config.has_images or (config.has_geometry and config.geometry.gradients)
+    if needs_views and not len(cameras):
+        raise DataError("no views: this network reads at least one")
+    rows = pack(gaussians)
+    gaussians = unpack(rows)  # the gradient of q is minus that of -q
+    order = tables.canonical_order(rows)
+    views: dict[str, np.ndarray] = {}
+    if config.has_images:
+        views = {**view_arrays(cameras), "images": image_arrays(gaussians, cameras, images, config)}
+    gradients = None
+    if config.has_geometry and config.geometry.gradients:
+        gradients = gradient_rows(gaussians, cameras, images)[order]
+    return Prepared(config, views, rows[order], gradients, order)
+
+
+def view_arrays(cameras: Sequence[Camera]) -> dict[str, np.ndarray]:
+    """``poses`` (n, 9), ``matrices`` (n, 3, 4) to (u w, v w, w) with u, v in [0, 1], and ``eyes`` (n, 3), float32.
+
+    A pose is world-to-camera: translation in half-diagonals of the unit cube, quaternion with w >= 0, field of view
+    (h, w) in radians. It is absolute: relative to the first view the volume's frame would be lost.
+    """
+    poses, matrices = [], []
+    for c in cameras:
+        translation = c.translation / UNIT_RADIUS
+        fov = 2 * np.arctan([c.height / (2 * c.fy), c.width / (2 * c.fx)])
+        poses.append(np.concatenate([translation, quaternion(c.rotation), fov]))
+        lens = np.array([[c.fx / c.width, 0, c.cx / c.width], [0, c.fy / c.height, c.cy / c.height], [0, 0, 1]])
+        matrices.append(lens @ np.column_stack([c.rotation, c.translation]))
+    eyes = [c.position for c in cameras]
+    return {
+        name: np.array(values, np.float32)
+        for name, values in {"poses": poses, "matrices": matrices, "eyes": eyes}.items()
+    }
+
+
+def quaternion(rotation: np.ndarray) -> np.ndarray:
+    """(w, x, y, z), w >= 0, of a rotation (3, 3): the eigenvector of Bar-Itzhack (2000), sound for every angle."""
+    m = rotation
+    k = np.array([
+        [m[0, 0] - m[1, 1] - m[2, 2], 0, 0, 0],
+        [m[1, 0] + m[0, 1], m[1, 1] - m[0, 0] - m[2, 2], 0, 0],
+        [m[2, 0] + m[0, 2], m[2, 1] + m[1, 2], m[2, 2] - m[0, 0] - m[1, 1], 0],
+        [m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1], m[0, 0] + m[1, 1] + m[2, 2]],
+    ])  # fmt: skip
+    x, y, z, w = np.linalg.eigh(k)[1][:, -1]  # eigh reads the lower triangle
+    return np.array([w, x, y, z]) * (1.0 if w >= 0 else -1.0)
+
+
+def image_arrays(
+    gaussians: Gaussians, cameras: Sequence[Camera], images: np.ndarray, config: NetworkConfig
+) -> np.ndarray:
+    """(n, channels, size, size) float32: targets, and where the network takes it the Gaussians' own rendering."""
+    size = config.image.size
+    out = np.empty((len(cameras), config.channels, size, size), np.float32)
+    for i, camera in enumerate(cameras):
+        out[i, :4] = resize(images[i], size)
+        if config.rendering:
+            from vvgt_cli.splat import render
+
+            out[i, 4:] = resize(render(gaussians, camera), size)
+    return out
+
+
+def resize(image: np.ndarray, size: int) -> np.ndarray:
+    """(h, w, c) to (c, size, size): each axis by a triangle filter, as wide as the coarser of the two grids."""
+    rows, columns = filter_matrix(image.shape[0], size), filter_matrix(image.shape[1], size)
+    return np.einsum("ih,hwc,jw->cij", rows, image, columns, optimize=True)
+
+
+def filter_matrix(old: int, new: int) -> np.ndarray:
+    """(new, old) float32 weights, each row's sum 1."""
+    if old == new:
+        return np.eye(new, dtype=np.float32)
+    ratio = old / new
+    centre = (np.arange(new) + 0.5) * ratio - 0.5  # in old pixels
+    weights = np.maximum(0, 1 - np.abs(centre[:, None] - np.arange(old)) / max(ratio, 1.0))
+    return (weights / weights.sum(axis=1, keepdims=True)).astype(np.float32)
+
+
+def gradient_rows(gaussians: Gaussians, cameras: Sequence[Camera], images: np.ndarray) -> np.ndarray:
+    """(K, 14) float32: dL/d(parameters), L the sum of squared RGBA errors over the views.
+
+    Gradients span decades, so each of the five fields is taken by its root mean square over the scene, then
+    ``sign(g) log(1 + |g|)``.
+    """
+    from vvgt_cli.splat import project, render, render_backward
+
+    total = np.zeros((len(gaussians), 14))
+    for camera, view in zip(cameras, images, strict=True):
+        projection = project(gaussians, camera)
+        image = render(gaussians, camera, projection)
+        g = render_backward(gaussians, camera, projection, image, 2 * (image - view))
+        total += np.concatenate(
+            [g.means, g.log_scales, g.quaternions, g.opacity_logits[:, None], g.colors], axis=1, dtype=np.float64
+        )
+    for field in (slice(0, 3), slice(3, 6), slice(6, 10), slice(10, 11), slice(11, 14)):
+        part = total[:, field]
+        part /= max(float(np.sqrt(np.mean(part**2))), 1e-30)
+    return (np.sign(total) * np.log1p(np.abs(total))).astype(np.float32)

@@ -1,0 +1,166 @@
+"""Running an exported model with onnxruntime: no torch, bounded memory (docs/network.md, "Running it")."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vvgt_cli.cameras import Camera
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.network.card import MAPS, OUTPUT, ModelCard, read_card
+from vvgt_cli.network.prepare import Prepared, prepare
+from vvgt_cli.progress import ProgressCallback
+
+PROVIDERS = {"cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider"}
+POINTS = 160_000  # Gaussians of one run of the second graph: the paper's 150,000 go at once
+
+
+def spread(cameras: Sequence[Camera], count: int) -> list[int]:
+    """Numbers, ascending, of at most ``count`` cameras that stand far apart: farthest-point choice.
+
+    It begins with the camera farthest from all others' centre. Ties go to the camera with the smaller position, so
+    that the order of the cameras does not matter.
+    """
+    eyes = np.array([camera.position for camera in cameras])
+    if len(eyes) <= count:
+        return list(range(len(eyes)))
+    tie = np.lexsort(eyes.T)  # smallest first
+    eyes = eyes[tie]
+    gap = np.linalg.norm(eyes - eyes[np.argmax(np.linalg.norm(eyes - eyes.mean(axis=0), axis=1))], axis=1)
+    chosen = [int(np.argmin(gap))]
+    while len(chosen) < count:
+        nearest = int(np.argmax(np.where(np.isin(np.arange(len(eyes)), chosen), -1.0, gap)))
+        chosen.append(nearest)
+        gap = np.minimum(gap, np.linalg.norm(eyes - eyes[nearest], axis=1))
+    return sorted(int(tie[i]) for i in chosen)
+
+
+@dataclass
+class Model:
+    """An exported model, ready to run.
+
+    Attributes:
+        card: what it is.
+        sessions: onnxruntime's, by "image" and "geometry".
+    """
+
+    card: ModelCard
+    sessions: dict[str, Any]
+
+    @classmethod
+    def open(cls, folder: Path, threads: int = 0, provider: str = "cpu") -> Model:
+        """Load a model; its files, names and axes are checked.
+
+        Args:
+            folder: with card and graphs, see `vvgt_cli.network.card.find_model`.
+            threads: of the CPU provider; 0 for onnxruntime's own choice.
+            provider: one of `PROVIDERS`.
+
+        Raises:
+            UsageError: a provider that this onnxruntime does not have.
+            DataError: files that are missing, damaged, of another version, or graphs with other inputs.
+        """
+        import onnxruntime
+
+        have = onnxruntime.get_available_providers()
+        if PROVIDERS[provider] not in have:
+            raise UsageError(
+                f"--provider {provider}: this onnxruntime has {', '.join(have)}; install onnxruntime-gpu, or use cpu"
+            )
+        card = read_card(folder)
+        sessions = {}
+        for name, record in card.graphs.items():
+            sessions[name] = _session(folder / record["file"], threads, provider)
+            _check_names(folder / record["file"], sessions[name], record)
+        return cls(card, sessions)
+
+    def improve(
+        self,
+        gaussians: Gaussians,
+        cameras: Sequence[Camera],
+        images: np.ndarray,
+        points: int = POINTS,
+        progress: ProgressCallback | None = None,
+    ) -> Gaussians:
+        """The network's Gaussians, in the order of the given.
+
+        Views beyond the number that the model is made for are thinned out (`spread`). More Gaussians than ``points``
+        are dealt with in equal parts along the Z-order, each as a scene of its own.
+
+        Args:
+            gaussians: where it starts, unit frame.
+            cameras, images: views, (n, h, w, 4) float32 premultiplied.
+            points: of one part, at most.
+            progress: called after each part.
+
+        Raises:
+            DataError: no Gaussians, no views, or output that is not finite.
+        """
+        config = self.card.network
+        few = spread(cameras, config.image.views)
+        scene = prepare(gaussians, [cameras[i] for i in few], images[few], config)
+        rows = self.run_rows(scene, points, progress)
+        if not np.isfinite(rows).all():
+            raise DataError(f"model {self.card.name}: its output is not finite; it cannot be used on these Gaussians")
+        return scene.restore(rows)
+
+    def run_rows(self, scene: Prepared, points: int = POINTS, progress: ProgressCallback | None = None) -> np.ndarray:
+        """Both graphs on a prepared scene: rows (K, 14) in its order."""
+        views = dict(scene.views)
+        if "image" in self.sessions:
+            maps = self._run("image", {name: views.pop(name) for name in ("images", "poses")})
+            views |= dict(zip(MAPS, maps, strict=True))
+        count = len(scene.rows)
+        parts = math.ceil(count / points)
+        edges = [count * i // parts for i in range(parts + 1)]
+        out = np.empty_like(scene.rows)
+        for number in range(parts):
+            start, stop = edges[number], edges[number + 1]
+            out[start:stop] = self._run("geometry", views | scene.part(start, stop))[0]
+            if progress:
+                progress(number + 1, parts)
+        return out
+
+    def _run(self, graph: str, feed: dict[str, np.ndarray]) -> list[np.ndarray]:
+        session = self.sessions[graph]
+        try:
+            return session.run(None, {entry.name: feed[entry.name] for entry in session.get_inputs()})
+        except Exception as error:  # onnxruntime raises classes of its own C++ module
+            reason = " ".join(str(error).split())[:200]
+            raise DataError(f"model {self.card.name}: the {graph} graph failed ({reason})") from None
+
+
+def _session(path: Path, threads: int, provider: str) -> Any:
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.log_severity_level = 4  # errors come as exceptions
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # waiting threads would burn a core each
+    try:
+        session = onnxruntime.InferenceSession(str(path), options, [PROVIDERS[provider]])
+    except Exception as error:  # onnxruntime raises classes of its own C++ module
+        reason = " ".join(str(error).split())[:200]
+        raise DataError(f"{path}: onnxruntime cannot load it ({reason}); fetch or export the model again") from None
+    if session.get_providers()[0] != PROVIDERS[provider]:
+        raise DataError(f"--provider {provider}: onnxruntime fell back to the CPU; check the driver, or use cpu")
+    return session
+
+
+def _check_names(path: Path, session: Any, record: dict[str, Any]) -> None:
+    """The graph's names are the card's, and the last output of the second is what this version reads."""
+    found = [entry.name for entry in session.get_inputs()], [entry.name for entry in session.get_outputs()]
+    wanted = list(record["inputs"]), list(record["outputs"])
+    outputs = MAPS if path.stem == "image" else [OUTPUT]
+    for side, has, expected in zip(("inputs", "outputs"), found, wanted, strict=True):
+        if has != expected or (side == "outputs" and has != outputs):
+            raise DataError(
+                f"{path}: {side} are {', '.join(has)}; expected {', '.join(expected)}: a graph of another version, "
+                "export the checkpoint again"
+            )

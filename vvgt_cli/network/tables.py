@@ -1,0 +1,166 @@
+"""Integer tables of the geometry transformer, in numpy: order, windows, pooling, neighbours (PTV3, Sec. 4).
+
+They depend on where the Gaussians are and on nothing that is learned, so they stay out of the graphs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vvgt_cli.network.config import STAGES, GeometryConfig
+from vvgt_cli.network.curves import BITS, CURVES, curve_code, interleave
+
+OFFSETS = np.array([(i, j, k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)])  # (27, 3)
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Points of one stage, in Z-order: at stage 0 Gaussians, later cells.
+
+    Attributes:
+        cells: (n, 3) int64 below 2^bits.
+        bits: depth of the grid.
+        positions: (n, 3) float32 mean position of the Gaussians within, unit frame.
+        counts: (n,) int64 Gaussians within.
+    """
+
+    cells: np.ndarray
+    bits: int
+    positions: np.ndarray
+    counts: np.ndarray
+
+
+def block_curves(config: GeometryConfig) -> list[list[str]]:
+    """Curve of each block: nine lists, encoder stages 0 to 4, then decoder stages 3 to 0; block i takes i mod 4."""
+    depths = [*config.depths, *config.decoder_depths[::-1]]
+    curves, block = [], 0
+    for depth in depths:
+        curves.append([CURVES[(block + i) % len(CURVES)] for i in range(depth)])
+        block += depth
+    return curves
+
+
+def stages_of_blocks() -> list[int]:
+    """Stage of each of the nine groups of blocks."""
+    return [*range(STAGES), *reversed(range(STAGES - 1))]
+
+
+def quantise(means: np.ndarray) -> np.ndarray:
+    """Cells (n, 3) int64 of the finest grid: 2^16 an axis over the cube around the unit frame and all means."""
+    bound = max(1.0, float(np.abs(means).max(initial=0)))
+    cells = np.floor((means.astype(np.float64) / bound + 1) * (1 << BITS - 1)).astype(np.int64)
+    return np.clip(cells, 0, (1 << BITS) - 1)
+
+
+def canonical_order(rows: np.ndarray) -> np.ndarray:
+    """Permutation (K,) that sorts Gaussians along the Z-order curve; ties by all parameters, in full precision.
+
+    Whatever order the rows come in, they go on in one order (exact duplicates aside, which nothing can tell apart).
+
+    Args:
+        rows: (K, n) float32, mean first.
+    """
+    codes = interleave(quantise(rows[:, :3]))
+    order = np.argsort(codes, kind="stable")
+    ordered = codes[order]
+    tied = np.zeros(len(rows), bool)
+    same = ordered[1:] == ordered[:-1]
+    tied[1:] |= same
+    tied[:-1] |= same
+    if tied.any():
+        some = order[tied]
+        keys = [*(rows[some, i] for i in reversed(range(rows.shape[1]))), codes[some]]
+        order[tied] = some[np.lexsort(keys)]
+    return order
+
+
+def pool(stage: Stage) -> tuple[Stage, np.ndarray]:
+    """The next stage and the parent (n,) of each point: the finest grid that has no more than half the points.
+
+    PTV3 halves the resolution each time; the cells of the closed form have many sizes, and so may need more.
+    """
+    codes = interleave(stage.cells)
+    target = max(len(codes) // 2, 1)
+    bits = stage.bits if len(codes) > 1 else 0
+    steps = codes[1:] ^ codes[:-1]  # sorted: a cell ends where the code above the shift changes
+    while bits > 0:
+        bits -= 1
+        ends = steps >> 3 * (stage.bits - bits) != 0
+        if np.count_nonzero(ends) + 1 <= target:
+            break
+    else:
+        ends = np.zeros(len(steps), bool)
+    first = np.concatenate([[0], np.flatnonzero(ends) + 1])
+    parents = np.concatenate([[0], np.cumsum(ends)]).astype(np.int64)
+    counts = np.add.reduceat(stage.counts, first)
+    sums = np.add.reduceat(stage.positions.astype(np.float64) * stage.counts[:, None], first, axis=0)
+    positions = (sums / counts[:, None]).astype(np.float32)
+    return Stage(stage.cells[first] >> stage.bits - bits, bits, positions, counts), parents
+
+
+def neighbours(stage: Stage) -> np.ndarray:
+    """(n, 27) int64: which point is in each of the cells around a point's own; n where none is."""
+    count, side = len(stage.cells), 1 << stage.bits
+    codes = interleave(stage.cells)  # ascending and distinct
+    table = np.full((count, 27), count, np.int64)
+    own = np.arange(count)
+    table[:, 13] = own
+    for j in range(13):  # the other 13 are mirror images
+        near = stage.cells + OFFSETS[j]
+        inside = ((near >= 0) & (near < side)).all(axis=1)
+        wanted = interleave(near[inside])
+        place = np.minimum(np.searchsorted(codes, wanted), count - 1)
+        hit = codes[place] == wanted
+        points, others = own[inside][hit], place[hit]
+        table[points, j] = others
+        table[others, 26 - j] = points
+    return table
+
+
+def windows(order: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Windows along an order of n points: members (p, w) int64, and (n,) the slot in them that each point reads.
+
+    The last window begins early where n is no multiple of ``size``: its first points attend twice and the slot
+    takes the earlier result. Padding would need a mask.
+    """
+    n = len(order)
+    width = min(size, n)
+    count = -(-n // width)
+    starts = np.minimum(np.arange(count) * width, n - width)
+    members = order[starts[:, None] + np.arange(width)]  # (p, w)
+    place = np.arange(n)
+    slots = np.empty(n, np.int64)
+    window = np.minimum(place // width, count - 1)
+    slots[order] = window * width + place - starts[window]
+    return members, slots
+
+
+def build(means: np.ndarray, config: GeometryConfig) -> dict[str, np.ndarray]:
+    """All tables of a scene.
+
+    Args:
+        means: (K, 3) float32, already in `canonical_order`.
+
+    Returns:
+        By name: ``positions`` (n, 3) float32 of the epipolar stage; ``parents_I`` (n_I,) into stage I + 1;
+        ``neighbours_I`` (n_I, 27) for I from 1; ``windows_I_C`` and ``slots_I_C`` for each curve C that stage I uses.
+    """
+    stage = Stage(quantise(means), BITS, means, np.ones(len(means), np.int64))
+    wanted: list[list[str]] = [[] for _ in range(STAGES)]
+    for number, curves in zip(stages_of_blocks(), block_curves(config), strict=True):
+        wanted[number] += [curve for curve in curves if curve not in wanted[number]]
+    tables: dict[str, np.ndarray] = {}
+    for i in range(STAGES):
+        if i == config.epipolar_stage:
+            tables["positions"] = stage.positions
+        if i > 0:
+            tables[f"neighbours_{i}"] = neighbours(stage)
+        for curve in wanted[i]:
+            # stable: equal codes keep the canonical order
+            order = np.argsort(curve_code(stage.cells, max(stage.bits, 1), curve), kind="stable")
+            tables[f"windows_{i}_{curve}"], tables[f"slots_{i}_{curve}"] = windows(order, config.window)
+        if i < STAGES - 1:
+            stage, tables[f"parents_{i}"] = pool(stage)
+    return tables
