@@ -268,6 +268,16 @@ def test_views_are_the_same_bytes_every_time_and_report_progress():
     assert seen == [(1, 2), (2, 2)]
 
 
+def test_a_step_of_1_is_a_step_of_one_point_zero_to_the_compiler():
+    from vvgt_cli.dvr.kernel import render_tiles
+
+    scene = Scene.build(Volume(smooth(10)), RAINBOW, 1.0)
+    first = render_view(scene, camera(), RenderSettings(step=1.0, samples=1))
+    compiled = len(render_tiles.signatures)
+    assert render_view(scene, camera(), RenderSettings(step=1, samples=1)).tobytes() == first.tobytes()
+    assert len(render_tiles.signatures) == compiled
+
+
 @pytest.mark.parametrize("options", [{"step": 0}, {"step": 5}, {"step": math.nan}, {"samples": 0}, {"samples": 17}])
 def test_settings_are_checked(options):
     with pytest.raises(UsageError, match="expected"):

@@ -89,7 +89,7 @@ def render_view(scene: Scene, camera: Camera, settings: RenderSettings | None = 
     def trace(grid: int, mask: np.ndarray, known: bool) -> None:
         render_tiles(
             scene.values, tables.lo, tables.inv_width, tables.nodes, tables.cumulative, tables.dark, scene.empty,
-            eye, basis, lens, settings.step, order, grid, mask, known, out,
+            eye, basis, lens, float(settings.step), order, grid, mask, known, out,
         )  # fmt: skip
 
     trace(first, everywhere, False)
