@@ -144,47 +144,42 @@ def _visible_voxels(scene: Scene, samples: int = 256) -> float:
 def fit(
     form: ClosedForm, cameras: Sequence[Camera], views: np.ndarray, progress: Progress | None = None
 ) -> tuple[Gaussians, str]:
-    """The best of a few ways to cut the pyramid, judged on every third view, then coloured by all of them.
+    """The pyramid cut where views see errors, then coloured by all of them.
 
-    Tried: cells by moments or refined by image error, and where bodies are opaque three styles of surface.
+    Where bodies are opaque, styles of surface compete on every third view.
 
     Args:
         form: what to cut.
         cameras, views: training views, (n, h, w, 4) float32 premultiplied.
-        progress: called after each way and at the end.
+        progress: called after each cut and at the end.
 
     Returns:
-        The Gaussians and one line that says which way was taken.
+        The Gaussians and one line that says what was done.
     """
     few = range(0, len(cameras), max(len(cameras) // REFINE_VIEWS, 1))
     some, images = [cameras[i] for i in few], views[list(few)]
-    styles = STYLES if form.opaque.any else {"": ROUND}
-    ways = [(name, refine) for name in styles for refine in (False, True)]
+    styles = list(STYLES) if form.opaque.any else ["round"]
     tick = progress or (lambda done, total: None)
-    best: tuple[float, Gaussians, str] | None = None
-    for number, (name, refine) in enumerate(ways):
-        cut = form.refined(some, images, styles[name]) if refine else form.gaussians(styles[name])
-        gaussians = solve_colors(cut, some, images, rounds=1)
-        loss = _loss(gaussians, some, images, TWICE if form.opaque.any else 0.0)
-        if best is None or loss < best[0]:
-            how = f"cells by {'image error' if refine else 'moments'}" + (f", {name} surfaces" if name else "")
-            best = loss, gaussians, how
-        tick(number + 1, len(ways) + 1)
-    assert best is not None
-    gaussians = solve_colors(best[1], cameras, views, twice_every=TWICE_EVERY)
-    tick(len(ways) + 1, len(ways) + 1)
-    return gaussians, best[2]
+    cuts = []
+    for number, name in enumerate(styles):
+        cuts.append(form.refined(some, images, STYLES[name]))
+        tick(number + 1, len(styles) + 1)
+    best = 0
+    if len(cuts) > 1:
+        best = int(np.argmin([_loss(solve_colors(cut, some, images, rounds=1), some, images) for cut in cuts]))
+    gaussians = solve_colors(cuts[best], cameras, views, twice_every=TWICE_EVERY)
+    tick(len(styles) + 1, len(styles) + 1)
+    return gaussians, "cells by image error" + (f", {styles[best]} surfaces" if form.opaque.any else "")
 
 
-def _loss(gaussians: Gaussians, cameras: Sequence[Camera], views: np.ndarray, twice: float) -> float:
-    """Mean squared colour error at the views' size, plus ``twice`` times that at twice the size (averaged 2 x 2).
+def _loss(gaussians: Gaussians, cameras: Sequence[Camera], views: np.ndarray) -> float:
+    """Mean squared colour error at the views' size, plus `TWICE` times that at twice the size (averaged 2 x 2).
 
     A file that leans on the renderer's 0.3 px looks right at one size only.
     """
     total = 0.0
     for camera, view in zip(cameras, views, strict=True):
+        halved = render(gaussians, camera, project(gaussians, camera, DILATION / 4))
         total += float(np.mean((render(gaussians, camera) - view)[..., :3] ** 2))
-        if twice:
-            halved = render(gaussians, camera, project(gaussians, camera, DILATION / 4))
-            total += twice * float(np.mean((halved - view)[..., :3] ** 2))
+        total += TWICE * float(np.mean((halved - view)[..., :3] ** 2))
     return total / len(cameras)
