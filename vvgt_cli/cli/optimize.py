@@ -30,6 +30,10 @@ from vvgt_cli.progress import Console
     "--max-gaussians", type=click.IntRange(1, 100_000_000), metavar="K",
     help="Of --method 3dgs: grow to no more than this. Default: as many as IN.ply has.",
 )  # fmt: skip
+@click.option(
+    "--checkpoint", metavar="FILE.npz",
+    help="For long runs: written every 25 steps and at the end; the same command begins where it ended.",
+)  # fmt: skip
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of the order of views.")
 @click.option("--report", metavar="R.json", help="Write times and errors of every stage as JSON; - is standard output.")
 @overwrite_option
@@ -58,6 +62,7 @@ def command(
         raise UsageError(f"--max-gaussians is of --method 3dgs; --method {method} keeps the number as it is")
     how = OptimizeOptions.of(
         method, max_gaussians=most, target_psnr=options["target_psnr"], seed=options["seed"],
+        checkpoint=options["checkpoint"],
         **budget(options["steps"], options["time_budget"]),
     )  # fmt: skip
     optimize_file(OptimizeRequest(ply, views, output, how, report, overwrite), console)

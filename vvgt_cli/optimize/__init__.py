@@ -35,6 +35,7 @@ class OptimizeOptions:
         alpha: weight of the alpha channel's |r| and r^2 beside a colour channel's.
         check_every: steps between two looks at the check views.
         patience: looks in a row without a gain of 0.01 dB after which to stop.
+        checkpoint: .npz written every ``check_every`` steps and at the end; where it is there, the run goes on from it.
         seed: of the order of views, and of what "3dgs" draws.
     """
 
@@ -49,6 +50,7 @@ class OptimizeOptions:
     alpha: float = 0.5
     check_every: int = 25
     patience: int = 3
+    checkpoint: str | None = None
     seed: int = 0
 
     def __post_init__(self) -> None:

@@ -8,6 +8,7 @@ leaves `RECOVERY` steps to recover in. Clones share the opacity of what they wer
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Sequence
 
@@ -72,6 +73,20 @@ class Densified(Fields):
             if self.step >= self.last_reset + RECOVERY:
                 self._reset()
             self.last_reset, self.share_reset = self.step, share
+
+    def saved(self) -> dict[str, np.ndarray]:
+        """All that the next steps depend on."""
+        last = np.array([self.last, self.last_reset, self.share, self.share_reset], np.float64)
+        drawn = np.array(json.dumps(self.rng.bit_generator.state))
+        return super().saved() | {"slopes": self.slopes, "seen": self.seen, "last": last, "drawn": drawn}
+
+    def restore(self, saved: dict[str, np.ndarray]) -> None:
+        """Put back what `saved` gave."""
+        super().restore(saved)
+        self.slopes, self.seen = saved["slopes"], saved["seen"]
+        last, last_reset, self.share, self.share_reset = map(float, saved["last"])
+        self.last, self.last_reset = int(last), int(last_reset)
+        self.rng.bit_generator.state = json.loads(str(saved["drawn"]))
 
     def _densify(self) -> None:
         score = self.slopes / np.maximum(self.seen, 1)

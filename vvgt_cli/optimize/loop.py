@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.metrics import psnr
 from vvgt_cli.optimize import OptimizeOptions, OptimizeRecord, Progress
+from vvgt_cli.optimize.checkpoint import fingerprint, resume, save
 from vvgt_cli.optimize.densify import Densified
 from vvgt_cli.optimize.states import Fields, OwnFrame
 from vvgt_cli.splat import blend
@@ -36,32 +38,59 @@ def run(
     """`optimize` without its defaults."""
     for name, (some, views) in {"training": (cameras, images), "check": check or (cameras, images)}.items():
         _fit(name, some, views)
-    entered = time.perf_counter()
     record = OptimizeRecord()
     state = begin(gaussians, cameras, options)
-    judge = _Judge(state, check, record)
-    error, speed, order = None, 1.0, views_in_turn(len(cameras), options.seed)
-    judge.look(0.0)
-    record.psnr_before = judge.best
-    began = time.perf_counter()
+    judge = Judge(state, check, record)
+    keep, walk = _checkpoint(options, gaussians, (cameras, images), check, state, judge)
+    entered, order = time.perf_counter(), views_in_turn(len(cameras), options.seed)
+    if not record.checks:
+        judge.look(0.0)
+        record.psnr_before = judge.best
+    spent, began = walk.elapsed, time.perf_counter() - walk.elapsed
+    for _ in range(record.steps):
+        next(order)
     while True:
-        elapsed = time.perf_counter() - began
-        reason = _reason(options, judge, elapsed, stop)
+        walk.elapsed = time.perf_counter() - began
+        reason = _reason(options, judge, walk.elapsed, stop)
         if reason:
             record.reason = reason
             break
         view = next(order)
-        share = _share(options, record.steps, elapsed)
-        error = step(state, cameras[view], images[view], options, error, share, speed)
+        share = _share(options, record.steps, walk.elapsed)
+        walk.error = step(state, cameras[view], images[view], options, walk.error, share, walk.speed)
         record.steps += 1
         if progress:
-            progress(record.steps, _expected(options, record.steps, elapsed))
-        if record.steps % options.check_every == 0 and not judge.look(time.perf_counter() - began):
-            speed *= SLOWER
+            progress(record.steps, _expected(options, record.steps, walk.elapsed))
+        if record.steps % options.check_every == 0:
+            if not judge.look(time.perf_counter() - began):
+                walk.speed *= SLOWER
+            keep()
+    keep()  # before the last look: a run that goes on from here would not have taken it
     judge.look(time.perf_counter() - began)
     result = judge.result(gaussians)
-    record.seconds = time.perf_counter() - entered
+    record.seconds = spent + time.perf_counter() - entered
     return result, record
+
+
+@dataclass
+class _Walk:
+    """What changes from step to step beside the state."""
+
+    error: float | None = None
+    speed: float = 1.0
+    elapsed: float = 0.0
+
+
+def _checkpoint(
+    options: OptimizeOptions, gaussians: Gaussians, train: Check, check: Check | None, state: State, judge: Judge
+) -> tuple[Callable[[], None], _Walk]:
+    """What saves the run, and where it begins: the end of the last one where there is a checkpoint."""
+    path = options.checkpoint
+    if path is None:
+        return lambda: None, _Walk()
+    key = fingerprint(gaussians, options, train, check)
+    walk = _Walk(**(resume(path, key, state, judge, judge.record) or {}))
+    return lambda: save(path, key, state, judge, judge.record, asdict(walk)), walk
 
 
 def begin(gaussians: Gaussians, cameras: Sequence[Camera], options: OptimizeOptions) -> State:
@@ -120,7 +149,7 @@ def _expected(options: OptimizeOptions, steps: int, elapsed: float) -> int:
     return max(steps, round(steps / share)) if options.time_budget and share > 0 else options.steps or steps
 
 
-def _reason(options: OptimizeOptions, judge: _Judge, elapsed: float, stop: Callable[[], bool] | None) -> str | None:
+def _reason(options: OptimizeOptions, judge: Judge, elapsed: float, stop: Callable[[], bool] | None) -> str | None:
     """Why to stop before the next step; None to go on."""
     if options.steps is not None and judge.record.steps >= options.steps:
         return "steps"
@@ -142,7 +171,7 @@ def _fit(name: str, cameras: Sequence[Camera], images: np.ndarray) -> None:
             raise DataError(f"{name} view {camera.name}: image of shape {image.shape}; expected {expected}")
 
 
-class _Judge:
+class Judge:
     """Looks at the check views, and remembers the best state that they have seen."""
 
     def __init__(self, state: State, check: Check | None, record: OptimizeRecord) -> None:

@@ -20,7 +20,8 @@ SMALLEST = 1e-7  # standard deviation, unit frame
 class OwnFrame:
     """Covariance ``M M^T``; steps ``mu += M d``, ``M <- M (I + E + E^2 / 2)``, and of opacity logits and colours.
 
-    Rates go with the root of the running error of the pictures: the nearer, the smaller.
+    Rates go with the root of the running error of the pictures: the nearer, the smaller; and from the middle of the
+    run on in a straight line to zero.
     """
 
     RATES = np.array([0.05, 0.025, 0.0125, 0.03, 0.008])  # d, E on and off the diagonal, logit, colour
@@ -68,12 +69,22 @@ class OwnFrame:
         pairs = moments(projection, colors, image, grad)
         slopes = own_frame_backward(means, factors, colors, camera, projection, pairs)
         self.step += 1
-        pace = speed * 0.5 * (1 + math.cos(math.pi * share))  # half a cosine over the run
+        pace = speed * min(1.0, 2 * (1 - share))
         pace *= min(self.LARGEST, math.sqrt(error / self.ERROR)) * min(1.0, self.step / WARM_UP)
         steps.own_frame(
             slopes.frame, slopes.opacity_logits, slopes.colors, self.RATES * pace, self.CLIPS, self.pixel,
             *self.BETAS, self.step, means, factors, logits, colors, self.first, self.second,
         )  # fmt: skip
+
+    def saved(self) -> dict[str, np.ndarray]:
+        """All that the next steps depend on."""
+        named = {f"array_{i}": array for i, array in enumerate(self.arrays)}
+        return named | {"first": self.first, "second": self.second, "step": np.array(self.step)}
+
+    def restore(self, saved: dict[str, np.ndarray]) -> None:
+        """Put back what `saved` gave."""
+        self.arrays = tuple(saved[f"array_{i}"] for i in range(len(self.arrays)))
+        self.first, self.second, self.step = saved["first"], saved["second"], int(saved["step"])
 
     def gaussians(self) -> Gaussians:
         """As a file has them: singular values and vectors of M."""
@@ -128,6 +139,19 @@ class Fields:
         for array, slope, rate, (first, second) in zip(self.arrays, found, rates, self.running, strict=True):
             values, moment, square = array.reshape(-1), first.reshape(-1), second.reshape(-1)
             steps.adam(values, slope.reshape(-1), rate, *self.BETAS, self.step, moment, square)
+
+    def saved(self) -> dict[str, np.ndarray]:
+        """All that the next steps depend on."""
+        named = {f"array_{i}": array for i, array in enumerate(self.arrays)}
+        for i, (first, second) in enumerate(self.running):
+            named |= {f"first_{i}": first, f"second_{i}": second}
+        return named | {"step": np.array(self.step)}
+
+    def restore(self, saved: dict[str, np.ndarray]) -> None:
+        """Put back what `saved` gave."""
+        self.arrays = tuple(saved[f"array_{i}"] for i in range(len(self.arrays)))
+        self.running = [(saved[f"first_{i}"], saved[f"second_{i}"]) for i in range(len(self.arrays))]
+        self.step = int(saved["step"])
 
     def gaussians(self) -> Gaussians:
         return Gaussians(*self.arrays)

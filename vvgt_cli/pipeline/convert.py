@@ -24,12 +24,13 @@ from vvgt_cli.volume.blocks import free_memory
 
 if TYPE_CHECKING:
     from vvgt_cli.cameras import Camera
-    from vvgt_cli.dvr import Scene
+    from vvgt_cli.dvr import RenderSettings, Scene
     from vvgt_cli.metrics import Scores
     from vvgt_cli.vbm import Start
 
 VIEW_BYTES = 2 * 16  # a pixel: float32 RGBA, and as much again while views are stacked
 REFINE_VIEWS = 48  # training views of gradient descent; the closed form takes every second of them
+FINE_ENOUGH = 50.0  # dB between a view and one of the default integration
 PREVIEW_VIEWS = (0, 4, 9)  # test views of the preview, and of the score without a report: above, side, below
 
 
@@ -99,13 +100,13 @@ def convert(request: ConvertRequest, console: Console | None = None) -> Conversi
     _check_memory(request.fit)
     source, scene = _begin(run, request)
     start = _closed_form(run, scene, request.fit)
-    train, check = _views(run, scene, request.fit)
+    train, check, settings = _views(run, scene, request.fit)
     gaussians = _back_project(run, start, train.take(range(0, len(train), 2)) if request.fit.steps else train, check)
     if request.fit.steps:
         options = OptimizeOptions(steps=request.fit.steps, seed=request.fit.seed)
         gaussians = refine(run, gaussians, train, check, options)
     gaussians = as_stored(gaussians)  # what is scored is what the file holds
-    scores, sheet = _score(run, scene, gaussians, request)
+    scores, sheet = _score(run, scene, gaussians, request, settings)
     run.report.scores = asdict(scores)
     return _finish(run, request, source, gaussians, sheet)
 
@@ -206,18 +207,34 @@ def _splats(gaussians: Gaussians, cameras: list[Camera]) -> list[np.ndarray]:
     return [render(gaussians, camera) for camera in cameras]
 
 
-def _views(run: Run, scene: Scene, fit: FitOptions) -> tuple[Views, Views]:
-    """Training and check views; pixel-integrated for gradient descent, which would follow the jags of single rays."""
+def _views(run: Run, scene: Scene, fit: FitOptions) -> tuple[Views, Views, RenderSettings]:
+    """Training and check views, and how the test views are to be integrated."""
     from vvgt_cli.dvr import render_views
     from vvgt_cli.dvr.render import FIT_VIEWS, SCORE_VIEWS
 
     train, check = default_views("train", fit.views(), size=fit.size), default_views("check", size=fit.size)
-    settings = SCORE_VIEWS if fit.steps else FIT_VIEWS
     with run.stage("views") as stage:
+        settings = _fine_enough(scene, check[0]) if fit.steps else FIT_VIEWS
         images = render_views(scene, train, settings, progress=run.console.bar("views"))
         reference = render_views(scene, check, settings)
         stage.note = f"{len(train)} to fit to, {len(check)} to check by, {fit.size} px"
-    return Views(train, images), Views(check, reference)
+    return Views(train, images), Views(check, reference), settings if fit.steps else SCORE_VIEWS
+
+
+def _fine_enough(scene: Scene, camera: Camera) -> RenderSettings:
+    """The cheapest integration that a view does not tell from the default one.
+
+    Gradient descent follows the jags of single rays and the error of long steps, where a scene has hard edges.
+    """
+    from vvgt_cli.dvr import RenderSettings, render_view
+    from vvgt_cli.dvr.render import FIT_VIEWS, SCORE_VIEWS
+    from vvgt_cli.metrics import psnr
+
+    fine = render_view(scene, camera)
+    for settings in (FIT_VIEWS, SCORE_VIEWS):
+        if psnr(fine, render_view(scene, camera, settings)) >= FINE_ENOUGH:
+            return settings
+    return RenderSettings()
 
 
 def _back_project(run: Run, start: Start, train: Views, check: Views) -> Gaussians:
@@ -236,16 +253,16 @@ def _back_project(run: Run, start: Start, train: Views, check: Views) -> Gaussia
     return mended if stage.kept else start.gaussians
 
 
-def _score(run: Run, scene: Scene, gaussians: Gaussians, request: ConvertRequest) -> tuple[Scores, np.ndarray | None]:
+def _score(
+    run: Run, scene: Scene, gaussians: Gaussians, request: ConvertRequest, settings: RenderSettings
+) -> tuple[Scores, np.ndarray | None]:
     """Scores on the test views, and the preview's sheet where one is asked for."""
-    from vvgt_cli.dvr.render import SCORE_VIEWS
-
     with run.stage("test views") as stage:
         scores, sheet = score_test_views(
             scene,
             gaussians,
             request.fit.size,
-            SCORE_VIEWS,
+            settings,
             perceptual=request.report is not None,
             keep=PREVIEW_VIEWS if request.preview else (),
             only=None if request.report else PREVIEW_VIEWS,

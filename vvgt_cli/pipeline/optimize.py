@@ -86,6 +86,8 @@ def optimize_file(request: OptimizeRequest, console: Console | None = None) -> C
     """
     run = Run(console or Console(), ConversionReport("optimize"))
     check_outputs(request.outputs(), [request.ply], request.overwrite)
+    if request.options.checkpoint:
+        check_outputs([Output("--checkpoint", request.options.checkpoint, (".npz",))], [request.ply], True)
     with run.stage("read") as stage:
         start, header = open_gaussians(request.ply, run.console)
         stage.note = f"{len(start)} Gaussians, {header.frame} frame"

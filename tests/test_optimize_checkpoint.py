@@ -1,0 +1,87 @@
+"""A run that is interrupted and goes on ends with the bytes of one that was not."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from vvgt_cli.cameras import default_views
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.optimize import OptimizeOptions, optimize
+from vvgt_cli.splat import render
+
+FIELDS = ("means", "log_scales", "quaternions", "opacity_logits", "colors")
+CAMERAS, CHECKS = default_views("train", 5, size=32), default_views("check", 2, size=32)
+
+
+def cloud(count=40, seed=0, sigma=0.1):
+    rng = np.random.default_rng(seed)
+    return Gaussians(
+        rng.uniform(-0.6, 0.6, (count, 3)),
+        np.log(sigma) + rng.normal(0, 0.2, (count, 3)),
+        rng.normal(size=(count, 4)),
+        rng.normal(0, 1, count),
+        rng.uniform(0, 1, (count, 3)),
+    )
+
+
+def views(g, cameras):
+    return np.stack([render(g, camera) for camera in cameras])
+
+
+TRUTH = cloud(seed=1)
+
+
+def run(path=None, stop=None, method="frame", start=None, steps=30):
+    options = OptimizeOptions.of(method, steps=steps, check_every=5, max_gaussians=50, checkpoint=path and str(path))
+    images, check = views(TRUTH, CAMERAS), (CHECKS, views(TRUTH, CHECKS))
+    return optimize(start or cloud(), CAMERAS, images, options, check, stop=stop)
+
+
+def after(steps):
+    """Asked before each step: True at the one after ``steps``."""
+    count = itertools.count()
+    return lambda: next(count) == steps
+
+
+@pytest.mark.parametrize("method", ["frame", "adam", "3dgs"])
+def test_an_interrupted_run_ends_as_a_whole_one(method, tmp_path):
+    path = tmp_path / "run.npz"
+    whole, expected = run(method=method)
+    for steps in (7, 8):  # ends after 7, then after 15, where a look is due
+        part, record = run(path, after(steps), method)
+        assert record.reason == "interrupted"
+        assert len(part)
+    assert record.steps == 15
+    result, record = run(path, method=method)
+    assert (record.steps, record.kept, record.reason) == (30, expected.kept, "steps")
+    assert [(step, db) for step, _, db in record.checks] == [(step, db) for step, _, db in expected.checks]
+    for field in FIELDS:
+        assert getattr(result, field).tobytes() == getattr(whole, field).tobytes(), field
+    again, record = run(path, method=method)  # at its end: nothing is left to do
+    assert record.steps == 30
+    assert again.means.tobytes() == whole.means.tobytes()
+
+
+def test_another_runs_checkpoint_is_refused(tmp_path):
+    path = tmp_path / "run.npz"
+    run(path, after(2))
+    before = path.read_bytes()
+    for other in ({"steps": 31}, {"start": cloud(seed=3)}, {"method": "adam"}):
+        with pytest.raises(UsageError, match=r"run\.npz"):
+            run(path, **other)
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04", b"nonsense" * 100])
+def test_a_damaged_checkpoint_is_refused(content, tmp_path):
+    path = tmp_path / "run.npz"
+    path.write_bytes(content)
+    with pytest.raises(DataError, match="not a checkpoint"):
+        run(path)
+    np.savez(path, other=np.zeros(3))
+    with pytest.raises(DataError, match="not a checkpoint"):
+        run(path)
