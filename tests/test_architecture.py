@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from vvgt_cli.cli.main import COMMANDS
+
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "vvgt_cli"
 ROOMS = (
@@ -133,7 +135,7 @@ def test_help_loads_click_and_nothing_heavier():
     assert not modules & (HEAVY | {"numpy"})
 
 
-@pytest.mark.parametrize("command", ["convert", "init", "render", "render-views", "evaluate", "info", "tf"])
+@pytest.mark.parametrize("command", list(COMMANDS))
 def test_a_commands_help_is_as_light(command):
     modules = loaded("from vvgt_cli.cli.main import run", f"assert run(['{command}', '--help']) == 0")
     assert not modules & (HEAVY | {"numpy"})

@@ -23,6 +23,8 @@ COMMANDS = {
     "evaluate": "vvgt_cli.cli.evaluate",
     "info": "vvgt_cli.cli.info",
     "tf": "vvgt_cli.cli.tf",
+    "infer": "vvgt_cli.cli.infer",
+    "export": "vvgt_cli.cli.export",
 }
 INTERRUPTED = 130  # 128 + SIGINT, as shells report it
 BROKEN_PIPE = 141  # 128 + SIGPIPE

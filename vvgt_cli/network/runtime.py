@@ -13,11 +13,14 @@ import numpy as np
 from vvgt_cli.cameras import Camera
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.network.card import MAPS, OUTPUT, ModelCard, read_card
+from vvgt_cli.network import tables
+from vvgt_cli.network.card import IMAGE_INPUTS, MAPS, OUTPUT, ModelCard, read_card
+from vvgt_cli.network.config import NetworkConfig
 from vvgt_cli.network.prepare import Prepared, prepare
 from vvgt_cli.progress import ProgressCallback
 
 PROVIDERS = {"cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider"}
+_AGAIN = "export the checkpoint again"
 POINTS = 160_000  # Gaussians of one run of the second graph: the paper's 150,000 go at once
 
 
@@ -77,7 +80,7 @@ class Model:
         sessions = {}
         for name, record in card.graphs.items():
             sessions[name] = _session(folder / record["file"], threads, provider)
-            _check_names(folder / record["file"], sessions[name], record)
+            _check_names(folder / record["file"], sessions[name], record, card.network)
         return cls(card, sessions)
 
     def improve(
@@ -153,14 +156,23 @@ def _session(path: Path, threads: int, provider: str) -> Any:
     return session
 
 
-def _check_names(path: Path, session: Any, record: dict[str, Any]) -> None:
-    """The graph's names are the card's, and the last output of the second is what this version reads."""
+def _check_names(path: Path, session: Any, record: dict[str, Any], config: NetworkConfig) -> None:
+    """The graph's names are the card's, its inputs are among those that this version makes, its outputs those it reads.
+
+    Raises:
+        DataError: they are not.
+    """
+    image = path.stem == "image"
+    made = {*IMAGE_INPUTS} if image else {"gaussians", "gradients", "matrices", "eyes", *MAPS}
+    if not image:
+        made |= set(tables.build(np.zeros((1, 3), np.float32), config.geometry))
     found = [entry.name for entry in session.get_inputs()], [entry.name for entry in session.get_outputs()]
-    wanted = list(record["inputs"]), list(record["outputs"])
-    outputs = MAPS if path.stem == "image" else [OUTPUT]
-    for side, has, expected in zip(("inputs", "outputs"), found, wanted, strict=True):
-        if has != expected or (side == "outputs" and has != outputs):
-            raise DataError(
-                f"{path}: {side} are {', '.join(has)}; expected {', '.join(expected)}: a graph of another version, "
-                "export the checkpoint again"
-            )
+    for side, has, expected in zip(("inputs", "outputs"), found, (record["inputs"], record["outputs"]), strict=True):
+        if has != expected:
+            raise DataError(f"{path}: {side} {', '.join(has)}; its card says {', '.join(expected)}: {_AGAIN}")
+    if unknown := set(found[0]) - made:
+        raise DataError(f"{path}: wants {', '.join(sorted(unknown))}, which this version does not make: {_AGAIN}")
+    if found[1] != (MAPS if image else [OUTPUT]):
+        raise DataError(
+            f"{path}: gives {', '.join(found[1])}; expected {', '.join(MAPS if image else [OUTPUT])}: {_AGAIN}"
+        )

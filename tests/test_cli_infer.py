@@ -1,0 +1,146 @@
+"""`vvgt infer` on models built by hand: what is kept, what is dropped, what is refused."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from network_models import as_rows
+from onnx_models import write_model
+
+from vvgt_cli.cli.main import run
+from vvgt_cli.gaussians import PlyOptions, read_ply, write_ply
+from vvgt_cli.pipeline.infer import divide
+from vvgt_cli.volume.types import UnitFrame
+
+DARK = 0.2
+BRIGHTER, DARKER = (*[0.0] * 11, *[DARK] * 3), (*[0.0] * 11, *[-DARK] * 3)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Views of a volume, its Gaussians with colours too dark by `DARK`, and two models; to be read only."""
+    folder = tmp_path_factory.mktemp("infer")
+    volume = ("example:blob:16", "--tf", "viridis")
+    views = ("--views", 6, "--test-views", 1, "--size", 32, "-o", folder / "views")
+    assert run([str(arg) for arg in ("render-views", *volume, *views, "--quiet")]) == 0
+    start = ("init", *volume, "--max-gaussians", 300, "--size", 32, "-o", folder / "init.ply", "--quiet")
+    assert run([str(arg) for arg in start]) == 0
+    gaussians, _ = read_ply(folder / "init.ply")
+    frame = UnitFrame(0.5, (0.0,) * 3, (0.0,) * 3, (3.0, 4.0, 5.0))
+    dark = replace(gaussians, colors=gaussians.colors - DARK)
+    write_ply(folder / "in.ply", dark, PlyOptions("world", "z", unit_frame=frame, unit_distance=0.7))
+    write_model(folder / "brighter", BRIGHTER)
+    write_model(folder / "darker", DARKER)
+    return folder
+
+
+def call(made, model, output, *more):
+    return "infer", made / "in.ply", "--views", made / "views", "--model", made / model, "-o", output, *more
+
+
+def test_a_gain_is_kept_and_the_file_is_as_the_one_read(made, tmp_path, vvgt):
+    result = vvgt(*call(made, "brighter", tmp_path / "out.ply", "--report", tmp_path / "r.json"))
+    assert result.code == 0, result.err
+    assert "dropped" not in result.err
+    (before, old), (after, new) = read_ply(made / "in.ply"), read_ply(tmp_path / "out.ply")
+    assert np.allclose(after.colors, before.colors + DARK, atol=1e-5)
+    assert np.allclose(after.means, before.means, atol=1e-5)
+    assert (new.frame, new.up, new.scale, new.centre, new.unit_distance) == ("world", "z", 0.5, (3.0, 4.0, 5.0), 0.7)
+    assert old.comments == new.comments
+    options = json.loads((tmp_path / "r.json").read_text())["options"]
+    assert options["psnr_after"] > options["psnr_before"] + 3
+    assert len(options["read"]) == 3
+    assert not set(options["read"]) & set(options["judges"])
+
+
+def test_without_a_gain_the_input_is_written_and_it_is_said(made, tmp_path, vvgt):
+    result = vvgt(*call(made, "darker", tmp_path / "out.ply"))
+    assert result.code == 0, result.err
+    assert "no gain: dropped" in result.err
+    (before, _), (after, _) = read_ply(made / "in.ply"), read_ply(tmp_path / "out.ply")
+    assert np.allclose(as_rows(after), as_rows(before), atol=1e-5)
+
+
+def test_the_same_bytes_again_and_through_pipes(made, tmp_path, vvgt, monkeypatch):
+    outputs = []
+    for name in ("a.ply", "b.ply"):
+        assert vvgt(*call(made, "brighter", tmp_path / name, "--quiet", "--threads", 2)).err == ""
+        outputs.append((tmp_path / name).read_bytes())
+    assert outputs[0] == outputs[1]
+    with (made / "in.ply").open() as stream:
+        monkeypatch.setattr("sys.stdin", stream)
+        piped = vvgt("infer", "-", "--views", made / "views", "--model", made / "brighter", "-o", "-")
+    assert piped.out == outputs[0]
+
+
+def test_threads_come_from_the_option_or_the_environment(made, tmp_path, vvgt, monkeypatch):
+    import numba
+
+    from vvgt_cli.network import runtime
+
+    asked = []
+    opened = runtime._session
+    monkeypatch.setattr(
+        runtime, "_session", lambda path, threads, provider: asked.append(threads) or opened(path, threads, provider)
+    )
+    limit = numba.config.NUMBA_NUM_THREADS
+    try:
+        vvgt(*call(made, "brighter", tmp_path / "a.ply", "--threads", 1))
+        monkeypatch.delenv("NUMBA_NUM_THREADS", raising=False)
+        monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+        monkeypatch.setenv("SLURM_CPUS_PER_TASK", "2")
+        vvgt(*call(made, "brighter", tmp_path / "b.ply"))
+    finally:
+        numba.set_num_threads(limit)
+    assert asked == [1, 1, min(2, limit), min(2, limit)]
+
+
+def test_with_too_few_views_those_that_were_read_judge(made):
+    from vvgt_cli.cameras import default_views
+
+    read, judges = divide(default_views("train", 3), 8)
+    assert read == judges == [0, 1, 2]
+    read, judges = divide(default_views("train"), 8)
+    assert (len(read), len(judges)) == (8, 4)
+    assert not set(read) & set(judges)
+
+
+CASES = {
+    "no model": (("--model", "no/such"), 2, "no such folder"),
+    "folder without a card": (("--model", "."), 2, "card.json"),
+    "no views": (("--views", "."), 1, "transforms_train.json"),
+    "no input": (("IN", "no.ply"), 1, "no.ply"),
+    "suffix": (("-o", "out.txt"), 2, ".ply"),
+    "report suffix": (("--report", "out.txt"), 2, ".json"),
+    "provider": (("--provider", "abacus"), 2, "abacus"),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_bad_input_gets_one_line_and_leaves_nothing(case, made, tmp_path, vvgt, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (change, value), code, message = CASES[case]
+    args = list(call(made, "brighter", "out.ply"))
+    if change == "IN":
+        args[1] = value
+    elif change in args:
+        args[args.index(change) + 1] = value
+    else:
+        args += [change, value]
+    result = vvgt(*args)
+    assert result.code == code, result.err
+    assert message in result.error
+    assert "internal" not in result.error
+    assert not list(Path().iterdir())
+
+
+def test_nothing_is_overwritten_unasked(made, tmp_path, vvgt):
+    (tmp_path / "out.ply").write_bytes(b"mine")
+    result = vvgt(*call(made, "brighter", tmp_path / "out.ply"))
+    assert result.code == 2
+    assert "--overwrite" in result.error
+    assert (tmp_path / "out.ply").read_bytes() == b"mine"

@@ -1,0 +1,146 @@
+"""`infer`: Gaussians through an exported network, kept if the views agree."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vvgt_cli.cameras import Camera
+from vvgt_cli.files import atomic_write
+from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions, write_ply
+from vvgt_cli.pipeline.outputs import STDOUT, Output, check_outputs, write_text
+from vvgt_cli.pipeline.record import ConversionReport, Run
+from vvgt_cli.pipeline.render import open_gaussians
+from vvgt_cli.progress import Console
+from vvgt_cli.volume.types import UnitFrame
+
+JUDGES = 4  # views that the network is not shown, as many as the default check set
+
+
+@dataclass(frozen=True)
+class InferRequest:
+    """A run of a network.
+
+    Attributes:
+        ply: Gaussians, "-" for standard input.
+        views: folder that `vvgt render-views` wrote.
+        model: folder of a model, or the name of one that is shipped.
+        output: the .ply to write, "-" for standard output.
+        provider: "cpu" or "cuda".
+        report: JSON to write, or None.
+        overwrite: replace files that exist.
+    """
+
+    ply: str
+    views: str
+    model: str
+    output: str
+    provider: str = "cpu"
+    report: str | None = None
+    overwrite: bool = False
+
+
+def divide(cameras: Sequence[Camera], wanted: int) -> tuple[list[int], list[int]]:
+    """Numbers of the views that the network reads, and of those that judge it.
+
+    The judges are views that it does not read, as far apart as may be; all of its own where there are no others.
+    """
+    from vvgt_cli.network.runtime import spread
+
+    read = spread(cameras, wanted)
+    others = [i for i in range(len(cameras)) if i not in read]
+    judges = [others[i] for i in spread([cameras[i] for i in others], JUDGES)] if others else read
+    return read, judges
+
+
+def infer_file(request: InferRequest, console: Console | None = None) -> ConversionReport:
+    """Improve a `.ply` by a network and write it; where the judging views see no gain, write the input's Gaussians.
+
+    Raises:
+        UsageError: an output that may not be written, no such model or provider.
+        DataError: Gaussians, views or a model that are not what they must be.
+    """
+    from vvgt_cli.images.viewset import load_views
+    from vvgt_cli.network.card import find_model
+    from vvgt_cli.network.runtime import Model
+
+    outputs = [Output("-o", request.output, (".ply",))]
+    if request.report:
+        outputs.append(Output("--report", request.report, (".json",), binary=False))
+    check_outputs(outputs, [request.ply], request.overwrite)
+    run = Run(console or Console(), ConversionReport("infer"))
+    with run.stage("read") as stage:
+        model = Model.open(find_model(request.model), _threads(), request.provider)
+        gaussians, header = open_gaussians(request.ply, run.console)
+        cameras, images = load_views(request.views, "train")
+        wanted = model.card.network.image.views
+        read, judges = divide(cameras, wanted)
+        stage.note = f"{len(gaussians)} Gaussians, {len(cameras)} views, model {model.card.name}"
+    with run.stage("network") as stage:
+        shown = [cameras[i] for i in read]
+        better = model.improve(gaussians, shown, images[read], progress=run.console.bar("network"))
+        stage.note = f"reads {len(read)} views"
+    with run.stage("judge") as stage:
+        before, after = (_psnr(g, cameras, images, judges) for g in (gaussians, better))
+        stage.psnr, stage.kept = after, after > before
+        own = "" if set(judges) - set(read) else ", which the network has read"
+        stage.note = f"from {before:.2f} dB on {len(judges)} views{own}"
+    run.report.options = {
+        "model": model.card.name,
+        "provider": request.provider,
+        "read": [cameras[i].name for i in read],
+        "judges": [cameras[i].name for i in judges],
+        "psnr_before": before,
+        "psnr_after": after,
+    }
+    return _finish(run, request, better if stage.kept else gaussians, header)
+
+
+def _finish(run: Run, request: InferRequest, gaussians: Gaussians, header: PlyHeader) -> ConversionReport:
+    options = ply_options(header)
+    with run.stage("write") as stage:
+        if request.output == STDOUT:
+            run.report.bytes = write_ply(sys.stdout.buffer, gaussians, options)
+            sys.stdout.buffer.flush()
+        else:
+            with atomic_write(request.output, request.overwrite) as temporary:
+                run.report.bytes = write_ply(temporary, gaussians, options)
+        run.report.gaussians = len(gaussians)
+        stage.note = f"{request.output}: {len(gaussians)} Gaussians"
+    report = run.finish()
+    if request.report:
+        write_text(request.report, report.to_json(), request.overwrite)
+    return report
+
+
+def ply_options(header: PlyHeader) -> PlyOptions:
+    """What writes a file as the given one is: its frame, turn, harmonics' padding and records."""
+    frame = None
+    if header.scale is not None and header.centre is not None:
+        frame = UnitFrame(header.scale, (0.0,) * 3, (0.0,) * 3, header.centre)  # only these two are written
+    return PlyOptions(
+        frame=header.frame,
+        up=header.up,
+        sh_degree=header.sh_degree,
+        comments=header.version is not None,
+        unit_frame=frame,
+        unit_distance=header.unit_distance,
+        unit_distance_label=header.unit_distance_label or "given",
+    )
+
+
+def _psnr(gaussians: Gaussians, cameras: Sequence[Camera], images: np.ndarray, judges: Sequence[int]) -> float:
+    from vvgt_cli.metrics import score_views
+    from vvgt_cli.splat import render
+
+    return score_views(images[list(judges)], [render(gaussians, cameras[i]) for i in judges], perceptual=False).psnr
+
+
+def _threads() -> int:
+    """What ``--threads`` and the environment have given the kernels."""
+    import numba
+
+    return numba.get_num_threads()
