@@ -14,7 +14,7 @@ from vvgt_cli.splat.constants import DILATION
 SEEN = 1e-2  # blending weight (pixels, over all views) below which views say nothing about a splat
 PRIOR = 1.0  # pixels of weight that the closed form's colour counts for
 ROUNDS = 6
-ENOUGH = 0.01  # share of the squared error below which another round is not worth its time
+ENOUGH = 0.005  # share of the squared error below which another round is not worth its time
 BRIGHTEST = 2.0  # colours are kept in [0, 2]: more would flare up where other views thin the splats in front
 
 Progress = Callable[[int, int], None]
