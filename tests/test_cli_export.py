@@ -137,6 +137,7 @@ def _other_state(change):
 BROKEN = {
     "code": (lambda: {"format": "vvgt-checkpoint", "state": _Pickled()}, "not a checkpoint"),
     "other": (lambda: {"weights": torch.zeros(3)}, "not a checkpoint"),
+    "a tensor": (lambda: torch.zeros(3), "holds a Tensor"),
     "schema": (lambda: _changed(_document(), schema=9), "schema 9"),
     "config": (lambda: _changed(_document(), config={}), "config"),
     "lost key": (lambda: {k: v for k, v in _document().items() if k != "state"}, "without 'state'"),

@@ -56,14 +56,8 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
     Raises:
         DataError: not a checkpoint, of another schema, or weights that do not fit the configuration.
     """
-    if not Path(path).is_file():
-        raise DataError(f"{path}: no such file; expected a checkpoint")
-    try:
-        document = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch raises its own, pickle's, zipfile's and more
-        reason = str(error).splitlines()[0][:120]
-        raise DataError(f"{path}: not a checkpoint, or damaged ({type(error).__name__}: {reason})") from None
-    if not isinstance(document, dict) or document.get("format") != FORMAT:
+    document = read_tensors(path)
+    if document.get("format") != FORMAT:
         raise DataError(f"{path}: not a checkpoint of this program; expected one that training wrote")
     if document.get("schema") != SCHEMA:
         raise DataError(f"{path}: checkpoint of schema {document.get('schema')}; this version reads schema {SCHEMA}")
@@ -73,6 +67,24 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
         return Checkpoint(network.eval(), document["training"], document["metrics"], str(document["commit"]))
     except KeyError as error:
         raise DataError(f"{path}: checkpoint without {error}; it was not written whole") from None
+
+
+def read_tensors(path: str | Path) -> dict[str, Any]:
+    """What a file of torch holds, tensors and plain values only: no code that may be in it is run.
+
+    Raises:
+        DataError: no such file, not one of torch's, damaged, or not a mapping.
+    """
+    if not Path(path).is_file():
+        raise DataError(f"{path}: no such file; expected a file that torch saved")
+    try:
+        document = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # torch raises its own, pickle's, zipfile's and more
+        reason = str(error).splitlines()[0][:120]
+        raise DataError(f"{path}: not a checkpoint of tensors, or damaged ({type(error).__name__}: {reason})") from None
+    if not isinstance(document, dict):
+        raise DataError(f"{path}: holds a {type(document).__name__}; expected a checkpoint")
+    return document
 
 
 def load_weights(module: torch.nn.Module, state: dict[str, Tensor], name: str) -> None:
