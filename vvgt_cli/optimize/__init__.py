@@ -33,8 +33,8 @@ class OptimizeOptions:
         target_psnr: dB on the check views at which to stop.
         l1, l2, ssim: weights of the sums over pixels and RGB of |r|, r^2 and 1 - SSIM.
         alpha: weight of the alpha channel's |r| and r^2 beside a colour channel's.
-        check_every: steps between two looks at the check views.
-        patience: looks in a row without a gain of 0.01 dB after which to stop.
+        check_every: fewest steps between two looks at the check views, of which a run takes eight or so.
+        patience: looks in a row without a gain of 0.01 dB, in the second half, after which to stop.
         checkpoint: .npz written every ``check_every`` steps and at the end; where it is there, the run goes on from it.
         seed: of the order of views, and of what "3dgs" draws.
     """

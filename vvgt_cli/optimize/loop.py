@@ -20,8 +20,11 @@ from vvgt_cli.optimize.states import Fields, OwnFrame
 from vvgt_cli.splat import blend
 
 GAIN = 0.01  # dB: less is none
+FALLEN = 3.0  # dB below the best: rates were too large
+SLOWER = 0.5  # rates after a fall
+LOOKS = 8  # at the check views in a run, where that leaves enough steps between two
+SETTLING = 0.5  # share of the run from which on looks without gain count: rates fall only then
 MEMORY = 0.9  # of the running error, a step
-SLOWER = 0.5  # rates, after a look that found no gain
 State = OwnFrame | Fields
 Check = tuple[Sequence[Camera], np.ndarray]
 
@@ -59,10 +62,12 @@ def run(
         share = _share(options, record.steps, walk.elapsed)
         walk.error = step(state, cameras[view], images[view], options, walk.error, share, walk.speed)
         record.steps += 1
+        expected = _expected(options, record.steps, walk.elapsed)
         if progress:
-            progress(record.steps, _expected(options, record.steps, walk.elapsed))
-        if record.steps % options.check_every == 0:
-            if not judge.look(time.perf_counter() - began):
+            progress(record.steps, expected)
+        if record.steps >= walk.looked + max(options.check_every, expected // LOOKS):
+            walk.looked = record.steps
+            if judge.look(time.perf_counter() - began, share >= SETTLING):
                 walk.speed *= SLOWER
             keep()
     keep()  # before the last look: a run that goes on from here would not have taken it
@@ -79,6 +84,7 @@ class _Walk:
     error: float | None = None
     speed: float = 1.0
     elapsed: float = 0.0
+    looked: int = 0
 
 
 def _checkpoint(
@@ -157,7 +163,7 @@ def _reason(options: OptimizeOptions, judge: Judge, elapsed: float, stop: Callab
         return "time"
     if options.target_psnr is not None and judge.best is not None and judge.best >= options.target_psnr:
         return "target"
-    if judge.idle >= options.patience and judge.state.STEADY:
+    if judge.idle >= options.patience:
         return "no gain"
     return "interrupted" if stop and stop() else None
 
@@ -180,28 +186,29 @@ class Judge:
         self.kept: tuple[np.ndarray, ...] | None = None
         self.idle = 0
 
-    def look(self, seconds: float) -> bool:
-        """Score the state, unless that has been done; True if it is the best so far.
+    def look(self, seconds: float, settling: bool = False) -> bool:
+        """Score the state, unless that has been done; True if it has fallen, and was put back to the best.
 
-        One that is worse is put back to the best, where the method is one that never needs to get worse.
+        Rates are kept up in the first half of a run, and pictures may get worse on the way: looks without gain count
+        when it is ``settling``, and after a fall.
         """
         record = self.record
         if self.check is None or (record.checks and record.checks[-1][0] == record.steps):
-            return True
+            return False
         scores = []
         for camera, view in zip(*self.check, strict=True):
             image = blend(self.state.project(camera), self.state.colors, camera.height, camera.width)
             scores.append(psnr(view[..., :3], image[..., :3]))
-        now, self.idle = float(np.mean(scores)), self.idle + 1
+        now = float(np.mean(scores))
         record.checks.append((record.steps, seconds, now))
-        if self.best is None or now > self.best + GAIN:
-            self.idle = 0
+        fallen = self.best is not None and now < self.best - FALLEN and self.state.STEADY
+        gained = self.best is None or now > self.best + GAIN
+        self.idle = 0 if gained else self.idle + ((settling and self.state.STEADY) or fallen)
         if self.best is None or now > self.best:
             self.best, self.kept, record.kept = now, tuple(a.copy() for a in self.state.arrays), record.steps
-            return True
-        if self.state.STEADY:
+        if fallen:
             self._put_back()
-        return False
+        return fallen
 
     def _put_back(self) -> None:
         assert self.kept is not None

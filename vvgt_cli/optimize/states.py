@@ -28,7 +28,7 @@ class OwnFrame:
     CLIPS = np.array([0.5, 1.0, 0.3])  # d, logit, E
     ERROR, LARGEST = 0.05, 1.5
     BETAS = 0.6, 0.999
-    STEADY = True  # it can be put back to where it was best, and a run without gain is at its end
+    STEADY = True  # what falls far behind its best can be put back there, and a run without gain is at its end
 
     def __init__(self, gaussians: Gaussians, cameras: Sequence[Camera]) -> None:
         from vvgt_cli.optimize import steps

@@ -29,8 +29,9 @@ if TYPE_CHECKING:
     from vvgt_cli.vbm import Start
 
 VIEW_BYTES = 2 * 16  # a pixel: float32 RGBA, and as much again while views are stacked
-REFINE_VIEWS = 48  # training views of gradient descent; the closed form takes every second of them
-FINE_ENOUGH = 50.0  # dB between a view and one of the default integration
+REFINE_VIEWS = 72  # training views of gradient descent, which learns fewer by heart; the closed form takes a third
+LADDER = ((1.0, 1), (1.0, 2), (0.5, 1), (0.5, 2))  # steps in voxels and rays along a pixel's edge, by cost
+MARGIN = 16.0  # dB
 PREVIEW_VIEWS = (0, 4, 9)  # test views of the preview, and of the score without a report: above, side, below
 
 
@@ -53,8 +54,9 @@ class FitOptions:
     steps: int = 0
 
     def views(self) -> int:
-        """Training views: more of them where gradient descent would learn them by heart."""
-        return REFINE_VIEWS if self.steps else SET_VIEWS["train"]
+        """Training views: no more than there are steps."""
+        fewest = SET_VIEWS["train"]
+        return fewest * min(max(self.steps // fewest, 1), REFINE_VIEWS // fewest)
 
 
 @dataclass(frozen=True)
@@ -100,13 +102,13 @@ def convert(request: ConvertRequest, console: Console | None = None) -> Conversi
     _check_memory(request.fit)
     source, scene = _begin(run, request)
     start = _closed_form(run, scene, request.fit)
-    train, check, settings = _views(run, scene, request.fit)
-    gaussians = _back_project(run, start, train.take(range(0, len(train), 2)) if request.fit.steps else train, check)
+    train, check = _views(run, scene, start.gaussians, request.fit)
+    gaussians = _back_project(run, start, train.take(range(0, len(train), len(train) // SET_VIEWS["train"])), check)
     if request.fit.steps:
         options = OptimizeOptions(steps=request.fit.steps, seed=request.fit.seed)
         gaussians = refine(run, gaussians, train, check, options)
     gaussians = as_stored(gaussians)  # what is scored is what the file holds
-    scores, sheet = _score(run, scene, gaussians, request, settings)
+    scores, sheet = _score(run, scene, gaussians, request)
     run.report.scores = asdict(scores)
     return _finish(run, request, source, gaussians, sheet)
 
@@ -207,32 +209,36 @@ def _splats(gaussians: Gaussians, cameras: list[Camera]) -> list[np.ndarray]:
     return [render(gaussians, camera) for camera in cameras]
 
 
-def _views(run: Run, scene: Scene, fit: FitOptions) -> tuple[Views, Views, RenderSettings]:
-    """Training and check views, and how the test views are to be integrated."""
-    from vvgt_cli.dvr import render_views
-    from vvgt_cli.dvr.render import FIT_VIEWS, SCORE_VIEWS
+def _views(run: Run, scene: Scene, start: Gaussians, fit: FitOptions) -> tuple[Views, Views]:
+    """Training and check views."""
+    from vvgt_cli.dvr import RenderSettings, render_views
+    from vvgt_cli.dvr.render import FIT_VIEWS
 
     train, check = default_views("train", fit.views(), size=fit.size), default_views("check", size=fit.size)
     with run.stage("views") as stage:
-        settings = _fine_enough(scene, check[0]) if fit.steps else FIT_VIEWS
+        reference = render_views(scene, check, RenderSettings() if fit.steps else FIT_VIEWS)
+        settings = _fine_enough(scene, Views(check, reference), start) if fit.steps else FIT_VIEWS
         images = render_views(scene, train, settings, progress=run.console.bar("views"))
-        reference = render_views(scene, check, settings)
-        stage.note = f"{len(train)} to fit to, {len(check)} to check by, {fit.size} px"
-    return Views(train, images), Views(check, reference), settings if fit.steps else SCORE_VIEWS
+        rays = "one ray" if settings.samples == 1 else f"up to {settings.samples**2} rays"
+        how = f", {rays} a pixel, steps of {settings.step:g}" if fit.steps else ""
+        stage.note = f"{len(train)} to fit to, {len(check)} to check by, {fit.size} px{how}"
+    return Views(train, images), Views(check, reference)
 
 
-def _fine_enough(scene: Scene, camera: Camera) -> RenderSettings:
-    """The cheapest integration that a view does not tell from the default one.
+def _fine_enough(scene: Scene, check: Views, start: Gaussians) -> RenderSettings:
+    """The cheapest integration whose error is `MARGIN` below that of ``start``, against finely rendered check views.
 
-    Gradient descent follows the jags of single rays and the error of long steps, where a scene has hard edges.
+    Gradient descent follows the jags of single rays and the error of long steps, which hard edges have.
     """
     from vvgt_cli.dvr import RenderSettings, render_view
-    from vvgt_cli.dvr.render import FIT_VIEWS, SCORE_VIEWS
     from vvgt_cli.metrics import psnr
+    from vvgt_cli.splat import render
 
-    fine = render_view(scene, camera)
-    for settings in (FIT_VIEWS, SCORE_VIEWS):
-        if psnr(fine, render_view(scene, camera, settings)) >= FINE_ENOUGH:
+    camera, fine = check.cameras[0], check.images[0]
+    wanted = psnr(fine[..., :3], render(start, camera)[..., :3]) + MARGIN
+    for step, samples in LADDER:
+        settings = RenderSettings(step=step, samples=samples)
+        if psnr(fine[..., :3], render_view(scene, camera, settings)[..., :3]) >= wanted:
             return settings
     return RenderSettings()
 
@@ -253,16 +259,17 @@ def _back_project(run: Run, start: Start, train: Views, check: Views) -> Gaussia
     return mended if stage.kept else start.gaussians
 
 
-def _score(
-    run: Run, scene: Scene, gaussians: Gaussians, request: ConvertRequest, settings: RenderSettings
-) -> tuple[Scores, np.ndarray | None]:
+def _score(run: Run, scene: Scene, gaussians: Gaussians, request: ConvertRequest) -> tuple[Scores, np.ndarray | None]:
     """Scores on the test views, and the preview's sheet where one is asked for."""
+    from vvgt_cli.dvr import RenderSettings
+    from vvgt_cli.dvr.render import SCORE_VIEWS
+
     with run.stage("test views") as stage:
         scores, sheet = score_test_views(
             scene,
             gaussians,
             request.fit.size,
-            settings,
+            RenderSettings() if request.fit.steps else SCORE_VIEWS,
             perceptual=request.report is not None,
             keep=PREVIEW_VIEWS if request.preview else (),
             only=None if request.report else PREVIEW_VIEWS,
