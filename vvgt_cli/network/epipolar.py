@@ -98,8 +98,10 @@ class EpipolarCrossAttention(nn.Module):
         places = [corners(uv, of_scale.shape[1], of_scale.shape[2]) for of_scale in maps]
         for scale, layer in product(range(SCALES), range(self.layers)):
             rows = self.rows(maps[scale], scale, layer)
-            parts = [rows.index_select(0, index) * weight for index, weight in places[scale]]
-            sampled = sum(parts[1:], parts[0]).reshape(views, count, 2 * self.inner)
+            sampled = torch.zeros_like(rows[:1])
+            for index, weight in places[scale]:  # summed as they come: two of the four exist at a time
+                sampled = sampled + rows.index_select(0, index) * weight
+            sampled = sampled.reshape(views, count, 2 * self.inner)
             keys, values = sampled[..., : self.inner], sampled[..., self.inner :]
             logits = (keys * query).sum(dim=-1) + bias  # (n, m)
             now = torch.maximum(top[:, 0], logits.amax(dim=0))[:, None]  # (m, 1)

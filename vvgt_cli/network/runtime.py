@@ -144,6 +144,7 @@ def _session(path: Path, threads: int, provider: str) -> Any:
 
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
+    options.enable_cpu_mem_arena = False  # the arena doubles as it grows and keeps what it has: twice the peak
     options.log_severity_level = 4  # errors come as exceptions
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # waiting threads would burn a core each
     try:
