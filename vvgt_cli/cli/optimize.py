@@ -32,7 +32,7 @@ from vvgt_cli.progress import Console
 )  # fmt: skip
 @click.option(
     "--checkpoint", metavar="FILE.npz",
-    help="For long runs: written at every look at the check views and at the end; the same command begins where it ended.",
+    help="For long runs: written at every look at the check views and at the end; the same command goes on there.",
 )  # fmt: skip
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of the order of views.")
 @click.option("--report", metavar="R.json", help="Write times and errors of every stage as JSON; - is standard output.")
