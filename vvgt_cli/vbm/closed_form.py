@@ -162,11 +162,11 @@ def fit(
     tick = progress or (lambda done, total: None)
     cuts = []
     for number, name in enumerate(styles):
-        cuts.append(form.refined(some, images, STYLES[name]))
+        cuts.append(solve_colors(form.refined(some, images, STYLES[name]), some, images, rounds=1))
         tick(number + 1, len(styles) + 1)
     best = 0
     if len(cuts) > 1:
-        best = int(np.argmin([_loss(solve_colors(cut, some, images, rounds=1), some, images) for cut in cuts]))
+        best = int(np.argmin([_loss(cut, some, images) for cut in cuts]))
     gaussians = solve_colors(cuts[best], cameras, views, twice_every=TWICE_EVERY)
     tick(len(styles) + 1, len(styles) + 1)
     return gaussians, "cells by image error" + (f", {styles[best]} surfaces" if form.opaque.any else "")
