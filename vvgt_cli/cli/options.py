@@ -56,7 +56,9 @@ read_options = group(
     spacing=click.option(
         "--spacing", nargs=3, type=float, metavar="X Y Z", help="Voxel edges, in place of the file's."
     ),
-    array=click.option("--array", metavar="NAME", help="Which array, where the file holds several."),
+    array=click.option(
+        "--array", "--grid", "array", metavar="NAME", help="Which array or grid, where the file holds several."
+    ),
     component=click.option(
         "--component", metavar="N|magnitude", callback=_component, help="Which component of a vector array."
     ),

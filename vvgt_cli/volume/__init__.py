@@ -1,6 +1,18 @@
 """Volumes and their readers."""
 
-from vvgt_cli.volume import examples, inviwo, metaimage, nifti, nrrd, raw, slc, tiff, vtk_legacy, vtk_xml  # noqa: F401
+from vvgt_cli.volume import (  # noqa: F401  each registers its format
+    examples,
+    inviwo,
+    metaimage,
+    nifti,
+    nrrd,
+    openvdb,
+    raw,
+    slc,
+    tiff,
+    vtk_legacy,
+    vtk_xml,
+)
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.registry import read_volume
 from vvgt_cli.volume.stats import Statistics, slabs, statistics

@@ -1,0 +1,242 @@
+"""OpenVDB files that OpenVDB 10 wrote (tests/fixtures/vdb/write_vdb.cc), against the values that it read from them."""
+
+from __future__ import annotations
+
+import shutil
+import struct
+import tarfile
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.volume import ReadOptions, read_volume, statistics
+from vvgt_cli.volume.bricks import BrickArray
+from vvgt_cli.volume.components import magnitude
+from vvgt_cli.volume.openvdb import codec
+from vvgt_cli.volume.openvdb.cursor import Cursor
+
+ARCHIVE = Path(__file__).parent / "fixtures" / "vdb" / "grids.tar.xz"
+
+
+@dataclass(frozen=True)
+class Case:
+    """A line of expected.tsv."""
+
+    file: str
+    grid: str
+    dtype: str
+    components: int
+    dims: tuple[int, ...]
+    spacing: tuple[float, ...]
+    origin: tuple[float, ...]
+    raw: str
+
+    @classmethod
+    def parse(cls, line: str) -> Case:
+        f = line.split("\t")
+        numbers = [tuple(float(v) for v in f[k : k + 3]) for k in (7, 10)]
+        return cls(f[0], f[1], f[2], int(f[3]), tuple(map(int, f[4:7])), numbers[0], numbers[1], f[13])
+
+    def values(self, folder: Path) -> np.ndarray:
+        """(nz, ny, nx, c) as OpenVDB has them."""
+        return np.fromfile(folder / self.raw, self.dtype).reshape(*self.dims[::-1], self.components)
+
+
+def cases() -> list[Case]:
+    with tarfile.open(ARCHIVE) as archive:
+        table = archive.extractfile("./expected.tsv")
+        assert table is not None
+        return [Case.parse(line) for line in table.read().decode().splitlines()]
+
+
+@pytest.fixture(scope="session")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("vdb")
+    with tarfile.open(ARCHIVE) as archive:
+        archive.extractall(path, filter="data")
+    return path
+
+
+REFUSED = ("sheared", "frustum")
+
+
+@pytest.mark.parametrize(
+    "case", [c for c in cases() if c.grid not in REFUSED], ids=lambda c: f"{c.file}-{c.grid}".replace(" ", "_")
+)
+def test_every_grid_is_equal_to_the_last_bit(folder: Path, case: Case) -> None:
+    expected = case.values(folder)
+    for component in range(case.components):
+        options = ReadOptions(array=case.grid, component=component if case.components > 1 else None)
+        volume = read_volume(str(folder / case.file), options)
+        assert isinstance(volume.data, BrickArray)
+        assert volume.dims == case.dims
+        assert volume.data.dtype == np.dtype(case.dtype)
+        assert np.asarray(volume.data).tobytes() == np.ascontiguousarray(expected[..., component]).tobytes()
+        # a rotated grid's edges come from its axes here, from differences of positions there
+        np.testing.assert_allclose(volume.spacing, case.spacing, rtol=1e-14)
+        np.testing.assert_allclose(volume.origin, case.origin, rtol=1e-14, atol=1e-14)
+    if case.components > 1:
+        volume = read_volume(str(folder / case.file), ReadOptions(array=case.grid, component="magnitude"))
+        np.testing.assert_array_equal(np.asarray(volume.data), magnitude(expected))
+
+
+def test_the_fixtures_hold_what_is_claimed() -> None:
+    found = cases()
+    codecs = {"none.vdb", "none_mask.vdb", "zip.vdb", "zip_mask.vdb", "blosc.vdb", "blosc_mask.vdb"}
+    kinds = {
+        "float",
+        "half",
+        "double",
+        "half double",
+        "int32",
+        "int64",
+        "bool",
+        "vec3s",
+        "half vec3s",
+        "vec3d",
+        "vec3i",
+    }
+    assert {(c.file, c.grid) for c in found} >= {(codec, kind) for codec in codecs for kind in kinds}
+    assert ARCHIVE.stat().st_size < 600_000
+
+
+def test_slabs_are_the_parts_of_the_whole(folder: Path) -> None:
+    for grid in ("tiles", "root"):
+        lazy = read_volume(str(folder / "tiles.vdb"), ReadOptions(array=grid)).data
+        whole = np.asarray(read_volume(str(folder / "tiles.vdb"), ReadOptions(array=grid)).data)
+        for start, stop in ((0, 1), (0, 3), (5, 22), (7, 9), (len(whole) - 2, len(whole)), (4, 4)):
+            np.testing.assert_array_equal(lazy[start:stop], whole[start:stop])
+        np.testing.assert_array_equal(lazy[-1], whole[-1])
+        np.testing.assert_array_equal(np.stack(list(lazy)), whole)
+        with pytest.raises(IndexError):
+            lazy[len(whole)]
+        np.testing.assert_array_equal(lazy[::2, 1:3], whole[::2, 1:3])
+
+
+def test_statistics_do_not_lay_the_array_out(folder: Path) -> None:
+    volume = read_volume(str(folder / "tiles.vdb"), ReadOptions(array="tiles"))
+    numbers = statistics(volume)
+    assert volume.data._whole is None
+    assert (numbers.lo, numbers.hi, numbers.finite_count) == (1.5, 4.5, volume.data.size)
+
+
+@pytest.mark.parametrize(
+    ("grid", "direction"),
+    [
+        ("mirrored", (1, 0, 0, 0, -1, 0, 0, 0, 1)),
+        ("turned", (0, -1, 0, 1, 0, 0, 0, 0, 1)),
+        ("affine", (1, 0, 0, 0, 1, 0, 0, 0, 1)),
+    ],
+)
+def test_direction(folder: Path, grid: str, direction: tuple[float, ...]) -> None:
+    assert read_volume(str(folder / "transforms.vdb"), ReadOptions(array=grid)).direction == direction
+
+
+@pytest.mark.parametrize(
+    ("file", "options", "error", "message"),
+    [
+        ("many.vdb", {}, UsageError, r"several grids: density\[0\] \(float\); .*choose one with --grid NAME"),
+        ("many.vdb", {"array": "smoke"}, UsageError, "no grid 'smoke'; it has density"),
+        ("many.vdb", {"array": "density"}, UsageError, "2 grids 'density'.*name one with its number"),
+        ("many.vdb", {"array": "velocity"}, UsageError, "3 components.*--component 0 to 2, or --component magnitude"),
+        ("many.vdb", {"array": "other"}, DataError, "float, tree 4-3-2.*expected values of type float"),
+        ("many.vdb", {"array": "nothing"}, DataError, "no active voxel"),
+        ("version222.vdb", {"array": "float", "component": 1}, UsageError, "has 1 component"),
+        ("tiles.vdb", {"array": "far"}, DataError, "span 4000000001 x 6 x 6"),
+        ("transforms.vdb", {"array": "sheared"}, DataError, "shears or flattens"),
+        ("transforms.vdb", {"array": "frustum"}, DataError, "a frustum"),
+    ],
+)
+def test_what_cannot_be_read(folder: Path, file: str, options: dict, error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        read_volume(str(folder / file), ReadOptions(**options))
+
+
+def test_the_only_grid_needs_no_name(folder: Path) -> None:
+    with pytest.raises(UsageError, match="grid 'velocity' has 3 components"):
+        read_volume(str(folder / "version223.vdb"))
+    volume = read_volume(str(folder / "version223.vdb"), ReadOptions(component="magnitude", spacing=(2, 3, 4)))
+    assert (volume.name, volume.spacing, volume.data.dtype) == ("version223", (2, 3, 4), np.float32)
+
+
+@pytest.mark.parametrize(
+    ("at", "value", "message"),
+    [
+        (8, struct.pack("<I", 221), "format version 221; expected 222 to 224"),
+        (8, struct.pack("<I", 225), "format version 225"),
+        (20, b"\0", "written as an OpenVDB stream"),
+        (0, b"x", "named like a OpenVDB file, but its content is of no known format"),
+    ],
+)
+def test_damaged_headers(folder: Path, tmp_path: Path, at: int, value: bytes, message: str) -> None:
+    data = bytearray((folder / "version222.vdb").read_bytes())
+    data[at : at + len(value)] = value
+    (tmp_path / "v.vdb").write_bytes(data)
+    with pytest.raises(DataError, match=message):
+        read_volume(str(tmp_path / "v.vdb"), ReadOptions(array="float"))
+
+
+def test_a_file_that_was_cut(folder: Path, tmp_path: Path) -> None:
+    data = (folder / "version222.vdb").read_bytes()
+    for size in (9, 30, 100, 1000, 20000, len(data) // 2):
+        (tmp_path / "v.vdb").write_bytes(data[:size])
+        with pytest.raises(DataError, match="check that the file is whole"):
+            read_volume(str(tmp_path / "v.vdb"), ReadOptions(array="bool"))
+
+
+def packed(data: bytes) -> Cursor:
+    return Cursor(memoryview(struct.pack("<q", len(data)) + data), "v.vdb")
+
+
+def test_a_bomb_is_not_unpacked() -> None:
+    with pytest.raises(DataError, match="holds 2049 bytes where 2048 are expected"):
+        codec.read_block(packed(zlib.compress(bytes(1 << 24))), 2048, codec.ZIP)
+    with pytest.raises(DataError, match="damaged ZIP"):
+        codec.read_block(packed(b"nonsense"), 2048, codec.ZIP)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"flags": 0x20 | 4}, "expected LZ4"),
+        ({"flags": 0x80}, "expected LZ4"),
+        ({"nbytes": 1 << 30}, "where 64 for 64 are expected|for 64 are expected"),
+        ({"cbytes": 4000}, "a Blosc block of 4000"),
+        ({"blocksize": 0}, "block size 0"),
+        ({"typesize": 0}, "expected LZ4"),
+        ({"start": 1 << 31}, "leaves its bounds"),
+        ({"blocksize": 1}, "without its table"),
+    ],
+)
+def test_a_blosc_block_that_lies(change: dict, message: str) -> None:
+    stream = bytes([0x1F, 7, 1, 0, 44]) + bytes(20)
+    told = {
+        "flags": 0x31,
+        "typesize": 4,
+        "nbytes": 64,
+        "blocksize": 64,
+        "cbytes": 24 + len(stream),
+        "start": 20,
+    } | change
+    head = struct.pack("<4B3I", 2, 1, *(told[k] for k in ("flags", "typesize", "nbytes", "blocksize", "cbytes")))
+    data = head + struct.pack("<Ii", told["start"], len(stream)) + stream
+    with pytest.raises(DataError, match=message):
+        codec.read_block(packed(data), 64, codec.BLOSC)
+
+
+def test_nanovdb_says_how_to_convert(tmp_path: Path) -> None:
+    (tmp_path / "v.nvdb").write_bytes(b"NanoVDB2" + bytes(100))
+    with pytest.raises(DataError, match=r"nanovdb_convert v\.nvdb v\.vdb"):
+        read_volume(str(tmp_path / "v.nvdb"))
+
+
+def test_a_grid_by_name_on_the_command_line(vvgt, folder: Path, tmp_path: Path) -> None:
+    shutil.copy(folder / "sphere.vdb", tmp_path)
+    result = vvgt("info", tmp_path / "sphere.vdb", "--grid", "surface", "--json")
+    assert result.code == 0, result.err
+    assert b'"float32"' in result.out
+    assert "fog (float)" in vvgt("info", tmp_path / "sphere.vdb").error

@@ -1,0 +1,104 @@
+"""Blocks of values in OpenVDB files: plain, zlib, and Blosc 1 with LZ4, the only coder that OpenVDB asks it for.
+
+Lengths come from the caller; what the file says is compared with them before anything is unpacked.
+Formats: openvdb/io/Compression.h; Blosc 1, README_CHUNK_FORMAT.rst.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+
+import numpy as np
+
+from vvgt_cli.volume.openvdb.cursor import Cursor
+
+ZIP, ACTIVE_MASK, BLOSC = 1, 2, 4
+_LZ4 = 1
+_MAX_SPLITS, _MIN_SPLIT = 16, 128  # blosc.c
+
+
+def read_block(cursor: Cursor, need: int, compression: int) -> bytes | memoryview:
+    """The next ``need`` bytes of values.
+
+    Raises:
+        DataError: cut short, damaged, or of another length.
+    """
+    if not compression & (ZIP | BLOSC):
+        return cursor.take(need)
+    (packed,) = cursor.unpack("q")
+    if packed <= 0:  # what does not get smaller is stored plainly, its length negated
+        if -packed != need:
+            raise cursor.bad(f"a block of {-packed} bytes where {need} are expected")
+        return cursor.take(need)
+    data = cursor.take(packed)
+    out = _unblosc(data, need, cursor) if compression & BLOSC else _unzip(data, need, cursor)
+    if len(out) != need:
+        raise cursor.bad(f"a compressed block holds {len(out)} bytes where {need} are expected")
+    return out
+
+
+def _unzip(data: memoryview, need: int, cursor: Cursor) -> bytes:
+    engine = zlib.decompressobj()
+    try:
+        out = engine.decompress(data, need + 1)
+    except zlib.error as error:
+        raise cursor.bad(f"damaged ZIP data ({error})") from error
+    return out
+
+
+def _unblosc(data: memoryview, need: int, cursor: Cursor) -> bytes:
+    if len(data) < 16:
+        raise cursor.bad("a Blosc block shorter than its header")
+    _, _, flags, typesize, nbytes, blocksize, cbytes = struct.unpack_from("<4B3I", data)
+    if nbytes != need or cbytes != len(data):
+        raise cursor.bad(f"a Blosc block of {cbytes} for {nbytes} bytes where {len(data)} for {need} are expected")
+    if flags & 2:
+        return bytes(data[16 : 16 + need])
+    if flags >> 5 != _LZ4 or flags & 4 or typesize < 1 or not 1 <= blocksize <= need:
+        raise cursor.bad(f"Blosc flags {flags:#x}, block size {blocksize}; expected LZ4 with or without byte shuffle")
+    count = -(-need // blocksize)
+    starts = struct.unpack_from(f"<{count}I", data, 16) if 16 + 4 * count <= len(data) else ()
+    if len(starts) != count:
+        raise cursor.bad("a Blosc block without its table")
+    parts = []
+    for number, start in enumerate(starts):
+        length = min(blocksize, need - number * blocksize)
+        whole = length == blocksize
+        splits = typesize if not flags & 16 and whole and typesize <= _MAX_SPLITS else 1
+        if splits > 1 and (blocksize // typesize < _MIN_SPLIT or length % typesize):
+            splits = 1
+        block = _unsplit(data, start, length, splits, cursor)
+        parts.append(_unshuffle(block, typesize) if flags & 1 and typesize > 1 else block)
+    return b"".join(parts)
+
+
+def _unsplit(data: memoryview, start: int, length: int, splits: int, cursor: Cursor) -> bytes:
+    """One block of ``length`` bytes: streams of equal lengths, each behind its compressed length."""
+    import lz4.block
+
+    each, out = length // splits, []
+    for _ in range(splits):
+        size = struct.unpack_from("<i", data, start)[0] if start + 4 <= len(data) else -1
+        start += 4
+        if size < 0 or start + size > len(data):
+            raise cursor.bad("a Blosc block that leaves its bounds")
+        stream = data[start : start + size]
+        start += size
+        if size == each:
+            out.append(bytes(stream))
+            continue
+        try:
+            out.append(lz4.block.decompress(stream, uncompressed_size=each))
+        except lz4.block.LZ4BlockError as error:
+            raise cursor.bad(f"damaged LZ4 data ({error})") from error
+        if len(out[-1]) != each:
+            raise cursor.bad(f"LZ4 data of {len(out[-1])} bytes where {each} are expected")
+    return b"".join(out)
+
+
+def _unshuffle(block: bytes, typesize: int) -> bytes:
+    """Undo the byte shuffle: first bytes of all values, then the second ones; a rest stays as it is."""
+    n = len(block) // typesize
+    body = np.frombuffer(block, np.uint8, n * typesize).reshape(typesize, n).T.tobytes()
+    return body + block[n * typesize :]
