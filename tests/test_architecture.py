@@ -16,11 +16,11 @@ ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "vvgt_cli"
 ROOMS = (
     *("errors", "progress", "files", "jit", "volume", "transfer", "cameras", "images", "metrics", "gaussians", "synth"),
-    *("dvr", "splat", "vbm", "network", "optimize", "training", "report", "pipeline", "cli"),
+    *("dvr", "splat", "vbm", "network", "optimize", "training", "checks", "report", "pipeline", "cli"),
 )
 HEAVY = {
     *("numba", "vtk", "vtkmodules", "pyvista", "onnxruntime", "torch", "matplotlib", "OpenImageIO", "OpenEXR"),
-    *("scipy", "nibabel", "gsplat", "lpips"),
+    *("scipy", "nibabel", "gsplat", "lpips", "h5py", "netCDF4", "zarr", "numcodecs", "pydicom"),
 }
 # Modules that hold numba kernels or torch networks: their importers import them inside the functions that call them.
 KERNELS = {"numba", "torch"}

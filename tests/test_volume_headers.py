@@ -141,7 +141,7 @@ def test_nrrd_components(tmp_path: Path, fields: dict, axis: int) -> None:
         ({"data file": "/etc/passwd"}, "header's own folder"),
         ({"data file": "../v.raw"}, "header's own folder"),
         ({"data file": "none.raw"}, "does not exist beside it"),
-        ({"data file": "v%02d.raw 0 9 1"}, "several files"),
+        ({"data file": "v%02d.raw 0 9 1"}, "10 data files of 5 x 4 values"),
     ],
 )
 def test_nrrd_lies(tmp_path: Path, fields: dict, message: str) -> None:

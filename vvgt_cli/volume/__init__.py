@@ -1,17 +1,23 @@
 """Volumes and their readers."""
 
-from vvgt_cli.volume import (  # noqa: F401  each registers its format
+from vvgt_cli.volume import (  # noqa: F401  each registers its formats, in this order
+    dicom,
     examples,
+    hdf5,
     inviwo,
     metaimage,
+    netcdf,
     nifti,
     nrrd,
-    openvdb,
+    numpy_file,
     raw,
     slc,
+    slices,
     tiff,
+    vtk_grids,
     vtk_legacy,
     vtk_xml,
+    zarr_store,
 )
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.registry import read_volume

@@ -85,16 +85,17 @@ def select_component(
     if n == 1:
         if component not in (None, 0):
             raise UsageError(f"{what}; leave out --component {component}")
-        return _contiguous(values[..., 0]), scaling
+        return contiguous(values[..., 0]), scaling
     if component is None or (isinstance(component, int) and component >= n):
         found = "" if component is None else f", not component {component}"
         raise UsageError(f"{what}{found}; expected a scalar: try --component 0 to {n - 1}, or --component magnitude")
     if component == "magnitude":
         return magnitude(values, *scaling), (1.0, 0.0)
-    return _contiguous(values[..., int(component)]), scaling
+    return contiguous(values[..., int(component)]), scaling
 
 
-def _contiguous(field: np.ndarray) -> np.ndarray:
+def contiguous(field: np.ndarray) -> np.ndarray:
+    """The field itself (mapped, perhaps), or a C-contiguous copy where it is not one."""
     return field if field.flags.c_contiguous else np.ascontiguousarray(field)
 
 

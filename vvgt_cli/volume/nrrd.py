@@ -1,4 +1,6 @@
-"""NRRD, attached (``.nrrd``) and detached (``.nhdr``): raw (memory-mapped), gzip, bzip2 and text encodings.
+"""NRRD, attached (``.nrrd``) and detached (``.nhdr``, with one data file or several).
+
+Encodings: raw (memory-mapped where it is one file), gzip, bzip2 and text.
 
 Format: https://teem.sourceforge.net/nrrd/format.html
 """
@@ -13,6 +15,7 @@ from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import data_file, load_block
 from vvgt_cli.volume.components import select_component
 from vvgt_cli.volume.headers import MAX_HEADER, Fields, unit_rows
+from vvgt_cli.volume.nrrd_files import data_names, load_files
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.registry import Reader, register, volume_name
 from vvgt_cli.volume.types import IDENTITY, Volume
@@ -162,21 +165,25 @@ def read_nrrd(path: Path, options: ReadOptions) -> Volume:
     sizes = fields.sizes("sizes", fields.need("sizes"))
     if len(sizes) != fields.integer("dimension", len(sizes)):
         raise DataError(f"{path}: dimension {fields['dimension']} but sizes {fields['sizes']!r}")
-    source = path
-    named = fields.get("data file") or fields.get("datafile")
-    if named is not None:
-        if named.startswith("LIST") or "%" in named:
-            raise DataError(f"{path}: its data lie in several files; expected one (try teem: unu save -f nrrd)")
-        source, offset = data_file(path, named), 0
-    offset = _line_skip(source, offset, fields.integer("line skip", 0))
     skip = fields.integer("byte skip", 0)
     if skip < -1 or (skip == -1 and encoding != "raw"):
         raise DataError(f"{path}: byte skip {skip} with encoding {encoding}; expected 0 or more (-1 with raw only)")
+
+    def load(source: Path, start: int, shape: tuple[int, ...]) -> np.ndarray:
+        if skip == -1:
+            return load_block(source, dtype, shape, offset=-1)
+        start = _line_skip(source, start, fields.integer("line skip", 0))
+        return load_block(source, dtype, shape, offset=start, encoding=encoding, skip=skip)
+
     shape = tuple(reversed(sizes))
-    if skip == -1:
-        block = load_block(source, dtype, shape, offset=-1)
+    named = fields.get("data file") or fields.get("datafile")
+    several = data_names(path, named, len(sizes)) if named is not None else None
+    if named is None:
+        block = load(path, offset, shape)
+    elif several is None:
+        block = load(data_file(path, named), 0, shape)
     else:
-        block = load_block(source, dtype, shape, offset=offset, encoding=encoding, skip=skip)
+        block = load_files(path, *several, shape, dtype, lambda name, part: load(data_file(path, name), 0, part))
     return _volume(path, fields, block, sizes, options)
 
 

@@ -41,12 +41,12 @@ class ReadOptions:
     """How to read a volume; every field left at ``None`` (or 0) means "as the file says".
 
     Attributes:
-        dims: voxels along (x, y, z) of a raw file.
+        dims: voxels along (x, y, z) of a raw file, or of the grid that a mesh is resampled to.
         dtype: a name of `DTYPES` (or a C-like alias such as ``ushort``) for a raw file.
         byte_order: ``little`` or ``big`` for a raw file (default little).
         header_bytes: bytes to skip at the start of a raw file.
         spacing: voxel edges (x, y, z) in world units; overrides the file's.
-        array: name of the array, for formats that hold several.
+        array: name of the array (path of a dataset, series of a DICOM folder), for formats that hold several.
         component: index of a component, or ``magnitude``, for arrays that have several.
 
     Raises:

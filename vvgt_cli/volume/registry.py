@@ -7,11 +7,12 @@ A reader is a module that ends in one ``register(Reader(...))``; a scheme (``exa
 from __future__ import annotations
 
 import gzip
+import os
 import re
 import struct
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from vvgt_cli.errors import DataError, UsageError
@@ -34,6 +35,8 @@ class Reader:
         named_arrays: takes ``--array``.
         raw_layout: takes dims, dtype, byte order and header bytes.
         by_name: tried on a file that only its name speaks for (formats without a fixed beginning).
+        resamples: takes ``--dims`` as the grid to sample on.
+        holds: does this folder hold the format? Of formats that are folders.
     """
 
     name: str
@@ -44,6 +47,8 @@ class Reader:
     named_arrays: bool = False
     raw_layout: bool = False
     by_name: bool = False
+    resamples: bool = False
+    holds: Callable[[Path], bool] | None = None
 
 
 Scheme = Callable[[str, ReadOptions], Volume]
@@ -87,7 +92,7 @@ def read_volume(source: str, options: ReadOptions | None = None) -> Volume:
     """Read a volume from a file, from standard input (``-``, raw bytes) or from a registered scheme.
 
     Args:
-        source: a path, ``-`` or ``scheme:rest``.
+        source: a path, ``PATH:/inner/path`` for formats that hold several arrays, ``-`` or ``scheme:rest``.
         options: see `ReadOptions`.
 
     Returns:
@@ -105,9 +110,11 @@ def read_volume(source: str, options: ReadOptions | None = None) -> Volume:
     scheme, colon, rest = source.partition(":")
     if colon and scheme in _SCHEMES:
         return _SCHEMES[scheme](rest, options)
-    path = Path(source)
-    head = _head(path, source)
-    reader = _find(path, head, options)
+    path, options = _inner(source, options)
+    slices = _slices(source, options)
+    if slices is not None:
+        return slices
+    reader = _folder(path, source) if os.path.isdir(path) else _find(path, _head(path, source), options)
     _check_options(reader, source, options)
     try:
         return reader.read(path, options)
@@ -118,11 +125,41 @@ def read_volume(source: str, options: ReadOptions | None = None) -> Volume:
         raise DataError(f"{source}: not enough memory to read it; try a machine with more") from error
 
 
+def _inner(source: str, options: ReadOptions) -> tuple[Path, ReadOptions]:
+    """Path of ``PATH:/inner/path``, and the options with the inner path as their array."""
+    head, _, inner = source.rpartition(":/")
+    if not head or os.path.exists(source) or not os.path.exists(head):
+        return Path(source), options
+    if options.array is not None:
+        raise UsageError(f"{source}: --array {options.array} and :/{inner} choose both; leave out one")
+    return Path(head), replace(options, array="/" + inner)
+
+
+def _slices(source: str, options: ReadOptions) -> Volume | None:
+    """The volume of a glob of slices, or None where the source is none."""
+    if not set(source) & set("*?[") or "\0" in source or os.path.exists(source):
+        return None
+    from vvgt_cli.volume.slices import READER, read_glob
+
+    volume = read_glob(source, options)
+    if volume is not None:
+        _check_options(READER, source, options)
+    return volume
+
+
+def _folder(path: Path, source: str) -> Reader:
+    for reader in _READERS:
+        if reader.holds is not None and reader.holds(path):
+            return reader
+    kinds = ", ".join(reader.name for reader in _READERS if reader.holds is not None)
+    raise DataError(
+        f"{source}: a folder; expected a volume file ({', '.join(known_suffixes())}) or a folder of {kinds}"
+    )
+
+
 def _head(path: Path, source: str) -> bytes:
     """First bytes of a file; raises `DataError` if there are none to be had."""
     try:
-        if path.is_dir():
-            raise DataError(f"{source}: a folder; expected a volume file ({', '.join(known_suffixes())})")
         with open(path, "rb") as file:
             head = file.read(HEAD_BYTES)
     except FileNotFoundError:
@@ -158,7 +195,7 @@ def _find(path: Path, head: bytes, options: ReadOptions) -> Reader:
 
     named = _by_name(path)
     found, zipped = _by_content(path, head)
-    if found is not None and found is not named and (options.dims or raw.parse_name(path.name)):
+    if found is not None and found is not named and not found.resamples and (options.dims or raw.parse_name(path.name)):
         return raw.READER  # a raw volume may begin with any bytes; where its layout is stated, believe that
     if found is not None:
         if zipped and not found.unzips:
@@ -180,10 +217,9 @@ def _find(path: Path, head: bytes, options: ReadOptions) -> Reader:
 
 
 def _check_options(reader: Reader, source: str, options: ReadOptions) -> None:
-    if not reader.raw_layout and options.raw_flags:
-        raise UsageError(
-            f"{source}: a {reader.name} file, which states its own layout; leave out {' '.join(options.raw_flags)}"
-        )
+    needless = [flag for flag in options.raw_flags if not (reader.resamples and flag == "--dims")]
+    if not reader.raw_layout and needless:
+        raise UsageError(f"{source}: a {reader.name} file, which states its own layout; leave out {' '.join(needless)}")
     if options.array is not None and not reader.named_arrays:
         raise UsageError(
             f"{source}: a {reader.name} file, which has one array without a name; leave out --array {options.array}"

@@ -20,6 +20,7 @@ from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.registry import Reader, register, volume_name
 from vvgt_cli.volume.types import Volume
 
+SUFFIXES = (".tif", ".tiff")
 _WIDTH, _HEIGHT, _BITS, _SAMPLES, _SUBFILE = 256, 257, 258, 277, 254
 _FIELD = {1: "B", 3: "H", 4: "I", 13: "I", 16: "Q"}
 _MAX_PAGES = 1 << 20
@@ -147,4 +148,4 @@ def _sniff(head: bytes) -> bool:
     return head[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
 
-register(Reader("TIFF", (".tif", ".tiff"), _sniff, read_tiff))
+register(Reader("TIFF", SUFFIXES, _sniff, read_tiff))

@@ -7,6 +7,7 @@ Parsed here because VTK's reader allocates whatever an array's header declares. 
 from __future__ import annotations
 
 import mmap
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import unquote
@@ -39,6 +40,7 @@ _TYPES = {
     "float": "f4",
     "double": "f8",
 }
+GRIDS = ("UNSTRUCTURED_GRID", "RECTILINEAR_GRID", "STRUCTURED_GRID")
 _FIXED = {"VECTORS": 3, "NORMALS": 3, "TENSORS": 9, "TENSORS6": 6, "GLOBAL_IDS": 1, "PEDIGREE_IDS": 1, "EDGE_FLAGS": 1}
 
 
@@ -52,8 +54,10 @@ class _Array:
     start: int
 
 
-class _Parser:
+class Parser:
     """Walks the sections of a legacy file and notes the arrays; values are skipped, not read."""
+
+    KINDS: tuple[str, ...] = ("STRUCTURED_POINTS", "IMAGE_DATA")
 
     def __init__(self, text: mmap.mmap, path: Path) -> None:
         self.text, self.path, self.position = text, path, 0
@@ -92,9 +96,9 @@ class _Parser:
             raise self.bad(f"coding is {coding[:40]!r}; expected ASCII or BINARY")
         self.binary = coding == "BINARY"
         kind = self.words() or ["nothing"]
-        if kind[-1].upper() not in ("STRUCTURED_POINTS", "IMAGE_DATA"):
+        if kind[-1].upper() not in self.KINDS:
             raise DataError(
-                f"{self.path}: a legacy VTK file with dataset {kind[-1]}; expected an image (STRUCTURED_POINTS); "
+                f"{self.path}: a legacy VTK file with dataset {kind[-1]}; expected {' or '.join(self.KINDS)}; "
                 "resample it first (ParaView: Resample To Image) and save it as .vti"
             )
         while (words := self.words()) is not None:
@@ -185,7 +189,7 @@ class _Parser:
             self.position += width + (length & ((1 << (8 * width - 2)) - 1))
 
 
-def _values(parser: _Parser, array: _Array, shape: tuple[int, int, int]) -> np.ndarray:
+def _values(parser: Parser, array: _Array, shape: tuple[int, int, int]) -> np.ndarray:
     """(nz, ny, nx, c) stored values of an array."""
     full = (*shape, array.info.components)
     n = array.tuples * array.info.components
@@ -201,7 +205,7 @@ def _values(parser: _Parser, array: _Array, shape: tuple[int, int, int]) -> np.n
     return load_block(parser.path, np.dtype(_TYPES[array.type]).newbyteorder(">"), full, offset=array.start)
 
 
-def _grid(parser: _Parser, where: str) -> tuple[tuple[int, ...], list[float], list[float]]:
+def _grid(parser: Parser, where: str) -> tuple[tuple[int, ...], list[float], list[float]]:
     """Dims, spacing and origin (x, y, z) of point or cell centres."""
     geometry = parser.geometry
     dims = [int(d) for d in geometry.get("DIMENSIONS", [])]
@@ -228,7 +232,7 @@ def read_legacy(path: Path, options: ReadOptions) -> Volume:
         UsageError: a choice of array or component that is missing or does not exist.
     """
     with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as text:
-        parser = _Parser(text, path)
+        parser = Parser(text, path)
         parser.parse()
         array = parser.arrays[choose_array([a.info for a in parser.arrays], options.array, str(path))]
         dims, spacing, origin = _grid(parser, array.info.where)
@@ -242,11 +246,18 @@ def read_legacy(path: Path, options: ReadOptions) -> Volume:
     return Volume(field, options.spacing_or(tuple(spacing)), tuple(origin), name=volume_name(path))  # type: ignore[arg-type]
 
 
+def is_legacy(head: bytes, grid: bool) -> bool:
+    """Whether a file begins as a legacy VTK file of a mesh or grid (`GRIDS`), or of anything else."""
+    kind = re.search(rb"\n\s*DATASET\s+(\w+)", head[:1024], re.IGNORECASE)
+    found = kind is not None and kind[1].decode().upper() in GRIDS
+    return head[:64].lower().startswith(b"# vtk datafile version") and found == grid
+
+
 register(
     Reader(
         "legacy VTK",
         (".vtk",),
-        lambda head: head[:64].lower().startswith(b"# vtk datafile version"),
+        lambda head: is_legacy(head, grid=False),
         read_legacy,
         named_arrays=True,
     )

@@ -39,16 +39,19 @@ _DTYPES = {
 # Most that a byte of the file can stand for: deflate 1032, LZ4 255, LZMA some 7000; "0 " for a double in text.
 _RATIO = {"": 4, "vtkZLibDataCompressor": 1040, "vtkLZ4DataCompressor": 256, "vtkLZMADataCompressor": 10000}
 _CHUNK = 1 << 16
+GRIDS = ("UnstructuredGrid", "RectilinearGrid", "StructuredGrid")
 
 
 @dataclass
 class _Scan:
-    """What the XML says; arrays are those of the first piece."""
+    """What the XML says; arrays are those of the first piece, points and cells of all."""
 
     kind: str = ""
     root: dict[str, str] = field(default_factory=dict)
     image: dict[str, str] = field(default_factory=dict)
     pieces: int = 0
+    points: int = 0
+    cells: int = 0
     where: str = ""
     active: dict[str, str] = field(default_factory=dict)
     arrays: list[tuple[ArrayInfo, dict[str, str]]] = field(default_factory=list)
@@ -68,10 +71,12 @@ def scan(path: Path) -> _Scan:
     def start(tag: str, attributes: dict[str, str]) -> None:
         if tag == "VTKFile":
             found.root, found.kind = attributes, attributes.get("type", "")
-        elif tag == "ImageData":
+        elif tag in ("ImageData", "RectilinearGrid", "StructuredGrid"):
             found.image = attributes
         elif tag == "Piece":
             found.pieces += 1
+            found.points += int(attributes.get("NumberOfPoints", "0"))
+            found.cells += int(attributes.get("NumberOfCells", "0"))
         elif tag in ("PointData", "CellData"):
             found.where = tag[:-4].lower()
             found.active[found.where] = attributes.get("Scalars", "")
@@ -132,13 +137,39 @@ class _Grid:
     direction: tuple[float, ...]
 
 
-def _grid(found: _Scan, where: str, path: Path) -> _Grid:
-    """The grid of points, or of cell centres (half a voxel further, one fewer along each axis)."""
-    image = found.image
-    extent = [int(e) for e in _numbers(image.get("WholeExtent", ""), 6, path, "WholeExtent")]
+def _extent(found: _Scan, path: Path) -> list[int]:
+    return [int(e) for e in _numbers(found.image.get("WholeExtent", ""), 6, path, "WholeExtent")]
+
+
+def extent_dims(found: _Scan, path: Path) -> list[int]:
+    """Points along (x, y, z) of an image or a structured grid.
+
+    Raises:
+        DataError: none along an axis.
+    """
+    extent = _extent(found, path)
     dims = [extent[2 * k + 1] - extent[2 * k] + 1 for k in range(3)]
     if min(dims) < 1:
         raise DataError(f"{path}: WholeExtent {extent} is empty; expected at least one voxel along each axis")
+    return dims
+
+
+def stored_ratio(found: _Scan, path: Path) -> int:
+    """Most bytes of values that a byte of the file can stand for.
+
+    Raises:
+        DataError: an unknown compressor.
+    """
+    compressor = found.root.get("compressor", "")
+    if compressor not in _RATIO:
+        raise DataError(f"{path}: compressor {compressor!r}; expected one of {', '.join(filter(None, _RATIO))}")
+    return _RATIO[compressor]
+
+
+def _grid(found: _Scan, where: str, path: Path) -> _Grid:
+    """The grid of points, or of cell centres (half a voxel further, one fewer along each axis)."""
+    image = found.image
+    extent, dims = _extent(found, path), extent_dims(found, path)
     spacing = _numbers(image.get("Spacing", "1 1 1"), 3, path, "Spacing")
     origin = _numbers(image.get("Origin", "0 0 0"), 3, path, "Origin")
     direction = IDENTITY
@@ -186,10 +217,7 @@ def read_vti(path: Path, options: ReadOptions) -> Volume:
 def _check_size(found: _Scan, info: ArrayInfo, n_values: int, path: Path) -> None:
     need = n_values * np.dtype(info.dtype).itemsize
     size = path.stat().st_size
-    compressor = found.root.get("compressor", "")
-    if compressor not in _RATIO:
-        raise DataError(f"{path}: compressor {compressor!r}; expected one of {', '.join(filter(None, _RATIO))}")
-    if need > size * _RATIO[compressor]:
+    if need > size * stored_ratio(found, path):
         raise DataError(
             f"{path}: {size_text(size)} cannot hold the {size_text(need)} of array {info.name!r} that its header "
             "declares; check that the file is whole"
@@ -267,8 +295,14 @@ def _by_vtk(path: Path, info: ArrayInfo, shape: tuple[int, ...]) -> np.ndarray:
     return values.reshape(shape)
 
 
-def _sniff(head: bytes) -> bool:
-    return re.search(rb"^\s*(?:<\?xml[^>]*>\s*)?(?:<!--.*?-->\s*)*<VTKFile\s", head, re.DOTALL) is not None
+def is_xml(head: bytes, grid: bool) -> bool:
+    """Whether a file begins as a VTK XML file of a mesh or grid (`GRIDS`), or of anything else."""
+    kind = re.search(rb'<VTKFile\s[^>]*?type\s*=\s*["\'](\w+)["\']', head)
+    found = kind is not None and kind[1].decode() in GRIDS
+    return (
+        found == grid
+        and re.search(rb"^\s*(?:<\?xml[^>]*>\s*)?(?:<!--.*?-->\s*)*<VTKFile\s", head, re.DOTALL) is not None
+    )
 
 
-register(Reader("VTK XML", (".vti",), _sniff, read_vti, named_arrays=True))
+register(Reader("VTK XML", (".vti",), lambda head: is_xml(head, grid=False), read_vti, named_arrays=True))

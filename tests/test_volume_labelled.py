@@ -1,0 +1,311 @@
+"""Arrays with named axes: HDF5, NetCDF, Zarr and NumPy, written by their own libraries."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import sys
+from pathlib import Path
+
+import h5py
+import netCDF4
+import numpy as np
+import pytest
+import zarr
+
+from tests.ramps import X, Y, Z, check_grid, check_ramp, ramp
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.volume import ReadOptions, read_volume
+
+VALUES = ramp(X, Y, Z)
+AXES = {"x": X, "y": Y, "z": Z}
+
+
+def write_netcdf(path: Path, order: str = "zyx", axes: dict | None = None, units: dict | None = None, **how) -> str:
+    """The ramp on axes named after their letters, in the given order."""
+    axes = axes or AXES
+    with netCDF4.Dataset(path, "w", format=how.pop("format", "NETCDF4")) as file:
+        for name, centres in axes.items():
+            file.createDimension(name, len(centres))
+            variable = file.createVariable(name, "f8", (name,))
+            variable[:] = centres
+            variable.units = (units or {}).get(name, "m")
+        values = np.transpose(ramp(axes["x"], axes["y"], axes["z"]), ["zyx".index(name) for name in order])
+        variable = file.createVariable("field", how.pop("dtype", "f4"), tuple(order), **how)
+        variable[:] = values
+    return str(path)
+
+
+@pytest.mark.parametrize("order", ["".join(order) for order in itertools.permutations("zyx")])
+def test_netcdf_axes_in_any_order(tmp_path: Path, order: str) -> None:
+    check_grid(read_volume(write_netcdf(tmp_path / "v.nc", order)))
+
+
+@pytest.mark.parametrize("form", ["NETCDF3_CLASSIC", "NETCDF3_64BIT_OFFSET", "NETCDF3_64BIT_DATA", "NETCDF4_CLASSIC"])
+def test_netcdf_versions_by_content(tmp_path: Path, form: str) -> None:
+    check_grid(read_volume(write_netcdf(tmp_path / "v.nc", format=form)))
+
+
+def test_netcdf4_is_hdf5_with_dimension_scales(tmp_path: Path) -> None:
+    path = write_netcdf(tmp_path / "v.h5", "xzy")
+    with h5py.File(path, "a") as file:
+        del file.attrs["_NCProperties"]
+    check_grid(read_volume(path))
+
+
+def test_netcdf_descending_axes_are_turned(tmp_path: Path) -> None:
+    turned = {"x": X[::-1], "y": Y, "z": Z[::-1]}
+    check_grid(read_volume(write_netcdf(tmp_path / "v.nc", axes=turned)))
+
+
+def test_netcdf_units_of_length_become_those_of_x(tmp_path: Path) -> None:
+    volume = read_volume(write_netcdf(tmp_path / "v.nc", units={"x": "km", "y": "m", "z": "cm"}))
+    np.testing.assert_allclose(volume.spacing, (0.25, 0.5e-3, 2e-5))
+    np.testing.assert_allclose(volume.origin, (0.5, -3e-3, 1e-4))
+
+
+def test_netcdf_units_that_do_not_compare(tmp_path: Path) -> None:
+    path = write_netcdf(tmp_path / "v.nc", units={"x": "degrees_east", "y": "degrees_north", "z": "hPa"})
+    with pytest.raises(UsageError, match=r"axes x in degrees, y in degrees, z in hpa; .*try --spacing X Y Z"):
+        read_volume(path)
+    assert read_volume(path, ReadOptions(spacing=(1, 2, 3))).spacing == (1, 2, 3)
+    same = write_netcdf(tmp_path / "w.nc", units={"x": "degrees_east", "y": "degrees_north", "z": "degree"})
+    check_grid(read_volume(same))
+
+
+def test_netcdf_irregular_axes_are_refused_or_resampled(tmp_path: Path) -> None:
+    axes = {"x": X, "y": Y, "z": np.array([10.0, 11.0, 13.0, 20.0])}
+    path = write_netcdf(tmp_path / "v.nc", axes=axes)
+    with pytest.raises(UsageError, match=r"axis z has steps from 1 to 7; .*--dims X Y Z .*--spacing X Y Z"):
+        read_volume(path)
+    volume = read_volume(path, ReadOptions(dims=(6, 5, 20)))
+    assert volume.dims == (6, 5, 20)
+    assert volume.name == "v:field (resampled to 6 x 5 x 20)"
+    np.testing.assert_allclose(volume.spacing, (1 / 6, 0.3, 0.5))
+    check_ramp(volume, atol=2e-3)
+    assert np.isfinite(volume.data).all()
+    with pytest.raises(UsageError, match="evenly spaced; leave out --dims"):
+        read_volume(write_netcdf(tmp_path / "w.nc"), ReadOptions(dims=(6, 5, 20)))
+    with pytest.raises(DataError, match="coordinates of axis z neither ascend nor descend"):
+        read_volume(write_netcdf(tmp_path / "u.nc", axes=AXES | {"z": np.array([1.0, 3.0, 2.0])}))
+
+
+def test_netcdf_scaling_and_missing_values(tmp_path: Path) -> None:
+    path = tmp_path / "v.nc"
+    with netCDF4.Dataset(path, "w") as file:
+        for name, size in zip("zyx", VALUES.shape, strict=True):
+            file.createDimension(name, size)
+        packed = file.createVariable("packed", "i2", ("z", "y", "x"), fill_value=-32768)
+        packed.scale_factor, packed.add_offset = 0.5, 5000.0
+        packed.set_auto_maskandscale(False)
+        stored = np.round((VALUES - 5000) / 0.5).astype("i2")
+        packed[:] = stored
+        holed = file.createVariable("holed", "i2", ("z", "y", "x"), fill_value=-32768)
+        holed.scale_factor, holed.add_offset, holed.valid_max = 0.5, 5000.0, np.int16(stored.max() - 1)
+        holed.set_auto_maskandscale(False)
+        stored[0, 0, 0] = -32768
+        holed[:] = stored
+        unwritten = file.createVariable("unwritten", "f4", ("z", "y", "x"))
+        unwritten[1:] = VALUES[1:]
+    volume = read_volume(str(path), ReadOptions(array="packed"))
+    assert (volume.data.dtype, volume.slope, volume.intercept) == (np.int16, 0.5, 5000)
+    np.testing.assert_allclose(volume.data * volume.slope + volume.intercept, VALUES, atol=0.26)
+    volume = read_volume(str(path), ReadOptions(array="holed"))
+    assert (volume.data.dtype, volume.slope, volume.intercept) == (np.float32, 1, 0)
+    assert np.argwhere(np.isnan(volume.data)).tolist() == [[0, 0, 0], [2, 3, 4]]
+    np.testing.assert_allclose(volume.data[1], VALUES[1], atol=0.26)
+    volume = read_volume(str(path), ReadOptions(array="unwritten"))
+    assert np.isnan(volume.data[0]).all()
+    np.testing.assert_allclose(volume.data[1:], VALUES[1:], rtol=1e-6)
+    with pytest.raises(UsageError, match=r"several variables: packed \(z, y, x: 3 x 4 x 5\); holed"):
+        read_volume(str(path))
+    with pytest.raises(UsageError, match="no variable none; it has packed"):
+        read_volume(str(path), ReadOptions(array="none"))
+
+
+def test_netcdf_time_steps_are_chosen_by_component(tmp_path: Path) -> None:
+    path = tmp_path / "v.nc"
+    with netCDF4.Dataset(path, "w") as file:
+        for name, centres in (AXES | {"time": np.arange(2.0)}).items():
+            file.createDimension(name, len(centres))
+            file.createVariable(name, "f8", (name,))[:] = centres
+        file["time"].units = "hours since 2020-01-01"
+        steps = file.createVariable("field", "f4", ("time", "z", "y", "x"))
+        steps[0], steps[1] = VALUES, -VALUES
+    check_grid(read_volume(str(path), ReadOptions(component=0)))
+    np.testing.assert_allclose(read_volume(str(path), ReadOptions(component=1)).data, -VALUES, rtol=1e-6)
+    with pytest.raises(UsageError, match=r"axes time \(2\), z \(3\).*choose along time with --component 0 to 1"):
+        read_volume(str(path))
+    with pytest.raises(UsageError, match="expected 0 to 1"):
+        read_volume(str(path), ReadOptions(component=2))
+
+
+@pytest.mark.parametrize("how", [{}, {"chunks": (2, 2, 2), "compression": "gzip", "shuffle": True}])
+@pytest.mark.parametrize("dtype", ["<f4", ">f8", "i2", "u1"])
+def test_hdf5_datasets(tmp_path: Path, how: dict, dtype: str) -> None:
+    values = (VALUES / 100).astype(dtype)
+    with h5py.File(tmp_path / "v.h5", "w") as file:
+        file.create_dataset("deep/field", data=values, **how)
+        file["deep/points"] = np.zeros((9, 3))
+        file["text"] = "not a number"
+    volume = read_volume(str(tmp_path / "v.h5"))
+    assert volume.name == "v:deep/field"
+    assert volume.data.dtype == values.dtype
+    assert isinstance(volume.data, np.memmap) == (not how)
+    np.testing.assert_array_equal(volume.data, values)
+    again = read_volume(f"{tmp_path / 'v.h5'}:/deep/field", ReadOptions(spacing=(1, 2, 3)))
+    np.testing.assert_array_equal(again.data, values)
+    assert again.spacing == (1, 2, 3)
+
+
+def test_hdf5_choices(tmp_path: Path) -> None:
+    path = tmp_path / "v.h5"
+    with h5py.File(path, "w") as file:
+        file["a/one"], file["b/two"] = VALUES, VALUES + 1
+    with pytest.raises(UsageError, match=r"several datasets: /a/one \(3, 4, 5\) float64; /b/two .*choose one as"):
+        read_volume(str(path))
+    with pytest.raises(UsageError, match=r"no dataset /c; it has /a/one"):
+        read_volume(f"{path}:/c")
+    with pytest.raises(UsageError, match="choose both"):
+        read_volume(f"{path}:/a/one", ReadOptions(array="/a/one"))
+    assert read_volume(f"{path}:/b").name == "v:b/two"
+    with pytest.raises(DataError, match="no such file"):
+        read_volume(f"{tmp_path / 'none.h5'}:/a")
+
+
+def test_hdf5_stays_in_its_folder(tmp_path: Path) -> None:
+    (tmp_path / "inner").mkdir()
+    with h5py.File(tmp_path / "outside.h5", "w") as file:
+        file["field"] = VALUES
+    path = tmp_path / "inner" / "v.h5"
+    layout = h5py.VirtualLayout((3, 4, 5), "f8")
+    layout[:] = h5py.VirtualSource("../outside.h5", "field", (3, 4, 5))
+    with h5py.File(path, "w") as file:
+        file["link"] = h5py.ExternalLink("../outside.h5", "/field")
+        file.create_virtual_dataset("virtual", layout)
+        file.create_dataset("raw", (3, 4, 5), "f8", external=[("../outside.h5", 0, h5py.h5f.UNLIMITED)])
+    for name, message in (("link", "own folder"), ("virtual", "own folder"), ("raw", "other files")):
+        with pytest.raises(DataError, match=message):
+            read_volume(f"{path}:/{name}")
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_zarr_with_coordinates(tmp_path: Path, version: int) -> None:
+    store = tmp_path / "v.zarr"
+    group = zarr.open_group(str(store), mode="w", zarr_format=version)
+    for name, centres in AXES.items():
+        names = {"dimension_names": [name]} if version == 3 else {}
+        array = group.create_array(name, data=centres, **names)
+        array.attrs.update({"units": "mm"} | ({"_ARRAY_DIMENSIONS": [name]} if version == 2 else {}))
+    names = {"dimension_names": ["x", "z", "y"]} if version == 3 else {}
+    stored = np.round(VALUES.transpose(2, 0, 1) * 2).astype("i4")
+    stored[0, 0, 0] = -1
+    array = group.create_array("deep/field", data=stored, chunks=(2, 2, 2), **names)
+    told = {"scale_factor": 0.5, "_FillValue": -1} | ({"_ARRAY_DIMENSIONS": ["x", "z", "y"]} if version == 2 else {})
+    array.attrs.update(told)
+    with pytest.raises(UsageError, match=r"no array .*it has deep/field \[5, 3, 4\]"):
+        read_volume(f"{store}:/none")
+    bare = read_volume(str(store))
+    assert bare.name == "v:deep/field"
+    assert bare.spacing == (1, 1, 1)  # the coordinates lie in another group
+    (store / "deep" / "field").rename(store / "field")
+    volume = read_volume(f"{store}:/field")
+    check_grid(volume, atol=0.26)
+    assert np.argwhere(np.isnan(volume.data)).tolist() == [[0, 0, 0]]
+
+
+def test_zarr_array_by_itself_and_sharded(tmp_path: Path) -> None:
+    store = tmp_path / "v.zarr"
+    zarr.create_array(str(store), data=VALUES.astype("f4"), chunks=(1, 2, 5), shards=(3, 4, 5))
+    volume = read_volume(str(store))
+    assert volume.name == "v"
+    np.testing.assert_array_equal(volume.data, VALUES.astype("f4"))
+
+
+def test_ome_zarr(tmp_path: Path) -> None:
+    store = tmp_path / "v.ome.zarr"
+    group = zarr.open_group(str(store), mode="w", zarr_format=2)
+    group.create_array("0", data=np.stack([VALUES, -VALUES]).astype("f4"))
+    group.create_array("1", data=VALUES[None, :, ::2, ::2].astype("f4"))
+    axes = [{"name": "c", "type": "channel"}, *({"name": n, "type": "space", "unit": "micrometer"} for n in "zyx")]
+    moves = [{"type": "scale", "scale": [1, 2, 0.5, 0.25]}, {"type": "translation", "translation": [0, 10, -3, 0.5]}]
+    level = {"path": "0", "coordinateTransformations": moves}
+    group.attrs["multiscales"] = [{"version": "0.4", "axes": axes, "datasets": [level, {"path": "1"}]}]
+    check_grid(read_volume(str(store), ReadOptions(component=0)))
+    with pytest.raises(UsageError, match="choose along c with --component 0 to 1"):
+        read_volume(str(store))
+    assert read_volume(f"{store}:/1").dims == (3, 2, 3)
+
+
+def test_zarr_refuses_codecs_that_run_code(tmp_path: Path) -> None:
+    store = tmp_path / "v.zarr"
+    zarr.create_array(str(store), data=VALUES, zarr_format=2)
+    facts = json.loads((store / ".zarray").read_text())
+    (store / ".zarray").write_text(json.dumps(facts | {"filters": [{"id": "pickle"}]}))
+    with pytest.raises(DataError, match="codec 'pickle'; expected one of"):
+        read_volume(str(store))
+    (store / ".zarray").write_text(json.dumps(facts | {"shape": [1 << 20] * 3, "chunks": [1 << 20] * 3}))
+    with pytest.raises(DataError, match="chunks of"):
+        read_volume(str(store))
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_npy(tmp_path: Path, order: str) -> None:
+    np.save(tmp_path / "v.npy", np.asarray(VALUES, ">f4", order=order))
+    volume = read_volume(str(tmp_path / "v.npy"), ReadOptions(spacing=(1, 2, 3)))
+    np.testing.assert_array_equal(volume.data, VALUES.astype("f4"))
+    assert volume.spacing == (1, 2, 3)
+    assert volume.data.flags.c_contiguous
+    assert isinstance(volume.data, np.memmap) == (order == "C")
+
+
+@pytest.mark.parametrize("axis", [0, 3])
+def test_npy_components(tmp_path: Path, axis: int) -> None:
+    np.save(tmp_path / "v.npy", np.stack([VALUES, -VALUES], axis))
+    np.testing.assert_array_equal(read_volume(str(tmp_path / "v.npy"), ReadOptions(component=1)).data, -VALUES)
+    length = read_volume(str(tmp_path / "v.npy"), ReadOptions(component="magnitude"))
+    np.testing.assert_allclose(length.data, np.sqrt(2) * VALUES, rtol=1e-6)
+
+
+@pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
+def test_npz(tmp_path: Path, save) -> None:
+    path = tmp_path / "v.npz"
+    save(path, field=VALUES, time=np.arange(3.0))
+    volume = read_volume(str(path))
+    assert volume.name == "v:field"
+    np.testing.assert_array_equal(volume.data, VALUES)
+    save(path, field=VALUES, other=VALUES + 1)
+    with pytest.raises(UsageError, match="several arrays: field, other; choose one with --array"):
+        read_volume(str(path))
+    np.testing.assert_array_equal(read_volume(str(path), ReadOptions(array="other")).data, VALUES + 1)
+
+
+def test_npy_lies(tmp_path: Path) -> None:
+    np.save(tmp_path / "o.npy", np.array([{}], dtype=object), allow_pickle=True)
+    with pytest.raises(DataError, match=r"objects are never unpickled|type object"):
+        read_volume(str(tmp_path / "o.npy"))
+    np.save(tmp_path / "v.npy", VALUES)
+    body = (tmp_path / "v.npy").read_bytes()
+    (tmp_path / "v.npy").write_bytes(body.replace(b"(3, 4, 5)", b"(9, 9, 9)"))
+    with pytest.raises(DataError, match="after 128 bytes need"):
+        read_volume(str(tmp_path / "v.npy"))
+    np.save(tmp_path / "w.npy", np.zeros(7))
+    with pytest.raises(DataError, match=r"axes unnamed \(7\); expected two or three axes"):
+        read_volume(str(tmp_path / "w.npy"))
+
+
+@pytest.mark.parametrize(
+    ("name", "module", "extra"), [("v.h5", "h5py", "hdf5"), ("v.nc", "netCDF4", "netcdf"), ("v.zarr", "zarr", "zarr")]
+)
+def test_a_missing_library_names_its_extra(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, module: str, extra: str
+) -> None:
+    if name == "v.zarr":
+        zarr.create_array(str(tmp_path / name), data=VALUES)
+    elif name == "v.h5":
+        h5py.File(tmp_path / name, "w").create_dataset("field", data=VALUES).file.close()
+    else:
+        write_netcdf(tmp_path / name)
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(DataError, match=rf"needs {module} .*pip install 'vvgt\[{extra}\]'"):
+        read_volume(str(tmp_path / name))

@@ -1,0 +1,241 @@
+"""DICOM: a folder of one or more series, or one file (several frames allowed). Read by pydicom.
+
+Geometry: DICOM PS3.3, C.7.6.2 (Image Plane Module) and C.7.6.16 (multi-frame functional groups). Slices are ordered by
+their positions along the normal of the image plane; names and instance numbers are not used.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.volume.blocks import check_memory
+from vvgt_cli.volume.components import select_component
+from vvgt_cli.volume.libraries import library_errors, need
+from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.registry import Reader, register
+from vvgt_cli.volume.types import Volume
+
+MOST = 100_000  # files
+ANGLE = 1e-3  # of a unit normal: how far slices may be tilted against each other
+EVEN = 0.01  # of the spacing: how far a slice may be off
+
+
+def _is_dicom(head: bytes) -> bool:
+    return head[128:132] == b"DICM"
+
+
+def _files(folder: Path) -> Iterator[Path]:
+    """The DICOM files of a folder and the folders in it, sorted by name."""
+    seen = 0
+    for root, folders, names in os.walk(folder):
+        folders.sort()
+        for name in sorted(names):
+            seen += 1
+            if seen > MOST:
+                raise DataError(f"{folder}: more than {MOST} files; expected the folder of one series")
+            path = Path(root, name)
+            try:
+                with open(path, "rb") as file:
+                    found = _is_dicom(file.read(132))
+            except OSError:
+                continue
+            if found and name != "DICOMDIR":
+                yield path
+
+
+def _holds(folder: Path) -> bool:
+    return next(_files(folder), None) is not None
+
+
+@dataclass(frozen=True)
+class _Slice:
+    """A frame: its file's header, its number in the file, and where it is."""
+
+    path: Path
+    frame: int
+    header: Any
+    position: np.ndarray  # (3,) of the centre of its first pixel
+    rows: np.ndarray  # (2, 3) unit vectors along a row (x) and down a column (y)
+    spacing: tuple[float, float]  # (x, y)
+    scaling: tuple[float, float]  # slope, intercept
+
+
+def read_dicom(path: Path, options: ReadOptions) -> Volume:
+    """Read one series of a folder, or the frames of one file.
+
+    Raises:
+        DataError: pydicom is not installed, no images, slices that are missing, tilted or of different sizes.
+        UsageError: several series and none chosen (``array`` is a series' number, UID or description).
+    """
+    pydicom = need("pydicom", "dicom", str(path), "DICOM")
+    with library_errors(str(path), "DICOM"):
+        files = _files(path) if path.is_dir() else [path]
+        headers = [(file, pydicom.dcmread(file, stop_before_pixels=True)) for file in files]
+        headers = [(file, header) for file, header in headers if "Rows" in header and "Columns" in header]
+        title, chosen = _series(headers, options.array, path)
+        slices = _ordered([s for file, header in chosen for s in _frames(file, header)], path)
+        spacing = _spacing(slices, path)
+        values, (slope, intercept) = _pixels(pydicom, slices, path)
+    field, (slope, intercept) = select_component(
+        values, options.component, str(path), label="each pixel", scaling=(slope, intercept)
+    )
+    first = slices[0]
+    across, down = first.rows
+    direction = np.column_stack([across, down, np.cross(across, down)]).ravel()
+    return Volume(
+        field, options.spacing_or(spacing), tuple(first.position.tolist()), tuple(direction.tolist()),
+        f"{path.resolve().name.removesuffix('.dcm')}{title}", slope, intercept,
+    )  # type: ignore[arg-type]  # fmt: skip
+
+
+def _series(headers: Sequence[tuple[Path, Any]], wanted: str | None, path: Path) -> tuple[str, list[tuple[Path, Any]]]:
+    """The series asked for, or the only one: what to add to the volume's name, and its files."""
+    found: dict[str, list[tuple[Path, Any]]] = {}
+    for file, header in headers:
+        found.setdefault(str(header.get("SeriesInstanceUID", "")), []).append((file, header))
+    if not found:
+        raise DataError(f"{path}: no DICOM images; expected files with rows and columns of pixels")
+    listing = "; ".join(
+        f"{h.get('SeriesNumber', '?')} {str(h.get('SeriesDescription', '')).strip()!r} ({len(files)} files, {uid})"
+        for uid, files in found.items()
+        for _, h in files[:1]
+    )
+    if wanted is None:
+        if len(found) > 1:
+            raise UsageError(f"{path}: several series: {listing}; choose one by number or UID with --array SERIES")
+        return "", next(iter(found.values()))
+    wanted = wanted.strip("/")
+    fits = []
+    for uid, files in found.items():
+        keys = (str(files[0][1].get(key, "")).strip() for key in ("SeriesNumber", "SeriesDescription"))
+        fits += [files] if wanted in (uid, *keys) else []
+    if len(fits) != 1:
+        raise UsageError(f"{path}: {len(fits)} series {wanted!r}; it has {listing}; choose with --array SERIES")
+    return f":{wanted}", fits[0]
+
+
+def _frames(path: Path, header: Any) -> Iterator[_Slice]:
+    """The frames of a file: one, or those that functional groups or a fixed distance place."""
+    n = int(header.get("NumberOfFrames", 1) or 1)
+    per_frame = header.get("PerFrameFunctionalGroupsSequence")
+    shared = (header.get("SharedFunctionalGroupsSequence") or [None])[0]
+    if n > 1 and not per_frame:
+        raise DataError(f"{path}: {n} frames without functional groups; expected a position for each")
+    if per_frame and len(per_frame) != n:
+        raise DataError(f"{path}: {n} frames, but places for {len(per_frame)}; check that the file is whole")
+    for k in range(n):
+        groups = [g for g in (per_frame[k] if per_frame else None, shared) if g is not None]
+
+        def item(sequence: str, keyword: str, groups: list[Any] = groups) -> Any:
+            for group in groups:
+                if sequence in group and keyword in group[sequence][0]:
+                    return group[sequence][0][keyword].value
+            return header.get(keyword)
+
+        position = item("PlanePositionSequence", "ImagePositionPatient")
+        cosines = item("PlaneOrientationSequence", "ImageOrientationPatient")
+        between = item("PixelMeasuresSequence", "PixelSpacing")
+        if position is None or cosines is None or between is None:
+            raise DataError(f"{path}: no ImagePositionPatient, ImageOrientationPatient and PixelSpacing; expected all")
+        slope = item("PixelValueTransformationSequence", "RescaleSlope")
+        intercept = item("PixelValueTransformationSequence", "RescaleIntercept")
+        rows = np.array([float(c) for c in cosines]).reshape(2, 3)
+        lengths = np.linalg.norm(rows, axis=1)
+        if not np.isfinite(rows).all() or abs(lengths - 1).max() > ANGLE or abs(rows[0] @ rows[1]) > ANGLE:
+            raise DataError(
+                f"{path}: ImageOrientationPatient {list(cosines)}; expected two unit vectors at right angles"
+            )
+        scaling = (1.0 if slope is None else float(slope), 0.0 if intercept is None else float(intercept))
+        place = np.array([float(c) for c in position])
+        yield _Slice(path, k, header, place, rows, (float(between[1]), float(between[0])), scaling)
+
+
+def _ordered(slices: list[_Slice], path: Path) -> list[_Slice]:
+    """By position along the normal; all of one size, orientation and pixel spacing."""
+    first = slices[0]
+    for s in slices:
+        same = all(s.header.get(k) == first.header.get(k) for k in ("Rows", "Columns", "SamplesPerPixel"))
+        same = same and np.allclose(s.rows, first.rows, atol=ANGLE) and np.allclose(s.spacing, first.spacing, rtol=1e-4)
+        if not same:
+            raise DataError(
+                f"{path}: {s.path.name} and {first.path.name} differ in size, orientation or pixel spacing; expected "
+                "the slices of one stack (scouts and other stacks elsewhere)"
+            )
+    normal = np.cross(first.rows[0], first.rows[1])
+    return sorted(slices, key=lambda s: float(s.position @ normal))
+
+
+def _spacing(slices: list[_Slice], path: Path) -> tuple[float, float, float]:
+    """(x, y, z) with z from the positions."""
+    first = slices[0]
+    if len(slices) == 1:
+        thickness = first.header.get("SliceThickness")
+        return (*first.spacing, float(thickness or first.spacing[0]))
+    positions = np.array([s.position for s in slices])
+    normal = np.cross(first.rows[0], first.rows[1])
+    steps = np.diff(positions @ normal)
+    step = float(np.median(steps))
+    if step <= 0 or steps.min() < EVEN * step:
+        raise DataError(
+            f"{path}: {len(slices)} slices, several in one place (times or echoes in one series); expected one a "
+            "position"
+        )
+    worst = int(np.abs(steps - step).argmax())
+    if abs(steps[worst] - step) > EVEN * step:
+        raise DataError(
+            f"{path}: slices {steps.min():g} to {steps.max():g} mm apart (at {slices[worst].path.name}); expected even "
+            "distances: is a slice missing?"
+        )
+    sideways = positions - positions[0] - np.outer((positions - positions[0]) @ normal, normal)
+    if np.abs(sideways).max() > EVEN * max(step, *first.spacing) * len(slices):
+        raise DataError(f"{path}: slices shift sideways (a tilted gantry); expected them above each other")
+    return (*first.spacing, step)
+
+
+def _pixels(pydicom: Any, slices: list[_Slice], path: Path) -> tuple[np.ndarray, tuple[float, float]]:
+    """(slices, rows, columns, samples) stored values and their scaling; differing scalings are applied (float32)."""
+    header = slices[0].header
+    shape = (int(header.Rows), int(header.Columns), int(header.get("SamplesPerPixel", 1)))
+    alike = len({s.scaling for s in slices}) == 1
+    out: np.ndarray | None = None
+    loaded: tuple[Path, np.ndarray] | None = None
+    for z, s in enumerate(slices):
+        if loaded is None or loaded[0] != s.path:
+            if z == 0:
+                check_memory(len(slices) * int(np.prod(shape)) * 2, str(path))
+            loaded = (s.path, _decoded(pydicom, s.path))
+        frames = loaded[1].reshape(-1, *shape)
+        plane = frames[s.frame]
+        if not alike:
+            plane = (plane * s.scaling[0] + s.scaling[1]).astype(np.float32)
+        if out is None:
+            check_memory(len(slices) * plane.nbytes, str(path))
+            out = np.empty((len(slices), *shape), plane.dtype)
+        if plane.dtype != out.dtype:
+            raise DataError(f"{s.path}: pixels of type {plane.dtype}; expected {out.dtype} as in the first slice")
+        out[z] = plane
+    if out is None:
+        raise DataError(f"{path}: no slices")
+    return out, slices[0].scaling if alike else (1.0, 0.0)
+
+
+def _decoded(pydicom: Any, path: Path) -> np.ndarray:
+    dataset = pydicom.dcmread(path)
+    try:
+        return dataset.pixel_array
+    except (NotImplementedError, RuntimeError) as error:  # a codec that pydicom does not have
+        syntax = dataset.file_meta.TransferSyntaxUID.name
+        raise DataError(
+            f"{path}: pixels coded as {syntax} cannot be decoded ({' '.join(str(error).split())[:200]}); "
+            "try: pip install pylibjpeg pylibjpeg-openjpeg"
+        ) from error
+
+
+register(Reader("DICOM", (".dcm",), _is_dicom, read_dicom, named_arrays=True, holds=_holds))

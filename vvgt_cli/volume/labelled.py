@@ -1,0 +1,321 @@
+"""Arrays with named axes and attributes (HDF5, NetCDF, Zarr, NumPy) to volumes: order, spacing, units, scaling.
+
+Attributes and axes are read as the CF conventions (https://cfconventions.org) have them, chapters 2.5, 3.1, 4 and 8.1.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.volume.blocks import check_memory, count
+from vvgt_cli.volume.components import contiguous, select_component
+from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.types import Volume
+
+EVEN = 0.01  # of a step that a coordinate may be off and still count as evenly spaced (float32 longitudes are)
+AXIS_ATTRIBUTES = ("axis", "standard_name", "units")
+CF_ATTRIBUTES = (
+    *("scale_factor", "add_offset", "_FillValue", "missing_value"),
+    *("valid_min", "valid_max", "valid_range", "_Unsigned"),
+)
+_METRES = {
+    "km": 1e3, "kilometer": 1e3, "kilometre": 1e3, "m": 1.0, "meter": 1.0, "metre": 1.0, "cm": 1e-2, "centimeter": 1e-2,
+    "mm": 1e-3, "millimeter": 1e-3, "millimetre": 1e-3, "um": 1e-6, "µm": 1e-6, "micron": 1e-6, "micrometer": 1e-6,
+    "micrometre": 1e-6, "nm": 1e-9, "nanometer": 1e-9, "nanometre": 1e-9, "angstrom": 1e-10, "pm": 1e-12,
+}  # fmt: skip
+_ROLES = {
+    "x": {"x", "lon", "longitude", "rlon", "easting", "projection_x_coordinate", "grid_longitude"},
+    "y": {"y", "lat", "latitude", "rlat", "northing", "projection_y_coordinate", "grid_latitude"},
+    "z": {"z", "lev", "level", "plev", "depth", "height", "altitude", "elevation", "pressure", "air_pressure"},
+    "t": {"t", "time"},
+}
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One axis of an array.
+
+    Attributes:
+        name: as the file has it, or "".
+        size: values along it.
+        centres: (size,) coordinates of the values, or None.
+        units: of the coordinates, or "".
+        role: ``x``, ``y``, ``z``, ``t``, ``c`` (components), or "" where nothing says.
+    """
+
+    name: str
+    size: int
+    centres: np.ndarray | None = None
+    units: str = ""
+    role: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.name or 'unnamed'} ({self.size})"
+
+
+def axis(name: str, size: int, centres: np.ndarray | None = None, attributes: Mapping[str, Any] | None = None) -> Axis:
+    """An axis with its role from the attributes ``axis``, ``standard_name`` and ``units``, else from its name."""
+    told = {key: str(value).strip() for key, value in (attributes or {}).items() if key in AXIS_ATTRIBUTES}
+    units = told.get("units", "")
+    role = told.get("axis", "").lower()
+    if role not in ("x", "y", "z", "t"):
+        role = ""
+        words = [told.get("standard_name", "").lower(), units.lower().replace("degrees_", ""), name.lower()]
+        words = [{"east": "lon", "north": "lat"}.get(word, word) for word in words]
+        for word in words:
+            role = role or next((key for key, names in _ROLES.items() if word in names), "")
+        if " since " in units:
+            role = "t"
+    return Axis(name, size, centres, units, role)
+
+
+def labelled_volume(
+    stored: np.ndarray | Callable[[tuple[Any, ...]], np.ndarray],
+    dtype: np.dtype,
+    axes: Sequence[Axis],
+    attributes: Mapping[str, Any],
+    options: ReadOptions,
+    source: str,
+    name: str,
+) -> Volume:
+    """The volume of an array with named axes.
+
+    Args:
+        stored: the stored values (mapped, perhaps), or what reads a part: from an index, a slice or a number an axis.
+        dtype: of the stored values.
+        axes: of the array, slowest first.
+        attributes: of the array: ``scale_factor``, ``add_offset``, ``_FillValue``, ``missing_value``, ``valid_*``.
+        options: ``component`` is the index along an axis that is not one of space.
+        source: for messages.
+        name: of the volume.
+
+    Returns:
+        Axes in the order z, y, x and ascending; values that the attributes call missing are NaN.
+
+    Raises:
+        DataError: an array without two or three axes of space, coordinates that do not ascend or descend.
+        UsageError: an axis too many and no choice along it, axes that are irregular or of different units.
+    """
+    if dtype.kind not in "iufb":
+        raise DataError(f"{source}: values of type {dtype}; expected integers or floats")
+    space, extra = _split_axes(list(axes), options, source)
+    chosen = options.component if isinstance(options.component, int) else None
+    index: list[Any] = [slice(None) if k in space else 0 for k in range(len(axes))]
+    if extra is not None:
+        if chosen is not None and chosen >= axes[extra].size:
+            raise UsageError(
+                f"{source}: --component {chosen}: axis {axes[extra]}; expected 0 to {axes[extra].size - 1}"
+            )
+        index[extra] = slice(None) if chosen is None else chosen
+    if callable(stored):
+        sizes = [n.size if i == slice(None) else 1 for n, i in zip(axes, index, strict=True)]
+        check_memory(count(tuple(sizes)) * dtype.itemsize, source)
+        values = np.asarray(stored(tuple(index)))
+    else:
+        values = stored[tuple(index)]
+    values, slope, intercept = decode(values, attributes, source)
+    kept = [k for k in range(len(axes)) if index[k] == slice(None)]
+    order = [kept.index(k) for k in _zyx(space, axes)]
+    if extra is not None and chosen is None:  # the magnitude over an axis of components
+        values = np.transpose(values, [*order, kept.index(extra)])
+        field, (slope, intercept) = select_component(values, "magnitude", source, scaling=(slope, intercept))
+    else:
+        field = np.transpose(values, order)
+    spatial = [axes[k] for k in _zyx(space, axes)]
+    if field.ndim == 2:
+        field, spatial = field[None], [Axis("", 1), *spatial]
+    return _placed(field, spatial, (slope, intercept), options, source, name)
+
+
+def _split_axes(axes: list[Axis], options: ReadOptions, source: str) -> tuple[list[int], int | None]:
+    """Indices of the axes of space, and of the one that a component is chosen along."""
+    left = list(range(len(axes)))
+    for k in [k for k in left if axes[k].size == 1]:  # of time steps and the like there may be one
+        if len(left) > 3 or (len(left) == 3 and axes[k].role in ("t", "c")):
+            left.remove(k)
+    listing = ", ".join(map(str, axes)) or "none"
+    odd = [k for k in left if axes[k].role in ("t", "c")]
+    if not odd and len(left) == 4:
+        unnamed = [k for k in left if axes[k].role not in ("x", "y", "z")]
+        ends = left[0] if axes[left[0]].size <= axes[left[-1]].size else left[-1]
+        odd = unnamed if len(unnamed) == 1 else [ends]
+    space = [k for k in left if k not in odd]
+    if len(odd) > 1 or len(space) not in (2, 3):
+        raise DataError(f"{source}: axes {listing}; expected two or three axes of space and at most one more")
+    if not odd and options.component not in (None, 0):
+        raise UsageError(f"{source}: axes {listing}, none of components; leave out --component {options.component}")
+    if odd and options.component is None:
+        last = axes[odd[0]].size - 1
+        raise UsageError(
+            f"{source}: axes {listing}; expected three: choose along {axes[odd[0]].name or 'the shortest of them'} "
+            f"with --component 0 to {last} (or --component magnitude)"
+        )
+    return space, odd[0] if odd else None
+
+
+def _zyx(space: Sequence[int], axes: Sequence[Axis]) -> list[int]:
+    """The axes of space in the order z, y, x: by role, those without one in the order of the file."""
+    slots: dict[str, int] = {}
+    for k in space:
+        if axes[k].role in "xyz" and axes[k].role not in ("", *slots):
+            slots[axes[k].role] = k
+    rest = [k for k in space if k not in slots.values()]
+    wanted = "zyx"[3 - len(space) :]
+    if not set(slots) <= set(wanted):  # a slice across another plane: as the file has it
+        return list(space)
+    return [slots[role] if role in slots else rest.pop(0) for role in wanted]
+
+
+def decode(values: np.ndarray, attributes: Mapping[str, Any], source: str) -> tuple[np.ndarray, float, float]:
+    """Apply CF attributes: missing values become NaN; slope and intercept are returned, unless NaN made floats needed.
+
+    Returns:
+        values, slope, intercept: the data value is ``slope * values + intercept``.
+    """
+    slope = _number(attributes, "scale_factor", 1.0, source)
+    intercept = _number(attributes, "add_offset", 0.0, source)
+    missing = _missing(values, attributes)  # marks have the stored type, signed as it may be
+    if str(attributes.get("_Unsigned", "")).lower() == "true" and values.dtype.kind == "i":
+        values = values.view(values.dtype.str.replace("i", "u"))
+    if missing is None or not missing.any():
+        return values, slope, intercept
+    check_memory(values.size * max(values.itemsize, 4), source)
+    if values.dtype.kind != "f":
+        wide = np.float32 if values.dtype.itemsize <= 2 else np.float64
+        values = (values * slope + intercept).astype(wide)
+        slope, intercept = 1.0, 0.0
+    elif not values.flags.writeable:
+        values = np.array(values)
+    values[missing] = np.nan
+    return values, slope, intercept
+
+
+def _number(attributes: Mapping[str, Any], key: str, default: float, source: str) -> float:
+    if key not in attributes:
+        return default
+    try:
+        value = float(np.asarray(attributes[key]).reshape(-1)[0])
+    except (ValueError, TypeError, IndexError):
+        value = math.nan
+    if not math.isfinite(value) or (key == "scale_factor" and value == 0):
+        raise DataError(f"{source}: attribute {key} is {attributes[key]!r}; expected a finite number")
+    return value
+
+
+def _missing(values: np.ndarray, attributes: Mapping[str, Any]) -> np.ndarray | None:
+    """Mask of the stored values that the attributes call missing, or None."""
+    mask: np.ndarray | None = None
+    marks = [m for key in ("_FillValue", "missing_value") if key in attributes for m in _stored(attributes[key])]
+    tests: list[np.ndarray] = [values == mark for mark in marks if mark == mark]
+    limits = _stored(attributes.get("valid_range", ()))
+    lo = _stored(attributes.get("valid_min", ())) or limits[:1]
+    hi = _stored(attributes.get("valid_max", ())) or limits[1:2]
+    tests += [values < lo[0]] if lo else []
+    tests += [values > hi[0]] if hi else []
+    for test in tests:
+        mask = test if mask is None else mask | test
+    return mask
+
+
+def _stored(value: Any) -> list[Any]:
+    """Numbers of an attribute; nothing where it is text."""
+    found = np.asarray(value).reshape(-1)
+    return [] if found.dtype.kind not in "iuf" else found.tolist()
+
+
+def _placed(
+    field: np.ndarray, axes: list[Axis], scaling: tuple[float, float], options: ReadOptions, source: str, name: str
+) -> Volume:
+    """The volume with spacing and origin from the coordinates of its axes (z, y, x), which are made ascending."""
+    flips = [_descends(a, source) for a in axes]
+    field = contiguous(field[tuple(slice(None, None, -1 if flip else 1) for flip in flips)])
+    axes = [
+        replace(a, centres=a.centres[::-1]) if flip and a.centres is not None else a
+        for a, flip in zip(axes, flips, strict=True)
+    ]
+    if options.spacing is not None:
+        _no_dims(options, source, "--spacing says where the values are")
+        return Volume(field, options.spacing, name=name, slope=scaling[0], intercept=scaling[1])
+    centres = _one_unit(axes, source)
+    if all(c is None or even(c) for c in centres):
+        _no_dims(options, source, "its axes are evenly spaced")
+        steps = [1.0 if c is None or c.size < 2 else float((c[-1] - c[0]) / (c.size - 1)) for c in centres]
+        if field.shape[0] == 1 and (centres[0] is None or centres[0].size < 2):
+            steps[0] = steps[2]  # a single slice is as thick as its pixels are wide
+        origin = [0.0 if c is None else float(c[0]) for c in centres]
+        return Volume(field, tuple(steps[::-1]), tuple(origin[::-1]), name=name, slope=scaling[0], intercept=scaling[1])  # type: ignore[arg-type]
+    if options.dims is None:
+        uneven = [a for a, c in zip(axes, centres, strict=True) if c is not None and not even(c)]
+        steps_text = ", ".join(_steps(a) for a in uneven)
+        raise UsageError(
+            f"{source}: {steps_text}; expected evenly spaced values: try --dims X Y Z to resample to a regular grid, "
+            "or --spacing X Y Z to take the values as evenly spaced"
+        )
+    from vvgt_cli.volume.resample import rectilinear, resample
+
+    points = [np.arange(a.size, dtype=float) if c is None else c for a, c in zip(axes, centres, strict=True)]
+    data = (field * np.float64(scaling[0]) + scaling[1]).ravel()
+    return resample(rectilinear(points[::-1]), data, "point", options.dims, source, name)
+
+
+def _no_dims(options: ReadOptions, source: str, why: str) -> None:
+    if options.dims is not None:
+        raise UsageError(f"{source}: {why}; leave out --dims")
+
+
+def _descends(a: Axis, source: str) -> bool:
+    """Whether an axis runs downwards.
+
+    Raises:
+        DataError: it does neither run up nor down.
+    """
+    if a.centres is None or a.size < 2:
+        return False
+    steps = np.diff(a.centres)
+    if not np.isfinite(a.centres).all() or not ((steps > 0).all() or (steps < 0).all()):
+        raise DataError(f"{source}: coordinates of axis {a.name} neither ascend nor descend throughout; expected one")
+    return bool(steps[0] < 0)
+
+
+def even(centres: np.ndarray) -> bool:
+    """Whether coordinates lie within `EVEN` steps of equal distances."""
+    if centres.size < 3:
+        return True
+    line = np.linspace(centres[0], centres[-1], centres.size)
+    return bool(np.abs(centres - line).max() <= EVEN * abs(centres[-1] - centres[0]) / (centres.size - 1))
+
+
+def _steps(a: Axis) -> str:
+    steps = np.abs(np.diff(a.centres if a.centres is not None else np.arange(2)))
+    return f"axis {a.name or 'unnamed'} has steps from {steps.min():g} to {steps.max():g}"
+
+
+def _one_unit(axes: Sequence[Axis], source: str) -> list[np.ndarray | None]:
+    """The coordinates, lengths in the unit of the last axis.
+
+    Raises:
+        UsageError: units that do not compare.
+    """
+    units = [_unit(a) for a in axes if a.size > 1]
+    if len(set(units)) <= 1:
+        return [a.centres for a in axes]
+    if all(u in _METRES for u in units):
+        base = _METRES[units[-1]]
+        return [None if a.centres is None else a.centres * (_METRES.get(_unit(a), base) / base) for a in axes]
+    told = ", ".join(f"{a.name or 'unnamed'} in {_unit(a) or 'no unit'}" for a in reversed(axes) if a.size > 1)
+    raise UsageError(f"{source}: axes {told}; expected one unit of length: try --spacing X Y Z")
+
+
+def _unit(a: Axis) -> str:
+    unit = a.units.strip()
+    if unit.lower().startswith("degree"):
+        return "degrees"
+    if unit in _METRES:
+        return unit
+    return unit.lower().rstrip("s") if unit.lower().rstrip("s") in _METRES else unit.lower()

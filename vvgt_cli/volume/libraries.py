@@ -1,0 +1,34 @@
+"""Libraries that single formats need: imported when such a file comes, and their errors made one of ours."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from vvgt_cli.errors import DataError, VvgtError
+
+
+def need(module: str, extra: str, source: str, what: str) -> Any:
+    """Import a module that comes with an extra.
+
+    Raises:
+        DataError: it is not installed; the error names the extra.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise DataError(f"{source}: {what} needs {module} ({error}); try: pip install 'vvgt[{extra}]'") from error
+
+
+@contextmanager
+def library_errors(source: str, what: str) -> Iterator[None]:
+    """Make whatever a library raises on a file one `DataError`; memory that runs out is left to the registry."""
+    try:
+        yield
+    except (VvgtError, MemoryError):
+        raise
+    except Exception as error:  # libraries raise what they like on damaged files
+        text = " ".join(str(error).split())[:300] or type(error).__name__
+        raise DataError(f"{source}: cannot be read as {what} ({text}); check that it is whole") from error

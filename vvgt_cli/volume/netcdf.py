@@ -1,0 +1,88 @@
+"""NetCDF 3 and 4 (``.nc``), one variable on its CF axes. Read by netCDF4."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.volume.hdf5 import MAGIC, MOST_LISTED
+from vvgt_cli.volume.labelled import Axis, axis, labelled_volume
+from vvgt_cli.volume.libraries import library_errors, need
+from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.registry import Reader, register, volume_name
+from vvgt_cli.volume.types import Volume
+
+
+def read_netcdf(path: Path, options: ReadOptions) -> Volume:
+    """Read one variable of a NetCDF file, on the axes that its coordinate variables describe.
+
+    Raises:
+        DataError: netCDF4 is not installed, no variable of numbers, a damaged file.
+        UsageError: several variables and none chosen, or choices that `labelled_volume` asks for.
+    """
+    library = need("netCDF4", "netcdf", str(path), "NetCDF")
+    with library_errors(str(path), "NetCDF"), library.Dataset(str(path), "r") as file:
+        file.set_auto_maskandscale(False)
+        variable = _choose(file, options.array, path)
+        attributes = {key: variable.getncattr(key) for key in variable.ncattrs()}
+        kind = np.dtype(variable.dtype).str[1:]
+        if "_FillValue" not in attributes and kind[1:] != "1" and kind in library.default_fillvals:
+            attributes["_FillValue"] = library.default_fillvals[kind]  # what the library fills unwritten values with
+        source = f"{path}:{variable.name}"
+        axes = [_axis(variable, name, size) for name, size in zip(variable.dimensions, variable.shape, strict=True)]
+        name = f"{volume_name(path)}:{variable.name}"
+        return labelled_volume(
+            lambda index: variable[index], np.dtype(variable.dtype), axes, attributes, options, source, name
+        )
+
+
+def _choose(file: Any, wanted: str | None, path: Path) -> Any:
+    """The variable asked for, else the only one of three axes or more (of two, if there is none)."""
+    found: dict[str, Any] = {}
+    groups = [("", file)]
+    while groups:
+        prefix, group = groups.pop(0)
+        found |= {prefix + name: variable for name, variable in group.variables.items()}
+        groups += [(f"{prefix}{name}/", inner) for name, inner in group.groups.items()]
+    bounds = {variable.getncattr("bounds") for variable in found.values() if "bounds" in variable.ncattrs()}
+    fits = {
+        name: variable
+        for name, variable in found.items()
+        if isinstance(variable.dtype, np.dtype) and variable.dtype.kind in "iuf" and len(variable.shape) >= 2
+        and name not in bounds
+    }  # fmt: skip
+    if wanted is not None and wanted.strip("/") in found:
+        return found[wanted.strip("/")]
+    deep = {name: variable for name, variable in fits.items() if sum(n > 1 for n in variable.shape) >= 3} or fits
+    parts = [f"{name} ({', '.join(v.dimensions)}: {' x '.join(map(str, v.shape))})" for name, v in deep.items()]
+    listing = "; ".join(parts[:MOST_LISTED]) + ("; ..." if len(parts) > MOST_LISTED else "") or "none"
+    if wanted is not None:
+        raise UsageError(f"{path}: no variable {wanted}; it has {listing}; choose one with --array NAME")
+    if not deep:
+        raise DataError(f"{path}: no variable of numbers with two axes or more; expected a volume")
+    if len(deep) > 1:
+        raise UsageError(f"{path}: several variables: {listing}; choose one with --array NAME")
+    return next(iter(deep.values()))
+
+
+def _axis(variable: Any, name: str, size: int) -> Axis:
+    """An axis with its coordinate variable: that of its own name, in the variable's group or one above."""
+    group = variable.group()
+    while group is not None:
+        found = group.variables.get(name)
+        if found is not None and found.shape == (size,) and np.dtype(found.dtype).kind in "iuf":
+            told = {key: found.getncattr(key) for key in found.ncattrs()}
+            scale, offset = float(told.get("scale_factor", 1.0)), float(told.get("add_offset", 0.0))
+            return axis(name, size, np.asarray(found[:], np.float64) * scale + offset, told)
+        group = group.parent
+    return axis(name, size)
+
+
+def _sniff(head: bytes) -> bool:
+    return head[:4] in (b"CDF\x01", b"CDF\x02", b"CDF\x05") or (head.startswith(MAGIC) and b"_NCProperties" in head)
+
+
+register(Reader("NetCDF", (".nc", ".nc4", ".cdf"), _sniff, read_netcdf, named_arrays=True, resamples=True))

@@ -1,0 +1,208 @@
+"""VTK meshes and grids (``.vtu``, ``.vtr``, ``.vts``, legacy ``.vtk``, VTKHDF), read by VTK and resampled.
+
+Declared sizes are checked against the file before VTK allocates (VTKHDF: by VTK alone), cells against points before
+VTK walks them.
+"""
+
+from __future__ import annotations
+
+import mmap
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.volume.blocks import check_memory, count, size_text
+from vvgt_cli.volume.components import ArrayInfo, choose_array, select_component
+from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.registry import Reader, register, volume_name
+from vvgt_cli.volume.resample import resample
+from vvgt_cli.volume.types import Volume
+from vvgt_cli.volume.vtk_legacy import GRIDS, Parser, is_legacy
+from vvgt_cli.volume.vtk_xml import extent_dims, is_xml, quiet_vtk, scan, stored_ratio
+
+
+def read_xml_grid(path: Path, options: ReadOptions) -> Volume:
+    """Read and resample ``.vtu``, ``.vtr`` or ``.vts``.
+
+    Raises:
+        DataError: damaged, or sizes that the file cannot hold.
+        UsageError: a choice of array or component that is missing or does not exist.
+    """
+    from vtkmodules import vtkIOXML
+
+    found = scan(path)
+    points, cells = found.points, found.cells
+    if found.image:
+        dims = extent_dims(found, path)
+        points, cells = count(tuple(dims)), count(tuple(max(d - 1, 1) for d in dims))
+    need = 12 * points if found.kind == "StructuredGrid" else 0
+    if found.kind == "UnstructuredGrid":
+        need = 12 * points + 5 * cells  # coordinates; an offset and a type a cell
+    for info, _ in found.arrays:
+        need += (points if info.where == "point" else cells) * info.components * np.dtype(info.dtype).itemsize
+    size = path.stat().st_size
+    if need > size * stored_ratio(found, path):
+        raise DataError(f"{path}: {size_text(size)} cannot hold {points} points and {cells} cells; is the file whole?")
+    check_memory(need, str(path))
+    return _sampled(getattr(vtkIOXML, f"vtkXML{found.kind}Reader"), path, options)
+
+
+class _Sections(Parser):
+    """The sections of a legacy mesh or grid, to see that the file holds what they declare."""
+
+    KINDS = GRIDS
+
+    def section(self, key: str, words: list[str]) -> None:
+        if key in ("X_COORDINATES", "Y_COORDINATES", "Z_COORDINATES"):
+            self.skip(words[2].lower(), int(words[1]))
+        elif key == "POINTS":
+            self.skip(words[2].lower(), 3 * int(words[1]))
+        elif key == "CELL_TYPES":
+            self.skip("int", int(words[1]))
+        elif key == "CELLS":
+            self.cells(int(words[1]), int(words[2]))
+        else:
+            super().section(key, words)
+
+    def cells(self, first: int, second: int) -> None:
+        """Cells as numbers in a row (version 4), or as offsets and connectivity (5.1)."""
+        back = self.position
+        line = self.text[back : back + 64].split(None, 2)
+        if not line or line[0] != b"OFFSETS":
+            self.skip("int", second)
+            return
+        for n in (first, second):
+            words = self.words() or []
+            if len(words) != 2:
+                raise self.bad("CELLS without OFFSETS and CONNECTIVITY")
+            self.skip(words[1].lower(), n)
+
+
+def read_legacy_grid(path: Path, options: ReadOptions) -> Volume:
+    """Read and resample a legacy ``.vtk`` mesh or grid.
+
+    Raises:
+        DataError: damaged, or sizes that the file cannot hold.
+        UsageError: a choice of array or component that is missing or does not exist.
+    """
+    from vtkmodules.vtkIOLegacy import vtkDataSetReader
+
+    with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as text:
+        _Sections(text, path).parse()
+
+    def reader() -> Any:
+        made = vtkDataSetReader()
+        for switch in (made.ReadAllScalarsOn, made.ReadAllVectorsOn, made.ReadAllFieldsOn, made.ReadAllTensorsOn):
+            switch()
+        return made
+
+    return _sampled(reader, path, options)
+
+
+def read_vtkhdf(path: Path, options: ReadOptions) -> Volume:
+    """Read VTKHDF: an image as it is, an unstructured grid resampled.
+
+    Raises:
+        DataError: damaged, or another kind of dataset.
+        UsageError: a choice of array or component that is missing or does not exist.
+    """
+    from vtkmodules.vtkIOHDF import vtkHDFReader
+
+    return _sampled(vtkHDFReader, path, options)
+
+
+def _sampled(make: Callable[[], Any], path: Path, options: ReadOptions) -> Volume:
+    with quiet_vtk() as message:
+        reader = make()
+        reader.SetFileName(str(path))
+        reader.Update()
+        mesh = reader.GetOutputDataObject(0)
+        error = message()
+    if error or reader.GetErrorCode() or mesh is None:
+        raise DataError(f"{path}: VTK cannot read it ({error or 'no message'}); is the file whole?")
+    if not mesh.IsA("vtkDataSet"):
+        raise DataError(f"{path}: a {mesh.GetClassName()}; expected one image, grid or mesh of cells")
+    if mesh.IsA("vtkPolyData"):
+        raise DataError(f"{path}: a surface (vtkPolyData); expected cells that fill a volume")
+    infos = _arrays(mesh)
+    info = infos[choose_array(infos, options.array, str(path))]
+    if mesh.IsA("vtkImageData"):
+        return _image(mesh, info, path, options)
+    if options.spacing is not None:
+        raise UsageError(f"{path}: its points say where values are; leave out --spacing (--dims says how many to take)")
+    _check_cells(mesh, path)
+    values = _values(mesh, info).reshape(1, 1, -1, info.components)
+    field, _ = select_component(values, options.component, str(path), label=f"array {info.name!r}")
+    return resample(mesh, field.ravel(), info.where, options.dims, str(path), volume_name(path))
+
+
+def _values(mesh: Any, info: ArrayInfo) -> np.ndarray:
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    data = mesh.GetPointData() if info.where == "point" else mesh.GetCellData()
+    return vtk_to_numpy(data.GetArray(info.name))
+
+
+def _arrays(mesh: Any) -> list[ArrayInfo]:
+    """The arrays of numbers; ghost marks left out."""
+    from vtkmodules.util.numpy_support import get_vtk_to_numpy_typemap
+
+    types = get_vtk_to_numpy_typemap()
+    found = []
+    for where, data in (("point", mesh.GetPointData()), ("cell", mesh.GetCellData())):
+        active = data.GetScalars()
+        for k in range(data.GetNumberOfArrays()):
+            array = data.GetArray(k)
+            if array is None or array.GetDataType() not in types or array.GetName() == "vtkGhostType":
+                continue
+            if not array.GetName():
+                array.SetName(f"array{k}")
+            dtype = np.dtype(types[array.GetDataType()]).name
+            found.append(ArrayInfo(array.GetName(), where, array.GetNumberOfComponents(), dtype, array is active))
+    return found
+
+
+def _check_cells(mesh: Any, path: Path) -> None:
+    """Refuse cells that name points which are not there: VTK would read beyond the array."""
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    if not mesh.IsA("vtkUnstructuredGrid") or mesh.GetNumberOfCells() < 1:
+        return
+    cells = mesh.GetCells()
+    ids = vtk_to_numpy(cells.GetConnectivityArray())
+    offsets = vtk_to_numpy(cells.GetOffsetsArray())
+    fits = ids.size and ids.min() >= 0 and ids.max() < mesh.GetNumberOfPoints()
+    if not fits or offsets[0] != 0 or offsets[-1] > ids.size or (np.diff(offsets) < 0).any():
+        raise DataError(f"{path}: its cells name points that do not exist; check that the file is whole")
+
+
+def _image(image: Any, info: ArrayInfo, path: Path, options: ReadOptions) -> Volume:
+    """A vtkImageData as it is: point data, or cell data on the grid of cell centres."""
+    if options.dims is not None:
+        raise UsageError(f"{path}: an image, which is a regular grid already; leave out --dims")
+    low = np.array(image.GetExtent()[::2], float)
+    dims, spacing = np.array(image.GetDimensions()), np.array(image.GetSpacing())
+    if info.where == "cell":
+        low, dims = low + np.where(dims > 1, 0.5, 0.0), np.maximum(dims - 1, 1)
+    matrix = image.GetDirectionMatrix()
+    direction = np.array([[matrix.GetElement(r, c) for c in range(3)] for r in range(3)])
+    origin = np.array(image.GetOrigin()) + direction @ (low * spacing)
+    values = _values(image, info).reshape(*dims[::-1], info.components)
+    field, _ = select_component(values, options.component, str(path), label=f"array {info.name!r}")
+    place = tuple(origin.tolist()), tuple(direction.ravel().tolist())
+    return Volume(field, options.spacing_or(tuple(spacing)), *place, volume_name(path))  # type: ignore[arg-type]
+
+
+def _is_vtkhdf(head: bytes) -> bool:
+    return head.startswith(b"\x89HDF\r\n\x1a\n") and b"VTKHDF" in head
+
+
+for _name, _suffixes, _sniff, _read in (
+    ("VTK grid", (".vtu", ".vtr", ".vts"), lambda head: is_xml(head, grid=True), read_xml_grid),
+    ("legacy VTK grid", (), lambda head: is_legacy(head, grid=True), read_legacy_grid),
+    ("VTKHDF", (".vtkhdf",), _is_vtkhdf, read_vtkhdf),
+):
+    register(Reader(_name, _suffixes, _sniff, _read, named_arrays=True, resamples=True))
