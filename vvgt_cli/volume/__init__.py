@@ -10,6 +10,7 @@ from vvgt_cli.volume import (  # noqa: F401  each registers its formats, in this
     nifti,
     nrrd,
     numpy_file,
+    openvdb,
     raw,
     slc,
     slices,
