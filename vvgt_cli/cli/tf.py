@@ -8,9 +8,9 @@ from vvgt_cli.cli.options import common_options, overwrite_option, read_options,
 from vvgt_cli.progress import Console
 
 
-@click.group("tf", short_help="Look at transfer functions, or have some made.")
+@click.group("tf", short_help="Look at transfer functions, convert them, or have some made.")
 def command() -> None:
-    """Look at transfer functions, or have some made."""
+    """Look at transfer functions, convert them, or have some made."""
 
 
 @command.command("show", short_help="Draw a transfer function over a histogram.")
@@ -34,6 +34,31 @@ def show(
     from vvgt_cli.volume import ReadOptions
 
     show_transfer_function(tf, output, volume, ReadOptions(**read), tf_range, overwrite)
+
+
+@command.command("convert", short_help="Write a transfer function in another format.")
+@click.argument("tf", metavar="IN")
+@click.argument("output", metavar="OUT")
+@click.option(
+    "--format", "form", type=click.Choice(["minimal", "paraview"]), default="minimal", show_default=True,
+    help="Minimal JSON, which holds the unit distance, or a ParaView preset, which holds midpoints and sharpness.",
+)  # fmt: skip
+@tf_range_option
+@overwrite_option
+@common_options
+def convert(tf: str, output: str, form: str, tf_range: str, overwrite: bool, console: Console) -> None:
+    """Write the transfer function IN (any format that is read, or the name of a colour map) as the JSON file OUT.
+
+    What the format cannot hold is refused, and named. OUT may be - for standard output.
+
+    \b
+    Examples:
+      vvgt tf convert CT-Bone.vp bone.json
+      vvgt tf convert plasma.itf plasma.json --tf-range 0,255 --format paraview
+    """
+    from vvgt_cli.pipeline.tf_convert import convert_transfer_function
+
+    convert_transfer_function(tf, output, form, tf_range, overwrite, console)
 
 
 @command.command("suggest", short_help="Make functions that show a range of values each.")

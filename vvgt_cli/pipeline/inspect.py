@@ -11,6 +11,7 @@ from vvgt_cli.cameras.files import read_cameras
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import describe, read_ply
 from vvgt_cli.pipeline.render import STDIN
+from vvgt_cli.transfer.readers import SUFFIXES
 from vvgt_cli.volume import ReadOptions
 
 _PLY = (b"ply\n", b"ply\r")
@@ -36,7 +37,7 @@ def inspect(file: str, read: ReadOptions) -> dict[str, Any]:
         head = stream.read(_HEAD)
     if head.startswith(_PLY):
         return {"kind": "gaussians", "name": path.name, **describe(*read_ply(path))}
-    if path.suffix.lower() == ".json" or head.lstrip()[:1] in (b"{", b"["):
+    if path.suffix.lower() in SUFFIXES or head.lstrip()[:1] in (b"{", b"["):
         if b'"frames"' in head:
             return _views(path)
         return _transfer_function(file)

@@ -114,6 +114,8 @@ def unit_distance(spec: str | float | None, volume: Volume, tf: TransferFunction
     if spec is None:
         if tf is not None and tf.opacity_unit_distance is not None:
             return tf.opacity_unit_distance, "file"
+        if tf is not None and tf.opacity_unit_share is not None:
+            return tf.opacity_unit_share * max(volume.extent), "file"
         spec = "paraview"
     mean = sum(volume.spacing) / 3
     if spec == "mean-spacing":

@@ -6,11 +6,13 @@ from pathlib import Path
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.transfer.function import TransferFunction
-from vvgt_cli.transfer.readers import colormap_name, minimal, paraview
-from vvgt_cli.transfer.readers.fields import load_json
+from vvgt_cli.transfer.readers import colormap_name, inviwo, minimal, paraview, paraview_xml, slicer, vtkjs
+from vvgt_cli.transfer.readers.fields import load
 
-FORMATS = (paraview, minimal)  # each: matches(parsed) -> bool, read(parsed, what, pick) -> TransferFunction
-
+# vtkjs before paraview: its presets are ParaView's with opacity under another name
+# each: matches(parsed) -> bool, read(parsed, what, pick) -> TransferFunction
+FORMATS = (vtkjs, paraview, minimal, slicer, paraview_xml, inviwo)
+SUFFIXES = (".json", ".xml", ".itf", ".vp")
 __all__ = ["read_transfer_function"]
 
 
@@ -18,9 +20,9 @@ def read_transfer_function(source: str) -> TransferFunction:
     """Read a transfer function; the format of a file is told by its content.
 
     Args:
-        source: path of a ParaView preset (JSON; ``presets.json#Name`` picks one of several) or of our
-            minimal JSON (`vvgt_cli.transfer.readers.minimal`), or a matplotlib colour-map name with an
-            opacity ramp, ``NAME[:LO,HI[:MAX]]`` (`vvgt_cli.transfer.readers.colormap_name`).
+        source: path of a file (``presets.json#Name`` picks one of several functions; the modules of this room say of
+            which formats), or a matplotlib colour-map name with an opacity ramp, ``NAME[:LO,HI[:MAX]]``
+            (`vvgt_cli.transfer.readers.colormap_name`).
 
     Returns:
         The function; `vvgt_cli.transfer.resolve.resolve` puts it on the data.
@@ -38,13 +40,14 @@ def read_transfer_function(source: str) -> TransferFunction:
     if path.is_dir():
         raise UsageError(f"{path} is a folder; expected a transfer-function file or a colour-map name")
     if not path.exists():
-        if pick or "/" in source or "\\" in source or Path(source).suffix.lower() in (".json", ".xml", ".itf", ".vp"):
-            raise UsageError(f"{path}: no such file; expected a transfer function (ParaView preset JSON, minimal JSON)")
+        if pick or "/" in source or "\\" in source or Path(source).suffix.lower() in SUFFIXES:
+            raise UsageError(f"{path}: no such file; expected a transfer function ({', '.join(SUFFIXES)})")
         return colormap_name.read(source)
-    parsed = load_json(path)
+    parsed = load(path)
     for reader in FORMATS:
         if reader.matches(parsed):
             return reader.read(parsed, str(path), pick)
     raise DataError(
-        f"{path}: JSON, but not a transfer function; expected a ParaView preset (RGBPoints) or an object with points"
+        f"{path}: not a transfer function; expected a preset of ParaView or vtk.js (RGBPoints), an object with points, "
+        "a volume property of 3D Slicer, XML of ParaView (ColorMap) or of Inviwo (Points)"
     )

@@ -1,11 +1,14 @@
-"""Checked access to parsed JSON: every error names the file and the field."""
+"""Files parsed as JSON, XML or lines, and checked access to what they hold: every error names file and field."""
 
 from __future__ import annotations
 
 import json
 import math
+import re
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from xml.parsers import expat
 
 import numpy as np
 
@@ -14,12 +17,53 @@ from vvgt_cli.errors import DataError
 MAX_BYTES = 16 * 2**20
 
 
-def load_json(path: Path) -> Any:
-    """Parse a UTF-8 JSON file of at most 16 MiB.
+@dataclass(frozen=True)
+class Elements:
+    """The elements of an XML file in the order of their start tags: names in lower case, attributes."""
+
+    root: str
+    items: list[tuple[str, dict[str, str]]]
+
+
+@dataclass(frozen=True)
+class Lines:
+    """The lines of a text file, stripped, without blank ones."""
+
+    items: list[str]
+
+
+def load(path: Path) -> Any:
+    """Parse a UTF-8 file of at most 16 MiB: `Elements` if it begins as XML, `Lines` if with a line of numbers, or JSON.
 
     Raises:
-        DataError: too large, not readable, not UTF-8, not JSON.
+        DataError: too large, not readable, not UTF-8, neither of the three.
     """
+    text = _text(path)
+    if text.lstrip()[:1] == "<":
+        return _elements(text, path)
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    if len(lines) > 1 and re.fullmatch(r"[-+.\d\s]+", lines[0]):
+        return Lines(lines)
+    return _json(text, path)
+
+
+def _elements(text: str, path: Path) -> Elements:
+    items: list[tuple[str, dict[str, str]]] = []
+    parser = expat.ParserCreate()
+
+    def refuse(*_: Any) -> None:
+        raise DataError(f"{path}: XML that declares entities; expected a transfer function without")
+
+    parser.StartElementHandler = lambda tag, attributes: items.append((tag.lower(), attributes))
+    parser.EntityDeclHandler = refuse
+    try:
+        parser.Parse(text.encode(), True)
+    except expat.ExpatError as error:
+        raise DataError(f"{path}: damaged XML ({error}); expected a transfer function") from error
+    return Elements(items[0][0], items)
+
+
+def _text(path: Path) -> str:
     try:
         size = path.stat().st_size
         if size > MAX_BYTES:
@@ -31,11 +75,16 @@ def load_json(path: Path) -> Any:
     if len(raw) > MAX_BYTES:
         raise DataError(f"{path}: more than 16 MiB; expected a transfer function")
     try:
-        return json.loads(raw.decode("utf-8-sig"))
+        return raw.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise DataError(
-            f"{path}: not text (byte {error.start} is not UTF-8); expected a JSON transfer function"
+            f"{path}: not text (byte {error.start} is not UTF-8); expected a transfer function of JSON, XML or numbers"
         ) from error
+
+
+def _json(text: str, path: Path) -> Any:
+    try:
+        return json.loads(text)
     except json.JSONDecodeError as error:
         raise DataError(
             f"{path}: not JSON (line {error.lineno}, column {error.colno}: {error.msg}); "
@@ -56,6 +105,25 @@ def number(what: str, value: Any) -> float:
     if not math.isfinite(result):
         raise DataError(f"{what}: {_shown(value)}; expected a finite number")
     return result
+
+
+def floats(what: str, text: str) -> list[float]:
+    """The numbers of a text, separated by white space; finite, or DataError."""
+    try:
+        values = [float(word) for word in text.split()]
+    except ValueError:
+        values = []
+    if not values or not all(map(math.isfinite, values)):
+        raise DataError(f"{what}: {_shown(text)}; expected finite numbers")
+    return values
+
+
+def attribute(what: str, attributes: dict[str, str], key: str) -> float:
+    """A number of an XML element's attributes, or DataError."""
+    values = floats(f"{what} {key}", attributes.get(key, ""))
+    if len(values) != 1:
+        raise DataError(f"{what} {key}: {_shown(attributes[key])}; expected one number")
+    return values[0]
 
 
 def table(what: str, value: Any, width: int, columns: str) -> np.ndarray:

@@ -31,7 +31,7 @@ def read(parsed: Any, what: str, pick: str = "") -> TransferFunction:
     Raises:
         DataError: several presets and no ``pick``, a categorical preset, a field that is not what it must be.
     """
-    preset = _choose(parsed if isinstance(parsed, list) else [parsed], what, pick)
+    preset = choose(parsed if isinstance(parsed, list) else [parsed], what, pick)
     if "RGBPoints" not in preset:
         raise DataError(
             f"{what}: a categorical preset (IndexedColors, no RGBPoints); expected one over a range of values"
@@ -66,7 +66,7 @@ def read(parsed: Any, what: str, pick: str = "") -> TransferFunction:
         raise named(what, error) from error
 
 
-def _choose(presets: list[dict[str, Any]], what: str, pick: str) -> dict[str, Any]:
+def choose(presets: list[dict[str, Any]], what: str, pick: str) -> dict[str, Any]:
     names = [str(p.get("Name", "")) for p in presets]
     if pick:
         if pick not in names:
