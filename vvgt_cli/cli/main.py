@@ -21,6 +21,7 @@ COMMANDS = {
     "render": "vvgt_cli.cli.render",
     "render-views": "vvgt_cli.cli.render_views",
     "evaluate": "vvgt_cli.cli.evaluate",
+    "check": "vvgt_cli.cli.check",
     "info": "vvgt_cli.cli.info",
     "tf": "vvgt_cli.cli.tf",
     "infer": "vvgt_cli.cli.infer",

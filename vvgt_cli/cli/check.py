@@ -1,0 +1,51 @@
+"""`vvgt check`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import click
+
+from vvgt_cli.cli.options import common_options, read_options, tf_options
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.progress import Console
+
+
+@click.command("check", short_help="The stability suite, or how stiff a scene is.")
+@click.argument("volume", required=False)
+@click.option(
+    "--tolerance", type=click.FloatRange(0, 1, min_open=True), default=0.002, show_default=True, metavar="RMS",
+    help="Of VOLUME's views: error that the step is chosen for, root mean square of RGBA.",
+)  # fmt: skip
+@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a table.")
+@tf_options
+@read_options
+@common_options
+def command(volume: str | None, tolerance: float, as_json: bool, console: Console, **options: Any) -> None:
+    """Run stiff and extreme cases through every stage; a table on standard output, exit status 1 if one fails.
+
+    Fast kernels are compared with their float64 twins; optical mass must be kept, pictures stay in range, files
+    come back to the bit, and nothing may be NaN or crash. A minute or two on two cores.
+
+    With VOLUME, only that scene is looked at: cases of its own, its stiffness, and the step that views of it need.
+
+    \b
+    Examples:
+      vvgt check
+      vvgt check head.nrrd --tf bone.json --tolerance 0.001
+      vvgt check --json | jq '.outcomes[] | select(.passed | not)'
+    """
+    from vvgt_cli.cli.fit import source_request
+    from vvgt_cli.pipeline.check import check
+
+    given = [f"--{key.replace('_', '-')}" for key, value in (options["optics"] | options["read"]).items() if value]
+    given = [name for name in given if name != "--tf-range" or options["optics"]["tf_range"] != "data"]
+    if volume is None and given:
+        raise UsageError(f"{', '.join(given)}: of a volume, and none is given; expected VOLUME too")
+    source = None if volume is None else source_request(volume, options["read"], options["optics"])
+    report = check(source, tolerance, console)
+    click.echo(report.to_json() if as_json else report.table(), nl=False)
+    if report.failed:
+        names = "; ".join(f"{o.stage}: {o.name}" for o in report.failed[:3])
+        more = f" and {len(report.failed) - 3} more" if len(report.failed) > 3 else ""
+        raise DataError(f"{len(report.failed)} of {len(report.outcomes)} cases failed ({names}{more})")
