@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import struct
 import zipfile
 from collections.abc import Sequence
 from dataclasses import asdict, replace
@@ -23,6 +24,11 @@ from vvgt_cli.optimize import OptimizeOptions, OptimizeRecord
 
 if TYPE_CHECKING:
     from vvgt_cli.optimize.loop import Judge, State
+
+_FAULTS = (
+    *(OSError, KeyError, ValueError, TypeError, AttributeError, OverflowError, EOFError, MemoryError, RuntimeError),
+    *(zipfile.BadZipFile, struct.error),
+)
 
 
 def fingerprint(
@@ -64,17 +70,53 @@ def resume(path: str, key: str, state: State, judge: Judge, record: OptimizeReco
     if not Path(path).exists():
         return None
     try:
-        with np.load(path, allow_pickle=False) as file:
-            about = json.loads(str(file["about"]))
-            arrays = {name: file[name] for name in file.files if name != "about"}
-    except (OSError, KeyError, ValueError, zipfile.BadZipFile, EOFError) as error:
-        raise DataError(f"{path}: not a checkpoint of 'vvgt optimize' ({error}); remove it to start afresh") from None
-    if about["key"] != key:
-        raise UsageError(f"{path}: checkpoint of a run with other Gaussians, views or options; name another file")
-    state.restore({name.removeprefix("state_"): array for name, array in arrays.items() if name.startswith("state_")})
-    kept = [arrays[name] for name in sorted(arrays) if name.startswith("best_")]
-    judge.best, judge.idle, judge.kept = about["best"], about["idle"], tuple(kept) or None
-    for field, value in about["record"].items():
-        setattr(record, field, [tuple(look) for look in value] if field == "checks" else value)
-    walk: dict[str, Any] = about["walk"]
+        about, arrays = _load(path)
+        if about["key"] != key:
+            raise UsageError(f"{path}: checkpoint of a run with other Gaussians, views or options; name another file")
+        own = state.saved()
+        saved = {name.removeprefix("state_"): array for name, array in arrays.items() if name.startswith("state_")}
+        _check_like(saved, own)
+        kept = [arrays[name] for name in sorted(arrays) if name.startswith("best_")]
+        if kept:
+            own = {name: array for name, array in own.items() if name.startswith("array_")}
+            _check_like({f"array_{i}": array for i, array in enumerate(kept)}, own)
+        state.restore(saved)
+        best, idle, walk = about["best"], int(about["idle"]), dict(about["walk"])
+        told = {field: about["record"][field] for field in asdict(record)}
+        told["checks"] = [tuple(look) for look in told["checks"]]
+    except _FAULTS as error:
+        text = " ".join(str(error).split())[:200]
+        raise DataError(f"{path}: not a checkpoint of 'vvgt optimize' ({text}); remove it to start afresh") from None
+    judge.best, judge.idle, judge.kept = best, idle, tuple(kept) or None
+    for field, value in told.items():
+        setattr(record, field, value)
     return walk
+
+
+def _load(path: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """What was said about the run, and the arrays; all as it lies in the file, so that nothing grows in memory."""
+    with zipfile.ZipFile(path) as archive:
+        entries = archive.infolist()
+        if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
+            raise ValueError("compressed entries")
+        if sum(entry.file_size for entry in entries) > Path(path).stat().st_size:
+            raise ValueError("entries that are larger than the file")
+    with np.load(path, allow_pickle=False) as file:
+        about = json.loads(str(file["about"]))
+        return about, {name: file[name] for name in file.files if name != "about"}
+
+
+def _check_like(saved: dict[str, np.ndarray], own: dict[str, np.ndarray]) -> None:
+    """See that arrays are those of a state of any number of Gaussians: kernels do not check.
+
+    Raises:
+        ValueError: other names, types or shapes.
+    """
+    if set(saved) != set(own):
+        raise ValueError("other arrays")
+    for name, array in own.items():
+        there = saved[name]
+        rows = (len(saved["array_0"]),) if array.ndim and name != "last" else array.shape[:1]
+        same = there.dtype == array.dtype or there.dtype.kind == array.dtype.kind == "U"
+        if not same or there.shape != (*rows, *array.shape[1:]):
+            raise ValueError(f"{name} is {there.dtype} of shape {there.shape}")

@@ -131,7 +131,9 @@ def brick_grid(lo: np.ndarray, hi: np.ndarray, itemsize: int, source: str) -> tu
         )
     first = np.asarray(lo, np.int64) // EDGE
     count = np.asarray(hi, np.int64) // EDGE - first + 1
-    check_memory(math.prod(map(int, count)) * (itemsize + 4), source)
+    n = [int(c) for c in count]
+    # the tables, and two layers of bricks laid out as slabs are put together
+    check_memory(math.prod(n) * (itemsize + 4) + 2 * n[0] * n[1] * EDGE**3 * itemsize, source)
     return first, count
 
 

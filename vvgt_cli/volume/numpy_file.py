@@ -9,6 +9,7 @@ import io
 import struct
 import zipfile
 from pathlib import Path
+from tokenize import TokenError
 from typing import IO
 
 import numpy as np
@@ -29,7 +30,10 @@ def _header(stream: IO[bytes], source: str) -> tuple[tuple[int, ...], bool, np.d
     if version not in ((1, 0), (2, 0), (3, 0)):
         raise DataError(f"{source}: .npy version {version}; expected 1.0 to 3.0")
     reader = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, fortran, dtype = reader(stream, max_header_size=_HEADER)
+    try:
+        shape, fortran, dtype = reader(stream, max_header_size=_HEADER)
+    except TokenError as error:  # numpy reads headers of Python 2 with a tokenizer
+        raise DataError(f"{source}: damaged .npy header ({error.args[0]}); check that it is whole") from error
     if dtype.kind not in "iufb":
         raise DataError(f"{source}: values of type {dtype}; expected integers or floats (objects are never unpickled)")
     return shape, fortran, dtype

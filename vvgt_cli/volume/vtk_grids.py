@@ -20,6 +20,7 @@ from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.registry import Reader, register, volume_name
 from vvgt_cli.volume.resample import resample
 from vvgt_cli.volume.types import Volume
+from vvgt_cli.volume.vtk_blocks import check_blocks
 from vvgt_cli.volume.vtk_legacy import GRIDS, Parser, is_legacy
 from vvgt_cli.volume.vtk_xml import extent_dims, is_xml, quiet_vtk, scan, stored_ratio
 
@@ -47,6 +48,7 @@ def read_xml_grid(path: Path, options: ReadOptions) -> Volume:
     if need > size * stored_ratio(found, path):
         raise DataError(f"{path}: {size_text(size)} cannot hold {points} points and {cells} cells; is the file whole?")
     check_memory(need, str(path))
+    check_blocks(path, found.root, found.appended, found.data_start, stored_ratio(found, path))
     return _sampled(getattr(vtkIOXML, f"vtkXML{found.kind}Reader"), path, options)
 
 

@@ -22,6 +22,7 @@ from vvgt_cli.volume.components import ArrayInfo, choose_array, select_component
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.registry import Reader, register, volume_name
 from vvgt_cli.volume.types import IDENTITY, Volume
+from vvgt_cli.volume.vtk_blocks import check_blocks
 
 _DTYPES = {
     "int8": "i1",
@@ -223,6 +224,7 @@ def _check_size(found: _Scan, info: ArrayInfo, n_values: int, path: Path) -> Non
             "declares; check that the file is whole"
         )
     check_memory(need, str(path))
+    check_blocks(path, found.root, found.appended, found.data_start, stored_ratio(found, path))
 
 
 def _mapped(

@@ -49,7 +49,7 @@ def load(path: Path) -> Any:
 
 def _elements(text: str, path: Path) -> Elements:
     items: list[tuple[str, dict[str, str]]] = []
-    parser = expat.ParserCreate()
+    parser = expat.ParserCreate("utf-8")  # whatever the text calls itself
 
     def refuse(*_: Any) -> None:
         raise DataError(f"{path}: XML that declares entities; expected a transfer function without")

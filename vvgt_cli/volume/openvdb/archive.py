@@ -76,8 +76,9 @@ class Grid:
         return TYPES[self.kind][1] if self.kind in TYPES else 0
 
     def __str__(self) -> str:
-        tree = "" if self.levels == _LEVELS else f", tree {self.levels.replace('_', '-')}"
-        return f"{self.label or '(unnamed)'} ({self.kind}{', stored as half' if self.half else ''}{tree})"
+        tree = "" if self.levels == _LEVELS else f", tree {self.levels.replace('_', '-') or 'unknown'}"
+        text = f"{self.label or '(unnamed)'} ({self.kind}{', stored as half' if self.half else ''}{tree})"
+        return "".join(c if c.isprintable() else "?" for c in text[:100])
 
 
 def read_header(cursor: Cursor) -> list[Grid]:

@@ -1,0 +1,361 @@
+"""Seeds of tests/fuzz.py: small whole files of every format that the package reads by itself."""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import io
+import json
+import tarfile
+import tempfile
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tests.fuzz import Seed
+from vvgt_cli.volume import ReadOptions, read_volume
+
+FIXTURES = Path(__file__).parent / "fixtures"
+VALUES = np.random.default_rng(7).integers(0, 200, (3, 4, 5)).astype(np.int16)
+FLOATS = np.random.default_rng(8).standard_normal((3, 4, 5)).astype(np.float32)
+
+
+def volume_reader(**options: Any) -> Callable[[Path], None]:
+    """Read a volume and look at its first and last slices."""
+
+    def read(path: Path) -> None:
+        volume = read_volume(str(path), ReadOptions(**options))
+        for z in (0, -1):
+            np.asarray(volume.data[z])
+
+    return read
+
+
+READ = volume_reader()
+
+
+def raw() -> list[Seed]:
+    return [
+        Seed("v_5x4x3_int16.raw", VALUES.tobytes(), READ),
+        Seed("w_5x4x3_int16.raw.gz", gzip.compress(VALUES.tobytes()), READ),
+        Seed("x.raw.gz", VALUES.tobytes(), volume_reader(dims=(5, 4, 3), dtype="int16"), pack=gzip.compress),
+    ]
+
+
+def nrrd() -> list[Seed]:
+    def head(encoding: str, more: str = "") -> bytes:
+        text = (
+            "NRRD0005\n# a comment\ntype: short\ndimension: 3\nspace: left-posterior-superior\nsizes: 5 4 3\n"
+            "space directions: (1,0,0) (0,2,0) (0,0,3)\nspace origin: (1,2,3)\nendian: little\n"
+            f"encoding: {encoding}\n{more}\n"
+        )
+        return text.encode()
+
+    data = VALUES.tobytes()
+    numbers = " ".join(map(str, VALUES.ravel())).encode()
+    slices = {f"s{z}.raw": plane.tobytes() for z, plane in enumerate(VALUES)}
+    vectors = (
+        b"NRRD0004\ntype: float\ndimension: 4\nsizes: 3 5 4 3\nkinds: vector domain domain domain\n"
+        b"spacings: nan 1 2 3\nendian: big\nencoding: raw\n\n"
+    )
+    return [
+        Seed("a.nrrd", head("raw") + data, READ),
+        Seed("b.nrrd", head("gzip") + gzip.compress(data), READ),
+        Seed("c.nrrd", head("bzip2") + bz2.compress(data), READ),
+        Seed("d.nrrd", head("text") + numbers, READ),
+        Seed("e.nhdr", head("raw", "byte skip: 2\nline skip: 0\ndata file: v.raw\n"), READ, {"v.raw": b"xx" + data}),
+        Seed("f.nrrd", vectors + np.repeat(FLOATS, 3).astype(">f4").tobytes(), volume_reader(component="magnitude")),
+        Seed("g.nhdr", head("raw", "data file: LIST\ns0.raw\ns1.raw\ns2.raw")[:-1], READ, slices),
+        Seed("h.nhdr", head("raw", "data file: s%d.raw 0 2 1\n"), READ, slices),
+    ]
+
+
+def metaimage() -> list[Seed]:
+    def head(name: str, **more: str) -> bytes:
+        fields = {
+            "ObjectType": "Image", "NDims": "3", "BinaryData": "True", "BinaryDataByteOrderMSB": "False",
+            "CompressedData": "False", "TransformMatrix": "1 0 0 0 1 0 0 0 1", "Offset": "1 2 3",
+            "ElementSpacing": "0.5 1 2", "DimSize": "5 4 3", "ElementType": "MET_SHORT",
+        } | more  # fmt: skip
+        return "".join(f"{k} = {v}\n" for k, v in fields.items()).encode() + f"ElementDataFile = {name}\n".encode()
+
+    data = VALUES.tobytes()
+    packed = zlib.compress(data)
+    size = str(len(packed))
+    text = " ".join(map(str, VALUES.ravel())).encode()
+    series = head("LOCAL", NDims="4", DimSize="5 4 1 3", ElementSpacing="1 1 1 1", Offset="0 0 0 0", HeaderSize="-1")
+    return [
+        Seed("a.mha", head("LOCAL") + data, READ),
+        Seed("b.mha", head("LOCAL", CompressedData="True", CompressedDataSize=size) + packed, READ),
+        Seed("c.mha", head("LOCAL", BinaryData="False") + text, READ),
+        Seed("d.mhd", head("v.raw", HeaderSize="2"), READ, {"v.raw": b"xx" + data}),
+        Seed("e.mha", series + data, volume_reader(component=1)),
+    ]
+
+
+def inviwo() -> list[Seed]:
+    text = (
+        b"RawFile: v.raw\nResolution: 5 4 3\nFormat: INT16\nByteOffset: 2\nBasisVector1: 1 0 0\nBasisVector2: 0 2 0\n"
+        b"BasisVector3: 0 0 3\nOffset: 1 2 3\nDataRange: 0 200\nValueRange: 0 1\n"
+    )
+    series = b"ObjectFileName: v.raw\nResolution: 5 4 1\nFormat: SHORT\nSequences: 3\nSliceThickness: 1 1 2\n"
+    beside = {"v.raw": b"xx" + VALUES.tobytes()}
+    return [Seed("a.dat", text, READ, beside), Seed("b.dat", series, volume_reader(component=2), beside)]
+
+
+def nifti() -> list[Seed]:
+    import nibabel as nib
+
+    affine = np.diag([1.0, 2, 3, 1])
+    first = nib.Nifti1Image(VALUES.T, affine)
+    first.header.set_slope_inter(2, 1)
+    second = nib.Nifti2Image(np.stack([FLOATS.T] * 2, axis=3), affine)
+    pair = nib.Nifti1Pair(VALUES.T, affine)
+    maps = pair.make_file_map({"header": io.BytesIO(), "image": io.BytesIO()})
+    pair.to_file_map(maps)
+    header, image = (maps[k].fileobj.getvalue() for k in ("header", "image"))
+    return [
+        Seed("a.nii", first.to_bytes(), READ),
+        Seed("b.nii.gz", first.to_bytes(), READ, pack=gzip.compress),
+        Seed("c.nii", second.to_bytes(), volume_reader(component=1)),
+        Seed("d.hdr", header, READ, {"d.img": image}),
+    ]
+
+
+def slc() -> list[Seed]:
+    head = b"11111\n5 4 3 8\n1.0 2.0 3.0\n1 0 0\n%d\n2 2 X" + bytes(12)
+    values = VALUES.astype(np.uint8)
+    planes = b""
+    for plane in values:
+        runs = bytes([128 + 18]) + plane.ravel()[:18].tobytes() + bytes([2, int(plane.ravel()[-1]), 0])
+        planes += b"%d X" % len(runs) + runs
+    return [Seed("a.slc", head % 0 + values.tobytes(), READ), Seed("b.slc", head % 1 + planes, READ)]
+
+
+def tiff() -> list[Seed]:
+    import OpenImageIO as oiio
+
+    seeds = []
+    for name, values, how in (
+        ("a.tif", VALUES.astype(np.uint16), "zip"),
+        ("b.tif", FLOATS, "none"),
+        ("c.tif", VALUES.astype(np.uint8), "packbits"),
+    ):
+        with tempfile.TemporaryDirectory() as folder:
+            path = f"{folder}/{name}"
+            spec = oiio.ImageSpec(5, 4, 1, str(values.dtype))
+            spec.attribute("compression", how)
+            out = oiio.ImageOutput.create(path)
+            out.open(path, [spec] * 3)
+            for z, page in enumerate(values):
+                if z:
+                    out.open(path, spec, "AppendSubimage")
+                out.write_image(np.ascontiguousarray(page[..., None]))
+            out.close()
+            seeds.append(Seed(name, Path(path).read_bytes(), READ))
+    return seeds
+
+
+def vtk_legacy() -> list[Seed]:
+    head = (
+        b"# vtk DataFile Version 4.2\na title\n%s\nDATASET STRUCTURED_POINTS\nDIMENSIONS 5 4 3\nSPACING 1 2 3\n"
+        b"ORIGIN 1 2 3\nPOINT_DATA 60\nSCALARS values short 1\nLOOKUP_TABLE default\n"
+    )
+    numbers = b" ".join(b"%d" % v for v in VALUES.ravel())
+    more = b"\nMETADATA\nINFORMATION 0\n\nFIELD FieldData 1\nother 1 60 float\n"
+    floats = FLOATS.astype(">f4").tobytes()
+    return [
+        Seed("a.vtk", head % b"ASCII" + numbers + b"\n", READ),
+        Seed("b.vtk", head % b"BINARY" + VALUES.astype(">i2").tobytes() + more + floats + b"\n", READ),
+        Seed("c.vtk", head % b"ASCII" + numbers + more + b"1 2 3 " * 20, volume_reader(array="other")),
+    ]
+
+
+def vti() -> list[Seed]:
+    from vtkmodules.util.numpy_support import numpy_to_vtk
+    from vtkmodules.vtkCommonDataModel import vtkImageData
+    from vtkmodules.vtkIOXML import vtkXMLImageDataWriter
+
+    image = vtkImageData()
+    image.SetDimensions(5, 4, 3)
+    image.SetSpacing(1, 2, 3)
+    array = numpy_to_vtk(VALUES.ravel())
+    array.SetName("values")
+    image.GetPointData().SetScalars(array)
+    seeds = []
+    for name, mode, compressor in (
+        ("a.vti", "Ascii", "None"),
+        ("b.vti", "Binary", "ZLib"),
+        ("c.vti", "Appended", "LZ4"),
+        ("d.vti", "Appended", "None"),
+    ):
+        writer = vtkXMLImageDataWriter()
+        writer.SetInputData(image)
+        writer.WriteToOutputStringOn()
+        getattr(writer, f"SetDataModeTo{mode}")()
+        getattr(writer, f"SetCompressorTypeTo{compressor}")()
+        writer.SetEncodeAppendedData(compressor != "None")
+        writer.Write()
+        written = writer.GetOutputString()  # text where it is text, else bytes
+        seeds.append(Seed(name, written.encode() if isinstance(written, str) else written, READ))
+    return seeds
+
+
+def vdb() -> list[Seed]:
+    with tarfile.open(FIXTURES / "vdb" / "grids.tar.xz") as archive:
+        files = {n: archive.extractfile(f"./{n}.vdb").read() for n in ("version222", "version223", "tiles", "many")}  # type: ignore[union-attr]
+    return [
+        Seed("a.vdb", files["version222"], volume_reader(array="float")),
+        Seed("b.vdb", files["version222"], volume_reader(array="bool")),
+        Seed("c.vdb", files["version223"], volume_reader(component="magnitude")),
+        Seed("d.vdb", files["tiles"], volume_reader(array="root")),
+        Seed("e.vdb", files["tiles"], volume_reader(array="tiles")),
+        Seed("f.vdb", files["many"], volume_reader(array="shared")),
+        Seed("g.vdb", files["many"], volume_reader(array="mask")),
+    ]
+
+
+def numpy_files() -> list[Seed]:
+    plain, several, packed = io.BytesIO(), io.BytesIO(), io.BytesIO()
+    np.save(plain, VALUES)
+    np.savez(several, first=VALUES, second=FLOATS)
+    np.savez_compressed(packed, values=np.asfortranarray(FLOATS))
+    return [
+        Seed("a.npy", plain.getvalue(), READ),
+        Seed("b.npz", several.getvalue(), volume_reader(array="second")),
+        Seed("c.npz", packed.getvalue(), READ),
+    ]
+
+
+def transfer() -> list[Seed]:
+    from tests.test_transfer_formats import ITF, XML, vp, vp_json
+    from vvgt_cli.transfer import read_transfer_function
+
+    def read(path: Path) -> None:
+        tf = read_transfer_function(str(path))
+        tf.node_range()
+
+    preset = {
+        "ColorSpace": "Diverging", "Name": "Preset", "NanColor": [1, 1, 0],
+        "RGBPoints": [0, 0.2, 0.3, 0.8, 50, 0.9, 0.9, 0.9, 100, 0.7, 0, 0.1],
+        "Points": [0, 0, 0.5, 0, 40, 0.1, 0.3, 0.2, 100, 1, 0.5, 0],
+    }  # fmt: skip
+    minimal = {
+        "name": "two", "range": [0, 10], "color_space": "RGB", "opacity_unit_distance": 2,
+        "points": [{"x": 0, "rgb": [0, 0, 0], "opacity": 0}, {"x": 1, "rgb": [1, 0.5, 0], "opacity": 0.75}],
+    }  # fmt: skip
+    return [
+        Seed("a.json", json.dumps([preset]).encode(), read),
+        Seed("b.json", json.dumps(minimal, indent=1).encode(), read),
+        Seed("c.xml", XML.format(space="Lab").encode(), read),
+        Seed("d.itf", ITF.format(lo=0, hi=0.9, type=0).encode(), read),
+        Seed("e.vp", vp().encode(), read),
+        Seed("f.vp.json", json.dumps(vp_json()).encode(), read),
+    ]
+
+
+def ply() -> list[Seed]:
+    from vvgt_cli.gaussians import Gaussians, PlyOptions, describe, read_ply, write_ply
+    from vvgt_cli.volume.types import UnitFrame
+
+    rng = np.random.default_rng(3)
+    shapes = ((4, 3), (4, 3), (4, 4), (4,), (4, 3))
+    gaussians = Gaussians(*(rng.standard_normal(shape).astype(np.float32) for shape in shapes))
+    frame = UnitFrame(0.5, (1, 1, 1), (0.1, 0.1, 0.1), (1, 2, 3))
+    seeds = []
+    for name, options in (
+        ("a.ply", PlyOptions(comments=False)),
+        ("b.ply", PlyOptions("world", "-y", 1, True, frame, 1.5, "given")),
+    ):
+        stream = io.BytesIO()
+        write_ply(stream, gaussians, options)
+        seeds.append(Seed(name, stream.getvalue(), lambda path: describe(*read_ply(path))))
+    return seeds
+
+
+def cameras() -> list[Seed]:
+    from vvgt_cli.cameras import default_views
+    from vvgt_cli.cameras.files import blender_json, read_frames, transforms_json
+
+    views = default_views("check", size=40)
+    return [
+        Seed("a.json", transforms_json(views).encode(), read_frames),
+        Seed("b.json", blender_json(views, [f"./{v.name}" for v in views]).encode(), lambda p: read_frames(p, 40)),
+    ]
+
+
+def model_card() -> list[Seed]:
+    from vvgt_cli.network.card import IMAGE_INPUTS, MAPS, ModelCard, graph_record, read_card
+    from vvgt_cli.network.config import NetworkConfig
+
+    with tempfile.TemporaryDirectory() as folder:
+        graphs = {}
+        for name in ("image", "geometry"):
+            (Path(folder) / f"{name}.onnx").write_bytes(b"graph")
+            graphs[name] = graph_record(Path(folder) / f"{name}.onnx", IMAGE_INPUTS, MAPS)
+    card = ModelCard("tiny", NetworkConfig().to_dict(), 10, {}, "abc", {}, 18, "float32", 0.0, graphs)
+    beside = {"image.onnx": b"graph", "geometry.onnx": b"graph"}
+    return [Seed("card.json", card.to_json().encode(), lambda path: read_card(path.parent).network, beside)]
+
+
+def checkpoint() -> list[Seed]:
+    from tests.test_optimize_checkpoint import CAMERAS, cloud
+    from vvgt_cli.optimize import OptimizeOptions, OptimizeRecord
+    from vvgt_cli.optimize.checkpoint import resume, save
+    from vvgt_cli.optimize.loop import Judge, begin
+
+    def fresh(method: str) -> tuple[Any, Judge, OptimizeRecord]:
+        record = OptimizeRecord()
+        state = begin(cloud(4), CAMERAS, OptimizeOptions.of(method, max_gaussians=8))
+        return state, Judge(state, None, record), record
+
+    seeds = []
+    for method in ("frame", "3dgs"):
+        state, judge, record = fresh(method)
+        judge.kept = tuple(state.arrays)
+        with tempfile.TemporaryDirectory() as folder:
+            save(f"{folder}/run.npz", "key", state, judge, record, {"step": 3})
+            data = Path(f"{folder}/run.npz").read_bytes()
+        seeds.append(Seed("run.npz", data, lambda path, method=method: resume(str(path), "key", *fresh(method))))
+    return seeds
+
+
+def manifest() -> list[Seed]:
+    from vvgt_cli.pipeline.manifest import Manifest, read_manifest
+
+    document = {
+        "format": "vvgt-views", "schema": 1, "hash": "ab" * 32, "settings": {"size": 40, "half": False},
+        "files": {"train/a.png": {"bytes": 10, "sha256": "cd" * 32}},
+    }  # fmt: skip
+
+    def read(path: Path) -> None:
+        read_manifest(path)
+        Manifest(path.parent, {"size": 40}).refresh()
+
+    return [Seed("manifest.json", json.dumps(document).encode(), read)]
+
+
+def readers() -> dict[str, list[Seed]]:
+    """Seeds by reader."""
+    return {
+        "raw": raw(),
+        "NRRD": nrrd(),
+        "MetaImage": metaimage(),
+        "Inviwo": inviwo(),
+        "NIfTI": nifti(),
+        "SLC": slc(),
+        "TIFF": tiff(),
+        "VTK legacy": vtk_legacy(),
+        "VTK XML": vti(),
+        "OpenVDB": vdb(),
+        "NumPy": numpy_files(),
+        "transfer function": transfer(),
+        "Gaussians": ply(),
+        "view set": cameras(),
+        "model card": model_card(),
+        "manifest of views": manifest(),
+        "checkpoint": checkpoint(),
+    }
