@@ -24,9 +24,10 @@ from vvgt_cli.progress import Console
 @read_options
 @click.option("--report", metavar="R.json", help="Write times and errors of every stage as JSON; - is standard output.")
 @click.option("--preview", metavar="P.png", help="Write reference, ours and difference of three test views.")
+@click.option("--shard", metavar="I/N", help="Of a series: convert part I of N, for job arrays; I counts from 1.")
 @overwrite_option
 @common_options
-def command(volume: str, console: Console, **options: Any) -> None:
+def command(volume: str, shard: str | None, console: Console, **options: Any) -> None:
     """Convert VOLUME into a standard 3D Gaussian Splatting .ply.
 
     VOLUME is a file (raw with a header or with --dims and --dtype, NRRD, NIfTI, MetaImage, VTK, TIFF, ...),
@@ -37,13 +38,27 @@ def command(volume: str, console: Console, **options: Any) -> None:
     to (ten with --report); the error is printed. --steps refines them further by gradient descent; Ctrl-C
     ends that stage only.
 
+    With a place for a number in OUT.ply, VOLUME is a glob of the frames of a time series: one file a frame,
+    under one function and one range of values. The same command again goes on where it was.
+
     \b
     Examples:
       vvgt convert example:frog -o frog.ply --preview frog.png
       vvgt convert head.nrrd --tf bone.json -o head.ply --max-gaussians 50000 --steps 200
       vvgt convert - --dims 64 64 93 --dtype uint16 -o - < head.raw > head.ply
+      vvgt convert 'run_*.vti' --tf tf.json -o 'out_{:04d}.ply'
     """
     from vvgt_cli.cli.fit import convert_request
+    from vvgt_cli.errors import UsageError
     from vvgt_cli.pipeline.convert import convert
+    from vvgt_cli.pipeline.series import convert_series, is_pattern
 
-    convert(convert_request(volume, **options), console)
+    request = convert_request(volume, **options)
+    if is_pattern(request.output):
+        from vvgt_cli.pipeline.render_views import parse_shard
+
+        convert_series(request, parse_shard(shard or "1/1"), console)
+    elif shard is not None:
+        raise UsageError(f"--shard {shard} is of a series; give -o a place for the frame's number, as out_{{:04d}}.ply")
+    else:
+        convert(request, console)

@@ -1,4 +1,4 @@
-"""The manifest of a folder of views: which run it belongs to, and which of its files are complete."""
+"""The manifest of a folder of views or frames: which run it belongs to, and which of its files are complete."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ from vvgt_cli.files import atomic_write
 from vvgt_cli.volume import Volume
 from vvgt_cli.volume.stats import slabs
 
-FORMAT, SCHEMA = "vvgt-views", 1
+SCHEMA = 1
+COMMANDS = {"views": "vvgt render-views", "frames": "vvgt convert"}  # by what a folder holds
 NAME = re.compile(r"manifest(-\d+-of-\d+)?\.json")
 DIGESTS = {"volume": "another volume", "function": "another transfer function", "cameras": "other cameras"}
 FRESH = "choose another directory, or pass --overwrite to start afresh"
@@ -52,11 +53,12 @@ class Manifest:
     """What a run has written into ``folder``.
 
     Attributes:
-        folder: of one function's views.
+        folder: of one function's views, or of a series' frames.
         settings: everything that the files depend on, plain values; the hash is theirs.
         shard: whose manifest this is.
         files: relative path -> {"bytes", "sha256"} of each file that was written whole, other parts' included.
         own: those of ``files`` that this part records.
+        what: the folder holds, a key of `COMMANDS`.
     """
 
     folder: Path
@@ -64,6 +66,7 @@ class Manifest:
     shard: Shard = field(default_factory=Shard)
     files: dict[str, dict[str, Any]] = field(default_factory=dict)
     own: dict[str, dict[str, Any]] = field(default_factory=dict)
+    what: str = "views"
 
     @property
     def hash(self) -> str:
@@ -78,16 +81,18 @@ class Manifest:
             overwrite: remove what an earlier run wrote, whatever its settings.
 
         Raises:
-            UsageError: the folder holds another run's views, or files that no manifest knows.
+            UsageError: the folder holds another run's files, or files that no manifest knows.
             DataError: a manifest that is none.
         """
         found = self._manifests()
         if overwrite:
             self._clear(found)
         for path in [] if overwrite else found:
-            document = read_manifest(path)
+            document = read_manifest(path, self.what)
             if document["hash"] != self.hash:
-                raise UsageError(f"{self.folder}: {difference(document['settings'], self.settings)}; {FRESH}")
+                raise UsageError(
+                    f"{self.folder}: {difference(document['settings'], self.settings, self.what)}; {FRESH}"
+                )
             self.files |= document["files"]
             if path.name == self.shard.manifest:
                 self.own = document["files"]
@@ -101,7 +106,7 @@ class Manifest:
         """Take in what other parts have recorded meanwhile."""
         for path in self._manifests():
             if path.name != self.shard.manifest:
-                self.files |= read_manifest(path)["files"]
+                self.files |= read_manifest(path, self.what)["files"]
 
     def _manifests(self) -> list[Path]:
         if not self.folder.is_dir():
@@ -111,7 +116,7 @@ class Manifest:
     def _clear(self, found: list[Path]) -> None:
         for path in found:
             try:
-                written = read_manifest(path)["files"]
+                written = read_manifest(path, self.what)["files"]
             except DataError:  # not ours: it is replaced, nothing else is
                 written = {}
             for name in written:
@@ -130,13 +135,16 @@ class Manifest:
         for name in names:
             path = self.folder / name
             self.files[name] = self.own[name] = {"bytes": path.stat().st_size, "sha256": file_digest(path)}
-        document = {"format": FORMAT, "schema": SCHEMA, "hash": self.hash, "settings": self.settings, "files": self.own}
+        document = {
+            "format": f"vvgt-{self.what}", "schema": SCHEMA, "hash": self.hash, "settings": self.settings,
+            "files": self.own,
+        }  # fmt: skip
         with atomic_write(self.folder / self.shard.manifest, overwrite=True) as temporary:
             temporary.write_text(json.dumps(document, indent=1) + "\n", "utf-8")
 
 
-def read_manifest(path: Path) -> dict[str, Any]:
-    """A manifest's document.
+def read_manifest(path: Path, what: str = "views") -> dict[str, Any]:
+    """A manifest's document, of a folder of ``what`` (a key of `COMMANDS`).
 
     Raises:
         DataError: not one, or one that names files outside its folder.
@@ -144,23 +152,23 @@ def read_manifest(path: Path) -> dict[str, Any]:
     try:
         document = json.loads(path.read_text("utf-8"))
         entries = [(PurePosixPath(name), entry["bytes"], entry["sha256"]) for name, entry in document["files"].items()]
-        known = (document["format"], document["schema"]) == (FORMAT, SCHEMA)
+        known = (document["format"], document["schema"]) == (f"vvgt-{what}", SCHEMA)
         known = known and isinstance(document["hash"], str) and isinstance(document["settings"], dict)
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         known, entries = False, []
     if not known or any(name.is_absolute() or ".." in name.parts for name, _, _ in entries):
-        raise DataError(f"{path}: not a manifest of 'vvgt render-views' (schema {SCHEMA}); {FRESH}")
+        raise DataError(f"{path}: not a manifest of '{COMMANDS[what]}' (schema {SCHEMA}); {FRESH}")
     return document
 
 
-def difference(there: dict[str, Any], here: dict[str, Any]) -> str:
+def difference(there: dict[str, Any], here: dict[str, Any], what: str = "views") -> str:
     """What two runs differ in, one line."""
     parts = []
     for key in dict.fromkeys([*here, *there]):
         a, b = there.get(key), here.get(key)
         if a != b:
             parts.append(DIGESTS.get(key) or f"{key.replace('_', ' ')} {_shown(a)} there, {_shown(b)} here")
-    return "holds views of another run: " + (", ".join(parts) or "its manifest was edited")
+    return f"holds {what} of another run: " + (", ".join(parts) or "its manifest was edited")
 
 
 def _shown(value: Any) -> str:

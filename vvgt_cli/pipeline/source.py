@@ -23,6 +23,7 @@ class SourceRequest:
         tf: transfer-function file or colour-map name; None makes one from the histogram.
         tf_range: "data", "rescale" or "LO,HI".
         unit_distance: a length, "paraview", "mean-spacing", or None: the function's own, else "paraview".
+        statistics: what the function's nodes follow from in place of the volume's own: those of the whole series.
     """
 
     volume: str
@@ -30,6 +31,7 @@ class SourceRequest:
     tf: str | None = None
     tf_range: str = "data"
     unit_distance: str | None = None
+    statistics: Statistics | None = None
 
 
 @dataclass(frozen=True)
@@ -83,7 +85,8 @@ def load_all(request: SourceRequest, tfs: Sequence[str | None]) -> list[Source]:
     numbers = statistics(volume)
     sources = []
     for tf, (distance, label) in zip(functions, distances, strict=True):
-        shown = resolve(tf, numbers, tf_range) if tf else from_histogram(numbers)
+        whole = request.statistics or numbers
+        shown = resolve(tf, whole, tf_range) if tf else from_histogram(whole)
         check_visible(shown, numbers)
         sources.append(Source(volume, numbers, shown, distance, label))
     return sources

@@ -81,7 +81,10 @@ def read_glob(pattern: str, options: ReadOptions) -> Volume | None:
         return None
     odd = next((path for path in files if path.suffix.lower() not in SUFFIXES), None)
     if odd is not None:
-        raise DataError(f"{pattern}: {odd.name} is no TIFF slice; expected slices ({', '.join(SUFFIXES)}), or one file")
+        raise DataError(
+            f"{pattern}: {odd.name} is no TIFF slice; expected slices ({', '.join(SUFFIXES)}), one "
+            "file, or frames of a series with a number in -o, as out_{:04d}.ply"
+        )
     return read_slices(files, options, pattern, re.sub(r"[\W_]+$", "", files[0].stem.rstrip("0123456789")) or "slices")
 
 
