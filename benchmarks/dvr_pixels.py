@@ -33,7 +33,7 @@ def measure(scene: Scene) -> dict[str, Any]:
     """One row: means over the views."""
     rows = []
     for camera in (default_views("test")[i] for i in VIEWS):
-        exact = render_view(scene, camera, RenderSettings(samples=8, adaptive=False))
+        exact = render_view(scene, camera, RenderSettings(samples=8))
         one = render_view(scene, camera, RenderSettings(samples=1))
         adaptive = render_view(scene, camera, RenderSettings())
         every = render_view(scene, camera, RenderSettings(adaptive=False))

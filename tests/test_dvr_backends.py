@@ -67,7 +67,7 @@ def test_torch_matches_the_twin(device, eye, bad):
 
 def test_torch_integrates_pixels_as_the_kernel_does(device):
     made, camera = scene(), view()
-    for settings in (RenderSettings(step=0.5), RenderSettings(step=0.5, samples=2, adaptive=False)):
+    for settings in (RenderSettings(step=0.5), RenderSettings(step=0.5, samples=2)):
         kernel = render_views(made, [camera], settings)[0]
         np.testing.assert_allclose(torch_view(device, made, camera, settings), kernel, atol=5e-3)  # sub-segments differ
 

@@ -9,6 +9,8 @@ import pytest
 
 from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.dvr import RenderSettings, Scene, render_view, render_view_reference, render_views
+from vvgt_cli.dvr.render import ray_offsets
+from vvgt_cli.dvr.runs import NEAR
 from vvgt_cli.errors import UsageError
 from vvgt_cli.transfer.colormap import ColorMap
 from vvgt_cli.transfer.opacity import PiecewiseOpacity
@@ -243,20 +245,67 @@ def test_a_constant_volume_takes_one_value_of_the_function(value):
 
 
 @pytest.mark.parametrize("samples", [2, 3])
-def test_grids_of_rays_average_and_adaptive_ones_spare_flat_parts_of_the_picture(samples):
+def test_grids_of_rays_average(samples):
+    scene = Scene.build(Volume(smooth(10)), Function([0, 0.5, 0.51, 1], [0, 0, 0.5, 0.5]), 1.0)
+    every = render_view(scene, camera(48, 48), RenderSettings(step=0.25, samples=samples))
+    reference = render_view_reference(scene, camera(48, 48), step=1 / 16, samples=samples)
+    assert np.abs(every - reference).mean() < 1e-3
+
+
+def test_pixels_get_as_many_rays_as_they_differ_from_their_neighbours():
     scene = Scene.build(Volume(smooth(10)), Function([0, 0.5, 0.51, 1], [0, 0, 0.5, 0.5]), 1.0)
     c = camera(48, 48)
-    every = render_view(scene, c, RenderSettings(step=0.25, samples=samples, adaptive=False))
-    reference = render_view_reference(scene, c, step=1 / 16, samples=samples)
-    assert np.abs(every - reference).mean() < 1e-3
-    adaptive = render_view(scene, c, RenderSettings(step=0.25, samples=samples))
-    single = render_view(scene, c, RenderSettings(step=0.25, samples=1))
-    same = np.abs(adaptive - every).max(axis=-1) < 2e-7
+    fine, single = (render_view(scene, c, RenderSettings(step=0.25, samples=n)) for n in (8, 1))
+    adaptive = render_view(scene, c, RenderSettings(step=0.25))
+    padded = np.pad(single, ((1, 1), (1, 1), (0, 0)), mode="edge")
+    around = [padded[i : i + 48, j : j + 48] for i in range(3) for j in range(3)]
+    differ = np.max([np.abs(single - other).max(axis=-1) for other in around], axis=0)
+    mask = differ > 0.08
+    assert 0.01 < mask.mean() < 0.5
     kept = (adaptive == single).all(axis=-1)
-    assert (same | kept).all()
-    assert not same.all()
-    assert not kept.all()
-    assert np.abs(adaptive - every).max() < 0.02
+    assert kept[~mask].all()
+    assert kept[mask].mean() < 0.1  # rays that all miss, or see the same
+    errors = [np.sqrt(np.mean((image - fine) ** 2)) for image in (single, adaptive)]
+    assert errors[1] < 0.3 * errors[0]
+    grids = render_view(scene, c, RenderSettings(step=0.25, tiers=((0.08, 9),)))
+    every = render_view(scene, c, RenderSettings(step=0.25, samples=3))
+    np.testing.assert_allclose(grids, np.where(mask[..., None], every, single), atol=2e-7)
+
+
+@pytest.mark.parametrize("count", [5, 13])
+def test_rays_of_a_lattice_share_no_row_or_column_and_have_a_pixels_moments(count):
+    offsets = ray_offsets(count)
+    assert (offsets == 0).all(axis=1).any()
+    assert np.abs(offsets).max() < 0.5
+    for axis in offsets.T:
+        np.testing.assert_allclose(np.sort(axis), (np.arange(count) - count // 2) / count)
+    np.testing.assert_allclose((offsets**2).mean(axis=0), 1 / 12, rtol=1.1 / count**2)
+    assert abs(offsets.prod(axis=1).mean()) < 0.01
+
+
+def test_other_numbers_of_rays_are_refused():
+    with pytest.raises(ValueError, match="6 rays a pixel"):
+        ray_offsets(6)
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 4), (1, 2, 2), (2, 1, 2), (1, 1, 3), (2, 2, 2), (1, 3, 5)])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_few_integer_voxels_read_nothing_beyond_the_last(shape, dtype):
+    values = np.random.default_rng(3).integers(60, 255, shape).astype(dtype)
+    scene = Scene.build(Volume(values), Function([0, 255], [0, 0.9]), 1.0)
+    image = render_view(scene, camera(), FINE)
+    np.testing.assert_allclose(image, render_view_reference(scene, camera(), step=1 / 32), atol=2e-3)
+
+
+def test_slabs_beyond_32_bit_offsets_are_read_as_others():
+    values = np.zeros((3, 4100, 4100), np.uint8)
+    values[:, 2000:2100, 2000:2100] = np.random.default_rng(5).integers(0, 255, (3, 100, 100))
+    assert values[0].size > NEAR
+    scene = Scene.build(Volume(values), Function([0, 255], [0, 0.9]), 1.0)
+    close = camera(8, 8, eye=(0.004, -0.002, 0.02), fov=60.0)
+    image = render_view(scene, close, FINE)
+    assert image[..., 3].max() > 0.1
+    np.testing.assert_allclose(image, render_view_reference(scene, close, step=1 / 32), atol=2e-3)
 
 
 def test_views_are_the_same_bytes_every_time_and_report_progress():

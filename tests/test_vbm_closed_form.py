@@ -21,7 +21,7 @@ from vvgt_cli.volume import Volume
 
 FIELDS = ("means", "log_scales", "quaternions", "opacity_logits", "colors")
 SIZE = 64
-EVERYWHERE = RenderSettings(samples=3, adaptive=False)  # what is thinner than a pixel is met by some ray
+EVERYWHERE = RenderSettings(samples=3)  # what is thinner than a pixel is met by some ray
 
 
 def same_bytes(a: Gaussians, b: Gaussians) -> bool:

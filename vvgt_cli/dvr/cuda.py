@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.cameras import Camera
-from vvgt_cli.dvr.render import RenderSettings, edges
+from vvgt_cli.dvr.render import RenderSettings, cast_tiers
 from vvgt_cli.dvr.scene import Scene
 from vvgt_cli.errors import DataError, UsageError
 
@@ -36,13 +36,13 @@ def view_renderer(scene: Scene, settings: RenderSettings, device: str = "cuda") 
     field = Field.upload(scene, device)
 
     def draw(camera: Camera) -> np.ndarray:
-        pixels = np.indices((camera.height, camera.width)).reshape(2, -1)
-        first = 1 if settings.adaptive else settings.samples
-        image = field.pixels(camera, pixels, first, settings.step).reshape(camera.height, camera.width, 4)
-        if settings.adaptive and settings.samples > 1:
-            mask = edges(image)
-            if mask.any():
-                image[mask] = field.pixels(camera, np.array(np.nonzero(mask)), settings.samples, settings.step)
+        image = np.zeros((camera.height, camera.width, 4), np.float32)
+
+        def cast(offsets: np.ndarray, mask: np.ndarray, known: int) -> None:
+            new = field.pixels(camera, np.array(np.nonzero(mask)), offsets, settings.step)
+            image[mask] = (known * image[mask] + len(offsets) * new) / (known + len(offsets))
+
+        cast_tiers(settings, image, cast)
         return image
 
     return draw
@@ -65,22 +65,21 @@ class Field:
         nodes, cumulative = (torch.from_numpy(t).to(device) for t in (scene.tables.nodes, scene.tables.cumulative))
         return cls(scene, values, nodes, cumulative)
 
-    def pixels(self, camera: Camera, pixels: np.ndarray, grid: int, step: float) -> np.ndarray:
-        """Means over ``grid`` x ``grid`` rays of ``pixels`` (2, n), rows and columns: (n, 4) float32."""
+    def pixels(self, camera: Camera, pixels: np.ndarray, offsets: np.ndarray, step: float) -> np.ndarray:
+        """Means over the rays at ``offsets`` (m, 2) of ``pixels`` (2, n), rows and columns: (n, 4) float32."""
         import torch
 
-        at = (np.arange(grid) + 0.5) / grid
-        block = max(RAYS // grid**2, 1)
+        at = 0.5 + offsets
+        block = max(RAYS // len(at), 1)
         parts = []
         for start in range(0, pixels.shape[1], block):
-            row, col = pixels[:, start : start + block, None, None]
-            b = np.broadcast_to((row + at[:, None] - camera.cy) / camera.fy, (*row.shape[:1], grid, grid))
-            a = np.broadcast_to((col + at[None, :] - camera.cx) / camera.fx, b.shape)
+            row, col = pixels[:, start : start + block, None]
+            a, b = (col + at[:, 0] - camera.cx) / camera.fx, (row + at[:, 1] - camera.cy) / camera.fy
             local = np.stack([a, b, np.ones_like(a)], axis=-1).reshape(-1, 3)
             local /= np.linalg.norm(local, axis=1, keepdims=True)
             directions = torch.from_numpy(local @ camera.rotation).to(self.values.device)
             rgba = self.march(camera.position, directions, step)
-            parts.append(rgba.reshape(-1, grid * grid, 4).mean(dim=1).float().cpu().numpy())
+            parts.append(rgba.reshape(-1, len(at), 4).mean(dim=1).float().cpu().numpy())
         return np.concatenate(parts)
 
     def march(self, eye: np.ndarray, directions: Any, step: float) -> Any:

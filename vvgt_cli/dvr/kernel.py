@@ -252,19 +252,12 @@ def cast(values, lo, inv_width, nodes, cumulative, dark, empty, px, py, pz, dx, 
 
 
 @_jit
-def _pixel(values, lo, inv_width, nodes, cumulative, dark, empty, eye, basis, lens, step, col, row, grid, known):
-    """Sums over ``grid`` x ``grid`` rays of a pixel; with ``known`` the central one is left out."""
+def _pixel(values, lo, inv_width, nodes, cumulative, dark, empty, eye, basis, lens, step, col, row, offsets):
+    """Sums over the rays through the points ``offsets`` (n, 2: right, down) from the centre of a pixel."""
     acc0 = acc1 = acc2 = acc3 = 0.0
-    share = 1.0 / grid
-    column, line = -1, 0
-    for ray in range(grid * grid):
-        column += 1
-        if column == grid:
-            column, line = 0, line + 1
-        if known and 2 * ray + 1 == grid * grid:
-            continue
-        a = (col + (column + 0.5) * share - lens[2]) * lens[0]
-        b = (row + (line + 0.5) * share - lens[3]) * lens[1]
+    for ray in range(len(offsets)):
+        a = (col + 0.5 + offsets[U(ray), 0] - lens[2]) * lens[0]
+        b = (row + 0.5 + offsets[U(ray), 1] - lens[3]) * lens[1]
         norm = 1.0 / math.sqrt(a * a + b * b + 1.0)
         dx = (basis[0, 0] * a + basis[1, 0] * b + basis[2, 0]) * norm
         dy = (basis[0, 1] * a + basis[1, 1] * b + basis[2, 1]) * norm
@@ -278,38 +271,39 @@ def _pixel(values, lo, inv_width, nodes, cumulative, dark, empty, eye, basis, le
 
 @_jit
 def _tile(
-    values, lo, inv_width, nodes, cumulative, dark, empty, eye, basis, lens, step, top, left, grid, mask, known, out
+    values, lo, inv_width, nodes, cumulative, dark, empty, eye, basis, lens, step, top, left, offsets, mask, known, out
 ):
     """Pixels of one tile; arguments as of `render_tiles`."""
     height, width = out.shape[:2]
-    share = 1.0 / (grid * grid)
+    share = 1.0 / (known + len(offsets))
     for line in range(top, min(top + TILE, height)):
         for col in range(left, min(left + TILE, width)):
             if not mask[line, col]:
                 continue
             red, green, blue, alpha = _pixel(
-                values, lo, inv_width, nodes, cumulative, dark, empty, eye, basis, lens, step, col, line, grid, known
+                values, lo, inv_width, nodes, cumulative, dark, empty, eye, basis, lens, step, col, line, offsets
             )
             pixel = out[line, col]
-            if known:
-                red, green, blue, alpha = red + pixel[0], green + pixel[1], blue + pixel[2], alpha + pixel[3]
+            if known > 0:
+                red, green, blue = red + known * pixel[0], green + known * pixel[1], blue + known * pixel[2]
+                alpha += known * pixel[3]
             pixel[0], pixel[1], pixel[2], pixel[3] = red * share, green * share, blue * share, alpha * share
 
 
 @nb.njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
 def render_tiles(
-    values, lo, inv_width, nodes, cumulative, dark, empty, eye, basis, lens, step, order, grid, mask, known, out
+    values, lo, inv_width, nodes, cumulative, dark, empty, eye, basis, lens, step, order, offsets, mask, known, out
 ):
-    """Render one view into ``out`` (h, w, 4) float32 with ``grid`` x ``grid`` rays a pixel where ``mask`` is set.
+    """Render one view into ``out`` (h, w, 4) float32, rays at ``offsets`` (n, 2) in pixels where ``mask`` is set.
 
     ``eye`` (3,) and ``basis`` (3, 3: rows right, down, forward) are in voxel coordinates per unit-frame length;
     ``lens`` is (1/fx, 1/fy, cx, cy); ``order`` permutes the tiles (row-major) so that contiguous chunks of threads are
-    balanced; ``known`` says that ``out`` holds the central ray's result already and that ``grid`` is odd.
+    balanced; ``known``: number of rays whose mean ``out`` holds already.
     """
     across = (out.shape[1] + TILE - 1) // TILE
     for index in nb.prange(len(order)):
         top, left = order[index] // across * TILE, order[index] % across * TILE
         _tile(
-            values, lo, inv_width, nodes, cumulative, dark, empty, eye, basis, lens, step, top, left, grid, mask, known,
-            out,
+            values, lo, inv_width, nodes, cumulative, dark, empty, eye, basis, lens, step, top, left, offsets, mask,
+            known, out,
         )  # fmt: skip

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -11,7 +12,9 @@ from vvgt_cli.cameras import Camera
 from vvgt_cli.dvr.scene import Scene
 from vvgt_cli.errors import UsageError
 
-EDGE = 0.02  # neighbouring pixels that differ by more get a grid of rays
+# Pixels that differ from a neighbour by more than this get that many rays; five save half of what a grid of nine costs.
+ADAPTIVE = ((0.08, 5), (0.3, 13))
+LATTICE = {5: 2, 13: 5}  # point i of n at (i, k i mod n) / n: all columns and rows differ, which edges along axes need
 
 
 @dataclass(frozen=True)
@@ -20,24 +23,42 @@ class RenderSettings:
 
     Attributes:
         step: sampling distance in voxels; scalars are linear between samples (pre-integration).
-        samples: rays along a pixel's edge where neighbours differ by more than 0.02 (``adaptive``), else everywhere.
-        adaptive: False renders ``samples`` x ``samples`` rays in every pixel.
+        samples: rays along a pixel's edge, everywhere; None: as ``tiers`` say.
+        tiers: (difference, rays): pixels that differ from one of 8 neighbours by more than the first, rising, get so
+            many rays (5, 13 or an odd square), all others one.
     """
 
     step: float = 0.5
-    samples: int = 3
-    adaptive: bool = True
+    samples: int | None = None
+    tiers: tuple[tuple[float, int], ...] = ADAPTIVE
 
     def __post_init__(self) -> None:
         if not 0 < self.step <= 4:
             raise UsageError(f"step {self.step} voxels; expected more than 0 and at most 4")
-        if not 1 <= self.samples <= 16:
+        if self.samples is not None and not 1 <= self.samples <= 16:
             raise UsageError(f"samples {self.samples}; expected 1 to 16 rays along a pixel's edge")
 
 
-REFERENCE = RenderSettings(step=0.125, samples=3)
+REFERENCE = RenderSettings(step=0.125, tiers=((0.02, 9),))
 FIT_VIEWS = RenderSettings(step=1.0, samples=1)  # one ray a pixel: pixel-integrated views fit no better
-SCORE_VIEWS = RenderSettings(step=1.0, samples=2)
+SCORE_VIEWS = RenderSettings(step=1.0)
+
+
+def ray_offsets(count: int) -> np.ndarray:
+    """(count, 2) places of a pixel's rays, right and down from its centre in pixels: a lattice, or a grid of a square.
+
+    Raises:
+        ValueError: neither.
+    """
+    if count in LATTICE:
+        across = np.arange(count) - count // 2
+        down = (LATTICE[count] * across + count // 2) % count - count // 2
+        return np.stack([across, down], axis=1) / count
+    edge = math.isqrt(count)
+    if edge * edge != count:
+        raise ValueError(f"{count} rays a pixel; expected {', '.join(map(str, LATTICE))} or a square")
+    place = (np.arange(edge) + 0.5) / edge - 0.5
+    return np.stack([np.tile(place, edge), np.repeat(place, edge)], axis=1)
 
 
 def camera_arrays(scene: Scene, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -58,20 +79,25 @@ def tile_order(height: int, width: int) -> np.ndarray:
     return np.concatenate([np.arange(first, count, threads) for first in range(threads)])
 
 
-def edges(image: np.ndarray) -> np.ndarray:
-    """Pixels (h, w) of an image (h, w, c) that differ from one of 8 neighbours by more than `EDGE`."""
-    mask = np.zeros(image.shape[:2], bool)
-    pairs = [
-        (np.s_[1:, :], np.s_[:-1, :]),
-        (np.s_[:, 1:], np.s_[:, :-1]),
-        (np.s_[1:, 1:], np.s_[:-1, :-1]),
-        (np.s_[1:, :-1], np.s_[:-1, 1:]),
-    ]
-    for a, b in pairs:
-        differ = np.abs(image[a] - image[b]).max(axis=-1) > EDGE
-        mask[a] |= differ
-        mask[b] |= differ
-    return mask
+def cast_tiers(
+    settings: RenderSettings, image: np.ndarray, cast: Callable[[np.ndarray, np.ndarray, int], None]
+) -> None:
+    """Fill ``image`` (h, w, 4) by ``cast(offsets, mask, known)``: rays at ``offsets`` in the pixels of ``mask``,
+    averaged with the ``known`` ones that the image holds."""
+    from vvgt_cli.dvr.contrast import contrast
+
+    everywhere = np.ones(image.shape[:2], bool)
+    if settings.samples is not None:
+        cast(ray_offsets(settings.samples**2), everywhere, 0)
+        return
+    cast(np.zeros((1, 2)), everywhere, 0)
+    differ = contrast(image)
+    ends = [threshold for threshold, _ in settings.tiers[1:]]
+    for (low, count), high in zip(settings.tiers, [*ends, np.inf], strict=True):
+        mask = (differ > low) & (differ <= high)
+        if mask.any():
+            offsets = ray_offsets(count)
+            cast(offsets[np.any(offsets != 0, axis=1)], mask, 1)
 
 
 def render_view(scene: Scene, camera: Camera, settings: RenderSettings | None = None) -> np.ndarray:
@@ -82,21 +108,15 @@ def render_view(scene: Scene, camera: Camera, settings: RenderSettings | None = 
     tables = scene.tables
     eye, basis, lens = camera_arrays(scene, camera)
     out = np.zeros((camera.height, camera.width, 4), np.float32)
-    everywhere = np.ones(out.shape[:2], bool)
     order = tile_order(camera.height, camera.width)
-    first = 1 if settings.adaptive else settings.samples
 
-    def trace(grid: int, mask: np.ndarray, known: bool) -> None:
+    def cast(offsets: np.ndarray, mask: np.ndarray, known: int) -> None:
         render_tiles(
             scene.values, tables.lo, tables.inv_width, tables.nodes, tables.cumulative, tables.dark, scene.empty,
-            eye, basis, lens, float(settings.step), order, grid, mask, known, out,
+            eye, basis, lens, float(settings.step), order, offsets, mask, known, out,
         )  # fmt: skip
 
-    trace(first, everywhere, False)
-    if settings.adaptive and settings.samples > 1:
-        mask = edges(out)
-        if mask.any():
-            trace(settings.samples, mask, settings.samples % 2 == 1)
+    cast_tiers(settings, out, cast)
     return out
 
 

@@ -14,7 +14,9 @@ from numba.core import cgutils
 from vvgt_cli.dvr.vectors import intrinsic
 from vvgt_cli.jit import inlined
 
-RUN = 16  # samples of a run: one vector of AVX-512 float32, two of AVX2
+RUN = 32  # samples of a run: two vectors of AVX-512 float32, four of AVX2
+MOST = (1 << 31) - 1
+NEAR = MOST // (4 * RUN + 3)  # voxels of a slab up to which the offsets within a run of steps to 4 voxels fit 32 bits
 
 # Arrays are not reference-counted within these functions: counting cost 100 ns a ray.
 BORROWED = {"_nrt": False}
@@ -24,16 +26,16 @@ F, N, U = nb.float32, nb.int32, nb.uint64
 
 @intrinsic
 def stack_run(typingctx: Any) -> Any:
-    """Pointer to `RUN` float64 on the caller's stack.
+    """Pointer to `RUN` float32 on the caller's stack.
 
     Stores to memory that the compiler cannot tell apart from the volume would forbid it to vectorise.
     """
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        array = cgutils.alloca_once(builder, ir.ArrayType(ir.DoubleType(), RUN))
-        return builder.bitcast(array, ir.DoubleType().as_pointer())
+        array = cgutils.alloca_once(builder, ir.ArrayType(ir.FloatType(), RUN))
+        return builder.bitcast(array, ir.FloatType().as_pointer())
 
-    return types.CPointer(types.float64)(), codegen
+    return types.CPointer(types.float32)(), codegen
 
 
 @intrinsic
@@ -41,16 +43,16 @@ def run_range(typingctx: Any, run: Any) -> Any:
     """Smallest and largest of the `RUN` values behind a pointer; none may be NaN."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        vector = ir.VectorType(ir.DoubleType(), RUN)
-        values = builder.load(builder.bitcast(args[0], vector.as_pointer()), align=8)
-        kind = ir.FunctionType(ir.DoubleType(), [vector])
+        vector = ir.VectorType(ir.FloatType(), RUN)
+        values = builder.load(builder.bitcast(args[0], vector.as_pointer()), align=4)
+        kind = ir.FunctionType(ir.FloatType(), [vector])
         ends = []
         for name in ("fmin", "fmax"):
-            reduce = cgutils.get_or_insert_function(builder.module, kind, f"llvm.vector.reduce.{name}.v{RUN}f64")
+            reduce = cgutils.get_or_insert_function(builder.module, kind, f"llvm.vector.reduce.{name}.v{RUN}f32")
             ends.append(builder.call(reduce, [values], fastmath=("nnan", "nsz")))
         return context.make_tuple(builder, signature.return_type, ends)
 
-    return types.UniTuple(types.float64, 2)(run), codegen
+    return types.UniTuple(types.float32, 2)(run), codegen
 
 
 @intrinsic
@@ -64,13 +66,14 @@ def first_value(typingctx: Any, values: Any) -> Any:
 
 
 @intrinsic
-def _pair(typingctx: Any, values: Any, index: Any, edge: Any) -> Any:
+def _pair(typingctx: Any, values: Any, index: Any, edge: Any, last: Any) -> Any:
     """Values ``index + edge`` and ``index + 1`` behind a pointer, as float32.
 
-    Integers come in one load, without ``edge``: its weight is zero there, but a NaN would not vanish by that.
+    Integers come in one load of 32 bits, without ``edge``: its weight is zero there, but a NaN would not vanish by
+    that. ``last``: the highest index at which such a load stays within the array.
     """
     bits = values.dtype.bitwidth
-    whole, half = ir.IntType(2 * bits), ir.IntType(bits)
+    whole, half = ir.IntType(32), ir.IntType(bits)
 
     def floats(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         one = ir.Constant(args[1].type, 1)
@@ -79,14 +82,22 @@ def _pair(typingctx: Any, values: Any, index: Any, edge: Any) -> Any:
         return context.make_tuple(builder, signature.return_type, ends)
 
     def integers(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        place = builder.bitcast(builder.gep(args[0], [args[1]]), whole.as_pointer())
+        first, last = args[1], args[3]
+        if bits == 8:
+            first = builder.select(builder.icmp_signed("<", first, last), first, last)
+        place = builder.bitcast(builder.gep(args[0], [first]), whole.as_pointer())
         both = builder.load(place, align=bits // 8)
+        if bits == 8:
+            behind = builder.sub(args[1], first)
+            if behind.type.width > 32:
+                behind = builder.trunc(behind, whole)
+            both = builder.lshr(both, builder.shl(behind, ir.Constant(whole, 3)))
         parts = [both, builder.lshr(both, ir.Constant(whole, bits))]  # little-endian
         ends = [builder.uitofp(builder.trunc(part, half), ir.FloatType()) for part in parts]
         return context.make_tuple(builder, signature.return_type, ends)
 
     codegen = floats if isinstance(values.dtype, types.Float) else integers
-    return types.UniTuple(types.float32, 2)(values, index, edge), codegen
+    return types.UniTuple(types.float32, 2)(values, index, edge, last), codegen
 
 
 @inlined(error_model="numpy", **BORROWED)
@@ -99,45 +110,75 @@ def _base(p, v, n):
     return base, F(p - base), F(n - 1 - base)
 
 
+@intrinsic
+def _from(typingctx: Any, values: Any, index: Any) -> Any:
+    """Pointer to value ``index`` behind a pointer."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.gep(args[0], [args[1]])
+
+    return values(values, index), codegen
+
+
+def _sampler(index):
+    """The loop over a run, its offsets of type ``index``: 32 bits are one vector of AVX-512 where 64 are two."""
+
+    @inlined(fastmath={"contract", "nsz", "arcp", "afn"}, error_model="numpy", **BORROWED)
+    def samples(here, row, slab, last, start, step, top, last_voxel, table, out):
+        (x0, y0, z0), (dx, dy, dz), (x_top, y_top, z_top) = start, step, top
+        (last_i, last_j, last_k), (lo, inv_width, bins) = last_voxel, table
+        for n in range(RUN):
+            s = F(N(n))
+            x = min(max(x0 + s * dx, F(0)), x_top)
+            y = min(max(y0 + s * dy, F(0)), y_top)
+            z = min(max(z0 + s * dz, F(0)), z_top)
+            i, j, k = min(N(x), last_i), N(y), N(z)
+            fx, fy, fz = x - F(i), y - F(j), z - F(k)
+            edge = index(1 if N(x) > last_i else 0)
+            a = index(index(index(k) * slab) + index(index(j) * row) + index(i))
+            b = index(a + (row if j < last_j else index(0)))
+            above = slab if k < last_k else index(0)
+            c, d = index(a + above), index(b + above)
+            v00, w00 = _pair(here, a, edge, last)
+            v01, w01 = _pair(here, b, edge, last)
+            v10, w10 = _pair(here, c, edge, last)
+            v11, w11 = _pair(here, d, edge, last)
+            v00 += (w00 - v00) * fx
+            v01 += (w01 - v01) * fx
+            v10 += (w10 - v10) * fx
+            v11 += (w11 - v11) * fx
+            v00 += (v01 - v00) * fy
+            v10 += (v11 - v10) * fy
+            value = v00 + (v10 - v00) * fz
+            u = min(max((value - lo) * inv_width, F(0)), bins)
+            out[n] = u if abs(value) < F(np.inf) else F(-1)
+
+    return samples
+
+
+_near_samples, _far_samples = _sampler(nb.int32), _sampler(nb.int64)
+
+
 @inlined(fastmath={"contract", "nsz", "arcp", "afn"}, error_model="numpy", **BORROWED)
 def sample_run(values, flat, px, py, pz, vx, vy, vz, lo, inv_width, bins, out):
     """Table coordinates ``out`` (RUN,) in [0, bins] of the samples at p + k v, k < RUN; -1 where not finite.
 
     ``values`` (nz, ny, nx), ``flat`` its `first_value`; p, v in voxel coordinates. Integer volumes are at least two
-    voxels wide along x (`scene.kernel_values`). As `kernel.sample` and `kernel.table_coordinate`, in float32.
+    voxels wide along x and have four or more (`scene.kernel_values`). As `kernel.sample` and
+    `kernel.table_coordinate`, in float32.
     """
     nz, ny, nx = values.shape
     bx, x0, x_top = _base(px, vx, nx)
     by, y0, y_top = _base(py, vy, ny)
     bz, z0, z_top = _base(pz, vz, nz)
-    dx, dy, dz = F(vx), F(vy), F(vz)
-    row = nb.int64(nx)
-    slab = row * nb.int64(ny)
+    row, slab = nb.int64(nx), nb.int64(nx) * nb.int64(ny)
     first = bz * slab + by * row + bx
-    last_i, last_j, last_k = N(nx - 2 - bx), N(ny - 1 - by), N(nz - 1 - bz)  # the last pair along x
-    top = float(bins)
-    for n in range(RUN):
-        s = F(N(n))
-        x = min(max(x0 + s * dx, F(0)), x_top)
-        y = min(max(y0 + s * dy, F(0)), y_top)
-        z = min(max(z0 + s * dz, F(0)), z_top)
-        i, j, k = min(N(x), last_i), N(y), N(z)
-        fx, fy, fz = x - F(i), y - F(j), z - F(k)
-        edge = U(1 if N(x) > last_i else 0)
-        a = U(first + nb.int64(k) * slab + nb.int64(j) * row + nb.int64(i))
-        b = a + U(row if j < last_j else 0)
-        above = U(slab if k < last_k else 0)
-        c, d = a + above, b + above
-        v00, w00 = _pair(flat, a, edge)
-        v01, w01 = _pair(flat, b, edge)
-        v10, w10 = _pair(flat, c, edge)
-        v11, w11 = _pair(flat, d, edge)
-        v00 += (w00 - v00) * fx
-        v01 += (w01 - v01) * fx
-        v10 += (w10 - v10) * fx
-        v11 += (w11 - v11) * fx
-        v00 += (v01 - v00) * fy
-        v10 += (v11 - v10) * fy
-        value = nb.float64(v00 + (v10 - v00) * fz)
-        u = min(max((value - lo) * inv_width, 0.0), top)
-        out[n] = u if abs(value) < np.inf else -1.0
+    last = slab * nb.int64(nz) - 4 - first
+    here = _from(flat, first)
+    start, step, top = (x0, y0, z0), (F(vx), F(vy), F(vz)), (x_top, y_top, z_top)
+    last_voxel = N(nx - 2 - bx), N(ny - 1 - by), N(nz - 1 - bz)  # the last pair along x
+    table = F(lo), F(inv_width), F(bins)
+    if slab < NEAR:
+        _near_samples(here, N(row), N(slab), N(min(last, MOST)), start, step, top, last_voxel, table, out)
+    else:
+        _far_samples(here, row, slab, last, start, step, top, last_voxel, table, out)

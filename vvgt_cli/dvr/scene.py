@@ -83,7 +83,7 @@ def kernel_values(volume: Volume) -> tuple[np.ndarray, float, float]:
     if data.dtype == np.bool_:
         data = data.view(np.uint8)
     kind = data.dtype.newbyteorder("=")
-    if kind in (np.uint8, np.uint16) and data.shape[2] > 1:  # kernels read pairs of integers along x
+    if kind in (np.uint8, np.uint16) and data.shape[2] > 1 and data.size > 3:  # kernels read 32 bits at a time
         return _read_only(data, kind), volume.slope, volume.intercept
     if kind.itemsize <= 2:  # exact in float32
         return _read_only(data, np.dtype(np.float32)), volume.slope, volume.intercept

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 VIEW_BYTES = 2 * 16  # a pixel: float32 RGBA, and as much again while views are stacked
 REFINE_VIEWS = 72  # training views of gradient descent, which learns fewer by heart; the closed form takes a third
-LADDER = ((1.0, 1), (1.0, 2), (0.5, 1), (0.5, 2))  # steps in voxels and rays along a pixel's edge, by cost
+LADDER = ((1.0, 1), (1.0, None), (0.5, 1))  # steps in voxels and rays a pixel (None: adaptive), by cost
 MARGIN = 16.0  # dB
 PREVIEW_VIEWS = (0, 4, 9)  # test views of the preview, and of the score without a report: above, side, below
 
@@ -219,7 +219,7 @@ def _views(run: Run, scene: Scene, start: Gaussians, fit: FitOptions) -> tuple[V
         reference = render_views(scene, check, RenderSettings() if fit.steps else FIT_VIEWS)
         settings = _fine_enough(scene, Views(check, reference), start) if fit.steps else FIT_VIEWS
         images = render_views(scene, train, settings, progress=run.console.bar("views"))
-        rays = "one ray" if settings.samples == 1 else f"up to {settings.samples**2} rays"
+        rays = "one ray" if settings.samples == 1 else "adaptive rays"
         how = f", {rays} a pixel, steps of {settings.step:g}" if fit.steps else ""
         stage.note = f"{len(train)} to fit to, {len(check)} to check by, {fit.size} px{how}"
     return Views(train, images), Views(check, reference)

@@ -135,6 +135,6 @@ def _reference_psnr(scene: Scene, request: EvaluateRequest) -> float:
     offset = (request.size - edge) // 2
     middle = replace(whole, cx=whole.cx - offset, cy=whole.cy - offset, width=edge, height=edge)
     settings = replace(REFERENCE, step=request.step)
-    finer = replace(settings, step=settings.step / 2, samples=2 * settings.samples)
+    finer = replace(settings, step=settings.step / 2, tiers=tuple((edge, 4 * rays) for edge, rays in settings.tiers))
     images = [render_view(scene, middle, s) for s in (finer, settings)]
     return score_view(images[0], images[1], perceptual=False).psnr

@@ -99,7 +99,7 @@ class ViewsRequest:
         cameras: which views.
         layout: which files.
         renderer: ``cpu``, ``cuda`` or ``vtk``.
-        samples: rays along a pixel's edge everywhere, None: 3 where neighbours differ, else 1.
+        samples: rays along a pixel's edge everywhere, None: 5 or 13 where neighbours differ, else 1.
         step: sampling distance in voxels.
         shard: which part of the views to render.
         overwrite: start afresh where another run's views are.
@@ -239,8 +239,7 @@ def _work(run: Run, request: ViewsRequest, job: _Job, views: list[View]) -> None
             scene = job.source.scene()
             stage.note = f"{job.source.tf.name}, opacity per {job.source.unit_distance:g} ({job.source.unit_label})"
     if job.pending:
-        samples, adaptive = request.samples or RenderSettings.samples, request.samples is None
-        draw = view_renderer(request.renderer, scene, RenderSettings(request.step, samples, adaptive))
+        draw = view_renderer(request.renderer, scene, RenderSettings(request.step, request.samples))
     if models:
         with run.stage("points") as stage:
             points, colors = start_points(scene, views[0].camera.height)

@@ -1,0 +1,36 @@
+"""Where neighbouring pixels differ: which pixels need more rays."""
+
+from __future__ import annotations
+
+import numba as nb
+import numpy as np
+
+from vvgt_cli.jit import inlined
+
+
+@inlined()
+def _apart(image, row, col, i, j):
+    """Largest difference between two pixels in any channel."""
+    most = 0.0
+    for channel in range(image.shape[2]):
+        most = max(most, abs(image[row, col, channel] - image[i, j, channel]))
+    return most
+
+
+@nb.njit(parallel=True, cache=True)
+def _contrast(image, out):
+    height, width = out.shape
+    for row in nb.prange(height):
+        for col in range(width):
+            most = 0.0
+            for i in range(max(row - 1, 0), min(row + 2, height)):
+                for j in range(max(col - 1, 0), min(col + 2, width)):
+                    most = max(most, _apart(image, row, col, i, j))
+            out[row, col] = most
+
+
+def contrast(image: np.ndarray) -> np.ndarray:
+    """Largest difference of each pixel from its 8 neighbours, (h, w), in any channel of an image (h, w, c)."""
+    out = np.empty(image.shape[:2], image.dtype)
+    _contrast(image, out)
+    return out
