@@ -264,7 +264,7 @@ def test_pixels_get_as_many_rays_as_they_differ_from_their_neighbours():
     assert 0.01 < mask.mean() < 0.5
     kept = (adaptive == single).all(axis=-1)
     assert kept[~mask].all()
-    assert kept[mask].mean() < 0.1  # rays that all miss, or see the same
+    assert kept[mask].mean() < 0.25  # rays that all miss, or all end in the same opaque matter
     errors = [np.sqrt(np.mean((image - fine) ** 2)) for image in (single, adaptive)]
     assert errors[1] < 0.3 * errors[0]
     grids = render_view(scene, c, RenderSettings(step=0.25, tiers=((0.08, 9),)))

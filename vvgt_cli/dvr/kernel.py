@@ -290,7 +290,7 @@ def _tile(
             pixel[0], pixel[1], pixel[2], pixel[3] = red * share, green * share, blue * share, alpha * share
 
 
-@nb.njit(parallel=True, cache=True, fastmath=FLAGS, error_model="numpy")
+@nb.njit(parallel=True, cache=True, nogil=True, fastmath=FLAGS, error_model="numpy")
 def render_tiles(
     values, lo, inv_width, nodes, cumulative, dark, empty, eye, basis, lens, step, order, offsets, mask, known, out
 ):

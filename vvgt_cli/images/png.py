@@ -41,6 +41,7 @@ def write_png(path: str | PathLike[str], image: np.ndarray, overwrite: bool = Fa
     spec = oiio.ImageSpec(width, height, channels, oiio.UINT8)
     spec.attribute("oiio:UnassociatedAlpha", 1)  # straight already: the writer must not divide again
     spec.attribute("oiio:ColorSpace", "sRGB")
+    spec.attribute("png:compressionLevel", 3)
     with atomic_write(path, overwrite) as temporary:
         output = oiio.ImageOutput.create("png")
         if output is None or not output.open(str(temporary), spec):

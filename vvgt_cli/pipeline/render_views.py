@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -261,10 +262,17 @@ def _render(run: Run, request: ViewsRequest, job: _Job, draw: Callable[[Camera],
     _sweep(job, request.layout)
     with run.stage("views") as stage:
         bar = run.console.bar("views")
-        for done, view in enumerate(job.pending, 1):
-            job.manifest.record(request.layout.write(job.folder, view, draw(view.camera)))
-            if bar:
-                bar(done, len(job.pending))
+        with ThreadPoolExecutor(1) as writer:  # compresses one view while the next is rendered
+            written: Future[list[str]] = writer.submit(list)
+            try:
+                for done, view in enumerate(job.pending, 1):
+                    image = draw(view.camera)
+                    job.manifest.record(written.result())
+                    written = writer.submit(request.layout.write, job.folder, view, image)
+                    if bar:
+                        bar(done, len(job.pending))
+            finally:
+                job.manifest.record(written.result())
         camera = job.pending[0].camera
         stage.note = f"{len(job.pending)} views of {camera.width} x {camera.height} px in {job.folder}"
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vvgt_cli.cameras import Camera
+from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.cameras.colmap import colmap_model, point_cloud_ply
 from vvgt_cli.cameras.files import blender_json, transforms_json
 from vvgt_cli.images import contact_sheet, over, write_exr, write_png
@@ -22,6 +22,8 @@ FORMATS = ("both", "exr", "png")
 CONTACT = "contact.png"
 POINTS_FILE = "points3d.ply"  # the original 3DGS code looks for this name
 POINTS = 20_000  # Gaussians of the closed form whose centres become the cloud
+COARSER = 4  # that many are wider than cells for the images' own size: these would cost four times the time
+POINT_VIEWS, POINT_VIEW_SIZE = 12, 80  # that decide what is seen
 THUMBNAIL = 160  # pixels along a thumbnail's edge, at most
 
 
@@ -124,9 +126,10 @@ def start_points(scene: Scene, size: int) -> tuple[np.ndarray, np.ndarray]:
         scene: the volume under its function.
         size: image height in pixels.
     """
-    from vvgt_cli.vbm import VbmOptions, initialise
+    from vvgt_cli.vbm.closed_form import closed_form
 
-    gaussians = initialise(scene, VbmOptions(max_gaussians=POINTS, size=size)).gaussians
+    cameras = default_views("train", POINT_VIEWS, size=POINT_VIEW_SIZE)
+    gaussians = closed_form(scene, POINTS, max(size // COARSER, 1), cameras).gaussians()
     return gaussians.means.astype(np.float64), np.clip(gaussians.colors, 0, 1)
 
 
