@@ -31,7 +31,7 @@ from vvgt_cli.dvr.reference import optics, rays, trilinear
 from vvgt_cli.dvr.vtk import aim, image_data, read_pixels, require_opengl, volume_property
 
 NAMES = ("bonsai-tree", "embryo-shells", "headsq-bone-skin", "spm152-tissue")
-VIEWS, REPEATS, SAMPLE_FLOPS = (0, 3), 3, 50
+VIEWS, REPEATS, SAMPLE_FLOPS = (0, 3), 5, 50
 SPARSE = 50  # pixels along the edge of the views whose samples are counted
 OURS, THEIRS = (0.5, 1.0, 1.25, 1.5, 2.0), (0.5, 1.0)  # voxels between samples
 

@@ -69,7 +69,7 @@ ray_options = group(
     ),
     samples=click.option(
         "--samples", default="adaptive", show_default=True, callback=_samples, metavar="adaptive|N",
-        help="Rays a pixel: 3 x 3 where neighbours differ and one elsewhere, or N x N everywhere.",
+        help="Rays a pixel: 5 or 13 where neighbours differ and one elsewhere, or N x N everywhere.",
     ),
     step=click.option(
         "--step", type=click.FloatRange(0, 4, min_open=True), default=0.5, show_default=True, metavar="VOXELS",
