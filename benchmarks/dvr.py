@@ -23,7 +23,7 @@ SAMPLE_FLOPS = 50  # position 6, trilinear 24, table coordinate 4, compositing t
 SETTINGS = {
     "one ray, half a voxel": RenderSettings(samples=1),
     "one ray, a voxel": RenderSettings(step=1.0, samples=1),
-    "3 x 3 at edges": RenderSettings(),
+    "adaptive": RenderSettings(),
     "reference": REFERENCE,
 }
 

@@ -3,11 +3,11 @@
     PYTHONPATH=. python benchmarks/dvr_pixels.py SCENES.tsv DATA_DIR TF_DIR -o docs/dvr-pixels.csv
     PYTHONPATH=. python benchmarks/dvr_pixels.py --table docs/dvr-pixels.csv
 
-400 px, two test views, half-voxel steps on both sides. Errors are of RGB in dB: of one ray a pixel, of the default (5 rays
-where neighbours differ by more than 0.08, 13 by more than 0.3), of what references use (3 x 3 above 0.02), of 3 x 3
-everywhere. `rays` is the mean number of rays a pixel of the default; `missed` the share of its pixels with one ray whose
-error is above 0.08: features that fall between the first pass's rays. `seconds_24` is the wall time of the 24 training
-views by default, `one_ray_24` with one ray a pixel.
+400 px, two test views, half-voxel steps on both sides. Errors are of RGB in dB: of one ray a pixel, of the default (5
+rays where neighbours differ by more than 0.08, 13 by more than 0.3), of what references use (3 x 3 above 0.02), of
+3 x 3 everywhere. `rays` is the mean number of rays a pixel of the default; `missed` the share of its pixels with one
+ray whose error is above 0.08: features that fall between the first pass's rays. `seconds_24` is the wall time of the 24
+training views by default, `one_ray_24` with one ray a pixel.
 """
 
 from __future__ import annotations
