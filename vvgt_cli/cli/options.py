@@ -47,7 +47,13 @@ def _component(ctx: click.Context, param: click.Parameter, value: str | None) ->
 
 read_options = group(
     "read",
-    dims=click.option("--dims", nargs=3, type=click.IntRange(1), metavar="X Y Z", help="Voxels of a raw file."),
+    dims=click.option(
+        "--dims",
+        nargs=3,
+        type=click.IntRange(1),
+        metavar="X Y Z",
+        help="Voxels of a raw file, or of the grid to resample a mesh to.",
+    ),
     dtype=click.option("--dtype", metavar="TYPE", help="Type of a raw file's values: uint8, int16, float32, ..."),
     byte_order=click.option("--byte-order", type=click.Choice(["little", "big"]), help="Of a raw file."),
     header_bytes=click.option(
