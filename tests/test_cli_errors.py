@@ -74,7 +74,7 @@ CASES = {
     "evaluate missing": (("evaluate", "no.ply", "--volume", "v.raw", *RAW), 1, "no.ply"),
     "evaluate both": (("evaluate", "-", "--volume", "-", *RAW), 2, "standard input"),
     "info missing": (("info", "no.raw"), 1, "no.raw"),
-    "info directory": (("info", "."), 1, "directory"),
+    "info directory": (("info", "."), 1, "a folder; expected"),
     "show suffix": (("tf", "show", "good.json", "-o", "a.txt"), 2, ".png"),
     "show broken": (("tf", "show", "broken.json", "-o", "a.png"), 1, "broken.json"),
     "show no volume": (("tf", "show", "good.json", "-o", "a.png", "--tf-range", "0,1"), 2, "--volume"),

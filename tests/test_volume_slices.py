@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import json
 import sys
 from pathlib import Path
 
@@ -230,3 +231,15 @@ def test_nrrd_in_several_files(tmp_path: Path, encoding: str, pack) -> None:
     ):
         with pytest.raises(DataError, match=message):
             read_volume(nhdr(tmp_path / "v.nhdr", named, encoding))
+
+
+def test_info_takes_folders_globs_and_inner_paths(vvgt, tmp_path: Path) -> None:
+    write_series(tmp_path / "scan")
+    write_slices(tmp_path / "stack", VALUES.astype(np.float32))
+    np.savez(tmp_path / "v.npz", field=VALUES, other=VALUES)
+    for source in ("scan", "stack", "stack/*.tif", "v.npz:/field"):
+        done = vvgt("info", f"{tmp_path}/{source}", "--json")
+        assert done.code == 0, done.err
+        assert json.loads(done.out)["dims"] == [5, 4, 3]
+    (tmp_path / "empty").mkdir()
+    assert "a folder; expected a volume file" in vvgt("info", tmp_path / "empty").error

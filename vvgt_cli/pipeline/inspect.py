@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import io
+import os
 import sys
 from pathlib import Path
 from typing import Any
 
 from vvgt_cli.cameras.files import read_cameras
-from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import describe, read_ply
 from vvgt_cli.pipeline.render import STDIN
 from vvgt_cli.transfer.readers import SUFFIXES
@@ -26,13 +26,9 @@ def inspect(file: str, read: ReadOptions) -> dict[str, Any]:
     """
     if file == STDIN and _head_of_stdin().startswith(_PLY):
         return {"kind": "gaussians", "name": "standard input", **describe(*read_ply(sys.stdin.buffer))}
-    if file == STDIN or file.startswith("example:"):
+    if not os.path.isfile(file):  # standard input, example:NAME, a folder, a glob, FILE:/array, or nothing
         return _volume(file, read)
     path = Path(file)
-    if path.is_dir():
-        raise DataError(f"{file}: is a directory; expected a volume, a transfer function, a view set or a .ply")
-    if not path.exists():
-        raise DataError(f"{file}: no such file; expected a volume, a transfer function, a view set or a .ply")
     with path.open("rb") as stream:
         head = stream.read(_HEAD)
     if head.startswith(_PLY):

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from vvgt_cli.volume.registry import Reader, register
 from vvgt_cli.volume.types import Volume
 
 MOST = 100_000  # files
+TRIED = 1000  # files of a folder that are looked at to see whether it holds DICOM
 ANGLE = 1e-3  # of a unit normal: how far slices may be tilted against each other
 EVEN = 0.01  # of the spacing: how far a slice may be off
 
@@ -41,17 +43,24 @@ def _files(folder: Path) -> Iterator[Path]:
             if seen > MOST:
                 raise DataError(f"{folder}: more than {MOST} files; expected the folder of one series")
             path = Path(root, name)
-            try:
-                with open(path, "rb") as file:
-                    found = _is_dicom(file.read(132))
-            except OSError:
-                continue
-            if found and name != "DICOMDIR":
+            if name != "DICOMDIR" and _begins_as_dicom(path):
                 yield path
 
 
 def _holds(folder: Path) -> bool:
-    return next(_files(folder), None) is not None
+    """Whether there is a DICOM file among the first `TRIED` of a folder and the folders in it."""
+    every = (Path(root, name) for root, _, names in os.walk(folder) for name in names)
+    return any(map(_begins_as_dicom, islice(every, TRIED)))
+
+
+def _begins_as_dicom(path: Path) -> bool:
+    try:
+        if not path.is_file():  # a pipe would wait
+            return False
+        with open(path, "rb") as file:
+            return _is_dicom(file.read(132))
+    except OSError:
+        return False
 
 
 @dataclass(frozen=True)
