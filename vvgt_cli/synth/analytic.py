@@ -30,7 +30,8 @@ def _axes(size: Size) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return x[None, None, :], y[None, :, None], z[:, None, None]
 
 
-def _volume(values: np.ndarray, name: str) -> Volume:
+def volume_of(values: np.ndarray, name: str) -> Volume:
+    """Values (nz, ny, nx) as a float32 volume with cubic voxels, centred on 0, longest edge 2."""
     nz, ny, nx = values.shape
     h = 2.0 / max(nx, ny, nz)
     origin = tuple(-(n - 1) / 2 * h for n in (nx, ny, nz))
@@ -50,14 +51,14 @@ def marschner_lobb(size: Size = 64, frequency: float = 6.0, alpha: float = 0.25)
     """
     x, y, z = _axes(size)
     ripples = np.cos(2 * np.pi * frequency * np.cos(np.pi * np.sqrt(x * x + y * y) / 2))
-    return _volume((1 - np.sin(np.pi * z / 2) + alpha * (1 + ripples)) / (2 * (1 + alpha)), "marschner-lobb")
+    return volume_of((1 - np.sin(np.pi * z / 2) + alpha * (1 + ripples)) / (2 * (1 + alpha)), "marschner-lobb")
 
 
 def blob(size: Size = 64, sigma: float = 0.25) -> Volume:
     """A Gaussian ``exp(-r^2 / (2 sigma^2))`` at the centre; sigma in world units (the box's longest edge is 2)."""
     # A product of three factors: no array but the result has the volume's size.
     factors = [np.exp(-(axis**2) / (2 * sigma**2)) for axis in _axes(size)]
-    return _volume(factors[0] * factors[1] * factors[2], "blob")
+    return volume_of(factors[0] * factors[1] * factors[2], "blob")
 
 
 def slab(size: Size = 64, thickness: float = 1.0, value: float = 1.0) -> Volume:
@@ -66,7 +67,7 @@ def slab(size: Size = 64, thickness: float = 1.0, value: float = 1.0) -> Volume:
     h = 2.0 / max(nx, ny, nz)
     z, half = _axes(size)[2], thickness / 2
     inside = np.maximum(np.minimum(z + h / 2, half) - np.maximum(z - h / 2, -half), 0) / h
-    return _volume(np.broadcast_to(inside * value, (nz, ny, nx)), "slab")
+    return volume_of(np.broadcast_to(inside * value, (nz, ny, nx)), "slab")
 
 
 def sphere(size: Size = 64, radius: float = 0.7, value: float = 1.0, *, hard: bool = False) -> Volume:
@@ -82,7 +83,7 @@ def sphere(size: Size = 64, radius: float = 0.7, value: float = 1.0, *, hard: bo
     h = 2.0 / max(_dims(size))
     distance = radius - np.sqrt(x * x + y * y + z * z)
     inside = distance >= 0 if hard else np.clip(distance / h + 0.5, 0, 1)
-    return _volume(inside * value, "sphere")
+    return volume_of(inside * value, "sphere")
 
 
 def checkerboard(size: Size = 32, cells: int = 8) -> Volume:
@@ -90,13 +91,13 @@ def checkerboard(size: Size = 32, cells: int = 8) -> Volume:
     nx, ny, nz = _dims(size)
     edge = max(1, max(nx, ny, nz) // max(1, cells))
     x, y, z = (np.arange(n) // edge for n in (nx, ny, nz))
-    return _volume((x[None, None, :] + y[None, :, None] + z[:, None, None]) % 2, "checkerboard")
+    return volume_of((x[None, None, :] + y[None, :, None] + z[:, None, None]) % 2, "checkerboard")
 
 
 def constant(size: Size = 16, value: float = 1.0) -> Volume:
     """The same value everywhere."""
     nx, ny, nz = _dims(size)
-    return _volume(np.full((nz, ny, nx), value, np.float32), "constant")
+    return volume_of(np.full((nz, ny, nx), value, np.float32), "constant")
 
 
 def random_field(size: Size = 64, cycles: float = 8.0, seed: int = 0) -> Volume:
@@ -116,4 +117,4 @@ def random_field(size: Size = 64, cycles: float = 8.0, seed: int = 0) -> Volume:
     spectrum[k2 > cycles**2] = 0
     field = np.fft.irfftn(spectrum, s=(nz, ny, nx), axes=(0, 1, 2))
     lo, hi = field.min(), field.max()
-    return _volume((field - lo) / (hi - lo) if hi > lo else np.zeros_like(field), "random")
+    return volume_of((field - lo) / (hi - lo) if hi > lo else np.zeros_like(field), "random")

@@ -1,0 +1,137 @@
+"""Shapes as CT and MR show them: nested shells, tubes, plates, and noise of all scales. float32, values near [0, 1].
+
+A seed gives one volume on every machine but for the last bits of its Fourier transforms.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from vvgt_cli.errors import UsageError
+from vvgt_cli.synth.analytic import volume_of
+from vvgt_cli.volume.blocks import check_memory
+from vvgt_cli.volume.types import Volume
+
+SMALLEST = 8  # voxels a side
+BYTES = 100  # a voxel, at the peak
+
+
+def _grid(size: int) -> np.ndarray:
+    """(3, n, n, n) positions x, y, z of voxel centres in a box of [-1, 1]."""
+    line = (np.arange(size) + 0.5) * 2 / size - 1
+    z, y, x = np.meshgrid(line, line, line, indexing="ij")
+    return np.stack([x, y, z])
+
+
+def _field(rng: np.random.Generator, size: int, slope: float, finest: float = np.inf) -> np.ndarray:
+    """(n, n, n) periodic noise of variance 1 whose amplitude falls as k^-slope, up to ``finest`` cycles a box."""
+    spectrum = np.fft.rfftn(rng.standard_normal((size, size, size)))
+    line, half = np.fft.fftfreq(size, 1 / size), np.fft.rfftfreq(size, 1 / size)
+    k = np.sqrt(half[None, None, :] ** 2 + line[None, :, None] ** 2 + line[:, None, None] ** 2)
+    spectrum *= np.where((k > 0) & (k <= finest), np.maximum(k, 1) ** -slope, 0)
+    field = np.fft.irfftn(spectrum, s=(size,) * 3, axes=(0, 1, 2))
+    return field / field.std()
+
+
+def _rotation(rng: np.random.Generator) -> np.ndarray:
+    """(3, 3), uniform: QR of a Gaussian matrix, signs fixed."""
+    q, r = np.linalg.qr(rng.standard_normal((3, 3)))
+    return q * np.sign(np.diag(r))
+
+
+def _inside(distance: np.ndarray, size: int) -> np.ndarray:
+    """Share of a voxel that lies inside, by a linear ramp of a voxel across the surface."""
+    return np.clip(distance * size / 2 + 0.5, 0, 1)
+
+
+def shells(size: int, seed: int) -> np.ndarray:
+    """Three to five bent ellipsoids, one within the other, with a value and some texture each (skin, skull, brain)."""
+    rng = np.random.default_rng(seed)
+    centred = np.tensordot(_rotation(rng), _grid(size), 1) / rng.uniform(0.65, 0.95, 3)[:, None, None, None]
+    radius = np.linalg.norm(centred, axis=0) + 0.04 * _field(rng, size, 2.5, 6)
+    out = np.zeros((size,) * 3)
+    edge = 0.92
+    for _ in range(rng.integers(3, 6)):
+        value = rng.uniform(0.2, 1.0)
+        texture = rng.uniform(0, 0.06) * _field(rng, size, 1.5, size / 6)
+        bent = radius + 0.03 * _field(rng, size, 2.5, 10)
+        cover = _inside(edge - bent, size)
+        out += cover * (value + texture - out)
+        edge *= rng.uniform(0.6, 0.93)
+    return out
+
+
+def tubes(size: int, seed: int) -> np.ndarray:
+    """Vessels: bent lines with radii that shrink along them, brightest in their middle, in faint tissue."""
+    rng = np.random.default_rng(seed)
+    out = 0.08 + 0.02 * _field(rng, size, 1.5, size / 4)
+    for _ in range(rng.integers(8, 20)):
+        place, heading = rng.uniform(-0.8, 0.8, 3), rng.standard_normal(3)
+        radius, value = rng.uniform(0.03, 0.1), rng.uniform(0.4, 1.0)
+        for _ in range(rng.integers(40, 120)):
+            heading = heading / np.linalg.norm(heading) + 0.25 * rng.standard_normal(3)
+            place = place + 0.6 * radius * heading / np.linalg.norm(heading)
+            radius = max(radius * 0.99, 2.0 / size)
+            _stamp(out, place, radius, value)
+    return out
+
+
+def _stamp(out: np.ndarray, place: np.ndarray, radius: float, value: float) -> None:
+    """A ball whose value falls off towards its surface; the larger value stays."""
+    size = len(out)
+    middle = (place + 1) * size / 2 - 0.5  # in voxels, x y z
+    reach = radius * size / 2 + 1
+    low = np.maximum(np.ceil(middle - reach).astype(int), 0)
+    high = np.minimum(np.floor(middle + reach).astype(int) + 1, size)
+    if (low >= high).any():
+        return
+    x, y, z = (np.arange(a, b) - m for a, b, m in zip(low, high, middle, strict=True))
+    distance = np.sqrt(z[:, None, None] ** 2 + y[None, :, None] ** 2 + x[None, None, :] ** 2) * 2 / size
+    ball = _inside(radius - distance, size) * value * (1 - 0.5 * np.minimum(distance / radius, 1) ** 2)
+    part = out[low[2] : high[2], low[1] : high[1], low[0] : high[0]]
+    np.maximum(part, ball, out=part)
+
+
+def plates(size: int, seed: int) -> np.ndarray:
+    """Boxes of metal: thin plates, bars and blocks at any angle, with holes; a value each, sharp edges."""
+    rng = np.random.default_rng(seed)
+    grid = _grid(size)
+    out = np.zeros((size,) * 3)
+    for _ in range(rng.integers(6, 14)):
+        half = np.exp(rng.uniform(np.log(0.03), np.log(0.5), 3))
+        local = np.tensordot(_rotation(rng), grid - rng.uniform(-0.5, 0.5, 3)[:, None, None, None], 1)
+        depth = (half[:, None, None, None] - np.abs(local)).min(axis=0)
+        if rng.random() < 0.5:  # a drilled hole along its first axis
+            depth = np.minimum(depth, np.hypot(local[1], local[2]) - 0.5 * min(half[1], half[2]))
+        cover = _inside(depth, size)
+        out += cover * (rng.uniform(0.25, 1.0) - out)
+    return out
+
+
+def noise(size: int, seed: int) -> np.ndarray:
+    """Noise of all scales, clouds to granite by its seed, over [0, 1]."""
+    rng = np.random.default_rng(seed)
+    field = _field(rng, size, rng.uniform(1.6, 2.6), size / 3)
+    return (field - field.min()) / (field.max() - field.min())
+
+
+SHAPES: dict[str, Callable[[int, int], np.ndarray]] = {
+    "shells": shells,
+    "tubes": tubes,
+    "plates": plates,
+    "noise": noise,
+}
+
+
+def make_shape(kind: str, size: int = 128, seed: int = 0) -> Volume:
+    """A volume of one of `SHAPES`, ``size`` voxels a side.
+
+    Raises:
+        UsageError: a size below `SMALLEST`, or above what memory holds.
+    """
+    if size < SMALLEST:
+        raise UsageError(f"{kind} of {size} voxels a side: expected at least {SMALLEST}")
+    check_memory(size**3 * BYTES, f"{kind} of {size} x {size} x {size} voxels")
+    return volume_of(SHAPES[kind](size, seed), f"{kind}-{seed}")

@@ -1,0 +1,37 @@
+"""Writing a volume as NRRD: one attached raw file, which ParaView, 3D Slicer and this program read."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from vvgt_cli.files import atomic_write
+from vvgt_cli.volume.types import Volume
+
+
+def write_nrrd(path: str | os.PathLike[str], volume: Volume, overwrite: bool = False) -> int:
+    """Write the volume's data values as float32; direction cosines are left out. Returns the file's bytes.
+
+    Raises:
+        UsageError, DataError: see `vvgt_cli.files.atomic_write`.
+    """
+    values = np.ascontiguousarray(volume.data, "<f4") * np.float32(volume.slope) + np.float32(volume.intercept)
+    vectors = " ".join(
+        "(" + ",".join(repr(float(s)) if i == j else "0" for j in range(3)) + ")" for i, s in enumerate(volume.spacing)
+    )
+    header = [
+        "NRRD0004",
+        "type: float",
+        "dimension: 3",
+        "space dimension: 3",
+        f"sizes: {' '.join(map(str, volume.dims))}",
+        f"space directions: {vectors}",
+        f"space origin: ({','.join(repr(float(o)) for o in volume.origin)})",
+        "endian: little",
+        "encoding: raw",
+    ]
+    with atomic_write(path, overwrite) as temporary:
+        temporary.write_bytes(("\n".join(header) + "\n\n").encode() + values.astype("<f4", copy=False).tobytes())
+    return Path(path).stat().st_size
