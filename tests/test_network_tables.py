@@ -14,6 +14,7 @@ from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.network import NAMED, GeometryConfig, ImageConfig, NetworkConfig
 from vvgt_cli.network import tables as tb
+from vvgt_cli.network.config import SLOPES
 from vvgt_cli.network.curves import CURVES, curve_code, hilbert, interleave
 from vvgt_cli.network.prepare import filter_matrix, pack, prepare, quaternion, resize, unpack, view_arrays
 from vvgt_cli.network.runtime import spread
@@ -181,12 +182,13 @@ def test_scene_arrays_hold_what_the_switches_ask_for():
     assert prepared.views["images"].shape == (2, 8, 28, 28)
     assert prepared.views["images"][:, 4:].max() > 0.01  # the rendering
     assert prepared.gradients is not None
-    assert prepared.gradients.shape == (40, 14)
+    assert prepared.gradients.shape == (40, SLOPES)
     flipped = replace(gaussians, quaternions=-2 * gaussians.quaternions)
     assert np.allclose(prepare(flipped, cameras, images, config).gradients, prepared.gradients, atol=1e-4)
-    # black targets: a brighter colour raises the error, for every Gaussian that is seen
-    assert (prepared.gradients[:, 11:] >= 0).all()
-    assert prepared.gradients[:, 11:].max() > 0
+    # black targets: a brighter colour raises the error, in every view that sees it
+    assert (prepared.gradients[:, 10:13] >= 0).all()
+    assert prepared.gradients[:, 10:13].max() > 0.9
+    assert np.abs(prepared.gradients[:, :13]).max() <= 1 + 1e-6
     restored = prepared.restore(prepared.rows)
     assert np.array_equal(restored.means, gaussians.means)
 

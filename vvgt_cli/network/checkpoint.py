@@ -33,7 +33,7 @@ class Checkpoint:
     commit: str = "unknown"
 
     def to_dict(self) -> dict[str, Any]:
-        """What the file holds; a trainer may add keys of its own."""
+        """What the file holds."""
         return {
             "format": FORMAT,
             "schema": SCHEMA,
@@ -45,9 +45,12 @@ class Checkpoint:
         }
 
 
-def save_checkpoint(path: str | Path, checkpoint: Checkpoint) -> None:
-    """Write a checkpoint to ``path`` as it is given (`vvgt_cli.files.atomic_write` makes it whole or none)."""
-    torch.save(checkpoint.to_dict(), path)
+def save_checkpoint(path: str | Path, checkpoint: Checkpoint, more: dict[str, Any] | None = None) -> None:
+    """Write a checkpoint to ``path`` as it is given (`vvgt_cli.files.atomic_write` makes it whole or none).
+
+    ``more`` is for the trainer itself: tensors and plain values.
+    """
+    torch.save(checkpoint.to_dict() | (more or {}), path)
 
 
 def load_checkpoint(path: str | Path) -> Checkpoint:

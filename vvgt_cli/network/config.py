@@ -11,6 +11,8 @@ VARIANTS = ("full", "wo_3dt", "wo_vbm", "wo_vgf")  # the paper's Tab. 2
 STAGES = 5  # of the geometry transformer's encoder; its decoder has one fewer
 SCALES = 3  # S of the paper: maps at 1, 2 and 4 times the patch grid
 PARAMETERS = 14  # of a Gaussian: mean 3, log-scale 3, quaternion 4, opacity logit 1, colour 3
+STEP = 13  # of a step in a Gaussian's own frame: centre 3, log-scale 3, turn 3, opacity logit 1, colour 3
+SLOPES = STEP + 9  # see `vvgt_cli.network.slopes.slope_rows`
 PATCH = 14  # pixels, DINOv2's
 
 
@@ -61,14 +63,15 @@ class GeometryConfig:
     """The 3D geometry transformer, the epipolar attention and the head.
 
     Attributes:
-        widths, depths, heads: of the five encoder stages.
+        widths, depths, heads: of the five encoder stages; a stage of depth 0 only embeds, pools and hands on.
         decoder_widths, decoder_depths, decoder_heads: of stages 0 to 3 on the way back.
         window: points that attend to each other.
         epipolar_stage: encoder stage after whose blocks the views are read (the paper's "second layer").
         epipolar_width: D of Eq. 7.
-        head: "residual" adds to every parameter, "direct" predicts all but the position (Eq. 6).
+        head: "residual" adds to every parameter, "direct" predicts all but the position (Eq. 6), "step" scales and
+            mends the direction of the gradient in the own frame (needs ``gradients``; not in the paper).
         reach: largest move of a centre in standard deviations along each own axis.
-        gradients: takes the gradient of the image error as input too (not in the paper).
+        gradients: takes how the image error changes with each parameter as input too (not in the paper).
     """
 
     widths: tuple[int, ...] = (32, 64, 96, 128, 160)
@@ -89,20 +92,23 @@ class GeometryConfig:
             values = tuple(getattr(self, name))
             object.__setattr__(self, name, values)
             count = STAGES - name.startswith("decoder")
-            if len(values) != count or min(values) < 1:
-                raise DataError(f"geometry {name} {values}: expected {count} numbers of at least 1")
+            least = 0 if name.endswith("depths") else 1
+            if len(values) != count or min(values) < least:
+                raise DataError(f"geometry {name} {values}: expected {count} numbers of at least {least}")
         pairs = zip(self.widths + self.decoder_widths, self.heads + self.decoder_heads, strict=True)
         if any(width % heads for width, heads in pairs):
             raise DataError("geometry: every width must be a multiple of its heads")
-        if self.head not in ("residual", "direct"):
-            raise DataError(f"head {self.head!r}: expected residual or direct")
+        if self.head not in ("residual", "direct", "step"):
+            raise DataError(f"head {self.head!r}: expected residual, direct or step")
+        if self.head == "step" and not self.gradients:
+            raise DataError("head 'step' scales gradients: expected gradients to be on")
         if not 0 <= self.epipolar_stage < STAGES or self.window < 1 or self.epipolar_width < 1 or not self.reach > 0:
             raise DataError("geometry config: epipolar_stage, window, epipolar_width or reach is out of range")
 
     @property
     def inputs(self) -> int:
         """Numbers that describe a Gaussian to the network."""
-        return PARAMETERS * (2 if self.gradients else 1)
+        return PARAMETERS + (SLOPES if self.gradients else 0)
 
 
 @dataclass(frozen=True)
@@ -115,6 +121,7 @@ class NetworkConfig:
         variant: "full", or an ablation of the paper: "wo_3dt" predicts Gaussians a pixel from the 2D side,
             "wo_vbm" is the full network started from uniform random samples, "wo_vgf" is the 3D side alone.
         rendering: images carry eight channels, the target and the present Gaussians' rendering (not in the paper).
+        rounds: times that the network is run, each on its own output and on other views (not in the paper).
     """
 
     name: str = "small"
@@ -122,8 +129,11 @@ class NetworkConfig:
     geometry: GeometryConfig = field(default_factory=GeometryConfig)
     variant: str = "full"
     rendering: bool = False
+    rounds: int = 1
 
     def __post_init__(self) -> None:
+        if self.rounds < 1:
+            raise DataError(f"rounds {self.rounds}: expected at least 1")
         if self.variant not in VARIANTS:
             raise UsageError(f"variant {self.variant!r}: expected one of {', '.join(VARIANTS)}")
 
@@ -131,6 +141,11 @@ class NetworkConfig:
     def channels(self) -> int:
         """Of an input image: premultiplied RGBA, once or twice."""
         return 8 if self.rendering else 4
+
+    @property
+    def reads(self) -> int:
+        """Views that it is made for, all rounds together."""
+        return self.rounds * self.image.views
 
     @property
     def has_images(self) -> bool:
@@ -188,6 +203,24 @@ NAMED = {
             window=256,
             epipolar_width=128,
         ),
+    ),
+    # not the paper's: the 3D side alone, fed with the slopes of the image error, which it makes a step of
+    "lean": NetworkConfig(
+        name="lean",
+        image=ImageConfig(views=10),  # twice: of 24 views four are left to judge
+        geometry=GeometryConfig(
+            widths=(48, 48, 64, 64, 64),
+            depths=(0, 1, 1, 1, 1),
+            heads=(4, 4, 4, 4, 4),
+            decoder_widths=(48, 48, 64, 64),
+            decoder_depths=(0, 1, 1, 1),
+            decoder_heads=(4, 4, 4, 4),
+            window=64,
+            head="step",
+            gradients=True,
+        ),
+        variant="wo_vgf",
+        rounds=2,
     ),
     # DINOv2-L's encoder and VGGT's 24 pairs with its taps; PTV3 as published
     "paper": NetworkConfig(

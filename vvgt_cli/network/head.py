@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from vvgt_cli.gaussians.types import SH_C0
-from vvgt_cli.network.config import PARAMETERS, GeometryConfig
+from vvgt_cli.network.config import PARAMETERS, STEP, GeometryConfig
 from vvgt_cli.network.layers import ZeroLinear
 
 SPLIT = (3, 3, 4, 1, 3)  # mean, log-scale, quaternion, opacity logit, colour
@@ -50,7 +50,7 @@ class GaussianHead(nn.Module):
         self.hidden = nn.Linear(width, width)
         self.last = ZeroLinear(width, PARAMETERS)
 
-    def forward(self, x: Tensor, gaussians: Tensor) -> Tensor:
+    def forward(self, x: Tensor, gaussians: Tensor, slopes: Tensor | None = None) -> Tensor:
         step = self.last(functional.gelu(self.hidden(self.norm(x)))).split(SPLIT, dim=-1)
         mean, log_scale, quaternion, logit, color = gaussians.split(SPLIT, dim=-1)
         own = self.reach * log_scale.exp() * torch.tanh(step[0])  # (K, 3) along the Gaussian's axes
@@ -62,6 +62,51 @@ class GaussianHead(nn.Module):
         grown = log_scale + 2 * torch.tanh(step[1])  # at most a factor e^2 either way
         turned = functional.normalize(quaternion + step[2], dim=-1)
         return torch.cat([moved, grown, turned, logit + step[3], color + SH_C0 * step[4]], dim=-1)
+
+
+class StepHead(nn.Module):
+    """A step in each Gaussian's own frame: a factor for the direction of every gradient, and an addition.
+
+    ``mu + R S d``, ``log s + e``, ``q (1, w / 2)``, ``logit + .``, ``colour + .``. Without training every factor is 1:
+    a plain step downhill of `SIZES`, which were chosen by trial (docs/train.md).
+    """
+
+    SIZES = (0.1,) * 3 + (0.05,) * 6 + (0.06,) + (0.016,) * 3
+    LARGEST = (2.0,) * 3 + (1.0,) * 6 + (2.0,) + (0.3,) * 3
+
+    def __init__(self, config: GeometryConfig) -> None:
+        super().__init__()
+        width = config.decoder_widths[0]
+        self.norm = nn.LayerNorm(width)
+        self.hidden = nn.Linear(width, width)
+        self.last = ZeroLinear(width, 2 * STEP)
+        nn.init.ones_(self.last.bias[:STEP])
+
+    def forward(self, x: Tensor, gaussians: Tensor, slopes: Tensor | None = None) -> Tensor:
+        """Features (K, width), Gaussians (K, 14), slopes (K, SLOPES) -> Gaussians (K, 14)."""
+        assert slopes is not None
+        factor, more = self.last(functional.gelu(self.hidden(self.norm(x)))).chunk(2, dim=-1)  # (K, 13) each
+        sizes, largest = x.new_tensor(self.SIZES), x.new_tensor(self.LARGEST)
+        step = largest * torch.tanh((more - factor * slopes[:, :STEP]) * sizes / largest)
+        along, grown, spin, harder, tint = step.split((3, 3, 3, 1, 3), dim=-1)
+        mean, log_scale, quaternion, logit, color = gaussians.split(SPLIT, dim=-1)
+        moved = mean + (rotation(quaternion) @ (log_scale.exp() * along)[..., None])[..., 0]
+        turned = functional.normalize(quaternion + turned_by(quaternion, spin / 2), dim=-1)
+        return torch.cat([moved, log_scale + grown, turned, logit + harder, color + tint], dim=-1)
+
+
+def turned_by(quaternion: Tensor, vector: Tensor) -> Tensor:
+    """Product (n, 4) of quaternions (n, 4) with (0, vector (n, 3))."""
+    w, x, y, z = quaternion.unbind(-1)
+    a, b, c = vector.unbind(-1)
+    return torch.stack(
+        [-x * a - y * b - z * c, w * a + y * c - z * b, w * b + z * a - x * c, w * c + x * b - y * a], -1
+    )
+
+
+def gaussian_head(config: GeometryConfig) -> GaussianHead | StepHead:
+    """The head that a configuration names."""
+    return StepHead(config) if config.head == "step" else GaussianHead(config)
 
 
 class PixelHead(nn.Module):

@@ -11,7 +11,7 @@ from vvgt_cli.network.appearance import AppearanceTransformer, MultiScaleMaps
 from vvgt_cli.network.config import NetworkConfig
 from vvgt_cli.network.epipolar import EpipolarCrossAttention
 from vvgt_cli.network.geometry import GeometryTransformer, Tables
-from vvgt_cli.network.head import GaussianHead, PixelHead, describe
+from vvgt_cli.network.head import PixelHead, describe, gaussian_head
 
 
 class ImageSide(nn.Module):
@@ -37,7 +37,7 @@ class GeometrySide(nn.Module):
             width = geometry.widths[geometry.epipolar_stage]
             vgf = EpipolarCrossAttention(width, image.map_width, len(image.taps), geometry.epipolar_width)
         self.transformer = GeometryTransformer(geometry, vgf)
-        self.head = GaussianHead(geometry)
+        self.head = gaussian_head(geometry)
 
     def forward(
         self,
@@ -46,11 +46,11 @@ class GeometrySide(nn.Module):
         views: tuple[Tensor, Tensor, list[Tensor]] | None = None,
         gradients: Tensor | None = None,
     ) -> Tensor:
-        """Gaussians (K, 14) in canonical order; views: matrices (n, 3, 4), eyes (n, 3), S maps; gradients (K, 14)."""
+        """Gaussians (K, 14) in canonical order; views: matrices (n, 3, 4), eyes (n, 3), S maps; gradients (K, s)."""
         features = describe(gaussians)
         if gradients is not None:
             features = cat([features, gradients], dim=-1)
-        return self.head(self.transformer(features, tables, views), gaussians)
+        return self.head(self.transformer(features, tables, views), gaussians, gradients)
 
 
 class Vvgt(nn.Module):

@@ -13,6 +13,7 @@ from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.network import tables
 from vvgt_cli.network.config import NetworkConfig
+from vvgt_cli.network.slopes import slope_rows
 
 UNIT_RADIUS = math.sqrt(3)  # half-diagonal of the unit frame's cube
 
@@ -26,7 +27,7 @@ class Prepared:
         views: ``images`` (n, channels, size, size), ``poses`` (n, 9), ``matrices`` (n, 3, 4), ``eyes`` (n, 3);
             nothing for a network that reads no views.
         rows: (K, 14) Gaussians in canonical order.
-        gradients: (K, 14), None for a network that takes none.
+        gradients: (K, `SLOPES`), None for a network that takes none.
         order: (K,) row of the given Gaussians that each of ``rows`` is.
     """
 
@@ -94,7 +95,7 @@ def prepare(gaussians: Gaussians, cameras: Sequence[Camera], images: np.ndarray,
         views = {**view_arrays(cameras), "images": image_arrays(gaussians, cameras, images, config)}
     gradients = None
     if config.has_geometry and config.geometry.gradients:
-        gradients = gradient_rows(gaussians, cameras, images)[order]
+        gradients = slope_rows(gaussians, cameras, images)[order]
     return Prepared(config, views, rows[order], gradients, order)
 
 
@@ -160,25 +161,3 @@ def filter_matrix(old: int, new: int) -> np.ndarray:
     centre = (np.arange(new) + 0.5) * ratio - 0.5  # in old pixels
     weights = np.maximum(0, 1 - np.abs(centre[:, None] - np.arange(old)) / max(ratio, 1.0))
     return (weights / weights.sum(axis=1, keepdims=True)).astype(np.float32)
-
-
-def gradient_rows(gaussians: Gaussians, cameras: Sequence[Camera], images: np.ndarray) -> np.ndarray:
-    """(K, 14) float32: dL/d(parameters), L the sum of squared RGBA errors over the views.
-
-    Gradients span decades, so each of the five fields is taken by its root mean square over the scene, then
-    ``sign(g) log(1 + |g|)``.
-    """
-    from vvgt_cli.splat import project, render, render_backward
-
-    total = np.zeros((len(gaussians), 14))
-    for camera, view in zip(cameras, images, strict=True):
-        projection = project(gaussians, camera)
-        image = render(gaussians, camera, projection)
-        g = render_backward(gaussians, camera, projection, image, 2 * (image - view))
-        total += np.concatenate(
-            [g.means, g.log_scales, g.quaternions, g.opacity_logits[:, None], g.colors], axis=1, dtype=np.float64
-        )
-    for field in (slice(0, 3), slice(3, 6), slice(6, 10), slice(10, 11), slice(11, 14)):
-        part = total[:, field]
-        part /= max(float(np.sqrt(np.mean(part**2))), 1e-30)
-    return (np.sign(total) * np.log1p(np.abs(total))).astype(np.float32)

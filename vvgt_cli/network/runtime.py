@@ -44,6 +44,11 @@ def spread(cameras: Sequence[Camera], count: int) -> list[int]:
     return sorted(int(tie[i]) for i in chosen)
 
 
+def in_turn(views: Sequence[int], number: int, rounds: int) -> list[int]:
+    """The views of round ``number``: every ``rounds``-th, all of them where there are fewer than rounds."""
+    return list(views[number::rounds]) if len(views) >= rounds else list(views)
+
+
 @dataclass
 class Model:
     """An exported model, ready to run.
@@ -93,8 +98,8 @@ class Model:
     ) -> Gaussians:
         """The network's Gaussians, in the order of the given.
 
-        Views beyond the number that the model is made for are thinned out (`spread`). More Gaussians than ``points``
-        are dealt with in equal parts along the Z-order, each as a scene of its own.
+        Views beyond the number that the model is made for are thinned out (`spread`); each round reads others of them.
+        More Gaussians than ``points`` are dealt with in equal parts along the Z-order, each as a scene of its own.
 
         Args:
             gaussians: where it starts, unit frame.
@@ -106,12 +111,15 @@ class Model:
             DataError: no Gaussians, no views, or output that is not finite.
         """
         config = self.card.network
-        few = spread(cameras, config.image.views)
-        scene = prepare(gaussians, [cameras[i] for i in few], images[few], config)
-        rows = self.run_rows(scene, points, progress)
-        if not np.isfinite(rows).all():
-            raise DataError(f"model {self.card.name}: its output is not finite; it cannot be used on these Gaussians")
-        return scene.restore(rows)
+        few = spread(cameras, config.reads)
+        for number in range(config.rounds):
+            shown = in_turn(few, number, config.rounds)
+            scene = prepare(gaussians, [cameras[i] for i in shown], images[shown], config)
+            rows = self.run_rows(scene, points, progress)
+            if not np.isfinite(rows).all():
+                raise DataError(f"model {self.card.name}: its output is not finite; these Gaussians are beyond it")
+            gaussians = scene.restore(rows)
+        return gaussians
 
     def run_rows(self, scene: Prepared, points: int = POINTS, progress: ProgressCallback | None = None) -> np.ndarray:
         """Both graphs on a prepared scene: rows (K, 14) in its order."""

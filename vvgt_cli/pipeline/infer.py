@@ -76,7 +76,7 @@ def infer_file(request: InferRequest, console: Console | None = None) -> Convers
         model = Model.open(find_model(request.model), _threads(), request.provider)
         gaussians, header = open_gaussians(request.ply, run.console)
         cameras, images = load_views(request.views, "train")
-        wanted = model.card.network.image.views
+        wanted = model.card.network.reads
         read, judges = divide(cameras, wanted)
         stage.note = f"{len(gaussians)} Gaussians, {len(cameras)} views, model {model.card.name}"
     with run.stage("network") as stage:

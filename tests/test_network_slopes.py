@@ -1,0 +1,79 @@
+"""Slopes of the image error in each Gaussian's own frame: against differences, and what each column says."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from network_models import scene
+
+from vvgt_cli.cameras import default_views
+from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.network.config import SLOPES
+from vvgt_cli.network.prepare import pack, unpack
+from vvgt_cli.network.slopes import STEP, halved, own_frame, slope_rows
+from vvgt_cli.splat import project, render, render_backward_reference, render_reference
+from vvgt_cli.splat.constants import DILATION
+from vvgt_cli.splat.reference import rotations
+
+
+def stepped(g, step):
+    """Gaussians after a step (K, 13) in their own frames."""
+    axes, scales = rotations(g.quaternions), np.exp(g.log_scales.astype(np.float64))
+    w, x, y, z = g.quaternions.T.astype(np.float64)
+    a, b, c = step[:, 6:9].T / 2
+    turn = [-x * a - y * b - z * c, w * a + y * c - z * b, w * b + z * a - x * c, w * c + x * b - y * a]
+    return Gaussians(
+        g.means + np.einsum("kij,kj->ki", axes, scales * step[:, :3]),
+        g.log_scales + step[:, 3:6],
+        g.quaternions + np.stack(turn, axis=1),
+        g.opacity_logits + step[:, 9],
+        g.colors + step[:, 10:],
+    )
+
+
+@pytest.mark.parametrize("columns", [(0, 3), (3, 6), (6, 9), (9, 10), (10, 13)])
+def test_gradients_in_the_own_frame_against_differences(columns):
+    gaussians, cameras, _ = scene(count=12, views=1, seed=4)
+    gaussians = unpack(pack(gaussians))
+    slope = np.random.default_rng(0).normal(size=(32, 32, 4))
+    twin = render_backward_reference(gaussians, cameras[0], slope)
+    fields = [twin[name] for name in ("means", "log_scales", "quaternions", "opacity_logits", "colors")]
+    scales = np.exp(gaussians.log_scales)
+    found = own_frame(gaussians.quaternions, rotations(gaussians.quaternions), scales, fields)
+    assert found.shape == (12, STEP)
+    step = np.zeros((12, STEP))
+    step[:, slice(*columns)] = np.random.default_rng(1).normal(size=(12, columns[1] - columns[0]))
+    loss = lambda e: (render_reference(stepped(gaussians, e * step), cameras[0]) * slope).sum()  # noqa: E731
+    difference = (loss(2e-3) - loss(-2e-3)) / 4e-3
+    # the jump of the cut at 1/255 is left out of gradients, and is part of the difference
+    assert (found * step).sum() == pytest.approx(difference, rel=0.12)
+
+
+def test_columns_say_direction_agreement_and_size():
+    gaussians, cameras, _ = scene(count=50, views=4)
+    gaussians = unpack(pack(gaussians))
+    brighter = np.stack([render(gaussians, camera) for camera in cameras]) * np.float32(1.5)
+    rows = slope_rows(gaussians, cameras, brighter)
+    assert rows.shape == (50, SLOPES)
+    assert rows.dtype == np.float32
+    assert np.isfinite(rows).all()
+    assert (rows[:, 10:13] <= 0).all()  # more colour lowers the error everywhere
+    assert np.median(rows[:, 10:13]) < -0.8  # and all views agree
+    same = slope_rows(gaussians, cameras, np.stack([render(gaussians, camera) for camera in cameras]))
+    assert (same[:, 20] < rows[:, 20] - 1).all()  # the scene's error
+    shown = slope_rows(gaussians, cameras[:1], brighter[:1])
+    seen = np.abs(shown[:, 10]) > 0
+    assert np.allclose(np.abs(shown[seen, 10]), 1, atol=1e-3)  # one view always agrees with itself
+
+
+def test_halved_views_show_what_whole_ones_do():
+    gaussians, _, _ = scene(count=50)
+    cameras = default_views("train", 2, size=64)
+    views = np.stack([render(gaussians, camera) for camera in cameras])
+    few, small, dilation = halved(cameras, views)
+    assert small.shape == (2, 32, 32, 4)
+    assert dilation == DILATION / 4
+    for camera, view in zip(few, small, strict=True):
+        assert np.abs(render(gaussians, camera, project(gaussians, camera, dilation)) - view).mean() < 0.01
+    odd = default_views("train", 2, size=33)
+    assert halved(odd, np.zeros((2, 33, 33, 4), np.float32))[2] == DILATION
