@@ -1,11 +1,11 @@
 """Refinement: time of a step's parts, and what steps gain on a list of scenes.
 
-    python benchmarks/optimize.py parts [VOLUME ...] [--gaussians K]
+    python benchmarks/optimize.py parts [PLY|VOLUME ...] [--gaussians K]
     PYTHONPATH=. python benchmarks/optimize.py gain SCENES.tsv DATA_DIR TF_DIR -o CSV [--steps N] [--views N]
                                                 [--method frame|adam|3dgs]
 
-`parts` prints milliseconds with one and with two threads (medians of alternated repeats, 400 px) and a floor: the
-arithmetic of the tile rows that the Gaussians' pixel boxes cover, for forward and backward pass (none of it is saved
+`parts` prints milliseconds with one and with all threads (medians of alternated repeats, 400 px), the speed-up, beside it
+that of bare arithmetic, and a floor: the arithmetic of the tile rows that the Gaussians' pixel boxes cover, for forward and backward pass (none of it is saved
 where pixels end early, so opaque scenes may lie below). `gain` starts from the closed form of each scene; references as
 in `closed_form.py`, all views with 3 x 3 rays where neighbours differ and half-voxel steps; seconds are processor time.
 """
@@ -28,6 +28,7 @@ from splat import PIXEL_FLOPS, covered_pixels, sampled
 from vvgt_cli.cameras import default_views
 from vvgt_cli.dvr import render_views
 from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.gaussians.ply import read_ply
 from vvgt_cli.metrics import score_views
 from vvgt_cli.optimize import OptimizeOptions, optimize
 from vvgt_cli.optimize.loss import loss_gradient
@@ -83,34 +84,53 @@ def main() -> None:
     """Benchmarks of refinement."""
 
 
+@numba.njit(parallel=True, cache=True)
+def arithmetic(out):  # type: ignore[no-untyped-def]
+    """Nothing but arithmetic, in equal chunks: the speed-up that threads of this machine can have."""
+    for chunk in numba.prange(out.shape[0]):
+        x = 1.0 + chunk
+        for _ in range(60_000):
+            x = x * 0.999999 + 1e-6
+        out[chunk] = x
+
+
+def with_threads(threads: int, call: Callable[[], object]) -> Callable[[], object]:
+    def run() -> None:
+        numba.set_num_threads(threads)
+        call()
+
+    return run
+
+
 @main.command()
-@click.argument("volumes", nargs=-1)
-@click.option("--gaussians", "count", default=100_000)
-def parts(volumes: tuple[str, ...], count: int) -> None:
-    """Milliseconds of a step's parts."""
+@click.argument("files", nargs=-1)
+@click.option("--gaussians", "count", default=100_000, help="Of volumes.")
+def parts(files: tuple[str, ...], count: int) -> None:
+    """Milliseconds of a step's parts on each .ply or volume."""
     print(machine())
     rate = flops(np.float32)
     most = numba.get_num_threads()
-    for name in volumes or ("example:frog", "example:channels"):
-        gaussians = sampled(open_volume(name), count)
-        camera = default_views("train")[3]
+    camera, out = default_views("train")[3], np.empty(256)
+    for name in files or ("example:frog", "example:channels"):
+        gaussians = read_ply(name)[0] if name.endswith(".ply") else sampled(open_volume(name), count)
         target = render(gaussians, camera) * np.float32(0.9)
-        columns = []
-        for threads in (1, most):
-            numba.set_num_threads(threads)
-            columns.append(alternate(part_calls(gaussians, target), REPEATS))
-        pixels = covered_pixels(OwnFrame(gaussians, [camera]).project(camera))
-        print(f"{name}: {len(gaussians)} Gaussians, {pixels / 1e6:.0f} million pixels; 1 thread, {most} threads")
-        for part in columns[0]:
-            print(f"  {part:<16}" + "".join(f"{column[part] * 1e3:9.2f}" for column in columns) + " ms")
+        calls = part_calls(gaussians, target) | {"(arithmetic)": lambda: arithmetic(out)}
+        both = {(part, n): with_threads(n, call) for part, call in calls.items() for n in (1, most)}
+        times = alternate(both, REPEATS)  # type: ignore[type-var, arg-type]
+        numba.set_num_threads(most)
         for label, chosen in (
             ("forward", ("project", "sort", "file into tiles", "blend")),
-            ("step", [part for part in columns[0] if part[0] != "("]),
+            ("step", [part for part in calls if part[0] != "("]),
         ):
-            sums = [sum(column[part] for part in chosen) * 1e3 for column in columns]
-            print(f"  {label:<16}" + "".join(f"{value:9.2f}" for value in sums) + " ms")
+            for n in (1, most):
+                times[label, n] = sum(times[part, n] for part in chosen)  # type: ignore[index]
+        pixels = covered_pixels(OwnFrame(gaussians, [camera]).project(camera))
+        print(f"{name}: {len(gaussians)} Gaussians, {pixels / 1e6:.0f} million pixels; 1 thread, {most} threads")
+        for part in (*calls, "forward", "step"):
+            one, all_of_them = times[part, 1], times[part, most]  # type: ignore[index]
+            print(f"  {part:<16}{one * 1e3:9.2f}{all_of_them * 1e3:9.2f} ms, x {one / all_of_them:.2f}")
         floor = pixels * (PIXEL_FLOPS + BACKWARD_FLOPS) / rate * 1e3
-        print(f"  floor           {floor:9.2f} ms with {most} threads (flops, no early end)")
+        print(f"  floor           {floor:18.2f} ms (flops, no early end)")
 
 
 def gain_row(scene, options: OptimizeOptions, budget: int, views: int) -> dict[str, str]:  # type: ignore[no-untyped-def]

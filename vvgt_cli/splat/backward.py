@@ -133,13 +133,14 @@ def moments(tiles, start, members, slots, extent, flat, colors, tiles_x, image, 
 
 
 @_exact
-def _total(first, pairs, k, total):
-    """Sum of Gaussian k's pairs into ``total`` (9,) float64, in a fixed order."""
-    for i in range(SUMS):
-        total[i] = 0.0
+def _total(first, pairs, k):
+    """Sum of Gaussian k's pairs, 9 float64, in a fixed order; a tuple: an array would be allocated for each."""
+    s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = s8 = 0.0
     for p in range(first[k], first[k + 1]):
-        for i in range(SUMS):
-            total[i] += pairs[p, i]
+        s0, s1, s2 = s0 + pairs[p, 0], s1 + pairs[p, 1], s2 + pairs[p, 2]
+        s3, s4, s5 = s3 + pairs[p, 3], s4 + pairs[p, 4], s5 + pairs[p, 5]
+        s6, s7, s8 = s6 + pairs[p, 6], s7 + pairs[p, 7], s8 + pairs[p, 8]
+    return s0, s1, s2, s3, s4, s5, s6, s7, s8
 
 
 @_exact
@@ -158,8 +159,7 @@ def screen(first, pairs, flat, out):
     for k in nb.prange(flat.shape[0]):
         out[k] = 0.0
         if first[k + 1] > first[k]:
-            total = np.empty(SUMS)
-            _total(first, pairs, k, total)
+            total = _total(first, pairs, k)
             du, dv, _, _, _ = _screen(flat, k, total)
             out[k] = np.sqrt(du * du + dv * dv)
 
@@ -178,8 +178,16 @@ def _center(x, y, z, fx, fy, du, dv, d00, d02, d11, d12):
 @_exact
 def _colors_and_logit(k, flat, colors, total, out_logits, out_colors):
     out_logits[k] = total[0] * (1.0 - flat[k, 5])
-    for i in range(3):
-        out_colors[k, i] = total[6 + i] if colors[k, i] >= 0.0 else 0.0
+    out_colors[k, 0] = total[6] if colors[k, 0] >= 0.0 else 0.0
+    out_colors[k, 1] = total[7] if colors[k, 1] >= 0.0 else 0.0
+    out_colors[k, 2] = total[8] if colors[k, 2] >= 0.0 else 0.0
+
+
+@_exact
+def _axis(factors, k, i, rot, jx, jy, jxz, jyz):
+    """Column i of W M (3) and of N = J W M (2)."""
+    v0, v1, v2 = turned(rot, np.float64(factors[k, 0, i]), np.float64(factors[k, 1, i]), np.float64(factors[k, 2, i]))
+    return v0, v1, v2, jx * v0 + jxz * v2, jy * v1 + jyz * v2
 
 
 @nb.njit(parallel=True, cache=True)
@@ -195,54 +203,54 @@ def own_frame(first, pairs, extent, flat, means, factors, colors, rot, trans, le
         out_colors[k] = 0.0
         if extent[k, 2] <= extent[k, 0]:
             continue
-        total = np.empty(SUMS)
-        _total(first, pairs, k, total)
+        total = _total(first, pairs, k)
         _colors_and_logit(k, flat, colors, total, out_logits, out_colors)
         x, y, z = to_camera(means, k, rot, trans)
         du, dv, h00, h01, h11 = _screen(flat, k, total)
         jx, jy, jxz, jyz = fx / z, fy / z, -fx * x / (z * z), -fy * y / (z * z)
-        axes = np.empty((5, 3))  # columns of W M, and of N = J W M
         d00 = d02 = d11 = d12 = 0.0
         for i in range(3):
-            v0, v1, v2 = turned(
-                rot, np.float64(factors[k, 0, i]), np.float64(factors[k, 1, i]), np.float64(factors[k, 2, i])
-            )
-            n0, n1 = jx * v0 + jxz * v2, jy * v1 + jyz * v2
+            v0, v1, v2, n0, n1 = _axis(factors, k, i, rot, jx, jy, jxz, jyz)
             e0, e1 = 2.0 * (h00 * n0 + h01 * n1), 2.0 * (h01 * n0 + h11 * n1)  # dL/dN
             d00, d02, d11, d12 = d00 + e0 * v0, d02 + e0 * v2, d11 + e1 * v1, d12 + e1 * v2
-            axes[0, i], axes[1, i], axes[2, i], axes[3, i], axes[4, i] = v0, v1, v2, n0, n1
         dx, dy, dz = _center(x, y, z, fx, fy, du, dv, d00, d02, d11, d12)
         for i in range(3):
-            out_frame[k, i] = dx * axes[0, i] + dy * axes[1, i] + dz * axes[2, i]
-            e0 = 2.0 * (h00 * axes[3, i] + h01 * axes[4, i])
-            e1 = 2.0 * (h01 * axes[3, i] + h11 * axes[4, i])
-            for j in range(i, 3):
-                entry = e0 * axes[3, j] + e1 * axes[4, j]
-                out_frame[k, 3 + i if i == j else 5 + i + j] = entry if i == j else 2.0 * entry
+            v0, v1, v2, n0, n1 = _axis(factors, k, i, rot, jx, jy, jxz, jyz)
+            out_frame[k, i] = dx * v0 + dy * v1 + dz * v2
+            e0, e1 = 2.0 * (h00 * n0 + h01 * n1), 2.0 * (h01 * n0 + h11 * n1)
+            out_frame[k, 3 + i] = e0 * n0 + e1 * n1
+            for j in range(i + 1, 3):
+                _, _, _, m0, m1 = _axis(factors, k, j, rot, jx, jy, jxz, jyz)
+                out_frame[k, 5 + i + j] = 2.0 * (e0 * m0 + e1 * m1)
 
 
 @_exact
-def _quaternion(w, a, b, c, n, dr, out):
-    """Gradient with respect to a quaternion of any norm, from that of its rotation matrix ``dr`` (3, 3)."""
-    gw = 2 * (a * (dr[2, 1] - dr[1, 2]) + b * (dr[0, 2] - dr[2, 0]) + c * (dr[1, 0] - dr[0, 1]))
-    ga = 2 * (
-        w * (dr[2, 1] - dr[1, 2])
-        + b * (dr[0, 1] + dr[1, 0])
-        + c * (dr[0, 2] + dr[2, 0])
-        - 2 * a * (dr[1, 1] + dr[2, 2])
+def _column(turn, i, log_scale, rot, slopes):
+    """Of axis i: the gradient of its log-scale, of its column of the rotation (3), and its part of dL/dJ (4)."""
+    jx, jy, jxz, jyz, h00, h01, h11 = slopes
+    w, a, b, c = turn
+    v0, v1, v2 = turned(rot, *rotation_column(w, a, b, c, i))
+    s = np.exp(np.float64(log_scale))
+    n0, n1 = (jx * v0 + jxz * v2) * s, (jy * v1 + jyz * v2) * s
+    e0, e1 = 2.0 * (h00 * n0 + h01 * n1), 2.0 * (h01 * n0 + h11 * n1)
+    scale = e0 * n0 + e1 * n1
+    e0, e1 = e0 * s, e1 * s
+    x, y, z = jx * e0, jy * e1, jxz * e0 + jyz * e1  # dL/d(column) in the camera's axes
+    column = (
+        rot[0, 0] * x + rot[1, 0] * y + rot[2, 0] * z,
+        rot[0, 1] * x + rot[1, 1] * y + rot[2, 1] * z,
+        rot[0, 2] * x + rot[1, 2] * y + rot[2, 2] * z,
     )
-    gb = 2 * (
-        w * (dr[0, 2] - dr[2, 0])
-        + a * (dr[0, 1] + dr[1, 0])
-        + c * (dr[1, 2] + dr[2, 1])
-        - 2 * b * (dr[0, 0] + dr[2, 2])
-    )
-    gc = 2 * (
-        w * (dr[1, 0] - dr[0, 1])
-        + a * (dr[0, 2] + dr[2, 0])
-        + b * (dr[1, 2] + dr[2, 1])
-        - 2 * c * (dr[0, 0] + dr[1, 1])
-    )
+    return scale, column, (e0 * v0, e0 * v2, e1 * v1, e1 * v2)
+
+
+@_exact
+def _quaternion(w, a, b, c, n, c0, c1, c2, out):
+    """Gradient with respect to a quaternion of any norm, from those of its rotation's columns."""
+    gw = 2 * (a * (c1[2] - c2[1]) + b * (c2[0] - c0[2]) + c * (c0[1] - c1[0]))
+    ga = 2 * (w * (c1[2] - c2[1]) + b * (c1[0] + c0[1]) + c * (c2[0] + c0[2]) - 2 * a * (c1[1] + c2[2]))
+    gb = 2 * (w * (c2[0] - c0[2]) + a * (c1[0] + c0[1]) + c * (c2[1] + c1[2]) - 2 * b * (c0[0] + c2[2]))
+    gc = 2 * (w * (c0[1] - c1[0]) + a * (c2[0] + c0[2]) + b * (c2[1] + c1[2]) - 2 * c * (c0[0] + c1[1]))
     along = gw * w + ga * a + gb * b + gc * c
     out[0], out[1], out[2], out[3] = (
         (gw - along * w) * n,
@@ -267,26 +275,20 @@ def standard(
         out_colors[k] = 0.0
         if extent[k, 2] <= extent[k, 0]:
             continue
-        total = np.empty(SUMS)
-        _total(first, pairs, k, total)
+        total = _total(first, pairs, k)
         _colors_and_logit(k, flat, colors, total, out_logits, out_colors)
         x, y, z = to_camera(means, k, rot, trans)
         du, dv, h00, h01, h11 = _screen(flat, k, total)
         jx, jy, jxz, jyz = fx / z, fy / z, -fx * x / (z * z), -fy * y / (z * z)
         w, a, b, c, n = unit_quaternion(quats, k)
-        dr = np.empty((3, 3))
-        d00 = d02 = d11 = d12 = 0.0
-        for i in range(3):
-            v0, v1, v2 = turned(rot, *rotation_column(w, a, b, c, i))
-            s = np.exp(np.float64(log_scales[k, i]))
-            n0, n1 = (jx * v0 + jxz * v2) * s, (jy * v1 + jyz * v2) * s
-            e0, e1 = 2.0 * (h00 * n0 + h01 * n1), 2.0 * (h01 * n0 + h11 * n1)
-            out_scales[k, i] = e0 * n0 + e1 * n1
-            e0, e1 = e0 * s, e1 * s
-            d00, d02, d11, d12 = d00 + e0 * v0, d02 + e0 * v2, d11 + e1 * v1, d12 + e1 * v2
-            for j in range(3):  # (J W)^T dL/dN, times s: gradient of the rotation's column
-                dr[j, i] = rot[0, j] * jx * e0 + rot[1, j] * jy * e1 + rot[2, j] * (jxz * e0 + jyz * e1)
+        turn = w, a, b, c
+        screen_slopes = jx, jy, jxz, jyz, h00, h01, h11
+        s0, c0, d0 = _column(turn, 0, log_scales[k, 0], rot, screen_slopes)
+        s1, c1, d1 = _column(turn, 1, log_scales[k, 1], rot, screen_slopes)
+        s2, c2, d2 = _column(turn, 2, log_scales[k, 2], rot, screen_slopes)
+        out_scales[k, 0], out_scales[k, 1], out_scales[k, 2] = s0, s1, s2
+        d00, d02, d11, d12 = d0[0] + d1[0] + d2[0], d0[1] + d1[1] + d2[1], d0[2] + d1[2] + d2[2], d0[3] + d1[3] + d2[3]
         dx, dy, dz = _center(x, y, z, fx, fy, du, dv, d00, d02, d11, d12)
         for j in range(3):
             out_means[k, j] = rot[0, j] * dx + rot[1, j] * dy + rot[2, j] * dz
-        _quaternion(w, a, b, c, n, dr, out_quats[k])
+        _quaternion(w, a, b, c, n, c0, c1, c2, out_quats[k])

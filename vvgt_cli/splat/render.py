@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,7 +22,7 @@ class Projection:
         extent: (K, 4) int32 pixel boxes x0, y0, x1, y1; empty where not seen.
         start, members, slots, first: tile lists, see `kernel.tile_lists`.
         tiles_x: tiles along a row.
-        tiles: (tiles,) order in which threads take the tiles.
+        tiles: (tiles,) order in which threads take the tiles: the longest lists first.
     """
 
     flat: np.ndarray
@@ -69,7 +70,7 @@ def _projected(
     tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
     order = depth_order(depth)
     start, members, slots, first = kernel.tile_lists(order, extent, tiles_x, tiles_y, numba.get_num_threads())
-    return Projection(flat, extent, start, members, slots, first, tiles_x, deal(np.diff(start)))
+    return Projection(flat, extent, start, members, slots, first, tiles_x, np.argsort(-np.diff(start), kind="stable"))
 
 
 def pose(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -85,13 +86,11 @@ def depth_order(depth: np.ndarray) -> np.ndarray:
     return (keys & np.uint64(0xFFFFFFFF)).astype(np.int64)
 
 
-def deal(work: np.ndarray) -> np.ndarray:
-    """Order (n,) of tasks that gives contiguous chunks, one a thread, near equal shares of ``work`` (n,)."""
+def tile_by_tile() -> AbstractContextManager[None]:
+    """Threads take one tile after the other: what a tile costs is not known before (pixels end early)."""
     import numba
 
-    threads = numba.get_num_threads()
-    order = np.argsort(-work, kind="stable")
-    return np.concatenate([order[thread::threads] for thread in range(threads)])
+    return numba.parallel_chunksize(1)
 
 
 def blend(projection: Projection, colors: np.ndarray, height: int, width: int) -> np.ndarray:
@@ -101,7 +100,8 @@ def blend(projection: Projection, colors: np.ndarray, height: int, width: int) -
     p = projection
     image = np.zeros((height, width, 4), np.float32)
     colors = np.ascontiguousarray(colors, np.float32)
-    tiles.blend(p.tiles, p.start, p.members, p.extent, p.flat, colors, p.tiles_x, image)
+    with tile_by_tile():
+        tiles.blend(p.tiles, p.start, p.members, p.extent, p.flat, colors, p.tiles_x, image)
     return image
 
 
@@ -118,7 +118,8 @@ def gather(projection: Projection, fields: np.ndarray, out: np.ndarray) -> None:
     p = projection
     pairs = np.zeros((len(p.members), 5), np.float32)
     fields = np.ascontiguousarray(fields, np.float32)
-    tiles.gather(p.tiles, p.start, p.members, p.slots, p.extent, p.flat, p.tiles_x, fields, pairs)
+    with tile_by_tile():
+        tiles.gather(p.tiles, p.start, p.members, p.slots, p.extent, p.flat, p.tiles_x, fields, pairs)
     tiles.reduce_pairs(p.first, pairs, out)
 
 
@@ -179,7 +180,8 @@ def moments(projection: Projection, colors: np.ndarray, image: np.ndarray, grad:
     p = projection
     pairs = np.empty((len(p.members), backward.SUMS), np.float32)
     grad = np.ascontiguousarray(grad, np.float32)
-    backward.moments(p.tiles, p.start, p.members, p.slots, p.extent, p.flat, colors, p.tiles_x, image, grad, pairs)
+    with tile_by_tile():
+        backward.moments(p.tiles, p.start, p.members, p.slots, p.extent, p.flat, colors, p.tiles_x, image, grad, pairs)
     return pairs
 
 

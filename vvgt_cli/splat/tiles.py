@@ -119,7 +119,7 @@ def _blend_tile(entries, extent, flat, colors, ox, oy, buf):
 def blend(tiles, start, members, extent, flat, colors, tiles_x, image):
     """Front-to-back blending into ``image`` (height, width, 4) float32, linear in ``colors`` (K, 3) float32.
 
-    ``tiles`` is the order in which threads take the tiles: equal chunks of it should hold equal work.
+    ``tiles`` is the order in which threads take the tiles.
     """
     height, width = image.shape[:2]
     for index in nb.prange(tiles.shape[0]):
