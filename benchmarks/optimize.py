@@ -1,47 +1,32 @@
-"""Refinement: time of a step's parts, and what steps gain on a list of scenes.
+"""Refinement: time of a step's parts: `python benchmarks/optimize.py [PLY|VOLUME ...] [--gaussians K]`.
 
-    python benchmarks/optimize.py parts [PLY|VOLUME ...] [--gaussians K]
-    PYTHONPATH=. python benchmarks/optimize.py gain SCENES.tsv DATA_DIR TF_DIR -o CSV [--steps N] [--views N]
-                                                [--method frame|adam|3dgs]
-
-`parts` prints milliseconds with one and with all threads (medians of alternated repeats, 400 px), the speed-up, beside it
-that of bare arithmetic, and a floor: the arithmetic of the tile rows that the Gaussians' pixel boxes cover, for forward and backward pass (none of it is saved
-where pixels end early, so opaque scenes may lie below). `gain` starts from the closed form of each scene; references as
-in `closed_form.py`, all views with 3 x 3 rays where neighbours differ and half-voxel steps; seconds are processor time.
+Milliseconds with one and with all threads (medians of alternated repeats, 400 px), the speed-up, beside it that of bare
+arithmetic, and a floor: the arithmetic of the tile rows that the Gaussians' pixel boxes cover, for forward and backward
+pass (none of it is saved where pixels end early, so opaque scenes may lie below). What steps gain: `refinement.py`.
 """
 
 from __future__ import annotations
 
-import csv
-import sys
-import time
 from collections.abc import Callable
-from pathlib import Path
 
 import click
 import numba
 import numpy as np
-from closed_form import read_options
 from floors import alternate, flops, machine
 from splat import PIXEL_FLOPS, covered_pixels, sampled
 
 from vvgt_cli.cameras import default_views
-from vvgt_cli.dvr import render_views
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.ply import read_ply
-from vvgt_cli.metrics import score_views
-from vvgt_cli.optimize import OptimizeOptions, optimize
 from vvgt_cli.optimize.loss import loss_gradient
 from vvgt_cli.optimize.ssim import add_ssim_gradient
 from vvgt_cli.optimize.states import OwnFrame
 from vvgt_cli.optimize.steps import own_frame
-from vvgt_cli.pipeline.source import SourceRequest, load
 from vvgt_cli.splat import blend, render
 from vvgt_cli.splat.constants import DILATION
 from vvgt_cli.splat.kernel import project_factors, tile_lists
 from vvgt_cli.splat.render import depth_order, moments, own_frame_backward, pose
 from vvgt_cli.synth import open_volume
-from vvgt_cli.vbm import VbmOptions, backproject, initialise
 
 REPEATS = 9
 BACKWARD_FLOPS = 60  # a pixel: the forward's 30, colour against gradient 8, what is behind 5, nine sums 12, division
@@ -79,11 +64,6 @@ def part_calls(gaussians: Gaussians, target: np.ndarray) -> dict[str, Callable[[
     }
 
 
-@click.group()
-def main() -> None:
-    """Benchmarks of refinement."""
-
-
 @numba.njit(parallel=True, cache=True)
 def arithmetic(out):  # type: ignore[no-untyped-def]
     """Nothing but arithmetic, in equal chunks: the speed-up that threads of this machine can have."""
@@ -102,10 +82,10 @@ def with_threads(threads: int, call: Callable[[], object]) -> Callable[[], objec
     return run
 
 
-@main.command()
+@click.command(help=__doc__)
 @click.argument("files", nargs=-1)
 @click.option("--gaussians", "count", default=100_000, help="Of volumes.")
-def parts(files: tuple[str, ...], count: int) -> None:
+def main(files: tuple[str, ...], count: int) -> None:
     """Milliseconds of a step's parts on each .ply or volume."""
     print(machine())
     rate = flops(np.float32)
@@ -131,59 +111,6 @@ def parts(files: tuple[str, ...], count: int) -> None:
             print(f"  {part:<16}{one * 1e3:9.2f}{all_of_them * 1e3:9.2f} ms, x {one / all_of_them:.2f}")
         floor = pixels * (PIXEL_FLOPS + BACKWARD_FLOPS) / rate * 1e3
         print(f"  floor           {floor:18.2f} ms (flops, no early end)")
-
-
-def gain_row(scene, options: OptimizeOptions, budget: int, views: int) -> dict[str, str]:  # type: ignore[no-untyped-def]
-    """Closed form, refinement, and the scores of both on the test views."""
-    train, check, test = default_views("train", views), default_views("check"), default_views("test")
-    images, judge, reference = (render_views(scene, cameras) for cameras in (train, check, test))
-    some = slice(None, None, views // 24)
-    start, _ = backproject(initialise(scene, VbmOptions(max_gaussians=budget)), train[some], images[some])
-    began = time.process_time()
-    result, record = optimize(start, train, images, options, (check, judge))
-    seconds = time.process_time() - began
-    before, after = (
-        score_views(reference, (render(g, camera) for camera in test), perceptual=g is result) for g in (start, result)
-    )
-    numbers = {
-        "before": before.psnr, "psnr": after.psnr, "alpha_before": before.psnr_alpha, "psnr_alpha": after.psnr_alpha,
-        "ssim": after.ssim, "check_before": record.psnr_before, "check": record.psnr_after, "seconds": seconds,
-    }  # fmt: skip
-    texts = {key: f"{value:.3f}" for key, value in numbers.items() if value is not None}
-    return texts | {"steps": str(record.steps), "kept": str(record.kept), "reason": record.reason}
-
-
-@main.command()
-@click.argument("paths", nargs=3)
-@click.option("-o", "--output", required=True, help="CSV to write.")
-@click.option("--only", multiple=True, help="Scenes to measure (default: all).")
-@click.option("--steps", default=160)
-@click.option("--method", default="frame")
-@click.option("--views", default=72, type=click.IntRange(24))
-@click.option("--max-gaussians", default=100_000)
-def gain(paths, output, only, steps, method, views, max_gaussians):
-    """PSNR before and after, a row a scene."""
-    scenes, data, functions = map(Path, paths)
-    rows = []
-    for line in scenes.read_text().splitlines():
-        if line.startswith("#") or not line.strip():
-            continue
-        name, volume, options, function = line.split("\t")
-        if only and name not in only:
-            continue
-        request = SourceRequest(
-            volume=str(data / volume),
-            tf=str(functions / function),
-            read=read_options(options),
-            unit_distance="mean-spacing",
-        )
-        row = gain_row(load(request).scene(), OptimizeOptions.of(method, steps=steps), max_gaussians, views)
-        rows.append({"scene": name, "method": method, **row})
-        print(rows[-1], file=sys.stderr)
-        with open(output, "w", newline="") as file:
-            writer = csv.DictWriter(file, list(rows[0]))
-            writer.writeheader()
-            writer.writerows(rows)
 
 
 if __name__ == "__main__":
