@@ -16,6 +16,7 @@ import zarr
 from tests.ramps import X, Y, Z, check_grid, check_ramp, ramp
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume import ReadOptions, read_volume
+from vvgt_cli.volume.netcdf3 import check_header
 
 VALUES = ramp(X, Y, Z)
 AXES = {"x": X, "y": Y, "z": Z}
@@ -309,3 +310,20 @@ def test_a_missing_library_names_its_extra(
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(DataError, match=rf"needs {module} .*pip install 'vvgt\[{extra}\]'"):
         read_volume(str(tmp_path / name))
+
+
+@pytest.mark.parametrize("form", ["NETCDF3_CLASSIC", "NETCDF3_64BIT_OFFSET", "NETCDF3_64BIT_DATA"])
+def test_netcdf_classic_headers_are_checked_before_the_library(tmp_path: Path, form: str) -> None:
+    whole = Path(write_netcdf(tmp_path / "w.nc", format=form)).read_bytes()
+    path, refused = tmp_path / "v.nc", 0
+    for at in range(4, 360):
+        path.write_bytes(whole[:at] + bytes([whole[at] ^ 0x7F]) + whole[at + 1 :])
+        try:
+            check_header(path)
+        except DataError:
+            refused += 1
+    assert refused > 100
+    for cut in range(8, len(whole), 5):
+        path.write_bytes(whole[:cut])
+        with pytest.raises(DataError, match="NetCDF header"):
+            read_volume(str(path))

@@ -133,6 +133,8 @@ def convert_series(request: ConvertRequest, shard: Shard, console: Console | Non
         UsageError: no such files, outputs without a place for a number, a folder that holds another series.
         DataError: a frame that cannot be read, or on another grid than the first.
     """
+    if request.overwrite and shard.count > 1:
+        raise UsageError("--overwrite with --shard: parts would remove each other's files; remove the files instead")
     console = console or Console()
     source = request.source
     files = _files(source)

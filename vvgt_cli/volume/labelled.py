@@ -6,6 +6,7 @@ Attributes and axes are read as the CF conventions (https://cfconventions.org) h
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -66,10 +67,11 @@ def axis(name: str, size: int, centres: np.ndarray | None = None, attributes: Ma
     role = told.get("axis", "").lower()
     if role not in ("x", "y", "z", "t"):
         role = ""
-        words = [told.get("standard_name", "").lower(), units.lower().replace("degrees_", ""), name.lower()]
-        words = [{"east": "lon", "north": "lat"}.get(word, word) for word in words]
-        for word in words:
+        for word in (told.get("standard_name", "").lower(), name.lower()):
             role = role or next((key for key, names in _ROLES.items() if word in names), "")
+        bearing = re.fullmatch(r"degrees?_?(east|north|e|n)", units.lower())  # CF, 4.1 and 4.2
+        if bearing is not None:
+            role = "x" if bearing[1].startswith("e") else "y"
         if " since " in units:
             role = "t"
     return Axis(name, size, centres, units, role)

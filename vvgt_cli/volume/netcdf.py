@@ -11,6 +11,7 @@ from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.hdf5 import MAGIC, MOST_LISTED
 from vvgt_cli.volume.labelled import Axis, axis, labelled_volume
 from vvgt_cli.volume.libraries import library_errors, need
+from vvgt_cli.volume.netcdf3 import check_header
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.registry import Reader, register, volume_name
 from vvgt_cli.volume.types import Volume
@@ -24,6 +25,9 @@ def read_netcdf(path: Path, options: ReadOptions) -> Volume:
         UsageError: several variables and none chosen, or choices that `labelled_volume` asks for.
     """
     library = need("netCDF4", "netcdf", str(path), "NetCDF")
+    with open(path, "rb") as stream:
+        if stream.read(3) == b"CDF":
+            check_header(path)
     with library_errors(str(path), "NetCDF"), library.Dataset(str(path), "r") as file:
         file.set_auto_maskandscale(False)
         variable = _choose(file, options.array, path)

@@ -258,7 +258,10 @@ def quiet_vtk() -> Iterator[Any]:
 
     def message() -> str:
         # "ERROR: In file, line n\nclass (0x..): text"
-        texts = re.findall(r"\(0x[0-9a-f]+\): ([^\n]+)", window.GetOutput() or "")
+        output = window.GetOutput() or ""
+        if isinstance(output, bytes):  # with something in it that is no text
+            output = output.decode("utf-8", "replace")
+        texts = re.findall(r"\(0x[0-9a-f]+\): ([^\n]+)", output)
         return texts[0].strip() if texts else ""
 
     try:
