@@ -22,6 +22,7 @@ COMMANDS = {
     "render-views": "vvgt_cli.cli.render_views",
     "evaluate": "vvgt_cli.cli.evaluate",
     "check": "vvgt_cli.cli.check",
+    "report": "vvgt_cli.cli.report",
     "info": "vvgt_cli.cli.info",
     "tf": "vvgt_cli.cli.tf",
     "infer": "vvgt_cli.cli.infer",

@@ -1,0 +1,73 @@
+"""`vvgt report` of a list of scenes, and an index of them.
+
+    python benchmarks/reports.py SCENES.tsv DATA_DIR TF_DIR -o docs/reports [--only SCENE] [-- VVGT_REPORT_OPTIONS ...]
+
+The list has a line a scene: name, volume, options of reading, function, separated by tabs. Opacity is per mean spacing.
+Scenes that have their report.json are left out, so that the same command goes on where it was. `index.md` holds a row a
+scene, from the JSON. For a machine that does nothing else: runs are timed once. For docs/: `-- --picture-size 160`.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import click
+
+COLUMNS = ("quickest", "knee", "nearest", "3DGS", "iVR-GS setting")
+
+
+def row(found: dict) -> dict[str, str]:
+    """Seconds and dB of the runs that say most."""
+    runs = {run["name"]: run for run in found["runs"]}
+    by_label = {run["label"]: run for run in found["runs"]}
+    front = found["front"]
+    chosen = {"quickest": runs[front[0]], "knee": runs[found["knee"]], "nearest": runs[front[-1]]}
+    chosen |= {name: by_label[name] for name in COLUMNS[3:] if name in by_label}
+    return {
+        name: f"{run['scores']['psnr']:.1f} dB, {run['cost']:.1f} s ({run['label']})" for name, run in chosen.items()
+    }
+
+
+def index(folder: Path) -> str:
+    """A Markdown table of every report in ``folder``."""
+    lines = ["# Reports", "", f"| scene | {' | '.join(COLUMNS)} |", "| --- |" + " --- |" * len(COLUMNS)]
+    machines = set()
+    for path in sorted(folder.glob("*/report.json")):
+        found = json.loads(path.read_text("utf-8"))
+        cells = row(found)
+        name = path.parent.name
+        lines.append(f"| [{name}]({name}/report.html) | {' | '.join(cells.get(c, '-') for c in COLUMNS)} |")
+        machines.add(
+            f"{found['machine']['cpu']}, {found['machine']['threads']} threads; vvgt {found['versions']['vvgt']}"
+        )
+    return "\n".join([*lines, "", *sorted(machines), ""])
+
+
+@click.command()
+@click.argument("paths", nargs=3)
+@click.option("-o", "--output", required=True, help="Folder: one within it a scene.")
+@click.option("--only", multiple=True, help="Scenes to measure (default: all).")
+@click.argument("options", nargs=-1, type=click.UNPROCESSED)
+def main(paths, output, only, options):
+    """Make every report that is not there yet."""
+    scenes, data, functions = map(Path, paths)
+    folder = Path(output)
+    folder.mkdir(parents=True, exist_ok=True)
+    for line in scenes.read_text().splitlines():
+        if line.startswith("#") or not line.strip():
+            continue
+        name, volume, reading, function = line.split("\t")
+        if (only and name not in only) or (folder / name / "report.json").exists():
+            continue
+        call = [sys.executable, "-m", "vvgt_cli.cli.main", "report", str(data / volume), *reading.split()]
+        call += ["--tf", str(functions / function), "--opacity-unit-distance", "mean-spacing"]
+        print(name, file=sys.stderr)
+        subprocess.run([*call, "-o", str(folder / name), "--overwrite", *options], check=True)
+    (folder / "index.md").write_text(index(folder), "utf-8")
+
+
+if __name__ == "__main__":
+    main()

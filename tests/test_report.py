@@ -1,0 +1,290 @@
+"""`vvgt report`: the ladder end to end, and what is made of runs: fronts, tables, charts, the page, comparisons."""
+
+from __future__ import annotations
+
+import copy
+import csv
+import io
+import json
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from tests.onnx_models import write_model
+from tests.report_runs import document, run, runs
+from vvgt_cli.errors import DataError
+from vvgt_cli.images import read_png
+from vvgt_cli.pipeline.ladder import LadderOptions, random_points, rungs
+from vvgt_cli.report.charts import log_ticks, scatter, ticks
+from vvgt_cli.report.page import Pictures, page, points
+from vvgt_cli.report.plots import FILES
+from vvgt_cli.report.runs import Series, cost, front, knee, psnr, read_series, short, table, unit_costs
+
+SMALL = ("--tf", "viridis", "--size", 24, "--max-gaussians", 60, "--steps", 2)
+VOID = {"meta", "img", "input", "br", "polygon", "polyline", "circle", "line", "i"}
+
+
+class Reader(HTMLParser):
+    """Checks that elements close in order, and collects what a page would load."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.loads, self.tags = [], [], []
+        self.feed(text)
+        assert not self.open, self.open
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append(tag)
+        self.loads += [value for name, value in attributes if name in ("src", "href", "srcset", "data")]
+        if tag not in VOID - {"i"}:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attributes):
+        self.tags.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+@pytest.fixture(scope="module")
+def ladder(tmp_path_factory):
+    """A whole report of a small scene with a model that shrinks every Gaussian: (folder, JSON)."""
+    from vvgt_cli.cli.main import run as vvgt
+
+    folder = tmp_path_factory.mktemp("report")
+    step = np.zeros(14)
+    step[3:6] = -3
+    model = write_model(folder / "worse", step)
+    args = ["report", "example:blob:10", *SMALL, "--model", model, "-o", folder / "out", "--quiet"]
+    assert vvgt([str(arg) for arg in args]) == 0
+    return folder / "out", json.loads((folder / "out" / "report.json").read_text())
+
+
+def test_the_ladder_writes_every_file_and_scores_every_rung(ladder):
+    folder, found = ladder
+    assert sorted(path.name for path in folder.iterdir()) == sorted(
+        ["report.json", "report.csv", "report.html", *FILES]
+    )
+    names = [rung["name"] for rung in found["runs"]]
+    assert names == [
+        "closed form, K = 1", "closed form, K = 3", "closed form, K = 15", "closed form, K = 60", "network worse",
+        "2 steps", "3DGS, 2 steps", "iVR-GS setting, 2 steps",
+    ]  # fmt: skip
+    scores = {rung["name"]: rung["scores"]["psnr"] for rung in found["runs"]}
+    assert scores["closed form, K = 1"] < scores["closed form, K = 15"]
+    assert scores["network worse"] == pytest.approx(scores["closed form, K = 60"], abs=0.5)  # what is worse is not kept
+    judge = next(s for s in found["runs"][4]["stages"] if s["name"] == "judge")
+    assert not judge["kept"]
+    assert judge["psnr"] < judge["psnr_before"]
+    assert scores["3DGS, 2 steps"] < scores["iVR-GS setting, 2 steps"]
+    for rung in found["runs"]:
+        assert rung["scores"]["views"] == 10
+        assert rung["bytes"] > 68 * rung["gaussians"] > 0
+        assert rung["cost"] == pytest.approx(cost(rung)) > 0
+        assert {"read", "views", "write"} <= {stage["name"] for stage in rung["stages"]}
+    assert found["format"] == "vvgt-report"
+    assert found["reference"] == {"views": 10, "size": 24, "step": 0.125, "rays": 9}
+    assert found["knee"] in found["front"]
+    assert found["command_line"].startswith("vvgt report example:blob:10 -o ")
+    assert "--steps 2" in found["command_line"]
+    assert found["machine"]["cpu"]
+
+
+def test_the_ladders_page_opens_offline_and_shows_its_pictures(ladder):
+    folder, found = ladder
+    text = (folder / "report.html").read_text("utf-8")
+    reader = Reader(text)
+    assert all(value.startswith("data:image/png;base64,") for value in reader.loads)
+    assert not re.search(r"@import|url\(|https?://", text)
+    assert reader.tags.count("svg") >= 3
+    assert found["machine"]["cpu"] in text
+    assert f"vvgt {found['versions']['vvgt']}" in text
+    held = json.loads(re.search(r'id="images">(.*?)</script>', text, re.S)[1])
+    assert len(held["reference"]) == 2
+    assert [own["name"] for own in held["runs"]] == [rung["name"] for rung in found["runs"]]
+    import base64
+
+    def pixels(uri):
+        (folder.parent / "view.png").write_bytes(base64.b64decode(uri.partition(",")[2]))
+        return read_png(folder.parent / "view.png")
+
+    best = max(range(len(found["runs"])), key=lambda n: found["runs"][n]["scores"]["psnr"])
+    reference, ours = pixels(held["reference"][0]), pixels(held["runs"][best]["images"][0])
+    assert reference.max() > 0.2
+    off = -10 * np.log10(np.mean((reference - ours) ** 2))
+    assert off == pytest.approx(found["runs"][best]["scores"]["per_view"][0]["psnr"], abs=0.3)  # 8 bits
+
+
+def test_csv_and_plots_of_the_ladder(ladder):
+    folder, found = ladder
+    rows = list(csv.DictReader(io.StringIO((folder / "report.csv").read_text())))
+    assert [row["name"] for row in rows] == [rung["name"] for rung in found["runs"]]
+    assert float(rows[3]["psnr"]) == pytest.approx(found["runs"][3]["scores"]["psnr"], abs=1e-4)
+    assert {row["name"] for row in rows if row["pareto"] == "1"} == set(found["front"])
+    for name in FILES:
+        image = read_png(folder / name)
+        assert min(image.shape[:2]) > 300
+        assert len(np.unique(image.reshape(-1, image.shape[2]), axis=0)) > 20
+
+
+def test_nothing_is_overwritten_unasked(ladder, vvgt):
+    folder, _ = ladder
+    result = vvgt("report", "example:blob:10", *SMALL, "-o", folder)
+    assert result.code == 2
+    assert "exists; give --overwrite" in result.error
+
+
+def test_compare_reads_reports_and_conversions(ladder, vvgt, tmp_path):
+    folder, _ = ladder
+    assert vvgt("convert", "example:blob:10", "--tf", "viridis", "--size", 24, "--max-gaussians", 60,
+                "-o", tmp_path / "a.ply", "--report", tmp_path / "a.json").code == 0  # fmt: skip
+    result = vvgt("report", "--compare", folder / "report.json", tmp_path / "a.json", "-o", tmp_path / "both")
+    assert result.code == 0, result.err
+    assert {p.name for p in (tmp_path / "both").iterdir()} == {"report.csv", "report.html", *FILES}
+    text = (tmp_path / "both" / "report.html").read_text("utf-8")
+    Reader(text)
+    assert "out: closed form, K = 60" in text
+    assert "a: convert, K 60" in text
+    assert "a: 1 runs" in result.err
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (("report", "-", "-o", "x"), "every run of the ladder reads it anew"),
+        (("report", "example:blob", "-o", "-"), "a folder of files"),
+        (("report", "example:blob", "-o", "no/where"), "does not exist"),
+        (("report", "example:blob", "-o", "file"), "is a file"),
+        (("report", "example:blob", "example:slab", "-o", "x"), "2 volumes; expected one"),
+        (("report", "--compare", "file", "-o", "x"), "expected two or more"),
+        (("report", "--compare", "file", "file", "-o", "x", "--tf", "viridis"), "--tf: of a volume's report"),
+        (("report", "example:blob", "--model", "none", "-o", "x"), "no such folder"),
+    ],
+)
+def test_calls_that_are_wrong(args, message, vvgt, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("{}")
+    result = vvgt(*args)
+    assert result.code == 2
+    assert message in result.error
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.parametrize(
+    "content", ["", "[]", "{}", '{"format": "vvgt-check"}', '{"format": "vvgt-report", "runs": [{}]}',
+                '{"format": "vvgt-report", "runs": []}', "\xff"],
+)  # fmt: skip
+def test_files_that_are_no_reports(content, tmp_path):
+    path = tmp_path / "r.json"
+    path.write_bytes(content.encode("latin-1"))
+    with pytest.raises(DataError, match=r"r\.json"):
+        read_series(str(path))
+    with pytest.raises(DataError, match="not a report"):
+        read_series(str(tmp_path / "none.json"))
+
+
+def test_the_front_is_what_nothing_beats():
+    found = runs()
+    best = front(found)
+    assert [r["name"] for r in best] == [r["name"] for r in found if r["kind"] in ("closed form", "steps")]
+    for r in found:
+        beaten = any(cost(o) <= cost(r) and psnr(o) >= psnr(r) and o is not r for o in found)
+        assert beaten == (r not in best)
+    assert front([]) == []
+    assert knee(found)["name"] == "closed form, K = 25k"
+    assert knee(found[:1]) is found[0]
+    twins = [run("a", "a", "steps", 10, 1.0, 30.0, 5), run("b", "b", "steps", 10, 1.0, 30.0, 5)]
+    assert [r["name"] for r in front(twins)] == ["a"]
+
+
+def test_the_scoring_costs_nothing_and_units_are_medians():
+    one = run("a", "a", "steps", 1000, 10.0, 30.0, 100)
+    assert cost(one) == pytest.approx(10.0)
+    found = unit_costs(runs())
+    steps = sorted(
+        s["seconds"] / r["refinement"]["steps"]
+        for r in runs() if r["kind"] == "steps" for s in r["stages"] if s["name"] == "refinement"
+    )  # fmt: skip
+    assert found["refinement, a step"] == pytest.approx((steps[1] + steps[2]) / 2)
+    assert "test views, a run" not in found
+    assert unit_costs([]) == {}
+
+
+def test_tables_have_a_column_a_stage_and_a_row_a_run():
+    rows = list(csv.DictReader(io.StringIO(table(runs()))))
+    assert len(rows) == len(runs())
+    for row, one in zip(rows, runs(), strict=True):
+        stages = {stage["name"]: stage["seconds"] for stage in one["stages"]}
+        for name, seconds in stages.items():
+            assert float(row[f"seconds: {name}"]) == pytest.approx(seconds, abs=1e-4)
+        assert row["psnr_alpha"] == ""
+
+
+def test_ticks_lie_within_and_are_some():
+    for lo, hi in ((0.9, 1.1), (1, 60), (1e-3, 1e6), (25, 38), (2.0, 2.6)):
+        found = log_ticks(lo, hi)
+        assert all(lo <= tick <= hi for tick in found)
+        assert len(found) >= 1
+        assert 3 <= len(ticks(lo, hi)) <= 8
+    assert [short(n) for n in (7, 1536, 1e5, 2.5e6)] == ["7", "1.54k", "100k", "2.5M"]
+
+
+def test_charts_keep_marks_and_labels_inside_and_labels_apart():
+    one = Series("s", runs())
+    for axis in ("seconds", "gaussians", "megabytes"):
+        drawn = scatter(points([one], axis)[0], "x", "y")
+        box = [float(v) for v in re.search(r'viewBox="([^"]*)"', drawn)[1].split()]
+        places = [
+            tuple(map(float, m)) for m in re.findall(r'<text class="name [^"]*" x="([\d.]+)" y="([\d.]+)"', drawn)
+        ]
+        assert len(places) >= 7
+        assert all(0 < x < box[2] and 0 < y < box[3] for x, y in places)
+        assert drawn.count("<title>") == len(runs())
+    assert scatter(points([Series("s", runs()[:1])], "seconds")[0], "x", "y").count("<title>") == 1
+
+
+def test_names_cannot_break_out_of_the_page():
+    bad = document(volume={"name": "</script><b>", "dims": [1, 1, 1], "dtype": "u1"})
+    for one in bad["runs"]:
+        one["name"] = "</script><img src=x onerror=alert(1)>"
+    pictures = Pictures([0], [b"png"], [[b"png"]] * len(bad["runs"]))
+    text = page([Series("<i>", bad["runs"], bad)], "<u>", pictures)
+    reader = Reader(text)
+    assert reader.tags.count("img") == 4
+    assert reader.tags.count("script") == 2
+    assert "u" not in reader.tags
+
+
+def test_several_reports_are_told_apart(tmp_path, vvgt):
+    other = copy.deepcopy(document())
+    for one in other["runs"]:
+        one["scores"]["psnr"] -= 1
+    for name, content in (("a", document()), ("b", other)):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "report.json").write_text(json.dumps(content))
+    result = vvgt("report", "--compare", tmp_path / "a" / "report.json", tmp_path / "b" / "report.json",
+                  tmp_path / "a" / "report.json", "-o", tmp_path / "c")  # fmt: skip
+    assert result.code == 0, result.err
+    text = (tmp_path / "c" / "report.html").read_text("utf-8")
+    Reader(text)
+    for name in ("a (1)", "b", "a (3)"):
+        assert f"Where the time goes: {name}" in text
+    rows = list(csv.DictReader(io.StringIO((tmp_path / "c" / "report.csv").read_text())))
+    assert len(rows) == 3 * len(runs())
+
+
+def test_rungs_follow_the_options_and_random_points_fill_the_box():
+    names = [r.name for r in rungs(LadderOptions(64_000, 100, (100, 25, 25), "m/net", 3))]
+    assert names[:5] == ["closed form, K = 1k", "closed form, K = 4k", "closed form, K = 16k", "closed form, K = 64k",
+                         "network net"]  # fmt: skip
+    assert names[5:] == ["25 steps", "100 steps", "3DGS, 100 steps", "iVR-GS setting, 100 steps"]
+    assert len(rungs(LadderOptions(1))) == 1 + 4 + 2
+    half = np.array([1.0, 0.5, 0.1])
+    points = random_points(half, 2000, 0)
+    assert (np.abs(points.means) <= half).all()
+    assert np.abs(points.means).max(axis=0) == pytest.approx(half, rel=0.01)
+    gaps = np.linalg.norm(points.means[:, None] - points.means[None], axis=-1)
+    nearest = np.sort(gaps, axis=1)[:, 1:4].mean()
+    assert np.exp(points.log_scales[0, 0]) == pytest.approx(nearest, rel=0.3)  # a thin box has more rim

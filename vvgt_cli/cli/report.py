@@ -1,0 +1,96 @@
+"""`vvgt report`."""
+
+from __future__ import annotations
+
+import shlex
+from typing import Any
+
+import click
+from click.core import ParameterSource
+
+from vvgt_cli.cli.options import common_options, overwrite_option, read_options, tf_options
+from vvgt_cli.errors import UsageError
+from vvgt_cli.progress import Console
+
+OF_BOTH = {"paths", "compare", "output", "overwrite", "quiet"}  # parameters that --compare takes too
+
+
+def _typed(ctx: click.Context) -> list[click.Parameter]:
+    """Parameters that were given on the command line."""
+    return [p for p in ctx.command.params if p.name and ctx.get_parameter_source(p.name) is ParameterSource.COMMANDLINE]
+
+
+def command_line(ctx: click.Context) -> str:
+    """The call, arguments first; without ``--threads``, which the report records by itself."""
+    words = ["vvgt", "report"]
+    for parameter in _typed(ctx):
+        value = ctx.params.get(parameter.name or "")
+        values = list(value) if isinstance(value, tuple) else [value]
+        if isinstance(parameter, click.Argument):
+            words += map(str, values)
+        elif isinstance(parameter, click.Option) and parameter.name in ctx.params:
+            name = parameter.opts[-1]
+            repeated = [[name, str(v)] for v in values] if parameter.multiple else [[name, *map(str, values)]]
+            words += [name] if parameter.is_flag else [word for part in repeated for word in part]
+    return shlex.join(words)
+
+
+@click.command("report", short_help="Error against run time, as a page, plots and tables.")
+@click.argument("paths", nargs=-1, required=True, metavar="VOLUME | A.json B.json ...")
+@click.option("-o", "--output", required=True, metavar="DIR", help="Folder to write to; made if it is not there.")
+@click.option("--compare", is_flag=True, help="Overlay reports: report.json files, or --report files of convert.")
+@click.option(
+    "--max-gaussians", type=click.IntRange(1, 100_000_000), default=100_000, show_default=True, metavar="K",
+    help="Largest budget; the closed form runs with 1/64, 1/16 and 1/4 of it too.",
+)  # fmt: skip
+@click.option("--size", type=click.IntRange(16, 2048), default=400, show_default=True, metavar="PX", help="Image size.")
+@click.option(
+    "--steps", type=click.IntRange(1, 10_000_000), multiple=True, default=(25, 100, 200, 400), show_default=True,
+    metavar="N", help="Steps of gradient descent, a run each; may be repeated. The baselines take the largest.",
+)  # fmt: skip
+@click.option(
+    "--picture-size", type=click.IntRange(16, 2048), default=400, show_default=True, metavar="PX",
+    help="Pictures on the page are averaged down to at most this.",
+)  # fmt: skip
+@click.option("--model", metavar="MODEL", help="Network to run: a folder that 'vvgt export' wrote, or a shipped one.")
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of whatever draws random numbers.")
+@tf_options
+@read_options
+@overwrite_option
+@common_options
+@click.pass_context
+def command(
+    ctx: click.Context, paths: tuple[str, ...], output: str, compare: bool, console: Console, **options: Any
+) -> None:
+    """Make the Gaussians of VOLUME by ever dearer means and show what each costs and gains.
+
+    The closed form at several budgets, a network where a model is named, gradient descent of several lengths, and
+    two baselines: 3DGS from random points, and iVR-GS' setting (3DGS from samples of the volume). Each is timed on
+    its own, views and all, and scored on the same ten test views. DIR gets report.html (one file, opens offline),
+    report.json, report.csv and four PNG plots.
+
+    \b
+    Examples:
+      vvgt report head.nrrd --tf bone.json -o head-report
+      vvgt report example:frog --size 200 --max-gaussians 20000 --steps 25 --steps 100 -o frog-report
+      vvgt report --compare head-report/report.json other/report.json -o both
+    """
+    from vvgt_cli.cli.fit import source_request
+    from vvgt_cli.pipeline import report as pipeline
+
+    if compare:
+        other = [p.opts[-1] for p in _typed(ctx) if p.name not in OF_BOTH]
+        if other:
+            raise UsageError(f"{', '.join(other)}: of a volume's report; --compare only overlays reports")
+        pipeline.compare(paths, output, options["overwrite"], console)
+        return
+    if len(paths) != 1:
+        raise UsageError(f"{len(paths)} volumes; expected one (reports to overlay need --compare)")
+    ladder = pipeline.LadderOptions(
+        options["max_gaussians"], options["size"], options["steps"], options["model"], options["seed"]
+    )
+    source = source_request(paths[0], options["read"], options["optics"])
+    request = pipeline.ReportRequest(
+        source, output, ladder, options["picture_size"], options["overwrite"], command_line(ctx)
+    )
+    pipeline.report(request, console)

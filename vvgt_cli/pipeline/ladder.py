@@ -1,0 +1,257 @@
+"""The ladder of `report`: one scene by ever dearer means, each run timed on its own and scored on the same views."""
+
+from __future__ import annotations
+
+import io
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vvgt_cli.cameras import default_views
+from vvgt_cli.cameras.sets import SET_VIEWS
+from vvgt_cli.gaussians import Gaussians, as_stored, read_ply, write_ply
+from vvgt_cli.optimize import OptimizeOptions
+from vvgt_cli.pipeline.convert import ConvertRequest, FitOptions, convert
+from vvgt_cli.pipeline.optimize import Views, refine
+from vvgt_cli.pipeline.record import ConversionReport, Run
+from vvgt_cli.pipeline.source import SourceRequest, load
+from vvgt_cli.progress import Console
+from vvgt_cli.report.runs import short
+
+if TYPE_CHECKING:
+    from vvgt_cli.dvr import Scene
+    from vvgt_cli.network.runtime import Model
+
+SHARES = (64, 16, 4)  # of the budget, for the closed form at several K
+STARTS = 2  # of the budget, what the baselines begin with: they grow
+FAINT = 0.1  # opacity of 3DGS' first points
+NEIGHBOURS = 0.72  # mean distance to the three nearest of n random points, over (volume / n)^(1/3)
+
+
+@dataclass(frozen=True)
+class LadderOptions:
+    """Which rungs there are.
+
+    Attributes:
+        max_gaussians: largest budget K.
+        size: pixels along an image's edge.
+        steps: of gradient descent, a rung each; the baselines take as many as the longest.
+        model: folder or name of an exported network, None for none.
+        seed: of whatever draws random numbers.
+    """
+
+    max_gaussians: int = 100_000
+    size: int = 400
+    steps: tuple[int, ...] = (25, 100, 200, 400)
+    model: str | None = None
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Rung:
+    """One way of making the file.
+
+    Attributes:
+        name: for tables; ``label`` for charts.
+        kind: one of `vvgt_cli.report.runs.KINDS`.
+        fit: of a conversion, and what the others take their sizes from.
+        start: of the baselines: "points" (random in the box) or "samples" (of what the function shows).
+    """
+
+    name: str
+    label: str
+    kind: str
+    fit: FitOptions
+    start: str | None = None
+
+
+def rungs(options: LadderOptions) -> list[Rung]:
+    """From the cheapest on, then the baselines."""
+    most, size, seed = options.max_gaussians, options.size, options.seed
+    budgets = sorted({max(most // share, 1) for share in SHARES} | {most})
+    found = [
+        Rung(f"closed form, K = {short(k)}", short(k), "closed form", FitOptions(k, size, seed=seed)) for k in budgets
+    ]
+    full = FitOptions(most, size, seed=seed)
+    if options.model:
+        found.append(Rung(f"network {Path(options.model).name}", "network", "network", full))
+    for steps in sorted(set(options.steps)):
+        fit = FitOptions(most, size, seed=seed, steps=steps)
+        found.append(Rung(f"{steps} steps", f"{steps} steps", "steps", fit))
+    longest = FitOptions(most, size, seed=seed, steps=max(options.steps, default=0))
+    if longest.steps:
+        for name, start in (("3DGS", "points"), ("iVR-GS setting", "samples")):
+            found.append(Rung(f"{name}, {longest.steps} steps", name, "baseline", longest, start))
+    return found
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What every rung is scored against: test views, rendered once and in no rung's time."""
+
+    views: Views
+    step: float  # voxels
+    rays: int  # a pixel, at most
+
+    @classmethod
+    def render(cls, scene: Scene, size: int, console: Console) -> Reference:
+        """The test views as `vvgt evaluate` has them."""
+        from vvgt_cli.dvr import REFERENCE, render_views
+
+        cameras = default_views("test", size=size)
+        images = render_views(scene, cameras, REFERENCE, progress=console.bar("reference"))
+        return cls(Views(cameras, images), REFERENCE.step, max(rays for _, rays in REFERENCE.tiers))
+
+
+def climb(
+    source: SourceRequest, options: LadderOptions, reference: Reference, console: Console
+) -> Iterator[tuple[dict[str, Any], list[np.ndarray]]]:
+    """Each rung's run (a dict, see `vvgt_cli.report.runs`) and its pictures of the reference's views.
+
+    Raises:
+        DataError, UsageError: as `vvgt_cli.pipeline.convert.convert`.
+        KeyboardInterrupt: a refinement was interrupted; what came after it would not be comparable.
+    """
+    from vvgt_cli.metrics import score_views
+    from vvgt_cli.splat import render
+
+    model = _model(options.model)
+    for rung in rungs(options):
+        report, gaussians = _run(source, rung, model)
+        if report.refinement and report.refinement["reason"] == "interrupted":
+            raise KeyboardInterrupt
+        images = [render(gaussians, camera) for camera in reference.views.cameras]
+        report.scores = asdict(score_views(reference.views.images, images))
+        views = rung.fit.views() + SET_VIEWS["check"]
+        run = {"name": rung.name, "label": rung.label, "kind": rung.kind, "views": views, **asdict(report)}
+        yield run, images
+
+
+def warm_up(source: SourceRequest, options: LadderOptions) -> None:
+    """Run every kind of rung once at next to no size: kernels are compiled or loaded before any clock starts."""
+    few = LadderOptions(100, 64, (2,) if options.steps else (), options.model, options.seed)
+    model = _model(options.model)
+    for rung in rungs(few)[-4:]:
+        _run(source, rung, model)
+
+
+def _run(source: SourceRequest, rung: Rung, model: Model | None) -> tuple[ConversionReport, Gaussians]:
+    if rung.kind == "baseline":
+        return _baseline(source, rung)
+    if rung.kind == "network":
+        assert model is not None
+        return _network(source, rung, model)
+    with tempfile.TemporaryDirectory() as folder:
+        path = str(Path(folder) / "rung.ply")
+        report = convert(ConvertRequest(source, path, rung.fit), Console(quiet=True))
+        return report, read_ply(path)[0]
+
+
+def _model(name: str | None) -> Model | None:
+    if name is None:
+        return None
+    import numba
+
+    from vvgt_cli.network.card import find_model
+    from vvgt_cli.network.runtime import Model
+
+    return Model.open(find_model(name), numba.get_num_threads())
+
+
+def _begin(source: SourceRequest, rung: Rung) -> tuple[Run, Scene]:
+    run = Run(Console(quiet=True), ConversionReport("report", options=asdict(rung.fit)))
+    with run.stage("read"):
+        loaded = load(source)
+    with run.stage("scene"):
+        scene = loaded.scene()
+    return run, scene
+
+
+def _views(run: Run, scene: Scene, fit: FitOptions) -> tuple[Views, Views]:
+    from vvgt_cli.dvr import render_views
+
+    train, check = default_views("train", fit.views(), size=fit.size), default_views("check", size=fit.size)
+    with run.stage("views"):
+        return Views(train, render_views(scene, train)), Views(check, render_views(scene, check))
+
+
+def _finish(run: Run, gaussians: Gaussians) -> tuple[ConversionReport, Gaussians]:
+    stored = as_stored(gaussians)
+    with run.stage("write"):
+        run.report.bytes = write_ply(io.BytesIO(), stored)
+    run.report.gaussians = len(stored)
+    return run.finish(), stored
+
+
+def _baseline(source: SourceRequest, rung: Rung) -> tuple[ConversionReport, Gaussians]:
+    """3DGS (Kerbl et al. 2023): its loss, rates and density control, from random points or samples of the volume."""
+    from vvgt_cli.vbm import VbmOptions, initialise
+
+    run, scene = _begin(source, rung)
+    fit = rung.fit
+    count = max(fit.max_gaussians // STARTS, 1)
+    with run.stage("samples"):
+        if rung.start == "points":
+            start = random_points(scene.half, count, fit.seed)
+        else:
+            start = initialise(scene, VbmOptions(count, fit.size, "uniform", fit.seed)).gaussians
+    train, check = _views(run, scene, fit)
+    options = OptimizeOptions.of("3dgs", steps=fit.steps, max_gaussians=fit.max_gaussians, seed=fit.seed)
+    return _finish(run, refine(run, start, train, check, options))
+
+
+def random_points(half: np.ndarray, count: int, seed: int) -> Gaussians:
+    """What 3DGS begins with where it has no points: ``count`` anywhere in the box, of any colour, round and faint.
+
+    Sizes are the mean distance to the three nearest points; ``half`` (3,) are the box's half extents.
+    """
+    rng = np.random.default_rng(seed)
+    scale = NEIGHBOURS * (8 * float(np.prod(half)) / count) ** (1 / 3)
+    return Gaussians(
+        rng.uniform(-1, 1, (count, 3)) * half,
+        np.full((count, 3), np.log(scale)),
+        np.tile([1.0, 0, 0, 0], (count, 1)),
+        np.full(count, np.log(FAINT / (1 - FAINT))),
+        rng.random((count, 3)),
+    )
+
+
+def _network(source: SourceRequest, rung: Rung, model: Model) -> tuple[ConversionReport, Gaussians]:
+    """Closed form, colours from the views, the network on the same views; kept if the check views agree."""
+    from vvgt_cli.metrics import score_views
+    from vvgt_cli.splat import render
+    from vvgt_cli.vbm import VbmOptions, backproject, initialise
+
+    run, scene = _begin(source, rung)
+    with run.stage("closed form"):
+        start = initialise(scene, VbmOptions(rung.fit.max_gaussians, rung.fit.size))
+    train, check = _views(run, scene, rung.fit)
+    with run.stage("back-projection"):
+        gaussians, _ = backproject(start, train.cameras, train.images)
+    with run.stage("network"):
+        better = model.improve(gaussians, train.cameras, train.images)
+
+    def judged(some: Gaussians) -> float:
+        images = (render(some, camera) for camera in check.cameras)
+        return score_views(check.images, images, perceptual=False).psnr
+
+    with run.stage("judge") as stage:
+        stage.psnr_before, stage.psnr = judged(gaussians), judged(better)
+        stage.kept = stage.psnr > stage.psnr_before
+    return _finish(run, better if stage.kept else gaussians)
+
+
+def pictures(images: Sequence[np.ndarray] | np.ndarray, numbers: Sequence[int], limit: int) -> list[np.ndarray]:
+    """RGB over black of some views, (h, w, 3) in [0, 1], averaged over squares of pixels to sides of ``limit``."""
+    found = []
+    for n in numbers:
+        image = np.clip(images[n][..., :3], 0, 1)
+        factor = -(-max(image.shape[:2]) // limit)
+        height, width = (side // factor for side in image.shape[:2])
+        squares = image[: height * factor, : width * factor].reshape(height, factor, width, factor, 3)
+        found.append(squares.mean(axis=(1, 3)))
+    return found

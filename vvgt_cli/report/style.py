@@ -1,0 +1,99 @@
+"""Style sheet and script of the page: no font, no library, nothing fetched."""
+
+CSS = """
+:root{color-scheme:light dark;--paper:#fbfbfa;--card:#fff;--ink:#1c1f23;--soft:#5d656f;--line:#e3e5e8;--grid:#eceef0;
+--k0:#0072b2;--k1:#a8527e;--k2:#00845f;--k3:#c05a00;--c0:#0072b2;--c1:#c05a00;--c2:#00845f;--c3:#a8527e;
+--s0:#8a949e;--s1:#b4bbc2;--s2:#8f7bbf;--s3:#0072b2;--s4:#e69f00;--s5:#56b4e9;--s6:#cc79a7;--s7:#e3b5cd;--s8:#009e73;
+--s9:#6b6f75}
+@media(prefers-color-scheme:dark){:root{--paper:#14171a;--card:#1c2024;--ink:#e8eaec;--soft:#9aa3ad;--line:#2e343a;
+--grid:#282d33;--k0:#56b4e9;--k1:#d995ba;--k2:#2fc79b;--k3:#f0954a;--c0:#56b4e9;--c1:#f0954a;--c2:#2fc79b;--c3:#d995ba;
+--s0:#77818b;--s1:#4f575f;--s3:#3d8fc7;--s9:#9aa0a6}}
+*{box-sizing:border-box}
+body{margin:0;background:var(--paper);color:var(--ink);
+font:16px/1.5 system-ui,-apple-system,"Segoe UI",Roboto,sans-serif}
+main{max-width:1240px;margin:0 auto;padding:28px 20px 60px}
+h1{font-size:1.7rem;line-height:1.2;margin:0 0 .2em;overflow-wrap:anywhere}
+h2{font-size:1.1rem;margin:0 0 .6em}
+p{margin:.3em 0}.soft{color:var(--soft)}small{color:var(--soft)}
+section{background:var(--card);border:1px solid var(--line);border-radius:10px;padding:18px;margin-top:18px;min-width:0}
+.facts{display:grid;grid-template-columns:repeat(auto-fit,minmax(170px,1fr));gap:12px;margin-top:18px}
+.facts div{background:var(--card);border:1px solid var(--line);border-radius:10px;padding:12px 16px}
+.facts b{display:block;font-size:1.35rem;line-height:1.3;font-variant-numeric:tabular-nums}
+.grid2{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(100%,440px),1fr));gap:18px}
+.grid2 section{margin-top:0}.grid2{margin-top:18px}
+svg{display:block;width:100%;height:auto;overflow:visible;font-family:inherit}
+svg text{font-size:12.5px;fill:var(--ink)}svg .tick{fill:var(--soft)}svg .axis{font-weight:600}
+svg .name{font-size:12px;paint-order:stroke;stroke:var(--card);stroke-width:3px;stroke-linejoin:round}
+svg .grid{stroke:var(--grid);stroke-width:1}.front{fill:none;stroke-width:2;opacity:.65;stroke:var(--ink)}
+svg .name.c0{fill:var(--c0)}svg .name.c1{fill:var(--c1)}svg .name.c2{fill:var(--c2)}svg .name.c3{fill:var(--c3)}
+.key{fill:var(--ink)}
+.ring{fill:none;stroke:currentColor;stroke-width:1.6;opacity:.75}
+.k0{color:var(--k0);fill:var(--k0)}.k1{color:var(--k1);fill:var(--k1)}.k2{color:var(--k2);fill:var(--k2)}
+.k3{color:var(--k3);fill:var(--k3)}.c0{color:var(--c0);fill:var(--c0)}.c1{color:var(--c1);fill:var(--c1)}
+.c2{color:var(--c2);fill:var(--c2)}.c3{color:var(--c3);fill:var(--c3)}
+polyline.front{fill:none}polyline.c0,polyline.c1,polyline.c2,polyline.c3{stroke:currentColor}
+.keys{display:flex;flex-wrap:wrap;gap:4px 16px;font-size:.875rem;color:var(--soft);margin:0 0 10px}
+.keys span{display:inline-flex;align-items:center;gap:6px}.key{width:18px;height:18px;flex:none}
+.keys i{width:14px;height:14px;border-radius:3px;flex:none}
+.s0{background:var(--s0)}.s1{background:var(--s1)}.s2{background:var(--s2)}.s3{background:var(--s3)}
+.s4{background:var(--s4)}.s5{background:var(--s5)}.s6{background:var(--s6)}.s7{background:var(--s7)}
+.s8{background:var(--s8)}.s9{background:var(--s9)}
+.s10{background:repeating-linear-gradient(135deg,var(--line) 0 3px,var(--soft) 3px 4.5px)}
+.bar{display:grid;grid-template-columns:minmax(90px,170px) 1fr 76px;gap:10px;align-items:center;margin:5px 0;
+font-size:.875rem}
+.bar b{font-weight:500;line-height:1.2}.bar div{display:flex;height:18px;min-width:0}
+.bar i{display:block;min-width:1px}.bar em{font-style:normal;text-align:right;font-variant-numeric:tabular-nums}
+.scroll{overflow-x:auto}table{border-collapse:collapse;width:100%;font-size:.875rem;font-variant-numeric:tabular-nums}
+th,td{padding:6px 10px;text-align:right;border-bottom:1px solid var(--line);white-space:nowrap}
+th{color:var(--soft);font-weight:600}th:first-child,td:first-child{text-align:left}
+tr.best td:first-child{font-weight:700}
+code{display:block;background:var(--paper);border:1px solid var(--line);border-radius:6px;padding:10px 12px;
+font:13px/1.5 ui-monospace,Menlo,Consolas,monospace;overflow-wrap:anywhere;white-space:pre-wrap}
+dl{display:grid;grid-template-columns:max-content 1fr;gap:3px 16px;margin:12px 0 0;font-size:.9rem}
+dt{color:var(--soft)}dd{margin:0;overflow-wrap:anywhere}
+.tools{display:flex;flex-wrap:wrap;gap:10px 18px;align-items:center;margin-bottom:12px;font-size:.9rem}
+select{font:inherit;color:inherit;background:var(--paper);border:1px solid var(--line);border-radius:6px;
+padding:5px 8px;max-width:100%}
+.pair{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(100%,300px),1fr));gap:16px}
+figure{margin:0;min-width:0}figcaption{font-size:.875rem;color:var(--soft);margin-top:6px}
+.stage{position:relative;aspect-ratio:1;background:#000;border-radius:8px;overflow:hidden}
+.stage img{position:absolute;inset:0;width:100%;height:100%;object-fit:contain}
+.wipe .ours{clip-path:inset(0 0 0 var(--at,50%))}
+.wipe::after{content:"";position:absolute;top:0;bottom:0;left:var(--at,50%);width:2px;margin-left:-1px;background:#fff;
+mix-blend-mode:difference}
+.wipe input{position:absolute;inset:0;width:100%;height:100%;margin:0;opacity:0;cursor:ew-resize}
+.wipe:focus-within{outline:3px solid var(--k0);outline-offset:2px}
+.tag{position:absolute;top:8px;padding:1px 8px;border-radius:9px;background:#0009;color:#fff;font-size:.75rem}
+.tag.l{left:8px}.tag.r{right:8px}
+.gap{isolation:isolate}.gap .ours{mix-blend-mode:difference}
+input[type=range]{accent-color:var(--k0)}
+@media(max-width:560px){main{padding:18px 12px 40px}section{padding:14px 12px}h1{font-size:1.35rem}
+.bar{grid-template-columns:1fr 66px;gap:0 8px;margin:8px 0}.bar b{grid-column:1/-1}.facts{grid-template-columns:1fr}
+.facts b{font-size:1.1rem}dl{grid-template-columns:1fr;gap:0}dd{margin-bottom:6px}}
+"""
+
+SCRIPT = """
+(() => {
+  const data = JSON.parse(document.getElementById("images").textContent);
+  const [run, view, gain] = ["run", "view", "gain"].map(name => document.getElementById(name));
+  const set = (name, source) => document.querySelectorAll("img." + name).forEach(image => { image.src = source; });
+  const show = () => {
+    const ours = data.runs[run.value];
+    set("reference", data.reference[view.value]);
+    set("ours", ours.images[view.value]);
+    document.getElementById("score").textContent = ours.scores[view.value];
+    document.getElementById("ours-name").textContent = ours.name;
+  };
+  const slide = event => event.target.parentElement.style.setProperty("--at", event.target.value + "%");
+  const brighten = () => {
+    document.querySelector(".gap").style.filter = "brightness(" + gain.value + ")";
+    document.getElementById("gain-value").textContent = gain.value;
+  };
+  run.addEventListener("change", show);
+  view.addEventListener("change", show);
+  document.getElementById("wipe").addEventListener("input", slide);
+  gain.addEventListener("input", brighten);
+  show();
+  brighten();
+})();
+"""
