@@ -1,4 +1,4 @@
-"""Damaged files for every reader: ``python -m tests.fuzz [--inputs N] [--start N] [--reader NAME] [--save FOLDER]``.
+"""Damaged files for every reader: ``python tests/fuzz.py [--inputs N] [--start N] [--reader NAME] [--save FOLDER]``.
 
 Input ``i`` of a reader is one of its seeds (tests/fuzz_seeds.py), changed in a few places by a generator that is seeded
 with the reader's name and ``i``: the same number is always the same file. A reader may only return, or raise one of our
@@ -245,7 +245,7 @@ def _lay(folder: Path, seed: Seed, data: bytes) -> Path:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the readers that are asked for; 1 if anything was found."""
-    from tests.fuzz_seeds import readers
+    from fuzz_seeds import readers
 
     parser = argparse.ArgumentParser()
     parser.add_argument("--inputs", type=int, default=1000, help="of each reader")

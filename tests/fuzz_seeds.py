@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from fuzz import Seed
 
-from tests.fuzz import Seed
 from vvgt_cli.volume import ReadOptions, read_volume
 
 FIXTURES = Path(__file__).parent / "fixtures"
@@ -231,7 +231,8 @@ def numpy_files() -> list[Seed]:
 
 
 def transfer() -> list[Seed]:
-    from tests.test_transfer_formats import ITF, XML, vp, vp_json
+    from test_transfer_formats import ITF, XML, vp, vp_json
+
     from vvgt_cli.transfer import read_transfer_function
 
     def read(path: Path) -> None:
@@ -288,21 +289,19 @@ def cameras() -> list[Seed]:
 
 
 def model_card() -> list[Seed]:
-    from vvgt_cli.network.card import IMAGE_INPUTS, MAPS, ModelCard, graph_record, read_card
-    from vvgt_cli.network.config import NetworkConfig
+    from onnx_models import write_model
+
+    from vvgt_cli.network.runtime import Model
 
     with tempfile.TemporaryDirectory() as folder:
-        graphs = {}
-        for name in ("image", "geometry"):
-            (Path(folder) / f"{name}.onnx").write_bytes(b"graph")
-            graphs[name] = graph_record(Path(folder) / f"{name}.onnx", IMAGE_INPUTS, MAPS)
-    card = ModelCard("tiny", NetworkConfig().to_dict(), 10, {}, "abc", {}, 18, "float32", 0.0, graphs)
-    beside = {"image.onnx": b"graph", "geometry.onnx": b"graph"}
-    return [Seed("card.json", card.to_json().encode(), lambda path: read_card(path.parent).network, beside)]
+        files = {path.name: path.read_bytes() for path in write_model(Path(folder) / "tiny").iterdir()}
+    card = files.pop("card.json")
+    return [Seed("card.json", card, lambda path: Model.open(path.parent, threads=1), files)]
 
 
 def checkpoint() -> list[Seed]:
-    from tests.test_optimize_checkpoint import CAMERAS, cloud
+    from test_optimize_checkpoint import CAMERAS, cloud
+
     from vvgt_cli.optimize import OptimizeOptions, OptimizeRecord
     from vvgt_cli.optimize.checkpoint import resume, save
     from vvgt_cli.optimize.loop import Judge, begin

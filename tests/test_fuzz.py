@@ -11,8 +11,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from fuzz import Seed, mutate, run
 
-from tests.fuzz import Seed, mutate, run
 from vvgt_cli.errors import DataError
 
 ROOT = Path(__file__).parent.parent
@@ -20,7 +20,7 @@ ROOT = Path(__file__).parent.parent
 
 def test_damaged_files_end_in_one_of_our_errors(request: pytest.FixtureRequest) -> None:
     inputs = 100_000 if request.config.getoption("--long") else 1000
-    command = [sys.executable, "-m", "tests.fuzz", "--inputs", str(inputs)]
+    command = [sys.executable, "tests/fuzz.py", "--inputs", str(inputs)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.stdout, done.stderr
     for line in done.stdout.splitlines():

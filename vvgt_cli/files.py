@@ -1,4 +1,4 @@
-"""Writing files: beside the target and renamed, and never over an existing one unasked."""
+"""Writing files: beside the target and renamed, and never over an existing one unasked; reading small ones."""
 
 from __future__ import annotations
 
@@ -9,6 +9,22 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from vvgt_cli.errors import DataError, UsageError
+
+MAX_TEXT = 64 << 20  # bytes; parsed JSON takes some ten times as many
+
+
+def read_text(path: str | os.PathLike[str]) -> str:
+    """The text of a small file (UTF-8).
+
+    Raises:
+        DataError: more than 64 MiB.
+        OSError, UnicodeDecodeError: it cannot be read, or is not text.
+    """
+    with open(path, "rb") as file:
+        content = file.read(MAX_TEXT + 1)
+    if len(content) > MAX_TEXT:
+        raise DataError(f"{path}: more than 64 MiB; expected a small text file")
+    return content.decode("utf-8")
 
 
 def check_target(path: str | os.PathLike[str], overwrite: bool = False) -> Path:

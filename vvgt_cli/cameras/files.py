@@ -17,6 +17,7 @@ import numpy as np
 
 from vvgt_cli.cameras.types import Camera
 from vvgt_cli.errors import DataError
+from vvgt_cli.files import read_text
 
 OPENGL = np.diag([1.0, -1.0, -1.0])  # camera axes OpenCV <-> OpenGL
 MAX_SIDE = 16384  # pixels; 4 GiB of float RGBA
@@ -124,7 +125,7 @@ def read_frames(path: str | Path, size: int | None = None) -> list[Frame]:
     """
     name = Path(path).name
     try:
-        document = json.loads(Path(path).read_text("utf-8"))
+        document = json.loads(read_text(path))
     except (ValueError, RecursionError) as error:
         raise DataError(f"{name}: not JSON ({error}); expected a transforms.json") from None
     entries = document.get("frames") if isinstance(document, dict) else None
@@ -156,6 +157,8 @@ def _camera(entry: dict[str, Any], name: str, index: int, size: int | None) -> C
     matrix = _matrix(entry.get("transform_matrix"), name)
     width, height, fx, fy, cx, cy = _lens(entry, name, size)
     stem = PurePosixPath(str(entry.get("file_path", f"view_{index:03d}"))).stem or f"view_{index:03d}"
+    if not stem.isprintable() or "\\" in stem:  # it becomes the name of a file
+        raise DataError(f"{name}: image {stem!r}; expected a plain file name")
     rotation, translation = opengl_to_pose(matrix)
     try:
         camera = Camera(rotation, translation, fx, fy, cx, cy, width, height, stem)

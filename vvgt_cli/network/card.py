@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import hashlib
 import json
+import sysconfig
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from vvgt_cli import __version__
 from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.files import read_text
 from vvgt_cli.network.config import SCALES, NetworkConfig
 
 FORMAT, SCHEMA = "vvgt-model", 1  # the schema is raised when a graph's input or output changes its meaning
 CARD = "card.json"
-MODELS = Path(__file__).parents[2] / "models"
+MODELS = Path(__file__).parents[2] / "models"  # of a checkout
+INSTALLED = "share/vvgt/models"  # below where pip puts a wheel's data
 MAPS = [f"maps_{scale}" for scale in range(SCALES)]
 IMAGE_INPUTS = ["images", "poses"]
 OUTPUT = "gaussians_out"
@@ -73,12 +76,13 @@ def find_model(name: str) -> Path:
     Raises:
         UsageError: there is none.
     """
-    for folder in (Path(name), MODELS / name):
+    places = [MODELS, Path(sysconfig.get_path("data")) / INSTALLED]
+    for folder in (Path(name), *(place / name for place in places)):
         if (folder / CARD).is_file():
             return folder
     if Path(name).is_dir():
         raise UsageError(f"model {name}: the folder has no {CARD}; expected one that 'vvgt export' wrote")
-    shipped = sorted(path.parent.name for path in MODELS.glob(f"*/{CARD}"))
+    shipped = sorted({path.parent.name for place in places for path in place.glob(f"*/{CARD}")})
     known = f"; shipped are {', '.join(shipped)}" if shipped else "; none is shipped with this version"
     raise UsageError(f"model {name}: no such folder{known}; expected a folder that 'vvgt export' wrote")
 
@@ -91,7 +95,7 @@ def read_card(folder: Path) -> ModelCard:
     """
     path = folder / CARD
     try:
-        document = json.loads(path.read_text("utf-8"))
+        document = json.loads(read_text(path))
         kind, schema = document.pop("format"), document.pop("schema")
     except (OSError, ValueError, KeyError, AttributeError, TypeError) as error:
         raise DataError(f"{path}: not a model card ({error}); expected one that 'vvgt export' wrote") from None

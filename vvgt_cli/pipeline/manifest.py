@@ -14,7 +14,7 @@ import numpy as np
 
 from vvgt_cli.cameras import Camera
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.files import atomic_write
+from vvgt_cli.files import atomic_write, read_text
 from vvgt_cli.volume import Volume
 from vvgt_cli.volume.stats import slabs
 
@@ -150,7 +150,7 @@ def read_manifest(path: Path, what: str = "views") -> dict[str, Any]:
         DataError: not one, or one that names files outside its folder.
     """
     try:
-        document = json.loads(path.read_text("utf-8"))
+        document = json.loads(read_text(path))
         entries = [(PurePosixPath(name), entry["bytes"], entry["sha256"]) for name, entry in document["files"].items()]
         known = (document["format"], document["schema"]) == (f"vvgt-{what}", SCHEMA)
         known = known and isinstance(document["hash"], str) and isinstance(document["settings"], dict)

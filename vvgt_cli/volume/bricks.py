@@ -86,7 +86,8 @@ class BrickArray:
                 # bytes, not values: minus zero is something
                 rows = slab.view(np.uint8).any(axis=2)
                 target[rows] = slab[rows]
-            self._whole, self._layer = out, None
+            out.flags.writeable = False
+            self._whole, self._layer, self._bricks = out, None, self._bricks[:0]  # the parts are not needed any more
         return self._whole
 
     def _slices(self, start: int, stop: int) -> np.ndarray:

@@ -86,7 +86,8 @@ def _choose(archive: zipfile.ZipFile, members: dict[str, zipfile.ZipInfo], wante
     if wanted is not None:
         wanted = wanted.strip("/")
         if wanted not in members:
-            raise UsageError(f"{path}: no array {wanted}; it has {', '.join(members)}; choose one with --array NAME")
+            listing = " ".join(", ".join(members).split())
+            raise UsageError(f"{path}: no array {wanted}; it has {listing}; choose one with --array NAME")
         return wanted
     shapes = {}
     for name, info in members.items():
@@ -98,7 +99,8 @@ def _choose(archive: zipfile.ZipFile, members: dict[str, zipfile.ZipInfo], wante
             continue
     deep = [name for name, shape in shapes.items() if sum(n > 1 for n in shape) >= 3] or list(members)
     if len(deep) > 1:
-        raise UsageError(f"{path}: several arrays: {', '.join(deep)}; choose one with --array NAME")
+        listing = " ".join(", ".join(deep).split())
+        raise UsageError(f"{path}: several arrays: {listing}; choose one with --array NAME")
     return deep[0]
 
 
