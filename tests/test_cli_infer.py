@@ -13,7 +13,14 @@ from onnx_models import write_model
 
 from vvgt_cli.cli.main import run
 from vvgt_cli.gaussians import PlyOptions, read_ply, write_ply
-from vvgt_cli.pipeline.infer import divide
+from vvgt_cli.images.viewset import load_views
+from vvgt_cli.network.card import ModelCard
+from vvgt_cli.network.prepare import prepare
+from vvgt_cli.network.runtime import Model
+from vvgt_cli.pipeline.infer import divide, improve
+from vvgt_cli.pipeline.optimize import Views
+from vvgt_cli.pipeline.record import ConversionReport, Run
+from vvgt_cli.progress import Console
 from vvgt_cli.volume.types import UnitFrame
 
 DARK = 0.2
@@ -63,6 +70,34 @@ def test_without_a_gain_the_input_is_written_and_it_is_said(made, tmp_path, vvgt
     assert "no gain: dropped" in result.err
     (before, _), (after, _) = read_ply(made / "in.ply"), read_ply(tmp_path / "out.ply")
     assert np.allclose(as_rows(after), as_rows(before), atol=1e-5)
+
+
+@pytest.mark.parametrize(("model", "kept"), [("brighter", True), ("darker", False)])
+def test_the_stage_keeps_what_the_check_views_agree_with(made, model, kept):
+    cameras, images = load_views(made / "views", "train")
+    few = Views(cameras, images)
+    gaussians, _ = read_ply(made / "init.ply")
+    dark = replace(gaussians, colors=gaussians.colors - DARK)
+    run_ = Run(Console(quiet=True), ConversionReport("convert"))
+    out = improve(run_, dark, few.take([0, 1, 2]), few.take([3, 4]), str(made / model))
+    assert np.allclose(out.colors, dark.colors + (DARK if kept else 0), atol=1e-5)
+    stage = run_.report.stages[0]
+    assert (stage.name, stage.kept) == ("network", kept)
+    assert (stage.psnr > stage.psnr_before) == kept
+
+
+def test_rounds_run_on_their_own_output_and_on_other_views(made, monkeypatch):
+    model = Model.open(made / "brighter")
+    config = replace(model.card.network, rounds=3, image=replace(model.card.network.image, views=2))
+    monkeypatch.setattr(ModelCard, "network", config)
+    seen = []
+    monkeypatch.setattr("vvgt_cli.network.runtime.prepare", lambda g, c, i, n: seen.append(c) or prepare(g, c, i, n))
+    cameras, images = load_views(made / "views", "train")
+    gaussians, _ = read_ply(made / "init.ply")
+    out = model.improve(gaussians, cameras, images)
+    assert np.allclose(out.colors, gaussians.colors + 3 * DARK, atol=1e-5)
+    names = [camera.name for cameras in seen for camera in cameras]
+    assert len(names) == len(set(names)) == 6
 
 
 def test_the_same_bytes_again_and_through_pipes(made, tmp_path, vvgt, monkeypatch):

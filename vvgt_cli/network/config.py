@@ -209,13 +209,12 @@ NAMED = {
         name="lean",
         image=ImageConfig(views=10),  # twice: of 24 views four are left to judge
         geometry=GeometryConfig(
-            widths=(48, 48, 64, 64, 64),
-            depths=(0, 1, 1, 1, 1),
+            widths=(48, 48, 48, 48, 48),
+            depths=(0, 0, 0, 0, 0),  # pooling alone tells a Gaussian of those around it
             heads=(4, 4, 4, 4, 4),
-            decoder_widths=(48, 48, 64, 64),
-            decoder_depths=(0, 1, 1, 1),
+            decoder_widths=(48, 48, 48, 48),
+            decoder_depths=(0, 0, 0, 0),
             decoder_heads=(4, 4, 4, 4),
-            window=64,
             head="step",
             gradients=True,
         ),

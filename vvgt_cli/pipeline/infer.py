@@ -11,12 +11,14 @@ import numpy as np
 from vvgt_cli.cameras import Camera
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions, write_ply
+from vvgt_cli.pipeline.optimize import Views
 from vvgt_cli.pipeline.outputs import STDOUT, Output, check_outputs, write_text
 from vvgt_cli.pipeline.record import ConversionReport, Run
 from vvgt_cli.pipeline.render import open_gaussians
 from vvgt_cli.progress import Console
 from vvgt_cli.volume.types import UnitFrame
 
+SHIPPED = "vvgt-small"  # the model that comes with the program
 JUDGES = 4  # views that the network is not shown, as many as the default check set
 
 
@@ -54,6 +56,29 @@ def divide(cameras: Sequence[Camera], wanted: int) -> tuple[list[int], list[int]
     others = [i for i in range(len(cameras)) if i not in read]
     judges = [others[i] for i in spread([cameras[i] for i in others], JUDGES)] if others else read
     return read, judges
+
+
+def improve(
+    run: Run, gaussians: Gaussians, train: Views, check: Views, model: str = SHIPPED, provider: str = "cpu"
+) -> Gaussians:
+    """The stage, for runs that have views at hand: the network's Gaussians where the check views agree, else the given.
+
+    Raises:
+        UsageError: no such model or provider.
+        DataError: a model that is not what it must be.
+    """
+    from vvgt_cli.network.card import find_model
+    from vvgt_cli.network.runtime import Model
+
+    everything = range(len(check))
+    with run.stage("network") as stage:
+        opened = Model.open(find_model(model), _threads(), provider)
+        better = opened.improve(gaussians, train.cameras, train.images, progress=run.console.bar("network"))
+        before, after = (_psnr(g, check.cameras, check.images, everything) for g in (gaussians, better))
+        stage.kept = after > before
+        stage.psnr_before, stage.psnr = before, after
+        stage.note = f"{opened.card.name}; from {before:.2f} dB on the check views"
+    return better if stage.kept else gaussians
 
 
 def infer_file(request: InferRequest, console: Console | None = None) -> ConversionReport:

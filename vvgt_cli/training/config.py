@@ -88,6 +88,8 @@ class TrainConfig:
         steps: of the optimiser.
         batch: scenes a step, over all processes.
         views: target views that the loss of a scene is taken on.
+        view_sets: choices of views to show, drawn once for each scene; images and slopes of each are made once.
+        keep: inputs kept in memory, a few megabytes each.
         rate, last_rate: AdamW's, from the end of the warm-up down to the last step along a cosine.
         warmup: steps of a linear rise.
         weight_decay: AdamW's.
@@ -103,6 +105,8 @@ class TrainConfig:
     steps: int = 40_000
     batch: int = 8
     views: int = 4
+    view_sets: int = 4
+    keep: int = 256
     rate: float = 1e-4
     last_rate: float = 1e-6
     warmup: int = 100
@@ -113,8 +117,9 @@ class TrainConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if min(self.steps, self.batch, self.views, self.check_every, self.save_every) < 1 or self.warmup < 0:
-            raise UsageError("train config: steps, batch, views, check_every and save_every must be at least 1")
+        counts = ("steps", "batch", "views", "view_sets", "keep", "check_every", "save_every")
+        if min(getattr(self, name) for name in counts) < 1 or self.warmup < 0:
+            raise UsageError(f"train config: {', '.join(counts)} must be at least 1, warmup at least 0")
         if not 0 < self.last_rate <= self.rate or not self.clip > 0 or self.weight_decay < 0:
             raise UsageError("train config: expected 0 < last_rate <= rate, clip above 0, weight_decay at least 0")
         if (self.network.variant == "wo_vbm") != (self.scenes.start == "uniform"):

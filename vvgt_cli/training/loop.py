@@ -24,7 +24,7 @@ from vvgt_cli.progress import Console
 from vvgt_cli.training.config import TrainConfig, config_text, read_config
 from vvgt_cli.training.parallel import World, world
 from vvgt_cli.training.record import Recorder
-from vvgt_cli.training.sample import judge, learn
+from vvgt_cli.training.sample import Feeder, judge, learn
 from vvgt_cli.training.scenes import TrainingScene, prepare_scenes
 
 LAST, BEST, CONFIG = "last.pt", "best.pt", "config.yaml"
@@ -123,6 +123,7 @@ class _Run:
         self.config, self.data, self.folder, self.here, self.scenes = config, data, folder, here, scenes
         self.network = Vvgt(config.network).to(here.device)
         self.optimizer = torch.optim.AdamW(self.network.parameters(), lr=config.rate, weight_decay=config.weight_decay)
+        self.feeder = Feeder(scenes["train"], config)
         self.progress = Progress()
         if (folder / LAST).exists():
             self._resume()
@@ -156,8 +157,7 @@ class _Run:
         tally = np.zeros(3)
         for index in range(here.rank, config.batch, here.size):
             rng = np.random.default_rng([config.seed, state.step, index])
-            scene = self.scenes["train"][int(rng.integers(len(self.scenes["train"])))]
-            one = learn(self.network, scene, config, rng, here.device)
+            one = learn(self.network, self.feeder, rng, here.device)
             tally += [one.loss, one.gain, one.bad]
         self.here.add_gradients(self.network)
         loss, gain, bad, stop = here.total([*tally, max(ended, default=0) if here.size == 1 else bool(ended)])

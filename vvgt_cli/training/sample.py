@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -31,50 +32,77 @@ class Tally:
     bad: int = 0
 
 
-def tensors(scene: Prepared, device: torch.device) -> dict[str, Tensor]:
-    """The network's input on its device."""
-    return {name: torch.from_numpy(np.array(array)).to(device) for name, array in scene.arrays().items()}
+def tensors(prepared: Prepared) -> dict[str, Tensor]:
+    """The network's input."""
+    return {name: torch.from_numpy(np.array(array)) for name, array in prepared.arrays().items()}
 
 
-def run_network(network: Vvgt, prepared: Prepared, device: torch.device) -> Tensor:
+def run_network(network: Vvgt, inputs: dict[str, Tensor], device: torch.device) -> Tensor:
     """Rows (K, 14) float32; bfloat16 within on CUDA."""
     with torch.autocast(device.type, torch.bfloat16, enabled=device.type == "cuda"):
-        rows: Tensor = network(tensors(prepared, device))
+        rows: Tensor = network({name: tensor.to(device) for name, tensor in inputs.items()})
     return rows.float()
 
 
-def learn(
-    network: Vvgt, scene: TrainingScene, config: TrainConfig, rng: np.random.Generator, device: torch.device
-) -> Tally:
-    """Add the gradients of a scene's loss, mean over rounds and views, divided by the batch.
+class Feeder:
+    """What the network is given of the scenes to train on, made when first asked for and kept.
 
-    Every round is an example of its own: its input is what the round before has made, without gradients through it.
+    Slopes cost more than the rest of a step. They depend on Gaussians and views alone, so a scene's first round has
+    ``view_sets`` inputs in all. Those of round r start from what r rounds of the untrained network make of the scene:
+    plain steps downhill for the head "step", nothing for the others.
     """
-    tally, rounds = Tally(), config.network.rounds
-    views = [int(i) for i in rng.permutation(len(scene.cameras))[: config.network.reads]]
-    chosen = [int(i) for i in rng.permutation(len(scene.targets))[: config.views]]
-    targets = [torch.from_numpy(as_float(scene.target_images[i])).to(device) for i in chosen]
-    gaussians = scene.gaussians
-    for number in range(rounds):
-        shown = in_turn(views, number, rounds)
-        prepared = prepare(gaussians, [scene.cameras[i] for i in shown], as_float(scene.images[shown]), config.network)
-        rows = run_network(network, prepared, device)
-        if not torch.isfinite(rows).all():
-            return Tally(bad=1)
-        loss = rows.new_zeros(())
-        for i, target in zip(chosen, targets, strict=True):
-            before = torch.from_numpy(render(gaussians, scene.targets[i])).to(device)
-            picture = splat(rows, scene.targets[i])
-            loss = loss + view_loss(picture, target, before, config.loss) / (len(chosen) * rounds)
+
+    def __init__(self, scenes: Sequence[TrainingScene], config: TrainConfig) -> None:
+        self.scenes, self.config = scenes, config
+        self.plain = Vvgt(config.network).eval()  # on the host
+        self.kept: OrderedDict[tuple[int, int, int], tuple[Prepared, dict[str, Tensor]]] = OrderedDict()
+
+    def give(self, scene: int, views: int, number: int) -> tuple[Prepared, dict[str, Tensor]]:
+        """Input of round ``number`` of a scene, with its view set ``views``."""
+        key = (scene, views, number)
+        if key not in self.kept:
+            prepared = self._make(*key)
+            self.kept[key] = prepared, tensors(prepared)
+            if len(self.kept) > self.config.keep:
+                self.kept.popitem(last=False)
+        self.kept.move_to_end(key)
+        return self.kept[key]
+
+    def _make(self, scene: int, views: int, number: int) -> Prepared:
+        rounds, source = self.config.network.rounds, self.scenes[scene]
+        rng = np.random.default_rng([self.config.seed, scene, views])
+        chosen = [int(i) for i in rng.permutation(len(source.cameras))[: self.config.network.reads]]
+        gaussians = source.gaussians
+        if number:
+            before, inputs = self.give(scene, views, number - 1)
             with torch.no_grad():
-                tally.gain += float(decibels(picture, target, before)) / len(chosen)
-        if not torch.isfinite(loss):
-            return Tally(bad=1)
-        (loss / config.batch).backward()
-        tally.loss += float(loss.detach())
-        if number + 1 < rounds:
-            gaussians = unpack(rows.detach().cpu().numpy())
-    return tally
+                gaussians = before.restore(run_network(self.plain, inputs, torch.device("cpu")).numpy())
+        shown = in_turn(chosen, number, rounds)
+        cameras = [source.cameras[i] for i in shown]
+        return prepare(gaussians, cameras, as_float(source.images[shown]), self.config.network)
+
+
+def learn(network: Vvgt, feeder: Feeder, rng: np.random.Generator, device: torch.device) -> Tally:
+    """Add the gradients of the loss of a scene's round, both drawn by ``rng``: mean over views, over the batch."""
+    config = feeder.config
+    index, views, number = (int(rng.integers(n)) for n in (len(feeder.scenes), config.view_sets, config.network.rounds))
+    scene, (prepared, inputs) = feeder.scenes[index], feeder.give(index, views, number)
+    chosen = [int(i) for i in rng.permutation(len(scene.targets))[: config.views]]
+    rows = run_network(network, inputs, device)
+    if not torch.isfinite(rows).all():
+        return Tally(bad=1)
+    before = prepared.restore(prepared.rows)
+    loss, gain = rows.new_zeros(()), 0.0
+    for i in chosen:
+        target = torch.from_numpy(as_float(scene.target_images[i])).to(device)
+        start = torch.from_numpy(render(before, scene.targets[i])).to(device)
+        picture = splat(rows, scene.targets[i])
+        loss = loss + view_loss(picture, target, start, config.loss) / len(chosen)
+        gain += float(decibels(picture.detach(), target, start)) / len(chosen)
+    if not torch.isfinite(loss):
+        return Tally(bad=1)
+    (loss / config.batch).backward()
+    return Tally(float(loss.detach()), gain)
 
 
 @torch.no_grad()
@@ -85,7 +113,7 @@ def judge(network: Vvgt, scene: TrainingScene, config: TrainConfig, device: torc
     for number in range(config.network.rounds):
         shown = in_turn(few, number, config.network.rounds)
         prepared = prepare(gaussians, [scene.cameras[i] for i in shown], as_float(scene.images[shown]), config.network)
-        gaussians = unpack(run_network(network, prepared, device).cpu().numpy())
+        gaussians = unpack(run_network(network, tensors(prepared), device).cpu().numpy())
         found.append(mean_psnr(gaussians, scene.targets, scene.target_images))
     return found
 
