@@ -27,6 +27,8 @@ COMMANDS = {
     "tf": "vvgt_cli.cli.tf",
     "infer": "vvgt_cli.cli.infer",
     "export": "vvgt_cli.cli.export",
+    "train": "vvgt_cli.cli.train",
+    "synth": "vvgt_cli.cli.synth",
 }
 INTERRUPTED = 130  # 128 + SIGINT, as shells report it
 BROKEN_PIPE = 141  # 128 + SIGPIPE
