@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import shutil
 import struct
 import tarfile
@@ -120,7 +121,10 @@ def test_slabs_are_the_parts_of_the_whole(folder: Path) -> None:
 def test_statistics_do_not_lay_the_array_out(folder: Path) -> None:
     volume = read_volume(str(folder / "tiles.vdb"), ReadOptions(array="tiles"))
     numbers = statistics(volume)
+    copy.copy(volume.data)
     assert volume.data._whole is None
+    assert np.asarray(volume.data).flags.c_contiguous
+    assert not volume.data.flags.writeable
     assert (numbers.lo, numbers.hi, numbers.finite_count) == (1.5, 4.5, volume.data.size)
 
 

@@ -67,7 +67,7 @@ class BrickArray:
         return np.array(self.whole(), dtype, copy=copy) if copy else np.asarray(self.whole(), dtype)
 
     def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):  # protocols that numpy and copy ask for
+        if name.startswith("_"):  # protocols that numpy and copy ask for
             raise AttributeError(name)
         return getattr(self.whole(), name)
 
