@@ -131,7 +131,7 @@ def _series(headers: Sequence[tuple[Path, Any]], wanted: str | None, path: Path)
 
 
 def _frames(path: Path, header: Any) -> Iterator[_Slice]:
-    """The frames of a file: one, or those that functional groups or a fixed distance place."""
+    """The frames of a file: one, or those that functional groups place."""
     n = int(header.get("NumberOfFrames", 1) or 1)
     per_frame = header.get("PerFrameFunctionalGroupsSequence")
     shared = (header.get("SharedFunctionalGroupsSequence") or [None])[0]
