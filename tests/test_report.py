@@ -82,7 +82,8 @@ def test_the_ladder_writes_every_file_and_scores_every_rung(ladder):
     for rung in found["runs"]:
         assert rung["scores"]["views"] == 10
         assert rung["bytes"] > 68 * rung["gaussians"] > 0
-        assert rung["cost"] == pytest.approx(cost(rung)) > 0
+        assert rung["cost"] == pytest.approx(cost(rung))
+        assert rung["cost"] > 0
         assert {"read", "views", "write"} <= {stage["name"] for stage in rung["stages"]}
     assert found["format"] == "vvgt-report"
     assert found["reference"] == {"views": 10, "size": 24, "step": 0.125, "rays": 9}
@@ -159,6 +160,7 @@ def test_compare_reads_reports_and_conversions(ladder, vvgt, tmp_path):
         (("report", "example:blob", "-o", "file"), "is a file"),
         (("report", "example:blob", "example:slab", "-o", "x"), "2 volumes; expected one"),
         (("report", "--compare", "file", "-o", "x"), "expected two or more"),
+        (("report", "--compare", "file", "-o", "x", "--threads", 1), "expected two or more"),
         (("report", "--compare", "file", "file", "-o", "x", "--tf", "viridis"), "--tf: of a volume's report"),
         (("report", "example:blob", "--model", "none", "-o", "x"), "no such folder"),
     ],
@@ -172,9 +174,14 @@ def test_calls_that_are_wrong(args, message, vvgt, tmp_path, monkeypatch):
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
 
 
+OTHER = document(runs=[runs()[0] | {"kind": "other"}])
+UNNAMED = document(runs=[runs()[0] | {"name": 3}])
+
+
 @pytest.mark.parametrize(
-    "content", ["", "[]", "{}", '{"format": "vvgt-check"}', '{"format": "vvgt-report", "runs": [{}]}',
-                '{"format": "vvgt-report", "runs": []}', "\xff"],
+    "content",
+    ["", "[]", "{}", '{"format": "vvgt-check"}', '{"format": "vvgt-report", "runs": [{}]}',
+     '{"format": "vvgt-report", "runs": []}', json.dumps(OTHER), json.dumps(UNNAMED), "\xff"],
 )  # fmt: skip
 def test_files_that_are_no_reports(content, tmp_path):
     path = tmp_path / "r.json"

@@ -12,7 +12,7 @@ from vvgt_cli.cli.options import common_options, overwrite_option, read_options,
 from vvgt_cli.errors import UsageError
 from vvgt_cli.progress import Console
 
-OF_BOTH = {"paths", "compare", "output", "overwrite", "quiet"}  # parameters that --compare takes too
+OF_BOTH = {"paths", "compare", "output", "overwrite", "threads", "quiet"}  # parameters that --compare takes too
 
 
 def _typed(ctx: click.Context) -> list[click.Parameter]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
@@ -146,6 +147,8 @@ def _folder(output: str, names: Sequence[str], overwrite: bool, inputs: Sequence
         raise UsageError(f"-o {folder}: is a file; expected a folder's name")
     if not folder.parent.is_dir():
         raise UsageError(f"-o {folder}: the folder {folder.parent} does not exist; make it first")
+    if not os.access(folder if folder.is_dir() else folder.parent, os.W_OK):
+        raise UsageError(f"-o {folder}: may not be written to; expected a folder of yours")
     if folder.is_dir():
         check_outputs([Output("-o", str(folder / name)) for name in names], list(inputs), overwrite)
     return folder

@@ -145,6 +145,8 @@ def read_series(path: str) -> Series:
             raise DataError(f"{path}: a {kind} document; expected one that 'vvgt report' or 'convert --report' wrote")
         runs = document["runs"] if kind == "vvgt-report" else [_named(document)]
         series = Series(_title(path, document), runs, document)
+        for run in runs:
+            _check(run)
         count = len(series.scored())
     except (OSError, UnicodeDecodeError, ValueError, KeyError, TypeError, AttributeError) as error:
         what = error.strerror if isinstance(error, OSError) else f"{type(error).__name__} {error}"
@@ -152,6 +154,14 @@ def read_series(path: str) -> Series:
     if not count:
         raise DataError(f"{path}: no run with scores; expected report.json, or --report of 'vvgt convert'")
     return series
+
+
+def _check(run: Run) -> None:
+    """Raise where what tables and charts read of a run is missing or of another type."""
+    if run["kind"] not in KINDS:
+        raise ValueError(f"a run of kind {run['kind']!r}")
+    if not (isinstance(run["name"], str) and isinstance(run["gaussians"], int) and isinstance(run["bytes"], int)):
+        raise TypeError("a run's name, Gaussians or bytes")
 
 
 def _named(document: dict[str, Any]) -> Run:
