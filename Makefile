@@ -2,7 +2,7 @@
 VENV ?= .venv-test
 PYTHON ?= python3
 
-.PHONY: test lint format long ci
+.PHONY: test lint format long fuzz ci
 
 $(VENV)/bin/pytest: pyproject.toml constraints.txt
 	[ -x $(VENV)/bin/python ] || $(PYTHON) -m venv $(VENV)
@@ -24,6 +24,10 @@ format: $(VENV)/bin/pytest
 # The checks that take too long for every change: tests marked `long`, and property tests with 100 times the examples.
 long: $(VENV)/bin/pytest
 	HYPOTHESIS_PROFILE=long $(VENV)/bin/pytest --long
+
+# 100,000 damaged files for every reader (part of `long`); what is found lies in out/fuzz.
+fuzz: $(VENV)/bin/pytest
+	$(VENV)/bin/python tests/fuzz.py --inputs 100000 --save out/fuzz
 
 ci:
 	.ci/run
