@@ -85,3 +85,33 @@ def test_a_damaged_checkpoint_is_refused(content, tmp_path):
     np.savez(path, other=np.zeros(3))
     with pytest.raises(DataError, match="not a checkpoint"):
         run(path)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda arrays: arrays.update(state_array_1=arrays["state_array_1"][:, :1]),
+        lambda arrays: arrays.update(state_array_0=arrays["state_array_0"][:5]),
+        lambda arrays: arrays.update(state_first=arrays["state_first"].astype(np.float64)),
+        lambda arrays: arrays.update(best_0=arrays["best_0"][:5]),
+        lambda arrays: arrays.pop("state_second"),
+    ],
+)
+def test_arrays_that_the_kernels_do_not_take_are_refused(change, tmp_path):
+    path = tmp_path / "run.npz"
+    run(path, after(6))
+    with np.load(path) as file:
+        arrays = dict(file)
+    change(arrays)
+    np.savez(path, **arrays)
+    with pytest.raises(DataError, match="not a checkpoint"):
+        run(path)
+
+
+def test_a_packed_checkpoint_is_refused(tmp_path):
+    path = tmp_path / "run.npz"
+    run(path, after(2))
+    with np.load(path) as file:
+        np.savez_compressed(path, **dict(file))
+    with pytest.raises(DataError, match="compressed entries"):
+        run(path)
