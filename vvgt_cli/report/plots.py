@@ -8,8 +8,9 @@ from typing import Any
 
 from vvgt_cli.errors import UsageError
 from vvgt_cli.files import atomic_write
+from vvgt_cli.report.charts import log_ticks
 from vvgt_cli.report.page import AXES, points
-from vvgt_cli.report.runs import KINDS, SCORING, STAGES, Series
+from vvgt_cli.report.runs import KINDS, SCORING, STAGES, Series, short
 
 MARKS = ("o", "D", "s", "^")
 COLORS = ("#0072b2", "#a8527e", "#00845f", "#c05a00")
@@ -43,8 +44,11 @@ def write_plots(folder: Path, series: Sequence[Series], overwrite: bool) -> None
         figure, axes = _figure((6.4, 4.4))
         _scatter(axes, series, axis)
         axes.set(xscale="log", xlabel=label, ylabel="PSNR, dB")
+        places = log_ticks(*axes.get_xlim())
+        axes.set_xticks(places, [short(place) for place in places])
+        axes.set_xticks([], minor=True)
         axes.grid(alpha=0.25)
-        axes.legend(frameon=False, fontsize=8, loc="lower right")
+        axes.legend(frameon=False, fontsize=8, loc="lower left", bbox_to_anchor=(0, 1), ncols=4)
         _save(figure, folder / name, overwrite)
     count = sum(len(one.runs) for one in series)
     figure, axes = _figure((6.4, 1.4 + 0.28 * count))
@@ -69,7 +73,7 @@ def _scatter(axes: Any, series: Sequence[Series], axis: str) -> None:
             named.add(name)
             color = COLORS[n % 4] if several else COLORS[p.shape]
             axes.scatter([p.x], [p.y], marker=MARKS[p.shape], color=color, s=36, label=label, zorder=2)
-            axes.annotate(p.label, (p.x, p.y), xytext=(5, 4), textcoords="offset points", fontsize=7, parse_math=False)
+            axes.annotate(p.label, (p.x, p.y), xytext=(6, -9), textcoords="offset points", fontsize=7, parse_math=False)
 
 
 def _stages(axes: Any, series: Sequence[Series]) -> None:
@@ -85,4 +89,4 @@ def _stages(axes: Any, series: Sequence[Series]) -> None:
     axes.set_yticks(range(len(rows)), names, fontsize=8, parse_math=False)
     axes.invert_yaxis()
     axes.set_xlabel("seconds")
-    axes.legend(frameon=False, fontsize=7, loc="upper right")
+    axes.legend(frameon=False, fontsize=7, loc="lower left", bbox_to_anchor=(0, 1), ncols=4)
