@@ -28,8 +28,9 @@ from vvgt_cli.dvr.render import FIT_VIEWS
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.metrics import score_views
 from vvgt_cli.optimize import LOSS_3DGS, OptimizeOptions, optimize
-from vvgt_cli.pipeline.convert import FitOptions, fine_enough
+from vvgt_cli.pipeline.mend import fine_enough
 from vvgt_cli.pipeline.optimize import Views
+from vvgt_cli.pipeline.plan import views_of
 from vvgt_cli.splat import render
 from vvgt_cli.vbm import VbmOptions, backproject, initialise
 
@@ -66,7 +67,7 @@ def equal_row(judged: Judged) -> dict[str, Any]:
     adam, _ = judged.refined(start, train, images, OptimizeOptions(steps=ADAM_STEPS, method="adam", **LOSS_3DGS))
     budget = time.perf_counter() - began
     began = time.perf_counter()
-    cameras = default_views("train", FitOptions(steps=ADAM_STEPS).views())
+    cameras = default_views("train", views_of(ADAM_STEPS))
     settings = fine_enough(judged.scene, judged.check, start)
     images = render_views(judged.scene, cameras, settings)
     views = time.perf_counter() - began
@@ -89,7 +90,7 @@ def point(judged: Judged, method: str, steps: int) -> dict[str, Any]:
     began = time.perf_counter()
     start = begin(judged, method)
     if steps:
-        count = FitOptions(steps=steps).views() if method == "ours" else 24 if method == "adam" else BASE_VIEWS
+        count = views_of(steps) if method == "ours" else 24 if method == "adam" else BASE_VIEWS
         cameras = default_views("train", count)
         settings = fine_enough(judged.scene, judged.check, start) if method == "ours" else FIT_VIEWS
         images = render_views(judged.scene, cameras, settings)

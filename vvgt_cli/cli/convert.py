@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from vvgt_cli.cli.fit import fit_options, ply_options
+from vvgt_cli.cli.fit import fit_options, limit_options, ply_options
 from vvgt_cli.cli.options import common_options, overwrite_option, read_options, tf_options
 from vvgt_cli.progress import Console
 
@@ -16,9 +16,11 @@ from vvgt_cli.progress import Console
 @click.option("-o", "--output", required=True, metavar="OUT.ply", help="File to write; - is standard output.")
 @fit_options
 @click.option(
-    "--steps", type=click.IntRange(0, 10_000_000), default=0, show_default=True, metavar="N",
-    help="Steps of gradient descent after the closed form, one view each; 0 for none.",
+    "--steps", type=click.IntRange(0, 10_000_000), metavar="N",
+    help="Steps of gradient descent after the closed form, one view each, at most; 0 for none. Without: by the plan.",
 )  # fmt: skip
+@limit_options
+@click.option("--dry-run", is_flag=True, help="Print the plan with estimated time, memory and size; write nothing.")
 @ply_options
 @tf_options
 @read_options
@@ -35,8 +37,8 @@ def command(volume: str, shard: str | None, console: Console, **options: Any) ->
     input. Without --tf a function is made from the histogram.
 
     The Gaussians are made for images of --size pixels and scored on three test views that nothing was fitted
-    to (ten with --report); the error is printed. --steps refines them further by gradient descent; Ctrl-C
-    ends that stage only.
+    to (ten with --report); the error is printed. --target-psnr, --time-budget and --max-size, any or none,
+    decide which stages run; what is left out is said, and why. Ctrl-C ends gradient descent only.
 
     With a place for a number in OUT.ply, VOLUME is a glob of the frames of a time series: one file a frame,
     under one function and one range of values. The same command again goes on where it was.
@@ -45,12 +47,15 @@ def command(volume: str, shard: str | None, console: Console, **options: Any) ->
     Examples:
       vvgt convert example:frog -o frog.ply --preview frog.png
       vvgt convert head.nrrd --tf bone.json -o head.ply --max-gaussians 50000 --steps 200
+      vvgt convert head.nrrd --tf bone.json -o head.ply --time-budget 10
+      vvgt convert head.nrrd --tf bone.json -o head.ply --target-psnr 35 --max-size 5
       vvgt convert - --dims 64 64 93 --dtype uint16 -o - < head.raw > head.ply
       vvgt convert 'run_*.vti' --tf tf.json -o 'out_{:04d}.ply'
     """
     from vvgt_cli.cli.fit import convert_request
     from vvgt_cli.errors import UsageError
     from vvgt_cli.pipeline.convert import convert
+    from vvgt_cli.pipeline.plan import Plan
     from vvgt_cli.pipeline.series import convert_series, is_pattern
 
     request = convert_request(volume, **options)
@@ -61,4 +66,6 @@ def command(volume: str, shard: str | None, console: Console, **options: Any) ->
     elif shard is not None:
         raise UsageError(f"--shard {shard} is of a series; give -o a place for the frame's number, as out_{{:04d}}.ply")
     else:
-        convert(request, console)
+        done = convert(request, console)
+        if request.dry_run:
+            click.echo(Plan(**(done.plan or {})).text())

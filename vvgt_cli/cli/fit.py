@@ -29,6 +29,19 @@ fit_options = group(
     seed=click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of random samples."),
 )  # fmt: skip
 
+limit_options = group(
+    "limits",
+    target_psnr=click.option(
+        "--target-psnr", type=float, metavar="DB", help="Enough: stages and Gaussians beyond it are left out.",
+    ),
+    time_budget=click.option(
+        "--time-budget", type=float, metavar="SECONDS", help="Of the whole run: what does not fit is left out.",
+    ),
+    max_megabytes=click.option(
+        "--max-size", "max_megabytes", type=float, metavar="MB", help="Of the file (10^6 bytes): fewer Gaussians.",
+    ),
+)  # fmt: skip
+
 ply_options = group(
     "ply",
     frame=click.option(
@@ -67,16 +80,21 @@ def convert_request(
     overwrite: bool,
     report: str | None = None,
     preview: str | None = None,
-    steps: int = 0,
+    steps: int | None = None,
+    limits: dict[str, Any] | None = None,
+    dry_run: bool = False,
 ) -> ConvertRequest:
     """The request that the options of `convert` and `init` add up to."""
     from vvgt_cli.gaussians import PlyOptions
     from vvgt_cli.pipeline.convert import ConvertRequest, FitOptions
+    from vvgt_cli.pipeline.plan import Limits
 
     return ConvertRequest(
         source_request(volume, read, optics),
         output,
         FitOptions(**fit, steps=steps),
+        Limits(**(limits or {})),
+        dry_run,
         PlyOptions(**ply),
         report,
         preview,

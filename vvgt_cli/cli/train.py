@@ -9,9 +9,7 @@ from vvgt_cli.progress import Console
 
 
 @click.command("train", short_help="Train the network on volumes.")
-@click.option(
-    "--data", required=True, metavar="DIR", help="Volumes in DIR/train and DIR/held; scenes to DIR/scenes."
-)
+@click.option("--data", required=True, metavar="DIR", help="Volumes in DIR/train and DIR/held; scenes to DIR/scenes.")
 @click.option("-o", "--output", required=True, metavar="RUN", help="Folder of the run: made, or gone on with.")
 @click.option("--config", "path", metavar="FILE.yaml", help="What differs from the defaults, or a run's config.yaml.")
 @common_options

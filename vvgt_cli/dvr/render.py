@@ -41,7 +41,6 @@ class RenderSettings:
 
 REFERENCE = RenderSettings(step=0.125, tiers=((0.02, 9),))
 FIT_VIEWS = RenderSettings(step=1.0, samples=1)  # one ray a pixel: pixel-integrated views fit no better
-SCORE_VIEWS = RenderSettings(step=1.0)
 
 
 def ray_offsets(count: int) -> np.ndarray:

@@ -8,31 +8,22 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vvgt_cli.cameras import default_views
-from vvgt_cli.cameras.sets import SET_VIEWS
-from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.errors import DataError
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored, write_ply
-from vvgt_cli.optimize import OptimizeOptions
-from vvgt_cli.pipeline.optimize import Views, refine
+from vvgt_cli.pipeline.mend import check_view_memory, mend
 from vvgt_cli.pipeline.outputs import STDOUT, Output, check_outputs, write_text
+from vvgt_cli.pipeline.plan import Limits, Planner, estimate
 from vvgt_cli.pipeline.record import ConversionReport, Run
 from vvgt_cli.pipeline.score import psnr_note, score_test_views
 from vvgt_cli.pipeline.source import Source, SourceRequest, load
 from vvgt_cli.progress import Console
-from vvgt_cli.volume.blocks import free_memory
 
 if TYPE_CHECKING:
-    from vvgt_cli.cameras import Camera
-    from vvgt_cli.dvr import RenderSettings, Scene
+    from vvgt_cli.dvr import Scene
     from vvgt_cli.metrics import Scores
     from vvgt_cli.vbm import Start
 
-VIEW_BYTES = 2 * 16  # a pixel: float32 RGBA, and as much again while views are stacked
-REFINE_VIEWS = 72  # training views of gradient descent, which learns fewer by heart; the closed form takes a third
-LADDER = ((1.0, 1), (0.5, 1), (1.0, None))  # steps in voxels and rays a pixel (None: adaptive), by cost
-MARGIN = 12.0  # dB
-STEPS_A_SET = 48  # of gradient descent, for each further 24 views
 PREVIEW_VIEWS = (0, 4, 9)  # test views of the preview, and of the score without a report: above, side, below
 
 
@@ -45,19 +36,14 @@ class FitOptions:
         size: pixels along an image's edge that the file is made for.
         init: "vbm", "wavelet" or "uniform".
         seed: of whatever draws random numbers.
-        steps: of gradient descent after the closed form.
+        steps: of gradient descent after the closed form, at most; None: what the plan finds worth its time.
     """
 
     max_gaussians: int = 100_000
     size: int = 400
     init: str = "vbm"
     seed: int = 0
-    steps: int = 0
-
-    def views(self) -> int:
-        """Training views: in a short run more steps gain more than more views."""
-        fewest = SET_VIEWS["train"]
-        return fewest * min(max(self.steps // STEPS_A_SET, 1), REFINE_VIEWS // fewest)
+    steps: int | None = None
 
 
 @dataclass(frozen=True)
@@ -68,6 +54,8 @@ class ConvertRequest:
         source: what to read.
         output: `.ply` to write, "-" for standard output.
         fit: what the Gaussians are made for.
+        limits: error, time and size that decide what is done.
+        dry_run: plan, and write nothing.
         ply: how the file is written; the unit frame and distance are filled in from the source.
         report: JSON to write, "-" for standard output, None for none.
         preview: PNG to write (reference, ours, difference of a few test views), None for none.
@@ -77,6 +65,8 @@ class ConvertRequest:
     source: SourceRequest
     output: str
     fit: FitOptions = field(default_factory=FitOptions)
+    limits: Limits = field(default_factory=Limits)
+    dry_run: bool = False
     ply: PlyOptions = field(default_factory=PlyOptions)
     report: str | None = None
     preview: str | None = None
@@ -95,20 +85,27 @@ class ConvertRequest:
 def convert(request: ConvertRequest, console: Console | None = None) -> ConversionReport:
     """Volume to `.ply`: closed form, what the training views can mend, gradient descent; scored on the test views.
 
+    What of these is done, and with how many Gaussians, follows from the request's limits and what the stages cost
+    (`pipeline.plan`); the check views decide. What is left out is said, and costs nothing.
+
     Raises:
         UsageError: an output that may not be written; found before anything is read.
         DataError: input that is not what it must be, or a scene that shows nothing.
     """
     run = Run(console or Console(), ConversionReport("convert"))
-    _check_memory(request.fit)
+    budget = request.limits.gaussians(request.fit.max_gaussians, request.ply.sh_degree)
+    fit = replace(request.fit, max_gaussians=budget)
     source, scene = _begin(run, request)
-    start = _closed_form(run, scene, request.fit)
-    train, check = _views(run, scene, start.gaussians, request.fit)
-    gaussians = _back_project(run, start, train.take(range(0, len(train), len(train) // SET_VIEWS["train"])), check)
-    if request.fit.steps:
-        options = OptimizeOptions(steps=request.fit.steps, seed=request.fit.seed)
-        gaussians = refine(run, gaussians, train, check, options)
-    gaussians = as_stored(gaussians)  # what is scored is what the file holds
+    costs = estimate(scene, fit.size, fit.max_gaussians)
+    planner = Planner(request.limits, fit.max_gaussians, fit.steps, request.ply.sh_degree)
+    plan = planner.plan(costs, run.elapsed())
+    run.report.plan = plan.record()
+    if request.dry_run:
+        return run.finish()
+    check_view_memory(plan, fit.size)
+    start = _closed_form(run, scene, fit)
+    plan = planner.plan(costs.at(run.report.stages[-1].seconds / costs.closed_form), run.elapsed(), begun=True)
+    gaussians = as_stored(mend(run, scene, start, plan, request.limits, fit))  # what is scored is what the file holds
     scores, sheet = _score(run, scene, gaussians, request)
     run.report.scores = asdict(scores)
     return _finish(run, request, source, gaussians, sheet)
@@ -124,17 +121,6 @@ def initialise_only(request: ConvertRequest, console: Console | None = None) -> 
     source, scene = _begin(run, request)
     start = _closed_form(run, scene, request.fit)
     return _finish(run, request, source, as_stored(start.gaussians))
-
-
-def _check_memory(fit: FitOptions) -> None:
-    """Refuse a size whose training and check views would not fit."""
-    views = fit.views() + SET_VIEWS["check"]
-    need, free = views * fit.size**2 * VIEW_BYTES, free_memory()
-    if free is not None and need > free:
-        raise UsageError(
-            f"--size {fit.size}: {views} views need {need / 2**30:.1f} GiB of memory, {free / 2**30:.1f} GiB are free; "
-            "try a smaller size, or 'vvgt init', which renders none"
-        )
 
 
 def _begin(run: Run, request: ConvertRequest) -> tuple[Source, Scene]:
@@ -204,73 +190,16 @@ def _closed_form(run: Run, scene: Scene, fit: FitOptions) -> Start:
     return start
 
 
-def _splats(gaussians: Gaussians, cameras: list[Camera]) -> list[np.ndarray]:
-    from vvgt_cli.splat import render
-
-    return [render(gaussians, camera) for camera in cameras]
-
-
-def _views(run: Run, scene: Scene, start: Gaussians, fit: FitOptions) -> tuple[Views, Views]:
-    """Training and check views."""
-    from vvgt_cli.dvr import RenderSettings, render_views
-    from vvgt_cli.dvr.render import FIT_VIEWS
-
-    train, check = default_views("train", fit.views(), size=fit.size), default_views("check", size=fit.size)
-    with run.stage("views") as stage:
-        reference = render_views(scene, check, RenderSettings() if fit.steps else FIT_VIEWS)
-        settings = fine_enough(scene, Views(check, reference), start) if fit.steps else FIT_VIEWS
-        images = render_views(scene, train, settings, progress=run.console.bar("views"))
-        rays = "one ray" if settings.samples == 1 else "adaptive rays"
-        how = f", {rays} a pixel, steps of {settings.step:g}" if fit.steps else ""
-        stage.note = f"{len(train)} to fit to, {len(check)} to check by, {fit.size} px{how}"
-    return Views(train, images), Views(check, reference)
-
-
-def fine_enough(scene: Scene, check: Views, start: Gaussians) -> RenderSettings:
-    """The cheapest integration whose error is `MARGIN` below that of ``start``, against finely rendered check views.
-
-    Gradient descent follows the jags of single rays and the error of long steps, which hard edges have.
-    """
-    from vvgt_cli.dvr import RenderSettings, render_view
-    from vvgt_cli.metrics import psnr
-    from vvgt_cli.splat import render
-
-    camera, fine = check.cameras[0], check.images[0]
-    wanted = psnr(fine[..., :3], render(start, camera)[..., :3]) + MARGIN
-    for step, samples in LADDER:
-        settings = RenderSettings(step=step, samples=samples)
-        if psnr(fine[..., :3], render_view(scene, camera, settings)[..., :3]) >= wanted:
-            return settings
-    return RenderSettings()
-
-
-def _back_project(run: Run, start: Start, train: Views, check: Views) -> Gaussians:
-    """What the training views can mend, kept if the check views agree."""
-    from vvgt_cli.metrics import score_views
-    from vvgt_cli.vbm import backproject
-
-    with run.stage("back-projection") as stage:
-        before = score_views(check.images, _splats(start.gaussians, check.cameras), perceptual=False).psnr
-        bar = run.console.bar("back-projection")
-        mended, how = backproject(start, train.cameras, train.images, progress=bar)
-        after = score_views(check.images, _splats(mended, check.cameras), perceptual=False).psnr
-        stage.kept = after > before
-        stage.note = f"{how}; from {before:.2f} dB on the check views"
-        stage.psnr_before, stage.psnr = before, after
-    return mended if stage.kept else start.gaussians
-
-
 def _score(run: Run, scene: Scene, gaussians: Gaussians, request: ConvertRequest) -> tuple[Scores, np.ndarray | None]:
     """Scores on the test views, and the preview's sheet where one is asked for."""
     from vvgt_cli.dvr import RenderSettings
-    from vvgt_cli.dvr.render import SCORE_VIEWS
 
     with run.stage("test views") as stage:
         scores, sheet = score_test_views(
             scene,
             gaussians,
             request.fit.size,
-            RenderSettings() if request.fit.steps else SCORE_VIEWS,
+            RenderSettings(),
             perceptual=request.report is not None,
             keep=PREVIEW_VIEWS if request.preview else (),
             only=None if request.report else PREVIEW_VIEWS,

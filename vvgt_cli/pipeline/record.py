@@ -58,6 +58,8 @@ class ConversionReport:
         stages: in the order they ran.
         gaussians, bytes: of the file written.
         scores: on the test views, None for `init`.
+        plan: estimates of `convert` (`vvgt_cli.pipeline.plan.Plan`): stages, seconds, bytes, memory.
+        left_out: (stage, why) of what was not done.
         refinement: what gradient descent did (`vvgt_cli.optimize.OptimizeRecord`), None without it.
         seconds: wall time of the whole run, without the interpreter's start.
     """
@@ -71,6 +73,8 @@ class ConversionReport:
     bytes: int = 0
     scores: dict[str, Any] | None = None
     refinement: dict[str, Any] | None = None
+    plan: dict[str, Any] | None = None
+    left_out: list[tuple[str, str]] = field(default_factory=list)
     seconds: float = 0.0
 
     def to_json(self) -> str:
@@ -164,7 +168,16 @@ class Run:
         self.report.stages.append(stage)
         self.console.stage(name, stage.seconds, stage.detail())
 
+    def elapsed(self) -> float:
+        """Wall seconds since the run began."""
+        return time.perf_counter() - self.start
+
+    def leave_out(self, stage: str, why: str) -> None:
+        """Say and record that a stage is not done."""
+        self.report.left_out.append((stage, why))
+        self.console.say(f"left out: {stage} ({why})")
+
     def finish(self) -> ConversionReport:
         """Close the report with the whole run's time."""
-        self.report.seconds = time.perf_counter() - self.start
+        self.report.seconds = self.elapsed()
         return self.report

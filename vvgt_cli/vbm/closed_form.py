@@ -118,6 +118,12 @@ def base_level(scene: Scene, pixel: float) -> int:
     return level
 
 
+def expected_cells(scene: Scene, size: int) -> float:
+    """About how many base cells the closed form for images of ``size`` px will have."""
+    level = base_level(scene, pixel_width(size))
+    return _visible_voxels(scene) / float(np.prod(2.0 ** exponents(scene.step, level)))
+
+
 def _visible_voxels(scene: Scene, samples: int = 256) -> float:
     """About how many voxels have extinction: bricks that do, times the share in a sample of them."""
     bricks = np.argwhere(scene.empty == 0) * BRICK

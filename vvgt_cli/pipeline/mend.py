@@ -1,0 +1,147 @@
+"""What views of the volume can mend of the closed form: the stages of `convert` between it and the score."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from vvgt_cli.cameras import default_views
+from vvgt_cli.cameras.sets import SET_VIEWS
+from vvgt_cli.errors import UsageError
+from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.optimize import OptimizeOptions
+from vvgt_cli.pipeline.optimize import Views, refine
+from vvgt_cli.pipeline.plan import SMALLER, Limits, Plan, views_of
+from vvgt_cli.pipeline.record import Run
+from vvgt_cli.volume.blocks import free_memory
+
+if TYPE_CHECKING:
+    from vvgt_cli.dvr import RenderSettings, Scene
+    from vvgt_cli.pipeline.convert import FitOptions
+    from vvgt_cli.vbm import Start
+
+VIEW_BYTES = 2 * 16  # a pixel: float32 RGBA, and as much again while views are stacked
+LADDER = ((1.0, 1), (0.5, 1), (1.0, None))  # steps in voxels and rays a pixel (None: adaptive), by cost
+MARGIN = 12.0  # dB
+
+
+def check_view_memory(plan: Plan, size: int) -> None:
+    """Refuse a size whose training and check views would not fit."""
+    views = views_of(plan.steps) + SET_VIEWS["check"]
+    need, free = views * size**2 * VIEW_BYTES, free_memory()
+    if plan.back_project and free is not None and need > free:
+        raise UsageError(
+            f"--size {size}: {views} views need {need / 2**30:.1f} GiB of memory, {free / 2**30:.1f} GiB are free; "
+            "try a smaller size, or 'vvgt init', which renders none"
+        )
+
+
+def mend(run: Run, scene: Scene, start: Start, plan: Plan, limits: Limits, fit: FitOptions) -> Gaussians:
+    """The closed form after what the plan has for it, or as much of it as the target asks for."""
+    for name, why in plan.left_out:
+        run.leave_out(name, why)
+    if not (plan.back_project or plan.steps or limits.target_psnr is not None):
+        return start.gaussians
+    stage = _Mending(run, scene, plan, limits, fit)
+    if stage.enough(start.gaussians):
+        run.leave_out("refinement", f"the check views have {limits.target_psnr:g} dB without it")
+        return stage.smaller(start)
+    if plan.back_project:
+        return stage.back_project(start)
+    return stage.refine(start.gaussians) if plan.steps else start.gaussians
+
+
+class _Mending:
+    """Check views, and what is done with them."""
+
+    def __init__(self, run: Run, scene: Scene, plan: Plan, limits: Limits, fit: FitOptions) -> None:
+        from vvgt_cli.dvr import RenderSettings, render_views
+        from vvgt_cli.dvr.render import FIT_VIEWS
+
+        self.run, self.scene, self.plan, self.limits, self.fit = run, scene, plan, limits, fit
+        cameras = default_views("check", size=fit.size)
+        with run.stage("check views") as stage:
+            judged = plan.steps or limits.target_psnr is not None
+            self.check = Views(cameras, render_views(scene, cameras, RenderSettings() if judged else FIT_VIEWS))
+            stage.note = f"{len(cameras)} of {fit.size} px"
+        self.settings: RenderSettings = FIT_VIEWS
+
+    def psnr(self, gaussians: Gaussians) -> float:
+        """On the check views."""
+        from vvgt_cli.metrics import score_views
+        from vvgt_cli.splat import render
+
+        pictures = [render(gaussians, camera) for camera in self.check.cameras]
+        return score_views(self.check.images, pictures, perceptual=False).psnr
+
+    def enough(self, gaussians: Gaussians) -> bool:
+        """Whether the target is reached."""
+        return self.limits.target_psnr is not None and self.psnr(gaussians) >= self.limits.target_psnr
+
+    def smaller(self, start: Start) -> Gaussians:
+        """The fewest Gaussians that reach the target: a part of the budget, or all."""
+        if start.form is not None:
+            for part in SMALLER:
+                fewer = replace(start.form, budget=max(start.form.budget // part, 1)).gaussians()
+                if self.enough(fewer):
+                    self.run.leave_out(
+                        f"{len(start.gaussians) - len(fewer)} Gaussians", "the target is reached without"
+                    )
+                    return fewer
+        return start.gaussians
+
+    def back_project(self, start: Start) -> Gaussians:
+        """Cells split and colours solved, kept if the check views agree."""
+        from vvgt_cli.vbm import backproject
+
+        run, train = self.run, self._rendered(SET_VIEWS["train"])
+        with run.stage("back-projection") as stage:
+            before = self.psnr(start.gaussians)
+            bar = run.console.bar("back-projection")
+            mended, how = backproject(start, train.cameras, train.images, progress=bar)
+            after = self.psnr(mended)
+            stage.kept = after > before
+            stage.note = f"{how}; from {before:.2f} dB on the check views"
+            stage.psnr_before, stage.psnr = before, after
+        return mended if stage.kept else start.gaussians
+
+    def refine(self, gaussians: Gaussians) -> Gaussians:
+        """Gradient descent on the training views."""
+        self.settings = fine_enough(self.scene, self.check, gaussians)
+        train = self._rendered(views_of(self.plan.steps))
+        left = None
+        if self.limits.time_budget is not None:
+            ending = sum(seconds for name, seconds in self.plan.stages if name in ("test views", "write"))
+            left = max(self.limits.time_budget - self.run.elapsed() - ending, 0.0)
+        target = self.limits.target_psnr
+        options = OptimizeOptions(steps=self.plan.most_steps, time_budget=left, target_psnr=target, seed=self.fit.seed)
+        return refine(self.run, gaussians, train, self.check, options)
+
+    def _rendered(self, count: int) -> Views:
+        """Training views."""
+        from vvgt_cli.dvr import render_views
+
+        cameras = default_views("train", count, size=self.fit.size)
+        with self.run.stage("views") as stage:
+            images = render_views(self.scene, cameras, self.settings, progress=self.run.console.bar("views"))
+            rays = "one ray" if self.settings.samples == 1 else "adaptive rays"
+            stage.note = f"{count} to fit to, {rays} a pixel, steps of {self.settings.step:g}"
+        return Views(cameras, images)
+
+
+def fine_enough(scene: Scene, check: Views, start: Gaussians) -> RenderSettings:
+    """The cheapest integration whose error is `MARGIN` below that of ``start``, against finely rendered check views.
+
+    Gradient descent follows the jags of single rays and the error of long steps, which hard edges have.
+    """
+    from vvgt_cli.dvr import RenderSettings, render_view
+    from vvgt_cli.metrics import psnr
+    from vvgt_cli.splat import render
+
+    camera, fine = check.cameras[0], check.images[0]
+    wanted = psnr(fine[..., :3], render(start, camera)[..., :3]) + MARGIN
+    for step, samples in LADDER:
+        settings = RenderSettings(step=step, samples=samples)
+        if psnr(fine[..., :3], render_view(scene, camera, settings)[..., :3]) >= wanted:
+            return settings
+    return RenderSettings()

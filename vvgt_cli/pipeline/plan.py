@@ -1,0 +1,245 @@
+"""What `convert` will do: which stages, how many Gaussians, views and steps, and what that should cost."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict, dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vvgt_cli.cameras.sets import SET_VIEWS
+from vvgt_cli.errors import UsageError
+
+if TYPE_CHECKING:
+    from vvgt_cli.dvr import Scene
+
+VERTEX_BYTES = 68  # x y z, normals, three colours, opacity, three scales, four of rotation: float32
+HARMONIC_BYTES = {0: 0, 1: 36, 2: 96, 3: 180}  # zeros up to a degree
+HEADER_BYTES = 1000
+DEFAULT_STEPS = 72  # of gradient descent: the knee of error against seconds (docs/report.md)
+MOST_STEPS = 400  # where a target or a time asks for as many as it takes
+FEWEST_STEPS = 8  # less is not worth the views
+REFINE_VIEWS = 72  # training views of gradient descent, which learns fewer by heart
+STEPS_A_SET = 48  # of gradient descent, for each further 24 views
+SMALLER = (8, 4, 2)  # parts of the budget that a target is tried with first
+PROBE = 80  # pixels along the edge of the view that is timed
+# Seconds on two cores where 200,000 random float64 sort in `SORT`; fitted to conversions, see docs/report.md.
+SORT = 2.0e-3
+CLOSED_FORM = 0.5, 1.0, 0.5  # always, per 10^7 voxels, per 10^6 cells
+STEP = 0.01, 0.03  # per 400 x 400 px, per 100,000 Gaussians
+BACK_PROJECTION = 100.0  # steps
+VIEW, SCORE = 1.5, 6.0  # of the view that is timed: finer integration; with its picture, for three views
+MEMORY = 3e8, 210.0, 1500.0  # bytes: programs and kernels, a cell, a Gaussian
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a user allows, any or none.
+
+    Attributes:
+        target_psnr: dB on the check views that are enough.
+        time_budget: wall seconds of the whole run, from the start of reading on.
+        max_megabytes: size of the file, 10^6 bytes.
+    """
+
+    target_psnr: float | None = None
+    time_budget: float | None = None
+    max_megabytes: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.time_budget is not None and not self.time_budget > 0:
+            raise UsageError(f"--time-budget {self.time_budget:g}: expected more than 0 seconds")
+        if self.max_megabytes is not None and not self.max_megabytes > 0:
+            raise UsageError(f"--max-size {self.max_megabytes:g}: expected more than 0 MB")
+
+    def gaussians(self, most: int, sh_degree: int) -> int:
+        """As many Gaussians as budget and file size allow.
+
+        Raises:
+            UsageError: not even one fits the size.
+        """
+        if self.max_megabytes is None:
+            return most
+        fit = int((self.max_megabytes * 1e6 - HEADER_BYTES) // (VERTEX_BYTES + HARMONIC_BYTES[sh_degree]))
+        if fit < 1:
+            raise UsageError(f"--max-size {self.max_megabytes:g}: no Gaussian fits; expected 0.002 MB or more")
+        return min(most, fit)
+
+
+def views_of(steps: int) -> int:
+    """Training views of so many steps: in a short run more steps gain more than more views."""
+    fewest = SET_VIEWS["train"]
+    return fewest * min(max(steps // STEPS_A_SET, 1), REFINE_VIEWS // fewest)
+
+
+@dataclass(frozen=True)
+class Costs:
+    """Seconds and bytes that stages should take on this machine; docs/report.md says how they were fitted.
+
+    Attributes:
+        closed_form: moments, pyramid and choice of cells.
+        view: a view to fit to.
+        back_projection: of 24 views.
+        step: of gradient descent, with its share of the looks at check views.
+        score: test views.
+        write: the file.
+        memory: of the whole process at its most, bytes.
+    """
+
+    closed_form: float
+    view: float
+    back_projection: float
+    step: float
+    score: float
+    write: float
+    memory: float
+
+    def at(self, pace: float) -> Costs:
+        """The same on a machine that takes ``pace`` times as long."""
+        seconds = {
+            name: getattr(self, name) * pace for name in ("closed_form", "back_projection", "step", "score", "write")
+        }
+        return replace(self, **seconds)
+
+
+@dataclass
+class Plan:
+    """What is going to be done.
+
+    Attributes:
+        gaussians: budget.
+        back_project: whether views correct the closed form by cells and colours instead of gradient descent.
+        steps: of gradient descent, as many as there should be time for.
+        most_steps: where there is more time than that.
+        seconds, bytes, memory: estimates of the whole run, its file, its memory at most.
+        stages: (stage, seconds) estimates in order.
+        left_out: (stage, why) of what is not done.
+    """
+
+    gaussians: int
+    back_project: bool = False
+    steps: int = 0
+    most_steps: int = 0
+    seconds: float = 0.0
+    bytes: int = 0
+    memory: float = 0.0
+    stages: list[tuple[str, float]] = field(default_factory=list)
+    left_out: list[tuple[str, str]] = field(default_factory=list)
+
+    def record(self) -> dict[str, Any]:
+        """Plain values for the report."""
+        return asdict(self)
+
+    def text(self) -> str:
+        """The plan as `--dry-run` prints it."""
+        lines = [f"{name:<17}{seconds:8.1f} s" for name, seconds in self.stages]
+        lines += [f"{name:<17}{'-':>8}    {why}" for name, why in self.left_out]
+        lines.append(
+            f"{'whole':<17}{self.seconds:8.1f} s, {self.memory / 2**30:.1f} GiB of memory, "
+            f"{self.bytes / 1e6:.1f} MB with {self.gaussians} Gaussians"
+        )
+        return "\n".join(lines)
+
+
+@dataclass(frozen=True)
+class Planner:
+    """What decides.
+
+    Attributes:
+        limits: what the user allows.
+        gaussians: budget.
+        steps: of gradient descent that the user asks for; None: the plan's choice.
+        sh_degree: harmonics in the file.
+    """
+
+    limits: Limits
+    gaussians: int
+    steps: int | None
+    sh_degree: int
+
+    def plan(self, costs: Costs, spent: float, begun: bool = False) -> Plan:
+        """Which stages fit, after ``spent`` seconds; ``begun``: the closed form is done."""
+        plan = Plan(self.gaussians, memory=costs.memory)
+        plan.bytes = HEADER_BYTES + self.gaussians * (VERTEX_BYTES + HARMONIC_BYTES[self.sh_degree])
+        last = [("test views", costs.score), ("write", costs.write)]
+        plan.stages = [("so far", spent)] + ([] if begun else [("closed form", costs.closed_form)])
+        left = None
+        if self.limits.time_budget is not None:
+            left = self.limits.time_budget - sum(seconds for _, seconds in [*plan.stages, *last])
+        self._views(plan, costs, left)
+        plan.stages += last
+        plan.seconds = sum(seconds for _, seconds in plan.stages)
+        return plan
+
+    def _views(self, plan: Plan, costs: Costs, left: float | None) -> None:
+        """What needs views: gradient descent, as asked for, as long as there is time, or as much as pays."""
+        open_end = self.limits.target_psnr is not None or left is not None
+        steps = self.steps if self.steps is not None else MOST_STEPS if open_end else DEFAULT_STEPS
+        wanted = steps
+        while left is not None and steps > 0 and _refinement(costs, steps) > left:
+            steps = min(steps - 1, int(steps * 0.9))
+        if wanted and steps >= min(FEWEST_STEPS, wanted):
+            plan.steps, plan.most_steps = steps, wanted
+            plan.stages.append((f"views, {steps} steps", _refinement(costs, steps)))
+            plan.left_out.append(("back-projection", "gradient descent gains more in its time"))
+            return
+        room = "no steps are asked for" if not wanted else f"{max(left or 0, 0):.1f} s are left"
+        plan.left_out.append(("refinement", room))
+        mending = (SET_VIEWS["train"] + SET_VIEWS["check"]) * costs.view + costs.back_projection
+        plan.back_project = left is None or left >= mending
+        if plan.back_project:
+            plan.stages.append(("back-projection", mending))
+        else:
+            plan.left_out.append(("back-projection", f"about {mending:.1f} s with its views; {room}"))
+
+
+def _refinement(costs: Costs, steps: int) -> float:
+    """Seconds of so many steps, with their views."""
+    return steps * costs.step + (views_of(steps) + SET_VIEWS["check"]) * costs.view
+
+
+def estimate(scene: Scene, size: int, gaussians: int) -> Costs:
+    """What stages should cost: a small view is timed, the rest follows from counts and the machine's pace."""
+    from vvgt_cli.vbm.closed_form import expected_cells
+
+    cells, pixels, pace = expected_cells(scene, size), (size / 400) ** 2, _pace()
+    count = min(gaussians, cells)
+    step = pace * (STEP[0] * pixels + STEP[1] * count / 1e5)
+    view = _view_seconds(scene, size)
+    voxels = scene.values.size / 1e7
+    return Costs(
+        closed_form=pace * (CLOSED_FORM[0] + CLOSED_FORM[1] * voxels + CLOSED_FORM[2] * cells / 1e6),
+        view=VIEW * view,
+        back_projection=BACK_PROJECTION * step,
+        step=step,
+        score=SCORE * (view + step),
+        write=pace * (0.1 + 0.2 * count / 1e5),
+        memory=MEMORY[0] + scene.volume.data.nbytes + MEMORY[1] * cells + MEMORY[2] * count + 1000 * size**2,
+    )
+
+
+def _view_seconds(scene: Scene, size: int) -> float:
+    """Of a check view with one ray a pixel, from one of `PROBE` px."""
+    from vvgt_cli.cameras import default_views
+    from vvgt_cli.dvr import render_view
+    from vvgt_cli.dvr.render import FIT_VIEWS
+
+    camera = default_views("check", size=PROBE)[0]
+    render_view(scene, camera, FIT_VIEWS)  # compiled, or loaded
+    begin = time.perf_counter()
+    render_view(scene, camera, FIT_VIEWS)
+    return (time.perf_counter() - begin) * (size / PROBE) ** 2
+
+
+def _pace() -> float:
+    """How many times as long as the machine of the fit this one takes: a sort, and the threads."""
+    import numba
+
+    values = np.random.default_rng(0).random(200_000)
+    taken = []
+    for _ in range(3):
+        begin = time.perf_counter()
+        np.sort(values)
+        taken.append(time.perf_counter() - begin)
+    return min(taken) / SORT * (2 / numba.get_num_threads()) ** 0.7
