@@ -96,7 +96,7 @@ def convert(request: ConvertRequest, console: Console | None = None) -> Conversi
     budget = request.limits.gaussians(request.fit.max_gaussians, request.ply.sh_degree)
     fit = replace(request.fit, max_gaussians=budget)
     source, scene = _begin(run, request)
-    costs = estimate(scene, fit.size, fit.max_gaussians)
+    costs = estimate(scene, fit.size, fit.max_gaussians, request.report is not None)
     planner = Planner(request.limits, fit.max_gaussians, fit.steps, request.ply.sh_degree)
     plan = planner.plan(costs, run.elapsed())
     run.report.plan = plan.record()

@@ -17,6 +17,7 @@ from vvgt_cli.gaussians import Gaussians, as_stored, read_ply, write_ply
 from vvgt_cli.optimize import OptimizeOptions
 from vvgt_cli.pipeline.convert import ConvertRequest, FitOptions, convert
 from vvgt_cli.pipeline.optimize import Views, refine
+from vvgt_cli.pipeline.plan import views_of
 from vvgt_cli.pipeline.record import ConversionReport, Run
 from vvgt_cli.pipeline.source import SourceRequest, load
 from vvgt_cli.progress import Console
@@ -74,9 +75,10 @@ def rungs(options: LadderOptions) -> list[Rung]:
     most, size, seed = options.max_gaussians, options.size, options.seed
     budgets = sorted({max(most // share, 1) for share in SHARES} | {most})
     found = [
-        Rung(f"closed form, K = {short(k)}", short(k), "closed form", FitOptions(k, size, seed=seed)) for k in budgets
+        Rung(f"closed form, K = {short(k)}", short(k), "closed form", FitOptions(k, size, seed=seed, steps=0))
+        for k in budgets
     ]
-    full = FitOptions(most, size, seed=seed)
+    full = FitOptions(most, size, seed=seed, steps=0)
     if options.model:
         found.append(Rung(f"network {Path(options.model).name}", "network", "network", full))
     for steps in sorted(set(options.steps)):
@@ -126,7 +128,7 @@ def climb(
             raise KeyboardInterrupt
         images = [render(gaussians, camera) for camera in reference.views.cameras]
         report.scores = asdict(score_views(reference.views.images, images))
-        views = rung.fit.views() + SET_VIEWS["check"]
+        views = views_of(rung.fit.steps or 0) + SET_VIEWS["check"]
         run = {"name": rung.name, "label": rung.label, "kind": rung.kind, "views": views, **asdict(report)}
         yield run, images
 
@@ -174,7 +176,8 @@ def _begin(source: SourceRequest, rung: Rung) -> tuple[Run, Scene]:
 def _views(run: Run, scene: Scene, fit: FitOptions) -> tuple[Views, Views]:
     from vvgt_cli.dvr import render_views
 
-    train, check = default_views("train", fit.views(), size=fit.size), default_views("check", size=fit.size)
+    train = default_views("train", views_of(fit.steps or 0), size=fit.size)
+    check = default_views("check", size=fit.size)
     with run.stage("views"):
         return Views(train, render_views(scene, train)), Views(check, render_views(scene, check))
 

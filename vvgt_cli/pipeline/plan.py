@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -17,20 +18,21 @@ if TYPE_CHECKING:
 VERTEX_BYTES = 68  # x y z, normals, three colours, opacity, three scales, four of rotation: float32
 HARMONIC_BYTES = {0: 0, 1: 36, 2: 96, 3: 180}  # zeros up to a degree
 HEADER_BYTES = 1000
-DEFAULT_STEPS = 72  # of gradient descent: the knee of error against seconds (docs/report.md)
+DEFAULT_STEPS = 72  # of gradient descent: the knee of error against seconds (docs/plan.md)
 MOST_STEPS = 400  # where a target or a time asks for as many as it takes
 FEWEST_STEPS = 8  # less is not worth the views
 REFINE_VIEWS = 72  # training views of gradient descent, which learns fewer by heart
 STEPS_A_SET = 48  # of gradient descent, for each further 24 views
 SMALLER = (8, 4, 2)  # parts of the budget that a target is tried with first
 PROBE = 80  # pixels along the edge of the view that is timed
-# Seconds on two cores where 200,000 random float64 sort in `SORT`; fitted to conversions, see docs/report.md.
-SORT = 2.0e-3
-CLOSED_FORM = 0.5, 1.0, 0.5  # always, per 10^7 voxels, per 10^6 cells
-STEP = 0.01, 0.03  # per 400 x 400 px, per 100,000 Gaussians
-BACK_PROJECTION = 100.0  # steps
-VIEW, SCORE = 1.5, 6.0  # of the view that is timed: finer integration; with its picture, for three views
-MEMORY = 3e8, 210.0, 1500.0  # bytes: programs and kernels, a cell, a Gaussian
+# Seconds on two cores where 200,000 random float64 sort in `SORT`, fitted to conversions: docs/plan.md.
+SORT = 0.95e-3
+CLOSED_FORM = 1.0, 1.9, 0.3  # always, per 10^6 cells, per 10^6 voxels in bricks that are not empty
+STEP = 0.015, 0.042  # per 400 x 400 px, per 100,000 Gaussians
+BACK_PROJECTION = 120.0  # steps
+VIEW = 1.1  # of the view that is timed
+SCORE, SCORE_ALL = (3, 2.5, 0.03), (10, 2.5, 0.2)  # views, of the view that is timed, and seconds a view beside it
+MEMORY = 2.6e8, 294.0, 1240.0, 625.0  # bytes: program and kernels, a cell, a Gaussian, a pixel of a view
 
 
 @dataclass(frozen=True)
@@ -75,7 +77,7 @@ def views_of(steps: int) -> int:
 
 @dataclass(frozen=True)
 class Costs:
-    """Seconds and bytes that stages should take on this machine; docs/report.md says how they were fitted.
+    """Seconds and bytes that stages should take on this machine; docs/plan.md says how they were fitted.
 
     Attributes:
         closed_form: moments, pyramid and choice of cells.
@@ -199,23 +201,28 @@ def _refinement(costs: Costs, steps: int) -> float:
     return steps * costs.step + (views_of(steps) + SET_VIEWS["check"]) * costs.view
 
 
-def estimate(scene: Scene, size: int, gaussians: int) -> Costs:
-    """What stages should cost: a small view is timed, the rest follows from counts and the machine's pace."""
+def estimate(scene: Scene, size: int, gaussians: int, all_views: bool = False) -> Costs:
+    """What stages should cost: a small view is timed, the rest follows from counts and the machine's pace.
+
+    ``all_views``: the score is that of all test views, with the perceptual measures.
+    """
+    from vvgt_cli.dvr.scene import BRICK
     from vvgt_cli.vbm.closed_form import expected_cells
 
     cells, pixels, pace = expected_cells(scene, size), (size / 400) ** 2, _pace()
+    voxels = np.count_nonzero(scene.empty == 0) * BRICK**3
     count = min(gaussians, cells)
     step = pace * (STEP[0] * pixels + STEP[1] * count / 1e5)
-    view = _view_seconds(scene, size)
-    voxels = scene.values.size / 1e7
+    view = VIEW * _view_seconds(scene, size)
+    views, finer, beside = SCORE_ALL if all_views else SCORE
     return Costs(
-        closed_form=pace * (CLOSED_FORM[0] + CLOSED_FORM[1] * voxels + CLOSED_FORM[2] * cells / 1e6),
-        view=VIEW * view,
+        closed_form=pace * (CLOSED_FORM[0] + CLOSED_FORM[1] * cells / 1e6 + CLOSED_FORM[2] * voxels / 1e6),
+        view=view,
         back_projection=BACK_PROJECTION * step,
         step=step,
-        score=SCORE * (view + step),
-        write=pace * (0.1 + 0.2 * count / 1e5),
-        memory=MEMORY[0] + scene.volume.data.nbytes + MEMORY[1] * cells + MEMORY[2] * count + 1000 * size**2,
+        score=views * (finer * view + pace * beside * pixels),
+        write=pace * 0.1,
+        memory=MEMORY[0] + scene.volume.data.nbytes + MEMORY[1] * cells + MEMORY[2] * count + MEMORY[3] * size**2,
     )
 
 
@@ -227,9 +234,17 @@ def _view_seconds(scene: Scene, size: int) -> float:
 
     camera = default_views("check", size=PROBE)[0]
     render_view(scene, camera, FIT_VIEWS)  # compiled, or loaded
-    begin = time.perf_counter()
-    render_view(scene, camera, FIT_VIEWS)
-    return (time.perf_counter() - begin) * (size / PROBE) ** 2
+    return _quickest(lambda: render_view(scene, camera, FIT_VIEWS)) * (size / PROBE) ** 2
+
+
+def _quickest(call: Callable[[], object]) -> float:
+    """Seconds of the quickest of three calls."""
+    taken = []
+    for _ in range(3):
+        begin = time.perf_counter()
+        call()
+        taken.append(time.perf_counter() - begin)
+    return min(taken)
 
 
 def _pace() -> float:
@@ -237,9 +252,4 @@ def _pace() -> float:
     import numba
 
     values = np.random.default_rng(0).random(200_000)
-    taken = []
-    for _ in range(3):
-        begin = time.perf_counter()
-        np.sort(values)
-        taken.append(time.perf_counter() - begin)
-    return min(taken) / SORT * (2 / numba.get_num_threads()) ** 0.7
+    return _quickest(lambda: np.sort(values)) / SORT * (2 / numba.get_num_threads()) ** 0.7

@@ -1,0 +1,137 @@
+"""What `convert` decides to do: limits, estimates, and what is left out."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vvgt_cli.errors import UsageError
+from vvgt_cli.gaussians import read_ply
+from vvgt_cli.pipeline.convert import ConvertRequest, FitOptions, convert
+from vvgt_cli.pipeline.plan import DEFAULT_STEPS, MOST_STEPS, Costs, Limits, Planner, views_of
+from vvgt_cli.pipeline.source import SourceRequest
+from vvgt_cli.progress import Console
+
+COSTS = Costs(closed_form=5, view=0.05, back_projection=6, step=0.05, score=0.5, write=0.1, memory=1e9)
+SOURCE = SourceRequest("example:marschner-lobb:24")
+SMALL = FitOptions(400, 48)
+
+
+def plan(steps=None, spent=1.0, begun=False, costs=COSTS, **limits):
+    return Planner(Limits(**limits), 1000, steps, 0).plan(costs, spent, begun)
+
+
+def done(tmp_path, fit=SMALL, **options):
+    request = ConvertRequest(SOURCE, str(tmp_path / "a.ply"), fit, **options)
+    return convert(request, Console(quiet=True))
+
+
+def names(report):
+    return [stage.name for stage in report.stages]
+
+
+def test_without_limits_the_default_steps_are_planned_and_back_projection_is_not():
+    found = plan()
+    assert (found.steps, found.back_project) == (DEFAULT_STEPS, False)
+    assert [name for name, _ in found.left_out] == ["back-projection"]
+    assert found.seconds == pytest.approx(sum(seconds for _, seconds in found.stages))
+    assert found.seconds == pytest.approx(1 + 5 + DEFAULT_STEPS * 0.05 + 28 * 0.05 + 0.6)
+    assert found.bytes == 1000 + 1000 * 68
+    assert "72 steps" in found.text()
+
+
+def test_no_steps_leave_back_projection():
+    found = plan(steps=0)
+    assert (found.steps, found.back_project) == (0, True)
+    assert [name for name, _ in found.left_out] == ["refinement"]
+
+
+def test_more_time_is_more_steps_and_never_more_than_the_time():
+    taken = [plan(time_budget=seconds) for seconds in (2, 7, 9, 10, 15, 20, 30, 100)]
+    steps = [found.steps for found in taken]
+    assert steps == sorted(steps)
+    assert steps[0] == 0
+    assert 8 <= steps[3] < steps[-1] == MOST_STEPS
+    for found, seconds in zip(taken[2:], (9, 10, 15, 20, 30, 100), strict=True):
+        assert found.seconds <= seconds
+        assert found.most_steps == MOST_STEPS
+    assert not taken[0].back_project
+    assert {name for name, _ in taken[0].left_out} == {"refinement", "back-projection"}
+    assert plan(time_budget=30, steps=40).steps == 40
+
+
+def test_a_slower_machine_gets_fewer_steps_after_the_closed_form():
+    quick, slow = (plan(time_budget=12, spent=6, begun=True, costs=COSTS.at(pace)) for pace in (1, 3))
+    assert quick.steps > slow.steps > 0
+    assert COSTS.at(3).view == COSTS.view  # measured, not fitted
+
+
+def test_views_come_in_sets():
+    assert [views_of(steps) for steps in (0, 1, 95, 96, 143, 144, 10_000)] == [24, 24, 24, 48, 48, 72, 72]
+
+
+@pytest.mark.parametrize(
+    ("limits", "line"), [({"time_budget": 0.0}, "--time-budget 0"), ({"max_megabytes": -1.0}, "--max-size -1")]
+)
+def test_limits_that_cannot_be_are_refused(limits, line):
+    with pytest.raises(UsageError, match=line):
+        Limits(**limits)
+
+
+def test_a_size_is_kept_to_the_byte_and_one_without_room_is_refused(tmp_path):
+    report = done(tmp_path, FitOptions(100_000, 48, steps=0), limits=Limits(max_megabytes=0.01))
+    assert report.gaussians == len(read_ply(tmp_path / "a.ply")[0])
+    assert 0.9 * 0.01e6 - 1000 < report.bytes <= 0.01e6
+    assert (tmp_path / "a.ply").stat().st_size == report.bytes
+    with pytest.raises(UsageError, match="no Gaussian fits"):
+        done(tmp_path, limits=Limits(max_megabytes=0.001))
+
+
+def test_a_target_that_the_closed_form_has_pays_for_nothing_else(tmp_path):
+    report = done(tmp_path, limits=Limits(target_psnr=10.0))
+    assert names(report) == ["read", "scene", "closed form", "check views", "test views", "write"]
+    assert report.gaussians <= 400 // 8
+    assert {"refinement", "back-projection"} <= {name for name, _ in report.left_out}
+
+
+def test_a_target_between_ends_refinement_when_it_is_reached(tmp_path):
+    start = done(tmp_path, FitOptions(400, 48, steps=1)).stages
+    before = next(stage.psnr_before for stage in start if stage.name == "refinement")
+    report = done(tmp_path, limits=Limits(target_psnr=before + 1), overwrite=True)
+    assert report.refinement["reason"] == "target"
+    assert report.refinement["psnr_after"] >= before + 1
+    assert report.refinement["steps"] < MOST_STEPS
+
+
+def test_a_hopeless_target_ends_and_writes_the_best(tmp_path):
+    report = done(tmp_path, FitOptions(50, 32), limits=Limits(target_psnr=90.0))
+    assert report.refinement["reason"] in ("steps", "no gain")
+    assert report.refinement["psnr_after"] >= report.refinement["psnr_before"]
+    assert len(read_ply(tmp_path / "a.ply")[0]) == report.gaussians
+
+
+def test_no_time_leaves_the_closed_form(tmp_path):
+    report = done(tmp_path, limits=Limits(time_budget=1e-3))
+    assert names(report) == ["read", "scene", "closed form", "test views", "write"]
+    assert len(read_ply(tmp_path / "a.ply")[0]) == report.gaussians > 0
+
+
+def test_a_dry_run_plans_and_writes_nothing(tmp_path):
+    report = done(tmp_path, dry_run=True)
+    assert names(report) == ["read", "scene"]
+    assert not list(tmp_path.iterdir())
+    assert report.plan["seconds"] > 0
+    assert report.plan["memory"] > 1e8
+    assert json.loads(report.to_json())["plan"]["stages"]
+
+
+def test_the_default_refines_and_says_what_it_left_out(tmp_path):
+    report = done(tmp_path)
+    assert report.refinement["steps"] == DEFAULT_STEPS
+    assert "back-projection" not in names(report)
+    assert report.left_out[0][0] == "back-projection"
+    assert np.isfinite(report.scores["psnr"])
+    assert Path(tmp_path / "a.ply").exists()
