@@ -7,8 +7,8 @@
 400 px, K = 100,000, RGB dB on the ten test views (half-voxel steps, adaptive rays), wall seconds. `equal` starts both
 from the closed form: 100 steps of Adam on the file's fields with 3DGS' loss (SSIM included) on 24 views of one ray a
 pixel and steps of a voxel, and our steps for as long as those took, views included on both sides. `curve`: every point
-is a run of its own from the prepared scene on, views and closed form included. `ours` and `adam` start from the closed
-form; `3dgs` from 10,000 uniform samples that grow as in 3DGS, `ivr-gs` from as many uniform samples as the limit, with
+is a run of its own from the prepared scene on, views and closed form included. `ours` starts from the
+closed form as it is (without steps: back-projected), `adam` from the back-projected one; `3dgs` from 10,000 uniform samples that grow as in 3DGS, `ivr-gs` from as many uniform samples as the limit, with
 the function's colours, none added; both with 3DGS' loss and Adam, on 72 views.
 """
 
@@ -35,7 +35,7 @@ from vvgt_cli.splat import render
 from vvgt_cli.vbm import VbmOptions, backproject, initialise
 
 K, ADAM_STEPS, BASE_VIEWS = 100_000, 100, 72
-STEPS = {"ours": (0, 25, 50, 100, 200, 400), "adam": (25, 50, 100, 200), "3dgs": (300, 1000), "ivr-gs": (300, 1000)}
+STEPS = {"ours": (0, 24, 72, 144, 400), "adam": (25, 100, 200), "3dgs": (300, 1000), "ivr-gs": (300, 1000)}
 
 
 class Judged:
@@ -78,7 +78,9 @@ def equal_row(judged: Judged) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def begin(judged: Judged, method: str) -> Gaussians:
+def begin(judged: Judged, method: str, steps: int) -> Gaussians:
+    if method == "ours" and steps:  # as `convert` does
+        return initialise(judged.scene, VbmOptions(K)).gaussians
     if method in ("ours", "adam"):
         return judged.closed_form()
     count = 10_000 if method == "3dgs" else K
@@ -88,7 +90,7 @@ def begin(judged: Judged, method: str) -> Gaussians:
 def point(judged: Judged, method: str, steps: int) -> dict[str, Any]:
     """One run, from the prepared scene on."""
     began = time.perf_counter()
-    start = begin(judged, method)
+    start = begin(judged, method, steps)
     if steps:
         count = views_of(steps) if method == "ours" else 24 if method == "adam" else BASE_VIEWS
         cameras = default_views("train", count)

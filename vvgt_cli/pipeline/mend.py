@@ -29,7 +29,7 @@ def check_view_memory(plan: Plan, size: int) -> None:
     """Refuse a size whose training and check views would not fit."""
     views = views_of(plan.steps) + SET_VIEWS["check"]
     need, free = views * size**2 * VIEW_BYTES, free_memory()
-    if plan.back_project and free is not None and need > free:
+    if (plan.back_project or plan.steps) and free is not None and need > free:
         raise UsageError(
             f"--size {size}: {views} views need {need / 2**30:.1f} GiB of memory, {free / 2**30:.1f} GiB are free; "
             "try a smaller size, or 'vvgt init', which renders none"
