@@ -88,7 +88,7 @@ def test_the_ladder_writes_every_file_and_scores_every_rung(ladder):
     assert found["format"] == "vvgt-report"
     assert found["reference"] == {"views": 10, "size": 24, "step": 0.125, "rays": 9}
     assert found["knee"] in found["front"]
-    assert found["command_line"].startswith("vvgt report example:blob:10 -o ")
+    assert found["command_line"].startswith("vvgt report example:blob:10 --output ")
     assert "--steps 2" in found["command_line"]
     assert found["machine"]["cpu"]
 
