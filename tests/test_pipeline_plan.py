@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from onnx_models import write_model
+from test_cli_infer import DARKER
 
 from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians import read_ply
@@ -15,7 +17,7 @@ from vvgt_cli.pipeline.plan import DEFAULT_STEPS, MOST_STEPS, Costs, Limits, Pla
 from vvgt_cli.pipeline.source import SourceRequest
 from vvgt_cli.progress import Console
 
-COSTS = Costs(closed_form=5, view=0.05, back_projection=6, step=0.05, score=0.5, write=0.1, memory=1e9)
+COSTS = Costs(closed_form=5, view=0.05, back_projection=6, network=3, step=0.05, score=0.5, write=0.1, memory=1e9)
 SOURCE = SourceRequest("example:marschner-lobb:24")
 SMALL = FitOptions(400, 48)
 
@@ -61,6 +63,14 @@ def test_more_time_is_more_steps_and_never_more_than_the_time():
     assert not taken[0].back_project
     assert {name for name, _ in taken[0].left_out} == {"refinement", "back-projection"}
     assert plan(time_budget=30, steps=40).steps == 40
+
+
+def test_a_network_runs_where_there_is_time_for_it():
+    planner = Planner(Limits(), 1000, None, 0, "some")
+    assert planner.plan(COSTS, 1.0).network == "some"
+    short = Planner(Limits(time_budget=9.0), 1000, None, 0, "some").plan(COSTS, 1.0)
+    assert short.network is None
+    assert "network" in {name for name, _ in short.left_out}
 
 
 def test_a_slower_machine_gets_fewer_steps_after_the_closed_form():
@@ -135,3 +145,15 @@ def test_the_default_refines_and_says_what_it_left_out(tmp_path):
     assert report.left_out[0][0] == "back-projection"
     assert np.isfinite(report.scores["psnr"])
     assert Path(tmp_path / "a.ply").exists()
+
+
+def test_a_network_that_makes_it_worse_is_dropped(tmp_path):
+    write_model(tmp_path / "darker", DARKER)
+    plain = done(tmp_path, FitOptions(400, 48, steps=10))
+    worse = done(tmp_path, FitOptions(400, 48, steps=10, model=str(tmp_path / "darker")), overwrite=True)
+    stage = next(stage for stage in worse.stages if stage.name == "network")
+    assert not stage.kept
+    assert stage.psnr < stage.psnr_before
+    assert worse.scores["psnr"] == plain.scores["psnr"]
+    with pytest.raises(UsageError, match="no such folder"):
+        done(tmp_path, FitOptions(400, 48, model="no/such"), overwrite=True)

@@ -19,6 +19,9 @@ from vvgt_cli.progress import Console
     "--steps", type=click.IntRange(0, 10_000_000), metavar="N",
     help="Steps of gradient descent after the closed form, one view each, at most; 0 for none. Without: by the plan.",
 )  # fmt: skip
+@click.option(
+    "--model", metavar="NAME", help="Trained network that runs before the steps; kept where the check views agree."
+)
 @limit_options
 @click.option("--dry-run", is_flag=True, help="Print the plan with estimated time, memory and size; write nothing.")
 @ply_options

@@ -81,6 +81,7 @@ def convert_request(
     report: str | None = None,
     preview: str | None = None,
     steps: int | None = None,
+    model: str | None = None,
     limits: dict[str, Any] | None = None,
     dry_run: bool = False,
 ) -> ConvertRequest:
@@ -92,7 +93,7 @@ def convert_request(
     return ConvertRequest(
         source_request(volume, read, optics),
         output,
-        FitOptions(**fit, steps=steps),
+        FitOptions(**fit, steps=steps, model=model),
         Limits(**(limits or {})),
         dry_run,
         PlyOptions(**ply),

@@ -11,6 +11,7 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored, write_ply
+from vvgt_cli.network.card import find_model
 from vvgt_cli.pipeline.mend import check_view_memory, mend
 from vvgt_cli.pipeline.outputs import STDOUT, Output, check_outputs, write_text
 from vvgt_cli.pipeline.plan import Limits, Planner, estimate
@@ -36,6 +37,7 @@ class FitOptions:
         size: pixels along an image's edge that the file is made for.
         init: "vbm", "wavelet" or "uniform".
         seed: of whatever draws random numbers.
+        model: network that runs before the steps: a folder or the name of a shipped one, None for none.
         steps: of gradient descent after the closed form, at most; None: what the plan finds worth its time.
     """
 
@@ -44,6 +46,7 @@ class FitOptions:
     init: str = "vbm"
     seed: int = 0
     steps: int | None = None
+    model: str | None = None
 
 
 @dataclass(frozen=True)
@@ -96,8 +99,10 @@ def convert(request: ConvertRequest, console: Console | None = None) -> Conversi
     budget = request.limits.gaussians(request.fit.max_gaussians, request.ply.sh_degree)
     fit = replace(request.fit, max_gaussians=budget)
     source, scene = _begin(run, request)
+    if fit.model is not None:
+        find_model(fit.model)  # fails before the work, not after
     costs = estimate(scene, fit.size, fit.max_gaussians, request.report is not None)
-    planner = Planner(request.limits, fit.max_gaussians, fit.steps, request.ply.sh_degree)
+    planner = Planner(request.limits, fit.max_gaussians, fit.steps, request.ply.sh_degree, fit.model)
     plan = planner.plan(costs, run.elapsed())
     run.report.plan = plan.record()
     if request.dry_run:

@@ -40,15 +40,19 @@ def mend(run: Run, scene: Scene, start: Start, plan: Plan, limits: Limits, fit: 
     """The closed form after what the plan has for it, or as much of it as the target asks for."""
     for name, why in plan.left_out:
         run.leave_out(name, why)
-    if not (plan.back_project or plan.steps or limits.target_psnr is not None):
+    if not (plan.back_project or plan.steps or plan.network or limits.target_psnr is not None):
         return start.gaussians
     stage = _Mending(run, scene, plan, limits, fit)
     if stage.enough(start.gaussians):
         run.leave_out("refinement", f"the check views have {limits.target_psnr:g} dB without it")
         return stage.smaller(start)
-    if plan.back_project:
-        return stage.back_project(start)
-    return stage.refine(start.gaussians) if plan.steps else start.gaussians
+    gaussians = stage.back_project(start) if plan.back_project else start.gaussians
+    if plan.network:
+        gaussians = stage.network(gaussians)
+        if stage.enough(gaussians):
+            run.leave_out("refinement", f"the check views have {limits.target_psnr:g} dB without it")
+            return gaussians
+    return stage.refine(gaussians) if plan.steps else gaussians
 
 
 class _Mending:
@@ -65,6 +69,7 @@ class _Mending:
             self.check = Views(cameras, render_views(scene, cameras, RenderSettings() if judged else FIT_VIEWS))
             stage.note = f"{len(cameras)} of {fit.size} px"
         self.settings: RenderSettings = FIT_VIEWS
+        self.train: Views | None = None
 
     def psnr(self, gaussians: Gaussians) -> float:
         """On the check views."""
@@ -105,10 +110,23 @@ class _Mending:
             stage.psnr_before, stage.psnr = before, after
         return mended if stage.kept else start.gaussians
 
+    def network(self, gaussians: Gaussians) -> Gaussians:
+        """One pass of a trained network, kept if the check views agree."""
+        from vvgt_cli.pipeline.infer import improve
+
+        assert self.plan.network is not None
+        return improve(self.run, gaussians, self.views(gaussians), self.check, self.plan.network)
+
+    def views(self, start: Gaussians) -> Views:
+        """Training views, as finely integrated as ``start`` asks for."""
+        if self.train is None:
+            self.settings = fine_enough(self.scene, self.check, start)
+            self.train = self._rendered(views_of(self.plan.steps))
+        return self.train
+
     def refine(self, gaussians: Gaussians) -> Gaussians:
         """Gradient descent on the training views."""
-        self.settings = fine_enough(self.scene, self.check, gaussians)
-        train = self._rendered(views_of(self.plan.steps))
+        train = self.views(gaussians)
         left = None
         if self.limits.time_budget is not None:
             ending = sum(seconds for name, seconds in self.plan.stages if name in ("test views", "write"))

@@ -30,6 +30,7 @@ SORT = 0.95e-3
 CLOSED_FORM = 1.0, 1.9, 0.3  # always, per 10^6 cells, per 10^6 voxels in bricks that are not empty
 STEP = 0.015, 0.042  # per 400 x 400 px, per 100,000 Gaussians
 BACK_PROJECTION = 120.0  # steps
+NETWORK = 0.5, 4.0  # always, per 100,000 Gaussians (docs/network.md)
 VIEW = 1.1  # of the view that is timed
 SCORE, SCORE_ALL = (3, 2.5, 0.03), (10, 2.5, 0.2)  # views, of the view that is timed, and seconds a view beside it
 MEMORY = 2.6e8, 294.0, 1240.0, 625.0  # bytes: program and kernels, a cell, a Gaussian, a pixel of a view
@@ -83,6 +84,7 @@ class Costs:
         closed_form: moments, pyramid and choice of cells.
         view: a view to fit to.
         back_projection: of 24 views.
+        network: one pass of a network.
         step: of gradient descent, with its share of the looks at check views.
         score: test views.
         write: the file.
@@ -92,6 +94,7 @@ class Costs:
     closed_form: float
     view: float
     back_projection: float
+    network: float
     step: float
     score: float
     write: float
@@ -114,6 +117,7 @@ class Plan:
         back_project: whether views correct the closed form by cells and colours instead of gradient descent.
         steps: of gradient descent, as many as there should be time for.
         most_steps: where there is more time than that.
+        network: model that improves the Gaussians before the steps, or None.
         seconds, bytes, memory: estimates of the whole run, its file, its memory at most.
         stages: (stage, seconds) estimates in order.
         left_out: (stage, why) of what is not done.
@@ -123,6 +127,7 @@ class Plan:
     back_project: bool = False
     steps: int = 0
     most_steps: int = 0
+    network: str | None = None
     seconds: float = 0.0
     bytes: int = 0
     memory: float = 0.0
@@ -153,12 +158,14 @@ class Planner:
         gaussians: budget.
         steps: of gradient descent that the user asks for; None: the plan's choice.
         sh_degree: harmonics in the file.
+        model: network that the user asks for.
     """
 
     limits: Limits
     gaussians: int
     steps: int | None
     sh_degree: int
+    model: str | None = None
 
     def plan(self, costs: Costs, spent: float, begun: bool = False) -> Plan:
         """Which stages fit, after ``spent`` seconds; ``begun``: the closed form is done."""
@@ -177,6 +184,7 @@ class Planner:
     def _views(self, plan: Plan, costs: Costs, left: float | None) -> None:
         """What needs views: gradient descent, as asked for, as long as there is time, or as much as pays."""
         open_end = self.limits.target_psnr is not None or left is not None
+        left = self._network(plan, costs, left)
         steps = self.steps if self.steps is not None else MOST_STEPS if open_end else DEFAULT_STEPS
         wanted = steps
         while left is not None and steps > 0 and _refinement(costs, steps) > left:
@@ -194,6 +202,17 @@ class Planner:
             plan.stages.append(("back-projection", mending))
         else:
             plan.left_out.append(("back-projection", f"about {mending:.1f} s with its views; {room}"))
+
+    def _network(self, plan: Plan, costs: Costs, left: float | None) -> float | None:
+        """The network, where one is asked for and there is time; returns what is left."""
+        if self.model is None:
+            return left
+        if left is not None and left < costs.network + _refinement(costs, 0):
+            plan.left_out.append(("network", f"about {costs.network:.1f} s, {max(left, 0):.1f} s are left"))
+            return left
+        plan.network = self.model
+        plan.stages.append(("network", costs.network))
+        return None if left is None else left - costs.network
 
 
 def _refinement(costs: Costs, steps: int) -> float:
@@ -219,6 +238,7 @@ def estimate(scene: Scene, size: int, gaussians: int, all_views: bool = False) -
         closed_form=pace * (CLOSED_FORM[0] + CLOSED_FORM[1] * cells / 1e6 + CLOSED_FORM[2] * voxels / 1e6),
         view=view,
         back_projection=BACK_PROJECTION * step,
+        network=pace * (NETWORK[0] + NETWORK[1] * count / 1e5),
         step=step,
         score=views * (finer * view + pace * beside * pixels),
         write=pace * 0.1,
