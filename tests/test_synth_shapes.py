@@ -45,6 +45,15 @@ def test_plates_are_flat_inside_and_sharp_at_their_edges():
     assert steps.max() > 0.2
 
 
+def test_wells_are_smooth():
+    values = make_shape("wells", 48, 1).data
+    assert values.min() == 0
+    assert values.max() == 1
+    second = np.abs(np.diff(values, n=2, axis=0))
+    assert second.max() < 0.15  # a width of 0.06 is 1.4 voxels here
+    assert np.median(second) < 0.005
+
+
 def test_noise_has_the_spectrum_of_a_power_law():
     values = make_shape("noise", 48, 0).data.astype(np.float64)
     power = np.abs(np.fft.fftn(values)) ** 2

@@ -13,6 +13,7 @@ from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.network import tables
 from vvgt_cli.network.config import NetworkConfig
+from vvgt_cli.network.damp import damped
 from vvgt_cli.network.slopes import slope_rows
 
 UNIT_RADIUS = math.sqrt(3)  # half-diagonal of the unit frame's cube
@@ -48,6 +49,12 @@ class Prepared:
     def arrays(self) -> dict[str, np.ndarray]:
         """All that `Vvgt.forward` is given."""
         return self.views | (self.part() if self.config.has_geometry else {})
+
+    def accept(self, rows: np.ndarray, cameras: Sequence[Camera], images: np.ndarray) -> Gaussians:
+        """`restore`; of a step as much as lowers the error of the views that were read (`vvgt_cli.network.damp`)."""
+        if self.config.geometry.head != "step":
+            return self.restore(rows)
+        return damped(self.restore(self.rows), self.restore(rows), cameras, images)[0]
 
     def restore(self, rows: np.ndarray) -> Gaussians:
         """The network's output (K, 14) as Gaussians in the order that was given."""

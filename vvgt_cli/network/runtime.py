@@ -118,7 +118,7 @@ class Model:
             rows = self.run_rows(scene, points, progress)
             if not np.isfinite(rows).all():
                 raise DataError(f"model {self.card.name}: its output is not finite; these Gaussians are beyond it")
-            gaussians = scene.restore(rows)
+            gaussians = scene.accept(rows, [cameras[i] for i in shown], images[shown])
         return gaussians
 
     def run_rows(self, scene: Prepared, points: int = POINTS, progress: ProgressCallback | None = None) -> np.ndarray:

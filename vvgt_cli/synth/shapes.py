@@ -1,4 +1,4 @@
-"""Shapes as CT and MR show them: nested shells, tubes, plates, and noise of all scales. float32, values near [0, 1].
+"""Shapes as CT, MR and simulations show them: nested shells, tubes, plates, noise, wells. float32, values near [0, 1].
 
 A seed gives one volume on every machine but for the last bits of its Fourier transforms.
 """
@@ -117,11 +117,24 @@ def noise(size: int, seed: int) -> np.ndarray:
     return (field - field.min()) / (field.max() - field.min())
 
 
+def wells(size: int, seed: int) -> np.ndarray:
+    """Sums of smooth bumps of both signs, as densities and potentials of molecules are, over [0, 1]."""
+    rng = np.random.default_rng(seed)
+    line = (np.arange(size) + 0.5) * 2 / size - 1
+    field = np.zeros((size,) * 3)
+    for _ in range(rng.integers(6, 60)):
+        place, width = rng.uniform(-0.7, 0.7, 3), np.exp(rng.uniform(np.log(0.06), np.log(0.3)))
+        x, y, z = (np.exp(-0.5 * ((line - p) / width) ** 2) for p in place)
+        field += rng.choice([-0.5, 1.0]) * rng.uniform(0.3, 1) * z[:, None, None] * y[None, :, None] * x[None, None, :]
+    return (field - field.min()) / (field.max() - field.min())
+
+
 SHAPES: dict[str, Callable[[int, int], np.ndarray]] = {
     "shells": shells,
     "tubes": tubes,
     "plates": plates,
     "noise": noise,
+    "wells": wells,
 }
 
 

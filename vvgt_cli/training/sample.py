@@ -14,7 +14,7 @@ from vvgt_cli.cameras import Camera
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.metrics import psnr
 from vvgt_cli.network.model import Vvgt
-from vvgt_cli.network.prepare import Prepared, prepare, unpack
+from vvgt_cli.network.prepare import Prepared, prepare
 from vvgt_cli.network.runtime import in_turn, spread
 from vvgt_cli.splat import render
 from vvgt_cli.training.config import TrainConfig
@@ -112,8 +112,10 @@ def judge(network: Vvgt, scene: TrainingScene, config: TrainConfig, device: torc
     found = [mean_psnr(gaussians, scene.targets, scene.target_images)]
     for number in range(config.network.rounds):
         shown = in_turn(few, number, config.network.rounds)
-        prepared = prepare(gaussians, [scene.cameras[i] for i in shown], as_float(scene.images[shown]), config.network)
-        gaussians = unpack(run_network(network, tensors(prepared), device).cpu().numpy())
+        cameras, images = [scene.cameras[i] for i in shown], as_float(scene.images[shown])
+        prepared = prepare(gaussians, cameras, images, config.network)
+        rows = run_network(network, tensors(prepared), device).cpu().numpy()
+        gaussians = prepared.accept(rows, cameras, images)
         found.append(mean_psnr(gaussians, scene.targets, scene.target_images))
     return found
 
