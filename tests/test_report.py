@@ -75,9 +75,9 @@ def test_the_ladder_writes_every_file_and_scores_every_rung(ladder):
     scores = {rung["name"]: rung["scores"]["psnr"] for rung in found["runs"]}
     assert scores["closed form, K = 1"] < scores["closed form, K = 15"]
     assert scores["network worse"] == pytest.approx(scores["closed form, K = 60"], abs=0.5)  # what is worse is not kept
-    judge = next(s for s in found["runs"][4]["stages"] if s["name"] == "judge")
-    assert not judge["kept"]
-    assert judge["psnr"] < judge["psnr_before"]
+    network = next(s for s in found["runs"][4]["stages"] if s["name"] == "network")
+    assert not network["kept"]
+    assert network["psnr"] < network["psnr_before"]
     assert scores["3DGS, 2 steps"] < scores["iVR-GS setting, 2 steps"]
     for rung in found["runs"]:
         assert rung["scores"]["views"] == 10

@@ -52,7 +52,10 @@ def command_line(ctx: click.Context) -> str:
     "--picture-size", type=click.IntRange(16, 2048), default=400, show_default=True, metavar="PX",
     help="Pictures on the page are averaged down to at most this.",
 )  # fmt: skip
-@click.option("--model", metavar="MODEL", help="Network to run: a folder that 'vvgt export' wrote, or a shipped one.")
+@click.option(
+    "--model", metavar="MODEL",
+    help="Network: a folder of 'vvgt export' or a shipped one's name. Default: the shipped one, if any.",
+)  # fmt: skip
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of whatever draws random numbers.")
 @tf_options
 @read_options
@@ -64,7 +67,7 @@ def command(
 ) -> None:
     """Make the Gaussians of VOLUME by ever dearer means and show what each costs and gains.
 
-    The closed form at several budgets, a network where a model is named, gradient descent of several lengths, and
+    The closed form at several budgets, a network where there is one, gradient descent of several lengths, and
     two baselines: 3DGS from random points, and iVR-GS' setting (3DGS from samples of the volume). Each is timed on
     its own, views and all, and scored on the same ten test views. DIR gets report.html (one file, opens offline),
     report.json, report.csv and four PNG plots.

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vvgt_cli.cameras import default_views
-from vvgt_cli.cameras.sets import SET_VIEWS
 from vvgt_cli.gaussians import Gaussians, as_stored, read_ply, write_ply
 from vvgt_cli.optimize import OptimizeOptions
 from vvgt_cli.pipeline.convert import ConvertRequest, FitOptions, convert
@@ -25,7 +24,6 @@ from vvgt_cli.report.runs import short
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
-    from vvgt_cli.network.runtime import Model
 
 SHARES = (64, 16, 4)  # of the budget, for the closed form at several K
 STARTS = 2  # of the budget, what the baselines begin with: they grow
@@ -84,10 +82,11 @@ def rungs(options: LadderOptions) -> list[Rung]:
     for steps in sorted(set(options.steps)):
         fit = FitOptions(most, size, seed=seed, steps=steps)
         found.append(Rung(f"{steps} steps", f"{steps} steps", "steps", fit))
-    longest = FitOptions(most, size, seed=seed, steps=max(options.steps, default=0))
-    if longest.steps:
+    most_steps = max(options.steps, default=0)
+    longest = FitOptions(most, size, seed=seed, steps=most_steps)
+    if most_steps:
         for name, start in (("3DGS", "points"), ("iVR-GS setting", "samples")):
-            found.append(Rung(f"{name}, {longest.steps} steps", name, "baseline", longest, start))
+            found.append(Rung(f"{name}, {most_steps} steps", name, "baseline", longest, start))
     return found
 
 
@@ -121,14 +120,13 @@ def climb(
     from vvgt_cli.metrics import score_views
     from vvgt_cli.splat import render
 
-    model = _model(options.model)
     for rung in rungs(options):
-        report, gaussians = _run(source, rung, model)
+        report, gaussians = _run(source, rung)
         if report.refinement and report.refinement["reason"] == "interrupted":
             raise KeyboardInterrupt
         images = [render(gaussians, camera) for camera in reference.views.cameras]
         report.scores = asdict(score_views(reference.views.images, images))
-        views = views_of(rung.fit.steps or 0) + SET_VIEWS["check"]
+        views = views_of(rung.fit.steps or 0)
         run = {"name": rung.name, "label": rung.label, "kind": rung.kind, "views": views, **asdict(report)}
         yield run, images
 
@@ -136,32 +134,17 @@ def climb(
 def warm_up(source: SourceRequest, options: LadderOptions) -> None:
     """Run every kind of rung once at next to no size: kernels are compiled or loaded before any clock starts."""
     few = LadderOptions(100, 64, (2,) if options.steps else (), options.model, options.seed)
-    model = _model(options.model)
     for rung in rungs(few)[-4:]:
-        _run(source, rung, model)
+        _run(source, rung)
 
 
-def _run(source: SourceRequest, rung: Rung, model: Model | None) -> tuple[ConversionReport, Gaussians]:
+def _run(source: SourceRequest, rung: Rung) -> tuple[ConversionReport, Gaussians]:
     if rung.kind == "baseline":
         return _baseline(source, rung)
-    if rung.kind == "network":
-        assert model is not None
-        return _network(source, rung, model)
     with tempfile.TemporaryDirectory() as folder:
         path = str(Path(folder) / "rung.ply")
         report = convert(ConvertRequest(source, path, rung.fit), Console(quiet=True))
         return report, read_ply(path)[0]
-
-
-def _model(name: str | None) -> Model | None:
-    if name is None:
-        return None
-    import numba
-
-    from vvgt_cli.network.card import find_model
-    from vvgt_cli.network.runtime import Model
-
-    return Model.open(find_model(name), numba.get_num_threads())
 
 
 def _begin(source: SourceRequest, rung: Rung) -> tuple[Run, Scene]:
@@ -178,8 +161,10 @@ def _views(run: Run, scene: Scene, fit: FitOptions) -> tuple[Views, Views]:
 
     train = default_views("train", views_of(fit.steps or 0), size=fit.size)
     check = default_views("check", size=fit.size)
+    with run.stage("check views"):
+        judges = Views(check, render_views(scene, check))
     with run.stage("views"):
-        return Views(train, render_views(scene, train)), Views(check, render_views(scene, check))
+        return Views(train, render_views(scene, train)), judges
 
 
 def _finish(run: Run, gaussians: Gaussians) -> tuple[ConversionReport, Gaussians]:
@@ -221,31 +206,6 @@ def random_points(half: np.ndarray, count: int, seed: int) -> Gaussians:
         np.full(count, np.log(FAINT / (1 - FAINT))),
         rng.random((count, 3)),
     )
-
-
-def _network(source: SourceRequest, rung: Rung, model: Model) -> tuple[ConversionReport, Gaussians]:
-    """Closed form, colours from the views, the network on the same views; kept if the check views agree."""
-    from vvgt_cli.metrics import score_views
-    from vvgt_cli.splat import render
-    from vvgt_cli.vbm import VbmOptions, backproject, initialise
-
-    run, scene = _begin(source, rung)
-    with run.stage("closed form"):
-        start = initialise(scene, VbmOptions(rung.fit.max_gaussians, rung.fit.size))
-    train, check = _views(run, scene, rung.fit)
-    with run.stage("back-projection"):
-        gaussians, _ = backproject(start, train.cameras, train.images)
-    with run.stage("network"):
-        better = model.improve(gaussians, train.cameras, train.images)
-
-    def judged(some: Gaussians) -> float:
-        images = (render(some, camera) for camera in check.cameras)
-        return score_views(check.images, images, perceptual=False).psnr
-
-    with run.stage("judge") as stage:
-        stage.psnr_before, stage.psnr = judged(gaussians), judged(better)
-        stage.kept = stage.psnr > stage.psnr_before
-    return _finish(run, better if stage.kept else gaussians)
 
 
 def pictures(images: Sequence[np.ndarray] | np.ndarray, numbers: Sequence[int], limit: int) -> list[np.ndarray]:

@@ -6,14 +6,16 @@ import json
 import os
 import tempfile
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from vvgt_cli.errors import UsageError
+from vvgt_cli.network.card import CARD, MODELS
 from vvgt_cli.pipeline.convert import describe_source, tf_record, volume_record
+from vvgt_cli.pipeline.infer import SHIPPED
 from vvgt_cli.pipeline.ladder import LadderOptions, Reference, climb, pictures, rungs, warm_up
 from vvgt_cli.pipeline.outputs import STDOUT, Output, check_outputs, write_text
 from vvgt_cli.pipeline.record import document
@@ -61,6 +63,7 @@ def report(request: ReportRequest, console: Console | None = None) -> dict[str, 
     if request.source.volume == STDOUT:
         raise UsageError("VOLUME is '-': every run of the ladder reads it anew; expected a file")
     folder = _folder(request.output, (DATA, TABLE, PAGE, *FILES), request.overwrite)
+    request = replace(request, ladder=_with_model(request.ladder))
     size = request.ladder.size
     check_memory(10 * size**2 * VIEW_BYTES, f"--size {size}: ten test views")
     source = load(request.source)
@@ -84,6 +87,13 @@ def report(request: ReportRequest, console: Console | None = None) -> dict[str, 
     _write(folder, series, title, table(runs), Pictures(list(PICTURED), shown, ours), request.overwrite)
     console.say(f"{folder / PAGE}")
     return found
+
+
+def _with_model(ladder: LadderOptions) -> LadderOptions:
+    """The shipped network where none is named and one is there."""
+    if ladder.model is None and (MODELS / SHIPPED / CARD).is_file():
+        return replace(ladder, model=SHIPPED)
+    return ladder
 
 
 def _document(request: ReportRequest, source: Any, reference: Reference, runs: list[dict[str, Any]]) -> dict[str, Any]:

@@ -7,12 +7,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 
-from vvgt_cli.report.runs import KINDS, SCORING, STAGES, Run, cost, short
+from vvgt_cli.report.runs import KINDS, OTHER, SCORING, STAGES, Run, cost, short, stage_names
 
 WIDTH, HEIGHT = 440, 340  # of the drawing; fonts are 12.5 units, 9 px on a phone
 LEFT, RIGHT, TOP, BOTTOM = 46, 14, 14, 44
 MARK = 5.5
 LETTER = 6.5  # width of one
+HATCH = "background:repeating-linear-gradient(135deg,var(--line) 0 3px,var(--soft) 3px 4.5px)"
 SHAPES = ("circle", "diamond", "square", "triangle")
 
 
@@ -165,13 +166,13 @@ def legend(shapes: Sequence[int], colors: Sequence[str]) -> str:
 
 def stage_bars(runs: Sequence[Run], longest: float) -> str:
     """A bar a run, a segment a stage; ``longest`` seconds fill the width. Scoring is hatched: it makes no file."""
-    names = [name for name in STAGES if any(stage["name"] == name for run in runs for stage in run["stages"])]
+    names = stage_names(runs)
+    paint = {name: HATCH if name == SCORING else f"background:{STAGES.get(name, OTHER)}" for name in names}
     rows = []
     for run in runs:
         seconds = {name: sum(s["seconds"] for s in run["stages"] if s["name"] == name) for name in names}
         segments = "".join(
-            f'<i class="s{STAGES.index(name)}" style="width:{100 * value / longest:.3f}%" '
-            f'title="{escape(name)}: {value:.2f} s"></i>'
+            f'<i style="width:{100 * value / longest:.3f}%;{paint[name]}" title="{escape(name)}: {value:.2f} s"></i>'
             for name, value in seconds.items()
             if value > 0
         )
@@ -179,5 +180,5 @@ def stage_bars(runs: Sequence[Run], longest: float) -> str:
             f'<div class="bar"><b>{escape(run["name"])}</b><div>{segments}</div><em>{cost(run):.2f} s</em></div>'
         )
     shown = {name: "scoring (not counted)" if name == SCORING else name for name in names}
-    keys = "".join(f'<span><i class="s{STAGES.index(name)}"></i>{escape(shown[name])}</span>' for name in names)
+    keys = "".join(f'<span><i style="{paint[name]}"></i>{escape(shown[name])}</span>' for name in names)
     return f'<div class="keys">{keys}</div><div class="bars">{"".join(rows)}</div>'

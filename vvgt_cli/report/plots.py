@@ -10,14 +10,10 @@ from vvgt_cli.errors import UsageError
 from vvgt_cli.files import atomic_write
 from vvgt_cli.report.charts import log_ticks
 from vvgt_cli.report.page import AXES, points
-from vvgt_cli.report.runs import KINDS, SCORING, STAGES, Series, short
+from vvgt_cli.report.runs import KINDS, OTHER, SCORING, STAGES, Series, short, stage_names
 
 MARKS = ("o", "D", "s", "^")
 COLORS = ("#0072b2", "#a8527e", "#00845f", "#c05a00")
-STAGE_COLORS = (
-    "#8a949e", "#b4bbc2", "#8f7bbf", "#0072b2", "#e69f00", "#56b4e9", "#cc79a7", "#e3b5cd", "#009e73", "#6b6f75",
-    "#dddddd",
-)  # fmt: skip
 FILES = ("psnr-seconds.png", "psnr-gaussians.png", "psnr-megabytes.png", "stages.png")
 
 
@@ -80,11 +76,11 @@ def _stages(axes: Any, series: Sequence[Series]) -> None:
     rows = [(one, run) for one in series for run in one.runs]
     names = [f"{one.name}: {run['name']}" if len(series) > 1 else run["name"] for one, run in rows]
     ends = [0.0] * len(rows)
-    for stage, color in zip(STAGES, STAGE_COLORS, strict=True):
+    for stage in stage_names([run for _, run in rows]):
         widths = [sum(s["seconds"] for s in run["stages"] if s["name"] == stage) for _, run in rows]
         if any(widths):
             label = "scoring (not counted)" if stage == SCORING else stage
-            axes.barh(range(len(rows)), widths, left=ends, color=color, label=label)
+            axes.barh(range(len(rows)), widths, left=ends, color=STAGES.get(stage, OTHER), label=label)
             ends = [end + width for end, width in zip(ends, widths, strict=True)]
     axes.set_yticks(range(len(rows)), names, fontsize=8, parse_math=False)
     axes.invert_yaxis()

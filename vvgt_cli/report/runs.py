@@ -21,10 +21,12 @@ Run = dict[str, Any]
 FORMATS = ("vvgt-report", "vvgt-conversion")
 SCORING = "test views"  # the stage that only measures
 KINDS = ("closed form", "network", "steps", "baseline")
-STAGES = (
-    "read", "scene", "samples", "closed form", "views", "back-projection", "network", "judge", "refinement", "write",
-    SCORING,
-)  # fmt: skip
+STAGES = {  # colours of the stages that are known, in order
+    "read": "#8a949e", "scene": "#b4bbc2", "samples": "#8f7bbf", "closed form": "#2f7fbf", "check views": "#f2c76b",
+    "views": "#e69f00", "back-projection": "#56b4e9", "network": "#cc79a7", "judge": "#e3b5cd", "refinement": "#009e73",
+    "write": "#777c83", SCORING: "#dddddd",
+}  # fmt: skip
+OTHER = "#a05d3b"
 SCORES = ("psnr", "psnr_foreground", "psnr_white", "psnr_alpha", "ssim", "flip")
 
 
@@ -83,7 +85,7 @@ def knee(runs: Sequence[Run]) -> Run | None:
 def unit_costs(runs: Sequence[Run]) -> dict[str, float]:
     """Medians over runs of what a stage costs a unit of its work; stages without runs are left out.
 
-    Keys say the unit: seconds a training or check view, a view and step of refinement, a megabyte, a run.
+    Keys say the unit: a training view, a step of refinement, a megabyte, a run.
     """
     found: dict[str, list[float]] = {}
 
@@ -107,8 +109,7 @@ def unit_costs(runs: Sequence[Run]) -> dict[str, float]:
 
 def table(runs: Sequence[Run]) -> str:
     """CSV, a row a run: name, kind, seconds, Gaussians, bytes, scores, and a column a stage."""
-    stages = [name for name in STAGES if any(name in _seconds(run) for run in runs)]
-    stages += sorted({name for run in runs for name in _seconds(run)} - set(stages))
+    stages = stage_names(runs)
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     heads = ["name", "kind", "seconds", "gaussians", "bytes", *SCORES, "pareto", *(f"seconds: {s}" for s in stages)]
@@ -122,6 +123,12 @@ def table(runs: Sequence[Run]) -> str:
         row += [int(id(run) in best), *(f"{seconds[s]:.4f}" if s in seconds else "" for s in stages)]
         writer.writerow(row)
     return stream.getvalue()
+
+
+def stage_names(runs: Sequence[Run]) -> list[str]:
+    """Names of the stages of any run: those that are known in their order, then others."""
+    found = {stage["name"] for run in runs for stage in run["stages"]}
+    return [name for name in STAGES if name in found] + sorted(found - set(STAGES))
 
 
 def _seconds(run: Run) -> dict[str, float]:

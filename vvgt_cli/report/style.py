@@ -2,12 +2,9 @@
 
 CSS = """
 :root{color-scheme:light dark;--paper:#fbfbfa;--card:#fff;--ink:#1c1f23;--soft:#5d656f;--line:#e3e5e8;--grid:#eceef0;
---k0:#0072b2;--k1:#a8527e;--k2:#00845f;--k3:#c05a00;--c0:#0072b2;--c1:#c05a00;--c2:#00845f;--c3:#a8527e;
---s0:#8a949e;--s1:#b4bbc2;--s2:#8f7bbf;--s3:#0072b2;--s4:#e69f00;--s5:#56b4e9;--s6:#cc79a7;--s7:#e3b5cd;--s8:#009e73;
---s9:#6b6f75}
+--k0:#0072b2;--k1:#a8527e;--k2:#00845f;--k3:#c05a00;--c0:#0072b2;--c1:#c05a00;--c2:#00845f;--c3:#a8527e}
 @media(prefers-color-scheme:dark){:root{--paper:#14171a;--card:#1c2024;--ink:#e8eaec;--soft:#9aa3ad;--line:#2e343a;
---grid:#282d33;--k0:#56b4e9;--k1:#d995ba;--k2:#2fc79b;--k3:#f0954a;--c0:#56b4e9;--c1:#f0954a;--c2:#2fc79b;--c3:#d995ba;
---s0:#77818b;--s1:#4f575f;--s3:#3d8fc7;--s9:#9aa0a6}}
+--grid:#282d33;--k0:#56b4e9;--k1:#d995ba;--k2:#2fc79b;--k3:#f0954a;--c0:#56b4e9;--c1:#f0954a;--c2:#2fc79b;--c3:#d995ba}}
 *{box-sizing:border-box}
 body{margin:0;background:var(--paper);color:var(--ink);
 font:16px/1.5 system-ui,-apple-system,"Segoe UI",Roboto,sans-serif}
@@ -35,10 +32,6 @@ polyline.front{fill:none}polyline.c0,polyline.c1,polyline.c2,polyline.c3{stroke:
 .keys{display:flex;flex-wrap:wrap;gap:4px 16px;font-size:.875rem;color:var(--soft);margin:0 0 10px}
 .keys span{display:inline-flex;align-items:center;gap:6px}.key{width:18px;height:18px;flex:none}
 .keys i{width:14px;height:14px;border-radius:3px;flex:none}
-.s0{background:var(--s0)}.s1{background:var(--s1)}.s2{background:var(--s2)}.s3{background:var(--s3)}
-.s4{background:var(--s4)}.s5{background:var(--s5)}.s6{background:var(--s6)}.s7{background:var(--s7)}
-.s8{background:var(--s8)}.s9{background:var(--s9)}
-.s10{background:repeating-linear-gradient(135deg,var(--line) 0 3px,var(--soft) 3px 4.5px)}
 .bar{display:grid;grid-template-columns:minmax(90px,170px) 1fr 76px;gap:10px;align-items:center;margin:5px 0;
 font-size:.875rem}
 .bar b{font-weight:500;line-height:1.2}.bar div{display:flex;height:18px;min-width:0}
