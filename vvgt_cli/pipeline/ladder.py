@@ -76,9 +76,9 @@ def rungs(options: LadderOptions) -> list[Rung]:
         Rung(f"closed form, K = {short(k)}", short(k), "closed form", FitOptions(k, size, seed=seed, steps=0))
         for k in budgets
     ]
-    full = FitOptions(most, size, seed=seed, steps=0)
     if options.model:
-        found.append(Rung(f"network {Path(options.model).name}", "network", "network", full))
+        fit = FitOptions(most, size, seed=seed, steps=0, model=options.model)
+        found.append(Rung(f"network {Path(options.model).name}", "network", "network", fit))
     for steps in sorted(set(options.steps)):
         fit = FitOptions(most, size, seed=seed, steps=steps)
         found.append(Rung(f"{steps} steps", f"{steps} steps", "steps", fit))
