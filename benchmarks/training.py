@@ -2,6 +2,7 @@
 
     python benchmarks/training.py data DIR
     PYTHONPATH=. python benchmarks/training.py gain SCENES DATA_DIR TF_DIR -o CSV --model MODEL [--gaussians K]
+    PYTHONPATH=. python benchmarks/training.py held DIR CONFIG.yaml -o CSV --model MODEL
 
 `data` writes the volumes that the shipped model was trained on (`train/`) and those that it never saw (`held/`):
 snapshots of turbulence at 64^3, and shapes at 96^3. About 15 minutes of one core.
@@ -9,26 +10,25 @@ snapshots of turbulence at 64^3, and shapes at 96^3. About 15 minutes of one cor
 `gain` takes the closed form of each scene through the model, through 25 and 100 steps of refinement, and through both:
 PSNR and SSIM on the ten test views (400 px, half-voxel steps, 2 x 2 rays where neighbours differ, as the 24 training
 and 4 check views), and processor seconds of one thread, of the closed form and from there on. SCENES is a table as in
-`closed_form.py`, or `held:DIR` for the volumes in DIR/held, each under the sixth of ten suggested functions, at its
-density and at 8 times that.
+`closed_form.py`. `held` does the same on the scenes that training holds out, at their own size, scored on the views
+that losses are taken on.
 """
 
 from __future__ import annotations
 
 import csv
-import json
 import pickle
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import click
 import numba
 import numpy as np
 from closed_form import read_options
 
-from vvgt_cli.cameras import default_views
+from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.dvr import RenderSettings, Scene, render_views
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.metrics import score_views, ssim
@@ -38,14 +38,12 @@ from vvgt_cli.optimize import OptimizeOptions, optimize
 from vvgt_cli.pipeline.source import SourceRequest, load
 from vvgt_cli.progress import Console
 from vvgt_cli.splat import render
-from vvgt_cli.synth import open_volume
 from vvgt_cli.synth.analytic import volume_of
 from vvgt_cli.synth.shapes import make_shape
 from vvgt_cli.synth.turbulence import TURNOVER, Solver, fields, flow_of, run
-from vvgt_cli.transfer.readers import minimal
-from vvgt_cli.transfer.suggest import suggest
+from vvgt_cli.training.config import read_config
+from vvgt_cli.training.scenes import as_float, prepare_scenes
 from vvgt_cli.vbm import VbmOptions, backproject, initialise
-from vvgt_cli.volume import statistics
 from vvgt_cli.volume.nrrd_write import write_nrrd
 
 GRID, SIZE = 64, 96
@@ -103,11 +101,6 @@ Refine = Callable[[Gaussians], Gaussians]
 
 def listed(scenes: str, data: str, functions: str) -> Iterator[tuple[str, Callable[[], Scene]]]:
     """Names of the scenes, and what makes each."""
-    if scenes.startswith("held:"):
-        for path in sorted((Path(scenes[5:]) / "held").iterdir()):
-            for density in (1.0, 8.0):
-                yield f"{path.stem} x{density:g}", lambda path=path, density=density: suggested(path, density)
-        return
     for line in Path(scenes).read_text().splitlines():
         if line.strip() and not line.startswith("#"):
             name, volume, options, function = line.split("\t")
@@ -116,15 +109,6 @@ def listed(scenes: str, data: str, functions: str) -> Iterator[tuple[str, Callab
                 unit_distance="mean-spacing",
             )  # fmt: skip
             yield name, lambda request=request: load(request).scene()
-
-
-def suggested(path: Path, density: float) -> Scene:
-    """A held-out volume under its sixth function."""
-    volume = open_volume(str(path))
-    numbers = statistics(volume)
-    chosen = suggest(numbers, 10, sum(volume.dims) / 3, sum(volume.spacing) / 3)[5]
-    function: Any = minimal.read(json.loads(chosen.to_json()), chosen.name)
-    return Scene.build(volume, function, chosen.unit_distance / density, (numbers.lo, numbers.hi))
 
 
 def begun(make: Callable[[], Scene], budget: int, method: str, cache: Path | None) -> tuple[dict, Gaussians, float]:
@@ -144,19 +128,75 @@ def begun(make: Callable[[], Scene], budget: int, method: str, cache: Path | Non
     return found
 
 
-def ways(views: dict[str, np.ndarray], model: Model | None) -> dict[str, list[Refine]]:
+@dataclass
+class Case:
+    """A scene to compare on: where to start, views to fit to, to check by (None: the end is returned) and to score."""
+
+    start: Gaussians
+    cameras: list[Camera]
+    images: np.ndarray
+    check: tuple[list[Camera], np.ndarray] | None
+    test: tuple[list[Camera], np.ndarray]
+
+
+def ways(case: Case, model: Model | None) -> dict[str, list[Refine]]:
     """What is compared: names, and the stages after the closed form."""
-    train, check = default_views("train"), default_views("check")
 
     def steps(count: int) -> Refine:
         options = OptimizeOptions(steps=count)
-        return lambda g: optimize(g, train, views["train"], options, (check, views["check"]))[0]
+        return lambda g: optimize(g, case.cameras, case.images, options, case.check)[0]
 
     found: dict[str, list[Refine]] = {"closed form": [], "25 steps": [steps(25)], "100 steps": [steps(100)]}
     if model is None:
         return found
-    network: Refine = lambda g: model.improve(g, train, views["train"])  # noqa: E731
+    network: Refine = lambda g: model.improve(g, case.cameras, case.images)  # noqa: E731
     return found | {"network": [network], "network + 100 steps": [network, steps(100)]}
+
+
+def compare(case: Case, model: Model | None, wanted: tuple[str, ...]) -> Iterator[dict[str, str]]:
+    """A row a way."""
+    for way, stages in ways(case, model).items():
+        if wanted and way not in wanted:
+            continue
+        gaussians, start = case.start, time.process_time()
+        for stage in stages:
+            gaussians = stage(gaussians)
+        spent = time.process_time() - start
+        pictures = [render(gaussians, camera) for camera in case.test[0]]
+        found = score_views(case.test[1], pictures, perceptual=False).psnr
+        alike = [ssim(view[..., :3], ours[..., :3]) for view, ours in zip(case.test[1], pictures, strict=True)]
+        yield {
+            "gaussians": str(len(gaussians)), "way": way, "psnr": f"{found:.3f}", "ssim": f"{np.mean(alike):.4f}",
+            "cpu_seconds": f"{spent:.2f}",
+        }  # fmt: skip
+
+
+def write(output: str, rows: list[dict[str, str]]) -> None:
+    """Print the last row, and write all."""
+    print(rows[-1], flush=True)
+    with open(output, "w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+@main.command()
+@click.argument("folder", type=Path)
+@click.argument("config")
+@click.option("-o", "--output", required=True, help="CSV to write.")
+@click.option("--model", required=True, help="Folder or name of a model.")
+@click.option("--ways", "wanted", multiple=True, help="Of what is compared (default: all).")
+def held(folder, config, output, model, wanted):
+    """The scenes that training with CONFIG on FOLDER holds out."""
+    numba.set_num_threads(1)
+    opened, rows = Model.open(find_model(model), threads=1), []
+    for part, scenes in prepare_scenes(folder, read_config(config).scenes, Console(quiet=True)).items():
+        for scene in scenes if part != "train" else []:
+            test = (list(scene.targets), as_float(scene.target_images))
+            case = Case(scene.gaussians, list(scene.cameras), as_float(scene.images), None, test)
+            for row in compare(case, opened, wanted):
+                rows.append({"part": part, "scene": scene.name, **row})
+                write(output, rows)
 
 
 @main.command()
@@ -179,25 +219,13 @@ def gain(scenes, folders, output, model, budget, method, only, wanted, cache):
             continue
         place = cache / f"{name}-{budget}-{method}.pkl" if cache else None
         views, closed, seconds = begun(make, budget, method, place)
-        for way, stages in ways(views, opened).items():
-            if wanted and way not in wanted:
-                continue
-            gaussians, start = closed, time.process_time()
-            for stage in stages:
-                gaussians = stage(gaussians)
-            spent = time.process_time() - start if stages else seconds
-            pictures = [render(gaussians, camera) for camera in default_views("test")]
-            found = score_views(views["test"], pictures, perceptual=False).psnr
-            alike = [ssim(view[..., :3], ours[..., :3]) for view, ours in zip(views["test"], pictures, strict=True)]
-            rows.append({
-                "scene": name, "gaussians": len(gaussians), "init": method, "way": way, "psnr": f"{found:.3f}",
-                "ssim": f"{np.mean(alike):.4f}", "cpu_seconds": f"{spent:.2f}",
-            })  # fmt: skip
-            print(rows[-1], flush=True)
-            with open(output, "w", newline="") as file:
-                writer = csv.DictWriter(file, list(rows[0]))
-                writer.writeheader()
-                writer.writerows(rows)
+        sets = {name: (default_views(name), images) for name, images in views.items()}
+        case = Case(closed, *sets["train"], sets["check"], sets["test"])
+        for row in compare(case, opened, wanted):
+            if row["way"] == "closed form":
+                row["cpu_seconds"] = f"{seconds:.2f}"
+            rows.append({"scene": name, "init": method, **row})
+            write(output, rows)
 
 
 if __name__ == "__main__":

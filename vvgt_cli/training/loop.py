@@ -123,6 +123,7 @@ class _Run:
         self.config, self.data, self.folder, self.here, self.scenes = config, data, folder, here, scenes
         self.network = Vvgt(config.network).to(here.device)
         self.optimizer = torch.optim.AdamW(self.network.parameters(), lr=config.rate, weight_decay=config.weight_decay)
+        self.commit = commit()  # now: the checkout may move on while this runs
         self.feeder = Feeder(scenes["train"], config)
         self.progress = Progress()
         if (folder / LAST).exists():
@@ -215,7 +216,7 @@ class _Run:
             "step": state.step, "skipped": state.skipped, "seconds": round(state.seconds, 1),
             "processes": self.here.size, "device": self.here.device.type, "torch": str(torch.__version__),
         }  # fmt: skip
-        checkpoint = Checkpoint(self.network, plain(training), plain(state.found), commit())
+        checkpoint = Checkpoint(self.network, plain(training), plain(state.found), self.commit)
         with atomic_write(self.folder / name, overwrite=True) as temporary:
             save_checkpoint(temporary, checkpoint, more)
 
