@@ -35,7 +35,8 @@ def command(
 
     KIND: isotropic (forced turbulence) and stratified (rotating, stratified turbulence with its temperature), solved
     by a pseudo-spectral method; shells (nested bodies), tubes (vessels), plates (sharp machined parts), noise (of all
-    scales), wells (smooth bumps, as molecules' potentials). Turbulence takes about a minute a turnover at 64 on a core, sixteen times as long at 128.
+    scales), wells (smooth bumps, as molecules' potentials). Turbulence takes about a minute a turnover at 64 on a core,
+    sixteen times as long at 128.
 
     \b
     Example:
