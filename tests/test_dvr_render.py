@@ -290,7 +290,7 @@ def test_other_numbers_of_rays_are_refused():
 
 @pytest.mark.parametrize("shape", [(1, 1, 4), (1, 2, 2), (2, 1, 2), (1, 1, 3), (2, 2, 2), (1, 3, 5)])
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_few_integer_voxels_read_nothing_beyond_the_last(shape, dtype):
+def test_few_integer_voxels_are_read_as_many_are(shape, dtype):
     values = np.random.default_rng(3).integers(60, 255, shape).astype(dtype)
     scene = Scene.build(Volume(values), Function([0, 255], [0, 0.9]), 1.0)
     image = render_view(scene, camera(), FINE)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from vvgt_cli.errors import UsageError
+from vvgt_cli.pipeline.record import ConversionReport
 from vvgt_cli.pipeline.series import frame_names, is_pattern, together
 from vvgt_cli.pipeline.source import load
 from vvgt_cli.synth.analytic import blob
@@ -35,12 +36,13 @@ def stand_in(monkeypatch: pytest.MonkeyPatch) -> list:
     """Write what a frame's function and values come to in place of converting it; returns the calls."""
     calls: list = []
 
-    def write(request, console) -> None:
+    def write(request, console) -> ConversionReport:
         calls.append(request)
         source = load(request.source)
         text = f"{source.tf.node_range()} {source.statistics.hi:g} {request.fit}"
         for name in filter(None, (request.output, request.report)):
             Path(name).write_text(text)
+        return ConversionReport("convert")
 
     monkeypatch.setattr("vvgt_cli.pipeline.series.convert", write)
     return calls
@@ -91,6 +93,25 @@ def test_resumed_and_in_parts_it_leaves_the_same_bytes(vvgt, series: Path, stand
     assert "1 frames converted, 2 were done before" in again.err
     assert contents(series / "out") == made
     assert (series / "out" / "03.ply").stat().st_mtime_ns == before
+
+
+def test_a_dry_run_of_a_series_is_refused_before_anything_is_written(vvgt, series: Path) -> None:
+    out = series / "out" / "{:02d}.ply"
+    done = vvgt("convert", series / "run_*.npy", "--tf", series / "tf.json", "-o", out, *SMALL, "--dry-run")
+    assert done.code == 2
+    assert "--dry-run of a series" in done.err
+    assert not list((series / "out").iterdir())
+
+
+def test_an_interrupted_frame_is_not_recorded(vvgt, series: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(request, console) -> ConversionReport:
+        Path(request.output).write_text("short")
+        return ConversionReport("convert", refinement={"reason": "interrupted"})
+
+    monkeypatch.setattr("vvgt_cli.pipeline.series.convert", interrupted)
+    run = ("convert", series / "run_*.npy", "--tf", series / "tf.json", "-o", series / "out" / "{:02d}.ply", *SMALL)
+    assert vvgt(*run).code == 130
+    assert "01.ply" not in (series / "out" / "manifest.json").read_text().split('"files"')[1]
 
 
 def test_another_series_is_refused_and_overwritten_on_request(vvgt, series: Path, stand_in: list) -> None:

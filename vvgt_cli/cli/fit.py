@@ -32,7 +32,8 @@ fit_options = group(
 limit_options = group(
     "limits",
     target_psnr=click.option(
-        "--target-psnr", type=float, metavar="DB", help="Enough: stages and Gaussians beyond it are left out.",
+        "--target-psnr", type=click.FloatRange(0, 150), metavar="DB",
+        help="Enough: stages and Gaussians beyond it are left out.",
     ),
     time_budget=click.option(
         "--time-budget", type=float, metavar="SECONDS", help="Of the whole run: what does not fit is left out.",

@@ -25,7 +25,7 @@ def command(volume: str, console: Console, **options: Any) -> None:
     """Turn VOLUME into Gaussians in closed form, without rendering an image.
 
     The first stage of 'vvgt convert', for a quick look or as the start of an optimisation elsewhere. What
-    'convert' does beyond it: colours and masses mended by views of the volume, and a score.
+    'convert' does beyond it: gradient descent on views of the volume, and a score.
 
     \b
     Example:

@@ -12,7 +12,7 @@ from vvgt_cli.cameras import Camera
 from vvgt_cli.dvr.scene import Scene
 from vvgt_cli.errors import UsageError
 
-# Pixels that differ from a neighbour by more than this get that many rays; five save half of what a grid of nine costs.
+# Pixels that differ from a neighbour by more than this get that many rays.
 ADAPTIVE = ((0.08, 5), (0.3, 13))
 LATTICE = {5: 2, 13: 5}  # point i of n at (i, k i mod n) / n: all columns and rows differ, which edges along axes need
 
@@ -25,7 +25,7 @@ class RenderSettings:
         step: sampling distance in voxels; scalars are linear between samples (pre-integration).
         samples: rays along a pixel's edge, everywhere; None: as ``tiers`` say.
         tiers: (difference, rays): pixels that differ from one of 8 neighbours by more than the first, rising, get so
-            many rays (5, 13 or an odd square), all others one.
+            many rays (5, 13 or a square), all others one.
     """
 
     step: float = 0.5
@@ -96,7 +96,8 @@ def cast_tiers(
         mask = (differ > low) & (differ <= high)
         if mask.any():
             offsets = ray_offsets(count)
-            cast(offsets[np.any(offsets != 0, axis=1)], mask, 1)
+            new = np.any(offsets != 0, axis=1)  # a grid of an even edge has no ray in the middle
+            cast(offsets[new], mask, int(not new.all()))
 
 
 def render_view(scene: Scene, camera: Camera, settings: RenderSettings | None = None) -> np.ndarray:

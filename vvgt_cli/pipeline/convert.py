@@ -11,7 +11,7 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored, write_ply
-from vvgt_cli.network.card import find_model
+from vvgt_cli.network.card import find_model, read_card
 from vvgt_cli.pipeline.mend import check_view_memory, mend
 from vvgt_cli.pipeline.outputs import STDOUT, Output, check_outputs, write_text
 from vvgt_cli.pipeline.plan import Limits, Planner, estimate
@@ -98,18 +98,21 @@ def convert(request: ConvertRequest, console: Console | None = None) -> Conversi
     run = Run(console or Console(), ConversionReport("convert"))
     budget = request.limits.gaussians(request.fit.max_gaussians, request.ply.sh_degree)
     fit = replace(request.fit, max_gaussians=budget)
-    source, scene = _begin(run, request)
     if fit.model is not None:
-        find_model(fit.model)  # fails before the work, not after
+        read_card(find_model(fit.model))  # fails before the work, not after
+    source, scene = _begin(run, request)
     costs = estimate(scene, fit.size, fit.max_gaussians, request.report is not None)
     planner = Planner(request.limits, fit.max_gaussians, fit.steps, request.ply.sh_degree, fit.model)
     plan = planner.plan(costs, run.elapsed())
     run.report.plan = plan.record()
+    check_view_memory(plan, fit.size)
     if request.dry_run:
         return run.finish()
-    check_view_memory(plan, fit.size)
     start = _closed_form(run, scene, fit)
-    plan = planner.plan(costs.at(run.report.stages[-1].seconds / costs.closed_form), run.elapsed(), begun=True)
+    plan = planner.plan(
+        costs.at(max(run.report.stages[-1].seconds / costs.closed_form, 1.0)), run.elapsed(), begun=True
+    )
+    check_view_memory(plan, fit.size)
     gaussians = as_stored(mend(run, scene, start, plan, request.limits, fit))  # what is scored is what the file holds
     scores, sheet = _score(run, scene, gaussians, request)
     run.report.scores = asdict(scores)
@@ -138,7 +141,7 @@ def _begin(run: Run, request: ConvertRequest) -> tuple[Source, Scene]:
         scene = source.scene()
     run.report.volume = volume_record(source)
     run.report.transfer_function = tf_record(source, request.source)
-    run.report.options = asdict(request.fit) | {
+    run.report.options = asdict(request.fit) | asdict(request.limits) | {
         "frame": request.ply.frame, "up": request.ply.up, "sh_degree": request.ply.sh_degree,
     }  # fmt: skip
     return source, scene

@@ -29,7 +29,7 @@ def check_view_memory(plan: Plan, size: int) -> None:
     """Refuse a size whose training and check views would not fit."""
     views = views_of(plan.steps) + SET_VIEWS["check"]
     need, free = views * size**2 * VIEW_BYTES, free_memory()
-    if (plan.back_project or plan.steps) and free is not None and need > free:
+    if (plan.back_project or plan.steps or plan.network) and free is not None and need > free:
         raise UsageError(
             f"--size {size}: {views} views need {need / 2**30:.1f} GiB of memory, {free / 2**30:.1f} GiB are free; "
             "try a smaller size, or 'vvgt init', which renders none"
@@ -38,21 +38,28 @@ def check_view_memory(plan: Plan, size: int) -> None:
 
 def mend(run: Run, scene: Scene, start: Start, plan: Plan, limits: Limits, fit: FitOptions) -> Gaussians:
     """The closed form after what the plan has for it, or as much of it as the target asks for."""
-    for name, why in plan.left_out:
-        run.leave_out(name, why)
-    if not (plan.back_project or plan.steps or plan.network or limits.target_psnr is not None):
+    target = limits.target_psnr is not None
+    if not (plan.back_project or plan.steps or plan.network or (target and plan.judge)):
+        _say(run, plan.left_out)
         return start.gaussians
     stage = _Mending(run, scene, plan, limits, fit)
     if stage.enough(start.gaussians):
-        run.leave_out("refinement", f"the check views have {limits.target_psnr:g} dB without it")
+        unneeded = {"network": plan.network, "back-projection": plan.back_project, "refinement": plan.steps}
+        _say(run, [(name, stage.reached()) for name, planned in unneeded.items() if planned])
         return stage.smaller(start)
+    _say(run, plan.left_out)
     gaussians = stage.back_project(start) if plan.back_project else start.gaussians
     if plan.network:
         gaussians = stage.network(gaussians)
-        if stage.enough(gaussians):
-            run.leave_out("refinement", f"the check views have {limits.target_psnr:g} dB without it")
-            return gaussians
+    if plan.steps and stage.enough(gaussians):
+        _say(run, [("refinement", stage.reached())])
+        return gaussians
     return stage.refine(gaussians) if plan.steps else gaussians
+
+
+def _say(run: Run, left_out: list[tuple[str, str]]) -> None:
+    for name, why in left_out:
+        run.leave_out(name, why)
 
 
 class _Mending:
@@ -65,7 +72,7 @@ class _Mending:
         self.run, self.scene, self.plan, self.limits, self.fit = run, scene, plan, limits, fit
         cameras = default_views("check", size=fit.size)
         with run.stage("check views") as stage:
-            judged = plan.steps or limits.target_psnr is not None
+            judged = plan.steps or plan.network or limits.target_psnr is not None
             self.check = Views(cameras, render_views(scene, cameras, RenderSettings() if judged else FIT_VIEWS))
             stage.note = f"{len(cameras)} of {fit.size} px"
         self.settings: RenderSettings = FIT_VIEWS
@@ -83,23 +90,26 @@ class _Mending:
         """Whether the target is reached."""
         return self.limits.target_psnr is not None and self.psnr(gaussians) >= self.limits.target_psnr
 
+    def reached(self) -> str:
+        """Why the rest is left out."""
+        return f"the check views have {self.limits.target_psnr:g} dB without it"
+
     def smaller(self, start: Start) -> Gaussians:
         """The fewest Gaussians that reach the target: a part of the budget, or all."""
-        if start.form is not None:
-            for part in SMALLER:
-                fewer = replace(start.form, budget=max(start.form.budget // part, 1)).gaussians()
-                if self.enough(fewer):
-                    self.run.leave_out(
-                        f"{len(start.gaussians) - len(fewer)} Gaussians", "the target is reached without"
-                    )
-                    return fewer
+        count = len(start.gaussians)
+        for part in SMALLER if start.form is not None else ():
+            assert start.form is not None
+            fewer = replace(start.form, budget=max(count // part, 1)).gaussians()
+            if len(fewer) < count and self.enough(fewer):
+                self.run.leave_out(f"{count - len(fewer)} Gaussians", "the target is reached without")
+                return fewer
         return start.gaussians
 
     def back_project(self, start: Start) -> Gaussians:
         """Cells split and colours solved, kept if the check views agree."""
         from vvgt_cli.vbm import backproject
 
-        run, train = self.run, self._rendered(SET_VIEWS["train"])
+        run, train = self.run, self.views(start.gaussians)
         with run.stage("back-projection") as stage:
             before = self.psnr(start.gaussians)
             bar = run.console.bar("back-projection")
@@ -120,7 +130,8 @@ class _Mending:
     def views(self, start: Gaussians) -> Views:
         """Training views, as finely integrated as ``start`` asks for."""
         if self.train is None:
-            self.settings = fine_enough(self.scene, self.check, start)
+            if self.plan.steps or self.plan.network:
+                self.settings = fine_enough(self.scene, self.check, start)
             self.train = self._rendered(views_of(self.plan.steps))
         return self.train
 

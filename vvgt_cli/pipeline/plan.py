@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
@@ -17,10 +18,11 @@ if TYPE_CHECKING:
 
 VERTEX_BYTES = 68  # x y z, normals, three colours, opacity, three scales, four of rotation: float32
 HARMONIC_BYTES = {0: 0, 1: 36, 2: 96, 3: 180}  # zeros up to a degree
-HEADER_BYTES = 1000
+HEADER_BYTES = {0: 1000, 1: 1200, 2: 1600, 3: 2200}
 DEFAULT_STEPS = 72  # of gradient descent: the knee of error against seconds (docs/plan.md)
 MOST_STEPS = 400  # where a target or a time asks for as many as it takes
 FEWEST_STEPS = 8  # less is not worth the views
+ENOUGH_STEPS = 24  # as good as back-projection; fewer are taken after it
 REFINE_VIEWS = 72  # training views of gradient descent, which learns fewer by heart
 STEPS_A_SET = 48  # of gradient descent, for each further 24 views
 SMALLER = (8, 4, 2)  # parts of the budget that a target is tried with first
@@ -32,8 +34,10 @@ STEP = 0.015, 0.042  # per 400 x 400 px, per 100,000 Gaussians
 BACK_PROJECTION = 120.0  # steps
 NETWORK = 0.5, 4.0  # always, per 100,000 Gaussians (docs/network.md)
 VIEW = 1.1  # of the view that is timed
-SCORE, SCORE_ALL = (3, 2.5, 0.03), (10, 2.5, 0.2)  # views, of the view that is timed, and seconds a view beside it
-MEMORY = 2.6e8, 294.0, 1240.0, 625.0  # bytes: program and kernels, a cell, a Gaussian, a pixel of a view
+FINER = 2.5  # of the view that is timed: check and test views
+SCORE, SCORE_ALL = (3, 0.03), (10, 0.2)  # views, and seconds a view beside its rendering
+MEMORY = 2.6e8, 294.0, 1240.0  # bytes: program and kernels, a cell, a Gaussian
+VIEW_MEMORY = 22.0  # bytes a pixel of each view
 
 
 @dataclass(frozen=True)
@@ -51,9 +55,11 @@ class Limits:
     max_megabytes: float | None = None
 
     def __post_init__(self) -> None:
-        if self.time_budget is not None and not self.time_budget > 0:
+        if self.target_psnr is not None and not 0 <= self.target_psnr <= 150:
+            raise UsageError(f"--target-psnr {self.target_psnr:g}: expected 0 to 150 dB")
+        if self.time_budget is not None and not 0 < self.time_budget < math.inf:
             raise UsageError(f"--time-budget {self.time_budget:g}: expected more than 0 seconds")
-        if self.max_megabytes is not None and not self.max_megabytes > 0:
+        if self.max_megabytes is not None and not 0 < self.max_megabytes < math.inf:
             raise UsageError(f"--max-size {self.max_megabytes:g}: expected more than 0 MB")
 
     def gaussians(self, most: int, sh_degree: int) -> int:
@@ -64,7 +70,7 @@ class Limits:
         """
         if self.max_megabytes is None:
             return most
-        fit = int((self.max_megabytes * 1e6 - HEADER_BYTES) // (VERTEX_BYTES + HARMONIC_BYTES[sh_degree]))
+        fit = int((self.max_megabytes * 1e6 - HEADER_BYTES[sh_degree]) // (VERTEX_BYTES + HARMONIC_BYTES[sh_degree]))
         if fit < 1:
             raise UsageError(f"--max-size {self.max_megabytes:g}: no Gaussian fits; expected 0.002 MB or more")
         return min(most, fit)
@@ -88,7 +94,8 @@ class Costs:
         step: of gradient descent, with its share of the looks at check views.
         score: test views.
         write: the file.
-        memory: of the whole process at its most, bytes.
+        memory: of the whole process at its most, bytes, without its views.
+        view_memory: of a view, bytes.
     """
 
     closed_form: float
@@ -99,13 +106,12 @@ class Costs:
     score: float
     write: float
     memory: float
+    view_memory: float
 
     def at(self, pace: float) -> Costs:
-        """The same on a machine that takes ``pace`` times as long."""
-        seconds = {
-            name: getattr(self, name) * pace for name in ("closed_form", "back_projection", "step", "score", "write")
-        }
-        return replace(self, **seconds)
+        """The same on a machine that takes ``pace`` times as long; what was timed, and what is small, stays."""
+        names = ("closed_form", "back_projection", "network", "step")
+        return replace(self, **{name: getattr(self, name) * pace for name in names})
 
 
 @dataclass
@@ -114,10 +120,11 @@ class Plan:
 
     Attributes:
         gaussians: budget.
-        back_project: whether views correct the closed form by cells and colours instead of gradient descent.
+        back_project: whether views correct the closed form by cells and colours, instead of many steps or before few.
         steps: of gradient descent, as many as there should be time for.
         most_steps: where there is more time than that.
         network: model that improves the Gaussians before the steps, or None.
+        judge: there is time for check views where a target asks for them.
         seconds, bytes, memory: estimates of the whole run, its file, its memory at most.
         stages: (stage, seconds) estimates in order.
         left_out: (stage, why) of what is not done.
@@ -128,6 +135,7 @@ class Plan:
     steps: int = 0
     most_steps: int = 0
     network: str | None = None
+    judge: bool = True
     seconds: float = 0.0
     bytes: int = 0
     memory: float = 0.0
@@ -170,13 +178,14 @@ class Planner:
     def plan(self, costs: Costs, spent: float, begun: bool = False) -> Plan:
         """Which stages fit, after ``spent`` seconds; ``begun``: the closed form is done."""
         plan = Plan(self.gaussians, memory=costs.memory)
-        plan.bytes = HEADER_BYTES + self.gaussians * (VERTEX_BYTES + HARMONIC_BYTES[self.sh_degree])
+        plan.bytes = HEADER_BYTES[self.sh_degree] + self.gaussians * (VERTEX_BYTES + HARMONIC_BYTES[self.sh_degree])
         last = [("test views", costs.score), ("write", costs.write)]
         plan.stages = [("so far", spent)] + ([] if begun else [("closed form", costs.closed_form)])
         left = None
         if self.limits.time_budget is not None:
             left = self.limits.time_budget - sum(seconds for _, seconds in [*plan.stages, *last])
         self._views(plan, costs, left)
+        plan.memory += (views_of(plan.steps) + SET_VIEWS["check"]) * costs.view_memory
         plan.stages += last
         plan.seconds = sum(seconds for _, seconds in plan.stages)
         return plan
@@ -184,40 +193,55 @@ class Planner:
     def _views(self, plan: Plan, costs: Costs, left: float | None) -> None:
         """What needs views: gradient descent, as asked for, as long as there is time, or as much as pays."""
         open_end = self.limits.target_psnr is not None or left is not None
-        left = self._network(plan, costs, left)
         steps = self.steps if self.steps is not None else MOST_STEPS if open_end else DEFAULT_STEPS
+        left = self._network(plan, costs, left)
         wanted = steps
         while left is not None and steps > 0 and _refinement(costs, steps) > left:
             steps = min(steps - 1, int(steps * 0.9))
         if wanted and steps >= min(FEWEST_STEPS, wanted):
             plan.steps, plan.most_steps = steps, wanted
             plan.stages.append((f"views, {steps} steps", _refinement(costs, steps)))
-            plan.left_out.append(("back-projection", "gradient descent gains more in its time"))
-            return
-        room = "no steps are asked for" if not wanted else f"{max(left or 0, 0):.1f} s are left"
-        plan.left_out.append(("refinement", room))
-        mending = (SET_VIEWS["train"] + SET_VIEWS["check"]) * costs.view + costs.back_projection
-        plan.back_project = left is None or left >= mending
-        if plan.back_project:
-            plan.stages.append(("back-projection", mending))
+            if wanted < ENOUGH_STEPS and left is None:
+                plan.back_project = True
+                plan.stages.append(("back-projection", costs.back_projection))
+            else:
+                plan.left_out.append(("back-projection", "gradient descent gains more in its time"))
         else:
-            plan.left_out.append(("back-projection", f"about {mending:.1f} s with its views; {room}"))
+            plan.left_out.append(("refinement", _room(left) if wanted else "no steps are asked for"))
+            self._without_steps(plan, costs, left)
+
+    def _without_steps(self, plan: Plan, costs: Costs, left: float | None) -> None:
+        """Back-projection instead, if there is time, and whether there is any for check views."""
+        views = _refinement(costs, 0)
+        plan.back_project = left is None or left >= views + costs.back_projection
+        if plan.back_project:
+            plan.stages.append(("back-projection", views + costs.back_projection))
+        else:
+            why = f"about {views + costs.back_projection:.1f} s with its views, {_room(left)}"
+            plan.left_out.append(("back-projection", why))
+            if plan.network:
+                plan.stages.append(("views", views))
+        plan.judge = plan.back_project or plan.network is not None or left is None or left >= views
 
     def _network(self, plan: Plan, costs: Costs, left: float | None) -> float | None:
         """The network, where one is asked for and there is time; returns what is left."""
         if self.model is None:
             return left
         if left is not None and left < costs.network + _refinement(costs, 0):
-            plan.left_out.append(("network", f"about {costs.network:.1f} s, {max(left, 0):.1f} s are left"))
+            plan.left_out.append(("network", f"about {costs.network:.1f} s, {_room(left)}"))
             return left
         plan.network = self.model
         plan.stages.append(("network", costs.network))
         return None if left is None else left - costs.network
 
 
+def _room(left: float | None) -> str:
+    return f"{max(left or 0.0, 0.0):.1f} s are left"
+
+
 def _refinement(costs: Costs, steps: int) -> float:
-    """Seconds of so many steps, with their views."""
-    return steps * costs.step + (views_of(steps) + SET_VIEWS["check"]) * costs.view
+    """Seconds of so many steps, with their views; check views are finer."""
+    return steps * costs.step + (views_of(steps) + FINER * SET_VIEWS["check"]) * costs.view
 
 
 def estimate(scene: Scene, size: int, gaussians: int, all_views: bool = False) -> Costs:
@@ -233,17 +257,24 @@ def estimate(scene: Scene, size: int, gaussians: int, all_views: bool = False) -
     count = min(gaussians, cells)
     step = pace * (STEP[0] * pixels + STEP[1] * count / 1e5)
     view = VIEW * _view_seconds(scene, size)
-    views, finer, beside = SCORE_ALL if all_views else SCORE
+    views, beside = SCORE_ALL if all_views else SCORE
     return Costs(
         closed_form=pace * (CLOSED_FORM[0] + CLOSED_FORM[1] * cells / 1e6 + CLOSED_FORM[2] * voxels / 1e6),
         view=view,
         back_projection=BACK_PROJECTION * step,
         network=pace * (NETWORK[0] + NETWORK[1] * count / 1e5),
         step=step,
-        score=views * (finer * view + pace * beside * pixels),
+        score=views * (FINER * view + pace * beside * pixels),
         write=pace * 0.1,
-        memory=MEMORY[0] + scene.volume.data.nbytes + MEMORY[1] * cells + MEMORY[2] * count + MEMORY[3] * size**2,
+        memory=MEMORY[0] + _volume_bytes(scene) + MEMORY[1] * cells + MEMORY[2] * count,
+        view_memory=VIEW_MEMORY * size**2,
     )
+
+
+def _volume_bytes(scene: Scene) -> int:
+    """Of the values, and of the copy where the kernels need another type."""
+    data, values = scene.volume.data, scene.values
+    return data.nbytes + (0 if np.may_share_memory(data, values) else values.nbytes)
 
 
 def _view_seconds(scene: Scene, size: int) -> float:

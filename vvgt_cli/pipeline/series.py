@@ -12,6 +12,8 @@ import numpy as np
 
 from vvgt_cli import __version__
 from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.files import read_text
+from vvgt_cli.network.card import CARD, find_model
 from vvgt_cli.pipeline.convert import ConvertRequest, convert
 from vvgt_cli.pipeline.manifest import Manifest, Shard, digest, volume_digest
 from vvgt_cli.pipeline.outputs import check_outputs
@@ -135,6 +137,8 @@ def convert_series(request: ConvertRequest, shard: Shard, console: Console | Non
     """
     if request.overwrite and shard.count > 1:
         raise UsageError("--overwrite with --shard: parts would remove each other's files; remove the files instead")
+    if request.dry_run:
+        raise UsageError("--dry-run of a series: expected one volume; try it on one of the frames")
     console = console or Console()
     source = request.source
     files = _files(source)
@@ -163,7 +167,9 @@ def convert_series(request: ConvertRequest, shard: Shard, console: Console | Non
             console.say(f"{file.name}: nothing of it is visible; it gets no file")
             continue
         console.say(f"{file.name}: frame {k + 1} of {len(files)}, to {names[k][0]}")
-        convert(_frame(request, replace(source, volume=str(file)), names[k]), console)
+        report = convert(_frame(request, replace(source, volume=str(file)), names[k]), console)
+        if report.refinement and report.refinement["reason"] == "interrupted":
+            raise KeyboardInterrupt  # the frame is there, but not what it would be: it is made again
         manifest.record(own)
         done += 1
     mine = sum(shard.holds(k) and not d for k, d in enumerate(dark))
@@ -229,6 +235,8 @@ def _settings(request: ConvertRequest, frames: Frames, tf: TransferFunction, dis
         "function": digest(tf.opacity_nodes, tf.color_map),
         "opacity_unit_distance": distance,
         **asdict(request.fit),
+        **asdict(request.limits),
+        "model": read_text(find_model(request.fit.model) / CARD) if request.fit.model else None,
         **{key: ply[key] for key in ("frame", "up", "sh_degree", "comments")},
         "outputs": [Path(p).name for p in (request.output, request.report, request.preview) if p],
     }

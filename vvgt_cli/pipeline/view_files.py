@@ -130,6 +130,8 @@ def start_points(scene: Scene, size: int) -> tuple[np.ndarray, np.ndarray]:
 
     cameras = default_views("train", POINT_VIEWS, size=POINT_VIEW_SIZE)
     gaussians = closed_form(scene, POINTS, max(size // COARSER, 1), cameras).gaussians()
+    if not len(gaussians):  # what is thinner than these views' pixels
+        gaussians = closed_form(scene, POINTS, size).gaussians()
     return gaussians.means.astype(np.float64), np.clip(gaussians.colors, 0, 1)
 
 

@@ -22,7 +22,7 @@ class Projection:
         extent: (K, 4) int32 pixel boxes x0, y0, x1, y1; empty where not seen.
         start, members, slots, first: tile lists, see `kernel.tile_lists`.
         tiles_x: tiles along a row.
-        tiles: (tiles,) order in which threads take the tiles: the longest lists first.
+        tiles: (tiles,) order in which threads take the tiles.
     """
 
     flat: np.ndarray
@@ -70,7 +70,7 @@ def _projected(
     tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
     order = depth_order(depth)
     start, members, slots, first = kernel.tile_lists(order, extent, tiles_x, tiles_y, numba.get_num_threads())
-    return Projection(flat, extent, start, members, slots, first, tiles_x, np.argsort(-np.diff(start), kind="stable"))
+    return Projection(flat, extent, start, members, slots, first, tiles_x, deal(np.diff(start)))
 
 
 def pose(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -86,8 +86,20 @@ def depth_order(depth: np.ndarray) -> np.ndarray:
     return (keys & np.uint64(0xFFFFFFFF)).astype(np.int64)
 
 
+def deal(work: np.ndarray) -> np.ndarray:
+    """Order (n,) of tasks that gives contiguous chunks, one a thread, near equal shares of ``work`` (n,)."""
+    import numba
+
+    threads = numba.get_num_threads()
+    order = np.argsort(-work, kind="stable")
+    return np.concatenate([order[thread::threads] for thread in range(threads)])
+
+
 def tile_by_tile() -> AbstractContextManager[None]:
-    """Threads take one tile after the other: what a tile costs is not known before (pixels end early)."""
+    """Threads take one tile after the other where numba has TBB: what a tile costs is not known before.
+
+    Its other threading layers deal the tiles out in equal chunks, which `deal` balances by the lengths of the lists.
+    """
     import numba
 
     return numba.parallel_chunksize(1)

@@ -68,6 +68,7 @@ def cell_gaussians(leaves: Leaves, voxel: float, pixel: float, opaque: Opaque, s
         spread = np.maximum(spread, solid * floor**2)
         reach = np.sqrt(2 * np.log(np.clip(1.43 * style.chord * pixel / edge, 1.5, 90)))  # at most 3
         mean = mean + inset(opaque, mean, spread, axes, solid[:, 0] * reach, style.dilation * pixel**2, 6 * pixel)
+        mean = np.clip(mean, -opaque.half, opaque.half)  # where the box cuts a body
     opacity = peak_opacity(mass, spread, pixel)
     return make_gaussians(mean, spread, axes, opacity, seen_color(moments))
 
