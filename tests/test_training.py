@@ -86,6 +86,21 @@ def test_gradients_of_the_splatter_against_its_twin_and_against_differences():
     assert difference == pytest.approx(float((rows.grad.numpy() * step).sum()), rel=1e-3)
 
 
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_gsplat_draws_and_differentiates_as_the_kernels_do():
+    pytest.importorskip("gsplat")
+    gaussians, cameras, _ = scene(count=20, views=1)
+    slope = torch.from_numpy(np.random.default_rng(0).normal(size=(32, 32, 4)).astype(np.float32))
+    found = []
+    for device in ("cpu", "cuda"):
+        rows = torch.from_numpy(pack(gaussians)).to(device).requires_grad_()
+        picture = splat(rows, cameras[0])
+        (picture * slope.to(device)).sum().backward()
+        found.append((picture.detach().cpu().numpy(), rows.grad.cpu().numpy()))
+    assert np.abs(found[0][0] - found[1][0]).max() < 5e-3
+    assert np.allclose(found[0][1], found[1][1], rtol=2e-2, atol=2e-2 * np.abs(found[0][1]).max(axis=0))
+
+
 def test_losses_against_the_metrics():
     rng = np.random.default_rng(0)
     a, b, c = (rng.random((24, 20, 4)).astype(np.float32) for _ in range(3))
