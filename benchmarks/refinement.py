@@ -9,8 +9,8 @@ from the closed form: 100 steps of Adam on the file's fields with 3DGS' loss (SS
 pixel and steps of a voxel, and our steps for as long as those took, views included on both sides. `curve`: every point
 is a run of its own from the prepared scene on, views and closed form included. `ours` starts from the closed form as it
 is (without steps: back-projected), `adam` from the back-projected one; `3dgs` from 10,000 uniform samples that grow as
-in 3DGS, `ivr-gs` from as many uniform samples as the limit, with the function's colours, none added; both with 3DGS' loss
-and Adam, on 72 views.
+in 3DGS, `ivr-gs` from as many uniform samples as the limit, with the function's colours, none added; both with 3DGS'
+loss and Adam, on 72 views.
 """
 
 from __future__ import annotations

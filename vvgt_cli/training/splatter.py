@@ -46,8 +46,11 @@ def splat(rows: Tensor, camera: Camera) -> Tensor:
 
 
 def gsplat_picture(rows: Tensor, camera: Camera) -> Tensor:
-    """`splat` by gsplat (Ye et al. 2024), differentiable. Its alpha ends at 0.999 where ours does at 0.99, and it keeps the
-    Jacobian of what lies beside the frustum at the frustum's edge: pictures differ there."""
+    """`splat` by gsplat (Ye et al. 2024), differentiable.
+
+    Its alpha ends at 0.999 where ours does at 0.99, and it takes the Jacobian of what lies beside the frustum at the
+    frustum's edge: pictures differ there.
+    """
     from gsplat import rasterization
 
     means, log_scales, quaternions, logits, colors = rows.float().split([3, 3, 4, 1, 3], dim=1)
