@@ -179,6 +179,24 @@ def test_a_run_learns_and_keeps_its_record(straight):
     assert read_config(straight / "config.yaml") == CONFIG
 
 
+@pytest.mark.parametrize("variant", ["full", "wo_3dt", "wo_vgf", "wo_vbm"])
+def test_the_papers_network_and_its_ablations_learn(variant, data):
+    start = "uniform" if variant == "wo_vbm" else "vbm"
+    config = replace(
+        CONFIG, network=replace(TINY, variant=variant), loss=LossConfig(), scenes=replace(CONFIG.scenes, start=start)
+    )
+    scenes = prepare_scenes(data, config.scenes, Console(quiet=True))
+    network, device = sample.Vvgt(config.network), torch.device("cpu")
+    tally = sample.learn(network, sample.Feeder(scenes["train"], config), np.random.default_rng(0), device)
+    assert tally.loss > 0
+    assert not tally.bad
+    slopes = [parameter.grad for parameter in network.parameters() if parameter.grad is not None]
+    assert slopes
+    assert all(torch.isfinite(slope).all() for slope in slopes)
+    assert any(slope.abs().max() > 0 for slope in slopes)
+    assert np.isfinite(sample.judge(network, scenes["held volumes"][0], config, device)).all()
+
+
 def test_a_run_elsewhere_or_otherwise_is_refused(data, straight, tmp_path):
     with pytest.raises(UsageError, match="another configuration"):
         loop.train(replace(CONFIG, rate=2e-3), str(data), str(straight), Console(quiet=True))

@@ -57,7 +57,9 @@ class Prepared:
         return damped(self.restore(self.rows), self.restore(rows), cameras, images)[0]
 
     def restore(self, rows: np.ndarray) -> Gaussians:
-        """The network's output (K, 14) as Gaussians in the order that was given."""
+        """The network's output (K, 14) as Gaussians in the order that was given; "wo_3dt" has an order of its own."""
+        if not self.config.has_geometry:
+            return unpack(rows)
         given = np.empty_like(rows)
         given[self.order] = rows
         return unpack(given)

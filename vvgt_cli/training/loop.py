@@ -160,8 +160,8 @@ class _Run:
             rng = np.random.default_rng([config.seed, state.step, index])
             one = learn(self.network, self.feeder, rng, here.device)
             tally += [one.loss, one.gain, one.bad]
-        self.here.add_gradients(self.network)
-        loss, gain, bad, stop = here.total([*tally, max(ended, default=0) if here.size == 1 else bool(ended)])
+        here.add_gradients(self.network)
+        loss, gain, bad, stop = here.total([*tally, bool(ended)])
         norm = float(torch.nn.utils.clip_grad_norm_(self.network.parameters(), config.clip))
         if bad or not math.isfinite(norm):
             state.skipped += 1
