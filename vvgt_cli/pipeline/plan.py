@@ -201,6 +201,8 @@ class Planner:
         if wanted and steps >= min(FEWEST_STEPS, wanted):
             plan.steps, plan.most_steps = steps, wanted
             plan.stages.append((f"views, {steps} steps", _refinement(costs, steps)))
+            if self.model is None:
+                plan.left_out.append(("network", "gradient descent gains more in its time; --model runs it"))
             if wanted < ENOUGH_STEPS and left is None:
                 plan.back_project = True
                 plan.stages.append(("back-projection", costs.back_projection))
