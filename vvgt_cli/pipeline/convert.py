@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.files import atomic_write
-from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored, write_ply
+from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored
 from vvgt_cli.network.card import find_model, read_card
 from vvgt_cli.pipeline.mend import check_view_memory, mend
-from vvgt_cli.pipeline.outputs import STDOUT, Output, check_outputs, write_text
+from vvgt_cli.pipeline.outputs import Output, check_outputs, write_text
 from vvgt_cli.pipeline.plan import Limits, Planner, estimate
 from vvgt_cli.pipeline.record import ConversionReport, Run
+from vvgt_cli.pipeline.render import write_gaussians
 from vvgt_cli.pipeline.score import psnr_note, score_test_views
 from vvgt_cli.pipeline.source import Source, SourceRequest, load
 from vvgt_cli.progress import Console
@@ -230,17 +229,9 @@ def _finish(
         unit_distance_label=source.unit_label,
     )
     report = run.report
-    with run.stage("write") as stage:
-        if request.output == STDOUT:
-            report.bytes = write_ply(sys.stdout.buffer, gaussians, ply)
-            sys.stdout.buffer.flush()
-        else:
-            with atomic_write(request.output, request.overwrite) as temporary:
-                report.bytes = write_ply(temporary, gaussians, ply)
-        if request.preview and sheet is not None:
-            write_png(request.preview, sheet, request.overwrite)
-        report.gaussians = len(gaussians)
-        stage.note = f"{request.output}: {len(gaussians)} Gaussians, {report.bytes / 1e6:.1f} MB"
+    write_gaussians(run, request.output, gaussians, ply, request.overwrite)
+    if request.preview and sheet is not None:
+        write_png(request.preview, sheet, request.overwrite)
     run.finish()
     if request.report:
         write_text(request.report, report.to_json(), request.overwrite)

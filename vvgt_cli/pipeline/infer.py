@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from vvgt_cli.cameras import Camera
-from vvgt_cli.files import atomic_write
-from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions, write_ply
+from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.pipeline.optimize import Views
-from vvgt_cli.pipeline.outputs import STDOUT, Output, check_outputs, write_text
+from vvgt_cli.pipeline.outputs import Output, check_outputs, write_text
 from vvgt_cli.pipeline.record import ConversionReport, Run
-from vvgt_cli.pipeline.render import open_gaussians
+from vvgt_cli.pipeline.render import layout_of, open_gaussians, write_gaussians
 from vvgt_cli.progress import Console
-from vvgt_cli.volume.types import UnitFrame
 
 SHIPPED = "vvgt-small"  # the model that comes with the program
 JUDGES = 4  # views that the network is not shown, as many as the default check set
@@ -121,40 +118,12 @@ def infer_file(request: InferRequest, console: Console | None = None) -> Convers
         "psnr_before": before,
         "psnr_after": after,
     }
-    return _finish(run, request, better if stage.kept else gaussians, header)
-
-
-def _finish(run: Run, request: InferRequest, gaussians: Gaussians, header: PlyHeader) -> ConversionReport:
-    options = ply_options(header)
-    with run.stage("write") as stage:
-        if request.output == STDOUT:
-            run.report.bytes = write_ply(sys.stdout.buffer, gaussians, options)
-            sys.stdout.buffer.flush()
-        else:
-            with atomic_write(request.output, request.overwrite) as temporary:
-                run.report.bytes = write_ply(temporary, gaussians, options)
-        run.report.gaussians = len(gaussians)
-        stage.note = f"{request.output}: {len(gaussians)} Gaussians"
+    kept = better if stage.kept else gaussians
+    write_gaussians(run, request.output, kept, layout_of(header), request.overwrite)
     report = run.finish()
     if request.report:
         write_text(request.report, report.to_json(), request.overwrite)
     return report
-
-
-def ply_options(header: PlyHeader) -> PlyOptions:
-    """What writes a file as the given one is: its frame, turn, harmonics' padding and records."""
-    frame = None
-    if header.scale is not None and header.centre is not None:
-        frame = UnitFrame(header.scale, (0.0,) * 3, (0.0,) * 3, header.centre)  # only these two are written
-    return PlyOptions(
-        frame=header.frame,
-        up=header.up,
-        sh_degree=header.sh_degree,
-        comments=header.version is not None,
-        unit_frame=frame,
-        unit_distance=header.unit_distance,
-        unit_distance_label=header.unit_distance_label or "given",
-    )
 
 
 def _psnr(gaussians: Gaussians, cameras: Sequence[Camera], images: np.ndarray, judges: Sequence[int]) -> float:

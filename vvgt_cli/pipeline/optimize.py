@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -15,16 +14,14 @@ import numpy as np
 
 from vvgt_cli.cameras import Camera
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.files import atomic_write
-from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions, as_stored, write_ply
+from vvgt_cli.gaussians import Gaussians, as_stored
 from vvgt_cli.images.viewset import load_views
 from vvgt_cli.optimize import OptimizeOptions, OptimizeRecord, optimize
-from vvgt_cli.pipeline.outputs import STDOUT, Output, check_outputs, write_text
+from vvgt_cli.pipeline.outputs import Output, check_outputs, write_text
 from vvgt_cli.pipeline.record import ConversionReport, Run
-from vvgt_cli.pipeline.render import open_gaussians
+from vvgt_cli.pipeline.render import layout_of, open_gaussians, write_gaussians
 from vvgt_cli.pipeline.score import psnr_note
 from vvgt_cli.progress import Console
-from vvgt_cli.volume.types import UnitFrame
 
 if TYPE_CHECKING:
     from vvgt_cli.metrics import Scores
@@ -99,7 +96,7 @@ def optimize_file(request: OptimizeRequest, console: Console | None = None) -> C
     gaussians = refine(run, start, train, check, request.options)
     if test is not None:
         _score(run, test, start, gaussians)
-    _write(run, request, gaussians, header)
+    write_gaussians(run, request.output, gaussians, layout_of(header), request.overwrite)
     run.finish()
     if request.report:
         write_text(request.report, run.report.to_json(), request.overwrite)
@@ -187,35 +184,6 @@ def _mean(test: Views, gaussians: Gaussians, perceptual: bool) -> Scores:
     from vvgt_cli.splat import render
 
     return score_views(test.images, (render(gaussians, camera) for camera in test.cameras), perceptual=perceptual)
-
-
-def _ply_options(header: PlyHeader) -> PlyOptions:
-    """What makes a file laid out, placed and commented as the one read was."""
-    frame = None
-    if header.scale is not None and header.centre is not None:
-        frame = UnitFrame(header.scale, (1, 1, 1), (1, 1, 1), header.centre)  # of which scale and centre are written
-    return PlyOptions(
-        frame=header.frame,
-        up=header.up,
-        sh_degree=header.sh_degree,
-        comments=header.version is not None,
-        unit_frame=frame,
-        unit_distance=header.unit_distance,
-        unit_distance_label=header.unit_distance_label or "given",
-    )
-
-
-def _write(run: Run, request: OptimizeRequest, gaussians: Gaussians, header: PlyHeader) -> None:
-    options, report = _ply_options(header), run.report
-    with run.stage("write") as stage:
-        if request.output == STDOUT:
-            report.bytes = write_ply(sys.stdout.buffer, gaussians, options)
-            sys.stdout.buffer.flush()
-        else:
-            with atomic_write(request.output, request.overwrite) as temporary:
-                report.bytes = write_ply(temporary, gaussians, options)
-        report.gaussians = len(gaussians)
-        stage.note = f"{request.output}: {len(gaussians)} Gaussians, {report.bytes / 1e6:.1f} MB"
 
 
 def budget(steps: int | None, seconds: float | None) -> dict[str, int | float | None]:

@@ -10,10 +10,12 @@ from vvgt_cli.cameras import Camera, orbit_views
 from vvgt_cli.cameras.files import read_cameras, transforms_json
 from vvgt_cli.cameras.sets import SIZE
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.gaussians import Gaussians, PlyHeader, in_unit_frame, read_ply
+from vvgt_cli.files import atomic_write
+from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions, in_unit_frame, read_ply, write_ply
 from vvgt_cli.pipeline.outputs import STDOUT, write_text
 from vvgt_cli.pipeline.record import ConversionReport, Run
 from vvgt_cli.progress import Console
+from vvgt_cli.volume.types import UnitFrame
 
 STDIN = STDOUT
 VIEWS_FILE = "transforms.json"
@@ -62,6 +64,36 @@ def open_gaussians(source: str, console: Console) -> tuple[Gaussians, PlyHeader]
     if header.sh_degree and not header.version:
         console.say(f"{source}: spherical harmonics of degree {header.sh_degree}; only the base colour is used")
     return in_unit_frame(gaussians, header), header
+
+
+def layout_of(header: PlyHeader) -> PlyOptions:
+    """What makes a file laid out, placed and commented as the one read was."""
+    frame = None
+    if header.scale is not None and header.centre is not None:
+        frame = UnitFrame(header.scale, (1, 1, 1), (1, 1, 1), header.centre)  # of which scale and centre are written
+    return PlyOptions(
+        frame=header.frame,
+        up=header.up,
+        sh_degree=header.sh_degree,
+        comments=header.version is not None,
+        unit_frame=frame,
+        unit_distance=header.unit_distance,
+        unit_distance_label=header.unit_distance_label or "given",
+    )
+
+
+def write_gaussians(run: Run, output: str, gaussians: Gaussians, options: PlyOptions, overwrite: bool) -> None:
+    """The stage that writes a `.ply`, or standard output for "-", and records its size."""
+    report = run.report
+    with run.stage("write") as stage:
+        if output == STDOUT:
+            report.bytes = write_ply(sys.stdout.buffer, gaussians, options)
+            sys.stdout.buffer.flush()
+        else:
+            with atomic_write(output, overwrite) as temporary:
+                report.bytes = write_ply(temporary, gaussians, options)
+        report.gaussians = len(gaussians)
+        stage.note = f"{output}: {len(gaussians)} Gaussians, {report.bytes / 1e6:.1f} MB"
 
 
 def _check_directory(request: RenderRequest, names: list[str]) -> None:

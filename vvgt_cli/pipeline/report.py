@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import UsageError
-from vvgt_cli.network.card import CARD, MODELS
+from vvgt_cli.network.card import find_model
 from vvgt_cli.pipeline.convert import describe_source, tf_record, volume_record
 from vvgt_cli.pipeline.infer import SHIPPED
 from vvgt_cli.pipeline.ladder import LadderOptions, Reference, climb, pictures, rungs, warm_up
@@ -91,9 +91,13 @@ def report(request: ReportRequest, console: Console | None = None) -> dict[str, 
 
 def _with_model(ladder: LadderOptions) -> LadderOptions:
     """The shipped network where none is named and one is there."""
-    if ladder.model is None and (MODELS / SHIPPED / CARD).is_file():
-        return replace(ladder, model=SHIPPED)
-    return ladder
+    if ladder.model is not None:
+        return ladder
+    try:
+        find_model(SHIPPED)
+    except UsageError:
+        return ladder
+    return replace(ladder, model=SHIPPED)
 
 
 def _document(request: ReportRequest, source: Any, reference: Reference, runs: list[dict[str, Any]]) -> dict[str, Any]:
