@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from vvgt_cli.cameras.sets import look_at
+from vvgt_cli.checks.clouds import cloud
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.splat import blend, gather, gather_reference, project, render, render_reference
 from vvgt_cli.splat.constants import DILATION, MIN_ALPHA
@@ -19,17 +20,6 @@ JUMP, TIGHT = 0.01, 3e-5
 
 def camera(width=64, height=64, eye=EYE, fov=40.0):
     return look_at(eye, width=width, height=height, fov=fov)
-
-
-def cloud(count, seed=0, scale=0.05, spread=0.3, logit=0.0, box=0.6):
-    rng = np.random.default_rng(seed)
-    return Gaussians(
-        rng.uniform(-box, box, (count, 3)),
-        np.log(scale) + rng.normal(0, spread, (count, 3)),
-        rng.normal(size=(count, 4)),
-        logit + rng.normal(0, 2, count),
-        rng.uniform(-0.3, 1.2, (count, 3)),
-    )
 
 
 def taken(gaussians, order):
