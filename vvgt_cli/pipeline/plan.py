@@ -70,9 +70,11 @@ class Limits:
         """
         if self.max_megabytes is None:
             return most
-        fit = int((self.max_megabytes * 1e6 - HEADER_BYTES[sh_degree]) // (VERTEX_BYTES + HARMONIC_BYTES[sh_degree]))
+        header, each = HEADER_BYTES[sh_degree], VERTEX_BYTES + HARMONIC_BYTES[sh_degree]
+        fit = int((self.max_megabytes * 1e6 - header) // each)
         if fit < 1:
-            raise UsageError(f"--max-size {self.max_megabytes:g}: no Gaussian fits; expected 0.002 MB or more")
+            least = (header + each) / 1e6
+            raise UsageError(f"--max-size {self.max_megabytes:g}: no Gaussian fits; expected {least:.4f} MB or more")
         return min(most, fit)
 
 
