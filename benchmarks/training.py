@@ -47,7 +47,7 @@ from vvgt_cli.vbm import VbmOptions, backproject, initialise
 from vvgt_cli.volume.nrrd_write import write_nrrd
 
 GRID, SIZE = 64, 96
-KINDS = ("shells", "tubes", "plates", "noise")
+KINDS = ("shells", "tubes", "plates", "noise", "wells")
 TRAINED, HELD = range(6), range(100, 102)  # seeds of shapes
 FIRST, EVERY, SNAPSHOTS = 2.0, 0.6, 5  # turnovers
 HELD_SEED = 100
