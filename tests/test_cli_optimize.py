@@ -174,4 +174,4 @@ def test_convert_refines_after_the_closed_form(tmp_path, vvgt):
     assert stages["refinement"]["psnr"] > stages["refinement"]["psnr_before"] + 1
     assert report["scores"]["psnr"] > stages["refinement"]["psnr_before"]
     assert report["options"]["steps"] == report["refinement"]["steps"] == 30
-    assert "24 to fit to" in stages["views"]["note"]
+    assert "24 of 32 px to fit to" in stages["views"]["note"]

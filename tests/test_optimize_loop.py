@@ -12,6 +12,8 @@ from vvgt_cli.metrics import psnr
 from vvgt_cli.optimize import OptimizeOptions, optimize
 from vvgt_cli.optimize.states import OwnFrame
 from vvgt_cli.splat import render
+from vvgt_cli.splat.constants import DILATION
+from vvgt_cli.splat.half import halved
 from vvgt_cli.splat.reference import covariances
 
 FIELDS = ("means", "log_scales", "quaternions", "opacity_logits", "colors")
@@ -68,6 +70,20 @@ def test_views_that_were_not_trained_on_come_nearer(scene, options, gain):
     assert record.psnr_after == pytest.approx(score(result, *check), abs=0.02)
     assert record.psnr_before == pytest.approx(score(start, *check), abs=0.02)
     assert score(result, CAMERAS, images) > score(start, CAMERAS, images) + gain
+
+
+@pytest.mark.parametrize("method", ["frame", "adam"])
+def test_views_of_half_the_size_want_a_quarter_of_the_dilation(method):
+    wide = truth(300)
+    thin = Gaussians(wide.means, wide.log_scales - 1.2, wide.quaternions, wide.opacity_logits + 1, wide.colors)
+    images, check = views(thin, CAMERAS), (CHECKS, views(thin, CHECKS))
+    cameras, small, dilation = halved(CAMERAS, images)
+    start, ends = shaken(thin, 0.03), {}
+    for given in (dilation, DILATION):
+        options = OptimizeOptions(steps=60, method=method, dilation=given)
+        ends[given] = score(optimize(start, cameras, small, options)[0], *check)
+    assert ends[dilation] > score(start, *check) + 1
+    assert ends[dilation] > ends[DILATION] + 1
 
 
 def test_alpha_is_fitted_where_colour_says_nothing(scene):

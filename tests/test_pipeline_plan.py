@@ -10,22 +10,33 @@ import pytest
 from onnx_models import write_model
 from test_cli_infer import DARKER
 
+from vvgt_cli.cameras import default_views
 from vvgt_cli.errors import UsageError
-from vvgt_cli.gaussians import PlyOptions, read_ply
+from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply
 from vvgt_cli.pipeline.convert import ConvertRequest, FitOptions, convert
-from vvgt_cli.pipeline.plan import DEFAULT_STEPS, MOST_STEPS, Costs, Limits, Planner, views_of
+from vvgt_cli.pipeline.mend import wide
+from vvgt_cli.pipeline.plan import DEFAULT_HALF_STEPS, DEFAULT_STEPS, MOST_STEPS, Costs, Limits, Planner, views_of
 from vvgt_cli.pipeline.source import SourceRequest
 from vvgt_cli.progress import Console
 
 COSTS = Costs(
-    closed_form=5, view=0.05, back_projection=6, network=3, step=0.05, score=0.5, write=0.1, memory=1e9, view_memory=1e7
+    closed_form=5,
+    view=0.05,
+    back_projection=6,
+    network=3,
+    step=0.05,
+    half_step=0.05,
+    score=0.5,
+    write=0.1,
+    memory=1e9,
+    view_memory=1e7,
 )
 SOURCE = SourceRequest("example:marschner-lobb:24")
 SMALL = FitOptions(400, 48)
 
 
-def plan(steps=None, spent=1.0, begun=False, costs=COSTS, **limits):
-    return Planner(Limits(**limits), 1000, steps, 0).plan(costs, spent, begun)
+def plan(steps=None, spent=1.0, begun=False, costs=COSTS, size=48, wide=True, **limits):
+    return Planner(Limits(**limits), 1000, steps, 0, size, wide).plan(costs, spent, begun)
 
 
 def done(tmp_path, fit=SMALL, **options):
@@ -45,6 +56,38 @@ def test_without_limits_the_default_steps_are_planned_and_back_projection_is_not
     assert found.seconds == pytest.approx(1 + 5 + DEFAULT_STEPS * 0.05 + (24 + 2.5 * 4) * 0.05 + 0.6)
     assert found.bytes == 1000 + 1000 * 68
     assert "72 steps" in found.text()
+
+
+def test_views_are_half_the_size_where_gaussians_are_wide():
+    found = plan(size=400)
+    assert (found.half, found.steps) == (True, DEFAULT_HALF_STEPS)
+    assert found.seconds == pytest.approx(1 + 5 + DEFAULT_HALF_STEPS * 0.05 + (48 / 4 + 2.5 * 4) * 0.05 + 0.6)
+    assert found.memory == pytest.approx(1e9 + (48 / 4 + 4) * 1e7)
+    assert plan(size=400, time_budget=20.0).half
+    for other in (plan(size=401), plan(size=100), plan(size=400, wide=False), plan(size=400, steps=23)):
+        assert not other.half
+
+
+def test_wide_is_told_by_the_middle_axis():
+    camera = default_views("check", 1, size=400)[0]
+    pixel = np.linalg.norm(camera.position) / camera.fx
+    scales = np.log(np.float32([[0.1, 1.0, 5.0]]) * pixel)
+    one = lambda size: Gaussians(  # noqa: E731
+        np.zeros((1, 3), np.float32), scales + np.float32(np.log(size)), np.float32([[1, 0, 0, 0]]),
+        np.zeros(1, np.float32), np.zeros((1, 3), np.float32),
+    )  # fmt: skip
+    assert wide(one(1.0), 400)
+    assert not wide(one(0.8), 400)
+    assert not wide(one(1.0), 200)
+
+
+def test_refinement_on_half_views_gains_on_whole_ones(tmp_path):
+    report = done(tmp_path, FitOptions(600, 128))
+    stages = {stage.name: stage for stage in report.stages}
+    assert stages["views"].note.startswith("48 of 64 px to fit to")
+    assert stages["refinement"].kept
+    assert stages["refinement"].psnr > stages["refinement"].psnr_before + 1
+    assert report.plan["half"]
 
 
 def test_no_steps_leave_back_projection():
@@ -77,9 +120,10 @@ def test_more_time_is_more_steps_and_never_more_than_the_time():
 
 
 def test_a_network_runs_where_there_is_time_for_it():
-    planner = Planner(Limits(), 1000, None, 0, "some")
+    planner = Planner(Limits(), 1000, None, 0, 400, model="some")
     assert planner.plan(COSTS, 1.0).network == "some"
-    short = Planner(Limits(time_budget=9.0), 1000, None, 0, "some").plan(COSTS, 1.0)
+    assert not planner.plan(COSTS, 1.0).half  # it was trained on whole views
+    short = Planner(Limits(time_budget=9.0), 1000, None, 0, 400, model="some").plan(COSTS, 1.0)
     assert short.network is None
     assert "network" in {name for name, _ in short.left_out}
 

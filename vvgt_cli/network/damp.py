@@ -8,7 +8,7 @@ import numpy as np
 
 from vvgt_cli.cameras import Camera
 from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.network.slopes import halved
+from vvgt_cli.splat.half import halved
 
 VIEWS = 3  # of those that the network has read
 SMALLEST = 1 / 16  # share of a step; below it none is taken

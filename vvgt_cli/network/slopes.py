@@ -14,9 +14,9 @@ import numpy as np
 from vvgt_cli.cameras import Camera
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.network.config import STEP
+from vvgt_cli.splat.half import halved
 
 FIELDS = ((0, 3), (3, 6), (6, 9), (9, 10), (10, 13))  # d, e, w, logit, colour: columns of a step
-HALF = 0.25  # of the renderer's dilation: what it is worth at half the size
 
 
 def own_frame(
@@ -39,20 +39,6 @@ def own_frame(
         [w * b - x * a + z * c - y * d, w * c - z * b - y * a + x * d, w * d + y * b - x * c - z * a], axis=1
     )
     return np.concatenate([along, log_scales, spin / 2, logits[:, None], colors], axis=1)
-
-
-def halved(cameras: Sequence[Camera], images: np.ndarray) -> tuple[list[Camera], np.ndarray, float]:
-    """Views averaged 2 x 2 where their sides are even, and the dilation that stands for the renderer's there.
-
-    They say nearly as much about a step as whole ones, for about half the work: twice the views are worth more.
-    """
-    from vvgt_cli.splat.constants import DILATION
-
-    n, h, w, c = images.shape
-    if h % 2 or w % 2:
-        return list(cameras), images, DILATION
-    mean = images.reshape(n, h // 2, 2, w // 2, 2, c).mean(axis=(2, 4), dtype=np.float32)
-    return [camera.resized(0.5) for camera in cameras], mean, DILATION * HALF
 
 
 def slope_rows(gaussians: Gaussians, cameras: Sequence[Camera], images: np.ndarray) -> np.ndarray:

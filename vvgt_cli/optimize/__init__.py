@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from vvgt_cli.errors import UsageError
+from vvgt_cli.splat.constants import DILATION
 
 if TYPE_CHECKING:
     import numpy as np
@@ -33,6 +34,8 @@ class OptimizeOptions:
         target_psnr: dB on the check views at which to stop.
         l1, l2, ssim: weights of the sums over pixels and RGB of |r|, r^2 and 1 - SSIM.
         alpha: weight of the alpha channel's |r| and r^2 beside a colour channel's.
+        dilation: px^2 added to projected covariances in the training views: a quarter of the standard programs' where
+            those views are half the size of what the file is made for. Check views have the standard one.
         check_every: fewest steps between two looks at the check views, of which a run takes eight or so.
         patience: looks in a row without a gain of 0.01 dB, in the second half, after which to stop.
         checkpoint: .npz written every ``check_every`` steps and at the end; where it is there, the run goes on from it.
@@ -48,6 +51,7 @@ class OptimizeOptions:
     l2: float = 1.0
     ssim: float = 0.0
     alpha: float = 0.5
+    dilation: float = DILATION
     check_every: int = 25
     patience: int = 3
     checkpoint: str | None = None

@@ -103,7 +103,9 @@ def begin(gaussians: Gaussians, cameras: Sequence[Camera], options: OptimizeOpti
     """What the method descends on."""
     if options.method == "3dgs":
         return Densified(gaussians, cameras, options)
-    return (OwnFrame if options.method == "frame" else Fields)(gaussians, cameras)
+    if options.method == "adam":
+        return Fields(gaussians, cameras)
+    return OwnFrame(gaussians, cameras, options.dilation)
 
 
 def step(
@@ -122,7 +124,7 @@ def step(
     from vvgt_cli.optimize.loss import loss_gradient
     from vvgt_cli.optimize.ssim import add_ssim_gradient
 
-    projection = state.project(camera)
+    projection = state.project(camera, options.dilation)
     image = blend(projection, state.colors, camera.height, camera.width)
     grad = np.empty_like(image)
     l1, l2, alpha = np.float32(options.l1), np.float32(options.l2), np.float32(options.alpha)

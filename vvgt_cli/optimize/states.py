@@ -10,6 +10,7 @@ import numpy as np
 from vvgt_cli.cameras import Camera
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.splat import Projection, project
+from vvgt_cli.splat.constants import DILATION
 from vvgt_cli.splat.reference import rotations
 from vvgt_cli.splat.render import fields_backward, moments, own_frame_backward, project_factors
 
@@ -30,7 +31,7 @@ class OwnFrame:
     BETAS = 0.6, 0.999
     STEADY = True  # what falls far behind its best can be put back there, and a run without gain is at its end
 
-    def __init__(self, gaussians: Gaussians, cameras: Sequence[Camera]) -> None:
+    def __init__(self, gaussians: Gaussians, cameras: Sequence[Camera], dilation: float = DILATION) -> None:
         from vvgt_cli.optimize import steps
 
         scales = np.exp(gaussians.log_scales.astype(np.float64))
@@ -41,16 +42,17 @@ class OwnFrame:
             np.maximum(gaussians.colors, 0),
         )
         self.first, self.second = (np.zeros((len(gaussians), steps.COUNT), np.float32) for _ in range(2))
-        self.pixel = float(np.median([np.linalg.norm(camera.position) / camera.fx for camera in cameras]))
+        pixel = float(np.median([np.linalg.norm(camera.position) / camera.fx for camera in cameras]))
+        self.spread = dilation * pixel**2
         self.step = 0
 
     @property
     def colors(self) -> np.ndarray:
         return self.arrays[3]
 
-    def project(self, camera: Camera) -> Projection:
+    def project(self, camera: Camera, dilation: float = DILATION) -> Projection:
         means, factors, logits, _ = self.arrays
-        return project_factors(means, factors, logits, camera)
+        return project_factors(means, factors, logits, camera, dilation)
 
     def descend(
         self,
@@ -72,7 +74,7 @@ class OwnFrame:
         pace = speed * min(1.0, 2 * (1 - share))
         pace *= min(self.LARGEST, math.sqrt(error / self.ERROR)) * min(1.0, self.step / WARM_UP)
         steps.own_frame(
-            slopes.frame, slopes.opacity_logits, slopes.colors, self.RATES * pace, self.CLIPS, self.pixel,
+            slopes.frame, slopes.opacity_logits, slopes.colors, self.RATES * pace, self.CLIPS, self.spread,
             *self.BETAS, self.step, means, factors, logits, colors, self.first, self.second,
         )  # fmt: skip
 
@@ -113,8 +115,8 @@ class Fields:
     def colors(self) -> np.ndarray:
         return np.maximum(self.arrays[4], 0)
 
-    def project(self, camera: Camera) -> Projection:
-        return project(self.gaussians(), camera)
+    def project(self, camera: Camera, dilation: float = DILATION) -> Projection:
+        return project(self.gaussians(), camera, dilation)
 
     def descend(
         self,

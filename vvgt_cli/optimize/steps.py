@@ -7,7 +7,6 @@ import math
 import numba as nb
 
 from vvgt_cli.jit import inlined
-from vvgt_cli.splat.constants import DILATION
 
 EPSILON = 1e-15
 COUNT = 13  # own frame: d (3), E (6), opacity logit, colour (3)
@@ -29,10 +28,10 @@ def _clip(value, bound):
 
 
 @_jit
-def _gain(factors, k, i, pixel):
-    """How much further axis i may go than one of many pixels: the dilation hides part of its step, at most 3."""
+def _gain(factors, k, i, spread):
+    """How much further axis i may go than a long one: the dilation, of variance ``spread``, hides part of its step."""
     size = factors[k, 0, i] ** 2 + factors[k, 1, i] ** 2 + factors[k, 2, i] ** 2
-    return math.sqrt(min(1 + DILATION * pixel * pixel / max(size, 1e-30), 9.0))
+    return math.sqrt(min(1 + spread / max(size, 1e-30), 9.0))
 
 
 @_jit
@@ -58,7 +57,7 @@ def own_frame(
     color_grad,
     rates,
     clips,
-    pixel,
+    spread,
     beta1,
     beta2,
     step,
@@ -71,12 +70,12 @@ def own_frame(
 ):
     """mu += M d, M <- M (I + E + E^2 / 2): d, E, logit and colour by Adam; ``step`` counts from 1.
 
-    ``rates`` (5,): d, E on and off the diagonal, logit, colour. ``clips`` (3,): d, logit, E. ``pixel`` is a pixel's
-    width at the scene.
+    ``rates`` (5,): d, E on and off the diagonal, logit, colour. ``clips`` (3,): d, logit, E. ``spread`` is the
+    dilation's variance at the scene.
     """
     fix1, fix2 = 1 / (1 - beta1**step), 1 / (1 - beta2**step)
     for k in nb.prange(means.shape[0]):
-        p0, p1, p2 = _gain(factors, k, 0, pixel), _gain(factors, k, 1, pixel), _gain(factors, k, 2, pixel)
+        p0, p1, p2 = _gain(factors, k, 0, spread), _gain(factors, k, 1, spread), _gain(factors, k, 2, spread)
         d0, d1, d2, a0, a1, a2, b0, b1, b2 = _directions(frame, k, first, second, beta1, beta2, fix1, fix2)
         d0, d1, d2 = (_clip(d0 * rates[0] * p0, clips[0]), _clip(d1 * rates[0] * p1, clips[0]),
                       _clip(d2 * rates[0] * p2, clips[0]))  # fmt: skip

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.sets import SET_VIEWS
 from vvgt_cli.errors import UsageError
@@ -13,6 +15,8 @@ from vvgt_cli.optimize import OptimizeOptions
 from vvgt_cli.pipeline.optimize import Views, refine
 from vvgt_cli.pipeline.plan import SMALLER, Limits, Plan, views_of
 from vvgt_cli.pipeline.record import Run
+from vvgt_cli.splat.constants import DILATION
+from vvgt_cli.splat.half import HALF, halved
 from vvgt_cli.volume.blocks import free_memory
 
 if TYPE_CHECKING:
@@ -21,17 +25,17 @@ if TYPE_CHECKING:
     from vvgt_cli.vbm import Start
 
 VIEW_BYTES = 2 * 16  # a pixel: float32 RGBA, and as much again while views are stacked
-LADDER = ((1.0, 1), (0.5, 1), (1.0, None))  # steps in voxels and rays a pixel (None: adaptive), by cost
-MARGIN = 12.0  # dB
+MARGIN = 4.0  # dB
+WIDE = 0.9  # standard deviation in pixels
 
 
 def check_view_memory(plan: Plan, size: int) -> None:
     """Refuse a size whose training and check views would not fit."""
-    views = views_of(plan.steps) + SET_VIEWS["check"]
+    views = views_of(plan.steps) * (HALF if plan.half else 1) + SET_VIEWS["check"]
     need, free = views * size**2 * VIEW_BYTES, free_memory()
     if (plan.back_project or plan.steps or plan.network) and free is not None and need > free:
         raise UsageError(
-            f"--size {size}: {views} views need {need / 2**30:.1f} GiB of memory, {free / 2**30:.1f} GiB are free; "
+            f"--size {size}: views need {need / 2**30:.1f} GiB of memory, {free / 2**30:.1f} GiB are free; "
             "try a smaller size, or 'vvgt init', which renders none"
         )
 
@@ -131,7 +135,7 @@ class _Mending:
         """Training views, as finely integrated as ``start`` asks for."""
         if self.train is None:
             if self.plan.steps or self.plan.network:
-                self.settings = fine_enough(self.scene, self.check, start)
+                self.settings = fine_enough(self.scene, self.check, start, self.plan.half)
             self.train = self._rendered(views_of(self.plan.steps))
         return self.train
 
@@ -143,34 +147,48 @@ class _Mending:
             ending = sum(seconds for name, seconds in self.plan.stages if name in ("test views", "write"))
             left = max(self.limits.time_budget - self.run.elapsed() - ending, 0.0)
         target = self.limits.target_psnr
-        options = OptimizeOptions(steps=self.plan.most_steps, time_budget=left, target_psnr=target, seed=self.fit.seed)
+        dilation = DILATION * HALF if self.plan.half else DILATION
+        options = OptimizeOptions(
+            steps=self.plan.most_steps, time_budget=left, target_psnr=target, dilation=dilation, seed=self.fit.seed
+        )
         return refine(self.run, gaussians, train, self.check, options)
 
     def _rendered(self, count: int) -> Views:
         """Training views."""
         from vvgt_cli.dvr import render_views
 
-        cameras = default_views("train", count, size=self.fit.size)
+        size = self.fit.size // 2 if self.plan.half else self.fit.size
+        cameras = default_views("train", count, size=size)
         with self.run.stage("views") as stage:
             images = render_views(self.scene, cameras, self.settings, progress=self.run.console.bar("views"))
             rays = "one ray" if self.settings.samples == 1 else "adaptive rays"
-            stage.note = f"{count} to fit to, {rays} a pixel, steps of {self.settings.step:g}"
+            stage.note = f"{count} of {size} px to fit to, {rays} a pixel, steps of {self.settings.step:g}"
         return Views(cameras, images)
 
 
-def fine_enough(scene: Scene, check: Views, start: Gaussians) -> RenderSettings:
-    """The cheapest integration whose error is `MARGIN` below that of ``start``, against finely rendered check views.
+def fine_enough(scene: Scene, check: Views, start: Gaussians, half: bool) -> RenderSettings:
+    """One ray a pixel where its error is `MARGIN` below that of ``start``, else adaptive rays; half-voxel steps.
 
-    Gradient descent follows the jags of single rays and the error of long steps, which hard edges have.
+    The error is that of a check view, ``half``: at half its size, against the same finely rendered. Gradient descent
+    follows the jags of single rays at hard edges, and those of longer steps everywhere.
     """
     from vvgt_cli.dvr import RenderSettings, render_view
     from vvgt_cli.metrics import psnr
-    from vvgt_cli.splat import render
+    from vvgt_cli.splat import project, render
 
-    camera, fine = check.cameras[0], check.images[0]
-    wanted = psnr(fine[..., :3], render(start, camera)[..., :3]) + MARGIN
-    for step, samples in LADDER:
-        settings = RenderSettings(step=step, samples=samples)
-        if psnr(fine[..., :3], render_view(scene, camera, settings)[..., :3]) >= wanted:
-            return settings
-    return RenderSettings()
+    cameras, views, dilation = check.cameras[:1], check.images[:1], DILATION
+    if half:
+        cameras, views, dilation = halved(cameras, views)
+    camera, fine = cameras[0], views[0]
+    wanted = psnr(fine[..., :3], render(start, camera, project(start, camera, dilation))[..., :3]) + MARGIN
+    single = RenderSettings(samples=1)
+    enough = psnr(fine[..., :3], render_view(scene, camera, single)[..., :3]) >= wanted
+    return single if enough else RenderSettings()
+
+
+def wide(gaussians: Gaussians, size: int) -> bool:
+    """Whether views of half the size still show them: the median of middle standard deviations is above `WIDE` px."""
+    camera = default_views("check", 1, size=size)[0]
+    pixel = float(np.linalg.norm(camera.position)) / camera.fx
+    middle = np.exp(np.median(gaussians.log_scales, axis=1))  # of three
+    return bool(np.median(middle) > WIDE * pixel)

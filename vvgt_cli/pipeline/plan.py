@@ -12,6 +12,7 @@ import numpy as np
 
 from vvgt_cli.cameras.sets import SET_VIEWS
 from vvgt_cli.errors import UsageError
+from vvgt_cli.splat.half import HALF
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
@@ -20,6 +21,7 @@ VERTEX_BYTES = 68  # x y z, normals, three colours, opacity, three scales, four 
 HARMONIC_BYTES = {0: 0, 1: 36, 2: 96, 3: 180}  # zeros up to a degree
 HEADER_BYTES = {0: 1000, 1: 1200, 2: 1600, 3: 2200}
 DEFAULT_STEPS = 72  # of gradient descent: the knee of error against seconds (docs/plan.md)
+DEFAULT_HALF_STEPS = 96  # likewise, on views half the size
 MOST_STEPS = 400  # where a target or a time asks for as many as it takes
 FEWEST_STEPS = 8  # less is not worth the views
 ENOUGH_STEPS = 24  # as good as back-projection; fewer are taken after it
@@ -31,6 +33,8 @@ PROBE = 80  # pixels along the edge of the view that is timed
 SORT = 0.95e-3
 CLOSED_FORM = 1.0, 1.9, 0.3  # always, per 10^6 cells, per 10^6 voxels in bricks that are not empty
 STEP = 0.015, 0.042  # per 400 x 400 px, per 100,000 Gaussians
+HALF_STEP = 0.008, 0.022  # likewise, on a view half the size
+SMALLEST_HALF = 64  # pixels along the edge of a view half the size
 BACK_PROJECTION = 120.0  # steps
 NETWORK = 0.5, 4.0  # always, per 100,000 Gaussians (docs/network.md)
 VIEW = 1.1  # of the view that is timed
@@ -93,7 +97,7 @@ class Costs:
         view: a view to fit to.
         back_projection: of 24 views.
         network: one pass of a network.
-        step: of gradient descent, with its share of the looks at check views.
+        step: of gradient descent, with its share of the looks at check views; ``half_step`` on a view half the size.
         score: test views.
         write: the file.
         memory: of the whole process at its most, bytes, without its views.
@@ -105,6 +109,7 @@ class Costs:
     back_projection: float
     network: float
     step: float
+    half_step: float
     score: float
     write: float
     memory: float
@@ -112,7 +117,7 @@ class Costs:
 
     def at(self, pace: float) -> Costs:
         """The same on a machine that takes ``pace`` times as long; what was timed, and what is small, stays."""
-        names = ("closed_form", "back_projection", "network", "step")
+        names = ("closed_form", "back_projection", "network", "step", "half_step")
         return replace(self, **{name: getattr(self, name) * pace for name in names})
 
 
@@ -126,6 +131,7 @@ class Plan:
         steps: of gradient descent, as many as there should be time for.
         most_steps: where there is more time than that.
         network: model that improves the Gaussians before the steps, or None.
+        half: training views are half the size: descent gains as much from them in half the time.
         judge: there is time for check views where a target asks for them.
         seconds, bytes, memory: estimates of the whole run, its file, its memory at most.
         stages: (stage, seconds) estimates in order.
@@ -137,6 +143,7 @@ class Plan:
     steps: int = 0
     most_steps: int = 0
     network: str | None = None
+    half: bool = False
     judge: bool = True
     seconds: float = 0.0
     bytes: int = 0
@@ -168,6 +175,8 @@ class Planner:
         gaussians: budget.
         steps: of gradient descent that the user asks for; None: the plan's choice.
         sh_degree: harmonics in the file.
+        size: pixels along an image's edge.
+        wide: Gaussians are wide enough to be seen in views half the size.
         model: network that the user asks for.
     """
 
@@ -175,6 +184,8 @@ class Planner:
     gaussians: int
     steps: int | None
     sh_degree: int
+    size: int
+    wide: bool = True
     model: str | None = None
 
     def plan(self, costs: Costs, spent: float, begun: bool = False) -> Plan:
@@ -187,7 +198,8 @@ class Planner:
         if self.limits.time_budget is not None:
             left = self.limits.time_budget - sum(seconds for _, seconds in [*plan.stages, *last])
         self._views(plan, costs, left)
-        plan.memory += (views_of(plan.steps) + SET_VIEWS["check"]) * costs.view_memory
+        views = views_of(plan.steps) * (HALF if plan.half else 1) + SET_VIEWS["check"]
+        plan.memory += views * costs.view_memory
         plan.stages += last
         plan.seconds = sum(seconds for _, seconds in plan.stages)
         return plan
@@ -195,17 +207,19 @@ class Planner:
     def _views(self, plan: Plan, costs: Costs, left: float | None) -> None:
         """What needs views: gradient descent, as asked for, as long as there is time, or as much as pays."""
         open_end = self.limits.target_psnr is not None or left is not None
-        steps = self.steps if self.steps is not None else MOST_STEPS if open_end else DEFAULT_STEPS
         left = self._network(plan, costs, left)
-        wanted = steps
-        while left is not None and steps > 0 and _refinement(costs, steps) > left:
+        few = self.steps is not None and self.steps < ENOUGH_STEPS and left is None
+        half = self.wide and not few and self.model is None and self.size % 2 == 0 and self.size >= 2 * SMALLEST_HALF
+        usual = DEFAULT_HALF_STEPS if half else DEFAULT_STEPS
+        steps = wanted = self.steps if self.steps is not None else MOST_STEPS if open_end else usual
+        while left is not None and steps > 0 and _refinement(costs, steps, half) > left:
             steps = min(steps - 1, int(steps * 0.9))
         if wanted and steps >= min(FEWEST_STEPS, wanted):
-            plan.steps, plan.most_steps = steps, wanted
-            plan.stages.append((f"views, {steps} steps", _refinement(costs, steps)))
+            plan.steps, plan.most_steps, plan.half = steps, wanted, half
+            plan.stages.append((f"views, {steps} steps", _refinement(costs, steps, half)))
             if self.model is None:
                 plan.left_out.append(("network", "gradient descent gains more in its time; --model runs it"))
-            if wanted < ENOUGH_STEPS and left is None:
+            if few:
                 plan.back_project = True
                 plan.stages.append(("back-projection", costs.back_projection))
             else:
@@ -216,7 +230,7 @@ class Planner:
 
     def _without_steps(self, plan: Plan, costs: Costs, left: float | None) -> None:
         """Back-projection instead, if there is time, and whether there is any for check views."""
-        views = _refinement(costs, 0)
+        views = _refinement(costs, 0, False)
         plan.back_project = left is None or left >= views + costs.back_projection
         if plan.back_project:
             plan.stages.append(("back-projection", views + costs.back_projection))
@@ -231,7 +245,7 @@ class Planner:
         """The network, where one is asked for and there is time; returns what is left."""
         if self.model is None:
             return left
-        if left is not None and left < costs.network + _refinement(costs, 0):
+        if left is not None and left < costs.network + _refinement(costs, 0, False):
             plan.left_out.append(("network", f"about {costs.network:.1f} s, {_room(left)}"))
             return left
         plan.network = self.model
@@ -243,9 +257,10 @@ def _room(left: float | None) -> str:
     return f"{max(left or 0.0, 0.0):.1f} s are left"
 
 
-def _refinement(costs: Costs, steps: int) -> float:
-    """Seconds of so many steps, with their views; check views are finer."""
-    return steps * costs.step + (views_of(steps) + FINER * SET_VIEWS["check"]) * costs.view
+def _refinement(costs: Costs, steps: int, half: bool) -> float:
+    """Seconds of so many steps, with their views, ``half`` the size or whole; check views are finer, and whole."""
+    step, share = (costs.half_step, HALF) if half else (costs.step, 1.0)
+    return steps * step + (views_of(steps) * share + FINER * SET_VIEWS["check"]) * costs.view
 
 
 def estimate(scene: Scene, size: int, gaussians: int, all_views: bool = False) -> Costs:
@@ -259,7 +274,7 @@ def estimate(scene: Scene, size: int, gaussians: int, all_views: bool = False) -
     cells, pixels, pace = expected_cells(scene, size), (size / 400) ** 2, _pace()
     voxels = np.count_nonzero(scene.empty == 0) * BRICK**3
     count = min(gaussians, cells)
-    step = pace * (STEP[0] * pixels + STEP[1] * count / 1e5)
+    step, half_step = (pace * (each[0] * pixels + each[1] * count / 1e5) for each in (STEP, HALF_STEP))
     view = VIEW * _view_seconds(scene, size)
     views, beside = SCORE_ALL if all_views else SCORE
     return Costs(
@@ -268,6 +283,7 @@ def estimate(scene: Scene, size: int, gaussians: int, all_views: bool = False) -
         back_projection=BACK_PROJECTION * step,
         network=pace * (NETWORK[0] + NETWORK[1] * count / 1e5),
         step=step,
+        half_step=half_step,
         score=views * (FINER * view + pace * beside * pixels),
         write=pace * 0.1,
         memory=MEMORY[0] + _volume_bytes(scene) + MEMORY[1] * cells + MEMORY[2] * count,

@@ -47,11 +47,13 @@ def project(gaussians: Gaussians, camera: Camera, dilation: float = DILATION) ->
     return _projected(kernel.project, (g.means, g.log_scales, g.quaternions, g.opacity_logits), camera, dilation)
 
 
-def project_factors(means: np.ndarray, factors: np.ndarray, logits: np.ndarray, camera: Camera) -> Projection:
+def project_factors(
+    means: np.ndarray, factors: np.ndarray, logits: np.ndarray, camera: Camera, dilation: float = DILATION
+) -> Projection:
     """`project` for covariances ``M M^T``: means (K, 3), factors (K, 3, 3) M, logits (K,), all float32."""
     from vvgt_cli.splat import kernel
 
-    return _projected(kernel.project_factors, (means, factors, logits), camera, DILATION)
+    return _projected(kernel.project_factors, (means, factors, logits), camera, dilation)
 
 
 def _projected(
