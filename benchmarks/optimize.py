@@ -47,7 +47,7 @@ def part_calls(gaussians: Gaussians, target: np.ndarray) -> dict[str, Callable[[
     loss_gradient(image, target, *weights, grad)
     pairs = moments(p, colors, image, grad)
     slopes = own_frame_backward(means, factors, colors, camera, p, pairs)
-    still = np.zeros(5), state.CLIPS, state.pixel, *state.BETAS, 1  # rates 0: the scene stays as it is
+    still = np.zeros(5), state.CLIPS, state.spread, *state.BETAS, 1  # rates 0: the scene stays as it is
     tiles_y = -(-camera.height // 16)
     return {
         "project": lambda: project_factors(means, factors, logits, *pose(camera), DILATION, *scratch),

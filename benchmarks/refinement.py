@@ -5,12 +5,13 @@
     PYTHONPATH=. python benchmarks/refinement.py table docs/refine-equal.csv
 
 400 px, K = 100,000, RGB dB on the ten test views (half-voxel steps, adaptive rays), wall seconds. `equal` starts both
-from the closed form: 100 steps of Adam on the file's fields with 3DGS' loss (SSIM included) on 24 views of one ray a
-pixel and steps of a voxel, and our steps for as long as those took, views included on both sides. `curve`: every point
-is a run of its own from the prepared scene on, views and closed form included. `ours` starts from the closed form as it
-is (without steps: back-projected), `adam` from the back-projected one; `3dgs` from 10,000 uniform samples that grow as
-in 3DGS, `ivr-gs` from as many uniform samples as the limit, with the function's colours, none added; both with 3DGS'
-loss and Adam, on 72 views.
+from the back-projected closed form: 100 steps of Adam on the file's fields with 3DGS' loss (SSIM included) on 24 views
+of one ray a pixel and steps of a voxel, and our steps on 72 views, as `convert` renders them (half the size where it
+does), for as long as those took, views included on both sides. `curve`: every point is a run of its own from the
+prepared scene on, views and closed form included. `ours` starts from the closed form as it is (without steps:
+back-projected), `adam` from the back-projected one; `3dgs` from 10,000 uniform samples that grow as in 3DGS, `ivr-gs`
+from as many uniform samples as the limit, with the function's colours, none added; both with 3DGS' loss and Adam, on 72
+views.
 """
 
 from __future__ import annotations
@@ -29,14 +30,16 @@ from vvgt_cli.dvr.render import FIT_VIEWS
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.metrics import score_views
 from vvgt_cli.optimize import LOSS_3DGS, OptimizeOptions, optimize
-from vvgt_cli.pipeline.mend import fine_enough
+from vvgt_cli.pipeline.mend import fine_enough, wide
 from vvgt_cli.pipeline.optimize import Views
-from vvgt_cli.pipeline.plan import views_of
+from vvgt_cli.pipeline.plan import REFINE_VIEWS, views_of
 from vvgt_cli.splat import render
+from vvgt_cli.splat.constants import DILATION
+from vvgt_cli.splat.half import HALF
 from vvgt_cli.vbm import VbmOptions, backproject, initialise
 
-K, ADAM_STEPS, BASE_VIEWS = 100_000, 100, 72
-STEPS = {"ours": (0, 24, 72, 144, 400), "adam": (25, 100, 200), "3dgs": (300, 1000), "ivr-gs": (300, 1000)}
+K, SIZE, ADAM_STEPS, BASE_VIEWS = 100_000, 400, 100, 72
+STEPS = {"ours": (0, 24, 48, 96, 144, 400), "adam": (25, 100, 200), "3dgs": (300, 1000), "ivr-gs": (300, 1000)}
 
 
 class Judged:
@@ -68,15 +71,22 @@ def equal_row(judged: Judged) -> dict[str, Any]:
     adam, _ = judged.refined(start, train, images, OptimizeOptions(steps=ADAM_STEPS, method="adam", **LOSS_3DGS))
     budget = time.perf_counter() - began
     began = time.perf_counter()
-    cameras = default_views("train", views_of(ADAM_STEPS))
-    settings = fine_enough(judged.scene, judged.check, start)
-    images = render_views(judged.scene, cameras, settings)
+    cameras, images, dilation = training_views(judged, start, REFINE_VIEWS)
     views = time.perf_counter() - began
-    ours, record = judged.refined(start, cameras, images, OptimizeOptions(steps=None, time_budget=budget - views))
+    options = OptimizeOptions(steps=None, time_budget=budget - views, dilation=dilation)
+    ours, record = judged.refined(start, cameras, images, options)
     return {
         "closed_form": judged.psnr(start), "adam": judged.psnr(adam), "ours": judged.psnr(ours), "adam_s": budget,
         "ours_s": views + record.seconds, "views": len(cameras), "views_s": views, "steps": record.steps,
     }  # fmt: skip
+
+
+def training_views(judged: Judged, start: Gaussians, count: int) -> tuple[list[Camera], np.ndarray, float]:
+    """As `convert` makes them: cameras, images, dilation."""
+    half = wide(start, SIZE)
+    cameras = default_views("train", count, size=SIZE // 2 if half else SIZE)
+    images = render_views(judged.scene, cameras, fine_enough(judged.scene, judged.check, start, half))
+    return cameras, images, DILATION * HALF if half else DILATION
 
 
 def begin(judged: Judged, method: str, steps: int) -> Gaussians:
@@ -93,13 +103,14 @@ def point(judged: Judged, method: str, steps: int) -> dict[str, Any]:
     began = time.perf_counter()
     start = begin(judged, method, steps)
     if steps:
-        count = views_of(steps) if method == "ours" else 24 if method == "adam" else BASE_VIEWS
-        cameras = default_views("train", count)
-        settings = fine_enough(judged.scene, judged.check, start) if method == "ours" else FIT_VIEWS
-        images = render_views(judged.scene, cameras, settings)
-        name = {"ours": "frame", "ivr-gs": "adam"}.get(method, method)
-        loss = {} if method == "ours" else LOSS_3DGS
-        options = OptimizeOptions(steps=steps, method=name, max_gaussians=K, **loss)
+        if method == "ours":
+            cameras, images, dilation = training_views(judged, start, views_of(steps))
+            options = OptimizeOptions(steps=steps, dilation=dilation)
+        else:
+            cameras = default_views("train", 24 if method == "adam" else BASE_VIEWS)
+            images = render_views(judged.scene, cameras, FIT_VIEWS)
+            name = "adam" if method == "ivr-gs" else method
+            options = OptimizeOptions(steps=steps, method=name, max_gaussians=K, **LOSS_3DGS)
         start, _ = judged.refined(start, cameras, images, options)
     seconds = time.perf_counter() - began
     return {"method": method, "steps": steps, "seconds": seconds, "psnr": judged.psnr(start), "gaussians": len(start)}
