@@ -23,7 +23,9 @@ from vvgt_cli.progress import Console
 from vvgt_cli.splat import project, render, render_backward_reference, render_reference
 from vvgt_cli.synth.shapes import make_shape
 from vvgt_cli.training import LossConfig, SceneConfig, TrainConfig
-from vvgt_cli.training.scenes import prepare_scenes, recipes
+from vvgt_cli.training.scenes import make_scenes, prepare_scenes, recipes, together
+from vvgt_cli.transfer.readers import minimal
+from vvgt_cli.transfer.suggest import Suggestion
 from vvgt_cli.volume.nrrd_write import write_nrrd
 
 torch = pytest.importorskip("torch")
@@ -41,7 +43,7 @@ STEPPER = replace(
 CONFIG = TrainConfig(
     network=STEPPER,
     scenes=SceneConfig(size=32, gaussians=(300, 500), functions=4, held_functions=(1,), per_volume=1,
-                       densities=(4.0,), inputs=4, targets=2, held=2),
+                       densities=(4.0, 4.0), inputs=4, targets=2, held=2),
     loss=LossConfig(l1=0.5, ssim=0.2, decibel=1.0),
     steps=4, batch=2, views=2, rate=1e-3, last_rate=1e-5, warmup=1, check_every=2, save_every=1,
 )  # fmt: skip
@@ -141,10 +143,54 @@ def test_configurations_survive_yaml_and_faults_are_named(tmp_path):
 
 def test_held_out_functions_and_volumes_are_not_trained_on(data):
     found = recipes(data, CONFIG.scenes)
-    assert {r.function for r in found["train"]}.isdisjoint({1})
-    assert {r.function for r in found["held functions"]} == {1}
+    assert {f for r in found["train"] for f in r.functions} <= {0, 2, 3}
+    assert {r.functions for r in found["held functions"]} == {(1,)}
     assert {r.volume for r in found["train"]}.isdisjoint({r.volume for r in found["held volumes"]})
     assert found == recipes(data, CONFIG.scenes)
+
+
+def test_recipes_keep_to_the_ranges_of_the_configuration(data):
+    several = replace(CONFIG.scenes, size=[32, 64], bands=[1, 3], densities=[0.5, 8.0], per_volume=40)
+    found = recipes(data, several)["train"]
+    assert len(found) == 80
+    assert {r.size for r in found} == {32, 64}
+    assert {len(r.functions) for r in found} == {1, 2, 3}
+    assert all(len(set(r.functions)) == len(r.functions) == len(r.densities) for r in found)
+    assert all(0.5 <= factor <= 8 for r in found for factor in r.densities)
+    small, large = ([r.gaussians for r in found if r.size == size] for size in (32, 64))
+    assert 300 <= min(small) < max(small) <= 500 < 2**1.3 * 300 <= min(large) <= max(large) <= 2**1.3 * 500
+    with pytest.raises(UsageError, match="bands"):
+        replace(several, bands=(2, 4))  # three functions are trained on
+    with pytest.raises(UsageError, match="densities"):
+        replace(several, densities=(0.0, 1.0))
+
+
+def test_processes_make_shares_of_the_scenes(data):
+    scenes = replace(CONFIG.scenes, seed=5)
+    count = lambda: len(list((data / "scenes").iterdir()))  # noqa: E731
+    (data / "scenes").mkdir(exist_ok=True)
+    before = count()
+    for rank in (0, 1):
+        make_scenes(data, scenes, Console(quiet=True), (rank, 2))
+        assert before < count()
+    made = count()
+    assert len(prepare_scenes(data, scenes, Console(quiet=True))["train"]) == 2
+    assert count() == made
+
+
+def test_functions_together_show_each_where_it_is():
+    band = lambda lo, hi, opacity: Suggestion(  # noqa: E731
+        "band", np.array([lo, hi]), np.array([opacity, opacity]), np.array([[1.0, 0, 0], [0, 1.0, 0]]), 2.0, 0.1
+    )
+    alone = minimal.read(together([band(0, 1, 0.1)], [1.0]), "t")
+    assert np.allclose(alone.opacity(np.array([0.25, 0.5])), 0.1)
+    denser = minimal.read(together([band(0, 1, 0.1)], [3.0]), "t")
+    assert np.allclose(denser.opacity(np.array([0.5])), 1 - 0.9**3)
+    both = minimal.read(together([band(0, 1, 0.1), band(0, 1, 0.3)], [1.0, 1.0]), "t")
+    assert np.allclose(both.opacity(np.array([0.5])), 0.4)
+    solid = together([band(0, 1, 0.9), band(0, 1, 0.9)], [8.0, 8.0])
+    assert max(point["opacity"] for point in solid["points"]) < 1
+    assert solid["opacity_unit_distance"] == 2.0
 
 
 def test_scenes_hold_what_the_closed_form_and_the_ray_caster_give(data):

@@ -7,7 +7,7 @@ import click
 from vvgt_cli.cli.options import common_options, overwrite_option
 from vvgt_cli.progress import Console
 
-KINDS = ("isotropic", "stratified", "shells", "tubes", "plates", "noise", "wells")
+KINDS = ("isotropic", "stratified", "shells", "tubes", "plates", "noise", "wells", "bodies")
 
 
 @click.command("synth", short_help="Make a volume: turbulence, or shapes as CT and MR show them.")
@@ -35,8 +35,8 @@ def command(
 
     KIND: isotropic (forced turbulence) and stratified (rotating, stratified turbulence with its temperature), solved
     by a pseudo-spectral method; shells (nested bodies), tubes (vessels), plates (sharp machined parts), noise (of all
-    scales), wells (smooth bumps, as molecules' potentials). Turbulence takes about a minute a turnover at 64 on a core,
-    sixteen times as long at 128.
+    scales), wells (smooth bumps, as molecules' potentials), bodies (shells with vessels, metal and noise). Turbulence
+    takes about a minute a turnover at 64 on a core, sixteen times as long at 128.
 
     \b
     Example:

@@ -1,4 +1,4 @@
-"""Shapes as CT, MR and simulations show them: nested shells, tubes, plates, noise, wells. float32, values near [0, 1].
+"""Shapes as CT, MR and simulations show them, see `SHAPES`. float32, values near [0, 1].
 
 A seed gives one volume on every machine but for the last bits of its Fourier transforms.
 """
@@ -129,12 +129,26 @@ def wells(size: int, seed: int) -> np.ndarray:
     return (field - field.min()) / (field.max() - field.min())
 
 
+def bodies(size: int, seed: int) -> np.ndarray:
+    """Shells with vessels in and around most of them, metal parts in some, and the noise of a scanner."""
+    rng = np.random.default_rng([seed, 1])
+    out = shells(size, seed)
+    if rng.random() < 0.8:
+        vessels = tubes(size, seed)
+        out += np.clip((vessels - 0.2) * 6, 0, 1) * (vessels * rng.uniform(0.6, 1.4) - out)
+    if rng.random() < 0.4:
+        parts = plates(size, seed)
+        out = np.where(parts > 0, parts * rng.uniform(0.5, 1.2), out)
+    return out + rng.uniform(0, 0.05) * _field(rng, size, rng.uniform(0.3, 1.5), size / 3)
+
+
 SHAPES: dict[str, Callable[[int, int], np.ndarray]] = {
     "shells": shells,
     "tubes": tubes,
     "plates": plates,
     "noise": noise,
     "wells": wells,
+    "bodies": bodies,
 }
 
 

@@ -11,6 +11,7 @@ from vvgt_cli.network import NAMED, NetworkConfig
 from vvgt_cli.vbm import METHODS
 
 INSTALL = "install vvgt[train]"
+GROWTH = 1.3  # of Gaussians with the size of images
 
 
 @dataclass(frozen=True)
@@ -18,36 +19,41 @@ class SceneConfig:
     """Which scenes are made of the volumes.
 
     Attributes:
-        size: pixels along an image's edge.
-        gaussians: fewest and most Gaussians of a scene, drawn evenly by their logarithm.
+        size: pixels along an image's edge, or several, of which each scene gets one.
+        gaussians: fewest and most Gaussians of a scene at the first size, drawn evenly by their logarithm; as many more
+            as the size is larger, to the power `GROWTH`.
         start: what the network is given, a method of `vvgt_cli.vbm`; "uniform" for the ablation "wo_vbm".
         mended: with what the views can mend, as `vvgt convert` hands it on; without, the closed form alone.
         functions: transfer functions suggested a volume.
         held_functions: those of them (from 0) that are never trained on.
         per_volume: functions trained on, of each volume.
-        densities: factors of extinction, one drawn for each scene: fog and solid bodies.
+        bands: fewest and most of the suggested functions in a scene's function.
+        densities: least and largest factor of a band's extinction, drawn evenly by its logarithm: fog and solid bodies.
         inputs: views that the network may be shown, the default training set.
         targets: other views, that the loss is taken on.
         held: scenes of held-out volumes, and as many of held-out functions.
         seed: of what is drawn here.
     """
 
-    size: int = 256
+    size: int | tuple[int, ...] = 256
     gaussians: tuple[int, int] = (8_000, 40_000)
     start: str = "vbm"
     mended: bool = True
     functions: int = 10
     held_functions: tuple[int, ...] = (3, 7)
     per_volume: int = 3
-    densities: tuple[float, ...] = (1.0, 8.0)
+    bands: tuple[int, int] = (1, 1)
+    densities: tuple[float, float] = (1.0, 8.0)
     inputs: int = 24
     targets: int = 8
     held: int = 8
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("gaussians", "held_functions", "densities"):
+        for name in ("gaussians", "held_functions", "bands", "densities"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
+        if not isinstance(self.size, int):
+            object.__setattr__(self, "size", tuple(self.size))
         if self.start not in METHODS:
             raise UsageError(f"scenes.start {self.start!r}: expected one of {', '.join(METHODS)}")
         if len(self.gaussians) != 2 or not 1 <= self.gaussians[0] <= self.gaussians[1]:
@@ -55,8 +61,17 @@ class SceneConfig:
         trained = self.functions - len(set(self.held_functions))
         if not 1 <= self.per_volume <= trained or not set(self.held_functions) <= set(range(self.functions)):
             raise UsageError(f"scenes.per_volume {self.per_volume}: expected 1 to the {trained} functions not held out")
-        if min(self.size, self.inputs, self.targets, self.held) < 1 or not self.densities or min(self.densities) <= 0:
-            raise UsageError("scenes: size, inputs, targets and held must be at least 1, densities above 0")
+        if len(self.bands) != 2 or not 1 <= self.bands[0] <= self.bands[1] <= trained:
+            raise UsageError(f"scenes.bands {self.bands}: expected the fewest and the most, 1 to {trained}")
+        if len(self.densities) != 2 or not 0 < self.densities[0] <= self.densities[1]:
+            raise UsageError(f"scenes.densities {self.densities}: expected the least and the largest, above 0")
+        if not self.sizes or min(*self.sizes, self.inputs, self.targets, self.held) < 1:
+            raise UsageError("scenes: size, inputs, targets and held must be at least 1")
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """All sizes of images."""
+        return (self.size,) if isinstance(self.size, int) else self.size
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from vvgt_cli.training.config import TrainConfig, config_text, read_config
 from vvgt_cli.training.parallel import World, world
 from vvgt_cli.training.record import Recorder
 from vvgt_cli.training.sample import Feeder, judge, learn
-from vvgt_cli.training.scenes import TrainingScene, prepare_scenes
+from vvgt_cli.training.scenes import TrainingScene, make_scenes, prepare_scenes
 
 LAST, BEST, CONFIG = "last.pt", "best.pt", "config.yaml"
 Scenes = dict[str, list[TrainingScene]]
@@ -64,9 +64,10 @@ def train(config: TrainConfig, data: str, output: str, console: Console) -> int:
         talk = console if here.first else Console(quiet=True)
         if here.first:
             _open_run(folder, config)
-            prepare_scenes(Path(data), config.scenes, console)
         here.wait()
-        scenes = prepare_scenes(Path(data), config.scenes, Console(quiet=True))
+        make_scenes(Path(data), config.scenes, talk, (here.rank, here.size))
+        here.wait()
+        scenes = prepare_scenes(Path(data), config.scenes, talk)
         torch.manual_seed(config.seed)
         run = _Run(config, data, folder, here, scenes, talk)
         return run.to_the_end(ended)

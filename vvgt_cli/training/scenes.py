@@ -22,9 +22,10 @@ from vvgt_cli.cameras.sets import fibonacci_views
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.progress import Console
-from vvgt_cli.training.config import SceneConfig
+from vvgt_cli.training.config import GROWTH, SceneConfig
+from vvgt_cli.transfer.suggest import Suggestion
 
-VERSION = 1  # raised when scenes are made otherwise
+VERSION = 2  # raised when scenes are made otherwise
 FEWEST = 256  # Gaussians: a scene with less shows next to nothing
 FULL = 65535  # images are kept as uint16
 TARGET_SHIFT = 0.31  # of the targets' Fibonacci sphere: none of the three default sets'
@@ -36,14 +37,16 @@ class Recipe:
 
     Attributes:
         volume: file.
-        function: number of the suggested function, from 0.
-        density: factor of extinction.
+        functions: numbers of the suggested functions that are shown at once, from 0.
+        densities: factors of their extinction.
+        size: pixels along an image's edge.
         gaussians: budget.
     """
 
     volume: str
-    function: int
-    density: float
+    functions: tuple[int, ...]
+    densities: tuple[float, ...]
+    size: int
     gaussians: int
 
 
@@ -82,16 +85,19 @@ def recipes(folder: Path, config: SceneConfig) -> dict[str, list[Recipe]]:
     held = sorted(set(config.held_functions))
     trained = [f for f in range(config.functions) if f not in held]
 
-    def make(volume: str, function: int) -> Recipe:
-        low, high = np.log(config.gaussians)
-        budget = round(float(np.exp(rng.uniform(low, high))))
-        return Recipe(volume, int(function), float(rng.choice(config.densities)), budget)
+    def make(volume: str, functions: list[int]) -> Recipe:
+        count = min(int(rng.integers(config.bands[0], config.bands[1] + 1)), len(functions))
+        chosen = tuple(int(f) for f in rng.permutation(functions)[:count])
+        even = lambda limits: np.exp(rng.uniform(*np.log(limits)))  # noqa: E731
+        densities = tuple(float(even(config.densities)) for _ in chosen)
+        size = int(rng.choice(config.sizes))
+        budget = round(float(even(config.gaussians) * (size / config.sizes[0]) ** GROWTH))
+        return Recipe(volume, chosen, densities, size, budget)
 
-    train = [make(v, f) for v in volumes["train"] for f in rng.permutation(trained)[: config.per_volume]]
     return {
-        "train": train,
-        "held volumes": [make(v, rng.choice(trained)) for v in _some(volumes["held"], config.held)],
-        "held functions": [make(v, rng.choice(held)) for v in _some(volumes["train"], config.held) if held],
+        "train": [make(v, trained) for v in volumes["train"] for _ in range(config.per_volume)],
+        "held volumes": [make(v, trained) for v in _some(volumes["held"], config.held)],
+        "held functions": [make(v, held) for v in _some(volumes["train"], config.held) if held],
     }
 
 
@@ -109,6 +115,21 @@ def _some(entries: Sequence[str], count: int) -> list[str]:
     return [entries[i * len(entries) // count if len(entries) >= count else i % len(entries)] for i in range(count)]
 
 
+def make_scenes(folder: Path, config: SceneConfig, console: Console, share: tuple[int, int]) -> None:
+    """Make the scenes that are not there yet: of ``share`` (i, n) every n-th, from i.
+
+    Raises:
+        UsageError, DataError: see `prepare_scenes`.
+    """
+    (folder / "scenes").mkdir(exist_ok=True)
+    for part, wanted in recipes(folder, config).items():
+        for number, recipe in enumerate(wanted):
+            place = folder / "scenes" / _key(recipe, config)
+            if number % share[1] == share[0] and not place.exists():
+                _make(place, recipe, config)
+                console.say(f"scene {number + 1} of {len(wanted)} ({part}): {_about(place)['name']}")
+
+
 def prepare_scenes(folder: Path, config: SceneConfig, console: Console) -> dict[str, list[TrainingScene]]:
     """All scenes, those made that are not there yet; a scene that shows next to nothing is left out.
 
@@ -116,16 +137,10 @@ def prepare_scenes(folder: Path, config: SceneConfig, console: Console) -> dict[
         UsageError: see `recipes`; also data of which no scene is left.
         DataError: a volume that cannot be read.
     """
-    (folder / "scenes").mkdir(exist_ok=True)
+    make_scenes(folder, config, console, (0, 1))
     out: dict[str, list[TrainingScene]] = {}
     for part, wanted in recipes(folder, config).items():
-        places = []
-        for number, recipe in enumerate(wanted):
-            place = folder / "scenes" / _key(recipe, config)
-            if not place.exists():
-                _make(place, recipe, config)
-                console.say(f"scene {number + 1} of {len(wanted)} ({part}): {_about(place)['name']}")
-            places.append(place)
+        places = [folder / "scenes" / _key(recipe, config) for recipe in wanted]
         out[part] = [_load(place, config) for place in places if _about(place)["gaussians"] >= FEWEST]
         if not out[part]:
             raise UsageError(f"--data {folder}: no scene left ({part}); other volumes may show more")
@@ -137,10 +152,9 @@ def _key(recipe: Recipe, config: SceneConfig) -> str:
     """Hash of all that a scene depends on."""
     with open(recipe.volume, "rb") as stream:
         content = hashlib.file_digest(stream, "sha256").hexdigest()
-    whole = {
-        name: asdict(config)[name] for name in ("size", "start", "mended", "functions", "inputs", "targets", "seed")
-    }
-    text = json.dumps([VERSION, content, recipe.function, recipe.density, recipe.gaussians, whole])
+    whole = {name: asdict(config)[name] for name in ("start", "mended", "functions", "inputs", "targets", "seed")}
+    drawn = {name: value for name, value in asdict(recipe).items() if name != "volume"}
+    text = json.dumps([VERSION, content, drawn, whole])
     return hashlib.sha256(text.encode()).hexdigest()[:20]
 
 
@@ -149,10 +163,10 @@ def _about(place: Path) -> dict[str, Any]:
     return about
 
 
-def view_sets(config: SceneConfig) -> tuple[list[Camera], list[Camera]]:
+def view_sets(config: SceneConfig, size: int) -> tuple[list[Camera], list[Camera]]:
     """Cameras to show and cameras of the loss."""
-    shown = default_views("train", config.inputs, size=config.size)
-    return shown, fibonacci_views(config.targets, TARGET_SHIFT, size=config.size, name="target")
+    shown = default_views("train", config.inputs, size=size)
+    return shown, fibonacci_views(config.targets, TARGET_SHIFT, size=size, name="target")
 
 
 def _make(place: Path, recipe: Recipe, config: SceneConfig) -> None:
@@ -186,16 +200,18 @@ def _render(recipe: Recipe, config: SceneConfig) -> tuple[str, Gaussians, np.nda
 
     volume = open_volume(recipe.volume)
     numbers = statistics(volume)
-    chosen = suggest(numbers, config.functions, sum(volume.dims) / 3, sum(volume.spacing) / 3)[recipe.function]
-    function: Any = minimal.read(json.loads(chosen.to_json()), chosen.name)
-    distance = chosen.unit_distance / recipe.density
-    scene = Scene.build(volume, function, distance, (numbers.lo, numbers.hi))
-    options = VbmOptions(recipe.gaussians, config.size, config.start, config.seed)
+    size = recipe.size
+    bands = suggest(numbers, config.functions, sum(volume.dims) / 3, sum(volume.spacing) / 3)
+    chosen = [bands[number] for number in recipe.functions]
+    function: Any = minimal.read(together(chosen, recipe.densities), "bands")
+    scene = Scene.build(volume, function, chosen[0].unit_distance, (numbers.lo, numbers.hi))
+    options = VbmOptions(recipe.gaussians, size, config.start, config.seed)
     begun = initialise(scene, options)
-    name = f"{Path(recipe.volume).stem}, {chosen.name}, density x {recipe.density:g}"
-    shown, targets = view_sets(config)
+    parts = [f"{band.name} x {factor:.2g}" for band, factor in zip(chosen, recipe.densities, strict=True)]
+    name = f"{Path(recipe.volume).stem}, {size} px, {' and '.join(parts)}"
+    shown, targets = view_sets(config, size)
     if len(begun.gaussians) < FEWEST:
-        return name, begun.gaussians, np.zeros((0, config.size, config.size, 4), np.float32)
+        return name, begun.gaussians, np.zeros((0, size, size, 4), np.float32)
     images = render_views(scene, [*shown, *targets], RenderSettings(step=0.5, samples=2))
     gaussians = begun.gaussians
     if config.mended:
@@ -203,11 +219,29 @@ def _render(recipe: Recipe, config: SceneConfig) -> tuple[str, Gaussians, np.nda
     return name, gaussians, images
 
 
+def together(bands: Sequence[Suggestion], factors: Sequence[float]) -> dict[str, Any]:
+    """One function that shows all ``bands``, extinctions times ``factors``: the minimal JSON form, per their distance.
+
+    Opacities of bands that overlap add up, below 1; colours are means by opacity.
+    """
+    x = np.unique(np.concatenate([band.x for band in bands]))
+    opacity, light = np.zeros(len(x)), np.zeros((len(x), 3))
+    for band, factor in zip(bands, factors, strict=True):
+        own = 1 - (1 - np.interp(x, band.x, band.opacity, left=0, right=0)) ** factor
+        opacity += own
+        light += own[:, None] * np.column_stack([np.interp(x, band.x, channel) for channel in band.rgb.T])
+    rgb = np.where(opacity[:, None] > 0, light / np.maximum(opacity, 1e-12)[:, None], bands[0].rgb[0])
+    points = [
+        {"x": float(v), "rgb": [float(c) for c in color], "opacity": float(o)}
+        for v, color, o in zip(x, np.clip(rgb, 0, 1), np.minimum(opacity, 0.999), strict=True)
+    ]
+    return {"name": "bands", "opacity_unit_distance": bands[0].unit_distance, "points": points}
+
+
 def _load(place: Path, config: SceneConfig) -> TrainingScene:
     with np.load(place / "gaussians.npz") as file:
         gaussians = Gaussians(**{name: file[name] for name in file.files})
     images = np.load(place / "images.npy", mmap_mode="r")
-    shown, targets = view_sets(config)
-    return TrainingScene(
-        str(_about(place)["name"]), gaussians, shown, images[: len(shown)], targets, images[len(shown) :]
-    )
+    about = _about(place)
+    shown, targets = view_sets(config, about["size"])
+    return TrainingScene(str(about["name"]), gaussians, shown, images[: len(shown)], targets, images[len(shown) :])
