@@ -35,7 +35,7 @@ from vvgt_cli.pipeline.optimize import Views
 from vvgt_cli.pipeline.plan import REFINE_VIEWS, views_of
 from vvgt_cli.splat import render
 from vvgt_cli.splat.constants import DILATION
-from vvgt_cli.splat.half import HALF
+from vvgt_cli.splat.half import QUARTER
 from vvgt_cli.vbm import VbmOptions, backproject, initialise
 
 K, SIZE, ADAM_STEPS, BASE_VIEWS = 100_000, 400, 100, 72
@@ -86,7 +86,7 @@ def training_views(judged: Judged, start: Gaussians, count: int) -> tuple[list[C
     half = wide(start, SIZE)
     cameras = default_views("train", count, size=SIZE // 2 if half else SIZE)
     images = render_views(judged.scene, cameras, fine_enough(judged.scene, judged.check, start, half))
-    return cameras, images, DILATION * HALF if half else DILATION
+    return cameras, images, DILATION * QUARTER if half else DILATION
 
 
 def begin(judged: Judged, method: str, steps: int) -> Gaussians:

@@ -11,13 +11,19 @@ from onnx_models import write_model
 from test_cli_infer import DARKER
 
 from vvgt_cli.cameras import default_views
+from vvgt_cli.dvr import Scene, render_views
 from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply
 from vvgt_cli.pipeline.convert import ConvertRequest, FitOptions, convert
-from vvgt_cli.pipeline.mend import wide
+from vvgt_cli.pipeline.mend import check_view_memory, fine_enough, whole_views_fit, wide
+from vvgt_cli.pipeline.optimize import Views
 from vvgt_cli.pipeline.plan import DEFAULT_HALF_STEPS, DEFAULT_STEPS, MOST_STEPS, Costs, Limits, Planner, views_of
 from vvgt_cli.pipeline.source import SourceRequest
 from vvgt_cli.progress import Console
+from vvgt_cli.splat.constants import DILATION
+from vvgt_cli.transfer.readers import minimal
+from vvgt_cli.vbm import VbmOptions, initialise
+from vvgt_cli.volume import Volume
 
 COSTS = Costs(
     closed_form=5,
@@ -53,7 +59,7 @@ def test_without_limits_the_default_steps_are_planned_and_back_projection_is_not
     assert (found.steps, found.back_project) == (DEFAULT_STEPS, False)
     assert [name for name, _ in found.left_out] == ["network", "back-projection"]
     assert found.seconds == pytest.approx(sum(seconds for _, seconds in found.stages))
-    assert found.seconds == pytest.approx(1 + 5 + DEFAULT_STEPS * 0.05 + (24 + 2.5 * 4) * 0.05 + 0.6)
+    assert found.seconds == pytest.approx(1 + 5 + DEFAULT_STEPS * 0.05 + (24 + 1.8 * 4) * 0.05 + 0.6)
     assert found.bytes == 1000 + 1000 * 68
     assert "72 steps" in found.text()
 
@@ -61,7 +67,7 @@ def test_without_limits_the_default_steps_are_planned_and_back_projection_is_not
 def test_views_are_half_the_size_where_gaussians_are_wide():
     found = plan(size=400)
     assert (found.half, found.steps) == (True, DEFAULT_HALF_STEPS)
-    assert found.seconds == pytest.approx(1 + 5 + DEFAULT_HALF_STEPS * 0.05 + (48 / 4 + 2.5 * 4) * 0.05 + 0.6)
+    assert found.seconds == pytest.approx(1 + 5 + DEFAULT_HALF_STEPS * 0.05 + (48 / 4 + 1.8 * 4) * 0.05 + 0.6)
     assert found.memory == pytest.approx(1e9 + (48 / 4 + 4) * 1e7)
     assert plan(size=400, time_budget=20.0).half
     for other in (plan(size=401), plan(size=100), plan(size=400, wide=False), plan(size=400, steps=23)):
@@ -88,6 +94,44 @@ def test_refinement_on_half_views_gains_on_whole_ones(tmp_path):
     assert stages["refinement"].kept
     assert stages["refinement"].psnr > stages["refinement"].psnr_before + 1
     assert report.plan["half"]
+    assert report.refinement["dilation"] == DILATION / 4
+
+
+def test_narrow_gaussians_get_whole_views(tmp_path, monkeypatch):
+    monkeypatch.setattr("vvgt_cli.pipeline.convert.wide", lambda *_: False)
+    report = done(tmp_path, FitOptions(600, 128, steps=30))
+    assert report.plan["half"]  # what was foreseen
+    assert next(stage for stage in report.stages if stage.name == "views").note.startswith("24 of 128 px")
+    assert report.refinement["dilation"] == DILATION
+
+
+def test_whole_views_that_do_not_fit_stay_half(monkeypatch):
+    found = plan(size=400)
+    views = 400**2 * 32
+    monkeypatch.setattr("vvgt_cli.pipeline.mend.free_memory", lambda: views * 40)
+    check_view_memory(found, 400)  # 48 / 4 + 4
+    assert not whole_views_fit(found, 400)
+    monkeypatch.setattr("vvgt_cli.pipeline.mend.free_memory", lambda: views * 52)
+    assert whole_views_fit(found, 400)
+    monkeypatch.setattr("vvgt_cli.pipeline.mend.free_memory", lambda: views * 10)
+    with pytest.raises(UsageError, match="--size 400"):
+        check_view_memory(found, 400)
+
+
+@pytest.mark.parametrize(("edge", "samples"), [(0.4, 1), (0.01, None)])
+def test_hard_edges_get_adaptive_rays(edge, samples):
+    """A ball's surface, over a wide range of values or within a hundredth of it."""
+    line = np.linspace(-1, 1, 32, dtype=np.float32)
+    z, y, x = np.meshgrid(line, line, line, indexing="ij")
+    ball = Volume(1 - np.sqrt(x * x + y * y + z * z))
+    node = lambda v, o: {"x": v, "rgb": [1.0, 0.5 + v / 4, 0.2], "opacity": o}  # noqa: E731
+    points = [node(-1.0, 0.0), node(0.3, 0.0), node(0.3 + edge, 0.9), node(1.0, 0.9)]
+    scene = Scene.build(ball, minimal.read({"points": points}, "edge"), 1.0, (-0.8, 1.0))
+    start = initialise(scene, VbmOptions(4000, 128)).gaussians
+    cameras = default_views("check", 1, size=128)
+    check = Views(cameras, render_views(scene, cameras))
+    for half in (False, True):
+        assert fine_enough(scene, check, start, half).samples == samples
 
 
 def test_no_steps_leave_back_projection():

@@ -40,7 +40,7 @@ class RenderSettings:
 
 
 REFERENCE = RenderSettings(step=0.125, tiers=((0.02, 9),))
-FIT_VIEWS = RenderSettings(step=1.0, samples=1)  # one ray a pixel: pixel-integrated views fit no better
+FIT_VIEWS = RenderSettings(step=1.0, samples=1)  # what colours are solved from
 
 
 def ray_offsets(count: int) -> np.ndarray:

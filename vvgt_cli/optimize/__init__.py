@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -64,6 +65,8 @@ class OptimizeOptions:
             raise UsageError("neither steps nor a time budget; expected one of them")
         if self.steps is not None and self.steps < 0:
             raise UsageError(f"{self.steps} steps; expected 0 or more")
+        if not 0 <= self.dilation < math.inf:
+            raise UsageError(f"dilation {self.dilation} px^2; expected 0 or more")
         if min(self.check_every, self.patience) < 1:
             raise UsageError(f"check every {self.check_every} steps, patience {self.patience}; expected at least 1")
         if self.time_budget is not None and not self.time_budget >= 0:

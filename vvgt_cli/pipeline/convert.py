@@ -10,7 +10,7 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored
 from vvgt_cli.network.card import find_model, read_card
-from vvgt_cli.pipeline.mend import check_view_memory, mend, wide
+from vvgt_cli.pipeline.mend import check_view_memory, mend, whole_views_fit, wide
 from vvgt_cli.pipeline.outputs import Output, check_outputs, write_text
 from vvgt_cli.pipeline.plan import Limits, Planner, estimate
 from vvgt_cli.pipeline.record import ConversionReport, Run
@@ -101,17 +101,15 @@ def convert(request: ConvertRequest, console: Console | None = None) -> Conversi
         read_card(find_model(fit.model))  # fails before the work, not after
     source, scene = _begin(run, request)
     costs = estimate(scene, fit.size, fit.max_gaussians, request.report is not None)
-    dense = fit.max_gaussians > fit.size**2
-    planner = Planner(
-        request.limits, fit.max_gaussians, fit.steps, request.ply.sh_degree, fit.size, not dense, fit.model
-    )
+    sparse = fit.max_gaussians <= fit.size**2  # a guess, until the Gaussians are there
+    planner = Planner(request.limits, fit.max_gaussians, fit.steps, request.ply.sh_degree, fit.size, sparse, fit.model)
     plan = planner.plan(costs, run.elapsed())
     run.report.plan = plan.record()
     check_view_memory(plan, fit.size)
     if request.dry_run:
         return run.finish()
     start = _closed_form(run, scene, fit)
-    planner = replace(planner, wide=wide(start.gaussians, fit.size))
+    planner = replace(planner, wide=wide(start.gaussians, fit.size) or not whole_views_fit(plan, fit.size))
     plan = planner.plan(
         costs.at(max(run.report.stages[-1].seconds / costs.closed_form, 1.0)), run.elapsed(), begun=True
     )

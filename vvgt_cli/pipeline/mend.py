@@ -16,7 +16,7 @@ from vvgt_cli.pipeline.optimize import Views, refine
 from vvgt_cli.pipeline.plan import SMALLER, Limits, Plan, views_of
 from vvgt_cli.pipeline.record import Run
 from vvgt_cli.splat.constants import DILATION
-from vvgt_cli.splat.half import HALF, halved
+from vvgt_cli.splat.half import QUARTER, halved
 from vvgt_cli.volume.blocks import free_memory
 
 if TYPE_CHECKING:
@@ -31,13 +31,25 @@ WIDE = 0.9  # standard deviation in pixels
 
 def check_view_memory(plan: Plan, size: int) -> None:
     """Refuse a size whose training and check views would not fit."""
-    views = views_of(plan.steps) * (HALF if plan.half else 1) + SET_VIEWS["check"]
-    need, free = views * size**2 * VIEW_BYTES, free_memory()
-    if (plan.back_project or plan.steps or plan.network) and free is not None and need > free:
+    need, free = _view_memory(plan, size), free_memory()
+    if free is not None and need > free:
         raise UsageError(
             f"--size {size}: views need {need / 2**30:.1f} GiB of memory, {free / 2**30:.1f} GiB are free; "
             "try a smaller size, or 'vvgt init', which renders none"
         )
+
+
+def whole_views_fit(plan: Plan, size: int) -> bool:
+    """Whether training views of the whole size would fit in memory."""
+    free = free_memory()
+    return free is None or _view_memory(replace(plan, half=False), size) <= free
+
+
+def _view_memory(plan: Plan, size: int) -> float:
+    """Bytes of training and check views."""
+    if not (plan.back_project or plan.steps or plan.network):
+        return 0.0
+    return (views_of(plan.steps) * (QUARTER if plan.half else 1) + SET_VIEWS["check"]) * size**2 * VIEW_BYTES
 
 
 def mend(run: Run, scene: Scene, start: Start, plan: Plan, limits: Limits, fit: FitOptions) -> Gaussians:
@@ -147,7 +159,7 @@ class _Mending:
             ending = sum(seconds for name, seconds in self.plan.stages if name in ("test views", "write"))
             left = max(self.limits.time_budget - self.run.elapsed() - ending, 0.0)
         target = self.limits.target_psnr
-        dilation = DILATION * HALF if self.plan.half else DILATION
+        dilation = DILATION * QUARTER if self.plan.half else DILATION
         options = OptimizeOptions(
             steps=self.plan.most_steps, time_budget=left, target_psnr=target, dilation=dilation, seed=self.fit.seed
         )

@@ -12,7 +12,7 @@ import numpy as np
 
 from vvgt_cli.cameras.sets import SET_VIEWS
 from vvgt_cli.errors import UsageError
-from vvgt_cli.splat.half import HALF
+from vvgt_cli.splat.half import QUARTER
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
@@ -34,11 +34,11 @@ SORT = 0.95e-3
 CLOSED_FORM = 1.0, 1.9, 0.3  # always, per 10^6 cells, per 10^6 voxels in bricks that are not empty
 STEP = 0.015, 0.042  # per 400 x 400 px, per 100,000 Gaussians
 HALF_STEP = 0.008, 0.022  # likewise, on a view half the size
-SMALLEST_HALF = 64  # pixels along the edge of a view half the size
+SMALLEST_HALF = 64  # pixels along the edge of a view half the size: four tiles
 BACK_PROJECTION = 120.0  # steps
 NETWORK = 0.5, 4.0  # always, per 100,000 Gaussians (docs/network.md)
 VIEW = 1.1  # of the view that is timed
-FINER = 2.5  # of the view that is timed: check and test views
+FINER = 1.8  # of the view that is timed: check and test views
 SCORE, SCORE_ALL = (3, 0.03), (10, 0.2)  # views, and seconds a view beside its rendering
 MEMORY = 2.6e8, 294.0, 1240.0  # bytes: program and kernels, a cell, a Gaussian
 VIEW_MEMORY = 22.0  # bytes a pixel of each view
@@ -131,7 +131,7 @@ class Plan:
         steps: of gradient descent, as many as there should be time for.
         most_steps: where there is more time than that.
         network: model that improves the Gaussians before the steps, or None.
-        half: training views are half the size: descent gains as much from them in half the time.
+        half: training views are half the size: descent gains as much from them in less time (docs/optimize.md).
         judge: there is time for check views where a target asks for them.
         seconds, bytes, memory: estimates of the whole run, its file, its memory at most.
         stages: (stage, seconds) estimates in order.
@@ -198,7 +198,7 @@ class Planner:
         if self.limits.time_budget is not None:
             left = self.limits.time_budget - sum(seconds for _, seconds in [*plan.stages, *last])
         self._views(plan, costs, left)
-        views = views_of(plan.steps) * (HALF if plan.half else 1) + SET_VIEWS["check"]
+        views = views_of(plan.steps) * (QUARTER if plan.half else 1) + SET_VIEWS["check"]
         plan.memory += views * costs.view_memory
         plan.stages += last
         plan.seconds = sum(seconds for _, seconds in plan.stages)
@@ -209,14 +209,14 @@ class Planner:
         open_end = self.limits.target_psnr is not None or left is not None
         left = self._network(plan, costs, left)
         few = self.steps is not None and self.steps < ENOUGH_STEPS and left is None
-        half = self.wide and not few and self.model is None and self.size % 2 == 0 and self.size >= 2 * SMALLEST_HALF
+        half = self.wide and not few and plan.network is None and self.size % 2 == 0 and self.size >= 2 * SMALLEST_HALF
         usual = DEFAULT_HALF_STEPS if half else DEFAULT_STEPS
         steps = wanted = self.steps if self.steps is not None else MOST_STEPS if open_end else usual
         while left is not None and steps > 0 and _refinement(costs, steps, half) > left:
             steps = min(steps - 1, int(steps * 0.9))
         if wanted and steps >= min(FEWEST_STEPS, wanted):
             plan.steps, plan.most_steps, plan.half = steps, wanted, half
-            plan.stages.append((f"views, {steps} steps", _refinement(costs, steps, half)))
+            plan.stages.append((f"{'half ' if half else ''}views, {steps} steps", _refinement(costs, steps, half)))
             if self.model is None:
                 plan.left_out.append(("network", "gradient descent gains more in its time; --model runs it"))
             if few:
@@ -259,7 +259,7 @@ def _room(left: float | None) -> str:
 
 def _refinement(costs: Costs, steps: int, half: bool) -> float:
     """Seconds of so many steps, with their views, ``half`` the size or whole; check views are finer, and whole."""
-    step, share = (costs.half_step, HALF) if half else (costs.step, 1.0)
+    step, share = (costs.half_step, QUARTER) if half else (costs.step, 1.0)
     return steps * step + (views_of(steps) * share + FINER * SET_VIEWS["check"]) * costs.view
 
 
@@ -298,14 +298,14 @@ def _volume_bytes(scene: Scene) -> int:
 
 
 def _view_seconds(scene: Scene, size: int) -> float:
-    """Of a check view with one ray a pixel, from one of `PROBE` px."""
+    """Of a check view with one ray a pixel and half-voxel steps, from one of `PROBE` px."""
     from vvgt_cli.cameras import default_views
-    from vvgt_cli.dvr import render_view
-    from vvgt_cli.dvr.render import FIT_VIEWS
+    from vvgt_cli.dvr import RenderSettings, render_view
 
+    settings = RenderSettings(samples=1)
     camera = default_views("check", size=PROBE)[0]
-    render_view(scene, camera, FIT_VIEWS)  # compiled, or loaded
-    return _quickest(lambda: render_view(scene, camera, FIT_VIEWS)) * (size / PROBE) ** 2
+    render_view(scene, camera, settings)  # compiled, or loaded
+    return _quickest(lambda: render_view(scene, camera, settings)) * (size / PROBE) ** 2
 
 
 def _quickest(call: Callable[[], object]) -> float:

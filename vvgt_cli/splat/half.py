@@ -9,7 +9,7 @@ import numpy as np
 from vvgt_cli.cameras import Camera
 from vvgt_cli.splat.constants import DILATION
 
-HALF = 0.25  # of the renderer's dilation, which is an area in pixels: what it is worth at half the size
+QUARTER = 0.25  # of the pixels, and of the renderer's dilation, which is an area in pixels
 
 
 def halved(cameras: Sequence[Camera], images: np.ndarray) -> tuple[list[Camera], np.ndarray, float]:
@@ -23,4 +23,4 @@ def halved(cameras: Sequence[Camera], images: np.ndarray) -> tuple[list[Camera],
         return list(cameras), images, DILATION
     upper, lower = images[:, ::2], images[:, 1::2]
     mean = np.float32(0.25) * (upper[:, :, ::2] + upper[:, :, 1::2] + lower[:, :, ::2] + lower[:, :, 1::2])
-    return [camera.resized(0.5) for camera in cameras], mean, DILATION * HALF
+    return [camera.resized(0.5) for camera in cameras], mean, DILATION * QUARTER

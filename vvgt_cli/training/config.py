@@ -26,7 +26,7 @@ class SceneConfig:
         mended: with what the views can mend, as `vvgt convert` hands it on; without, the closed form alone.
         functions: transfer functions suggested a volume.
         held_functions: those of them (from 0) that are never trained on.
-        per_volume: functions trained on, of each volume.
+        per_volume: scenes to train on of each volume, each with a function of its own.
         bands: fewest and most of the suggested functions in a scene's function.
         densities: least and largest factor of a band's extinction, drawn evenly by its logarithm: fog and solid bodies.
         inputs: views that the network may be shown, the default training set.
@@ -59,14 +59,14 @@ class SceneConfig:
         if len(self.gaussians) != 2 or not 1 <= self.gaussians[0] <= self.gaussians[1]:
             raise UsageError(f"scenes.gaussians {self.gaussians}: expected the fewest and the most")
         trained = self.functions - len(set(self.held_functions))
-        if not 1 <= self.per_volume <= trained or not set(self.held_functions) <= set(range(self.functions)):
-            raise UsageError(f"scenes.per_volume {self.per_volume}: expected 1 to the {trained} functions not held out")
+        if trained < 1 or not set(self.held_functions) <= set(range(self.functions)):
+            raise UsageError(f"scenes.held_functions {self.held_functions}: expected some of {self.functions}, from 0")
         if len(self.bands) != 2 or not 1 <= self.bands[0] <= self.bands[1] <= trained:
             raise UsageError(f"scenes.bands {self.bands}: expected the fewest and the most, 1 to {trained}")
         if len(self.densities) != 2 or not 0 < self.densities[0] <= self.densities[1]:
             raise UsageError(f"scenes.densities {self.densities}: expected the least and the largest, above 0")
-        if not self.sizes or min(*self.sizes, self.inputs, self.targets, self.held) < 1:
-            raise UsageError("scenes: size, inputs, targets and held must be at least 1")
+        if not self.sizes or min(*self.sizes, self.per_volume, self.inputs, self.targets, self.held) < 1:
+            raise UsageError("scenes: size, per_volume, inputs, targets and held must be at least 1")
 
     @property
     def sizes(self) -> tuple[int, ...]:
