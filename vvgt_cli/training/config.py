@@ -11,6 +11,7 @@ from vvgt_cli.network import NAMED, NetworkConfig
 from vvgt_cli.vbm import METHODS
 
 INSTALL = "install vvgt[train]"
+SMALLEST_LPIPS = 16  # pixels: VGG-16 pools four times
 GROWTH = 1.3  # of Gaussians with the size of images
 
 
@@ -83,15 +84,24 @@ class LossConfig:
         ssim: 1 - SSIM of RGB.
         decibel: minus a tenth of the gain in PSNR over the Gaussians that the network was given (not in the paper):
             scenes of 30 and of 45 dB count alike.
+        lpips: LPIPS of RGB (the paper: 0.05), where both its files are given.
+        lpips_backbone: VGG-16 as torchvision has it.
+        lpips_linear: LPIPS' linear weights for it, version 0.1.
     """
 
     l1: float = 0.8
     ssim: float = 0.2
     decibel: float = 0.0
+    lpips: float = 0.0
+    lpips_backbone: str = ""
+    lpips_linear: str = ""
 
     def __post_init__(self) -> None:
-        if min(self.l1, self.ssim, self.decibel) < 0 or not self.l1 + self.ssim + self.decibel > 0:
+        weights = self.l1, self.ssim, self.decibel, self.lpips
+        if min(weights) < 0 or not sum(weights) > 0:
             raise UsageError("loss: weights must be at least 0, one of them above")
+        if bool(self.lpips) != bool(self.lpips_backbone) or bool(self.lpips) != bool(self.lpips_linear):
+            raise UsageError("loss: lpips needs lpips_backbone and lpips_linear, files of weights, and they need lpips")
 
 
 @dataclass(frozen=True)
@@ -143,6 +153,8 @@ class TrainConfig:
             raise UsageError(f"train config: views {self.views}, but a scene has {self.scenes.targets} targets")
         if self.network.reads > self.scenes.inputs:
             raise UsageError(f"train config: the network reads {self.network.reads} views, scenes.inputs gives fewer")
+        if self.loss.lpips and min(self.scenes.sizes) < SMALLEST_LPIPS:
+            raise UsageError(f"loss.lpips: pictures of {min(self.scenes.sizes)} px; expected {SMALLEST_LPIPS} or more")
         if not self.network.has_geometry and self.loss.decibel:
             raise UsageError("loss.decibel compares with the Gaussians given; the variant wo_3dt is given none")
 

@@ -22,6 +22,7 @@ from vvgt_cli.network.checkpoint import Checkpoint, load_weights, read_tensors, 
 from vvgt_cli.network.model import Vvgt
 from vvgt_cli.progress import Console
 from vvgt_cli.training.config import TrainConfig, config_text, read_config
+from vvgt_cli.training.lpips import load_lpips
 from vvgt_cli.training.parallel import World, world
 from vvgt_cli.training.record import Recorder
 from vvgt_cli.training.sample import Feeder, judge, learn
@@ -126,6 +127,8 @@ class _Run:
         self.optimizer = torch.optim.AdamW(self.network.parameters(), lr=config.rate, weight_decay=config.weight_decay)
         self.commit = commit()  # now: the checkout may move on while this runs
         self.feeder = Feeder(scenes["train"], config)
+        lpips = load_lpips(config.loss)
+        self.lpips = lpips.to(here.device) if lpips else None
         self.progress = Progress()
         if (folder / LAST).exists():
             self._resume()
@@ -159,7 +162,7 @@ class _Run:
         tally = np.zeros(3)
         for index in range(here.rank, config.batch, here.size):
             rng = np.random.default_rng([config.seed, state.step, index])
-            one = learn(self.network, self.feeder, rng, here.device)
+            one = learn(self.network, self.feeder, rng, here.device, self.lpips)
             tally += [one.loss, one.gain, one.bad]
         here.add_gradients(self.network)
         loss, gain, bad, stop = here.total([*tally, bool(ended)])

@@ -1,7 +1,4 @@
-"""The loss of a rendered view: L1 and SSIM as in the paper (Sec. 4.4), and the gain in PSNR.
-
-LPIPS, the paper's third term, is left out: its backbone's weights are not at hand, and without them it is no LPIPS.
-"""
+"""The loss of a rendered view: L1, SSIM and LPIPS as in the paper (Sec. 4.4), and the gain in PSNR."""
 
 from __future__ import annotations
 
@@ -13,17 +10,21 @@ from torch.nn import functional
 
 from vvgt_cli.metrics.ssim import C1, C2, RADIUS, SIGMA
 from vvgt_cli.training.config import LossConfig
+from vvgt_cli.training.lpips import Lpips
 
 TINY = 1e-10  # squared error of 100 dB
 
 
-def view_loss(picture: Tensor, target: Tensor, before: Tensor | None, config: LossConfig) -> Tensor:
+def view_loss(
+    picture: Tensor, target: Tensor, before: Tensor | None, config: LossConfig, lpips: Lpips | None = None
+) -> Tensor:
     """Weighted sum of the terms.
 
     Args:
         picture, target: (h, w, 4) premultiplied RGBA.
         before: picture of the Gaussians that the network was given; for ``decibel``.
         config: weights; a term of weight 0 is not computed.
+        lpips: network of the ``lpips`` term.
     """
     total = picture.new_zeros(())
     if config.l1:
@@ -33,6 +34,9 @@ def view_loss(picture: Tensor, target: Tensor, before: Tensor | None, config: Lo
     if config.decibel:
         assert before is not None
         total = total - config.decibel * decibels(picture, target, before) / 10
+    if config.lpips:
+        assert lpips is not None
+        total = total + config.lpips * lpips(picture[..., :3], target[..., :3])
     return total
 
 

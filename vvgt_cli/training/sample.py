@@ -19,6 +19,7 @@ from vvgt_cli.network.runtime import in_turn, spread
 from vvgt_cli.splat import render
 from vvgt_cli.training.config import TrainConfig
 from vvgt_cli.training.losses import decibels, view_loss
+from vvgt_cli.training.lpips import Lpips
 from vvgt_cli.training.scenes import TrainingScene, as_float
 from vvgt_cli.training.splatter import splat
 
@@ -82,7 +83,9 @@ class Feeder:
         return prepare(gaussians, cameras, as_float(source.images[shown]), self.config.network)
 
 
-def learn(network: Vvgt, feeder: Feeder, rng: np.random.Generator, device: torch.device) -> Tally:
+def learn(
+    network: Vvgt, feeder: Feeder, rng: np.random.Generator, device: torch.device, lpips: Lpips | None = None
+) -> Tally:
     """Add the gradients of the loss of a scene's round, both drawn by ``rng``: mean over views, over the batch."""
     config = feeder.config
     index, views, number = (int(rng.integers(n)) for n in (len(feeder.scenes), config.view_sets, config.network.rounds))
@@ -97,7 +100,7 @@ def learn(network: Vvgt, feeder: Feeder, rng: np.random.Generator, device: torch
         target = torch.from_numpy(as_float(scene.target_images[i])).to(device)
         start = torch.from_numpy(render(before, scene.targets[i])).to(device)
         picture = splat(rows, scene.targets[i])
-        loss = loss + view_loss(picture, target, start, config.loss) / len(chosen)
+        loss = loss + view_loss(picture, target, start, config.loss, lpips) / len(chosen)
         gain += float(decibels(picture.detach(), target, start)) / len(chosen)
     if not torch.isfinite(loss):
         return Tally(bad=1)
