@@ -31,11 +31,11 @@ SMALLER = (8, 4, 2)  # parts of the budget that a target is tried with first
 PROBE = 80  # pixels along the edge of the view that is timed
 # Seconds on two cores where 200,000 random float64 sort in `SORT`, fitted to conversions: docs/plan.md.
 SORT = 0.95e-3
-CLOSED_FORM = 1.0, 1.9, 0.3  # always, per 10^6 cells, per 10^6 voxels in bricks that are not empty
-STEP = 0.015, 0.042  # per 400 x 400 px, per 100,000 Gaussians
-HALF_STEP = 0.008, 0.022  # likewise, on a view half the size
+CLOSED_FORM = 0.85, 1.6, 0.25  # always, per 10^6 cells, per 10^6 voxels in bricks that are not empty
+STEP = 0.013, 0.035  # per 400 x 400 px, per 100,000 Gaussians
+HALF_STEP = 0.006, 0.017  # likewise, on a view half the size
 SMALLEST_HALF = 64  # pixels along the edge of a view half the size: four tiles
-BACK_PROJECTION = 120.0  # steps
+BACK_PROJECTION = 140.0  # steps
 NETWORK = 0.5, 4.0  # always, per 100,000 Gaussians (docs/network.md)
 VIEW = 1.1  # of the view that is timed
 FINER = 1.8  # of the view that is timed: check and test views
