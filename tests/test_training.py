@@ -23,6 +23,7 @@ from vvgt_cli.progress import Console
 from vvgt_cli.splat import project, render, render_backward_reference, render_reference
 from vvgt_cli.synth.shapes import make_shape
 from vvgt_cli.training import LossConfig, SceneConfig, TrainConfig
+from vvgt_cli.training import scenes as training_scenes
 from vvgt_cli.training.scenes import make_scenes, prepare_scenes, recipes, together
 from vvgt_cli.transfer.readers import minimal
 from vvgt_cli.transfer.suggest import Suggestion
@@ -176,6 +177,19 @@ def test_processes_make_shares_of_the_scenes(data):
     made = count()
     assert len(prepare_scenes(data, scenes, Console(quiet=True))["train"]) == 2
     assert count() == made
+
+
+def test_a_scene_that_shows_next_to_nothing_is_left_out(data, monkeypatch):
+    scenes = replace(CONFIG.scenes, seed=6)
+    whole, empty = training_scenes._render, recipes(data, scenes)["train"][0]
+
+    def render_or_nothing(recipe, config):
+        name, gaussians, images = whole(recipe, config)
+        return (name, gaussians.take(np.arange(9)), images[:0]) if recipe == empty else (name, gaussians, images)
+
+    monkeypatch.setattr(training_scenes, "_render", render_or_nothing)
+    found = prepare_scenes(data, scenes, Console(quiet=True))
+    assert [len(scenes) for scenes in found.values()] == [1, 2, 2]
 
 
 def test_functions_together_show_each_where_it_is():

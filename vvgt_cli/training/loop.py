@@ -22,7 +22,7 @@ from vvgt_cli.network.checkpoint import Checkpoint, load_weights, read_tensors, 
 from vvgt_cli.network.model import Vvgt
 from vvgt_cli.progress import Console
 from vvgt_cli.training.config import TrainConfig, config_text, read_config
-from vvgt_cli.training.lpips import load_lpips
+from vvgt_cli.training.lpips import Lpips, load_lpips
 from vvgt_cli.training.parallel import World, world
 from vvgt_cli.training.record import Recorder
 from vvgt_cli.training.sample import Feeder, judge, learn
@@ -60,7 +60,7 @@ def train(config: TrainConfig, data: str, output: str, console: Console) -> int:
         UsageError: folders that are not what they must be, or a run with another configuration.
         DataError: volumes or a checkpoint that cannot be read.
     """
-    folder = Path(output)
+    folder, lpips = Path(output), load_lpips(config.loss)  # fails before the work, not after
     with world() as here, ending() as ended:
         talk = console if here.first else Console(quiet=True)
         if here.first:
@@ -70,7 +70,7 @@ def train(config: TrainConfig, data: str, output: str, console: Console) -> int:
         here.wait()
         scenes = prepare_scenes(Path(data), config.scenes, talk)
         torch.manual_seed(config.seed)
-        run = _Run(config, data, folder, here, scenes, talk)
+        run = _Run(config, data, folder, here, scenes, talk, lpips)
         return run.to_the_end(ended)
 
 
@@ -120,14 +120,20 @@ class _Run:
     """A run in one process."""
 
     def __init__(
-        self, config: TrainConfig, data: str, folder: Path, here: World, scenes: Scenes, console: Console
+        self,
+        config: TrainConfig,
+        data: str,
+        folder: Path,
+        here: World,
+        scenes: Scenes,
+        console: Console,
+        lpips: Lpips | None,
     ) -> None:
         self.config, self.data, self.folder, self.here, self.scenes = config, data, folder, here, scenes
         self.network = Vvgt(config.network).to(here.device)
         self.optimizer = torch.optim.AdamW(self.network.parameters(), lr=config.rate, weight_decay=config.weight_decay)
         self.commit = commit()  # now: the checkout may move on while this runs
         self.feeder = Feeder(scenes["train"], config)
-        lpips = load_lpips(config.loss)
         self.lpips = lpips.to(here.device) if lpips else None
         self.progress = Progress()
         if (folder / LAST).exists():

@@ -25,7 +25,7 @@ from vvgt_cli.progress import Console
 from vvgt_cli.training.config import GROWTH, SceneConfig
 from vvgt_cli.transfer.suggest import Suggestion
 
-VERSION = 2  # raised when scenes are made otherwise
+VERSION = 3  # raised when scenes are made otherwise
 FEWEST = 256  # Gaussians: a scene with less shows next to nothing
 FULL = 65535  # images are kept as uint16
 TARGET_SHIFT = 0.31  # of the targets' Fibonacci sphere: none of the three default sets'
@@ -179,7 +179,7 @@ def _make(place: Path, recipe: Recipe, config: SceneConfig) -> None:
         np.savez(scratch / "gaussians.npz", means=g.means, log_scales=g.log_scales, quaternions=g.quaternions,
                  opacity_logits=g.opacity_logits, colors=g.colors)  # fmt: skip
         np.save(scratch / "images.npy", np.rint(np.clip(images, 0, 1) * FULL).astype(np.uint16))
-        (scratch / "about.json").write_text(json.dumps({"name": name, "gaussians": len(g), **asdict(recipe)}), "utf-8")
+        (scratch / "about.json").write_text(json.dumps(asdict(recipe) | {"name": name, "gaussians": len(g)}), "utf-8")
         os.replace(scratch, place)
     except OSError as error:
         if place.exists():  # another process was first
