@@ -24,6 +24,15 @@ def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "long: takes too long for every change (make long)")
 
 
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Compile kernels on all cores, before the tests ask for them one by one."""
+    if len(session.items) > 20 and not session.config.getoption("collectonly"):
+        from vvgt_cli.jit.ahead import ALL
+        from vvgt_cli.jit.compile import compile_ahead
+
+        compile_ahead(ALL)
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     if not config.getoption("--long"):
         for item in items:

@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 import traceback
+import warnings
 from collections.abc import Sequence
 
 import click
@@ -29,6 +30,7 @@ COMMANDS = {
     "export": "vvgt_cli.cli.export",
     "train": "vvgt_cli.cli.train",
     "synth": "vvgt_cli.cli.synth",
+    "warmup": "vvgt_cli.cli.warmup",
 }
 INTERRUPTED = 130  # 128 + SIGINT, as shells report it
 BROKEN_PIPE = 141  # 128 + SIGPIPE
@@ -61,6 +63,18 @@ def cli() -> None:
 def _fail(message: str, code: int) -> int:
     print(f"vvgt: error: {' '.join(message.split())}", file=sys.stderr)
     return code
+
+
+def _note(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: object = None,
+    line: object = None,
+) -> None:
+    """A warning as one line (`warnings.showwarning`)."""
+    print(f"vvgt: note: {' '.join(str(message).split())}", file=sys.stderr)
 
 
 def _usage(error: click.ClickException) -> int:
@@ -125,6 +139,7 @@ def _terminate(number: int, frame: object) -> None:
 def main() -> None:
     """Entry point of the `vvgt` command."""
     signal.signal(signal.SIGTERM, _terminate)
+    warnings.showwarning = _note
     sys.exit(run())
 
 

@@ -6,12 +6,13 @@ import numba as nb
 import numpy as np
 
 from vvgt_cli.dvr.scene import BRICK
+from vvgt_cli.jit.decorators import kernel
 from vvgt_cli.transfer.tables import OpticalTables
 
 MAX_DISTANCE = 15  # bricks; a longer leap saves nothing measurable
 
 
-@nb.njit(parallel=True, cache=True)
+@kernel("V f8:4", parallel=True)
 def _ranges(values, out):
     nz, ny, nx = values.shape
     bz, by, bx = out.shape[:3]

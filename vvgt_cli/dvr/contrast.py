@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
-from vvgt_cli.jit import inlined
+from vvgt_cli.jit.decorators import inlined, kernel
 
 
 @inlined()
@@ -17,7 +17,7 @@ def _apart(image, row, col, i, j):
     return most
 
 
-@nb.njit(parallel=True, cache=True)
+@kernel("f4:3 f4:2", parallel=True)
 def _contrast(image, out):
     height, width = out.shape
     for row in nb.prange(height):

@@ -10,7 +10,7 @@ import numpy as np
 from vvgt_cli.dvr.runs import BORROWED, RUN, first_value, run_range, sample_run, stack_run
 from vvgt_cli.dvr.scene import BRICK, BRICK_BITS
 from vvgt_cli.dvr.vectors import add, lane, row, scale, sub, zeros4
-from vvgt_cli.jit import inlined
+from vvgt_cli.jit.decorators import inlined, kernel
 
 OPAQUE = 1e-3  # times step^2, as the error of integration goes: the transmittance at which a ray ends
 SUB_DEPTH = 1.0  # optical depth of a sub-segment: colour is constant within one; 0.3 is no more accurate
@@ -290,7 +290,13 @@ def _tile(
             pixel[0], pixel[1], pixel[2], pixel[3] = red * share, green * share, blue * share, alpha * share
 
 
-@nb.njit(parallel=True, cache=True, nogil=True, fastmath=FLAGS, error_model="numpy")
+@kernel(
+    "V f8 f8 f8:2 f8:2 f8:1 u1:3 f8:1 f8:2 f8:1 f8 i8:1 f8:2 b1:2 i8 f4:3",
+    parallel=True,
+    nogil=True,
+    fastmath=FLAGS,
+    error_model="numpy",
+)
 def render_tiles(
     values, lo, inv_width, nodes, cumulative, dark, empty, eye, basis, lens, step, order, offsets, mask, known, out
 ):

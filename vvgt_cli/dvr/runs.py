@@ -12,7 +12,7 @@ from numba import types
 from numba.core import cgutils
 
 from vvgt_cli.dvr.vectors import intrinsic
-from vvgt_cli.jit import inlined
+from vvgt_cli.jit.decorators import inlined
 
 RUN = 32  # samples of a run: two vectors of AVX-512 float32, four of AVX2
 MOST = (1 << 31) - 1

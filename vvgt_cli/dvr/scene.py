@@ -98,6 +98,13 @@ def kernel_values(volume: Volume) -> tuple[np.ndarray, float, float]:
     return _read_only(out, out.dtype), volume.slope * 2 * half_width, volume.slope * lo + volume.intercept
 
 
+def kernel_type(volume: Volume) -> str:
+    """Name of the type that `kernel_values` gives a volume's values."""
+    kind = volume.data.dtype.newbyteorder("=")
+    narrow = kind in (np.bool_, np.uint8, np.uint16) and volume.data.shape[2] > 1 and volume.data.size > 3
+    return "float32" if not narrow else "uint16" if kind == np.uint16 else "uint8"
+
+
 def _read_only(data: np.ndarray, dtype: np.dtype) -> np.ndarray:
     """``data`` as a read-only, aligned, C-contiguous array of ``dtype``; copied (slab by slab) only where it is not."""
     if data.dtype == dtype and data.flags.c_contiguous and data.flags.aligned:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
+from vvgt_cli.jit.decorators import kernel
 
-@nb.njit(parallel=True, cache=True)
+
+@kernel("f4:3 f4:3 f4 f4 f4 f4:3", parallel=True)
 def loss_gradient(image, target, l1, l2, alpha_weight, grad):
     """Fill ``grad`` (h, w, 4) with the gradient of ``sum l1 |r| + l2 r^2`` over RGB, alpha's share weighted.
 

@@ -11,15 +11,15 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
+from vvgt_cli.jit.decorators import kernel
 from vvgt_cli.metrics.ssim import C1, C2, RADIUS, SIGMA
 
 KERNEL = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / SIGMA) ** 2)
 KERNEL = (KERNEL / KERNEL.sum()).astype(np.float32)
 f32 = np.float32
-_parallel = nb.njit(cache=True, fastmath=True, error_model="numpy", parallel=True)
 
 
-@_parallel
+@kernel(parallel=True, fastmath=True, error_model="numpy")
 def blur(planes, kernel, padded, out):
     """Correlate ``planes`` (n, h, w) with the outer square of ``kernel`` (2 r + 1,), zeros beyond the border.
 
@@ -45,7 +45,7 @@ def blur(planes, kernel, padded, out):
                 out[p, y, x] += weight * line[x + i]
 
 
-@_parallel
+@kernel(parallel=True, fastmath=True, error_model="numpy")
 def products(x, y, out):
     """``out`` (5, h, w): x, y, x^2, y^2, x y of one channel (h, w)."""
     for row in nb.prange(x.shape[0]):
@@ -55,7 +55,7 @@ def products(x, y, out):
             out[2, row, col], out[3, row, col], out[4, row, col] = a * a, b * b, a * b
 
 
-@_parallel
+@kernel(parallel=True, fastmath=True, error_model="numpy")
 def slopes(blurred, out, score):
     """SSIM's derivatives by blur(x), blur(x^2), blur(x y) into ``out`` (3, h, w), its sums a row into ``score``."""
     c1, c2 = f32(C1), f32(C2)
@@ -76,7 +76,7 @@ def slopes(blurred, out, score):
         score[row] = total
 
 
-@_parallel
+@kernel(parallel=True, fastmath=True, error_model="numpy")
 def add_gradient(blurred, x, y, scale, channel, grad):
     """``grad`` (h, w, 4), one channel, += ``scale`` x gradient of the sum of SSIM."""
     for row in nb.prange(x.shape[0]):

@@ -6,7 +6,7 @@ import math
 
 import numba as nb
 
-from vvgt_cli.jit import inlined
+from vvgt_cli.jit.decorators import inlined, kernel
 
 EPSILON = 1e-15
 COUNT = 13  # own frame: d (3), E (6), opacity logit, colour (3)
@@ -50,7 +50,10 @@ def _directions(frame, k, first, second, beta1, beta2, fix1, fix2):
     )
 
 
-@nb.njit(parallel=True, cache=True)
+@kernel(
+    "f4:2 f4:1 f4:2 f8:1 f8:1 f8 f8 f8 i8 f4:2 f4:3 f4:1 f4:2 f4:2 f4:2",
+    parallel=True,
+)
 def own_frame(
     frame,
     logit_grad,
@@ -99,7 +102,7 @@ def own_frame(
             colors[k, i] = max(colors[k, i] - tint, 0.0)
 
 
-@nb.njit(parallel=True, cache=True)
+@kernel(parallel=True)
 def adam(values, slopes, rate, beta1, beta2, step, first, second):
     """Adam (Kingma and Ba 2015) on (n,) ``values`` in place; ``step`` counts from 1."""
     fix1, fix2 = 1 / (1 - beta1**step), 1 / (1 - beta2**step)

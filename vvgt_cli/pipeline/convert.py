@@ -9,6 +9,7 @@ import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored
+from vvgt_cli.jit.ahead import CONVERT, INIT
 from vvgt_cli.network.card import find_model, read_card
 from vvgt_cli.pipeline.mend import check_view_memory, mend, whole_views_fit, wide
 from vvgt_cli.pipeline.outputs import Output, check_outputs, write_text
@@ -139,6 +140,7 @@ def _begin(run: Run, request: ConvertRequest) -> tuple[Source, Scene]:
     with run.stage("read") as stage:
         source = load(request.source)
         stage.note = describe_source(source)
+    run.compile(CONVERT if run.report.command == "convert" else INIT, source.kernel_type())
     with run.stage("scene"):
         scene = source.scene()
     run.report.volume = volume_record(source)

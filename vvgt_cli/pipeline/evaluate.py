@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from vvgt_cli.cameras import default_views
 from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians import PlyHeader
+from vvgt_cli.jit.ahead import EVALUATE
 from vvgt_cli.pipeline.convert import describe_source, tf_record, volume_record
 from vvgt_cli.pipeline.record import ConversionReport, Run, Stage, document
 from vvgt_cli.pipeline.render import STDIN, open_gaussians
@@ -101,6 +102,7 @@ def evaluate(request: EvaluateRequest, console: Console | None = None) -> Evalua
         gaussians, header = open_gaussians(request.ply, run.console)
         source = _load(request.source, header)
         stage.note = f"{len(gaussians)} Gaussians; {describe_source(source)}"
+    run.compile(EVALUATE, source.kernel_type())
     with run.stage("scene"):
         scene = source.scene()
     with run.stage("reference") as stage:

@@ -9,6 +9,7 @@ import numpy as np
 
 from vvgt_cli.cameras import Camera
 from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.jit.ahead import INFER
 from vvgt_cli.pipeline.optimize import Views
 from vvgt_cli.pipeline.outputs import Output, check_outputs, write_text
 from vvgt_cli.pipeline.record import ConversionReport, Run
@@ -101,6 +102,7 @@ def infer_file(request: InferRequest, console: Console | None = None) -> Convers
         wanted = model.card.network.reads
         read, judges = divide(cameras, wanted)
         stage.note = f"{len(gaussians)} Gaussians, {len(cameras)} views, model {model.card.name}"
+    run.compile(INFER)
     with run.stage("network") as stage:
         shown = [cameras[i] for i in read]
         better = model.improve(gaussians, shown, images[read], progress=run.console.bar("network"))

@@ -11,6 +11,7 @@ from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.sets import SET_VIEWS
 from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.jit.ahead import BACK_PROJECT
 from vvgt_cli.optimize import OptimizeOptions
 from vvgt_cli.pipeline.optimize import Views, refine
 from vvgt_cli.pipeline.plan import SMALLER, Limits, Plan, views_of
@@ -126,6 +127,7 @@ class _Mending:
         from vvgt_cli.vbm import backproject
 
         run, train = self.run, self.views(start.gaussians)
+        run.compile(BACK_PROJECT)
         with run.stage("back-projection") as stage:
             before = self.psnr(start.gaussians)
             bar = run.console.bar("back-projection")

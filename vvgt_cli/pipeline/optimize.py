@@ -16,6 +16,7 @@ from vvgt_cli.cameras import Camera
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import Gaussians, as_stored
 from vvgt_cli.images.viewset import load_views
+from vvgt_cli.jit.ahead import OPTIMIZE
 from vvgt_cli.optimize import OptimizeOptions, OptimizeRecord, optimize
 from vvgt_cli.pipeline.outputs import Output, check_outputs, write_text
 from vvgt_cli.pipeline.record import ConversionReport, Run
@@ -92,6 +93,7 @@ def optimize_file(request: OptimizeRequest, console: Console | None = None) -> C
         train, check, held_out = load_sets(request.views)
         test = Views(*load_views(request.views, "test")) if _has(request.views, "test") else None
         stage.note = f"{len(train)} to fit to, {len(check)} to check by{held_out}"
+    run.compile(OPTIMIZE)
     run.report.options = asdict(request.options)
     gaussians = refine(run, start, train, check, request.options)
     if test is not None:

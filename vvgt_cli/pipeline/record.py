@@ -8,7 +8,7 @@ import os
 import platform
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, is_dataclass
 from typing import Any
@@ -167,6 +167,21 @@ class Run:
         stage.seconds = time.perf_counter() - begin
         self.report.stages.append(stage)
         self.console.stage(name, stage.seconds, stage.detail())
+
+    def compile(self, kernels: Collection[str], volume: str | None = None) -> None:
+        """Have kernels compiled whose code does not lie on disk: a stage of a first run, nothing in later ones.
+
+        Args:
+            kernels: of `vvgt_cli.jit.ahead`.
+            volume: type of the volume's values, where kernels read any.
+        """
+        from vvgt_cli.jit.compile import VOLUMES, compile_aside, missing, usual_jobs
+
+        todo = missing(usual_jobs(kernels, (volume,) if volume else VOLUMES))
+        if todo:
+            with self.stage("compile") as stage:
+                compile_aside(todo, self.console.bar("compile"))
+                stage.note = f"{len(todo)} kernels, on a first run (vvgt warmup does it beforehand)"
 
     def elapsed(self) -> float:
         """Wall seconds since the run began."""

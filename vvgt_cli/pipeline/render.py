@@ -12,6 +12,7 @@ from vvgt_cli.cameras.sets import SIZE
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions, in_unit_frame, read_ply, write_ply
+from vvgt_cli.jit.ahead import DRAW
 from vvgt_cli.pipeline.outputs import STDOUT, write_text
 from vvgt_cli.pipeline.record import ConversionReport, Run
 from vvgt_cli.progress import Console
@@ -127,6 +128,7 @@ def render_file(request: RenderRequest, console: Console | None = None) -> int:
     with run.stage("read") as stage:
         gaussians, header = open_gaussians(request.ply, console)
         stage.note = f"{len(gaussians)} Gaussians, {header.frame} frame"
+    run.compile(DRAW)
     directory = Path(request.output)
     directory.mkdir(exist_ok=True)
     with run.stage("render") as stage:

@@ -18,6 +18,7 @@ from vvgt_cli.cameras.sets import FIELD_OF_VIEW, RADIUS, SET_VIEWS, SIZE
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import atomic_write
 from vvgt_cli.images import write_png
+from vvgt_cli.jit.ahead import VIEWS
 from vvgt_cli.pipeline.manifest import Manifest, Shard, cameras_digest, digest, volume_digest
 from vvgt_cli.pipeline.record import ConversionReport, Run
 from vvgt_cli.pipeline.source import Source, SourceRequest, load_all
@@ -179,6 +180,7 @@ def render_view_sets(request: ViewsRequest, console: Console | None = None) -> i
         sources = load_all(request.source, request.tfs or (None,))
         volume = sources[0].volume
         stage.note = f"{volume.name}: {' x '.join(map(str, volume.dims))} {volume.data.dtype.name}"
+    run.compile(VIEWS, sources[0].kernel_type())
     with run.stage("plan") as stage:
         jobs = _plan(request, views, folders, sources)
         total = sum(len(job.pending) for job in jobs)

@@ -47,6 +47,12 @@ class Source:
     unit_distance: float
     unit_label: str
 
+    def kernel_type(self) -> str:
+        """Name of the type in which kernels read the volume's values."""
+        from vvgt_cli.dvr.scene import kernel_type
+
+        return kernel_type(self.volume)
+
     def scene(self) -> Scene:
         """The volume laid out for the kernels."""
         from vvgt_cli.dvr import Scene

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
-from vvgt_cli.jit import inlined
+from vvgt_cli.jit.decorators import inlined, kernel
 from vvgt_cli.splat.constants import TILE
 from vvgt_cli.splat.kernel import rotation_column, to_camera, turned, unit_quaternion
 from vvgt_cli.splat.tiles import (
@@ -31,7 +31,6 @@ from vvgt_cli.splat.tiles import (
     _eighth,
     _jit,
     _open,
-    _parallel,
     _rows,
     f32,
 )  # fmt: skip
@@ -107,7 +106,12 @@ def _moments_tile(entries, slots, extent, flat, colors, ox, oy, buf, pairs):
         pairs[slots[index]] = _ZERO
 
 
-@_parallel
+@kernel(
+    "i8:1 i8:1 i4:1 i8:1 i4:2 f4:2 f4:2 i8 f4:3 f4:3 f4:2",
+    parallel=True,
+    fastmath=True,
+    error_model="numpy",
+)
 def moments(tiles, start, members, slots, extent, flat, colors, tiles_x, image, grad, pairs):
     """For each (tile, Gaussian) pair: its nine `SUMS` into ``pairs`` (n, 9) float32.
 
@@ -153,7 +157,7 @@ def _screen(flat, k, total):
     return du, dv, 0.5 * (p0 * a + p1 * b), 0.5 * (p0 * b + p1 * c), 0.5 * (q0 * b + q1 * c)
 
 
-@nb.njit(parallel=True, cache=True)
+@kernel(parallel=True)
 def screen(first, pairs, flat, out):
     """Length of the gradient with respect to each projected centre (pixels) into ``out`` (K,); 0 where none shows."""
     for k in nb.prange(flat.shape[0]):
@@ -190,7 +194,10 @@ def _axis(factors, k, i, rot, jx, jy, jxz, jyz):
     return v0, v1, v2, jx * v0 + jxz * v2, jy * v1 + jyz * v2
 
 
-@nb.njit(parallel=True, cache=True)
+@kernel(
+    "i8:1 f4:2 i4:2 f4:2 f4:2 f4:3 f4:2 f8:2 f8:1 f8:1 f4:2 f4:1 f4:2",
+    parallel=True,
+)
 def own_frame(first, pairs, extent, flat, means, factors, colors, rot, trans, lens, out_frame, out_logits, out_colors):
     """Gradients for steps in each Gaussian's own frame: mu += M d, M <- M (I + E), E symmetric.
 
@@ -260,7 +267,7 @@ def _quaternion(w, a, b, c, n, c0, c1, c2, out):
     )
 
 
-@nb.njit(parallel=True, cache=True)
+@kernel("i8:1 f4:2 i4:2 f4:2 f4:2 f4:2 f4:2 f4:2 f8:2 f8:1 f8:1 f4:2 f4:2 f4:2 f4:1 f4:2", parallel=True)
 def standard(
     first, pairs, extent, flat, means, log_scales, quats, colors, rot, trans, lens,
     out_means, out_scales, out_quats, out_logits, out_colors,

@@ -7,7 +7,7 @@ import math
 import numba as nb
 import numpy as np
 
-from vvgt_cli.jit import inlined
+from vvgt_cli.jit.decorators import inlined, kernel
 from vvgt_cli.splat.constants import MIN_ALPHA, NEAR, TILE
 
 _jit = inlined()
@@ -83,7 +83,10 @@ def _place(k, x, y, z, sxx, sxy, syy, opacity, lens, dilation, flat, depth, exte
     depth[k] = z
 
 
-@nb.njit(parallel=True, cache=True)
+@kernel(
+    "f4:2 f4:2 f4:2 f4:1 f8:2 f8:1 f8:1 f8 f4:2 f4:1 i4:2",
+    parallel=True,
+)
 def project(means, log_scales, quats, logits, rot, trans, lens, dilation, flat, depth, extent):
     """EWA projection of every Gaussian.
 
@@ -115,7 +118,10 @@ def project(means, log_scales, quats, logits, rot, trans, lens, dilation, flat, 
         _place(k, x, y, z, sxx, sxy, syy, opacity, lens, dilation, flat, depth, extent)
 
 
-@nb.njit(parallel=True, cache=True)
+@kernel(
+    "f4:2 f4:3 f4:1 f8:2 f8:1 f8:1 f8 f4:2 f4:1 i4:2",
+    parallel=True,
+)
 def project_factors(means, factors, logits, rot, trans, lens, dilation, flat, depth, extent):
     """`project` for covariances ``M M^T`` given by ``factors`` (K, 3, 3) M."""
     fx, fy = lens[0], lens[1]
@@ -140,7 +146,7 @@ def project_factors(means, factors, logits, rot, trans, lens, dilation, flat, de
         _place(k, x, y, z, sxx, sxy, syy, opacity, lens, dilation, flat, depth, extent)
 
 
-@nb.njit(parallel=True, cache=True)
+@kernel("i8:1 i4:2 i8 i8 i8", parallel=True)
 def tile_lists(order, extent, tiles_x, tiles_y, workers):
     """Gaussians of each tile in the given (depth) order.
 

@@ -12,7 +12,7 @@ import math
 import numba as nb
 import numpy as np
 
-from vvgt_cli.jit import inlined
+from vvgt_cli.jit.decorators import inlined, kernel
 from vvgt_cli.splat.constants import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, TILE
 
 f32, U = np.float32, nb.uint64
@@ -28,7 +28,6 @@ _EXP = tuple(
 )
 
 _jit = inlined(fastmath=True, error_model="numpy")
-_parallel = nb.njit(cache=True, fastmath=True, error_model="numpy", parallel=True)
 
 
 @_jit
@@ -115,7 +114,12 @@ def _blend_tile(entries, extent, flat, colors, ox, oy, buf):
                 buf[j + _P3] += weight * blue
 
 
-@_parallel
+@kernel(
+    "i8:1 i8:1 i4:1 i4:2 f4:2 f4:2 i8 f4:3",
+    parallel=True,
+    fastmath=True,
+    error_model="numpy",
+)
 def blend(tiles, start, members, extent, flat, colors, tiles_x, image):
     """Front-to-back blending into ``image`` (height, width, 4) float32, linear in ``colors`` (K, 3) float32.
 
@@ -165,7 +169,12 @@ def _gather_tile(entries, slots, extent, flat, ox, oy, buf, pairs):
         pairs[slot, 0], pairs[slot, 1], pairs[slot, 2], pairs[slot, 3], pairs[slot, 4] = s0, s1, s2, s3, s4
 
 
-@_parallel
+@kernel(
+    "i8:1 i8:1 i4:1 i8:1 i4:2 f4:2 i8 f4:3 f4:2",
+    parallel=True,
+    fastmath=True,
+    error_model="numpy",
+)
 def gather(tiles, start, members, slots, extent, flat, tiles_x, fields, pairs):
     """For each (tile, Gaussian) pair: sums over its pixels of w and of w x 4 ``fields`` (4, h, w), w = T alpha.
 
@@ -186,7 +195,7 @@ def gather(tiles, start, members, slots, extent, flat, tiles_x, fields, pairs):
         _gather_tile(members[span], slots[span], extent, flat, ox, oy, buf, pairs)
 
 
-@nb.njit(parallel=True, cache=True)
+@kernel("i8:1 f4:2 f8:2", parallel=True)
 def reduce_pairs(first, pairs, out):
     """Add each Gaussian's pairs, in a fixed order: out (K, 5) float64 += sums."""
     for k in nb.prange(first.shape[0] - 1):

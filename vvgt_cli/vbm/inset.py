@@ -14,7 +14,7 @@ import numba as nb
 import numpy as np
 
 from vvgt_cli.dvr.kernel import sample
-from vvgt_cli.jit import inlined
+from vvgt_cli.jit.decorators import inlined, kernel
 from vvgt_cli.vbm.moments import Cells
 
 OPAQUE_DEPTH = 5.0  # optical depth a voxel at which a cell counts as wholly opaque; half of it is the surface
@@ -83,7 +83,7 @@ def _run(field, x, y, z, dx, dy, dz, limit, inside):
     return limit
 
 
-@nb.njit(parallel=True, cache=True)
+@kernel("f4:3 f4:3 f8:2 f8:1 f8:1 f8:3 f8:1 f8 f8 f8:2", parallel=True)
 def _shift(field, smooth, means, half, edge, cov, reach, dilation, far, out):
     small = edge.min()
     stride = 0.25 * small

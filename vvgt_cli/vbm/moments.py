@@ -15,7 +15,7 @@ import numpy as np
 
 from vvgt_cli.dvr.kernel import FLAGS, mean_optics, table_coordinate
 from vvgt_cli.dvr.scene import BRICK, Scene
-from vvgt_cli.jit import inlined
+from vvgt_cli.jit.decorators import inlined, kernel
 
 # columns of a moment row: M, M x, M y, M z, M xx, M xy, M xz, M yy, M yz, M zz, M r, M g, M b
 MOMENTS = 13
@@ -73,7 +73,11 @@ def _value_and_spread(values, x, y, z, dx, dy, dz):
     return c0 + (c1 - c0) * fz, math.sqrt(gx * gx + gy * gy + gz * gz)
 
 
-@nb.njit(parallel=True, cache=True, fastmath=FLAGS)
+@kernel(
+    "V f8 f8 f8:2 f8:2 f8:1 f8:2 i8:1 i8:1 f8:1 f8:1 f8:1 f8:5",
+    parallel=True,
+    fastmath=FLAGS,
+)
 def _brick_moments(values, lo, inv_width, nodes, cumulative, dark, bricks, cells, points, cell_voxels, half, step, out):
     """Moments of the ``cells`` (x, y, z) cells of each brick with ``points`` (x, y, z) points a cell.
 

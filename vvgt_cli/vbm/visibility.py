@@ -13,7 +13,7 @@ from vvgt_cli.cameras import Camera
 from vvgt_cli.dvr.kernel import FLAGS, _leap, box_span, mean_optics, sample, table_coordinate
 from vvgt_cli.dvr.render import camera_arrays
 from vvgt_cli.dvr.scene import BRICK_BITS, Scene
-from vvgt_cli.jit import inlined
+from vvgt_cli.jit.decorators import inlined, kernel
 
 MAX_CELLS = 1 << 24
 MIN_RAYS = 8  # that meet a cell: with fewer, some cells are met by none and count as hidden
@@ -95,7 +95,11 @@ def _deposit(values, lo, inv_width, nodes, cumulative, dark, empty, px, py, pz, 
         i += 1
 
 
-@nb.njit(parallel=True, cache=True, fastmath=FLAGS)
+@kernel(
+    "V f8 f8 f8:2 f8:2 f8:1 u1:3 f8:2 f8:3 f8:2 i8 f8 f8 f4:5",
+    parallel=True,
+    fastmath=FLAGS,
+)
 def _march(values, lo, inv_width, nodes, cumulative, dark, empty, eyes, bases, lenses, size, step, inv_cell, grids):
     """Rays of all views, dealt over the workers; ``grids`` (workers, 3, cz, cy, cx) float32."""
     workers = grids.shape[0]

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from vvgt_cli.jit.decorators import kernel
 
-@numba.njit(cache=True)
+
+@kernel("u1:1 u1:1")
 def decode_plane(packed: np.ndarray, out: np.ndarray) -> int:
     """Decode one plane, never past either end.
 

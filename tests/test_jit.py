@@ -1,0 +1,260 @@
+"""Compiled kernels: the same bytes cold and warm, what their code is kept under, damaged and read-only folders."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from vvgt_cli.jit import ahead
+
+ROOT = Path(__file__).parent.parent
+SOURCE = "example:marschner-lobb:24"
+SMALL = ("--max-gaussians", "200", "--size", "40")
+STEP = (
+    "from vvgt_cli.optimize.steps import adam; import numpy as np; a = np.ones(3, np.float32); "
+    "adam(a, a.copy(), 0.1, 0.9, 0.99, 1, a * 0, a * 0); print(a)"
+)
+
+
+def environment(folder, **more):
+    own = {"NUMBA_CACHE_DIR": str(folder)} if folder else {}
+    kept = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
+    return kept | {"PYTHONPATH": str(ROOT)} | own | more
+
+
+def python(*args, cwd=ROOT, code=0, **variables):
+    done = subprocess.run(
+        [sys.executable, *args], cwd=cwd, env=environment(**variables), capture_output=True, text=True
+    )
+    assert done.returncode == code, done.stderr
+    return done
+
+
+def command(*args, cwd, **variables):
+    return python("-m", "vvgt_cli.cli.main", *map(str, args), cwd=cwd, **variables)
+
+
+def commands_leave(place: Path, cache: Path, **target: str) -> dict[str, bytes]:
+    """Run the commands that draw, each in a process of its own; what they leave."""
+    place.mkdir()
+    for line in (
+        f"convert {SOURCE} --max-gaussians 200 --size 40 --steps 12 -o a.ply",
+        f"render-views {SOURCE} --views 6 --test-views 2 --size 40 -o views",
+        "optimize a.ply --views views --steps 6 -o b.ply",
+        "infer a.ply --views views --model vvgt-small -o c.ply",
+        "render a.ply --orbit 2 --size 40 --exr -o d",
+    ):
+        command(*line.split(), "-q", cwd=place, folder=cache, **target)
+    files = sorted(path for path in place.rglob("*") if path.suffix in (".ply", ".png", ".exr"))
+    return {str(path.relative_to(place)): path.read_bytes() for path in files}
+
+
+@pytest.mark.parametrize(
+    "target",
+    [
+        {},
+        {"NUMBA_CPU_NAME": "generic"},
+        pytest.param({"NUMBA_CPU_NAME": "haswell", "NUMBA_CPU_FEATURES": "+avx2,+fma"}, marks=pytest.mark.long),
+        pytest.param({"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}, marks=pytest.mark.long),
+        pytest.param({"NUMBA_CPU_FEATURES": "+sse4.2"}, marks=pytest.mark.long),
+    ],
+    ids=lambda target: "-".join(target.values()) or "host",
+)
+def test_cold_and_warm_runs_leave_the_same_bytes(tmp_path, target):
+    cold = commands_leave(tmp_path / "cold", tmp_path / "cache", **target)
+    warm = commands_leave(tmp_path / "warm", tmp_path / "cache", **target)
+    assert len(cold) > 15
+    assert cold == warm
+
+
+def test_warmup_says_where_and_another_order_compiles_the_same(tmp_path):
+    first = command("warmup", cwd=tmp_path, folder=tmp_path / "cache")
+    folder = Path(first.stdout.strip())
+    assert len(kernels(folder)) > 20
+    assert "kernels were missing" in first.stderr
+    assert "nothing was missing" in command("warmup", cwd=tmp_path, folder=tmp_path / "cache").stderr
+    for name, cache in (("a", tmp_path / "cache"), ("b", None)):
+        done = command("convert", SOURCE, *SMALL, "-o", f"{name}.ply", cwd=tmp_path, folder=cache)
+        assert cache is None or "compile" not in done.stderr
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+
+
+def test_warmup_without_a_place_is_an_error(tmp_path):
+    (tmp_path / "file").write_bytes(b"")
+    few = "from vvgt_cli.jit import ahead; ahead.ALL = ahead.BACK_PROJECT[1:]"
+    quick = f"{few}; from vvgt_cli.cli.main import main; main()"
+    done = python("-c", quick, "warmup", cwd=tmp_path, code=1, folder=tmp_path / "file")
+    assert "could not be kept" in done.stderr
+
+
+def wanted(tmp_path, *args):
+    """Kernels that a command asks for."""
+    spy = (
+        "import sys; from vvgt_cli.jit.cache import KernelCache as K; inner = K.load_overload; names = set()\n"
+        "def spy(self, sig, context):\n"
+        "    names.add(f'{self.function.__module__}:{self.function.__qualname__}')\n"
+        "    return inner(self, sig, context)\n"
+        "K.load_overload = spy\n"
+        "from vvgt_cli.cli.main import run\n"
+        f"code = run({[str(arg) for arg in args]!r}); print(*names); sys.exit(code)"
+    )
+    return set(python("-c", spy, cwd=tmp_path, folder=None).stdout.splitlines()[-1].split())
+
+
+def test_commands_need_what_is_compiled_ahead_and_nothing_else(tmp_path):
+    rare = {"vvgt_cli.vbm.inset:_shift"}  # of opaque scenes
+    fit = ("--max-gaussians", 200, "--size", 64, "-q")
+    assert wanted(tmp_path, "convert", SOURCE, *fit, "--steps", 24, "-o", "a.ply") == set(ahead.CONVERT) - rare
+    assert wanted(tmp_path, "init", SOURCE, *fit, "-o", "i.ply") == set(ahead.INIT) - rare
+    few = wanted(tmp_path, "convert", SOURCE, *fit, "--steps", 0, "-o", "b.ply")
+    assert set(ahead.BACK_PROJECT) <= few <= {*ahead.CONVERT, *ahead.BACK_PROJECT}
+    views = ("--views", 6, "--test-views", 2, "--size", 40, "-q", "-o", "views")
+    assert wanted(tmp_path, "render-views", SOURCE, *views) == set(ahead.VIEWS)
+    seen = ("a.ply", "--views", "views")
+    assert wanted(tmp_path, "optimize", *seen, "--steps", 3, "-qo", "c.ply") == set(ahead.OPTIMIZE)
+    assert wanted(tmp_path, "infer", *seen, "--model", "vvgt-small", "-qo", "d.ply") == set(ahead.INFER)
+    assert wanted(tmp_path, "evaluate", "a.ply", "--volume", SOURCE, "--size", 24, "-q") == set(ahead.EVALUATE)
+    assert wanted(tmp_path, "render", "a.ply", "--orbit", 1, "--size", 24, "-qo", "r") == set(ahead.DRAW)
+
+
+def test_lists_name_kernels():
+    from vvgt_cli.jit.compile import usual_jobs
+
+    jobs = usual_jobs(ahead.ALL)
+    assert len({job.file for job in jobs}) == len(jobs) > 20
+
+
+def kernels(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.rglob("*.kernel"))
+
+
+PROBE = """
+from vvgt_cli.dvr.kernel import table_coordinate
+from vvgt_cli.jit.decorators import kernel
+from vvgt_cli.splat.constants import NEAR
+
+@kernel()
+def probe(value):
+    return table_coordinate(value, 0.0, 1.0, 10) + NEAR
+"""
+
+
+def test_an_edit_of_what_a_kernel_calls_or_reads_is_noticed_and_the_old_code_goes(tmp_path):
+    package = tmp_path / "vvgt_cli"
+    shutil.copytree(ROOT / "vvgt_cli", package, ignore=shutil.ignore_patterns("__pycache__"))
+    (package / "probe.py").write_text(PROBE)
+
+    def probe():
+        code = "from vvgt_cli.probe import probe; print(probe(3.0))"
+        out = python("-c", code, cwd=tmp_path, folder=tmp_path / "cache", PYTHONPATH=str(tmp_path)).stdout
+        (name,) = kernels(tmp_path / "cache")  # no old ones
+        return float(out), name
+
+    def edit(file, old, new):
+        text = (package / file).read_text()
+        assert old in text
+        (package / file).write_text(text.replace(old, new))
+
+    value, name = probe()
+    assert value == pytest.approx(3.01)
+    edit("optimize/loss.py", '"""Numba', '"""A numba')  # of no use to it
+    assert probe() == (value, name)
+    edit("dvr/kernel.py", "(value - lo) * inv_width", "(value - lo) * 2.0 * inv_width")
+    assert probe()[0] == pytest.approx(6.01)
+    edit("splat/constants.py", "NEAR = 0.01", "NEAR = 0.5")
+    assert probe()[0] == pytest.approx(6.5)
+
+
+def test_what_a_kernel_reaches():
+    from vvgt_cli.jit.cache import reached
+    from vvgt_cli.splat.tiles import blend
+    from vvgt_cli.vbm.moments import _brick_moments
+
+    modules, constants = reached(blend.py_func)
+    assert "vvgt_cli.splat.tiles" in modules
+    assert {"TILE = 16", "_MAX_A = np.float32(0.99)"} <= constants
+    assert {"vvgt_cli.vbm.moments", "vvgt_cli.dvr.kernel"} <= reached(_brick_moments.py_func)[0]
+
+
+@pytest.mark.parametrize(
+    "damage", [lambda text: text[:-100], lambda text: b"", lambda text: text[:60] + b"x" + text[61:]]
+)
+def test_damaged_files_are_compiled_anew(tmp_path, damage):
+    whole = python("-c", STEP, folder=tmp_path).stdout
+    (file,) = tmp_path.rglob("*.kernel")
+    good = file.read_bytes()
+    file.write_bytes(damage(good))
+    done = python("-c", STEP, folder=tmp_path)
+    assert done.stdout == whole
+    assert done.stderr.count("RuntimeWarning") == done.stderr.count("anew\n") == 1
+    assert len(file.read_bytes()) == len(good)
+    assert python("-c", STEP, folder=tmp_path).stderr == ""
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root gives files away")
+def test_files_of_other_users_are_not_read(tmp_path):
+    python("-c", STEP, folder=tmp_path)
+    (file,) = tmp_path.rglob("*.kernel")
+    os.chown(file, 12345, -1)
+    assert "another user" in python("-c", STEP, folder=tmp_path).stderr
+    assert file.stat().st_uid == 0  # in its place is one of our own
+
+
+@pytest.fixture(scope="module")
+def ply(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("ply")
+    command("init", SOURCE, *SMALL, "-qo", "a.ply", cwd=folder, folder=None)
+    return folder / "a.ply"
+
+
+def test_nowhere_to_write_is_one_line_and_the_same_numbers(tmp_path, ply):
+    (tmp_path / "file").write_bytes(b"")
+    (tmp_path / "tmp").mkdir()
+    draw = ("render", ply, "--orbit", 1, "--size", 40)
+    usual = command(*draw, "-o", "a", cwd=tmp_path, folder=None)
+    done = command(*draw, "-o", "b", cwd=tmp_path, folder=tmp_path / "file", TMPDIR=str(tmp_path / "tmp"))
+    assert usual.stderr.count("vvgt: note:") == 0
+    assert done.stderr.count("vvgt: note:") == done.stderr.count("cannot be kept") == 1
+    assert (tmp_path / "a" / "orbit_000.png").read_bytes() == (tmp_path / "b" / "orbit_000.png").read_bytes()
+    assert not list((tmp_path / "tmp").iterdir())  # removed at the end
+
+
+def test_without_another_process_it_still_works(tmp_path):
+    code = f"import sys; sys.executable = ''; {STEP}"
+    done = python("-c", code, folder=tmp_path)
+    assert done.stdout == python("-c", STEP, folder=tmp_path).stdout
+    assert done.stderr.count("RuntimeWarning: kernels compiled in this process") == 1
+
+
+def test_without_a_home(tmp_path):
+    package = tmp_path / "vvgt_cli"
+    shutil.copytree(ROOT / "vvgt_cli", package, ignore=shutil.ignore_patterns("__pycache__"))
+    (package / "__pycache__").write_bytes(b"")  # cannot be a folder
+    own = {"HOME": "/nonexistent/at/all", "XDG_CACHE_HOME": str(tmp_path / "user"), "PYTHONPATH": str(tmp_path)}
+    done = python("-c", STEP, cwd=tmp_path, folder=None, PYTHONDONTWRITEBYTECODE="1", **own)
+    assert done.stderr == ""
+    assert len(kernels(tmp_path / "user")) == 1
+
+
+def test_two_first_runs_at_once(tmp_path, ply):
+    args = ["-m", "vvgt_cli.cli.main", "render", str(ply), "--orbit", "1", "--size", "40", "-qo"]
+    runs = [
+        subprocess.Popen([sys.executable, *args, f"{i}"], cwd=tmp_path, env=environment(tmp_path / "cache"))
+        for i in range(2)
+    ]
+    assert [run.wait() for run in runs] == [0, 0]
+    assert (tmp_path / "0" / "orbit_000.png").read_bytes() == (tmp_path / "1" / "orbit_000.png").read_bytes()
+    assert len(kernels(tmp_path / "cache")) == len(ahead.DRAW)
+    assert not list((tmp_path / "cache").rglob("*.part"))
+
+
+def test_helpers_are_not_called_from_python():
+    from vvgt_cli.splat.kernel import to_camera
+
+    with pytest.raises(TypeError, match="kernels only"):
+        to_camera(1, 2, 3, 4)

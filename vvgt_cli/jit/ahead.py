@@ -1,0 +1,22 @@
+"""Kernels that commands will need, slowest to compile first; a test holds the lists to what the commands call."""
+
+from __future__ import annotations
+
+RAYCAST = ("vvgt_cli.dvr.kernel:render_tiles", "vvgt_cli.dvr.bricks:_ranges", "vvgt_cli.dvr.contrast:_contrast")
+DRAW = ("vvgt_cli.splat.kernel:tile_lists", "vvgt_cli.splat.tiles:blend", "vvgt_cli.splat.kernel:project")
+CLOSED_FORM = ("vvgt_cli.vbm.visibility:_march", "vvgt_cli.vbm.moments:_brick_moments", "vvgt_cli.vbm.inset:_shift")
+SLOPES = (
+    "vvgt_cli.splat.backward:moments",
+    "vvgt_cli.splat.backward:own_frame",
+    "vvgt_cli.splat.kernel:project_factors",
+)
+REFINE = ("vvgt_cli.optimize.steps:own_frame", *SLOPES, "vvgt_cli.optimize.loss:loss_gradient")
+BACK_PROJECT = ("vvgt_cli.splat.tiles:gather", "vvgt_cli.splat.tiles:reduce_pairs")
+
+VIEWS = (*RAYCAST, *CLOSED_FORM[:2])  # and points to start from
+INIT = (*CLOSED_FORM, "vvgt_cli.dvr.bricks:_ranges")
+CONVERT = (RAYCAST[0], REFINE[0], *CLOSED_FORM, *DRAW, *REFINE[1:], *RAYCAST[1:])
+OPTIMIZE = (*REFINE, *DRAW)
+EVALUATE = (*RAYCAST, *DRAW)
+INFER = (*DRAW, SLOPES[0], "vvgt_cli.splat.backward:standard", *BACK_PROJECT)
+ALL = (*CONVERT, *INFER[len(DRAW) + 1 :], "vvgt_cli.volume.slc_kernel:decode_plane")

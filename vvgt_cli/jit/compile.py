@@ -1,0 +1,136 @@
+"""Has kernels compiled by another process."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pickle
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numba
+from numba.core.registry import cpu_target
+
+from vvgt_cli.jit.cache import PACKAGE, folder_for_writing, folders, warn_once
+
+VOLUMES = ("uint8", "uint16", "float32")  # types of a volume's values that kernels read
+
+
+@dataclass(frozen=True)
+class Job:
+    """A kernel to compile.
+
+    Attributes:
+        module, function: where it is.
+        types: numba types of its arguments.
+        file: name that the caller will look for; a worker that finds other sources refuses.
+    """
+
+    module: str
+    function: str
+    types: tuple[Any, ...]
+    file: str
+
+
+def usual_jobs(names: Iterable[str], volumes: Sequence[str] = VOLUMES) -> list[Job]:
+    """Jobs for the declared argument types of kernels ("vvgt_cli.room.module:function")."""
+    jobs = []
+    for name in names:
+        module, function = name.split(":")
+        dispatcher = getattr(import_module(module), function)
+        for kind in volumes if "V" in dispatcher.usual.split() else volumes[:1]:
+            types = parse_types(dispatcher.usual, kind)
+            codegen = cpu_target.target_context.codegen()
+            jobs.append(Job(module, function, types, dispatcher._cache.file(types, codegen)))
+    return jobs
+
+
+def parse_types(usual: str, volume: str) -> tuple[Any, ...]:
+    """numba types from their short names; `V`: read-only values (nz, ny, nx) of type ``volume``."""
+    found: list[Any] = []
+    for word in usual.split():
+        name, _, axes = word.partition(":")
+        if name == "V":
+            found.append(numba.types.Array(getattr(numba.types, volume), 3, "C", readonly=True))
+        else:
+            kind = getattr(numba.types, name)
+            found.append(numba.types.Array(kind, int(axes), "C") if axes else kind)
+    return tuple(found)
+
+
+def missing(jobs: Iterable[Job]) -> list[Job]:
+    """Those of ``jobs`` whose code does not lie on disk."""
+    return [job for job in jobs if getattr(import_module(job.module), job.function)._cache.find(job.file) is None]
+
+
+def compile_aside(jobs: Sequence[Job], progress: Callable[[int, int], None] | None = None) -> bool:
+    """Compile ``jobs`` in a process of its own, one at a time on each processor; whether that worked.
+
+    What did not work is left to the caller, who finds no file.
+    """
+    folder = folder_for_writing()
+    if folder is None or not sys.executable:
+        return False
+    environment = os.environ | {
+        "PYTHONPATH": os.pathsep.join(filter(None, [str(PACKAGE.parent), os.environ.get("PYTHONPATH")])),
+        "PYTHONHASHSEED": "0",  # sets of names are walked through while compiling
+    }
+    try:
+        process = subprocess.Popen(
+            [sys.executable, "-P", "-m", "vvgt_cli.jit.worker"], env=environment, start_new_session=True,
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+    except OSError as error:
+        warn_once(f"kernels cannot be compiled by another process: {error}")
+        return False
+    try:
+        return _attend(process, pickle.dumps((folder, list(jobs))), len(jobs), progress)
+    finally:
+        if process.poll() is None:
+            _kill(process)
+        process.wait()
+
+
+def _attend(process: Any, order: bytes, count: int, progress: Callable[[int, int], None] | None) -> bool:
+    """Hand the order over, and follow what the worker prints: a line a kernel that is done."""
+    with contextlib.suppress(BrokenPipeError):
+        process.stdin.write(order)
+        process.stdin.close()
+    for done, _ in enumerate(process.stdout, 1):
+        if progress:
+            progress(done, count)
+    return process.wait() == 0
+
+
+def _kill(process: Any) -> None:
+    """End a worker and what it has started."""
+    with contextlib.suppress(OSError):
+        if hasattr(os, "killpg"):
+            os.killpg(process.pid, signal.SIGKILL)
+        else:
+            process.kill()
+
+
+def compile_ahead(
+    names: Iterable[str], progress: Callable[[int, int], None] | None = None
+) -> tuple[int, int, Path | None]:
+    """Compile kernels that are not found, for every type of values.
+
+    Args:
+        names: of `vvgt_cli.jit.ahead`.
+        progress: called after each with (done, total).
+
+    Returns:
+        (how many were missing, how many still are, the folder that later runs look into; None where none can be kept).
+    """
+    todo = missing(usual_jobs(names))
+    if todo:
+        compile_aside(todo, progress)
+    kept = folder_for_writing() if todo else next((f for f in folders() if f.is_dir()), None)
+    return len(todo), len(missing(todo)), kept if kept in folders() else None

@@ -1,0 +1,51 @@
+"""The two marks of compiled functions: `kernel` for what Python calls, `inlined` for what kernels call."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numba as nb
+
+from vvgt_cli.jit.cache import KernelCache
+
+NO_ENTRY: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+
+
+def kernel(usual: str = "", **options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """``numba.njit`` for functions that Python calls: compiled in another process, loaded from disk.
+
+    Args:
+        usual: types of the arguments as commands pass them: "f4:2 i8" is a C-contiguous float32 array of two axes and
+            an int64, "V" a volume's values. What is compiled ahead (`vvgt_cli.jit.ahead`); other types are compiled
+            when they are met.
+        options: of ``numba.njit``.
+    """
+
+    def wrap(function: Callable[..., Any]) -> Any:
+        made: Any = nb.njit(**options)(function)
+        if hasattr(made, "py_func"):  # with NUMBA_DISABLE_JIT it is the function
+            made._cache = KernelCache(made)
+            made.usual = usual
+        return made
+
+    return wrap
+
+
+def inlined(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """``numba.njit`` for functions that only kernels call: inlined always, without an entry for Python.
+
+    The entries would take a quarter of the time of compiling.
+    """
+
+    def wrap(function: Callable[..., Any]) -> Any:
+        made: Any = nb.njit(forceinline=True, **NO_ENTRY, **options)(function)
+        if hasattr(made, "py_func"):
+
+            def refuse(*args: Any, **keywords: Any) -> None:
+                raise TypeError(f"{function.__qualname__} is called by kernels only; call its .py_func")
+
+            made._compile_for_args = refuse
+        return made
+
+    return wrap
