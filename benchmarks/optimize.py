@@ -23,9 +23,9 @@ from vvgt_cli.optimize.ssim import add_ssim_gradient
 from vvgt_cli.optimize.states import OwnFrame
 from vvgt_cli.optimize.steps import own_frame
 from vvgt_cli.splat import blend, render
-from vvgt_cli.splat.constants import DILATION
 from vvgt_cli.splat.kernel import project_factors, tile_lists
 from vvgt_cli.splat.render import depth_order, moments, own_frame_backward, pose
+from vvgt_cli.splat.rules import INRIA
 from vvgt_cli.synth import open_volume
 
 REPEATS = 9
@@ -50,7 +50,7 @@ def part_calls(gaussians: Gaussians, target: np.ndarray) -> dict[str, Callable[[
     still = np.zeros(5), state.CLIPS, state.spread, *state.BETAS, 1  # rates 0: the scene stays as it is
     tiles_y = -(-camera.height // 16)
     return {
-        "project": lambda: project_factors(means, factors, logits, *pose(camera), DILATION, *scratch),
+        "project": lambda: project_factors(means, factors, logits, *pose(camera), INRIA.projecting(), *scratch),
         "sort": lambda: depth_order(depth),
         "file into tiles": lambda: tile_lists(order, p.extent, p.tiles_x, tiles_y, numba.get_num_threads()),
         "blend": lambda: blend(p, colors, camera.height, camera.width),

@@ -34,8 +34,7 @@ from vvgt_cli.pipeline.mend import fine_enough, wide
 from vvgt_cli.pipeline.optimize import Views
 from vvgt_cli.pipeline.plan import REFINE_VIEWS, views_of
 from vvgt_cli.splat import render
-from vvgt_cli.splat.constants import DILATION
-from vvgt_cli.splat.half import QUARTER
+from vvgt_cli.splat.rules import INRIA
 from vvgt_cli.vbm import VbmOptions, backproject, initialise
 
 K, SIZE, ADAM_STEPS, BASE_VIEWS = 100_000, 400, 100, 72
@@ -71,9 +70,9 @@ def equal_row(judged: Judged) -> dict[str, Any]:
     adam, _ = judged.refined(start, train, images, OptimizeOptions(steps=ADAM_STEPS, method="adam", **LOSS_3DGS))
     budget = time.perf_counter() - began
     began = time.perf_counter()
-    cameras, images, dilation = training_views(judged, start, REFINE_VIEWS)
+    cameras, images, rule = training_views(judged, start, REFINE_VIEWS)
     views = time.perf_counter() - began
-    options = OptimizeOptions(steps=None, time_budget=budget - views, dilation=dilation)
+    options = OptimizeOptions(steps=None, time_budget=budget - views, rule=rule)
     ours, record = judged.refined(start, cameras, images, options)
     return {
         "closed_form": judged.psnr(start), "adam": judged.psnr(adam), "ours": judged.psnr(ours), "adam_s": budget,
@@ -82,11 +81,11 @@ def equal_row(judged: Judged) -> dict[str, Any]:
 
 
 def training_views(judged: Judged, start: Gaussians, count: int) -> tuple[list[Camera], np.ndarray, float]:
-    """As `convert` makes them: cameras, images, dilation."""
+    """As `convert` makes them: cameras, images, rule."""
     half = wide(start, SIZE)
     cameras = default_views("train", count, size=SIZE // 2 if half else SIZE)
     images = render_views(judged.scene, cameras, fine_enough(judged.scene, judged.check, start, half))
-    return cameras, images, DILATION * QUARTER if half else DILATION
+    return cameras, images, INRIA.at(0.5) if half else INRIA
 
 
 def begin(judged: Judged, method: str, steps: int) -> Gaussians:
@@ -104,8 +103,8 @@ def point(judged: Judged, method: str, steps: int) -> dict[str, Any]:
     start = begin(judged, method, steps)
     if steps:
         if method == "ours":
-            cameras, images, dilation = training_views(judged, start, views_of(steps))
-            options = OptimizeOptions(steps=steps, dilation=dilation)
+            cameras, images, rule = training_views(judged, start, views_of(steps))
+            options = OptimizeOptions(steps=steps, rule=rule)
         else:
             cameras = default_views("train", 24 if method == "adam" else BASE_VIEWS)
             images = render_views(judged.scene, cameras, FIT_VIEWS)

@@ -156,8 +156,8 @@ def ways(case: Case, model: Model | None) -> dict[str, list[Refine]]:
         return lambda g: optimize(g, case.cameras, case.images, options, case.check)[0]
 
     def half_steps(g: Gaussians) -> Gaussians:
-        cameras, images, dilation = halved(case.cameras, case.images)
-        return optimize(g, cameras, images, OptimizeOptions(steps=36, dilation=dilation), case.check)[0]
+        cameras, images, rule = halved(case.cameras, case.images)
+        return optimize(g, cameras, images, OptimizeOptions(steps=36, rule=rule), case.check)[0]
 
     found: dict[str, list[Refine]] = {
         "closed form": [], "25 steps": [steps(25)], "36 steps on half views": [half_steps], "100 steps": [steps(100)]

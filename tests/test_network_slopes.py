@@ -11,7 +11,7 @@ from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.network.config import SLOPES
 from vvgt_cli.network.prepare import pack, unpack
 from vvgt_cli.network.slopes import STEP, own_frame, slope_rows
-from vvgt_cli.splat import project, render, render_backward_reference, render_reference
+from vvgt_cli.splat import render, render_backward_reference, render_reference
 from vvgt_cli.splat.constants import DILATION
 from vvgt_cli.splat.half import halved
 from vvgt_cli.splat.reference import rotations
@@ -71,10 +71,10 @@ def test_halved_views_show_what_whole_ones_do():
     gaussians, _, _ = scene(count=50)
     cameras = default_views("train", 2, size=64)
     views = np.stack([render(gaussians, camera) for camera in cameras])
-    few, small, dilation = halved(cameras, views)
+    few, small, rule = halved(cameras, views)
     assert small.shape == (2, 32, 32, 4)
-    assert dilation == DILATION / 4
+    assert rule.dilation == DILATION / 4
     for camera, view in zip(few, small, strict=True):
-        assert np.abs(render(gaussians, camera, project(gaussians, camera, dilation)) - view).mean() < 0.01
+        assert np.abs(render(gaussians, camera, rule) - view).mean() < 0.01
     odd = default_views("train", 2, size=33)
-    assert halved(odd, np.zeros((2, 33, 33, 4), np.float32))[2] == DILATION
+    assert halved(odd, np.zeros((2, 33, 33, 4), np.float32))[2].dilation == DILATION

@@ -12,9 +12,9 @@ from vvgt_cli.metrics import psnr
 from vvgt_cli.optimize import OptimizeOptions, optimize
 from vvgt_cli.optimize.states import OwnFrame
 from vvgt_cli.splat import render
-from vvgt_cli.splat.constants import DILATION
 from vvgt_cli.splat.half import halved
 from vvgt_cli.splat.reference import covariances
+from vvgt_cli.splat.rules import INRIA
 
 FIELDS = ("means", "log_scales", "quaternions", "opacity_logits", "colors")
 CAMERAS, CHECKS = default_views("train", 6, size=48), default_views("check", 2, size=48)
@@ -77,13 +77,13 @@ def test_views_of_half_the_size_want_a_quarter_of_the_dilation(method):
     wide = truth(300)
     thin = Gaussians(wide.means, wide.log_scales - 1.2, wide.quaternions, wide.opacity_logits + 1, wide.colors)
     images, check = views(thin, CAMERAS), (CHECKS, views(thin, CHECKS))
-    cameras, small, dilation = halved(CAMERAS, images)
+    cameras, small, rule = halved(CAMERAS, images)
     start, ends = shaken(thin, 0.03), {}
-    for given in (dilation, DILATION):
-        options = OptimizeOptions(steps=60, method=method, dilation=given)
+    for given in (rule, INRIA):
+        options = OptimizeOptions(steps=60, method=method, rule=given)
         ends[given] = score(optimize(start, cameras, small, options)[0], *check)
-    assert ends[dilation] > score(start, *check) + 1
-    assert ends[dilation] > ends[DILATION] + 1
+    assert ends[rule] > score(start, *check) + 1
+    assert ends[rule] > ends[INRIA] + 1
 
 
 def test_alpha_is_fitted_where_colour_says_nothing(scene):

@@ -11,6 +11,7 @@ from vvgt_cli.splat import project, render, render_backward, render_backward_ref
 from vvgt_cli.splat.constants import MAX_ALPHA
 from vvgt_cli.splat.reference import covariances, image_gradients, layers, rotations, space_gradients
 from vvgt_cli.splat.render import moments, own_frame_backward, project_factors
+from vvgt_cli.splat.rules import INRIA, RULES
 
 FIELDS = ("means", "log_scales", "quaternions", "opacity_logits", "colors")
 EYE = (2.0, -1.7, 1.1)
@@ -35,9 +36,9 @@ def moved(g, steps, sign):
     return Gaussians(*(np.float32(getattr(g, f) + np.float64(sign) * steps.get(f, 0)) for f in FIELDS))
 
 
-def drawn(g, c):
+def drawn(g, c, rule=INRIA):
     """Order, and which pixels of each Gaussian are drawn or clamped: where this changes there is no derivative."""
-    found = list(layers(g, c))
+    found = list(layers(g, c, rule))
     return [k for k, _, _ in found], np.array([(a > 0) + 1 * (a == MAX_ALPHA) for _, a, _ in found])
 
 
@@ -49,9 +50,10 @@ def direction(rng, g, seed, size=2e-4):
     return steps if seed % 6 == 5 else {FIELDS[seed % 6]: steps[FIELDS[seed % 6]]}
 
 
+@pytest.mark.parametrize("rule", ["inria", "compensated"])
 @pytest.mark.parametrize("block", range(6))
-def test_the_twin_agrees_with_central_differences_in_hundreds_of_scenes(block):
-    checked = 0
+def test_the_twin_agrees_with_central_differences_in_hundreds_of_scenes(block, rule):
+    checked, rule = 0, RULES[rule]
     for seed in range(block, 360, 6):
         rng = np.random.default_rng(seed)
         axes = rng.choice([0.15, 0.3, 1.0])
@@ -59,25 +61,25 @@ def test_the_twin_agrees_with_central_differences_in_hundreds_of_scenes(block):
         g, c = cloud(6, seed, scale=0.2 * axes, spread=axes, logit=rng.choice([-2.0, 0.0, 3.0])), camera(12, 10, eye)
         steps = direction(rng, g, block)
         low, high = moved(g, steps, -1), moved(g, steps, 1)
-        (order, mask), (order_low, mask_low), (order_high, mask_high) = (drawn(x, c) for x in (g, low, high))
+        (order, mask), (order_low, mask_low), (order_high, mask_high) = (drawn(x, c, rule) for x in (g, low, high))
         if not order == order_low == order_high:
             continue
         grad = rng.normal(size=(c.height, c.width, 4))
         grad[(mask != mask_low).any(axis=0) | (mask != mask_high).any(axis=0)] = 0
-        difference = (grad * (render_reference(high, c) - render_reference(low, c))).sum()
-        slopes = render_backward_reference(g, c, grad)
+        difference = (grad * (render_reference(high, c, rule) - render_reference(low, c, rule))).sum()
+        slopes = render_backward_reference(g, c, grad, rule)
         parts = [slopes[f] * (getattr(high, f).astype(np.float64) - getattr(low, f)) for f in FIELDS]
         assert abs(difference - sum(p.sum() for p in parts)) < 2e-3 * sum(np.abs(p).sum() for p in parts) + 1e-12
         checked += any(p.any() for p in parts)
     assert checked > 40
 
 
-def assert_matches_twin(g, c, seed=0, tight=2e-3, share=0.01):
+def assert_matches_twin(g, c, seed=0, tight=2e-3, share=0.01, rule=INRIA):
     """Kernel against twin, relative to a Gaussian's size of gradient; a pixel at a threshold may fall either way."""
     grad = np.random.default_rng(seed).normal(size=(c.height, c.width, 4)).astype(np.float32)
-    p = project(g, c)
-    ours = render_backward(g, c, p, render(g, c, p), grad)
-    twin = render_backward_reference(g, c, grad.astype(np.float64))
+    p = project(g, c, rule)
+    ours = render_backward(g, c, p, render(g, c, projection=p), grad)
+    twin = render_backward_reference(g, c, grad.astype(np.float64), rule)
     for field in FIELDS:
         a, b = getattr(ours, field).reshape(len(g), -1), twin[field].reshape(len(g), -1)
         assert np.isfinite(a).all(), field
@@ -91,6 +93,12 @@ def assert_matches_twin(g, c, seed=0, tight=2e-3, share=0.01):
 @pytest.mark.parametrize("size", [(64, 64), (17, 49), (1, 1)])
 def test_kernels_match_the_twin(seed, size):
     assert_matches_twin(cloud(300, seed, scale=0.05), camera(*size), seed, share=0.03)
+
+
+@pytest.mark.parametrize("name", [name for name, rule in RULES.items() if not rule.shifted])
+@pytest.mark.parametrize("scale", [0.05, 0.012])
+def test_kernels_match_the_twin_by_every_rule_that_is_fitted_to(name, scale):
+    assert_matches_twin(cloud(300, 5, scale=scale), camera(64, 64), 5, share=0.03, rule=RULES[name])
 
 
 @pytest.mark.parametrize("axes", [(0.8, 1e-3, 1e-3), (0.8, 0.8, 1e-4), (1e-6, 1e-6, 1e-6), (3.0, 3.0, 3.0)])
@@ -150,7 +158,7 @@ def test_nothing_and_what_is_not_drawn():
     c = camera()
     for g in (cloud(0), cloud(5, logit=-20.0)):
         p = project(g, c)
-        out = render_backward(g, c, p, render(g, c, p), np.ones((c.height, c.width, 4), np.float32))
+        out = render_backward(g, c, p, render(g, c, projection=p), np.ones((c.height, c.width, 4), np.float32))
         assert not any(getattr(out, field).any() for field in FIELDS)
 
 
@@ -158,23 +166,24 @@ def test_the_same_call_gives_the_same_bytes():
     g, c = cloud(500, 7, scale=0.05), camera(64, 64)
     grad = np.random.default_rng(0).normal(size=(64, 64, 4))
     p = project(g, c)
-    image = render(g, c, p)
+    image = render(g, c, projection=p)
     first, second = (render_backward(g, c, p, image, grad) for _ in range(2))
     for field in FIELDS:
         assert getattr(first, field).tobytes() == getattr(second, field).tobytes()
 
 
+@pytest.mark.parametrize("rule", [RULES["inria"], RULES["compensated"]], ids=lambda rule: rule.name)
 @pytest.mark.parametrize("axes", [(0.1, 0.05, 0.02), (0.6, 0.6, 1e-5)])
-def test_own_frame_gradients_match_the_twin(axes):
+def test_own_frame_gradients_match_the_twin(axes, rule):
     g, c = cloud(200, 8), camera(48, 40)
     g = Gaussians(g.means, np.log(np.tile(axes, (200, 1))), g.quaternions, g.opacity_logits, g.colors)
     factors = np.float32(rotations(g.quaternions) * np.exp(g.log_scales.astype(np.float64))[:, None, :])
     np.testing.assert_allclose(factors @ factors.transpose(0, 2, 1), covariances(g), atol=1e-7)
     grad = np.random.default_rng(0).normal(size=(c.height, c.width, 4)).astype(np.float32)
-    p = project_factors(g.means, factors, g.opacity_logits, c)
-    ours = own_frame_backward(g.means, factors, g.colors, c, p, moments(p, g.colors, render(g, c, p), grad))
-    centres, inverses, logits, colors = image_gradients(g, c, grad.astype(np.float64))
-    means, spatial = space_gradients(g, c, centres, inverses)
+    p = project_factors(g.means, factors, g.opacity_logits, c, rule)
+    ours = own_frame_backward(g.means, factors, g.colors, c, p, moments(p, g.colors, render(g, c, projection=p), grad))
+    centres, inverses, logits, colors = image_gradients(g, c, grad.astype(np.float64), rule)
+    means, spatial = space_gradients(g, c, centres, inverses, rule)
     steps = np.einsum("kji,kj->ki", factors, means)
     entries = 2 * factors.transpose(0, 2, 1) @ spatial @ factors
     pairs = [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]

@@ -9,8 +9,9 @@ from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.checks.clouds import cloud
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.splat import blend, gather, gather_reference, project, render, render_reference
-from vvgt_cli.splat.constants import DILATION, MIN_ALPHA
+from vvgt_cli.splat.constants import MIN_ALPHA
 from vvgt_cli.splat.render import deal, depth_order
+from vvgt_cli.splat.rules import INRIA, RULES
 
 EYE = (2.0, -1.7, 1.1)
 # Where alpha crosses 1/255, or T 1e-4, float32 may decide otherwise than float64: such a pixel is off by a 1/255 at
@@ -38,6 +39,48 @@ def assert_close(image, reference, tight=TIGHT):
 def test_random_clouds_match_the_twin(seed, size):
     g, c = cloud(300, seed), camera(*size)
     assert_close(render(g, c), render_reference(g, c))
+
+
+@pytest.mark.parametrize("rule", RULES.values(), ids=RULES)
+@pytest.mark.parametrize("scale", [0.05, 0.012])
+def test_every_rule_matches_the_twin(rule, scale):
+    g, c = cloud(300, 12, scale=scale, logit=1.0), camera()
+    image = render(g, c, rule)
+    assert_close(image, render_reference(g, c, rule))
+    assert image[..., 3].max() <= 1
+    assert np.array_equal(image, render(g, c, rule.name))
+
+
+def test_rules_differ_as_they_say():
+    one = Gaussians(np.zeros((1, 3)), np.full((1, 3), np.log(0.06)), [[1, 0, 0, 0]], [0.0], [[1, 1, 1]])
+    c = camera(257, 257)
+    mass = {name: float(render(one, c, name)[..., 3].sum(dtype=np.float64)) for name in RULES}
+    pixel = np.linalg.norm(c.position) / c.fx
+    area = 2 * np.pi * (0.06 / pixel) ** 2 * 0.5  # of the whole Gaussian: opacity one half
+    shifted = (1 - np.exp(-4) * (1 + 4)) / (1 - np.exp(-4))  # of exp(-p) - exp(-4), p < 4
+    wide = 1 + 0.3 / (0.06 / pixel) ** 2
+    assert mass["inria"] == pytest.approx(area * wide * (1 - 2 / 255), rel=3e-3)
+    assert mass["compensated"] == pytest.approx(area * (1 - 2 / 255), rel=3e-3)
+    assert mass["spark"] == pytest.approx(area * (1 - np.exp(-4)), rel=3e-3)
+    assert mass["playcanvas"] == pytest.approx(area * (1 + (wide - 1) / 4) * shifted, rel=1e-2)  # and cut below 1/255
+    assert mass["viser"] == pytest.approx(area * wide * (1 - 0.01 / 0.5), rel=3e-3)
+
+
+def test_small_splats_are_left_out_where_viewers_do():
+    c = camera(101, 101)
+    pixel = np.linalg.norm(c.position) / c.fx
+    for sigma, seen in ((0.2, False), (0.25, True)):  # px; 0.125 - 0.075 px^2 between them
+        g = Gaussians(np.zeros((1, 3)), np.full((1, 3), np.log(sigma * pixel)), [[1, 0, 0, 0]], [3.0], [[1, 1, 1]])
+        assert render(g, c, "playcanvas").any() == seen
+        assert render(g, c, "inria").any()
+
+
+def test_a_rule_at_a_ratio_shows_what_the_whole_size_does_at_fewer_points():
+    g, c = cloud(60, 11, scale=0.03), camera(63, 63)
+    large = render(g, c.resized(3))[1::3, 1::3]  # the same points
+    for rule in RULES.values():
+        np.testing.assert_allclose(render(g, c, rule.at(1 / 3)), render(g, c.resized(3), rule)[1::3, 1::3], atol=JUMP)
+    assert np.abs(render(g, c) - large).mean() > 1e-3
 
 
 @pytest.mark.parametrize("axes", [(0.8, 1e-4, 1e-4), (0.8, 0.8, 1e-4), (1e-6, 1e-6, 1e-6), (3.0, 3.0, 3.0)])
@@ -163,6 +206,6 @@ def test_depths_sort_stably_and_tiles_are_dealt_out_whole():
 def test_a_quarter_of_the_dilation_shows_twice_the_size_averaged():
     g, c = cloud(60, 11, scale=0.05), camera()
     large = render(g, c.resized(2)).reshape(c.height, 2, c.width, 2, 4).mean(axis=(1, 3))
-    near = render(g, c, project(g, c, DILATION / 4))
+    near = render(g, c, INRIA.at(0.5))
     far = render(g, c)
     assert np.abs(near - large).mean() < 0.25 * np.abs(far - large).mean()

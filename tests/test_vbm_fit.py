@@ -8,7 +8,7 @@ import pytest
 from vvgt_cli.cameras import default_views
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.splat import blend, project, render
-from vvgt_cli.splat.constants import DILATION
+from vvgt_cli.splat.rules import INRIA
 from vvgt_cli.vbm import fit as fit_module
 from vvgt_cli.vbm.fit import BRIGHTEST, PRIOR, image_errors, solve_colors
 
@@ -177,7 +177,7 @@ def test_views_that_count_at_twice_the_size_draw_the_colours_there(monkeypatch: 
     """Every view counted so: the solution for the smaller dilation."""
     monkeypatch.setattr(fit_module, "PRIOR", 1e-4)
     truth = cloud(24)
-    views = np.stack([blend(project(truth, c, DILATION / 4), truth.colors, 40, 40) for c in CAMERAS])
+    views = np.stack([blend(project(truth, c, INRIA.at(0.5)), truth.colors, 40, 40) for c in CAMERAS])
     near = solve_colors(with_colors(truth, 0.5), CAMERAS, views, 30, twice_every=1)
     far = solve_colors(with_colors(truth, 0.5), CAMERAS, views, 30)
     assert np.abs(near.colors - truth.colors).mean() < 0.5 * np.abs(far.colors - truth.colors).mean()

@@ -19,7 +19,7 @@ STAGE = "gradients"
 
 def _gradients(gaussians: Gaussians, camera: Camera, grad: np.ndarray) -> Gradients:
     projection = project(gaussians, camera)
-    found = render_backward(gaussians, camera, projection, render(gaussians, camera, projection), grad)
+    found = render_backward(gaussians, camera, projection, render(gaussians, camera, projection=projection), grad)
     for field in FIELDS:
         require(np.isfinite(getattr(found, field)).all(), f"gradients of {field} that are not finite")
     return found

@@ -33,15 +33,15 @@ def damped(start: Gaussians, end: Gaussians, cameras: Sequence[Camera], images: 
     A network that meets a scene of another kind than it was trained on errs by the size of its steps first. The error
     is the squared one of RGBA over `VIEWS` of the given views, averaged 2 x 2; 0 where no share lowers it.
     """
-    from vvgt_cli.splat import project, render
+    from vvgt_cli.splat import render
 
     some = np.linspace(0, len(cameras) - 1, min(VIEWS, len(cameras))).round().astype(int)
-    few, views, dilation = halved([cameras[i] for i in some], images[some])
+    few, views, rule = halved([cameras[i] for i in some], images[some])
 
     def error(gaussians: Gaussians) -> float:
         total = 0.0
         for camera, view in zip(few, views, strict=True):
-            picture = render(gaussians, camera, project(gaussians, camera, dilation))
+            picture = render(gaussians, camera, rule)
             total += float(np.square(picture - view, dtype=np.float64).sum())
         return total
 

@@ -59,10 +59,10 @@ def slope_rows(gaussians: Gaussians, cameras: Sequence[Camera], images: np.ndarr
     total, squares = np.zeros((count, STEP), np.float32), np.zeros((count, STEP), np.float32)
     weights, error = np.zeros((count, 5)), 0.0
     pixel = float(np.median([np.linalg.norm(c.position) / c.fx for c in cameras]))
-    cameras, images, dilation = halved(cameras, images)
+    cameras, images, rule = halved(cameras, images)
     for camera, view in zip(cameras, images, strict=True):
-        projection = project(g, camera, dilation)
-        image = render(g, camera, projection)
+        projection = project(g, camera, rule)
+        image = render(g, camera, projection=projection)
         rest = image - view
         slope = render_backward(g, camera, projection, image, 2 * rest)
         fields = slope.means, slope.log_scales, slope.quaternions, slope.opacity_logits, slope.colors

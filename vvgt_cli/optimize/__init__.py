@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from vvgt_cli.errors import UsageError
-from vvgt_cli.splat.constants import DILATION
+from vvgt_cli.splat.rules import INRIA, Rule
 
 if TYPE_CHECKING:
     import numpy as np
@@ -35,8 +35,9 @@ class OptimizeOptions:
         target_psnr: dB on the check views at which to stop.
         l1, l2, ssim: weights of the sums over pixels and RGB of |r|, r^2 and 1 - SSIM.
         alpha: weight of the alpha channel's |r| and r^2 beside a colour channel's.
-        dilation: px^2 added to projected covariances in the training views: a quarter of the standard programs' where
-            those views are half the size of what the file is made for. Check views have the standard one.
+        rule: by which the training views are drawn: ``rule.at(w / W)`` where they are w px wide and the file is made
+            for W. Falloffs that are shifted cannot be descended on.
+        judge: by which the check views are drawn.
         check_every: fewest steps between two looks at the check views, of which a run takes eight or so.
         patience: looks in a row without a gain of 0.01 dB, in the second half, after which to stop.
         checkpoint: .npz written every ``check_every`` steps and at the end; where it is there, the run goes on from it.
@@ -52,7 +53,8 @@ class OptimizeOptions:
     l2: float = 1.0
     ssim: float = 0.0
     alpha: float = 0.5
-    dilation: float = DILATION
+    rule: Rule = INRIA
+    judge: Rule = INRIA
     check_every: int = 25
     patience: int = 3
     checkpoint: str | None = None
@@ -65,8 +67,10 @@ class OptimizeOptions:
             raise UsageError("neither steps nor a time budget; expected one of them")
         if self.steps is not None and self.steps < 0:
             raise UsageError(f"{self.steps} steps; expected 0 or more")
-        if not 0 <= self.dilation < math.inf:
-            raise UsageError(f"dilation {self.dilation} px^2; expected 0 or more")
+        if self.rule.shifted:
+            raise UsageError(f"rule {self.rule.name}: its falloff has no gradient here; fit to inria")
+        if not 0 <= self.rule.dilation < math.inf:
+            raise UsageError(f"dilation {self.rule.dilation} px^2; expected 0 or more")
         if min(self.check_every, self.patience) < 1:
             raise UsageError(f"check every {self.check_every} steps, patience {self.patience}; expected at least 1")
         if self.time_budget is not None and not self.time_budget >= 0:

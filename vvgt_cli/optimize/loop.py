@@ -105,7 +105,7 @@ def begin(gaussians: Gaussians, cameras: Sequence[Camera], options: OptimizeOpti
         return Densified(gaussians, cameras, options)
     if options.method == "adam":
         return Fields(gaussians, cameras)
-    return OwnFrame(gaussians, cameras, options.dilation)
+    return OwnFrame(gaussians, cameras, options.rule)
 
 
 def step(
@@ -124,7 +124,7 @@ def step(
     from vvgt_cli.optimize.loss import loss_gradient
     from vvgt_cli.optimize.ssim import add_ssim_gradient
 
-    projection = state.project(camera, options.dilation)
+    projection = state.project(camera, options.rule)
     image = blend(projection, state.colors, camera.height, camera.width)
     grad = np.empty_like(image)
     l1, l2, alpha = np.float32(options.l1), np.float32(options.l2), np.float32(options.alpha)

@@ -10,9 +10,9 @@ import numpy as np
 from vvgt_cli.cameras import Camera
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.splat import Projection, project
-from vvgt_cli.splat.constants import DILATION
 from vvgt_cli.splat.reference import rotations
 from vvgt_cli.splat.render import fields_backward, moments, own_frame_backward, project_factors
+from vvgt_cli.splat.rules import INRIA, Rule
 
 WARM_UP = 3  # steps
 SMALLEST = 1e-7  # standard deviation, unit frame
@@ -31,7 +31,7 @@ class OwnFrame:
     BETAS = 0.6, 0.999
     STEADY = True  # what falls far behind its best can be put back there, and a run without gain is at its end
 
-    def __init__(self, gaussians: Gaussians, cameras: Sequence[Camera], dilation: float = DILATION) -> None:
+    def __init__(self, gaussians: Gaussians, cameras: Sequence[Camera], rule: Rule = INRIA) -> None:
         from vvgt_cli.optimize import steps
 
         scales = np.exp(gaussians.log_scales.astype(np.float64))
@@ -43,16 +43,16 @@ class OwnFrame:
         )
         self.first, self.second = (np.zeros((len(gaussians), steps.COUNT), np.float32) for _ in range(2))
         pixel = float(np.median([np.linalg.norm(camera.position) / camera.fx for camera in cameras]))
-        self.spread = dilation * pixel**2
+        self.spread = rule.dilation * pixel**2
         self.step = 0
 
     @property
     def colors(self) -> np.ndarray:
         return self.arrays[3]
 
-    def project(self, camera: Camera, dilation: float = DILATION) -> Projection:
+    def project(self, camera: Camera, rule: Rule = INRIA) -> Projection:
         means, factors, logits, _ = self.arrays
-        return project_factors(means, factors, logits, camera, dilation)
+        return project_factors(means, factors, logits, camera, rule)
 
     def descend(
         self,
@@ -115,8 +115,8 @@ class Fields:
     def colors(self) -> np.ndarray:
         return np.maximum(self.arrays[4], 0)
 
-    def project(self, camera: Camera, dilation: float = DILATION) -> Projection:
-        return project(self.gaussians(), camera, dilation)
+    def project(self, camera: Camera, rule: Rule = INRIA) -> Projection:
+        return project(self.gaussians(), camera, rule)
 
     def descend(
         self,

@@ -16,8 +16,8 @@ from vvgt_cli.optimize import OptimizeOptions
 from vvgt_cli.pipeline.optimize import Views, refine
 from vvgt_cli.pipeline.plan import SMALLER, Limits, Plan, views_of
 from vvgt_cli.pipeline.record import Run
-from vvgt_cli.splat.constants import DILATION
 from vvgt_cli.splat.half import QUARTER, halved
+from vvgt_cli.splat.rules import INRIA
 from vvgt_cli.volume.blocks import free_memory
 
 if TYPE_CHECKING:
@@ -161,9 +161,9 @@ class _Mending:
             ending = sum(seconds for name, seconds in self.plan.stages if name in ("test views", "write"))
             left = max(self.limits.time_budget - self.run.elapsed() - ending, 0.0)
         target = self.limits.target_psnr
-        dilation = DILATION * QUARTER if self.plan.half else DILATION
+        rule = INRIA.at(0.5) if self.plan.half else INRIA
         options = OptimizeOptions(
-            steps=self.plan.most_steps, time_budget=left, target_psnr=target, dilation=dilation, seed=self.fit.seed
+            steps=self.plan.most_steps, time_budget=left, target_psnr=target, rule=rule, seed=self.fit.seed
         )
         return refine(self.run, gaussians, train, self.check, options)
 
@@ -188,13 +188,13 @@ def fine_enough(scene: Scene, check: Views, start: Gaussians, half: bool) -> Ren
     """
     from vvgt_cli.dvr import RenderSettings, render_view
     from vvgt_cli.metrics import psnr
-    from vvgt_cli.splat import project, render
+    from vvgt_cli.splat import render
 
-    cameras, views, dilation = check.cameras[:1], check.images[:1], DILATION
+    cameras, views, rule = check.cameras[:1], check.images[:1], INRIA
     if half:
-        cameras, views, dilation = halved(cameras, views)
+        cameras, views, rule = halved(cameras, views)
     camera, fine = cameras[0], views[0]
-    wanted = psnr(fine[..., :3], render(start, camera, project(start, camera, dilation))[..., :3]) + MARGIN
+    wanted = psnr(fine[..., :3], render(start, camera, rule)[..., :3]) + MARGIN
     single = RenderSettings(samples=1)
     enough = psnr(fine[..., :3], render_view(scene, camera, single)[..., :3]) >= wanted
     return single if enough else RenderSettings()

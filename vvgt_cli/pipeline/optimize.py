@@ -141,7 +141,8 @@ def refine(run: Run, start: Gaussians, train: Views, check: Views, options: Opti
         stage.kept = record.kept > 0
         stage.psnr_before, stage.psnr = record.psnr_before, record.psnr_after
         stage.note = _note(record, options)
-    run.report.refinement = asdict(record) | {"method": options.method, "dilation": options.dilation}
+    drawn = {"rule": options.rule.name, "dilation": options.rule.dilation}
+    run.report.refinement = asdict(record) | {"method": options.method} | drawn
     return as_stored(result)
 
 

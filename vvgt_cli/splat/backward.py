@@ -16,9 +16,6 @@ from vvgt_cli.splat.kernel import rotation_column, to_camera, turned, unit_quate
 from vvgt_cli.splat.tiles import (
     _AREA,
     _HALF,
-    _MAX_A,
-    _MIN_A,
-    _MIN_T,
     _P1,
     _P2,
     _P3,
@@ -35,6 +32,7 @@ from vvgt_cli.splat.tiles import (
     f32,
 )  # fmt: skip
 
+SINGULAR = 1e-9  # det S of det S' below which the gradient of the compensation is left out
 SUMS = 9  # of G = alpha dL/dalpha: 1, dx, dy, dx^2, dx dy, dy^2; of the weight: x dL/d(r, g, b)
 _T = U(TILE)
 _A0, _A1, _A2 = U(6 * _AREA), U(6 * _AREA + TILE), U(6 * _AREA + 2 * TILE)
@@ -44,9 +42,10 @@ _exact = inlined()
 
 
 @_jit
-def _sweep(y0, y1, k, colors, a, b, c, u, v, opacity, buf):
+def _sweep(y0, y1, k, colors, a, b, c, u, v, opacity, rule, buf):
     """One Gaussian over rows [y0, y1): sums a column into the six rows behind the planes."""
     red, green, blue = max(colors[k, 0], _ZERO), max(colors[k, 1], _ZERO), max(colors[k, 2], _ZERO)
+    min_alpha, max_alpha, floor, factor, offset, end = rule
     for i in range(_A0, _END):
         buf[i] = _ZERO
     for y in range(y0, y1):
@@ -54,16 +53,16 @@ def _sweep(y0, y1, k, colors, a, b, c, u, v, opacity, buf):
         h, q = b * dy, c * dy * dy
         for i in range(_T):
             j = y * _T + i
-            raw = _alpha(f32(np.int32(i)) + _HALF - u, a, h, q, opacity)
+            raw = _alpha(f32(np.int32(i)) + _HALF - u, a, h, q, opacity, floor, factor, offset)
             t = buf[j]
-            weight = min(raw, _MAX_A) * t if raw >= _MIN_A else _ZERO
+            weight = min(raw, max_alpha) * t if raw >= min_alpha else _ZERO
             after = t - weight
-            ended = after < _MIN_T
+            ended = after < end
             weight = _ZERO if ended else weight
             own = red * buf[j + _P2] + green * buf[j + _P3] + blue * buf[j + _P4] + buf[j + _P5]
             behind = buf[j + _P1] - weight * own
             g = weight * (own - behind / after)
-            g = g if raw < _MAX_A else _ZERO
+            g = g if raw < max_alpha else _ZERO
             buf[j] = -abs(t) if ended else after
             buf[j + _P1] = behind
             buf[_A0 + i] += g
@@ -76,7 +75,7 @@ def _sweep(y0, y1, k, colors, a, b, c, u, v, opacity, buf):
 
 
 @_jit
-def _moments_tile(entries, slots, extent, flat, colors, ox, oy, buf, pairs):
+def _moments_tile(entries, slots, extent, flat, colors, ox, oy, rule, buf, pairs):
     """The nine sums of each of the Gaussians ``entries``, in their order, into their rows of ``pairs``."""
     done = entries.shape[0]
     for index in range(entries.shape[0]):
@@ -85,8 +84,8 @@ def _moments_tile(entries, slots, extent, flat, colors, ox, oy, buf, pairs):
             break
         k = entries[index]
         a, b, c, u, v, opacity = _eighth(flat, k, f32(ox), f32(oy))
-        y0, y1 = _rows(extent[k, 1] - oy, extent[k, 3] - oy, a, b, c, u, v, opacity)
-        _sweep(y0, y1, k, colors, a, b, c, u, v, opacity, buf)
+        y0, y1 = _rows(extent[k, 1] - oy, extent[k, 3] - oy, a, b, c, u, v, opacity, rule)
+        _sweep(y0, y1, k, colors, a, b, c, u, v, opacity, rule, buf)
         s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = s8 = _ZERO
         for i in range(_T):  # type: ignore[assignment]
             dx = f32(np.int32(i)) + _HALF - u
@@ -107,17 +106,18 @@ def _moments_tile(entries, slots, extent, flat, colors, ox, oy, buf, pairs):
 
 
 @kernel(
-    "i8:1 i8:1 i4:1 i8:1 i4:2 f4:2 f4:2 i8 f4:3 f4:3 f4:2",
+    "i8:1 i8:1 i4:1 i8:1 i4:2 f4:2 f4:2 i8 f4:1 f4:3 f4:3 f4:2",
     parallel=True,
     fastmath=True,
     error_model="numpy",
 )
-def moments(tiles, start, members, slots, extent, flat, colors, tiles_x, image, grad, pairs):
+def moments(tiles, start, members, slots, extent, flat, colors, tiles_x, rule, image, grad, pairs):
     """For each (tile, Gaussian) pair: its nine `SUMS` into ``pairs`` (n, 9) float32.
 
     ``image`` (h, w, 4) is what `tiles.blend` made of ``colors`` clamped at 0, ``grad`` (h, w, 4) dL/d(image), float32.
     """
     height, width = image.shape[:2]
+    way = rule[0], rule[1], rule[2], rule[3], rule[4], rule[5]
     for index in nb.prange(tiles.shape[0]):
         tile = tiles[index]
         ox, oy = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
@@ -133,7 +133,7 @@ def moments(tiles, start, members, slots, extent, flat, colors, tiles_x, image, 
                     buf[U((f + 2) * _AREA + y * TILE + x)] = g
                 buf[U(_AREA + y * TILE + x)] = behind
         span = slice(start[tile], start[tile + 1])
-        _moments_tile(members[span], slots[span], extent, flat, colors, ox, oy, buf, pairs)
+        _moments_tile(members[span], slots[span], extent, flat, colors, ox, oy, way, buf, pairs)
 
 
 @_exact
@@ -148,13 +148,25 @@ def _total(first, pairs, k):
 
 
 @_exact
-def _screen(flat, k, total):
-    """Gradients with respect to the projected centre (u, v) and the projected covariance (H, symmetric)."""
+def _screen(flat, k, total, dilation, compensate):
+    """Gradients with respect to the projected centre (u, v) and the projected covariance (H, symmetric).
+
+    Where opacity is compensated by sqrt(det S / det S'), half of S^-1 - S'^-1 for each part of its gradient is added.
+    """
     a, b, c = np.float64(flat[k, 2]), np.float64(flat[k, 3]), np.float64(flat[k, 4])
     du, dv = a * total[1] + b * total[2], b * total[1] + c * total[2]
     p0, p1 = a * total[3] + b * total[4], a * total[4] + b * total[5]  # conic x second moments
     q0, q1 = b * total[3] + c * total[4], b * total[4] + c * total[5]
-    return du, dv, 0.5 * (p0 * a + p1 * b), 0.5 * (p0 * b + p1 * c), 0.5 * (q0 * b + q1 * c)
+    h00, h01, h11 = 0.5 * (p0 * a + p1 * b), 0.5 * (p0 * b + p1 * c), 0.5 * (q0 * b + q1 * c)
+    if compensate > 0.0:
+        det = 1.0 / (a * c - b * b)
+        sxx, sxy, syy = c * det - dilation, -b * det, a * det - dilation
+        own = sxx * syy - sxy * sxy
+        if own > SINGULAR * det:
+            h00 += 0.5 * total[0] * (syy / own - a)
+            h01 -= 0.5 * total[0] * (sxy / own + b)
+            h11 += 0.5 * total[0] * (sxx / own - c)
+    return du, dv, h00, h01, h11
 
 
 @kernel(parallel=True)
@@ -164,7 +176,7 @@ def screen(first, pairs, flat, out):
         out[k] = 0.0
         if first[k + 1] > first[k]:
             total = _total(first, pairs, k)
-            du, dv, _, _, _ = _screen(flat, k, total)
+            du, dv, _, _, _ = _screen(flat, k, total, 0.0, 0.0)
             out[k] = np.sqrt(du * du + dv * dv)
 
 
@@ -181,7 +193,7 @@ def _center(x, y, z, fx, fy, du, dv, d00, d02, d11, d12):
 
 @_exact
 def _colors_and_logit(k, flat, colors, total, out_logits, out_colors):
-    out_logits[k] = total[0] * (1.0 - flat[k, 5])
+    out_logits[k] = total[0] * (1.0 - flat[k, 6])
     out_colors[k, 0] = total[6] if colors[k, 0] >= 0.0 else 0.0
     out_colors[k, 1] = total[7] if colors[k, 1] >= 0.0 else 0.0
     out_colors[k, 2] = total[8] if colors[k, 2] >= 0.0 else 0.0
@@ -195,10 +207,12 @@ def _axis(factors, k, i, rot, jx, jy, jxz, jyz):
 
 
 @kernel(
-    "i8:1 f4:2 i4:2 f4:2 f4:2 f4:3 f4:2 f8:2 f8:1 f8:1 f4:2 f4:1 f4:2",
+    "i8:1 f4:2 i4:2 f4:2 f4:2 f4:3 f4:2 f8:2 f8:1 f8:1 f8:1 f4:2 f4:1 f4:2",
     parallel=True,
 )
-def own_frame(first, pairs, extent, flat, means, factors, colors, rot, trans, lens, out_frame, out_logits, out_colors):
+def own_frame(
+    first, pairs, extent, flat, means, factors, colors, rot, trans, lens, rule, out_frame, out_logits, out_colors
+):  # fmt: skip
     """Gradients for steps in each Gaussian's own frame: mu += M d, M <- M (I + E), E symmetric.
 
     ``out_frame`` (K, 9) float32: d (3), then E: xx, yy, zz, xy, xz, yz (an entry off the diagonal stands for both).
@@ -213,7 +227,7 @@ def own_frame(first, pairs, extent, flat, means, factors, colors, rot, trans, le
         total = _total(first, pairs, k)
         _colors_and_logit(k, flat, colors, total, out_logits, out_colors)
         x, y, z = to_camera(means, k, rot, trans)
-        du, dv, h00, h01, h11 = _screen(flat, k, total)
+        du, dv, h00, h01, h11 = _screen(flat, k, total, rule[0], rule[1])
         jx, jy, jxz, jyz = fx / z, fy / z, -fx * x / (z * z), -fy * y / (z * z)
         d00 = d02 = d11 = d12 = 0.0
         for i in range(3):
@@ -267,9 +281,9 @@ def _quaternion(w, a, b, c, n, c0, c1, c2, out):
     )
 
 
-@kernel("i8:1 f4:2 i4:2 f4:2 f4:2 f4:2 f4:2 f4:2 f8:2 f8:1 f8:1 f4:2 f4:2 f4:2 f4:1 f4:2", parallel=True)
+@kernel("i8:1 f4:2 i4:2 f4:2 f4:2 f4:2 f4:2 f4:2 f8:2 f8:1 f8:1 f8:1 f4:2 f4:2 f4:2 f4:1 f4:2", parallel=True)
 def standard(
-    first, pairs, extent, flat, means, log_scales, quats, colors, rot, trans, lens,
+    first, pairs, extent, flat, means, log_scales, quats, colors, rot, trans, lens, rule,
     out_means, out_scales, out_quats, out_logits, out_colors,
 ):  # fmt: skip
     """Gradients with respect to the fields of `Gaussians`, float32 arrays of their shapes."""
@@ -285,7 +299,7 @@ def standard(
         total = _total(first, pairs, k)
         _colors_and_logit(k, flat, colors, total, out_logits, out_colors)
         x, y, z = to_camera(means, k, rot, trans)
-        du, dv, h00, h01, h11 = _screen(flat, k, total)
+        du, dv, h00, h01, h11 = _screen(flat, k, total, rule[0], rule[1])
         jx, jy, jxz, jyz = fx / z, fy / z, -fx * x / (z * z), -fy * y / (z * z)
         w, a, b, c, n = unit_quaternion(quats, k)
         turn = w, a, b, c

@@ -8,7 +8,7 @@ import numba as nb
 import numpy as np
 
 from vvgt_cli.jit.decorators import inlined, kernel
-from vvgt_cli.splat.constants import MIN_ALPHA, NEAR, TILE
+from vvgt_cli.splat.constants import NEAR, TILE
 
 _jit = inlined()
 SHIFT = TILE.bit_length() - 1
@@ -60,17 +60,28 @@ def _clear(k, depth, extent):
 
 
 @_jit
-def _place(k, x, y, z, sxx, sxy, syy, opacity, lens, dilation, flat, depth, extent):
+def _place(k, x, y, z, sxx, sxy, syy, opacity, lens, rule, flat, depth, extent):
     """Fill row k of ``flat``, ``depth`` and ``extent`` from centre, 2D covariance (without dilation) and opacity."""
     fx, fy, cx, cy, width, height = lens
+    dilation, compensate, min_alpha, farthest, min_variance = rule
     inv = 1.0 / z
+    own = sxx * syy - sxy * sxy
     sxx += dilation
     syy += dilation
     det = sxx * syy - sxy * sxy
     if not (det > 0.0 and det < np.inf):
         return
+    flat[k, 6] = opacity
+    if compensate > 0.0:
+        opacity *= math.sqrt(max(own, 0.0) / det)
+    if opacity < min_alpha:
+        return
+    if min_variance > 0.0:
+        middle, half = 0.5 * (sxx + syy), 0.5 * (sxx - syy)
+        if middle + math.sqrt(half * half + sxy * sxy) < min_variance:
+            return
     u, v = fx * x * inv + cx, fy * y * inv + cy
-    reach = 2.0 * math.log(opacity / MIN_ALPHA)
+    reach = 2.0 * min(math.log(opacity / min_alpha), farthest)
     ex, ey = math.sqrt(reach * sxx), math.sqrt(reach * syy)
     x0, x1 = max(math.ceil(u - ex - 0.5), 0.0), min(math.floor(u + ex - 0.5) + 1.0, width)
     y0, y1 = max(math.ceil(v - ey - 0.5), 0.0), min(math.floor(v + ey - 0.5) + 1.0, height)
@@ -84,22 +95,22 @@ def _place(k, x, y, z, sxx, sxy, syy, opacity, lens, dilation, flat, depth, exte
 
 
 @kernel(
-    "f4:2 f4:2 f4:2 f4:1 f8:2 f8:1 f8:1 f8 f4:2 f4:1 i4:2",
+    "f4:2 f4:2 f4:2 f4:1 f8:2 f8:1 f8:1 f8:1 f4:2 f4:1 i4:2",
     parallel=True,
 )
-def project(means, log_scales, quats, logits, rot, trans, lens, dilation, flat, depth, extent):
+def project(means, log_scales, quats, logits, rot, trans, lens, rule, flat, depth, extent):
     """EWA projection of every Gaussian.
 
-    ``lens`` (fx, fy, cx, cy, width, height); ``dilation`` px^2 on the diagonal. Fills ``flat`` (K, 6) float32: centre
-    x, y, conic a, b, c, opacity; ``depth`` (K,) float32; ``extent`` (K, 4) int32: pixel box x0, y0, x1, y1 (empty where
-    nothing is seen).
+    ``lens`` (fx, fy, cx, cy, width, height); ``rule`` from `Rule.projecting`. Fills ``flat`` (K, 7) float32: centre
+    x, y, conic a, b, c, opacity as drawn and as given; ``depth`` (K,) float32;
+    ``extent`` (K, 4) int32: pixel box x0, y0, x1, y1 (empty where nothing is seen).
     """
     fx, fy = lens[0], lens[1]
     for k in nb.prange(means.shape[0]):
         _clear(k, depth, extent)
         x, y, z = to_camera(means, k, rot, trans)
         opacity = 1.0 / (1.0 + math.exp(-np.float64(logits[k])))
-        if not z > NEAR or opacity < MIN_ALPHA:
+        if not z > NEAR or opacity < rule[2]:
             continue
         w, a, b, c, _ = unit_quaternion(quats, k)
         inv = 1.0 / z
@@ -115,21 +126,21 @@ def project(means, log_scales, quats, logits, rot, trans, lens, dilation, flat, 
             sxx += px * px
             sxy += px * py
             syy += py * py
-        _place(k, x, y, z, sxx, sxy, syy, opacity, lens, dilation, flat, depth, extent)
+        _place(k, x, y, z, sxx, sxy, syy, opacity, lens, rule, flat, depth, extent)
 
 
 @kernel(
-    "f4:2 f4:3 f4:1 f8:2 f8:1 f8:1 f8 f4:2 f4:1 i4:2",
+    "f4:2 f4:3 f4:1 f8:2 f8:1 f8:1 f8:1 f4:2 f4:1 i4:2",
     parallel=True,
 )
-def project_factors(means, factors, logits, rot, trans, lens, dilation, flat, depth, extent):
+def project_factors(means, factors, logits, rot, trans, lens, rule, flat, depth, extent):
     """`project` for covariances ``M M^T`` given by ``factors`` (K, 3, 3) M."""
     fx, fy = lens[0], lens[1]
     for k in nb.prange(means.shape[0]):
         _clear(k, depth, extent)
         x, y, z = to_camera(means, k, rot, trans)
         opacity = 1.0 / (1.0 + math.exp(-np.float64(logits[k])))
-        if not z > NEAR or opacity < MIN_ALPHA:
+        if not z > NEAR or opacity < rule[2]:
             continue
         inv = 1.0 / z
         jx, jy = fx * inv, fy * inv
@@ -143,7 +154,7 @@ def project_factors(means, factors, logits, rot, trans, lens, dilation, flat, de
             sxx += px * px
             sxy += px * py
             syy += py * py
-        _place(k, x, y, z, sxx, sxy, syy, opacity, lens, dilation, flat, depth, extent)
+        _place(k, x, y, z, sxx, sxy, syy, opacity, lens, rule, flat, depth, extent)
 
 
 @kernel("i8:1 i4:2 i8 i8 i8", parallel=True)

@@ -8,7 +8,8 @@ import numpy as np
 
 from vvgt_cli.cameras import Camera
 from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.splat.constants import DILATION, MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, NEAR
+from vvgt_cli.splat.constants import NEAR
+from vvgt_cli.splat.rules import INRIA, Rule
 
 
 def rotations(quaternions: np.ndarray) -> np.ndarray:
@@ -31,7 +32,7 @@ def covariances(gaussians: Gaussians) -> np.ndarray:
     return factors @ factors.transpose(0, 2, 1)
 
 
-def project(gaussians: Gaussians, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def project(gaussians: Gaussians, camera: Camera, rule: Rule = INRIA) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """EWA projection (Zwicker et al. 2002; Kerbl et al. 2023, eq. 5), float64.
 
     Returns:
@@ -51,19 +52,19 @@ def project(gaussians: Gaussians, camera: Camera) -> tuple[np.ndarray, np.ndarra
         axis=1,
     )  # (K, 2, 3)
     local = camera.rotation @ covariances(gaussians) @ camera.rotation.T
-    flat = jacobian @ local @ jacobian.transpose(0, 2, 1) + DILATION * np.eye(2)
+    flat = jacobian @ local @ jacobian.transpose(0, 2, 1) + rule.dilation * np.eye(2)
     centres = np.stack([camera.fx * x * inv + camera.cx, camera.fy * y * inv + camera.cy], -1)
     centres[~seen] = np.nan
     return centres, flat, z
 
 
-def layers(gaussians: Gaussians, camera: Camera) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+def layers(gaussians: Gaussians, camera: Camera, rule: Rule = INRIA) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
     """Front to back in order of the centres' depth: Gaussian k, its alpha and the transmittance T in front of it.
 
     Both (height, width) float64; alpha is 0 where nothing is drawn: below the cut, and in pixels that have ended.
     """
-    centres, flat, depths = project(gaussians, camera)
-    opacity = 1 / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64)))
+    centres, flat, depths = project(gaussians, camera, rule)
+    opacity = drawn_opacity(gaussians, flat, rule)
     px, py = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     trans = np.ones((camera.height, camera.width))
     alive = np.ones_like(trans, dtype=bool)
@@ -73,25 +74,35 @@ def layers(gaussians: Gaussians, camera: Camera) -> Iterator[tuple[int, np.ndarr
         inverse = np.linalg.inv(flat[k])
         dx, dy = px - centres[k, 0], py - centres[k, 1]
         power = 0.5 * (inverse[0, 0] * dx * dx + inverse[1, 1] * dy * dy) + inverse[0, 1] * dx * dy
-        alpha = np.minimum(MAX_ALPHA, opacity[k] * np.exp(-power))
-        alpha[alpha < MIN_ALPHA] = 0
-        alive &= (trans * (1 - alpha) >= MIN_TRANSMITTANCE) | (alpha == 0)
+        rest = np.exp(-rule.reach) if rule.shifted else 0.0
+        alpha = np.minimum(rule.max_alpha, opacity[k] * (np.exp(-power) - rest) / (1 - rest))
+        alpha[(alpha < rule.min_alpha) | (power > rule.reach)] = 0
+        alive &= (trans * (1 - alpha) >= rule.min_transmittance) | (alpha == 0)
         alpha = np.where(alive, alpha, 0)
         yield int(k), alpha, trans
         trans = trans * (1 - alpha)
 
 
-def weights(gaussians: Gaussians, camera: Camera) -> Iterator[tuple[int, np.ndarray]]:
+def drawn_opacity(gaussians: Gaussians, flat: np.ndarray, rule: Rule) -> np.ndarray:
+    """(K,) opacity by a rule, given covariances (K, 2, 2) with the dilation: compensated, 0 for what is left out."""
+    opacity = 1 / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64)))
+    if rule.compensate:
+        own = np.linalg.det(flat - rule.dilation * np.eye(2))
+        opacity = opacity * np.sqrt(np.maximum(own, 0) / np.linalg.det(flat))
+    return np.where(np.linalg.eigvalsh(flat)[:, 1] < rule.min_variance, 0, opacity)
+
+
+def weights(gaussians: Gaussians, camera: Camera, rule: Rule = INRIA) -> Iterator[tuple[int, np.ndarray]]:
     """Gaussian k and its weight T alpha, (height, width), front to back."""
-    for k, alpha, trans in layers(gaussians, camera):
+    for k, alpha, trans in layers(gaussians, camera, rule):
         yield k, trans * alpha
 
 
-def render_reference(gaussians: Gaussians, camera: Camera) -> np.ndarray:
+def render_reference(gaussians: Gaussians, camera: Camera, rule: Rule = INRIA) -> np.ndarray:
     """(height, width, 4) float64 premultiplied RGBA; negative colours are 0."""
     colors = np.maximum(gaussians.colors.astype(np.float64), 0)
     image = np.zeros((camera.height, camera.width, 4))
-    for k, weight in weights(gaussians, camera):
+    for k, weight in weights(gaussians, camera, rule):
         image += weight[..., None] * np.append(colors[k], 1.0)
     return image
 
@@ -106,7 +117,7 @@ def gather_reference(gaussians: Gaussians, camera: Camera, fields: np.ndarray) -
 
 
 def image_gradients(
-    gaussians: Gaussians, camera: Camera, grad: np.ndarray
+    gaussians: Gaussians, camera: Camera, grad: np.ndarray, rule: Rule = INRIA
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Gradients with respect to what is on the screen, of a loss whose gradient to the picture is ``grad`` (h, w, 4).
 
@@ -117,27 +128,30 @@ def image_gradients(
         centres (K, 2), inverse projected covariances (K, 2, 2) symmetric, opacity logits (K,), colours (K, 3).
     """
     count = len(gaussians)
-    centres, flat, _ = project(gaussians, camera)
+    centres, flat, _ = project(gaussians, camera, rule)
     opacity = 1 / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64)))
     pixels = np.stack(np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5), -1)
     colors = np.column_stack([np.maximum(gaussians.colors.astype(np.float64), 0), np.ones(count)])
     out = np.zeros((count, 2)), np.zeros((count, 2, 2)), np.zeros(count), np.zeros((count, 4))
     behind = np.zeros((camera.height, camera.width, 4))
-    for k, alpha, trans in reversed(list(layers(gaussians, camera))):
+    for k, alpha, trans in reversed(list(layers(gaussians, camera, rule))):
         out[3][k] = ((trans * alpha)[..., None] * grad).sum(axis=(0, 1))
         slope = trans * ((colors[k] - behind) * grad).sum(axis=-1)  # dL/dalpha
-        slope[(alpha == 0) | (alpha == MAX_ALPHA)] = 0
+        slope[(alpha == 0) | (alpha == rule.max_alpha)] = 0
         moved = slope * alpha  # dL/d(exponent), and dL/d(log opacity)
         d, inverse = pixels - centres[k], np.linalg.inv(flat[k])
         out[0][k] = (moved[..., None] * (d @ inverse)).sum(axis=(0, 1))
         out[1][k] = -0.5 * np.einsum("yx,yxi,yxj->ij", moved, d, d)
+        if rule.compensate:  # log of the factor is half of log det S - log det S'; by S'^-1: -S' dS S'
+            own = np.linalg.inv(flat[k] - rule.dilation * np.eye(2))
+            out[1][k] -= moved.sum() * 0.5 * flat[k] @ (own - inverse) @ flat[k]
         out[2][k] = moved.sum() * (1 - opacity[k])
         behind = alpha[..., None] * colors[k] + (1 - alpha)[..., None] * behind
     return *out[:3], np.where(gaussians.colors >= 0, out[3][:, :3], 0)
 
 
 def space_gradients(
-    gaussians: Gaussians, camera: Camera, centres: np.ndarray, inverses: np.ndarray
+    gaussians: Gaussians, camera: Camera, centres: np.ndarray, inverses: np.ndarray, rule: Rule = INRIA
 ) -> tuple[np.ndarray, np.ndarray]:
     """Gradients with respect to means (K, 3) and covariances (K, 3, 3), given those of `image_gradients`."""
     means, spatial = np.zeros((len(gaussians), 3)), np.zeros((len(gaussians), 3, 3))
@@ -148,7 +162,7 @@ def space_gradients(
             continue
         fx, fy = camera.fx, camera.fy
         jacobian = np.array([[fx / z, 0, -fx * x / z**2], [0, fy / z, -fy * y / z**2]])
-        inverse = np.linalg.inv(jacobian @ local[k] @ jacobian.T + DILATION * np.eye(2))
+        inverse = np.linalg.inv(jacobian @ local[k] @ jacobian.T + rule.dilation * np.eye(2))
         flat = -inverse @ inverses[k] @ inverse  # d(S^-1) = -S^-1 dS S^-1
         spatial[k] = camera.rotation.T @ jacobian.T @ flat @ jacobian @ camera.rotation
         lens = 2 * flat @ jacobian @ local[k]  # dL/dJ
@@ -160,10 +174,12 @@ def space_gradients(
     return means, spatial
 
 
-def render_backward_reference(gaussians: Gaussians, camera: Camera, grad: np.ndarray) -> dict[str, np.ndarray]:
+def render_backward_reference(
+    gaussians: Gaussians, camera: Camera, grad: np.ndarray, rule: Rule = INRIA
+) -> dict[str, np.ndarray]:
     """`render_backward` in float64: dL/d(field) for each field of `Gaussians`; ``grad`` (h, w, 4) dL/d(picture)."""
-    centres, inverses, logits, colors = image_gradients(gaussians, camera, grad)
-    means, spatial = space_gradients(gaussians, camera, centres, inverses)
+    centres, inverses, logits, colors = image_gradients(gaussians, camera, grad, rule)
+    means, spatial = space_gradients(gaussians, camera, centres, inverses, rule)
     scales = np.exp(gaussians.log_scales.astype(np.float64))
     factors = rotations(gaussians.quaternions) * scales[:, None, :]
     to_factors = 2 * spatial @ factors  # Sigma = M M^T

@@ -10,7 +10,8 @@ import numpy as np
 
 from vvgt_cli.cameras import Camera
 from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.splat.constants import DILATION, TILE
+from vvgt_cli.splat.constants import TILE
+from vvgt_cli.splat.rules import INRIA, Rule, rule_of
 
 
 @dataclass(frozen=True)
@@ -18,11 +19,12 @@ class Projection:
     """Gaussians projected into one camera and sorted into tiles.
 
     Attributes:
-        flat: (K, 6) float32 centre x, y (px), conic a, b, c (px^-2), opacity.
+        flat: (K, 7) float32 centre x, y (px), conic a, b, c (px^-2), opacity as drawn and as given.
         extent: (K, 4) int32 pixel boxes x0, y0, x1, y1; empty where not seen.
         start, members, slots, first: tile lists, see `kernel.tile_lists`.
         tiles_x: tiles along a row.
         tiles: (tiles,) order in which threads take the tiles.
+        rule: by which it was made, and is to be blended.
     """
 
     flat: np.ndarray
@@ -33,46 +35,46 @@ class Projection:
     first: np.ndarray
     tiles_x: int
     tiles: np.ndarray
+    rule: Rule
 
 
-def project(gaussians: Gaussians, camera: Camera, dilation: float = DILATION) -> Projection:
-    """EWA projection and depth-sorted tile lists.
+def project(gaussians: Gaussians, camera: Camera, rule: str | Rule = INRIA) -> Projection:
+    """EWA projection and depth-sorted tile lists by a rule, or the rule of that name.
 
-    ``dilation`` px^2 are added to the diagonal of projected covariances. A quarter of the standard programs' 0.3 gives,
-    at a camera's size, what they show at twice that size averaged 2 x 2.
+    ``rule.at(w / W)`` gives, at a camera's size w, what viewers show at size W, at fewer points.
     """
     from vvgt_cli.splat import kernel
 
     g = gaussians
-    return _projected(kernel.project, (g.means, g.log_scales, g.quaternions, g.opacity_logits), camera, dilation)
+    return _projected(kernel.project, (g.means, g.log_scales, g.quaternions, g.opacity_logits), camera, rule)
 
 
 def project_factors(
-    means: np.ndarray, factors: np.ndarray, logits: np.ndarray, camera: Camera, dilation: float = DILATION
+    means: np.ndarray, factors: np.ndarray, logits: np.ndarray, camera: Camera, rule: str | Rule = INRIA
 ) -> Projection:
     """`project` for covariances ``M M^T``: means (K, 3), factors (K, 3, 3) M, logits (K,), all float32."""
     from vvgt_cli.splat import kernel
 
-    return _projected(kernel.project_factors, (means, factors, logits), camera, dilation)
+    return _projected(kernel.project_factors, (means, factors, logits), camera, rule)
 
 
 def _projected(
-    kernel_project: Callable[..., None], arrays: tuple[np.ndarray, ...], camera: Camera, dilation: float
+    kernel_project: Callable[..., None], arrays: tuple[np.ndarray, ...], camera: Camera, rule: str | Rule
 ) -> Projection:
     """Run one of the projecting kernels, sort by depth, file into tiles."""
     import numba
 
     from vvgt_cli.splat import kernel
 
-    count = len(arrays[0])
-    flat = np.zeros((count, 6), np.float32)
+    rule, count = rule_of(rule), len(arrays[0])
+    flat = np.zeros((count, 7), np.float32)
     depth = np.empty(count, np.float32)
     extent = np.empty((count, 4), np.int32)
-    kernel_project(*arrays, *pose(camera), dilation, flat, depth, extent)
+    kernel_project(*arrays, *pose(camera), rule.projecting(), flat, depth, extent)
     tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
     order = depth_order(depth)
     start, members, slots, first = kernel.tile_lists(order, extent, tiles_x, tiles_y, numba.get_num_threads())
-    return Projection(flat, extent, start, members, slots, first, tiles_x, deal(np.diff(start)))
+    return Projection(flat, extent, start, members, slots, first, tiles_x, deal(np.diff(start)), rule)
 
 
 def pose(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -115,13 +117,18 @@ def blend(projection: Projection, colors: np.ndarray, height: int, width: int) -
     image = np.zeros((height, width, 4), np.float32)
     colors = np.ascontiguousarray(colors, np.float32)
     with tile_by_tile():
-        tiles.blend(p.tiles, p.start, p.members, p.extent, p.flat, colors, p.tiles_x, image)
+        tiles.blend(p.tiles, p.start, p.members, p.extent, p.flat, colors, p.tiles_x, p.rule.blending(), image)
     return image
 
 
-def render(gaussians: Gaussians, camera: Camera, projection: Projection | None = None) -> np.ndarray:
-    """(height, width, 4) float32 premultiplied RGBA over nothing (conventions: Gaussians); negative colours are 0."""
-    p = projection or project(gaussians, camera)
+def render(
+    gaussians: Gaussians, camera: Camera, rule: str | Rule = INRIA, projection: Projection | None = None
+) -> np.ndarray:
+    """(height, width, 4) float32 premultiplied RGBA over nothing (conventions: Gaussians); negative colours are 0.
+
+    ``projection``, where there is one, was made by a rule of its own.
+    """
+    p = projection or project(gaussians, camera, rule)
     return blend(p, np.maximum(gaussians.colors, 0), camera.height, camera.width)
 
 
@@ -133,7 +140,9 @@ def gather(projection: Projection, fields: np.ndarray, out: np.ndarray) -> None:
     pairs = np.zeros((len(p.members), 5), np.float32)
     fields = np.ascontiguousarray(fields, np.float32)
     with tile_by_tile():
-        tiles.gather(p.tiles, p.start, p.members, p.slots, p.extent, p.flat, p.tiles_x, fields, pairs)
+        tiles.gather(
+            p.tiles, p.start, p.members, p.slots, p.extent, p.flat, p.tiles_x, p.rule.blending(), fields, pairs
+        )
     tiles.reduce_pairs(p.first, pairs, out)
 
 
@@ -173,6 +182,7 @@ def fields_backward(gaussians: Gaussians, camera: Camera, projection: Projection
     out = Gradients(*(np.empty_like(array) for array in shapes))
     backward.standard(
         p.first, pairs, p.extent, p.flat, g.means, g.log_scales, g.quaternions, g.colors, *pose(camera),
+        p.rule.projecting(),
         out.means, out.log_scales, out.quaternions, out.opacity_logits, out.colors,
     )  # fmt: skip
     return out
@@ -195,7 +205,10 @@ def moments(projection: Projection, colors: np.ndarray, image: np.ndarray, grad:
     pairs = np.empty((len(p.members), backward.SUMS), np.float32)
     grad = np.ascontiguousarray(grad, np.float32)
     with tile_by_tile():
-        backward.moments(p.tiles, p.start, p.members, p.slots, p.extent, p.flat, colors, p.tiles_x, image, grad, pairs)
+        backward.moments(
+            p.tiles, p.start, p.members, p.slots, p.extent, p.flat, colors, p.tiles_x, p.rule.blending(), image, grad,
+            pairs,
+        )  # fmt: skip
     return pairs
 
 
@@ -232,6 +245,7 @@ def own_frame_backward(
     out = FrameGradients(*(np.empty(shape, np.float32) for shape in ((count, 9), (count,), (count, 3))))
     backward.own_frame(
         p.first, pairs, p.extent, p.flat, means, factors, colors, *pose(camera),
+        p.rule.projecting(),
         out.frame, out.opacity_logits, out.colors,
     )  # fmt: skip
     return out

@@ -13,14 +13,13 @@ import numba as nb
 import numpy as np
 
 from vvgt_cli.jit.decorators import inlined, kernel
-from vvgt_cli.splat.constants import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, TILE
+from vvgt_cli.splat.constants import TILE
 
 f32, U = np.float32, nb.uint64
-_MAX_A, _MIN_A, _MIN_T, _HALF, _ZERO = f32(MAX_ALPHA), f32(MIN_ALPHA), f32(MIN_TRANSMITTANCE), f32(0.5), f32(0)
+_HALF, _ZERO = f32(0.5), f32(0)
 _AREA = TILE * TILE
 _P1, _P2, _P3, _P4 = U(_AREA), U(2 * _AREA), U(3 * _AREA), U(4 * _AREA)
 _P5 = U(5 * _AREA)
-_FLOOR = f32(-0.75)  # exp(-6) < 1/255: nothing below is drawn
 # exp(e) on [-0.75, 0] with exp(0) = 1: minimax of the relative error, 1.1e-6 after the eighth power
 _EXP = tuple(
     f32(c)
@@ -47,9 +46,9 @@ def _misses(y, a, b, c, u, v, floor):
 
 
 @_jit
-def _rows(y0, y1, a, b, c, u, v, opacity):
-    """Rows [y0, y1) of the tile without those at either end that the 1/255 ellipse, being convex, misses."""
-    floor = f32(0.125) * math.log(_MIN_A / opacity) - f32(1e-4)
+def _rows(y0, y1, a, b, c, u, v, opacity, rule):
+    """Rows [y0, y1) of the tile without those at either end that the ellipse of what is drawn, being convex, misses."""
+    floor = max(f32(0.125) * math.log(rule[0] / opacity), rule[2]) - f32(1e-4)
     y0, y1 = max(y0, 0), min(y1, TILE)
     while y0 < y1 and _misses(y0, a, b, c, u, v, floor):
         y0 += 1
@@ -59,22 +58,25 @@ def _rows(y0, y1, a, b, c, u, v, opacity):
 
 
 @_jit
-def _alpha(dx, a, h, q, opacity):
-    """Opacity of a pixel, neither clamped nor cut."""
-    e = max((a * dx + h) * dx + q, _FLOOR)
+def _alpha(dx, a, h, q, opacity, floor, factor, offset):
+    """Opacity of a pixel, neither clamped nor cut; 0 beyond the rule's reach."""
+    power = (a * dx + h) * dx + q
+    e = max(power, floor)
     p = f32(1) + e * (_EXP[0] + e * (_EXP[1] + e * (_EXP[2] + e * (_EXP[3] + e * _EXP[4]))))
     p *= p
     p *= p
-    return opacity * p * p
+    drawn = opacity * (factor * (p * p) - offset)
+    return drawn if power >= floor else _ZERO
 
 
 @_jit
-def _pixel(t, dx, a, h, q, opacity):
+def _pixel(t, dx, a, h, q, opacity, rule):
     """Weight T alpha of a pixel and its transmittance afterwards; a pixel that has ended keeps T with a minus."""
-    alpha = min(_alpha(dx, a, h, q, opacity), _MAX_A)
-    weight = alpha * t if alpha >= _MIN_A else _ZERO
+    min_alpha, max_alpha, floor, factor, offset, end = rule
+    alpha = min(_alpha(dx, a, h, q, opacity, floor, factor, offset), max_alpha)
+    weight = alpha * t if alpha >= min_alpha else _ZERO
     after = t - weight
-    ended = after < _MIN_T
+    ended = after < end
     return _ZERO if ended else weight, -abs(t) if ended else after
 
 
@@ -94,7 +96,7 @@ def _all_ended(buf):
 
 
 @_jit
-def _blend_tile(entries, extent, flat, colors, ox, oy, buf):
+def _blend_tile(entries, extent, flat, colors, ox, oy, rule, buf):
     """Blend the Gaussians ``entries`` in their order into planes 1, 2, 3."""
     for index in range(entries.shape[0]):
         if (index & 31) == 31 and _all_ended(buf):
@@ -102,37 +104,38 @@ def _blend_tile(entries, extent, flat, colors, ox, oy, buf):
         k = entries[index]
         a, b, c, u, v, opacity = _eighth(flat, k, f32(ox), f32(oy))
         red, green, blue = colors[k, 0], colors[k, 1], colors[k, 2]
-        y0, y1 = _rows(extent[k, 1] - oy, extent[k, 3] - oy, a, b, c, u, v, opacity)
+        y0, y1 = _rows(extent[k, 1] - oy, extent[k, 3] - oy, a, b, c, u, v, opacity, rule)
         for y in range(y0, y1):
             dy = f32(np.int32(y)) + _HALF - v
             h, q = b * dy, c * dy * dy
             for i in range(U(TILE)):
                 j = y * U(TILE) + i
-                weight, buf[j] = _pixel(buf[j], f32(np.int32(i)) + _HALF - u, a, h, q, opacity)
+                weight, buf[j] = _pixel(buf[j], f32(np.int32(i)) + _HALF - u, a, h, q, opacity, rule)
                 buf[j + _P1] += weight * red
                 buf[j + _P2] += weight * green
                 buf[j + _P3] += weight * blue
 
 
 @kernel(
-    "i8:1 i8:1 i4:1 i4:2 f4:2 f4:2 i8 f4:3",
+    "i8:1 i8:1 i4:1 i4:2 f4:2 f4:2 i8 f4:1 f4:3",
     parallel=True,
     fastmath=True,
     error_model="numpy",
 )
-def blend(tiles, start, members, extent, flat, colors, tiles_x, image):
+def blend(tiles, start, members, extent, flat, colors, tiles_x, rule, image):
     """Front-to-back blending into ``image`` (height, width, 4) float32, linear in ``colors`` (K, 3) float32.
 
-    ``tiles`` is the order in which threads take the tiles.
+    ``tiles`` are the tiles to draw, in the order in which threads take them; ``rule`` from `Rule.blending`.
     """
     height, width = image.shape[:2]
+    way = rule[0], rule[1], rule[2], rule[3], rule[4], rule[5]
     for index in nb.prange(tiles.shape[0]):
         tile = tiles[index]
         ox, oy = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
         w, h = min(TILE, width - ox), min(TILE, height - oy)
         buf = np.zeros(4 * _AREA, np.float32)  # transmittance, r, g, b
         _open(buf, w, h)
-        _blend_tile(members[start[tile] : start[tile + 1]], extent, flat, colors, ox, oy, buf)
+        _blend_tile(members[start[tile] : start[tile + 1]], extent, flat, colors, ox, oy, way, buf)
         for y in range(h):
             for x in range(w):
                 j = U(y * TILE + x)
@@ -143,20 +146,20 @@ def blend(tiles, start, members, extent, flat, colors, tiles_x, image):
 
 
 @_jit
-def _gather_tile(entries, slots, extent, flat, ox, oy, buf, pairs):
+def _gather_tile(entries, slots, extent, flat, ox, oy, rule, buf, pairs):
     """Weights of each Gaussian into plane 1, then their sum and their products with planes 2 to 5."""
     for index in range(entries.shape[0]):
         if (index & 31) == 31 and _all_ended(buf):
             break
         k = entries[index]
         a, b, c, u, v, opacity = _eighth(flat, k, f32(ox), f32(oy))
-        y0, y1 = _rows(extent[k, 1] - oy, extent[k, 3] - oy, a, b, c, u, v, opacity)
+        y0, y1 = _rows(extent[k, 1] - oy, extent[k, 3] - oy, a, b, c, u, v, opacity, rule)
         for y in range(y0, y1):
             dy = f32(np.int32(y)) + _HALF - v
             h, q = b * dy, c * dy * dy
             for i in range(U(TILE)):
                 j = y * U(TILE) + i
-                buf[j + _P1], buf[j] = _pixel(buf[j], f32(np.int32(i)) + _HALF - u, a, h, q, opacity)
+                buf[j + _P1], buf[j] = _pixel(buf[j], f32(np.int32(i)) + _HALF - u, a, h, q, opacity, rule)
         s0 = s1 = s2 = s3 = s4 = _ZERO
         for j in range(y0 * U(TILE), y1 * U(TILE)):  # type: ignore[assignment]
             weight = buf[j + _P1]
@@ -170,17 +173,18 @@ def _gather_tile(entries, slots, extent, flat, ox, oy, buf, pairs):
 
 
 @kernel(
-    "i8:1 i8:1 i4:1 i8:1 i4:2 f4:2 i8 f4:3 f4:2",
+    "i8:1 i8:1 i4:1 i8:1 i4:2 f4:2 i8 f4:1 f4:3 f4:2",
     parallel=True,
     fastmath=True,
     error_model="numpy",
 )
-def gather(tiles, start, members, slots, extent, flat, tiles_x, fields, pairs):
+def gather(tiles, start, members, slots, extent, flat, tiles_x, rule, fields, pairs):
     """For each (tile, Gaussian) pair: sums over its pixels of w and of w x 4 ``fields`` (4, h, w), w = T alpha.
 
     ``pairs`` (n, 5) float32 must be zero on entry: entries that no open pixel reaches stay zero.
     """
     height, width = fields.shape[1:]
+    way = rule[0], rule[1], rule[2], rule[3], rule[4], rule[5]
     for index in nb.prange(tiles.shape[0]):
         tile = tiles[index]
         ox, oy = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
@@ -192,7 +196,7 @@ def gather(tiles, start, members, slots, extent, flat, tiles_x, fields, pairs):
                 for x in range(w):
                     buf[U((f + 2) * _AREA + y * TILE + x)] = fields[f, oy + y, ox + x]
         span = slice(start[tile], start[tile + 1])
-        _gather_tile(members[span], slots[span], extent, flat, ox, oy, buf, pairs)
+        _gather_tile(members[span], slots[span], extent, flat, ox, oy, way, buf, pairs)
 
 
 @kernel("i8:1 f4:2 f8:2", parallel=True)

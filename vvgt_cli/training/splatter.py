@@ -22,7 +22,7 @@ class Splat(torch.autograd.Function):
     def forward(ctx: Any, rows: Tensor, camera: Camera) -> Tensor:
         gaussians = unpack(rows.detach().float().cpu().numpy())
         projection = project(gaussians, camera)
-        image = render(gaussians, camera, projection)
+        image = render(gaussians, camera, projection=projection)
         ctx.kept = gaussians, camera, projection, image
         return torch.from_numpy(image).to(rows.device)
 

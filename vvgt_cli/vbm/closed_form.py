@@ -12,8 +12,8 @@ from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.cameras.sets import FIELD_OF_VIEW, RADIUS
 from vvgt_cli.dvr.scene import BRICK, Scene
 from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.splat import project, render
-from vvgt_cli.splat.constants import DILATION
+from vvgt_cli.splat import render
+from vvgt_cli.splat.rules import INRIA
 from vvgt_cli.vbm.fit import image_errors, solve_colors
 from vvgt_cli.vbm.inset import Opaque, opaque_field
 from vvgt_cli.vbm.moments import base_cells, exponents
@@ -185,7 +185,7 @@ def _loss(gaussians: Gaussians, cameras: Sequence[Camera], views: np.ndarray) ->
     """
     total = 0.0
     for camera, view in zip(cameras, views, strict=True):
-        halved = render(gaussians, camera, project(gaussians, camera, DILATION / 4))
+        halved = render(gaussians, camera, INRIA.at(0.5))
         total += float(np.mean((render(gaussians, camera) - view)[..., :3] ** 2))
         total += TWICE * float(np.mean((halved - view)[..., :3] ** 2))
     return total / len(cameras)

@@ -9,7 +9,7 @@ import numpy as np
 from vvgt_cli.cameras import Camera
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.splat import Projection, blend, gather, project, render
-from vvgt_cli.splat.constants import DILATION
+from vvgt_cli.splat.rules import INRIA
 
 SEEN = 1e-2  # blending weight (pixels, over all views) below which views say nothing about a splat
 PRIOR = 1.0  # pixels of weight that the closed form's colour counts for
@@ -25,7 +25,7 @@ def image_errors(gaussians: Gaussians, cameras: Sequence[Camera], views: np.ndar
     sums = np.zeros((len(gaussians), 5))
     for camera, view in zip(cameras, views, strict=True):
         projection = project(gaussians, camera)
-        error = np.abs(view - render(gaussians, camera, projection)).sum(axis=-1)
+        error = np.abs(view - render(gaussians, camera, projection=projection)).sum(axis=-1)
         gather(projection, np.ascontiguousarray(np.broadcast_to(error, (4, *error.shape)), np.float32), sums)
     return sums[:, 1]
 
@@ -47,7 +47,7 @@ def solve_colors(
     """
     count = len(gaussians)
     projections = [
-        project(gaussians, camera, DILATION / 4 if twice_every and i % twice_every == twice_every - 1 else DILATION)
+        project(gaussians, camera, INRIA.at(0.5) if twice_every and i % twice_every == twice_every - 1 else INRIA)
         for i, camera in enumerate(cameras)
     ]
     start = gaussians.colors.astype(np.float64)
