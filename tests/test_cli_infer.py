@@ -91,7 +91,7 @@ def test_rounds_run_on_their_own_output_and_on_other_views(made, monkeypatch):
     config = replace(model.card.network, rounds=3, image=replace(model.card.network.image, views=2))
     monkeypatch.setattr(ModelCard, "network", config)
     seen = []
-    monkeypatch.setattr("vvgt_cli.network.runtime.prepare", lambda g, c, i, n: seen.append(c) or prepare(g, c, i, n))
+    monkeypatch.setattr("vvgt_cli.network.runtime.prepare", lambda g, c, *rest: seen.append(c) or prepare(g, c, *rest))
     cameras, images = load_views(made / "views", "train")
     gaussians, _ = read_ply(made / "init.ply")
     out = model.improve(gaussians, cameras, images)

@@ -11,16 +11,16 @@ from onnx_models import write_model
 from test_cli_infer import DARKER
 
 from vvgt_cli.cameras import default_views
-from vvgt_cli.dvr import Scene, render_views
+from vvgt_cli.dvr import RenderSettings, Scene, render_view
 from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply
 from vvgt_cli.pipeline.convert import ConvertRequest, FitOptions, convert
-from vvgt_cli.pipeline.mend import check_view_memory, fine_enough, whole_views_fit, wide
-from vvgt_cli.pipeline.optimize import Views
+from vvgt_cli.pipeline.mend import check_view_memory, drawn_by_all, fine_enough, judging_views, wide
 from vvgt_cli.pipeline.plan import DEFAULT_HALF_STEPS, DEFAULT_STEPS, MOST_STEPS, Costs, Limits, Planner, views_of
 from vvgt_cli.pipeline.source import SourceRequest
 from vvgt_cli.progress import Console
 from vvgt_cli.splat.constants import DILATION
+from vvgt_cli.splat.rules import INRIA
 from vvgt_cli.transfer.readers import minimal
 from vvgt_cli.vbm import VbmOptions, initialise
 from vvgt_cli.volume import Volume
@@ -28,6 +28,7 @@ from vvgt_cli.volume import Volume
 COSTS = Costs(
     closed_form=5,
     view=0.05,
+    judge=0.09,
     back_projection=6,
     network=3,
     step=0.05,
@@ -36,6 +37,7 @@ COSTS = Costs(
     write=0.1,
     memory=1e9,
     view_memory=1e7,
+    judge_memory=1e7,
 )
 SOURCE = SourceRequest("example:marschner-lobb:24")
 SMALL = FitOptions(400, 48)
@@ -59,19 +61,21 @@ def test_without_limits_the_default_steps_are_planned_and_back_projection_is_not
     assert (found.steps, found.back_project) == (DEFAULT_STEPS, False)
     assert [name for name, _ in found.left_out] == ["network", "back-projection"]
     assert found.seconds == pytest.approx(sum(seconds for _, seconds in found.stages))
-    assert found.seconds == pytest.approx(1 + 5 + DEFAULT_STEPS * 0.05 + (24 + 1.8 * 4) * 0.05 + 0.6)
+    assert found.seconds == pytest.approx(1 + 5 + DEFAULT_STEPS * 0.05 + 48 * 0.05 + 4 * 0.09 + 0.6)
     assert found.bytes == 1000 + 1000 * 68
-    assert "72 steps" in found.text()
+    assert f"{DEFAULT_STEPS} steps" in found.text()
 
 
-def test_views_are_half_the_size_where_gaussians_are_wide():
-    found = plan(size=400)
-    assert (found.half, found.steps) == (True, DEFAULT_HALF_STEPS)
-    assert found.seconds == pytest.approx(1 + 5 + DEFAULT_HALF_STEPS * 0.05 + (48 / 4 + 1.8 * 4) * 0.05 + 0.6)
-    assert found.memory == pytest.approx(1e9 + (48 / 4 + 4) * 1e7)
-    assert plan(size=400, time_budget=20.0).half
-    for other in (plan(size=401), plan(size=100), plan(size=400, wide=False), plan(size=400, steps=23)):
-        assert not other.half
+@pytest.mark.parametrize(("size", "edge"), [(400, 200), (1080, 200), (300, 150)])
+def test_views_are_half_as_large_as_they_may_be_where_gaussians_are_wide(size, edge):
+    found = plan(size=size)
+    assert (found.half, found.steps, found.view_size) == (True, DEFAULT_HALF_STEPS, edge)
+    assert found.seconds == pytest.approx(1 + 5 + DEFAULT_HALF_STEPS * 0.05 + 72 / 4 * 0.05 + 4 * 0.09 + 0.6)
+    assert found.memory == pytest.approx(1e9 + (72 / 4 + 4) * 1e7)
+    assert plan(size=size, time_budget=20.0).half
+    for other in (plan(size=size, wide=False), plan(size=size, steps=23)):
+        assert (other.half, other.view_size) == (False, min(size, 400))
+    assert not plan(size=100).half
 
 
 def test_wide_is_told_by_the_middle_axis():
@@ -84,17 +88,64 @@ def test_wide_is_told_by_the_middle_axis():
     )  # fmt: skip
     assert wide(one(1.0), 400)
     assert not wide(one(0.8), 400)
+    assert wide(one(1.0), 1080)  # its views are no larger
     assert not wide(one(1.0), 200)
 
 
 def test_refinement_on_half_views_gains_on_whole_ones(tmp_path):
     report = done(tmp_path, FitOptions(600, 128))
     stages = {stage.name: stage for stage in report.stages}
-    assert stages["views"].note.startswith("48 of 64 px to fit to")
+    assert stages["views"].note.startswith("72 of 64 px to fit to")
     assert stages["refinement"].kept
     assert stages["refinement"].psnr > stages["refinement"].psnr_before + 1
     assert report.plan["half"]
     assert report.refinement["dilation"] == DILATION / 4
+    assert report.refinement["rule"] == "inria"
+
+
+def test_a_large_screen_is_fitted_to_by_its_dilation_on_small_views(tmp_path):
+    report = done(tmp_path, FitOptions(600, 800, steps=48))
+    assert report.refinement["dilation"] == pytest.approx(DILATION / 16)
+    stages = {stage.name: stage for stage in report.stages}
+    assert stages["views"].note.startswith("24 of 200 px")
+    assert "blocks" in stages["check views"].note
+    header = read_ply(tmp_path / "a.ply")[1]
+    assert (header.made_for, header.rule) == (800, "inria")
+    other = done(tmp_path, FitOptions(600, 800, steps=48, rule="playcanvas"), overwrite=True)
+    by = {(seat["rule"], seat["size"]): seat["psnr"] for seat in report.seats}
+    assert {(seat["rule"], seat["size"]): seat["psnr"] for seat in other.seats}["playcanvas", 800] > by[
+        "playcanvas", 800
+    ]
+    assert report.seats == sorted(report.seats, key=lambda seat: seat["psnr"])
+    assert len(by) == 10
+
+
+def test_blocks_tell_what_the_whole_picture_does(tmp_path):
+    line = np.linspace(-1, 1, 24, dtype=np.float32)
+    ball = Volume(1 - np.sqrt(sum(np.square(np.meshgrid(line, line, line)))))
+    points = [{"x": x, "rgb": [1, abs(x), 0.2], "opacity": o} for x, o in ((-1, 0), (0.2, 0), (0.5, 0.5), (1, 0.9))]
+    scene = Scene.build(ball, minimal.read({"points": points}, "ball"), 1.0, (-0.8, 1.0))
+    cameras = default_views("check", 2, size=640)
+    judged = judging_views(scene, cameras, RenderSettings())
+    assert judged.images.shape[0] == len(judged.blocks) == 2
+    assert judged.images[0].size < 0.55 * 640 * 640 * 4
+    for camera, blocks, picked in zip(cameras, judged.blocks, judged.images, strict=True):
+        np.testing.assert_allclose(blocks.pick(render_view(scene, camera)), picked, atol=0.1)  # rays at their edges
+        assert np.abs(blocks.pick(render_view(scene, camera)) - picked).mean() < 1e-4
+
+
+def test_what_viewers_leave_out_is_not_written():
+    camera = default_views("check", 1, size=1000)[0]
+    pixel = np.linalg.norm(camera.position) / camera.fx
+    sizes = np.log(np.float32([0.1, 0.5, 2.0, 2.0])[:, None] * pixel * np.float32([1, 0.5, 0.1]))
+    logits = np.float32([2.0, 0.0, 0.0, -6.0])
+    turn, grey = np.tile(np.float32([1, 0, 0, 0]), (4, 1)), np.full((4, 3), 0.5, np.float32)
+    kept = drawn_by_all(Gaussians(np.zeros((4, 3), np.float32), sizes, turn, logits, grey), 1000)
+    assert len(kept) == 3  # the faint one is gone
+    np.testing.assert_allclose(np.exp(kept.log_scales.max(axis=1)) / pixel, [0.5, 0.5, 2.0], rtol=1e-5)
+    mass = lambda logit, scales: 1 / (1 + np.exp(-logit)) * np.exp(scales[0] + scales[1])  # noqa: E731
+    assert mass(kept.opacity_logits[0], kept.log_scales[0]) == pytest.approx(mass(logits[0], sizes[0]), rel=1e-4)
+    assert np.array_equal(kept.opacity_logits[1:], logits[1:3])
 
 
 def test_narrow_gaussians_get_whole_views(tmp_path, monkeypatch):
@@ -105,15 +156,11 @@ def test_narrow_gaussians_get_whole_views(tmp_path, monkeypatch):
     assert report.refinement["dilation"] == DILATION
 
 
-def test_whole_views_that_do_not_fit_stay_half(monkeypatch):
+def test_views_that_do_not_fit_are_refused(monkeypatch):
     found = plan(size=400)
-    views = 400**2 * 32
-    monkeypatch.setattr("vvgt_cli.pipeline.mend.free_memory", lambda: views * 40)
-    check_view_memory(found, 400)  # 48 / 4 + 4
-    assert not whole_views_fit(found, 400)
-    monkeypatch.setattr("vvgt_cli.pipeline.mend.free_memory", lambda: views * 52)
-    assert whole_views_fit(found, 400)
-    monkeypatch.setattr("vvgt_cli.pipeline.mend.free_memory", lambda: views * 10)
+    monkeypatch.setattr("vvgt_cli.pipeline.mend.free_memory", lambda: 400**2 * 32 * 24)
+    check_view_memory(found, 400)  # 72 / 4 + 5
+    monkeypatch.setattr("vvgt_cli.pipeline.mend.free_memory", lambda: 400**2 * 32 * 22)
     with pytest.raises(UsageError, match="--size 400"):
         check_view_memory(found, 400)
 
@@ -128,10 +175,8 @@ def test_hard_edges_get_adaptive_rays(edge, samples):
     points = [node(-1.0, 0.0), node(0.3, 0.0), node(0.3 + edge, 0.9), node(1.0, 0.9)]
     scene = Scene.build(ball, minimal.read({"points": points}, "edge"), 1.0, (-0.8, 1.0))
     start = initialise(scene, VbmOptions(4000, 128)).gaussians
-    cameras = default_views("check", 1, size=128)
-    check = Views(cameras, render_views(scene, cameras))
-    for half in (False, True):
-        assert fine_enough(scene, check, start, half).samples == samples
+    for size, rule in ((128, INRIA), (64, INRIA.at(0.5))):
+        assert fine_enough(scene, start, size, rule).samples == samples
 
 
 def test_no_steps_leave_back_projection():
@@ -209,7 +254,7 @@ def test_a_size_is_kept_to_the_byte_and_one_without_room_is_refused(degree, tmp_
 
 def test_a_target_that_the_closed_form_has_pays_for_nothing_else(tmp_path):
     report = done(tmp_path, limits=Limits(target_psnr=10.0))
-    assert names(report) == ["read", "scene", "closed form", "check views", "test views", "write"]
+    assert names(report) == ["read", "scene", "closed form", "check views", "test views", "seats", "write"]
     assert report.gaussians <= 400 // 8
     assert report.left_out[0][0] == "refinement"
     assert "Gaussians" in report.left_out[1][0]

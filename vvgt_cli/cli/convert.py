@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from vvgt_cli.cli.fit import fit_options, limit_options, ply_options
+from vvgt_cli.cli.fit import fit_options, limit_options, ply_options, rule_option
 from vvgt_cli.cli.options import common_options, overwrite_option, read_options, tf_options
 from vvgt_cli.progress import Console
 
@@ -15,6 +15,7 @@ from vvgt_cli.progress import Console
 @click.argument("volume")
 @click.option("-o", "--output", required=True, metavar="OUT.ply", help="File to write; - is standard output.")
 @fit_options
+@rule_option("Viewers that the file is fitted to: how they draw a Gaussian.", "inria")
 @click.option(
     "--steps", type=click.IntRange(0, 10_000_000), metavar="N",
     help="Steps of gradient descent after the closed form, one view each, at most; 0 for none. Without: by the plan.",

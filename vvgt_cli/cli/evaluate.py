@@ -6,6 +6,7 @@ from typing import Any
 
 import click
 
+from vvgt_cli.cli.fit import rule_option
 from vvgt_cli.cli.options import common_options, read_options, tf_options
 from vvgt_cli.progress import Console
 
@@ -14,18 +15,14 @@ from vvgt_cli.progress import Console
 @click.argument("ply", metavar="OUT.ply")
 @click.option("--volume", required=True, metavar="VOLUME", help="The volume that the file was made from.")
 @click.option(
-    "--size", type=click.IntRange(16, 4096), default=400, show_default=True, metavar="PX", help="Image size at 1x."
-)
+    "--size", type=click.IntRange(16, 8192), metavar="PX",
+    help="Image size to score at. Default: what the file is made for, or 400.",
+)  # fmt: skip
+@rule_option("How to draw: as which viewers do. Default: the file's rule, or inria.")
 @click.option(
-    "--scale",
-    "scales",
-    type=click.IntRange(1, 8),
-    multiple=True,
-    metavar="N",
-    default=(1, 2, 4),
-    show_default=True,
-    help="Score at N times the size; may be repeated.",
-)
+    "--no-seats", "seats", is_flag=True, default=True, flag_value=False,
+    help="Leave out the table of every rule, several sizes and close-ups.",
+)  # fmt: skip
 @click.option(
     "--step", type=click.FloatRange(0, 4, min_open=True), default=0.125, show_default=True, metavar="VOXELS",
     help="Sampling distance of the reference; 0.5 is what convert scores with.",
@@ -35,19 +32,22 @@ from vvgt_cli.progress import Console
 @read_options
 @common_options
 def command(ply: str, volume: str, as_json: bool, console: Console, **options: Any) -> None:
-    """Score OUT.ply against the volume it was made from, on the ten test views, at 1x, 2x and 4x the size.
+    """Score OUT.ply against the volume it was made from: on the ten test views, and from every seat.
 
-    The reference is ray-cast with steps of 1/8 voxel and up to 9 rays a pixel; its own error (against half
-    the step and up to 36 rays, on the middle of one view) is printed with the scores. Without
-    --opacity-unit-distance the one that the file's header records is taken.
+    A seat is a rule of drawing (docs/viewers.md), a size (400, 800, the file's own and 2160 px) or a close-up
+    (field of view 10 degrees); three test views each, worst first. Large pictures are scored on blocks of 16 px.
+    The reference is ray-cast with steps of 1/8 voxel and up to 9 rays a pixel (seats: as convert's); its own
+    error is printed with the scores. Size, rule and --opacity-unit-distance are the file's own unless given.
 
     \b
     Example:
-      vvgt evaluate head.ply --volume head.nrrd --tf bone.json --scale 1 --scale 2
+      vvgt evaluate head.ply --volume head.nrrd --tf bone.json --json
     """
     from vvgt_cli.cli.fit import source_request
     from vvgt_cli.pipeline.evaluate import EvaluateRequest, evaluate
 
     source = source_request(volume, options["read"], options["optics"])
-    evaluation = evaluate(EvaluateRequest(ply, source, options["size"], options["scales"], options["step"]), console)
+    evaluation = evaluate(
+        EvaluateRequest(ply, source, options["size"], options["rule"], options["step"], options["seats"]), console
+    )
     click.echo(evaluation.to_json() if as_json else evaluation.table(), nl=False)

@@ -19,8 +19,8 @@ fit_options = group(
         help="Budget: no more Gaussians than this.",
     ),
     size=click.option(
-        "--size", type=click.IntRange(16, 8192), default=400, show_default=True, metavar="PX",
-        help="Image size that the file is made for; viewers widen every splat by a third of a pixel.",
+        "--size", type=click.IntRange(16, 8192), default=1080, show_default=True, metavar="PX",
+        help="Screen that the file is made for, in pixels along the edge; it is scored there.",
     ),
     init=click.option(
         "--init", type=click.Choice(["vbm", "wavelet", "uniform"]), default="vbm", show_default=True,
@@ -28,6 +28,16 @@ fit_options = group(
     ),
     seed=click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of random samples."),
 )  # fmt: skip
+
+RULES = ("inria", "compensated", "spark", "playcanvas", "viser")  # `vvgt_cli.splat.rules.RULES`; a test compares
+
+
+def rule_option(help: str, default: str | None = None) -> Any:
+    """``--rule``."""
+    return click.option(
+        "--rule", type=click.Choice(RULES), default=default, show_default=default is not None, help=help
+    )
+
 
 limit_options = group(
     "limits",
@@ -81,6 +91,7 @@ def convert_request(
     overwrite: bool,
     report: str | None = None,
     preview: str | None = None,
+    rule: str = "inria",
     steps: int | None = None,
     model: str | None = None,
     limits: dict[str, Any] | None = None,
@@ -94,7 +105,7 @@ def convert_request(
     return ConvertRequest(
         source_request(volume, read, optics),
         output,
-        FitOptions(**fit, steps=steps, model=model),
+        FitOptions(**fit, rule=rule, steps=steps, model=model),
         Limits(**(limits or {})),
         dry_run,
         PlyOptions(**ply),

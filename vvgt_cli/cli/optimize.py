@@ -6,6 +6,7 @@ from typing import Any
 
 import click
 
+from vvgt_cli.cli.fit import rule_option
 from vvgt_cli.cli.options import common_options, overwrite_option
 from vvgt_cli.progress import Console
 
@@ -34,6 +35,11 @@ from vvgt_cli.progress import Console
     "--checkpoint", metavar="FILE.npz",
     help="For long runs: written at every look at the check views and at the end; the same command goes on there.",
 )  # fmt: skip
+@click.option(
+    "--size", type=click.IntRange(16, 8192), metavar="PX",
+    help="Screen that the file is made for, of which the views are samples. Default: the file's, or the views' size.",
+)  # fmt: skip
+@rule_option("Viewers to fit to: how they draw a Gaussian. Default: the file's rule, or inria.")
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of the order of views.")
 @click.option("--report", metavar="R.json", help="Write times and errors of every stage as JSON; - is standard output.")
 @overwrite_option
@@ -65,4 +71,6 @@ def command(
         checkpoint=options["checkpoint"],
         **budget(options["steps"], options["time_budget"]),
     )  # fmt: skip
-    optimize_file(OptimizeRequest(ply, views, output, how, report, overwrite), console)
+    optimize_file(
+        OptimizeRequest(ply, views, output, how, options["size"], options["rule"], report, overwrite), console
+    )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import click
 
+from vvgt_cli.cli.fit import rule_option
 from vvgt_cli.cli.options import common_options, overwrite_option
 from vvgt_cli.progress import Console
 
@@ -12,12 +13,18 @@ from vvgt_cli.progress import Console
 @click.argument("ply", metavar="OUT.ply")
 @click.option("--camera", metavar="FILE", help="Views of a transforms.json (in the unit frame).")
 @click.option("--orbit", type=click.IntRange(1, 10_000), metavar="N", help="N views on a circle around +z.")
-@click.option("--size", type=click.IntRange(1, 16384), metavar="PX", help="Image height. Default: the file's, or 400.")
+@click.option(
+    "--size",
+    type=click.IntRange(1, 16384),
+    metavar="PX",
+    help="Image height. Default: the view set's, for an orbit what the .ply is made for, or 400.",
+)
 @click.option("-o", "--output", required=True, metavar="DIR", help="Directory for the images; made if it is not there.")
 @click.option("--exr", is_flag=True, help="Write float EXR (premultiplied RGBA) beside each PNG.")
 @click.option(
     "--background", type=float, nargs=3, metavar="R G B", help="Put the PNG over this colour. Default: transparent."
 )
+@rule_option("How to draw: as which viewers do. Default: the file's rule, or inria.")
 @overwrite_option
 @common_options
 def command(
@@ -25,6 +32,7 @@ def command(
     camera: str | None,
     orbit: int | None,
     size: int | None,
+    rule: str | None,
     output: str,
     exr: bool,
     background: tuple[float, float, float] | None,
@@ -47,4 +55,4 @@ def command(
         raise UsageError("give the views with either --camera FILE or --orbit N")
     if background is not None and not all(0 <= c <= 1 for c in background):
         raise UsageError(f"--background {' '.join(map(str, background))}: expected three numbers in [0, 1]")
-    render_file(RenderRequest(ply, output, camera, orbit, size, exr, background, overwrite), console)
+    render_file(RenderRequest(ply, output, camera, orbit, size, rule, exr, background, overwrite), console)

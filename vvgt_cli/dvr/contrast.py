@@ -17,20 +17,27 @@ def _apart(image, row, col, i, j):
     return most
 
 
-@kernel("f4:3 f4:2", parallel=True)
-def _contrast(image, out):
+@kernel("f4:3 b1:2 f4:2", parallel=True)
+def _contrast(image, known, out):
     height, width = out.shape
     for row in nb.prange(height):
         for col in range(width):
             most = 0.0
+            if not known[row, col]:
+                out[row, col] = most
+                continue
             for i in range(max(row - 1, 0), min(row + 2, height)):
                 for j in range(max(col - 1, 0), min(col + 2, width)):
-                    most = max(most, _apart(image, row, col, i, j))
+                    if known[i, j]:
+                        most = max(most, _apart(image, row, col, i, j))
             out[row, col] = most
 
 
-def contrast(image: np.ndarray) -> np.ndarray:
-    """Largest difference of each pixel from its 8 neighbours, (h, w), in any channel of an image (h, w, c)."""
+def contrast(image: np.ndarray, known: np.ndarray | None = None) -> np.ndarray:
+    """Largest difference of each pixel from its 8 neighbours, (h, w), in any channel of an image (h, w, c).
+
+    ``known`` (h, w) bool: pixels that have been rendered; others differ from nothing.
+    """
     out = np.empty(image.shape[:2], image.dtype)
-    _contrast(image, out)
+    _contrast(image, np.ones(image.shape[:2], bool) if known is None else known, out)
     return out

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vvgt_cli.cameras import Camera
+from vvgt_cli.cameras.blocks import Blocks
 from vvgt_cli.dvr.scene import Scene
 from vvgt_cli.errors import UsageError
 
@@ -26,17 +27,21 @@ class RenderSettings:
         samples: rays along a pixel's edge, everywhere; None: as ``tiers`` say.
         tiers: (difference, rays): pixels that differ from one of 8 neighbours by more than the first, rising, get so
             many rays (5, 13 or a square), all others one.
+        footprint: part of a pixel's edge that its rays cover: w / W where a view of w px samples a screen of W.
     """
 
     step: float = 0.5
     samples: int | None = None
     tiers: tuple[tuple[float, int], ...] = ADAPTIVE
+    footprint: float = 1.0
 
     def __post_init__(self) -> None:
         if not 0 < self.step <= 4:
             raise UsageError(f"step {self.step} voxels; expected more than 0 and at most 4")
         if self.samples is not None and not 1 <= self.samples <= 16:
             raise UsageError(f"samples {self.samples}; expected 1 to 16 rays along a pixel's edge")
+        if not 0 < self.footprint <= 1:
+            raise UsageError(f"footprint {self.footprint}; expected more than 0 and at most 1 pixel")
 
 
 REFERENCE = RenderSettings(step=0.125, tiers=((0.02, 9),))
@@ -68,47 +73,53 @@ def camera_arrays(scene: Scene, camera: Camera) -> tuple[np.ndarray, np.ndarray,
     return eye, basis, lens
 
 
-def tile_order(height: int, width: int) -> np.ndarray:
-    """Tiles dealt out over the threads like cards, so that equal chunks have equal work."""
+def tile_order(height: int, width: int, blocks: Blocks | None = None) -> np.ndarray:
+    """Tiles, or ``blocks``, dealt out over the threads like cards, so that equal chunks have equal work."""
     import numba
 
     from vvgt_cli.dvr.kernel import TILE
 
-    count, threads = -(-height // TILE) * -(-width // TILE), numba.get_num_threads()
-    return np.concatenate([np.arange(first, count, threads) for first in range(threads)])
+    tiles = np.arange(-(-height // TILE) * -(-width // TILE)) if blocks is None else blocks.numbers
+    threads = numba.get_num_threads()
+    return np.concatenate([tiles[first::threads] for first in range(threads)])
 
 
 def cast_tiers(
-    settings: RenderSettings, image: np.ndarray, cast: Callable[[np.ndarray, np.ndarray, int], None]
+    settings: RenderSettings,
+    image: np.ndarray,
+    cast: Callable[[np.ndarray, np.ndarray, int], None],
+    blocks: Blocks | None = None,
 ) -> None:
     """Fill ``image`` (h, w, 4) by ``cast(offsets, mask, known)``: rays at ``offsets`` in the pixels of ``mask``,
-    averaged with the ``known`` ones that the image holds."""
+    averaged with the ``known`` ones that the image holds. With ``blocks`` only those."""
     from vvgt_cli.dvr.contrast import contrast
 
-    everywhere = np.ones(image.shape[:2], bool)
+    everywhere = np.ones(image.shape[:2], bool) if blocks is None else blocks.mask()
     if settings.samples is not None:
-        cast(ray_offsets(settings.samples**2), everywhere, 0)
+        cast(ray_offsets(settings.samples**2) * settings.footprint, everywhere, 0)
         return
     cast(np.zeros((1, 2)), everywhere, 0)
-    differ = contrast(image)
+    differ = contrast(image, everywhere)
     ends = [threshold for threshold, _ in settings.tiers[1:]]
     for (low, count), high in zip(settings.tiers, [*ends, np.inf], strict=True):
         mask = (differ > low) & (differ <= high)
         if mask.any():
-            offsets = ray_offsets(count)
+            offsets = ray_offsets(count) * settings.footprint
             new = np.any(offsets != 0, axis=1)  # a grid of an even edge has no ray in the middle
             cast(offsets[new], mask, int(not new.all()))
 
 
-def render_view(scene: Scene, camera: Camera, settings: RenderSettings | None = None) -> np.ndarray:
-    """One view: (height, width, 4) float32, premultiplied RGBA over nothing."""
+def render_view(
+    scene: Scene, camera: Camera, settings: RenderSettings | None = None, blocks: Blocks | None = None
+) -> np.ndarray:
+    """One view: (height, width, 4) float32, premultiplied RGBA over nothing; with ``blocks`` zero elsewhere."""
     from vvgt_cli.dvr.kernel import render_tiles
 
     settings = settings or RenderSettings()
     tables = scene.tables
     eye, basis, lens = camera_arrays(scene, camera)
     out = np.zeros((camera.height, camera.width, 4), np.float32)
-    order = tile_order(camera.height, camera.width)
+    order = tile_order(camera.height, camera.width, blocks)
 
     def cast(offsets: np.ndarray, mask: np.ndarray, known: int) -> None:
         render_tiles(
@@ -116,7 +127,7 @@ def render_view(scene: Scene, camera: Camera, settings: RenderSettings | None = 
             eye, basis, lens, float(settings.step), order, offsets, mask, known, out,
         )  # fmt: skip
 
-    cast_tiers(settings, out, cast)
+    cast_tiers(settings, out, cast, blocks)
     return out
 
 

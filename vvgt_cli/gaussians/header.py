@@ -35,6 +35,7 @@ class PlyHeader:
         scale, centre: of the volume's `UnitFrame`, where the comments give them.
         up: volume axis that was turned up, "none" where no comment says otherwise.
         unit_distance, unit_distance_label: what opacity referred to, None where not recorded.
+        made_for, rule: pixels of the screen that it is made for, and the rule by which it is drawn; None: not recorded.
         version: of the vvgt that wrote it, None for other programs.
     """
 
@@ -49,6 +50,8 @@ class PlyHeader:
     up: str = "none"
     unit_distance: float | None = None
     unit_distance_label: str | None = None
+    made_for: int | None = None
+    rule: str | None = None
     version: str | None = None
 
 
@@ -172,6 +175,10 @@ def _one_comment(words: list[str]) -> dict:
         return {"up": words[1]}
     if words[0] == "unit-distance":
         return {"unit_distance": _finite([words[1]])[0], "unit_distance_label": " ".join(words[2:])}
+    if words[0] == "size":
+        if words[2] != "rule" or len(words) != 4 or not words[1].isdecimal() or not 0 < int(words[1]) <= 2**20:
+            raise ValueError(words)
+        return {"made_for": int(words[1]), "rule": words[3]}
     return {"version": words[0]}
 
 

@@ -20,6 +20,9 @@ FRAMES = ("unit", "world")
 _HEADER_LIMIT = 1 << 16  # bytes; a header longer than this is not one
 
 
+MIP = "comment SplatRenderMode: mip"  # as Brush marks opacity that is to be compensated
+
+
 @dataclass(frozen=True)
 class PlyOptions:
     """What is written and how.
@@ -32,6 +35,7 @@ class PlyOptions:
         unit_frame: frame of the volume; needed for "world", recorded in the comments otherwise.
         unit_distance: world length that opacity refers to, recorded in the comments.
         unit_distance_label: how that distance was chosen, one word.
+        made_for, rule: pixels of the screen that they are made for, and name of the rule by which they are drawn.
     """
 
     frame: str = "unit"
@@ -41,6 +45,8 @@ class PlyOptions:
     unit_frame: UnitFrame | None = None
     unit_distance: float | None = None
     unit_distance_label: str = "given"
+    made_for: int | None = None
+    rule: str | None = None
 
     def __post_init__(self) -> None:
         up_matrix(self.up)
@@ -96,6 +102,10 @@ def _comments(options: PlyOptions) -> list[str]:
     lines += [frame, f"comment vvgt up {options.up}"]
     if options.unit_distance is not None:
         lines.append(f"comment vvgt unit-distance {float(options.unit_distance)!r} {options.unit_distance_label}")
+    if options.made_for is not None:
+        lines.append(f"comment vvgt size {options.made_for} rule {options.rule or 'inria'}")
+    if options.rule == "compensated":
+        lines.append(MIP)
     return lines
 
 

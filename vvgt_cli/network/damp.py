@@ -9,6 +9,7 @@ import numpy as np
 from vvgt_cli.cameras import Camera
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.splat.half import halved
+from vvgt_cli.splat.rules import INRIA, Rule
 
 VIEWS = 3  # of those that the network has read
 SMALLEST = 1 / 16  # share of a step; below it none is taken
@@ -27,7 +28,9 @@ def between(start: Gaussians, end: Gaussians, share: float) -> Gaussians:
     )
 
 
-def damped(start: Gaussians, end: Gaussians, cameras: Sequence[Camera], images: np.ndarray) -> tuple[Gaussians, float]:
+def damped(
+    start: Gaussians, end: Gaussians, cameras: Sequence[Camera], images: np.ndarray, rule: Rule = INRIA
+) -> tuple[Gaussians, float]:
     """The share 1, 1/2, ... of the step from ``start`` to ``end`` up to which halving lowers the error; and that share.
 
     A network that meets a scene of another kind than it was trained on errs by the size of its steps first. The error
@@ -36,7 +39,7 @@ def damped(start: Gaussians, end: Gaussians, cameras: Sequence[Camera], images: 
     from vvgt_cli.splat import render
 
     some = np.linspace(0, len(cameras) - 1, min(VIEWS, len(cameras))).round().astype(int)
-    few, views, rule = halved([cameras[i] for i in some], images[some])
+    few, views, rule = halved([cameras[i] for i in some], images[some], rule)
 
     def error(gaussians: Gaussians) -> float:
         total = 0.0

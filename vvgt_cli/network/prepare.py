@@ -15,6 +15,7 @@ from vvgt_cli.network import tables
 from vvgt_cli.network.config import NetworkConfig
 from vvgt_cli.network.damp import damped
 from vvgt_cli.network.slopes import slope_rows
+from vvgt_cli.splat.rules import INRIA, Rule
 
 UNIT_RADIUS = math.sqrt(3)  # half-diagonal of the unit frame's cube
 
@@ -50,11 +51,11 @@ class Prepared:
         """All that `Vvgt.forward` is given."""
         return self.views | (self.part() if self.config.has_geometry else {})
 
-    def accept(self, rows: np.ndarray, cameras: Sequence[Camera], images: np.ndarray) -> Gaussians:
+    def accept(self, rows: np.ndarray, cameras: Sequence[Camera], images: np.ndarray, rule: Rule = INRIA) -> Gaussians:
         """`restore`; of a step as much as lowers the error of the views that were read (`vvgt_cli.network.damp`)."""
         if self.config.geometry.head != "step":
             return self.restore(rows)
-        return damped(self.restore(self.rows), self.restore(rows), cameras, images)[0]
+        return damped(self.restore(self.rows), self.restore(rows), cameras, images, rule)[0]
 
     def restore(self, rows: np.ndarray) -> Gaussians:
         """The network's output (K, 14) as Gaussians in the order that was given; "wo_3dt" has an order of its own."""
@@ -80,7 +81,9 @@ def unpack(rows: np.ndarray) -> Gaussians:
     return Gaussians(rows[:, :3], rows[:, 3:6], rows[:, 6:10], rows[:, 10], rows[:, 11:])
 
 
-def prepare(gaussians: Gaussians, cameras: Sequence[Camera], images: np.ndarray, config: NetworkConfig) -> Prepared:
+def prepare(
+    gaussians: Gaussians, cameras: Sequence[Camera], images: np.ndarray, config: NetworkConfig, rule: Rule = INRIA
+) -> Prepared:
     """Everything that the network is given for a scene.
 
     Args:
@@ -104,7 +107,7 @@ def prepare(gaussians: Gaussians, cameras: Sequence[Camera], images: np.ndarray,
         views = {**view_arrays(cameras), "images": image_arrays(gaussians, cameras, images, config)}
     gradients = None
     if config.has_geometry and config.geometry.gradients:
-        gradients = slope_rows(gaussians, cameras, images)[order]
+        gradients = slope_rows(gaussians, cameras, images, rule)[order]
     return Prepared(config, views, rows[order], gradients, order)
 
 

@@ -18,6 +18,7 @@ from vvgt_cli.network.card import IMAGE_INPUTS, MAPS, OUTPUT, ModelCard, read_ca
 from vvgt_cli.network.config import NetworkConfig
 from vvgt_cli.network.prepare import Prepared, prepare
 from vvgt_cli.progress import ProgressCallback
+from vvgt_cli.splat.rules import INRIA, Rule
 
 PROVIDERS = {"cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider"}
 _AGAIN = "export the checkpoint again"
@@ -95,6 +96,7 @@ class Model:
         images: np.ndarray,
         points: int = POINTS,
         progress: ProgressCallback | None = None,
+        rule: Rule = INRIA,
     ) -> Gaussians:
         """The network's Gaussians, in the order of the given.
 
@@ -106,6 +108,7 @@ class Model:
             cameras, images: views, (n, h, w, 4) float32 premultiplied.
             points: of one part, at most.
             progress: called after each part.
+            rule: by which the views are drawn.
 
         Raises:
             DataError: no Gaussians, no views, or output that is not finite.
@@ -114,11 +117,11 @@ class Model:
         few = spread(cameras, config.reads)
         for number in range(config.rounds):
             shown = in_turn(few, number, config.rounds)
-            scene = prepare(gaussians, [cameras[i] for i in shown], images[shown], config)
+            scene = prepare(gaussians, [cameras[i] for i in shown], images[shown], config, rule)
             rows = self.run_rows(scene, points, progress)
             if not np.isfinite(rows).all():
                 raise DataError(f"model {self.card.name}: its output is not finite; these Gaussians are beyond it")
-            gaussians = scene.accept(rows, [cameras[i] for i in shown], images[shown])
+            gaussians = scene.accept(rows, [cameras[i] for i in shown], images[shown], rule)
         return gaussians
 
     def run_rows(self, scene: Prepared, points: int = POINTS, progress: ProgressCallback | None = None) -> np.ndarray:

@@ -15,6 +15,7 @@ from vvgt_cli.cameras import Camera
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.network.config import STEP
 from vvgt_cli.splat.half import halved
+from vvgt_cli.splat.rules import INRIA, Rule
 
 FIELDS = ((0, 3), (3, 6), (6, 9), (9, 10), (10, 13))  # d, e, w, logit, colour: columns of a step
 
@@ -41,7 +42,7 @@ def own_frame(
     return np.concatenate([along, log_scales, spin / 2, logits[:, None], colors], axis=1)
 
 
-def slope_rows(gaussians: Gaussians, cameras: Sequence[Camera], images: np.ndarray) -> np.ndarray:
+def slope_rows(gaussians: Gaussians, cameras: Sequence[Camera], images: np.ndarray, rule: Rule = INRIA) -> np.ndarray:
     """(K, `SLOPES`) float32 of Gaussians with unit quaternions; L is the sum of squared RGBA errors of a view, halved.
 
     Columns, g_v the (13,) gradient of view v's L in the own frame, n views:
@@ -59,7 +60,7 @@ def slope_rows(gaussians: Gaussians, cameras: Sequence[Camera], images: np.ndarr
     total, squares = np.zeros((count, STEP), np.float32), np.zeros((count, STEP), np.float32)
     weights, error = np.zeros((count, 5)), 0.0
     pixel = float(np.median([np.linalg.norm(c.position) / c.fx for c in cameras]))
-    cameras, images, rule = halved(cameras, images)
+    cameras, images, rule = halved(cameras, images, rule)
     for camera, view in zip(cameras, images, strict=True):
         projection = project(g, camera, rule)
         image = render(g, camera, projection=projection)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from vvgt_cli.errors import UsageError
 from vvgt_cli.splat.rules import INRIA, Rule
@@ -14,11 +14,14 @@ if TYPE_CHECKING:
     import numpy as np
 
     from vvgt_cli.cameras import Camera
+    from vvgt_cli.cameras.blocks import Blocks
     from vvgt_cli.gaussians import Gaussians
 
 METHODS = ("frame", "adam", "3dgs")
 LOSS_3DGS = {"l1": 0.8, "l2": 0.0, "ssim": 0.2, "alpha": 0.0}
 Progress = Callable[[int, int], None]
+Train: TypeAlias = "tuple[Sequence[Camera], np.ndarray]"
+Check: TypeAlias = "Train | tuple[Sequence[Camera], np.ndarray, Sequence[Blocks] | None]"
 
 
 @dataclass(frozen=True)
@@ -36,7 +39,7 @@ class OptimizeOptions:
         l1, l2, ssim: weights of the sums over pixels and RGB of |r|, r^2 and 1 - SSIM.
         alpha: weight of the alpha channel's |r| and r^2 beside a colour channel's.
         rule: by which the training views are drawn: ``rule.at(w / W)`` where they are w px wide and the file is made
-            for W. Falloffs that are shifted cannot be descended on.
+            for W.
         judge: by which the check views are drawn.
         check_every: fewest steps between two looks at the check views, of which a run takes eight or so.
         patience: looks in a row without a gain of 0.01 dB, in the second half, after which to stop.
@@ -67,8 +70,6 @@ class OptimizeOptions:
             raise UsageError("neither steps nor a time budget; expected one of them")
         if self.steps is not None and self.steps < 0:
             raise UsageError(f"{self.steps} steps; expected 0 or more")
-        if self.rule.shifted:
-            raise UsageError(f"rule {self.rule.name}: its falloff has no gradient here; fit to inria")
         if not 0 <= self.rule.dilation < math.inf:
             raise UsageError(f"dilation {self.rule.dilation} px^2; expected 0 or more")
         if min(self.check_every, self.patience) < 1:
@@ -110,7 +111,7 @@ def optimize(
     cameras: Sequence[Camera],
     images: np.ndarray,
     options: OptimizeOptions | None = None,
-    check: tuple[Sequence[Camera], np.ndarray] | None = None,
+    check: Check | None = None,
     progress: Progress | None = None,
     stop: Callable[[], bool] | None = None,
 ) -> tuple[Gaussians, OptimizeRecord]:
@@ -120,8 +121,8 @@ def optimize(
         gaussians: where to start.
         cameras, images: training views, (n, h, w, 4) float32 premultiplied.
         options: how, and when to stop.
-        check: cameras and images to judge by: what is returned is the best that they have seen, the input included.
-            Without them the last step's Gaussians are returned.
+        check: cameras and images to judge by, and `Blocks` of each where the images hold only those: what is returned
+            is the best that they have seen, the input included. Without them the last step's Gaussians are returned.
         progress: called after each step with the steps taken and expected.
         stop: asked before each step; True ends the run as a time budget would.
 

@@ -9,14 +9,12 @@ import hashlib
 import json
 import struct
 import zipfile
-from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vvgt_cli.cameras import Camera
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import Gaussians
@@ -31,18 +29,16 @@ _FAULTS = (
 )
 
 
-def fingerprint(
-    gaussians: Gaussians, options: OptimizeOptions, *views: tuple[Sequence[Camera], np.ndarray] | None
-) -> str:
-    """Hash of all that a run depends on."""
+def fingerprint(gaussians: Gaussians, options: OptimizeOptions, *views: Any) -> str:
+    """Hash of all that a run depends on; ``views``: `Train`, `Check` or None."""
     found = hashlib.sha256(repr(replace(options, checkpoint=None)).encode())
     g = gaussians
     for array in (g.means, g.log_scales, g.quaternions, g.opacity_logits, g.colors):
         found.update(array.tobytes())
-    for cameras, images in filter(None, views):
-        for camera in cameras:
+    for part in filter(None, views):
+        found.update(repr(part[2:]).encode())
+        for camera, image in zip(part[0], part[1], strict=True):
             found.update(repr(camera).encode())
-        for image in images:
             found.update(image.tobytes())
     return found.hexdigest()
 

@@ -10,14 +10,16 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from vvgt_cli.cameras import Camera
+from vvgt_cli.cameras.blocks import BLOCK, Blocks
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.metrics import psnr
-from vvgt_cli.optimize import OptimizeOptions, OptimizeRecord, Progress
+from vvgt_cli.optimize import Check, OptimizeOptions, OptimizeRecord, Progress, Train
 from vvgt_cli.optimize.checkpoint import fingerprint, resume, save
 from vvgt_cli.optimize.densify import Densified
 from vvgt_cli.optimize.states import Fields, OwnFrame
 from vvgt_cli.splat import blend
+from vvgt_cli.splat.rules import INRIA, Rule
 
 GAIN = 0.01  # dB: less is none
 FALLEN = 3.0  # dB below the best: rates were too large
@@ -26,7 +28,6 @@ LOOKS = 8  # at the check views in a run, where that leaves enough steps between
 SETTLING = 0.5  # share of the run from which on looks without gain count: rates fall only then
 MEMORY = 0.9  # of the running error, a step
 State = OwnFrame | Fields
-Check = tuple[Sequence[Camera], np.ndarray]
 
 
 def run(
@@ -39,11 +40,12 @@ def run(
     stop: Callable[[], bool] | None,
 ) -> tuple[Gaussians, OptimizeRecord]:
     """`optimize` without its defaults."""
-    for name, (some, views) in {"training": (cameras, images), "check": check or (cameras, images)}.items():
-        _fit(name, some, views)
+    _fit("training", cameras, images)
+    if check is not None:
+        _fit("check", *check)
     record = OptimizeRecord()
     state = begin(gaussians, cameras, options)
-    judge = Judge(state, check, record)
+    judge = Judge(state, check, record, options.judge)
     keep, walk = _checkpoint(options, gaussians, (cameras, images), check, state, judge)
     entered, order = time.perf_counter(), views_in_turn(len(cameras), options.seed)
     if not record.checks:
@@ -88,7 +90,7 @@ class _Walk:
 
 
 def _checkpoint(
-    options: OptimizeOptions, gaussians: Gaussians, train: Check, check: Check | None, state: State, judge: Judge
+    options: OptimizeOptions, gaussians: Gaussians, train: Train, check: Check | None, state: State, judge: Judge
 ) -> tuple[Callable[[], None], _Walk]:
     """What saves the run, and where it begins: the end of the last one where there is a checkpoint."""
     path = options.checkpoint
@@ -170,20 +172,22 @@ def _reason(options: OptimizeOptions, judge: Judge, elapsed: float, stop: Callab
     return "interrupted" if stop and stop() else None
 
 
-def _fit(name: str, cameras: Sequence[Camera], images: np.ndarray) -> None:
+def _fit(name: str, cameras: Sequence[Camera], images: np.ndarray, blocks: Sequence[Blocks] | None = None) -> None:
     if not len(cameras) or len(cameras) != len(images):
         raise DataError(f"{len(images)} {name} images for {len(cameras)} cameras; expected as many, and at least one")
-    for camera, image in zip(cameras, images, strict=True):
-        if image.shape != (camera.height, camera.width, 4):
-            expected = (camera.height, camera.width, 4)
+    for i, (camera, image) in enumerate(zip(cameras, images, strict=True)):
+        expected = (camera.height, camera.width, 4)
+        if blocks is not None:
+            expected = (blocks[i].numbers.size * BLOCK, BLOCK, 4)
+        if image.shape != expected:
             raise DataError(f"{name} view {camera.name}: image of shape {image.shape}; expected {expected}")
 
 
 class Judge:
     """Looks at the check views, and remembers the best state that they have seen."""
 
-    def __init__(self, state: State, check: Check | None, record: OptimizeRecord) -> None:
-        self.state, self.check, self.record = state, check, record
+    def __init__(self, state: State, check: Check | None, record: OptimizeRecord, rule: Rule = INRIA) -> None:
+        self.state, self.check, self.record, self.rule = state, check, record, rule
         self.best: float | None = None
         self.kept: tuple[np.ndarray, ...] | None = None
         self.idle = 0
@@ -198,9 +202,13 @@ class Judge:
         if self.check is None or (record.checks and record.checks[-1][0] == record.steps):
             return False
         scores = []
-        for camera, view in zip(*self.check, strict=True):
-            image = blend(self.state.project(camera), self.state.colors, camera.height, camera.width)
-            scores.append(psnr(view[..., :3], image[..., :3]))
+        cameras, views, *rest = self.check
+        blocks = rest[0] if rest else None
+        for i, (camera, view) in enumerate(zip(cameras, views, strict=True)):
+            part = None if blocks is None else blocks[i]
+            projection = self.state.project(camera, self.rule)
+            image = blend(projection, self.state.colors, camera.height, camera.width, part)
+            scores.append(psnr(view[..., :3], (image if part is None else part.pick(image))[..., :3]))
         now = float(np.mean(scores))
         record.checks.append((record.steps, seconds, now))
         fallen = self.best is not None and now < self.best - FALLEN and self.state.STEADY

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -11,12 +12,13 @@ from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored
 from vvgt_cli.jit.ahead import CONVERT, INIT
 from vvgt_cli.network.card import find_model, read_card
-from vvgt_cli.pipeline.mend import check_view_memory, mend, whole_views_fit, wide
+from vvgt_cli.pipeline.mend import check_view_memory, mend, wide
 from vvgt_cli.pipeline.outputs import Output, check_outputs, write_text
-from vvgt_cli.pipeline.plan import Limits, Planner, estimate
+from vvgt_cli.pipeline.plan import Limits, Planner, estimate, view_edge
 from vvgt_cli.pipeline.record import ConversionReport, Run
 from vvgt_cli.pipeline.render import write_gaussians
 from vvgt_cli.pipeline.score import psnr_note, score_test_views
+from vvgt_cli.pipeline.seats import SIDE, from_above, score_seats
 from vvgt_cli.pipeline.source import Source, SourceRequest, load
 from vvgt_cli.progress import Console
 
@@ -26,6 +28,8 @@ if TYPE_CHECKING:
     from vvgt_cli.vbm import Start
 
 QUICKEST = 0.5  # of the estimate, where the closed form took less: the rest then takes less too
+FAINT = 0.02  # opacity
+FEWEST = 5000  # Gaussians that a fog keeps
 PREVIEW_VIEWS = (0, 4, 9)  # test views of the preview, and of the score without a report: above, side, below
 
 
@@ -37,14 +41,16 @@ class FitOptions:
         max_gaussians: budget K.
         size: pixels along an image's edge that the file is made for.
         init: "vbm", "wavelet" or "uniform".
+        rule: of `vvgt_cli.splat.rules` that is fitted to and scored by.
         seed: of whatever draws random numbers.
         model: network that runs before the steps: a folder or the name of a shipped one, None for none.
         steps: of gradient descent after the closed form, at most; None: what the plan finds worth its time.
     """
 
     max_gaussians: int = 100_000
-    size: int = 400
+    size: int = 1080
     init: str = "vbm"
+    rule: str = "inria"
     seed: int = 0
     steps: int | None = None
     model: str | None = None
@@ -103,7 +109,7 @@ def convert(request: ConvertRequest, console: Console | None = None) -> Conversi
         read_card(find_model(fit.model))  # fails before the work, not after
     source, scene = _begin(run, request)
     costs = estimate(scene, fit.size, fit.max_gaussians, request.report is not None)
-    sparse = fit.max_gaussians <= fit.size**2  # a guess, until the Gaussians are there
+    sparse = fit.max_gaussians <= view_edge(fit.size, half=False) ** 2  # a guess, until the Gaussians are there
     planner = Planner(request.limits, fit.max_gaussians, fit.steps, request.ply.sh_degree, fit.size, sparse, fit.model)
     plan = planner.plan(costs, run.elapsed())
     run.report.plan = plan.record()
@@ -111,7 +117,7 @@ def convert(request: ConvertRequest, console: Console | None = None) -> Conversi
     if request.dry_run:
         return run.finish()
     start = _closed_form(run, scene, fit)
-    planner = replace(planner, wide=wide(start.gaussians, fit.size) or not whole_views_fit(plan, fit.size))
+    planner = replace(planner, wide=wide(start.gaussians, fit.size))
     plan = planner.plan(
         costs.at(max(run.report.stages[-1].seconds / costs.closed_form, QUICKEST)), run.elapsed(), begun=True
     )
@@ -198,8 +204,25 @@ def _closed_form(run: Run, scene: Scene, fit: FitOptions) -> Start:
                 f"{scene.volume.name} under {scene.tf.name}: nothing visible from any view; "
                 "expected opacity above 0 where the data are (try 'vvgt tf show TF -o tf.png --volume VOLUME')"
             )
+        start, spared = thinned(start)
         stage.note = f"{len(start.gaussians)} Gaussians ({fit.init})"
+    if spared:
+        run.leave_out(f"{spared} Gaussians", "so faint that viewers differ on what they draw of them")
     return start
+
+
+def thinned(start: Start) -> tuple[Start, int]:
+    """Half the budget, again and again, while the median opacity is below `FAINT`; and how many Gaussians that spares.
+
+    Programs leave out what is below 1/255, 1/510 or 1/100 in a pixel: of a fog of faint splats each shows another part.
+    """
+    before = len(start.gaussians)
+    while start.form is not None and start.form.budget >= 2 * FEWEST:
+        if np.median(start.gaussians.opacity_logits) >= math.log(FAINT / (1 - FAINT)):
+            break
+        form = replace(start.form, budget=start.form.budget // 2)
+        start = replace(start, form=form, gaussians=form.gaussians())
+    return start, before - len(start.gaussians)
 
 
 def _score(run: Run, scene: Scene, gaussians: Gaussians, request: ConvertRequest) -> tuple[Scores, np.ndarray | None]:
@@ -212,12 +235,21 @@ def _score(run: Run, scene: Scene, gaussians: Gaussians, request: ConvertRequest
             gaussians,
             request.fit.size,
             RenderSettings(),
+            rule=request.fit.rule,
             perceptual=request.report is not None,
             keep=PREVIEW_VIEWS if request.preview else (),
             only=None if request.report else PREVIEW_VIEWS,
             progress=run.console.bar("test views"),
         )
         stage.note = f"{psnr_note(scores)}, {scores.views} views of {request.fit.size} px"
+    budget = request.limits.time_budget
+    if budget is not None and run.elapsed() > budget:
+        run.leave_out("seats", "time is up")
+        return scores, sheet
+    with run.stage("seats") as stage:
+        seats = score_seats(scene, gaussians, from_above(request.fit.size), views=SIDE)
+        run.report.seats = [asdict(seat) for seat in seats]
+        stage.note = f"worst of {len(seats)}: {seats[0].name()}, {seats[0].psnr:.2f} dB"
     return scores, sheet
 
 
@@ -232,6 +264,8 @@ def _finish(
         unit_frame=source.volume.unit_frame(),
         unit_distance=source.unit_distance,
         unit_distance_label=source.unit_label,
+        made_for=request.fit.size,
+        rule=request.fit.rule,
     )
     report = run.report
     write_gaussians(run, request.output, gaussians, ply, request.overwrite)

@@ -1,4 +1,4 @@
-"""`evaluate`: a `.ply` against the volume it was made from, at several sizes, on the test views."""
+"""`evaluate`: a `.ply` against the volume it was made from, on the test views, and from every seat."""
 
 from __future__ import annotations
 
@@ -6,18 +6,22 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from vvgt_cli.cameras import default_views
+from vvgt_cli.cameras.sets import SIZE
 from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians import PlyHeader
 from vvgt_cli.jit.ahead import EVALUATE
 from vvgt_cli.pipeline.convert import describe_source, tf_record, volume_record
 from vvgt_cli.pipeline.record import ConversionReport, Run, Stage, document
-from vvgt_cli.pipeline.render import STDIN, open_gaussians
+from vvgt_cli.pipeline.render import STDIN, file_rule, open_gaussians
 from vvgt_cli.pipeline.score import psnr_note, score_test_views
+from vvgt_cli.pipeline.seats import Seat, score_seats, seats_of
 from vvgt_cli.pipeline.source import Source, SourceRequest, load
 from vvgt_cli.progress import Console
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
+
+MIDDLE = 200  # pixels along the edge of what the reference's own error is measured on
 
 
 @dataclass(frozen=True)
@@ -27,30 +31,34 @@ class EvaluateRequest:
     Attributes:
         ply: Gaussians, "-" for standard input.
         source: the volume and the function that they were made from.
-        size: pixels along an image's edge at 1x.
-        scales: multiples of the size to score at.
+        size: pixels along an image's edge; None: what the file is made for.
+        rule: of `vvgt_cli.splat.rules` to draw by; None: the file's.
         step: of the reference, in voxels.
+        seats: score every rule at several sizes and close up as well.
     """
 
     ply: str
     source: SourceRequest
-    size: int = 400
-    scales: tuple[int, ...] = (1, 2, 4)
+    size: int | None = None
+    rule: str | None = None
     step: float = 0.125
+    seats: bool = True
 
 
 @dataclass
 class Evaluation:
-    """Scores by scale, with what they were measured on; `to_json` is documented in docs/report.md."""
+    """Scores and seats, with what they were measured on; `to_json` is documented in docs/report.md."""
 
     gaussians: int
     size: int
+    rule: str
     step: float
     views: int
     volume: dict[str, Any]
     transfer_function: dict[str, Any]
     reference_psnr: float
-    scores: dict[str, dict[str, Any]] = field(default_factory=dict)
+    scores: dict[str, Any] = field(default_factory=dict)
+    seats: list[dict[str, Any]] = field(default_factory=list)
     stages: list[Stage] = field(default_factory=list)
     seconds: float = 0.0
 
@@ -59,18 +67,16 @@ class Evaluation:
         return document("vvgt-evaluation", asdict(self))
 
     def table(self) -> str:
-        """The scores as text: a row a number, a column a scale."""
-        scales = list(self.scores)
-        rows = [("", *(f"{scale} ({self.size * int(scale[:-1])} px)" for scale in scales))]
-        for key in next(iter(self.scores.values())):
-            if key == "per_view":
-                continue
-            values = [self.scores[scale][key] for scale in scales]
-            rows.append((key.replace("_", " "), *map(_cell, values)))
-        width = max(len(row[0]) for row in rows) + 2
-        lines = [f"{row[0]:<{width}}" + "".join(f"{cell:>16}" for cell in row[1:]) for row in rows]
-        lines.append(f"reference against a finer one: PSNR {self.reference_psnr:.2f} dB (middle of the first view, 1x)")
-        return "\n".join(line.rstrip() for line in lines) + "\n"
+        """The scores, a row a number, then the seats by PSNR, worst first."""
+        lines = [f"made for {self.size} px, drawn as {self.rule}"]
+        for key, value in self.scores.items():
+            if key != "per_view":
+                lines.append(f"{key.replace('_', ' '):<24}{_cell(value):>12}")
+        lines.append(f"reference against a finer one: PSNR {self.reference_psnr:.2f} dB (middle of the first view)")
+        if self.seats:
+            lines.append(f"\n{'seat':<32}{'psnr':>10}")
+        lines += [f"{Seat(**seat).name():<32}{seat['psnr']:>10.2f}" for seat in self.seats]
+        return "\n".join(lines) + "\n"
 
 
 def _cell(value: Any) -> str:
@@ -105,38 +111,43 @@ def evaluate(request: EvaluateRequest, console: Console | None = None) -> Evalua
     run.compile(EVALUATE, source.kernel_type())
     with run.stage("scene"):
         scene = source.scene()
+    size, rule = request.size or header.made_for or SIZE, file_rule(header, request.rule)
     with run.stage("reference") as stage:
-        own = _reference_psnr(scene, request)
+        own = _reference_psnr(scene, size, request.step)
         stage.note = f"its own error {own:.1f} dB"
     evaluation = Evaluation(
-        len(gaussians), request.size, request.step, len(default_views("test")), volume_record(source),
+        len(gaussians), size, rule.name, request.step, len(default_views("test")), volume_record(source),
         tf_record(source, request.source), own,
     )  # fmt: skip
-    for scale in sorted(set(request.scales)):
-        with run.stage(f"test views {scale}x") as stage:
-            bar = run.console.bar(f"test views {scale}x")
-            settings = replace(REFERENCE, step=request.step)
-            scores, _ = score_test_views(scene, gaussians, request.size * scale, settings, progress=bar)
-            evaluation.scores[f"{scale}x"] = asdict(scores)
-            stage.note = psnr_note(scores)
+    with run.stage("test views") as stage:
+        settings = replace(REFERENCE, step=request.step)
+        bar = run.console.bar("test views")
+        scores, _ = score_test_views(scene, gaussians, size, settings, rule=rule, progress=bar)
+        evaluation.scores = asdict(scores)
+        stage.note = f"{psnr_note(scores)}, {size} px"
+    if request.seats:
+        with run.stage("seats") as stage:
+            seats = score_seats(scene, gaussians, seats_of(size), progress=run.console.bar("seats"))
+            evaluation.seats = [asdict(seat) for seat in seats]
+            stage.note = f"worst: {seats[0].name()}, {seats[0].psnr:.2f} dB"
     evaluation.stages = run.report.stages
     evaluation.seconds = run.finish().seconds
     return evaluation
 
 
-def _reference_psnr(scene: Scene, request: EvaluateRequest) -> float:
+def _reference_psnr(scene: Scene, size: int, step: float) -> float:
     """PSNR of the reference against half its step and twice its rays along a pixel's edge.
 
-    Measured on the middle quarter of the first test view: the whole of it would cost as much as eight views.
+    Measured on the middle of the first test view: the whole of it would cost as much as eight views.
     """
     from vvgt_cli.dvr import REFERENCE, render_view
     from vvgt_cli.metrics import score_view
 
-    whole = default_views("test", size=request.size)[0]
-    edge = request.size // 2
-    offset = (request.size - edge) // 2
+    whole = default_views("test", size=size)[0]
+    edge = min(size // 2, MIDDLE)
+    offset = (size - edge) // 2
     middle = replace(whole, cx=whole.cx - offset, cy=whole.cy - offset, width=edge, height=edge)
-    settings = replace(REFERENCE, step=request.step)
+    settings = replace(REFERENCE, step=step)
     finer = replace(settings, step=settings.step / 2, tiers=tuple((edge, 4 * rays) for edge, rays in settings.tiers))
     images = [render_view(scene, middle, s) for s in (finer, settings)]
     return score_view(images[0], images[1], perceptual=False).psnr

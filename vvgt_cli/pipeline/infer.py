@@ -15,6 +15,7 @@ from vvgt_cli.pipeline.outputs import Output, check_outputs, write_text
 from vvgt_cli.pipeline.record import ConversionReport, Run
 from vvgt_cli.pipeline.render import layout_of, open_gaussians, write_gaussians
 from vvgt_cli.progress import Console
+from vvgt_cli.splat.rules import INRIA, Rule
 
 SHIPPED = "vvgt-small"  # the model that comes with the program
 JUDGES = 4  # views that the network is not shown, as many as the default check set
@@ -57,22 +58,33 @@ def divide(cameras: Sequence[Camera], wanted: int) -> tuple[list[int], list[int]
 
 
 def improve(
-    run: Run, gaussians: Gaussians, train: Views, check: Views, model: str = SHIPPED, provider: str = "cpu"
+    run: Run,
+    gaussians: Gaussians,
+    train: Views,
+    check: Views,
+    model: str = SHIPPED,
+    rules: tuple[Rule, Rule] = (INRIA, INRIA),
 ) -> Gaussians:
     """The stage, for runs that have views at hand: the network's Gaussians where the check views agree, else the given.
+
+    ``rules``: of the training and of the check views.
 
     Raises:
         UsageError: no such model or provider.
         DataError: a model that is not what it must be.
     """
+    from vvgt_cli.metrics import score_views
     from vvgt_cli.network.card import find_model
     from vvgt_cli.network.runtime import Model
 
-    everything = range(len(check))
     with run.stage("network") as stage:
-        opened = Model.open(find_model(model), _threads(), provider)
-        better = opened.improve(gaussians, train.cameras, train.images, progress=run.console.bar("network"))
-        before, after = (_psnr(g, check.cameras, check.images, everything) for g in (gaussians, better))
+        opened = Model.open(find_model(model), _threads())
+        better = opened.improve(
+            gaussians, train.cameras, train.images, progress=run.console.bar("network"), rule=rules[0]
+        )
+        before, after = (
+            score_views(check.images, check.pictures(g, rules[1]), perceptual=False).psnr for g in (gaussians, better)
+        )
         stage.kept = after > before
         stage.psnr_before, stage.psnr = before, after
         stage.note = f"{opened.card.name}; from {before:.2f} dB on the check views"

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vvgt_cli.cameras import default_views
+from vvgt_cli.cameras import Camera, default_views
+from vvgt_cli.cameras.blocks import spread_blocks
 from vvgt_cli.cameras.sets import SET_VIEWS
 from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.jit.ahead import BACK_PROJECT
 from vvgt_cli.optimize import OptimizeOptions
 from vvgt_cli.pipeline.optimize import Views, refine
-from vvgt_cli.pipeline.plan import SMALLER, Limits, Plan, views_of
+from vvgt_cli.pipeline.plan import SMALLER, Limits, Plan, view_edge, views_of
 from vvgt_cli.pipeline.record import Run
-from vvgt_cli.splat.half import QUARTER, halved
-from vvgt_cli.splat.rules import INRIA
+from vvgt_cli.splat.constants import MIN_ALPHA
+from vvgt_cli.splat.rules import Rule, rule_of
 from vvgt_cli.volume.blocks import free_memory
 
 if TYPE_CHECKING:
@@ -26,8 +28,10 @@ if TYPE_CHECKING:
     from vvgt_cli.vbm import Start
 
 VIEW_BYTES = 2 * 16  # a pixel: float32 RGBA, and as much again while views are stacked
-MARGIN = 4.0  # dB
-WIDE = 0.9  # standard deviation in pixels
+MARGIN, SAMPLES = 4.0, 12.0  # dB, where views are means over their pixels, and where they are samples of a screen's
+SMALLEST = 0.5  # standard deviation of the longest axis in pixels of the screen: viewers drop or fade less
+LARGE = 0.5  # of the screen: views as large are means over their own pixels
+WIDE = 0.9  # standard deviation in pixels of whole training views
 
 
 def check_view_memory(plan: Plan, size: int) -> None:
@@ -40,17 +44,24 @@ def check_view_memory(plan: Plan, size: int) -> None:
         )
 
 
-def whole_views_fit(plan: Plan, size: int) -> bool:
-    """Whether training views of the whole size would fit in memory."""
-    free = free_memory()
-    return free is None or _view_memory(replace(plan, half=False), size) <= free
-
-
 def _view_memory(plan: Plan, size: int) -> float:
-    """Bytes of training and check views."""
+    """Bytes of training and check views; one of these is drawn whole, of which blocks are kept."""
     if not (plan.back_project or plan.steps or plan.network):
         return 0.0
-    return (views_of(plan.steps) * (QUARTER if plan.half else 1) + SET_VIEWS["check"]) * size**2 * VIEW_BYTES
+    return (views_of(plan.steps) * plan.view_size**2 + (1 + SET_VIEWS["check"]) * size**2) * VIEW_BYTES
+
+
+def judging_views(scene: Scene, cameras: Sequence[Camera], settings: RenderSettings) -> Views:
+    """Views to score by, of blocks where they are large."""
+    from vvgt_cli.dvr import render_view
+
+    blocks = [spread_blocks(camera.width, camera.height, i) for i, camera in enumerate(cameras)]
+    images = []
+    for camera, part in zip(cameras, blocks, strict=True):
+        image = render_view(scene, camera, settings, part)
+        images.append(image if part is None else part.pick(image))
+    known = [part for part in blocks if part is not None]
+    return Views(list(cameras), np.stack(images), known or None)
 
 
 def mend(run: Run, scene: Scene, start: Start, plan: Plan, limits: Limits, fit: FitOptions) -> Gaussians:
@@ -71,7 +82,7 @@ def mend(run: Run, scene: Scene, start: Start, plan: Plan, limits: Limits, fit: 
     if plan.steps and stage.enough(gaussians):
         _say(run, [("refinement", stage.reached())])
         return gaussians
-    return stage.refine(gaussians) if plan.steps else gaussians
+    return drawn_by_all(stage.refine(gaussians), fit.size) if plan.steps else gaussians
 
 
 def _say(run: Run, left_out: list[tuple[str, str]]) -> None:
@@ -83,25 +94,28 @@ class _Mending:
     """Check views, and what is done with them."""
 
     def __init__(self, run: Run, scene: Scene, plan: Plan, limits: Limits, fit: FitOptions) -> None:
-        from vvgt_cli.dvr import RenderSettings, render_views
+        from vvgt_cli.dvr import RenderSettings
         from vvgt_cli.dvr.render import FIT_VIEWS
 
         self.run, self.scene, self.plan, self.limits, self.fit = run, scene, plan, limits, fit
         cameras = default_views("check", size=fit.size)
         with run.stage("check views") as stage:
             judged = plan.steps or plan.network or limits.target_psnr is not None
-            self.check = Views(cameras, render_views(scene, cameras, RenderSettings() if judged else FIT_VIEWS))
-            stage.note = f"{len(cameras)} of {fit.size} px"
+            self.check = judging_views(scene, cameras, RenderSettings() if judged else FIT_VIEWS)
+            stage.note = f"{len(cameras)} of {fit.size} px" + (", blocks of them" if self.check.blocks else "")
         self.settings: RenderSettings = FIT_VIEWS
+        self.rule = rule_of(fit.rule)
+        self.footprint = plan.view_size / fit.size
+        self.train_rule = self.rule.at(self.footprint)
+        if self.footprint >= LARGE:
+            self.footprint = 1.0
         self.train: Views | None = None
 
     def psnr(self, gaussians: Gaussians) -> float:
         """On the check views."""
         from vvgt_cli.metrics import score_views
-        from vvgt_cli.splat import render
 
-        pictures = [render(gaussians, camera) for camera in self.check.cameras]
-        return score_views(self.check.images, pictures, perceptual=False).psnr
+        return score_views(self.check.images, self.check.pictures(gaussians, self.rule), perceptual=False).psnr
 
     def enough(self, gaussians: Gaussians) -> bool:
         """Whether the target is reached."""
@@ -131,7 +145,7 @@ class _Mending:
         with run.stage("back-projection") as stage:
             before = self.psnr(start.gaussians)
             bar = run.console.bar("back-projection")
-            mended, how = backproject(start, train.cameras, train.images, progress=bar)
+            mended, how = backproject(start, train.cameras, train.images, progress=bar, rule=self.train_rule)
             after = self.psnr(mended)
             stage.kept = after > before
             stage.note = f"{how}; from {before:.2f} dB on the check views"
@@ -143,13 +157,15 @@ class _Mending:
         from vvgt_cli.pipeline.infer import improve
 
         assert self.plan.network is not None
-        return improve(self.run, gaussians, self.views(gaussians), self.check, self.plan.network)
+        return improve(
+            self.run, gaussians, self.views(gaussians), self.check, self.plan.network, (self.train_rule, self.rule)
+        )
 
     def views(self, start: Gaussians) -> Views:
         """Training views, as finely integrated as ``start`` asks for."""
         if self.train is None:
             if self.plan.steps or self.plan.network:
-                self.settings = fine_enough(self.scene, self.check, start, self.plan.half)
+                self.settings = fine_enough(self.scene, start, self.plan.view_size, self.train_rule, self.footprint)
             self.train = self._rendered(views_of(self.plan.steps))
         return self.train
 
@@ -161,17 +177,17 @@ class _Mending:
             ending = sum(seconds for name, seconds in self.plan.stages if name in ("test views", "write"))
             left = max(self.limits.time_budget - self.run.elapsed() - ending, 0.0)
         target = self.limits.target_psnr
-        rule = INRIA.at(0.5) if self.plan.half else INRIA
         options = OptimizeOptions(
-            steps=self.plan.most_steps, time_budget=left, target_psnr=target, rule=rule, seed=self.fit.seed
-        )
+            steps=self.plan.most_steps, time_budget=left, target_psnr=target, rule=self.train_rule, judge=self.rule,
+            seed=self.fit.seed,
+        )  # fmt: skip
         return refine(self.run, gaussians, train, self.check, options)
 
     def _rendered(self, count: int) -> Views:
         """Training views."""
         from vvgt_cli.dvr import render_views
 
-        size = self.fit.size // 2 if self.plan.half else self.fit.size
+        size = self.plan.view_size
         cameras = default_views("train", count, size=size)
         with self.run.stage("views") as stage:
             images = render_views(self.scene, cameras, self.settings, progress=self.run.console.bar("views"))
@@ -180,29 +196,51 @@ class _Mending:
         return Views(cameras, images)
 
 
-def fine_enough(scene: Scene, check: Views, start: Gaussians, half: bool) -> RenderSettings:
-    """One ray a pixel where its error is `MARGIN` below that of ``start``, else adaptive rays; half-voxel steps.
+def fine_enough(scene: Scene, start: Gaussians, size: int, rule: Rule, footprint: float = 1.0) -> RenderSettings:
+    """One ray a pixel where its error is `MARGIN` or `SAMPLES` below that of ``start``, else adaptive rays.
 
-    The error is that of a check view, ``half``: at half its size, against the same finely rendered. Gradient descent
-    follows the jags of single rays at hard edges, and those of longer steps everywhere.
+    The error is that of a check view of ``size`` px drawn by ``rule``, against the same finely rendered. Gradient
+    descent follows the jags of single rays at hard edges, and those of longer steps everywhere. Rays are spread over
+    ``footprint`` of a pixel's edge: views are samples of the screen's pixels, not means over their own.
     """
     from vvgt_cli.dvr import RenderSettings, render_view
     from vvgt_cli.metrics import psnr
     from vvgt_cli.splat import render
 
-    cameras, views, rule = check.cameras[:1], check.images[:1], INRIA
-    if half:
-        cameras, views, rule = halved(cameras, views)
-    camera, fine = cameras[0], views[0]
-    wanted = psnr(fine[..., :3], render(start, camera, rule)[..., :3]) + MARGIN
-    single = RenderSettings(samples=1)
-    enough = psnr(fine[..., :3], render_view(scene, camera, single)[..., :3]) >= wanted
-    return single if enough else RenderSettings()
+    camera = default_views("check", size=size)[0]
+    many, one = RenderSettings(footprint=footprint), RenderSettings(samples=1)
+    fine, single = (render_view(scene, camera, settings) for settings in (many, one))
+    wanted = psnr(fine[..., :3], render(start, camera, rule)[..., :3])
+    wanted += MARGIN if footprint == 1 else SAMPLES
+    enough = psnr(fine[..., :3], single[..., :3]) >= wanted
+    return one if enough else many
+
+
+def drawn_by_all(gaussians: Gaussians, size: int) -> Gaussians:
+    """Without what viewers leave out: splats that never reach 1/255, and, widened with their mass kept, small ones.
+
+    ``size``: pixels along the edge of the screen that the file is made for; none stays narrower than `SMALLEST` there.
+    """
+    opacity = 1 / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64)))
+    camera = default_views("check", 1, size=size)[0]
+    pixel = float(np.linalg.norm(camera.position)) / camera.fx
+    widening = np.maximum(SMALLEST * pixel / np.exp(gaussians.log_scales.max(axis=1).astype(np.float64)), 1)
+    opacity = np.clip(opacity / widening**2, 1e-7, 1 - 1e-7)
+    kept = opacity >= MIN_ALPHA
+    if not kept.any():
+        return gaussians
+    logits = np.where(widening > 1, np.log(opacity / (1 - opacity)), gaussians.opacity_logits)
+    scales = gaussians.log_scales + np.log(widening)[:, None]
+    fields = (gaussians.means, scales, gaussians.quaternions, logits, gaussians.colors)
+    return Gaussians(*(field[kept] for field in fields))
 
 
 def wide(gaussians: Gaussians, size: int) -> bool:
-    """Whether views of half the size still show them: the median of middle standard deviations is above `WIDE` px."""
-    camera = default_views("check", 1, size=size)[0]
+    """Whether training views half as large as they may be still show Gaussians.
+
+    That is so where the median of middle standard deviations is above `WIDE` px of whole ones.
+    """
+    camera = default_views("check", 1, size=view_edge(size, half=False))[0]
     pixel = float(np.linalg.norm(camera.position)) / camera.fx
     middle = np.exp(np.median(gaussians.log_scales, axis=1))  # of three
     return bool(np.median(middle) > WIDE * pixel)

@@ -6,13 +6,14 @@ import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vvgt_cli.cameras import Camera
+from vvgt_cli.cameras.blocks import Blocks
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import Gaussians, as_stored
 from vvgt_cli.images.viewset import load_views
@@ -20,9 +21,10 @@ from vvgt_cli.jit.ahead import OPTIMIZE
 from vvgt_cli.optimize import OptimizeOptions, OptimizeRecord, optimize
 from vvgt_cli.pipeline.outputs import Output, check_outputs, write_text
 from vvgt_cli.pipeline.record import ConversionReport, Run
-from vvgt_cli.pipeline.render import layout_of, open_gaussians, write_gaussians
+from vvgt_cli.pipeline.render import file_rule, layout_of, open_gaussians, write_gaussians
 from vvgt_cli.pipeline.score import psnr_note
 from vvgt_cli.progress import Console
+from vvgt_cli.splat.rules import INRIA, Rule
 
 if TYPE_CHECKING:
     from vvgt_cli.metrics import Scores
@@ -36,17 +38,28 @@ REASONS = {
 
 @dataclass(frozen=True)
 class Views:
-    """Cameras and what they see, (n, h, w, 4) float32 premultiplied."""
+    """Cameras and what they see, (n, h, w, 4) float32 premultiplied; with ``blocks``, only those of each view."""
 
     cameras: list[Camera]
     images: np.ndarray
+    blocks: list[Blocks] | None = None
 
     def __len__(self) -> int:
         return len(self.cameras)
 
     def take(self, index: Sequence[int] | np.ndarray) -> Views:
         """Some of them."""
-        return Views([self.cameras[i] for i in index], self.images[list(index)])
+        blocks = None if self.blocks is None else [self.blocks[i] for i in index]
+        return Views([self.cameras[i] for i in index], self.images[list(index)], blocks)
+
+    def pictures(self, gaussians: Gaussians, rule: Rule = INRIA) -> Iterator[np.ndarray]:
+        """Gaussians drawn as the views are: whole or their blocks."""
+        from vvgt_cli.splat import render
+
+        for i, camera in enumerate(self.cameras):
+            blocks = None if self.blocks is None else self.blocks[i]
+            image = render(gaussians, camera, rule, blocks=blocks)
+            yield image if blocks is None else blocks.pick(image)
 
 
 @dataclass(frozen=True)
@@ -58,6 +71,8 @@ class OptimizeRequest:
         views: folder that `render-views` wrote.
         output: `.ply` to write, "-" for standard output.
         options: how to descend, and when to stop.
+        size: pixels along the edge of the screen that the file is made for; None: the file's, or the views'.
+        rule: of `vvgt_cli.splat.rules` to fit to; None: the file's, or inria.
         report: JSON to write, "-" for standard output, None for none.
         overwrite: replace files that exist.
     """
@@ -66,6 +81,8 @@ class OptimizeRequest:
     views: str
     output: str
     options: OptimizeOptions
+    size: int | None = None
+    rule: str | None = None
     report: str | None = None
     overwrite: bool = False
 
@@ -94,11 +111,16 @@ def optimize_file(request: OptimizeRequest, console: Console | None = None) -> C
         test = Views(*load_views(request.views, "test")) if _has(request.views, "test") else None
         stage.note = f"{len(train)} to fit to, {len(check)} to check by{held_out}"
     run.compile(OPTIMIZE)
-    run.report.options = asdict(request.options)
-    gaussians = refine(run, start, train, check, request.options)
+    edge = train.cameras[0].width
+    size, asked = request.size or header.made_for or edge, file_rule(header, request.rule)
+    rule = asked.at(edge / size)
+    options = replace(request.options, rule=rule, judge=rule)
+    run.report.options = asdict(request.options) | {"rule": asked.name, "judge": asked.name, "size": size}
+    gaussians = refine(run, start, train, check, options)
     if test is not None:
-        _score(run, test, start, gaussians)
-    write_gaussians(run, request.output, gaussians, layout_of(header), request.overwrite)
+        _score(run, test, start, gaussians, rule)
+    layout = replace(layout_of(header), made_for=size, rule=asked.name)
+    write_gaussians(run, request.output, gaussians, layout, request.overwrite)
     run.finish()
     if request.report:
         write_text(request.report, run.report.to_json(), request.overwrite)
@@ -134,7 +156,7 @@ def refine(run: Run, start: Gaussians, train: Views, check: Views, options: Opti
             train.cameras,
             train.images,
             options,
-            (check.cameras, check.images),
+            (check.cameras, check.images, check.blocks),
             progress=run.console.bar("refinement"),
             stop=stop,
         )
@@ -175,18 +197,17 @@ def interruption(console: Console) -> Iterator[Callable[[], bool]]:
         signal.signal(signal.SIGINT, before)
 
 
-def _score(run: Run, test: Views, start: Gaussians, gaussians: Gaussians) -> None:
+def _score(run: Run, test: Views, start: Gaussians, gaussians: Gaussians, rule: Rule) -> None:
     with run.stage("test views") as stage:
-        before, after = _mean(test, start, perceptual=False), _mean(test, gaussians, perceptual=True)
+        before, after = (_mean(test, g, rule, perceptual=last) for g, last in ((start, False), (gaussians, True)))
         run.report.scores = asdict(after)
         stage.note = f"{psnr_note(after)}, from {before.psnr:.2f} dB, {after.views} views"
 
 
-def _mean(test: Views, gaussians: Gaussians, perceptual: bool) -> Scores:
+def _mean(test: Views, gaussians: Gaussians, rule: Rule, perceptual: bool) -> Scores:
     from vvgt_cli.metrics import score_views
-    from vvgt_cli.splat import render
 
-    return score_views(test.images, (render(gaussians, camera) for camera in test.cameras), perceptual=perceptual)
+    return score_views(test.images, test.pictures(gaussians, rule), perceptual=perceptual)
 
 
 def budget(steps: int | None, seconds: float | None) -> dict[str, int | float | None]:

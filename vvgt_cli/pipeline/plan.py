@@ -12,7 +12,6 @@ import numpy as np
 
 from vvgt_cli.cameras.sets import SET_VIEWS
 from vvgt_cli.errors import UsageError
-from vvgt_cli.splat.half import QUARTER
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
@@ -20,8 +19,8 @@ if TYPE_CHECKING:
 VERTEX_BYTES = 68  # x y z, normals, three colours, opacity, three scales, four of rotation: float32
 HARMONIC_BYTES = {0: 0, 1: 36, 2: 96, 3: 180}  # zeros up to a degree
 HEADER_BYTES = {0: 1000, 1: 1200, 2: 1600, 3: 2200}
-DEFAULT_STEPS = 72  # of gradient descent: the knee of error against seconds (docs/plan.md)
-DEFAULT_HALF_STEPS = 96  # likewise, on views half the size
+DEFAULT_STEPS = 96  # of gradient descent: the knee of error against seconds (docs/plan.md)
+DEFAULT_HALF_STEPS = 144  # likewise, on views half the size
 MOST_STEPS = 400  # where a target or a time asks for as many as it takes
 FEWEST_STEPS = 8  # less is not worth the views
 ENOUGH_STEPS = 24  # as good as back-projection; fewer are taken after it
@@ -33,13 +32,15 @@ PROBE = 80  # pixels along the edge of the view that is timed
 SORT = 0.95e-3
 CLOSED_FORM = 0.85, 1.6, 0.25  # always, per 10^6 cells, per 10^6 voxels in bricks that are not empty
 STEP = 0.013, 0.035  # per 400 x 400 px, per 100,000 Gaussians
-HALF_STEP = 0.006, 0.017  # likewise, on a view half the size
-SMALLEST_HALF = 64  # pixels along the edge of a view half the size: four tiles
+HALF_STEP = 0.006, 0.017  # likewise, on a view half that size
+WHOLE = 400  # pixels along the edge of a training view, at most: more show no more (docs/optimize.md)
+SMALLEST_HALF = 64  # pixels along the edge of a training view half that size: four tiles
 BACK_PROJECTION = 140.0  # steps
 NETWORK = 0.5, 4.0  # always, per 100,000 Gaussians (docs/network.md)
 VIEW = 1.1  # of the view that is timed
 FINER = 1.8  # of the view that is timed: check and test views
 SCORE, SCORE_ALL = (3, 0.03), (10, 0.2)  # views, and seconds a view beside its rendering
+SEATS = 2, 0.3  # check views, and seconds beside them
 MEMORY = 2.6e8, 294.0, 1240.0  # bytes: program and kernels, a cell, a Gaussian
 VIEW_MEMORY = 22.0  # bytes a pixel of each view
 
@@ -82,6 +83,11 @@ class Limits:
         return min(most, fit)
 
 
+def view_edge(size: int, half: bool) -> int:
+    """Pixels along the edge of a training view: the size that the file is made for, or half of it, within bounds."""
+    return min(size, WHOLE) // (2 if half else 1)
+
+
 def views_of(steps: int) -> int:
     """Training views of so many steps: in a short run more steps gain more than more views."""
     fewest = SET_VIEWS["train"]
@@ -94,18 +100,19 @@ class Costs:
 
     Attributes:
         closed_form: moments, pyramid and choice of cells.
-        view: a view to fit to.
+        view: a view to fit to; ``judge`` a check or test view, of blocks of the size made for.
         back_projection: of 24 views.
         network: one pass of a network.
         step: of gradient descent, with its share of the looks at check views; ``half_step`` on a view half the size.
         score: test views.
         write: the file.
         memory: of the whole process at its most, bytes, without its views.
-        view_memory: of a view, bytes.
+        view_memory: of a view to fit to, bytes; ``judge_memory`` of a check view.
     """
 
     closed_form: float
     view: float
+    judge: float
     back_projection: float
     network: float
     step: float
@@ -114,6 +121,7 @@ class Costs:
     write: float
     memory: float
     view_memory: float
+    judge_memory: float
 
     def at(self, pace: float) -> Costs:
         """The same on a machine that takes ``pace`` times as long; what was timed, and what is small, stays."""
@@ -131,7 +139,8 @@ class Plan:
         steps: of gradient descent, as many as there should be time for.
         most_steps: where there is more time than that.
         network: model that improves the Gaussians before the steps, or None.
-        half: training views are half the size: descent gains as much from them in less time (docs/optimize.md).
+        half: training views are half as large as they may be: descent gains as much in less time (docs/optimize.md).
+        view_size: pixels along a training view's edge.
         judge: there is time for check views where a target asks for them.
         seconds, bytes, memory: estimates of the whole run, its file, its memory at most.
         stages: (stage, seconds) estimates in order.
@@ -144,6 +153,7 @@ class Plan:
     most_steps: int = 0
     network: str | None = None
     half: bool = False
+    view_size: int = 0
     judge: bool = True
     seconds: float = 0.0
     bytes: int = 0
@@ -175,7 +185,7 @@ class Planner:
         gaussians: budget.
         steps: of gradient descent that the user asks for; None: the plan's choice.
         sh_degree: harmonics in the file.
-        size: pixels along an image's edge.
+        size: pixels along the edge of images that the file is made for.
         wide: Gaussians are wide enough to be seen in views half the size.
         model: network that the user asks for.
     """
@@ -198,8 +208,9 @@ class Planner:
         if self.limits.time_budget is not None:
             left = self.limits.time_budget - sum(seconds for _, seconds in [*plan.stages, *last])
         self._views(plan, costs, left)
-        views = views_of(plan.steps) * (QUARTER if plan.half else 1) + SET_VIEWS["check"]
-        plan.memory += views * costs.view_memory
+        plan.view_size = view_edge(self.size, plan.half)
+        views = views_of(plan.steps) * (0.25 if plan.half else 1)
+        plan.memory += views * costs.view_memory + SET_VIEWS["check"] * costs.judge_memory
         plan.stages += last
         plan.seconds = sum(seconds for _, seconds in plan.stages)
         return plan
@@ -209,7 +220,7 @@ class Planner:
         open_end = self.limits.target_psnr is not None or left is not None
         left = self._network(plan, costs, left)
         few = self.steps is not None and self.steps < ENOUGH_STEPS and left is None
-        half = self.wide and not few and plan.network is None and self.size % 2 == 0 and self.size >= 2 * SMALLEST_HALF
+        half = self.wide and not few and plan.network is None and self.size >= 2 * SMALLEST_HALF
         usual = DEFAULT_HALF_STEPS if half else DEFAULT_STEPS
         steps = wanted = self.steps if self.steps is not None else MOST_STEPS if open_end else usual
         while left is not None and steps > 0 and _refinement(costs, steps, half) > left:
@@ -258,9 +269,9 @@ def _room(left: float | None) -> str:
 
 
 def _refinement(costs: Costs, steps: int, half: bool) -> float:
-    """Seconds of so many steps, with their views, ``half`` the size or whole; check views are finer, and whole."""
-    step, share = (costs.half_step, QUARTER) if half else (costs.step, 1.0)
-    return steps * step + (views_of(steps) * share + FINER * SET_VIEWS["check"]) * costs.view
+    """Seconds of so many steps, with their views, ``half`` the size or whole, and the check views."""
+    step, share = (costs.half_step, 0.25) if half else (costs.step, 1.0)
+    return steps * step + views_of(steps) * share * costs.view + SET_VIEWS["check"] * costs.judge
 
 
 def estimate(scene: Scene, size: int, gaussians: int, all_views: bool = False) -> Costs:
@@ -268,26 +279,33 @@ def estimate(scene: Scene, size: int, gaussians: int, all_views: bool = False) -
 
     ``all_views``: the score is that of all test views, with the perceptual measures.
     """
+    from vvgt_cli.cameras.blocks import BLOCK, spread_blocks
     from vvgt_cli.dvr.scene import BRICK
     from vvgt_cli.vbm.closed_form import expected_cells
 
-    cells, pixels, pace = expected_cells(scene, size), (size / 400) ** 2, _pace()
+    cells, pace, edge = expected_cells(scene, size), _pace(), view_edge(size, half=False)
+    blocks = spread_blocks(size, size)
+    judged = size**2 if blocks is None else blocks.numbers.size * BLOCK**2  # pixels
+    pixels = (edge / 400) ** 2
     voxels = np.count_nonzero(scene.empty == 0) * BRICK**3
     count = min(gaussians, cells)
     step, half_step = (pace * (each[0] * pixels + each[1] * count / 1e5) for each in (STEP, HALF_STEP))
-    view = VIEW * _view_seconds(scene, size)
+    view = VIEW * _view_seconds(scene, edge)
+    judge = FINER * view * judged / edge**2
     views, beside = SCORE_ALL if all_views else SCORE
     return Costs(
         closed_form=pace * (CLOSED_FORM[0] + CLOSED_FORM[1] * cells / 1e6 + CLOSED_FORM[2] * voxels / 1e6),
         view=view,
+        judge=judge,
         back_projection=BACK_PROJECTION * step,
         network=pace * (NETWORK[0] + NETWORK[1] * count / 1e5),
         step=step,
         half_step=half_step,
-        score=views * (FINER * view + pace * beside * pixels),
+        score=views * (judge + pace * beside * judged / 400**2) + SEATS[0] * judge + pace * SEATS[1],
         write=pace * 0.1,
         memory=MEMORY[0] + _volume_bytes(scene) + MEMORY[1] * cells + MEMORY[2] * count,
-        view_memory=VIEW_MEMORY * size**2,
+        view_memory=VIEW_MEMORY * edge**2,
+        judge_memory=VIEW_MEMORY * judged,
     )
 
 

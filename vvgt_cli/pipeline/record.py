@@ -58,6 +58,7 @@ class ConversionReport:
         stages: in the order they ran.
         gaussians, bytes: of the file written.
         scores: on the test views, None for `init`.
+        seats: `convert`'s scores by every rule at the size made for and above (`vvgt_cli.pipeline.seats`), worst first.
         plan: estimates of `convert` (`vvgt_cli.pipeline.plan.Plan`): stages, seconds, bytes, memory.
         left_out: (stage, why) of what was not done.
         refinement: what gradient descent did (`vvgt_cli.optimize.OptimizeRecord`), None without it.
@@ -72,6 +73,7 @@ class ConversionReport:
     gaussians: int = 0
     bytes: int = 0
     scores: dict[str, Any] | None = None
+    seats: list[dict[str, Any]] | None = None
     refinement: dict[str, Any] | None = None
     plan: dict[str, Any] | None = None
     left_out: list[tuple[str, str]] = field(default_factory=list)

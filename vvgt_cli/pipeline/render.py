@@ -16,6 +16,7 @@ from vvgt_cli.jit.ahead import DRAW
 from vvgt_cli.pipeline.outputs import STDOUT, write_text
 from vvgt_cli.pipeline.record import ConversionReport, Run
 from vvgt_cli.progress import Console
+from vvgt_cli.splat.rules import INRIA, Rule, rule_of
 from vvgt_cli.volume.types import UnitFrame
 
 STDIN = STDOUT
@@ -31,7 +32,8 @@ class RenderRequest:
         output: directory for the images.
         camera: view-set file, or None.
         orbit: number of views on a circle, or None; one of the two is given.
-        size: image height in pixels, None for the view set's own.
+        size: image height in pixels; None: the view set's own, or what the file is made for.
+        rule: of `vvgt_cli.splat.rules` to draw by; None: the file's.
         exr: write EXR too.
         background: RGB in [0, 1] that PNGs stand on, None for transparent.
         overwrite: replace images that exist.
@@ -42,15 +44,25 @@ class RenderRequest:
     camera: str | None = None
     orbit: int | None = None
     size: int | None = None
+    rule: str | None = None
     exr: bool = False
     background: tuple[float, float, float] | None = None
     overwrite: bool = False
 
-    def cameras(self) -> list[Camera]:
-        """The views asked for."""
+    def cameras(self, size: int | None = None) -> list[Camera]:
+        """The views asked for; ``size``: pixels of an orbit's where none are."""
         if self.camera is not None:
             return read_cameras(self.camera, self.size)
-        return orbit_views(self.orbit or 0, size=self.size or SIZE)
+        return orbit_views(self.orbit or 0, size=self.size or size or SIZE)
+
+
+def file_rule(header: PlyHeader, asked: str | None = None) -> Rule:
+    """The rule to draw by: that asked for, else the file's, else the usual one.
+
+    Raises:
+        UsageError: no such rule.
+    """
+    return rule_of(asked or header.rule or INRIA)
 
 
 def open_gaussians(source: str, console: Console) -> tuple[Gaussians, PlyHeader]:
@@ -80,6 +92,8 @@ def layout_of(header: PlyHeader) -> PlyOptions:
         unit_frame=frame,
         unit_distance=header.unit_distance,
         unit_distance_label=header.unit_distance_label or "given",
+        made_for=header.made_for,
+        rule=header.rule,
     )
 
 
@@ -128,13 +142,14 @@ def render_file(request: RenderRequest, console: Console | None = None) -> int:
     with run.stage("read") as stage:
         gaussians, header = open_gaussians(request.ply, console)
         stage.note = f"{len(gaussians)} Gaussians, {header.frame} frame"
+    cameras, rule = request.cameras(header.made_for), file_rule(header, request.rule)
     run.compile(DRAW)
     directory = Path(request.output)
     directory.mkdir(exist_ok=True)
     with run.stage("render") as stage:
         bar = console.bar("render")
         for done, camera in enumerate(cameras, 1):
-            image = render(gaussians, camera)
+            image = render(gaussians, camera, rule)
             if request.exr:
                 write_exr(directory / f"{camera.name}.exr", image, camera=camera, overwrite=request.overwrite)
             shown = image if request.background is None else over(image, request.background)
@@ -142,5 +157,7 @@ def render_file(request: RenderRequest, console: Console | None = None) -> int:
             if bar:
                 bar(done, len(cameras))
         write_text(str(directory / VIEWS_FILE), transforms_json(cameras), request.overwrite)
-        stage.note = f"{len(cameras)} views of {cameras[0].width} x {cameras[0].height} px in {directory}"
+        stage.note = (
+            f"{len(cameras)} views of {cameras[0].width} x {cameras[0].height} px by {rule.name} in {directory}"
+        )
     return len(cameras)

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vvgt_cli.cameras import default_views
+from vvgt_cli.cameras.blocks import spread_blocks
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.progress import ProgressCallback
+from vvgt_cli.splat.rules import INRIA, Rule
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import RenderSettings, Scene
     from vvgt_cli.metrics import Scores
+
+WHOLE = (0, 4, 9)  # test views of which large ones are drawn whole, for what blocks cannot tell
 
 
 def score_test_views(
@@ -22,6 +27,7 @@ def score_test_views(
     size: int,
     settings: RenderSettings,
     *,
+    rule: str | Rule = INRIA,
     perceptual: bool = True,
     keep: Collection[int] = (),
     only: Collection[int] | None = None,
@@ -33,7 +39,8 @@ def score_test_views(
         scene, gaussians: what is compared.
         size: pixels along an image's edge.
         settings: of the reference.
-        perceptual: SSIM and FLIP too.
+        rule: by which Gaussians are drawn.
+        perceptual: SSIM and FLIP too, of the whole of `WHOLE` views; all else of blocks where views are large.
         keep: numbers of views to draw.
         only: numbers of the views to score; None for all ten.
         progress: called after each view.
@@ -52,8 +59,16 @@ def score_test_views(
     views, rows = [], []
     for done, i in enumerate(numbers):
         camera = cameras[i]
-        reference, ours = render_view(scene, camera, settings), render(gaussians, camera)
-        views.append(score_view(reference, ours, perceptual=perceptual))
+        blocks = spread_blocks(camera.width, camera.height, i)
+        whole = blocks is None or i in keep or (perceptual and i in WHOLE)
+        part = None if whole else blocks
+        reference, ours = render_view(scene, camera, settings, part), render(gaussians, camera, rule, blocks=part)
+        pair = (reference, ours) if blocks is None else (blocks.pick(reference), blocks.pick(ours))
+        score = score_view(*pair, perceptual=perceptual and blocks is None)
+        if perceptual and blocks is not None and whole:
+            seen = score_view(reference, ours)
+            score = replace(score, ssim=seen.ssim, flip=seen.flip)
+        views.append(score)
         if i in keep:
             rows.append(side_by_side(reference, ours))
         if progress:

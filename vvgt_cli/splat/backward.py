@@ -33,19 +33,21 @@ from vvgt_cli.splat.tiles import (
 )  # fmt: skip
 
 SINGULAR = 1e-9  # det S of det S' below which the gradient of the compensation is left out
-SUMS = 9  # of G = alpha dL/dalpha: 1, dx, dy, dx^2, dx dy, dy^2; of the weight: x dL/d(r, g, b)
+# alpha dL/dalpha; G = -dalpha/dp dL/dalpha, p the exponent, x dx, dy, dx^2, dx dy, dy^2; weight x dL/d(r, g, b)
+SUMS = 9
 _T = U(TILE)
 _A0, _A1, _A2 = U(6 * _AREA), U(6 * _AREA + TILE), U(6 * _AREA + 2 * TILE)
 _A3, _A4, _A5 = U(6 * _AREA + 3 * TILE), U(6 * _AREA + 4 * TILE), U(6 * _AREA + 5 * TILE)
-_END = U(6 * _AREA + 6 * TILE)
+_A6, _END = U(6 * _AREA + 6 * TILE), U(6 * _AREA + 7 * TILE)
 _exact = inlined()
 
 
 @_jit
 def _sweep(y0, y1, k, colors, a, b, c, u, v, opacity, rule, buf):
-    """One Gaussian over rows [y0, y1): sums a column into the six rows behind the planes."""
+    """One Gaussian over rows [y0, y1): sums a column into the seven rows behind the planes."""
     red, green, blue = max(colors[k, 0], _ZERO), max(colors[k, 1], _ZERO), max(colors[k, 2], _ZERO)
     min_alpha, max_alpha, floor, factor, offset, end = rule
+    shift = opacity * offset
     for i in range(_A0, _END):
         buf[i] = _ZERO
     for y in range(y0, y1):
@@ -61,8 +63,9 @@ def _sweep(y0, y1, k, colors, a, b, c, u, v, opacity, rule, buf):
             weight = _ZERO if ended else weight
             own = red * buf[j + _P2] + green * buf[j + _P3] + blue * buf[j + _P4] + buf[j + _P5]
             behind = buf[j + _P1] - weight * own
-            g = weight * (own - behind / after)
-            g = g if raw < max_alpha else _ZERO
+            slope = t * (own - behind / after)
+            slope = slope if weight > _ZERO and raw < max_alpha else _ZERO
+            g = (raw + shift) * slope
             buf[j] = -abs(t) if ended else after
             buf[j + _P1] = behind
             buf[_A0 + i] += g
@@ -72,6 +75,7 @@ def _sweep(y0, y1, k, colors, a, b, c, u, v, opacity, rule, buf):
             buf[_A3 + i] += weight * buf[j + _P2]
             buf[_A4 + i] += weight * buf[j + _P3]
             buf[_A5 + i] += weight * buf[j + _P4]
+            buf[_A6 + i] += raw * slope
 
 
 @_jit
@@ -89,7 +93,7 @@ def _moments_tile(entries, slots, extent, flat, colors, ox, oy, rule, buf, pairs
         s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = s8 = _ZERO
         for i in range(_T):  # type: ignore[assignment]
             dx = f32(np.int32(i)) + _HALF - u
-            s0 += buf[_A0 + i]
+            s0 += buf[_A6 + i]
             s1 += buf[_A0 + i] * dx
             s2 += buf[_A1 + i]
             s3 += buf[_A0 + i] * dx * dx
@@ -122,7 +126,7 @@ def moments(tiles, start, members, slots, extent, flat, colors, tiles_x, rule, i
         tile = tiles[index]
         ox, oy = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
         w, h = min(TILE, width - ox), min(TILE, height - oy)
-        buf = np.zeros(6 * _AREA + 6 * TILE, np.float32)  # transmittance, what is behind, dL/d(r, g, b, a); sums
+        buf = np.zeros(6 * _AREA + 7 * TILE, np.float32)  # transmittance, what is behind, dL/d(r, g, b, a); sums
         _open(buf, w, h)
         for y in range(h):
             for x in range(w):

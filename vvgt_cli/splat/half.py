@@ -9,18 +9,17 @@ import numpy as np
 from vvgt_cli.cameras import Camera
 from vvgt_cli.splat.rules import INRIA, Rule
 
-QUARTER = 0.25  # of the pixels
 
-
-def halved(cameras: Sequence[Camera], images: np.ndarray) -> tuple[list[Camera], np.ndarray, Rule]:
+def halved(cameras: Sequence[Camera], images: np.ndarray, rule: Rule = INRIA) -> tuple[list[Camera], np.ndarray, Rule]:
     """Views averaged 2 x 2 where their sides are even, and the rule that stands for the standard one there.
 
     Args:
         cameras, images: (n, h, w, c) float32.
+        rule: by which these are drawn.
     """
     h, w = images.shape[1:3]
     if h % 2 or w % 2:
-        return list(cameras), images, INRIA
+        return list(cameras), images, rule
     upper, lower = images[:, ::2], images[:, 1::2]
     mean = np.float32(0.25) * (upper[:, :, ::2] + upper[:, :, 1::2] + lower[:, :, ::2] + lower[:, :, 1::2])
-    return [camera.resized(0.5) for camera in cameras], mean, INRIA.at(0.5)
+    return [camera.resized(0.5) for camera in cameras], mean, rule.at(0.5)

@@ -130,6 +130,7 @@ def image_gradients(
     count = len(gaussians)
     centres, flat, _ = project(gaussians, camera, rule)
     opacity = 1 / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64)))
+    drawn = drawn_opacity(gaussians, flat, rule)
     pixels = np.stack(np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5), -1)
     colors = np.column_stack([np.maximum(gaussians.colors.astype(np.float64), 0), np.ones(count)])
     out = np.zeros((count, 2)), np.zeros((count, 2, 2)), np.zeros(count), np.zeros((count, 4))
@@ -138,10 +139,12 @@ def image_gradients(
         out[3][k] = ((trans * alpha)[..., None] * grad).sum(axis=(0, 1))
         slope = trans * ((colors[k] - behind) * grad).sum(axis=-1)  # dL/dalpha
         slope[(alpha == 0) | (alpha == rule.max_alpha)] = 0
-        moved = slope * alpha  # dL/d(exponent), and dL/d(log opacity)
+        moved = slope * alpha  # dL/d(log opacity)
+        rest = np.exp(-rule.reach) if rule.shifted else 0.0
+        bent = moved + np.where(alpha > 0, slope * drawn[k] * rest / (1 - rest), 0)  # dL/d(exponent)
         d, inverse = pixels - centres[k], np.linalg.inv(flat[k])
-        out[0][k] = (moved[..., None] * (d @ inverse)).sum(axis=(0, 1))
-        out[1][k] = -0.5 * np.einsum("yx,yxi,yxj->ij", moved, d, d)
+        out[0][k] = (bent[..., None] * (d @ inverse)).sum(axis=(0, 1))
+        out[1][k] = -0.5 * np.einsum("yx,yxi,yxj->ij", bent, d, d)
         if rule.compensate:  # log of the factor is half of log det S - log det S'; by S'^-1: -S' dS S'
             own = np.linalg.inv(flat[k] - rule.dilation * np.eye(2))
             out[1][k] -= moved.sum() * 0.5 * flat[k] @ (own - inverse) @ flat[k]

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vvgt_cli.cameras import Camera
+from vvgt_cli.cameras.blocks import Blocks
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.splat.constants import TILE
 from vvgt_cli.splat.rules import INRIA, Rule, rule_of
@@ -109,27 +110,37 @@ def tile_by_tile() -> AbstractContextManager[None]:
     return numba.parallel_chunksize(1)
 
 
-def blend(projection: Projection, colors: np.ndarray, height: int, width: int) -> np.ndarray:
-    """(height, width, 4) float32 premultiplied RGBA, linear in ``colors`` (K, 3) float32, which may be negative."""
+def blend(
+    projection: Projection, colors: np.ndarray, height: int, width: int, blocks: Blocks | None = None
+) -> np.ndarray:
+    """(height, width, 4) float32 premultiplied RGBA, linear in ``colors`` (K, 3) float32, which may be negative.
+
+    With ``blocks`` zero elsewhere.
+    """
     from vvgt_cli.splat import tiles
 
     p = projection
     image = np.zeros((height, width, 4), np.float32)
     colors = np.ascontiguousarray(colors, np.float32)
     with tile_by_tile():
-        tiles.blend(p.tiles, p.start, p.members, p.extent, p.flat, colors, p.tiles_x, p.rule.blending(), image)
+        chosen = p.tiles if blocks is None else p.tiles[np.isin(p.tiles, blocks.numbers)]
+        tiles.blend(chosen, p.start, p.members, p.extent, p.flat, colors, p.tiles_x, p.rule.blending(), image)
     return image
 
 
 def render(
-    gaussians: Gaussians, camera: Camera, rule: str | Rule = INRIA, projection: Projection | None = None
+    gaussians: Gaussians,
+    camera: Camera,
+    rule: str | Rule = INRIA,
+    projection: Projection | None = None,
+    blocks: Blocks | None = None,
 ) -> np.ndarray:
     """(height, width, 4) float32 premultiplied RGBA over nothing (conventions: Gaussians); negative colours are 0.
 
-    ``projection``, where there is one, was made by a rule of its own.
+    ``projection``, where there is one, was made by a rule of its own; with ``blocks`` zero elsewhere.
     """
     p = projection or project(gaussians, camera, rule)
-    return blend(p, np.maximum(gaussians.colors, 0), camera.height, camera.width)
+    return blend(p, np.maximum(gaussians.colors, 0), camera.height, camera.width, blocks)
 
 
 def gather(projection: Projection, fields: np.ndarray, out: np.ndarray) -> None:

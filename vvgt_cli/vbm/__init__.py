@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from vvgt_cli.errors import UsageError
+from vvgt_cli.splat.rules import INRIA, Rule
 
 if TYPE_CHECKING:
     import numpy as np
@@ -72,13 +73,19 @@ def initialise(scene: Scene, options: VbmOptions, progress: Progress | None = No
 
 
 def backproject(
-    start: Start, cameras: Sequence[Camera], views: np.ndarray, progress: Progress | None = None
+    start: Start,
+    cameras: Sequence[Camera],
+    views: np.ndarray,
+    progress: Progress | None = None,
+    rule: Rule = INRIA,
 ) -> tuple[Gaussians, str]:
     """What views can mend without gradient descent: which cells are split, the style of surfaces, and the colours.
 
     Args:
         start: from `initialise`.
         cameras, views: training views, (n, h, w, 4) float32 premultiplied.
+        progress: called after each part.
+        rule: by which they are drawn.
 
     Returns:
         Gaussians, and one line that says what was done.
@@ -87,8 +94,8 @@ def backproject(
     from vvgt_cli.vbm.fit import solve_colors
 
     if start.form is None:
-        return solve_colors(start.gaussians, cameras, views, progress=progress), "colours"
-    return fit(start.form, cameras, views, progress)
+        return solve_colors(start.gaussians, cameras, views, progress=progress, rule=rule), "colours"
+    return fit(start.form, cameras, views, progress, rule)
 
 
 __all__ = ["METHODS", "Start", "VbmOptions", "backproject", "initialise"]

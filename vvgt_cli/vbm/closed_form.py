@@ -13,7 +13,7 @@ from vvgt_cli.cameras.sets import FIELD_OF_VIEW, RADIUS
 from vvgt_cli.dvr.scene import BRICK, Scene
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.splat import render
-from vvgt_cli.splat.rules import INRIA
+from vvgt_cli.splat.rules import INRIA, Rule
 from vvgt_cli.vbm.fit import image_errors, solve_colors
 from vvgt_cli.vbm.inset import Opaque, opaque_field
 from vvgt_cli.vbm.moments import base_cells, exponents
@@ -68,14 +68,14 @@ class ClosedForm:
     def _of(self, leaves: Leaves, style: SurfaceStyle) -> Gaussians:
         return cell_gaussians(leaves, self.voxel, self.pixel, self.opaque, style)
 
-    def refined(self, cameras: Sequence[Camera], views: np.ndarray, style: SurfaceStyle) -> Gaussians:
+    def refined(self, cameras: Sequence[Camera], views: np.ndarray, style: SurfaceStyle, rule: Rule) -> Gaussians:
         """Gaussians for the budget: half by the moments, then the cells with the largest image error are split."""
         start = max(int(self.budget * REFINE_FROM), 1)
         leaves = leaves_of(self.tree, select(self.tree, start))
         smallest = max(2 * MIN_CELL * self.pixel, 2.0 ** (FINEST + 1) * self.voxel)  # edge of a cell to split
         for done in range(1, REFINE_ROUNDS + 1):
-            gaussians = solve_colors(self._of(leaves, style), cameras, views, rounds=1)
-            error = image_errors(gaussians, cameras, views)
+            gaussians = solve_colors(self._of(leaves, style), cameras, views, rounds=1, rule=rule)
+            error = image_errors(gaussians, cameras, views, rule)
             room = start + (self.budget - start) * done // REFINE_ROUNDS - len(leaves)
             order = np.argsort(-error, kind="stable")
             order = order[leaves.edge[order].min(axis=1) >= smallest]
@@ -148,7 +148,11 @@ def _visible_voxels(scene: Scene, samples: int = 256) -> float:
 
 
 def fit(
-    form: ClosedForm, cameras: Sequence[Camera], views: np.ndarray, progress: Progress | None = None
+    form: ClosedForm,
+    cameras: Sequence[Camera],
+    views: np.ndarray,
+    progress: Progress | None = None,
+    rule: Rule = INRIA,
 ) -> tuple[Gaussians, str]:
     """The pyramid cut where views see errors, then coloured by all of them.
 
@@ -158,6 +162,7 @@ def fit(
         form: what to cut.
         cameras, views: training views, (n, h, w, 4) float32 premultiplied.
         progress: called after each cut and at the end.
+        rule: by which the views are drawn.
 
     Returns:
         The Gaussians and one line that says what was done.
@@ -168,24 +173,24 @@ def fit(
     tick = progress or (lambda done, total: None)
     cuts = []
     for number, name in enumerate(styles):
-        cuts.append(solve_colors(form.refined(some, images, STYLES[name]), some, images, rounds=1))
+        cuts.append(solve_colors(form.refined(some, images, STYLES[name], rule), some, images, rounds=1, rule=rule))
         tick(number + 1, len(styles) + 1)
     best = 0
     if len(cuts) > 1:
-        best = int(np.argmin([_loss(cut, some, images) for cut in cuts]))
-    gaussians = solve_colors(cuts[best], cameras, views, twice_every=TWICE_EVERY)
+        best = int(np.argmin([_loss(cut, some, images, rule) for cut in cuts]))
+    gaussians = solve_colors(cuts[best], cameras, views, twice_every=TWICE_EVERY, rule=rule)
     tick(len(styles) + 1, len(styles) + 1)
     return gaussians, "cells by image error" + (f", {styles[best]} surfaces" if form.opaque.any else "")
 
 
-def _loss(gaussians: Gaussians, cameras: Sequence[Camera], views: np.ndarray) -> float:
+def _loss(gaussians: Gaussians, cameras: Sequence[Camera], views: np.ndarray, rule: Rule) -> float:
     """Mean squared colour error at the views' size, plus `TWICE` times that at twice the size (averaged 2 x 2).
 
     A file that leans on the renderer's 0.3 px looks right at one size only.
     """
     total = 0.0
     for camera, view in zip(cameras, views, strict=True):
-        halved = render(gaussians, camera, INRIA.at(0.5))
-        total += float(np.mean((render(gaussians, camera) - view)[..., :3] ** 2))
+        halved = render(gaussians, camera, rule.at(0.5))
+        total += float(np.mean((render(gaussians, camera, rule) - view)[..., :3] ** 2))
         total += TWICE * float(np.mean((halved - view)[..., :3] ** 2))
     return total / len(cameras)

@@ -9,7 +9,7 @@ import numpy as np
 from vvgt_cli.cameras import Camera
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.splat import Projection, blend, gather, project, render
-from vvgt_cli.splat.rules import INRIA
+from vvgt_cli.splat.rules import INRIA, Rule
 
 SEEN = 1e-2  # blending weight (pixels, over all views) below which views say nothing about a splat
 PRIOR = 1.0  # pixels of weight that the closed form's colour counts for
@@ -20,11 +20,11 @@ BRIGHTEST = 2.0  # colours are kept in [0, 2]: more would flare up where other v
 Progress = Callable[[int, int], None]
 
 
-def image_errors(gaussians: Gaussians, cameras: Sequence[Camera], views: np.ndarray) -> np.ndarray:
+def image_errors(gaussians: Gaussians, cameras: Sequence[Camera], views: np.ndarray, rule: Rule = INRIA) -> np.ndarray:
     """(K,) sum over views and pixels of blending weight x absolute error of RGB and alpha; ``views`` (n, h, w, 4)."""
     sums = np.zeros((len(gaussians), 5))
     for camera, view in zip(cameras, views, strict=True):
-        projection = project(gaussians, camera)
+        projection = project(gaussians, camera, rule)
         error = np.abs(view - render(gaussians, camera, projection=projection)).sum(axis=-1)
         gather(projection, np.ascontiguousarray(np.broadcast_to(error, (4, *error.shape)), np.float32), sums)
     return sums[:, 1]
@@ -37,17 +37,18 @@ def solve_colors(
     rounds: int = ROUNDS,
     progress: Progress | None = None,
     twice_every: int = 0,
+    rule: Rule = INRIA,
 ) -> Gaussians:
     """Least-squares colours by preconditioned conjugate gradients: images are linear in them.
 
     Minimises ``sum |blend(c) - view|^2 + PRIOR |c - c0|^2`` over all views and RGB; ``views`` (n, h, w, 4) float32
     premultiplied. The preconditioner is the blending weight of each splat, so that one round is the normalised
     back-projection of the residual. Rounds end early where one lowers the squared error by less than `ENOUGH`. Every
-    ``twice_every``-th view (0: none) counts as seen at twice its size.
+    ``twice_every``-th view (0: none) counts as seen at twice its size; ``rule`` is that of the views.
     """
     count = len(gaussians)
     projections = [
-        project(gaussians, camera, INRIA.at(0.5) if twice_every and i % twice_every == twice_every - 1 else INRIA)
+        project(gaussians, camera, rule.at(0.5) if twice_every and i % twice_every == twice_every - 1 else rule)
         for i, camera in enumerate(cameras)
     ]
     start = gaussians.colors.astype(np.float64)

@@ -1,0 +1,51 @@
+"""The number for a lattice: found where there is one, at its amplitude; and how much of one the closed form has."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from vvgt_cli.cameras.sets import look_at
+from vvgt_cli.dvr import Scene, render_view
+from vvgt_cli.metrics.lattice import lattice
+from vvgt_cli.splat import render
+from vvgt_cli.transfer.readers import minimal
+from vvgt_cli.vbm import VbmOptions, initialise
+from vvgt_cli.volume import Volume
+
+
+def waves(period, amplitude, n=256):
+    x = np.arange(n)
+    return amplitude * (np.sin(2 * np.pi * x / period) + np.sin(2 * np.pi * x / period)[:, None])
+
+
+def test_a_lattice_is_found_in_noise_at_its_period():
+    noise = np.random.default_rng(0).normal(0, 0.01, (256, 256))
+    db, amplitude = lattice(noise + waves(11.0, 0.02), 11.0)
+    assert db > 20
+    assert amplitude == pytest.approx(0.02, rel=0.3)
+    assert lattice(noise + waves(11.0, 0.02), 7.0)[0] < 6
+    assert abs(lattice(noise, 11.0)[0]) < 6
+
+
+def test_what_cannot_be_told_is_refused():
+    for image, period in ((np.zeros((64, 32)), 8.0), (np.zeros((64, 64)), 20.0), (np.zeros((64, 64)), 2.0)):
+        with pytest.raises(ValueError, match="period"):
+            lattice(image, period)
+
+
+def test_a_translucent_block_close_up_shows_little_of_its_cells():
+    """From afar through a narrow field, so that all cells of the block have one period."""
+    values = np.zeros((32, 32, 32), np.float32)
+    values[2:30, 2:30, 2:30] = 1
+    points = [{"x": x, "rgb": [0.9, 0.6, 0.3], "opacity": 0.04 * x} for x in (0.0, 1.0)]
+    scene = Scene.build(Volume(values), minimal.read({"points": points}, "fog"), 1.0, (0.0, 1.0))
+    gaussians = initialise(scene, VbmOptions(6000, 1080)).gaussians
+    camera = look_at((40.0, 0.001, 0.0), width=256, height=256, fov=1.0)
+    camera = replace(camera, fx=256 * 40.0, fy=256 * 40.0)  # a width of 1, of 2, at the volume
+    ours, reference = (image[..., :3].mean(axis=2) for image in (render(gaussians, camera), render_view(scene, camera)))
+    voxel = 2 / 32 * 256  # pixels
+    found = [lattice(ours - reference, voxel * 2.0**level)[1] for level in (-2, -1, 0, 1)]
+    assert max(found) < 0.01 * reference.mean()
