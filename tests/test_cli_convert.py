@@ -55,6 +55,7 @@ def test_convert_leaves_file_report_and_preview(converted):
     gaussians, header = read_ply(folder / "a.ply")
     assert 0 < len(gaussians) <= 300
     assert (header.frame, header.up, header.unit_distance_label) == ("unit", "none", "paraview")
+    assert (header.made_for, header.rule) == (48, "inria")
     assert np.abs(gaussians.means).max() < 1.2
     report = json.loads((folder / "a.json").read_text())
     assert (report["format"], report["schema"], report["command"]) == ("vvgt-conversion", 1, "convert")
@@ -174,21 +175,33 @@ def test_pipes(folder, vvgt):
     assert Path("d/orbit_000.png").exists()
 
 
-def test_evaluate_scores_every_scale(converted, vvgt):
+def test_evaluate_scores_every_seat(converted, vvgt):
     ply = converted[0] / "a.ply"
-    options = ("evaluate", ply, "--volume", SOURCE, "--size", 32, "--scale", 1, "--scale", 2, "--step", 0.5)
+    options = ("evaluate", ply, "--volume", SOURCE, "--step", 0.5)
     document = json.loads(vvgt(*options, "--json").out)
-    assert list(document["scores"]) == ["1x", "2x"]
-    assert document["format"] == "vvgt-evaluation"
+    assert (document["format"], document["size"], document["rule"]) == ("vvgt-evaluation", 48, "inria")  # the file's
     assert document["reference_psnr"] > 30
     report = json.loads((converted[0] / "a.json").read_text())
-    assert document["scores"]["1x"]["psnr"] == pytest.approx(report["scores"]["psnr"], abs=3)  # smaller pictures
+    assert document["scores"]["psnr"] == pytest.approx(report["scores"]["psnr"], abs=0.5)
     assert document["transfer_function"]["unit_distance"] == report["transfer_function"]["unit_distance"]
+    seats = document["seats"]
+    assert len(seats) == 5 * 5  # rules; 48, 400, 800, 2160 px and close up
+    assert [seat["psnr"] for seat in seats] == sorted(seat["psnr"] for seat in seats)
+    assert {seat["field_of_view"] for seat in seats} == {10, 40}
     page = (ROOT / "docs" / "report.md").read_text()
-    assert all(f"`{name}`" in page for name in (*document, *document["scores"]["1x"]))
-    table = vvgt(*options, "--quiet")
+    assert all(f"`{name}`" in page for name in (*document, *document["scores"], *seats[0]))
+    table = vvgt(*options, "--no-seats", "--quiet", "--rule", "playcanvas")
     assert table.err == ""
-    assert f"{document['scores']['2x']['psnr']:.4f}" in table.out.decode()
+    assert "drawn as playcanvas" in table.out.decode()
+    assert "close up" not in table.out.decode()
+    assert f"{document['scores']['psnr']:.4f}" not in table.out.decode()
+
+
+def test_rules_are_the_tables():
+    from vvgt_cli.cli.fit import RULES as NAMES
+    from vvgt_cli.splat.rules import RULES
+
+    assert tuple(RULES) == NAMES
 
 
 def test_a_scene_without_anything_to_see_is_an_error(folder, vvgt):

@@ -48,4 +48,4 @@ def test_a_translucent_block_close_up_shows_little_of_its_cells():
     ours, reference = (image[..., :3].mean(axis=2) for image in (render(gaussians, camera), render_view(scene, camera)))
     voxel = 2 / 32 * 256  # pixels
     found = [lattice(ours - reference, voxel * 2.0**level)[1] for level in (-2, -1, 0, 1)]
-    assert max(found) < 0.01 * reference.mean()
+    assert max(found) < 0.008 * reference.mean()  # a spread of 1.5 has 0.011

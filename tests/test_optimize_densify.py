@@ -134,6 +134,6 @@ def test_screen_slopes_are_the_twins():
     g, camera = cloud(60, sigma=0.1), CAMERAS[0]
     grad = np.random.default_rng(5).normal(size=(48, 48, 4)).astype(np.float32)
     p = project(g, camera)
-    slopes = screen_slopes(p, moments(p, g.colors, render(g, camera, p), grad))
+    slopes = screen_slopes(p, moments(p, g.colors, render(g, camera, projection=p), grad))
     twin = np.linalg.norm(image_gradients(g, camera, grad.astype(np.float64))[0], axis=1)
     assert (np.abs(slopes - twin) > 5e-3 * (twin + 0.01 * twin.mean())).mean() < 0.05

@@ -12,7 +12,7 @@ from vvgt_cli.vbm.opacity import peak_opacity
 from vvgt_cli.vbm.tree import SEEN, Leaves, central
 
 FLOOR = 0.05  # smallest standard deviation, in the smaller of voxel and cell edge
-TRANSLUCENT_SPREAD = 1.5  # what a cell that its mass fills adds to its second moment; nothing across a sheet
+TRANSLUCENT_SPREAD = 2.0  # what a cell that its mass fills adds to its second moment; nothing across a sheet
 OPAQUE_SPREAD = np.array([1.0, 2.4, 2.4])  # factors of the ascending principal moments of an opaque cell
 DEBLUR = 0.3  # px^2 that an opaque cell gives back: the renderer's dilation adds them
 
@@ -50,7 +50,7 @@ def cell_gaussians(leaves: Leaves, voxel: float, pixel: float, opaque: Opaque, s
         opaque: where bodies are opaque; their surfaces are moved inwards.
         style: of opaque surfaces.
 
-    The centre is the centroid of the extinction, the covariance its second moment times a spread (1 + 1.5 min(1,
+    The centre is the centroid of the extinction, the covariance its second moment times a spread (1 + 2 min(1,
     12 w / H^2) where the cell is translucent, `OPAQUE_SPREAD` where it is not), the colour the seen mean, the opacity
     that of the mass (`peak_opacity`).
     """
