@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from vvgt_cli.cli.options import common_options, read_options, tf_options
+from vvgt_cli.cli.options import common_options, placed_read_options, tf_options
 from vvgt_cli.progress import Console
 
 
@@ -32,7 +32,7 @@ from vvgt_cli.progress import Console
 )  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a table.")
 @tf_options
-@read_options
+@placed_read_options
 @common_options
 def command(ply: str, volume: str, as_json: bool, console: Console, **options: Any) -> None:
     """Score OUT.ply against the volume it was made from, on the ten test views, at 1x, 2x and 4x the size.

@@ -35,6 +35,8 @@ class PlyHeader:
         scale, centre: of the volume's `UnitFrame`, where the comments give them.
         up: volume axis that was turned up, "none" where no comment says otherwise.
         unit_distance, unit_distance_label: what opacity referred to, None where not recorded.
+        space: anatomical space of the world, "RAS", "LPS" or "none"; None where no comment says.
+        affine: 3 x 4 row-major, voxel index (i, j, k, 1) of the volume to world position.
         version: of the vvgt that wrote it, None for other programs.
     """
 
@@ -49,6 +51,8 @@ class PlyHeader:
     up: str = "none"
     unit_distance: float | None = None
     unit_distance_label: str | None = None
+    space: str | None = None
+    affine: tuple[float, ...] | None = None
     version: str | None = None
 
 
@@ -172,6 +176,16 @@ def _one_comment(words: list[str]) -> dict:
         return {"up": words[1]}
     if words[0] == "unit-distance":
         return {"unit_distance": _finite([words[1]])[0], "unit_distance_label": " ".join(words[2:])}
+    if words[0] == "space":
+        if words[1:] not in (["RAS"], ["LPS"], ["none"]):
+            raise ValueError(words)
+        return {"space": words[1]}
+    if words[0] == "affine":
+        affine = _finite(words[1:])
+        axes = np.reshape(affine, (3, 4))[:, :3]  # another count: ValueError
+        if not axes.any() or np.linalg.det(axes / np.abs(axes).max()) == 0:
+            raise ValueError(words)
+        return {"affine": tuple(affine)}
     return {"version": words[0]}
 
 

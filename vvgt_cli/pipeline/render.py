@@ -80,6 +80,8 @@ def layout_of(header: PlyHeader) -> PlyOptions:
         unit_frame=frame,
         unit_distance=header.unit_distance,
         unit_distance_label=header.unit_distance_label or "given",
+        space=header.space or "none",
+        affine=header.affine,
     )
 
 
