@@ -6,10 +6,10 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-import anatomy
 import numpy as np
 import pytest
 
+from tests import anatomy
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.cameras.boxed import boxed
 from vvgt_cli.cameras.files import transforms_json

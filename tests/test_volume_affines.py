@@ -5,13 +5,13 @@ from __future__ import annotations
 import tarfile
 from pathlib import Path
 
-import anatomy
 import nibabel as nib
 import numpy as np
 import pydicom
 import pytest
 import SimpleITK as sitk
 
+from tests import anatomy
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume import ReadOptions, Volume, read_volume
 from vvgt_cli.volume.space import axis_facts, world_axis

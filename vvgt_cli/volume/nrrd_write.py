@@ -18,7 +18,9 @@ def write_nrrd(path: str | os.PathLike[str], volume: Volume, overwrite: bool = F
         UsageError, DataError: see `vvgt_cli.files.atomic_write`.
     """
     values = np.ascontiguousarray(volume.data, "<f4") * np.float32(volume.slope) + np.float32(volume.intercept)
-    vectors = " ".join(f"({','.join(repr(v + 0.0) for v in axis)})" for axis in volume.affine[:3, :3].T.tolist())
+    vectors = " ".join(
+        f"({','.join(repr(v) if v else '0' for v in axis)})" for axis in volume.affine[:3, :3].T.tolist()
+    )
     space = {"RAS": "right-anterior-superior", "LPS": "left-posterior-superior"}.get(volume.space or "")
     header = [
         "NRRD0004",
