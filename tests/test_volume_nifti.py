@@ -91,11 +91,13 @@ def test_geometry(tmp_path: Path, method: str, flip: int) -> None:
     volume = read_volume(str(tmp_path / "v.nii"))
     np.testing.assert_allclose(np.reshape(volume.direction, (3, 3)), rotation, atol=1e-6)
     np.testing.assert_allclose(volume.origin, [10, -20, 30], rtol=1e-6)
-    assert volume.spacing == (2, 3, 4)
+    np.testing.assert_allclose(volume.spacing, (2, 3, 4), rtol=1e-6)
+    np.testing.assert_allclose(volume.affine, image.affine, atol=1e-5)
 
 
 def test_spacing_signs_and_zeros(tmp_path: Path) -> None:
     source = save(tmp_path / "v.nii", VALUES.astype("u1"))
+    patch(source, 252, np.zeros(2, "<i2"))  # neither qform nor sform
     patch(source, 80, np.array([-2, 3, 0], "<f4"))
     with pytest.raises(DataError, match="try --spacing X Y Z"):
         read_volume(source)

@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from vvgt_cli.cli.fit import rule_option
-from vvgt_cli.cli.options import common_options, read_options, tf_options
+from vvgt_cli.cli.options import common_options, placed_read_options, tf_options
 from vvgt_cli.progress import Console
 
 
@@ -29,7 +29,7 @@ from vvgt_cli.progress import Console
 )  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a table.")
 @tf_options
-@read_options
+@placed_read_options
 @common_options
 def command(ply: str, volume: str, as_json: bool, console: Console, **options: Any) -> None:
     """Score OUT.ply against the volume it was made from: on the ten test views, and from every seat.

@@ -57,11 +57,16 @@ ply_options = group(
     "ply",
     frame=click.option(
         "--frame", type=click.Choice(["unit", "world"]), default="unit", show_default=True,
-        help="Box centred with longest edge 2, or the volume's physical space.",
+        help="World directions, box centred with longest edge 2; or the volume's physical space.",
     ),
     up=click.option(
-        "--up", type=click.Choice(["none", "x", "-x", "y", "-y", "z", "-z"]), default="none", show_default=True,
-        help="Volume axis that viewers show upwards; none leaves the axes as they are.",
+        "--up", metavar="DIRECTION",
+        type=click.Choice([
+            *("none", "x", "-x", "y", "-y", "z", "-z"),
+            *("superior", "inferior", "anterior", "posterior", "left", "right"),
+        ]),
+        help="What viewers show upwards: superior, ..., right, or a world axis (x, -x, ..., -z); none leaves axes "
+        "as they are. Default: superior where the space is anatomical and the frame unit.",
     ),
     sh_degree=click.option(
         "--sh-degree", type=click.IntRange(0, 3), default=0, show_default=True,
@@ -102,6 +107,7 @@ def convert_request(
     from vvgt_cli.pipeline.convert import ConvertRequest, FitOptions
     from vvgt_cli.pipeline.plan import Limits
 
+    up = ply.pop("up")
     return ConvertRequest(
         source_request(volume, read, optics),
         output,
@@ -109,6 +115,7 @@ def convert_request(
         Limits(**(limits or {})),
         dry_run,
         PlyOptions(**ply),
+        up,
         report,
         preview,
         overwrite,

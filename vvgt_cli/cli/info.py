@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import click
 
-from vvgt_cli.cli.options import common_options, read_options
+from vvgt_cli.cli.options import common_options, placed_read_options
 from vvgt_cli.progress import Console
 
 
 @click.command("info", short_help="What a volume, transfer function, view set or .ply holds.")
 @click.argument("file")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of lines.")
-@read_options
+@placed_read_options
 @common_options
 def command(file: str, as_json: bool, read: dict, console: Console) -> None:
     """Say what FILE holds, found out from its content: a volume, a transfer function, a view set

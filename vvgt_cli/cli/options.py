@@ -45,8 +45,7 @@ def _component(ctx: click.Context, param: click.Parameter, value: str | None) ->
     return int(value)
 
 
-read_options = group(
-    "read",
+_READ = dict(
     dims=click.option(
         "--dims",
         nargs=3,
@@ -67,6 +66,14 @@ read_options = group(
     ),
     component=click.option(
         "--component", metavar="N|magnitude", callback=_component, help="Which component of a vector array."
+    ),
+)
+read_options = group("read", **_READ)
+placed_read_options = group(
+    "read",
+    **_READ,
+    space=click.option(
+        "--space", type=click.Choice(["RAS", "LPS"]), help="World of a volume with an anatomical space. Default: RAS."
     ),
 )
 

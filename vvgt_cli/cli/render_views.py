@@ -9,7 +9,7 @@ import click
 from vvgt_cli.cli.options import (
     common_options,
     group,
-    read_options,
+    placed_read_options,
     tf_range_option,
     unit_distance_option,
 )
@@ -96,7 +96,7 @@ optics_options = group(
 @image_options
 @ray_options
 @optics_options
-@read_options
+@placed_read_options
 @click.option("--shard", default="1/1", metavar="I/N", help="Render part I of N, for job arrays; I counts from 1.")
 @click.option("--overwrite", is_flag=True, help="Start afresh where another run's views are.")
 @common_options

@@ -1,4 +1,4 @@
-"""Moving Gaussians between frames: a similarity applied to means, scales and rotations."""
+"""Moving Gaussians between frames: similarities and other linear maps of means, scales and rotations."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from vvgt_cli.gaussians.types import Gaussians
 
 _HALF = math.sqrt(0.5)
 _IDENTITY = np.eye(3)
+_RIGID = 1e-4  # departure of A^T A from 1 up to which a map is taken as a rotation or a reflection
 
 # SuperSplat and its relatives show PLY (x, y, z) as (-x, -y, z) with +y up on the screen, so "up" is PLY -y.
 # Each matrix takes the named volume axis to (0, -1, 0); the quaternion (w, x, y, z) is the same rotation.
@@ -79,3 +80,58 @@ def rescale(gaussians: Gaussians, factor: float, before: np.ndarray, after: np.n
         gaussians.opacity_logits,
         gaussians.colors,
     )
+
+
+def transform(gaussians: Gaussians, matrix: np.ndarray) -> Gaussians:
+    """``A m`` for means, ``A S A^T`` for covariances; opacities and colours stay. The identity gives the same object.
+
+    Rotations and reflections turn the quaternions and leave the scales alone (-1 leaves a covariance as it is, so a
+    reflection turns as the rotation -A does); of other maps the principal axes are found anew, by singular values.
+
+    Args:
+        matrix: (3, 3) A, not singular.
+    """
+    matrix = np.asarray(matrix, dtype=np.float64)
+    if np.array_equal(matrix, _IDENTITY):
+        return gaussians
+    quaternions = gaussians.quaternions.astype(np.float64)
+    log_scales = gaussians.log_scales.astype(np.float64)
+    if np.abs(matrix.T @ matrix - _IDENTITY).max() <= _RIGID:
+        turned = _quaternions(matrix[None] * np.sign(np.linalg.det(matrix)))[0]
+        quaternions = _quaternion_product(tuple(turned.tolist()), quaternions)
+    else:
+        largest = log_scales.max(axis=1, keepdims=True)
+        factors = matrix @ _rotations(quaternions) * np.exp(log_scales - largest)[:, None, :]
+        axes, sigma, _ = np.linalg.svd(factors)
+        quaternions = _quaternions(axes * np.sign(np.linalg.det(axes))[:, None, None])
+        log_scales = np.log(np.maximum(sigma, np.finfo(np.float64).tiny)) + largest
+    return Gaussians(
+        (gaussians.means.astype(np.float64) @ matrix.T).astype(np.float32),
+        log_scales.astype(np.float32),
+        quaternions.astype(np.float32),
+        gaussians.opacity_logits,
+        gaussians.colors,
+    )
+
+
+def _rotations(quaternions: np.ndarray) -> np.ndarray:
+    """(K, 3, 3) of quaternions (K, 4) of any norm, (w, x, y, z)."""
+    w, x, y, z = (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), -1, 0)
+
+
+def _quaternions(rotations: np.ndarray) -> np.ndarray:
+    """(K, 4) unit quaternions (w, x, y, z) of (K, 3, 3), by Bar-Itzhack (2000): eigenvectors of symmetric matrices."""
+    r = np.moveaxis(rotations, 0, -1)
+    table = np.zeros((4, 4, len(rotations)))
+    table[0, 0] = r[0, 0] + r[1, 1] + r[2, 2]
+    for a, (b, c) in enumerate(((1, 2), (2, 0), (0, 1))):
+        table[a + 1, a + 1] = r[a, a] - r[b, b] - r[c, c]
+        table[0, a + 1] = table[a + 1, 0] = r[c, b] - r[b, c]
+        table[b + 1, c + 1] = table[c + 1, b + 1] = r[b, c] + r[c, b]
+    return np.linalg.eigh(np.moveaxis(table, -1, 0))[1][:, :, -1]

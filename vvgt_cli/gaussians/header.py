@@ -36,6 +36,8 @@ class PlyHeader:
         up: volume axis that was turned up, "none" where no comment says otherwise.
         unit_distance, unit_distance_label: what opacity referred to, None where not recorded.
         made_for, rule: pixels of the screen that it is made for, and the rule by which it is drawn; None: not recorded.
+        space: anatomical space of the world, "RAS", "LPS" or "none"; None where no comment says.
+        affine: 3 x 4 row-major, voxel index (i, j, k, 1) of the volume to world position.
         version: of the vvgt that wrote it, None for other programs.
     """
 
@@ -52,6 +54,8 @@ class PlyHeader:
     unit_distance_label: str | None = None
     made_for: int | None = None
     rule: str | None = None
+    space: str | None = None
+    affine: tuple[float, ...] | None = None
     version: str | None = None
 
 
@@ -179,6 +183,16 @@ def _one_comment(words: list[str]) -> dict:
         if words[2] != "rule" or len(words) != 4 or not words[1].isdecimal() or not 0 < int(words[1]) <= 2**20:
             raise ValueError(words)
         return {"made_for": int(words[1]), "rule": words[3]}
+    if words[0] == "space":
+        if words[1:] not in (["RAS"], ["LPS"], ["none"]):
+            raise ValueError(words)
+        return {"space": words[1]}
+    if words[0] == "affine":
+        affine = _finite(words[1:])
+        axes = np.reshape(affine, (3, 4))[:, :3]  # another count: ValueError
+        if not axes.any() or np.linalg.det(axes / np.abs(axes).max()) == 0:
+            raise ValueError(words)
+        return {"affine": tuple(affine)}
     return {"version": words[0]}
 
 

@@ -14,6 +14,7 @@ from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians.frames import rescale, turn, up_matrix
 from vvgt_cli.gaussians.header import REST_COUNTS, PlyHeader, parse_header
 from vvgt_cli.gaussians.types import SH_C0, Gaussians
+from vvgt_cli.volume.space import axis_facts
 from vvgt_cli.volume.types import UnitFrame
 
 FRAMES = ("unit", "world")
@@ -29,13 +30,15 @@ class PlyOptions:
 
     Attributes:
         frame: "unit" (box-centred, longest edge 2) or "world" (the volume's physical space).
-        up: volume axis that points up in viewers, one of `frames.UP_NAMES`.
+        up: world axis that points up in viewers, one of `frames.UP_NAMES`.
         sh_degree: 0 to 3; bands above 0 are written as zeros, for loaders that insist on them.
         comments: write the transform, the unit distance and the version before `end_header`.
         unit_frame: frame of the volume; needed for "world", recorded in the comments otherwise.
         unit_distance: world length that opacity refers to, recorded in the comments.
         unit_distance_label: how that distance was chosen, one word.
         made_for, rule: pixels of the screen that they are made for, and name of the rule by which they are drawn.
+        space: anatomical space of the world, "RAS", "LPS" or "none", recorded in the comments with the affine.
+        affine: 3 x 4 row-major, voxel index to world, recorded in the comments.
     """
 
     frame: str = "unit"
@@ -47,6 +50,8 @@ class PlyOptions:
     unit_distance_label: str = "given"
     made_for: int | None = None
     rule: str | None = None
+    space: str = "none"
+    affine: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
         up_matrix(self.up)
@@ -100,6 +105,9 @@ def _comments(options: PlyOptions) -> list[str]:
         centre = " ".join(repr(float(c)) for c in options.unit_frame.centre)
         frame += f" scale {float(options.unit_frame.scale)!r} centre {centre}"
     lines += [frame, f"comment vvgt up {options.up}"]
+    if options.affine is not None:
+        numbers = " ".join(repr(float(a)) for a in options.affine)
+        lines += [f"comment vvgt space {options.space}", f"comment vvgt affine {numbers}"]
     if options.unit_distance is not None:
         lines.append(f"comment vvgt unit-distance {float(options.unit_distance)!r} {options.unit_distance_label}")
     if options.made_for is not None:
@@ -239,6 +247,8 @@ def describe(gaussians: Gaussians, header: PlyHeader) -> dict[str, object]:
         "sh_degree": header.sh_degree,
         "frame": header.frame,
         "up": header.up,
+        "space": header.space,
+        **(axis_facts(np.reshape(header.affine, (3, 4)), header.space) if header.affine else {}),
         "unit_distance": header.unit_distance,
         "unit_distance_label": header.unit_distance_label,
         "version": header.version,

@@ -14,6 +14,7 @@ from vvgt_cli.jit.ahead import CONVERT, INIT
 from vvgt_cli.network.card import find_model, read_card
 from vvgt_cli.pipeline.mend import check_view_memory, mend, wide
 from vvgt_cli.pipeline.outputs import Output, check_outputs, write_text
+from vvgt_cli.pipeline.place import out_of_box, placed, preview, remarks, up_axis, upright
 from vvgt_cli.pipeline.plan import Limits, Planner, estimate, view_edge
 from vvgt_cli.pipeline.record import ConversionReport, Run
 from vvgt_cli.pipeline.render import write_gaussians
@@ -66,7 +67,8 @@ class ConvertRequest:
         fit: what the Gaussians are made for.
         limits: error, time and size that decide what is done.
         dry_run: plan, and write nothing.
-        ply: how the file is written; the unit frame and distance are filled in from the source.
+        ply: how the file is written; up, the volume's place and the distance are filled in from the source.
+        up: world axis or anatomical direction that viewers show upwards, "none", or None: `pipeline.place.up_axis`.
         report: JSON to write, "-" for standard output, None for none.
         preview: PNG to write (reference, ours, difference of a few test views), None for none.
         overwrite: replace files that exist.
@@ -78,6 +80,7 @@ class ConvertRequest:
     limits: Limits = field(default_factory=Limits)
     dry_run: bool = False
     ply: PlyOptions = field(default_factory=PlyOptions)
+    up: str | None = None
     report: str | None = None
     preview: str | None = None
     overwrite: bool = False
@@ -123,8 +126,12 @@ def convert(request: ConvertRequest, console: Console | None = None) -> Conversi
     )
     check_view_memory(plan, fit.size)
     gaussians = as_stored(mend(run, scene, start, plan, request.limits, fit))  # what is scored is what the file holds
-    scores, sheet = _score(run, scene, gaussians, request)
+    scores, sheet = _score(run, request, source, scene, gaussians)
     run.report.scores = asdict(scores)
+    if request.preview and sheet is None:
+        with run.stage("preview"):
+            axes = upright(source.volume, _ply(request, source).up)
+            sheet = preview(scene, gaussians, fit.size, axes, PREVIEW_VIEWS)
     return _finish(run, request, source, gaussians, sheet)
 
 
@@ -146,15 +153,31 @@ def _begin(run: Run, request: ConvertRequest) -> tuple[Source, Scene]:
     with run.stage("read") as stage:
         source = load(request.source)
         stage.note = describe_source(source)
+        ply = _ply(request, source)
+    for remark in remarks(source.volume, ply):
+        run.console.say(remark)
     run.compile(CONVERT if run.report.command == "convert" else INIT, source.kernel_type())
     with run.stage("scene"):
         scene = source.scene()
     run.report.volume = volume_record(source)
     run.report.transfer_function = tf_record(source, request.source)
     run.report.options = asdict(request.fit) | asdict(request.limits) | {
-        "frame": request.ply.frame, "up": request.ply.up, "sh_degree": request.ply.sh_degree,
+        "frame": ply.frame, "up": ply.up, "sh_degree": ply.sh_degree,
     }  # fmt: skip
     return source, scene
+
+
+def _ply(request: ConvertRequest, source: Source) -> PlyOptions:
+    """How the file is written, with all that follows from the source."""
+    ply = replace(
+        request.ply,
+        up=up_axis(request.up, request.ply.frame, source.volume.space),
+        unit_distance=source.unit_distance,
+        unit_distance_label=source.unit_label,
+        made_for=request.fit.size,
+        rule=request.fit.rule,
+    )
+    return placed(ply, source.volume)
 
 
 def describe_source(source: Source) -> str:
@@ -175,6 +198,7 @@ def volume_record(source: Source) -> dict[str, Any]:
         "dims": volume.dims,
         "dtype": volume.data.dtype.name,
         "spacing": volume.spacing,
+        "space": volume.space or "none",
         "range": (numbers.lo, numbers.hi),
         "nan": numbers.nan_count,
         "inf": numbers.inf_count,
@@ -225,10 +249,13 @@ def thinned(start: Start) -> tuple[Start, int]:
     return start, before - len(start.gaussians)
 
 
-def _score(run: Run, scene: Scene, gaussians: Gaussians, request: ConvertRequest) -> tuple[Scores, np.ndarray | None]:
-    """Scores on the test views, and the preview's sheet where one is asked for."""
+def _score(
+    run: Run, request: ConvertRequest, source: Source, scene: Scene, gaussians: Gaussians
+) -> tuple[Scores, np.ndarray | None]:
+    """Scores on the test views, and the preview's sheet where one is asked for and these views are the right way up."""
     from vvgt_cli.dvr import RenderSettings
 
+    straight = np.array_equal(upright(source.volume, _ply(request, source).up), np.eye(3))
     with run.stage("test views") as stage:
         scores, sheet = score_test_views(
             scene,
@@ -237,7 +264,7 @@ def _score(run: Run, scene: Scene, gaussians: Gaussians, request: ConvertRequest
             RenderSettings(),
             rule=request.fit.rule,
             perceptual=request.report is not None,
-            keep=PREVIEW_VIEWS if request.preview else (),
+            keep=PREVIEW_VIEWS if request.preview and straight else (),
             only=None if request.report else PREVIEW_VIEWS,
             progress=run.console.bar("test views"),
         )
@@ -259,16 +286,9 @@ def _finish(
     """Write the file, then the preview and the report."""
     from vvgt_cli.images import write_png
 
-    ply = replace(
-        request.ply,
-        unit_frame=source.volume.unit_frame(),
-        unit_distance=source.unit_distance,
-        unit_distance_label=source.unit_label,
-        made_for=request.fit.size,
-        rule=request.fit.rule,
-    )
     report = run.report
-    write_gaussians(run, request.output, gaussians, ply, request.overwrite)
+    out = out_of_box(gaussians, source.volume)
+    write_gaussians(run, request.output, out, _ply(request, source), request.overwrite)
     if request.preview and sheet is not None:
         write_png(request.preview, sheet, request.overwrite)
     run.finish()

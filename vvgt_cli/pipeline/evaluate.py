@@ -5,12 +5,15 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.sets import SIZE
 from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians import PlyHeader
 from vvgt_cli.jit.ahead import EVALUATE
 from vvgt_cli.pipeline.convert import describe_source, tf_record, volume_record
+from vvgt_cli.pipeline.place import into_box
 from vvgt_cli.pipeline.record import ConversionReport, Run, Stage, document
 from vvgt_cli.pipeline.render import STDIN, file_rule, open_gaussians
 from vvgt_cli.pipeline.score import psnr_note, score_test_views
@@ -86,7 +89,9 @@ def _cell(value: Any) -> str:
 
 
 def _load(request: SourceRequest, header: PlyHeader) -> Source:
-    """The source, with the file's own unit distance where none is asked for."""
+    """The source, with the file's own anatomical space and unit distance where none is asked for."""
+    if request.read.space is None and header.space == "LPS":
+        request = replace(request, read=replace(request.read, space="LPS"))
     if request.unit_distance is not None or header.unit_distance is None:
         return load(request)
     source = load(replace(request, unit_distance=repr(header.unit_distance)))
@@ -107,7 +112,10 @@ def evaluate(request: EvaluateRequest, console: Console | None = None) -> Evalua
     with run.stage("read") as stage:
         gaussians, header = open_gaussians(request.ply, run.console)
         source = _load(request.source, header)
+        gaussians = into_box(gaussians, source.volume)
         stage.note = f"{len(gaussians)} Gaussians; {describe_source(source)}"
+    if header.affine is not None and not np.allclose(header.affine, source.volume.affine[:3].ravel(), rtol=1e-6):
+        run.console.say(f"{request.ply}: its header's affine is not that of {source.volume.name}: of another volume?")
     run.compile(EVALUATE, source.kernel_type())
     with run.stage("scene"):
         scene = source.scene()

@@ -13,6 +13,7 @@ from vvgt_cli.gaussians import describe, read_ply
 from vvgt_cli.pipeline.render import STDIN
 from vvgt_cli.transfer.readers import SUFFIXES
 from vvgt_cli.volume import ReadOptions
+from vvgt_cli.volume.space import axis_facts
 
 _PLY = (b"ply\n", b"ply\r")
 _HEAD = 65536  # bytes that tell a view set from a transfer function
@@ -89,6 +90,8 @@ def _volume(file: str, read: ReadOptions) -> dict[str, Any]:
         "spacing": volume.spacing,
         "origin": volume.origin,
         "direction": volume.direction,
+        "space": volume.space or "none",
+        **axis_facts(volume.affine, volume.space),
         "extent": volume.extent,
         "scaling": [volume.slope, volume.intercept],
         "range": [numbers.lo, numbers.hi],

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import io
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vvgt_cli.cameras import default_views
+from vvgt_cli.cameras import Camera, default_views
+from vvgt_cli.cameras.boxed import drawn_in_box
 from vvgt_cli.gaussians import Gaussians, as_stored, read_ply, write_ply
+from vvgt_cli.gaussians.frames import transform
 from vvgt_cli.optimize import OptimizeOptions
 from vvgt_cli.pipeline.convert import ConvertRequest, FitOptions, convert
 from vvgt_cli.pipeline.optimize import Views, refine
@@ -28,6 +31,7 @@ if TYPE_CHECKING:
 SHARES = (64, 16, 4)  # of the budget, for the closed form at several K
 STARTS = 2  # of the budget, what the baselines begin with: they grow
 FAINT = 0.1  # opacity of 3DGS' first points
+PICTURED = (0, 4)  # test views on the page: from above, from the side
 NEIGHBOURS = 0.72  # mean distance to the three nearest of n random points, over (volume / n)^(1/3)
 
 
@@ -97,15 +101,31 @@ class Reference:
     views: Views
     step: float  # voxels
     rays: int  # a pixel, at most
+    axes: np.ndarray  # (3, 3) `Volume.axes`: from the box frame, in which the views are, to the unit frame
+    shown: list[np.ndarray]  # as `upright` makes them
 
     @classmethod
     def render(cls, scene: Scene, size: int, console: Console) -> Reference:
         """The test views as `vvgt evaluate` has them."""
-        from vvgt_cli.dvr import REFERENCE, render_views
+        from vvgt_cli.dvr import REFERENCE, render_view, render_views
 
-        cameras = default_views("test", size=size)
+        cameras, axes = default_views("test", size=size), scene.volume.axes
         images = render_views(scene, cameras, REFERENCE, progress=console.bar("reference"))
-        return cls(Views(cameras, images), REFERENCE.step, max(rays for _, rays in REFERENCE.tiers))
+        shown = upright(images, cameras, axes, lambda camera: render_view(scene, camera, REFERENCE))
+        return cls(Views(cameras, images), REFERENCE.step, max(rays for _, rays in REFERENCE.tiers), axes, shown)
+
+
+def upright(
+    images: np.ndarray | Sequence[np.ndarray],
+    cameras: Sequence[Camera],
+    axes: np.ndarray,
+    draw: Callable[[Camera], np.ndarray],
+) -> list[np.ndarray]:
+    """Images of the box frame for people: those of `PICTURED` drawn anew in the unit frame, where that is another."""
+    if np.array_equal(axes, np.eye(3)):
+        return list(images)
+    see = drawn_in_box(draw, axes)
+    return [see(cameras[n]) if n in PICTURED else image for n, image in enumerate(images)]
 
 
 def climb(
@@ -121,30 +141,31 @@ def climb(
     from vvgt_cli.splat import render
 
     for rung in rungs(options):
-        report, gaussians = _run(source, rung)
+        report, gaussians = _run(source, rung, reference.axes)
         if report.refinement and report.refinement["reason"] == "interrupted":
             raise KeyboardInterrupt
         images = [render(gaussians, camera) for camera in reference.views.cameras]
         report.scores = asdict(score_views(reference.views.images, images))
         views = views_of(rung.fit.steps or 0)
         run = {"name": rung.name, "label": rung.label, "kind": rung.kind, "views": views, **asdict(report)}
-        yield run, images
+        yield run, upright(images, reference.views.cameras, reference.axes, partial(render, gaussians))
 
 
 def warm_up(source: SourceRequest, options: LadderOptions) -> None:
     """Run every kind of rung once at next to no size: kernels are compiled or loaded before any clock starts."""
     few = LadderOptions(100, 64, (2,) if options.steps else (), options.model, options.seed)
     for rung in rungs(few)[-4:]:
-        _run(source, rung)
+        _run(source, rung, np.eye(3))
 
 
-def _run(source: SourceRequest, rung: Rung) -> tuple[ConversionReport, Gaussians]:
+def _run(source: SourceRequest, rung: Rung, axes: np.ndarray) -> tuple[ConversionReport, Gaussians]:
+    """What became of it, Gaussians in the box frame; ``axes`` as `Reference` has them."""
     if rung.kind == "baseline":
         return _baseline(source, rung)
     with tempfile.TemporaryDirectory() as folder:
         path = str(Path(folder) / "rung.ply")
-        report = convert(ConvertRequest(source, path, rung.fit), Console(quiet=True))
-        return report, read_ply(path)[0]
+        report = convert(ConvertRequest(source, path, rung.fit, up="none"), Console(quiet=True))
+        return report, transform(read_ply(path)[0], np.linalg.inv(axes))
 
 
 def _begin(source: SourceRequest, rung: Rung) -> tuple[Run, Scene]:

@@ -94,6 +94,8 @@ def layout_of(header: PlyHeader) -> PlyOptions:
         unit_distance_label=header.unit_distance_label or "given",
         made_for=header.made_for,
         rule=header.rule,
+        space=header.space or "none",
+        affine=header.affine,
     )
 
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from vvgt_cli import __version__
 from vvgt_cli.cameras import Camera, default_views, orbit_views
+from vvgt_cli.cameras.boxed import drawn_in_box
 from vvgt_cli.cameras.files import read_frames
 from vvgt_cli.cameras.sets import FIELD_OF_VIEW, RADIUS, SET_VIEWS, SIZE
 from vvgt_cli.errors import DataError, UsageError
@@ -24,6 +25,8 @@ from vvgt_cli.pipeline.record import ConversionReport, Run
 from vvgt_cli.pipeline.source import Source, SourceRequest, load_all
 from vvgt_cli.pipeline.view_files import CONTACT, Layout, View, start_points, thumbnails
 from vvgt_cli.progress import Console
+from vvgt_cli.volume.space import shear_text
+from vvgt_cli.volume.types import IDENTITY
 
 SPHERE, ORBIT = "sphere", "orbit"
 
@@ -179,6 +182,11 @@ def render_view_sets(request: ViewsRequest, console: Console | None = None) -> i
     with run.stage("read") as stage:
         sources = load_all(request.source, request.tfs or (None,))
         volume = sources[0].volume
+        if volume.sheared:
+            raise DataError(
+                f"{volume.name}: {shear_text(volume.axes)}; expected right angles: no pinhole camera sees a sheared "
+                "volume; resample it first ('vvgt convert' takes it)"
+            )
         stage.note = f"{volume.name}: {' x '.join(map(str, volume.dims))} {volume.data.dtype.name}"
     run.compile(VIEWS, sources[0].kernel_type())
     with run.stage("plan") as stage:
@@ -203,6 +211,7 @@ def _settings(request: ViewsRequest, views: Sequence[View], source: Source, cont
         "test_views": len(cameras["test"]),
         "size": ", ".join(sizes),
         "cameras": cameras_digest(cameras["train"] + cameras["test"]),
+        **({} if source.volume.direction == IDENTITY else {"direction": list(source.volume.direction)}),
         "renderer": request.renderer,
         "samples": 1 if request.renderer == "vtk" else request.samples or "adaptive",
         "step": request.step,
@@ -242,7 +251,8 @@ def _work(run: Run, request: ViewsRequest, job: _Job, views: list[View]) -> None
             scene = job.source.scene()
             stage.note = f"{job.source.tf.name}, opacity per {job.source.unit_distance:g} ({job.source.unit_label})"
     if job.pending:
-        draw = view_renderer(request.renderer, scene, RenderSettings(request.step, request.samples))
+        inside = view_renderer(request.renderer, scene, RenderSettings(request.step, request.samples))
+        draw = drawn_in_box(inside, scene.volume.axes)
     if models:
         with run.stage("points") as stage:
             points, colors = start_points(scene, views[0].camera.height)

@@ -16,7 +16,7 @@ from vvgt_cli.errors import UsageError
 from vvgt_cli.network.card import find_model
 from vvgt_cli.pipeline.convert import describe_source, tf_record, volume_record
 from vvgt_cli.pipeline.infer import SHIPPED
-from vvgt_cli.pipeline.ladder import LadderOptions, Reference, climb, pictures, rungs, warm_up
+from vvgt_cli.pipeline.ladder import PICTURED, LadderOptions, Reference, climb, pictures, rungs, warm_up
 from vvgt_cli.pipeline.outputs import STDOUT, Output, check_outputs, write_text
 from vvgt_cli.pipeline.record import document
 from vvgt_cli.pipeline.source import SourceRequest, load
@@ -26,7 +26,6 @@ from vvgt_cli.report.plots import FILES, write_plots
 from vvgt_cli.report.runs import Series, cost, front, knee, psnr, read_series, table, unit_costs
 from vvgt_cli.volume.blocks import check_memory
 
-PICTURED = (0, 4)  # test views on the page: from above, from the side
 PAGE, TABLE, DATA = "report.html", "report.csv", "report.json"
 VIEW_BYTES = 16  # a pixel: float32 RGBA
 
@@ -80,7 +79,7 @@ def report(request: ReportRequest, console: Console | None = None) -> dict[str, 
     text = document("vvgt-report", _document(request, source, reference, runs))
     found: dict[str, Any] = json.loads(text)
     series = [Series(source.volume.name, runs, found)]
-    shown = _pngs(pictures(reference.views.images, PICTURED, request.picture_size))
+    shown = _pngs(pictures(reference.shown, PICTURED, request.picture_size))
     folder.mkdir(exist_ok=True)
     write_text(str(folder / DATA), text, request.overwrite)
     title = f"Error against run time: {source.volume.name}"

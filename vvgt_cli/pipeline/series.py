@@ -17,6 +17,7 @@ from vvgt_cli.network.card import CARD, find_model
 from vvgt_cli.pipeline.convert import ConvertRequest, convert
 from vvgt_cli.pipeline.manifest import Manifest, Shard, digest, volume_digest
 from vvgt_cli.pipeline.outputs import check_outputs
+from vvgt_cli.pipeline.place import up_axis
 from vvgt_cli.pipeline.record import ConversionReport, Run
 from vvgt_cli.pipeline.source import SourceRequest
 from vvgt_cli.progress import Console
@@ -93,12 +94,13 @@ def survey(files: list[Path], read: ReadOptions, console: Console) -> Frames:
 
 
 def _grid(volume: Volume) -> tuple[Any, ...]:
-    return volume.dims, volume.spacing, volume.origin
+    return volume.dims, volume.spacing, volume.origin, volume.direction, volume.space
 
 
 def _grid_text(volume: Volume) -> str:
-    numbers = (" ".join(f"{value:g}" for value in values) for values in (volume.spacing, volume.origin))
-    return " x ".join(map(str, volume.dims)) + " voxels of {} from {}".format(*numbers)
+    parts = (volume.spacing, volume.origin, volume.direction)
+    numbers = (" ".join(f"{value:g}" for value in values) for values in parts)
+    return " x ".join(map(str, volume.dims)) + " voxels of {} from {} along {}".format(*numbers)
 
 
 def together(parts: Sequence[Statistics]) -> Statistics:
@@ -237,6 +239,8 @@ def _settings(request: ConvertRequest, frames: Frames, tf: TransferFunction, dis
         **asdict(request.fit),
         **asdict(request.limits),
         "model": read_text(find_model(request.fit.model) / CARD) if request.fit.model else None,
-        **{key: ply[key] for key in ("frame", "up", "sh_degree", "comments")},
+        **{key: ply[key] for key in ("frame", "sh_degree", "comments")},
+        "up": up_axis(request.up, request.ply.frame, frames.first.space),
+        "place": [frames.first.space, *frames.first.affine[:3].ravel().tolist()],
         "outputs": [Path(p).name for p in (request.output, request.report, request.preview) if p],
     }

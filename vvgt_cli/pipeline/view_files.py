@@ -120,7 +120,7 @@ class Layout:
 
 
 def start_points(scene: Scene, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Centres and colours of the closed form's Gaussians, (n, 3) each; none where no view sees anything.
+    """Centres (unit frame) and colours of the closed form's Gaussians, (n, 3) each; none where no view sees anything.
 
     Args:
         scene: the volume under its function.
@@ -132,7 +132,7 @@ def start_points(scene: Scene, size: int) -> tuple[np.ndarray, np.ndarray]:
     gaussians = closed_form(scene, POINTS, max(size // COARSER, 1), cameras).gaussians()
     if not len(gaussians):  # what is thinner than these views' pixels
         gaussians = closed_form(scene, POINTS, size).gaussians()
-    return gaussians.means.astype(np.float64), np.clip(gaussians.colors, 0, 1)
+    return gaussians.means.astype(np.float64) @ scene.volume.axes.T, np.clip(gaussians.colors, 0, 1)
 
 
 def thumbnails(folder: Path, views: Sequence[View], background: Sequence[float]) -> np.ndarray:

@@ -90,17 +90,14 @@ def read_dicom(path: Path, options: ReadOptions) -> Volume:
         headers = [(file, header) for file, header in headers if "Rows" in header and "Columns" in header]
         title, chosen = _series(headers, options.array, path)
         slices = _ordered([s for file, header in chosen for s in _frames(file, header)], path)
-        spacing = _spacing(slices, path)
+        spacing, direction = _steps(slices, path)
         values, (slope, intercept) = _pixels(pydicom, slices, path)
     field, (slope, intercept) = select_component(
         values, options.component, str(path), label="each pixel", scaling=(slope, intercept)
     )
-    first = slices[0]
-    across, down = first.rows
-    direction = np.column_stack([across, down, np.cross(across, down)]).ravel()
     return Volume(
-        field, options.spacing_or(spacing), tuple(first.position.tolist()), tuple(direction.tolist()),
-        f"{path.resolve().name.removesuffix('.dcm')}{title}", slope, intercept,
+        field, options.spacing_or(spacing), tuple(slices[0].position.tolist()), direction,
+        f"{path.resolve().name.removesuffix('.dcm')}{title}", slope, intercept, "LPS",
     )  # type: ignore[arg-type]  # fmt: skip
 
 
@@ -181,14 +178,14 @@ def _ordered(slices: list[_Slice], path: Path) -> list[_Slice]:
     return sorted(slices, key=lambda s: float(s.position @ normal))
 
 
-def _spacing(slices: list[_Slice], path: Path) -> tuple[float, float, float]:
-    """(x, y, z) with z from the positions."""
+def _steps(slices: list[_Slice], path: Path) -> tuple[tuple[float, float, float], tuple[float, ...]]:
+    """Spacing (x, y, z) and direction (row-major) from the positions; slices that shift sideways evenly are sheared."""
     first = slices[0]
-    if len(slices) == 1:
-        thickness = first.header.get("SliceThickness")
-        return (*first.spacing, float(thickness or first.spacing[0]))
-    positions = np.array([s.position for s in slices])
     normal = np.cross(first.rows[0], first.rows[1])
+    if len(slices) == 1:
+        thickness = float(first.header.get("SliceThickness") or first.spacing[0])
+        return (*first.spacing, thickness), _direction(first, normal)
+    positions = np.array([s.position for s in slices])
     steps = np.diff(positions @ normal)
     step = float(np.median(steps))
     if step <= 0 or steps.min() < EVEN * step:
@@ -202,10 +199,19 @@ def _spacing(slices: list[_Slice], path: Path) -> tuple[float, float, float]:
             f"{path}: slices {steps.min():g} to {steps.max():g} mm apart (at {slices[worst].path.name}); expected even "
             "distances: is a slice missing?"
         )
-    sideways = positions - positions[0] - np.outer((positions - positions[0]) @ normal, normal)
-    if np.abs(sideways).max() > EVEN * max(step, *first.spacing) * len(slices):
-        raise DataError(f"{path}: slices shift sideways (a tilted gantry); expected them above each other")
-    return (*first.spacing, step)
+    along = (positions[-1] - positions[0]) / (len(slices) - 1)
+    uneven = positions - positions[0] - np.arange(len(slices))[:, None] * along
+    uneven -= np.outer(uneven @ normal, normal)
+    if np.abs(uneven).max() > EVEN * max(step, *first.spacing) * len(slices):
+        raise DataError(
+            f"{path}: slices shift sideways unevenly; expected them above each other, or tilted by one angle"
+        )
+    length = float(np.linalg.norm(along))
+    return (*first.spacing, length), _direction(first, along / length)
+
+
+def _direction(first: _Slice, third: np.ndarray) -> tuple[float, ...]:
+    return tuple(np.column_stack([*first.rows, third]).ravel().tolist())
 
 
 def _pixels(pydicom: Any, slices: list[_Slice], path: Path) -> tuple[np.ndarray, tuple[float, float]]:

@@ -13,10 +13,10 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import data_file, load_block
 from vvgt_cli.volume.components import select_component
-from vvgt_cli.volume.headers import MAX_HEADER, Fields
+from vvgt_cli.volume.headers import MAX_HEADER, Fields, unit_rows
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.registry import Reader, register, volume_name
-from vvgt_cli.volume.types import IDENTITY, Volume
+from vvgt_cli.volume.types import Volume
 
 # MET_LONG has 4 bytes whatever the machine (MetaIO, metaTypes.h).
 _TYPES = {
@@ -69,25 +69,31 @@ def _dtype(fields: Fields) -> np.dtype:
     return np.dtype(_TYPES[name]).newbyteorder(">" if big else "<")
 
 
-def _geometry(fields: Fields, n: int) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
-    """Spacing (x, y, z), direction (row-major; TransformMatrix lists the axes one after the other) and origin."""
+def _geometry(fields: Fields, n: int) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...], str | None]:
+    """Spacing (x, y, z), direction (row-major; TransformMatrix lists the axes one after the other), origin and space.
+
+    The space is LPS where the header names an orientation or gives axes, as ITK has it whatever the letters are.
+    """
     spacing: tuple[float, ...] = (1.0,) * 3
     for key in ("elementspacing", "elementsize"):
         if key in fields:
             spacing = (*fields.floats(key, fields[key], min(n, 3)), 1.0)[:3]
             break
-    direction: tuple[float, ...] = IDENTITY
+    rows = np.eye(3)  # directions of the axes, one after the other
+    space = "LPS" if fields.get("anatomicalorientation", "?").strip("? ") else None
     for key in ("transformmatrix", "rotation", "orientation"):
-        if key in fields and n == 3:
-            m = fields.floats(key, fields[key], 9)
-            direction = tuple(m[column * 3 + row] for row in range(3) for column in range(3))
+        if key in fields:
+            rows[: min(n, 3), : min(n, 3)] = np.reshape(fields.floats(key, fields[key], n * n), (n, n))[:3, :3]
+            if fields.get("anatomicalorientation", "LPS").strip("? "):
+                space = "LPS"
             break
     origin: tuple[float, ...] = (0.0,) * 3
     for key in ("offset", "position", "origin"):
         if key in fields:
             origin = (*fields.floats(key, fields[key], min(n, 3)), 0.0)[:3]
             break
-    return spacing, direction, origin
+    lengths, direction = unit_rows((rows * np.where(np.array(spacing) < 0, -1.0, 1.0)[:, None]).tolist())
+    return tuple(abs(s) * length for s, length in zip(spacing, lengths, strict=True)), direction, origin, space
 
 
 def read_metaimage(path: Path, options: ReadOptions) -> Volume:
@@ -121,8 +127,8 @@ def read_metaimage(path: Path, options: ReadOptions) -> Volume:
     elif len(sizes) == 2:
         block = block[None]
     field, _ = select_component(block, options.component, str(path))
-    spacing, direction, origin = _geometry(fields, len(sizes))
-    return Volume(field, options.spacing_or(spacing), origin, direction, volume_name(path))  # type: ignore[arg-type]
+    spacing, direction, origin, space = _geometry(fields, len(sizes))
+    return Volume(field, options.spacing_or(spacing), origin, direction, volume_name(path), space=space)  # type: ignore[arg-type]
 
 
 def _load(fields: Fields, source: Path, dtype: np.dtype, shape: tuple[int, ...], start: int) -> np.ndarray:

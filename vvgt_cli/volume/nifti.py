@@ -21,7 +21,7 @@ from vvgt_cli.volume.components import select_component
 from vvgt_cli.volume.headers import unit_rows
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.registry import Reader, register, volume_name
-from vvgt_cli.volume.types import IDENTITY, Volume
+from vvgt_cli.volume.types import FLAT, IDENTITY, Volume
 
 _DTYPES = {
     2: "u1",
@@ -60,6 +60,7 @@ class Header:
     pixdim: tuple[float, ...]
     qform: tuple[float, ...] | None
     sform: tuple[float, ...] | None
+    unit: float = 1.0  # mm
 
 
 def _order(head: bytes) -> tuple[str, int] | None:
@@ -95,12 +96,12 @@ def parse_header(head: bytes, name: str) -> Header:
         magic, dim, (code,), pixdim = head[344:348], get("8h", 40), get("h", 70), get("8f", 76)
         offset, slope, intercept = get("3f", 108)
         q_code, s_code = get("2h", 252)
-        quatern, sform = get("6f", 256), get("12f", 280)
+        quatern, sform, units = get("6f", 256), get("12f", 280), head[123]
     else:
         magic, dim, (code,), pixdim = head[4:8], get("8q", 16), get("h", 12), get("8d", 104)
         (offset,), (slope, intercept) = get("q", 168), get("2d", 176)
         q_code, s_code = get("2i", 344)
-        quatern, sform = get("6d", 352), get("12d", 400)
+        quatern, sform, (units,) = get("6d", 352), get("12d", 400), get("i", 500)
     if not 1 <= dim[0] <= 7 or min(dim[1 : dim[0] + 1]) < 1:
         raise DataError(f"{name}: dim {dim}; expected 1 to 7 axes of at least 1 voxel each")
     if code not in _DTYPES:
@@ -123,6 +124,7 @@ def parse_header(head: bytes, name: str) -> Header:
         pixdim,
         quatern if q_code > 0 else None,
         sform if s_code > 0 else None,
+        {1: 1e3, 3: 1e-3}.get(units & 7, 1.0),  # metres, micrometres
     )
 
 
@@ -135,23 +137,42 @@ def _scaling(slope: float, intercept: float, name: str) -> tuple[float, float]:
     return slope, intercept
 
 
-def _orientation(header: Header) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Direction (row-major) and origin: sform, else qform, else none (nifti1.h, methods 3, 2, 1)."""
+def _place(header: Header) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...], str | None]:
+    """Spacing, direction (row-major), origin and space: sform, else qform, else pixdim (nifti1.h, methods 3, 2, 1).
+
+    A form that is not finite, or whose axes lie in a plane, is passed over. Of pixdim alone no space is known.
+    """
+    steps = tuple(abs(p) for p in header.pixdim[1:4])
     if header.sform is not None and all(map(math.isfinite, header.sform)):
         m = header.sform
-        columns = [[m[4 * row + column] for row in range(3)] for column in range(3)]
-        return unit_rows(columns)[1], (m[3], m[7], m[11])
+        lengths, direction = unit_rows([[m[4 * row + column] for row in range(3)] for column in range(3)])
+        if min(lengths) > 0 and abs(np.linalg.det(np.reshape(direction, (3, 3)))) > FLAT:
+            return _in_mm(header, lengths), direction, _in_mm(header, (m[3], m[7], m[11])), "RAS"
     if header.qform is not None and all(map(math.isfinite, header.qform)):
-        b, c, d, *origin = header.qform
-        a = math.sqrt(max(0.0, 1.0 - (b * b + c * c + d * d)))
-        flip = -1.0 if header.pixdim[0] < 0 else 1.0
-        rows = (
-            (a * a + b * b - c * c - d * d, 2 * (b * c - a * d), flip * 2 * (b * d + a * c)),
-            (2 * (b * c + a * d), a * a + c * c - b * b - d * d, flip * 2 * (c * d - a * b)),
-            (2 * (b * d - a * c), 2 * (c * d + a * b), flip * (a * a + d * d - b * b - c * c)),
-        )
-        return tuple(v for row in rows for v in row), tuple(origin)
-    return IDENTITY, (0.0, 0.0, 0.0)
+        return _in_mm(header, steps), _rotation(header), _in_mm(header, header.qform[3:]), "RAS"
+    return steps, IDENTITY, (0.0, 0.0, 0.0), None
+
+
+def _in_mm(header: Header, lengths: tuple[float, ...]) -> tuple[float, ...]:
+    return tuple(header.unit * length for length in lengths)
+
+
+def _rotation(header: Header) -> tuple[float, ...]:
+    """Row-major, of the quaternion (a, b, c, d) with a >= 0; pixdim[0] < 0 turns the third axis round."""
+    assert header.qform is not None
+    b, c, d = header.qform[:3]
+    rest = 1.0 - (b * b + c * c + d * d)
+    a = math.sqrt(max(0.0, rest))
+    if rest < 1e-7:  # half a turn, rounded: nifti1_io.c makes a unit of the other three
+        length = math.hypot(b, c, d)
+        a, b, c, d = 0.0, b / length, c / length, d / length
+    flip = -1.0 if header.pixdim[0] < 0 else 1.0
+    rows = (
+        (a * a + b * b - c * c - d * d, 2 * (b * c - a * d), flip * 2 * (b * d + a * c)),
+        (2 * (b * c + a * d), a * a + c * c - b * b - d * d, flip * 2 * (c * d - a * b)),
+        (2 * (b * d - a * c), 2 * (c * d + a * b), flip * (a * a + d * d - b * b - c * c)),
+    )
+    return tuple(v for row in rows for v in row)
 
 
 def _read_head(path: Path) -> tuple[bytes, bool]:
@@ -179,7 +200,7 @@ def _image_file(path: Path) -> tuple[Path, bool]:
 def read_nifti(path: Path, options: ReadOptions) -> Volume:
     """Read a NIfTI file. Axes beyond the third (time, vectors) are components; plain files are memory-mapped.
 
-    Spacing is pixdim's; sform or qform give direction and origin (metadata); slope and intercept go into the volume.
+    sform, else qform, else pixdim say where voxels are; slope and intercept go into the volume.
 
     Raises:
         DataError: a header that is damaged or does not fit the data, colours or complex values.
@@ -208,8 +229,8 @@ def read_nifti(path: Path, options: ReadOptions) -> Volume:
         label="the series" if rest > 1 else "",
         scaling=(header.slope, header.intercept),
     )
-    steps = tuple(p if n > 1 or p else 1.0 for p, n in zip(header.pixdim[1:4], spatial, strict=True))
-    direction, origin = _orientation(header)
+    spacing, direction, origin, space = _place(header)
+    steps = tuple(s if n > 1 or s else 1.0 for s, n in zip(spacing, spatial, strict=True))
     return Volume(
         field,
         options.spacing_or(steps),
@@ -218,6 +239,7 @@ def read_nifti(path: Path, options: ReadOptions) -> Volume:
         volume_name(path),
         slope,
         intercept,
+        space,
     )
 
 

@@ -18,7 +18,8 @@ from vvgt_cli.volume.headers import MAX_HEADER, Fields, unit_rows
 from vvgt_cli.volume.nrrd_files import data_names, load_files
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.registry import Reader, register, volume_name
-from vvgt_cli.volume.types import IDENTITY, Volume
+from vvgt_cli.volume.space import millimetres
+from vvgt_cli.volume.types import Volume
 
 _TYPES = {
     "i1": "signed char, int8, int8_t",
@@ -121,24 +122,48 @@ def _component_axis(fields: Fields, sizes: list[int], vectors: list[list[float] 
 
 
 def _geometry(
-    fields: Fields, vectors: list[list[float] | None] | None, axis: int | None, n: int
-) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
-    """Spacing (x, y, z), direction (row-major) and origin."""
-    spacing: tuple[float, ...] = (1.0,) * 3
-    direction: tuple[float, ...] = IDENTITY
+    fields: Fields, vectors: list[list[float] | None] | None, axis: int | None
+) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...], str | None]:
+    """Spacing (x, y, z), direction (row-major), origin and space.
+
+    Coordinates of left-handed spaces (left-anterior-superior, 3D-left-handed) are made right-handed ones.
+    """
+    axes = np.eye(3)  # rows: world vectors of a step along x, y, z
     if vectors is not None:
         spatial = [v for k, v in enumerate(vectors) if k != axis and v is not None]
-        if len(spatial) == 2:
-            spatial.append([0.0, 0.0, 1.0])
-        spacing, direction = unit_rows(spatial)
+        axes = np.array(spatial if len(spatial) == 3 else [*spatial, _third(spatial)])
     elif "spacings" in fields:
         words = [w for k, w in enumerate(fields["spacings"].split()) if k != axis]
         values = fields.floats("spacings", " ".join("1" if w.lower() == "nan" else w for w in words))
-        spacing = (*values, 1.0, 1.0)[:3]
-    origin: tuple[float, ...] = (0.0,) * 3
+        axes = np.diag((*values, 1.0, 1.0)[:3])
+    origin = np.zeros(3)
     if "space origin" in fields and "none" not in fields["space origin"]:
-        origin = (*fields.floats("space origin", fields["space origin"].strip("() ")), 0.0, 0.0)[:3]
-    return spacing, direction, origin
+        origin = np.array((*fields.floats("space origin", fields["space origin"].strip("() ")), 0.0, 0.0)[:3])
+    signs, space = _space(fields) if vectors is not None else (np.ones(3), None)  # space directions say where axes run
+    if space is not None:
+        units = [word.strip('"') for word in fields.get("space units", "").split()]
+        signs = signs * ([millimetres(unit) for unit in units] if len(units) == 3 else 1.0)
+    lengths, direction = unit_rows((axes * signs).tolist())
+    return lengths, direction, tuple((origin * signs + 0.0).tolist()), space
+
+
+def _third(axes: list[list[float]]) -> np.ndarray:
+    """A unit vector at right angles to the first two axes, for a volume of two."""
+    unit = np.reshape(unit_rows([*axes, [0.0, 0.0, 1.0]])[1], (3, 3)).T
+    normal = np.cross(unit[0], unit[1])
+    length = np.linalg.norm(normal)
+    return normal / length if length > 0 else unit[2]
+
+
+def _space(fields: Fields) -> tuple[np.ndarray, str | None]:
+    """Signs that make the file's coordinates right-handed, and the anatomical space that they then are in."""
+    name = fields.get("space", "").lower().removesuffix("-time")
+    letters = "".join(word[:1] for word in name.split("-")) if name.count("-") == 2 else name
+    if letters in ("ras", "lps"):
+        return np.ones(3), letters.upper()
+    if letters in ("las", "rps"):
+        return np.array([-1.0, 1.0, 1.0]), "RAS" if letters == "las" else "LPS"
+    return np.array([1.0, 1.0, -1.0 if name == "3d-left-handed" else 1.0]), None
 
 
 def _line_skip(path: Path, offset: int, lines: int) -> int:
@@ -194,8 +219,8 @@ def _volume(path: Path, fields: Fields, block: np.ndarray, sizes: list[int], opt
     if block.ndim == 3:
         block = block[None]
     field, _ = select_component(block, options.component, str(path), label=f"axis {axis}" if axis is not None else "")
-    spacing, direction, origin = _geometry(fields, vectors, axis, len(sizes))
-    return Volume(field, options.spacing_or(spacing), origin, direction, volume_name(path))  # type: ignore[arg-type]
+    spacing, direction, origin, space = _geometry(fields, vectors, axis)
+    return Volume(field, options.spacing_or(spacing), origin, direction, volume_name(path), space=space)  # type: ignore[arg-type]
 
 
 register(Reader("NRRD", (".nrrd", ".nhdr"), lambda head: head.startswith(b"NRRD000"), read_nrrd))

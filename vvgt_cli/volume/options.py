@@ -48,6 +48,7 @@ class ReadOptions:
         spacing: voxel edges (x, y, z) in world units; overrides the file's.
         array: name of the array (path of a dataset, series of a DICOM folder), for formats that hold several.
         component: index of a component, or ``magnitude``, for arrays that have several.
+        space: anatomical space to bring the volume to, ``RAS`` or ``LPS``; None: RAS where its file states one.
 
     Raises:
         UsageError: a value out of its range.
@@ -60,6 +61,7 @@ class ReadOptions:
     spacing: tuple[float, float, float] | None = None
     array: str | None = None
     component: int | str | None = None
+    space: str | None = None
 
     def __post_init__(self) -> None:
         if self.dims is not None and (len(self.dims) != 3 or min(self.dims) < 1):
@@ -74,6 +76,8 @@ class ReadOptions:
             len(self.spacing) == 3 and all(math.isfinite(s) and s > 0 for s in self.spacing)
         ):
             raise UsageError(f"--spacing {self.spacing}: expected three positive numbers, as --spacing 1 1 2.5")
+        if self.space not in (None, "RAS", "LPS"):
+            raise UsageError(f"--space {self.space}: expected RAS or LPS")
         component = self.component
         if isinstance(component, str) and component != "magnitude":
             raise UsageError(f"--component {component}: expected an index (0, 1, ...) or magnitude")

@@ -17,6 +17,7 @@ from pathlib import Path
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.space import in_space
 from vvgt_cli.volume.types import Volume
 
 HEAD_BYTES = 4096
@@ -96,13 +97,19 @@ def read_volume(source: str, options: ReadOptions | None = None) -> Volume:
         options: see `ReadOptions`.
 
     Returns:
-        The volume; memory-mapped where the format stores plain values.
+        The volume; memory-mapped where the format stores plain values. Where its file states an anatomical space, it
+        is in the one that the options name, else in RAS.
 
     Raises:
         DataError: no such file, an unknown format, a damaged file, sizes that do not fit.
         UsageError: options that the format does not take, or a choice (array, component, dims) that is missing.
     """
     options = options or ReadOptions()
+    return in_space(_read(source, options), options.space)
+
+
+def _read(source: str, options: ReadOptions) -> Volume:
+    """The volume in its format's own space."""
     if source == "-":
         from vvgt_cli.volume.raw import read_stdin
 

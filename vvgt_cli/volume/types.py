@@ -1,4 +1,4 @@
-"""`Volume`: a scalar field on a regular grid, and the unit frame that every stage works in."""
+"""`Volume`: a scalar field on a regular grid, and the box frame that every stage works in."""
 
 from __future__ import annotations
 
@@ -10,17 +10,22 @@ import numpy as np
 from vvgt_cli.errors import DataError
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+FLAT = 1e-3  # volume of the parallelepiped of three unit axes, below which they lie in a plane
+RIGHT = 1e-4  # cosine up to which axes are at right angles
 
 
 @dataclass(frozen=True)
 class UnitFrame:
-    """Box-centred frame with longest edge 2: ``unit = (index_xyz + 0.5) * step - half``.
+    """Box-centred frame with longest edge 2 along the index axes: ``box = (index_xyz + 0.5) * step - half``.
+
+    The unit frame of files is the same turned to world directions: ``unit = axes @ box = scale * (world - centre)``,
+    with `Volume.axes`.
 
     Attributes:
         scale: unit-frame lengths per world length (1 / world unit).
         half: half extents of the box in the unit frame, (x, y, z).
         step: voxel edge in the unit frame, (x, y, z).
-        centre: box centre in index axes x spacing + origin (world units), (x, y, z).
+        centre: box centre in the world, (x, y, z).
     """
 
     scale: float
@@ -38,12 +43,14 @@ class Volume:
             and byte order. The data value is ``slope * stored + intercept``.
         spacing: voxel edge (x, y, z) in world units, each > 0.
         origin: world position of the centre of voxel (0, 0, 0), (x, y, z).
-        direction: 3 x 3 direction cosines, row-major; metadata only.
+        direction: 3 x 3 row-major, its columns the world directions (unit vectors) of the index axes i, j, k; of any
+            handedness, and at any angles to each other but in a plane.
         name: short name for reports.
         slope, intercept: stored-value scaling (NIfTI, DICOM), slope finite and not 0.
+        space: anatomical space that direction and origin are in, "RAS" or "LPS", None where there is none.
 
     Raises:
-        DataError: wrong rank, empty axis, dtype that is not real, spacing not finite and positive.
+        DataError: wrong rank, empty axis, dtype that is not real, spacing not finite and positive, axes in a plane.
     """
 
     data: np.ndarray
@@ -53,6 +60,7 @@ class Volume:
     name: str = "volume"
     slope: float = 1.0
     intercept: float = 0.0
+    space: str | None = None
 
     def __post_init__(self) -> None:
         if self.data.ndim != 3 or min(self.data.shape) < 1:
@@ -67,6 +75,12 @@ class Volume:
             raise DataError(
                 f"{self.name}: value scaling {self.slope} * stored + {self.intercept}; expected finite, slope not 0"
             )
+        place = np.array([*self.direction, *self.origin], dtype=np.float64)
+        if place.shape != (12,) or not np.isfinite(place).all() or abs(np.linalg.det(self.axes)) < FLAT:
+            raise DataError(
+                f"{self.name}: direction {self.direction}, origin {self.origin}; expected finite numbers and axes that "
+                "do not lie in a plane"
+            )
 
     @property
     def dims(self) -> tuple[int, int, int]:
@@ -79,11 +93,34 @@ class Volume:
         """Edges of the box (x, y, z) in world units; it reaches half a voxel beyond the outer centres."""
         return tuple(n * s for n, s in zip(self.dims, self.spacing, strict=True))  # type: ignore[return-value]
 
+    @property
+    def axes(self) -> np.ndarray:
+        """(3, 3) float64, columns: world directions of the index axes; takes the box frame to the unit frame."""
+        return np.array(self.direction, dtype=np.float64).reshape(3, 3)
+
+    @property
+    def affine(self) -> np.ndarray:
+        """(4, 4) float64: (i, j, k, 1) of a voxel centre to its world position."""
+        matrix = np.eye(4)
+        matrix[:3, :3] = self.axes * np.array(self.spacing)
+        matrix[:3, 3] = self.origin
+        return matrix
+
+    @property
+    def sheared(self) -> bool:
+        """Whether the index axes are not at right angles (a tilted gantry)."""
+        axes = self.axes
+        return bool(np.abs(axes.T @ axes - np.eye(3)).max() > RIGHT)
+
     def unit_frame(self) -> UnitFrame:
-        """The frame that cameras and Gaussians live in (conventions: Space)."""
+        """The frame that cameras and Gaussians of a run live in (conventions: Space)."""
         extent = self.extent
         scale = 2.0 / max(extent)
         half = tuple(e * scale / 2 for e in extent)
         step = tuple(s * scale for s in self.spacing)
-        centre = tuple(o + (n - 1) * s / 2 for o, n, s in zip(self.origin, self.dims, self.spacing, strict=True))
+        middle = [(n - 1) * s / 2 for n, s in zip(self.dims, self.spacing, strict=True)]
+        rows = (self.direction[3 * r : 3 * r + 3] for r in range(3))
+        centre = tuple(
+            o + sum(d * m for d, m in zip(row, middle, strict=True)) for o, row in zip(self.origin, rows, strict=True)
+        )
         return UnitFrame(scale, half, step, centre)  # type: ignore[arg-type]

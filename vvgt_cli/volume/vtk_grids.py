@@ -16,6 +16,7 @@ import numpy as np
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.blocks import check_memory, count, size_text
 from vvgt_cli.volume.components import ArrayInfo, choose_array, select_component
+from vvgt_cli.volume.headers import unit_rows
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.registry import Reader, register, volume_name
 from vvgt_cli.volume.resample import resample
@@ -194,8 +195,8 @@ def _image(image: Any, info: ArrayInfo, path: Path, options: ReadOptions) -> Vol
     origin = np.array(image.GetOrigin()) + direction @ (low * spacing)
     values = _values(image, info).reshape(*dims[::-1], info.components)
     field, _ = select_component(values, options.component, str(path), label=f"array {info.name!r}")
-    place = tuple(origin.tolist()), tuple(direction.ravel().tolist())
-    return Volume(field, options.spacing_or(tuple(spacing)), *place, volume_name(path))  # type: ignore[arg-type]
+    lengths, turned = unit_rows((direction * spacing).T.tolist())
+    return Volume(field, options.spacing_or(lengths), tuple(origin.tolist()), turned, volume_name(path))  # type: ignore[arg-type]
 
 
 def _is_vtkhdf(head: bytes) -> bool:

@@ -17,6 +17,7 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import load_block, parse_numbers, tokens
 from vvgt_cli.volume.components import ArrayInfo, choose_array, select_component
+from vvgt_cli.volume.headers import unit_rows
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.registry import Reader, register, volume_name
 from vvgt_cli.volume.types import Volume
@@ -243,7 +244,8 @@ def read_legacy(path: Path, options: ReadOptions) -> Volume:
             )
         values = _values(parser, array, (dims[2], dims[1], dims[0]))
     field, _ = select_component(values, options.component, str(path), label=str(array.info.name))
-    return Volume(field, options.spacing_or(tuple(spacing)), tuple(origin), name=volume_name(path))  # type: ignore[arg-type]
+    lengths, direction = unit_rows(np.diag(spacing).tolist())
+    return Volume(field, options.spacing_or(lengths), tuple(origin), direction, volume_name(path))  # type: ignore[arg-type]
 
 
 def is_legacy(head: bytes, grid: bool) -> bool:

@@ -19,6 +19,7 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import check_memory, count, load_block, size_text
 from vvgt_cli.volume.components import ArrayInfo, choose_array, select_component
+from vvgt_cli.volume.headers import unit_rows
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.registry import Reader, register, volume_name
 from vvgt_cli.volume.types import IDENTITY, Volume
@@ -130,11 +131,11 @@ def _numbers(text: str, n: int, path: Path, what: str) -> list[float]:
 
 @dataclass(frozen=True)
 class _Grid:
-    """Dims, spacing, origin (x, y, z) of the values, direction row-major."""
+    """Dims, origin and spacing (x, y, z) of the values, direction row-major."""
 
     dims: tuple[int, ...]
-    spacing: tuple[float, ...]
     origin: tuple[float, ...]
+    spacing: tuple[float, ...]
     direction: tuple[float, ...]
 
 
@@ -182,7 +183,8 @@ def _grid(found: _Scan, where: str, path: Path) -> _Grid:
         dims = [max(d - 1, 1) for d in dims]
     step = [f * s for f, s in zip(first, spacing, strict=True)]
     origin = [o + sum(direction[3 * row + k] * step[k] for k in range(3)) for row, o in enumerate(origin)]
-    return _Grid(tuple(dims), tuple(spacing), tuple(origin), direction)
+    axes = [[direction[3 * row + k] * spacing[k] for row in range(3)] for k in range(3)]
+    return _Grid(tuple(dims), tuple(origin), *unit_rows(axes))
 
 
 def read_vti(path: Path, options: ReadOptions) -> Volume:

@@ -14,6 +14,7 @@ from vvgt_cli.errors import DataError
 from vvgt_cli.volume.headers import unit_rows
 from vvgt_cli.volume.openvdb.codec import ACTIVE_MASK, BLOSC, ZIP
 from vvgt_cli.volume.openvdb.cursor import Cursor
+from vvgt_cli.volume.types import FLAT
 
 MAGIC = b" BDV\0\0\0\0"
 VERSIONS = range(222, 225)
@@ -187,10 +188,9 @@ def _placement(cursor: Cursor) -> Placement:
     if not np.isfinite(axes).all() or not np.isfinite(translation).all():
         raise cursor.bad("a transform that is not finite")
     lengths, direction = unit_rows(axes.tolist())
-    columns = np.array(direction).reshape(3, 3)
-    if min(lengths) <= 0 or np.abs(columns.T @ columns - np.eye(3)).max() > 1e-6:
+    if min(lengths) <= 0 or abs(np.linalg.det(np.array(direction).reshape(3, 3))) < FLAT:
         raise DataError(
-            f"{cursor.name}: the grid's transform shears or flattens; expected scale, translation and rotation: "
+            f"{cursor.name}: the grid's transform flattens; expected scale, translation, rotation and shear: "
             "resample it first"
         )
     return Placement(lengths, direction, axes, translation)

@@ -1,0 +1,90 @@
+"""Between the box frame, where a run's Gaussians are, and the unit frame of files: which way round and which way up."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vvgt_cli.cameras import default_views
+from vvgt_cli.cameras.boxed import drawn_in_box
+from vvgt_cli.gaussians import Gaussians, PlyOptions
+from vvgt_cli.gaussians.frames import transform, up_matrix
+from vvgt_cli.volume import Volume
+from vvgt_cli.volume.space import shear_text, world_axis
+
+if TYPE_CHECKING:
+    from vvgt_cli.dvr import Scene
+
+NONE = "none"
+
+
+def out_of_box(gaussians: Gaussians, volume: Volume) -> Gaussians:
+    """Gaussians of the volume's box frame in its unit frame."""
+    return transform(gaussians, volume.axes)
+
+
+def into_box(gaussians: Gaussians, volume: Volume) -> Gaussians:
+    """Gaussians of the volume's unit frame in its box frame."""
+    axes = volume.axes
+    straight = np.array_equal(axes, np.eye(3))
+    return gaussians if straight else transform(gaussians, np.linalg.inv(axes))
+
+
+def up_axis(up: str | None, frame: str, space: str | None) -> str:
+    """World axis that is turned up in viewers: the one asked for, else superior in unit frames of anatomical spaces.
+
+    World frames are left alone unless asked: their positions are to be those of other data.
+
+    Raises:
+        UsageError: an anatomical direction where the space is not.
+    """
+    if up is not None:
+        return world_axis(up, space)
+    return world_axis("superior", space) if space and frame == "unit" else NONE
+
+
+def placed(ply: PlyOptions, volume: Volume) -> PlyOptions:
+    """The layout of a file, with the records of where the volume is."""
+    return replace(
+        ply,
+        unit_frame=volume.unit_frame(),
+        space=volume.space or NONE,
+        affine=tuple(volume.affine[:3].ravel().tolist()),
+    )
+
+
+def remarks(volume: Volume, ply: PlyOptions) -> list[str]:
+    """What there is to say of a volume's place before the work: sheared axes, a turn that the file will not record."""
+    said = []
+    if volume.sheared:
+        said.append(
+            f"{volume.name}: {shear_text(volume.axes)} (a tilted gantry?): Gaussians are sheared with them; opacity "
+            "stays per length along the index axes, and pictures are of the volume unsheared"
+        )
+    if not ply.comments and (ply.up != NONE or ply.frame != "unit"):
+        said.append(
+            f"--no-comments: nothing in the file will say that it is in the {ply.frame} frame with up {ply.up}; "
+            "'vvgt evaluate' and 'vvgt render' will take it as the unit frame with up none"
+        )
+    return said
+
+
+def upright(volume: Volume, up: str) -> np.ndarray:
+    """(3, 3): box frame to a frame with world directions in which ``up`` is +z; what previews are seen in."""
+    turn = np.eye(3) if up == NONE else up_matrix("z").T @ up_matrix(up)
+    return turn @ volume.axes
+
+
+def preview(scene: Scene, gaussians: Gaussians, size: int, axes: np.ndarray, numbers: Sequence[int]) -> np.ndarray:
+    """Reference, ours and their difference on some test views of the frame that ``axes`` (`upright`) leads to."""
+    from vvgt_cli.dvr import RenderSettings, render_view
+    from vvgt_cli.images import side_by_side
+    from vvgt_cli.splat import render
+
+    reference = drawn_in_box(lambda camera: render_view(scene, camera, RenderSettings()), axes)
+    ours = drawn_in_box(lambda camera: render(gaussians, camera), axes)
+    cameras = default_views("test", size=size)
+    return np.concatenate([side_by_side(reference(cameras[n]), ours(cameras[n])) for n in numbers])
