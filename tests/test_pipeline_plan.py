@@ -82,11 +82,12 @@ def test_wide_is_told_by_the_middle_axis():
     camera = default_views("check", 1, size=400)[0]
     pixel = np.linalg.norm(camera.position) / camera.fx
     scales = np.log(np.float32([[0.1, 1.0, 5.0]]) * pixel)
-    one = lambda size: Gaussians(  # noqa: E731
+    one = lambda size, logit=0.0: Gaussians(  # noqa: E731
         np.zeros((1, 3), np.float32), scales + np.float32(np.log(size)), np.float32([[1, 0, 0, 0]]),
-        np.zeros(1, np.float32), np.zeros((1, 3), np.float32),
+        np.full(1, logit, np.float32), np.zeros((1, 3), np.float32),
     )  # fmt: skip
     assert wide(one(1.0), 400)
+    assert not wide(one(1.0, 3.0), 400)  # opaque
     assert not wide(one(0.8), 400)
     assert wide(one(1.0), 1080)  # its views are no larger
     assert not wide(one(1.0), 200)

@@ -32,6 +32,7 @@ MARGIN, SAMPLES = 4.0, 12.0  # dB, where views are means over their pixels, and 
 SMALLEST = 0.5  # standard deviation of the longest axis in pixels of the screen: viewers drop or fade less
 LARGE = 0.5  # of the screen: views as large are means over their own pixels
 WIDE = 0.9  # standard deviation in pixels of whole training views
+SOLID = 0.9  # median opacity of opaque bodies
 
 
 def check_view_memory(plan: Plan, size: int) -> None:
@@ -238,9 +239,11 @@ def drawn_by_all(gaussians: Gaussians, size: int) -> Gaussians:
 def wide(gaussians: Gaussians, size: int) -> bool:
     """Whether training views half as large as they may be still show Gaussians.
 
-    That is so where the median of middle standard deviations is above `WIDE` px of whole ones.
+    That is so where the median of middle standard deviations is above `WIDE` px of whole ones, and bodies are not
+    opaque: of these the edges are all there is.
     """
     camera = default_views("check", 1, size=view_edge(size, half=False))[0]
     pixel = float(np.linalg.norm(camera.position)) / camera.fx
     middle = np.exp(np.median(gaussians.log_scales, axis=1))  # of three
-    return bool(np.median(middle) > WIDE * pixel)
+    solid = np.median(gaussians.opacity_logits) > np.log(SOLID / (1 - SOLID))
+    return bool(np.median(middle) > WIDE * pixel and not solid)
