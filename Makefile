@@ -1,8 +1,8 @@
-# make test | lint | long | ci
+# make test | lint | long | viewers | ci
 VENV ?= .venv-test
 PYTHON ?= python3
 
-.PHONY: test lint format long fuzz ci
+.PHONY: test lint format long fuzz viewers ci
 
 $(VENV)/bin/pytest: pyproject.toml constraints.txt
 	[ -x $(VENV)/bin/python ] || $(PYTHON) -m venv $(VENV)
@@ -28,6 +28,10 @@ long: $(VENV)/bin/pytest
 # 100,000 damaged files for every reader (part of `long`); what is found lies in out/fuzz.
 fuzz: $(VENV)/bin/pytest
 	$(VENV)/bin/python tests/fuzz.py --inputs 100000 --save out/fuzz
+
+# Files in web viewers (part of `long`): needs Chromium, node and npm; packages go to a cache folder.
+viewers: $(VENV)/bin/pytest
+	$(VENV)/bin/pytest --long -s -rs tests/test_viewers.py
 
 ci:
 	.ci/run

@@ -79,7 +79,7 @@ RULES = {
         Rule("compensated", "gsplat antialiased, Brush, Mip-Splatting", compensate=True),
         Rule("spark", "Spark (three.js)", compensate=True, reach=4.0, min_alpha=0.5 / 255, **WEBGL),
         Rule("playcanvas", "SuperSplat, PlayCanvas", reach=4.0, shifted=True, **HALF_PIXELS, **WEBGL),
-        Rule("viser", "viser", min_alpha=0.01, **WEBGL),
+        Rule("viser", "viser", reach=4.0, min_alpha=0.01, **WEBGL),
     )
 }
 

@@ -1,0 +1,71 @@
+"""Web viewers in headless Chromium: `tests/viewers` has the pages, their packages live in a cache folder."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import shutil
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vvgt_cli.cameras import Camera
+from vvgt_cli.images import read_png
+
+PAGES = Path(__file__).parent / "viewers"
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+
+
+def browser() -> str:
+    """Path of Chromium; the test is skipped where there is none."""
+    for name in BROWSERS:
+        if path := shutil.which(name):
+            return path
+    pytest.skip(f"none of {', '.join(BROWSERS)} on the path (Debian: apt-get install chromium)")
+
+
+def packages() -> Path:
+    """Folder whose ``node_modules`` holds what `tests/viewers/package.json` names; made on the first call."""
+    if not (shutil.which("node") and shutil.which("npm")):
+        pytest.skip("node and npm are not on the path")
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "vvgt-viewers"
+    wanted, done = PAGES / "package.json", cache / "installed.json"
+    if not done.is_file() or done.read_bytes() != wanted.read_bytes():
+        cache.mkdir(parents=True, exist_ok=True)
+        shutil.copy(wanted, cache / "package.json")
+        command = ["npm", "install", "--no-audit", "--no-fund", "--no-package-lock"]
+        run = subprocess.run(command, cwd=cache, capture_output=True, text=True, timeout=600)
+        if run.returncode:
+            pytest.skip(f"npm install: {run.stderr.strip().splitlines()[-1:]}")
+        shutil.copy(wanted, done)
+    return cache
+
+
+def shoot(viewer: str, file: Path, cameras: Sequence[Camera | None], size: int, folder: Path) -> list[np.ndarray]:
+    """Pictures (size, size, 3) of ``file`` over black by a page of `tests/viewers`; None: from the viewer's own camera.
+
+    Cameras are square, have their principal point in the middle, and are in the frame of the file.
+    """
+    outputs = [folder / f"{viewer}-{file.stem}-{size}-{index}.png" for index in range(len(cameras))]
+    job = {
+        "viewer": viewer,
+        "file": str(file),
+        "size": size,
+        "cameras": [camera and _pose(camera) for camera in cameras],
+        "out": [str(path) for path in outputs],
+    }
+    jobs = folder / f"{viewer}-{file.stem}-{size}.json"
+    jobs.write_text(json.dumps({"browser": browser(), "jobs": [job]}))
+    command = ["node", str(PAGES / "shots.mjs"), str(jobs), str(packages())]
+    run = subprocess.run(command, capture_output=True, text=True, timeout=900)
+    assert run.returncode == 0, run.stderr
+    return [read_png(path)[..., :3] for path in outputs]
+
+
+def _pose(camera: Camera) -> dict[str, object]:
+    fov = math.degrees(2 * math.atan(camera.height / (2 * camera.fy)))
+    return {"rotation": camera.rotation.tolist(), "translation": camera.translation.tolist(), "fov": fov}

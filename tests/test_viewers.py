@@ -1,0 +1,143 @@
+"""What web viewers draw, in a real browser, against our pictures by their rules (docs/viewers.md)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from browser import shoot
+
+from vvgt_cli.cameras import Camera, default_views, look_at
+from vvgt_cli.cli.main import run
+from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
+from vvgt_cli.metrics import psnr
+from vvgt_cli.splat import render
+
+RULES = pytest.importorskip("vvgt_cli.splat.rules").RULES
+RULE = {"supersplat": "playcanvas", "spark": "spark"}  # page: rule
+STEPS = {"supersplat": 255, "spark": 254}  # both keep a scale as one of so many over 21 e-folds from exp(-12)
+SIZE = 540
+LARGE = ((6, 6), (14, 5), (4, 12), (16, 16), (3, 3))  # sigmas in px, across and down
+SMALL = (0.1, 0.15, 0.2, 0.24, 0.3, 0.4, 0.6, 1.0)
+
+pytestmark = pytest.mark.long
+
+
+def front(size: int = SIZE) -> Camera:
+    """From -y: x to the right, z up."""
+    return look_at((0, -3, 0), width=size, height=size)
+
+
+def lone_splats(camera: Camera, steps: int) -> Gaussians:
+    """Splats that overlap nowhere, facing ``camera``, from 0.1 to 16 px; none of their values is rounded by viewers."""
+    rows: list[tuple[float, float, float, float, int, tuple[int, int, int]]] = []
+    for i, (across, down) in enumerate(LARGE):
+        for j, opacity in enumerate((60, 160, 252)):
+            rows.append((60 + 105 * i, 80 + 110 * j, across, down, opacity, (255 - 50 * i, 60 + 90 * j, 30 * (i + j))))
+    for i, sigma in enumerate(SMALL):
+        for j, opacity in enumerate((120, 252)):
+            rows.append((40.5 + 60 * i, 400.5 + 60 * j, sigma, sigma, opacity, (255, 255, 255)))
+    u, v, across, down, opacity, color = (np.array(column, np.float64) for column in zip(*rows, strict=True))
+    x, z = (np.round(512 * 3 * side / camera.fx) / 512 for side in (u - SIZE / 2, SIZE / 2 - v))  # exact in half floats
+    scales = 3 * np.stack([across, np.minimum(across, down), down], axis=1) / camera.fx
+    step = 21 / steps
+    log_scales = step * np.round((np.log(scales) + 12) / step) - 12
+    quaternions = np.tile((1.0, 0, 0, 0), (len(rows), 1))
+    opacity = opacity / 255
+    return Gaussians(
+        np.stack([x, 0 * x, z], axis=1), log_scales, quaternions, np.log(opacity / (1 - opacity)), color / 255
+    )
+
+
+def lone_picture(gaussians: Gaussians, camera: Camera, rule_name: str) -> np.ndarray:
+    """(height, width, 3) of axis-aligned splats seen by `front`, each alone: the rule's formula, pixel by pixel."""
+    rule = RULES[rule_name]
+    out = np.zeros((camera.height, camera.width, 3))
+    px, py = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    opacities = 1 / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64)))
+    scales = np.exp(gaussians.log_scales.astype(np.float64))
+    rows = zip(gaussians.means, scales, opacities, gaussians.colors, strict=True)
+    for (x, y, z), (sx, sy, sz), opacity, color in rows:
+        right, down, depth = float(x), -float(z), float(y) + 3
+        across = np.array([sx, -right * sy / depth]) * camera.fx / depth
+        along = np.array([sz, -down * sy / depth]) * camera.fy / depth
+        flat = np.diag([across @ across, along @ along])
+        flat[0, 1] = flat[1, 0] = across[1] * along[1]
+        wide = flat + rule.dilation * np.eye(2)
+        if np.linalg.eigvalsh(wide)[1] < rule.min_variance:
+            continue
+        if rule.compensate:
+            opacity *= np.sqrt(np.linalg.det(flat) / np.linalg.det(wide))
+        inverse = np.linalg.inv(wide)
+        dx, dy = px - camera.fx * right / depth - camera.cx, py - camera.fy * down / depth - camera.cy
+        p = 0.5 * (inverse[0, 0] * dx * dx + inverse[1, 1] * dy * dy) + inverse[0, 1] * dx * dy
+        rest = np.exp(-rule.reach) if rule.shifted else 0.0
+        alpha = np.minimum(opacity * (np.exp(-p) - rest) / (1 - rest), rule.max_alpha)
+        alpha[(p > rule.reach) | (alpha < rule.min_alpha)] = 0
+        out += alpha[..., None] * color
+    return out
+
+
+@pytest.mark.parametrize("viewer", RULE)
+def test_lone_splats_are_drawn_by_the_rule(viewer: str, tmp_path: Path) -> None:
+    camera = front()
+    gaussians = lone_splats(camera, STEPS[viewer])
+    write_ply(tmp_path / "lone.ply", gaussians)
+    shot = shoot(viewer, tmp_path / "lone.ply", [camera], SIZE, tmp_path)[0]
+    formula = lone_picture(gaussians, camera, RULE[viewer])
+    ours = render(gaussians, camera, rule=RULE[viewer])[..., :3]
+    scores = {name: psnr(lone_picture(gaussians, camera, name), shot) for name in RULES}
+    away = abs(formula - shot).max(axis=2)
+    print(f"{viewer}: {scores}, ours {psnr(ours, shot):.2f}, largest difference {away.max() * 255:.2f}/255")
+    assert away.max() < np.exp(-4) + 1 / 255  # a pixel at a splat's reach, met from the other side
+    assert (away > 2 / 255).mean() < 1e-4  # everywhere else 8 bits a channel
+    assert psnr(ours, shot) > 55
+    assert psnr(ours, formula) > 65
+    assert all(score < scores[RULE[viewer]] - 6 for name, score in scores.items() if name != RULE[viewer])
+    for mirrored in (shot[:, ::-1], shot[::-1], shot.transpose(1, 0, 2)):
+        assert psnr(ours, mirrored) < 25
+
+
+def test_up_and_hand_in_supersplat(tmp_path: Path) -> None:
+    """`--up z` puts z on top in front of SuperSplat's own camera, and mirrors nothing (conventions: The .ply)."""
+    means = 0.6 * np.eye(3)  # red, green and blue at the ends of x, y and z
+    gaussians = Gaussians(means, np.full((3, 3), np.log(0.05)), np.tile((1, 0, 0, 0), (3, 1)), np.full(3, 4), np.eye(3))
+    write_ply(tmp_path / "axes.ply", gaussians, PlyOptions(up="z"))
+    stored, _ = read_ply(tmp_path / "axes.ply")
+    shot = shoot("supersplat", tmp_path / "axes.ply", [None], 400, tmp_path)[0]
+    places = np.argwhere(shot > 0.5)
+    found = np.stack([places[places[:, 2] == k, :2].mean(axis=0) for k in range(3)])  # row, column of each colour
+    shown = stored.means * (-1, -1, 1)  # how SuperSplat shows PLY coordinates; its camera is at z = 3, with y up
+    focal = 200 / np.tan(np.radians(20))
+    expected = 200 + focal * np.stack([-shown[:, 1], shown[:, 0]], axis=1) / (3 - shown[:, 2:])
+    assert abs(found - expected).max() < 2
+    assert found[2, 0] < found[:2, 0].min() - 50  # z on top
+    hand = np.linalg.det(shown)
+    assert hand == pytest.approx(np.linalg.det(means), rel=1e-5)
+
+
+@pytest.fixture(scope="module")
+def converted(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Camera, np.ndarray]:
+    """A converted volume, a test view of 1080 px, and the volume there."""
+    from vvgt_cli.dvr import render_view
+    from vvgt_cli.pipeline.source import SourceRequest, load
+
+    path, volume = tmp_path_factory.mktemp("viewers") / "converted.ply", "example:marschner-lobb:64"
+    options = ("--max-gaussians", "20000", "--size", "1080", "--steps", "0", "--quiet")
+    assert run(["convert", volume, *options, "-o", str(path)]) == 0
+    camera = default_views("test", size=1080)[3]
+    return path, camera, render_view(load(SourceRequest(volume)).scene(), camera)[..., :3]
+
+
+@pytest.mark.parametrize("viewer", RULE)
+def test_converted_volume_looks_as_scored(
+    viewer: str, converted: tuple[Path, Camera, np.ndarray], tmp_path: Path
+) -> None:
+    path, camera, volume = converted
+    shot = shoot(viewer, path, [camera], 1080, tmp_path)[0]
+    ours = render(read_ply(path)[0], camera, rule=RULE[viewer])[..., :3]
+    seen, said, same = psnr(volume, shot), psnr(volume, ours), psnr(ours, shot)
+    print(f"{viewer}: {seen:.2f} dB against the volume, {said:.2f} by our drawing; {same:.2f} between the two")
+    assert abs(seen - said) < 1
+    assert same > 40
