@@ -40,9 +40,7 @@ def group(name: str, **options: Decorator) -> Decorator:
 def _component(ctx: click.Context, param: click.Parameter, value: str | None) -> int | str | None:
     if value is None or value == "magnitude":
         return value
-    if not (value.isascii() and value.isdecimal()):
-        raise click.BadParameter(f"{value!r}: expected a component's number from 0, or 'magnitude'")
-    return int(value)
+    return int(value) if value.isascii() and value.isdecimal() else value
 
 
 read_options = group(
@@ -63,12 +61,17 @@ read_options = group(
         "--spacing", nargs=3, type=float, metavar="X Y Z", help="Voxel edges, in place of the file's."
     ),
     array=click.option(
-        "--array", "--grid", "array", metavar="NAME", help="Which array or grid, where the file holds several."
+        "--array", "--grid", "--series", "array", metavar="NAME",
+        help="Which array, grid or series (of DICOM: number, UID or description), where there are several.",
     ),
     component=click.option(
-        "--component", metavar="N|magnitude", callback=_component, help="Which component of a vector array."
+        "--component", "--channel", "component", metavar="N|NAME|magnitude", callback=_component,
+        help="Which component of vectors, or which channel: its number from 0, or its name.",
     ),
-)
+    time=click.option(
+        "--time", type=click.IntRange(0), metavar="N", help="Which time step, from 0, where the file holds several."
+    ),
+)  # fmt: skip
 
 tf_range_option = click.option(
     "--tf-range", default="data", show_default=True, metavar="data|rescale|LO,HI",

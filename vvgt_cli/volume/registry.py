@@ -15,7 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.errors import DataError, SeveralSteps, UsageError
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.types import Volume
 
@@ -33,6 +33,7 @@ class Reader:
         read: path and options to volume.
         unzips: reads gzip-compressed files by itself.
         named_arrays: takes ``--array``.
+        times: takes ``--time``.
         raw_layout: takes dims, dtype, byte order and header bytes.
         by_name: tried on a file that only its name speaks for (formats without a fixed beginning).
         resamples: takes ``--dims`` as the grid to sample on.
@@ -45,6 +46,7 @@ class Reader:
     read: Callable[[Path, ReadOptions], Volume]
     unzips: bool = False
     named_arrays: bool = False
+    times: bool = False
     raw_layout: bool = False
     by_name: bool = False
     resamples: bool = False
@@ -103,6 +105,8 @@ def read_volume(source: str, options: ReadOptions | None = None) -> Volume:
         UsageError: options that the format does not take, or a choice (array, component, dims) that is missing.
     """
     options = options or ReadOptions()
+    if options.time is not None and (source == "-" or source.partition(":")[0] in _SCHEMES):
+        raise UsageError(f"{source}: one volume, no time steps; leave out --time {options.time}")
     if source == "-":
         from vvgt_cli.volume.raw import read_stdin
 
@@ -123,6 +127,19 @@ def read_volume(source: str, options: ReadOptions | None = None) -> Volume:
         raise DataError(f"{source}: damaged {reader.name} file ({text}); check that it is whole") from error
     except MemoryError as error:
         raise DataError(f"{source}: not enough memory to read it; try a machine with more") from error
+
+
+def time_steps(source: str, options: ReadOptions) -> int:
+    """How many time steps a source has, where ``options`` choose none.
+
+    Raises:
+        DataError, UsageError: as `read_volume`.
+    """
+    try:
+        read_volume(source, options)
+    except SeveralSteps as error:
+        return error.steps
+    return 1
 
 
 def _inner(source: str, options: ReadOptions) -> tuple[Path, ReadOptions]:
@@ -220,6 +237,11 @@ def _check_options(reader: Reader, source: str, options: ReadOptions) -> None:
     needless = [flag for flag in options.raw_flags if not (reader.resamples and flag == "--dims")]
     if not reader.raw_layout and needless:
         raise UsageError(f"{source}: a {reader.name} file, which states its own layout; leave out {' '.join(needless)}")
+    if options.time is not None and not reader.times:
+        raise UsageError(
+            f"{source}: a {reader.name} file, of which no time steps are known; leave out --time {options.time} (along "
+            "a fourth axis of any kind --component N chooses)"
+        )
     if options.array is not None and not reader.named_arrays:
         raise UsageError(
             f"{source}: a {reader.name} file, which has one array without a name; leave out --array {options.array}"
