@@ -253,7 +253,7 @@ def numpy_files() -> list[Seed]:
 
 
 def transfer() -> list[Seed]:
-    from test_transfer_formats import ITF, XML, vp, vp_json
+    from test_transfer_formats import ITF, XML, mrml, vp, vp_json
 
     from vvgt_cli.transfer import read_transfer_function
 
@@ -277,6 +277,7 @@ def transfer() -> list[Seed]:
         Seed("d.itf", ITF.format(lo=0, hi=0.9, type=0).encode(), read),
         Seed("e.vp", vp().encode(), read),
         Seed("f.vp.json", json.dumps(vp_json()).encode(), read),
+        Seed("presets.xml", mrml().encode(), lambda path: read(Path(f"{path}#CT-AAA"))),
     ]
 
 

@@ -13,6 +13,7 @@ import struct
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 
 from vvgt_cli.errors import DataError, SeveralSteps, UsageError
@@ -20,6 +21,7 @@ from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.types import Volume
 
 HEAD_BYTES = 4096
+LOOKED_AT = 2000  # files of a folder
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,7 @@ class Reader:
         by_name: tried on a file that only its name speaks for (formats without a fixed beginning).
         resamples: takes ``--dims`` as the grid to sample on.
         holds: does this folder hold the format? Of formats that are folders.
+        by_whole: such a folder is one volume whatever else lies in it.
     """
 
     name: str
@@ -51,6 +54,7 @@ class Reader:
     by_name: bool = False
     resamples: bool = False
     holds: Callable[[Path], bool] | None = None
+    by_whole: bool = False
 
 
 Scheme = Callable[[str, ReadOptions], Volume]
@@ -165,13 +169,38 @@ def _slices(source: str, options: ReadOptions) -> Volume | None:
 
 
 def _folder(path: Path, source: str) -> Reader:
+    """The reader of a folder; none where more of its files are volumes of other formats."""
+    lying = _lying(path)
     for reader in _READERS:
         if reader.holds is not None and reader.holds(path):
-            return reader
+            own = len(lying.get(reader.name.removesuffix(" slices"), []))
+            if reader.by_whole or 2 * own >= sum(map(len, lying.values())):
+                return reader
+    if lying:
+        listing = "; ".join(f"{len(names)} {kind} ({', '.join(names[:3])}{', ...' if len(names) > 3 else ''})"
+                            for kind, names in lying.items())  # fmt: skip
+        raise DataError(f"{source}: a folder with {listing}; expected one volume: give one of the files")
     kinds = ", ".join(reader.name for reader in _READERS if reader.holds is not None)
     raise DataError(
         f"{source}: a folder; expected a volume file ({', '.join(known_suffixes())}) or a folder of {kinds}"
     )
+
+
+def _lying(path: Path) -> dict[str, list[str]]:
+    """The volume files in a folder (not in those in it), by format: of their name, else of their content."""
+    found: dict[str, list[str]] = {}
+    for name in sorted(entry.name for entry in islice(os.scandir(path), LOOKED_AT) if entry.is_file()):
+        reader = _by_name(path / name)
+        if reader is None:
+            try:
+                with open(path / name, "rb") as file:
+                    head = file.read(HEAD_BYTES)
+            except OSError:
+                continue
+            reader = next((r for r in _READERS if r.holds is not None and head and r.sniff(head)), None)
+        if reader is not None:
+            found.setdefault(reader.name, []).append(name)
+    return found
 
 
 def _head(path: Path, source: str) -> bytes:

@@ -215,5 +215,6 @@ register(
         resamples=True,
         times=True,
         holds=holds_zarr,
+        by_whole=True,
     )
 )
