@@ -165,6 +165,10 @@ def test_slicer_presets_xml(vvgt, file, tmp_path: Path) -> None:
     info = vvgt("info", source + "#MR-Default")
     assert info.code == 0, info.err
     assert b"1 (VTK's default)" in info.out
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert vvgt("info", source + "#CT-AAA").code == 1
+        assert vvgt("info", source + "#CT-AAA", "-q").code == 0
     assert "2 presets, 'CT-AAA', 'MR-Default'" in vvgt("info", source).error
     out = tmp_path / "mr.json"
     assert vvgt("tf", "convert", source + "#MR-Default", out).code == 0

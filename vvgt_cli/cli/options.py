@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import os
 import sys
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -138,6 +139,9 @@ def common_options(function: Callable[..., Any]) -> Callable[..., Any]:
     @click.option("-q", "--quiet", is_flag=True, help="Say nothing on standard error but errors.")
     @functools.wraps(function)
     def wrapper(*args: Any, quiet: bool, **kwargs: Any) -> Any:
-        return function(*args, console=Console(quiet), **kwargs)  # fmt: skip
+        with warnings.catch_warnings():
+            if quiet:
+                warnings.simplefilter("ignore")  # they are notes on standard error
+            return function(*args, console=Console(quiet), **kwargs)
 
     return wrapper
