@@ -156,6 +156,28 @@ def tiff() -> list[Seed]:
                 out.write_image(np.ascontiguousarray(page[..., None]))
             out.close()
             seeds.append(Seed(name, Path(path).read_bytes(), READ))
+    return seeds + _tiff_images()
+
+
+def _tiff_images() -> list[Seed]:
+    """OME-TIFF, ImageJ's and tifffile's own, plain and compressed, little and big, of channels and time steps."""
+    import tifffile
+
+    values = np.random.default_rng(9).integers(0, 200, (2, 2, 3, 4, 5)).astype(np.uint16)
+    ome = {"axes": "TCZYX", "PhysicalSizeX": 0.2, "PhysicalSizeZ": 1.5, "Channel": {"Name": ["a", "b"]}}
+    imagej = {"axes": "TZCYX", "spacing": 2.5, "unit": "um"}
+    chosen = volume_reader(component=1, time=1)
+    seeds = []
+    for name, axes, read, how in (
+        ("d.ome.tif", (0, 1, 2, 3, 4), volume_reader(component="b", time=1), {"ome": True, "metadata": ome}),
+        ("e.ome.tif", (0, 1, 2, 3, 4), chosen, {"ome": True, "metadata": ome, "compression": "zlib", "bigtiff": True}),
+        ("f.tif", (0, 2, 1, 3, 4), chosen, {"imagej": True, "metadata": imagej, "resolution": (5, 4)}),
+        ("g.tif", (0, 2, 1, 3, 4), chosen, {"imagej": True, "metadata": imagej, "compression": "lzma"}),
+        ("h.tif", (0, 1, 2, 3, 4), chosen, {"metadata": {"axes": "TCZYX"}, "byteorder": ">"}),
+    ):
+        out = io.BytesIO()
+        tifffile.imwrite(out, values.transpose(axes), **{"byteorder": "<", **how})  # type: ignore[arg-type]
+        seeds.append(Seed(name, out.getvalue(), read))
     return seeds
 
 
@@ -231,7 +253,7 @@ def numpy_files() -> list[Seed]:
 
 
 def transfer() -> list[Seed]:
-    from test_transfer_formats import ITF, XML, vp, vp_json
+    from test_transfer_formats import ITF, XML, mrml, vp, vp_json
 
     from vvgt_cli.transfer import read_transfer_function
 
@@ -255,6 +277,7 @@ def transfer() -> list[Seed]:
         Seed("d.itf", ITF.format(lo=0, hi=0.9, type=0).encode(), read),
         Seed("e.vp", vp().encode(), read),
         Seed("f.vp.json", json.dumps(vp_json()).encode(), read),
+        Seed("presets.xml", mrml().encode(), lambda path: read(Path(f"{path}#CT-AAA"))),
     ]
 
 

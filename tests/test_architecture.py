@@ -20,7 +20,7 @@ ROOMS = (
 )
 HEAVY = {
     *("numba", "vtk", "vtkmodules", "pyvista", "onnxruntime", "torch", "matplotlib", "OpenImageIO", "OpenEXR"),
-    *("scipy", "nibabel", "gsplat", "lpips", "h5py", "netCDF4", "zarr", "numcodecs", "pydicom"),
+    *("scipy", "nibabel", "gsplat", "lpips", "tifffile", "h5py", "netCDF4", "zarr", "numcodecs", "pydicom"),
 }
 # Modules that hold numba kernels or torch networks: their importers import them inside the functions that call them.
 KERNELS = {"numba", "torch"}

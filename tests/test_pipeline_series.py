@@ -6,8 +6,10 @@ import json
 import re
 from pathlib import Path
 
+import nibabel as nib
 import numpy as np
 import pytest
+import tifffile
 
 from vvgt_cli.errors import UsageError
 from vvgt_cli.pipeline.record import ConversionReport
@@ -93,6 +95,26 @@ def test_resumed_and_in_parts_it_leaves_the_same_bytes(vvgt, series: Path, stand
     assert "1 frames converted, 2 were done before" in again.err
     assert contents(series / "out") == made
     assert (series / "out" / "03.ply").stat().st_mtime_ns == before
+
+
+def test_time_steps_of_one_file(vvgt, series: Path, stand_in: list) -> None:
+    frames = np.stack([np.load(series / f"run_{k}.npy") for k in range(8, 12)])
+    tifffile.imwrite(series / "cells.ome.tif", frames, ome=True, metadata={"axes": "TZYX"}, photometric="minisblack")
+    nib.save(nib.Nifti1Image(frames.transpose(3, 2, 1, 0), np.eye(4)), series / "bold.nii.gz")
+    run = ("--tf", series / "tf.json", "--tf-range", "rescale", *[part for part in SMALL if part != "-q"])
+    made = {}
+    for source in ("run_*.npy", "cells.ome.tif", "bold.nii.gz"):
+        folder = series / source.partition(".")[0].strip("_*")
+        folder.mkdir()
+        done = vvgt("convert", series / source, "-o", folder / "p_{:02d}.ply", *run)
+        assert done.code == 0, done.err
+        made[source] = contents(folder)
+    assert list(made["cells.ome.tif"]) == ["p_01.ply", "p_02.ply", "p_03.ply"]
+    assert made["cells.ome.tif"] == made["bold.nii.gz"] == made["run_*.npy"]
+    assert "bold.nii.gz time 0: nothing of it is visible" in done.err
+    assert [request.source.read.time for request in stand_in] == [None] * 3 + [1, 2, 3] * 2
+    error = vvgt("convert", series / "bold.nii.gz", "-o", series / "p.ply", *run).error
+    assert "4 time steps; expected one: try --time N (0 to 3), or a number in the output" in error
 
 
 def test_a_dry_run_of_a_series_is_refused_before_anything_is_written(vvgt, series: Path) -> None:

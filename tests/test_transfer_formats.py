@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from contextlib import suppress
 from pathlib import Path
 
@@ -92,7 +93,11 @@ def test_slicer_vp(file) -> None:
     tf = read_transfer_function(file(vp(), "bone.vp"))
     assert (tf.domain, tf.opacity_unit_distance, tf.name) == ("data", 1, "volume property")
     check_vtk(tf, [node[:2] for node in OPACITY], COLORS)
-    assert "gradient opacity left out" in read_transfer_function(file(vp("4 0 0 255 1"), "bone.vp")).name
+    assert tf.opacity_unit_label == "VTK's default"
+    with pytest.warns(
+        UserWarning, match=r"bone.vp: gradient opacity and shading \(ambient 0.1, diffuse 0.9, specular 0.2"
+    ):
+        read_transfer_function(file(vp("4 0 0 255 1"), "bone.vp"))
 
 
 def test_slicer_vp_json(file) -> None:
@@ -100,9 +105,15 @@ def test_slicer_vp_json(file) -> None:
     assert (tf.domain, tf.opacity_unit_distance) == ("data", 0.75)
     check_vtk(tf, OPACITY, COLORS, sharpness=0.3)
     slopes = {"points": [{"x": 0, "y": 0.0}, {"x": 255, "y": 1.0}]}
-    assert "left out" in read_transfer_function(file(vp_json(gradientOpacity=slopes), "a.json")).name
+    assert tf.opacity_unit_label == "file"
+    with pytest.warns(UserWarning, match=r"a.json: gradient opacity not used: there is no lighting here"):
+        read_transfer_function(file(vp_json(gradientOpacity=slopes), "a.json"))
+    with pytest.warns(UserWarning, match=r"b.json: shading \(ambient 0.3\) not used"):
+        read_transfer_function(file(vp_json(shade=True, lighting={"ambient": 0.3}), "b.json"))
     off = vp_json(gradientOpacity=slopes, disableGradientOpacity=True)
-    assert "left out" not in read_transfer_function(file(off, "a.json")).name
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        read_transfer_function(file(off, "a.json"))
 
 
 def test_slicer_presets_of_viewers_on_vtkjs(file) -> None:
@@ -110,6 +121,59 @@ def test_slicer_presets_of_viewers_on_vtkjs(file) -> None:
     tf = read_transfer_function(file([preset, preset | {"name": "other"}], "presets.json") + "#CT-Bone")
     assert (tf.name, tf.opacity_unit_distance) == ("CT-Bone", 1)
     check_vtk(tf, [node[:2] for node in OPACITY], COLORS)
+
+
+def mrml(**changes: str) -> str:
+    """Two presets as the volume rendering module of Slicer keeps them."""
+    fields = {
+        "interpolation": "1", "shade": "1", "diffuse": "0.66", "ambient": "0.1", "specular": "0.62",
+        "specularPower": "14", "scalarOpacity": numbers(o[:2] for o in OPACITY), "gradientOpacity": "4 0 1 255 1",
+        "colorTransfer": numbers(COLORS), "effectiveRange": "-3024 348", "selected": "false",
+    } | changes  # fmt: skip
+    text = " ".join(f'{key}="{value}"' for key, value in fields.items())
+    flat = text.replace('shade="1"', 'shade="0"').replace("0.6 ", "0.5 ")
+    return (
+        '<MRML version="Slicer4.4.0" userTags="">\n'
+        f'<VolumeProperty id="vtkMRMLVolumePropertyNode1" name="CT-AAA" {text}></VolumeProperty>\n'
+        f'<VolumeProperty id="vtkMRMLVolumePropertyNode2" name="MR-Default" {flat}></VolumeProperty>\n</MRML>\n'
+    )
+
+
+def test_slicer_presets_xml(vvgt, file, tmp_path: Path) -> None:
+    source = file(mrml(), "presets.xml")
+    with pytest.raises(DataError, match="2 presets, 'CT-AAA', 'MR-Default'; pick one as FILE#NAME"):
+        read_transfer_function(source)
+    with pytest.raises(DataError, match="no preset 'CT'; it has 'CT-AAA', 'MR-Default'"):
+        read_transfer_function(source + "#CT")
+    with pytest.warns(
+        UserWarning, match=r"#CT-AAA: shading \(ambient 0.1, diffuse 0.66, specular 0.62, specularPower 14\)"
+    ):
+        tf = read_transfer_function(source + "#CT-AAA")
+    assert (tf.name, tf.domain, tf.opacity_unit_distance, tf.opacity_unit_label) == (
+        "CT-AAA",
+        "data",
+        1,
+        "VTK's default",
+    )
+    check_vtk(tf, [node[:2] for node in OPACITY], COLORS)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert read_transfer_function(source + "#MR-Default").name == "MR-Default"
+        told = file(mrml(scalarOpacityUnitDistance="0.5"), "own.xml")
+        own = read_transfer_function(told + "#MR-Default")
+        assert (own.opacity_unit_distance, own.opacity_unit_label) == (0.5, "file")
+    info = vvgt("info", source + "#MR-Default")
+    assert info.code == 0, info.err
+    assert b"1 (VTK's default)" in info.out
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert vvgt("info", source + "#CT-AAA").code == 1
+        assert vvgt("info", source + "#CT-AAA", "-q").code == 0
+    assert "2 presets, 'CT-AAA', 'MR-Default'" in vvgt("info", source).error
+    out = tmp_path / "mr.json"
+    assert vvgt("tf", "convert", source + "#MR-Default", out).code == 0
+    np.testing.assert_allclose(read_transfer_function(str(out)).opacity(AT), tf.opacity(AT), atol=0.2)
+    assert vvgt("tf", "show", source + "#MR-Default", "-o", tmp_path / "mr.png").code == 0
 
 
 def test_vtkjs_preset(file) -> None:

@@ -135,8 +135,11 @@ def test_netcdf_time_steps_are_chosen_by_component(tmp_path: Path) -> None:
         steps[0], steps[1] = VALUES, -VALUES
     check_grid(read_volume(str(path), ReadOptions(component=0)))
     np.testing.assert_allclose(read_volume(str(path), ReadOptions(component=1)).data, -VALUES, rtol=1e-6)
-    with pytest.raises(UsageError, match=r"axes time \(2\), z \(3\).*choose along time with --component 0 to 1"):
+    np.testing.assert_allclose(read_volume(str(path), ReadOptions(time=1)).data, -VALUES, rtol=1e-6)
+    with pytest.raises(UsageError, match=r"2 time steps; .*--time N"):
         read_volume(str(path))
+    with pytest.raises(UsageError, match=r"--time 2: .*expected 0 to 1"):
+        read_volume(str(path), ReadOptions(time=2))
     with pytest.raises(UsageError, match="expected 0 to 1"):
         read_volume(str(path), ReadOptions(component=2))
 
@@ -236,6 +239,26 @@ def test_ome_zarr(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="choose along c with --component 0 to 1"):
         read_volume(str(store))
     assert read_volume(f"{store}:/1").dims == (3, 2, 3)
+    with pytest.raises(UsageError, match="none of time; leave out --time 1"):
+        read_volume(str(store), ReadOptions(time=1))
+
+
+def test_ome_zarr_of_channels_over_time(tmp_path: Path) -> None:
+    store = tmp_path / "v.ome.zarr"
+    values = np.stack([np.stack([VALUES + 10 * t + 100 * c for c in range(2)]) for t in range(3)]).astype("f4")
+    group = zarr.open_group(str(store), mode="w", zarr_format=2)
+    group.create_array("0", data=values)
+    kinds = {"t": "time", "c": "channel"}
+    axes = [{"name": n, "type": kinds.get(n, "space")} for n in "tczyx"]
+    level = {"path": "0", "coordinateTransformations": [{"type": "scale", "scale": [1, 1, 2, 0.5, 0.25]}]}
+    group.attrs["multiscales"] = [{"version": "0.4", "axes": axes, "datasets": [level]}]
+    for time in range(3):
+        volume = read_volume(str(store), ReadOptions(time=time, component=1))
+        np.testing.assert_array_equal(volume.data, values[time, 1])
+    with pytest.raises(UsageError, match="3 time steps"):
+        read_volume(str(store), ReadOptions(component=1))
+    with pytest.raises(UsageError, match="choose along c with --component"):
+        read_volume(str(store), ReadOptions(time=1))
 
 
 def test_zarr_refuses_codecs_that_run_code(tmp_path: Path) -> None:

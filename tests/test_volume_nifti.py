@@ -110,17 +110,42 @@ def test_spacing_signs_and_zeros(tmp_path: Path) -> None:
 def test_series(tmp_path: Path, suffix: str) -> None:
     series = np.stack([VALUES, VALUES + 100], -1).astype("i2")
     source = save(tmp_path / f"v{suffix}", series, slope=0.5, inter=-3)
-    with pytest.raises(UsageError, match="the series has 2 components"):
+    with pytest.raises(UsageError, match=r"2 time steps; .*--time N"):
         read_volume(source)
     expected = nib.load(source).get_fdata()
     for step in (0, 1):
         volume = read_volume(source, ReadOptions(component=step))
         np.testing.assert_array_equal(data_values(volume), expected[..., step])
         assert isinstance(volume.data, np.memmap) == (suffix == ".nii")
+        by_time = read_volume(source, ReadOptions(time=step))
+        np.testing.assert_array_equal(by_time.data, volume.data)
+    for options, message in (
+        ({"time": 2}, "expected 0 to 1"),
+        ({"time": 0, "component": 1}, "leave out --component 1"),
+        ({"component": "T1"}, "not component T1"),
+    ):
+        with pytest.raises(UsageError, match=message):
+            read_volume(source, ReadOptions(**options))
     norm = read_volume(source, ReadOptions(component="magnitude"))
     np.testing.assert_allclose(data_values(norm), np.linalg.norm(expected, axis=-1), rtol=1e-6)
     single = save(tmp_path / f"one{suffix}", series[..., :1])
     np.testing.assert_array_equal(data_values(read_volume(single)), series[..., 0])
+
+
+@pytest.mark.parametrize("suffix", [".nii", ".nii.gz"])
+def test_vectors_over_time(tmp_path: Path, suffix: str) -> None:
+    both = np.stack([np.stack([VALUES + 10 * t + 100 * c for t in range(2)], -1) for c in range(3)], -1).astype("i2")
+    source = save(tmp_path / f"v{suffix}", both)
+    for time in range(2):
+        for component in range(3):
+            volume = read_volume(source, ReadOptions(time=time, component=component))
+            np.testing.assert_array_equal(data_values(volume), both[..., time, component])
+    norm = read_volume(source, ReadOptions(time=1, component="magnitude"))
+    np.testing.assert_allclose(data_values(norm), np.linalg.norm(both[..., 1, :].astype(float), axis=-1), rtol=1e-6)
+    with pytest.raises(UsageError, match="2 time steps"):
+        read_volume(source, ReadOptions(component=1))
+    with pytest.raises(UsageError, match="3 components"):
+        read_volume(source, ReadOptions(time=1))
 
 
 def test_pair(tmp_path: Path) -> None:

@@ -20,3 +20,18 @@ class UsageError(VvgtError):
     """The call itself is wrong: options that contradict, a name that does not exist (exit status 2)."""
 
     exit_code = 2
+
+
+class SeveralSteps(UsageError):
+    """A file of several time steps and none chosen.
+
+    Attributes:
+        steps: how many there are.
+    """
+
+    def __init__(self, source: str, steps: int, what: str = "time steps") -> None:
+        super().__init__(
+            f"{source}: {steps} {what}; expected one: try --time N (0 to {steps - 1}), or a number in the output of "
+            "vvgt convert, as -o 'p_{:02d}.ply', which makes a series of them"
+        )
+        self.steps = steps

@@ -44,8 +44,9 @@ def command(volume: str, shard: str | None, console: Console, **options: Any) ->
     to (ten with --report); the error is printed. --target-psnr, --time-budget and --max-size, any or none,
     decide which stages run; what is left out is said, and why. Ctrl-C ends gradient descent only.
 
-    With a place for a number in OUT.ply, VOLUME is a glob of the frames of a time series: one file a frame,
-    under one function and one range of values. The same command again goes on where it was.
+    With a place for a number in OUT.ply, VOLUME is a time series: a glob of its frames, or one file of several
+    time steps. One .ply a frame, under one function and one range of values. The same command again goes on
+    where it was.
 
     \b
     Examples:
@@ -55,6 +56,7 @@ def command(volume: str, shard: str | None, console: Console, **options: Any) ->
       vvgt convert head.nrrd --tf bone.json -o head.ply --target-psnr 35 --max-size 5
       vvgt convert - --dims 64 64 93 --dtype uint16 -o - < head.raw > head.ply
       vvgt convert 'run_*.vti' --tf tf.json -o 'out_{:04d}.ply'
+      vvgt convert cells.ome.tif --channel GFP --time 0 -o cells.ply
     """
     from vvgt_cli.cli.fit import convert_request
     from vvgt_cli.errors import UsageError

@@ -21,6 +21,7 @@ def command(file: str, as_json: bool, read: dict, console: Console) -> None:
     Examples:
       vvgt info example:frog
       vvgt info frog.ply --json | jq .gaussians
+      vvgt info presets.xml#CT-AAA
     """
     from vvgt_cli.pipeline.inspect import inspect
     from vvgt_cli.pipeline.record import plain

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import os
 import sys
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -40,9 +41,7 @@ def group(name: str, **options: Decorator) -> Decorator:
 def _component(ctx: click.Context, param: click.Parameter, value: str | None) -> int | str | None:
     if value is None or value == "magnitude":
         return value
-    if not (value.isascii() and value.isdecimal()):
-        raise click.BadParameter(f"{value!r}: expected a component's number from 0, or 'magnitude'")
-    return int(value)
+    return int(value) if value.isascii() and value.isdecimal() else value
 
 
 _READ = dict(
@@ -62,10 +61,15 @@ _READ = dict(
         "--spacing", nargs=3, type=float, metavar="X Y Z", help="Voxel edges, in place of the file's."
     ),
     array=click.option(
-        "--array", "--grid", "array", metavar="NAME", help="Which array or grid, where the file holds several."
+        "--array", "--grid", "--series", "array", metavar="NAME",
+        help="Which array, grid or series (of DICOM: number, UID or description), where there are several.",
     ),
     component=click.option(
-        "--component", metavar="N|magnitude", callback=_component, help="Which component of a vector array."
+        "--component", "--channel", "component", metavar="N|NAME|magnitude", callback=_component,
+        help="Which component of vectors, or which channel: its number from 0, or its name.",
+    ),
+    time=click.option(
+        "--time", type=click.IntRange(0), metavar="N", help="Which time step, from 0, where the file holds several."
     ),
 )
 read_options = group("read", **_READ)
@@ -142,6 +146,9 @@ def common_options(function: Callable[..., Any]) -> Callable[..., Any]:
     @click.option("-q", "--quiet", is_flag=True, help="Say nothing on standard error but errors.")
     @functools.wraps(function)
     def wrapper(*args: Any, quiet: bool, **kwargs: Any) -> Any:
-        return function(*args, console=Console(quiet), **kwargs)  # fmt: skip
+        with warnings.catch_warnings():
+            if quiet:
+                warnings.simplefilter("ignore")  # they are notes on standard error
+            return function(*args, console=Console(quiet), **kwargs)
 
     return wrapper

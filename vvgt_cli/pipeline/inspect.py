@@ -27,6 +27,8 @@ def inspect(file: str, read: ReadOptions) -> dict[str, Any]:
     """
     if file == STDIN and _head_of_stdin().startswith(_PLY):
         return {"kind": "gaussians", "name": "standard input", **describe(*read_ply(sys.stdin.buffer))}
+    if not os.path.exists(file) and os.path.isfile(file.rpartition("#")[0]):  # a preset of several
+        return _transfer_function(file)
     if not os.path.isfile(file):  # standard input, example:NAME, a folder, a glob, FILE:/array, or nothing
         return _volume(file, read)
     path = Path(file)
@@ -68,7 +70,10 @@ def _transfer_function(file: str) -> dict[str, Any]:
 
     tf = read_transfer_function(file)
     lo, hi = tf.node_range()
-    return {"kind": "transfer function", "name": tf.name, "nodes": [lo, hi]}
+    facts: dict[str, Any] = {"kind": "transfer function", "name": tf.name, "nodes": [lo, hi]}
+    if tf.opacity_unit_distance is not None:
+        facts["opacity_per"] = f"{tf.opacity_unit_distance:g} ({tf.opacity_unit_label})"
+    return facts
 
 
 def _volume(file: str, read: ReadOptions) -> dict[str, Any]:

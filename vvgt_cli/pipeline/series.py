@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -46,25 +47,40 @@ def frame_names(option: str, pattern: str, count: int) -> list[str]:
 
 
 @dataclass(frozen=True)
+class Step:
+    """A frame of a series: a file, or a time step of one.
+
+    Attributes:
+        name: for talk.
+        volume: as `SourceRequest.volume`.
+        read: how to read it.
+    """
+
+    name: str
+    volume: str
+    read: ReadOptions
+
+
+@dataclass(frozen=True)
 class Frames:
     """What the first pass over a series found.
 
     Attributes:
-        files: sorted by the numbers in their names.
+        count: how many there are.
         own: range (lo, hi) of each.
         whole: statistics of all frames together.
         first: the first frame without its values; the grid of all of them is its.
         content: digest of all frames' values.
     """
 
-    files: list[Path]
+    count: int
     own: list[tuple[float, float]]
     whole: Statistics
     first: Volume
     content: str
 
 
-def survey(files: list[Path], read: ReadOptions, console: Console) -> Frames:
+def survey(steps: Sequence[Step], console: Console) -> Frames:
     """Read every frame once, for the range and the digest of all.
 
     Raises:
@@ -75,22 +91,22 @@ def survey(files: list[Path], read: ReadOptions, console: Console) -> Frames:
     first: Volume | None = None
     numbers, digests = [], []
     bar = console.bar("range")
-    for k, file in enumerate(files):
-        volume = open_volume(str(file), read)
+    for k, step in enumerate(steps):
+        volume = open_volume(step.volume, step.read)
         if first is None:
             first = replace(volume, data=np.broadcast_to(volume.data.dtype.type(0), volume.data.shape))
         if _grid(volume) != _grid(first):
             raise DataError(
-                f"{file}: {_grid_text(volume)}; expected the grid of {files[0].name}, {_grid_text(first)}: frames of "
-                "one series share it"
+                f"{step.name}: {_grid_text(volume)}; expected the grid of {steps[0].name}, {_grid_text(first)}: frames "
+                "of one series share it"
             )
         numbers.append(statistics(volume))
         digests.append(volume_digest(volume))
         if bar:
-            bar(k + 1, len(files))
+            bar(k + 1, len(steps))
     if first is None:
         raise UsageError("a series without frames")
-    return Frames(files, [(n.lo, n.hi) for n in numbers], together(numbers), first, digest(*digests))
+    return Frames(len(steps), [(n.lo, n.hi) for n in numbers], together(numbers), first, digest(*digests))
 
 
 def _grid(volume: Volume) -> tuple[Any, ...]:
@@ -120,7 +136,7 @@ def together(parts: Sequence[Statistics]) -> Statistics:
 
 
 def convert_series(request: ConvertRequest, shard: Shard, console: Console | None = None) -> int:
-    """Convert every frame that ``request.source.volume``, a glob, names and that is not done yet.
+    """Convert every frame that ``request.source.volume``, a glob or a file of time steps, has and that is not done yet.
 
     Nodes of the function that follow from the data (``--tf-range rescale``, percentiles, the histogram) follow from all
     frames together. Frames in which the function shows nothing get no file, and a line says so.
@@ -143,33 +159,33 @@ def convert_series(request: ConvertRequest, shard: Shard, console: Console | Non
         raise UsageError("--dry-run of a series: expected one volume; try it on one of the frames")
     console = console or Console()
     source = request.source
-    files = _files(source)
-    names = _outputs(request, len(files))
+    steps = _steps(source)
+    names = _outputs(request, len(steps))
     run = Run(console, ConversionReport("convert"))
     with run.stage("frames") as stage:
-        frames = survey(files, source.read, console)
+        frames = survey(steps, console)
         source = replace(source, statistics=frames.whole)
         tf, distance = _function(source, frames)
         dark = [not tf.support(*own) for own in frames.own]
         stage.note = (
-            f"{len(files)} of {' x '.join(map(str, frames.first.dims))}, values {frames.whole.lo:g} to "
+            f"{len(steps)} of {' x '.join(map(str, frames.first.dims))}, values {frames.whole.lo:g} to "
             f"{frames.whole.hi:g}; {tf.name}: opacity per {distance[0]:g} ({distance[1]})"
         )
     if all(dark):
-        raise DataError(f"{source.volume}: {tf.name} shows nothing in any of {len(files)} frames; try another function")
+        raise DataError(f"{source.volume}: {tf.name} shows nothing in any of {len(steps)} frames; try another function")
     manifest = Manifest(Path(names[0][0]).parent, _settings(request, frames, tf, distance[0]), shard, what="frames")
     manifest.open([Path(name).name for row in names for name in row], request.overwrite)
     manifest.record()  # claims the folder
     done = 0
-    for k, file in enumerate(files):
+    for k, step in enumerate(steps):
         own = [Path(name).name for name in names[k]]
         if not shard.holds(k) or all(map(manifest.complete, own)):
             continue
         if dark[k]:
-            console.say(f"{file.name}: nothing of it is visible; it gets no file")
+            console.say(f"{step.name}: nothing of it is visible; it gets no file")
             continue
-        console.say(f"{file.name}: frame {k + 1} of {len(files)}, to {names[k][0]}")
-        report = convert(_frame(request, replace(source, volume=str(file)), names[k]), console)
+        console.say(f"{step.name}: frame {k + 1} of {len(steps)}, to {names[k][0]}")
+        report = convert(_frame(request, replace(source, volume=step.volume, read=step.read), names[k]), console)
         if report.refinement and report.refinement["reason"] == "interrupted":
             raise KeyboardInterrupt  # the frame is there, but not what it would be: it is made again
         manifest.record(own)
@@ -191,15 +207,25 @@ def _function(source: SourceRequest, frames: Frames) -> tuple[TransferFunction, 
     return resolve(read, frames.whole, parse_tf_range(source.tf_range)), distance
 
 
-def _files(source: SourceRequest) -> list[Path]:
+def _steps(source: SourceRequest) -> list[Step]:
+    """The files of a glob, or the time steps of the one file that is named."""
+    from vvgt_cli.volume.registry import time_steps
     from vvgt_cli.volume.slices import matching
 
-    files = matching(source.volume)
-    if not files:
+    files = [] if os.path.exists(source.volume) else matching(source.volume)
+    if not files and set(source.volume) & set("*?[") and not os.path.exists(source.volume):
         raise UsageError(
-            f"{source.volume}: no such files; with a number in -o expected the frames of a series, as 'run_*.vti'"
+            f"{source.volume}: no such files; with a number in -o expected the frames of a series, as 'run_*.vti', or "
+            "a file of several time steps"
         )
-    return files
+    if len(files) > 1:
+        return [Step(file.name, str(file), source.read) for file in files]
+    volume = str(files[0]) if files else source.volume
+    name = Path(volume).name
+    count = time_steps(volume, source.read)
+    if count == 1:
+        return [Step(name, volume, source.read)]
+    return [Step(f"{name} time {k}", volume, replace(source.read, time=k)) for k in range(count)]
 
 
 def _outputs(request: ConvertRequest, count: int) -> list[list[str]]:
@@ -233,7 +259,7 @@ def _settings(request: ConvertRequest, frames: Frames, tf: TransferFunction, dis
     return {
         "version": __version__,
         "volume": frames.content,
-        "frames": len(frames.files),
+        "frames": frames.count,
         "function": digest(tf.opacity_nodes, tf.color_map),
         "opacity_unit_distance": distance,
         **asdict(request.fit),

@@ -23,6 +23,7 @@ class TransferFunction:
         opacity_nodes: opacity per unit distance over the scalar.
         color_map: colour over the scalar.
         opacity_unit_distance: world length that the opacities are per, when the source says one.
+        opacity_unit_label: where ``opacity_unit_distance`` is from: the ``file``, or a default of its program.
         opacity_unit_share: the same as a share of the longest edge of the volume's box (Inviwo); not both.
         domain: what the node positions are: ``data`` values; a ``fraction`` in [0, 1] of the data range;
             or a ``percentile`` / 100 of the voxels. `vvgt_cli.transfer.resolve.resolve` turns all into data values.
@@ -37,6 +38,7 @@ class TransferFunction:
     opacity_unit_distance: float | None = None
     domain: str = "data"
     opacity_unit_share: float | None = None
+    opacity_unit_label: str = "file"
 
     def __post_init__(self) -> None:
         if self.domain not in DOMAINS:

@@ -106,14 +106,14 @@ def unit_distance(spec: str | float | None, volume: Volume, tf: TransferFunction
             ``mean-spacing``: arithmetic mean of the three spacings; None: the function's own, or ``paraview``.
 
     Returns:
-        (distance, label), the label one of ``given``, ``file``, ``paraview``, ``mean-spacing``.
+        (distance, label), the label one of ``given``, ``file``, ``paraview``, ``mean-spacing``, or the function's own.
 
     Raises:
         UsageError: anything else.
     """
     if spec is None:
         if tf is not None and tf.opacity_unit_distance is not None:
-            return tf.opacity_unit_distance, "file"
+            return tf.opacity_unit_distance, tf.opacity_unit_label
         if tf is not None and tf.opacity_unit_share is not None:
             return tf.opacity_unit_share * max(volume.extent), "file"
         spec = "paraview"

@@ -86,7 +86,7 @@ def select_component(
         if component not in (None, 0):
             raise UsageError(f"{what}; leave out --component {component}")
         return contiguous(values[..., 0]), scaling
-    if component is None or (isinstance(component, int) and component >= n):
+    if component is None or (component != "magnitude" and component not in range(n)):
         found = "" if component is None else f", not component {component}"
         raise UsageError(f"{what}{found}; expected a scalar: try --component 0 to {n - 1}, or --component magnitude")
     if component == "magnitude":

@@ -1,13 +1,14 @@
 """DICOM: a folder of one or more series, or one file (several frames allowed). Read by pydicom.
 
-Geometry: DICOM PS3.3, C.7.6.2 (Image Plane Module) and C.7.6.16 (multi-frame functional groups). Slices are ordered by
+Geometry: DICOM PS3.3, C.7.6.2 (Image Plane Module), C.7.6.16 (multi-frame functional groups) and C.8.8.3
+(dose grids). Slices are ordered by
 their positions along the normal of the image plane; names and instance numbers are not used.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -15,9 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import check_memory
 from vvgt_cli.volume.components import select_component
+from vvgt_cli.volume.dicom_select import choose_series, one_stack
 from vvgt_cli.volume.libraries import library_errors, need
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.registry import Reader, register
@@ -27,6 +29,11 @@ MOST = 100_000  # files
 TRIED = 1000  # files of a folder that are looked at to see whether it holds DICOM
 ANGLE = 1e-3  # of a unit normal: how far slices may be tilted against each other
 EVEN = 0.01  # of the spacing: how far a slice may be off
+CODECS = {  # what pydicom decodes a coding with, by words of its name, the first that fits
+    "JPEG-LS": "pyjpegls",
+    "JPEG 2000": "pylibjpeg pylibjpeg-openjpeg",
+    "JPEG": "pylibjpeg pylibjpeg-libjpeg",
+}
 
 
 def _is_dicom(head: bytes) -> bool:
@@ -88,8 +95,9 @@ def read_dicom(path: Path, options: ReadOptions) -> Volume:
         files = _files(path) if path.is_dir() else [path]
         headers = [(file, pydicom.dcmread(file, stop_before_pixels=True)) for file in files]
         headers = [(file, header) for file, header in headers if "Rows" in header and "Columns" in header]
-        title, chosen = _series(headers, options.array, path)
-        slices = _ordered([s for file, header in chosen for s in _frames(file, header)], path)
+        title, chosen, stack = choose_series(headers, options.array, path)
+        slices = [s for file, header in chosen for s in _frames(file, header)]
+        slices = _ordered(one_stack(slices, _alike, stack, title, path))
         spacing, direction = _steps(slices, path)
         values, (slope, intercept) = _pixels(pydicom, slices, path)
     field, (slope, intercept) = select_component(
@@ -101,38 +109,13 @@ def read_dicom(path: Path, options: ReadOptions) -> Volume:
     )  # type: ignore[arg-type]  # fmt: skip
 
 
-def _series(headers: Sequence[tuple[Path, Any]], wanted: str | None, path: Path) -> tuple[str, list[tuple[Path, Any]]]:
-    """The series asked for, or the only one: what to add to the volume's name, and its files."""
-    found: dict[str, list[tuple[Path, Any]]] = {}
-    for file, header in headers:
-        found.setdefault(str(header.get("SeriesInstanceUID", "")), []).append((file, header))
-    if not found:
-        raise DataError(f"{path}: no DICOM images; expected files with rows and columns of pixels")
-    listing = "; ".join(
-        f"{h.get('SeriesNumber', '?')} {str(h.get('SeriesDescription', '')).strip()!r} ({len(files)} files, {uid})"
-        for uid, files in found.items()
-        for _, h in files[:1]
-    )
-    if wanted is None:
-        if len(found) > 1:
-            raise UsageError(f"{path}: several series: {listing}; choose one by number or UID with --array SERIES")
-        return "", next(iter(found.values()))
-    wanted = wanted.strip("/")
-    fits = []
-    for uid, files in found.items():
-        keys = (str(files[0][1].get(key, "")).strip() for key in ("SeriesNumber", "SeriesDescription"))
-        fits += [files] if wanted in (uid, *keys) else []
-    if len(fits) != 1:
-        raise UsageError(f"{path}: {len(fits)} series {wanted!r}; it has {listing}; choose with --array SERIES")
-    return f":{wanted}", fits[0]
-
-
 def _frames(path: Path, header: Any) -> Iterator[_Slice]:
-    """The frames of a file: one, or those that functional groups place."""
+    """The frames of a file: one, or those that functional groups place, or the planes of a dose grid."""
     n = int(header.get("NumberOfFrames", 1) or 1)
+    dose = header.get("DoseGridScaling")
     per_frame = header.get("PerFrameFunctionalGroupsSequence")
     shared = (header.get("SharedFunctionalGroupsSequence") or [None])[0]
-    if n > 1 and not per_frame:
+    if n > 1 and not per_frame and dose is None:
         raise DataError(f"{path}: {n} frames without functional groups; expected a position for each")
     if per_frame and len(per_frame) != n:
         raise DataError(f"{path}: {n} frames, but places for {len(per_frame)}; check that the file is whole")
@@ -160,20 +143,31 @@ def _frames(path: Path, header: Any) -> Iterator[_Slice]:
             )
         scaling = (1.0 if slope is None else float(slope), 0.0 if intercept is None else float(intercept))
         place = np.array([float(c) for c in position])
+        if dose is not None:
+            scaling = (float(dose), 0.0)
+            place = place + _dose_offset(path, header, n, k, np.cross(rows[0], rows[1]))
         yield _Slice(path, k, header, place, rows, (float(between[1]), float(between[0])), scaling)
 
 
-def _ordered(slices: list[_Slice], path: Path) -> list[_Slice]:
-    """By position along the normal; all of one size, orientation and pixel spacing."""
+def _dose_offset(path: Path, header: Any, n: int, k: int, normal: np.ndarray) -> np.ndarray:
+    """How far plane k of a dose grid (RTDOSE) is from its ImagePositionPatient (PS3.3, C.8.8.3.2)."""
+    offsets = [float(z) for z in header.get("GridFrameOffsetVector") or ([0.0] if n == 1 else [])]
+    if len(offsets) != n:
+        raise DataError(f"{path}: a dose grid of {n} planes with {len(offsets)} offsets; expected one for each")
+    if offsets[0] == 0:
+        return offsets[k] * normal
+    return np.array([0.0, 0.0, offsets[k] - float(header.ImagePositionPatient[2])])  # these are heights themselves
+
+
+def _alike(a: _Slice, b: _Slice) -> bool:
+    """Whether two slices have one size, orientation and pixel spacing."""
+    same = all(a.header.get(k) == b.header.get(k) for k in ("Rows", "Columns", "SamplesPerPixel"))
+    return bool(same and np.allclose(a.rows, b.rows, atol=ANGLE) and np.allclose(a.spacing, b.spacing, rtol=1e-4))
+
+
+def _ordered(slices: list[_Slice]) -> list[_Slice]:
+    """By position along the normal."""
     first = slices[0]
-    for s in slices:
-        same = all(s.header.get(k) == first.header.get(k) for k in ("Rows", "Columns", "SamplesPerPixel"))
-        same = same and np.allclose(s.rows, first.rows, atol=ANGLE) and np.allclose(s.spacing, first.spacing, rtol=1e-4)
-        if not same:
-            raise DataError(
-                f"{path}: {s.path.name} and {first.path.name} differ in size, orientation or pixel spacing; expected "
-                "the slices of one stack (scouts and other stacks elsewhere)"
-            )
     normal = np.cross(first.rows[0], first.rows[1])
     return sorted(slices, key=lambda s: float(s.position @ normal))
 
@@ -246,10 +240,11 @@ def _decoded(pydicom: Any, path: Path) -> np.ndarray:
     try:
         return dataset.pixel_array
     except (NotImplementedError, RuntimeError) as error:  # a codec that pydicom does not have
-        syntax = dataset.file_meta.TransferSyntaxUID.name
+        syntax = dataset.file_meta.TransferSyntaxUID
+        package = next((package for name, package in CODECS.items() if name in syntax.name), None)
         raise DataError(
-            f"{path}: pixels coded as {syntax} cannot be decoded ({' '.join(str(error).split())[:200]}); "
-            "try: pip install pylibjpeg pylibjpeg-openjpeg"
+            f"{path}: pixels coded as {syntax.name} cannot be decoded ({' '.join(str(error).split())[:200]}); "
+            + (f"try: pip install {package}" if package else "convert them to an uncompressed syntax first")
         ) from error
 
 

@@ -153,5 +153,6 @@ register(
         read_hdf5,
         named_arrays=True,
         resamples=True,
+        times=True,
     )
 )

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.errors import DataError, SeveralSteps, UsageError
 from vvgt_cli.volume.blocks import check_memory, count
 from vvgt_cli.volume.components import contiguous, select_component
 from vvgt_cli.volume.options import ReadOptions
@@ -25,7 +25,7 @@ CF_ATTRIBUTES = (
     *("scale_factor", "add_offset", "_FillValue", "missing_value"),
     *("valid_min", "valid_max", "valid_range", "_Unsigned"),
 )
-_METRES = {
+METRES = {
     "km": 1e3, "kilometer": 1e3, "kilometre": 1e3, "m": 1.0, "meter": 1.0, "metre": 1.0, "cm": 1e-2, "centimeter": 1e-2,
     "mm": 1e-3, "millimeter": 1e-3, "millimetre": 1e-3, "um": 1e-6, "µm": 1e-6, "micron": 1e-6, "micrometer": 1e-6,
     "micrometre": 1e-6, "nm": 1e-9, "nanometer": 1e-9, "nanometre": 1e-9, "angstrom": 1e-10, "pm": 1e-12,
@@ -93,7 +93,8 @@ def labelled_volume(
         dtype: of the stored values.
         axes: of the array, slowest first.
         attributes: of the array: ``scale_factor``, ``add_offset``, ``_FillValue``, ``missing_value``, ``valid_*``.
-        options: ``component`` is the index along an axis that is not one of space.
+        options: ``time`` is the index along the axis of time, ``component`` that along another axis that is not one
+            of space; where there is only one such axis, either.
         source: for messages.
         name: of the volume.
 
@@ -102,19 +103,19 @@ def labelled_volume(
 
     Raises:
         DataError: an array without two or three axes of space, coordinates that do not ascend or descend.
-        UsageError: an axis too many and no choice along it, axes that are irregular or of different units.
+        UsageError: an axis too many and no choice along it (`SeveralSteps` where it is time's), axes that are
+            irregular or of different units.
     """
     if dtype.kind not in "iufb":
         raise DataError(f"{source}: values of type {dtype}; expected integers or floats")
-    space, extra = _split_axes(list(axes), options, source)
-    chosen = options.component if isinstance(options.component, int) else None
+    space, extra, step = _split_axes(list(axes), options, source)
+    chosen = None if options.component == "magnitude" else options.component
     index: list[Any] = [slice(None) if k in space else 0 for k in range(len(axes))]
-    if extra is not None:
-        if chosen is not None and chosen >= axes[extra].size:
-            raise UsageError(
-                f"{source}: --component {chosen}: axis {axes[extra]}; expected 0 to {axes[extra].size - 1}"
-            )
-        index[extra] = slice(None) if chosen is None else chosen
+    for k, flag, value in ((extra, "--component", chosen), (step, "--time", options.time)):
+        if k is not None:
+            if value is not None and value not in range(axes[k].size):
+                raise UsageError(f"{source}: {flag} {value}: axis {axes[k]}; expected 0 to {axes[k].size - 1}")
+            index[k] = slice(None) if value is None else value
     if callable(stored):
         sizes = [n.size if i == slice(None) else 1 for n, i in zip(axes, index, strict=True)]
         check_memory(count(tuple(sizes)) * dtype.itemsize, source)
@@ -135,8 +136,8 @@ def labelled_volume(
     return _placed(field, spatial, (slope, intercept), options, source, name)
 
 
-def _split_axes(axes: list[Axis], options: ReadOptions, source: str) -> tuple[list[int], int | None]:
-    """Indices of the axes of space, and of the one that a component is chosen along."""
+def _split_axes(axes: list[Axis], options: ReadOptions, source: str) -> tuple[list[int], int | None, int | None]:
+    """Indices of the axes of space, of the one that a component is chosen along, and of the one that a time is."""
     left = list(range(len(axes)))
     for k in [k for k in left if axes[k].size == 1]:  # of time steps and the like there may be one
         if len(left) > 3 or (len(left) == 3 and axes[k].role in ("t", "c")):
@@ -148,8 +149,20 @@ def _split_axes(axes: list[Axis], options: ReadOptions, source: str) -> tuple[li
         ends = left[0] if axes[left[0]].size <= axes[left[-1]].size else left[-1]
         odd = unnamed if len(unnamed) == 1 else [ends]
     space = [k for k in left if k not in odd]
+    times = [k for k in odd if axes[k].role == "t"]
+    steps = times or [k for k in odd if axes[k].role != "c"]
+    step = None
+    if options.time is not None and steps:
+        step = steps[0]
+        odd = [k for k in odd if k != step]
+    elif options.time:
+        raise UsageError(f"{source}: axes {listing}, none of time; leave out --time {options.time}")
+    elif times and (len(odd) > 1 or options.component is None):
+        raise SeveralSteps(source, axes[times[0]].size)
     if len(odd) > 1 or len(space) not in (2, 3):
-        raise DataError(f"{source}: axes {listing}; expected two or three axes of space and at most one more")
+        raise DataError(
+            f"{source}: axes {listing}; expected two or three axes of space, and at most one of time and one more"
+        )
     if not odd and options.component not in (None, 0):
         raise UsageError(f"{source}: axes {listing}, none of components; leave out --component {options.component}")
     if odd and options.component is None:
@@ -158,7 +171,7 @@ def _split_axes(axes: list[Axis], options: ReadOptions, source: str) -> tuple[li
             f"{source}: axes {listing}; expected three: choose along {axes[odd[0]].name or 'the shortest of them'} "
             f"with --component 0 to {last} (or --component magnitude)"
         )
-    return space, odd[0] if odd else None
+    return space, odd[0] if odd else None, step
 
 
 def _zyx(space: Sequence[int], axes: Sequence[Axis]) -> list[int]:
@@ -307,9 +320,9 @@ def _one_unit(axes: Sequence[Axis], source: str) -> list[np.ndarray | None]:
     units = [_unit(a) for a in axes if a.size > 1]
     if len(set(units)) <= 1:
         return [a.centres for a in axes]
-    if all(u in _METRES for u in units):
-        base = _METRES[units[-1]]
-        return [None if a.centres is None else a.centres * (_METRES.get(_unit(a), base) / base) for a in axes]
+    if all(u in METRES for u in units):
+        base = METRES[units[-1]]
+        return [None if a.centres is None else a.centres * (METRES.get(_unit(a), base) / base) for a in axes]
     told = ", ".join(f"{a.name or 'unnamed'} in {_unit(a) or 'no unit'}" for a in reversed(axes) if a.size > 1)
     raise UsageError(f"{source}: axes {told}; expected one unit of length: try --spacing X Y Z")
 
@@ -318,6 +331,6 @@ def _unit(a: Axis) -> str:
     unit = a.units.strip()
     if unit.lower().startswith("degree"):
         return "degrees"
-    if unit in _METRES:
+    if unit in METRES:
         return unit
-    return unit.lower().rstrip("s") if unit.lower().rstrip("s") in _METRES else unit.lower()
+    return unit.lower().rstrip("s") if unit.lower().rstrip("s") in METRES else unit.lower()

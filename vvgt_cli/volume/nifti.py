@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vvgt_cli.errors import DataError
+from vvgt_cli.errors import DataError, SeveralSteps, UsageError
 from vvgt_cli.volume.blocks import load_block
 from vvgt_cli.volume.components import select_component
 from vvgt_cli.volume.headers import unit_rows
@@ -197,14 +197,28 @@ def _image_file(path: Path) -> tuple[Path, bool]:
     raise DataError(f"{path}: the header of a pair, without its .img file beside it")
 
 
+def _times(header: Header, options: ReadOptions, source: str) -> tuple[int, int]:
+    """Time steps and components; a lone fourth axis counts as components where a component is asked for."""
+    times, rest = math.prod(header.dims[3:4]), math.prod(header.dims[4:])
+    if options.time is None and times > 1:
+        if rest > 1 or options.component is None:
+            raise SeveralSteps(source, times)
+        return 1, times
+    if (options.time or 0) >= times:
+        raise UsageError(f"{source}: --time {options.time}: it has {times} time steps; expected 0 to {times - 1}")
+    return times, rest
+
+
 def read_nifti(path: Path, options: ReadOptions) -> Volume:
-    """Read a NIfTI file. Axes beyond the third (time, vectors) are components; plain files are memory-mapped.
+    """Read a NIfTI file; plain files are memory-mapped. The fourth axis is time, those beyond it are components.
+
+    Where the fourth axis is the only one beyond space, ``component`` is taken for it too.
 
     sform, else qform, else pixdim say where voxels are; slope and intercept go into the volume.
 
     Raises:
         DataError: a header that is damaged or does not fit the data, colours or complex values.
-        UsageError: several time steps or components and none chosen.
+        UsageError: several components, or time steps (`SeveralSteps`), and none chosen.
     """
     head, zipped = _read_head(path)
     header = parse_header(head, str(path))
@@ -212,18 +226,23 @@ def read_nifti(path: Path, options: ReadOptions) -> Volume:
     if not header.single:
         source, zipped = _image_file(path)
     spatial = (*header.dims, 1, 1)[:3]
-    rest = math.prod(header.dims[3:])
-    component = options.component
-    if isinstance(component, int) and component < rest > 1:  # only that one need be unpacked
-        offset += component * math.prod(spatial) * header.dtype.itemsize
-        rest, component = 1, None
-    shape = (rest, *reversed(spatial))  # (c, z, y, x)
+    times, rest = _times(header, options, str(path))
+    step, component = options.time or 0, options.component
+    number = None  # of the one volume that need be unpacked
+    if rest == 1:
+        number = step
+    elif isinstance(component, int) and component < rest:
+        number, component = component * times + step, None
+    if number is not None:
+        offset += number * math.prod(spatial) * header.dtype.itemsize
+        times, rest, step = 1, 1, 0
+    shape = (rest, times, *reversed(spatial))  # (c, t, z, y, x)
     if zipped:
         block = load_block(source, header.dtype, shape, encoding="gzip", skip=offset)
     else:
         block = load_block(source, header.dtype, shape, offset=offset)
     field, (slope, intercept) = select_component(
-        np.moveaxis(block, 0, -1),
+        np.moveaxis(block[:, step], 0, -1),
         component,
         str(path),
         label="the series" if rest > 1 else "",
@@ -243,4 +262,4 @@ def read_nifti(path: Path, options: ReadOptions) -> Volume:
     )
 
 
-register(Reader("NIfTI", (".nii", ".nii.gz", ".hdr"), _sniff, read_nifti, unzips=True))
+register(Reader("NIfTI", (".nii", ".nii.gz", ".hdr"), _sniff, read_nifti, unzips=True, times=True))

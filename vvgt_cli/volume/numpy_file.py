@@ -131,5 +131,5 @@ def _is_npz(head: bytes) -> bool:
     return head.startswith(b"PK\x03\x04") and b".npy" in head[:512]
 
 
-register(Reader("NumPy", (".npy",), lambda head: head.startswith(b"\x93NUMPY"), read_npy))
-register(Reader("NumPy archive", (".npz",), _is_npz, read_npz, named_arrays=True))
+register(Reader("NumPy", (".npy",), lambda head: head.startswith(b"\x93NUMPY"), read_npy, times=True))
+register(Reader("NumPy archive", (".npz",), _is_npz, read_npz, named_arrays=True, times=True))

@@ -47,7 +47,9 @@ class ReadOptions:
         header_bytes: bytes to skip at the start of a raw file.
         spacing: voxel edges (x, y, z) in world units; overrides the file's.
         array: name of the array (path of a dataset, series of a DICOM folder), for formats that hold several.
-        component: index of a component, or ``magnitude``, for arrays that have several.
+        component: index of a component or channel, the name of a channel, or ``magnitude``, for arrays that have
+            several.
+        time: index of the time step, for files that hold several.
         space: anatomical space to bring the volume to, ``RAS`` or ``LPS``; None: RAS where its file states one.
 
     Raises:
@@ -61,6 +63,7 @@ class ReadOptions:
     spacing: tuple[float, float, float] | None = None
     array: str | None = None
     component: int | str | None = None
+    time: int | None = None
     space: str | None = None
 
     def __post_init__(self) -> None:
@@ -79,10 +82,10 @@ class ReadOptions:
         if self.space not in (None, "RAS", "LPS"):
             raise UsageError(f"--space {self.space}: expected RAS or LPS")
         component = self.component
-        if isinstance(component, str) and component != "magnitude":
-            raise UsageError(f"--component {component}: expected an index (0, 1, ...) or magnitude")
-        if isinstance(component, int) and component < 0:
-            raise UsageError(f"--component {component}: expected an index of at least 0, or magnitude")
+        if component == "" or (isinstance(component, int) and component < 0):
+            raise UsageError(f"--component {component}: expected an index (0, 1, ...), a channel's name or magnitude")
+        if self.time is not None and self.time < 0:
+            raise UsageError(f"--time {self.time}: expected the index of a time step (0, 1, ...)")
 
     @property
     def raw_flags(self) -> list[str]:

@@ -13,14 +13,16 @@ import struct
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 
-from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.errors import DataError, SeveralSteps, UsageError
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.space import in_space
 from vvgt_cli.volume.types import Volume
 
 HEAD_BYTES = 4096
+LOOKED_AT = 2000  # files of a folder
 
 
 @dataclass(frozen=True)
@@ -34,10 +36,12 @@ class Reader:
         read: path and options to volume.
         unzips: reads gzip-compressed files by itself.
         named_arrays: takes ``--array``.
+        times: takes ``--time``.
         raw_layout: takes dims, dtype, byte order and header bytes.
         by_name: tried on a file that only its name speaks for (formats without a fixed beginning).
         resamples: takes ``--dims`` as the grid to sample on.
         holds: does this folder hold the format? Of formats that are folders.
+        by_whole: such a folder is one volume whatever else lies in it.
     """
 
     name: str
@@ -46,10 +50,12 @@ class Reader:
     read: Callable[[Path, ReadOptions], Volume]
     unzips: bool = False
     named_arrays: bool = False
+    times: bool = False
     raw_layout: bool = False
     by_name: bool = False
     resamples: bool = False
     holds: Callable[[Path], bool] | None = None
+    by_whole: bool = False
 
 
 Scheme = Callable[[str, ReadOptions], Volume]
@@ -105,6 +111,8 @@ def read_volume(source: str, options: ReadOptions | None = None) -> Volume:
         UsageError: options that the format does not take, or a choice (array, component, dims) that is missing.
     """
     options = options or ReadOptions()
+    if options.time is not None and (source == "-" or source.partition(":")[0] in _SCHEMES):
+        raise UsageError(f"{source}: one volume, no time steps; leave out --time {options.time}")
     return in_space(_read(source, options), options.space)
 
 
@@ -132,6 +140,19 @@ def _read(source: str, options: ReadOptions) -> Volume:
         raise DataError(f"{source}: not enough memory to read it; try a machine with more") from error
 
 
+def time_steps(source: str, options: ReadOptions) -> int:
+    """How many time steps a source has, where ``options`` choose none.
+
+    Raises:
+        DataError, UsageError: as `read_volume`.
+    """
+    try:
+        read_volume(source, options)
+    except SeveralSteps as error:
+        return error.steps
+    return 1
+
+
 def _inner(source: str, options: ReadOptions) -> tuple[Path, ReadOptions]:
     """Path of ``PATH:/inner/path``, and the options with the inner path as their array."""
     head, _, inner = source.rpartition(":/")
@@ -155,13 +176,38 @@ def _slices(source: str, options: ReadOptions) -> Volume | None:
 
 
 def _folder(path: Path, source: str) -> Reader:
+    """The reader of a folder; none where more of its files are volumes of other formats."""
+    lying = _lying(path)
     for reader in _READERS:
         if reader.holds is not None and reader.holds(path):
-            return reader
+            own = len(lying.get(reader.name.removesuffix(" slices"), []))
+            if reader.by_whole or 2 * own >= sum(map(len, lying.values())):
+                return reader
+    if lying:
+        listing = "; ".join(f"{len(names)} {kind} ({', '.join(names[:3])}{', ...' if len(names) > 3 else ''})"
+                            for kind, names in lying.items())  # fmt: skip
+        raise DataError(f"{source}: a folder with {listing}; expected one volume: give one of the files")
     kinds = ", ".join(reader.name for reader in _READERS if reader.holds is not None)
     raise DataError(
         f"{source}: a folder; expected a volume file ({', '.join(known_suffixes())}) or a folder of {kinds}"
     )
+
+
+def _lying(path: Path) -> dict[str, list[str]]:
+    """The volume files in a folder (not in those in it), by format: of their name, else of their content."""
+    found: dict[str, list[str]] = {}
+    for name in sorted(entry.name for entry in islice(os.scandir(path), LOOKED_AT) if entry.is_file()):
+        reader = _by_name(path / name)
+        if reader is None:
+            try:
+                with open(path / name, "rb") as file:
+                    head = file.read(HEAD_BYTES)
+            except OSError:
+                continue
+            reader = next((r for r in _READERS if r.holds is not None and head and r.sniff(head)), None)
+        if reader is not None:
+            found.setdefault(reader.name, []).append(name)
+    return found
 
 
 def _head(path: Path, source: str) -> bytes:
@@ -227,6 +273,11 @@ def _check_options(reader: Reader, source: str, options: ReadOptions) -> None:
     needless = [flag for flag in options.raw_flags if not (reader.resamples and flag == "--dims")]
     if not reader.raw_layout and needless:
         raise UsageError(f"{source}: a {reader.name} file, which states its own layout; leave out {' '.join(needless)}")
+    if options.time is not None and not reader.times:
+        raise UsageError(
+            f"{source}: a {reader.name} file, of which no time steps are known; leave out --time {options.time} (along "
+            "a fourth axis of any kind --component N chooses)"
+        )
     if options.array is not None and not reader.named_arrays:
         raise UsageError(
             f"{source}: a {reader.name} file, which has one array without a name; leave out --array {options.array}"

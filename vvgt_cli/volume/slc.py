@@ -13,6 +13,7 @@ import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import check_memory, load_block
+from vvgt_cli.volume.components import select_component
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.registry import Reader, register, volume_name
 from vvgt_cli.volume.types import Volume
@@ -44,7 +45,8 @@ def read_slc(path: Path, options: ReadOptions) -> Volume:
         data = _decode(path, (nz, ny, nx), start)
     else:
         raise DataError(f"{path}: SLC coding {coding}; expected 0 (plain) or 1 (run lengths)")
-    return Volume(data, spacing, name=volume_name(path))
+    field, _ = select_component(data[..., None], options.component, str(path))
+    return Volume(field, spacing, name=volume_name(path))
 
 
 def _decode(path: Path, shape: tuple[int, int, int], start: int) -> np.ndarray:

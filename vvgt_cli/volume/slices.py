@@ -43,7 +43,7 @@ def read_folder(folder: Path, options: ReadOptions) -> Volume:
 
 
 def read_slices(files: list[Path], options: ReadOptions, source: str, name: str) -> Volume:
-    """Slice z is file z, with rows from the top as y.
+    """Slice z is file z, with rows from the top as y; the spacing is the first file's.
 
     Raises:
         DataError: slices of different sizes or types, files of several pages, more files than `MOST`.
@@ -52,13 +52,18 @@ def read_slices(files: list[Path], options: ReadOptions, source: str, name: str)
     if len(files) > MOST:
         raise DataError(f"{source}: {len(files)} files; expected at most {MOST} slices")
     out: np.ndarray | None = None
+    spacing = (1.0, 1.0, 1.0)
     for z, path in enumerate(files):
-        plane = read_tiff(path, options).data
+        volume = read_tiff(path, options)
+        plane = volume.data
         if plane.shape[0] != 1:
-            raise DataError(f"{path}: {plane.shape[0]} pages in one of {len(files)} files; expected one slice a file")
+            raise DataError(
+                f"{path}: {plane.shape[0]} slices in one of {len(files)} files; expected one slice a file (of an OME "
+                "set give one of the files alone)"
+            )
         if out is None:
             check_memory(len(files) * plane.nbytes, source)
-            out = np.empty((len(files), *plane.shape[1:]), plane.dtype)
+            out, spacing = np.empty((len(files), *plane.shape[1:]), plane.dtype), volume.spacing
         if plane.shape[1:] != out.shape[1:] or plane.dtype != out.dtype:
             raise DataError(
                 f"{path}: {plane.shape[2]} x {plane.shape[1]} {plane.dtype}; expected {out.shape[2]} x {out.shape[1]} "
@@ -67,7 +72,7 @@ def read_slices(files: list[Path], options: ReadOptions, source: str, name: str)
         out[z] = plane[0]
     if out is None:
         raise DataError(f"{source}: no TIFF slices")
-    return Volume(out, options.spacing_or((1.0, 1.0, 1.0)), name=name)
+    return Volume(out, spacing, name=name)
 
 
 def read_glob(pattern: str, options: ReadOptions) -> Volume | None:

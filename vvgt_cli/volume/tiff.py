@@ -1,151 +1,271 @@
-"""TIFF stacks (``.tif``, ``.tiff``), one page a slice, read with OpenImageIO.
+"""TIFF (``.tif``, ``.tiff``), OME-TIFF, ImageJ's and BigTIFF among them: axes by tifffile, pixels by OpenImageIO.
 
-The directories are walked first: the pages must agree, and their sizes are checked against the file. Pixels are
-decoded by OpenImageIO because VTK's reader takes only 8- and 16-bit unsigned and 32-bit float pages, and returns the
-pages before the damage of a damaged file as if that were all.
+tifffile says which page is which slice, channel and time. Its decoders are not used where OpenImageIO has one: those
+unpack a page to its size and no further, and need no further package. Pixels that lie together plainly are
+memory-mapped. What OpenImageIO does not decode is left to tifffile, which wants imagecodecs for it.
 """
 
 from __future__ import annotations
 
-import struct
-from dataclasses import dataclass
+import itertools
+import logging
+import math
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from vvgt_cli.errors import DataError
+from vvgt_cli.errors import DataError, SeveralSteps, UsageError
 from vvgt_cli.volume.blocks import check_memory, size_text
-from vvgt_cli.volume.components import select_component
+from vvgt_cli.volume.components import contiguous, magnitude
+from vvgt_cli.volume.libraries import library_errors
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.registry import Reader, register, volume_name
+from vvgt_cli.volume.tiff_decode import Pages
+from vvgt_cli.volume.tiff_facts import Facts, imagej_facts, ome_facts, ome_root
+from vvgt_cli.volume.tiff_pages import check_pages
 from vvgt_cli.volume.types import Volume
 
 SUFFIXES = (".tif", ".tiff")
-_WIDTH, _HEIGHT, _BITS, _SAMPLES, _SUBFILE = 256, 257, 258, 277, 254
-_FIELD = {1: "B", 3: "H", 4: "I", 13: "I", 16: "Q"}
-_MAX_PAGES = 1 << 20
-_MAX_RATIO = 1 << 15  # fax codes blank pages in next to nothing; deflate is at 1032
+_LISTED = 12  # series or channels that an error lists
+_AXES = {"X": "columns", "Y": "rows", "Z": "slices", "T": "time steps", "C": "channels", "S": "samples"}
 
 
 @dataclass(frozen=True)
-class _Page:
-    width: int
-    height: int
-    bits: int
-    samples: int
+class Layout:
+    """Where the voxels are in the axes of a series.
 
-
-def pages(path: Path) -> list[_Page | None]:
-    """The page sizes from the file's directories; None for a page that is a thumbnail or a mask.
-
-    Raises:
-        DataError: a directory outside the file or in a circle.
+    Attributes:
+        axes: letters as tifffile has them, unknown ones that stand for slices made Z.
+        shape: sizes along them.
+        lead: how many of them count pages; the rest lie in a page.
     """
-    with open(path, "rb") as file:
-        head = file.read(16)
-        order = "<" if head[:2] == b"II" else ">"
-        (version,) = struct.unpack_from(order + "H", head, 2)
-        big = version == 43
-        (offset,) = struct.unpack_from(order + ("Q" if big else "I"), head, 8 if big else 4)
-        number, entry, link = ("Q", "HHQ8s", "Q") if big else ("H", "HHI4s", "I")
-        found: list[_Page | None] = []
-        seen: set[int] = set()
-        while offset:
-            if offset in seen or len(seen) >= _MAX_PAGES:
-                raise DataError(f"{path}: page {len(seen)} of the TIFF file points back to an earlier one")
-            seen.add(offset)
-            file.seek(offset)
-            (n,) = struct.unpack(order + number, file.read(struct.calcsize(number)))
-            step = struct.calcsize("<" + entry)
-            table = file.read(min(n, 4096) * step)
-            found.append(_page(table, order, entry, step, file))
-            file.seek(offset + struct.calcsize(number) + n * step)
-            (offset,) = struct.unpack(order + link, file.read(struct.calcsize(link)))
-    return found
 
+    axes: str
+    shape: tuple[int, ...]
+    lead: int
 
-def _page(table: bytes, order: str, entry: str, step: int, file: object) -> _Page | None:
-    tags: dict[int, int] = {}
-    for at in range(0, len(table) - step + 1, step):
-        tag, kind, _n, value = struct.unpack_from(order + entry, table, at)
-        if kind in _FIELD:
-            tags[tag] = struct.unpack_from(order + _FIELD[kind], value)[0]
-    if tags.get(_SUBFILE, 0) & 5:
-        return None
-    samples = tags.get(_SAMPLES, 1)
-    # BitsPerSample lies elsewhere in the file when there are several: 8 is the least that matters for a size check.
-    bits = tags.get(_BITS, 1) if samples <= 2 else 8
-    return _Page(tags.get(_WIDTH, 0), tags.get(_HEIGHT, 0), bits, samples)
+    def of(self, letters: str) -> list[int]:
+        """Positions of axes of more than one value."""
+        return [k for k, a in enumerate(self.axes) if a in letters and self.shape[k] > 1]
 
 
 def read_tiff(path: Path, options: ReadOptions) -> Volume:
-    """Read a TIFF stack: page k is slice z = k, rows from the top are y. Resolution tags are not spacing.
+    """Read a volume from a TIFF file; rows from the top are y. Resolution tags alone are not spacing.
+
+    Spacing is in micrometres where OME-XML or ImageJ's description has one, else 1.
 
     Raises:
-        DataError: pages of different sizes, damaged pages, or sizes that the file cannot hold.
-        UsageError: colour pages and no component chosen.
+        DataError: directories or OME-XML that cannot be, damaged or missing pages, pixels of an unknown coding.
+        UsageError: several series, channels or time steps (`SeveralSteps`) and none chosen.
     """
+    import tifffile
+
+    check_pages(path)
+    with library_errors(str(path), "TIFF"), _silent(), tifffile.TiffFile(path) as file:
+        root = ome_root(file.ome_metadata, path) if file.is_ome and file.ome_metadata else None
+        series, number = _series(file, options.array, path)
+        facts = _facts(file, root, series, number, path)
+        layout = _layout(series, path)
+        index, several = _choose(layout, facts, options, path, series.dtype)
+        values = _values(file, series, layout, index, path)
+    order = [*(_kept(layout, index, a) for a in "ZYX"), *([_kept(layout, index, c) for c in "CS"] if several else [])]
+    field = _arranged(values, order, layout, index)
+    if several:
+        check_memory(field[..., 0].size * 4, str(path))
+        field = magnitude(field)
+    elif not field.flags.c_contiguous:
+        check_memory(field.nbytes, str(path))
+    spacing, guessed = facts.voxel(options, field.shape[0], str(path))
+    if guessed:
+        warnings.warn(
+            f"{path}: no distance between its slices; taken as wide as its pixels (--spacing X Y Z sets it)",
+            stacklevel=2,
+        )
+    return Volume(contiguous(field), spacing, name=volume_name(path))
+
+
+@contextmanager
+def _silent() -> Iterator[None]:
+    """Keep tifffile from logging: what matters of it becomes an error here."""
+    logger = logging.getLogger("tifffile")
+    before, logger.disabled = logger.disabled, True
     try:
-        found = pages(path)
-    except struct.error as error:
-        raise DataError(f"{path}: its TIFF directories are cut short; check that the file is whole") from error
-    wanted = [k for k, page in enumerate(found) if page is not None]
-    sizes = {(p.width, p.height, p.samples) for p in found if p is not None}
-    if len(sizes) != 1:
-        raise DataError(f"{path}: pages of {len(sizes)} sizes {sorted(sizes)[:4]}; expected slices of one size")
-    width, height, samples = sizes.pop()
-    if min(width, height, samples) < 1:
-        raise DataError(f"{path}: pages of {width} x {height} pixels with {samples} samples; expected at least 1")
-    file_size = path.stat().st_size
-    least = width * height * samples * len(wanted)
-    if least > file_size * _MAX_RATIO:
-        raise DataError(f"{path}: {size_text(file_size)} cannot hold {len(wanted)} pages of {width} x {height} pixels")
-    values = _decode(path, wanted, (height, width, samples))
-    field, _ = select_component(values, options.component, str(path), label="each page")
-    return Volume(field, options.spacing_or((1.0, 1.0, 1.0)), name=volume_name(path))
-
-
-def _decode(path: Path, wanted: list[int], shape: tuple[int, int, int]) -> np.ndarray:
-    """(pages, height, width, samples) by OpenImageIO, in the file's own type."""
-    import OpenImageIO as oiio
-
-    config = oiio.ImageSpec()
-    config.attribute("oiio:UnassociatedAlpha", 1)  # numbers as stored, not multiplied by alpha
-    config.attribute("oiio:RawColor", 1)
-    image = oiio.ImageInput.open(str(path), config)
-    if image is None:
-        raise DataError(f"{path}: cannot be read as TIFF ({_one_line(oiio.geterror())})")
-    out: np.ndarray | None = None
-    try:
-        for z, page in enumerate(wanted):
-            spec = image.spec() if image.seek_subimage(page, 0) else None
-            if spec is not None and (spec.height, spec.width, spec.nchannels) != shape:
-                raise DataError(
-                    f"{path}: page {page} is {spec.width} x {spec.height} x {spec.nchannels} when decoded; expected "
-                    f"{shape[1]} x {shape[0]} x {shape[2]} (palettes are not scalars: convert to grey first)"
-                )
-            pixels = None if spec is None else image.read_image(page, 0, 0, spec.nchannels, spec.format)
-            if pixels is None:
-                raise DataError(f"{path}: page {page} is damaged ({_one_line(image.geterror())})")
-            if out is None:
-                check_memory(len(wanted) * pixels.nbytes, str(path))
-                out = np.empty((len(wanted), *shape), pixels.dtype)
-            if pixels.dtype != out.dtype:
-                raise DataError(f"{path}: page {page} has type {pixels.dtype}, the first one {out.dtype}")
-            out[z] = pixels.reshape(shape)
+        yield
     finally:
-        image.close()
-    if out is None:
-        raise DataError(f"{path}: a TIFF file without pages")
+        logger.disabled = before
+
+
+def _series(file: Any, wanted: str | None, path: Path) -> tuple[Any, int]:
+    """The series asked for, or the only one that is an image of its own; and its number."""
+    found = [(k, s) for k, s in enumerate(file.series) if not (s.keyframe.is_reduced or s.keyframe.is_mask)]
+    if not found:
+        raise DataError(f"{path}: no pages but thumbnails and masks; expected slices")
+    listing = "; ".join(
+        f"{k} {s.name!r} ({' x '.join(map(str, s.shape))}, axes {s.axes}, {s.dtype})" for k, s in found[:_LISTED]
+    ) + ("; ..." if len(found) > _LISTED else "")
+    if wanted is None:
+        if len(found) > 1:
+            raise UsageError(f"{path}: {len(found)} series: {listing}; choose one by number or name with --series NAME")
+        return found[0][1], found[0][0]
+    fits = [(k, s) for k, s in found if wanted.strip("/") in (str(k), s.name)]
+    if len(fits) != 1:
+        raise UsageError(f"{path}: {len(fits)} series {wanted!r}; it has {listing}; choose with --series NAME")
+    return fits[0][1], fits[0][0]
+
+
+def _facts(file: Any, root: Any, series: Any, number: int, path: Path) -> Facts:
+    """What the file says of a series; its pages must be what was told of them."""
+    facts = Facts()
+    if root is not None:
+        facts = ome_facts(root, number, len(file.series))
+        if series.kind not in ("ome", "imagej", "mmstack"):
+            raise DataError(f"{path}: its OME-XML does not fit its pages; check that the file is whole")
+    if facts.spacing == (None, None, None) and file.is_imagej and not file.is_shaped:
+        first = file.pages.first
+        resolution = tuple(float(n) for n in first.get_resolution())
+        told = imagej_facts(file.imagej_metadata or {}, resolution, int(first.resolutionunit))  # type: ignore[arg-type]
+        facts = replace(told, channels=facts.channels)
+        if facts.images > 1 and series.kind != "imagej" and root is None:
+            raise DataError(
+                f"{path}: ImageJ's description tells of {facts.images} images that are not there; is it whole?"
+            )
+    return facts
+
+
+def _layout(series: Any, path: Path) -> Layout:
+    """The axes of a series, and how they lie in its pages."""
+    axes, shape = series.get_axes(False), tuple(map(int, series.get_shape(False)))
+    keyframe = series.keyframe
+    if keyframe.photometric == 3 and not (keyframe.is_imagej or series.kind in ("ome", "imagej")):
+        raise DataError(f"{path}: pixels are numbers of a palette's colours; expected scalars: convert to grey first")
+    strange = [k for k, a in enumerate(axes) if a not in _AXES and shape[k] > 1]
+    deep = any(a == "Z" and n > 1 for a, n in zip(axes, shape, strict=True))
+    if len(strange) == 1 and not deep and axes[strange[0]] in "IQ":
+        axes = axes.replace("Z", "Q")
+        axes = axes[: strange[0]] + "Z" + axes[strange[0] + 1 :]
+    elif strange:
+        raise DataError(
+            f"{path}: axes {_described(axes, shape)}; expected slices, rows, columns, channels and time steps: "
+            "write the others as files of their own"
+        )
+    lead = next((k for k in range(len(shape), -1, -1) if math.prod(shape[k:]) == keyframe.size), None)
+    if lead is None or math.prod(shape[:lead]) != len(series):
+        raise DataError(
+            f"{path}: {len(series)} pages of {keyframe.size} values; expected {' x '.join(map(str, shape))}; check "
+            "that the file is whole"
+        )
+    layout = Layout(axes, shape, lead)
+    if any(len(layout.of(letter)) > 1 for letter in _AXES):
+        raise DataError(f"{path}: axes {_described(axes, shape)}; expected one of each")
+    return layout
+
+
+def _described(axes: str, shape: tuple[int, ...]) -> str:
+    return ", ".join(f"{n} {_AXES.get(a, a)}" for a, n in zip(axes, shape, strict=True) if n > 1) or "of one value each"
+
+
+def _choose(
+    layout: Layout, facts: Facts, options: ReadOptions, path: Path, dtype: np.dtype
+) -> tuple[tuple[int | slice, ...], bool]:
+    """An index along every axis of a series (whole along those of space), and whether all channels are wanted."""
+    space = layout.of("XYZ")
+    index: list[int | slice] = [slice(None) if k in space else 0 for k in range(len(layout.shape))]
+    channels = layout.of("CS")
+    several = options.component == "magnitude" and bool(channels)
+    number = _channel([layout.shape[k] for k in channels], facts.channels, options.component, path, dtype)
+    for k in reversed(channels):  # the samples of a pixel count faster than the channels
+        index[k] = slice(None) if several else number % layout.shape[k]
+        number //= layout.shape[k]
+    times = layout.of("T")
+    steps = layout.shape[times[0]] if times else 1
+    if options.time is None and steps > 1:
+        raise SeveralSteps(str(path), steps, "time steps" if layout.of("Z") else "time steps of one slice each")
+    if (options.time or 0) >= steps:
+        raise UsageError(
+            f"{path}: --time {options.time}: it has {steps} time step{'s' * (steps > 1)}; "
+            + (f"expected 0 to {steps - 1}" if steps > 1 else "leave out --time")
+        )
+    for k in times:
+        index[k] = options.time or 0
+    return tuple(index), several
+
+
+def _channel(sizes: list[int], names: list[str], wanted: int | str | None, path: Path, dtype: np.dtype) -> int:
+    """Number of the channel asked for, or of the only one; 0 for the magnitude of all."""
+    n = math.prod(sizes)
+    names = names if len(names) == n else []
+    if wanted == "magnitude" and n > 1:
+        return 0
+    if isinstance(wanted, str) and names.count(wanted) == 1:
+        return names.index(wanted)
+    if isinstance(wanted, int) and wanted < n:
+        return wanted
+    if wanted is None and n == 1:
+        return 0
+    shown = ", ".join(f"{k} {name!r}" for k, name in enumerate(names[:_LISTED])) + (", ..." if n > _LISTED else "")
+    what = f"{path}: {n} channel{'s' * (n > 1)}{f' ({shown})' if names else ''} of type {dtype}"
+    if n == 1:
+        raise UsageError(f"{what}; leave out --channel {wanted}")
+    found = "" if wanted is None else f", not {wanted!r}"
+    raise UsageError(f"{what}{found}; expected one: try --channel 0 to {n - 1}, a name, or --component magnitude")
+
+
+def _kept(layout: Layout, index: tuple[int | slice, ...], letter: str) -> int | None:
+    """Position of a letter's axis among those that an index keeps."""
+    kept = [k for k, i in enumerate(index) if isinstance(i, slice)]
+    return next((kept.index(k) for k in kept if layout.axes[k] == letter), None)
+
+
+def _arranged(
+    values: np.ndarray, order: list[int | None], layout: Layout, index: tuple[int | slice, ...]
+) -> np.ndarray:
+    """The values with axes z, y, x, and one of channels where there are several."""
+    there = [k for k in order if k is not None]
+    field = np.transpose(values, there)
+    for at, k in enumerate(order[:3]):
+        if k is None:
+            field = np.expand_dims(field, at)
+    return field if len(order) == 3 else field.reshape(*field.shape[:3], -1)
+
+
+def _values(file: Any, series: Any, layout: Layout, index: tuple[int | slice, ...], path: Path) -> np.ndarray:
+    """The values at an index of a series: mapped where they lie together plainly, else decoded page by page."""
+    if series.dataoffset is not None and not series.is_multifile and series.keyframe.is_memmappable:
+        offset, need = int(series.dataoffset), math.prod(layout.shape) * series.dtype.itemsize
+        size = path.stat().st_size
+        if offset + need > size:
+            raise DataError(f"{path}: {size_text(size)}; its pixels need {size_text(offset + need)}: is it whole?")
+        dtype = series.dtype.newbyteorder(file.byteorder)
+        return np.memmap(path, dtype, "r", offset, layout.shape)[index]
+    missing = [number for number, page in enumerate(series[:]) if page is None]
+    if missing:
+        raise DataError(
+            f"{path}: {len(missing)} of {len(series)} planes are missing, the first is number {missing[0]}; check that "
+            "the file, or the set, is whole"
+        )
+    whole = [isinstance(i, slice) for i in index]
+    sizes = [n for n, kept in zip(layout.shape, whole, strict=True) if kept]
+    check_memory(math.prod(sizes) * series.dtype.itemsize, str(path))
+    out = np.empty(sizes, series.dtype)
+    lead, inner = layout.shape[: layout.lead], layout.shape[layout.lead :]
+    rows = out.reshape(-1, *(n for n, kept in zip(inner, whole[layout.lead :], strict=True) if kept))
+    wanted = itertools.product(
+        *(range(n) if isinstance(i, slice) else (i,) for n, i in zip(lead, index[: layout.lead], strict=True))
+    )
+    with Pages(path) as pages:
+        for row, place in zip(rows, wanted, strict=True):
+            number = int(np.ravel_multi_index(place, lead)) if place else 0
+            row[...] = pages.decoded(series[number], series).reshape(inner)[index[layout.lead :]]
     return out
-
-
-def _one_line(text: str) -> str:
-    return " ".join(text.split())[:200] or "no message"
 
 
 def _sniff(head: bytes) -> bool:
     return head[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
 
-register(Reader("TIFF", SUFFIXES, _sniff, read_tiff))
+register(Reader("TIFF", (".ome.tif", ".ome.tiff", *SUFFIXES), _sniff, read_tiff, named_arrays=True, times=True))

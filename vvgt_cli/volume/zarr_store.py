@@ -205,4 +205,16 @@ def _ome_axes(place: Path, shape: tuple[int, ...]) -> list[Axis]:
     return axes
 
 
-register(Reader("Zarr", (".zarr",), lambda head: False, read_zarr, named_arrays=True, resamples=True, holds=holds_zarr))
+register(
+    Reader(
+        "Zarr",
+        (".zarr",),
+        lambda head: False,
+        read_zarr,
+        named_arrays=True,
+        resamples=True,
+        times=True,
+        holds=holds_zarr,
+        by_whole=True,
+    )
+)

@@ -13,6 +13,7 @@ from vvgt_cli.transfer.opacity import PiecewiseOpacity
 from vvgt_cli.transfer.readers.fields import named, rgb, table
 
 PRESET_KEYS = ("RGBPoints", "IndexedColors", "ColorSpace")
+LISTED, LONGEST = 60, 1000  # names, characters of them, in an error
 SPACE_OF = {name.lower().replace("-", ""): name for name in SPACES} | {"ciede2000": "Lab/CIEDE2000"}
 
 
@@ -78,5 +79,5 @@ def choose(presets: list[dict[str, Any]], what: str, pick: str) -> dict[str, Any
 
 
 def _listed(names: list[str]) -> str:
-    shown = ", ".join(repr(n) for n in names[:8])
-    return shown + (", ..." if len(names) > 8 else "")
+    shown = ", ".join(repr(n) for n in names[:LISTED])
+    return shown[:LONGEST] + (", ..." if len(names) > LISTED or len(shown) > LONGEST else "")

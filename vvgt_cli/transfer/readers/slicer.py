@@ -1,15 +1,19 @@
-"""Volume properties of 3D Slicer: ``.vp`` (lines of numbers), ``.vp.json``, and presets that carry the lines as fields.
+"""Volume properties of 3D Slicer: ``.vp`` (lines of numbers), ``.vp.json``, ``presets.xml``, and presets as JSON.
 
 ``.vp`` has nine lines: interpolation, shading, diffuse, ambient, specular, specular power, then scalar opacity,
 gradient opacity and colours, each a count of numbers and the numbers, (x, opacity) or (x, r, g, b). ``.vp.json`` names
 the same, with midpoints and sharpness, once a component; the first component is read. Opacity is per
-``scalarOpacityUnitDistance`` in millimetres; the old format has none and VTK's default of 1 is taken. Lighting is left
-out; so is gradient opacity, and the function's name says so where there is any. A JSON object with ``scalarOpacity``
-and ``colorTransfer`` as such lines of text, as viewers on vtk.js keep Slicer's presets, is read as well.
+``scalarOpacityUnitDistance`` in millimetres; the other forms have none and VTK's default of 1 is taken. MRML
+(``presets.xml``, scenes) has a ``VolumeProperty`` element a preset, with the lines of ``.vp`` as attributes
+(``scalarOpacity``, ``gradientOpacity``, ``colorTransfer``, ``shade``, ``ambient``, ...); viewers on vtk.js keep the
+same as JSON. There is no lighting here: shading and gradient opacity are not used, which a warning says where a file
+asks for them.
 """
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -19,15 +23,19 @@ from vvgt_cli.transfer.colormap import ColorMap
 from vvgt_cli.transfer.function import TransferFunction
 from vvgt_cli.transfer.opacity import PiecewiseOpacity
 from vvgt_cli.transfer.readers import paraview
-from vvgt_cli.transfer.readers.fields import Lines, floats, named, number, rgb
+from vvgt_cli.transfer.readers.fields import Elements, Lines, floats, named, number, rgb
 
 UNIT_DISTANCE = 1.0  # vtkVolumeProperty's
+DEFAULT = "VTK's default"  # what that distance is called
+_LIGHT = ("ambient", "diffuse", "specular", "specularPower")
 
 
 def matches(parsed: Any) -> bool:
-    """Whether it is a volume property of any of the three forms."""
+    """Whether it is a volume property of any of the forms."""
     if isinstance(parsed, Lines):
         return True
+    if isinstance(parsed, Elements):
+        return any(tag == "volumeproperty" for tag, _ in parsed.items)
     if isinstance(parsed, dict) and "volumeProperties" in parsed:
         return True
     presets = parsed if isinstance(parsed, list) else [parsed]
@@ -41,21 +49,25 @@ def read(parsed: Any, what: str, pick: str = "") -> TransferFunction:
         DataError: too few lines, a count that is not that of the numbers, a field that is not what it must be, several
             presets and no ``pick``, or ``pick`` where there are none.
     """
-    if pick and not (isinstance(parsed, list) or "colorTransfer" in getattr(parsed, "keys", dict)()):
+    several = isinstance(parsed, list | Elements) or "colorTransfer" in getattr(parsed, "keys", dict)()
+    if pick and not several:
         raise DataError(f"{what}: one function, no presets to pick {pick!r} from; leave out #{pick}")
     try:
         if isinstance(parsed, Lines):
             if len(parsed.items) < 9:
                 raise DataError(f"{len(parsed.items)} lines of numbers; expected the nine of a volume property (.vp)")
-            return _of_lines("volume property", *parsed.items[6:9])
+            keys = ("shade", "diffuse", "ambient", "specular", "specularPower")
+            fields = dict(zip(("scalarOpacity", "gradientOpacity", "colorTransfer"), parsed.items[6:9], strict=True))
+            return _of_fields("volume property", fields | dict(zip(keys, parsed.items[1:6], strict=True)), what)
         if isinstance(parsed, dict) and "volumeProperties" in parsed:
-            return _of_json(parsed)
-        presets = [{**p, "Name": p.get("name", "")} for p in (parsed if isinstance(parsed, list) else [parsed])]
-        preset = paraview.choose(presets, what, pick)
-        fields = (preset["scalarOpacity"], preset.get("gradientOpacity", ""), preset["colorTransfer"])
-        if not all(isinstance(field, str) for field in fields):
-            raise DataError("scalarOpacity, gradientOpacity and colorTransfer; expected text, a count and numbers each")
-        return _of_lines(str(preset["Name"]) or "volume property", *fields)
+            return _of_json(parsed, what)
+        if isinstance(parsed, Elements):
+            nodes = [dict(attributes) for tag, attributes in parsed.items if tag == "volumeproperty"]
+        else:
+            nodes = parsed if isinstance(parsed, list) else [parsed]
+        preset = paraview.choose([{**p, "Name": p.get("name", "")} for p in nodes], what, pick)
+        shown = f"{what}#{pick}" if pick else what
+        return _of_fields(str(preset["Name"]) or "volume property", preset, shown)
     except DataError as error:
         raise error if str(error).startswith(what) else named(what, error) from error
 
@@ -68,25 +80,40 @@ def _counted(what: str, line: str, width: int) -> np.ndarray:
     return np.array(values).reshape(-1, width)
 
 
-def _of_lines(name: str, opacity: str, gradient: str, color: str) -> TransferFunction:
+def _of_fields(name: str, fields: Mapping[str, Any], what: str) -> TransferFunction:
+    """The function of a preset whose ``scalarOpacity``, ``gradientOpacity``, ``colorTransfer`` are lines of numbers."""
+    opacity, gradient, color = (fields.get(key, "") for key in ("scalarOpacity", "gradientOpacity", "colorTransfer"))
+    if not all(isinstance(field, str) for field in (opacity, gradient, color)):
+        raise DataError("scalarOpacity, gradientOpacity and colorTransfer; expected text, a count and numbers each")
     nodes, colors = _counted("scalar opacity", opacity, 2), _counted("colours", color, 4)
     slopes = _counted("gradient opacity", gradient, 2)[:, 1] if gradient.strip() else np.ones(1)
+    _say_unused(what, bool((slopes != 1).any()), fields)
+    distance = fields.get("scalarOpacityUnitDistance")
+    label = "file" if distance is not None else DEFAULT
     return TransferFunction(
-        name + _left_out(bool((slopes != 1).any())),
+        name,
         PiecewiseOpacity(*nodes.T),
         ColorMap(colors[:, 0], colors[:, 1:]),
-        UNIT_DISTANCE,
+        UNIT_DISTANCE if distance is None else floats("scalarOpacityUnitDistance", str(distance))[0],
+        opacity_unit_label=label,
     )
 
 
-def _left_out(gradient: bool) -> str:
-    return " (gradient opacity left out)" if gradient else ""
+def _say_unused(what: str, gradient: bool, light: Mapping[str, Any]) -> None:
+    """Say once what a file asks for and is not done."""
+    shade = str(light.get("shade", "")).strip().lower() in ("1", "true")
+    values = ", ".join(f"{key} {light[key]}" for key in _LIGHT if key in light)
+    parts = ["gradient opacity"] if gradient else []
+    parts += [f"shading ({values})" if values else "shading"] if shade else []
+    if parts:
+        warnings.warn(f"{what}: {' and '.join(parts)} not used: there is no lighting here", stacklevel=3)
 
 
-def _of_json(parsed: dict[str, Any]) -> TransferFunction:
+def _of_json(parsed: dict[str, Any], what: str) -> TransferFunction:
     properties = parsed["volumeProperties"]
     first = properties[0] if isinstance(properties, list) and properties else None
-    parts = first.get("components") if isinstance(first, dict) else None
+    first = first if isinstance(first, dict) else {}
+    parts = first.get("components")
     if not isinstance(parts, list) or not parts or not isinstance(parts[0], dict):
         raise DataError("volumeProperties; expected a list of objects with components")
     part = parts[0]
@@ -100,12 +127,16 @@ def _of_json(parsed: dict[str, Any]) -> TransferFunction:
     bends = np.array([_bend(p) for p in points])
     gradient = part.get("gradientOpacity") and not part.get("disableGradientOpacity")
     slopes = [p.get("y") for p in _points(part, "gradientOpacity")] if gradient else []
+    lighting = part.get("lighting")
+    light = {**(lighting if isinstance(lighting, dict) else {}), "shade": part.get("shade")}
+    _say_unused(what, any(y != 1 for y in slopes), light)
     distance = number("scalarOpacityUnitDistance", part.get("scalarOpacityUnitDistance", UNIT_DISTANCE))
     return TransferFunction(
-        "volume property" + _left_out(any(y != 1 for y in slopes)),
+        "volume property",
         PiecewiseOpacity(*np.array(opacity).T),
         ColorMap(np.array([_x(p) for p in points]), np.array(colors), bends[:, 0], bends[:, 1]),
         distance,
+        opacity_unit_label="file" if "scalarOpacityUnitDistance" in part else DEFAULT,
     )
 
 

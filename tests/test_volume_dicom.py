@@ -1,0 +1,161 @@
+"""DICOM folders as scanners leave them: scouts, several orientations, dose grids, segmentations, other codings."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydicom.dataset import Dataset
+from pydicom.encaps import encapsulate
+from pydicom.uid import HTJ2K, MPEG2MPML, UID, JPEG2000Lossless, JPEGBaseline8Bit, JPEGLosslessSV1, JPEGLSLossless
+
+from tests.ramps import X, Y, check_grid
+from tests.test_volume_slices import SLOPE, header, write_series
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.volume import ReadOptions, read_volume
+
+SAGITTAL, CORONAL = [0, 1, 0, 0, 0, -1], [1, 0, 0, 0, 0, -1]
+SCOUT = ["ORIGINAL", "PRIMARY", "LOCALIZER"]
+
+
+def write_scouts(folder: Path, number: int, uid: str = "1.2.3", **changes) -> None:
+    """Sagittal slices of other names in the same folder."""
+    places = {"ImageOrientationPatient": SAGITTAL, "ImagePositionPatient": lambda k: [5.0 * k, 0, 0]}
+    write_series(folder, uid, number, **{"SeriesNumber": 1, **places, **changes})
+
+
+def test_scouts_in_the_series_are_left_out_and_that_is_said(tmp_path: Path) -> None:
+    write_series(tmp_path)
+    write_scouts(tmp_path, 7, ImageType=SCOUT)
+    with pytest.warns(UserWarning, match=r"left out.*1/2: 3 sagittal slices of 5 x 4, localiser$"):
+        check_grid(read_volume(str(tmp_path)), atol=SLOPE)
+    for name in ("a", "b"):  # one scout that is not called so
+        (tmp_path / f"{name}-7.dcm").unlink()
+    write_scouts(tmp_path / "other", 7)
+    (tmp_path / "other" / "c-7.dcm").rename(tmp_path / "c-7.dcm")
+    for name in ("a", "b"):
+        (tmp_path / "other" / f"{name}-7.dcm").unlink()
+    with pytest.warns(UserWarning, match=r"left out.*1/2: 1 sagittal slice of 5 x 4$"):
+        check_grid(read_volume(str(tmp_path)), atol=SLOPE)
+
+
+def test_several_orientations_are_told_apart(tmp_path: Path) -> None:
+    write_series(tmp_path)
+    write_scouts(tmp_path, 7)
+    write_scouts(tmp_path, 8, ImageOrientationPatient=CORONAL, ImagePositionPatient=lambda k: [0, 5.0 * k, 0])
+    listing = r"1/1: 3 axial slices of 5 x 4; 1/2: 3 sagittal slices of 5 x 4; 1/3: 3 coronal.*--series SERIES/STACK"
+    with pytest.raises(UsageError, match=listing):
+        read_volume(str(tmp_path))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_grid(read_volume(str(tmp_path), ReadOptions(array="1/1")), atol=SLOPE)
+        assert read_volume(str(tmp_path), ReadOptions(array="1.2.3/2")).spacing == (0.25, 0.5, 5)
+        check_grid(read_volume(f"{tmp_path}:/1/1"), atol=SLOPE)
+    with pytest.raises(UsageError, match="no stack 1/4; it has 1/1: 3 axial"):
+        read_volume(str(tmp_path), ReadOptions(array="1/4"))
+    with pytest.raises(UsageError, match="no one series '9/1'"):
+        read_volume(str(tmp_path), ReadOptions(array="9/1"))
+
+
+def test_pixel_spacings_are_told_apart(tmp_path: Path) -> None:
+    write_series(tmp_path, PixelSpacing=lambda k: [1, 1 + k])
+    with pytest.raises(UsageError, match=r"differ in size, orientation or pixel spacing: 1/1: 1 axial slice of 5 x 4"):
+        read_volume(str(tmp_path))
+
+
+def test_series_of_scouts_segmentations_and_pictures_are_left_out(tmp_path: Path) -> None:
+    write_series(tmp_path)
+    write_scouts(tmp_path, 7, "1.2.7", SeriesNumber=7, ImageType=SCOUT)
+    write_series(tmp_path, "1.2.8", 8, SOPClassUID=UID("1.2.840.10008.5.1.4.1.1.66.4"), Modality="SEG")
+    write_series(tmp_path, "1.2.9", 9, ImagePositionPatient=None, Modality="OT")
+    said = r"left out: 7 'series 7' \(CT, 3 slices, 1\.2\.7\); 8 .*\(SEG, .*; 9 .*\(OT, "
+    with pytest.warns(UserWarning, match=said):
+        check_grid(read_volume(str(tmp_path)), atol=SLOPE)
+    write_series(tmp_path, "1.2.4", 2)
+    with pytest.raises(UsageError, match=r"several series: 1 .*CT, 3 slices.*choose one by number, UID or description"):
+        read_volume(str(tmp_path))
+
+
+def test_segmentations_and_other_objects_are_refused_in_their_own_words(tmp_path: Path) -> None:
+    labels = []
+    for name in ("liver", "spleen"):
+        labels.append(Dataset())
+        labels[-1].SegmentLabel = name
+    kind = UID("1.2.840.10008.5.1.4.1.1.66.4")
+    write_series(tmp_path / "seg", SOPClassUID=kind, Modality="SEG", SegmentSequence=labels)
+    with pytest.raises(
+        DataError, match=r"a segmentation \(DICOM SEG\) of 2 segments \(liver, spleen\), bits and no val"
+    ):
+        read_volume(str(tmp_path / "seg"))
+    write_series(tmp_path / "rt", Modality="RTSTRUCT", Rows=None, Columns=None)
+    with pytest.raises(DataError, match=r"no DICOM images \(3 RTSTRUCT\)"):
+        read_volume(str(tmp_path / "rt"))
+
+
+@pytest.mark.parametrize("heights", [False, True])
+def test_dose_grid(tmp_path: Path, heights: bool) -> None:
+    file = header(len(Y), len(X))
+    file.Modality, file.SeriesInstanceUID, file.SeriesNumber = "RTDOSE", "1.2.3", 1
+    file.SOPClassUID = file.file_meta.MediaStorageSOPClassUID = UID("1.2.840.10008.5.1.4.1.1.481.2")
+    file.BitsAllocated = file.BitsStored = 32
+    file.HighBit, file.PixelRepresentation = 31, 0
+    file.NumberOfFrames, file.DoseGridScaling, file.DoseUnits = 3, 2e-4, "GY"
+    file.ImageOrientationPatient, file.ImagePositionPatient = [1, 0, 0, 0, 1, 0], [X[0], Y[0], 10.0]
+    file.PixelSpacing = [0.5, 0.25]
+    file.GridFrameOffsetVector = [10.0, 12.0, 14.0] if heights else [0.0, 2.0, 4.0]
+    values = np.arange(60, dtype="<u4").reshape(3, 4, 5) * 1000
+    file.PixelData = values.tobytes()
+    path = tmp_path / "dose.dcm"
+    file.save_as(path, enforce_file_format=True)
+    volume = read_volume(str(path))
+    np.testing.assert_array_equal(volume.data, values)
+    assert (volume.slope, volume.intercept) == (2e-4, 0)
+    assert (volume.spacing, volume.origin) == ((0.25, 0.5, 2), (X[0], Y[0], 10))
+    file.GridFrameOffsetVector = [0.0, 2.0]
+    file.save_as(path, enforce_file_format=True)
+    with pytest.raises(DataError, match="a dose grid of 3 planes with 2 offsets"):
+        read_volume(str(path))
+
+
+@pytest.mark.parametrize(
+    ("syntax", "package"),
+    [
+        (JPEGLSLossless, "try: pip install pyjpegls$"),
+        (JPEG2000Lossless, "try: pip install pylibjpeg pylibjpeg-openjpeg$"),
+        (HTJ2K, "try: pip install pylibjpeg pylibjpeg-openjpeg$"),
+        (JPEGBaseline8Bit, "try: pip install pylibjpeg pylibjpeg-libjpeg$"),
+        (JPEGLosslessSV1, "try: pip install pylibjpeg pylibjpeg-libjpeg$"),
+        (MPEG2MPML, "convert them to an uncompressed syntax first$"),
+    ],
+)
+def test_codings_name_their_package(tmp_path: Path, syntax: UID, package: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    from pydicom.pixels.decoders import base
+
+    for decoder in base._PIXEL_DATA_DECODERS.values():  # as if nothing but pydicom were installed
+        monkeypatch.setattr(decoder[0], "_available", {})
+    for file in write_series(tmp_path):
+        file.file_meta.TransferSyntaxUID = syntax
+        file.PixelData = encapsulate([b"\xff\xd8\xff\xd9"])
+        file["PixelData"].VR = "OB"
+        name = f"{'cab'[int((file.ImagePositionPatient[2] - 10) / 2)]}-1.dcm"
+        file.save_as(tmp_path / name, enforce_file_format=True)
+    with pytest.raises(DataError, match=package) as caught:
+        read_volume(str(tmp_path))
+    assert syntax.name in str(caught.value)
+
+
+def test_a_folder_of_several_formats_asks_for_one_file(tmp_path: Path) -> None:
+    for name in ("a.nii", "b.nii.gz", "c.nrrd", "notes.txt"):
+        (tmp_path / name).write_bytes(b"x")
+    with pytest.raises(DataError, match=r"a folder with 2 NIfTI \(a.nii, b.nii.gz\); 1 NRRD \(c.nrrd\); .*give one of"):
+        read_volume(str(tmp_path))
+    write_series(tmp_path / "inner")
+    (tmp_path / "inner" / "a-1.dcm").rename(tmp_path / "one")  # without a name that says what it is
+    with pytest.raises(DataError, match=r"2 NIfTI .*; 1 NRRD \(c.nrrd\); 1 DICOM \(one\)"):
+        read_volume(str(tmp_path))
+    scan = tmp_path / "scan"
+    write_series(scan)
+    (scan / "mask.nii").write_bytes(b"x")  # few of another format are no matter
+    check_grid(read_volume(str(scan)), atol=SLOPE)

@@ -1,0 +1,269 @@
+"""TIFF as microscopes write it: axes, channels, time steps and sizes of OME-TIFF and ImageJ, several series."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import struct
+import sys
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+
+from vvgt_cli.errors import DataError, UsageError, VvgtError
+from vvgt_cli.volume import ReadOptions, read_volume
+
+T, C, Z, Y, X = 3, 2, 4, 6, 5
+VALUES = np.random.default_rng(3).integers(0, 200, (T, C, Z, Y, X)).astype("u2")
+SIZES = {
+    "PhysicalSizeX": 0.2, "PhysicalSizeY": 0.3, "PhysicalSizeZ": 2000, "PhysicalSizeZUnit": "nm",
+    "Channel": {"Name": ["DAPI", "GFP"]},
+}  # fmt: skip
+
+
+def write_ome(path: Path, values: np.ndarray = VALUES, axes: str = "TCZYX", sizes: dict = SIZES, **how) -> str:
+    tifffile.imwrite(path, values, ome=True, metadata={"axes": axes, **sizes}, **how)
+    return str(path)
+
+
+def xml_of(path: Path, old: str, new: str) -> None:
+    """Change the OME-XML of a file, to text of the same length."""
+    body = path.read_bytes()
+    assert body.count(old.encode()) >= 1
+    path.write_bytes(body.replace(old.encode(), new.ljust(len(old)).encode()))
+
+
+@pytest.mark.parametrize("how", [{}, {"bigtiff": True, "byteorder": ">"}, {"compression": "zlib"}, {"tile": (16, 16)}])
+def test_ome_channels_time_steps_and_sizes(tmp_path: Path, how: dict) -> None:
+    source = write_ome(tmp_path / "cells.ome.tif", **how)
+    for t, c in itertools.product(range(T), range(C)):
+        volume = read_volume(source, ReadOptions(time=t, component=c))
+        np.testing.assert_array_equal(volume.data, VALUES[t, c])
+    assert (volume.name, volume.data.dtype.name) == ("cells", "uint16")
+    assert volume.spacing == pytest.approx((0.2, 0.3, 2), rel=1e-12)
+    assert isinstance(volume.data, np.memmap) == (not set(how) & {"compression", "tile"})
+    named = read_volume(source, ReadOptions(time=1, component="GFP", spacing=(1, 2, 3)))
+    np.testing.assert_array_equal(named.data, VALUES[1, 1])
+    assert named.spacing == (1, 2, 3)
+    norm = read_volume(source, ReadOptions(time=2, component="magnitude"))
+    np.testing.assert_allclose(norm.data, np.linalg.norm(VALUES[2].astype(float), axis=0), rtol=1e-6)
+
+
+@pytest.mark.parametrize("axes", ["TZCYX", "CTZYX", "ZCTYX"])
+def test_ome_orders_of_planes(tmp_path: Path, axes: str) -> None:
+    order = ["TCZYX".index(a) for a in axes]
+    source = write_ome(tmp_path / "a.ome.tif", VALUES.transpose(order), axes)
+    for t, c in itertools.product(range(T), range(C)):
+        np.testing.assert_array_equal(read_volume(source, ReadOptions(time=t, component=c)).data, VALUES[t, c])
+
+
+def test_a_choice_is_obeyed_or_an_error_that_lists(tmp_path: Path) -> None:
+    source = write_ome(tmp_path / "a.ome.tif")
+    still = write_ome(tmp_path / "b.ome.tif", VALUES[0, 0], "ZYX", {})
+    for path, options, message in (
+        (source, {}, r"2 channels \(0 'DAPI', 1 'GFP'\) of type uint16; expected one: try --channel 0 to 1"),
+        (source, {"component": 2, "time": 0}, r"2 channels .*, not 2; expected one"),
+        (source, {"component": "RFP", "time": 0}, r"'GFP'\) of type uint16, not 'RFP'"),
+        (source, {"component": 1}, r"3 time steps; expected one: try --time N \(0 to 2\).*-o 'p_{:02d}.ply'"),
+        (source, {"component": 1, "time": 3}, r"--time 3: it has 3 time steps; expected 0 to 2"),
+        (still, {"time": 1}, r"--time 1: it has 1 time step; leave out --time"),
+        (still, {"component": 1}, r"1 channel of type uint16; leave out --channel 1"),
+        (still, {"component": "magnitude"}, r"1 channel of type uint16; leave out --channel magnitude"),
+        (still, {"array": "7"}, r"0 series '7'; it has 0"),
+    ):
+        with pytest.raises(UsageError, match=message):
+            read_volume(path, ReadOptions(**options))
+    np.testing.assert_array_equal(read_volume(still, ReadOptions(time=0, component=0)).data, VALUES[0, 0])
+
+
+@pytest.mark.parametrize("compression", [None, "zlib"])
+def test_imagej(tmp_path: Path, compression: str | None) -> None:
+    path = tmp_path / "a.tif"
+    order = VALUES.transpose(0, 2, 1, 3, 4)
+    for unit, factor in (("um", 1), ("\\u00B5m", 1), ("nm", 1e-3), ("mm", 1000), ("pixel", 1)):
+        told = {"axes": "TZCYX", "spacing": 2.5, "unit": unit}
+        tifffile.imwrite(path, order, imagej=True, metadata=told, resolution=(5, 4), compression=compression)
+        for t, c in itertools.product(range(T), range(C)):
+            volume = read_volume(str(path), ReadOptions(time=t, component=c))
+            np.testing.assert_array_equal(volume.data, VALUES[t, c])
+        assert volume.spacing == pytest.approx((0.2 * factor, 0.25 * factor, 2.5 * factor), rel=1e-12)
+    tifffile.imwrite(path, VALUES[0, 0], imagej=True, metadata={"axes": "ZYX"})
+    assert read_volume(str(path)).spacing == (1, 1, 1)
+
+
+def test_slices_without_a_distance_are_as_far_apart_as_pixels_and_that_is_said(tmp_path: Path) -> None:
+    source = write_ome(tmp_path / "a.ome.tif", VALUES[0, 0], "ZYX", {"PhysicalSizeX": 0.5, "PhysicalSizeY": 0.5})
+    with pytest.warns(UserWarning, match=r"no distance between its slices; taken as wide as its pixels"):
+        assert read_volume(source).spacing == (0.5, 0.5, 0.5)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert read_volume(source, ReadOptions(spacing=(1, 1, 2))).spacing == (1, 1, 2)
+
+
+def test_several_series(tmp_path: Path) -> None:
+    path = tmp_path / "a.ome.tif"
+    with tifffile.TiffWriter(path, ome=True) as writer:
+        for name, values, size in (("overview", VALUES[0, 0], 5.0), ("detail", VALUES[0, 1, :, :, :3], 0.5)):
+            told = {"axes": "ZYX", "Name": name, "PhysicalSizeX": size}
+            writer.write(values, metadata=told, photometric="minisblack")
+    with pytest.raises(
+        UsageError, match=r"2 series: 0 'overview' \(4 x 6 x 5, axes ZYX, uint16\); 1 'detail'.*--series"
+    ):
+        read_volume(str(path))
+    for wanted in ("1", "detail"):
+        with pytest.warns(UserWarning, match="no distance"):
+            volume = read_volume(str(path), ReadOptions(array=wanted))
+        np.testing.assert_array_equal(volume.data, VALUES[0, 1, :, :, :3])
+        assert volume.spacing[0] == 0.5
+
+
+@pytest.mark.parametrize("planar", ["contig", "separate"])
+@pytest.mark.parametrize("compression", [None, "zlib"])
+def test_samples_of_a_pixel_are_channels(tmp_path: Path, planar: str, compression: str | None) -> None:
+    values = np.random.default_rng(0).integers(0, 255, (Z, Y, X, 3)).astype("u1")
+    stored = values if planar == "contig" else np.moveaxis(values, -1, 1)
+    tifffile.imwrite(tmp_path / "a.tif", stored, photometric="rgb", planarconfig=planar, compression=compression)
+    for c in range(3):
+        volume = read_volume(str(tmp_path / "a.tif"), ReadOptions(component=c))
+        np.testing.assert_array_equal(volume.data, values[..., c])
+
+
+@pytest.mark.parametrize("compression", [None, "zlib"])
+def test_numbers_are_as_stored(tmp_path: Path, compression: str | None) -> None:
+    path = tmp_path / "a.tif"
+    for dtype in ("u1", "u2", "i2", "f4"):  # where 0 is white too
+        values = VALUES[0, 0].astype(dtype)
+        tifffile.imwrite(path, values, photometric="miniswhite", compression=compression)
+        np.testing.assert_array_equal(read_volume(str(path)).data, values)
+    for dtype in ("f2", "u8", "f8"):
+        values = VALUES[0, 0].astype(dtype)
+        tifffile.imwrite(path, values, photometric="minisblack", compression=compression)
+        volume = read_volume(str(path))
+        np.testing.assert_array_equal(volume.data, values)
+        assert volume.data.dtype == dtype
+    tifffile.imwrite(path, VALUES[0, 0] > 100, photometric="minisblack", compression=compression)
+    np.testing.assert_array_equal(read_volume(str(path)).data, VALUES[0, 0] > 100)
+
+
+def test_twelve_bits_and_lzma_without_imagecodecs(tmp_path: Path) -> None:
+    values = np.arange(24, dtype=np.uint16).reshape(4, 6) * 170
+    bits = "".join(f"{v:012b}" for v in values.ravel())
+    packed = int(bits, 2).to_bytes(len(bits) // 8, "big")
+    tags = [
+        *((256, 3, 1, 6), (257, 3, 1, 4), (258, 3, 1, 12), (259, 3, 1, 1), (262, 3, 1, 1)),
+        *((273, 4, 1, 8 + 2 + 9 * 12 + 4), (277, 3, 1, 1), (278, 3, 1, 4), (279, 4, 1, len(packed))),
+    ]
+    head = b"MM\0*" + struct.pack(">IH", 8, 9)
+    for tag, kind, n, value in tags:
+        head += struct.pack(">HHI", tag, kind, n) + struct.pack(">HH" if kind == 3 else ">I", *([value, 0][: 5 - kind]))
+    (tmp_path / "a.tif").write_bytes(head + bytes(4) + packed)
+    np.testing.assert_array_equal(read_volume(str(tmp_path / "a.tif")).data[0], values)
+    tifffile.imwrite(tmp_path / "b.tif", VALUES[0, 0], compression="lzma", photometric="minisblack")
+    np.testing.assert_array_equal(read_volume(str(tmp_path / "b.tif")).data, VALUES[0, 0])
+
+
+def test_a_coding_without_a_decoder_names_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(path, VALUES[0, 0], photometric="minisblack", compression="zlib")
+    zlib, jpeg2000 = struct.pack("<HHII", 259, 3, 1, 8), struct.pack("<HHII", 259, 3, 1, 34712)
+    assert path.read_bytes().count(zlib) == Z
+    path.write_bytes(path.read_bytes().replace(zlib, jpeg2000))
+    monkeypatch.setitem(sys.modules, "imagecodecs", None)
+    with pytest.raises(DataError, match=r"coded as JPEG2000 need imagecodecs .*try: pip install imagecodecs"):
+        read_volume(str(path))
+
+
+def test_sets_of_files(tmp_path: Path) -> None:
+    """One OME-TIFF over two files: each names the other."""
+    names = ["a.ome.tif", "b.ome.tif"]
+    planes = "".join(
+        f'<TiffData IFD="{z % 2}" FirstZ="{z}" PlaneCount="1"><UUID FileName="{names[z // 2]}">urn:uuid:{z // 2}</UUID>'
+        "</TiffData>" for z in range(Z)
+    )  # fmt: skip
+    for k, name in enumerate(names):
+        xml = (
+            f'<OME xmlns="http://www.openmicroscopy.org/Schemas/OME/2016-06" UUID="urn:uuid:{k}"><Image ID="Image:0">'
+            f'<Pixels ID="Pixels:0" DimensionOrder="XYZCT" Type="uint16" SizeX="{X}" SizeY="{Y}" SizeZ="{Z}" SizeC="1" '
+            f'SizeT="1" PhysicalSizeX="2" PhysicalSizeY="2" PhysicalSizeZ="3">{planes}</Pixels></Image></OME>'
+        )
+        tifffile.imwrite(
+            tmp_path / name, VALUES[0, 0, 2 * k : 2 * k + 2], description=xml, metadata=None, photometric="minisblack"
+        )
+    for name in names:
+        volume = read_volume(str(tmp_path / name))
+        np.testing.assert_array_equal(volume.data, VALUES[0, 0])
+        assert volume.spacing == (2, 2, 3)
+    (tmp_path / names[1]).unlink()
+    with pytest.raises(DataError, match=r"OME-XML names the file b.ome.tif, which is not beside it"):
+        read_volume(str(tmp_path / names[0]))
+    xml_of(tmp_path / names[0], 'FileName="b.ome.tif"', 'FileName="/etc/pass"')
+    with pytest.raises(DataError, match=r"names the file '/etc/pass'; expected names in its own folder"):
+        read_volume(str(tmp_path / names[0]))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('SizeZ="4"', 'SizeZ="9"', "30 of 54 planes are missing, the first is number 24"),
+        ('SizeZ="4"', 'SizeZ="0"', "OME-XML of sizes"),
+        ('SizeT="3"', 'SizeT="99999999"', "OME-XML of sizes"),
+        ('PlaneCount="24"', 'PlaneCount="-1"', "TiffData of .*-1"),
+        ('PlaneCount="24"', 'PlaneCount="99999999999"', "TiffData of"),
+        ('DimensionOrder="XYZCT"', 'DimensionOrder="XXZCT"', "DimensionOrder 'XXZCT'"),
+        ('PhysicalSizeX="0.2"', 'PhysicalSizeX="1" PhysicalSizeXUnit="pixel"', "pixel, µm, nm; expected one unit"),
+        ("</Pixels>", "</Pixel>", "damaged OME-XML"),
+        ("<Pixels", "<!DOCTYPE a [<!ENTITY b 'c'>]><Pixels", "declares entities"),
+        ("<TiffData", '<x><AlongZ Start="0" End="1e9" Step="1e-9"/></x><TiffData', "AlongZ from 0"),
+        ("<Pixels", '<BinaryOnly MetadataFile="all.companion.ome"/><Pixels', "OME-XML is in all.companion.ome"),
+    ],
+)
+def test_xml_that_lies(tmp_path: Path, old: str, new: str, message: str) -> None:
+    write_ome(tmp_path / "a.ome.tif")
+    with tifffile.TiffFile(tmp_path / "a.ome.tif") as file:
+        xml = file.ome_metadata
+    assert xml is not None
+    assert old in xml
+    changed = xml.replace(old, new).encode()
+    flat = VALUES.reshape(-1, Y, X)
+    tifffile.imwrite(tmp_path / "a.ome.tif", flat, description=changed, metadata=None, photometric="minisblack")
+    with pytest.raises(VvgtError, match=message) as caught:
+        read_volume(str(tmp_path / "a.ome.tif"), ReadOptions(time=0, component=0))
+    assert "\n" not in str(caught.value)
+
+
+def test_other_axes_and_palettes_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(path, VALUES[0], metadata={"axes": "RZYX"}, photometric="minisblack")
+    with pytest.raises(DataError, match="axes 2 R, 4 slices, 6 rows, 5 columns; expected"):
+        read_volume(str(path))
+    table = np.zeros((3, 256), "u2")
+    tifffile.imwrite(path, VALUES[0, 0].astype("u1"), photometric="palette", colormap=table)
+    with pytest.raises(DataError, match="numbers of a palette's colours"):
+        read_volume(str(path))
+
+
+def test_a_page_that_unpacks_to_more_than_itself(tmp_path: Path) -> None:
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(path, np.zeros((2, 64, 64), "u8"), compression="zlib", photometric="minisblack", rowsperstrip=64)
+    body = path.read_bytes()
+    for tag in (256, 257):
+        wide = struct.pack("<HHII", tag, 4, 1, 64)
+        assert wide in body
+        body = body.replace(wide, struct.pack("<HHII", tag, 4, 1, 8))
+    path.write_bytes(body)
+    with pytest.raises(DataError, match="unpacks to more than its 512 bytes"):
+        read_volume(str(path))
+
+
+def test_info_and_a_series_of_one_file(vvgt, tmp_path: Path) -> None:
+    source = write_ome(tmp_path / "a.ome.tif")
+    done = vvgt("info", source, "--channel", "GFP", "--time", "2", "--json")
+    assert done.code == 0, done.err
+    facts = json.loads(done.out)
+    assert facts["dims"] == [X, Y, Z]
+    assert facts["range"] == [VALUES[2, 1].min(), VALUES[2, 1].max()]
+    assert "2 channels (0 'DAPI', 1 'GFP')" in vvgt("info", source).error
+    assert "3 time steps" in vvgt("info", source, "--channel", "1").error

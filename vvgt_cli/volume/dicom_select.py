@@ -1,0 +1,173 @@
+"""Which images of a DICOM folder make the volume: one series, and in it one stack of slices.
+
+Localisers (scouts), segmentations and single images of another orientation are left out where one stack remains, and a
+warning says so; where several remain, the error lists them.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vvgt_cli.errors import DataError, UsageError
+
+_SEGMENTATIONS = (
+    "1.2.840.10008.5.1.4.1.1.66.4",
+    "1.2.840.10008.5.1.4.1.1.66.7",
+)  # Segmentation, Label Map Segmentation
+_FEW = 2  # slices: fewer than make a stack, beside one that has more
+_LISTED = 12
+_SPACE = ("sagittal", "coronal", "axial")
+
+Files = list[tuple[Path, Any]]
+
+
+def choose_series(headers: Sequence[tuple[Path, Any]], wanted: str | None, path: Path) -> tuple[str, Files, int | None]:
+    """The series asked for, or the only one.
+
+    Args:
+        headers: files and their headers.
+        wanted: number, UID or description of a series; ``/K`` after it is the number of a stack in it, from 1.
+        path: for messages.
+
+    Returns:
+        What to add to the volume's name, the files of the series, and the stack's number or None.
+
+    Raises:
+        DataError: no images, or a segmentation.
+        UsageError: several series and none chosen, or none of that name.
+    """
+    found: dict[str, Files] = {}
+    for file, header in headers:
+        if "Rows" in header and "Columns" in header:
+            found.setdefault(str(header.get("SeriesInstanceUID", "")), []).append((file, header))
+    if not found:
+        kinds = Counter(str(header.get("Modality", "?")) for _, header in headers)
+        listing = ", ".join(f"{n} {kind}" for kind, n in kinds.items()) or "no DICOM files"
+        raise DataError(f"{path}: no DICOM images ({listing}); expected files with rows and columns of pixels")
+    stack = None
+    if wanted is None:
+        title, chosen = "", _only(found, path)
+    else:
+        wanted = wanted.strip("/")
+        chosen = _named(found, wanted)
+        head, _, number = wanted.rpartition("/")
+        if not chosen and number.isdecimal() and head:
+            chosen, stack = _named(found, head), int(number)
+        if not chosen:
+            raise UsageError(f"{path}: no one series {wanted!r}; it has {_listed(found)}; choose with --series SERIES")
+        title = f":{wanted}"
+    if _segmentation(chosen[0][1]):
+        header = chosen[0][1]
+        labels = [str(s.get("SegmentLabel", "?")) for s in header.get("SegmentSequence", [])]
+        raise DataError(
+            f"{path}: a segmentation (DICOM SEG) of {len(labels)} segments ({', '.join(labels[:_LISTED])}), bits and "
+            "no values; give the images that it was made on, or export a label map as NIfTI or NRRD"
+        )
+    return title, chosen, stack
+
+
+def _only(found: dict[str, Files], path: Path) -> Files:
+    """The only series of images that are placed, no scouts, no segmentation."""
+    aside = {uid: f for uid, f in found.items() if all(_localiser(h) or _segmentation(h) or _unplaced(h) for _, h in f)}
+    left = {uid: f for uid, f in found.items() if uid not in aside} or found
+    if len(left) > 1:
+        raise UsageError(
+            f"{path}: several series: {_listed(found)}; choose one by number, UID or description with --series SERIES"
+        )
+    if len(left) < len(found):
+        warnings.warn(
+            f"{path}: left out: {_listed(aside)} (localisers, segmentations, images without a position)", stacklevel=2
+        )
+    return next(iter(left.values()))
+
+
+def _named(found: dict[str, Files], wanted: str) -> Files:
+    """The one series with this number, UID or description, else nothing."""
+    fits = []
+    for uid, files in found.items():
+        keys = (str(files[0][1].get(key, "")).strip() for key in ("SeriesNumber", "SeriesDescription"))
+        fits += [files] if wanted in (uid, *keys) else []
+    return fits[0] if len(fits) == 1 else []
+
+
+def _listed(found: dict[str, Files]) -> str:
+    """Series for an error: number, description, modality, slices, UID."""
+    parts = []
+    for uid, files in list(found.items())[:_LISTED]:
+        header = files[0][1]
+        slices = sum(int(h.get("NumberOfFrames", 1) or 1) for _, h in files)
+        parts.append(
+            f"{header.get('SeriesNumber', '?')} {str(header.get('SeriesDescription', '')).strip()!r} "
+            f"({header.get('Modality', '?')}, {slices} slice{'s' * (slices != 1)}, {uid})"
+        )
+    return "; ".join(parts) + ("; ..." if len(found) > _LISTED else "")
+
+
+def _localiser(header: Any) -> bool:
+    return "LOCALIZER" in [str(word).upper() for word in header.get("ImageType") or []]
+
+
+def _segmentation(header: Any) -> bool:
+    return str(header.get("SOPClassUID", "")) in _SEGMENTATIONS
+
+
+def _unplaced(header: Any) -> bool:
+    return not any(key in header for key in ("ImagePositionPatient", "PerFrameFunctionalGroupsSequence"))
+
+
+def one_stack(
+    slices: list[Any], alike: Callable[[Any, Any], bool], number: int | None, title: str, path: Path
+) -> list[Any]:
+    """The slices of one size and orientation: the stack asked for, or the only one of more than `_FEW` slices.
+
+    Args:
+        slices: of a series; each with a ``header`` and ``rows`` (2, 3).
+        alike: whether two slices may lie in one stack.
+        number: of the stack, from 1, in the order of their first slices; None for the only one.
+        title: how the series was asked for, "" where it was not.
+        path: for messages.
+
+    Raises:
+        UsageError: several stacks, or no such one.
+    """
+    stacks: list[list[Any]] = []
+    for s in slices:
+        home = next((stack for stack in stacks if alike(stack[0], s)), None)
+        if home is None:
+            stacks.append([s])
+        else:
+            home.append(s)
+    name = title.removeprefix(":").rpartition("/")[0] if number is not None else title.removeprefix(":")
+    name = name or str(slices[0].header.get("SeriesNumber") or slices[0].header.get("SeriesInstanceUID") or "?")
+    listing = "; ".join(f"{name}/{k}: {_of(stack)}" for k, stack in enumerate(stacks[:_LISTED], 1))
+    if number is not None:
+        if not 1 <= number <= len(stacks):
+            raise UsageError(f"{path}: no stack {name}/{number}; it has {listing}; choose with --series SERIES/STACK")
+        return stacks[number - 1]
+    if len(stacks) == 1:
+        return stacks[0]
+    real = [stack for stack in stacks if not all(_localiser(s.header) for s in stack)] or stacks
+    large = [stack for stack in real if len(stack) > _FEW] if len(real) > 1 else real
+    if len(large) != 1:
+        raise UsageError(
+            f"{path}: slices that differ in size, orientation or pixel spacing: {listing}; choose one with --series "
+            "SERIES/STACK"
+        )
+    rest = "; ".join(f"{name}/{k}: {_of(stack)}" for k, stack in enumerate(stacks, 1) if stack is not large[0])
+    warnings.warn(f"{path}: left out, of another size or orientation: {rest[:500]}", stacklevel=2)
+    return large[0]
+
+
+def _of(stack: list[Any]) -> str:
+    first = stack[0]
+    normal = np.abs(np.cross(first.rows[0], first.rows[1]))
+    plane = _SPACE[int(normal.argmax())] if normal.max() > 0.95 else "oblique"
+    scout = ", localiser" if _localiser(first.header) else ""
+    size = f"{first.header.get('Columns')} x {first.header.get('Rows')}"
+    return f"{len(stack)} {plane} slice{'s' * (len(stack) != 1)} of {size}{scout}"
