@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 import warnings
 from pathlib import Path
 
@@ -14,10 +15,17 @@ from pydicom.uid import HTJ2K, MPEG2MPML, UID, JPEG2000Lossless, JPEGBaseline8Bi
 from tests.ramps import X, Y, check_grid
 from tests.test_volume_slices import SLOPE, header, write_series
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.volume import ReadOptions, read_volume
+from vvgt_cli.volume import ReadOptions
+from vvgt_cli.volume import read_volume as read_placed
 
 SAGITTAL, CORONAL = [0, 1, 0, 0, 0, -1], [1, 0, 0, 0, 0, -1]
 SCOUT = ["ORIGINAL", "PRIMARY", "LOCALIZER"]
+
+
+def read_volume(source, options=None):
+    """In the space of the files: the ramps are along its axes."""
+    return read_placed(source, replace(options or ReadOptions(), space="LPS"))
+
 
 
 def write_scouts(folder: Path, number: int, uid: str = "1.2.3", **changes) -> None:

@@ -94,7 +94,6 @@ def read_dicom(path: Path, options: ReadOptions) -> Volume:
     with library_errors(str(path), "DICOM"):
         files = _files(path) if path.is_dir() else [path]
         headers = [(file, pydicom.dcmread(file, stop_before_pixels=True)) for file in files]
-        headers = [(file, header) for file, header in headers if "Rows" in header and "Columns" in header]
         title, chosen, stack = choose_series(headers, options.array, path)
         slices = [s for file, header in chosen for s in _frames(file, header)]
         slices = _ordered(one_stack(slices, _alike, stack, title, path))
