@@ -186,7 +186,7 @@ def _folder(path: Path, source: str) -> Reader:
     if lying:
         listing = "; ".join(f"{len(names)} {kind} ({', '.join(names[:3])}{', ...' if len(names) > 3 else ''})"
                             for kind, names in lying.items())  # fmt: skip
-        raise DataError(f"{source}: a folder with {listing}; expected one volume: give one of the files")
+        raise DataError(f"{source}: a folder; expected one volume, found {listing}: give one of the files")
     kinds = ", ".join(reader.name for reader in _READERS if reader.holds is not None)
     raise DataError(
         f"{source}: a folder; expected a volume file ({', '.join(known_suffixes())}) or a folder of {kinds}"
