@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +25,6 @@ SCOUT = ["ORIGINAL", "PRIMARY", "LOCALIZER"]
 def read_volume(source, options=None):
     """In the space of the files: the ramps are along its axes."""
     return read_placed(source, replace(options or ReadOptions(), space="LPS"))
-
 
 
 def write_scouts(folder: Path, number: int, uid: str = "1.2.3", **changes) -> None:

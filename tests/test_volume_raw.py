@@ -151,7 +151,6 @@ def test_stdin(monkeypatch: pytest.MonkeyPatch, header: int) -> None:
         {"header_bytes": -1},
         {"spacing": (1.0, 0.0, 1.0)},
         {"spacing": (1.0, float("nan"), 1.0)},
-        {"component": "norm"},
         {"component": -1},
     ],
 )

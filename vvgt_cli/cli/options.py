@@ -61,11 +61,19 @@ _READ = dict(
         "--spacing", nargs=3, type=float, metavar="X Y Z", help="Voxel edges, in place of the file's."
     ),
     array=click.option(
-        "--array", "--grid", "--series", "array", metavar="NAME",
+        "--array",
+        "--grid",
+        "--series",
+        "array",
+        metavar="NAME",
         help="Which array, grid or series (of DICOM: number, UID or description), where there are several.",
     ),
     component=click.option(
-        "--component", "--channel", "component", metavar="N|NAME|magnitude", callback=_component,
+        "--component",
+        "--channel",
+        "component",
+        metavar="N|NAME|magnitude",
+        callback=_component,
         help="Which component of vectors, or which channel: its number from 0, or its name.",
     ),
     time=click.option(
