@@ -177,7 +177,7 @@ def test_what_a_kernel_reaches():
 
     modules, constants = reached(blend.py_func)
     assert "vvgt_cli.splat.tiles" in modules
-    assert {"TILE = 16", "_MAX_A = np.float32(0.99)"} <= constants
+    assert {"TILE = 16", "_HALF = np.float32(0.5)"} <= constants
     assert {"vvgt_cli.vbm.moments", "vvgt_cli.dvr.kernel"} <= reached(_brick_moments.py_func)[0]
 
 

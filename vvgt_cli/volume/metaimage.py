@@ -83,7 +83,9 @@ def _geometry(fields: Fields, n: int) -> tuple[tuple[float, ...], tuple[float, .
     space = "LPS" if fields.get("anatomicalorientation", "?").strip("? ") else None
     for key in ("transformmatrix", "rotation", "orientation"):
         if key in fields:
-            rows[: min(n, 3), : min(n, 3)] = np.reshape(fields.floats(key, fields[key], n * n), (n, n))[:3, :3]
+            edge = 3 if n == 4 and len(fields[key].split()) == 9 else n  # a matrix of space alone
+            matrix = np.reshape(fields.floats(key, fields[key], edge * edge), (edge, edge))
+            rows[: min(n, 3), : min(n, 3)] = matrix[:3, :3]
             if fields.get("anatomicalorientation", "LPS").strip("? "):
                 space = "LPS"
             break
