@@ -70,8 +70,8 @@ def test_without_limits_the_default_steps_are_planned_and_back_projection_is_not
 def test_views_are_half_as_large_as_they_may_be_where_gaussians_are_wide(size, edge):
     found = plan(size=size)
     assert (found.half, found.steps, found.view_size) == (True, DEFAULT_HALF_STEPS, edge)
-    assert found.seconds == pytest.approx(1 + 5 + DEFAULT_HALF_STEPS * 0.05 + 72 / 4 * 0.05 + 4 * 0.09 + 0.6)
-    assert found.memory == pytest.approx(1e9 + (72 / 4 + 4) * 1e7)
+    assert found.seconds == pytest.approx(1 + 5 + DEFAULT_HALF_STEPS * 0.05 + 48 / 4 * 0.05 + 4 * 0.09 + 0.6)
+    assert found.memory == pytest.approx(1e9 + (48 / 4 + 4) * 1e7)
     assert plan(size=size, time_budget=20.0).half
     for other in (plan(size=size, wide=False), plan(size=size, steps=23)):
         assert (other.half, other.view_size) == (False, min(size, 400))
@@ -96,7 +96,7 @@ def test_wide_is_told_by_the_middle_axis():
 def test_refinement_on_half_views_gains_on_whole_ones(tmp_path):
     report = done(tmp_path, FitOptions(600, 128))
     stages = {stage.name: stage for stage in report.stages}
-    assert stages["views"].note.startswith("72 of 64 px to fit to")
+    assert stages["views"].note.startswith("48 of 64 px to fit to")
     assert stages["refinement"].kept
     assert stages["refinement"].psnr > stages["refinement"].psnr_before + 1
     assert report.plan["half"]
@@ -159,9 +159,9 @@ def test_narrow_gaussians_get_whole_views(tmp_path, monkeypatch):
 
 def test_views_that_do_not_fit_are_refused(monkeypatch):
     found = plan(size=400)
-    monkeypatch.setattr("vvgt_cli.pipeline.mend.free_memory", lambda: 400**2 * 32 * 24)
-    check_view_memory(found, 400)  # 72 / 4 + 5
-    monkeypatch.setattr("vvgt_cli.pipeline.mend.free_memory", lambda: 400**2 * 32 * 22)
+    monkeypatch.setattr("vvgt_cli.pipeline.mend.free_memory", lambda: 400**2 * 32 * 18)
+    check_view_memory(found, 400)  # 48 / 4 + 5
+    monkeypatch.setattr("vvgt_cli.pipeline.mend.free_memory", lambda: 400**2 * 32 * 16)
     with pytest.raises(UsageError, match="--size 400"):
         check_view_memory(found, 400)
 

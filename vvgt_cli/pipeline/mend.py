@@ -32,6 +32,7 @@ MARGIN, SAMPLES = 4.0, 12.0  # dB, where views are means over their pixels, and 
 SMALLEST = 0.5  # standard deviation of the longest axis in pixels of the screen: viewers drop or fade less
 LARGE = 0.5  # of the screen: views as large are means over their own pixels
 WIDE = 0.9  # standard deviation in pixels of whole training views
+LOOK = 25  # steps between two looks at the check views where a target ends the run; else one is taken in the middle
 SOLID = 0.9  # median opacity of opaque bodies
 
 
@@ -180,7 +181,7 @@ class _Mending:
         target = self.limits.target_psnr
         options = OptimizeOptions(
             steps=self.plan.most_steps, time_budget=left, target_psnr=target, rule=self.train_rule, judge=self.rule,
-            seed=self.fit.seed,
+            seed=self.fit.seed, check_every=LOOK if target is not None else max(LOOK, self.plan.most_steps // 2),
         )  # fmt: skip
         return refine(self.run, gaussians, train, self.check, options)
 
