@@ -106,10 +106,29 @@ def wanted(tmp_path, *args):
     return set(python("-c", spy, cwd=tmp_path, folder=None).stdout.splitlines()[-1].split())
 
 
+def one_by_one(tmp_path, *args):
+    """Kernels, with the types, that a command finds no code for and was not told of."""
+    spy = (
+        "import sys; from vvgt_cli.jit import compile as c; from vvgt_cli.jit.cache import KernelCache as K\n"
+        "inner = K.load_overload; alone = []\n"
+        "def spy(self, sig, context):\n"
+        "    types = tuple(getattr(sig, 'args', sig))\n"
+        "    usual = [c.parse_types(self.dispatcher.usual, kind) for kind in c.VOLUMES]\n"
+        "    if types not in usual: alone.append(self.function.__qualname__)\n"
+        "    return inner(self, sig, context)\n"
+        "K.load_overload = spy\n"
+        "from vvgt_cli.cli.main import run\n"
+        f"code = run({[str(arg) for arg in args]!r}); print(*alone); sys.exit(code)"
+    )
+    return python("-c", spy, cwd=tmp_path, folder=None).stdout.splitlines()[-1].split()
+
+
 def test_commands_need_what_is_compiled_ahead_and_nothing_else(tmp_path):
     rare = {"vvgt_cli.vbm.inset:_shift"}  # of opaque scenes
     fit = ("--max-gaussians", 200, "--size", 64, "-q")
     assert wanted(tmp_path, "convert", SOURCE, *fit, "--steps", 24, "-o", "a.ply") == set(ahead.CONVERT) - rare
+    large = ("--max-gaussians", 200, "--size", 640, "-q", "--steps", 24)  # scored on blocks
+    assert one_by_one(tmp_path, "convert", SOURCE, *large, "-o", "l.ply") == []
     assert wanted(tmp_path, "init", SOURCE, *fit, "-o", "i.ply") == set(ahead.INIT) - rare
     few = wanted(tmp_path, "convert", SOURCE, *fit, "--steps", 0, "-o", "b.ply")
     assert set(ahead.BACK_PROJECT) <= few <= {*ahead.CONVERT, *ahead.BACK_PROJECT}

@@ -30,7 +30,7 @@ class Blocks:
         chosen = np.zeros(rows * across, bool)
         chosen[self.numbers] = True
         wide = chosen.reshape(rows, across).repeat(BLOCK, axis=0).repeat(BLOCK, axis=1)
-        return wide[: self.height, : self.width]
+        return np.ascontiguousarray(wide[: self.height, : self.width])  # as kernels are compiled for
 
     def pick(self, image: np.ndarray) -> np.ndarray:
         """The blocks of an image (h, w, c) below each other: (16 n, 16, c)."""
