@@ -127,7 +127,7 @@ def test_commands_need_what_is_compiled_ahead_and_nothing_else(tmp_path):
     rare = {"vvgt_cli.vbm.inset:_shift"}  # of opaque scenes
     fit = ("--max-gaussians", 200, "--size", 64, "-q")
     assert wanted(tmp_path, "convert", SOURCE, *fit, "--steps", 24, "-o", "a.ply") == set(ahead.CONVERT) - rare
-    large = ("--max-gaussians", 200, "--size", 640, "-q", "--steps", 24)  # scored on blocks
+    large = ("--max-gaussians", 200, "--size", 650, "-q", "--steps", 24)  # scored on blocks
     assert one_by_one(tmp_path, "convert", SOURCE, *large, "-o", "l.ply") == []
     assert wanted(tmp_path, "init", SOURCE, *fit, "-o", "i.ply") == set(ahead.INIT) - rare
     few = wanted(tmp_path, "convert", SOURCE, *fit, "--steps", 0, "-o", "b.ply")
