@@ -148,7 +148,8 @@ def test_a_letter_is_never_mirrored(vvgt, grid: str) -> None:
     anatomy.nifti(Path("f"), anatomy.letter(affine), affine)
     Path("front.json").write_text(transforms_json([FRONT]))
     for frame in ("unit", "world"):
-        _, header = init(vvgt, "f.nii", f"{frame}.ply", "--frame", frame)
+        turn = "superior" if frame == "unit" else "none"
+        _, header = init(vvgt, "f.nii", f"{frame}.ply", "--frame", frame, "--up", turn)
         assert vvgt("render", f"{frame}.ply", "--camera", "front.json", "-o", frame, "-q").code == 0
         assert_reads_right(read_png(f"{frame}/front.png")[..., 3], frame)
         assert header.up == ("z" if frame == "unit" else "none")
@@ -238,7 +239,7 @@ def test_evaluate_reads_every_frame_space_and_turn_back(vvgt) -> None:
 def test_no_comments_says_what_will_not_be_known(vvgt) -> None:
     affine = anatomy.place(anatomy.AXIAL)
     anatomy.nifti(Path("v"), anatomy.balls(affine), affine)
-    result = vvgt("init", "v.nii", "--tf", "tf.json", "-o", "a.ply", *SMALL[:-1], "--no-comments")
+    result = vvgt("init", "v.nii", "--tf", "tf.json", "-o", "a.ply", *SMALL[:-1], "--up", "superior", "--no-comments")
     assert "--no-comments: nothing in the file will say that it is in the unit frame with up z" in result.err
 
 
@@ -248,7 +249,7 @@ def test_refined_by_views_of_a_left_handed_volume(vvgt) -> None:
     anatomy.nifti(Path("v"), anatomy.letter(affine) + anatomy.balls(affine), affine)
     views = ("--views", 8, "--test-views", 2, "--size", 48, "-o", "views", "-q")
     assert vvgt("render-views", "v.nii", "--tf", "tf.json", *views).code == 0
-    init(vvgt, "v.nii", "in.ply")
+    init(vvgt, "v.nii", "in.ply", "--up", "superior")
     result = vvgt("optimize", "in.ply", "--views", "views", "--steps", 12, "-o", "out.ply", "--report", "r.json")
     assert result.code == 0, result.err
     report = json.loads(Path("r.json").read_text())
@@ -273,7 +274,8 @@ def test_preview_is_the_right_way_round_and_up(vvgt) -> None:
         index = np.round((world - straight[:3, 3]) / anatomy.ZOOMS).astype(int)
         both = anatomy.letter(straight) + anatomy.balls(straight)
         anatomy.nifti(Path(name), both[index[..., 2], index[..., 1], index[..., 0]], affine)
-        options = ("--max-gaussians", 400, "--size", 64, "--steps", 0, "--preview", f"{name}.png", "-o", f"{name}.ply")
+        options = ("--max-gaussians", 400, "--size", 64, "--steps", 0, "--preview", f"{name}.png")
+        options += ("--up", "superior", "-o", f"{name}.ply")
         result = vvgt("convert", f"{name}.nii", "--tf", "tf.json", *options, "-q")
         assert result.code == 0, result.err
         pictures.append(read_png(f"{name}.png"))

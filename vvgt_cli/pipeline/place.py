@@ -13,7 +13,7 @@ from vvgt_cli.cameras.boxed import drawn_in_box
 from vvgt_cli.gaussians import Gaussians, PlyOptions
 from vvgt_cli.gaussians.frames import transform, up_matrix
 from vvgt_cli.volume import Volume
-from vvgt_cli.volume.space import shear_text, world_axis
+from vvgt_cli.volume.space import shear_text
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
@@ -31,19 +31,6 @@ def into_box(gaussians: Gaussians, volume: Volume) -> Gaussians:
     axes = volume.axes
     straight = np.array_equal(axes, np.eye(3))
     return gaussians if straight else transform(gaussians, np.linalg.inv(axes))
-
-
-def up_axis(up: str | None, frame: str, space: str | None) -> str:
-    """World axis that is turned up in viewers: the one asked for, else superior in unit frames of anatomical spaces.
-
-    World frames are left alone unless asked: their positions are to be those of other data.
-
-    Raises:
-        UsageError: an anatomical direction where the space is not.
-    """
-    if up is not None:
-        return world_axis(up, space)
-    return world_axis("superior", space) if space and frame == "unit" else NONE
 
 
 def placed(ply: PlyOptions, volume: Volume) -> PlyOptions:
