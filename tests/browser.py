@@ -46,7 +46,9 @@ def packages() -> Path:
 
 
 def shoot(viewer: str, file: Path, cameras: Sequence[Camera | None], size: int, folder: Path) -> list[np.ndarray]:
-    """Pictures (size, size, 3) of ``file`` over black by a page of `tests/viewers`; None: from the viewer's own camera.
+    """Pictures (size, size, 3) of ``file`` over black by a page of `tests/viewers`.
+
+    A camera of None: from z = 3 of the viewer's own axes, y up.
 
     Cameras are square, have their principal point in the middle, and are in the frame of the file.
     """

@@ -1,6 +1,6 @@
 // shots.mjs JOBS.json MODULES: pictures of .ply files as web viewers draw them, in headless Chromium.
 // JOBS: {"browser": path, "jobs": [{"viewer": page, "file": .ply, "size": px, "options": query or nothing,
-//   "cameras": [{"rotation", "translation", "fov": degrees} or null for the viewer's own], "out": [.png]}]}
+//   "cameras": [{"rotation", "translation", "fov": degrees} or null for (0, 0, 3) in the viewer's axes, y up], "out": [.png]}]}
 import fs from 'node:fs';
 import http from 'node:http';
 import path from 'node:path';

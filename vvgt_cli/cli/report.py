@@ -43,9 +43,12 @@ def command_line(ctx: click.Context) -> str:
     "--max-gaussians", type=click.IntRange(1, 100_000_000), default=100_000, show_default=True, metavar="K",
     help="Largest budget; the closed form runs with 1/64, 1/16 and 1/4 of it too.",
 )  # fmt: skip
-@click.option("--size", type=click.IntRange(16, 2048), default=400, show_default=True, metavar="PX", help="Image size.")
 @click.option(
-    "--steps", type=click.IntRange(1, 10_000_000), multiple=True, default=(25, 100, 200, 400), show_default=True,
+    "--size", type=click.IntRange(16, 2048), default=1080, show_default=True, metavar="PX",
+    help="Size of the screen that files are made for and scored on.",
+)  # fmt: skip
+@click.option(
+    "--steps", type=click.IntRange(1, 10_000_000), multiple=True, default=(25, 120, 200, 400), show_default=True,
     metavar="N", help="Steps of gradient descent, a run each; may be repeated. The baselines take the largest.",
 )  # fmt: skip
 @click.option(

@@ -13,20 +13,26 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vvgt_cli.cameras import Camera, default_views
+from vvgt_cli.cameras.blocks import Blocks, spread_blocks
 from vvgt_cli.cameras.boxed import drawn_in_box
 from vvgt_cli.gaussians import Gaussians, as_stored, read_ply, write_ply
 from vvgt_cli.gaussians.frames import transform
 from vvgt_cli.optimize import OptimizeOptions
 from vvgt_cli.pipeline.convert import ConvertRequest, FitOptions, convert
+from vvgt_cli.pipeline.mend import judging_views
 from vvgt_cli.pipeline.optimize import Views, refine
-from vvgt_cli.pipeline.plan import views_of
+from vvgt_cli.pipeline.plan import DEFAULT_HALF_STEPS, view_edge, views_of
 from vvgt_cli.pipeline.record import ConversionReport, Run
+from vvgt_cli.pipeline.score import WHOLE, score_seen
+from vvgt_cli.pipeline.seats import SIDE, from_above, score_seats
 from vvgt_cli.pipeline.source import SourceRequest, load
 from vvgt_cli.progress import Console
 from vvgt_cli.report.runs import short
+from vvgt_cli.splat.rules import INRIA
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
+    from vvgt_cli.metrics import Scores
 
 SHARES = (64, 16, 4)  # of the budget, for the closed form at several K
 STARTS = 2  # of the budget, what the baselines begin with: they grow
@@ -41,15 +47,15 @@ class LadderOptions:
 
     Attributes:
         max_gaussians: largest budget K.
-        size: pixels along an image's edge.
+        size: pixels along the edge of the screen that files are made for and scored on.
         steps: of gradient descent, a rung each; the baselines take as many as the longest.
         model: folder or name of an exported network, None for none.
         seed: of whatever draws random numbers.
     """
 
     max_gaussians: int = 100_000
-    size: int = 400
-    steps: tuple[int, ...] = (25, 100, 200, 400)
+    size: int = 1080
+    steps: tuple[int, ...] = (25, DEFAULT_HALF_STEPS, 200, 400)
     model: str | None = None
     seed: int = 0
 
@@ -96,23 +102,55 @@ def rungs(options: LadderOptions) -> list[Rung]:
 
 @dataclass(frozen=True)
 class Reference:
-    """What every rung is scored against: test views, rendered once and in no rung's time."""
+    """What every rung is scored against: test views, rendered once and in no rung's time.
 
-    views: Views
-    step: float  # voxels
-    rays: int  # a pixel, at most
-    axes: np.ndarray  # (3, 3) `Volume.axes`: from the box frame, in which the views are, to the unit frame
-    shown: list[np.ndarray]  # as `upright` makes them
+    Attributes:
+        cameras: of the views; ``blocks`` of each that are scored, None for all of it.
+        images: (h, w, 4) float32 each; of those that are not in `WHOLE` only the blocks are drawn.
+        step: voxels; ``rays`` a pixel, at most.
+        axes: (3, 3) `Volume.axes`: from the box frame, in which the views are, to the unit frame.
+        shown: images as `upright` makes them.
+    """
+
+    cameras: list[Camera]
+    blocks: list[Blocks | None]
+    images: list[np.ndarray]
+    step: float
+    rays: int
+    axes: np.ndarray
+    shown: list[np.ndarray]
 
     @classmethod
     def render(cls, scene: Scene, size: int, console: Console) -> Reference:
         """The test views as `vvgt evaluate` has them."""
-        from vvgt_cli.dvr import REFERENCE, render_view, render_views
+        from vvgt_cli.dvr import REFERENCE, render_view
 
         cameras, axes = default_views("test", size=size), scene.volume.axes
-        images = render_views(scene, cameras, REFERENCE, progress=console.bar("reference"))
+        blocks = [spread_blocks(size, size, i) for i in range(len(cameras))]
+        images, bar = [], console.bar("reference")
+        for i, camera in enumerate(cameras):
+            images.append(render_view(scene, camera, REFERENCE, _drawn(blocks, i)))
+            if bar:
+                bar(i + 1, len(cameras))
         shown = upright(images, cameras, axes, lambda camera: render_view(scene, camera, REFERENCE))
-        return cls(Views(cameras, images), REFERENCE.step, max(rays for _, rays in REFERENCE.tiers), axes, shown)
+        return cls(cameras, blocks, images, REFERENCE.step, max(rays for _, rays in REFERENCE.tiers), axes, shown)
+
+    def score(self, gaussians: Gaussians) -> tuple[Scores, list[np.ndarray]]:
+        """Scores as `vvgt evaluate` has them, and our images."""
+        from vvgt_cli.metrics import mean_scores
+        from vvgt_cli.splat import render
+
+        ours, scores = [], []
+        for i, camera in enumerate(self.cameras):
+            drawn = _drawn(self.blocks, i)
+            ours.append(render(gaussians, camera, blocks=drawn))
+            scores.append(score_seen(self.images[i], ours[i], self.blocks[i], drawn is None))
+        return mean_scores(scores), ours
+
+
+def _drawn(blocks: Sequence[Blocks | None], view: int) -> Blocks | None:
+    """What of a test view is drawn."""
+    return None if view in WHOLE else blocks[view]
 
 
 def upright(
@@ -137,18 +175,20 @@ def climb(
         DataError, UsageError: as `vvgt_cli.pipeline.convert.convert`.
         KeyboardInterrupt: a refinement was interrupted; what came after it would not be comparable.
     """
-    from vvgt_cli.metrics import score_views
+    from vvgt_cli.dvr import REFERENCE
     from vvgt_cli.splat import render
 
+    scene = load(source).scene()
     for rung in rungs(options):
         report, gaussians = _run(source, rung, reference.axes)
         if report.refinement and report.refinement["reason"] == "interrupted":
             raise KeyboardInterrupt
-        images = [render(gaussians, camera) for camera in reference.views.cameras]
-        report.scores = asdict(score_views(reference.views.images, images))
+        scores, images = reference.score(gaussians)
+        seats = score_seats(scene, gaussians, from_above(options.size), REFERENCE, views=SIDE)
+        report.scores, report.seats = asdict(scores), [asdict(seat) for seat in seats]
         views = views_of(rung.fit.steps or 0)
         run = {"name": rung.name, "label": rung.label, "kind": rung.kind, "views": views, **asdict(report)}
-        yield run, upright(images, reference.views.cameras, reference.axes, partial(render, gaussians))
+        yield run, upright(images, reference.cameras, reference.axes, partial(render, gaussians))
 
 
 def warm_up(source: SourceRequest, options: LadderOptions) -> None:
@@ -178,12 +218,11 @@ def _begin(source: SourceRequest, rung: Rung) -> tuple[Run, Scene]:
 
 
 def _views(run: Run, scene: Scene, fit: FitOptions) -> tuple[Views, Views]:
-    from vvgt_cli.dvr import render_views
+    from vvgt_cli.dvr import RenderSettings, render_views
 
-    train = default_views("train", views_of(fit.steps or 0), size=fit.size)
-    check = default_views("check", size=fit.size)
+    train = default_views("train", views_of(fit.steps or 0), size=view_edge(fit.size, half=False))
     with run.stage("check views"):
-        judges = Views(check, render_views(scene, check))
+        judges = judging_views(scene, default_views("check", size=fit.size), RenderSettings())
     with run.stage("views"):
         return Views(train, render_views(scene, train)), judges
 
@@ -209,7 +248,10 @@ def _baseline(source: SourceRequest, rung: Rung) -> tuple[ConversionReport, Gaus
         else:
             start = initialise(scene, VbmOptions(count, fit.size, "uniform", fit.seed)).gaussians
     train, check = _views(run, scene, fit)
-    options = OptimizeOptions.of("3dgs", steps=fit.steps, max_gaussians=fit.max_gaussians, seed=fit.seed)
+    options = OptimizeOptions.of(
+        "3dgs", steps=fit.steps, max_gaussians=fit.max_gaussians, seed=fit.seed,
+        rule=INRIA.at(train.cameras[0].width / fit.size), judge=INRIA,
+    )  # fmt: skip
     return _finish(run, refine(run, start, train, check, options))
 
 

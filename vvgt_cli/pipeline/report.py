@@ -23,11 +23,11 @@ from vvgt_cli.pipeline.source import SourceRequest, load
 from vvgt_cli.progress import Console
 from vvgt_cli.report.page import Pictures, page
 from vvgt_cli.report.plots import FILES, write_plots
-from vvgt_cli.report.runs import Series, cost, front, knee, psnr, read_series, table, unit_costs
+from vvgt_cli.report.runs import Series, cost, front, knee, psnr, read_series, table, unit_costs, worst_seat
 from vvgt_cli.volume.blocks import check_memory
 
 PAGE, TABLE, DATA = "report.html", "report.csv", "report.json"
-VIEW_BYTES = 16  # a pixel: float32 RGBA
+VIEWS, VIEW_BYTES = 24, 16  # test views, ours and those shown; a pixel: float32 RGBA
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ def report(request: ReportRequest, console: Console | None = None) -> dict[str, 
     folder = _folder(request.output, (DATA, TABLE, PAGE, *FILES), request.overwrite)
     request = replace(request, ladder=_with_model(request.ladder))
     size = request.ladder.size
-    check_memory(10 * size**2 * VIEW_BYTES, f"--size {size}: ten test views")
+    check_memory(VIEWS * size**2 * VIEW_BYTES, f"--size {size}: test views and ours")
     source = load(request.source)
     console.say(describe_source(source))
     warm_up(request.source, request.ladder)
@@ -74,8 +74,9 @@ def report(request: ReportRequest, console: Console | None = None) -> dict[str, 
     for run, images in climb(request.source, request.ladder, reference, console):
         runs.append(run)
         ours.append(_pngs(pictures(images, PICTURED, request.picture_size)))
-        score = f"PSNR {psnr(run):.2f} dB, {run['gaussians']} Gaussians, {run['bytes'] / 1e6:.1f} MB"
-        console.stage(f"{len(runs)}/{total}", cost(run), f"{run['name']}: {score}")
+        score = f"PSNR {psnr(run):.2f} dB, worst seat {worst_seat(run):.2f} dB"
+        megabytes = f"{run['gaussians']} Gaussians, {run['bytes'] / 1e6:.1f} MB"
+        console.stage(f"{len(runs)}/{total}", cost(run), f"{run['name']}: {score}, {megabytes}")
     text = document("vvgt-report", _document(request, source, reference, runs))
     found: dict[str, Any] = json.loads(text)
     series = [Series(source.volume.name, runs, found)]
@@ -107,7 +108,7 @@ def _document(request: ReportRequest, source: Any, reference: Reference, runs: l
         "transfer_function": tf_record(source, request.source),
         "options": asdict(request.ladder),
         "reference": {
-            "views": len(reference.views), "size": request.ladder.size, "step": reference.step,
+            "views": len(reference.cameras), "size": request.ladder.size, "step": reference.step,
             "rays": reference.rays,
         },
         "front": best,

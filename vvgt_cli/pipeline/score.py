@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vvgt_cli.cameras import default_views
-from vvgt_cli.cameras.blocks import spread_blocks
+from vvgt_cli.cameras.blocks import Blocks, spread_blocks
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.progress import ProgressCallback
 from vvgt_cli.splat.rules import INRIA, Rule
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import RenderSettings, Scene
-    from vvgt_cli.metrics import Scores
+    from vvgt_cli.metrics import Scores, ViewScore
 
 WHOLE = (0, 4, 9)  # test views of which large ones are drawn whole, for what blocks cannot tell
 
@@ -51,7 +51,7 @@ def score_test_views(
     """
     from vvgt_cli.dvr import render_view
     from vvgt_cli.images import side_by_side
-    from vvgt_cli.metrics import mean_scores, score_view
+    from vvgt_cli.metrics import mean_scores
     from vvgt_cli.splat import render
 
     cameras = default_views("test", size=size)
@@ -63,17 +63,34 @@ def score_test_views(
         whole = blocks is None or i in keep or (perceptual and i in WHOLE)
         part = None if whole else blocks
         reference, ours = render_view(scene, camera, settings, part), render(gaussians, camera, rule, blocks=part)
-        pair = (reference, ours) if blocks is None else (blocks.pick(reference), blocks.pick(ours))
-        score = score_view(*pair, perceptual=perceptual and blocks is None)
-        if perceptual and blocks is not None and whole:
-            seen = score_view(reference, ours)
-            score = replace(score, ssim=seen.ssim, flip=seen.flip)
-        views.append(score)
+        views.append(score_seen(reference, ours, blocks, whole, perceptual))
         if i in keep:
             rows.append(side_by_side(reference, ours))
         if progress:
             progress(done + 1, len(numbers))
     return mean_scores(views), np.concatenate(rows) if rows else None
+
+
+def score_seen(
+    reference: np.ndarray, ours: np.ndarray, blocks: Blocks | None, whole: bool = True, perceptual: bool = True
+) -> ViewScore:
+    """One view: errors of its blocks, where it has such; SSIM and FLIP of the whole, where it was drawn.
+
+    Args:
+        reference, ours: (h, w, 4) float32 premultiplied.
+        blocks: of the view, or None for all of it.
+        whole: whether more than the blocks was drawn.
+        perceptual: SSIM and FLIP too.
+    """
+    from vvgt_cli.metrics import score_view
+
+    if blocks is None:
+        return score_view(reference, ours, perceptual=perceptual)
+    score = score_view(blocks.pick(reference), blocks.pick(ours), perceptual=False)
+    if perceptual and whole:
+        seen = score_view(reference, ours)
+        score = replace(score, ssim=seen.ssim, flip=seen.flip)
+    return score
 
 
 def psnr_note(scores: Scores) -> str:

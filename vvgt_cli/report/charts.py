@@ -167,7 +167,7 @@ def legend(shapes: Sequence[int], colors: Sequence[str]) -> str:
 def stage_bars(runs: Sequence[Run], longest: float) -> str:
     """A bar a run, a segment a stage; ``longest`` seconds fill the width. Scoring is hatched: it makes no file."""
     names = stage_names(runs)
-    paint = {name: HATCH if name == SCORING else f"background:{STAGES.get(name, OTHER)}" for name in names}
+    paint = {name: HATCH if name in SCORING else f"background:{STAGES.get(name, OTHER)}" for name in names}
     rows = []
     for run in runs:
         seconds = {name: sum(s["seconds"] for s in run["stages"] if s["name"] == name) for name in names}
@@ -179,6 +179,6 @@ def stage_bars(runs: Sequence[Run], longest: float) -> str:
         rows.append(
             f'<div class="bar"><b>{escape(run["name"])}</b><div>{segments}</div><em>{cost(run):.2f} s</em></div>'
         )
-    shown = {name: "scoring (not counted)" if name == SCORING else name for name in names}
+    shown = {name: f"{name} (not counted)" if name in SCORING else name for name in names}
     keys = "".join(f'<span><i style="{paint[name]}"></i>{escape(shown[name])}</span>' for name in names)
     return f'<div class="keys">{keys}</div><div class="bars">{"".join(rows)}</div>'

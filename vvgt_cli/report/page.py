@@ -9,7 +9,7 @@ from html import escape
 from typing import Any
 
 from vvgt_cli.report.charts import Point, legend, mark, scatter, stage_bars
-from vvgt_cli.report.runs import KINDS, Run, Series, cost, front, knee, psnr, short
+from vvgt_cli.report.runs import KINDS, Run, Series, cost, front, knee, psnr, short, worst_seat
 from vvgt_cli.report.style import CSS, SCRIPT
 
 AXES = (
@@ -200,7 +200,7 @@ def _cell(value: Any, digits: int) -> str:
 
 
 def _table(series: Sequence[Series]) -> str:
-    heads = ("run", "seconds", "PSNR", "foreground", "SSIM", "FLIP", "Gaussians", "MB")
+    heads = ("run", "seconds", "PSNR", "foreground", "worst seat", "SSIM", "FLIP", "Gaussians", "MB")
     rows = []
     for one in series:
         best = {id(run) for run in front(one.scored())}
@@ -209,7 +209,8 @@ def _table(series: Sequence[Series]) -> str:
             name = run["name"] if len(series) == 1 else f"{one.name}: {run['name']}"
             cells = [
                 f"{cost(run):.2f}", _cell(scores.get("psnr"), 2), _cell(scores.get("psnr_foreground"), 2),
-                _cell(scores.get("ssim"), 4), _cell(scores.get("flip"), 4), f"{run['gaussians']:,}",
+                _cell(worst_seat(run), 2), _cell(scores.get("ssim"), 4), _cell(scores.get("flip"), 4),
+                f"{run['gaussians']:,}",
                 f"{run['bytes'] / 1e6:.2f}",
             ]  # fmt: skip
             mark = ' class="best"' if id(run) in best else ""
@@ -217,7 +218,8 @@ def _table(series: Sequence[Series]) -> str:
     head = "".join(f"<th>{name}</th>" for name in heads)
     return (
         f'<section><h2>All runs</h2><div class="scroll"><table><tr>{head}</tr>{"".join(rows)}</table></div>'
-        "<p><small>Bold: nothing is both faster and nearer.</small></p></section>"
+        "<p><small>Bold: nothing is both faster and nearer. Worst seat: the lowest PSNR of every rule of drawing, "
+        "at the size made for and on the next larger screen, in one view.</small></p></section>"
     )
 
 

@@ -79,7 +79,7 @@ def _stages(axes: Any, series: Sequence[Series]) -> None:
     for stage in stage_names([run for _, run in rows]):
         widths = [sum(s["seconds"] for s in run["stages"] if s["name"] == stage) for _, run in rows]
         if any(widths):
-            label = "scoring (not counted)" if stage == SCORING else stage
+            label = f"{stage} (not counted)" if stage in SCORING else stage
             axes.barh(range(len(rows)), widths, left=ends, color=STAGES.get(stage, OTHER), label=label)
             ends = [end + width for end, width in zip(ends, widths, strict=True)]
     axes.set_yticks(range(len(rows)), names, fontsize=8, parse_math=False)

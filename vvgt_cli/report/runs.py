@@ -19,12 +19,12 @@ from vvgt_cli.errors import DataError
 
 Run = dict[str, Any]
 FORMATS = ("vvgt-report", "vvgt-conversion")
-SCORING = "test views"  # the stage that only measures
+SCORING = ("test views", "seats")  # stages that only measure
 KINDS = ("closed form", "network", "steps", "baseline")
 STAGES = {  # colours of the stages that are known, in order
     "read": "#8a949e", "scene": "#b4bbc2", "samples": "#8f7bbf", "closed form": "#2f7fbf", "check views": "#f2c76b",
     "views": "#e69f00", "back-projection": "#56b4e9", "network": "#cc79a7", "judge": "#e3b5cd", "refinement": "#009e73",
-    "write": "#777c83", SCORING: "#dddddd",
+    "write": "#777c83", "test views": "#dddddd", "seats": "#e8e8e8",
 }  # fmt: skip
 OTHER = "#a05d3b"
 SCORES = ("psnr", "psnr_foreground", "psnr_white", "psnr_alpha", "ssim", "flip")
@@ -50,13 +50,18 @@ class Series:
 
 
 def cost(run: Run) -> float:
-    """Wall seconds to the file: every stage but the scoring."""
-    return float(sum(stage["seconds"] for stage in run["stages"] if stage["name"] != SCORING))
+    """Wall seconds to the file: every stage but those that score."""
+    return float(sum(stage["seconds"] for stage in run["stages"] if stage["name"] not in SCORING))
 
 
 def psnr(run: Run) -> float | None:
     """PSNR on the test views, whole frame over black, dB; None without."""
     return None if not run.get("scores") else run["scores"]["psnr"]
+
+
+def worst_seat(run: Run) -> float | None:
+    """PSNR where the run looks least like the volume (`vvgt_cli.pipeline.seats`), dB; None without."""
+    return min((seat["psnr"] for seat in run.get("seats") or ()), default=None)
 
 
 def front(runs: Sequence[Run]) -> list[Run]:
@@ -102,7 +107,7 @@ def unit_costs(runs: Sequence[Run]) -> dict[str, float]:
                 note("refinement, a step", seconds, (run.get("refinement") or {}).get("steps") or 0)
             elif name == "write":
                 note("write, a megabyte", seconds, run["bytes"] / 1e6)
-            elif name != SCORING and run["kind"] != "baseline":
+            elif name not in SCORING and run["kind"] != "baseline":
                 note(f"{name}, a run", seconds, 1)
     return {key: statistics.median(values) for key, values in found.items()}
 
@@ -112,13 +117,24 @@ def table(runs: Sequence[Run]) -> str:
     stages = stage_names(runs)
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
-    heads = ["name", "kind", "seconds", "gaussians", "bytes", *SCORES, "pareto", *(f"seconds: {s}" for s in stages)]
+    heads = [
+        "name",
+        "kind",
+        "seconds",
+        "gaussians",
+        "bytes",
+        *SCORES,
+        "worst_seat",
+        "pareto",
+        *(f"seconds: {s}" for s in stages),
+    ]
     writer.writerow(heads)
     best = {id(run) for run in front(runs)}
     for run in runs:
         scores = run.get("scores") or {}
         row = [run["name"], run["kind"], f"{cost(run):.4f}", run["gaussians"], run["bytes"]]
-        row += ["" if scores.get(key) is None else f"{scores[key]:.4f}" for key in SCORES]
+        numbers = [*(scores.get(key) for key in SCORES), worst_seat(run)]
+        row += ["" if number is None else f"{number:.4f}" for number in numbers]
         seconds = _seconds(run)
         row += [int(id(run) in best), *(f"{seconds[s]:.4f}" if s in seconds else "" for s in stages)]
         writer.writerow(row)
