@@ -15,6 +15,7 @@ import pytest
 from vvgt_cli.cameras.files import read_cameras
 from vvgt_cli.gaussians import in_unit_frame, read_ply
 from vvgt_cli.images import read_exr, read_png
+from vvgt_cli.metrics import psnr
 
 ROOT = Path(__file__).parent.parent
 SMALL = ("--max-gaussians", 300, "--size", 48)
@@ -195,6 +196,25 @@ def test_evaluate_scores_every_seat(converted, vvgt):
     assert "drawn as playcanvas" in table.out.decode()
     assert "close up" not in table.out.decode()
     assert f"{document['scores']['psnr']:.4f}" not in table.out.decode()
+
+
+def test_evaluate_draws_what_it_scores_from_afar_and_close_up(converted, vvgt, tmp_path):
+    picture = tmp_path / "seen.png"
+    options = ("evaluate", converted[0] / "a.ply", "--volume", SOURCE, "--no-seats", "--step", 0.5)
+    options += ("--preview", picture)
+    document = json.loads(vvgt(*options, "--json").out)
+    sheet = read_png(picture)[..., :3]
+    assert sheet.shape[:2] == (2 * 48, 3 * 48)
+    far, near = sheet[:48], sheet[48:]
+    assert psnr(far[:, :48], far[:, 48:96]) == pytest.approx(document["scores"]["per_view"][4]["psnr"], abs=0.3)
+    np.testing.assert_allclose(far[:, 96:], np.clip(8 * abs(far[:, :48] - far[:, 48:96]), 0, 1), atol=10 / 255)
+    middle = far[18:30, 18:30]  # what 10 degrees of 40 show
+    assert near[:, :48].mean((0, 1)) == pytest.approx(middle.mean((0, 1)), rel=0.1)
+    assert far[:, :48].mean((0, 1)) != pytest.approx(middle.mean((0, 1)), rel=0.1)
+    assert psnr(near[:, :48], near[:, 48:96]) > 20
+    again = vvgt(*options)
+    assert again.code == 2
+    assert "exists" in again.error
 
 
 def test_rules_are_the_tables():

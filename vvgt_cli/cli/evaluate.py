@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from vvgt_cli.cli.fit import rule_option
-from vvgt_cli.cli.options import common_options, placed_read_options, tf_options
+from vvgt_cli.cli.options import common_options, overwrite_option, placed_read_options, tf_options
 from vvgt_cli.progress import Console
 
 
@@ -27,9 +27,14 @@ from vvgt_cli.progress import Console
     "--step", type=click.FloatRange(0, 4, min_open=True), default=0.125, show_default=True, metavar="VOXELS",
     help="Sampling distance of the reference; 0.5 is what convert scores with.",
 )  # fmt: skip
+@click.option(
+    "--preview", metavar="FILE.png",
+    help="Reference, result and 8 times their difference, of a test view from the side and close up.",
+)  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a table.")
 @tf_options
 @placed_read_options
+@overwrite_option
 @common_options
 def command(ply: str, volume: str, as_json: bool, console: Console, **options: Any) -> None:
     """Score OUT.ply against the volume it was made from: on the ten test views, and from every seat.
@@ -47,7 +52,6 @@ def command(ply: str, volume: str, as_json: bool, console: Console, **options: A
     from vvgt_cli.pipeline.evaluate import EvaluateRequest, evaluate
 
     source = source_request(volume, options["read"], options["optics"])
-    evaluation = evaluate(
-        EvaluateRequest(ply, source, options["size"], options["rule"], options["step"], options["seats"]), console
-    )
+    names = ("size", "rule", "step", "seats", "preview", "overwrite")
+    evaluation = evaluate(EvaluateRequest(ply, source, **{name: options[name] for name in names}), console)
     click.echo(evaluation.to_json() if as_json else evaluation.table(), nl=False)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vvgt_cli.cameras import default_views
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored
 from vvgt_cli.jit.ahead import CONVERT, INIT
@@ -132,7 +133,8 @@ def convert(request: ConvertRequest, console: Console | None = None) -> Conversi
     if request.preview and sheet is None:
         with run.stage("preview"):
             axes = upright(source.volume, _ply(request, source).up)
-            sheet = preview(scene, gaussians, fit.size, axes, PREVIEW_VIEWS)
+            views = default_views("test", size=fit.size)
+            sheet = preview(scene, gaussians, [views[n] for n in PREVIEW_VIEWS], axes, fit.rule)
     return _finish(run, request, source, gaussians, sheet)
 
 

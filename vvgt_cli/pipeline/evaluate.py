@@ -13,17 +13,19 @@ from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians import PlyHeader
 from vvgt_cli.jit.ahead import EVALUATE
 from vvgt_cli.pipeline.convert import describe_source, tf_record, volume_record
-from vvgt_cli.pipeline.place import into_box
+from vvgt_cli.pipeline.outputs import Output, check_outputs
+from vvgt_cli.pipeline.place import into_box, preview, upright
 from vvgt_cli.pipeline.record import ConversionReport, Run, Stage, document
 from vvgt_cli.pipeline.render import STDIN, file_rule, open_gaussians
 from vvgt_cli.pipeline.score import psnr_note, score_test_views
-from vvgt_cli.pipeline.seats import Seat, score_seats, seats_of
+from vvgt_cli.pipeline.seats import CLOSE, Seat, score_seats, seats_of, zoomed
 from vvgt_cli.pipeline.source import Source, SourceRequest, load
 from vvgt_cli.progress import Console
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
 
+PICTURED = 4  # test view of the preview: from the side
 MIDDLE = 200  # pixels along the edge of what the reference's own error is measured on
 
 
@@ -38,6 +40,8 @@ class EvaluateRequest:
         rule: of `vvgt_cli.splat.rules` to draw by; None: the file's.
         step: of the reference, in voxels.
         seats: score every rule at several sizes and close up as well.
+        preview: PNG to write (reference, ours, difference of a test view and of a close-up), None for none.
+        overwrite: replace it if it exists.
     """
 
     ply: str
@@ -46,6 +50,8 @@ class EvaluateRequest:
     rule: str | None = None
     step: float = 0.125
     seats: bool = True
+    preview: str | None = None
+    overwrite: bool = False
 
 
 @dataclass
@@ -105,10 +111,13 @@ def evaluate(request: EvaluateRequest, console: Console | None = None) -> Evalua
         UsageError, DataError: inputs that are not what they must be.
     """
     from vvgt_cli.dvr import REFERENCE
+    from vvgt_cli.images import write_png
 
     if request.ply == STDIN == request.source.volume:
         raise UsageError("both OUT.ply and --volume are '-': standard input holds one of them")
     run = Run(console or Console(), ConversionReport("evaluate"))
+    if request.preview:
+        check_outputs([Output("--preview", request.preview, (".png",))], [request.ply], request.overwrite)
     with run.stage("read") as stage:
         gaussians, header = open_gaussians(request.ply, run.console)
         source = _load(request.source, header)
@@ -133,6 +142,12 @@ def evaluate(request: EvaluateRequest, console: Console | None = None) -> Evalua
         scores, _ = score_test_views(scene, gaussians, size, settings, rule=rule, progress=bar)
         evaluation.scores = asdict(scores)
         stage.note = f"{psnr_note(scores)}, {size} px"
+    if request.preview:
+        with run.stage("preview"):
+            camera = default_views("test", size=size)[PICTURED]
+            axes = upright(source.volume, header.up)
+            sheet = preview(scene, gaussians, [camera, zoomed(camera, CLOSE)], axes, rule)
+            write_png(request.preview, sheet, request.overwrite)
     if request.seats:
         with run.stage("seats") as stage:
             seats = score_seats(scene, gaussians, seats_of(size), progress=run.console.bar("seats"))

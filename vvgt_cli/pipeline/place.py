@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vvgt_cli.cameras import default_views
+from vvgt_cli.cameras import Camera
 from vvgt_cli.cameras.boxed import drawn_in_box
 from vvgt_cli.gaussians import Gaussians, PlyOptions
 from vvgt_cli.gaussians.frames import transform, up_matrix
+from vvgt_cli.splat.rules import INRIA, Rule
 from vvgt_cli.volume import Volume
 from vvgt_cli.volume.space import shear_text
 
@@ -65,13 +66,14 @@ def upright(volume: Volume, up: str) -> np.ndarray:
     return turn @ volume.axes
 
 
-def preview(scene: Scene, gaussians: Gaussians, size: int, axes: np.ndarray, numbers: Sequence[int]) -> np.ndarray:
-    """Reference, ours and their difference on some test views of the frame that ``axes`` (`upright`) leads to."""
+def preview(
+    scene: Scene, gaussians: Gaussians, cameras: Sequence[Camera], axes: np.ndarray, rule: str | Rule = INRIA
+) -> np.ndarray:
+    """Reference, ours and their difference, a row a camera of the frame that ``axes`` (`upright`) leads to."""
     from vvgt_cli.dvr import RenderSettings, render_view
     from vvgt_cli.images import side_by_side
     from vvgt_cli.splat import render
 
     reference = drawn_in_box(lambda camera: render_view(scene, camera, RenderSettings()), axes)
-    ours = drawn_in_box(lambda camera: render(gaussians, camera), axes)
-    cameras = default_views("test", size=size)
-    return np.concatenate([side_by_side(reference(cameras[n]), ours(cameras[n])) for n in numbers])
+    ours = drawn_in_box(lambda camera: render(gaussians, camera, rule), axes)
+    return np.concatenate([side_by_side(reference(camera), ours(camera)) for camera in cameras])
