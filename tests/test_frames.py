@@ -12,7 +12,7 @@ import pytest
 from tests import anatomy
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.cameras.boxed import boxed
-from vvgt_cli.cameras.files import transforms_json
+from vvgt_cli.cameras.files import read_cameras, transforms_json
 from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.gaussians import Gaussians, PlyHeader, in_unit_frame, read_ply
 from vvgt_cli.gaussians.frames import transform
@@ -148,8 +148,7 @@ def test_a_letter_is_never_mirrored(vvgt, grid: str) -> None:
     anatomy.nifti(Path("f"), anatomy.letter(affine), affine)
     Path("front.json").write_text(transforms_json([FRONT]))
     for frame in ("unit", "world"):
-        turn = "superior" if frame == "unit" else "none"
-        _, header = init(vvgt, "f.nii", f"{frame}.ply", "--frame", frame, "--up", turn)
+        _, header = init(vvgt, "f.nii", f"{frame}.ply", "--frame", frame)
         assert vvgt("render", f"{frame}.ply", "--camera", "front.json", "-o", frame, "-q").code == 0
         assert_reads_right(read_png(f"{frame}/front.png")[..., 3], frame)
         assert header.up == ("z" if frame == "unit" else "none")
@@ -200,6 +199,38 @@ def test_up_in_viewers(vvgt, up: str) -> None:
         np.testing.assert_allclose(back.means, plain.means * signs, atol=1e-5)
 
 
+@pytest.mark.parametrize("name", ["nifti sform", "nrrd left-posterior-superior", "mha", "dicom", "vti"])
+def test_the_head_is_up_by_default(vvgt, name: str) -> None:
+    """Superior is PLY -y, which viewers show upwards, in both spaces; in the world frame nothing is turned."""
+    affine = anatomy.place(anatomy.CORONAL)
+    path = in_format(name, anatomy.balls(affine), affine)
+    plain, _ = init(vvgt, path, "plain.ply", "--up", "none")
+    cloud, header = init(vvgt, path, "auto.ply")
+    world = init(vvgt, path, "world.ply", "--frame", "world")[1]
+    if name == "vti":
+        assert (header.up, world.up) == ("none", "none")
+        np.testing.assert_array_equal(cloud.means, plain.means)
+        return
+    assert (header.up, world.up) == ("z", "none")
+    np.testing.assert_allclose(-cloud.means[:, 1], plain.means[:, 2], atol=1e-6)
+    lps, header = init(vvgt, path, "lps.ply", "--space", "LPS")
+    np.testing.assert_allclose(lps.means, cloud.means * (-1, 1, -1), atol=1e-5)  # half a turn about the way up
+    assert header.up == "z"
+
+
+@pytest.mark.parametrize("up", ["auto", "none", "inferior", "left", "y"])
+def test_an_orbit_circles_the_way_up(vvgt, up: str) -> None:
+    """Eyes lie 20 degrees above the plane that the way up is normal to, and the tops of pictures that way."""
+    affine = anatomy.place(anatomy.AXIAL)
+    anatomy.nifti(Path("b"), anatomy.balls(affine), affine)
+    init(vvgt, "b.nii", "b.ply", "--up", up)
+    assert vvgt("render", "b.ply", "--orbit", 5, "--size", 32, "-o", "turn", "-q").code == 0
+    towards = np.array({"inferior": (0, 0, -1), "left": (-1, 0, 0), "y": (0, 1, 0)}.get(up, (0, 0, 1)), float)
+    for camera in read_cameras("turn/transforms.json"):
+        assert camera.position @ towards == pytest.approx(3 * np.sin(np.radians(20)), abs=1e-6)
+        assert -camera.rotation[1] @ towards == pytest.approx(np.cos(np.radians(20)), abs=1e-6)  # camera -y is up
+
+
 def test_up_needs_a_space_for_directions_of_the_body(vvgt) -> None:
     np.save("bare.npy", anatomy.balls(anatomy.place(anatomy.AXIAL)))
     result = vvgt("init", "bare.npy", "--tf", "tf.json", "-o", "a.ply", "--up", "superior")
@@ -239,7 +270,7 @@ def test_evaluate_reads_every_frame_space_and_turn_back(vvgt) -> None:
 def test_no_comments_says_what_will_not_be_known(vvgt) -> None:
     affine = anatomy.place(anatomy.AXIAL)
     anatomy.nifti(Path("v"), anatomy.balls(affine), affine)
-    result = vvgt("init", "v.nii", "--tf", "tf.json", "-o", "a.ply", *SMALL[:-1], "--up", "superior", "--no-comments")
+    result = vvgt("init", "v.nii", "--tf", "tf.json", "-o", "a.ply", *SMALL[:-1], "--no-comments")
     assert "--no-comments: nothing in the file will say that it is in the unit frame with up z" in result.err
 
 
@@ -249,7 +280,7 @@ def test_refined_by_views_of_a_left_handed_volume(vvgt) -> None:
     anatomy.nifti(Path("v"), anatomy.letter(affine) + anatomy.balls(affine), affine)
     views = ("--views", 8, "--test-views", 2, "--size", 48, "-o", "views", "-q")
     assert vvgt("render-views", "v.nii", "--tf", "tf.json", *views).code == 0
-    init(vvgt, "v.nii", "in.ply", "--up", "superior")
+    init(vvgt, "v.nii", "in.ply")
     result = vvgt("optimize", "in.ply", "--views", "views", "--steps", 12, "-o", "out.ply", "--report", "r.json")
     assert result.code == 0, result.err
     report = json.loads(Path("r.json").read_text())
@@ -275,7 +306,7 @@ def test_preview_is_the_right_way_round_and_up(vvgt) -> None:
         both = anatomy.letter(straight) + anatomy.balls(straight)
         anatomy.nifti(Path(name), both[index[..., 2], index[..., 1], index[..., 0]], affine)
         options = ("--max-gaussians", 400, "--size", 64, "--steps", 0, "--preview", f"{name}.png")
-        options += ("--up", "superior", "-o", f"{name}.ply")
+        options += ("-o", f"{name}.ply")
         result = vvgt("convert", f"{name}.nii", "--tf", "tf.json", *options, "-q")
         assert result.code == 0, result.err
         pictures.append(read_png(f"{name}.png"))

@@ -60,13 +60,13 @@ ply_options = group(
         help="World directions, box centred with longest edge 2; or the volume's physical space.",
     ),
     up=click.option(
-        "--up", metavar="DIRECTION", default="none", show_default=True,
+        "--up", metavar="DIRECTION", default="auto", show_default=True,
         type=click.Choice([
-            *("none", "x", "-x", "y", "-y", "z", "-z"),
+            *("auto", "none", "x", "-x", "y", "-y", "z", "-z"),
             *("superior", "inferior", "anterior", "posterior", "left", "right"),
         ]),
         help="What viewers show upwards: superior, ..., right, or a world axis (x, -x, ..., -z); none leaves axes "
-        "as they are.",
+        "as they are; auto is superior in the unit frame of an anatomical space, else none.",
     ),
     sh_degree=click.option(
         "--sh-degree", type=click.IntRange(0, 3), default=0, show_default=True,

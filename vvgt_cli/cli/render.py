@@ -12,7 +12,7 @@ from vvgt_cli.progress import Console
 @click.command("render", short_help="Pictures of a .ply.")
 @click.argument("ply", metavar="OUT.ply")
 @click.option("--camera", metavar="FILE", help="Views of a transforms.json (in the unit frame).")
-@click.option("--orbit", type=click.IntRange(1, 10_000), metavar="N", help="N views on a circle around +z.")
+@click.option("--orbit", type=click.IntRange(1, 10_000), metavar="N", help="N views on a circle around the way up.")
 @click.option(
     "--size",
     type=click.IntRange(1, 16384),
@@ -41,7 +41,8 @@ def command(
 ) -> None:
     """Render the Gaussians of OUT.ply as the standard viewers do, one PNG a view, and a transforms.json.
 
-    OUT.ply may be "-" for standard input. Give the views with --camera or with --orbit.
+    OUT.ply may be "-" for standard input. Give the views with --camera or with --orbit. The way up is the one that
+    OUT.ply was made with (--up), else +z.
 
     \b
     Examples:

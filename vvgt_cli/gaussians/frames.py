@@ -38,6 +38,11 @@ def up_matrix(up: str) -> np.ndarray:
     return np.array(_UP[up][0], dtype=np.float64)
 
 
+def upright_matrix(up: str) -> np.ndarray:
+    """(3, 3) float64 rotation that takes the volume axis ``up`` to +z, which views have upwards; 1 for "none"."""
+    return _IDENTITY if up == "none" else up_matrix("z").T @ up_matrix(up)
+
+
 def _quaternion_product(left: tuple[float, ...], right: np.ndarray) -> np.ndarray:
     """Hamilton product of one quaternion (w, x, y, z) with (K, 4), float64."""
     w, x, y, z = left

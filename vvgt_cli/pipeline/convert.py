@@ -15,7 +15,7 @@ from vvgt_cli.jit.ahead import CONVERT, INIT
 from vvgt_cli.network.card import find_model, read_card
 from vvgt_cli.pipeline.mend import check_view_memory, mend, wide
 from vvgt_cli.pipeline.outputs import Output, check_outputs, write_text
-from vvgt_cli.pipeline.place import out_of_box, placed, preview, remarks, upright
+from vvgt_cli.pipeline.place import AUTO, out_of_box, placed, preview, remarks, upright, way_up
 from vvgt_cli.pipeline.plan import Limits, Planner, estimate, view_edge
 from vvgt_cli.pipeline.record import ConversionReport, Run
 from vvgt_cli.pipeline.render import write_gaussians
@@ -23,7 +23,6 @@ from vvgt_cli.pipeline.score import psnr_note, score_test_views
 from vvgt_cli.pipeline.seats import SIDE, from_above, score_seats
 from vvgt_cli.pipeline.source import Source, SourceRequest, load
 from vvgt_cli.progress import Console
-from vvgt_cli.volume.space import world_axis
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
@@ -70,7 +69,7 @@ class ConvertRequest:
         limits: error, time and size that decide what is done.
         dry_run: plan, and write nothing.
         ply: how the file is written; up, the volume's place and the distance are filled in from the source.
-        up: world axis or anatomical direction that viewers show upwards, or "none".
+        up: world axis or anatomical direction that viewers show upwards, "none", or "auto" (`place.way_up`).
         report: JSON to write, "-" for standard output, None for none.
         preview: PNG to write (reference, ours, difference of a few test views), None for none.
         overwrite: replace files that exist.
@@ -82,7 +81,7 @@ class ConvertRequest:
     limits: Limits = field(default_factory=Limits)
     dry_run: bool = False
     ply: PlyOptions = field(default_factory=PlyOptions)
-    up: str = "none"
+    up: str = AUTO
     report: str | None = None
     preview: str | None = None
     overwrite: bool = False
@@ -174,7 +173,7 @@ def _ply(request: ConvertRequest, source: Source) -> PlyOptions:
     """How the file is written, with all that follows from the source."""
     ply = replace(
         request.ply,
-        up=world_axis(request.up, source.volume.space),
+        up=way_up(request.up, request.ply.frame, source.volume.space),
         unit_distance=source.unit_distance,
         unit_distance_label=source.unit_label,
         made_for=request.fit.size,

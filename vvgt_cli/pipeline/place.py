@@ -11,15 +11,31 @@ import numpy as np
 from vvgt_cli.cameras import Camera
 from vvgt_cli.cameras.boxed import drawn_in_box
 from vvgt_cli.gaussians import Gaussians, PlyOptions
-from vvgt_cli.gaussians.frames import transform, up_matrix
+from vvgt_cli.gaussians.frames import transform, upright_matrix
 from vvgt_cli.splat.rules import INRIA, Rule
 from vvgt_cli.volume import Volume
-from vvgt_cli.volume.space import shear_text
+from vvgt_cli.volume.space import shear_text, world_axis
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
 
-NONE = "none"
+AUTO, NONE = "auto", "none"
+
+
+def way_up(up: str, frame: str, space: str | None) -> str:
+    """World axis that viewers show upwards: superior for `AUTO` in the unit frame of an anatomical space, else `NONE`.
+
+    Args:
+        up: a world axis, an anatomical direction, `AUTO` or `NONE`.
+        frame: of the file: positions in "world" stay what they are beside other data, unless a turn is asked for.
+        space: of the volume, None where it is not anatomical.
+
+    Raises:
+        UsageError: an anatomical direction where the space is not.
+    """
+    if up == AUTO:
+        up = "superior" if space is not None and frame == "unit" else NONE
+    return world_axis(up, space)
 
 
 def out_of_box(gaussians: Gaussians, volume: Volume) -> Gaussians:
@@ -62,8 +78,7 @@ def remarks(volume: Volume, ply: PlyOptions) -> list[str]:
 
 def upright(volume: Volume, up: str) -> np.ndarray:
     """(3, 3): box frame to a frame with world directions in which ``up`` is +z; what previews are seen in."""
-    turn = np.eye(3) if up == NONE else up_matrix("z").T @ up_matrix(up)
-    return turn @ volume.axes
+    return upright_matrix(up) @ volume.axes
 
 
 def preview(

@@ -7,11 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vvgt_cli.cameras import Camera, orbit_views
+from vvgt_cli.cameras.boxed import boxed
 from vvgt_cli.cameras.files import read_cameras, transforms_json
 from vvgt_cli.cameras.sets import SIZE
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions, in_unit_frame, read_ply, write_ply
+from vvgt_cli.gaussians.frames import upright_matrix
 from vvgt_cli.jit.ahead import DRAW
 from vvgt_cli.pipeline.outputs import STDOUT, write_text
 from vvgt_cli.pipeline.record import ConversionReport, Run
@@ -31,7 +33,7 @@ class RenderRequest:
         ply: Gaussians, "-" for standard input.
         output: directory for the images.
         camera: view-set file, or None.
-        orbit: number of views on a circle, or None; one of the two is given.
+        orbit: number of views on a circle around the file's way up, or None; one of the two is given.
         size: image height in pixels; None: the view set's own, or what the file is made for.
         rule: of `vvgt_cli.splat.rules` to draw by; None: the file's.
         exr: write EXR too.
@@ -49,11 +51,12 @@ class RenderRequest:
     background: tuple[float, float, float] | None = None
     overwrite: bool = False
 
-    def cameras(self, size: int | None = None) -> list[Camera]:
-        """The views asked for; ``size``: pixels of an orbit's where none are."""
+    def cameras(self, size: int | None = None, up: str = "none") -> list[Camera]:
+        """The views asked for; of an orbit, ``size``: pixels where none are, ``up``: axis that it circles."""
         if self.camera is not None:
             return read_cameras(self.camera, self.size)
-        return orbit_views(self.orbit or 0, size=self.size or size or SIZE)
+        cameras = orbit_views(self.orbit or 0, size=self.size or size or SIZE)
+        return [boxed(camera, upright_matrix(up))[0] for camera in cameras]
 
 
 def file_rule(header: PlyHeader, asked: str | None = None) -> Rule:
@@ -144,7 +147,7 @@ def render_file(request: RenderRequest, console: Console | None = None) -> int:
     with run.stage("read") as stage:
         gaussians, header = open_gaussians(request.ply, console)
         stage.note = f"{len(gaussians)} Gaussians, {header.frame} frame"
-    cameras, rule = request.cameras(header.made_for), file_rule(header, request.rule)
+    cameras, rule = request.cameras(header.made_for, header.up), file_rule(header, request.rule)
     run.compile(DRAW)
     directory = Path(request.output)
     directory.mkdir(exist_ok=True)

@@ -18,11 +18,11 @@ from vvgt_cli.network.card import CARD, find_model
 from vvgt_cli.pipeline.convert import ConvertRequest, convert
 from vvgt_cli.pipeline.manifest import Manifest, Shard, digest, volume_digest
 from vvgt_cli.pipeline.outputs import check_outputs
+from vvgt_cli.pipeline.place import way_up
 from vvgt_cli.pipeline.record import ConversionReport, Run
 from vvgt_cli.pipeline.source import SourceRequest
 from vvgt_cli.progress import Console
 from vvgt_cli.volume import ReadOptions, Statistics, Volume, statistics
-from vvgt_cli.volume.space import world_axis
 
 if TYPE_CHECKING:
     from vvgt_cli.transfer import TransferFunction
@@ -266,7 +266,7 @@ def _settings(request: ConvertRequest, frames: Frames, tf: TransferFunction, dis
         **asdict(request.limits),
         "model": read_text(find_model(request.fit.model) / CARD) if request.fit.model else None,
         **{key: ply[key] for key in ("frame", "sh_degree", "comments")},
-        "up": world_axis(request.up, frames.first.space),
+        "up": way_up(request.up, request.ply.frame, frames.first.space),
         "place": [frames.first.space, *frames.first.affine[:3].ravel().tolist()],
         "outputs": [Path(p).name for p in (request.output, request.report, request.preview) if p],
     }
