@@ -30,6 +30,7 @@ def folder(tmp_path, monkeypatch):
     clear = [{**point, "opacity": 0} for point in points]
     Path("clear.json").write_text(json.dumps({"range": [0, 255], "points": clear}))
     Path("broken.json").write_text('{"range": [0, 255], "points": [')
+    Path("gaussians.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\n")
     Path("not.ply").write_bytes(b"solid cube\n")
     return tmp_path
 
@@ -53,7 +54,20 @@ CASES = {
     "tf range alone": ((*CONVERT, "--tf-range", "0,1"), 2, "--tf"),
     "unit distance": ((*CONVERT, "--opacity-unit-distance", "-1"), 2, "--opacity-unit-distance"),
     "unknown option": ((*CONVERT, "--fast"), 2, "--fast"),
-    "unknown command": (("transmogrify",), 2, "transmogrify"),
+    "unknown command": (("transmogrify",), 2, "no command 'transmogrify'; expected one of convert, init"),
+    "nearly a command": (("convrt", "v.raw"), 2, "no command 'convrt'; did you mean convert?"),
+    "nearly a command of tf": (("tf", "sugest", "v.raw"), 2, "suggest"),
+    "two dims": (
+        ("convert", "v.raw", "--dims", "8,8", "--dtype", "uint8", "-o", "out.ply"),
+        2,
+        "as --dims 256 256 128",
+    ),
+    "one end": ((*CONVERT, "--tf", "good.json", "--tf-range", "100"), 2, "two numbers LO,HI"),
+    "ply for a volume": (
+        ("init", "gaussians.ply", "-o", "out.ply"),
+        1,
+        "a .ply (Gaussians, points or a mesh); expected",
+    ),
     "no output": (("convert", "v.raw", *RAW), 2, "--output"),
     "budget": ((*CONVERT, "--max-gaussians", 0), 2, "--max-gaussians"),
     "method": ((*CONVERT, "--init", "magic"), 2, "magic"),

@@ -73,12 +73,26 @@ def test_rescale_keeps_duplicate_nodes():
     np.testing.assert_allclose(tf.opacity(np.array([0.499, 0.5])), [0, 1])
 
 
-def test_unit_nodes_on_other_data_name_the_flag():
-    with pytest.raises(DataError, match=r"in \[0, 1\], the data in \[-100, 300\]; try --tf-range rescale"):
-        resolve(function(x=(0, 0.5, 1)), DATA)
+def test_unit_nodes_on_other_data_are_stretched_and_said():
+    with pytest.warns(
+        UserWarning, match=r"in \[0, 1\], the data in \[-100, 300\]; stretched .* \(--tf-range 0,1: data"
+    ):
+        assert resolve(function(x=(0, 0.5, 1)), DATA).node_range() == (-100, 300)
+    with pytest.warns(UserWarning, match=r"the data in \[5, 6\]; stretched"):  # nothing of them in [0, 1]
+        assert resolve(function(x=(0, 0.5, 1)), statistics([5.0, 6.0])).node_range() == (5, 6)
+
+
+@pytest.mark.parametrize("values", [[0.0, 1.19], [-1.0, 1.0], [0.5, 2.4], [0.0, 2.0]])
+def test_unit_nodes_on_data_that_reach_a_little_beyond_are_data_values(values):
+    with pytest.warns(UserWarning, match=r"taken as data values \(--tf-range rescale"):
+        assert resolve(function(x=(0, 0.5, 1)), statistics(values)).node_range() == (0, 1)
+
+
+def test_unit_nodes_on_unit_data_are_data_values(recwarn):
     inside = statistics([0.2, 0.9])
     assert resolve(function(x=(0, 0.5, 1)), inside).node_range() == (0, 1)
     assert resolve(function(x=(0, 0.5, 1)), DATA, "0,1").node_range() == (0, 1)
+    assert not recwarn.list
 
 
 @pytest.mark.parametrize("spec", ["all", "1", "1,2,3", "2,1", "1,1", "nan,1", "0,inf", "", (1,)])

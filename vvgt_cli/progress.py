@@ -26,9 +26,9 @@ class Console:
     stream: TextIO = field(default_factory=lambda: sys.stderr)
 
     def say(self, line: str) -> None:
-        """Print one line."""
+        """Print one line: what separates lines in it (in the name of a file, say) becomes a blank."""
         if not self.quiet:
-            print(line, file=self.stream, flush=True)
+            print(" ".join(line.splitlines()), file=self.stream, flush=True)
 
     def stage(self, name: str, seconds: float, detail: str = "") -> None:
         """Print a stage's line: name, wall seconds, and what there is to say about it."""

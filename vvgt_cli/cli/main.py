@@ -9,11 +9,13 @@ import sys
 import traceback
 import warnings
 from collections.abc import Sequence
+from difflib import get_close_matches
 
 import click
 
 from vvgt_cli import __version__
-from vvgt_cli.errors import VvgtError
+from vvgt_cli.cli.numbers import spread
+from vvgt_cli.errors import UsageError, VvgtError
 
 COMMANDS = {
     "convert": "vvgt_cli.cli.convert",
@@ -47,6 +49,16 @@ class LazyGroup(click.Group):
         if cmd_name not in COMMANDS:
             return None
         return importlib.import_module(COMMANDS[cmd_name]).command
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        name = args[0]
+        if name not in COMMANDS and not name.startswith("-"):
+            near = get_close_matches(name, COMMANDS)
+            hint = f"did you mean {' or '.join(near)}?" if near else f"expected one of {', '.join(COMMANDS)}"
+            raise UsageError(f"no command {name!r}; {hint}")
+        return super().resolve_command(ctx, args)
 
 
 @click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
@@ -97,7 +109,7 @@ def run(args: Sequence[str] | None = None) -> int:
     """Run a command line and return its exit status; every error is one line on standard error."""
     try:
         # not cli.main: it would turn a broken pipe and an interrupt into statuses of its own
-        with cli.make_context("vvgt", list(sys.argv[1:] if args is None else args)) as context:
+        with cli.make_context("vvgt", spread(sys.argv[1:] if args is None else args)) as context:
             cli.invoke(context)
         sys.stdout.flush()
         return 0

@@ -50,7 +50,7 @@ _READ = dict(
         nargs=3,
         type=click.IntRange(1),
         metavar="X Y Z",
-        help="Voxels of a raw file, or of the grid to resample a mesh to.",
+        help="Voxels of a raw file, or of the grid to resample a mesh to; also X,Y,Z.",
     ),
     dtype=click.option("--dtype", metavar="TYPE", help="Type of a raw file's values: uint8, int16, float32, ..."),
     byte_order=click.option("--byte-order", type=click.Choice(["little", "big"]), help="Of a raw file."),
@@ -58,7 +58,7 @@ _READ = dict(
         "--header-bytes", type=click.IntRange(0), default=0, metavar="N", help="Bytes before a raw file's values."
     ),
     spacing=click.option(
-        "--spacing", nargs=3, type=float, metavar="X Y Z", help="Voxel edges, in place of the file's."
+        "--spacing", nargs=3, type=float, metavar="X Y Z", help="Voxel edges, in place of the file's; also X,Y,Z."
     ),
     array=click.option(
         "--array",
@@ -91,7 +91,8 @@ placed_read_options = group(
 
 tf_range_option = click.option(
     "--tf-range", default="data", show_default=True, metavar="data|rescale|LO,HI",
-    help="Where the function's nodes lie: at their own data values, stretched to the data's range, or to LO,HI.",
+    help="Where the function's nodes lie: at their own data values, stretched to the data's range, or to LO,HI "
+    "(LO HI).",
 )  # fmt: skip
 
 unit_distance_option = click.option(

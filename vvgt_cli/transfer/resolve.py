@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from typing import Protocol
 
 import numpy as np
@@ -10,6 +11,8 @@ import numpy as np
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.transfer.function import TransferFunction
 from vvgt_cli.volume.types import Volume
+
+ABOUT_ONE = 2.0  # span of data up to which nodes in [0, 1] are values of theirs
 
 
 class StatisticsLike(Protocol):
@@ -59,9 +62,11 @@ def resolve(
         tf_range: ``data`` takes the nodes as they are (fractions and percentiles: of the data), ``rescale``
             stretches them linearly to the data range, ``LO,HI`` to that range.
 
+    With ``data``, nodes in [0, 1] over data that are not may be meant as fractions of the range. A note says which
+    was taken: values where the data overlap [0, 1] and span no more than `ABOUT_ONE`, else as with ``rescale``.
+
     Raises:
-        DataError: all nodes in [0, 1] and the data not, with ``data``; no finite voxel; a function of one
-            position to stretch.
+        DataError: no finite voxel; a function of one position to stretch.
         UsageError: a ``tf_range`` that is none, or a range for a function of percentiles.
     """
     chosen = parse_tf_range(tf_range)
@@ -79,12 +84,15 @@ def resolve(
     if not isinstance(chosen, str):
         return tf.rescaled(*chosen)
     first, last = tf.node_range()
-    if first >= 0 and last <= 1 and (lo < 0 or hi > 1):
-        raise DataError(
-            f"{tf.name}: all nodes lie in [{first:g}, {last:g}], the data in [{lo:g}, {hi:g}]; "
-            f"try --tf-range rescale (or --tf-range {first:g},{last:g} if they are data values)"
-        )
-    return tf
+    if not (first >= 0 and last <= 1 and (lo < 0 or hi > 1)):
+        return tf
+    where = f"{tf.name}: all nodes lie in [{first:g}, {last:g}], the data in [{lo:g}, {hi:g}]"
+    if first == last or (lo <= 1 and hi >= 0 and hi / 2 - lo / 2 <= ABOUT_ONE / 2):
+        warnings.warn(f"{where}; taken as data values (--tf-range rescale stretches them to the data)", stacklevel=2)
+        return tf
+    asked = f"--tf-range {first:g},{last:g}"
+    warnings.warn(f"{where}; stretched to the data, as with --tf-range rescale ({asked}: data values)", stacklevel=2)
+    return tf.rescaled(lo, hi)
 
 
 def percentiles(statistics: StatisticsLike, fraction: np.ndarray) -> np.ndarray:

@@ -256,6 +256,11 @@ def _find(path: Path, head: bytes, options: ReadOptions) -> Reader:
         return found
     if options.dims:
         return raw.READER
+    if head.startswith((b"ply\n", b"ply\r\n")):
+        raise DataError(
+            f"{path}: a .ply (Gaussians, points or a mesh); expected the volume that it was made from (try "
+            f"'vvgt info', 'vvgt render' or 'vvgt evaluate {path.name} --volume VOLUME')"
+        )
     if named is not None and named.by_name:
         return named
     if named is not None:
