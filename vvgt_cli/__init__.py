@@ -1,8 +1,70 @@
-"""Scientific volumes to 3D Gaussian splats (VVGT)."""
+"""Scientific volumes to 3D Gaussian splats (VVGT): the library; `docs/python.md` shows it.
 
+>>> import vvgt_cli as vvgt
+>>> result = vvgt.convert("example:blob:16", max_gaussians=50, size=48, steps=0)
+>>> len(result.gaussians) <= 50
+True
+"""
+
+import importlib
 import os
+from typing import TYPE_CHECKING, Any
 
 # Read when numba is imported. With TBB a parallel region costs the more the more have run before (docs/log.md).
 os.environ.setdefault("NUMBA_THREADING_LAYER_PRIORITY", "omp tbb workqueue")
 
 __version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from vvgt_cli.cameras import Camera, default_views, orbit_views
+    from vvgt_cli.errors import DataError, UsageError, VvgtError
+    from vvgt_cli.gaussians import Gaussians, PlyHeader
+    from vvgt_cli.library.functions import convert, evaluate, optimize, read_ply, read_volume, render_views
+    from vvgt_cli.pipeline.result import Conversion, Result
+    from vvgt_cli.transfer import ColorMap, PiecewiseOpacity, TransferFunction, read_transfer_function
+    from vvgt_cli.volume import Volume
+
+_WHERE = {  # imported when asked for: `import vvgt_cli` costs nothing
+    "cameras": ("Camera", "default_views", "orbit_views"),
+    "errors": ("DataError", "UsageError", "VvgtError"),
+    "gaussians": ("Gaussians", "PlyHeader"),
+    "library.functions": ("convert", "evaluate", "optimize", "read_ply", "read_volume", "render_views"),
+    "pipeline.result": ("Conversion", "Result"),
+    "transfer": ("ColorMap", "PiecewiseOpacity", "TransferFunction", "read_transfer_function"),
+    "volume": ("Volume",),
+}
+_MODULES = {name: module for module, names in _WHERE.items() for name in names}
+
+__all__ = [
+    "Camera",
+    "ColorMap",
+    "Conversion",
+    "DataError",
+    "Gaussians",
+    "PiecewiseOpacity",
+    "PlyHeader",
+    "Result",
+    "TransferFunction",
+    "UsageError",
+    "Volume",
+    "VvgtError",
+    "convert",
+    "default_views",
+    "evaluate",
+    "optimize",
+    "orbit_views",
+    "read_ply",
+    "read_transfer_function",
+    "read_volume",
+    "render_views",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_MODULES])

@@ -65,7 +65,7 @@ def command(volume: str, shard: str | None, console: Console, **options: Any) ->
     from vvgt_cli.pipeline.series import convert_series, is_pattern
 
     request = convert_request(volume, **options)
-    if is_pattern(request.output):
+    if is_pattern(options["output"]):
         from vvgt_cli.pipeline.render_views import parse_shard
 
         convert_series(request, parse_shard(shard or "1/1"), console)

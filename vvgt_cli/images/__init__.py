@@ -2,6 +2,6 @@
 
 from vvgt_cli.images.compose import contact_sheet, over, side_by_side
 from vvgt_cli.images.exr import read_exr, write_exr
-from vvgt_cli.images.png import read_png, write_png
+from vvgt_cli.images.png import png_bytes, read_png, write_png
 
-__all__ = ["contact_sheet", "over", "read_exr", "read_png", "side_by_side", "write_exr", "write_png"]
+__all__ = ["contact_sheet", "over", "png_bytes", "read_exr", "read_png", "side_by_side", "write_exr", "write_png"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from os import PathLike
 from pathlib import Path
 
@@ -49,6 +50,14 @@ def write_png(path: str | PathLike[str], image: np.ndarray, overwrite: bool = Fa
         written = output.write_image(pixels)
         if not (output.close() and written):
             raise DataError(f"{path}: cannot be written ({output.geterror()})")
+
+
+def png_bytes(image: np.ndarray) -> bytes:
+    """An image as `write_png` writes it, in memory: what notebooks and browsers are handed."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "image.png"
+        write_png(path, image)
+        return path.read_bytes()
 
 
 def read_png(path: str | PathLike[str]) -> np.ndarray:

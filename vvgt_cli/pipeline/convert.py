@@ -8,17 +8,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vvgt_cli.cameras import default_views
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored
 from vvgt_cli.jit.ahead import CONVERT, INIT
 from vvgt_cli.network.card import find_model, read_card
 from vvgt_cli.pipeline.mend import check_view_memory, mend, wide
 from vvgt_cli.pipeline.outputs import Output, check_outputs, write_text
-from vvgt_cli.pipeline.place import AUTO, out_of_box, placed, preview, remarks, upright, way_up
+from vvgt_cli.pipeline.place import AUTO, out_of_box, placed, remarks, way_up
 from vvgt_cli.pipeline.plan import Limits, Planner, estimate, view_edge
 from vvgt_cli.pipeline.record import ConversionReport, Run
 from vvgt_cli.pipeline.render import write_gaussians
+from vvgt_cli.pipeline.result import PREVIEW_VIEWS, Conversion
 from vvgt_cli.pipeline.score import psnr_note, score_test_views
 from vvgt_cli.pipeline.seats import SIDE, from_above, score_seats
 from vvgt_cli.pipeline.source import Source, SourceRequest, load
@@ -26,13 +26,11 @@ from vvgt_cli.progress import Console
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
-    from vvgt_cli.metrics import Scores
     from vvgt_cli.vbm import Start
 
 QUICKEST = 0.5  # of the estimate, where the closed form took less: the rest then takes less too
 FAINT = 0.02  # opacity
 FEWEST = 5000  # Gaussians that a fog keeps
-PREVIEW_VIEWS = (0, 4, 9)  # test views of the preview, and of the score without a report: above, side, below
 
 
 @dataclass(frozen=True)
@@ -64,7 +62,7 @@ class ConvertRequest:
 
     Attributes:
         source: what to read.
-        output: `.ply` to write, "-" for standard output.
+        output: `.ply` to write, "-" for standard output, None for none.
         fit: what the Gaussians are made for.
         limits: error, time and size that decide what is done.
         dry_run: plan, and write nothing.
@@ -73,10 +71,11 @@ class ConvertRequest:
         report: JSON to write, "-" for standard output, None for none.
         preview: PNG to write (reference, ours, difference of a few test views), None for none.
         overwrite: replace files that exist.
+        all_views: score on all ten test views, by SSIM and FLIP too, as a report has it.
     """
 
     source: SourceRequest
-    output: str
+    output: str | None = None
     fit: FitOptions = field(default_factory=FitOptions)
     limits: Limits = field(default_factory=Limits)
     dry_run: bool = False
@@ -85,10 +84,24 @@ class ConvertRequest:
     report: str | None = None
     preview: str | None = None
     overwrite: bool = False
+    all_views: bool = False
+
+    def budget(self) -> int:
+        """Gaussians that fit.
+
+        Raises:
+            UsageError: not one does.
+        """
+        return self.limits.gaussians(self.fit.max_gaussians, self.ply.sh_degree)
+
+    @property
+    def scored_whole(self) -> bool:
+        """Whether on all ten test views."""
+        return self.all_views or self.report is not None
 
     def outputs(self) -> list[Output]:
         """Everything that will be written."""
-        outputs = [Output("-o", self.output, (".ply",))]
+        outputs = [Output("-o", self.output, (".ply",))] if self.output else []
         if self.report:
             outputs.append(Output("--report", self.report, (".json",), binary=False))
         if self.preview:
@@ -97,44 +110,32 @@ class ConvertRequest:
 
 
 def convert(request: ConvertRequest, console: Console | None = None) -> ConversionReport:
-    """Volume to `.ply`: closed form, what the training views can mend, gradient descent; scored on the test views.
-
-    What of these is done, and with how many Gaussians, follows from the request's limits and what the stages cost
-    (`pipeline.plan`); the check views decide. What is left out is said, and costs nothing.
+    """Volume to `.ply`: `made`, and its outputs written.
 
     Raises:
         UsageError: an output that may not be written; found before anything is read.
         DataError: input that is not what it must be, or a scene that shows nothing.
     """
+    request.budget()
     run = Run(console or Console(), ConversionReport("convert"))
-    budget = request.limits.gaussians(request.fit.max_gaussians, request.ply.sh_degree)
-    fit = replace(request.fit, max_gaussians=budget)
-    if fit.model is not None:
-        read_card(find_model(fit.model))  # fails before the work, not after
-    source, scene = _begin(run, request)
-    costs = estimate(scene, fit.size, fit.max_gaussians, request.report is not None)
-    sparse = fit.max_gaussians <= view_edge(fit.size, half=False) ** 2  # a guess, until the Gaussians are there
-    planner = Planner(request.limits, fit.max_gaussians, fit.steps, request.ply.sh_degree, fit.size, sparse, fit.model)
-    plan = planner.plan(costs, run.elapsed())
-    run.report.plan = plan.record()
-    check_view_memory(plan, fit.size)
-    if request.dry_run:
-        return run.finish()
-    start = _closed_form(run, scene, fit)
-    planner = replace(planner, wide=wide(start.gaussians, fit.size))
-    plan = planner.plan(
-        costs.at(max(run.report.stages[-1].seconds / costs.closed_form, QUICKEST)), run.elapsed(), begun=True
-    )
-    check_view_memory(plan, fit.size)
-    gaussians = as_stored(mend(run, scene, start, plan, request.limits, fit))  # what is scored is what the file holds
-    scores, sheet = _score(run, request, source, scene, gaussians)
-    run.report.scores = asdict(scores)
-    if request.preview and sheet is None:
-        with run.stage("preview"):
-            axes = upright(source.volume, _ply(request, source).up)
-            views = default_views("test", size=fit.size)
-            sheet = preview(scene, gaussians, [views[n] for n in PREVIEW_VIEWS], axes, fit.rule)
-    return _finish(run, request, source, gaussians, sheet)
+    check_outputs(request.outputs(), request.source.paths(), request.overwrite)
+    conversion = made(run, request)
+    return run.finish() if conversion is None else _write(run, request, conversion)
+
+
+def in_memory(
+    source: SourceRequest, fit: FitOptions, limits: Limits, all_views: bool = False, console: Console | None = None
+) -> Conversion:
+    """A conversion of which nothing is written.
+
+    Raises:
+        DataError, UsageError: as `convert`.
+    """
+    run = Run(console or Console(), ConversionReport("convert"))
+    conversion = made(run, ConvertRequest(source, None, fit, limits, all_views=all_views))
+    assert conversion is not None  # None is of dry runs
+    run.finish()
+    return conversion
 
 
 def initialise_only(request: ConvertRequest, console: Console | None = None) -> ConversionReport:
@@ -144,14 +145,53 @@ def initialise_only(request: ConvertRequest, console: Console | None = None) -> 
         UsageError, DataError: as `convert`.
     """
     run = Run(console or Console(), ConversionReport("init"))
+    check_outputs(request.outputs(), request.source.paths(), request.overwrite)
     source, scene = _begin(run, request)
     start = _closed_form(run, scene, request.fit)
-    return _finish(run, request, source, as_stored(start.gaussians))
+    return _write(run, request, _conversion(run, request, source, scene, as_stored(start.gaussians)))
+
+
+def made(run: Run, request: ConvertRequest) -> Conversion | None:
+    """Closed form, what the training views can mend, gradient descent; scored on the test views. Nothing is written.
+
+    What of these is done, and with how many Gaussians, follows from the request's limits and what the stages cost
+    (`pipeline.plan`); the check views decide. What is left out is said, and costs nothing.
+
+    Returns:
+        The conversion; None of a dry run, whose plan the run's report holds.
+
+    Raises:
+        DataError, UsageError: as `convert`.
+    """
+    fit = replace(request.fit, max_gaussians=request.budget())
+    if fit.model is not None:
+        read_card(find_model(fit.model))  # fails before the work, not after
+    source, scene = _begin(run, request)
+    costs = estimate(scene, fit.size, fit.max_gaussians, request.scored_whole)
+    sparse = fit.max_gaussians <= view_edge(fit.size, half=False) ** 2  # a guess, until the Gaussians are there
+    planner = Planner(request.limits, fit.max_gaussians, fit.steps, request.ply.sh_degree, fit.size, sparse, fit.model)
+    plan = planner.plan(costs, run.elapsed())
+    run.report.plan = plan.record()
+    check_view_memory(plan, fit.size)
+    if request.dry_run:
+        return None
+    start = _closed_form(run, scene, fit)
+    planner = replace(planner, wide=wide(start.gaussians, fit.size))
+    plan = planner.plan(
+        costs.at(max(run.report.stages[-1].seconds / costs.closed_form, QUICKEST)), run.elapsed(), begun=True
+    )
+    check_view_memory(plan, fit.size)
+    gaussians = as_stored(mend(run, scene, start, plan, request.limits, fit))  # what is scored is what the file holds
+    _score(run, request, scene, gaussians)
+    return _conversion(run, request, source, scene, gaussians)
+
+
+def _conversion(run: Run, request: ConvertRequest, source: Source, scene: Scene, gaussians: Gaussians) -> Conversion:
+    return Conversion(out_of_box(gaussians, source.volume), run.report, _ply(request, source), source, scene)
 
 
 def _begin(run: Run, request: ConvertRequest) -> tuple[Source, Scene]:
-    """Check the outputs, read, and lay the volume out for the kernels."""
-    check_outputs(request.outputs(), [request.source.volume, request.source.tf], request.overwrite)
+    """Read, and lay the volume out for the kernels."""
     with run.stage("read") as stage:
         source = load(request.source)
         stage.note = describe_source(source)
@@ -251,48 +291,44 @@ def thinned(start: Start) -> tuple[Start, int]:
     return start, before - len(start.gaussians)
 
 
-def _score(
-    run: Run, request: ConvertRequest, source: Source, scene: Scene, gaussians: Gaussians
-) -> tuple[Scores, np.ndarray | None]:
-    """Scores on the test views, and the preview's sheet where one is asked for and these views are the right way up."""
+def _score(run: Run, request: ConvertRequest, scene: Scene, gaussians: Gaussians) -> None:
+    """Scores on the test views, and from the seats."""
     from vvgt_cli.dvr import RenderSettings
 
-    straight = np.array_equal(upright(source.volume, _ply(request, source).up), np.eye(3))
+    fit, whole = request.fit, request.scored_whole
     with run.stage("test views") as stage:
-        scores, sheet = score_test_views(
+        scores = score_test_views(
             scene,
             gaussians,
-            request.fit.size,
+            fit.size,
             RenderSettings(),
-            rule=request.fit.rule,
-            perceptual=request.report is not None,
-            keep=PREVIEW_VIEWS if request.preview and straight else (),
-            only=None if request.report else PREVIEW_VIEWS,
+            rule=fit.rule,
+            perceptual=whole,
+            only=None if whole else PREVIEW_VIEWS,
             progress=run.console.bar("test views"),
         )
-        stage.note = f"{psnr_note(scores)}, {scores.views} views of {request.fit.size} px"
+        run.report.scores = asdict(scores)
+        stage.note = f"{psnr_note(scores)}, {scores.views} views of {fit.size} px"
     budget = request.limits.time_budget
     if budget is not None and run.elapsed() > budget:
         run.leave_out("seats", "time is up")
-        return scores, sheet
+        return
     with run.stage("seats") as stage:
-        seats = score_seats(scene, gaussians, from_above(request.fit.size), views=SIDE)
+        seats = score_seats(scene, gaussians, from_above(fit.size), views=SIDE)
         run.report.seats = [asdict(seat) for seat in seats]
         stage.note = f"worst of {len(seats)}: {seats[0].name()}, {seats[0].psnr:.2f} dB"
-    return scores, sheet
 
 
-def _finish(
-    run: Run, request: ConvertRequest, source: Source, gaussians: Gaussians, sheet: np.ndarray | None = None
-) -> ConversionReport:
-    """Write the file, then the preview and the report."""
+def _write(run: Run, request: ConvertRequest, conversion: Conversion) -> ConversionReport:
+    """Write the file, the preview and the report."""
     from vvgt_cli.images import write_png
 
     report = run.report
-    out = out_of_box(gaussians, source.volume)
-    write_gaussians(run, request.output, out, _ply(request, source), request.overwrite)
-    if request.preview and sheet is not None:
-        write_png(request.preview, sheet, request.overwrite)
+    assert request.output is not None
+    write_gaussians(run, request.output, conversion.gaussians, conversion.ply, request.overwrite)
+    if request.preview:
+        with run.stage("preview"):
+            write_png(request.preview, conversion.preview(), request.overwrite)
     run.finish()
     if request.report:
         write_text(request.report, report.to_json(), request.overwrite)

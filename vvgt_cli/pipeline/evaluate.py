@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
@@ -34,7 +34,7 @@ class EvaluateRequest:
     """What to score.
 
     Attributes:
-        ply: Gaussians, "-" for standard input.
+        ply: Gaussians, "-" for standard input, or a stream of them.
         source: the volume and the function that they were made from.
         size: pixels along an image's edge; None: what the file is made for.
         rule: of `vvgt_cli.splat.rules` to draw by; None: the file's.
@@ -44,7 +44,7 @@ class EvaluateRequest:
         overwrite: replace it if it exists.
     """
 
-    ply: str
+    ply: str | BinaryIO
     source: SourceRequest
     size: int | None = None
     rule: str | None = None
@@ -52,6 +52,10 @@ class EvaluateRequest:
     seats: bool = True
     preview: str | None = None
     overwrite: bool = False
+
+    def inputs(self) -> list[str]:
+        """Files that are read."""
+        return [*self.source.paths(), *([self.ply] if isinstance(self.ply, str) else [])]
 
 
 @dataclass
@@ -117,7 +121,7 @@ def evaluate(request: EvaluateRequest, console: Console | None = None) -> Evalua
         raise UsageError("both OUT.ply and --volume are '-': standard input holds one of them")
     run = Run(console or Console(), ConversionReport("evaluate"))
     if request.preview:
-        check_outputs([Output("--preview", request.preview, (".png",))], [request.ply], request.overwrite)
+        check_outputs([Output("--preview", request.preview, (".png",))], request.inputs(), request.overwrite)
     with run.stage("read") as stage:
         gaussians, header = open_gaussians(request.ply, run.console)
         source = _load(request.source, header)
@@ -139,7 +143,7 @@ def evaluate(request: EvaluateRequest, console: Console | None = None) -> Evalua
     with run.stage("test views") as stage:
         settings = replace(REFERENCE, step=request.step)
         bar = run.console.bar("test views")
-        scores, _ = score_test_views(scene, gaussians, size, settings, rule=rule, progress=bar)
+        scores = score_test_views(scene, gaussians, size, settings, rule=rule, progress=bar)
         evaluation.scores = asdict(scores)
         stage.note = f"{psnr_note(scores)}, {size} px"
     if request.preview:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from vvgt_cli.optimize import OptimizeOptions, OptimizeRecord, optimize
 from vvgt_cli.pipeline.outputs import Output, check_outputs, write_text
 from vvgt_cli.pipeline.record import ConversionReport, Run
 from vvgt_cli.pipeline.render import file_rule, layout_of, open_gaussians, write_gaussians
+from vvgt_cli.pipeline.result import Result
 from vvgt_cli.pipeline.score import psnr_note
 from vvgt_cli.progress import Console
 from vvgt_cli.splat.rules import INRIA, Rule
@@ -67,9 +68,9 @@ class OptimizeRequest:
     """A whole refinement.
 
     Attributes:
-        ply: Gaussians to start from, "-" for standard input.
+        ply: Gaussians to start from, "-" for standard input, or a stream of them.
         views: folder that `render-views` wrote.
-        output: `.ply` to write, "-" for standard output.
+        output: `.ply` to write, "-" for standard output, None for none.
         options: how to descend, and when to stop.
         size: pixels along the edge of the screen that the file is made for; None: the file's, or the views'.
         rule: of `vvgt_cli.splat.rules` to fit to; None: the file's, or inria.
@@ -77,9 +78,9 @@ class OptimizeRequest:
         overwrite: replace files that exist.
     """
 
-    ply: str
+    ply: str | BinaryIO
     views: str
-    output: str
+    output: str | None
     options: OptimizeOptions
     size: int | None = None
     rule: str | None = None
@@ -89,7 +90,11 @@ class OptimizeRequest:
     def outputs(self) -> list[Output]:
         """Everything that will be written."""
         report = [Output("--report", self.report, (".json",), binary=False)] if self.report else []
-        return [Output("-o", self.output, (".ply",)), *report]
+        return [*([Output("-o", self.output, (".ply",))] if self.output else []), *report]
+
+    def inputs(self) -> list[str]:
+        """Files that are read."""
+        return [self.ply] if isinstance(self.ply, str) else []
 
 
 def optimize_file(request: OptimizeRequest, console: Console | None = None) -> ConversionReport:
@@ -100,9 +105,24 @@ def optimize_file(request: OptimizeRequest, console: Console | None = None) -> C
         DataError: a `.ply` or a folder of views that is not one.
     """
     run = Run(console or Console(), ConversionReport("optimize"))
-    check_outputs(request.outputs(), [request.ply], request.overwrite)
+    check_outputs(request.outputs(), request.inputs(), request.overwrite)
     if request.options.checkpoint:
-        check_outputs([Output("--checkpoint", request.options.checkpoint, (".npz",))], [request.ply], True)
+        check_outputs([Output("--checkpoint", request.options.checkpoint, (".npz",))], request.inputs(), True)
+    result = optimized(run, request)
+    assert request.output is not None
+    write_gaussians(run, request.output, result.gaussians, result.ply, request.overwrite)
+    run.finish()
+    if request.report:
+        write_text(request.report, run.report.to_json(), request.overwrite)
+    return run.report
+
+
+def optimized(run: Run, request: OptimizeRequest) -> Result:
+    """The refinement, with nothing written but its checkpoint.
+
+    Raises:
+        DataError: a `.ply` or a folder of views that is not one.
+    """
     with run.stage("read") as stage:
         start, header = open_gaussians(request.ply, run.console)
         stage.note = f"{len(start)} Gaussians, {header.frame} frame"
@@ -119,12 +139,7 @@ def optimize_file(request: OptimizeRequest, console: Console | None = None) -> C
     gaussians = refine(run, start, train, check, options)
     if test is not None:
         _score(run, test, start, gaussians, rule)
-    layout = replace(layout_of(header), made_for=size, rule=asked.name)
-    write_gaussians(run, request.output, gaussians, layout, request.overwrite)
-    run.finish()
-    if request.report:
-        write_text(request.report, run.report.to_json(), request.overwrite)
-    return run.report
+    return Result(gaussians, run.report, replace(layout_of(header), made_for=size, rule=asked.name))
 
 
 def load_sets(folder: str) -> tuple[Views, Views, str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 from vvgt_cli.cameras import Camera, orbit_views
 from vvgt_cli.cameras.boxed import boxed
@@ -68,8 +69,8 @@ def file_rule(header: PlyHeader, asked: str | None = None) -> Rule:
     return rule_of(asked or header.rule or INRIA)
 
 
-def open_gaussians(source: str, console: Console) -> tuple[Gaussians, PlyHeader]:
-    """Read a `.ply` (or standard input) into the unit frame, and say what was left out.
+def open_gaussians(source: str | BinaryIO, console: Console) -> tuple[Gaussians, PlyHeader]:
+    """Read a `.ply` (a path, "-" for standard input, or a stream) into the unit frame, and say what was left out.
 
     Raises:
         DataError: not a 3DGS `.ply`, or one without Gaussians.

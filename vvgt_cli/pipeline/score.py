@@ -29,10 +29,9 @@ def score_test_views(
     *,
     rule: str | Rule = INRIA,
     perceptual: bool = True,
-    keep: Collection[int] = (),
     only: Collection[int] | None = None,
     progress: ProgressCallback | None = None,
-) -> tuple[Scores, np.ndarray | None]:
+) -> Scores:
     """Scores on the test views at ``size`` px (docs/conventions.md, "Units of a report").
 
     Args:
@@ -41,34 +40,26 @@ def score_test_views(
         settings: of the reference.
         rule: by which Gaussians are drawn.
         perceptual: SSIM and FLIP too, of the whole of `WHOLE` views; all else of blocks where views are large.
-        keep: numbers of views to draw.
         only: numbers of the views to score; None for all ten.
         progress: called after each view.
-
-    Returns:
-        (scores, sheet): a row a kept view, reference, ours and 8 x their difference, (h, w, 3) float32 in
-        [0, 1]; None where none is kept.
     """
     from vvgt_cli.dvr import render_view
-    from vvgt_cli.images import side_by_side
     from vvgt_cli.metrics import mean_scores
     from vvgt_cli.splat import render
 
     cameras = default_views("test", size=size)
     numbers = sorted(range(len(cameras)) if only is None else only)
-    views, rows = [], []
+    views = []
     for done, i in enumerate(numbers):
         camera = cameras[i]
         blocks = spread_blocks(camera.width, camera.height, i)
-        whole = blocks is None or i in keep or (perceptual and i in WHOLE)
+        whole = blocks is None or (perceptual and i in WHOLE)
         part = None if whole else blocks
         reference, ours = render_view(scene, camera, settings, part), render(gaussians, camera, rule, blocks=part)
         views.append(score_seen(reference, ours, blocks, whole, perceptual))
-        if i in keep:
-            rows.append(side_by_side(reference, ours))
         if progress:
             progress(done + 1, len(numbers))
-    return mean_scores(views), np.concatenate(rows) if rows else None
+    return mean_scores(views)
 
 
 def score_seen(

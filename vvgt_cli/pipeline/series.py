@@ -200,7 +200,7 @@ def _function(source: SourceRequest, frames: Frames) -> tuple[TransferFunction, 
     from vvgt_cli.transfer import from_histogram, read_transfer_function, resolve, unit_distance
     from vvgt_cli.transfer.resolve import parse_tf_range
 
-    read = read_transfer_function(source.tf) if source.tf else None
+    read = read_transfer_function(source.tf) if isinstance(source.tf, str) else source.tf
     distance = unit_distance(source.unit_distance, frames.first, read)
     if read is None:
         return from_histogram(frames.whole), distance
@@ -212,15 +212,15 @@ def _steps(source: SourceRequest) -> list[Step]:
     from vvgt_cli.volume.registry import time_steps
     from vvgt_cli.volume.slices import matching
 
-    files = [] if os.path.exists(source.volume) else matching(source.volume)
-    if not files and set(source.volume) & set("*?[") and not os.path.exists(source.volume):
+    files = [] if os.path.exists(source.path) else matching(source.path)
+    if not files and set(source.path) & set("*?[") and not os.path.exists(source.path):
         raise UsageError(
-            f"{source.volume}: no such files; with a number in -o expected the frames of a series, as 'run_*.vti', or "
+            f"{source.path}: no such files; with a number in -o expected the frames of a series, as 'run_*.vti', or "
             "a file of several time steps"
         )
     if len(files) > 1:
         return [Step(file.name, str(file), source.read) for file in files]
-    volume = str(files[0]) if files else source.volume
+    volume = str(files[0]) if files else source.path
     name = Path(volume).name
     count = time_steps(volume, source.read)
     if count == 1:
@@ -233,7 +233,7 @@ def _outputs(request: ConvertRequest, count: int) -> list[list[str]]:
     patterns = {"-o": request.output, "--report": request.report, "--preview": request.preview}
     columns = [frame_names(option, pattern, count) for option, pattern in patterns.items() if pattern is not None]
     rows = [list(row) for row in zip(*columns, strict=True)]
-    check_outputs(_frame(request, request.source, rows[0]).outputs(), [request.source.tf], overwrite=True)
+    check_outputs(_frame(request, request.source, rows[0]).outputs(), request.source.paths()[1:], overwrite=True)
     folders = {str(Path(name).parent) for name in rows[0]}
     if len(folders) > 1:
         raise UsageError(f"the frames, reports and previews of a series go to one folder; got {', '.join(folders)}")

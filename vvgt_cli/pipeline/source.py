@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from vvgt_cli.errors import UsageError
 from vvgt_cli.volume import ReadOptions, Statistics, Volume
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
+    from vvgt_cli.transfer import TransferFunction
 
 
 @dataclass(frozen=True)
@@ -18,20 +19,35 @@ class SourceRequest:
     """What to read.
 
     Attributes:
-        volume: path, `example:NAME`, or "-" for raw values on standard input.
+        volume: path, `example:NAME`, or "-" for raw values on standard input; or a volume that is there already.
         read: how to read it.
-        tf: transfer-function file or colour-map name; None makes one from the histogram.
+        tf: transfer-function file or colour-map name, or a function; None makes one from the histogram.
         tf_range: "data", "rescale" or "LO,HI".
         unit_distance: a length, "paraview", "mean-spacing", or None: the function's own, else "paraview".
         statistics: what the function's nodes follow from in place of the volume's own: those of the whole series.
     """
 
-    volume: str
+    volume: str | Volume
     read: ReadOptions = field(default_factory=ReadOptions)
-    tf: str | None = None
+    tf: str | TransferFunction | None = None
     tf_range: str = "data"
     unit_distance: str | None = None
     statistics: Statistics | None = None
+
+    @property
+    def path(self) -> str:
+        """Of the volume's file.
+
+        Raises:
+            UsageError: a volume that is there already.
+        """
+        if not isinstance(self.volume, str):
+            raise UsageError(f"{self.volume.name}: a volume in memory; expected a path here")
+        return self.volume
+
+    def paths(self) -> list[str]:
+        """What of it is read from files."""
+        return [given for given in (self.volume, self.tf) if isinstance(given, str)]
 
 
 @dataclass(frozen=True)
@@ -43,7 +59,7 @@ class Source:
 
     volume: Volume
     statistics: Statistics
-    tf: Any  # vvgt_cli.transfer.TransferFunction
+    tf: TransferFunction
     unit_distance: float
     unit_label: str
 
@@ -71,7 +87,7 @@ def load(request: SourceRequest) -> Source:
     return load_all(request, (request.tf,))[0]
 
 
-def load_all(request: SourceRequest, tfs: Sequence[str | None]) -> list[Source]:
+def load_all(request: SourceRequest, tfs: Sequence[str | TransferFunction | None]) -> list[Source]:
     """One volume under each of several functions; ``request.tf`` is not used.
 
     Raises:
@@ -83,10 +99,12 @@ def load_all(request: SourceRequest, tfs: Sequence[str | None]) -> list[Source]:
     from vvgt_cli.volume import statistics
 
     tf_range = parse_tf_range(request.tf_range)
-    functions = [read_transfer_function(tf) if tf else None for tf in tfs]  # small: their errors come first
+    functions = [
+        read_transfer_function(tf) if isinstance(tf, str) else tf for tf in tfs
+    ]  # small: their errors come first
     if None in functions and tf_range != "data":
         raise UsageError("--tf-range says where the nodes of a function lie; it needs --tf")
-    volume = open_volume(request.volume, request.read)
+    volume = open_volume(request.volume, request.read) if isinstance(request.volume, str) else request.volume
     distances = [unit_distance(request.unit_distance, volume, tf) for tf in functions]
     numbers = statistics(volume)
     sources = []

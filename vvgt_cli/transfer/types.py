@@ -10,7 +10,10 @@ import numpy as np
 class TransferFunctionLike(Protocol):
     """What the optics need of a transfer function; `TransferFunction` is the one implementation."""
 
-    name: str
+    @property
+    def name(self) -> str:
+        """For reports."""
+        ...
 
     def opacity(self, x: np.ndarray) -> np.ndarray:
         """Opacity in [0, 1] per unit distance at data values x (n,), float64 -> (n,)."""

@@ -126,20 +126,37 @@ def _sampled(make: Callable[[], Any], path: Path, options: ReadOptions) -> Volum
         error = message()
     if error or reader.GetErrorCode() or mesh is None:
         raise DataError(f"{path}: VTK cannot read it ({error or 'no message'}); is the file whole?")
+    return dataset_volume(mesh, options, str(path), volume_name(path))
+
+
+def dataset_volume(mesh: Any, options: ReadOptions, source: str, name: str) -> Volume:
+    """A vtkDataSet in memory: an image as it is, any other grid or mesh of cells resampled.
+
+    Args:
+        mesh: vtkDataSet (pyvista's are).
+        options: ``array``, ``component``, ``spacing``, and ``dims`` of what is resampled.
+        source: for messages; ``name``: of the volume.
+
+    Raises:
+        DataError: a surface, or damaged cells.
+        UsageError: a choice of array or component that is missing or does not exist.
+    """
     if not mesh.IsA("vtkDataSet"):
-        raise DataError(f"{path}: a {mesh.GetClassName()}; expected one image, grid or mesh of cells")
+        raise DataError(f"{source}: a {mesh.GetClassName()}; expected one image, grid or mesh of cells")
     if mesh.IsA("vtkPolyData"):
-        raise DataError(f"{path}: a surface (vtkPolyData); expected cells that fill a volume")
+        raise DataError(f"{source}: a surface (vtkPolyData); expected cells that fill a volume")
     infos = _arrays(mesh)
-    info = infos[choose_array(infos, options.array, str(path))]
+    info = infos[choose_array(infos, options.array, source)]
     if mesh.IsA("vtkImageData"):
-        return _image(mesh, info, path, options)
+        return _image(mesh, info, options, source, name)
     if options.spacing is not None:
-        raise UsageError(f"{path}: its points say where values are; leave out --spacing (--dims says how many to take)")
-    _check_cells(mesh, path)
+        raise UsageError(
+            f"{source}: its points say where values are; leave out --spacing (--dims says how many to take)"
+        )
+    _check_cells(mesh, source)
     values = _values(mesh, info).reshape(1, 1, -1, info.components)
-    field, _ = select_component(values, options.component, str(path), label=f"array {info.name!r}")
-    return resample(mesh, field.ravel(), info.where, options.dims, str(path), volume_name(path))
+    field, _ = select_component(values, options.component, source, label=f"array {info.name!r}")
+    return resample(mesh, field.ravel(), info.where, options.dims, source, name)
 
 
 def _values(mesh: Any, info: ArrayInfo) -> np.ndarray:
@@ -168,7 +185,7 @@ def _arrays(mesh: Any) -> list[ArrayInfo]:
     return found
 
 
-def _check_cells(mesh: Any, path: Path) -> None:
+def _check_cells(mesh: Any, source: str) -> None:
     """Refuse cells that name points which are not there: VTK would read beyond the array."""
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
@@ -179,13 +196,13 @@ def _check_cells(mesh: Any, path: Path) -> None:
     offsets = vtk_to_numpy(cells.GetOffsetsArray())
     fits = ids.size and ids.min() >= 0 and ids.max() < mesh.GetNumberOfPoints()
     if not fits or offsets[0] != 0 or offsets[-1] > ids.size or (np.diff(offsets) < 0).any():
-        raise DataError(f"{path}: its cells name points that do not exist; check that the file is whole")
+        raise DataError(f"{source}: its cells name points that do not exist; check that the file is whole")
 
 
-def _image(image: Any, info: ArrayInfo, path: Path, options: ReadOptions) -> Volume:
+def _image(image: Any, info: ArrayInfo, options: ReadOptions, source: str, name: str) -> Volume:
     """A vtkImageData as it is: point data, or cell data on the grid of cell centres."""
     if options.dims is not None:
-        raise UsageError(f"{path}: an image, which is a regular grid already; leave out --dims")
+        raise UsageError(f"{source}: an image, which is a regular grid already; leave out --dims")
     low = np.array(image.GetExtent()[::2], float)
     dims, spacing = np.array(image.GetDimensions()), np.array(image.GetSpacing())
     if info.where == "cell":
@@ -194,9 +211,9 @@ def _image(image: Any, info: ArrayInfo, path: Path, options: ReadOptions) -> Vol
     direction = np.array([[matrix.GetElement(r, c) for c in range(3)] for r in range(3)])
     origin = np.array(image.GetOrigin()) + direction @ (low * spacing)
     values = _values(image, info).reshape(*dims[::-1], info.components)
-    field, _ = select_component(values, options.component, str(path), label=f"array {info.name!r}")
+    field, _ = select_component(values, options.component, source, label=f"array {info.name!r}")
     lengths, turned = unit_rows((direction * spacing).T.tolist())
-    return Volume(field, options.spacing_or(lengths), tuple(origin.tolist()), turned, volume_name(path))  # type: ignore[arg-type]
+    return Volume(field, options.spacing_or(lengths), tuple(origin.tolist()), turned, name)  # type: ignore[arg-type]
 
 
 def _is_vtkhdf(head: bytes) -> bool:

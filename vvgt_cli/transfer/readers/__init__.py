@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.transfer.function import TransferFunction
@@ -16,13 +19,13 @@ SUFFIXES = (".json", ".xml", ".itf", ".vp")
 __all__ = ["read_transfer_function"]
 
 
-def read_transfer_function(source: str) -> TransferFunction:
+def read_transfer_function(source: str | os.PathLike[str] | Mapping[str, Any]) -> TransferFunction:
     """Read a transfer function; the format of a file is told by its content.
 
     Args:
         source: path of a file (``presets.json#Name`` picks one of several functions; the modules of this room say of
             which formats), or a matplotlib colour-map name with an opacity ramp, ``NAME[:LO,HI[:MAX]]``
-            (`vvgt_cli.transfer.readers.colormap_name`).
+            (`vvgt_cli.transfer.readers.colormap_name`); or what such a JSON file holds, parsed.
 
     Returns:
         The function; `vvgt_cli.transfer.resolve.resolve` puts it on the data.
@@ -31,6 +34,9 @@ def read_transfer_function(source: str) -> TransferFunction:
         DataError: the file is not a transfer function, or a faulty one.
         UsageError: neither a file nor a colour-map name.
     """
+    if isinstance(source, Mapping):
+        return _read(dict(source), "transfer function", "")
+    source = os.fspath(source)
     if not source.strip():
         raise UsageError("an empty name; expected a transfer-function file or a colour-map name")
     path, pick = Path(source), ""
@@ -43,11 +49,15 @@ def read_transfer_function(source: str) -> TransferFunction:
         if pick or "/" in source or "\\" in source or Path(source).suffix.lower() in SUFFIXES:
             raise UsageError(f"{path}: no such file; expected a transfer function ({', '.join(SUFFIXES)})")
         return colormap_name.read(source)
-    parsed = load(path)
+    return _read(load(path), str(path), pick)
+
+
+def _read(parsed: Any, what: str, pick: str) -> TransferFunction:
+    """The function of a parsed file, by the first format that matches."""
     for reader in FORMATS:
         if reader.matches(parsed):
-            return reader.read(parsed, str(path), pick)
+            return reader.read(parsed, what, pick)
     raise DataError(
-        f"{path}: not a transfer function; expected a preset of ParaView or vtk.js (RGBPoints), an object with points, "
+        f"{what}: not a transfer function; expected a preset of ParaView or vtk.js (RGBPoints), an object with points, "
         "a volume property of 3D Slicer, XML of ParaView (ColorMap) or of Inviwo (Points)"
     )

@@ -1,0 +1,188 @@
+"""The library: the same as the commands, for files and for what is in memory."""
+
+from __future__ import annotations
+
+import doctest
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import nibabel
+import numpy as np
+import pytest
+import pyvista
+import xarray
+
+import vvgt_cli as vvgt
+from vvgt_cli.library import functions
+
+ROOT = Path(__file__).parent.parent
+TF = {
+    "points": [
+        {"x": 0.2, "opacity": 0, "rgb": [0.2, 0.3, 0.9]},
+        {"x": 0.6, "opacity": 0.4, "rgb": [0.9, 0.8, 0.2]},
+        {"x": 1, "opacity": 0.1, "rgb": [1, 0.2, 0.1]},
+    ],
+    "opacity_unit_distance": 1.5,
+}
+SPACING = (1.0, 1.5, 2.0)
+HOW = {"max_gaussians": 300, "size": 48, "steps": 6}
+
+
+@pytest.fixture(scope="module")
+def field() -> np.ndarray:
+    """(12, 16, 20) float32: a lump with a hollow, that no axis is like another in."""
+    z, y, x = np.meshgrid(*(np.linspace(-1, 1, n) for n in (12, 16, 20)), indexing="ij")
+    return (np.exp(-3 * (x**2 + (y - 0.2) ** 2 + 2 * z**2)) * (1 - 0.5 * np.exp(-20 * (x - 0.3) ** 2))).astype("f4")
+
+
+@pytest.fixture(scope="module")
+def converted(field) -> vvgt.Conversion:
+    return vvgt.convert(field, TF, spacing=SPACING, **HOW)
+
+
+def saved(result: vvgt.Result, path: Path) -> bytes:
+    result.save(path)
+    return path.read_bytes()
+
+
+def test_commands_and_library_leave_the_same_bytes(field, converted, tmp_path):
+    from vvgt_cli.cli.main import run
+
+    field.tofile(tmp_path / "a.raw")
+    (tmp_path / "tf.json").write_text(json.dumps(TF))
+    read = ("--dims", "20", "16", "12", "--dtype", "float32", "--spacing", *map(str, SPACING))
+    how = ("--max-gaussians", "300", "--size", "48", "--steps", "6", "--tf", str(tmp_path / "tf.json"), "-q")
+    assert run(["convert", str(tmp_path / "a.raw"), *read, *how, "-o", str(tmp_path / "a.ply")]) == 0
+    written = (tmp_path / "a.ply").read_bytes()
+    assert saved(converted, tmp_path / "b.ply") == written
+    path = vvgt.convert(tmp_path / "a.raw", tmp_path / "tf.json", dims=(20, 16, 12), dtype="float32", spacing=SPACING,
+                        **HOW)  # fmt: skip
+    assert saved(path, tmp_path / "c.ply") == written
+    header = written[: written.index(b"end_header")].decode()
+    world = saved_world(converted, tmp_path / "w.ply")
+    assert "frame world" in world
+    assert "frame unit" in header
+
+
+def saved_world(result: vvgt.Result, path: Path) -> str:
+    result.save(path, frame="world")
+    return path.read_bytes().split(b"end_header")[0].decode()
+
+
+def test_what_is_in_memory_is_read_alike(field, converted, tmp_path):
+    grid = pyvista.ImageData(dimensions=field.shape[::-1], spacing=SPACING)
+    grid["values"] = field.ravel()
+    x, y, z = (np.arange(n) * step for n, step in zip(field.shape[::-1], SPACING, strict=True))
+    labelled = xarray.DataArray(field, dims=("z", "y", "x"), coords={"x": x, "y": y, "z": z}, name="values")
+    affine = np.diag([*SPACING, 1.0])
+    wanted = saved(converted, tmp_path / "array.ply")
+    inputs = {"image": (grid, {}), "labelled": (labelled, {}), "affine": (field, {"affine": affine})}
+    inputs["turned"] = (labelled.transpose("x", "z", "y")[::-1], {})  # its coordinates say where values are
+    inputs["volume"] = (vvgt.read_volume(field, spacing=SPACING), {})
+    for name, (volume, reading) in inputs.items():
+        result = vvgt.convert(volume, TF, **HOW, **reading)
+        assert saved(result, tmp_path / f"{name}.ply") == wanted, name
+
+
+def test_an_affine_is_nibabels(field, tmp_path):
+    affine = np.array([[0, -1.5, 0, 7], [1, 0, 0, -3], [0, 0, -2, 11], [0, 0, 0, 1.0]])
+    image = nibabel.Nifti1Image(field.T, affine)
+    nibabel.save(image, tmp_path / "a.nii.gz")
+    file = vvgt.read_volume(tmp_path / "a.nii.gz")
+    array = vvgt.read_volume(np.asarray(image.dataobj).T, affine=image.affine, space="RAS")
+    np.testing.assert_array_equal(file.data, array.data)
+    np.testing.assert_allclose(file.affine, array.affine, atol=1e-6)
+    assert array.space == file.space == "RAS"
+
+
+def test_results_are_drawn_scored_and_shown(field, converted):
+    assert converted.scores["psnr"] > 25
+    assert [stage.name for stage in converted.stages][:3] == ["read", "scene", "closed form"]
+    image = converted.render()
+    assert image.shape == (48, 48, 4)
+    assert image[..., 3].max() > 0.2
+    cameras, volume = vvgt.render_views(field, TF, vvgt.default_views("test", size=48)[4:5], spacing=SPACING)
+    assert np.sqrt(np.mean((volume[0] - image) ** 2)) < 0.05
+    np.testing.assert_array_equal(converted.render(cameras[0]), image)
+    sheet = converted.preview(32)
+    assert sheet.shape == (3 * 32, 3 * 32, 3)
+    assert converted._repr_png_().startswith(b"\x89PNG")
+    scores = vvgt.evaluate(converted, field, TF, spacing=SPACING, seats=False, step=0.5)
+    assert scores.scores["psnr"] == pytest.approx(converted.scores["psnr"], abs=0.7)
+    assert scores.size == 48
+
+
+def test_a_result_is_refined_and_read_again(field, converted, tmp_path):
+    from vvgt_cli.cli.main import run
+
+    grid = pyvista.ImageData(dimensions=field.shape[::-1], spacing=SPACING)
+    grid["values"] = field.ravel()
+    grid.save(tmp_path / "a.vti")
+    (tmp_path / "tf.json").write_text(json.dumps(TF))
+    where = ["-o", str(tmp_path / "views"), "--tf", str(tmp_path / "tf.json"), "--size", "48", "--views", "8", "-q"]
+    assert run(["render-views", str(tmp_path / "a.vti"), *where]) == 0
+    better = vvgt.optimize(converted, tmp_path / "views", steps=20)
+    assert better.scores["psnr"] > converted.scores["psnr"] - 0.5
+    saved(better, tmp_path / "better.ply")
+    gaussians, header = vvgt.read_ply(tmp_path / "better.ply")
+    np.testing.assert_allclose(gaussians.means, better.gaussians.means, atol=1e-6)
+    assert header.made_for == 48
+    converted.save(tmp_path / "start.ply")
+    file = vvgt.optimize(tmp_path / "start.ply", tmp_path / "views", steps=20)
+    assert saved(file, tmp_path / "file.ply") == (tmp_path / "better.ply").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("volume", "reading", "words"),
+    [
+        (np.zeros((4, 4)), {}, "expected three axes"),
+        (np.zeros((4, 4, 4), complex), {}, "expected integers or floats"),
+        (np.zeros((4, 4, 4)), {"spacing": (1, 1, 0)}, "three positive numbers"),
+        (np.zeros((4, 4, 4)), {"affine": np.eye(3)}, r"expected \(4, 4\)"),
+        (np.zeros((4, 4, 4)), {"affine": np.eye(4), "spacing": (1, 1, 1)}, "leave out"),
+        (np.zeros((4, 4, 4)), {"component": 1}, "an array is one volume"),
+        (np.zeros((4, 4, 4)), {"space": "RAS"}, "give affine too"),
+        ("example:blob:8", {"affine": np.eye(4)}, "a file says itself"),
+        ("nothing.nrrd", {}, "no such file"),
+        (pyvista.Sphere(), {}, "surface"),
+        (pyvista.ImageData(dimensions=(3, 3, 3)), {}, "array"),
+    ],
+)
+def test_bad_input_is_an_exception_that_says_what(volume, reading, words):
+    with pytest.raises(vvgt.VvgtError, match=words):
+        vvgt.read_volume(volume, **reading)
+
+
+def test_nothing_is_overwritten_unasked(converted, tmp_path):
+    converted.save(tmp_path / "a.ply")
+    with pytest.raises(vvgt.UsageError, match="exists"):
+        converted.save(tmp_path / "a.ply")
+    assert converted.save(tmp_path / "a.ply", sh_degree=1, overwrite=True) > 300 * 26 * 4
+
+
+@pytest.mark.parametrize("module", [vvgt, functions])
+def test_the_examples_in_docstrings_run(module):
+    result = doctest.testmod(module, optionflags=doctest.ELLIPSIS)
+    assert result.attempted >= 3
+    assert result.failed == 0
+
+
+def test_importing_costs_nothing_and_is_quiet():
+    code = "import sys, vvgt_cli as vvgt; print(len({m for m in sys.modules if m.startswith(('numpy', 'numba'))}))"
+    code += "; vvgt.convert; print('convert' in dir(vvgt))"
+    run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert run.stdout.split() == ["0", "True"]
+    assert run.stderr == ""
+    assert (ROOT / "vvgt_cli" / "py.typed").exists()
+    with pytest.raises(AttributeError, match="nothing_like_it"):
+        _ = vvgt.nothing_like_it
+    assert all(hasattr(vvgt, name) for name in vvgt.__all__)
+
+
+def test_a_conversion_says_nothing_unless_asked(field, capfd):
+    vvgt.convert(field, TF, max_gaussians=50, size=32, steps=0)
+    assert capfd.readouterr() == ("", "")
+    vvgt.convert(field, TF, max_gaussians=50, size=32, steps=0, progress=True)
+    assert "closed form" in capfd.readouterr().err

@@ -1,0 +1,238 @@
+"""The commands as functions. Each is as its command: `docs/commands` has what the options do."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Unpack
+
+from vvgt_cli.cameras import Camera, default_views
+from vvgt_cli.gaussians import Gaussians, PlyHeader
+from vvgt_cli.library.inputs import (
+    FunctionLike,
+    PathLike,
+    Reading,
+    VolumeLike,
+    console_of,
+    ply_of,
+    source_of,
+    volume_of,
+)
+from vvgt_cli.pipeline.result import Conversion, Result
+from vvgt_cli.volume import Volume
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from vvgt_cli.pipeline.evaluate import Evaluation
+
+
+def convert(
+    volume: VolumeLike,
+    tf: FunctionLike | None = None,
+    *,
+    max_gaussians: int = 100_000,
+    size: int = 1080,
+    rule: str = "inria",
+    init: str = "vbm",
+    steps: int | None = None,
+    model: str | None = None,
+    seed: int = 0,
+    target_psnr: float | None = None,
+    time_budget: float | None = None,
+    max_megabytes: float | None = None,
+    tf_range: str | Sequence[float] = "data",
+    opacity_unit_distance: str | float | None = None,
+    all_views: bool = False,
+    progress: bool = False,
+    **reading: Unpack[Reading],
+) -> Conversion:
+    """A volume under a transfer function as 3D Gaussians: ``vvgt convert`` without its files.
+
+    >>> import vvgt_cli as vvgt
+    >>> result = vvgt.convert("example:marschner-lobb:24", max_gaussians=200, size=64, steps=0)
+    >>> result.gaussians.means.shape[1]
+    3
+    >>> result.scores["psnr"] > 15
+    True
+
+    Args:
+        volume: a path (or ``example:NAME``); an array (nz, ny, nx) with ``spacing`` (x, y, z) or ``affine`` (4, 4); an
+            xarray.DataArray; a pyvista.ImageData; or a `Volume`.
+        tf: a file, a matplotlib colour map's name, a mapping as a JSON file holds it, or a `TransferFunction`; None
+            makes one from the histogram.
+        max_gaussians, size, rule, init, steps, model, seed: see `vvgt_cli.pipeline.convert.FitOptions`.
+        target_psnr, time_budget, max_megabytes: dB that are enough, seconds of the run, 10^6 bytes of the file.
+        tf_range: "data", "rescale" or (lo, hi): where the function's nodes lie.
+        opacity_unit_distance: world length that opacity is per, "paraview" or "mean-spacing".
+        all_views: score on all ten test views, by SSIM and FLIP too, as ``--report`` does.
+        progress: lines and bars on standard error.
+        **reading: how to read the volume: see `Reading`.
+
+    Returns:
+        Gaussians in the unit frame with scores, stages, `save`, `render` and `preview`.
+
+    Raises:
+        DataError: input that is not what it must be, or a scene that shows nothing.
+        UsageError: options that do not fit.
+    """
+    from vvgt_cli.pipeline.convert import FitOptions, in_memory
+    from vvgt_cli.pipeline.plan import Limits
+
+    fit = FitOptions(max_gaussians, size, init, rule, seed, steps, model)
+    limits = Limits(target_psnr, time_budget, max_megabytes)
+    source = source_of(volume, tf, tf_range, opacity_unit_distance, reading)
+    return in_memory(source, fit, limits, all_views, console_of(progress))
+
+
+def read_volume(volume: VolumeLike, **reading: Unpack[Reading]) -> Volume:
+    """A volume from a file, or from what is in memory.
+
+    >>> import numpy as np, vvgt_cli as vvgt
+    >>> vvgt.read_volume(np.zeros((4, 5, 6)), spacing=(1, 1, 2)).dims
+    (6, 5, 4)
+
+    Args:
+        volume, reading: as of `convert`.
+
+    Raises:
+        DataError, UsageError: as `convert`.
+    """
+    return volume_of(volume, reading)
+
+
+def read_ply(path: PathLike) -> tuple[Gaussians, PlyHeader]:
+    """Gaussians of a standard ``.ply`` in the unit frame, and what its header says.
+
+    Raises:
+        DataError: not a 3DGS ``.ply``, or one without Gaussians.
+    """
+    from vvgt_cli.pipeline.render import open_gaussians
+
+    return open_gaussians(os.fspath(path), console_of(False))
+
+
+def render_views(
+    volume: VolumeLike,
+    tf: FunctionLike | None = None,
+    cameras: Sequence[Camera] | int = 24,
+    *,
+    size: int = 400,
+    step: float = 0.5,
+    tf_range: str | Sequence[float] = "data",
+    opacity_unit_distance: str | float | None = None,
+    **reading: Unpack[Reading],
+) -> tuple[list[Camera], np.ndarray]:
+    """Pictures of a volume by our renderer, in memory; ``vvgt render-views`` writes them for trainers.
+
+    >>> import vvgt_cli as vvgt
+    >>> cameras, images = vvgt.render_views("example:blob:16", cameras=2, size=32)
+    >>> images.shape
+    (2, 32, 32, 4)
+
+    Args:
+        volume, tf, tf_range, opacity_unit_distance, reading: as of `convert`.
+        cameras: in the unit frame, all of one size; or how many of the training views.
+        size: pixels along the edge of the training views.
+        step: along a ray, in voxels.
+
+    Returns:
+        cameras, images: (n, h, w, 4) float32, premultiplied RGBA.
+
+    Raises:
+        DataError, UsageError: as `convert`; cameras of several sizes.
+    """
+    import numpy as np
+
+    from vvgt_cli.cameras.boxed import drawn_in_box
+    from vvgt_cli.dvr import RenderSettings, render_view
+    from vvgt_cli.errors import UsageError
+    from vvgt_cli.pipeline.source import load
+
+    views = default_views("train", cameras, size=size) if isinstance(cameras, int) else list(cameras)
+    if len({(view.width, view.height) for view in views}) != 1:
+        raise UsageError(f"{len(views)} cameras of several sizes; expected one or more of one size")
+    source = load(source_of(volume, tf, tf_range, opacity_unit_distance, reading))
+    scene = source.scene()
+    draw = drawn_in_box(lambda view: render_view(scene, view, RenderSettings(step=step)), source.volume.axes)
+    return views, np.stack([draw(view) for view in views])
+
+
+def evaluate(
+    ply: PathLike | Result,
+    volume: VolumeLike,
+    tf: FunctionLike | None = None,
+    *,
+    size: int | None = None,
+    rule: str | None = None,
+    step: float = 0.125,
+    seats: bool = True,
+    tf_range: str | Sequence[float] = "data",
+    opacity_unit_distance: str | float | None = None,
+    progress: bool = False,
+    **reading: Unpack[Reading],
+) -> Evaluation:
+    """Scores of a ``.ply``, or of a result, against its volume: ``vvgt evaluate``.
+
+    Args:
+        ply: path, or what `convert` or `optimize` returned.
+        volume, tf, tf_range, opacity_unit_distance, reading: as of `convert`.
+        size, rule: to score at and draw by; None: the file's.
+        step: of the reference, in voxels.
+        seats: every rule at several sizes and close up, too.
+        progress: lines and bars on standard error.
+
+    Raises:
+        DataError, UsageError: as `convert`.
+    """
+    from vvgt_cli.pipeline import evaluate as pipeline
+
+    source = source_of(volume, tf, tf_range, opacity_unit_distance, reading)
+    request = pipeline.EvaluateRequest(ply_of(ply), source, size, rule, step, seats)
+    return pipeline.evaluate(request, console_of(progress))
+
+
+def optimize(
+    ply: PathLike | Result,
+    views: PathLike,
+    *,
+    steps: int | None = None,
+    time_budget: float | None = None,
+    target_psnr: float | None = None,
+    method: str = "frame",
+    max_gaussians: int | None = None,
+    size: int | None = None,
+    rule: str | None = None,
+    seed: int = 0,
+    progress: bool = False,
+) -> Result:
+    """Gaussians refined by gradient descent on views: ``vvgt optimize``.
+
+    Args:
+        ply: path, or what `convert` returned.
+        views: folder that ``vvgt render-views`` wrote.
+        steps, time_budget: one of the two: steps of one view each, or seconds.
+        target_psnr: dB on the check views at which to end.
+        method: "frame", "adam" or "3dgs"; max_gaussians: that "3dgs" may grow to.
+        size, rule: of the screen that they are made for; None: the file's.
+        seed: of the order of views.
+        progress: lines and bars on standard error.
+
+    Returns:
+        The best that the check views have seen.
+
+    Raises:
+        DataError: a ``.ply`` or a folder of views that is not one.
+        UsageError: both of steps and time_budget, or none.
+    """
+    from vvgt_cli.optimize import OptimizeOptions
+    from vvgt_cli.pipeline.optimize import OptimizeRequest, budget, optimized
+    from vvgt_cli.pipeline.record import ConversionReport, Run
+
+    how = OptimizeOptions.of(
+        method, max_gaussians=max_gaussians, target_psnr=target_psnr, seed=seed, **budget(steps, time_budget)
+    )
+    run = Run(console_of(progress), ConversionReport("optimize"))
+    result = optimized(run, OptimizeRequest(ply_of(ply), os.fspath(views), None, how, size, rule))
+    run.finish()
+    return result
