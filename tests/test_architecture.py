@@ -15,8 +15,9 @@ from vvgt_cli.cli.main import COMMANDS
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "vvgt_cli"
 ROOMS = (
-    *("errors", "progress", "files", "jit", "volume", "transfer", "cameras", "images", "metrics", "gaussians", "synth"),
-    *("dvr", "splat", "vbm", "network", "optimize", "training", "checks", "report", "pipeline", "library", "cli"),
+    *("errors", "resources", "progress", "files", "jit", "volume", "transfer", "cameras", "images", "metrics"),
+    *("gaussians", "synth", "dvr", "splat", "vbm", "network", "optimize", "training", "checks", "report", "pipeline"),
+    *("library", "cli"),
 )
 HEAVY = {
     *("numba", "vtk", "vtkmodules", "pyvista", "onnxruntime", "torch", "matplotlib", "OpenImageIO", "OpenEXR"),

@@ -12,6 +12,7 @@ from typing import Any
 import click
 
 from vvgt_cli.progress import Console
+from vvgt_cli.resources import parse_size, processors, set_memory
 
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 THREAD_VARIABLES = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "SLURM_CPUS_PER_TASK")
@@ -114,14 +115,12 @@ overwrite_option = click.option("--overwrite", is_flag=True, help="Replace files
 
 
 def default_threads() -> int:
-    """Threads without `--threads`: the first of `THREAD_VARIABLES` that holds a number, else the CPUs we may use."""
+    """Threads without `--threads`: the first of `THREAD_VARIABLES` that holds a number, else the CPUs free to us."""
     for variable in THREAD_VARIABLES:
         value = os.environ.get(variable, "").split(",")[0].strip()
         if value.isascii() and value.isdecimal() and int(value) > 0:
             return int(value)
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    return processors()
 
 
 def set_threads(count: int) -> None:
@@ -141,8 +140,13 @@ def _threads(ctx: click.Context, param: click.Parameter, value: int | None) -> N
         set_threads(value or default_threads())
 
 
+def _memory(ctx: click.Context, param: click.Parameter, value: str | None) -> None:
+    if not ctx.resilient_parsing:
+        set_memory(None if value is None else parse_size(value))
+
+
 def common_options(function: Callable[..., Any]) -> Callable[..., Any]:
-    """``--threads`` and ``--quiet``; the command gets a ``console``."""
+    """``--threads``, ``--memory`` and ``--quiet``; the command gets a ``console``."""
 
     @click.option(
         "--threads",
@@ -151,6 +155,13 @@ def common_options(function: Callable[..., Any]) -> Callable[..., Any]:
         callback=_threads,
         expose_value=False,
         help="CPU threads. Default: OMP_NUM_THREADS, SLURM_CPUS_PER_TASK, or all that may be used.",
+    )
+    @click.option(
+        "--memory",
+        metavar="SIZE",
+        callback=_memory,
+        expose_value=False,
+        help="Memory to count on, as 4G. Default: what machine, cgroups and limits leave the process.",
     )
     @click.option("-q", "--quiet", is_flag=True, help="Say nothing on standard error but errors.")
     @functools.wraps(function)

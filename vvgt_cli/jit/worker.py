@@ -77,12 +77,14 @@ def run(folder: Path, jobs: list[Any]) -> int:
     """Compile all; 0 where all went well."""
     import importlib
 
+    from vvgt_cli.resources import processors
+
     for module in sorted({job.module for job in jobs}):
         importlib.import_module(module)
     failed = 0
     if not hasattr(os, "fork"):
         return sum(_attempt(folder, job) for job in jobs)
-    most = min(MOST, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
+    most = min(MOST, processors())
     running: set[int] = set()
     for job in jobs:
         if len(running) >= most:

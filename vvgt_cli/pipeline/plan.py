@@ -201,7 +201,7 @@ class Planner:
     def plan(self, costs: Costs, spent: float, begun: bool = False) -> Plan:
         """Which stages fit, after ``spent`` seconds; ``begun``: the closed form is done."""
         plan = Plan(self.gaussians, memory=costs.memory)
-        plan.bytes = HEADER_BYTES[self.sh_degree] + self.gaussians * (VERTEX_BYTES + HARMONIC_BYTES[self.sh_degree])
+        plan.bytes = file_bytes(self.gaussians, self.sh_degree)
         last = [("test views", costs.score), ("write", costs.write)]
         plan.stages = [("so far", spent)] + ([] if begun else [("closed form", costs.closed_form)])
         left = None
@@ -264,6 +264,11 @@ class Planner:
         return None if left is None else left - costs.network
 
 
+def file_bytes(gaussians: int, sh_degree: int) -> int:
+    """Of a `.ply`."""
+    return HEADER_BYTES[sh_degree] + gaussians * (VERTEX_BYTES + HARMONIC_BYTES[sh_degree])
+
+
 def _room(left: float | None) -> str:
     return f"{max(left or 0.0, 0.0):.1f} s are left"
 
@@ -283,7 +288,7 @@ def estimate(scene: Scene, size: int, gaussians: int, all_views: bool = False) -
     from vvgt_cli.dvr.scene import BRICK
     from vvgt_cli.vbm.closed_form import expected_cells
 
-    cells, pace, edge = expected_cells(scene, size), _pace(), view_edge(size, half=False)
+    cells, pace, edge = expected_cells(scene, size, gaussians), _pace(), view_edge(size, half=False)
     blocks = spread_blocks(size, size)
     judged = size**2 if blocks is None else blocks.numbers.size * BLOCK**2  # pixels
     pixels = (edge / 400) ** 2

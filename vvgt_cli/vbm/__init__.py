@@ -68,7 +68,7 @@ def initialise(scene: Scene, options: VbmOptions, progress: Progress | None = No
     else:
         gaussians, kept = form.gaussians(), form
     if progress:
-        progress(4, 4)
+        progress(100, 100)
     return Start(gaussians, kept)
 
 

@@ -22,6 +22,7 @@ from vvgt_cli.vbm.tree import Leaves, Tree, build_tree, leaves_of, select, split
 from vvgt_cli.vbm.visibility import Visibility, visibility
 
 MAX_BASE_CELLS = 5_000_000  # an upper bound: half of them are there, as a rule; 104 bytes each, twice for the pyramid
+CELLS_A_GAUSSIAN, FEW_CELLS = 256, 500_000  # more are of no use to a small budget, but so many cost nothing
 FINEST = -2  # cells of a quarter voxel at most
 MIN_CELL = 1.2  # pixels: a smaller base cell cannot be told from its neighbours
 MARCH_SIZE = 160  # pixels of the visibility march
@@ -93,34 +94,38 @@ def closed_form(
         budget: most Gaussians.
         size: image edge in pixels that the file is made for.
         cameras: what may see the scene; by default the training views.
-        progress: called after each of the four parts.
+        progress: called with (per cent done, 100), within parts that take long too.
     """
     step = np.asarray(scene.step)
-    tick = progress or (lambda done, total: None)
-    seen = visibility(scene, cameras or default_views("train", size=MARCH_SIZE))
-    tick(1, 4)
-    cells = base_cells(scene, exponents(step, base_level(scene, pixel_width(size))))
-    tick(2, 4)
+
+    def within(first: int, last: int) -> Callable[[float], None]:
+        return lambda share: progress(round(first + (last - first) * share), 100) if progress else None
+
+    seen = visibility(scene, cameras or default_views("train", size=MARCH_SIZE), progress=within(0, 25))
+    level = base_level(scene, pixel_width(size), budget)
+    cells = base_cells(scene, exponents(step, level), progress=within(25, 75))
     opaque = opaque_field(cells, step, np.asarray(scene.half))
+    within(75, 80)(1)
     tree = build_tree(cells, seen, step)
-    tick(3, 4)
+    within(80, 95)(1)
     return ClosedForm(scene, seen, tree, opaque, float(step.min()), pixel_width(size), budget)
 
 
-def base_level(scene: Scene, pixel: float) -> int:
-    """Finest level whose base cells fit the memory bound and are not finer than the images can tell."""
+def base_level(scene: Scene, pixel: float, budget: int) -> int:
+    """Finest level whose base cells fit the memory bound and the budget, and are not finer than the images can tell."""
+    most = min(MAX_BASE_CELLS, max(CELLS_A_GAUSSIAN * budget, FEW_CELLS))
     voxels = _visible_voxels(scene)
     finest = math.log2(MIN_CELL * pixel / float(scene.step.min()))
     level = max(FINEST, min(0, math.floor(finest)))
     # a long voxel holds more cells than 8^-level
-    while voxels / np.prod(2.0 ** exponents(scene.step, level)) > MAX_BASE_CELLS:
+    while voxels / np.prod(2.0 ** exponents(scene.step, level)) > most:
         level += 1
     return level
 
 
-def expected_cells(scene: Scene, size: int) -> float:
-    """About how many base cells the closed form for images of ``size`` px will have."""
-    level = base_level(scene, pixel_width(size))
+def expected_cells(scene: Scene, size: int, budget: int) -> float:
+    """About how many base cells the closed form of ``budget`` Gaussians for images of ``size`` px will have."""
+    level = base_level(scene, pixel_width(size), budget)
     return _visible_voxels(scene) / float(np.prod(2.0 ** exponents(scene.step, level)))
 
 

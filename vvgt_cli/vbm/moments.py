@@ -8,6 +8,7 @@ A base cell is a box of ``2^e`` voxels along each axis (e may be negative). Its 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numba as nb
@@ -20,7 +21,7 @@ from vvgt_cli.jit.decorators import inlined, kernel
 # columns of a moment row: M, M x, M y, M z, M xx, M xy, M xz, M yy, M yz, M zz, M r, M g, M b
 MOMENTS = 13
 FINEST_CUT = -4
-CHUNK_CELLS = 1 << 20  # cells of the dense scratch buffer
+CHUNK_CELLS = 1 << 19  # cells of the dense scratch buffer
 
 
 @dataclass(frozen=True)
@@ -160,8 +161,13 @@ def morton(index: np.ndarray) -> np.ndarray:
     return code
 
 
-def base_cells(scene: Scene, exponent: np.ndarray, points_per_voxel: int = 2) -> Cells:
-    """Moments of every base cell with extinction (see `Cells`); memory is that of the result plus a fixed scratch."""
+def base_cells(
+    scene: Scene, exponent: np.ndarray, points_per_voxel: int = 2, progress: Callable[[float], None] | None = None
+) -> Cells:
+    """Moments of every base cell with extinction (see `Cells`); memory is that of the result plus a fixed scratch.
+
+    ``progress`` is told the share that is done.
+    """
     tables = scene.tables
     block = np.maximum(BRICK, 2.0**exponent).astype(np.int64)  # voxels of one work item, (x, y, z)
     cell_voxels = 2.0**exponent
@@ -182,10 +188,19 @@ def base_cells(scene: Scene, exponent: np.ndarray, points_per_voxel: int = 2) ->
         kept_moments.append(out[at[:, 0], at[:, 1], at[:, 2], at[:, 3]])
         corner = np.round(part[at[:, 0]] / cell_voxels).astype(np.int32)
         kept_index.append(corner + at[:, :0:-1].astype(np.int32))
+        if progress:
+            progress(min(first + chunk, len(origins)) / len(origins))
+    del scratch
     index = np.concatenate(kept_index) if kept_index else np.empty((0, 3), np.int32)
-    moments = np.concatenate(kept_moments) if kept_moments else np.empty((0, MOMENTS))
     order = np.argsort(morton(index), kind="stable")
-    return Cells(index[order], moments[order], cell_voxels * scene.step, exponent)
+    place = np.empty_like(order)
+    place[order] = np.arange(len(order))
+    moments, done = np.empty((len(order), MOMENTS)), 0
+    while kept_moments:  # each part is let go of as it is laid in its place
+        part = kept_moments.pop(0)
+        moments[place[done : done + len(part)]] = part
+        done += len(part)
+    return Cells(index[order], moments, cell_voxels * scene.step, exponent)
 
 
 # offsets (x, y, z) of a cell's children, x fastest

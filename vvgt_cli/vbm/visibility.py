@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numba as nb
@@ -17,7 +17,9 @@ from vvgt_cli.jit.decorators import inlined, kernel
 
 MAX_CELLS = 1 << 24
 MIN_RAYS = 8  # that meet a cell: with fewer, some cells are met by none and count as hidden
-MAX_GRID = 1 << 25  # cells of all workers together: each has a grid of its own, so that sums need no atomics
+WORKERS = 4  # each with a grid of its own, so that sums need no atomics; whatever the threads, for the same bytes
+MAX_GRID = 1 << 25  # cells of all workers together
+THIN = 2.0  # pixels of the march: all of a box that is thinner may lie between two rays
 
 
 @dataclass(frozen=True)
@@ -126,23 +128,37 @@ def _rays_a_cell(scene: Scene, cameras: Sequence[Camera], exponent: int) -> floa
     return sum(area * camera.fx * camera.fy / max(float(camera.position @ camera.position), 1) for camera in cameras)
 
 
-def visibility(scene: Scene, cameras: Sequence[Camera], step: float = 1.0) -> Visibility:
-    """March every camera (square images of one size) and return what is seen of each cell of a grid."""
+def visibility(
+    scene: Scene, cameras: Sequence[Camera], step: float = 1.0, progress: Callable[[float], None] | None = None
+) -> Visibility:
+    """March every camera (square images of one size) and return what is seen of each cell of a grid.
+
+    In a box that is thinner than `THIN` pixels along some axis, a cell that no ray meets counts as seen: a line along
+    z lies between two columns of pixels in every view with z upright. ``progress`` is told the share that is done.
+    """
     exponent = 0
     while math.prod(-(-n // (1 << exponent)) for n in scene.values.shape) > MAX_CELLS or (
         _rays_a_cell(scene, cameras, exponent) < MIN_RAYS and 1 << exponent < max(scene.values.shape)
     ):
         exponent += 1
     shape = tuple(-(-n // (1 << exponent)) for n in scene.values.shape)
-    workers = max(min(nb.get_num_threads(), MAX_GRID // math.prod(shape)), 1)
+    workers = max(min(WORKERS, MAX_GRID // math.prod(shape)), 1)
     grids = np.zeros((workers, 3, *shape), np.float32)
-    arrays = [camera_arrays(scene, camera) for camera in cameras]
     tables = scene.tables
-    _march(
-        scene.values, tables.lo, tables.inv_width, tables.nodes, tables.cumulative, tables.dark, scene.empty,
-        np.stack([a[0] for a in arrays]), np.stack([a[1] for a in arrays]), np.stack([a[2] for a in arrays]),
-        cameras[0].width, step, 1.0 / (1 << exponent), grids,
-    )  # fmt: skip
+    for done, camera in enumerate(cameras, 1):
+        eye, basis, lens = camera_arrays(scene, camera)
+        _march(
+            scene.values, tables.lo, tables.inv_width, tables.nodes, tables.cumulative, tables.dark, scene.empty,
+            eye[None], basis[None], lens[None], camera.width, step, 1.0 / (1 << exponent), grids,
+        )  # fmt: skip
+        if progress:
+            progress(done / len(cameras))
     depth = grids[:, 0].sum(axis=0)
-    mean = np.divide(grids[:, 1].sum(axis=0), depth, out=np.zeros(shape, np.float32), where=depth > 0)
-    return Visibility(np.clip(mean, 0, 1), grids[:, 2].max(axis=0), exponent)
+    unmet = np.float32(2 * scene.half.min() < THIN * max(_pixel(camera) for camera in cameras))
+    mean = np.divide(grids[:, 1].sum(axis=0), depth, out=np.full(shape, unmet), where=depth > 0)
+    return Visibility(np.clip(mean, 0, 1), np.where(depth > 0, grids[:, 2].max(axis=0), unmet), exponent)
+
+
+def _pixel(camera: Camera) -> float:
+    """Width of a pixel at the centre, unit frame."""
+    return float(np.linalg.norm(camera.position)) / camera.fx

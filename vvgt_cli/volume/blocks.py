@@ -9,7 +9,6 @@ import bz2
 import gzip
 import math
 import mmap
-import os
 import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -18,6 +17,7 @@ from typing import IO, Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
+from vvgt_cli.resources import free_memory
 
 # The most that each coding can expand: deflate 258 bytes from 2 bits, bzip2 about 900 kB from some 40 bytes.
 MAX_RATIO = {"gzip": 1040, "zlib": 1040, "bzip2": 25000}
@@ -32,21 +32,6 @@ def count(shape: tuple[int, ...]) -> int:
 def size_text(n_bytes: int) -> str:
     """Bytes for people: ``1234 bytes`` or ``3.2 GiB``."""
     return f"{n_bytes} bytes" if n_bytes < 1 << 20 else f"{n_bytes} bytes ({n_bytes / 2**30:.3g} GiB)"
-
-
-def free_memory() -> int | None:
-    """Bytes of memory that can still be had, or None where the system does not say."""
-    try:
-        with open("/proc/meminfo", encoding="ascii") as lines:
-            for line in lines:
-                if line.startswith("MemAvailable:"):
-                    return int(line.split()[1]) * 1024
-    except (OSError, ValueError, IndexError):
-        pass
-    try:
-        return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (OSError, ValueError, AttributeError):
-        return None
 
 
 def check_memory(need: int, what: str) -> None:

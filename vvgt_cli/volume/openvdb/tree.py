@@ -12,7 +12,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.blocks import check_memory, free_memory
+from vvgt_cli.resources import free_memory
+from vvgt_cli.volume.blocks import check_memory
 from vvgt_cli.volume.openvdb.archive import TYPES
 from vvgt_cli.volume.openvdb.codec import ACTIVE_MASK, read_block
 from vvgt_cli.volume.openvdb.cursor import Cursor

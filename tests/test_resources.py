@@ -1,0 +1,167 @@
+"""Memory and processors are the job's: machine, cgroups at every level, limits of the process, and what was asked."""
+
+from __future__ import annotations
+
+import os
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vvgt_cli import resources
+from vvgt_cli.errors import UsageError
+from vvgt_cli.resources import free_memory, parse_size, processors, set_memory
+
+ROOT = Path(__file__).parent.parent
+V1 = Path("/sys/fs/cgroup/memory")
+GIB = 1 << 30
+
+
+@pytest.fixture
+def machine(tmp_path, monkeypatch):
+    """A machine made of files, with 64 GiB free; returns a function that writes one of them."""
+    monkeypatch.setattr(resources, "PROC", tmp_path / "proc")
+    monkeypatch.setattr(resource, "getrlimit", lambda limit: (resource.RLIM_INFINITY,) * 2)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(16)))
+
+    def write(name: str, text: str) -> None:
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text.replace("ROOT", str(tmp_path)))
+
+    write("proc/meminfo", f"MemTotal: 99 kB\nMemAvailable:   {64 << 20} kB\n")
+    write("proc/self/status", f"Name: vvgt\nVmSize: {4 << 20} kB\nVmData: {2 << 20} kB\nVmRSS: {1 << 20} kB\n")
+    write("proc/self/cgroup", "")
+    write("proc/self/mountinfo", "")
+    yield write
+    set_memory(None)
+
+
+def test_the_machine_alone(machine):
+    assert (free_memory(), processors()) == (64 * GIB, 16)
+
+
+def v2(machine, own: str = "/job/step", root: str = "/") -> None:
+    machine("proc/self/cgroup", f"0::{own}\n")
+    machine("proc/self/mountinfo", f"30 20 0:26 {root} ROOT/cg rw - cgroup2 cgroup2 rw\n")
+
+
+@pytest.mark.parametrize("level", ["job/step", "job", "."])
+def test_every_level_of_v2_counts(level, machine):
+    v2(machine)
+    for each in ("job/step", "job"):
+        machine(f"cg/{each}/memory.max", "max\n")
+        machine(f"cg/{each}/cpu.max", "max 100000\n")
+    machine(f"cg/{level}/memory.max", f"{8 * GIB}\n")
+    machine(f"cg/{level}/memory.current", f"{5 * GIB}\n")
+    machine(f"cg/{level}/memory.stat", f"anon 1\nactive_file {GIB}\ninactive_file {GIB}\n")
+    machine(f"cg/{level}/cpu.max", "250000 100000\n")
+    assert (free_memory(), processors()) == (5 * GIB, 3)
+
+
+def test_memory_high_holds_as_max_does(machine):
+    v2(machine)
+    for name, value in (("max", 9 * GIB), ("high", 4 * GIB), ("current", GIB)):
+        machine(f"cg/job/memory.{name}", f"{value}\n")
+    assert free_memory() == 3 * GIB
+
+
+def test_a_container_sees_its_part_of_the_tree(machine):
+    v2(machine, "/docker/abc/step", "/docker/abc")
+    machine("cg/step/memory.max", f"{2 * GIB}\n")
+    machine("cg/step/memory.current", "0\n")
+    assert free_memory() == 2 * GIB
+
+
+def test_v1_with_its_unlimited_groups(machine):
+    machine("proc/self/cgroup", "4:memory:/slurm/job\n3:cpu,cpuacct:/slurm/job\n1:name=systemd:/\n0::/\n")
+    mounts = (("memory", "memory"), ("cpu", "cpu,cpuacct"))
+    machine("proc/self/mountinfo", "".join(f"3 2 0:9 / ROOT/{d} rw - cgroup cgroup rw,{o}\n" for d, o in mounts))
+    machine("memory/slurm/job/memory.limit_in_bytes", "9223372036854771712\n")
+    machine("memory/slurm/job/memory.usage_in_bytes", "4096\n")
+    machine("memory/slurm/memory.limit_in_bytes", f"{6 * GIB}\n")
+    machine("memory/slurm/memory.usage_in_bytes", f"{4 * GIB}\n")
+    machine("memory/slurm/memory.stat", f"active_file 7\ntotal_active_file {GIB}\ntotal_inactive_file 0\n")
+    machine("cpu/slurm/job/cpu.cfs_quota_us", "-1\n")
+    machine("cpu/slurm/job/cpu.cfs_period_us", "100000\n")
+    machine("cpu/slurm/cpu.cfs_quota_us", "50000\n")
+    machine("cpu/slurm/cpu.cfs_period_us", "100000\n")
+    assert (free_memory(), processors()) == (3 * GIB, 1)
+
+
+@pytest.mark.parametrize(("limit", "left"), [("RLIMIT_AS", 6), ("RLIMIT_DATA", 8)])
+def test_limits_of_the_process(limit, left, machine, monkeypatch):
+    number = getattr(resource, limit)
+    soft = {number: (10 * GIB, 20 * GIB)}
+    monkeypatch.setattr(resource, "getrlimit", lambda of: soft.get(of, (resource.RLIM_INFINITY,) * 2))
+    assert free_memory() == left * GIB
+
+
+def test_what_was_asked_for_less_what_is_held(machine):
+    set_memory(parse_size("4G"))
+    assert free_memory() == 3 * GIB
+    set_memory(1)
+    assert free_memory() == 0
+
+
+def test_sizes():
+    assert [parse_size(text) for text in ("4096", "1.5k", "2 MiB", "4G", "1tb")] == [
+        4096, 1536, 2 << 20, 4 * GIB, 1 << 40,
+    ]  # fmt: skip
+    for text in ("", "4X", "-1", "0", "G", "1e9", "nan"):
+        with pytest.raises(UsageError, match="is not a size of memory; expected a number with K, M, G or T, as 4G"):
+            parse_size(text)
+
+
+def big(folder: Path, mib: int = 3400) -> Path:
+    """A small .nii.gz that unpacks to ``mib`` MiB of float32 zeros."""
+    import gzip
+    import struct
+
+    head = bytearray(352)
+    struct.pack_into("<i", head, 0, 348)
+    struct.pack_into("<8h", head, 40, 3, 1024, 1024, mib // 4, 1, 1, 1, 1)
+    struct.pack_into("<h", head, 70, 16)
+    struct.pack_into("<8f", head, 76, 1, 1, 1, 1, 0, 0, 0, 0)
+    struct.pack_into("<3f", head, 108, 352, 1, 0)
+    head[344:348] = b"n+1\0"
+    path = folder / "big.nii.gz"
+    with gzip.open(path, "wb", compresslevel=1) as out:
+        out.write(head)
+        for k in range(mib):
+            out.write(np.full(1 << 18, k, "<f4").tobytes())
+    return path
+
+
+def test_a_volume_that_does_not_fit_is_refused(tmp_path, vvgt, monkeypatch):
+    path = big(tmp_path, 64)
+    held = resources._status()["VmRSS"]
+    for command in (("info", path), ("convert", path, "-o", tmp_path / "a.ply")):
+        refused = vvgt(*command, "--memory", held + (48 << 20))
+        assert refused.code == 1
+        assert refused.error.startswith("vvgt: error: big.nii.gz: needs 67108864 bytes (0.0625 GiB) of memory, ")
+    assert vvgt("info", path).code == 0  # what was asked for held for one command
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not os.access(V1, os.W_OK), reason="no cgroup can be made here")
+def test_in_a_group_of_2_gib_a_file_that_unpacks_to_more_is_refused_not_killed(tmp_path):
+    group = V1 / f"vvgt-test-{os.getpid()}"
+    group.mkdir()
+    try:
+        (group / "memory.limit_in_bytes").write_text(str(2 * GIB))
+        path = big(tmp_path)
+        join = f"open({str(group / 'cgroup.procs')!r}, 'w').write('0')"
+        code = f"{join}\nfrom vvgt_cli.cli.main import main\nmain()\n"
+        paths = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+        done = subprocess.run(
+            [sys.executable, "-c", code, "convert", path, "-o", tmp_path / "a.ply"], capture_output=True, text=True,
+            env=os.environ | {"PYTHONPATH": paths}, timeout=1200,
+        )  # fmt: skip
+        assert done.returncode == 1, done.stderr
+        assert "big.nii.gz: needs 3565158400 bytes (3.32 GiB) of memory, " in done.stderr
+    finally:
+        group.rmdir()

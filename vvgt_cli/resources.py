@@ -1,0 +1,157 @@
+"""What the process may have of the machine: memory and processors, as its job and its limits leave them."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from vvgt_cli.errors import UsageError
+
+PROC = Path("/proc")
+UNITS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
+UNLIMITED = 1 << 60  # cgroup v1 writes a number near 2^63 where there is no limit
+_asked: int | None = None  # bytes that the whole process may take (`--memory`)
+
+
+def parse_size(text: str) -> int:
+    """Bytes of ``4G``, ``500M``, ``4GiB`` or a number; units are powers of 1024, as job schedulers count.
+
+    Raises:
+        UsageError: anything else.
+    """
+    match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT]?)(?:I?B)?\s*", text.upper())
+    if match is None or float(match[1]) <= 0:
+        raise UsageError(f"{text!r} is not a size of memory; expected a number with K, M, G or T, as 4G")
+    return int(float(match[1]) * UNITS[match[2]])
+
+
+def set_memory(limit: int | None) -> None:
+    """Let the whole process count on ``limit`` bytes at most; None: on what the system leaves it."""
+    global _asked
+    _asked = limit
+
+
+def free_memory() -> int | None:
+    """Bytes of memory that this process can still have, or None where the system does not say.
+
+    The least of what the machine has free, what every cgroup (v1 and v2) above the process leaves, the process's own
+    limits (RLIMIT_AS, RLIMIT_DATA) less what it has of them, and `set_memory` less what it holds.
+    """
+    found = [*_machine(), *(room for room in map(_room, _groups("memory")) if room is not None), *_own_limits()]
+    if _asked is not None:
+        found.append(_asked - _status().get("VmRSS", 0))
+    return max(min(found), 0) if found else None
+
+
+def processors() -> int:
+    """CPUs that this process may keep busy: those of its affinity, and no more than its cgroups' quotas allow."""
+    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    for group in _groups("cpu"):
+        quota = group.words("cpu.max") or [*group.words("cpu.cfs_quota_us"), *group.words("cpu.cfs_period_us")]
+        if len(quota) == 2 and all(word.isdecimal() and int(word) > 0 for word in quota):  # not "max", not -1
+            count = min(count, math.ceil(int(quota[0]) / int(quota[1])))
+    return max(count, 1)
+
+
+def _machine() -> list[int]:
+    """What the whole machine has free."""
+    free = _table(PROC / "meminfo").get("MemAvailable")
+    if free is not None:
+        return [free]
+    try:
+        return [os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")]
+    except (OSError, ValueError, AttributeError):
+        return []
+
+
+def _own_limits() -> Iterator[int]:
+    try:
+        import resource
+    except ImportError:
+        return
+    for limit, held in ((resource.RLIMIT_AS, "VmSize"), (resource.RLIMIT_DATA, "VmData")):
+        soft = resource.getrlimit(limit)[0]
+        if soft != resource.RLIM_INFINITY:
+            yield soft - _status().get(held, 0)
+
+
+def _status() -> dict[str, int]:
+    return _table(PROC / "self" / "status")
+
+
+def _table(path: Path) -> dict[str, int]:
+    """The lines ``Name: N kB`` of a file in bytes; empty where there is none."""
+    try:
+        text = path.read_text("ascii", "replace")
+    except OSError:
+        return {}
+    return {name: int(number) * 1024 for name, number in re.findall(r"^(\w+):\s+(\d+) kB$", text, re.M)}
+
+
+@dataclass(frozen=True)
+class Group:
+    """A cgroup that the process is in, or one above it, by its folder."""
+
+    folder: Path
+
+    def words(self, name: str) -> list[str]:
+        """The words of one of its files; none where it has no such file."""
+        try:
+            return (self.folder / name).read_text("ascii", "replace").split()
+        except OSError:
+            return []
+
+    def number(self, *names: str) -> int | None:
+        """The number in the first of its files ``names`` that holds one."""
+        words = next(filter(None, map(self.words, names)), [""])
+        return int(words[0]) if words[0].isdecimal() else None
+
+    def counter(self, name: str) -> int:
+        """An entry of its memory.stat; 0 where it has none."""
+        words = self.words("memory.stat")
+        return next((int(value) for key, value in zip(words[::2], words[1::2], strict=False) if key == name), 0)
+
+
+def _room(group: Group) -> int | None:
+    """Bytes that a cgroup leaves, None where it sets no limit; pages of files are given back when memory is short."""
+    limits = [group.number(name) for name in ("memory.max", "memory.high", "memory.limit_in_bytes")]
+    known = [limit for limit in limits if limit is not None and limit < UNLIMITED]
+    used = group.number("memory.current", "memory.usage_in_bytes")
+    if not known or used is None:
+        return None
+    total = "" if group.words("memory.current") else "total_"  # of v1, the groups within included
+    files = sum(group.counter(f"{total}{kind}_file") for kind in ("active", "inactive"))
+    return min(known) - max(used - files, 0)
+
+
+def _groups(controller: str) -> Iterator[Group]:
+    """The cgroups that the process is in, of v1 and v2, from its own up to where they are mounted.
+
+    Source: cgroups(7), proc_pid_cgroup(5), proc_pid_mountinfo(5). A container may see only its own part of the tree:
+    the mount's root tells which.
+    """
+    try:
+        own = (PROC / "self" / "cgroup").read_text("utf-8", "replace").splitlines()
+        mounts = (PROC / "self" / "mountinfo").read_text("utf-8", "replace").splitlines()
+    except OSError:
+        return
+    paths: dict[str, str] = {}  # by controller; "" is v2
+    for line in own:
+        _, names, path = line.split(":", 2)
+        paths |= dict.fromkeys(names.split(","), path)
+    for line in mounts:
+        before, _, after = line.partition(" - ")
+        fields, kind = before.split(), after.split()
+        if len(fields) < 5 or len(kind) < 3 or kind[0] not in ("cgroup", "cgroup2"):
+            continue
+        name = "" if kind[0] == "cgroup2" else controller
+        if name not in paths or (name and name not in kind[2].split(",")):
+            continue
+        own_path, root, place = Path(paths[name]), Path(fields[3]), Path(fields[4].replace("\\040", " "))
+        inside = own_path.relative_to(root) if own_path.is_relative_to(root) else Path()
+        folder = place / inside
+        yield from (Group(each) for each in (folder, *folder.parents) if each.is_relative_to(place))
