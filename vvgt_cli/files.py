@@ -1,16 +1,28 @@
-"""Writing files: beside the target and renamed, and never over an existing one unasked; reading small ones."""
+"""Files: written beside the target and renamed, never over an existing one unasked, by one run at a time; read from
+pipes as from disk."""
 
 from __future__ import annotations
 
+import errno
 import os
 import secrets
+import shutil
+import stat
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import IO
 
 from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.resources import free_memory
 
 MAX_TEXT = 64 << 20  # bytes; parsed JSON takes some ten times as many
+_CHUNK = 1 << 20
+_SPARE = 64 << 20  # bytes that what comes through a pipe leaves free
+_OPEN = ("/dev", "/dev/fd", "/proc/self/fd")  # folders of names for what is open already, as /dev/stdout
+_leftovers: set[Path] = set()  # temporary names and locks of this process
+_taken_in: dict[tuple[int, int], IO[bytes]] = {}  # by device and inode of the pipe: what came out of it
 
 
 def read_text(path: str | os.PathLike[str]) -> str:
@@ -20,20 +32,77 @@ def read_text(path: str | os.PathLike[str]) -> str:
         DataError: more than 64 MiB.
         OSError, UnicodeDecodeError: it cannot be read, or is not text.
     """
-    with open(path, "rb") as file:
+    with open(seekable(path), "rb") as file:
         content = file.read(MAX_TEXT + 1)
     if len(content) > MAX_TEXT:
         raise DataError(f"{path}: more than 64 MiB; expected a small text file")
     return content.decode("utf-8")
 
 
+def is_stream(path: str | os.PathLike[str]) -> bool:
+    """Whether a path to write to is a pipe, a socket, a device or what is open already: nothing to be replaced."""
+    try:
+        mode = os.stat(path).st_mode
+    except (OSError, ValueError):
+        return False
+    if stat.S_ISREG(mode):
+        return os.path.dirname(path) in _OPEN
+    return not (stat.S_ISDIR(mode) or stat.S_ISBLK(mode))
+
+
+def seekable(path: str | os.PathLike[str]) -> Path:
+    """The path itself, or for a pipe (``<(gunzip -c a.nii.gz)``, a FIFO) that of all that came through it, in memory.
+
+    A pipe is read once, to its end, however often this is asked.
+
+    Raises:
+        DataError: it cannot be read, more came than the memory holds, or the system cannot keep it.
+    """
+    try:
+        about = os.stat(path)
+    except (OSError, ValueError):
+        return Path(path)
+    if not (stat.S_ISFIFO(about.st_mode) or stat.S_ISSOCK(about.st_mode)):
+        return Path(path)
+    try:
+        key = about.st_dev, about.st_ino
+        if key not in _taken_in:
+            _taken_in[key] = _taken(path)
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror or error})") from error
+    return Path(f"/proc/self/fd/{_taken_in[key].fileno()}")
+
+
+def _taken(path: str | os.PathLike[str]) -> IO[bytes]:
+    """What comes through a pipe, in a file in memory."""
+    if not hasattr(os, "memfd_create") or not os.path.isdir("/proc/self/fd"):
+        raise DataError(f"{path}: is a pipe; expected a file: write what comes through it to one first")
+    kept = os.fdopen(os.memfd_create("pipe"), "w+b")
+    with open(path, "rb", buffering=0) as stream:
+        came = 0
+        while chunk := stream.read(_CHUNK):
+            free = free_memory()
+            if free is not None and free < _SPARE:
+                kept.close()
+                raise DataError(
+                    f"{path}: {came} bytes came through this pipe, and the free memory is used up; write it to a file "
+                    "first: large files are read where they lie"
+                )
+            kept.write(chunk)
+            came += len(chunk)
+    kept.flush()
+    return kept
+
+
 def check_target(path: str | os.PathLike[str], overwrite: bool = False) -> Path:
-    """The path as a `Path`, if a file may be written there.
+    """The path as a `Path`, if a file may be written there, or a pipe or device is.
 
     Raises:
         UsageError: it exists and ``overwrite`` is not set, is a folder, or its folder does not exist.
     """
     target = Path(path)
+    if is_stream(target):
+        return target
     if target.is_dir():
         raise UsageError(f"{target} is a folder; expected the name of a file to write")
     if not target.parent.is_dir():
@@ -43,25 +112,117 @@ def check_target(path: str | os.PathLike[str], overwrite: bool = False) -> Path:
     return target
 
 
+def check_room(path: str | os.PathLike[str], need: int) -> None:
+    """See that the disk of ``path`` has room for ``need`` bytes.
+
+    Raises:
+        DataError: it has not, in the system's own words for a full disk.
+    """
+    folder = Path(path).parent
+    if is_stream(path) or not hasattr(os, "statvfs"):
+        return
+    with suppress(OSError):
+        disk = os.statvfs(folder)
+        free = disk.f_bavail * disk.f_frsize
+        if disk.f_blocks and free < need:  # some file systems do not tell: they have no blocks
+            raise DataError(
+                f"{path}: {os.strerror(errno.ENOSPC)}: needs {need} bytes, {free} are free in {folder}; make room, or "
+                "give a name on another disk"
+            )
+
+
 @contextmanager
 def atomic_write(path: str | os.PathLike[str], overwrite: bool = False) -> Iterator[Path]:
     """Give a temporary name beside ``path`` to write to; rename it to ``path`` when the block ends well.
 
     The temporary keeps the suffix (libraries choose the format by it) and is removed on any error,
-    so that no partial file is left under either name.
+    so that no partial file is left under either name. Pipes and devices get its content.
 
     Raises:
         UsageError: as `check_target`.
         DataError: the operating system refuses (no permission, disk full).
     """
     target = check_target(path, overwrite)
-    temporary = target.with_name(f".{target.stem[:80]}.{secrets.token_hex(4)}{target.suffix}")
+    stream = is_stream(target)
+    name = f".{target.stem[:80]}.{secrets.token_hex(4)}{target.suffix}"
+    temporary = Path(tempfile.gettempdir(), name) if stream else target.with_name(name)
+    _leftovers.add(temporary)
     try:
         yield temporary
-        check_target(target, overwrite)  # it may have appeared meanwhile
-        os.replace(temporary, target)
+        if stream:
+            with open(temporary, "rb") as source, open(target, "ab") as sink:
+                shutil.copyfileobj(source, sink)
+        else:
+            check_target(target, overwrite)  # it may have appeared meanwhile
+            os.replace(temporary, target)
+    except BrokenPipeError:
+        raise
     except OSError as error:
         raise DataError(f"{target}: cannot be written ({error.strerror or error})") from error
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
+        _leftovers.discard(temporary)
+
+
+@contextmanager
+def claim(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Hold the right to write ``path`` within the block: of two runs to one name the second is told at once.
+
+    A lock on ``.NAME.lock`` beside it, which the system lets go of however the run ends; file systems without locks,
+    and systems without `fcntl`, grant it to everyone.
+
+    Raises:
+        UsageError: another process holds it.
+    """
+    target = Path(path)
+    lock = target.with_name(f".{target.name[:200]}.lock")
+    held = None if is_stream(target) else _locked(lock, target)
+    try:
+        yield
+    finally:
+        if held is not None:
+            with suppress(OSError):
+                lock.unlink(missing_ok=True)  # before it is let go of: whoever waits finds another file there
+            _leftovers.discard(lock)
+            held.close()
+
+
+def _locked(lock: Path, target: Path) -> IO[bytes] | None:
+    """The open lock file, locked; None where there are no locks."""
+    try:
+        import fcntl
+    except ImportError:
+        return None
+    while True:
+        try:
+            held = open(lock, "ab")  # noqa: SIM115 - the caller closes it
+        except OSError:
+            return None  # what is wrong with the folder is said where the file is written
+        try:
+            fcntl.lockf(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            held.close()
+            raise UsageError(
+                f"{target}: another run is at work on it; wait until that has ended, or give another name"
+            ) from None
+        except OSError as error:
+            if error.errno == errno.EACCES:  # as some systems say that it is held
+                held.close()
+                raise UsageError(f"{target}: another run is at work on it; give another name") from None
+            held.close()
+            with suppress(OSError):
+                lock.unlink(missing_ok=True)
+            return None
+        with suppress(OSError):
+            if os.stat(lock).st_ino == os.fstat(held.fileno()).st_ino:
+                _leftovers.add(lock)
+                return held
+        held.close()  # the run that held it has ended and taken the file away
+
+
+def discard_leftovers() -> None:
+    """Remove temporary files and locks of this process: for those who end it without unwinding."""
+    for path in list(_leftovers):
+        with suppress(OSError):
+            path.unlink(missing_ok=True)

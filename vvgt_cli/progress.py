@@ -5,12 +5,33 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import TextIO
+from typing import Any, TextIO
 
 ProgressCallback = Callable[[int, int], None]
 _WIDTH = 24  # characters of a bar
 _INTERVAL = 0.1  # seconds between two drawings of a bar
+_LINES = 30.0  # seconds between two lines where nobody watches
+
+
+class Talk:
+    """A text stream that takes what is said as said: on a full disk or a closed pipe talk is lost, the work is not."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        with suppress(OSError, ValueError):
+            self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with suppress(OSError, ValueError):
+            self._stream.flush()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
 
 
 @dataclass
@@ -35,14 +56,20 @@ class Console:
         self.say(f"{name:<16}{seconds:8.2f} s  {detail}".rstrip())
 
     def bar(self, label: str) -> ProgressCallback | None:
-        """A callback ``(done, total)`` that draws a bar, or None where the stream is not a terminal."""
-        if self.quiet or not self.stream.isatty():
+        """A callback ``(done, total)`` that draws a bar, or where no terminal is says a line every half minute."""
+        if self.quiet:
             return None
+        terminal = self.stream.isatty()
         start = last = time.monotonic()
 
         def draw(done: int, total: int) -> None:
             nonlocal last
             now = time.monotonic()
+            if not terminal:
+                if done < total and now - last >= _LINES:
+                    last = now
+                    self.say(f"{label:<16}{now - start:8.2f} s  {100 * done / total:.0f} %")
+                return
             if done >= total:
                 self.stream.write("\r\x1b[K")  # the stage's line follows
             elif now - last >= _INTERVAL:

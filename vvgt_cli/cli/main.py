@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import importlib
 import os
-import signal
 import sys
 import traceback
 import warnings
@@ -15,6 +15,7 @@ import click
 
 from vvgt_cli import __version__
 from vvgt_cli.cli.numbers import spread
+from vvgt_cli.cli.process import end_on_signals, ended_by, open_streams
 from vvgt_cli.errors import UsageError, VvgtError
 
 COMMANDS = {
@@ -36,6 +37,7 @@ COMMANDS = {
 }
 INTERRUPTED = 130  # 128 + SIGINT, as shells report it
 BROKEN_PIPE = 141  # 128 + SIGPIPE
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 DEBUG = "VVGT_TRACEBACK"
 
 
@@ -97,12 +99,21 @@ def _usage(error: click.ClickException) -> int:
 
 def _os_error(error: OSError) -> str:
     what = error.strerror or str(error) or type(error).__name__
-    return f"{error.filename}: {what}" if error.filename else what
+    if error.filename:
+        return f"{error.filename}: {what}"
+    if _stdout_fails() or error.errno in FULL:  # everything else that is written says its name
+        return f"standard output: {'it is closed' if error.errno == errno.EBADF else what}"
+    return what
 
 
-def _silence_stdout() -> None:
-    """Keep the interpreter from flushing into a closed pipe at exit."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+def _stdout_fails() -> bool:
+    """Whether what was printed cannot be written; the interpreter is kept from trying again at exit."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return True
+    return False
 
 
 def run(args: Sequence[str] | None = None) -> int:
@@ -130,7 +141,7 @@ def _status(error: BaseException) -> int:
     if isinstance(error, VvgtError):
         return _fail(str(error), error.exit_code)
     if isinstance(error, BrokenPipeError):
-        _silence_stdout()
+        _stdout_fails()
         return BROKEN_PIPE
     if isinstance(error, OSError):
         return _fail(_os_error(error), 1)
@@ -139,18 +150,16 @@ def _status(error: BaseException) -> int:
     if isinstance(error, KeyboardInterrupt):
         return _fail("interrupted", INTERRUPTED)
     if isinstance(error, SystemExit):
-        return error.code if isinstance(error.code, int) else 1
+        code = error.code if isinstance(error.code, int) else 1
+        name = ended_by(code)
+        return _fail(f"ended by {name}", code) if name else code
     return _fail(f"internal: {type(error).__name__}: {error} (a bug; {DEBUG}=1 shows where)", 1)
-
-
-def _terminate(number: int, frame: object) -> None:
-    """End as an exception does, so that temporary files are removed."""
-    sys.exit(128 + number)
 
 
 def main() -> None:
     """Entry point of the `vvgt` command."""
-    signal.signal(signal.SIGTERM, _terminate)
+    open_streams()
+    end_on_signals()
     warnings.showwarning = _note
     sys.exit(run())
 

@@ -293,7 +293,6 @@ def _tile(
 @kernel(
     "V f8 f8 f8:2 f8:2 f8:1 u1:3 f8:1 f8:2 f8:1 f8 i8:1 f8:2 b1:2 i8 f4:3",
     parallel=True,
-    nogil=True,
     fastmath=FLAGS,
     error_model="numpy",
 )

@@ -11,6 +11,7 @@ import numpy as np
 
 from vvgt_cli import __version__
 from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.files import seekable
 from vvgt_cli.gaussians.frames import rescale, turn, up_matrix
 from vvgt_cli.gaussians.header import REST_COUNTS, PlyHeader, parse_header
 from vvgt_cli.gaussians.types import SH_C0, Gaussians
@@ -154,7 +155,7 @@ def write_ply(target: str | Path | BinaryIO, gaussians: Gaussians, options: PlyO
     if isinstance(target, str | Path):
         with open(target, "wb") as stream:
             stream.write(header)
-            rows.tofile(stream)
+            stream.write(rows.data)  # not tofile, whose errors do not say why
     else:
         target.write(header)
         target.write(rows.tobytes())
@@ -164,7 +165,7 @@ def write_ply(target: str | Path | BinaryIO, gaussians: Gaussians, options: PlyO
 def _rows(source: str | Path | BinaryIO, name: str) -> tuple[PlyHeader, np.ndarray]:
     """Header and structured rows; the size is checked before anything is allocated."""
     if isinstance(source, str | Path):
-        with open(source, "rb") as stream:
+        with open(seekable(source), "rb") as stream:
             header = parse_header(stream.read(_HEADER_LIMIT), name)
             size = stream.seek(0, io.SEEK_END)
             _check_size(header, size, name)

@@ -15,6 +15,8 @@ NO_ENTRY: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True
 def kernel(usual: str = "", **options: Any) -> Callable[[Callable[..., Any]], Any]:
     """``numba.njit`` for functions that Python calls: compiled in another process, loaded from disk.
 
+    They run without the interpreter's lock, so that a signal is answered while they do (`vvgt_cli.cli.process`).
+
     Args:
         usual: types of the arguments as commands pass them: "f4:2 i8" is a C-contiguous float32 array of two axes and
             an int64, "V" a volume's values. What is compiled ahead (`vvgt_cli.jit.ahead`); other types are compiled
@@ -23,7 +25,7 @@ def kernel(usual: str = "", **options: Any) -> Callable[[Callable[..., Any]], An
     """
 
     def wrap(function: Callable[..., Any]) -> Any:
-        made: Any = nb.njit(**options)(function)
+        made: Any = nb.njit(nogil=True, **options)(function)
         if hasattr(made, "py_func"):  # with NUMBA_DISABLE_JIT it is the function
             made._cache = KernelCache(made)
             made.usual = usual

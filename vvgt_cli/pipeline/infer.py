@@ -11,7 +11,7 @@ from vvgt_cli.cameras import Camera
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.jit.ahead import INFER
 from vvgt_cli.pipeline.optimize import Views
-from vvgt_cli.pipeline.outputs import Output, check_outputs, write_text
+from vvgt_cli.pipeline.outputs import Output, claimed, write_text
 from vvgt_cli.pipeline.record import ConversionReport, Run
 from vvgt_cli.pipeline.render import layout_of, open_gaussians, write_gaussians
 from vvgt_cli.progress import Console
@@ -98,15 +98,18 @@ def infer_file(request: InferRequest, console: Console | None = None) -> Convers
         UsageError: an output that may not be written, no such model or provider.
         DataError: Gaussians, views or a model that are not what they must be.
     """
+    outputs = [Output("-o", request.output, (".ply",))]
+    if request.report:
+        outputs.append(Output("--report", request.report, (".json",), binary=False))
+    with claimed(outputs, [request.ply], request.overwrite):
+        return _infer_file(request, Run(console or Console(), ConversionReport("infer")))
+
+
+def _infer_file(request: InferRequest, run: Run) -> ConversionReport:
     from vvgt_cli.images.viewset import load_views
     from vvgt_cli.network.card import find_model
     from vvgt_cli.network.runtime import Model
 
-    outputs = [Output("-o", request.output, (".ply",))]
-    if request.report:
-        outputs.append(Output("--report", request.report, (".json",), binary=False))
-    check_outputs(outputs, [request.ply], request.overwrite)
-    run = Run(console or Console(), ConversionReport("infer"))
     with run.stage("read") as stage:
         model = Model.open(find_model(request.model), _threads(), request.provider)
         gaussians, header = open_gaussians(request.ply, run.console)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from vvgt_cli.cameras.files import read_cameras
+from vvgt_cli.files import seekable
 from vvgt_cli.gaussians import describe, read_ply
 from vvgt_cli.pipeline.render import STDIN
 from vvgt_cli.transfer.readers import SUFFIXES
@@ -29,16 +30,17 @@ def inspect(file: str, read: ReadOptions) -> dict[str, Any]:
         return {"kind": "gaussians", "name": "standard input", **describe(*read_ply(sys.stdin.buffer))}
     if not os.path.exists(file) and os.path.isfile(file.rpartition("#")[0]):  # a preset of several
         return _transfer_function(file)
-    if not os.path.isfile(file):  # standard input, example:NAME, a folder, a glob, FILE:/array, or nothing
+    path = seekable(file)
+    if not os.path.isfile(path):  # standard input, example:NAME, a folder, a glob, FILE:/array, or nothing
         return _volume(file, read)
-    path = Path(file)
+    name = Path(file)
     with path.open("rb") as stream:
         head = stream.read(_HEAD)
     if head.startswith(_PLY):
-        return {"kind": "gaussians", "name": path.name, **describe(*read_ply(path))}
-    if path.suffix.lower() in SUFFIXES or head.lstrip()[:1] in (b"{", b"["):
+        return {"kind": "gaussians", "name": name.name, **describe(*read_ply(path))}
+    if name.suffix.lower() in SUFFIXES or head.lstrip()[:1] in (b"{", b"["):
         if b'"frames"' in head:
-            return _views(path)
+            return _views(name)
         return _transfer_function(file)
     return _volume(file, read)
 

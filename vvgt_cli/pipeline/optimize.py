@@ -19,7 +19,7 @@ from vvgt_cli.gaussians import Gaussians, as_stored
 from vvgt_cli.images.viewset import load_views
 from vvgt_cli.jit.ahead import OPTIMIZE
 from vvgt_cli.optimize import OptimizeOptions, OptimizeRecord, optimize
-from vvgt_cli.pipeline.outputs import Output, check_outputs, write_text
+from vvgt_cli.pipeline.outputs import Output, check_outputs, claimed, write_text
 from vvgt_cli.pipeline.record import ConversionReport, Run
 from vvgt_cli.pipeline.render import file_rule, layout_of, open_gaussians, write_gaussians
 from vvgt_cli.pipeline.result import Result
@@ -104,17 +104,17 @@ def optimize_file(request: OptimizeRequest, console: Console | None = None) -> C
         UsageError: an output that may not be written; found before anything is read.
         DataError: a `.ply` or a folder of views that is not one.
     """
-    run = Run(console or Console(), ConversionReport("optimize"))
-    check_outputs(request.outputs(), request.inputs(), request.overwrite)
     if request.options.checkpoint:
         check_outputs([Output("--checkpoint", request.options.checkpoint, (".npz",))], request.inputs(), True)
-    result = optimized(run, request)
-    assert request.output is not None
-    write_gaussians(run, request.output, result.gaussians, result.ply, request.overwrite)
-    run.finish()
-    if request.report:
-        write_text(request.report, run.report.to_json(), request.overwrite)
-    return run.report
+    with claimed(request.outputs(), request.inputs(), request.overwrite):
+        run = Run(console or Console(), ConversionReport("optimize"))
+        result = optimized(run, request)
+        assert request.output is not None
+        write_gaussians(run, request.output, result.gaussians, result.ply, request.overwrite)
+        run.finish()
+        if request.report:
+            write_text(request.report, run.report.to_json(), request.overwrite)
+        return run.report
 
 
 def optimized(run: Run, request: OptimizeRequest) -> Result:

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 from vvgt_cli.errors import UsageError
-from vvgt_cli.files import atomic_write, check_target
+from vvgt_cli.files import atomic_write, check_room, check_target, claim, is_stream
 
 STDOUT = "-"
+SMALLEST = 4096  # bytes: a disk that has not got them takes no file
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,8 @@ def _check_one(output: Output, overwrite: bool) -> None:
             raise UsageError(f"{output.option} -: standard output is a terminal; redirect it to a file or a pipe")
         return
     path = Path(output.path)
+    if is_stream(path):
+        return
     if output.suffixes and path.suffix.lower() not in output.suffixes:
         raise UsageError(f"{output.option} {path}: expected a name ending in {' or '.join(output.suffixes)}")
     try:
@@ -45,6 +49,7 @@ def _check_one(output: Output, overwrite: bool) -> None:
         raise UsageError(f"{output.option}: {error}") from None
     if not os.access(path.parent, os.W_OK):
         raise UsageError(f"{output.option} {path}: directory {path.parent} is not writable")
+    check_room(path, SMALLEST)
 
 
 def check_outputs(outputs: Sequence[Output], inputs: Sequence[str | None], overwrite: bool) -> None:
@@ -57,6 +62,7 @@ def check_outputs(outputs: Sequence[Output], inputs: Sequence[str | None], overw
 
     Raises:
         UsageError: exists, is an input, two outputs in one place, no such directory, wrong ending, a terminal.
+        DataError: the disk is full.
     """
     taken: dict[str, str] = {}
     sources = {os.path.realpath(path) for path in inputs if path and path != STDOUT}
@@ -68,6 +74,22 @@ def check_outputs(outputs: Sequence[Output], inputs: Sequence[str | None], overw
         if place in taken:
             raise UsageError(f"{output.option} and {taken[place]} both go to {output.path}; choose two names")
         taken[place] = output.option
+
+
+@contextmanager
+def claimed(outputs: Sequence[Output], inputs: Sequence[str | None], overwrite: bool) -> Iterator[None]:
+    """`check_outputs`, and within the block nobody else may write them (`vvgt_cli.files.claim`).
+
+    Raises:
+        UsageError: as `check_outputs`, or another run is at work on one of them.
+    """
+    check_outputs(outputs, inputs, overwrite)
+    with ExitStack() as claims:
+        for output in outputs:
+            if output.path != STDOUT:
+                claims.enter_context(claim(output.path))
+        check_outputs(outputs, inputs, overwrite)  # another run may have ended meanwhile
+        yield
 
 
 def write_text(path: str, text: str, overwrite: bool) -> None:

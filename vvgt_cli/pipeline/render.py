@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import secrets
 import sys
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -11,8 +14,8 @@ from vvgt_cli.cameras import Camera, orbit_views
 from vvgt_cli.cameras.boxed import boxed
 from vvgt_cli.cameras.files import read_cameras, transforms_json
 from vvgt_cli.cameras.sets import SIZE
-from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.files import atomic_write
+from vvgt_cli.errors import DataError, UsageError, VvgtError
+from vvgt_cli.files import atomic_write, is_stream
 from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions, in_unit_frame, read_ply, write_ply
 from vvgt_cli.gaussians.frames import upright_matrix
 from vvgt_cli.jit.ahead import DRAW
@@ -111,10 +114,39 @@ def write_gaussians(run: Run, output: str, gaussians: Gaussians, options: PlyOpt
             report.bytes = write_ply(sys.stdout.buffer, gaussians, options)
             sys.stdout.buffer.flush()
         else:
-            with atomic_write(output, overwrite) as temporary:
-                report.bytes = write_ply(temporary, gaussians, options)
+            report.bytes = _write_file(output, gaussians, options, overwrite)
         report.gaussians = len(gaussians)
         stage.note = f"{output}: {len(gaussians)} Gaussians, {report.bytes / 1e6:.1f} MB"
+
+
+def _write_file(output: str, gaussians: Gaussians, options: PlyOptions, overwrite: bool) -> int:
+    """Write a `.ply`; where that fails, put it elsewhere and say so: it may have taken hours."""
+    if is_stream(output):
+        with open(output, "ab") as stream:
+            return write_ply(stream, gaussians, options)
+    try:
+        with atomic_write(output, overwrite) as temporary:
+            return write_ply(temporary, gaussians, options)
+    except VvgtError as error:
+        if isinstance(error, DataError) and not isinstance(error.__cause__, OSError):
+            raise  # these Gaussians cannot be written anywhere
+        place = _elsewhere(Path(output), gaussians, options)
+        if place is None:
+            raise
+        raise type(error)(f"{error}; what was computed lies in {place}") from error
+
+
+def _elsewhere(output: Path, gaussians: Gaussians, options: PlyOptions) -> Path | None:
+    """Write a `.ply` to the temporary folder, else to the working folder; where it is, None where neither takes it."""
+    name = f"{output.stem[:80]}.{secrets.token_hex(4)}.ply"
+    for find in (tempfile.gettempdir, os.getcwd):
+        try:
+            with atomic_write(Path(find(), name)) as temporary:
+                write_ply(temporary, gaussians, options)
+            return Path(find(), name)
+        except (OSError, VvgtError):
+            continue
+    return None
 
 
 def _check_directory(request: RenderRequest, names: list[str]) -> None:

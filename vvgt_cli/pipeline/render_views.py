@@ -17,7 +17,7 @@ from vvgt_cli.cameras.boxed import drawn_in_box
 from vvgt_cli.cameras.files import read_frames
 from vvgt_cli.cameras.sets import FIELD_OF_VIEW, RADIUS, SET_VIEWS, SIZE
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.files import atomic_write
+from vvgt_cli.files import atomic_write, claim
 from vvgt_cli.images import write_png
 from vvgt_cli.jit.ahead import VIEWS
 from vvgt_cli.pipeline.manifest import Manifest, Shard, cameras_digest, digest, volume_digest
@@ -262,12 +262,13 @@ def _work(run: Run, request: ViewsRequest, job: _Job, views: list[View]) -> None
             stage.note = f"{len(points)} points to start from"
     for name in ("", *layout.folders(views)):
         (job.folder / name).mkdir(parents=True, exist_ok=True)
-    if job.files or not (job.folder / request.shard.manifest).exists():
-        manifest.record()  # first: it claims the folder
-        _write(manifest, {name: built[name] for name in job.files})
-    if job.pending:
-        _render(run, request, job, draw)
-    _contact(run, job, layout, views)
+    with claim(job.folder / request.shard.manifest):
+        if job.files or not (job.folder / request.shard.manifest).exists():
+            manifest.record()  # first: it says whose the folder is
+            _write(manifest, {name: built[name] for name in job.files})
+        if job.pending:
+            _render(run, request, job, draw)
+        _contact(run, job, layout, views)
 
 
 def _render(run: Run, request: ViewsRequest, job: _Job, draw: Callable[[Camera], np.ndarray]) -> None:

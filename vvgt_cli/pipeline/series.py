@@ -13,7 +13,7 @@ import numpy as np
 
 from vvgt_cli import __version__
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.files import read_text
+from vvgt_cli.files import claim, read_text
 from vvgt_cli.network.card import CARD, find_model
 from vvgt_cli.pipeline.convert import ConvertRequest, convert
 from vvgt_cli.pipeline.manifest import Manifest, Shard, digest, volume_digest
@@ -174,12 +174,29 @@ def convert_series(request: ConvertRequest, shard: Shard, console: Console | Non
     if all(dark):
         raise DataError(f"{source.volume}: {tf.name} shows nothing in any of {len(steps)} frames; try another function")
     manifest = Manifest(Path(names[0][0]).parent, _settings(request, frames, tf, distance[0]), shard, what="frames")
-    manifest.open([Path(name).name for row in names for name in row], request.overwrite)
-    manifest.record()  # claims the folder
+    with claim(manifest.folder / shard.manifest):
+        manifest.open([Path(name).name for row in names for name in row], request.overwrite)
+        manifest.record()
+        done = _frames(request, source, steps, names, dark, manifest, console)
+    mine = sum(shard.holds(k) and not d for k, d in enumerate(dark))
+    console.say(f"{done} frames converted, {mine - done} were done before")
+    return done
+
+
+def _frames(
+    request: ConvertRequest,
+    source: SourceRequest,
+    steps: Sequence[Step],
+    names: Sequence[list[str]],
+    dark: Sequence[bool],
+    manifest: Manifest,
+    console: Console,
+) -> int:
+    """Convert what is missing of this part's frames; returns how many."""
     done = 0
     for k, step in enumerate(steps):
         own = [Path(name).name for name in names[k]]
-        if not shard.holds(k) or all(map(manifest.complete, own)):
+        if not manifest.shard.holds(k) or all(map(manifest.complete, own)):
             continue
         if dark[k]:
             console.say(f"{step.name}: nothing of it is visible; it gets no file")
@@ -190,8 +207,6 @@ def convert_series(request: ConvertRequest, shard: Shard, console: Console | Non
             raise KeyboardInterrupt  # the frame is there, but not what it would be: it is made again
         manifest.record(own)
         done += 1
-    mine = sum(shard.holds(k) and not d for k, d in enumerate(dark))
-    console.say(f"{done} frames converted, {mine - done} were done before")
     return done
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from vvgt_cli.errors import UsageError
-from vvgt_cli.pipeline.outputs import Output, check_outputs
+from vvgt_cli.pipeline.outputs import Output, claimed
 from vvgt_cli.pipeline.record import ConversionReport, Run
 from vvgt_cli.progress import Console
 from vvgt_cli.volume.types import Volume
@@ -42,16 +42,21 @@ def synthesise(request: SynthRequest, console: Console | None = None) -> Convers
         UsageError: options that the kind does not have, an output that may not be written.
         DataError: a volume that memory does not hold.
     """
-    from vvgt_cli.synth.shapes import SHAPES, make_shape
-    from vvgt_cli.volume.nrrd_write import write_nrrd
+    from vvgt_cli.synth.shapes import SHAPES
 
     shape = request.kind in SHAPES
     if shape and (request.field or request.turnovers is not None):
         raise UsageError(f"synth {request.kind}: --field and --turnovers are of isotropic and stratified turbulence")
     if request.field == "temperature" and request.kind != "stratified":
         raise UsageError(f"synth {request.kind}: --field temperature is of stratified turbulence alone")
-    check_outputs([Output("-o", request.output, (".nrrd",))], [], request.overwrite)
-    run = Run(console or Console(), ConversionReport("synth"))
+    with claimed([Output("-o", request.output, (".nrrd",))], [], request.overwrite):
+        return _make(request, Run(console or Console(), ConversionReport("synth")), shape)
+
+
+def _make(request: SynthRequest, run: Run, shape: bool) -> ConversionReport:
+    from vvgt_cli.synth.shapes import make_shape
+    from vvgt_cli.volume.nrrd_write import write_nrrd
+
     with run.stage(request.kind) as stage:
         if shape:
             volume = make_shape(request.kind, request.size or SHAPE_SIZE, request.seed)

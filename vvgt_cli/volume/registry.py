@@ -16,7 +16,8 @@ from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 
-from vvgt_cli.errors import DataError, SeveralSteps, UsageError
+from vvgt_cli.errors import DataError, SeveralSteps, UsageError, VvgtError
+from vvgt_cli.files import seekable
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.space import in_space
 from vvgt_cli.volume.types import Volume
@@ -126,6 +127,8 @@ def _read(source: str, options: ReadOptions) -> Volume:
     if colon and scheme in _SCHEMES:
         return _SCHEMES[scheme](rest, options)
     path, options = _inner(source, options)
+    if (kept := seekable(path)) != path:
+        return _from_pipe(kept, path, source, options)
     slices = _slices(source, options)
     if slices is not None:
         return slices
@@ -138,6 +141,15 @@ def _read(source: str, options: ReadOptions) -> Volume:
         raise DataError(f"{source}: damaged {reader.name} file ({text}); check that it is whole") from error
     except MemoryError as error:
         raise DataError(f"{source}: not enough memory to read it; try a machine with more") from error
+
+
+def _from_pipe(kept: Path, path: Path, source: str, options: ReadOptions) -> Volume:
+    """The volume that came through the pipe ``path`` and lies in ``kept``."""
+    try:
+        return replace(_read(str(kept), options), name=path.name)
+    except VvgtError as error:
+        error.args = (re.sub(rf"(?:{kept}|^{kept.name})(?=: )", lambda _: source, str(error)),)
+        raise
 
 
 def time_steps(source: str, options: ReadOptions) -> int:

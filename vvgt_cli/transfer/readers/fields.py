@@ -13,6 +13,7 @@ from xml.parsers import expat
 import numpy as np
 
 from vvgt_cli.errors import DataError
+from vvgt_cli.files import seekable
 
 MAX_BYTES = 16 * 2**20
 
@@ -65,10 +66,11 @@ def _elements(text: str, path: Path) -> Elements:
 
 def _text(path: Path) -> str:
     try:
-        size = path.stat().st_size
+        kept = seekable(path)
+        size = kept.stat().st_size
         if size > MAX_BYTES:
             raise DataError(f"{path}: {size} bytes; expected a transfer function of at most 16 MiB")
-        with path.open("rb") as file:
+        with kept.open("rb") as file:
             raw = file.read(MAX_BYTES + 1)
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror or error})") from error

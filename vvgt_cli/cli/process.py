@@ -1,0 +1,76 @@
+"""What the process has of the system: its three streams, whatever they are, and an end within seconds when asked."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+import time
+from contextlib import suppress
+from typing import Any
+
+from vvgt_cli.files import discard_leftovers
+from vvgt_cli.progress import Talk
+
+GRACE = 1.0  # seconds to end as an exception does, after which the process ends as it is
+ENDING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
+
+
+def open_streams() -> None:
+    """Put something where standard input, output or error are closed, and let talk fail unheard.
+
+    Otherwise the next file that is opened would get their numbers, and what libraries print would end in it. Writing
+    to a standard output that is closed fails, as it must.
+    """
+    for number, name, mode in ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w")):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_WRONLY if number == 2 else os.O_RDONLY)  # gets the lowest number that is free
+            os.set_inheritable(number, True)
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(number, mode, closefd=False))  # noqa: SIM115 - lives as long as the process
+    stderr: Any = Talk(sys.stderr)
+    sys.stderr = stderr
+
+
+def end_on_signals() -> None:
+    """Let SIGTERM and SIGHUP (unless it is ignored, as under nohup) end the process as an exception does.
+
+    Python runs handlers between two steps of its own, so that one second in a kernel would go by unanswered, or
+    twenty. So another thread listens too: what has not ended after `GRACE` seconds ends without unwinding, its
+    temporary files removed. Where somebody else has taken a signal over (training does), it is theirs.
+    """
+    for number in ENDING:
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, _end)
+    if os.name == "posix":
+        reader, writer = os.pipe()
+        os.set_blocking(writer, False)
+        signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
+        threading.Thread(target=_listen, args=(reader,), daemon=True).start()
+
+
+def ended_by(status: int) -> str | None:
+    """Name of the signal that an exit status stands for, None where it is another's."""
+    return next((signal.Signals(number).name for number in ENDING if status == 128 + number), None)
+
+
+def _end(number: int, frame: object) -> None:
+    sys.exit(128 + number)
+
+
+def _listen(reader: int) -> None:
+    while numbers := os.read(reader, 64):
+        for number in numbers:
+            if number in ENDING and signal.getsignal(number) is _end:
+                time.sleep(GRACE)
+                _leave(number)
+
+
+def _leave(number: int) -> None:
+    discard_leftovers()
+    with suppress(OSError):
+        os.write(2, f"vvgt: error: ended by {signal.Signals(number).name}\n".encode())
+    os._exit(128 + number)
