@@ -110,7 +110,9 @@ def test_results_are_drawn_scored_and_shown(field, converted):
     assert sheet.shape == (3 * 32, 3 * 32, 3)
     assert converted._repr_png_().startswith(b"\x89PNG")
     scores = vvgt.evaluate(converted, field, TF, spacing=SPACING, seats=False, step=0.5)
-    assert scores.scores["psnr"] == pytest.approx(converted.scores["psnr"], abs=0.7)
+    ten = [view["psnr"] for view in scores.scores["per_view"]]
+    three = [-10 * np.log10(np.mean([10 ** (-ten[n] / 10) for n in (0, 4, 9)])), np.mean([ten[n] for n in (0, 4, 9)])]
+    assert min(three) - 0.3 < converted.scores["psnr"] < max(three) + 0.3
     assert scores.size == 48
 
 

@@ -30,6 +30,11 @@ from vvgt_cli.progress import Console
 @placed_read_options
 @click.option("--report", metavar="R.json", help="Write times and errors of every stage as JSON; - is standard output.")
 @click.option("--preview", metavar="P.png", help="Write reference, ours and difference of three test views.")
+@click.option(
+    "--checkpoint",
+    metavar="FOLDER",
+    help="For long runs: keeps what each stage made until OUT.ply is written; the same command goes on there.",
+)
 @click.option("--shard", metavar="I/N", help="Of a series: convert part I of N, for job arrays; I counts from 1.")
 @overwrite_option
 @common_options
@@ -65,7 +70,10 @@ def command(volume: str, shard: str | None, console: Console, **options: Any) ->
     from vvgt_cli.pipeline.series import convert_series, is_pattern
 
     request = convert_request(volume, **options)
-    if is_pattern(options["output"]):
+    series = is_pattern(options["output"])
+    if series and request.checkpoint is not None:
+        raise UsageError("--checkpoint is of one volume; a series goes on by its manifest: leave the option out")
+    if series:
         from vvgt_cli.pipeline.render_views import parse_shard
 
         convert_series(request, parse_shard(shard or "1/1"), console)

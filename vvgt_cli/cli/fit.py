@@ -101,6 +101,7 @@ def convert_request(
     model: str | None = None,
     limits: dict[str, Any] | None = None,
     dry_run: bool = False,
+    checkpoint: str | None = None,
 ) -> ConvertRequest:
     """The request that the options of `convert` and `init` add up to."""
     from vvgt_cli.gaussians import PlyOptions
@@ -119,4 +120,5 @@ def convert_request(
         report,
         preview,
         overwrite,
+        checkpoint,
     )

@@ -66,7 +66,7 @@ def resume(path: str, key: str, state: State, judge: Judge, record: OptimizeReco
     if not Path(path).exists():
         return None
     try:
-        about, arrays = _load(path)
+        about, arrays = load_archive(path)
         if about["key"] != key:
             raise UsageError(f"{path}: checkpoint of a run with other Gaussians, views or options; name another file")
         own = state.saved()
@@ -89,7 +89,7 @@ def resume(path: str, key: str, state: State, judge: Judge, record: OptimizeReco
     return walk
 
 
-def _load(path: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+def load_archive(path: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """What was said about the run, and the arrays; all as it lies in the file, so that nothing grows in memory."""
     with zipfile.ZipFile(path) as archive:
         entries = archive.infolist()

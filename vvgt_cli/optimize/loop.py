@@ -27,6 +27,7 @@ SLOWER = 0.5  # rates after a fall
 LOOKS = 8  # at the check views in a run, where that leaves enough steps between two
 SETTLING = 0.5  # share of the run from which on looks without gain count: rates fall only then
 MEMORY = 0.9  # of the running error, a step
+KEEP = 30.0  # seconds after which a run is kept, looks or not
 State = OwnFrame | Fields
 
 
@@ -51,6 +52,7 @@ def run(
     if not record.checks:
         judge.look(0.0)
         record.psnr_before = judge.best
+    saved = entered
     spent, began = walk.elapsed, time.perf_counter() - walk.elapsed
     for _ in range(record.steps):
         next(order)
@@ -71,7 +73,10 @@ def run(
             walk.looked = record.steps
             if judge.look(time.perf_counter() - began, share >= SETTLING):
                 walk.speed *= SLOWER
-            keep()
+        elif time.perf_counter() < saved + KEEP:
+            continue
+        keep()
+        saved = time.perf_counter()
     keep()  # before the last look: a run that goes on from here would not have taken it
     judge.look(time.perf_counter() - began)
     result = judge.result(gaussians)

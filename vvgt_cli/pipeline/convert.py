@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vvgt_cli.errors import DataError
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.files import check_room
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored
 from vvgt_cli.jit.ahead import CONVERT, INIT
 from vvgt_cli.network.card import find_model, read_card
 from vvgt_cli.pipeline.mend import check_view_memory, mend, wide
-from vvgt_cli.pipeline.outputs import Output, check_outputs, write_text
+from vvgt_cli.pipeline.outputs import STDOUT, Output, claimed, write_text
 from vvgt_cli.pipeline.place import AUTO, out_of_box, placed, remarks, way_up
-from vvgt_cli.pipeline.plan import Limits, Planner, estimate, view_edge
+from vvgt_cli.pipeline.plan import Costs, Limits, Planner, estimate, file_bytes, view_edge
 from vvgt_cli.pipeline.record import ConversionReport, Run
 from vvgt_cli.pipeline.render import write_gaussians
 from vvgt_cli.pipeline.result import PREVIEW_VIEWS, Conversion
+from vvgt_cli.pipeline.resume import CLOSED_FORM, FITTED, Stages, checkpoint_folder, stages_of
 from vvgt_cli.pipeline.score import psnr_note, score_test_views
 from vvgt_cli.pipeline.seats import SIDE, from_above, score_seats
 from vvgt_cli.pipeline.source import Source, SourceRequest, load
@@ -72,6 +75,7 @@ class ConvertRequest:
         preview: PNG to write (reference, ours, difference of a few test views), None for none.
         overwrite: replace files that exist.
         all_views: score on all ten test views, by SSIM and FLIP too, as a report has it.
+        checkpoint: folder that keeps what the stages make, until the output is written; None for none.
     """
 
     source: SourceRequest
@@ -84,6 +88,7 @@ class ConvertRequest:
     report: str | None = None
     preview: str | None = None
     overwrite: bool = False
+    checkpoint: str | None = None
     all_views: bool = False
 
     def budget(self) -> int:
@@ -108,6 +113,10 @@ class ConvertRequest:
             outputs.append(Output("--preview", self.preview, (".png",)))
         return outputs
 
+    def inputs(self) -> list[str]:
+        """Files that are read."""
+        return self.source.paths()
+
 
 def convert(request: ConvertRequest, console: Console | None = None) -> ConversionReport:
     """Volume to `.ply`: `made`, and its outputs written.
@@ -117,10 +126,17 @@ def convert(request: ConvertRequest, console: Console | None = None) -> Conversi
         DataError: input that is not what it must be, or a scene that shows nothing.
     """
     request.budget()
+    if request.checkpoint is not None and request.limits.time_budget is not None:
+        raise UsageError("--checkpoint is of runs that repeat to the byte, --time-budget of others; give one of both")
     run = Run(console or Console(), ConversionReport("convert"))
-    check_outputs(request.outputs(), request.source.paths(), request.overwrite)
-    conversion = made(run, request)
-    return run.finish() if conversion is None else _write(run, request, conversion)
+    with claimed(request.outputs(), request.inputs(), request.overwrite), checkpoint_folder(request.checkpoint):
+        conversion = made(run, request)
+        if conversion is None:
+            return run.finish()
+        report = _write(run, request, conversion)
+        if request.checkpoint is not None and not _interrupted(run):
+            Stages(Path(request.checkpoint)).finish()
+        return report
 
 
 def in_memory(
@@ -145,14 +161,14 @@ def initialise_only(request: ConvertRequest, console: Console | None = None) -> 
         UsageError, DataError: as `convert`.
     """
     run = Run(console or Console(), ConversionReport("init"))
-    check_outputs(request.outputs(), request.source.paths(), request.overwrite)
-    source, scene = _begin(run, request)
-    start = _closed_form(run, scene, request.fit)
-    return _write(run, request, _conversion(run, request, source, scene, as_stored(start.gaussians)))
+    with claimed(request.outputs(), request.inputs(), request.overwrite):
+        source, scene = _begin(run, request)
+        start = _closed_form(run, scene, request.fit)
+        return _write(run, request, _conversion(run, request, source, scene, as_stored(start.gaussians)))
 
 
 def made(run: Run, request: ConvertRequest) -> Conversion | None:
-    """Closed form, what the training views can mend, gradient descent; scored on the test views. Nothing is written.
+    """Closed form, what views can mend of it, gradient descent; scored on the test views; only checkpoints are written.
 
     What of these is done, and with how many Gaussians, follows from the request's limits and what the stages cost
     (`pipeline.plan`); the check views decide. What is left out is said, and costs nothing.
@@ -175,15 +191,36 @@ def made(run: Run, request: ConvertRequest) -> Conversion | None:
     check_view_memory(plan, fit.size)
     if request.dry_run:
         return None
-    start = _closed_form(run, scene, fit)
+    stages = stages_of(request, source, fit)
+    kept = stages.load(FITTED)
+    gaussians = kept[0] if kept else _fitted(run, request, scene, fit, planner, costs, stages)
+    if kept:
+        run.console.say(f"{request.checkpoint} holds the fitted Gaussians: only the scores are left")
+    _score(run, request, scene, gaussians)
+    return _conversion(run, request, source, scene, gaussians)
+
+
+def _fitted(
+    run: Run, request: ConvertRequest, scene: Scene, fit: FitOptions, planner: Planner, costs: Costs, stages: Stages
+) -> Gaussians:
+    """Closed form, and what views can mend of it; as the file will hold it."""
+    start = _closed_form(run, scene, fit, stages if request.limits.target_psnr is None and fit.steps != 0 else Stages())
+    if request.output not in (None, STDOUT):
+        check_room(request.output, file_bytes(len(start.gaussians), request.ply.sh_degree))
     planner = replace(planner, wide=wide(start.gaussians, fit.size))
     plan = planner.plan(
         costs.at(max(run.report.stages[-1].seconds / costs.closed_form, QUICKEST)), run.elapsed(), begun=True
     )
     check_view_memory(plan, fit.size)
-    gaussians = as_stored(mend(run, scene, start, plan, request.limits, fit))  # what is scored is what the file holds
-    _score(run, request, scene, gaussians)
-    return _conversion(run, request, source, scene, gaussians)
+    gaussians = as_stored(mend(run, scene, start, plan, request.limits, fit, stages.descent))
+    if not _interrupted(run):
+        stages.save(FITTED, gaussians)
+    return gaussians
+
+
+def _interrupted(run: Run) -> bool:
+    """Whether Ctrl-C ended gradient descent: the same command then goes on with it."""
+    return run.report.refinement is not None and run.report.refinement["reason"] == "interrupted"
 
 
 def _conversion(run: Run, request: ConvertRequest, source: Source, scene: Scene, gaussians: Gaussians) -> Conversion:
@@ -259,9 +296,15 @@ def tf_record(source: Source, request: SourceRequest) -> dict[str, Any]:
     }
 
 
-def _closed_form(run: Run, scene: Scene, fit: FitOptions) -> Start:
-    from vvgt_cli.vbm import VbmOptions, initialise
+def _closed_form(run: Run, scene: Scene, fit: FitOptions, stages: Stages | None = None) -> Start:
+    """The closed form, or what is kept of it: without the pyramid, which views cut anew for a target or no steps."""
+    from vvgt_cli.vbm import Start, VbmOptions, initialise
 
+    stages = stages or Stages()
+    if kept := stages.load(CLOSED_FORM):
+        with run.stage("closed form") as stage:
+            stage.note = f"{len(kept[0])} Gaussians, as kept in {stages.folder}"
+        return Start(kept[0], None)
     options = VbmOptions(max_gaussians=fit.max_gaussians, size=fit.size, method=fit.init, seed=fit.seed)
     with run.stage("closed form") as stage:
         start = initialise(scene, options, progress=run.console.bar("closed form"))
@@ -274,6 +317,7 @@ def _closed_form(run: Run, scene: Scene, fit: FitOptions) -> Start:
         stage.note = f"{len(start.gaussians)} Gaussians ({fit.init})"
     if spared:
         run.leave_out(f"{spared} Gaussians", "so faint that viewers differ on what they draw of them")
+    stages.save(CLOSED_FORM, start.gaussians)
     return start
 
 

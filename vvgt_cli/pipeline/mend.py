@@ -18,9 +18,9 @@ from vvgt_cli.optimize import OptimizeOptions
 from vvgt_cli.pipeline.optimize import Views, refine
 from vvgt_cli.pipeline.plan import SMALLER, Limits, Plan, view_edge, views_of
 from vvgt_cli.pipeline.record import Run
+from vvgt_cli.resources import free_memory
 from vvgt_cli.splat.constants import MIN_ALPHA
 from vvgt_cli.splat.rules import Rule, rule_of
-from vvgt_cli.volume.blocks import free_memory
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import RenderSettings, Scene
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 VIEW_BYTES = 2 * 16  # a pixel: float32 RGBA, and as much again while views are stacked
 MARGIN, SAMPLES = 4.0, 12.0  # dB, where views are means over their pixels, and where they are samples of a screen's
 SMALLEST = 0.5  # standard deviation of the longest axis in pixels of the screen: viewers drop or fade less
+MOST = 0.99  # of the Gaussians: as many are left where small ones are widened, as a rule
 LARGE = 0.5  # of the screen: views as large are means over their own pixels
 WIDE = 0.9  # standard deviation in pixels of whole training views
 LOOK = 25  # steps between two looks at the check views where a target ends the run; else one is taken in the middle
@@ -66,13 +67,18 @@ def judging_views(scene: Scene, cameras: Sequence[Camera], settings: RenderSetti
     return Views(list(cameras), np.stack(images), known or None)
 
 
-def mend(run: Run, scene: Scene, start: Start, plan: Plan, limits: Limits, fit: FitOptions) -> Gaussians:
-    """The closed form after what the plan has for it, or as much of it as the target asks for."""
+def mend(
+    run: Run, scene: Scene, start: Start, plan: Plan, limits: Limits, fit: FitOptions, checkpoint: str | None = None
+) -> Gaussians:
+    """The closed form after what the plan has for it, or as much of it as the target asks for.
+
+    ``checkpoint``: file by which gradient descent goes on where it ended.
+    """
     target = limits.target_psnr is not None
     if not (plan.back_project or plan.steps or plan.network or (target and plan.judge)):
         _say(run, plan.left_out)
         return start.gaussians
-    stage = _Mending(run, scene, plan, limits, fit)
+    stage = _Mending(run, scene, plan, limits, fit, checkpoint)
     if stage.enough(start.gaussians):
         unneeded = {"network": plan.network, "back-projection": plan.back_project, "refinement": plan.steps}
         _say(run, [(name, stage.reached()) for name, planned in unneeded.items() if planned])
@@ -84,7 +90,7 @@ def mend(run: Run, scene: Scene, start: Start, plan: Plan, limits: Limits, fit: 
     if plan.steps and stage.enough(gaussians):
         _say(run, [("refinement", stage.reached())])
         return gaussians
-    return drawn_by_all(stage.refine(gaussians), fit.size) if plan.steps else gaussians
+    return stage.shown(stage.refine(gaussians)) if plan.steps else gaussians
 
 
 def _say(run: Run, left_out: list[tuple[str, str]]) -> None:
@@ -95,10 +101,13 @@ def _say(run: Run, left_out: list[tuple[str, str]]) -> None:
 class _Mending:
     """Check views, and what is done with them."""
 
-    def __init__(self, run: Run, scene: Scene, plan: Plan, limits: Limits, fit: FitOptions) -> None:
+    def __init__(
+        self, run: Run, scene: Scene, plan: Plan, limits: Limits, fit: FitOptions, checkpoint: str | None
+    ) -> None:
         from vvgt_cli.dvr import RenderSettings
         from vvgt_cli.dvr.render import FIT_VIEWS
 
+        self.checkpoint = checkpoint
         self.run, self.scene, self.plan, self.limits, self.fit = run, scene, plan, limits, fit
         cameras = default_views("check", size=fit.size)
         with run.stage("check views") as stage:
@@ -181,9 +190,17 @@ class _Mending:
         target = self.limits.target_psnr
         options = OptimizeOptions(
             steps=self.plan.most_steps, time_budget=left, target_psnr=target, rule=self.train_rule, judge=self.rule,
-            seed=self.fit.seed, check_every=LOOK if target is not None else max(LOOK, self.plan.most_steps // 2),
+            seed=self.fit.seed, checkpoint=self.checkpoint,
+            check_every=LOOK if target is not None else max(LOOK, self.plan.most_steps // 2),
         )  # fmt: skip
         return refine(self.run, gaussians, train, self.check, options)
+
+    def shown(self, gaussians: Gaussians) -> Gaussians:
+        """`drawn_by_all`; where that leaves out many, the mass is counted as the check views agree."""
+        kept = drawn_by_all(gaussians, self.fit.size)
+        if len(kept) >= MOST * len(gaussians):
+            return kept
+        return max(kept, drawn_by_all(gaussians, self.fit.size, self.rule.dilation), key=self.psnr)
 
     def _rendered(self, count: int) -> Views:
         """Training views."""
@@ -218,16 +235,21 @@ def fine_enough(scene: Scene, start: Gaussians, size: int, rule: Rule, footprint
     return one if enough else many
 
 
-def drawn_by_all(gaussians: Gaussians, size: int) -> Gaussians:
+def drawn_by_all(gaussians: Gaussians, size: int, dilation: float = 0.0) -> Gaussians:
     """Without what viewers leave out: splats that never reach 1/255, and, widened with their mass kept, small ones.
 
-    ``size``: pixels along the edge of the screen that the file is made for; none stays narrower than `SMALLEST` there.
+    Args:
+        gaussians: in the unit frame.
+        size: pixels along the edge of the screen that the file is made for; none stays narrower than `SMALLEST` there.
+        dilation: px^2 that the mass is counted with; 0 as viewers count it that compensate theirs.
     """
     opacity = 1 / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64)))
     camera = default_views("check", 1, size=size)[0]
     pixel = float(np.linalg.norm(camera.position)) / camera.fx
-    widening = np.maximum(SMALLEST * pixel / np.exp(gaussians.log_scales.max(axis=1).astype(np.float64)), 1)
-    opacity = np.clip(opacity / widening**2, 1e-7, 1 - 1e-7)
+    width = np.exp(gaussians.log_scales.max(axis=1).astype(np.float64))
+    widening = np.maximum(SMALLEST * pixel / width, 1)
+    beside = dilation * (pixel / width) ** 2
+    opacity = np.clip(opacity / ((widening**2 + beside) / (1 + beside)), 1e-7, 1 - 1e-7)
     kept = opacity >= MIN_ALPHA
     if not kept.any():
         return gaussians
