@@ -30,12 +30,12 @@ import numpy as np
 from closed_form import read_options
 
 from vvgt_cli.cameras import Camera, default_views
+from vvgt_cli.descent import OptimizeOptions, optimize
 from vvgt_cli.dvr import RenderSettings, Scene, render_views
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.metrics import score_views, ssim
 from vvgt_cli.network.card import find_model
 from vvgt_cli.network.runtime import Model
-from vvgt_cli.optimize import OptimizeOptions, optimize
 from vvgt_cli.pipeline.source import SourceRequest, load
 from vvgt_cli.progress import Console
 from vvgt_cli.splat import render

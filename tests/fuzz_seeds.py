@@ -325,9 +325,9 @@ def model_card() -> list[Seed]:
 def checkpoint() -> list[Seed]:
     from test_optimize_checkpoint import CAMERAS, cloud
 
-    from vvgt_cli.optimize import OptimizeOptions, OptimizeRecord
-    from vvgt_cli.optimize.checkpoint import resume, save
-    from vvgt_cli.optimize.loop import Judge, begin
+    from vvgt_cli.descent import OptimizeOptions, OptimizeRecord
+    from vvgt_cli.descent.checkpoint import resume, save
+    from vvgt_cli.descent.loop import Judge, begin
 
     def fresh(method: str) -> tuple[Any, Judge, OptimizeRecord]:
         record = OptimizeRecord()

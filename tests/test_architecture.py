@@ -16,7 +16,7 @@ ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "vvgt_cli"
 ROOMS = (
     *("errors", "resources", "progress", "files", "jit", "volume", "transfer", "cameras", "images", "metrics"),
-    *("gaussians", "synth", "dvr", "splat", "vbm", "network", "optimize", "training", "checks", "report", "pipeline"),
+    *("gaussians", "synth", "dvr", "splat", "vbm", "network", "descent", "training", "checks", "report", "pipeline"),
     *("library", "cli"),
 )
 HEAVY = {

@@ -16,7 +16,7 @@ ROOT = Path(__file__).parent.parent
 SOURCE = "example:marschner-lobb:24"
 SMALL = ("--max-gaussians", "200", "--size", "40")
 STEP = (
-    "from vvgt_cli.optimize.steps import adam; import numpy as np; a = np.ones(3, np.float32); "
+    "from vvgt_cli.descent.steps import adam; import numpy as np; a = np.ones(3, np.float32); "
     "adam(a, a.copy(), 0.1, 0.9, 0.99, 1, a * 0, a * 0); print(a)"
 )
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from vvgt_cli.cameras import default_views
+from vvgt_cli.descent import OptimizeOptions, optimize
+from vvgt_cli.descent.states import OwnFrame
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.metrics import psnr
-from vvgt_cli.optimize import OptimizeOptions, optimize
-from vvgt_cli.optimize.states import OwnFrame
 from vvgt_cli.splat import render
 from vvgt_cli.splat.half import halved
 from vvgt_cli.splat.reference import covariances

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from vvgt_cli.descent.loss import loss_gradient
+from vvgt_cli.descent.ssim import KERNEL, add_ssim_gradient
 from vvgt_cli.metrics import ssim
 from vvgt_cli.metrics.ssim import C1, C2
-from vvgt_cli.optimize.loss import loss_gradient
-from vvgt_cli.optimize.ssim import KERNEL, add_ssim_gradient
 
 
 def pictures(height=31, width=26, seed=0):

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from vvgt_cli.cameras import default_views
+from vvgt_cli.descent import OptimizeOptions, optimize
+from vvgt_cli.descent.states import Fields, OwnFrame
 from vvgt_cli.dvr import RenderSettings, Scene, render_views
 from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.optimize import OptimizeOptions, optimize
-from vvgt_cli.optimize.states import Fields, OwnFrame
 from vvgt_cli.splat import render
 from vvgt_cli.synth import open_volume
 from vvgt_cli.transfer import ColorMap, PiecewiseOpacity, TransferFunction

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from vvgt_cli.optimize import loop
+from vvgt_cli.descent import loop
 from vvgt_cli.pipeline import convert as conversion
 
 LINE = ("convert", "example:blob:8", "--max-gaussians", "200", "--size", "32", "--steps", "6")

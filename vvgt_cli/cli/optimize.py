@@ -59,8 +59,8 @@ def command(
       vvgt optimize head.ply --views views --steps 200 -o better.ply
       vvgt optimize head.ply --views views --time-budget 60 --target-psnr 40 -o better.ply
     """
+    from vvgt_cli.descent import OptimizeOptions
     from vvgt_cli.errors import UsageError
-    from vvgt_cli.optimize import OptimizeOptions
     from vvgt_cli.pipeline.optimize import OptimizeRequest, budget, optimize_file
 
     method, most = options["method"], options["max_gaussians"]

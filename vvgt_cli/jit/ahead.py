@@ -10,7 +10,7 @@ SLOPES = (
     "vvgt_cli.splat.backward:own_frame",
     "vvgt_cli.splat.kernel:project_factors",
 )
-REFINE = ("vvgt_cli.optimize.steps:own_frame", *SLOPES, "vvgt_cli.optimize.loss:loss_gradient")
+REFINE = ("vvgt_cli.descent.steps:own_frame", *SLOPES, "vvgt_cli.descent.loss:loss_gradient")
 BACK_PROJECT = ("vvgt_cli.splat.tiles:gather", "vvgt_cli.splat.tiles:reduce_pairs")
 
 VIEWS = (*RAYCAST, *CLOSED_FORM[:2])  # and points to start from

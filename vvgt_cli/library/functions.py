@@ -225,7 +225,7 @@ def optimize(
         DataError: a ``.ply`` or a folder of views that is not one.
         UsageError: both of steps and time_budget, or none.
     """
-    from vvgt_cli.optimize import OptimizeOptions
+    from vvgt_cli.descent import OptimizeOptions
     from vvgt_cli.pipeline.optimize import OptimizeRequest, budget, optimized
     from vvgt_cli.pipeline.record import ConversionReport, Run
 

@@ -15,9 +15,9 @@ import numpy as np
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.cameras.blocks import Blocks, spread_blocks
 from vvgt_cli.cameras.boxed import drawn_in_box
+from vvgt_cli.descent import OptimizeOptions
 from vvgt_cli.gaussians import Gaussians, as_stored, read_ply, write_ply
 from vvgt_cli.gaussians.frames import transform
-from vvgt_cli.optimize import OptimizeOptions
 from vvgt_cli.pipeline.convert import ConvertRequest, FitOptions, convert
 from vvgt_cli.pipeline.mend import judging_views
 from vvgt_cli.pipeline.optimize import Views, refine

@@ -11,10 +11,10 @@ import numpy as np
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.cameras.blocks import spread_blocks
 from vvgt_cli.cameras.sets import SET_VIEWS
+from vvgt_cli.descent import OptimizeOptions
 from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.jit.ahead import BACK_PROJECT
-from vvgt_cli.optimize import OptimizeOptions
 from vvgt_cli.pipeline.optimize import Views, refine
 from vvgt_cli.pipeline.plan import SMALLER, Limits, Plan, view_edge, views_of
 from vvgt_cli.pipeline.record import Run

@@ -14,11 +14,11 @@ import numpy as np
 
 from vvgt_cli.cameras import Camera
 from vvgt_cli.cameras.blocks import Blocks
+from vvgt_cli.descent import OptimizeOptions, OptimizeRecord, optimize
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import Gaussians, as_stored
 from vvgt_cli.images.viewset import load_views
 from vvgt_cli.jit.ahead import OPTIMIZE
-from vvgt_cli.optimize import OptimizeOptions, OptimizeRecord, optimize
 from vvgt_cli.pipeline.outputs import Output, check_outputs, claimed, write_text
 from vvgt_cli.pipeline.record import ConversionReport, Run
 from vvgt_cli.pipeline.render import file_rule, layout_of, open_gaussians, write_gaussians

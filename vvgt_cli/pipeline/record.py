@@ -61,7 +61,7 @@ class ConversionReport:
         seats: `convert`'s scores by every rule at the size made for and above (`vvgt_cli.pipeline.seats`), worst first.
         plan: estimates of `convert` (`vvgt_cli.pipeline.plan.Plan`): stages, seconds, bytes, memory.
         left_out: (stage, why) of what was not done.
-        refinement: what gradient descent did (`vvgt_cli.optimize.OptimizeRecord`), None without it.
+        refinement: what gradient descent did (`vvgt_cli.descent.OptimizeRecord`), None without it.
         seconds: wall time of the whole run, without the interpreter's start.
     """
 

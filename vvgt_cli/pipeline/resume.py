@@ -18,11 +18,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vvgt_cli import __version__
+from vvgt_cli.descent.checkpoint import load_archive
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import atomic_write, claim, read_text
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.network.card import CARD, find_model
-from vvgt_cli.optimize.checkpoint import load_archive
 from vvgt_cli.pipeline.manifest import digest, volume_digest
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from vvgt_cli.pipeline.source import Source
 
 CLOSED_FORM, FITTED = "closed-form.npz", "fitted.npz"
-DESCENT = "refinement.npz"  # of `vvgt_cli.optimize.checkpoint`
+DESCENT = "refinement.npz"  # of `vvgt_cli.descent.checkpoint`
 _FAULTS = (
     *(OSError, KeyError, ValueError, TypeError, AttributeError, EOFError, MemoryError, RuntimeError, DataError),
     *(zipfile.BadZipFile, struct.error),

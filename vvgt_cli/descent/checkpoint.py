@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vvgt_cli.descent import OptimizeOptions, OptimizeRecord
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.optimize import OptimizeOptions, OptimizeRecord
 
 if TYPE_CHECKING:
-    from vvgt_cli.optimize.loop import Judge, State
+    from vvgt_cli.descent.loop import Judge, State
 
 _FAULTS = (
     *(OSError, KeyError, ValueError, TypeError, AttributeError, OverflowError, EOFError, MemoryError, RuntimeError),

@@ -129,7 +129,7 @@ def optimize(
     Raises:
         DataError: no views, or images that do not fit their cameras.
     """
-    from vvgt_cli.optimize.loop import run
+    from vvgt_cli.descent.loop import run
 
     return run(gaussians, cameras, images, options or OptimizeOptions(), check, progress, stop)
 

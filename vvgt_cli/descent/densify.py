@@ -15,9 +15,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from vvgt_cli.cameras import Camera
+from vvgt_cli.descent import OptimizeOptions
+from vvgt_cli.descent.states import Fields
 from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.optimize import OptimizeOptions
-from vvgt_cli.optimize.states import Fields
 from vvgt_cli.splat import Projection
 from vvgt_cli.splat.reference import rotations
 from vvgt_cli.splat.render import moments, screen_slopes

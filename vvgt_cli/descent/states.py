@@ -32,7 +32,7 @@ class OwnFrame:
     STEADY = True  # what falls far behind its best can be put back there, and a run without gain is at its end
 
     def __init__(self, gaussians: Gaussians, cameras: Sequence[Camera], rule: Rule = INRIA) -> None:
-        from vvgt_cli.optimize import steps
+        from vvgt_cli.descent import steps
 
         scales = np.exp(gaussians.log_scales.astype(np.float64))
         self.arrays: tuple[np.ndarray, ...] = (
@@ -65,7 +65,7 @@ class OwnFrame:
         speed: float,
     ) -> None:
         """One step; ``error`` RMS of the pictures so far, ``share`` of the run behind, ``speed`` a factor of rates."""
-        from vvgt_cli.optimize import steps
+        from vvgt_cli.descent import steps
 
         means, factors, logits, colors = self.arrays
         pairs = moments(projection, colors, image, grad)
@@ -133,7 +133,7 @@ class Fields:
 
     def update(self, camera: Camera, projection: Projection, pairs: np.ndarray, rates: Sequence[float]) -> None:
         """Adam with ``rates`` for the fields, from the `moments` of a picture."""
-        from vvgt_cli.optimize import steps
+        from vvgt_cli.descent import steps
 
         slopes = fields_backward(self.gaussians(), camera, projection, pairs)
         self.step += 1

@@ -11,13 +11,13 @@ import numpy as np
 
 from vvgt_cli.cameras import Camera
 from vvgt_cli.cameras.blocks import BLOCK, Blocks
+from vvgt_cli.descent import Check, OptimizeOptions, OptimizeRecord, Progress, Train
+from vvgt_cli.descent.checkpoint import fingerprint, resume, save
+from vvgt_cli.descent.densify import Densified
+from vvgt_cli.descent.states import Fields, OwnFrame
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.metrics import psnr
-from vvgt_cli.optimize import Check, OptimizeOptions, OptimizeRecord, Progress, Train
-from vvgt_cli.optimize.checkpoint import fingerprint, resume, save
-from vvgt_cli.optimize.densify import Densified
-from vvgt_cli.optimize.states import Fields, OwnFrame
 from vvgt_cli.splat import blend
 from vvgt_cli.splat.rules import INRIA, Rule
 
@@ -128,8 +128,8 @@ def step(
 
     ``share`` in [0, 1] of the run lies behind; rates are multiplied by ``speed``.
     """
-    from vvgt_cli.optimize.loss import loss_gradient
-    from vvgt_cli.optimize.ssim import add_ssim_gradient
+    from vvgt_cli.descent.loss import loss_gradient
+    from vvgt_cli.descent.ssim import add_ssim_gradient
 
     projection = state.project(camera, options.rule)
     image = blend(projection, state.colors, camera.height, camera.width)
