@@ -59,6 +59,8 @@ image_options = group(
         "--background", type=click.FloatRange(0, 1), nargs=3, default=(0.0, 0.0, 0.0), metavar="R G B",
         help="Behind the opaque images for COLMAP and the contact sheet. Default: black.",
     ),
+    points=click.option("--no-points", "points", is_flag=True, default=True, flag_value=False,
+        help="Leave out the cloud to start from; the COLMAP model then has no points."),
 )  # fmt: skip
 
 ray_options = group(

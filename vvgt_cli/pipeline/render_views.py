@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -27,6 +27,11 @@ from vvgt_cli.pipeline.view_files import CONTACT, Layout, View, start_points, th
 from vvgt_cli.progress import Console
 from vvgt_cli.volume.space import shear_text
 from vvgt_cli.volume.types import IDENTITY
+
+if TYPE_CHECKING:
+    from vvgt_cli.dvr import Scene
+
+NO_POINTS = np.zeros((0, 3))
 
 SPHERE, ORBIT = "sphere", "orbit"
 
@@ -218,6 +223,7 @@ def _settings(request: ViewsRequest, views: Sequence[View], source: Source, cont
         "format": request.layout.format,
         "half": request.layout.half,
         "background": list(request.layout.background),
+        **({} if request.layout.points else {"points": False}),
     }
 
 
@@ -254,12 +260,7 @@ def _work(run: Run, request: ViewsRequest, job: _Job, views: list[View]) -> None
         inside = view_renderer(request.renderer, scene, RenderSettings(request.step, request.samples))
         draw = drawn_in_box(inside, scene.volume.axes)
     if models:
-        with run.stage("points") as stage:
-            points, colors = start_points(scene, views[0].camera.height)
-            if not len(points):
-                raise DataError(f"{scene.volume.name} under {scene.tf.name}: nothing visible from any view")
-            built |= layout.models(views, points, colors)
-            stage.note = f"{len(points)} points to start from"
+        built |= layout.models(views, *(_points(run, scene, views) if layout.points else (NO_POINTS, NO_POINTS)))
     for name in ("", *layout.folders(views)):
         (job.folder / name).mkdir(parents=True, exist_ok=True)
     with claim(job.folder / request.shard.manifest):
@@ -269,6 +270,16 @@ def _work(run: Run, request: ViewsRequest, job: _Job, views: list[View]) -> None
         if job.pending:
             _render(run, request, job, draw)
         _contact(run, job, layout, views)
+
+
+def _points(run: Run, scene: Scene, views: list[View]) -> tuple[np.ndarray, np.ndarray]:
+    """The cloud to start from: centres and colours, (n, 3) each."""
+    with run.stage("points") as stage:
+        points, colors = start_points(scene, views[0].camera.height)
+        if not len(points):
+            raise DataError(f"{scene.volume.name} under {scene.tf.name}: nothing visible from any view")
+        stage.note = f"{len(points)} points to start from"
+    return points, colors
 
 
 def _render(run: Run, request: ViewsRequest, job: _Job, draw: Callable[[Camera], np.ndarray]) -> None:

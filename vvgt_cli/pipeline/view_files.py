@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,6 +24,7 @@ POINTS_FILE = "points3d.ply"  # the original 3DGS code looks for this name
 POINTS = 20_000  # Gaussians of the closed form whose centres become the cloud
 COARSER = 4  # that many are wider than cells for the images' own size: these would cost four times the time
 POINT_VIEWS, POINT_VIEW_SIZE = 12, 80  # that decide what is seen
+POINT_GRID = 128  # voxels along the longest edge, at least, that the cloud is made of
 THUMBNAIL = 160  # pixels along a thumbnail's edge, at most
 
 
@@ -48,11 +49,13 @@ class Layout:
         format: ``exr``, ``png`` or ``both``.
         half: EXR in 16 bits.
         background: RGB that the opaque images for COLMAP and the contact sheet stand on.
+        points: with a cloud to start from.
     """
 
     format: str = "both"
     half: bool = False
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    points: bool = True
 
     @property
     def suffix(self) -> str:
@@ -98,15 +101,21 @@ class Layout:
         splits = {"train": names["train"], "val": names["test"], "test": names["test"]} if test else None
         paths = [view.stem + self.suffix for view in views]
         cameras = [view.camera for view in views]
-        files = {"transforms.json": transforms_json(cameras, ply_file_path=POINTS_FILE, paths=paths, splits=splits)}
+        cloud = POINTS_FILE if self.points else None
+        files = {"transforms.json": transforms_json(cameras, ply_file_path=cloud, paths=paths, splits=splits)}
         for split, of in (("train", train), ("test", test)):
             if of:
                 files[f"transforms_{split}.json"] = blender_json([v.camera for v in of], [f"./{v.stem}" for v in of])
         return {name: text.encode() for name, text in files.items()}
 
     def models(self, views: Sequence[View], points: np.ndarray, colors: np.ndarray) -> dict[str, bytes]:
-        """The point cloud, and with PNG the COLMAP model of the training views, by relative path."""
-        files = {POINTS_FILE: point_cloud_ply(points, colors)}
+        """The point cloud, and with PNG the COLMAP model of the training views, by relative path.
+
+        Args:
+            views: all of them.
+            points, colors: (n, 3) each; none where the layout is without.
+        """
+        files = {POINTS_FILE: point_cloud_ply(points, colors)} if self.points else {}
         if self.format != "exr":
             train = [view.camera for view in views if view.split == "train"]
             model = colmap_model(train, [f"{camera.name}.png" for camera in train], points, colors)
@@ -116,11 +125,13 @@ class Layout:
     def model_names(self) -> list[str]:
         """Relative paths of what `models` gives."""
         colmap = [f"sparse/0/{name}.bin" for name in ("cameras", "images", "points3D")]
-        return [POINTS_FILE, *(colmap if self.format != "exr" else [])]
+        return [*([POINTS_FILE] if self.points else []), *(colmap if self.format != "exr" else [])]
 
 
 def start_points(scene: Scene, size: int) -> tuple[np.ndarray, np.ndarray]:
     """Centres (unit frame) and colours of the closed form's Gaussians, (n, 3) each; none where no view sees anything.
+
+    Of a large volume every second voxel along each axis is enough, or every third, ...: points lie as far apart.
 
     Args:
         scene: the volume under its function.
@@ -129,10 +140,26 @@ def start_points(scene: Scene, size: int) -> tuple[np.ndarray, np.ndarray]:
     from vvgt_cli.vbm.closed_form import closed_form
 
     cameras = default_views("train", POINT_VIEWS, size=POINT_VIEW_SIZE)
-    gaussians = closed_form(scene, POINTS, max(size // COARSER, 1), cameras).gaussians()
-    if not len(gaussians):  # what is thinner than these views' pixels
+    shape = np.array(scene.values.shape[::-1])
+    every = np.minimum(max(shape.max() // POINT_GRID, 1), shape)
+    coarse = _thinned(scene, every)
+    gaussians = closed_form(coarse, POINTS, max(size // COARSER, 1), cameras).gaussians()
+    means = (gaussians.means + coarse.half) / coarse.step * every * scene.step - scene.half
+    if not len(gaussians):  # what is thinner than these views' pixels, or lies between the voxels that were taken
         gaussians = closed_form(scene, POINTS, size).gaussians()
-    return gaussians.means.astype(np.float64) @ scene.volume.axes.T, np.clip(gaussians.colors, 0, 1)
+        means = gaussians.means.astype(np.float64)
+    return np.clip(means, -scene.half, scene.half) @ scene.volume.axes.T, np.clip(gaussians.colors, 0, 1)
+
+
+def _thinned(scene: Scene, every: np.ndarray) -> Scene:
+    """The scene of the middle one of every so many voxels (x, y, z), from the same corner on."""
+    if every.max() == 1:
+        return scene
+    volume, data = scene.volume, scene.volume.data
+    for axis, (n, step) in enumerate(zip(data.shape, every[::-1], strict=True)):
+        data = np.take(data, np.minimum(np.arange(step // 2, n + step // 2, step), n - 1), axis)
+    x, y, z = (float(length) for length in volume.spacing * every)
+    return type(scene).build(replace(volume, data=data, spacing=(x, y, z)), scene.tf, scene.unit_distance)
 
 
 def thumbnails(folder: Path, views: Sequence[View], background: Sequence[float]) -> np.ndarray:
