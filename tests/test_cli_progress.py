@@ -5,8 +5,6 @@ from __future__ import annotations
 import io
 import sys
 
-import pytest
-
 from vvgt_cli.progress import Console
 
 
@@ -39,9 +37,36 @@ def test_bars_are_drawn_on_a_terminal_and_cleared(monkeypatch):
     assert "\n" not in stream.getvalue()
 
 
-@pytest.mark.parametrize("console", [Console(stream=io.StringIO()), Console(quiet=True, stream=Terminal())])
-def test_no_bars_where_nobody_watches(console):
-    assert console.bar("views") is None
+def test_without_a_terminal_a_line_is_said_every_half_minute(monkeypatch):
+    clock = iter([0.0, 29.0, 31.0, 45.0, 62.0, 70.0, 100.0])
+    monkeypatch.setattr("time.monotonic", lambda: next(clock))
+    stream = io.StringIO()
+    bar = Console(stream=stream).bar("closed form")
+    for done in (1, 2, 3, 4, 5, 6):
+        bar(done, 6)
+    assert stream.getvalue() == "closed form        31.00 s  33 %\nclosed form        62.00 s  67 %\n"
+
+
+def test_no_bars_where_nothing_is_to_be_said():
+    assert Console(quiet=True, stream=Terminal()).bar("views") is None
+
+
+def test_the_closed_form_tells_how_far_it_is():
+    import numpy as np
+    from vbm_scenes import Ramp, scene_of
+
+    from vvgt_cli.vbm import VbmOptions, initialise
+    from vvgt_cli.volume import Volume
+
+    told = []
+    scene = scene_of(Volume(np.linspace(0, 1, 4096, dtype=np.float32).reshape(16, 16, 16)), Ramp())
+    initialise(scene, VbmOptions(max_gaussians=50, size=32), progress=lambda done, total: told.append((done, total)))
+    assert {total for _, total in told} == {100}
+    shares = [done for done, _ in told]
+    assert shares == sorted(shares)
+    assert shares[-1] == 100
+    assert len({share for share in shares if share < 25}) > 10  # within the march, view by view
+    assert any(25 < share <= 75 for share in shares)
 
 
 def test_quiet_says_nothing():

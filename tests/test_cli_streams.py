@@ -117,3 +117,12 @@ def test_a_pipe_is_read_once_and_not_beyond_the_memory(tmp_path, monkeypatch):
     threading.Thread(target=lambda: second.write_bytes(b"x" * 3000)).start()
     with pytest.raises(Exception, match="the free memory is used up; write it to a file first"):
         seekable(second)
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="needs a folder that nobody can write to")
+def test_nothing_but_the_output_need_be_writable(tmp_path):
+    """The working folder, the home and the temporary folder are none that could be written to."""
+    line = f"vvgt convert example:blob:8 --max-gaussians 20 --size 32 --steps 2 -q -o {tmp_path}/a.ply"
+    done = shell(line, Path("/proc"), HOME="/proc", TMPDIR="/proc", XDG_CACHE_HOME="/proc")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert len(read_ply(tmp_path / "a.ply")[0])

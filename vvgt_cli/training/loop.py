@@ -94,12 +94,14 @@ def _open_run(folder: Path, config: TrainConfig) -> None:
 
 @contextmanager
 def ending() -> Iterator[list[int]]:
-    """Within the block SIGTERM and SIGINT only put their number into the list: the step ends first, and is saved."""
+    """Within the block signals to end only put their number into the list: the step ends first, and is saved."""
     heard: list[int] = []
     if threading.current_thread() is not threading.main_thread():
         yield heard  # handlers belong to the main thread
         return
-    numbers = (signal.SIGTERM, signal.SIGINT)
+    names = ("SIGTERM", "SIGINT", "SIGHUP")
+    numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
+    numbers = [number for number in numbers if signal.getsignal(number) is not signal.SIG_IGN]  # as under nohup
     before = [signal.signal(number, lambda n, frame: heard.append(n)) for number in numbers]
     try:
         yield heard

@@ -1,0 +1,70 @@
+"""Signals that end: within seconds from any stage, one line, nothing partial; a hangup counts unless it is ignored."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+# A march whose steps are so short that it takes minutes, in one kernel, while a file is being written.
+LONG = """
+import sys, threading
+import vvgt_cli.pipeline.convert as conversion
+from vvgt_cli.cli import main
+from vvgt_cli.files import atomic_write
+from vvgt_cli.vbm.visibility import visibility
+
+def closed_form(run, scene, fit, stages=None):
+    from vvgt_cli.cameras import default_views
+    with atomic_write("b.ply") as temporary:
+        temporary.write_bytes(b"half")
+        threading.Timer(1.0, print, ["in the kernel"], {"flush": True}).start()
+        visibility(scene, default_views("train", 1, size=160), step=1e-7)
+
+conversion._closed_form = closed_form
+main.main()
+"""
+# The handler alone, where nobody else listens.
+ALONE = """
+import os, signal, sys, time
+from vvgt_cli.cli.process import end_on_signals
+signal.signal(signal.SIGHUP, signal.SIG_IGN)
+end_on_signals()
+os.kill(os.getpid(), signal.SIGHUP)
+print("alive", flush=True)
+os.kill(os.getpid(), signal.SIGTERM)
+time.sleep(60)
+"""
+
+
+def start(code: str, folder: Path, *args: str) -> subprocess.Popen[str]:
+    paths = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    return subprocess.Popen(
+        [sys.executable, "-c", code, *args], cwd=folder, env=os.environ | {"PYTHONPATH": paths}, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
+def test_a_kernel_that_runs_for_minutes_is_ended_within_seconds(name, tmp_path):
+    number = getattr(signal, name)
+    child = start(LONG, tmp_path, "init", "example:blob:16", "--max-gaussians", "20", "-q", "-o", "a.ply")
+    assert child.stdout.readline() == "in the kernel\n", child.communicate()
+    begin = time.monotonic()
+    child.send_signal(number)
+    _, told = child.communicate()
+    assert time.monotonic() - begin < 5  # 1 s of grace; the rest is for other people's load
+    assert (child.returncode, told) == (128 + number, f"vvgt: error: ended by {name}\n")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_hangup_that_is_ignored_stays_so(tmp_path):
+    child = start(ALONE, tmp_path)
+    out, told = child.communicate()
+    assert (child.returncode, out, told) == (128 + signal.SIGTERM, "alive\n", "")
