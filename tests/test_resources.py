@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gzip
 import os
 import resource
+import struct
 import subprocess
 import sys
 from pathlib import Path
@@ -118,9 +120,6 @@ def test_sizes():
 
 def big(folder: Path, mib: int = 3400) -> Path:
     """A small .nii.gz that unpacks to ``mib`` MiB of float32 zeros."""
-    import gzip
-    import struct
-
     head = bytearray(352)
     struct.pack_into("<i", head, 0, 348)
     struct.pack_into("<8h", head, 40, 3, 1024, 1024, mib // 4, 1, 1, 1, 1)
@@ -136,19 +135,36 @@ def big(folder: Path, mib: int = 3400) -> Path:
     return path
 
 
-def test_a_volume_that_does_not_fit_is_refused(tmp_path, vvgt, monkeypatch):
+def test_a_volume_that_does_not_fit_is_refused(tmp_path, vvgt):
     path = big(tmp_path, 64)
-    held = resources._status()["VmRSS"]
-    for command in (("info", path), ("convert", path, "-o", tmp_path / "a.ply")):
-        refused = vvgt(*command, "--memory", held + (48 << 20))
-        assert refused.code == 1
-        assert refused.error.startswith("vvgt: error: big.nii.gz: needs 67108864 bytes (0.0625 GiB) of memory, ")
-    assert vvgt("info", path).code == 0  # what was asked for held for one command
+    little = resources._status()["VmRSS"] + (48 << 20)
+    refused = vvgt("convert", path, "-o", tmp_path / "a.ply", "--memory", little)
+    assert refused.code == 1
+    assert refused.error.startswith("vvgt: error: big.nii.gz: needs 67108864 bytes (0.0625 GiB) of memory, ")
+    assert " more, or store it uncompressed" in refused.error
+
+
+def test_info_reads_what_the_memory_does_not_hold(tmp_path, vvgt):
+    path = big(tmp_path, 64)
+    values = np.arange(64, dtype=np.float32).repeat(1 << 18)
+    (tmp_path / "big_1024x1024x16_float32.raw.gz").write_bytes(gzip.compress(values.tobytes(), 1))
+    head = "NRRD0004\ntype: float\ndimension: 3\nsizes: 1024 1024 16\nendian: little\nencoding: gzip\n\n"
+    (tmp_path / "big.nrrd").write_bytes(head.encode() + gzip.compress(values.tobytes(), 1))
+    for name in (path.name, "big.nrrd", "big_1024x1024x16_float32.raw.gz"):
+        whole = vvgt("info", tmp_path / name, "--json")
+        little = resources._status()["VmRSS"] + (48 << 20)
+        slabs = vvgt("info", tmp_path / name, "--json", "--memory", little)
+        assert (whole.code, slabs.code) == (0, 0), slabs.err
+        assert slabs.out == whole.out
+    damaged = path.read_bytes()
+    path.write_bytes(damaged[: len(damaged) // 2])
+    refused = vvgt("info", path, "--memory", little)
+    assert (refused.code, "big.nii.gz: damaged gzip data" in refused.error) == (1, True)
 
 
 @pytest.mark.long
 @pytest.mark.skipif(not os.access(V1, os.W_OK), reason="no cgroup can be made here")
-def test_in_a_group_of_2_gib_a_file_that_unpacks_to_more_is_refused_not_killed(tmp_path):
+def test_in_a_group_of_2_gib_a_file_that_unpacks_to_more_is_refused_or_read_not_killed(tmp_path):
     group = V1 / f"vvgt-test-{os.getpid()}"
     group.mkdir()
     try:
@@ -157,10 +173,14 @@ def test_in_a_group_of_2_gib_a_file_that_unpacks_to_more_is_refused_not_killed(t
         join = f"open({str(group / 'cgroup.procs')!r}, 'w').write('0')"
         code = f"{join}\nfrom vvgt_cli.cli.main import main\nmain()\n"
         paths = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
-        done = subprocess.run(
-            [sys.executable, "-c", code, "convert", path, "-o", tmp_path / "a.ply"], capture_output=True, text=True,
-            env=os.environ | {"PYTHONPATH": paths}, timeout=1200,
-        )  # fmt: skip
+        told = []
+        for line in (["info", path], ["convert", path, "-o", tmp_path / "a.ply"]):
+            told.append(subprocess.run(
+                [sys.executable, "-c", code, *line], capture_output=True, text=True,
+                env=os.environ | {"PYTHONPATH": paths}, timeout=1200,
+            ))  # fmt: skip
+        assert told[0].returncode == 0, told[0].stderr
+        done = told[1]
         assert done.returncode == 1, done.stderr
         assert "big.nii.gz: needs 3565158400 bytes (3.32 GiB) of memory, " in done.stderr
     finally:

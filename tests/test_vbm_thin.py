@@ -24,6 +24,7 @@ def along(axis: int, there: float, elsewhere: float) -> tuple[float, float, floa
 CASES = {"a voxel": ((1, 1, 1), (1.0, 1.0, 1.0))}
 for axis, name in enumerate("xyz"):
     CASES[f"a line along {name}"] = (along(axis, 500, 1), (1.0, 1.0, 1.0))
+    CASES[f"a hair along {name}"] = (along(axis, 3000, 1), (1.0, 1.0, 1.0))
     CASES[f"a sheet across {name}"] = (along(axis, 1, 60), (1.0, 1.0, 1.0))
     CASES[f"long voxels along {name}"] = ((6, 6, 6), along(axis, 1000.0, 1.0))
     CASES[f"flat voxels along {name}"] = ((6, 6, 6), along(axis, 0.001, 1.0))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -109,6 +109,11 @@ def cast_tiers(
             cast(offsets[new], mask, int(not new.all()))
 
 
+def _thinner_than_a_pixel(scene: Scene, camera: Camera) -> bool:
+    """Whether all of the box may lie between the middles of two rows or columns of pixels."""
+    return bool(2 * scene.half.min() * camera.fx < np.linalg.norm(camera.position))
+
+
 def render_view(
     scene: Scene, camera: Camera, settings: RenderSettings | None = None, blocks: Blocks | None = None
 ) -> np.ndarray:
@@ -116,6 +121,8 @@ def render_view(
     from vvgt_cli.dvr.kernel import render_tiles
 
     settings = settings or RenderSettings()
+    if _thinner_than_a_pixel(scene, camera):
+        settings = replace(settings, tiers=((-1.0, settings.tiers[-1][1]),))  # a first ray a pixel may show nothing
     tables = scene.tables
     eye, basis, lens = camera_arrays(scene, camera)
     out = np.zeros((camera.height, camera.width, 4), np.float32)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -83,7 +84,7 @@ def _volume(file: str, read: ReadOptions) -> dict[str, Any]:
     from vvgt_cli.transfer import unit_distance
     from vvgt_cli.volume import statistics
 
-    volume = open_volume(file, read)
+    volume = open_volume(file, replace(read, packed=True))
     numbers = statistics(volume)
     return {
         "kind": "volume",

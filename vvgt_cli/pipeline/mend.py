@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -43,7 +44,7 @@ def check_view_memory(plan: Plan, size: int) -> None:
     if free is not None and need > free:
         raise UsageError(
             f"--size {size}: views need {need / 2**30:.1f} GiB of memory, {free / 2**30:.1f} GiB are free; "
-            "try a smaller size, or 'vvgt init', which renders none"
+            f"--size {max(math.floor(size * math.sqrt(free / need)), 1)} would fit, or 'vvgt init', which renders none"
         )
 
 

@@ -40,7 +40,8 @@ def check_memory(need: int, what: str) -> None:
     if free is not None and need > free:
         raise DataError(
             f"{what}: needs {size_text(need)} of memory, {size_text(free)} are free; "
-            "try a machine with more, or store it uncompressed (raw or .nhdr files are mapped, not loaded)"
+            f"give it {size_text(need - free)} more, or store it uncompressed (raw and .nhdr files are mapped, not "
+            "loaded)"
         )
 
 
@@ -116,29 +117,44 @@ def _too_short(path: Path, size: int, shape: tuple[int, ...], dtype: np.dtype, o
 
 def _unpack(path: Path, dtype: np.dtype, shape: tuple[int, ...], offset: int, encoding: str, skip: int) -> np.ndarray:
     need = count(shape) * dtype.itemsize
-    packed = path.stat().st_size - offset
-    if packed <= 0 or need + skip > packed * MAX_RATIO[encoding] + 4096:
-        raise DataError(
-            f"{path.name}: {size_text(max(packed, 0))} of {encoding} data cannot hold the {size_text(need + skip)} "
-            "that its header declares; check the header's sizes and type"
-        )
+    check_packed(path, need, offset, encoding, skip)
     check_memory(need, path.name)
     with open(path, "rb") as file:
         file.seek(offset)
         try:
-            stream = _OPENERS[encoding](file)
+            stream = open_packed(encoding, file)
             read_discard(stream, skip)
             out, filled = fill(stream, need)
             if filled == need:
                 stream.read(1)  # reaches the trailer, and with it the checksum
         except (OSError, EOFError, zlib.error) as error:
-            raise DataError(f"{path.name}: damaged {encoding} data ({error}); try to fetch the file again") from error
+            raise damaged(path, encoding, error) from error
     if filled < need:
         raise DataError(
             f"{path.name}: its {encoding} data hold {size_text(filled + skip)}, its header declares "
             f"{size_text(need + skip)}; check the header's sizes and type"
         )
     return out.view(dtype).reshape(shape)
+
+
+def open_packed(encoding: str, file: IO[bytes]) -> Any:
+    """A stream with ``read(n)`` over what is compressed in a file, from where it stands."""
+    return _OPENERS[encoding](file)
+
+
+def damaged(path: Path, encoding: str, error: Exception) -> DataError:
+    """The error of compressed data that cannot be unpacked."""
+    return DataError(f"{path.name}: damaged {encoding} data ({error}); try to fetch the file again")
+
+
+def check_packed(path: Path, need: int, offset: int, encoding: str, skip: int) -> None:
+    """Raise `DataError` if the bytes from ``offset`` on cannot unpack to ``skip`` and ``need`` ones."""
+    packed = path.stat().st_size - offset
+    if packed <= 0 or need + skip > packed * MAX_RATIO[encoding] + 4096:
+        raise DataError(
+            f"{path.name}: {size_text(max(packed, 0))} of {encoding} data cannot hold the {size_text(need + skip)} "
+            "that its header declares; check the header's sizes and type"
+        )
 
 
 def read_discard(stream: Any, n: int) -> None:

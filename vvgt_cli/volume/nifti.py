@@ -10,7 +10,7 @@ import gzip
 import math
 import struct
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +20,7 @@ from vvgt_cli.volume.blocks import load_block
 from vvgt_cli.volume.components import select_component
 from vvgt_cli.volume.headers import unit_rows
 from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.packed import packed
 from vvgt_cli.volume.registry import Reader, register, volume_name
 from vvgt_cli.volume.types import FLAT, IDENTITY, Volume
 
@@ -237,6 +238,8 @@ def read_nifti(path: Path, options: ReadOptions) -> Volume:
         offset += number * math.prod(spatial) * header.dtype.itemsize
         times, rest, step = 1, 1, 0
     shape = (rest, times, *reversed(spatial))  # (c, t, z, y, x)
+    if zipped and options.packed and (rest, times, options.component) == (1, 1, None):
+        return _placed(header, packed(source, header.dtype, shape[2:], "gzip", skip=offset), path, options)
     if zipped:
         block = load_block(source, header.dtype, shape, encoding="gzip", skip=offset)
     else:
@@ -248,16 +251,21 @@ def read_nifti(path: Path, options: ReadOptions) -> Volume:
         label="the series" if rest > 1 else "",
         scaling=(header.slope, header.intercept),
     )
+    return _placed(replace(header, slope=slope, intercept=intercept), field, path, options)
+
+
+def _placed(header: Header, field: np.ndarray, path: Path, options: ReadOptions) -> Volume:
+    """The volume of a field (nz, ny, nx), where the header says."""
     spacing, direction, origin, space = _place(header)
-    steps = tuple(s if n > 1 or s else 1.0 for s, n in zip(spacing, spatial, strict=True))
+    steps = tuple(s if n > 1 or s else 1.0 for s, n in zip(spacing, reversed(field.shape), strict=True))
     return Volume(
         field,
         options.spacing_or(steps),
         origin,  # type: ignore[arg-type]
         direction,
         volume_name(path),
-        slope,
-        intercept,
+        header.slope,
+        header.intercept,
         space,
     )
 

@@ -17,6 +17,7 @@ from vvgt_cli.volume.components import select_component
 from vvgt_cli.volume.headers import MAX_HEADER, Fields, unit_rows
 from vvgt_cli.volume.nrrd_files import data_names, load_files
 from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.packed import Packed, packed
 from vvgt_cli.volume.registry import Reader, register, volume_name
 from vvgt_cli.volume.space import millimetres
 from vvgt_cli.volume.types import Volume
@@ -99,6 +100,11 @@ def _vectors(fields: Fields, n: int) -> list[list[float] | None]:
         vector = None if token == "none" else fields.floats("space directions", token.strip("()"))
         out.append(vector and [*vector, 0.0, 0.0][:3])
     return out
+
+
+def _directions(fields: Fields, axes: int) -> list[list[float] | None] | None:
+    """Space directions of the axes, None where the header has none."""
+    return _vectors(fields, axes) if "space directions" in fields else None
 
 
 def _component_axis(fields: Fields, sizes: list[int], vectors: list[list[float] | None] | None) -> int | None:
@@ -194,10 +200,15 @@ def read_nrrd(path: Path, options: ReadOptions) -> Volume:
     if skip < -1 or (skip == -1 and encoding != "raw"):
         raise DataError(f"{path}: byte skip {skip} with encoding {encoding}; expected 0 or more (-1 with raw only)")
 
+    slabs = options.packed and encoding in ("gzip", "bzip2") and len(sizes) == 3 and options.component is None
+    slabs = slabs and _component_axis(fields, sizes, _directions(fields, len(sizes))) is None
+
     def load(source: Path, start: int, shape: tuple[int, ...]) -> np.ndarray:
         if skip == -1:
             return load_block(source, dtype, shape, offset=-1)
         start = _line_skip(source, start, fields.integer("line skip", 0))
+        if slabs and shape == tuple(reversed(sizes)):
+            return packed(source, dtype, shape, encoding, offset=start, skip=skip)
         return load_block(source, dtype, shape, offset=start, encoding=encoding, skip=skip)
 
     shape = tuple(reversed(sizes))
@@ -213,13 +224,15 @@ def read_nrrd(path: Path, options: ReadOptions) -> Volume:
 
 
 def _volume(path: Path, fields: Fields, block: np.ndarray, sizes: list[int], options: ReadOptions) -> Volume:
-    vectors = _vectors(fields, len(sizes)) if "space directions" in fields else None
+    vectors = _directions(fields, len(sizes))
     axis = _component_axis(fields, sizes, vectors)
+    spacing, direction, origin, space = _geometry(fields, vectors, axis)
+    if isinstance(block, Packed):
+        return Volume(block, options.spacing_or(spacing), origin, direction, volume_name(path), space=space)  # type: ignore[arg-type]
     block = block[..., None] if axis is None else np.moveaxis(block, len(sizes) - 1 - axis, -1)
     if block.ndim == 3:
         block = block[None]
     field, _ = select_component(block, options.component, str(path), label=f"axis {axis}" if axis is not None else "")
-    spacing, direction, origin, space = _geometry(fields, vectors, axis)
     return Volume(field, options.spacing_or(spacing), origin, direction, volume_name(path), space=space)  # type: ignore[arg-type]
 
 

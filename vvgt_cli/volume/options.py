@@ -51,6 +51,8 @@ class ReadOptions:
             several.
         time: index of the time step, for files that hold several.
         space: anatomical space to bring the volume to, ``RAS`` or ``LPS``; None: RAS where its file states one.
+        packed: values are read front to back only: where they are compressed and a format can, they stay so
+            (`vvgt_cli.volume.packed`).
 
     Raises:
         UsageError: a value out of its range.
@@ -65,6 +67,7 @@ class ReadOptions:
     component: int | str | None = None
     time: int | None = None
     space: str | None = None
+    packed: bool = False
 
     def __post_init__(self) -> None:
         if self.dims is not None and (len(self.dims) != 3 or min(self.dims) < 1):

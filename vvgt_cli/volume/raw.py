@@ -18,6 +18,7 @@ from vvgt_cli.volume.blocks import check_memory, fill, load_block, size_text
 from vvgt_cli.volume.components import select_component
 from vvgt_cli.volume.options import ReadOptions, parse_dtype
 from vvgt_cli.volume.order import likelier_dims
+from vvgt_cli.volume.packed import packed
 from vvgt_cli.volume.registry import Reader, register, volume_name
 from vvgt_cli.volume.types import Volume
 
@@ -80,6 +81,9 @@ def read_raw(path: Path, options: ReadOptions) -> Volume:
     """
     dims, dtype = layout(path.name, options)
     need = dims[0] * dims[1] * dims[2] * dtype.itemsize + options.header_bytes
+    if path.name.lower().endswith(".gz") and options.packed and options.component is None:
+        field = packed(path, dtype, dims[::-1], "gzip", skip=options.header_bytes)
+        return Volume(field, spacing=options.spacing_or((1.0, 1.0, 1.0)), name=volume_name(path))
     if path.name.lower().endswith(".gz"):
         data = load_block(path, dtype, dims[::-1], encoding="gzip", skip=options.header_bytes)
         return _volume(data, volume_name(path), str(path), options)
