@@ -53,8 +53,8 @@ def test_no_bars_where_nothing_is_to_be_said():
 
 def test_the_closed_form_tells_how_far_it_is():
     import numpy as np
-    from vbm_scenes import Ramp, scene_of
 
+    from tests.vbm_scenes import Ramp, scene_of
     from vvgt_cli.vbm import VbmOptions, initialise
     from vvgt_cli.volume import Volume
 

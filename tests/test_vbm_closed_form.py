@@ -169,12 +169,22 @@ def test_base_level_keeps_the_memory_bound(monkeypatch: pytest.MonkeyPatch) -> N
         levels = []
         for bound in (10**6, 20_000, 300):
             monkeypatch.setattr(closed_form_module, "MAX_BASE_CELLS", bound)
-            level = base_level(scene, pixel_width(400))
+            level = base_level(scene, pixel_width(400), 10**6)
             levels.append(level)
             count = len(base_cells(scene, exponents(scene.step, level)).index)
             assert count <= 2 * bound  # the estimate counts voxels, and cells at the rim of a body are partly filled
         assert levels == sorted(levels)
         assert levels[-1] > levels[0]
+
+
+def test_few_gaussians_have_few_cells_and_it_is_said_why_there_are_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(closed_form_module, "FEW_CELLS", 2000)
+    scene = scene_of(noise((24, 24, 24)), Tent(0.5, 0.3))
+    forms = [closed_form_module.closed_form(scene, budget, 400) for budget in (10, 10**6)]
+    assert len(forms[0].tree) < len(forms[1].tree) / 3
+    assert closed_form_module.bound(forms[1]) == "the screen cannot tell smaller cells apart"
+    monkeypatch.setattr(closed_form_module, "MAX_BASE_CELLS", 300)
+    assert closed_form_module.bound(forms[1]) == "memory for at most 300 cells"
 
 
 def test_thin_support_between_the_voxels_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -183,7 +193,7 @@ def test_thin_support_between_the_voxels_is_counted(monkeypatch: pytest.MonkeyPa
 
     scene = scene_of(analytic.checkerboard(32, 32), Tent(0.5, 0.1))
     monkeypatch.setattr(closed_form_module, "MAX_BASE_CELLS", 5000)
-    level = base_level(scene, pixel_width(400))
+    level = base_level(scene, pixel_width(400), 10**6)
     assert len(base_cells(scene, exponents(scene.step, level)).index) <= 5000
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from vbm_scenes import Ramp, scene_of
 
+from tests.vbm_scenes import Ramp, scene_of
 from vvgt_cli.cameras import default_views
 from vvgt_cli.dvr import RenderSettings, render_view
 from vvgt_cli.splat import render

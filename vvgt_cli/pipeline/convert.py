@@ -299,6 +299,7 @@ def tf_record(source: Source, request: SourceRequest) -> dict[str, Any]:
 def _closed_form(run: Run, scene: Scene, fit: FitOptions, stages: Stages | None = None) -> Start:
     """The closed form, or what is kept of it: without the pyramid, which views cut anew for a target or no steps."""
     from vvgt_cli.vbm import Start, VbmOptions, initialise
+    from vvgt_cli.vbm.closed_form import bound
 
     stages = stages or Stages()
     if kept := stages.load(CLOSED_FORM):
@@ -313,8 +314,11 @@ def _closed_form(run: Run, scene: Scene, fit: FitOptions, stages: Stages | None 
                 f"{scene.volume.name} under {scene.tf.name}: nothing visible from any view; "
                 "expected opacity above 0 where the data are (try 'vvgt tf show TF -o tf.png --volume VOLUME')"
             )
+        found = len(start.gaussians)
         start, spared = thinned(start)
         stage.note = f"{len(start.gaussians)} Gaussians ({fit.init})"
+        if start.form is not None and not spared and found < fit.max_gaussians:
+            stage.note += f", no more: {bound(start.form)}"
     if spared:
         run.leave_out(f"{spared} Gaussians", "so faint that viewers differ on what they draw of them")
     stages.save(CLOSED_FORM, start.gaussians)

@@ -114,13 +114,22 @@ def closed_form(
 def base_level(scene: Scene, pixel: float, budget: int) -> int:
     """Finest level whose base cells fit the memory bound and the budget, and are not finer than the images can tell."""
     most = min(MAX_BASE_CELLS, max(CELLS_A_GAUSSIAN * budget, FEW_CELLS))
-    voxels = _visible_voxels(scene)
-    finest = math.log2(MIN_CELL * pixel / float(scene.step.min()))
-    level = max(FINEST, min(0, math.floor(finest)))
+    voxels, level = _visible_voxels(scene), _finest_level(scene, pixel)
     # a long voxel holds more cells than 8^-level
     while voxels / np.prod(2.0 ** exponents(scene.step, level)) > most:
         level += 1
     return level
+
+
+def _finest_level(scene: Scene, pixel: float) -> int:
+    return max(FINEST, min(0, math.floor(math.log2(MIN_CELL * pixel / float(scene.step.min())))))
+
+
+def bound(form: ClosedForm) -> str:
+    """Why there are no more Gaussians, where there are fewer than the budget."""
+    if base_level(form.scene, form.pixel, form.budget) > _finest_level(form.scene, form.pixel):
+        return f"memory for at most {MAX_BASE_CELLS} cells"
+    return "the screen cannot tell smaller cells apart"
 
 
 def expected_cells(scene: Scene, size: int, budget: int) -> float:
