@@ -16,7 +16,16 @@ from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply
 from vvgt_cli.pipeline.convert import ConvertRequest, FitOptions, convert
 from vvgt_cli.pipeline.mend import check_view_memory, drawn_by_all, fine_enough, judging_views, wide
-from vvgt_cli.pipeline.plan import DEFAULT_HALF_STEPS, DEFAULT_STEPS, MOST_STEPS, Costs, Limits, Planner, views_of
+from vvgt_cli.pipeline.plan import (
+    DEFAULT_HALF_STEPS,
+    DEFAULT_STEPS,
+    MOST_STEPS,
+    Costs,
+    Limits,
+    Planner,
+    check_plan_memory,
+    views_of,
+)
 from vvgt_cli.pipeline.source import SourceRequest
 from vvgt_cli.progress import Console
 from vvgt_cli.splat.constants import DILATION
@@ -36,6 +45,7 @@ COSTS = Costs(
     score=0.5,
     write=0.1,
     memory=1e9,
+    there=2e8,
     view_memory=1e7,
     judge_memory=1e7,
 )
@@ -164,6 +174,20 @@ def test_views_that_do_not_fit_are_refused(monkeypatch):
     monkeypatch.setattr("vvgt_cli.pipeline.mend.free_memory", lambda: 400**2 * 32 * 16)
     with pytest.raises(UsageError, match=r"--size 400: .* --size 388 would fit, or "):
         check_view_memory(found, 400)
+
+
+def test_gaussians_that_do_not_fit_are_refused(monkeypatch):
+    monkeypatch.setattr("vvgt_cli.pipeline.plan.working_memory", lambda scene, size, count: 2e3 * count)
+    found = plan(size=400, steps=0)
+    found.gaussians, found.memory = 400_000, 1e9 + 1e6  # of which 2e8 are taken, and views take 1e6
+    monkeypatch.setattr("vvgt_cli.pipeline.plan.free_memory", lambda: int(0.8 * 8.01e8) + 1)
+    check_plan_memory(found, COSTS, None, 400)
+    monkeypatch.setattr("vvgt_cli.pipeline.plan.free_memory", lambda: int(0.8 * 3e8))
+    with pytest.raises(UsageError, match=r"about 0\.60 GiB of memory more, 0\.22 .* --max-gaussians 100000 would fit"):
+        check_plan_memory(found, COSTS, None, 400)
+    monkeypatch.setattr("vvgt_cli.pipeline.plan.free_memory", lambda: 1000)
+    with pytest.raises(UsageError, match="no number of Gaussians would fit, or give the job more"):
+        check_plan_memory(found, COSTS, None, 400)
 
 
 @pytest.mark.parametrize(("edge", "samples"), [(0.4, 1), (0.01, None)])

@@ -17,7 +17,7 @@ from vvgt_cli.network.card import find_model, read_card
 from vvgt_cli.pipeline.mend import check_view_memory, mend, wide
 from vvgt_cli.pipeline.outputs import STDOUT, Output, claimed, write_text
 from vvgt_cli.pipeline.place import AUTO, out_of_box, placed, remarks, way_up
-from vvgt_cli.pipeline.plan import Costs, Limits, Planner, estimate, file_bytes, view_edge
+from vvgt_cli.pipeline.plan import Costs, Limits, Planner, check_plan_memory, estimate, file_bytes, view_edge
 from vvgt_cli.pipeline.record import ConversionReport, Run
 from vvgt_cli.pipeline.render import write_gaussians
 from vvgt_cli.pipeline.result import PREVIEW_VIEWS, Conversion
@@ -191,6 +191,7 @@ def made(run: Run, request: ConvertRequest) -> Conversion | None:
     check_view_memory(plan, fit.size)
     if request.dry_run:
         return None
+    check_plan_memory(plan, costs, scene, fit.size)
     stages = stages_of(request, source, fit)
     kept = stages.load(FITTED)
     gaussians = kept[0] if kept else _fitted(run, request, scene, fit, planner, costs, stages)

@@ -12,6 +12,7 @@ import numpy as np
 
 from vvgt_cli.cameras.sets import SET_VIEWS
 from vvgt_cli.errors import UsageError
+from vvgt_cli.resources import free_memory
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
@@ -42,6 +43,7 @@ FINER = 1.8  # of the view that is timed: check and test views
 SCORE, SCORE_ALL = (3, 0.03), (10, 0.2)  # views, and seconds a view beside its rendering
 SEATS = 2, 0.3  # check views, and seconds beside them
 MEMORY = 2.6e8, 294.0, 1240.0  # bytes: program and kernels, a cell, a Gaussian
+SURE = 0.8  # of an estimate of memory: as little has been enough
 VIEW_MEMORY = 22.0  # bytes a pixel of each view
 
 
@@ -107,6 +109,7 @@ class Costs:
         score: test views.
         write: the file.
         memory: of the whole process at its most, bytes, without its views.
+        there: of that, what the program and the volume have taken when the plan is made.
         view_memory: of a view to fit to, bytes; ``judge_memory`` of a check view.
     """
 
@@ -120,6 +123,7 @@ class Costs:
     score: float
     write: float
     memory: float
+    there: float
     view_memory: float
     judge_memory: float
 
@@ -288,6 +292,7 @@ def estimate(scene: Scene, size: int, gaussians: int, all_views: bool = False) -
     from vvgt_cli.dvr.scene import BRICK
     from vvgt_cli.vbm.closed_form import expected_cells
 
+    there = MEMORY[0] + _volume_bytes(scene)
     cells, pace, edge = expected_cells(scene, size, gaussians), _pace(), view_edge(size, half=False)
     blocks = spread_blocks(size, size)
     judged = size**2 if blocks is None else blocks.numbers.size * BLOCK**2  # pixels
@@ -308,9 +313,37 @@ def estimate(scene: Scene, size: int, gaussians: int, all_views: bool = False) -
         half_step=half_step,
         score=views * (judge + pace * beside * judged / 400**2) + SEATS[0] * judge + pace * SEATS[1],
         write=pace * 0.1,
-        memory=MEMORY[0] + _volume_bytes(scene) + MEMORY[1] * cells + MEMORY[2] * count,
+        memory=there + working_memory(scene, size, gaussians),
+        there=there,
         view_memory=VIEW_MEMORY * edge**2,
         judge_memory=VIEW_MEMORY * judged,
+    )
+
+
+def working_memory(scene: Scene, size: int, gaussians: int) -> float:
+    """Bytes of cells and Gaussians at their most."""
+    from vvgt_cli.vbm.closed_form import expected_cells
+
+    cells = expected_cells(scene, size, gaussians)
+    return MEMORY[1] * cells + MEMORY[2] * min(gaussians, cells)
+
+
+def check_plan_memory(plan: Plan, costs: Costs, scene: Scene, size: int) -> None:
+    """Refuse what would not fit, rather than have the system end it.
+
+    Raises:
+        UsageError: with the Gaussians that would fit.
+    """
+    need, free = SURE * (plan.memory - costs.there), free_memory()
+    if free is None or need <= free:
+        return
+    views, fewer = plan.memory - costs.memory, plan.gaussians
+    while fewer and SURE * (working_memory(scene, size, fewer) + views) > free:
+        fewer //= 2
+    advice = f"--max-gaussians {fewer} would fit" if fewer else "no number of Gaussians would fit"
+    raise UsageError(
+        f"{plan.gaussians} Gaussians need about {need / 2**30:.2f} GiB of memory more, {free / 2**30:.2f} GiB are "
+        f"free; {advice}, or give the job more"
     )
 
 
