@@ -59,7 +59,7 @@ def test_a_kernel_that_runs_for_minutes_is_ended_within_seconds(name, tmp_path):
     begin = time.monotonic()
     child.send_signal(number)
     _, told = child.communicate()
-    assert time.monotonic() - begin < 5  # 1 s of grace; the rest is for other people's load
+    assert time.monotonic() - begin < 20  # 1 s of grace; the rest is for other people's load
     assert (child.returncode, told) == (128 + number, f"vvgt: error: ended by {name}\n")
     assert list(tmp_path.iterdir()) == []
 

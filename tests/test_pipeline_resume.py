@@ -9,7 +9,7 @@ import pytest
 from vvgt_cli.descent import loop
 from vvgt_cli.pipeline import convert as conversion
 
-LINE = ("convert", "example:blob:8", "--max-gaussians", "200", "--size", "32", "--steps", "6")
+LINE = ("convert", "example:blob:8", "--max-gaussians", "200", "--size", "32", "--steps", "24")
 
 
 @pytest.fixture
@@ -54,7 +54,7 @@ def test_a_conversion_goes_on_where_it_was_ended(target, calls, left, folder, vv
     with monkeypatch.context() as patch:  # nothing is done twice
         if "fitted.npz" in left:
             ended(patch, "convert.mend", 0)
-        ended(patch, "loop.step", 2 if "refinement.npz" in left else 6)
+        ended(patch, "loop.step", 20 if "refinement.npz" in left else 24)
         patch.setattr("vvgt_cli.vbm.initialise", None)
         result = vvgt(*line)
     assert result.code == 0, result.err
@@ -62,7 +62,7 @@ def test_a_conversion_goes_on_where_it_was_ended(target, calls, left, folder, vv
     assert sorted(path.name for path in folder.iterdir()) == ["a.ply", "whole.ply"]
 
 
-@pytest.mark.parametrize("more", [("--steps", "0"), ("--target-psnr", "60")])
+@pytest.mark.parametrize("more", [("--steps", "0"), ("--steps", "4"), ("--target-psnr", "60")])
 def test_stages_that_cut_the_pyramid_anew_have_it(more, folder, vvgt, monkeypatch):
     line = (*LINE, *more, "--overwrite", "-o")
     assert vvgt(*line, "whole.ply").code == 0

@@ -1,11 +1,17 @@
-"""The same bytes on any number of threads."""
+"""The same bytes on any number of threads, and room for other runs beside."""
 
 from __future__ import annotations
 
 import os
+import statistics
 import subprocess
 import sys
+import time
 from pathlib import Path
+
+import pytest
+
+from vvgt_cli.cli.options import THREAD_VARIABLES
 
 ROOT = Path(__file__).parent.parent
 
@@ -20,3 +26,27 @@ def test_a_conversion_has_the_same_bytes_on_any_number_of_threads(tmp_path):
         )  # fmt: skip
     first = (tmp_path / "1.ply").read_bytes()
     assert all((tmp_path / f"{threads}.ply").read_bytes() == first for threads in (2, 3))
+
+
+@pytest.mark.long
+def test_two_at_once_take_at_most_2_3_times_as_long_as_one(tmp_path):
+    """Medians of five, alternated: threads that wait leave the processors to the other run."""
+    paths = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    line = ["convert", "example:blob:64", "--max-gaussians", "20000", "--size", "400", "-q", "--overwrite", "-o"]
+
+    def seconds(runs: int) -> float:
+        begin = time.monotonic()
+        started = [
+            subprocess.Popen(
+                [sys.executable, "-m", "vvgt_cli.cli.main", *line, f"{i}.ply"], cwd=tmp_path,
+                env={k: v for k, v in os.environ.items() if k not in THREAD_VARIABLES} | {"PYTHONPATH": paths},
+            )
+            for i in range(runs)
+        ]  # fmt: skip
+        assert [run.wait() for run in started] == [0] * runs
+        return time.monotonic() - begin
+
+    seconds(1)  # kernels and files
+    pairs = [(seconds(1), seconds(2)) for _ in range(5)]
+    one, two = (statistics.median(column) for column in zip(*pairs, strict=True))
+    assert two <= 2.3 * one, pairs

@@ -17,7 +17,7 @@ from vvgt_cli.network.card import find_model, read_card
 from vvgt_cli.pipeline.mend import check_view_memory, mend, wide
 from vvgt_cli.pipeline.outputs import STDOUT, Output, claimed, write_text
 from vvgt_cli.pipeline.place import AUTO, out_of_box, placed, remarks, way_up
-from vvgt_cli.pipeline.plan import Costs, Limits, Planner, check_plan_memory, estimate, file_bytes, view_edge
+from vvgt_cli.pipeline.plan import Costs, Limits, Plan, Planner, check_plan_memory, estimate, file_bytes, view_edge
 from vvgt_cli.pipeline.record import ConversionReport, Run
 from vvgt_cli.pipeline.render import write_gaussians
 from vvgt_cli.pipeline.result import PREVIEW_VIEWS, Conversion
@@ -194,7 +194,7 @@ def made(run: Run, request: ConvertRequest) -> Conversion | None:
     check_plan_memory(plan, costs, scene, fit.size)
     stages = stages_of(request, source, fit)
     kept = stages.load(FITTED)
-    gaussians = kept[0] if kept else _fitted(run, request, scene, fit, planner, costs, stages)
+    gaussians = kept[0] if kept else _fitted(run, request, scene, fit, planner, plan, costs, stages)
     if kept:
         run.console.say(f"{request.checkpoint} holds the fitted Gaussians: only the scores are left")
     _score(run, request, scene, gaussians)
@@ -202,10 +202,18 @@ def made(run: Run, request: ConvertRequest) -> Conversion | None:
 
 
 def _fitted(
-    run: Run, request: ConvertRequest, scene: Scene, fit: FitOptions, planner: Planner, costs: Costs, stages: Stages
+    run: Run,
+    request: ConvertRequest,
+    scene: Scene,
+    fit: FitOptions,
+    planner: Planner,
+    plan: Plan,
+    costs: Costs,
+    stages: Stages,
 ) -> Gaussians:
     """Closed form, and what views can mend of it; as the file will hold it."""
-    start = _closed_form(run, scene, fit, stages if request.limits.target_psnr is None and fit.steps != 0 else Stages())
+    anew = plan.back_project or request.limits.target_psnr is not None  # cells are cut once more
+    start = _closed_form(run, scene, fit, Stages() if anew else stages)
     if request.output not in (None, STDOUT):
         check_room(request.output, file_bytes(len(start.gaussians), request.ply.sh_degree))
     planner = replace(planner, wide=wide(start.gaussians, fit.size))
