@@ -26,7 +26,7 @@ from vvgt_cli.cameras import default_views
 from vvgt_cli.dvr import RenderSettings, Scene, render_views
 from vvgt_cli.dvr.render import FIT_VIEWS
 from vvgt_cli.metrics import score_views
-from vvgt_cli.pipeline.source import SourceRequest, load
+from vvgt_cli.runs.source import SourceRequest, load
 from vvgt_cli.splat import render
 from vvgt_cli.vbm import VbmOptions, backproject, initialise
 from vvgt_cli.volume import ReadOptions

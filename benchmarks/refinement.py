@@ -25,14 +25,13 @@ from dvr_scenes import commit, print_table, read_scenes, write_rows
 from floors import machine
 
 from vvgt_cli.cameras import Camera, default_views
+from vvgt_cli.conversion.stages.views import REFINE_VIEWS, fine_enough, views_of, wide
 from vvgt_cli.descent import LOSS_3DGS, OptimizeOptions, optimize
 from vvgt_cli.dvr import Scene, render_views
 from vvgt_cli.dvr.render import FIT_VIEWS
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.metrics import score_views
-from vvgt_cli.pipeline.mend import fine_enough, wide
-from vvgt_cli.pipeline.optimize import Views
-from vvgt_cli.pipeline.plan import REFINE_VIEWS, views_of
+from vvgt_cli.runs.views import Views
 from vvgt_cli.splat import render
 from vvgt_cli.splat.rules import INRIA
 from vvgt_cli.vbm import VbmOptions, backproject, initialise

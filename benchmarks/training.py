@@ -36,8 +36,8 @@ from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.metrics import score_views, ssim
 from vvgt_cli.network.card import find_model
 from vvgt_cli.network.runtime import Model
-from vvgt_cli.pipeline.source import SourceRequest, load
 from vvgt_cli.progress import Console
+from vvgt_cli.runs.source import SourceRequest, load
 from vvgt_cli.splat import render
 from vvgt_cli.splat.half import halved
 from vvgt_cli.synth.analytic import volume_of

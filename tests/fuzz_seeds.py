@@ -346,7 +346,7 @@ def checkpoint() -> list[Seed]:
 
 
 def manifest() -> list[Seed]:
-    from vvgt_cli.pipeline.manifest import Manifest, read_manifest
+    from vvgt_cli.batches.manifest import Manifest, read_manifest
 
     document = {
         "format": "vvgt-views", "schema": 1, "hash": "ab" * 32, "settings": {"size": 40, "half": False},

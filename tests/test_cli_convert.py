@@ -261,7 +261,7 @@ def test_tf_show_draws(folder, vvgt):
 
 
 def test_an_interrupted_run_leaves_nothing(folder, vvgt, monkeypatch):
-    import vvgt_cli.pipeline.render as pipeline
+    import vvgt_cli.tasks.render as pipeline
 
     def stop(stream, *args):
         Path(stream).write_bytes(b"half")

@@ -128,7 +128,7 @@ def test_a_directory_that_is_not_writable(folder, vvgt):
 
 
 def test_a_size_that_does_not_fit_in_memory(folder, vvgt, monkeypatch):
-    monkeypatch.setattr("vvgt_cli.pipeline.mend.free_memory", lambda: 2**28)
+    monkeypatch.setattr("vvgt_cli.conversion.mend.free_memory", lambda: 2**28)
     result = vvgt("convert", "v.raw", *RAW, "-o", "a.ply", "--size", 2000)
     assert (result.code, "--size 2000" in result.error) == (2, True)
 
@@ -211,7 +211,7 @@ def test_termination_removes_the_temporary_file(folder):
     code = "\n".join(
         [
             "import os, signal, sys",
-            "import vvgt_cli.pipeline.outputs as outputs",
+            "import vvgt_cli.runs.outputs as outputs",
             "from vvgt_cli.cli import main",
             "def work(args=None):",
             "    with outputs.atomic_write('a.txt') as temporary:",

@@ -12,15 +12,18 @@ from network_models import as_rows
 from onnx_models import write_model
 
 from vvgt_cli.cli.main import run
+from vvgt_cli.conversion.request import FitOptions
+from vvgt_cli.conversion.stage import Work
+from vvgt_cli.conversion.stages import Network
 from vvgt_cli.gaussians import PlyOptions, read_ply, write_ply
 from vvgt_cli.images.viewset import load_views
 from vvgt_cli.network.card import ModelCard
 from vvgt_cli.network.prepare import prepare
 from vvgt_cli.network.runtime import Model
-from vvgt_cli.pipeline.infer import divide, improve
-from vvgt_cli.pipeline.optimize import Views
-from vvgt_cli.pipeline.record import ConversionReport, Run
 from vvgt_cli.progress import Console
+from vvgt_cli.runs.record import ConversionReport, Run
+from vvgt_cli.runs.views import Views
+from vvgt_cli.tasks.infer import divide
 from vvgt_cli.volume.types import UnitFrame
 
 DARK = 0.2
@@ -79,8 +82,10 @@ def test_the_stage_keeps_what_the_check_views_agree_with(made, model, kept):
     gaussians, _ = read_ply(made / "init.ply")
     dark = replace(gaussians, colors=gaussians.colors - DARK)
     run_ = Run(Console(quiet=True), ConversionReport("convert"))
-    out = improve(run_, dark, few.take([0, 1, 2]), few.take([3, 4]), str(made / model))
-    assert np.allclose(out.colors, dark.colors + (DARK if kept else 0), atol=1e-5)
+    work = Work(run_, None, FitOptions(), gaussians=dark, train=few.take([0, 1, 2]), check=few.take([3, 4]))
+    work.train_rule = work.rule
+    Network(str(made / model)).run(work)
+    assert np.allclose(work.gaussians.colors, dark.colors + (DARK if kept else 0), atol=1e-5)
     stage = run_.report.stages[0]
     assert (stage.name, stage.kept) == ("network", kept)
     assert (stage.psnr > stage.psnr_before) == kept

@@ -15,7 +15,7 @@ ROOT = Path(__file__).parent.parent
 # A march whose steps are so short that it takes minutes, in one kernel, while a file is being written.
 LONG = """
 import sys, threading
-import vvgt_cli.pipeline.convert as conversion
+import vvgt_cli.conversion.convert as conversion
 from vvgt_cli.cli import main
 from vvgt_cli.files import atomic_write
 from vvgt_cli.vbm.visibility import visibility

@@ -8,7 +8,7 @@ import pytest
 from vvgt_cli.cameras import default_views
 from vvgt_cli.dvr import RenderSettings, render_view
 from vvgt_cli.errors import DataError
-from vvgt_cli.pipeline.source import SourceRequest, load
+from vvgt_cli.runs.source import SourceRequest, load
 from vvgt_cli.transfer import read_transfer_function
 from vvgt_cli.transfer.colorspace import rgb_to_lab
 from vvgt_cli.transfer.suggest import suggest

@@ -131,7 +131,7 @@ class Shown:
 
 def shown(volume: str, folder: Path) -> Shown:
     from vvgt_cli.dvr import render_view
-    from vvgt_cli.pipeline.source import SourceRequest, load
+    from vvgt_cli.runs.source import SourceRequest, load
 
     path = folder / "converted.ply"
     options = ("--max-gaussians", "20000", "--size", "1080", "--steps", "0", "--quiet")

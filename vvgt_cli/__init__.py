@@ -19,10 +19,10 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from vvgt_cli.cameras import Camera, default_views, orbit_views
+    from vvgt_cli.conversion.result import Conversion, Result
     from vvgt_cli.errors import DataError, UsageError, VvgtError
     from vvgt_cli.gaussians import Gaussians, PlyHeader
     from vvgt_cli.library.functions import convert, evaluate, optimize, read_ply, read_volume, render_views
-    from vvgt_cli.pipeline.result import Conversion, Result
     from vvgt_cli.transfer import ColorMap, PiecewiseOpacity, TransferFunction, read_transfer_function
     from vvgt_cli.volume import Volume
 
@@ -31,7 +31,7 @@ _WHERE = {  # imported when asked for: `import vvgt_cli` costs nothing
     "errors": ("DataError", "UsageError", "VvgtError"),
     "gaussians": ("Gaussians", "PlyHeader"),
     "library.functions": ("convert", "evaluate", "optimize", "read_ply", "read_volume", "render_views"),
-    "pipeline.result": ("Conversion", "Result"),
+    "conversion.result": ("Conversion", "Result"),
     "transfer": ("ColorMap", "PiecewiseOpacity", "TransferFunction", "read_transfer_function"),
     "volume": ("Volume",),
 }

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import Any, TextIO
 
@@ -34,6 +34,15 @@ class Talk:
         return getattr(self._stream, name)
 
 
+@contextmanager
+def uninterrupted(say: Callable[[str], None]) -> Iterator[Callable[[], bool]]:
+    """A block in which interrupts are what they always are."""
+    yield lambda: False
+
+
+Interruption = Callable[[Callable[[str], None]], AbstractContextManager[Callable[[], bool]]]
+
+
 @dataclass
 class Console:
     """Talk on standard error; standard output is for data.
@@ -41,10 +50,13 @@ class Console:
     Attributes:
         quiet: say nothing (errors are printed by the command line itself).
         stream: where to; standard error unless told otherwise.
+        interruption: given what says a line, a block within which a first interrupt makes its function return True; the
+            command line's, since handlers of signals are the program's and not a library's.
     """
 
     quiet: bool = False
     stream: TextIO = field(default_factory=lambda: sys.stderr)
+    interruption: Interruption = uninterrupted
 
     def say(self, line: str) -> None:
         """Print one line: what separates lines in it (in the name of a file, say) becomes a blank."""

@@ -38,7 +38,7 @@ from vvgt_cli.progress import Console
 @click.option("--shard", metavar="I/N", help="Of a series: convert part I of N, for job arrays; I counts from 1.")
 @overwrite_option
 @common_options
-def command(volume: str, shard: str | None, console: Console, **options: Any) -> None:
+def command(volume: str, shard: str | None, dry_run: bool, console: Console, **options: Any) -> None:
     """Convert VOLUME into a standard 3D Gaussian Splatting .ply.
 
     VOLUME is a file (raw with a header or with --dims and --dtype, NRRD, NIfTI, MetaImage, VTK, TIFF, ...),
@@ -63,23 +63,24 @@ def command(volume: str, shard: str | None, console: Console, **options: Any) ->
       vvgt convert 'run_*.vti' --tf tf.json -o 'out_{:04d}.ply'
       vvgt convert cells.ome.tif --channel GFP --time 0 -o cells.ply
     """
+    from vvgt_cli.batches.series import convert_series, is_pattern
     from vvgt_cli.cli.fit import convert_request
+    from vvgt_cli.conversion.convert import convert, planned
     from vvgt_cli.errors import UsageError
-    from vvgt_cli.pipeline.convert import convert
-    from vvgt_cli.pipeline.plan import Plan
-    from vvgt_cli.pipeline.series import convert_series, is_pattern
 
     request = convert_request(volume, **options)
     series = is_pattern(options["output"])
     if series and request.checkpoint is not None:
         raise UsageError("--checkpoint is of one volume; a series goes on by its manifest: leave the option out")
+    if series and dry_run:
+        raise UsageError("--dry-run of a series: expected one volume; try it on one of the frames")
     if series:
-        from vvgt_cli.pipeline.render_views import parse_shard
+        from vvgt_cli.batches.render_views import parse_shard
 
         convert_series(request, parse_shard(shard or "1/1"), console)
     elif shard is not None:
         raise UsageError(f"--shard {shard} is of a series; give -o a place for the frame's number, as out_{{:04d}}.ply")
+    elif dry_run:
+        click.echo(planned(request, console).text())
     else:
-        done = convert(request, console)
-        if request.dry_run:
-            click.echo(Plan(**(done.plan or {})).text())
+        convert(request, console)

@@ -9,8 +9,8 @@ import click
 from vvgt_cli.cli.options import group
 
 if TYPE_CHECKING:
-    from vvgt_cli.pipeline.convert import ConvertRequest
-    from vvgt_cli.pipeline.source import SourceRequest
+    from vvgt_cli.conversion.request import ConvertRequest
+    from vvgt_cli.runs.source import SourceRequest
 
 fit_options = group(
     "fit",
@@ -79,7 +79,7 @@ ply_options = group(
 
 def source_request(volume: str, read: dict[str, Any], optics: dict[str, Any]) -> SourceRequest:
     """What the shared options of `options.py` add up to."""
-    from vvgt_cli.pipeline.source import SourceRequest
+    from vvgt_cli.runs.source import SourceRequest
     from vvgt_cli.volume import ReadOptions
 
     return SourceRequest(volume, ReadOptions(**read), optics["tf"], optics["tf_range"], optics["opacity_unit_distance"])
@@ -100,13 +100,11 @@ def convert_request(
     steps: int | None = None,
     model: str | None = None,
     limits: dict[str, Any] | None = None,
-    dry_run: bool = False,
     checkpoint: str | None = None,
 ) -> ConvertRequest:
     """The request that the options of `convert` and `init` add up to."""
+    from vvgt_cli.conversion.request import ConvertRequest, FitOptions, Limits
     from vvgt_cli.gaussians import PlyOptions
-    from vvgt_cli.pipeline.convert import ConvertRequest, FitOptions
-    from vvgt_cli.pipeline.plan import Limits
 
     up = ply.pop("up")
     return ConvertRequest(
@@ -114,7 +112,6 @@ def convert_request(
         output,
         FitOptions(**fit, rule=rule, steps=steps, model=model),
         Limits(**(limits or {})),
-        dry_run,
         PlyOptions(**ply),
         up,
         report,

@@ -32,6 +32,6 @@ def command(volume: str, console: Console, **options: Any) -> None:
       vvgt init example:frog -o frog-init.ply --max-gaussians 20000
     """
     from vvgt_cli.cli.fit import convert_request
-    from vvgt_cli.pipeline.convert import initialise_only
+    from vvgt_cli.conversion.convert import initialise_only
 
     initialise_only(convert_request(volume, **options), console)

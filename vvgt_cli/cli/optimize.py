@@ -61,7 +61,7 @@ def command(
     """
     from vvgt_cli.descent import OptimizeOptions
     from vvgt_cli.errors import UsageError
-    from vvgt_cli.pipeline.optimize import OptimizeRequest, budget, optimize_file
+    from vvgt_cli.tasks.optimize import OptimizeRequest, budget, optimize_file
 
     method, most = options["method"], options["max_gaussians"]
     if most is not None and method != "3dgs":

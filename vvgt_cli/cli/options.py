@@ -11,6 +11,7 @@ from typing import Any
 
 import click
 
+from vvgt_cli.cli.process import interruption
 from vvgt_cli.progress import Console
 from vvgt_cli.resources import parse_size, processors, set_memory
 
@@ -169,6 +170,6 @@ def common_options(function: Callable[..., Any]) -> Callable[..., Any]:
         with warnings.catch_warnings():
             if quiet:
                 warnings.simplefilter("ignore")  # they are notes on standard error
-            return function(*args, console=Console(quiet), **kwargs)
+            return function(*args, console=Console(quiet, interruption=interruption), **kwargs)
 
     return wrapper

@@ -7,7 +7,8 @@ import signal
 import sys
 import threading
 import time
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from typing import Any
 
 from vvgt_cli.files import discard_leftovers
@@ -55,6 +56,26 @@ def end_on_signals() -> None:
 def ended_by(status: int) -> str | None:
     """Name of the signal that an exit status stands for, None where it is another's."""
     return next((signal.Signals(number).name for number in ENDING if status == 128 + number), None)
+
+
+@contextmanager
+def interruption(say: Callable[[str], None]) -> Iterator[Callable[[], bool]]:
+    """Within the block a first interrupt (Ctrl-C) only makes the given function return True; a second one ends all."""
+    stopped = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield stopped.is_set  # handlers belong to the main thread
+        return
+
+    def note(number: int, frame: object) -> None:
+        stopped.set()
+        signal.signal(signal.SIGINT, before)
+        say("interrupted: what there is will be written; once more to leave without")
+
+    before = signal.signal(signal.SIGINT, note)
+    try:
+        yield stopped.is_set
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _end(number: int, frame: object) -> None:

@@ -50,7 +50,7 @@ def command(
       vvgt convert example:frog -o - | vvgt render - --orbit 8 -o turn
     """
     from vvgt_cli.errors import UsageError
-    from vvgt_cli.pipeline.render import RenderRequest, render_file
+    from vvgt_cli.tasks.render import RenderRequest, render_file
 
     if (camera is None) == (orbit is None):
         raise UsageError("give the views with either --camera FILE or --orbit N")

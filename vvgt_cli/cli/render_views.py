@@ -127,10 +127,10 @@ def command(
       vvgt render-views head.nrrd --tf bone.json --tf skin.json -o views --views 36 --size 800
       vvgt render-views head.nrrd --tf bone.json -o views --shard $SLURM_ARRAY_TASK_ID/8
     """
+    from vvgt_cli.batches.render_views import CameraRequest, ViewsRequest, parse_shard, render_view_sets
+    from vvgt_cli.batches.view_files import Layout
     from vvgt_cli.errors import UsageError
-    from vvgt_cli.pipeline.render_views import CameraRequest, ViewsRequest, parse_shard, render_view_sets
-    from vvgt_cli.pipeline.source import SourceRequest
-    from vvgt_cli.pipeline.view_files import Layout
+    from vvgt_cli.runs.source import SourceRequest
     from vvgt_cli.volume import ReadOptions
 
     if layout["half"] and layout["format"] == "png":

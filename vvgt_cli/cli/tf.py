@@ -30,7 +30,7 @@ def show(
     Example:
       vvgt tf show bone.json -o bone.png --volume head.nrrd
     """
-    from vvgt_cli.pipeline.show import show_transfer_function
+    from vvgt_cli.tasks.show import show_transfer_function
     from vvgt_cli.volume import ReadOptions
 
     show_transfer_function(tf, output, volume, ReadOptions(**read), tf_range, overwrite)
@@ -56,7 +56,7 @@ def convert(tf: str, output: str, form: str, tf_range: str, overwrite: bool, con
       vvgt tf convert CT-Bone.vp bone.json
       vvgt tf convert plasma.itf plasma.json --tf-range 0,255 --format paraview
     """
-    from vvgt_cli.pipeline.tf_convert import convert_transfer_function
+    from vvgt_cli.tasks.tf_convert import convert_transfer_function
 
     convert_transfer_function(tf, output, form, tf_range, overwrite, console)
 
@@ -81,7 +81,7 @@ def suggest(volume: str, number: int, output: str, read: dict, overwrite: bool, 
     Example:
       vvgt tf suggest head.nrrd -n 10 -o bands
     """
-    from vvgt_cli.pipeline.suggest import suggest_transfer_functions
+    from vvgt_cli.tasks.suggest import suggest_transfer_functions
     from vvgt_cli.volume import ReadOptions
 
     for path in suggest_transfer_functions(volume, number, output, ReadOptions(**read), overwrite, console):

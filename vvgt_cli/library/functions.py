@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Unpack
 
 from vvgt_cli.cameras import Camera, default_views
+from vvgt_cli.conversion.result import Conversion, Result
 from vvgt_cli.gaussians import Gaussians, PlyHeader
 from vvgt_cli.library.inputs import (
     FunctionLike,
@@ -18,13 +19,12 @@ from vvgt_cli.library.inputs import (
     source_of,
     volume_of,
 )
-from vvgt_cli.pipeline.result import Conversion, Result
 from vvgt_cli.volume import Volume
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from vvgt_cli.pipeline.evaluate import Evaluation
+    from vvgt_cli.tasks.evaluate import Evaluation
 
 
 def convert(
@@ -61,7 +61,7 @@ def convert(
             xarray.DataArray; a pyvista.ImageData; or a `Volume`.
         tf: a file, a matplotlib colour map's name, a mapping as a JSON file holds it, or a `TransferFunction`; None
             makes one from the histogram.
-        max_gaussians, size, rule, init, steps, model, seed: see `vvgt_cli.pipeline.convert.FitOptions`.
+        max_gaussians, size, rule, init, steps, model, seed: see `vvgt_cli.conversion.convert.FitOptions`.
         target_psnr, time_budget, max_megabytes: dB that are enough, seconds of the run, 10^6 bytes of the file.
         tf_range: "data", "rescale" or (lo, hi): where the function's nodes lie.
         opacity_unit_distance: world length that opacity is per, "paraview" or "mean-spacing".
@@ -76,8 +76,8 @@ def convert(
         DataError: input that is not what it must be, or a scene that shows nothing.
         UsageError: options that do not fit.
     """
-    from vvgt_cli.pipeline.convert import FitOptions, in_memory
-    from vvgt_cli.pipeline.plan import Limits
+    from vvgt_cli.conversion.convert import in_memory
+    from vvgt_cli.conversion.request import FitOptions, Limits
 
     fit = FitOptions(max_gaussians, size, init, rule, seed, steps, model)
     limits = Limits(target_psnr, time_budget, max_megabytes)
@@ -107,7 +107,7 @@ def read_ply(path: PathLike) -> tuple[Gaussians, PlyHeader]:
     Raises:
         DataError: not a 3DGS ``.ply``, or one without Gaussians.
     """
-    from vvgt_cli.pipeline.render import open_gaussians
+    from vvgt_cli.runs.gaussian_files import open_gaussians
 
     return open_gaussians(os.fspath(path), console_of(False))
 
@@ -147,7 +147,7 @@ def render_views(
     from vvgt_cli.cameras.boxed import drawn_in_box
     from vvgt_cli.dvr import RenderSettings, render_view
     from vvgt_cli.errors import UsageError
-    from vvgt_cli.pipeline.source import load
+    from vvgt_cli.runs.source import load
 
     views = default_views("train", cameras, size=size) if isinstance(cameras, int) else list(cameras)
     if len({(view.width, view.height) for view in views}) != 1:
@@ -185,7 +185,7 @@ def evaluate(
     Raises:
         DataError, UsageError: as `convert`.
     """
-    from vvgt_cli.pipeline import evaluate as pipeline
+    from vvgt_cli.tasks import evaluate as pipeline
 
     source = source_of(volume, tf, tf_range, opacity_unit_distance, reading)
     request = pipeline.EvaluateRequest(ply_of(ply), source, size, rule, step, seats)
@@ -226,8 +226,8 @@ def optimize(
         UsageError: both of steps and time_budget, or none.
     """
     from vvgt_cli.descent import OptimizeOptions
-    from vvgt_cli.pipeline.optimize import OptimizeRequest, budget, optimized
-    from vvgt_cli.pipeline.record import ConversionReport, Run
+    from vvgt_cli.runs.record import ConversionReport, Run
+    from vvgt_cli.tasks.optimize import OptimizeRequest, budget, optimized
 
     how = OptimizeOptions.of(
         method, max_gaussians=max_gaussians, target_psnr=target_psnr, seed=seed, **budget(steps, time_budget)

@@ -8,10 +8,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, BinaryIO, TypedDict
 
+from vvgt_cli.conversion.result import Result
 from vvgt_cli.errors import UsageError
-from vvgt_cli.pipeline.result import Result
-from vvgt_cli.pipeline.source import SourceRequest
 from vvgt_cli.progress import Console
+from vvgt_cli.runs.source import SourceRequest
 from vvgt_cli.transfer import TransferFunction
 from vvgt_cli.volume import ReadOptions, Volume
 

@@ -1,0 +1,364 @@
+"""What `convert` decides to do: limits, estimates, and what is left out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from onnx_models import write_model
+from test_cli_infer import DARKER
+
+from vvgt_cli.cameras import default_views
+from vvgt_cli.conversion.case import Case
+from vvgt_cli.conversion.convert import convert, planned
+from vvgt_cli.conversion.plan import DEFAULT_HALF_STEPS, DEFAULT_STEPS, MOST_STEPS, Planner, check_memory
+from vvgt_cli.conversion.request import ConvertRequest, FitOptions, Limits
+from vvgt_cli.conversion.stage import Work
+from vvgt_cli.conversion.stages import BackProjection, Network, Refinement, TrainingViews
+from vvgt_cli.conversion.stages.refinement import drawn_by_all
+from vvgt_cli.conversion.stages.views import fine_enough, views_of, wide
+from vvgt_cli.dvr import RenderSettings, Scene, render_view
+from vvgt_cli.errors import UsageError
+from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply
+from vvgt_cli.progress import Console
+from vvgt_cli.runs.record import ConversionReport, Run
+from vvgt_cli.runs.source import SourceRequest
+from vvgt_cli.runs.views import judging_views
+from vvgt_cli.splat.constants import DILATION
+from vvgt_cli.splat.rules import INRIA
+from vvgt_cli.transfer.readers import minimal
+from vvgt_cli.vbm import VbmOptions, initialise
+from vvgt_cli.volume import Volume
+
+CASE = Case(gaussians=100_000, cells=1e6, voxels=10.2e6, size=48, view=0.05, pace=1.0, there=2e8)
+FORM = 0.85 + 1.6 + 0.25 * 10.2  # seconds of its closed form
+SOURCE = SourceRequest("example:marschner-lobb:24")
+SMALL = FitOptions(400, 48)
+
+
+def plan(steps=None, spent=1.0, begun=False, case=CASE, size=48, wide=True, **limits):
+    case = replace(case, size=size)
+    return Planner(Limits(**limits), 1000, steps, 0, size, wide).plan(case, spent, begun)
+
+
+def of(found, kind):
+    """The stage of a kind in a plan, or None."""
+    return next((stage for stage in found.stages if isinstance(stage, kind)), None)
+
+
+def steps_of(found):
+    stage = of(found, Refinement)
+    return 0 if stage is None else stage.steps
+
+
+def ending(edge=48.0, judge=0.09):
+    """Seconds of three test views, the seats and the file."""
+    return 3 * (judge + 0.03 * (edge / 400) ** 2) + 2 * judge + 0.3 + 0.1
+
+
+def done(tmp_path, fit=SMALL, **options):
+    request = ConvertRequest(SOURCE, str(tmp_path / "a.ply"), fit, **options)
+    return convert(request, Console(quiet=True))
+
+
+def chosen(report):
+    """What the plan had for refinement."""
+    return next(stage for stage in report.plan["stages"] if stage["name"] == "refinement")
+
+
+def names(report):
+    return [stage.name for stage in report.stages]
+
+
+def test_without_limits_the_default_steps_are_planned_and_back_projection_is_not():
+    found = plan()
+    assert [stage.name for stage in found.stages] == [
+        "closed form", "check views", "views", "refinement", "test views", "seats"
+    ]  # fmt: skip
+    assert steps_of(found) == DEFAULT_STEPS
+    assert [name for name, _ in found.left_out] == ["network", "back-projection"]
+    assert found.seconds == pytest.approx(sum(seconds for _, seconds in found.costs()))
+    step = 0.013 * (48 / 400) ** 2 + 0.035
+    assert found.seconds == pytest.approx(1 + FORM + DEFAULT_STEPS * step + 48 * 0.05 + 4 * 0.09 + ending())
+    assert found.bytes == 1000 + 1000 * 68
+    assert f"{DEFAULT_STEPS} steps" in found.text()
+
+
+@pytest.mark.parametrize(("size", "edge"), [(400, 200), (1080, 200), (300, 150)])
+def test_views_are_half_as_large_as_they_may_be_where_gaussians_are_wide(size, edge):
+    found = plan(size=size)
+    descent, views = of(found, Refinement), of(found, TrainingViews)
+    assert (descent.half, descent.steps, views.edge) == (True, DEFAULT_HALF_STEPS, edge)
+    judged = size**2 if size < 565 else 625 * 256
+    whole, judge = 2 * edge, 1.8 * 0.05 * judged / (2 * edge) ** 2
+    step = 0.006 * (whole / 400) ** 2 + 0.017
+    seconds = 1 + FORM + DEFAULT_HALF_STEPS * step + 48 / 4 * 0.05 + 4 * judge + ending(judged**0.5, judge)
+    assert found.seconds == pytest.approx(seconds, rel=0.003)  # there are a few blocks more than 625
+    bytes_ = 294e6 + 1240e5 + 32 * (48 * edge**2 + 4 * judged + size**2)
+    assert found.memory == pytest.approx(2e8 + bytes_, rel=1e-3)
+    assert of(plan(size=size, time_budget=20.0), Refinement).half
+    for other in (plan(size=size, wide=False), plan(size=size, steps=23)):
+        assert (of(other, Refinement).half, of(other, TrainingViews).edge) == (False, min(size, 400))
+    assert not of(plan(size=100), Refinement).half
+
+
+def test_wide_is_told_by_the_middle_axis():
+    camera = default_views("check", 1, size=400)[0]
+    pixel = np.linalg.norm(camera.position) / camera.fx
+    scales = np.log(np.float32([[0.1, 1.0, 5.0]]) * pixel)
+    one = lambda size, logit=0.0: Gaussians(  # noqa: E731
+        np.zeros((1, 3), np.float32), scales + np.float32(np.log(size)), np.float32([[1, 0, 0, 0]]),
+        np.full(1, logit, np.float32), np.zeros((1, 3), np.float32),
+    )  # fmt: skip
+    assert wide(one(1.0), 400)
+    assert not wide(one(1.0, 3.0), 400)  # opaque
+    assert not wide(one(0.8), 400)
+    assert wide(one(1.0), 1080)  # its views are no larger
+    assert not wide(one(1.0), 200)
+
+
+def test_refinement_on_half_views_gains_on_whole_ones(tmp_path):
+    report = done(tmp_path, FitOptions(600, 128))
+    stages = {stage.name: stage for stage in report.stages}
+    assert stages["views"].note.startswith("48 of 64 px to fit to")
+    assert stages["refinement"].kept
+    assert stages["refinement"].psnr > stages["refinement"].psnr_before + 1
+    assert chosen(report)["half"]
+    assert report.refinement["dilation"] == DILATION / 4
+    assert report.refinement["rule"] == "inria"
+
+
+def test_a_large_screen_is_fitted_to_by_its_dilation_on_small_views(tmp_path):
+    report = done(tmp_path, FitOptions(600, 800, steps=48))
+    assert report.refinement["dilation"] == pytest.approx(DILATION / 16)
+    stages = {stage.name: stage for stage in report.stages}
+    assert stages["views"].note.startswith("24 of 200 px")
+    assert "blocks" in stages["check views"].note
+    header = read_ply(tmp_path / "a.ply")[1]
+    assert (header.made_for, header.rule) == (800, "inria")
+    other = done(tmp_path, FitOptions(600, 800, steps=48, rule="playcanvas"), overwrite=True)
+    by = {(seat["rule"], seat["size"]): seat["psnr"] for seat in report.seats}
+    assert {(seat["rule"], seat["size"]): seat["psnr"] for seat in other.seats}["playcanvas", 800] > by[
+        "playcanvas", 800
+    ]
+    assert report.seats == sorted(report.seats, key=lambda seat: seat["psnr"])
+    assert len(by) == 10
+
+
+def test_blocks_tell_what_the_whole_picture_does(tmp_path):
+    line = np.linspace(-1, 1, 24, dtype=np.float32)
+    ball = Volume(1 - np.sqrt(sum(np.square(np.meshgrid(line, line, line)))))
+    points = [{"x": x, "rgb": [1, abs(x), 0.2], "opacity": o} for x, o in ((-1, 0), (0.2, 0), (0.5, 0.5), (1, 0.9))]
+    scene = Scene.build(ball, minimal.read({"points": points}, "ball"), 1.0, (-0.8, 1.0))
+    cameras = default_views("check", 2, size=640)
+    judged = judging_views(scene, cameras, RenderSettings())
+    assert judged.images.shape[0] == len(judged.blocks) == 2
+    assert judged.images[0].size < 0.55 * 640 * 640 * 4
+    for camera, blocks, picked in zip(cameras, judged.blocks, judged.images, strict=True):
+        np.testing.assert_allclose(blocks.pick(render_view(scene, camera)), picked, atol=0.1)  # rays at their edges
+        assert np.abs(blocks.pick(render_view(scene, camera)) - picked).mean() < 1e-4
+
+
+def test_what_viewers_leave_out_is_not_written():
+    camera = default_views("check", 1, size=1000)[0]
+    pixel = np.linalg.norm(camera.position) / camera.fx
+    sizes = np.log(np.float32([0.1, 0.5, 2.0, 2.0])[:, None] * pixel * np.float32([1, 0.5, 0.1]))
+    logits = np.float32([2.0, 0.0, 0.0, -6.0])
+    turn, grey = np.tile(np.float32([1, 0, 0, 0]), (4, 1)), np.full((4, 3), 0.5, np.float32)
+    kept = drawn_by_all(Gaussians(np.zeros((4, 3), np.float32), sizes, turn, logits, grey), 1000)
+    assert len(kept) == 3  # the faint one is gone
+    np.testing.assert_allclose(np.exp(kept.log_scales.max(axis=1)) / pixel, [0.5, 0.5, 2.0], rtol=1e-5)
+    mass = lambda logit, scales: 1 / (1 + np.exp(-logit)) * np.exp(scales[0] + scales[1])  # noqa: E731
+    assert mass(kept.opacity_logits[0], kept.log_scales[0]) == pytest.approx(mass(logits[0], sizes[0]), rel=1e-4)
+    assert np.array_equal(kept.opacity_logits[1:], logits[1:3])
+
+
+def test_narrow_gaussians_get_whole_views(tmp_path, monkeypatch):
+    monkeypatch.setattr("vvgt_cli.conversion.convert.wide", lambda *_: False)
+    report = done(tmp_path, FitOptions(600, 128, steps=30))
+    assert chosen(report)["half"]  # what was foreseen
+    assert next(stage for stage in report.stages if stage.name == "views").note.startswith("24 of 128 px")
+    assert report.refinement["dilation"] == DILATION
+
+
+def test_views_that_do_not_fit_are_refused(monkeypatch):
+    found = plan(size=400)  # 48 of 200 px, 4 to check by, one of which is drawn whole
+    monkeypatch.setattr("vvgt_cli.conversion.plan.free_memory", lambda: 400**2 * 32 * 18)
+    check_memory(found)
+    monkeypatch.setattr("vvgt_cli.conversion.plan.free_memory", lambda: 400**2 * 32 * 16)
+    with pytest.raises(UsageError, match=r"--size 400.*--size 388 would fit"):
+        check_memory(found)
+
+
+def test_gaussians_that_do_not_fit_are_refused_with_the_number_that_would(monkeypatch):
+    monkeypatch.setattr("vvgt_cli.vbm.closed_form.expected_cells", lambda scene, size, budget: 2.0 * budget)
+    case = replace(CASE, gaussians=1_000_000, cells=2e6)
+    found = Planner(Limits(), 1_000_000, 0, 0, 48).plan(case, 1.0)
+    each, views = 0.8 * (2 * 294 + 1240), 0.8 * 32 * 48**2 * 29
+    monkeypatch.setattr("vvgt_cli.conversion.plan.free_memory", lambda: each * 1e6 + views + 1)
+    check_memory(found, object())
+    monkeypatch.setattr("vvgt_cli.conversion.plan.free_memory", lambda: each * 3e5 + views)
+    with pytest.raises(UsageError, match="--max-gaussians 250000 would fit"):
+        check_memory(found, object())
+
+
+@pytest.mark.parametrize(("edge", "samples"), [(0.4, 1), (0.01, None)])
+def test_hard_edges_get_adaptive_rays(edge, samples):
+    """A ball's surface, over a wide range of values or within a hundredth of it."""
+    line = np.linspace(-1, 1, 32, dtype=np.float32)
+    z, y, x = np.meshgrid(line, line, line, indexing="ij")
+    ball = Volume(1 - np.sqrt(x * x + y * y + z * z))
+    node = lambda v, o: {"x": v, "rgb": [1.0, 0.5 + v / 4, 0.2], "opacity": o}  # noqa: E731
+    points = [node(-1.0, 0.0), node(0.3, 0.0), node(0.3 + edge, 0.9), node(1.0, 0.9)]
+    scene = Scene.build(ball, minimal.read({"points": points}, "edge"), 1.0, (-0.8, 1.0))
+    start = initialise(scene, VbmOptions(4000, 128)).gaussians
+    for size, rule in ((128, INRIA), (64, INRIA.at(0.5))):
+        assert fine_enough(scene, start, size, rule).samples == samples
+
+
+def test_no_steps_leave_back_projection():
+    found = plan(steps=0)
+    assert steps_of(found) == 0
+    assert of(found, BackProjection) is not None
+    assert found.stages[0].anew  # its cells are cut once more
+    assert [name for name, _ in found.left_out] == ["refinement"]
+
+
+@pytest.mark.parametrize(("steps", "before"), [(1, True), (23, True), (24, False)])
+def test_few_steps_are_taken_after_back_projection(steps, before, tmp_path):
+    assert (of(plan(steps=steps), BackProjection) is not None) is before
+    if steps == 1:
+        stages = names(done(tmp_path, FitOptions(200, 48, steps=1)))
+        assert stages.index("back-projection") < stages.index("refinement")
+        assert stages.count("views") == 1
+
+
+def test_more_time_is_more_steps_and_never_more_than_the_time():
+    taken = [plan(time_budget=seconds) for seconds in (2, 7, 9, 10, 15, 20, 30, 100)]
+    steps = [steps_of(found) for found in taken]
+    assert steps == sorted(steps)
+    assert steps[0] == 0
+    assert 8 <= steps[3] < steps[-1] == MOST_STEPS
+    for found, seconds in zip(taken[2:], (9, 10, 15, 20, 30, 100), strict=True):
+        assert found.seconds <= seconds
+        assert of(found, Refinement).most == MOST_STEPS
+    assert of(taken[0], BackProjection) is None
+    assert {name for name, _ in taken[0].left_out} == {"refinement", "back-projection"}
+    assert steps_of(plan(time_budget=30, steps=40)) == 40
+
+
+def test_a_network_runs_where_there_is_time_for_it():
+    planner = Planner(Limits(), 1000, None, 0, 400, model="some")
+    case = replace(CASE, size=400)
+    assert of(planner.plan(case, 1.0), Network).model == "some"
+    assert not of(planner.plan(case, 1.0), Refinement).half  # it was trained on whole views
+    short = Planner(Limits(time_budget=9.0), 1000, None, 0, 400, model="some").plan(case, 1.0)
+    assert of(short, Network) is None
+    assert "network" in {name for name, _ in short.left_out}
+
+
+def test_a_slower_machine_gets_fewer_steps_after_the_closed_form():
+    quick, slow = (plan(time_budget=12, spent=6, begun=True, case=CASE.at(pace)) for pace in (1, 3))
+    assert steps_of(quick) > steps_of(slow) > 0
+    assert CASE.at(3).view == CASE.view  # measured, not fitted
+
+
+def test_views_come_in_sets():
+    assert [views_of(steps) for steps in (0, 1, 95, 96, 143, 144, 10_000)] == [24, 24, 24, 48, 48, 72, 72]
+
+
+@pytest.mark.parametrize(
+    ("limits", "line"),
+    [
+        ({"time_budget": 0.0}, "--time-budget 0"),
+        ({"max_megabytes": -1.0}, "--max-size -1"),
+        ({"max_megabytes": float("inf")}, "--max-size inf"),
+        ({"target_psnr": float("nan")}, "--target-psnr nan"),
+    ],
+)
+def test_limits_that_cannot_be_are_refused(limits, line):
+    with pytest.raises(UsageError, match=line):
+        Limits(**limits)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_a_size_is_kept_to_the_byte_and_one_without_room_is_refused(degree, tmp_path):
+    fit, limits = FitOptions(100_000, 48, steps=0), Limits(max_megabytes=0.02)
+    report = done(tmp_path, fit, limits=limits, ply=PlyOptions(sh_degree=degree))
+    assert report.gaussians == len(read_ply(tmp_path / "a.ply")[0])
+    assert 0.02e6 - 1500 < report.bytes <= 0.02e6
+    assert (tmp_path / "a.ply").stat().st_size == report.bytes
+    with pytest.raises(UsageError, match="no Gaussian fits"):
+        done(tmp_path, limits=Limits(max_megabytes=0.001))
+
+
+def test_a_target_that_the_closed_form_has_pays_for_nothing_else(tmp_path):
+    report = done(tmp_path, limits=Limits(target_psnr=10.0))
+    assert names(report) == ["read", "scene", "closed form", "check views", "test views", "seats", "write"]
+    assert report.gaussians <= 400 // 8
+    assert report.left_out[0][0] == "refinement"
+    assert "Gaussians" in report.left_out[1][0]
+
+
+def test_a_target_between_ends_refinement_when_it_is_reached(tmp_path):
+    start = done(tmp_path, FitOptions(400, 48, steps=24)).stages
+    before = next(stage.psnr_before for stage in start if stage.name == "refinement")
+    report = done(tmp_path, limits=Limits(target_psnr=before + 1), overwrite=True)
+    assert report.refinement["reason"] == "target"
+    assert report.refinement["psnr_after"] >= before + 1
+    assert report.refinement["steps"] < MOST_STEPS
+
+
+def test_a_hopeless_target_ends_and_writes_the_best(tmp_path):
+    report = done(tmp_path, FitOptions(50, 32), limits=Limits(target_psnr=90.0))
+    assert report.refinement["reason"] in ("steps", "no gain")
+    assert report.refinement["psnr_after"] >= report.refinement["psnr_before"]
+    assert len(read_ply(tmp_path / "a.ply")[0]) == report.gaussians
+
+
+def test_no_time_leaves_the_closed_form(tmp_path):
+    report = done(tmp_path, limits=Limits(time_budget=1e-3))
+    assert names(report) == ["read", "scene", "closed form", "test views", "write"]
+    assert len(read_ply(tmp_path / "a.ply")[0]) == report.gaussians > 0
+
+
+def test_a_dry_run_plans_and_writes_nothing(tmp_path):
+    request = ConvertRequest(SOURCE, str(tmp_path / "a.ply"), SMALL)
+    found = planned(request, Console(quiet=True))
+    assert not list(tmp_path.iterdir())
+    assert found.seconds > 0
+    assert found.memory > 1e8
+    lines = found.text().splitlines()
+    assert [line.split()[0] for line in lines[:3]] == ["so", "closed", "check"]
+    assert "48 views of 48 px" in found.text()
+    done(tmp_path)
+    with pytest.raises(UsageError, match="exists"):
+        planned(request, Console(quiet=True))
+
+
+def test_a_stage_that_is_not_ready_is_a_bug_that_says_so():
+    with pytest.raises(AssertionError, match="before the one that makes them"):
+        Work(Run(Console(quiet=True), ConversionReport("convert")), None, SMALL).made()
+
+
+def test_the_default_refines_and_says_what_it_left_out(tmp_path):
+    report = done(tmp_path)
+    assert report.refinement["steps"] == DEFAULT_STEPS
+    assert "back-projection" not in names(report)
+    assert [name for name, _ in report.left_out] == ["network", "back-projection"]
+    assert np.isfinite(report.scores["psnr"])
+    assert Path(tmp_path / "a.ply").exists()
+
+
+def test_a_network_that_makes_it_worse_is_dropped(tmp_path):
+    write_model(tmp_path / "darker", DARKER)
+    plain = done(tmp_path, FitOptions(400, 48, steps=30))
+    worse = done(tmp_path, FitOptions(400, 48, steps=30, model=str(tmp_path / "darker")), overwrite=True)
+    stage = next(stage for stage in worse.stages if stage.name == "network")
+    assert not stage.kept
+    assert stage.psnr < stage.psnr_before
+    assert worse.scores["psnr"] == plain.scores["psnr"]
+    with pytest.raises(UsageError, match="no such folder"):
+        done(tmp_path, FitOptions(400, 48, model="no/such"), overwrite=True)

@@ -1,0 +1,108 @@
+"""Conversions that are ended at every stage and go on: the bytes are those of one that never was."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from vvgt_cli.conversion import convert as conversion
+from vvgt_cli.conversion.stages import scores
+from vvgt_cli.descent import loop
+
+LINE = ("convert", "example:blob:8", "--max-gaussians", "200", "--size", "32", "--steps", "24")
+
+
+@pytest.fixture
+def folder(tmp_path: Path, vvgt, monkeypatch) -> Path:
+    """The working folder, with what a run that is not ended writes."""
+    monkeypatch.chdir(tmp_path)
+    assert vvgt(*LINE, "-o", "whole.ply").code == 0
+    return tmp_path
+
+
+def ended(monkeypatch, target: str, calls: int) -> None:
+    """Let the function end the run at its call number ``calls`` (from 0)."""
+    module, _, name = target.rpartition(".")
+    owner = {"loop": loop, "convert": conversion, "scores": scores}[module]
+    own, count = getattr(owner, name), [0]
+
+    def call(*args, **kwargs):
+        count[0] += 1
+        if count[0] > calls:
+            raise KeyboardInterrupt
+        return own(*args, **kwargs)
+
+    monkeypatch.setattr(owner, name, call)
+
+
+@pytest.mark.parametrize(
+    ("target", "calls", "left"),
+    [
+        ("convert._improve", 0, {"closed-form.npz"}),
+        ("loop.step", 4, {"closed-form.npz", "refinement.npz"}),
+        ("scores.score_test_views", 0, {"closed-form.npz", "refinement.npz", "fitted.npz"}),
+        ("convert.write_gaussians", 0, {"closed-form.npz", "refinement.npz", "fitted.npz"}),
+    ],
+)
+def test_a_conversion_goes_on_where_it_was_ended(target, calls, left, folder, vvgt, monkeypatch):
+    line = (*LINE, "-o", "a.ply", "--checkpoint", "kept")
+    with monkeypatch.context() as patch:
+        patch.setattr(loop, "KEEP", 0.0)
+        ended(patch, target, calls)
+        assert vvgt(*line).code == 130
+    assert {path.name for path in (folder / "kept").iterdir()} == left
+    with monkeypatch.context() as patch:  # nothing is done twice
+        if "fitted.npz" in left:
+            ended(patch, "convert._improve", 0)
+        ended(patch, "loop.step", 20 if "refinement.npz" in left else 24)
+        patch.setattr("vvgt_cli.vbm.initialise", None)
+        result = vvgt(*line)
+    assert result.code == 0, result.err
+    assert (folder / "a.ply").read_bytes() == (folder / "whole.ply").read_bytes()
+    assert sorted(path.name for path in folder.iterdir()) == ["a.ply", "whole.ply"]
+
+
+@pytest.mark.parametrize("more", [("--steps", "0"), ("--steps", "4"), ("--target-psnr", "60")])
+def test_stages_that_cut_the_pyramid_anew_have_it(more, folder, vvgt, monkeypatch):
+    line = (*LINE, *more, "--overwrite", "-o")
+    assert vvgt(*line, "whole.ply").code == 0
+    with monkeypatch.context() as patch:
+        ended(patch, "scores.score_test_views", 0)
+        assert vvgt(*line, "a.ply", "--checkpoint", "kept").code == 130
+    (folder / "kept" / "fitted.npz").unlink()
+    assert vvgt(*line, "a.ply", "--checkpoint", "kept").code == 0
+    assert (folder / "a.ply").read_bytes() == (folder / "whole.ply").read_bytes()
+
+
+def test_what_is_kept_of_another_conversion_or_is_damaged(folder, vvgt, monkeypatch):
+    line = (*LINE, "-o", "a.ply", "--checkpoint", "kept")
+    with monkeypatch.context() as patch:
+        ended(patch, "scores.score_test_views", 0)
+        assert vvgt(*line).code == 130
+    other = vvgt(*line, "--max-gaussians", "100")
+    assert (other.code, "fitted.npz: of a conversion of another volume, or with other options" in other.error) == (
+        2,
+        True,
+    )
+    kept = folder / "kept" / "fitted.npz"
+    whole = kept.read_bytes()
+    for content in (b"", whole[: len(whole) // 2], whole.replace(b"means", b"moons")):
+        kept.write_bytes(content)
+        damaged = vvgt(*line)
+        assert (damaged.code, "not what a stage of 'vvgt convert' keeps" in damaged.error) == (1, True)
+
+
+@pytest.mark.parametrize(
+    ("more", "told"),
+    [
+        (("--time-budget", "9"), "give one of both"),
+        (("--checkpoint", "no/where"), "cannot be made (No such file or directory)"),
+        (("-o", "a_{}.ply"), "a series goes on by its manifest"),
+    ],
+)
+def test_what_cannot_go_on_is_said(more, told, tmp_path, vvgt, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    result = vvgt(*LINE, "-o", "a.ply", "--checkpoint", "kept", *more)
+    assert (result.code, told in result.error) == (2, True)
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,200 @@
+"""`vvgt convert` of a time series: one range for all, resumed by its manifest, in parts."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import nibabel as nib
+import numpy as np
+import pytest
+import tifffile
+
+from vvgt_cli.batches.series import frame_names, is_pattern, together
+from vvgt_cli.errors import UsageError
+from vvgt_cli.runs.record import ConversionReport
+from vvgt_cli.runs.source import load
+from vvgt_cli.synth.analytic import blob
+from vvgt_cli.volume import Volume, statistics
+
+SMALL = ("--size", "32", "--max-gaussians", "60", "-q")
+TF = {"points": [{"x": 0, "rgb": [0, 0, 1], "opacity": 0}, {"x": 10, "rgb": [1, 0, 0], "opacity": 0.5}]}
+
+
+@pytest.fixture
+def series(tmp_path: Path) -> Path:
+    """Four frames of a blob that grows from nothing to ten, named so that text does not sort them."""
+    for k, height in enumerate((0.0, 4.0, 7.0, 10.0)):
+        field = blob((12, 10, 8))
+        np.save(tmp_path / f"run_{k + 8}.npy", (field.data / field.data.max() * height).astype(np.float32))
+    (tmp_path / "tf.json").write_text(json.dumps(TF))
+    (tmp_path / "out").mkdir()
+    return tmp_path
+
+
+@pytest.fixture
+def stand_in(monkeypatch: pytest.MonkeyPatch) -> list:
+    """Write what a frame's function and values come to in place of converting it; returns the calls."""
+    calls: list = []
+
+    def write(request, console) -> ConversionReport:
+        calls.append(request)
+        source = load(request.source)
+        text = f"{source.tf.node_range()} {source.statistics.hi:g} {request.fit}"
+        for name in filter(None, (request.output, request.report)):
+            Path(name).write_text(text)
+        return ConversionReport("convert")
+
+    monkeypatch.setattr("vvgt_cli.batches.series.convert", write)
+    return calls
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted(folder.glob("*.ply"))}
+
+
+def test_frames_are_those_of_single_conversions_and_dark_ones_are_left_out(vvgt, series: Path) -> None:
+    out, tf = series / "out" / "f_{:03d}.ply", series / "tf.json"
+    done = vvgt("convert", series / "run_*.npy", "--tf", tf, "-o", out, *[a for a in SMALL if a != "-q"])
+    assert done.code == 0, done.err
+    assert "values 0 to 10" in done.err
+    assert "run_8.npy: nothing of it is visible" in done.err
+    made = contents(series / "out")
+    assert list(made) == ["f_001.ply", "f_002.ply", "f_003.ply"]
+    alone = series / "alone.ply"
+    assert vvgt("convert", series / "run_9.npy", "--tf", tf, "-o", alone, *SMALL).code == 0
+    assert alone.read_bytes() == made["f_001.ply"]
+
+
+@pytest.mark.parametrize("how", [("--tf", "viridis"), ("--tf", "TF", "--tf-range", "rescale"), ()])
+def test_one_range_for_all(vvgt, series: Path, stand_in: list, how: tuple) -> None:
+    how = tuple(series / "tf.json" if part == "TF" else part for part in how)
+    run = ("convert", series / "run_*.npy", "-o", series / "out" / "{:d}.ply", *how, *SMALL)
+    assert vvgt(*run, "--report", series / "out" / "r{:d}.json").code == 0
+    nodes = [load(request.source).tf.node_range() for request in stand_in]
+    assert len(nodes) >= 3
+    assert set(nodes) == {nodes[0]}
+    assert nodes[0][1] == pytest.approx(10, abs=0.05)
+    assert (series / "out" / "r3.json").is_file()
+
+
+def test_resumed_and_in_parts_it_leaves_the_same_bytes(vvgt, series: Path, stand_in: list) -> None:
+    (series / "parts").mkdir()
+    common = ("convert", series / "run_*.npy", "--tf", series / "tf.json", *SMALL)
+    whole = (*common, "-o", series / "out" / "{:02d}.ply")
+    assert vvgt(*whole).code == 0
+    made = contents(series / "out")
+    for part in ("2/2", "1/2"):
+        assert vvgt(*common, "-o", series / "parts" / "{:02d}.ply", "--shard", part).code == 0
+    assert contents(series / "parts") == made
+    (series / "out" / "02.ply").write_bytes(b"damaged")
+    before = (series / "out" / "03.ply").stat().st_mtime_ns
+    again = vvgt(*[part for part in whole if part != "-q"])
+    assert again.code == 0
+    assert "1 frames converted, 2 were done before" in again.err
+    assert contents(series / "out") == made
+    assert (series / "out" / "03.ply").stat().st_mtime_ns == before
+
+
+def test_time_steps_of_one_file(vvgt, series: Path, stand_in: list) -> None:
+    frames = np.stack([np.load(series / f"run_{k}.npy") for k in range(8, 12)])
+    tifffile.imwrite(series / "cells.ome.tif", frames, ome=True, metadata={"axes": "TZYX"}, photometric="minisblack")
+    nib.save(nib.Nifti1Image(frames.transpose(3, 2, 1, 0), np.eye(4)), series / "bold.nii.gz")
+    run = ("--tf", series / "tf.json", "--tf-range", "rescale", *[part for part in SMALL if part != "-q"])
+    made = {}
+    for source in ("run_*.npy", "cells.ome.tif", "bold.nii.gz"):
+        folder = series / source.partition(".")[0].strip("_*")
+        folder.mkdir()
+        done = vvgt("convert", series / source, "-o", folder / "p_{:02d}.ply", *run)
+        assert done.code == 0, done.err
+        made[source] = contents(folder)
+    assert list(made["cells.ome.tif"]) == ["p_01.ply", "p_02.ply", "p_03.ply"]
+    assert made["cells.ome.tif"] == made["bold.nii.gz"] == made["run_*.npy"]
+    assert "bold.nii.gz time 0: nothing of it is visible" in done.err
+    assert [request.source.read.time for request in stand_in] == [None] * 3 + [1, 2, 3] * 2
+    error = vvgt("convert", series / "bold.nii.gz", "-o", series / "p.ply", *run).error
+    assert "4 time steps; expected one: try --time N (0 to 3), or a number in the output" in error
+
+
+def test_a_dry_run_of_a_series_is_refused_before_anything_is_written(vvgt, series: Path) -> None:
+    out = series / "out" / "{:02d}.ply"
+    done = vvgt("convert", series / "run_*.npy", "--tf", series / "tf.json", "-o", out, *SMALL, "--dry-run")
+    assert done.code == 2
+    assert "--dry-run of a series" in done.err
+    assert not list((series / "out").iterdir())
+
+
+def test_an_interrupted_frame_is_not_recorded(vvgt, series: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(request, console) -> ConversionReport:
+        Path(request.output).write_text("short")
+        return ConversionReport("convert", refinement={"reason": "interrupted"})
+
+    monkeypatch.setattr("vvgt_cli.batches.series.convert", interrupted)
+    run = ("convert", series / "run_*.npy", "--tf", series / "tf.json", "-o", series / "out" / "{:02d}.ply", *SMALL)
+    assert vvgt(*run).code == 130
+    assert "01.ply" not in (series / "out" / "manifest.json").read_text().split('"files"')[1]
+
+
+def test_another_series_is_refused_and_overwritten_on_request(vvgt, series: Path, stand_in: list) -> None:
+    run = ("convert", series / "run_*.npy", "--tf", series / "tf.json", "-o", series / "out" / "{:02d}.ply", *SMALL)
+    assert vvgt(*run).code == 0
+    assert "holds frames of another run: max gaussians 60 there, 50 here" in vvgt(*run, "--max-gaussians", "50").error
+    np.save(series / "run_12.npy", np.zeros((8, 10, 12), np.float32))
+    assert "another volume, frames 4 there, 5 here" in vvgt(*run).error
+    assert vvgt(*run, "--overwrite").code == 0
+    (series / "out" / "manifest.json").unlink()
+    assert "01.ply exists, and no manifest" in vvgt(*run).error
+    (series / "out" / "manifest.json").write_text("{}")
+    assert "not a manifest of 'vvgt convert'" in vvgt(*run).error
+
+
+def test_calls_that_are_wrong(vvgt, series: Path) -> None:
+    frames, tf = series / "run_*.npy", series / "tf.json"
+    for args, message in (
+        ((series / "none_*.npy", "-o", "{}.ply"), "no such files"),
+        ((frames, "-o", series / "{}{}.ply"), "expected one place for the frame's number"),
+        ((frames, "-o", series / "{:02d}.ply", "--report", series / "r.json"), "--report .*expected one place"),
+        ((frames, "-o", series / "{:02d}.ply", "--report", series / "out" / "{}.json"), "go to one folder"),
+        ((frames, "-o", series / "{:02d}.obj"), "expected a name ending in .ply"),
+        ((frames, "-o", series / "none" / "{:02d}.ply"), "does not exist"),
+        ((frames, "-o", series / "{:02d}.ply", "--shard", "3/2"), "--shard 3/2"),
+        ((frames, "-o", series / "a.ply", "--shard", "1/2"), "is of a series"),
+        ((frames, "-o", series / "{}.ply", "--shard", "1/2", "--overwrite"), "would remove each other's files"),
+        ((frames, "-o", series / "a.ply"), "run_8.npy is no TIFF slice.*out_{:04d}.ply"),
+        ((frames, "-o", series / "{:02d}.ply", "--tf", tf, "--tf-range", "50,60"), "shows nothing in any of 4 frames"),
+    ):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.chdir(series)
+            done = vvgt("convert", *args, *SMALL)
+        assert done.code in (1, 2)
+        assert re.search(message, done.error), done.error
+    np.save(series / "run_7.npy", np.zeros((3, 4, 5), np.float32))
+    done = vvgt("convert", frames, "-o", series / "{:02d}.ply", *SMALL)
+    assert "expected the grid of run_7.npy, 5 x 4 x 3 voxels of 1 1 1 from 0 0 0" in done.error
+    assert not list(series.glob("*.ply"))
+
+
+def test_names_of_frames() -> None:
+    assert frame_names("-o", "a_{:04d}.ply", 2) == ["a_0000.ply", "a_0001.ply"]
+    assert [is_pattern(name) for name in ("a.ply", "{}.ply", "{:3d}.ply", "{x}.ply", "{0.__class__}.ply")] == [
+        False, True, True, False, False
+    ]  # fmt: skip
+    with pytest.raises(UsageError):
+        frame_names("-o", "{}/{:d}.ply", 2)
+
+
+def test_statistics_together() -> None:
+    rng = np.random.default_rng(0)
+    parts = [rng.normal(k, 1 + k, (4, 5, 6)).astype(np.float32) for k in range(3)]
+    parts[1][0, 0, 0] = np.nan
+    parts.append(np.full((4, 5, 6), 20.0, np.float32))
+    whole = statistics(Volume(np.concatenate(parts)))
+    joined = together([statistics(Volume(part)) for part in parts])
+    assert (joined.lo, joined.hi, joined.nan_count) == (whole.lo, whole.hi, 1)
+    np.testing.assert_allclose(joined.edges, whole.edges)
+    assert joined.histogram.sum() == whole.histogram.sum() == 479
+    off = np.abs(np.cumsum(joined.histogram) - np.cumsum(whole.histogram)).max()
+    assert off <= 0.02 * 479
+    constant = together([statistics(Volume(np.full((2, 2, 2), 3.0)))] * 2)
+    assert (constant.lo, constant.hi, constant.histogram.sum()) == (3, 3, 16)

@@ -1,0 +1,1 @@
+"""Many files of one run: sets of views and series, by manifest and in parts."""

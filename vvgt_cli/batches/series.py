@@ -1,0 +1,287 @@
+"""`vvgt convert` of a time series: one `.ply` a frame, under one function, range and grid for all of them."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vvgt_cli import __version__
+from vvgt_cli.batches.manifest import Manifest, Shard
+from vvgt_cli.conversion.convert import convert
+from vvgt_cli.conversion.request import ConvertRequest
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.files import claim, read_text
+from vvgt_cli.network.card import CARD, find_model
+from vvgt_cli.progress import Console
+from vvgt_cli.runs.digests import digest, volume_digest
+from vvgt_cli.runs.outputs import check_outputs
+from vvgt_cli.runs.place import way_up
+from vvgt_cli.runs.record import ConversionReport, Run
+from vvgt_cli.runs.source import SourceRequest
+from vvgt_cli.volume import ReadOptions, Statistics, Volume, statistics
+
+if TYPE_CHECKING:
+    from vvgt_cli.transfer import TransferFunction
+
+FIELD = re.compile(r"\{(?::0?\d{0,2}d)?\}")
+
+
+def is_pattern(output: str) -> bool:
+    """Whether an output's name has a place for a frame's number, as ``out_{:04d}.ply``."""
+    return FIELD.search(output) is not None
+
+
+def frame_names(option: str, pattern: str, count: int) -> list[str]:
+    """The names of ``count`` frames, numbered from 0.
+
+    Raises:
+        UsageError: not one place for a number.
+    """
+    if len(FIELD.findall(pattern)) != 1 or set(FIELD.sub("", pattern)) & set("{}"):
+        raise UsageError(f"{option} {pattern}: expected one place for the frame's number, as out_{{:04d}}.ply")
+    return [pattern.format(k) for k in range(count)]
+
+
+@dataclass(frozen=True)
+class Step:
+    """A frame of a series: a file, or a time step of one.
+
+    Attributes:
+        name: for talk.
+        volume: as `SourceRequest.volume`.
+        read: how to read it.
+    """
+
+    name: str
+    volume: str
+    read: ReadOptions
+
+
+@dataclass(frozen=True)
+class Frames:
+    """What the first pass over a series found.
+
+    Attributes:
+        count: how many there are.
+        own: range (lo, hi) of each.
+        whole: statistics of all frames together.
+        first: the first frame without its values; the grid of all of them is its.
+        content: digest of all frames' values.
+    """
+
+    count: int
+    own: list[tuple[float, float]]
+    whole: Statistics
+    first: Volume
+    content: str
+
+
+def survey(steps: Sequence[Step], console: Console) -> Frames:
+    """Read every frame once, for the range and the digest of all.
+
+    Raises:
+        DataError: a frame that cannot be read, or on another grid than the first.
+    """
+    from vvgt_cli.synth.sources import open_volume
+
+    first: Volume | None = None
+    numbers, digests = [], []
+    bar = console.bar("range")
+    for k, step in enumerate(steps):
+        volume = open_volume(step.volume, step.read)
+        if first is None:
+            first = replace(volume, data=np.broadcast_to(volume.data.dtype.type(0), volume.data.shape))
+        if _grid(volume) != _grid(first):
+            raise DataError(
+                f"{step.name}: {_grid_text(volume)}; expected the grid of {steps[0].name}, {_grid_text(first)}: frames "
+                "of one series share it"
+            )
+        numbers.append(statistics(volume))
+        digests.append(volume_digest(volume))
+        if bar:
+            bar(k + 1, len(steps))
+    if first is None:
+        raise UsageError("a series without frames")
+    return Frames(len(steps), [(n.lo, n.hi) for n in numbers], together(numbers), first, digest(*digests))
+
+
+def _grid(volume: Volume) -> tuple[Any, ...]:
+    return volume.dims, volume.spacing, volume.origin, volume.direction, volume.space
+
+
+def _grid_text(volume: Volume) -> str:
+    parts = (volume.spacing, volume.origin, volume.direction)
+    numbers = (" ".join(f"{value:g}" for value in values) for values in parts)
+    return " x ".join(map(str, volume.dims)) + " voxels of {} from {} along {}".format(*numbers)
+
+
+def together(parts: Sequence[Statistics]) -> Statistics:
+    """The statistics of several volumes as one; counts are spread evenly within each one's bins."""
+    lo, hi = min(p.lo for p in parts), max(p.hi for p in parts)
+    widest = max(parts, key=lambda p: p.edges[-1] - p.edges[0])
+    ends = (lo, hi) if lo < hi else (widest.edges[0], widest.edges[-1])
+    steps = np.arange(len(widest.edges)) / (len(widest.edges) - 1)
+    edges = ends[0] * (1 - steps) + ends[1] * steps
+    edges[0], edges[-1] = ends
+    below = np.zeros(len(edges))
+    for part in parts:
+        below += np.interp(edges, part.edges, np.concatenate([[0], np.cumsum(part.histogram)]))
+    below[0], below[-1] = 0, sum(int(p.histogram.sum()) for p in parts)
+    histogram = np.diff(np.round(below)).astype(np.int64)
+    return Statistics(lo, hi, sum(p.nan_count for p in parts), sum(p.inf_count for p in parts), histogram, edges)
+
+
+def convert_series(request: ConvertRequest, shard: Shard, console: Console | None = None) -> int:
+    """Convert every frame that ``request.source.volume``, a glob or a file of time steps, has and that is not done yet.
+
+    Nodes of the function that follow from the data (``--tf-range rescale``, percentiles, the histogram) follow from all
+    frames together. Frames in which the function shows nothing get no file, and a line says so.
+
+    Args:
+        request: of all frames; its outputs have a place for the frame's number.
+        shard: which part of the frames to convert.
+        console: for talk.
+
+    Returns:
+        How many frames were converted.
+
+    Raises:
+        UsageError: no such files, outputs without a place for a number, a folder that holds another series.
+        DataError: a frame that cannot be read, or on another grid than the first.
+    """
+    if request.overwrite and shard.count > 1:
+        raise UsageError("--overwrite with --shard: parts would remove each other's files; remove the files instead")
+    console = console or Console()
+    source = request.source
+    steps = _steps(source)
+    names = _outputs(request, len(steps))
+    run = Run(console, ConversionReport("convert"))
+    with run.stage("frames") as stage:
+        frames = survey(steps, console)
+        source = replace(source, statistics=frames.whole)
+        tf, distance = _function(source, frames)
+        dark = [not tf.support(*own) for own in frames.own]
+        stage.note = (
+            f"{len(steps)} of {' x '.join(map(str, frames.first.dims))}, values {frames.whole.lo:g} to "
+            f"{frames.whole.hi:g}; {tf.name}: opacity per {distance[0]:g} ({distance[1]})"
+        )
+    if all(dark):
+        raise DataError(f"{source.volume}: {tf.name} shows nothing in any of {len(steps)} frames; try another function")
+    manifest = Manifest(Path(names[0][0]).parent, _settings(request, frames, tf, distance[0]), shard, what="frames")
+    with claim(manifest.folder / shard.manifest):
+        manifest.open([Path(name).name for row in names for name in row], request.overwrite)
+        manifest.record()
+        done = _frames(request, source, steps, names, dark, manifest, console)
+    mine = sum(shard.holds(k) and not d for k, d in enumerate(dark))
+    console.say(f"{done} frames converted, {mine - done} were done before")
+    return done
+
+
+def _frames(
+    request: ConvertRequest,
+    source: SourceRequest,
+    steps: Sequence[Step],
+    names: Sequence[list[str]],
+    dark: Sequence[bool],
+    manifest: Manifest,
+    console: Console,
+) -> int:
+    """Convert what is missing of this part's frames; returns how many."""
+    done = 0
+    for k, step in enumerate(steps):
+        own = [Path(name).name for name in names[k]]
+        if not manifest.shard.holds(k) or all(map(manifest.complete, own)):
+            continue
+        if dark[k]:
+            console.say(f"{step.name}: nothing of it is visible; it gets no file")
+            continue
+        console.say(f"{step.name}: frame {k + 1} of {len(steps)}, to {names[k][0]}")
+        report = convert(_frame(request, replace(source, volume=step.volume, read=step.read), names[k]), console)
+        if report.refinement and report.refinement["reason"] == "interrupted":
+            raise KeyboardInterrupt  # the frame is there, but not what it would be: it is made again
+        manifest.record(own)
+        done += 1
+    return done
+
+
+def _function(source: SourceRequest, frames: Frames) -> tuple[TransferFunction, tuple[float, str]]:
+    """The function on data values, and its unit distance with how it was chosen; the same for every frame."""
+    from vvgt_cli.transfer import from_histogram, read_transfer_function, resolve, unit_distance
+    from vvgt_cli.transfer.resolve import parse_tf_range
+
+    read = read_transfer_function(source.tf) if isinstance(source.tf, str) else source.tf
+    distance = unit_distance(source.unit_distance, frames.first, read)
+    if read is None:
+        return from_histogram(frames.whole), distance
+    return resolve(read, frames.whole, parse_tf_range(source.tf_range)), distance
+
+
+def _steps(source: SourceRequest) -> list[Step]:
+    """The files of a glob, or the time steps of the one file that is named."""
+    from vvgt_cli.volume.registry import time_steps
+    from vvgt_cli.volume.slices import matching
+
+    files = [] if os.path.exists(source.path) else matching(source.path)
+    if not files and set(source.path) & set("*?[") and not os.path.exists(source.path):
+        raise UsageError(
+            f"{source.path}: no such files; with a number in -o expected the frames of a series, as 'run_*.vti', or "
+            "a file of several time steps"
+        )
+    if len(files) > 1:
+        return [Step(file.name, str(file), source.read) for file in files]
+    volume = str(files[0]) if files else source.path
+    name = Path(volume).name
+    count = time_steps(volume, source.read)
+    if count == 1:
+        return [Step(name, volume, source.read)]
+    return [Step(f"{name} time {k}", volume, replace(source.read, time=k)) for k in range(count)]
+
+
+def _outputs(request: ConvertRequest, count: int) -> list[list[str]]:
+    """Output, report and preview of every frame, checked as far as the first frame's tell."""
+    patterns = {"-o": request.output, "--report": request.report, "--preview": request.preview}
+    columns = [frame_names(option, pattern, count) for option, pattern in patterns.items() if pattern is not None]
+    rows = [list(row) for row in zip(*columns, strict=True)]
+    check_outputs(_frame(request, request.source, rows[0]).outputs(), request.source.paths()[1:], overwrite=True)
+    folders = {str(Path(name).parent) for name in rows[0]}
+    if len(folders) > 1:
+        raise UsageError(f"the frames, reports and previews of a series go to one folder; got {', '.join(folders)}")
+    return rows
+
+
+def _frame(request: ConvertRequest, source: SourceRequest, names: list[str]) -> ConvertRequest:
+    """The request of one frame; the manifest has said that its outputs may be replaced."""
+    rest = list(names)
+    return replace(
+        request,
+        source=source,
+        output=rest.pop(0),
+        report=rest.pop(0) if request.report is not None else None,
+        preview=rest.pop(0) if request.preview is not None else None,
+        overwrite=True,
+    )
+
+
+def _settings(request: ConvertRequest, frames: Frames, tf: TransferFunction, distance: float) -> dict[str, Any]:
+    """Everything that the files depend on; named as the command line names it."""
+    ply = asdict(request.ply)
+    return {
+        "version": __version__,
+        "volume": frames.content,
+        "frames": frames.count,
+        "function": digest(tf.opacity_nodes, tf.color_map),
+        "opacity_unit_distance": distance,
+        **asdict(request.fit),
+        **asdict(request.limits),
+        "model": read_text(find_model(request.fit.model) / CARD) if request.fit.model else None,
+        **{key: ply[key] for key in ("frame", "sh_degree", "comments")},
+        "up": way_up(request.up, request.ply.frame, frames.first.space),
+        "place": [frames.first.space, *frames.first.affine[:3].ravel().tolist()],
+        "outputs": [Path(p).name for p in (request.output, request.report, request.preview) if p],
+    }

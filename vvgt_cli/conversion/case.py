@@ -1,0 +1,129 @@
+"""`Case`: what of a scene and a machine the costs of stages depend on (docs/plan.md says how they were fitted)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vvgt_cli.cameras.blocks import BLOCK, spread_blocks
+
+if TYPE_CHECKING:
+    from vvgt_cli.dvr import Scene
+
+SORT = 0.95e-3  # seconds in which 200,000 random float64 sort on the two cores that costs were fitted on
+PROBE = 80  # pixels along the edge of the view that is timed
+VIEW, FINER = 1.1, 1.8  # of the view that is timed: a training view, and as much again where it is to judge by
+WHOLE = 400  # pixels along the edge of a training view, at most: more show no more (docs/optimize.md)
+PROGRAM = 2.6e8  # bytes: interpreter, libraries and kernels
+
+
+@dataclass(frozen=True)
+class Case:
+    """Counts of a scene, and a machine's pace.
+
+    Attributes:
+        gaussians: that there will be: the budget, or as many as there are cells.
+        cells: of the closed form's base.
+        voxels: in bricks that are not empty.
+        size: pixels along the edge of the screen that the file is made for.
+        view: seconds of a training view of ``edge`` px, one ray a pixel.
+        pace: how many times as long as the machine of the fit this one takes.
+        there: bytes that the program and the volume have taken when the plan is made.
+    """
+
+    gaussians: int
+    cells: float
+    voxels: float
+    size: int
+    view: float
+    pace: float = 1.0
+    there: float = PROGRAM
+
+    @property
+    def edge(self) -> int:
+        """Pixels along the edge of a whole training view."""
+        return view_edge(self.size, half=False)
+
+    @property
+    def judged(self) -> int:
+        """Pixels of a check or test view that are drawn: all, or blocks."""
+        blocks = spread_blocks(self.size, self.size)
+        return self.size**2 if blocks is None else blocks.numbers.size * BLOCK**2
+
+    @property
+    def judge(self) -> float:
+        """Seconds of a check or test view's reference."""
+        return FINER * self.view * self.judged / self.edge**2
+
+    def at(self, pace: float) -> Case:
+        """The same on a machine that takes ``pace`` times as long; what was timed stays."""
+        return replace(self, pace=self.pace * pace)
+
+
+def view_edge(size: int, half: bool) -> int:
+    """Pixels along the edge of a training view: the size that the file is made for, or half of it, within bounds."""
+    return min(size, WHOLE) // (2 if half else 1)
+
+
+def measure(scene: Scene, size: int, gaussians: int) -> Case:
+    """The case of a scene: counted, a small view timed, the machine's pace by a sort."""
+    from vvgt_cli.dvr.scene import BRICK
+    from vvgt_cli.vbm.closed_form import expected_cells
+
+    cells = expected_cells(scene, size, gaussians)
+    return Case(
+        gaussians=int(min(gaussians, cells)),
+        cells=cells,
+        voxels=float(np.count_nonzero(scene.empty == 0)) * BRICK**3,
+        size=size,
+        view=VIEW * _view_seconds(scene, view_edge(size, half=False)),
+        pace=_pace(),
+        there=PROGRAM + _volume_bytes(scene),
+    )
+
+
+def with_fewer(case: Case, scene: Scene, gaussians: int) -> Case:
+    """The same case with another budget; nothing is timed again."""
+    from vvgt_cli.vbm.closed_form import expected_cells
+
+    cells = expected_cells(scene, case.size, gaussians)
+    return replace(case, cells=cells, gaussians=int(min(gaussians, cells)))
+
+
+def _volume_bytes(scene: Scene) -> int:
+    """Of the values, and of the copy where the kernels need another type."""
+    data, values = scene.volume.data, scene.values
+    return data.nbytes + (0 if np.may_share_memory(data, values) else values.nbytes)
+
+
+def _view_seconds(scene: Scene, size: int) -> float:
+    """Of a check view with one ray a pixel and half-voxel steps, from one of `PROBE` px."""
+    from vvgt_cli.cameras import default_views
+    from vvgt_cli.dvr import RenderSettings, render_view
+
+    settings = RenderSettings(samples=1)
+    camera = default_views("check", size=PROBE)[0]
+    render_view(scene, camera, settings)  # compiled, or loaded
+    return _quickest(lambda: render_view(scene, camera, settings)) * (size / PROBE) ** 2
+
+
+def _quickest(call: Callable[[], object]) -> float:
+    """Seconds of the quickest of three calls."""
+    taken = []
+    for _ in range(3):
+        begin = time.perf_counter()
+        call()
+        taken.append(time.perf_counter() - begin)
+    return min(taken)
+
+
+def _pace() -> float:
+    """How many times as long as the machine of the fit this one takes: a sort, and the threads."""
+    import numba
+
+    values = np.random.default_rng(0).random(200_000)
+    return _quickest(lambda: np.sort(values)) / SORT * (2 / numba.get_num_threads()) ** 0.7

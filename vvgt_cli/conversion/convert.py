@@ -1,0 +1,244 @@
+"""`convert` and `init`: volume and transfer function in, `.ply` out, stage by stage."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vvgt_cli.conversion.case import measure
+from vvgt_cli.conversion.plan import Plan, Planner, check_memory
+from vvgt_cli.conversion.request import ConvertRequest, FitOptions, Limits, file_bytes
+from vvgt_cli.conversion.result import Conversion
+from vvgt_cli.conversion.resume import FITTED, Checkpoint, checkpoint_folder, checkpoint_of
+from vvgt_cli.conversion.stage import Work
+from vvgt_cli.conversion.stages import CheckViews, ClosedFormStage
+from vvgt_cli.conversion.stages.views import wide
+from vvgt_cli.errors import UsageError
+from vvgt_cli.files import check_room
+from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored
+from vvgt_cli.jit.ahead import CONVERT, INIT
+from vvgt_cli.network.card import find_model, read_card
+from vvgt_cli.progress import Console
+from vvgt_cli.runs.gaussian_files import write_gaussians
+from vvgt_cli.runs.outputs import STDOUT, check_outputs, claimed, write_text
+from vvgt_cli.runs.place import out_of_box, placed, remarks, way_up
+from vvgt_cli.runs.record import ConversionReport, Run
+from vvgt_cli.runs.source import Source, SourceRequest, describe_source, load, tf_record, volume_record
+
+if TYPE_CHECKING:
+    from vvgt_cli.dvr import Scene
+
+QUICKEST = 0.5  # of the estimate, where the closed form took less: the rest then takes less too
+SMALLER = (8, 4, 2)  # parts of the budget that a target is tried with first
+
+
+def convert(request: ConvertRequest, console: Console | None = None) -> ConversionReport:
+    """Volume to `.ply`: `made`, and its outputs written.
+
+    Raises:
+        UsageError: an output that may not be written; found before anything is read.
+        DataError: input that is not what it must be, or a scene that shows nothing.
+    """
+    request.budget()
+    if request.checkpoint is not None and request.limits.time_budget is not None:
+        raise UsageError("--checkpoint is of runs that repeat to the byte, --time-budget of others; give one of both")
+    run = Run(console or Console(), ConversionReport("convert"))
+    with claimed(request.outputs(), request.inputs(), request.overwrite), checkpoint_folder(request.checkpoint):
+        conversion = made(run, request)
+        report = _write(run, request, conversion)
+        if request.checkpoint is not None and not _interrupted(run):
+            Checkpoint(Path(request.checkpoint)).finish()
+        return report
+
+
+def in_memory(
+    source: SourceRequest, fit: FitOptions, limits: Limits, all_views: bool = False, console: Console | None = None
+) -> Conversion:
+    """A conversion of which nothing is written.
+
+    Raises:
+        DataError, UsageError: as `convert`.
+    """
+    run = Run(console or Console(), ConversionReport("convert"))
+    conversion = made(run, ConvertRequest(source, None, fit, limits, all_views=all_views))
+    run.finish()
+    return conversion
+
+
+def initialise_only(request: ConvertRequest, console: Console | None = None) -> ConversionReport:
+    """Volume to `.ply` by the closed form alone: no image is rendered.
+
+    Raises:
+        UsageError, DataError: as `convert`.
+    """
+    run = Run(console or Console(), ConversionReport("init"))
+    with claimed(request.outputs(), request.inputs(), request.overwrite):
+        source, scene = _begin(run, request)
+        work = Work(run, scene, request.fit)
+        ClosedFormStage().run(work)
+        return _write(run, request, _conversion(request, source, work, as_stored(work.made())))
+
+
+def planned(request: ConvertRequest, console: Console | None = None) -> Plan:
+    """What `convert` would do: the volume is read and laid out, a small view is timed, nothing is written.
+
+    Raises:
+        DataError, UsageError: as `convert`.
+    """
+    run = Run(console or Console(), ConversionReport("convert"))
+    check_outputs(request.outputs(), request.inputs(), request.overwrite)
+    return _planned(run, request)[-1]
+
+
+def made(run: Run, request: ConvertRequest) -> Conversion:
+    """Closed form, what views can improve of it, scores on the test views; only checkpoints are written.
+
+    What of these is done, and with how many Gaussians, follows from the request's limits and what the stages cost
+    (`vvgt_cli.conversion.plan`); the check views decide. What is left out is said, and costs nothing.
+
+    Returns:
+        The conversion; the run's report is still open.
+
+    Raises:
+        DataError, UsageError: as `convert`.
+    """
+    source, work, planner, plan = _planned(run, request)
+    check_memory(plan, work.scene)
+    work.checkpoint = checkpoint_of(request.checkpoint, source, work.fit, request.limits)
+    kept = work.checkpoint.load(FITTED)
+    if kept:
+        work.gaussians = kept[0]
+        run.console.say(f"{request.checkpoint} holds the fitted Gaussians: only the scores are left")
+    else:
+        plan = _fit(work, request, planner, plan)
+    for stage in plan.stages:
+        if stage.scores:
+            stage.run(work)
+    return _conversion(request, source, work, work.made())
+
+
+def _planned(run: Run, request: ConvertRequest) -> tuple[Source, Work, Planner, Plan]:
+    """All that comes before the first stage."""
+    fit = replace(request.fit, max_gaussians=request.budget())
+    if fit.model is not None:
+        read_card(find_model(fit.model))  # fails before the work, not after
+    source, scene = _begin(run, request)
+    case = measure(scene, fit.size, fit.max_gaussians)
+    sparse = fit.max_gaussians <= case.edge**2  # a guess, until the Gaussians are there
+    planner = Planner(
+        request.limits, fit.max_gaussians, fit.steps, request.ply.sh_degree, fit.size, sparse, fit.model,
+        request.scored_whole,
+    )  # fmt: skip
+    plan = planner.plan(case, run.elapsed())
+    run.report.plan = plan.record()
+    return source, Work(run, scene, fit, request.limits), planner, plan
+
+
+def _fit(work: Work, request: ConvertRequest, planner: Planner, plan: Plan) -> Plan:
+    """The closed form, and what views improve; returns the plan, made anew by what the closed form took and showed."""
+    first = plan.stages[0]
+    first.run(work)
+    if request.output is not None and request.output != STDOUT:
+        check_room(request.output, file_bytes(len(work.made()), request.ply.sh_degree))
+    pace = max(work.run.report.stages[-1].seconds / first.cost(plan.case).seconds, QUICKEST)
+    planner = replace(planner, wide=wide(work.made(), work.fit.size))
+    plan = planner.plan(plan.case.at(pace), work.run.elapsed(), begun=True)
+    check_memory(plan)
+    _improve(work, plan)
+    work.gaussians = as_stored(work.made())  # what is scored is what the file holds
+    if not _interrupted(work.run):
+        work.checkpoint.save(FITTED, work.gaussians)
+    return plan
+
+
+def _improve(work: Work, plan: Plan) -> None:
+    """The stages that views pay for; from where a target is reached on, none."""
+    ahead = [stage for stage in plan.stages if not stage.scores]
+    told = improved = False
+    for n, stage in enumerate([*ahead, None]):
+        if not (stage is None and improved) and work.enough():
+            for name in (other.name for other in ahead[n:] if other.improves):
+                work.run.leave_out(name, f"the check views have {work.limits.target_psnr:g} dB without it")
+            if not improved:
+                _fewer(work)
+            return
+        if not told and not isinstance(stage, CheckViews):
+            told = True
+            for name, why in plan.left_out:
+                work.run.leave_out(name, why)
+        if stage is not None:
+            work.ending = plan.after(stage)
+            stage.run(work)
+            improved = improved or stage.improves
+
+
+def _fewer(work: Work) -> None:
+    """The fewest Gaussians that reach the target: a part of the budget, or all."""
+    start = work.start
+    if start is None or start.form is None:
+        return
+    count = len(start.gaussians)
+    for part in SMALLER:
+        work.gaussians = replace(start.form, budget=max(count // part, 1)).gaussians()
+        if len(work.gaussians) < count and work.enough():
+            work.run.leave_out(f"{count - len(work.gaussians)} Gaussians", "the target is reached without")
+            return
+    work.gaussians = start.gaussians
+
+
+def _interrupted(run: Run) -> bool:
+    """Whether Ctrl-C ended gradient descent: the same command then goes on with it."""
+    return run.report.refinement is not None and run.report.refinement["reason"] == "interrupted"
+
+
+def _conversion(request: ConvertRequest, source: Source, work: Work, gaussians: Gaussians) -> Conversion:
+    return Conversion(out_of_box(gaussians, source.volume), work.run.report, _ply(request, source), source, work.scene)
+
+
+def _begin(run: Run, request: ConvertRequest) -> tuple[Source, Scene]:
+    """Read, and lay the volume out for the kernels."""
+    with run.stage("read") as stage:
+        source = load(request.source)
+        stage.note = describe_source(source)
+        ply = _ply(request, source)
+    for remark in remarks(source.volume, ply):
+        run.console.say(remark)
+    run.compile(CONVERT if run.report.command == "convert" else INIT, source.kernel_type())
+    with run.stage("scene"):
+        scene = source.scene()
+    run.report.volume = volume_record(source)
+    run.report.transfer_function = tf_record(source, request.source)
+    run.report.options = asdict(request.fit) | asdict(request.limits) | {
+        "frame": ply.frame, "up": ply.up, "sh_degree": ply.sh_degree,
+    }  # fmt: skip
+    return source, scene
+
+
+def _ply(request: ConvertRequest, source: Source) -> PlyOptions:
+    """How the file is written, with all that follows from the source."""
+    ply = replace(
+        request.ply,
+        up=way_up(request.up, request.ply.frame, source.volume.space),
+        unit_distance=source.unit_distance,
+        unit_distance_label=source.unit_label,
+        made_for=request.fit.size,
+        rule=request.fit.rule,
+    )
+    return placed(ply, source.volume)
+
+
+def _write(run: Run, request: ConvertRequest, conversion: Conversion) -> ConversionReport:
+    """Write the file, the preview and the report."""
+    from vvgt_cli.images import write_png
+
+    report = run.report
+    assert request.output is not None
+    write_gaussians(run, request.output, conversion.gaussians, conversion.ply, request.overwrite)
+    if request.preview:
+        with run.stage("preview"):
+            write_png(request.preview, conversion.preview(), request.overwrite)
+    run.finish()
+    if request.report:
+        write_text(request.report, report.to_json(), request.overwrite)
+    return report

@@ -1,0 +1,242 @@
+"""What `convert` will do: a list of stages, chosen by what they cost and what a user allows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+from typing import TYPE_CHECKING, Any
+
+from vvgt_cli.conversion.case import Case, view_edge, with_fewer
+from vvgt_cli.conversion.request import Limits, file_bytes
+from vvgt_cli.conversion.stage import Stage
+from vvgt_cli.conversion.stages import (
+    BackProjection,
+    CheckViews,
+    ClosedFormStage,
+    Network,
+    Refinement,
+    Seats,
+    TestViews,
+    TrainingViews,
+)
+from vvgt_cli.conversion.stages.views import views_of
+from vvgt_cli.errors import UsageError
+from vvgt_cli.resources import free_memory
+
+if TYPE_CHECKING:
+    from vvgt_cli.dvr import Scene
+
+DEFAULT_STEPS = 96  # of gradient descent: the knee of error against seconds (docs/plan.md)
+DEFAULT_HALF_STEPS = 120  # likewise, on views half the size
+MOST_STEPS = 400  # where a target or a time asks for as many as it takes
+FEWEST_STEPS = 8  # less is not worth the views
+ENOUGH_STEPS = 24  # as good as back-projection; fewer are taken after it
+SMALLEST_HALF = 64  # pixels along the edge of a training view half that size: four tiles
+WRITE = 0.1  # seconds of the file
+SURE = 0.8  # of an estimate of memory: as little has been enough
+
+
+@dataclass
+class Plan:
+    """What is going to be done.
+
+    Attributes:
+        case: what costs follow from.
+        gaussians: budget.
+        stages: in order.
+        spent: seconds before the first of them.
+        bytes: of the file.
+        left_out: (stage, why) of what is not done.
+    """
+
+    case: Case
+    gaussians: int
+    stages: list[Stage]
+    spent: float = 0.0
+    bytes: int = 0
+    left_out: list[tuple[str, str]] = field(default_factory=list)
+
+    def seconds_of(self, stages: Sequence[Stage]) -> float:
+        """That they should take, and writing the file."""
+        return sum(stage.cost(self.case).seconds for stage in stages) + self.case.pace * WRITE
+
+    @property
+    def seconds(self) -> float:
+        """Of the whole run."""
+        return self.spent + self.seconds_of(self.stages)
+
+    @property
+    def working_memory(self) -> float:
+        """Bytes that stages take beside the program and the volume."""
+        return sum(stage.cost(self.case).memory for stage in self.stages)
+
+    @property
+    def memory(self) -> float:
+        """Bytes of the whole process at its most."""
+        return self.case.there + self.working_memory
+
+    def after(self, stage: Stage) -> float:
+        """Seconds of what follows a stage."""
+        return self.seconds_of(self.stages[self.stages.index(stage) + 1 :])
+
+    def costs(self) -> list[tuple[str, float]]:
+        """(label, seconds) of every stage."""
+        stages = [(stage.label(), stage.cost(self.case).seconds) for stage in self.stages]
+        return [("so far", self.spent), *stages, ("write", self.case.pace * WRITE)]
+
+    def record(self) -> dict[str, Any]:
+        """Plain values for the report."""
+        return {
+            "gaussians": self.gaussians,
+            "seconds": self.seconds,
+            "memory": self.memory,
+            "bytes": self.bytes,
+            "stages": [self._record(stage) for stage in self.stages],
+            "left_out": self.left_out,
+        }
+
+    def _record(self, stage: Stage) -> dict[str, Any]:
+        seconds, memory = stage.cost(self.case)
+        chosen = {entry.name: getattr(stage, entry.name) for entry in fields(stage)}  # type: ignore[arg-type]
+        return {"name": stage.name, "seconds": seconds, "memory": memory, **chosen}
+
+    def text(self) -> str:
+        """The plan as `--dry-run` prints it."""
+        lines = [f"{name:<24}{seconds:8.1f} s" for name, seconds in self.costs()]
+        lines += [f"{name:<24}{'-':>8}    {why}" for name, why in self.left_out]
+        lines.append(
+            f"{'whole':<24}{self.seconds:8.1f} s, {self.memory / 2**30:.1f} GiB of memory, "
+            f"{self.bytes / 1e6:.1f} MB with {self.gaussians} Gaussians"
+        )
+        return "\n".join(lines)
+
+
+@dataclass(frozen=True)
+class Planner:
+    """What decides.
+
+    Attributes:
+        limits: what the user allows.
+        gaussians: budget.
+        steps: of gradient descent that the user asks for; None: the plan's choice.
+        sh_degree: harmonics in the file.
+        size: pixels along the edge of images that the file is made for.
+        wide: Gaussians are wide enough to be seen in views half the size.
+        model: network that the user asks for.
+        whole: all ten test views are scored.
+    """
+
+    limits: Limits
+    gaussians: int
+    steps: int | None
+    sh_degree: int
+    size: int
+    wide: bool = True
+    model: str | None = None
+    whole: bool = False
+
+    def plan(self, case: Case, spent: float, begun: bool = False) -> Plan:
+        """Which stages fit, after ``spent`` seconds; ``begun``: the closed form is done."""
+        plan = Plan(case, self.gaussians, [], spent, file_bytes(self.gaussians, self.sh_degree))
+        first: list[Stage] = [ClosedFormStage()]
+        last: list[Stage] = [TestViews(self.whole), Seats()]
+        left = None
+        if self.limits.time_budget is not None:
+            left = self.limits.time_budget - spent - plan.seconds_of([*([] if begun else first), *last])
+        between = self._improvements(plan, left)
+        if self.limits.target_psnr is not None or any(isinstance(stage, BackProjection) for stage in between):
+            first = [ClosedFormStage(anew=True)]
+        plan.stages = [*([] if begun else first), *between, *last]
+        return plan
+
+    def _improvements(self, plan: Plan, left: float | None) -> list[Stage]:
+        """What needs views: gradient descent, as asked for, as long as there is time, or as much as pays."""
+        case = plan.case
+        open_end = self.limits.target_psnr is not None or left is not None
+        network, left = self._network(plan, left)
+        few = self.steps is not None and self.steps < ENOUGH_STEPS and left is None
+        half = self.wide and not few and not network and self.size >= 2 * SMALLEST_HALF
+        usual = DEFAULT_HALF_STEPS if half else DEFAULT_STEPS
+        steps = wanted = self.steps if self.steps is not None else MOST_STEPS if open_end else usual
+        while left is not None and steps > 0 and self._seconds(case, steps, half) > left:
+            steps = min(steps - 1, int(steps * 0.9))
+        if not wanted or steps < min(FEWEST_STEPS, wanted):
+            plan.left_out.append(("refinement", _room(left) if wanted else "no steps are asked for"))
+            return self._without_steps(plan, network, left)
+        if self.model is None:
+            plan.left_out.append(("network", "gradient descent gains more in its time; --model runs it"))
+        if not few:
+            plan.left_out.append(("back-projection", "gradient descent gains more in its time"))
+        chosen = self._descent(steps, half, wanted)
+        return [*chosen[:2], *([BackProjection()] if few else []), *network, chosen[2]]
+
+    def _descent(self, steps: int, half: bool, most: int) -> list[Stage]:
+        return [
+            CheckViews(),
+            TrainingViews(views_of(steps), view_edge(self.size, half)),
+            Refinement(steps, most, half),
+        ]
+
+    def _seconds(self, case: Case, steps: int, half: bool) -> float:
+        """Of so many steps, with their views, ``half`` the size or whole, and the check views."""
+        return sum(stage.cost(case).seconds for stage in self._descent(steps, half, steps))
+
+    def _without_steps(self, plan: Plan, network: list[Stage], left: float | None) -> list[Stage]:
+        """Back-projection instead, if there is time; check views where there is a target and time for them."""
+        views = self._seconds(plan.case, 0, False)
+        whole = views + BackProjection().cost(plan.case).seconds
+        projected = left is None or left >= whole
+        if not projected:
+            plan.left_out.append(("back-projection", f"about {whole:.1f} s with its views, {_room(left)}"))
+        check = CheckViews(fine=bool(network) or self.limits.target_psnr is not None)
+        train = TrainingViews(views_of(0), view_edge(self.size, half=False), fitted=bool(network))
+        if projected or network:
+            return [check, train, *([BackProjection()] if projected else []), *network]
+        judge = self.limits.target_psnr is not None and (left is None or left >= views)
+        return [check] if judge else []
+
+    def _network(self, plan: Plan, left: float | None) -> tuple[list[Stage], float | None]:
+        """The network, where one is asked for and there is time; and what is left."""
+        if self.model is None:
+            return [], left
+        stage = Network(self.model)
+        seconds = stage.cost(plan.case).seconds
+        if left is not None and left < seconds + self._seconds(plan.case, 0, False):
+            plan.left_out.append(("network", f"about {seconds:.1f} s, {_room(left)}"))
+            return [], left
+        return [stage], None if left is None else left - seconds
+
+
+def _room(left: float | None) -> str:
+    return f"{max(left or 0.0, 0.0):.1f} s are left"
+
+
+def check_memory(plan: Plan, scene: Scene | None = None) -> None:
+    """Refuse what would not fit, rather than have the system end it.
+
+    Args:
+        plan: of the stages that are left.
+        scene: where the closed form is still to come: fewer Gaussians are tried.
+
+    Raises:
+        UsageError: with the size or the Gaussians that would fit.
+    """
+    free, size = free_memory(), plan.case.size
+    if free is None:
+        return
+    views = sum(stage.cost(plan.case).memory for stage in plan.stages if isinstance(stage, CheckViews | TrainingViews))
+    if views > free:
+        raise UsageError(
+            f"--size {size}: views need {views / 2**30:.1f} GiB of memory, {free / 2**30:.1f} GiB are free; --size "
+            f"{max(int(size * (free / views) ** 0.5), 1)} would fit, or 'vvgt init', which renders none"
+        )
+    need = SURE * plan.working_memory
+    if scene is None or need <= free:
+        return
+    form, fewer = ClosedFormStage(), plan.gaussians
+    while fewer > 1 and SURE * (form.cost(with_fewer(plan.case, scene, fewer)).memory + views) > free:
+        fewer //= 2
+    raise UsageError(
+        f"{plan.gaussians} Gaussians need about {need / 2**30:.2f} GiB of memory more, {free / 2**30:.2f} GiB are "
+        f"free; --max-gaussians {fewer} would fit, or give the job more"
+    )

@@ -1,0 +1,143 @@
+"""What is asked of a conversion."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+from vvgt_cli.errors import UsageError
+from vvgt_cli.gaussians import PlyOptions
+from vvgt_cli.runs.outputs import Output
+from vvgt_cli.runs.place import AUTO
+from vvgt_cli.runs.source import SourceRequest
+
+VERTEX_BYTES = 68  # x y z, normals, three colours, opacity, three scales, four of rotation: float32
+HARMONIC_BYTES = {0: 0, 1: 36, 2: 96, 3: 180}  # zeros up to a degree
+HEADER_BYTES = {0: 1000, 1: 1200, 2: 1600, 3: 2200}
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """What the Gaussians are made for.
+
+    Attributes:
+        max_gaussians: budget K.
+        size: pixels along an image's edge that the file is made for.
+        init: "vbm", "wavelet" or "uniform".
+        rule: of `vvgt_cli.splat.rules` that is fitted to and scored by.
+        seed: of whatever draws random numbers.
+        model: network that runs before the steps: a folder or the name of a shipped one, None for none.
+        steps: of gradient descent after the closed form, at most; None: what the plan finds worth its time.
+    """
+
+    max_gaussians: int = 100_000
+    size: int = 1080
+    init: str = "vbm"
+    rule: str = "inria"
+    seed: int = 0
+    steps: int | None = None
+    model: str | None = None
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a user allows, any or none.
+
+    Attributes:
+        target_psnr: dB on the check views that are enough.
+        time_budget: wall seconds of the whole run, from the start of reading on.
+        max_megabytes: size of the file, 10^6 bytes.
+
+    Raises:
+        UsageError: a limit that cannot be.
+    """
+
+    target_psnr: float | None = None
+    time_budget: float | None = None
+    max_megabytes: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.target_psnr is not None and not 0 <= self.target_psnr <= 150:
+            raise UsageError(f"--target-psnr {self.target_psnr:g}: expected 0 to 150 dB")
+        if self.time_budget is not None and not 0 < self.time_budget < math.inf:
+            raise UsageError(f"--time-budget {self.time_budget:g}: expected more than 0 seconds")
+        if self.max_megabytes is not None and not 0 < self.max_megabytes < math.inf:
+            raise UsageError(f"--max-size {self.max_megabytes:g}: expected more than 0 MB")
+
+    def gaussians(self, most: int, sh_degree: int) -> int:
+        """As many Gaussians as budget and file size allow.
+
+        Raises:
+            UsageError: not even one fits the size.
+        """
+        if self.max_megabytes is None:
+            return most
+        header, one = file_bytes(0, sh_degree), file_bytes(1, sh_degree)
+        fit = int((self.max_megabytes * 1e6 - header) // (one - header))
+        if fit < 1:
+            least = one / 1e6
+            raise UsageError(f"--max-size {self.max_megabytes:g}: no Gaussian fits; expected {least:.4f} MB or more")
+        return min(most, fit)
+
+
+def file_bytes(gaussians: int, sh_degree: int) -> int:
+    """Of a `.ply`, at most."""
+    return HEADER_BYTES[sh_degree] + gaussians * (VERTEX_BYTES + HARMONIC_BYTES[sh_degree])
+
+
+@dataclass(frozen=True)
+class ConvertRequest:
+    """A whole conversion.
+
+    Attributes:
+        source: what to read.
+        output: `.ply` to write, "-" for standard output, None for none.
+        fit: what the Gaussians are made for.
+        limits: error, time and size that decide what is done.
+        ply: how the file is written; up, the volume's place and the distance are filled in from the source.
+        up: world axis or anatomical direction that viewers show upwards, "none", or "auto" (superior in the unit frame
+            of an anatomical space).
+        report: JSON to write, "-" for standard output, None for none.
+        preview: PNG to write (reference, ours, difference of a few test views), None for none.
+        overwrite: replace files that exist.
+        checkpoint: folder that keeps what the stages make, until the output is written; None for none.
+        all_views: score on all ten test views, by SSIM and FLIP too, as a report has it.
+    """
+
+    source: SourceRequest
+    output: str | None = None
+    fit: FitOptions = field(default_factory=FitOptions)
+    limits: Limits = field(default_factory=Limits)
+    ply: PlyOptions = field(default_factory=PlyOptions)
+    up: str = AUTO
+    report: str | None = None
+    preview: str | None = None
+    overwrite: bool = False
+    checkpoint: str | None = None
+    all_views: bool = False
+
+    def budget(self) -> int:
+        """Gaussians that fit.
+
+        Raises:
+            UsageError: not one does.
+        """
+        return self.limits.gaussians(self.fit.max_gaussians, self.ply.sh_degree)
+
+    @property
+    def scored_whole(self) -> bool:
+        """Whether on all ten test views."""
+        return self.all_views or self.report is not None
+
+    def outputs(self) -> list[Output]:
+        """Everything that will be written."""
+        outputs = [Output("-o", self.output, (".ply",))] if self.output else []
+        if self.report:
+            outputs.append(Output("--report", self.report, (".json",), binary=False))
+        if self.preview:
+            outputs.append(Output("--preview", self.preview, (".png",)))
+        return outputs
+
+    def inputs(self) -> list[str]:
+        """Files that are read."""
+        return self.source.paths()

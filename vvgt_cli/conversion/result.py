@@ -1,0 +1,143 @@
+"""What a run leaves in memory: Gaussians, how they came about, and what can be done with them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vvgt_cli.cameras import Camera, default_views
+from vvgt_cli.cameras.sets import SIZE
+from vvgt_cli.files import atomic_write
+from vvgt_cli.gaussians import Gaussians, PlyOptions, write_ply
+from vvgt_cli.runs.place import AUTO, NONE, into_box, preview, upright, way_up
+from vvgt_cli.runs.record import ConversionReport, Stage
+from vvgt_cli.runs.seats import PREVIEW_VIEWS
+from vvgt_cli.runs.source import Source
+from vvgt_cli.splat.rules import INRIA, rule_of
+
+if TYPE_CHECKING:
+    from vvgt_cli.dvr import Scene
+
+FROM_THE_SIDE = 4  # test view that pictures show where none is asked for
+
+
+@dataclass
+class Result:
+    """Gaussians of a conversion or a refinement.
+
+    Attributes:
+        gaussians: in the unit frame, as a file holds them.
+        report: stages with their times, scores, what was left out; `report.to_json()` is what ``--report`` writes.
+        ply: how a file of them is written, unless `save` is told otherwise.
+    """
+
+    gaussians: Gaussians
+    report: ConversionReport
+    ply: PlyOptions
+
+    @property
+    def scores(self) -> dict[str, Any] | None:
+        """Means over the test views, by name (docs/report.md); None where none was drawn."""
+        return self.report.scores
+
+    @property
+    def stages(self) -> list[Stage]:
+        """What was done, in order, each with its seconds."""
+        return self.report.stages
+
+    def save(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        frame: str | None = None,
+        up: str | None = None,
+        sh_degree: int | None = None,
+        comments: bool | None = None,
+        overwrite: bool = False,
+    ) -> int:
+        """Write a standard ``.ply``, whole or not at all.
+
+        Args:
+            path: the file.
+            frame: "unit" or "world"; None, here and below: as `ply` says.
+            up: what viewers show upwards: a world axis, an anatomical direction, "none" or "auto" (superior in the unit
+                frame of an anatomical space); "auto" where another frame is asked for.
+            sh_degree: 0 to 3, padded with zeros.
+            comments: write what the file is into its header.
+            overwrite: replace a file that exists.
+
+        Returns:
+            Bytes written.
+
+        Raises:
+            UsageError: the file exists, or a value that is none of these.
+        """
+        old, space = self.ply, None if self.ply.space == NONE else self.ply.space
+        frame = frame or old.frame
+        ply = replace(
+            old,
+            frame=frame,
+            up=old.up if up is None and frame == old.frame else way_up(up or AUTO, frame, space),
+            sh_degree=old.sh_degree if sh_degree is None else sh_degree,
+            comments=old.comments if comments is None else comments,
+        )
+        with atomic_write(path, overwrite) as temporary:
+            return write_ply(temporary, self.gaussians, ply)
+
+    def render(self, camera: Camera | None = None, *, size: int | None = None, rule: str | None = None) -> np.ndarray:
+        """The Gaussians as viewers draw them.
+
+        Args:
+            camera: in the unit frame; None: a test view from the side.
+            size: pixels along the edge where no camera is given; None: what the Gaussians are made for.
+            rule: of `vvgt_cli.splat.rules`; None: that of the Gaussians.
+
+        Returns:
+            (h, w, 4) float32, premultiplied RGBA.
+
+        Raises:
+            UsageError: no such rule.
+        """
+        from vvgt_cli.splat import render
+
+        if camera is None:
+            camera = default_views("test", size=size or self.ply.made_for or SIZE)[FROM_THE_SIDE]
+        return render(self.gaussians, camera, rule_of(rule or self.ply.rule or INRIA))
+
+
+@dataclass
+class Conversion(Result):
+    """What became of a volume under a transfer function.
+
+    Attributes:
+        source: the volume and the function on its values.
+        scene: the volume as kernels read it.
+    """
+
+    source: Source
+    scene: Scene
+
+    def preview(self, size: int | None = None, views: Sequence[int] = PREVIEW_VIEWS) -> np.ndarray:
+        """Volume, splats and eight times their difference, a row a test view, with the way up upwards.
+
+        Args:
+            size: pixels along a picture's edge; None: what the Gaussians are made for.
+            views: numbers of test views, 0 to 9.
+
+        Returns:
+            (h, 3 w, 3) float32 RGB in [0, 1], rows below each other.
+        """
+        cameras = default_views("test", size=size or self.ply.made_for or SIZE)
+        axes = upright(self.source.volume, self.ply.up)
+        inside = into_box(self.gaussians, self.source.volume)
+        return preview(self.scene, inside, [cameras[n] for n in views], axes, self.ply.rule or INRIA)
+
+    def _repr_png_(self) -> bytes:
+        """What notebooks show."""
+        from vvgt_cli.images import png_bytes
+
+        return png_bytes(self.preview(SIZE, (FROM_THE_SIDE,)))

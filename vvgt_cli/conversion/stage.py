@@ -1,0 +1,109 @@
+"""`Stage`, of which a plan is a list, and `Work`, what stages hand on."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
+
+from vvgt_cli.conversion.case import Case
+from vvgt_cli.conversion.request import FitOptions, Limits
+from vvgt_cli.conversion.resume import Checkpoint
+from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.runs.record import Run
+from vvgt_cli.runs.views import Views
+from vvgt_cli.splat.rules import Rule, rule_of
+
+if TYPE_CHECKING:
+    from vvgt_cli.dvr import Scene
+    from vvgt_cli.vbm import Start
+
+
+class Cost(NamedTuple):
+    """What a stage should cost: wall seconds, and bytes of memory that it takes for the rest of the run."""
+
+    seconds: float
+    memory: float = 0.0
+
+
+@dataclass
+class Work:
+    """What the stages of one conversion read and leave.
+
+    Attributes:
+        run: times stages and tells the console.
+        scene: the volume under the function.
+        fit, limits: what is asked for.
+        checkpoint: where stages keep what they made; `Checkpoint` of no folder for nowhere.
+        ending: seconds that the stages after the present one should take.
+        start: the closed form, once it is there, with the pyramid that it was cut from.
+        gaussians: so far, in the box frame.
+        check: views to judge by, once they are there; ``train``: views to fit to.
+        train_rule: by which training views are drawn.
+    """
+
+    run: Run
+    scene: Scene
+    fit: FitOptions
+    limits: Limits = field(default_factory=Limits)
+    checkpoint: Checkpoint = field(default_factory=Checkpoint)
+    ending: float = 0.0
+    start: Start | None = None
+    gaussians: Gaussians | None = None
+    check: Views | None = None
+    train: Views | None = None
+    train_rule: Rule | None = None
+
+    @property
+    def rule(self) -> Rule:
+        """By which the file will be drawn."""
+        return rule_of(self.fit.rule)
+
+    def made(self) -> Gaussians:
+        """The Gaussians that a stage before has made."""
+        assert self.gaussians is not None, "a stage that needs Gaussians stands before the one that makes them"
+        return self.gaussians
+
+    def psnr(self, gaussians: Gaussians) -> float:
+        """On the check views."""
+        from vvgt_cli.metrics import score_views
+
+        assert self.check is not None, "a stage that judges stands before the check views"
+        return score_views(self.check.images, self.check.pictures(gaussians, self.rule), perceptual=False).psnr
+
+    def enough(self) -> bool:
+        """Whether the target is reached."""
+        target = self.limits.target_psnr
+        return target is not None and self.check is not None and self.psnr(self.made()) >= target
+
+    def keep_better(self, before: float, after: float, gaussians: Gaussians) -> bool:
+        """Take ``gaussians`` where the check views agree; whether they did."""
+        if after > before:
+            self.gaussians = gaussians
+        return after > before
+
+
+class Stage(ABC):
+    """One step of a conversion: what it is called, what it costs, what it does.
+
+    Attributes:
+        name: as the console and reports show it.
+        improves: makes better Gaussians of those that are there, as the check views see them.
+        scores: changes nothing, and is done whatever target is reached before.
+    """
+
+    name: ClassVar[str]
+    improves: ClassVar[bool] = False
+    scores: ClassVar[bool] = False
+
+    @abstractmethod
+    def cost(self, case: Case) -> Cost:
+        """What it should cost."""
+
+    @abstractmethod
+    def run(self, work: Work) -> None:
+        """Do it."""
+
+    def label(self) -> str:
+        """The name with what the plan chose, for `--dry-run`."""
+        return self.name

@@ -1,0 +1,43 @@
+"""Back-projection: cells split and colours solved by views, without moving anything."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from vvgt_cli.conversion.case import Case
+from vvgt_cli.conversion.stage import Cost, Stage, Work
+from vvgt_cli.conversion.stages.refinement import step_seconds
+from vvgt_cli.jit.ahead import BACK_PROJECT
+
+STEPS = 140.0  # of gradient descent on whole views that take as long
+
+
+@dataclass(frozen=True)
+class BackProjection(Stage):
+    """Kept if the check views agree."""
+
+    name: ClassVar[str] = "back-projection"
+    improves: ClassVar[bool] = True
+
+    def cost(self, case: Case) -> Cost:
+        """As so many steps."""
+        return Cost(STEPS * step_seconds(case, half=False))
+
+    def run(self, work: Work) -> None:
+        """Split and solve."""
+        from vvgt_cli.vbm import backproject
+
+        assert work.start is not None
+        assert work.train is not None
+        assert work.train_rule is not None
+        run, train = work.run, work.train
+        run.compile(BACK_PROJECT)
+        with run.stage(self.name) as stage:
+            before = work.psnr(work.start.gaussians)
+            bar = run.console.bar(self.name)
+            found, how = backproject(work.start, train.cameras, train.images, progress=bar, rule=work.train_rule)
+            after = work.psnr(found)
+            stage.kept = work.keep_better(before, after, found)
+            stage.note = f"{how}; from {before:.2f} dB on the check views"
+            stage.psnr_before, stage.psnr = before, after

@@ -1,0 +1,89 @@
+"""The closed form: moments, pyramid, choice of cells."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from vvgt_cli.conversion.case import Case
+from vvgt_cli.conversion.resume import CLOSED_FORM
+from vvgt_cli.conversion.stage import Cost, Stage, Work
+from vvgt_cli.errors import DataError
+
+if TYPE_CHECKING:
+    from vvgt_cli.vbm import Start
+
+SECONDS = 0.85, 1.6, 0.25  # always, per 10^6 cells, per 10^6 voxels in bricks that are not empty
+MEMORY = 294.0, 1240.0  # bytes: a cell, a Gaussian (with what later stages keep of it)
+FAINT = 0.02  # opacity
+NEARLY = 0.99  # of the budget: cells are split by eights, so that a few are always missing
+FEWEST = 5000  # Gaussians that a fog keeps
+
+
+@dataclass(frozen=True)
+class ClosedFormStage(Stage):
+    """Volume to Gaussians without a picture.
+
+    Attributes:
+        anew: a stage after it may cut the cells anew: nothing is kept of it, since only Gaussians are.
+    """
+
+    name: ClassVar[str] = "closed form"
+    anew: bool = False
+
+    def cost(self, case: Case) -> Cost:
+        """By cells and voxels."""
+        seconds = SECONDS[0] + SECONDS[1] * case.cells / 1e6 + SECONDS[2] * case.voxels / 1e6
+        return Cost(case.pace * seconds, MEMORY[0] * case.cells + MEMORY[1] * case.gaussians)
+
+    def run(self, work: Work) -> None:
+        """Make the Gaussians, or take what is kept of them: without the pyramid.
+
+        Raises:
+            DataError: nothing is visible from any view.
+        """
+        from vvgt_cli.vbm import Start, VbmOptions, initialise
+        from vvgt_cli.vbm.closed_form import bound
+
+        run, fit, scene = work.run, work.fit, work.scene
+        kept = None if self.anew else work.checkpoint.load(CLOSED_FORM)
+        if kept:
+            with run.stage(self.name) as stage:
+                stage.note = f"{len(kept[0])} Gaussians, as kept in {work.checkpoint.folder}"
+            work.start, work.gaussians = Start(kept[0], None), kept[0]
+            return
+        options = VbmOptions(max_gaussians=fit.max_gaussians, size=fit.size, method=fit.init, seed=fit.seed)
+        with run.stage(self.name) as stage:
+            start = initialise(scene, options, progress=run.console.bar(self.name))
+            if not len(start.gaussians):
+                raise DataError(
+                    f"{scene.volume.name} under {scene.tf.name}: nothing visible from any view; "
+                    "expected opacity above 0 where the data are (try 'vvgt tf show TF -o tf.png --volume VOLUME')"
+                )
+            found = len(start.gaussians)
+            start, spared = thinned(start)
+            stage.note = f"{len(start.gaussians)} Gaussians ({fit.init})"
+            if start.form is not None and not spared and found < NEARLY * fit.max_gaussians:
+                stage.note += f", no more: {bound(start.form)}"
+        if spared:
+            run.leave_out(f"{spared} Gaussians", "so faint that viewers differ on what they draw of them")
+        if not self.anew:
+            work.checkpoint.save(CLOSED_FORM, start.gaussians)
+        work.start, work.gaussians = start, start.gaussians
+
+
+def thinned(start: Start) -> tuple[Start, int]:
+    """Half the budget, again and again, while the median opacity is below `FAINT`; and how many Gaussians that spares.
+
+    Programs leave out what is below 1/255, 1/510 or 1/100 in a pixel: of a fog of faint splats each shows another part.
+    """
+    before = len(start.gaussians)
+    while start.form is not None and start.form.budget >= 2 * FEWEST:
+        if np.median(start.gaussians.opacity_logits) >= math.log(FAINT / (1 - FAINT)):
+            break
+        form = replace(start.form, budget=start.form.budget // 2)
+        start = replace(start, form=form, gaussians=form.gaussians())
+    return start, before - len(start.gaussians)

@@ -1,0 +1,135 @@
+"""Gradient descent on the training views, and what viewers would leave out of its result."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from vvgt_cli.cameras import default_views
+from vvgt_cli.conversion.case import Case
+from vvgt_cli.conversion.stage import Cost, Stage, Work
+from vvgt_cli.descent import OptimizeOptions, OptimizeRecord, optimize
+from vvgt_cli.gaussians import Gaussians, as_stored
+from vvgt_cli.runs.record import Run
+from vvgt_cli.runs.views import Views
+from vvgt_cli.splat.constants import MIN_ALPHA
+
+STEP = 0.013, 0.035  # seconds per 400 x 400 px, per 100,000 Gaussians
+HALF_STEP = 0.006, 0.017  # likewise, on a view half that size
+LOOK = 25  # steps between two looks at the check views where a target ends the run; else one is taken in the middle
+SMALLEST = 0.5  # standard deviation of the longest axis in pixels of the screen: viewers drop or fade less
+MOST = 0.99  # of the Gaussians: as many are left where small ones are widened, as a rule
+REASONS = {
+    "steps": "", "time": "time is up", "target": "target reached", "no gain": "ended early: no gain any more",
+    "interrupted": "interrupted",
+}  # fmt: skip
+
+
+def step_seconds(case: Case, half: bool) -> float:
+    """Of a step with its share of the looks at check views."""
+    each = HALF_STEP if half else STEP
+    return case.pace * (each[0] * (case.edge / 400) ** 2 + each[1] * case.gaussians / 1e5)
+
+
+@dataclass(frozen=True)
+class Refinement(Stage):
+    """Never to something worse, as the check views see it.
+
+    Attributes:
+        steps: that there should be time for.
+        most: where there is more time than that.
+        half: training views are half as large as they may be.
+    """
+
+    name: ClassVar[str] = "refinement"
+    improves: ClassVar[bool] = True
+    steps: int = 0
+    most: int = 0
+    half: bool = False
+
+    def cost(self, case: Case) -> Cost:
+        """By steps."""
+        return Cost(self.steps * step_seconds(case, self.half))
+
+    def label(self) -> str:
+        """With the number of steps."""
+        return f"{self.steps} steps"
+
+    def run(self, work: Work) -> None:
+        """Descend, and leave out what viewers do."""
+        assert work.train is not None
+        assert work.check is not None
+        assert work.train_rule is not None
+        left = None
+        if work.limits.time_budget is not None:
+            left = max(work.limits.time_budget - work.run.elapsed() - work.ending, 0.0)
+        target = work.limits.target_psnr
+        options = OptimizeOptions(
+            steps=self.most, time_budget=left, target_psnr=target, rule=work.train_rule, judge=work.rule,
+            seed=work.fit.seed, checkpoint=work.checkpoint.descent,
+            check_every=LOOK if target is not None else max(LOOK, self.most // 2),
+        )  # fmt: skip
+        work.gaussians = _seen(work, refine(work.run, work.made(), work.train, work.check, options))
+
+
+def _seen(work: Work, gaussians: Gaussians) -> Gaussians:
+    """`drawn_by_all`; where that leaves out many, the mass is counted as the check views agree."""
+    kept = drawn_by_all(gaussians, work.fit.size)
+    if len(kept) >= MOST * len(gaussians):
+        return kept
+    return max(kept, drawn_by_all(gaussians, work.fit.size, work.rule.dilation), key=work.psnr)
+
+
+def refine(run: Run, start: Gaussians, train: Views, check: Views, options: OptimizeOptions) -> Gaussians:
+    """The stage: the best that the check views have seen, as a file holds it; the input where nothing was better."""
+    with run.stage("refinement") as stage, run.console.interruption(run.console.say) as stop:
+        result, record = optimize(
+            start,
+            train.cameras,
+            train.images,
+            options,
+            (check.cameras, check.images, check.blocks),
+            progress=run.console.bar("refinement"),
+            stop=stop,
+        )
+        stage.kept = record.kept > 0
+        stage.psnr_before, stage.psnr = record.psnr_before, record.psnr_after
+        stage.note = _note(record, options)
+    drawn = {"rule": options.rule.name, "dilation": options.rule.dilation}
+    run.report.refinement = asdict(record) | {"method": options.method} | drawn
+    return as_stored(result)
+
+
+def _note(record: OptimizeRecord, options: OptimizeOptions) -> str:
+    parts = [f"{record.steps} steps ({options.method})"]
+    if 0 < record.kept < record.steps:
+        parts.append(f"best after {record.kept}")
+    if REASONS[record.reason]:
+        parts.append(REASONS[record.reason])
+    return ", ".join(parts) + f"; from {record.psnr_before:.2f} dB on the check views"
+
+
+def drawn_by_all(gaussians: Gaussians, size: int, dilation: float = 0.0) -> Gaussians:
+    """Without what viewers leave out: splats that never reach 1/255, and, widened with their mass kept, small ones.
+
+    Args:
+        gaussians: in the unit frame.
+        size: pixels along the edge of the screen that the file is made for; none stays narrower than `SMALLEST` there.
+        dilation: px^2 that the mass is counted with; 0 as viewers count it that compensate theirs.
+    """
+    opacity = 1 / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64)))
+    camera = default_views("check", 1, size=size)[0]
+    pixel = float(np.linalg.norm(camera.position)) / camera.fx
+    width = np.exp(gaussians.log_scales.max(axis=1).astype(np.float64))
+    widening = np.maximum(SMALLEST * pixel / width, 1)
+    beside = dilation * (pixel / width) ** 2
+    opacity = np.clip(opacity / ((widening**2 + beside) / (1 + beside)), 1e-7, 1 - 1e-7)
+    kept = opacity >= MIN_ALPHA
+    if not kept.any():
+        return gaussians
+    logits = np.where(widening > 1, np.log(opacity / (1 - opacity)), gaussians.opacity_logits)
+    scales = gaussians.log_scales + np.log(widening)[:, None]
+    fields = (gaussians.means, scales, gaussians.quaternions, logits, gaussians.colors)
+    return Gaussians(*(field[kept] for field in fields))

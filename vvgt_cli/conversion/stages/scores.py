@@ -1,0 +1,75 @@
+"""How near the result is: on the test views, and from the seats."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import ClassVar
+
+from vvgt_cli.conversion.case import Case
+from vvgt_cli.conversion.stage import Cost, Stage, Work
+from vvgt_cli.runs.score import psnr_note, score_test_views
+from vvgt_cli.runs.seats import PREVIEW_VIEWS, SIDE, from_above, score_seats
+
+SCORE, SCORE_ALL = (3, 0.03), (10, 0.2)  # views, and seconds a view beside its rendering
+SEATS = 2, 0.3  # check views, and seconds beside them
+
+
+@dataclass(frozen=True)
+class TestViews(Stage):
+    """Views that nothing was fitted to.
+
+    Attributes:
+        whole: all ten, by SSIM and FLIP too.
+    """
+
+    __test__ = False  # not pytest's
+    name: ClassVar[str] = "test views"
+    scores: ClassVar[bool] = True
+    whole: bool = False
+
+    def cost(self, case: Case) -> Cost:
+        """By pixels."""
+        views, beside = SCORE_ALL if self.whole else SCORE
+        return Cost(views * (case.judge + case.pace * beside * case.judged / 400**2))
+
+    def run(self, work: Work) -> None:
+        """Score."""
+        from vvgt_cli.dvr import RenderSettings
+
+        fit, run = work.fit, work.run
+        with run.stage(self.name) as stage:
+            scores = score_test_views(
+                work.scene,
+                work.made(),
+                fit.size,
+                RenderSettings(),
+                rule=fit.rule,
+                perceptual=self.whole,
+                only=None if self.whole else PREVIEW_VIEWS,
+                progress=run.console.bar(self.name),
+            )
+            run.report.scores = asdict(scores)
+            stage.note = f"{psnr_note(scores)}, {scores.views} views of {fit.size} px"
+
+
+@dataclass(frozen=True)
+class Seats(Stage):
+    """Every rule at the size made for and above; left out where time is up."""
+
+    name: ClassVar[str] = "seats"
+    scores: ClassVar[bool] = True
+
+    def cost(self, case: Case) -> Cost:
+        """By pixels."""
+        return Cost(SEATS[0] * case.judge + case.pace * SEATS[1])
+
+    def run(self, work: Work) -> None:
+        """Score."""
+        run, budget = work.run, work.limits.time_budget
+        if budget is not None and run.elapsed() > budget:
+            run.leave_out(self.name, "time is up")
+            return
+        with run.stage(self.name) as stage:
+            seats = score_seats(work.scene, work.made(), from_above(work.fit.size), views=SIDE)
+            run.report.seats = [asdict(seat) for seat in seats]
+            stage.note = f"worst of {len(seats)}: {seats[0].name()}, {seats[0].psnr:.2f} dB"

@@ -1,0 +1,135 @@
+"""Views of the volume: those that judge, and those that are fitted to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from vvgt_cli.cameras import default_views
+from vvgt_cli.cameras.sets import SET_VIEWS
+from vvgt_cli.conversion.case import Case, view_edge
+from vvgt_cli.conversion.stage import Cost, Stage, Work
+from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.runs.views import VIEW_BYTES, Views, judging_views
+from vvgt_cli.splat.rules import Rule
+
+if TYPE_CHECKING:
+    from vvgt_cli.dvr import RenderSettings, Scene
+
+REFINE_VIEWS = 72  # training views of gradient descent, which learns fewer by heart
+STEPS_A_SET = 48  # of gradient descent, for each further 24 views
+MARGIN, SAMPLES = 4.0, 12.0  # dB, where views are means over their pixels, and where they are samples of a screen's
+LARGE = 0.5  # of the screen: views as large are means over their own pixels
+WIDE = 0.9  # standard deviation in pixels of whole training views
+SOLID = 0.9  # median opacity of opaque bodies
+
+
+def views_of(steps: int) -> int:
+    """Training views of so many steps: in a short run more steps gain more than more views."""
+    fewest = SET_VIEWS["train"]
+    return fewest * min(max(steps // STEPS_A_SET, 1), REFINE_VIEWS // fewest)
+
+
+@dataclass(frozen=True)
+class CheckViews(Stage):
+    """Views that decide what is kept.
+
+    Attributes:
+        fine: integrated over pixels, as what is judged by them is worth it.
+    """
+
+    name: ClassVar[str] = "check views"
+    fine: bool = True
+
+    def cost(self, case: Case) -> Cost:
+        """One of them is drawn whole, of which blocks are kept."""
+        count = SET_VIEWS["check"]
+        return Cost(count * case.judge, (count * case.judged + case.size**2) * VIEW_BYTES)
+
+    def run(self, work: Work) -> None:
+        """Render them."""
+        from vvgt_cli.dvr import RenderSettings
+        from vvgt_cli.dvr.render import FIT_VIEWS
+
+        size = work.fit.size
+        cameras = default_views("check", size=size)
+        with work.run.stage(self.name) as stage:
+            work.check = judging_views(work.scene, cameras, RenderSettings() if self.fine else FIT_VIEWS)
+            stage.note = f"{len(cameras)} of {size} px" + (", blocks of them" if work.check.blocks else "")
+
+
+@dataclass(frozen=True)
+class TrainingViews(Stage):
+    """Views to fit to.
+
+    Attributes:
+        count: how many.
+        edge: pixels along their edge.
+        fitted: they are fitted to by descent, and as finely integrated as that asks for.
+    """
+
+    name: ClassVar[str] = "views"
+    count: int = 24
+    edge: int = 200
+    fitted: bool = True
+
+    def cost(self, case: Case) -> Cost:
+        """By pixels."""
+        return Cost(self.count * case.view * (self.edge / case.edge) ** 2, self.count * self.edge**2 * VIEW_BYTES)
+
+    def label(self) -> str:
+        """With their number and size."""
+        return f"{self.count} views of {self.edge} px"
+
+    def run(self, work: Work) -> None:
+        """Render them, as finely as the Gaussians ask for."""
+        from vvgt_cli.dvr import render_views
+        from vvgt_cli.dvr.render import FIT_VIEWS
+
+        footprint = self.edge / work.fit.size
+        work.train_rule = work.rule.at(footprint)
+        settings = FIT_VIEWS
+        if self.fitted:
+            spread = 1.0 if footprint >= LARGE else footprint
+            settings = fine_enough(work.scene, work.made(), self.edge, work.train_rule, spread)
+        cameras = default_views("train", self.count, size=self.edge)
+        with work.run.stage(self.name) as stage:
+            images = render_views(work.scene, cameras, settings, progress=work.run.console.bar(self.name))
+            rays = "one ray" if settings.samples == 1 else "adaptive rays"
+            stage.note = f"{self.count} of {self.edge} px to fit to, {rays} a pixel, steps of {settings.step:g}"
+        work.train = Views(cameras, images)
+
+
+def fine_enough(scene: Scene, start: Gaussians, size: int, rule: Rule, footprint: float = 1.0) -> RenderSettings:
+    """One ray a pixel where its error is `MARGIN` or `SAMPLES` below that of ``start``, else adaptive rays.
+
+    The error is that of a check view of ``size`` px drawn by ``rule``, against the same finely rendered. Gradient
+    descent follows the jags of single rays at hard edges, and those of longer steps everywhere. Rays are spread over
+    ``footprint`` of a pixel's edge: views are samples of the screen's pixels, not means over their own.
+    """
+    from vvgt_cli.dvr import RenderSettings, render_view
+    from vvgt_cli.metrics import psnr
+    from vvgt_cli.splat import render
+
+    camera = default_views("check", size=size)[0]
+    many, one = RenderSettings(footprint=footprint), RenderSettings(samples=1)
+    fine, single = (render_view(scene, camera, settings) for settings in (many, one))
+    wanted = psnr(fine[..., :3], render(start, camera, rule)[..., :3])
+    wanted += MARGIN if footprint == 1 else SAMPLES
+    enough = psnr(fine[..., :3], single[..., :3]) >= wanted
+    return one if enough else many
+
+
+def wide(gaussians: Gaussians, size: int) -> bool:
+    """Whether training views half as large as they may be still show Gaussians.
+
+    That is so where the median of middle standard deviations is above `WIDE` px of whole ones, and bodies are not
+    opaque: of these the edges are all there is.
+    """
+    camera = default_views("check", 1, size=view_edge(size, half=False))[0]
+    pixel = float(np.linalg.norm(camera.position)) / camera.fx
+    middle = np.exp(np.median(gaussians.log_scales, axis=1))  # of three
+    solid = np.median(gaussians.opacity_logits) > np.log(SOLID / (1 - SOLID))
+    return bool(np.median(middle) > WIDE * pixel and not solid)

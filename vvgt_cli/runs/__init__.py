@@ -1,0 +1,1 @@
+"""What every run shares: source, record, outputs, places, files of Gaussians, scores."""

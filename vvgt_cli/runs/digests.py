@@ -1,0 +1,55 @@
+"""Digests of what a run depends on: manifests and checkpoints tell by them whether files are theirs."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import fields, is_dataclass
+from typing import Any
+
+import numpy as np
+
+from vvgt_cli.cameras import Camera
+from vvgt_cli.volume import Volume
+from vvgt_cli.volume.stats import slabs
+
+
+def digest(*parts: Any) -> str:
+    """sha256 of values, hexadecimal: arrays by type, shape and bytes, dataclasses by their fields, the rest by repr."""
+    state = hashlib.sha256()
+    for part in parts:
+        _feed(state, part)
+    return state.hexdigest()
+
+
+def _feed(state: Any, part: Any) -> None:
+    if is_dataclass(part) and not isinstance(part, type):
+        for entry in fields(part):
+            _feed(state, entry.name)
+            _feed(state, getattr(part, entry.name))
+    elif isinstance(part, np.ndarray):
+        state.update(f"{part.dtype.str}{part.shape}".encode())
+        state.update(np.ascontiguousarray(part).data)
+    else:
+        state.update(f"{type(part).__name__}:{part!r};".encode())
+
+
+def volume_digest(volume: Volume) -> str:
+    """sha256 of a volume's content: grid, type, scaling and values; not of its name, place or orientation."""
+    state = hashlib.sha256()
+    _feed(state, volume.dims)
+    for number in (*volume.spacing, volume.slope, volume.intercept):
+        _feed(state, float(number))
+    for _, slab in slabs(volume):
+        _feed(state, slab)
+    return state.hexdigest()
+
+
+def cameras_digest(cameras: Sequence[Camera]) -> str:
+    """sha256 of names, poses and lenses; the size is left out."""
+    state = hashlib.sha256()
+    for camera in cameras:
+        lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy]) / camera.height
+        for part in (camera.name, camera.rotation, camera.translation, lens):
+            _feed(state, part)
+    return state.hexdigest()

@@ -1,0 +1,107 @@
+"""`.ply` in and out of a run: read into the unit frame, written by a stage, kept elsewhere where writing fails."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import sys
+import tempfile
+from pathlib import Path
+from typing import BinaryIO
+
+from vvgt_cli.errors import DataError, VvgtError
+from vvgt_cli.files import atomic_write, is_stream
+from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions, in_unit_frame, read_ply, write_ply
+from vvgt_cli.progress import Console
+from vvgt_cli.runs.outputs import STDOUT
+from vvgt_cli.runs.record import Run
+from vvgt_cli.splat.rules import INRIA, Rule, rule_of
+from vvgt_cli.volume.types import UnitFrame
+
+STDIN = STDOUT
+
+
+def file_rule(header: PlyHeader, asked: str | None = None) -> Rule:
+    """The rule to draw by: that asked for, else the file's, else the usual one.
+
+    Raises:
+        UsageError: no such rule.
+    """
+    return rule_of(asked or header.rule or INRIA)
+
+
+def open_gaussians(source: str | BinaryIO, console: Console) -> tuple[Gaussians, PlyHeader]:
+    """Read a `.ply` (a path, "-" for standard input, or a stream) into the unit frame, and say what was left out.
+
+    Raises:
+        DataError: not a 3DGS `.ply`, or one without Gaussians.
+    """
+    gaussians, header = read_ply(sys.stdin.buffer if source == STDIN else source)
+    if not len(gaussians):
+        raise DataError(f"{source}: holds no Gaussians; expected at least one")
+    if header.sh_degree and not header.version:
+        console.say(f"{source}: spherical harmonics of degree {header.sh_degree}; only the base colour is used")
+    return in_unit_frame(gaussians, header), header
+
+
+def layout_of(header: PlyHeader) -> PlyOptions:
+    """What makes a file laid out, placed and commented as the one read was."""
+    frame = None
+    if header.scale is not None and header.centre is not None:
+        frame = UnitFrame(header.scale, (1, 1, 1), (1, 1, 1), header.centre)  # of which scale and centre are written
+    return PlyOptions(
+        frame=header.frame,
+        up=header.up,
+        sh_degree=header.sh_degree,
+        comments=header.version is not None,
+        unit_frame=frame,
+        unit_distance=header.unit_distance,
+        unit_distance_label=header.unit_distance_label or "given",
+        made_for=header.made_for,
+        rule=header.rule,
+        space=header.space or "none",
+        affine=header.affine,
+    )
+
+
+def write_gaussians(run: Run, output: str, gaussians: Gaussians, options: PlyOptions, overwrite: bool) -> None:
+    """The stage that writes a `.ply`, or standard output for "-", and records its size."""
+    report = run.report
+    with run.stage("write") as stage:
+        if output == STDOUT:
+            report.bytes = write_ply(sys.stdout.buffer, gaussians, options)
+            sys.stdout.buffer.flush()
+        else:
+            report.bytes = _write_file(output, gaussians, options, overwrite)
+        report.gaussians = len(gaussians)
+        stage.note = f"{output}: {len(gaussians)} Gaussians, {report.bytes / 1e6:.1f} MB"
+
+
+def _write_file(output: str, gaussians: Gaussians, options: PlyOptions, overwrite: bool) -> int:
+    """Write a `.ply`; where that fails, put it elsewhere and say so: it may have taken hours."""
+    if is_stream(output):
+        with open(output, "ab") as stream:
+            return write_ply(stream, gaussians, options)
+    try:
+        with atomic_write(output, overwrite) as temporary:
+            return write_ply(temporary, gaussians, options)
+    except VvgtError as error:
+        if isinstance(error, DataError) and not isinstance(error.__cause__, OSError):
+            raise  # these Gaussians cannot be written anywhere
+        place = _elsewhere(Path(output), gaussians, options)
+        if place is None:
+            raise
+        raise type(error)(f"{error}; what was computed lies in {place}") from error
+
+
+def _elsewhere(output: Path, gaussians: Gaussians, options: PlyOptions) -> Path | None:
+    """Write a `.ply` to the temporary folder, else to the working folder; where it is, None where neither takes it."""
+    name = f"{output.stem[:80]}.{secrets.token_hex(4)}.ply"
+    for find in (tempfile.gettempdir, os.getcwd):
+        try:
+            with atomic_write(Path(find(), name)) as temporary:
+                write_ply(temporary, gaussians, options)
+            return Path(find(), name)
+        except (OSError, VvgtError):
+            continue
+    return None

@@ -1,0 +1,104 @@
+"""Where a file is looked at: every rule of `vvgt_cli.splat.rules`, several sizes, from afar and close up."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vvgt_cli.cameras import Camera, default_views
+from vvgt_cli.cameras.blocks import spread_blocks
+from vvgt_cli.cameras.sets import FIELD_OF_VIEW
+from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.progress import ProgressCallback
+from vvgt_cli.splat.rules import RULES
+
+if TYPE_CHECKING:
+    from vvgt_cli.dvr import RenderSettings, Scene
+
+SIZES = (400, 800, 2160)  # pixels: a small window, half a screen, a 4K screen
+CLOSE = 10.0  # degrees: a quarter of the default views' field
+VIEWS = (0, 4, 9)  # test views: above, side, below
+SIDE = (4,)  # enough to find the worst seat
+PREVIEW_VIEWS = (0, 4, 9)  # test views of previews, and of the score without a report: above, side, below
+
+
+@dataclass(frozen=True)
+class Seat:
+    """One place to look from.
+
+    Attributes:
+        rule: by which the splats are drawn.
+        size: pixels along the picture's edge.
+        field_of_view: degrees.
+        psnr: dB, over black, mean of the views.
+    """
+
+    rule: str
+    size: int
+    field_of_view: float
+    psnr: float
+
+    def name(self) -> str:
+        """As tables and talk have it."""
+        return f"{self.rule} {self.size} px" + ("" if self.field_of_view == FIELD_OF_VIEW else " close up")
+
+
+def seats_of(size: int) -> list[tuple[int, float]]:
+    """(size, field of view) from which a file made for ``size`` px is scored."""
+    return [(edge, FIELD_OF_VIEW) for edge in sorted({*SIZES, size})] + [(size, CLOSE)]
+
+
+def from_above(size: int) -> list[tuple[int, float]]:
+    """The size made for, and the next larger screen."""
+    return [(size, FIELD_OF_VIEW), (2160 if size < 2160 else 2 * size, FIELD_OF_VIEW)]
+
+
+def zoomed(camera: Camera, field_of_view: float) -> Camera:
+    """The same place with another field of view, degrees; square pixels."""
+    focal = camera.height / 2 / float(np.tan(np.radians(field_of_view) / 2))
+    return replace(camera, fx=focal, fy=focal)
+
+
+def score_seats(
+    scene: Scene,
+    gaussians: Gaussians,
+    places: Iterable[tuple[int, float]],
+    settings: RenderSettings | None = None,
+    *,
+    rules: Collection[str] = tuple(RULES),
+    views: Collection[int] = VIEWS,
+    progress: ProgressCallback | None = None,
+) -> list[Seat]:
+    """Every rule at every place, on blocks of the test views; worst first.
+
+    Args:
+        scene, gaussians: what is compared.
+        places: (size in pixels, field of view in degrees).
+        settings: of the reference; the renderer's default without.
+        rules: names.
+        views: numbers of the test views.
+        progress: called after each view of a place.
+    """
+    from vvgt_cli.dvr import render_view
+    from vvgt_cli.metrics import psnr
+    from vvgt_cli.splat import render
+
+    places, found, done = list(places), [], 0
+    for size, field_of_view in places:
+        cameras = default_views("test", size=size)
+        errors: dict[str, list[float]] = {rule: [] for rule in rules}
+        for i in views:
+            camera, blocks = zoomed(cameras[i], field_of_view), spread_blocks(size, size, i)
+            reference = render_view(scene, camera, settings, blocks)[..., :3]
+            for rule in rules:
+                ours = np.clip(render(gaussians, camera, rule, blocks=blocks)[..., :3], 0, 1)
+                pair = (reference, ours) if blocks is None else (blocks.pick(reference), blocks.pick(ours))
+                errors[rule].append(psnr(*pair))
+            done += 1
+            if progress:
+                progress(done, len(places) * len(views))
+        found += [Seat(rule, size, field_of_view, float(np.mean(dbs))) for rule, dbs in errors.items()]
+    return sorted(found, key=lambda seat: seat.psnr)

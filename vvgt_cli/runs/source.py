@@ -1,0 +1,153 @@
+"""What a run starts from: a volume under a transfer function, read and checked."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from vvgt_cli.errors import UsageError
+from vvgt_cli.volume import ReadOptions, Statistics, Volume
+
+if TYPE_CHECKING:
+    from vvgt_cli.dvr import Scene
+    from vvgt_cli.transfer import TransferFunction
+
+
+@dataclass(frozen=True)
+class SourceRequest:
+    """What to read.
+
+    Attributes:
+        volume: path, `example:NAME`, or "-" for raw values on standard input; or a volume that is there already.
+        read: how to read it.
+        tf: transfer-function file or colour-map name, or a function; None makes one from the histogram.
+        tf_range: "data", "rescale" or "LO,HI".
+        unit_distance: a length, "paraview", "mean-spacing", or None: the function's own, else "paraview".
+        statistics: what the function's nodes follow from in place of the volume's own: those of the whole series.
+    """
+
+    volume: str | Volume
+    read: ReadOptions = field(default_factory=ReadOptions)
+    tf: str | TransferFunction | None = None
+    tf_range: str = "data"
+    unit_distance: str | None = None
+    statistics: Statistics | None = None
+
+    @property
+    def path(self) -> str:
+        """Of the volume's file.
+
+        Raises:
+            UsageError: a volume that is there already.
+        """
+        if not isinstance(self.volume, str):
+            raise UsageError(f"{self.volume.name}: a volume in memory; expected a path here")
+        return self.volume
+
+    def paths(self) -> list[str]:
+        """What of it is read from files."""
+        return [given for given in (self.volume, self.tf) if isinstance(given, str)]
+
+
+@dataclass(frozen=True)
+class Source:
+    """What was read: the function is visible somewhere in the volume.
+
+    ``unit_distance`` is the world length that opacity refers to, ``unit_label`` how it was chosen.
+    """
+
+    volume: Volume
+    statistics: Statistics
+    tf: TransferFunction
+    unit_distance: float
+    unit_label: str
+
+    def kernel_type(self) -> str:
+        """Name of the type in which kernels read the volume's values."""
+        from vvgt_cli.dvr.scene import kernel_type
+
+        return kernel_type(self.volume)
+
+    def scene(self) -> Scene:
+        """The volume laid out for the kernels."""
+        from vvgt_cli.dvr import Scene
+
+        limits = (self.statistics.lo, self.statistics.hi)
+        return Scene.build(self.volume, self.tf, self.unit_distance, limits)
+
+
+def load(request: SourceRequest) -> Source:
+    """Read the function, then the volume, and bring them together.
+
+    Raises:
+        DataError: a file that is not what it must be, or a function that shows nothing of this volume.
+        UsageError: options that do not fit the file.
+    """
+    return load_all(request, (request.tf,))[0]
+
+
+def load_all(request: SourceRequest, tfs: Sequence[str | TransferFunction | None]) -> list[Source]:
+    """One volume under each of several functions; ``request.tf`` is not used.
+
+    Raises:
+        DataError, UsageError: as `load`.
+    """
+    from vvgt_cli.synth.sources import open_volume
+    from vvgt_cli.transfer import check_visible, from_histogram, read_transfer_function, resolve, unit_distance
+    from vvgt_cli.transfer.resolve import parse_tf_range
+    from vvgt_cli.volume import statistics
+
+    tf_range = parse_tf_range(request.tf_range)
+    functions = [
+        read_transfer_function(tf) if isinstance(tf, str) else tf for tf in tfs
+    ]  # small: their errors come first
+    if None in functions and tf_range != "data":
+        raise UsageError("--tf-range says where the nodes of a function lie; it needs --tf")
+    volume = open_volume(request.volume, request.read) if isinstance(request.volume, str) else request.volume
+    distances = [unit_distance(request.unit_distance, volume, tf) for tf in functions]
+    numbers = statistics(volume)
+    sources = []
+    for tf, (distance, label) in zip(functions, distances, strict=True):
+        whole = request.statistics or numbers
+        shown = resolve(tf, whole, tf_range) if tf else from_histogram(whole)
+        check_visible(shown, numbers)
+        sources.append(Source(volume, numbers, shown, distance, label))
+    return sources
+
+
+def describe_source(source: Source) -> str:
+    """One line: grid, type, values, function, unit distance."""
+    volume, numbers = source.volume, source.statistics
+    grid = " x ".join(map(str, volume.dims))
+    holes = [f"{n} {what} (transparent)" for n, what in ((numbers.nan_count, "NaN"), (numbers.inf_count, "inf")) if n]
+    values = ", ".join([f"values {numbers.lo:g} to {numbers.hi:g}", *holes])
+    distance = f"opacity per {source.unit_distance:g} ({source.unit_label})"
+    return f"{volume.name}: {grid} {volume.data.dtype.name}, {values}; {source.tf.name}: {distance}"
+
+
+def volume_record(source: Source) -> dict[str, Any]:
+    """The volume as reports show it."""
+    volume, numbers = source.volume, source.statistics
+    return {
+        "name": volume.name,
+        "dims": volume.dims,
+        "dtype": volume.data.dtype.name,
+        "spacing": volume.spacing,
+        "space": volume.space or "none",
+        "range": (numbers.lo, numbers.hi),
+        "nan": numbers.nan_count,
+        "inf": numbers.inf_count,
+    }
+
+
+def tf_record(source: Source, request: SourceRequest) -> dict[str, Any]:
+    """The transfer function as reports show it."""
+    return {
+        "name": source.tf.name,
+        "given": request.tf is not None,
+        "tf_range": request.tf_range,
+        "nodes": source.tf.node_range(),
+        "unit_distance": source.unit_distance,
+        "unit_distance_label": source.unit_label,
+    }
