@@ -261,13 +261,13 @@ def test_tf_show_draws(folder, vvgt):
 
 
 def test_an_interrupted_run_leaves_nothing(folder, vvgt, monkeypatch):
-    import vvgt_cli.tasks.render as pipeline
+    import vvgt_cli.runs.gaussian_files as files
 
     def stop(stream, *args):
         Path(stream).write_bytes(b"half")
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(pipeline, "write_ply", stop)
+    monkeypatch.setattr(files, "write_ply", stop)
     result = vvgt("init", SOURCE, *SMALL, "-o", "a.ply")
     assert (result.code, "interrupted" in result.err) == (130, True)
     assert [path.name for path in folder.iterdir()] == ["tf.json"]
