@@ -268,8 +268,12 @@ def test_inviwo(tmp_path: Path) -> None:
     volume = read_volume(write(tmp_path / "v.dat", dat(fields)))
     assert isinstance(volume.data, np.memmap)
     np.testing.assert_array_equal(volume.data, VALUES)
-    assert (volume.spacing, volume.origin) == ((2, 0.5, 3), (1, 2, 3))
+    assert (volume.spacing, volume.origin) == ((2, 0.5, 3), (2, 1.75, 4.5))  # the offset is the corner of the box
     assert volume.direction == (1, 0, 0, 0, -1, 0, 0, 0, 1)
+    rows = {"BasisVector1": "0 -4 0", "BasisVector2": "5 0 0", "BasisVector3": "0 0 3", "Offset": None}
+    turned = read_volume(write(tmp_path / "t.dat", dat(fields | rows)))  # i along y, j along -x
+    np.testing.assert_allclose(turned.affine[:3, :3], [[0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    np.testing.assert_allclose(turned.affine @ (2, 1.5, 1, 1), (0, 0, 0, 1), atol=1e-12)  # centred without an offset
 
 
 def test_inviwo_old_names_scaling_and_sequences(tmp_path: Path) -> None:

@@ -67,15 +67,28 @@ def _scaling(fields: Fields) -> tuple[float, float]:
 
 
 def _geometry(fields: Fields, dims: list[int]) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Spacing (x, y, z) and direction (row-major): basis vectors span the whole box."""
+    """Spacing (x, y, z) and direction (row-major).
+
+    Basis vectors are rows of the matrix whose columns span the whole box: so Inviwo's DatVolumeSequenceReader takes
+    them and its DatVolumeWriter writes them.
+    """
     keys = ("basisvector1", "basisvector2", "basisvector3")
     if all(fields.get(k) for k in keys):
-        lengths, direction = unit_rows([fields.floats(k, fields[k], 3) for k in keys])
+        rows = [fields.floats(k, fields[k], 3) for k in keys]
+        lengths, direction = unit_rows([list(column) for column in zip(*rows, strict=True)])
         return tuple(length / n for length, n in zip(lengths, dims, strict=True)), direction
     for key in ("spacing", "slicethickness"):
         if fields.get(key):
             return tuple(fields.floats(key, fields[key], 3)), IDENTITY
     return (1.0, 1.0, 1.0), IDENTITY
+
+
+def _origin(fields: Fields, dims: list[int], spacing: tuple[float, ...], direction: tuple[float, ...]) -> np.ndarray:
+    """(3,) centre of the first voxel: Offset is the corner of the box, which is centred without one."""
+    steps = np.array(direction).reshape(3, 3) * spacing
+    if fields.get("offset"):
+        return np.array(fields.floats("Offset", fields["offset"], 3)) + steps @ (0.5, 0.5, 0.5)
+    return steps @ (0.5 - np.array(dims) / 2) + 0.0
 
 
 def read_inviwo(path: Path, options: ReadOptions) -> Volume:
@@ -101,10 +114,11 @@ def read_inviwo(path: Path, options: ReadOptions) -> Volume:
     block = np.moveaxis(block, 0, -1).reshape(*reversed(dims), -1) if steps > 1 else block[0]
     field, (slope, intercept) = select_component(block, options.component, str(path), scaling=_scaling(fields))
     spacing, direction = _geometry(fields, dims)
-    origin = tuple(fields.floats("Offset", fields["offset"], 3)) if fields.get("offset") else (0.0, 0.0, 0.0)
+    spacing = options.spacing_or(spacing)
+    origin = tuple(_origin(fields, dims, spacing, direction).tolist())
     return Volume(
         field,
-        options.spacing_or(spacing),
+        spacing,  # type: ignore[arg-type]
         origin,  # type: ignore[arg-type]
         direction,
         volume_name(path),
