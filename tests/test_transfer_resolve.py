@@ -209,17 +209,24 @@ def test_data_without_finite_voxels_are_an_error():
             use()
 
 
+def ct_values(air=60_000):
+    """Hounsfield units of air, tissue and bone, (n,)."""
+    rng = np.random.default_rng(0)
+    return np.concatenate([rng.normal(-1000, 20, air), rng.normal(40, 60, 30_000), rng.normal(700, 200, 4000)])
+
+
 def kinds():
     """Value distributions of typical volumes: name, values, transparent below, visible somewhere in."""
     rng = np.random.default_rng(0)
-    air, tissue, bone = rng.normal(-1000, 20, 60_000), rng.normal(40, 60, 30_000), rng.normal(700, 200, 4000)
-    ct = np.concatenate([air, tissue, bone])
-    padded = np.concatenate([np.full(50_000, -2000.0), ct])
+    stored = np.round(ct_values() + 1024)  # as the file has them, or a raw one
+    padded = np.concatenate([np.full(50_000, -2000.0), stored])
+    eight = np.round(255 * (stored - stored.min()) / np.ptp(stored))
     mr = np.concatenate([rng.exponential(8, 70_000), rng.normal(300, 60, 30_000)]).clip(0)
     fog = rng.exponential(10, 100_000)
     return [
-        ("ct", ct, -1000, (-100, 1000)),
-        ("padded ct", padded, -1000, (-100, 1000)),
+        ("stored ct", stored, 24, (924, 2024)),
+        ("padded ct", padded, 24, (924, 2024)),
+        ("ct in 8 bits", eight, 12, (200, 250)),
         ("mr", mr, 2, (150, 400)),
         ("fog", fog, 0, (30, 60)),
     ]
@@ -233,9 +240,9 @@ def test_automatic_function_hides_the_background_and_shows_the_rest(name, values
     check_visible(tf, numbers)
     assert tf.opacity(np.array([background]))[0] <= 0.002
     assert tf.opacity(np.linspace(*foreground, 50)).max() > 0.02
-    assert tf.opacity(np.array([numbers.hi]))[0] == pytest.approx(0.7)
-    rising = tf.opacity(np.linspace(numbers.lo, numbers.hi, 500))
-    assert (np.diff(rising) >= -1e-12).all()
+    assert tf.opacity(np.array([numbers.hi]))[0] == pytest.approx(0.5)
+    depth = 256 * -np.log1p(-tf.opacity(values)).mean()  # along the longest edge, on average
+    assert 1 < depth < 4.5
     again = from_histogram(statistics(values))
     assert again.opacity_nodes.x.tolist() == tf.opacity_nodes.x.tolist()
 
@@ -245,10 +252,53 @@ def test_automatic_function_shows_both_sides_of_an_ambient_value():
     values = np.concatenate([rng.normal(0, 0.01, 80_000), rng.normal(-0.6, 0.2, 10_000), rng.normal(0.6, 0.2, 10_000)])
     tf = from_histogram(statistics(values))
     assert tf.opacity(np.array([0.0]))[0] == 0
-    assert tf.opacity(np.array([values.min(), values.max()])).min() > 0.5
+    assert tf.opacity(np.array([values.min(), values.max()])) == pytest.approx(0.5)
     high = from_histogram(statistics(np.concatenate([rng.normal(200, 2, 90_000), rng.uniform(0, 150, 10_000)])))
     assert high.opacity(np.array([200.0]))[0] == 0
-    assert high.opacity(np.array([0.0]))[0] > 0.5
+    assert high.opacity(np.array([0.0]))[0] > 0.3
+
+
+def test_automatic_function_of_hounsfield_units_shows_tissue_by_them():
+    values = ct_values()
+    for every in (values, np.concatenate([np.full(50_000, -2000.0), values])):
+        tf = from_histogram(statistics(every))
+        assert tf.name == "automatic (Hounsfield units)"
+        air, fat, organ, bone = tf.opacity(np.array([-1000.0, -100, 40, 700]))
+        assert air == 0
+        assert 0 < fat < organ < 0.006 < 0.29 < bone
+    crop = statistics(ct_values(air=0))
+    assert from_histogram(crop).name == "automatic (histogram)"
+    told = from_histogram(crop, hounsfield=True)
+    assert told.opacity_nodes.x.tolist() == tf.opacity_nodes.x.tolist()
+    dark = statistics(np.linspace(-2000, -900, 1000))
+    assert from_histogram(dark, hounsfield=True).name == "automatic (histogram)"
+
+
+@pytest.mark.parametrize("values", [np.linspace(-1100, 1100, 9999), np.random.default_rng(4).normal(0, 500, 9999)])
+def test_a_field_of_such_values_is_not_taken_for_hounsfield_units(values):
+    assert from_histogram(statistics(values)).name == "automatic (histogram)"
+
+
+def test_automatic_function_shows_the_whole_of_a_crop_without_air():
+    rng = np.random.default_rng(5)
+    crop = np.concatenate(
+        [rng.normal(10_500, 1200, 60_000), rng.normal(5000, 2500, 35_000), rng.uniform(0, 30_000, 300)]
+    )
+    tf = from_histogram(statistics(crop.clip(0)))
+    dark, usual, bright = tf.opacity(np.array([2000.0, 10_500, 28_000]))
+    assert dark < usual < bright == pytest.approx(0.5)
+
+
+def test_automatic_function_of_labels_shows_no_others_between_them():
+    labels = np.repeat([0.0, 1, 2, 3, 4], [90_000, 6000, 50, 3000, 950])
+    tf = from_histogram(statistics(labels))
+    at = tf.opacity(np.arange(5.0))
+    assert at[0] == 0
+    assert at[[2, 4]] == pytest.approx(0.5, rel=0.02)  # rare ones are thick; within half a bin
+    assert at[4] > at[3] > at[1] > 0
+    between = tf.opacity(np.arange(1.5, 4))
+    assert (between <= np.maximum(at[1:-1], at[2:]) * 1.02).all()
+    assert (between >= np.minimum(at[1:-1], at[2:])).all()
 
 
 @pytest.mark.parametrize(

@@ -216,10 +216,11 @@ def _function(source: SourceRequest, frames: Frames) -> tuple[TransferFunction, 
     from vvgt_cli.transfer.resolve import parse_tf_range
 
     read = read_transfer_function(source.tf) if isinstance(source.tf, str) else source.tf
-    distance = unit_distance(source.unit_distance, frames.first, read)
     if read is None:
-        return from_histogram(frames.whole), distance
-    return resolve(read, frames.whole, parse_tf_range(source.tf_range)), distance
+        shown = from_histogram(frames.whole, frames.first.hounsfield)
+    else:
+        shown = resolve(read, frames.whole, parse_tf_range(source.tf_range))
+    return shown, unit_distance(source.unit_distance, frames.first, read or shown)
 
 
 def _steps(source: SourceRequest) -> list[Step]:

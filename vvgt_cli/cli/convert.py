@@ -43,7 +43,8 @@ def command(volume: str, shard: str | None, dry_run: bool, console: Console, **o
 
     VOLUME is a file (raw with a header or with --dims and --dtype, NRRD, NIfTI, MetaImage, VTK, TIFF, ...),
     "example:NAME" for one of the volumes that come with the program, or "-" for raw values on standard
-    input. Without --tf a function is made from the histogram.
+    input. Without --tf a function is made: tissue by Hounsfield units
+    where values are such, else from the histogram, background transparent, what is rare more opaque.
 
     The Gaussians are made for images of --size pixels and scored on three test views that nothing was fitted
     to (ten with --report); the error is printed. --target-psnr, --time-budget and --max-size, any or none,

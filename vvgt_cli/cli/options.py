@@ -106,7 +106,7 @@ tf_options = group(
     "optics",
     tf=click.option(
         "--tf", metavar="TF",
-        help="Transfer function: a file, or a matplotlib colour map's name. Default: from the histogram.",
+        help="Transfer function: a file, or a matplotlib colour map's name. Default: made from the values.",
     ),
     tf_range=tf_range_option,
     opacity_unit_distance=unit_distance_option,

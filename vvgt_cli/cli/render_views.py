@@ -84,7 +84,7 @@ optics_options = group(
     tf=click.option(
         "--tf", multiple=True, metavar="TF",
         help="Transfer function: a file, or a matplotlib colour map's name; may be repeated. "
-        "Default: from the histogram.",
+        "Default: made from the values.",
     ),
     tf_range=tf_range_option,
     opacity_unit_distance=unit_distance_option,

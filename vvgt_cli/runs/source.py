@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -105,13 +106,20 @@ def load_all(request: SourceRequest, tfs: Sequence[str | TransferFunction | None
     if None in functions and tf_range != "data":
         raise UsageError("--tf-range says where the nodes of a function lie; it needs --tf")
     volume = open_volume(request.volume, request.read) if isinstance(request.volume, str) else request.volume
-    distances = [unit_distance(request.unit_distance, volume, tf) for tf in functions]
+    unit_distance(request.unit_distance, volume)  # its errors come first
     numbers = statistics(volume)
     sources = []
-    for tf, (distance, label) in zip(functions, distances, strict=True):
+    for tf in functions:
         whole = request.statistics or numbers
-        shown = resolve(tf, whole, tf_range) if tf else from_histogram(whole)
+        shown = resolve(tf, whole, tf_range) if tf else from_histogram(whole, volume.hounsfield)
+        if tf is None and whole.lo == whole.hi:
+            warnings.warn(
+                f"{volume.name}: every voxel is {whole.lo:g}, so that only the box is seen; check --dtype, --component "
+                "or --array, or give a --tf",
+                stacklevel=2,
+            )
         check_visible(shown, numbers)
+        distance, label = unit_distance(request.unit_distance, volume, tf or shown)
         sources.append(Source(volume, numbers, shown, distance, label))
     return sources
 

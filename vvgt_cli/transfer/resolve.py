@@ -123,7 +123,7 @@ def unit_distance(spec: str | float | None, volume: Volume, tf: TransferFunction
         if tf is not None and tf.opacity_unit_distance is not None:
             return tf.opacity_unit_distance, tf.opacity_unit_label
         if tf is not None and tf.opacity_unit_share is not None:
-            return tf.opacity_unit_share * max(volume.extent), "file"
+            return tf.opacity_unit_share * max(volume.extent), tf.opacity_unit_label
         spec = "paraview"
     mean = sum(volume.spacing) / 3
     if spec == "mean-spacing":

@@ -27,6 +27,7 @@ from vvgt_cli.volume.types import Volume
 
 MOST = 100_000  # files
 TRIED = 1000  # files of a folder that are looked at to see whether it holds DICOM
+HOUNSFIELD = "HU"  # Rescale Type (0028,1054), and what CT's is where it is absent (PS3.3, C.8.2.1.1.5)
 ANGLE = 1e-3  # of a unit normal: how far slices may be tilted against each other
 EVEN = 0.01  # of the spacing: how far a slice may be off
 CODECS = {  # what pydicom decodes a coding with, by words of its name, the first that fits
@@ -81,6 +82,7 @@ class _Slice:
     rows: np.ndarray  # (2, 3) unit vectors along a row (x) and down a column (y)
     spacing: tuple[float, float]  # (x, y)
     scaling: tuple[float, float]  # slope, intercept
+    hounsfield: bool  # what the scaling gives, as the header says
 
 
 def read_dicom(path: Path, options: ReadOptions) -> Volume:
@@ -102,9 +104,10 @@ def read_dicom(path: Path, options: ReadOptions) -> Volume:
     field, (slope, intercept) = select_component(
         values, options.component, str(path), label="each pixel", scaling=(slope, intercept)
     )
+    told = all(s.hounsfield for s in slices)
     return Volume(
         field, options.spacing_or(spacing), tuple(slices[0].position.tolist()), direction,
-        f"{path.resolve().name.removesuffix('.dcm')}{title}", slope, intercept, "LPS",
+        f"{path.resolve().name.removesuffix('.dcm')}{title}", slope, intercept, "LPS", told,
     )  # type: ignore[arg-type]  # fmt: skip
 
 
@@ -134,6 +137,8 @@ def _frames(path: Path, header: Any) -> Iterator[_Slice]:
             raise DataError(f"{path}: no ImagePositionPatient, ImageOrientationPatient and PixelSpacing; expected all")
         slope = item("PixelValueTransformationSequence", "RescaleSlope")
         intercept = item("PixelValueTransformationSequence", "RescaleIntercept")
+        unit = item("PixelValueTransformationSequence", "RescaleType") or HOUNSFIELD
+        hounsfield = header.get("Modality") == "CT" and intercept is not None and unit == HOUNSFIELD
         rows = np.array([float(c) for c in cosines]).reshape(2, 3)
         lengths = np.linalg.norm(rows, axis=1)
         if not np.isfinite(rows).all() or abs(lengths - 1).max() > ANGLE or abs(rows[0] @ rows[1]) > ANGLE:
@@ -145,7 +150,7 @@ def _frames(path: Path, header: Any) -> Iterator[_Slice]:
         if dose is not None:
             scaling = (float(dose), 0.0)
             place = place + _dose_offset(path, header, n, k, np.cross(rows[0], rows[1]))
-        yield _Slice(path, k, header, place, rows, (float(between[1]), float(between[0])), scaling)
+        yield _Slice(path, k, header, place, rows, (float(between[1]), float(between[0])), scaling, hounsfield)
 
 
 def _dose_offset(path: Path, header: Any, n: int, k: int, normal: np.ndarray) -> np.ndarray:

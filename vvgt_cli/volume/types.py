@@ -48,6 +48,7 @@ class Volume:
         name: short name for reports.
         slope, intercept: stored-value scaling (NIfTI, DICOM), slope finite and not 0.
         space: anatomical space that direction and origin are in, "RAS" or "LPS", None where there is none.
+        hounsfield: whether the file says that data values are Hounsfield units.
 
     Raises:
         DataError: wrong rank, empty axis, dtype that is not real, spacing not finite and positive, axes in a plane.
@@ -61,6 +62,7 @@ class Volume:
     slope: float = 1.0
     intercept: float = 0.0
     space: str | None = None
+    hounsfield: bool = False
 
     def __post_init__(self) -> None:
         if self.data.ndim != 3 or min(self.data.shape) < 1:

@@ -1,0 +1,64 @@
+"""Pictures of volumes under the function that is made when none is given, one PNG each.
+
+python benchmarks/automatic.py docs/automatic [NAME=VOLUME ...]
+
+Without volumes: scans that `scans` makes, and examples. VOLUME is a file or example:NAME.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from scans import cone_beam, head, nuclei, trunk
+
+from vvgt_cli.cameras.boxed import drawn_in_box
+from vvgt_cli.cameras.sets import look_at
+from vvgt_cli.dvr import RenderSettings, Scene, render_view
+from vvgt_cli.images import write_png
+from vvgt_cli.synth.sources import open_volume
+from vvgt_cli.transfer import from_histogram, unit_distance
+from vvgt_cli.volume import ReadOptions, Volume, statistics
+
+SIZE, AZIMUTH, ELEVATION, FIELD = 180, 60.0, 12.0, 36.0  # px, degrees
+MADE: dict[str, Callable[[], Volume]] = {
+    "mr-t1": lambda: head("t1"),
+    "mr-t2": lambda: head("t2"),
+    "ct-head": lambda: head("ct"),
+    "ct-abdomen": lambda: trunk(contrast=False),
+    "ct-angiography": lambda: trunk(contrast=True),
+    "cone-beam": cone_beam,
+    "microscopy": nuclei,
+}
+EXAMPLES = ("frog", "channels", "marschner-lobb")
+
+
+def picture(volume: Volume) -> tuple[np.ndarray, str]:
+    """(SIZE, SIZE, 3) picture over black, and the function's name."""
+    numbers = statistics(volume)
+    tf = from_histogram(numbers, volume.hounsfield)
+    scene = Scene.build(volume, tf, unit_distance(None, volume, tf)[0], (numbers.lo, numbers.hi))
+    azimuth, elevation = np.radians([AZIMUTH, ELEVATION])
+    level = np.cos(elevation)
+    eye = 3 * np.array([np.cos(azimuth) * level, np.sin(azimuth) * level, np.sin(elevation)])
+    camera = look_at(eye, width=SIZE, height=SIZE, fov=FIELD)
+    draw = drawn_in_box(lambda boxed: render_view(scene, boxed, RenderSettings()), volume.axes)
+    return np.clip(draw(camera)[..., :3], 0, 1), tf.name
+
+
+def main(folder: str, *named: str) -> None:
+    volumes = dict(MADE) if not named else {}
+    for entry in named or [f"{name}=example:{name}" for name in EXAMPLES]:
+        name, _, source = entry.partition("=")
+        volumes[name] = lambda source=source: open_volume(source, ReadOptions())
+    Path(folder).mkdir(parents=True, exist_ok=True)
+    for name, volume in volumes.items():
+        image, function = picture(volume())
+        write_png(Path(folder) / f"{name}.png", image, overwrite=True)
+        print(f"{name}: {function}")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,45 @@
+"""The function that is made when none is given, from files to its unit distance."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.test_volume_slices import write_series
+from vvgt_cli.pipeline.source import SourceRequest, load
+from vvgt_cli.volume import ReadOptions, read_volume
+
+
+@pytest.mark.parametrize(
+    ("changes", "units"),
+    [
+        ({"Modality": "CT"}, True),
+        ({"Modality": "CT", "RescaleType": "HU"}, True),
+        ({"Modality": "CT", "RescaleType": "US"}, False),
+        ({"Modality": "CT", "RescaleIntercept": None, "RescaleSlope": None}, False),
+        ({"Modality": "MR"}, False),
+    ],
+)
+def test_dicom_says_which_values_are_hounsfield_units(tmp_path: Path, changes: dict, units: bool) -> None:
+    write_series(tmp_path, **changes)
+    assert read_volume(str(tmp_path)).hounsfield == units
+    name = "automatic (Hounsfield units)" if units else "automatic (histogram)"
+    assert load(SourceRequest(str(tmp_path))).tf.name == name  # a ramp: by its values it is no scan
+
+
+def test_opacity_is_per_a_share_of_the_longest_edge(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", np.random.default_rng(0).exponential(10, (16, 8, 4)))
+    read = ReadOptions(spacing=(1.0, 2.0, 4.0))
+    made = load(SourceRequest(str(tmp_path / "a.npy"), read))
+    assert (made.unit_distance, made.unit_label) == (64 / 256, "automatic")
+    asked = load(SourceRequest(str(tmp_path / "a.npy"), read, unit_distance="mean-spacing"))
+    assert (asked.unit_distance, asked.unit_label) == (7 / 3, "mean-spacing")
+
+
+def test_a_volume_of_one_value_is_a_box_and_that_is_said(tmp_path: Path) -> None:
+    np.save(tmp_path / "zero.npy", np.zeros((4, 4, 4), np.uint8))
+    with pytest.warns(UserWarning, match=r"zero: every voxel is 0, so that only the box is seen; check --dtype"):
+        source = load(SourceRequest(str(tmp_path / "zero.npy")))
+    assert 0 < source.tf.opacity(np.zeros(1))[0] < 0.05
