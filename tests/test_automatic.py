@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.test_volume_slices import write_series
-from vvgt_cli.pipeline.source import SourceRequest, load
+from vvgt_cli.runs.source import SourceRequest, load
 from vvgt_cli.volume import ReadOptions, read_volume
 
 
