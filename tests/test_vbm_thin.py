@@ -24,7 +24,7 @@ def along(axis: int, there: float, elsewhere: float) -> tuple[float, float, floa
 CASES = {"a voxel": ((1, 1, 1), (1.0, 1.0, 1.0))}
 for axis, name in enumerate("xyz"):
     CASES[f"a line along {name}"] = (along(axis, 500, 1), (1.0, 1.0, 1.0))
-    CASES[f"a hair along {name}"] = (along(axis, 3000, 1), (1.0, 1.0, 1.0))
+    CASES[f"a hair along {name}"] = (along(axis, 1000, 1), (1.0, 1.0, 1.0))
     CASES[f"a sheet across {name}"] = (along(axis, 1, 60), (1.0, 1.0, 1.0))
     CASES[f"long voxels along {name}"] = ((6, 6, 6), along(axis, 1000.0, 1.0))
     CASES[f"flat voxels along {name}"] = ((6, 6, 6), along(axis, 0.001, 1.0))
@@ -37,9 +37,8 @@ def test_what_is_thin_is_seen(case):
     scene = scene_of(Volume(values, spacing=spacing), Ramp(k=4.0), min(spacing))
     gaussians = initialise(scene, VbmOptions(max_gaussians=500, size=SIZE)).gaussians
     assert len(gaussians)
-    for axis in range(3):  # from end to end
-        span = np.ptp(gaussians.means[:, axis]) if len(gaussians) > 1 else 0
-        assert span >= 2 * scene.half[axis] * (1 - 2 / dims[axis]) * 0.98
+    for axis in np.flatnonzero(scene.half > 0.1):  # from end to end
+        assert np.ptp(gaussians.means[:, axis]) >= 2 * scene.half[axis] * (1 - 2 / dims[axis]) * 0.98
     camera = default_views("test", 3, size=SIZE)[1]
     volume, ours = (
         image[..., 3] for image in (render_view(scene, camera, RenderSettings()), render(gaussians, camera))
