@@ -51,24 +51,6 @@ def test_no_bars_where_nothing_is_to_be_said():
     assert Console(quiet=True, stream=Terminal()).bar("views") is None
 
 
-def test_the_closed_form_tells_how_far_it_is():
-    import numpy as np
-
-    from tests.vbm_scenes import Ramp, scene_of
-    from vvgt_cli.vbm import VbmOptions, initialise
-    from vvgt_cli.volume import Volume
-
-    told = []
-    scene = scene_of(Volume(np.linspace(0, 1, 4096, dtype=np.float32).reshape(16, 16, 16)), Ramp())
-    initialise(scene, VbmOptions(max_gaussians=50, size=32), progress=lambda done, total: told.append((done, total)))
-    assert {total for _, total in told} == {100}
-    shares = [done for done, _ in told]
-    assert shares == sorted(shares)
-    assert shares[-1] == 100
-    assert len({share for share in shares if share < 25}) > 10  # within the march, view by view
-    assert any(25 < share <= 75 for share in shares)
-
-
 def test_quiet_says_nothing():
     stream = Terminal()
     console = Console(quiet=True, stream=stream)
