@@ -1,0 +1,117 @@
+"""NRRD and MetaImage files of SimpleITK and VTK, as VTK's own readers and SimpleITK have them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import SimpleITK as sitk
+from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
+from vtkmodules.vtkCommonDataModel import vtkImageData
+from vtkmodules.vtkIOImage import vtkMetaImageReader, vtkMetaImageWriter, vtkNrrdReader
+
+from tests import anatomy
+from vvgt_cli.volume import ReadOptions, read_volume
+
+SUFFIXES = (".nrrd", ".nhdr", ".mha", ".mhd")
+TYPES = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "float32", "float64")
+
+
+def vtk_image(path: Path) -> vtkImageData:
+    reader = vtkNrrdReader() if path.suffix in (".nrrd", ".nhdr") else vtkMetaImageReader()
+    assert reader.CanReadFile(str(path))
+    reader.SetFileName(str(path))
+    reader.Update()
+    return reader.GetOutput()
+
+
+def vtk_values(image: vtkImageData) -> np.ndarray:
+    return vtk_to_numpy(image.GetPointData().GetScalars()).reshape(image.GetDimensions()[::-1])
+
+
+def vtk_matrix(image: vtkImageData) -> np.ndarray:
+    matrix = image.GetDirectionMatrix()
+    return np.array([[matrix.GetElement(i, j) for j in range(3)] for i in range(3)])
+
+
+def values_of(kind: str) -> np.ndarray:
+    """No two alike, negative ones and large ones among them where the type has such."""
+    values = np.arange(np.prod(anatomy.DIMS)).reshape(anatomy.DIMS[::-1])
+    info = np.iinfo(kind) if np.dtype(kind).kind in "iu" else np.finfo(np.float32)
+    if np.dtype(kind).itemsize == 1:
+        return (values % 251 + int(info.min)).astype(kind)
+    return (values * (float(info.max) / values.size / 2) + (float(info.min) / 3)).astype(kind)
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("kind", TYPES)
+def test_values_spacing_and_origin_of_what_simpleitk_writes(
+    tmp_path: Path, kind: str, suffix: str, compressed: bool
+) -> None:
+    path, values = tmp_path / f"v{suffix}", values_of(kind)
+    image = sitk.GetImageFromArray(values)
+    image.SetSpacing((0.5, 1.25, 3.0))
+    image.SetOrigin((-7.0, 11.5, 13.0))
+    sitk.WriteImage(image, str(path), useCompression=compressed)
+    theirs, ours = vtk_image(path), read_volume(str(path), ReadOptions(space="LPS"))
+    assert ours.data.dtype == values.dtype
+    np.testing.assert_array_equal(ours.data, vtk_values(theirs))
+    np.testing.assert_array_equal(ours.data, values)
+    np.testing.assert_allclose(ours.spacing, theirs.GetSpacing(), rtol=1e-12)
+    np.testing.assert_allclose(ours.origin, theirs.GetOrigin(), rtol=1e-12)
+
+
+@pytest.mark.parametrize("suffix", [".nrrd", ".mha"])
+@pytest.mark.parametrize("grid", anatomy.GRIDS)
+def test_places_of_what_simpleitk_writes(tmp_path: Path, grid: str, suffix: str) -> None:
+    """VTK 9.7 drops the axes of NRRD files, and has those of MetaImage files in rows; ITK, whose format it is, in
+    columns."""
+    affine = anatomy.place(anatomy.GRIDS[grid])
+    path = anatomy.itk(tmp_path / f"v{suffix}", anatomy.balls(affine), affine)
+    theirs, ours = vtk_image(path), read_volume(str(path), ReadOptions(space="LPS"))
+    np.testing.assert_array_equal(ours.data, vtk_values(theirs))
+    np.testing.assert_allclose(ours.spacing, theirs.GetSpacing(), rtol=1e-9)
+    np.testing.assert_allclose(ours.origin, theirs.GetOrigin(), atol=1e-6)
+    columns = np.reshape(sitk.ReadImage(str(path)).GetDirection(), (3, 3))
+    np.testing.assert_allclose(ours.axes, columns, atol=1e-6)
+    np.testing.assert_allclose(vtk_matrix(theirs), columns.T if suffix == ".mha" else np.eye(3), atol=1e-6)
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+@pytest.mark.parametrize("suffix", [".mha", ".mhd"])
+@pytest.mark.parametrize("kind", ["uint8", "int16", "float32", "float64"])
+def test_what_vtk_writes(tmp_path: Path, kind: str, suffix: str, compressed: bool) -> None:
+    path, values = tmp_path / f"v{suffix}", values_of(kind)
+    image = vtkImageData()
+    image.SetDimensions(*anatomy.DIMS)
+    image.SetSpacing(0.5, 1.25, 3.0)
+    image.SetOrigin(-7.0, 11.5, 13.0)
+    image.GetPointData().SetScalars(numpy_to_vtk(values.ravel(), deep=True))
+    writer = vtkMetaImageWriter()
+    writer.SetFileName(str(path))
+    writer.SetCompression(compressed)
+    writer.SetInputData(image)
+    writer.Write()
+    theirs, ours = vtk_image(path), read_volume(str(path))
+    assert isinstance(ours.data, np.memmap) != compressed
+    np.testing.assert_array_equal(ours.data, values)
+    np.testing.assert_array_equal(ours.data, vtk_values(theirs))
+    np.testing.assert_allclose(ours.spacing, theirs.GetSpacing(), rtol=1e-12)
+    with_sitk = sitk.ReadImage(str(path))
+    expected = ReadOptions(space="LPS") if ours.space else ReadOptions()
+    np.testing.assert_allclose(read_volume(str(path), expected).origin, with_sitk.GetOrigin(), rtol=1e-12)
+
+
+@pytest.mark.parametrize("suffix", [".nrrd", ".mha"])
+def test_components_of_what_simpleitk_writes(tmp_path: Path, suffix: str) -> None:
+    values = np.random.default_rng(3).normal(size=(4, 5, 6, 3)).astype(np.float32)
+    path = tmp_path / f"v{suffix}"
+    sitk.WriteImage(sitk.GetImageFromArray(values, isVector=True), str(path))
+    for component in range(3):
+        ours = read_volume(str(path), ReadOptions(component=component))
+        np.testing.assert_array_equal(ours.data, values[..., component])
+        if suffix == ".mha":  # VTK 9.7 takes the second axis of such a NRRD file for x
+            theirs = vtk_to_numpy(vtk_image(path).GetPointData().GetScalars()).reshape(values.shape)
+            np.testing.assert_array_equal(ours.data, theirs[..., component])
