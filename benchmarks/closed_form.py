@@ -35,6 +35,13 @@ FIELDS = ["psnr", "psnr_foreground", "psnr_white", "psnr_alpha", "ssim", "psnr_2
 SECONDS = ["closed_form_s", "views_s", "back_projection_s"]
 
 
+def scene_rows(listing: str | Path) -> list[list[str]]:
+    """Scene, volume, options and function of each line of a list, without comments and the names of the columns."""
+    lines = [line for line in Path(listing).read_text("utf-8").splitlines() if line.strip() and line[0] != "#"]
+    rows = [[word.strip() for word in line.split("\t")[:4]] for line in lines]
+    return [row for row in rows if row[0] != "scene"]
+
+
 def read_options(text: str) -> ReadOptions:
     """The options that the list may hold: --spacing X Y Z."""
     words = shlex.split(text)
@@ -103,10 +110,7 @@ def main(paths, output, stored, only, method, max_gaussians, step):
     commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True).stdout.strip()
     machine = f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
     rows = []
-    for line in scenes.read_text().splitlines():
-        if line.startswith("#") or not line.strip():
-            continue
-        name, volume, options, function = line.split("\t")
+    for name, volume, options, function in scene_rows(scenes):
         if only and name not in only:
             continue
         for how in method:

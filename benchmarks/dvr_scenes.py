@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from closed_form import read_options
+from closed_form import read_options, scene_rows
 
 from vvgt_cli.runs.source import Source, SourceRequest, load
 
@@ -18,8 +18,7 @@ def read_scenes(
     listing: str, data: str, functions: str, names: tuple[str, ...] | None = None
 ) -> Iterator[tuple[str, Source]]:
     """Name and source of each scene of a tab-separated list (columns scene, volume, options, function)."""
-    for line in Path(listing).read_text().splitlines()[1:]:
-        name, volume, options, function = (word.strip() for word in line.split("\t")[:4])
+    for name, volume, options, function in scene_rows(listing):
         if names is None or name in names:
             request = SourceRequest(
                 str(Path(data) / volume),

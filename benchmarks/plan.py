@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+from closed_form import scene_rows
 from dvr_scenes import commit, print_table, write_rows
 
 KINDS: dict[str, tuple[str, ...]] = {
@@ -51,10 +52,10 @@ def main(paths: tuple[str, ...], output: str | None, table: str | None) -> None:
         print_table(table)
         return
     scenes, data, functions = map(Path, paths)
-    lines = [line.split("\t") for line in scenes.read_text().splitlines() if line.strip() and line[0] != "#"]
+    listed = scene_rows(scenes)
     rows: list[dict[str, Any]] = []
     for kind, options in KINDS.items():
-        for name, volume, extra, function in lines[: FEW if kind == "20,000" else None]:
+        for name, volume, extra, function in listed[: FEW if kind == "20,000" else None]:
             source = [str(data / volume), "--tf", str(functions / function), "--opacity-unit-distance", "mean-spacing"]
             row = conversion(source + shlex.split(extra), options)
             rows.append({"scene": name, "options": kind, **row, "commit": commit()})

@@ -33,7 +33,7 @@ from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.metrics import score_views
 from vvgt_cli.runs.views import Views
 from vvgt_cli.splat import render
-from vvgt_cli.splat.rules import INRIA
+from vvgt_cli.splat.rules import INRIA, Rule
 from vvgt_cli.vbm import VbmOptions, backproject, initialise
 
 K, SIZE, ADAM_STEPS, BASE_VIEWS = 100_000, 400, 100, 72
@@ -71,7 +71,7 @@ def equal_row(judged: Judged) -> dict[str, Any]:
     began = time.perf_counter()
     cameras, images, rule = training_views(judged, start, REFINE_VIEWS)
     views = time.perf_counter() - began
-    options = OptimizeOptions(steps=None, time_budget=budget - views, rule=rule)
+    options = OptimizeOptions(steps=None, time_budget=max(budget - views, 0.0), rule=rule)
     ours, record = judged.refined(start, cameras, images, options)
     return {
         "closed_form": judged.psnr(start), "adam": judged.psnr(adam), "ours": judged.psnr(ours), "adam_s": budget,
@@ -79,12 +79,13 @@ def equal_row(judged: Judged) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def training_views(judged: Judged, start: Gaussians, count: int) -> tuple[list[Camera], np.ndarray, float]:
+def training_views(judged: Judged, start: Gaussians, count: int) -> tuple[list[Camera], np.ndarray, Rule]:
     """As `convert` makes them: cameras, images, rule."""
     half = wide(start, SIZE)
     cameras = default_views("train", count, size=SIZE // 2 if half else SIZE)
-    images = render_views(judged.scene, cameras, fine_enough(judged.scene, judged.check, start, half))
-    return cameras, images, INRIA.at(0.5) if half else INRIA
+    rule = INRIA.at(0.5) if half else INRIA
+    images = render_views(judged.scene, cameras, fine_enough(judged.scene, start, cameras[0].width, rule))
+    return cameras, images, rule
 
 
 def begin(judged: Judged, method: str, steps: int) -> Gaussians:

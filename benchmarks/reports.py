@@ -1,6 +1,6 @@
 """`vvgt report` of a list of scenes, and an index of them.
 
-    python benchmarks/reports.py SCENES.tsv DATA_DIR TF_DIR -o docs/reports [--only SCENE] [-- VVGT_REPORT_OPTIONS ...]
+    PYTHONPATH=. python benchmarks/reports.py SCENES.tsv DATA_DIR TF_DIR -o docs/reports [--only SCENE] [-- OPTIONS ...]
 
 The list has a line a scene: name, volume, options of reading, function, separated by tabs. Opacity is per mean spacing.
 Scenes that have their report.json are left out, so that the same command goes on where it was. `index.md` holds a row a
@@ -15,6 +15,7 @@ import sys
 from pathlib import Path
 
 import click
+from closed_form import scene_rows
 
 COLUMNS = ("quickest", "knee", "nearest", "3DGS", "iVR-GS setting")
 
@@ -56,10 +57,7 @@ def main(paths, output, only, options):
     scenes, data, functions = map(Path, paths)
     folder = Path(output)
     folder.mkdir(parents=True, exist_ok=True)
-    for line in scenes.read_text().splitlines():
-        if line.startswith("#") or not line.strip():
-            continue
-        name, volume, reading, function = line.split("\t")
+    for name, volume, reading, function in scene_rows(scenes):
         if (only and name not in only) or (folder / name / "report.json").exists():
             continue
         call = [sys.executable, "-m", "vvgt_cli.cli.main", "report", str(data / volume), *reading.split()]

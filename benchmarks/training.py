@@ -27,7 +27,7 @@ from pathlib import Path
 import click
 import numba
 import numpy as np
-from closed_form import read_options
+from closed_form import read_options, scene_rows
 
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.descent import OptimizeOptions, optimize
@@ -104,14 +104,12 @@ Refine = Callable[[Gaussians], Gaussians]
 
 def listed(scenes: str, data: str, functions: str) -> Iterator[tuple[str, Callable[[], Scene]]]:
     """Names of the scenes, and what makes each."""
-    for line in Path(scenes).read_text().splitlines():
-        if line.strip() and not line.startswith("#"):
-            name, volume, options, function = line.split("\t")
-            request = SourceRequest(
-                volume=str(Path(data) / volume), tf=str(Path(functions) / function), read=read_options(options),
-                unit_distance="mean-spacing",
-            )  # fmt: skip
-            yield name, lambda request=request: load(request).scene()
+    for name, volume, options, function in scene_rows(scenes):
+        request = SourceRequest(
+            volume=str(Path(data) / volume), tf=str(Path(functions) / function), read=read_options(options),
+            unit_distance="mean-spacing",
+        )  # fmt: skip
+        yield name, lambda request=request: load(request).scene()
 
 
 def kept(place: Path | None, make: Callable[[], object]) -> object:

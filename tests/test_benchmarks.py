@@ -1,0 +1,225 @@
+"""Every program of benchmarks/, run on one tiny scene with tiny pictures."""
+
+from __future__ import annotations
+
+import csv
+import importlib
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from report_runs import document
+
+from vvgt_cli.cameras import default_views
+from vvgt_cli.dvr import RenderSettings
+from vvgt_cli.synth import open_volume
+from vvgt_cli.volume.nrrd_write import write_nrrd
+
+ROOT = Path(__file__).parent.parent
+FOLDER = ROOT / "benchmarks"
+SIZE, MODEL = 24, "vvgt-small"
+RUN = (
+    *("closed_form", "dvr", "dvr_pixels", "dvr_steps", "dvr_vtk", "network", "optimize", "plan", "refinement"),
+    *("reports", "splat", "training"),
+)
+SHARED = ("dvr_scenes", "floors")  # what the others import
+
+
+def test_none_is_left_out():
+    assert {*RUN, *SHARED} == {path.stem for path in FOLDER.glob("*.py")}
+    source = Path(__file__).read_text()
+    assert [name for name in RUN if f'bench("{name}"' not in source] == []
+
+
+@pytest.fixture
+def bench(monkeypatch):
+    """Import a benchmark, with pictures of `SIZE` px and what else is given in place of its constants."""
+    monkeypatch.syspath_prepend(str(FOLDER))
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+
+    def small_views(name, count=None, size=None):
+        return default_views(name, count, size=SIZE)
+
+    def load(name, **constants):
+        module = importlib.import_module(name)
+        assert Path(module.__file__).parent == FOLDER
+        if hasattr(module, "default_views"):
+            constants = {"default_views": small_views} | constants
+        if hasattr(module, "flops") and name != "network":
+            constants = {"flops": lambda dtype: 1e9} | constants
+        for constant, value in constants.items():
+            assert hasattr(module, constant), f"{name} has no {constant}"
+            monkeypatch.setattr(module, constant, value)
+        return module
+
+    return load
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory):
+    """A list with a comment, the names of its columns and one scene; the folders of its volume and its function."""
+    folder = tmp_path_factory.mktemp("scenes")
+    write_nrrd(folder / "blob.nrrd", open_volume("example:blob:10"))
+    points = [{"x": x, "rgb": [x, 0.5, 1 - x], "opacity": o} for x, o in ((0, 0), (0.2, 0), (0.4, 0.5), (1, 0.8))]
+    (folder / "shells.json").write_text(json.dumps({"range": [0, 1], "points": points}))
+    listing = folder / "scenes.tsv"
+    listing.write_text(
+        "# made by hand\nscene\tvolume\toptions\tfunction\nblob\tblob.nrrd\t--spacing 1 1 1\tshells.json\n"
+    )
+    return str(listing), str(folder), str(folder)
+
+
+def call(command, *args):
+    done = CliRunner().invoke(command, [str(arg) for arg in args], catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    return done.output
+
+
+def rows_of(path):
+    return list(csv.DictReader(Path(path).read_text().splitlines()))
+
+
+def test_the_names_of_columns_are_no_scene(bench, scenes, tmp_path):
+    rows = bench("closed_form").scene_rows(scenes[0])
+    assert rows == [["blob", "blob.nrrd", "--spacing 1 1 1", "shells.json"]]
+    (tmp_path / "list.tsv").write_text("# scene\tvolume\nblob\tblob.nrrd\t\tshells.json\n")
+    assert bench("closed_form").scene_rows(tmp_path / "list.tsv") == [["blob", "blob.nrrd", "", "shells.json"]]
+    assert [name for name, _ in bench("dvr_scenes").read_scenes(*scenes)] == ["blob"]
+
+
+def test_closed_form(bench, scenes, tmp_path):
+    module = bench("closed_form")
+    call(module.main, *scenes, "-o", tmp_path / "a.csv", "--max-gaussians", 60, "--step", 1)
+    (row,) = rows_of(tmp_path / "a.csv")
+    assert float(row["psnr"]) > 15
+    assert "Mean PSNR, vbm" in call(module.main, "--table", tmp_path / "a.csv")
+
+
+def test_dvr(bench, capsys):
+    settings = {"one": RenderSettings(samples=1)}
+    bench("dvr", SIZE=SIZE, REPEATS=1, SETTINGS=settings, bandwidth=lambda: 1e9).main(["example:blob:10"])
+    assert "ns/sample" in capsys.readouterr().out
+
+
+def test_dvr_pixels(bench, scenes, tmp_path):
+    module = bench("dvr_pixels")
+    call(module.main, *scenes, "-o", tmp_path / "a.csv")
+    (row,) = rows_of(tmp_path / "a.csv")
+    assert float(row["reference_db"]) > float(row["one_ray_db"])
+    assert "| blob |" in call(module.main, "--table", tmp_path / "a.csv").replace("scene blob", "| blob |")
+
+
+def test_dvr_steps(bench, tmp_path, monkeypatch):
+    module = bench("dvr_steps", STEPS={"pre-integrated": (1,), "plain": (1,)})
+    monkeypatch.setattr(module, "open_volume", lambda name: open_volume(f"{name}:12"))
+    call(module.main, "-o", tmp_path / "a.csv", "--repeats", 1)
+    ours, plain = rows_of(tmp_path / "a.csv")
+    assert float(ours["db"]) > float(plain["db"])  # through a thin shell
+
+
+def test_dvr_vtk(bench, scenes, tmp_path):
+    from vvgt_cli.dvr.vtk import require_opengl
+
+    require_opengl()
+    few = {"NAMES": ("blob",), "VIEWS": (0,), "REPEATS": 1, "OURS": (0.5, 1.0)}
+    module = bench("dvr_vtk", default_views=default_views, **few)
+    call(module.main, *scenes, "-o", tmp_path / "a.csv", "--sizes", 50)
+    rows = rows_of(tmp_path / "a.csv")
+    assert {row["scene"] for row in rows} == {"blob"}
+    assert min(float(row["vtk_db"]) for row in rows) > 15
+
+
+def test_network(bench, tmp_path):
+    from vvgt_cli.network.card import find_model
+
+    module = bench("network", default_views=default_views, CASES=[("lines", 64, 2, 1)])
+    model = find_model(MODEL)
+    call(module.main, "measure", model, "-o", tmp_path / "a.csv", "--repeats", 1)
+    (row,) = rows_of(tmp_path / "a.csv")
+    assert float(row["wall"]) > 0
+    assert float(row["peak_gib"]) > 0.05
+    assert row["points"].count("/") == 3
+
+
+def test_optimize(bench):
+    text = call(bench("optimize", REPEATS=1).main, "example:blob:10", "--gaussians", 40)
+    assert "40 Gaussians" in text
+    assert "forward" in text
+
+
+def test_plan(bench, scenes, tmp_path):
+    few = ("--max-gaussians", "40", "--size", str(SIZE), "--steps", "1")
+    module = bench("plan", KINDS={"default": few})
+    call(module.main, *scenes, "-o", tmp_path / "a.csv")
+    (row,) = rows_of(tmp_path / "a.csv")
+    assert (row["scene"], row["steps"]) == ("blob", "1")
+    assert float(row["predicted_s"]) > 0
+
+
+def test_refinement(bench, scenes, tmp_path):
+    steps = {"ours": (0, 2), "adam": (2,), "3dgs": (2,), "ivr-gs": (2,)}
+    module = bench("refinement", K=40, SIZE=SIZE, ADAM_STEPS=2, BASE_VIEWS=2, REFINE_VIEWS=2, STEPS=steps)
+    call(module.main, "equal", *scenes, "-o", tmp_path / "a.csv")
+    assert float(rows_of(tmp_path / "a.csv")[0]["closed_form"]) > 10
+    call(module.main, "curve", *scenes, "-o", tmp_path / "b.csv")
+    assert [row["method"] for row in rows_of(tmp_path / "b.csv")] == ["ours", "ours", "adam", "3dgs", "ivr-gs"]
+    assert "| ivr-gs |" in call(module.main, "table", tmp_path / "b.csv")
+
+
+def test_reports(bench, scenes, tmp_path, monkeypatch):
+    """What it calls is tested elsewhere: here it leaves the numbers of a report at once."""
+    called = []
+
+    def report(command, check):
+        called.append(command)
+        folder = Path(command[command.index("-o") + 1])
+        folder.mkdir()
+        runs = [run | {"cost": run["seconds"]} for run in document()["runs"]]
+        front = [run["name"] for run in runs[:9]]
+        (folder / "report.json").write_text(json.dumps(document(runs=runs, front=front, knee=front[4])))
+
+    module = bench("reports")
+    monkeypatch.setattr(module.subprocess, "run", report)
+    for _ in range(2):  # the second finds all there
+        call(module.main, *scenes, "-o", tmp_path / "out", "--", "--picture-size", 160)
+    (command,) = called
+    assert command[:4] == [sys.executable, "-m", "vvgt_cli.cli.main", "report"]
+    assert command[-2:] == ["--picture-size", "160"]
+    assert "[blob](blob/report.html)" in (tmp_path / "out" / "index.md").read_text()
+
+
+def test_splat(bench, capsys):
+    bench("splat", COUNT=40, REPEATS=1, SIZES=(SIZE,), bandwidth=lambda: 1e9).main(["example:blob:10"])
+    assert "40 Gaussians" in capsys.readouterr().out
+
+
+def test_training(bench, scenes, tmp_path, monkeypatch):
+    module = bench("training")
+    monkeypatch.setattr(module.numba, "set_num_threads", lambda count: None)
+    few = ("--gaussians", 40, "--ways", "closed form", "--ways", "network", "--model", MODEL)
+    for _ in range(2):  # from its cache the second time
+        call(module.main, "gain", *scenes, "-o", tmp_path / "a.csv", *few, "--cache", tmp_path / "cache")
+    assert [row["way"] for row in rows_of(tmp_path / "a.csv")] == ["closed form", "network"]
+    assert len(list((tmp_path / "cache").iterdir())) == 2
+    small = {
+        "SIZES": (8,),
+        "KINDS": ("shells",),
+        "TRAINED": range(1),
+        "HELD": range(100, 101),
+        "GRID": 8,
+        "SNAPSHOTS": 1,
+    }
+    call(bench("training", **small, FIRST=0.01, EVERY=0.01).main, "data", tmp_path / "data")
+    assert len(list((tmp_path / "data" / "train").glob("shells_*.nrrd"))) == 1
+    assert len(list((tmp_path / "data" / "held").glob("*_speed.nrrd"))) == 2
+
+
+def test_what_the_machine_does_at_best(bench):
+    floors = bench("floors")
+    assert floors.bandwidth() > 1e7
+    assert floors.seconds(lambda: None) < 1
+    assert set(floors.alternate({"a": lambda: None, "b": lambda: np.zeros(3)}, 3)) == {"a", "b"}
+    assert "threads" in floors.machine()
