@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import hypothesis
@@ -38,6 +38,15 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         for item in items:
             if "long" in item.keywords:
                 item.add_marker(pytest.mark.skip(reason="long: pass --long"))
+
+
+@pytest.fixture(scope="module")
+def small_seats() -> Iterator[None]:
+    """Seats of a module's conversions and reports are of the size made for and of twice that, not of a 4K screen."""
+    with pytest.MonkeyPatch.context() as patch:
+        for module in ("convert", "ladder"):
+            patch.setattr(f"vvgt_cli.pipeline.{module}.from_above", lambda size: [(size, 40.0), (2 * size, 40.0)])
+        yield
 
 
 @dataclass

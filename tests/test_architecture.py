@@ -6,6 +6,7 @@ import ast
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -37,6 +38,11 @@ def name(path: Path) -> str:
 def room(module: str) -> str:
     """Room of a dotted module name inside the package; "" for the package itself."""
     return module.split(".")[1] if "." in module else ""
+
+
+@cache
+def tree_of(path: Path) -> ast.Module:
+    return ast.parse(path.read_text("utf-8"))
 
 
 def imports(tree: ast.AST) -> Iterator[tuple[ast.stmt, str]]:
@@ -72,14 +78,14 @@ def test_a_room_imports_only_from_rooms_before_it(path):
     if own == "__init__":
         return
     assert own in ROOMS, f"{own} is not a room"
-    for node, module in imports(ast.parse(path.read_text("utf-8"))):
+    for node, module in imports(tree_of(path)):
         if module.startswith("vvgt_cli.") and room(module) != "__version__":
             assert ROOMS.index(room(module)) <= ROOMS.index(own), f"line {node.lineno}: {own} imports {module}"
 
 
 @pytest.mark.parametrize("path", FILES, ids=name)
 def test_heavy_imports_sit_where_they_are_used(path):
-    tree = ast.parse(path.read_text("utf-8"))
+    tree = tree_of(path)
     top = {id(node) for node in module_level(tree)}
     for node, module in imports(tree):
         package = module.split(".")[0]
@@ -88,18 +94,12 @@ def test_heavy_imports_sit_where_they_are_used(path):
 
 
 def test_rooms_and_commands_do_not_import_kernels_at_module_level():
-    trees = {path: ast.parse(path.read_text("utf-8")) for path in FILES}
-    dotted = {path: ".".join(path.relative_to(ROOT).with_suffix("").parts) for path in FILES}
-    kernels = {
-        dotted[path]
-        for path, tree in trees.items()
-        if any(id(node) in set(map(id, module_level(tree))) and module.split(".")[0] in KERNELS
-               for node, module in imports(tree))
-    }  # fmt: skip
-    uses = {
-        dotted[path]: {module for node, module in imports(tree) if id(node) in set(map(id, module_level(tree)))}
-        for path, tree in trees.items()
-    }
+    uses = {}
+    for path in FILES:
+        top = {id(node) for node in module_level(tree_of(path))}
+        dotted = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+        uses[dotted] = {module for node, module in imports(tree_of(path)) if id(node) in top}
+    kernels = {module for module, used in uses.items() if any(other.split(".")[0] in KERNELS for other in used)}
     heavy = set(kernels)
     while grown := {module for module, used in uses.items() if used & heavy} - heavy:
         heavy |= grown  # what imports a kernel at its top is heavy too
@@ -113,7 +113,7 @@ def test_rooms_and_commands_do_not_import_kernels_at_module_level():
 def test_files_and_functions_are_short(path):
     text = path.read_text("utf-8")
     assert text.count("\n") <= MAX_FILE
-    for node in ast.walk(ast.parse(text)):
+    for node in ast.walk(tree_of(path)):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             length = (node.end_lineno or node.lineno) - node.lineno + 1
             assert length <= MAX_FUNCTION, f"{node.name}: {length} lines"
@@ -121,7 +121,7 @@ def test_files_and_functions_are_short(path):
 
 @pytest.mark.parametrize("path", FILES, ids=name)
 def test_every_module_says_what_it_is(path):
-    assert ast.get_docstring(ast.parse(path.read_text("utf-8")))
+    assert ast.get_docstring(tree_of(path))
 
 
 def loaded(*code: str) -> set[str]:

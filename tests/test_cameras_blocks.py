@@ -40,9 +40,10 @@ def test_small_pictures_are_taken_whole():
     assert spread_blocks(1, 1) is None
 
 
-def test_what_is_picked_is_what_is_there():
-    blocks = spread_blocks(800, 640, 3)
-    rows, columns = np.indices((640, 800))
+@pytest.mark.parametrize(("width", "height"), [(800, 640), (810, 650)])
+def test_what_is_picked_is_what_is_there(width, height):
+    blocks = spread_blocks(width, height, 3)
+    rows, columns = np.indices((height, width))
     image = np.stack([rows, columns], axis=-1)
     picked = blocks.pick(image)
     assert picked.shape == (blocks.numbers.size * BLOCK, BLOCK, 2)

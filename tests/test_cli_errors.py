@@ -25,7 +25,7 @@ def folder(tmp_path, monkeypatch):
     """An empty working directory with a raw volume and two transfer functions."""
     monkeypatch.chdir(tmp_path)
     np.arange(512, dtype=np.uint16).astype(np.uint8).tofile("v.raw")
-    points = [{"x": 0, "rgb": [1, 0, 0], "opacity": 0.1}, {"x": 255, "rgb": [0, 0, 1], "opacity": 0.9}]
+    points = [{"x": 0, "rgb": [1, 0, 0], "opacity": 0.1}, {"x": 1, "rgb": [0, 0, 1], "opacity": 0.9}]
     Path("good.json").write_text(json.dumps({"range": [0, 255], "points": points}))
     clear = [{**point, "opacity": 0} for point in points]
     Path("clear.json").write_text(json.dumps({"range": [0, 255], "points": clear}))
@@ -49,7 +49,7 @@ CASES = {
     "missing tf": ((*CONVERT, "--tf", "no.json"), None, "no.json"),
     "broken tf": ((*CONVERT, "--tf", "broken.json"), 1, "broken.json"),
     "unknown map": ((*CONVERT, "--tf", "octarine"), None, "octarine"),
-    "clear tf": ((*CONVERT, "--tf", "clear.json"), 1, "255"),
+    "clear tf": ((*CONVERT, "--tf", "clear.json"), 1, "opacity is above 0 nowhere"),
     "tf range": ((*CONVERT, "--tf", "good.json", "--tf-range", "5,1"), 2, "--tf-range"),
     "tf range alone": ((*CONVERT, "--tf-range", "0,1"), 2, "--tf"),
     "unit distance": ((*CONVERT, "--opacity-unit-distance", "-1"), 2, "--opacity-unit-distance"),
@@ -118,6 +118,36 @@ def test_nothing_is_overwritten_unasked(option, folder, vvgt):
     assert "--overwrite" in result.error
     assert taken.read_bytes() == b"mine"
     assert {path.name for path in folder.glob("a.*")} == {taken.name}
+
+
+@pytest.mark.parametrize("command", ["convert", "init"])
+def test_what_is_there_is_noticed_before_anything_is_read(command, folder, vvgt, monkeypatch):
+    monkeypatch.setattr("vvgt_cli.conversion.convert.load", lambda *_: pytest.fail("read before the check"))
+    Path("a.ply").write_bytes(b"mine")
+    result = vvgt(command, "v.raw", *RAW, "-o", "a.ply")
+    assert (result.code, Path("a.ply").read_bytes()) == (2, b"mine")
+    assert "-o: a.ply exists; give --overwrite" in result.error
+
+
+@pytest.mark.usefixtures("small_seats")
+@pytest.mark.parametrize("late", ["a.ply", "a.json", "a.png"])
+def test_what_appears_during_the_work_is_not_replaced(late, folder, vvgt, monkeypatch):
+    """Outputs are checked twice: before the work, and when they are written."""
+    from vvgt_cli.pipeline import convert
+
+    def check_and_be_late(*args):
+        check(*args)
+        Path(late).write_bytes(b"theirs")
+
+    check = convert.check_outputs
+    monkeypatch.setattr(convert, "check_outputs", check_and_be_late)
+    outputs = ("-o", "a.ply", "--report", "a.json", "--preview", "a.png")
+    few = ("--max-gaussians", 50, "--size", 24, "--steps", 0, "--tf", "good.json")
+    result = vvgt("convert", "v.raw", *RAW, *few, *outputs)
+    assert result.code == 2
+    assert f"{late} exists; give --overwrite" in result.error
+    assert Path(late).read_bytes() == b"theirs"
+    assert not [path for path in folder.iterdir() if path.name.startswith(".")]  # no temporary file
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")

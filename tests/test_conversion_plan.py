@@ -11,12 +11,13 @@ from onnx_models import write_model
 from test_cli_infer import DARKER
 
 from vvgt_cli.cameras import default_views
-from vvgt_cli.conversion.case import Case
-from vvgt_cli.conversion.convert import convert, planned
+from vvgt_cli.cameras.blocks import BLOCK, spread_blocks
+from vvgt_cli.conversion.case import Case, measure
+from vvgt_cli.conversion.convert import convert, initialise_only, planned
 from vvgt_cli.conversion.plan import DEFAULT_HALF_STEPS, DEFAULT_STEPS, MOST_STEPS, Planner, check_memory
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions, Limits
 from vvgt_cli.conversion.stage import Work
-from vvgt_cli.conversion.stages import BackProjection, Network, Refinement, TrainingViews
+from vvgt_cli.conversion.stages import BackProjection, CheckViews, Network, Refinement, TrainingViews
 from vvgt_cli.conversion.stages.refinement import drawn_by_all
 from vvgt_cli.conversion.stages.views import fine_enough, views_of, wide
 from vvgt_cli.dvr import RenderSettings, Scene, render_view
@@ -27,15 +28,18 @@ from vvgt_cli.runs.record import ConversionReport, Run
 from vvgt_cli.runs.source import SourceRequest
 from vvgt_cli.runs.views import judging_views
 from vvgt_cli.splat.constants import DILATION
-from vvgt_cli.splat.rules import INRIA
+from vvgt_cli.splat.rules import INRIA, RULES
+from vvgt_cli.synth import open_volume
 from vvgt_cli.transfer.readers import minimal
 from vvgt_cli.vbm import VbmOptions, initialise
 from vvgt_cli.volume import Volume
 
+pytestmark = pytest.mark.usefixtures("small_seats")
 CASE = Case(gaussians=100_000, cells=1e6, voxels=10.2e6, size=48, view=0.05, pace=1.0, there=2e8)
 FORM = 0.85 + 1.6 + 0.25 * 10.2  # seconds of its closed form
 SOURCE = SourceRequest("example:marschner-lobb:24")
 SMALL = FitOptions(400, 48)
+POINTS = [{"x": x, "rgb": [x, 0.5, 1 - x], "opacity": 0.6 * x} for x in (0.0, 0.5, 1.0)]
 
 
 def plan(steps=None, spent=1.0, begun=False, case=CASE, size=48, wide=True, **limits):
@@ -226,6 +230,26 @@ def test_no_steps_leave_back_projection():
     assert [name for name, _ in found.left_out] == ["refinement"]
 
 
+def test_back_projection_is_kept_where_the_check_views_gain_and_dropped_where_they_lose(tmp_path, monkeypatch):
+    fit = FitOptions(200, 48, steps=0)
+    request = ConvertRequest(SOURCE, str(tmp_path / "init.ply"), fit)
+    initialise_only(request, Console(quiet=True))
+    alone = read_ply(tmp_path / "init.ply")[0]
+    stage = next(stage for stage in done(tmp_path, fit).stages if stage.name == "back-projection")
+    assert stage.kept
+    assert stage.psnr > stage.psnr_before
+    assert not np.array_equal(read_ply(tmp_path / "a.ply")[0].colors, alone.colors)
+    monkeypatch.setattr("vvgt_cli.vbm.backproject", lambda start, *_, **__: (darkened(start.gaussians), "worse"))
+    stage = next(stage for stage in done(tmp_path, fit, overwrite=True).stages if stage.name == "back-projection")
+    assert not stage.kept
+    assert stage.psnr < stage.psnr_before
+    assert np.array_equal(read_ply(tmp_path / "a.ply")[0].colors, alone.colors)
+
+
+def darkened(g):
+    return Gaussians(g.means, g.log_scales, g.quaternions, g.opacity_logits, 0.1 * g.colors)
+
+
 @pytest.mark.parametrize(("steps", "before"), [(1, True), (23, True), (24, False)])
 def test_few_steps_are_taken_after_back_projection(steps, before, tmp_path):
     assert (of(plan(steps=steps), BackProjection) is not None) is before
@@ -257,6 +281,38 @@ def test_a_network_runs_where_there_is_time_for_it():
     short = Planner(Limits(time_budget=9.0), 1000, None, 0, 400, model="some").plan(case, 1.0)
     assert of(short, Network) is None
     assert "network" in {name for name, _ in short.left_out}
+
+
+def test_the_seconds_of_a_network_are_not_spent_on_steps_too():
+    limits = Limits(time_budget=16.0)
+    alone, after = (Planner(limits, 1000, None, 0, 48, model=model).plan(CASE, 1.0) for model in (None, "some"))
+    assert of(after, Network).model == "some"
+    assert 0 < steps_of(after) < steps_of(alone)
+    assert after.seconds <= 16
+
+
+@pytest.mark.parametrize(("size", "judged"), [(300, 300**2), (1080, spread_blocks(1080, 1080).numbers.size * BLOCK**2)])
+def test_check_views_cost_what_their_blocks_do(size, judged):
+    scene = Scene.build(open_volume("example:marschner-lobb:16"), minimal.read({"points": POINTS}, "ramp"), 1.0)
+    case = measure(scene, size, 1000)
+    edge = min(size, 400)
+    seconds, memory = CheckViews().cost(case)
+    assert seconds == pytest.approx(4 * 1.8 * case.view * judged / edge**2)
+    assert memory == 32 * (4 * judged + size**2)
+    assert TrainingViews(48, edge).cost(case).memory == 32 * 48 * edge**2
+
+
+def test_views_are_fitted_to_at_their_size_and_judged_at_the_screens(tmp_path, monkeypatch):
+    asked = []
+
+    def refine(run, gaussians, train, check, options):
+        asked.append((options.rule, options.judge))
+        return gaussians
+
+    monkeypatch.setattr("vvgt_cli.conversion.stages.refinement.refine", refine)
+    done(tmp_path, FitOptions(100, 128, steps=30, rule="playcanvas"))
+    rule = RULES["playcanvas"]
+    assert asked == [(rule.at(0.5), rule)]
 
 
 def test_a_slower_machine_gets_fewer_steps_after_the_closed_form():

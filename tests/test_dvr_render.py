@@ -11,6 +11,7 @@ from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.dvr import RenderSettings, Scene, render_view, render_view_reference, render_views
 from vvgt_cli.dvr.render import ray_offsets
 from vvgt_cli.dvr.runs import NEAR
+from vvgt_cli.dvr.scene import BRICK
 from vvgt_cli.errors import UsageError
 from vvgt_cli.transfer.colormap import ColorMap
 from vvgt_cli.transfer.opacity import PiecewiseOpacity
@@ -233,6 +234,29 @@ def test_leaping_over_empty_space_changes_nothing():
         c = camera(32, 32, eye)
         leaping = render_view(scene, c, ONE_RAY)
         np.testing.assert_allclose(leaping, render_view(full, c, ONE_RAY), atol=1e-6)
+
+
+def corner_of_bricks():
+    """Four bricks around a column of NaN: 0 and 1, transparent, across the corner, and 0.5 beside them."""
+    data = np.zeros((2 * BRICK, 2 * BRICK, 2 * BRICK), np.float32)
+    data[:, :BRICK, BRICK + 1 :] = data[:, BRICK + 1 :, :BRICK] = 0.5
+    data[:, BRICK:, BRICK:] = 1.0
+    data[:, BRICK, BRICK] = np.nan
+    return Scene.build(Volume(data), Function([0, 0.2, 0.5, 0.8, 1], [0, 0, 0.9, 0, 0]), 1.0)
+
+
+@pytest.mark.parametrize("step", [0.5, 1.0, 4.0])
+def test_leaping_across_the_corner_of_a_visible_brick_keeps_the_segment_between(step):
+    """A step from 0 to 1 passes what is visible between them, though both ends lie in empty bricks."""
+    scene = corner_of_bricks()
+    assert scene.empty[0].tolist() == [[1, 0], [0, 1]]
+    full = Scene(**{**vars(scene), "empty": np.zeros_like(scene.empty)})
+    settings = RenderSettings(step=step, samples=1)
+    for eye in ((-3, -3, 0.2), (-2.4, -3, 0.3), (3, 2.5, -0.5)):
+        c = camera(64, 64, eye)
+        image, expected = render_view(scene, c, settings), render_view(full, c, settings)
+        assert expected[..., 3].max() > 0.5
+        np.testing.assert_allclose(image, expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("value", [0.0, 0.5, 7.0])

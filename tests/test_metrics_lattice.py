@@ -30,6 +30,15 @@ def test_a_lattice_is_found_in_noise_at_its_period():
     assert abs(lattice(noise, 11.0)[0]) < 6
 
 
+def test_lines_along_either_axis_count_alike():
+    noise = np.random.default_rng(0).normal(0, 0.01, (256, 256))
+    lines = 0.02 * np.sin(2 * np.pi * np.arange(256) / 11.0)
+    across, down = lattice(noise + lines, 11.0), lattice((noise + lines).T, 11.0)
+    assert across == pytest.approx(down, rel=1e-6)
+    assert across[0] > 20
+    assert across[1] == pytest.approx(0.02 / np.sqrt(2), rel=0.3)  # of two axes one has it
+
+
 def test_what_cannot_be_told_is_refused():
     for image, period in ((np.zeros((64, 32)), 8.0), (np.zeros((64, 64)), 20.0), (np.zeros((64, 64)), 2.0)):
         with pytest.raises(ValueError, match="period"):

@@ -73,6 +73,8 @@ def test_small_splats_are_left_out_where_viewers_do():
         g = Gaussians(np.zeros((1, 3)), np.full((1, 3), np.log(sigma * pixel)), [[1, 0, 0, 0]], [3.0], [[1, 1, 1]])
         assert render(g, c, "playcanvas").any() == seen
         assert render(g, c, "inria").any()
+        few = c.resized(1 / 101)  # one pixel, of the same middle
+        assert render(g, few, RULES["playcanvas"].at(1 / 101)).any() == seen
 
 
 def test_a_rule_at_a_ratio_shows_what_the_whole_size_does_at_fewer_points():

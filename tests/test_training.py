@@ -9,11 +9,14 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from network_models import TINY, as_rows, scene
 
+from vvgt_cli.cameras import Camera
+from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.metrics import psnr
@@ -21,6 +24,7 @@ from vvgt_cli.metrics import ssim as ssim_metric
 from vvgt_cli.network.prepare import pack, unpack
 from vvgt_cli.progress import Console
 from vvgt_cli.splat import project, render, render_backward_reference, render_reference
+from vvgt_cli.splat.constants import DILATION, NEAR
 from vvgt_cli.synth.shapes import make_shape
 from vvgt_cli.training import LossConfig, SceneConfig, TrainConfig
 from vvgt_cli.training import scenes as training_scenes
@@ -35,7 +39,7 @@ pytest.importorskip("yaml")
 from vvgt_cli.network.checkpoint import load_checkpoint  # noqa: E402
 from vvgt_cli.training import loop, losses, sample  # noqa: E402
 from vvgt_cli.training.config import config_text, read_config  # noqa: E402
-from vvgt_cli.training.splatter import splat  # noqa: E402
+from vvgt_cli.training.splatter import gsplat_picture, splat  # noqa: E402
 
 STEPPER = replace(
     TINY, variant="wo_vgf", rounds=2, image=replace(TINY.image, views=2),
@@ -87,6 +91,31 @@ def test_gradients_of_the_splatter_against_its_twin_and_against_differences():
     ends = [render_reference(unpack(pack(unit) + e * step), cameras[0]) for e in (1e-3, -1e-3)]
     difference = ((ends[0] - ends[1]) * slope).sum() / 2e-3
     assert difference == pytest.approx(float((rows.grad.numpy() * step).sum()), rel=1e-3)
+
+
+def like_gsplat(means, quats, scales, opacities, colors, viewmats, Ks, width, height, **options):
+    """gsplat's `rasterization` by our kernels: world-to-camera matrices, pinholes as it documents them."""
+    assert (means.shape[1], viewmats.shape, Ks.shape) == (3, (1, 4, 4), (1, 3, 3))
+    assert (options["near_plane"], options["eps2d"]) == (NEAR, DILATION)
+    view, lens = viewmats[0].numpy().astype(float), Ks[0].numpy().astype(float)
+    assert view[3].tolist() == [0, 0, 0, 1]
+    assert lens[2].tolist() == [0, 0, 1]
+    camera = Camera(view[:3, :3], view[:3, 3], lens[0, 0], lens[1, 1], lens[0, 2], lens[1, 2], width, height)
+    logits = torch.log(opacities / (1 - opacities))
+    fields = [field.numpy() for field in (means, scales.log(), quats, logits, colors)]
+    picture = torch.from_numpy(render(Gaussians(*fields), camera))
+    return picture[None, ..., :3], picture[None, ..., 3:], {}
+
+
+def test_gsplat_is_handed_the_camera(monkeypatch):
+    """A camera that is turned, off its axis, of unequal focal lengths and not square: no two numbers alike."""
+    monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(rasterization=like_gsplat))
+    gaussians, _, _ = scene(count=200, views=1)
+    camera = replace(look_at((2.0, -1.7, 0.9), width=40, height=28), fx=52.0, fy=44.0, cx=17.0, cy=16.5)
+    rows = torch.from_numpy(pack(gaussians))
+    ours = splat(rows, camera).numpy()
+    assert ours[..., 3].max() > 0.5
+    np.testing.assert_allclose(gsplat_picture(rows, camera).numpy(), ours, atol=1e-5)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")

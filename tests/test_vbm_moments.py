@@ -9,6 +9,7 @@ import pytest
 
 from tests.vbm_scenes import Above, Ramp, Tent, scene_of
 from vvgt_cli.dvr import Scene
+from vvgt_cli.dvr.scene import BRICK
 from vvgt_cli.synth import analytic
 from vvgt_cli.transfer.tables import extinction
 from vvgt_cli.vbm import moments as moments_module
@@ -98,6 +99,21 @@ def test_twin_of_integer_and_scaled_values() -> None:
     expected = twin(scene, tf, 1.0, np.zeros(3))
     got = dense(base_cells(scene, np.zeros(3, np.int64)), expected)
     np.testing.assert_allclose(got[..., 0], expected[..., 0], atol=1e-4 * expected[..., 0].max())
+
+
+@pytest.mark.parametrize("corner", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 0), (1, 1, 1)])
+def test_matter_that_ends_at_a_brick_reaches_into_the_next(corner: tuple[int, int, int]) -> None:
+    """Voxels up to a brick's last one: the half voxel behind it lies in blocks whose own bricks are empty."""
+    data = np.zeros([BRICK + 2 if along else 3 for along in corner], np.float32)
+    data[tuple(slice(0, BRICK if along else None) for along in corner)] = 1
+    scene, tf = scene_of(Volume(data), Ramp(2.0), 2.0), Ramp(2.0)
+    assert (scene.empty > 0).any()
+    expected = twin(scene, tf, 2.0, np.zeros(3))
+    got = dense(base_cells(scene, np.zeros(3, np.int64)), expected)
+    behind = tuple(slice(BRICK, None) if along else slice(None) for along in corner)
+    assert expected[behind][..., 0].max() > 0.1 ** sum(corner) * expected[..., 0].max()
+    rough = 0.25 if sum(corner) > 1 else 0  # where edges meet, the spread of a point's voxels is not that of its box
+    np.testing.assert_allclose(got[..., 0], expected[..., 0], rtol=rough, atol=1e-4 * expected[..., 0].max())
 
 
 def test_scratch_bound_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

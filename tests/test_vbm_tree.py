@@ -116,6 +116,17 @@ def test_select_covers_once_within_any_budget(tf) -> None:
     assert before > 0.9 * cells
 
 
+@pytest.mark.parametrize("seed", [0, 1])
+def test_select_covers_once_whatever_the_scores_are(tree: Tree, seed: int) -> None:
+    """Scores of children above their parents': a cell is split only where all above it are."""
+    score = np.random.default_rng(seed).random(len(tree))
+    for budget in (1, 9, 100, 777, len(tree)):
+        ids = select(tree, budget, score)
+        assert 0 < len(ids) <= budget
+        assert (cover(tree, ids) == 1).all()
+    assert len(select(tree, len(tree), score)) == (tree.children == 0).sum()
+
+
 def test_select_uses_the_budget(tree: Tree) -> None:
     for budget in (50, 500, 1500):
         assert len(select(tree, budget)) > budget - 8

@@ -38,13 +38,19 @@ def test_scouts_in_the_series_are_left_out_and_that_is_said(tmp_path: Path) -> N
     write_scouts(tmp_path, 7, ImageType=SCOUT)
     with pytest.warns(UserWarning, match=r"left out.*1/2: 3 sagittal slices of 5 x 4, localiser$"):
         check_grid(read_volume(str(tmp_path)), atol=SLOPE)
-    for name in ("a", "b"):  # one scout that is not called so
-        (tmp_path / f"{name}-7.dcm").unlink()
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_fewer_slices_than_make_a_stack_are_left_out(tmp_path: Path, count: int) -> None:
+    """Scouts that are not called so."""
+    write_series(tmp_path)
     write_scouts(tmp_path / "other", 7)
-    (tmp_path / "other" / "c-7.dcm").rename(tmp_path / "c-7.dcm")
-    for name in ("a", "b"):
-        (tmp_path / "other" / f"{name}-7.dcm").unlink()
-    with pytest.warns(UserWarning, match=r"left out.*1/2: 1 sagittal slice of 5 x 4$"):
+    for k, name in enumerate(("a-7.dcm", "b-7.dcm", "c-7.dcm")):
+        (tmp_path / "other" / name).rename(tmp_path / name)
+        if k >= count:
+            (tmp_path / name).unlink()
+    said = rf"left out.*1/2: {count} sagittal slice{'s' * (count > 1)} of 5 x 4$"
+    with pytest.warns(UserWarning, match=said):
         check_grid(read_volume(str(tmp_path)), atol=SLOPE)
 
 

@@ -132,6 +132,16 @@ def test_samples_of_a_pixel_are_channels(tmp_path: Path, planar: str, compressio
 
 
 @pytest.mark.parametrize("compression", [None, "zlib"])
+def test_samples_count_faster_than_channels(tmp_path: Path, compression: str | None) -> None:
+    values = np.random.default_rng(0).integers(0, 255, (2, Z, Y, X, 3)).astype("u1")
+    axes = {"axes": "CZYXS"}
+    tifffile.imwrite(tmp_path / "a.tif", values, photometric="rgb", metadata=axes, compression=compression)
+    for number in range(6):
+        volume = read_volume(str(tmp_path / "a.tif"), ReadOptions(component=number))
+        np.testing.assert_array_equal(volume.data, values[number // 3, ..., number % 3])
+
+
+@pytest.mark.parametrize("compression", [None, "zlib"])
 def test_numbers_are_as_stored(tmp_path: Path, compression: str | None) -> None:
     path = tmp_path / "a.tif"
     for dtype in ("u1", "u2", "i2", "f4"):  # where 0 is white too

@@ -1,0 +1,79 @@
+"""What a score is a score of: blocks or the whole, the rule, the field of view."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.vbm_scenes import Tent, scene_of
+from vvgt_cli.cameras import default_views
+from vvgt_cli.cameras.blocks import Blocks
+from vvgt_cli.dvr import RenderSettings, render_view
+from vvgt_cli.metrics import psnr, score_view, ssim
+from vvgt_cli.runs.score import score_seen, score_test_views
+from vvgt_cli.runs.seats import Seat, score_seats, seats_of, zoomed
+from vvgt_cli.splat import render
+from vvgt_cli.synth import open_volume
+from vvgt_cli.vbm import VbmOptions, initialise
+
+ONE_RAY = RenderSettings(samples=1)
+
+
+@pytest.fixture(scope="module")
+def pair():
+    scene = scene_of(open_volume("example:blob:12"), Tent())
+    return scene, initialise(scene, VbmOptions(60, 32)).gaussians
+
+
+def test_a_seat_close_up_is_the_same_place_with_a_narrower_field():
+    camera = default_views("test", size=100)[4]
+    near = zoomed(camera, 10.0)
+    assert np.array_equal(near.position, camera.position)
+    assert np.array_equal(near.rotation, camera.rotation)
+    assert np.degrees(2 * np.arctan(50 / near.fy)) == pytest.approx(10)
+    assert near.fx == near.fy
+    assert zoomed(camera, 40.0).fy == pytest.approx(camera.fy)
+
+
+def test_seats_are_what_they_say_worst_first(pair):
+    scene, gaussians = pair
+    rules, views = ("inria", "playcanvas"), (4, 9)
+    found = score_seats(scene, gaussians, [(24, 40.0), (40, 10.0)], ONE_RAY, rules=rules, views=views)
+    assert [seat.psnr for seat in found] == sorted(seat.psnr for seat in found)
+    assert len(found) == 4
+    for seat in found:
+        cameras = [zoomed(default_views("test", size=seat.size)[i], seat.field_of_view) for i in views]
+        pictures = [(render_view(scene, c, ONE_RAY), render(gaussians, c, seat.rule)) for c in cameras]
+        expected = np.mean([psnr(theirs[..., :3], np.clip(ours[..., :3], 0, 1)) for theirs, ours in pictures])
+        assert seat.psnr == pytest.approx(expected, abs=1e-6)
+    assert Seat("inria", 400, 10.0, 30.0).name() == "inria 400 px close up"
+    assert seats_of(1080) == [(400, 40), (800, 40), (1080, 40), (2160, 40), (1080, 10)]
+
+
+def test_errors_are_of_the_blocks_and_perception_is_of_the_whole():
+    rng = np.random.default_rng(0)
+    reference, ours = (rng.random((48, 64, 4)).astype(np.float32) for _ in range(2))
+    blocks = Blocks(64, 48, np.array([1, 6]))
+    seen, alone = score_seen(reference, ours, blocks), score_seen(reference, ours, blocks, whole=False)
+    mask = blocks.mask()
+    assert mask.sum() == 2 * 256
+    assert seen.psnr == alone.psnr == pytest.approx(psnr(reference[..., :3], ours[..., :3], mask))
+    assert abs(seen.psnr - psnr(reference[..., :3], ours[..., :3])) > 1e-3
+    assert seen.ssim == pytest.approx(ssim(reference[..., :3], ours[..., :3]))
+    assert seen.flip == score_view(reference, ours).flip
+    assert (alone.ssim, alone.flip) == (None, None)
+    assert score_seen(reference, ours, None) == score_view(reference, ours)
+
+
+def test_scores_are_by_the_rule_of_the_views_asked_for(pair):
+    scene, gaussians = pair
+    by = {}
+    for rule in ("inria", "playcanvas"):
+        asked = {"rule": rule, "perceptual": False, "only": (9, 0), "keep": (0,)}
+        scores, sheet = score_test_views(scene, gaussians, 32, ONE_RAY, **asked)
+        cameras = [default_views("test", size=32)[i] for i in (0, 9)]
+        expected = [psnr(render_view(scene, c, ONE_RAY)[..., :3], render(gaussians, c, rule)[..., :3]) for c in cameras]
+        assert [view.psnr for view in scores.per_view] == pytest.approx(expected)
+        assert sheet.shape == (32, 3 * 32, 3)
+        by[rule] = scores.psnr
+    assert by["inria"] != by["playcanvas"]
