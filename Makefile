@@ -1,8 +1,8 @@
-# make test | lint | long | viewers | ci
+# make test | quick | lint | long | viewers | ci
 VENV ?= .venv-test
 PYTHON ?= python3
 
-.PHONY: test lint format long fuzz viewers ci
+.PHONY: test quick lint format long fuzz viewers ci
 
 $(VENV)/bin/pytest: pyproject.toml constraints.txt
 	[ -x $(VENV)/bin/python ] || $(PYTHON) -m venv $(VENV)
@@ -11,6 +11,14 @@ $(VENV)/bin/pytest: pyproject.toml constraints.txt
 
 test: $(VENV)/bin/pytest
 	$(VENV)/bin/pytest
+
+# While working, for less than a minute once kernels are compiled: the rooms' order, pages, cameras, pictures, metrics, the
+# splatter and the ray caster's scenes, transfer functions, most formats; no conversions.
+QUICK := architecture docs_pages cameras_blocks cameras_files images_compose images_files metrics_images metrics_lattice \
+	metrics_scores gaussians_ply optimize_loss splat_render dvr_scene transfer_readers transfer_resolve volume_affines \
+	volume_headers volume_itk volume_raw volume_registry volume_tiff
+quick: $(VENV)/bin/pytest
+	$(VENV)/bin/pytest $(QUICK:%=tests/test_%.py)
 
 lint: $(VENV)/bin/pytest
 	$(VENV)/bin/ruff check .
