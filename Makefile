@@ -13,12 +13,12 @@ test: $(VENV)/bin/pytest
 	$(VENV)/bin/pytest
 
 # While working, for less than a minute once kernels are compiled: the rooms' order, pages, cameras, pictures, metrics, the
-# splatter and the ray caster's scenes, transfer functions, most formats; no conversions.
-QUICK := architecture docs_pages cameras_blocks cameras_files images_compose images_files metrics_images metrics_lattice \
+# splatter and the ray caster's scenes, transfer functions, most formats; ten examples a property, no conversions.
+QUICK := architecture docs_pages cameras_blocks cameras_files images_compose images_files metrics_images \
 	metrics_scores gaussians_ply optimize_loss splat_render dvr_scene transfer_readers transfer_resolve volume_affines \
 	volume_headers volume_itk volume_raw volume_registry volume_tiff
 quick: $(VENV)/bin/pytest
-	$(VENV)/bin/pytest $(QUICK:%=tests/test_%.py)
+	HYPOTHESIS_PROFILE=quick $(VENV)/bin/pytest $(QUICK:%=tests/test_%.py)
 
 lint: $(VENV)/bin/pytest
 	$(VENV)/bin/ruff check .
