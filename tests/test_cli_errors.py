@@ -133,14 +133,14 @@ def test_what_is_there_is_noticed_before_anything_is_read(command, folder, vvgt,
 @pytest.mark.parametrize("late", ["a.ply", "a.json", "a.png"])
 def test_what_appears_during_the_work_is_not_replaced(late, folder, vvgt, monkeypatch):
     """Outputs are checked twice: before the work, and when they are written."""
-    from vvgt_cli.pipeline import convert
+    from vvgt_cli.conversion import convert
 
-    def check_and_be_late(*args):
-        check(*args)
+    def load_and_be_late(*args):
         Path(late).write_bytes(b"theirs")
+        return load(*args)
 
-    check = convert.check_outputs
-    monkeypatch.setattr(convert, "check_outputs", check_and_be_late)
+    load = convert.load
+    monkeypatch.setattr(convert, "load", load_and_be_late)
     outputs = ("-o", "a.ply", "--report", "a.json", "--preview", "a.png")
     few = ("--max-gaussians", 50, "--size", 24, "--steps", 0, "--tf", "good.json")
     result = vvgt("convert", "v.raw", *RAW, *few, *outputs)
