@@ -78,6 +78,24 @@ def interruption(say: Callable[[str], None]) -> Iterator[Callable[[], bool]]:
         signal.signal(signal.SIGINT, before)
 
 
+@contextmanager
+def ending() -> Iterator[list[int]]:
+    """Within the block signals to end only put their number into the list: the step ends first, and is saved."""
+    heard: list[int] = []
+    if threading.current_thread() is not threading.main_thread():
+        yield heard  # handlers belong to the main thread
+        return
+    names = ("SIGTERM", "SIGINT", "SIGHUP")
+    numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
+    numbers = [number for number in numbers if signal.getsignal(number) is not signal.SIG_IGN]  # as under nohup
+    before = [signal.signal(number, lambda n, frame: heard.append(n)) for number in numbers]
+    try:
+        yield heard
+    finally:
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
+
+
 def _end(number: int, frame: object) -> None:
     sys.exit(128 + number)
 

@@ -35,6 +35,7 @@ def command(data: str, output: str, path: str | None, console: Console) -> None:
     """
     import sys
 
+    from vvgt_cli.cli.process import ending
     from vvgt_cli.errors import UsageError
 
     try:
@@ -45,6 +46,7 @@ def command(data: str, output: str, path: str | None, console: Console) -> None:
     from vvgt_cli.training.config import TrainConfig, read_config
     from vvgt_cli.training.loop import train
 
-    status = train(read_config(path) if path else TrainConfig(), data, output, console)
+    with ending() as ended:
+        status = train(read_config(path) if path else TrainConfig(), data, output, console, ended)
     if status:
         sys.exit(status)

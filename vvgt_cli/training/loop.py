@@ -5,10 +5,8 @@ from __future__ import annotations
 import math
 import signal
 import subprocess
-import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -51,8 +49,10 @@ class Progress:
     found: dict[str, float] = field(default_factory=dict)
 
 
-def train(config: TrainConfig, data: str, output: str, console: Console) -> int:
+def train(config: TrainConfig, data: str, output: str, console: Console, ended: Sequence[int] = ()) -> int:
     """Train to the end of the run in folder ``output``, from its last checkpoint if there is one.
+
+    ``ended``: numbers of signals that somebody notes while it runs: the step ends first, and is saved.
 
     Returns the exit status: 0, or 128 + the signal's number where one ended it (a checkpoint is written first).
 
@@ -61,7 +61,7 @@ def train(config: TrainConfig, data: str, output: str, console: Console) -> int:
         DataError: volumes or a checkpoint that cannot be read.
     """
     folder, lpips = Path(output), load_lpips(config.loss)  # fails before the work, not after
-    with world() as here, ending() as ended:
+    with world() as here:
         talk = console if here.first else Console(quiet=True)
         if here.first:
             _open_run(folder, config)
@@ -90,24 +90,6 @@ def _open_run(folder: Path, config: TrainConfig) -> None:
         raise UsageError(f"-o {folder}: is not empty and holds no run; give another folder")
     with atomic_write(place) as temporary:
         temporary.write_text(config_text(config), "utf-8")
-
-
-@contextmanager
-def ending() -> Iterator[list[int]]:
-    """Within the block signals to end only put their number into the list: the step ends first, and is saved."""
-    heard: list[int] = []
-    if threading.current_thread() is not threading.main_thread():
-        yield heard  # handlers belong to the main thread
-        return
-    names = ("SIGTERM", "SIGINT", "SIGHUP")
-    numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
-    numbers = [number for number in numbers if signal.getsignal(number) is not signal.SIG_IGN]  # as under nohup
-    before = [signal.signal(number, lambda n, frame: heard.append(n)) for number in numbers]
-    try:
-        yield heard
-    finally:
-        for number, handler in zip(numbers, before, strict=True):
-            signal.signal(number, handler)
 
 
 def rate(step: int, config: TrainConfig) -> float:
@@ -144,7 +126,7 @@ class _Run:
         self.recorder = Recorder(folder, self.progress.step, config.steps, console) if here.first else None
         self.console = console
 
-    def to_the_end(self, ended: list[int]) -> int:
+    def to_the_end(self, ended: Sequence[int]) -> int:
         """All steps that are left; the exit status."""
         config, state = self.config, self.progress
         stop = 0
@@ -162,7 +144,7 @@ class _Run:
             self.console.say(f"ended by signal {stop} after step {state.step}; the same command goes on from there")
         return 128 + stop if stop else 0
 
-    def _step(self, ended: list[int]) -> int:
+    def _step(self, ended: Sequence[int]) -> int:
         """One step; a signal that some process has heard, else 0: all end after the same step."""
         config, state, here = self.config, self.progress, self.here
         self.optimizer.zero_grad(set_to_none=True)
