@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from vvgt_cli.jit import ahead
+from vvgt_cli.jit.cache import folders
 
 ROOT = Path(__file__).parent.parent
 SOURCE = "example:marschner-lobb:24"
@@ -58,7 +59,7 @@ def commands_leave(place: Path, cache: Path, **target: str) -> dict[str, bytes]:
     "target",
     [
         {},
-        {"NUMBA_CPU_NAME": "generic"},
+        pytest.param({"NUMBA_CPU_NAME": "generic"}, marks=pytest.mark.long),
         pytest.param({"NUMBA_CPU_NAME": "haswell", "NUMBA_CPU_FEATURES": "+avx2,+fma"}, marks=pytest.mark.long),
         pytest.param({"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}, marks=pytest.mark.long),
         pytest.param({"NUMBA_CPU_FEATURES": "+sse4.2"}, marks=pytest.mark.long),
@@ -66,22 +67,34 @@ def commands_leave(place: Path, cache: Path, **target: str) -> dict[str, bytes]:
     ids=lambda target: "-".join(target.values()) or "host",
 )
 def test_cold_and_warm_runs_leave_the_same_bytes(tmp_path, target):
+    """Cold: command by command. Warm: where all was compiled beforehand, in another order, the package's folder."""
+    if target:
+        command("warmup", cwd=tmp_path, folder=tmp_path / "ahead", **target)
     cold = commands_leave(tmp_path / "cold", tmp_path / "cache", **target)
-    warm = commands_leave(tmp_path / "warm", tmp_path / "cache", **target)
+    warm = commands_leave(tmp_path / "warm", tmp_path / "ahead" if target else None, **target)
     assert len(cold) > 15
     assert cold == warm
 
 
-def test_warmup_says_where_and_another_order_compiles_the_same(tmp_path):
+def test_warmup_says_where_and_compiles_what_is_missing(tmp_path, monkeypatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    (cache,) = folders()
+    shutil.copytree(command("warmup", cwd=tmp_path, folder=None).stdout.strip(), cache)  # the package's
+    some = ("vvgt_cli.vbm.inset.", "vvgt_cli.splat.kernel.project-")
+    gone = {name for name in kernels(cache) if name.startswith(some)}
+    for name in gone:
+        (cache / name).unlink()
+    kept = len(kernels(cache))
+    assert kept > 20
     first = command("warmup", cwd=tmp_path, folder=tmp_path / "cache")
-    folder = Path(first.stdout.strip())
-    assert len(kernels(folder)) > 20
-    assert "kernels were missing" in first.stderr
+    assert first.stdout.strip() == str(cache)
+    found = gone & set(kernels(cache))
+    assert len({name.split("-")[0] for name in found}) == len(some)
+    assert len(kernels(cache)) == kept + len(found)
+    assert f"{len(found)} kernels were missing" in first.stderr
     assert "nothing was missing" in command("warmup", cwd=tmp_path, folder=tmp_path / "cache").stderr
-    for name, cache in (("a", tmp_path / "cache"), ("b", None)):
-        done = command("convert", SOURCE, *SMALL, "-o", f"{name}.ply", cwd=tmp_path, folder=cache)
-        assert cache is None or "compile" not in done.stderr
-    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+    done = command("convert", SOURCE, *SMALL, "-o", "a.ply", cwd=tmp_path, folder=tmp_path / "cache")
+    assert "compile" not in done.stderr
 
 
 def test_warmup_without_a_place_is_an_error(tmp_path):
@@ -200,27 +213,35 @@ def test_what_a_kernel_reaches():
     assert {"vvgt_cli.vbm.moments", "vvgt_cli.dvr.kernel"} <= reached(_brick_moments.py_func)[0]
 
 
+@pytest.fixture(scope="module")
+def stepped(tmp_path_factory):
+    """What `STEP` prints, and the folder that it leaves; to be copied."""
+    folder = tmp_path_factory.mktemp("stepped")
+    return python("-c", STEP, folder=folder).stdout, folder
+
+
 @pytest.mark.parametrize(
     "damage", [lambda text: text[:-100], lambda text: b"", lambda text: text[:60] + b"x" + text[61:]]
 )
-def test_damaged_files_are_compiled_anew(tmp_path, damage):
-    whole = python("-c", STEP, folder=tmp_path).stdout
-    (file,) = tmp_path.rglob("*.kernel")
+def test_damaged_files_are_compiled_anew(tmp_path, stepped, damage):
+    whole, folder = stepped
+    shutil.copytree(folder, tmp_path / "cache")
+    (file,) = (tmp_path / "cache").rglob("*.kernel")
     good = file.read_bytes()
     file.write_bytes(damage(good))
-    done = python("-c", STEP, folder=tmp_path)
+    done = python("-c", STEP, folder=tmp_path / "cache")
     assert done.stdout == whole
     assert done.stderr.count("RuntimeWarning") == done.stderr.count("anew\n") == 1
     assert len(file.read_bytes()) == len(good)
-    assert python("-c", STEP, folder=tmp_path).stderr == ""
+    assert python("-c", STEP, folder=tmp_path / "cache").stderr == ""
 
 
 @pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root gives files away")
-def test_files_of_other_users_are_not_read(tmp_path):
-    python("-c", STEP, folder=tmp_path)
-    (file,) = tmp_path.rglob("*.kernel")
+def test_files_of_other_users_are_not_read(tmp_path, stepped):
+    shutil.copytree(stepped[1], tmp_path / "cache")
+    (file,) = (tmp_path / "cache").rglob("*.kernel")
     os.chown(file, 12345, -1)
-    assert "another user" in python("-c", STEP, folder=tmp_path).stderr
+    assert "another user" in python("-c", STEP, folder=tmp_path / "cache").stderr
     assert file.stat().st_uid == 0  # in its place is one of our own
 
 
@@ -243,10 +264,10 @@ def test_nowhere_to_write_is_one_line_and_the_same_numbers(tmp_path, ply):
     assert not list((tmp_path / "tmp").iterdir())  # removed at the end
 
 
-def test_without_another_process_it_still_works(tmp_path):
+def test_without_another_process_it_still_works(tmp_path, stepped):
     code = f"import sys; sys.executable = ''; {STEP}"
     done = python("-c", code, folder=tmp_path)
-    assert done.stdout == python("-c", STEP, folder=tmp_path).stdout
+    assert done.stdout == stepped[0]
     assert done.stderr.count("RuntimeWarning: kernels compiled in this process") == 1
 
 
@@ -260,16 +281,21 @@ def test_without_a_home(tmp_path):
     assert len(kernels(tmp_path / "user")) == 1
 
 
-def test_two_first_runs_at_once(tmp_path, ply):
-    args = ["-m", "vvgt_cli.cli.main", "render", str(ply), "--orbit", "1", "--size", "40", "-qo"]
-    runs = [
-        subprocess.Popen([sys.executable, *args, f"{i}"], cwd=tmp_path, env=environment(tmp_path / "cache"))
-        for i in range(2)
-    ]
-    assert [run.wait() for run in runs] == [0, 0]
-    assert (tmp_path / "0" / "orbit_000.png").read_bytes() == (tmp_path / "1" / "orbit_000.png").read_bytes()
-    assert len(kernels(tmp_path / "cache")) == len(ahead.DRAW)
-    assert not list((tmp_path / "cache").rglob("*.part"))
+def test_two_first_runs_at_once(tmp_path):
+    """For a processor without extensions, whatever this one has: code of another kind, and a folder of its own."""
+    cache = tmp_path / "cache"
+    for line in (f"init {SOURCE} --max-gaussians 200 --size 40 -o", "render 0.ply --orbit 1 --size 40 -o"):
+        suffix = ".ply" if line.startswith("init") else ""
+        args = [sys.executable, "-m", "vvgt_cli.cli.main", *line.split()]
+        variables = environment(cache, NUMBA_CPU_NAME="generic")
+        runs = [subprocess.Popen([*args, f"{i}{suffix}", "-q"], cwd=tmp_path, env=variables) for i in range(2)]
+        assert [run.wait() for run in runs] == [0, 0]
+        command(*line.split(), f"2{suffix}", "-q", cwd=tmp_path, folder=cache, NUMBA_CPU_NAME="generic")
+    for name in ("{}.ply", "{}/orbit_000.png"):
+        first, second, warm = ((tmp_path / name.format(i)).read_bytes() for i in range(3))
+        assert first == second == warm
+    assert len(kernels(cache)) == len({*ahead.INIT, *ahead.DRAW})
+    assert not list(cache.rglob("*.part"))
 
 
 def test_helpers_are_not_called_from_python():
