@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vvgt_cli.cameras import Camera, default_views
-from vvgt_cli.cameras.blocks import spread_blocks
+from vvgt_cli.cameras.blocks import Blocks, spread_blocks
 from vvgt_cli.cameras.sets import FIELD_OF_VIEW
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.progress import ProgressCallback
@@ -62,43 +62,70 @@ def zoomed(camera: Camera, field_of_view: float) -> Camera:
     return replace(camera, fx=focal, fy=focal)
 
 
-def score_seats(
+@dataclass(frozen=True)
+class SeatView:
+    """What is to be seen from a seat in one view.
+
+    Attributes:
+        size, field_of_view: of the seat, pixels and degrees.
+        camera: of the view; ``blocks`` of it that are scored, None for all.
+        reference: (h, w, 3) float32 of the blocks, or of the whole.
+    """
+
+    size: int
+    field_of_view: float
+    camera: Camera
+    blocks: Blocks | None
+    reference: np.ndarray
+
+
+def seat_views(
     scene: Scene,
-    gaussians: Gaussians,
     places: Iterable[tuple[int, float]],
     settings: RenderSettings | None = None,
     *,
-    rules: Collection[str] = tuple(RULES),
     views: Collection[int] = VIEWS,
     progress: ProgressCallback | None = None,
-) -> list[Seat]:
-    """Every rule at every place, on blocks of the test views; worst first.
+) -> Iterator[SeatView]:
+    """References of every place, one at a time.
 
     Args:
-        scene, gaussians: what is compared.
+        scene: what is looked at.
         places: (size in pixels, field of view in degrees).
         settings: of the reference; the renderer's default without.
-        rules: names.
         views: numbers of the test views.
         progress: called after each view of a place.
     """
     from vvgt_cli.dvr import render_view
-    from vvgt_cli.metrics import psnr
-    from vvgt_cli.splat import render
 
-    places, found, done = list(places), [], 0
+    places, done = list(places), 0
     for size, field_of_view in places:
         cameras = default_views("test", size=size)
-        errors: dict[str, list[float]] = {rule: [] for rule in rules}
         for i in views:
             camera, blocks = zoomed(cameras[i], field_of_view), spread_blocks(size, size, i)
-            reference = render_view(scene, camera, settings, blocks)[..., :3]
-            for rule in rules:
-                ours = np.clip(render(gaussians, camera, rule, blocks=blocks)[..., :3], 0, 1)
-                pair = (reference, ours) if blocks is None else (blocks.pick(reference), blocks.pick(ours))
-                errors[rule].append(psnr(*pair))
+            image = render_view(scene, camera, settings, blocks)[..., :3]
+            yield SeatView(size, field_of_view, camera, blocks, image if blocks is None else blocks.pick(image))
             done += 1
             if progress:
                 progress(done, len(places) * len(views))
-        found += [Seat(rule, size, field_of_view, float(np.mean(dbs))) for rule, dbs in errors.items()]
+
+
+def score_seats(gaussians: Gaussians, seen: Iterable[SeatView], rules: Collection[str] = tuple(RULES)) -> list[Seat]:
+    """Every rule at every place, on blocks of the test views; worst first.
+
+    Args:
+        gaussians: that are drawn.
+        seen: of `seat_views`.
+        rules: names.
+    """
+    from vvgt_cli.metrics import psnr
+    from vvgt_cli.splat import render
+
+    errors: dict[tuple[str, int, float], list[float]] = {}
+    for view in seen:
+        for rule in rules:
+            ours = np.clip(render(gaussians, view.camera, rule, blocks=view.blocks)[..., :3], 0, 1)
+            shown = ours if view.blocks is None else view.blocks.pick(ours)
+            errors.setdefault((rule, view.size, view.field_of_view), []).append(psnr(view.reference, shown))
+    found = [Seat(*seat, float(np.mean(dbs))) for seat, dbs in errors.items()]
     return sorted(found, key=lambda seat: seat.psnr)

@@ -18,7 +18,7 @@ from vvgt_cli.runs.outputs import Output, check_outputs
 from vvgt_cli.runs.place import into_box, preview, upright
 from vvgt_cli.runs.record import ConversionReport, Run, Stage, document
 from vvgt_cli.runs.score import psnr_note, score_test_views
-from vvgt_cli.runs.seats import CLOSE, Seat, score_seats, seats_of, zoomed
+from vvgt_cli.runs.seats import CLOSE, Seat, score_seats, seat_views, seats_of, zoomed
 from vvgt_cli.runs.source import Source, SourceRequest, describe_source, load, tf_record, volume_record
 
 if TYPE_CHECKING:
@@ -153,7 +153,7 @@ def evaluate(request: EvaluateRequest, console: Console | None = None) -> Evalua
             write_png(request.preview, sheet, request.overwrite)
     if request.seats:
         with run.stage("seats") as stage:
-            seats = score_seats(scene, gaussians, seats_of(size), progress=run.console.bar("seats"))
+            seats = score_seats(gaussians, seat_views(scene, seats_of(size), progress=run.console.bar("seats")))
             evaluation.seats = [asdict(seat) for seat in seats]
             stage.note = f"worst: {seats[0].name()}, {seats[0].psnr:.2f} dB"
     evaluation.stages = run.report.stages

@@ -28,7 +28,7 @@ from vvgt_cli.progress import Console
 from vvgt_cli.report.runs import short
 from vvgt_cli.runs.record import ConversionReport, Run
 from vvgt_cli.runs.score import WHOLE, score_seen
-from vvgt_cli.runs.seats import SIDE, from_above, score_seats
+from vvgt_cli.runs.seats import SIDE, SeatView, from_above, score_seats, seat_views
 from vvgt_cli.runs.source import SourceRequest, load
 from vvgt_cli.runs.views import Views, judging_views
 from vvgt_cli.splat.rules import INRIA
@@ -113,6 +113,7 @@ class Reference:
         step: voxels; ``rays`` a pixel, at most.
         axes: (3, 3) `Volume.axes`: from the box frame, in which the views are, to the unit frame.
         shown: images as `upright` makes them.
+        seats: what is seen from the size made for, and from the next larger.
     """
 
     cameras: list[Camera]
@@ -122,6 +123,7 @@ class Reference:
     rays: int
     axes: np.ndarray
     shown: list[np.ndarray]
+    seats: list[SeatView]
 
     @classmethod
     def render(cls, scene: Scene, size: int, console: Console) -> Reference:
@@ -136,7 +138,9 @@ class Reference:
             if bar:
                 bar(i + 1, len(cameras))
         shown = upright(images, cameras, axes, lambda camera: render_view(scene, camera, REFERENCE))
-        return cls(cameras, blocks, images, REFERENCE.step, max(rays for _, rays in REFERENCE.tiers), axes, shown)
+        seats = list(seat_views(scene, from_above(size), REFERENCE, views=SIDE))
+        rays = max(rays for _, rays in REFERENCE.tiers)
+        return cls(cameras, blocks, images, REFERENCE.step, rays, axes, shown, seats)
 
     def score(self, gaussians: Gaussians) -> tuple[Scores, list[np.ndarray]]:
         """Scores as `vvgt evaluate` has them, and our images."""
@@ -178,16 +182,14 @@ def climb(
         DataError, UsageError: as `vvgt_cli.conversion.convert.convert`.
         KeyboardInterrupt: a refinement was interrupted; what came after it would not be comparable.
     """
-    from vvgt_cli.dvr import REFERENCE
     from vvgt_cli.splat import render
 
-    scene = load(source).scene()
     for rung in rungs(options):
         report, gaussians = _run(source, rung, reference.axes)
         if report.refinement and report.refinement["reason"] == "interrupted":
             raise KeyboardInterrupt
         scores, images = reference.score(gaussians)
-        seats = score_seats(scene, gaussians, from_above(options.size), REFERENCE, views=SIDE)
+        seats = score_seats(gaussians, reference.seats)
         report.scores, report.seats = asdict(scores), [asdict(seat) for seat in seats]
         views = views_of(rung.fit.steps or 0)
         run = {"name": rung.name, "label": rung.label, "kind": rung.kind, "views": views, **asdict(report)}

@@ -8,7 +8,7 @@ from typing import ClassVar
 from vvgt_cli.conversion.case import Case
 from vvgt_cli.conversion.stage import Cost, Stage, Work
 from vvgt_cli.runs.score import psnr_note, score_test_views
-from vvgt_cli.runs.seats import PREVIEW_VIEWS, SIDE, from_above, score_seats
+from vvgt_cli.runs.seats import PREVIEW_VIEWS, SIDE, from_above, score_seats, seat_views
 
 SCORE, SCORE_ALL = (3, 0.03), (10, 0.2)  # views, and seconds a view beside its rendering
 SEATS = 2, 0.3  # check views, and seconds beside them
@@ -70,6 +70,6 @@ class Seats(Stage):
             run.leave_out(self.name, "time is up")
             return
         with run.stage(self.name) as stage:
-            seats = score_seats(work.scene, work.made(), from_above(work.fit.size), views=SIDE)
+            seats = score_seats(work.made(), seat_views(work.scene, from_above(work.fit.size), views=SIDE))
             run.report.seats = [asdict(seat) for seat in seats]
             stage.note = f"worst of {len(seats)}: {seats[0].name()}, {seats[0].psnr:.2f} dB"
