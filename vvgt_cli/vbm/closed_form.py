@@ -70,7 +70,7 @@ class ClosedForm:
         return cell_gaussians(leaves, self.voxel, self.pixel, self.opaque, style)
 
     def refined(self, cameras: Sequence[Camera], views: np.ndarray, style: SurfaceStyle, rule: Rule) -> Gaussians:
-        """Gaussians for the budget: half by the moments, then the cells with the largest image error are split."""
+        """Gaussians for the budget: three tenths by the moments, then cells with the largest error are split."""
         start = max(int(self.budget * REFINE_FROM), 1)
         leaves = leaves_of(self.tree, select(self.tree, start))
         smallest = max(2 * MIN_CELL * self.pixel, 2.0 ** (FINEST + 1) * self.voxel)  # edge of a cell to split
