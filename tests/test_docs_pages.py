@@ -9,10 +9,11 @@ from pathlib import Path
 import click
 import pytest
 
+from tests.test_architecture import ROOMS
 from vvgt_cli.cli.main import COMMANDS, cli
 
 ROOT = Path(__file__).parent.parent
-PAGES = sorted([ROOT / "README.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").rglob("*.md"), *ROOT.glob("examples/*.md")])
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *ROOT.glob("examples/*.md")])
 
 
 def commands():
@@ -49,6 +50,34 @@ def test_links_lead_somewhere(path):
     for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", path.read_text("utf-8")):
         if "://" not in target:
             assert (path.parent / target).exists(), target
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_links_to_sections_find_them(path):
+    for target, section in re.findall(r"\]\(([^)#\s]*)#([^)\s]+)\)", path.read_text("utf-8")):
+        if "://" not in target:
+            text = (path.parent / target if target else path).read_text("utf-8")
+            heads = [
+                re.sub(r"[^\w\- ]", "", head.lower()).replace(" ", "-") for head in re.findall(r"^#+ (.*)$", text, re.M)
+            ]
+            assert section in heads, f"{target}#{section}"
+
+
+def test_the_index_has_every_room_in_its_order_and_every_page():
+    text = (ROOT / "docs" / "index.md").read_text("utf-8")
+    table = text.partition("## Rooms of the package")[2].partition("\n## ")[0]
+    rows = re.findall(r"^\| (`.*?`) \| ", table, re.M)
+    assert tuple(re.findall(r"`(\w+)`", " ".join(rows))) == ROOMS
+    for page in (ROOT / "docs").glob("*.md"):
+        assert page.name == "index.md" or f"({page.name})" in text, page.name
+
+
+def test_files_that_contributors_are_sent_to_are_there():
+    text = (ROOT / "CONTRIBUTING.md").read_text("utf-8")
+    named = re.findall(r"`((?:vvgt_cli|docs|tests|benchmarks)/[\w/.-]+|test_[\w*]+\.py)`", text)
+    assert len(named) > 30
+    for name in named:
+        assert list(ROOT.glob(name if "/" in name else f"tests/{name}")), name
 
 
 def test_readme_has_the_two_commands_each_on_a_line_with_its_own_set_up():

@@ -1,0 +1,117 @@
+"""What the pages show runs: Python of docs/python.md, commands of the tutorial and of the how-to, the notebook."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import nibabel
+import numpy as np
+import pytest
+import tifffile
+
+from tests import anatomy
+from tests.docs_commands import blocks, small
+from tests.test_transfer_formats import mrml
+
+ROOT = Path(__file__).parent.parent
+
+
+def test_the_python_page_runs_from_top_to_bottom(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    names: dict = {"__name__": "page"}
+    code = blocks(ROOT / "docs" / "python.md", "python")
+    assert len(code) > 15
+    for number, (_, block) in enumerate(code):
+        exec(compile(block, f"docs/python.md, block {number}", "exec"), names)
+    out = capsys.readouterr().out
+    assert "expected three axes" in out
+    assert "no such file" in out
+    assert (tmp_path / "better.ply").stat().st_size > 68
+
+
+def test_the_notebook_runs_and_is_kept_without_outputs(tmp_path):
+    import nbformat
+    from nbclient import NotebookClient
+
+    notebook = nbformat.read(ROOT / "examples" / "library.ipynb", as_version=4)
+    nbformat.validate(notebook)
+    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert all(not cell.outputs and cell.execution_count is None for cell in code)
+    NotebookClient(notebook, timeout=None, startup_timeout=600, kernel_name="python3").execute(
+        cwd=str(tmp_path), env=os.environ | {"PYTHONPATH": str(ROOT), "PYVISTA_OFF_SCREEN": "true"}
+    )
+    pictures = [output for cell in code for output in cell.outputs if "image/png" in output.get("data", {})]
+    assert len(pictures) == 3
+    assert any("dB" in output.get("text", "") for cell in code for output in cell.outputs)
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The working folder of a reader of the how-to: small files of the names that it has, and `vvgt` on the path."""
+    affine = anatomy.place(anatomy.AXIAL)
+    data = anatomy.balls(affine)  # (15, 18, 22) int16, 0 to 900
+    nibabel.save(nibabel.Nifti1Image(data.T, affine), tmp_path / "head.nii.gz")
+    anatomy.dicom(tmp_path / "scan", data, affine)
+    for name, head, values in (
+        ("dump", b"", data),
+        ("dump_22x18x15_int16", b"", data),
+        ("old", bytes(512), data.astype(">i2")),
+    ):
+        (tmp_path / f"{name}.raw").write_bytes(head + values.tobytes())
+    (tmp_path / "dump.raw.gz").write_bytes(gzip.compress(data.tobytes()))
+    for frame in range(3):
+        anatomy.vti(tmp_path / f"run_{frame}.vti", (data // (frame + 1)).astype("<i2"), affine)
+    cells = np.stack([[data, data[::-1]], [data, data // 2]]).astype("<u2")  # T C Z Y X
+    sizes = {"PhysicalSizeX": 0.2, "PhysicalSizeY": 0.2, "PhysicalSizeZ": 0.5, "Channel": {"Name": ["DAPI", "GFP"]}}
+    tifffile.imwrite(tmp_path / "cells.ome.tif", cells, ome=True, metadata={"axes": "TCZYX", **sizes})
+    (tmp_path / "bone.json").write_text(anatomy.TF)
+    preset = {"RGBPoints": [0, 0.9, 0.8, 0.7, 900, 1, 1, 1], "Points": [0, 0, 0.5, 0, 900, 0.5, 0.5, 0]}
+    (tmp_path / "presets.json").write_text(json.dumps([preset | {"Name": name} for name in ("bone", "skin")]))
+    (tmp_path / "presets.xml").write_text(mrml())
+    (tmp_path / "bin").mkdir()
+    shim = tmp_path / "bin" / "vvgt"
+    shim.write_text(f'#!/bin/sh\nPYTHONPATH={ROOT} exec {sys.executable} -m tests.docs_commands "$@"\n')
+    shim.chmod(0o755)
+    for name, value in {"PATH": f"{shim.parent}:{os.environ['PATH']}", "SLURM_ARRAY_TASK_ID": "1"}.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def run_blocks(page: str, vvgt) -> list[str]:
+    """Run a page's commands in order: plain ones in this process, those marked as bash by bash; returns them."""
+    done = []
+    for language, block in blocks(ROOT / "docs" / page, "", "bash"):
+        if language:
+            run = subprocess.run(["bash", "-euo", "pipefail", "-c", block], capture_output=True, text=True)
+            assert run.returncode == 0, f"{block}\n{run.stderr}"
+            done.append(block)
+            continue
+        for line in block.splitlines():
+            words = shlex.split(line)
+            assert words[0] == "vvgt", f"{page}: {line}: expected a vvgt command"
+            result = vvgt(*small(words[1:]))
+            assert result.code == 0, f"{line}\n{result.err}"
+            done.append(line)
+    return done
+
+
+def test_every_command_of_the_how_to_runs(folder, vvgt):
+    done = run_blocks("how-to.md", vvgt)
+    assert len(done) > 30
+    plys = {path.name for path in folder.glob("*.ply")}
+    named = set(re.findall(r"-o (\w+\.ply)", "\n".join(line for line in done if "--dry-run" not in line)))
+    assert named <= plys
+    assert {"run_02.ply", "cells_01.ply", "part_00.ply", "piped.ply"} <= plys
+    assert (folder / "piped.ply").read_bytes() == (folder / "dump.ply").read_bytes()
+
+
+def test_every_command_of_the_tutorial_runs(folder, vvgt):
+    assert len(run_blocks("tutorial.md", vvgt)) > 6
