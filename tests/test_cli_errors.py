@@ -158,7 +158,7 @@ def test_a_directory_that_is_not_writable(folder, vvgt):
 
 
 def test_a_size_that_does_not_fit_in_memory(folder, vvgt, monkeypatch):
-    monkeypatch.setattr("vvgt_cli.conversion.plan.free_memory", lambda: 2**28)
+    monkeypatch.setattr("vvgt_cli.conversion.plan.free_memory", lambda: 2**27)
     result = vvgt("convert", "v.raw", *RAW, "-o", "a.ply", "--size", 2000)
     assert (result.code, "--size 2000" in result.error) == (2, True)
 
