@@ -106,10 +106,10 @@ def run_blocks(page: str, vvgt) -> list[str]:
 def test_every_command_of_the_how_to_runs(folder, vvgt):
     done = run_blocks("how-to.md", vvgt)
     assert len(done) > 30
-    plys = {path.name for path in folder.glob("*.ply")}
+    plys = {path.relative_to(folder).as_posix() for path in folder.rglob("*.ply")}
     named = set(re.findall(r"-o (\w+\.ply)", "\n".join(line for line in done if "--dry-run" not in line)))
     assert named <= plys
-    assert {"run_02.ply", "cells_01.ply", "part_00.ply", "piped.ply"} <= plys
+    assert {"run/02.ply", "cells/01.ply", "part/00.ply", "piped.ply"} <= plys
     assert (folder / "piped.ply").read_bytes() == (folder / "dump.ply").read_bytes()
 
 
