@@ -10,7 +10,7 @@ $(VENV)/bin/pytest: pyproject.toml constraints.txt
 	touch $@
 
 test: $(VENV)/bin/pytest
-	$(VENV)/bin/pytest
+	$(VENV)/bin/pytest -n 2 --dist loadfile
 
 # While working, for less than a minute once kernels are compiled: the rooms' order, pages, cameras, pictures, metrics, the
 # splatter and the ray caster's scenes, transfer functions, most formats; ten examples a property, no conversions.
@@ -18,7 +18,7 @@ QUICK := architecture docs_pages cameras_blocks cameras_files images_compose ima
 	metrics_scores gaussians_ply optimize_loss splat_render dvr_scene transfer_readers transfer_resolve volume_affines \
 	volume_headers volume_itk volume_raw volume_registry volume_tiff
 quick: $(VENV)/bin/pytest
-	HYPOTHESIS_PROFILE=quick $(VENV)/bin/pytest $(QUICK:%=tests/test_%.py)
+	HYPOTHESIS_PROFILE=quick $(VENV)/bin/pytest -n 2 --dist loadfile $(QUICK:%=tests/test_%.py)
 
 lint: $(VENV)/bin/pytest
 	$(VENV)/bin/ruff check .

@@ -27,11 +27,23 @@ def pytest_configure(config: pytest.Config) -> None:
 
 def pytest_collection_finish(session: pytest.Session) -> None:
     """Compile kernels on all cores, before the tests ask for them one by one."""
-    if len(session.items) > 20 and not session.config.getoption("collectonly"):
-        from vvgt_cli.jit.ahead import ALL
-        from vvgt_cli.jit.compile import compile_ahead
+    parallel = hasattr(session.config, "workerinput")  # of pytest-xdist, whose first process has compiled them
+    if len(session.items) > 20 and not session.config.getoption("collectonly") and not parallel:
+        compile_kernels()
 
-        compile_ahead(ALL)
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_setupnodes() -> None:
+    """The same before tests run in several processes (-n)."""
+    compile_kernels()
+
+
+def compile_kernels() -> None:
+    """All of them, where they are not there yet."""
+    from vvgt_cli.jit.ahead import ALL
+    from vvgt_cli.jit.compile import compile_ahead
+
+    compile_ahead(ALL)
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

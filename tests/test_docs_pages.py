@@ -86,7 +86,7 @@ def test_readme_has_the_two_commands_each_on_a_line_with_its_own_set_up():
     ]
     assert len(lines) == 2
     assert re.search(r"bin/vvgt convert example:\S+ .*-o \S+\.ply", lines[0])
-    assert re.search(r"bin/pytest$", lines[1])
+    assert re.search(r"bin/pytest -n 2 --dist loadfile$", lines[1])
     for line in lines:
         assert "-c constraints.txt" in line
 
