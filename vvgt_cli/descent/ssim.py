@@ -57,7 +57,10 @@ def products(x, y, out):
 
 @kernel(parallel=True, fastmath=True, error_model="numpy")
 def slopes(blurred, out, score):
-    """SSIM's derivatives by blur(x), blur(x^2), blur(x y) into ``out`` (3, h, w), its sums a row into ``score``."""
+    """SSIM's derivatives by blur(x), blur(x^2), blur(x y) into ``out`` (3, h, w), its sums a row into ``score`` (h,).
+
+    ``blurred`` (5, h, w): the blurs of `products`.
+    """
     c1, c2 = f32(C1), f32(C2)
     for row in nb.prange(blurred.shape[1]):
         total = f32(0)
@@ -78,7 +81,10 @@ def slopes(blurred, out, score):
 
 @kernel(parallel=True, fastmath=True, error_model="numpy")
 def add_gradient(blurred, x, y, scale, channel, grad):
-    """``grad`` (h, w, 4), one channel, += ``scale`` x gradient of the sum of SSIM."""
+    """``grad`` (h, w, 4), one channel, += ``scale`` x gradient of the sum of SSIM.
+
+    ``blurred`` (3, h, w): the blurs of `slopes`; ``x``, ``y`` (h, w) the channel of picture and target.
+    """
     for row in nb.prange(x.shape[0]):
         for col in range(x.shape[1]):
             slope = blurred[0, row, col] + f32(2) * x[row, col] * blurred[1, row, col]

@@ -15,7 +15,7 @@ _jit = inlined()
 
 @_jit
 def _adam(g, k, i, first, second, beta1, beta2, fix1, fix2):
-    """One value's direction, about 1 in size; updates the running moments."""
+    """One value's direction, about 1 in size; updates the running moments ``first`` and ``second`` (K, COUNT)."""
     m = beta1 * first[k, i] + (1 - beta1) * g
     v = beta2 * second[k, i] + (1 - beta2) * g * g
     first[k, i], second[k, i] = m, v
@@ -24,19 +24,23 @@ def _adam(g, k, i, first, second, beta1, beta2, fix1, fix2):
 
 @_jit
 def _clip(value, bound):
+    """``value`` within +-``bound``."""
     return min(max(value, -bound), bound)
 
 
 @_jit
 def _gain(factors, k, i, spread):
-    """How much further axis i may go than a long one: the dilation, of variance ``spread``, hides part of its step."""
+    """How much further axis i, column i of ``factors`` (K, 3, 3), may go than a long one.
+
+    The dilation, of variance ``spread``, hides part of its step.
+    """
     size = factors[k, 0, i] ** 2 + factors[k, 1, i] ** 2 + factors[k, 2, i] ** 2
     return math.sqrt(min(1 + spread / max(size, 1e-30), 9.0))
 
 
 @_jit
 def _directions(frame, k, first, second, beta1, beta2, fix1, fix2):
-    """Adam's directions of d (3) and E (6)."""
+    """Adam's directions of d (3) and E (6), from row k of ``frame`` (K, 9)."""
     return (
         _adam(frame[k, 0], k, 0, first, second, beta1, beta2, fix1, fix2),
         _adam(frame[k, 1], k, 1, first, second, beta1, beta2, fix1, fix2),
@@ -73,8 +77,10 @@ def own_frame(
 ):
     """mu += M d, M <- M (I + E + E^2 / 2): d, E, logit and colour by Adam; ``step`` counts from 1.
 
-    ``rates`` (5,): d, E on and off the diagonal, logit, colour. ``clips`` (3,): d, logit, E. ``spread`` is the
-    dilation's variance at the scene.
+    Gradients ``frame`` (K, 9), ``logit_grad`` (K,), ``color_grad`` (K, 3) and what they are of, ``means`` (K, 3),
+    ``factors`` (K, 3, 3), ``logits`` (K,), ``colors`` (K, 3), are float32, as are Adam's moments ``first`` and
+    ``second`` (K, COUNT). ``rates`` (5,): d, E on and off the diagonal, logit, colour. ``clips`` (3,): d, logit, E.
+    ``spread`` is the dilation's variance at the scene.
     """
     fix1, fix2 = 1 / (1 - beta1**step), 1 / (1 - beta2**step)
     for k in nb.prange(means.shape[0]):
@@ -104,7 +110,10 @@ def own_frame(
 
 @kernel(parallel=True)
 def adam(values, slopes, rate, beta1, beta2, step, first, second):
-    """Adam (Kingma and Ba 2015) on (n,) ``values`` in place; ``step`` counts from 1."""
+    """Adam (Kingma and Ba 2015) on ``values`` (n,) in place; ``step`` counts from 1.
+
+    ``slopes`` (n,) gradient, ``first``, ``second`` (n,) its running moments.
+    """
     fix1, fix2 = 1 / (1 - beta1**step), 1 / (1 - beta2**step)
     for i in nb.prange(values.shape[0]):
         m = beta1 * first[i] + (1 - beta1) * slopes[i]

@@ -3,6 +3,9 @@
 The first half works as `tiles` does, front to back and with the same early end: what lies behind a splat is the whole
 pixel less what has been blended, so nothing but the picture is kept from the forward pass. Equations: docs/optimize.md.
 Twin: `reference.render_backward_reference`.
+
+Arguments are those of `splat.kernel` and `splat.tiles`; ``pairs`` (pairs, 9) float32 holds `SUMS` of each (tile,
+Gaussian) pair, Gaussian by Gaussian; ``total`` is a Gaussian's sum of them, 9 float64.
 """
 
 from __future__ import annotations
@@ -11,88 +14,88 @@ import numba as nb
 import numpy as np
 
 from vvgt_cli.jit.decorators import inlined, kernel
+from vvgt_cli.splat.buffer import (
+    AREA,
+    HALF,
+    PLANE_1,
+    PLANE_2,
+    PLANE_3,
+    PLANE_4,
+    PLANE_5,
+    ZERO,
+    U,
+    all_ended,
+    alpha_at,
+    eighth,
+    f32,
+    open_tile,
+    rows,
+    tile_jit,
+)
 from vvgt_cli.splat.constants import TILE
 from vvgt_cli.splat.kernel import rotation_column, to_camera, turned, unit_quaternion
-from vvgt_cli.splat.tiles import (
-    _AREA,
-    _HALF,
-    _P1,
-    _P2,
-    _P3,
-    _P4,
-    _P5,
-    _ZERO,
-    U,
-    _all_ended,
-    _alpha,
-    _eighth,
-    _jit,
-    _open,
-    _rows,
-    f32,
-)  # fmt: skip
 
 SINGULAR = 1e-9  # det S of det S' below which the gradient of the compensation is left out
 # alpha dL/dalpha; G = -dalpha/dp dL/dalpha, p the exponent, x dx, dy, dx^2, dx dy, dy^2; weight x dL/d(r, g, b)
 SUMS = 9
 _T = U(TILE)
-_A0, _A1, _A2 = U(6 * _AREA), U(6 * _AREA + TILE), U(6 * _AREA + 2 * TILE)
-_A3, _A4, _A5 = U(6 * _AREA + 3 * TILE), U(6 * _AREA + 4 * TILE), U(6 * _AREA + 5 * TILE)
-_A6, _END = U(6 * _AREA + 6 * TILE), U(6 * _AREA + 7 * TILE)
+_A0, _A1, _A2 = U(6 * AREA), U(6 * AREA + TILE), U(6 * AREA + 2 * TILE)
+_A3, _A4, _A5 = U(6 * AREA + 3 * TILE), U(6 * AREA + 4 * TILE), U(6 * AREA + 5 * TILE)
+_A6, _END = U(6 * AREA + 6 * TILE), U(6 * AREA + 7 * TILE)
 _exact = inlined()
 
 
-@_jit
+@tile_jit
 def _sweep(y0, y1, k, colors, a, b, c, u, v, opacity, rule, buf):
-    """One Gaussian over rows [y0, y1): sums a column into the seven rows behind the planes."""
-    red, green, blue = max(colors[k, 0], _ZERO), max(colors[k, 1], _ZERO), max(colors[k, 2], _ZERO)
+    """Gaussian k over rows [y0, y1): sums a column into the seven rows behind the planes of ``buf``."""
+    red, green, blue = max(colors[k, 0], ZERO), max(colors[k, 1], ZERO), max(colors[k, 2], ZERO)
     min_alpha, max_alpha, floor, factor, offset, end = rule
     shift = opacity * offset
     for i in range(_A0, _END):
-        buf[i] = _ZERO
+        buf[i] = ZERO
     for y in range(y0, y1):
-        dy = f32(np.int32(y)) + _HALF - v
+        dy = f32(np.int32(y)) + HALF - v
         h, q = b * dy, c * dy * dy
         for i in range(_T):
             j = y * _T + i
-            raw = _alpha(f32(np.int32(i)) + _HALF - u, a, h, q, opacity, floor, factor, offset)
+            raw = alpha_at(f32(np.int32(i)) + HALF - u, a, h, q, opacity, floor, factor, offset)
             t = buf[j]
-            weight = min(raw, max_alpha) * t if raw >= min_alpha else _ZERO
+            weight = min(raw, max_alpha) * t if raw >= min_alpha else ZERO
             after = t - weight
             ended = after < end
-            weight = _ZERO if ended else weight
-            own = red * buf[j + _P2] + green * buf[j + _P3] + blue * buf[j + _P4] + buf[j + _P5]
-            behind = buf[j + _P1] - weight * own
+            weight = ZERO if ended else weight
+            own = red * buf[j + PLANE_2] + green * buf[j + PLANE_3] + blue * buf[j + PLANE_4] + buf[j + PLANE_5]
+            behind = buf[j + PLANE_1] - weight * own
             slope = t * (own - behind / after)
-            slope = slope if weight > _ZERO and raw < max_alpha else _ZERO
+            slope = slope if weight > ZERO and raw < max_alpha else ZERO
             g = (raw + shift) * slope
             buf[j] = -abs(t) if ended else after
-            buf[j + _P1] = behind
+            buf[j + PLANE_1] = behind
             buf[_A0 + i] += g
             g *= dy
             buf[_A1 + i] += g
             buf[_A2 + i] += g * dy
-            buf[_A3 + i] += weight * buf[j + _P2]
-            buf[_A4 + i] += weight * buf[j + _P3]
-            buf[_A5 + i] += weight * buf[j + _P4]
+            buf[_A3 + i] += weight * buf[j + PLANE_2]
+            buf[_A4 + i] += weight * buf[j + PLANE_3]
+            buf[_A5 + i] += weight * buf[j + PLANE_4]
             buf[_A6 + i] += raw * slope
 
 
-@_jit
+@tile_jit
 def _moments_tile(entries, slots, extent, flat, colors, ox, oy, rule, buf, pairs):
     """The nine sums of each of the Gaussians ``entries``, in their order, into their rows of ``pairs``."""
     done = entries.shape[0]
     for index in range(entries.shape[0]):
-        if (index & 31) == 31 and _all_ended(buf):
+        if (index & 31) == 31 and all_ended(buf):
             done = index
             break
         k = entries[index]
-        a, b, c, u, v, opacity = _eighth(flat, k, f32(ox), f32(oy))
-        y0, y1 = _rows(extent[k, 1] - oy, extent[k, 3] - oy, a, b, c, u, v, opacity, rule)
+        a, b, c, u, v, opacity = eighth(flat, k, f32(ox), f32(oy))
+        y0, y1 = rows(extent[k, 1] - oy, extent[k, 3] - oy, a, b, c, u, v, opacity, rule)
         _sweep(y0, y1, k, colors, a, b, c, u, v, opacity, rule, buf)
-        s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = s8 = _ZERO
+        s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = s8 = ZERO
         for i in range(_T):  # type: ignore[assignment]
-            dx = f32(np.int32(i)) + _HALF - u
+            dx = f32(np.int32(i)) + HALF - u
             s0 += buf[_A6 + i]
             s1 += buf[_A0 + i] * dx
             s2 += buf[_A1 + i]
@@ -106,7 +109,7 @@ def _moments_tile(entries, slots, extent, flat, colors, ox, oy, rule, buf, pairs
         pairs[slot, 0], pairs[slot, 1], pairs[slot, 2], pairs[slot, 3], pairs[slot, 4] = s0, s1, s2, s3, s4
         pairs[slot, 5], pairs[slot, 6], pairs[slot, 7], pairs[slot, 8] = s5, s6, s7, s8
     for index in range(done, entries.shape[0]):
-        pairs[slots[index]] = _ZERO
+        pairs[slots[index]] = ZERO
 
 
 @kernel(
@@ -118,7 +121,8 @@ def _moments_tile(entries, slots, extent, flat, colors, ox, oy, rule, buf, pairs
 def moments(tiles, start, members, slots, extent, flat, colors, tiles_x, rule, image, grad, pairs):
     """For each (tile, Gaussian) pair: its nine `SUMS` into ``pairs`` (n, 9) float32.
 
-    ``image`` (h, w, 4) is what `tiles.blend` made of ``colors`` clamped at 0, ``grad`` (h, w, 4) dL/d(image), float32.
+    ``image`` (h, w, 4) float32 is what `tiles.blend` made of ``colors`` clamped at 0, ``grad`` (h, w, 4) dL/d(image),
+    float32.
     """
     height, width = image.shape[:2]
     way = rule[0], rule[1], rule[2], rule[3], rule[4], rule[5]
@@ -126,16 +130,16 @@ def moments(tiles, start, members, slots, extent, flat, colors, tiles_x, rule, i
         tile = tiles[index]
         ox, oy = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
         w, h = min(TILE, width - ox), min(TILE, height - oy)
-        buf = np.zeros(6 * _AREA + 7 * TILE, np.float32)  # transmittance, what is behind, dL/d(r, g, b, a); sums
-        _open(buf, w, h)
+        buf = np.zeros(6 * AREA + 7 * TILE, np.float32)  # transmittance, what is behind, dL/d(r, g, b, a); sums
+        open_tile(buf, w, h)
         for y in range(h):
             for x in range(w):
-                behind = _ZERO
+                behind = ZERO
                 for f in range(4):
                     g = grad[oy + y, ox + x, f]
                     behind += image[oy + y, ox + x, f] * g
-                    buf[U((f + 2) * _AREA + y * TILE + x)] = g
-                buf[U(_AREA + y * TILE + x)] = behind
+                    buf[U((f + 2) * AREA + y * TILE + x)] = g
+                buf[U(AREA + y * TILE + x)] = behind
         span = slice(start[tile], start[tile + 1])
         _moments_tile(members[span], slots[span], extent, flat, colors, ox, oy, way, buf, pairs)
 
@@ -175,7 +179,7 @@ def _screen(flat, k, total, dilation, compensate):
 
 @kernel(parallel=True)
 def screen(first, pairs, flat, out):
-    """Length of the gradient with respect to each projected centre (pixels) into ``out`` (K,); 0 where none shows."""
+    """Length of the gradient with respect to each projected centre (px) into ``out`` (K,) float64; 0 where unseen."""
     for k in nb.prange(flat.shape[0]):
         out[k] = 0.0
         if first[k + 1] > first[k]:
@@ -197,6 +201,7 @@ def _center(x, y, z, fx, fy, du, dv, d00, d02, d11, d12):
 
 @_exact
 def _colors_and_logit(k, flat, colors, total, out_logits, out_colors):
+    """Row k of ``out_logits`` (K,) and ``out_colors`` (K, 3), float32."""
     out_logits[k] = total[0] * (1.0 - flat[k, 6])
     out_colors[k, 0] = total[6] if colors[k, 0] >= 0.0 else 0.0
     out_colors[k, 1] = total[7] if colors[k, 1] >= 0.0 else 0.0
@@ -219,7 +224,8 @@ def own_frame(
 ):  # fmt: skip
     """Gradients for steps in each Gaussian's own frame: mu += M d, M <- M (I + E), E symmetric.
 
-    ``out_frame`` (K, 9) float32: d (3), then E: xx, yy, zz, xy, xz, yz (an entry off the diagonal stands for both).
+    ``out_logits`` (K,), ``out_colors`` (K, 3), ``out_frame`` (K, 9) float32: d (3), then E: xx, yy, zz, xy, xz, yz (an
+    entry off the diagonal stands for both).
     """
     fx, fy = lens[0], lens[1]
     for k in nb.prange(means.shape[0]):

@@ -1,4 +1,11 @@
-"""Numba kernels of the splatter's first half: projection and tile lists. Twin: `splat.reference`."""
+"""Numba kernels of the splatter's first half: projection and tile lists. Twin: `splat.reference`.
+
+Of K Gaussians: ``means`` (K, 3), ``log_scales`` (K, 3), ``quats`` (K, 4), ``logits`` (K,), ``factors`` (K, 3, 3), all
+float32, unit frame. Of the camera, float64: ``rot`` (3, 3) and ``trans`` (3,) world to camera, ``lens`` (6,) fx, fy,
+cx, cy, width, height, pixels. ``rule`` (5,) float64 from `Rule.projecting`. Per Gaussian: ``flat`` (K, 7) float32
+centre x, y (px), conic a, b, c (px^-2), opacity as drawn and as given; ``depth`` (K,) float32, unit frame; ``extent``
+(K, 4) int32 pixel box x0, y0, x1, y1, empty where nothing is seen.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +34,7 @@ def to_camera(means, k, rot, trans):
 
 @_jit
 def unit_quaternion(quats, k):
-    """Quaternion k divided by its norm, and 1 / norm, float64."""
+    """Row k of ``quats`` (K, 4) divided by its norm, and 1 / norm, float64."""
     w, a, b, c = np.float64(quats[k, 0]), np.float64(quats[k, 1]), np.float64(quats[k, 2]), np.float64(quats[k, 3])
     n = 1.0 / math.sqrt(w * w + a * a + b * b + c * c)
     return w * n, a * n, b * n, c * n, n
@@ -45,7 +52,7 @@ def rotation_column(w, a, b, c, axis):
 
 @_jit
 def turned(rot, r0, r1, r2):
-    """``rot`` times a vector."""
+    """``rot`` (3, 3) times a vector."""
     return (
         rot[0, 0] * r0 + rot[0, 1] * r1 + rot[0, 2] * r2,
         rot[1, 0] * r0 + rot[1, 1] * r1 + rot[1, 2] * r2,
@@ -55,13 +62,17 @@ def turned(rot, r0, r1, r2):
 
 @_jit
 def _clear(k, depth, extent):
+    """Row k is not seen."""
     extent[k, 0] = extent[k, 1] = extent[k, 2] = extent[k, 3] = 0
     depth[k] = 0
 
 
 @_jit
 def _place(k, x, y, z, sxx, sxy, syy, opacity, lens, rule, flat, depth, extent):
-    """Fill row k of ``flat``, ``depth`` and ``extent`` from centre, 2D covariance (without dilation) and opacity."""
+    """Fill row k of ``flat``, ``depth`` and ``extent``, unless nothing of the Gaussian is seen.
+
+    Of its centre (x, y, z) in camera coordinates, covariance sxx, sxy, syy in px^2 without dilation, and opacity.
+    """
     fx, fy, cx, cy, width, height = lens
     dilation, compensate, min_alpha, farthest, min_variance = rule
     inv = 1.0 / z
@@ -99,12 +110,7 @@ def _place(k, x, y, z, sxx, sxy, syy, opacity, lens, rule, flat, depth, extent):
     parallel=True,
 )
 def project(means, log_scales, quats, logits, rot, trans, lens, rule, flat, depth, extent):
-    """EWA projection of every Gaussian.
-
-    ``lens`` (fx, fy, cx, cy, width, height); ``rule`` from `Rule.projecting`. Fills ``flat`` (K, 7) float32: centre
-    x, y, conic a, b, c, opacity as drawn and as given; ``depth`` (K,) float32;
-    ``extent`` (K, 4) int32: pixel box x0, y0, x1, y1 (empty where nothing is seen).
-    """
+    """EWA projection of every Gaussian, into ``flat``, ``depth`` and ``extent``."""
     fx, fy = lens[0], lens[1]
     for k in nb.prange(means.shape[0]):
         _clear(k, depth, extent)
@@ -159,9 +165,9 @@ def project_factors(means, factors, logits, rot, trans, lens, rule, flat, depth,
 
 @kernel("i8:1 i4:2 i8 i8 i8", parallel=True)
 def tile_lists(order, extent, tiles_x, tiles_y, workers):
-    """Gaussians of each tile in the given (depth) order.
+    """Gaussians of each tile in the given (depth) order, ``order`` (K,) int64.
 
-    Each worker counts, then files, a stretch of ``order``; the result does not depend on how many there are.
+    Each of ``workers`` counts, then files, a stretch of ``order``; the result does not depend on how many there are.
 
     Returns ``start`` (tiles + 1,), ``members`` (pairs,) Gaussian of each entry, ``slots`` (pairs,) place of the
     entry's pair in a list grouped by Gaussian, ``first`` (K + 1,) where each Gaussian's group begins there.
