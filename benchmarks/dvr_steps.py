@@ -22,9 +22,9 @@ from floors import alternate, machine
 
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.dvr import RenderSettings, Scene, render_view
-from vvgt_cli.dvr.kernel import FLAGS, OPAQUE, _leap, absorbed, box_span, point_optics, sample, table_coordinate
+from vvgt_cli.dvr.kernel import FLAGS, OPAQUE, absorbed, box_span, leap, mean_optics, sample, table_coordinate
+from vvgt_cli.dvr.layout import BRICK_BITS
 from vvgt_cli.dvr.reference import rays
-from vvgt_cli.dvr.scene import BRICK_BITS
 from vvgt_cli.synth import open_volume
 from vvgt_cli.transfer.colormap import ColorMap
 from vvgt_cli.transfer.function import TransferFunction
@@ -35,9 +35,9 @@ STEPS = {"pre-integrated": (1, 1 / 2, 1 / 4, 1 / 8), "plain": (1, 1 / 2, 1 / 4, 
 
 
 @nb.njit(parallel=True, fastmath=FLAGS, error_model="numpy")
-def _plain(values, lo, inv_width, nodes, empty, eye, directions, step, out):
+def _plain(voxels, optics, empty, eye, directions, step, out):
+    values = voxels.values
     nz, ny, nx = values.shape
-    bins = len(nodes) - 1
     px, py, pz = eye
     for ray in nb.prange(len(directions)):
         dx, dy, dz = directions[ray]
@@ -58,11 +58,11 @@ def _plain(values, lo, inv_width, nodes, empty, eye, directions, step, out):
             reach = int(empty[bk, bj, bi])
             i += 1
             if reach > 0:
-                i = max(math.ceil((_leap(px, py, pz, dx, dy, dz, reach, bi, bj, bk) - t0) / dt - 0.5), i)
+                i = max(math.ceil((leap(px, py, pz, dx, dy, dz, reach, bi, bj, bk) - t0) / dt - 0.5), i)
                 continue
-            u = table_coordinate(sample(values, x, y, z), lo, inv_width, bins)
+            u = table_coordinate(sample(values, x, y, z), optics)
             if u >= 0.0:
-                r, g, b, tau = point_optics(u, nodes, bins)
+                r, g, b, tau = mean_optics(u, u, optics)
                 f = absorbed(tau * dt) * trans * dt
                 red, green, blue, trans = red + f * r, green + f * g, blue + f * b, trans - f * tau
         out[ray, 0], out[ray, 1], out[ray, 2], out[ray, 3] = red, green, blue, 1.0 - trans
@@ -71,12 +71,10 @@ def _plain(values, lo, inv_width, nodes, empty, eye, directions, step, out):
 def plain_view(scene: Scene, camera: Camera, step: float) -> np.ndarray:
     """(height, width, 4) float64 by post-classification."""
     eye, directions = rays(camera, 1)
-    t = scene.tables
     out = np.zeros((camera.height * camera.width, 4))
     start = tuple((eye + scene.half) / scene.step - 0.5)
-    _plain(
-        scene.values, t.lo, t.inv_width, t.nodes, scene.empty, start, directions.reshape(-1, 3) / scene.step, step, out
-    )
+    across = directions.reshape(-1, 3) / scene.step
+    _plain(scene.voxels, scene.optics, scene.empty, start, across, step, out)
     return out.reshape(camera.height, camera.width, 4)
 
 

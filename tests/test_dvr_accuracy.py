@@ -10,8 +10,9 @@ import pytest
 
 from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.dvr import RenderSettings, Scene, render_view, render_view_reference
+from vvgt_cli.dvr.layout import Optics, Voxels
 from vvgt_cli.dvr.reference import march, trilinear
-from vvgt_cli.dvr.runs import RUN, first_value, sample_run, stack_run
+from vvgt_cli.dvr.runs import RUN, sample_run, stack_run
 from vvgt_cli.transfer.colormap import ColorMap
 from vvgt_cli.transfer.function import TransferFunction
 from vvgt_cli.transfer.opacity import PiecewiseOpacity
@@ -128,12 +129,16 @@ def test_stiff_functions_stay_bounded_whatever_comes_together(per_voxel, edge, f
     assert np.abs(image - fine).mean() < 0.01 * max(fine.max(), 1e-12)
 
 
+# u is the stored value
+IDENTITY = Optics(0.0, 1.0, np.zeros((65537, 4)), np.zeros((65537, 4)), np.zeros(65537))
+
+
 @nb.njit
-def _runs(values, starts, speeds, out):
+def _runs(voxels, optics, starts, speeds, out):
     run = stack_run()
     for i in range(len(starts)):
         p, v = starts[i], speeds[i]
-        sample_run(values, first_value(values), p[0], p[1], p[2], v[0], v[1], v[2], 0.0, 1.0, 65536, run)
+        sample_run(voxels, p[0], p[1], p[2], v[0], v[1], v[2], optics, run)
         for n in range(RUN):
             out[i, n] = run[n]
 
@@ -148,7 +153,7 @@ def test_runs_of_samples_match_the_twin(kind, shape):
     speeds = rng.uniform(-1, 1, (200, 3)) * rng.choice([0.0, 0.1, 4.0], (200, 3))
     out = np.empty((200, RUN))
     stored = data if shape[2] > 1 else data.astype(np.float32)  # as `kernel_values` does
-    _runs(stored, starts, speeds, out)
+    _runs(Voxels(stored), IDENTITY, starts, speeds, out)
     points = starts[:, None] + np.arange(RUN)[:, None] * speeds[:, None]
     exact = trilinear(Volume(data), points.reshape(-1, 3)).reshape(200, RUN)
     np.testing.assert_allclose(out, exact, atol=200 * 2e-5)  # positions within a run to 1e-5 voxels, three axes
@@ -160,6 +165,6 @@ def test_samples_beside_a_voxel_that_is_not_finite_are_marked():
     data[3, 3, 0] = np.inf
     starts = np.array([[0.0, 1.0, 1.0], [0.0, 3.0, 3.0]])
     out = np.empty((2, RUN))
-    _runs(data, starts, np.array([[0.5, 0, 0], [0.5, 0, 0]]), out)
+    _runs(Voxels(data), IDENTITY, starts, np.array([[0.5, 0, 0], [0.5, 0, 0]]), out)
     np.testing.assert_array_equal(out[0, :RUN] == -1, [3 <= 0.5 * n < 5 for n in range(RUN)])
     np.testing.assert_array_equal(out[1, :RUN] == -1, [0.5 * n < 1 for n in range(RUN)])

@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
+import numba as nb
 import numpy as np
 import pytest
 
 from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.dvr import RenderSettings, Scene, render_view
-from vvgt_cli.dvr.scene import BRICK, kernel_values
+from vvgt_cli.dvr.layout import BRICK, Voxels
+from vvgt_cli.dvr.runs import sample_run, stack_run
+from vvgt_cli.dvr.scene import kernel_type, kernel_values
 from vvgt_cli.transfer.tables import MAX_OPACITY, build_tables, extinction
 from vvgt_cli.volume import Volume
 
 TYPES = ["b1", "u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f2", "f4", "f8"]
+
+
+class Unchecked(NamedTuple):
+    """What looks like `Voxels`."""
+
+    values: np.ndarray
 
 
 class Ramp:
@@ -59,6 +70,51 @@ def test_stored_value_scaling_is_applied(kind, slope, intercept):
     plain = view(Volume(slope * data.astype(np.float64) + intercept), Ramp(*ends))
     assert plain.max() > 0.1
     np.testing.assert_allclose(scaled, plain, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("values", "reason"),
+    [
+        (np.zeros((5, 4, 1), np.uint8), "two or more along x"),
+        (np.zeros((5, 4, 1), np.uint16), "two or more along x"),
+        (np.zeros((1, 1, 3), np.uint8), "four in all"),
+        (np.zeros((4, 4, 4), np.float32)[..., ::2], "C-contiguous"),
+        (np.zeros((4, 4, 4), np.uint8).T[:, 1:], "C-contiguous"),
+        (np.zeros(257, np.uint8)[1:].view(np.float32).reshape(4, 4, 4), "aligned"),
+        (np.zeros((4, 4, 4), ">f4"), "native"),
+        (np.zeros((4, 4, 4), np.int16), "uint16"),
+        (np.zeros((4, 4), np.float32), "nz, ny, nx"),
+        (np.zeros((4, 0, 4), np.float32), "not empty"),
+    ],
+)  # fmt: skip
+def test_layouts_that_loads_would_leave_are_refused(values, reason):
+    with pytest.raises(ValueError, match=reason):
+        Voxels(values)
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 2), (1, 1, 3), (1, 1, 4), (2, 1, 2), (9, 9, 1), (1, 1, 1)])
+@pytest.mark.parametrize("kind", TYPES)
+def test_scenes_have_layouts_that_pass(kind, shape):
+    scene = Scene.build(Volume(np.ones(shape, kind)), Ramp(0, 1), 1.0)
+    assert scene.voxels.values is scene.values
+    assert scene.values.dtype.name == kernel_type(scene.volume)
+
+
+def test_runs_are_read_from_checked_voxels_alone():
+    values = np.zeros((4, 4, 4), np.float32)
+    scene = Scene.build(Volume(values), Ramp(0, 1), 1.0)
+
+    @nb.njit
+    def read(voxels, optics):
+        run = stack_run()
+        sample_run(voxels, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, optics, run)
+        return run[0]
+
+    assert read(scene.voxels, scene.optics) == 0
+    with pytest.raises(nb.errors.TypingError):
+        read(values, scene.optics)
+    with pytest.raises(nb.errors.TypingError, match="read from Voxels"):
+        read(Unchecked(values), scene.optics)
 
 
 def test_kernel_values_are_native_contiguous_read_only_and_shared_where_they_can_be(tmp_path):

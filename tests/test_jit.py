@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 import subprocess
 import sys
+from collections import namedtuple
 from pathlib import Path
 
 import pytest
@@ -126,7 +128,7 @@ def one_by_one(tmp_path, *args):
         "inner = K.load_overload; alone = []\n"
         "def spy(self, sig, context):\n"
         "    types = tuple(getattr(sig, 'args', sig))\n"
-        "    usual = [c.parse_types(self.dispatcher.usual, kind) for kind in c.VOLUMES]\n"
+        "    usual = [c.usual_types(self.dispatcher, kind) for kind in c.VOLUMES]\n"
         "    if types not in usual: alone.append(self.function.__qualname__)\n"
         "    return inner(self, sig, context)\n"
         "K.load_overload = spy\n"
@@ -166,13 +168,13 @@ def kernels(folder: Path) -> list[str]:
 
 
 PROBE = """
-from vvgt_cli.dvr.kernel import table_coordinate
+from vvgt_cli.dvr.kernel import absorbed
 from vvgt_cli.jit.decorators import kernel
 from vvgt_cli.splat.constants import NEAR
 
 @kernel()
 def probe(value):
-    return table_coordinate(value, 0.0, 1.0, 10) + NEAR
+    return absorbed(value) + NEAR
 """
 
 
@@ -193,13 +195,13 @@ def test_an_edit_of_what_a_kernel_calls_or_reads_is_noticed_and_the_old_code_goe
         (package / file).write_text(text.replace(old, new))
 
     value, name = probe()
-    assert value == pytest.approx(3.01)
-    edit("optimize/loss.py", '"""Numba', '"""A numba')  # of no use to it
+    assert value == pytest.approx((1 - math.exp(-3)) / 3 + 0.01)
+    edit("descent/loss.py", '"""Numba', '"""A numba')  # of no use to it
     assert probe() == (value, name)
-    edit("dvr/kernel.py", "(value - lo) * inv_width", "(value - lo) * 2.0 * inv_width")
-    assert probe()[0] == pytest.approx(6.01)
+    edit("dvr/kernel.py", "return (1.0 - math.exp(-depth)) / depth", "return (4.0 - math.exp(-depth)) / depth")
+    assert probe()[0] == pytest.approx((4 - math.exp(-3)) / 3 + 0.01)
     edit("splat/constants.py", "NEAR = 0.01", "NEAR = 0.5")
-    assert probe()[0] == pytest.approx(6.5)
+    assert probe()[0] == pytest.approx((4 - math.exp(-3)) / 3 + 0.5)
 
 
 def test_what_a_kernel_reaches():
@@ -209,7 +211,7 @@ def test_what_a_kernel_reaches():
 
     modules, constants = reached(blend.py_func)
     assert "vvgt_cli.splat.tiles" in modules
-    assert {"TILE = 16", "_HALF = np.float32(0.5)"} <= constants
+    assert {"TILE = 16", "HALF = np.float32(0.5)"} <= constants
     assert {"vvgt_cli.vbm.moments", "vvgt_cli.dvr.kernel"} <= reached(_brick_moments.py_func)[0]
 
 
@@ -218,6 +220,18 @@ def stepped(tmp_path_factory):
     """What `STEP` prints, and the folder that it leaves; to be copied."""
     folder = tmp_path_factory.mktemp("stepped")
     return python("-c", STEP, folder=folder).stdout, folder
+
+
+def test_the_order_of_fields_is_part_of_what_a_kernel_is_kept_under():
+    from numba import types
+    from numba.core.registry import cpu_target
+
+    from vvgt_cli.splat.tiles import reduce_pairs
+
+    pairs = [types.BaseTuple.from_types((types.f8, types.f8), namedtuple("Pair", fields)) for fields in ("a b", "b a")]
+    codegen = cpu_target.target_context.codegen()
+    assert len({repr(pair) for pair in pairs}) == 1
+    assert len({reduce_pairs._cache.file((pair,), codegen) for pair in pairs}) == 2
 
 
 @pytest.mark.parametrize(

@@ -13,8 +13,9 @@ from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.dvr import Scene
 from vvgt_cli.synth import analytic
 from vvgt_cli.vbm import visibility as visibility_module
-from vvgt_cli.vbm.moments import MOMENTS, base_cells, morton
-from vvgt_cli.vbm.tree import COLUMNS, SEEN, Leaves, Tree, build_tree, central, leaves_of, select, split, split_score
+from vvgt_cli.vbm.columns import COLUMNS, MOMENTS, SEEN
+from vvgt_cli.vbm.moments import base_cells, morton
+from vvgt_cli.vbm.tree import Leaves, Tree, build_tree, central, leaves_of, select, split, split_score
 from vvgt_cli.vbm.visibility import Visibility, visibility
 from vvgt_cli.volume import Volume
 

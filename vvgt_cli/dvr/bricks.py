@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
-from vvgt_cli.dvr.scene import BRICK
+from vvgt_cli.dvr.layout import BRICK
 from vvgt_cli.jit.decorators import kernel
 from vvgt_cli.transfer.tables import OpticalTables
 
@@ -14,6 +14,7 @@ MAX_DISTANCE = 15  # bricks; a longer leap saves nothing measurable
 
 @kernel("V f8:4", parallel=True)
 def _ranges(values, out):
+    """Finite range over each brick of ``values`` (nz, ny, nx) and its upper neighbours; ``out`` (bz, by, bx, 2)."""
     nz, ny, nx = values.shape
     bz, by, bx = out.shape[:3]
     for flat in nb.prange(bz * by):

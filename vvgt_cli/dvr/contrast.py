@@ -10,7 +10,7 @@ from vvgt_cli.jit.decorators import inlined, kernel
 
 @inlined()
 def _apart(image, row, col, i, j):
-    """Largest difference between two pixels in any channel."""
+    """Largest difference between pixels (row, col) and (i, j) of ``image`` (h, w, c) in any channel."""
     most = 0.0
     for channel in range(image.shape[2]):
         most = max(most, abs(image[row, col, channel] - image[i, j, channel]))
@@ -19,6 +19,7 @@ def _apart(image, row, col, i, j):
 
 @kernel("f4:3 b1:2 f4:2", parallel=True)
 def _contrast(image, known, out):
+    """`contrast` of ``image`` (h, w, c) into ``out`` (h, w); ``known`` (h, w) bool."""
     height, width = out.shape
     for row in nb.prange(height):
         for col in range(width):

@@ -150,7 +150,7 @@ class Field:
         return torch.where(torch.isfinite(total), u, torch.nan)
 
     def _rows(self, u: Any) -> tuple[Any, Any]:
-        """Optics at u (n,) and their integrals over [0, u], (n, 4) each (`kernel.point_optics`, `_integrals`)."""
+        """Optics at u (n,) and their integrals over [0, u], (n, 4) each (`kernel._point`, `_integrals`)."""
         i = u.long().clamp(max=len(self.nodes) - 2)
         f = (u - i)[:, None]
         a, b = self.nodes[i], self.nodes[i + 1]

@@ -1,4 +1,9 @@
-"""The numba ray caster: pre-integrated emission-absorption with empty-space leaping (conventions: Optics)."""
+"""The numba ray caster: pre-integrated emission-absorption with empty-space leaping (conventions: Optics).
+
+Rays are p + t d: p, d (x, y, z) in voxels from the first voxel's centre, t in unit-frame lengths. ``voxels`` and
+``optics`` are `layout.Voxels` and `layout.Optics`; u is a coordinate in the tables, in [0, bins]; ``light`` and means
+are vectors (r, g, b, alpha or tau); ``empty`` (bz, by, bx) uint8 is `Scene.empty`.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +12,8 @@ import math
 import numba as nb
 import numpy as np
 
-from vvgt_cli.dvr.runs import BORROWED, RUN, first_value, run_range, sample_run, stack_run
-from vvgt_cli.dvr.scene import BRICK, BRICK_BITS
+from vvgt_cli.dvr.layout import BRICK, BRICK_BITS, TUPLES
+from vvgt_cli.dvr.runs import BORROWED, RUN, run_range, sample_run, stack_run
 from vvgt_cli.dvr.vectors import add, lane, row, scale, sub, zeros4
 from vvgt_cli.jit.decorators import inlined, kernel
 
@@ -28,7 +33,10 @@ _jit = inlined(fastmath=FLAGS, error_model="numpy", **BORROWED)
 
 @_jit
 def sample(values, x, y, z):
-    """Trilinear value at voxel coordinates, clamped to the edge voxels; NaN where a corner is not finite."""
+    """Trilinear value of ``values`` (nz, ny, nx) at voxel coordinates, clamped to the edge voxels.
+
+    NaN where a corner is not finite.
+    """
     nz, ny, nx = values.shape
     x = min(max(x, 0.0), nx - 1.0)
     y = min(max(y, 0.0), ny - 1.0)
@@ -47,57 +55,50 @@ def sample(values, x, y, z):
 
 
 @_jit
-def table_coordinate(value, lo, inv_width, bins):
+def table_coordinate(value, optics):
     """Table coordinate in [0, bins], or -1 for a value that is not finite."""
     if not (abs(value) < np.inf):
         return -1.0
-    return min(max((value - lo) * inv_width, 0.0), float(bins))
+    return min(max((value - optics.lo) * optics.inv_width, 0.0), float(optics.nodes.shape[0] - 1))
 
 
 @_jit
-def _integrals(u, nodes, cumulative, bins):
+def _integrals(u, optics):
     """Integrals over [0, u] of (tau r, tau g, tau b, tau): trapezoid, exact where tau is linear within a bin."""
-    index = min(int(u), bins - 1)
+    index = min(int(u), optics.nodes.shape[0] - 2)
     f = u - index
     h = 0.5 * f * f
-    linear = add(scale(f - h, row(nodes, U(index))), scale(h, row(nodes, U(index + 1))))
-    return add(row(cumulative, U(index)), linear)
+    linear = add(scale(f - h, row(optics.nodes, U(index))), scale(h, row(optics.nodes, U(index + 1))))
+    return add(row(optics.cumulative, U(index)), linear)
 
 
 @_jit
-def _point(u, nodes, bins):
+def _point(u, optics):
     """(tau r, tau g, tau b, tau) at one table coordinate."""
-    index = min(int(u), bins - 1)
+    index = min(int(u), optics.nodes.shape[0] - 2)
     f = u - index
-    return add(scale(1.0 - f, row(nodes, U(index))), scale(f, row(nodes, U(index + 1))))
+    return add(scale(1.0 - f, row(optics.nodes, U(index))), scale(f, row(optics.nodes, U(index + 1))))
 
 
 @_jit
-def _mean(u0, u1, nodes, cumulative, bins):
+def _mean(u0, u1, optics):
     """Mean of (tau r, tau g, tau b, tau) while the table coordinate goes linearly from u0 to u1."""
     width = u1 - u0
     if abs(width) < 0.5:
-        return _point(0.5 * (u0 + u1), nodes, bins)
-    return scale(1.0 / width, sub(_integrals(u1, nodes, cumulative, bins), _integrals(u0, nodes, cumulative, bins)))
+        return _point(0.5 * (u0 + u1), optics)
+    return scale(1.0 / width, sub(_integrals(u1, optics), _integrals(u0, optics)))
 
 
 @_jit
-def point_optics(u, nodes, bins):
-    """`_point` as a tuple."""
-    mean = _point(u, nodes, bins)
-    return lane(mean, 0), lane(mean, 1), lane(mean, 2), lane(mean, 3)
-
-
-@_jit
-def mean_optics(u0, u1, nodes, cumulative, bins):
+def mean_optics(u0, u1, optics):
     """`_mean` as a tuple."""
-    mean = _mean(u0, u1, nodes, cumulative, bins)
+    mean = _mean(u0, u1, optics)
     return lane(mean, 0), lane(mean, 1), lane(mean, 2), lane(mean, 3)
 
 
 @_jit
 def box_span(px, py, pz, dx, dy, dz, nx, ny, nz):
-    """Entry and exit of a ray (p + t d, t >= 0) through the box [-1/2, n - 1/2]^3; entry >= exit: missed."""
+    """Entry and exit t >= 0 of a ray through the box [-1/2, n - 1/2]^3; entry >= exit: missed."""
     t0, t1 = 0.0, np.inf
     for p, d, n in ((px, dx, nx), (py, dy, ny), (pz, dz, nz)):
         if d == 0.0:
@@ -122,9 +123,9 @@ def absorbed(depth):
 
 
 @_jit
-def _composite(u0, u1, dt, nodes, cumulative, bins, light, trans):
+def _composite(u0, u1, dt, optics, light, trans):
     """``light`` (r, g, b, alpha) and ``trans`` behind a segment of length dt; the coordinate goes from u0 to u1."""
-    segment = scale(dt, _mean(u0, u1, nodes, cumulative, bins))
+    segment = scale(dt, _mean(u0, u1, optics))
     depth = max(lane(segment, 3), 0.0)
     if depth <= SUB_DEPTH or abs(u1 - u0) < 0.5:
         f = absorbed(depth) * trans
@@ -132,7 +133,7 @@ def _composite(u0, u1, dt, nodes, cumulative, bins, light, trans):
     parts = min(int(depth / SUB_DEPTH) + 1, PARTS)
     width = (u1 - u0) / parts
     for part in range(parts):
-        mean = _mean(u0 + part * width, u0 + (part + 1) * width, nodes, cumulative, bins)
+        mean = _mean(u0 + part * width, u0 + (part + 1) * width, optics)
         segment = scale(dt / parts, mean)
         depth = max(lane(segment, 3), 0.0)
         f = absorbed(depth) * trans
@@ -156,7 +157,7 @@ def _exit(px, py, pz, ix, iy, iz, reach, bi, bj, bk):
 
 
 @_jit
-def _leap(px, py, pz, dx, dy, dz, reach, bi, bj, bk):
+def leap(px, py, pz, dx, dy, dz, reach, bi, bj, bk):
     """Ray parameter at which the empty cube of bricks around (bi, bj, bk) ends, from the ray's origin p."""
     return _exit(px, py, pz, _inverse(dx), _inverse(dy), _inverse(dz), reach, bi, bj, bk)
 
@@ -199,7 +200,7 @@ def _skip(shape, empty, px, py, pz, dx, dy, dz, ix, iy, iz, t0, dt, per_step, co
 
 @_jit
 def _any_light(run, u0, dark):
-    """Whether some segment of a run that comes from u0 (-1: none) may have extinction."""
+    """Whether some segment of a run (RUN,) that comes from u0 (-1: none) may have extinction."""
     lowest, highest = run_range(run)
     if u0 >= 0.0:
         lowest, highest = min(lowest, u0), max(highest, u0)
@@ -207,14 +208,9 @@ def _any_light(run, u0, dark):
 
 
 @_jit
-def cast(values, lo, inv_width, nodes, cumulative, dark, empty, px, py, pz, dx, dy, dz, step):
-    """Premultiplied (r, g, b, alpha) along p + t d in voxel coordinates, t in unit-frame lengths.
-
-    ``step`` is the sampling distance in voxels (along the ray, in voxel coordinates); ``dark``: `OpticalTables.dark`.
-    """
-    nz, ny, nx = values.shape
-    bins = nodes.shape[0] - 1
-    flat = first_value(values)
+def cast(voxels, optics, empty, px, py, pz, dx, dy, dz, step):
+    """Premultiplied (r, g, b, alpha) along a ray; ``step`` is the sampling distance in voxels along it."""
+    nz, ny, nx = voxels.values.shape
     run = stack_run()
     light, trans = zeros4(), 1.0
     t0, t1 = box_span(px, py, pz, dx, dy, dz, nx, ny, nz)
@@ -227,21 +223,19 @@ def cast(values, lo, inv_width, nodes, cumulative, dark, empty, px, py, pz, dx, 
     u0 = -1.0  # -1: no sample there, or not finite
     i = 0
     while True:
-        start = _skip(values.shape, empty, px, py, pz, dx, dy, dz, ix, iy, iz, t0, dt, per_step, count, i)
+        start = _skip(voxels.values.shape, empty, px, py, pz, dx, dy, dz, ix, iy, iz, t0, dt, per_step, count, i)
         if start > count:
             return lane(light, 0), lane(light, 1), lane(light, 2), 1.0 - trans
         if start > i:
             u0, i = -1.0, start
         t = t0 + i * dt
-        sample_run(
-            values, flat, px + t * dx, py + t * dy, pz + t * dz, dx * dt, dy * dt, dz * dt, lo, inv_width, bins, run
-        )
-        if _any_light(run, u0, dark):
+        sample_run(voxels, px + t * dx, py + t * dy, pz + t * dz, dx * dt, dy * dt, dz * dt, optics, run)
+        if _any_light(run, u0, optics.dark):
             for n in range(min(RUN, count + 1 - i)):
                 u1 = run[n]
                 first = min(u0, u1)
-                if first >= 0.0 and max(u0, u1) > dark[U(int(first))]:
-                    light, trans = _composite(u0, u1, dt, nodes, cumulative, bins, light, trans)
+                if first >= 0.0 and max(u0, u1) > optics.dark[U(int(first))]:
+                    light, trans = _composite(u0, u1, dt, optics, light, trans)
                     if trans < opaque:
                         return lane(light, 0), lane(light, 1), lane(light, 2), 1.0 - trans
                 u0 = u1
@@ -252,8 +246,11 @@ def cast(values, lo, inv_width, nodes, cumulative, dark, empty, px, py, pz, dx, 
 
 
 @_jit
-def _pixel(values, lo, inv_width, nodes, cumulative, dark, empty, eye, basis, lens, step, col, row, offsets):
-    """Sums over the rays through the points ``offsets`` (n, 2: right, down) from the centre of a pixel."""
+def _pixel(voxels, optics, empty, eye, basis, lens, step, col, row, offsets):
+    """Sums (r, g, b, alpha) over the rays through the points ``offsets`` (n, 2: right, down) from a pixel's centre.
+
+    Arguments as of `render_tiles`; the pixel is (``col``, ``row``).
+    """
     acc0 = acc1 = acc2 = acc3 = 0.0
     for ray in range(len(offsets)):
         a = (col + 0.5 + offsets[U(ray), 0] - lens[2]) * lens[0]
@@ -262,27 +259,21 @@ def _pixel(values, lo, inv_width, nodes, cumulative, dark, empty, eye, basis, le
         dx = (basis[0, 0] * a + basis[1, 0] * b + basis[2, 0]) * norm
         dy = (basis[0, 1] * a + basis[1, 1] * b + basis[2, 1]) * norm
         dz = (basis[0, 2] * a + basis[1, 2] * b + basis[2, 2]) * norm
-        red, green, blue, alpha = cast(
-            values, lo, inv_width, nodes, cumulative, dark, empty, eye[0], eye[1], eye[2], dx, dy, dz, step
-        )
+        red, green, blue, alpha = cast(voxels, optics, empty, eye[0], eye[1], eye[2], dx, dy, dz, step)
         acc0, acc1, acc2, acc3 = acc0 + red, acc1 + green, acc2 + blue, acc3 + alpha
     return acc0, acc1, acc2, acc3
 
 
 @_jit
-def _tile(
-    values, lo, inv_width, nodes, cumulative, dark, empty, eye, basis, lens, step, top, left, offsets, mask, known, out
-):
-    """Pixels of one tile; arguments as of `render_tiles`."""
+def _tile(voxels, optics, empty, eye, basis, lens, step, top, left, offsets, mask, known, out):
+    """Pixels of the tile from (``left``, ``top``) on; arguments as of `render_tiles`."""
     height, width = out.shape[:2]
     share = 1.0 / (known + len(offsets))
     for line in range(top, min(top + TILE, height)):
         for col in range(left, min(left + TILE, width)):
             if not mask[line, col]:
                 continue
-            red, green, blue, alpha = _pixel(
-                values, lo, inv_width, nodes, cumulative, dark, empty, eye, basis, lens, step, col, line, offsets
-            )
+            red, green, blue, alpha = _pixel(voxels, optics, empty, eye, basis, lens, step, col, line, offsets)
             pixel = out[line, col]
             if known > 0:
                 red, green, blue = red + known * pixel[0], green + known * pixel[1], blue + known * pixel[2]
@@ -291,24 +282,21 @@ def _tile(
 
 
 @kernel(
-    "V f8 f8 f8:2 f8:2 f8:1 u1:3 f8:1 f8:2 f8:1 f8 i8:1 f8:2 b1:2 i8 f4:3",
+    "Voxels Optics u1:3 f8:1 f8:2 f8:1 f8 i8:1 f8:2 b1:2 i8 f4:3",
+    TUPLES,
     parallel=True,
     fastmath=FLAGS,
     error_model="numpy",
 )
-def render_tiles(
-    values, lo, inv_width, nodes, cumulative, dark, empty, eye, basis, lens, step, order, offsets, mask, known, out
-):
+def render_tiles(voxels, optics, empty, eye, basis, lens, step, order, offsets, mask, known, out):
     """Render one view into ``out`` (h, w, 4) float32, rays at ``offsets`` (n, 2) in pixels where ``mask`` is set.
 
-    ``eye`` (3,) and ``basis`` (3, 3: rows right, down, forward) are in voxel coordinates per unit-frame length;
-    ``lens`` is (1/fx, 1/fy, cx, cy); ``order`` permutes the tiles (row-major) so that contiguous chunks of threads are
-    balanced; ``known``: number of rays whose mean ``out`` holds already.
+    ``eye`` (3,) voxels and ``basis`` (3, 3: rows right, down, forward) in voxels per unit-frame length;
+    ``lens`` is (1/fx, 1/fy, cx, cy), pixels; ``order`` (tiles,) permutes the tiles (row-major) so that contiguous
+    chunks of threads are balanced; ``mask`` (h, w) bool; ``step`` in voxels along a ray; ``known``: number of rays
+    whose mean ``out`` holds already.
     """
     across = (out.shape[1] + TILE - 1) // TILE
     for index in nb.prange(len(order)):
         top, left = order[index] // across * TILE, order[index] % across * TILE
-        _tile(
-            values, lo, inv_width, nodes, cumulative, dark, empty, eye, basis, lens, step, top, left, offsets, mask,
-            known, out,
-        )  # fmt: skip
+        _tile(voxels, optics, empty, eye, basis, lens, step, top, left, offsets, mask, known, out)

@@ -123,16 +123,15 @@ def render_view(
     settings = settings or RenderSettings()
     if _thinner_than_a_pixel(scene, camera):
         settings = replace(settings, tiers=((-1.0, settings.tiers[-1][1]),))  # a first ray a pixel may show nothing
-    tables = scene.tables
+    voxels, optics = scene.voxels, scene.optics
     eye, basis, lens = camera_arrays(scene, camera)
     out = np.zeros((camera.height, camera.width, 4), np.float32)
     order = tile_order(camera.height, camera.width, blocks)
 
     def cast(offsets: np.ndarray, mask: np.ndarray, known: int) -> None:
         render_tiles(
-            scene.values, tables.lo, tables.inv_width, tables.nodes, tables.cumulative, tables.dark, scene.empty,
-            eye, basis, lens, float(settings.step), order, offsets, mask, known, out,
-        )  # fmt: skip
+            voxels, optics, scene.empty, eye, basis, lens, float(settings.step), order, offsets, mask, known, out
+        )
 
     cast_tiers(settings, out, cast, blocks)
     return out

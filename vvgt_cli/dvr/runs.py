@@ -10,7 +10,9 @@ import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
+from numba.core.errors import TypingError
 
+from vvgt_cli.dvr.layout import Voxels
 from vvgt_cli.dvr.vectors import intrinsic
 from vvgt_cli.jit.decorators import inlined
 
@@ -56,13 +58,15 @@ def run_range(typingctx: Any, run: Any) -> Any:
 
 
 @intrinsic
-def first_value(typingctx: Any, values: Any) -> Any:
-    """Pointer to the first value of an array."""
+def _first(typingctx: Any, voxels: Any) -> Any:
+    """Pointer to the first value of `Voxels`: of nothing else, for only their layout has been checked."""
+    if getattr(voxels, "instance_class", None) is not Voxels:
+        raise TypingError(f"runs of samples are read from Voxels, not from {voxels}")
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return context.make_array(signature.args[0])(context, builder, args[0]).data
+        return context.make_array(voxels[0])(context, builder, builder.extract_value(args[0], 0)).data
 
-    return types.CPointer(values.dtype)(values), codegen
+    return types.CPointer(voxels[0].dtype)(voxels), codegen
 
 
 @intrinsic
@@ -102,9 +106,10 @@ def _pair(typingctx: Any, values: Any, index: Any, edge: Any, last: Any) -> Any:
 
 @inlined(error_model="numpy", **BORROWED)
 def _base(p, v, n):
-    """Lowest voxel of a run along one axis, and from there its start and the end of the axis, float32.
+    """Lowest voxel of a run along an axis of ``n``, and from there its start and the end of the axis, float32.
 
-    Counted from there, float32 keeps positions to 1e-5 voxels in a volume of any size.
+    The run goes from ``p`` by ``v`` a sample, voxels. Counted from there, float32 keeps positions to 1e-5 voxels in a
+    volume of any size.
     """
     base = max(min(math.floor(min(p, p + (RUN - 1) * v)), n - 2), 0)
     return base, F(p - base), F(n - 1 - base)
@@ -121,7 +126,12 @@ def _from(typingctx: Any, values: Any, index: Any) -> Any:
 
 
 def _sampler(index):
-    """The loop over a run, its offsets of type ``index``: 32 bits are one vector of AVX-512 where 64 are two."""
+    """The loop over a run, its offsets of type ``index``: 32 bits are one vector of AVX-512 where 64 are two.
+
+    ``here`` points to the run's lowest voxel; ``row``, ``slab``: voxels from one row, one slab to the next; ``last``:
+    see `_pair`; ``start``, ``step``, ``top``, ``last_voxel`` (x, y, z) voxels from ``here``; ``table`` (lo, inv_width,
+    bins); ``out`` (RUN,) float32.
+    """
 
     @inlined(fastmath={"contract", "nsz", "arcp", "afn"}, error_model="numpy", **BORROWED)
     def samples(here, row, slab, last, start, step, top, last_voxel, table, out):
@@ -160,24 +170,23 @@ _near_samples, _far_samples = _sampler(nb.int32), _sampler(nb.int64)
 
 
 @inlined(fastmath={"contract", "nsz", "arcp", "afn"}, error_model="numpy", **BORROWED)
-def sample_run(values, flat, px, py, pz, vx, vy, vz, lo, inv_width, bins, out):
-    """Table coordinates ``out`` (RUN,) in [0, bins] of the samples at p + k v, k < RUN; -1 where not finite.
+def sample_run(voxels, px, py, pz, vx, vy, vz, optics, out):
+    """Table coordinates in [0, bins] of the samples at p + k v, k < RUN; -1 where not finite.
 
-    ``values`` (nz, ny, nx), ``flat`` its `first_value`; p, v in voxel coordinates. Integer volumes are at least two
-    voxels wide along x and have four or more (`scene.kernel_values`). As `kernel.sample` and
-    `kernel.table_coordinate`, in float32.
+    ``voxels`` `Voxels`, ``optics`` `Optics`; p, v in voxels (x, y, z), from the first voxel's centre; ``out``
+    `stack_run`, (RUN,) float32. As `kernel.sample` and `kernel.table_coordinate`, in float32.
     """
-    nz, ny, nx = values.shape
+    nz, ny, nx = voxels.values.shape
     bx, x0, x_top = _base(px, vx, nx)
     by, y0, y_top = _base(py, vy, ny)
     bz, z0, z_top = _base(pz, vz, nz)
     row, slab = nb.int64(nx), nb.int64(nx) * nb.int64(ny)
     first = bz * slab + by * row + bx
     last = slab * nb.int64(nz) - 4 - first
-    here = _from(flat, first)
+    here = _from(_first(voxels), first)
     start, step, top = (x0, y0, z0), (F(vx), F(vy), F(vz)), (x_top, y_top, z_top)
     last_voxel = N(nx - 2 - bx), N(ny - 1 - by), N(nz - 1 - bz)  # the last pair along x
-    table = F(lo), F(inv_width), F(bins)
+    table = F(optics.lo), F(optics.inv_width), F(optics.nodes.shape[0] - 1)
     if slab < NEAR:
         _near_samples(here, N(row), N(slab), N(min(last, MOST)), start, step, top, last_voxel, table, out)
     else:

@@ -6,12 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vvgt_cli.dvr.layout import BRICK as BRICK  # for pipeline.plan, until it asks layout
+from vvgt_cli.dvr.layout import Optics, Voxels, pairs_fit
 from vvgt_cli.transfer.tables import OpticalTables, build_tables
 from vvgt_cli.transfer.types import TransferFunctionLike
 from vvgt_cli.volume import Volume
-
-BRICK_BITS = 3
-BRICK = 1 << BRICK_BITS  # voxels along the edge of a brick of the empty-space map
 
 
 @dataclass(frozen=True)
@@ -36,6 +35,17 @@ class Scene:
     empty: np.ndarray
     half: np.ndarray
     step: np.ndarray
+
+    @property
+    def voxels(self) -> Voxels:
+        """`values` as kernels take them."""
+        return Voxels(self.values)
+
+    @property
+    def optics(self) -> Optics:
+        """`tables` as kernels take them."""
+        t = self.tables
+        return Optics(t.lo, t.inv_width, t.nodes, t.cumulative, t.dark)
 
     @classmethod
     def build(
@@ -83,7 +93,7 @@ def kernel_values(volume: Volume) -> tuple[np.ndarray, float, float]:
     if data.dtype == np.bool_:
         data = data.view(np.uint8)
     kind = data.dtype.newbyteorder("=")
-    if kind in (np.uint8, np.uint16) and data.shape[2] > 1 and data.size > 3:  # kernels read 32 bits at a time
+    if kind in (np.uint8, np.uint16) and pairs_fit(data.shape):
         return _read_only(data, kind), volume.slope, volume.intercept
     if kind.itemsize <= 2:  # exact in float32
         return _read_only(data, np.dtype(np.float32)), volume.slope, volume.intercept
@@ -101,7 +111,7 @@ def kernel_values(volume: Volume) -> tuple[np.ndarray, float, float]:
 def kernel_type(volume: Volume) -> str:
     """Name of the type that `kernel_values` gives a volume's values."""
     kind = volume.data.dtype.newbyteorder("=")
-    narrow = kind in (np.bool_, np.uint8, np.uint16) and volume.data.shape[2] > 1 and volume.data.size > 3
+    narrow = kind in (np.bool_, np.uint8, np.uint16) and pairs_fit(volume.data.shape)
     return "float32" if not narrow else "uint16" if kind == np.uint16 else "uint8"
 
 

@@ -17,7 +17,7 @@ from typing import Any
 import numba
 from numba.core.registry import cpu_target
 
-from vvgt_cli.jit.cache import PACKAGE, folder_for_writing, folders, warn_once
+from vvgt_cli.jit.store import PACKAGE, folder_for_writing, folders, warn_once
 
 VOLUMES = ("uint8", "uint16", "float32")  # types of a volume's values that kernels read
 
@@ -44,23 +44,31 @@ def usual_jobs(names: Iterable[str], volumes: Sequence[str] = VOLUMES) -> list[J
     for name in names:
         module, function = name.split(":")
         dispatcher = getattr(import_module(module), function)
-        for kind in volumes if "V" in dispatcher.usual.split() else volumes[:1]:
-            types = parse_types(dispatcher.usual, kind)
-            codegen = cpu_target.target_context.codegen()
+        codegen = cpu_target.target_context.codegen()
+        for types in dict.fromkeys(usual_types(dispatcher, kind) for kind in volumes):
             jobs.append(Job(module, function, types, dispatcher._cache.file(types, codegen)))
     return jobs
 
 
-def parse_types(usual: str, volume: str) -> tuple[Any, ...]:
-    """numba types from their short names; `V`: read-only values (nz, ny, nx) of type ``volume``."""
+def usual_types(dispatcher: Any, volume: str) -> tuple[Any, ...]:
+    """numba types that a kernel declares; `V`: read-only values (nz, ny, nx) of type ``volume``."""
+    tuples = {kind.__name__: (kind, fields) for kind, fields in dispatcher.tuples.items()}
+    return _types(dispatcher.usual, tuples, volume)
+
+
+def _types(usual: str, tuples: dict[str, tuple[type, str]], volume: str) -> tuple[Any, ...]:
+    """numba types from their short names and those of named ``tuples`` {name: (class, types of its fields)}."""
     found: list[Any] = []
     for word in usual.split():
         name, _, axes = word.partition(":")
-        if name == "V":
+        if name in tuples:
+            kind, fields = tuples[name]
+            found.append(numba.types.BaseTuple.from_types(_types(fields, {}, volume), kind))
+        elif name == "V":
             found.append(numba.types.Array(getattr(numba.types, volume), 3, "C", readonly=True))
         else:
-            kind = getattr(numba.types, name)
-            found.append(numba.types.Array(kind, int(axes), "C") if axes else kind)
+            scalar = getattr(numba.types, name)
+            found.append(numba.types.Array(scalar, int(axes), "C") if axes else scalar)
     return tuple(found)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numba as nb
@@ -12,7 +12,9 @@ from vvgt_cli.jit.cache import KernelCache
 NO_ENTRY: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
 
-def kernel(usual: str = "", **options: Any) -> Callable[[Callable[..., Any]], Any]:
+def kernel(
+    usual: str = "", tuples: Mapping[type, str] | None = None, **options: Any
+) -> Callable[[Callable[..., Any]], Any]:
     """``numba.njit`` for functions that Python calls: compiled in another process, loaded from disk.
 
     They run without the interpreter's lock, so that a signal is answered while they do (`vvgt_cli.cli.process`).
@@ -21,6 +23,7 @@ def kernel(usual: str = "", **options: Any) -> Callable[[Callable[..., Any]], An
         usual: types of the arguments as commands pass them: "f4:2 i8" is a C-contiguous float32 array of two axes and
             an int64, "V" a volume's values. What is compiled ahead (`vvgt_cli.jit.ahead`); other types are compiled
             when they are met.
+        tuples: the types of the fields of the named tuples whose names ``usual`` holds.
         options: of ``numba.njit``.
     """
 
@@ -28,7 +31,7 @@ def kernel(usual: str = "", **options: Any) -> Callable[[Callable[..., Any]], An
         made: Any = nb.njit(nogil=True, **options)(function)
         if hasattr(made, "py_func"):  # with NUMBA_DISABLE_JIT it is the function
             made._cache = KernelCache(made)
-            made.usual = usual
+            made.usual, made.tuples = usual, tuples or {}
         return made
 
     return wrap

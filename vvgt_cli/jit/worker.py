@@ -14,7 +14,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-WORKING: Path | None = None  # file that this process compiles for; None in processes that load
 MOST = 8  # kernels at once: 0.3 GB each
 
 
@@ -34,26 +33,25 @@ def claim(folder: Path, file: str) -> Iterator[None]:
 
 def make(folder: Path, job: Any) -> None:
     """Compile one kernel, unless somebody else has meanwhile."""
-    global WORKING
     import importlib
     import itertools
 
     from numba.core import bytecode
     from numba.core.registry import cpu_target
 
-    from vvgt_cli.jit.cache import read
+    from vvgt_cli.jit import store
 
     dispatcher = getattr(importlib.import_module(job.module), job.function)
     file = dispatcher._cache.file(job.types, cpu_target.target_context.codegen())
     if file != job.file:
         raise RuntimeError(f"{job.function}: other sources than the caller's")
     with claim(folder, file):
-        if read(folder / file) is None:
+        if store.read(folder / file) is None:
             # names of symbols hold this number: those of two kernels, loaded by one process, must not meet
             bytecode.FunctionIdentity._unique_ids = itertools.count(int(file.split("-")[-1][:12], 16) << 16)
-            WORKING = folder / file
+            store.WORKING = folder / file
             dispatcher.compile(job.types)
-            WORKING = None
+            store.WORKING = None
 
 
 def _attempt(folder: Path, job: Any) -> int:
@@ -101,6 +99,4 @@ def run(folder: Path, jobs: list[Any]) -> int:
 if __name__ == "__main__":
     import pickle
 
-    from vvgt_cli.jit import worker  # not __main__: kernels look at the module
-
-    sys.exit(worker.run(*pickle.load(sys.stdin.buffer)))
+    sys.exit(run(*pickle.load(sys.stdin.buffer)))

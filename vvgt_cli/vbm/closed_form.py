@@ -10,7 +10,8 @@ import numpy as np
 
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.cameras.sets import FIELD_OF_VIEW, RADIUS
-from vvgt_cli.dvr.scene import BRICK, Scene
+from vvgt_cli.dvr.layout import BRICK
+from vvgt_cli.dvr.scene import Scene
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.splat import render
 from vvgt_cli.splat.rules import INRIA, Rule

@@ -15,6 +15,7 @@ import numpy as np
 
 from vvgt_cli.dvr.kernel import sample
 from vvgt_cli.jit.decorators import inlined, kernel
+from vvgt_cli.vbm.columns import MASS
 from vvgt_cli.vbm.moments import Cells
 
 OPAQUE_DEPTH = 5.0  # optical depth a voxel at which a cell counts as wholly opaque; half of it is the surface
@@ -46,7 +47,7 @@ class Opaque:
 
 def opaque_field(cells: Cells, step: np.ndarray, half: np.ndarray) -> Opaque:
     """Where the scene is opaque: empty fields where it is nowhere."""
-    depth = cells.moments[:, 0] / cells.edge.prod() * (float(step.mean()) / OPAQUE_DEPTH)
+    depth = cells.moments[:, MASS] / cells.edge.prod() * (float(step.mean()) / OPAQUE_DEPTH)
     if not len(depth) or depth.max() < 0.5:
         none = np.empty((0, 0, 0), np.float32)
         return Opaque(none, none, cells.edge, half)
@@ -76,7 +77,10 @@ def _blur(field: np.ndarray) -> None:
 
 @inlined()
 def _run(field, x, y, z, dx, dy, dz, limit, inside):
-    """Steps along d, from 1 to ``limit``, before the field leaves (``inside``) or enters the body; limit if never."""
+    """Steps along d, from 1 to ``limit``, before the field leaves (``inside``) or enters the body; limit if never.
+
+    ``field`` (nz, ny, nx); the point and d in its cells, (x, y, z).
+    """
     for i in range(1, limit):
         if (sample(field, x + i * dx, y + i * dy, z + i * dz) >= 0.5) != inside:
             return i - 1
@@ -85,6 +89,10 @@ def _run(field, x, y, z, dx, dy, dz, limit, inside):
 
 @kernel("f4:3 f4:3 f8:2 f8:1 f8:1 f8:3 f8:1 f8 f8 f8:2", parallel=True)
 def _shift(field, smooth, means, half, edge, cov, reach, dilation, far, out):
+    """`inset` into ``out`` (n, 3): ``field``, ``smooth``, ``half`` (3,), ``edge`` (3,) of `Opaque`.
+
+    ``means`` (n, 3), ``cov`` (n, 3, 3), ``reach`` (n,) standard deviations, ``dilation``, ``far``: unit frame.
+    """
     small = edge.min()
     stride = 0.25 * small
     limit = int(far / stride)

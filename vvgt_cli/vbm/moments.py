@@ -15,11 +15,11 @@ import numba as nb
 import numpy as np
 
 from vvgt_cli.dvr.kernel import FLAGS, mean_optics, table_coordinate
-from vvgt_cli.dvr.scene import BRICK, Scene
+from vvgt_cli.dvr.layout import BRICK, TUPLES
+from vvgt_cli.dvr.scene import Scene
 from vvgt_cli.jit.decorators import inlined, kernel
+from vvgt_cli.vbm.columns import BLUE, GREEN, MASS, MOMENTS, RED, XX, XY, XZ, YY, YZ, ZZ, X, Y, Z
 
-# columns of a moment row: M, M x, M y, M z, M xx, M xy, M xz, M yy, M yz, M zz, M r, M g, M b
-MOMENTS = 13
 FINEST_CUT = -4
 CHUNK_CELLS = 1 << 19  # cells of the dense scratch buffer
 
@@ -30,8 +30,7 @@ class Cells:
 
     Attributes:
         index: (n, 3) int32 cell indices (x, y, z) from the box's corner.
-        moments: (n, 13) float64 integrals of tau times 1, x, y, z, xx, xy, xz, yy, yz, zz and r, g, b
-            over the cell (unit-frame lengths: M has units of area).
+        moments: (n, 13) float64 integrals of tau over the cell by `columns` (unit-frame lengths: the mass is an area).
         edge: (3,) cell edge in unit-frame lengths (x, y, z).
         exponent: (3,) int cell edge in voxels = 2^exponent.
     """
@@ -44,7 +43,9 @@ class Cells:
 
 @inlined(fastmath=FLAGS)
 def _value_and_spread(values, x, y, z, dx, dy, dz):
-    """Trilinear value at voxel coordinates, and its spread over a box of edges (dx, dy, dz) voxels around there.
+    """Trilinear value of ``values`` (nz, ny, nx) at voxel coordinates, and its spread over a box around there.
+
+    The box has edges (dx, dy, dz) voxels.
 
     The spread is the root of the summed squared differences over the box, from the gradient of the same eight voxels.
     NaN where a voxel is not finite.
@@ -75,17 +76,19 @@ def _value_and_spread(values, x, y, z, dx, dy, dz):
 
 
 @kernel(
-    "V f8 f8 f8:2 f8:2 f8:1 f8:2 i8:1 i8:1 f8:1 f8:1 f8:1 f8:5",
+    "Voxels Optics f8:2 i8:1 i8:1 f8:1 f8:1 f8:1 f8:5",
+    TUPLES,
     parallel=True,
     fastmath=FLAGS,
 )
-def _brick_moments(values, lo, inv_width, nodes, cumulative, dark, bricks, cells, points, cell_voxels, half, step, out):
-    """Moments of the ``cells`` (x, y, z) cells of each brick with ``points`` (x, y, z) points a cell.
+def _brick_moments(voxels, optics, bricks, cells, points, cell_voxels, half, step, out):
+    """Moments of the ``cells`` (3,) cells of each brick with ``points`` (3,) points a cell, both (x, y, z).
 
-    ``bricks`` (n, 3) origins in voxels (x, y, z); ``out`` (n, cells z, cells y, cells x, 13).
+    ``bricks`` (n, 3) origins in voxels from the box's corner; ``cell_voxels`` (3,) a cell's edges, voxels; ``half``,
+    ``step`` (3,) of `Scene`; all (x, y, z). ``out`` (n, cells z, cells y, cells x, 13) float64.
     """
+    values, dark = voxels.values, optics.dark
     nz, ny, nx = values.shape
-    bins = nodes.shape[0] - 1
     dx, dy, dz = cell_voxels[0] / points[0], cell_voxels[1] / points[1], cell_voxels[2] / points[2]
     box = dx * step[0] * dy * step[1] * dz * step[2]
     for b in nb.prange(bricks.shape[0]):
@@ -110,11 +113,11 @@ def _brick_moments(values, lo, inv_width, nodes, cumulative, dark, bricks, cells
                                 w *= 0.5
                                 if not (abs(s) < np.inf and w < np.inf):
                                     continue
-                                u0 = table_coordinate(s - w, lo, inv_width, bins)
-                                u1 = table_coordinate(s + w, lo, inv_width, bins)
+                                u0 = table_coordinate(s - w, optics)
+                                u1 = table_coordinate(s + w, optics)
                                 if max(u0, u1) <= dark[int(min(u0, u1))]:
                                     continue
-                                r, g, bl, tau = mean_optics(u0, u1, nodes, cumulative, bins)
+                                r, g, bl, tau = mean_optics(u0, u1, optics)
                                 if not tau > 0.0:
                                     continue
                                 tau *= box
@@ -123,19 +126,19 @@ def _brick_moments(values, lo, inv_width, nodes, cumulative, dark, bricks, cells
                                 uz = (z + 0.5) * step[2] - half[2]
                                 # the point's own box has variance edge^2 / 12
                                 row = out[b, cz, cy, cx]
-                                row[0] += tau
-                                row[1] += tau * ux
-                                row[2] += tau * uy
-                                row[3] += tau * uz
-                                row[4] += tau * (ux * ux + (dx * step[0]) ** 2 / 12)
-                                row[5] += tau * ux * uy
-                                row[6] += tau * ux * uz
-                                row[7] += tau * (uy * uy + (dy * step[1]) ** 2 / 12)
-                                row[8] += tau * uy * uz
-                                row[9] += tau * (uz * uz + (dz * step[2]) ** 2 / 12)
-                                row[10] += box * r
-                                row[11] += box * g
-                                row[12] += box * bl
+                                row[MASS] += tau
+                                row[X] += tau * ux
+                                row[Y] += tau * uy
+                                row[Z] += tau * uz
+                                row[XX] += tau * (ux * ux + (dx * step[0]) ** 2 / 12)
+                                row[XY] += tau * ux * uy
+                                row[XZ] += tau * ux * uz
+                                row[YY] += tau * (uy * uy + (dy * step[1]) ** 2 / 12)
+                                row[YZ] += tau * uy * uz
+                                row[ZZ] += tau * (uz * uz + (dz * step[2]) ** 2 / 12)
+                                row[RED] += box * r
+                                row[GREEN] += box * g
+                                row[BLUE] += box * bl
 
 
 def exponents(step: np.ndarray, level: int) -> np.ndarray:
@@ -168,7 +171,6 @@ def base_cells(
 
     ``progress`` is told the share that is done.
     """
-    tables = scene.tables
     block = np.maximum(BRICK, 2.0**exponent).astype(np.int64)  # voxels of one work item, (x, y, z)
     cell_voxels = 2.0**exponent
     cells = np.round(block / cell_voxels).astype(np.int64)
@@ -177,14 +179,12 @@ def base_cells(
     chunk = max(int(CHUNK_CELLS // cells.prod()), 1)
     scratch = np.empty((min(chunk, max(len(origins), 1)), cells[2], cells[1], cells[0], MOMENTS))
     kept_index, kept_moments = [], []
+    voxels, optics = scene.voxels, scene.optics
     for first in range(0, len(origins), chunk):
         part = origins[first : first + chunk]
         out = scratch[: len(part)]
-        _brick_moments(
-            scene.values, tables.lo, tables.inv_width, tables.nodes, tables.cumulative, tables.dark,
-            part.astype(np.float64), cells, points, cell_voxels, scene.half, scene.step, out,
-        )  # fmt: skip
-        at = np.argwhere(out[..., 0] > 0)  # block, z, y, x
+        _brick_moments(voxels, optics, part.astype(np.float64), cells, points, cell_voxels, scene.half, scene.step, out)
+        at = np.argwhere(out[..., MASS] > 0)  # block, z, y, x
         kept_moments.append(out[at[:, 0], at[:, 1], at[:, 2], at[:, 3]])
         corner = np.round(part[at[:, 0]] / cell_voxels).astype(np.int32)
         kept_index.append(corner + at[:, :0:-1].astype(np.int32))
@@ -209,13 +209,12 @@ CHILDREN = np.array([(x, y, z) for z in (0, 1) for y in (0, 1) for x in (0, 1)],
 
 def cell_moments(scene: Scene, corners: np.ndarray, edge: np.ndarray, points_per_voxel: int = 2) -> np.ndarray:
     """Moments (n, 8, 13) of the children of cells of ``edge`` (3,) voxels, ``corners`` (n, 3) voxels from the box's."""
-    tables = scene.tables
     child = edge / 2
     points = np.maximum(np.round(child * points_per_voxel), 2).astype(np.int64)
     out = np.empty((len(corners), 2, 2, 2, MOMENTS))
     _brick_moments(
-        scene.values, tables.lo, tables.inv_width, tables.nodes, tables.cumulative, tables.dark,
-        np.ascontiguousarray(corners, np.float64), np.full(3, 2), points, child, scene.half, scene.step, out,
+        scene.voxels, scene.optics, np.ascontiguousarray(corners, np.float64), np.full(3, 2), points, child,
+        scene.half, scene.step, out,
     )  # fmt: skip
     return out.reshape(len(corners), 8, MOMENTS)
 

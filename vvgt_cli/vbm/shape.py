@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.vbm.columns import COLOR, MASS, SEEN, SEEN_COLOR
 from vvgt_cli.vbm.inset import Opaque, inset
 from vvgt_cli.vbm.opacity import peak_opacity
-from vvgt_cli.vbm.tree import SEEN, Leaves, central
+from vvgt_cli.vbm.tree import Leaves, central
 
 FLOOR = 0.05  # smallest standard deviation, in the smaller of voxel and cell edge
 TRANSLUCENT_SPREAD = 2.0  # what a cell that its mass fills adds to its second moment; nothing across a sheet
@@ -75,9 +76,9 @@ def cell_gaussians(leaves: Leaves, voxel: float, pixel: float, opaque: Opaque, s
 
 def seen_color(moments: np.ndarray) -> np.ndarray:
     """(n, 3) mean colour as the views see it; of all the extinction where they see none."""
-    seen = moments[:, SEEN : SEEN + 1]
-    hidden = seen <= 1e-12 * moments[:, :1]
-    return np.where(hidden, moments[:, 10:13] / moments[:, :1], moments[:, SEEN + 1 :] / np.where(hidden, 1, seen))
+    mass, seen = moments[:, [MASS]], moments[:, [SEEN]]  # (n, 1)
+    hidden = seen <= 1e-12 * mass
+    return np.where(hidden, moments[:, COLOR] / mass, moments[:, SEEN_COLOR] / np.where(hidden, 1, seen))
 
 
 def make_gaussians(

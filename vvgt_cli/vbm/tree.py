@@ -7,12 +7,26 @@ from dataclasses import dataclass
 import numpy as np
 
 from vvgt_cli.dvr.scene import Scene
-from vvgt_cli.vbm.moments import CHILDREN, MOMENTS, Cells, cell_moments, morton
+from vvgt_cli.vbm.columns import (
+    BLUE,
+    COLOR,
+    COLUMNS,
+    FIRST,
+    GREEN,
+    MASS,
+    MOMENTS,
+    RED,
+    SECOND,
+    SEEN,
+    SEEN_COLOR,
+    XX,
+    YY,
+    ZZ,
+)
+from vvgt_cli.vbm.moments import CHILDREN, Cells, cell_moments, morton
 from vvgt_cli.vbm.visibility import Visibility
 
 HIDDEN = 1e-3  # cells that no view sees with more transmittance are dropped
-COLUMNS = MOMENTS + 4  # moments of tau, then of tau T: 1, r, g, b
-SEEN = MOMENTS  # column of the seen mass
 
 
 @dataclass(frozen=True)
@@ -20,8 +34,7 @@ class Tree:
     """Every cell of every scale that holds extinction some view sees; base cells first, the root last.
 
     Attributes:
-        moments: (n, 17) float64: the 13 of `Cells`, then the same cells' seen mass and seen r, g, b
-            (weighted by the mean transmittance T over the views).
+        moments: (n, 17) float64 by `columns`: the 13 of `Cells`, then the same cells' seen mass and colour.
         largest: (n,) float64 largest transmittance over the views.
         index: (n, 3) int32 cell indices (x, y, z) from the box's corner, in cells of the row's own size.
         edge: (n, 3) float64 cell edges, unit-frame lengths.
@@ -59,8 +72,8 @@ def build_tree(cells: Cells, seen: Visibility, step: np.ndarray) -> Tree:
     first, children = np.zeros(total, np.int64), np.zeros(total, np.int64)
     base = moments[: counts[0]]
     np.take(cells.moments, keep, axis=0, out=base[:, :MOMENTS])
-    base[:, SEEN] = base[:, 0] * mean[keep]
-    base[:, SEEN + 1 :] = base[:, 10:13] * mean[keep, None]
+    base[:, SEEN] = base[:, MASS] * mean[keep]
+    base[:, SEEN_COLOR] = base[:, COLOR] * mean[keep, None]
     top[: counts[0]] = largest[keep]
     edge[: counts[0]] = cells.edge
     index[: counts[0]] = cells.index[keep]
@@ -82,9 +95,9 @@ def build_tree(cells: Cells, seen: Visibility, step: np.ndarray) -> Tree:
 
 def central(moments: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Mass (n,), centroid (n, 3) and covariance (n, 3, 3) of rows of moments."""
-    mass = moments[:, 0]
-    mean = moments[:, 1:4] / mass[:, None]
-    second = moments[:, 4:10] / mass[:, None]
+    mass = moments[:, MASS]
+    mean = moments[:, FIRST] / mass[:, None]
+    second = moments[:, SECOND] / mass[:, None]
     cov = np.empty((len(moments), 3, 3))
     for column, (i, j) in enumerate([(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]):
         cov[:, i, j] = cov[:, j, i] = second[:, column] - mean[:, i] * mean[:, j]
@@ -94,9 +107,9 @@ def central(moments: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def split_score(tree: Tree) -> np.ndarray:
     """(n,) what a cell's spread costs the image: saturated mass x visibility x variance."""
     m = tree.moments
-    mass = m[:, 0]
+    mass = m[:, MASS]
     area = np.cbrt(tree.edge.prod(axis=1)) ** 2
-    variance = (m[:, 4] + m[:, 7] + m[:, 9]) / mass - (m[:, 1:4] ** 2).sum(axis=1) / mass**2
+    variance = (m[:, XX] + m[:, YY] + m[:, ZZ]) / mass - (m[:, FIRST] ** 2).sum(axis=1) / mass**2
     seen = np.sqrt(tree.largest * m[:, SEEN] / mass)
     return -np.expm1(-mass / area) * area * seen * np.maximum(variance, 0)
 
@@ -221,7 +234,7 @@ def _children_below(leaves: Leaves, scene: Scene, seen: Visibility) -> tuple[np.
         moments = cell_moments(scene, leaves.index[chosen] * (edge / step), edge / step)  # (n, 8, 13)
         index = 2 * leaves.index[chosen][:, None, :] + CHILDREN  # (n, 8, 3)
         mean, largest = seen.at(((index + 0.5) * (edge / 2 / step)).reshape(-1, 3))
-        keep = (moments[..., 0] > 0) & (largest.reshape(-1, 8) > HIDDEN)
+        keep = (moments[..., MASS] > 0) & (largest.reshape(-1, 8) > HIDDEN)
         rows = with_seen(moments[keep], mean[keep.ravel()])
         owners.append(np.repeat(chosen, keep.sum(axis=1)))
         found.append(
@@ -236,4 +249,4 @@ def _children_below(leaves: Leaves, scene: Scene, seen: Visibility) -> tuple[np.
 
 def with_seen(moments: np.ndarray, mean: np.ndarray) -> np.ndarray:
     """Moments (n, 13) and mean transmittance (n,) -> (n, 17) with the seen mass and colour."""
-    return np.concatenate([moments, moments[:, [0, 10, 11, 12]] * mean[:, None]], axis=1)
+    return np.concatenate([moments, moments[:, [MASS, RED, GREEN, BLUE]] * mean[:, None]], axis=1)

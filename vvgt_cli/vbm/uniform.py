@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.vbm.columns import FIRST, MASS
 from vvgt_cli.vbm.opacity import peak_opacity
 from vvgt_cli.vbm.shape import make_gaussians, seen_color
 from vvgt_cli.vbm.tree import Tree
@@ -21,11 +22,11 @@ def uniform_gaussians(tree: Tree, budget: int, pixel: float, seed: int) -> Gauss
     rng = np.random.default_rng(seed)
     chosen = np.sort(rng.integers(0, max(len(base), 1), budget if len(base) else 0))
     moments, edge = tree.moments[base[chosen]], tree.edge[base[chosen]]
-    centre = moments[:, 1:4] / moments[:, :1]
+    centre = moments[:, FIRST] / moments[:, [MASS]]
     points = centre + edge * (rng.random(centre.shape) - 0.5)
     volume = len(base) * (edge[0].prod() if len(edge) else 0.0)
     sigma = 0.5 * (volume / max(len(chosen), 1)) ** (1 / 3)
     variances = np.full((len(chosen), 3), sigma**2)
-    mass = moments[:, 0] * len(base) / max(len(chosen), 1)
+    mass = moments[:, MASS] * len(base) / max(len(chosen), 1)
     axes = np.broadcast_to(np.eye(3), (len(chosen), 3, 3))
     return make_gaussians(points, variances, axes, peak_opacity(mass, variances, pixel), seen_color(moments))

@@ -10,9 +10,11 @@ import numba as nb
 import numpy as np
 
 from vvgt_cli.cameras import Camera
-from vvgt_cli.dvr.kernel import FLAGS, _leap, box_span, mean_optics, sample, table_coordinate
+from vvgt_cli.dvr.kernel import FLAGS, box_span, leap, mean_optics, sample, table_coordinate
+from vvgt_cli.dvr.layout import BRICK_BITS, TUPLES
 from vvgt_cli.dvr.render import camera_arrays
-from vvgt_cli.dvr.scene import BRICK_BITS, Scene
+from vvgt_cli.dvr.runs import BORROWED
+from vvgt_cli.dvr.scene import Scene
 from vvgt_cli.jit.decorators import inlined, kernel
 
 MAX_CELLS = 1 << 24
@@ -45,7 +47,7 @@ class Visibility:
 
 @inlined(fastmath=FLAGS)
 def _cell(x, y, z, inv_cell, grid):
-    """Grid cell of a point in voxel coordinates."""
+    """Cell (z, y, x) of ``grid`` (3, cz, cy, cx) with a point (voxels); ``inv_cell`` cells a voxel."""
     return (
         min(int(max(z + 0.5, 0.0) * inv_cell), grid.shape[1] - 1),
         min(int(max(y + 0.5, 0.0) * inv_cell), grid.shape[2] - 1),
@@ -53,14 +55,15 @@ def _cell(x, y, z, inv_cell, grid):
     )
 
 
-@inlined(fastmath=FLAGS)
-def _deposit(values, lo, inv_width, nodes, cumulative, dark, empty, px, py, pz, dx, dy, dz, step, inv_cell, grid):
+@inlined(fastmath=FLAGS, **BORROWED)
+def _deposit(voxels, optics, empty, px, py, pz, dx, dy, dz, step, inv_cell, grid):
     """March p + t d and add to ``grid`` (3, cz, cy, cx): optical depth, its seen part, largest transmittance.
 
-    What lies behind an opaque front adds to the depth only: it is there, and not seen.
+    p, d, ``step`` in voxels; ``empty`` (bz, by, bx) uint8; ``inv_cell`` grid cells a voxel. What lies behind an opaque
+    front adds to the depth only: it is there, and not seen.
     """
+    values, dark = voxels.values, optics.dark
     nz, ny, nx = values.shape
-    bins = nodes.shape[0] - 1
     t0, t1 = box_span(px, py, pz, dx, dy, dz, nx, ny, nz)
     if not t1 > t0:
         return
@@ -75,16 +78,16 @@ def _deposit(values, lo, inv_width, nodes, cumulative, dark, empty, px, py, pz, 
         bk = min(max(int(z), 0), nz - 1) >> BRICK_BITS
         reach = int(empty[bk, bj, bi])
         if reach > 0:
-            j = int((min(_leap(px, py, pz, dx, dy, dz, reach, bi, bj, bk), t1) - t0) / dt)
+            j = int((min(leap(px, py, pz, dx, dy, dz, reach, bi, bj, bk), t1) - t0) / dt)
             if j > i:
                 i, known = j, False
                 continue
         if not known:
-            u0 = table_coordinate(sample(values, x, y, z), lo, inv_width, bins)
+            u0 = table_coordinate(sample(values, x, y, z), optics)
         t += dt
-        u1 = table_coordinate(sample(values, px + t * dx, py + t * dy, pz + t * dz), lo, inv_width, bins)
+        u1 = table_coordinate(sample(values, px + t * dx, py + t * dy, pz + t * dz), optics)
         if u0 >= 0.0 and u1 >= 0.0 and max(u0, u1) > dark[int(min(u0, u1))]:
-            depth = mean_optics(u0, u1, nodes, cumulative, bins)[3] * dt
+            depth = mean_optics(u0, u1, optics)[3] * dt
             if depth > 0.0:
                 t -= 0.5 * dt
                 k, j, c = _cell(px + t * dx, py + t * dy, pz + t * dz, inv_cell, grid)
@@ -98,12 +101,16 @@ def _deposit(values, lo, inv_width, nodes, cumulative, dark, empty, px, py, pz, 
 
 
 @kernel(
-    "V f8 f8 f8:2 f8:2 f8:1 u1:3 f8:2 f8:3 f8:2 i8 f8 f8 f4:5",
+    "Voxels Optics u1:3 f8:2 f8:3 f8:2 i8 f8 f8 f4:5",
+    TUPLES,
     parallel=True,
     fastmath=FLAGS,
 )
-def _march(values, lo, inv_width, nodes, cumulative, dark, empty, eyes, bases, lenses, size, step, inv_cell, grids):
-    """Rays of all views, dealt over the workers; ``grids`` (workers, 3, cz, cy, cx) float32."""
+def _march(voxels, optics, empty, eyes, bases, lenses, size, step, inv_cell, grids):
+    """Rays of all views, dealt over the workers; ``grids`` (workers, 3, cz, cy, cx) float32.
+
+    ``eyes`` (n, 3), ``bases`` (n, 3, 3), ``lenses`` (n, 4) as `camera_arrays` has them; ``size`` px; ``step`` voxels.
+    """
     workers = grids.shape[0]
     for worker in nb.prange(workers):
         for job in range(worker, eyes.shape[0] * size, workers):
@@ -116,8 +123,7 @@ def _march(values, lo, inv_width, nodes, cumulative, dark, empty, eyes, bases, l
                 dy = (basis[0, 1] * a + basis[1, 1] * b + basis[2, 1]) * norm
                 dz = (basis[0, 2] * a + basis[1, 2] * b + basis[2, 2]) * norm
                 _deposit(
-                    values, lo, inv_width, nodes, cumulative, dark, empty,
-                    eye[0], eye[1], eye[2], dx, dy, dz, step, inv_cell, grids[worker],
+                    voxels, optics, empty, eye[0], eye[1], eye[2], dx, dy, dz, step, inv_cell, grids[worker]
                 )  # fmt: skip
 
 
@@ -144,12 +150,12 @@ def visibility(
     shape = tuple(-(-n // (1 << exponent)) for n in scene.values.shape)
     workers = max(min(WORKERS, MAX_GRID // math.prod(shape)), 1)
     grids = np.zeros((workers, 3, *shape), np.float32)
-    tables = scene.tables
+    voxels, optics = scene.voxels, scene.optics
     for done, camera in enumerate(cameras, 1):
         eye, basis, lens = camera_arrays(scene, camera)
         _march(
-            scene.values, tables.lo, tables.inv_width, tables.nodes, tables.cumulative, tables.dark, scene.empty,
-            eye[None], basis[None], lens[None], camera.width, step, 1.0 / (1 << exponent), grids,
+            voxels, optics, scene.empty, eye[None], basis[None], lens[None], camera.width, step,
+            1.0 / (1 << exponent), grids,
         )  # fmt: skip
         if progress:
             progress(done / len(cameras))

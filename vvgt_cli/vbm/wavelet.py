@@ -11,6 +11,7 @@ import functools
 import numpy as np
 
 from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.vbm.columns import FIRST, MASS
 from vvgt_cli.vbm.opacity import peak_opacity
 from vvgt_cli.vbm.shape import make_gaussians, seen_color
 from vvgt_cli.vbm.tree import Tree, select
@@ -41,7 +42,7 @@ def detail_energy(tree: Tree) -> np.ndarray:
     The energy is the children's squared density minus the cell's own, times volume. A cell whose children are alike has
     none, and is still split where something finer in it has some.
     """
-    mass, volume = tree.moments[:, 0], tree.edge.prod(axis=1)
+    mass, volume = tree.moments[:, MASS], tree.edge.prod(axis=1)
     energy = np.zeros(len(tree))
     np.add.at(energy, tree.parent[:-1], (mass**2 / volume)[:-1])
     energy -= mass**2 / volume
@@ -62,7 +63,7 @@ def wavelet_gaussians(tree: Tree, budget: int, pixel: float) -> Gaussians:
     moments, edge = tree.moments[ids], np.cbrt(tree.edge[ids].prod(axis=1))
     sigma, kept = box_surrogate()
     variances = np.repeat((sigma * edge)[:, None] ** 2, 3, axis=1)
-    opacity = peak_opacity(moments[:, 0] * kept, variances, pixel)
-    means = moments[:, 1:4] / moments[:, :1]
+    opacity = peak_opacity(moments[:, MASS] * kept, variances, pixel)
+    means = moments[:, FIRST] / moments[:, [MASS]]
     axes = np.broadcast_to(np.eye(3), (len(ids), 3, 3))
     return make_gaussians(means, variances, axes, opacity, seen_color(moments))

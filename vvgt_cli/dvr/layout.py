@@ -1,0 +1,68 @@
+"""What the ray caster's kernels read: a volume's values, the optics, the bricks of the empty-space map."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+BRICK_BITS = 3
+BRICK = 1 << BRICK_BITS  # voxels along the edge of a brick of the empty-space map
+TYPES = (np.dtype(np.uint8), np.dtype(np.uint16), np.dtype(np.float32))  # of values that kernels read
+
+
+def pairs_fit(shape: Sequence[int]) -> bool:
+    """Whether 32 bits, read at any pair of integers along x, lie within an array of ``shape`` (nz, ny, nx)."""
+    return shape[2] > 1 and math.prod(shape) > 3
+
+
+class _Values(NamedTuple):
+    values: np.ndarray
+
+
+class Voxels(_Values):
+    """A volume's values, so laid out that what `runs` loads by its address lies within them.
+
+    Attributes:
+        values: (nz, ny, nx) uint8, uint16 or float32, aligned, C-contiguous, in native byte order.
+
+    Raises:
+        ValueError: a layout under which loads would go astray.
+    """
+
+    __slots__ = ()
+
+    def __new__(cls, values: np.ndarray) -> Voxels:
+        shape, kind = values.shape, values.dtype
+        if len(shape) != 3 or 0 in shape or kind not in TYPES or not kind.isnative:
+            names = ", ".join(map(str, TYPES))
+            raise ValueError(f"values {shape} of {kind}; expected (nz, ny, nx), not empty, of native {names}")
+        if not (values.flags.c_contiguous and values.flags.aligned):
+            raise ValueError(f"values {shape} with strides {values.strides}; expected aligned and C-contiguous ones")
+        if kind.kind == "u" and not pairs_fit(shape):
+            raise ValueError(f"{kind} values {shape}; expected two or more along x and four in all, or float32")
+        return super().__new__(cls, values)
+
+
+class Optics(NamedTuple):
+    """Tables of optics over ``u = (stored - lo) * inv_width``, as `OpticalTables` has them.
+
+    Attributes:
+        lo: stored value at u = 0.
+        inv_width: bins per stored unit.
+        nodes: (n + 1, 4) float64 tau * (r, g, b) and tau at the bin edges, per unit-frame length.
+        cumulative: (n + 1, 4) float64 their integrals over u.
+        dark: (n + 1,) float64 the u up to which extinction is zero from bin i on.
+    """
+
+    lo: float
+    inv_width: float
+    nodes: np.ndarray
+    cumulative: np.ndarray
+    dark: np.ndarray
+
+
+# Types of the fields, for `jit.decorators.kernel`.
+TUPLES: dict[type, str] = {Voxels: "V", Optics: "f8 f8 f8:2 f8:2 f8:1"}
