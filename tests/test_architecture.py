@@ -31,6 +31,14 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 TESTS = sorted((ROOT / "tests").glob("*.py"))
 
 
+def dotted(path: Path) -> str:
+    """Name of a module, of a package for its ``__init__``."""
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+
+
+MODULES = {dotted(path): path for path in FILES}
+
+
 def name(path: Path) -> str:
     return path.relative_to(ROOT).as_posix()
 
@@ -91,6 +99,72 @@ def test_heavy_imports_sit_where_they_are_used(path):
         package = module.split(".")[0]
         if id(node) in top and package in HEAVY:
             assert package in KERNELS, f"line {node.lineno}: {module} is imported at module level"
+
+
+def type_checking(tree: ast.Module) -> set[int]:
+    """Statements under ``if TYPE_CHECKING``, which never run."""
+    guarded = [
+        node for node in ast.walk(tree) if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
+    ]
+    return {id(inner) for node in guarded for statement in node.body for inner in ast.walk(statement)}
+
+
+def modules_used(tree: ast.Module) -> set[str]:
+    """Modules of the package that a file's code imports, at its top or within functions."""
+    never, found = type_checking(tree), set()
+    for node in ast.walk(tree):
+        if id(node) in never:
+            continue
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            inner = {f"{node.module}.{alias.name}" for alias in node.names}
+            found |= {full if full in MODULES else node.module or "" for full in inner}
+    return found & set(MODULES)
+
+
+def circles(graph: dict[str, set[str]]) -> set[str]:
+    """Modules that import themselves through others: what is left when those that import none of the rest are gone."""
+    left = {module: used - {module} for module, used in graph.items()}
+    while leaves := {module for module, used in left.items() if not used & set(left)}:
+        left = {module: used for module, used in left.items() if module not in leaves}
+    return {module for module in left if module in _within(left, module)}
+
+
+def _within(graph: dict[str, set[str]], start: str) -> set[str]:
+    """Modules that ``start`` imports, at any distance."""
+    found: set[str] = set()
+    waiting = [start]
+    while waiting:
+        new = graph[waiting.pop()] & set(graph) - found
+        found |= new
+        waiting += new
+    return found
+
+
+def test_no_file_imports_in_a_circle():
+    graph = {module: modules_used(ast.parse(path.read_text("utf-8"))) for module, path in MODULES.items()}
+    assert sum(map(len, graph.values())) > 500
+    graph.pop("vvgt_cli")  # its __getattr__ imports by name
+    assert not circles(graph)
+    assert circles({"a": {"b"}, "b": {"c"}, "c": {"b", "d"}, "d": set()}) == {"b", "c"}
+
+
+@pytest.mark.parametrize("path", FILES, ids=name)
+def test_names_with_an_underscore_stay_in_their_module(path):
+    tree = ast.parse(path.read_text("utf-8"))
+    aliases = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("vvgt_cli"):
+            for alias in node.names:
+                assert not alias.name.startswith("_") or alias.name == "__version__", (
+                    f"line {node.lineno}: {alias.name}"
+                )
+                if f"{node.module}.{alias.name}" in MODULES:
+                    aliases.add(alias.asname or alias.name)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in aliases:
+            assert not node.attr.startswith("_"), f"line {node.lineno}: {node.value.id}.{node.attr}"
 
 
 def test_rooms_and_commands_do_not_import_kernels_at_module_level():

@@ -16,7 +16,7 @@ from vvgt_cli.errors import DataError, UsageError, VvgtError
 from vvgt_cli.synth import open_volume
 from vvgt_cli.volume import ReadOptions, read_volume
 from vvgt_cli.volume.blocks import parse_numbers
-from vvgt_cli.volume.registry import Reader, known_suffixes, register, volume_name
+from vvgt_cli.volume.readers import Reader, known_suffixes, register, volume_name
 
 NRRD = b"NRRD0004\ntype: uchar\ndimension: 3\nsizes: 2 2 2\nencoding: raw\n\n" + bytes(range(8))
 HEADS = (

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vvgt_cli.descent import OptimizeOptions, OptimizeRecord
+from vvgt_cli.descent.options import OptimizeOptions, OptimizeRecord
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import Gaussians

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from vvgt_cli.cameras import Camera
-from vvgt_cli.descent import OptimizeOptions
+from vvgt_cli.descent.options import OptimizeOptions
 from vvgt_cli.descent.states import Fields
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.splat import Projection

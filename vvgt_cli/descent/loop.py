@@ -11,9 +11,9 @@ import numpy as np
 
 from vvgt_cli.cameras import Camera
 from vvgt_cli.cameras.blocks import BLOCK, Blocks
-from vvgt_cli.descent import Check, OptimizeOptions, OptimizeRecord, Progress, Train
 from vvgt_cli.descent.checkpoint import fingerprint, resume, save
 from vvgt_cli.descent.densify import Densified
+from vvgt_cli.descent.options import Check, OptimizeOptions, OptimizeRecord, Progress, Train
 from vvgt_cli.descent.states import Fields, OwnFrame
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import Gaussians

@@ -22,7 +22,7 @@ from vvgt_cli.volume.components import select_component
 from vvgt_cli.volume.dicom_select import choose_series, one_stack
 from vvgt_cli.volume.libraries import library_errors, need
 from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.registry import Reader, register
+from vvgt_cli.volume.readers import Reader, register
 from vvgt_cli.volume.types import Volume
 
 MOST = 100_000  # files

@@ -8,7 +8,8 @@ from pathlib import Path
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.registry import read_volume, register_scheme
+from vvgt_cli.volume.readers import register_scheme
+from vvgt_cli.volume.registry import read_volume
 from vvgt_cli.volume.types import Volume
 
 # (text behind the name, options) -> Volume

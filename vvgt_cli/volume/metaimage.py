@@ -15,7 +15,7 @@ from vvgt_cli.volume.blocks import data_file, load_block
 from vvgt_cli.volume.components import select_component
 from vvgt_cli.volume.headers import MAX_HEADER, Fields, unit_rows
 from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.registry import Reader, register, volume_name
+from vvgt_cli.volume.readers import Reader, register, volume_name
 from vvgt_cli.volume.types import Volume
 
 # MET_LONG has 4 bytes whatever the machine (MetaIO, metaTypes.h).

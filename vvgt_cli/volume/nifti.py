@@ -21,7 +21,7 @@ from vvgt_cli.volume.components import select_component
 from vvgt_cli.volume.headers import unit_rows
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.packed import packed
-from vvgt_cli.volume.registry import Reader, register, volume_name
+from vvgt_cli.volume.readers import Reader, register, volume_name
 from vvgt_cli.volume.types import FLAT, IDENTITY, Volume
 
 _DTYPES = {

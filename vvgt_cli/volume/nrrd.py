@@ -18,7 +18,7 @@ from vvgt_cli.volume.headers import MAX_HEADER, Fields, unit_rows
 from vvgt_cli.volume.nrrd_files import data_names, load_files
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.packed import Packed, packed
-from vvgt_cli.volume.registry import Reader, register, volume_name
+from vvgt_cli.volume.readers import Reader, register, volume_name
 from vvgt_cli.volume.space import millimetres
 from vvgt_cli.volume.types import Volume
 

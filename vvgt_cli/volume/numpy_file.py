@@ -18,7 +18,7 @@ from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.blocks import MAX_RATIO, check_memory, count, fill, load_block, size_text
 from vvgt_cli.volume.labelled import Axis, labelled_volume
 from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.registry import Reader, register, volume_name
+from vvgt_cli.volume.readers import Reader, register, volume_name
 from vvgt_cli.volume.types import Volume
 
 _HEADER = 1 << 16

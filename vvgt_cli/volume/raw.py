@@ -19,7 +19,7 @@ from vvgt_cli.volume.components import select_component
 from vvgt_cli.volume.options import ReadOptions, parse_dtype
 from vvgt_cli.volume.order import likelier_dims
 from vvgt_cli.volume.packed import packed
-from vvgt_cli.volume.registry import Reader, register, volume_name
+from vvgt_cli.volume.readers import Reader, register, volume_name
 from vvgt_cli.volume.types import Volume
 
 _NAME = re.compile(r"(?:^|_)(\d+)x(\d+)x(\d+)_(u?int(?:8|16|32|64)|float(?:16|32|64))\.raw(?:\.gz)?$", re.IGNORECASE)

@@ -1,8 +1,4 @@
-"""The registry of readers: formats are found by content first, then by name.
-
-A reader is a module that ends in one ``register(Reader(...))``; a scheme (``example:``) is one
-``register_scheme(name, function)``.
-"""
+"""Reading by the table of `readers`: formats are found by content first, then by name."""
 
 from __future__ import annotations
 
@@ -11,89 +7,18 @@ import os
 import re
 import struct
 import zlib
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
 from vvgt_cli.errors import DataError, SeveralSteps, UsageError, VvgtError
 from vvgt_cli.files import seekable
 from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.readers import HEAD_BYTES, READERS, SCHEMES, Reader, known_suffixes
 from vvgt_cli.volume.space import in_space
 from vvgt_cli.volume.types import Volume
 
-HEAD_BYTES = 4096
 LOOKED_AT = 2000  # files of a folder
-
-
-@dataclass(frozen=True)
-class Reader:
-    """A volume format.
-
-    Attributes:
-        name: for messages.
-        suffixes: lower-case endings of file names, with the dot.
-        sniff: does a file with these first `HEAD_BYTES` (unzipped) bytes have this format?
-        read: path and options to volume.
-        unzips: reads gzip-compressed files by itself.
-        named_arrays: takes ``--array``.
-        times: takes ``--time``.
-        raw_layout: takes dims, dtype, byte order and header bytes.
-        by_name: tried on a file that only its name speaks for (formats without a fixed beginning).
-        resamples: takes ``--dims`` as the grid to sample on.
-        holds: does this folder hold the format? Of formats that are folders.
-        by_whole: such a folder is one volume whatever else lies in it.
-    """
-
-    name: str
-    suffixes: tuple[str, ...]
-    sniff: Callable[[bytes], bool]
-    read: Callable[[Path, ReadOptions], Volume]
-    unzips: bool = False
-    named_arrays: bool = False
-    times: bool = False
-    raw_layout: bool = False
-    by_name: bool = False
-    resamples: bool = False
-    holds: Callable[[Path], bool] | None = None
-    by_whole: bool = False
-
-
-Scheme = Callable[[str, ReadOptions], Volume]
-
-_READERS: list[Reader] = []
-_SCHEMES: dict[str, Scheme] = {}
-
-
-def register(reader: Reader) -> Reader:
-    """Add a reader; the earlier one wins where two recognise a file."""
-    if any(not s.startswith(".") or s != s.lower() for s in reader.suffixes):
-        raise ValueError(f"{reader.name}: suffixes must be lower case and start with a dot")
-    if reader.name in (r.name for r in _READERS):
-        raise ValueError(f"{reader.name}: registered twice")
-    _READERS.append(reader)
-    return reader
-
-
-def register_scheme(name: str, open_scheme: Scheme) -> None:
-    """Make ``NAME:rest`` a source: ``open_scheme(rest, options) -> Volume``."""
-    _SCHEMES[name] = open_scheme
-
-
-def known_suffixes() -> list[str]:
-    """Every file-name ending that a reader is registered for."""
-    return [suffix for reader in _READERS for suffix in reader.suffixes]
-
-
-def volume_name(path: Path) -> str:
-    """Short name of a file: without folder, known endings and the raw layout in its name."""
-    name = path.name
-    for suffix in sorted(known_suffixes(), key=len, reverse=True):
-        if name.lower().endswith(suffix):
-            name = name[: -len(suffix)]
-            break
-    name = re.sub(r"_\d+x\d+x\d+_u?(int|float)\d+$", "", name)
-    return name or path.name
 
 
 def read_volume(source: str, options: ReadOptions | None = None) -> Volume:
@@ -112,7 +37,7 @@ def read_volume(source: str, options: ReadOptions | None = None) -> Volume:
         UsageError: options that the format does not take, or a choice (array, component, dims) that is missing.
     """
     options = options or ReadOptions()
-    if options.time is not None and (source == "-" or source.partition(":")[0] in _SCHEMES):
+    if options.time is not None and (source == "-" or source.partition(":")[0] in SCHEMES):
         raise UsageError(f"{source}: one volume, no time steps; leave out --time {options.time}")
     return in_space(_read(source, options), options.space)
 
@@ -124,8 +49,8 @@ def _read(source: str, options: ReadOptions) -> Volume:
 
         return read_stdin(options)
     scheme, colon, rest = source.partition(":")
-    if colon and scheme in _SCHEMES:
-        return _SCHEMES[scheme](rest, options)
+    if colon and scheme in SCHEMES:
+        return SCHEMES[scheme](rest, options)
     path, options = _inner(source, options)
     if (kept := seekable(path)) != path:
         return _from_pipe(kept, path, source, options)
@@ -190,7 +115,7 @@ def _slices(source: str, options: ReadOptions) -> Volume | None:
 def _folder(path: Path, source: str) -> Reader:
     """The reader of a folder; none where more of its files are volumes of other formats."""
     lying = _lying(path)
-    for reader in _READERS:
+    for reader in READERS:
         if reader.holds is not None and reader.holds(path):
             own = len(lying.get(reader.name.removesuffix(" slices"), []))
             if reader.by_whole or 2 * own >= sum(map(len, lying.values())):
@@ -199,7 +124,7 @@ def _folder(path: Path, source: str) -> Reader:
         listing = "; ".join(f"{len(names)} {kind} ({', '.join(names[:3])}{', ...' if len(names) > 3 else ''})"
                             for kind, names in lying.items())  # fmt: skip
         raise DataError(f"{source}: a folder; expected one volume, found {listing}: give one of the files")
-    kinds = ", ".join(reader.name for reader in _READERS if reader.holds is not None)
+    kinds = ", ".join(reader.name for reader in READERS if reader.holds is not None)
     raise DataError(
         f"{source}: a folder; expected a volume file ({', '.join(known_suffixes())}) or a folder of {kinds}"
     )
@@ -216,7 +141,7 @@ def _lying(path: Path) -> dict[str, list[str]]:
                     head = file.read(HEAD_BYTES)
             except OSError:
                 continue
-            reader = next((r for r in _READERS if r.holds is not None and head and r.sniff(head)), None)
+            reader = next((r for r in READERS if r.holds is not None and head and r.sniff(head)), None)
         if reader is not None:
             found.setdefault(reader.name, []).append(name)
     return found
@@ -228,7 +153,7 @@ def _head(path: Path, source: str) -> bytes:
         with open(path, "rb") as file:
             head = file.read(HEAD_BYTES)
     except FileNotFoundError:
-        hint = "" if ":" not in source else f" (schemes: {', '.join(s + ':' for s in _SCHEMES)})"
+        hint = "" if ":" not in source else f" (schemes: {', '.join(s + ':' for s in SCHEMES)})"
         raise DataError(f"{source}: no such file; expected a volume file, - or example:NAME{hint}") from None
     except (OSError, ValueError) as error:
         raise DataError(f"{source}: cannot be read ({getattr(error, 'strerror', None) or error})") from error
@@ -246,12 +171,12 @@ def _by_content(path: Path, head: bytes) -> tuple[Reader | None, bool]:
                 head = file.read(HEAD_BYTES)
         except (OSError, EOFError, zlib.error):
             return None, True
-    return next((r for r in _READERS if r.sniff(head)), None), zipped
+    return next((r for r in READERS if r.sniff(head)), None), zipped
 
 
 def _by_name(path: Path) -> Reader | None:
     name = path.name.lower()
-    fits = [(len(s), r) for r in _READERS for s in r.suffixes if name.endswith(s)]
+    fits = [(len(s), r) for r in READERS for s in r.suffixes if name.endswith(s)]
     return max(fits, key=lambda fit: fit[0])[1] if fits else None
 
 

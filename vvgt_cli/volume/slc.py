@@ -15,7 +15,7 @@ from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import check_memory, load_block
 from vvgt_cli.volume.components import select_component
 from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.registry import Reader, register, volume_name
+from vvgt_cli.volume.readers import Reader, register, volume_name
 from vvgt_cli.volume.types import Volume
 
 # magic, sizes, bits, spacing, (unit, data origin, modification), coding, icon size

@@ -11,7 +11,7 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import check_memory
 from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.registry import Reader, register
+from vvgt_cli.volume.readers import Reader, register
 from vvgt_cli.volume.tiff import SUFFIXES, read_tiff
 from vvgt_cli.volume.types import Volume
 

@@ -24,7 +24,7 @@ from vvgt_cli.volume.blocks import check_memory, size_text
 from vvgt_cli.volume.components import contiguous, magnitude
 from vvgt_cli.volume.libraries import library_errors
 from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.registry import Reader, register, volume_name
+from vvgt_cli.volume.readers import Reader, register, volume_name
 from vvgt_cli.volume.tiff_decode import Pages
 from vvgt_cli.volume.tiff_facts import Facts, imagej_facts, ome_facts, ome_root
 from vvgt_cli.volume.tiff_pages import check_pages

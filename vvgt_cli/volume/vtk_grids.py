@@ -18,7 +18,7 @@ from vvgt_cli.volume.blocks import check_memory, count, size_text
 from vvgt_cli.volume.components import ArrayInfo, choose_array, select_component
 from vvgt_cli.volume.headers import unit_rows
 from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.registry import Reader, register, volume_name
+from vvgt_cli.volume.readers import Reader, register, volume_name
 from vvgt_cli.volume.resample import resample
 from vvgt_cli.volume.types import Volume
 from vvgt_cli.volume.vtk_blocks import check_blocks

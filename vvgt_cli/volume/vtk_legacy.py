@@ -19,7 +19,7 @@ from vvgt_cli.volume.blocks import load_block, parse_numbers, tokens
 from vvgt_cli.volume.components import ArrayInfo, choose_array, select_component
 from vvgt_cli.volume.headers import unit_rows
 from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.registry import Reader, register, volume_name
+from vvgt_cli.volume.readers import Reader, register, volume_name
 from vvgt_cli.volume.types import Volume
 
 # vtkIdType is stored as int; long is that of a 64-bit machine; colour is our name for COLOR_SCALARS in text, 0 to 1.

@@ -18,7 +18,7 @@ from vvgt_cli.volume.hdf5 import MAX_CHUNK, MOST_LISTED
 from vvgt_cli.volume.labelled import Axis, axis, labelled_volume
 from vvgt_cli.volume.libraries import library_errors, need
 from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.registry import Reader, register
+from vvgt_cli.volume.readers import Reader, register
 from vvgt_cli.volume.types import Volume
 
 _CODECS = {

@@ -14,7 +14,7 @@ from vvgt_cli.volume.openvdb.cursor import Cursor
 from vvgt_cli.volume.openvdb.layout import bounding_box, brick_array
 from vvgt_cli.volume.openvdb.tree import Tree, TreeReader
 from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.registry import Reader, register, volume_name
+from vvgt_cli.volume.readers import Reader, register, volume_name
 from vvgt_cli.volume.types import Volume
 
 
