@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -146,9 +147,9 @@ def parse_header(content: bytes, name: str) -> PlyHeader:
     return PlyHeader(size, count, dtype, degree, tuple(comments), **_provenance(comments, name))
 
 
-def _provenance(comments: list[str], name: str) -> dict:
+def _provenance(comments: list[str], name: str) -> dict[str, Any]:
     """Fields of `PlyHeader` that our own comments carry."""
-    found: dict = {}
+    found: dict[str, Any] = {}
     for comment in comments:
         words = comment.split()
         if len(words) < 2 or words[0] != "vvgt":
@@ -162,7 +163,7 @@ def _provenance(comments: list[str], name: str) -> dict:
     return found
 
 
-def _one_comment(words: list[str]) -> dict:
+def _one_comment(words: list[str]) -> dict[str, Any]:
     if words[0] == "frame":
         if words[1] not in ("unit", "world"):
             raise ValueError(words[1])

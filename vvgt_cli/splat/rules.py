@@ -44,10 +44,6 @@ class Rule:
     min_variance: float = 0.0
     min_transmittance: float = MIN_TRANSMITTANCE
 
-    def dilated(self, dilation: float) -> Rule:
-        """The same with another dilation, px^2."""
-        return replace(self, dilation=dilation)
-
     def at(self, ratio: float) -> Rule:
         """The rule for views of ``ratio`` times the size: they show what the whole size does, at fewer points."""
         return replace(self, dilation=self.dilation * ratio**2, min_variance=self.min_variance * ratio**2)

@@ -35,7 +35,7 @@ def volume_of(values: np.ndarray, name: str) -> Volume:
     nz, ny, nx = values.shape
     h = 2.0 / max(nx, ny, nz)
     origin = tuple(-(n - 1) / 2 * h for n in (nx, ny, nz))
-    return Volume(np.ascontiguousarray(values, np.float32), (h, h, h), origin, name=name)  # type: ignore[arg-type]
+    return Volume(np.ascontiguousarray(values, np.float32), (h, h, h), origin, name=name)
 
 
 def marschner_lobb(size: Size = 64, frequency: float = 6.0, alpha: float = 0.25) -> Volume:

@@ -40,4 +40,4 @@ def likelier_dims(data: np.ndarray) -> tuple[int, int, int] | None:
     best = int(np.argmin(unlike))
     if not np.isfinite(unlike).all() or not unlike[best] < LESS * unlike[0]:
         return None
-    return orders[best]  # type: ignore[return-value]
+    return orders[best]

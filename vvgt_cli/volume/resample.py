@@ -79,7 +79,7 @@ def resample(
     small = values.dtype.itemsize <= (4 if values.dtype.kind == "f" else 2)
     out = np.where(inside, sampled, np.nan).astype(np.float32 if small else np.float64).reshape(size[::-1])
     label = f"{name} (resampled to {_text(size)})"
-    return Volume(out, spacing, tuple(origin.tolist()), name=label)  # type: ignore[arg-type]
+    return Volume(out, spacing, tuple(origin.tolist()), name=label)
 
 
 def _text(size: Sequence[int]) -> str:
@@ -100,4 +100,4 @@ def _grid(
         wanted = np.where(thick, dims, 1)
     steps = np.where(thick, extent / wanted, 0.0)
     steps = np.where(thick, steps, steps[thick].mean() if thick.any() else 1.0)
-    return tuple(wanted.tolist()), tuple(steps.tolist())  # type: ignore[return-value]
+    return tuple(wanted.tolist()), tuple(steps.tolist())
