@@ -99,6 +99,7 @@ def test_an_affine_is_nibabels(field, tmp_path):
 
 def test_results_are_drawn_scored_and_shown(field, converted):
     assert converted.scores["psnr"] > 25
+    assert repr(converted).startswith(f"<Conversion: {len(converted.gaussians)} Gaussians, ")
     assert [stage.name for stage in converted.stages][:3] == ["read", "scene", "closed form"]
     image = converted.render()
     assert image.shape == (48, 48, 4)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 FROM_THE_SIDE = 4  # test view that pictures show where none is asked for
 
 
-@dataclass
+@dataclass(repr=False)
 class Result:
     """Gaussians of a conversion or a refinement.
 
@@ -38,6 +38,11 @@ class Result:
     gaussians: Gaussians
     report: ConversionReport
     ply: PlyOptions
+
+    def __repr__(self) -> str:
+        scores = self.scores
+        psnr = "" if scores is None else f", {scores['psnr']:.2f} dB"
+        return f"<{type(self).__name__}: {len(self.gaussians)} Gaussians{psnr}, {self.report.seconds:.1f} s>"
 
     @property
     def scores(self) -> dict[str, Any] | None:
@@ -109,7 +114,7 @@ class Result:
         return render(self.gaussians, camera, rule_of(rule or self.ply.rule or INRIA))
 
 
-@dataclass
+@dataclass(repr=False)
 class Conversion(Result):
     """What became of a volume under a transfer function.
 
