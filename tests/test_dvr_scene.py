@@ -101,7 +101,7 @@ def test_scenes_have_layouts_that_pass(kind, shape):
 
 
 def test_runs_are_read_from_checked_voxels_alone():
-    values = np.zeros((4, 4, 4), np.float32)
+    values = np.linspace(0, 1, 64, dtype=np.float32).reshape(4, 4, 4)
     scene = Scene.build(Volume(values), Ramp(0, 1), 1.0)
 
     @nb.njit
