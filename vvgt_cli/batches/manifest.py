@@ -154,7 +154,8 @@ def read_manifest(path: Path, what: str = "views") -> dict[str, Any]:
         known, entries = False, []
     if not known or any(name.is_absolute() or ".." in name.parts for name, _, _ in entries):
         raise DataError(f"{path}: not a manifest of '{COMMANDS[what]}' (schema {SCHEMA}); {FRESH}")
-    return document
+    result: dict[str, Any] = document
+    return result
 
 
 def difference(there: dict[str, Any], here: dict[str, Any], what: str = "views") -> str:

@@ -84,4 +84,5 @@ def quaternion(rotation: np.ndarray) -> tuple[float, float, float, float]:
 
 
 def _bytes(colors: np.ndarray) -> np.ndarray:
-    return np.rint(np.clip(colors, 0, 1) * 255).astype(np.uint8)
+    result: np.ndarray = np.rint(np.clip(colors, 0, 1) * 255).astype(np.uint8)
+    return result

@@ -50,7 +50,8 @@ class Camera:
     @property
     def position(self) -> np.ndarray:
         """Centre of projection in the unit frame, (3,)."""
-        return -self.rotation.T @ self.translation
+        result: np.ndarray = -self.rotation.T @ self.translation
+        return result
 
     def resized(self, factor: float) -> Camera:
         """The same view with ``factor`` times the pixels along each axis."""

@@ -80,7 +80,7 @@ class Hard:
 def build(data: np.ndarray | Volume, tf: TransferFunction, distance: float = 1.0) -> Scene:
     """A scene; voxels of edge 1 where only an array is given."""
     volume = data if isinstance(data, Volume) else Volume(data)
-    return Scene.build(volume, tf, distance)  # type: ignore[arg-type]  # frozen, the protocol's name is not
+    return Scene.build(volume, tf, distance)  # frozen, the protocol's name is not
 
 
 def _scene(data: np.ndarray, tf: TransferFunction, spacing: tuple[float, float, float] = (1.0,) * 3) -> Scene:

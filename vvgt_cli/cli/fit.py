@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -32,7 +33,7 @@ fit_options = group(
 RULES = ("inria", "compensated", "spark", "playcanvas", "viser")  # `vvgt_cli.splat.rules.RULES`; a test compares
 
 
-def rule_option(help: str, default: str | None = None) -> Any:
+def rule_option(help: str, default: str | None = None) -> Callable[[Any], Any]:
     """``--rule``."""
     return click.option(
         "--rule", type=click.Choice(RULES), default=default, show_default=default is not None, help=help

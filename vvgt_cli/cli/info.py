@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import click
 
 from vvgt_cli.cli.options import common_options, placed_read_options
@@ -13,7 +15,7 @@ from vvgt_cli.progress import Console
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of lines.")
 @placed_read_options
 @common_options
-def command(file: str, as_json: bool, read: dict, console: Console) -> None:
+def command(file: str, as_json: bool, read: dict[str, Any], console: Console) -> None:
     """Say what FILE holds, found out from its content: a volume, a transfer function, a view set
     (transforms.json) or a .ply of Gaussians.
 

@@ -50,7 +50,8 @@ class LazyGroup(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in COMMANDS:
             return None
-        return importlib.import_module(COMMANDS[cmd_name]).command
+        result: click.Command = importlib.import_module(COMMANDS[cmd_name]).command
+        return result
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]

@@ -66,7 +66,7 @@ def command_line(ctx: click.Context) -> str:
 @common_options
 @click.pass_context
 def command(
-    ctx: click.Context, paths: tuple[str, ...], output: str, compare: bool, console: Console, **options: Any
+    ctx: click.Context, /, paths: tuple[str, ...], output: str, compare: bool, console: Console, **options: Any
 ) -> None:
     """Make the Gaussians of VOLUME by ever dearer means and show what each costs and gains.
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import click
 
 from vvgt_cli.cli.options import common_options, overwrite_option, read_options, tf_range_option
@@ -22,7 +24,7 @@ def command() -> None:
 @overwrite_option
 @common_options
 def show(
-    tf: str, output: str, volume: str | None, tf_range: str, read: dict, overwrite: bool, console: Console
+    tf: str, output: str, volume: str | None, tf_range: str, read: dict[str, Any], overwrite: bool, console: Console
 ) -> None:
     """Draw the colours and the opacity of TF, over the histogram of --volume where one is given.
 
@@ -70,7 +72,7 @@ def convert(tf: str, output: str, form: str, tf_range: str, overwrite: bool, con
 @read_options
 @overwrite_option
 @common_options
-def suggest(volume: str, number: int, output: str, read: dict, overwrite: bool, console: Console) -> None:
+def suggest(volume: str, number: int, output: str, read: dict[str, Any], overwrite: bool, console: Console) -> None:
     """Write N transfer functions for VOLUME, each of which shows one range of its values in a colour of its own.
 
     The ranges follow from the histogram: the background is left out, the rest is shared evenly, half by value

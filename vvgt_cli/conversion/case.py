@@ -126,4 +126,4 @@ def _pace() -> float:
     import numba
 
     values = np.random.default_rng(0).random(200_000)
-    return _quickest(lambda: np.sort(values)) / SORT * (2 / numba.get_num_threads()) ** 0.7
+    return float(_quickest(lambda: np.sort(values)) / SORT * (2 / numba.get_num_threads()) ** 0.7)

@@ -112,4 +112,4 @@ def add_ssim_gradient(image: np.ndarray, target: np.ndarray, weight: float, grad
         blur(fields[:3], KERNEL, padded[:3], blurred[:3])
         add_gradient(blurred[:3], x, y, np.float32(-weight), channel, grad)
         total += float(score.sum(dtype=np.float64))
-    return total / (3 * h * w)
+    return float(total / (3 * h * w))

@@ -113,7 +113,8 @@ class Fields:
 
     @property
     def colors(self) -> np.ndarray:
-        return np.maximum(self.arrays[4], 0)
+        result: np.ndarray = np.maximum(self.arrays[4], 0)
+        return result
 
     def project(self, camera: Camera, rule: Rule = INRIA) -> Projection:
         return project(self.gaussians(), camera, rule)

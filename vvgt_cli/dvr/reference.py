@@ -81,4 +81,5 @@ def render_view_reference(scene: Scene, camera: Camera, step: float = 0.125, sam
     origin, directions = rays(camera, samples)
     flat = directions.reshape(-1, 3)
     parts = [march(scene, origin, flat[i : i + RAYS], step) for i in range(0, len(flat), RAYS)]
-    return np.concatenate(parts).reshape(camera.height, camera.width, samples**2, 4).mean(axis=2)
+    result: np.ndarray = np.concatenate(parts).reshape(camera.height, camera.width, samples**2, 4).mean(axis=2)
+    return result

@@ -32,7 +32,7 @@ quad = QuadType()
 @register_model(QuadType)
 class _QuadModel(models.PrimitiveModel):
     def __init__(self, manager: Any, kind: Any) -> None:
-        super().__init__(manager, kind, QUAD)
+        super().__init__(manager, kind, QUAD)  # type: ignore[no-untyped-call]
 
 
 def _splat(builder: Any, scalar: Any) -> Any:

@@ -47,7 +47,8 @@ def _quaternion_product(left: tuple[float, ...], right: np.ndarray) -> np.ndarra
     """Hamilton product of one quaternion (w, x, y, z) with (K, 4), float64."""
     w, x, y, z = left
     table = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
-    return right @ table.T
+    result: np.ndarray = right @ table.T
+    return result
 
 
 def turn(gaussians: Gaussians, up: str, *, inverse: bool = False) -> Gaussians:

@@ -113,7 +113,7 @@ def _attend(process: Any, order: bytes, count: int, progress: Callable[[int, int
     for done, _ in enumerate(process.stdout, 1):
         if progress:
             progress(done, count)
-    return process.wait() == 0
+    return bool(process.wait() == 0)
 
 
 def _kill(process: Any) -> None:

@@ -51,7 +51,8 @@ def flip_map(reference: np.ndarray, ours: np.ndarray, pixels_per_degree: float =
     features = [_features(image[0], pixels_per_degree) for image in opponent]
     edges, points = (np.abs(a - b) for a, b in zip(*features, strict=True))
     feature = (np.maximum(edges, points) / np.float32(math.sqrt(2))) ** np.float32(Q_F)
-    return error ** (1 - np.clip(feature, 0, 1))
+    result: np.ndarray = error ** (1 - np.clip(feature, 0, 1))
+    return result
 
 
 def _opponent(srgb: np.ndarray) -> np.ndarray:
@@ -70,7 +71,8 @@ def _opponent(srgb: np.ndarray) -> np.ndarray:
 
 def _mix(matrix: np.ndarray, planes: np.ndarray) -> np.ndarray:
     """3 x 3 matrix times planes (3, h, w), float32."""
-    return (matrix.astype(np.float32) @ planes.reshape(3, -1)).reshape(planes.shape)
+    result: np.ndarray = (matrix.astype(np.float32) @ planes.reshape(3, -1)).reshape(planes.shape)
+    return result
 
 
 def _padded(plane: np.ndarray, radius: int) -> np.ndarray:
@@ -107,7 +109,8 @@ def _hunt_lab(linear: np.ndarray) -> np.ndarray:
 def _hyab(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """HyAB distance of L*a*b* planes (3, h, w) -> (h, w) (equation 5)."""
     difference = a - b
-    return np.abs(difference[0]) + np.hypot(difference[1], difference[2])
+    result: np.ndarray = np.abs(difference[0]) + np.hypot(difference[1], difference[2])
+    return result
 
 
 def _redistributed(distance: np.ndarray) -> np.ndarray:
@@ -140,4 +143,5 @@ def _features(y: np.ndarray, ppd: float) -> tuple[np.ndarray, np.ndarray]:
 
 def _balanced(kernel: np.ndarray) -> np.ndarray:
     """Positive weights scaled to a sum of 1, negative ones to -1."""
-    return np.where(kernel < 0, kernel / -kernel[kernel < 0].sum(), kernel / kernel[kernel > 0].sum())
+    result: np.ndarray = np.where(kernel < 0, kernel / -kernel[kernel < 0].sum(), kernel / kernel[kernel > 0].sum())
+    return result

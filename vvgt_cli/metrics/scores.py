@@ -129,8 +129,10 @@ def _mean(values: list[float | None]) -> float | None:
 
 
 def _over_black(image: np.ndarray) -> np.ndarray:
-    return np.clip(image[..., :3], 0, 1)
+    result: np.ndarray = np.clip(image[..., :3], 0, 1)
+    return result
 
 
 def _over_white(image: np.ndarray) -> np.ndarray:
-    return np.clip(over(image, 1.0), 0, 1)
+    result: np.ndarray = np.clip(over(image, 1.0), 0, 1)
+    return result

@@ -174,7 +174,8 @@ class NetworkConfig:
         sides = {"image": ImageConfig, "geometry": GeometryConfig}
         try:
             known = {name: _exactly(side, values[name]) for name, side in sides.items()}
-            return _exactly(cls, {**values, **known})
+            result: NetworkConfig = _exactly(cls, {**values, **known})
+            return result
         except (KeyError, TypeError, ValueError) as error:
             raise DataError(f"network config: {error}; expected the fields of this version") from None
 

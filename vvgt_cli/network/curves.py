@@ -23,7 +23,8 @@ def spread(values: np.ndarray) -> np.ndarray:
 
 def interleave(cells: np.ndarray) -> np.ndarray:
     """Z-order code (n,) int64 of ``cells`` (n, 3) non-negative integers below 2^21, first axis first."""
-    return spread(cells[:, 0]) << 2 | spread(cells[:, 1]) << 1 | spread(cells[:, 2])
+    result: np.ndarray = spread(cells[:, 0]) << 2 | spread(cells[:, 1]) << 1 | spread(cells[:, 2])
+    return result
 
 
 def hilbert(cells: np.ndarray, bits: int) -> np.ndarray:

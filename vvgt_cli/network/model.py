@@ -23,7 +23,8 @@ class ImageSide(nn.Module):
         self.maps = MultiScaleMaps(config.image)
 
     def forward(self, images: Tensor, poses: Tensor) -> list[Tensor]:
-        return self.maps(self.transformer(images, poses))
+        result: list[Tensor] = self.maps(self.transformer(images, poses))
+        return result
 
 
 class GeometrySide(nn.Module):

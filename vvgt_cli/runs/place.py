@@ -78,7 +78,8 @@ def remarks(volume: Volume, ply: PlyOptions) -> list[str]:
 
 def upright(volume: Volume, up: str) -> np.ndarray:
     """(3, 3): box frame to a frame with world directions in which ``up`` is +z; what previews are seen in."""
-    return upright_matrix(up) @ volume.axes
+    result: np.ndarray = upright_matrix(up) @ volume.axes
+    return result
 
 
 def preview(

@@ -94,7 +94,7 @@ def _moments_tile(entries, slots, extent, flat, colors, ox, oy, rule, buf, pairs
         y0, y1 = rows(extent[k, 1] - oy, extent[k, 3] - oy, a, b, c, u, v, opacity, rule)
         _sweep(y0, y1, k, colors, a, b, c, u, v, opacity, rule, buf)
         s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = s8 = ZERO
-        for i in range(_T):  # type: ignore[assignment]
+        for i in range(_T):
             dx = f32(np.int32(i)) + HALF - u
             s0 += buf[_A6 + i]
             s1 += buf[_A0 + i] * dx

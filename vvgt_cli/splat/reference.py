@@ -29,7 +29,8 @@ def rotations(quaternions: np.ndarray) -> np.ndarray:
 def covariances(gaussians: Gaussians) -> np.ndarray:
     """``R diag(s^2) R^T``, (K, 3, 3) float64, unit-frame lengths squared."""
     factors = rotations(gaussians.quaternions) * np.exp(gaussians.log_scales.astype(np.float64))[:, None, :]
-    return factors @ factors.transpose(0, 2, 1)
+    result: np.ndarray = factors @ factors.transpose(0, 2, 1)
+    return result
 
 
 def project(gaussians: Gaussians, camera: Camera, rule: Rule = INRIA) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

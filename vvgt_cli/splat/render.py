@@ -107,7 +107,8 @@ def tile_by_tile() -> AbstractContextManager[None]:
     """
     import numba
 
-    return numba.parallel_chunksize(1)
+    result: AbstractContextManager[None] = numba.parallel_chunksize(1)
+    return result
 
 
 def blend(

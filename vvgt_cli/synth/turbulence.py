@@ -55,7 +55,7 @@ class Flow:
 
 def resolved_viscosity(size: int, power: float = POWER) -> float:
     """nu with which the smallest eddies just fit: kmax eta = `RESOLVED`, eta = (nu^3 / P)^(1/4), kmax = size / 3."""
-    return (RESOLVED * 3 / size) ** (4 / 3) * power ** (1 / 3)
+    return float((RESOLVED * 3 / size) ** (4 / 3) * power ** (1 / 3))
 
 
 class Solver:
@@ -82,7 +82,8 @@ class Solver:
 
     def project(self, modes: np.ndarray) -> np.ndarray:
         """The divergence-free part of (3, ...)."""
-        return modes - self.k * ((self.k * modes).sum(axis=0) * self.over_k2)
+        result: np.ndarray = modes - self.k * ((self.k * modes).sum(axis=0) * self.over_k2)
+        return result
 
     def curl(self, u: np.ndarray) -> np.ndarray:
         """Vorticity's modes."""
@@ -129,7 +130,8 @@ class Solver:
         b = self.slope(half * (state + dt / 2 * a))
         c = self.slope(half * state + dt / 2 * b)
         d = self.slope(half * (half * state + dt * c))
-        return half * (half * (state + dt / 6 * a) + dt / 3 * (b + c)) + dt / 6 * d
+        result: np.ndarray = half * (half * (state + dt / 6 * a) + dt / 3 * (b + c)) + dt / 6 * d
+        return result
 
     def courant_step(self, state: np.ndarray) -> float:
         """Largest dt that the fastest particle, and the fastest wave, allow."""

@@ -68,7 +68,8 @@ def load_lpips(config: LossConfig) -> Lpips | None:
     found = Lpips()
     state = _backbone(config.lpips_backbone) | _linear(config.lpips_linear)
     load_weights(found, state, f"{config.lpips_backbone}, {config.lpips_linear}")
-    return found.eval()
+    result: Lpips = found.eval()
+    return result
 
 
 def _backbone(path: str | Path) -> dict[str, Tensor]:

@@ -37,7 +37,8 @@ def delta_e(lab1: np.ndarray, lab2: np.ndarray) -> np.ndarray:
     sl = 1 + 0.015 * (mean_l - 50) ** 2 / np.sqrt(20 + (mean_l - 50) ** 2)
     sc, sh = 1 + 0.045 * mean_c, 1 + 0.015 * mean_c * t
     rt = -np.sin(2 * theta) * rc
-    return np.sqrt((dl / sl) ** 2 + (dc / sc) ** 2 + (dh / sh) ** 2 + rt * (dc / sc) * (dh / sh))
+    result: np.ndarray = np.sqrt((dl / sl) ** 2 + (dc / sc) ** 2 + (dh / sh) ** 2 + rt * (dc / sc) * (dh / sh))
+    return result
 
 
 @lru_cache(maxsize=1)

@@ -123,12 +123,14 @@ class ColorMap:
         x1, x2 = self.x[left], self.x[left + 1]
         if self.log_scale and self.x[0] > 0:
             x, x1, x2 = np.log10(x), np.log10(x1), np.log10(x2)
-        return (x - x1) / (x2 - x1)
+        result: np.ndarray = (x - x1) / (x2 - x1)
+        return result
 
     def _interpolate(self, left: np.ndarray, w: np.ndarray) -> np.ndarray:
         """Colour at weight w (n,) of the right node in the segments ``left`` (n,) -> (n, 3)."""
         if self.space == "Step":
-            return self.rgb[left + 1]
+            result: np.ndarray = self.rgb[left + 1]
+            return result
         if self.space == "Diverging":
             return _diverging(self.rgb[left], self.rgb[left + 1], w)
         if self.space == "Lab/CIEDE2000":
@@ -164,7 +166,8 @@ def _adjusted_hue(saturated: np.ndarray, other_m: np.ndarray) -> np.ndarray:
     with np.errstate(divide="ignore", invalid="ignore"):
         spin = s * np.sqrt(np.maximum(other_m**2 - m**2, 0)) / (m * np.sin(s))
     spun = np.where(h > -0.3 * np.pi, h + spin, h - spin)
-    return np.where(m >= other_m - 0.1, h, spun)
+    result: np.ndarray = np.where(m >= other_m - 0.1, h, spun)
+    return result
 
 
 def _angle(turn: np.ndarray) -> np.ndarray:

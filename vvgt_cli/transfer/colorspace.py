@@ -23,7 +23,8 @@ PROLAB_INVERSE_DIVISOR = np.array([-0.00862936717882646, -0.000243154854293407, 
 def rgb_to_xyz(rgb: np.ndarray) -> np.ndarray:
     """sRGB in [0, 1] to XYZ (vtkMath::RGBToXYZ)."""
     linear = np.where(rgb > 0.04045, ((rgb + 0.055) / 1.055) ** 2.4, rgb / 12.92)
-    return linear @ RGB_TO_XYZ.T
+    result: np.ndarray = linear @ RGB_TO_XYZ.T
+    return result
 
 
 def xyz_to_rgb(xyz: np.ndarray) -> np.ndarray:
@@ -32,7 +33,8 @@ def xyz_to_rgb(xyz: np.ndarray) -> np.ndarray:
     curved = 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055
     rgb = np.where(linear > 0.0031308, curved, 12.92 * linear)
     largest = rgb.max(axis=-1, keepdims=True)
-    return np.maximum(np.where(largest > 1.0, rgb / np.maximum(largest, 1.0), rgb), 0.0)
+    result: np.ndarray = np.maximum(np.where(largest > 1.0, rgb / np.maximum(largest, 1.0), rgb), 0.0)
+    return result
 
 
 def rgb_to_lab(rgb: np.ndarray) -> np.ndarray:
@@ -54,7 +56,8 @@ def lab_to_rgb(lab: np.ndarray) -> np.ndarray:
 def rgb_to_prolab(rgb: np.ndarray) -> np.ndarray:
     """sRGB to ProLab (vtkMath::RGBToProLab)."""
     xyz = rgb_to_xyz(np.asarray(rgb, dtype=np.float64)) / WHITE
-    return (xyz @ PROLAB.T) / (xyz @ PROLAB_DIVISOR + 1.0)[..., None]
+    result: np.ndarray = (xyz @ PROLAB.T) / (xyz @ PROLAB_DIVISOR + 1.0)[..., None]
+    return result
 
 
 def prolab_to_rgb(lab: np.ndarray) -> np.ndarray:
@@ -81,7 +84,8 @@ def hsv_to_rgb(hsv: np.ndarray) -> np.ndarray:
     """Hue in [0, 1], saturation, value to RGB (vtkMath::HSVToRGB)."""
     hue, saturation, value = (c[..., None] for c in np.moveaxis(hsv, -1, 0))
     pure = np.clip(np.abs((6 * hue + np.array([0.0, 4.0, 2.0])) % 6 - 3) - 1, 0, 1)
-    return value * (saturation * pure + 1 - saturation)
+    result: np.ndarray = value * (saturation * pure + 1 - saturation)
+    return result
 
 
 def lab_to_msh(lab: np.ndarray) -> np.ndarray:

@@ -14,7 +14,8 @@ STEP_ABOVE = 0.99  # sharpness above which a colour (not an opacity) is a step a
 def bend(s: np.ndarray, midpoint: np.ndarray) -> np.ndarray:
     """Move position s in [0, 1] of a segment so that ``midpoint`` lands on 0.5, (n,) -> (n,)."""
     m = np.clip(midpoint, MIDPOINT_MARGIN, 1 - MIDPOINT_MARGIN)
-    return np.where(s < m, 0.5 * s / m, 0.5 + 0.5 * (s - m) / (1.0 - m))
+    result: np.ndarray = np.where(s < m, 0.5 * s / m, 0.5 + 0.5 * (s - m) / (1.0 - m))
+    return result
 
 
 def compress(s: np.ndarray, sharpness: np.ndarray) -> np.ndarray:
@@ -33,7 +34,8 @@ def hermite_weight(s: np.ndarray, sharpness: np.ndarray) -> np.ndarray:
     """
     s2 = s * s
     s3 = s2 * s
-    return -2 * s3 + 3 * s2 + (1.0 - sharpness) * (2 * s3 - 3 * s2 + s)
+    result: np.ndarray = -2 * s3 + 3 * s2 + (1.0 - sharpness) * (2 * s3 - 3 * s2 + s)
+    return result
 
 
 def sorted_nodes(what: str, x: np.ndarray, *columns: np.ndarray) -> list[np.ndarray]:

@@ -67,7 +67,8 @@ class PiecewiseOpacity:
             if self.log_scale:
                 logged = (np.log10(x) - np.log10(x1)) / (np.log10(x2) - np.log10(x1))
                 s = np.where(x1 > 0, logged, s)
-        return np.clip(np.nan_to_num(s, nan=0.0), 0.0, 1.0)
+        result: np.ndarray = np.clip(np.nan_to_num(s, nan=0.0), 0.0, 1.0)
+        return result
 
     def moved(self, x: np.ndarray) -> PiecewiseOpacity:
         """The same values at other (n,) node positions, given in the order of ``self.x``."""

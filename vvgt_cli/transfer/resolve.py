@@ -101,7 +101,10 @@ def percentiles(statistics: StatisticsLike, fraction: np.ndarray) -> np.ndarray:
     cumulative = np.concatenate([[0.0], np.cumsum(counts)])
     if cumulative[-1] <= 0:
         raise DataError("the data have no finite voxel; expected some to take percentiles of")
-    return np.interp(fraction, cumulative / cumulative[-1], np.asarray(statistics.edges, dtype=np.float64))
+    result: np.ndarray = np.interp(
+        fraction, cumulative / cumulative[-1], np.asarray(statistics.edges, dtype=np.float64)
+    )
+    return result
 
 
 def unit_distance(spec: str | float | None, volume: Volume, tf: TransferFunction | None = None) -> tuple[float, str]:

@@ -16,7 +16,8 @@ BINS_PER_GAP = 8  # bins inside the narrowest gap between two nodes, where MAX_B
 
 def extinction(opacity: np.ndarray, unit_distance: float) -> np.ndarray:
     """``tau = -ln(1 - a) / d`` with a capped at 1 - 1e-5; ``opacity`` any shape, result per unit of d."""
-    return -np.log1p(-np.clip(opacity, 0.0, MAX_OPACITY)) / unit_distance
+    result: np.ndarray = -np.log1p(-np.clip(opacity, 0.0, MAX_OPACITY)) / unit_distance
+    return result
 
 
 @dataclass(frozen=True)

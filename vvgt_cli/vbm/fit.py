@@ -95,7 +95,8 @@ def _forward(projection: Projection, colors: np.ndarray, shape: tuple[int, ...])
 
 
 def _residual(projection: Projection, view: np.ndarray, colors: np.ndarray) -> np.ndarray:
-    return view[..., :3] - _forward(projection, colors, view.shape)
+    result: np.ndarray = view[..., :3] - _forward(projection, colors, view.shape)
+    return result
 
 
 def _back(projections: Sequence[Projection], images: Sequence[np.ndarray], count: int) -> np.ndarray:

@@ -228,4 +228,5 @@ def _active_blocks(scene: Scene, block: np.ndarray) -> np.ndarray:
         ahead[axis], behind[axis] = slice(1, None), slice(None, -1)
         mask[tuple(ahead)] |= mask[tuple(behind)].copy()
     bricks = np.argwhere(mask)[:, ::-1]  # (x, y, z)
-    return np.unique((bricks * BRICK // block)[:, ::-1], axis=0)[:, ::-1] * block
+    result: np.ndarray = np.unique((bricks * BRICK // block)[:, ::-1], axis=0)[:, ::-1] * block
+    return result

@@ -24,13 +24,15 @@ def _table() -> tuple[np.ndarray, np.ndarray]:
 
 def dilogarithm(o: np.ndarray) -> np.ndarray:
     """Li2(o) for o in [0, 0.99], any shape."""
-    return np.interp(o, *_table())
+    result: np.ndarray = np.interp(o, *_table())
+    return result
 
 
 def inverse_dilogarithm(y: np.ndarray) -> np.ndarray:
     """o in [0, 0.99] with Li2(o) = y; 0.99 where y is larger than Li2(0.99) = 1.59."""
     o, li2 = _table()
-    return np.interp(y, li2, o)
+    result: np.ndarray = np.interp(y, li2, o)
+    return result
 
 
 def peak_opacity(mass: np.ndarray, variances: np.ndarray, pixel: float) -> np.ndarray:
@@ -44,4 +46,5 @@ def peak_opacity(mass: np.ndarray, variances: np.ndarray, pixel: float) -> np.nd
         2 * np.pi * np.sqrt(np.stack([wide[:, 1] * wide[:, 2], wide[:, 0] * wide[:, 2], wide[:, 0] * wide[:, 1]], 1))
     )
     opacity = inverse_dilogarithm(mass[:, None] / areas + MIN_ALPHA)
-    return np.minimum((opacity * areas).sum(axis=1) / areas.sum(axis=1), MAX_ALPHA)
+    result: np.ndarray = np.minimum((opacity * areas).sum(axis=1) / areas.sum(axis=1), MAX_ALPHA)
+    return result

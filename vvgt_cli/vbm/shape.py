@@ -107,4 +107,5 @@ def quaternions(axes: np.ndarray) -> np.ndarray:
         axis=1,
     )  # (n, 4 candidates, 4): each row is the quaternion times four times its own component
     best = rows[np.arange(len(m)), squares.argmax(axis=1)]
-    return best / np.linalg.norm(best, axis=1, keepdims=True)
+    result: np.ndarray = best / np.linalg.norm(best, axis=1, keepdims=True)
+    return result

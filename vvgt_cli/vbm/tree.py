@@ -111,7 +111,8 @@ def split_score(tree: Tree) -> np.ndarray:
     area = np.cbrt(tree.edge.prod(axis=1)) ** 2
     variance = (m[:, XX] + m[:, YY] + m[:, ZZ]) / mass - (m[:, FIRST] ** 2).sum(axis=1) / mass**2
     seen = np.sqrt(tree.largest * m[:, SEEN] / mass)
-    return -np.expm1(-mass / area) * area * seen * np.maximum(variance, 0)
+    result: np.ndarray = -np.expm1(-mass / area) * area * seen * np.maximum(variance, 0)
+    return result
 
 
 def select(tree: Tree, budget: int, score: np.ndarray | None = None) -> np.ndarray:

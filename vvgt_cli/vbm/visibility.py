@@ -131,7 +131,9 @@ def _rays_a_cell(scene: Scene, cameras: Sequence[Camera], exponent: int) -> floa
     """How many rays of all views meet a cell near the centre, on average over directions."""
     x, y, z = np.minimum(1 << exponent, scene.values.shape[::-1]) * scene.step
     area = (x * y + y * z + z * x) / 2  # a convex body shows a quarter of its surface
-    return sum(area * camera.fx * camera.fy / max(float(camera.position @ camera.position), 1) for camera in cameras)
+    return float(
+        sum(area * camera.fx * camera.fy / max(float(camera.position @ camera.position), 1) for camera in cameras)
+    )
 
 
 def visibility(

@@ -54,7 +54,8 @@ def detail_energy(tree: Tree) -> np.ndarray:
         if np.array_equal(raised, energy[inner]):
             break
         energy[inner] = raised
-    return energy
+    result: np.ndarray = energy
+    return result
 
 
 def wavelet_gaussians(tree: Tree, budget: int, pixel: float) -> Gaussians:

@@ -57,11 +57,13 @@ class BrickArray:
             z = int(key) + (len(self) if key < 0 else 0)
             if not 0 <= z < len(self):
                 raise IndexError(f"slice {key} of {len(self)}")
-            return self._slices(z, z + 1)[0]
+            result: np.ndarray = self._slices(z, z + 1)[0]
+            return result
         if isinstance(key, slice) and key.step in (None, 1):
             start, stop, _ = key.indices(len(self))
             return self._slices(start, max(start, stop))
-        return self.whole()[key]
+        picked: np.ndarray = self.whole()[key]
+        return picked
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
         return np.array(self.whole(), dtype, copy=copy) if copy else np.asarray(self.whole(), dtype)

@@ -108,7 +108,7 @@ def read_dicom(path: Path, options: ReadOptions) -> Volume:
     return Volume(
         field, options.spacing_or(spacing), tuple(slices[0].position.tolist()), direction,
         f"{path.resolve().name.removesuffix('.dcm')}{title}", slope, intercept, "LPS", told,
-    )  # type: ignore[arg-type]  # fmt: skip
+    )  # fmt: skip
 
 
 def _frames(path: Path, header: Any) -> Iterator[_Slice]:
@@ -242,7 +242,8 @@ def _pixels(pydicom: Any, slices: list[_Slice], path: Path) -> tuple[np.ndarray,
 def _decoded(pydicom: Any, path: Path) -> np.ndarray:
     dataset = pydicom.dcmread(path)
     try:
-        return dataset.pixel_array
+        result: np.ndarray = dataset.pixel_array
+        return result
     except (NotImplementedError, RuntimeError) as error:  # a codec that pydicom does not have
         syntax = dataset.file_meta.TransferSyntaxUID
         package = next((package for name, package in CODECS.items() if name in syntax.name), None)

@@ -118,8 +118,8 @@ def read_inviwo(path: Path, options: ReadOptions) -> Volume:
     origin = tuple(_origin(fields, dims, spacing, direction).tolist())
     return Volume(
         field,
-        spacing,  # type: ignore[arg-type]
-        origin,  # type: ignore[arg-type]
+        spacing,
+        origin,
         direction,
         volume_name(path),
         slope,

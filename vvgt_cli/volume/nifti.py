@@ -12,6 +12,7 @@ import struct
 import zlib
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -90,7 +91,7 @@ def parse_header(head: bytes, name: str) -> Header:
         raise DataError(f"{name}: no NIfTI header (348 or 540 bytes with the magic n+1, ni1, n+2 or ni2)")
     order, version = found
 
-    def get(fmt: str, at: int) -> tuple:
+    def get(fmt: str, at: int) -> tuple[Any, ...]:
         return struct.unpack_from(order + fmt, head, at)
 
     if version == 1:

@@ -158,7 +158,8 @@ def _third(axes: list[list[float]]) -> np.ndarray:
     unit = np.reshape(unit_rows([*axes, [0.0, 0.0, 1.0]])[1], (3, 3)).T
     normal = np.cross(unit[0], unit[1])
     length = np.linalg.norm(normal)
-    return normal / length if length > 0 else unit[2]
+    result: np.ndarray = normal / length if length > 0 else unit[2]
+    return result
 
 
 def _space(fields: Fields) -> tuple[np.ndarray, str | None]:
@@ -228,7 +229,7 @@ def _volume(path: Path, fields: Fields, block: np.ndarray, sizes: list[int], opt
     axis = _component_axis(fields, sizes, vectors)
     spacing, direction, origin, space = _geometry(fields, vectors, axis)
     if isinstance(block, Packed):
-        return Volume(block, options.spacing_or(spacing), origin, direction, volume_name(path), space=space)  # type: ignore[arg-type]
+        return Volume(block, options.spacing_or(spacing), origin, direction, volume_name(path), space=space)
     block = block[..., None] if axis is None else np.moveaxis(block, len(sizes) - 1 - axis, -1)
     if block.ndim == 3:
         block = block[None]

@@ -79,4 +79,5 @@ def packed(
         return load_block(path, dtype, shape, offset=offset, encoding=encoding, skip=skip)
     check_packed(path, need, offset, encoding, skip)
     found: Any = Packed(path, dtype, shape, encoding, (offset, skip))
-    return found
+    result: np.ndarray = found
+    return result

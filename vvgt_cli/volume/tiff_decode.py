@@ -80,7 +80,8 @@ class Pages(ExitStack):
                 )
             pixels = image.read_image(page.index, 0, 0, spec.nchannels, spec.format)
             if pixels is not None:
-                return pixels.reshape(expected)
+                result: np.ndarray = pixels.reshape(expected)
+                return result
         text = _one_line(image.geterror())
         if keyframe.compression in _CODINGS:
             raise DataError(f"{self._path}: page {page.index} is damaged ({text})")
@@ -104,7 +105,8 @@ class Pages(ExitStack):
                 f"{self._path}: page {page.index} has {values.size} values of {values.dtype} when decoded; expected "
                 f"{keyframe.size} of {series.dtype}"
             )
-        return values
+        result: np.ndarray = values
+        return result
 
     def _check_segments(self, page: Any, keyframe: Any) -> None:
         """Refuse parts of a page that unpack to more than the page: tifffile's own decoders have no bound."""

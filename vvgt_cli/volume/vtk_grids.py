@@ -163,7 +163,8 @@ def _values(mesh: Any, info: ArrayInfo) -> np.ndarray:
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
     data = mesh.GetPointData() if info.where == "point" else mesh.GetCellData()
-    return vtk_to_numpy(data.GetArray(info.name))
+    result: np.ndarray = vtk_to_numpy(data.GetArray(info.name))
+    return result
 
 
 def _arrays(mesh: Any) -> list[ArrayInfo]:
@@ -213,7 +214,7 @@ def _image(image: Any, info: ArrayInfo, options: ReadOptions, source: str, name:
     values = _values(image, info).reshape(*dims[::-1], info.components)
     field, _ = select_component(values, options.component, source, label=f"array {info.name!r}")
     lengths, turned = unit_rows((direction * spacing).T.tolist())
-    return Volume(field, options.spacing_or(lengths), tuple(origin.tolist()), turned, name)  # type: ignore[arg-type]
+    return Volume(field, options.spacing_or(lengths), tuple(origin.tolist()), turned, name)
 
 
 def _is_vtkhdf(head: bytes) -> bool:

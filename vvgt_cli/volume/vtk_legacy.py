@@ -198,7 +198,8 @@ def _values(parser: Parser, array: _Array, shape: tuple[int, int, int]) -> np.nd
         dtype = np.dtype(_TYPES[array.type] or "u1")
         if array.type == "colour":
             shares = parse_numbers(parser.text, array.start, n, np.dtype("f4"), parser.path.name)
-            return np.round(np.clip(shares, 0, 1) * 255).astype(np.uint8).reshape(full)
+            result: np.ndarray = np.round(np.clip(shares, 0, 1) * 255).astype(np.uint8).reshape(full)
+            return result
         return parse_numbers(parser.text, array.start, n, dtype, parser.path.name).reshape(full)
     if array.type == "bit":
         packed = np.frombuffer(parser.text[array.start : array.start + (n + 7) // 8], np.uint8)

@@ -299,7 +299,8 @@ def _by_vtk(path: Path, info: ArrayInfo, shape: tuple[int, ...]) -> np.ndarray:
     values = vtk_to_numpy(array)
     if values.size != count(shape):
         raise DataError(f"{path}: array {info.name!r} has {values.size} values; expected {count(shape)}")
-    return values.reshape(shape)
+    result: np.ndarray = values.reshape(shape)
+    return result
 
 
 def is_xml(head: bytes, grid: bool) -> bool:

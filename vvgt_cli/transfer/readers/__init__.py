@@ -56,7 +56,8 @@ def _read(parsed: Any, what: str, pick: str) -> TransferFunction:
     """The function of a parsed file, by the first format that matches."""
     for reader in FORMATS:
         if reader.matches(parsed):
-            return reader.read(parsed, what, pick)
+            result: TransferFunction = reader.read(parsed, what, pick)
+            return result
     raise DataError(
         f"{what}: not a transfer function; expected a preset of ParaView or vtk.js (RGBPoints), an object with points, "
         "a volume property of 3D Slicer, XML of ParaView (ColorMap) or of Inviwo (Points)"

@@ -130,7 +130,8 @@ class TreeReader:
     def numbers(self, data: bytes | memoryview, dtype: np.dtype) -> np.ndarray:
         """Values of bytes, in native order and full precision."""
         if dtype.kind == "b":
-            return np.frombuffer(data, np.uint8) != 0
+            result: np.ndarray = np.frombuffer(data, np.uint8) != 0
+            return result
         return np.frombuffer(data, dtype).astype(self.dtype.newbyteorder("="))
 
     def bits(self, n: int) -> np.ndarray:
