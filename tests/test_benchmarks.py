@@ -15,6 +15,7 @@ from report_runs import document
 
 from vvgt_cli.cameras import default_views
 from vvgt_cli.dvr import RenderSettings
+from vvgt_cli.images import read_png
 from vvgt_cli.synth import open_volume
 from vvgt_cli.volume.nrrd_write import write_nrrd
 
@@ -22,10 +23,21 @@ ROOT = Path(__file__).parent.parent
 FOLDER = ROOT / "benchmarks"
 SIZE, MODEL = 24, "vvgt-small"
 RUN = (
-    *("closed_form", "dvr", "dvr_pixels", "dvr_steps", "dvr_vtk", "network", "optimize", "plan", "refinement"),
+    *(
+        "automatic",
+        "closed_form",
+        "dvr",
+        "dvr_pixels",
+        "dvr_steps",
+        "dvr_vtk",
+        "network",
+        "optimize",
+        "plan",
+        "refinement",
+    ),
     *("reports", "splat", "training"),
 )
-SHARED = ("dvr_scenes", "floors")  # what the others import
+SHARED = ("dvr_scenes", "floors", "scans")  # what the others import
 
 
 def test_none_is_left_out():
@@ -189,6 +201,14 @@ def test_reports(bench, scenes, tmp_path, monkeypatch):
     assert command[:4] == [sys.executable, "-m", "vvgt_cli.cli.main", "report"]
     assert command[-2:] == ["--picture-size", "160"]
     assert "[blob](blob/report.html)" in (tmp_path / "out" / "index.md").read_text()
+
+
+def test_automatic(bench, tmp_path, capsys):
+    module = bench("automatic", SIZE=SIZE)
+    module.main(str(tmp_path), "blob=example:blob:10")
+    assert capsys.readouterr().out.startswith("blob: automatic")
+    assert read_png(tmp_path / "blob.png").shape == (SIZE, SIZE, 3)
+    assert all(min(make().dims) > 50 for name, make in module.MADE.items() if name in ("mr-t1", "ct-abdomen"))
 
 
 def test_splat(bench, capsys):

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from vvgt_cli.jit import ahead
-from vvgt_cli.jit.cache import folders
+from vvgt_cli.jit.store import folders
 
 ROOT = Path(__file__).parent.parent
 SOURCE = "example:marschner-lobb:24"
