@@ -356,4 +356,4 @@ def test_a_step_follows_the_gradient_before_any_training():
     errors = [np.mean([(render(g, c) - v) ** 2 for c, v in zip(cameras, views, strict=True)]) for g in (other, better)]
     assert errors[1] < 0.9 * errors[0]
     assert np.abs(as_rows(better) - pack(other)).max() > 1e-3
-    assert project(better, cameras[0]).flat.shape == (40, 6)
+    assert len(project(better, cameras[0]).flat) == 40
