@@ -146,6 +146,7 @@ def test_a_result_is_refined_and_read_again(field, converted, tmp_path):
         (np.zeros((4, 4, 4)), {"affine": np.eye(3)}, r"expected \(4, 4\)"),
         (np.zeros((4, 4, 4)), {"affine": np.eye(4), "spacing": (1, 1, 1)}, "leave out"),
         (np.zeros((4, 4, 4)), {"component": 1}, "an array is one volume"),
+        (np.zeros((4, 4, 4)), {"max_gaussian": 5}, "max_gaussian: no such option; of reading expected dims, "),
         (np.zeros((4, 4, 4)), {"space": "RAS"}, "give affine too"),
         ("example:blob:8", {"affine": np.eye(4)}, "a file says itself"),
         ("nothing.nrrd", {}, "no such file"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -48,7 +49,7 @@ class Case:
         """Pixels along the edge of a whole training view."""
         return view_edge(self.size, half=False)
 
-    @property
+    @cached_property
     def judged(self) -> int:
         """Pixels of a check or test view that are drawn: all, or blocks."""
         blocks = spread_blocks(self.size, self.size)

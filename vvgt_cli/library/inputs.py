@@ -46,12 +46,14 @@ def volume_of(volume: VolumeLike, reading: Reading, name: str = "array") -> Volu
 
     Raises:
         DataError: not a volume, or a damaged one.
-        UsageError: options that it does not take.
+        UsageError: options that it does not take, or that there are not.
     """
     from vvgt_cli.synth.sources import open_volume
     from vvgt_cli.volume.memory import volume_in_memory
 
     given: dict[str, Any] = dict(reading)
+    if unknown := sorted(set(given) - set(Reading.__annotations__)):
+        raise UsageError(f"{unknown[0]}: no such option; of reading expected {', '.join(Reading.__annotations__)}")
     affine, origin = given.pop("affine", None), given.pop("origin", None)
     for key in ("dims", "spacing"):
         if given.get(key) is not None:
