@@ -357,3 +357,14 @@ def test_a_step_follows_the_gradient_before_any_training():
     assert errors[1] < 0.9 * errors[0]
     assert np.abs(as_rows(better) - pack(other)).max() > 1e-3
     assert len(project(better, cameras[0]).flat) == 40
+
+
+def test_a_group_of_processes_says_once_why_it_ended(tmp_path):
+    torchrun = (sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2",
+                "-m", "vvgt_cli.cli.main")  # fmt: skip
+    (tmp_path / "given.yaml").write_text(config_text(CONFIG))
+    told = subprocess.run(
+        command(tmp_path, tmp_path / "nowhere", *torchrun), env=ENVIRONMENT, capture_output=True, text=True, timeout=300
+    ).stderr
+    assert told.count("vvgt: error: ") == 1
+    assert "nowhere" in next(line for line in told.splitlines() if line.startswith("vvgt: error: "))

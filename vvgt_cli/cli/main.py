@@ -6,6 +6,7 @@ import errno
 import importlib
 import os
 import sys
+import time
 import traceback
 import warnings
 from collections.abc import Sequence
@@ -15,7 +16,7 @@ import click
 
 from vvgt_cli import __version__
 from vvgt_cli.cli.numbers import spread
-from vvgt_cli.cli.process import end_on_signals, ended_by, open_streams
+from vvgt_cli.cli.process import end_on_signals, ended_by, first_of_group, open_streams
 from vvgt_cli.errors import UsageError, VvgtError
 
 COMMANDS = {
@@ -37,6 +38,7 @@ COMMANDS = {
 }
 INTERRUPTED = 130  # 128 + SIGINT, as shells report it
 BROKEN_PIPE = 141  # 128 + SIGPIPE
+ALONE = 2.0  # seconds after which a process of a group of them tells of an error of its own
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 DEBUG = "VVGT_TRACEBACK"
 
@@ -76,6 +78,8 @@ def cli() -> None:
 
 
 def _fail(message: str, code: int) -> int:
+    if not first_of_group():
+        time.sleep(ALONE)  # what ends all processes is told by the first; torchrun ends the others meanwhile
     print(f"vvgt: error: {' '.join(message.split())}", file=sys.stderr)
     return code
 
@@ -153,7 +157,7 @@ def _status(error: BaseException) -> int:
     if isinstance(error, SystemExit):
         code = error.code if isinstance(error.code, int) else 1
         name = ended_by(code)
-        return _fail(f"ended by {name}", code) if name else code
+        return _fail(f"ended by {name}", code) if name and first_of_group() else code
     return _fail(f"internal: {type(error).__name__}: {error} (a bug; {DEBUG}=1 shows where)", 1)
 
 

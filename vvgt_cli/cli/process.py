@@ -96,6 +96,11 @@ def ending() -> Iterator[list[int]]:
             signal.signal(number, handler)
 
 
+def first_of_group() -> bool:
+    """Whether this process is the one that talks, of those that `torchrun` has started; alone it is."""
+    return os.environ.get("RANK", "0") == "0" or "TORCHELASTIC_RUN_ID" not in os.environ
+
+
 def _end(number: int, frame: object) -> None:
     sys.exit(128 + number)
 
@@ -110,6 +115,7 @@ def _listen(reader: int) -> None:
 
 def _leave(number: int) -> None:
     discard_leftovers()
-    with suppress(OSError):
-        os.write(2, f"vvgt: error: ended by {signal.Signals(number).name}\n".encode())
+    if first_of_group():
+        with suppress(OSError):
+            os.write(2, f"vvgt: error: ended by {signal.Signals(number).name}\n".encode())
     os._exit(128 + number)
