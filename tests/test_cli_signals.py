@@ -12,22 +12,25 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-# A march whose steps are so short that it takes minutes, in one kernel, while a file is being written.
+# A march of so many rays that it takes minutes, in one kernel, while a file is being written.
 LONG = """
 import signal, sys, threading
 signal.signal(signal.SIGHUP, signal.SIG_DFL)  # the tests may run under nohup
 from vvgt_cli.conversion.stages import ClosedFormStage
 from vvgt_cli.cli import main
 from vvgt_cli.files import atomic_write
+from vvgt_cli.vbm.moments import base_cells
 from vvgt_cli.vbm.visibility import visibility
+import numpy as np
 
 def closed_form(self, work):
     from vvgt_cli.cameras import default_views
     with atomic_write("b.ply") as temporary:
         temporary.write_bytes(b"half")
-        visibility(work.scene, default_views("train", 1, size=8))  # loads the kernel
+        cells = base_cells(work.scene, np.zeros(3, np.int64))
+        visibility(work.scene, cells, default_views("train", 1, size=8))  # loads the kernel
         threading.Timer(1.0, print, ["in the kernel"], {"flush": True}).start()
-        visibility(work.scene, default_views("train", 1, size=160), step=1e-7)
+        visibility(work.scene, cells, default_views("train", 1, size=50_000))
 
 ClosedFormStage.run = closed_form
 main.main()

@@ -207,12 +207,12 @@ def test_an_edit_of_what_a_kernel_calls_or_reads_is_noticed_and_the_old_code_goe
 def test_what_a_kernel_reaches():
     from vvgt_cli.jit.cache import reached
     from vvgt_cli.splat.tiles import blend
-    from vvgt_cli.vbm.moments import _brick_moments
+    from vvgt_cli.vbm.quadrature import block_moments
 
     modules, constants = reached(blend.py_func)
     assert "vvgt_cli.splat.tiles" in modules
     assert {"TILE = 16", "HALF = np.float32(0.5)"} <= constants
-    assert {"vvgt_cli.vbm.moments", "vvgt_cli.dvr.kernel"} <= reached(_brick_moments.py_func)[0]
+    assert {"vvgt_cli.vbm.quadrature", "vvgt_cli.dvr.kernel"} <= reached(block_moments.py_func)[0]
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,12 @@ from __future__ import annotations
 
 RAYCAST = ("vvgt_cli.dvr.kernel:render_tiles", "vvgt_cli.dvr.bricks:_ranges", "vvgt_cli.dvr.contrast:_contrast")
 DRAW = ("vvgt_cli.splat.kernel:tile_lists", "vvgt_cli.splat.tiles:blend", "vvgt_cli.splat.kernel:project")
-CLOSED_FORM = ("vvgt_cli.vbm.visibility:_march", "vvgt_cli.vbm.moments:_brick_moments", "vvgt_cli.vbm.inset:_shift")
+CLOSED_FORM = (
+    "vvgt_cli.vbm.visibility:march",
+    "vvgt_cli.vbm.quadrature:block_moments",
+    "vvgt_cli.vbm.quadrature:compact",
+    "vvgt_cli.vbm.inset:_shift",
+)
 SLOPES = (
     "vvgt_cli.splat.backward:moments",
     "vvgt_cli.splat.backward:own_frame",

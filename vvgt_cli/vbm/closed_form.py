@@ -102,9 +102,9 @@ def closed_form(
     def within(first: int, last: int) -> Callable[[float], None]:
         return lambda share: progress(round(first + (last - first) * share), 100) if progress else None
 
-    seen = visibility(scene, cameras or default_views("train", size=MARCH_SIZE), progress=within(0, 25))
     level = base_level(scene, pixel_width(size), budget)
-    cells = base_cells(scene, exponents(step, level), progress=within(25, 75))
+    cells = base_cells(scene, exponents(step, level), progress=within(0, 50))
+    seen = visibility(scene, cells, cameras or default_views("train", size=MARCH_SIZE), progress=within(50, 75))
     opaque = opaque_field(cells, step, np.asarray(scene.half))
     within(75, 80)(1)
     tree = build_tree(cells, seen, step)

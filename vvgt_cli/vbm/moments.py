@@ -7,21 +7,19 @@ A base cell is a box of ``2^e`` voxels along each axis (e may be negative). Its 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numba as nb
 import numpy as np
 
-from vvgt_cli.dvr.kernel import FLAGS, mean_optics, table_coordinate
-from vvgt_cli.dvr.layout import BRICK, TUPLES
+from vvgt_cli.dvr.layout import BRICK
 from vvgt_cli.dvr.scene import Scene
-from vvgt_cli.jit.decorators import inlined, kernel
-from vvgt_cli.vbm.columns import BLUE, GREEN, MASS, MOMENTS, RED, XX, XY, XZ, YY, YZ, ZZ, X, Y, Z
+from vvgt_cli.vbm.columns import MASS, MOMENTS
+from vvgt_cli.vbm.quadrature import block_moments, compact
 
 FINEST_CUT = -4
-CHUNK_CELLS = 1 << 19  # cells of the dense scratch buffer
+CHUNK_CELLS, CHUNK_BLOCKS = 1 << 17, 16  # cells of the dense scratch buffer; blocks at least
+MOST_CELLS = 32  # along the edge of a block that is made a cube of cells
 
 
 @dataclass(frozen=True)
@@ -39,106 +37,6 @@ class Cells:
     moments: np.ndarray
     edge: np.ndarray
     exponent: np.ndarray
-
-
-@inlined(fastmath=FLAGS)
-def _value_and_spread(values, x, y, z, dx, dy, dz):
-    """Trilinear value of ``values`` (nz, ny, nx) at voxel coordinates, and its spread over a box around there.
-
-    The box has edges (dx, dy, dz) voxels.
-
-    The spread is the root of the summed squared differences over the box, from the gradient of the same eight voxels.
-    NaN where a voxel is not finite.
-    """
-    nz, ny, nx = values.shape
-    # no spread in the rim before the first voxel centre (beyond the last one both neighbours are the same voxel)
-    dx, dy, dz = dx if x > 0.0 else 0.0, dy if y > 0.0 else 0.0, dz if z > 0.0 else 0.0
-    x = min(max(x, 0.0), nx - 1.0)
-    y = min(max(y, 0.0), ny - 1.0)
-    z = min(max(z, 0.0), nz - 1.0)
-    i, j, k = nb.uint64(x), nb.uint64(y), nb.uint64(z)
-    fx, fy, fz = x - i, y - j, z - k
-    i1 = min(i + nb.uint64(1), nb.uint64(nx - 1))
-    j1 = min(j + nb.uint64(1), nb.uint64(ny - 1))
-    k1 = min(k + nb.uint64(1), nb.uint64(nz - 1))
-    a000, a001 = np.float64(values[k, j, i]), np.float64(values[k, j, i1])
-    a010, a011 = np.float64(values[k, j1, i]), np.float64(values[k, j1, i1])
-    a100, a101 = np.float64(values[k1, j, i]), np.float64(values[k1, j, i1])
-    a110, a111 = np.float64(values[k1, j1, i]), np.float64(values[k1, j1, i1])
-    c00, c01 = a000 + (a001 - a000) * fx, a010 + (a011 - a010) * fx
-    c10, c11 = a100 + (a101 - a100) * fx, a110 + (a111 - a110) * fx
-    c0, c1 = c00 + (c01 - c00) * fy, c10 + (c11 - c10) * fy
-    g0, g1 = (a001 - a000) + (a011 - a010 - a001 + a000) * fy, (a101 - a100) + (a111 - a110 - a101 + a100) * fy
-    gx = (g0 + (g1 - g0) * fz) * dx
-    gy = ((c01 - c00) + (c11 - c10 - c01 + c00) * fz) * dy
-    gz = (c1 - c0) * dz
-    return c0 + (c1 - c0) * fz, math.sqrt(gx * gx + gy * gy + gz * gz)
-
-
-@kernel(
-    "Voxels Optics f8:2 i8:1 i8:1 f8:1 f8:1 f8:1 f8:5",
-    TUPLES,
-    parallel=True,
-    fastmath=FLAGS,
-)
-def _brick_moments(voxels, optics, bricks, cells, points, cell_voxels, half, step, out):
-    """Moments of the ``cells`` (3,) cells of each brick with ``points`` (3,) points a cell, both (x, y, z).
-
-    ``bricks`` (n, 3) origins in voxels from the box's corner; ``cell_voxels`` (3,) a cell's edges, voxels; ``half``,
-    ``step`` (3,) of `Scene`; all (x, y, z). ``out`` (n, cells z, cells y, cells x, 13) float64.
-    """
-    values, dark = voxels.values, optics.dark
-    nz, ny, nx = values.shape
-    dx, dy, dz = cell_voxels[0] / points[0], cell_voxels[1] / points[1], cell_voxels[2] / points[2]
-    box = dx * step[0] * dy * step[1] * dz * step[2]
-    for b in nb.prange(bricks.shape[0]):
-        for cz in range(cells[2]):
-            for cy in range(cells[1]):
-                for cx in range(cells[0]):
-                    for m in range(MOMENTS):
-                        out[b, cz, cy, cx, m] = 0.0
-                    for pz in range(points[2]):
-                        z = bricks[b, 2] + cz * cell_voxels[2] + (pz + 0.5) * dz - 0.5
-                        if z > nz - 0.5:
-                            continue
-                        for py in range(points[1]):
-                            y = bricks[b, 1] + cy * cell_voxels[1] + (py + 0.5) * dy - 0.5
-                            if y > ny - 0.5:
-                                continue
-                            for px in range(points[0]):
-                                x = bricks[b, 0] + cx * cell_voxels[0] + (px + 0.5) * dx - 0.5
-                                if x > nx - 0.5:
-                                    continue
-                                s, w = _value_and_spread(values, x, y, z, dx, dy, dz)
-                                w *= 0.5
-                                if not (abs(s) < np.inf and w < np.inf):
-                                    continue
-                                u0 = table_coordinate(s - w, optics)
-                                u1 = table_coordinate(s + w, optics)
-                                if max(u0, u1) <= dark[int(min(u0, u1))]:
-                                    continue
-                                r, g, bl, tau = mean_optics(u0, u1, optics)
-                                if not tau > 0.0:
-                                    continue
-                                tau *= box
-                                ux = (x + 0.5) * step[0] - half[0]
-                                uy = (y + 0.5) * step[1] - half[1]
-                                uz = (z + 0.5) * step[2] - half[2]
-                                # the point's own box has variance edge^2 / 12
-                                row = out[b, cz, cy, cx]
-                                row[MASS] += tau
-                                row[X] += tau * ux
-                                row[Y] += tau * uy
-                                row[Z] += tau * uz
-                                row[XX] += tau * (ux * ux + (dx * step[0]) ** 2 / 12)
-                                row[XY] += tau * ux * uy
-                                row[XZ] += tau * ux * uz
-                                row[YY] += tau * (uy * uy + (dy * step[1]) ** 2 / 12)
-                                row[YZ] += tau * uy * uz
-                                row[ZZ] += tau * (uz * uz + (dz * step[2]) ** 2 / 12)
-                                row[RED] += box * r
-                                row[GREEN] += box * g
-                                row[BLUE] += box * bl
 
 
 def exponents(step: np.ndarray, level: int) -> np.ndarray:
@@ -171,36 +69,58 @@ def base_cells(
 
     ``progress`` is told the share that is done.
     """
-    block = np.maximum(BRICK, 2.0**exponent).astype(np.int64)  # voxels of one work item, (x, y, z)
-    cell_voxels = 2.0**exponent
-    cells = np.round(block / cell_voxels).astype(np.int64)
-    points = np.maximum(np.round(cell_voxels * points_per_voxel), min(points_per_voxel, 2)).astype(np.int64)
+    cell = 2.0**exponent
+    block, cells = _blocks(exponent)
+    points = np.maximum(np.round(cell * points_per_voxel), min(points_per_voxel, 2)).astype(np.int64)
     origins = _active_blocks(scene, block)
-    chunk = max(int(CHUNK_CELLS // cells.prod()), 1)
-    scratch = np.empty((min(chunk, max(len(origins), 1)), cells[2], cells[1], cells[0], MOMENTS))
-    kept_index, kept_moments = [], []
-    voxels, optics = scene.voxels, scene.optics
+    origins = origins[np.argsort(morton(origins // block))]
+    chunk = max(int(CHUNK_CELLS // cells.prod()), CHUNK_BLOCKS)
+    scratch = np.empty((min(chunk, max(len(origins), 1)), *cells[::-1], MOMENTS))
+    order = np.argsort(morton(np.argwhere(np.ones(cells[::-1]))[:, ::-1]))
+    moments, index = [np.empty((0, MOMENTS))], [np.empty((0, 3), np.int32)]
     for first in range(0, len(origins), chunk):
         part = origins[first : first + chunk]
-        out = scratch[: len(part)]
-        _brick_moments(voxels, optics, part.astype(np.float64), cells, points, cell_voxels, scene.half, scene.step, out)
-        at = np.argwhere(out[..., MASS] > 0)  # block, z, y, x
-        kept_moments.append(out[at[:, 0], at[:, 1], at[:, 2], at[:, 3]])
-        corner = np.round(part[at[:, 0]] / cell_voxels).astype(np.int32)
-        kept_index.append(corner + at[:, :0:-1].astype(np.int32))
+        dense = scratch[: len(part)]
+        at = part.astype(np.float64)
+        block_moments(scene.voxels, scene.optics, at, points, cell, scene.half, scene.step, dense)
+        counts = np.count_nonzero(dense[..., MASS].reshape(len(part), -1), axis=1)
+        rows, local = np.empty((counts.sum(), MOMENTS)), np.empty((counts.sum(), 3), np.int32)
+        compact(dense, order, np.cumsum(counts) - counts, rows, local)
+        moments.append(rows)
+        index.append(local + np.repeat(np.round(part / cell).astype(np.int32), counts, axis=0))
         if progress:
             progress(min(first + chunk, len(origins)) / len(origins))
     del scratch
-    index = np.concatenate(kept_index) if kept_index else np.empty((0, 3), np.int32)
-    order = np.argsort(morton(index), kind="stable")
-    place = np.empty_like(order)
-    place[order] = np.arange(len(order))
-    moments, done = np.empty((len(order), MOMENTS)), 0
-    while kept_moments:  # each part is let go of as it is laid in its place
-        part = kept_moments.pop(0)
-        moments[place[done : done + len(part)]] = part
+    return Cells(*_in_order(np.concatenate(index), moments), cell * scene.step, exponent)
+
+
+def _blocks(exponent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Edges of a block in voxels and in cells, (3,): as many cells along each axis, where that is not too many.
+
+    Such blocks, taken in Morton order, leave cells in Morton order.
+    """
+    cell = 2.0**exponent
+    cells = np.round(np.maximum(BRICK, cell) / cell).astype(np.int64)
+    if cells.max() <= MOST_CELLS:
+        cells[:] = cells.max()
+    return np.round(cells * cell).astype(np.int64), cells
+
+
+def _in_order(index: np.ndarray, parts: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Indices (n, 3) and the rows of ``parts`` in Morton order; parts are let go of as they are laid in their place."""
+    codes = morton(index)
+    moments, done = np.empty((len(index), MOMENTS)), 0
+    order = None if (codes[1:] > codes[:-1]).all() else np.argsort(codes, kind="stable")
+    place = np.empty_like(order) if order is not None else None
+    if order is not None and place is not None:
+        place[order] = np.arange(len(order))
+    parts.reverse()
+    while parts:
+        part = parts.pop()
+        here = slice(done, done + len(part))
+        moments[here if place is None else place[here]] = part
         done += len(part)
-    return Cells(index[order], moments, cell_voxels * scene.step, exponent)
+    return index if order is None else index[order], moments
 
 
 # offsets (x, y, z) of a cell's children, x fastest
@@ -212,10 +132,8 @@ def cell_moments(scene: Scene, corners: np.ndarray, edge: np.ndarray, points_per
     child = edge / 2
     points = np.maximum(np.round(child * points_per_voxel), 2).astype(np.int64)
     out = np.empty((len(corners), 2, 2, 2, MOMENTS))
-    _brick_moments(
-        scene.voxels, scene.optics, np.ascontiguousarray(corners, np.float64), np.full(3, 2), points, child,
-        scene.half, scene.step, out,
-    )  # fmt: skip
+    at = np.ascontiguousarray(corners, np.float64)
+    block_moments(scene.voxels, scene.optics, at, points, child, scene.half, scene.step, out)
     return out.reshape(len(corners), 8, MOMENTS)
 
 

@@ -1,4 +1,4 @@
-"""What the cameras see of each cell: one march that deposits optical depth, and the seen part of it, on a grid."""
+"""What the cameras see of each cell: a march through the cells' extinction that adds up what is seen."""
 
 from __future__ import annotations
 
@@ -10,18 +10,19 @@ import numba as nb
 import numpy as np
 
 from vvgt_cli.cameras import Camera
-from vvgt_cli.dvr.kernel import FLAGS, box_span, leap, mean_optics, sample, table_coordinate
-from vvgt_cli.dvr.layout import BRICK_BITS, TUPLES
+from vvgt_cli.dvr.kernel import FLAGS
 from vvgt_cli.dvr.render import camera_arrays
-from vvgt_cli.dvr.runs import BORROWED
 from vvgt_cli.dvr.scene import Scene
 from vvgt_cli.jit.decorators import inlined, kernel
+from vvgt_cli.vbm.columns import MASS
+from vvgt_cli.vbm.moments import Cells
 
-MAX_CELLS = 1 << 24
+MAX_CELLS = 1 << 21
 MIN_RAYS = 8  # that meet a cell: with fewer, some cells are met by none and count as hidden
-WORKERS = 4  # each with a grid of its own, so that sums need no atomics; whatever the threads, for the same bytes
+WORKERS = 4  # each with sums of its own, so that they need no atomics; whatever the threads, for the same bytes
 MAX_GRID = 1 << 25  # cells of all workers together
 THIN = 2.0  # pixels of the march: all of a box that is thinner may lie between two rays
+DEPTH, SEEN, LARGEST = 0, 1, 2  # of a cell's sums over rays: optical depth, its seen part, largest transmittance
 
 
 @dataclass(frozen=True)
@@ -30,141 +31,166 @@ class Visibility:
 
     Attributes:
         mean: (nz, ny, nx) float32 seen part of the optical depth, averaged over views and rays: in [0, 1].
-        largest: (nz, ny, nx) float32 largest transmittance of any sample with extinction.
-        exponent: cell edge in voxels = 2^exponent (scalar).
+        largest: (nz, ny, nx) float32 largest transmittance with which a ray enters the cell, 0 without extinction.
+        edge: (3,) cell edges in voxels (x, y, z).
     """
 
     mean: np.ndarray
     largest: np.ndarray
-    exponent: int
+    edge: np.ndarray
 
     def at(self, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Mean and largest transmittance (n,) at positions (n, 3) in voxels (x, y, z) from the box's corner."""
         top = np.array(self.mean.shape[::-1]) - 1
-        x, y, z = np.clip(np.floor(position / (1 << self.exponent)).astype(np.int64), 0, top).T
+        x, y, z = np.clip(np.floor(position / self.edge).astype(np.int64), 0, top).T
         return self.mean[z, y, x], self.largest[z, y, x]
 
 
-@inlined(fastmath=FLAGS)
-def _cell(x, y, z, inv_cell, grid):
-    """Cell (z, y, x) of ``grid`` (3, cz, cy, cx) with a point (voxels); ``inv_cell`` cells a voxel."""
-    return (
-        min(int(max(z + 0.5, 0.0) * inv_cell), grid.shape[1] - 1),
-        min(int(max(y + 0.5, 0.0) * inv_cell), grid.shape[2] - 1),
-        min(int(max(x + 0.5, 0.0) * inv_cell), grid.shape[3] - 1),
-    )
+@inlined(fastmath=FLAGS, error_model="numpy")
+def _axis(p: float, d: float, t: float, n: int) -> tuple[int, int, float, float]:
+    """Cell of ``p + t d`` along an axis of ``n`` cells, the way through them, when the next begins, and its length."""
+    i = min(max(math.floor(p + t * d), 0), n - 1)
+    if d > 0.0:
+        return i, 1, (i + 1 - p) / d, 1 / d
+    if d < 0.0:
+        return i, -1, (i - p) / d, -1 / d
+    return i, 0, np.inf, np.inf
 
 
-@inlined(fastmath=FLAGS, **BORROWED)
-def _deposit(voxels, optics, empty, px, py, pz, dx, dy, dz, step, inv_cell, grid):
-    """March p + t d and add to ``grid`` (3, cz, cy, cx): optical depth, its seen part, largest transmittance.
+@inlined(fastmath=FLAGS, error_model="numpy")
+def _span(p: tuple, d: tuple, n: tuple) -> tuple[float, float]:
+    """Entry and exit t >= 0 of a ray through the box [0, n]; entry >= exit: missed."""
+    t0, t1 = 0.0, np.inf
+    for axis in range(3):
+        a, b, m = p[axis], d[axis], n[axis]
+        if b == 0.0:
+            if a < 0.0 or a > m:
+                return 1.0, 0.0
+        else:
+            u, v = -a / b, (m - a) / b
+            t0, t1 = max(t0, min(u, v)), min(t1, max(u, v))
+    return t0, t1
 
-    p, d, ``step`` in voxels; ``empty`` (bz, by, bx) uint8; ``inv_cell`` grid cells a voxel. What lies behind an opaque
-    front adds to the depth only: it is there, and not seen.
+
+@inlined(fastmath=FLAGS, error_model="numpy")
+def _deposit(extinction: np.ndarray, p: tuple, d: tuple, sums: np.ndarray) -> None:
+    """Go from cell to cell along p + t d and add to ``sums`` (nz, ny, nx, 3).
+
+    p, d (x, y, z) in cells from the box's corner, t in unit-frame lengths as ``extinction`` (nz, ny, nx) is per. What
+    lies behind an opaque front adds to the depth only: it is there, and not seen.
     """
-    values, dark = voxels.values, optics.dark
-    nz, ny, nx = values.shape
-    t0, t1 = box_span(px, py, pz, dx, dy, dz, nx, ny, nz)
-    if not t1 > t0:
+    nz, ny, nx = extinction.shape
+    t, end = _span(p, d, (nx, ny, nz))
+    if not end > t:
         return
-    count = max(math.ceil((t1 - t0) * math.sqrt(dx * dx + dy * dy + dz * dz) / step), 1)
-    dt = (t1 - t0) / count
-    trans, u0, known, i = 1.0, 0.0, False, 0
-    while i < count:
-        t = t0 + i * dt
-        x, y, z = px + t * dx, py + t * dy, pz + t * dz
-        bi = min(max(int(x), 0), nx - 1) >> BRICK_BITS
-        bj = min(max(int(y), 0), ny - 1) >> BRICK_BITS
-        bk = min(max(int(z), 0), nz - 1) >> BRICK_BITS
-        reach = int(empty[bk, bj, bi])
-        if reach > 0:
-            j = int((min(leap(px, py, pz, dx, dy, dz, reach, bi, bj, bk), t1) - t0) / dt)
-            if j > i:
-                i, known = j, False
-                continue
-        if not known:
-            u0 = table_coordinate(sample(values, x, y, z), optics)
-        t += dt
-        u1 = table_coordinate(sample(values, px + t * dx, py + t * dy, pz + t * dz), optics)
-        if u0 >= 0.0 and u1 >= 0.0 and max(u0, u1) > dark[int(min(u0, u1))]:
-            depth = mean_optics(u0, u1, optics)[3] * dt
-            if depth > 0.0:
-                t -= 0.5 * dt
-                k, j, c = _cell(px + t * dx, py + t * dy, pz + t * dz, inv_cell, grid)
-                after = trans * math.exp(-depth)
-                grid[0, k, j, c] += depth
-                grid[1, k, j, c] += trans - after
-                grid[2, k, j, c] = max(grid[2, k, j, c], trans)
-                trans = after
-        u0, known = u1, True
-        i += 1
+    i, step_i, next_i, length_i = _axis(p[0], d[0], t, nx)
+    j, step_j, next_j, length_j = _axis(p[1], d[1], t, ny)
+    k, step_k, next_k, length_k = _axis(p[2], d[2], t, nz)
+    trans = 1.0
+    while True:
+        ahead = max(min(next_i, next_j, next_k, end), t)
+        tau = extinction[k, j, i]
+        if tau > 0.0:
+            depth = tau * (ahead - t)
+            after = trans * math.exp(-depth)
+            cell = sums[k, j, i]
+            cell[DEPTH] += depth
+            cell[SEEN] += trans - after
+            cell[LARGEST] = max(cell[LARGEST], trans)
+            trans = after
+        t = ahead
+        if next_i <= next_j and next_i <= next_k:
+            i, next_i = i + step_i, next_i + length_i
+        elif next_j <= next_k:
+            j, next_j = j + step_j, next_j + length_j
+        else:
+            k, next_k = k + step_k, next_k + length_k
+        if t >= end or i < 0 or j < 0 or k < 0 or i >= nx or j >= ny or k >= nz:
+            return
 
 
-@kernel(
-    "Voxels Optics u1:3 f8:2 f8:3 f8:2 i8 f8 f8 f4:5",
-    TUPLES,
-    parallel=True,
-    fastmath=FLAGS,
-)
-def _march(voxels, optics, empty, eyes, bases, lenses, size, step, inv_cell, grids):
-    """Rays of all views, dealt over the workers; ``grids`` (workers, 3, cz, cy, cx) float32.
+@kernel("f4:3 f8:2 f8:3 f8:2 i8 f8:1 f4:5", parallel=True, fastmath=FLAGS, error_model="numpy")
+def march(
+    extinction: np.ndarray,
+    eyes: np.ndarray,
+    bases: np.ndarray,
+    lenses: np.ndarray,
+    size: int,
+    edge: np.ndarray,
+    sums: np.ndarray,
+) -> None:
+    """Rays of all views, dealt over the workers; ``sums`` (workers, nz, ny, nx, 3) float32.
 
-    ``eyes`` (n, 3), ``bases`` (n, 3, 3), ``lenses`` (n, 4) as `camera_arrays` has them; ``size`` px; ``step`` voxels.
+    ``eyes`` (n, 3), ``bases`` (n, 3, 3), ``lenses`` (n, 4) as `camera_arrays` has them; ``size`` px; ``edge`` (3,) of
+    a cell in voxels.
     """
-    workers = grids.shape[0]
+    workers = sums.shape[0]
     for worker in nb.prange(workers):
         for job in range(worker, eyes.shape[0] * size, workers):
             view, row = job // size, job % size
             eye, basis, lens = eyes[view], bases[view], lenses[view]
+            p = (eye[0] + 0.5) / edge[0], (eye[1] + 0.5) / edge[1], (eye[2] + 0.5) / edge[2]
             for col in range(size):
                 a, b = (col + 0.5 - lens[2]) * lens[0], (row + 0.5 - lens[3]) * lens[1]
                 norm = 1.0 / math.sqrt(a * a + b * b + 1.0)
-                dx = (basis[0, 0] * a + basis[1, 0] * b + basis[2, 0]) * norm
-                dy = (basis[0, 1] * a + basis[1, 1] * b + basis[2, 1]) * norm
-                dz = (basis[0, 2] * a + basis[1, 2] * b + basis[2, 2]) * norm
-                _deposit(
-                    voxels, optics, empty, eye[0], eye[1], eye[2], dx, dy, dz, step, inv_cell, grids[worker]
-                )  # fmt: skip
+                d = (
+                    (basis[0, 0] * a + basis[1, 0] * b + basis[2, 0]) * norm / edge[0],
+                    (basis[0, 1] * a + basis[1, 1] * b + basis[2, 1]) * norm / edge[1],
+                    (basis[0, 2] * a + basis[1, 2] * b + basis[2, 2]) * norm / edge[2],
+                )
+                _deposit(extinction, p, d, sums[worker])
 
 
-def _rays_a_cell(scene: Scene, cameras: Sequence[Camera], exponent: int) -> float:
-    """How many rays of all views meet a cell near the centre, on average over directions."""
-    x, y, z = np.minimum(1 << exponent, scene.values.shape[::-1]) * scene.step
+def _rays_a_cell(edge: np.ndarray, cameras: Sequence[Camera]) -> float:
+    """How many rays of all views meet a cell near the centre, on average over directions; ``edge`` (3,) unit frame."""
+    x, y, z = edge
     area = (x * y + y * z + z * x) / 2  # a convex body shows a quarter of its surface
     return float(
         sum(area * camera.fx * camera.fy / max(float(camera.position @ camera.position), 1) for camera in cameras)
     )
 
 
-def visibility(
-    scene: Scene, cameras: Sequence[Camera], step: float = 1.0, progress: Callable[[float], None] | None = None
-) -> Visibility:
-    """March every camera (square images of one size) and return what is seen of each cell of a grid.
+def _mean_extinction(cells: Cells, scene: Scene, wider: int) -> np.ndarray:
+    """(nz, ny, nx) float32 mean extinction of cells ``2^wider`` times as wide as ``cells`` along each axis."""
+    edge = 2.0 ** (cells.exponent + wider)
+    nx, ny, nz = shape = np.ceil(np.array(scene.values.shape[::-1]) / edge).astype(np.int64)
+    x, y, z = (cells.index >> wider).T.astype(np.int64)
+    mass = np.bincount((z * ny + y) * nx + x, cells.moments[:, MASS], int(shape.prod()))
+    result: np.ndarray = (mass / (edge * scene.step).prod()).astype(np.float32).reshape(nz, ny, nx)
+    return result
 
-    In a box that is thinner than `THIN` pixels along some axis, a cell that no ray meets counts as seen: a line along
-    z lies between two columns of pixels in every view with z upright. ``progress`` is told the share that is done.
+
+def visibility(
+    scene: Scene, cells: Cells, cameras: Sequence[Camera], progress: Callable[[float], None] | None = None
+) -> Visibility:
+    """March every camera (square images of one size) through the mean extinction of cells: what is seen of each.
+
+    The cells are ``cells``, or wider by a power of two where these are too many or meet too few rays. In a box that is
+    thinner than `THIN` pixels along some axis, a cell that no ray meets counts as seen: a line along z lies between two
+    columns of pixels in every view with z upright. ``progress`` is told the share that is done.
     """
-    exponent = 0
-    while math.prod(-(-n // (1 << exponent)) for n in scene.values.shape) > MAX_CELLS or (
-        _rays_a_cell(scene, cameras, exponent) < MIN_RAYS and 1 << exponent < max(scene.values.shape)
+    dims, wider = np.array(scene.values.shape[::-1]), 0
+
+    def edge() -> np.ndarray:
+        return np.minimum(2.0 ** (cells.exponent + wider), dims)
+
+    while np.ceil(dims / edge()).prod() > MAX_CELLS or (
+        _rays_a_cell(edge() * scene.step, cameras) < MIN_RAYS and (edge() < dims).any()
     ):
-        exponent += 1
-    shape = tuple(-(-n // (1 << exponent)) for n in scene.values.shape)
-    workers = max(min(WORKERS, MAX_GRID // math.prod(shape)), 1)
-    grids = np.zeros((workers, 3, *shape), np.float32)
-    voxels, optics = scene.voxels, scene.optics
+        wider += 1
+    extinction = _mean_extinction(cells, scene, wider)
+    voxels = 2.0 ** (cells.exponent + wider)
+    sums = np.zeros((max(min(WORKERS, MAX_GRID // extinction.size), 1), *extinction.shape, 3), np.float32)
     for done, camera in enumerate(cameras, 1):
         eye, basis, lens = camera_arrays(scene, camera)
-        _march(
-            voxels, optics, scene.empty, eye[None], basis[None], lens[None], camera.width, step,
-            1.0 / (1 << exponent), grids,
-        )  # fmt: skip
+        march(extinction, eye[None], basis[None], lens[None], camera.width, voxels, sums)
         if progress:
             progress(done / len(cameras))
-    depth = grids[:, 0].sum(axis=0)
+    depth = sums[..., DEPTH].sum(axis=0)
     unmet = np.float32(2 * scene.half.min() < THIN * max(_pixel(camera) for camera in cameras))
-    mean = np.divide(grids[:, 1].sum(axis=0), depth, out=np.full(shape, unmet), where=depth > 0)
-    return Visibility(np.clip(mean, 0, 1), np.where(depth > 0, grids[:, 2].max(axis=0), unmet), exponent)
+    mean = np.divide(sums[..., SEEN].sum(axis=0), depth, out=np.full(depth.shape, unmet), where=depth > 0)
+    largest = np.where(depth > 0, sums[..., LARGEST].max(axis=0), unmet)
+    return Visibility(np.clip(mean, 0, 1), largest, voxels)
 
 
 def _pixel(camera: Camera) -> float:
