@@ -10,16 +10,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numba as nb
 import numpy as np
 
 from vvgt_cli.dvr.kernel import FLAGS, mean_optics, table_coordinate
-from vvgt_cli.dvr.layout import BRICK, TUPLES
+from vvgt_cli.dvr.layout import BRICK, TUPLES, Optics, Voxels
 from vvgt_cli.dvr.scene import Scene
 from vvgt_cli.jit.decorators import inlined, kernel
 from vvgt_cli.vbm.columns import BLUE, GREEN, MASS, MOMENTS, RED, XX, XY, XZ, YY, YZ, ZZ, X, Y, Z
 
+U: Any = nb.uint64
 FINEST_CUT = -4
 CHUNK_CELLS = 1 << 19  # cells of the dense scratch buffer
 
@@ -42,7 +44,9 @@ class Cells:
 
 
 @inlined(fastmath=FLAGS)
-def _value_and_spread(values, x, y, z, dx, dy, dz):
+def _value_and_spread(
+    values: np.ndarray, x: float, y: float, z: float, dx: float, dy: float, dz: float
+) -> tuple[float, float]:
     """Trilinear value of ``values`` (nz, ny, nx) at voxel coordinates, and its spread over a box around there.
 
     The box has edges (dx, dy, dz) voxels.
@@ -56,11 +60,11 @@ def _value_and_spread(values, x, y, z, dx, dy, dz):
     x = min(max(x, 0.0), nx - 1.0)
     y = min(max(y, 0.0), ny - 1.0)
     z = min(max(z, 0.0), nz - 1.0)
-    i, j, k = nb.uint64(x), nb.uint64(y), nb.uint64(z)
+    i, j, k = U(x), U(y), U(z)
     fx, fy, fz = x - i, y - j, z - k
-    i1 = min(i + nb.uint64(1), nb.uint64(nx - 1))
-    j1 = min(j + nb.uint64(1), nb.uint64(ny - 1))
-    k1 = min(k + nb.uint64(1), nb.uint64(nz - 1))
+    i1 = min(i + U(1), U(nx - 1))
+    j1 = min(j + U(1), U(ny - 1))
+    k1 = min(k + U(1), U(nz - 1))
     a000, a001 = np.float64(values[k, j, i]), np.float64(values[k, j, i1])
     a010, a011 = np.float64(values[k, j1, i]), np.float64(values[k, j1, i1])
     a100, a101 = np.float64(values[k1, j, i]), np.float64(values[k1, j, i1])
@@ -81,7 +85,10 @@ def _value_and_spread(values, x, y, z, dx, dy, dz):
     parallel=True,
     fastmath=FLAGS,
 )
-def _brick_moments(voxels, optics, bricks, cells, points, cell_voxels, half, step, out):
+def _brick_moments(
+    voxels: Voxels, optics: Optics, bricks: np.ndarray, cells: np.ndarray, points: np.ndarray, cell_voxels: np.ndarray,
+    half: np.ndarray, step: np.ndarray, out: np.ndarray,
+) -> None:  # fmt: skip
     """Moments of the ``cells`` (3,) cells of each brick with ``points`` (3,) points a cell, both (x, y, z).
 
     ``bricks`` (n, 3) origins in voxels from the box's corner; ``cell_voxels`` (3,) a cell's edges, voxels; ``half``,
@@ -124,8 +131,7 @@ def _brick_moments(voxels, optics, bricks, cells, points, cell_voxels, half, ste
                                 ux = (x + 0.5) * step[0] - half[0]
                                 uy = (y + 0.5) * step[1] - half[1]
                                 uz = (z + 0.5) * step[2] - half[2]
-                                # the point's own box has variance edge^2 / 12
-                                row = out[b, cz, cy, cx]
+                                row = out[b, cz, cy, cx]  # the point's own box has variance edge^2 / 12
                                 row[MASS] += tau
                                 row[X] += tau * ux
                                 row[Y] += tau * uy

@@ -11,7 +11,7 @@ import numpy as np
 
 from vvgt_cli.cameras import Camera
 from vvgt_cli.dvr.kernel import FLAGS, box_span, leap, mean_optics, sample, table_coordinate
-from vvgt_cli.dvr.layout import BRICK_BITS, TUPLES
+from vvgt_cli.dvr.layout import BRICK_BITS, TUPLES, Optics, Voxels
 from vvgt_cli.dvr.render import camera_arrays
 from vvgt_cli.dvr.runs import BORROWED
 from vvgt_cli.dvr.scene import Scene
@@ -46,7 +46,7 @@ class Visibility:
 
 
 @inlined(fastmath=FLAGS)
-def _cell(x, y, z, inv_cell, grid):
+def _cell(x: float, y: float, z: float, inv_cell: float, grid: np.ndarray) -> tuple[int, int, int]:
     """Cell (z, y, x) of ``grid`` (3, cz, cy, cx) with a point (voxels); ``inv_cell`` cells a voxel."""
     return (
         min(int(max(z + 0.5, 0.0) * inv_cell), grid.shape[1] - 1),
@@ -56,7 +56,10 @@ def _cell(x, y, z, inv_cell, grid):
 
 
 @inlined(fastmath=FLAGS, **BORROWED)
-def _deposit(voxels, optics, empty, px, py, pz, dx, dy, dz, step, inv_cell, grid):
+def _deposit(
+    voxels: Voxels, optics: Optics, empty: np.ndarray, px: float, py: float, pz: float, dx: float, dy: float, dz: float,
+    step: float, inv_cell: float, grid: np.ndarray,
+) -> None:  # fmt: skip
     """March p + t d and add to ``grid`` (3, cz, cy, cx): optical depth, its seen part, largest transmittance.
 
     p, d, ``step`` in voxels; ``empty`` (bz, by, bx) uint8; ``inv_cell`` grid cells a voxel. What lies behind an opaque
@@ -106,7 +109,10 @@ def _deposit(voxels, optics, empty, px, py, pz, dx, dy, dz, step, inv_cell, grid
     parallel=True,
     fastmath=FLAGS,
 )
-def _march(voxels, optics, empty, eyes, bases, lenses, size, step, inv_cell, grids):
+def _march(
+    voxels: Voxels, optics: Optics, empty: np.ndarray, eyes: np.ndarray, bases: np.ndarray, lenses: np.ndarray,
+    size: int, step: float, inv_cell: float, grids: np.ndarray,
+) -> None:  # fmt: skip
     """Rays of all views, dealt over the workers; ``grids`` (workers, 3, cz, cy, cx) float32.
 
     ``eyes`` (n, 3), ``bases`` (n, 3, 3), ``lenses`` (n, 4) as `camera_arrays` has them; ``size`` px; ``step`` voxels.
