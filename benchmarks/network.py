@@ -111,11 +111,11 @@ def checkpoint(path: str, config: str) -> None:
     import torch
 
     from vvgt_cli.network.checkpoint import Checkpoint, save_checkpoint
-    from vvgt_cli.network.export import shaken
+    from vvgt_cli.network.export import randomised
     from vvgt_cli.network.model import Vvgt
 
     torch.manual_seed(0)
-    save_checkpoint(path, Checkpoint(shaken(Vvgt(NAMED[config]))))
+    save_checkpoint(path, Checkpoint(randomised(Vvgt(NAMED[config]))))
 
 
 @main.command()

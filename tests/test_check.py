@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from vvgt_cli import checks
-from vvgt_cli.checks import BrokenError, Case, Figure, all_cases, conduct, require
+from vvgt_cli.checks import BrokenError, Case, Figure, all_cases, require, run_case
 from vvgt_cli.checks.scenes import build, function, smooth, step
 from vvgt_cli.checks.stiffness import changes, stiffness
 
@@ -18,7 +18,7 @@ CASES = list(all_cases())
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.stage}: {case.name}")
 def test_case(case):
-    outcome = conduct(case)
+    outcome = run_case(case)
     assert outcome.passed, outcome.problem
 
 
@@ -52,7 +52,7 @@ HOPELESS = [
     list(zip(HOPELESS, ("off 2, at most 1", "off nan", "alpha 1.5", "IndexError: .*py:"), strict=True)),
 )
 def test_what_is_wrong_fails_with_one_line(case, problem):
-    outcome = conduct(case)
+    outcome = run_case(case)
     assert not outcome.passed
     assert "\n" not in outcome.problem
     assert re.search(problem, outcome.problem), outcome.problem

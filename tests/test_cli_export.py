@@ -32,7 +32,7 @@ def fresh(config=FED):
 def made(tmp_path_factory):
     """A checkpoint with weights everywhere, and its model, exported by the command; to be read only."""
     folder = tmp_path_factory.mktemp("export")
-    trained = Checkpoint(ex.shaken(fresh()), {"volumes": 3}, {"gain": 1.5}, "abc123")
+    trained = Checkpoint(ex.randomised(fresh()), {"volumes": 3}, {"gain": 1.5}, "abc123")
     save_checkpoint(folder / "tiny.pt", trained)
     assert run(["export", str(folder / "tiny.pt"), "-o", str(folder / "tiny"), "--quiet"]) == 0
     return folder
@@ -94,7 +94,7 @@ def test_a_head_that_is_zero_is_not_compared_as_it_is(made, traced, tmp_path):
 
 
 def test_graphs_that_differ_are_not_written(traced, tmp_path):
-    other = ex.shaken(ex.shaken(fresh()))
+    other = ex.randomised(ex.randomised(fresh()))
     save_checkpoint(tmp_path / "other.pt", Checkpoint(other))
     with pytest.raises(DataError, match="differs from torch"):
         ex.export_model(tmp_path / "other.pt", tmp_path / "other")

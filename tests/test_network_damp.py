@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from network_models import as_rows, scene
 
-from vvgt_cli.network.damp import between, damped
+from vvgt_cli.network.damp import damped, interpolate
 from vvgt_cli.network.prepare import pack, unpack
 from vvgt_cli.splat import render
 
@@ -39,8 +39,8 @@ def test_between_is_the_start_the_end_and_a_rotation_on_the_way():
     start = unpack(pack(start))
     end, _, _ = scene(count=20, seed=1)
     end = unpack(pack(end))
-    assert np.allclose(as_rows(between(start, end, 0.0)), as_rows(start), atol=1e-6)
-    assert np.allclose(as_rows(between(start, end, 1.0)), as_rows(end), atol=1e-6)
-    half = between(start, end, 0.5)
+    assert np.allclose(as_rows(interpolate(start, end, 0.0)), as_rows(start), atol=1e-6)
+    assert np.allclose(as_rows(interpolate(start, end, 1.0)), as_rows(end), atol=1e-6)
+    half = interpolate(start, end, 0.5)
     assert np.allclose(np.linalg.norm(half.quaternions, axis=1), 1, atol=1e-6)
     assert np.allclose(half.means, (start.means + end.means) / 2, atol=1e-6)

@@ -17,7 +17,7 @@ from vvgt_cli.network import tables as tb
 from vvgt_cli.network.config import SLOPES
 from vvgt_cli.network.curves import CURVES, curve_code, hilbert, interleave
 from vvgt_cli.network.prepare import filter_matrix, pack, prepare, quaternion, resize, unpack, view_arrays
-from vvgt_cli.network.runtime import spread
+from vvgt_cli.network.runtime import farthest_cameras
 
 SMALL = NAMED["small"]
 
@@ -162,11 +162,11 @@ def test_resizing_keeps_constants_and_ramps(old, new):
 
 def test_far_apart_views_are_chosen_whatever_their_order():
     cameras = default_views("train")
-    chosen = spread(cameras, 6)
+    chosen = farthest_cameras(cameras, 6)
     assert len(set(chosen)) == 6
-    assert spread(cameras, 30) == list(range(24))
+    assert farthest_cameras(cameras, 30) == list(range(24))
     order = np.random.default_rng(0).permutation(24)
-    mixed = spread([cameras[i] for i in order], 6)
+    mixed = farthest_cameras([cameras[i] for i in order], 6)
     assert sorted(order[mixed]) == chosen
     eyes = np.array([camera.position for camera in cameras])[chosen]
     gaps = np.linalg.norm(eyes[:, None] - eyes[None], axis=2) + 10 * np.eye(6)

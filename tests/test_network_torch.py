@@ -19,7 +19,7 @@ torch = pytest.importorskip("torch")
 from vvgt_cli.network import epipolar, head, layers  # noqa: E402
 from vvgt_cli.network.appearance import ImageEncoder  # noqa: E402
 from vvgt_cli.network.dinov2 import DEVIATION, MEAN, load_dinov2, positions  # noqa: E402
-from vvgt_cli.network.export import shaken  # noqa: E402
+from vvgt_cli.network.export import randomised  # noqa: E402
 from vvgt_cli.network.geometry import NeighbourConv  # noqa: E402
 from vvgt_cli.network.model import Vvgt  # noqa: E402
 
@@ -31,7 +31,7 @@ def tensors(arrays):
 def network(config=TINY, *, random=True):
     torch.manual_seed(0)
     made = Vvgt(config).eval()
-    return shaken(made) if random else made
+    return randomised(made) if random else made
 
 
 def run(model, gaussians, cameras, images):
@@ -100,7 +100,7 @@ def test_attention_is_softmax_of_products():
 def test_rope_makes_products_depend_on_the_difference_of_places():
     cos, sin = layers.axial_rope(6, special=2, width=16)
     q, k = torch.randn(2, 1, 16)
-    turned_q, turned_k = layers.turn(q, (cos, sin)), layers.turn(k, (cos, sin))  # (38, 16): at every place
+    turned_q, turned_k = layers.apply_rope(q, (cos, sin)), layers.apply_rope(k, (cos, sin))  # (38, 16): at every place
     products = turned_q @ turned_k.T
     at = lambda row, column: 2 + 6 * row + column  # noqa: E731
     assert torch.allclose(products[at(1, 2), at(3, 1)], products[at(2, 4), at(4, 3)], atol=1e-5)
@@ -137,7 +137,7 @@ def naive_epipolar(module, x, points, matrices, eyes, maps):
 
 def epipolar_case(points):
     torch.manual_seed(1)
-    module = shaken(epipolar.EpipolarCrossAttention(16, 8, 2, 8))
+    module = randomised(epipolar.EpipolarCrossAttention(16, 8, 2, 8))
     views = tensors(view_arrays(default_views("train", 4, size=40)))
     maps = [torch.randn(4, 3 * f, 3 * f, 2, 8) for f in (1, 2, 4)]
     return module, torch.randn(len(points), 16), points, views["matrices"], views["eyes"], maps

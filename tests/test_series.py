@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from vvgt_cli.batches.series import frame_names, is_pattern, together
+from vvgt_cli.batches.series import frame_names, is_pattern, merge_statistics
 from vvgt_cli.errors import UsageError
 from vvgt_cli.runs.record import ConversionReport
 from vvgt_cli.runs.source import load
@@ -190,11 +190,11 @@ def test_statistics_together() -> None:
     parts[1][0, 0, 0] = np.nan
     parts.append(np.full((4, 5, 6), 20.0, np.float32))
     whole = statistics(Volume(np.concatenate(parts)))
-    joined = together([statistics(Volume(part)) for part in parts])
+    joined = merge_statistics([statistics(Volume(part)) for part in parts])
     assert (joined.lo, joined.hi, joined.nan_count) == (whole.lo, whole.hi, 1)
     np.testing.assert_allclose(joined.edges, whole.edges)
     assert joined.histogram.sum() == whole.histogram.sum() == 479
     off = np.abs(np.cumsum(joined.histogram) - np.cumsum(whole.histogram)).max()
     assert off <= 0.02 * 479
-    constant = together([statistics(Volume(np.full((2, 2, 2), 3.0)))] * 2)
+    constant = merge_statistics([statistics(Volume(np.full((2, 2, 2), 3.0)))] * 2)
     assert (constant.lo, constant.hi, constant.histogram.sum()) == (3, 3, 16)

@@ -28,7 +28,7 @@ from vvgt_cli.splat.constants import DILATION, NEAR
 from vvgt_cli.synth.shapes import make_shape
 from vvgt_cli.training import LossConfig, SceneConfig, TrainConfig
 from vvgt_cli.training import scenes as training_scenes
-from vvgt_cli.training.scenes import make_scenes, prepare_scenes, recipes, together
+from vvgt_cli.training.scenes import make_scenes, merge_bands, prepare_scenes, recipes
 from vvgt_cli.transfer.readers import minimal
 from vvgt_cli.transfer.suggest import Suggestion
 from vvgt_cli.volume.nrrd_write import write_nrrd
@@ -225,13 +225,13 @@ def test_functions_together_show_each_where_it_is():
     band = lambda lo, hi, opacity: Suggestion(  # noqa: E731
         "band", np.array([lo, hi]), np.array([opacity, opacity]), np.array([[1.0, 0, 0], [0, 1.0, 0]]), 2.0, 0.1
     )
-    alone = minimal.read(together([band(0, 1, 0.1)], [1.0]), "t")
+    alone = minimal.read(merge_bands([band(0, 1, 0.1)], [1.0]), "t")
     assert np.allclose(alone.opacity(np.array([0.25, 0.5])), 0.1)
-    denser = minimal.read(together([band(0, 1, 0.1)], [3.0]), "t")
+    denser = minimal.read(merge_bands([band(0, 1, 0.1)], [3.0]), "t")
     assert np.allclose(denser.opacity(np.array([0.5])), 1 - 0.9**3)
-    both = minimal.read(together([band(0, 1, 0.1), band(0, 1, 0.3)], [1.0, 1.0]), "t")
+    both = minimal.read(merge_bands([band(0, 1, 0.1), band(0, 1, 0.3)], [1.0, 1.0]), "t")
     assert np.allclose(both.opacity(np.array([0.5])), 0.4)
-    solid = together([band(0, 1, 0.9), band(0, 1, 0.9)], [8.0, 8.0])
+    solid = merge_bands([band(0, 1, 0.9), band(0, 1, 0.9)], [8.0, 8.0])
     assert max(point["opacity"] for point in solid["points"]) < 1
     assert solid["opacity_unit_distance"] == 2.0
 
@@ -276,14 +276,16 @@ def test_the_papers_network_and_its_ablations_learn(variant, data):
     )
     scenes = prepare_scenes(data, config.scenes, Console(quiet=True))
     network, device = sample.Vvgt(config.network), torch.device("cpu")
-    tally = sample.learn(network, sample.Feeder(scenes["train"], config), np.random.default_rng(0), device)
+    tally = sample.accumulate_gradients(
+        network, sample.Feeder(scenes["train"], config), np.random.default_rng(0), device
+    )
     assert tally.loss > 0
     assert not tally.bad
     slopes = [parameter.grad for parameter in network.parameters() if parameter.grad is not None]
     assert slopes
     assert all(torch.isfinite(slope).all() for slope in slopes)
     assert any(slope.abs().max() > 0 for slope in slopes)
-    assert np.isfinite(sample.judge(network, scenes["held volumes"][0], config, device)).all()
+    assert np.isfinite(sample.score_scene(network, scenes["held volumes"][0], config, device)).all()
 
 
 def test_a_run_elsewhere_or_otherwise_is_refused(data, straight, tmp_path):

@@ -16,7 +16,7 @@ _LINES = 30.0  # seconds between two lines where nobody watches
 
 
 class Talk:
-    """A text stream that takes what is said as said: on a full disk or a closed pipe talk is lost, the work is not."""
+    """A text stream of messages that never fails: on a full disk or a closed pipe they are lost, the work is not."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -45,7 +45,7 @@ Interruption = Callable[[Callable[[str], None]], AbstractContextManager[Callable
 
 @dataclass
 class Console:
-    """Talk on standard error; standard output is for data.
+    """Messages on standard error; standard output is for data.
 
     Attributes:
         quiet: say nothing (errors are printed by the command line itself).

@@ -284,7 +284,7 @@ def _points(run: Run, scene: Scene, views: list[View]) -> tuple[np.ndarray, np.n
 
 
 def _render(run: Run, request: ViewsRequest, job: _Job, draw: Callable[[Camera], np.ndarray]) -> None:
-    _sweep(job, request.layout)
+    _remove_leftovers(job, request.layout)
     with run.stage("views") as stage:
         bar = run.console.bar("views")
         with ThreadPoolExecutor(1) as writer:  # compresses one view while the next is rendered
@@ -302,7 +302,7 @@ def _render(run: Run, request: ViewsRequest, job: _Job, draw: Callable[[Camera],
         stage.note = f"{len(job.pending)} views of {camera.width} x {camera.height} px in {job.folder}"
 
 
-def _sweep(job: _Job, layout: Layout) -> None:
+def _remove_leftovers(job: _Job, layout: Layout) -> None:
     """Remove the temporary files of this part's views that a run killed outright has left."""
     for path in (job.folder / name for view in job.pending for name in layout.files(view)):
         for left in path.parent.glob(f".{path.stem}.{'[0-9a-f]' * 8}{path.suffix}"):

@@ -53,7 +53,7 @@ class Step:
     """A frame of a series: a file, or a time step of one.
 
     Attributes:
-        name: for talk.
+        name: for messages.
         volume: as `SourceRequest.volume`.
         read: how to read it.
     """
@@ -108,7 +108,7 @@ def survey(steps: Sequence[Step], console: Console) -> Frames:
             bar(k + 1, len(steps))
     if first is None:
         raise UsageError("a series without frames")
-    return Frames(len(steps), [(n.lo, n.hi) for n in numbers], together(numbers), first, digest(*digests))
+    return Frames(len(steps), [(n.lo, n.hi) for n in numbers], merge_statistics(numbers), first, digest(*digests))
 
 
 def _grid(volume: Volume) -> tuple[Any, ...]:
@@ -121,7 +121,7 @@ def _grid_text(volume: Volume) -> str:
     return " x ".join(map(str, volume.dims)) + " voxels of {} from {} along {}".format(*numbers)
 
 
-def together(parts: Sequence[Statistics]) -> Statistics:
+def merge_statistics(parts: Sequence[Statistics]) -> Statistics:
     """The statistics of several volumes as one; counts are spread evenly within each one's bins."""
     lo, hi = min(p.lo for p in parts), max(p.hi for p in parts)
     widest = max(parts, key=lambda p: p.edges[-1] - p.edges[0])
@@ -146,7 +146,7 @@ def convert_series(request: ConvertRequest, shard: Shard, console: Console | Non
     Args:
         request: of all frames; its outputs have a place for the frame's number.
         shard: which part of the frames to convert.
-        console: for talk.
+        console: for messages.
 
     Returns:
         How many frames were converted.

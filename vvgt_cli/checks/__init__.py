@@ -74,7 +74,7 @@ def all_cases() -> Iterator[Case]:
         yield from importlib.import_module(f"vvgt_cli.checks.{name}").cases()
 
 
-def conduct(case: Case) -> Outcome:
+def run_case(case: Case) -> Outcome:
     """Run a case; whatever it raises is its problem."""
     begin = time.perf_counter()
     figure, problem = None, ""
@@ -94,4 +94,4 @@ def conduct(case: Case) -> Outcome:
     return Outcome(case.stage, case.name, not problem, figure.what, value, figure.limit, problem, seconds)
 
 
-__all__ = ["BrokenError", "Case", "Figure", "Outcome", "all_cases", "conduct", "require"]
+__all__ = ["BrokenError", "Case", "Figure", "Outcome", "all_cases", "require", "run_case"]

@@ -125,20 +125,20 @@ def _depth_of_one() -> Figure:
     return Figure("alpha off, relative", abs(float(ours) / float(exact) - 1), 0.05)  # the cut at 1/255
 
 
-def _mended(scene: Scene) -> Figure:
-    """What views mend stays finite, and comes no farther from them."""
+def _back_projected(scene: Scene) -> Figure:
+    """What back-projection makes of it is finite, and no farther from the views."""
     cameras = [camera(SIZE, SIZE, eye) for eye in ((2.2, -1.6, 1.1), (-2.0, 2.0, 0.5), (0.3, 0.2, -3.0))]
     views = render_views(scene, cameras, RenderSettings(step=0.25, samples=2))
     start = initialise(scene, VbmOptions(200, SIZE))
-    mended, _ = backproject(start, cameras, views)
-    require(len(mended) <= 200, f"{len(mended)} Gaussians for a budget of 200")
-    require(0 <= mended.colors.min() <= mended.colors.max() <= 2, "colours outside [0, 2]")
+    refitted, _ = backproject(start, cameras, views)
+    require(len(refitted) <= 200, f"{len(refitted)} Gaussians for a budget of 200")
+    require(0 <= refitted.colors.min() <= refitted.colors.max() <= 2, "colours outside [0, 2]")
 
     def error(gaussians: Gaussians) -> float:
         off = [render(gaussians, c)[..., :3] - v[..., :3] for c, v in zip(cameras, views, strict=True)]
         return float(np.sqrt(np.mean(np.square(off))))
 
-    return Figure("error over the error before", error(mended) / max(error(start.gaussians), 1e-9), 1.0)
+    return Figure("error over the error before", error(refitted) / max(error(start.gaussians), 1e-9), 1.0)
 
 
 def cases() -> Iterator[Case]:
@@ -158,4 +158,4 @@ def cases() -> Iterator[Case]:
         "one slice": lambda: build(rough((1, 9, 9)), ramp(), 1.0),
     }
     for name, make in scenes.items():
-        yield Case(STAGE, f"mended by views: {name}", partial(lambda make: _mended(make()), make))
+        yield Case(STAGE, f"back-projected: {name}", partial(lambda make: _back_projected(make()), make))

@@ -45,7 +45,7 @@ def convert(request: ConvertRequest, console: Console | None = None) -> Conversi
         raise UsageError("--checkpoint is of runs that repeat to the byte, --time-budget of others; give one of both")
     run = Run(console or Console(), ConversionReport("convert"))
     with claimed(request.outputs(), request.inputs(), request.overwrite), checkpoint_folder(request.checkpoint):
-        conversion = made(run, request)
+        conversion = run_conversion(run, request)
         report = _write(run, request, conversion)
         if request.checkpoint is not None and not _interrupted(run):
             Checkpoint(Path(request.checkpoint)).finish()
@@ -61,7 +61,7 @@ def in_memory(
         DataError, UsageError: as `convert`.
     """
     run = Run(console or Console(), ConversionReport("convert"))
-    conversion = made(run, ConvertRequest(source, None, fit, limits, all_views=all_views))
+    conversion = run_conversion(run, ConvertRequest(source, None, fit, limits, all_views=all_views))
     run.finish()
     return conversion
 
@@ -91,7 +91,7 @@ def planned(request: ConvertRequest, console: Console | None = None) -> Plan:
     return _planned(run, request)[-1]
 
 
-def made(run: Run, request: ConvertRequest) -> Conversion:
+def run_conversion(run: Run, request: ConvertRequest) -> Conversion:
     """Closed form, what views can improve of it, scores on the test views; only checkpoints are written.
 
     What of these is done, and with how many Gaussians, follows from the request's limits and what the stages cost
@@ -157,7 +157,7 @@ def _improve(work: Work, plan: Plan) -> None:
     ahead = [stage for stage in plan.stages if not stage.scores]
     told = improved = False
     for n, stage in enumerate([*ahead, None]):
-        if not (stage is None and improved) and work.enough():
+        if not (stage is None and improved) and work.target_reached():
             for name in (other.name for other in ahead[n:] if other.improves):
                 work.run.leave_out(name, f"the check views have {work.limits.target_psnr:g} dB without it")
             if not improved:
@@ -181,7 +181,7 @@ def _fewer(work: Work) -> None:
     count = len(start.gaussians)
     for part in SMALLER:
         work.gaussians = replace(start.form, budget=max(count // part, 1)).gaussians()
-        if len(work.gaussians) < count and work.enough():
+        if len(work.gaussians) < count and work.target_reached():
             work.run.leave_out(f"{count - len(work.gaussians)} Gaussians", "the target is reached without")
             return
     work.gaussians = start.gaussians

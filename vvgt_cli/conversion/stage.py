@@ -71,7 +71,7 @@ class Work:
         assert self.check is not None, "a stage that judges stands before the check views"
         return score_views(self.check.images, self.check.pictures(gaussians, self.rule), perceptual=False).psnr
 
-    def enough(self) -> bool:
+    def target_reached(self) -> bool:
         """Whether the target is reached."""
         target = self.limits.target_psnr
         return target is not None and self.check is not None and self.psnr(self.made()) >= target

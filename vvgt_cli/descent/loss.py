@@ -9,7 +9,14 @@ from vvgt_cli.jit.decorators import kernel
 
 
 @kernel("f4:3 f4:3 f4 f4 f4 f4:3", parallel=True)
-def loss_gradient(image, target, l1, l2, alpha_weight, grad):
+def loss_gradient(
+    image: np.ndarray,
+    target: np.ndarray,
+    l1: np.float32,
+    l2: np.float32,
+    alpha_weight: np.float32,
+    grad: np.ndarray,
+) -> float:
     """Fill ``grad`` (h, w, 4) with the gradient of ``sum l1 |r| + l2 r^2`` over RGB, alpha's share weighted.
 
     ``image``, ``target`` (h, w, 4) float32. Returns the sum of r^2, alpha's weighted too.
@@ -24,4 +31,5 @@ def loss_gradient(image, target, l1, l2, alpha_weight, grad):
                 slope = np.float32(2) * l2 * r + (l1 if r > 0 else -l1 if r < 0 else np.float32(0))
                 grad[y, x, f] = weight * slope
                 squares[y] += np.float64(weight * r * r)
-    return squares.sum()
+    total: float = squares.sum()
+    return total

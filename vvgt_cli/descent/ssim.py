@@ -8,6 +8,8 @@ blur(A) + 2 x blur(B) + y blur(D), where A, B, D are the derivatives by blur(x),
 
 from __future__ import annotations
 
+from typing import Any
+
 import numba as nb
 import numpy as np
 
@@ -16,11 +18,11 @@ from vvgt_cli.metrics.ssim import C1, C2, RADIUS, SIGMA
 
 KERNEL = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / SIGMA) ** 2)
 KERNEL = (KERNEL / KERNEL.sum()).astype(np.float32)
-f32 = np.float32
+f32: Any = np.float32
 
 
 @kernel(parallel=True, fastmath=True, error_model="numpy")
-def blur(planes, kernel, padded, out):
+def blur(planes: np.ndarray, kernel: np.ndarray, padded: np.ndarray, out: np.ndarray) -> None:
     """Correlate ``planes`` (n, h, w) with the outer square of ``kernel`` (2 r + 1,), zeros beyond the border.
 
     ``padded`` (n, h + 2 r, w + 2 r) is scratch whose rim is zero.
@@ -46,7 +48,7 @@ def blur(planes, kernel, padded, out):
 
 
 @kernel(parallel=True, fastmath=True, error_model="numpy")
-def products(x, y, out):
+def products(x: np.ndarray, y: np.ndarray, out: np.ndarray) -> None:
     """``out`` (5, h, w): x, y, x^2, y^2, x y of one channel (h, w)."""
     for row in nb.prange(x.shape[0]):
         for col in range(x.shape[1]):
@@ -56,7 +58,7 @@ def products(x, y, out):
 
 
 @kernel(parallel=True, fastmath=True, error_model="numpy")
-def slopes(blurred, out, score):
+def slopes(blurred: np.ndarray, out: np.ndarray, score: np.ndarray) -> None:
     """SSIM's derivatives by blur(x), blur(x^2), blur(x y) into ``out`` (3, h, w), its sums a row into ``score`` (h,).
 
     ``blurred`` (5, h, w): the blurs of `products`.
@@ -80,7 +82,9 @@ def slopes(blurred, out, score):
 
 
 @kernel(parallel=True, fastmath=True, error_model="numpy")
-def add_gradient(blurred, x, y, scale, channel, grad):
+def add_gradient(
+    blurred: np.ndarray, x: np.ndarray, y: np.ndarray, scale: np.float32, channel: int, grad: np.ndarray
+) -> None:
     """``grad`` (h, w, 4), one channel, += ``scale`` x gradient of the sum of SSIM.
 
     ``blurred`` (3, h, w): the blurs of `slopes`; ``x``, ``y`` (h, w) the channel of picture and target.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numba as nb
+import numpy as np
 
 from vvgt_cli.jit.decorators import inlined, kernel
 
@@ -14,22 +15,25 @@ _jit = inlined()
 
 
 @_jit
-def _adam(g, k, i, first, second, beta1, beta2, fix1, fix2):
+def _adam(
+    g: float, k: int, i: int, first: np.ndarray, second: np.ndarray, beta1: float, beta2: float, fix1: float,
+    fix2: float,
+) -> float:  # fmt: skip
     """One value's direction, about 1 in size; updates the running moments ``first`` and ``second`` (K, COUNT)."""
-    m = beta1 * first[k, i] + (1 - beta1) * g
-    v = beta2 * second[k, i] + (1 - beta2) * g * g
+    m: float = beta1 * first[k, i] + (1 - beta1) * g
+    v: float = beta2 * second[k, i] + (1 - beta2) * g * g
     first[k, i], second[k, i] = m, v
     return m * fix1 / (math.sqrt(v * fix2) + EPSILON)
 
 
 @_jit
-def _clip(value, bound):
+def _clip(value: float, bound: float) -> float:
     """``value`` within +-``bound``."""
     return min(max(value, -bound), bound)
 
 
 @_jit
-def _gain(factors, k, i, spread):
+def _gain(factors: np.ndarray, k: int, i: int, spread: float) -> float:
     """How much further axis i, column i of ``factors`` (K, 3, 3), may go than a long one.
 
     The dilation, of variance ``spread``, hides part of its step.
@@ -39,7 +43,10 @@ def _gain(factors, k, i, spread):
 
 
 @_jit
-def _directions(frame, k, first, second, beta1, beta2, fix1, fix2):
+def _directions(
+    frame: np.ndarray, k: int, first: np.ndarray, second: np.ndarray, beta1: float, beta2: float, fix1: float,
+    fix2: float,
+) -> tuple[float, ...]:  # fmt: skip
     """Adam's directions of d (3) and E (6), from row k of ``frame`` (K, 9)."""
     return (
         _adam(frame[k, 0], k, 0, first, second, beta1, beta2, fix1, fix2),
@@ -59,22 +66,10 @@ def _directions(frame, k, first, second, beta1, beta2, fix1, fix2):
     parallel=True,
 )
 def own_frame(
-    frame,
-    logit_grad,
-    color_grad,
-    rates,
-    clips,
-    spread,
-    beta1,
-    beta2,
-    step,
-    means,
-    factors,
-    logits,
-    colors,
-    first,
-    second,
-):
+    frame: np.ndarray, logit_grad: np.ndarray, color_grad: np.ndarray, rates: np.ndarray, clips: np.ndarray,
+    spread: float, beta1: float, beta2: float, step: int, means: np.ndarray, factors: np.ndarray, logits: np.ndarray,
+    colors: np.ndarray, first: np.ndarray, second: np.ndarray,
+) -> None:  # fmt: skip
     """mu += M d, M <- M (I + E + E^2 / 2): d, E, logit and colour by Adam; ``step`` counts from 1.
 
     Gradients ``frame`` (K, 9), ``logit_grad`` (K,), ``color_grad`` (K, 3) and what they are of, ``means`` (K, 3),
@@ -109,7 +104,10 @@ def own_frame(
 
 
 @kernel(parallel=True)
-def adam(values, slopes, rate, beta1, beta2, step, first, second):
+def adam(
+    values: np.ndarray, slopes: np.ndarray, rate: float, beta1: float, beta2: float, step: int, first: np.ndarray,
+    second: np.ndarray,
+) -> None:  # fmt: skip
     """Adam (Kingma and Ba 2015) on ``values`` (n,) in place; ``step`` counts from 1.
 
     ``slopes`` (n,) gradient, ``first``, ``second`` (n,) its running moments.

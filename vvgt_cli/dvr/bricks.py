@@ -13,7 +13,7 @@ MAX_DISTANCE = 15  # bricks; a longer leap saves nothing measurable
 
 
 @kernel("V f8:4", parallel=True)
-def _ranges(values, out):
+def _ranges(values: np.ndarray, out: np.ndarray) -> None:
     """Finite range over each brick of ``values`` (nz, ny, nx) and its upper neighbours; ``out`` (bz, by, bx, 2)."""
     nz, ny, nx = values.shape
     bz, by, bx = out.shape[:3]

@@ -9,7 +9,7 @@ from vvgt_cli.jit.decorators import inlined, kernel
 
 
 @inlined()
-def _apart(image, row, col, i, j):
+def _apart(image: np.ndarray, row: int, col: int, i: int, j: int) -> float:
     """Largest difference between pixels (row, col) and (i, j) of ``image`` (h, w, c) in any channel."""
     most = 0.0
     for channel in range(image.shape[2]):
@@ -18,7 +18,7 @@ def _apart(image, row, col, i, j):
 
 
 @kernel("f4:3 b1:2 f4:2", parallel=True)
-def _contrast(image, known, out):
+def _contrast(image: np.ndarray, known: np.ndarray, out: np.ndarray) -> None:
     """`contrast` of ``image`` (h, w, c) into ``out`` (h, w); ``known`` (h, w) bool."""
     height, width = out.shape
     for row in nb.prange(height):

@@ -12,9 +12,9 @@ import math
 import numba as nb
 import numpy as np
 
-from vvgt_cli.dvr.layout import BRICK, BRICK_BITS, TUPLES
-from vvgt_cli.dvr.runs import BORROWED, RUN, run_range, sample_run, stack_run
-from vvgt_cli.dvr.vectors import add, lane, row, scale, sub, zeros4
+from vvgt_cli.dvr.layout import BRICK, BRICK_BITS, TUPLES, Optics, Voxels
+from vvgt_cli.dvr.runs import BORROWED, RUN, Run, run_range, sample_run, stack_run
+from vvgt_cli.dvr.vectors import Quad, add, lane, row, scale, sub, zeros4
 from vvgt_cli.jit.decorators import inlined, kernel
 
 OPAQUE = 1e-3  # times step^2, as the error of integration goes: the transmittance at which a ray ends
@@ -24,7 +24,7 @@ TILE = 16  # pixels along the edge of a tile: its rays share what they read
 FLAGS = {"contract", "nsz", "arcp", "afn"}  # no nnan/ninf: non-finite voxels are data
 
 _x = 0.5 + 0.5 * np.cos((np.arange(8) + 0.5) * math.pi / 8)  # Chebyshev's points of [0, 1]
-ABSORBED = tuple(np.linalg.solve(np.vander(_x, increasing=True), -np.expm1(-_x) / _x).tolist())
+ABSORBED: tuple[float, ...] = tuple(np.linalg.solve(np.vander(_x, increasing=True), -np.expm1(-_x) / _x).tolist())
 
 U = nb.uint64
 
@@ -32,7 +32,7 @@ _jit = inlined(fastmath=FLAGS, error_model="numpy", **BORROWED)
 
 
 @_jit
-def sample(values, x, y, z):
+def sample(values: np.ndarray, x: float, y: float, z: float) -> float:
     """Trilinear value of ``values`` (nz, ny, nx) at voxel coordinates, clamped to the edge voxels.
 
     NaN where a corner is not finite.
@@ -47,15 +47,15 @@ def sample(values, x, y, z):
     # unsigned: no wrap-around tests on the eight loads
     i1, j1, k1 = U(min(i + 1, nx - 1)), U(min(j + 1, ny - 1)), U(min(k + 1, nz - 1))
     i0, j0, k0 = U(i), U(j), U(k)
-    c00 = values[k0, j0, i0] * gx + values[k0, j0, i1] * fx
-    c01 = values[k0, j1, i0] * gx + values[k0, j1, i1] * fx
-    c10 = values[k1, j0, i0] * gx + values[k1, j0, i1] * fx
-    c11 = values[k1, j1, i0] * gx + values[k1, j1, i1] * fx
+    c00: float = values[k0, j0, i0] * gx + values[k0, j0, i1] * fx
+    c01: float = values[k0, j1, i0] * gx + values[k0, j1, i1] * fx
+    c10: float = values[k1, j0, i0] * gx + values[k1, j0, i1] * fx
+    c11: float = values[k1, j1, i0] * gx + values[k1, j1, i1] * fx
     return (c00 * gy + c01 * fy) * (1.0 - fz) + (c10 * gy + c11 * fy) * fz
 
 
 @_jit
-def table_coordinate(value, optics):
+def table_coordinate(value: float, optics: Optics) -> float:
     """Table coordinate in [0, bins], or -1 for a value that is not finite."""
     if not (abs(value) < np.inf):
         return -1.0
@@ -63,7 +63,7 @@ def table_coordinate(value, optics):
 
 
 @_jit
-def _integrals(u, optics):
+def _integrals(u: float, optics: Optics) -> Quad:
     """Integrals over [0, u] of (tau r, tau g, tau b, tau): trapezoid, exact where tau is linear within a bin."""
     index = min(int(u), optics.nodes.shape[0] - 2)
     f = u - index
@@ -73,7 +73,7 @@ def _integrals(u, optics):
 
 
 @_jit
-def _point(u, optics):
+def _point(u: float, optics: Optics) -> Quad:
     """(tau r, tau g, tau b, tau) at one table coordinate."""
     index = min(int(u), optics.nodes.shape[0] - 2)
     f = u - index
@@ -81,7 +81,7 @@ def _point(u, optics):
 
 
 @_jit
-def _mean(u0, u1, optics):
+def _mean(u0: float, u1: float, optics: Optics) -> Quad:
     """Mean of (tau r, tau g, tau b, tau) while the table coordinate goes linearly from u0 to u1."""
     width = u1 - u0
     if abs(width) < 0.5:
@@ -90,14 +90,16 @@ def _mean(u0, u1, optics):
 
 
 @_jit
-def mean_optics(u0, u1, optics):
+def mean_optics(u0: float, u1: float, optics: Optics) -> tuple[float, float, float, float]:
     """`_mean` as a tuple."""
     mean = _mean(u0, u1, optics)
     return lane(mean, 0), lane(mean, 1), lane(mean, 2), lane(mean, 3)
 
 
 @_jit
-def box_span(px, py, pz, dx, dy, dz, nx, ny, nz):
+def box_span(
+    px: float, py: float, pz: float, dx: float, dy: float, dz: float, nx: int, ny: int, nz: int
+) -> tuple[float, float]:
     """Entry and exit t >= 0 of a ray through the box [-1/2, n - 1/2]^3; entry >= exit: missed."""
     t0, t1 = 0.0, np.inf
     for p, d, n in ((px, dx, nx), (py, dy, ny), (pz, dz, nz)):
@@ -111,7 +113,7 @@ def box_span(px, py, pz, dx, dy, dz, nx, ny, nz):
 
 
 @_jit
-def absorbed(depth):
+def absorbed(depth: float) -> float:
     """(1 - exp(-x)) / x for x >= 0, to 2e-10."""
     if depth > 1.0:
         return (1.0 - math.exp(-depth)) / depth
@@ -123,7 +125,7 @@ def absorbed(depth):
 
 
 @_jit
-def _composite(u0, u1, dt, optics, light, trans):
+def _composite(u0: float, u1: float, dt: float, optics: Optics, light: Quad, trans: float) -> tuple[Quad, float]:
     """``light`` (r, g, b, alpha) and ``trans`` behind a segment of length dt; the coordinate goes from u0 to u1."""
     segment = scale(dt, _mean(u0, u1, optics))
     depth = max(lane(segment, 3), 0.0)
@@ -142,13 +144,15 @@ def _composite(u0, u1, dt, optics, light, trans):
 
 
 @_jit
-def _inverse(d):
+def _inverse(d: float) -> float:
     """1 / d, or so large for d = 0 that a face across that axis is never reached."""
     return 1.0 / d if d != 0.0 else 1e300
 
 
 @_jit
-def _exit(px, py, pz, ix, iy, iz, reach, bi, bj, bk):
+def _exit(
+    px: float, py: float, pz: float, ix: float, iy: float, iz: float, reach: int, bi: int, bj: int, bk: int
+) -> float:
     """Ray parameter at which the cube of bricks within ``reach`` of (bi, bj, bk) ends; ix, iy, iz: `_inverse`."""
     x = (bi + reach if ix > 0.0 else bi - reach + 1) * BRICK
     y = (bj + reach if iy > 0.0 else bj - reach + 1) * BRICK
@@ -157,19 +161,24 @@ def _exit(px, py, pz, ix, iy, iz, reach, bi, bj, bk):
 
 
 @_jit
-def leap(px, py, pz, dx, dy, dz, reach, bi, bj, bk):
+def leap(
+    px: float, py: float, pz: float, dx: float, dy: float, dz: float, reach: int, bi: int, bj: int, bk: int
+) -> float:
     """Ray parameter at which the empty cube of bricks around (bi, bj, bk) ends, from the ray's origin p."""
     return _exit(px, py, pz, _inverse(dx), _inverse(dy), _inverse(dz), reach, bi, bj, bk)
 
 
 @_jit
-def _brick(p, d, t, n):
+def _brick(p: float, d: float, t: float, n: int) -> int:
     """Brick along one axis in which the ray p + t d is, clamped to the volume."""
     return min(max(int(p + t * d), 0), n - 1) >> BRICK_BITS
 
 
 @_jit
-def _skip(shape, empty, px, py, pz, dx, dy, dz, ix, iy, iz, t0, dt, per_step, count, i):
+def _skip(
+    shape: tuple[int, int, int], empty: np.ndarray, px: float, py: float, pz: float, dx: float, dy: float, dz: float,
+    ix: float, iy: float, iz: float, t0: float, dt: float, per_step: float, count: int, i: int,
+) -> int:  # fmt: skip
     """The sample from which on, after sample i, the ray may meet something visible; > count: none.
 
     Leaps from one empty cube of bricks to the next while what lies between is empty too: bricks that share a face make
@@ -199,8 +208,10 @@ def _skip(shape, empty, px, py, pz, dx, dy, dz, ix, iy, iz, t0, dt, per_step, co
 
 
 @_jit
-def _any_light(run, u0, dark):
+def _any_light(run: Run, u0: float, dark: np.ndarray) -> bool:
     """Whether some segment of a run (RUN,) that comes from u0 (-1: none) may have extinction."""
+    lowest: float
+    highest: float
     lowest, highest = run_range(run)
     if u0 >= 0.0:
         lowest, highest = min(lowest, u0), max(highest, u0)
@@ -208,7 +219,10 @@ def _any_light(run, u0, dark):
 
 
 @_jit
-def cast(voxels, optics, empty, px, py, pz, dx, dy, dz, step):
+def cast(
+    voxels: Voxels, optics: Optics, empty: np.ndarray, px: float, py: float, pz: float, dx: float, dy: float, dz: float,
+    step: float,
+) -> tuple[float, float, float, float]:  # fmt: skip
     """Premultiplied (r, g, b, alpha) along a ray; ``step`` is the sampling distance in voxels along it."""
     nz, ny, nx = voxels.values.shape
     run = stack_run()
@@ -246,7 +260,10 @@ def cast(voxels, optics, empty, px, py, pz, dx, dy, dz, step):
 
 
 @_jit
-def _pixel(voxels, optics, empty, eye, basis, lens, step, col, row, offsets):
+def _pixel(
+    voxels: Voxels, optics: Optics, empty: np.ndarray, eye: np.ndarray, basis: np.ndarray, lens: np.ndarray,
+    step: float, col: int, row: int, offsets: np.ndarray,
+) -> tuple[float, float, float, float]:  # fmt: skip
     """Sums (r, g, b, alpha) over the rays through the points ``offsets`` (n, 2: right, down) from a pixel's centre.
 
     Arguments as of `render_tiles`; the pixel is (``col``, ``row``).
@@ -265,7 +282,10 @@ def _pixel(voxels, optics, empty, eye, basis, lens, step, col, row, offsets):
 
 
 @_jit
-def _tile(voxels, optics, empty, eye, basis, lens, step, top, left, offsets, mask, known, out):
+def _tile(
+    voxels: Voxels, optics: Optics, empty: np.ndarray, eye: np.ndarray, basis: np.ndarray, lens: np.ndarray,
+    step: float, top: int, left: int, offsets: np.ndarray, mask: np.ndarray, known: int, out: np.ndarray,
+) -> None:  # fmt: skip
     """Pixels of the tile from (``left``, ``top``) on; arguments as of `render_tiles`."""
     height, width = out.shape[:2]
     share = 1.0 / (known + len(offsets))
@@ -288,7 +308,10 @@ def _tile(voxels, optics, empty, eye, basis, lens, step, top, left, offsets, mas
     fastmath=FLAGS,
     error_model="numpy",
 )
-def render_tiles(voxels, optics, empty, eye, basis, lens, step, order, offsets, mask, known, out):
+def render_tiles(
+    voxels: Voxels, optics: Optics, empty: np.ndarray, eye: np.ndarray, basis: np.ndarray, lens: np.ndarray,
+    step: float, order: np.ndarray, offsets: np.ndarray, mask: np.ndarray, known: int, out: np.ndarray,
+) -> None:  # fmt: skip
     """Render one view into ``out`` (h, w, 4) float32, rays at ``offsets`` (n, 2) in pixels where ``mask`` is set.
 
     ``eye`` (3,) voxels and ``basis`` (3, 3: rows right, down, forward) in voxels per unit-frame length;

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeAlias
 
 import numba as nb
 import numpy as np
@@ -12,7 +13,7 @@ from numba import types
 from numba.core import cgutils
 from numba.core.errors import TypingError
 
-from vvgt_cli.dvr.layout import Voxels
+from vvgt_cli.dvr.layout import Optics, Voxels
 from vvgt_cli.dvr.vectors import intrinsic
 from vvgt_cli.jit.decorators import inlined
 
@@ -23,7 +24,11 @@ NEAR = MOST // (4 * RUN + 3)  # voxels of a slab up to which the offsets within 
 # Arrays are not reference-counted within these functions: counting cost 100 ns a ray.
 BORROWED = {"_nrt": False}
 
-F, N, U = nb.float32, nb.int32, nb.uint64
+F: Any = nb.float32  # Any: mypy knows what they make outside of kernels
+N: Any = nb.int32
+L: Any = nb.int64
+Pointer: TypeAlias = Any  # to values of the volume
+Run: TypeAlias = Any  # pointer to `RUN` float32, of `stack_run`
 
 
 @intrinsic
@@ -105,7 +110,7 @@ def _pair(typingctx: Any, values: Any, index: Any, edge: Any, last: Any) -> Any:
 
 
 @inlined(error_model="numpy", **BORROWED)
-def _base(p, v, n):
+def _base(p: float, v: float, n: int) -> tuple[int, float, float]:
     """Lowest voxel of a run along an axis of ``n``, and from there its start and the end of the axis, float32.
 
     The run goes from ``p`` by ``v`` a sample, voxels. Counted from there, float32 keeps positions to 1e-5 voxels in a
@@ -125,7 +130,7 @@ def _from(typingctx: Any, values: Any, index: Any) -> Any:
     return values(values, index), codegen
 
 
-def _sampler(index):
+def _sampler(index: Callable[[int], int]) -> Callable[..., None]:
     """The loop over a run, its offsets of type ``index``: 32 bits are one vector of AVX-512 where 64 are two.
 
     ``here`` points to the run's lowest voxel; ``row``, ``slab``: voxels from one row, one slab to the next; ``last``:
@@ -134,7 +139,11 @@ def _sampler(index):
     """
 
     @inlined(fastmath={"contract", "nsz", "arcp", "afn"}, error_model="numpy", **BORROWED)
-    def samples(here, row, slab, last, start, step, top, last_voxel, table, out):
+    def samples(
+        here: Pointer, row: int, slab: int, last: int, start: tuple[float, float, float],
+        step: tuple[float, float, float], top: tuple[float, float, float], last_voxel: tuple[int, int, int],
+        table: tuple[float, float, float], out: Run,
+    ) -> None:  # fmt: skip
         (x0, y0, z0), (dx, dy, dz), (x_top, y_top, z_top) = start, step, top
         (last_i, last_j, last_k), (lo, inv_width, bins) = last_voxel, table
         for n in range(RUN):
@@ -166,11 +175,13 @@ def _sampler(index):
     return samples
 
 
-_near_samples, _far_samples = _sampler(nb.int32), _sampler(nb.int64)
+_near_samples, _far_samples = _sampler(N), _sampler(L)
 
 
 @inlined(fastmath={"contract", "nsz", "arcp", "afn"}, error_model="numpy", **BORROWED)
-def sample_run(voxels, px, py, pz, vx, vy, vz, optics, out):
+def sample_run(
+    voxels: Voxels, px: float, py: float, pz: float, vx: float, vy: float, vz: float, optics: Optics, out: Run
+) -> None:
     """Table coordinates in [0, bins] of the samples at p + k v, k < RUN; -1 where not finite.
 
     ``voxels`` `Voxels`, ``optics`` `Optics`; p, v in voxels (x, y, z), from the first voxel's centre; ``out``
@@ -180,9 +191,9 @@ def sample_run(voxels, px, py, pz, vx, vy, vz, optics, out):
     bx, x0, x_top = _base(px, vx, nx)
     by, y0, y_top = _base(py, vy, ny)
     bz, z0, z_top = _base(pz, vz, nz)
-    row, slab = nb.int64(nx), nb.int64(nx) * nb.int64(ny)
+    row, slab = L(nx), L(nx) * L(ny)
     first = bz * slab + by * row + bx
-    last = slab * nb.int64(nz) - 4 - first
+    last = slab * L(nz) - 4 - first
     here = _from(_first(voxels), first)
     start, step, top = (x0, y0, z0), (F(vx), F(vy), F(vz)), (x_top, y_top, z_top)
     last_voxel = N(nx - 2 - bx), N(ny - 1 - by), N(nz - 1 - bz)  # the last pair along x

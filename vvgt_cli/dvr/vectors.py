@@ -6,7 +6,7 @@ instructions.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeAlias
 
 from llvmlite import ir
 from numba import extending, types
@@ -27,6 +27,7 @@ class QuadType(types.Type):
 
 
 quad = QuadType()
+Quad: TypeAlias = Any  # a value of that type, in annotations: Python has none like it
 
 
 @register_model(QuadType)

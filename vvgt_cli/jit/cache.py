@@ -26,7 +26,7 @@ from numba.core.serialize import dumps
 
 from vvgt_cli import __version__
 from vvgt_cli.jit import store
-from vvgt_cli.jit.compile import Job, compile_aside
+from vvgt_cli.jit.compile import Job, compile_in_subprocess
 
 VERSIONS = numba.__version__, llvmlite.__version__, platform.python_version(), sys.implementation.name, __version__
 SETTINGS = ("OPT", "LOOP_VECTORIZE", "SLP_VECTORIZE", "BOUNDSCHECK", "DISABLE_INTEL_SVML", "USING_SVML", "CPU_FEATURES")
@@ -39,7 +39,7 @@ def _names(code: CodeType) -> Iterator[str]:
             yield from _names(constant)
 
 
-def _plain(value: Any) -> Any:
+def _unwrapped(value: Any) -> Any:
     """The Python function behind a compiled one or an intrinsic."""
     if isinstance(value, Dispatcher):
         return value.py_func
@@ -65,7 +65,7 @@ def reached(function: FunctionType) -> tuple[set[str], set[str]]:
         reads = {name: value.__globals__[name] for name in _names(value.__code__) if name in value.__globals__}
         reads |= {k: v for k, v in inspect.getclosurevars(value).nonlocals.items()} if value.__closure__ else {}
         for name, read in reads.items():
-            read = _plain(read)
+            read = _unwrapped(read)
             if isinstance(read, ModuleType):
                 if read.__name__.startswith("vvgt_cli"):
                     modules.add(read.__name__)
@@ -156,7 +156,7 @@ class KernelCache(caching._Cache):
         file = self.file(types, target_context.codegen())
         payload = self.find(file)
         if payload is None:
-            compile_aside([Job(self.function.__module__, self.function.__qualname__, types, file)])
+            compile_in_subprocess([Job(self.function.__module__, self.function.__qualname__, types, file)])
             payload = self.find(file)
         if payload is None:
             return None

@@ -77,8 +77,8 @@ def missing(jobs: Iterable[Job]) -> list[Job]:
     return [job for job in jobs if getattr(import_module(job.module), job.function)._cache.find(job.file) is None]
 
 
-def compile_aside(jobs: Sequence[Job], progress: Callable[[int, int], None] | None = None) -> bool:
-    """Compile ``jobs`` in a process of its own, one at a time on each processor; whether that worked.
+def compile_in_subprocess(jobs: Sequence[Job], progress: Callable[[int, int], None] | None = None) -> bool:
+    """Compile ``jobs`` in another process, one at a time on each processor; whether that worked.
 
     What did not work is left to the caller, who finds no file.
     """
@@ -98,14 +98,14 @@ def compile_aside(jobs: Sequence[Job], progress: Callable[[int, int], None] | No
         warn_once(f"kernels cannot be compiled by another process: {error}")
         return False
     try:
-        return _attend(process, pickle.dumps((folder, list(jobs))), len(jobs), progress)
+        return _follow(process, pickle.dumps((folder, list(jobs))), len(jobs), progress)
     finally:
         if process.poll() is None:
             _kill(process)
         process.wait()
 
 
-def _attend(process: Any, order: bytes, count: int, progress: Callable[[int, int], None] | None) -> bool:
+def _follow(process: Any, order: bytes, count: int, progress: Callable[[int, int], None] | None) -> bool:
     """Hand the order over, and follow what the worker prints: a line a kernel that is done."""
     with contextlib.suppress(BrokenPipeError):
         process.stdin.write(order)
@@ -139,6 +139,6 @@ def compile_ahead(
     """
     todo = missing(usual_jobs(names))
     if todo:
-        compile_aside(todo, progress)
+        compile_in_subprocess(todo, progress)
     kept = folder_for_writing() if todo else next((f for f in folders() if f.is_dir()), None)
     return len(todo), len(missing(todo)), kept if kept in folders() else None

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import numba as nb
 
 from vvgt_cli.jit.cache import KernelCache
 
+F = TypeVar("F", bound=Callable[..., Any])  # a kernel is called as the function that it is made of
 NO_ENTRY: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
 
-def kernel(
-    usual: str = "", tuples: Mapping[type, str] | None = None, **options: Any
-) -> Callable[[Callable[..., Any]], Any]:
+def kernel(usual: str = "", tuples: Mapping[type, str] | None = None, **options: Any) -> Callable[[F], F]:
     """``numba.njit`` for functions that Python calls: compiled in another process, loaded from disk.
 
     They run without the interpreter's lock, so that a signal is answered while they do (`vvgt_cli.cli.process`).
@@ -27,23 +26,23 @@ def kernel(
         options: of ``numba.njit``.
     """
 
-    def wrap(function: Callable[..., Any]) -> Any:
+    def wrap(function: F) -> F:
         made: Any = nb.njit(nogil=True, **options)(function)
         if hasattr(made, "py_func"):  # with NUMBA_DISABLE_JIT it is the function
             made._cache = KernelCache(made)
             made.usual, made.tuples = usual, tuples or {}
-        return made
+        return cast(F, made)
 
     return wrap
 
 
-def inlined(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+def inlined(**options: Any) -> Callable[[F], F]:
     """``numba.njit`` for functions that only kernels call: inlined always, without an entry for Python.
 
     The entries would take a quarter of the time of compiling.
     """
 
-    def wrap(function: Callable[..., Any]) -> Any:
+    def wrap(function: F) -> F:
         made: Any = nb.njit(forceinline=True, **NO_ENTRY, **options)(function)
         if hasattr(made, "py_func"):
 
@@ -51,6 +50,6 @@ def inlined(**options: Any) -> Callable[[Callable[..., Any]], Any]:
                 raise TypeError(f"{function.__qualname__} is called by kernels only; call its .py_func")
 
             made._compile_for_args = refuse
-        return made
+        return cast(F, made)
 
     return wrap

@@ -69,7 +69,7 @@ class GeometryConfig:
         epipolar_stage: encoder stage after whose blocks the views are read (the paper's "second layer").
         epipolar_width: D of Eq. 7.
         head: "residual" adds to every parameter, "direct" predicts all but the position (Eq. 6), "step" scales and
-            mends the direction of the gradient in the own frame (needs ``gradients``; not in the paper).
+            corrects the direction of the gradient in the own frame (needs ``gradients``; not in the paper).
         reach: largest move of a centre in standard deviations along each own axis.
         gradients: takes how the image error changes with each parameter as input too (not in the paper).
     """
@@ -143,7 +143,7 @@ class NetworkConfig:
         return 8 if self.rendering else 4
 
     @property
-    def reads(self) -> int:
+    def total_views(self) -> int:
         """Views that it is made for, all rounds together."""
         return self.rounds * self.image.views
 

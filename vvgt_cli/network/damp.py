@@ -15,7 +15,7 @@ VIEWS = 3  # of those that the network has read
 SMALLEST = 1 / 16  # share of a step; below it none is taken
 
 
-def between(start: Gaussians, end: Gaussians, share: float) -> Gaussians:
+def interpolate(start: Gaussians, end: Gaussians, share: float) -> Gaussians:
     """The Gaussians ``share`` of the way; quaternions of norm 1, on the short arc's chord."""
     mix = lambda a, b: a + np.float32(share) * (b - a)  # noqa: E731
     q = mix(start.quaternions, end.quaternions)
@@ -50,7 +50,7 @@ def damped(
 
     share, best, lowest = 1.0, end, error(end)
     while share > SMALLEST:
-        closer = between(start, end, share / 2)
+        closer = interpolate(start, end, share / 2)
         now = error(closer)
         if now >= lowest:
             break

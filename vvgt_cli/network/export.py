@@ -134,7 +134,7 @@ def _exported(
     return proto
 
 
-def halve(proto: Any) -> Any:
+def with_float16_weights(proto: Any) -> Any:
     """A copy with float32 weights stored as float16, each widened again by a Cast that loading folds away."""
     import onnx
 
@@ -153,7 +153,7 @@ def halve(proto: Any) -> Any:
     return proto
 
 
-def shaken(network: Vvgt) -> Vvgt:
+def randomised(network: Vvgt) -> Vvgt:
     """A copy in which nothing is zero: weights as large as trained ones everywhere."""
     network = copy.deepcopy(network)
     generator = torch.Generator().manual_seed(0)
@@ -186,7 +186,7 @@ def write_model(folder: Path, protos: Mapping[str, Any], card: ModelCard, storag
     """Graphs and card into a folder."""
     for name, proto in protos.items():
         path = folder / f"{name}.onnx"
-        path.write_bytes((halve(proto) if storage == "float16" else proto).SerializeToString())
+        path.write_bytes((with_float16_weights(proto) if storage == "float16" else proto).SerializeToString())
         inputs, outputs = ([entry.name for entry in side] for side in (proto.graph.input, proto.graph.output))
         card.graphs[name] = graph_record(path, inputs, outputs)
     (folder / CARD).write_text(card.to_json(), "utf-8")
@@ -209,7 +209,7 @@ def check_folder(target: Path, overwrite: bool) -> None:
         raise UsageError(f"-o {target}: is not a model that 'vvgt export' wrote; choose another name")
 
 
-def put(place: Path, target: Path) -> None:
+def replace_folder(place: Path, target: Path) -> None:
     """Move a finished folder to its place; what stood there goes once the new one is complete."""
     old = target.with_name(f".{target.name}.{secrets.token_hex(4)}")
     if target.exists():
@@ -251,7 +251,7 @@ def export_model(
         loaded.commit, loaded.metrics, OPSET, storage, 0.0,
     )  # fmt: skip
     moves = any(parameter.any() for parameter in network.geometry.head.last.parameters())
-    tried = network if moves else shaken(network)
+    tried = network if moves else randomised(network)
     with tempfile.TemporaryDirectory(prefix=f".{target.name[:80]}.", dir=target.parent) as scratch:
         place = Path(scratch) / "model"
         place.mkdir()
@@ -265,5 +265,5 @@ def export_model(
                     f"({kind} weights); expected at most {LIMITS[kind]:.0e}"
                 )
         write_model(place, protos if moves else trace(network), card, storage)
-        put(place, target)
+        replace_folder(place, target)
     return card

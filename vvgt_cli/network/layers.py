@@ -39,7 +39,7 @@ class Mlp(nn.Module):
         return self.fc2(functional.gelu(self.fc1(x)))
 
 
-def turn(x: Tensor, rope: tuple[Tensor, Tensor]) -> Tensor:
+def apply_rope(x: Tensor, rope: tuple[Tensor, Tensor]) -> Tensor:
     """Rotary embedding (Su et al. 2021) with tables cos, sin (t, d) of `axial_rope`; x (..., t, d)."""
     cos, sin = rope
     first, second = x.chunk(2, dim=-1)  # (..., t, d / 2) each
@@ -80,7 +80,7 @@ class Attention(nn.Module):
         q, k, v = qkv[0], qkv[1], qkv[2]  # (batch, heads, tokens, head_width)
         q, k = self.q_norm(q), self.k_norm(k)
         if rope is not None:
-            q, k = turn(q, rope), turn(k, rope)
+            q, k = apply_rope(q, rope), apply_rope(k, rope)
         out = functional.scaled_dot_product_attention(q, k, v)
         return self.proj(out.transpose(1, 2).reshape(batch, tokens, width))
 

@@ -25,7 +25,7 @@ _AGAIN = "export the checkpoint again"
 POINTS = 160_000  # Gaussians of one run of the second graph: the paper's 150,000 go at once
 
 
-def spread(cameras: Sequence[Camera], count: int) -> list[int]:
+def farthest_cameras(cameras: Sequence[Camera], count: int) -> list[int]:
     """Numbers, ascending, of at most ``count`` cameras that stand far apart: farthest-point choice.
 
     It begins with the camera farthest from all others' centre. Ties go to the camera with the smaller position, so
@@ -45,7 +45,7 @@ def spread(cameras: Sequence[Camera], count: int) -> list[int]:
     return sorted(int(tie[i]) for i in chosen)
 
 
-def in_turn(views: Sequence[int], number: int, rounds: int) -> list[int]:
+def views_of_round(views: Sequence[int], number: int, rounds: int) -> list[int]:
     """The views of round ``number``: every ``rounds``-th, all of them where there are fewer than rounds."""
     return list(views[number::rounds]) if len(views) >= rounds else list(views)
 
@@ -100,8 +100,9 @@ class Model:
     ) -> Gaussians:
         """The network's Gaussians, in the order of the given.
 
-        Views beyond the number that the model is made for are thinned out (`spread`); each round reads others of them.
-        More Gaussians than ``points`` are dealt with in equal parts along the Z-order, each as a scene of its own.
+        Views beyond the number that the model is made for are thinned out (`farthest_cameras`); each round reads others
+        of them. More Gaussians than ``points`` go through it in equal parts along the Z-order, each as a scene of its
+        own.
 
         Args:
             gaussians: where it starts, unit frame.
@@ -114,9 +115,9 @@ class Model:
             DataError: no Gaussians, no views, or output that is not finite.
         """
         config = self.card.network
-        few = spread(cameras, config.reads)
+        few = farthest_cameras(cameras, config.total_views)
         for number in range(config.rounds):
-            shown = in_turn(few, number, config.rounds)
+            shown = views_of_round(few, number, config.rounds)
             scene = prepare(gaussians, [cameras[i] for i in shown], images[shown], config, rule)
             rows = self.run_rows(scene, points, progress)
             if not np.isfinite(rows).all():

@@ -177,12 +177,12 @@ class Run:
             kernels: of `vvgt_cli.jit.ahead`.
             volume: type of the volume's values, where kernels read any.
         """
-        from vvgt_cli.jit.compile import VOLUMES, compile_aside, missing, usual_jobs
+        from vvgt_cli.jit.compile import VOLUMES, compile_in_subprocess, missing, usual_jobs
 
         todo = missing(usual_jobs(kernels, (volume,) if volume else VOLUMES))
         if todo:
             with self.stage("compile") as stage:
-                compile_aside(todo, self.console.bar("compile"))
+                compile_in_subprocess(todo, self.console.bar("compile"))
                 stage.note = f"{len(todo)} kernels, on a first run (vvgt warmup does it beforehand)"
 
     def elapsed(self) -> float:

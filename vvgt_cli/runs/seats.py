@@ -42,7 +42,7 @@ class Seat:
     psnr: float
 
     def name(self) -> str:
-        """As tables and talk have it."""
+        """As tables and messages have it."""
         return f"{self.rule} {self.size} px" + ("" if self.field_of_view == FIELD_OF_VIEW else " close up")
 
 

@@ -46,7 +46,10 @@ _exact = inlined()
 
 
 @tile_jit
-def _sweep(y0, y1, k, colors, a, b, c, u, v, opacity, rule, buf):
+def _sweep(
+    y0: int, y1: int, k: int, colors: np.ndarray, a: float, b: float, c: float, u: float, v: float, opacity: float,
+    rule: tuple[float, ...], buf: np.ndarray,
+) -> None:  # fmt: skip
     """Gaussian k over rows [y0, y1): sums a column into the seven rows behind the planes of ``buf``."""
     red, green, blue = max(colors[k, 0], ZERO), max(colors[k, 1], ZERO), max(colors[k, 2], ZERO)
     min_alpha, max_alpha, floor, factor, offset, end = rule
@@ -82,7 +85,10 @@ def _sweep(y0, y1, k, colors, a, b, c, u, v, opacity, rule, buf):
 
 
 @tile_jit
-def _moments_tile(entries, slots, extent, flat, colors, ox, oy, rule, buf, pairs):
+def _moments_tile(
+    entries: np.ndarray, slots: np.ndarray, extent: np.ndarray, flat: np.ndarray, colors: np.ndarray, ox: int, oy: int,
+    rule: tuple[float, ...], buf: np.ndarray, pairs: np.ndarray,
+) -> None:  # fmt: skip
     """The nine sums of each of the Gaussians ``entries``, in their order, into their rows of ``pairs``."""
     done = entries.shape[0]
     for index in range(entries.shape[0]):
@@ -118,7 +124,10 @@ def _moments_tile(entries, slots, extent, flat, colors, ox, oy, rule, buf, pairs
     fastmath=True,
     error_model="numpy",
 )
-def moments(tiles, start, members, slots, extent, flat, colors, tiles_x, rule, image, grad, pairs):
+def moments(
+    tiles: np.ndarray, start: np.ndarray, members: np.ndarray, slots: np.ndarray, extent: np.ndarray, flat: np.ndarray,
+    colors: np.ndarray, tiles_x: int, rule: np.ndarray, image: np.ndarray, grad: np.ndarray, pairs: np.ndarray,
+) -> None:  # fmt: skip
     """For each (tile, Gaussian) pair: its nine `SUMS` into ``pairs`` (n, 9) float32.
 
     ``image`` (h, w, 4) float32 is what `tiles.blend` made of ``colors`` clamped at 0, ``grad`` (h, w, 4) dL/d(image),
@@ -145,7 +154,7 @@ def moments(tiles, start, members, slots, extent, flat, colors, tiles_x, rule, i
 
 
 @_exact
-def _total(first, pairs, k):
+def _total(first: np.ndarray, pairs: np.ndarray, k: int) -> tuple[float, ...]:
     """Sum of Gaussian k's pairs, 9 float64, in a fixed order; a tuple: an array would be allocated for each."""
     s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = s8 = 0.0
     for p in range(first[k], first[k + 1]):
@@ -156,7 +165,9 @@ def _total(first, pairs, k):
 
 
 @_exact
-def _screen(flat, k, total, dilation, compensate):
+def _screen(
+    flat: np.ndarray, k: int, total: tuple[float, ...], dilation: float, compensate: float
+) -> tuple[float, ...]:
     """Gradients with respect to the projected centre (u, v) and the projected covariance (H, symmetric).
 
     Where opacity is compensated by sqrt(det S / det S'), half of S^-1 - S'^-1 for each part of its gradient is added.
@@ -178,7 +189,7 @@ def _screen(flat, k, total, dilation, compensate):
 
 
 @kernel(parallel=True)
-def screen(first, pairs, flat, out):
+def screen(first: np.ndarray, pairs: np.ndarray, flat: np.ndarray, out: np.ndarray) -> None:
     """Length of the gradient with respect to each projected centre (px) into ``out`` (K,) float64; 0 where unseen."""
     for k in nb.prange(flat.shape[0]):
         out[k] = 0.0
@@ -189,7 +200,10 @@ def screen(first, pairs, flat, out):
 
 
 @_exact
-def _center(x, y, z, fx, fy, du, dv, d00, d02, d11, d12):
+def _center(
+    x: float, y: float, z: float, fx: float, fy: float, du: float, dv: float, d00: float, d02: float, d11: float,
+    d12: float,
+) -> tuple[float, float, float]:  # fmt: skip
     """Gradient with respect to the centre in camera coordinates; d is the gradient of the Jacobian J."""
     inv = 1.0 / z
     jx, jy, jxz, jyz = fx * inv, fy * inv, -fx * x * inv * inv, -fy * y * inv * inv
@@ -200,7 +214,10 @@ def _center(x, y, z, fx, fy, du, dv, d00, d02, d11, d12):
 
 
 @_exact
-def _colors_and_logit(k, flat, colors, total, out_logits, out_colors):
+def _colors_and_logit(
+    k: int, flat: np.ndarray, colors: np.ndarray, total: tuple[float, ...], out_logits: np.ndarray,
+    out_colors: np.ndarray,
+) -> None:  # fmt: skip
     """Row k of ``out_logits`` (K,) and ``out_colors`` (K, 3), float32."""
     out_logits[k] = total[0] * (1.0 - flat[k, 6])
     out_colors[k, 0] = total[6] if colors[k, 0] >= 0.0 else 0.0
@@ -209,7 +226,9 @@ def _colors_and_logit(k, flat, colors, total, out_logits, out_colors):
 
 
 @_exact
-def _axis(factors, k, i, rot, jx, jy, jxz, jyz):
+def _axis(
+    factors: np.ndarray, k: int, i: int, rot: np.ndarray, jx: float, jy: float, jxz: float, jyz: float
+) -> tuple[float, ...]:
     """Column i of W M (3) and of N = J W M (2)."""
     v0, v1, v2 = turned(rot, np.float64(factors[k, 0, i]), np.float64(factors[k, 1, i]), np.float64(factors[k, 2, i]))
     return v0, v1, v2, jx * v0 + jxz * v2, jy * v1 + jyz * v2
@@ -220,8 +239,10 @@ def _axis(factors, k, i, rot, jx, jy, jxz, jyz):
     parallel=True,
 )
 def own_frame(
-    first, pairs, extent, flat, means, factors, colors, rot, trans, lens, rule, out_frame, out_logits, out_colors
-):  # fmt: skip
+    first: np.ndarray, pairs: np.ndarray, extent: np.ndarray, flat: np.ndarray, means: np.ndarray, factors: np.ndarray,
+    colors: np.ndarray, rot: np.ndarray, trans: np.ndarray, lens: np.ndarray, rule: np.ndarray, out_frame: np.ndarray,
+    out_logits: np.ndarray, out_colors: np.ndarray,
+) -> None:  # fmt: skip
     """Gradients for steps in each Gaussian's own frame: mu += M d, M <- M (I + E), E symmetric.
 
     ``out_logits`` (K,), ``out_colors`` (K, 3), ``out_frame`` (K, 9) float32: d (3), then E: xx, yy, zz, xy, xz, yz (an
@@ -256,7 +277,9 @@ def own_frame(
 
 
 @_exact
-def _column(turn, i, log_scale, rot, slopes):
+def _column(
+    turn: tuple[float, ...], i: int, log_scale: float, rot: np.ndarray, slopes: tuple[float, ...]
+) -> tuple[float, tuple[float, float, float], tuple[float, float, float, float]]:
     """Of axis i: the gradient of its log-scale, of its column of the rotation (3), and its part of dL/dJ (4)."""
     jx, jy, jxz, jyz, h00, h01, h11 = slopes
     w, a, b, c = turn
@@ -276,7 +299,10 @@ def _column(turn, i, log_scale, rot, slopes):
 
 
 @_exact
-def _quaternion(w, a, b, c, n, c0, c1, c2, out):
+def _quaternion(
+    w: float, a: float, b: float, c: float, n: float, c0: tuple[float, float, float], c1: tuple[float, float, float],
+    c2: tuple[float, float, float], out: np.ndarray,
+) -> None:  # fmt: skip
     """Gradient with respect to a quaternion of any norm, from those of its rotation's columns."""
     gw = 2 * (a * (c1[2] - c2[1]) + b * (c2[0] - c0[2]) + c * (c0[1] - c1[0]))
     ga = 2 * (w * (c1[2] - c2[1]) + b * (c1[0] + c0[1]) + c * (c2[0] + c0[2]) - 2 * a * (c1[1] + c2[2]))
@@ -293,9 +319,11 @@ def _quaternion(w, a, b, c, n, c0, c1, c2, out):
 
 @kernel("i8:1 f4:2 i4:2 f4:2 f4:2 f4:2 f4:2 f4:2 f8:2 f8:1 f8:1 f8:1 f4:2 f4:2 f4:2 f4:1 f4:2", parallel=True)
 def standard(
-    first, pairs, extent, flat, means, log_scales, quats, colors, rot, trans, lens, rule,
-    out_means, out_scales, out_quats, out_logits, out_colors,
-):  # fmt: skip
+    first: np.ndarray, pairs: np.ndarray, extent: np.ndarray, flat: np.ndarray, means: np.ndarray,
+    log_scales: np.ndarray, quats: np.ndarray, colors: np.ndarray, rot: np.ndarray, trans: np.ndarray, lens: np.ndarray,
+    rule: np.ndarray, out_means: np.ndarray, out_scales: np.ndarray, out_quats: np.ndarray, out_logits: np.ndarray,
+    out_colors: np.ndarray,
+) -> None:  # fmt: skip
     """Gradients with respect to the fields of `Gaussians`, float32 arrays of their shapes."""
     fx, fy = lens[0], lens[1]
     for k in nb.prange(means.shape[0]):

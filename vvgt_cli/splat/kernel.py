@@ -22,7 +22,7 @@ SHIFT = TILE.bit_length() - 1
 
 
 @_jit
-def to_camera(means, k, rot, trans):
+def to_camera(means: np.ndarray, k: int, rot: np.ndarray, trans: np.ndarray) -> tuple[float, float, float]:
     """Gaussian k's centre in camera coordinates, float64."""
     m0, m1, m2 = np.float64(means[k, 0]), np.float64(means[k, 1]), np.float64(means[k, 2])
     return (
@@ -33,7 +33,7 @@ def to_camera(means, k, rot, trans):
 
 
 @_jit
-def unit_quaternion(quats, k):
+def unit_quaternion(quats: np.ndarray, k: int) -> tuple[float, ...]:
     """Row k of ``quats`` (K, 4) divided by its norm, and 1 / norm, float64."""
     w, a, b, c = np.float64(quats[k, 0]), np.float64(quats[k, 1]), np.float64(quats[k, 2]), np.float64(quats[k, 3])
     n = 1.0 / math.sqrt(w * w + a * a + b * b + c * c)
@@ -41,7 +41,7 @@ def unit_quaternion(quats, k):
 
 
 @_jit
-def rotation_column(w, a, b, c, axis):
+def rotation_column(w: float, a: float, b: float, c: float, axis: int) -> tuple[float, float, float]:
     """Column ``axis`` of the rotation matrix of a unit quaternion."""
     if axis == 0:
         return 1 - 2 * (b * b + c * c), 2 * (a * b + w * c), 2 * (a * c - w * b)
@@ -51,7 +51,7 @@ def rotation_column(w, a, b, c, axis):
 
 
 @_jit
-def turned(rot, r0, r1, r2):
+def turned(rot: np.ndarray, r0: float, r1: float, r2: float) -> tuple[float, float, float]:
     """``rot`` (3, 3) times a vector."""
     return (
         rot[0, 0] * r0 + rot[0, 1] * r1 + rot[0, 2] * r2,
@@ -61,14 +61,17 @@ def turned(rot, r0, r1, r2):
 
 
 @_jit
-def _clear(k, depth, extent):
+def _clear(k: int, depth: np.ndarray, extent: np.ndarray) -> None:
     """Row k is not seen."""
     extent[k, 0] = extent[k, 1] = extent[k, 2] = extent[k, 3] = 0
     depth[k] = 0
 
 
 @_jit
-def _place(k, x, y, z, sxx, sxy, syy, opacity, lens, rule, flat, depth, extent):
+def _place(
+    k: int, x: float, y: float, z: float, sxx: float, sxy: float, syy: float, opacity: float, lens: np.ndarray,
+    rule: np.ndarray, flat: np.ndarray, depth: np.ndarray, extent: np.ndarray,
+) -> None:  # fmt: skip
     """Fill row k of ``flat``, ``depth`` and ``extent``, unless nothing of the Gaussian is seen.
 
     Of its centre (x, y, z) in camera coordinates, covariance sxx, sxy, syy in px^2 without dilation, and opacity.
@@ -109,7 +112,10 @@ def _place(k, x, y, z, sxx, sxy, syy, opacity, lens, rule, flat, depth, extent):
     "f4:2 f4:2 f4:2 f4:1 f8:2 f8:1 f8:1 f8:1 f4:2 f4:1 i4:2",
     parallel=True,
 )
-def project(means, log_scales, quats, logits, rot, trans, lens, rule, flat, depth, extent):
+def project(
+    means: np.ndarray, log_scales: np.ndarray, quats: np.ndarray, logits: np.ndarray, rot: np.ndarray,
+    trans: np.ndarray, lens: np.ndarray, rule: np.ndarray, flat: np.ndarray, depth: np.ndarray, extent: np.ndarray,
+) -> None:  # fmt: skip
     """EWA projection of every Gaussian, into ``flat``, ``depth`` and ``extent``."""
     fx, fy = lens[0], lens[1]
     for k in nb.prange(means.shape[0]):
@@ -139,7 +145,10 @@ def project(means, log_scales, quats, logits, rot, trans, lens, rule, flat, dept
     "f4:2 f4:3 f4:1 f8:2 f8:1 f8:1 f8:1 f4:2 f4:1 i4:2",
     parallel=True,
 )
-def project_factors(means, factors, logits, rot, trans, lens, rule, flat, depth, extent):
+def project_factors(
+    means: np.ndarray, factors: np.ndarray, logits: np.ndarray, rot: np.ndarray, trans: np.ndarray, lens: np.ndarray,
+    rule: np.ndarray, flat: np.ndarray, depth: np.ndarray, extent: np.ndarray,
+) -> None:  # fmt: skip
     """`project` for covariances ``M M^T`` given by ``factors`` (K, 3, 3) M."""
     fx, fy = lens[0], lens[1]
     for k in nb.prange(means.shape[0]):
@@ -164,7 +173,9 @@ def project_factors(means, factors, logits, rot, trans, lens, rule, flat, depth,
 
 
 @kernel("i8:1 i4:2 i8 i8 i8", parallel=True)
-def tile_lists(order, extent, tiles_x, tiles_y, workers):
+def tile_lists(
+    order: np.ndarray, extent: np.ndarray, tiles_x: int, tiles_y: int, workers: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Gaussians of each tile in the given (depth) order, ``order`` (K,) int64.
 
     Each of ``workers`` counts, then files, a stretch of ``order``; the result does not depend on how many there are.

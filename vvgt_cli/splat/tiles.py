@@ -35,7 +35,9 @@ from vvgt_cli.splat.constants import TILE
 
 
 @tile_jit
-def _pixel(t, dx, a, h, q, opacity, rule):
+def _pixel(
+    t: float, dx: float, a: float, h: float, q: float, opacity: float, rule: tuple[float, ...]
+) -> tuple[float, float]:
     """Weight T alpha of a pixel and its transmittance afterwards; a pixel that has ended keeps T with a minus.
 
     ``t`` is T before; other arguments as of `alpha_at`.
@@ -49,7 +51,10 @@ def _pixel(t, dx, a, h, q, opacity, rule):
 
 
 @tile_jit
-def _blend_tile(entries, extent, flat, colors, ox, oy, rule, buf):
+def _blend_tile(
+    entries: np.ndarray, extent: np.ndarray, flat: np.ndarray, colors: np.ndarray, ox: int, oy: int,
+    rule: tuple[float, ...], buf: np.ndarray,
+) -> None:  # fmt: skip
     """Blend the Gaussians ``entries`` in their order into planes 1, 2, 3."""
     for index in range(entries.shape[0]):
         if (index & 31) == 31 and all_ended(buf):
@@ -75,7 +80,10 @@ def _blend_tile(entries, extent, flat, colors, ox, oy, rule, buf):
     fastmath=True,
     error_model="numpy",
 )
-def blend(tiles, start, members, extent, flat, colors, tiles_x, rule, image):
+def blend(
+    tiles: np.ndarray, start: np.ndarray, members: np.ndarray, extent: np.ndarray, flat: np.ndarray, colors: np.ndarray,
+    tiles_x: int, rule: np.ndarray, image: np.ndarray,
+) -> None:  # fmt: skip
     """Front-to-back blending into ``image`` (height, width, 4) float32, linear in ``colors``."""
     height, width = image.shape[:2]
     way = rule[0], rule[1], rule[2], rule[3], rule[4], rule[5]
@@ -96,7 +104,10 @@ def blend(tiles, start, members, extent, flat, colors, tiles_x, rule, image):
 
 
 @tile_jit
-def _gather_tile(entries, slots, extent, flat, ox, oy, rule, buf, pairs):
+def _gather_tile(
+    entries: np.ndarray, slots: np.ndarray, extent: np.ndarray, flat: np.ndarray, ox: int, oy: int,
+    rule: tuple[float, ...], buf: np.ndarray, pairs: np.ndarray,
+) -> None:  # fmt: skip
     """Weights of each Gaussian into plane 1, then their sum and their products with planes 2 to 5 into ``pairs``."""
     for index in range(entries.shape[0]):
         if (index & 31) == 31 and all_ended(buf):
@@ -111,7 +122,7 @@ def _gather_tile(entries, slots, extent, flat, ox, oy, rule, buf, pairs):
                 j = y * U(TILE) + i
                 buf[j + PLANE_1], buf[j] = _pixel(buf[j], f32(np.int32(i)) + HALF - u, a, h, q, opacity, rule)
         s0 = s1 = s2 = s3 = s4 = ZERO
-        for j in range(y0 * U(TILE), y1 * U(TILE)):  # type: ignore[assignment]
+        for j in range(y0 * U(TILE), y1 * U(TILE)):
             weight = buf[j + PLANE_1]
             s0 += weight
             s1 += weight * buf[j + PLANE_2]
@@ -128,7 +139,10 @@ def _gather_tile(entries, slots, extent, flat, ox, oy, rule, buf, pairs):
     fastmath=True,
     error_model="numpy",
 )
-def gather(tiles, start, members, slots, extent, flat, tiles_x, rule, fields, pairs):
+def gather(
+    tiles: np.ndarray, start: np.ndarray, members: np.ndarray, slots: np.ndarray, extent: np.ndarray, flat: np.ndarray,
+    tiles_x: int, rule: np.ndarray, fields: np.ndarray, pairs: np.ndarray,
+) -> None:  # fmt: skip
     """For each (tile, Gaussian) pair: sums over its pixels of w and of w x 4 ``fields`` (4, h, w), w = T alpha.
 
     ``fields`` and ``pairs`` (pairs, 5) float32; these must be zero on entry: entries that no open pixel reaches stay
@@ -151,7 +165,7 @@ def gather(tiles, start, members, slots, extent, flat, tiles_x, rule, fields, pa
 
 
 @kernel("i8:1 f4:2 f8:2", parallel=True)
-def reduce_pairs(first, pairs, out):
+def reduce_pairs(first: np.ndarray, pairs: np.ndarray, out: np.ndarray) -> None:
     """Add each Gaussian's pairs, in a fixed order: ``out`` (K, 5) float64 += sums of rows of ``pairs`` (pairs, 5)."""
     for k in nb.prange(first.shape[0] - 1):
         for p in range(first[k], first[k + 1]):

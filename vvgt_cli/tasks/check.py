@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from vvgt_cli.checks import Case, Outcome, all_cases, conduct
+from vvgt_cli.checks import Case, Outcome, all_cases, run_case
 from vvgt_cli.checks.stiffness import Stiffness, scene_cases, stiffness
 from vvgt_cli.progress import Console
 from vvgt_cli.runs.record import document
@@ -85,22 +85,22 @@ def check(source: SourceRequest | None, tolerance: float, console: Console | Non
     """
     console = console or Console()
     if source is None:
-        return CheckReport(_conduct(list(all_cases()), console))
+        return CheckReport(_run_cases(list(all_cases()), console))
     loaded = load(source)
     console.say(describe_source(loaded))
     scene = loaded.scene()
     found = stiffness(scene, tolerance, console.bar("stiffness"))
-    outcomes = _conduct(list(scene_cases(scene)), console)
+    outcomes = _run_cases(list(scene_cases(scene)), console)
     return CheckReport(outcomes, volume_record(loaded), tf_record(loaded, source), found)
 
 
-def _conduct(cases: list[Case], console: Console) -> list[Outcome]:
+def _run_cases(cases: list[Case], console: Console) -> list[Outcome]:
     outcomes: list[Outcome] = []
     bar = console.bar("check")
     for case in cases:
         if outcomes and case.stage != outcomes[-1].stage:
             _say(console, outcomes, outcomes[-1].stage)
-        outcomes.append(conduct(case))
+        outcomes.append(run_case(case))
         if bar:
             bar(len(outcomes), len(cases))
     _say(console, outcomes, outcomes[-1].stage)

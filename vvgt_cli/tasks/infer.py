@@ -47,11 +47,11 @@ def divide(cameras: Sequence[Camera], wanted: int) -> tuple[list[int], list[int]
 
     The judges are views that it does not read, as far apart as may be; all of its own where there are no others.
     """
-    from vvgt_cli.network.runtime import spread
+    from vvgt_cli.network.runtime import farthest_cameras
 
-    read = spread(cameras, wanted)
+    read = farthest_cameras(cameras, wanted)
     others = [i for i in range(len(cameras)) if i not in read]
-    judges = [others[i] for i in spread([cameras[i] for i in others], JUDGES)] if others else read
+    judges = [others[i] for i in farthest_cameras([cameras[i] for i in others], JUDGES)] if others else read
     return read, judges
 
 
@@ -80,7 +80,7 @@ def _infer_file(request: InferRequest, run: Run) -> ConversionReport:
         model = Model.open(find_model(request.model), numba.get_num_threads(), request.provider)
         gaussians, header = open_gaussians(request.ply, run.console)
         cameras, images = load_views(request.views, "train")
-        wanted = model.card.network.reads
+        wanted = model.card.network.total_views
         read, judges = divide(cameras, wanted)
         stage.note = f"{len(gaussians)} Gaussians, {len(cameras)} views, model {model.card.name}"
     run.compile(INFER)

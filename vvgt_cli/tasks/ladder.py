@@ -173,7 +173,7 @@ def upright(
     return [see(cameras[n]) if n in PICTURED else image for n, image in enumerate(images)]
 
 
-def climb(
+def run_rungs(
     source: SourceRequest, options: LadderOptions, reference: Reference, console: Console
 ) -> Iterator[tuple[dict[str, Any], list[np.ndarray]]]:
     """Each rung's run (a dict, see `vvgt_cli.report.runs`) and its pictures of the reference's views.

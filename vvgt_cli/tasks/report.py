@@ -22,7 +22,7 @@ from vvgt_cli.runs.outputs import STDOUT, Output, check_outputs, write_text
 from vvgt_cli.runs.record import document
 from vvgt_cli.runs.source import SourceRequest, describe_source, load, tf_record, volume_record
 from vvgt_cli.tasks.infer import SHIPPED
-from vvgt_cli.tasks.ladder import PICTURED, LadderOptions, Reference, climb, pictures, rungs, warm_up
+from vvgt_cli.tasks.ladder import PICTURED, LadderOptions, Reference, pictures, run_rungs, rungs, warm_up
 from vvgt_cli.volume.blocks import check_memory
 
 PAGE, TABLE, DATA = "report.html", "report.csv", "report.json"
@@ -70,7 +70,7 @@ def report(request: ReportRequest, console: Console | None = None) -> dict[str, 
     reference = Reference.render(source.scene(), size, console)
     runs, ours = [], []
     total = len(rungs(request.ladder))
-    for run, images in climb(request.source, request.ladder, reference, console):
+    for run, images in run_rungs(request.source, request.ladder, reference, console):
         runs.append(run)
         ours.append(_pngs(pictures(images, PICTURED, request.picture_size)))
         score = f"PSNR {psnr(run):.2f} dB, worst seat {worst_seat(run):.2f} dB"

@@ -24,7 +24,8 @@ class SceneConfig:
         gaussians: fewest and most Gaussians of a scene at the first size, drawn evenly by their logarithm; as many more
             as the size is larger, to the power `GROWTH`.
         start: what the network is given, a method of `vvgt_cli.vbm`; "uniform" for the ablation "wo_vbm".
-        mended: with what the views can mend, as `vvgt convert` hands it on; without, the closed form alone.
+        back_projection: improve it by back-projection of the views, as `vvgt convert` does; without, the closed form
+            alone.
         functions: transfer functions suggested a volume.
         held_functions: those of them (from 0) that are never trained on.
         per_volume: scenes to train on of each volume, each with a function of its own.
@@ -39,7 +40,7 @@ class SceneConfig:
     size: int | tuple[int, ...] = 256
     gaussians: tuple[int, int] = (8_000, 40_000)
     start: str = "vbm"
-    mended: bool = True
+    back_projection: bool = True
     functions: int = 10
     held_functions: tuple[int, ...] = (3, 7)
     per_volume: int = 3
@@ -151,8 +152,10 @@ class TrainConfig:
             raise UsageError("train config: scenes.start is 'uniform' for the variant wo_vbm, and only there")
         if self.views > self.scenes.targets:
             raise UsageError(f"train config: views {self.views}, but a scene has {self.scenes.targets} targets")
-        if self.network.reads > self.scenes.inputs:
-            raise UsageError(f"train config: the network reads {self.network.reads} views, scenes.inputs gives fewer")
+        if self.network.total_views > self.scenes.inputs:
+            raise UsageError(
+                f"train config: the network reads {self.network.total_views} views, scenes.inputs gives fewer"
+            )
         if self.loss.lpips and min(self.scenes.sizes) < SMALLEST_LPIPS:
             raise UsageError(f"loss.lpips: pictures of {min(self.scenes.sizes)} px; expected {SMALLEST_LPIPS} or more")
         if not self.network.has_geometry and self.loss.decibel:

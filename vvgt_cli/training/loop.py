@@ -23,7 +23,7 @@ from vvgt_cli.training.config import TrainConfig, config_text, read_config
 from vvgt_cli.training.lpips import Lpips, load_lpips
 from vvgt_cli.training.parallel import World, world
 from vvgt_cli.training.record import Recorder
-from vvgt_cli.training.sample import Feeder, judge, learn
+from vvgt_cli.training.sample import Feeder, accumulate_gradients, score_scene
 from vvgt_cli.training.scenes import TrainingScene, make_scenes, prepare_scenes
 
 LAST, BEST, CONFIG = "last.pt", "best.pt", "config.yaml"
@@ -39,7 +39,7 @@ class Progress:
         skipped: of them, those without an update because something was not finite.
         best: largest mean gain on held-out scenes so far, dB.
         seconds: of training, over all resumptions.
-        found: the last look at the held-out scenes.
+        found: the last scores of the held-out scenes.
     """
 
     step: int = 0
@@ -62,15 +62,15 @@ def train(config: TrainConfig, data: str, output: str, console: Console, ended: 
     """
     folder, lpips = Path(output), load_lpips(config.loss)  # fails before the work, not after
     with world() as here:
-        talk = console if here.first else Console(quiet=True)
+        messages = console if here.first else Console(quiet=True)
         if here.first:
             _open_run(folder, config)
         here.wait()
-        make_scenes(Path(data), config.scenes, talk, (here.rank, here.size))
+        make_scenes(Path(data), config.scenes, messages, (here.rank, here.size))
         here.wait()
-        scenes = prepare_scenes(Path(data), config.scenes, talk)
+        scenes = prepare_scenes(Path(data), config.scenes, messages)
         torch.manual_seed(config.seed)
-        run = _Run(config, data, folder, here, scenes, talk, lpips)
+        run = _Run(config, data, folder, here, scenes, messages, lpips)
         return run.to_the_end(ended)
 
 
@@ -135,7 +135,7 @@ class _Run:
             stop = self._step(ended)
             state.seconds += time.monotonic() - began
             if state.step % config.check_every == 0 or state.step == config.steps:
-                self._look()
+                self._validate()
             if stop or state.step % config.save_every == 0 or state.step == config.steps:
                 self._save()
         if self.recorder is not None:
@@ -152,7 +152,7 @@ class _Run:
         tally = np.zeros(3)
         for index in range(here.rank, config.batch, here.size):
             rng = np.random.default_rng([config.seed, state.step, index])
-            one = learn(self.network, self.feeder, rng, here.device, self.lpips)
+            one = accumulate_gradients(self.network, self.feeder, rng, here.device, self.lpips)
             tally += [one.loss, one.gain, one.bad]
         here.add_gradients(self.network)
         loss, gain, bad, stop = here.total([*tally, bool(ended)])
@@ -175,14 +175,14 @@ class _Run:
             return 0
         return int(max(ended, default=signal.SIGTERM))
 
-    def _look(self) -> None:
+    def _validate(self) -> None:
         """Score the held-out scenes; keep the best network."""
         parts = [part for part in self.scenes if part != "train"]
         row: dict[str, Any] = {"step": self.progress.step}
         gains = []
         for part in parts:
             mine = self.scenes[part][self.here.rank :: self.here.size]
-            found = np.array([judge(self.network, scene, self.config, self.here.device) for scene in mine])
+            found = np.array([score_scene(self.network, scene, self.config, self.here.device) for scene in mine])
             rounds = self.config.network.rounds
             sums = found.sum(axis=0) if len(found) else np.zeros(rounds + 1)
             means = np.array(self.here.total(sums)) / len(self.scenes[part])
@@ -194,7 +194,7 @@ class _Run:
             self.progress.best = float(np.mean(gains))
             self._write(BEST, {})
         if self.recorder is not None:
-            self.recorder.look(row)
+            self.recorder.validation(row)
 
     def _save(self) -> None:
         self._write(LAST, {"optimizer": self.optimizer.state_dict(), "progress": asdict(self.progress)})

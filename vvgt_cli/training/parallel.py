@@ -27,7 +27,7 @@ class World:
 
     @property
     def first(self) -> bool:
-        """Whether it is the one that writes and talks."""
+        """Whether it is the one that writes and prints."""
         return self.rank == 0
 
     def total(self, values: Iterable[float]) -> list[float]:

@@ -40,7 +40,7 @@ class Table:
 
 
 class Recorder:
-    """Tables ``metrics.csv`` (a row a step) and ``held.csv`` (a row a look), TensorBoard, and talk."""
+    """Tables ``metrics.csv`` (a row a step) and ``held.csv`` (a row a validation), TensorBoard, and messages."""
 
     def __init__(self, folder: Path, step: int, steps: int, console: Console) -> None:
         self.metrics, self.held = Table(folder / "metrics.csv", step), Table(folder / "held.csv", step)
@@ -61,8 +61,8 @@ class Recorder:
                 f"{row['skipped']} skipped, {left / 60:.1f} minutes left"
             )
 
-    def look(self, row: dict[str, Any]) -> None:
-        """The held-out scenes have been looked at."""
+    def validation(self, row: dict[str, Any]) -> None:
+        """The held-out scenes have been scored."""
         self.held.add(row)
         self._plot("held", row)
         found = ", ".join(f"{key} {value:+.3f} dB" for key, value in row.items() if "gain" in key)

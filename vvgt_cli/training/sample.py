@@ -15,7 +15,7 @@ from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.metrics import psnr
 from vvgt_cli.network.model import Vvgt
 from vvgt_cli.network.prepare import Prepared, prepare
-from vvgt_cli.network.runtime import in_turn, spread
+from vvgt_cli.network.runtime import farthest_cameras, views_of_round
 from vvgt_cli.splat import render
 from vvgt_cli.training.config import TrainConfig
 from vvgt_cli.training.losses import decibels, view_loss
@@ -72,18 +72,18 @@ class Feeder:
     def _make(self, scene: int, views: int, number: int) -> Prepared:
         rounds, source = self.config.network.rounds, self.scenes[scene]
         rng = np.random.default_rng([self.config.seed, scene, views])
-        chosen = [int(i) for i in rng.permutation(len(source.cameras))[: self.config.network.reads]]
+        chosen = [int(i) for i in rng.permutation(len(source.cameras))[: self.config.network.total_views]]
         gaussians = source.gaussians
         if number:
             before, inputs = self.give(scene, views, number - 1)
             with torch.no_grad():
                 gaussians = before.restore(run_network(self.plain, inputs, torch.device("cpu")).numpy())
-        shown = in_turn(chosen, number, rounds)
+        shown = views_of_round(chosen, number, rounds)
         cameras = [source.cameras[i] for i in shown]
         return prepare(gaussians, cameras, as_float(source.images[shown]), self.config.network)
 
 
-def learn(
+def accumulate_gradients(
     network: Vvgt, feeder: Feeder, rng: np.random.Generator, device: torch.device, lpips: Lpips | None = None
 ) -> Tally:
     """Add the gradients of the loss of a scene's round, both drawn by ``rng``: mean over views, over the batch."""
@@ -109,12 +109,12 @@ def learn(
 
 
 @torch.no_grad()
-def judge(network: Vvgt, scene: TrainingScene, config: TrainConfig, device: torch.device) -> list[float]:
+def score_scene(network: Vvgt, scene: TrainingScene, config: TrainConfig, device: torch.device) -> list[float]:
     """PSNR on all targets of what the network is given, and after every round."""
-    few, gaussians = spread(scene.cameras, config.network.reads), scene.gaussians
+    few, gaussians = farthest_cameras(scene.cameras, config.network.total_views), scene.gaussians
     found = [mean_psnr(gaussians, scene.targets, scene.target_images)]
     for number in range(config.network.rounds):
-        shown = in_turn(few, number, config.network.rounds)
+        shown = views_of_round(few, number, config.network.rounds)
         cameras, images = [scene.cameras[i] for i in shown], as_float(scene.images[shown])
         prepared = prepare(gaussians, cameras, images, config.network)
         rows = run_network(network, tensors(prepared), device).cpu().numpy()

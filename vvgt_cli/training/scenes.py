@@ -96,8 +96,8 @@ def recipes(folder: Path, config: SceneConfig) -> dict[str, list[Recipe]]:
 
     return {
         "train": [make(v, trained) for v in volumes["train"] for _ in range(config.per_volume)],
-        "held volumes": [make(v, trained) for v in _some(volumes["held"], config.held)],
-        "held functions": [make(v, held) for v in _some(volumes["train"], config.held) if held],
+        "held volumes": [make(v, trained) for v in _subset(volumes["held"], config.held)],
+        "held functions": [make(v, held) for v in _subset(volumes["train"], config.held) if held],
     }
 
 
@@ -110,7 +110,7 @@ def _volumes(folder: Path) -> list[str]:
     return found
 
 
-def _some(entries: Sequence[str], count: int) -> list[str]:
+def _subset(entries: Sequence[str], count: int) -> list[str]:
     """``count`` of them, evenly spread, again from the first where there are fewer."""
     return [entries[i * len(entries) // count if len(entries) >= count else i % len(entries)] for i in range(count)]
 
@@ -152,7 +152,9 @@ def _key(recipe: Recipe, config: SceneConfig) -> str:
     """Hash of all that a scene depends on."""
     with open(recipe.volume, "rb") as stream:
         content = hashlib.file_digest(stream, "sha256").hexdigest()
-    whole = {name: asdict(config)[name] for name in ("start", "mended", "functions", "inputs", "targets", "seed")}
+    whole = {
+        name: asdict(config)[name] for name in ("start", "back_projection", "functions", "inputs", "targets", "seed")
+    }
     drawn = {name: value for name, value in asdict(recipe).items() if name != "volume"}
     text = json.dumps([VERSION, content, drawn, whole])
     return hashlib.sha256(text.encode()).hexdigest()[:20]
@@ -203,7 +205,7 @@ def _render(recipe: Recipe, config: SceneConfig) -> tuple[str, Gaussians, np.nda
     size = recipe.size
     bands = suggest(numbers, config.functions, sum(volume.dims) / 3, sum(volume.spacing) / 3)
     chosen = [bands[number] for number in recipe.functions]
-    function: Any = minimal.read(together(chosen, recipe.densities), "bands")
+    function: Any = minimal.read(merge_bands(chosen, recipe.densities), "bands")
     scene = Scene.build(volume, function, chosen[0].unit_distance, (numbers.lo, numbers.hi))
     options = VbmOptions(recipe.gaussians, size, config.start, config.seed)
     begun = initialise(scene, options)
@@ -214,12 +216,12 @@ def _render(recipe: Recipe, config: SceneConfig) -> tuple[str, Gaussians, np.nda
         return name, begun.gaussians, np.zeros((0, size, size, 4), np.float32)
     images = render_views(scene, [*shown, *targets], RenderSettings(step=0.5, samples=2))
     gaussians = begun.gaussians
-    if config.mended:
+    if config.back_projection:
         gaussians, _ = backproject(begun, shown, images[: len(shown)])
     return name, gaussians, images
 
 
-def together(bands: Sequence[Suggestion], factors: Sequence[float]) -> dict[str, Any]:
+def merge_bands(bands: Sequence[Suggestion], factors: Sequence[float]) -> dict[str, Any]:
     """One function that shows all ``bands``, extinctions times ``factors``: the minimal JSON form, per their distance.
 
     Opacities of bands that overlap add up, below 1; colours are means by opacity.

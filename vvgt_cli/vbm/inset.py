@@ -76,7 +76,9 @@ def _blur(field: np.ndarray) -> None:
 
 
 @inlined()
-def _run(field, x, y, z, dx, dy, dz, limit, inside):
+def _run(
+    field: np.ndarray, x: float, y: float, z: float, dx: float, dy: float, dz: float, limit: int, inside: bool
+) -> int:
     """Steps along d, from 1 to ``limit``, before the field leaves (``inside``) or enters the body; limit if never.
 
     ``field`` (nz, ny, nx); the point and d in its cells, (x, y, z).
@@ -88,7 +90,10 @@ def _run(field, x, y, z, dx, dy, dz, limit, inside):
 
 
 @kernel("f4:3 f4:3 f8:2 f8:1 f8:1 f8:3 f8:1 f8 f8 f8:2", parallel=True)
-def _shift(field, smooth, means, half, edge, cov, reach, dilation, far, out):
+def _shift(
+    field: np.ndarray, smooth: np.ndarray, means: np.ndarray, half: np.ndarray, edge: np.ndarray, cov: np.ndarray,
+    reach: np.ndarray, dilation: float, far: float, out: np.ndarray,
+) -> None:  # fmt: skip
     """`inset` into ``out`` (n, 3): ``field``, ``smooth``, ``half`` (3,), ``edge`` (3,) of `Opaque`.
 
     ``means`` (n, 3), ``cov`` (n, 3, 3), ``reach`` (n,) standard deviations, ``dilation``, ``far``: unit frame.

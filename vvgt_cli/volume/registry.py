@@ -114,7 +114,7 @@ def _slices(source: str, options: ReadOptions) -> Volume | None:
 
 def _folder(path: Path, source: str) -> Reader:
     """The reader of a folder; none where more of its files are volumes of other formats."""
-    lying = _lying(path)
+    lying = _volumes_in(path)
     for reader in READERS:
         if reader.holds is not None and reader.holds(path):
             own = len(lying.get(reader.name.removesuffix(" slices"), []))
@@ -130,7 +130,7 @@ def _folder(path: Path, source: str) -> Reader:
     )
 
 
-def _lying(path: Path) -> dict[str, list[str]]:
+def _volumes_in(path: Path) -> dict[str, list[str]]:
     """The volume files in a folder (not in those in it), by format: of their name, else of their content."""
     found: dict[str, list[str]] = {}
     for name in sorted(entry.name for entry in islice(os.scandir(path), LOOKED_AT) if entry.is_file()):
