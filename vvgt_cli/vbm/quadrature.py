@@ -16,11 +16,14 @@ from vvgt_cli.dvr.layout import TUPLES, Optics, Voxels
 from vvgt_cli.jit.decorators import inlined, kernel
 from vvgt_cli.vbm.columns import BLUE, GREEN, MASS, MOMENTS, RED, XX, XY, XZ, YY, YZ, ZZ, X, Y, Z
 
+Between = tuple[int, int, float, float]  # of `_between`
+Rows = tuple[np.ndarray, np.ndarray, np.ndarray]  # of `_rows`
+
 _jit = inlined(fastmath=FLAGS, error_model="numpy")
 
 
 @_jit
-def _between(p: float, d: float, n: int) -> tuple[int, int, float, float]:
+def _between(p: float, d: float, n: int) -> Between:
     """Voxels on both sides of ``p`` along an axis of ``n``, the share of the second, and the length of spread there.
 
     That is ``d``, and 0 in the rim before the first centre (beyond the last one both neighbours are the same voxel).
@@ -33,7 +36,13 @@ def _between(p: float, d: float, n: int) -> tuple[int, int, float, float]:
 
 @_jit
 def _rows(
-    values: np.ndarray, y: tuple, z: tuple, first: int, value: np.ndarray, along_y: np.ndarray, along_z: np.ndarray
+    values: np.ndarray,
+    y: Between,
+    z: Between,
+    first: int,
+    value: np.ndarray,
+    along_y: np.ndarray,
+    along_z: np.ndarray,
 ) -> None:
     """Voxels from ``first`` on, between rows: ``value``, and its differences over a point's box along y and z.
 
@@ -58,7 +67,7 @@ def _rows(
 
 @_jit
 def _ranges(
-    rows: tuple, at: np.ndarray, share: np.ndarray, dx: float, optics: Optics, u0: np.ndarray, u1: np.ndarray
+    rows: Rows, at: np.ndarray, share: np.ndarray, dx: float, optics: Optics, u0: np.ndarray, u1: np.ndarray
 ) -> None:
     """Table coordinates at both ends of the spread of each point of a row; ``u1`` -1 where a voxel is not finite.
 
@@ -82,7 +91,9 @@ def _ranges(
 
 
 @_jit
-def _gather(u0: np.ndarray, u1: np.ndarray, optics: Optics, points: int, d: float, y: float, z: float, out: np.ndarray):
+def _gather(
+    u0: np.ndarray, u1: np.ndarray, optics: Optics, points: int, d: float, y: float, z: float, out: np.ndarray
+) -> None:
     """Add a row of points to the moments ``out`` (cells, 13) about the cells' corners; ``points`` along x in a cell.
 
     The points lie at (m + 1/2) ``d`` from a corner along x and at ``y`` and ``z`` along the others, unit frame.

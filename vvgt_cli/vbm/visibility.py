@@ -22,6 +22,7 @@ MIN_RAYS = 8  # that meet a cell: with fewer, some cells are met by none and cou
 WORKERS = 4  # each with sums of its own, so that they need no atomics; whatever the threads, for the same bytes
 MAX_GRID = 1 << 25  # cells of all workers together
 THIN = 2.0  # pixels of the march: all of a box that is thinner may lie between two rays
+Vector = tuple[float, float, float]
 DEPTH, SEEN, LARGEST = 0, 1, 2  # of a cell's sums over rays: optical depth, its seen part, largest transmittance
 
 
@@ -58,7 +59,7 @@ def _axis(p: float, d: float, t: float, n: int) -> tuple[int, int, float, float]
 
 
 @inlined(fastmath=FLAGS, error_model="numpy")
-def _span(p: tuple, d: tuple, n: tuple) -> tuple[float, float]:
+def _span(p: Vector, d: Vector, n: tuple[int, int, int]) -> tuple[float, float]:
     """Entry and exit t >= 0 of a ray through the box [0, n]; entry >= exit: missed."""
     t0, t1 = 0.0, np.inf
     for axis in range(3):
@@ -73,7 +74,7 @@ def _span(p: tuple, d: tuple, n: tuple) -> tuple[float, float]:
 
 
 @inlined(fastmath=FLAGS, error_model="numpy")
-def _deposit(extinction: np.ndarray, p: tuple, d: tuple, sums: np.ndarray) -> None:
+def _deposit(extinction: np.ndarray, p: Vector, d: Vector, sums: np.ndarray) -> None:
     """Go from cell to cell along p + t d and add to ``sums`` (nz, ny, nx, 3).
 
     p, d (x, y, z) in cells from the box's corner, t in unit-frame lengths as ``extinction`` (nz, ny, nx) is per. What
@@ -172,7 +173,8 @@ def visibility(
     dims, wider = np.array(scene.values.shape[::-1]), 0
 
     def edge() -> np.ndarray:
-        return np.minimum(2.0 ** (cells.exponent + wider), dims)
+        result: np.ndarray = np.minimum(2.0 ** (cells.exponent + wider), dims)
+        return result
 
     while np.ceil(dims / edge()).prod() > MAX_CELLS or (
         _rays_a_cell(edge() * scene.step, cameras) < MIN_RAYS and (edge() < dims).any()
