@@ -16,6 +16,7 @@ from vvgt_cli.synth import analytic
 from vvgt_cli.vbm import visibility as visibility_module
 from vvgt_cli.vbm.columns import COLUMNS, MOMENTS, SEEN
 from vvgt_cli.vbm.moments import base_cells, morton
+from vvgt_cli.vbm.pyramid import principal_axes
 from vvgt_cli.vbm.tree import Leaves, Tree, build_tree, central, leaves_of, select, split, split_score
 from vvgt_cli.vbm.visibility import Visibility, march, visibility
 from vvgt_cli.volume import Volume
@@ -337,11 +338,30 @@ def test_rays_against_their_twin() -> None:
 
 
 def test_visibility_lookup() -> None:
+    """The grid's cell that holds a cell's middle, or the nearest one."""
     mean = np.arange(24, dtype=np.float32).reshape(2, 3, 4)
-    seen = Visibility(mean, mean + 100, np.array([2, 2, 2]))
-    at = np.array([[0.1, 0.1, 0.1], [7.9, 5.9, 3.9], [2.0, 0, 0], [-1, 99, 0]])
-    np.testing.assert_array_equal(seen.at(at)[0], [0, 23, 1, 8])
-    np.testing.assert_array_equal(seen.at(at)[1], [100, 123, 101, 108])
+    seen = Visibility(mean, mean + 100, np.array([2.0, 2.0, 4.0]))
+    index = np.array([[0, 0, 0], [7, 5, 3], [2, 0, 0], [-1, 99, 0], [7, 1, 4]], np.int32)
+    expected = np.array([0, 11, 1, 8, 15], np.float32)
+    np.testing.assert_array_equal(seen.at(index, np.ones(3)), np.stack([expected, expected + 100], 1))
+    np.testing.assert_array_equal(seen.at(np.array([[1, 1, 0]]), np.full(3, 2.0)), [[5, 105]])
+
+
+@pytest.mark.parametrize("spread", [1.0, 1e-6, 0.0])
+def test_principal_axes_against_lapack(spread: float) -> None:
+    """Random, nearly isotropic, flat and diagonal covariances, of every size."""
+    rng = np.random.default_rng(0)
+    factors = rng.normal(size=(200, 3, 3)) * spread + np.eye(3)
+    factors[50:100, :, 2] = 0
+    factors[100:120] *= np.eye(3)
+    cov = factors @ factors.transpose(0, 2, 1) * 10.0 ** rng.integers(-12, 6, 200)[:, None, None]
+    values, vectors = np.empty((200, 3)), np.empty((200, 3, 3))
+    principal_axes(cov, values, vectors)
+    size = np.abs(cov).max(axis=(1, 2))[:, None]
+    np.testing.assert_allclose(values / size, np.linalg.eigvalsh(cov) / size, atol=1e-14)
+    rebuilt = (vectors * values[:, None, :]) @ vectors.transpose(0, 2, 1)
+    np.testing.assert_allclose(rebuilt / size[..., None], cov / size[..., None], atol=1e-13)
+    np.testing.assert_allclose(vectors @ vectors.transpose(0, 2, 1), np.broadcast_to(np.eye(3), cov.shape), atol=1e-13)
 
 
 @pytest.mark.parametrize("dims", [(512, 512, 1), (1024, 700, 1), (3, 256, 256), (96, 96, 96)])

@@ -8,7 +8,13 @@ CLOSED_FORM = (
     "vvgt_cli.vbm.visibility:march",
     "vvgt_cli.vbm.quadrature:block_moments",
     "vvgt_cli.vbm.quadrature:compact",
+    "vvgt_cli.vbm.pyramid:look_up",
+    "vvgt_cli.vbm.pyramid:morton_codes",
+    "vvgt_cli.vbm.pyramid:take_base",
+    "vvgt_cli.vbm.pyramid:sum_children",
+    "vvgt_cli.vbm.pyramid:principal_axes",
     "vvgt_cli.vbm.inset:_shift",
+    "vvgt_cli.vbm.inset:_blur",
 )
 SLOPES = (
     "vvgt_cli.splat.backward:moments",
@@ -18,7 +24,7 @@ SLOPES = (
 REFINE = ("vvgt_cli.descent.steps:own_frame", *SLOPES, "vvgt_cli.descent.loss:loss_gradient")
 BACK_PROJECT = ("vvgt_cli.splat.tiles:gather", "vvgt_cli.splat.tiles:reduce_pairs")
 
-VIEWS = (*RAYCAST, *CLOSED_FORM[:2])  # and points to start from
+VIEWS = (*RAYCAST, *CLOSED_FORM[:3])  # and points to start from
 INIT = (*CLOSED_FORM, "vvgt_cli.dvr.bricks:_ranges")
 CONVERT = (RAYCAST[0], REFINE[0], *CLOSED_FORM, *DRAW, *REFINE[1:], *RAYCAST[1:])
 OPTIMIZE = (*REFINE, *DRAW)

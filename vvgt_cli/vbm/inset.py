@@ -55,24 +55,28 @@ def opaque_field(cells: Cells, step: np.ndarray, half: np.ndarray) -> Opaque:
     fraction = np.minimum(depth, 1)
     while math.prod(np.ceil(2 * half / edge - 1e-6)) > MAX_FIELD:
         edge, index, fraction = edge * 2, index >> 1, fraction / 8
-    field = np.zeros(np.ceil(2 * half / edge - 1e-6).astype(np.int64)[::-1], np.float32)
-    np.add.at(field, (index[:, 2], index[:, 1], index[:, 0]), fraction.astype(np.float32))
-    smooth = field.copy()
-    _blur(smooth)
-    _blur(smooth)
+    nx, ny, nz = np.ceil(2 * half / edge - 1e-6).astype(np.int64)
+    x, y, z = index.T.astype(np.int64)
+    field = np.bincount((z * ny + y) * nx + x, fraction, nx * ny * nz).astype(np.float32).reshape(nz, ny, nx)
+    smooth, other = field, np.empty_like(field)
+    for axis in (0, 1, 2, 0, 1, 2):
+        target = np.empty_like(field) if smooth is field else other
+        _blur(smooth, *np.eye(3, dtype=np.int64)[axis], target)
+        smooth, other = target, smooth if smooth is not field else other
     return Opaque(field, smooth, edge, half)
 
 
-def _blur(field: np.ndarray) -> None:
-    """[1, 2, 1] / 4 along each axis in place, edges clamped."""
-    for axis in range(3):
-        rows = np.moveaxis(field, axis, 0)
-        before = rows[0].copy()
-        for i in range(len(rows)):
-            here = rows[i].copy()
-            after = rows[min(i + 1, len(rows) - 1)]
-            rows[i] = 0.5 * here + 0.25 * (before + after)
-            before = here
+@kernel("f4:3 i8 i8 i8 f4:3", parallel=True)
+def _blur(field: np.ndarray, dz: int, dy: int, dx: int, out: np.ndarray) -> None:
+    """[1, 2, 1] / 4 along the axis of which d is 1, edges clamped; ``field`` and ``out`` (nz, ny, nx)."""
+    nz, ny, nx = field.shape
+    for k in nb.prange(nz):
+        for j in range(ny):
+            before = field[max(k - dz, 0), max(j - dy, 0)]
+            after = field[min(k + dz, nz - 1), min(j + dy, ny - 1)]
+            for i in range(nx):
+                beside = before[max(i - dx, 0)] + after[min(i + dx, nx - 1)]
+                out[k, j, i] = np.float32(0.5) * field[k, j, i] + np.float32(0.25) * beside
 
 
 @inlined()

@@ -15,6 +15,7 @@ import numpy as np
 from vvgt_cli.dvr.layout import BRICK
 from vvgt_cli.dvr.scene import Scene
 from vvgt_cli.vbm.columns import MASS, MOMENTS
+from vvgt_cli.vbm.pyramid import morton_codes
 from vvgt_cli.vbm.quadrature import block_moments, compact
 
 FINEST_CUT = -4
@@ -50,16 +51,9 @@ def exponents(step: np.ndarray, level: int) -> np.ndarray:
 
 def morton(index: np.ndarray) -> np.ndarray:
     """(n, 3) cell indices below 2^21 -> (n,) uint64 Morton codes, x lowest."""
-    code = np.zeros(len(index), np.uint64)
-    for axis in range(3):
-        v = index[:, axis].astype(np.uint64)
-        for shift, mask in (
-            (32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F), (4, 0x10C30C30C30C30C3),
-            (2, 0x1249249249249249),
-        ):  # fmt: skip
-            v = (v | (v << np.uint64(shift))) & np.uint64(mask)
-        code |= v << np.uint64(axis)
-    return code
+    out = np.empty(len(index), np.uint64)
+    morton_codes(np.ascontiguousarray(index, np.int32), out)
+    return out
 
 
 def base_cells(

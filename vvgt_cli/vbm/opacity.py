@@ -19,7 +19,8 @@ def _table() -> tuple[np.ndarray, np.ndarray]:
     """o on [0, 0.99] and Li2(o) = sum o^k / k^2 there (700 terms: the rest is below 1e-7)."""
     o = np.linspace(0, MAX_ALPHA, 2001)
     k = np.arange(1, 701, dtype=np.float64)
-    return o, (o[:, None] ** k / k**2).sum(axis=1)
+    powers = np.multiply.accumulate(np.broadcast_to(o[:, None], (len(o), len(k))), axis=1)
+    return o, powers @ (1 / k**2)
 
 
 def dilogarithm(o: np.ndarray) -> np.ndarray:

@@ -10,6 +10,7 @@ from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.vbm.columns import COLOR, MASS, SEEN, SEEN_COLOR
 from vvgt_cli.vbm.inset import Opaque, inset
 from vvgt_cli.vbm.opacity import peak_opacity
+from vvgt_cli.vbm.pyramid import principal_axes
 from vvgt_cli.vbm.tree import Leaves, central
 
 FLOOR = 0.05  # smallest standard deviation, in the smaller of voxel and cell edge
@@ -58,7 +59,8 @@ def cell_gaussians(leaves: Leaves, voxel: float, pixel: float, opaque: Opaque, s
     moments = leaves.moments
     mass, mean, cov = central(moments)
     edge = np.cbrt(leaves.edge.prod(axis=1))
-    variances, axes = np.linalg.eigh(cov)  # ascending
+    variances, axes = np.empty_like(mean), np.empty_like(cov)
+    principal_axes(cov, variances, axes)  # ascending
     variances = np.maximum(variances, 1e-20)
     solid = -np.expm1(-2 * mass / edge**2)[:, None]
     thin = variances * (1 + TRANSLUCENT_SPREAD * np.minimum(1, 12 * variances / edge[:, None] ** 2))

@@ -9,21 +9,19 @@ import numpy as np
 from vvgt_cli.dvr.scene import Scene
 from vvgt_cli.vbm.columns import (
     BLUE,
-    COLOR,
     COLUMNS,
     FIRST,
     GREEN,
     MASS,
-    MOMENTS,
     RED,
     SECOND,
     SEEN,
-    SEEN_COLOR,
     XX,
     YY,
     ZZ,
 )
 from vvgt_cli.vbm.moments import CHILDREN, Cells, cell_moments, morton
+from vvgt_cli.vbm.pyramid import sum_children, take_base
 from vvgt_cli.vbm.visibility import Visibility
 
 HIDDEN = 1e-3  # cells that no view sees with more transmittance are dropped
@@ -57,8 +55,8 @@ class Tree:
 
 def build_tree(cells: Cells, seen: Visibility, step: np.ndarray) -> Tree:
     """Sum moments upwards, eight (or fewer) cells at a time; ``step`` is the voxel edge in the unit frame (3,)."""
-    mean, largest = seen.at((cells.index + 0.5) * (cells.edge / step))
-    keep = np.flatnonzero(largest > HIDDEN)
+    through = seen.at(cells.index, cells.edge / step)
+    keep = np.flatnonzero(through[:, 1] > HIDDEN)
     codes = [morton(cells.index[keep])]
     starts = []
     while len(codes[-1]) > 1:
@@ -70,19 +68,14 @@ def build_tree(cells: Cells, seen: Visibility, step: np.ndarray) -> Tree:
     moments, top = np.empty((total, COLUMNS)), np.empty(total)
     index, edge, parent = np.empty((total, 3), np.int32), np.empty((total, 3)), np.empty(total, np.int64)
     first, children = np.zeros(total, np.int64), np.zeros(total, np.int64)
-    base = moments[: counts[0]]
-    np.take(cells.moments, keep, axis=0, out=base[:, :MOMENTS])
-    base[:, SEEN] = base[:, MASS] * mean[keep]
-    base[:, SEEN_COLOR] = base[:, COLOR] * mean[keep, None]
-    top[: counts[0]] = largest[keep]
+    take_base(cells.moments, keep, through, moments[: counts[0]], top[: counts[0]])
     edge[: counts[0]] = cells.edge
     index[: counts[0]] = cells.index[keep]
     offset = 0
     for level, start in enumerate(starts):
         here = slice(offset, offset + counts[level])
         up = slice(here.stop, here.stop + counts[level + 1])
-        np.add.reduceat(moments[here], start, axis=0, out=moments[up])
-        np.maximum.reduceat(top[here], start, out=top[up])
+        sum_children(moments[here], top[here], start, moments[up], top[up])
         edge[up] = cells.edge * 2.0 ** (level + 1)
         index[up] = index[here][start] >> 1
         first[up] = offset + start
@@ -234,9 +227,9 @@ def _children_below(leaves: Leaves, scene: Scene, seen: Visibility) -> tuple[np.
         chosen = np.flatnonzero((leaves.edge == edge).all(axis=1))
         moments = cell_moments(scene, leaves.index[chosen] * (edge / step), edge / step)  # (n, 8, 13)
         index = 2 * leaves.index[chosen][:, None, :] + CHILDREN  # (n, 8, 3)
-        mean, largest = seen.at(((index + 0.5) * (edge / 2 / step)).reshape(-1, 3))
-        keep = (moments[..., MASS] > 0) & (largest.reshape(-1, 8) > HIDDEN)
-        rows = with_seen(moments[keep], mean[keep.ravel()])
+        through = seen.at(index.reshape(-1, 3), edge / 2 / step).reshape(-1, 8, 2)
+        keep = (moments[..., MASS] > 0) & (through[..., 1] > HIDDEN)
+        rows = with_seen(moments[keep], through[keep, 0])
         owners.append(np.repeat(chosen, keep.sum(axis=1)))
         found.append(
             Leaves(rows, index[keep], np.broadcast_to(edge / 2, (len(rows), 3)), np.full(len(rows), -1, np.int64))

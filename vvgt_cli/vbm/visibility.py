@@ -16,6 +16,7 @@ from vvgt_cli.dvr.scene import Scene
 from vvgt_cli.jit.decorators import inlined, kernel
 from vvgt_cli.vbm.columns import MASS
 from vvgt_cli.vbm.moments import Cells
+from vvgt_cli.vbm.pyramid import look_up
 
 MAX_CELLS = 1 << 21
 MIN_RAYS = 8  # that meet a cell: with fewer, some cells are met by none and count as hidden
@@ -40,11 +41,11 @@ class Visibility:
     largest: np.ndarray
     edge: np.ndarray
 
-    def at(self, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Mean and largest transmittance (n,) at positions (n, 3) in voxels (x, y, z) from the box's corner."""
-        top = np.array(self.mean.shape[::-1]) - 1
-        x, y, z = np.clip(np.floor(position / self.edge).astype(np.int64), 0, top).T
-        return self.mean[z, y, x], self.largest[z, y, x]
+    def at(self, index: np.ndarray, edge: np.ndarray) -> np.ndarray:
+        """Mean and largest transmittance (n, 2) of cells ``index`` (n, 3) int32 (x, y, z), edges (3,) in voxels."""
+        out = np.empty((len(index), 2), np.float32)
+        look_up(np.ascontiguousarray(index, np.int32), edge / self.edge, self.mean, self.largest, out)
+        return out
 
 
 @inlined(fastmath=FLAGS, error_model="numpy")
