@@ -86,6 +86,22 @@ def test_what_is_in_memory_is_read_alike(field, converted, tmp_path):
         assert saved(result, tmp_path / f"{name}.ply") == wanted, name
 
 
+def test_a_session_reads_once_and_leaves_the_same_bytes(field, tmp_path, monkeypatch):
+    session = vvgt.Session(field, spacing=SPACING)
+    alone = [saved(vvgt.convert(field, tf, spacing=SPACING, **HOW), tmp_path / f"{tf}.ply") for tf in ("gray", "hot")]
+    from vvgt_cli.dvr import bricks
+
+    monkeypatch.setattr(bricks, "brick_ranges", None)  # neither laid out again
+    monkeypatch.setattr("vvgt_cli.volume.statistics", None)  # nor counted
+    together = [saved(session.convert(tf, **HOW), tmp_path / f"s-{tf}.ply") for tf in ("gray", "hot")]
+    assert together == alone
+    cameras, images = vvgt.render_views(session, "gray", 1, size=32)
+    assert images[..., 3].max() > 0
+    assert session.volume.spacing == SPACING
+    with pytest.raises(vvgt.UsageError, match="spacing: a session's volume has been read"):
+        vvgt.convert(session, "gray", spacing=SPACING)
+
+
 def test_an_affine_is_nibabels(field, tmp_path):
     affine = np.array([[0, -1.5, 0, 7], [1, 0, 0, -3], [0, 0, -2, 11], [0, 0, 0, 1.0]])
     image = nibabel.Nifti1Image(field.T, affine)

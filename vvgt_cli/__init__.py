@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from vvgt_cli.errors import DataError, UsageError, VvgtError
     from vvgt_cli.gaussians import Gaussians, PlyHeader
     from vvgt_cli.library.functions import convert, evaluate, optimize, read_ply, read_volume, render_views
+    from vvgt_cli.library.session import Session
     from vvgt_cli.transfer import ColorMap, PiecewiseOpacity, TransferFunction, read_transfer_function
     from vvgt_cli.volume import Volume
 
@@ -31,6 +32,7 @@ _WHERE = {  # imported when asked for: `import vvgt_cli` costs nothing
     "errors": ("DataError", "UsageError", "VvgtError"),
     "gaussians": ("Gaussians", "PlyHeader"),
     "library.functions": ("convert", "evaluate", "optimize", "read_ply", "read_volume", "render_views"),
+    "library.session": ("Session",),
     "conversion.result": ("Conversion", "Result"),
     "transfer": ("ColorMap", "PiecewiseOpacity", "TransferFunction", "read_transfer_function"),
     "volume": ("Volume",),
@@ -46,6 +48,7 @@ __all__ = [
     "PiecewiseOpacity",
     "PlyHeader",
     "Result",
+    "Session",
     "TransferFunction",
     "UsageError",
     "Volume",

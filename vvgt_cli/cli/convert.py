@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from vvgt_cli.cli.fit import fit_options, limit_options, ply_options, rule_option
-from vvgt_cli.cli.options import common_options, overwrite_option, placed_read_options, tf_options
+from vvgt_cli.cli.options import common_options, overwrite_option, placed_read_options, tfs_options
 from vvgt_cli.progress import Console
 
 
@@ -26,7 +26,7 @@ from vvgt_cli.progress import Console
 @limit_options
 @click.option("--dry-run", is_flag=True, help="Print the plan with estimated time, memory and size; write nothing.")
 @ply_options
-@tf_options
+@tfs_options
 @placed_read_options
 @click.option("--report", metavar="R.json", help="Write times and errors of every stage as JSON; - is standard output.")
 @click.option("--preview", metavar="P.png", help="Write reference, ours and difference of three test views.")
@@ -52,7 +52,7 @@ def command(volume: str, shard: str | None, dry_run: bool, console: Console, **o
 
     With a place for a number in OUT.ply, VOLUME is a time series: a glob of its frames, or one file of several
     time steps. One .ply a frame, under one function and one range of values. The same command again goes on
-    where it was.
+    where it was. With --tf several times, {} in OUT.ply stands for each function's name, and VOLUME is read once.
 
     \b
     Examples:
@@ -62,20 +62,29 @@ def command(volume: str, shard: str | None, dry_run: bool, console: Console, **o
       vvgt convert head.nrrd --tf bone.json -o head.ply --target-psnr 35 --max-size 5
       vvgt convert - --dims 64 64 93 --dtype uint16 -o - < head.raw > head.ply
       vvgt convert 'run_*.vti' --tf tf.json -o 'out_{:04d}.ply'
+      vvgt convert head.nrrd --tf bone.json --tf skin.json -o 'head_{}.ply'
       vvgt convert cells.ome.tif --channel GFP --time 0 -o cells.ply
     """
+    from vvgt_cli.batches.functions import convert_functions
     from vvgt_cli.batches.series import convert_series, is_pattern
     from vvgt_cli.cli.fit import convert_request
     from vvgt_cli.conversion.convert import convert, planned
     from vvgt_cli.errors import UsageError
 
+    functions = options["optics"].pop("tf")
+    options["optics"]["tf"] = functions[0] if functions else None
     request = convert_request(volume, **options)
-    series = is_pattern(options["output"])
+    several = len(functions) > 1
+    if several and (dry_run or shard is not None or request.checkpoint is not None):
+        raise UsageError(f"{len(functions)} functions; expected one with --dry-run, --shard or --checkpoint")
+    series = is_pattern(options["output"]) and not several
     if series and request.checkpoint is not None:
         raise UsageError("--checkpoint is of one volume; a series goes on by its manifest: leave the option out")
     if series and dry_run:
         raise UsageError("--dry-run of a series: expected one volume; try it on one of the frames")
-    if series:
+    if several:
+        convert_functions(request, functions, console)
+    elif series:
         from vvgt_cli.batches.render_views import parse_shard
 
         convert_series(request, parse_shard(shard or "1/1"), console)

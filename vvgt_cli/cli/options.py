@@ -102,15 +102,21 @@ unit_distance_option = click.option(
     help="Distance that the function's opacity refers to. Default: the function's own, else paraview.",
 )  # fmt: skip
 
+TF_HELP = "Transfer function: a file, or a matplotlib colour map's name. Default: made from the values."
 tf_options = group(
     "optics",
+    tf=click.option("--tf", metavar="TF", help=TF_HELP),
+    tf_range=tf_range_option,
+    opacity_unit_distance=unit_distance_option,
+)
+tfs_options = group(
+    "optics",
     tf=click.option(
-        "--tf", metavar="TF",
-        help="Transfer function: a file, or a matplotlib colour map's name. Default: made from the values.",
+        "--tf", metavar="TF", multiple=True, help=f"{TF_HELP} Again: one file a function, its name for {{}} in OUT.ply."
     ),
     tf_range=tf_range_option,
     opacity_unit_distance=unit_distance_option,
-)  # fmt: skip
+)
 
 overwrite_option = click.option("--overwrite", is_flag=True, help="Replace files that exist.")
 

@@ -14,6 +14,29 @@ from vvgt_cli.volume import Volume
 
 
 @dataclass(frozen=True)
+class Layout:
+    """What of a scene does not depend on the function.
+
+    Attributes:
+        values, slope, intercept: of `kernel_values`.
+        ranges: (bz, by, bx, 2) stored values of each brick, NaN where none is finite.
+    """
+
+    values: np.ndarray
+    slope: float
+    intercept: float
+    ranges: np.ndarray
+
+    @classmethod
+    def of(cls, volume: Volume) -> Layout:
+        """Lay ``volume`` out."""
+        from vvgt_cli.dvr import bricks
+
+        values, slope, intercept = kernel_values(volume)
+        return cls(values, slope, intercept, bricks.brick_ranges(values))
+
+
+@dataclass(frozen=True)
 class Scene:
     """What every later stage reads.
 
@@ -55,13 +78,14 @@ class Scene:
         unit_distance: float,
         value_range: tuple[float, float] | None = None,
         bins: int | None = None,
+        layout: Layout | None = None,
     ) -> Scene:
-        """Prepare ``volume`` under ``tf``; ``value_range`` (data values), where it is known, is taken as it is."""
+        """Prepare ``volume`` under ``tf``; ``value_range`` (data values) and ``layout`` are taken as they are."""
         from vvgt_cli.dvr import bricks
 
         frame = volume.unit_frame()
-        values, slope, intercept = kernel_values(volume)
-        ranges = bricks.brick_ranges(values)  # (bz, by, bx, 2) stored values
+        layout = layout or Layout.of(volume)
+        values, slope, intercept, ranges = layout.values, layout.slope, layout.intercept, layout.ranges
         if value_range is None:
             ends = [
                 slope * float(np.nanmin(ranges[..., 0])) + intercept,

@@ -11,12 +11,12 @@ from typing import Any, BinaryIO, TypedDict
 from vvgt_cli.conversion.result import Result
 from vvgt_cli.errors import UsageError
 from vvgt_cli.progress import Console
-from vvgt_cli.runs.source import SourceRequest
+from vvgt_cli.runs.source import Opened, SourceRequest
 from vvgt_cli.transfer import TransferFunction
 from vvgt_cli.volume import ReadOptions, Volume
 
 PathLike = str | os.PathLike[str]
-VolumeLike = Any  # a path, a Volume, an array, an xarray.DataArray, a pyvista (VTK) dataset
+VolumeLike = Any  # a path, a Volume, a Session, an array, an xarray.DataArray, a pyvista (VTK) dataset
 FunctionLike = PathLike | Mapping[str, Any] | TransferFunction
 
 
@@ -98,7 +98,18 @@ def source_of(
     if not isinstance(tf_range, str):
         tf_range = ",".join(repr(float(v)) for v in tf_range)
     distance = None if opacity_unit_distance is None else str(opacity_unit_distance)
-    return SourceRequest(volume_of(volume, reading), tf=function_of(tf), tf_range=tf_range, unit_distance=distance)
+    opened = _opened(volume, reading) or volume_of(volume, reading)
+    return SourceRequest(opened, tf=function_of(tf), tf_range=tf_range, unit_distance=distance)
+
+
+def _opened(volume: VolumeLike, reading: Reading) -> Opened | None:
+    """What a `Session` holds."""
+    opened = getattr(volume, "opened", volume)
+    if not isinstance(opened, Opened):
+        return None
+    if reading:
+        raise UsageError(f"{', '.join(reading)}: a session's volume has been read; leave out {', '.join(reading)}")
+    return opened
 
 
 def ply_of(ply: PathLike | Result) -> str | BinaryIO:

@@ -12,7 +12,31 @@ from vvgt_cli.volume import ReadOptions, Statistics, Volume
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
+    from vvgt_cli.dvr.scene import Layout
     from vvgt_cli.transfer import TransferFunction
+
+
+@dataclass(frozen=True)
+class Opened:
+    """A volume with what does not depend on the function: for several functions, one after the other.
+
+    Attributes:
+        volume: as it was read.
+        statistics: of its values.
+        layout: for the kernels.
+    """
+
+    volume: Volume
+    statistics: Statistics
+    layout: Layout
+
+    @classmethod
+    def of(cls, volume: Volume) -> Opened:
+        """Count and lay out."""
+        from vvgt_cli.dvr.scene import Layout
+        from vvgt_cli.volume import statistics
+
+        return cls(volume, statistics(volume), Layout.of(volume))
 
 
 @dataclass(frozen=True)
@@ -20,7 +44,8 @@ class SourceRequest:
     """What to read.
 
     Attributes:
-        volume: path, `example:NAME`, or "-" for raw values on standard input; or a volume that is there already.
+        volume: path, `example:NAME`, or "-" for raw values on standard input; or a volume that is there already, with
+            what does not depend on the function or without.
         read: how to read it.
         tf: transfer-function file or colour-map name, or a function; None makes one from the histogram.
         tf_range: "data", "rescale" or "LO,HI".
@@ -28,7 +53,7 @@ class SourceRequest:
         statistics: what the function's nodes follow from in place of the volume's own: those of the whole series.
     """
 
-    volume: str | Volume
+    volume: str | Volume | Opened
     read: ReadOptions = field(default_factory=ReadOptions)
     tf: str | TransferFunction | None = None
     tf_range: str = "data"
@@ -43,7 +68,8 @@ class SourceRequest:
             UsageError: a volume that is there already.
         """
         if not isinstance(self.volume, str):
-            raise UsageError(f"{self.volume.name}: a volume in memory; expected a path here")
+            volume = self.volume.volume if isinstance(self.volume, Opened) else self.volume
+            raise UsageError(f"{volume.name}: a volume in memory; expected a path here")
         return self.volume
 
     def paths(self) -> list[str]:
@@ -55,7 +81,8 @@ class SourceRequest:
 class Source:
     """What was read: the function is visible somewhere in the volume.
 
-    ``unit_distance`` is the world length that opacity refers to, ``unit_label`` how it was chosen.
+    ``unit_distance`` is the world length that opacity refers to, ``unit_label`` how it was chosen; ``layout`` is the
+    volume's, where it is known.
     """
 
     volume: Volume
@@ -63,6 +90,7 @@ class Source:
     tf: TransferFunction
     unit_distance: float
     unit_label: str
+    layout: Layout | None = None
 
     def kernel_type(self) -> str:
         """Name of the type in which kernels read the volume's values."""
@@ -75,7 +103,7 @@ class Source:
         from vvgt_cli.dvr import Scene
 
         limits = (self.statistics.lo, self.statistics.hi)
-        return Scene.build(self.volume, self.tf, self.unit_distance, limits)
+        return Scene.build(self.volume, self.tf, self.unit_distance, limits, layout=self.layout)
 
 
 def load(request: SourceRequest) -> Source:
@@ -105,9 +133,11 @@ def load_all(request: SourceRequest, tfs: Sequence[str | TransferFunction | None
     ]  # small: their errors come first
     if None in functions and tf_range != "data":
         raise UsageError("--tf-range says where the nodes of a function lie; it needs --tf")
-    volume = open_volume(request.volume, request.read) if isinstance(request.volume, str) else request.volume
+    opened = request.volume if isinstance(request.volume, Opened) else None
+    given = opened.volume if opened else request.volume
+    volume = open_volume(given, request.read) if isinstance(given, str) else given
     unit_distance(request.unit_distance, volume)  # its errors come first
-    numbers = statistics(volume)
+    numbers = opened.statistics if opened else statistics(volume)
     sources = []
     for tf in functions:
         whole = request.statistics or numbers
@@ -120,7 +150,7 @@ def load_all(request: SourceRequest, tfs: Sequence[str | TransferFunction | None
             )
         check_visible(shown, numbers)
         distance, label = unit_distance(request.unit_distance, volume, tf or shown)
-        sources.append(Source(volume, numbers, shown, distance, label))
+        sources.append(Source(volume, numbers, shown, distance, label, opened and opened.layout))
     return sources
 
 

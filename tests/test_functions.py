@@ -1,0 +1,68 @@
+"""`vvgt convert` with several transfer functions: one file each, the volume read once."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+HOW = ("--max-gaussians", "60", "--size", "32", "--steps", "2")
+
+
+@pytest.fixture
+def functions(tmp_path):
+    for name, color in (("bone", [1, 1, 0.8]), ("skin", [0.9, 0.6, 0.5])):
+        points = [{"x": 0.2, "rgb": color, "opacity": 0}, {"x": 1, "rgb": color, "opacity": 0.4}]
+        (tmp_path / f"{name}.json").write_text(json.dumps({"range": [0, 1], "points": points}))
+    return [str(tmp_path / name) for name in ("bone.json", "skin.json")]
+
+
+def test_each_function_gets_the_file_that_it_gets_alone(vvgt, tmp_path, functions):
+    bone, skin = functions
+    out = str(tmp_path / "blob_{}.ply")
+    done = vvgt("convert", "example:blob:16", "--tf", bone, "--tf", skin, "-o", out, *HOW)
+    assert done.code == 0, done.err
+    assert done.err.count("volume ") == 1
+    assert "function 2 of 2" in done.err
+    for name, tf in (("bone", bone), ("skin", skin)):
+        alone = tmp_path / f"alone-{name}.ply"
+        assert vvgt("convert", "example:blob:16", "--tf", tf, "-o", str(alone), *HOW).code == 0
+        assert (tmp_path / f"blob_{name}.ply").read_bytes() == alone.read_bytes()
+    again = vvgt("convert", "example:blob:16", "--tf", bone, "--tf", skin, "-o", out, *HOW)
+    assert (again.code, "blob_bone.ply" in again.err) == (2, True)
+
+
+def test_reports_and_previews_have_the_name_too(vvgt, tmp_path, functions):
+    names = [str(tmp_path / name) for name in ("{}.ply", "{}.report.json", "{}.png")]
+    line = ("convert", "example:blob:16", "--tf", functions[0], "--tf", functions[1], *HOW)
+    done = vvgt(*line, "-o", names[0], "--report", names[1], "--preview", names[2])
+    assert done.code == 0, done.err
+    for name in ("bone", "skin"):
+        assert json.loads((tmp_path / f"{name}.report.json").read_text())["transfer_function"]["name"]
+        assert (tmp_path / f"{name}.png").stat().st_size > 0
+
+
+@pytest.mark.parametrize(
+    ("extra", "told"),
+    [
+        (("-o", "one.ply"), "-o one.ply: expected one place for the function's name"),
+        (("-o", "{:04d}.ply"), "expected one place for the function's name"),
+        (("-o", "{}.ply", "--preview", "p.png"), "--preview p.png: expected one place"),
+        (("-o", "{}.ply", "--dry-run"), "2 functions; expected one with --dry-run"),
+        (("-o", "{}.ply", "--shard", "1/2"), "2 functions; expected one with"),
+        (("-o", "{}.ply", "--checkpoint", "c"), "2 functions; expected one with"),
+    ],
+)
+def test_what_several_functions_ask_for(vvgt, tmp_path, functions, monkeypatch, extra, told):
+    monkeypatch.chdir(tmp_path)
+    done = vvgt("convert", "example:blob:16", "--tf", functions[0], "--tf", functions[1], *extra)
+    assert (done.code, told in done.err) == (2, True), done.err
+    assert len(done.err.strip().splitlines()) == 1
+
+
+def test_functions_of_one_name_are_refused(vvgt, tmp_path, functions):
+    (tmp_path / "other").mkdir()
+    twin = tmp_path / "other" / "bone.json"
+    twin.write_text((tmp_path / "bone.json").read_text())
+    done = vvgt("convert", "example:blob:16", "--tf", functions[0], "--tf", str(twin), "-o", str(tmp_path / "{}.ply"))
+    assert (done.code, "would have the same name" in done.err) == (2, True)

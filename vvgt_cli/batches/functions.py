@@ -1,0 +1,67 @@
+"""`vvgt convert` of one volume under several transfer functions: it is read and laid out once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from vvgt_cli.batches.series import is_pattern
+from vvgt_cli.conversion.convert import convert
+from vvgt_cli.conversion.request import ConvertRequest
+from vvgt_cli.errors import UsageError
+from vvgt_cli.progress import Console
+from vvgt_cli.runs.outputs import check_outputs
+from vvgt_cli.runs.record import ConversionReport, Run
+from vvgt_cli.runs.source import Opened
+
+
+def convert_functions(request: ConvertRequest, functions: Sequence[str], console: Console | None = None) -> None:
+    """One `.ply` a function; ``{}`` in the outputs of ``request`` is its file's name without endings.
+
+    Raises:
+        UsageError: outputs without a place for the name, or two functions of one name; found before anything is read.
+        DataError: as `convert`; what is done before stays.
+    """
+    from vvgt_cli.synth.sources import open_volume
+
+    console = console or Console()
+    requests = [_one(request, tf) for tf in functions]
+    for one in requests:
+        check_outputs(one.outputs(), one.inputs(), one.overwrite)
+    if len({one.output for one in requests}) < len(requests):
+        names = ", ".join(dict.fromkeys(map(_name, functions)))
+        raise UsageError(f"{len(functions)} functions, named {names}: the files would have the same name; rename one")
+    run = Run(console, ConversionReport("convert"))
+    with run.stage("volume") as stage:
+        opened = Opened.of(open_volume(request.source.path, request.source.read))
+        stage.note = f"{opened.volume.name}, for {len(functions)} functions"
+    for number, one in enumerate(requests, 1):
+        console.say(f"{one.source.tf}: function {number} of {len(requests)}, to {one.output}")
+        report = convert(replace(one, source=replace(one.source, volume=opened)), console)
+        if report.refinement and report.refinement["reason"] == "interrupted":
+            raise KeyboardInterrupt
+
+
+def _one(request: ConvertRequest, tf: str) -> ConvertRequest:
+    """The request of one function."""
+
+    def named(option: str, pattern: str | None) -> str | None:
+        if pattern is None:
+            return None
+        if pattern.count("{}") != 1 or not is_pattern(pattern):
+            raise UsageError(f"{option} {pattern}: expected one place for the function's name, as out_{{}}.ply")
+        return pattern.replace("{}", _name(tf))
+
+    return replace(
+        request,
+        source=replace(request.source, tf=tf),
+        output=named("-o", request.output),
+        report=named("--report", request.report),
+        preview=named("--preview", request.preview),
+    )
+
+
+def _name(tf: str) -> str:
+    """Of a file without folder and endings; of a preset of several (FILE#NAME) its own."""
+    return tf.rpartition("#")[2] if "#" in tf else Path(tf).name.partition(".")[0]

@@ -1,0 +1,44 @@
+"""`Session`: a volume that several functions are tried on."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Unpack
+
+from vvgt_cli.library.inputs import FunctionLike, Reading, VolumeLike, volume_of
+from vvgt_cli.runs.source import Opened
+
+if TYPE_CHECKING:
+    from vvgt_cli.conversion.result import Conversion
+    from vvgt_cli.volume import Volume
+
+
+class Session:
+    """A volume, read, counted and laid out once, for one function after the other.
+
+    >>> import vvgt_cli as vvgt
+    >>> session = vvgt.Session("example:blob:16")
+    >>> [len(session.convert(tf, max_gaussians=20, size=32, steps=0).gaussians) for tf in ("gray", "viridis")]
+    [20, 20]
+
+    It stands for the volume wherever the library takes one.
+
+    Args:
+        volume, reading: as of `convert`.
+
+    Raises:
+        DataError, UsageError: as `convert`.
+    """
+
+    def __init__(self, volume: VolumeLike, **reading: Unpack[Reading]) -> None:
+        self.opened = Opened.of(volume_of(volume, reading))
+
+    @property
+    def volume(self) -> Volume:
+        """What was read."""
+        return self.opened.volume
+
+    def convert(self, tf: FunctionLike | None = None, **options: Any) -> Conversion:
+        """The volume under another function: `convert`, with its options, without reading again."""
+        from vvgt_cli.library.functions import convert
+
+        return convert(self.opened, tf, **options)
