@@ -134,8 +134,10 @@ def load_all(request: SourceRequest, tfs: Sequence[str | TransferFunction | None
     if None in functions and tf_range != "data":
         raise UsageError("--tf-range says where the nodes of a function lie; it needs --tf")
     opened = request.volume if isinstance(request.volume, Opened) else None
-    given = opened.volume if opened else request.volume
-    volume = open_volume(given, request.read) if isinstance(given, str) else given
+    if isinstance(request.volume, Opened):
+        volume = request.volume.volume
+    else:
+        volume = open_volume(request.volume, request.read) if isinstance(request.volume, str) else request.volume
     unit_distance(request.unit_distance, volume)  # its errors come first
     numbers = opened.statistics if opened else statistics(volume)
     sources = []
@@ -150,7 +152,7 @@ def load_all(request: SourceRequest, tfs: Sequence[str | TransferFunction | None
             )
         check_visible(shown, numbers)
         distance, label = unit_distance(request.unit_distance, volume, tf or shown)
-        sources.append(Source(volume, numbers, shown, distance, label, opened and opened.layout))
+        sources.append(Source(volume, numbers, shown, distance, label, opened.layout if opened else None))
     return sources
 
 

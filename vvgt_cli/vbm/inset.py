@@ -59,10 +59,10 @@ def opaque_field(cells: Cells, step: np.ndarray, half: np.ndarray) -> Opaque:
     x, y, z = index.T.astype(np.int64)
     field = np.bincount((z * ny + y) * nx + x, fraction, nx * ny * nz).astype(np.float32).reshape(nz, ny, nx)
     smooth, other = field, np.empty_like(field)
-    for axis in (0, 1, 2, 0, 1, 2):
+    for dz, dy, dx in 2 * ((1, 0, 0), (0, 1, 0), (0, 0, 1)):
         target = np.empty_like(field) if smooth is field else other
-        _blur(smooth, *np.eye(3, dtype=np.int64)[axis], target)
-        smooth, other = target, smooth if smooth is not field else other
+        _blur(smooth, dz, dy, dx, target)
+        smooth, other = target, other if smooth is field else smooth
     return Opaque(field, smooth, edge, half)
 
 

@@ -15,14 +15,15 @@ CONVERGED = 1e-30  # off-diagonal squares, of the trace's square
 
 
 @inlined()
-def _spread_bits(v: int) -> int:
-    """The 21 lowest bits of ``v``, two zeros between them."""
-    v = np.uint64(v)
+def _spread_bits(number: int) -> np.uint64:
+    """The 21 lowest bits of ``number``, two zeros between them."""
+    v = np.uint64(number)
     v = (v | (v << np.uint64(32))) & np.uint64(0x1F00000000FFFF)
     v = (v | (v << np.uint64(16))) & np.uint64(0x1F0000FF0000FF)
     v = (v | (v << np.uint64(8))) & np.uint64(0x100F00F00F00F00F)
     v = (v | (v << np.uint64(4))) & np.uint64(0x10C30C30C30C30C3)
-    return (v | (v << np.uint64(2))) & np.uint64(0x1249249249249249)
+    v = (v | (v << np.uint64(2))) & np.uint64(0x1249249249249249)
+    return v  # noqa: RET504 - one expression would be of another type
 
 
 @kernel("i4:2 u8:1", parallel=True)
