@@ -24,7 +24,7 @@ SLOPES = (
 REFINE = ("vvgt_cli.descent.steps:own_frame", *SLOPES, "vvgt_cli.descent.loss:loss_gradient")
 BACK_PROJECT = ("vvgt_cli.splat.tiles:gather", "vvgt_cli.splat.tiles:reduce_pairs")
 
-VIEWS = (*RAYCAST, *CLOSED_FORM[:3])  # and points to start from
+VIEWS = (*RAYCAST, *CLOSED_FORM[:-2])  # and points to start from
 INIT = (*CLOSED_FORM, "vvgt_cli.dvr.bricks:_ranges")
 CONVERT = (RAYCAST[0], REFINE[0], *CLOSED_FORM, *DRAW, *REFINE[1:], *RAYCAST[1:])
 OPTIMIZE = (*REFINE, *DRAW)

@@ -11,7 +11,7 @@ import math
 import numba as nb
 import numpy as np
 
-from vvgt_cli.dvr.kernel import FLAGS, mean_optics
+from vvgt_cli.dvr.kernel import FLAGS, mean_optics, table_coordinate
 from vvgt_cli.dvr.layout import TUPLES, Optics, Voxels
 from vvgt_cli.jit.decorators import inlined, kernel
 from vvgt_cli.vbm.columns import BLUE, GREEN, MASS, MOMENTS, RED, XX, XY, XZ, YY, YZ, ZZ, X, Y, Z
@@ -43,15 +43,17 @@ def _rows(
     value: np.ndarray,
     along_y: np.ndarray,
     along_z: np.ndarray,
-) -> None:
+) -> tuple[float, float, float]:
     """Voxels from ``first`` on, between rows: ``value``, and its differences over a point's box along y and z.
 
-    ``y``, ``z`` of `_between`; the three rows (n,) float64 hold the edge voxels where they leave ``values``.
+    ``y``, ``z`` of `_between`; the three rows (n,) float64 hold the edge voxels where they leave ``values``. Returns
+    the smallest and largest value, and the largest square of both differences.
     """
     j0, j1, fy, dy = y
     k0, k1, fz, dz = z
     n, nx = value.shape[0], values.shape[2]
     start, stop = max(-first, 0), min(n, nx - first)
+    low, high, steep = np.inf, -np.inf, 0.0
     for i in range(start, stop):
         a00, a01 = np.float64(values[k0, j0, first + i]), np.float64(values[k0, j1, first + i])
         a10, a11 = np.float64(values[k1, j0, first + i]), np.float64(values[k1, j1, first + i])
@@ -59,10 +61,22 @@ def _rows(
         value[i] = c0 + (c1 - c0) * fz
         along_y[i] = ((a01 - a00) + (a11 - a10 - a01 + a00) * fz) * dy
         along_z[i] = (c1 - c0) * dz
+        low, high = min(low, value[i]), max(high, value[i])
+        steep = max(steep, along_y[i] * along_y[i] + along_z[i] * along_z[i])
     for i in range(start):
         value[i], along_y[i], along_z[i] = value[start], along_y[start], along_z[start]
     for i in range(stop, n):
         value[i], along_y[i], along_z[i] = value[stop - 1], along_y[stop - 1], along_z[stop - 1]
+    return low, high, steep
+
+
+@_jit
+def _all_dark(low: float, high: float, spread: float, optics: Optics) -> bool:
+    """Whether nothing within ``spread`` of the values from ``low`` to ``high`` has extinction."""
+    if not low <= high:
+        return True  # no voxel is finite
+    u0, u1 = table_coordinate(low - spread, optics), table_coordinate(high + spread, optics)
+    return min(u0, u1) >= 0.0 and max(u0, u1) <= optics.dark[int(min(u0, u1))]
 
 
 @_jit
@@ -180,7 +194,9 @@ def block_moments(
                 if inside < 1 or z > nz - 0.5 or y > ny - 0.5:
                     continue
                 near_y, near_z = _between(y, dy, ny), _between(z, dz, nz)
-                _rows(voxels.values, near_y, near_z, first, value, along_y, along_z)
+                low, high, steep = _rows(voxels.values, near_y, near_z, first, value, along_y, along_z)
+                if _all_dark(low, high, 0.5 * math.sqrt(steep + (high - low) ** 2 * dx * dx), optics):
+                    continue
                 _ranges((value, along_y, along_z), at, share, dx, optics, u0, u1)
                 cy, cz = py // points[1], pz // points[2]
                 ly, lz = (py - cy * points[1] + 0.5) * box[1], (pz - cz * points[2] + 0.5) * box[2]

@@ -10,7 +10,7 @@ import numba as nb
 import numpy as np
 
 from vvgt_cli.cameras import Camera
-from vvgt_cli.dvr.kernel import FLAGS
+from vvgt_cli.dvr.kernel import FLAGS, absorbed
 from vvgt_cli.dvr.render import camera_arrays
 from vvgt_cli.dvr.scene import Scene
 from vvgt_cli.jit.decorators import inlined, kernel
@@ -23,6 +23,7 @@ MIN_RAYS = 8  # that meet a cell: with fewer, some cells are met by none and cou
 WORKERS = 4  # each with sums of its own, so that they need no atomics; whatever the threads, for the same bytes
 MAX_GRID = 1 << 25  # cells of all workers together
 THIN = 2.0  # pixels of the march: all of a box that is thinner may lie between two rays
+U = nb.uint64  # indices that cannot be negative need no test
 Vector = tuple[float, float, float]
 DEPTH, SEEN, LARGEST = 0, 1, 2  # of a cell's sums over rays: optical depth, its seen part, largest transmittance
 
@@ -91,15 +92,15 @@ def _deposit(extinction: np.ndarray, p: Vector, d: Vector, sums: np.ndarray) -> 
     trans = 1.0
     while True:
         ahead = max(min(next_i, next_j, next_k, end), t)
-        tau = extinction[k, j, i]
+        tau = extinction[U(k), U(j), U(i)]
         if tau > 0.0:
             depth = tau * (ahead - t)
-            after = trans * math.exp(-depth)
-            cell = sums[k, j, i]
+            lost = trans * depth * absorbed(depth)
+            cell = sums[U(k), U(j), U(i)]
             cell[DEPTH] += depth
-            cell[SEEN] += trans - after
+            cell[SEEN] += lost
             cell[LARGEST] = max(cell[LARGEST], trans)
-            trans = after
+            trans -= lost
         t = ahead
         if next_i <= next_j and next_i <= next_k:
             i, next_i = i + step_i, next_i + length_i
