@@ -31,7 +31,7 @@ from vvgt_cli.transfer.readers import minimal
 
 pytestmark = pytest.mark.usefixtures("small_seats")
 CASE = Case(gaussians=100_000, cells=1e6, voxels=10.2e6, size=48, view=0.05, pace=1.0, there=2e8)
-FORM = 0.85 + 1.6 + 0.25 * 10.2  # seconds of its closed form
+FORM = 0.41 + 0.77 + 0.12 * 10.2  # seconds of its closed form
 SOURCE = SourceRequest("example:marschner-lobb:24")
 SMALL = FitOptions(400, 48)
 POINTS = [{"x": x, "rgb": [x, 0.5, 1 - x], "opacity": 0.6 * x} for x in (0.0, 0.5, 1.0)]

@@ -95,7 +95,7 @@ def test_a_session_reads_once_and_leaves_the_same_bytes(field, tmp_path, monkeyp
     monkeypatch.setattr("vvgt_cli.volume.statistics", None)  # nor counted
     together = [saved(session.convert(tf, **HOW), tmp_path / f"s-{tf}.ply") for tf in ("gray", "hot")]
     assert together == alone
-    cameras, images = vvgt.render_views(session, "gray", 1, size=32)
+    _, images = vvgt.render_views(session, "gray", 1, size=32)
     assert images[..., 3].max() > 0
     assert session.volume.spacing == SPACING
     with pytest.raises(vvgt.UsageError, match="spacing: a session's volume has been read"):

@@ -175,6 +175,27 @@ def test_twelve_bits_and_lzma_without_imagecodecs(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_volume(str(tmp_path / "b.tif")).data, VALUES[0, 0])
 
 
+@pytest.mark.parametrize(
+    ("tag", "value", "told"),
+    [
+        ((279, 4), 1 << 31, "has a part of 2147483648 bytes at"),
+        ((257, 3), 9000 * Y, "has 1 parts; expected 9000"),
+    ],
+)
+def test_parts_that_are_not_there(tmp_path: Path, tag: tuple[int, int], value: int, told: str) -> None:
+    """Sizes of gigabytes and thousands of strips are refused before they are made room for, or looped over."""
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(path, VALUES[0, 0, 0], compression="lzma", photometric="minisblack", rowsperstrip=Y)
+    with tifffile.TiffFile(path) as file:
+        found = file.pages[0].tags[tag[0]]
+        place, kind = found.offset, found.dtype
+    data = bytearray(path.read_bytes())
+    data[place : place + 12] = struct.pack("<HHI", tag[0], kind, 1) + struct.pack("<I", value)
+    path.write_bytes(data)
+    with pytest.raises(DataError, match=told):
+        read_volume(str(path))
+
+
 def test_a_coding_without_a_decoder_names_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "a.tif"
     tifffile.imwrite(path, VALUES[0, 0], photometric="minisblack", compression="zlib")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import lzma
+import math
+import os
 import zlib
 from contextlib import ExitStack
 from pathlib import Path
@@ -14,7 +16,12 @@ from vvgt_cli.errors import DataError
 
 # of OpenImageIO: none, CCITT, LZW, JPEG, deflate, PackBits
 _CODINGS = {1, 2, 3, 4, 5, 7, 8, 32773, 32946}
-_ENGINES: dict[int, Any] = {8: zlib.decompressobj, 32946: zlib.decompressobj, 34925: lzma.LZMADecompressor}
+LZMA_MEMORY = 128 << 20  # bytes: the strongest preset's dictionary needs half of it, a damaged header says gigabytes
+_ENGINES: dict[int, Any] = {
+    8: zlib.decompressobj,
+    32946: zlib.decompressobj,
+    34925: lambda: lzma.LZMADecompressor(memlimit=LZMA_MEMORY),
+}
 _WHITE_IS_ZERO, _PALETTE = 0, 3
 
 
@@ -109,12 +116,23 @@ class Pages(ExitStack):
         return result
 
     def _check_segments(self, page: Any, keyframe: Any) -> None:
-        """Refuse parts of a page that unpack to more than the page: tifffile's own decoders have no bound."""
+        """Refuse pages that lack parts, parts beyond the file, and parts that unpack to more than the page.
+
+        tifffile's own decoders have no bound.
+        """
+        parts = math.prod(page.chunked)
+        if len(page.dataoffsets) != parts:
+            raise DataError(f"{self._path}: page {page.index} has {len(page.dataoffsets)} parts; expected {parts}")
         make = _ENGINES.get(int(keyframe.compression))
         if make is None:
             return
         with open(page.parent.filehandle.path, "rb") as file:
+            end = file.seek(0, os.SEEK_END)
             for offset, n in zip(page.dataoffsets, page.databytecounts, strict=True):
+                if offset + n > end:
+                    raise DataError(
+                        f"{self._path}: page {page.index} has a part of {n} bytes at {offset}; the file ends at {end}"
+                    )
                 file.seek(offset)
                 if len(make().decompress(file.read(n), keyframe.nbytes + 1)) > keyframe.nbytes:
                     raise DataError(f"{self._path}: page {page.index} unpacks to more than its {keyframe.nbytes} bytes")
