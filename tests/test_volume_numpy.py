@@ -1,3 +1,12 @@
+"""Headers of NumPy's files that numpy itself stumbles over."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vvgt_cli.errors import DataError
+from vvgt_cli.volume import read_volume
 
 
 def test_a_type_that_numpy_cannot_parse_is_a_damaged_header(tmp_path):
