@@ -7,9 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import vvgt_cli as vvgt
 from tests.test_gaussians_harmonics import cloud
+from vvgt_cli import vbm
 from vvgt_cli.cameras import default_views
 from vvgt_cli.conversion.case import Case
+from vvgt_cli.conversion.plan import Planner
 from vvgt_cli.conversion.stages.refinement import HARMONICS, step_seconds
 from vvgt_cli.descent import METHODS, OptimizeOptions, OptimizeRecord, optimize
 from vvgt_cli.descent.checkpoint import fingerprint, resume, save
@@ -17,7 +20,7 @@ from vvgt_cli.descent.densify import SLOPE, Densified, densify
 from vvgt_cli.descent.loop import Judge, begin, step
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.metrics import psnr
-from vvgt_cli.splat import render
+from vvgt_cli.splat import blend, render
 
 CAMERAS, CHECKS = default_views("train", 24, size=40), default_views("check", 2, size=40)
 TEST = default_views("test", size=40)
@@ -35,7 +38,7 @@ def score(g: Gaussians, truth: Gaussians) -> float:
     return float(np.mean([psnr(render(truth, c)[..., :3], render(g, c)[..., :3]) for c in TEST]))
 
 
-@pytest.mark.parametrize(("method", "steps", "gain"), [("frame", 120, 3.0), ("adam", 400, 1.0)])
+@pytest.mark.parametrize(("method", "steps", "gain"), [("frame", 96, 4.0), ("adam", 200, 0.2)])
 def test_harmonics_are_found_and_degree_0_is_behind(method, steps, gain):
     truth = shiny()
     start, images, check = replace(truth, harmonics=None), views(truth, CAMERAS), (CHECKS, views(truth, CHECKS))
@@ -67,8 +70,6 @@ def test_states_draw_and_return_what_they_were_given(method):
     state = begin(g, CAMERAS, OptimizeOptions.of(method, steps=4))
     np.testing.assert_array_equal(state.gaussians().harmonics, g.harmonics)
     c = CAMERAS[3]
-    from vvgt_cli.splat import blend
-
     image = blend(state.project(c), np.maximum(state.colors_from(c), 0), c.height, c.width)
     np.testing.assert_allclose(image, render(g, c), atol=1e-4)
 
@@ -125,3 +126,28 @@ def test_the_plan_knows_that_steps_with_harmonics_take_longer():
     seconds = [step_seconds(replace(case, degree=degree), half=False) for degree in range(4)]
     assert seconds == sorted(seconds)
     assert [s / seconds[0] for s in seconds] == pytest.approx(HARMONICS)
+
+
+@pytest.mark.parametrize("steps", [0, 24])
+def test_a_conversion_keeps_what_its_closed_form_has(steps, monkeypatch, tmp_path):
+    """Through colours solved or steps, what viewers drop, the checkpoint and the file."""
+    made, planned = vbm.initialise, []
+
+    def glossy(*args, **options):
+        start = made(*args, **options)
+        harmonics = np.full((len(start.gaussians), 3, 3), 0.2)
+        return replace(start, gaussians=replace(start.gaussians, harmonics=harmonics), form=None)
+
+    def seen(self, case, *args, **options):
+        planned.append((self.sh_degree, case.degree))
+        return plan(self, case, *args, **options)
+
+    plan = Planner.plan
+    monkeypatch.setattr(vbm, "initialise", glossy)
+    monkeypatch.setattr(Planner, "plan", seen)
+    result = vvgt.convert("example:blob:16", max_gaussians=60, size=32, steps=steps)
+    assert planned == [(0, 0), (1, 1)]
+    assert result.gaussians.degree == 1
+    for options, degree in (({}, 1), ({"sh_degree": 0}, 0), ({"sh_degree": 2}, 2)):
+        result.save(tmp_path / "a.ply", overwrite=True, **options)
+        assert vvgt.read_ply(tmp_path / "a.ply")[0].degree == degree

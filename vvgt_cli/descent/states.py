@@ -30,8 +30,8 @@ class OwnFrame:
     run on in a straight line to zero.
     """
 
-    # d, E on and off the diagonal, logit, colour, harmonics (of coefficients)
-    RATES = np.array([0.05, 0.025, 0.0125, 0.03, 0.008, 0.008 / SH_C0 / 20])
+    # d, E on and off the diagonal, logit, colour, and what harmonics together change it (RMS over directions)
+    RATES = np.array([0.05, 0.025, 0.0125, 0.03, 0.008, 0.008])
     CLIPS = np.array([0.5, 1.0, 0.3])  # d, logit, E
     ERROR, LARGEST = 0.05, 1.5
     BETAS = 0.6, 0.999
@@ -90,7 +90,8 @@ class OwnFrame:
         )  # fmt: skip
         if harmonics is not None and slopes.harmonics is not None:
             flat = [array.reshape(-1) for array in (harmonics, slopes.harmonics, *self.running)]
-            steps.adam(*flat[:2], self.RATES[5] * pace, *self.BETAS, self.step, *flat[2:])
+            rate = self.RATES[5] * math.sqrt(4 * math.pi / harmonics.shape[1])
+            steps.adam(*flat[:2], rate * pace, *self.BETAS, self.step, *flat[2:])
 
     def saved(self) -> dict[str, np.ndarray]:
         """All that the next steps depend on."""

@@ -18,7 +18,7 @@ from vvgt_cli.splat.constants import MIN_ALPHA
 
 STEP = 0.013, 0.035  # seconds per 400 x 400 px, per 100,000 Gaussians
 HALF_STEP = 0.006, 0.017  # likewise, on a view half that size
-HARMONICS = 1.0, 1.2, 1.3, 1.5  # times as long with harmonics of degree 0 to 3
+HARMONICS = 1.0, 1.1, 1.25, 1.4  # times as long with harmonics of degree 0 to 3
 LOOK = 25  # steps between two looks at the check views where a target ends the run; else one is taken in the middle
 SMALLEST = 0.5  # standard deviation of the longest axis in pixels of the screen: viewers drop or fade less
 MOST = 0.99  # of the Gaussians: as many are left where small ones are widened, as a rule
