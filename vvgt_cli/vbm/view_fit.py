@@ -20,7 +20,7 @@ from vvgt_cli.splat import Projection, blend, gather
 from vvgt_cli.splat.render import seen_colors
 
 PIXELS = 1.0
-SHARE = 0.01
+SHARE = 0.001
 CHUNK = 1 << 14  # Gaussians whose matrices are inverted at once
 
 
