@@ -36,6 +36,20 @@ def folder(tmp_path_factory):
     return folder
 
 
+@pytest.mark.parametrize("degree", [0, 2])
+def test_the_degree_that_is_asked_for_is_refined_and_written(degree, folder, call):
+    """IN.ply is padded to degree 1."""
+    result = call("--steps", 30, "--sh-degree", degree, "--report", "r.json")
+    assert result.code == 0, result.err
+    assert json.loads(Path("r.json").read_text())["options"]["sh_degree"] == degree
+    gaussians, header = read_ply("out.ply")
+    assert header.sh_degree == gaussians.degree == degree
+    again = run(["optimize", "out.ply", "--views", str(folder / "views"), "--steps", "0", "-qo", "again.ply"])
+    assert again == 0  # turned back from world, z up, and placed there again
+    for field, array in read_ply("again.ply")[0].arrays().items():
+        np.testing.assert_allclose(array, getattr(gaussians, field), rtol=1e-4, atol=1e-5)
+
+
 @pytest.fixture
 def call(folder, tmp_path, monkeypatch, vvgt):
     monkeypatch.chdir(tmp_path)
