@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from vvgt_cli.errors import UsageError
+from vvgt_cli.transfer.lighting import Lighting, LightOptions
 from vvgt_cli.volume import ReadOptions, Statistics, Volume
 
 if TYPE_CHECKING:
@@ -26,6 +27,7 @@ class SourceRequest:
         tf_range: "data", "rescale" or "LO,HI".
         unit_distance: a length, "paraview", "mean-spacing", or None: the function's own, else "paraview".
         statistics: what the function's nodes follow from in place of the volume's own: those of the whole series.
+        light: what falls on it; without options what the function's file says, else nothing.
     """
 
     volume: str | Volume
@@ -34,6 +36,7 @@ class SourceRequest:
     tf_range: str = "data"
     unit_distance: str | None = None
     statistics: Statistics | None = None
+    light: LightOptions = field(default_factory=LightOptions)
 
     @property
     def path(self) -> str:
@@ -55,7 +58,8 @@ class SourceRequest:
 class Source:
     """What was read: the function is visible somewhere in the volume.
 
-    ``unit_distance`` is the world length that opacity refers to, ``unit_label`` how it was chosen.
+    ``unit_distance`` is the world length that opacity refers to, ``unit_label`` how it was chosen, ``lighting`` what
+    falls on it, None for nothing.
     """
 
     volume: Volume
@@ -63,6 +67,7 @@ class Source:
     tf: TransferFunction
     unit_distance: float
     unit_label: str
+    lighting: Lighting | None = None
 
     def kernel_type(self) -> str:
         """Name of the type in which kernels read the volume's values."""
@@ -75,7 +80,7 @@ class Source:
         from vvgt_cli.dvr import Scene
 
         limits = (self.statistics.lo, self.statistics.hi)
-        return Scene.build(self.volume, self.tf, self.unit_distance, limits)
+        return Scene.build(self.volume, self.tf, self.unit_distance, limits, lighting=self.lighting)
 
 
 def load(request: SourceRequest) -> Source:
@@ -107,9 +112,10 @@ def load_all(request: SourceRequest, tfs: Sequence[str | TransferFunction | None
         raise UsageError("--tf-range says where the nodes of a function lie; it needs --tf")
     volume = open_volume(request.volume, request.read) if isinstance(request.volume, str) else request.volume
     unit_distance(request.unit_distance, volume)  # its errors come first
+    lights = [request.light.lighting(None if tf is None else tf.lighting, volume.space) for tf in functions]
     numbers = statistics(volume)
     sources = []
-    for tf in functions:
+    for tf, lighting in zip(functions, lights, strict=True):
         whole = request.statistics or numbers
         shown = resolve(tf, whole, tf_range) if tf else from_histogram(whole, volume.hounsfield)
         if tf is None and whole.lo == whole.hi:
@@ -120,7 +126,7 @@ def load_all(request: SourceRequest, tfs: Sequence[str | TransferFunction | None
             )
         check_visible(shown, numbers)
         distance, label = unit_distance(request.unit_distance, volume, tf or shown)
-        sources.append(Source(volume, numbers, shown, distance, label))
+        sources.append(Source(volume, numbers, shown, distance, label, lighting))
     return sources
 
 
@@ -131,7 +137,8 @@ def describe_source(source: Source) -> str:
     holes = [f"{n} {what} (transparent)" for n, what in ((numbers.nan_count, "NaN"), (numbers.inf_count, "inf")) if n]
     values = ", ".join([f"values {numbers.lo:g} to {numbers.hi:g}", *holes])
     distance = f"opacity per {source.unit_distance:g} ({source.unit_label})"
-    return f"{volume.name}: {grid} {volume.data.dtype.name}, {values}; {source.tf.name}: {distance}"
+    light = "" if source.lighting is None else f"; light {source.lighting.text()}"
+    return f"{volume.name}: {grid} {volume.data.dtype.name}, {values}; {source.tf.name}: {distance}{light}"
 
 
 def volume_record(source: Source) -> dict[str, Any]:
@@ -158,4 +165,5 @@ def tf_record(source: Source, request: SourceRequest) -> dict[str, Any]:
         "nodes": source.tf.node_range(),
         "unit_distance": source.unit_distance,
         "unit_distance_label": source.unit_label,
+        **({} if source.lighting is None else {"light": source.lighting.text()}),
     }
