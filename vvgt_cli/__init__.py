@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from vvgt_cli.gaussians import Gaussians, PlyHeader
     from vvgt_cli.library.functions import convert, evaluate, optimize, read_ply, read_volume, render_views
     from vvgt_cli.transfer import ColorMap, PiecewiseOpacity, TransferFunction, read_transfer_function
+    from vvgt_cli.transfer.lighting import LightOptions
     from vvgt_cli.volume import Volume
 
 _WHERE = {  # imported when asked for: `import vvgt_cli` costs nothing
@@ -33,6 +34,7 @@ _WHERE = {  # imported when asked for: `import vvgt_cli` costs nothing
     "library.functions": ("convert", "evaluate", "optimize", "read_ply", "read_volume", "render_views"),
     "conversion.result": ("Conversion", "Result"),
     "transfer": ("ColorMap", "PiecewiseOpacity", "TransferFunction", "read_transfer_function"),
+    "transfer.lighting": ("LightOptions",),
     "volume": ("Volume",),
 }
 _MODULES = {name: module for module, names in _WHERE.items() for name in names}
@@ -43,6 +45,7 @@ __all__ = [
     "Conversion",
     "DataError",
     "Gaussians",
+    "LightOptions",
     "PiecewiseOpacity",
     "PlyHeader",
     "Result",

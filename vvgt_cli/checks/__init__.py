@@ -9,7 +9,10 @@ import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-MODULES = ("reading", "functions", "raycast", "mapping", "forward", "backward", "descent", "files", "network", "whole")
+MODULES = (
+    *("reading", "functions", "raycast", "light", "mapping", "forward", "backward", "descent", "files", "network"),
+    "whole",
+)
 
 
 class BrokenError(Exception):

@@ -10,6 +10,7 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians.frames import up_matrix
+from vvgt_cli.transfer.lighting import Lighting, parse_lighting
 
 REST_COUNTS = {0: 0, 9: 1, 24: 2, 45: 3}  # f_rest properties: 3 ((degree + 1)^2 - 1)
 REQUIRED = (
@@ -39,6 +40,7 @@ class PlyHeader:
         made_for, rule: pixels of the screen that it is made for, and the rule by which it is drawn; None: not recorded.
         space: anatomical space of the world, "RAS", "LPS" or "none"; None where no comment says.
         affine: 3 x 4 row-major, voxel index (i, j, k, 1) of the volume to world position.
+        light: what fell on the scene, None where no comment says.
         version: of the vvgt that wrote it, None for other programs.
     """
 
@@ -57,6 +59,7 @@ class PlyHeader:
     rule: str | None = None
     space: str | None = None
     affine: tuple[float, ...] | None = None
+    light: Lighting | None = None
     version: str | None = None
 
 
@@ -188,6 +191,8 @@ def _one_comment(words: list[str]) -> dict[str, Any]:
         if words[1:] not in (["RAS"], ["LPS"], ["none"]):
             raise ValueError(words)
         return {"space": words[1]}
+    if words[0] == "light":
+        return {"light": parse_lighting(" ".join(words[1:]))}
     if words[0] == "affine":
         affine = _finite(words[1:])
         axes = np.reshape(affine, (3, 4))[:, :3]  # another count: ValueError

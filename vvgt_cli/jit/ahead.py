@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 RAYCAST = ("vvgt_cli.dvr.kernel:render_tiles", "vvgt_cli.dvr.bricks:_ranges", "vvgt_cli.dvr.contrast:_contrast")
+LIGHT = ("vvgt_cli.dvr.lit:render_lit_tiles", "vvgt_cli.dvr.shadows:mean_transmittance", "vvgt_cli.vbm.lit:_shade")
 DRAW = ("vvgt_cli.splat.kernel:tile_lists", "vvgt_cli.splat.tiles:blend", "vvgt_cli.splat.kernel:project")
 CLOSED_FORM = ("vvgt_cli.vbm.visibility:_march", "vvgt_cli.vbm.moments:_brick_moments", "vvgt_cli.vbm.inset:_shift")
 SLOPES = (

@@ -20,6 +20,7 @@ from vvgt_cli.runs.record import ConversionReport, Run, Stage, document
 from vvgt_cli.runs.score import psnr_note, score_test_views
 from vvgt_cli.runs.seats import CLOSE, Seat, score_seats, seat_views, seats_of, zoomed
 from vvgt_cli.runs.source import Source, SourceRequest, describe_source, load, tf_record, volume_record
+from vvgt_cli.transfer.lighting import LightOptions
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
@@ -98,7 +99,14 @@ def _cell(value: Any) -> str:
 
 
 def _load(request: SourceRequest, header: PlyHeader) -> Source:
-    """The source, with the file's own anatomical space and unit distance where none is asked for."""
+    """The source, with the file's own anatomical space, light and unit distance where none is asked for."""
+    asked = request.light
+    source = _load_dark(replace(request, light=LightOptions()), header)
+    preset = source.lighting if header.version is None else header.light
+    return replace(source, lighting=asked.lighting(preset, source.volume.space))
+
+
+def _load_dark(request: SourceRequest, header: PlyHeader) -> Source:
     if request.read.space is None and header.space == "LPS":
         request = replace(request, read=replace(request.read, space="LPS"))
     if request.unit_distance is not None or header.unit_distance is None:
