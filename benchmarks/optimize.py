@@ -59,7 +59,14 @@ def part_calls(gaussians: Gaussians, target: np.ndarray) -> dict[str, Callable[[
         "moments": lambda: moments(p, colors, image, grad),
         "gradients": lambda: own_frame_backward(means, factors, colors, camera, p, pairs),
         "update": lambda: own_frame(
-            slopes.frame, slopes.opacity_logits, slopes.colors, *still, *state.arrays, state.first, state.second
+            slopes.frame,
+            slopes.opacity_logits,
+            slopes.colors,
+            *still,
+            *state.arrays,
+            state.darkest,
+            state.first,
+            state.second,
         ),
     }
 

@@ -167,7 +167,7 @@ def test_a_step_is_the_exponential_of_e_to_second_order():
     nothing = np.zeros(200, np.float32), np.zeros((200, 3), np.float32)
     steps.own_frame(
         frames, *nothing, rates, np.array([0.5, 1.0, 0.3]), state.spread, *state.BETAS, 1,
-        means, factors, logits, colors, state.first, state.second,
+        means, factors, logits, colors, state.darkest, state.first, state.second,
     )  # fmt: skip
     np.testing.assert_allclose(means, expected[0], atol=1e-6)
     np.testing.assert_allclose(factors, expected[1], atol=1e-6)

@@ -120,6 +120,32 @@ def test_up_and_hand_in_supersplat(tmp_path: Path) -> None:
     assert hand == pytest.approx(np.linalg.det(means), rel=1e-5)
 
 
+@pytest.mark.parametrize("viewer", RULE)
+def test_harmonics_are_seen_from_their_side(viewer: str, tmp_path: Path) -> None:
+    """Strong harmonics of degree 3: what a viewer shows is our picture, and not that from the other side."""
+    rng = np.random.default_rng(0)
+    gaussians = Gaussians(
+        rng.uniform(-0.7, 0.7, (150, 3)),
+        np.log(0.09) + rng.normal(0, 0.2, (150, 3)),
+        rng.normal(size=(150, 4)),
+        np.full(150, 3.0),
+        np.full((150, 3), 0.5),
+        rng.normal(0, 0.3, (150, 15, 3)),
+    )
+    write_ply(tmp_path / "glossy.ply", gaussians)
+    back, _ = read_ply(tmp_path / "glossy.ply")
+    odd = np.repeat([-1, 1, -1], [3, 5, 7])[:, None].astype(np.float32)
+    behind, plain = replace(back, harmonics=back.harmonics * odd), replace(back, harmonics=None)
+    cameras = [default_views("test", size=SIZE)[i] for i in (0, 4, 9)]
+    for camera, shot in zip(cameras, shoot(viewer, tmp_path / "glossy.ply", cameras, SIZE, tmp_path), strict=True):
+        ours, other, flat = (
+            psnr(np.clip(render(g, camera, rule=RULE[viewer])[..., :3], 0, 1), shot) for g in (back, behind, plain)
+        )
+        print(f"{viewer}, {camera.name}: {ours:.2f} dB, {other:.2f} from the other side, {flat:.2f} without")
+        assert ours > 30
+        assert ours > max(other, flat) + 12
+
+
 @dataclass(frozen=True)
 class Shown:
     """A converted volume, a test view of 1080 px, and the volume there."""

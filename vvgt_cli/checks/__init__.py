@@ -10,7 +10,17 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 MODULES = (
-    *("reading", "functions", "raycast", "light", "mapping", "forward", "backward", "descent", "files", "network"),
+    "reading",
+    "functions",
+    "raycast",
+    "light",
+    "mapping",
+    "forward",
+    "backward",
+    "descent",
+    "harmonics",
+    "files",
+    "network",
     "whole",
 )
 

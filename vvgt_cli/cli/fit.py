@@ -70,8 +70,8 @@ ply_options = group(
         "as they are; auto is superior in the unit frame of an anatomical space, else none.",
     ),
     sh_degree=click.option(
-        "--sh-degree", type=click.IntRange(0, 3), default=0, show_default=True,
-        help="Pad the file with zero harmonics up to this degree, for loaders that insist on them.",
+        "--sh-degree", type=click.IntRange(0, 3), metavar="N",
+        help="Degree of the file: zeros where there are no harmonics, those above it left out. Default: as they are.",
     ),
     comments=click.option("--no-comments", "comments", is_flag=True, default=True, flag_value=False,
         help="Leave frame, unit distance and version out of the header."),

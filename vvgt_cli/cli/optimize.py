@@ -40,6 +40,11 @@ from vvgt_cli.progress import Console
     help="Screen that the file is made for, of which the views are samples. Default: the file's, or the views' size.",
 )  # fmt: skip
 @rule_option("Viewers to fit to: how they draw a Gaussian. Default: the file's rule, or inria.")
+@click.option(
+    "--sh-degree", type=click.IntRange(0, 3), metavar="N",
+    help="Of the spherical harmonics that are refined: those above it are left out, those that are missing begin with "
+    "0. Default: that of IN.ply.",
+)  # fmt: skip
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of the order of views.")
 @click.option("--report", metavar="R.json", help="Write times and errors of every stage as JSON; - is standard output.")
 @overwrite_option
@@ -72,5 +77,8 @@ def command(
         **budget(options["steps"], options["time_budget"]),
     )  # fmt: skip
     optimize_file(
-        OptimizeRequest(ply, views, output, how, options["size"], options["rule"], report, overwrite), console
+        OptimizeRequest(
+            ply, views, output, how, options["size"], options["rule"], options["sh_degree"], report, overwrite
+        ),
+        console,
     )

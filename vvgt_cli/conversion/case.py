@@ -34,6 +34,7 @@ class Case:
         view: seconds of a training view of ``edge`` px, one ray a pixel.
         pace: how many times as long as the machine of the fit this one takes.
         there: bytes that the program and the volume have taken when the plan is made.
+        degree: of the Gaussians' harmonics.
     """
 
     gaussians: int
@@ -43,6 +44,7 @@ class Case:
     view: float
     pace: float = 1.0
     there: float = PROGRAM
+    degree: int = 0
 
     @property
     def edge(self) -> int:

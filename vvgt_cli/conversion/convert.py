@@ -127,10 +127,10 @@ def _planned(run: Run, request: ConvertRequest) -> tuple[Source, Work, Planner, 
     source, scene = _begin(run, request)
     degree = degree_of(request, source)
     fit = replace(fit, max_gaussians=request.limits.gaussians(fit.max_gaussians, degree))
-    case = measure(scene, fit.size, fit.max_gaussians)
+    case = replace(measure(scene, fit.size, fit.max_gaussians), degree=degree)
     sparse = fit.max_gaussians <= case.edge**2  # a guess, until the Gaussians are there
     planner = Planner(
-        request.limits, fit.max_gaussians, fit.steps, request.ply.sh_degree, fit.size, sparse, fit.model,
+        request.limits, fit.max_gaussians, fit.steps, request.ply.sh_degree or degree, fit.size, sparse, fit.model,
         request.scored_whole,
     )  # fmt: skip
     plan = planner.plan(case, run.elapsed())
@@ -142,11 +142,12 @@ def _fit(work: Work, request: ConvertRequest, planner: Planner, plan: Plan) -> P
     """The closed form, and what views improve; returns the plan, made anew by what the closed form took and showed."""
     first = plan.stages[0]
     first.run(work)
+    degree = work.made().degree if request.ply.sh_degree is None else request.ply.sh_degree
     if request.output is not None and request.output != STDOUT:
-        check_room(request.output, file_bytes(len(work.made()), request.ply.sh_degree))
+        check_room(request.output, file_bytes(len(work.made()), degree))
     pace = max(work.run.report.stages[-1].seconds / first.cost(plan.case).seconds, QUICKEST)
-    planner = replace(planner, wide=wide(work.made(), work.fit.size))
-    plan = planner.plan(plan.case.at(pace), work.run.elapsed(), begun=True)
+    planner = replace(planner, wide=wide(work.made(), work.fit.size), sh_degree=degree)
+    plan = planner.plan(replace(plan.case.at(pace), degree=work.made().degree), work.run.elapsed(), begun=True)
     check_memory(plan)
     _improve(work, plan)
     work.gaussians = as_stored(work.made())  # what is scored is what the file holds

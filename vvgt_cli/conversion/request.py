@@ -12,7 +12,7 @@ from vvgt_cli.runs.place import AUTO
 from vvgt_cli.runs.source import SourceRequest
 
 VERTEX_BYTES = 68  # x y z, normals, three colours, opacity, three scales, four of rotation: float32
-HARMONIC_BYTES = {0: 0, 1: 36, 2: 96, 3: 180}  # zeros up to a degree
+HARMONIC_BYTES = {0: 0, 1: 36, 2: 96, 3: 180}  # up to a degree
 HEADER_BYTES = {0: 1000, 1: 1200, 2: 1600, 3: 2200}
 
 
@@ -122,7 +122,7 @@ class ConvertRequest:
         Raises:
             UsageError: not one does.
         """
-        return self.limits.gaussians(self.fit.max_gaussians, self.ply.sh_degree)
+        return self.limits.gaussians(self.fit.max_gaussians, self.ply.sh_degree or 0)
 
     @property
     def scored_whole(self) -> bool:

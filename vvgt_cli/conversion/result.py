@@ -71,7 +71,7 @@ class Result:
             frame: "unit" or "world"; None, here and below: as `ply` says.
             up: what viewers show upwards: a world axis, an anatomical direction, "none" or "auto" (superior in the unit
                 frame of an anatomical space); "auto" where another frame is asked for.
-            sh_degree: 0 to 3, padded with zeros.
+            sh_degree: 0 to 3, of the file: zeros where there are no harmonics, those above it left out.
             comments: write what the file is into its header.
             overwrite: replace a file that exists.
 

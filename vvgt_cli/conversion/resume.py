@@ -11,7 +11,7 @@ import struct
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -84,7 +84,7 @@ class Checkpoint:
         """
         if self.folder is None:
             return
-        arrays: dict[str, Any] = {field.name: getattr(gaussians, field.name) for field in fields(gaussians)}
+        arrays: dict[str, Any] = gaussians.arrays()
         about = np.array(json.dumps({"key": self.key, "beside": beside}))
         with atomic_write(self.folder / name, overwrite=True) as temporary, open(temporary, "wb") as stream:
             np.savez(stream, about=about, **arrays)

@@ -32,8 +32,7 @@ _FAULTS = (
 def fingerprint(gaussians: Gaussians, options: OptimizeOptions, *views: Any) -> str:
     """Hash of all that a run depends on; ``views``: `Train`, `Check` or None."""
     found = hashlib.sha256(repr(replace(options, checkpoint=None)).encode())
-    g = gaussians
-    for array in (g.means, g.log_scales, g.quaternions, g.opacity_logits, g.colors):
+    for array in gaussians.arrays().values():
         found.update(array.tobytes())
     for part in filter(None, views):
         found.update(repr(part[2:]).encode())

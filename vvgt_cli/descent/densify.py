@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -61,11 +62,12 @@ class Densified(Fields):
         speed: float,
     ) -> None:
         """One step, and density control where it is due."""
-        pairs = moments(projection, self.arrays[4], image, grad)
+        seen = self.colors_from(camera)
+        pairs = moments(projection, seen, image, grad)
         size = 3 * camera.width * camera.height  # their loss is a mean, ours a sum
         self.slopes += screen_slopes(projection, pairs) * (0.5 * max(camera.width, camera.height) / size)
         self.seen += projection.extent[:, 2] > projection.extent[:, 0]
-        self.update(camera, projection, pairs, (self.RATES[0] * FINAL_RATE**share, *self.RATES[1:]))
+        self.update(camera, projection, pairs, seen, (self.RATES[0] * FINAL_RATE**share, *self.RATES[1:]))
         if FIRST <= share <= LAST and share >= self.share + EVERY and self.step >= self.last + FEWEST:
             self._densify()
             self.last, self.share = self.step, share
@@ -91,7 +93,7 @@ class Densified(Fields):
     def _densify(self) -> None:
         score = self.slopes / np.maximum(self.seen, 1)
         denser, origin = densify(self.gaussians(), score, self.limit, self.extent, self.rng)
-        self.arrays = (denser.means, denser.log_scales, denser.quaternions, denser.opacity_logits, denser.colors)
+        self.arrays = tuple(denser.arrays().values())
         for index, moment in enumerate(self.running):
             kept = [np.where(_wide(origin >= 0, a), a[origin], 0) for a in moment]
             self.running[index] = (kept[0], kept[1])
@@ -140,7 +142,7 @@ def densify(
         logs[rows[large]] -= np.float32(math.log(SHRINK))
         shared = -np.expm1(0.5 * np.log1p(-np.minimum(opacity[chosen[~large]], 1 - 1e-6)))
         logits[rows[~large]] = np.log(shared / (1 - shared))
-    return Gaussians(means, logs, g.quaternions[index], logits, g.colors[index]), origin
+    return replace(g.take(index), means=means, log_scales=logs, opacity_logits=logits), origin
 
 
 def _wide(mask: np.ndarray, like: np.ndarray) -> np.ndarray:

@@ -132,7 +132,7 @@ def step(
     from vvgt_cli.descent.ssim import add_ssim_gradient
 
     projection = state.project(camera, options.rule)
-    image = blend(projection, state.colors, camera.height, camera.width)
+    image = blend(projection, np.maximum(state.colors_from(camera), 0), camera.height, camera.width)
     grad = np.empty_like(image)
     l1, l2, alpha = np.float32(options.l1), np.float32(options.l2), np.float32(options.alpha)
     squares = loss_gradient(image, target, l1, l2, alpha, grad)
@@ -212,7 +212,7 @@ class Judge:
         for i, (camera, view) in enumerate(zip(cameras, views, strict=True)):
             part = None if blocks is None else blocks[i]
             projection = self.state.project(camera, self.rule)
-            image = blend(projection, self.state.colors, camera.height, camera.width, part)
+            image = blend(projection, np.maximum(self.state.colors_from(camera), 0), camera.height, camera.width, part)
             scores.append(psnr(view[..., :3], (image if part is None else part.pick(image))[..., :3]))
         now = float(np.mean(scores))
         record.checks.append((record.steps, seconds, now))

@@ -8,24 +8,30 @@ from collections.abc import Sequence
 import numpy as np
 
 from vvgt_cli.cameras import Camera
-from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.gaussians import SH_C0, Gaussians
 from vvgt_cli.splat import Projection, project
 from vvgt_cli.splat.reference import rotations
-from vvgt_cli.splat.render import fields_backward, moments, own_frame_backward, project_factors
+from vvgt_cli.splat.render import fields_backward, moments, own_frame_backward, project_factors, seen_colors
 from vvgt_cli.splat.rules import INRIA, Rule
 
 WARM_UP = 3  # steps
 SMALLEST = 1e-7  # standard deviation, unit frame
 
 
+def _last(arrays: tuple[np.ndarray, ...], index: int) -> np.ndarray | None:
+    """The harmonics, where there are any: the last of a state's arrays."""
+    return arrays[index] if len(arrays) > index else None
+
+
 class OwnFrame:
-    """Covariance ``M M^T``; steps ``mu += M d``, ``M <- M (I + E + E^2 / 2)``, and of opacity logits and colours.
+    """Covariance ``M M^T``; steps ``mu += M d``, ``M <- M (I + E + E^2 / 2)``, of opacity logits, colours, harmonics.
 
     Rates go with the root of the running error of the pictures: the nearer, the smaller; and from the middle of the
     run on in a straight line to zero.
     """
 
-    RATES = np.array([0.05, 0.025, 0.0125, 0.03, 0.008])  # d, E on and off the diagonal, logit, colour
+    # d, E on and off the diagonal, logit, colour, harmonics (of coefficients)
+    RATES = np.array([0.05, 0.025, 0.0125, 0.03, 0.008, 0.008 / SH_C0 / 20])
     CLIPS = np.array([0.5, 1.0, 0.3])  # d, logit, E
     ERROR, LARGEST = 0.05, 1.5
     BETAS = 0.6, 0.999
@@ -35,23 +41,27 @@ class OwnFrame:
         from vvgt_cli.descent import steps
 
         scales = np.exp(gaussians.log_scales.astype(np.float64))
+        harmonics = gaussians.harmonics
         self.arrays: tuple[np.ndarray, ...] = (
             gaussians.means.copy(),
             np.ascontiguousarray(rotations(gaussians.quaternions) * scales[:, None, :], np.float32),
             gaussians.opacity_logits.copy(),
-            np.maximum(gaussians.colors, 0),
+            np.maximum(gaussians.colors, 0) if harmonics is None else gaussians.colors.copy(),
+            *([] if harmonics is None else [harmonics.copy()]),
         )
+        self.running = [np.zeros_like(array) for array in self.arrays[4:] for _ in range(2)]
+        self.darkest = 0.0 if harmonics is None else -math.inf  # what is negative may be lighter from elsewhere
         self.first, self.second = (np.zeros((len(gaussians), steps.COUNT), np.float32) for _ in range(2))
         pixel = float(np.median([np.linalg.norm(camera.position) / camera.fx for camera in cameras]))
         self.spread = rule.dilation * pixel**2
         self.step = 0
 
-    @property
-    def colors(self) -> np.ndarray:
-        return self.arrays[3]
+    def colors_from(self, camera: Camera) -> np.ndarray:
+        """(K, 3) colours as the camera sees them, which may be negative."""
+        return seen_colors(self.arrays[0], self.arrays[3], _last(self.arrays, 4), camera.position)
 
     def project(self, camera: Camera, rule: Rule = INRIA) -> Projection:
-        means, factors, logits, _ = self.arrays
+        means, factors, logits = self.arrays[:3]
         return project_factors(means, factors, logits, camera, rule)
 
     def descend(
@@ -67,54 +77,57 @@ class OwnFrame:
         """One step; ``error`` RMS of the pictures so far, ``share`` of the run behind, ``speed`` a factor of rates."""
         from vvgt_cli.descent import steps
 
-        means, factors, logits, colors = self.arrays
-        pairs = moments(projection, colors, image, grad)
-        slopes = own_frame_backward(means, factors, colors, camera, projection, pairs)
+        means, factors, logits, colors = self.arrays[:4]
+        harmonics, seen = _last(self.arrays, 4), self.colors_from(camera)
+        pairs = moments(projection, seen, image, grad)
+        slopes = own_frame_backward(means, factors, seen, camera, projection, pairs, harmonics)
         self.step += 1
         pace = speed * min(1.0, 2 * (1 - share))
         pace *= min(self.LARGEST, math.sqrt(error / self.ERROR)) * min(1.0, self.step / WARM_UP)
         steps.own_frame(
             slopes.frame, slopes.opacity_logits, slopes.colors, self.RATES * pace, self.CLIPS, self.spread,
-            *self.BETAS, self.step, means, factors, logits, colors, self.first, self.second,
+            *self.BETAS, self.step, means, factors, logits, colors, self.darkest, self.first, self.second,
         )  # fmt: skip
+        if harmonics is not None and slopes.harmonics is not None:
+            flat = [array.reshape(-1) for array in (harmonics, slopes.harmonics, *self.running)]
+            steps.adam(*flat[:2], self.RATES[5] * pace, *self.BETAS, self.step, *flat[2:])
 
     def saved(self) -> dict[str, np.ndarray]:
         """All that the next steps depend on."""
         named = {f"array_{i}": array for i, array in enumerate(self.arrays)}
+        named |= {f"running_{i}": array for i, array in enumerate(self.running)}
         return named | {"first": self.first, "second": self.second, "step": np.array(self.step)}
 
     def restore(self, saved: dict[str, np.ndarray]) -> None:
         """Put back what `saved` gave."""
         self.arrays = tuple(saved[f"array_{i}"] for i in range(len(self.arrays)))
+        self.running = [saved[f"running_{i}"] for i in range(len(self.running))]
         self.first, self.second, self.step = saved["first"], saved["second"], int(saved["step"])
 
     def gaussians(self) -> Gaussians:
         """As a file has them: singular values and vectors of M."""
         from vvgt_cli.vbm.shape import quaternions
 
-        means, factors, logits, colors = self.arrays
+        means, factors, logits, *colors = self.arrays
         axes, scales, _ = np.linalg.svd(factors.astype(np.float64))
-        return Gaussians(means, np.log(np.maximum(scales, SMALLEST)), quaternions(axes), logits, colors)
+        return Gaussians(means, np.log(np.maximum(scales, SMALLEST)), quaternions(axes), logits, *colors)
 
 
 class Fields:
     """Adam on the fields of `Gaussians` with the rates of 3DGS (Kerbl et al. 2023), nothing else of theirs."""
 
-    RATES = (5e-4, 5e-3, 1e-3, 5e-2, 2.5e-3 * 0.28209479177387814)  # lengths: 1.6e-4 x an extent of 3.3
+    RATES = (5e-4, 5e-3, 1e-3, 5e-2, 2.5e-3 * SH_C0, 2.5e-3 / 20)  # lengths: 1.6e-4 x an extent of 3.3
     BETAS = 0.9, 0.999
     STEADY = True
 
     def __init__(self, gaussians: Gaussians, cameras: Sequence[Camera]) -> None:
-        g = gaussians
-        fields = (g.means, g.log_scales, g.quaternions, g.opacity_logits, g.colors)
-        self.arrays: tuple[np.ndarray, ...] = tuple(array.copy() for array in fields)
-        self.running = [(np.zeros_like(array), np.zeros_like(array)) for array in fields]
+        self.arrays: tuple[np.ndarray, ...] = tuple(array.copy() for array in gaussians.arrays().values())
+        self.running = [(np.zeros_like(array), np.zeros_like(array)) for array in self.arrays]
         self.step = 0
 
-    @property
-    def colors(self) -> np.ndarray:
-        result: np.ndarray = np.maximum(self.arrays[4], 0)
-        return result
+    def colors_from(self, camera: Camera) -> np.ndarray:
+        """(K, 3) colours as the camera sees them, which may be negative."""
+        return seen_colors(self.arrays[0], self.arrays[4], _last(self.arrays, 5), camera.position)
 
     def project(self, camera: Camera, rule: Rule = INRIA) -> Projection:
         return project(self.gaussians(), camera, rule)
@@ -130,16 +143,21 @@ class Fields:
         speed: float,
     ) -> None:
         """One step; the error does not matter, nor does the schedule: 3DGS' rates are constant over so few steps."""
-        self.update(camera, projection, moments(projection, self.arrays[4], image, grad), self.RATES)
+        seen = self.colors_from(camera)
+        self.update(camera, projection, moments(projection, seen, image, grad), seen, self.RATES)
 
-    def update(self, camera: Camera, projection: Projection, pairs: np.ndarray, rates: Sequence[float]) -> None:
-        """Adam with ``rates`` for the fields, from the `moments` of a picture."""
+    def update(
+        self, camera: Camera, projection: Projection, pairs: np.ndarray, seen: np.ndarray, rates: Sequence[float]
+    ) -> None:
+        """Adam with ``rates`` for the fields, from the `moments` of a picture with the colours ``seen`` (K, 3)."""
         from vvgt_cli.descent import steps
 
-        slopes = fields_backward(self.gaussians(), camera, projection, pairs)
+        gaussians = self.gaussians()
+        slopes = fields_backward(gaussians, camera, projection, pairs, seen)
         self.step += 1
-        found = (slopes.means, slopes.log_scales, slopes.quaternions, slopes.opacity_logits, slopes.colors)
-        for array, slope, rate, (first, second) in zip(self.arrays, found, rates, self.running, strict=True):
+        found = [getattr(slopes, field) for field in gaussians.arrays()]
+        used = rates[: len(found)]
+        for array, slope, rate, (first, second) in zip(self.arrays, found, used, self.running, strict=True):
             values, moment, square = array.reshape(-1), first.reshape(-1), second.reshape(-1)
             steps.adam(values, slope.reshape(-1), rate, *self.BETAS, self.step, moment, square)
 

@@ -55,7 +55,7 @@ def _directions(frame, k, first, second, beta1, beta2, fix1, fix2):
 
 
 @kernel(
-    "f4:2 f4:1 f4:2 f8:1 f8:1 f8 f8 f8 i8 f4:2 f4:3 f4:1 f4:2 f4:2 f4:2",
+    "f4:2 f4:1 f4:2 f8:1 f8:1 f8 f8 f8 i8 f4:2 f4:3 f4:1 f4:2 f8 f4:2 f4:2",
     parallel=True,
 )
 def own_frame(
@@ -72,6 +72,7 @@ def own_frame(
     factors,
     logits,
     colors,
+    darkest,
     first,
     second,
 ):
@@ -79,8 +80,8 @@ def own_frame(
 
     Gradients ``frame`` (K, 9), ``logit_grad`` (K,), ``color_grad`` (K, 3) and what they are of, ``means`` (K, 3),
     ``factors`` (K, 3, 3), ``logits`` (K,), ``colors`` (K, 3), are float32, as are Adam's moments ``first`` and
-    ``second`` (K, COUNT). ``rates`` (5,): d, E on and off the diagonal, logit, colour. ``clips`` (3,): d, logit, E.
-    ``spread`` is the dilation's variance at the scene.
+    ``second`` (K, COUNT). ``rates`` (5 or more,): d, E on and off the diagonal, logit, colour. ``clips`` (3,): d,
+    logit, E. ``spread`` is the dilation's variance at the scene, ``darkest`` the least that a colour becomes.
     """
     fix1, fix2 = 1 / (1 - beta1**step), 1 / (1 - beta2**step)
     for k in nb.prange(means.shape[0]):
@@ -105,7 +106,7 @@ def own_frame(
         logits[k] -= _clip(turn, clips[1])
         for i in range(3):
             tint = _adam(color_grad[k, i], k, 10 + i, first, second, beta1, beta2, fix1, fix2) * rates[4]
-            colors[k, i] = max(colors[k, i] - tint, 0.0)
+            colors[k, i] = max(colors[k, i] - tint, darkest)
 
 
 @kernel(parallel=True)

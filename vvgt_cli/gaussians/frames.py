@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
 from vvgt_cli.errors import UsageError
+from vvgt_cli.gaussians.harmonics import turned
 from vvgt_cli.gaussians.types import Gaussians
 
 _HALF = math.sqrt(0.5)
@@ -61,12 +63,11 @@ def turn(gaussians: Gaussians, up: str, *, inverse: bool = False) -> Gaussians:
         matrix, (x, y, z) = matrix.T, (-x, -y, -z)
     means = gaussians.means.astype(np.float64) @ matrix.T
     quaternions = _quaternion_product((w, x, y, z), gaussians.quaternions.astype(np.float64))
-    return Gaussians(
-        means.astype(np.float32),
-        gaussians.log_scales,
-        quaternions.astype(np.float32),
-        gaussians.opacity_logits,
-        gaussians.colors,
+    return replace(
+        gaussians,
+        means=means.astype(np.float32),
+        quaternions=quaternions.astype(np.float32),
+        harmonics=turned(gaussians, matrix),
     )
 
 
@@ -79,17 +80,13 @@ def rescale(gaussians: Gaussians, factor: float, before: np.ndarray, after: np.n
     """
     means = (gaussians.means.astype(np.float64) + before) * factor + after
     log_scales = gaussians.log_scales.astype(np.float64) + math.log(factor)
-    return Gaussians(
-        means.astype(np.float32),
-        log_scales.astype(np.float32),
-        gaussians.quaternions,
-        gaussians.opacity_logits,
-        gaussians.colors,
-    )
+    return replace(gaussians, means=means.astype(np.float32), log_scales=log_scales.astype(np.float32))
 
 
 def transform(gaussians: Gaussians, matrix: np.ndarray) -> Gaussians:
-    """``A m`` for means, ``A S A^T`` for covariances; opacities and colours stay. The identity gives the same object.
+    """``A m`` for means, ``A S A^T`` for covariances; opacities and colours stay, harmonics turn with the Gaussians.
+
+    The identity gives the same object. Harmonics are turned, or reflected, by the orthogonal matrix nearest to A.
 
     Rotations and reflections turn the quaternions and leave the scales alone (-1 leaves a covariance as it is, so a
     reflection turns as the rotation -A does); of other maps the principal axes are found anew, by singular values.
@@ -103,24 +100,24 @@ def transform(gaussians: Gaussians, matrix: np.ndarray) -> Gaussians:
     quaternions = gaussians.quaternions.astype(np.float64)
     log_scales = gaussians.log_scales.astype(np.float64)
     if np.abs(matrix.T @ matrix - _IDENTITY).max() <= _RIGID:
-        turned = _quaternions(matrix[None] * np.sign(np.linalg.det(matrix)))[0]
-        quaternions = _quaternion_product(tuple(turned.tolist()), quaternions)
+        turn_by = _quaternions(matrix[None] * np.sign(np.linalg.det(matrix)))[0]
+        quaternions = _quaternion_product(tuple(turn_by.tolist()), quaternions)
     else:
         largest = log_scales.max(axis=1, keepdims=True)
-        factors = matrix @ _rotations(quaternions) * np.exp(log_scales - largest)[:, None, :]
+        factors = matrix @ rotations(quaternions) * np.exp(log_scales - largest)[:, None, :]
         axes, sigma, _ = np.linalg.svd(factors)
         quaternions = _quaternions(axes * np.sign(np.linalg.det(axes))[:, None, None])
         log_scales = np.log(np.maximum(sigma, np.finfo(np.float64).tiny)) + largest
-    return Gaussians(
-        (gaussians.means.astype(np.float64) @ matrix.T).astype(np.float32),
-        log_scales.astype(np.float32),
-        quaternions.astype(np.float32),
-        gaussians.opacity_logits,
-        gaussians.colors,
+    return replace(
+        gaussians,
+        means=(gaussians.means.astype(np.float64) @ matrix.T).astype(np.float32),
+        log_scales=log_scales.astype(np.float32),
+        quaternions=quaternions.astype(np.float32),
+        harmonics=turned(gaussians, matrix),
     )
 
 
-def _rotations(quaternions: np.ndarray) -> np.ndarray:
+def rotations(quaternions: np.ndarray) -> np.ndarray:
     """(K, 3, 3) of quaternions (K, 4) of any norm, (w, x, y, z)."""
     w, x, y, z = (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).T
     rows = [

@@ -10,9 +10,10 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians.frames import up_matrix
+from vvgt_cli.gaussians.types import HARMONICS
 from vvgt_cli.transfer.lighting import Lighting, parse_lighting
 
-REST_COUNTS = {0: 0, 9: 1, 24: 2, 45: 3}  # f_rest properties: 3 ((degree + 1)^2 - 1)
+REST_COUNTS = {3 * terms: degree for degree, terms in HARMONICS.items()}  # f_rest properties: 0, 9, 24, 45
 REQUIRED = (
     *("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
     *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
@@ -99,7 +100,7 @@ def _property(words: list[str], fields: dict[str, str], name: str) -> None:
         raise DataError(f"{name}: property {' '.join(words[1:])!r}; expected a scalar type and a name")
     if words[2] in fields:
         raise DataError(f"{name}: property {words[2]!r} stands twice in the header")
-    if words[2] in REQUIRED and _TYPES[words[1]] != "<f4":
+    if (words[2] in REQUIRED or words[2].startswith("f_rest_")) and _TYPES[words[1]] != "<f4":
         raise DataError(f"{name}: property {words[2]} is {words[1]}; expected float")
     fields[words[2]] = _TYPES[words[1]]
 
@@ -108,10 +109,18 @@ def _sh_degree(fields: dict[str, str], name: str) -> int:
     missing = [field for field in REQUIRED if field not in fields]
     if missing:
         raise DataError(f"{name}: no {', '.join(missing)} among its {len(fields)} properties; {_ADVICE}")
-    rest = sum(field.startswith("f_rest_") for field in fields)
-    if rest not in REST_COUNTS:
-        raise DataError(f"{name}: {rest} f_rest properties; expected {', '.join(map(str, REST_COUNTS))}")
-    return REST_COUNTS[rest]
+    rest = [field for field in fields if field.startswith("f_rest_")]
+    if len(rest) not in REST_COUNTS:
+        raise DataError(f"{name}: {len(rest)} f_rest properties; expected {', '.join(map(str, REST_COUNTS))}")
+    odd = set(rest) - set(rest_names(REST_COUNTS[len(rest)]))
+    if odd:
+        raise DataError(f"{name}: property {min(odd)} among {len(rest)} f_rest properties; expected f_rest_0 and on")
+    return REST_COUNTS[len(rest)]
+
+
+def rest_names(degree: int) -> list[str]:
+    """Properties of the harmonics up to a degree: red's coefficients, then green's, then blue's."""
+    return [f"f_rest_{i}" for i in range(3 * HARMONICS[degree])]
 
 
 def parse_header(content: bytes, name: str) -> PlyHeader:

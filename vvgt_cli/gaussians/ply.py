@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO
 
@@ -13,8 +13,8 @@ from vvgt_cli import __version__
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import seekable
 from vvgt_cli.gaussians.frames import rescale, turn, up_matrix
-from vvgt_cli.gaussians.header import REST_COUNTS, PlyHeader, parse_header
-from vvgt_cli.gaussians.types import SH_C0, Gaussians
+from vvgt_cli.gaussians.header import PlyHeader, parse_header, rest_names
+from vvgt_cli.gaussians.types import HARMONICS, SH_C0, Gaussians
 from vvgt_cli.volume.space import axis_facts
 from vvgt_cli.volume.types import UnitFrame
 
@@ -32,7 +32,8 @@ class PlyOptions:
     Attributes:
         frame: "unit" (box-centred, longest edge 2) or "world" (the volume's physical space).
         up: world axis that points up in viewers, one of `frames.UP_NAMES`.
-        sh_degree: 0 to 3; bands above 0 are written as zeros, for loaders that insist on them.
+        sh_degree: 0 to 3, of the harmonics in the file: zeros where the Gaussians have none, and those above it left
+            out; None: as the Gaussians have them.
         comments: write the transform, the unit distance and the version before `end_header`.
         unit_frame: frame of the volume; needed for "world", recorded in the comments otherwise.
         unit_distance: world length that opacity refers to, recorded in the comments.
@@ -45,7 +46,7 @@ class PlyOptions:
 
     frame: str = "unit"
     up: str = "none"
-    sh_degree: int = 0
+    sh_degree: int | None = None
     comments: bool = True
     unit_frame: UnitFrame | None = None
     unit_distance: float | None = None
@@ -60,7 +61,7 @@ class PlyOptions:
         up_matrix(self.up)
         if self.frame not in FRAMES:
             raise UsageError(f"frame {self.frame!r}: expected one of {', '.join(FRAMES)}")
-        if self.sh_degree not in REST_COUNTS.values():
+        if self.sh_degree is not None and self.sh_degree not in HARMONICS:
             raise UsageError(f"SH degree {self.sh_degree}: expected 0 to 3")
 
 
@@ -82,21 +83,14 @@ def f_dc_to_colors(f_dc: np.ndarray) -> np.ndarray:
 
 def as_stored(gaussians: Gaussians) -> Gaussians:
     """The Gaussians that a unit-frame file will give back: colours rounded as the file rounds them."""
-    return Gaussians(
-        gaussians.means,
-        gaussians.log_scales,
-        gaussians.quaternions,
-        gaussians.opacity_logits,
-        f_dc_to_colors(colors_to_f_dc(gaussians.colors)),
-    )
+    return replace(gaussians, colors=f_dc_to_colors(colors_to_f_dc(gaussians.colors)))
 
 
 def property_names(sh_degree: int = 0) -> list[str]:
     """Property order of the file; all float32."""
-    rest = next(count for count, degree in REST_COUNTS.items() if degree == sh_degree)
     return [
         *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
-        *(f"f_rest_{i}" for i in range(rest)),
+        *rest_names(sh_degree),
         *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
     ]
 
@@ -143,7 +137,7 @@ def write_ply(
     if not len(gaussians):
         raise DataError("no Gaussians to write: a .ply needs at least one")
     _check_rotations(gaussians, "Gaussians to write")
-    placed = turn(gaussians, options.up)
+    placed = turn(gaussians if options.sh_degree is None else gaussians.of_degree(options.sh_degree), options.up)
     if options.frame == "world":
         if options.unit_frame is None:
             raise UsageError("frame 'world' needs the volume's unit frame: pass PlyOptions(unit_frame=...)")
@@ -152,12 +146,14 @@ def write_ply(
     f_dc = colors_to_f_dc(placed.colors)
     if not np.isfinite(f_dc).all():
         raise DataError("colours too large for float32 spherical harmonics; expected values near [0, 1]")
-    names = property_names(options.sh_degree)
+    names = property_names(placed.degree)
     rows = np.zeros((len(placed), len(names)), dtype="<f4")  # (K, properties)
     rows[:, 0:3] = placed.means
     if normals is not None:
         rows[:, 3:6] = normals @ up_matrix(options.up).T
     rows[:, 6:9] = f_dc
+    if placed.harmonics is not None:
+        rows[:, 9:-8] = placed.harmonics.transpose(0, 2, 1).reshape(len(placed), -1)
     rows[:, -8] = placed.opacity_logits
     rows[:, -7:-4] = placed.log_scales
     rows[:, -4:] = placed.quaternions
@@ -205,8 +201,8 @@ def _check_size(header: PlyHeader, size: int, name: str) -> None:
 def read_ply(source: str | Path | BinaryIO) -> tuple[Gaussians, PlyHeader]:
     """Read a 3DGS `.ply` from a path or a binary stream, in the frame that the file is in.
 
-    Properties are found by name, so files of other programs in another order are read too; spherical
-    harmonics above degree 0 are left out (``header.sh_degree`` tells).
+    Properties are found by name, so files of other programs in another order are read too. Harmonics that are all 0
+    are none, but padding: ``header.sh_degree`` tells how far it goes.
 
     Raises:
         DataError: not a binary little-endian 3DGS `.ply`, of another size than its header says, or with
@@ -225,11 +221,18 @@ def read_ply(source: str | Path | BinaryIO) -> tuple[Gaussians, PlyHeader]:
             columns("rot_0", "rot_1", "rot_2", "rot_3"),
             np.array(rows["opacity"], dtype=np.float32),
             f_dc_to_colors(columns("f_dc_0", "f_dc_1", "f_dc_2")),
+            _harmonics(columns(*rest_names(header.sh_degree))) if header.sh_degree else None,
         )
     except DataError as error:
         raise DataError(f"{name}: {error}") from None
     _check_rotations(gaussians, str(name))
     return gaussians, header
+
+
+def _harmonics(rest: np.ndarray) -> np.ndarray | None:
+    """(K, M, 3) of a file's (K, 3 M), channel after channel; None where not a bit is set."""
+    terms = rest.shape[1] // 3
+    return rest.reshape(-1, 3, terms).transpose(0, 2, 1) if rest.view(np.uint32).any() else None
 
 
 def _check_rotations(gaussians: Gaussians, name: str) -> None:
@@ -276,4 +279,5 @@ def describe(gaussians: Gaussians, header: PlyHeader) -> dict[str, object]:
         summary["box_max"] = [float(v) for v in gaussians.means.max(axis=0)]
         summary["color_min"] = [float(v) for v in gaussians.colors.min(axis=0)]
         summary["color_max"] = [float(v) for v in gaussians.colors.max(axis=0)]
+        summary["harmonics_largest"] = float(np.abs(gaussians.arrays().get("harmonics", np.zeros(1))).max())
     return summary

@@ -12,6 +12,8 @@ SLOPES = (
     "vvgt_cli.splat.kernel:project_factors",
 )
 REFINE = ("vvgt_cli.descent.steps:own_frame", *SLOPES, "vvgt_cli.descent.loss:loss_gradient")
+HARMONICS = ("vvgt_cli.splat.harmonics:view_slopes", "vvgt_cli.splat.harmonics:view_colors")
+DEPOSITS = ("vvgt_cli.splat.harmonics:deposit_squares", "vvgt_cli.splat.harmonics:deposit")
 BACK_PROJECT = ("vvgt_cli.splat.tiles:gather", "vvgt_cli.splat.tiles:reduce_pairs")
 
 VIEWS = (*RAYCAST, *CLOSED_FORM[:2])  # and points to start from
@@ -20,4 +22,9 @@ CONVERT = (RAYCAST[0], REFINE[0], *CLOSED_FORM, *DRAW, *REFINE[1:], *RAYCAST[1:]
 OPTIMIZE = (*REFINE, *DRAW)
 EVALUATE = (*RAYCAST, *DRAW)
 INFER = (*DRAW, SLOPES[0], "vvgt_cli.splat.backward:standard", *BACK_PROJECT)
-ALL = (*CONVERT, *INFER[len(DRAW) + 1 :], "vvgt_cli.volume.slc_kernel:decode_plane")
+ALL = (*CONVERT, *LIGHT, *INFER[len(DRAW) + 1 :], *HARMONICS, *DEPOSITS, "vvgt_cli.volume.slc_kernel:decode_plane")
+
+
+def for_degree(names: tuple[str, ...], degree: int) -> tuple[str, ...]:
+    """Kernels of a command that meets Gaussians with harmonics of a degree: more, where that is above 0."""
+    return (*names, *(HARMONICS if SLOPES[0] in names else HARMONICS[1:])) if degree else names

@@ -113,7 +113,7 @@ def read_ply(path: PathLike) -> tuple[Gaussians, PlyHeader]:
     """
     from vvgt_cli.runs.gaussian_files import open_gaussians
 
-    return open_gaussians(os.fspath(path), console_of(False))
+    return open_gaussians(os.fspath(path))
 
 
 def render_views(
@@ -209,6 +209,7 @@ def optimize(
     max_gaussians: int | None = None,
     size: int | None = None,
     rule: str | None = None,
+    sh_degree: int | None = None,
     seed: int = 0,
     progress: bool = False,
 ) -> Result:
@@ -221,6 +222,7 @@ def optimize(
         target_psnr: dB on the check views at which to end.
         method: "frame", "adam" or "3dgs"; max_gaussians: that "3dgs" may grow to.
         size, rule: of the screen that they are made for; None: the file's.
+        sh_degree: of the spherical harmonics that are refined, 0 to 3; None: the file's.
         seed: of the order of views.
         progress: lines and bars on standard error.
 
@@ -239,6 +241,6 @@ def optimize(
         method, max_gaussians=max_gaussians, target_psnr=target_psnr, seed=seed, **budget(steps, time_budget)
     )
     run = Run(console_of(progress), ConversionReport("optimize"))
-    result = optimized(run, OptimizeRequest(ply_of(ply), os.fspath(views), None, how, size, rule))
+    result = optimized(run, OptimizeRequest(ply_of(ply), os.fspath(views), None, how, size, rule, sh_degree))
     run.finish()
     return result

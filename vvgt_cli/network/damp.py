@@ -18,14 +18,9 @@ SMALLEST = 1 / 16  # share of a step; below it none is taken
 def between(start: Gaussians, end: Gaussians, share: float) -> Gaussians:
     """The Gaussians ``share`` of the way; quaternions of norm 1, on the short arc's chord."""
     mix = lambda a, b: a + np.float32(share) * (b - a)  # noqa: E731
-    q = mix(start.quaternions, end.quaternions)
-    return Gaussians(
-        mix(start.means, end.means),
-        mix(start.log_scales, end.log_scales),
-        q / np.linalg.norm(q, axis=1, keepdims=True),
-        mix(start.opacity_logits, end.opacity_logits),
-        mix(start.colors, end.colors),
-    )
+    fields = {field: mix(array, getattr(end, field)) for field, array in start.arrays().items()}
+    fields["quaternions"] /= np.linalg.norm(fields["quaternions"], axis=1, keepdims=True)
+    return Gaussians(**fields)
 
 
 def damped(

@@ -67,7 +67,16 @@ class Prepared:
 
 
 def pack(gaussians: Gaussians) -> np.ndarray:
-    """(K, 14) float32; quaternions of norm 1, of q and -q (one rotation) the one with the first non-zero above 0."""
+    """(K, 14) float32; quaternions of norm 1, of q and -q (one rotation) the one with the first non-zero above 0.
+
+    Raises:
+        DataError: Gaussians with harmonics, of which a network knows nothing.
+    """
+    if gaussians.harmonics is not None:
+        raise DataError(
+            f"spherical harmonics of degree {gaussians.degree}: a network knows only colours that are the same from "
+            "all sides; expected Gaussians of degree 0 ('vvgt optimize --sh-degree 0' leaves the harmonics out)"
+        )
     q = gaussians.quaternions.astype(np.float64)
     q /= np.linalg.norm(q, axis=1, keepdims=True)
     first = np.take_along_axis(q, (q != 0).argmax(axis=1)[:, None], axis=1)
@@ -92,7 +101,7 @@ def prepare(
         config: of the network.
 
     Raises:
-        DataError: no Gaussians, or no views for a network that needs some.
+        DataError: no Gaussians, Gaussians with harmonics, or no views for a network that needs some.
     """
     if not len(gaussians):
         raise DataError("no Gaussians: the network needs at least one")

@@ -14,7 +14,6 @@ import numpy as np
 from vvgt_cli.errors import DataError, VvgtError
 from vvgt_cli.files import atomic_write, is_stream
 from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions, in_unit_frame, read_ply, write_ply
-from vvgt_cli.progress import Console
 from vvgt_cli.runs.outputs import STDOUT
 from vvgt_cli.runs.record import Run
 from vvgt_cli.splat.rules import INRIA, Rule, rule_of
@@ -32,8 +31,8 @@ def file_rule(header: PlyHeader, asked: str | None = None) -> Rule:
     return rule_of(asked or header.rule or INRIA)
 
 
-def open_gaussians(source: str | BinaryIO, console: Console) -> tuple[Gaussians, PlyHeader]:
-    """Read a `.ply` (a path, "-" for standard input, or a stream) into the unit frame, and say what was left out.
+def open_gaussians(source: str | BinaryIO) -> tuple[Gaussians, PlyHeader]:
+    """Read a `.ply` (a path, "-" for standard input, or a stream) into the unit frame.
 
     Raises:
         DataError: not a 3DGS `.ply`, or one without Gaussians.
@@ -41,8 +40,6 @@ def open_gaussians(source: str | BinaryIO, console: Console) -> tuple[Gaussians,
     gaussians, header = read_ply(sys.stdin.buffer if source == STDIN else source)
     if not len(gaussians):
         raise DataError(f"{source}: holds no Gaussians; expected at least one")
-    if header.sh_degree and not header.version:
-        console.say(f"{source}: spherical harmonics of degree {header.sh_degree}; only the base colour is used")
     return in_unit_frame(gaussians, header), header
 
 

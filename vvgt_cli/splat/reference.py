@@ -8,6 +8,7 @@ import numpy as np
 
 from vvgt_cli.cameras import Camera
 from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.gaussians.harmonics import view_colors, view_slopes
 from vvgt_cli.splat.constants import NEAR
 from vvgt_cli.splat.rules import INRIA, Rule
 
@@ -101,7 +102,7 @@ def weights(gaussians: Gaussians, camera: Camera, rule: Rule = INRIA) -> Iterato
 
 def render_reference(gaussians: Gaussians, camera: Camera, rule: Rule = INRIA) -> np.ndarray:
     """(height, width, 4) float64 premultiplied RGBA; negative colours are 0."""
-    colors = np.maximum(gaussians.colors.astype(np.float64), 0)
+    colors = np.maximum(view_colors(gaussians, camera.position), 0)
     image = np.zeros((camera.height, camera.width, 4))
     for k, weight in weights(gaussians, camera, rule):
         image += weight[..., None] * np.append(colors[k], 1.0)
@@ -126,14 +127,16 @@ def image_gradients(
     ``... + T (alpha (c, 1) + (1 - alpha) B)``, so that dL/dalpha = T ((c, 1) - B) . grad.
 
     Returns:
-        centres (K, 2), inverse projected covariances (K, 2, 2) symmetric, opacity logits (K,), colours (K, 3).
+        centres (K, 2), inverse projected covariances (K, 2, 2) symmetric, opacity logits (K,), colours as they are seen
+        (K, 3).
     """
     count = len(gaussians)
     centres, flat, _ = project(gaussians, camera, rule)
     opacity = 1 / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64)))
     drawn = drawn_opacity(gaussians, flat, rule)
     pixels = np.stack(np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5), -1)
-    colors = np.column_stack([np.maximum(gaussians.colors.astype(np.float64), 0), np.ones(count)])
+    seen = view_colors(gaussians, camera.position)
+    colors = np.column_stack([np.maximum(seen, 0), np.ones(count)])
     out = np.zeros((count, 2)), np.zeros((count, 2, 2)), np.zeros(count), np.zeros((count, 4))
     behind = np.zeros((camera.height, camera.width, 4))
     for k, alpha, trans in reversed(list(layers(gaussians, camera, rule))):
@@ -151,7 +154,7 @@ def image_gradients(
             out[1][k] -= moved.sum() * 0.5 * flat[k] @ (own - inverse) @ flat[k]
         out[2][k] = moved.sum() * (1 - opacity[k])
         behind = alpha[..., None] * colors[k] + (1 - alpha)[..., None] * behind
-    return *out[:3], np.where(gaussians.colors >= 0, out[3][:, :3], 0)
+    return *out[:3], np.where(seen >= 0, out[3][:, :3], 0)
 
 
 def space_gradients(
@@ -184,6 +187,7 @@ def render_backward_reference(
     """`render_backward` in float64: dL/d(field) for each field of `Gaussians`; ``grad`` (h, w, 4) dL/d(picture)."""
     centres, inverses, logits, colors = image_gradients(gaussians, camera, grad, rule)
     means, spatial = space_gradients(gaussians, camera, centres, inverses, rule)
+    harmonics, through = view_slopes(gaussians, camera.position, colors)
     scales = np.exp(gaussians.log_scales.astype(np.float64))
     factors = rotations(gaussians.quaternions) * scales[:, None, :]
     to_factors = 2 * spatial @ factors  # Sigma = M M^T
@@ -192,11 +196,12 @@ def render_backward_reference(
     unit = gaussians.quaternions / norms
     to_unit = np.einsum("kij,kqij->kq", to_rotations, rotation_derivatives(unit))
     return {
-        "means": means,
+        "means": means + through,
         "log_scales": (to_factors * factors).sum(axis=1),
         "quaternions": (to_unit - (to_unit * unit).sum(axis=1, keepdims=True) * unit) / norms,
         "opacity_logits": logits,
         "colors": colors,
+        "harmonics": harmonics,
     }
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -141,7 +141,31 @@ def render(
     ``projection``, where there is one, was made by a rule of its own; with ``blocks`` zero elsewhere.
     """
     p = projection or project(gaussians, camera, rule)
-    return blend(p, np.maximum(gaussians.colors, 0), camera.height, camera.width, blocks)
+    g = gaussians
+    colors = seen_colors(g.means, g.colors, g.harmonics, camera.position)
+    return blend(p, np.maximum(colors, 0), camera.height, camera.width, blocks)
+
+
+def seen_colors(means: np.ndarray, colors: np.ndarray, harmonics: np.ndarray | None, eye: np.ndarray) -> np.ndarray:
+    """(K, 3) float32 colours as they are seen from ``eye`` (3,), which may be negative; others as of `Gaussians`."""
+    if harmonics is None:
+        return colors
+    from vvgt_cli.splat import harmonics as kernels
+
+    out = np.empty_like(colors)
+    kernels.view_colors(means, colors, harmonics, np.asarray(eye, np.float64), out)
+    return out
+
+
+def seen_slopes(
+    means: np.ndarray, harmonics: np.ndarray, eye: np.ndarray, slopes: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Gradients with respect to harmonics (K, M, 3) and means (K, 3), from those to `seen_colors`; all float32."""
+    from vvgt_cli.splat import harmonics as kernels
+
+    by_harmonics, by_means = np.empty_like(harmonics), np.empty_like(means)
+    kernels.view_slopes(means, harmonics, np.asarray(eye, np.float64), slopes, by_harmonics, by_means)
+    return by_harmonics, by_means
 
 
 def gather(projection: Projection, fields: np.ndarray, out: np.ndarray) -> None:
@@ -160,13 +184,14 @@ def gather(projection: Projection, fields: np.ndarray, out: np.ndarray) -> None:
 
 @dataclass(frozen=True)
 class Gradients:
-    """dL/d(field) of each field of `Gaussians`, float32 of the same shapes."""
+    """dL/d(field) of each field of `Gaussians`, float32 of the same shapes; None for harmonics that there are not."""
 
     means: np.ndarray
     log_scales: np.ndarray
     quaternions: np.ndarray
     opacity_logits: np.ndarray
     colors: np.ndarray
+    harmonics: np.ndarray | None = None
 
 
 def render_backward(
@@ -182,22 +207,29 @@ def render_backward(
         projection, image: of the forward pass.
         grad: (height, width, 4) dL/d(image), premultiplied RGBA.
     """
-    return fields_backward(gaussians, camera, projection, moments(projection, gaussians.colors, image, grad))
+    g = gaussians
+    seen = seen_colors(g.means, g.colors, g.harmonics, camera.position)
+    return fields_backward(gaussians, camera, projection, moments(projection, seen, image, grad), seen)
 
 
-def fields_backward(gaussians: Gaussians, camera: Camera, projection: Projection, pairs: np.ndarray) -> Gradients:
-    """`render_backward` from ``pairs``, its `moments`."""
+def fields_backward(
+    gaussians: Gaussians, camera: Camera, projection: Projection, pairs: np.ndarray, seen: np.ndarray
+) -> Gradients:
+    """`render_backward` from ``pairs``, its `moments`, and the `seen_colors` (K, 3) that they were made with."""
     from vvgt_cli.splat import backward
 
     g, p = gaussians, projection
     shapes = (g.means, g.log_scales, g.quaternions, g.opacity_logits, g.colors)
     out = Gradients(*(np.empty_like(array) for array in shapes))
     backward.standard(
-        p.first, pairs, p.extent, p.flat, g.means, g.log_scales, g.quaternions, g.colors, *pose(camera),
+        p.first, pairs, p.extent, p.flat, g.means, g.log_scales, g.quaternions, seen, *pose(camera),
         p.rule.projecting(),
         out.means, out.log_scales, out.quaternions, out.opacity_logits, out.colors,
     )  # fmt: skip
-    return out
+    if g.harmonics is None:
+        return out
+    by_harmonics, by_means = seen_slopes(g.means, g.harmonics, camera.position, out.colors)
+    return replace(out, means=out.means + by_means, harmonics=by_harmonics)
 
 
 def screen_slopes(projection: Projection, pairs: np.ndarray) -> np.ndarray:
@@ -232,11 +264,13 @@ class FrameGradients:
         frame: (K, 9) float32 d (3), then E: xx, yy, zz, xy, xz, yz; one off the diagonal stands for both entries.
         opacity_logits: (K,) float32.
         colors: (K, 3) float32.
+        harmonics: (K, M, 3) float32, None where there are none.
     """
 
     frame: np.ndarray
     opacity_logits: np.ndarray
     colors: np.ndarray
+    harmonics: np.ndarray | None = None
 
 
 def own_frame_backward(
@@ -246,10 +280,12 @@ def own_frame_backward(
     camera: Camera,
     projection: Projection,
     pairs: np.ndarray,
+    harmonics: np.ndarray | None = None,
 ) -> FrameGradients:
-    """The gradient for covariances ``M M^T``: means (K, 3), factors (K, 3, 3) M, colours (K, 3), all float32.
+    """The gradient for covariances ``M M^T``: means (K, 3), factors (K, 3, 3) M, all float32.
 
-    ``projection`` from `project_factors`, ``pairs`` from `moments`.
+    ``projection`` from `project_factors`, ``pairs`` from `moments` with ``colors`` (K, 3): those of `seen_colors` where
+    there are ``harmonics`` (K, M, 3).
     """
     from vvgt_cli.splat import backward
 
@@ -260,4 +296,8 @@ def own_frame_backward(
         p.rule.projecting(),
         out.frame, out.opacity_logits, out.colors,
     )  # fmt: skip
-    return out
+    if harmonics is None:
+        return out
+    by_harmonics, by_means = seen_slopes(means, harmonics, camera.position, out.colors)
+    out.frame[:, :3] += np.einsum("kji,kj->ki", factors, by_means)
+    return replace(out, harmonics=by_harmonics)

@@ -78,7 +78,7 @@ def _infer_file(request: InferRequest, run: Run) -> ConversionReport:
 
     with run.stage("read") as stage:
         model = Model.open(find_model(request.model), numba.get_num_threads(), request.provider)
-        gaussians, header = open_gaussians(request.ply, run.console)
+        gaussians, header = open_gaussians(request.ply)
         cameras, images = load_views(request.views, "train")
         wanted = model.card.network.reads
         read, judges = divide(cameras, wanted)

@@ -14,7 +14,7 @@ from vvgt_cli.descent import OptimizeOptions
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.images.viewset import load_views
-from vvgt_cli.jit.ahead import OPTIMIZE
+from vvgt_cli.jit.ahead import OPTIMIZE, for_degree
 from vvgt_cli.progress import Console
 from vvgt_cli.runs.gaussian_files import file_rule, layout_of, open_gaussians, write_gaussians
 from vvgt_cli.runs.outputs import Output, check_outputs, claimed, write_text
@@ -44,6 +44,7 @@ class OptimizeRequest:
         options: how to descend, and when to stop.
         size: pixels along the edge of the screen that the file is made for; None: the file's, or the views'.
         rule: of `vvgt_cli.splat.rules` to fit to; None: the file's, or inria.
+        sh_degree: of the harmonics that are refined and written, 0 to 3; None: the file's.
         report: JSON to write, "-" for standard output, None for none.
         overwrite: replace files that exist.
     """
@@ -54,6 +55,7 @@ class OptimizeRequest:
     options: OptimizeOptions
     size: int | None = None
     rule: str | None = None
+    sh_degree: int | None = None
     report: str | None = None
     overwrite: bool = False
 
@@ -94,22 +96,30 @@ def optimized(run: Run, request: OptimizeRequest) -> Result:
         DataError: a `.ply` or a folder of views that is not one.
     """
     with run.stage("read") as stage:
-        start, header = open_gaussians(request.ply, run.console)
+        start, header = open_gaussians(request.ply)
         stage.note = f"{len(start)} Gaussians, {header.frame} frame"
+        start = start if request.sh_degree is None else start.of_degree(request.sh_degree)
     with run.stage("views") as stage:
         train, check, held_out = load_sets(request.views)
         test = Views(*load_views(request.views, "test")) if _has(request.views, "test") else None
         stage.note = f"{len(train)} to fit to, {len(check)} to check by{held_out}"
-    run.compile(OPTIMIZE)
+    run.compile(for_degree(OPTIMIZE, start.degree))
     edge = train.cameras[0].width
     size, asked = request.size or header.made_for or edge, file_rule(header, request.rule)
     rule = asked.at(edge / size)
     options = replace(request.options, rule=rule, judge=rule)
-    run.report.options = asdict(request.options) | {"rule": asked.name, "judge": asked.name, "size": size}
+    run.report.options = asdict(request.options) | {
+        "rule": asked.name,
+        "judge": asked.name,
+        "size": size,
+        "sh_degree": start.degree,
+    }
     gaussians = refine(run, start, train, check, options)
     if test is not None:
         _score(run, test, start, gaussians, rule)
-    return Result(gaussians, run.report, replace(layout_of(header), made_for=size, rule=asked.name))
+    degree = header.sh_degree if request.sh_degree is None else request.sh_degree
+    layout = replace(layout_of(header), made_for=size, rule=asked.name, sh_degree=degree)
+    return Result(gaussians, run.report, layout)
 
 
 def load_sets(folder: str) -> tuple[Views, Views, str]:

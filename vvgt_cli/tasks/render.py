@@ -11,7 +11,7 @@ from vvgt_cli.cameras.files import read_cameras, transforms_json
 from vvgt_cli.cameras.sets import SIZE
 from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians.frames import upright_matrix
-from vvgt_cli.jit.ahead import DRAW
+from vvgt_cli.jit.ahead import DRAW, for_degree
 from vvgt_cli.progress import Console
 from vvgt_cli.runs.gaussian_files import file_rule, open_gaussians
 from vvgt_cli.runs.outputs import write_text
@@ -83,10 +83,10 @@ def render_file(request: RenderRequest, console: Console | None = None) -> int:
     names = [f"{c.name}.png" for c in cameras] + ([f"{c.name}.exr" for c in cameras] if request.exr else [])
     _check_directory(request, [*names, VIEWS_FILE])
     with run.stage("read") as stage:
-        gaussians, header = open_gaussians(request.ply, console)
+        gaussians, header = open_gaussians(request.ply)
         stage.note = f"{len(gaussians)} Gaussians, {header.frame} frame"
     cameras, rule = request.cameras(header.made_for, header.up), file_rule(header, request.rule)
-    run.compile(DRAW)
+    run.compile(for_degree(DRAW, gaussians.degree))
     directory = Path(request.output)
     directory.mkdir(exist_ok=True)
     with run.stage("render") as stage:

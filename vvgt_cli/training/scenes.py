@@ -176,8 +176,8 @@ def _make(place: Path, recipe: Recipe, config: SceneConfig) -> None:
     scratch.mkdir()
     try:
         g = gaussians
-        np.savez(scratch / "gaussians.npz", means=g.means, log_scales=g.log_scales, quaternions=g.quaternions,
-                 opacity_logits=g.opacity_logits, colors=g.colors)  # fmt: skip
+        fields: dict[str, Any] = g.arrays()
+        np.savez(scratch / "gaussians.npz", **fields)
         np.save(scratch / "images.npy", np.rint(np.clip(images, 0, 1) * FULL).astype(np.uint16))
         (scratch / "about.json").write_text(json.dumps(asdict(recipe) | {"name": name, "gaussians": len(g)}), "utf-8")
         os.replace(scratch, place)

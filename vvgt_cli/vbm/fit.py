@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 
@@ -38,34 +40,90 @@ def solve_colors(
     progress: Progress | None = None,
     twice_every: int = 0,
     rule: Rule = INRIA,
+    degree: int | None = None,
 ) -> Gaussians:
     """Least-squares colours by preconditioned conjugate gradients: images are linear in them.
 
     Minimises ``sum |blend(c) - view|^2 + PRIOR |c - c0|^2`` over all views and RGB; ``views`` (n, h, w, 4) float32
     premultiplied. The preconditioner is the blending weight of each splat, so that one round is the normalised
     back-projection of the residual. Rounds end early where one lowers the squared error by less than `ENOUGH`. Every
-    ``twice_every``-th view (0: none) counts as seen at twice its size; ``rule`` is that of the views.
+    ``twice_every``-th view (0: none) counts as seen at twice its size; ``rule`` is that of the views. Colours and
+    harmonics of ``degree`` (None: the Gaussians' own) are solved together: see `vvgt_cli.vbm.view_fit`.
     """
-    count = len(gaussians)
+    gaussians = gaussians if degree is None else gaussians.of_degree(degree)
     projections = [
         project(gaussians, camera, rule.at(0.5) if twice_every and i % twice_every == twice_every - 1 else rule)
         for i, camera in enumerate(cameras)
     ]
-    start = gaussians.colors.astype(np.float64)
-    colors = start.copy()
-    residuals = [_residual(p, view, colors) for p, view in zip(projections, views, strict=True)]
-    sums = _back(projections, residuals, count)
-    weight = np.maximum(sums[:, :1], SEEN) + PRIOR
-    gradient = sums[:, 1:4]  # (K, 3)
-    direction = gradient / weight
-    slope = (gradient * direction).sum(axis=0)
+    if gaussians.harmonics is None:
+        found = np.clip(_descend(_Single(gaussians, projections), views, rounds, progress), 0, BRIGHTEST)
+        return replace(gaussians, colors=found)
+    from vvgt_cli.vbm.view_fit import PerView
+
+    system = PerView(gaussians, [camera.position for camera in cameras], projections, PRIOR)
+    return system.gaussians(_descend(system, views, rounds, progress), BRIGHTEST)
+
+
+class System(Protocol):
+    """Pictures as a linear function of unknowns (K, ..., 3), channel by channel.
+
+    Attributes:
+        start: unknowns to begin with, float64.
+    """
+
+    start: np.ndarray
+
+    def forward(self, view: int, unknowns: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+        """RGB picture (h, w, 3) of a view, of ``shape`` (h, w, ...)."""
+
+    def back(self, images: Sequence[np.ndarray]) -> np.ndarray:
+        """The adjoint of `forward`, summed over the views' ``images``; float64 like the unknowns."""
+
+    def pull(self, change: np.ndarray) -> np.ndarray:
+        """Half the gradient of what is asked of a ``change`` of the unknowns: to be small."""
+
+    def scaled(self, gradient: np.ndarray) -> np.ndarray:
+        """The preconditioned gradient; `back` has been called."""
+
+
+class _Single:
+    """One colour a Gaussian: unknowns (K, 3)."""
+
+    def __init__(self, gaussians: Gaussians, projections: Sequence[Projection]) -> None:
+        self.projections, self.start = projections, gaussians.colors.astype(np.float64)
+        self.weight = np.zeros((len(gaussians), 1))
+
+    def forward(self, view: int, unknowns: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+        return _forward(self.projections[view], unknowns, shape)
+
+    def back(self, images: Sequence[np.ndarray]) -> np.ndarray:
+        sums = _back(self.projections, images, len(self.start))
+        self.weight = np.maximum(sums[:, :1], SEEN) + PRIOR
+        return sums[:, 1:4]
+
+    def pull(self, change: np.ndarray) -> np.ndarray:
+        return PRIOR * change
+
+    def scaled(self, gradient: np.ndarray) -> np.ndarray:
+        result: np.ndarray = gradient / self.weight
+        return result
+
+
+def _descend(system: System, views: np.ndarray, rounds: int, progress: Progress | None) -> np.ndarray:
+    """The unknowns after conjugate gradients of `solve_colors`."""
+    found = system.start.copy()
+    rows = tuple(range(found.ndim - 1))  # all axes but the channels
+    residuals = [view[..., :3] - system.forward(i, found, view.shape) for i, view in enumerate(views)]
+    gradient = system.back(residuals)
+    direction = system.scaled(gradient)
+    slope = (gradient * direction).sum(axis=rows)
     error = sum(float(np.vdot(r, r)) for r in residuals)
     for done in range(rounds):
-        images = [_forward(p, direction, view.shape) for p, view in zip(projections, views, strict=True)]
+        images = [system.forward(i, direction, view.shape) for i, view in enumerate(views)]
         curvature = sum((image.astype(np.float64) ** 2).sum(axis=(0, 1)) for image in images)
-        curvature = curvature + PRIOR * (direction**2).sum(axis=0)
+        curvature = curvature + (direction * system.pull(direction)).sum(axis=rows)
         length = np.where(curvature > 0, slope / np.where(curvature > 0, curvature, 1), 0)
-        colors += length * direction
+        found += length * direction
         gained = float((length * slope).sum())  # an exact line search lowers the squared error by this
         last = done == rounds - 1 or gained <= ENOUGH * error
         if progress:
@@ -75,28 +133,17 @@ def solve_colors(
         error -= gained
         for residual, image in zip(residuals, images, strict=True):
             residual -= length.astype(np.float32) * image
-        gradient = _back(projections, residuals, count)[:, 1:4] - PRIOR * (colors - start)
-        scaled = gradient / weight
-        new = (gradient * scaled).sum(axis=0)
+        gradient = system.back(residuals) - system.pull(found - system.start)
+        scaled = system.scaled(gradient)
+        new = (gradient * scaled).sum(axis=rows)
         direction = scaled + np.where(slope > 0, new / np.where(slope > 0, slope, 1), 0) * direction
         slope = new
-    return Gaussians(
-        gaussians.means,
-        gaussians.log_scales,
-        gaussians.quaternions,
-        gaussians.opacity_logits,
-        np.clip(colors, 0, BRIGHTEST),
-    )
+    return found
 
 
 def _forward(projection: Projection, colors: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """RGB image (h, w, 3) of signed colours."""
     return blend(projection, np.ascontiguousarray(colors, np.float32), shape[0], shape[1])[..., :3]
-
-
-def _residual(projection: Projection, view: np.ndarray, colors: np.ndarray) -> np.ndarray:
-    result: np.ndarray = view[..., :3] - _forward(projection, colors, view.shape)
-    return result
 
 
 def _back(projections: Sequence[Projection], images: Sequence[np.ndarray], count: int) -> np.ndarray:

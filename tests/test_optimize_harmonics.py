@@ -1,0 +1,127 @@
+"""Descent on harmonics: it finds a view-dependent colour that degree 0 cannot show, and loses none on the way."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.test_gaussians_harmonics import cloud
+from vvgt_cli.cameras import default_views
+from vvgt_cli.conversion.case import Case
+from vvgt_cli.conversion.stages.refinement import HARMONICS, step_seconds
+from vvgt_cli.descent import METHODS, OptimizeOptions, OptimizeRecord, optimize
+from vvgt_cli.descent.checkpoint import fingerprint, resume, save
+from vvgt_cli.descent.densify import SLOPE, Densified, densify
+from vvgt_cli.descent.loop import Judge, begin, step
+from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.metrics import psnr
+from vvgt_cli.splat import render
+
+CAMERAS, CHECKS = default_views("train", 24, size=40), default_views("check", 2, size=40)
+TEST = default_views("test", size=40)
+
+
+def shiny(count: int = 60, degree: int = 2, seed: int = 0) -> Gaussians:
+    return replace(cloud(count, degree, seed, 0.25), colors=np.random.default_rng(seed).uniform(0.3, 0.7, (count, 3)))
+
+
+def views(g: Gaussians, cameras) -> np.ndarray:
+    return np.stack([render(g, camera) for camera in cameras])
+
+
+def score(g: Gaussians, truth: Gaussians) -> float:
+    return float(np.mean([psnr(render(truth, c)[..., :3], render(g, c)[..., :3]) for c in TEST]))
+
+
+@pytest.mark.parametrize(("method", "steps", "gain"), [("frame", 120, 3.0), ("adam", 400, 1.0)])
+def test_harmonics_are_found_and_degree_0_is_behind(method, steps, gain):
+    truth = shiny()
+    start, images, check = replace(truth, harmonics=None), views(truth, CAMERAS), (CHECKS, views(truth, CHECKS))
+    options = OptimizeOptions(steps=steps, method=method)
+    ends = [optimize(start.of_degree(degree), CAMERAS, images, options, check)[0] for degree in (0, 2)]
+    assert [end.degree for end in ends] == [0, 2]
+    assert score(ends[1], truth) > score(ends[0], truth) + gain
+
+
+def test_zeros_that_no_gradient_moves_leave_the_bytes_of_degree_0():
+    """Views of Gaussians that look the same from everywhere, at rate 0 of the harmonics: the same run."""
+    truth = shiny(degree=0)
+    start, images = replace(truth, colors=truth.colors * np.float32(0.8)), views(truth, CAMERAS)
+    options, ends = OptimizeOptions(steps=10), []
+    for degree in (0, 3):
+        state = begin(start.of_degree(degree), CAMERAS, options)
+        state.RATES = state.RATES * np.array([1, 1, 1, 1, 1, 0])
+        for n in range(10):
+            step(state, CAMERAS[n], images[n], options, 0.05, n / 10, 1.0)
+        ends.append(state.gaussians())
+    assert not ends[1].harmonics.any()
+    for field, array in ends[0].arrays().items():
+        assert array.tobytes() == getattr(ends[1], field).tobytes()
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_states_draw_and_return_what_they_were_given(method):
+    g = shiny()
+    state = begin(g, CAMERAS, OptimizeOptions.of(method, steps=4))
+    np.testing.assert_array_equal(state.gaussians().harmonics, g.harmonics)
+    c = CAMERAS[3]
+    from vvgt_cli.splat import blend
+
+    image = blend(state.project(c), np.maximum(state.colors_from(c), 0), c.height, c.width)
+    np.testing.assert_allclose(image, render(g, c), atol=1e-4)
+
+
+def test_negative_base_colours_are_kept_where_harmonics_may_make_up_for_them():
+    g = replace(shiny(), colors=np.full((60, 3), -0.1))
+    for method in METHODS:
+        state = begin(g, CAMERAS, OptimizeOptions.of(method, steps=4))
+        np.testing.assert_array_equal(state.gaussians().colors, g.colors)
+    assert begin(g.of_degree(0), CAMERAS, OptimizeOptions()).gaussians().colors.min() == 0
+
+
+def test_clones_splits_and_moments_go_with_their_harmonics():
+    g = shiny()
+    score_of = np.where(np.arange(60) % 3 == 0, 2 * SLOPE, 0)
+    denser, origin = densify(g, score_of, 1000, 3.3, np.random.default_rng(0))
+    assert denser.harmonics.shape == (80, 8, 3)
+    np.testing.assert_array_equal(denser.harmonics[60:], g.harmonics[::3])
+    np.testing.assert_array_equal(denser.harmonics[origin >= 0], g.harmonics[origin[origin >= 0]])
+    state = Densified(g, CAMERAS, OptimizeOptions.of("3dgs", steps=30, max_gaussians=90))
+    images = views(shiny(seed=1), CAMERAS)
+    for camera, image in zip(CAMERAS[:6], images, strict=False):
+        step(state, camera, image, OptimizeOptions.of("3dgs", steps=30), None, 0.0, 1.0)
+    state.slopes[:] = np.where(np.arange(60) < 7, 1.0, 0.0)
+    state._densify()
+    assert len(state.arrays) == len(state.running) == 6
+    assert {len(array) for array in state.arrays} == {len(m) for pair in state.running for m in pair} == {67}
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_checkpoint_holds_them(method, tmp_path):
+    g, options = shiny(), OptimizeOptions.of(method, steps=9)
+    images = views(shiny(seed=1), CAMERAS)
+    path, states = str(tmp_path / "a.npz"), [begin(g, CAMERAS, options) for _ in range(2)]
+    walk = {"error": None, "speed": 1.0, "elapsed": 0.0, "looked": 0}
+    for n in range(3):
+        step(states[0], CAMERAS[n], images[n], options, 0.1, 0.1, 1.0)
+    judges = [Judge(state, None, OptimizeRecord()) for state in states]
+    save(path, "key", states[0], judges[0], OptimizeRecord(), walk)
+    assert resume(path, "key", states[1], judges[1], OptimizeRecord()) == walk
+    for n in range(3, 6):
+        for state in states:
+            step(state, CAMERAS[n], images[n], options, 0.1, 0.1, 1.0)
+    first, second = (state.gaussians() for state in states)
+    for field, array in first.arrays().items():
+        assert array.tobytes() == getattr(second, field).tobytes()
+    assert np.abs(first.harmonics - g.harmonics).max() > 0
+    other = replace(g, harmonics=g.harmonics * np.float32(0.5))
+    assert len({fingerprint(x, options) for x in (g, other, replace(g, harmonics=None))}) == 3
+
+
+def test_the_plan_knows_that_steps_with_harmonics_take_longer():
+    case = Case(100_000, 1e6, 1e6, 400, 0.05)
+    seconds = [step_seconds(replace(case, degree=degree), half=False) for degree in range(4)]
+    assert seconds == sorted(seconds)
+    assert [s / seconds[0] for s in seconds] == pytest.approx(HARMONICS)

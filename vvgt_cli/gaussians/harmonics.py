@@ -1,0 +1,153 @@
+"""Real spherical harmonics as 3DGS has them: colours that depend on where a Gaussian is seen from.
+
+Order, constants and signs are those of Kerbl et al. (2023), `computeColorFromSH`: the real harmonics of degree 1, 2 and
+3, m from -l to l, with the Condon-Shortley phase. A direction leads from the eye to the Gaussian's centre. All float64;
+`vvgt_cli.splat.harmonics` has the kernels.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from vvgt_cli.gaussians.types import HARMONICS, Gaussians
+
+C1 = 0.4886025119029199
+C2 = 1.0925484305920792, 0.31539156525252005, 0.5462742152960396
+C3 = 0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277
+_LARGEST = float(np.finfo(np.float32).max)
+_DIRECTIONS = 64  # on which rotations are solved: more than coefficients, spread evenly
+
+
+def terms(x: Any, y: Any, z: Any) -> tuple[Any, ...]:
+    """The 15 harmonics of degree 1 to 3 at a unit direction, scalars or arrays."""
+    xx, yy, zz = x * x, y * y, z * z
+    return (
+        -C1 * y,
+        C1 * z,
+        -C1 * x,
+        C2[0] * x * y,
+        -C2[0] * y * z,
+        C2[1] * (2 * zz - xx - yy),
+        -C2[0] * x * z,
+        C2[2] * (xx - yy),
+        -C3[0] * y * (3 * xx - yy),
+        C3[1] * x * y * z,
+        -C3[2] * y * (4 * zz - xx - yy),
+        C3[3] * z * (2 * zz - 3 * xx - 3 * yy),
+        -C3[2] * x * (4 * zz - xx - yy),
+        C3[4] * z * (xx - yy),
+        -C3[0] * x * (xx - 3 * yy),
+    )
+
+
+def term_slopes(x: Any, y: Any, z: Any) -> tuple[tuple[Any, Any, Any], ...]:
+    """Derivatives of the polynomials of `terms` by x, y and z; what is 0 for every direction is the number 0."""
+    xx, yy, zz = x * x, y * y, z * z
+    a, b, c = C2
+    p, q, r, s, t = C3
+    return (
+        (0.0, -C1, 0.0),
+        (0.0, 0.0, C1),
+        (-C1, 0.0, 0.0),
+        (a * y, a * x, 0.0),
+        (0.0, -a * z, -a * y),
+        (-2 * b * x, -2 * b * y, 4 * b * z),
+        (-a * z, 0.0, -a * x),
+        (2 * c * x, -2 * c * y, 0.0),
+        (-6 * p * x * y, -3 * p * (xx - yy), 0.0),
+        (q * y * z, q * x * z, q * x * y),
+        (2 * r * x * y, -r * (4 * zz - xx - 3 * yy), -8 * r * y * z),
+        (-6 * s * x * z, -6 * s * y * z, s * (6 * zz - 3 * xx - 3 * yy)),
+        (-r * (4 * zz - 3 * xx - yy), 2 * r * x * y, -8 * r * x * z),
+        (2 * t * x * z, -2 * t * y * z, t * (xx - yy)),
+        (-3 * p * (xx - yy), 6 * p * x * y, 0.0),
+    )
+
+
+def directions(means: np.ndarray, eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Unit directions (K, 3) from ``eye`` (3,) to ``means`` (K, 3), and the distances (K,); 0 for one at the eye."""
+    offset = np.asarray(means, np.float64) - eye
+    distance = np.linalg.norm(offset, axis=1)
+    return offset / np.where(distance > 0, distance, 1)[:, None], distance
+
+
+def basis(directions: np.ndarray, degree: int) -> np.ndarray:
+    """(K, M) harmonics of degree 1 to ``degree`` at unit directions (K, 3)."""
+    d = np.asarray(directions, np.float64)
+    found: np.ndarray = np.stack(terms(*d.T), axis=-1)[:, : HARMONICS[degree]]
+    return found
+
+
+def basis_slopes(directions: np.ndarray, degree: int) -> np.ndarray:
+    """(K, M, 3) derivatives of the polynomials of `basis` by the direction (K, 3).
+
+    The part along the direction means nothing: what moves a direction moves it across.
+    """
+    d = np.asarray(directions, np.float64)
+    rows = [np.stack(np.broadcast_arrays(*row, d[:, 0])[:3], -1) for row in term_slopes(*d.T)[: HARMONICS[degree]]]
+    return np.stack(rows, axis=1) if rows else np.zeros((len(d), 0, 3))
+
+
+def view_colors(gaussians: Gaussians, eye: np.ndarray) -> np.ndarray:
+    """(K, 3) float64 colours as they are seen from ``eye`` (3,), before what is negative is drawn as 0."""
+    colors: np.ndarray = gaussians.colors.astype(np.float64)
+    if gaussians.harmonics is not None:
+        toward, _ = directions(gaussians.means, eye)
+        colors += np.einsum("km,kmc->kc", basis(toward, gaussians.degree), gaussians.harmonics.astype(np.float64))
+    return colors
+
+
+def view_slopes(gaussians: Gaussians, eye: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Gradients with respect to harmonics (K, M, 3) and means (K, 3), given those to `view_colors`, (K, 3)."""
+    if gaussians.harmonics is None:
+        return np.zeros((len(gaussians), 0, 3)), np.zeros((len(gaussians), 3))
+    toward, distance = directions(gaussians.means, eye)
+    by_term = np.einsum("kmc,kc->km", gaussians.harmonics.astype(np.float64), slopes)
+    bent = np.einsum("km,kmi->ki", by_term, basis_slopes(toward, gaussians.degree))
+    across = bent - (bent * toward).sum(axis=1, keepdims=True) * toward
+    means = across / np.where(distance > 0, distance, math.inf)[:, None]
+    return basis(toward, gaussians.degree)[:, :, None] * slopes[:, None, :], means
+
+
+def turned(gaussians: Gaussians, matrix: np.ndarray) -> np.ndarray | None:
+    """Harmonics of Gaussians under ``matrix``: seen along ``matrix @ d`` they show what they showed along d.
+
+    Args:
+        matrix: (3, 3), a rotation or a reflection; of others the nearest of these is taken.
+    """
+    if gaussians.harmonics is None:
+        return None
+    left, _, right = np.linalg.svd(np.asarray(matrix, np.float64))
+    mixed = np.einsum("nm,kmc->knc", mixing(left @ right, gaussians.degree), gaussians.harmonics.astype(np.float64))
+    found: np.ndarray = np.clip(mixed, -_LARGEST, _LARGEST).astype(np.float32)
+    return found
+
+
+def mixing(matrix: np.ndarray, degree: int) -> np.ndarray:
+    """(M, M) that takes coefficients to those under an orthogonal ``matrix`` (3, 3); degrees do not mix.
+
+    Solved on directions all over the sphere: to rounding, as every harmonic of a turned direction is a sum of those of
+    the same degree.
+    """
+    points, inverses = _solver()
+    moved = points @ matrix  # rows R^T d
+    whole, there = np.zeros((HARMONICS[degree],) * 2), basis(moved, degree)
+    for n in range(1, degree + 1):
+        band = slice(HARMONICS[n - 1], HARMONICS[n])
+        whole[band, band] = inverses[n - 1] @ there[:, band]
+    return whole
+
+
+@cache
+def _solver() -> tuple[np.ndarray, list[np.ndarray]]:
+    """Directions (n, 3) on a Fibonacci sphere, and the pseudo-inverse of each degree's harmonics there."""
+    z = 1 - (2 * np.arange(_DIRECTIONS) + 1) / _DIRECTIONS
+    azimuth = 2 * np.pi * np.arange(_DIRECTIONS) * (math.sqrt(5) - 1) / 2
+    across = np.sqrt(1 - z * z)
+    points = np.column_stack([across * np.cos(azimuth), across * np.sin(azimuth), z])
+    whole = basis(points, 3)
+    return points, [np.linalg.pinv(whole[:, HARMONICS[n - 1] : HARMONICS[n]]) for n in (1, 2, 3)]
