@@ -41,6 +41,9 @@ def by_cpu_mapper(scene: Scene, camera: Camera) -> np.ndarray:
     window, renderer, mapper = vtk_window(scene, 1)
     renderer.GetVolumes().GetItemAsObject(0).SetProperty(volume_property(scene, 1.0))
     add_lights(renderer, scene)
+    if scene.light is None or not len(scene.light.directions):
+        renderer.CreateLight()
+    renderer.GetLights().GetItemAsObject(0).SetAmbientColor(1, 1, 1)  # 0 by default, with which there is no ambient
     window.SetSize(camera.width, camera.height)
     aim(renderer, camera)
     mapper.SetSampleDistance(distance(scene, camera, STEP))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vvgt_cli.dvr.layout import BRICK, Light
-from vvgt_cli.transfer.lighting import COEFFICIENTS, Lighting
+from vvgt_cli.transfer.lighting import Lighting
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr.scene import Scene
@@ -43,7 +43,8 @@ def lights_of(scene: Scene, lighting: Lighting, max_cells: int = MAX_CELLS) -> L
         grids.append(np.minimum(2 * around, 1))  # a plane is open
     shade = np.stack(grids) if grids else np.ones((1, 1, 1, 1), np.float32)
     return Light(
-        *(float(getattr(lighting, name)) for name in COEFFICIENTS), int(lighting.headlight),
+        float(lighting.ambient), float(lighting.diffuse), float(lighting.specular), float(lighting.specular_power),
+        int(lighting.headlight),
         np.ascontiguousarray(directions), shade, int(lighting.shadows), int(lighting.occlusion is not None),
         1.0 / cell, np.ascontiguousarray(scene.step, np.float64),
     )  # fmt: skip
