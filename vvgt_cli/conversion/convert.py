@@ -17,7 +17,7 @@ from vvgt_cli.conversion.stages.views import wide
 from vvgt_cli.errors import UsageError
 from vvgt_cli.files import check_room
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored
-from vvgt_cli.jit.ahead import CONVERT, INIT, LIGHT, for_degree
+from vvgt_cli.jit.ahead import CONVERT, INIT, for_degree, for_light
 from vvgt_cli.network.card import find_model, read_card
 from vvgt_cli.progress import Console
 from vvgt_cli.runs.gaussian_files import write_gaussians
@@ -224,7 +224,7 @@ def _kernels(run: Run, request: ConvertRequest, source: Source) -> tuple[str, ..
     """That a run will need."""
     names = CONVERT if run.report.command == "convert" else INIT
     if source.lighting is not None:
-        names = (*names, *LIGHT)
+        names = for_light(names, source.lighting.attenuated)
     return for_degree(names, degree_of(request, source))
 
 

@@ -63,6 +63,11 @@ class Lighting:
         """Whether colours change with the eye."""
         return (self.headlight and self.diffuse > 0) or self.specular > 0
 
+    @property
+    def attenuated(self) -> bool:
+        """Whether light is marched through the scene, for shadows or occlusion."""
+        return self.shadows or self.occlusion is not None
+
     def text(self) -> str:
         """One line, as the header of a `.ply` has it; `parse_lighting` reads it."""
         words = [repr(float(getattr(self, name))) for name in COEFFICIENTS]
