@@ -102,12 +102,11 @@ def test_a_degree_that_cannot_hold_it_is_said(folder, vvgt):
 
 
 def test_a_preset_decides_unless_it_is_overruled(folder, vvgt):
-    out = folder / "views"
     shown = {}
     for name, more in (("preset", ()), ("none", ("--light", "none")), ("left", ("--light", "left"))):
         done = vvgt(
             "render-views", SOURCE, *tf(folder, "lit"), "--views", "1", "--test-views", "0", "--size", "32", "--format",
-            "exr", "--no-points", *more, "-o", out / ".." / name,
+            "exr", "--no-points", *more, "-o", folder / name,
         )  # fmt: skip
         assert done.code == 0, done.err
         shown[name] = next((folder / name).rglob("*.exr")).read_bytes()
@@ -140,4 +139,4 @@ def test_the_library_takes_names_directions_and_options():
     _, images = vvgt_cli.render_views(SOURCE, function, cameras=1, size=32, light=options)
     _, dark = vvgt_cli.render_views(SOURCE, function, cameras=1, size=32)
     assert np.abs(images - dark).max() > 0.05
-    np.testing.assert_array_equal(images[..., 3], dark[..., 3])
+    np.testing.assert_allclose(images[..., 3], dark[..., 3], atol=0.02)  # other pixels get more rays
