@@ -82,8 +82,6 @@ def test_the_kernel_is_the_cpu_renderer():
 def test_what_a_renderer_cannot_do_is_said_in_one_line(monkeypatch):
     with pytest.raises(UsageError, match=r"renderer 'gpu'; expected one of cpu, cuda, vtk"):
         render_views_with("gpu", scene(), [view()])
-    with pytest.raises(UsageError, match="no lighting"):
-        render_views_with("cpu", scene(), [view()], shade=True)
     monkeypatch.setitem(sys.modules, "torch", None)
     with pytest.raises(UsageError, match=r"needs torch; install vvgt\[cuda\]"):
         render_views_with("cuda", scene(), [view()])
@@ -108,7 +106,8 @@ import sys
 import numpy as np
 from test_dvr_backends import FINE, decentred, scene, view
 from vvgt_cli.dvr.backends import view_renderer
-draw, lit = (view_renderer("vtk", scene(), FINE, shade=shade) for shade in (False, True))
+from vvgt_cli.transfer.lighting import Lighting
+draw, lit = (view_renderer("vtk", made, FINE) for made in (scene(), scene().lit(Lighting())))
 np.savez(sys.argv[1], plain=draw(view()), decentred=draw(decentred()), lit=lit(view()))
 """
 

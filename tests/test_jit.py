@@ -154,6 +154,11 @@ def test_commands_need_what_is_compiled_ahead_and_nothing_else(tmp_path):
     assert wanted(tmp_path, "infer", *seen, "--model", "vvgt-small", "-qo", "d.ply") == set(ahead.INFER)
     assert wanted(tmp_path, "evaluate", "a.ply", "--volume", SOURCE, "--size", 24, "-q") == set(ahead.EVALUATE)
     assert wanted(tmp_path, "render", "a.ply", "--orbit", 1, "--size", 24, "-qo", "r") == set(ahead.DRAW)
+    lit = wanted(tmp_path, "convert", SOURCE, *fit, "--steps", 24, "--light", "headlight", "-o", "e.ply")
+    assert lit == set(ahead.for_degree(ahead.for_light(ahead.CONVERT, False), 2)) - rare
+    dark = ("--light", "above", "--shadows", "--specular", 0)
+    flat = wanted(tmp_path, "convert", SOURCE, *fit, "--steps", 24, *dark, "-o", "f.ply")
+    assert flat == set(ahead.for_light(ahead.CONVERT, True)) - rare
 
 
 def test_lists_name_kernels():

@@ -14,6 +14,7 @@ from vtkmodules.vtkRenderingCore import vtkColorTransferFunction
 
 from vvgt_cli.errors import DataError, VvgtError
 from vvgt_cli.transfer import read_transfer_function, unit_distance
+from vvgt_cli.transfer.lighting import Lighting
 from vvgt_cli.volume import Volume
 
 OPACITY = [(-3024.0, 0.0, 0.5, 0.0), (-86.9, 0.1, 0.3, 0.4), (45.4, 0.169, 0.5, 0.9), (348.0, 0.6, 0.5, 0.0)]
@@ -94,10 +95,9 @@ def test_slicer_vp(file) -> None:
     assert (tf.domain, tf.opacity_unit_distance, tf.name) == ("data", 1, "volume property")
     check_vtk(tf, [node[:2] for node in OPACITY], COLORS)
     assert tf.opacity_unit_label == "VTK's default"
-    with pytest.warns(
-        UserWarning, match=r"bone.vp: gradient opacity and shading \(ambient 0.1, diffuse 0.9, specular 0.2"
-    ):
-        read_transfer_function(file(vp("4 0 0 255 1"), "bone.vp"))
+    with pytest.warns(UserWarning, match=r"bone.vp: gradient opacity not used"):
+        shaded = read_transfer_function(file(vp("4 0 0 255 1"), "bone.vp"))
+    assert shaded.lighting == Lighting(ambient=0.1, diffuse=0.9, specular=0.2, specular_power=10)
 
 
 def test_slicer_vp_json(file) -> None:
@@ -106,10 +106,13 @@ def test_slicer_vp_json(file) -> None:
     check_vtk(tf, OPACITY, COLORS, sharpness=0.3)
     slopes = {"points": [{"x": 0, "y": 0.0}, {"x": 255, "y": 1.0}]}
     assert tf.opacity_unit_label == "file"
-    with pytest.warns(UserWarning, match=r"a.json: gradient opacity not used: there is no lighting here"):
+    with pytest.warns(UserWarning, match=r"a.json: gradient opacity not used"):
         read_transfer_function(file(vp_json(gradientOpacity=slopes), "a.json"))
-    with pytest.warns(UserWarning, match=r"b.json: shading \(ambient 0.3\) not used"):
-        read_transfer_function(file(vp_json(shade=True, lighting={"ambient": 0.3}), "b.json"))
+    lit = read_transfer_function(file(vp_json(shade=True, lighting={"ambient": 0.3}), "b.json"))
+    assert lit.lighting == Lighting(ambient=0.3)
+    with pytest.raises(DataError, match=r"b.json: shading with diffuse -1: expected 0 to 1000"):
+        read_transfer_function(file(vp_json(shade=True, lighting={"diffuse": -1}), "b.json"))
+    assert tf.lighting is None
     off = vp_json(gradientOpacity=slopes, disableGradientOpacity=True)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -145,10 +148,8 @@ def test_slicer_presets_xml(vvgt, file, tmp_path: Path) -> None:
         read_transfer_function(source)
     with pytest.raises(DataError, match="no preset 'CT'; it has 'CT-AAA', 'MR-Default'"):
         read_transfer_function(source + "#CT")
-    with pytest.warns(
-        UserWarning, match=r"#CT-AAA: shading \(ambient 0.1, diffuse 0.66, specular 0.62, specularPower 14\)"
-    ):
-        tf = read_transfer_function(source + "#CT-AAA")
+    tf = read_transfer_function(source + "#CT-AAA")
+    assert tf.lighting == Lighting(True, (), 0.1, 0.66, 0.62, 14)
     assert (tf.name, tf.domain, tf.opacity_unit_distance, tf.opacity_unit_label) == (
         "CT-AAA",
         "data",
@@ -158,21 +159,29 @@ def test_slicer_presets_xml(vvgt, file, tmp_path: Path) -> None:
     check_vtk(tf, [node[:2] for node in OPACITY], COLORS)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert read_transfer_function(source + "#MR-Default").name == "MR-Default"
+        flat = read_transfer_function(source + "#MR-Default")
+        assert (flat.name, flat.lighting) == ("MR-Default", None)
         told = file(mrml(scalarOpacityUnitDistance="0.5"), "own.xml")
         own = read_transfer_function(told + "#MR-Default")
         assert (own.opacity_unit_distance, own.opacity_unit_label) == (0.5, "file")
     info = vvgt("info", source + "#MR-Default")
     assert info.code == 0, info.err
     assert b"1 (VTK's default)" in info.out
+    assert b"0.1 0.66 0.62 14" in vvgt("info", source + "#CT-AAA").out
+    steep = file(mrml(gradientOpacity="4 0 0 255 1"), "steep.xml")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert vvgt("info", source + "#CT-AAA").code == 1
-        assert vvgt("info", source + "#CT-AAA", "-q").code == 0
+        assert vvgt("info", steep + "#CT-AAA").code == 1
+        assert vvgt("info", steep + "#CT-AAA", "-q").code == 0
     assert "2 presets, 'CT-AAA', 'MR-Default'" in vvgt("info", source).error
     out = tmp_path / "mr.json"
     assert vvgt("tf", "convert", source + "#MR-Default", out).code == 0
     np.testing.assert_allclose(read_transfer_function(str(out)).opacity(AT), tf.opacity(AT), atol=0.2)
+    assert vvgt("tf", "convert", source + "#CT-AAA", tmp_path / "ct.json").code == 0
+    assert read_transfer_function(str(tmp_path / "ct.json")).lighting == tf.lighting
+    assert (
+        "holds no shading" in vvgt("tf", "convert", source + "#CT-AAA", tmp_path / "p.json", "--format", "paraview").err
+    )
     assert vvgt("tf", "show", source + "#MR-Default", "-o", tmp_path / "mr.png").code == 0
 
 

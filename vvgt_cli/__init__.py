@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from vvgt_cli.library.functions import convert, evaluate, optimize, read_ply, read_volume, render_views
     from vvgt_cli.library.session import Session
     from vvgt_cli.transfer import ColorMap, PiecewiseOpacity, TransferFunction, read_transfer_function
+    from vvgt_cli.transfer.lighting import LightOptions
     from vvgt_cli.volume import Volume
 
 _WHERE = {  # imported when asked for: `import vvgt_cli` costs nothing
@@ -35,6 +36,7 @@ _WHERE = {  # imported when asked for: `import vvgt_cli` costs nothing
     "library.session": ("Session",),
     "conversion.result": ("Conversion", "Result"),
     "transfer": ("ColorMap", "PiecewiseOpacity", "TransferFunction", "read_transfer_function"),
+    "transfer.lighting": ("LightOptions",),
     "volume": ("Volume",),
 }
 _MODULES = {name: module for module, names in _WHERE.items() for name in names}
@@ -45,6 +47,7 @@ __all__ = [
     "Conversion",
     "DataError",
     "Gaussians",
+    "LightOptions",
     "PiecewiseOpacity",
     "PlyHeader",
     "Result",

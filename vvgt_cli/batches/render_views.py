@@ -21,7 +21,7 @@ from vvgt_cli.cameras.sets import FIELD_OF_VIEW, RADIUS, SET_VIEWS, SIZE
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import atomic_write, claim
 from vvgt_cli.images import write_png
-from vvgt_cli.jit.ahead import VIEWS
+from vvgt_cli.jit.ahead import VIEWS, for_light
 from vvgt_cli.progress import Console
 from vvgt_cli.runs.digests import cameras_digest, digest, volume_digest
 from vvgt_cli.runs.record import ConversionReport, Run
@@ -194,7 +194,9 @@ def render_view_sets(request: ViewsRequest, console: Console | None = None) -> i
                 "volume; resample it first ('vvgt convert' takes it)"
             )
         stage.note = f"{volume.name}: {' x '.join(map(str, volume.dims))} {volume.data.dtype.name}"
-    run.compile(VIEWS, sources[0].kernel_type())
+    lights = [source.lighting for source in sources if source.lighting is not None]
+    names = for_light(VIEWS, any(light.attenuated for light in lights)) if lights else VIEWS
+    run.compile(names, sources[0].kernel_type())
     with run.stage("plan") as stage:
         jobs = _plan(request, views, folders, sources)
         total = sum(len(job.pending) for job in jobs)
@@ -213,6 +215,7 @@ def _settings(request: ViewsRequest, views: Sequence[View], source: Source, cont
         "volume": content,
         "function": digest(source.tf.opacity_nodes, source.tf.color_map),
         "opacity_unit_distance": source.unit_distance,
+        **({} if source.lighting is None else {"light": source.lighting.text()}),
         "views": len(cameras["train"]),
         "test_views": len(cameras["test"]),
         "size": ", ".join(sizes),

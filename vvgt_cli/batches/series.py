@@ -272,12 +272,14 @@ def _frame(request: ConvertRequest, source: SourceRequest, names: list[str]) -> 
 def _settings(request: ConvertRequest, frames: Frames, tf: TransferFunction, distance: float) -> dict[str, Any]:
     """Everything that the files depend on; named as the command line names it."""
     ply = asdict(request.ply)
+    lighting = request.source.light.lighting(tf.lighting, frames.first.space)
     return {
         "version": __version__,
         "volume": frames.content,
         "frames": frames.count,
         "function": digest(tf.opacity_nodes, tf.color_map),
         "opacity_unit_distance": distance,
+        **({} if lighting is None else {"light": lighting.text()}),
         **asdict(request.fit),
         **asdict(request.limits),
         "model": read_text(find_model(request.fit.model) / CARD) if request.fit.model else None,

@@ -159,7 +159,9 @@ def _thinned(scene: Scene, every: np.ndarray) -> Scene:
     for axis, (n, step) in enumerate(zip(data.shape, every[::-1], strict=True)):
         data = np.take(data, np.minimum(np.arange(step // 2, n + step // 2, step), n - 1), axis)
     x, y, z = (float(length) for length in volume.spacing * every)
-    return type(scene).build(replace(volume, data=data, spacing=(x, y, z)), scene.tf, scene.unit_distance)
+    return type(scene).build(
+        replace(volume, data=data, spacing=(x, y, z)), scene.tf, scene.unit_distance, lighting=scene.lighting
+    )
 
 
 def thumbnails(folder: Path, views: Sequence[View], background: Sequence[float]) -> np.ndarray:

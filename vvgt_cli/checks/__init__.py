@@ -13,6 +13,7 @@ MODULES = (
     "reading",
     "functions",
     "raycast",
+    "light",
     "mapping",
     "forward",
     "backward",

@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from vvgt_cli.cli.fit import fit_options, limit_options, ply_options, rule_option
-from vvgt_cli.cli.options import common_options, overwrite_option, placed_read_options, tfs_options
+from vvgt_cli.cli.options import common_options, light_options, overwrite_option, placed_read_options, tfs_options
 from vvgt_cli.progress import Console
 
 
@@ -27,6 +27,7 @@ from vvgt_cli.progress import Console
 @click.option("--dry-run", is_flag=True, help="Print the plan with estimated time, memory and size; write nothing.")
 @ply_options
 @tfs_options
+@light_options
 @placed_read_options
 @click.option("--report", metavar="R.json", help="Write times and errors of every stage as JSON; - is standard output.")
 @click.option("--preview", metavar="P.png", help="Write reference, ours and difference of three test views.")

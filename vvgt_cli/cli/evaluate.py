@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from vvgt_cli.cli.fit import rule_option
-from vvgt_cli.cli.options import common_options, overwrite_option, placed_read_options, tf_options
+from vvgt_cli.cli.options import common_options, light_options, overwrite_option, placed_read_options, tf_options
 from vvgt_cli.progress import Console
 
 
@@ -33,6 +33,7 @@ from vvgt_cli.progress import Console
 )  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a table.")
 @tf_options
+@light_options
 @placed_read_options
 @overwrite_option
 @common_options
@@ -42,7 +43,7 @@ def command(ply: str, volume: str, as_json: bool, console: Console, **options: A
     A seat is a rule of drawing (docs/viewers.md), a size (400, 800, the file's own and 2160 px) or a close-up
     (field of view 10 degrees); three test views each, worst first. Large pictures are scored on blocks of 16 px.
     The reference is ray-cast with steps of 1/8 voxel and up to 9 rays a pixel (seats: as convert's); its own
-    error is printed with the scores. Size, rule and --opacity-unit-distance are the file's own unless given.
+    error is printed with the scores. Size, rule, light and --opacity-unit-distance are the file's own unless given.
 
     \b
     Example:
@@ -51,7 +52,7 @@ def command(ply: str, volume: str, as_json: bool, console: Console, **options: A
     from vvgt_cli.cli.fit import source_request
     from vvgt_cli.tasks.evaluate import EvaluateRequest, evaluate
 
-    source = source_request(volume, options["read"], options["optics"])
+    source = source_request(volume, options["read"], options["optics"], options["light"])
     names = ("size", "rule", "step", "seats", "preview", "overwrite")
     evaluation = evaluate(EvaluateRequest(ply, source, **{name: options[name] for name in names}), console)
     click.echo(evaluation.to_json() if as_json else evaluation.table(), nl=False)

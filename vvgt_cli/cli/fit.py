@@ -78,12 +78,18 @@ ply_options = group(
 )  # fmt: skip
 
 
-def source_request(volume: str, read: dict[str, Any], optics: dict[str, Any]) -> SourceRequest:
+def source_request(
+    volume: str, read: dict[str, Any], optics: dict[str, Any], light: dict[str, Any] | None = None
+) -> SourceRequest:
     """What the shared options of `options.py` add up to."""
     from vvgt_cli.runs.source import SourceRequest
+    from vvgt_cli.transfer.lighting import LightOptions
     from vvgt_cli.volume import ReadOptions
 
-    return SourceRequest(volume, ReadOptions(**read), optics["tf"], optics["tf_range"], optics["opacity_unit_distance"])
+    return SourceRequest(
+        volume, ReadOptions(**read), optics["tf"], optics["tf_range"], optics["opacity_unit_distance"],
+        light=LightOptions(**(light or {})),
+    )  # fmt: skip
 
 
 def convert_request(
@@ -94,6 +100,7 @@ def convert_request(
     ply: dict[str, Any],
     read: dict[str, Any],
     optics: dict[str, Any],
+    light: dict[str, Any],
     overwrite: bool,
     report: str | None = None,
     preview: str | None = None,
@@ -109,7 +116,7 @@ def convert_request(
 
     up = ply.pop("up")
     return ConvertRequest(
-        source_request(volume, read, optics),
+        source_request(volume, read, optics, light),
         output,
         FitOptions(**fit, rule=rule, steps=steps, model=model),
         Limits(**(limits or {})),

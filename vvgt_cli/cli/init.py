@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from vvgt_cli.cli.fit import fit_options, ply_options
-from vvgt_cli.cli.options import common_options, overwrite_option, placed_read_options, tf_options
+from vvgt_cli.cli.options import common_options, light_options, overwrite_option, placed_read_options, tf_options
 from vvgt_cli.progress import Console
 
 
@@ -17,6 +17,7 @@ from vvgt_cli.progress import Console
 @fit_options
 @ply_options
 @tf_options
+@light_options
 @placed_read_options
 @click.option("--report", metavar="R.json", help="Write the times of every stage as JSON; - is standard output.")
 @overwrite_option

@@ -118,6 +118,30 @@ tfs_options = group(
     opacity_unit_distance=unit_distance_option,
 )
 
+light_options = group(
+    "light",
+    lights=click.option(
+        "--light", "lights", multiple=True, metavar="none|headlight|X,Y,Z|left|above|...",
+        help="Light at the eye, or from a direction in the world: X,Y,Z, an axis (x, -x, ...), above, below, left, "
+        "right, anterior, ...; may be repeated. Default: the function's, if its file has one, else none.",
+    ),
+    ambient=click.option(
+        "--ambient", type=float, metavar="KA", help="Part of the colour that is there without light. Default: 0.1."
+    ),
+    diffuse=click.option(
+        "--diffuse", type=float, metavar="KD", help="Part of the colour where light falls straight. Default: 0.7."
+    ),
+    specular=click.option("--specular", type=float, metavar="KS", help="White of the highlights. Default: 0.2."),
+    specular_power=click.option(
+        "--specular-power", type=float, metavar="P", help="The larger, the smaller are highlights. Default: 10."
+    ),
+    shadows=click.option("--shadows", is_flag=True, help="Lights from directions throw shadows, with soft edges."),
+    occlusion=click.option(
+        "--ambient-occlusion", "occlusion", type=float, is_flag=False, flag_value=0.1, metavar="[RADIUS]",
+        help="Darker where much is around, within RADIUS (the longest edge is 2; without a number 0.1).",
+    ),
+)  # fmt: skip
+
 overwrite_option = click.option("--overwrite", is_flag=True, help="Replace files that exist.")
 
 

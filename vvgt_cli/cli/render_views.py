@@ -9,6 +9,7 @@ import click
 from vvgt_cli.cli.options import (
     common_options,
     group,
+    light_options,
     placed_read_options,
     tf_range_option,
     unit_distance_option,
@@ -98,6 +99,7 @@ optics_options = group(
 @image_options
 @ray_options
 @optics_options
+@light_options
 @placed_read_options
 @click.option("--shard", default="1/1", metavar="I/N", help="Render part I of N, for job arrays; I counts from 1.")
 @click.option("--overwrite", is_flag=True, help="Start afresh where another run's views are.")
@@ -109,6 +111,7 @@ def command(
     layout: dict[str, Any],
     rays: dict[str, Any],
     optics: dict[str, Any],
+    light: dict[str, Any],
     read: dict[str, Any],
     shard: str,
     overwrite: bool,
@@ -131,11 +134,15 @@ def command(
     from vvgt_cli.batches.view_files import Layout
     from vvgt_cli.errors import UsageError
     from vvgt_cli.runs.source import SourceRequest
+    from vvgt_cli.transfer.lighting import LightOptions
     from vvgt_cli.volume import ReadOptions
 
     if layout["half"] and layout["format"] == "png":
         raise UsageError("--half is of EXR, which --format png leaves out; leave out one of the two")
-    source = SourceRequest(volume, ReadOptions(**read), None, optics["tf_range"], optics["opacity_unit_distance"])
+    source = SourceRequest(
+        volume, ReadOptions(**read), None, optics["tf_range"], optics["opacity_unit_distance"],
+        light=LightOptions(**light),
+    )  # fmt: skip
     request = ViewsRequest(
         source, optics["tf"], output, CameraRequest(**cameras), Layout(**layout),
         shard=parse_shard(shard), overwrite=overwrite, **rays,

@@ -8,7 +8,7 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from vvgt_cli.cli.options import common_options, overwrite_option, read_options, tf_options
+from vvgt_cli.cli.options import common_options, light_options, overwrite_option, read_options, tf_options
 from vvgt_cli.errors import UsageError
 from vvgt_cli.progress import Console
 
@@ -61,6 +61,7 @@ def command_line(ctx: click.Context) -> str:
 )  # fmt: skip
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of whatever draws random numbers.")
 @tf_options
+@light_options
 @read_options
 @overwrite_option
 @common_options
@@ -95,7 +96,7 @@ def command(
     ladder = pipeline.LadderOptions(
         options["max_gaussians"], options["size"], options["steps"], options["model"], options["seed"]
     )
-    source = source_request(paths[0], options["read"], options["optics"])
+    source = source_request(paths[0], options["read"], options["optics"], options["light"])
     request = pipeline.ReportRequest(
         source, output, ladder, options["picture_size"], options["overwrite"], command_line(ctx)
     )

@@ -17,7 +17,7 @@ from vvgt_cli.conversion.stages.views import wide
 from vvgt_cli.errors import UsageError
 from vvgt_cli.files import check_room
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored
-from vvgt_cli.jit.ahead import CONVERT, INIT
+from vvgt_cli.jit.ahead import CONVERT, INIT, for_degree, for_light
 from vvgt_cli.network.card import find_model, read_card
 from vvgt_cli.progress import Console
 from vvgt_cli.runs.gaussian_files import write_gaussians
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
 
 QUICKEST = 0.5  # of the estimate, where the closed form took less: the rest then takes less too
+VIEW_DEGREE = 2  # of harmonics by default where the light depends on the view: abs(n . v) is even
 SMALLER = (8, 4, 2)  # parts of the budget that a target is tried with first
 
 
@@ -75,7 +76,7 @@ def initialise_only(request: ConvertRequest, console: Console | None = None) -> 
     run = Run(console or Console(), ConversionReport("init"))
     with claimed(request.outputs(), request.inputs(), request.overwrite):
         source, scene = _begin(run, request)
-        work = Work(run, scene, request.fit)
+        work = Work(run, scene, request.fit, degree=degree_of(request, source))
         ClosedFormStage().run(work)
         return _write(run, request, _conversion(request, source, work, as_stored(work.made())))
 
@@ -124,15 +125,17 @@ def _planned(run: Run, request: ConvertRequest) -> tuple[Source, Work, Planner, 
     if fit.model is not None:
         read_card(find_model(fit.model))  # fails before the work, not after
     source, scene = _begin(run, request)
-    case = measure(scene, fit.size, fit.max_gaussians)
+    degree = degree_of(request, source)
+    fit = replace(fit, max_gaussians=request.limits.gaussians(fit.max_gaussians, degree))
+    case = replace(measure(scene, fit.size, fit.max_gaussians), degree=degree)
     sparse = fit.max_gaussians <= case.edge**2  # a guess, until the Gaussians are there
     planner = Planner(
-        request.limits, fit.max_gaussians, fit.steps, request.ply.sh_degree or 0, fit.size, sparse, fit.model,
+        request.limits, fit.max_gaussians, fit.steps, request.ply.sh_degree or degree, fit.size, sparse, fit.model,
         request.scored_whole,
     )  # fmt: skip
     plan = planner.plan(case, run.elapsed())
     run.report.plan = plan.record()
-    return source, Work(run, scene, fit, request.limits), planner, plan
+    return source, Work(run, scene, fit, request.limits, degree), planner, plan
 
 
 def _fit(work: Work, request: ConvertRequest, planner: Planner, plan: Plan) -> Plan:
@@ -203,9 +206,10 @@ def _begin(run: Run, request: ConvertRequest) -> tuple[Source, Scene]:
         source = load(request.source)
         stage.note = describe_source(source)
         ply = _ply(request, source)
-    for remark in remarks(source.volume, ply):
+    flattened = _flattened(degree_of(request, source), source)
+    for remark in [*remarks(source.volume, ply), *([flattened] if flattened else [])]:
         run.console.say(remark)
-    run.compile(CONVERT if run.report.command == "convert" else INIT, source.kernel_type())
+    run.compile(_kernels(run, request, source), source.kernel_type())
     with run.stage("scene"):
         scene = source.scene()
     run.report.volume = volume_record(source)
@@ -214,6 +218,31 @@ def _begin(run: Run, request: ConvertRequest) -> tuple[Source, Scene]:
         "frame": ply.frame, "up": ply.up, "sh_degree": ply.sh_degree,
     }  # fmt: skip
     return source, scene
+
+
+def _kernels(run: Run, request: ConvertRequest, source: Source) -> tuple[str, ...]:
+    """That a run will need."""
+    names: tuple[str, ...] = CONVERT if run.report.command == "convert" else INIT
+    if source.lighting is not None:
+        names = for_light(names, source.lighting.attenuated)
+    return for_degree(names, degree_of(request, source))
+
+
+def degree_of(request: ConvertRequest, source: Source) -> int:
+    """Of the harmonics that colours get: 0 where the light does not depend on the view, else as asked for, or 2."""
+    if source.lighting is None or not source.lighting.depends_on_view:
+        return 0
+    return VIEW_DEGREE if request.ply.sh_degree is None else request.ply.sh_degree
+
+
+def _flattened(degree: int, source: Source) -> str | None:
+    """What there is to say of a light that the harmonics asked for cannot hold."""
+    if degree >= VIEW_DEGREE or source.lighting is None or not source.lighting.depends_on_view:
+        return None
+    return (
+        f"--sh-degree {degree}: what the headlight and highlights show changes with the view; the file has their mean "
+        f"over directions (--sh-degree {VIEW_DEGREE} holds them)"
+    )
 
 
 def _ply(request: ConvertRequest, source: Source) -> PlyOptions:
@@ -225,6 +254,7 @@ def _ply(request: ConvertRequest, source: Source) -> PlyOptions:
         unit_distance_label=source.unit_label,
         made_for=request.fit.size,
         rule=request.fit.rule,
+        light=None if source.lighting is None else source.lighting.text(),
     )
     return placed(ply, source.volume)
 
@@ -235,7 +265,7 @@ def _write(run: Run, request: ConvertRequest, conversion: Conversion) -> Convers
 
     report = run.report
     assert request.output is not None
-    write_gaussians(run, request.output, conversion.gaussians, conversion.ply, request.overwrite)
+    write_gaussians(run, request.output, conversion.gaussians, conversion.ply, request.overwrite, conversion.normals())
     if request.preview:
         with run.stage("preview"):
             write_png(request.preview, conversion.preview(), request.overwrite)

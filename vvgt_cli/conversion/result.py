@@ -91,7 +91,11 @@ class Result:
             comments=old.comments if comments is None else comments,
         )
         with atomic_write(path, overwrite) as temporary:
-            return write_ply(temporary, self.gaussians, ply)
+            return write_ply(temporary, self.gaussians, ply, self.normals())
+
+    def normals(self) -> np.ndarray | None:
+        """Normals (K, 3) that a file of them has, unit frame; None for zeros."""
+        return None
 
     def render(self, camera: Camera | None = None, *, size: int | None = None, rule: str | None = None) -> np.ndarray:
         """The Gaussians as viewers draw them.
@@ -125,6 +129,17 @@ class Conversion(Result):
 
     source: Source
     scene: Scene
+
+    def normals(self) -> np.ndarray | None:
+        """Directions (K, 3) of the mean gradient around each Gaussian, unit frame; None where nothing is lit."""
+        if self.scene.light is None:
+            return None
+        from vvgt_cli.vbm.lit import mean_normals
+
+        axes = np.linalg.inv(self.source.volume.axes)
+        turned = mean_normals(into_box(self.gaussians, self.source.volume), self.scene) @ axes
+        found: np.ndarray = turned / np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-30)
+        return found
 
     def preview(self, size: int | None = None, views: Sequence[int] = PREVIEW_VIEWS) -> np.ndarray:
         """Volume, splats and eight times their difference, a row a test view, with the way up upwards.

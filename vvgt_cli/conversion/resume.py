@@ -134,6 +134,7 @@ def checkpoint_of(folder: str | None, source: Source, fit: FitOptions, limits: L
         "volume": volume_digest(source.volume),
         "function": digest(source.tf.opacity_nodes, source.tf.color_map),
         "opacity_unit_distance": source.unit_distance,
+        "light": None if source.lighting is None else source.lighting.text(),
         **asdict(fit),
         **asdict(limits),
         "model": read_text(find_model(fit.model) / CARD) if fit.model else None,

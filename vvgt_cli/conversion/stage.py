@@ -34,6 +34,7 @@ class Work:
         run: times stages and tells the console.
         scene: the volume under the function.
         fit, limits: what is asked for.
+        degree: of the harmonics that colours have where the light depends on the view.
         checkpoint: where stages keep what they made; `Checkpoint` of no folder for nowhere.
         ending: seconds that the stages after the present one should take.
         start: the closed form, once it is there, with the pyramid that it was cut from.
@@ -46,6 +47,7 @@ class Work:
     scene: Scene
     fit: FitOptions
     limits: Limits = field(default_factory=Limits)
+    degree: int = 0
     checkpoint: Checkpoint = field(default_factory=Checkpoint)
     ending: float = 0.0
     start: Start | None = None

@@ -15,7 +15,7 @@ RENDERERS = ("cpu", "cuda", "vtk")
 
 
 def view_renderer(
-    renderer: str, scene: Scene, settings: RenderSettings | None = None, *, shade: bool = False
+    renderer: str, scene: Scene, settings: RenderSettings | None = None
 ) -> Callable[[Camera], np.ndarray]:
     """A function from a camera to its view, (height, width, 4) float32, premultiplied RGBA over nothing.
 
@@ -23,19 +23,20 @@ def view_renderer(
 
     Args:
         renderer: ``cpu`` (the numba kernel), ``cuda`` (torch, the same definition) or ``vtk`` (VTK's own picture).
-        scene: the volume under its function.
+        scene: the volume under its function, and its light: ``cuda`` knows of none, ``vtk`` of none that is attenuated.
         settings: step and rays a pixel; VTK takes the step and shoots one ray a pixel.
-        shade: light the volume as VTK does; only ``vtk`` can.
 
     Raises:
-        UsageError: an unknown renderer, ``shade`` with another than ``vtk``, a package that is not installed.
+        UsageError: an unknown renderer, a light that it does not know, a package that is not installed.
         DataError: no CUDA device, or no off-screen OpenGL, on this machine.
     """
     settings = settings or RenderSettings()
     if renderer not in RENDERERS:
         raise UsageError(f"renderer {renderer!r}; expected one of {', '.join(RENDERERS)}")
-    if shade and renderer != "vtk":
-        raise UsageError(f"the {renderer} renderer has no lighting; leave it out, or use the vtk renderer")
+    if scene.light is not None and renderer == "cuda":
+        raise UsageError("the cuda renderer has no lighting; use the cpu renderer, or --light none")
+    if scene.light is not None and renderer == "vtk" and (scene.light.shadows or scene.light.occlusion):
+        raise UsageError("the vtk renderer has neither our shadows nor our ambient occlusion; use the cpu renderer")
     if renderer == "cpu":
         return lambda camera: render_view(scene, camera, settings)
     if renderer == "cuda":
@@ -44,7 +45,7 @@ def view_renderer(
         return cuda.view_renderer(scene, settings)
     from vvgt_cli.dvr import vtk
 
-    return vtk.view_renderer(scene, settings, shade)
+    return vtk.view_renderer(scene, settings)
 
 
 def render_views_with(
@@ -53,14 +54,12 @@ def render_views_with(
     cameras: Sequence[Camera],
     settings: RenderSettings | None = None,
     progress: Callable[[int, int], None] | None = None,
-    *,
-    shade: bool = False,
 ) -> np.ndarray:
     """Views of one size: (n, height, width, 4) float32, premultiplied; arguments and errors as `view_renderer`.
 
     ``progress(done, total)`` is called after each view.
     """
-    draw = view_renderer(renderer, scene, settings, shade=shade)
+    draw = view_renderer(renderer, scene, settings)
     images = []
     for i, camera in enumerate(cameras):
         images.append(draw(camera))

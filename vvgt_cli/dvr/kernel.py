@@ -8,6 +8,8 @@ are vectors (r, g, b, alpha or tau); ``empty`` (bz, by, bx) uint8 is `Scene.empt
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import numba as nb
 import numpy as np
@@ -27,6 +29,7 @@ _x = 0.5 + 0.5 * np.cos((np.arange(8) + 0.5) * math.pi / 8)  # Chebyshev's point
 ABSORBED: tuple[float, ...] = tuple(np.linalg.solve(np.vander(_x, increasing=True), -np.expm1(-_x) / _x).tolist())
 
 U = nb.uint64
+Cast = Callable[..., tuple[float, float, float, float]]
 
 _jit = inlined(fastmath=FLAGS, error_model="numpy", **BORROWED)
 
@@ -125,7 +128,7 @@ def absorbed(depth: float) -> float:
 
 
 @_jit
-def _composite(u0: float, u1: float, dt: float, optics: Optics, light: Quad, trans: float) -> tuple[Quad, float]:
+def composite(u0: float, u1: float, dt: float, optics: Optics, light: Quad, trans: float) -> tuple[Quad, float]:
     """``light`` (r, g, b, alpha) and ``trans`` behind a segment of length dt; the coordinate goes from u0 to u1."""
     segment = scale(dt, _mean(u0, u1, optics))
     depth = max(lane(segment, 3), 0.0)
@@ -144,7 +147,7 @@ def _composite(u0: float, u1: float, dt: float, optics: Optics, light: Quad, tra
 
 
 @_jit
-def _inverse(d: float) -> float:
+def inverse(d: float) -> float:
     """1 / d, or so large for d = 0 that a face across that axis is never reached."""
     return 1.0 / d if d != 0.0 else 1e300
 
@@ -153,7 +156,7 @@ def _inverse(d: float) -> float:
 def _exit(
     px: float, py: float, pz: float, ix: float, iy: float, iz: float, reach: int, bi: int, bj: int, bk: int
 ) -> float:
-    """Ray parameter at which the cube of bricks within ``reach`` of (bi, bj, bk) ends; ix, iy, iz: `_inverse`."""
+    """Ray parameter at which the cube of bricks within ``reach`` of (bi, bj, bk) ends; ix, iy, iz: `inverse`."""
     x = (bi + reach if ix > 0.0 else bi - reach + 1) * BRICK
     y = (bj + reach if iy > 0.0 else bj - reach + 1) * BRICK
     z = (bk + reach if iz > 0.0 else bk - reach + 1) * BRICK
@@ -165,7 +168,7 @@ def leap(
     px: float, py: float, pz: float, dx: float, dy: float, dz: float, reach: int, bi: int, bj: int, bk: int
 ) -> float:
     """Ray parameter at which the empty cube of bricks around (bi, bj, bk) ends, from the ray's origin p."""
-    return _exit(px, py, pz, _inverse(dx), _inverse(dy), _inverse(dz), reach, bi, bj, bk)
+    return _exit(px, py, pz, inverse(dx), inverse(dy), inverse(dz), reach, bi, bj, bk)
 
 
 @_jit
@@ -175,7 +178,7 @@ def _brick(p: float, d: float, t: float, n: int) -> int:
 
 
 @_jit
-def _skip(
+def skip(
     shape: tuple[int, int, int], empty: np.ndarray, px: float, py: float, pz: float, dx: float, dy: float, dz: float,
     ix: float, iy: float, iz: float, t0: float, dt: float, per_step: float, count: int, i: int,
 ) -> int:  # fmt: skip
@@ -208,7 +211,7 @@ def _skip(
 
 
 @_jit
-def _any_light(run: Run, u0: float, dark: np.ndarray) -> bool:
+def any_light(run: Run, u0: float, dark: np.ndarray) -> bool:
     """Whether some segment of a run (RUN,) that comes from u0 (-1: none) may have extinction."""
     lowest: float
     highest: float
@@ -220,85 +223,95 @@ def _any_light(run: Run, u0: float, dark: np.ndarray) -> bool:
 
 @_jit
 def cast(
-    voxels: Voxels, optics: Optics, empty: np.ndarray, px: float, py: float, pz: float, dx: float, dy: float, dz: float,
-    step: float,
+    voxels: Voxels, optics: Optics, empty: np.ndarray, light: None, px: float, py: float, pz: float, dx: float,
+    dy: float, dz: float, step: float,
 ) -> tuple[float, float, float, float]:  # fmt: skip
-    """Premultiplied (r, g, b, alpha) along a ray; ``step`` is the sampling distance in voxels along it."""
+    """Premultiplied (r, g, b, alpha) along a ray; ``step`` is the sampling distance in voxels, ``light`` None."""
     nz, ny, nx = voxels.values.shape
     run = stack_run()
-    light, trans = zeros4(), 1.0
+    seen, trans = zeros4(), 1.0
     t0, t1 = box_span(px, py, pz, dx, dy, dz, nx, ny, nz)
     if not t1 > t0:
         return 0.0, 0.0, 0.0, 0.0
     count = max(math.ceil((t1 - t0) * math.sqrt(dx * dx + dy * dy + dz * dz) / step), 1)
     dt = (t1 - t0) / count
     opaque = OPAQUE * min(step * step, 1.0)
-    ix, iy, iz, per_step = _inverse(dx), _inverse(dy), _inverse(dz), 1.0 / dt
+    ix, iy, iz, per_step = inverse(dx), inverse(dy), inverse(dz), 1.0 / dt
     u0 = -1.0  # -1: no sample there, or not finite
     i = 0
     while True:
-        start = _skip(voxels.values.shape, empty, px, py, pz, dx, dy, dz, ix, iy, iz, t0, dt, per_step, count, i)
+        start = skip(voxels.values.shape, empty, px, py, pz, dx, dy, dz, ix, iy, iz, t0, dt, per_step, count, i)
         if start > count:
-            return lane(light, 0), lane(light, 1), lane(light, 2), 1.0 - trans
+            return lane(seen, 0), lane(seen, 1), lane(seen, 2), 1.0 - trans
         if start > i:
             u0, i = -1.0, start
         t = t0 + i * dt
         sample_run(voxels, px + t * dx, py + t * dy, pz + t * dz, dx * dt, dy * dt, dz * dt, optics, run)
-        if _any_light(run, u0, optics.dark):
+        if any_light(run, u0, optics.dark):
             for n in range(min(RUN, count + 1 - i)):
                 u1 = run[n]
                 first = min(u0, u1)
                 if first >= 0.0 and max(u0, u1) > optics.dark[U(int(first))]:
-                    light, trans = _composite(u0, u1, dt, optics, light, trans)
+                    seen, trans = composite(u0, u1, dt, optics, seen, trans)
                     if trans < opaque:
-                        return lane(light, 0), lane(light, 1), lane(light, 2), 1.0 - trans
+                        return lane(seen, 0), lane(seen, 1), lane(seen, 2), 1.0 - trans
                 u0 = u1
         u0 = run[RUN - 1]
         i += RUN
         if i > count:
-            return lane(light, 0), lane(light, 1), lane(light, 2), 1.0 - trans
+            return lane(seen, 0), lane(seen, 1), lane(seen, 2), 1.0 - trans
 
 
-@_jit
-def _pixel(
-    voxels: Voxels, optics: Optics, empty: np.ndarray, eye: np.ndarray, basis: np.ndarray, lens: np.ndarray,
-    step: float, col: int, row: int, offsets: np.ndarray,
-) -> tuple[float, float, float, float]:  # fmt: skip
-    """Sums (r, g, b, alpha) over the rays through the points ``offsets`` (n, 2: right, down) from a pixel's centre.
+def tiles_of(cast: Cast) -> Callable[..., None]:
+    """The loop over the pixels of a tile whose rays ``cast`` follows, `cast` or one with its arguments."""
 
-    Arguments as of `render_tiles`; the pixel is (``col``, ``row``).
-    """
-    acc0 = acc1 = acc2 = acc3 = 0.0
-    for ray in range(len(offsets)):
-        a = (col + 0.5 + offsets[U(ray), 0] - lens[2]) * lens[0]
-        b = (row + 0.5 + offsets[U(ray), 1] - lens[3]) * lens[1]
-        norm = 1.0 / math.sqrt(a * a + b * b + 1.0)
-        dx = (basis[0, 0] * a + basis[1, 0] * b + basis[2, 0]) * norm
-        dy = (basis[0, 1] * a + basis[1, 1] * b + basis[2, 1]) * norm
-        dz = (basis[0, 2] * a + basis[1, 2] * b + basis[2, 2]) * norm
-        red, green, blue, alpha = cast(voxels, optics, empty, eye[0], eye[1], eye[2], dx, dy, dz, step)
-        acc0, acc1, acc2, acc3 = acc0 + red, acc1 + green, acc2 + blue, acc3 + alpha
-    return acc0, acc1, acc2, acc3
+    @_jit
+    def pixel_sum(
+        voxels: Voxels, optics: Optics, empty: np.ndarray, light: Any, eye: np.ndarray, basis: np.ndarray,
+        lens: np.ndarray, step: float, col: int, row: int, offsets: np.ndarray,
+    ) -> tuple[float, float, float, float]:  # fmt: skip
+        """Sums (r, g, b, alpha) over the rays through the points ``offsets`` (n, 2: right, down) from a pixel's centre.
+
+        Arguments as of `render_tiles`; the pixel is (``col``, ``row``).
+        """
+        acc0 = acc1 = acc2 = acc3 = 0.0
+        for ray in range(len(offsets)):
+            a = (col + 0.5 + offsets[U(ray), 0] - lens[2]) * lens[0]
+            b = (row + 0.5 + offsets[U(ray), 1] - lens[3]) * lens[1]
+            norm = 1.0 / math.sqrt(a * a + b * b + 1.0)
+            dx = (basis[0, 0] * a + basis[1, 0] * b + basis[2, 0]) * norm
+            dy = (basis[0, 1] * a + basis[1, 1] * b + basis[2, 1]) * norm
+            dz = (basis[0, 2] * a + basis[1, 2] * b + basis[2, 2]) * norm
+            red, green, blue, alpha = cast(voxels, optics, empty, light, eye[0], eye[1], eye[2], dx, dy, dz, step)
+            acc0, acc1, acc2, acc3 = acc0 + red, acc1 + green, acc2 + blue, acc3 + alpha
+        return acc0, acc1, acc2, acc3
+
+    @_jit
+    def tile(
+        voxels: Voxels, optics: Optics, empty: np.ndarray, light: Any, eye: np.ndarray, basis: np.ndarray,
+        lens: np.ndarray, step: float, top: int, left: int, offsets: np.ndarray, mask: np.ndarray, known: int,
+        out: np.ndarray,
+    ) -> None:  # fmt: skip
+        """Pixels of the tile from (``left``, ``top``) on; arguments as of `render_tiles`."""
+        height, width = out.shape[:2]
+        share = 1.0 / (known + len(offsets))
+        for line in range(top, min(top + TILE, height)):
+            for col in range(left, min(left + TILE, width)):
+                if not mask[line, col]:
+                    continue
+                red, green, blue, alpha = pixel_sum(
+                    voxels, optics, empty, light, eye, basis, lens, step, col, line, offsets
+                )  # fmt: skip
+                pixel = out[line, col]
+                if known > 0:
+                    red, green, blue = red + known * pixel[0], green + known * pixel[1], blue + known * pixel[2]
+                    alpha += known * pixel[3]
+                pixel[0], pixel[1], pixel[2], pixel[3] = red * share, green * share, blue * share, alpha * share
+
+    return tile
 
 
-@_jit
-def _tile(
-    voxels: Voxels, optics: Optics, empty: np.ndarray, eye: np.ndarray, basis: np.ndarray, lens: np.ndarray,
-    step: float, top: int, left: int, offsets: np.ndarray, mask: np.ndarray, known: int, out: np.ndarray,
-) -> None:  # fmt: skip
-    """Pixels of the tile from (``left``, ``top``) on; arguments as of `render_tiles`."""
-    height, width = out.shape[:2]
-    share = 1.0 / (known + len(offsets))
-    for line in range(top, min(top + TILE, height)):
-        for col in range(left, min(left + TILE, width)):
-            if not mask[line, col]:
-                continue
-            red, green, blue, alpha = _pixel(voxels, optics, empty, eye, basis, lens, step, col, line, offsets)
-            pixel = out[line, col]
-            if known > 0:
-                red, green, blue = red + known * pixel[0], green + known * pixel[1], blue + known * pixel[2]
-                alpha += known * pixel[3]
-            pixel[0], pixel[1], pixel[2], pixel[3] = red * share, green * share, blue * share, alpha * share
+_tile = tiles_of(cast)
 
 
 @kernel(
@@ -322,4 +335,4 @@ def render_tiles(
     across = (out.shape[1] + TILE - 1) // TILE
     for index in nb.prange(len(order)):
         top, left = order[index] // across * TILE, order[index] % across * TILE
-        _tile(voxels, optics, empty, eye, basis, lens, step, top, left, offsets, mask, known, out)
+        _tile(voxels, optics, empty, None, eye, basis, lens, step, top, left, offsets, mask, known, out)

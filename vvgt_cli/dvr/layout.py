@@ -1,4 +1,4 @@
-"""What the ray caster's kernels read: a volume's values, the optics, the bricks of the empty-space map."""
+"""What the ray caster's kernels read: a volume's values, the optics, the light, the bricks of the empty-space map."""
 
 from __future__ import annotations
 
@@ -64,5 +64,33 @@ class Optics(NamedTuple):
     dark: np.ndarray
 
 
+class Light(NamedTuple):
+    """What falls on a scene, in its box frame (docs/light.md).
+
+    Attributes:
+        ambient, diffuse, specular, power: coefficients; ``power`` is of the highlight.
+        head: 1 with a light at the eye, else 0.
+        directions: (n, 3) float64 unit vectors towards lights at infinity, (x, y, z).
+        shade: (m, cz, cy, cx) float32 in [0, 1] at the centres of cubes of voxels: the transmittance towards each
+            light where there are shadows (then m >= n), and last how open each place is where there is occlusion.
+        shadows, occlusion: 1 where ``shade`` has them, else 0.
+        inv_cell: cells of ``shade`` a voxel.
+        edge: (3,) float64 voxel edges, unit-frame lengths, (x, y, z).
+    """
+
+    ambient: float
+    diffuse: float
+    specular: float
+    power: float
+    head: int
+    directions: np.ndarray
+    shade: np.ndarray
+    shadows: int
+    occlusion: int
+    inv_cell: float
+    edge: np.ndarray
+
+
 # Types of the fields, for `jit.decorators.kernel`.
 TUPLES: dict[type, str] = {Voxels: "V", Optics: "f8 f8 f8:2 f8:2 f8:1"}
+LIT: dict[type, str] = {**TUPLES, Light: "f8 f8 f8 f8 i8 f8:2 f4:4 i8 i8 f8 f8:1"}

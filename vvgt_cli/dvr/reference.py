@@ -1,7 +1,7 @@
 """The float64 twin of the ray caster: every ray at one small step, optics straight from the transfer function.
 
 Per segment of length ds, with the scalar s at its middle (Max 1995, eq. 8, by the midpoint rule; conventions: Optics):
-``alpha = 1 - exp(-tau(s) ds)``, ``C += T alpha c(s)``, ``T *= 1 - alpha``.
+``alpha = 1 - exp(-tau(s) ds)``, ``C += T alpha c(s)``, ``T *= 1 - alpha``. Under light c is shaded (docs/light.md).
 """
 
 from __future__ import annotations
@@ -43,6 +43,63 @@ def optics(scene: Scene, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.where(known, tau, 0.0), scene.tf.color(clean)
 
 
+def normals(scene: Scene, points: np.ndarray) -> np.ndarray:
+    """Directions (n, 3) of the gradient, box frame, at voxel coordinates (n, 3); zeros where there is none.
+
+    Central differences of stored voxels (clamped at the edges), interpolated trilinearly.
+    """
+    top = np.array(scene.volume.dims) - 1
+    points = np.clip(points, 0, top)
+    low = np.floor(points).astype(np.int64)
+    fraction = points - low
+    gradient = np.zeros((len(points), 3))
+    for corner in np.ndindex(2, 2, 2):
+        at = np.minimum(low + corner, top)
+        weight = np.prod(np.where(corner, fraction, 1 - fraction), axis=1)
+        for axis, unit in enumerate(np.eye(3, dtype=np.int64)):
+            # beyond the last voxel the interpolation's corner stays where it is, its neighbours move on
+            ends = [np.clip(low + corner + sign * unit, 0, top) for sign in (1, -1)]
+            ends = [np.where(unit, end, at) for end in ends]
+            after, before = (scene.values[e[:, 2], e[:, 1], e[:, 0]].astype(np.float64) for e in ends)
+            with np.errstate(invalid="ignore"):
+                gradient[:, axis] += weight * (after - before) / scene.step[axis]
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        length = np.linalg.norm(gradient, axis=1, keepdims=True)
+        return np.where((length > 0) & (length < np.inf), gradient / length, 0.0)
+
+
+def grid_values(grid: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Values (n,) of a grid (nz, ny, nx) at its coordinates (n, 3), (x, y, z), clamped."""
+    top = np.array(grid.shape[::-1]) - 1
+    points = np.clip(points, 0, top)
+    low = np.floor(points).astype(np.int64)
+    total = np.zeros(len(points))
+    for corner in np.ndindex(2, 2, 2):
+        x, y, z = np.minimum(low + corner, top).T
+        total += np.prod(np.where(corner, points - low, 1 - (points - low)), axis=1) * grid[z, y, x]
+    return total
+
+
+def shade(scene: Scene, points: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(factor of the colour (n,), white to add (n,)) at voxel coordinates (n, 3), seen along unit vectors (n, 3)."""
+    light = scene.light
+    assert light is not None
+    at = (points + 0.5) * light.inv_cell - 0.5
+    normal = normals(scene, points)
+    known = normal.any(axis=1)
+    diffuse, white = np.zeros(len(points)), np.zeros(len(points))
+    lights = [(d, grid_values(light.shade[k], at) if light.shadows else 1.0) for k, d in enumerate(light.directions)]
+    for toward, part in [*lights, *([(-directions, 1.0)] if light.head else [])]:
+        half = toward - directions
+        length = np.linalg.norm(half, axis=1)
+        half = half / np.where(length > 1e-9, length, np.inf)[:, None]
+        diffuse += part * np.abs((normal * toward).sum(axis=1))
+        white += part * np.where(length > 1e-9, np.abs((normal * half).sum(axis=1)) ** light.power, 0)
+    open_ = grid_values(light.shade[-1], at) if light.occlusion else 1.0
+    factor = open_ * (light.ambient + light.diffuse * np.where(known, diffuse, 0))
+    return factor, light.specular * np.where(known, white, 0)
+
+
 def rays(camera: Camera, samples: int) -> tuple[np.ndarray, np.ndarray]:
     """Origin (3,) and unit directions (height, width, samples^2, 3) in the unit frame."""
     offset = (np.arange(samples) + 0.5) / samples
@@ -71,6 +128,9 @@ def march(scene: Scene, origin: np.ndarray, directions: np.ndarray, step: float)
         points = (origin + t[:, None] * directions + scene.half) / scene.step - 0.5
         tau, rgb = optics(scene, trilinear(scene.volume, points))
         alpha = -np.expm1(-tau * ds)
+        if scene.light is not None:
+            factor, white = shade(scene, points, directions)
+            rgb = np.minimum(factor[:, None] * rgb + white[:, None], 1)
         color += (trans * alpha)[:, None] * rgb
         trans = trans * (1 - alpha)
     return np.concatenate([color, 1 - trans[:, None]], axis=1)

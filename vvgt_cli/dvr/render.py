@@ -119,6 +119,7 @@ def render_view(
 ) -> np.ndarray:
     """One view: (height, width, 4) float32, premultiplied RGBA over nothing; with ``blocks`` zero elsewhere."""
     from vvgt_cli.dvr.kernel import render_tiles
+    from vvgt_cli.dvr.lit import render_lit_tiles
 
     settings = settings or RenderSettings()
     if _thinner_than_a_pixel(scene, camera):
@@ -129,9 +130,11 @@ def render_view(
     order = tile_order(camera.height, camera.width, blocks)
 
     def cast(offsets: np.ndarray, mask: np.ndarray, known: int) -> None:
-        render_tiles(
-            voxels, optics, scene.empty, eye, basis, lens, float(settings.step), order, offsets, mask, known, out
-        )
+        where = eye, basis, lens, float(settings.step), order, offsets, mask, known, out
+        if scene.light is None:
+            render_tiles(voxels, optics, scene.empty, *where)
+        else:
+            render_lit_tiles(voxels, optics, scene.empty, scene.light, *where)
 
     cast_tiers(settings, out, cast, blocks)
     return out

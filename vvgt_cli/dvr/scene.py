@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from vvgt_cli.dvr.layout import BRICK as BRICK  # for pipeline.plan, until it asks layout
-from vvgt_cli.dvr.layout import Optics, Voxels, pairs_fit
+from vvgt_cli.dvr.layout import Light, Optics, Voxels, pairs_fit
+from vvgt_cli.transfer.lighting import Lighting
 from vvgt_cli.transfer.tables import OpticalTables, build_tables
 from vvgt_cli.transfer.types import TransferFunctionLike
 from vvgt_cli.volume import Volume
@@ -48,6 +49,8 @@ class Scene:
         tables: optics over stored values, extinction per unit-frame length.
         empty: (bz, by, bx) uint8 Chebyshev distance, in bricks, to the nearest brick with extinction (0: has some).
         half, step: (3,) float64 half extents and voxel edges in the unit frame, (x, y, z).
+        lighting: in world axes; ``light`` the same as kernels take it, with its shadows; None: colours are the
+            function's.
     """
 
     volume: Volume
@@ -58,6 +61,8 @@ class Scene:
     empty: np.ndarray
     half: np.ndarray
     step: np.ndarray
+    lighting: Lighting | None = None
+    light: Light | None = None
 
     @property
     def voxels(self) -> Voxels:
@@ -79,6 +84,7 @@ class Scene:
         value_range: tuple[float, float] | None = None,
         bins: int | None = None,
         layout: Layout | None = None,
+        lighting: Lighting | None = None,
     ) -> Scene:
         """Prepare ``volume`` under ``tf``; ``value_range`` (data values) and ``layout`` are taken as they are."""
         from vvgt_cli.dvr import bricks
@@ -102,7 +108,14 @@ class Scene:
             bins=bins,
         )
         empty = bricks.empty_distance(ranges, tables)
-        return cls(volume, tf, unit_distance, values, tables, empty, np.array(frame.half), np.array(frame.step))
+        scene = cls(volume, tf, unit_distance, values, tables, empty, np.array(frame.half), np.array(frame.step))
+        return scene if lighting is None else scene.lit(lighting)
+
+    def lit(self, lighting: Lighting) -> Scene:
+        """The same scene under light; shadows and occlusion are marched here."""
+        from vvgt_cli.dvr.light import lights_of
+
+        return replace(self, lighting=lighting, light=lights_of(self, lighting))
 
 
 def kernel_values(volume: Volume) -> tuple[np.ndarray, float, float]:

@@ -1,4 +1,4 @@
-"""VTK's GPU volume mapper, off screen: for those who want VTK's picture, its lighting included.
+"""VTK's GPU volume mapper, off screen: for those who want VTK's picture, lit or not.
 
 Classification after sampling, front to back, 8 bits a channel (`vtkGPUVolumeRayCastMapper`). VTK's frame buffer holds
 premultiplied colour and alpha over a transparent background, so alpha is read from it and nothing is divided.
@@ -19,6 +19,7 @@ from vvgt_cli.dvr.scene import Scene
 from vvgt_cli.errors import DataError
 
 NODES = 4096  # of the functions handed to VTK: it tabulates them anyway
+REFLECTED = 0.25  # of the power: of the angle to the reflected ray, twice that to the half vector
 NEAR = 1e-3  # unit-frame lengths: an eye inside the volume sees what is around it
 MODULES = ("vtkRenderingOpenGL2", "vtkRenderingVolumeOpenGL2")  # their import registers what the classes below become
 PROBE = (
@@ -43,7 +44,7 @@ def require_opengl() -> None:
         )
 
 
-def view_renderer(scene: Scene, settings: RenderSettings, shade: bool = False) -> Callable[[Camera], np.ndarray]:
+def view_renderer(scene: Scene, settings: RenderSettings) -> Callable[[Camera], np.ndarray]:
     """A function from a camera to VTK's view, (height, width, 4) float32, premultiplied RGBA in steps of 1/255.
 
     One ray a pixel at ``settings.step`` voxels of the mean edge. The volume is padded by its edge voxels and cropped to
@@ -70,11 +71,12 @@ def view_renderer(scene: Scene, settings: RenderSettings, shade: bool = False) -
     mapper.SetCroppingRegionPlanes(*(s * h for h in scene.half for s in (-1, 1)))
     volume = vtkVolume()
     volume.SetMapper(mapper)
-    volume.SetProperty(volume_property(scene, shade))
+    volume.SetProperty(volume_property(scene))
     renderer = vtkRenderer()
     renderer.SetBackground(0, 0, 0)
     renderer.SetBackgroundAlpha(0)
     renderer.AddVolume(volume)
+    add_lights(renderer, scene)
     window = vtkRenderWindow()
     window.SetOffScreenRendering(True)
     window.SetAlphaBitPlanes(True)
@@ -106,8 +108,32 @@ def image_data(scene: Scene, padded: bool) -> Any:
     return image
 
 
-def volume_property(scene: Scene, shade: bool = False) -> Any:
-    """vtkVolumeProperty over stored values with the scene's function, unit distance and linear interpolation."""
+def add_lights(renderer: Any, scene: Scene) -> None:
+    """The scene's lights where some are at infinity; else VTK makes its head-light, the only one that it knows well.
+
+    With others its mapper takes the ambient colour from the lights, not from the volume: there is none (docs/light.md).
+    """
+    from vtkmodules.vtkRenderingCore import vtkLight
+
+    if scene.light is None or not len(scene.light.directions):
+        return
+    renderer.SetAutomaticLightCreation(False)
+    for direction in [*scene.light.directions, *([None] if scene.light.head else [])]:
+        light = vtkLight()
+        if direction is None:
+            light.SetLightTypeToHeadlight()
+        else:
+            light.SetLightTypeToSceneLight()
+            light.SetFocalPoint(0, 0, 0)
+            light.SetPosition(*direction)
+        renderer.AddLight(light)
+
+
+def volume_property(scene: Scene, highlight: float = REFLECTED) -> Any:
+    """vtkVolumeProperty over stored values: the scene's function, unit distance and shading, linear interpolation.
+
+    ``highlight``: what the power of highlights is multiplied with.
+    """
     from vtkmodules.vtkCommonDataModel import vtkPiecewiseFunction
     from vtkmodules.vtkRenderingCore import vtkColorTransferFunction, vtkVolumeProperty
 
@@ -129,7 +155,12 @@ def volume_property(scene: Scene, shade: bool = False) -> Any:
     made.SetColor(color)
     made.SetScalarOpacityUnitDistance(length)
     made.SetInterpolationTypeToLinear()
-    made.SetShade(shade)
+    if scene.light is not None:
+        made.SetShade(True)
+        made.SetAmbient(scene.light.ambient)
+        made.SetDiffuse(scene.light.diffuse)
+        made.SetSpecular(scene.light.specular)
+        made.SetSpecularPower(highlight * scene.light.power)
     return made
 
 

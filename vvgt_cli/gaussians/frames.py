@@ -104,7 +104,7 @@ def transform(gaussians: Gaussians, matrix: np.ndarray) -> Gaussians:
         quaternions = _quaternion_product(tuple(turn_by.tolist()), quaternions)
     else:
         largest = log_scales.max(axis=1, keepdims=True)
-        factors = matrix @ _rotations(quaternions) * np.exp(log_scales - largest)[:, None, :]
+        factors = matrix @ rotations(quaternions) * np.exp(log_scales - largest)[:, None, :]
         axes, sigma, _ = np.linalg.svd(factors)
         quaternions = _quaternions(axes * np.sign(np.linalg.det(axes))[:, None, None])
         log_scales = np.log(np.maximum(sigma, np.finfo(np.float64).tiny)) + largest
@@ -117,7 +117,7 @@ def transform(gaussians: Gaussians, matrix: np.ndarray) -> Gaussians:
     )
 
 
-def _rotations(quaternions: np.ndarray) -> np.ndarray:
+def rotations(quaternions: np.ndarray) -> np.ndarray:
     """(K, 3, 3) of quaternions (K, 4) of any norm, (w, x, y, z)."""
     w, x, y, z = (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).T
     rows = [

@@ -11,6 +11,7 @@ import numpy as np
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians.frames import up_matrix
 from vvgt_cli.gaussians.types import HARMONICS
+from vvgt_cli.transfer.lighting import Lighting, parse_lighting
 
 REST_COUNTS = {3 * terms: degree for degree, terms in HARMONICS.items()}  # f_rest properties: 0, 9, 24, 45
 REQUIRED = (
@@ -40,6 +41,7 @@ class PlyHeader:
         made_for, rule: pixels of the screen that it is made for, and the rule by which it is drawn; None: not recorded.
         space: anatomical space of the world, "RAS", "LPS" or "none"; None where no comment says.
         affine: 3 x 4 row-major, voxel index (i, j, k, 1) of the volume to world position.
+        light: what fell on the scene, None where no comment says.
         version: of the vvgt that wrote it, None for other programs.
     """
 
@@ -58,6 +60,7 @@ class PlyHeader:
     rule: str | None = None
     space: str | None = None
     affine: tuple[float, ...] | None = None
+    light: Lighting | None = None
     version: str | None = None
 
 
@@ -197,6 +200,8 @@ def _one_comment(words: list[str]) -> dict[str, Any]:
         if words[1:] not in (["RAS"], ["LPS"], ["none"]):
             raise ValueError(words)
         return {"space": words[1]}
+    if words[0] == "light":
+        return {"light": parse_lighting(" ".join(words[1:]))}
     if words[0] == "affine":
         affine = _finite(words[1:])
         axes = np.reshape(affine, (3, 4))[:, :3]  # another count: ValueError

@@ -41,6 +41,7 @@ class PlyOptions:
         made_for, rule: pixels of the screen that they are made for, and name of the rule by which they are drawn.
         space: anatomical space of the world, "RAS", "LPS" or "none", recorded in the comments with the affine.
         affine: 3 x 4 row-major, voxel index to world, recorded in the comments.
+        light: what fell on the scene, as `vvgt_cli.transfer.lighting.Lighting.text` has it, recorded in the comments.
     """
 
     frame: str = "unit"
@@ -54,6 +55,7 @@ class PlyOptions:
     rule: str | None = None
     space: str = "none"
     affine: tuple[float, ...] | None = None
+    light: str | None = None
 
     def __post_init__(self) -> None:
         up_matrix(self.up)
@@ -107,13 +109,22 @@ def _comments(options: PlyOptions) -> list[str]:
         lines.append(f"comment vvgt unit-distance {float(options.unit_distance)!r} {options.unit_distance_label}")
     if options.made_for is not None:
         lines.append(f"comment vvgt size {options.made_for} rule {options.rule or 'inria'}")
+    if options.light is not None:
+        lines.append(f"comment vvgt light {options.light}")
     if options.rule == "compensated":
         lines.append(MIP)
     return lines
 
 
-def write_ply(target: str | Path | BinaryIO, gaussians: Gaussians, options: PlyOptions | None = None) -> int:
+def write_ply(
+    target: str | Path | BinaryIO,
+    gaussians: Gaussians,
+    options: PlyOptions | None = None,
+    normals: np.ndarray | None = None,
+) -> int:
     """Write ``gaussians`` (unit frame) to a path or a binary stream; returns the bytes written.
+
+    ``normals`` (K, 3), unit frame; None: zeros.
 
     A path is written as it is given: callers that must not leave a partial file pass the temporary name of
     `vvgt_cli.files.atomic_write`. The bytes depend on the arguments and the version only.
@@ -138,6 +149,8 @@ def write_ply(target: str | Path | BinaryIO, gaussians: Gaussians, options: PlyO
     names = property_names(placed.degree)
     rows = np.zeros((len(placed), len(names)), dtype="<f4")  # (K, properties)
     rows[:, 0:3] = placed.means
+    if normals is not None:
+        rows[:, 3:6] = normals @ up_matrix(options.up).T
     rows[:, 6:9] = f_dc
     if placed.harmonics is not None:
         rows[:, 9:-8] = placed.harmonics.transpose(0, 2, 1).reshape(len(placed), -1)
@@ -256,6 +269,7 @@ def describe(gaussians: Gaussians, header: PlyHeader) -> dict[str, object]:
         "unit_distance": header.unit_distance,
         "unit_distance_label": header.unit_distance_label,
         "version": header.version,
+        **({} if header.light is None else {"light": header.light.text()}),
     }
     if len(gaussians):
         sigma = np.exp(np.clip(gaussians.log_scales.astype(np.float64), -700, 700))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 RAYCAST = ("vvgt_cli.dvr.kernel:render_tiles", "vvgt_cli.dvr.bricks:_ranges", "vvgt_cli.dvr.contrast:_contrast")
+LIGHT = ("vvgt_cli.dvr.lit:render_lit_tiles", "vvgt_cli.vbm.lit:_shade", "vvgt_cli.dvr.shadows:mean_transmittance")
 DRAW = ("vvgt_cli.splat.kernel:tile_lists", "vvgt_cli.splat.tiles:blend", "vvgt_cli.splat.kernel:project")
 CLOSED_FORM = (
     "vvgt_cli.vbm.visibility:march",
@@ -32,7 +33,14 @@ CONVERT = (RAYCAST[0], REFINE[0], *CLOSED_FORM, *DRAW, *REFINE[1:], *RAYCAST[1:]
 OPTIMIZE = (*REFINE, *DRAW)
 EVALUATE = (*RAYCAST, *DRAW)
 INFER = (*DRAW, SLOPES[0], "vvgt_cli.splat.backward:standard", *BACK_PROJECT)
-ALL = (*CONVERT, *INFER[len(DRAW) + 1 :], *HARMONICS, *DEPOSITS, "vvgt_cli.volume.slc_kernel:decode_plane")
+ALL = (*CONVERT, *LIGHT, *INFER[len(DRAW) + 1 :], *HARMONICS, *DEPOSITS, "vvgt_cli.volume.slc_kernel:decode_plane")
+
+
+def for_light(names: tuple[str, ...], attenuated: bool) -> tuple[str, ...]:
+    """Kernels of a command whose scene is lit, ``attenuated`` by shadows or occlusion: others follow the rays."""
+    rays = tuple(LIGHT[0] if name == RAYCAST[0] else name for name in names)
+    shaded = LIGHT[1:2] if CLOSED_FORM[0] in names else ()
+    return (*rays, *shaded, *(LIGHT[2:] if attenuated else ()))
 
 
 def for_degree(names: tuple[str, ...], degree: int) -> tuple[str, ...]:

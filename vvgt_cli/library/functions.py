@@ -11,6 +11,7 @@ from vvgt_cli.conversion.result import Conversion, Result
 from vvgt_cli.gaussians import Gaussians, PlyHeader
 from vvgt_cli.library.inputs import (
     FunctionLike,
+    LightLike,
     PathLike,
     Reading,
     VolumeLike,
@@ -43,6 +44,7 @@ def convert(
     max_megabytes: float | None = None,
     tf_range: str | Sequence[float] = "data",
     opacity_unit_distance: str | float | None = None,
+    light: LightLike = None,
     all_views: bool = False,
     progress: bool = False,
     **reading: Unpack[Reading],
@@ -65,6 +67,8 @@ def convert(
         target_psnr, time_budget, max_megabytes: dB that are enough, seconds of the run, 10^6 bytes of the file.
         tf_range: "data", "rescale" or (lo, hi): where the function's nodes lie.
         opacity_unit_distance: world length that opacity is per, "paraview" or "mean-spacing".
+        light: "none", "headlight", a direction (x, y, z) or its name, several of these, or `LightOptions`; None: what
+            the function's file says.
         all_views: score on all ten test views, by SSIM and FLIP too, as ``--report`` does.
         progress: lines and bars on standard error.
         **reading: how to read the volume: see `Reading`.
@@ -81,7 +85,7 @@ def convert(
 
     fit = FitOptions(max_gaussians, size, init, rule, seed, steps, model)
     limits = Limits(target_psnr, time_budget, max_megabytes)
-    source = source_of(volume, tf, tf_range, opacity_unit_distance, reading)
+    source = source_of(volume, tf, tf_range, opacity_unit_distance, reading, light)
     return in_memory(source, fit, limits, all_views, console_of(progress))
 
 
@@ -121,6 +125,7 @@ def render_views(
     step: float = 0.5,
     tf_range: str | Sequence[float] = "data",
     opacity_unit_distance: str | float | None = None,
+    light: LightLike = None,
     **reading: Unpack[Reading],
 ) -> tuple[list[Camera], np.ndarray]:
     """Pictures of a volume by our renderer, in memory; ``vvgt render-views`` writes them for trainers.
@@ -131,7 +136,7 @@ def render_views(
     (2, 32, 32, 4)
 
     Args:
-        volume, tf, tf_range, opacity_unit_distance, reading: as of `convert`.
+        volume, tf, tf_range, opacity_unit_distance, light, reading: as of `convert`.
         cameras: in the unit frame, all of one size; or how many of the training views.
         size: pixels along the edge of the training views.
         step: along a ray, in voxels.
@@ -152,7 +157,7 @@ def render_views(
     views = default_views("train", cameras, size=size) if isinstance(cameras, int) else list(cameras)
     if len({(view.width, view.height) for view in views}) != 1:
         raise UsageError(f"{len(views)} cameras of several sizes; expected one or more of one size")
-    source = load(source_of(volume, tf, tf_range, opacity_unit_distance, reading))
+    source = load(source_of(volume, tf, tf_range, opacity_unit_distance, reading, light))
     scene = source.scene()
     draw = drawn_in_box(lambda view: render_view(scene, view, RenderSettings(step=step)), source.volume.axes)
     return views, np.stack([draw(view) for view in views])
@@ -169,6 +174,7 @@ def evaluate(
     seats: bool = True,
     tf_range: str | Sequence[float] = "data",
     opacity_unit_distance: str | float | None = None,
+    light: LightLike = None,
     progress: bool = False,
     **reading: Unpack[Reading],
 ) -> Evaluation:
@@ -176,7 +182,7 @@ def evaluate(
 
     Args:
         ply: path, or what `convert` or `optimize` returned.
-        volume, tf, tf_range, opacity_unit_distance, reading: as of `convert`.
+        volume, tf, tf_range, opacity_unit_distance, light, reading: as of `convert`.
         size, rule: to score at and draw by; None: the file's.
         step: of the reference, in voxels.
         seats: every rule at several sizes and close up, too.
@@ -187,7 +193,7 @@ def evaluate(
     """
     from vvgt_cli.tasks import evaluate as pipeline
 
-    source = source_of(volume, tf, tf_range, opacity_unit_distance, reading)
+    source = source_of(volume, tf, tf_range, opacity_unit_distance, reading, light)
     request = pipeline.EvaluateRequest(ply_of(ply), source, size, rule, step, seats)
     return pipeline.evaluate(request, console_of(progress))
 

@@ -6,6 +6,7 @@ import io
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from numbers import Real
 from typing import Any, BinaryIO, TypedDict
 
 from vvgt_cli.conversion.result import Result
@@ -13,10 +14,12 @@ from vvgt_cli.errors import UsageError
 from vvgt_cli.progress import Console
 from vvgt_cli.runs.source import Opened, SourceRequest
 from vvgt_cli.transfer import TransferFunction
+from vvgt_cli.transfer.lighting import LightOptions
 from vvgt_cli.volume import ReadOptions, Volume
 
 PathLike = str | os.PathLike[str]
 VolumeLike = Any  # a path, a Volume, a Session, an array, an xarray.DataArray, a pyvista (VTK) dataset
+LightLike = LightOptions | str | Sequence[float] | Sequence[str | Sequence[float]] | None
 FunctionLike = PathLike | Mapping[str, Any] | TransferFunction
 
 
@@ -89,6 +92,7 @@ def source_of(
     tf_range: str | Sequence[float],
     opacity_unit_distance: str | float | None,
     reading: Reading,
+    light: LightLike = None,
 ) -> SourceRequest:
     """The volume, read, under a function.
 
@@ -99,7 +103,7 @@ def source_of(
         tf_range = ",".join(repr(float(v)) for v in tf_range)
     distance = None if opacity_unit_distance is None else str(opacity_unit_distance)
     opened = _opened(volume, reading) or volume_of(volume, reading)
-    return SourceRequest(opened, tf=function_of(tf), tf_range=tf_range, unit_distance=distance)
+    return SourceRequest(opened, tf=function_of(tf), tf_range=tf_range, unit_distance=distance, light=light_of(light))
 
 
 def _opened(volume: VolumeLike, reading: Reading) -> Opened | None:
@@ -110,6 +114,18 @@ def _opened(volume: VolumeLike, reading: Reading) -> Opened | None:
     if reading:
         raise UsageError(f"{', '.join(reading)}: a session's volume has been read; leave out {', '.join(reading)}")
     return opened
+
+
+def light_of(light: LightLike) -> LightOptions:
+    """The light that a caller means: options as they are, a name, three numbers, or several of these."""
+    if isinstance(light, LightOptions):
+        return light
+    if light is None or isinstance(light, str):
+        return LightOptions(() if light is None else (light,))
+    parts: list[Any] = list(light)
+    if all(isinstance(part, Real) for part in parts):
+        parts = [parts]
+    return LightOptions(tuple(p if isinstance(p, str) else ",".join(repr(float(v)) for v in p) for p in parts))
 
 
 def ply_of(ply: PathLike | Result) -> str | BinaryIO:

@@ -9,6 +9,8 @@ import tempfile
 from pathlib import Path
 from typing import BinaryIO
 
+import numpy as np
+
 from vvgt_cli.errors import DataError, VvgtError
 from vvgt_cli.files import atomic_write, is_stream
 from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions, in_unit_frame, read_ply, write_ply
@@ -58,46 +60,56 @@ def layout_of(header: PlyHeader) -> PlyOptions:
         rule=header.rule,
         space=header.space or "none",
         affine=header.affine,
+        light=None if header.light is None else header.light.text(),
     )
 
 
-def write_gaussians(run: Run, output: str, gaussians: Gaussians, options: PlyOptions, overwrite: bool) -> None:
-    """The stage that writes a `.ply`, or standard output for "-", and records its size."""
+def write_gaussians(
+    run: Run,
+    output: str,
+    gaussians: Gaussians,
+    options: PlyOptions,
+    overwrite: bool,
+    normals: np.ndarray | None = None,
+) -> None:
+    """The stage that writes a `.ply`, or standard output for "-", and records its size; ``normals`` (K, 3)."""
     report = run.report
     with run.stage("write") as stage:
         if output == STDOUT:
-            report.bytes = write_ply(sys.stdout.buffer, gaussians, options)
+            report.bytes = write_ply(sys.stdout.buffer, gaussians, options, normals)
             sys.stdout.buffer.flush()
         else:
-            report.bytes = _write_file(output, gaussians, options, overwrite)
+            report.bytes = _write_file(output, gaussians, options, overwrite, normals)
         report.gaussians = len(gaussians)
         stage.note = f"{output}: {len(gaussians)} Gaussians, {report.bytes / 1e6:.1f} MB"
 
 
-def _write_file(output: str, gaussians: Gaussians, options: PlyOptions, overwrite: bool) -> int:
+def _write_file(
+    output: str, gaussians: Gaussians, options: PlyOptions, overwrite: bool, normals: np.ndarray | None
+) -> int:
     """Write a `.ply`; where that fails, put it elsewhere and say so: it may have taken hours."""
     if is_stream(output):
         with open(output, "ab") as stream:
-            return write_ply(stream, gaussians, options)
+            return write_ply(stream, gaussians, options, normals)
     try:
         with atomic_write(output, overwrite) as temporary:
-            return write_ply(temporary, gaussians, options)
+            return write_ply(temporary, gaussians, options, normals)
     except VvgtError as error:
         if isinstance(error, DataError) and not isinstance(error.__cause__, OSError):
             raise  # these Gaussians cannot be written anywhere
-        place = _elsewhere(Path(output), gaussians, options)
+        place = _elsewhere(Path(output), gaussians, options, normals)
         if place is None:
             raise
         raise type(error)(f"{error}; what was computed lies in {place}") from error
 
 
-def _elsewhere(output: Path, gaussians: Gaussians, options: PlyOptions) -> Path | None:
+def _elsewhere(output: Path, gaussians: Gaussians, options: PlyOptions, normals: np.ndarray | None) -> Path | None:
     """Write a `.ply` to the temporary folder, else to the working folder; where it is, None where neither takes it."""
     name = f"{output.stem[:80]}.{secrets.token_hex(4)}.ply"
     for find in (tempfile.gettempdir, os.getcwd):
         try:
             with atomic_write(Path(find(), name)) as temporary:
-                write_ply(temporary, gaussians, options)
+                write_ply(temporary, gaussians, options, normals)
             return Path(find(), name)
         except (OSError, VvgtError):
             continue

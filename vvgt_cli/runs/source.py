@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from vvgt_cli.errors import UsageError
+from vvgt_cli.transfer.lighting import Lighting, LightOptions
 from vvgt_cli.volume import ReadOptions, Statistics, Volume
 
 if TYPE_CHECKING:
@@ -51,6 +52,7 @@ class SourceRequest:
         tf_range: "data", "rescale" or "LO,HI".
         unit_distance: a length, "paraview", "mean-spacing", or None: the function's own, else "paraview".
         statistics: what the function's nodes follow from in place of the volume's own: those of the whole series.
+        light: what falls on it; without options what the function's file says, else nothing.
     """
 
     volume: str | Volume | Opened
@@ -59,6 +61,7 @@ class SourceRequest:
     tf_range: str = "data"
     unit_distance: str | None = None
     statistics: Statistics | None = None
+    light: LightOptions = field(default_factory=LightOptions)
 
     @property
     def path(self) -> str:
@@ -81,8 +84,8 @@ class SourceRequest:
 class Source:
     """What was read: the function is visible somewhere in the volume.
 
-    ``unit_distance`` is the world length that opacity refers to, ``unit_label`` how it was chosen; ``layout`` is the
-    volume's, where it is known.
+    ``unit_distance`` is the world length that opacity refers to, ``unit_label`` how it was chosen, ``lighting`` what
+    falls on it, None for nothing; ``layout`` is the volume's, where it is known.
     """
 
     volume: Volume
@@ -90,6 +93,7 @@ class Source:
     tf: TransferFunction
     unit_distance: float
     unit_label: str
+    lighting: Lighting | None = None
     layout: Layout | None = None
 
     def kernel_type(self) -> str:
@@ -103,7 +107,7 @@ class Source:
         from vvgt_cli.dvr import Scene
 
         limits = (self.statistics.lo, self.statistics.hi)
-        return Scene.build(self.volume, self.tf, self.unit_distance, limits, layout=self.layout)
+        return Scene.build(self.volume, self.tf, self.unit_distance, limits, lighting=self.lighting, layout=self.layout)
 
 
 def load(request: SourceRequest) -> Source:
@@ -139,9 +143,10 @@ def load_all(request: SourceRequest, tfs: Sequence[str | TransferFunction | None
     else:
         volume = open_volume(request.volume, request.read) if isinstance(request.volume, str) else request.volume
     unit_distance(request.unit_distance, volume)  # its errors come first
+    lights = [request.light.lighting(None if tf is None else tf.lighting, volume.space) for tf in functions]
     numbers = opened.statistics if opened else statistics(volume)
     sources = []
-    for tf in functions:
+    for tf, lighting in zip(functions, lights, strict=True):
         whole = request.statistics or numbers
         shown = resolve(tf, whole, tf_range) if tf else from_histogram(whole, volume.hounsfield)
         if tf is None and whole.lo == whole.hi:
@@ -152,7 +157,8 @@ def load_all(request: SourceRequest, tfs: Sequence[str | TransferFunction | None
             )
         check_visible(shown, numbers)
         distance, label = unit_distance(request.unit_distance, volume, tf or shown)
-        sources.append(Source(volume, numbers, shown, distance, label, opened.layout if opened else None))
+        layout = opened.layout if opened else None
+        sources.append(Source(volume, numbers, shown, distance, label, lighting, layout))
     return sources
 
 
@@ -163,7 +169,8 @@ def describe_source(source: Source) -> str:
     holes = [f"{n} {what} (transparent)" for n, what in ((numbers.nan_count, "NaN"), (numbers.inf_count, "inf")) if n]
     values = ", ".join([f"values {numbers.lo:g} to {numbers.hi:g}", *holes])
     distance = f"opacity per {source.unit_distance:g} ({source.unit_label})"
-    return f"{volume.name}: {grid} {volume.data.dtype.name}, {values}; {source.tf.name}: {distance}"
+    light = "" if source.lighting is None else f"; light {source.lighting.text()}"
+    return f"{volume.name}: {grid} {volume.data.dtype.name}, {values}; {source.tf.name}: {distance}{light}"
 
 
 def volume_record(source: Source) -> dict[str, Any]:
@@ -190,4 +197,5 @@ def tf_record(source: Source, request: SourceRequest) -> dict[str, Any]:
         "nodes": source.tf.node_range(),
         "unit_distance": source.unit_distance,
         "unit_distance_label": source.unit_label,
+        **({} if source.lighting is None else {"light": source.lighting.text()}),
     }

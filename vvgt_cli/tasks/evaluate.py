@@ -11,7 +11,7 @@ from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.sets import SIZE
 from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians import PlyHeader
-from vvgt_cli.jit.ahead import EVALUATE, for_degree
+from vvgt_cli.jit.ahead import EVALUATE, for_degree, for_light
 from vvgt_cli.progress import Console
 from vvgt_cli.runs.gaussian_files import STDIN, file_rule, open_gaussians
 from vvgt_cli.runs.outputs import Output, check_outputs
@@ -20,6 +20,7 @@ from vvgt_cli.runs.record import ConversionReport, Run, Stage, document
 from vvgt_cli.runs.score import psnr_note, score_test_views
 from vvgt_cli.runs.seats import CLOSE, Seat, score_seats, seat_views, seats_of, zoomed
 from vvgt_cli.runs.source import Source, SourceRequest, describe_source, load, tf_record, volume_record
+from vvgt_cli.transfer.lighting import LightOptions
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
@@ -98,7 +99,14 @@ def _cell(value: Any) -> str:
 
 
 def _load(request: SourceRequest, header: PlyHeader) -> Source:
-    """The source, with the file's own anatomical space and unit distance where none is asked for."""
+    """The source, with the file's own anatomical space, light and unit distance where none is asked for."""
+    asked = request.light
+    source = _load_dark(replace(request, light=LightOptions()), header)
+    preset = source.lighting if header.version is None else header.light
+    return replace(source, lighting=asked.lighting(preset, source.volume.space))
+
+
+def _load_dark(request: SourceRequest, header: PlyHeader) -> Source:
     if request.read.space is None and header.space == "LPS":
         request = replace(request, read=replace(request.read, space="LPS"))
     if request.unit_distance is not None or header.unit_distance is None:
@@ -128,7 +136,10 @@ def evaluate(request: EvaluateRequest, console: Console | None = None) -> Evalua
         stage.note = f"{len(gaussians)} Gaussians; {describe_source(source)}"
     if header.affine is not None and not np.allclose(header.affine, source.volume.affine[:3].ravel(), rtol=1e-6):
         run.console.say(f"{request.ply}: its header's affine is not that of {source.volume.name}: of another volume?")
-    run.compile(for_degree(EVALUATE, gaussians.degree), source.kernel_type())
+    names = for_degree(EVALUATE, gaussians.degree)
+    if source.lighting is not None:
+        names = for_light(names, source.lighting.attenuated)
+    run.compile(names, source.kernel_type())
     with run.stage("scene"):
         scene = source.scene()
     size, rule = request.size or header.made_for or SIZE, file_rule(header, request.rule)

@@ -76,6 +76,8 @@ def _transfer_function(file: str) -> dict[str, Any]:
     facts: dict[str, Any] = {"kind": "transfer function", "name": tf.name, "nodes": [lo, hi]}
     if tf.opacity_unit_distance is not None:
         facts["opacity_per"] = f"{tf.opacity_unit_distance:g} ({tf.opacity_unit_label})"
+    if tf.lighting is not None:
+        facts["light"] = tf.lighting.text()
     return facts
 
 

@@ -39,4 +39,6 @@ def convert_transfer_function(
             f"{output}: a ParaView preset holds no unit distance: set it to {distance} there, or give "
             f"--opacity-unit-distance {distance} here"
         )
+    if form == "paraview" and function.lighting is not None:
+        (console or Console()).say(f"{output}: a ParaView preset holds no shading: it is left out (--light headlight)")
     write_text(output, text, overwrite)

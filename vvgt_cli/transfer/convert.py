@@ -10,6 +10,7 @@ import numpy as np
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.transfer.colormap import ColorMap
 from vvgt_cli.transfer.function import TransferFunction
+from vvgt_cli.transfer.lighting import COEFFICIENTS
 from vvgt_cli.transfer.opacity import PiecewiseOpacity
 
 FORMATS = ("minimal", "paraview")
@@ -82,6 +83,8 @@ def _minimal(tf: TransferFunction) -> dict[str, Any]:
         body["color_space"] = tf.color_map.space
     if tf.opacity_unit_distance is not None:
         body["opacity_unit_distance"] = tf.opacity_unit_distance
+    if tf.lighting is not None:
+        body["lighting"] = {name: getattr(tf.lighting, name) for name in COEFFICIENTS}
     return body
 
 

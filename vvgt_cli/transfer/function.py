@@ -9,6 +9,7 @@ import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.transfer.colormap import ColorMap
+from vvgt_cli.transfer.lighting import Lighting
 from vvgt_cli.transfer.opacity import PiecewiseOpacity
 
 DOMAINS = ("data", "fraction", "percentile")
@@ -27,6 +28,7 @@ class TransferFunction:
         opacity_unit_share: the same as a share of the longest edge of the volume's box (Inviwo); not both.
         domain: what the node positions are: ``data`` values; a ``fraction`` in [0, 1] of the data range;
             or a ``percentile`` / 100 of the voxels. `vvgt_cli.transfer.resolve.resolve` turns all into data values.
+        lighting: that the source asks for, None where it asks for none.
 
     Raises:
         DataError: unknown domain, unit distance not finite and above 0, fractions outside [0, 1].
@@ -39,6 +41,7 @@ class TransferFunction:
     domain: str = "data"
     opacity_unit_share: float | None = None
     opacity_unit_label: str = "file"
+    lighting: Lighting | None = None
 
     def __post_init__(self) -> None:
         if self.domain not in DOMAINS:

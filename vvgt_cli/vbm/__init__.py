@@ -30,12 +30,14 @@ class VbmOptions:
         size: image edge in pixels at the default views; opacities allow for the renderer's dilation there.
         method: "vbm", "wavelet" (isotropic bank) or "uniform" (random samples).
         seed: of the random samples.
+        degree: of the harmonics that colours have under a light that depends on the view.
     """
 
     max_gaussians: int = 100_000
     size: int = 400
     method: str = "vbm"
     seed: int = 0
+    degree: int = 0
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
@@ -60,13 +62,17 @@ def initialise(scene: Scene, options: VbmOptions, progress: Progress | None = No
     from vvgt_cli.vbm.uniform import uniform_gaussians
     from vvgt_cli.vbm.wavelet import wavelet_gaussians
 
-    form = closed_form(scene, options.max_gaussians, options.size, progress=progress)
+    form = closed_form(scene, options.max_gaussians, options.size, progress=progress, degree=options.degree)
     if options.method == "wavelet":
         gaussians, kept = wavelet_gaussians(form.tree, form.budget, form.pixel), None
     elif options.method == "uniform":
         gaussians, kept = uniform_gaussians(form.tree, form.budget, form.pixel, options.seed), None
     else:
         gaussians, kept = form.gaussians(), form
+    if kept is None and scene.light is not None:
+        from vvgt_cli.vbm.lit import lit_alone
+
+        gaussians = lit_alone(gaussians, scene, options.degree)
     if progress:
         progress(100, 100)
     return Start(gaussians, kept)

@@ -53,6 +53,7 @@ class ClosedForm:
         voxel: finest voxel edge, unit frame.
         pixel: a pixel's width at the centre, unit frame.
         budget: most Gaussians.
+        degree: of the harmonics that colours have under a light that depends on the view.
     """
 
     scene: Scene
@@ -62,13 +63,19 @@ class ClosedForm:
     voxel: float
     pixel: float
     budget: int
+    degree: int = 0
 
     def gaussians(self, style: SurfaceStyle = ROUND) -> Gaussians:
         """Gaussians of the cells that the moments alone choose."""
         return self._of(leaves_of(self.tree, select(self.tree, self.budget)), style)
 
     def _of(self, leaves: Leaves, style: SurfaceStyle) -> Gaussians:
-        return cell_gaussians(leaves, self.voxel, self.pixel, self.opaque, style)
+        found = cell_gaussians(leaves, self.voxel, self.pixel, self.opaque, style)
+        if self.scene.light is None:
+            return found
+        from vvgt_cli.vbm.lit import lit
+
+        return lit(found, self.scene, self.tree, leaves, self.degree)
 
     def refined(self, cameras: Sequence[Camera], views: np.ndarray, style: SurfaceStyle, rule: Rule) -> Gaussians:
         """Gaussians for the budget: three tenths by the moments, then cells with the largest error are split."""
@@ -86,7 +93,12 @@ class ClosedForm:
 
 
 def closed_form(
-    scene: Scene, budget: int, size: int, cameras: Sequence[Camera] | None = None, progress: Progress | None = None
+    scene: Scene,
+    budget: int,
+    size: int,
+    cameras: Sequence[Camera] | None = None,
+    progress: Progress | None = None,
+    degree: int = 0,
 ) -> ClosedForm:
     """Moments, visibility and pyramid of a scene.
 
@@ -96,6 +108,7 @@ def closed_form(
         size: image edge in pixels that the file is made for.
         cameras: what may see the scene; by default the training views.
         progress: called with (per cent done, 100), within parts that take long too.
+        degree: of the harmonics under a light that depends on the view.
     """
     step = np.asarray(scene.step)
 
@@ -109,7 +122,7 @@ def closed_form(
     within(75, 80)(1)
     tree = build_tree(cells, seen, step)
     within(80, 95)(1)
-    return ClosedForm(scene, seen, tree, opaque, float(step.min()), pixel_width(size), budget)
+    return ClosedForm(scene, seen, tree, opaque, float(step.min()), pixel_width(size), budget, degree)
 
 
 def base_level(scene: Scene, pixel: float, budget: int) -> int:

@@ -55,7 +55,9 @@ class ClosedFormStage(Stage):
                 stage.note = f"{len(kept[0])} Gaussians, as kept in {work.checkpoint.folder}"
             work.start, work.gaussians = Start(kept[0], None), kept[0]
             return
-        options = VbmOptions(max_gaussians=fit.max_gaussians, size=fit.size, method=fit.init, seed=fit.seed)
+        options = VbmOptions(
+            max_gaussians=fit.max_gaussians, size=fit.size, method=fit.init, seed=fit.seed, degree=work.degree
+        )
         with run.stage(self.name) as stage:
             start = initialise(scene, options, progress=run.console.bar(self.name))
             if not len(start.gaussians):

@@ -7,8 +7,9 @@ An object with these keys, and no others::
       "range": [0, 4095],                    optional: see below
       "points": [{"x": 0.2, "rgb": [1, 1, 1], "opacity": 0.5}, ...],
       "color_space": "RGB",                  optional: a ParaView ColorSpace
-      "opacity_unit_distance": 1.5           optional: world length that the opacities are per
-    }
+      "opacity_unit_distance": 1.5,          optional: world length that the opacities are per
+      "lighting": {"ambient": 0.1, "diffuse": 0.7, "specular": 0.2, "specular_power": 10}
+    }                                        optional: a head-light with these coefficients, or VTK's
 
 ``x`` is a data value without ``range``; in [0, 1] from one end of ``"range": [lo, hi]`` to the other; or,
 with ``"range": "percentile"``, the fraction of the voxels that lie below (0.5 is the median). A point
@@ -25,10 +26,11 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.transfer.colormap import ColorMap
 from vvgt_cli.transfer.function import TransferFunction
+from vvgt_cli.transfer.lighting import COEFFICIENTS, Lighting, preset_lighting
 from vvgt_cli.transfer.opacity import PiecewiseOpacity
 from vvgt_cli.transfer.readers.fields import named, number, rgb
 
-KEYS = {"name", "range", "points", "color_space", "opacity_unit_distance"}
+KEYS = {"name", "range", "points", "color_space", "opacity_unit_distance", "lighting"}
 POINT_KEYS = {"x", "rgb", "opacity"}
 
 
@@ -65,9 +67,18 @@ def read(parsed: dict[str, Any], what: str, pick: str = "") -> TransferFunction:
             ColorMap(np.array(xc), np.array(c), space=str(parsed.get("color_space", "RGB"))),
             distance,
             domain,
+            lighting=_lighting(parsed.get("lighting"), what),
         )
     except DataError as error:
         raise named(what, error) from error
+
+
+def _lighting(value: Any, what: str) -> Lighting | None:
+    if value is None:
+        return None
+    if not isinstance(value, dict) or not set(value) <= set(COEFFICIENTS):
+        raise DataError(f"{what}: lighting; expected an object of {', '.join(COEFFICIENTS)}, any or none")
+    return preset_lighting(what, True, {key: number(f"{what}: lighting.{key}", v) for key, v in value.items()})
 
 
 def _range(value: Any, what: str) -> tuple[str, float, float]:

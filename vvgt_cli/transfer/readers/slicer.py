@@ -6,8 +6,8 @@ the same, with midpoints and sharpness, once a component; the first component is
 ``scalarOpacityUnitDistance`` in millimetres; the other forms have none and VTK's default of 1 is taken. MRML
 (``presets.xml``, scenes) has a ``VolumeProperty`` element a preset, with the lines of ``.vp`` as attributes
 (``scalarOpacity``, ``gradientOpacity``, ``colorTransfer``, ``shade``, ``ambient``, ...); viewers on vtk.js keep the
-same as JSON. There is no lighting here: shading and gradient opacity are not used, which a warning says where a file
-asks for them.
+same as JSON. Where shading is on, the function has the head-light of VTK's viewers with the file's coefficients
+(`vvgt_cli.transfer.lighting`). Gradient opacity is not used, which a warning says where a file asks for it.
 """
 
 from __future__ import annotations
@@ -21,13 +21,14 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.transfer.colormap import ColorMap
 from vvgt_cli.transfer.function import TransferFunction
+from vvgt_cli.transfer.lighting import Lighting, preset_lighting
 from vvgt_cli.transfer.opacity import PiecewiseOpacity
 from vvgt_cli.transfer.readers import paraview
 from vvgt_cli.transfer.readers.fields import Elements, Lines, floats, named, number, rgb
 
 UNIT_DISTANCE = 1.0  # vtkVolumeProperty's
 DEFAULT = "VTK's default"  # what that distance is called
-_LIGHT = ("ambient", "diffuse", "specular", "specularPower")
+_LIGHT = {"ambient": "ambient", "diffuse": "diffuse", "specular": "specular", "specularPower": "specular_power"}
 
 
 def matches(parsed: Any) -> bool:
@@ -87,7 +88,7 @@ def _of_fields(name: str, fields: Mapping[str, Any], what: str) -> TransferFunct
         raise DataError("scalarOpacity, gradientOpacity and colorTransfer; expected text, a count and numbers each")
     nodes, colors = _counted("scalar opacity", opacity, 2), _counted("colours", color, 4)
     slopes = _counted("gradient opacity", gradient, 2)[:, 1] if gradient.strip() else np.ones(1)
-    _say_unused(what, bool((slopes != 1).any()), fields)
+    _say_unused(what, bool((slopes != 1).any()))
     distance = fields.get("scalarOpacityUnitDistance")
     label = "file" if distance is not None else DEFAULT
     return TransferFunction(
@@ -96,17 +97,21 @@ def _of_fields(name: str, fields: Mapping[str, Any], what: str) -> TransferFunct
         ColorMap(colors[:, 0], colors[:, 1:]),
         UNIT_DISTANCE if distance is None else floats("scalarOpacityUnitDistance", str(distance))[0],
         opacity_unit_label=label,
+        lighting=_lighting(what, fields),
     )
 
 
-def _say_unused(what: str, gradient: bool, light: Mapping[str, Any]) -> None:
+def _say_unused(what: str, gradient: bool) -> None:
     """Say once what a file asks for and is not done."""
-    shade = str(light.get("shade", "")).strip().lower() in ("1", "true")
-    values = ", ".join(f"{key} {light[key]}" for key in _LIGHT if key in light)
-    parts = ["gradient opacity"] if gradient else []
-    parts += [f"shading ({values})" if values else "shading"] if shade else []
-    if parts:
-        warnings.warn(f"{what}: {' and '.join(parts)} not used: there is no lighting here", stacklevel=3)
+    if gradient:
+        warnings.warn(f"{what}: gradient opacity not used", stacklevel=3)
+
+
+def _lighting(what: str, fields: Mapping[str, Any]) -> Lighting | None:
+    """The light of a volume property that is shaded."""
+    shade = str(fields.get("shade", "")).strip().lower() in ("1", "true")
+    given = {name: floats(key, str(fields[key]))[0] for key, name in _LIGHT.items() if key in fields} if shade else {}
+    return preset_lighting(what, shade, given)
 
 
 def _of_json(parsed: dict[str, Any], what: str) -> TransferFunction:
@@ -129,7 +134,7 @@ def _of_json(parsed: dict[str, Any], what: str) -> TransferFunction:
     slopes = [p.get("y") for p in _points(part, "gradientOpacity")] if gradient else []
     lighting = part.get("lighting")
     light = {**(lighting if isinstance(lighting, dict) else {}), "shade": part.get("shade")}
-    _say_unused(what, any(y != 1 for y in slopes), light)
+    _say_unused(what, any(y != 1 for y in slopes))
     distance = number("scalarOpacityUnitDistance", part.get("scalarOpacityUnitDistance", UNIT_DISTANCE))
     return TransferFunction(
         "volume property",
@@ -137,6 +142,7 @@ def _of_json(parsed: dict[str, Any], what: str) -> TransferFunction:
         ColorMap(np.array([_x(p) for p in points]), np.array(colors), bends[:, 0], bends[:, 1]),
         distance,
         opacity_unit_label="file" if "scalarOpacityUnitDistance" in part else DEFAULT,
+        lighting=_lighting(what, light),
     )
 
 

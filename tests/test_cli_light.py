@@ -1,0 +1,142 @@
+"""Light on the command line and in the library: files that say what fell on them, degrees, normals, refusals."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+import vvgt_cli
+from vvgt_cli.gaussians import read_ply
+from vvgt_cli.gaussians.ply import _rows
+from vvgt_cli.transfer.lighting import Lighting, LightOptions
+
+SOURCE = "example:marschner-lobb:24"
+SMALL = ("--max-gaussians", "300", "--size", "48", "--steps", "24")
+FUNCTION = {
+    "points": [{"x": 0.0, "rgb": [1, 0.5, 0.2], "opacity": 0}, {"x": 0.5, "opacity": 0.6}, {"x": 1, "opacity": 0.6}],
+    "lighting": {"diffuse": 0.9},
+}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    place = tmp_path_factory.mktemp("light")
+    (place / "lit.json").write_text(json.dumps(FUNCTION))
+    (place / "dark.json").write_text(json.dumps({"points": FUNCTION["points"]}))
+    return place
+
+
+def tf(folder, name="dark"):
+    return ("--tf", str(folder / f"{name}.json"))
+
+
+def psnr(vvgt, ply, *more):
+    result = vvgt("evaluate", ply, "--volume", SOURCE, "--no-seats", "--step", "0.5", "--json", *more)
+    assert result.code == 0, result.err
+    return json.loads(result.out)["scores"]["psnr"]
+
+
+def test_a_lit_file_says_its_light_and_is_judged_under_it(folder, vvgt):
+    out = folder / "head.ply"
+    report = folder / "head.json"
+    made = vvgt("convert", SOURCE, *tf(folder), *SMALL, "--light", "headlight", "--report", report, "-o", out)
+    assert made.code == 0, made.err
+    gaussians, header = read_ply(out)
+    assert header.light == Lighting()
+    assert gaussians.degree == header.sh_degree == 2
+    told = json.loads(report.read_text())
+    assert told["transfer_function"]["light"] == Lighting().text()
+    own = psnr(vvgt, out, *tf(folder))
+    assert abs(own - told["scores"]["psnr"]) < 1.5
+    assert psnr(vvgt, out, *tf(folder), "--light", "none") < own - 3
+    rows = _rows(out, "head")[1]
+    normals = np.stack([rows[n] for n in ("nx", "ny", "nz")], axis=1)
+    lengths = np.linalg.norm(normals, axis=1)
+    assert (np.abs(lengths - 1) < 1e-5).mean() > 0.9
+    info = json.loads(vvgt("info", out, "--json").out)
+    assert info["light"] == Lighting().text()
+
+
+def test_light_that_does_not_depend_on_the_view_needs_no_harmonics(folder, vvgt):
+    out = folder / "fixed.ply"
+    made = vvgt(
+        "convert", SOURCE, *tf(folder), *SMALL, "--light", "1,0,2", "--shadows", "--specular", "0",
+        "--ambient-occlusion", "-o", out,
+    )  # fmt: skip
+    assert made.code == 0, made.err
+    gaussians, header = read_ply(out)
+    assert (gaussians.harmonics, header.sh_degree) == (None, 0)
+    assert header.light.shadows
+    assert header.light.occlusion == 0.1
+    dark = folder / "dark.ply"
+    assert vvgt("convert", SOURCE, *tf(folder), *SMALL, "-o", dark).code == 0
+    assert read_ply(dark)[1].light is None
+    assert gaussians.colors.mean() < 0.8 * read_ply(dark)[0].colors.mean()
+    assert not np.any(_rows(dark, "dark")[1]["nz"])
+
+
+def test_a_degree_that_cannot_hold_it_is_said(folder, vvgt):
+    out = folder / "flat.ply"
+    made = vvgt("init", SOURCE, *tf(folder, "lit"), "--max-gaussians", "300", "--sh-degree", "0", "-o", out)
+    assert made.code == 0, made.err
+    assert "--sh-degree 0: what the headlight and highlights show changes with the view" in made.err
+    gaussians, header = read_ply(out)
+    assert (gaussians.degree, header.light) == (0, Lighting(diffuse=0.9))
+    for degree in (1, 3):
+        again = vvgt(
+            "init",
+            SOURCE,
+            *tf(folder, "lit"),
+            "--max-gaussians",
+            "300",
+            "--sh-degree",
+            degree,
+            "-o",
+            out,
+            "--overwrite",
+        )
+        assert read_ply(out)[1].sh_degree == degree
+        assert ("changes with the view" in again.err) == (degree == 1)
+
+
+def test_a_preset_decides_unless_it_is_overruled(folder, vvgt):
+    shown = {}
+    for name, more in (("preset", ()), ("none", ("--light", "none")), ("left", ("--light", "left"))):
+        done = vvgt(
+            "render-views", SOURCE, *tf(folder, "lit"), "--views", "1", "--test-views", "0", "--size", "32", "--format",
+            "exr", "--no-points", *more, "-o", folder / name,
+        )  # fmt: skip
+        assert done.code == 0, done.err
+        shown[name] = next((folder / name).rglob("*.exr")).read_bytes()
+    assert len(set(shown.values())) == 3
+
+
+def test_what_cannot_be_is_refused_before_the_work(folder, vvgt):
+    for options, message in (
+        (("--light", "0,0,0"), "--light 0,0,0: of length 0"),
+        (("--specular", "0.5"), "--specular: nothing is lit"),
+        (("--light", "headlight", "--ambient", "nan"), "--ambient nan"),
+        (("--light", "headlight", "--shadows"), "--shadows: a headlight throws none"),
+    ):
+        failed = vvgt("convert", SOURCE, *tf(folder), *options, "-o", folder / "no.ply")
+        assert failed.code == 2
+        assert message in failed.error
+        assert not (folder / "no.ply").exists()
+
+
+def test_the_library_takes_names_directions_and_options():
+    function = {"points": FUNCTION["points"]}
+    few = {"max_gaussians": 100, "size": 40, "steps": 0}
+    by_name = vvgt_cli.convert(SOURCE, function, light="headlight", **few)
+    assert by_name.scene.lighting == Lighting()
+    assert by_name.gaussians.degree == 2
+    assert by_name.normals().shape == by_name.gaussians.means.shape
+    by_direction = vvgt_cli.convert(SOURCE, function, light=(0, 0, 1), **few)
+    assert by_direction.scene.lighting == Lighting(False, ((0, 0, 1),))
+    options = LightOptions(("above", "headlight"), shadows=True, specular=0)
+    _, images = vvgt_cli.render_views(SOURCE, function, cameras=1, size=32, light=options)
+    _, dark = vvgt_cli.render_views(SOURCE, function, cameras=1, size=32)
+    assert np.abs(images - dark).max() > 0.05
+    np.testing.assert_allclose(images[..., 3], dark[..., 3], atol=0.02)  # other pixels get more rays

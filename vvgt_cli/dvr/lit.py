@@ -1,0 +1,110 @@
+"""The numba ray caster under light: `kernel.cast` with every visible segment shaded at its middle (docs/light.md)."""
+
+from __future__ import annotations
+
+import math
+
+import numba as nb
+import numpy as np
+
+from vvgt_cli.dvr.kernel import FLAGS, OPAQUE, TILE, U, any_light, box_span, composite, inverse, skip, tiles_of
+from vvgt_cli.dvr.layout import LIT, Light, Optics, Voxels
+from vvgt_cli.dvr.runs import BORROWED, RUN, sample_run, stack_run
+from vvgt_cli.dvr.shading import shading
+from vvgt_cli.dvr.vectors import lane, zeros4
+from vvgt_cli.jit.decorators import inlined, kernel
+
+_jit = inlined(fastmath=FLAGS, error_model="numpy", **BORROWED)
+
+
+@_jit
+def cast(
+    voxels: Voxels,
+    optics: Optics,
+    empty: np.ndarray,
+    light: Light,
+    px: float,
+    py: float,
+    pz: float,
+    dx: float,
+    dy: float,
+    dz: float,
+    step: float,
+) -> tuple[float, float, float, float]:
+    """`kernel.cast` under ``light`` (`Light`); no colour of a sample exceeds 1."""
+    nz, ny, nx = voxels.values.shape
+    run = stack_run()
+    red = green = blue = 0.0
+    trans = 1.0
+    t0, t1 = box_span(px, py, pz, dx, dy, dz, nx, ny, nz)
+    if not t1 > t0:
+        return 0.0, 0.0, 0.0, 0.0
+    count = max(math.ceil((t1 - t0) * math.sqrt(dx * dx + dy * dy + dz * dz) / step), 1)
+    dt = (t1 - t0) / count
+    opaque = OPAQUE * min(step * step, 1.0)
+    ix, iy, iz, per_step = inverse(dx), inverse(dy), inverse(dz), 1.0 / dt
+    ux, uy, uz = dx * light.edge[0], dy * light.edge[1], dz * light.edge[2]
+    u0 = -1.0  # -1: no sample there, or not finite
+    i = 0
+    while True:
+        start = skip(voxels.values.shape, empty, px, py, pz, dx, dy, dz, ix, iy, iz, t0, dt, per_step, count, i)
+        if start > count:
+            return red, green, blue, 1.0 - trans
+        if start > i:
+            u0, i = -1.0, start
+        t = t0 + i * dt
+        sample_run(voxels, px + t * dx, py + t * dy, pz + t * dz, dx * dt, dy * dt, dz * dt, optics, run)
+        if any_light(run, u0, optics.dark):
+            for n in range(min(RUN, count + 1 - i)):
+                u1 = run[n]
+                first = min(u0, u1)
+                if first >= 0.0 and max(u0, u1) > optics.dark[U(int(first))]:
+                    seen, trans = composite(u0, u1, dt, optics, zeros4(), trans)
+                    s = t + (n - 0.5) * dt
+                    factor, white = shading(
+                        voxels.values, light, px + s * dx, py + s * dy, pz + s * dz, ux, uy, uz
+                    )  # fmt: skip
+                    most = lane(seen, 3)
+                    white *= most
+                    red += min(factor * lane(seen, 0) + white, most)
+                    green += min(factor * lane(seen, 1) + white, most)
+                    blue += min(factor * lane(seen, 2) + white, most)
+                    if trans < opaque:
+                        return red, green, blue, 1.0 - trans
+                u0 = u1
+        u0 = run[RUN - 1]
+        i += RUN
+        if i > count:
+            return red, green, blue, 1.0 - trans
+
+
+_tile = tiles_of(cast)
+
+
+@kernel(
+    "Voxels Optics u1:3 Light f8:1 f8:2 f8:1 f8 i8:1 f8:2 b1:2 i8 f4:3",
+    LIT,
+    parallel=True,
+    fastmath=FLAGS,
+    error_model="numpy",
+)
+def render_lit_tiles(
+    voxels: Voxels,
+    optics: Optics,
+    empty: np.ndarray,
+    light: Light,
+    eye: np.ndarray,
+    basis: np.ndarray,
+    lens: np.ndarray,
+    step: float,
+    order: np.ndarray,
+    offsets: np.ndarray,
+    mask: np.ndarray,
+    known: int,
+    out: np.ndarray,
+) -> None:
+    """`kernel.render_tiles` under ``light`` (`Light`)."""
+    across = (out.shape[1] + TILE - 1) // TILE
+    for index in nb.prange(len(order)):
+        top, left = order[index] // across * TILE, order[index] % across * TILE
+        _tile(voxels, optics, empty, light, eye, basis, lens, step, top, left, offsets, mask, known, out)

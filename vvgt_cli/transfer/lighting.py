@@ -1,0 +1,181 @@
+"""`Lighting`: lights and coefficients, as presets and users give them (docs/light.md)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.volume.space import world_axis
+
+AMBIENT, DIFFUSE, SPECULAR, POWER = 0.1, 0.7, 0.2, 10.0  # vtkVolumeProperty's
+COEFFICIENTS = ("ambient", "diffuse", "specular", "specular_power")
+HEADLIGHT, NONE = "headlight", "none"
+OCCLUSION = 0.1  # unit-frame lengths: a twentieth of the longest edge
+MOST = 1000.0  # of a coefficient: a highlight with a larger power is a point
+AXES = {axis: tuple(float(letter == axis) for letter in "xyz") for axis in "xyz"}
+WORDS = ("left", "right", "anterior", "posterior", "superior", "inferior", "above", "below")
+EXPECTED = f"expected {HEADLIGHT}, X,Y,Z, x, -x, y, -y, z, -z, {', '.join(WORDS[:-1])} or {WORDS[-1]}"
+
+Direction = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Lighting:
+    """Lights of one white, and how matter answers them: ``c = ka c0 + kd |n.l| c0 + ks |n.h|^p``.
+
+    Attributes:
+        headlight: a light at the eye.
+        directions: unit vectors towards lights at infinity, world axes.
+        ambient, diffuse, specular, specular_power: ka, kd, ks, p.
+        shadows: lights at infinity arrive attenuated by what lies before them.
+        occlusion: unit-frame length within which what is around takes of ambient and diffuse light; None: none.
+
+    Raises:
+        UsageError: no light, a direction of length zero, a coefficient that is not finite, negative or above `MOST`,
+            shadows without a light that throws any.
+    """
+
+    headlight: bool = True
+    directions: tuple[Direction, ...] = ()
+    ambient: float = AMBIENT
+    diffuse: float = DIFFUSE
+    specular: float = SPECULAR
+    specular_power: float = POWER
+    shadows: bool = False
+    occlusion: float | None = None
+
+    def __post_init__(self) -> None:
+        if not (self.headlight or self.directions):
+            raise UsageError(f"no light; {EXPECTED}")
+        for name in COEFFICIENTS:
+            value = getattr(self, name)
+            if not 0 <= value <= MOST:
+                raise UsageError(f"--{name.replace('_', '-')} {value:g}: expected 0 to {MOST:g}")
+        if self.occlusion is not None and not 0 < self.occlusion < math.inf:
+            raise UsageError(f"--ambient-occlusion {self.occlusion:g}: expected a length above 0")
+        if self.shadows and not self.directions:
+            raise UsageError("--shadows: a headlight throws none that its eye sees; give --light X,Y,Z too, or none")
+
+    @property
+    def depends_on_view(self) -> bool:
+        """Whether colours change with the eye."""
+        return (self.headlight and self.diffuse > 0) or self.specular > 0
+
+    @property
+    def attenuated(self) -> bool:
+        """Whether light is marched through the scene, for shadows or occlusion."""
+        return self.shadows or self.occlusion is not None
+
+    def text(self) -> str:
+        """One line, as the header of a `.ply` has it; `parse_lighting` reads it."""
+        words = [repr(float(getattr(self, name))) for name in COEFFICIENTS]
+        words += [HEADLIGHT] * self.headlight + [",".join(repr(v) for v in d) for d in self.directions]
+        words += ["shadows"] * self.shadows
+        return " ".join(words + ([] if self.occlusion is None else ["occlusion", repr(float(self.occlusion))]))
+
+
+def parse_lighting(text: str) -> Lighting:
+    """What `Lighting.text` wrote.
+
+    Raises:
+        ValueError, UsageError: something else.
+    """
+    words = text.split()
+    numbers, rest = [float(word) for word in words[:4]], words[4:]
+    occlusion = None
+    if "occlusion" in rest:
+        at = rest.index("occlusion")
+        occlusion, rest = float(rest[at + 1]), rest[:at] + rest[at + 2 :]
+    found = Lighting(HEADLIGHT in rest, _directions([w for w in rest if "," in w], None), *numbers)  # type: ignore[arg-type]
+    if known := set(rest) - {HEADLIGHT, "shadows"} - {w for w in rest if "," in w}:
+        raise ValueError(known)
+    return replace(found, shadows="shadows" in rest, occlusion=occlusion)
+
+
+@dataclass(frozen=True)
+class LightOptions:
+    """What a user asks for; None, here and of each: what the function's file says, else VTK's defaults.
+
+    Attributes:
+        lights: ``none``, ``headlight``, ``X,Y,Z``, an axis or a word of `WORDS`; empty: what the function's file says.
+        ambient, diffuse, specular, specular_power: coefficients.
+        shadows, occlusion: as `Lighting` has them.
+    """
+
+    lights: tuple[str, ...] = ()
+    ambient: float | None = None
+    diffuse: float | None = None
+    specular: float | None = None
+    specular_power: float | None = None
+    shadows: bool = False
+    occlusion: float | None = None
+
+    def lighting(self, preset: Lighting | None, space: str | None) -> Lighting | None:
+        """Light of a scene, None for none.
+
+        Args:
+            preset: what the function's file says.
+            space: anatomical space of the world, None where it is not.
+
+        Raises:
+            UsageError: lights that are none, or other options where nothing is lit.
+        """
+        given = {name: getattr(self, name) for name in COEFFICIENTS if getattr(self, name) is not None}
+        given |= {"occlusion": self.occlusion} if self.occlusion is not None else {}
+        given |= {"shadows": True} if self.shadows else {}
+        if NONE in self.lights or not (self.lights or preset):
+            if len(self.lights) > 1:
+                raise UsageError(f"--light {' --light '.join(self.lights)}: none and others; give one of both")
+            if given:
+                name = {"occlusion": "ambient-occlusion"}.get(first := next(iter(given)), first.replace("_", "-"))
+                raise UsageError(f"--{name}: nothing is lit; give --light headlight, or a direction as X,Y,Z, too")
+            return None
+        if not self.lights:
+            assert preset is not None
+            return replace(preset, **given)
+        fixed = _directions([light for light in self.lights if light != HEADLIGHT], space)
+        if len(self.lights) - len(fixed) > 1:
+            raise UsageError("--light headlight: twice; there is one")
+        kept = {} if preset is None else {name: getattr(preset, name) for name in COEFFICIENTS}
+        return Lighting(HEADLIGHT in self.lights, fixed, **(kept | given))
+
+
+def _directions(lights: Sequence[str], space: str | None) -> tuple[Direction, ...]:
+    return tuple(_direction(light, space) for light in lights)
+
+
+def _direction(light: str, space: str | None) -> Direction:
+    """Unit vector towards a light."""
+    word = {"above": "z", "below": "-z"}.get(light, light)
+    if word in WORDS:
+        if space is None and word not in ("left", "right"):
+            raise UsageError(f"--light {light}: the volume states no anatomical space; {EXPECTED.replace('or ', '')}")
+        word = {"left": "-x", "right": "x"}[word] if space is None else world_axis(word, space)
+    if word.lstrip("-") in AXES and word.count("-") < 2:
+        x, y, z = (-v if word[0] == "-" and v else v for v in AXES[word[-1]])
+        return x, y, z
+    try:
+        x, y, z = (float(v) for v in word.split(","))
+    except ValueError:
+        raise UsageError(f"--light {light}; {EXPECTED}") from None
+    largest = max(abs(x), abs(y), abs(z))
+    if not 0 < largest < math.inf:
+        raise UsageError(f"--light {light}: of length {'0' if largest == 0 else 'nothing finite'}; {EXPECTED}")
+    length = largest * math.hypot(x / largest, y / largest, z / largest)
+    return x / length, y / length, z / length
+
+
+def preset_lighting(what: str, shade: bool, fields: dict[str, float]) -> Lighting | None:
+    """What a volume property says of light: a head-light where it is shaded, None where not.
+
+    Raises:
+        DataError: coefficients that cannot be.
+    """
+    if not shade:
+        return None
+    try:
+        return Lighting(**fields)  # type: ignore[arg-type]
+    except UsageError as error:
+        raise DataError(f"{what}: shading with {str(error).lstrip('-')}") from None

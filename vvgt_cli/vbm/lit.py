@@ -1,0 +1,234 @@
+"""Colours of cells under light in closed form: what does not depend on the view, and harmonics of what does.
+
+Every base cell is shaded at its centroid and counts by what the cameras see of it, so that of an opaque body its
+surface counts. The head-light's terms are even in n . d: with ``|x|^p = A + B x^2``, least squares over [0, 1] weighted
+by x (what is seen at a grazing angle covers few pixels), a Gaussian's colour is the quadratic form ``A g + B d^T Q d``
+of its direction d, Q the mean of n n^T and g its trace: harmonics of degree 0 and 2, without a picture. Highlights of
+lights at infinity are projected onto the harmonics for the main axis of Q.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numba as nb
+import numpy as np
+
+from vvgt_cli.dvr.kernel import FLAGS
+from vvgt_cli.dvr.layout import LIT, Light, Voxels
+from vvgt_cli.dvr.light import sphere
+from vvgt_cli.dvr.reference import optics, trilinear
+from vvgt_cli.dvr.scene import Scene
+from vvgt_cli.dvr.shading import arrives, fixed_diffuse, normal, openness
+from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.gaussians.frames import rotations
+from vvgt_cli.gaussians.harmonics import C2, basis
+from vvgt_cli.gaussians.types import HARMONICS, SH_C0
+from vvgt_cli.jit.decorators import kernel
+from vvgt_cli.vbm.columns import COLOR, COLUMNS, FIRST, MASS, RED, SEEN, SEEN_COLOR, SEEN_RED, X, Y, Z
+from vvgt_cli.vbm.tree import Leaves, Tree
+
+NORMALS, TINT, FIXED, MEAN, ARRIVING = slice(1, 7), slice(7, 10), slice(10, 13), slice(13, 16), 16
+SEEN_LITTLE = 1e-12  # of the mass: all of it counts where the cameras see no more
+AROUND = 96  # directions that highlights are projected on
+CHUNK = 1 << 14  # Gaussians whose highlights are projected at once
+BRIGHTEST = 2.0  # as `vvgt_cli.vbm.fit` has it
+
+
+@kernel("Voxels Light f8:2 i8:1 i8:1 f8:1 f8:1 f8:2", LIT, parallel=True, fastmath=FLAGS, error_model="numpy")
+def _shade(
+    voxels: Voxels,
+    light: Light,
+    moments: np.ndarray,
+    first: np.ndarray,
+    last: np.ndarray,
+    half: np.ndarray,
+    step: np.ndarray,
+    out: np.ndarray,
+) -> None:
+    """Sums over rows ``first[k]`` to ``last[k]`` of ``moments`` (n, 17) into ``out`` (k, 16 + lights).
+
+    Weight (what is seen), times n n^T (xx, xy, xz, yy, yz, zz), colour where it is open, colour without what depends on
+    the view, times n, and what arrives of each light. ``half``, ``step`` (3,) of `Scene`.
+    """
+    values = voxels.values
+    for k in nb.prange(len(first)):
+        row = out[k]
+        row[:] = 0.0
+        mass = seen = 0.0
+        for m in range(first[k], last[k]):
+            mass += moments[m, MASS]
+            seen += moments[m, SEEN]
+        shift = SEEN if seen > SEEN_LITTLE * mass else MASS
+        color = SEEN_RED if seen > SEEN_LITTLE * mass else RED
+        for m in range(first[k], last[k]):
+            cell = moments[m]
+            w = cell[shift]
+            if not w > 0.0:
+                continue
+            x = (cell[X] / cell[MASS] + half[0]) / step[0] - 0.5
+            y = (cell[Y] / cell[MASS] + half[1]) / step[1] - 0.5
+            z = (cell[Z] / cell[MASS] + half[2]) / step[2] - 0.5
+            n0, n1, n2 = normal(values, light.edge, x, y, z)
+            open_ = openness(light, x, y, z)
+            factor = open_ * (light.ambient + light.diffuse * fixed_diffuse(light, n0, n1, n2, x, y, z))
+            row[0] += w
+            row[1] += w * n0 * n0
+            row[2] += w * n0 * n1
+            row[3] += w * n0 * n2
+            row[4] += w * n1 * n1
+            row[5] += w * n1 * n2
+            row[6] += w * n2 * n2
+            for c in range(3):
+                row[7 + c] += open_ * cell[color + c]
+                row[10 + c] += factor * cell[color + c]
+            row[13] += w * n0
+            row[14] += w * n1
+            row[15] += w * n2
+            for which in range(light.directions.shape[0]):
+                row[16 + which] += w * arrives(light, which, x, y, z)
+
+
+def lit(gaussians: Gaussians, scene: Scene, tree: Tree, leaves: Leaves, degree: int) -> Gaussians:
+    """Gaussians of ``leaves`` with the colours of their cells under the scene's light, harmonics up to ``degree``."""
+    inside = leaves.node >= 0  # others lie below the tree's base: a row of their own
+    sums = np.empty((len(leaves), _width(scene)))
+    sums[inside] = _sums(scene, tree.moments, *_base_rows(tree, leaves.node[inside]))
+    sums[~inside] = _sums(scene, leaves.moments[~inside])
+    return _colored(gaussians, scene, sums, degree)
+
+
+def lit_alone(gaussians: Gaussians, scene: Scene, degree: int) -> Gaussians:
+    """Gaussians with their own colours under the scene's light, as it is at their centres."""
+    rows = _rows(gaussians.means)
+    rows[:, COLOR] = rows[:, SEEN_COLOR] = gaussians.colors
+    return _colored(gaussians, scene, _sums(scene, rows), degree)
+
+
+def mean_normals(gaussians: Gaussians, scene: Scene) -> np.ndarray:
+    """(K, 3) unit directions of the mean gradient of the optical mass around Gaussians, box frame; zeros for none.
+
+    A mean over the centre and the six points a standard deviation along the axes, weighted by the extinction there.
+    """
+    axes = rotations(gaussians.quaternions.astype(np.float64))  # columns
+    arms = (axes * np.exp(gaussians.log_scales.astype(np.float64))[:, None, :]).transpose(0, 2, 1)  # (K, 3, 3)
+    arms = np.concatenate([np.zeros_like(arms[:, :1]), arms, -arms], axis=1)
+    points = (gaussians.means[:, None, :] + arms).reshape(-1, 3)
+    rows = _rows(points)
+    rows[:, SEEN] = extinction_at(scene, (points + scene.half) / scene.step - 0.5)
+    rows[:, MASS] = np.maximum(rows[:, SEEN], 1e-6 * max(scene.tables.largest_extinction(), 1e-300))
+    rows[:, FIRST] *= rows[:, [MASS]]
+    first = 7 * np.arange(len(gaussians))
+    mean = _sums(scene, rows, first, first + 7)[:, MEAN]
+    length = np.linalg.norm(mean, axis=1, keepdims=True)
+    found: np.ndarray = np.where(length > 1e-3, mean / np.where(length > 1e-3, length, 1), 0)
+    return found
+
+
+def _rows(points: np.ndarray) -> np.ndarray:
+    """Rows of moments (n, 17) of mass 1 at points (n, 3), black."""
+    rows = np.zeros((len(points), COLUMNS))
+    rows[:, [MASS, SEEN]] = 1
+    rows[:, FIRST] = points
+    return rows
+
+
+def extinction_at(scene: Scene, points: np.ndarray) -> np.ndarray:
+    """Extinction (n,) at voxel coordinates (n, 3); 0 outside the box."""
+    inside = ((points > -0.5) & (points < np.array(scene.volume.dims) - 0.5)).all(axis=1)
+    return np.where(inside, optics(scene, trilinear(scene.volume, points))[0], 0)
+
+
+def _width(scene: Scene) -> int:
+    assert scene.light is not None
+    return ARRIVING + len(scene.light.directions)
+
+
+def _sums(
+    scene: Scene, rows: np.ndarray, first: np.ndarray | None = None, last: np.ndarray | None = None
+) -> np.ndarray:
+    """`_shade` of each row, or of the rows from ``first`` to ``last``, over the weight: means (k, 16 + lights)."""
+    assert scene.light is not None
+    if first is None or last is None:
+        first, last = np.arange(len(rows)), np.arange(1, len(rows) + 1)
+    out = np.empty((len(first), _width(scene)))
+    _shade(scene.voxels, scene.light, np.ascontiguousarray(rows), first, last, scene.half, scene.step, out)
+    out /= np.maximum(out[:, :1], np.finfo(np.float64).tiny)
+    return out
+
+
+def _base_rows(tree: Tree, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """First and last + 1 of the base cells, in Morton order, within ``nodes`` (k,) of a tree."""
+    first, last = nodes, nodes
+    while (inner := tree.children[first] > 0).any():
+        down = tree.first[last] + tree.children[last] - 1
+        first, last = np.where(inner, tree.first[first], first), np.where(inner, down, last)
+    return first, last + 1
+
+
+def _colored(gaussians: Gaussians, scene: Scene, out: np.ndarray, degree: int) -> Gaussians:
+    """Gaussians with the colours that the means ``out`` (K, 16 + lights) of `_sums` stand for."""
+    light = scene.light
+    assert light is not None
+    colors, terms = out[:, FIXED].copy(), np.zeros((len(out), HARMONICS[degree], 3))
+    normals = symmetric(out[:, NORMALS])
+    white = np.ones((1, 3))
+    if light.head:
+        for tint, factor, power in ((out[:, TINT], light.diffuse, 1.0), (white, light.specular, light.power)):
+            mean, across = even(normals, power, degree)
+            colors += factor * mean[:, None] * tint
+            if degree >= 2:
+                terms[:, 3:8] += factor * across[:, :, None] * tint[:, None, :]
+    if light.specular > 0 and len(light.directions):
+        mean, all_terms = highlights(normals, light.directions, out[:, ARRIVING:], light.power, degree)
+        colors += light.specular * mean[:, None]
+        terms += light.specular * all_terms[:, :, None]
+    return replace(gaussians, colors=np.clip(colors, 0, BRIGHTEST), harmonics=terms if degree else None)
+
+
+def symmetric(columns: np.ndarray) -> np.ndarray:
+    """(n, 3, 3) of xx, xy, xz, yy, yz, zz (n, 6)."""
+    return columns[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+
+
+def even(normals: np.ndarray, power: float, degree: int) -> tuple[np.ndarray, np.ndarray]:
+    """Mean over directions (n,) and coefficients of degree 2 (n, 5) of the mean of abs(n . d)^power.
+
+    ``normals`` (n, 3, 3) are means of n n^T, of a trace below 1 where some have no normal.
+    """
+    trace = np.trace(normals, axis1=1, axis2=2)
+    if degree < 2:
+        return trace * 2 / (power + 2), np.zeros((len(normals), 5))
+    at_zero, square = 48 * np.array([[1 / 6, -1 / 4], [-1 / 4, 1 / 2]]) @ [1 / (power + 2), 1 / (power + 4)]
+    m = square * (normals - trace[:, None, None] * np.eye(3) / 3)
+    across = [
+        2 * m[:, 0, 1] / C2[0], -2 * m[:, 1, 2] / C2[0], m[:, 2, 2] / 2 / C2[1], -2 * m[:, 0, 2] / C2[0],
+        (m[:, 0, 0] - m[:, 1, 1]) / 2 / C2[2],
+    ]  # fmt: skip
+    return trace * (at_zero + square / 3), np.stack(across, axis=1)
+
+
+def highlights(
+    normals: np.ndarray, directions: np.ndarray, arriving: np.ndarray, power: float, degree: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean over directions (n,) and coefficients (n, M) of the highlights of lights at infinity.
+
+    Args:
+        normals: (n, 3, 3) means of n n^T.
+        directions: (lights, 3) towards them; ``arriving`` (n, lights) what arrives.
+        power: of abs(n . h).
+        degree: of the harmonics.
+    """
+    eyes = sphere(AROUND)  # directions that cameras look along
+    projected = np.concatenate([np.full((AROUND, 1), SH_C0), basis(eyes, degree)], axis=1) * (4 * np.pi / AROUND)
+    half = directions[:, None, :] - eyes
+    half /= np.maximum(np.linalg.norm(half, axis=2, keepdims=True), 1e-9)
+    found = np.zeros((len(normals), 1 + HARMONICS[degree]))
+    for start in range(0, len(normals), CHUNK):
+        part = slice(start, start + CHUNK)
+        main = np.linalg.eigh(normals[part])[1][:, :, 2]
+        trace = np.trace(normals[part], axis1=1, axis2=2)
+        for k in range(len(directions)):
+            weight = (trace * arriving[part, k])[:, None]
+            found[part] += weight * (np.minimum(np.abs(main @ half[k].T), 1) ** power @ projected)
+    return found[:, 0] * SH_C0, found[:, 1:]
