@@ -26,7 +26,7 @@ from vvgt_cli.gaussians.harmonics import (
     view_slopes,
 )
 from vvgt_cli.gaussians.types import HARMONICS
-from vvgt_cli.network.damp import between
+from vvgt_cli.network.damp import interpolate
 from vvgt_cli.network.prepare import pack
 from vvgt_cli.splat import render
 from vvgt_cli.volume.types import UnitFrame
@@ -304,7 +304,7 @@ def test_what_makes_gaussians_of_gaussians_keeps_their_harmonics(tmp_path):
     }
     kept.save("fitted.npz", replace(g, harmonics=None))
     assert kept.load("fitted.npz")[0].harmonics is None
-    half = between(g, replace(g, harmonics=3 * g.harmonics), 0.5)
+    half = interpolate(g, replace(g, harmonics=3 * g.harmonics), 0.5)
     np.testing.assert_allclose(half.harmonics, 2 * g.harmonics, rtol=1e-6)
 
 
