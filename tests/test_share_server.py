@@ -208,7 +208,7 @@ def test_a_volume_is_converted_and_shown(tmp_path):
         (["a.ply", "-o", "a.png"], 2, ".spz"),
         (["a.ply", "-o", "b.html", "--port", "8000"], 2, "leave --port"),
         (["a.ply", "a.ply", "-o", "b.html"], 2, "one by one"),
-        (["a.ply", "-o", "a.ply"], 2, "is an input"),
+        (["a.ply", "-o", "a.ply", "--overwrite"], 2, "is an input"),
         (["text.ply"], 1, "text.ply"),
     ],
 )

@@ -25,7 +25,10 @@ const broken = new Promise((_, fail) => { page.on('pageerror', (error) => fail(e
 page.on('console', (message) => { if (message.type() === 'error') console.error(message.text()); });
 const begin = Date.now();
 await page.goto(job.url);
-await Promise.race([broken, page.waitForFunction('window.vvgt !== undefined')]);
+await Promise.race([broken, page.waitForFunction('window.vvgt || document.getElementById("said").textContent !== "loading"')]);
+if (!await page.evaluate('window.vvgt !== undefined')) {
+  throw new Error(await page.evaluate('document.getElementById("said").textContent'));
+}
 const seconds = (Date.now() - begin) / 1000;
 const shoot = async ({ camera, frame }) => {
   const { viewer, show } = window.vvgt, { app } = viewer, canvas = app.graphicsDevice.canvas;
