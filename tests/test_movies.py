@@ -62,7 +62,7 @@ def test_a_gif_of_an_orbit_repeats_without_a_jump(ply, tmp_path, vvgt):
     assert pictures.shape == (20, 64, 64, 3)
     assert (set(times), loop) == ({40}, 0)
     for k, camera in enumerate(orbit_views(20, size=64)):
-        assert psnr(render(gaussians, camera)[..., :3], pictures[k]) > 30
+        assert psnr(render(gaussians, camera)[..., :3], pictures[k]) > 28
     assert even_steps(pictures)
     assert not even_steps(pictures[:15])
     assert list(tmp_path.glob("*.json")) == []

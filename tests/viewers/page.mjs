@@ -25,7 +25,8 @@ const broken = new Promise((_, fail) => { page.on('pageerror', (error) => fail(e
 page.on('console', (message) => { if (message.type() === 'error') console.error(message.text()); });
 const begin = Date.now();
 await page.goto(job.url);
-await Promise.race([broken, page.waitForFunction('window.vvgt || document.getElementById("said").textContent !== "loading"')]);
+const there = 'window.vvgt !== undefined || document.getElementById("said").textContent !== "loading"';
+while (!await Promise.race([broken, page.evaluate(there)])) await new Promise((done) => setTimeout(done, 200));
 if (!await page.evaluate('window.vvgt !== undefined')) {
   throw new Error(await page.evaluate('document.getElementById("said").textContent'));
 }

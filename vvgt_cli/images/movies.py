@@ -14,7 +14,8 @@ from vvgt_cli.files import atomic_write
 SUFFIXES = (".gif", ".mp4")
 RATE = 25  # pictures a second: 4 hundredths a picture, which GIF can say
 _QUALITY = "18"  # of x264: hardly to be told from the pictures
-_COLORS, _SAMPLES = 256, 16  # of a GIF's palette, and pictures that it is made of
+_MOST = 1 << 16  # colours that a palette is made of
+_COLORS, _SAMPLES, _ROUNDS = 256, 16, 3  # of a GIF's palette, pictures that it is made of, rounds of its clustering
 
 
 def movie_ready(path: str | Path) -> None:
@@ -50,8 +51,10 @@ def _gif(path: Path, frames: Iterator[np.ndarray]) -> None:
     from PIL import Image
 
     images = [Image.fromarray(frame) for frame in frames]
-    some = [np.asarray(image) for image in images[:: max(len(images) // _SAMPLES, 1)]]
-    palette = Image.fromarray(np.concatenate(some)).quantize(_COLORS, Image.Quantize.MEDIANCUT)
+    some = [np.asarray(image).reshape(-1, 3) for image in images[:: max(len(images) // _SAMPLES, 1)]]
+    colors = np.unique(np.concatenate(some), axis=0)  # each once: the background is no more than any other
+    colors = colors[:: max(len(colors) // _MOST, 1)]
+    palette = Image.fromarray(colors[None]).quantize(_COLORS, Image.Quantize.MEDIANCUT, kmeans=_ROUNDS)
     drawn = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     drawn[0].save(path, save_all=True, append_images=drawn[1:], duration=1000 // RATE, loop=0, optimize=False)
 

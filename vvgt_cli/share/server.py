@@ -18,9 +18,11 @@ from vvgt_cli.errors import UsageError, VvgtError
 
 ADDRESS = "127.0.0.1"
 NAMES = (ADDRESS, "localhost")  # that a request may know it by; the port is another one behind a tunnel
+_PANELS = "sha256-jHF5hTIlMDyGZRAsNK0HO/WFYrwPvI2I1q0o1xKKB6I="  # event.stopPropagation(), in the viewer's elements
 _HEADERS = {
     "Cache-Control": "no-store",
-    "Content-Security-Policy": "default-src 'none'; script-src 'self' 'wasm-unsafe-eval' blob:; worker-src blob:; "
+    "Content-Security-Policy": "default-src 'none'; "
+    f"script-src 'self' 'unsafe-hashes' '{_PANELS}' blob:; worker-src blob:; "
     "style-src 'unsafe-inline'; img-src data: blob:; connect-src 'self' data: blob:; frame-ancestors 'none'",
     "Cross-Origin-Resource-Policy": "same-origin",
     "Referrer-Policy": "no-referrer",
