@@ -1,6 +1,6 @@
 // page.mjs JOB.json MODULES: a picture of the page of `vvgt view`, or of one in a file, in headless Chromium; nothing but its
 // own address may be asked for. JOB: {"browser", "url", "size", "camera": {"position", "target", "up", "fov"} in the viewer's
-// axes or null for where it begins, "frame": number to go to or null, "out": .png}; prints {"asked": [other URLs], "text": what
+// axes or null for where the page says that it begins, "frame": number to go to or null, "out": .png}; prints {"asked": [other URLs], "text": what
 // the page says, "seconds": from opening to the first picture, "frames": how many the slider has}.
 import fs from 'node:fs';
 import path from 'node:path';
@@ -36,16 +36,12 @@ const shoot = async ({ camera, frame }) => {
   const entity = app.root.findComponent('camera').entity;
   let ready = true, shift = 0;
   app.systems.gsplat.on('frame:ready', (c, layer, isReady, loading) => { ready = isReady && loading === 0; });
-  const place = entity.getPosition().clone(), rotation = entity.getRotation().clone();
-  app.on('update', () => {  // after the viewer's own, which would orbit
-    if (camera) {
-      entity.setPosition(...camera.position);
-      entity.lookAt(...camera.target, ...camera.up);
-      entity.camera.fov = camera.fov;
-    } else {
-      entity.setPosition(place);
-      entity.setRotation(rotation);
-    }
+  const { position, target, up, fov } =
+    camera ?? { ...JSON.parse(document.getElementById('scene').textContent).camera, up: [0, 1, 0] };
+  app.on('update', () => {  // after the viewer's own, which may still be on its way
+    entity.setPosition(...position);
+    entity.lookAt(...target, ...up);
+    entity.camera.fov = fov;
     entity.translateLocal(shift, 0, 0);
   });
   if (frame !== null) await show(frame);
