@@ -10,7 +10,8 @@ const said = document.getElementById('said');
 const scene = JSON.parse(document.getElementById('scene').textContent);
 const off = { enabled: false };
 const settings = {
-  version: 2, tonemapping: 'none', highPrecisionRendering: false, background: { color: [0, 0, 0] },  // true: blurred edges
+  version: 2, tonemapping: 'none', background: { color: [0, 0, 0] },
+  highPrecisionRendering: true,  // 16 bits a channel: nothing is rounded at every splat
   postEffectSettings: {
     sharpness: { ...off, amount: 0 }, bloom: { ...off, intensity: 0.1, blurLevel: 2 },
     grading: { ...off, brightness: 1, contrast: 1, saturation: 1, tint: [1, 1, 1] },
