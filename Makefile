@@ -1,8 +1,8 @@
-# make test | quick | lint | long | viewers | ci
+# make test | quick | lint | long | viewers | page | ci
 VENV ?= .venv-test
 PYTHON ?= python3
 
-.PHONY: test quick lint format long fuzz viewers ci
+.PHONY: test quick lint format long fuzz viewers page ci
 
 $(VENV)/bin/pytest: pyproject.toml constraints.txt
 	[ -x $(VENV)/bin/python ] || $(PYTHON) -m venv $(VENV)
@@ -40,6 +40,10 @@ fuzz: $(VENV)/bin/pytest
 # Files in web viewers (part of `long`): needs Chromium, node and npm; packages go to a cache folder.
 viewers: $(VENV)/bin/pytest
 	$(VENV)/bin/pytest --long -s -rs tests/test_viewers.py
+
+# The viewer that `vvgt view` serves, anew of the npm packages that page/package.json pins; node and npm are needed.
+page:
+	vvgt_cli/share/page/build.sh
 
 ci:
 	.ci/run

@@ -14,6 +14,7 @@ from click.testing import CliRunner
 from report_runs import document
 
 from vvgt_cli.cameras import default_views
+from vvgt_cli.cli.main import run
 from vvgt_cli.dvr import RenderSettings
 from vvgt_cli.images import read_png
 from vvgt_cli.synth import open_volume
@@ -35,7 +36,7 @@ RUN = (
         "plan",
         "refinement",
     ),
-    *("reports", "splat", "training"),
+    *("reports", "share", "splat", "training"),
 )
 SHARED = ("dvr_scenes", "floors", "scans")  # what the others import
 
@@ -243,3 +244,18 @@ def test_what_the_machine_does_at_best(bench):
     assert floors.seconds(lambda: None) < 1
     assert set(floors.alternate({"a": lambda: None, "b": lambda: np.zeros(3)}, 3)) == {"a", "b"}
     assert "threads" in floors.machine()
+
+
+def test_share(bench, scenes, tmp_path):
+    module = bench("share", EDGE=SIZE)
+    options = ["--tf", f"{scenes[1]}/shells.json", "--opacity-unit-distance", "mean-spacing", "--max-gaussians", "60"]
+    target = ["--size", str(SIZE), "-q", "-o", str(tmp_path / "blob.ply")]
+    done = run(["init", f"{scenes[1]}/blob.nrrd", *options, *target])
+    assert done == 0
+    call(module.main, *scenes, tmp_path, "-o", tmp_path / "a.csv", "--pictures", tmp_path / "pictures")
+    rows = {row["format"]: row for row in rows_of(tmp_path / "a.csv")}
+    assert {".ply", ".spz", ".glb", ".html"} <= set(rows)
+    assert abs(float(rows[".glb"]["cost"])) < 0.01
+    assert float(rows[".spz"]["psnr"]) > 10
+    assert (tmp_path / "pictures" / "blob.jpg").stat().st_size > 500
+    assert "| .spz |" in call(module.main, "--table", tmp_path / "a.csv")

@@ -111,3 +111,12 @@ def test_constraints_pin_every_dependency_of_the_package():
     wanted = project["dependencies"] + project["optional-dependencies"]["test"]
     for requirement in wanted:
         assert re.sub(r"[-_.]+", "-", re.match(r"[\w.-]+", requirement)[0]).lower() in names, requirement
+
+
+def test_pictures_of_the_gallery_are_small_and_shown():
+    text = (ROOT / "docs" / "gallery.md").read_text("utf-8")
+    pictures = sorted((ROOT / "docs" / "gallery").iterdir())
+    assert len(pictures) >= 3
+    for picture in pictures:
+        assert f"(gallery/{picture.name})" in text
+        assert picture.stat().st_size < 150_000

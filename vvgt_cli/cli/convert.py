@@ -13,7 +13,13 @@ from vvgt_cli.progress import Console
 
 @click.command("convert", short_help="Volume and transfer function to .ply.")
 @click.argument("volume")
-@click.option("-o", "--output", required=True, metavar="OUT.ply", help="File to write; - is standard output.")
+@click.option(
+    "-o",
+    "--output",
+    required=True,
+    metavar="OUT.ply",
+    help="File to write, in the format of its ending; - is standard output.",
+)
 @fit_options
 @rule_option("Viewers that the file is fitted to: how they draw a Gaussian.", "inria")
 @click.option(
@@ -30,7 +36,9 @@ from vvgt_cli.progress import Console
 @light_options
 @placed_read_options
 @click.option("--report", metavar="R.json", help="Write times and errors of every stage as JSON; - is standard output.")
-@click.option("--preview", metavar="P.png", help="Write reference, ours and difference of three test views.")
+@click.option(
+    "--preview", metavar="P.png", help="Write reference, ours and difference of three test views, at the screen's size."
+)
 @click.option(
     "--checkpoint",
     metavar="FOLDER",
@@ -50,6 +58,9 @@ def command(volume: str, shard: str | None, dry_run: bool, console: Console, **o
     The Gaussians are made for images of --size pixels and scored on three test views that nothing was fitted
     to (ten with --report); the error is printed. --target-psnr, --time-budget and --max-size, any or none,
     decide which stages run; what is left out is said, and why. Ctrl-C ends gradient descent only.
+
+    OUT.ply may end in .html (one file that shows it in a browser), .spz, .compressed.ply, .sog, .glb or .usdc: what the
+    format costs is printed.
 
     With a place for a number in OUT.ply, VOLUME is a time series: a glob of its frames, or one file of several
     time steps. One .ply a frame, under one function and one range of values. The same command again goes on

@@ -13,7 +13,13 @@ from vvgt_cli.progress import Console
 
 @click.command("init", short_help="The closed form alone: no image is rendered.")
 @click.argument("volume")
-@click.option("-o", "--output", required=True, metavar="OUT.ply", help="File to write; - is standard output.")
+@click.option(
+    "-o",
+    "--output",
+    required=True,
+    metavar="OUT.ply",
+    help="File to write, in the format of its ending; - is standard output.",
+)
 @fit_options
 @ply_options
 @tf_options

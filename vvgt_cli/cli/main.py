@@ -23,6 +23,7 @@ COMMANDS = {
     "convert": "vvgt_cli.cli.convert",
     "init": "vvgt_cli.cli.init",
     "optimize": "vvgt_cli.cli.optimize",
+    "view": "vvgt_cli.cli.view",
     "render": "vvgt_cli.cli.render",
     "render-views": "vvgt_cli.cli.render_views",
     "evaluate": "vvgt_cli.cli.evaluate",

@@ -9,7 +9,7 @@ from vvgt_cli.cli.options import common_options, overwrite_option
 from vvgt_cli.progress import Console
 
 
-@click.command("render", short_help="Pictures of a .ply.")
+@click.command("render", short_help="Pictures of a .ply, or a movie.")
 @click.argument("ply", metavar="OUT.ply")
 @click.option("--camera", metavar="FILE", help="Views of a transforms.json (in the unit frame).")
 @click.option("--orbit", type=click.IntRange(1, 10_000), metavar="N", help="N views on a circle around the way up.")
@@ -19,10 +19,17 @@ from vvgt_cli.progress import Console
     metavar="PX",
     help="Image height. Default: the view set's, for an orbit what the .ply is made for, or 400.",
 )
-@click.option("-o", "--output", required=True, metavar="DIR", help="Directory for the images; made if it is not there.")
+@click.option(
+    "-o", "--output", required=True, metavar="DIR|FILE",
+    help="Directory for the images, made if it is not there; or a movie: turn.gif, turn.mp4.",
+)  # fmt: skip
 @click.option("--exr", is_flag=True, help="Write float EXR (premultiplied RGBA) beside each PNG.")
 @click.option(
-    "--background", type=float, nargs=3, metavar="R G B", help="Put the PNG over this colour. Default: transparent."
+    "--background",
+    type=float,
+    nargs=3,
+    metavar="R G B",
+    help="Put pictures over this colour. Default: transparent PNG, black movies.",
 )
 @rule_option("How to draw: as which viewers do. Default: the file's rule, or inria.")
 @overwrite_option
@@ -41,12 +48,14 @@ def command(
 ) -> None:
     """Render the Gaussians of OUT.ply as the standard viewers do, one PNG a view, and a transforms.json.
 
-    OUT.ply may be "-" for standard input. Give the views with --camera or with --orbit. The way up is the one that
-    OUT.ply was made with (--up), else +z.
+    With -o turn.gif or turn.mp4 the views are the pictures of a movie, 25 a second; that of an orbit goes on from its
+    last picture to its first without a jump. OUT.ply may be "-" for standard input. Give the views with --camera or
+    with --orbit. The way up is the one that OUT.ply was made with (--up), else +z.
 
     \b
     Examples:
       vvgt render frog.ply --orbit 36 --size 800 -o turn
+      vvgt render frog.ply --orbit 100 --size 480 -o turn.gif
       vvgt convert example:frog -o - | vvgt render - --orbit 8 -o turn
     """
     from vvgt_cli.errors import UsageError

@@ -17,14 +17,16 @@ from vvgt_cli.conversion.stages.views import wide
 from vvgt_cli.errors import UsageError
 from vvgt_cli.files import check_room
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored
-from vvgt_cli.jit.ahead import CONVERT, INIT, for_degree, for_light
+from vvgt_cli.jit.ahead import CONVERT, EVALUATE, INIT, for_degree, for_light
 from vvgt_cli.network.card import find_model, read_card
 from vvgt_cli.progress import Console
 from vvgt_cli.runs.gaussian_files import write_gaussians
 from vvgt_cli.runs.outputs import STDOUT, check_outputs, claimed, write_text
 from vvgt_cli.runs.place import out_of_box, placed, remarks, way_up
+from vvgt_cli.runs.readback import tell_cost
 from vvgt_cli.runs.record import ConversionReport, Run
 from vvgt_cli.runs.source import Source, SourceRequest, describe_source, load, tf_record, volume_record
+from vvgt_cli.share import format_of
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
@@ -266,6 +268,10 @@ def _write(run: Run, request: ConvertRequest, conversion: Conversion) -> Convers
     report = run.report
     assert request.output is not None
     write_gaussians(run, request.output, conversion.gaussians, conversion.ply, request.overwrite, conversion.normals())
+    if format_of(request.output):
+        run.compile(EVALUATE)
+        volume = conversion.source.volume
+        tell_cost(run, request.output, conversion.gaussians, conversion.ply, conversion.scene, volume)
     if request.preview:
         with run.stage("preview"):
             write_png(request.preview, conversion.preview(), request.overwrite)

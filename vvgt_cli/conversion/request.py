@@ -10,6 +10,7 @@ from vvgt_cli.gaussians import PlyOptions
 from vvgt_cli.runs.outputs import Output
 from vvgt_cli.runs.place import AUTO
 from vvgt_cli.runs.source import SourceRequest
+from vvgt_cli.share import SUFFIXES, format_of
 
 VERTEX_BYTES = 68  # x y z, normals, three colours, opacity, three scales, four of rotation: float32
 HARMONIC_BYTES = {0: 0, 1: 36, 2: 96, 3: 180}  # up to a degree
@@ -91,7 +92,7 @@ class ConvertRequest:
 
     Attributes:
         source: what to read.
-        output: `.ply` to write, "-" for standard output, None for none.
+        output: file to write, of any format of `vvgt_cli.share`, "-" for a `.ply` on standard output, None for none.
         fit: what the Gaussians are made for.
         limits: error, time and size that decide what is done.
         ply: how the file is written; up, the volume's place and the distance are filled in from the source.
@@ -120,8 +121,10 @@ class ConvertRequest:
         """Gaussians that fit.
 
         Raises:
-            UsageError: not one does.
+            UsageError: not one does, or the size of the output's format does not follow from their number.
         """
+        if self.limits.max_megabytes is not None and self.output and format_of(self.output):
+            raise UsageError(f"--max-size is of a .ply, -o {self.output} is none; try --max-gaussians in its place")
         return self.limits.gaussians(self.fit.max_gaussians, self.ply.sh_degree or 0)
 
     @property
@@ -131,7 +134,7 @@ class ConvertRequest:
 
     def outputs(self) -> list[Output]:
         """Everything that will be written."""
-        outputs = [Output("-o", self.output, (".ply",))] if self.output else []
+        outputs = [Output("-o", self.output, SUFFIXES, splats=True)] if self.output else []
         if self.report:
             outputs.append(Output("--report", self.report, (".json",), binary=False))
         if self.preview:

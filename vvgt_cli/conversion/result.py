@@ -17,6 +17,7 @@ from vvgt_cli.runs.place import AUTO, NONE, into_box, preview, upright, way_up
 from vvgt_cli.runs.record import ConversionReport, Stage
 from vvgt_cli.runs.seats import PREVIEW_VIEWS
 from vvgt_cli.runs.source import Source
+from vvgt_cli.share import encoded, format_of
 from vvgt_cli.splat.rules import INRIA, rule_of
 
 if TYPE_CHECKING:
@@ -64,10 +65,10 @@ class Result:
         comments: bool | None = None,
         overwrite: bool = False,
     ) -> int:
-        """Write a standard ``.ply``, whole or not at all.
+        """Write a standard ``.ply``, or another format by the name's ending, whole or not at all.
 
         Args:
-            path: the file.
+            path: the file: ``.ply``, ``.html`` (a page that shows them) or another of `vvgt_cli.share.SUFFIXES`.
             frame: "unit" or "world"; None, here and below: as `ply` says.
             up: what viewers show upwards: a world axis, an anatomical direction, "none" or "auto" (superior in the unit
                 frame of an anatomical space); "auto" where another frame is asked for.
@@ -80,6 +81,7 @@ class Result:
 
         Raises:
             UsageError: the file exists, or a value that is none of these.
+            DataError: a library that the format needs is not installed.
         """
         old, space = self.ply, None if self.ply.space == NONE else self.ply.space
         frame = frame or old.frame
@@ -90,11 +92,14 @@ class Result:
             sh_degree=old.sh_degree if sh_degree is None else sh_degree,
             comments=old.comments if comments is None else comments,
         )
+        known = format_of(path)
         with atomic_write(path, overwrite) as temporary:
-            return write_ply(temporary, self.gaussians, ply, self.normals())
+            if known is None:
+                return write_ply(temporary, self.gaussians, ply, self.normals())
+            return temporary.write_bytes(encoded(known, self.gaussians, ply, os.fspath(path)))
 
     def normals(self) -> np.ndarray | None:
-        """Normals (K, 3) that a file of them has, unit frame; None for zeros."""
+        """Normals (K, 3) that a `.ply` of them has, unit frame; None for zeros."""
         return None
 
     def render(self, camera: Camera | None = None, *, size: int | None = None, rule: str | None = None) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""`.ply` in and out of a run: read into the unit frame, written by a stage, kept elsewhere where writing fails."""
+"""Gaussians in and out of a run: read into the unit frame, written by a stage, kept elsewhere where writing fails."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from vvgt_cli.files import atomic_write, is_stream
 from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions, in_unit_frame, read_ply, write_ply
 from vvgt_cli.runs.outputs import STDOUT
 from vvgt_cli.runs.record import Run
+from vvgt_cli.share import encoded, format_of, read_splats
 from vvgt_cli.splat.rules import INRIA, Rule, rule_of
 from vvgt_cli.volume.types import UnitFrame
 
@@ -32,12 +33,15 @@ def file_rule(header: PlyHeader, asked: str | None = None) -> Rule:
 
 
 def open_gaussians(source: str | BinaryIO) -> tuple[Gaussians, PlyHeader]:
-    """Read a `.ply` (a path, "-" for standard input, or a stream) into the unit frame.
+    """Read Gaussians (a path, "-" for a `.ply` on standard input, or a stream of one) into the unit frame.
 
     Raises:
-        DataError: not a 3DGS `.ply`, or one without Gaussians.
+        DataError: not a file of Gaussians, or one without any.
     """
-    gaussians, header = read_ply(sys.stdin.buffer if source == STDIN else source)
+    if isinstance(source, str) and source != STDIN:
+        gaussians, header = read_splats(source)
+    else:
+        gaussians, header = read_ply(sys.stdin.buffer if isinstance(source, str) else source)
     if not len(gaussians):
         raise DataError(f"{source}: holds no Gaussians; expected at least one")
     return in_unit_frame(gaussians, header), header
@@ -72,7 +76,10 @@ def write_gaussians(
     overwrite: bool,
     normals: np.ndarray | None = None,
 ) -> None:
-    """The stage that writes a `.ply`, or standard output for "-", and records its size; ``normals`` (K, 3)."""
+    """The stage that writes Gaussians in the format of the name, to standard output as a `.ply`; records the size.
+
+    ``normals`` (K, 3) are of a `.ply`.
+    """
     report = run.report
     with run.stage("write") as stage:
         if output == STDOUT:
@@ -87,15 +94,18 @@ def write_gaussians(
 def _write_file(
     output: str, gaussians: Gaussians, options: PlyOptions, overwrite: bool, normals: np.ndarray | None
 ) -> int:
-    """Write a `.ply`; where that fails, put it elsewhere and say so: it may have taken hours."""
+    """Write a file; where that fails, put a `.ply` elsewhere and say so: it may have taken hours."""
     if is_stream(output):
         with open(output, "ab") as stream:
             return write_ply(stream, gaussians, options, normals)
+    known = format_of(output)
     try:
         with atomic_write(output, overwrite) as temporary:
-            return write_ply(temporary, gaussians, options, normals)
+            if known is None:
+                return write_ply(temporary, gaussians, options, normals)
+            return temporary.write_bytes(encoded(known, gaussians, options, output))
     except VvgtError as error:
-        if isinstance(error, DataError) and not isinstance(error.__cause__, OSError):
+        if known is None and isinstance(error, DataError) and not isinstance(error.__cause__, OSError):
             raise  # these Gaussians cannot be written anywhere
         place = _elsewhere(Path(output), gaussians, options, normals)
         if place is None:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from vvgt_cli.errors import UsageError
 from vvgt_cli.files import atomic_write, check_room, check_target, claim, is_stream
+from vvgt_cli.share import ready
 
 STDOUT = "-"
 SMALLEST = 4096  # bytes: a disk that has not got them takes no file
@@ -25,12 +26,14 @@ class Output:
         path: a path, or "-" for standard output.
         suffixes: names it may end in; none: any.
         binary: not for a terminal.
+        splats: Gaussians, whose format may need a library.
     """
 
     option: str
     path: str
     suffixes: tuple[str, ...] = ()
     binary: bool = True
+    splats: bool = False
 
 
 def _check_one(output: Output, overwrite: bool) -> None:
@@ -41,7 +44,7 @@ def _check_one(output: Output, overwrite: bool) -> None:
     path = Path(output.path)
     if is_stream(path):
         return
-    if output.suffixes and path.suffix.lower() not in output.suffixes:
+    if output.suffixes and not path.name.lower().endswith(output.suffixes):
         raise UsageError(f"{output.option} {path}: expected a name ending in {' or '.join(output.suffixes)}")
     try:
         check_target(path, overwrite)
@@ -50,6 +53,8 @@ def _check_one(output: Output, overwrite: bool) -> None:
     if not os.access(path.parent, os.W_OK):
         raise UsageError(f"{output.option} {path}: directory {path.parent} is not writable")
     check_room(path, SMALLEST)
+    if output.splats:
+        ready(path)
 
 
 def check_outputs(outputs: Sequence[Output], inputs: Sequence[str | None], overwrite: bool) -> None:
@@ -62,7 +67,7 @@ def check_outputs(outputs: Sequence[Output], inputs: Sequence[str | None], overw
 
     Raises:
         UsageError: exists, is an input, two outputs in one place, no such directory, wrong ending, a terminal.
-        DataError: the disk is full.
+        DataError: the disk is full, or a library that a format needs is not installed.
     """
     taken: dict[str, str] = {}
     sources = {os.path.realpath(path) for path in inputs if path and path != STDOUT}

@@ -13,6 +13,7 @@ from vvgt_cli.cameras.files import read_cameras
 from vvgt_cli.files import seekable
 from vvgt_cli.gaussians import describe, read_ply
 from vvgt_cli.runs.gaussian_files import STDIN
+from vvgt_cli.share import format_of, read_splats
 from vvgt_cli.transfer.readers import SUFFIXES
 from vvgt_cli.volume import ReadOptions
 from vvgt_cli.volume.space import axis_facts
@@ -37,8 +38,10 @@ def inspect(file: str, read: ReadOptions) -> dict[str, Any]:
     name = Path(file)
     with path.open("rb") as stream:
         head = stream.read(_HEAD)
-    if head.startswith(_PLY):
-        return {"kind": "gaussians", "name": name.name, **describe(*read_ply(path))}
+    known = format_of(name)
+    if head.startswith(_PLY) or known:
+        facts = {"kind": "gaussians", "name": name.name, **describe(*read_splats(file))}
+        return facts | ({"bytes": path.stat().st_size, "format": known.suffix} if known else {})
     if name.suffix.lower() in SUFFIXES or head.lstrip()[:1] in (b"{", b"["):
         if b'"frames"' in head:
             return _views(name)

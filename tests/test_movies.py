@@ -1,0 +1,110 @@
+"""Turntables: every picture is there, in order and in time, and the last leads to the first."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from vvgt_cli.cameras import orbit_views
+from vvgt_cli.errors import DataError
+from vvgt_cli.gaussians import Gaussians, PlyOptions, write_ply
+from vvgt_cli.images.movies import write_movie
+from vvgt_cli.metrics import psnr
+from vvgt_cli.splat import render
+
+
+@pytest.fixture
+def ply(tmp_path):
+    rng = np.random.default_rng(2)
+    means = rng.uniform(-0.7, 0.7, (40, 3))
+    colors = np.round(rng.uniform(0, 1, (40, 3)))
+    gaussians = Gaussians(means, np.full((40, 3), -2.2), np.tile((1, 0, 0, 0), (40, 1)), np.full(40, 3), colors)
+    write_ply(tmp_path / "a.ply", gaussians, PlyOptions(made_for=64))
+    return gaussians, tmp_path / "a.ply"
+
+
+def gif(path):
+    """Pictures (n, h, w, 3) in [0, 1] and the milliseconds of each."""
+    with Image.open(path) as image:
+        times, pictures = [], []
+        for k in range(image.n_frames):
+            image.seek(k)
+            pictures.append(np.asarray(image.convert("RGB"), np.float32) / 255)
+            times.append(image.info["duration"])
+        return np.stack(pictures), times, image.info.get("loop")
+
+
+def mp4(path):
+    import imageio_ffmpeg
+
+    reader = imageio_ffmpeg.read_frames(str(path))
+    about = next(reader)
+    width, height = about["size"]
+    frames = [np.frombuffer(frame, np.uint8).reshape(height, width, 3) for frame in reader]
+    return np.stack(frames) / np.float32(255), about
+
+
+def even_steps(pictures):
+    """Whether the step from the last picture to the first is like all others."""
+    steps = [float(((a - b) ** 2).mean()) for a, b in zip(pictures, np.roll(pictures, -1, axis=0), strict=True)]
+    return min(steps) > 0 and steps[-1] < 1.5 * max(steps[:-1]) and steps[-1] > 0.5 * min(steps[:-1])
+
+
+def test_a_gif_of_an_orbit_repeats_without_a_jump(ply, tmp_path, vvgt):
+    gaussians, path = ply
+    result = vvgt("render", path, "--orbit", 20, "-o", tmp_path / "turn.gif")
+    assert result.code == 0, result.err
+    assert "0.8 s" in result.err
+    pictures, times, loop = gif(tmp_path / "turn.gif")
+    assert pictures.shape == (20, 64, 64, 3)
+    assert (set(times), loop) == ({40}, 0)
+    for k, camera in enumerate(orbit_views(20, size=64)):
+        assert psnr(render(gaussians, camera)[..., :3], pictures[k]) > 28
+    assert even_steps(pictures)
+    assert not even_steps(pictures[:15])
+    assert list(tmp_path.glob("*.json")) == []
+
+
+def test_an_mp4_of_an_orbit_over_white(ply, tmp_path, vvgt):
+    pytest.importorskip("imageio_ffmpeg")
+    result = vvgt("render", ply[1], "--orbit", 10, "--size", 65, "--background", 1, 1, 1, "-o", tmp_path / "turn.mp4")
+    assert result.code == 0, result.err
+    pictures, about = mp4(tmp_path / "turn.mp4")
+    assert pictures.shape == (10, 66, 66, 3)
+    assert about["fps"] == 25
+    assert about["codec"] == "h264"
+    assert pictures[:, :3, :3].min() > 0.95  # corners are background
+    assert even_steps(pictures)
+
+
+def test_movies_are_not_replaced_unasked(ply, tmp_path, vvgt):
+    (tmp_path / "turn.gif").write_bytes(b"old")
+    assert "exists" in vvgt("render", ply[1], "--orbit", 2, "-o", tmp_path / "turn.gif").error
+    assert vvgt("render", ply[1], "--orbit", 2, "--overwrite", "-o", tmp_path / "turn.gif").code == 0
+    assert len(gif(tmp_path / "turn.gif")[0]) == 2
+
+
+def test_bad_calls_are_one_line(ply, tmp_path, vvgt, monkeypatch):
+    assert (
+        "--exr is of single pictures" in vvgt("render", ply[1], "--orbit", 2, "--exr", "-o", tmp_path / "a.gif").error
+    )
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    result = vvgt("render", ply[1], "--orbit", 2, "-o", tmp_path / "a.mp4")
+    assert result.code == 1
+    assert "pip install 'vvgt[share]'" in result.error
+    assert "read" not in result.err.replace(result.error, "")
+
+
+def test_what_ffmpeg_cannot_do_is_told(tmp_path):
+    pytest.importorskip("imageio_ffmpeg")
+
+    def pictures():
+        yield np.zeros((16, 16, 3), np.float32)
+        raise OSError("ffmpeg went away")
+
+    with pytest.raises(DataError, match="ffmpeg went away"):
+        write_movie(tmp_path / "a.mp4", pictures())
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,62 @@
+// page.mjs JOB.json MODULES: a picture of the page of `vvgt view`, or of one in a file, in headless Chromium; nothing but its
+// own address may be asked for. JOB: {"browser", "url", "size", "camera": {"position", "target", "up", "fov"} in the viewer's
+// axes or null for where the page says that it begins, "frame": number to go to or null, "out": .png}; prints {"asked": [other URLs], "text": what
+// the page says, "seconds": from opening to the first picture, "frames": how many the slider has}.
+import fs from 'node:fs';
+import path from 'node:path';
+import { createRequire } from 'node:module';
+import { fileURLToPath } from 'node:url';
+
+const [jobFile, modules] = process.argv.slice(2);
+const { chromium } = createRequire(path.join(modules, 'x.js'))('playwright-core');
+const job = JSON.parse(fs.readFileSync(jobFile));
+const args = ['--no-sandbox', '--use-angle=swiftshader', '--enable-unsafe-swiftshader', '--ignore-gpu-blocklist',
+  '--disable-background-networking', '--disable-component-update', '--disable-sync', '--no-first-run',
+  '--force-color-profile=srgb'];
+const browser = await chromium.launch({ executablePath: job.browser, args });
+const page = await browser.newPage({ viewport: { width: job.size, height: job.size }, deviceScaleFactor: 1 });
+page.setDefaultTimeout(600000);
+const asked = [], own = job.url.startsWith('file:') ? job.url : new URL(job.url).origin + '/';
+await page.route((url) => /^(https?|wss?):/.test(url.href) && !url.href.startsWith(own), (route) => {
+  asked.push(route.request().url());
+  return route.abort();
+});
+const broken = new Promise((_, fail) => { page.on('pageerror', (error) => fail(error)); });
+page.on('console', (message) => { if (message.type() === 'error') console.error(message.text()); });
+const begin = Date.now();
+await page.goto(job.url);
+const there = 'window.vvgt !== undefined || document.getElementById("said").textContent !== "loading"';
+while (!await Promise.race([broken, page.evaluate(there)])) await new Promise((done) => setTimeout(done, 200));
+if (!await page.evaluate('window.vvgt !== undefined')) {
+  throw new Error(await page.evaluate('document.getElementById("said").textContent'));
+}
+const seconds = (Date.now() - begin) / 1000;
+const shoot = async ({ camera, frame }) => {
+  const { viewer, show } = window.vvgt, { app } = viewer, canvas = app.graphicsDevice.canvas;
+  const entity = app.root.findComponent('camera').entity;
+  let ready = true, shift = 0;
+  app.systems.gsplat.on('frame:ready', (c, layer, isReady, loading) => { ready = isReady && loading === 0; });
+  const { position, target, up, fov } =
+    camera ?? { ...JSON.parse(document.getElementById('scene').textContent).camera, up: [0, 1, 0] };
+  app.on('update', () => {  // after the viewer's own, which may still be on its way
+    entity.setPosition(...position);
+    entity.lookAt(...target, ...up);
+    entity.camera.fov = fov;
+    entity.translateLocal(shift, 0, 0);
+  });
+  if (frame !== null) await show(frame);
+  document.querySelectorAll('.sse-ui, #series').forEach((element) => { element.style.display = 'none'; });
+  return settled((by) => { shift = by; }, () => new Promise((done) => {
+    app.renderNextFrame = true;
+    app.once('frameend', () => done(canvas.toDataURL('image/png')));
+  }), () => ready);
+};
+// as the debugger's expression: the page's own policy lets no foreign script in
+const settled = fs.readFileSync(path.join(path.dirname(fileURLToPath(import.meta.url)), 'settled.mjs'), 'utf8');
+const expression = `${settled.replaceAll('export ', '')}; (${shoot})(${JSON.stringify(job)})`;
+const url = await Promise.race([broken, page.evaluate(expression)]);
+fs.writeFileSync(job.out, Buffer.from(url.split(',')[1], 'base64'));
+const text = await page.evaluate(() => document.getElementById('said').textContent);
+const frames = await page.evaluate(() => Number(document.querySelector('#series input')?.max ?? 0) + 1);
+console.log(JSON.stringify({ asked, text, seconds, frames }));
+await browser.close();

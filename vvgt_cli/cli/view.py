@@ -1,0 +1,61 @@
+"""`vvgt view`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import click
+
+from vvgt_cli.cli.options import common_options, overwrite_option, placed_read_options, tf_options
+from vvgt_cli.progress import Console
+
+
+@click.command("view", short_help="Gaussians, or a volume, in a browser; or as a page to send.")
+@click.argument("files", metavar="FILE...", nargs=-1, required=True)
+@click.option(
+    "-o", "--output", metavar="OUT.html",
+    help="Write instead of showing: a page that opens by itself, or another format, by the name's ending.",
+)  # fmt: skip
+@click.option(
+    "--port", type=click.IntRange(1, 65535), metavar="N", help="Of the server, for tunnels. Default: one that is free."
+)
+@click.option("--no-browser", "browser", is_flag=True, default=True, flag_value=False, help="Only print the address.")
+@tf_options
+@placed_read_options
+@overwrite_option
+@common_options
+def command(
+    files: tuple[str, ...],
+    output: str | None,
+    port: int | None,
+    browser: bool,
+    read: dict[str, Any],
+    optics: dict[str, Any],
+    overwrite: bool,
+    console: Console,
+) -> None:
+    """Show FILE, a .ply or another file of Gaussians, in a browser; a volume is converted first.
+
+    A server on this machine's own address (127.0.0.1) hands the page to the browser, and to nobody else; nothing
+    comes from the network. The address is printed; Ctrl-C ends. Several files, or a glob, are a series: a slider
+    goes through them.
+
+    With -o nothing is shown: OUT.html holds viewer and Gaussians and opens by double click; .spz, .compressed.ply,
+    .sog, .glb and .usdc are for other programs. What the format costs is printed.
+
+    \b
+    Examples:
+      vvgt view frog.ply
+      vvgt view example:frog
+      vvgt view 'run/*.ply' --port 8000 --no-browser
+      vvgt view frog.ply -o frog.html
+    """
+    from vvgt_cli.cli.fit import source_request
+    from vvgt_cli.errors import UsageError
+    from vvgt_cli.tasks.view import ViewRequest, view
+
+    if output is not None and (port is not None or not browser):
+        raise UsageError("-o writes a file and serves nothing: leave --port and --no-browser out")
+    source = source_request(files[0], read, optics)
+    request = ViewRequest(files, source, output, port or 0, browser, overwrite)
+    view(request, lambda url: click.echo(url), console)

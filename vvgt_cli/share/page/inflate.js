@@ -1,0 +1,10 @@
+// Of a page in one file: the viewer's program, packed, becomes a script.
+(async () => {
+  const text = atob(document.getElementById('program').textContent), packed = new Uint8Array(text.length);
+  for (let i = 0; i < text.length; i++) packed[i] = text.charCodeAt(i);
+  const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream('gzip'));
+  const script = document.createElement('script');
+  script.textContent = await new Response(stream).text();
+  document.getElementById('program').remove();
+  document.body.append(script);
+})().catch((error) => { document.getElementById('said').textContent = `This browser does not show it: ${error}`; });

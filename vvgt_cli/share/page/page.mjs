@@ -1,0 +1,137 @@
+// The page of `vvgt view` and of `-o out.html`: SuperSplat's viewer, its camera where `vvgt render --orbit` begins, and a
+// slider where there are several frames. Splats are drawn by the file's rule (docs/viewers.md). `make page` bundles it with its packages to viewer.js.gz.
+import css from '@playcanvas/supersplat-viewer/viewer.css';
+import { createViewer } from '@playcanvas/supersplat-viewer/viewer';
+import { Asset, SHADERLANGUAGE_GLSL, ShaderChunks } from 'playcanvas';
+
+const KEPT = 16;  // frames of a series that stay in memory
+const PAUSE = 200;  // milliseconds from one frame of a series to the next
+const said = document.getElementById('said');
+const scene = JSON.parse(document.getElementById('scene').textContent);
+const off = { enabled: false };
+const settings = {
+  version: 2, tonemapping: 'none', background: { color: [0, 0, 0] },
+  highPrecisionRendering: true,  // 16 bits a channel: nothing is rounded at every splat
+  postEffectSettings: {
+    sharpness: { ...off, amount: 0 }, bloom: { ...off, intensity: 0.1, blurLevel: 2 },
+    grading: { ...off, brightness: 1, contrast: 1, saturation: 1, tint: [1, 1, 1] },
+    vignette: { ...off, intensity: 0.5, inner: 0.3, outer: 0.75, curvature: 1 }, fringing: { ...off, intensity: 0.5 },
+  },
+  animTracks: [], annotations: [], startMode: 'default', cameras: [{ initial: scene.camera }],
+};
+
+// what the file itself holds (base64), or the server's answer
+function content(frame) {
+  const held = document.getElementById('splats');
+  if (!held) return fetch(frame.file);
+  const text = atob(held.textContent), bytes = new Uint8Array(text.length);
+  for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i);
+  held.remove();
+  return Promise.resolve(new Response(bytes));
+}
+
+// The engine's shaders count in half pixels: their 0.3 is 0.075 px^2. Splats are drawn after this and the first content.
+function draw(app, { dilation, shifted }) {
+  const chunks = ShaderChunks.get(app.graphicsDevice, SHADERLANGUAGE_GLSL);
+  const change = (name, old, now) => {
+    const text = chunks.get(name);
+    if (!text.includes(old)) throw new Error(`${name} of the engine is another one`);
+    chunks.set(name, text.replaceAll(old, now));
+  };
+  change('gsplatCornerVS', '+ 0.3', `+ ${(4 * dilation).toFixed(6)}`);
+  if (!shifted) change('gsplatPS', '(exp(x * -4.0) - EXP4) * INV_EXP4', 'exp(x * -4.0)');
+}
+
+function series(viewer) {
+  const { app } = viewer, entity = app.root.findByName('gsplat');
+  const assets = new Map([[0, Promise.resolve(app.assets.get(entity.gsplat.asset))]]);  // by frame, the last used last
+  const box = document.createElement('div');
+  box.id = 'series';
+  box.innerHTML = '<button>▶</button><input type="range" min="0" value="0" aria-label="frame"><span></span>';
+  const [button, slider, name] = box.children;
+  slider.max = scene.frames.length - 1;
+  document.body.append(box);
+  let wanted = 0, playing = false;
+
+  function loaded(k) {
+    if (!assets.has(k)) {
+      const { file } = scene.frames[k];
+      assets.set(k, new Promise((done, fail) => {
+        const asset = new Asset(file, 'gsplat', { url: file, filename: file });
+        asset.once('load', () => done(asset));
+        asset.once('error', fail);
+        app.assets.add(asset);
+        app.assets.load(asset);
+      }));
+    }
+    const asset = assets.get(k);
+    assets.delete(k);
+    assets.set(k, asset);
+    return asset;
+  }
+
+  async function show(k) {
+    wanted = k;
+    slider.value = k;
+    name.textContent = scene.frames[k].name;
+    try {
+      const asset = await loaded(k);
+      if (wanted !== k) return;
+      entity.gsplat.asset = asset.id;
+      app.renderNextFrame = true;
+      said.textContent = '';
+    } catch (error) {
+      assets.delete(k);
+      said.textContent = `${scene.frames[k].name} cannot be read: ${error}`;
+    }
+    while (assets.size > KEPT) {
+      const [old, gone] = assets.entries().next().value;
+      assets.delete(old);
+      gone.then((asset) => { app.assets.remove(asset); asset.unload(); }, () => {});
+    }
+  }
+
+  async function play() {
+    while (playing) {
+      const next = (wanted + 1) % scene.frames.length, begin = performance.now();
+      await loaded(next).catch(() => {});
+      await new Promise((done) => setTimeout(done, Math.max(0, PAUSE - (performance.now() - begin))));
+      if (playing) await show(next);
+    }
+  }
+
+  slider.addEventListener('input', () => show(Number(slider.value)));
+  button.addEventListener('click', () => {
+    playing = !playing;
+    button.textContent = playing ? '❚❚' : '▶';
+    if (playing) play();
+  });
+  name.textContent = scene.frames[0].name;
+  return show;
+}
+
+async function start() {
+  const style = document.createElement('style');
+  style.textContent = css;
+  document.head.append(style);
+  const { file } = scene.frames[0];
+  const response = await content(scene.frames[0]);
+  if (!response.ok) throw new Error(`${scene.frames[0].name} cannot be read`);
+  let deliver;
+  const viewer = await createViewer({
+    container: document.getElementById('view'), contentUrl: file, contentFilename: file, settings,
+    contents: new Promise((done) => { deliver = done; }), aa: scene.rule.compensate,
+    renderer: 'webgl',  // the one whose pictures are measured; WebGPU leaves more splats out
+  });
+  draw(viewer.app, scene.rule);
+  viewer.app.scene.gsplat.alphaClipForward = scene.rule.minAlpha;
+  viewer.app.scene.gsplat.minPixelSize = Math.sqrt(32 * scene.rule.minVariance);
+  deliver(response);
+  if (!viewer.state.loaded) await new Promise((done) => viewer.events.once('loaded:changed', done));
+  said.textContent = '';
+  window.vvgt = { viewer, show: scene.frames.length > 1 ? series(viewer) : null };
+}
+
+start().catch((error) => {
+  said.textContent = `This browser does not show it: ${error.message ?? error}`;
+});

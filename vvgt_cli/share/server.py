@@ -1,0 +1,160 @@
+"""The server of `vvgt view`: on this machine's own address, one page and its files, for the browser that has its name.
+
+Other users of the machine, and other pages in the browser, can reach the port too. So the page's path has a random
+part, and what does not name this host, comes from another page, or asks for anything else gets nothing.
+"""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from threading import Thread
+from urllib.parse import urlsplit
+
+from vvgt_cli.errors import UsageError, VvgtError
+
+ADDRESS = "127.0.0.1"
+NAMES = (ADDRESS, "localhost")  # that a request may know it by; the port is another one behind a tunnel
+_PANELS = "sha256-jHF5hTIlMDyGZRAsNK0HO/WFYrwPvI2I1q0o1xKKB6I="  # event.stopPropagation(), in the viewer's elements
+_HEADERS = {
+    "Cache-Control": "no-store",
+    "Content-Security-Policy": "default-src 'none'; "
+    f"script-src 'self' 'unsafe-hashes' '{_PANELS}' blob:; worker-src blob:; "
+    "style-src 'unsafe-inline'; img-src data: blob:; connect-src 'self' data: blob:; frame-ancestors 'none'",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+}
+
+
+@dataclass(frozen=True)
+class Part:
+    """What stands at a path.
+
+    Attributes:
+        kind: media type.
+        content: called for each request.
+        packed: by gzip, as browsers unpack it.
+    """
+
+    kind: str
+    content: Callable[[], bytes]
+    packed: bool = False
+
+
+@dataclass(frozen=True)
+class Site:
+    """Parts by name; "" is the page.
+
+    Attributes:
+        parts: what there is.
+        failed: is told what went wrong with a part.
+        word: random part of the paths.
+    """
+
+    parts: dict[str, Part]
+    failed: Callable[[str], None]
+    word: str = field(default_factory=lambda: secrets.token_urlsafe(12))
+
+    def part(self, path: str) -> Part | None:
+        """What stands at a path of a request, to the letter."""
+        return self.parts.get(path.removeprefix(f"/{self.word}/")) if path.startswith(f"/{self.word}/") else None
+
+
+@contextmanager
+def served(site: Site, port: int = 0) -> Iterator[str]:
+    """Serve a site within the block.
+
+    Args:
+        site: the page and its files.
+        port: 0 takes one that is free.
+
+    Yields:
+        URL of the page.
+
+    Raises:
+        UsageError: the port is taken, or not allowed.
+    """
+    handler = type("Handler", (_Handler,), {"site": site})
+    try:
+        server = _Server((ADDRESS, port), handler)
+    except OSError as error:
+        raise UsageError(f"--port {port}: {error.strerror or error}; try another, or leave it out") from None
+    thread = Thread(target=server.serve_forever, kwargs={"poll_interval": 0.1}, daemon=True)
+    thread.start()
+    try:
+        yield f"http://{ADDRESS}:{server.server_address[1]}/{site.word}/"
+    finally:
+        server.shutdown()
+        server.server_close()
+
+
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True  # a browser that does not read on keeps nobody waiting
+    block_on_close = False
+
+    def handle_error(self, request: object, client_address: object) -> None:
+        """A browser that goes away in the middle is none."""
+
+
+class _Handler(BaseHTTPRequestHandler):
+    site: Site
+    protocol_version = "HTTP/1.1"
+    timeout = 60
+
+    def do_GET(self) -> None:
+        part = self.site.part(self.path) if self._ours() else None
+        if part is None:
+            self.send_error(404 if self._ours() else 403)
+            return
+        try:
+            content = part.content()
+        except (VvgtError, OSError) as error:
+            self.site.failed(str(error))
+            self.send_error(500)
+            return
+        self.send_response_only(200)
+        self.send_header("Content-Type", part.kind)
+        self.send_header("Content-Length", str(len(content)))
+        if part.packed:
+            self.send_header("Content-Encoding", "gzip")
+        for name, value in _HEADERS.items():
+            self.send_header(name, value)
+        self.end_headers()
+        if self.command != "HEAD":
+            self.wfile.write(content)
+
+    do_HEAD = do_GET
+
+    def _ours(self) -> bool:
+        """Whether a request names this machine, and comes from the page itself or from nowhere."""
+        host = self.headers.get("Host", "")
+        origin = self.headers.get("Origin")
+        if _name(f"http://{host}") not in NAMES or self.headers.get("Sec-Fetch-Site", "none") not in (
+            "none",
+            "same-origin",
+        ):
+            return False
+        return origin is None or origin == f"http://{host}"
+
+    def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
+        """A status and nothing else; what was sent along is not read."""
+        self.close_connection = True
+        self.send_response_only(405 if code == 501 else code)  # of a method that there is not
+        self.send_header("Content-Length", "0")
+        self.send_header("Connection", "close")
+        self.end_headers()
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Requests are not talked about."""
+
+
+def _name(url: str) -> str | None:
+    try:
+        parts = urlsplit(url)
+        return parts.hostname if parts.username is None and not parts.path else None
+    except ValueError:
+        return None

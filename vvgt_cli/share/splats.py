@@ -1,0 +1,132 @@
+"""The columns of a standard `.ply`, which every other format holds in its own way: out of one, and back into one."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions, read_ply, write_ply
+from vvgt_cli.gaussians.header import parse_header
+from vvgt_cli.gaussians.ply import property_names
+
+HARMONICS = {0: 0, 1: 3, 2: 8, 3: 15}  # a channel, above degree 0
+DEGREES = {count: degree for degree, count in HARMONICS.items()}
+
+
+@dataclass(frozen=True)
+class Splats:
+    """K Gaussians as a standard `.ply` holds them (docs/conventions.md), in the frame and the turn of the file.
+
+    Attributes:
+        means: (K, 3) float32.
+        log_scales: (K, 3) float32, natural logarithms.
+        quaternions: (K, 4) float32, (w, x, y, z), of norm 1.
+        logits: (K,) float32, of opacity.
+        f_dc: (K, 3) float32, harmonics of degree 0.
+        f_rest: (K, M, 3) float32, harmonics above, M = 0, 3, 8 or 15.
+        comments: lines of the header, without the word.
+    """
+
+    means: np.ndarray
+    log_scales: np.ndarray
+    quaternions: np.ndarray
+    logits: np.ndarray
+    f_dc: np.ndarray
+    f_rest: np.ndarray
+    comments: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    def take(self, order: np.ndarray) -> Splats:
+        """A permutation or a part of them."""
+        names = ("means", "log_scales", "quaternions", "logits", "f_dc", "f_rest")
+        return replace(self, **{name: getattr(self, name)[order] for name in names})
+
+
+def splats_of(gaussians: Gaussians, options: PlyOptions) -> Splats:
+    """What `write_ply` would write.
+
+    Raises:
+        DataError, UsageError: as `write_ply`.
+    """
+    stream = io.BytesIO()
+    write_ply(stream, gaussians, options)
+    return columns_of(stream.getvalue(), "Gaussians")
+
+
+def columns_of(content: bytes, name: str) -> Splats:
+    """The columns of a standard `.ply`.
+
+    Raises:
+        DataError: another file.
+    """
+    header = parse_header(content[: 1 << 16], name)
+    rows = np.frombuffer(content, header.dtype, header.count, header.size)
+
+    def columns(*names: str) -> np.ndarray:
+        return np.stack([rows[name] for name in names], axis=-1)
+
+    rest = [f"f_rest_{k}" for k in range(3 * HARMONICS[header.sh_degree])]
+    f_rest = columns(*rest) if rest else np.zeros((header.count, 0), np.float32)
+    quaternions = columns("rot_0", "rot_1", "rot_2", "rot_3").astype(np.float64)
+    quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
+    return Splats(
+        columns("x", "y", "z"),
+        columns("scale_0", "scale_1", "scale_2"),
+        quaternions.astype(np.float32),
+        rows["opacity"].copy(),
+        columns("f_dc_0", "f_dc_1", "f_dc_2"),
+        np.ascontiguousarray(f_rest.reshape(header.count, 3, -1).transpose(0, 2, 1)),
+        header.comments,
+    )
+
+
+def ply_bytes(splats: Splats) -> bytes:
+    """A standard `.ply` of the columns."""
+    count, degree = len(splats), DEGREES[splats.f_rest.shape[1]]
+    names = property_names(degree)
+    rows = np.zeros((count, len(names)), "<f4")
+    rest = splats.f_rest.transpose(0, 2, 1).reshape(count, -1)
+    rows[:, :3], rows[:, 6:9], rows[:, 9 : 9 + rest.shape[1]] = splats.means, splats.f_dc, rest
+    rows[:, -8], rows[:, -7:-4], rows[:, -4:] = splats.logits, splats.log_scales, splats.quaternions
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+    lines += [f"property float {name}" for name in names] + [f"comment {line}" for line in splats.comments]
+    return "\n".join([*lines, "end_header", ""]).encode() + rows.tobytes()
+
+
+def gaussians_of(splats: Splats, name: str) -> tuple[Gaussians, PlyHeader]:
+    """As `read_ply` reads a file of these columns.
+
+    Raises:
+        DataError: values that are not finite, comments that are not ours.
+    """
+    stream = io.BytesIO(ply_bytes(splats))
+    stream.name = name
+    return read_ply(stream)
+
+
+def opacities_of(logits: np.ndarray) -> np.ndarray:
+    """Opacity (K,) float32 of logits."""
+    result: np.ndarray = (1 / (1 + np.exp(-np.clip(logits.astype(np.float64), -700, 700)))).astype(np.float32)
+    return result
+
+
+def logits_of(opacities: np.ndarray) -> np.ndarray:
+    """Logits (K,) float32 of opacity; 0 and 1, whose logits are infinite, are taken as 1e-7 from there."""
+    some = np.clip(opacities.astype(np.float64), 1e-7, 1 - 1e-7)
+    result: np.ndarray = (np.log(some) - np.log1p(-some)).astype(np.float32)
+    return result
+
+
+def near_each_other(means: np.ndarray) -> np.ndarray:
+    """An order (K,) along Morton's curve: neighbours in the list are neighbours in space."""
+    low, high = means.min(axis=0), means.max(axis=0)
+    cells = ((means - low) / np.maximum(high - low, 1e-30) * 1023).astype(np.uint32)
+    code = np.zeros(len(means), np.uint32)
+    for bit in range(10):
+        for axis in range(3):
+            code |= ((cells[:, axis] >> bit) & 1) << np.uint32(3 * bit + axis)
+    return np.argsort(code, kind="stable")

@@ -1,0 +1,152 @@
+"""`view`: Gaussians in a browser, from a server on this machine, or written as what others can open."""
+
+from __future__ import annotations
+
+import io
+import os
+import sys
+import webbrowser
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from threading import Event
+
+from vvgt_cli.errors import UsageError
+from vvgt_cli.gaussians import Gaussians, PlyOptions, write_ply
+from vvgt_cli.jit.ahead import DRAW
+from vvgt_cli.progress import Console
+from vvgt_cli.runs.gaussian_files import STDIN, layout_of, open_gaussians, write_gaussians
+from vvgt_cli.runs.outputs import Output, claimed
+from vvgt_cli.runs.readback import tell_agreement
+from vvgt_cli.runs.record import ConversionReport, Run
+from vvgt_cli.runs.source import SourceRequest
+from vvgt_cli.share import SUFFIXES, is_splats
+from vvgt_cli.share.page_file import PROGRAM, asset, page, upright
+from vvgt_cli.share.server import Part, Site, served
+from vvgt_cli.share.splats import columns_of
+from vvgt_cli.volume import ReadOptions
+from vvgt_cli.volume.slices import matching
+
+
+@dataclass(frozen=True)
+class ViewRequest:
+    """What to show.
+
+    Attributes:
+        files: of Gaussians, or globs of them; several are a series. Or one volume.
+        source: how to read the volume, and its function; of files of Gaussians as it is by default.
+        output: file to write in place of showing, None for none.
+        port: of the server; 0 takes a free one.
+        browser: open one, where there is a display.
+        overwrite: replace the file if it exists.
+    """
+
+    files: tuple[str, ...]
+    source: SourceRequest
+    output: str | None = None
+    port: int = 0
+    browser: bool = True
+    overwrite: bool = False
+
+
+def view(request: ViewRequest, announce: Callable[[str], None], console: Console | None = None) -> None:
+    """Show Gaussians until an interrupt, or write them.
+
+    Args:
+        request: what and how.
+        announce: is told the page's URL, once it can be opened.
+        console: for talk.
+
+    Raises:
+        UsageError: several volumes, options of volumes with files of Gaussians, a port or an output that cannot be.
+        DataError: a file that is not what it must be.
+    """
+    run = Run(console or Console(), ConversionReport("view"))
+    files = expanded(request.files)
+    if request.output is None:
+        _serve(run, request, files, announce)
+        return
+    if len(files) > 1:
+        raise UsageError(f"-o {request.output} is of one file, got {len(files)}; write them one by one")
+    with claimed([Output("-o", request.output, SUFFIXES, splats=True)], files, request.overwrite):
+        gaussians, options = _opened(run, request, files[0])
+        write_gaussians(run, request.output, gaussians, options, request.overwrite)
+        run.compile(DRAW)
+        tell_agreement(run, request.output, gaussians, options)
+
+
+def expanded(names: Sequence[str]) -> list[str]:
+    """Files of names and globs; those of a glob by the numbers in their names.
+
+    Raises:
+        UsageError: a glob that matches nothing.
+    """
+    files: list[str] = []
+    for name in names:
+        found = [] if os.path.exists(name) or not set(name) & set("*?[") else [str(path) for path in matching(name)]
+        if not found and set(name) & set("*?[") and not os.path.exists(name):
+            raise UsageError(f"{name}: no such files; expected files of Gaussians ({', '.join(SUFFIXES)}), or a volume")
+        files += found if any(map(is_splats, found)) else [name]  # a glob may be a volume: slices
+    return files
+
+
+def _opened(run: Run, request: ViewRequest, name: str) -> tuple[Gaussians, PlyOptions]:
+    """Gaussians in the unit frame and how a file of them is laid out; a volume is converted."""
+    given = request.source
+    if name == STDIN or is_splats(name):
+        plain = SourceRequest(given.volume)
+        if (given.tf, given.tf_range, given.unit_distance, given.read) != (None, plain.tf_range, None, ReadOptions()):
+            raise UsageError(f"{name} holds Gaussians: --tf and options of reading are of volumes; leave them out")
+        gaussians, header = open_gaussians(name)
+        return gaussians, layout_of(header)
+    from vvgt_cli.conversion.convert import in_memory
+    from vvgt_cli.conversion.request import FitOptions, Limits
+
+    conversion = in_memory(replace(given, volume=name), FitOptions(), Limits(), console=run.console)
+    return conversion.gaussians, conversion.ply
+
+
+def _stored(gaussians: Gaussians, options: PlyOptions) -> bytes:
+    stream = io.BytesIO()
+    write_ply(stream, gaussians, upright(options))
+    return stream.getvalue()
+
+
+def _serve(run: Run, request: ViewRequest, files: Sequence[str], announce: Callable[[str], None]) -> None:
+    volumes = [name for name in files if name != STDIN and not is_splats(name)]
+    if len(files) > 1 and (volumes or STDIN in files):
+        raise UsageError(
+            f"{(volumes or [STDIN])[0]}: of several files expected all to hold Gaussians; convert it first"
+        )
+    first = _stored(*_opened(run, request, files[0]))
+
+    @cache
+    def name_of(k: int) -> str:
+        return f"{k}.ply"
+
+    def content(k: int) -> bytes:
+        if k == 0:
+            return first
+        gaussians, header = open_gaussians(files[k])
+        return _stored(gaussians, layout_of(header))
+
+    frames = [(Path(name).name, name_of(k)) for k, name in enumerate(files)]
+    text = page(f"{frames[0][0]} - vvgt", columns_of(first, files[0]), frames, '<script src="viewer.js"></script>')
+    parts = {
+        "": Part("text/html; charset=utf-8", lambda: text.encode("utf-8")),
+        "viewer.js": Part("text/javascript; charset=utf-8", lambda: asset(PROGRAM), packed=True),
+    }
+    parts |= {name_of(k): Part("application/octet-stream", lambda k=k: content(k)) for k in range(len(files))}  # type: ignore[misc]
+    with served(Site(parts, run.console.say), request.port) as url:
+        announce(url)
+        opened = request.browser and display() and webbrowser.open(url)
+        run.console.say(f"{'shown in a browser' if opened else 'open this address in a browser'}; Ctrl-C ends")
+        with suppress(KeyboardInterrupt):
+            Event().wait()
+
+
+def display() -> bool:
+    """Whether a browser would have a screen: else `webbrowser` may start one of those for terminals."""
+    return sys.platform in ("darwin", "win32") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
