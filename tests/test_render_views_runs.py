@@ -222,3 +222,18 @@ def test_complete_needs_the_recorded_bytes(tmp_path):
     again = Manifest(tmp_path, {"a": 1})
     again.open(["x"], overwrite=False)
     assert again.files == manifest.files
+
+
+def test_no_points_leaves_out_the_cloud_and_nothing_else(vvgt, tmp_path, made):
+    folder = tmp_path / "views"
+    assert vvgt(*BASE, "--no-points", "-o", folder).code == 0
+    names = {path.relative_to(made) for path in made.rglob("*.*") if path.is_file()}
+    found = {path.relative_to(folder) for path in folder.rglob("*.*") if path.is_file()}
+    assert {path.name for path in names - found} == {"points3d.ply"}
+    assert found <= names
+    points = next(folder.rglob("points3D.bin")).read_bytes()
+    assert points == bytes(8)  # their number
+    assert next(made.rglob("points3D.bin")).stat().st_size > 8
+    for path in found:
+        if path.suffix in (".png", ".exr"):
+            assert (folder / path).read_bytes() == (made / path).read_bytes(), path
