@@ -222,7 +222,7 @@ def _begin(run: Run, request: ConvertRequest) -> tuple[Source, Scene]:
 
 def _kernels(run: Run, request: ConvertRequest, source: Source) -> tuple[str, ...]:
     """That a run will need."""
-    names = CONVERT if run.report.command == "convert" else INIT
+    names: tuple[str, ...] = CONVERT if run.report.command == "convert" else INIT
     if source.lighting is not None:
         names = for_light(names, source.lighting.attenuated)
     return for_degree(names, degree_of(request, source))
