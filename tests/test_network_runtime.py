@@ -124,6 +124,12 @@ def _other_names(folder):
     (folder / CARD).write_text(json.dumps(card))
 
 
+def _config(folder, side, **changes):
+    card = json.loads((folder / CARD).read_text())
+    card["config"][side] |= changes
+    (folder / CARD).write_text(json.dumps(card))
+
+
 def _outside(folder):
     card = json.loads((folder / CARD).read_text())
     card["graphs"]["image"]["file"] = "../image.onnx"
@@ -141,6 +147,10 @@ def _outside(folder):
         (_other_output, "gives splats"),
         (_other_names, "its card says"),
         (_outside, "no such file"),
+        (lambda f: _config(f, "image", heads=0), "heads"),
+        (lambda f: _config(f, "image", views=2.5), "expected a value like"),
+        (lambda f: _config(f, "geometry", window=10**9), "window 1000000000"),
+        (lambda f: _config(f, "geometry", depths=[1, 1, 1, 1, 60_000]), "numbers from 0 to 256"),
         (lambda f: (f / CARD).write_text("{"), "not a model card"),
         (lambda f: (f / CARD).write_text("[]"), "not a model card"),
         (lambda f: _edit_card(f, schema=99), "schema 99"),

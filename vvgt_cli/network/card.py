@@ -110,6 +110,9 @@ def read_card(folder: Path) -> ModelCard:
         if set(card.graphs) != wanted:
             raise ValueError(f"graphs {sorted(card.graphs)}, expected {sorted(wanted)}")
         for record in card.graphs.values():
+            for side in ("inputs", "outputs"):
+                if not isinstance(record[side], list) or not all(isinstance(name, str) for name in record[side]):
+                    raise ValueError(f"{side} {record[side]!r}, expected names")
             check_graph(folder, record)
     except (TypeError, KeyError, ValueError) as error:
         raise DataError(f"{path}: {error}; export the checkpoint again") from None

@@ -14,6 +14,7 @@ PARAMETERS = 14  # of a Gaussian: mean 3, log-scale 3, quaternion 4, opacity log
 STEP = 13  # of a step in a Gaussian's own frame: centre 3, log-scale 3, turn 3, opacity logit 1, colour 3
 SLOPES = STEP + 9  # see `vvgt_cli.network.slopes.slope_rows`
 PATCH = 14  # pixels, DINOv2's
+MOST, DEEPEST = 1 << 16, 1 << 8  # of any number in a configuration; of blocks in a stage
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ class ImageConfig:
         object.__setattr__(self, "taps", tuple(self.taps))
         if self.size < PATCH or self.size % PATCH:
             raise DataError(f"image size {self.size}: expected a multiple of the patch, {PATCH}")
-        if self.width % (4 * self.heads):
+        if self.heads < 1 or self.width < 1 or self.width % (4 * self.heads):
             raise DataError(f"image width {self.width}, {self.heads} heads: expected a multiple of 4 a head")
         if not self.taps or min(self.taps) < 0 or max(self.taps) >= self.alternating:
             raise DataError(f"taps {self.taps}: expected numbers of the {self.alternating} alternating pairs, from 0")
@@ -93,8 +94,9 @@ class GeometryConfig:
             object.__setattr__(self, name, values)
             count = STAGES - name.startswith("decoder")
             least = 0 if name.endswith("depths") else 1
-            if len(values) != count or min(values) < least:
-                raise DataError(f"geometry {name} {values}: expected {count} numbers of at least {least}")
+            most = DEEPEST if name.endswith("depths") else MOST
+            if len(values) != count or min(values) < least or max(values) > most:
+                raise DataError(f"geometry {name} {values}: expected {count} numbers from {least} to {most}")
         pairs = zip(self.widths + self.decoder_widths, self.heads + self.decoder_heads, strict=True)
         if any(width % heads for width, heads in pairs):
             raise DataError("geometry: every width must be a multiple of its heads")
@@ -186,7 +188,21 @@ def _exactly(kind: type, values: Any) -> Any:
     if not isinstance(values, dict) or set(values) != wanted:
         given = set(values) if isinstance(values, dict) else set()
         raise ValueError(f"{kind.__name__} differs in {', '.join(sorted(wanted ^ given)) or 'kind'}")
+    usual = kind()
+    for name, value in values.items():
+        if not _alike(value, getattr(usual, name)):
+            raise ValueError(f"{kind.__name__}.{name} {value!r}: expected a value like {getattr(usual, name)!r}")
     return kind(**values)
+
+
+def _alike(value: Any, usual: Any) -> bool:
+    """Whether a value from a file has the type of a usual one, and no number in it is beyond `MOST`."""
+    if isinstance(usual, tuple):
+        return isinstance(value, list | tuple) and all(_alike(entry, 0) for entry in value)
+    if isinstance(usual, bool) or not isinstance(usual, int | float):
+        return isinstance(value, type(usual))
+    kinds = int if isinstance(usual, int) else (int, float)
+    return isinstance(value, kinds) and not isinstance(value, bool) and abs(value) <= MOST
 
 
 NAMED = {
