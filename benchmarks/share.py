@@ -20,7 +20,6 @@ from vvgt_cli.cameras import default_views
 from vvgt_cli.dvr import RenderSettings, Scene
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import Gaussians, in_unit_frame
-from vvgt_cli.progress import Console
 from vvgt_cli.runs.gaussian_files import file_rule, layout_of, open_gaussians
 from vvgt_cli.runs.place import into_box, preview, upright
 from vvgt_cli.runs.score import score_test_views
@@ -42,7 +41,7 @@ def score(source: Source, scene: Scene, gaussians: Gaussians, size: int, rule: R
 
 def rows(name: str, source: Source, scene: Scene, path: Path) -> Iterator[dict[str, Any]]:
     """A row a format that can be written here."""
-    gaussians, header = open_gaussians(str(path), Console(quiet=True))
+    gaussians, header = open_gaussians(str(path))
     rule, size, layout = file_rule(header), header.made_for or 400, layout_of(header)
     best = score(source, scene, gaussians, size, rule)
     yield {"scene": name, "format": ".ply", "megabytes": path.stat().st_size / 1e6, "psnr": best, "cost": 0.0}
@@ -62,7 +61,7 @@ def picture(source: Source, scene: Scene, path: Path, target: Path) -> None:
     """Volume, splats and eight times their difference from the side, as JPEG."""
     from PIL import Image
 
-    gaussians, header = open_gaussians(str(path), Console(quiet=True))
+    gaussians, header = open_gaussians(str(path))
     axes = upright(source.volume, header.up)
     camera = default_views("test", size=EDGE)[PICTURED]
     size = header.made_for or EDGE

@@ -31,6 +31,7 @@ RUN = (
         "dvr_pixels",
         "dvr_steps",
         "dvr_vtk",
+        "light_vtk",
         "network",
         "optimize",
         "plan",
@@ -143,6 +144,18 @@ def test_dvr_vtk(bench, scenes, tmp_path):
     rows = rows_of(tmp_path / "a.csv")
     assert {row["scene"] for row in rows} == {"blob"}
     assert min(float(row["vtk_db"]) for row in rows) > 15
+
+
+def test_light_vtk(bench, scenes, tmp_path):
+    from vvgt_cli.dvr.vtk import require_opengl
+
+    require_opengl()
+    module = bench("light_vtk", default_views=default_views, NAMES=("blob",), VIEWS=(0,))
+    call(module.main, *scenes, "-o", tmp_path / "a.csv", "--size", 50)
+    rows = {row["light"]: row for row in rows_of(tmp_path / "a.csv")}
+    assert set(rows) == {"unlit", "headlight", "fixed"}
+    assert min(float(row["gpu_db"]) for row in rows.values()) > 15
+    assert "headlight" in call(module.main, "--table", tmp_path / "a.csv")
 
 
 def test_network(bench, tmp_path):

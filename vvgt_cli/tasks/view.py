@@ -5,13 +5,13 @@ from __future__ import annotations
 import io
 import os
 import sys
+import time
 import webbrowser
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from threading import Event
 
 from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians import Gaussians, PlyOptions, write_ply
@@ -28,6 +28,8 @@ from vvgt_cli.share.server import Part, Site, served
 from vvgt_cli.share.splats import columns_of
 from vvgt_cli.volume import ReadOptions
 from vvgt_cli.volume.slices import matching
+
+TICK = 0.2  # seconds within which Ctrl-C is answered
 
 
 @dataclass(frozen=True)
@@ -144,7 +146,8 @@ def _serve(run: Run, request: ViewRequest, files: Sequence[str], announce: Calla
         opened = request.browser and display() and webbrowser.open(url)
         run.console.say(f"{'shown in a browser' if opened else 'open this address in a browser'}; Ctrl-C ends")
         with suppress(KeyboardInterrupt):
-            Event().wait()
+            while True:
+                time.sleep(TICK)  # a signal may reach another thread, which wakes nobody here
 
 
 def display() -> bool:
