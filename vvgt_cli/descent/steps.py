@@ -103,7 +103,7 @@ def own_frame(
             colors[k, i] = max(colors[k, i] - tint, darkest)
 
 
-@kernel(parallel=True)
+@kernel("f4:1 f4:1 f8 f8 f8 i8 f4:1 f4:1", parallel=True)
 def adam(
     values: np.ndarray, slopes: np.ndarray, rate: float, beta1: float, beta2: float, step: int, first: np.ndarray,
     second: np.ndarray,

@@ -24,6 +24,7 @@ SLOPES = (
 )
 REFINE = ("vvgt_cli.descent.steps:own_frame", *SLOPES, "vvgt_cli.descent.loss:loss_gradient")
 HARMONICS = ("vvgt_cli.splat.harmonics:view_slopes", "vvgt_cli.splat.harmonics:view_colors")
+STEPPED = ("vvgt_cli.descent.steps:adam",)  # harmonics, in a run whose other steps are in the own frame
 DEPOSITS = ("vvgt_cli.splat.harmonics:deposit_squares", "vvgt_cli.splat.harmonics:deposit")
 BACK_PROJECT = ("vvgt_cli.splat.tiles:gather", "vvgt_cli.splat.tiles:reduce_pairs")
 
@@ -33,7 +34,15 @@ CONVERT = (RAYCAST[0], REFINE[0], *CLOSED_FORM, *DRAW, *REFINE[1:], *RAYCAST[1:]
 OPTIMIZE = (*REFINE, *DRAW)
 EVALUATE = (*RAYCAST, *DRAW)
 INFER = (*DRAW, SLOPES[0], "vvgt_cli.splat.backward:standard", *BACK_PROJECT)
-ALL = (*CONVERT, *LIGHT, *INFER[len(DRAW) + 1 :], *HARMONICS, *DEPOSITS, "vvgt_cli.volume.slc_kernel:decode_plane")
+ALL = (
+    *CONVERT,
+    *LIGHT,
+    *INFER[len(DRAW) + 1 :],
+    *HARMONICS,
+    *STEPPED,
+    *DEPOSITS,
+    "vvgt_cli.volume.slc_kernel:decode_plane",
+)
 
 
 def for_light(names: tuple[str, ...], attenuated: bool) -> tuple[str, ...]:
@@ -45,4 +54,7 @@ def for_light(names: tuple[str, ...], attenuated: bool) -> tuple[str, ...]:
 
 def for_degree(names: tuple[str, ...], degree: int) -> tuple[str, ...]:
     """Kernels of a command that meets Gaussians with harmonics of a degree: more, where that is above 0."""
-    return (*names, *(HARMONICS if SLOPES[0] in names else HARMONICS[1:])) if degree else names
+    if not degree:
+        return names
+    stepped = STEPPED if REFINE[0] in names else ()
+    return (*names, *(HARMONICS if SLOPES[0] in names else HARMONICS[1:]), *stepped)
