@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tests.vtk_views import drawn_by_vtk
 from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.dvr import RenderSettings, Scene, render_view_reference, render_views
 from vvgt_cli.dvr import vtk as vtk_renderer
@@ -119,21 +117,7 @@ def decentred():
 
 @pytest.fixture(scope="module")
 def from_vtk(tmp_path_factory):
-    """VTK's views, drawn by a process of its own: VTK may crash where OpenGL is incomplete."""
-    try:
-        vtk_renderer.require_opengl()
-    except DataError as error:
-        pytest.skip(str(error))
-    path = tmp_path_factory.mktemp("vtk") / "views.npz"
-    folders = os.pathsep.join([str(Path(__file__).parent), *filter(None, [os.environ.get("PYTHONPATH")])])
-    done = subprocess.run(
-        [sys.executable, "-c", VTK_VIEWS, path],
-        capture_output=True,
-        text=True,
-        env=os.environ | {"PYTHONPATH": folders},
-    )
-    assert done.returncode == 0, done.stderr
-    return np.load(path)
+    return drawn_by_vtk(VTK_VIEWS, tmp_path_factory.mktemp("vtk"))
 
 
 def decibels(a, b):

@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import math
-import os
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tests.vtk_views import drawn_by_vtk
 from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.dvr import RenderSettings, Scene, render_view, render_view_reference
 from vvgt_cli.dvr import vtk as vtk_renderer
 from vvgt_cli.dvr.backends import view_renderer
 from vvgt_cli.dvr.light import ANGLE, OFFSET, RAYS, cone, sphere, transmittance
 from vvgt_cli.dvr.reference import grid_values, normals, optics, trilinear
-from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.errors import UsageError
 from vvgt_cli.transfer import ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.transfer.lighting import Lighting, LightOptions, parse_lighting
 from vvgt_cli.volume import Volume
@@ -338,19 +335,7 @@ def by_cpu_mapper(scene, view):
 
 @pytest.fixture(scope="module")
 def from_vtk(tmp_path_factory):
-    """VTK's views, drawn by a process of its own: VTK may crash where OpenGL is incomplete."""
-    try:
-        vtk_renderer.require_opengl()
-    except DataError as error:
-        pytest.skip(str(error))
-    path = tmp_path_factory.mktemp("vtk") / "views.npz"
-    folders = os.pathsep.join([str(Path(__file__).parent), *filter(None, [os.environ.get("PYTHONPATH")])])
-    done = subprocess.run(
-        [sys.executable, "-c", BY_VTK, path], capture_output=True, text=True,
-        env=os.environ | {"PYTHONPATH": folders},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    return np.load(path)
+    return drawn_by_vtk(BY_VTK, tmp_path_factory.mktemp("vtk"))
 
 
 @pytest.mark.parametrize("mapper", ["", " cpu"])

@@ -52,7 +52,8 @@ def _placed(frame: str, up: str) -> Figure:
     return Figure("off, largest", float(max(centres, shapes)), 2e-4 if frame == "world" else 1e-6)
 
 
-def _refused(make: Callable[[], object]) -> Figure:
+def one_line(make: Callable[[], object]) -> Figure:
+    """A `DataError` of one line is what ``make`` should end with."""
     try:
         make()
     except DataError as error:
@@ -95,4 +96,4 @@ def cases() -> Iterator[Case]:
         "not a .ply": lambda: read_ply(io.BytesIO(b"\x89PNG\r\n")),
     }
     for name, make in refused.items():
-        yield Case(STAGE, f"refused: {name}", partial(_refused, make))
+        yield Case(STAGE, f"refused: {name}", partial(one_line, make))

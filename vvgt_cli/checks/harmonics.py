@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 
@@ -13,9 +13,9 @@ from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.boxed import boxed
 from vvgt_cli.checks import Case, Figure, require
 from vvgt_cli.checks.clouds import cloud, view
+from vvgt_cli.checks.files import one_line
 from vvgt_cli.checks.forward import sane
-from vvgt_cli.descent import METHODS, OptimizeOptions, optimize
-from vvgt_cli.errors import DataError
+from vvgt_cli.descent import OptimizeOptions, optimize
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
 from vvgt_cli.gaussians.frames import transform
 from vvgt_cli.gaussians.types import HARMONICS
@@ -27,7 +27,7 @@ QUARTERS = {
     "x": [[1, 0, 0], [0, 0, -1], [0, 1, 0]], "y": [[0, 0, 1], [0, 1, 0], [-1, 0, 0]],
     "z": [[0, -1, 0], [1, 0, 0], [0, 0, 1]],
 }  # fmt: skip
-NEARER = {"frame": 0.6, "adam": 0.95, "3dgs": 1.0}  # squared error after 80 steps over that before
+NEARER = {"frame": 0.6, "adam": 0.95}  # squared error after 80 steps over that before
 MIRROR = np.diag([-1.0, 1.0, 1.0])
 
 
@@ -102,15 +102,6 @@ def _file(degree: int) -> Figure:
     return Figure("coefficients that differ", float(differ.sum()), 0)
 
 
-def _refused(make: Callable[[], object]) -> Figure:
-    try:
-        make()
-    except DataError as error:
-        require("\n" not in str(error), "an error of several lines")
-        return Figure("accepted", 0, 0)
-    return Figure("accepted", 1, 0)
-
-
 def _not_a_number() -> object:
     content = bytearray(_written(shiny(10, 1)))
     content[-4 * 9 : -4 * 8] = np.array([np.nan], "<f4").tobytes()  # blue's last
@@ -130,7 +121,7 @@ def _one_view() -> Figure:
 
 
 def _found(method: str) -> Figure:
-    """From the base colours towards views that harmonics made; 3DGS' own rates are for runs a hundred times as long."""
+    """From the base colours towards views that harmonics made, by rates that get there in 80 steps: 3DGS' do not."""
     truth, cameras = shiny(60, 2), default_views("train", 8, size=32)
     views = np.stack([render(truth, camera) for camera in cameras])
     start = truth.of_degree(0).of_degree(2)
@@ -155,10 +146,10 @@ def cases() -> Iterator[Case]:
     for axis, matrix in QUARTERS.items():
         yield Case(STAGE, f"turned by 90 degrees about {axis}", partial(_turned, np.array(matrix, np.float64)))
     yield Case(STAGE, "in a mirror", partial(_turned, MIRROR))
-    yield Case(STAGE, "refused: a NaN", partial(_refused, _not_a_number))
+    yield Case(STAGE, "refused: a NaN", partial(one_line, _not_a_number))
     yield Case(
-        STAGE, "refused: four coefficients", partial(_refused, lambda: replace(cloud(5), harmonics=np.ones((5, 4, 3))))
+        STAGE, "refused: four coefficients", partial(one_line, lambda: replace(cloud(5), harmonics=np.ones((5, 4, 3))))
     )
     yield Case(STAGE, "solved from one view", _one_view)
-    for method in METHODS:
+    for method in NEARER:
         yield Case(STAGE, f"{method}, back to where views come from", partial(_found, method))

@@ -21,7 +21,6 @@ from vvgt_cli.vbm.pyramid import look_up
 MAX_CELLS = 1 << 21
 MIN_RAYS = 8  # that meet a cell: with fewer, some cells are met by none and count as hidden
 WORKERS = 4  # each with sums of its own, so that they need no atomics; whatever the threads, for the same bytes
-MAX_GRID = 1 << 25  # cells of all workers together
 THIN = 2.0  # pixels of the march: all of a box that is thinner may lie between two rays
 U = nb.uint64  # indices that cannot be negative need no test
 Vector = tuple[float, float, float]
@@ -184,7 +183,7 @@ def visibility(
         wider += 1
     extinction = _mean_extinction(cells, scene, wider)
     voxels = 2.0 ** (cells.exponent + wider)
-    sums = np.zeros((max(min(WORKERS, MAX_GRID // extinction.size), 1), *extinction.shape, 3), np.float32)
+    sums = np.zeros((WORKERS, *extinction.shape, 3), np.float32)
     for done, camera in enumerate(cameras, 1):
         eye, basis, lens = camera_arrays(scene, camera)
         march(extinction, eye[None], basis[None], lens[None], camera.width, voxels, sums)
