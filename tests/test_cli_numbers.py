@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vvgt_cli.cli.numbers import spread
+from vvgt_cli.cli.numbers import expand
 from vvgt_cli.errors import UsageError
 from vvgt_cli.synth.analytic import blob
 from vvgt_cli.volume.order import likelier_dims
@@ -22,9 +22,9 @@ FORMS = (
 @pytest.mark.parametrize("form", FORMS)
 def test_three_numbers_in_any_form(form: str) -> None:
     expected = ["convert", "a", "--dims", "64", "64", "93", "--dtype", "uint8"]
-    assert spread(["convert", "a", "--dims", *form.split(" "), "--dtype", "uint8"]) == expected
+    assert expand(["convert", "a", "--dims", *form.split(" "), "--dtype", "uint8"]) == expected
     first, *rest = form.split(" ")
-    assert spread(["convert", "a", f"--dims={first}", *rest, "--dtype", "uint8"]) == expected
+    assert expand(["convert", "a", f"--dims={first}", *rest, "--dtype", "uint8"]) == expected
 
 
 def test_numbers_of_other_options_and_other_words_are_left_alone() -> None:
@@ -32,19 +32,19 @@ def test_numbers_of_other_options_and_other_words_are_left_alone() -> None:
         "convert 1,2,3 -o 4,5", "x --tf-range data 5", "x --tf-range rescale", "x --tf-range 5", "x -- --dims 1,2,3",
         "x --spacing 0.5 1e-3 -2.", "x --tf-range 100,200 3", "",
     ):  # fmt: skip
-        assert spread(line.split()) == line.split()
+        assert expand(line.split()) == line.split()
     for line, expected in (
         ("x --tf-range -1000 400 v.nii", "x --tf-range -1000,400 v.nii"),
         ("x --tf-range=-1e3, 400 v", "x --tf-range -1e3,400 v"),
         ("x --spacing .5,1e-3,2 5", "x --spacing .5 1e-3 2 5"),
     ):
-        assert spread(line.split()) == expected.split()
+        assert expand(line.split()) == expected.split()
 
 
 @pytest.mark.parametrize("line", ["--dims 64 64 --dtype uint8", "--dims 64,64", "--dims", "--dims 1,2,3,4"])
 def test_what_is_not_three_numbers_is_said_with_the_syntax(line: str) -> None:
     with pytest.raises(UsageError, match=r"expected three numbers, as --dims 256 256 128 or --dims 256,256,128"):
-        spread(line.split())
+        expand(line.split())
 
 
 @pytest.fixture(autouse=True)

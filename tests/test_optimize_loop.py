@@ -128,11 +128,11 @@ def test_the_best_state_is_returned_not_the_last(scene, kind):
     start, _, check = scene
     state, record = kind(start, CAMERAS), OptimizeRecord()
     judge = Judge(state, check, record)
-    judge.look(0.0)
+    judge.measure(0.0)
     best, last = shaken(truth(), 0.02), shaken(truth(), 0.025)
     for record.steps, g in ((5, best), (10, last)):
         state.arrays = kind(g, CAMERAS).arrays
-        assert not judge.look(1.0)
+        assert not judge.measure(1.0)
     looks = [db for *_, db in record.checks]
     assert looks[1] - FALLEN < looks[2] < looks[1] - 0.5
     assert looks[0] < looks[2]

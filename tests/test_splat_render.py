@@ -10,7 +10,7 @@ from vvgt_cli.checks.clouds import cloud
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.splat import blend, gather, gather_reference, project, render, render_reference
 from vvgt_cli.splat.constants import MIN_ALPHA
-from vvgt_cli.splat.render import deal, depth_order
+from vvgt_cli.splat.render import balance, depth_order
 from vvgt_cli.splat.rules import INRIA, RULES
 
 EYE = (2.0, -1.7, 1.1)
@@ -202,7 +202,7 @@ def test_depths_sort_stably_and_tiles_are_dealt_out_whole():
     rng = np.random.default_rng(0)
     depth = np.float32(rng.choice([0, 1e-30, 0.5, 1, 1.0000001, 3e38], 2000) * rng.integers(1, 3, 2000) / 2)
     np.testing.assert_array_equal(depth_order(depth), np.argsort(depth, kind="stable"))
-    np.testing.assert_array_equal(np.sort(deal(rng.integers(0, 9, 101))), np.arange(101))
+    np.testing.assert_array_equal(np.sort(balance(rng.integers(0, 9, 101))), np.arange(101))
 
 
 def test_a_quarter_of_the_dilation_shows_twice_the_size_averaged():

@@ -15,7 +15,7 @@ _INTERVAL = 0.1  # seconds between two drawings of a bar
 _LINES = 30.0  # seconds between two lines where nobody watches
 
 
-class Talk:
+class MessageStream:
     """A text stream of messages that never fails: on a full disk or a closed pipe they are lost, the work is not."""
 
     def __init__(self, stream: TextIO) -> None:

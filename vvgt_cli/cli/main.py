@@ -15,7 +15,7 @@ from difflib import get_close_matches
 import click
 
 from vvgt_cli import __version__
-from vvgt_cli.cli.numbers import spread
+from vvgt_cli.cli.numbers import expand
 from vvgt_cli.cli.process import end_on_signals, ended_by, first_of_group, open_streams
 from vvgt_cli.errors import UsageError, VvgtError
 
@@ -126,7 +126,7 @@ def run(args: Sequence[str] | None = None) -> int:
     """Run a command line and return its exit status; every error is one line on standard error."""
     try:
         # not cli.main: it would turn a broken pipe and an interrupt into statuses of its own
-        with cli.make_context("vvgt", spread(sys.argv[1:] if args is None else args)) as context:
+        with cli.make_context("vvgt", expand(sys.argv[1:] if args is None else args)) as context:
             cli.invoke(context)
         sys.stdout.flush()
         return 0

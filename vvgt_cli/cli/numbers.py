@@ -13,7 +13,7 @@ _BETWEEN = re.compile(r"[,x×]", re.IGNORECASE)
 _LONGEST = 5  # words: 64 x 64 x 93
 
 
-def spread(args: Sequence[str]) -> list[str]:
+def expand(args: Sequence[str]) -> list[str]:
     """A command line as the options are declared: three words for `THREES`, one, ``LO,HI``, for `RANGE`.
 
     Args:

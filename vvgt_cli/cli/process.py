@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from typing import Any
 
 from vvgt_cli.files import discard_leftovers
-from vvgt_cli.progress import Talk
+from vvgt_cli.progress import MessageStream
 
 GRACE = 1.0  # seconds to end as an exception does, after which the process ends as it is
 ENDING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
@@ -32,7 +32,7 @@ def open_streams() -> None:
             os.set_inheritable(number, True)
         if getattr(sys, name) is None:
             setattr(sys, name, open(number, mode, closefd=False))  # noqa: SIM115 - lives as long as the process
-    stderr: Any = Talk(sys.stderr)
+    stderr: Any = MessageStream(sys.stderr)
     sys.stderr = stderr
 
 

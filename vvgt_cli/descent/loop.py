@@ -47,45 +47,45 @@ def run(
     record = OptimizeRecord()
     state = begin(gaussians, cameras, options)
     judge = Judge(state, check, record, options.judge)
-    keep, walk = _checkpoint(options, gaussians, (cameras, images), check, state, judge)
+    keep, course = _checkpoint(options, gaussians, (cameras, images), check, state, judge)
     entered, order = time.perf_counter(), views_in_turn(len(cameras), options.seed)
     if not record.checks:
-        judge.look(0.0)
+        judge.measure(0.0)
         record.psnr_before = judge.best
     saved = entered
-    spent, began = walk.elapsed, time.perf_counter() - walk.elapsed
+    spent, began = course.elapsed, time.perf_counter() - course.elapsed
     for _ in range(record.steps):
         next(order)
     while True:
-        walk.elapsed = time.perf_counter() - began
-        reason = _reason(options, judge, walk.elapsed, stop)
+        course.elapsed = time.perf_counter() - began
+        reason = _reason(options, judge, course.elapsed, stop)
         if reason:
             record.reason = reason
             break
         view = next(order)
-        share = _share(options, record.steps, walk.elapsed)
-        walk.error = step(state, cameras[view], images[view], options, walk.error, share, walk.speed)
+        share = _share(options, record.steps, course.elapsed)
+        course.error = step(state, cameras[view], images[view], options, course.error, share, course.speed)
         record.steps += 1
-        expected = _expected(options, record.steps, walk.elapsed)
+        expected = _expected(options, record.steps, course.elapsed)
         if progress:
             progress(record.steps, expected)
-        if record.steps >= walk.looked + max(options.check_every, expected // LOOKS):
-            walk.looked = record.steps
-            if judge.look(time.perf_counter() - began, share >= SETTLING):
-                walk.speed *= SLOWER
+        if record.steps >= course.looked + max(options.check_every, expected // LOOKS):
+            course.looked = record.steps
+            if judge.measure(time.perf_counter() - began, share >= SETTLING):
+                course.speed *= SLOWER
         elif time.perf_counter() < saved + KEEP:
             continue
         keep()
         saved = time.perf_counter()
     keep()  # before the last look: a run that goes on from here would not have taken it
-    judge.look(time.perf_counter() - began)
+    judge.measure(time.perf_counter() - began)
     result = judge.result(gaussians)
     record.seconds = spent + time.perf_counter() - entered
     return result, record
 
 
 @dataclass
-class _Walk:
+class _Course:
     """What changes from step to step beside the state."""
 
     error: float | None = None
@@ -96,14 +96,14 @@ class _Walk:
 
 def _checkpoint(
     options: OptimizeOptions, gaussians: Gaussians, train: Train, check: Check | None, state: State, judge: Judge
-) -> tuple[Callable[[], None], _Walk]:
+) -> tuple[Callable[[], None], _Course]:
     """What saves the run, and where it begins: the end of the last one where there is a checkpoint."""
     path = options.checkpoint
     if path is None:
-        return lambda: None, _Walk()
+        return lambda: None, _Course()
     key = fingerprint(gaussians, options, train, check)
-    walk = _Walk(**(resume(path, key, state, judge, judge.record) or {}))
-    return lambda: save(path, key, state, judge, judge.record, asdict(walk)), walk
+    course = _Course(**(resume(path, key, state, judge, judge.record) or {}))
+    return lambda: save(path, key, state, judge, judge.record, asdict(course)), course
 
 
 def begin(gaussians: Gaussians, cameras: Sequence[Camera], options: OptimizeOptions) -> State:
@@ -197,7 +197,7 @@ class Judge:
         self.kept: tuple[np.ndarray, ...] | None = None
         self.idle = 0
 
-    def look(self, seconds: float, settling: bool = False) -> bool:
+    def measure(self, seconds: float, settling: bool = False) -> bool:
         """Score the state, unless that has been done; True if it has fallen, and was put back to the best.
 
         Rates are kept up in the first half of a run, and pictures may get worse on the way: looks without gain count

@@ -26,10 +26,10 @@ from vvgt_cli.splat.buffer import (
     U,
     all_ended,
     alpha_at,
-    eighth,
     f32,
     open_tile,
     rows,
+    scaled_conic,
     tile_jit,
 )
 from vvgt_cli.splat.constants import TILE
@@ -96,7 +96,7 @@ def _moments_tile(
             done = index
             break
         k = entries[index]
-        a, b, c, u, v, opacity = eighth(flat, k, f32(ox), f32(oy))
+        a, b, c, u, v, opacity = scaled_conic(flat, k, f32(ox), f32(oy))
         y0, y1 = rows(extent[k, 1] - oy, extent[k, 3] - oy, a, b, c, u, v, opacity, rule)
         _sweep(y0, y1, k, colors, a, b, c, u, v, opacity, rule, buf)
         s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = s8 = ZERO

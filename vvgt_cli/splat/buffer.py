@@ -37,7 +37,7 @@ tile_jit = inlined(fastmath=True, error_model="numpy")
 
 
 @tile_jit
-def eighth(flat: np.ndarray, k: int, ox: float, oy: float) -> tuple[float, ...]:
+def scaled_conic(flat: np.ndarray, k: int, ox: float, oy: float) -> tuple[float, ...]:
     """a, b, c, u, v and opacity of row k of ``flat`` (K, 7), relative to a tile with its corner at pixel (ox, oy)."""
     s = f32(-0.125)
     return s * HALF * flat[k, 2], s * flat[k, 3], s * HALF * flat[k, 4], flat[k, 0] - ox, flat[k, 1] - oy, flat[k, 5]

@@ -75,7 +75,7 @@ def _projected(
     tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
     order = depth_order(depth)
     start, members, slots, first = kernel.tile_lists(order, extent, tiles_x, tiles_y, numba.get_num_threads())
-    return Projection(flat, extent, start, members, slots, first, tiles_x, deal(np.diff(start)), rule)
+    return Projection(flat, extent, start, members, slots, first, tiles_x, balance(np.diff(start)), rule)
 
 
 def pose(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -91,7 +91,7 @@ def depth_order(depth: np.ndarray) -> np.ndarray:
     return (keys & np.uint64(0xFFFFFFFF)).astype(np.int64)
 
 
-def deal(work: np.ndarray) -> np.ndarray:
+def balance(work: np.ndarray) -> np.ndarray:
     """Order (n,) of tasks that gives contiguous chunks, one a thread, near equal shares of ``work`` (n,)."""
     import numba
 
@@ -103,7 +103,7 @@ def deal(work: np.ndarray) -> np.ndarray:
 def tile_by_tile() -> AbstractContextManager[None]:
     """Threads take one tile after the other where numba has TBB: what a tile costs is not known before.
 
-    Its other threading layers deal the tiles out in equal chunks, which `deal` balances by the lengths of the lists.
+    Its other threading layers deal the tiles out in equal chunks, which `balance` balances by the lengths of the lists.
     """
     import numba
 

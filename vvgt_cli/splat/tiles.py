@@ -25,10 +25,10 @@ from vvgt_cli.splat.buffer import (
     U,
     all_ended,
     alpha_at,
-    eighth,
     f32,
     open_tile,
     rows,
+    scaled_conic,
     tile_jit,
 )
 from vvgt_cli.splat.constants import TILE
@@ -60,7 +60,7 @@ def _blend_tile(
         if (index & 31) == 31 and all_ended(buf):
             break
         k = entries[index]
-        a, b, c, u, v, opacity = eighth(flat, k, f32(ox), f32(oy))
+        a, b, c, u, v, opacity = scaled_conic(flat, k, f32(ox), f32(oy))
         red, green, blue = colors[k, 0], colors[k, 1], colors[k, 2]
         y0, y1 = rows(extent[k, 1] - oy, extent[k, 3] - oy, a, b, c, u, v, opacity, rule)
         for y in range(y0, y1):
@@ -113,7 +113,7 @@ def _gather_tile(
         if (index & 31) == 31 and all_ended(buf):
             break
         k = entries[index]
-        a, b, c, u, v, opacity = eighth(flat, k, f32(ox), f32(oy))
+        a, b, c, u, v, opacity = scaled_conic(flat, k, f32(ox), f32(oy))
         y0, y1 = rows(extent[k, 1] - oy, extent[k, 3] - oy, a, b, c, u, v, opacity, rule)
         for y in range(y0, y1):
             dy = f32(np.int32(y)) + HALF - v

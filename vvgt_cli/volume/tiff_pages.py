@@ -18,7 +18,7 @@ _MAX_RATIO = 1 << 15  # fax codes blank pages in next to nothing; deflate is at 
 
 
 @dataclass(frozen=True)
-class _Walk:
+class _Layout:
     """A file being walked: its byte order, the forms of a directory's parts, and its size."""
 
     path: Path
@@ -49,7 +49,7 @@ def _walk(file: BinaryIO, path: Path) -> int:
     big = version == 43
     (offset,) = struct.unpack_from(order + ("Q" if big else "I"), head, 8 if big else 4)
     forms = ("Q", "HHQ8s", "Q") if big else ("H", "HHI4s", "I")
-    walk = _Walk(path, order, *forms, path.stat().st_size)
+    layout = _Layout(path, order, *forms, path.stat().st_size)
     seen: set[int] = set()
     least = 0
     while offset:
@@ -57,34 +57,36 @@ def _walk(file: BinaryIO, path: Path) -> int:
             raise DataError(f"{path}: page {len(seen)} of the TIFF file points back to an earlier one")
         seen.add(offset)
         file.seek(offset)
-        (n,) = struct.unpack(order + walk.number, file.read(struct.calcsize(walk.number)))
-        step = struct.calcsize("<" + walk.entry)
-        least += _page_bytes(file.read(min(n, 4096) * step), walk, len(seen) - 1)
-        file.seek(offset + struct.calcsize(walk.number) + n * step)
-        (offset,) = struct.unpack(order + walk.link, file.read(struct.calcsize(walk.link)))
+        (n,) = struct.unpack(order + layout.number, file.read(struct.calcsize(layout.number)))
+        step = struct.calcsize("<" + layout.entry)
+        least += _page_bytes(file.read(min(n, 4096) * step), layout, len(seen) - 1)
+        file.seek(offset + struct.calcsize(layout.number) + n * step)
+        (offset,) = struct.unpack(order + layout.link, file.read(struct.calcsize(layout.link)))
     if not seen:
         raise DataError(f"{path}: a TIFF file without pages")
-    if least > walk.size * _MAX_RATIO:
-        raise DataError(f"{path}: {size_text(walk.size)} cannot hold its {len(seen)} pages of {size_text(least)}")
+    if least > layout.size * _MAX_RATIO:
+        raise DataError(f"{path}: {size_text(layout.size)} cannot hold its {len(seen)} pages of {size_text(least)}")
     return len(seen)
 
 
-def _page_bytes(table: bytes, walk: _Walk, page: int) -> int:
+def _page_bytes(table: bytes, layout: _Layout, page: int) -> int:
     """The least bytes that the pixels of a page come to."""
     tags: dict[int, int] = {}
-    step = struct.calcsize("<" + walk.entry)
+    step = struct.calcsize("<" + layout.entry)
     for at in range(0, len(table) - step + 1, step):
-        tag, kind, n, value = struct.unpack_from(walk.order + walk.entry, table, at)
-        if n * _BYTES.get(kind, 1) > walk.size:
-            raise DataError(f"{walk.path}: page {page}: {n} values of tag {tag} in a file of {size_text(walk.size)}")
+        tag, kind, n, value = struct.unpack_from(layout.order + layout.entry, table, at)
+        if n * _BYTES.get(kind, 1) > layout.size:
+            raise DataError(
+                f"{layout.path}: page {page}: {n} values of tag {tag} in a file of {size_text(layout.size)}"
+            )
         if kind in _FIELD and n:
-            tags[tag] = struct.unpack_from(walk.order + _FIELD[kind], value)[0]
+            tags[tag] = struct.unpack_from(layout.order + _FIELD[kind], value)[0]
     samples = tags.get(_SAMPLES, 1)
     # BitsPerSample lies elsewhere in the file when there are several: 8 is the least that matters for a size check.
     bits = tags.get(_BITS, 1) if samples <= 2 else 8
     width, height = tags.get(_WIDTH, 0), tags.get(_HEIGHT, 0)
     if min(width, height, samples) < 1:
         raise DataError(
-            f"{walk.path}: page {page} of {width} x {height} pixels with {samples} samples; expected at least 1"
+            f"{layout.path}: page {page} of {width} x {height} pixels with {samples} samples; expected at least 1"
         )
     return width * height * samples * max(tags.get(_DEPTH, 1), 1) * max(bits, 1) // 8
