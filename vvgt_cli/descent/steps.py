@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numba as nb
 import numpy as np
 
 from vvgt_cli.jit.decorators import inlined, kernel
 
-EPSILON = 1e-15
+f32: Any = np.float32
+ONE, HALF, FOUR, EPSILON = f32(1), f32(0.5), f32(4), f32(1e-15)
 COUNT = 13  # own frame: d (3), E (6), opacity logit, colour (3)
 _jit = inlined()
 
@@ -20,10 +22,11 @@ def _adam(
     fix2: float,
 ) -> float:  # fmt: skip
     """One value's direction, about 1 in size; updates the running moments ``first`` and ``second`` (K, COUNT)."""
-    m: float = beta1 * first[k, i] + (1 - beta1) * g
-    v: float = beta2 * second[k, i] + (1 - beta2) * g * g
+    m: float = beta1 * first[k, i] + (ONE - beta1) * g
+    v: float = beta2 * second[k, i] + (ONE - beta2) * g * g
     first[k, i], second[k, i] = m, v
-    return m * fix1 / (math.sqrt(v * fix2) + EPSILON)
+    direction: float = m * fix1 / (math.sqrt(v * fix2) + EPSILON)
+    return direction
 
 
 @_jit
@@ -38,8 +41,8 @@ def _gain(factors: np.ndarray, k: int, i: int, spread: float) -> float:
 
     The dilation, of variance ``spread``, hides part of its step.
     """
-    size = factors[k, 0, i] ** 2 + factors[k, 1, i] ** 2 + factors[k, 2, i] ** 2
-    return math.sqrt(min(1 + spread / max(size, 1e-30), 9.0))
+    x, y, z = factors[k, 0, i], factors[k, 1, i], factors[k, 2, i]
+    return math.sqrt(min(ONE + spread / max(x * x + y * y + z * z, f32(1e-30)), f32(9)))
 
 
 @_jit
@@ -74,33 +77,38 @@ def own_frame(
 
     Gradients ``frame`` (K, 9), ``logit_grad`` (K,), ``color_grad`` (K, 3) and what they are of, ``means`` (K, 3),
     ``factors`` (K, 3, 3), ``logits`` (K,), ``colors`` (K, 3), are float32, as are Adam's moments ``first`` and
-    ``second`` (K, COUNT). ``rates`` (5 or more,): d, E on and off the diagonal, logit, colour. ``clips`` (3,): d,
-    logit, E. ``spread`` is the dilation's variance at the scene, ``darkest`` the least that a colour becomes.
+    ``second`` (K, COUNT) and what is computed. ``rates`` (5 or more,): d, E on and off the diagonal, logit, colour.
+    ``clips`` (3,): d, logit, E. ``spread`` is the dilation's variance at the scene, ``darkest`` the least that a colour
+    becomes.
     """
-    fix1, fix2 = 1 / (1 - beta1**step), 1 / (1 - beta2**step)
+    fix1, fix2 = f32(1 / (1 - beta1**step)), f32(1 / (1 - beta2**step))
+    b1, b2, hidden, least = f32(beta1), f32(beta2), f32(spread), f32(darkest)
+    r0, r1, r2, r3, r4 = f32(rates[0]), f32(rates[1]), f32(rates[2]), f32(rates[3]), f32(rates[4])
+    c0, c1, c2 = f32(clips[0]), f32(clips[1]), f32(clips[2])
     for k in nb.prange(means.shape[0]):
-        p0, p1, p2 = _gain(factors, k, 0, spread), _gain(factors, k, 1, spread), _gain(factors, k, 2, spread)
-        d0, d1, d2, a0, a1, a2, b0, b1, b2 = _directions(frame, k, first, second, beta1, beta2, fix1, fix2)
-        d0, d1, d2 = (_clip(d0 * rates[0] * p0, clips[0]), _clip(d1 * rates[0] * p1, clips[0]),
-                      _clip(d2 * rates[0] * p2, clips[0]))  # fmt: skip
-        a0, a1, a2 = (_clip(a0 * rates[1] * min(p0 * p0, 4.0), clips[2]),
-                      _clip(a1 * rates[1] * min(p1 * p1, 4.0), clips[2]),
-                      _clip(a2 * rates[1] * min(p2 * p2, 4.0), clips[2]))  # fmt: skip
-        b0, b1, b2 = (_clip(b0 * rates[2] * min(p0 * p1, 4.0), clips[2]),
-                      _clip(b1 * rates[2] * min(p0 * p2, 4.0), clips[2]),
-                      _clip(b2 * rates[2] * min(p1 * p2, 4.0), clips[2]))  # fmt: skip
+        p0, p1, p2 = _gain(factors, k, 0, hidden), _gain(factors, k, 1, hidden), _gain(factors, k, 2, hidden)
+        d0, d1, d2, e00, e11, e22, e01, e02, e12 = _directions(frame, k, first, second, b1, b2, fix1, fix2)
+        d0, d1, d2 = _clip(d0 * r0 * p0, c0), _clip(d1 * r0 * p1, c0), _clip(d2 * r0 * p2, c0)
+        e00 = _clip(e00 * r1 * min(p0 * p0, FOUR), c2)
+        e11 = _clip(e11 * r1 * min(p1 * p1, FOUR), c2)
+        e22 = _clip(e22 * r1 * min(p2 * p2, FOUR), c2)
+        e01 = _clip(e01 * r2 * min(p0 * p1, FOUR), c2)
+        e02 = _clip(e02 * r2 * min(p0 * p2, FOUR), c2)
+        e12 = _clip(e12 * r2 * min(p1 * p2, FOUR), c2)
         for i in range(3):
             m0, m1, m2 = factors[k, i, 0], factors[k, i, 1], factors[k, i, 2]
             means[k, i] -= m0 * d0 + m1 * d1 + m2 * d2
-            e0, e1, e2 = m0 * a0 + m1 * b0 + m2 * b1, m0 * b0 + m1 * a1 + m2 * b2, m0 * b1 + m1 * b2 + m2 * a2  # M E
-            factors[k, i, 0] = m0 - e0 + 0.5 * (e0 * a0 + e1 * b0 + e2 * b1)
-            factors[k, i, 1] = m1 - e1 + 0.5 * (e0 * b0 + e1 * a1 + e2 * b2)
-            factors[k, i, 2] = m2 - e2 + 0.5 * (e0 * b1 + e1 * b2 + e2 * a2)
-        turn = _adam(logit_grad[k], k, 9, first, second, beta1, beta2, fix1, fix2) * rates[3]
-        logits[k] -= _clip(turn, clips[1])
+            s0 = m0 * e00 + m1 * e01 + m2 * e02  # M E
+            s1 = m0 * e01 + m1 * e11 + m2 * e12
+            s2 = m0 * e02 + m1 * e12 + m2 * e22
+            factors[k, i, 0] = m0 - s0 + HALF * (s0 * e00 + s1 * e01 + s2 * e02)
+            factors[k, i, 1] = m1 - s1 + HALF * (s0 * e01 + s1 * e11 + s2 * e12)
+            factors[k, i, 2] = m2 - s2 + HALF * (s0 * e02 + s1 * e12 + s2 * e22)
+        turn = _adam(logit_grad[k], k, 9, first, second, b1, b2, fix1, fix2) * r3
+        logits[k] -= _clip(turn, c1)
         for i in range(3):
-            tint = _adam(color_grad[k, i], k, 10 + i, first, second, beta1, beta2, fix1, fix2) * rates[4]
-            colors[k, i] = max(colors[k, i] - tint, darkest)
+            tint = _adam(color_grad[k, i], k, 10 + i, first, second, b1, b2, fix1, fix2) * r4
+            colors[k, i] = max(colors[k, i] - tint, least)
 
 
 @kernel("f4:1 f4:1 f8 f8 f8 i8 f4:1 f4:1", parallel=True)
@@ -112,9 +120,10 @@ def adam(
 
     ``slopes`` (n,) gradient, ``first``, ``second`` (n,) its running moments.
     """
-    fix1, fix2 = 1 / (1 - beta1**step), 1 / (1 - beta2**step)
+    fix1, fix2 = f32(1 / (1 - beta1**step)), f32(1 / (1 - beta2**step))
+    b1, b2, pace = f32(beta1), f32(beta2), f32(rate)
     for i in nb.prange(values.shape[0]):
-        m = beta1 * first[i] + (1 - beta1) * slopes[i]
-        v = beta2 * second[i] + (1 - beta2) * slopes[i] * slopes[i]
+        m = b1 * first[i] + (ONE - b1) * slopes[i]
+        v = b2 * second[i] + (ONE - b2) * slopes[i] * slopes[i]
         first[i], second[i] = m, v
-        values[i] -= rate * m * fix1 / (math.sqrt(v * fix2) + EPSILON)
+        values[i] -= pace * m * fix1 / (math.sqrt(v * fix2) + EPSILON)

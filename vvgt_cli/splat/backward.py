@@ -16,20 +16,27 @@ import numpy as np
 from vvgt_cli.jit.decorators import inlined, kernel
 from vvgt_cli.splat.buffer import (
     AREA,
+    BLUE,
+    CHUNK,
+    END_ROW,
+    FIELDS,
+    FIRST_ROW,
+    GREEN,
     HALF,
     PLANE_1,
     PLANE_2,
     PLANE_3,
     PLANE_4,
     PLANE_5,
+    RED,
     ZERO,
     U,
     all_ended,
     alpha_at,
     f32,
+    fetch,
+    fetch_colors,
     open_tile,
-    rows,
-    scaled_conic,
     tile_jit,
 )
 from vvgt_cli.splat.constants import TILE
@@ -39,23 +46,22 @@ SINGULAR = 1e-9  # det S of det S' below which the gradient of the compensation 
 # alpha dL/dalpha; G = -dalpha/dp dL/dalpha, p the exponent, x dx, dy, dx^2, dx dy, dy^2; weight x dL/d(r, g, b)
 SUMS = 9
 _T = U(TILE)
-_A0, _A1, _A2 = U(6 * AREA), U(6 * AREA + TILE), U(6 * AREA + 2 * TILE)
-_A3, _A4, _A5 = U(6 * AREA + 3 * TILE), U(6 * AREA + 4 * TILE), U(6 * AREA + 5 * TILE)
-_A6, _END = U(6 * AREA + 6 * TILE), U(6 * AREA + 7 * TILE)
+_A0, _A1, _A2, _A3 = U(0), U(TILE), U(2 * TILE), U(3 * TILE)
+_A4, _A5, _A6, _END = U(4 * TILE), U(5 * TILE), U(6 * TILE), U(7 * TILE)
 _exact = inlined()
 
 
 @tile_jit
-def _sweep(
-    y0: int, y1: int, k: int, colors: np.ndarray, a: float, b: float, c: float, u: float, v: float, opacity: float,
-    rule: tuple[float, ...], buf: np.ndarray,
-) -> None:  # fmt: skip
-    """Gaussian k over rows [y0, y1): sums a column into the seven rows behind the planes of ``buf``."""
-    red, green, blue = max(colors[k, 0], ZERO), max(colors[k, 1], ZERO), max(colors[k, 2], ZERO)
+def _sweep(fetched: np.ndarray, at: int, rule: tuple[float, ...], buf: np.ndarray, sums: np.ndarray) -> None:
+    """The Gaussian at ``at``: sums a column into the seven rows of ``sums`` (7 x TILE,)."""
+    a, b, c, u, v = fetched[at], fetched[at + U(1)], fetched[at + U(2)], fetched[at + U(3)], fetched[at + U(4)]
+    opacity = fetched[at + U(5)]
+    red, green, blue = max(fetched[at + RED], ZERO), max(fetched[at + GREEN], ZERO), max(fetched[at + BLUE], ZERO)
+    y0, y1 = U(fetched[at + FIRST_ROW]), U(fetched[at + END_ROW])
     min_alpha, max_alpha, floor, factor, offset, end = rule
     shift = opacity * offset
-    for i in range(_A0, _END):
-        buf[i] = ZERO
+    for i in range(_END):
+        sums[i] = ZERO
     for y in range(y0, y1):
         dy = f32(np.int32(y)) + HALF - v
         h, q = b * dy, c * dy * dy
@@ -74,14 +80,14 @@ def _sweep(
             g = (raw + shift) * slope
             buf[j] = -abs(t) if ended else after
             buf[j + PLANE_1] = behind
-            buf[_A0 + i] += g
+            sums[_A0 + i] += g
             g *= dy
-            buf[_A1 + i] += g
-            buf[_A2 + i] += g * dy
-            buf[_A3 + i] += weight * buf[j + PLANE_2]
-            buf[_A4 + i] += weight * buf[j + PLANE_3]
-            buf[_A5 + i] += weight * buf[j + PLANE_4]
-            buf[_A6 + i] += raw * slope
+            sums[_A1 + i] += g
+            sums[_A2 + i] += g * dy
+            sums[_A3 + i] += weight * buf[j + PLANE_2]
+            sums[_A4 + i] += weight * buf[j + PLANE_3]
+            sums[_A5 + i] += weight * buf[j + PLANE_4]
+            sums[_A6 + i] += raw * slope
 
 
 @tile_jit
@@ -90,32 +96,32 @@ def _moments_tile(
     rule: tuple[float, ...], buf: np.ndarray, pairs: np.ndarray,
 ) -> None:  # fmt: skip
     """The nine sums of each of the Gaussians ``entries``, in their order, into their rows of ``pairs``."""
-    done = entries.shape[0]
-    for index in range(entries.shape[0]):
-        if (index & 31) == 31 and all_ended(buf):
-            done = index
+    fetched, sums = np.empty(CHUNK * FIELDS, np.float32), np.empty(_END, np.float32)
+    for begin in range(0, entries.shape[0], CHUNK):
+        if begin > 0 and all_ended(buf):
+            for index in range(begin, entries.shape[0]):
+                pairs[slots[index]] = ZERO
             break
-        k = entries[index]
-        a, b, c, u, v, opacity = scaled_conic(flat, k, f32(ox), f32(oy))
-        y0, y1 = rows(extent[k, 1] - oy, extent[k, 3] - oy, a, b, c, u, v, opacity, rule)
-        _sweep(y0, y1, k, colors, a, b, c, u, v, opacity, rule, buf)
-        s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = s8 = ZERO
-        for i in range(_T):
-            dx = f32(np.int32(i)) + HALF - u
-            s0 += buf[_A6 + i]
-            s1 += buf[_A0 + i] * dx
-            s2 += buf[_A1 + i]
-            s3 += buf[_A0 + i] * dx * dx
-            s4 += buf[_A1 + i] * dx
-            s5 += buf[_A2 + i]
-            s6 += buf[_A3 + i]
-            s7 += buf[_A4 + i]
-            s8 += buf[_A5 + i]
-        slot = slots[index]
-        pairs[slot, 0], pairs[slot, 1], pairs[slot, 2], pairs[slot, 3], pairs[slot, 4] = s0, s1, s2, s3, s4
-        pairs[slot, 5], pairs[slot, 6], pairs[slot, 7], pairs[slot, 8] = s5, s6, s7, s8
-    for index in range(done, entries.shape[0]):
-        pairs[slots[index]] = ZERO
+        count = fetch(entries, begin, extent, flat, ox, oy, fetched)
+        fetch_colors(entries, begin, count, colors, fetched)
+        for index in range(count):
+            at, slot = U(index) * FIELDS, slots[begin + index]
+            u = fetched[at + U(3)]
+            _sweep(fetched, at, rule, buf, sums)
+            s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = s8 = ZERO
+            for i in range(_T):
+                dx = f32(np.int32(i)) + HALF - u
+                s0 += sums[_A6 + i]
+                s1 += sums[_A0 + i] * dx
+                s2 += sums[_A1 + i]
+                s3 += sums[_A0 + i] * dx * dx
+                s4 += sums[_A1 + i] * dx
+                s5 += sums[_A2 + i]
+                s6 += sums[_A3 + i]
+                s7 += sums[_A4 + i]
+                s8 += sums[_A5 + i]
+            pairs[slot, 0], pairs[slot, 1], pairs[slot, 2], pairs[slot, 3], pairs[slot, 4] = s0, s1, s2, s3, s4
+            pairs[slot, 5], pairs[slot, 6], pairs[slot, 7], pairs[slot, 8] = s5, s6, s7, s8
 
 
 @kernel(
@@ -139,7 +145,7 @@ def moments(
         tile = tiles[index]
         ox, oy = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
         w, h = min(TILE, width - ox), min(TILE, height - oy)
-        buf = np.zeros(6 * AREA + 7 * TILE, np.float32)  # transmittance, what is behind, dL/d(r, g, b, a); sums
+        buf = np.zeros(6 * AREA, np.float32)  # transmittance, what is behind, dL/d(r, g, b, a)
         open_tile(buf, w, h)
         for y in range(h):
             for x in range(w):

@@ -2,7 +2,9 @@
 
 A tile works in one flat float32 buffer of planes of TILE x TILE pixels, transmittance first. Loops over a row have a
 fixed length, unsigned indices at constant distances and no branches: LLVM turns each into one or two vector
-instructions a line (a signed index, a second array or an early exit would undo that).
+instructions a line (a signed index or an early exit would undo that, and a sum over rows in the same array costs 50
+comparisons of addresses a Gaussian). Gaussians are fetched `CHUNK` at a time: in the order of depth they lie far apart
+in memory, and a loop that does nothing else waits for many of them at once.
 
 ``buf`` (planes x TILE x TILE,) float32; ``rule`` is `Rule.blending` as a tuple of 6 float32. Pixels are counted from
 the tile's corner; in them -1/8 of a Gaussian's exponent is ``a dx^2 + b dx dy + c dy^2`` at (dx, dy) from its centre
@@ -11,7 +13,6 @@ the tile's corner; in them -1/8 of a Gaussian's exponent is ``a dx^2 + b dx dy +
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numba as nb
@@ -27,6 +28,9 @@ ZERO: float = f32(0)
 AREA = TILE * TILE
 PLANE_1, PLANE_2, PLANE_3, PLANE_4 = U(AREA), U(2 * AREA), U(3 * AREA), U(4 * AREA)
 PLANE_5 = U(5 * AREA)
+CHUNK = 32  # Gaussians
+FIELDS = U(11)  # of a Gaussian: a, b, c, u, v, opacity, first row and end of its rows in the tile, colour
+FIRST_ROW, END_ROW, RED, GREEN, BLUE = U(6), U(7), U(8), U(9), U(10)
 # exp(e) on [-0.75, 0] with exp(0) = 1: minimax of the relative error, 1.1e-6 after the eighth power
 _EXP: tuple[float, ...] = tuple(
     f32(c)
@@ -37,33 +41,33 @@ tile_jit = inlined(fastmath=True, error_model="numpy")
 
 
 @tile_jit
-def scaled_conic(flat: np.ndarray, k: int, ox: float, oy: float) -> tuple[float, ...]:
-    """a, b, c, u, v and opacity of row k of ``flat`` (K, 7), relative to a tile with its corner at pixel (ox, oy)."""
-    s = f32(-0.125)
-    return s * HALF * flat[k, 2], s * flat[k, 3], s * HALF * flat[k, 4], flat[k, 0] - ox, flat[k, 1] - oy, flat[k, 5]
+def fetch(
+    entries: np.ndarray, begin: int, extent: np.ndarray, flat: np.ndarray, ox: int, oy: int, fetched: np.ndarray
+) -> int:
+    """Entries from ``begin`` on, at most `CHUNK`, into ``fetched`` (CHUNK x FIELDS,), without colours; their number."""
+    count: int = min(CHUNK, entries.shape[0] - begin)
+    s, left, top = f32(-0.125), f32(ox), f32(oy)
+    for i in range(count):
+        k, at = entries[begin + i], U(i) * FIELDS
+        fetched[at] = s * HALF * flat[k, 2]
+        fetched[at + U(1)] = s * flat[k, 3]
+        fetched[at + U(2)] = s * HALF * flat[k, 4]
+        fetched[at + U(3)] = flat[k, 0] - left
+        fetched[at + U(4)] = flat[k, 1] - top
+        fetched[at + U(5)] = flat[k, 5]
+        fetched[at + FIRST_ROW] = f32(max(extent[k, 1] - oy, 0))
+        fetched[at + END_ROW] = f32(min(extent[k, 3] - oy, TILE))
+    return count
 
 
 @tile_jit
-def _misses(y: int, a: float, b: float, c: float, u: float, v: float, floor: float) -> bool:
-    """Whether the largest exponent along pixel row y of the tile is below ``floor``."""
-    dy: float = f32(y) + HALF - v
-    h = b * dy
-    dx: float = min(max(HALF * h / (f32(1e-30) - a), HALF - u), f32(TILE - 0.5) - u)  # a <= 0, and may underflow to 0
-    return (a * dx + h) * dx + c * dy * dy < floor
-
-
-@tile_jit
-def rows(
-    y0: int, y1: int, a: float, b: float, c: float, u: float, v: float, opacity: float, rule: tuple[float, ...]
-) -> tuple[int, int]:
-    """Rows [y0, y1) of the tile without those at either end that the ellipse of what is drawn, being convex, misses."""
-    floor = max(f32(0.125) * math.log(rule[0] / opacity), rule[2]) - f32(1e-4)
-    y0, y1 = max(y0, 0), min(y1, TILE)
-    while y0 < y1 and _misses(y0, a, b, c, u, v, floor):
-        y0 += 1
-    while y1 > y0 and _misses(y1 - 1, a, b, c, u, v, floor):
-        y1 -= 1
-    return U(y0), U(y1)
+def fetch_colors(entries: np.ndarray, begin: int, count: int, colors: np.ndarray, fetched: np.ndarray) -> None:
+    """The colours of ``count`` entries from ``begin`` on into their places of ``fetched``."""
+    for i in range(count):
+        k, at = entries[begin + i], U(i) * FIELDS
+        fetched[at + RED] = colors[k, 0]
+        fetched[at + GREEN] = colors[k, 1]
+        fetched[at + BLUE] = colors[k, 2]
 
 
 @tile_jit

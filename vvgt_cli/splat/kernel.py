@@ -103,7 +103,8 @@ def _place(
         return
     extent[k, 0], extent[k, 1], extent[k, 2], extent[k, 3] = int(x0), int(y0), int(x1), int(y1)
     flat[k, 0], flat[k, 1] = u, v
-    flat[k, 2], flat[k, 3], flat[k, 4] = syy / det, -sxy / det, sxx / det
+    per_det = 1.0 / det
+    flat[k, 2], flat[k, 3], flat[k, 4] = syy * per_det, -sxy * per_det, sxx * per_det
     flat[k, 5] = opacity
     depth[k] = z
 

@@ -4,7 +4,7 @@ Of a projection: ``flat`` (K, 7) float32, ``extent`` (K, 4) int32, ``start`` (ti
 ``slots`` (pairs,), ``first`` (K + 1,) as `splat.kernel` fills them; ``tiles`` (n,) int64 the tiles to draw, in the
 order in which threads take them, ``tiles_x`` in a row of the image; ``rule`` (6,) float32 from `Rule.blending`.
 ``colors`` (K, 3) float32. In a tile: ``entries`` (m,) its Gaussians, (``ox``, ``oy``) its corner in pixels, ``buf`` its
-buffer.
+buffer, ``fetched`` what `buffer.fetch` fills.
 """
 
 from __future__ import annotations
@@ -15,20 +15,27 @@ import numpy as np
 from vvgt_cli.jit.decorators import kernel
 from vvgt_cli.splat.buffer import (
     AREA,
+    BLUE,
+    CHUNK,
+    END_ROW,
+    FIELDS,
+    FIRST_ROW,
+    GREEN,
     HALF,
     PLANE_1,
     PLANE_2,
     PLANE_3,
     PLANE_4,
     PLANE_5,
+    RED,
     ZERO,
     U,
     all_ended,
     alpha_at,
     f32,
+    fetch,
+    fetch_colors,
     open_tile,
-    rows,
-    scaled_conic,
     tile_jit,
 )
 from vvgt_cli.splat.constants import TILE
@@ -56,22 +63,27 @@ def _blend_tile(
     rule: tuple[float, ...], buf: np.ndarray,
 ) -> None:  # fmt: skip
     """Blend the Gaussians ``entries`` in their order into planes 1, 2, 3."""
-    for index in range(entries.shape[0]):
-        if (index & 31) == 31 and all_ended(buf):
+    fetched = np.empty(CHUNK * FIELDS, np.float32)
+    for begin in range(0, entries.shape[0], CHUNK):
+        if begin > 0 and all_ended(buf):
             break
-        k = entries[index]
-        a, b, c, u, v, opacity = scaled_conic(flat, k, f32(ox), f32(oy))
-        red, green, blue = colors[k, 0], colors[k, 1], colors[k, 2]
-        y0, y1 = rows(extent[k, 1] - oy, extent[k, 3] - oy, a, b, c, u, v, opacity, rule)
-        for y in range(y0, y1):
-            dy = f32(np.int32(y)) + HALF - v
-            h, q = b * dy, c * dy * dy
-            for i in range(U(TILE)):
-                j = y * U(TILE) + i
-                weight, buf[j] = _pixel(buf[j], f32(np.int32(i)) + HALF - u, a, h, q, opacity, rule)
-                buf[j + PLANE_1] += weight * red
-                buf[j + PLANE_2] += weight * green
-                buf[j + PLANE_3] += weight * blue
+        count = fetch(entries, begin, extent, flat, ox, oy, fetched)
+        fetch_colors(entries, begin, count, colors, fetched)
+        for index in range(count):
+            at = U(index) * FIELDS
+            a, b, c, u, v = fetched[at], fetched[at + U(1)], fetched[at + U(2)], fetched[at + U(3)], fetched[at + U(4)]
+            opacity = fetched[at + U(5)]
+            red, green, blue = fetched[at + RED], fetched[at + GREEN], fetched[at + BLUE]
+            y0, y1 = U(fetched[at + FIRST_ROW]), U(fetched[at + END_ROW])
+            for y in range(y0, y1):
+                dy = f32(np.int32(y)) + HALF - v
+                h, q = b * dy, c * dy * dy
+                for i in range(U(TILE)):
+                    j = y * U(TILE) + i
+                    weight, buf[j] = _pixel(buf[j], f32(np.int32(i)) + HALF - u, a, h, q, opacity, rule)
+                    buf[j + PLANE_1] += weight * red
+                    buf[j + PLANE_2] += weight * green
+                    buf[j + PLANE_3] += weight * blue
 
 
 @kernel(
@@ -109,28 +121,31 @@ def _gather_tile(
     rule: tuple[float, ...], buf: np.ndarray, pairs: np.ndarray,
 ) -> None:  # fmt: skip
     """Weights of each Gaussian into plane 1, then their sum and their products with planes 2 to 5 into ``pairs``."""
-    for index in range(entries.shape[0]):
-        if (index & 31) == 31 and all_ended(buf):
+    fetched = np.empty(CHUNK * FIELDS, np.float32)
+    for begin in range(0, entries.shape[0], CHUNK):
+        if begin > 0 and all_ended(buf):
             break
-        k = entries[index]
-        a, b, c, u, v, opacity = scaled_conic(flat, k, f32(ox), f32(oy))
-        y0, y1 = rows(extent[k, 1] - oy, extent[k, 3] - oy, a, b, c, u, v, opacity, rule)
-        for y in range(y0, y1):
-            dy = f32(np.int32(y)) + HALF - v
-            h, q = b * dy, c * dy * dy
-            for i in range(U(TILE)):
-                j = y * U(TILE) + i
-                buf[j + PLANE_1], buf[j] = _pixel(buf[j], f32(np.int32(i)) + HALF - u, a, h, q, opacity, rule)
-        s0 = s1 = s2 = s3 = s4 = ZERO
-        for j in range(y0 * U(TILE), y1 * U(TILE)):
-            weight = buf[j + PLANE_1]
-            s0 += weight
-            s1 += weight * buf[j + PLANE_2]
-            s2 += weight * buf[j + PLANE_3]
-            s3 += weight * buf[j + PLANE_4]
-            s4 += weight * buf[j + PLANE_5]
-        slot = slots[index]
-        pairs[slot, 0], pairs[slot, 1], pairs[slot, 2], pairs[slot, 3], pairs[slot, 4] = s0, s1, s2, s3, s4
+        for index in range(fetch(entries, begin, extent, flat, ox, oy, fetched)):
+            at = U(index) * FIELDS
+            a, b, c, u, v = fetched[at], fetched[at + U(1)], fetched[at + U(2)], fetched[at + U(3)], fetched[at + U(4)]
+            opacity = fetched[at + U(5)]
+            y0, y1 = U(fetched[at + FIRST_ROW]), U(fetched[at + END_ROW])
+            for y in range(y0, y1):
+                dy = f32(np.int32(y)) + HALF - v
+                h, q = b * dy, c * dy * dy
+                for i in range(U(TILE)):
+                    j = y * U(TILE) + i
+                    buf[j + PLANE_1], buf[j] = _pixel(buf[j], f32(np.int32(i)) + HALF - u, a, h, q, opacity, rule)
+            s0 = s1 = s2 = s3 = s4 = ZERO
+            for j in range(y0 * U(TILE), y1 * U(TILE)):
+                weight = buf[j + PLANE_1]
+                s0 += weight
+                s1 += weight * buf[j + PLANE_2]
+                s2 += weight * buf[j + PLANE_3]
+                s3 += weight * buf[j + PLANE_4]
+                s4 += weight * buf[j + PLANE_5]
+            slot = slots[begin + index]
+            pairs[slot, 0], pairs[slot, 1], pairs[slot, 2], pairs[slot, 3], pairs[slot, 4] = s0, s1, s2, s3, s4
 
 
 @kernel(
