@@ -149,6 +149,17 @@ def test_a_recognised_label_map_is_said_and_none_takes_it_back(vvgt, tmp_path: P
     assert '"label_map": true' in vvgt("info", seg, "--json").out.decode()
 
 
+def test_a_segmentation_is_its_own_table(tmp_path: Path) -> None:
+    from vvgt_cli.runs.source import SourceRequest, load
+
+    values = np.array([0, 1, 3, 1, 0, 3, 1, 0], np.uint8)
+    (tmp_path / "x.seg.nrrd").write_bytes(SEGMENTS.encode() + values.tobytes())
+    with pytest.warns(UserWarning, match="taken as a label map"):
+        table = load(SourceRequest(str(tmp_path / "x.seg.nrrd"))).tf
+    assert isinstance(table, LabelTable)
+    assert [(e.number, e.name) for e in table.labels] == [(1, "skin"), (3, "inner_core")]
+
+
 def test_one_file_a_label_and_they_add_up(vvgt, tmp_path: Path, seg: Path) -> None:
     labels = table(tmp_path, JSON, "a.json")
     done = vvgt("convert", seg, "--labels", labels, "--split-labels", *SMALL, "-o", tmp_path / "p_{}.ply")

@@ -355,3 +355,11 @@ def test_in_python() -> None:
         Volume(balls(12).astype(np.float32)), "gray", layers=[request], max_gaussians=100, size=32, steps=0
     )
     assert np.ptp(both.gaussians.colors) > 0.1
+
+
+def test_the_python_of_the_page_runs() -> None:
+    page = Path(__file__).parent.parent / "docs" / "layers.md"
+    code = page.read_text("utf-8").partition("```python\n")[2].partition("```")[0]
+    names: dict = {}
+    exec(compile(code, "docs/layers.md", "exec"), names)
+    assert len(names["result"].gaussians) > 100

@@ -86,7 +86,7 @@ def command(
       vvgt convert head.nrrd --tf bone.json --tf skin.json -o 'head_{}.ply'
       vvgt convert cells.ome.tif --channel GFP --time 0 -o cells.ply
       vvgt convert atlas.nii.gz --labels atlas.label --split-labels -o 'atlas_{}.ply'
-      vvgt convert ct.nrrd --tf bone.json --layer organs.seg.nrrd,labels=organs.seg.nrrd -o both.ply
+      vvgt convert ct.nrrd --tf bone.json --layer organs.seg.nrrd -o both.ply
     """
     from vvgt_cli.cli.fit import convert_request
 

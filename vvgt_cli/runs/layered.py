@@ -30,6 +30,7 @@ from vvgt_cli.volume import ReadOptions, Volume, statistics
 from vvgt_cli.volume.label_maps import labels_in, recognised
 
 AUTO, NONE = "auto", "none"
+SEGMENTATION = ".seg.nrrd"  # a label map whose header is its table
 COLOR, ALL = "color", "all"  # of --component
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709
 CHANNEL_COLORS = ((0, 1, 0), (1, 0, 1), (0, 1, 1), (1, 0.5, 0), (0.4, 0.4, 1), (1, 1, 0), (1, 0, 0))
@@ -88,11 +89,13 @@ class Content:
         volumes: the scalar field; or red, green, blue and perhaps opacity; or a channel each.
         color: they are colours.
         colors: RGB of each channel, None where the file says none.
+        path: of the file, None where it is in memory.
     """
 
     volumes: tuple[Volume, ...]
     color: bool = False
     colors: Sequence[tuple[float, float, float] | None] = ()
+    path: str | None = None
 
 
 def open_parts(source: str, read: ReadOptions) -> Content:
@@ -118,7 +121,7 @@ def open_parts(source: str, read: ReadOptions) -> Content:
         return Content(parts, True)
     if asked:
         raise UsageError(f"{source}: one component; leave out --component {asked}")
-    return Content((volume,))
+    return Content((volume,), path=source)
 
 
 def is_plain(opened: Content, tf: object, labels: str | LabelTable | None, layers: Sequence[LayerRequest]) -> bool:
@@ -159,7 +162,8 @@ def layers_of(
             stacklevel=2,
         )
     if labels not in (None, NONE):
-        return [_labelled(volume, labels, distance)]
+        own = opened.path if labels == AUTO and str(opened.path).endswith(SEGMENTATION) else labels
+        return [_labelled(volume, own, distance)]
     function = read_transfer_function(tf) if isinstance(tf, str) else tf
     if opened.color:
         return [_colored(opened.volumes, function, tf_range, distance)]

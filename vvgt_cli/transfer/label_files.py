@@ -24,7 +24,7 @@ EXPECTED = (
     'or JSON {"1": {"name": ..., "color": [r, g, b], "opacity": a}}'
 )
 _NAMED = re.compile(r"(-?\d+)\s+(.+?)\s+(\d+)\s+(\d+)\s+(\d+)(?:\s+(\d+))?")
-_SNAP = re.compile(r'(-?\d+)\s+(\d+)\s+(\d+)\s+(\d+)\s+([\d.]+)\s+([01])\s+([01])\s+"(.*)"')
+_SNAP = re.compile(r'(-?\d+)\s+(\d+)\s+(\d+)\s+(\d+)\s+(\d+(?:\.\d*)?)\s+([01])\s+([01])\s+"(.*)"')
 
 
 def read_labels(source: str) -> LabelTable:

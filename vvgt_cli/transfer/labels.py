@@ -62,6 +62,11 @@ class LabelTable:
     def _numbers(self) -> np.ndarray:
         return np.array([label.number for label in self.labels], np.float64)
 
+    @cached_property
+    def _optics(self) -> np.ndarray:
+        """(n, 4) float64 red, green, blue and opacity."""
+        return np.array([(*label.color, label.opacity) for label in self.labels], np.float64)
+
     def _rows(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Row of each of x (n,), and whether it has one."""
         found = np.minimum(np.searchsorted(self._numbers, np.where(np.isnan(x), np.inf, x)), len(self.labels) - 1)
@@ -70,12 +75,11 @@ class LabelTable:
     def opacity(self, x: np.ndarray) -> np.ndarray:
         """Opacity in [0, 1] per unit distance of labels x (n,); 0 where there is no entry."""
         rows, there = self._rows(x)
-        return np.where(there, np.array([label.opacity for label in self.labels])[rows], 0.0)
+        return np.where(there, self._optics[rows, 3], 0.0)
 
     def color(self, x: np.ndarray) -> np.ndarray:
         """RGB (n, 3) in [0, 1] of labels x (n,)."""
-        colors = np.array([label.color for label in self.labels], np.float64)
-        result: np.ndarray = colors[self._rows(x)[0]]
+        result: np.ndarray = self._optics[self._rows(x)[0], :3]
         return result
 
     def node_range(self) -> tuple[float, float]:

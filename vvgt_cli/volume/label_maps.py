@@ -7,7 +7,7 @@ import re
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.stats import slabs
+from vvgt_cli.volume.stats import count_integers, slabs
 from vvgt_cli.volume.types import Volume
 
 FEW = 512  # labels up to which a volume that is named so is taken for a label map
@@ -21,6 +21,10 @@ def labels_in(volume: Volume) -> list[int]:
     Raises:
         DataError: data values that are no whole numbers, or more than `MOST` of them.
     """
+    kind = volume.data.dtype
+    if kind.kind in "iu" and kind.itemsize <= 2 and (volume.slope, volume.intercept) == (1, 0):
+        counts, first = count_integers(volume)
+        return [int(n) + first for n in np.flatnonzero(counts)]
     found = np.empty(0)
     for _, slab in slabs(volume):
         values = np.unique(slab)
