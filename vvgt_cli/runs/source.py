@@ -86,9 +86,9 @@ class SourceRequest:
 
     def paths(self) -> list[str]:
         """What of it is read from files."""
-        table = None if self.labels in (AUTO, NONE) else self.labels
-        given = [self.volume, self.tf, table, self.read.mask, *(layer.volume for layer in self.layers)]
-        return [path for path in given if isinstance(path, str)]
+        given = [self.volume, self.tf, self.labels, self.read.mask]
+        given += [part for layer in self.layers for part in (layer.volume, layer.tf, layer.labels)]
+        return [path for path in given if isinstance(path, str) and path not in (AUTO, NONE)]
 
 
 @dataclass(frozen=True)
