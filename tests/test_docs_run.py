@@ -66,6 +66,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     ):
         (tmp_path / f"{name}.raw").write_bytes(head + values.tobytes())
     (tmp_path / "dump.raw.gz").write_bytes(gzip.compress(data.tobytes()))
+    nibabel.save(nibabel.Nifti1Image((data.T // 400).astype(np.uint8), affine), tmp_path / "atlas.nii.gz")
     for frame in range(3):
         anatomy.vti(tmp_path / f"run_{frame}.vti", (data // (frame + 1)).astype("<i2"), affine)
     cells = np.stack([[data, data[::-1]], [data, data // 2]]).astype("<u2")  # T C Z Y X

@@ -10,6 +10,7 @@ import sys
 from collections import namedtuple
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from vvgt_cli.jit import ahead
@@ -156,6 +157,10 @@ def test_commands_need_what_is_compiled_ahead_and_nothing_else(tmp_path):
     assert wanted(tmp_path, "render", "a.ply", "--orbit", 1, "--size", 24, "-qo", "r") == set(ahead.DRAW)
     lit = wanted(tmp_path, "convert", SOURCE, *fit, "--steps", 24, "--light", "headlight", "-o", "e.ply")
     assert lit == set(ahead.for_degree(ahead.for_light(ahead.CONVERT, False), 2)) - rare
+    np.save(tmp_path / "seg.npy", (np.indices((9, 9, 9)).sum(axis=0) // 9).astype(np.uint8))
+    labels = wanted(tmp_path, "convert", "seg.npy", *fit, "--steps", 24, "-o", "g.ply")
+    assert labels == set(ahead.for_grid(ahead.CONVERT))
+    assert one_by_one(tmp_path, "convert", "seg.npy", *large, "-o", "h.ply") == []
     dark = ("--light", "above", "--shadows", "--specular", 0)
     flat = wanted(tmp_path, "convert", SOURCE, *fit, "--steps", 24, *dark, "-o", "f.ply")
     assert flat == set(ahead.for_light(ahead.CONVERT, True)) - rare

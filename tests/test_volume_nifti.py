@@ -170,7 +170,7 @@ def test_content_beats_name(tmp_path: Path) -> None:
         (40, np.array([3, 32767, 32767, 32767], "<i2"), "the file has"),
         (40, np.array([3, 5, 0, 3], "<i2"), "at least 1 voxel"),
         (40, np.array([9], "<i2"), "1 to 7 axes"),
-        (70, np.array([128], "<i2"), "RGB colours"),
+        (70, np.array([128], "<i2"), "need 532 bytes"),
         (70, np.array([32], "<i2"), "complex64"),
         (70, np.array([7], "<i2"), "unknown type 7"),
         (108, np.array([np.nan], "<f4"), "vox_offset"),

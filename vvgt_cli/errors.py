@@ -1,5 +1,7 @@
 """The two errors a user can meet: each message says what was read, what was expected, what to try."""
 
+from collections.abc import Sequence
+
 
 class VvgtError(Exception):
     """Base of every error that the command line shows as one line.
@@ -35,3 +37,19 @@ class SeveralSteps(UsageError):
             "vvgt convert, as -o 'p_{:02d}.ply', which makes a series of them"
         )
         self.steps = steps
+
+
+class SeveralComponents(UsageError):
+    """A volume of several components or channels and none chosen.
+
+    Attributes:
+        count: how many there are.
+        color: they are red, green, blue and perhaps opacity.
+        colors: RGB in [0, 1] of each channel, None where the file says none.
+    """
+
+    def __init__(
+        self, text: str, count: int, color: bool = False, colors: Sequence[tuple[float, float, float] | None] = ()
+    ) -> None:
+        super().__init__(text)
+        self.count, self.color, self.colors = count, color, colors

@@ -45,20 +45,28 @@ def convert_functions(request: ConvertRequest, functions: Sequence[str], console
 
 def _one(request: ConvertRequest, tf: str) -> ConvertRequest:
     """The request of one function."""
+    return named(replace(request, source=replace(request.source, tf=tf)), _name(tf), "function")
 
-    def named(option: str, pattern: str | None) -> str | None:
+
+def named(request: ConvertRequest, name: str, what: str) -> ConvertRequest:
+    """The request with a name in its outputs.
+
+    Raises:
+        UsageError: outputs without a place for it.
+    """
+
+    def put(option: str, pattern: str | None) -> str | None:
         if pattern is None:
             return None
         if pattern.count("{}") != 1 or not is_pattern(pattern):
-            raise UsageError(f"{option} {pattern}: expected one place for the function's name, as out_{{}}.ply")
-        return pattern.replace("{}", _name(tf))
+            raise UsageError(f"{option} {pattern}: expected one place for the {what}'s name, as out_{{}}.ply")
+        return pattern.replace("{}", name)
 
     return replace(
         request,
-        source=replace(request.source, tf=tf),
-        output=named("-o", request.output),
-        report=named("--report", request.report),
-        preview=named("--preview", request.preview),
+        output=put("-o", request.output),
+        report=put("--report", request.report),
+        preview=put("--preview", request.preview),
     )
 
 

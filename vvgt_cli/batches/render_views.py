@@ -21,9 +21,9 @@ from vvgt_cli.cameras.sets import FIELD_OF_VIEW, RADIUS, SET_VIEWS, SIZE
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import atomic_write, claim
 from vvgt_cli.images import write_png
-from vvgt_cli.jit.ahead import VIEWS, for_light
+from vvgt_cli.jit.ahead import VIEWS
 from vvgt_cli.progress import Console
-from vvgt_cli.runs.digests import cameras_digest, digest, volume_digest
+from vvgt_cli.runs.digests import cameras_digest, volume_digest
 from vvgt_cli.runs.record import ConversionReport, Run
 from vvgt_cli.runs.source import Source, SourceRequest, load_all
 from vvgt_cli.volume.space import shear_text
@@ -194,9 +194,9 @@ def render_view_sets(request: ViewsRequest, console: Console | None = None) -> i
                 "volume; resample it first ('vvgt convert' takes it)"
             )
         stage.note = f"{volume.name}: {' x '.join(map(str, volume.dims))} {volume.data.dtype.name}"
-    lights = [source.lighting for source in sources if source.lighting is not None]
-    names = for_light(VIEWS, any(light.attenuated for light in lights)) if lights else VIEWS
-    run.compile(names, sources[0].kernel_type())
+    lit = [source for source in sources if source.lighting is not None]
+    lit.sort(key=lambda source: source.lighting is not None and source.lighting.attenuated)
+    run.compile((lit or sources)[-1].kernels(VIEWS), sources[0].kernel_type())
     with run.stage("plan") as stage:
         jobs = _plan(request, views, folders, sources)
         total = sum(len(job.pending) for job in jobs)
@@ -213,7 +213,7 @@ def _settings(request: ViewsRequest, views: Sequence[View], source: Source, cont
     return {
         "version": __version__,
         "volume": content,
-        "function": digest(source.tf.opacity_nodes, source.tf.color_map),
+        "function": source.look(),
         "opacity_unit_distance": source.unit_distance,
         **({} if source.lighting is None else {"light": source.lighting.text()}),
         "views": len(cameras["train"]),
@@ -259,7 +259,7 @@ def _work(run: Run, request: ViewsRequest, job: _Job, views: list[View]) -> None
     if job.pending or models:
         with run.stage("scene") as stage:
             scene = job.source.scene()
-            stage.note = f"{job.source.tf.name}, opacity per {job.source.unit_distance:g} ({job.source.unit_label})"
+            stage.note = f"{job.source.name}, opacity per {job.source.unit_distance:g} ({job.source.unit_label})"
     if job.pending:
         inside = view_renderer(request.renderer, scene, RenderSettings(request.step, request.samples))
         draw = drawn_in_box(inside, scene.volume.axes)

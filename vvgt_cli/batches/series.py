@@ -20,11 +20,15 @@ from vvgt_cli.files import claim, read_text
 from vvgt_cli.network.card import CARD, find_model
 from vvgt_cli.progress import Console
 from vvgt_cli.runs.digests import digest, volume_digest
+from vvgt_cli.runs.layered import AUTO, NONE
 from vvgt_cli.runs.outputs import check_outputs
 from vvgt_cli.runs.place import way_up
 from vvgt_cli.runs.record import ConversionReport, Run
 from vvgt_cli.runs.source import SourceRequest
+from vvgt_cli.transfer.label_files import read_labels
+from vvgt_cli.transfer.labels import LabelTable, distinct
 from vvgt_cli.volume import ReadOptions, Statistics, Volume, statistics
+from vvgt_cli.volume.label_maps import recognised
 
 if TYPE_CHECKING:
     from vvgt_cli.transfer import TransferFunction
@@ -165,6 +169,8 @@ def convert_series(request: ConvertRequest, shard: Shard, console: Console | Non
     with run.stage("frames") as stage:
         frames = survey(steps, console)
         source = replace(source, statistics=frames.whole)
+        if source.labels is None and source.tf is None and recognised(frames.first):
+            source = replace(source, labels=AUTO)
         tf, distance = _function(source, frames)
         dark = [not tf.support(*own) for own in frames.own]
         stage.note = (
@@ -210,17 +216,27 @@ def _frames(
     return done
 
 
-def _function(source: SourceRequest, frames: Frames) -> tuple[TransferFunction, tuple[float, str]]:
+def _function(source: SourceRequest, frames: Frames) -> tuple[TransferFunction | LabelTable, tuple[float, str]]:
     """The function on data values, and its unit distance with how it was chosen; the same for every frame."""
     from vvgt_cli.transfer import from_histogram, read_transfer_function, resolve, unit_distance
     from vvgt_cli.transfer.resolve import parse_tf_range
 
+    if source.labels not in (None, NONE):
+        table = _table(source.labels, frames.whole)
+        return table, unit_distance(source.unit_distance, frames.first)
     read = read_transfer_function(source.tf) if isinstance(source.tf, str) else source.tf
     if read is None:
         shown = from_histogram(frames.whole, frames.first.hounsfield)
     else:
         shown = resolve(read, frames.whole, parse_tf_range(source.tf_range))
     return shown, unit_distance(source.unit_distance, frames.first, read or shown)
+
+
+def _table(labels: str | LabelTable | None, whole: Statistics) -> LabelTable:
+    """Of a series of label maps; colours that are made depend on a label's number alone."""
+    if isinstance(labels, str) and labels != AUTO:
+        return read_labels(labels)
+    return labels if isinstance(labels, LabelTable) else distinct(range(int(whole.lo), int(whole.hi) + 1))
 
 
 def _steps(source: SourceRequest) -> list[Step]:
@@ -269,7 +285,9 @@ def _frame(request: ConvertRequest, source: SourceRequest, names: list[str]) -> 
     )
 
 
-def _settings(request: ConvertRequest, frames: Frames, tf: TransferFunction, distance: float) -> dict[str, Any]:
+def _settings(
+    request: ConvertRequest, frames: Frames, tf: TransferFunction | LabelTable, distance: float
+) -> dict[str, Any]:
     """Everything that the files depend on; named as the command line names it."""
     ply = asdict(request.ply)
     lighting = request.source.light.lighting(tf.lighting, frames.first.space)
@@ -277,7 +295,8 @@ def _settings(request: ConvertRequest, frames: Frames, tf: TransferFunction, dis
         "version": __version__,
         "volume": frames.content,
         "frames": frames.count,
-        "function": digest(tf.opacity_nodes, tf.color_map),
+        "function": digest(*(tf.labels if isinstance(tf, LabelTable) else (tf.opacity_nodes, tf.color_map))),
+        **({"layers": [repr(layer) for layer in request.source.layers]} if request.source.layers else {}),
         "opacity_unit_distance": distance,
         **({} if lighting is None else {"light": lighting.text()}),
         **asdict(request.fit),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from vvgt_cli.cameras.colmap import colmap_model, point_cloud_ply
 from vvgt_cli.cameras.files import blender_json, transforms_json
 from vvgt_cli.images import contact_sheet, over, write_exr, write_png
 from vvgt_cli.images.viewset import read_view
+from vvgt_cli.transfer.types import TransferFunctionLike
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
@@ -155,13 +156,15 @@ def _thinned(scene: Scene, every: np.ndarray) -> Scene:
     """The scene of the middle one of every so many voxels (x, y, z), from the same corner on."""
     if every.max() == 1:
         return scene
-    volume, data = scene.volume, scene.volume.data
-    for axis, (n, step) in enumerate(zip(data.shape, every[::-1], strict=True)):
+    volume, data = scene.volume, scene.volume.data if scene.grid is None else scene.grid
+    for axis, (n, step) in enumerate(zip(volume.data.shape, every[::-1], strict=True)):
         data = np.take(data, np.minimum(np.arange(step // 2, n + step // 2, step), n - 1), axis)
     x, y, z = (float(length) for length in volume.spacing * every)
-    return type(scene).build(
-        replace(volume, data=data, spacing=(x, y, z)), scene.tf, scene.unit_distance, lighting=scene.lighting
-    )
+    if scene.grid is not None:
+        volume, world = replace(volume, data=data[..., 3], spacing=(x, y, z)), np.float32(volume.unit_frame().scale)
+        return type(scene).of_grid(volume, scene.tf, scene.unit_distance, data * world, scene.lighting)
+    volume, tf = replace(volume, data=data, spacing=(x, y, z)), cast(TransferFunctionLike, scene.tf)
+    return type(scene).build(volume, tf, scene.unit_distance, lighting=scene.lighting)
 
 
 def thumbnails(folder: Path, views: Sequence[View], background: Sequence[float]) -> np.ndarray:

@@ -12,7 +12,7 @@ from vvgt_cli.cameras import default_views
 from vvgt_cli.checks import Case, Figure, require
 from vvgt_cli.checks.scenes import Hard, build, camera, function, hard_scenes, ramp, rough, smooth, step
 from vvgt_cli.dvr import RenderSettings, Scene, render_views
-from vvgt_cli.dvr.reference import optics, trilinear
+from vvgt_cli.dvr.reference import optics_at
 from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.splat import render
@@ -30,7 +30,7 @@ def quadrature(scene: Scene, points: int) -> float:
     """Optical mass of a scene, the integral of its extinction: midpoint rule in float64, ``points``^3 a voxel."""
     axes = [(np.arange(n * points) + 0.5) / points - 0.5 for n in scene.volume.dims]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-    tau, _ = optics(scene, trilinear(scene.volume, grid))
+    tau, _ = optics_at(scene, grid)
     return float(tau.sum() * np.prod(scene.step / points))
 
 

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from vvgt_cli.cli.fit import fit_options, limit_options, ply_options, rule_option
 from vvgt_cli.cli.options import common_options, light_options, overwrite_option, placed_read_options, tfs_options
 from vvgt_cli.progress import Console
+
+if TYPE_CHECKING:
+    from vvgt_cli.conversion.request import ConvertRequest
 
 
 @click.command("convert", short_help="Volume and transfer function to .ply.")
@@ -44,10 +48,15 @@ from vvgt_cli.progress import Console
     metavar="FOLDER",
     help="For long runs: keeps what each stage made until OUT.ply is written; the same command goes on there.",
 )
+@click.option(
+    "--split-labels", is_flag=True, help="Of a label map: one file a label, its name for {} in OUT.ply, and an index."
+)
 @click.option("--shard", metavar="I/N", help="Of a series: convert part I of N, for job arrays; I counts from 1.")
 @overwrite_option
 @common_options
-def command(volume: str, shard: str | None, dry_run: bool, console: Console, **options: Any) -> None:
+def command(
+    volume: str, shard: str | None, dry_run: bool, split_labels: bool, console: Console, **options: Any
+) -> None:
     """Convert VOLUME into a standard 3D Gaussian Splatting .ply.
 
     VOLUME is a file (raw with a header or with --dims and --dtype, NRRD, NIfTI, MetaImage, VTK, TIFF, ...),
@@ -76,20 +85,43 @@ def command(volume: str, shard: str | None, dry_run: bool, console: Console, **o
       vvgt convert 'run_*.vti' --tf tf.json -o 'out_{:04d}.ply'
       vvgt convert head.nrrd --tf bone.json --tf skin.json -o 'head_{}.ply'
       vvgt convert cells.ome.tif --channel GFP --time 0 -o cells.ply
+      vvgt convert atlas.nii.gz --labels atlas.label --split-labels -o 'atlas_{}.ply'
+      vvgt convert ct.nrrd --tf bone.json --layer organs.seg.nrrd -o both.ply
     """
-    from vvgt_cli.batches.functions import convert_functions
-    from vvgt_cli.batches.series import convert_series, is_pattern
     from vvgt_cli.cli.fit import convert_request
-    from vvgt_cli.conversion.convert import convert, planned
-    from vvgt_cli.errors import UsageError
 
     functions = options["optics"].pop("tf")
     options["optics"]["tf"] = functions[0] if functions else None
     request = convert_request(volume, **options)
+    if split_labels:
+        _split(request, functions, dry_run or shard is not None, console)
+    else:
+        _convert(request, functions, shard, dry_run, console)
+
+
+def _split(request: ConvertRequest, functions: Sequence[str], other: bool, console: Console) -> None:
+    """One file a label; ``other``: options that go with one file are given."""
+    from vvgt_cli.batches.labels import convert_labels
+    from vvgt_cli.errors import UsageError
+
+    if functions or other or request.checkpoint is not None:
+        raise UsageError("--split-labels is of one label map; leave out --tf, --dry-run, --shard and --checkpoint")
+    convert_labels(request, console)
+
+
+def _convert(
+    request: ConvertRequest, functions: Sequence[str], shard: str | None, dry_run: bool, console: Console
+) -> None:
+    """One volume, a series, or several functions."""
+    from vvgt_cli.batches.functions import convert_functions
+    from vvgt_cli.batches.series import convert_series, is_pattern
+    from vvgt_cli.conversion.convert import convert, planned
+    from vvgt_cli.errors import UsageError
+
     several = len(functions) > 1
     if several and (dry_run or shard is not None or request.checkpoint is not None):
         raise UsageError(f"{len(functions)} functions; expected one with --dry-run, --shard or --checkpoint")
-    series = is_pattern(options["output"]) and not several
+    series = is_pattern(request.output or "") and not several
     if series and request.checkpoint is not None:
         raise UsageError("--checkpoint is of one volume; a series goes on by its manifest: leave the option out")
     if series and dry_run:

@@ -82,13 +82,15 @@ def source_request(
     volume: str, read: dict[str, Any], optics: dict[str, Any], light: dict[str, Any] | None = None
 ) -> SourceRequest:
     """What the shared options of `options.py` add up to."""
+    from vvgt_cli.runs.layered import parse_layer
     from vvgt_cli.runs.source import SourceRequest
     from vvgt_cli.transfer.lighting import LightOptions
     from vvgt_cli.volume import ReadOptions
 
     return SourceRequest(
         volume, ReadOptions(**read), optics["tf"], optics["tf_range"], optics["opacity_unit_distance"],
-        light=LightOptions(**(light or {})),
+        light=LightOptions(**(light or {})), labels=optics["labels"],
+        layers=tuple(parse_layer(text, read.get("space")) for text in optics["layers"]),
     )  # fmt: skip
 
 

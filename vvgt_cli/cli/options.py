@@ -74,13 +74,18 @@ _READ = dict(
         "--component",
         "--channel",
         "component",
-        metavar="N|NAME|magnitude",
+        metavar="N|NAME|magnitude|color|all",
         callback=_component,
-        help="Which component of vectors, or which channel: its number from 0, or its name.",
+        help="Which component of vectors, or which channel: its number from 0, or its name; color: components are "
+        "red, green, blue and perhaps opacity; all: every channel in its own colour.",
     ),
     time=click.option(
         "--time", type=click.IntRange(0), metavar="N", help="Which time step, from 0, where the file holds several."
     ),
+    crop=click.option(
+        "--crop", metavar="X0:X1,Y0:Y1,Z0:Z1", help="Voxels to keep, from 0, the last excluded; ends may be left out."
+    ),
+    mask=click.option("--mask", metavar="FILE", help="Volume of the same size: where it is 0 nothing is shown."),
 )
 read_options = group("read", **_READ)
 placed_read_options = group(
@@ -102,12 +107,26 @@ unit_distance_option = click.option(
     help="Distance that the function's opacity refers to. Default: the function's own, else paraview.",
 )  # fmt: skip
 
+LABELS = dict(
+    labels=click.option(
+        "--labels", metavar="TABLE|auto|none",
+        help="VOLUME is a label map: its table (3D Slicer, ITK-SNAP, FreeSurfer, .seg.nrrd, JSON), or auto for "
+        "distinct colours. Default: auto where it is recognised by name and type; none: scalars.",
+    ),
+    layers=click.option(
+        "--layer", "layers", multiple=True, metavar="FILE[,tf=TF][,labels=TABLE]...",
+        help="Lay another volume over VOLUME, where both say they are, with its own tf, labels, distance, array, "
+        "component (channel) or time; may be repeated.",
+    ),
+)  # fmt: skip
+
 TF_HELP = "Transfer function: a file, or a matplotlib colour map's name. Default: made from the values."
 tf_options = group(
     "optics",
     tf=click.option("--tf", metavar="TF", help=TF_HELP),
     tf_range=tf_range_option,
     opacity_unit_distance=unit_distance_option,
+    **LABELS,
 )
 tfs_options = group(
     "optics",
@@ -116,6 +135,7 @@ tfs_options = group(
     ),
     tf_range=tf_range_option,
     opacity_unit_distance=unit_distance_option,
+    **LABELS,
 )
 
 light_options = group(

@@ -6,7 +6,9 @@ from typing import Any
 
 import click
 
+from vvgt_cli.cli.fit import source_request
 from vvgt_cli.cli.options import (
+    LABELS,
     common_options,
     group,
     light_options,
@@ -89,6 +91,7 @@ optics_options = group(
     ),
     tf_range=tf_range_option,
     opacity_unit_distance=unit_distance_option,
+    **LABELS,
 )  # fmt: skip
 
 
@@ -133,16 +136,10 @@ def command(
     from vvgt_cli.batches.render_views import CameraRequest, ViewsRequest, parse_shard, render_view_sets
     from vvgt_cli.batches.view_files import Layout
     from vvgt_cli.errors import UsageError
-    from vvgt_cli.runs.source import SourceRequest
-    from vvgt_cli.transfer.lighting import LightOptions
-    from vvgt_cli.volume import ReadOptions
 
     if layout["half"] and layout["format"] == "png":
         raise UsageError("--half is of EXR, which --format png leaves out; leave out one of the two")
-    source = SourceRequest(
-        volume, ReadOptions(**read), None, optics["tf_range"], optics["opacity_unit_distance"],
-        light=LightOptions(**light),
-    )  # fmt: skip
+    source = source_request(volume, read, optics | {"tf": None}, light)
     request = ViewsRequest(
         source, optics["tf"], output, CameraRequest(**cameras), Layout(**layout),
         shard=parse_shard(shard), overwrite=overwrite, **rays,

@@ -100,7 +100,8 @@ def with_fewer(case: Case, scene: Scene, gaussians: int) -> Case:
 def _volume_bytes(scene: Scene) -> int:
     """Of the values, and of the copy where the kernels need another type."""
     data, values = scene.volume.data, scene.values
-    return data.nbytes + (0 if np.may_share_memory(data, values) else values.nbytes)
+    grid = 0 if scene.grid is None else scene.grid.nbytes
+    return data.nbytes + grid + (0 if np.may_share_memory(data, values) else values.nbytes)
 
 
 def _view_seconds(scene: Scene, size: int) -> float:

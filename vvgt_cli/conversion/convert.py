@@ -17,7 +17,7 @@ from vvgt_cli.conversion.stages.views import wide
 from vvgt_cli.errors import UsageError
 from vvgt_cli.files import check_room
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored
-from vvgt_cli.jit.ahead import CONVERT, EVALUATE, INIT, for_degree, for_light
+from vvgt_cli.jit.ahead import CONVERT, EVALUATE, INIT, for_degree
 from vvgt_cli.network.card import find_model, read_card
 from vvgt_cli.progress import Console
 from vvgt_cli.runs.gaussian_files import write_gaussians
@@ -225,9 +225,7 @@ def _begin(run: Run, request: ConvertRequest) -> tuple[Source, Scene]:
 def _kernels(run: Run, request: ConvertRequest, source: Source) -> tuple[str, ...]:
     """That a run will need."""
     names: tuple[str, ...] = CONVERT if run.report.command == "convert" else INIT
-    if source.lighting is not None:
-        names = for_light(names, source.lighting.attenuated)
-    return for_degree(names, degree_of(request, source))
+    return for_degree(source.kernels(names), degree_of(request, source))
 
 
 def degree_of(request: ConvertRequest, source: Source) -> int:
@@ -269,7 +267,7 @@ def _write(run: Run, request: ConvertRequest, conversion: Conversion) -> Convers
     assert request.output is not None
     write_gaussians(run, request.output, conversion.gaussians, conversion.ply, request.overwrite, conversion.normals())
     if format_of(request.output):
-        run.compile(EVALUATE)
+        run.compile(conversion.source.kernels(EVALUATE), conversion.source.kernel_type())
         volume = conversion.source.volume
         tell_cost(run, request.output, conversion.gaussians, conversion.ply, conversion.scene, volume)
     if request.preview:

@@ -132,7 +132,7 @@ def checkpoint_of(folder: str | None, source: Source, fit: FitOptions, limits: L
     depends = {
         "version": __version__,
         "volume": volume_digest(source.volume),
-        "function": digest(source.tf.opacity_nodes, source.tf.color_map),
+        "function": source.look(),
         "opacity_unit_distance": source.unit_distance,
         "light": None if source.lighting is None else source.lighting.text(),
         **asdict(fit),

@@ -33,6 +33,8 @@ def view_renderer(
     settings = settings or RenderSettings()
     if renderer not in RENDERERS:
         raise UsageError(f"renderer {renderer!r}; expected one of {', '.join(RENDERERS)}")
+    if scene.grid is not None and renderer != "cpu":
+        raise UsageError(f"the {renderer} renderer draws one volume under a function; of {scene.tf.name} try cpu")
     if scene.light is not None and renderer == "cuda":
         raise UsageError("the cuda renderer has no lighting; use the cpu renderer, or --light none")
     if scene.light is not None and renderer == "vtk" and (scene.light.shadows or scene.light.occlusion):

@@ -46,6 +46,31 @@ class Voxels(_Values):
         return super().__new__(cls, values)
 
 
+class _Grid(NamedTuple):
+    values: np.ndarray
+
+
+class Texels(_Grid):
+    """An optics grid, so laid out that what `vectors.texel` loads by its address lies within it.
+
+    Attributes:
+        values: (nz, ny, nx, 4) float32 extinction times (r, g, b, 1) per unit-frame length, writable: kernels know no
+            other.
+
+    Raises:
+        ValueError: a layout under which loads would go astray.
+    """
+
+    __slots__ = ()
+
+    def __new__(cls, values: np.ndarray) -> Texels:
+        if values.ndim != 4 or values.shape[3] != 4 or 0 in values.shape or values.dtype != np.dtype(np.float32):
+            raise ValueError(f"grid {values.shape} of {values.dtype}; expected (nz, ny, nx, 4) float32, not empty")
+        if not (values.flags.c_contiguous and values.flags.aligned and values.flags.writeable):
+            raise ValueError(f"grid {values.shape}; expected aligned, C-contiguous and writable memory")
+        return super().__new__(cls, values)
+
+
 class Optics(NamedTuple):
     """Tables of optics over ``u = (stored - lo) * inv_width``, as `OpticalTables` has them.
 
@@ -94,3 +119,5 @@ class Light(NamedTuple):
 # Types of the fields, for `jit.decorators.kernel`.
 TUPLES: dict[type, str] = {Voxels: "V", Optics: "f8 f8 f8:2 f8:2 f8:1"}
 LIT: dict[type, str] = {**TUPLES, Light: "f8 f8 f8 f8 i8 f8:2 f4:4 i8 i8 f8 f8:1"}
+GRID: dict[type, str] = {Texels: "f4:4"}
+LIT_GRID: dict[type, str] = {**LIT, **GRID}

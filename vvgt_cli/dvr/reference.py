@@ -6,11 +6,14 @@ Per segment of length ds, with the scalar s at its middle (Max 1995, eq. 8, by t
 
 from __future__ import annotations
 
+from typing import cast
+
 import numpy as np
 
 from vvgt_cli.cameras import Camera
 from vvgt_cli.dvr.scene import Scene
 from vvgt_cli.transfer.tables import extinction
+from vvgt_cli.transfer.types import TransferFunctionLike
 from vvgt_cli.volume import Volume
 
 RAYS = 4096  # marched at a time: bounds the memory
@@ -38,9 +41,18 @@ def trilinear(volume: Volume, points: np.ndarray) -> np.ndarray:
 def optics(scene: Scene, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Extinction (n,) per unit-frame length and colour (n, 3) of data values (n,); NaN is transparent."""
     known = np.isfinite(x)
-    clean = np.clip(np.where(known, x, 0.0), *scene.tf.node_range())
-    tau = extinction(scene.tf.opacity(clean), scene.unit_distance) / scene.volume.unit_frame().scale
-    return np.where(known, tau, 0.0), scene.tf.color(clean)
+    tf = cast(TransferFunctionLike, scene.tf)
+    clean = np.clip(np.where(known, x, 0.0), *tf.node_range())
+    tau = extinction(tf.opacity(clean), scene.unit_distance) / scene.volume.unit_frame().scale
+    return np.where(known, tau, 0.0), tf.color(clean)
+
+
+def optics_at(scene: Scene, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Extinction (n,) per unit-frame length and colour (n, 3) at voxel coordinates (n, 3)."""
+    if scene.grid is None:
+        return optics(scene, trilinear(scene.volume, points))
+    *color, tau = (grid_values(scene.grid[..., k], points) for k in range(4))
+    return tau, np.stack(color, axis=-1) / np.where(tau > 0, tau, 1)[:, None]
 
 
 def normals(scene: Scene, points: np.ndarray) -> np.ndarray:
@@ -126,7 +138,7 @@ def march(scene: Scene, origin: np.ndarray, directions: np.ndarray, step: float)
     for i in range(count):
         t = first + (i + 0.5) * ds
         points = (origin + t[:, None] * directions + scene.half) / scene.step - 0.5
-        tau, rgb = optics(scene, trilinear(scene.volume, points))
+        tau, rgb = optics_at(scene, points)
         alpha = -np.expm1(-tau * ds)
         if scene.light is not None:
             factor, white = shade(scene, points, directions)

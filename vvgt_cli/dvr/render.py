@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -114,27 +115,33 @@ def _thinner_than_a_pixel(scene: Scene, camera: Camera) -> bool:
     return bool(2 * scene.half.min() * camera.fx < np.linalg.norm(camera.position))
 
 
+def _rays(scene: Scene) -> Callable[..., None]:
+    """The kernel of a scene's kind, with what it reads of it."""
+    from vvgt_cli.dvr import grid, kernel, lit
+
+    if scene.grid is None:
+        if scene.light is None:
+            return partial(kernel.render_tiles, scene.voxels, scene.optics, scene.empty)
+        return partial(lit.render_lit_tiles, scene.voxels, scene.optics, scene.empty, scene.light)
+    if scene.light is None:
+        return partial(grid.render_grid_tiles, scene.texels, scene.empty)
+    return partial(grid.render_lit_grid_tiles, scene.texels, scene.voxels, scene.empty, scene.light)
+
+
 def render_view(
     scene: Scene, camera: Camera, settings: RenderSettings | None = None, blocks: Blocks | None = None
 ) -> np.ndarray:
     """One view: (height, width, 4) float32, premultiplied RGBA over nothing; with ``blocks`` zero elsewhere."""
-    from vvgt_cli.dvr.kernel import render_tiles
-    from vvgt_cli.dvr.lit import render_lit_tiles
-
     settings = settings or RenderSettings()
     if _thinner_than_a_pixel(scene, camera):
         settings = replace(settings, tiers=((-1.0, settings.tiers[-1][1]),))  # a first ray a pixel may show nothing
-    voxels, optics = scene.voxels, scene.optics
+    draw = _rays(scene)
     eye, basis, lens = camera_arrays(scene, camera)
     out = np.zeros((camera.height, camera.width, 4), np.float32)
     order = tile_order(camera.height, camera.width, blocks)
 
     def cast(offsets: np.ndarray, mask: np.ndarray, known: int) -> None:
-        where = eye, basis, lens, float(settings.step), order, offsets, mask, known, out
-        if scene.light is None:
-            render_tiles(voxels, optics, scene.empty, *where)
-        else:
-            render_lit_tiles(voxels, optics, scene.empty, scene.light, *where)
+        draw(eye, basis, lens, float(settings.step), order, offsets, mask, known, out)
 
     cast_tiers(settings, out, cast, blocks)
     return out

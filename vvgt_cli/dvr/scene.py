@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vvgt_cli.dvr.layout import BRICK as BRICK  # for pipeline.plan, until it asks layout
-from vvgt_cli.dvr.layout import Light, Optics, Voxels, pairs_fit
+from vvgt_cli.dvr.layout import Light, Optics, Texels, Voxels, pairs_fit
 from vvgt_cli.transfer.lighting import Lighting
 from vvgt_cli.transfer.tables import OpticalTables, build_tables
-from vvgt_cli.transfer.types import TransferFunctionLike
+from vvgt_cli.transfer.types import Named, TransferFunctionLike
 from vvgt_cli.volume import Volume
 
 
@@ -51,10 +51,12 @@ class Scene:
         half, step: (3,) float64 half extents and voxel edges in the unit frame, (x, y, z).
         lighting: in world axes; ``light`` the same as kernels take it, with its shadows; None: colours are the
             function's.
+        grid: (nz, ny, nx, 4) float32 extinction times (r, g, b, 1) per unit-frame length, of an optics grid: what is
+            drawn. ``values`` and ``tables`` then hold its extinction alone: what light, shadows and bricks ask for.
     """
 
     volume: Volume
-    tf: TransferFunctionLike
+    tf: Named
     unit_distance: float
     values: np.ndarray
     tables: OpticalTables
@@ -63,6 +65,13 @@ class Scene:
     step: np.ndarray
     lighting: Lighting | None = None
     light: Light | None = None
+    grid: np.ndarray | None = None
+
+    @property
+    def texels(self) -> Texels:
+        """`grid` as kernels take it."""
+        assert self.grid is not None
+        return Texels(self.grid)
 
     @property
     def voxels(self) -> Voxels:
@@ -109,6 +118,24 @@ class Scene:
         )
         empty = bricks.empty_distance(ranges, tables)
         scene = cls(volume, tf, unit_distance, values, tables, empty, np.array(frame.half), np.array(frame.step))
+        return scene if lighting is None else scene.lit(lighting)
+
+    @classmethod
+    def of_grid(
+        cls, volume: Volume, tf: Named, unit_distance: float, grid: np.ndarray, lighting: Lighting | None = None
+    ) -> Scene:
+        """An optics grid (nz, ny, nx, 4) float32 per world length, taken over and scaled, on the grid of ``volume``."""
+        from vvgt_cli.dvr import bricks
+
+        frame = volume.unit_frame()
+        grid *= np.float32(1 / frame.scale)
+        values = _read_only(grid[..., 3], grid.dtype)
+        top = float(values.max()) or 1.0
+        nodes = np.array([[0.0, 0, 0, 0], [0, 0, 0, top]])
+        tables = OpticalTables(0.0, 1 / top, nodes, np.cumsum(nodes / 2, axis=0))
+        empty = bricks.empty_distance(bricks.brick_ranges(values), tables)
+        half, step = np.array(frame.half), np.array(frame.step)
+        scene = cls(volume, tf, unit_distance, values, tables, empty, half, step, grid=grid)
         return scene if lighting is None else scene.lit(lighting)
 
     def lit(self, lighting: Lighting) -> Scene:

@@ -58,6 +58,22 @@ def row(typingctx: Any, table: Any, index: Any) -> Any:
 
 
 @intrinsic
+def texel(typingctx: Any, grid: Any, index: Any) -> Any:
+    """Voxel ``index`` (unsigned, in range, x fastest) of a C-contiguous float32 array (nz, ny, nx, 4)."""
+    if not (isinstance(grid, types.Array) and (grid.dtype, grid.ndim, grid.layout) == (types.float32, 4, "C")):
+        raise TypingError(f"voxels are taken from C-contiguous float32 grids, not from {grid}")
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        array = context.make_array(signature.args[0])(context, builder, args[0])
+        at = builder.shl(args[1], ir.Constant(args[1].type, 2))
+        start = builder.gep(array.data, [at])
+        four = builder.load(builder.bitcast(start, ir.VectorType(ir.FloatType(), 4).as_pointer()), align=4)
+        return builder.fpext(four, QUAD)
+
+    return quad(grid, index), codegen
+
+
+@intrinsic
 def zeros4(typingctx: Any) -> Any:
     """(0, 0, 0, 0)."""
     return quad(), lambda context, builder, signature, args: ir.Constant(QUAD, [0.0] * 4)

@@ -4,6 +4,11 @@ from __future__ import annotations
 
 RAYCAST = ("vvgt_cli.dvr.kernel:render_tiles", "vvgt_cli.dvr.bricks:_ranges", "vvgt_cli.dvr.contrast:_contrast")
 LIGHT = ("vvgt_cli.dvr.lit:render_lit_tiles", "vvgt_cli.vbm.lit:_shade", "vvgt_cli.dvr.shadows:mean_transmittance")
+GRID = {
+    "vvgt_cli.dvr.kernel:render_tiles": "vvgt_cli.dvr.grid:render_grid_tiles",
+    "vvgt_cli.dvr.lit:render_lit_tiles": "vvgt_cli.dvr.grid:render_lit_grid_tiles",
+    "vvgt_cli.vbm.quadrature:block_moments": "vvgt_cli.vbm.grid:grid_moments",
+}
 DRAW = ("vvgt_cli.splat.kernel:tile_lists", "vvgt_cli.splat.tiles:blend", "vvgt_cli.splat.kernel:project")
 CLOSED_FORM = (
     "vvgt_cli.vbm.visibility:march",
@@ -37,6 +42,8 @@ INFER = (*DRAW, SLOPES[0], "vvgt_cli.splat.backward:standard", *BACK_PROJECT)
 ALL = (
     *CONVERT,
     *LIGHT,
+    *GRID.values(),
+    "vvgt_cli.dvr.place:place",
     *INFER[len(DRAW) + 1 :],
     *HARMONICS,
     *STEPPED,
@@ -58,3 +65,8 @@ def for_degree(names: tuple[str, ...], degree: int) -> tuple[str, ...]:
         return names
     stepped = STEPPED if REFINE[0] in names else ()
     return (*names, *(HARMONICS if SLOPES[0] in names else HARMONICS[1:]), *stepped)
+
+
+def for_grid(names: tuple[str, ...]) -> tuple[str, ...]:
+    """Kernels of a command whose scene is an optics grid."""
+    return tuple(GRID.get(name, name) for name in names)

@@ -11,6 +11,8 @@ from vvgt_cli.conversion.result import Conversion, Result
 from vvgt_cli.gaussians import Gaussians, PlyHeader
 from vvgt_cli.library.inputs import (
     FunctionLike,
+    LabelsLike,
+    LayerLike,
     LightLike,
     PathLike,
     Reading,
@@ -45,6 +47,8 @@ def convert(
     tf_range: str | Sequence[float] = "data",
     opacity_unit_distance: str | float | None = None,
     light: LightLike = None,
+    labels: LabelsLike | None = None,
+    layers: Sequence[LayerLike] = (),
     all_views: bool = False,
     progress: bool = False,
     **reading: Unpack[Reading],
@@ -53,8 +57,6 @@ def convert(
 
     >>> import vvgt_cli as vvgt
     >>> result = vvgt.convert("example:marschner-lobb:24", max_gaussians=200, size=64, steps=0)
-    >>> result.gaussians.means.shape[1]
-    3
     >>> result.scores["psnr"] > 15
     True
 
@@ -69,6 +71,8 @@ def convert(
         opacity_unit_distance: world length that opacity is per, "paraview" or "mean-spacing".
         light: "none", "headlight", a direction (x, y, z) or its name, several of these, or `LightOptions`; None: what
             the function's file says.
+        labels: a label map's table: a file, a mapping {label: {"name", "color", "opacity"}}, "auto", "none".
+        layers: what is laid over it: files as ``--layer`` has them, or `LayerRequest`.
         all_views: score on all ten test views, by SSIM and FLIP too, as ``--report`` does.
         progress: lines and bars on standard error.
         **reading: how to read the volume: see `Reading`.
@@ -84,9 +88,8 @@ def convert(
     from vvgt_cli.conversion.request import FitOptions, Limits
 
     fit = FitOptions(max_gaussians, size, init, rule, seed, steps, model)
-    limits = Limits(target_psnr, time_budget, max_megabytes)
-    source = source_of(volume, tf, tf_range, opacity_unit_distance, reading, light)
-    return in_memory(source, fit, limits, all_views, console_of(progress))
+    source = source_of(volume, tf, tf_range, opacity_unit_distance, reading, light, labels, layers)
+    return in_memory(source, fit, Limits(target_psnr, time_budget, max_megabytes), all_views, console_of(progress))
 
 
 def read_volume(volume: VolumeLike, **reading: Unpack[Reading]) -> Volume:
@@ -126,6 +129,8 @@ def render_views(
     tf_range: str | Sequence[float] = "data",
     opacity_unit_distance: str | float | None = None,
     light: LightLike = None,
+    labels: LabelsLike | None = None,
+    layers: Sequence[LayerLike] = (),
     **reading: Unpack[Reading],
 ) -> tuple[list[Camera], np.ndarray]:
     """Pictures of a volume by our renderer, in memory; ``vvgt render-views`` writes them for trainers.
@@ -136,7 +141,7 @@ def render_views(
     (2, 32, 32, 4)
 
     Args:
-        volume, tf, tf_range, opacity_unit_distance, light, reading: as of `convert`.
+        volume, tf, tf_range, opacity_unit_distance, light, labels, layers, reading: as of `convert`.
         cameras: in the unit frame, all of one size; or how many of the training views.
         size: pixels along the edge of the training views.
         step: along a ray, in voxels.
@@ -157,7 +162,7 @@ def render_views(
     views = default_views("train", cameras, size=size) if isinstance(cameras, int) else list(cameras)
     if len({(view.width, view.height) for view in views}) != 1:
         raise UsageError(f"{len(views)} cameras of several sizes; expected one or more of one size")
-    source = load(source_of(volume, tf, tf_range, opacity_unit_distance, reading, light))
+    source = load(source_of(volume, tf, tf_range, opacity_unit_distance, reading, light, labels, layers))
     scene = source.scene()
     draw = drawn_in_box(lambda view: render_view(scene, view, RenderSettings(step=step)), source.volume.axes)
     return views, np.stack([draw(view) for view in views])
@@ -175,6 +180,8 @@ def evaluate(
     tf_range: str | Sequence[float] = "data",
     opacity_unit_distance: str | float | None = None,
     light: LightLike = None,
+    labels: LabelsLike | None = None,
+    layers: Sequence[LayerLike] = (),
     progress: bool = False,
     **reading: Unpack[Reading],
 ) -> Evaluation:
@@ -182,7 +189,7 @@ def evaluate(
 
     Args:
         ply: path, or what `convert` or `optimize` returned.
-        volume, tf, tf_range, opacity_unit_distance, light, reading: as of `convert`.
+        volume, tf, tf_range, opacity_unit_distance, light, labels, layers, reading: as of `convert`.
         size, rule: to score at and draw by; None: the file's.
         step: of the reference, in voxels.
         seats: every rule at several sizes and close up, too.
@@ -193,7 +200,7 @@ def evaluate(
     """
     from vvgt_cli.tasks import evaluate as pipeline
 
-    source = source_of(volume, tf, tf_range, opacity_unit_distance, reading, light)
+    source = source_of(volume, tf, tf_range, opacity_unit_distance, reading, light, labels, layers)
     request = pipeline.EvaluateRequest(ply_of(ply), source, size, rule, step, seats)
     return pipeline.evaluate(request, console_of(progress))
 

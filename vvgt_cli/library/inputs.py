@@ -12,14 +12,19 @@ from typing import Any, BinaryIO, TypedDict
 from vvgt_cli.conversion.result import Result
 from vvgt_cli.errors import UsageError
 from vvgt_cli.progress import Console
+from vvgt_cli.runs.layered import LayerRequest, parse_layer
 from vvgt_cli.runs.source import Opened, SourceRequest
 from vvgt_cli.transfer import TransferFunction
+from vvgt_cli.transfer.label_files import table_of
+from vvgt_cli.transfer.labels import LabelTable
 from vvgt_cli.transfer.lighting import LightOptions
 from vvgt_cli.volume import ReadOptions, Volume
 
 PathLike = str | os.PathLike[str]
 VolumeLike = Any  # a path, a Volume, a Session, an array, an xarray.DataArray, a pyvista (VTK) dataset
 LightLike = LightOptions | str | Sequence[float] | Sequence[str | Sequence[float]] | None
+LabelsLike = PathLike | Mapping[Any, Mapping[str, Any]] | LabelTable
+LayerLike = PathLike | LayerRequest
 FunctionLike = PathLike | Mapping[str, Any] | TransferFunction
 
 
@@ -35,6 +40,8 @@ class Reading(TypedDict, total=False):
     component: int | str
     time: int
     space: str
+    crop: str
+    mask: Any
     affine: Any
     origin: Sequence[float]
 
@@ -53,15 +60,11 @@ def volume_of(volume: VolumeLike, reading: Reading, name: str = "array") -> Volu
     """
     from vvgt_cli.synth.sources import open_volume
     from vvgt_cli.volume.memory import volume_in_memory
+    from vvgt_cli.volume.registry import cut
 
     given: dict[str, Any] = dict(reading)
-    if unknown := sorted(set(given) - set(Reading.__annotations__)):
-        raise UsageError(f"{unknown[0]}: no such option; of reading expected {', '.join(Reading.__annotations__)}")
     affine, origin = given.pop("affine", None), given.pop("origin", None)
-    for key in ("dims", "spacing"):
-        if given.get(key) is not None:
-            given[key] = tuple(float(v) if key == "spacing" else int(v) for v in given[key])
-    options = ReadOptions(**given)
+    options = _options(given)
     if isinstance(volume, Volume):
         if reading:
             raise UsageError(f"{', '.join(reading)}: a Volume has been read; leave out {', '.join(reading)}")
@@ -70,7 +73,29 @@ def volume_of(volume: VolumeLike, reading: Reading, name: str = "array") -> Volu
         if affine is not None or origin is not None:
             raise UsageError("affine and origin are of arrays; a file says itself where it is; leave them out")
         return open_volume(os.fspath(volume), options)
-    return volume_in_memory(volume, options, origin=origin, affine=affine, name=name)
+    return cut(volume_in_memory(volume, options, origin=origin, affine=affine, name=name), options)
+
+
+def _options(reading: Mapping[str, Any]) -> ReadOptions:
+    """How to read, of what callers hand in.
+
+    Raises:
+        UsageError: options that there are not.
+    """
+    import numpy as np
+
+    given = dict(reading)
+    if unknown := sorted(set(given) - set(Reading.__annotations__)):
+        raise UsageError(f"{unknown[0]}: no such option; of reading expected {', '.join(Reading.__annotations__)}")
+    if "affine" in given or "origin" in given:
+        raise UsageError("affine and origin are of arrays; a file says itself where it is; leave them out")
+    for key in ("dims", "spacing"):
+        if given.get(key) is not None:
+            given[key] = tuple(float(v) if key == "spacing" else int(v) for v in given[key])
+    if given.get("mask") is not None and not isinstance(given["mask"], str | Volume):
+        mask = given["mask"]
+        given["mask"] = os.fspath(mask) if isinstance(mask, os.PathLike) else Volume(np.asarray(mask), name="mask")
+    return ReadOptions(**given)
 
 
 def function_of(tf: FunctionLike | None) -> str | TransferFunction | None:
@@ -93,6 +118,8 @@ def source_of(
     opacity_unit_distance: str | float | None,
     reading: Reading,
     light: LightLike = None,
+    labels: LabelsLike | None = None,
+    layers: Sequence[LayerLike] = (),
 ) -> SourceRequest:
     """The volume, read, under a function.
 
@@ -102,8 +129,31 @@ def source_of(
     if not isinstance(tf_range, str):
         tf_range = ",".join(repr(float(v)) for v in tf_range)
     distance = None if opacity_unit_distance is None else str(opacity_unit_distance)
-    opened = _opened(volume, reading) or volume_of(volume, reading)
-    return SourceRequest(opened, tf=function_of(tf), tf_range=tf_range, unit_distance=distance, light=light_of(light))
+    if isinstance(volume, str | os.PathLike):  # colours and channels are several volumes: the source opens them
+        options = _options(reading)
+        given: Any = os.fspath(volume)
+    else:
+        options, given = ReadOptions(), _opened(volume, reading) or volume_of(volume, reading)
+    return SourceRequest(
+        given, options, function_of(tf), tf_range, distance, light=light_of(light), labels=labels_of(labels),
+        layers=tuple(layer_of(layer) for layer in layers),
+    )  # fmt: skip
+
+
+def labels_of(labels: LabelsLike | None) -> str | LabelTable | None:
+    """The table that a caller means: a path, ``auto`` or ``none`` as they are, a mapping read as a JSON file is.
+
+    Raises:
+        DataError: a mapping that is no table.
+    """
+    if isinstance(labels, Mapping):
+        return table_of({str(number): dict(entry) for number, entry in labels.items()}, "labels")
+    return os.fspath(labels) if isinstance(labels, os.PathLike) else labels
+
+
+def layer_of(layer: LayerLike) -> LayerRequest:
+    """A layer as ``--layer`` writes it, or as it is."""
+    return layer if isinstance(layer, LayerRequest) else parse_layer(os.fspath(layer))
 
 
 def _opened(volume: VolumeLike, reading: Reading) -> Opened | None:

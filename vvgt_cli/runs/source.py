@@ -8,13 +8,18 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from vvgt_cli.errors import UsageError
+from vvgt_cli.jit.ahead import for_grid, for_light
+from vvgt_cli.runs.digests import digest, volume_digest
+from vvgt_cli.runs.layered import AUTO, NONE, Content, LayerRequest, is_plain, layers_of, open_parts
+from vvgt_cli.transfer.function import TransferFunction
+from vvgt_cli.transfer.labels import LabelTable
 from vvgt_cli.transfer.lighting import Lighting, LightOptions
 from vvgt_cli.volume import ReadOptions, Statistics, Volume
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
+    from vvgt_cli.dvr.layers import Layer
     from vvgt_cli.dvr.scene import Layout
-    from vvgt_cli.transfer import TransferFunction
 
 
 @dataclass(frozen=True)
@@ -53,6 +58,8 @@ class SourceRequest:
         unit_distance: a length, "paraview", "mean-spacing", or None: the function's own, else "paraview".
         statistics: what the function's nodes follow from in place of the volume's own: those of the whole series.
         light: what falls on it; without options what the function's file says, else nothing.
+        labels: table of its labels, the file of one, "auto", "none", or None: "auto" where it is recognised.
+        layers: what is laid over it.
     """
 
     volume: str | Volume | Opened
@@ -62,6 +69,8 @@ class SourceRequest:
     unit_distance: str | None = None
     statistics: Statistics | None = None
     light: LightOptions = field(default_factory=LightOptions)
+    labels: str | LabelTable | None = None
+    layers: tuple[LayerRequest, ...] = ()
 
     @property
     def path(self) -> str:
@@ -77,7 +86,9 @@ class SourceRequest:
 
     def paths(self) -> list[str]:
         """What of it is read from files."""
-        return [given for given in (self.volume, self.tf) if isinstance(given, str)]
+        given = [self.volume, self.tf, self.labels, self.read.mask]
+        given += [part for layer in self.layers for part in (layer.volume, layer.tf, layer.labels)]
+        return [path for path in given if isinstance(path, str) and path not in (AUTO, NONE)]
 
 
 @dataclass(frozen=True)
@@ -85,29 +96,68 @@ class Source:
     """What was read: the function is visible somewhere in the volume.
 
     ``unit_distance`` is the world length that opacity refers to, ``unit_label`` how it was chosen, ``lighting`` what
-    falls on it, None for nothing; ``layout`` is the volume's, where it is known.
+    falls on it, None for nothing; ``layout`` is the volume's, where it is known. ``layers`` are what adds up to it
+    where it is an optics grid: on the grid of ``volume``; ``tf`` and unit distance are the first one's.
     """
 
     volume: Volume
     statistics: Statistics
-    tf: TransferFunction
+    tf: TransferFunction | LabelTable
     unit_distance: float
     unit_label: str
     lighting: Lighting | None = None
     layout: Layout | None = None
+    layers: tuple[Layer, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Of the function, or of all layers."""
+        return " + ".join(layer.name for layer in self.layers) or self.tf.name
+
+    def look(self) -> str:
+        """Digest of all that gives the volume its colours, other volumes included."""
+        if isinstance(self.tf, TransferFunction) and not self.layers:
+            return digest(self.tf.opacity_nodes, self.tf.color_map)
+        parts: list[Any] = []
+        for layer in self.layers:
+            tf = layer.tf
+            parts += tf.labels if isinstance(tf, LabelTable) else (tf.opacity_nodes, tf.color_map)
+            parts += [layer.unit_distance, layer.volume.affine, volume_digest(layer.volume), layer.white]
+            parts += [volume_digest(band) for band in layer.colors or ()]
+        return digest(*parts)
+
+    def kernels(self, names: tuple[str, ...]) -> tuple[str, ...]:
+        """The kernels of a command, of the kind of scene and light that this is."""
+        lit = names if self.lighting is None else for_light(names, self.lighting.attenuated)
+        return for_grid(lit) if self.layers else lit
 
     def kernel_type(self) -> str:
         """Name of the type in which kernels read the volume's values."""
         from vvgt_cli.dvr.scene import kernel_type
 
+        if self.layers:
+            return "float32"
         return kernel_type(self.volume)
 
     def scene(self) -> Scene:
         """The volume laid out for the kernels."""
         from vvgt_cli.dvr import Scene
 
+        if self.layers:
+            from vvgt_cli.dvr.layers import grid_of
+
+            grid = grid_of(self.layers, self.volume)
+            return Scene.of_grid(self.volume, Title(self.name), self.unit_distance, grid, self.lighting)
+        assert isinstance(self.tf, TransferFunction)
         limits = (self.statistics.lo, self.statistics.hi)
         return Scene.build(self.volume, self.tf, self.unit_distance, limits, lighting=self.lighting, layout=self.layout)
+
+
+@dataclass(frozen=True)
+class Title:
+    """What layers are called together."""
+
+    name: str
 
 
 def load(request: SourceRequest) -> Source:
@@ -126,7 +176,6 @@ def load_all(request: SourceRequest, tfs: Sequence[str | TransferFunction | None
     Raises:
         DataError, UsageError: as `load`.
     """
-    from vvgt_cli.synth.sources import open_volume
     from vvgt_cli.transfer import check_visible, from_histogram, read_transfer_function, resolve, unit_distance
     from vvgt_cli.transfer.resolve import parse_tf_range
     from vvgt_cli.volume import statistics
@@ -138,10 +187,13 @@ def load_all(request: SourceRequest, tfs: Sequence[str | TransferFunction | None
     if None in functions and tf_range != "data":
         raise UsageError("--tf-range says where the nodes of a function lie; it needs --tf")
     opened = request.volume if isinstance(request.volume, Opened) else None
-    if isinstance(request.volume, Opened):
-        volume = request.volume.volume
+    if isinstance(request.volume, str):
+        content = open_parts(request.volume, request.read)
     else:
-        volume = open_volume(request.volume, request.read) if isinstance(request.volume, str) else request.volume
+        content = Content((request.volume if opened is None else opened.volume,))  # type: ignore[arg-type]
+    if not is_plain(content, functions[0], request.labels, request.layers):
+        return [_layered(request, content, tf, tf_range) for tf in functions]
+    volume = content.volumes[0]
     unit_distance(request.unit_distance, volume)  # its errors come first
     lights = [request.light.lighting(None if tf is None else tf.lighting, volume.space) for tf in functions]
     numbers = opened.statistics if opened else statistics(volume)
@@ -162,6 +214,25 @@ def load_all(request: SourceRequest, tfs: Sequence[str | TransferFunction | None
     return sources
 
 
+def _layered(
+    request: SourceRequest, content: Content, tf: TransferFunction | None, tf_range: str | tuple[float, float]
+) -> Source:
+    """The optics grid that a volume and its layers add up to."""
+    from vvgt_cli.dvr.layers import common_grid
+    from vvgt_cli.volume import statistics
+
+    lighting = request.light.lighting(None if tf is None else tf.lighting, content.volumes[0].space)
+    layers = layers_of(content, tf, request.labels, tf_range, request.unit_distance)
+    for other in request.layers:
+        inner = open_parts(other.volume, other.read) if isinstance(other.volume, str) else Content((other.volume,))
+        layers += layers_of(inner, other.tf, other.labels, "data", other.distance)
+    first = layers[0]
+    return Source(
+        common_grid(layers), statistics(first.volume), first.tf, first.unit_distance, first.unit_label, lighting,
+        layers=tuple(layers),
+    )  # fmt: skip
+
+
 def describe_source(source: Source) -> str:
     """One line: grid, type, values, function, unit distance."""
     volume, numbers = source.volume, source.statistics
@@ -170,7 +241,8 @@ def describe_source(source: Source) -> str:
     values = ", ".join([f"values {numbers.lo:g} to {numbers.hi:g}", *holes])
     distance = f"opacity per {source.unit_distance:g} ({source.unit_label})"
     light = "" if source.lighting is None else f"; light {source.lighting.text()}"
-    return f"{volume.name}: {grid} {volume.data.dtype.name}, {values}; {source.tf.name}: {distance}{light}"
+    name = source.name if len(source.layers) > 1 else source.tf.name
+    return f"{volume.name}: {grid} {volume.data.dtype.name}, {values}; {name}: {distance}{light}"
 
 
 def volume_record(source: Source) -> dict[str, Any]:
@@ -191,11 +263,12 @@ def volume_record(source: Source) -> dict[str, Any]:
 def tf_record(source: Source, request: SourceRequest) -> dict[str, Any]:
     """The transfer function as reports show it."""
     return {
-        "name": source.tf.name,
+        "name": source.name if len(source.layers) > 1 else source.tf.name,
         "given": request.tf is not None,
         "tf_range": request.tf_range,
         "nodes": source.tf.node_range(),
         "unit_distance": source.unit_distance,
         "unit_distance_label": source.unit_label,
         **({} if source.lighting is None else {"light": source.lighting.text()}),
+        **({"layers": [layer.name for layer in source.layers]} if source.layers else {}),
     }

@@ -11,7 +11,7 @@ from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.sets import SIZE
 from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians import PlyHeader
-from vvgt_cli.jit.ahead import EVALUATE, for_degree, for_light
+from vvgt_cli.jit.ahead import EVALUATE, for_degree
 from vvgt_cli.progress import Console
 from vvgt_cli.runs.gaussian_files import STDIN, file_rule, open_gaussians
 from vvgt_cli.runs.outputs import Output, check_outputs
@@ -136,10 +136,7 @@ def evaluate(request: EvaluateRequest, console: Console | None = None) -> Evalua
         stage.note = f"{len(gaussians)} Gaussians; {describe_source(source)}"
     if header.affine is not None and not np.allclose(header.affine, source.volume.affine[:3].ravel(), rtol=1e-6):
         run.console.say(f"{request.ply}: its header's affine is not that of {source.volume.name}: of another volume?")
-    names = for_degree(EVALUATE, gaussians.degree)
-    if source.lighting is not None:
-        names = for_light(names, source.lighting.attenuated)
-    run.compile(names, source.kernel_type())
+    run.compile(source.kernels(for_degree(EVALUATE, gaussians.degree)), source.kernel_type())
     with run.stage("scene"):
         scene = source.scene()
     size, rule = request.size or header.made_for or SIZE, file_rule(header, request.rule)

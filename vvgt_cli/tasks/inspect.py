@@ -16,6 +16,7 @@ from vvgt_cli.runs.gaussian_files import STDIN
 from vvgt_cli.share import format_of, read_splats
 from vvgt_cli.transfer.readers import SUFFIXES
 from vvgt_cli.volume import ReadOptions
+from vvgt_cli.volume.packed import Packed
 from vvgt_cli.volume.space import axis_facts
 
 _PLY = (b"ply\n", b"ply\r")
@@ -85,15 +86,25 @@ def _transfer_function(file: str) -> dict[str, Any]:
 
 
 def _volume(file: str, read: ReadOptions) -> dict[str, Any]:
-    from vvgt_cli.synth.sources import open_volume
+    from vvgt_cli.runs.layered import open_parts
     from vvgt_cli.transfer import unit_distance
     from vvgt_cli.volume import statistics
+    from vvgt_cli.volume.label_maps import recognised
 
-    volume = open_volume(file, replace(read, packed=True))
+    content = open_parts(file, replace(read, packed=True))
+    volume = content.volumes[0]
+    kinds: dict[str, Any] = {}
+    if content.color:
+        kinds["colors"] = "RGBA"[: len(content.volumes)]
+    elif len(content.volumes) > 1:
+        kinds["channels"] = len(content.volumes)
+    elif not isinstance(volume.data, Packed) and recognised(volume):
+        kinds["label_map"] = True
     numbers = statistics(volume)
     return {
         "kind": "volume",
         "name": volume.name,
+        **kinds,
         "dims": volume.dims,
         "dtype": volume.data.dtype.name,
         "byte_order": sys.byteorder

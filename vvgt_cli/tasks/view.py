@@ -26,7 +26,6 @@ from vvgt_cli.share import SUFFIXES, is_splats
 from vvgt_cli.share.page_file import PROGRAM, asset, page, upright
 from vvgt_cli.share.server import Part, Site, served
 from vvgt_cli.share.splats import columns_of
-from vvgt_cli.volume import ReadOptions
 from vvgt_cli.volume.slices import matching
 
 TICK = 0.2  # seconds within which Ctrl-C is answered
@@ -99,8 +98,10 @@ def _opened(run: Run, request: ViewRequest, name: str) -> tuple[Gaussians, PlyOp
     given = request.source
     if name == STDIN or is_splats(name):
         plain = SourceRequest(given.volume)
-        if (given.tf, given.tf_range, given.unit_distance, given.read) != (None, plain.tf_range, None, ReadOptions()):
-            raise UsageError(f"{name} holds Gaussians: --tf and options of reading are of volumes; leave them out")
+        if replace(given, volume=plain.volume, light=plain.light) != plain:
+            raise UsageError(
+                f"{name} holds Gaussians: --tf, --labels, --layer and options of reading are of volumes; leave them out"
+            )
         gaussians, header = open_gaussians(name)
         return gaussians, layout_of(header)
     from vvgt_cli.conversion.convert import in_memory

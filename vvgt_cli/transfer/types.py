@@ -7,13 +7,17 @@ from typing import Protocol
 import numpy as np
 
 
-class TransferFunctionLike(Protocol):
-    """What the optics need of a transfer function; `TransferFunction` is the one implementation."""
+class Named(Protocol):
+    """Whatever gives a scene its colours."""
 
     @property
     def name(self) -> str:
         """For reports."""
         ...
+
+
+class TransferFunctionLike(Named, Protocol):
+    """What the optics need of a transfer function; `TransferFunction` is the one implementation."""
 
     def opacity(self, x: np.ndarray) -> np.ndarray:
         """Opacity in [0, 1] per unit distance at data values x (n,), float64 -> (n,)."""

@@ -17,7 +17,7 @@ import numpy as np
 from vvgt_cli.dvr.kernel import FLAGS
 from vvgt_cli.dvr.layout import LIT, Light, Voxels
 from vvgt_cli.dvr.light import sphere
-from vvgt_cli.dvr.reference import optics, trilinear
+from vvgt_cli.dvr.reference import optics_at
 from vvgt_cli.dvr.scene import Scene
 from vvgt_cli.dvr.shading import arrives, fixed_diffuse, normal, openness
 from vvgt_cli.gaussians import Gaussians
@@ -136,7 +136,7 @@ def _rows(points: np.ndarray) -> np.ndarray:
 def extinction_at(scene: Scene, points: np.ndarray) -> np.ndarray:
     """Extinction (n,) at voxel coordinates (n, 3); 0 outside the box."""
     inside = ((points > -0.5) & (points < np.array(scene.volume.dims) - 0.5)).all(axis=1)
-    return np.where(inside, optics(scene, trilinear(scene.volume, points))[0], 0)
+    return np.where(inside, optics_at(scene, points)[0], 0)
 
 
 def _width(scene: Scene) -> int:

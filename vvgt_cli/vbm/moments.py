@@ -15,6 +15,7 @@ import numpy as np
 from vvgt_cli.dvr.layout import BRICK
 from vvgt_cli.dvr.scene import Scene
 from vvgt_cli.vbm.columns import MASS, MOMENTS
+from vvgt_cli.vbm.grid import grid_moments
 from vvgt_cli.vbm.pyramid import morton_codes
 from vvgt_cli.vbm.quadrature import block_moments, compact
 
@@ -76,7 +77,7 @@ def base_cells(
         part = origins[first : first + chunk]
         dense = scratch[: len(part)]
         at = part.astype(np.float64)
-        block_moments(scene.voxels, scene.optics, at, points, cell, scene.half, scene.step, dense)
+        _integrate(scene, at, points, cell, dense)
         counts = np.count_nonzero(dense[..., MASS].reshape(len(part), -1), axis=1)
         rows, local = np.empty((counts.sum(), MOMENTS)), np.empty((counts.sum(), 3), np.int32)
         compact(dense, order, np.cumsum(counts) - counts, rows, local)
@@ -86,6 +87,14 @@ def base_cells(
             progress(min(first + chunk, len(origins)) / len(origins))
     del scratch
     return Cells(*_in_order(np.concatenate(index), moments), cell * scene.step, exponent)
+
+
+def _integrate(scene: Scene, blocks: np.ndarray, points: np.ndarray, cell: np.ndarray, out: np.ndarray) -> None:
+    """`block_moments` by the kernel of the scene's kind."""
+    if scene.grid is None:
+        block_moments(scene.voxels, scene.optics, blocks, points, cell, scene.half, scene.step, out)
+    else:
+        grid_moments(scene.texels, blocks, points, cell, scene.half, scene.step, out)
 
 
 def _blocks(exponent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -127,7 +136,7 @@ def cell_moments(scene: Scene, corners: np.ndarray, edge: np.ndarray, points_per
     points = np.maximum(np.round(child * points_per_voxel), 2).astype(np.int64)
     out = np.empty((len(corners), 2, 2, 2, MOMENTS))
     at = np.ascontiguousarray(corners, np.float64)
-    block_moments(scene.voxels, scene.optics, at, points, child, scene.half, scene.step, out)
+    _integrate(scene, at, points, child, out)
     return out.reshape(len(corners), 8, MOMENTS)
 
 

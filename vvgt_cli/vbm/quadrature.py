@@ -16,14 +16,14 @@ from vvgt_cli.dvr.layout import TUPLES, Optics, Voxels
 from vvgt_cli.jit.decorators import inlined, kernel
 from vvgt_cli.vbm.columns import BLUE, GREEN, MASS, MOMENTS, RED, XX, XY, XZ, YY, YZ, ZZ, X, Y, Z
 
-Between = tuple[int, int, float, float]  # of `_between`
+Between = tuple[int, int, float, float]  # of `between`
 Rows = tuple[np.ndarray, np.ndarray, np.ndarray]  # of `_rows`
 
 _jit = inlined(fastmath=FLAGS, error_model="numpy")
 
 
 @_jit
-def _between(p: float, d: float, n: int) -> Between:
+def between(p: float, d: float, n: int) -> Between:
     """Voxels on both sides of ``p`` along an axis of ``n``, the share of the second, and the length of spread there.
 
     That is ``d``, and 0 in the rim before the first centre (beyond the last one both neighbours are the same voxel).
@@ -46,7 +46,7 @@ def _rows(
 ) -> tuple[float, float, float]:
     """Voxels from ``first`` on, between rows: ``value``, and its differences over a point's box along y and z.
 
-    ``y``, ``z`` of `_between`; the three rows (n,) float64 hold the edge voxels where they leave ``values``. Returns
+    ``y``, ``z`` of `between`; the three rows (n,) float64 hold the edge voxels where they leave ``values``. Returns
     the smallest and largest value, and the largest square of both differences.
     """
     j0, j1, fy, dy = y
@@ -140,7 +140,7 @@ def _gather(
 
 
 @_jit
-def _move(row: np.ndarray, x: float, y: float, z: float, d: tuple[float, float, float]) -> None:
+def moved(row: np.ndarray, x: float, y: float, z: float, d: tuple[float, float, float]) -> None:
     """Moments about a cell's corner (x, y, z) -> about the origin; a point's own box ``d`` has variance d^2 / 12."""
     mass, first_x, first_y, first_z = row[MASS], row[X], row[Y], row[Z]
     row[XX] += mass * (x * x + d[0] * d[0] / 12) + 2 * x * first_x
@@ -193,7 +193,7 @@ def block_moments(
                 y = y0 + (py + 0.5) * dy - 0.5
                 if inside < 1 or z > nz - 0.5 or y > ny - 0.5:
                     continue
-                near_y, near_z = _between(y, dy, ny), _between(z, dz, nz)
+                near_y, near_z = between(y, dy, ny), between(z, dz, nz)
                 low, high, steep = _rows(voxels.values, near_y, near_z, first, value, along_y, along_z)
                 if _all_dark(low, high, 0.5 * math.sqrt(steep + (high - low) ** 2 * dx * dx), optics):
                     continue
@@ -205,7 +205,7 @@ def block_moments(
             if out[b, cz, cy, cx, MASS] > 0.0:
                 x = (x0 + cx * cell[0]) * step[0] - half[0]
                 y, z = (y0 + cy * cell[1]) * step[1] - half[1], (z0 + cz * cell[2]) * step[2] - half[2]
-                _move(out[b, cz, cy, cx], x, y, z, box)
+                moved(out[b, cz, cy, cx], x, y, z, box)
 
 
 @kernel("f8:5 i8:1 i8:1 f8:2 i4:2", parallel=True)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.errors import DataError, SeveralComponents, UsageError
 
 
 @dataclass(frozen=True)
@@ -64,6 +64,7 @@ def select_component(
     *,
     label: str = "",
     scaling: tuple[float, float] = (1.0, 0.0),
+    color: bool = False,
 ) -> tuple[np.ndarray, tuple[float, float]]:
     """One scalar field out of a field with components.
 
@@ -73,12 +74,13 @@ def select_component(
         source: for messages.
         label: what the values are called, for messages.
         scaling: (slope, intercept) of the stored values.
+        color: the file says that three or four components are colours.
 
     Returns:
         (nz, ny, nx), C-contiguous (a view where that is possible), and the scaling that remains to be applied.
 
     Raises:
-        UsageError: several components and no choice, or a choice that does not exist.
+        UsageError: several components and no choice (`SeveralComponents`), or a choice that does not exist.
     """
     n = values.shape[3]
     what = f"{source}: {label or 'its array'} has {n} component{'' if n == 1 else 's'} of type {values.dtype.name}"
@@ -88,7 +90,8 @@ def select_component(
         return contiguous(values[..., 0]), scaling
     if component is None or (component != "magnitude" and component not in range(n)):
         found = "" if component is None else f", not component {component}"
-        raise UsageError(f"{what}{found}; expected a scalar: try --component 0 to {n - 1}, or --component magnitude")
+        text = f"{what}{found}; expected a scalar: try --component 0 to {n - 1}, or --component magnitude"
+        raise SeveralComponents(text, n, color and n in (3, 4)) if component is None else UsageError(text)
     if component == "magnitude":
         return magnitude(values, *scaling), (1.0, 0.0)
     return contiguous(values[..., int(component)]), scaling

@@ -37,14 +37,13 @@ _DTYPES = {
     1024: "i8",
     1280: "u8",
 }
+_COLORS = {128: 3, 2304: 4}  # bytes a voxel
 _OTHERS = {
     1: "bits",
     32: "complex64",
-    128: "RGB colours",
     1536: "128-bit floats",
     1792: "complex128",
     2048: "complex256",
-    2304: "RGBA colours",
 }
 _MAGIC = {b"n+1\0": True, b"ni1\0": False, b"n+2\0": True, b"ni2\0": False}
 
@@ -63,6 +62,7 @@ class Header:
     qform: tuple[float, ...] | None
     sform: tuple[float, ...] | None
     unit: float = 1.0  # mm
+    samples: int = 0  # bytes of a voxel that is a colour
 
 
 def _order(head: bytes) -> tuple[str, int] | None:
@@ -106,7 +106,7 @@ def parse_header(head: bytes, name: str) -> Header:
         quatern, sform, (units,) = get("6d", 352), get("12d", 400), get("i", 500)
     if not 1 <= dim[0] <= 7 or min(dim[1 : dim[0] + 1]) < 1:
         raise DataError(f"{name}: dim {dim}; expected 1 to 7 axes of at least 1 voxel each")
-    if code not in _DTYPES:
+    if code not in _DTYPES and code not in _COLORS:
         raise DataError(
             f"{name}: values are {_OTHERS.get(code, f'of unknown type {code}')}; expected real numbers (convert it "
             "to one channel first)"
@@ -118,7 +118,7 @@ def parse_header(head: bytes, name: str) -> Header:
     least = {1: 352, 2: 544}[version] if single else 0
     return Header(
         dim[1 : dim[0] + 1],
-        np.dtype(order + _DTYPES[code]),
+        np.dtype(order + _DTYPES.get(code, "u1")),
         single,
         max(int(offset), least),
         slope,
@@ -127,6 +127,7 @@ def parse_header(head: bytes, name: str) -> Header:
         quatern if q_code > 0 else None,
         sform if s_code > 0 else None,
         {1: 1e3, 3: 1e-3}.get(units & 7, 1.0),  # metres, micrometres
+        _COLORS.get(code, 0),
     )
 
 
@@ -219,7 +220,7 @@ def read_nifti(path: Path, options: ReadOptions) -> Volume:
     sform, else qform, else pixdim say where voxels are; slope and intercept go into the volume.
 
     Raises:
-        DataError: a header that is damaged or does not fit the data, colours or complex values.
+        DataError: a header that is damaged or does not fit the data, or complex values.
         UsageError: several components, or time steps (`SeveralSteps`), and none chosen.
     """
     head, zipped = _read_head(path)
@@ -228,6 +229,8 @@ def read_nifti(path: Path, options: ReadOptions) -> Volume:
     if not header.single:
         source, zipped = _image_file(path)
     spatial = (*header.dims, 1, 1)[:3]
+    if header.samples:
+        return _placed(header, _colors(header, source, zipped, spatial, path, options), path, options)
     times, rest = _times(header, options, str(path))
     step, component = options.time or 0, options.component
     number = None  # of the one volume that need be unpacked
@@ -253,6 +256,20 @@ def read_nifti(path: Path, options: ReadOptions) -> Volume:
         scaling=(header.slope, header.intercept),
     )
     return _placed(replace(header, slope=slope, intercept=intercept), field, path, options)
+
+
+def _colors(
+    header: Header, source: Path, zipped: bool, spatial: tuple[int, ...], path: Path, options: ReadOptions
+) -> np.ndarray:
+    """One component of RGB or RGBA voxels, (nz, ny, nx)."""
+    if math.prod(header.dims[3:]) > 1:
+        raise DataError(f"{path}: colours of {math.prod(header.dims[3:])} time steps; expected one volume of colours")
+    shape, offset = (*reversed(spatial), header.samples), header.offset
+    if zipped:
+        block = load_block(source, header.dtype, shape, encoding="gzip", skip=offset)
+    else:
+        block = load_block(source, header.dtype, shape, offset=offset)
+    return select_component(block, options.component, str(path), label="its colour", color=True)[0]
 
 
 def _placed(header: Header, field: np.ndarray, path: Path, options: ReadOptions) -> Volume:

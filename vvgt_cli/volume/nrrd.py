@@ -233,7 +233,9 @@ def _volume(path: Path, fields: Fields, block: np.ndarray, sizes: list[int], opt
     block = block[..., None] if axis is None else np.moveaxis(block, len(sizes) - 1 - axis, -1)
     if block.ndim == 3:
         block = block[None]
-    field, _ = select_component(block, options.component, str(path), label=f"axis {axis}" if axis is not None else "")
+    color = "rgb" in fields.get("kinds", "").lower()
+    label = f"axis {axis}" if axis is not None else ""
+    field, _ = select_component(block, options.component, str(path), label=label, color=color)
     return Volume(field, options.spacing_or(spacing), origin, direction, volume_name(path), space=space)  # type: ignore[arg-type]
 
 

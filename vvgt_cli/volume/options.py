@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from vvgt_cli.errors import UsageError
+from vvgt_cli.volume.cut import parse_crop
+from vvgt_cli.volume.types import Volume
 
 DTYPES = (
     "int8",
@@ -51,6 +53,8 @@ class ReadOptions:
             several.
         time: index of the time step, for files that hold several.
         space: anatomical space to bring the volume to, ``RAS`` or ``LPS``; None: RAS where its file states one.
+        crop: ``x0:x1,y0:y1,z0:z1``, the voxels to keep, as `vvgt_cli.volume.cut.parse_crop` has it.
+        mask: file or `Volume` of the same size (before or after ``crop``); where it is 0 nothing is shown.
         packed: values are read front to back only: where they are compressed and a format can, they stay so
             (`vvgt_cli.volume.packed`).
 
@@ -67,6 +71,8 @@ class ReadOptions:
     component: int | str | None = None
     time: int | None = None
     space: str | None = None
+    crop: str | None = None
+    mask: str | Volume | None = None
     packed: bool = False
 
     def __post_init__(self) -> None:
@@ -87,6 +93,8 @@ class ReadOptions:
         component = self.component
         if component == "" or (isinstance(component, int) and component < 0):
             raise UsageError(f"--component {component}: expected an index (0, 1, ...), a channel's name or magnitude")
+        if self.crop is not None:
+            parse_crop(self.crop)
         if self.time is not None and self.time < 0:
             raise UsageError(f"--time {self.time}: expected the index of a time step (0, 1, ...)")
 

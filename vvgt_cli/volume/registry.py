@@ -13,6 +13,7 @@ from pathlib import Path
 
 from vvgt_cli.errors import DataError, SeveralSteps, UsageError, VvgtError
 from vvgt_cli.files import seekable
+from vvgt_cli.volume.cut import crop, masked, parse_crop
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import HEAD_BYTES, READERS, SCHEMES, Reader, known_suffixes
 from vvgt_cli.volume.space import in_space
@@ -29,8 +30,8 @@ def read_volume(source: str, options: ReadOptions | None = None) -> Volume:
         options: see `ReadOptions`.
 
     Returns:
-        The volume; memory-mapped where the format stores plain values. Where its file states an anatomical space, it
-        is in the one that the options name, else in RAS.
+        The volume, cropped and masked; memory-mapped where the format stores plain values. Where its file states an
+        anatomical space, it is in the one that the options name, else in RAS.
 
     Raises:
         DataError: no such file, an unknown format, a damaged file, sizes that do not fit.
@@ -39,7 +40,23 @@ def read_volume(source: str, options: ReadOptions | None = None) -> Volume:
     options = options or ReadOptions()
     if options.time is not None and (source == "-" or source.partition(":")[0] in SCHEMES):
         raise UsageError(f"{source}: one volume, no time steps; leave out --time {options.time}")
-    return in_space(_read(source, options), options.space)
+    if options.crop is not None or options.mask is not None:
+        options = replace(options, packed=False)
+    return cut(in_space(_read(source, options), options.space), options)
+
+
+def cut(volume: Volume, options: ReadOptions) -> Volume:
+    """What the options' mask and crop leave of a volume.
+
+    Raises:
+        DataError, UsageError: a mask of another size, a crop outside.
+    """
+    box = None if options.crop is None else parse_crop(options.crop)
+    mask = read_volume(options.mask) if isinstance(options.mask, str) else options.mask
+    if mask is not None and box is not None and mask.dims == volume.dims:
+        mask = crop(mask, box)
+    volume = volume if box is None else crop(volume, box)
+    return volume if mask is None else masked(volume, mask)
 
 
 def _read(source: str, options: ReadOptions) -> Volume:

@@ -59,7 +59,7 @@ def statistics(volume: Volume) -> Statistics:
         DataError: no voxel has a finite value, or the scaling makes values infinite.
     """
     if volume.data.dtype.kind in "iub" and volume.data.dtype.itemsize <= 2:
-        counts, first = _count_integers(volume)
+        counts, first = count_integers(volume)
         used = np.nonzero(counts)[0]
         with np.errstate(over="ignore"):
             values = (used + first).astype(np.float64) * volume.slope + volume.intercept
@@ -105,7 +105,7 @@ def _bins(values: np.ndarray, lo: float, hi: float) -> np.ndarray:
     return np.minimum((t * BINS).astype(np.int64), BINS - 1)
 
 
-def _count_integers(volume: Volume) -> tuple[np.ndarray, int]:
+def count_integers(volume: Volume) -> tuple[np.ndarray, int]:
     """Counts of every stored value of an 8- or 16-bit type, and the value that the first count is of."""
     dtype = volume.data.dtype.newbyteorder("=")
     unsigned = np.dtype(f"u{dtype.itemsize}")

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.errors import DataError, SeveralSteps, UsageError
+from vvgt_cli.errors import DataError, SeveralComponents, SeveralSteps, UsageError
 from vvgt_cli.volume.blocks import check_memory, size_text
 from vvgt_cli.volume.components import contiguous, magnitude
 from vvgt_cli.volume.libraries import library_errors
@@ -43,11 +43,13 @@ class Layout:
         axes: letters as tifffile has them, unknown ones that stand for slices made Z.
         shape: sizes along them.
         lead: how many of them count pages; the rest lie in a page.
+        color: pixels are colours, as their photometric tag says.
     """
 
     axes: str
     shape: tuple[int, ...]
     lead: int
+    color: bool = False
 
     def of(self, letters: str) -> list[int]:
         """Positions of axes of more than one value."""
@@ -159,7 +161,7 @@ def _layout(series: Any, path: Path) -> Layout:
             f"{path}: {len(series)} pages of {keyframe.size} values; expected {' x '.join(map(str, shape))}; check "
             "that the file is whole"
         )
-    layout = Layout(axes, shape, lead)
+    layout = Layout(axes, shape, lead, keyframe.photometric == 2)
     if any(len(layout.of(letter)) > 1 for letter in _AXES):
         raise DataError(f"{path}: axes {_described(axes, shape)}; expected one of each")
     return layout
@@ -177,7 +179,7 @@ def _choose(
     index: list[int | slice] = [slice(None) if k in space else 0 for k in range(len(layout.shape))]
     channels = layout.of("CS")
     several = options.component == "magnitude" and bool(channels)
-    number = _channel([layout.shape[k] for k in channels], facts.channels, options.component, path, dtype)
+    number = _channel([layout.shape[k] for k in channels], facts, options.component, path, dtype, layout.color)
     for k in reversed(channels):  # the samples of a pixel count faster than the channels
         index[k] = slice(None) if several else number % layout.shape[k]
         number //= layout.shape[k]
@@ -195,10 +197,10 @@ def _choose(
     return tuple(index), several
 
 
-def _channel(sizes: list[int], names: list[str], wanted: int | str | None, path: Path, dtype: np.dtype) -> int:
+def _channel(sizes: list[int], facts: Facts, wanted: int | str | None, path: Path, dtype: np.dtype, color: bool) -> int:
     """Number of the channel asked for, or of the only one; 0 for the magnitude of all."""
     n = math.prod(sizes)
-    names = names if len(names) == n else []
+    names = facts.channels if len(facts.channels) == n else []
     if wanted == "magnitude" and n > 1:
         return 0
     if isinstance(wanted, str) and names.count(wanted) == 1:
@@ -212,7 +214,10 @@ def _channel(sizes: list[int], names: list[str], wanted: int | str | None, path:
     if n == 1:
         raise UsageError(f"{what}; leave out --channel {wanted}")
     found = "" if wanted is None else f", not {wanted!r}"
-    raise UsageError(f"{what}{found}; expected one: try --channel 0 to {n - 1}, a name, or --component magnitude")
+    text = f"{what}{found}; expected one: try --channel 0 to {n - 1}, a name, all, or --component magnitude"
+    if wanted is not None:
+        raise UsageError(text)
+    raise SeveralComponents(text, n, color and n in (3, 4), facts.colors if len(facts.colors) == n else ())
 
 
 def _kept(layout: Layout, index: tuple[int | slice, ...], letter: str) -> int | None:

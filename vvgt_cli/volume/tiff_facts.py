@@ -29,12 +29,14 @@ class Facts:
     Attributes:
         spacing: voxel edges (x, y, z) in micrometres (in the file's numbers where its unit is no length); None unsaid.
         channels: names of the channels, where they have any.
+        colors: RGB in [0, 1] of the channels, where they have any.
         images: images that must be there for the description to hold; 0 where it does not say.
         units: of the spacing, where they do not compare.
     """
 
     spacing: tuple[float | None, float | None, float | None] = (None, None, None)
     channels: list[str] = field(default_factory=list)
+    colors: list[tuple[float, float, float] | None] = field(default_factory=list)
     images: int = 0
     units: str = ""
 
@@ -119,11 +121,21 @@ def ome_facts(root: ElementTree.Element, series: int, count: int) -> Facts:
     pixels = images[series]
     numbers = [_positive(pixels.get(f"PhysicalSize{axis}")) for axis in "XYZ"]
     units = [pixels.get(f"PhysicalSize{axis}Unit", "µm") for axis in "XYZ"]
-    names = []
+    names, colors = [], []
     for channel in (c for c in pixels if _tag(c) == "Channel"):
         name, samples = channel.get("Name", ""), int(channel.get("SamplesPerPixel", 1))
         names += [name] if samples == 1 else [f"{name}:{k}" for k in range(min(samples, 1000))]
-    return replace(_micrometres(numbers, units), channels=names if any(names) else [])
+        colors += [_color(channel.get("Color"))] * min(samples, 1000)
+    return replace(_micrometres(numbers, units), channels=names if any(names) else [], colors=colors)
+
+
+def _color(text: str | None) -> tuple[float, float, float] | None:
+    """RGB of OME's signed 32-bit RGBA; None for none, and for black, which shows nothing."""
+    if text is None or not re.fullmatch(r"-?\d{1,10}", text):
+        return None
+    value = int(text) & 0xFFFFFFFF
+    red, green, blue = value >> 24, value >> 16 & 255, value >> 8 & 255
+    return (red / 255, green / 255, blue / 255) if red + green + blue else None
 
 
 def imagej_facts(told: dict[str, Any], resolution: tuple[float, float], unit: int) -> Facts:

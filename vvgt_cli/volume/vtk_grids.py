@@ -155,7 +155,9 @@ def dataset_volume(mesh: Any, options: ReadOptions, source: str, name: str) -> V
         )
     _check_cells(mesh, source)
     values = _values(mesh, info).reshape(1, 1, -1, info.components)
-    field, _ = select_component(values, options.component, source, label=f"array {info.name!r}")
+    field, _ = select_component(
+        values, options.component, source, label=f"array {info.name!r}", color=values.dtype == np.uint8
+    )
     return resample(mesh, field.ravel(), info.where, options.dims, source, name)
 
 
@@ -212,7 +214,9 @@ def _image(image: Any, info: ArrayInfo, options: ReadOptions, source: str, name:
     direction = np.array([[matrix.GetElement(r, c) for c in range(3)] for r in range(3)])
     origin = np.array(image.GetOrigin()) + direction @ (low * spacing)
     values = _values(image, info).reshape(*dims[::-1], info.components)
-    field, _ = select_component(values, options.component, source, label=f"array {info.name!r}")
+    field, _ = select_component(
+        values, options.component, source, label=f"array {info.name!r}", color=values.dtype == np.uint8
+    )
     lengths, turned = unit_rows((direction * spacing).T.tolist())
     return Volume(field, options.spacing_or(lengths), tuple(origin.tolist()), turned, name)
 

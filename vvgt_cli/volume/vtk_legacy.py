@@ -244,7 +244,8 @@ def read_legacy(path: Path, options: ReadOptions) -> Volume:
                 f"{' x '.join(map(str, dims))} were expected"
             )
         values = _values(parser, array, (dims[2], dims[1], dims[0]))
-    field, _ = select_component(values, options.component, str(path), label=str(array.info.name))
+    label, color = str(array.info.name), values.dtype == np.uint8
+    field, _ = select_component(values, options.component, str(path), label=label, color=color)
     lengths, direction = unit_rows(np.diag(spacing).tolist())
     return Volume(field, options.spacing_or(lengths), tuple(origin), direction, volume_name(path))  # type: ignore[arg-type]
 

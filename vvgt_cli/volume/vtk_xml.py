@@ -207,7 +207,9 @@ def read_vti(path: Path, options: ReadOptions) -> Volume:
     values = _mapped(found, attributes, info, shape, path)
     if values is None:
         values = _by_vtk(path, info, shape)
-    component, _ = select_component(values, options.component, str(path), label=f"array {info.name!r}")
+    component, _ = select_component(
+        values, options.component, str(path), label=f"array {info.name!r}", color=values.dtype == np.uint8
+    )
     return Volume(
         component,
         options.spacing_or(grid.spacing),

@@ -39,13 +39,13 @@ def load(path: Path) -> Any:
     Raises:
         DataError: too large, not readable, not UTF-8, neither of the three.
     """
-    text = _text(path)
+    text = text_of(path)
     if text.lstrip()[:1] == "<":
         return _elements(text, path)
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     if len(lines) > 1 and re.fullmatch(r"[-+.\d\s]+", lines[0]):
         return Lines(lines)
-    return _json(text, path)
+    return json_of(text, path)
 
 
 def _elements(text: str, path: Path) -> Elements:
@@ -64,27 +64,37 @@ def _elements(text: str, path: Path) -> Elements:
     return Elements(items[0][0], items)
 
 
-def _text(path: Path) -> str:
+def text_of(path: Path, what: str = "a transfer function") -> str:
+    """The text of a UTF-8 file of at most 16 MiB; ``what`` is expected there.
+
+    Raises:
+        DataError: too large, not readable, not UTF-8.
+    """
     try:
         kept = seekable(path)
         size = kept.stat().st_size
         if size > MAX_BYTES:
-            raise DataError(f"{path}: {size} bytes; expected a transfer function of at most 16 MiB")
+            raise DataError(f"{path}: {size} bytes; expected {what} of at most 16 MiB")
         with kept.open("rb") as file:
             raw = file.read(MAX_BYTES + 1)
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror or error})") from error
     if len(raw) > MAX_BYTES:
-        raise DataError(f"{path}: more than 16 MiB; expected a transfer function")
+        raise DataError(f"{path}: more than 16 MiB; expected {what}")
     try:
         return raw.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise DataError(
-            f"{path}: not text (byte {error.start} is not UTF-8); expected a transfer function of JSON, XML or numbers"
+            f"{path}: not text (byte {error.start} is not UTF-8); expected {what} of JSON, XML or numbers"
         ) from error
 
 
-def _json(text: str, path: Path) -> Any:
+def json_of(text: str, path: Path) -> Any:
+    """What a JSON text holds.
+
+    Raises:
+        DataError: not JSON.
+    """
     try:
         return json.loads(text)
     except json.JSONDecodeError as error:

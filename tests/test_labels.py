@@ -1,0 +1,243 @@
+"""Label maps: tables of five programs, recognised volumes, one file a label; RGB and channels are in test_layers."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import vvgt_cli as library
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.gaussians import read_ply
+from vvgt_cli.transfer.label_files import read_labels
+from vvgt_cli.transfer.labels import LabelTable, distinct
+from vvgt_cli.volume import Volume
+from vvgt_cli.volume.label_maps import labels_in, recognised
+
+SMALL = ("--max-gaussians", 300, "--size", 64, "--steps", 0)
+SLICER = "# Color table file\n1 skin 255 51 0 128\n3 inner_core 0 0 255 255\n"
+FREESURFER = "#No. Label Name: R G B A\n0 Unknown 0 0 0 0\n1 skin 255 51 0 127\n\n3 inner_core 0 0 255 0\n"
+SNAP = '# ITK-SnAP\n0 0 0 0 0 0 0 "Clear Label"\n1 255 51 0 0.5 1 1 "skin"\n3 0 0 255 1 1 1 "inner_core"\n'
+JSON = json.dumps(
+    {"1": {"name": "skin", "color": "#ff3300", "opacity": 0.5}, "3": {"name": "inner_core", "color": [0, 0, 1]}}
+)
+SEGMENTS = (
+    "NRRD0004\ntype: uchar\ndimension: 3\nsizes: 2 2 2\nencoding: raw\nspace directions: (1,0,0) (0,1,0) (0,0,1)\n"
+    "Segment0_LabelValue:=1\nSegment0_Name:=skin\nSegment0_Color:=1 0.2 0\nSegment1_LabelValue:=3\n"
+    "Segment1_ID:=inner_core\nSegment1_Color:=0 0 1\n\n"
+)
+
+
+def balls(n: int = 24) -> np.ndarray:
+    """A ball of label 3 in one of label 1, (n, n, n) uint8."""
+    z, y, x = np.mgrid[:n, :n, :n] - (n - 1) / 2
+    radius = np.sqrt(x * x + y * y + z * z)
+    return np.where(radius < n / 5, 3, np.where(radius < n / 2.2, 1, 0)).astype(np.uint8)
+
+
+def table(tmp_path: Path, text: str, name: str) -> str:
+    path = tmp_path / name
+    path.write_bytes(text.encode() + (b"\0" * 8 if text.startswith("NRRD") else b""))
+    return str(path)
+
+
+@pytest.fixture
+def seg(tmp_path: Path) -> Path:
+    np.save(tmp_path / "balls_seg.npy", balls())
+    return tmp_path / "balls_seg.npy"
+
+
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [(SLICER, "a.ctbl"), (FREESURFER, "LUT.txt"), (SNAP, "a.label"), (JSON, "a.json"), (SEGMENTS, "a.seg.nrrd")],
+)
+def test_tables_of_every_program(tmp_path: Path, text: str, name: str) -> None:
+    skin, core = (e for e in read_labels(table(tmp_path, text, name)).labels if e.number)
+    assert (skin.number, skin.name, core.number, core.name) == (1, "skin", 3, "inner_core")
+    np.testing.assert_allclose([skin.color, core.color], [(1, 0.2, 0), (0, 0, 1)])
+    assert (skin.opacity, core.opacity) == (1.0 if "nrrd" in name else pytest.approx(0.5, abs=0.01), 1.0)
+
+
+def test_a_function_of_whole_numbers() -> None:
+    found = distinct(range(65_536))
+    x = np.array([0, 1, 3, 1.5, -1, np.nan, 65_535, 70_000])
+    np.testing.assert_array_equal(found.opacity(x), [0, 1, 1, 0, 0, 0, 1, 0])
+    assert found.color(x).shape == (8, 3)
+    assert len({e.color for e in found.labels[1:61]}) >= 55
+    assert found.labels[7].color == distinct([7]).labels[0].color  # by the number, whatever else there is
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "said"),
+    [
+        ("1 skin red 0 255\n", "a.ctbl", "line 1"),
+        ("", "a.ctbl", "no label"),
+        ("1 a 1 2 3 4\n1 b 1 2 3 4\n", "a.ctbl", "label 1 twice"),
+        ("1 a 300 2 3 4\n", "a.ctbl", r"in \[0, 1\]"),
+        ("1 a 0 2 3 0\n", "a.ctbl", "none of them visible"),
+        ("[1]", "a.json", "no object"),
+        ('{"liver": {}}', "a.json", "'liver'"),
+        ('{"1": {"color": [0, 0, 1], "opacity": 2}}', "a.json", "opacity 2"),
+        ('{"1": {"color": "red"}}', "a.json", "three numbers"),
+        ("{", "a.json", "not JSON"),
+        (SEGMENTS.replace("0 0 1\n\n", "0 x\n\n"), "a.seg.nrrd", "segment 1"),
+        (SEGMENTS.replace("Segment", "Other"), "a.seg.nrrd", "no label"),
+    ],
+)
+def test_faulty_tables(tmp_path: Path, text: str, name: str, said: str) -> None:
+    with pytest.raises(DataError, match=said) as error:
+        read_labels(table(tmp_path, text, name))
+    assert "\n" not in str(error.value)
+
+
+def test_recognised_by_type_name_and_number() -> None:
+    for volume, expected in (
+        (Volume(balls(), name="brain_labels"), True),
+        (Volume(balls(), name="x.aseg"), True),
+        (Volume(balls(), name="segment"), True),
+        (Volume(balls(), name="sega"), False),
+        (Volume(balls(), name="frog_tissues"), False),
+        (Volume(balls().astype(np.float32), name="labels"), False),
+        (Volume(np.arange(1000, dtype=np.int16).reshape(10, 10, 10), name="labels"), False),
+    ):
+        assert recognised(volume) is expected, volume.name
+
+
+def test_labels_are_data_values_and_whole() -> None:
+    assert labels_in(Volume(balls(), slope=2.0, intercept=1.0)) == [1, 3, 7]
+    holes = np.where(balls() == 3, np.nan, balls())
+    assert labels_in(Volume(holes)) == [0, 1]
+    with pytest.raises(DataError, match=r"such as 0\.5; expected a label map"):
+        labels_in(Volume(balls() / 2))
+    many = np.arange(65_536, dtype=np.uint16).reshape(16, 64, 64)
+    assert len(labels_in(Volume(many))) == 65_536
+
+
+# ---- the command line
+
+
+def test_convert_evaluate_and_views(vvgt, tmp_path: Path, seg: Path) -> None:
+    labels = table(tmp_path, JSON, "a.json")
+    ply = tmp_path / "a.ply"
+    done = vvgt("convert", seg, "--labels", labels, *SMALL, "-o", ply, "--report", tmp_path / "a-r.json")
+    assert done.code == 0, done.err
+    assert "a.json" in done.err
+    gaussians, _ = read_ply(str(ply))
+    report = json.loads((tmp_path / "a-r.json").read_text())
+    assert report["scores"]["psnr"] > 25
+    assert np.abs(gaussians.colors[:, 1] - 0.2 * gaussians.colors[:, 0]).max() < 0.1  # no colour that is no mix of both
+    own = vvgt("evaluate", ply, "--volume", seg, "--labels", labels, "--no-seats", "--step", 0.5, "--json", "-q")
+    assert json.loads(own.out)["scores"]["psnr"] == pytest.approx(report["scores"]["psnr"], abs=1)
+    views = ("--views", 2, "--test-views", 1, "--size", 32, "-q", "-o", tmp_path / "views")
+    assert vvgt("render-views", seg, "--labels", labels, *views).code == 0
+    again = vvgt("render-views", seg, "--labels", "auto", *views)
+    assert "another run" in again.error or "function" in again.error
+    lit = vvgt("init", seg, "--labels", labels, "--light", "headlight", *SMALL[:4], "-o", tmp_path / "lit.ply")
+    assert lit.code == 0, lit.err
+
+
+def test_a_recognised_label_map_is_said_and_none_takes_it_back(vvgt, tmp_path: Path, seg: Path) -> None:
+    with pytest.warns(UserWarning, match="balls_seg: taken as a label map, by its name"):
+        done = vvgt("init", seg, *SMALL[:4], "-o", tmp_path / "a.ply")
+    assert "distinct colours" in done.err
+    plain = vvgt("init", seg, "--labels", "none", *SMALL[:4], "-o", tmp_path / "b.ply")
+    assert "label map" not in plain.err
+    assert "automatic" in plain.err
+    assert (tmp_path / "a.ply").read_bytes() != (tmp_path / "b.ply").read_bytes()
+    assert '"label_map": true' in vvgt("info", seg, "--json").out.decode()
+
+
+def test_a_segmentation_is_its_own_table(tmp_path: Path) -> None:
+    from vvgt_cli.runs.source import SourceRequest, load
+
+    values = np.array([0, 1, 3, 1, 0, 3, 1, 0], np.uint8)
+    (tmp_path / "x.seg.nrrd").write_bytes(SEGMENTS.encode() + values.tobytes())
+    with pytest.warns(UserWarning, match="taken as a label map"):
+        table = load(SourceRequest(str(tmp_path / "x.seg.nrrd"))).tf
+    assert isinstance(table, LabelTable)
+    assert [(e.number, e.name) for e in table.labels] == [(1, "skin"), (3, "inner_core")]
+
+
+def test_one_file_a_label_and_they_add_up(vvgt, tmp_path: Path, seg: Path) -> None:
+    labels = table(tmp_path, JSON, "a.json")
+    done = vvgt("convert", seg, "--labels", labels, "--split-labels", *SMALL, "-o", tmp_path / "p_{}.ply")
+    assert done.code == 0, done.err
+    index = json.loads((tmp_path / "p_index.json").read_text())
+    assert [(row["label"], row["file"]) for row in index["files"]] == [(1, "p_1-skin.ply"), (3, "p_3-inner-core.ply")]
+    assert sum(row["gaussians"] for row in index["files"]) <= 300
+    headers = [read_ply(str(tmp_path / row["file"]))[1] for row in index["files"]]
+    assert headers[0].affine == headers[1].affine
+    assert (
+        "exists"
+        in vvgt("convert", seg, "--labels", labels, "--split-labels", *SMALL, "-o", tmp_path / "p_{}.ply").error
+    )
+
+
+def test_extinctions_of_labels_add_up_to_the_whole() -> None:
+    from vvgt_cli.dvr.layers import Layer, grid_of
+
+    volume, whole = Volume(balls()), distinct([0, 1, 3])
+    grids = [grid_of([Layer(volume, t, 1.0)], volume) for t in (whole, whole.only(1), whole.only(3))]
+    np.testing.assert_array_equal(grids[0], grids[1] + grids[2])
+    assert (grids[1].any(axis=-1) == (balls() == 1)).all()
+
+
+@pytest.mark.parametrize(
+    ("values", "text", "said"),
+    [
+        (balls(), SLICER.replace("3 inner_core", "4 other"), "have no entry in t.ctbl: 3; add them"),
+        (balls(), "9 other 1 2 3 255\n", "none of its labels (1, 3) is in t.ctbl, which has 9"),
+        (balls() * 0, SLICER, "none of its labels (only 0)"),
+        (balls() / 2, SLICER, "expected a label map, of whole numbers"),
+    ],
+)
+def test_labels_that_do_not_fit_are_one_line(vvgt, tmp_path: Path, values, text: str, said: str) -> None:
+    np.save(tmp_path / "v.npy", values)
+    done = vvgt("init", tmp_path / "v.npy", "--labels", table(tmp_path, text, "t.ctbl"), "-o", tmp_path / "a.ply")
+    assert done.code == 1
+    assert said in done.error
+
+
+def test_calls_that_contradict(vvgt, tmp_path: Path, seg: Path) -> None:
+    out = ("-o", tmp_path / "a_{}.ply")
+    for options, said in (
+        (("--labels", "auto", "--tf", "gray"), "expected one of --tf and --labels"),
+        (("--labels", tmp_path / "no.ctbl"), "no such file"),
+        (("--split-labels", "--tf", "gray"), "leave out --tf"),
+        (("--split-labels", "--dry-run"), "--dry-run"),
+        (("--split-labels", "-o", tmp_path / "a.ply"), "label's name"),
+    ):
+        done = vvgt("convert", seg, *out, *options)
+        assert done.code == 2, options
+        assert said in done.error
+    np.save(tmp_path / "empty_seg.npy", balls() * 0)
+    assert (
+        "no label but 0" in vvgt("init", tmp_path / "empty_seg.npy", "--labels", "auto", "-o", tmp_path / "a.ply").error
+    )
+
+
+def test_a_series_of_label_maps_has_the_same_colours(vvgt, tmp_path: Path) -> None:
+    for k in range(2):
+        np.save(tmp_path / f"run_seg_{k}.npy", np.where(balls() == 3, 3 if k else 1, balls()).astype(np.uint8))
+    done = vvgt("convert", tmp_path / "run_seg_*.npy", "--labels", "auto", *SMALL, "-o", tmp_path / "o_{}.ply")
+    assert done.code == 0, done.err
+    first, second = (read_ply(str(tmp_path / f"o_{k}.ply"))[0].colors for k in range(2))
+    wanted = distinct([1]).labels[0].color
+    np.testing.assert_allclose(np.median(first, axis=0), wanted, atol=0.05)
+    np.testing.assert_allclose(np.median(second, axis=0), wanted, atol=0.05)
+
+
+def test_in_python() -> None:
+    entries = {1: {"color": [1, 0, 0], "opacity": 0.1}, 3: {"color": "#0000ff"}}
+    result = library.convert(balls(), labels=entries, max_gaussians=300, size=64, steps=0)
+    assert result.gaussians.colors[:, 1].max() < 0.05
+    _, images = library.render_views(balls(), cameras=2, size=32, labels=entries)
+    assert images[..., 0].max() > 0.1 < images[..., 2].max()
+    assert images[..., 1].max() == 0
+    with pytest.raises(DataError, match="no entry"):
+        library.convert(balls(), labels={1: {"color": [1, 0, 0]}})
+    with pytest.raises(UsageError, match="no such file"):
+        library.convert(balls(), labels="nowhere.ctbl")
+    assert isinstance(distinct([1]), LabelTable)

@@ -1,0 +1,365 @@
+"""Crops, masks, colours, channels and layers: what adds up, where it lies, and what is refused."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import nibabel
+import numpy as np
+import pytest
+import tifffile
+
+import vvgt_cli as library
+from tests.test_labels import SMALL, balls
+from vvgt_cli.dvr.layers import Layer, common_grid, grid_of, same_grid
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.gaussians import read_ply
+from vvgt_cli.runs.layered import ALL, LayerRequest, open_parts, parse_layer
+from vvgt_cli.runs.source import SourceRequest, load
+from vvgt_cli.transfer import ColorMap, PiecewiseOpacity, TransferFunction
+from vvgt_cli.transfer.labels import distinct
+from vvgt_cli.volume import ReadOptions, Volume, read_volume
+from vvgt_cli.volume.cut import crop, masked, parse_crop
+
+TURNED = (0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+
+
+def ramp(lo: float, hi: float, rgb=(1.0, 1.0, 1.0)) -> TransferFunction:
+    x = np.array([lo, hi])
+    return TransferFunction("ramp", PiecewiseOpacity(x, np.array([0.0, 0.5])), ColorMap(x, np.array([rgb, rgb])))
+
+
+def cloud(shape=(10, 12, 14), **place) -> Volume:
+    return Volume(np.random.default_rng(1).random(shape).astype(np.float32), name="cloud", **place)
+
+
+# ---- crop and mask
+
+
+def test_a_crop_keeps_its_place_in_the_world() -> None:
+    volume = cloud(spacing=(1.0, 2.0, 0.5), origin=(5.0, -3.0, 2.0), direction=TURNED)
+    part = crop(volume, parse_crop("2:9,:,3:"))
+    assert part.dims == (7, 12, 7)
+    np.testing.assert_array_equal(part.data, volume.data[3:, :, 2:9])
+    np.testing.assert_allclose(part.affine @ [1, 2, 3, 1], volume.affine @ [3, 2, 6, 1])
+
+
+@pytest.mark.parametrize("text", ["1:2", "1:2,3:4,5", "2:2,:,:", "5:3,:,:", "a:b,:,:", "-1:3,:,:", "1:2,3:4,5:6,7:8"])
+def test_crops_that_are_none(text: str) -> None:
+    with pytest.raises(UsageError, match="--crop"):
+        ReadOptions(crop=text)
+
+
+def test_a_mask_hides_and_must_have_the_size() -> None:
+    volume = Volume(np.arange(24, dtype=np.int16).reshape(2, 3, 4), slope=2.0, name="v")
+    keep = np.zeros((2, 3, 4), np.uint8)
+    keep[1] = 7
+    part = masked(volume, Volume(keep))
+    assert part.slope == 2.0
+    assert part.data.dtype == np.float32
+    np.testing.assert_array_equal(np.isfinite(part.data), keep > 0)
+    np.testing.assert_array_equal(part.data[1], volume.data[1])
+    with pytest.raises(DataError, match=r"--mask m: 4 x 3 x 1 voxels; expected the 4 x 3 x 2 of v"):
+        masked(volume, Volume(keep[:1], name="m"))
+    with pytest.raises(DataError, match="all of it is 0"):
+        masked(volume, Volume(keep * 0))
+    big = replace(volume, data=volume.data.astype(np.int32) * 1000003)
+    np.testing.assert_array_equal(masked(big, Volume(keep)).data[1], big.data[1])
+
+
+def test_of_scalars_and_labels_on_the_command_line(vvgt, tmp_path: Path) -> None:
+    affine = np.array([[0, -2, 0, 10], [1.5, 0, 0, -4], [0, 0, 1, 7], [0, 0, 0, 1.0]])
+    nibabel.save(nibabel.Nifti1Image(balls().astype(np.int16), affine), tmp_path / "v.nii")
+    nibabel.save(nibabel.Nifti1Image((balls() == 3).astype(np.uint8), affine), tmp_path / "m.nii")
+    whole, part = (
+        read_volume(str(tmp_path / "v.nii")),
+        read_volume(str(tmp_path / "v.nii"), ReadOptions(crop=":,6:18,:")),
+    )
+    np.testing.assert_allclose(part.affine @ [0, 0, 0, 1], whole.affine @ [0, 6, 0, 1])
+    out = tmp_path / "a.ply"
+    done = vvgt(
+        "init", tmp_path / "v.nii", "--tf", "gray", "--crop", ":,6:18,:", *SMALL[:4], "--frame", "world", "-o", out
+    )
+    assert done.code == 0, done.err
+    _, header = read_ply(str(out))
+    np.testing.assert_allclose(np.reshape(header.affine, (3, 4)), part.affine[:3], atol=1e-6)
+    for options in (("--tf", "gray"), ("--labels", "auto")):
+        mask = ("--mask", tmp_path / "m.nii", "--overwrite")
+        done = vvgt("init", tmp_path / "v.nii", *options, *mask, *SMALL[:4], "-o", out)
+        assert done.code == 0, done.err
+        means, frame = library.read_ply(out)[0].means, whole.unit_frame()
+        world = means / frame.scale + frame.centre
+        index = np.round((np.linalg.inv(whole.affine) @ np.c_[world, np.ones(len(world))].T).T[:, :3]).astype(int)
+        assert np.mean(balls()[tuple(np.clip(index, 0, 23).T)] == 3) > 0.95
+    assert "nothing of v" in vvgt("info", tmp_path / "v.nii", "--crop", "30:,:,:").error
+    wrong = tmp_path / "w.nii"
+    nibabel.save(nibabel.Nifti1Image(np.ones((2, 2, 2), np.uint8), affine), wrong)
+    assert "2 x 2 x 2 voxels; expected the 24 x 24 x 24" in vvgt("info", tmp_path / "v.nii", "--mask", wrong).error
+
+
+# ---- colours
+
+
+def colors(shape=(6, 8, 10), samples: int = 3) -> np.ndarray:
+    """Smooth RGB or RGBA, (nz, ny, nx, samples) uint8."""
+    z, y, x = np.mgrid[: shape[0], : shape[1], : shape[2]].astype(np.float64)
+    bands = [x / x.max(), y / y.max(), z / z.max(), (x + y) / (x + y).max()]
+    return np.round(255 * np.stack(bands[:samples], axis=-1)).astype(np.uint8)
+
+
+def write_nifti(path: Path, values: np.ndarray) -> None:
+    kind = np.dtype([(c, "u1") for c in "RGBA"[: values.shape[3]]])
+    image = np.ascontiguousarray(values.transpose(2, 1, 0, 3)).view(kind)[..., 0]
+    nibabel.save(nibabel.Nifti1Image(image, np.diag([1, 2, 3, 1.0])), path)
+
+
+def write_nrrd(path: Path, values: np.ndarray) -> None:
+    n, (nz, ny, nx) = values.shape[3], values.shape[:3]
+    kind = "RGBA-color" if n == 4 else "RGB-color"
+    header = f"NRRD0004\ntype: uchar\ndimension: 4\nsizes: {n} {nx} {ny} {nz}\nencoding: raw\n"
+    header += f"kinds: {kind} domain domain domain\n\n"
+    path.write_bytes(header.encode() + values.tobytes())
+
+
+def write_tiff(path: Path, values: np.ndarray) -> None:
+    extra = {"extrasamples": ["unassalpha"]} if values.shape[3] == 4 else {}
+    tifffile.imwrite(path, values, photometric="rgb", **extra)
+
+
+def write_vti(path: Path, values: np.ndarray) -> None:
+    import pyvista
+
+    image = pyvista.ImageData(dimensions=values.shape[2::-1])
+    image.point_data["colours"] = values.reshape(-1, values.shape[3])
+    image.save(path)
+
+
+@pytest.mark.parametrize("samples", [3, 4])
+@pytest.mark.parametrize(
+    ("write", "name"),
+    [
+        (write_nifti, "a.nii.gz"),
+        (write_nifti, "a.nii"),
+        (write_nrrd, "a.nrrd"),
+        (write_tiff, "a.tif"),
+        (write_vti, "a.vti"),
+        (write_vti, "a.vtk"),
+    ],
+)
+def test_colours_of_every_format(tmp_path: Path, write, name: str, samples: int) -> None:
+    values = colors(samples=samples)
+    write(tmp_path / name, values)
+    content = open_parts(str(tmp_path / name), ReadOptions())
+    assert content.color
+    np.testing.assert_array_equal(np.stack([v.data for v in content.volumes], axis=-1), values)
+    np.testing.assert_array_equal(read_volume(str(tmp_path / name), ReadOptions(component=1)).data, values[..., 1])
+    source = load(SourceRequest(str(tmp_path / name)))
+    grid = grid_of(source.layers, source.volume)
+    weight = values[..., 3] if samples == 4 else values @ np.array([0.2126, 0.7152, 0.0722])
+    seen = grid[..., 3] > 0
+    np.testing.assert_array_equal(seen, weight > 0)
+    np.testing.assert_allclose(grid[..., :3][seen] / grid[..., 3:][seen], values[..., :3][seen] / 255, atol=1e-5)
+    distance = max(source.volume.extent) / 256
+    np.testing.assert_allclose(
+        grid[..., 3], -np.log1p(-np.minimum(weight / 255, 1 - 1e-5)) / distance, rtol=2e-4, atol=1e-4
+    )
+
+
+def test_colours_by_command(vvgt, tmp_path: Path) -> None:
+    write_nrrd(tmp_path / "a.nrrd", colors())
+    assert '"colors": "RGB"' in vvgt("info", tmp_path / "a.nrrd", "--json").out.decode()
+    done = vvgt("convert", tmp_path / "a.nrrd", *SMALL, "-o", tmp_path / "a.ply")
+    assert done.code == 0, done.err
+    assert "opacity by luminance" in done.err
+    made, _ = read_ply(str(tmp_path / "a.ply"))
+    order = np.argsort(made.means[:, 0])
+    assert np.polyfit(made.means[order, 0], made.colors[order, 0], 1)[0] > 0.3  # red grows along x
+    np.save(tmp_path / "f.npy", colors().astype(np.float32))
+    assert "component" in vvgt("init", tmp_path / "f.npy", "-o", tmp_path / "b.ply").error
+    one = vvgt("init", tmp_path / "a.nrrd", "--component", 0, "-o", tmp_path / "c.ply")
+    assert one.code == 0, one.err
+    asked = vvgt("init", "example:blob:8", "--component", "color", "-o", tmp_path / "d.ply")
+    assert "one component; leave out --component color" in asked.error
+    table = vvgt("init", tmp_path / "a.nrrd", "--labels", "auto", "-o", tmp_path / "e.ply")
+    assert "several components" in table.error
+
+
+def test_rgb_looks_as_vtk_draws_dependent_components() -> None:
+    """vtkGPUVolumeRayCastMapper's picture of RGBA, independent components off, at the same steps."""
+    from tests.vtk_colors import dependent
+    from vvgt_cli.checks.scenes import camera
+    from vvgt_cli.dvr import RenderSettings, Scene, render_view
+    from vvgt_cli.metrics import psnr
+
+    values = colors((24, 24, 24), 4)
+    bands = tuple(Volume(np.ascontiguousarray(values[..., c])) for c in range(4))
+    opacity = TransferFunction("a", PiecewiseOpacity(np.array([0.0, 255]), np.array([0.0, 0.3])), ramp(0, 1).color_map)
+    layer = Layer(bands[3], opacity, 1.0, "given", bands[:3], 255.0)
+    scene = Scene.of_grid(bands[3], opacity, 1.0, grid_of([layer], bands[3]))
+    view = camera(96, 96)
+    theirs = dependent(values, scene, 0.3, view)
+    ours = render_view(scene, view, RenderSettings(step=0.25, samples=1))
+    assert theirs[..., 3].max() > 0.5
+    assert psnr(theirs[..., :3], ours[..., :3]) > 38
+
+
+# ---- channels
+
+
+def write_ome(path: Path) -> np.ndarray:
+    values = np.zeros((6, 2, 8, 10), np.uint16)
+    values[:, 0, :, :5], values[:, 1, :, 5:] = 1000, 3000
+    channel = {"Name": ["red", "cyan"], "Color": [-16776961, 16777215]}  # RGBA as signed 32 bits
+    tifffile.imwrite(path, values, ome=True, metadata={"axes": "ZCYX", "Channel": channel})
+    return values
+
+
+def test_channels_in_their_own_colours_add_up(vvgt, tmp_path: Path) -> None:
+    values = write_ome(tmp_path / "a.ome.tif")
+    content = open_parts(str(tmp_path / "a.ome.tif"), ReadOptions(component=ALL))
+    assert list(content.colors) == [(1.0, 0.0, 0.0), (0.0, 1.0, 1.0)]
+    source = load(SourceRequest(str(tmp_path / "a.ome.tif"), ReadOptions(component=ALL)))
+    grid = grid_of(source.layers, source.volume)
+    assert (grid[..., 0] > 0).tolist() == (values[:, 0] > 0).tolist()
+    np.testing.assert_array_equal(grid[..., 1], grid[..., 2])
+    assert vvgt("init", tmp_path / "a.ome.tif", "-o", tmp_path / "a.ply").code == 2  # one, or all
+    done = vvgt("init", tmp_path / "a.ome.tif", "--channel", "all", *SMALL[:4], "-o", tmp_path / "a.ply")
+    assert done.code == 0, done.err
+    layer = f"{tmp_path / 'a.ome.tif'},channel=cyan,tf=gray"
+    done = vvgt(
+        "init",
+        tmp_path / "a.ome.tif",
+        "--channel",
+        0,
+        "--tf",
+        "hot",
+        "--layer",
+        layer,
+        *SMALL[:4],
+        "-o",
+        tmp_path / "b.ply",
+    )
+    assert done.code == 0, done.err
+    assert "gray" in done.err
+
+
+# ---- layers
+
+
+def test_extinctions_add_and_colours_mix_by_extinction() -> None:
+    volume = cloud()
+    one, other = Layer(volume, ramp(0, 1, (1, 0, 0)), 1.0), Layer(volume, ramp(0.5, 2, (0, 0, 1)), 2.0)
+    assert common_grid([one, other]) is volume
+    both = grid_of([one, other], volume)
+    np.testing.assert_allclose(both, grid_of([one], volume) + grid_of([other], volume), rtol=1e-6)
+    np.testing.assert_allclose(both[..., 0] + both[..., 2], both[..., 3], rtol=1e-5)
+
+
+def test_a_layer_is_placed_by_its_affine() -> None:
+    """A linear field is the same wherever its samples are: turned, coarser and shifted."""
+    first = cloud((12, 12, 12), spacing=(1.0, 1.0, 1.0))
+
+    def field(spacing, origin, direction, shape) -> Volume:
+        empty = Volume(np.zeros(shape, np.float32), spacing, origin, direction)
+        k, j, i = np.mgrid[: shape[0], : shape[1], : shape[2]]
+        x, y, z, _ = np.tensordot(empty.affine, np.stack([i, j, k, np.ones_like(i)]).astype(float), 1)
+        return replace(empty, data=(x + 2 * y + 3 * z).astype(np.float32))
+
+    exact = field((1.0, 1.0, 1.0), (0.0, 0.0, 0.0), Volume.direction, (12, 12, 12))
+    turned = field((2.0, 1.5, 2.0), (13.0, -1.0, -2.0), TURNED, (9, 12, 12))
+    function = ramp(0, 100)
+    layers = [Layer(first, ramp(2, 3), 1.0), Layer(turned, function, 1.0)]
+    target = common_grid(layers)
+    assert target is first
+    np.testing.assert_allclose(grid_of(layers, target), grid_of([Layer(exact, function, 1.0)], exact), atol=1e-5)
+
+
+def test_the_grid_is_as_fine_as_the_finest_layer() -> None:
+    first = cloud((4, 5, 6), spacing=(2.0, 2.0, 4.0), origin=(1.0, 2.0, 3.0))
+    fine = cloud((16, 20, 12), spacing=(1.0, 0.5, 1.0), origin=(1.0, 2.0, 3.0))
+    target = common_grid([Layer(first, ramp(0, 1), 1.0), Layer(fine, ramp(0, 1), 1.0)])
+    assert target.dims == (12, 20, 16)
+    np.testing.assert_allclose(target.extent, first.extent)
+    np.testing.assert_allclose(target.unit_frame().centre, first.unit_frame().centre)
+    assert same_grid(target, replace(target, origin=tuple(v + 1e-5 for v in target.origin)))
+    assert not same_grid(target, replace(target, origin=tuple(v + 0.1 for v in target.origin)))
+
+
+def test_labels_are_not_interpolated_on_a_finer_grid() -> None:
+    labels = Volume(balls(12), spacing=(2.0, 2.0, 2.0), origin=(0.5, 0.5, 0.5))
+    fine = Volume(np.zeros((24, 24, 24), np.uint8))
+    table = distinct([0, 1, 2, 3])
+    table = replace(
+        table,
+        labels=tuple(replace(e, color=(1.0, 0.0, 0.0) if e.number != 2 else (0.0, 1.0, 0.0)) for e in table.labels),
+    )
+    grid = grid_of([Layer(fine, ramp(5, 6), 1.0), Layer(labels, table, 1.0)], fine)
+    assert grid[..., 0].max() > 1
+    assert grid[..., 1].max() == 0  # of label 2, which no voxel has
+
+
+def test_layers_that_do_not_meet_or_fit_are_refused(vvgt, tmp_path: Path) -> None:
+    first, far = cloud(), cloud(origin=(100.0, 0.0, 0.0))
+    with pytest.raises(DataError, match="lies beside cloud in the world"):
+        common_grid([Layer(first, ramp(0, 1), 1.0), Layer(far, ramp(0, 1), 1.0)])
+    tiny = cloud((4, 4, 4), spacing=(0.05, 0.05, 0.05))
+    with pytest.raises(DataError, match="20 times finer"):
+        common_grid([Layer(first, ramp(0, 1), 1.0), Layer(tiny, ramp(0, 1), 1.0)])
+    for text in ("", "a.nii,hue=3", "a.nii,time=x", "a.nii,tf="):
+        with pytest.raises(UsageError, match="--layer"):
+            parse_layer(text)
+    assert parse_layer("a,b.nii,tf=hot:0.2,0.8,labels=none") == LayerRequest("a,b.nii", "hot:0.2,0.8", "none")
+    gone = vvgt("init", "example:blob:8", "--layer", tmp_path / "no.nii", "-o", tmp_path / "a.ply")
+    assert "no such file" in gone.error
+
+
+def test_a_scan_with_its_segmentation(vvgt, tmp_path: Path) -> None:
+    affine = np.diag([2.0, 2.0, 2.0, 1.0])
+    scan = np.zeros((16, 16, 16), np.float32)
+    scan[2:14, 2:14, 2:14] = 1
+    nibabel.save(nibabel.Nifti1Image(scan, affine), tmp_path / "ct.nii.gz")
+    half = np.array([[1.0, 0, 0, -0.5], [0, 1, 0, -0.5], [0, 0, 1, -0.5], [0, 0, 0, 1]])
+    seg = np.zeros((32, 32, 32), np.uint8)
+    seg[12:20, 12:20, 12:20] = 5
+    nibabel.save(nibabel.Nifti1Image(seg, half), tmp_path / "organ_seg.nii.gz")
+    (tmp_path / "t.json").write_text('{"5": {"name": "organ", "color": [1, 0, 0]}}')
+    layer = f"{tmp_path / 'organ_seg.nii.gz'},labels={tmp_path / 't.json'}"
+    asked = ("--tf", "gray:0.5,1:0.05", "--layer", layer)
+    out, report = tmp_path / "a.ply", tmp_path / "a.json"
+    done = vvgt("convert", tmp_path / "ct.nii.gz", *asked, *SMALL, "-o", out, "--report", report)
+    assert done.code == 0, done.err
+    assert "32 x 32 x 32" in done.err
+    made, _ = read_ply(str(out))
+    red = made.colors[:, 0] - made.colors[:, 1] > 0.5
+    assert red.sum() > 5
+    assert np.abs(made.means[red]).max() < 0.35 < np.abs(made.means[~red]).max()
+    assert len(json.loads(report.read_text())["transfer_function"]["layers"]) == 2
+    own = vvgt("evaluate", out, "--volume", tmp_path / "ct.nii.gz", *asked, "--no-seats", "--step", 0.5, "--json", "-q")
+    assert json.loads(own.out)["scores"]["psnr"] == pytest.approx(
+        json.loads(report.read_text())["scores"]["psnr"], abs=1
+    )
+    kept = ("--checkpoint", tmp_path / "kept", "--overwrite")
+    assert vvgt("convert", tmp_path / "ct.nii.gz", *asked, *SMALL, *kept, "-o", tmp_path / "b.ply").code == 0
+    assert out.read_bytes() == (tmp_path / "b.ply").read_bytes()
+
+
+def test_in_python() -> None:
+    part = library.convert(
+        cloud().data, crop="2:8,:,:", mask=np.ones((10, 12, 14)), max_gaussians=100, size=32, steps=0
+    )
+    assert part.gaussians.means.shape[1] == 3
+    request = LayerRequest(Volume(balls(12)), labels="auto")
+    both = library.convert(
+        Volume(balls(12).astype(np.float32)), "gray", layers=[request], max_gaussians=100, size=32, steps=0
+    )
+    assert np.ptp(both.gaussians.colors) > 0.1
+
+
+def test_the_python_of_the_page_runs() -> None:
+    page = Path(__file__).parent.parent / "docs" / "layers.md"
+    code = page.read_text("utf-8").partition("```python\n")[2].partition("```")[0]
+    names: dict = {}
+    exec(compile(code, "docs/layers.md", "exec"), names)
+    assert len(names["result"].gaussians) > 100

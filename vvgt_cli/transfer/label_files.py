@@ -1,0 +1,123 @@
+"""Tables of labels: 3D Slicer's .ctbl, ITK-SNAP's .label, FreeSurfer's LUT, the header of a .seg.nrrd, and JSON.
+
+- 3D Slicer, `number name R G B A` with 0 to 255 each.
+- FreeSurfer (FreeSurferColorLUT.txt): the same, but A is transparency; 0 is opaque.
+- ITK-SNAP: `number R G B A VIS MSH "name"`, colours 0 to 255, A in [0, 1], VIS 0 or 1.
+- .seg.nrrd: `Segment0_LabelValue:=1`, `Segment0_Name:=`, `Segment0_Color:=0.5 0.4 0.1`.
+- JSON: `{"1": {"name": "liver", "color": [0.6, 0.3, 0.2], "opacity": 0.8}}`; a colour may be "#aabbcc".
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.transfer.labels import SOLID, Label, LabelTable
+from vvgt_cli.transfer.readers.fields import json_of, number, rgb, text_of
+
+MOST = 2**31  # of a label's number
+HEADER = 2**20  # bytes of a .seg.nrrd that are looked at
+EXPECTED = (
+    "expected a table of labels: 3D Slicer (.ctbl), ITK-SNAP (.label), FreeSurfer (number name R G B A), a .seg.nrrd, "
+    'or JSON {"1": {"name": ..., "color": [r, g, b], "opacity": a}}'
+)
+_NAMED = re.compile(r"(-?\d+)\s+(.+?)\s+(\d+)\s+(\d+)\s+(\d+)(?:\s+(\d+))?")
+_SNAP = re.compile(r'(-?\d+)\s+(\d+)\s+(\d+)\s+(\d+)\s+(\d+(?:\.\d*)?)\s+([01])\s+([01])\s+"(.*)"')
+
+
+def read_labels(source: str) -> LabelTable:
+    """The table in a file.
+
+    Raises:
+        UsageError: no such file.
+        DataError: not a table of labels, or a faulty one.
+    """
+    path = Path(source)
+    if not path.is_file():
+        raise UsageError(f"--labels {source}: no such file; {EXPECTED}, or auto, or none")
+    with path.open("rb") as stream:
+        head = stream.read(HEADER)
+    if not head.startswith(b"NRRD") and (text := text_of(path, "a table of labels")).lstrip().startswith(("{", "[")):
+        return table_of(json_of(text, path), str(path))
+    if head.startswith(b"NRRD"):
+        found = _segments(head.partition(b"\n\n")[0].decode("utf-8", "replace"), str(path))
+    else:
+        found = _lines(text, path)
+    return _table(found, str(path))
+
+
+def _table(found: list[Label], what: str) -> LabelTable:
+    if not found:
+        raise DataError(f"{what}: no label in it; {EXPECTED}")
+    return LabelTable(Path(what).name, tuple(sorted(found, key=lambda label: label.number)))
+
+
+def _lines(text: str, path: Path) -> list[Label]:
+    """Of a table of lines; those that begin with # are left out."""
+    found = []
+    for n, line in enumerate(map(str.strip, text.splitlines()), 1):
+        if not line or line.startswith("#"):
+            continue
+        if snap := _SNAP.fullmatch(line):
+            numbers, name, alpha = snap.groups()[1:4], snap[8], float(snap[5]) * int(snap[6])
+        elif plain := _NAMED.fullmatch(line):
+            numbers, name, last = plain.groups()[2:5], plain[2].strip('"'), int(plain[6] or 0) / 255
+            alpha = last if plain[6] is not None and path.suffix.lower() == ".ctbl" else 1 - last
+            snap = plain
+        else:
+            raise DataError(f"{path}: line {n}: {line[:60]!r}; {EXPECTED}")
+        if int(snap[1]) == 0:
+            alpha = 0.0
+        found.append(_label(f"{path}: line {n}", int(snap[1]), name, [int(v) / 255 for v in numbers], alpha))
+    return found
+
+
+def _segments(header: str, what: str) -> list[Label]:
+    """Of the segments that a NRRD header names."""
+    parts: dict[str, dict[str, str]] = {}
+    for index, key, value in re.findall(r"^Segment(\d+)_(\w+):=(.*)$", header, re.M):
+        parts.setdefault(index, {})[key] = value.strip()
+    found = []
+    for index, part in parts.items():
+        color, label = part.get("Color", "").split(), part.get("LabelValue", str(int(index) + 1))
+        if not re.fullmatch(r"\d{1,10}", label) or not all(_is_number(c) for c in color):
+            raise DataError(f"{what}: segment {index}: label {label!r}, colour {color}; expected numbers")
+        name = part.get("Name", part.get("ID", f"label {label}"))
+        found.append(_label(f"{what}: segment {index}", int(label), name, [float(c) for c in color], SOLID))
+    return found
+
+
+def table_of(parsed: Any, what: str) -> LabelTable:
+    """The table that a parsed JSON file holds.
+
+    Raises:
+        DataError: none, or a faulty one.
+    """
+    if not isinstance(parsed, dict):
+        raise DataError(f"{what}: JSON that is no object; {EXPECTED}")
+    found = []
+    for key, entry in parsed.items():
+        if not re.fullmatch(r"-?\d{1,10}", key) or not isinstance(entry, dict):
+            raise DataError(f"{what}: {key[:40]!r}; {EXPECTED}")
+        color = entry.get("color")
+        if isinstance(color, str) and re.fullmatch(r"#[0-9a-fA-F]{6}", color):
+            color = [int(color[k : k + 2], 16) / 255 for k in (1, 3, 5)]
+        opacity = number(f"{what}: label {key}: opacity", entry.get("opacity", SOLID if int(key) else 0.0))
+        name = str(entry.get("name", f"label {key}"))
+        found.append(_label(f"{what}: label {key}", int(key), name, color, opacity))
+    return _table(found, what)
+
+
+def _is_number(text: str) -> bool:
+    return re.fullmatch(r"\d+(\.\d*)?([eE][+-]?\d+)?", text) is not None
+
+
+def _label(what: str, value: int, name: str, color: Any, opacity: float) -> Label:
+    """A label of checked parts."""
+    if not 0 <= opacity <= 1:
+        raise DataError(f"{what}: opacity {opacity:g}; expected 0 to 1")
+    if abs(value) > MOST:
+        raise DataError(f"{what}: label {value}; expected a 32-bit number")
+    return Label(value, name, rgb(f"{what}: colour", color), opacity)

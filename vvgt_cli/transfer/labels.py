@@ -1,0 +1,127 @@
+"""`LabelTable`: names, colours and opacities of a label map's labels; its files are read by `label_files`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from vvgt_cli.errors import DataError
+
+PALETTES = ("tab10", "tab20b", "tab20c", "Set2", "Dark2", "Set3")  # matplotlib's qualitative ones: 78 colours
+LISTED = 8  # labels that a message names
+SOLID = 1.0  # opacity of a label whose table says none
+
+
+@dataclass(frozen=True)
+class Label:
+    """One label.
+
+    Attributes:
+        number: the voxels' value.
+        name: of the structure.
+        color: RGB in [0, 1].
+        opacity: in [0, 1] per unit distance.
+    """
+
+    number: int
+    name: str
+    color: tuple[float, float, float]
+    opacity: float = SOLID
+
+
+@dataclass(frozen=True)
+class LabelTable:
+    """What labels look like; a function of whole numbers, transparent elsewhere. Label 0 is transparent by default.
+
+    Attributes:
+        name: for reports.
+        labels: by ascending numbers, each once.
+
+    Raises:
+        DataError: no labels, a number twice, or all of them transparent.
+    """
+
+    name: str
+    labels: tuple[Label, ...]
+    lighting = None
+    opacity_unit_distance = None
+    opacity_unit_share = None
+
+    def __post_init__(self) -> None:
+        numbers = [label.number for label in self.labels]
+        if sorted(set(numbers)) != numbers:
+            twice = next((n for n in numbers if numbers.count(n) > 1), None)
+            raise DataError(f"{self.name}: label {twice} twice; expected each label once")
+        if not any(label.opacity > 0 for label in self.labels):
+            raise DataError(f"{self.name}: {len(numbers)} labels, none of them visible; expected an opacity above 0")
+
+    @cached_property
+    def _numbers(self) -> np.ndarray:
+        return np.array([label.number for label in self.labels], np.float64)
+
+    @cached_property
+    def _optics(self) -> np.ndarray:
+        """(n, 4) float64 red, green, blue and opacity."""
+        return np.array([(*label.color, label.opacity) for label in self.labels], np.float64)
+
+    def _rows(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Row of each of x (n,), and whether it has one."""
+        found = np.minimum(np.searchsorted(self._numbers, np.where(np.isnan(x), np.inf, x)), len(self.labels) - 1)
+        return found, self._numbers[found] == x
+
+    def opacity(self, x: np.ndarray) -> np.ndarray:
+        """Opacity in [0, 1] per unit distance of labels x (n,); 0 where there is no entry."""
+        rows, there = self._rows(x)
+        return np.where(there, self._optics[rows, 3], 0.0)
+
+    def color(self, x: np.ndarray) -> np.ndarray:
+        """RGB (n, 3) in [0, 1] of labels x (n,)."""
+        result: np.ndarray = self._optics[self._rows(x)[0], :3]
+        return result
+
+    def node_range(self) -> tuple[float, float]:
+        """Smallest and largest label."""
+        return float(self._numbers[0]), float(self._numbers[-1])
+
+    def support(self, lo: float, hi: float) -> list[tuple[float, float]]:
+        """Visible labels in [lo, hi], as intervals."""
+        return [(float(e.number),) * 2 for e in self.labels if e.opacity > 0 and lo <= e.number <= hi]
+
+    def of(self, numbers: Sequence[int], where: str) -> LabelTable:
+        """The entries of a volume's labels, ascending ``numbers``; 0 is left out.
+
+        Raises:
+            DataError: labels without an entry, or none of the table's labels.
+        """
+        known = {label.number: label for label in self.labels}
+        missing = [n for n in numbers if n != 0 and n not in known]
+        shown = ", ".join(map(str, missing[:LISTED])) + (", ..." if len(missing) > LISTED else "")
+        if not any(n in known for n in numbers if n != 0):
+            has = ", ".join(str(n) for n in list(known)[:LISTED]) + (", ..." if len(known) > LISTED else "")
+            raise DataError(f"{where}: none of its labels ({shown or 'only 0'}) is in {self.name}, which has {has}")
+        if missing:
+            raise DataError(
+                f"{where}: {len(missing)} labels have no entry in {self.name}: {shown}; add them (opacity 0 hides one)"
+            )
+        return replace(self, labels=tuple(known[n] for n in numbers if n in known))
+
+    def only(self, number: int) -> LabelTable:
+        """The table with one label, the others transparent."""
+        kept = tuple(e if e.number == number else replace(e, opacity=0.0) for e in self.labels)
+        return replace(self, name=f"{self.name}, label {number}", labels=kept)
+
+
+def distinct(numbers: Sequence[int]) -> LabelTable:
+    """Solid labels in distinct colours, which depend on a label's number alone; above 78 they repeat.
+
+    Args:
+        numbers: of the labels, ascending; 0 is transparent.
+    """
+    from matplotlib import colormaps
+
+    colors = [tuple(map(float, rgb[:3])) for name in PALETTES for rgb in colormaps[name](range(colormaps[name].N))]
+    labels = [Label(n, f"label {n}", colors[(n - 1) % len(colors)], SOLID if n else 0.0) for n in numbers]  # type: ignore[arg-type]
+    return LabelTable("distinct colours", tuple(labels))
