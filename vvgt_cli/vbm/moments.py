@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vvgt_cli.dvr.layout import BRICK
+from vvgt_cli.dvr.layout import BRICK, Optics, Voxels
 from vvgt_cli.dvr.scene import Scene
 from vvgt_cli.vbm.columns import MASS, MOMENTS
 from vvgt_cli.vbm.pyramid import morton_codes
@@ -63,10 +63,45 @@ def base_cells(
 
     ``progress`` is told the share that is done.
     """
-    cell = 2.0**exponent
-    block, cells = _blocks(exponent)
-    points = np.maximum(np.round(cell * points_per_voxel), min(points_per_voxel, 2)).astype(np.int64)
+    block, _ = blocks(exponent)
     origins = _active_blocks(scene, block)
+    region = Region(scene.voxels, scene.optics, np.asarray(scene.half), np.asarray(scene.step), np.zeros(3))
+    index, moments = region_cells(region, origins, exponent, points_per_voxel, progress)
+    return Cells(index, moments, 2.0**exponent * scene.step, exponent)
+
+
+@dataclass(frozen=True)
+class Region:
+    """Voxels of a volume, or of a part of it with a margin of one voxel towards the rest.
+
+    Attributes:
+        voxels, optics: as kernels take them.
+        half, step: (3,) of the whole volume, as `Scene` has them.
+        begin: (3,) float64 voxel of the whole volume that ``voxels`` begin with, (x, y, z).
+    """
+
+    voxels: Voxels
+    optics: Optics
+    half: np.ndarray
+    step: np.ndarray
+    begin: np.ndarray
+
+
+def region_cells(
+    region: Region,
+    origins: np.ndarray,
+    exponent: np.ndarray,
+    points_per_voxel: int,
+    progress: Callable[[float], None] | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Cells with extinction in the blocks of `blocks` at ``origins`` (n, 3), voxels (x, y, z) of the whole volume.
+
+    Returns:
+        Indices (m, 3) int32 and moments (m, 13), as in `Cells`: the same bytes whatever part of the volume is there.
+    """
+    cell = 2.0**exponent
+    block, cells = blocks(exponent)
+    points = np.maximum(np.round(cell * points_per_voxel), min(points_per_voxel, 2)).astype(np.int64)
     origins = origins[np.argsort(morton(origins // block))]
     chunk = max(int(CHUNK_CELLS // cells.prod()), CHUNK_BLOCKS)
     scratch = np.empty((min(chunk, max(len(origins), 1)), *cells[::-1], MOMENTS))
@@ -75,8 +110,10 @@ def base_cells(
     for first in range(0, len(origins), chunk):
         part = origins[first : first + chunk]
         dense = scratch[: len(part)]
-        at = part.astype(np.float64)
-        block_moments(scene.voxels, scene.optics, at, points, cell, scene.half, scene.step, dense)
+        at = part - region.begin
+        block_moments(
+            region.voxels, region.optics, at, points, cell, region.half, region.step, region.begin, dense
+        )  # fmt: skip
         counts = np.count_nonzero(dense[..., MASS].reshape(len(part), -1), axis=1)
         rows, local = np.empty((counts.sum(), MOMENTS)), np.empty((counts.sum(), 3), np.int32)
         compact(dense, order, np.cumsum(counts) - counts, rows, local)
@@ -85,10 +122,10 @@ def base_cells(
         if progress:
             progress(min(first + chunk, len(origins)) / len(origins))
     del scratch
-    return Cells(*_in_order(np.concatenate(index), moments), cell * scene.step, exponent)
+    return _in_order(np.concatenate(index), moments)
 
 
-def _blocks(exponent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def blocks(exponent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Edges of a block in voxels and in cells, (3,): as many cells along each axis, where that is not too many.
 
     Such blocks, taken in Morton order, leave cells in Morton order.
@@ -127,7 +164,7 @@ def cell_moments(scene: Scene, corners: np.ndarray, edge: np.ndarray, points_per
     points = np.maximum(np.round(child * points_per_voxel), 2).astype(np.int64)
     out = np.empty((len(corners), 2, 2, 2, MOMENTS))
     at = np.ascontiguousarray(corners, np.float64)
-    block_moments(scene.voxels, scene.optics, at, points, child, scene.half, scene.step, out)
+    block_moments(scene.voxels, scene.optics, at, points, child, scene.half, scene.step, np.zeros(3), out)
     return out.reshape(len(corners), 8, MOMENTS)
 
 

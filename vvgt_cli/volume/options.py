@@ -53,6 +53,8 @@ class ReadOptions:
         space: anatomical space to bring the volume to, ``RAS`` or ``LPS``; None: RAS where its file states one.
         packed: values are read front to back only: where they are compressed and a format can, they stay so
             (`vvgt_cli.volume.packed`).
+        stored: values are read block by block: formats that can leave them in the file (`vvgt_cli.volume.stored`).
+        level: of a file with several resolutions (OME-Zarr), from 0, the finest.
 
     Raises:
         UsageError: a value out of its range.
@@ -68,6 +70,8 @@ class ReadOptions:
     time: int | None = None
     space: str | None = None
     packed: bool = False
+    stored: bool = False
+    level: int | None = None
 
     def __post_init__(self) -> None:
         if self.dims is not None and (len(self.dims) != 3 or min(self.dims) < 1):
@@ -87,6 +91,8 @@ class ReadOptions:
         component = self.component
         if component == "" or (isinstance(component, int) and component < 0):
             raise UsageError(f"--component {component}: expected an index (0, 1, ...), a channel's name or magnitude")
+        if self.level is not None and self.level < 0:
+            raise UsageError(f"--level {self.level}: expected full, or the number of a level (0, 1, ...)")
         if self.time is not None and self.time < 0:
             raise UsageError(f"--time {self.time}: expected the index of a time step (0, 1, ...)")
 
