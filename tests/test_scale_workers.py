@@ -96,11 +96,28 @@ def test_a_damaged_part_is_a_line(vvgt, raw, tmp_path):
     assert not (tmp_path / "a.ply").exists()
 
 
-def test_processes_leave_the_same_bytes(raw, alone, tmp_path):
-    run = start("init", raw, "-o", tmp_path / "two.ply", *FIT[:-1], *SIZE, "--workers", 2)
-    assert run.wait(300) == 0, run.stderr.read()
-    assert "2 workers" in run.stderr.read()
-    assert (tmp_path / "two.ply").read_bytes() == alone
+def test_dasks_workers_leave_the_same_bytes(raw, alone, tmp_path):
+    pytest.importorskip("distributed")
+    out = tmp_path / "two.ply"
+    run = start("init", raw, "-o", out, *FIT[:-1], *SIZE, "--workers", 2, "--scheduler", "local")
+    said = run.communicate(timeout=900)[1]
+    assert run.returncode == 0, said
+    assert "2 workers" in said
+    assert out.read_bytes() == alone
+
+
+def test_a_scheduler_that_is_not_there_is_a_line(vvgt, raw, tmp_path, monkeypatch):
+    pytest.importorskip("distributed")
+    monkeypatch.setattr("vvgt_cli.scale.dask_runner.WAIT", "1s")
+    for scheduler, code, word in (
+        ("tcp://127.0.0.1:9", 1, "no Dask scheduler answers"),
+        ("nonsense://x", 1, "no Dask scheduler answers"),
+    ):
+        run = vvgt("init", raw, "-o", tmp_path / "a.ply", *FIT, *SIZE, "--scheduler", scheduler)
+        assert run.code == code, run.err
+        assert word in run.err
+        assert run.err.count("\n") == 1
+    assert vvgt("init", raw, "-o", tmp_path / "a", *FIT, "--shard", "1/2", "--scheduler", "local").code == 2
 
 
 def children(pid):
@@ -119,7 +136,7 @@ def children(pid):
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
 def test_a_killed_worker_costs_nothing_but_time(raw, alone, tmp_path):
     run = start("init", raw, "-o", tmp_path / "two.ply", *FIT, "--blocks", 16, "--workers", 2)
-    killed, until = 0, time.monotonic() + 240
+    killed, until = 0, time.monotonic() + 900
     while run.poll() is None and time.monotonic() < until:
         workers = [pid for pid, line in children(run.pid).items() if b"spawn_main" in line]
         parts = list(tmp_path.glob(".two.ply.blocks/counts/*.npz"))

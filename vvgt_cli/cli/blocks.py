@@ -48,7 +48,12 @@ block_options = group(
     ),
     workers=click.option(
         "--workers", type=click.IntRange(1, 1024), default=1, show_default=True, metavar="N",
-        help="Processes that go through blocks at once.",
+        help="Processes that go through blocks at once; with --scheduler local, its workers.",
+    ),
+    scheduler=click.option(
+        "--scheduler", metavar="local|ADDRESS",
+        help="Let Dask's workers go through the blocks: of this machine, or of the scheduler at "
+        "ADDRESS (tcp://...). Needs the extra cluster.",
     ),
     shard=click.option(
         "--shard", metavar="I/N", callback=_shard,

@@ -36,8 +36,8 @@ def command(volume: str, console: Console, blocks: dict[str, Any], **options: An
     The first stage of 'vvgt convert', for a quick look or as the start of an optimisation elsewhere. What
     'convert' does beyond it: gradient descent on views of the volume, and a score.
 
-    A VOLUME that the memory does not hold is gone through in blocks, by itself or as --blocks, --workers
-    and --shard say; the file is the same whatever the blocks and however many are at work.
+    A VOLUME that the memory does not hold is gone through in blocks, by itself or as --blocks, --workers,
+    --scheduler and --shard say; the file is the same whatever the blocks and however many are at work.
 
     \b
     Examples:

@@ -93,6 +93,8 @@ def _refuse(request: ConvertRequest, options: BlockOptions) -> None:
         raise UsageError("--light: shading needs the whole volume in memory; blocks are lit by nothing")
     if request.output and options.shard is None and format_of(request.output):
         raise UsageError(f"-o {request.output}: blocks are written as a .ply; give a name that ends in .ply")
+    if options.shard is not None and options.scheduler is not None:
+        raise UsageError("--shard and --scheduler both share the blocks out; give one of them")
     if options.shard is not None and (request.output in (None, STDOUT) or request.report):
         raise UsageError("--shard: -o is a folder of blocks then, there is no --report; 'vvgt merge' makes the .ply")
 
@@ -109,9 +111,12 @@ def _folder(output: str | None) -> Iterator[Parts]:
 
 
 def _runner(options: BlockOptions) -> Runner:
-    if options.workers < 2:
-        return Here()
-    return Processes(options.workers, int(os.environ.get("NUMBA_NUM_THREADS", "1")))
+    threads = int(os.environ.get("NUMBA_NUM_THREADS", "1"))
+    if options.scheduler is not None:
+        from vvgt_cli.scale.dask_runner import Dask
+
+        return Dask(options.scheduler, options.workers, threads)
+    return Processes(options.workers, threads) if options.workers > 1 else Here()
 
 
 def _settings(request: ConvertRequest, opened: InBlocks) -> dict[str, Any]:

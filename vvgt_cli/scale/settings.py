@@ -29,10 +29,9 @@ class BlockOptions:
     Attributes:
         size: voxels along the edge of a block, None: by the memory.
         workers: processes.
-        scheduler: "local", "slurm" or the address of a Dask scheduler; None: without Dask.
+        scheduler: "local" or the address of a Dask scheduler; None: without Dask.
         shard: part (from 1) and count of a job array, None for the whole.
         level: of a file of several resolutions: a number, "full", or None: the one that matches the screen.
-        levels: of detail that are written.
     """
 
     size: int | None = None
@@ -40,7 +39,6 @@ class BlockOptions:
     scheduler: str | None = None
     shard: tuple[int, int] | None = None
     level: int | str | None = None
-    levels: int = 1
 
     def __post_init__(self) -> None:
         if self.size is not None and (self.size < SMALLEST or self.size & (self.size - 1)):

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError, SeveralSteps, UsageError
-from vvgt_cli.volume.blocks import check_memory, count
+from vvgt_cli.volume.blocks import IN_BLOCKS, check_memory, count
 from vvgt_cli.volume.components import contiguous, select_component
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.stored import Stored
@@ -123,7 +123,7 @@ def labelled_volume(
         return _left(stored, dtype, axes, index, _zyx(space, axes), attributes, options, source, name, chunks)
     if callable(stored):
         sizes = [n.size if i == slice(None) else 1 for n, i in zip(axes, index, strict=True)]
-        check_memory(count(tuple(sizes)) * dtype.itemsize, source)
+        check_memory(count(tuple(sizes)) * dtype.itemsize, source, IN_BLOCKS)
         values = np.asarray(stored(tuple(index)))
     else:
         values = stored[tuple(index)]
