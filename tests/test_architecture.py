@@ -18,12 +18,12 @@ PACKAGE = ROOT / "vvgt_cli"
 ROOMS = (
     *("errors", "resources", "progress", "files", "jit", "volume", "transfer", "cameras", "images", "metrics"),
     *("gaussians", "synth", "dvr", "splat", "share", "vbm", "network", "descent", "training", "checks", "report"),
-    *("runs", "conversion", "tasks", "batches", "library", "cli"),
+    *("runs", "conversion", "scale", "tasks", "batches", "library", "cli"),
 )
 HEAVY = {
     *("numba", "vtk", "vtkmodules", "pyvista", "onnxruntime", "torch", "matplotlib", "OpenImageIO", "OpenEXR"),
     *("scipy", "nibabel", "gsplat", "lpips", "tifffile", "h5py", "netCDF4", "zarr", "numcodecs", "pydicom"),
-    *("gsply", "pxr", "PIL", "imageio_ffmpeg"),
+    *("gsply", "pxr", "PIL", "imageio_ffmpeg", "dask", "distributed"),
 }
 # Modules that hold numba kernels or torch networks: their importers import them inside the functions that call them.
 KERNELS = {"numba", "torch"}

@@ -146,6 +146,9 @@ def test_commands_need_what_is_compiled_ahead_and_nothing_else(tmp_path):
     large = ("--max-gaussians", 200, "--size", 650, "-q", "--steps", 24)  # scored on blocks
     assert one_by_one(tmp_path, "convert", SOURCE, *large, "-o", "l.ply") == []
     assert wanted(tmp_path, "init", SOURCE, *fit, "-o", "i.ply") == set(ahead.INIT) - rare
+    (tmp_path / "v_24x24x24_uint8.raw").write_bytes(bytes(range(216)) * 64)
+    blocks = wanted(tmp_path, "init", "v_24x24x24_uint8.raw", *fit, "--blocks", 16, "-o", "k.ply")
+    assert blocks == set(ahead.BLOCKS) - rare
     few = wanted(tmp_path, "convert", SOURCE, *fit, "--steps", 0, "-o", "b.ply")
     assert set(ahead.BACK_PROJECT) <= few <= {*ahead.CONVERT, *ahead.BACK_PROJECT}
     views = ("--views", 6, "--test-views", 2, "--size", 40, "-q", "-o", "views")

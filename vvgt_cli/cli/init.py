@@ -6,6 +6,7 @@ from typing import Any
 
 import click
 
+from vvgt_cli.cli.blocks import block_options
 from vvgt_cli.cli.fit import fit_options, ply_options
 from vvgt_cli.cli.options import common_options, light_options, overwrite_option, placed_read_options, tf_options
 from vvgt_cli.progress import Console
@@ -26,19 +27,31 @@ from vvgt_cli.progress import Console
 @light_options
 @placed_read_options
 @click.option("--report", metavar="R.json", help="Write the times of every stage as JSON; - is standard output.")
+@block_options
 @overwrite_option
 @common_options
-def command(volume: str, console: Console, **options: Any) -> None:
+def command(volume: str, console: Console, blocks: dict[str, Any], **options: Any) -> None:
     """Turn VOLUME into Gaussians in closed form, without rendering an image.
 
     The first stage of 'vvgt convert', for a quick look or as the start of an optimisation elsewhere. What
     'convert' does beyond it: gradient descent on views of the volume, and a score.
 
+    A VOLUME that the memory does not hold is gone through in blocks, by itself or as --blocks, --workers,
+    --scheduler and --shard say; the file is the same whatever the blocks and however many are at work.
+
     \b
-    Example:
+    Examples:
       vvgt init example:frog -o frog-init.ply --max-gaussians 20000
+      vvgt init huge.zarr -o huge.ply --blocks auto --workers 4 --memory 8G
     """
+    from vvgt_cli.cli.blocks import chosen
     from vvgt_cli.cli.fit import convert_request
     from vvgt_cli.conversion.convert import initialise_only
+    from vvgt_cli.scale.run import init_in_blocks
 
-    initialise_only(convert_request(volume, **options), console)
+    request = convert_request(volume, **options)
+    asked = chosen(blocks, request, console)
+    if asked is None:
+        initialise_only(request, console)
+    else:
+        init_in_blocks(request, asked, console)

@@ -22,6 +22,7 @@ from vvgt_cli.errors import UsageError, VvgtError
 COMMANDS = {
     "convert": "vvgt_cli.cli.convert",
     "init": "vvgt_cli.cli.init",
+    "merge": "vvgt_cli.cli.merge",
     "optimize": "vvgt_cli.cli.optimize",
     "view": "vvgt_cli.cli.view",
     "render": "vvgt_cli.cli.render",

@@ -199,7 +199,9 @@ def _interrupted(run: Run) -> bool:
 
 
 def _conversion(request: ConvertRequest, source: Source, work: Work, gaussians: Gaussians) -> Conversion:
-    return Conversion(out_of_box(gaussians, source.volume), work.run.report, _ply(request, source), source, work.scene)
+    return Conversion(
+        out_of_box(gaussians, source.volume), work.run.report, ply_options(request, source), source, work.scene
+    )
 
 
 def _begin(run: Run, request: ConvertRequest) -> tuple[Source, Scene]:
@@ -207,7 +209,7 @@ def _begin(run: Run, request: ConvertRequest) -> tuple[Source, Scene]:
     with run.stage("read") as stage:
         source = load(request.source)
         stage.note = describe_source(source)
-        ply = _ply(request, source)
+        ply = ply_options(request, source)
     flattened = _flattened(degree_of(request, source), source)
     for remark in [*remarks(source.volume, ply), *([flattened] if flattened else [])]:
         run.console.say(remark)
@@ -245,7 +247,7 @@ def _flattened(degree: int, source: Source) -> str | None:
     )
 
 
-def _ply(request: ConvertRequest, source: Source) -> PlyOptions:
+def ply_options(request: ConvertRequest, source: Source) -> PlyOptions:
     """How the file is written, with all that follows from the source."""
     ply = replace(
         request.ply,

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Protocol
 
 import numpy as np
 
@@ -66,7 +67,16 @@ def ray_offsets(count: int) -> np.ndarray:
     return np.stack([np.tile(place, edge), np.repeat(place, edge)], axis=1)
 
 
-def camera_arrays(scene: Scene, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+class Placed(Protocol):
+    """A box: half extents and voxel edges (3,) float64 in the unit frame, (x, y, z), as `Scene` has them."""
+
+    @property
+    def half(self) -> np.ndarray: ...
+    @property
+    def step(self) -> np.ndarray: ...
+
+
+def camera_arrays(scene: Placed, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Eye (3,) in voxel coordinates, basis (3, 3) in voxels per unit length, lens (1/fx, 1/fy, cx, cy)."""
     eye = (camera.position + scene.half) / scene.step - 0.5
     basis = camera.rotation / scene.step[None, :]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -156,20 +157,56 @@ def kernel_values(volume: Volume) -> tuple[np.ndarray, float, float]:
     data = volume.data
     if data.dtype == np.bool_:
         data = data.view(np.uint8)
-    kind = data.dtype.newbyteorder("=")
-    if kind in (np.uint8, np.uint16) and pairs_fit(data.shape):
-        return _read_only(data, kind), volume.slope, volume.intercept
-    if kind.itemsize <= 2:  # exact in float32
-        return _read_only(data, np.dtype(np.float32)), volume.slope, volume.intercept
-    lo, hi = _finite_range(data)
-    if kind == np.float32 and max(abs(lo), abs(hi)) < 1e30 and hi / 2 - lo / 2 > 1e-30:
-        return _read_only(data, kind), volume.slope, volume.intercept
-    half_width = hi / 2 - lo / 2 or 0.5  # halves: hi - lo may overflow
+    rule = kernel_rule(volume, lambda: _finite_range(data))
+    if rule.half_width is None:
+        return _read_only(data, rule.dtype), rule.slope, rule.intercept
     out = np.empty(data.shape, np.float32)
     for z in range(len(data)):
+        out[z] = rule.apply(data[z])
+    return _read_only(out, out.dtype), rule.slope, rule.intercept
+
+
+@dataclass(frozen=True)
+class KernelRule:
+    """How stored values become those that kernels read, of which the data value is ``slope * value + intercept``.
+
+    Attributes:
+        dtype: uint8, uint16 or float32.
+        slope, intercept: see above.
+        lo, half_width: values are shifted by ``lo`` and divided by twice ``half_width``; None: taken as they are.
+    """
+
+    dtype: np.dtype
+    slope: float
+    intercept: float
+    lo: float = 0.0
+    half_width: float | None = None
+
+    def apply(self, stored: np.ndarray) -> np.ndarray:
+        """Stored values, any shape and byte order, as kernels read them."""
+        if self.half_width is None:
+            stored = stored.view(np.uint8) if stored.dtype == np.bool_ else stored
+            return stored.astype(self.dtype, copy=False)
         with np.errstate(invalid="ignore", over="ignore"):
-            out[z] = (data[z].astype(np.float64) / 2 - lo / 2) / half_width
-    return _read_only(out, out.dtype), volume.slope * 2 * half_width, volume.slope * lo + volume.intercept
+            result: np.ndarray = ((stored.astype(np.float64) / 2 - self.lo / 2) / self.half_width).astype(np.float32)
+        return result
+
+
+def kernel_rule(volume: Volume, limits: Callable[[], tuple[float, float]]) -> KernelRule:
+    """The rule of `kernel_values`; ``limits`` gives the least and greatest finite stored value, where they matter."""
+    kind = volume.data.dtype.newbyteorder("=")
+    if kind == np.bool_:
+        kind = np.dtype(np.uint8)
+    if kind in (np.uint8, np.uint16) and pairs_fit(volume.data.shape):
+        return KernelRule(kind, volume.slope, volume.intercept)
+    if kind.itemsize <= 2:  # exact in float32
+        return KernelRule(np.dtype(np.float32), volume.slope, volume.intercept)
+    lo, hi = limits()
+    if kind == np.float32 and max(abs(lo), abs(hi)) < 1e30 and hi / 2 - lo / 2 > 1e-30:
+        return KernelRule(kind, volume.slope, volume.intercept)
+    half_width = hi / 2 - lo / 2 or 0.5  # halves: hi - lo may overflow
+    slope, intercept = volume.slope * 2 * half_width, volume.slope * lo + volume.intercept
+    return KernelRule(np.dtype(np.float32), slope, intercept, lo, half_width)
 
 
 def kernel_type(volume: Volume) -> str:

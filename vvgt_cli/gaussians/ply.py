@@ -136,6 +136,25 @@ def write_ply(
     options = options or PlyOptions()
     if not len(gaussians):
         raise DataError("no Gaussians to write: a .ply needs at least one")
+    rows = ply_rows(gaussians, options, normals)
+    degree = gaussians.degree if options.sh_degree is None else options.sh_degree
+    header = ply_header(len(gaussians), degree, options)
+    if isinstance(target, str | Path):
+        with open(target, "wb") as stream:
+            stream.write(header)
+            stream.write(rows.data)  # not tofile, whose errors do not say why
+    else:
+        target.write(header)
+        target.write(rows.tobytes())
+    return len(header) + rows.nbytes
+
+
+def ply_rows(gaussians: Gaussians, options: PlyOptions, normals: np.ndarray | None = None) -> np.ndarray:
+    """The rows (K, properties) float32 little-endian of a file, as `write_ply` writes them.
+
+    Raises:
+        DataError, UsageError: as `write_ply`.
+    """
     _check_rotations(gaussians, "Gaussians to write")
     placed = turn(gaussians if options.sh_degree is None else gaussians.of_degree(options.sh_degree), options.up)
     if options.frame == "world":
@@ -157,18 +176,15 @@ def write_ply(
     rows[:, -8] = placed.opacity_logits
     rows[:, -7:-4] = placed.log_scales
     rows[:, -4:] = placed.quaternions
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(placed)}"]  # some loaders count lines
-    lines += [f"property float {name}" for name in names]
+    return rows
+
+
+def ply_header(count: int, degree: int, options: PlyOptions) -> bytes:
+    """The header of a file of ``count`` Gaussians with harmonics of ``degree``."""
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]  # some loaders count lines
+    lines += [f"property float {name}" for name in property_names(degree)]
     lines += [*(_comments(options) if options.comments else []), "end_header", ""]
-    header = "\n".join(lines).encode("ascii")
-    if isinstance(target, str | Path):
-        with open(target, "wb") as stream:
-            stream.write(header)
-            stream.write(rows.data)  # not tofile, whose errors do not say why
-    else:
-        target.write(header)
-        target.write(rows.tobytes())
-    return len(header) + rows.nbytes
+    return "\n".join(lines).encode("ascii")
 
 
 def _rows(source: str | Path | BinaryIO, name: str) -> tuple[PlyHeader, np.ndarray]:

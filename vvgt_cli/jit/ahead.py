@@ -35,6 +35,12 @@ BACK_PROJECT = ("vvgt_cli.splat.tiles:gather", "vvgt_cli.splat.tiles:reduce_pair
 
 VIEWS = (*RAYCAST, *CLOSED_FORM[:-2])  # and points to start from
 INIT = (*CLOSED_FORM, "vvgt_cli.dvr.bricks:_ranges")
+MERGE = tuple(name for name in CLOSED_FORM if "block_moments" not in name and "compact" not in name)
+BLOCKS = (
+    *CLOSED_FORM,
+    "vvgt_cli.vbm.ranges:block_ranges",
+    "vvgt_cli.volume.count_kernel:count_values",
+)  # of a volume that is gone through in blocks
 CONVERT = (RAYCAST[0], REFINE[0], *CLOSED_FORM, *DRAW, *REFINE[1:], *RAYCAST[1:])
 OPTIMIZE = (*REFINE, *DRAW)
 EVALUATE = (*RAYCAST, *DRAW)
@@ -48,6 +54,7 @@ ALL = (
     *HARMONICS,
     *STEPPED,
     *DEPOSITS,
+    *BLOCKS[-2:],
     "vvgt_cli.volume.slc_kernel:decode_plane",
 )
 

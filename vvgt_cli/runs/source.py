@@ -29,12 +29,12 @@ class Opened:
     Attributes:
         volume: as it was read.
         statistics: of its values.
-        layout: for the kernels.
+        layout: for the kernels, where it is known.
     """
 
     volume: Volume
     statistics: Statistics
-    layout: Layout
+    layout: Layout | None = None
 
     @classmethod
     def of(cls, volume: Volume) -> Opened:

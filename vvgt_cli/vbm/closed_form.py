@@ -15,6 +15,7 @@ from vvgt_cli.dvr.scene import Scene
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.splat import render
 from vvgt_cli.splat.rules import INRIA, Rule
+from vvgt_cli.transfer.tables import OpticalTables
 from vvgt_cli.vbm.fit import image_errors, solve_colors
 from vvgt_cli.vbm.inset import Opaque, opaque_field
 from vvgt_cli.vbm.moments import base_cells, exponents
@@ -127,10 +128,19 @@ def closed_form(
 
 def base_level(scene: Scene, pixel: float, budget: int) -> int:
     """Finest level whose base cells fit the memory bound and the budget, and are not finer than the images can tell."""
-    most = min(MAX_BASE_CELLS, max(CELLS_A_GAUSSIAN * budget, FEW_CELLS))
-    voxels, level = _visible_voxels(scene), _finest_level(scene, pixel)
+    return level_within(scene.step, _visible_voxels(scene), most_cells(budget), _finest_level(scene, pixel))
+
+
+def most_cells(budget: int) -> int:
+    """Base cells that a budget has use for, and memory holds."""
+    return min(MAX_BASE_CELLS, max(CELLS_A_GAUSSIAN * budget, FEW_CELLS))
+
+
+def level_within(step: np.ndarray, voxels: float, most: float, finest: int) -> int:
+    """Finest level, from ``finest`` on, that cuts ``voxels`` voxels of edges ``step`` into ``most`` cells or fewer."""
+    level = finest
     # a long voxel holds more cells than 8^-level
-    while voxels / np.prod(2.0 ** exponents(scene.step, level)) > most:
+    while voxels / np.prod(2.0 ** exponents(step, level)) > most:
         level += 1
     return level
 
@@ -158,21 +168,26 @@ def _visible_voxels(scene: Scene, samples: int = 256) -> float:
     if not len(bricks):
         return 0.0
     chosen = bricks[np.linspace(0, len(bricks) - 1, min(samples, len(bricks))).astype(np.int64)]
-    tables = scene.tables
-    positive = np.concatenate([[0], np.cumsum(tables.nodes[:, 3] > 0)])
-    share = []
-    for z, y, x in chosen:
-        u = tables.coordinate(scene.values[z : z + BRICK + 1, y : y + BRICK + 1, x : x + BRICK + 1])
-        u = np.where(np.isfinite(u), u, 0)
-        low, high = u, u
-        for axis in range(3):  # range over the corners of each cube of eight voxels
-            if u.shape[axis] > 1:
-                n = low.shape[axis]
-                low = np.minimum(np.take(low, range(n - 1), axis), np.take(low, range(1, n), axis))
-                high = np.maximum(np.take(high, range(n - 1), axis), np.take(high, range(1, n), axis))
-        visible = positive[np.ceil(high).astype(np.int64) + 1] > positive[np.floor(low).astype(np.int64)]
-        share.append(visible.mean())
+    corner = BRICK + 1
+    share = [
+        visible_share(scene.tables, scene.values[z : z + corner, y : y + corner, x : x + corner]) for z, y, x in chosen
+    ]
     return float(np.mean(share)) * len(bricks) * BRICK**3
+
+
+def visible_share(tables: OpticalTables, values: np.ndarray) -> float:
+    """Part of the cubes of eight voxels of ``values`` (z, y, x) that hold extinction."""
+    positive = np.concatenate([[0], np.cumsum(tables.nodes[:, 3] > 0)])
+    u = tables.coordinate(values)
+    u = np.where(np.isfinite(u), u, 0)
+    low, high = u, u
+    for axis in range(3):  # range over the corners of each cube of eight voxels
+        if u.shape[axis] > 1:
+            n = low.shape[axis]
+            low = np.minimum(np.take(low, range(n - 1), axis), np.take(low, range(1, n), axis))
+            high = np.maximum(np.take(high, range(n - 1), axis), np.take(high, range(1, n), axis))
+    visible = positive[np.ceil(high).astype(np.int64) + 1] > positive[np.floor(low).astype(np.int64)]
+    return float(visible.mean())
 
 
 def fit(

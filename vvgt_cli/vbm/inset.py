@@ -17,8 +17,10 @@ from vvgt_cli.dvr.kernel import sample
 from vvgt_cli.jit.decorators import inlined, kernel
 from vvgt_cli.vbm.columns import MASS
 from vvgt_cli.vbm.moments import Cells
+from vvgt_cli.vbm.visibility import summed
 
 OPAQUE_DEPTH = 5.0  # optical depth a voxel at which a cell counts as wholly opaque; half of it is the surface
+SURFACE = 0.5  # of that
 MAX_FIELD = 1 << 26  # cells of the opacity field; finer scenes are averaged down to it
 FLAT = 0.02  # change of opacity over a cell below which there is no surface to speak of
 
@@ -47,17 +49,38 @@ class Opaque:
 
 def opaque_field(cells: Cells, step: np.ndarray, half: np.ndarray) -> Opaque:
     """Where the scene is opaque: empty fields where it is nowhere."""
-    depth = cells.moments[:, MASS] / cells.edge.prod() * (float(step.mean()) / OPAQUE_DEPTH)
-    if not len(depth) or depth.max() < 0.5:
-        none = np.empty((0, 0, 0), np.float32)
-        return Opaque(none, none, cells.edge, half)
-    edge, index = cells.edge, cells.index
-    fraction = np.minimum(depth, 1)
-    while math.prod(np.ceil(2 * half / edge - 1e-6)) > MAX_FIELD:
-        edge, index, fraction = edge * 2, index >> 1, fraction / 8
-    nx, ny, nz = np.ceil(2 * half / edge - 1e-6).astype(np.int64)
-    x, y, z = index.T.astype(np.int64)
-    field = np.bincount((z * ny + y) * nx + x, fraction, nx * ny * nz).astype(np.float32).reshape(nz, ny, nx)
+    depth = opaque_depth(cells.moments[:, MASS], cells.edge, step)
+    if not len(depth) or depth.max() < SURFACE:
+        return nowhere(cells.edge, half)
+    wider = averaged_down(cells.edge, half, MAX_FIELD)
+    edge = cells.edge * 2.0**wider
+    shape = np.ceil(2 * half / edge - 1e-6).astype(np.int64)
+    field = summed(cells.index >> wider, np.minimum(depth, 1) / 8.0**wider, shape).astype(np.float32)
+    return smoothed(field, edge, half)
+
+
+def nowhere(edge: np.ndarray, half: np.ndarray) -> Opaque:
+    """`Opaque` of a scene without opaque bodies."""
+    none = np.empty((0, 0, 0), np.float32)
+    return Opaque(none, none, edge, half)
+
+
+def opaque_depth(mass: np.ndarray, edge: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """(n,) opacity of cells of ``mass`` (n,), 1 and more where they are opaque; edges of cell and voxel (3,)."""
+    result: np.ndarray = mass / edge.prod() * (float(step.mean()) / OPAQUE_DEPTH)
+    return result
+
+
+def averaged_down(edge: np.ndarray, half: np.ndarray, most: int) -> int:
+    """By how many powers of two the field's cells are wider than ``edge`` (3,), for no more than ``most`` of them."""
+    wider = 0
+    while math.prod(np.ceil(2 * half / (edge * 2.0**wider) - 1e-6)) > most:
+        wider += 1
+    return wider
+
+
+def smoothed(field: np.ndarray, edge: np.ndarray, half: np.ndarray) -> Opaque:
+    """`Opaque` of a ``field`` (nz, ny, nx) float32 of cells of ``edge`` (3,)."""
     smooth, other = field, np.empty_like(field)
     for dz, dy, dx in 2 * ((1, 0, 0), (0, 1, 0), (0, 0, 1)):
         target = np.empty_like(field) if smooth is field else other

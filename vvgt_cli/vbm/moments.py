@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vvgt_cli.dvr.layout import BRICK
+from vvgt_cli.dvr.layout import BRICK, Optics, Texels, Voxels
 from vvgt_cli.dvr.scene import Scene
 from vvgt_cli.vbm.columns import MASS, MOMENTS
 from vvgt_cli.vbm.grid import grid_moments
@@ -64,10 +64,52 @@ def base_cells(
 
     ``progress`` is told the share that is done.
     """
-    cell = 2.0**exponent
-    block, cells = _blocks(exponent)
-    points = np.maximum(np.round(cell * points_per_voxel), min(points_per_voxel, 2)).astype(np.int64)
+    block, _ = blocks(exponent)
     origins = _active_blocks(scene, block)
+    index, moments = region_cells(Region.whole(scene), origins, exponent, points_per_voxel, progress)
+    return Cells(index, moments, 2.0**exponent * scene.step, exponent)
+
+
+@dataclass(frozen=True)
+class Region:
+    """Voxels of a volume, or of a part of it with a margin of one voxel towards the rest.
+
+    Attributes:
+        voxels, optics: as kernels take them.
+        half, step: (3,) of the whole volume, as `Scene` has them.
+        begin: (3,) float64 voxel of the whole volume that ``voxels`` begin with, (x, y, z).
+        texels: of an optics grid, which is there as a whole.
+    """
+
+    voxels: Voxels
+    optics: Optics
+    half: np.ndarray
+    step: np.ndarray
+    begin: np.ndarray
+    texels: Texels | None = None
+
+    @classmethod
+    def whole(cls, scene: Scene) -> Region:
+        """All of a scene."""
+        texels = None if scene.grid is None else scene.texels
+        return cls(scene.voxels, scene.optics, np.asarray(scene.half), np.asarray(scene.step), np.zeros(3), texels)
+
+
+def region_cells(
+    region: Region,
+    origins: np.ndarray,
+    exponent: np.ndarray,
+    points_per_voxel: int,
+    progress: Callable[[float], None] | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Cells with extinction in the blocks of `blocks` at ``origins`` (n, 3), voxels (x, y, z) of the whole volume.
+
+    Returns:
+        Indices (m, 3) int32 and moments (m, 13), as in `Cells`: the same bytes whatever part of the volume is there.
+    """
+    cell = 2.0**exponent
+    block, cells = blocks(exponent)
+    points = np.maximum(np.round(cell * points_per_voxel), min(points_per_voxel, 2)).astype(np.int64)
     origins = origins[np.argsort(morton(origins // block))]
     chunk = max(int(CHUNK_CELLS // cells.prod()), CHUNK_BLOCKS)
     scratch = np.empty((min(chunk, max(len(origins), 1)), *cells[::-1], MOMENTS))
@@ -76,8 +118,8 @@ def base_cells(
     for first in range(0, len(origins), chunk):
         part = origins[first : first + chunk]
         dense = scratch[: len(part)]
-        at = part.astype(np.float64)
-        _integrate(scene, at, points, cell, dense)
+        at = part - region.begin
+        _integrate(region, at, points, cell, dense)
         counts = np.count_nonzero(dense[..., MASS].reshape(len(part), -1), axis=1)
         rows, local = np.empty((counts.sum(), MOMENTS)), np.empty((counts.sum(), 3), np.int32)
         compact(dense, order, np.cumsum(counts) - counts, rows, local)
@@ -86,18 +128,20 @@ def base_cells(
         if progress:
             progress(min(first + chunk, len(origins)) / len(origins))
     del scratch
-    return Cells(*_in_order(np.concatenate(index), moments), cell * scene.step, exponent)
+    return _in_order(np.concatenate(index), moments)
 
 
-def _integrate(scene: Scene, blocks: np.ndarray, points: np.ndarray, cell: np.ndarray, out: np.ndarray) -> None:
-    """`block_moments` by the kernel of the scene's kind."""
-    if scene.grid is None:
-        block_moments(scene.voxels, scene.optics, blocks, points, cell, scene.half, scene.step, out)
+def _integrate(region: Region, at: np.ndarray, points: np.ndarray, cell: np.ndarray, out: np.ndarray) -> None:
+    """`block_moments` by the kernel of the region's kind."""
+    if region.texels is None:
+        block_moments(
+            region.voxels, region.optics, at, points, cell, region.half, region.step, region.begin, out
+        )  # fmt: skip
     else:
-        grid_moments(scene.texels, blocks, points, cell, scene.half, scene.step, out)
+        grid_moments(region.texels, at, points, cell, region.half, region.step, out)
 
 
-def _blocks(exponent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def blocks(exponent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Edges of a block in voxels and in cells, (3,): as many cells along each axis, where that is not too many.
 
     Such blocks, taken in Morton order, leave cells in Morton order.
@@ -136,7 +180,7 @@ def cell_moments(scene: Scene, corners: np.ndarray, edge: np.ndarray, points_per
     points = np.maximum(np.round(child * points_per_voxel), 2).astype(np.int64)
     out = np.empty((len(corners), 2, 2, 2, MOMENTS))
     at = np.ascontiguousarray(corners, np.float64)
-    _integrate(scene, at, points, child, out)
+    _integrate(Region.whole(scene), at, points, child, out)
     return out.reshape(len(corners), 8, MOMENTS)
 
 

@@ -156,7 +156,7 @@ def moved(row: np.ndarray, x: float, y: float, z: float, d: tuple[float, float, 
         row[column] *= d[0] * d[1] * d[2]
 
 
-@kernel("Voxels Optics f8:2 i8:1 f8:1 f8:1 f8:1 f8:5", TUPLES, parallel=True, fastmath=FLAGS, error_model="numpy")
+@kernel("Voxels Optics f8:2 i8:1 f8:1 f8:1 f8:1 f8:1 f8:5", TUPLES, parallel=True, fastmath=FLAGS, error_model="numpy")
 def block_moments(
     voxels: Voxels,
     optics: Optics,
@@ -165,12 +165,14 @@ def block_moments(
     cell: np.ndarray,
     half: np.ndarray,
     step: np.ndarray,
+    begin: np.ndarray,
     out: np.ndarray,
 ) -> None:
     """Moments of the cells of each block by ``points`` (3,) points a cell.
 
-    ``blocks`` (n, 3) origins in voxels from the box's corner; ``cell`` (3,) a cell's edges, voxels; ``half``, ``step``
-    (3,) of `Scene`; all (x, y, z). ``out`` (n, cells z, cells y, cells x, 13) float64.
+    ``blocks`` (n, 3) origins in voxels from the corner of ``voxels``; ``cell`` (3,) a cell's edges, voxels; ``half``,
+    ``step`` (3,) of `Scene`; ``begin`` (3,) voxel of the whole volume that ``voxels`` begin with; all (x, y, z).
+    ``out`` (n, cells z, cells y, cells x, 13) float64.
     """
     nz, ny, nx = voxels.values.shape
     dx, dy, dz = cell[0] / points[0], cell[1] / points[1], cell[2] / points[2]
@@ -203,8 +205,9 @@ def block_moments(
                 _gather(u0, u1, optics, points[0], box[0], ly, lz, out[b, cz, cy])
         for cz, cy, cx in np.ndindex(out.shape[1:4]):
             if out[b, cz, cy, cx, MASS] > 0.0:
-                x = (x0 + cx * cell[0]) * step[0] - half[0]
-                y, z = (y0 + cy * cell[1]) * step[1] - half[1], (z0 + cz * cell[2]) * step[2] - half[2]
+                x = (begin[0] + x0 + cx * cell[0]) * step[0] - half[0]
+                y = (begin[1] + y0 + cy * cell[1]) * step[1] - half[1]
+                z = (begin[2] + z0 + cz * cell[2]) * step[2] - half[2]
                 moved(out[b, cz, cy, cx], x, y, z, box)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,13 +54,31 @@ class Tree:
         return len(self.largest)
 
 
-def build_tree(cells: Cells, seen: Visibility, step: np.ndarray) -> Tree:
-    """Sum moments upwards, eight (or fewer) cells at a time; ``step`` is the voxel edge in the unit frame (3,)."""
+def build_tree(cells: Cells, seen: Visibility, step: np.ndarray, levels: int | None = None) -> Tree:
+    """Sum moments upwards, eight (or fewer) cells at a time; ``step`` is the voxel edge in the unit frame (3,).
+
+    To the first cell that holds all of them, or so many ``levels``.
+    """
     through = seen.at(cells.index, cells.edge / step)
     keep = np.flatnonzero(through[:, 1] > HIDDEN)
-    codes = [morton(cells.index[keep])]
-    starts = []
-    while len(codes[-1]) > 1:
+    return pyramid(
+        cells.index[keep],
+        cells.edge,
+        lambda moments, top: take_base(cells.moments, keep, through, moments, top),
+        levels,
+    )
+
+
+def pyramid(
+    base: np.ndarray, base_edge: np.ndarray, fill: Callable[[np.ndarray, np.ndarray], None], levels: int | None = None
+) -> Tree:
+    """The tree over cells ``base`` (n, 3) in Morton order, of edges ``base_edge`` (3,).
+
+    ``fill`` is given their moments (n, 17) and largest transmittance (n,) to write.
+    """
+    codes = [morton(base)]
+    starts: list[np.ndarray] = []
+    while len(codes[-1]) > 1 if levels is None else len(codes[-1]) > 0 and len(starts) < levels:
         above = codes[-1] >> np.uint64(3)
         starts.append(np.flatnonzero(np.concatenate([[True], above[1:] != above[:-1]])))
         codes.append(above[starts[-1]])
@@ -68,15 +87,15 @@ def build_tree(cells: Cells, seen: Visibility, step: np.ndarray) -> Tree:
     moments, top = np.empty((total, COLUMNS)), np.empty(total)
     index, edge, parent = np.empty((total, 3), np.int32), np.empty((total, 3)), np.empty(total, np.int64)
     first, children = np.zeros(total, np.int64), np.zeros(total, np.int64)
-    take_base(cells.moments, keep, through, moments[: counts[0]], top[: counts[0]])
-    edge[: counts[0]] = cells.edge
-    index[: counts[0]] = cells.index[keep]
+    fill(moments[: counts[0]], top[: counts[0]])
+    edge[: counts[0]] = base_edge
+    index[: counts[0]] = base
     offset = 0
     for level, start in enumerate(starts):
         here = slice(offset, offset + counts[level])
         up = slice(here.stop, here.stop + counts[level + 1])
         sum_children(moments[here], top[here], start, moments[up], top[up])
-        edge[up] = cells.edge * 2.0 ** (level + 1)
+        edge[up] = base_edge * 2.0 ** (level + 1)
         index[up] = index[here][start] >> 1
         first[up] = offset + start
         children[up] = np.diff(np.append(start, counts[level]))
@@ -115,7 +134,7 @@ def select(tree: Tree, budget: int, score: np.ndarray | None = None) -> np.ndarr
     """
     if not len(tree) or budget < 1:
         return np.empty(0, np.int64)
-    capped = _cap_by_ancestors(tree, split_score(tree) if score is None else score)
+    capped = cap_by_ancestors(tree, split_score(tree) if score is None else score)
     above = capped[tree.parent]
     above[-1] = np.inf  # the root is there at any threshold
     inner = tree.children > 0
@@ -146,7 +165,7 @@ def _cells_above(entries: np.ndarray, exits: np.ndarray, threshold: float) -> in
     return int(exist - (len(exits) - np.searchsorted(exits, threshold, "right")))
 
 
-def _cap_by_ancestors(tree: Tree, score: np.ndarray) -> np.ndarray:
+def cap_by_ancestors(tree: Tree, score: np.ndarray) -> np.ndarray:
     """Each cell's score, lowered to the smallest above it."""
     capped = score.copy()
     end = len(tree) - 1

@@ -11,7 +11,7 @@ import numpy as np
 
 from vvgt_cli.cameras import Camera
 from vvgt_cli.dvr.kernel import FLAGS, absorbed
-from vvgt_cli.dvr.render import camera_arrays
+from vvgt_cli.dvr.render import Placed, camera_arrays
 from vvgt_cli.dvr.scene import Scene
 from vvgt_cli.jit.decorators import inlined, kernel
 from vvgt_cli.vbm.columns import MASS
@@ -155,11 +155,17 @@ def _rays_a_cell(edge: np.ndarray, cameras: Sequence[Camera]) -> float:
 def _mean_extinction(cells: Cells, scene: Scene, wider: int) -> np.ndarray:
     """(nz, ny, nx) float32 mean extinction of cells ``2^wider`` times as wide as ``cells`` along each axis."""
     edge = 2.0 ** (cells.exponent + wider)
-    nx, ny, nz = shape = np.ceil(np.array(scene.values.shape[::-1]) / edge).astype(np.int64)
-    x, y, z = (cells.index >> wider).T.astype(np.int64)
-    mass = np.bincount((z * ny + y) * nx + x, cells.moments[:, MASS], int(shape.prod()))
-    result: np.ndarray = (mass / (edge * scene.step).prod()).astype(np.float32).reshape(nz, ny, nx)
+    shape = np.ceil(np.array(scene.values.shape[::-1]) / edge).astype(np.int64)
+    mass = summed(cells.index >> wider, cells.moments[:, MASS], shape)
+    result: np.ndarray = (mass / (edge * scene.step).prod()).astype(np.float32)
     return result
+
+
+def summed(index: np.ndarray, values: np.ndarray, shape: np.ndarray) -> np.ndarray:
+    """Sums (nz, ny, nx) of ``values`` (n,), in order, by cell: ``index`` (n, 3) and ``shape`` (3,) are x first."""
+    nx, ny, nz = shape
+    x, y, z = index.T.astype(np.int64)
+    return np.bincount((z * ny + y) * nx + x, values, int(shape.prod())).reshape(nz, ny, nx)
 
 
 def visibility(
@@ -167,22 +173,44 @@ def visibility(
 ) -> Visibility:
     """March every camera (square images of one size) through the mean extinction of cells: what is seen of each.
 
-    The cells are ``cells``, or wider by a power of two where these are too many or meet too few rays. In a box that is
-    thinner than `THIN` pixels along some axis, a cell that no ray meets counts as seen: a line along z lies between two
-    columns of pixels in every view with z upright. ``progress`` is told the share that is done.
+    The cells are ``cells``, or wider by a power of two where these are too many or meet too few rays. ``progress`` is
+    told the share that is done.
     """
-    dims, wider = np.array(scene.values.shape[::-1]), 0
+    wider = widening(np.array(scene.values.shape[::-1]), cells.exponent, scene.step, cameras)
+    extinction = _mean_extinction(cells, scene, wider)
+    return seen_through(extinction, 2.0 ** (cells.exponent + wider), scene, cameras, progress)
+
+
+def widening(dims: np.ndarray, exponent: np.ndarray, step: np.ndarray, cameras: Sequence[Camera]) -> int:
+    """By how many powers of two the cells of the march are wider than those of 2^``exponent`` (3,) voxels.
+
+    ``dims`` (3,) voxels and ``step`` (3,) their edges in the unit frame, (x, y, z).
+    """
+    wider = 0
 
     def edge() -> np.ndarray:
-        result: np.ndarray = np.minimum(2.0 ** (cells.exponent + wider), dims)
+        result: np.ndarray = np.minimum(2.0 ** (exponent + wider), dims)
         return result
 
     while np.ceil(dims / edge()).prod() > MAX_CELLS or (
-        _rays_a_cell(edge() * scene.step, cameras) < MIN_RAYS and (edge() < dims).any()
+        _rays_a_cell(edge() * step, cameras) < MIN_RAYS and (edge() < dims).any()
     ):
         wider += 1
-    extinction = _mean_extinction(cells, scene, wider)
-    voxels = 2.0 ** (cells.exponent + wider)
+    return wider
+
+
+def seen_through(
+    extinction: np.ndarray,
+    voxels: np.ndarray,
+    scene: Placed,
+    cameras: Sequence[Camera],
+    progress: Callable[[float], None] | None = None,
+) -> Visibility:
+    """What cameras see through ``extinction`` (nz, ny, nx) float32, mean over cells of ``voxels`` (3,) voxels.
+
+    In a box that is thinner than `THIN` pixels along some axis, a cell that no ray meets counts as seen: a line along z
+    lies between two columns of pixels in every view with z upright.
+    """
     sums = np.zeros((WORKERS, *extinction.shape, 3), np.float32)
     for done, camera in enumerate(cameras, 1):
         eye, basis, lens = camera_arrays(scene, camera)

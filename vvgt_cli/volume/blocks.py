@@ -34,14 +34,17 @@ def size_text(n_bytes: int) -> str:
     return f"{n_bytes} bytes" if n_bytes < 1 << 20 else f"{n_bytes} bytes ({n_bytes / 2**30:.3g} GiB)"
 
 
-def check_memory(need: int, what: str) -> None:
-    """Raise `DataError` if ``need`` bytes exceed the free memory."""
+MAPPED = "store it uncompressed (raw and .nhdr files are mapped, not loaded)"
+IN_BLOCKS = "try 'vvgt init', which goes through it in blocks"
+
+
+def check_memory(need: int, what: str, instead: str = MAPPED) -> None:
+    """Raise `DataError` if ``need`` bytes exceed the free memory; ``instead`` is what else may be done."""
     free = free_memory()
     if free is not None and need > free:
         raise DataError(
             f"{what}: needs {size_text(need)} of memory, {size_text(free)} are free; "
-            f"give it {size_text(need - free)} more, or store it uncompressed (raw and .nhdr files are mapped, not "
-            "loaded)"
+            f"give it {size_text(need - free)} more, or {instead}"
         )
 
 

@@ -6,6 +6,7 @@ attributes of scaling and missing values are applied: a NetCDF-4 file is such a 
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +42,18 @@ def read_hdf5(path: Path, options: ReadOptions) -> Volume:
         stored = mapped if mapped is not None else lambda index: dataset[index]
         name = f"{volume_name(path)}:{dataset.name.strip('/')}"
         attributes = {key: dataset.attrs[key] for key in CF_ATTRIBUTES if key in dataset.attrs}
-        return labelled_volume(stored, dataset.dtype, _axes(dataset), attributes, options, source, name)
+        chunks = dataset.chunks or dataset.shape
+        if mapped is None and options.stored:
+            stored = partial(_part, path, dataset.name)
+        return labelled_volume(stored, dataset.dtype, _axes(dataset), attributes, options, source, name, chunks)
+
+
+def _part(path: Path, name: str, index: tuple[Any, ...]) -> np.ndarray:
+    """A part of a dataset, of a file that is open no longer than that."""
+    import h5py
+
+    with h5py.File(path, "r") as file:
+        return np.asarray(file[name][index])
 
 
 def _choose(h5py: Any, file: Any, wanted: str | None, path: Path) -> Any:

@@ -14,13 +14,15 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError, SeveralSteps, UsageError
-from vvgt_cli.volume.blocks import check_memory, count
+from vvgt_cli.volume.blocks import IN_BLOCKS, check_memory, count
 from vvgt_cli.volume.components import contiguous, select_component
 from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.stored import Stored
 from vvgt_cli.volume.types import Volume
 
 EVEN = 0.01  # of a step that a coordinate may be off and still count as evenly spaced (float32 longitudes are)
 AXIS_ATTRIBUTES = ("axis", "standard_name", "units")
+MARKS = ("_FillValue", "missing_value", "valid_min", "valid_max", "valid_range")
 CF_ATTRIBUTES = (
     *("scale_factor", "add_offset", "_FillValue", "missing_value"),
     *("valid_min", "valid_max", "valid_range", "_Unsigned"),
@@ -85,18 +87,19 @@ def labelled_volume(
     options: ReadOptions,
     source: str,
     name: str,
+    chunks: Sequence[int] | None = None,
 ) -> Volume:
     """The volume of an array with named axes.
 
     Args:
-        stored: the stored values (mapped, perhaps), or what reads a part: from an index, a slice or a number an axis.
-        dtype: of the stored values.
+        stored, dtype: the stored values (mapped, perhaps), or what reads a part: from a slice or a number an axis.
         axes: of the array, slowest first.
         attributes: of the array: ``scale_factor``, ``add_offset``, ``_FillValue``, ``missing_value``, ``valid_*``.
-        options: ``time`` is the index along the axis of time, ``component`` that along another axis that is not one
-            of space; where there is only one such axis, either.
+        options: ``time`` is the index along the axis of time, ``component`` that along another that is not of space; of
+            a single such axis, either.
         source: for messages.
         name: of the volume.
+        chunks: of the array in its file, one an axis; with ``options.stored`` it stays there and is read in blocks.
 
     Returns:
         Axes in the order z, y, x and ascending; values that the attributes call missing are NaN.
@@ -116,9 +119,11 @@ def labelled_volume(
             if value is not None and value not in range(axes[k].size):
                 raise UsageError(f"{source}: {flag} {value}: axis {axes[k]}; expected 0 to {axes[k].size - 1}")
             index[k] = slice(None) if value is None else value
+    if callable(stored) and options.stored and chunks is not None and len(space) == 3:
+        return _left(stored, dtype, axes, index, _zyx(space, axes), attributes, options, source, name, chunks)
     if callable(stored):
         sizes = [n.size if i == slice(None) else 1 for n, i in zip(axes, index, strict=True)]
-        check_memory(count(tuple(sizes)) * dtype.itemsize, source)
+        check_memory(count(tuple(sizes)) * dtype.itemsize, source, IN_BLOCKS)
         values = np.asarray(stored(tuple(index)))
     else:
         values = stored[tuple(index)]
@@ -249,7 +254,8 @@ def _placed(
 ) -> Volume:
     """The volume with spacing and origin from the coordinates of its axes (z, y, x), which are made ascending."""
     flips = [_descends(a, source) for a in axes]
-    field = contiguous(field[tuple(slice(None, None, -1 if flip else 1) for flip in flips)])
+    if not isinstance(field, Stored):  # it turns its blocks itself
+        field = contiguous(field[tuple(slice(None, None, -1 if flip else 1) for flip in flips)])
     axes = [
         replace(a, centres=a.centres[::-1]) if flip and a.centres is not None else a
         for a, flip in zip(axes, flips, strict=True)
@@ -277,6 +283,40 @@ def _placed(
     points = [np.arange(a.size, dtype=float) if c is None else c for a, c in zip(axes, centres, strict=True)]
     data = (field * np.float64(scaling[0]) + scaling[1]).ravel()
     return resample(rectilinear(points[::-1]), data, "point", options.dims, source, name)
+
+
+def _left(
+    stored: Callable[[tuple[Any, ...]], np.ndarray], dtype: np.dtype, axes: Sequence[Axis], index: list[Any],
+    zyx: list[int], attributes: Mapping[str, Any], options: ReadOptions, source: str, name: str, chunks: Sequence[int],
+) -> Volume:  # fmt: skip
+    """The volume of an array that stays in its file; values that may be missing make every block floats.
+
+    ``index`` chooses along the axes that are not of space; ``zyx`` are those that are.
+    """
+    if any(index[k] == slice(None) for k in range(len(axes)) if k not in zyx) or options.dims is not None:
+        raise UsageError(f"{source}: block by block a magnitude or another grid cannot be read; choose one component")
+    flips = [_descends(axes[k], source) for k in zyx]
+    marked = any(key in attributes for key in MARKS)
+    unsigned = dtype.kind == "i" and str(attributes.get("_Unsigned", "")).lower() == "true"
+    kind = np.dtype(dtype.str.replace("i", "u")) if unsigned else dtype
+    wide = marked and kind.kind != "f"
+    final = np.dtype(np.float32 if dtype.itemsize <= 2 else np.float64) if wide else kind
+    scale = _number(attributes, "scale_factor", 1.0, source), _number(attributes, "add_offset", 0.0, source)
+    inner = [sorted(zyx).index(k) for k in zyx]
+
+    def read(slices: tuple[slice, ...]) -> np.ndarray:
+        wanted = list(index)
+        for k, part, flip in zip(zyx, slices, flips, strict=True):
+            n = axes[k].size
+            wanted[k] = slice(n - part.stop, n - part.start) if flip else slice(part.start, part.stop)
+        values, slope, intercept = decode(np.asarray(stored(tuple(wanted))), attributes, source)
+        if wide and values.dtype != final:
+            values = (values * slope + intercept).astype(final)
+        turned: np.ndarray = np.transpose(values, inner)
+        return turned[tuple(slice(None, None, -1 if flip else 1) for flip in flips)]
+
+    field: Any = Stored(read, final, tuple(axes[k].size for k in zyx), [chunks[k] for k in zyx], source)
+    return _placed(field, [axes[k] for k in zyx], (1.0, 0.0) if wide else scale, options, source, name)
 
 
 def _no_dims(options: ReadOptions, source: str, why: str) -> None:

@@ -57,6 +57,8 @@ class ReadOptions:
         mask: file or `Volume` of the same size (before or after ``crop``); where it is 0 nothing is shown.
         packed: values are read front to back only: where they are compressed and a format can, they stay so
             (`vvgt_cli.volume.packed`).
+        stored: values are read block by block: formats that can leave them in the file (`vvgt_cli.volume.stored`).
+        level: of a file with several resolutions (OME-Zarr), from 0, the finest.
 
     Raises:
         UsageError: a value out of its range.
@@ -74,6 +76,8 @@ class ReadOptions:
     crop: str | None = None
     mask: str | Volume | None = None
     packed: bool = False
+    stored: bool = False
+    level: int | None = None
 
     def __post_init__(self) -> None:
         if self.dims is not None and (len(self.dims) != 3 or min(self.dims) < 1):
@@ -95,6 +99,8 @@ class ReadOptions:
             raise UsageError(f"--component {component}: expected an index (0, 1, ...), a channel's name or magnitude")
         if self.crop is not None:
             parse_crop(self.crop)
+        if self.level is not None and self.level < 0:
+            raise UsageError(f"--level {self.level}: expected full, or the number of a level (0, 1, ...)")
         if self.time is not None and self.time < 0:
             raise UsageError(f"--time {self.time}: expected the index of a time step (0, 1, ...)")
 

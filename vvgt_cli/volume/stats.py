@@ -59,27 +59,19 @@ def statistics(volume: Volume) -> Statistics:
         DataError: no voxel has a finite value, or the scaling makes values infinite.
     """
     if volume.data.dtype.kind in "iub" and volume.data.dtype.itemsize <= 2:
-        counts, first = count_integers(volume)
-        used = np.nonzero(counts)[0]
-        with np.errstate(over="ignore"):
-            values = (used + first).astype(np.float64) * volume.slope + volume.intercept
-        lo, hi = float(values.min()), float(values.max())
-        _check_range(lo, hi, volume)
-        edges = _edges(lo, hi)
-        bins = _bins(values, float(edges[0]), float(edges[-1]))
-        histogram = np.bincount(bins, weights=counts[used], minlength=BINS).astype(np.int64)
-        return Statistics(lo, hi, 0, 0, histogram, edges)
+        return integer_statistics(_byte_counts(volume), volume)
     lo, hi, nan_count, inf_count = _range(volume)
-    _check_range(lo, hi, volume)
-    edges = _edges(lo, hi)
+    check_range(lo, hi, volume)
+    edges = edges_of(lo, hi)
     histogram = np.zeros(BINS, np.int64)
     for _, slab in slabs(volume):
-        values = _finite(slab, volume)
-        histogram += np.bincount(_bins(values, float(edges[0]), float(edges[-1])), minlength=BINS)
+        values = finite_values(slab, volume)
+        histogram += np.bincount(bins_of(values, float(edges[0]), float(edges[-1])), minlength=BINS)
     return Statistics(lo, hi, nan_count, inf_count, histogram, edges)
 
 
-def _check_range(lo: float, hi: float, volume: Volume) -> None:
+def check_range(lo: float, hi: float, volume: Volume) -> None:
+    """Raise `DataError` where the least and greatest data value are not finite."""
     if not (np.isfinite(lo) and np.isfinite(hi)):
         raise DataError(
             f"{volume.name}: data values {volume.slope:g} * stored + {volume.intercept:g} reach from {lo:g} to {hi:g}; "
@@ -87,7 +79,8 @@ def _check_range(lo: float, hi: float, volume: Volume) -> None:
         )
 
 
-def _edges(lo: float, hi: float) -> np.ndarray:
+def edges_of(lo: float, hi: float) -> np.ndarray:
+    """(257,) bin edges over [lo, hi]."""
     if lo == hi:
         half = max(0.5, abs(lo) * 2.0**-40)
         lo, hi = lo - half, hi + half
@@ -98,27 +91,55 @@ def _edges(lo: float, hi: float) -> np.ndarray:
     return edges
 
 
-def _bins(values: np.ndarray, lo: float, hi: float) -> np.ndarray:
+def bins_of(values: np.ndarray, lo: float, hi: float) -> np.ndarray:
     """Bin of each value; the last bin is closed."""
     width = hi - lo
     t = (values - lo) / width if np.isfinite(width) else (values / 2 - lo / 2) / (hi / 2 - lo / 2)
     return np.minimum((t * BINS).astype(np.int64), BINS - 1)
 
 
+def integer_statistics(counts: np.ndarray, volume: Volume) -> Statistics:
+    """Statistics from ``counts`` (256 or 65536,) of every stored value of an 8- or 16-bit type, as its bytes, unsigned.
+
+    Raises:
+        DataError: the scaling makes values infinite.
+    """
+    counts, first = _in_order(counts, volume)
+    used = np.nonzero(counts)[0]
+    with np.errstate(over="ignore"):
+        values = (used + first).astype(np.float64) * volume.slope + volume.intercept
+    lo, hi = float(values.min()), float(values.max())
+    check_range(lo, hi, volume)
+    edges = edges_of(lo, hi)
+    bins = bins_of(values, float(edges[0]), float(edges[-1]))
+    histogram = np.bincount(bins, weights=counts[used], minlength=BINS).astype(np.int64)
+    return Statistics(lo, hi, 0, 0, histogram, edges)
+
+
 def count_integers(volume: Volume) -> tuple[np.ndarray, int]:
     """Counts of every stored value of an 8- or 16-bit type, and the value that the first count is of."""
+    return _in_order(_byte_counts(volume), volume)
+
+
+def _in_order(counts: np.ndarray, volume: Volume) -> tuple[np.ndarray, int]:
+    """Counts of values as their bytes, unsigned, in the order of the values, and the first of these."""
+    if volume.data.dtype.kind == "i":  # two's complement: the upper half are the negative values
+        return np.roll(counts, len(counts) // 2), -(len(counts) // 2)
+    return counts, 0
+
+
+def _byte_counts(volume: Volume) -> np.ndarray:
+    """Counts of every stored value of an 8- or 16-bit type, as its bytes, unsigned."""
     dtype = volume.data.dtype.newbyteorder("=")
     unsigned = np.dtype(f"u{dtype.itemsize}")
     size = 256**dtype.itemsize
     counts = np.zeros(size, np.int64)
     for _, slab in slabs(volume):
         counts += np.bincount(slab.view(unsigned).ravel(), minlength=size)
-    if dtype.kind == "i":  # two's complement: the upper half are the negative values
-        return np.roll(counts, size // 2), -(size // 2)
-    return counts, 0
+    return counts
 
 
-def _finite(slab: np.ndarray, volume: Volume) -> np.ndarray:
+def finite_values(slab: np.ndarray, volume: Volume) -> np.ndarray:
     """Finite data values of a slab, (n,) float64."""
     with np.errstate(over="ignore", invalid="ignore"):
         values = slab.ravel().astype(np.float64)
@@ -135,7 +156,7 @@ def _finite(slab: np.ndarray, volume: Volume) -> np.ndarray:
 def _range(volume: Volume) -> tuple[float, float, int, int]:
     lo, hi, nan_count, finite = np.inf, -np.inf, 0, 0
     for _, slab in slabs(volume):
-        values = _finite(slab, volume)
+        values = finite_values(slab, volume)
         finite += values.size
         if values.size < slab.size:
             nan_count += int(np.isnan(slab).sum())

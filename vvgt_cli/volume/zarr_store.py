@@ -44,7 +44,7 @@ def read_zarr(path: Path, options: ReadOptions) -> Volume:
     """
     zarr = need("zarr", "zarr", str(path), "Zarr")
     with library_errors(str(path), "Zarr"):
-        place, facts = _choose(path, options.array)
+        place, facts = _choose(path, options.array, options.level)
         _check_codecs(place, facts)
         array = zarr.open_array(store=str(place), mode="r")
         if int(np.prod(array.chunks, dtype=object)) * array.dtype.itemsize > MAX_CHUNK:
@@ -59,6 +59,7 @@ def read_zarr(path: Path, options: ReadOptions) -> Volume:
             options,
             str(place),
             _name(path, place),
+            array.chunks,
         )
 
 
@@ -84,8 +85,19 @@ def _metadata(folder: Path) -> dict[str, Any]:
     return {}
 
 
-def _choose(path: Path, wanted: str | None) -> tuple[Path, dict[str, Any]]:
-    """Folder and metadata of the array asked for, else of the image's first level, else of the only one."""
+def level_shapes(source: str, options: ReadOptions) -> list[tuple[int, ...]]:
+    """Shapes of the levels of an OME-Zarr image, finest first; none where a source is no such image."""
+    path = Path(source)
+    here = path / (options.array or "").strip("/")
+    if not here.is_dir() or not holds_zarr(here) or not here.resolve().is_relative_to(path.resolve()):
+        return []
+    places = [here / str(entry.get("path")) for entry in _multiscale(here).get("datasets", [])]
+    inside = [place for place in places if place.resolve().is_relative_to(path.resolve())]
+    return [tuple(_metadata(place).get("shape", ())) for place in inside]
+
+
+def _choose(path: Path, wanted: str | None, number: int | None) -> tuple[Path, dict[str, Any]]:
+    """Folder and metadata of the array asked for, else of the image's level ``number``, else of the only one."""
     here = path
     if wanted is not None:
         here = path / wanted.strip("/")
@@ -95,8 +107,12 @@ def _choose(path: Path, wanted: str | None) -> tuple[Path, dict[str, Any]]:
     if facts.get("node_type") == "array":
         return here, facts
     level = _multiscale(here)
+    if number is not None and not level:
+        raise UsageError(f"{path}: no OME-Zarr image, which alone has levels; leave out --level {number}")
     if level:
-        place = here / str(level["datasets"][0]["path"])
+        if (number or 0) >= len(level["datasets"]):
+            raise UsageError(f"{path}: --level {number}: expected full, or 0 to {len(level['datasets']) - 1}")
+        place = here / str(level["datasets"][number or 0]["path"])
         if place.resolve().is_relative_to(path.resolve()):
             return place, _metadata(place)
     fits = _arrays(here if facts else path)

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 SECONDS = 0.41, 0.77, 0.12  # always, per 10^6 cells, per 10^6 voxels in bricks that are not empty
 MEMORY = 294.0, 1240.0  # bytes: a cell, a Gaussian (with what later stages keep of it)
 FAINT = 0.02  # opacity
+FAINT_LOGIT = math.log(FAINT / (1 - FAINT))
 NEARLY = 0.99  # of the budget: cells are split by eights, so that a few are always missing
 FEWEST = 5000  # Gaussians that a fog keeps
 
@@ -84,7 +85,7 @@ def thinned(start: Start) -> tuple[Start, int]:
     """
     before = len(start.gaussians)
     while start.form is not None and start.form.budget >= 2 * FEWEST:
-        if np.median(start.gaussians.opacity_logits) >= math.log(FAINT / (1 - FAINT)):
+        if np.median(start.gaussians.opacity_logits) >= FAINT_LOGIT:
             break
         form = replace(start.form, budget=start.form.budget // 2)
         start = replace(start, form=form, gaussians=form.gaussians())

@@ -1,0 +1,241 @@
+"""The closed form in blocks: the same Gaussians as in memory, the same bytes whatever the blocks, workers and order."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vvgt_cli.gaussians import read_ply
+from vvgt_cli.volume import ReadOptions, read_volume
+from vvgt_cli.volume.stats import statistics
+from vvgt_cli.volume.tallies import counted, statistics_of, tally, with_limits
+
+FIT = ("--max-gaussians", "3000", "--size", "150", "-q")
+
+
+def bodies(dims=(100, 90, 80)):
+    """(nz, ny, nx) float in [0, 1]: balls, a shell, texture."""
+    axes = [(np.arange(n) + 0.5) / n * 2 - 1 for n in dims]
+    z, y, x = np.meshgrid(*axes[::-1], indexing="ij")
+    r = np.sqrt(x * x + y * y + z * z)
+    values = np.exp(-60 * (r - 0.6) ** 2) * 0.5 + 0.9 * np.exp(-40 * ((x - 0.3) ** 2 + y * y + z * z))
+    return np.clip(values + 0.03 * np.sin(30 * x) * np.sin(25 * y) * (values > 0.05), 0, 1)
+
+
+@pytest.fixture
+def raw(tmp_path):
+    """A raw uint8 file of 100 x 90 x 80."""
+    path = tmp_path / "v_100x90x80_uint8.raw"
+    path.write_bytes(np.round(bodies() * 255).astype(np.uint8).tobytes())
+    return path
+
+
+def sorted_rows(path):
+    """Rows of a .ply in an order of their own."""
+    content = path.read_bytes()
+    start = content.index(b"end_header\n") + 11
+    rows = np.frombuffer(content, np.uint8, offset=start).reshape(len(read_ply(path)[0]), -1).view(np.uint32)
+    return content[:start], rows[np.lexsort(rows.T)]
+
+
+def same_gaussians(one, other):
+    (head, rows), (head_2, rows_2) = sorted_rows(one), sorted_rows(other)
+    return head == head_2 and rows.shape == rows_2.shape and np.array_equal(rows, rows_2)
+
+
+def test_blocks_leave_the_gaussians_that_memory_does_in_any_size_of_block(vvgt, raw, tmp_path):
+    memory = tmp_path / "memory.ply"
+    assert vvgt("init", raw, "-o", memory, *FIT).code == 0
+    files = []
+    for size in ("16", "32", "128", "auto"):
+        path = tmp_path / f"{size}.ply"
+        assert vvgt("init", raw, "-o", path, *FIT, "--blocks", size).code == 0
+        files.append(path.read_bytes())
+    assert len(set(files)) == 1
+    assert same_gaussians(memory, path)
+    assert [p.name for p in tmp_path.iterdir() if "blocks" in p.name] == []
+
+
+@pytest.mark.parametrize("budget", ["1", "7", "64", "400", "100000"])
+def test_any_budget_is_cut_as_in_memory(vvgt, raw, tmp_path, budget):
+    one, other = tmp_path / "a.ply", tmp_path / "b.ply"
+    fit = ("--max-gaussians", budget, "--size", "100", "-q")
+    assert vvgt("init", raw, "-o", one, *fit).code == 0
+    assert vvgt("init", raw, "-o", other, *fit, "--blocks", "32").code == 0
+    assert same_gaussians(one, other)
+
+
+def test_opaque_anisotropic_and_turned_volumes_too(vvgt, tmp_path):
+    path = tmp_path / "v.nhdr"
+    (tmp_path / "v.raw").write_bytes(np.round(bodies((60, 70, 30)) * 4000 - 100).astype(">i2").tobytes())
+    path.write_text(
+        "NRRD0004\ntype: int16\ndimension: 3\nsizes: 60 70 30\nendian: big\nencoding: raw\nspace: LPS\n"
+        "space directions: (0,1,0) (-1,0,0) (0,0,2.5)\nspace origin: (3,4,5)\ndata file: v.raw\n"
+    )
+    tf = tmp_path / "tf.json"
+    tf.write_text('{"range": [0, 1000], "points": [{"x": 0.3, "rgb": [1, 0, 0], "opacity": 0},'
+                  '{"x": 0.4, "rgb": [1, 1, 0], "opacity": 1}]}')  # fmt: skip
+    one, other = tmp_path / "a.ply", tmp_path / "b.ply"
+    options = ("--tf", tf, "--max-gaussians", "3000", "--size", "200", "-q")
+    assert vvgt("init", path, "-o", one, *options).code == 0
+    for size in ("16", "32"):
+        assert vvgt("init", path, "-o", other, *options, "--blocks", size, "--overwrite").code == 0
+        assert same_gaussians(one, other)
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "int16", "float32", "float64", "int32"])
+def test_counts_of_blocks_add_up_to_the_statistics(tmp_path, dtype):
+    values = bodies((30, 20, 25)) * 200 - 50
+    values = values.astype(dtype) if dtype != "uint8" else np.round(bodies((30, 20, 25)) * 255).astype(dtype)
+    if values.dtype.kind == "f":
+        values[3, 4, 5:9], values[0, 0, 0] = np.nan, np.inf
+    np.save(tmp_path / "v.npy", values)
+    volume = read_volume(str(tmp_path / "v.npy"))
+    parts = [values[a:b] for a, b in ((11, 25), (0, 3), (3, 11))]
+    whole = tally(parts[0], volume).plus(tally(parts[1], volume)).plus(tally(parts[2], volume))
+    whole, histogram = with_limits(whole, volume), None
+    if not counted(volume):
+        histogram = sum(tally(part, volume, (whole.lo, whole.hi)).histogram for part in parts)
+    ours, theirs = statistics_of(whole, volume, histogram), statistics(volume)
+    assert (ours.lo, ours.hi, ours.nan_count, ours.inf_count) == (
+        theirs.lo,
+        theirs.hi,
+        theirs.nan_count,
+        theirs.inf_count,
+    )
+    assert np.array_equal(ours.histogram, theirs.histogram)
+    assert np.array_equal(ours.edges, theirs.edges)
+
+
+def store(kind, path, values, chunks=(16, 20, 24)):
+    """A chunked file of an array; what to give to vvgt."""
+    if kind == "hdf5":
+        h5py = pytest.importorskip("h5py")
+        with h5py.File(path / "v.h5", "w") as file:
+            file.create_dataset("a", data=values, chunks=chunks, compression="gzip")
+        return path / "v.h5"
+    zarr = pytest.importorskip("zarr")
+    version = int(kind[-1])
+    array = zarr.create_array(
+        path / "v.zarr", shape=values.shape, chunks=chunks, dtype=values.dtype, zarr_format=version, fill_value=0
+    )
+    array[:] = values
+    return path / "v.zarr"
+
+
+@pytest.mark.parametrize("kind", ["zarr2", "zarr3", "hdf5"])
+def test_chunked_files_are_read_in_blocks(vvgt, tmp_path, kind):
+    source = store(kind, tmp_path, bodies().astype(np.float32))
+    one, other = tmp_path / "a.ply", tmp_path / "b.ply"
+    assert vvgt("init", source, "-o", one, *FIT).code == 0
+    assert vvgt("init", source, "-o", other, *FIT, "--blocks", "32").code == 0
+    assert same_gaussians(one, other)
+
+
+def test_axes_of_an_array_in_a_file_are_turned_as_in_memory(tmp_path):
+    h5py = pytest.importorskip("h5py")
+    values = np.arange(6 * 5 * 4 * 2, dtype=np.int16).reshape(6, 5, 4, 2)
+    with h5py.File(tmp_path / "v.h5", "w") as file:
+        data = file.create_dataset("a", data=values, chunks=(2, 2, 3, 1))
+        data.attrs["_FillValue"] = np.int16(7)
+        data.attrs["scale_factor"] = 0.5
+        for k, (name, centres) in enumerate([("x", range(6)), ("z", range(5, 0, -1)), ("y", range(4))]):
+            file[name] = np.array(list(centres), np.float64)
+            file[name].make_scale(name)
+            data.dims[k].attach_scale(file[name])
+    path = str(tmp_path / "v.h5")
+    whole = read_volume(path, ReadOptions(array="a", component=1))
+    left = read_volume(path, ReadOptions(array="a", component=1, stored=True))
+    assert left.data.shape == whole.data.shape == (5, 4, 6)
+    assert (left.spacing, left.origin) == (whole.spacing, whole.origin)
+    scaled = whole.data * whole.slope + whole.intercept
+    assert np.array_equal(left.data[:] * left.slope + left.intercept, scaled, equal_nan=True)
+    assert np.array_equal(left.data[1:3, 2:, 1:5] * left.slope, scaled[1:3, 2:, 1:5], equal_nan=True)
+
+
+def chunk_files(path):
+    return sorted(p for p in path.rglob("*") if p.is_file() and not p.name.startswith((".z", "zarr.json")))
+
+
+@pytest.mark.parametrize("kind", ["zarr2", "zarr3"])
+def test_a_missing_chunk_is_fill_value_and_a_damaged_one_a_line_with_its_index(vvgt, tmp_path, kind):
+    values = np.round(bodies((64, 64, 64)) * 255).astype(np.uint8)
+    source = store(kind, tmp_path, values, (32, 32, 32))
+    chunks = chunk_files(source)
+    assert len(chunks) == 8
+    chunks[5].write_bytes(b"nonsense")
+    run = vvgt("init", source, "-o", tmp_path / "a.ply", *FIT, "--blocks", "32")
+    assert run.code == 1
+    assert "chunk (1, 0, 1) (z, y, x) is damaged" in run.err
+    chunks[5].unlink()
+    run = vvgt("init", source, "-o", tmp_path / "a.ply", *FIT, "--blocks", "32")
+    assert run.code == 0
+    values[32:, :32, 32:] = 0
+    np.save(tmp_path / "v.npy", values)
+    assert vvgt("init", tmp_path / "v.npy", "-o", tmp_path / "b.ply", *FIT).code == 0
+    assert same_gaussians(tmp_path / "a.ply", tmp_path / "b.ply")
+
+
+def test_a_level_of_an_image_is_chosen_by_the_screen(vvgt, tmp_path):
+    zarr = pytest.importorskip("zarr")
+    group = zarr.open_group(tmp_path / "v.zarr", mode="w", zarr_format=3)
+    values = np.round(bodies((64, 64, 64)) * 255).astype(np.uint8)
+    for n in range(3):
+        group.create_array(str(n), data=values[:: 2**n, :: 2**n, :: 2**n])
+    levels = [
+        {"path": str(n), "coordinateTransformations": [{"type": "scale", "scale": [2.0**n] * 3}]} for n in range(3)
+    ]
+    axes = [{"name": name, "type": "space"} for name in "zyx"]
+    group.attrs["ome"] = {"version": "0.5", "multiscales": [{"axes": axes, "datasets": levels}]}
+    options = ("--max-gaussians", "500", "--overwrite")
+    for size, level, grid in ((300, None, "64 x 64 x 64"), (30, None, "32 x 32 x 32"), (30, "full", "64 x 64 x 64"),
+                              (30, "2", "16 x 16 x 16")):  # fmt: skip
+        chosen = ["--level", level] if level else ["--blocks", "auto"]
+        run = vvgt("init", tmp_path / "v.zarr", "-o", tmp_path / "a.ply", "--size", size, *options, *chosen)
+        assert run.code == 0
+        assert f": {grid} uint8" in run.err
+    run = vvgt("init", tmp_path / "v.zarr", "-o", tmp_path / "a.ply", *options, "--level", "3")
+    assert run.code == 2
+    assert "expected full, or 0 to 2" in run.err
+    run = vvgt("init", "example:blob:20", "-o", tmp_path / "a.ply", *options, "--level", "1")
+    assert run.code == 2
+    assert "no OME-Zarr image" in run.err
+
+
+def test_memory_decides_by_itself(vvgt, tmp_path, monkeypatch):
+    source = store("hdf5", tmp_path, bodies().astype(np.float32))
+    plain = vvgt("init", source, "-o", tmp_path / "a.ply", *FIT[:-1])
+    assert plain.code == 0
+    assert "blocks" not in plain.err
+    monkeypatch.setattr("vvgt_cli.scale.source.free_memory", lambda: 200 << 20)
+    less = vvgt("init", source, "-o", tmp_path / "b.ply", *FIT[:-1])
+    assert less.code == 0
+    assert "more than the memory holds" in less.err
+    assert same_gaussians(tmp_path / "a.ply", tmp_path / "b.ply")
+    monkeypatch.setattr("vvgt_cli.volume.blocks.free_memory", lambda: 1 << 20)
+    whole = vvgt("convert", source, "-o", tmp_path / "c.ply", *FIT[:-1])
+    assert whole.code == 1
+    assert "try 'vvgt init', which goes through it in blocks" in whole.err
+    monkeypatch.setattr("vvgt_cli.scale.settings.free_memory", lambda: 200 << 20)
+    none = vvgt("init", source, "-o", tmp_path / "c.ply", *FIT[:-1])
+    assert none.code == 2
+    assert "MiB more" in none.err
+
+
+def test_what_blocks_cannot_do_is_a_line(vvgt, raw, tmp_path):
+    for options, word in (
+        (("--blocks", "48"), "power of two"),
+        (("--blocks", "auto", "--init", "wavelet"), "whole volume in memory"),
+        (("--blocks", "auto", "--light", "headlight"), "lit by nothing"),
+        (("--shard", "1/2", "--report", "r.json"), "vvgt merge"),
+        (("--shard", "3/2"), "I from 1 to N"),
+    ):
+        run = vvgt("init", raw, "-o", tmp_path / "a.ply", *FIT, *options)
+        assert run.code == 2, options
+        assert word in run.err
+    packed = tmp_path / "v_100x90x80_uint8.raw.gz"
+    import gzip
+
+    packed.write_bytes(gzip.compress(raw.read_bytes()))
+    assert vvgt("init", packed, "-o", tmp_path / "c.ply", *FIT, "--blocks", "auto").code == 0  # small: unpacked
+    assert vvgt("merge", tmp_path, "-o", tmp_path / "d.ply").code == 2

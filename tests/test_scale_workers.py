@@ -1,0 +1,164 @@
+"""Blocks by shards, processes and Dask's workers: the same bytes, whoever is killed."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.test_scale import FIT, bodies
+
+ROOT = Path(__file__).parent.parent
+SIZE = ("--blocks", "32")
+
+
+@pytest.fixture
+def raw(tmp_path):
+    """A raw uint8 file of 128 x 90 x 120."""
+    path = tmp_path / "v_128x90x120_uint8.raw"
+    path.write_bytes(np.round(bodies((128, 90, 120)) * 255).astype(np.uint8).tobytes())
+    return path
+
+
+@pytest.fixture
+def alone(vvgt, raw, tmp_path):
+    """Bytes of the file that one process makes."""
+    assert vvgt("init", raw, "-o", tmp_path / "alone.ply", *FIT, *SIZE).code == 0
+    return (tmp_path / "alone.ply").read_bytes()
+
+
+def start(*args, **variables):
+    """The command line in a process of its own."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "vvgt_cli.cli.main", *map(str, args)],
+        env={**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", **variables}, stderr=subprocess.PIPE,
+        text=True,
+    )  # fmt: skip
+
+
+def test_shards_in_any_order_and_a_merge_leave_the_same_bytes(vvgt, raw, alone, tmp_path):
+    folder, out = tmp_path / "v.blocks", tmp_path / "merged.ply"
+    for shard in ("2/3", "3/3"):
+        run = vvgt("init", raw, "-o", folder, *FIT[:-1], *SIZE, "--shard", shard)
+        assert run.code == 0
+        assert "run the same array again" in run.err
+    early = vvgt("merge", folder, "-o", out)
+    assert early.code == 1
+    assert "run the same array again" in early.err
+    for shard in ("1/3", "3/3"):
+        assert vvgt("init", raw, "-o", folder, *FIT[:-1], *SIZE, "--shard", shard).code == 0
+    early = vvgt("merge", folder, "-o", out)
+    assert early.code == 1
+    assert "is missing; run the shard" in early.err
+    last = vvgt("init", raw, "-o", folder, *FIT[:-1], *SIZE, "--shard", "2/3")
+    assert "all blocks are there" in last.err
+    raw.unlink()  # is not needed any more
+    assert vvgt("merge", folder, "-o", out).code == 0
+    assert out.read_bytes() == alone
+    assert vvgt("merge", folder, "-o", out).code == 2  # exists
+    assert vvgt("merge", folder, "-o", "-").out == alone
+
+
+def test_another_run_is_not_mixed_in(vvgt, raw, tmp_path):
+    folder = tmp_path / "v.blocks"
+    assert vvgt("init", raw, "-o", folder, *FIT, *SIZE, "--shard", "1/2").code == 0
+    other = vvgt("init", raw, "-o", folder, *FIT, "--tf", "viridis", *SIZE, "--shard", "1/2")
+    assert other.code == 2
+    assert "another run (other function)" in other.err
+    other = vvgt("init", raw, "-o", folder, *FIT, "--blocks", "64", "--shard", "1/2")
+    assert other.code == 2
+    assert "another run (other blocks)" in other.err
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.txt").write_text("x")
+    other = vvgt("init", raw, "-o", tmp_path / "mine", *FIT, *SIZE, "--shard", "1/2")
+    assert other.code == 2
+    assert "something else" in other.err
+
+
+def test_a_damaged_part_is_a_line(vvgt, raw, tmp_path):
+    folder = tmp_path / "v.blocks"
+    assert vvgt("init", raw, "-o", folder, *FIT, *SIZE, "--shard", "1/1").code == 0
+    rows = sorted((folder / "cells").glob("*.rows"), key=lambda path: path.stat().st_size)[-1]
+    rows.write_bytes(rows.read_bytes()[:-1000])
+    run = vvgt("merge", folder, "-o", tmp_path / "a.ply")
+    assert run.code == 1
+    assert "not whole; remove" in run.err
+    rows.with_suffix(".npz").write_bytes(b"PK nonsense")
+    run = vvgt("merge", folder, "-o", tmp_path / "a.ply")
+    assert run.code == 1
+    assert "damaged" in run.err
+    assert not (tmp_path / "a.ply").exists()
+
+
+def test_dasks_workers_leave_the_same_bytes(raw, alone, tmp_path):
+    pytest.importorskip("distributed")
+    out = tmp_path / "two.ply"
+    run = start("init", raw, "-o", out, *FIT[:-1], *SIZE, "--workers", 2, "--scheduler", "local")
+    said = run.communicate(timeout=900)[1]
+    assert run.returncode == 0, said
+    assert "2 workers" in said
+    assert out.read_bytes() == alone
+
+
+def test_a_scheduler_that_is_not_there_is_a_line(vvgt, raw, tmp_path, monkeypatch):
+    pytest.importorskip("distributed")
+    monkeypatch.setattr("vvgt_cli.scale.dask_runner.WAIT", "1s")
+    for scheduler, code, word in (
+        ("tcp://127.0.0.1:9", 1, "no Dask scheduler answers"),
+        ("nonsense://x", 1, "no Dask scheduler answers"),
+    ):
+        run = vvgt("init", raw, "-o", tmp_path / "a.ply", *FIT, *SIZE, "--scheduler", scheduler)
+        assert run.code == code, run.err
+        assert word in run.err
+        assert run.err.count("\n") == 1
+    assert vvgt("init", raw, "-o", tmp_path / "a", *FIT, "--shard", "1/2", "--scheduler", "local").code == 2
+
+
+def children(pid):
+    """Processes that a process has started, by their command line."""
+    found = {}
+    for path in Path("/proc").glob("[0-9]*"):
+        try:
+            stat, line = (path / "stat").read_text(), (path / "cmdline").read_bytes()
+        except OSError:
+            continue
+        if int(stat.rpartition(")")[2].split()[1]) == pid:
+            found[int(path.name)] = line
+    return found
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
+def test_a_killed_worker_costs_nothing_but_time(raw, alone, tmp_path):
+    run = start("init", raw, "-o", tmp_path / "two.ply", *FIT, "--blocks", 16, "--workers", 2)
+    killed, until = 0, time.monotonic() + 900
+    while run.poll() is None and time.monotonic() < until:
+        workers = [pid for pid, line in children(run.pid).items() if b"spawn_main" in line]
+        parts = list(tmp_path.glob(".two.ply.blocks/counts/*.npz"))
+        if workers and parts and not killed:
+            os.kill(workers[0], signal.SIGKILL)
+            killed += 1
+        time.sleep(0.01)
+    assert run.wait(10) == 0, run.stderr.read()
+    assert killed == 1
+    assert (tmp_path / "two.ply").read_bytes() == alone
+
+
+def test_a_killed_run_goes_on_where_it_was(raw, alone, vvgt, tmp_path):
+    run = start("init", raw, "-o", tmp_path / "a.ply", *FIT, "--blocks", 16)
+    while run.poll() is None and not list(tmp_path.glob(".a.ply.blocks/cells/*.npz")):
+        time.sleep(0.005)
+    run.kill()
+    run.wait()
+    assert not (tmp_path / "a.ply").exists()
+    again = vvgt("init", raw, "-o", tmp_path / "a.ply", *FIT[:-1], "--blocks", "auto")
+    assert again.code == 0
+    assert "going on with the blocks" in again.err
+    assert "0 of 48 blocks" in again.err
+    assert (tmp_path / "a.ply").read_bytes() == alone
+    assert not (tmp_path / ".a.ply.blocks").exists()

@@ -1,0 +1,85 @@
+"""Options of what goes through a volume in blocks."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from vvgt_cli.cli.options import group
+from vvgt_cli.progress import Console
+
+if TYPE_CHECKING:
+    from vvgt_cli.conversion.request import ConvertRequest
+    from vvgt_cli.scale.settings import BlockOptions
+
+
+def _size(ctx: click.Context, param: click.Parameter, value: str | None) -> int | str | None:
+    if value is None or value == "auto":
+        return value
+    if not (value.isascii() and value.isdecimal()):
+        raise click.BadParameter(f"{value!r}; expected auto, or a power of two from 16 on")
+    return int(value)
+
+
+def _shard(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[int, int] | None:
+    if value is None:
+        return None
+    index, _, count = value.partition("/")
+    if not (index.isdecimal() and count.isdecimal() and 1 <= int(index) <= int(count)):
+        raise click.BadParameter(f"{value!r}; expected I/N with I from 1 to N, as 3/8")
+    return int(index), int(count)
+
+
+def _level(ctx: click.Context, param: click.Parameter, value: str | None) -> int | str | None:
+    if value is None or value == "full":
+        return value
+    if not (value.isascii() and value.isdecimal()):
+        raise click.BadParameter(f"{value!r}; expected full, or the number of a level (0, 1, ...)")
+    return int(value)
+
+
+block_options = group(
+    "blocks",
+    block_size=click.option(
+        "--blocks", "block_size", metavar="SIZE|auto", callback=_size,
+        help="Read the volume in blocks of SIZE voxels along an edge (a power of two), or as the memory allows. "
+        "Default: only where the memory does not hold it.",
+    ),
+    workers=click.option(
+        "--workers", type=click.IntRange(1, 1024), default=1, show_default=True, metavar="N",
+        help="Processes that go through blocks at once; with --scheduler local, its workers.",
+    ),
+    scheduler=click.option(
+        "--scheduler", metavar="local|ADDRESS",
+        help="Let Dask's workers go through the blocks: of this machine, or of the scheduler at "
+        "ADDRESS (tcp://...). Needs the extra cluster.",
+    ),
+    shard=click.option(
+        "--shard", metavar="I/N", callback=_shard,
+        help="Part I of N of a job array: -o is a folder of blocks then, for 'vvgt merge'.",
+    ),
+    level=click.option(
+        "--level", metavar="full|N", callback=_level,
+        help="Of an OME-Zarr image in blocks, 0 the finest. Default: the coarsest that --size cannot tell from it.",
+    ),
+)  # fmt: skip
+
+
+def chosen(blocks: dict[str, Any], request: ConvertRequest, console: Console) -> BlockOptions | None:
+    """What the options add up to; None: the volume is read as a whole.
+
+    Raises:
+        DataError, UsageError: options that do not fit, a volume that cannot be opened.
+    """
+    from vvgt_cli.scale.settings import BlockOptions
+    from vvgt_cli.scale.source import beyond_memory
+
+    size = blocks.pop("block_size")
+    given = [value for key, value in blocks.items() if key != "workers"]
+    asked = size is not None or blocks["workers"] > 1 or any(value is not None for value in given)
+    if not asked:
+        if not beyond_memory(request.source):
+            return None
+        console.say("more than the memory holds: in blocks (docs/scale.md)")
+    return BlockOptions(**{**blocks, "size": None if size == "auto" else size})

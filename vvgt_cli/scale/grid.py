@@ -1,0 +1,125 @@
+"""How a volume is cut: blocks that are read, tiles of cells that are kept, coarse grids that are marched through.
+
+A tile is a cube of 64 base cells along each axis, a block a box of whole tiles. What is kept of a tile depends on the
+volume and the base cells alone, so that everything that follows is the same to the byte whatever blocks were read.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+TILE_BITS = 6
+TILE = 1 << TILE_BITS  # base cells along the edge of a tile
+SAMPLES = 4096  # bricks, at most, that the share of visible voxels is estimated from
+SAMPLE = 9  # voxels along their edge
+Triple = tuple[int, int, int]
+
+
+@dataclass(frozen=True)
+class Boxes:
+    """A volume of ``dims`` voxels cut into boxes of ``edge`` voxels, both (x, y, z); numbered x fastest."""
+
+    dims: Triple
+    edge: Triple
+
+    @property
+    def shape(self) -> Triple:
+        """Boxes along each axis."""
+        nx, ny, nz = (-(-n // e) for n, e in zip(self.dims, self.edge, strict=True))
+        return nx, ny, nz
+
+    def __len__(self) -> int:
+        return math.prod(self.shape)
+
+    def at(self, number: int) -> tuple[np.ndarray, np.ndarray]:
+        """First voxel (3,) of a box, and that behind its last one, int64."""
+        nx, ny, _ = self.shape
+        index = np.array([number % nx, number // nx % ny, number // (nx * ny)], np.int64)
+        lo = index * np.array(self.edge, np.int64)
+        return lo, np.minimum(lo + self.edge, self.dims)
+
+
+@dataclass(frozen=True)
+class CellGrid:
+    """The base cells of a volume and what is made of them.
+
+    Attributes:
+        blocks: that are read, of whole tiles.
+        exponent: a cell's edges are 2^exponent voxels, (x, y, z).
+        half, step: of the volume, as `vvgt_cli.dvr.Scene` has them.
+        points: of quadrature a voxel and axis.
+        march: the cells that visibility is marched through are 2^march times as wide.
+        field: those of the field of opacity, 2^field times.
+    """
+
+    blocks: Boxes
+    exponent: Triple
+    half: tuple[float, float, float]
+    step: tuple[float, float, float]
+    points: int
+    march: int
+    field: int
+
+    @property
+    def dims(self) -> np.ndarray:
+        """Voxels (3,) of the volume."""
+        return np.array(self.blocks.dims, np.int64)
+
+    @property
+    def cell(self) -> np.ndarray:
+        """Edges (3,) of a base cell, voxels."""
+        result: np.ndarray = 2.0 ** np.array(self.exponent)
+        return result
+
+    @property
+    def cell_edge(self) -> np.ndarray:
+        """Edges (3,) of a base cell, unit-frame lengths."""
+        result: np.ndarray = self.cell * np.array(self.step)
+        return result
+
+    @property
+    def tile(self) -> np.ndarray:
+        """Edges (3,) of a tile, voxels."""
+        return np.round(TILE * self.cell).astype(np.int64)
+
+    def tiles(self, number: int) -> np.ndarray:
+        """Numbers (n, 3) int64, (x, y, z), of the tiles in a block."""
+        lo, hi = self.blocks.at(number)
+        first, last = lo // self.tile, -(-hi // self.tile)
+        local = np.argwhere(np.ones((last - first)[::-1]))[:, ::-1]
+        result: np.ndarray = local + first
+        return result
+
+    def coarse_shape(self, wider: int) -> np.ndarray:
+        """Cells (3,) along each axis, x first, of the grid of cells 2^``wider`` times as wide."""
+        return np.ceil(self.dims / (self.cell * 2.0**wider)).astype(np.int64)
+
+
+def sample_spacing(dims: Triple) -> int:
+    """Voxels between two bricks of samples."""
+    spacing = 16
+    while math.prod(-(-n // spacing) for n in dims) > SAMPLES:
+        spacing *= 2
+    return spacing
+
+
+def samples_in(dims: Triple, lo: np.ndarray, hi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """First voxels (n, 3) of the bricks of samples in a box from ``lo`` to ``hi`` (3,), and what each stands for, (n,).
+
+    One lies in the middle of every cube of `sample_spacing` voxels, of which the box holds whole ones; at the volume's
+    end it is moved into what is left of the cube, or there is none.
+    """
+    spacing, axes, weights = sample_spacing(dims), [], []
+    for n, a, b in zip(dims, lo, hi, strict=True):
+        begin = np.arange(a, b, spacing)
+        end = np.minimum(begin + spacing, n)
+        first = np.minimum(begin + (spacing - SAMPLE) // 2, np.maximum(end - min(SAMPLE, n), 0))
+        fits = (first >= begin) | (n <= SAMPLE)
+        axes.append(first[fits])
+        weights.append((end - begin)[fits].astype(np.float64))
+    places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    x, y, z = weights
+    return places, (x[:, None, None] * y[:, None] * z).ravel()

@@ -1,0 +1,133 @@
+"""The folder that blocks are kept in: one file a block and pass, whole or not there."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.files import atomic_write
+
+RUN = "run.json"
+COUNTS, HISTOGRAM, CELLS = "counts", "histogram", "cells"
+PASSES = (COUNTS, HISTOGRAM, CELLS)
+
+
+@dataclass(frozen=True)
+class Parts:
+    """A folder of parts.
+
+    Attributes:
+        folder: it.
+    """
+
+    folder: Path
+
+    def open(self, settings: dict[str, Any], ours: bool) -> bool:
+        """Make the folder, or take up what an earlier run of the same settings left; whether there was one.
+
+        Args:
+            settings: all that the parts depend on, plain values.
+            ours: the folder is this program's own: what another run left is removed.
+
+        Raises:
+            UsageError: the folder holds another run's parts, or something else.
+            DataError: it cannot be written.
+        """
+        text = json.dumps(settings, sort_keys=True, indent=1)
+        place = self.folder / RUN
+        if self.folder.exists() and not (place.is_file() and place.read_text("utf-8") == text):
+            if not ours and any(self.folder.iterdir()) and not place.is_file():
+                raise UsageError(f"{self.folder}: a folder of something else; choose another name")
+            if not ours and place.is_file():
+                raise UsageError(
+                    f"{self.folder}: holds the blocks of another run ({differences(place, settings)}); choose another "
+                    "name, or remove it"
+                )
+            if ours:
+                shutil.rmtree(self.folder, ignore_errors=True)
+        there = place.is_file()
+        try:
+            for name in PASSES:
+                (self.folder / name).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise DataError(f"{self.folder}: cannot be made ({error.strerror or error})") from error
+        if not there:
+            with atomic_write(place, overwrite=True) as temporary:
+                temporary.write_text(text, "utf-8")
+        return there
+
+    def kept_edge(self, settings: dict[str, Any]) -> int | None:
+        """Size of the blocks that an earlier run of the same settings has left, None where there was none."""
+        try:
+            found = dict(self.settings())
+        except UsageError:
+            return None
+        edge = found.pop("blocks", None)
+        return edge if found == json.loads(json.dumps(settings)) else None
+
+    def settings(self) -> dict[str, Any]:
+        """As `open` was given them.
+
+        Raises:
+            UsageError: not a folder of parts.
+        """
+        try:
+            found = json.loads((self.folder / RUN).read_text("utf-8"))
+        except (OSError, ValueError):
+            raise UsageError(
+                f"{self.folder}: not a folder of blocks; expected what 'vvgt init --shard' wrote"
+            ) from None
+        return dict(found)
+
+    def path(self, kind: str, number: int, suffix: str = ".npz") -> Path:
+        """Of a part."""
+        return self.folder / kind / f"{number:06d}{suffix}"
+
+    def missing(self, kind: str, numbers: Iterable[int]) -> list[int]:
+        """Those of ``numbers`` that are not there."""
+        return [number for number in numbers if not self.path(kind, number).is_file()]
+
+    def save(self, kind: str, number: int, **arrays: np.ndarray) -> None:
+        """Write a part, whole or not at all.
+
+        Raises:
+            DataError: the system refuses (a full disk).
+        """
+        with atomic_write(self.path(kind, number), overwrite=True) as temporary, open(temporary, "wb") as stream:
+            np.savez(stream, allow_pickle=False, **arrays)
+
+    def load(self, kind: str, number: int) -> dict[str, np.ndarray]:
+        """The arrays of a part.
+
+        Raises:
+            DataError: it is not there, or damaged.
+        """
+        path = self.path(kind, number)
+        try:
+            with np.load(path) as found:
+                return {name: found[name] for name in found.files}
+        except FileNotFoundError:
+            raise DataError(f"{path}: block {number} is missing; run the shard that makes it") from None
+        except Exception as error:  # zipfile, zlib and numpy raise what they like
+            raise DataError(f"{path}: damaged ({error}); remove it and run the same command again") from error
+
+    def remove(self) -> None:
+        """The whole folder."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def differences(place: Path, settings: dict[str, Any]) -> str:
+    """Names of the settings in which the run of a file differs."""
+    try:
+        other = json.loads(place.read_text("utf-8"))
+    except ValueError:
+        return "damaged"
+    names = sorted(key for key in {*other, *settings} if other.get(key) != settings.get(key))
+    return "other " + ", ".join(names)

@@ -1,0 +1,89 @@
+"""What the blocks of a run have in common and its file depends on, beside them on disk: enough to merge without the
+volume."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from vvgt_cli.errors import DataError
+from vvgt_cli.files import atomic_write
+from vvgt_cli.gaussians import PlyOptions
+from vvgt_cli.runs.record import plain
+from vvgt_cli.scale.grid import Boxes, CellGrid
+from vvgt_cli.scale.parts import Parts
+from vvgt_cli.volume.types import UnitFrame
+
+PLAN = "plan.json"
+A_GAUSSIAN = 8  # base cells there may be a Gaussian, where the budget is so large that it decides
+
+
+@dataclass(frozen=True)
+class Plan:
+    """See the module.
+
+    Attributes:
+        grid: the cells.
+        budget, size: most Gaussians, and pixels of the screen that they are made for.
+        axes: (9,) row-major world directions of the index axes, as `Volume.direction`.
+        ply: how the file is written.
+        volume, function: as reports show them.
+    """
+
+    grid: CellGrid
+    budget: int
+    size: int
+    axes: tuple[float, ...]
+    ply: PlyOptions
+    volume: dict[str, Any]
+    function: dict[str, Any]
+
+    def save(self, parts: Parts) -> None:
+        """Write it beside the parts."""
+        with atomic_write(parts.folder / PLAN, overwrite=True) as temporary:
+            temporary.write_text(json.dumps(plain(asdict(self)), indent=1), "utf-8")
+
+    @classmethod
+    def load(cls, parts: Parts) -> Plan:
+        """The plan beside parts.
+
+        Raises:
+            DataError: there is none, or it is damaged.
+        """
+        path = parts.folder / PLAN
+        try:
+            found = json.loads(path.read_text("utf-8"))
+            grid, ply = found["grid"], found["ply"]
+            boxes = Boxes(*(tuple(grid["blocks"][key]) for key in ("dims", "edge")))
+            grid = CellGrid(**{**{key: _tupled(value) for key, value in grid.items()}, "blocks": boxes})
+            frame = UnitFrame(**{key: _tupled(value) for key, value in ply["unit_frame"].items()})
+            options = PlyOptions(**{**{key: _tupled(value) for key, value in ply.items()}, "unit_frame": frame})
+            return replace(cls(**{**found, "grid": grid, "ply": options}), axes=tuple(found["axes"]))
+        except FileNotFoundError:
+            raise DataError(
+                f"{path}: is missing: not all shards have counted their blocks; run the same array again"
+            ) from None
+        except (ValueError, KeyError, TypeError) as error:
+            raise DataError(f"{path}: damaged ({error}); remove it and run a shard again") from error
+
+
+def _tupled(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value
+
+
+def finest_level(step: np.ndarray, size: int) -> int:
+    """Level of the cells that a screen of ``size`` px just tells apart; ``step`` (3,) voxel edges, unit frame."""
+    from vvgt_cli.vbm.closed_form import FINEST, MIN_CELL, pixel_width
+
+    return max(FINEST, math.floor(math.log2(MIN_CELL * pixel_width(size) / float(step.min()))))
+
+
+def most_cells(budget: int) -> int:
+    """Base cells that a budget has use for, on disk: as many as in memory, more where there are more Gaussians."""
+    from vvgt_cli.vbm.closed_form import most_cells as in_memory
+
+    return max(in_memory(budget), A_GAUSSIAN * budget)

@@ -1,0 +1,259 @@
+"""`vvgt init` in blocks: count, choose the cells' size, integrate, cut, write."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vvgt_cli.conversion.convert import ply_options
+from vvgt_cli.conversion.request import ConvertRequest
+from vvgt_cli.errors import UsageError
+from vvgt_cli.jit.ahead import BLOCKS
+from vvgt_cli.progress import Console
+from vvgt_cli.runs.outputs import STDOUT, claimed, write_text
+from vvgt_cli.runs.place import remarks
+from vvgt_cli.runs.record import ConversionReport, Run
+from vvgt_cli.runs.source import Source, describe_source, tf_record, volume_record
+from vvgt_cli.scale.grid import sample_spacing
+from vvgt_cli.scale.merge import write_merged
+from vvgt_cli.scale.parts import Parts
+from vvgt_cli.scale.plan import Plan, finest_level, most_cells
+from vvgt_cli.scale.runners import Here, Processes, Runner
+from vvgt_cli.scale.settings import BlockOptions, block_edge, cell_grid, counted_boxes
+from vvgt_cli.scale.source import InBlocks, Samples, needs_histogram, open_in_blocks, resolved
+from vvgt_cli.share import format_of
+
+if TYPE_CHECKING:
+    from vvgt_cli.scale.grid import CellGrid
+    from vvgt_cli.scale.tasks import CellBlocks, CountBlocks
+
+
+class Later(Exception):
+    """Parts of other shards are missing: nothing more can be done now."""
+
+    def __init__(self, what: str, missing: int) -> None:
+        super().__init__(what)
+        self.what, self.missing = what, missing
+
+
+def init_in_blocks(request: ConvertRequest, options: BlockOptions, console: Console | None = None) -> ConversionReport:
+    """Volume to `.ply` by the closed form, of which only blocks are ever in memory.
+
+    With ``options.shard`` the output is a folder of blocks, which `merge` puts together.
+
+    Raises:
+        UsageError, DataError: as `vvgt_cli.conversion.convert.initialise_only`; what blocks cannot do.
+    """
+    _refuse(request, options)
+    run = Run(console or Console(), ConversionReport("init"))
+    if options.shard is not None:
+        assert request.output is not None
+        _shard(run, request, options, Parts(Path(request.output).absolute()))
+        return run.finish()
+    with claimed(request.outputs(), request.inputs(), request.overwrite), _folder(request.output) as parts:
+        _make_parts(run, request, options, parts)
+        write_merged(run, parts, request.output or STDOUT, request.overwrite)
+        run.finish()
+        if request.report:
+            write_text(request.report, run.report.to_json(), request.overwrite)
+        parts.remove()
+    return run.report
+
+
+def merge(folder: str, output: str, overwrite: bool = False, console: Console | None = None) -> ConversionReport:
+    """Make a `.ply` of the blocks that shards have left in a folder.
+
+    Raises:
+        UsageError: not such a folder, or an output that may not be written.
+        DataError: blocks are missing or damaged.
+    """
+    from vvgt_cli.runs.outputs import Output
+
+    run = Run(console or Console(), ConversionReport("merge"))
+    parts = Parts(Path(folder))
+    parts.settings()
+    with claimed([Output("-o", output, (".ply",), splats=True)], [], overwrite):
+        write_merged(run, parts, output, overwrite)
+    return run.finish()
+
+
+def _refuse(request: ConvertRequest, options: BlockOptions) -> None:
+    """What is not done in blocks."""
+    if request.fit.init != "vbm":
+        raise UsageError(f"--init {request.fit.init}: needs the whole volume in memory; in blocks: vbm")
+    light = request.source.light
+    if (any(light.lights) and light.lights != ("none",)) or light.shadows or light.occlusion:
+        raise UsageError("--light: shading needs the whole volume in memory; blocks are lit by nothing")
+    if request.output and options.shard is None and format_of(request.output):
+        raise UsageError(f"-o {request.output}: blocks are written as a .ply; give a name that ends in .ply")
+    if options.shard is not None and options.scheduler is not None:
+        raise UsageError("--shard and --scheduler both share the blocks out; give one of them")
+    if options.shard is not None and (request.output in (None, STDOUT) or request.report):
+        raise UsageError("--shard: -o is a folder of blocks then, there is no --report; 'vvgt merge' makes the .ply")
+
+
+@contextmanager
+def _folder(output: str | None) -> Iterator[Parts]:
+    """Where blocks are kept: beside the output, so that the same command goes on there after it was ended."""
+    if output is None or output == STDOUT:
+        with tempfile.TemporaryDirectory(prefix="vvgt-") as folder:
+            yield Parts(Path(folder) / "blocks")
+        return
+    target = Path(output).absolute()
+    yield Parts(target.with_name(f".{target.name[:80]}.blocks"))
+
+
+def _runner(options: BlockOptions) -> Runner:
+    threads = int(os.environ.get("NUMBA_NUM_THREADS", "1"))
+    if options.scheduler is not None:
+        from vvgt_cli.scale.dask_runner import Dask
+
+        return Dask(options.scheduler, options.workers, threads)
+    return Processes(options.workers, threads) if options.workers > 1 else Here()
+
+
+def _settings(request: ConvertRequest, opened: InBlocks) -> dict[str, Any]:
+    """All that parts depend on."""
+    path = opened.request.path
+    facts = [os.stat(path).st_size, os.stat(path).st_mtime_ns] if os.path.exists(path) else []
+    tf = request.source.tf
+    text = Path(tf).read_text("utf-8", "replace") if isinstance(tf, str) and os.path.isfile(tf) else repr(tf)
+    return {
+        "volume": [path, *facts],
+        "read": {key: value for key, value in asdict(opened.request.read).items() if value is not None},
+        "function": [text, request.source.tf_range, request.source.unit_distance],
+        "gaussians": request.fit.max_gaussians,
+        "size": request.fit.size,
+        "ply": [request.ply.frame, request.up, request.ply.sh_degree, request.ply.comments],
+    }
+
+
+def _shard(run: Run, request: ConvertRequest, options: BlockOptions, parts: Parts) -> None:
+    """Do a shard's share of what can be done now, and say what is left."""
+    try:
+        _make_parts(run, request, options, parts)
+    except Later as later:
+        run.console.say(
+            f"{later.what}: this shard's share is done, {later.missing} blocks are other shards'; run the same array "
+            "again when they are"
+        )
+    else:
+        run.console.say(f"all blocks are there; next: vvgt merge {request.output} -o OUT.ply")
+
+
+def _make_parts(run: Run, request: ConvertRequest, options: BlockOptions, parts: Parts) -> None:
+    """Every block's part, those that are there taken as they are; and the plan of the file.
+
+    Raises:
+        Later: other shards' blocks are missing.
+    """
+    from vvgt_cli.dvr.scene import kernel_type
+    from vvgt_cli.scale.tasks import CountBlocks, Place
+    from vvgt_cli.vbm.closed_form import pixel_width
+
+    with run.stage("open") as stage:
+        opened = open_in_blocks(request.source, options, pixel_width(request.fit.size))
+        volume = opened.volume
+        settings = _settings(request, opened)
+        edge = parts.kept_edge(settings) if options.size is None else None
+        edge = edge or block_edge(volume, options)
+        there = parts.open(settings | {"blocks": edge}, ours=options.shard is None)
+        stage.note = f"{volume.name}: {' x '.join(map(str, volume.dims))} {volume.data.dtype.name}, blocks of {edge}"
+    for line in (opened.told, f"going on with the blocks in {parts.folder}" if there else None):
+        if line:
+            run.console.say(line)
+    run.compile(BLOCKS, kernel_type(volume))
+    runner = _runner(options)
+    place = Place(opened.request.path, opened.request.read, str(parts.folder))
+    counts = CountBlocks(place, counted_boxes(volume, edge, sample_spacing(volume.dims)))
+    _do(run, runner, counts, options, "count")
+    second = None
+    if needs_histogram(request.source) and not _counted(opened):
+        from vvgt_cli.volume.tallies import with_limits
+
+        whole = with_limits(counts.merged()[0], volume)
+        second = replace(counts, limits=(whole.lo, whole.hi))
+        _do(run, runner, second, options, "histogram")
+    source, limits, samples = resolved(opened, counts, second)
+    for line in (describe_source(source), *remarks(source.volume, ply_options(request, source))):
+        run.console.say(line)
+    cells = _cells(request, source, limits, samples, place, edge)
+    _plan(request, source, cells.grid).save(parts)
+    _do(run, runner, cells, options, "integrate")
+
+
+def _counted(opened: InBlocks) -> bool:
+    from vvgt_cli.volume.tallies import counted
+
+    return counted(opened.volume)
+
+
+def _do(run: Run, runner: Runner, task: CountBlocks | CellBlocks, options: BlockOptions, name: str) -> None:
+    """The tasks of a pass that are this run's and not done.
+
+    Raises:
+        Later: others are missing.
+    """
+    parts, everything = task.place.parts, range(len(task))
+    index, count = options.shard or (1, 1)
+    own = parts.missing(task.kind, (n for n in everything if n % count == index - 1))
+    with run.stage(name) as stage:
+        runner.run(task, own, run.console.bar(name))
+        stage.note = f"{len(own)} of {len(task)} blocks" + (f", {runner.workers} workers" if runner.workers > 1 else "")
+    missing = parts.missing(task.kind, everything)
+    if missing:
+        raise Later(name, len(missing))
+
+
+def _plan(request: ConvertRequest, source: Source, grid: CellGrid) -> Plan:
+    """What merging needs to know."""
+    return Plan(
+        grid, request.fit.max_gaussians, request.fit.size, source.volume.direction, ply_options(request, source),
+        volume_record(source), tf_record(source, request.source),
+    )  # fmt: skip
+
+
+def _cells(
+    request: ConvertRequest, source: Source, limits: tuple[float, float], samples: Samples, place: Any, edge: int
+) -> CellBlocks:
+    """The pass that integrates, with the cells' size from the samples."""
+    from vvgt_cli.cameras import default_views
+    from vvgt_cli.dvr.scene import kernel_rule
+    from vvgt_cli.scale.tasks import CellBlocks
+    from vvgt_cli.transfer.tables import build_tables
+    from vvgt_cli.vbm.closed_form import MARCH_SIZE, visible_share
+    from vvgt_cli.vbm.visibility import widening
+
+    if source.lighting is not None:
+        raise UsageError(f"{source.tf.name}: is shaded, which needs the whole volume in memory; add --light none")
+    volume, frame = source.volume, source.volume.unit_frame()
+    rule = kernel_rule(volume, lambda: limits)
+    tables = build_tables(
+        source.tf, (source.statistics.lo, source.statistics.hi), slope=rule.slope, intercept=rule.intercept,
+        unit_distance=source.unit_distance, world_per_unit=1 / frame.scale,
+    )  # fmt: skip
+    visible = sum(w * visible_share(tables, rule.apply(brick)) for brick, w in zip(*samples, strict=True))
+    exponent = _exponent(request, np.array(frame.step), visible * volume.data.size / samples[1].sum())
+    march = widening(
+        np.array(volume.dims), exponent, np.array(frame.step), default_views("train", size=MARCH_SIZE)
+    )  # fmt: skip
+    return CellBlocks(place, cell_grid(volume, exponent, edge, march), rule, tables)
+
+
+def _exponent(request: ConvertRequest, step: np.ndarray, voxels: float) -> np.ndarray:
+    """Exponents (3,) of the base cells: no finer than the screen tells, and than budget and disk have use for."""
+    from vvgt_cli.scale.grid import TILE
+    from vvgt_cli.vbm.closed_form import level_within
+    from vvgt_cli.vbm.moments import blocks, exponents
+
+    level = level_within(step, voxels, most_cells(request.fit.max_gaussians), finest_level(step, request.fit.size))
+    while blocks(exponents(step, level))[1].max() > TILE:  # of voxels so thin that a block of them is many cells
+        level += 1
+    return exponents(step, level)

@@ -1,0 +1,86 @@
+"""Who does the tasks: this process, processes of this machine, or a Dask cluster."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+from vvgt_cli.errors import DataError
+
+Progress = Callable[[int, int], None]
+IDLE = 3  # pools that broke one after the other without a block done: it is not chance
+
+
+class Task(Protocol):
+    """Does one block and leaves its part."""
+
+    def __call__(self, number: int) -> None: ...
+
+
+class Runner(Protocol):
+    """Does tasks, each at least once; ``workers`` are at work at once."""
+
+    @property
+    def workers(self) -> int: ...
+
+    def run(self, task: Task, numbers: Sequence[int], progress: Progress | None) -> None: ...
+
+
+class Here:
+    """One block after the other, in this process."""
+
+    workers = 1
+
+    def run(self, task: Task, numbers: Sequence[int], progress: Progress | None) -> None:
+        """Do the tasks in the order of ``numbers``."""
+        for done, number in enumerate(numbers, 1):
+            task(number)
+            if progress:
+                progress(done, len(numbers))
+
+
+def _begin(threads: int) -> None:
+    """Before a process imports its kernels: how many threads they have."""
+    os.environ["NUMBA_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = str(threads)
+
+
+class Processes:
+    """Processes of this machine, started afresh; what a killed one had begun is begun anew."""
+
+    def __init__(self, workers: int, threads: int) -> None:
+        """Of ``threads`` in all."""
+        self.workers, self.threads = workers, max(threads // workers, 1)
+
+    def run(self, task: Task, numbers: Sequence[int], progress: Progress | None) -> None:
+        """Do the tasks.
+
+        Raises:
+            DataError: processes end again and again without a block done.
+        """
+        import multiprocessing
+        from concurrent.futures import ProcessPoolExecutor, as_completed
+        from concurrent.futures.process import BrokenProcessPool
+
+        left, idle = list(numbers), 0
+        while left:
+            before = len(left)
+            context = multiprocessing.get_context("spawn")
+            with ProcessPoolExecutor(self.workers, context, _begin, (self.threads,)) as pool:
+                waiting = {pool.submit(task, number): number for number in left}
+                try:
+                    for future in as_completed(waiting):
+                        future.result()
+                        left.remove(waiting[future])
+                        if progress:
+                            progress(len(numbers) - len(left), len(numbers))
+                except BrokenProcessPool:
+                    idle = idle + 1 if len(left) == before else 0
+                except BaseException:
+                    pool.shutdown(wait=False, cancel_futures=True)
+                    raise
+            if idle >= IDLE:
+                raise DataError(
+                    f"worker processes were ended {IDLE} times without a block done (out of memory?); try --blocks "
+                    "with a smaller size, fewer --workers, or more --memory"
+                )

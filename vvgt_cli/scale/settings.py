@@ -1,0 +1,103 @@
+"""What is asked of a run in blocks, and the sizes that follow from the memory."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from vvgt_cli.errors import UsageError
+from vvgt_cli.resources import free_memory
+from vvgt_cli.scale.grid import TILE, Boxes, CellGrid, Triple
+from vvgt_cli.volume import Volume
+from vvgt_cli.volume.stored import Stored
+
+LARGEST, SMALLEST = 512, 16  # voxels along the edge of a block
+SHARED = 256  # of a shard, whatever the memory of its node: all shards must agree
+MAX_FIELD = 1 << 24  # cells of the field of opacity
+A_BLOCK = 0.3  # of the memory of a worker: what its voxels may take; as much again where they are converted
+COUNTED = 3  # bytes a voxel of counting: a copy, and the bins
+ALWAYS = 400 << 20  # bytes: coarse grids, a tile's tree, a batch of Gaussians
+MOST_WIDER = 6  # powers of two that a coarse cell is wider than a base cell: a tile
+
+
+@dataclass(frozen=True)
+class BlockOptions:
+    """How a volume is gone through.
+
+    Attributes:
+        size: voxels along the edge of a block, None: by the memory.
+        workers: processes.
+        scheduler: "local" or the address of a Dask scheduler; None: without Dask.
+        shard: part (from 1) and count of a job array, None for the whole.
+        level: of a file of several resolutions: a number, "full", or None: the one that matches the screen.
+    """
+
+    size: int | None = None
+    workers: int = 1
+    scheduler: str | None = None
+    shard: tuple[int, int] | None = None
+    level: int | str | None = None
+
+    def __post_init__(self) -> None:
+        if self.size is not None and (self.size < SMALLEST or self.size & (self.size - 1)):
+            raise UsageError(f"--blocks {self.size}: expected auto, or a power of two from {SMALLEST} on")
+
+
+def block_edge(volume: Volume, options: BlockOptions) -> int:
+    """Voxels along the edge of a block (of rows of which the file is mapped: across them).
+
+    Raises:
+        UsageError: not even the smallest fits the memory.
+    """
+    free = free_memory()
+    if options.size is not None or free is None or options.shard is not None:
+        return options.size or SHARED
+    room = A_BLOCK * max(free - ALWAYS, 0) / max(options.workers if options.scheduler is None else 1, 1)
+    edge = LARGEST
+    while edge > SMALLEST and block_bytes(volume, edge) > room:
+        edge //= 2
+    if block_bytes(volume, edge) > max(free - ALWAYS, 0):
+        need = block_bytes(volume, edge) + ALWAYS
+        raise UsageError(
+            f"blocks of {edge} voxels and the coarse grids need about {need >> 20} MiB of memory, {free >> 20} MiB are "
+            f"free; give the job {(need - free >> 20) + 1} MiB more"
+        )
+    return edge
+
+
+def block_bytes(volume: Volume, edge: int) -> int:
+    """Bytes that a block takes while it is integrated."""
+    sizes = [min(e + 2, n) for e, n in zip(shape_of(volume, edge), volume.dims, strict=True)]
+    one = volume.data.dtype.itemsize
+    return math.prod(sizes) * (one + (4 if one > 2 and volume.data.dtype != np.float32 else COUNTED))
+
+
+def shape_of(volume: Volume, edge: int) -> Triple:
+    """Voxels (x, y, z) along a block: rows of a mapped file are read whole, as they lie together."""
+    if isinstance(volume.data, Stored):
+        return edge, edge, edge
+    across = 1 << max(math.ceil(math.log2(max(volume.dims[0], 2))), 4)
+    return max(across, edge), edge, edge
+
+
+def counted_boxes(volume: Volume, edge: int, spacing: int) -> Boxes:
+    """The boxes in which values are counted: of whole steps of the lattice of samples."""
+    x, y, z = (max(e, spacing) for e in shape_of(volume, edge))
+    return Boxes(volume.dims, (x, y, z))
+
+
+def cell_grid(volume: Volume, exponent: np.ndarray, edge: int, march: int) -> CellGrid:
+    """The grid of base cells of 2^``exponent`` (3,) voxels, in blocks of about ``edge`` voxels and whole tiles."""
+    frame = volume.unit_frame()
+    tile = np.round(TILE * 2.0**exponent).astype(np.int64)
+    wanted = np.array(shape_of(volume, edge))
+    x, y, z = (int(t * max(round(w / t), 1)) for t, w in zip(tile, wanted, strict=True))
+    step = np.array(frame.step)
+    from vvgt_cli.vbm.inset import averaged_down
+
+    field = averaged_down(2.0**exponent * step, np.array(frame.half), MAX_FIELD)
+    i, j, k = (int(e) for e in exponent)
+    points = 1 if min(i, j, k) >= 1 else 2
+    return CellGrid(Boxes(volume.dims, (x, y, z)), (i, j, k), frame.half, frame.step, points, march, field)

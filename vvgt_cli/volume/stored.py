@@ -1,0 +1,121 @@
+"""`Stored`: a (nz, ny, nx) array that stays in its file and is read block by block (Zarr, HDF5).
+
+It stands where a `Volume` has its array, and gives parts of it to whoever asks for them by three slices.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import mmap
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from vvgt_cli.errors import DataError, VvgtError
+from vvgt_cli.volume.bricks import BrickArray
+from vvgt_cli.volume.packed import Packed
+from vvgt_cli.volume.types import Volume
+
+Slices = tuple[slice, ...]
+
+
+class Stored:
+    """See the module.
+
+    Attributes:
+        shape: (nz, ny, nx).
+        dtype: of the values.
+        chunks: (z, y, x) voxels of what the file packs together.
+    """
+
+    ndim = 3
+
+    def __init__(
+        self,
+        read: Callable[[Slices], np.ndarray],
+        dtype: np.dtype,
+        shape: tuple[int, ...],
+        chunks: Sequence[int],
+        source: str,
+    ) -> None:
+        """Take what reads the block of three slices with start, stop and step 1, (z, y, x); ``source`` is its name."""
+        self._read, self.dtype, self.shape, self.source = read, np.dtype(dtype), tuple(map(int, shape)), source
+        self.chunks = tuple(max(min(int(c), n), 1) for c, n in zip(chunks, self.shape, strict=True))
+        self.size = math.prod(self.shape)
+        self.nbytes = self.size * self.dtype.itemsize
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, key: Any) -> np.ndarray:
+        """The block of one to three slices.
+
+        Raises:
+            DataError: a chunk that cannot be read, with its index.
+        """
+        keys = key if isinstance(key, tuple) else (key,)
+        whole = [*keys, *[slice(None)] * (3 - len(keys))]
+        slices = tuple(slice(*k.indices(n)) for k, n in zip(whole, self.shape, strict=True))
+        try:
+            return self._read(slices)
+        except VvgtError:
+            raise
+        except Exception as error:  # whatever codecs raise
+            raise self._damaged(slices, error) from error
+
+    def _damaged(self, slices: Slices, error: Exception) -> DataError:
+        """The error of the first chunk in the block that cannot be read."""
+        spans = [range(s.start // c, -(-s.stop // c)) for s, c in zip(slices, self.chunks, strict=True)]
+        for index in itertools.product(*spans):
+            part = tuple(
+                slice(max(i * c, s.start), min((i + 1) * c, s.stop), 1)
+                for i, c, s in zip(index, self.chunks, slices, strict=True)
+            )
+            try:
+                self._read(part)
+            except Exception as found:
+                text = " ".join(str(found).split()) or type(found).__name__
+                return DataError(
+                    f"{self.source}: chunk {index} (z, y, x) is damaged ({text}); fetch it again, or remove it for the "
+                    "format's fill value"
+                )
+        return DataError(f"{self.source}: cannot be read ({error}); try again")
+
+
+def readable_in_blocks(volume: Volume) -> bool:
+    """Whether parts of a volume's array can be had without the rest: mapped, `Stored`, bricks, or in memory."""
+    return not isinstance(volume.data, Packed)
+
+
+def lies_in_file(volume: Volume) -> bool:
+    """Whether a volume's values lie in a file, mapped or `Stored`."""
+    return isinstance(volume.data, Stored) or _map_under(volume.data) is not None
+
+
+def read_block(volume: Volume, lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
+    """The stored values of voxels ``lo`` to ``hi`` (3,) int, x first, the latter not in it: (z, y, x), native.
+
+    A copy; pages of a mapped file that it came from are given back to the system.
+
+    Raises:
+        DataError: the file ends early, or a chunk is damaged.
+    """
+    (x0, y0, z0), (x1, y1, z1) = lo, hi
+    data: Any = volume.data
+    part = data[z0:z1][:, y0:y1, x0:x1] if isinstance(data, BrickArray) else data[z0:z1, y0:y1, x0:x1]
+    out = np.array(part, part.dtype.newbyteorder("="), order="C", copy=True)
+    under = _map_under(data)
+    if under is not None and hasattr(mmap, "MADV_DONTNEED"):
+        under.madvise(mmap.MADV_DONTNEED)
+    return out
+
+
+def _map_under(data: Any) -> mmap.mmap | None:
+    """The map that an array is a view of, None where it is of none that is only read."""
+    while data is not None and not isinstance(data, mmap.mmap):
+        if isinstance(data, np.memmap) and data.mode != "r":
+            return None
+        data = getattr(data, "base", None) if isinstance(data, np.ndarray) else None
+    return data

@@ -1,0 +1,114 @@
+"""`Statistics` of a volume that is never there as a whole: counted block by block, in any order, and added up.
+
+Everything that is added is whole numbers and extremes, so that the figures are those of `stats.statistics`, to the bit,
+however the volume is cut.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from vvgt_cli.errors import DataError
+from vvgt_cli.volume.stats import BINS, Statistics, bins_of, check_range, edges_of, finite_values, integer_statistics
+from vvgt_cli.volume.types import Volume
+
+PARTS = 4  # of a block, counted at once
+
+
+@dataclass(frozen=True)
+class Tally:
+    """What is counted of some blocks.
+
+    Attributes:
+        counts: (256 or 65536,) of every stored value of an 8- or 16-bit type (as its bytes, unsigned), (0,) of others.
+        lo, hi: least and greatest finite data value, of other types.
+        stored: least and greatest finite stored value.
+        nan, finite: voxels that are NaN, and those that are finite.
+        histogram: (256,) finite values over the range, once that is known; (0,) before.
+    """
+
+    counts: np.ndarray
+    lo: float = np.inf
+    hi: float = -np.inf
+    stored: tuple[float, float] = (np.inf, -np.inf)
+    nan: int = 0
+    finite: int = 0
+    histogram: np.ndarray = field(default_factory=lambda: np.empty(0, np.int64))
+
+    def plus(self, other: Tally) -> Tally:
+        """Of both."""
+        return Tally(
+            self.counts + other.counts,
+            min(self.lo, other.lo),
+            max(self.hi, other.hi),
+            (min(self.stored[0], other.stored[0]), max(self.stored[1], other.stored[1])),
+            self.nan + other.nan,
+            self.finite + other.finite,
+            self.histogram + other.histogram,
+        )
+
+
+def counted(volume: Volume) -> bool:
+    """Whether every value of the volume's type is counted, so that no second pass is needed for a histogram."""
+    return volume.data.dtype.kind in "iub" and volume.data.dtype.itemsize <= 2
+
+
+def tally(values: np.ndarray, volume: Volume, limits: tuple[float, float] | None = None) -> Tally:
+    """Of a block of stored values (z, y, x), native, C-contiguous; with ``limits`` (data values) its histogram alone.
+
+    The block is made read-only.
+    """
+    if counted(volume):
+        from vvgt_cli.volume.count_kernel import LANES, count_values
+
+        found = np.zeros((PARTS, LANES, 256**values.dtype.itemsize), np.int64)
+        values.flags.writeable = False  # kernels are compiled for such
+        count_values(values.view(f"u{values.dtype.itemsize}"), found)
+        return Tally(found.sum(axis=(0, 1)))
+    numbers = finite_values(values, volume)
+    none = np.empty(0, np.int64)
+    if limits is not None:
+        edges = edges_of(*limits)
+        return Tally(none, histogram=np.bincount(bins_of(numbers, float(edges[0]), float(edges[-1])), minlength=BINS))
+    nan = int(np.isnan(values).sum()) if numbers.size < values.size else 0
+    if not numbers.size:
+        return Tally(none, nan=nan)
+    flat = values[np.isfinite(values)] if values.dtype.kind == "f" and numbers.size < values.size else values
+    stored = float(flat.min()), float(flat.max())
+    return Tally(none, float(numbers.min()), float(numbers.max()), stored, nan, numbers.size)
+
+
+def with_limits(whole: Tally, volume: Volume) -> Tally:
+    """The sum over all blocks, checked.
+
+    Raises:
+        DataError: no voxel has a finite value, or the scaling makes values infinite.
+    """
+    if counted(volume):
+        numbers = integer_statistics(whole.counts, volume)
+        ends = (numbers.lo - volume.intercept) / volume.slope, (numbers.hi - volume.intercept) / volume.slope
+        return replace(whole, lo=numbers.lo, hi=numbers.hi, stored=(min(ends), max(ends)), finite=volume.data.size)
+    if not whole.finite:
+        inf = volume.data.size - whole.nan
+        raise DataError(
+            f"{volume.name}: none of its {volume.data.size} voxels is finite ({whole.nan} NaN, {inf} infinite); check "
+            "the type and byte order (--dtype, --byte-order)"
+        )
+    check_range(whole.lo, whole.hi, volume)
+    return whole
+
+
+def statistics_of(whole: Tally, volume: Volume, histogram: np.ndarray | None = None) -> Statistics:
+    """The statistics that `with_limits` of all blocks, and the histogram of a second pass over them, amount to.
+
+    Without ``histogram`` (a function is given, in data values) all values count in the lowest bin.
+    """
+    if counted(volume):
+        return integer_statistics(whole.counts, volume)
+    if histogram is None:
+        histogram = np.zeros(BINS, np.int64)
+        histogram[0] = whole.finite
+    infinite = volume.data.size - whole.finite - whole.nan
+    return Statistics(whole.lo, whole.hi, whole.nan, infinite, histogram, edges_of(whole.lo, whole.hi))
