@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from vvgt_cli.dvr.runs import NEAR
 from vvgt_cli.dvr.scene import BRICK
 from vvgt_cli.errors import UsageError
 from vvgt_cli.transfer.colormap import ColorMap
+from vvgt_cli.transfer.lighting import Lighting
 from vvgt_cli.transfer.opacity import PiecewiseOpacity
 from vvgt_cli.transfer.tables import extinction
 from vvgt_cli.volume import Volume
@@ -234,6 +236,22 @@ def test_leaping_over_empty_space_changes_nothing():
         c = camera(32, 32, eye)
         leaping = render_view(scene, c, ONE_RAY)
         np.testing.assert_allclose(leaping, render_view(full, c, ONE_RAY), atol=1e-6)
+
+
+@pytest.mark.parametrize("light", [None, Lighting()])
+def test_the_segment_before_a_leap_is_seen(light):
+    """Also where a run of samples ends as the ray leaves the last visible brick."""
+    data = np.zeros((40, 40, 40))
+    data[8:32, 8:32, 8:32] = field((24, 24, 24), 3)
+    scene = Scene.build(Volume(data), Function([0, 0.01, 0.02, 1], [0, 0, 0.03, 0.03]), 1.0)
+    scene = scene if light is None else scene.lit(light)
+    full = replace(scene, empty=np.zeros_like(scene.empty))
+    assert scene.empty.max() > 0
+    settings = RenderSettings(step=1.0, samples=1)
+    for eye in ((2.2, -1.6, 1.1), (3, 0.2, 0.1), (0.3, -0.4, 3)):
+        c = camera(96, 96, eye)
+        leaping = render_view(scene, c, settings)
+        np.testing.assert_allclose(leaping, render_view(full, c, settings), atol=1e-5)
 
 
 def corner_of_bricks():

@@ -240,10 +240,11 @@ def cast(
     u0 = -1.0  # -1: no sample there, or not finite
     i = 0
     while True:
-        start = skip(voxels.values.shape, empty, px, py, pz, dx, dy, dz, ix, iy, iz, t0, dt, per_step, count, i)
+        at = i - 1 if u0 >= 0.0 else i  # the segment that comes from there is still to be seen
+        start = skip(voxels.values.shape, empty, px, py, pz, dx, dy, dz, ix, iy, iz, t0, dt, per_step, count, at)
         if start > count:
             return lane(seen, 0), lane(seen, 1), lane(seen, 2), 1.0 - trans
-        if start > i:
+        if start > at:
             u0, i = -1.0, start
         t = t0 + i * dt
         sample_run(voxels, px + t * dx, py + t * dy, pz + t * dz, dx * dt, dy * dt, dz * dt, optics, run)
