@@ -227,6 +227,8 @@ def test_what_blocks_cannot_do_is_a_line(vvgt, raw, tmp_path):
         (("--blocks", "48"), "power of two"),
         (("--blocks", "auto", "--init", "wavelet"), "whole volume in memory"),
         (("--blocks", "auto", "--light", "headlight"), "lit by nothing"),
+        (("--blocks", "auto", "--labels", "auto"), "not in blocks"),
+        (("--blocks", "auto", "--layer", str(raw)), "not in blocks"),
         (("--shard", "1/2", "--report", "r.json"), "vvgt merge"),
         (("--shard", "3/2"), "I from 1 to N"),
     ):
@@ -239,3 +241,12 @@ def test_what_blocks_cannot_do_is_a_line(vvgt, raw, tmp_path):
     packed.write_bytes(gzip.compress(raw.read_bytes()))
     assert vvgt("init", packed, "-o", tmp_path / "c.ply", *FIT, "--blocks", "auto").code == 0  # small: unpacked
     assert vvgt("merge", tmp_path, "-o", tmp_path / "d.ply").code == 2
+
+
+def test_a_label_map_by_name_is_not_taken_for_scalars_in_blocks(vvgt, raw, tmp_path):
+    named = tmp_path / f"head_labels_{raw.name.split('_', 1)[1]}"
+    named.write_bytes(raw.read_bytes())
+    run = vvgt("init", named, "-o", tmp_path / "a.ply", *FIT, "--blocks", "32")
+    assert run.code == 2
+    assert "label map" in run.err
+    assert vvgt("init", named, "-o", tmp_path / "a.ply", *FIT, "--blocks", "32", "--labels", "none").code == 0

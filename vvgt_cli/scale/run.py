@@ -17,6 +17,7 @@ from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import UsageError
 from vvgt_cli.jit.ahead import BLOCKS
 from vvgt_cli.progress import Console
+from vvgt_cli.runs.layered import ALL, COLOR, NONE
 from vvgt_cli.runs.outputs import STDOUT, claimed, write_text
 from vvgt_cli.runs.place import remarks
 from vvgt_cli.runs.record import ConversionReport, Run
@@ -91,6 +92,9 @@ def _refuse(request: ConvertRequest, options: BlockOptions) -> None:
     light = request.source.light
     if (any(light.lights) and light.lights != ("none",)) or light.shadows or light.occlusion:
         raise UsageError("--light: shading needs the whole volume in memory; blocks are lit by nothing")
+    source = request.source
+    if source.labels not in (None, NONE) or source.layers or source.read.component in (COLOR, ALL):
+        raise UsageError("labels, layers, colours and channels together need the whole volume in memory; not in blocks")
     if request.output and options.shard is None and format_of(request.output):
         raise UsageError(f"-o {request.output}: blocks are written as a .ply; give a name that ends in .ply")
     if options.shard is not None and options.scheduler is not None:

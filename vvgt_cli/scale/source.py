@@ -113,14 +113,19 @@ def resolved(
     Raises:
         DataError, UsageError: as `vvgt_cli.runs.source.load`.
     """
+    from vvgt_cli.runs.layered import NONE
     from vvgt_cli.runs.source import Opened, load
+    from vvgt_cli.volume.label_maps import NAMED
     from vvgt_cli.volume.tallies import statistics_of, with_limits
 
     volume = opened.volume
     whole, samples, weights = counts.merged()
     whole = with_limits(whole, volume)
     numbers = statistics_of(whole, volume, second.merged()[0].histogram if second else None)
-    source = load(replace(opened.request, volume=Opened(volume, numbers)))
+    request = opened.request
+    if request.tf is None and request.labels is None and volume.data.dtype.kind in "iu" and NAMED.search(volume.name):
+        raise UsageError(f"{volume.name}: named as a label map, which blocks are not: give --tf, or --labels none")
+    source = load(replace(request, volume=Opened(volume, numbers), labels=NONE))
     return source, whole.stored, (samples, weights)
 
 
