@@ -71,7 +71,7 @@ def classified(volume: Volume, tf: object, finer: int = 1) -> Scene:
 @pytest.mark.parametrize("lighting", [None, LIT], ids=["unlit", "lit"])
 def test_pictures_are_the_twins(top: float, lighting: Lighting | None) -> None:
     scene = grid_scene(random_grid(top=top), (1.0, 1.3, 0.7), lighting)
-    view = camera(24, 24)
+    view = camera(24, 24) if top < 10 else camera(12, 12)  # the twin takes eight times as many steps then
     ours, twin = render_view(scene, view, FINE), render_view_reference(scene, view, step=1 / (256 if top > 10 else 32))
     assert twin.max() > min(top / 1e3, 0.9)
     stiff = lighting is not None and top > 10  # shading is constant along a segment

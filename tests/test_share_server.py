@@ -200,7 +200,7 @@ def test_a_volume_is_converted_and_shown(tmp_path):
     [
         (["nothing.ply"], 1, "nothing.ply"),
         (["nothing_*.ply"], 2, "no such files"),
-        (["a.ply", "--tf", "viridis"], 2, "--tf and options of reading are of volumes"),
+        (["a.ply", "--tf", "viridis"], 2, "and options of reading are of volumes"),
         (["a.ply", "--tf-range", "rescale"], 2, "are of volumes"),
         (["a.ply", "--spacing", "1", "1", "1"], 2, "are of volumes"),
         (["a.ply", "example:blob:8"], 2, "expected all to hold Gaussians"),
