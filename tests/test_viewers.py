@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from vvgt_cli.cameras import Camera, default_views, look_at
 from vvgt_cli.cli.main import run
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
 from vvgt_cli.metrics import psnr
+from vvgt_cli.share import encoded, format_of
 from vvgt_cli.splat import render
 from vvgt_cli.splat.reference import project
 
@@ -230,3 +232,15 @@ def blended(gaussians: Gaussians, camera: Camera, viewer: str, row: int, column:
         out = out * (1 - alpha[..., None]) + alpha[..., None] * np.clip(gaussians.colors[k], 0, 1)
         out = np.round(out * levels) / levels if levels else out
     return out
+
+
+@pytest.mark.parametrize("ending", [".spz", ".sog"])
+def test_spark_reads_what_another_program_wrote(ending: str, body: Shown, tmp_path: Path) -> None:
+    """Spark decodes by itself: neither with gsply, which writes .spz for us, nor splat-transform, which writes .sog."""
+    if ending == ".sog" and shutil.which("splat-transform") is None:
+        pytest.skip("splat-transform is not on the path (npm install -g @playcanvas/splat-transform@3.7.0)")
+    path = tmp_path / f"body{ending}"
+    path.write_bytes(encoded(format_of(path), read_ply(body.file)[0], PlyOptions(), path.name))
+    plain, packed = (shoot("spark", file, [body.camera], SIZE, tmp_path)[0] for file in (body.file, path))
+    print(f"{ending}: {psnr(plain, packed):.2f} dB from the .ply in Spark")
+    assert psnr(plain, packed) > 35

@@ -1,5 +1,5 @@
-// shots.mjs JOBS.json MODULES: pictures of .ply files as web viewers draw them, in headless Chromium.
-// JOBS: {"browser": path, "jobs": [{"viewer": page, "file": .ply, "size": px, "options": query or nothing,
+// shots.mjs JOBS.json MODULES: pictures of files as web viewers draw them, in headless Chromium.
+// JOBS: {"browser": path, "jobs": [{"viewer": page, "file": path, "size": px, "options": query or nothing,
 //   "cameras": [{"rotation", "translation", "fov": degrees} or null for (0, 0, 3) in the viewer's axes, y up], "out": [.png]}]}
 import fs from 'node:fs';
 import http from 'node:http';
@@ -15,9 +15,9 @@ const TYPES = {
   '.html': 'text/html', '.js': 'text/javascript', '.mjs': 'text/javascript', '.wasm': 'application/wasm', '.css': 'text/css',
 };
 
-// pages at /, packages at /node_modules/, the files of the jobs at /file/<job>.ply, and nothing else
+// pages at /, packages at /node_modules/, the files of the jobs at /file/<job> with their endings, and nothing else
 function located(url) {
-  const file = /^\/file\/(\d+)\.ply$/.exec(url);
+  const file = /^\/file\/(\d+)\.\w+$/.exec(url);
   if (file) return jobs[Number(file[1])]?.file;
   const [root, rest] = url.startsWith('/node_modules/') ? [path.join(modules, 'node_modules'), url.slice(13)] : [pages, url];
   const found = path.join(root, path.normalize(rest));
@@ -43,7 +43,7 @@ for (const [index, job] of jobs.entries()) {
     page.on('pageerror', (error) => fail(new Error(`${job.viewer}: ${error.message}`)));
   });
   page.on('console', (message) => { if (message.type() === 'error') console.error(`${job.viewer}: ${message.text()}`); });
-  const query = `file=/file/${index}.ply&size=${job.size}&${job.options ?? ''}`;
+  const query = `file=/file/${index}${path.extname(job.file)}&size=${job.size}&${job.options ?? ''}`;
   await page.goto(`http://127.0.0.1:${server.address().port}/${job.viewer}.html?${query}`);
   await Promise.race([broken, page.waitForFunction('window.show !== undefined')]);
   for (const [view, camera] of job.cameras.entries()) {
