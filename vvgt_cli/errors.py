@@ -18,6 +18,16 @@ class DataError(VvgtError):
     exit_code = 1
 
 
+class NothingVisible(DataError):
+    """A function that shows nothing of a volume, from any view."""
+
+    def __init__(self, volume: str, function: str) -> None:
+        super().__init__(
+            f"{volume} under {function}: nothing visible from any view; expected opacity above 0 where the data are "
+            "(try 'vvgt tf show TF -o tf.png --volume VOLUME')"
+        )
+
+
 class UsageError(VvgtError):
     """The call itself is wrong: options that contradict, a name that does not exist (exit status 2)."""
 

@@ -14,7 +14,7 @@ import numpy as np
 from vvgt_cli.batches.functions import named
 from vvgt_cli.conversion.convert import convert
 from vvgt_cli.conversion.request import ConvertRequest
-from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.errors import NothingVisible, UsageError
 from vvgt_cli.progress import Console
 from vvgt_cli.runs.layered import AUTO, NONE, layers_of, open_parts
 from vvgt_cli.runs.outputs import Output, check_outputs, write_text
@@ -62,9 +62,7 @@ def convert_labels(request: ConvertRequest, console: Console | None = None) -> d
         console.say(f"label {label.number}, {label.name}: to {one.output}")
         try:
             report = convert(one, console)
-        except DataError as error:
-            if "nothing visible" not in str(error):
-                raise
+        except NothingVisible as error:
             console.say(f"{error}; it gets no file")
             continue
         rows.append(_row(label, one, report))

@@ -18,7 +18,7 @@ from vvgt_cli.cameras import Camera, default_views, orbit_views
 from vvgt_cli.cameras.boxed import drawn_in_box
 from vvgt_cli.cameras.files import read_frames
 from vvgt_cli.cameras.sets import FIELD_OF_VIEW, RADIUS, SET_VIEWS, SIZE
-from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.errors import DataError, NothingVisible, UsageError
 from vvgt_cli.files import atomic_write, claim
 from vvgt_cli.images import write_png
 from vvgt_cli.jit.ahead import VIEWS
@@ -281,7 +281,7 @@ def _points(run: Run, scene: Scene, views: list[View]) -> tuple[np.ndarray, np.n
     with run.stage("points") as stage:
         points, colors = start_points(scene, views[0].camera.height)
         if not len(points):
-            raise DataError(f"{scene.volume.name} under {scene.tf.name}: nothing visible from any view")
+            raise NothingVisible(scene.volume.name, scene.tf.name)
         stage.note = f"{len(points)} points to start from"
     return points, colors
 

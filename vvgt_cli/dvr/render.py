@@ -127,12 +127,16 @@ def _thinner_than_a_pixel(scene: Scene, camera: Camera) -> bool:
 
 def _rays(scene: Scene) -> Callable[..., None]:
     """The kernel of a scene's kind, with what it reads of it."""
-    from vvgt_cli.dvr import grid, kernel, lit
-
     if scene.grid is None:
         if scene.light is None:
+            from vvgt_cli.dvr import kernel
+
             return partial(kernel.render_tiles, scene.voxels, scene.optics, scene.empty)
+        from vvgt_cli.dvr import lit
+
         return partial(lit.render_lit_tiles, scene.voxels, scene.optics, scene.empty, scene.light)
+    from vvgt_cli.dvr import grid
+
     if scene.light is None:
         return partial(grid.render_grid_tiles, scene.texels, scene.empty)
     return partial(grid.render_lit_grid_tiles, scene.texels, scene.voxels, scene.empty, scene.light)

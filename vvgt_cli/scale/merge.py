@@ -13,7 +13,7 @@ import numpy as np
 
 from vvgt_cli.conversion.request import VERTEX_BYTES
 from vvgt_cli.conversion.stages.closed_form import FAINT_LOGIT, FEWEST, NEARLY
-from vvgt_cli.errors import DataError
+from vvgt_cli.errors import NothingVisible
 from vvgt_cli.files import atomic_write, check_room, is_stream
 from vvgt_cli.gaussians.frames import transform
 from vvgt_cli.gaussians.ply import as_stored, ply_header, ply_rows
@@ -78,10 +78,7 @@ def _forest(parts: Parts, plan: Plan) -> tuple[Forest, Opaque]:
     seen = seen_through(extinction, wide, box, default_views("train", size=MARCH_SIZE))
     forest = Forest(parts, grid, seen, coarse, parts.folder / SCRATCH)
     if forest.top is None:
-        raise DataError(
-            f"{plan.volume['name']} under {plan.function['name']}: nothing visible from any view; expected opacity "
-            "above 0 where the data are (try 'vvgt tf show TF -o tf.png --volume VOLUME')"
-        )
+        raise NothingVisible(plan.volume["name"], plan.function["name"])
     return forest, _opaque(coarse, plan)
 
 

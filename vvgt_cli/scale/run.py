@@ -94,7 +94,10 @@ def _refuse(request: ConvertRequest, options: BlockOptions) -> None:
         raise UsageError("--light: shading needs the whole volume in memory; blocks are lit by nothing")
     source = request.source
     if source.labels not in (None, NONE) or source.layers or source.read.component in (COLOR, ALL):
-        raise UsageError("labels, layers, colours and channels together need the whole volume in memory; not in blocks")
+        raise UsageError(
+            "labels, layers, colours and channels together need the whole volume in memory, not blocks of it: give the "
+            "job more memory (--memory), or take one component (--component N, --labels none)"
+        )
     if request.output and options.shard is None and format_of(request.output):
         raise UsageError(f"-o {request.output}: blocks are written as a .ply; give a name that ends in .ply")
     if options.shard is not None and options.scheduler is not None:

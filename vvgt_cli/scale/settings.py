@@ -90,13 +90,13 @@ def counted_boxes(volume: Volume, edge: int, spacing: int) -> Boxes:
 
 def cell_grid(volume: Volume, exponent: np.ndarray, edge: int, march: int) -> CellGrid:
     """The grid of base cells of 2^``exponent`` (3,) voxels, in blocks of about ``edge`` voxels and whole tiles."""
+    from vvgt_cli.vbm.inset import averaged_down
+
     frame = volume.unit_frame()
     tile = np.round(TILE * 2.0**exponent).astype(np.int64)
     wanted = np.array(shape_of(volume, edge))
     x, y, z = (int(t * max(round(w / t), 1)) for t, w in zip(tile, wanted, strict=True))
     step = np.array(frame.step)
-    from vvgt_cli.vbm.inset import averaged_down
-
     field = averaged_down(2.0**exponent * step, np.array(frame.half), MAX_FIELD)
     i, j, k = (int(e) for e in exponent)
     points = 1 if min(i, j, k) >= 1 else 2

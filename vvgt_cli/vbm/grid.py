@@ -13,8 +13,8 @@ from vvgt_cli.dvr.layout import GRID, Texels
 from vvgt_cli.dvr.vectors import add, lane, texel, zeros4
 from vvgt_cli.dvr.vectors import row as row_of
 from vvgt_cli.jit.decorators import inlined, kernel
-from vvgt_cli.vbm.columns import BLUE, GREEN, MASS, RED, XX, XY, XZ, YY, YZ, ZZ, X, Y, Z
-from vvgt_cli.vbm.quadrature import Between, between, moved
+from vvgt_cli.vbm.columns import BLUE, GREEN, MASS, RED
+from vvgt_cli.vbm.quadrature import Between, between, deposit, moved
 
 _jit = inlined(fastmath=FLAGS, error_model="numpy")
 
@@ -56,16 +56,7 @@ def _gather(
         mass = lane(total, 3)
         if mass > 0.0:
             cell = out[m0 // points]
-            cell[MASS] += mass
-            cell[X] += first
-            cell[Y] += mass * y
-            cell[Z] += mass * z
-            cell[XX] += second
-            cell[XY] += first * y
-            cell[XZ] += first * z
-            cell[YY] += mass * y * y
-            cell[YZ] += mass * y * z
-            cell[ZZ] += mass * z * z
+            deposit(cell, mass, first, second, y, z)
             cell[RED] += lane(total, 0)
             cell[GREEN] += lane(total, 1)
             cell[BLUE] += lane(total, 2)

@@ -15,7 +15,6 @@ import numpy as np
 from vvgt_cli.dvr.layout import BRICK, Optics, Texels, Voxels
 from vvgt_cli.dvr.scene import Scene
 from vvgt_cli.vbm.columns import MASS, MOMENTS
-from vvgt_cli.vbm.grid import grid_moments
 from vvgt_cli.vbm.pyramid import morton_codes
 from vvgt_cli.vbm.quadrature import block_moments, compact
 
@@ -138,6 +137,8 @@ def _integrate(region: Region, at: np.ndarray, points: np.ndarray, cell: np.ndar
             region.voxels, region.optics, at, points, cell, region.half, region.step, region.begin, out
         )  # fmt: skip
     else:
+        from vvgt_cli.vbm.grid import grid_moments  # loaded for what needs it only
+
         grid_moments(region.texels, at, points, cell, region.half, region.step, out)
 
 

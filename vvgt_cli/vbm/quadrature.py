@@ -105,6 +105,21 @@ def _ranges(
 
 
 @_jit
+def deposit(row: np.ndarray, mass: float, first: float, second: float, y: float, z: float) -> None:
+    """Add ``mass`` at (y, z), of moments ``first`` and ``second`` along x, to a cell's ``row`` (13,) of moments."""
+    row[MASS] += mass
+    row[X] += first
+    row[Y] += mass * y
+    row[Z] += mass * z
+    row[XX] += second
+    row[XY] += first * y
+    row[XZ] += first * z
+    row[YY] += mass * y * y
+    row[YZ] += mass * y * z
+    row[ZZ] += mass * z * z
+
+
+@_jit
 def _gather(
     u0: np.ndarray, u1: np.ndarray, optics: Optics, points: int, d: float, y: float, z: float, out: np.ndarray
 ) -> None:
@@ -124,16 +139,7 @@ def _gather(
                 r, g, b = r + red, g + green, b + blue
         if mass > 0.0:
             row = out[m0 // points]
-            row[MASS] += mass
-            row[X] += first
-            row[Y] += mass * y
-            row[Z] += mass * z
-            row[XX] += second
-            row[XY] += first * y
-            row[XZ] += first * z
-            row[YY] += mass * y * y
-            row[YZ] += mass * y * z
-            row[ZZ] += mass * z * z
+            deposit(row, mass, first, second, y, z)
             row[RED] += r
             row[GREEN] += g
             row[BLUE] += b

@@ -11,7 +11,7 @@ import numpy as np
 from vvgt_cli.conversion.case import Case
 from vvgt_cli.conversion.resume import CLOSED_FORM
 from vvgt_cli.conversion.stage import Cost, Stage, Work
-from vvgt_cli.errors import DataError
+from vvgt_cli.errors import NothingVisible
 
 if TYPE_CHECKING:
     from vvgt_cli.vbm import Start
@@ -44,7 +44,7 @@ class ClosedFormStage(Stage):
         """Make the Gaussians, or take what is kept of them: without the pyramid.
 
         Raises:
-            DataError: nothing is visible from any view.
+            NothingVisible: nothing is visible from any view.
         """
         from vvgt_cli.vbm import Start, VbmOptions, initialise
         from vvgt_cli.vbm.closed_form import bound
@@ -62,10 +62,7 @@ class ClosedFormStage(Stage):
         with run.stage(self.name) as stage:
             start = initialise(scene, options, progress=run.console.bar(self.name))
             if not len(start.gaussians):
-                raise DataError(
-                    f"{scene.volume.name} under {scene.tf.name}: nothing visible from any view; "
-                    "expected opacity above 0 where the data are (try 'vvgt tf show TF -o tf.png --volume VOLUME')"
-                )
+                raise NothingVisible(scene.volume.name, scene.tf.name)
             found = len(start.gaussians)
             start, spared = thinned(start)
             stage.note = f"{len(start.gaussians)} Gaussians ({fit.init})"
