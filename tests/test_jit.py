@@ -58,14 +58,15 @@ def commands_leave(place: Path, cache: Path, **target: str) -> dict[str, bytes]:
     return {str(path.relative_to(place)): path.read_bytes() for path in files}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "target",
     [
         {},
-        pytest.param({"NUMBA_CPU_NAME": "generic"}, marks=pytest.mark.long),
-        pytest.param({"NUMBA_CPU_NAME": "haswell", "NUMBA_CPU_FEATURES": "+avx2,+fma"}, marks=pytest.mark.long),
-        pytest.param({"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}, marks=pytest.mark.long),
-        pytest.param({"NUMBA_CPU_FEATURES": "+sse4.2"}, marks=pytest.mark.long),
+        {"NUMBA_CPU_NAME": "generic"},
+        {"NUMBA_CPU_NAME": "haswell", "NUMBA_CPU_FEATURES": "+avx2,+fma"},
+        {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""},
+        {"NUMBA_CPU_FEATURES": "+sse4.2"},
     ],
     ids=lambda target: "-".join(target.values()) or "host",
 )
@@ -79,10 +80,31 @@ def test_cold_and_warm_runs_leave_the_same_bytes(tmp_path, target):
     assert cold == warm
 
 
-def test_warmup_says_where_and_compiles_what_is_missing(tmp_path, monkeypatch):
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    """A copy of the package's folder, where NUMBA_CACHE_DIR = ``tmp_path / "cache"`` has it."""
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
-    (cache,) = folders()
-    shutil.copytree(command("warmup", cwd=tmp_path, folder=None).stdout.strip(), cache)  # the package's
+    (folder,) = folders()
+    shutil.copytree(command("warmup", cwd=tmp_path, folder=None).stdout.strip(), folder)
+    return folder
+
+
+def test_a_run_that_compiles_leaves_the_bytes_of_one_that_loads(tmp_path, cache):
+    """Two kernels of loops over threads and one without are compiled by the first run, one of them by itself."""
+    some = ("vvgt_cli.splat.tiles.blend-", "vvgt_cli.splat.kernel.project-", "vvgt_cli.vbm.pyramid.take_base-")
+    for name in kernels(cache):
+        if name.startswith(some):
+            (cache / name).unlink()
+    kept = len(kernels(cache))
+    runs = {}
+    for run in ("cold", "warm"):
+        command("convert", SOURCE, *SMALL, "--steps", 12, "-qo", f"{run}.ply", cwd=tmp_path, folder=tmp_path / "cache")
+        runs[run] = (tmp_path / f"{run}.ply").read_bytes()
+        assert len(kernels(cache)) == kept + len(some)
+    assert runs["cold"] == runs["warm"]
+
+
+def test_warmup_says_where_and_compiles_what_is_missing(tmp_path, cache):
     some = ("vvgt_cli.vbm.inset._shift", "vvgt_cli.splat.kernel.project-")
     gone = {name for name in kernels(cache) if name.startswith(some)}
     for name in gone:
@@ -308,20 +330,17 @@ def test_without_a_home(tmp_path):
     assert len(kernels(tmp_path / "user")) == 1
 
 
-def test_two_first_runs_at_once(tmp_path):
+def test_two_first_runs_at_once(tmp_path, ply):
     """For a processor without extensions, whatever this one has: code of another kind, and a folder of its own."""
     cache = tmp_path / "cache"
-    for line in (f"init {SOURCE} --max-gaussians 200 --size 40 -o", "render 0.ply --orbit 1 --size 40 -o"):
-        suffix = ".ply" if line.startswith("init") else ""
-        args = [sys.executable, "-m", "vvgt_cli.cli.main", *line.split()]
-        variables = environment(cache, NUMBA_CPU_NAME="generic")
-        runs = [subprocess.Popen([*args, f"{i}{suffix}", "-q"], cwd=tmp_path, env=variables) for i in range(2)]
-        assert [run.wait() for run in runs] == [0, 0]
-        command(*line.split(), f"2{suffix}", "-q", cwd=tmp_path, folder=cache, NUMBA_CPU_NAME="generic")
-    for name in ("{}.ply", "{}/orbit_000.png"):
-        first, second, warm = ((tmp_path / name.format(i)).read_bytes() for i in range(3))
-        assert first == second == warm
-    assert len(kernels(cache)) == len({*ahead.INIT, *ahead.DRAW})
+    args = [sys.executable, "-m", "vvgt_cli.cli.main", "render", str(ply), "--orbit", "1", "--size", "40", "-q", "-o"]
+    variables = environment(cache, NUMBA_CPU_NAME="generic")
+    runs = [subprocess.Popen([*args, str(i)], cwd=tmp_path, env=variables) for i in range(2)]
+    assert [run.wait() for run in runs] == [0, 0]
+    command(*args[3:], "2", cwd=tmp_path, folder=cache, NUMBA_CPU_NAME="generic")
+    first, second, warm = ((tmp_path / str(i) / "orbit_000.png").read_bytes() for i in range(3))
+    assert first == second == warm
+    assert len(kernels(cache)) == len(ahead.DRAW)
     assert not list(cache.rglob("*.part"))
 
 
