@@ -25,7 +25,8 @@ from dvr_scenes import commit, print_table, read_scenes, write_rows
 from floors import machine
 
 from vvgt_cli.cameras import Camera, default_views
-from vvgt_cli.conversion.stages.views import REFINE_VIEWS, fine_enough, views_of, wide
+from vvgt_cli.conversion.case import view_edge
+from vvgt_cli.conversion.stages.views import LARGE, REFINE_VIEWS, fine_enough, views_of, wide
 from vvgt_cli.descent import LOSS_3DGS, OptimizeOptions, optimize
 from vvgt_cli.dvr import Scene, render_views
 from vvgt_cli.dvr.render import FIT_VIEWS
@@ -81,11 +82,11 @@ def equal_row(judged: Judged) -> dict[str, Any]:
 
 def training_views(judged: Judged, start: Gaussians, count: int) -> tuple[list[Camera], np.ndarray, Rule]:
     """As `convert` makes them: cameras, images, rule."""
-    half = wide(start, SIZE)
-    cameras = default_views("train", count, size=SIZE // 2 if half else SIZE)
-    rule = INRIA.at(0.5) if half else INRIA
-    images = render_views(judged.scene, cameras, fine_enough(judged.scene, start, cameras[0].width, rule))
-    return cameras, images, rule
+    edge = view_edge(SIZE, wide(start, SIZE))
+    cameras, share = default_views("train", count, size=edge), edge / SIZE
+    rule = INRIA.at(share)
+    settings = fine_enough(judged.scene, start, edge, rule, 1.0 if share >= LARGE else share)
+    return cameras, render_views(judged.scene, cameras, settings), rule
 
 
 def begin(judged: Judged, method: str, steps: int) -> Gaussians:
@@ -103,7 +104,7 @@ def point(judged: Judged, method: str, steps: int) -> dict[str, Any]:
     start = begin(judged, method, steps)
     if steps:
         if method == "ours":
-            cameras, images, rule = training_views(judged, start, views_of(steps))
+            cameras, images, rule = training_views(judged, start, views_of(steps, wide(start, SIZE)))
             options = OptimizeOptions(steps=steps, rule=rule)
         else:
             cameras = default_views("train", 24 if method == "adam" else BASE_VIEWS)

@@ -10,10 +10,10 @@ import pytest
 from onnx_models import write_model
 from test_cli_infer import DARKER
 
-from vvgt_cli.cameras.blocks import BLOCK, spread_blocks
+from vvgt_cli.cameras.blocks import BLOCK, ENOUGH, FEW, spread_blocks
 from vvgt_cli.conversion.case import Case, measure
 from vvgt_cli.conversion.convert import convert, initialise_only, planned
-from vvgt_cli.conversion.plan import DEFAULT_HALF_STEPS, DEFAULT_STEPS, MOST_STEPS, Planner, check_memory
+from vvgt_cli.conversion.plan import DEFAULT_STEPS, MOST_STEPS, Planner, check_memory
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions, Limits
 from vvgt_cli.conversion.stage import Work
 from vvgt_cli.conversion.stages import BackProjection, CheckViews, Network, Refinement, TrainingViews
@@ -31,7 +31,7 @@ from vvgt_cli.transfer.readers import minimal
 
 pytestmark = pytest.mark.usefixtures("small_seats")
 CASE = Case(gaussians=100_000, cells=1e6, voxels=10.2e6, size=48, view=0.05, pace=1.0, there=2e8)
-FORM = 0.41 + 0.77 + 0.12 * 10.2  # seconds of its closed form
+FORM = 0.25 + 0.46 + 0.072 * 10.2  # seconds of its closed form
 SOURCE = SourceRequest("example:marschner-lobb:24")
 SMALL = FitOptions(400, 48)
 POINTS = [{"x": x, "rgb": [x, 0.5, 1 - x], "opacity": 0.6 * x} for x in (0.0, 0.5, 1.0)]
@@ -52,9 +52,15 @@ def steps_of(found):
     return 0 if stage is None else stage.steps
 
 
-def ending(edge=48.0, judge=0.09):
+def ending(edge=48.0, judge=0.09, glance=0.09):
     """Seconds of three test views, the seats and the file."""
-    return 3 * (judge + 0.03 * (edge / 400) ** 2) + 2 * judge + 0.3 + 0.1
+    return 3 * (judge + 0.03 * (edge / 400) ** 2) + 2 * glance + 0.3 + 0.1
+
+
+def drawn(size, enough):
+    """Pixels of a view's blocks."""
+    blocks = spread_blocks(size, size, enough=enough)
+    return size**2 if blocks is None else blocks.numbers.size * BLOCK**2
 
 
 def done(tmp_path, fit=SMALL, **options):
@@ -79,37 +85,44 @@ def test_without_limits_the_default_steps_are_planned_and_back_projection_is_not
     assert steps_of(found) == DEFAULT_STEPS
     assert [name for name, _ in found.left_out] == ["network", "back-projection"]
     assert found.seconds == pytest.approx(sum(seconds for _, seconds in found.costs()))
-    step = 0.013 * (48 / 400) ** 2 + 0.035
-    assert found.seconds == pytest.approx(1 + FORM + DEFAULT_STEPS * step + 48 * 0.05 + 4 * 0.09 + ending())
+    step = 0.013 * (48 / 400) ** 2 + 0.024
+    assert found.seconds == pytest.approx(1 + FORM + DEFAULT_STEPS * step + 96 * 0.05 + 4 * 0.09 + ending())
     assert found.bytes == 1000 + 1000 * 68
     assert f"{DEFAULT_STEPS} steps" in found.text()
 
 
 @pytest.mark.parametrize(("size", "edge"), [(400, 200), (1080, 200), (300, 150)])
-def test_views_are_half_as_large_as_they_may_be_where_gaussians_are_wide(size, edge):
+def test_views_are_small_where_gaussians_are_wide(size, edge):
     found = plan(size=size)
     descent, views = of(found, Refinement), of(found, TrainingViews)
-    assert (descent.half, descent.steps, views.edge) == (True, DEFAULT_HALF_STEPS, edge)
-    judged = size**2 if size < 565 else 625 * 256
-    whole, judge = 2 * edge, 1.8 * 0.05 * judged / (2 * edge) ** 2
-    step = 0.006 * (whole / 400) ** 2 + 0.017
-    seconds = 1 + FORM + DEFAULT_HALF_STEPS * step + 48 / 4 * 0.05 + 4 * judge + ending(judged**0.5, judge)
-    assert found.seconds == pytest.approx(seconds, rel=0.003)  # there are a few blocks more than 625
-    bytes_ = 294e6 + 1240e5 + 32 * (48 * edge**2 + 4 * judged + size**2)
+    assert (descent.small, descent.steps, views.edge) == (True, DEFAULT_STEPS, edge)
+    judged, glanced, whole = drawn(size, ENOUGH), drawn(size, FEW), min(size, 300)
+    judge, glance = (1.8 * 0.05 * pixels / whole**2 for pixels in (judged, glanced))
+    step = 0.006 * (whole / 400) ** 2 + 0.020
+    seconds = (
+        1
+        + FORM
+        + DEFAULT_STEPS * step
+        + 72 * (edge / whole) ** 2 * 0.05
+        + 4 * glance
+        + ending(judged**0.5, judge, glance)
+    )
+    assert found.seconds == pytest.approx(seconds)
+    bytes_ = 294e6 + 1240e5 + 32 * (72 * edge**2 + 4 * glanced + size**2)
     assert found.memory == pytest.approx(2e8 + bytes_, rel=1e-3)
-    assert of(plan(size=size, time_budget=20.0), Refinement).half
+    assert of(plan(size=size, time_budget=20.0), Refinement).small
     for other in (plan(size=size, wide=False), plan(size=size, steps=23)):
-        assert (of(other, Refinement).half, of(other, TrainingViews).edge) == (False, min(size, 400))
-    assert not of(plan(size=100), Refinement).half
+        assert (of(other, Refinement).small, of(other, TrainingViews).edge) == (False, min(size, 300))
+    assert not of(plan(size=100), Refinement).small
 
 
-def test_refinement_on_half_views_gains_on_whole_ones(tmp_path):
+def test_refinement_on_small_views_gains_on_whole_ones(tmp_path):
     report = done(tmp_path, FitOptions(600, 128))
     stages = {stage.name: stage for stage in report.stages}
-    assert stages["views"].note.startswith("48 of 64 px to fit to")
+    assert stages["views"].note.startswith("72 of 64 px to fit to")
     assert stages["refinement"].kept
     assert stages["refinement"].psnr > stages["refinement"].psnr_before + 1
-    assert chosen(report)["half"]
+    assert chosen(report)["small"]
     assert report.refinement["dilation"] == DILATION / 4
     assert report.refinement["rule"] == "inria"
 
@@ -134,17 +147,17 @@ def test_a_large_screen_is_fitted_to_by_its_dilation_on_small_views(tmp_path):
 def test_narrow_gaussians_get_whole_views(tmp_path, monkeypatch):
     monkeypatch.setattr("vvgt_cli.conversion.convert.wide", lambda *_: False)
     report = done(tmp_path, FitOptions(600, 128, steps=30))
-    assert chosen(report)["half"]  # what was foreseen
+    assert chosen(report)["small"]  # what was foreseen
     assert next(stage for stage in report.stages if stage.name == "views").note.startswith("24 of 128 px")
     assert report.refinement["dilation"] == DILATION
 
 
 def test_views_that_do_not_fit_are_refused(monkeypatch):
-    found = plan(size=400)  # 48 of 200 px, 4 to check by, one of which is drawn whole
-    monkeypatch.setattr("vvgt_cli.conversion.plan.free_memory", lambda: 400**2 * 32 * 18)
+    found = plan(size=400)  # 72 of 200 px, blocks of 4 to check by, one of which is drawn whole
+    monkeypatch.setattr("vvgt_cli.conversion.plan.free_memory", lambda: 400**2 * 32 * 22)
     check_memory(found)
-    monkeypatch.setattr("vvgt_cli.conversion.plan.free_memory", lambda: 400**2 * 32 * 16)
-    with pytest.raises(UsageError, match=r"--size 400.*--size 388 would fit"):
+    monkeypatch.setattr("vvgt_cli.conversion.plan.free_memory", lambda: 400**2 * 32 * 20)
+    with pytest.raises(UsageError, match=r"--size 400.*--size 390 would fit"):
         check_memory(found)
 
 
@@ -215,7 +228,7 @@ def test_a_network_runs_where_there_is_time_for_it():
     planner = Planner(Limits(), 1000, None, 0, 400, model="some")
     case = replace(CASE, size=400)
     assert of(planner.plan(case, 1.0), Network).model == "some"
-    assert not of(planner.plan(case, 1.0), Refinement).half  # it was trained on whole views
+    assert not of(planner.plan(case, 1.0), Refinement).small  # it was trained on whole views
     short = Planner(Limits(time_budget=9.0), 1000, None, 0, 400, model="some").plan(case, 1.0)
     assert of(short, Network) is None
     assert "network" in {name for name, _ in short.left_out}
@@ -229,11 +242,11 @@ def test_the_seconds_of_a_network_are_not_spent_on_steps_too():
     assert after.seconds <= 16
 
 
-@pytest.mark.parametrize(("size", "judged"), [(300, 300**2), (1080, spread_blocks(1080, 1080).numbers.size * BLOCK**2)])
+@pytest.mark.parametrize(("size", "judged"), [(300, 300**2), (1080, drawn(1080, FEW))])
 def test_check_views_cost_what_their_blocks_do(size, judged):
     scene = Scene.build(open_volume("example:marschner-lobb:16"), minimal.read({"points": POINTS}, "ramp"), 1.0)
     case = measure(scene, size, 1000)
-    edge = min(size, 400)
+    edge = min(size, 300)
     seconds, memory = CheckViews().cost(case)
     assert seconds == pytest.approx(4 * 1.8 * case.view * judged / edge**2)
     assert memory == 32 * (4 * judged + size**2)
@@ -260,7 +273,7 @@ def test_a_slower_machine_gets_fewer_steps_after_the_closed_form():
 
 
 def test_views_come_in_sets():
-    assert [views_of(steps) for steps in (0, 1, 95, 96, 143, 144, 10_000)] == [24, 24, 24, 48, 48, 72, 72]
+    assert [views_of(steps, True) for steps in (0, 1, 48, 80, 112, 144, 10_000)] == [24, 24, 24, 48, 72, 96, 120]
 
 
 @pytest.mark.parametrize(
@@ -326,7 +339,7 @@ def test_a_dry_run_plans_and_writes_nothing(tmp_path):
     assert found.memory > 1e8
     lines = found.text().splitlines()
     assert [line.split()[0] for line in lines[:3]] == ["so", "closed", "check"]
-    assert "48 views of 48 px" in found.text()
+    assert "96 views of 48 px" in found.text()
     done(tmp_path)
     with pytest.raises(UsageError, match="exists"):
         planned(request, Console(quiet=True))

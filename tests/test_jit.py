@@ -349,3 +349,26 @@ def test_helpers_are_not_called_from_python():
 
     with pytest.raises(TypeError, match="kernels only"):
         to_camera(1, 2, 3, 4)
+
+
+def test_vectors_are_wide_where_that_costs_no_clock(monkeypatch):
+    from numba.core import config
+
+    from vvgt_cli.jit.target import features
+
+    monkeypatch.setattr(config, "CPU_FEATURES", None)
+    assert features("+avx512f,+avx512vbmi2") == "+avx512f,+avx512vbmi2,-prefer-256-bit"
+    assert features("+avx2,+avx512f,-avx512vbmi2") == "+avx2,+avx512f,-avx512vbmi2"
+    assert features("") == ""
+    monkeypatch.setattr(config, "CPU_FEATURES", "+avx512vbmi2")
+    assert features("+avx512vbmi2") == "+avx512vbmi2"
+
+
+def test_a_worker_compiles_by_those_features():
+    code = (
+        "from vvgt_cli.jit import target; target.features = lambda found: found + ',-avx'; target.widen()\n"
+        "from numba.core.registry import cpu_target\n"
+        "codegen = cpu_target.target_context.codegen(); options = {}; codegen._customize_tm_options(options)\n"
+        "print(options['features'].endswith(',-avx'), codegen.magic_tuple()[2].endswith(',-avx'))"
+    )
+    assert python("-c", code, folder=None).stdout.split() == ["True", "False"]

@@ -21,6 +21,7 @@ from vvgt_cli.vbm.closed_form import closed_form
 from vvgt_cli.vbm.inset import inset, opaque_field
 from vvgt_cli.vbm.moments import base_cells
 from vvgt_cli.vbm.opacity import dilogarithm, inverse_dilogarithm, peak_opacity
+from vvgt_cli.vbm.pyramid import principal_axes
 from vvgt_cli.vbm.shape import ROUND, make_gaussians, quaternions
 from vvgt_cli.vbm.wavelet import box_surrogate
 from vvgt_cli.volume import Volume
@@ -244,3 +245,20 @@ def test_silhouette_of_a_ball(radius: float) -> None:
         r = np.hypot(x - size / 2, y - size / 2)
         assert ours[r < radii[0] - 1].min() > 0.5
         assert ours[r > radii[0] + 1].max() < 0.5
+
+
+@pytest.mark.parametrize("spread", [1.0, 1e-6, 0.0])
+def test_principal_axes_against_lapack(spread: float) -> None:
+    """Random, nearly isotropic, flat and diagonal covariances, of every size."""
+    rng = np.random.default_rng(0)
+    factors = rng.normal(size=(200, 3, 3)) * spread + np.eye(3)
+    factors[50:100, :, 2] = 0
+    factors[100:120] *= np.eye(3)
+    cov = factors @ factors.transpose(0, 2, 1) * 10.0 ** rng.integers(-12, 6, 200)[:, None, None]
+    values, vectors = np.empty((200, 3)), np.empty((200, 3, 3))
+    principal_axes(cov, values, vectors)
+    size = np.abs(cov).max(axis=(1, 2))[:, None]
+    np.testing.assert_allclose(values / size, np.linalg.eigvalsh(cov) / size, atol=1e-14)
+    rebuilt = (vectors * values[:, None, :]) @ vectors.transpose(0, 2, 1)
+    np.testing.assert_allclose(rebuilt / size[..., None], cov / size[..., None], atol=1e-13)
+    np.testing.assert_allclose(vectors @ vectors.transpose(0, 2, 1), np.broadcast_to(np.eye(3), cov.shape), atol=1e-13)

@@ -16,7 +16,6 @@ from vvgt_cli.synth import analytic
 from vvgt_cli.vbm import visibility as visibility_module
 from vvgt_cli.vbm.columns import COLUMNS, MOMENTS, SEEN
 from vvgt_cli.vbm.moments import base_cells, morton
-from vvgt_cli.vbm.pyramid import principal_axes
 from vvgt_cli.vbm.tree import Leaves, Tree, build_tree, central, leaves_of, select, split, split_score
 from vvgt_cli.vbm.visibility import Visibility, march, visibility
 from vvgt_cli.volume import Volume
@@ -89,6 +88,17 @@ def test_central_moments(tree: Tree) -> None:
     np.testing.assert_allclose(rebuilt[:, 0, 2], tree.moments[:, 6] / mass, atol=1e-12)
     assert (tree.moments[:, SEEN] <= mass * (1 + 1e-6)).all()
     assert (tree.moments[:, SEEN] >= 0).all()
+
+
+def test_split_scores_are_their_twins(tree: Tree) -> None:
+    mass, _, cov = central(tree.moments)
+    area = np.cbrt(tree.edge.prod(axis=1)) ** 2
+    seen = np.sqrt(tree.largest * tree.moments[:, SEEN] / mass)
+    expected = -np.expm1(-mass / area) * area * seen * np.trace(cov, axis1=1, axis2=2)
+    scores = split_score(tree)
+    assert (scores >= 0).all()
+    assert scores.max() > 0
+    np.testing.assert_allclose(scores, expected, rtol=1e-9, atol=1e-12 * expected.max())
 
 
 def cover(tree: Tree, ids: np.ndarray) -> np.ndarray:
@@ -345,23 +355,6 @@ def test_visibility_lookup() -> None:
     expected = np.array([0, 11, 1, 8, 15], np.float32)
     np.testing.assert_array_equal(seen.at(index, np.ones(3)), np.stack([expected, expected + 100], 1))
     np.testing.assert_array_equal(seen.at(np.array([[1, 1, 0]]), np.full(3, 2.0)), [[5, 105]])
-
-
-@pytest.mark.parametrize("spread", [1.0, 1e-6, 0.0])
-def test_principal_axes_against_lapack(spread: float) -> None:
-    """Random, nearly isotropic, flat and diagonal covariances, of every size."""
-    rng = np.random.default_rng(0)
-    factors = rng.normal(size=(200, 3, 3)) * spread + np.eye(3)
-    factors[50:100, :, 2] = 0
-    factors[100:120] *= np.eye(3)
-    cov = factors @ factors.transpose(0, 2, 1) * 10.0 ** rng.integers(-12, 6, 200)[:, None, None]
-    values, vectors = np.empty((200, 3)), np.empty((200, 3, 3))
-    principal_axes(cov, values, vectors)
-    size = np.abs(cov).max(axis=(1, 2))[:, None]
-    np.testing.assert_allclose(values / size, np.linalg.eigvalsh(cov) / size, atol=1e-14)
-    rebuilt = (vectors * values[:, None, :]) @ vectors.transpose(0, 2, 1)
-    np.testing.assert_allclose(rebuilt / size[..., None], cov / size[..., None], atol=1e-13)
-    np.testing.assert_allclose(vectors @ vectors.transpose(0, 2, 1), np.broadcast_to(np.eye(3), cov.shape), atol=1e-13)
 
 
 @pytest.mark.parametrize("dims", [(512, 512, 1), (1024, 700, 1), (3, 256, 256), (96, 96, 96)])

@@ -8,6 +8,7 @@ import numpy as np
 
 BLOCK = 16  # pixels along an edge: the tile of the ray caster and of the splatter
 ENOUGH = 625  # blocks: as many as a picture of 400 px has
+FEW = 250  # blocks that tell the better of two results, and from where one looks worst
 GOLDEN = 0.6180339887498949
 
 
@@ -41,14 +42,14 @@ class Blocks:
         return picked.reshape(-1, BLOCK, image.shape[2])
 
 
-def spread_blocks(width: int, height: int, shift: int = 0) -> Blocks | None:
-    """About `ENOUGH` blocks on a lattice over the picture; None where that would be nearly all of it.
+def spread_blocks(width: int, height: int, shift: int = 0, enough: int = ENOUGH) -> Blocks | None:
+    """About ``enough`` blocks on a lattice over the picture; None where that would be nearly all of it.
 
     Every s-th block of the first row, and from row to row the golden part of s further, so that no line or column of
     the picture is left out; ``shift`` takes others of the s sets (of other views, say), as many.
     """
     rows, across = height // BLOCK, width // BLOCK
-    every = round(rows * across / ENOUGH)
+    every = round(rows * across / enough)
     if every < 2:
         return None
     row, column = np.divmod(np.arange(rows * across), across)

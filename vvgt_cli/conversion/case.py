@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vvgt_cli.cameras.blocks import BLOCK, spread_blocks
+from vvgt_cli.cameras.blocks import BLOCK, ENOUGH, FEW, spread_blocks
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 SORT = 0.95e-3  # seconds in which 200,000 random float64 sort on the two cores that costs were fitted on
 PROBE = 80  # pixels along the edge of the view that is timed
 VIEW, FINER = 1.1, 1.8  # of the view that is timed: a training view, and as much again where it is to judge by
-WHOLE = 400  # pixels along the edge of a training view, at most: more show no more (docs/optimize.md)
+LARGE, SMALL = 300, 200  # pixels along the edge of a training view, at most: more show no more (docs/optimize.md)
 PROGRAM = 2.6e8  # bytes: interpreter, libraries and kernels
 
 
@@ -49,27 +49,40 @@ class Case:
     @property
     def edge(self) -> int:
         """Pixels along the edge of a whole training view."""
-        return view_edge(self.size, half=False)
+        return view_edge(self.size, small=False)
 
     @cached_property
     def judged(self) -> int:
-        """Pixels of a check or test view that are drawn: all, or blocks."""
-        blocks = spread_blocks(self.size, self.size)
+        """Pixels of a test view that are drawn: all, or blocks."""
+        return self._pixels(ENOUGH)
+
+    @cached_property
+    def glanced(self) -> int:
+        """Pixels of a check view that are drawn: all, or blocks."""
+        return self._pixels(FEW)
+
+    def _pixels(self, enough: int) -> int:
+        blocks = spread_blocks(self.size, self.size, enough=enough)
         return self.size**2 if blocks is None else blocks.numbers.size * BLOCK**2
 
     @property
     def judge(self) -> float:
-        """Seconds of a check or test view's reference."""
+        """Seconds of a test view's reference."""
         return FINER * self.view * self.judged / self.edge**2
+
+    @property
+    def glance(self) -> float:
+        """Seconds of a check view's reference."""
+        return FINER * self.view * self.glanced / self.edge**2
 
     def at(self, pace: float) -> Case:
         """The same on a machine that takes ``pace`` times as long; what was timed stays."""
         return replace(self, pace=self.pace * pace)
 
 
-def view_edge(size: int, half: bool) -> int:
+def view_edge(size: int, small: bool) -> int:
     """Pixels along the edge of a training view: the size that the file is made for, or half of it, within bounds."""
-    return min(size, WHOLE) // (2 if half else 1)
+    return min(size // 2, SMALL) if small else min(size, LARGE)
 
 
 def measure(scene: Scene, size: int, gaussians: int) -> Case:
@@ -83,7 +96,7 @@ def measure(scene: Scene, size: int, gaussians: int) -> Case:
         cells=cells,
         voxels=float(np.count_nonzero(scene.empty == 0)) * BRICK**3,
         size=size,
-        view=VIEW * _view_seconds(scene, view_edge(size, half=False)),
+        view=VIEW * _view_seconds(scene, view_edge(size, small=False)),
         pace=_pace(),
         there=PROGRAM + _volume_bytes(scene),
     )

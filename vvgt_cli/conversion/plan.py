@@ -26,12 +26,11 @@ from vvgt_cli.resources import free_memory
 if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
 
-DEFAULT_STEPS = 96  # of gradient descent: the knee of error against seconds (docs/plan.md)
-DEFAULT_HALF_STEPS = 120  # likewise, on views half the size
+DEFAULT_STEPS = 112  # of gradient descent: the knee of error against seconds (docs/plan.md)
 MOST_STEPS = 400  # where a target or a time asks for as many as it takes
 FEWEST_STEPS = 8  # less is not worth the views
 ENOUGH_STEPS = 24  # as good as back-projection; fewer are taken after it
-SMALLEST_HALF = 64  # pixels along the edge of a training view half that size: four tiles
+SMALLEST = 64  # pixels along the edge of a training view that is small: four tiles
 WRITE = 0.1  # seconds of the file
 SURE = 0.8  # of an estimate of memory: as little has been enough
 
@@ -121,7 +120,7 @@ class Planner:
         steps: of gradient descent that the user asks for; None: the plan's choice.
         sh_degree: harmonics in the file.
         size: pixels along the edge of images that the file is made for.
-        wide: Gaussians are wide enough to be seen in views half the size.
+        wide: Gaussians are wide enough to be seen in small views.
         model: network that the user asks for.
         whole: all ten test views are scored.
     """
@@ -155,10 +154,9 @@ class Planner:
         open_end = self.limits.target_psnr is not None or left is not None
         network, left = self._network(plan, left)
         few = self.steps is not None and self.steps < ENOUGH_STEPS and left is None
-        half = self.wide and not few and not network and self.size >= 2 * SMALLEST_HALF
-        usual = DEFAULT_HALF_STEPS if half else DEFAULT_STEPS
-        steps = wanted = self.steps if self.steps is not None else MOST_STEPS if open_end else usual
-        while left is not None and steps > 0 and self._seconds(case, steps, half) > left:
+        small = self.wide and not few and not network and self.size >= 2 * SMALLEST
+        steps = wanted = self.steps if self.steps is not None else MOST_STEPS if open_end else DEFAULT_STEPS
+        while left is not None and steps > 0 and self._seconds(case, steps, small) > left:
             steps = min(steps - 1, int(steps * 0.9))
         if not wanted or steps < min(FEWEST_STEPS, wanted):
             plan.left_out.append(("refinement", _room(left) if wanted else "no steps are asked for"))
@@ -167,19 +165,19 @@ class Planner:
             plan.left_out.append(("network", "gradient descent gains more in its time; --model runs it"))
         if not few:
             plan.left_out.append(("back-projection", "gradient descent gains more in its time"))
-        chosen = self._descent(steps, half, wanted)
+        chosen = self._descent(steps, small, wanted)
         return [*chosen[:2], *([BackProjection()] if few else []), *network, chosen[2]]
 
-    def _descent(self, steps: int, half: bool, most: int) -> list[Stage]:
+    def _descent(self, steps: int, small: bool, most: int) -> list[Stage]:
         return [
             CheckViews(),
-            TrainingViews(views_of(steps), view_edge(self.size, half)),
-            Refinement(steps, most, half),
+            TrainingViews(views_of(steps, small), view_edge(self.size, small)),
+            Refinement(steps, most, small),
         ]
 
-    def _seconds(self, case: Case, steps: int, half: bool) -> float:
-        """Of so many steps, with their views, ``half`` the size or whole, and the check views."""
-        return sum(stage.cost(case).seconds for stage in self._descent(steps, half, steps))
+    def _seconds(self, case: Case, steps: int, small: bool) -> float:
+        """Of so many steps, with their views, ``small`` ones or not, and the check views."""
+        return sum(stage.cost(case).seconds for stage in self._descent(steps, small, steps))
 
     def _without_steps(self, plan: Plan, network: list[Stage], left: float | None) -> list[Stage]:
         """Back-projection instead, if there is time; check views where there is a target and time for them."""
@@ -189,7 +187,7 @@ class Planner:
         if not projected:
             plan.left_out.append(("back-projection", f"about {whole:.1f} s with its views, {_room(left)}"))
         check = CheckViews(fine=bool(network) or self.limits.target_psnr is not None)
-        train = TrainingViews(views_of(0), view_edge(self.size, half=False), fitted=bool(network))
+        train = TrainingViews(views_of(0, small=False), view_edge(self.size, small=False), fitted=bool(network))
         if projected or network:
             return [check, train, *([BackProjection()] if projected else []), *network]
         judge = self.limits.target_psnr is not None and (left is None or left >= views)

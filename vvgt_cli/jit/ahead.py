@@ -18,6 +18,7 @@ CLOSED_FORM = (
     "vvgt_cli.vbm.pyramid:morton_codes",
     "vvgt_cli.vbm.pyramid:take_base",
     "vvgt_cli.vbm.pyramid:sum_children",
+    "vvgt_cli.vbm.pyramid:score_splits",
     "vvgt_cli.vbm.pyramid:principal_axes",
     "vvgt_cli.vbm.inset:_shift",
     "vvgt_cli.vbm.inset:_blur",

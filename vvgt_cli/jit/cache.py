@@ -27,6 +27,7 @@ from numba.core.serialize import dumps
 from vvgt_cli import __version__
 from vvgt_cli.jit import store
 from vvgt_cli.jit.compile import Job, compile_in_subprocess
+from vvgt_cli.jit.target import features
 
 VERSIONS = numba.__version__, llvmlite.__version__, platform.python_version(), sys.implementation.name, __version__
 SETTINGS = ("OPT", "LOOP_VECTORIZE", "SLP_VECTORIZE", "BOUNDSCHECK", "DISABLE_INTEL_SVML", "USING_SVML", "CPU_FEATURES")
@@ -123,7 +124,8 @@ class KernelCache(caching._Cache):
 
     def file(self, types: tuple[Any, ...], codegen: Any) -> str:
         """Name of the file of a signature on a target."""
-        target = _digest(codegen.magic_tuple(), [getattr(config, name, None) for name in SETTINGS])
+        triple, processor, found = codegen.magic_tuple()
+        target = _digest(triple, processor, features(found), [getattr(config, name, None) for name in SETTINGS])
         described = [f"{t!r}{getattr(t, 'fields', '')}" for t in types]  # named tuples with their fields' order
         return f"{self.name}-{self.key}-{target}-{_digest(*described)}.kernel"
 

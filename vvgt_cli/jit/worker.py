@@ -75,8 +75,10 @@ def run(folder: Path, jobs: list[Any]) -> int:
     """Compile all; 0 where all went well."""
     import importlib
 
+    from vvgt_cli.jit.target import widen
     from vvgt_cli.resources import processors
 
+    widen()
     for module in sorted({job.module for job in jobs}):
         importlib.import_module(module)
     failed = 0

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vvgt_cli.cameras import Camera, default_views
-from vvgt_cli.cameras.blocks import Blocks, spread_blocks
+from vvgt_cli.cameras.blocks import ENOUGH, Blocks, spread_blocks
 from vvgt_cli.cameras.sets import FIELD_OF_VIEW
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.progress import ProgressCallback
@@ -85,6 +85,7 @@ def seat_views(
     settings: RenderSettings | None = None,
     *,
     views: Collection[int] = VIEWS,
+    enough: int = ENOUGH,
     progress: ProgressCallback | None = None,
 ) -> Iterator[SeatView]:
     """References of every place, one at a time.
@@ -94,6 +95,7 @@ def seat_views(
         places: (size in pixels, field of view in degrees).
         settings: of the reference; the renderer's default without.
         views: numbers of the test views.
+        enough: blocks of a view, about.
         progress: called after each view of a place.
     """
     from vvgt_cli.dvr import render_view
@@ -102,7 +104,7 @@ def seat_views(
     for size, field_of_view in places:
         cameras = default_views("test", size=size)
         for i in views:
-            camera, blocks = zoomed(cameras[i], field_of_view), spread_blocks(size, size, i)
+            camera, blocks = zoomed(cameras[i], field_of_view), spread_blocks(size, size, i, enough)
             image = render_view(scene, camera, settings, blocks)[..., :3]
             yield SeatView(size, field_of_view, camera, blocks, image if blocks is None else blocks.pick(image))
             done += 1

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vvgt_cli.cameras import Camera
-from vvgt_cli.cameras.blocks import Blocks, spread_blocks
+from vvgt_cli.cameras.blocks import FEW, Blocks, spread_blocks
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.splat.rules import INRIA, Rule
 
@@ -46,10 +46,10 @@ class Views:
 
 
 def judging_views(scene: Scene, cameras: Sequence[Camera], settings: RenderSettings) -> Views:
-    """Views to score by, of blocks where they are large."""
+    """Views to judge by, of `FEW` blocks where they have more."""
     from vvgt_cli.dvr import render_view
 
-    blocks = [spread_blocks(camera.width, camera.height, i) for i, camera in enumerate(cameras)]
+    blocks = [spread_blocks(camera.width, camera.height, i, FEW) for i, camera in enumerate(cameras)]
     images = []
     for camera, part in zip(cameras, blocks, strict=True):
         image = render_view(scene, camera, settings, part)

@@ -17,10 +17,10 @@ from vvgt_cli.cameras.blocks import Blocks, spread_blocks
 from vvgt_cli.cameras.boxed import drawn_in_box
 from vvgt_cli.conversion.case import view_edge
 from vvgt_cli.conversion.convert import convert
-from vvgt_cli.conversion.plan import DEFAULT_HALF_STEPS
+from vvgt_cli.conversion.plan import DEFAULT_STEPS
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.conversion.stages.refinement import refine
-from vvgt_cli.conversion.stages.views import views_of
+from vvgt_cli.conversion.stages.views import TrainingViews, views_of
 from vvgt_cli.descent import OptimizeOptions
 from vvgt_cli.gaussians import Gaussians, as_stored, read_ply, write_ply
 from vvgt_cli.gaussians.frames import transform
@@ -58,7 +58,7 @@ class LadderOptions:
 
     max_gaussians: int = 100_000
     size: int = 1080
-    steps: tuple[int, ...] = (25, DEFAULT_HALF_STEPS, 200, 400)
+    steps: tuple[int, ...] = (25, DEFAULT_STEPS, 200, 400)
     model: str | None = None
     seed: int = 0
 
@@ -191,8 +191,8 @@ def run_rungs(
         scores, images = reference.score(gaussians)
         seats = score_seats(gaussians, reference.seats)
         report.scores, report.seats = asdict(scores), [asdict(seat) for seat in seats]
-        views = views_of(rung.fit.steps or 0)
-        run = {"name": rung.name, "label": rung.label, "kind": rung.kind, "views": views, **asdict(report)}
+        run = {"name": rung.name, "label": rung.label, "kind": rung.kind, "views": _views_of(report, rung.fit)}
+        run |= asdict(report)
         yield run, upright(images, reference.cameras, reference.axes, partial(render, gaussians))
 
 
@@ -222,10 +222,17 @@ def _begin(source: SourceRequest, rung: Rung) -> tuple[Run, Scene]:
     return run, scene
 
 
+def _views_of(report: ConversionReport, fit: FitOptions) -> int:
+    """Training views that were planned, or that a baseline takes."""
+    if report.plan is None:
+        return views_of(fit.steps or 0, small=False)
+    return sum(stage["count"] for stage in report.plan["stages"] if stage["name"] == TrainingViews.name)
+
+
 def _views(run: Run, scene: Scene, fit: FitOptions) -> tuple[Views, Views]:
     from vvgt_cli.dvr import RenderSettings, render_views
 
-    train = default_views("train", views_of(fit.steps or 0), size=view_edge(fit.size, half=False))
+    train = default_views("train", views_of(fit.steps or 0, small=False), size=view_edge(fit.size, small=False))
     with run.stage("check views"):
         judges = judging_views(scene, default_views("check", size=fit.size), RenderSettings())
     with run.stage("views"):

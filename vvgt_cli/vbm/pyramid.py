@@ -8,7 +8,7 @@ import numba as nb
 import numpy as np
 
 from vvgt_cli.jit.decorators import inlined, kernel
-from vvgt_cli.vbm.columns import COLUMNS, MASS, MOMENTS, RED, SEEN
+from vvgt_cli.vbm.columns import COLUMNS, MASS, MOMENTS, RED, SEEN, XX, YY, ZZ, X, Y, Z
 
 SWEEPS = 8  # of Jacobi rotations: each squares the error, three are enough for most
 CONVERGED = 1e-30  # off-diagonal squares, of the trace's square
@@ -76,6 +76,17 @@ def sum_children(rows: np.ndarray, top: np.ndarray, start: np.ndarray, out: np.n
             for column in range(COLUMNS):
                 out[m, column] += rows[n, column]
             out_top[m] = max(out_top[m], top[n])
+
+
+@kernel("f8:2 f8:1 f8:2 f8:1", parallel=True, error_model="numpy")
+def score_splits(moments: np.ndarray, top: np.ndarray, edge: np.ndarray, out: np.ndarray) -> None:
+    """`tree.split_score` ``out`` (n,) of rows of ``moments`` (n, 17), ``top`` (n,) and edges ``edge`` (n, 3)."""
+    for n in nb.prange(len(out)):
+        row, mass = moments[n], moments[n, MASS]
+        area = (edge[n, 0] * edge[n, 1] * edge[n, 2]) ** (2.0 / 3.0)
+        x, y, z = row[X] / mass, row[Y] / mass, row[Z] / mass
+        variance = max((row[XX] + row[YY] + row[ZZ]) / mass - (x * x + y * y + z * z), 0.0)
+        out[n] = -math.expm1(-mass / area) * area * math.sqrt(top[n] * row[SEEN] / mass) * variance
 
 
 @inlined(error_model="numpy")

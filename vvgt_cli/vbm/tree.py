@@ -8,21 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from vvgt_cli.dvr.scene import Scene
-from vvgt_cli.vbm.columns import (
-    BLUE,
-    COLUMNS,
-    FIRST,
-    GREEN,
-    MASS,
-    RED,
-    SECOND,
-    SEEN,
-    XX,
-    YY,
-    ZZ,
-)
+from vvgt_cli.vbm.columns import BLUE, COLUMNS, FIRST, GREEN, MASS, RED, SECOND
 from vvgt_cli.vbm.moments import CHILDREN, Cells, cell_moments, morton
-from vvgt_cli.vbm.pyramid import sum_children, take_base
+from vvgt_cli.vbm.pyramid import score_splits, sum_children, take_base
 from vvgt_cli.vbm.visibility import Visibility
 
 HIDDEN = 1e-3  # cells that no view sees with more transmittance are dropped
@@ -118,13 +106,9 @@ def central(moments: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def split_score(tree: Tree) -> np.ndarray:
     """(n,) what a cell's spread costs the image: saturated mass x visibility x variance."""
-    m = tree.moments
-    mass = m[:, MASS]
-    area = np.cbrt(tree.edge.prod(axis=1)) ** 2
-    variance = (m[:, XX] + m[:, YY] + m[:, ZZ]) / mass - (m[:, FIRST] ** 2).sum(axis=1) / mass**2
-    seen = np.sqrt(tree.largest * m[:, SEEN] / mass)
-    result: np.ndarray = -np.expm1(-mass / area) * area * seen * np.maximum(variance, 0)
-    return result
+    score = np.empty(len(tree))
+    score_splits(tree.moments, tree.largest, tree.edge, score)
+    return score
 
 
 def select(tree: Tree, budget: int, score: np.ndarray | None = None) -> np.ndarray:

@@ -22,7 +22,7 @@ class BackProjection(Stage):
 
     def cost(self, case: Case) -> Cost:
         """As so many steps."""
-        return Cost(STEPS * step_seconds(case, half=False))
+        return Cost(STEPS * step_seconds(case, small=False))
 
     def run(self, work: Work) -> None:
         """Split and solve."""

@@ -16,8 +16,8 @@ from vvgt_cli.runs.record import Run
 from vvgt_cli.runs.views import Views
 from vvgt_cli.splat.constants import MIN_ALPHA
 
-STEP = 0.013, 0.035  # seconds per 400 x 400 px, per 100,000 Gaussians
-HALF_STEP = 0.006, 0.017  # likewise, on a view half that size
+STEP = 0.013, 0.024  # seconds per 400 x 400 px, per 100,000 Gaussians
+SMALL_STEP = 0.006, 0.020  # likewise, on a small view
 HARMONICS = 1.0, 1.1, 1.25, 1.4  # times as long with harmonics of degree 0 to 3
 LOOK = 25  # steps between two looks at the check views where a target ends the run; else one is taken in the middle
 SMALLEST = 0.5  # standard deviation of the longest axis in pixels of the screen: viewers drop or fade less
@@ -28,9 +28,9 @@ REASONS = {
 }  # fmt: skip
 
 
-def step_seconds(case: Case, half: bool) -> float:
+def step_seconds(case: Case, small: bool) -> float:
     """Of a step with its share of the looks at check views."""
-    each = HALF_STEP if half else STEP
+    each = SMALL_STEP if small else STEP
     one = case.pace * (each[0] * (case.edge / 400) ** 2 + each[1] * case.gaussians / 1e5)
     return HARMONICS[case.degree] * one
 
@@ -42,18 +42,18 @@ class Refinement(Stage):
     Attributes:
         steps: that there should be time for.
         most: where there is more time than that.
-        half: training views are half as large as they may be.
+        small: its training views are small.
     """
 
     name: ClassVar[str] = "refinement"
     improves: ClassVar[bool] = True
     steps: int = 0
     most: int = 0
-    half: bool = False
+    small: bool = False
 
     def cost(self, case: Case) -> Cost:
         """By steps."""
-        return Cost(self.steps * step_seconds(case, self.half))
+        return Cost(self.steps * step_seconds(case, self.small))
 
     def label(self) -> str:
         """With the number of steps."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import ClassVar
 
+from vvgt_cli.cameras.blocks import FEW
 from vvgt_cli.conversion.case import Case
 from vvgt_cli.conversion.stage import Cost, Stage, Work
 from vvgt_cli.runs.score import psnr_note, score_test_views
@@ -61,7 +62,7 @@ class Seats(Stage):
 
     def cost(self, case: Case) -> Cost:
         """By pixels."""
-        return Cost(SEATS[0] * case.judge + case.pace * SEATS[1])
+        return Cost(SEATS[0] * case.glance + case.pace * SEATS[1])
 
     def run(self, work: Work) -> None:
         """Score."""
@@ -70,6 +71,7 @@ class Seats(Stage):
             run.leave_out(self.name, "time is up")
             return
         with run.stage(self.name) as stage:
-            seats = score_seats(work.made(), seat_views(work.scene, from_above(work.fit.size), views=SIDE))
+            seen = seat_views(work.scene, from_above(work.fit.size), views=SIDE, enough=FEW)
+            seats = score_seats(work.made(), seen)
             run.report.seats = [asdict(seat) for seat in seats]
             stage.note = f"worst of {len(seats)}: {seats[0].name()}, {seats[0].psnr:.2f} dB"

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from vvgt_cli.cameras import default_views
+from vvgt_cli.cameras.blocks import spread_blocks
 from vvgt_cli.cameras.sets import SET_VIEWS
 from vvgt_cli.conversion.case import Case, view_edge
 from vvgt_cli.conversion.stage import Cost, Stage, Work
@@ -18,18 +19,20 @@ from vvgt_cli.splat.rules import Rule
 if TYPE_CHECKING:
     from vvgt_cli.dvr import RenderSettings, Scene
 
-REFINE_VIEWS = 72  # training views of gradient descent, which learns fewer by heart
-STEPS_A_SET = 48  # of gradient descent, for each further 24 views
+REFINE_VIEWS = 120  # training views of gradient descent at most
+A_STEP = 0.65, 0.85  # of them, small and large: fewer are learned by heart, more take the time of steps (docs/log.md)
 MARGIN, SAMPLES = 4.0, 12.0  # dB, where views are means over their pixels, and where they are samples of a screen's
+LONGER = 6.0  # dB more, for longer steps: their errors are the same from all sides
+PROBED = 72  # blocks of a view that rays are tried on
 LARGE = 0.5  # of the screen: views as large are means over their own pixels
-WIDE = 0.9  # standard deviation in pixels of whole training views
+WIDE = 0.9  # standard deviation in pixels
 SOLID = 0.9  # median opacity of opaque bodies
 
 
-def views_of(steps: int) -> int:
-    """Training views of so many steps: in a short run more steps gain more than more views."""
-    fewest = SET_VIEWS["train"]
-    return fewest * min(max(steps // STEPS_A_SET, 1), REFINE_VIEWS // fewest)
+def views_of(steps: int, small: bool) -> int:
+    """Training views of so many steps, in whole sets."""
+    fewest, each = SET_VIEWS["train"], A_STEP[0] if small else A_STEP[1]
+    return fewest * min(max(round(each * steps / fewest), 1), REFINE_VIEWS // fewest)
 
 
 @dataclass(frozen=True)
@@ -46,7 +49,7 @@ class CheckViews(Stage):
     def cost(self, case: Case) -> Cost:
         """One of them is drawn whole, of which blocks are kept."""
         count = SET_VIEWS["check"]
-        return Cost(count * case.judge, (count * case.judged + case.size**2) * VIEW_BYTES)
+        return Cost(count * case.glance, (count * case.glanced + case.size**2) * VIEW_BYTES)
 
     def run(self, work: Work) -> None:
         """Render them."""
@@ -106,29 +109,38 @@ def fine_enough(scene: Scene, start: Gaussians, size: int, rule: Rule, footprint
     """One ray a pixel where its error is `MARGIN` or `SAMPLES` below that of ``start``, else adaptive rays.
 
     The error is that of a check view of ``size`` px drawn by ``rule``, against the same finely rendered. Gradient
-    descent follows the jags of single rays at hard edges, and those of longer steps everywhere. Rays are spread over
-    ``footprint`` of a pixel's edge: views are samples of the screen's pixels, not means over their own.
+    descent follows the jags of single rays at hard edges, and those of longer steps everywhere: where the error is
+    `LONGER` below that too with steps of a voxel, these are taken. Rays are spread over ``footprint`` of a pixel's
+    edge: views are samples of the screen's pixels, not means over their own.
     """
     from vvgt_cli.dvr import RenderSettings, render_view
+    from vvgt_cli.dvr.render import FIT_VIEWS
     from vvgt_cli.metrics import psnr
     from vvgt_cli.splat import render
 
     camera = default_views("check", size=size)[0]
-    many, one = RenderSettings(footprint=footprint), RenderSettings(samples=1)
-    fine, single = (render_view(scene, camera, settings) for settings in (many, one))
-    wanted = psnr(fine[..., :3], render(start, camera, rule)[..., :3])
+    blocks = spread_blocks(size, size, enough=PROBED)
+
+    def picked(image: np.ndarray) -> np.ndarray:
+        return (image if blocks is None else blocks.pick(image))[..., :3]
+
+    many = RenderSettings(footprint=footprint)
+    fine = picked(render_view(scene, camera, many, blocks))
+    wanted = psnr(fine, picked(render(start, camera, rule, blocks=blocks)))
     wanted += MARGIN if footprint == 1 else SAMPLES
-    enough = psnr(fine[..., :3], single[..., :3]) >= wanted
-    return one if enough else many
+    for single, more in ((FIT_VIEWS, LONGER), (RenderSettings(samples=1), 0.0)):
+        if psnr(fine, picked(render_view(scene, camera, single, blocks))) >= wanted + more:
+            return single
+    return many
 
 
 def wide(gaussians: Gaussians, size: int) -> bool:
-    """Whether training views half as large as they may be still show Gaussians.
+    """Whether small training views still show Gaussians.
 
-    That is so where the median of middle standard deviations is above `WIDE` px of whole ones, and bodies are not
-    opaque: of these the edges are all there is.
+    That is so where the median of middle standard deviations is above `WIDE` px of a view twice as large, and bodies
+    are not opaque: of these the edges are all there is.
     """
-    camera = default_views("check", 1, size=view_edge(size, half=False))[0]
+    camera = default_views("check", 1, size=2 * view_edge(size, small=True))[0]
     pixel = float(np.linalg.norm(camera.position)) / camera.fx
     middle = np.exp(np.median(gaussians.log_scales, axis=1))  # of three
     solid = np.median(gaussians.opacity_logits) > np.log(SOLID / (1 - SOLID))
