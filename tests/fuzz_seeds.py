@@ -281,6 +281,22 @@ def transfer() -> list[Seed]:
     ]
 
 
+def label_tables() -> list[Seed]:
+    from test_labels import FREESURFER, JSON, SEGMENTS, SLICER, SNAP
+
+    from vvgt_cli.transfer.label_files import read_labels
+
+    read = lambda path: read_labels(str(path)).color(np.array([0.0, 1.0, 3.0, np.nan]))  # noqa: E731
+
+    return [
+        Seed("a.ctbl", SLICER.encode(), read),
+        Seed("LUT.txt", FREESURFER.encode(), read),
+        Seed("a.label", SNAP.encode(), read),
+        Seed("a.json", JSON.encode(), read),
+        Seed("a.seg.nrrd", SEGMENTS.encode() + bytes(8), read),
+    ]
+
+
 def ply() -> list[Seed]:
     from vvgt_cli.gaussians import Gaussians, PlyOptions, describe, read_ply, write_ply
     from vvgt_cli.volume.types import UnitFrame
@@ -375,6 +391,7 @@ def readers() -> dict[str, list[Seed]]:
         "OpenVDB": vdb(),
         "NumPy": numpy_files(),
         "transfer function": transfer(),
+        "label table": label_tables(),
         "Gaussians": ply(),
         "view set": cameras(),
         "model card": model_card(),

@@ -12,6 +12,8 @@ from vvgt_cli import checks
 from vvgt_cli.checks import BrokenError, Case, Figure, all_cases, require, run_case
 from vvgt_cli.checks.scenes import build, function, smooth, step
 from vvgt_cli.checks.stiffness import changes, stiffness
+from vvgt_cli.dvr import Scene
+from vvgt_cli.volume import Volume
 
 CASES = list(all_cases())
 
@@ -27,7 +29,7 @@ def test_there_are_enough_cases_through_every_stage_each_with_a_name_of_its_own(
     assert len({(case.stage, case.name) for case in CASES}) == len(CASES)
     assert {case.stage for case in CASES} == {
         "reading", "function", "ray caster", "closed form", "splats", "gradients", "optimiser", ".ply", "network",
-        "whole way", "harmonics", "light",
+        "whole way", "harmonics", "light", "optics grid",
     }  # fmt: skip
 
 
@@ -131,6 +133,17 @@ def test_a_spike_between_two_voxels_counts_as_change():
     change, abrupt = changes(build(data, function([0, 0.4, 0.5, 0.6, 1], [0, 0, 1, 0, 0])))
     assert change == 1
     assert abrupt == 1
+
+
+def test_stiffness_of_a_grid_is_that_of_its_extinction():
+    """Labels of 1 and 0.6 of the largest extinction along x, then nothing: steps of 0.4 and 0.6."""
+    grid = np.zeros((3, 3, 6, 4), np.float32)
+    grid[:, :, :4, 3] = 0.5, 0.5, 0.3, 0.3
+    scene = Scene.of_grid(Volume(grid[..., 3]), function([0, 1], [0, 1]), 1.0, grid)
+    change, abrupt = changes(scene)
+    assert change == pytest.approx(0.6)
+    assert abrupt == pytest.approx(9 / (9 * 4 + 4 * 6 * 2))  # of neighbours along x, and along y and z, that show any
+    assert stiffness(scene, 1e-3).depth_per_step == pytest.approx(0.25)
 
 
 def test_slabs_change_no_figure(monkeypatch):

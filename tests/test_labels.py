@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import vvgt_cli as library
+from vvgt_cli.dvr.layers import grid_of
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import read_ply
+from vvgt_cli.runs.source import SourceRequest, load
 from vvgt_cli.transfer.label_files import read_labels
 from vvgt_cli.transfer.labels import LabelTable, distinct
 from vvgt_cli.volume import Volume
@@ -81,7 +84,12 @@ def test_a_function_of_whole_numbers() -> None:
         ('{"liver": {}}', "a.json", "'liver'"),
         ('{"1": {"color": [0, 0, 1], "opacity": 2}}', "a.json", "opacity 2"),
         ('{"1": {"color": "red"}}', "a.json", "three numbers"),
-        ("{", "a.json", "not JSON"),
+        ("{", "a.json", "not JSON .*expected a table of labels"),
+        ("9" * 5000 + " a 1 2 3 4\n", "a.ctbl", "line 1"),
+        ("1 a 2 3 4 " + "9" * 400 + "\n", "a.ctbl", "line 1"),
+        ("1 255 51 0 " + "9" * 400 + ' 1 1 "a"\n', "a.label", "line 1"),
+        ("1" + " " * 100_000 + "x\n", "a.ctbl", "line 1"),  # an expression took the third power of this
+        (SEGMENTS.replace("Segment1", "Segment" + "9" * 5000).replace("Segment0", "Other"), "a.seg.nrrd", "no label"),
         (SEGMENTS.replace("0 0 1\n\n", "0 x\n\n"), "a.seg.nrrd", "segment 1"),
         (SEGMENTS.replace("Segment", "Other"), "a.seg.nrrd", "no label"),
     ],
@@ -90,6 +98,17 @@ def test_faulty_tables(tmp_path: Path, text: str, name: str, said: str) -> None:
     with pytest.raises(DataError, match=said) as error:
         read_labels(table(tmp_path, text, name))
     assert "\n" not in str(error.value)
+
+
+def test_names_of_several_words_and_long_tables(tmp_path: Path) -> None:
+    text = '1 left  kidney 10 20 30 255\n2 "part 7" 10 20 30\n3 lobe 7 10 20 30 255\n4 5 6 7 8 9\n'
+    found = read_labels(table(tmp_path, text, "a.ctbl")).labels
+    assert [e.name for e in found] == ["left  kidney", "part 7", "lobe 7", "5"]
+    assert {tuple(np.round(255 * np.array(e.color)).astype(int)) for e in found[:3]} == {(10, 20, 30)}
+    begin = time.process_time()
+    with pytest.raises(DataError, match="label 39999 twice"):
+        read_labels(table(tmp_path, "".join(f"{k} a 1 2 3 255\n" for k in [*range(40_000), 39_999]), "b.ctbl"))
+    assert time.process_time() - begin < 10  # 35 s by counting each
 
 
 def test_recognised_by_type_name_and_number() -> None:
@@ -176,7 +195,7 @@ def test_one_file_a_label_and_they_add_up(vvgt, tmp_path: Path, seg: Path) -> No
 
 
 def test_extinctions_of_labels_add_up_to_the_whole() -> None:
-    from vvgt_cli.dvr.layers import Layer, grid_of
+    from vvgt_cli.dvr.layers import Layer
 
     volume, whole = Volume(balls()), distinct([0, 1, 3])
     grids = [grid_of([Layer(volume, t, 1.0)], volume) for t in (whole, whole.only(1), whole.only(3))]
@@ -241,3 +260,67 @@ def test_in_python() -> None:
     with pytest.raises(UsageError, match="no such file"):
         library.convert(balls(), labels="nowhere.ctbl")
     assert isinstance(distinct([1]), LabelTable)
+
+
+def overlapping(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """A .seg.nrrd of two layers, as 3D Slicer writes segments that overlap: label 1 in both, and 2 in the second."""
+    a, b = np.zeros((2, 10, 12, 14), np.uint8)
+    a[2:8, 2:10, 2:8] = 1
+    b[2:8, 2:10, 6:12] = 1
+    b[4:6, 2:10, 6:8] = 2
+    header = (
+        "NRRD0004\ntype: uchar\ndimension: 4\nspace: left-posterior-superior\nsizes: 2 14 12 10\n"
+        "space directions: none (1,0,0) (0,1,0) (0,0,1)\nkinds: list domain domain domain\nencoding: raw\n"
+        "space origin: (0,0,0)\nSegment0_LabelValue:=1\nSegment0_Layer:=0\nSegment0_Name:=liver\n"
+        "Segment0_Color:=1 0 0\nSegment1_LabelValue:=1\nSegment1_Layer:=1\nSegment1_Name:=lesion\n"
+        "Segment1_Color:=0 0 1\nSegment2_LabelValue:=2\nSegment2_Layer:=1\nSegment2_Name:=vein\n"
+        "Segment2_Color:=0 1 0\n\n"
+    )
+    path.write_bytes(header.encode() + np.stack([a, b], axis=-1).tobytes())
+    return a, b
+
+
+def test_segments_that_overlap_add_up(vvgt, tmp_path: Path) -> None:
+    path = tmp_path / "x.seg.nrrd"
+    a, b = overlapping(path)
+    source = load(SourceRequest(str(path)))
+    grid = grid_of(source.layers, source.volume)
+    solid = grid[2, 2, 2, 3]
+    np.testing.assert_allclose(grid[..., 3], solid * ((a > 0).astype(int) + (b > 0)), rtol=1e-6)
+    np.testing.assert_allclose(grid[..., :3], solid * np.stack([a == 1, b == 2, b == 1], axis=-1), rtol=1e-6)
+    done = vvgt("convert", path, "--split-labels", *SMALL, "-o", tmp_path / "p_{}.ply")
+    assert done.code == 0, done.err
+    index = json.loads((tmp_path / "p_index.json").read_text())
+    assert [(row["name"], row["file"]) for row in index["files"]] == [
+        ("liver", "p_0-1-liver.ply"), ("lesion", "p_1-1-lesion.ply"), ("vein", "p_2-vein.ply")
+    ]  # fmt: skip
+    wanted = ((1, 0, 0), (0, 0, 1), (0, 1, 0))
+    for row, color in zip(index["files"], wanted, strict=True):
+        colors = read_ply(str(tmp_path / row["file"]))[0].colors
+        assert np.median(colors @ color) > 0.7
+        assert np.abs(colors[:, np.array(color) == 0]).max() < 1e-6
+    assert json.loads(vvgt("info", path, "--json").out)["segment_layers"] == 2
+    layer = vvgt("init", "example:blob:8", "--layer", path, *SMALL[:4], "-o", tmp_path / "l.ply")
+    assert layer.code == 0, layer.err
+    for options in (("--tf", "gray"), ("--labels", "none")):
+        done = vvgt("init", path, *options, "-o", tmp_path / "n.ply")
+        assert done.code == 2
+        assert "2 layers of segments that overlap" in done.error
+    one = vvgt("init", path, "--component", 1, *SMALL[:4], "-o", tmp_path / "c.ply")
+    assert one.code == 0, one.err
+    series = vvgt("convert", tmp_path / "*.seg.nrrd", *SMALL, "-o", tmp_path / "s_{}.ply")
+    assert "convert such frames one by one" in series.error
+    path.write_bytes(path.read_bytes().replace(b"Segment0_Layer:=0", b"Segment0_Layer:=7"))
+    assert "layer 0: no label in it" in vvgt("init", path, "-o", tmp_path / "n.ply").error
+
+
+def test_labels_of_a_series_are_those_that_there_are(vvgt, tmp_path: Path) -> None:
+    """Two labels of numbers that are far apart make a table of two, not of all between."""
+    far = np.where(balls() == 3, 2_000_000_000, balls()).astype(np.int32)
+    for k in range(2):
+        np.save(tmp_path / f"run_seg_{k}.npy", far)
+    done = vvgt("convert", tmp_path / "run_seg_*.npy", *SMALL, "-o", tmp_path / "o_{}.ply")
+    assert done.code == 0, done.err
+    colors = read_ply(str(tmp_path / "o_1.ply"))[0].colors
+    near = np.abs(colors[:, None] - [e.color for e in distinct([1, 2_000_000_000]).labels]).max(axis=2).min(axis=1)
+    assert np.median(near) < 0.1

@@ -198,3 +198,57 @@ def test_statistics_together() -> None:
     assert off <= 0.02 * 479
     constant = merge_statistics([statistics(Volume(np.full((2, 2, 2), 3.0)))] * 2)
     assert (constant.lo, constant.hi, constant.histogram.sum()) == (3, 3, 16)
+
+
+def write_colors(path: Path, k: int, samples: int = 3) -> None:
+    """A frame of RGB voxels that grows brighter; the first is black."""
+    z, y, x = np.mgrid[:6, :8, :10]
+    values = np.stack([x, y, z, x + y], axis=-1)[..., :samples] * (10 * k)
+    tifffile.imwrite(path, values.astype(np.uint8), photometric="rgb")
+
+
+def test_frames_of_colours(vvgt, series: Path) -> None:
+    for k in range(3):
+        write_colors(series / f"rgb_{k}.tif", k)
+    out = series / "out" / "c_{}.ply"
+    done = vvgt("convert", series / "rgb_*.tif", "-o", out, *[a for a in SMALL if a != "-q"])
+    assert done.code == 0, done.err
+    assert "opacity by luminance" in done.err
+    assert "rgb_0.tif: nothing of it is visible" in done.err
+    made = contents(series / "out")
+    assert list(made) == ["c_1.ply", "c_2.ply"]
+    assert vvgt("convert", series / "rgb_1.tif", "-o", series / "alone.ply", *SMALL).code == 0
+    assert (series / "alone.ply").read_bytes() == made["c_1.ply"]
+    write_colors(series / "rgb_3.tif", 1, 4)
+    assert "components 4; expected the 3 of rgb_0.tif" in vvgt("convert", series / "rgb_*.tif", "-o", out, *SMALL).error
+
+
+def test_channels_of_time_steps_have_one_function_each(vvgt, series: Path, stand_in: list) -> None:
+    """The ramp of a channel follows from all frames: the brightest one is not as bright in the first."""
+    rng = np.random.default_rng(0)
+    values = rng.random((3, 6, 2, 8, 10)) * np.array([1, 2, 4])[:, None, None, None, None] * 1000
+    tifffile.imwrite(series / "t.ome.tif", values.astype(np.uint16), ome=True, metadata={"axes": "TZCYX"})
+    run = ("convert", series / "t.ome.tif", "--channel", "all", "-o", series / "out" / "{}.ply", *SMALL[:-1])
+    done = vvgt(*run)
+    assert done.code == 0, done.err
+    assert "3 of 10 x 8 x 6" in done.err
+    layers = [load(request.source).layers for request in stand_in]
+    nodes = [[layer.tf.node_range() for layer in frame] for frame in layers]
+    assert [len(frame) for frame in layers] == [2, 2, 2]
+    assert nodes[0] == nodes[1] == nodes[2]
+    assert nodes[0][0][1] == pytest.approx(4000, rel=0.02)
+    assert all((a.volume.data != b.volume.data).any() for a, b in zip(layers[0], layers[1], strict=True))
+
+
+def test_layers_over_frames_have_one_function_and_dark_frames_are_shown(vvgt, series: Path, stand_in: list) -> None:
+    """Frame 8 is nothing under the function; what is laid over it is seen all the same."""
+    np.save(series / "other.npy", np.ones((8, 10, 12), np.float32))
+    run = ("convert", series / "run_*.npy", "--layer", f"{series / 'other.npy'},tf={series / 'tf.json'}")
+    done = vvgt(*run, "--tf", series / "tf.json", "-o", series / "out" / "{:d}.ply", *SMALL)
+    assert done.code == 0, done.err
+    assert len(contents(series / "out")) == 4
+    stand_in.clear()
+    done = vvgt(*run, "-o", series / "out" / "b{:d}.ply", *SMALL, "--overwrite")
+    assert done.code == 0, done.err
+    made = [load(request.source).layers[0].tf for request in stand_in]
+    assert len({tf.node_range() for tf in made}) == 1

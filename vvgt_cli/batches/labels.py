@@ -23,6 +23,7 @@ from vvgt_cli.transfer.labels import Label, LabelTable
 from vvgt_cli.volume import Volume
 
 INDEX = "index"  # in the place of a label's name
+LONGEST = 80  # characters of a label's name in a file's
 
 
 def convert_labels(request: ConvertRequest, console: Console | None = None) -> dict[str, Any]:
@@ -44,17 +45,23 @@ def convert_labels(request: ConvertRequest, console: Console | None = None) -> d
     named(request, INDEX, "label")  # its errors come before the volume
     run = Run(console, ConversionReport("convert"))
     with run.stage("volume") as stage:
-        (layer,) = layers_of(open_parts(source.path, source.read), None, source.labels or AUTO)
-        volume, table = layer.volume, layer.tf
-        assert isinstance(table, LabelTable)
-        labels = [label for label in table.labels if label.opacity > 0]
-        stage.note = f"{volume.name}, {len(labels)} labels of {table.name}"
+        maps = [
+            (layer.volume, layer.tf)
+            for layer in layers_of(open_parts(source.path, source.read), None, source.labels or AUTO)
+            if isinstance(layer.tf, LabelTable)
+        ]
+        shown = [(volume, table, label) for volume, table in maps for label in table.labels if label.opacity > 0]
+        labels = [label for *_, label in shown]
+        title, tables = maps[0][0].name, " + ".join(table.name for _, table in maps)
+        stage.note = f"{title}, {len(labels)} labels of {tables}"
     index = str(Path(str(request.output).replace("{}", INDEX)).with_suffix(".json"))
     requests = []
-    for label, share in zip(labels, shares(volume, labels, request.fit.max_gaussians), strict=True):
+    for (volume, table, label), share in zip(shown, shares(shown, request.fit.max_gaussians), strict=True):
         alone = replace(source, volume=volume, labels=table.only(label.number))
         one = replace(request, source=alone, fit=replace(request.fit, max_gaussians=share))
-        requests.append(named(one, file_name(label), "label"))
+        again = sum(other.number == label.number for other in labels) > 1  # of segments that overlap
+        name = f"{volume.name.rpartition(' ')[2]}-{file_name(label)}" if again else file_name(label)
+        requests.append(named(one, name, "label"))
     outputs = [output for one in requests for output in one.outputs()]
     check_outputs([*outputs, Output("-o", index, (".json",), binary=False)], source.paths(), request.overwrite)
     rows = []
@@ -68,7 +75,7 @@ def convert_labels(request: ConvertRequest, console: Console | None = None) -> d
         rows.append(_row(label, one, report))
         if report.refinement and report.refinement["reason"] == "interrupted":
             raise KeyboardInterrupt
-    found = {"format": "vvgt-labels", "volume": volume.name, "table": table.name, "files": rows}
+    found = {"format": "vvgt-labels", "volume": title, "table": tables, "files": rows}
     write_text(index, json.dumps(plain(found), indent=2) + "\n", request.overwrite)
     console.say(f"{index}: {len(rows)} labels")
     return found
@@ -82,21 +89,27 @@ def _row(label: Label, request: ConvertRequest, report: ConversionReport) -> dic
     }  # fmt: skip
 
 
-def shares(volume: Volume, labels: Sequence[Label], budget: int) -> list[int]:
+def shares(shown: Sequence[tuple[Volume, LabelTable, Label]], budget: int) -> list[int]:
     """Gaussians of each label, at most ``budget`` in all but for one a label."""
-    counts = np.zeros(len(labels))
-    numbers = np.array([label.number for label in labels], np.float64)
-    for z in range(len(volume.data)):
-        values, many = np.unique(
-            volume.slope * volume.data[z].astype(np.float64) + volume.intercept, return_counts=True
-        )
-        at = np.minimum(np.searchsorted(numbers, values), len(numbers) - 1)
-        np.add.at(counts, at, np.where(numbers[at] == values, many, 0))
-    weight = np.maximum(counts, 1) ** (2 / 3)
+    weight = np.array([max(count, 1) for count in _voxels(shown)], np.float64) ** (2 / 3)
     weight = np.maximum(weight / weight.sum(), 0.01)
     return [max(int(budget * share), 1) for share in weight / weight.sum()]
 
 
+def _voxels(shown: Sequence[tuple[Volume, LabelTable, Label]]) -> list[int]:
+    """Voxels of each label in its map; every map is counted once."""
+    counts: dict[int, dict[float, int]] = {}
+    for volume, *_ in shown:
+        if id(volume) in counts:
+            continue
+        own = counts[id(volume)] = {}
+        for z in range(len(volume.data)):
+            values, many = np.unique(volume.data[z], return_counts=True)
+            for value, n in zip(volume.slope * values.astype(np.float64) + volume.intercept, many, strict=True):
+                own[float(value)] = own.get(float(value), 0) + int(n)
+    return [counts[id(volume)].get(float(label.number), 0) for volume, _, label in shown]
+
+
 def file_name(label: Label) -> str:
     """Its number, which no other has, and its name in plain characters."""
-    return f"{label.number}-{re.sub(r'[^0-9A-Za-z]+', '-', label.name).strip('-')}".strip("-")
+    return f"{label.number}-{re.sub(r'[^0-9A-Za-z]+', '-', label.name)[:LONGEST].strip('-')}".strip("-")

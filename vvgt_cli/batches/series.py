@@ -15,12 +15,12 @@ from vvgt_cli import __version__
 from vvgt_cli.batches.manifest import Manifest, Shard
 from vvgt_cli.conversion.convert import convert
 from vvgt_cli.conversion.request import ConvertRequest
-from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.errors import DataError, SeveralComponents, UsageError
 from vvgt_cli.files import claim, read_text
 from vvgt_cli.network.card import CARD, find_model
 from vvgt_cli.progress import Console
 from vvgt_cli.runs.digests import digest, volume_digest
-from vvgt_cli.runs.layered import AUTO, NONE
+from vvgt_cli.runs.layered import ALL, AUTO, COLOR, NONE, Content, functions_of, open_parts
 from vvgt_cli.runs.outputs import check_outputs
 from vvgt_cli.runs.place import way_up
 from vvgt_cli.runs.record import ConversionReport, Run
@@ -28,7 +28,7 @@ from vvgt_cli.runs.source import SourceRequest
 from vvgt_cli.transfer.label_files import read_labels
 from vvgt_cli.transfer.labels import LabelTable, distinct
 from vvgt_cli.volume import ReadOptions, Statistics, Volume, statistics
-from vvgt_cli.volume.label_maps import recognised
+from vvgt_cli.volume.label_maps import labels_in, recognised
 
 if TYPE_CHECKING:
     from vvgt_cli.transfer import TransferFunction
@@ -73,46 +73,81 @@ class Frames:
 
     Attributes:
         count: how many there are.
-        own: range (lo, hi) of each.
-        whole: statistics of all frames together.
+        own: range (lo, hi) of each frame's components, as `Content.classified` has them.
+        whole: statistics of all frames together, of each component.
         first: the first frame without its values; the grid of all of them is its.
         content: digest of all frames' values.
+        labels: of all frames, where they are label maps.
     """
 
     count: int
-    own: list[tuple[float, float]]
-    whole: Statistics
-    first: Volume
+    own: list[list[tuple[float, float]]]
+    whole: tuple[Statistics, ...]
+    first: Content
     content: str
+    labels: tuple[int, ...] | None
+
+    @property
+    def grid(self) -> Volume:
+        """That all frames share."""
+        return self.first.volumes[0]
 
 
-def survey(steps: Sequence[Step], console: Console) -> Frames:
+def survey(steps: Sequence[Step], labels: str | LabelTable | None, tf: object, console: Console) -> Frames:
     """Read every frame once, for the range and the digest of all.
+
+    Args:
+        steps: the frames.
+        labels, tf: as they are asked for.
+        console: for progress.
 
     Raises:
         DataError: a frame that cannot be read, or on another grid than the first.
+        UsageError: frames of segments that overlap.
     """
-    from vvgt_cli.synth.sources import open_volume
-
-    first: Volume | None = None
+    first: Content | None = None
     numbers, digests = [], []
+    mapped, found = labels not in (None, NONE), set[int]()
     bar = console.bar("range")
     for k, step in enumerate(steps):
-        volume = open_volume(step.volume, step.read)
-        if first is None:
-            first = replace(volume, data=np.broadcast_to(volume.data.dtype.type(0), volume.data.shape))
-        if _grid(volume) != _grid(first):
-            raise DataError(
-                f"{step.name}: {_grid_text(volume)}; expected the grid of {steps[0].name}, {_grid_text(first)}: frames "
-                "of one series share it"
-            )
-        numbers.append(statistics(volume))
-        digests.append(volume_digest(volume))
+        content = open_parts(step.volume, step.read)
+        if content.overlapping:
+            raise UsageError(f"{step.name}: segments that overlap, in several layers; convert such frames one by one")
+        first = first or replace(content, volumes=tuple(map(_hollow, content.volumes)))
+        _check_frame(step, steps[0], content, first)
+        if k == 0 and labels is None and tf is None and content.one_field:
+            mapped = recognised(content.volumes[0])
+        if mapped and content.one_field:
+            found.update(labels_in(content.volumes[0]))
+        numbers.append([statistics(volume) for volume in content.classified])
+        digests += [volume_digest(volume) for volume in content.volumes]
         if bar:
             bar(k + 1, len(steps))
     if first is None:
         raise UsageError("a series without frames")
-    return Frames(len(steps), [(n.lo, n.hi) for n in numbers], merge_statistics(numbers), first, digest(*digests))
+    whole = tuple(merge_statistics(parts) for parts in zip(*numbers, strict=True))
+    own = [[(n.lo, n.hi) for n in parts] for parts in numbers]
+    return Frames(len(steps), own, whole, first, digest(*digests), tuple(sorted(found)) if mapped else None)
+
+
+def _hollow(volume: Volume) -> Volume:
+    """The same without its values."""
+    return replace(volume, data=np.broadcast_to(volume.data.dtype.type(0), volume.data.shape))
+
+
+def _check_frame(step: Step, begin: Step, content: Content, first: Content) -> None:
+    """Refuse frames of another grid, or of other components."""
+    volume, grid = content.volumes[0], first.volumes[0]
+    if _grid(volume) != _grid(grid):
+        raise DataError(
+            f"{step.name}: {_grid_text(volume)}; expected the grid of {begin.name}, {_grid_text(grid)}: frames of one "
+            "series share it"
+        )
+    if (len(content.volumes), content.color) != (len(first.volumes), first.color):
+        raise DataError(
+            f"{step.name}: components {len(content.volumes)}; expected the {len(first.volumes)} of {begin.name}: "
+            "frames of one series share them"
+        )
 
 
 def _grid(volume: Volume) -> tuple[Any, ...]:
@@ -167,19 +202,22 @@ def convert_series(request: ConvertRequest, shard: Shard, console: Console | Non
     names = _outputs(request, len(steps))
     run = Run(console, ConversionReport("convert"))
     with run.stage("frames") as stage:
-        frames = survey(steps, console)
+        frames = survey(steps, source.labels, source.tf, console)
         source = replace(source, statistics=frames.whole)
-        if source.labels is None and source.tf is None and recognised(frames.first):
+        if source.labels is None and frames.labels is not None:
             source = replace(source, labels=AUTO)
-        tf, distance = _function(source, frames)
-        dark = [not tf.support(*own) for own in frames.own]
+        shown, distance = _functions(source, frames)
+        dark = [not source.layers and _dark(shown, own) for own in frames.own]
+        lo, hi = min(n.lo for n in frames.whole), max(n.hi for n in frames.whole)
         stage.note = (
-            f"{len(steps)} of {' x '.join(map(str, frames.first.dims))}, values {frames.whole.lo:g} to "
-            f"{frames.whole.hi:g}; {tf.name}: opacity per {distance[0]:g} ({distance[1]})"
+            f"{len(steps)} of {' x '.join(map(str, frames.grid.dims))}, values {lo:g} to {hi:g}; "
+            f"{' + '.join(tf.name for tf in shown)}: opacity per {distance[0]:g} ({distance[1]})"
         )
     if all(dark):
-        raise DataError(f"{source.volume}: {tf.name} shows nothing in any of {len(steps)} frames; try another function")
-    manifest = Manifest(Path(names[0][0]).parent, _settings(request, frames, tf, distance[0]), shard, what="frames")
+        raise DataError(
+            f"{source.volume}: {shown[0].name} shows nothing in any of {len(steps)} frames; try another function"
+        )
+    manifest = Manifest(Path(names[0][0]).parent, _settings(request, frames, shown, distance[0]), shard, what="frames")
     with claim(manifest.folder / shard.manifest):
         manifest.open([Path(name).name for row in names for name in row], request.overwrite)
         manifest.record()
@@ -216,32 +254,38 @@ def _frames(
     return done
 
 
-def _function(source: SourceRequest, frames: Frames) -> tuple[TransferFunction | LabelTable, tuple[float, str]]:
-    """The function on data values, and its unit distance with how it was chosen; the same for every frame."""
-    from vvgt_cli.transfer import from_histogram, read_transfer_function, resolve, unit_distance
+def _dark(shown: Sequence[TransferFunction | LabelTable], own: Sequence[tuple[float, float]]) -> bool:
+    """Whether nothing of a frame is visible."""
+    return not any(tf.support(*limits) for tf, limits in zip(shown, own, strict=True))
+
+
+def _functions(
+    source: SourceRequest, frames: Frames
+) -> tuple[Sequence[TransferFunction | LabelTable], tuple[float, str]]:
+    """The function of each component, on data values, and the first one's unit distance with how it was chosen.
+
+    They are the same for every frame.
+    """
+    from vvgt_cli.transfer import read_transfer_function, unit_distance
     from vvgt_cli.transfer.resolve import parse_tf_range
 
-    if source.labels not in (None, NONE):
-        table = _table(source.labels, frames.whole)
-        return table, unit_distance(source.unit_distance, frames.first)
+    if frames.labels is not None and frames.first.one_field:
+        return (_table(source.labels, frames.labels),), unit_distance(source.unit_distance, frames.grid)
     read = read_transfer_function(source.tf) if isinstance(source.tf, str) else source.tf
-    if read is None:
-        shown = from_histogram(frames.whole, frames.first.hounsfield)
-    else:
-        shown = resolve(read, frames.whole, parse_tf_range(source.tf_range))
-    return shown, unit_distance(source.unit_distance, frames.first, read or shown)
+    shown = functions_of(frames.first, frames.whole, read, parse_tf_range(source.tf_range))
+    given = read if read is not None and frames.first.one_field else shown[0]
+    return shown, unit_distance(source.unit_distance, frames.grid, given)
 
 
-def _table(labels: str | LabelTable | None, whole: Statistics) -> LabelTable:
+def _table(labels: str | LabelTable | None, found: Sequence[int]) -> LabelTable:
     """Of a series of label maps; colours that are made depend on a label's number alone."""
     if isinstance(labels, str) and labels != AUTO:
         return read_labels(labels)
-    return labels if isinstance(labels, LabelTable) else distinct(range(int(whole.lo), int(whole.hi) + 1))
+    return labels if isinstance(labels, LabelTable) else distinct(found)
 
 
 def _steps(source: SourceRequest) -> list[Step]:
     """The files of a glob, or the time steps of the one file that is named."""
-    from vvgt_cli.volume.registry import time_steps
     from vvgt_cli.volume.slices import matching
 
     files = [] if os.path.exists(source.path) else matching(source.path)
@@ -254,10 +298,22 @@ def _steps(source: SourceRequest) -> list[Step]:
         return [Step(file.name, str(file), source.read) for file in files]
     volume = str(files[0]) if files else source.path
     name = Path(volume).name
-    count = time_steps(volume, source.read)
+    count = _count(volume, source.read)
     if count == 1:
         return [Step(name, volume, source.read)]
     return [Step(f"{name} time {k}", volume, replace(source.read, time=k)) for k in range(count)]
+
+
+def _count(volume: str, read: ReadOptions) -> int:
+    """Time steps of a file, whatever its components are."""
+    from vvgt_cli.volume.registry import time_steps
+
+    if read.component in (COLOR, ALL):
+        read = replace(read, component=0)
+    try:
+        return time_steps(volume, read)
+    except SeveralComponents:
+        return time_steps(volume, replace(read, component=0))
 
 
 def _outputs(request: ConvertRequest, count: int) -> list[list[str]]:
@@ -286,16 +342,19 @@ def _frame(request: ConvertRequest, source: SourceRequest, names: list[str]) -> 
 
 
 def _settings(
-    request: ConvertRequest, frames: Frames, tf: TransferFunction | LabelTable, distance: float
+    request: ConvertRequest, frames: Frames, shown: Sequence[TransferFunction | LabelTable], distance: float
 ) -> dict[str, Any]:
     """Everything that the files depend on; named as the command line names it."""
     ply = asdict(request.ply)
-    lighting = request.source.light.lighting(tf.lighting, frames.first.space)
+    lighting = request.source.light.lighting(shown[0].lighting, frames.grid.space)
+    looks: list[Any] = []
+    for tf in shown:
+        looks += tf.labels if isinstance(tf, LabelTable) else (tf.opacity_nodes, tf.color_map)
     return {
         "version": __version__,
         "volume": frames.content,
         "frames": frames.count,
-        "function": digest(*(tf.labels if isinstance(tf, LabelTable) else (tf.opacity_nodes, tf.color_map))),
+        "function": digest(*looks),
         **({"layers": [repr(layer) for layer in request.source.layers]} if request.source.layers else {}),
         "opacity_unit_distance": distance,
         **({} if lighting is None else {"light": lighting.text()}),
@@ -303,7 +362,7 @@ def _settings(
         **asdict(request.limits),
         "model": read_text(find_model(request.fit.model) / CARD) if request.fit.model else None,
         **{key: ply[key] for key in ("frame", "sh_degree", "comments")},
-        "up": way_up(request.up, request.ply.frame, frames.first.space),
-        "place": [frames.first.space, *frames.first.affine[:3].ravel().tolist()],
+        "up": way_up(request.up, request.ply.frame, frames.grid.space),
+        "place": [frames.grid.space, *frames.grid.affine[:3].ravel().tolist()],
         "outputs": [Path(p).name for p in (request.output, request.report, request.preview) if p],
     }

@@ -15,6 +15,7 @@ MODULES = (
     "raycast",
     "light",
     "mapping",
+    "grids",
     "forward",
     "backward",
     "descent",

@@ -46,7 +46,7 @@ def sound(gaussians: Gaussians, scene: Scene, budget: int) -> None:
     require(gaussians.log_scales.max() < 1, f"a scale of {np.exp(float(gaussians.log_scales.max())):.3g}")
 
 
-def _hard(row: Hard) -> Figure:
+def hard(row: Hard) -> Figure:
     """Mass of the base cells against quadrature; the pyramid keeps it, and every cut through it."""
     from vvgt_cli.vbm.closed_form import closed_form
     from vvgt_cli.vbm.moments import base_cells
@@ -144,7 +144,7 @@ def _back_projected(scene: Scene) -> Figure:
 def cases() -> Iterator[Case]:
     """All of them."""
     for row in hard_scenes():
-        yield Case(STAGE, row.name, partial(_hard, row))
+        yield Case(STAGE, row.name, partial(hard, row))
     yield Case(STAGE, "K = 0", _no_budget)
     for method in METHODS:
         for budget in (1, 10, 1_000_000):

@@ -68,13 +68,14 @@ class _Ranges:
 
 def changes(scene: Scene, progress: Callable[[int, int], None] | None = None) -> tuple[float, float]:
     """`Stiffness.change_per_voxel` and `Stiffness.abrupt`; neighbours that are not finite are left out."""
-    ranges = _Ranges(scene.tables.nodes[:, 3])
+    ranges = None if scene.grid is not None else _Ranges(scene.tables.nodes[:, 3])  # a grid holds extinction itself
     top = scene.tables.largest_extinction()
     nz, ny, nx = scene.values.shape
     thick = max(1, SLAB // (ny * nx))
     largest, abrupt, visible = 0.0, 0, 0
     for z in range(0, nz, thick):
-        u = scene.tables.coordinate(scene.values[z : z + thick + 1])
+        u = scene.values[z : z + thick + 1]
+        u = u.astype(np.float64) if ranges is None else scene.tables.coordinate(u)
         for axis in range(3):
             count = u.shape[axis]
             a, b = np.take(u, range(count - 1), axis), np.take(u, range(1, count), axis)
@@ -85,7 +86,10 @@ def changes(scene: Scene, progress: Callable[[int, int], None] | None = None) ->
             if not a.size:
                 continue
             first, last = np.minimum(a, b), np.maximum(a, b)
-            change, high = ranges.change(np.floor(first).astype(np.int64), np.ceil(last).astype(np.int64))
+            if ranges is None:
+                change, high = last - first, last
+            else:
+                change, high = ranges.change(np.floor(first).astype(np.int64), np.ceil(last).astype(np.int64))
             largest = max(largest, float(change.max()))
             abrupt += int(np.count_nonzero(change > top / 2))
             visible += int(np.count_nonzero(high > 0))

@@ -24,9 +24,9 @@ from vvgt_cli.transfer import (
     unit_distance,
 )
 from vvgt_cli.transfer.histogram import UNIT_SHARE
-from vvgt_cli.transfer.label_files import read_labels
+from vvgt_cli.transfer.label_files import read_labels, segments_of
 from vvgt_cli.transfer.labels import LabelTable, distinct
-from vvgt_cli.volume import ReadOptions, Volume, statistics
+from vvgt_cli.volume import ReadOptions, Statistics, Volume, statistics
 from vvgt_cli.volume.label_maps import labels_in, recognised
 
 AUTO, NONE = "auto", "none"
@@ -86,16 +86,33 @@ class Content:
     """What a file holds.
 
     Attributes:
-        volumes: the scalar field; or red, green, blue and perhaps opacity; or a channel each.
+        volumes: the scalar field; or red, green, blue and perhaps opacity; or a channel each; or label maps.
         color: they are colours.
         colors: RGB of each channel, None where the file says none.
         path: of the file, None where it is in memory.
+        overlapping: they are the layers of a segmentation whose segments overlap.
+        layer: number of the one component that was asked for, None where none was.
     """
 
     volumes: tuple[Volume, ...]
     color: bool = False
     colors: Sequence[tuple[float, float, float] | None] = ()
     path: str | None = None
+    overlapping: bool = False
+    layer: int | None = None
+
+    @property
+    def one_field(self) -> bool:
+        """Whether it is scalars or labels alone."""
+        return not self.color and len(self.volumes) == 1
+
+    @property
+    def classified(self) -> tuple[Volume, ...]:
+        """What functions are of: opacity or luminance of colours, else the volumes themselves."""
+        if not self.color:
+            return self.volumes
+        source = self.volumes[3] if len(self.volumes) > 3 else _luminance(*self.volumes[:3])
+        return (replace(source, name=self.volumes[0].name),)
 
 
 def open_parts(source: str, read: ReadOptions) -> Content:
@@ -108,25 +125,27 @@ def open_parts(source: str, read: ReadOptions) -> Content:
     try:
         volume = open_volume(source, replace(read, component=None) if asked else read)
     except SeveralComponents as error:
-        if not asked and not error.color:
+        overlapping = not asked and source.endswith(SEGMENTATION)
+        if not asked and not error.color and not overlapping:
             raise
         if asked == COLOR and error.count not in (3, 4):
             raise UsageError(
                 f"{source}: {error.count} components; expected three or four for --component color"
             ) from None
         parts = tuple(open_volume(source, replace(read, component=k)) for k in range(error.count))
-        if asked == ALL:
-            colors = error.colors or [None] * error.count
-            return Content(tuple(replace(v, name=f"{v.name} {k}") for k, v in enumerate(parts)), False, colors)
-        return Content(parts, True)
+        if asked == COLOR or (error.color and not asked and not overlapping):
+            return Content(parts, True)
+        colors = error.colors or [None] * error.count
+        named = tuple(replace(v, name=f"{v.name} {k}") for k, v in enumerate(parts))
+        return Content(named, colors=colors, path=source, overlapping=overlapping)
     if asked:
         raise UsageError(f"{source}: one component; leave out --component {asked}")
-    return Content((volume,), path=source)
+    return Content((volume,), path=source, layer=read.component if isinstance(read.component, int) else None)
 
 
 def is_plain(opened: Content, tf: object, labels: str | LabelTable | None, layers: Sequence[LayerRequest]) -> bool:
     """Whether it is one scalar field under a function; a label map that is recognised is not."""
-    if opened.color or len(opened.volumes) > 1 or layers or labels not in (None, NONE):
+    if not opened.one_field or layers or labels not in (None, NONE):
         return False
     return tf is not None or labels == NONE or not recognised(opened.volumes[0])
 
@@ -137,6 +156,7 @@ def layers_of(
     labels: str | LabelTable | None,
     tf_range: str | tuple[float, float] = "data",
     distance: str | None = None,
+    whole: Sequence[Statistics] = (),
 ) -> list[Layer]:
     """The layers that a file's content makes.
 
@@ -145,34 +165,93 @@ def layers_of(
         tf: function, None makes one; of colours its opacity is taken, over their luminance or opacity.
         labels: table of labels, its file, ``auto``, ``none`` or None.
         tf_range, distance: of functions.
+        whole: statistics of `Content.classified` over a whole series; none: the volumes' own.
 
     Raises:
         DataError: labels that do not fit the table, nothing that is visible.
         UsageError: a table and a function at once.
     """
+    labels = _asked(opened, tf, labels)
+    if labels not in (None, NONE):
+        own = labels == AUTO and str(opened.path).endswith(SEGMENTATION)
+        if opened.overlapping:
+            return _overlapping(opened, labels, own, distance)
+        if own and opened.layer is not None:
+            labels = segments_of(str(opened.path), opened.layer)
+        elif own:
+            labels = opened.path
+        return [_labelled(opened.volumes[0], labels, distance)]
+    function = read_transfer_function(tf) if isinstance(tf, str) else tf
+    sources = opened.classified
+    numbers = whole or [statistics(volume) for volume in sources]
+    shown = functions_of(opened, numbers, function, tf_range)
+    colors = (opened.volumes[0], opened.volumes[1], opened.volumes[2]) if opened.color else None
+    layers = []
+    for volume, one, its in zip(sources, shown, numbers, strict=True):
+        if opened.one_field or opened.color:
+            check_visible(one, its)
+        given = function if function is not None and opened.one_field else one
+        layers.append(Layer(volume, one, *unit_distance(distance, volume, given), colors, _white(opened)))
+    return layers
+
+
+def _asked(
+    opened: Content, tf: str | TransferFunction | None, labels: str | LabelTable | None
+) -> str | LabelTable | None:
+    """The labels asked for, ``auto`` where the content is recognised; see `layers_of`."""
     volume = opened.volumes[0]
-    if labels not in (None, NONE) and (opened.color or len(opened.volumes) > 1):
+    if opened.overlapping:
+        if tf is not None or labels == NONE:
+            raise UsageError(
+                f"{opened.path}: {len(opened.volumes)} layers of segments that overlap; expected labels: leave out "
+                "--tf and --labels none, or take one layer with --component N"
+            )
+        return labels or AUTO
+    if labels not in (None, NONE) and not opened.one_field:
         raise UsageError(f"{volume.name}: several components; expected one of labels: choose it with --component N")
     if labels not in (None, NONE) and tf is not None:
         raise UsageError(f"{volume.name}: both a function and a table of labels; expected one of --tf and --labels")
-    if labels is None and tf is None and not opened.color and len(opened.volumes) == 1 and recognised(volume):
-        labels = AUTO
+    if labels is None and tf is None and opened.one_field and recognised(volume):
         warnings.warn(
             f"{volume.name}: taken as a label map, by its name and its few integers (--labels none: as scalars)",
-            stacklevel=2,
+            stacklevel=3,
         )
-    if labels not in (None, NONE):
-        own = opened.path if labels == AUTO and str(opened.path).endswith(SEGMENTATION) else labels
-        return [_labelled(volume, own, distance)]
-    function = read_transfer_function(tf) if isinstance(tf, str) else tf
+        return AUTO
+    return labels
+
+
+def functions_of(
+    opened: Content,
+    numbers: Sequence[Statistics],
+    tf: TransferFunction | None,
+    tf_range: str | tuple[float, float] = "data",
+) -> list[TransferFunction]:
+    """What `Content.classified` is shown by, on data values; arguments as `layers_of`, ``numbers`` of each."""
     if opened.color:
-        return [_colored(opened.volumes, function, tf_range, distance)]
-    if len(opened.volumes) > 1:
-        return [_channel(v, k, opened.colors[k], function, tf_range, distance) for k, v in enumerate(opened.volumes)]
-    numbers = statistics(volume)
-    shown = resolve(function, numbers, tf_range) if function else from_histogram(numbers, volume.hounsfield)
-    check_visible(shown, numbers)
-    return [Layer(volume, shown, *unit_distance(distance, volume, function or shown))]
+        kind = "opacity of the file" if len(opened.volumes) > 3 else "opacity by luminance"
+        return [resolve(tf, numbers[0], tf_range) if tf else _function(kind, 0.0, _white(opened), (1, 1, 1))]
+    if opened.one_field:
+        made = None if tf else from_histogram(numbers[0], opened.volumes[0].hounsfield)
+        return [made or resolve(tf, numbers[0], tf_range)]  # type: ignore[arg-type]
+    return [_channel(k, opened.colors[k], its, tf, tf_range) for k, its in enumerate(numbers)]
+
+
+def _white(opened: Content) -> float:
+    """Data value of colours that is 1."""
+    kind = opened.volumes[0].data.dtype
+    return float(np.iinfo(kind).max) if opened.color and kind.kind in "iu" else 1.0
+
+
+def _overlapping(opened: Content, labels: str | LabelTable | None, own: bool, distance: str | None) -> list[Layer]:
+    """Of the layers of a .seg.nrrd, each under its own segments, or all under one table; empty ones are left out."""
+    found = []
+    for k, volume in enumerate(opened.volumes):
+        if any(labels_in(volume)):
+            table = segments_of(str(opened.path), k) if own else labels
+            found.append(_labelled(volume, table, distance))
+    if not found:
+        raise DataError(f"{opened.path}: no label but 0 in any of its layers; expected some to show")
+    return found
 
 
 def _labelled(volume: Volume, labels: str | LabelTable | None, distance: str | None) -> Layer:
@@ -188,22 +267,6 @@ def _labelled(volume: Volume, labels: str | LabelTable | None, distance: str | N
     return Layer(volume, table, *unit_distance(distance, volume))
 
 
-def _colored(
-    volumes: Sequence[Volume], tf: TransferFunction | None, tf_range: str | tuple[float, float], distance: str | None
-) -> Layer:
-    """Colours as they are; opacity from theirs, or from luminance, under the function or in proportion."""
-    red, green, blue = volumes[:3]
-    kind = red.data.dtype
-    white = float(np.iinfo(kind).max) if kind.kind in "iu" else 1.0
-    source = volumes[3] if len(volumes) > 3 else _luminance(red, green, blue)
-    numbers = statistics(source)
-    ramp = _function("opacity of the file" if len(volumes) > 3 else "opacity by luminance", 0.0, white, (1, 1, 1))
-    shown = resolve(tf, numbers, tf_range) if tf else ramp
-    check_visible(shown, numbers)
-    source = replace(source, name=red.name)
-    return Layer(source, shown, *unit_distance(distance, source, shown), (red, green, blue), white)
-
-
 def _luminance(*bands: Volume) -> Volume:
     """(nz, ny, nx) float32, in the data values of the colours."""
     out = np.zeros(bands[0].data.shape, np.float32)
@@ -214,26 +277,22 @@ def _luminance(*bands: Volume) -> Volume:
 
 
 def _channel(
-    volume: Volume,
     number: int,
     color: tuple[float, float, float] | None,
+    numbers: Statistics,
     tf: TransferFunction | None,
     tf_range: str | tuple[float, float],
-    distance: str | None,
-) -> Layer:
+) -> TransferFunction:
     """A channel in its colour; the function's opacity, or a ramp over its brighter voxels."""
     from vvgt_cli.transfer.resolve import percentiles
 
     rgb = color or CHANNEL_COLORS[number % len(CHANNEL_COLORS)]
-    numbers = statistics(volume)
     if tf is not None:
         shown = resolve(tf, numbers, tf_range)
         lo, hi = shown.node_range()
-        shown = replace(shown, color_map=_function("", lo, max(hi, lo + 1e-9), rgb).color_map)
-    else:
-        lo, hi = percentiles(numbers, np.array([DARK, BRIGHT]))
-        shown = _function(f"channel {number}", float(lo), float(hi) if hi > lo else float(lo) + 1, rgb)
-    return Layer(volume, shown, *unit_distance(distance, volume, shown))
+        return replace(shown, color_map=_function("", lo, max(hi, lo + 1e-9), rgb).color_map)
+    lo, hi = percentiles(numbers, np.array([DARK, BRIGHT]))
+    return _function(f"channel {number}", float(lo), float(hi) if hi > lo else float(lo) + 1, rgb)
 
 
 def _function(name: str, lo: float, hi: float, rgb: Sequence[float]) -> TransferFunction:

@@ -56,7 +56,8 @@ class SourceRequest:
         tf: transfer-function file or colour-map name, or a function; None makes one from the histogram.
         tf_range: "data", "rescale" or "LO,HI".
         unit_distance: a length, "paraview", "mean-spacing", or None: the function's own, else "paraview".
-        statistics: what the function's nodes follow from in place of the volume's own: those of the whole series.
+        statistics: what the functions' nodes follow from in place of the volume's own: those of the whole series, of
+            every component.
         light: what falls on it; without options what the function's file says, else nothing.
         labels: table of its labels, the file of one, "auto", "none", or None: "auto" where it is recognised.
         layers: what is laid over it.
@@ -67,7 +68,7 @@ class SourceRequest:
     tf: str | TransferFunction | None = None
     tf_range: str = "data"
     unit_distance: str | None = None
-    statistics: Statistics | None = None
+    statistics: tuple[Statistics, ...] = ()
     light: LightOptions = field(default_factory=LightOptions)
     labels: str | LabelTable | None = None
     layers: tuple[LayerRequest, ...] = ()
@@ -199,7 +200,7 @@ def load_all(request: SourceRequest, tfs: Sequence[str | TransferFunction | None
     numbers = opened.statistics if opened else statistics(volume)
     sources = []
     for tf, lighting in zip(functions, lights, strict=True):
-        whole = request.statistics or numbers
+        whole = request.statistics[0] if request.statistics else numbers
         shown = resolve(tf, whole, tf_range) if tf else from_histogram(whole, volume.hounsfield)
         if tf is None and whole.lo == whole.hi:
             warnings.warn(
@@ -222,7 +223,7 @@ def _layered(
     from vvgt_cli.volume import statistics
 
     lighting = request.light.lighting(None if tf is None else tf.lighting, content.volumes[0].space)
-    layers = layers_of(content, tf, request.labels, tf_range, request.unit_distance)
+    layers = layers_of(content, tf, request.labels, tf_range, request.unit_distance, request.statistics)
     for other in request.layers:
         inner = open_parts(other.volume, other.read) if isinstance(other.volume, str) else Content((other.volume,))
         layers += layers_of(inner, other.tf, other.labels, "data", other.distance)

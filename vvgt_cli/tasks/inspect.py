@@ -96,6 +96,8 @@ def _volume(file: str, read: ReadOptions) -> dict[str, Any]:
     kinds: dict[str, Any] = {}
     if content.color:
         kinds["colors"] = "RGBA"[: len(content.volumes)]
+    elif content.overlapping:
+        kinds["segment_layers"] = len(content.volumes)
     elif len(content.volumes) > 1:
         kinds["channels"] = len(content.volumes)
     elif not isinstance(volume.data, Packed) and recognised(volume):

@@ -10,6 +10,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +25,10 @@ EXPECTED = (
     "expected a table of labels: 3D Slicer (.ctbl), ITK-SNAP (.label), FreeSurfer (number name R G B A), a .seg.nrrd, "
     'or JSON {"1": {"name": ..., "color": [r, g, b], "opacity": a}}'
 )
-_NAMED = re.compile(r"(-?\d+)\s+(.+?)\s+(\d+)\s+(\d+)\s+(\d+)(?:\s+(\d+))?")
-_SNAP = re.compile(r'(-?\d+)\s+(\d+)\s+(\d+)\s+(\d+)\s+(\d+(?:\.\d*)?)\s+([01])\s+([01])\s+"(.*)"')
+_WHOLE = re.compile(r"-?[0-9]{1,10}")
+_SNAP = re.compile(
+    r'(-?[0-9]{1,10})\s+([0-9]{1,3})\s+([0-9]{1,3})\s+([0-9]{1,3})\s+([0-9]{1,3}(?:\.[0-9]*)?)\s+([01])\s+([01])\s+"(.*)"'
+)
 
 
 def read_labels(source: str) -> LabelTable:
@@ -40,12 +44,24 @@ def read_labels(source: str) -> LabelTable:
     with path.open("rb") as stream:
         head = stream.read(HEADER)
     if not head.startswith(b"NRRD") and (text := text_of(path, "a table of labels")).lstrip().startswith(("{", "[")):
-        return table_of(json_of(text, path), str(path))
+        return table_of(json_of(text, path, "a table of labels"), str(path))
     if head.startswith(b"NRRD"):
         found = _segments(head.partition(b"\n\n")[0].decode("utf-8", "replace"), str(path))
     else:
         found = _lines(text, path)
     return _table(found, str(path))
+
+
+def segments_of(source: str, layer: int) -> LabelTable:
+    """The segments of one layer of a .seg.nrrd in which segments overlap; numbers of labels are those of the layer.
+
+    Raises:
+        DataError: none in this layer, or faulty ones.
+    """
+    with Path(source).open("rb") as stream:
+        head = stream.read(HEADER).partition(b"\n\n")[0].decode("utf-8", "replace")
+    found = _table(_segments(head, source, layer), f"{source}: layer {layer}")
+    return replace(found, name=f"{Path(source).name} layer {layer}")
 
 
 def _table(found: list[Label], what: str) -> LabelTable:
@@ -60,27 +76,43 @@ def _lines(text: str, path: Path) -> list[Label]:
     for n, line in enumerate(map(str.strip, text.splitlines()), 1):
         if not line or line.startswith("#"):
             continue
+        color: Sequence[str]
         if snap := _SNAP.fullmatch(line):
-            numbers, name, alpha = snap.groups()[1:4], snap[8], float(snap[5]) * int(snap[6])
-        elif plain := _NAMED.fullmatch(line):
-            numbers, name, last = plain.groups()[2:5], plain[2].strip('"'), int(plain[6] or 0) / 255
-            alpha = last if plain[6] is not None and path.suffix.lower() == ".ctbl" else 1 - last
-            snap = plain
+            value, color, name, alpha = snap[1], snap.groups()[1:4], snap[8], float(snap[5]) * int(snap[6])
+        elif plain := _plain(line):
+            value, name, color, last = plain
+            alpha = 1.0 if last is None else last if path.suffix.lower() == ".ctbl" else 1 - last
         else:
             raise DataError(f"{path}: line {n}: {line[:60]!r}; {EXPECTED}")
-        if int(snap[1]) == 0:
-            alpha = 0.0
-        found.append(_label(f"{path}: line {n}", int(snap[1]), name, [int(v) / 255 for v in numbers], alpha))
+        alpha = alpha if int(value) else 0.0
+        found.append(_label(f"{path}: line {n}", int(value), name, [int(v) / 255 for v in color], alpha))
     return found
 
 
-def _segments(header: str, what: str) -> list[Label]:
-    """Of the segments that a NRRD header names."""
+def _plain(line: str) -> tuple[str, str, Sequence[str], float | None] | None:
+    """Label, name, red, green and blue, and A over 255 of ``number name R G B [A]``; None where it is no such line.
+
+    Of names that end in numbers the last four are R, G, B and A. By words: an expression over a line of blanks would
+    take the third power of its length.
+    """
+    words = line.split()
+    last = next((k for k, word in enumerate(reversed(words)) if not _WHOLE.fullmatch(word)), len(words))
+    many = min(last, len(words) - 2, 4)  # of the numbers at the end; label and name come before
+    if many < 3 or not _WHOLE.fullmatch(words[0]):
+        return None
+    name = line.split(None, 1)[1].rsplit(None, many)[0].strip('"')
+    return words[0], name, words[-many:][:3], int(words[-1]) / 255 if many == 4 else None
+
+
+def _segments(header: str, what: str, layer: int | None = None) -> list[Label]:
+    """Of the segments that a NRRD header names, in one layer or in all."""
     parts: dict[str, dict[str, str]] = {}
-    for index, key, value in re.findall(r"^Segment(\d+)_(\w+):=(.*)$", header, re.M):
+    for index, key, value in re.findall(r"^Segment([0-9]{1,9})_(\w+):=(.*)$", header, re.M):
         parts.setdefault(index, {})[key] = value.strip()
     found = []
     for index, part in parts.items():
+        if layer is not None and part.get("Layer", "0") != str(layer):
+            continue
         color, label = part.get("Color", "").split(), part.get("LabelValue", str(int(index) + 1))
         if not re.fullmatch(r"\d{1,10}", label) or not all(_is_number(c) for c in color):
             raise DataError(f"{what}: segment {index}: label {label!r}, colour {color}; expected numbers")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
@@ -53,7 +54,7 @@ class LabelTable:
     def __post_init__(self) -> None:
         numbers = [label.number for label in self.labels]
         if sorted(set(numbers)) != numbers:
-            twice = next((n for n in numbers if numbers.count(n) > 1), None)
+            twice = next((a for a, b in pairwise(sorted(numbers)) if a == b), None)
             raise DataError(f"{self.name}: label {twice} twice; expected each label once")
         if not any(label.opacity > 0 for label in self.labels):
             raise DataError(f"{self.name}: {len(numbers)} labels, none of them visible; expected an opacity above 0")

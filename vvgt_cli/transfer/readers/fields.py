@@ -84,13 +84,11 @@ def text_of(path: Path, what: str = "a transfer function") -> str:
     try:
         return raw.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise DataError(
-            f"{path}: not text (byte {error.start} is not UTF-8); expected {what} of JSON, XML or numbers"
-        ) from error
+        raise DataError(f"{path}: not text (byte {error.start} is not UTF-8); expected {what}") from error
 
 
-def json_of(text: str, path: Path) -> Any:
-    """What a JSON text holds.
+def json_of(text: str, path: Path, what: str = "a ParaView preset or a minimal transfer function") -> Any:
+    """What a JSON text holds; ``what`` is expected there.
 
     Raises:
         DataError: not JSON.
@@ -99,11 +97,10 @@ def json_of(text: str, path: Path) -> Any:
         return json.loads(text)
     except json.JSONDecodeError as error:
         raise DataError(
-            f"{path}: not JSON (line {error.lineno}, column {error.colno}: {error.msg}); "
-            "expected a ParaView preset or a minimal transfer function"
+            f"{path}: not JSON (line {error.lineno}, column {error.colno}: {error.msg}); expected {what}"
         ) from error
     except (RecursionError, ValueError) as error:  # nested too deep; an integer of thousands of digits
-        raise DataError(f"{path}: JSON that cannot be a transfer function (too deep, or a number too long)") from error
+        raise DataError(f"{path}: JSON that is too deep, or with too long a number; expected {what}") from error
 
 
 def number(what: str, value: Any) -> float:
