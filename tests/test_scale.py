@@ -213,9 +213,12 @@ def test_memory_decides_by_itself(vvgt, tmp_path, monkeypatch):
     assert "more than the memory holds" in less.err
     assert same_gaussians(tmp_path / "a.ply", tmp_path / "b.ply")
     monkeypatch.setattr("vvgt_cli.volume.blocks.free_memory", lambda: 1 << 20)
-    whole = vvgt("convert", source, "-o", tmp_path / "c.ply", *FIT[:-1])
+    whole = vvgt("render-views", source, "-o", tmp_path / "views", "--size", "40", "--views", "2")
     assert whole.code == 1
-    assert "try 'vvgt init', which goes through it in blocks" in whole.err
+    assert "which go through it in blocks" in whole.err
+    fitted = vvgt("convert", source, "-o", tmp_path / "d.ply", *FIT[:-1], "--steps", "8")
+    assert fitted.code == 0
+    assert "more than the memory holds" in fitted.err
     monkeypatch.setattr("vvgt_cli.scale.settings.free_memory", lambda: 200 << 20)
     none = vvgt("init", source, "-o", tmp_path / "c.ply", *FIT[:-1])
     assert none.code == 2

@@ -7,6 +7,7 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from typing import IO, TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -17,11 +18,15 @@ from vvgt_cli.errors import NothingVisible
 from vvgt_cli.files import atomic_write, check_room, is_stream
 from vvgt_cli.gaussians.frames import transform
 from vvgt_cli.gaussians.ply import as_stored, ply_header, ply_rows
+from vvgt_cli.gaussians.types import together
 from vvgt_cli.jit.ahead import MERGE
+from vvgt_cli.resources import free_memory
 from vvgt_cli.runs.outputs import STDOUT
 from vvgt_cli.runs.record import Run
 from vvgt_cli.scale.parts import Parts
 from vvgt_cli.scale.plan import Plan
+from vvgt_cli.scale.sight import Box, drawing_bytes, score_gaussians, score_text
+from vvgt_cli.splat.rules import INRIA
 
 if TYPE_CHECKING:
     from vvgt_cli.gaussians import Gaussians
@@ -30,13 +35,6 @@ if TYPE_CHECKING:
 
 BATCH = 1 << 16  # Gaussians that are made at once
 SCRATCH = "scores"
-
-
-class Box(NamedTuple):
-    """A volume's half extents and voxel edges (3,), unit frame, as cameras ask for them."""
-
-    half: np.ndarray
-    step: np.ndarray
 
 
 def write_merged(run: Run, parts: Parts, output: str, overwrite: bool) -> None:
@@ -52,20 +50,39 @@ def write_merged(run: Run, parts: Parts, output: str, overwrite: bool) -> None:
     report.options = {"max_gaussians": plan.budget, "size": plan.size, "frame": plan.ply.frame, "up": plan.ply.up}
     run.compile(MERGE)
     with run.stage("pyramid") as stage:
-        forest, opaque = _forest(parts, plan)
+        forest, opaque = pyramid(parts, plan)
         stage.note = f"{forest.base} cells in {len(forest.tiles)} tiles"
     with run.stage("write") as stage, _sink(parts, output, overwrite) as sink:
-        count, spared = _write(forest, opaque, plan, sink, output)
+        made, spared = _write(forest, opaque, plan, sink, output)
+        count = made.total
         report.gaussians, report.bytes = count, sink.tell()
         stage.note = f"{output}: {count} Gaussians, {report.bytes / 1e6:.1f} MB"
         if not spared and count < NEARLY * plan.budget:
             stage.note += f", no more: {forest.base} cells that the screen, or {plan.budget} Gaussians, have use for"
     if spared:
         run.leave_out(f"{spared} Gaussians", "so faint that viewers differ on what they draw of them")
+    _score(run, parts, plan, made)
 
 
-def _forest(parts: Parts, plan: Plan) -> tuple[Forest, Opaque]:
-    """The pyramid over all parts, and where bodies are opaque."""
+def _score(run: Run, parts: Parts, plan: Plan, made: Made) -> None:
+    """The file against pixels of the volume itself, every voxel of it."""
+    if made.batches is None:
+        need = drawing_bytes(made.total, plan.size)
+        run.leave_out("test views", f"{made.total} Gaussians at once need about {need / 2**30:.1f} GiB of memory")
+        return
+    with run.stage("test views") as stage:
+        scores = score_gaussians(together(made.batches), parts, plan.grid, plan.size, plan.ply.rule or INRIA)
+        run.report.scores = asdict(scores)
+        stage.note = score_text(scores, plan.size)
+
+
+def pyramid(parts: Parts, plan: Plan) -> tuple[Forest, Opaque]:
+    """The pyramid over all parts, and where bodies are opaque.
+
+    Raises:
+        NothingVisible: from no view.
+        DataError: parts are missing or damaged.
+    """
     from vvgt_cli.cameras import default_views
     from vvgt_cli.scale.forest import Forest, gather
     from vvgt_cli.vbm.closed_form import MARCH_SIZE
@@ -90,9 +107,17 @@ def _opaque(coarse: Coarse, plan: Plan) -> Opaque:
     return nowhere(edge, half) if coarse.deepest < SURFACE else smoothed(coarse.field, edge, half)
 
 
-def _write(forest: Forest, opaque: Opaque, plan: Plan, sink: IO[bytes], output: str) -> tuple[int, int]:
-    """Write the file; how many Gaussians it has, and how many are left out since they would be too faint."""
-    budget, first = plan.budget, 0
+class Made(NamedTuple):
+    """What was written: how many Gaussians, and themselves in the box frame, None where the memory holds no drawing."""
+
+    total: int
+    batches: list[Gaussians] | None
+
+
+def _write(forest: Forest, opaque: Opaque, plan: Plan, sink: IO[bytes], output: str) -> tuple[Made, int]:
+    """Write the file; what it has, and how many Gaussians are left out since they would be too faint."""
+    budget, first, free = plan.budget, 0, free_memory()
+    axes = np.array(plan.axes).reshape(3, 3)
     while True:
         threshold = forest.threshold(budget)
         count = forest.count(threshold)
@@ -102,25 +127,41 @@ def _write(forest: Forest, opaque: Opaque, plan: Plan, sink: IO[bytes], output: 
         sink.seek(0)
         sink.truncate()
         sink.write(ply_header(count, plan.ply.sh_degree or 0, plan.ply))
+        kept: list[Gaussians] | None = [] if free is None or drawing_bytes(count, plan.size) < free else None
         faint = 0
         for gaussians in gaussians_of(forest, opaque, plan, threshold):
-            sink.write(ply_rows(gaussians, plan.ply).data)
+            sink.write(ply_rows(transform(gaussians, axes), plan.ply).data)
             faint += int((gaussians.opacity_logits < FAINT_LOGIT).sum())
+            if kept is not None:
+                kept.append(gaussians)
         if 2 * faint <= count or budget < 2 * FEWEST:
-            return count, first - count
+            return Made(count, kept), first - count
+        budget //= 2
+
+
+def cut(forest: Forest, opaque: Opaque, plan: Plan) -> tuple[Gaussians, int]:
+    """All Gaussians at once, box frame, as a file holds them; and how many are left out since they would be too faint.
+
+    The plan's budget is halved as where they are written.
+    """
+    budget, first = plan.budget, 0
+    while True:
+        made = together(list(gaussians_of(forest, opaque, plan, forest.threshold(budget))))
+        first = first or len(made)
+        if 2 * int((made.opacity_logits < FAINT_LOGIT).sum()) <= len(made) or budget < 2 * FEWEST:
+            return made, first - len(made)
         budget //= 2
 
 
 def gaussians_of(forest: Forest, opaque: Opaque, plan: Plan, threshold: float) -> Iterator[Gaussians]:
-    """Gaussians of the cells that a threshold leaves, in the unit frame, as the file will hold them, in batches."""
+    """Gaussians of the cells that a threshold leaves, in the box frame, as a file holds them, in batches."""
     from vvgt_cli.scale.forest import batches
     from vvgt_cli.vbm.closed_form import pixel_width
     from vvgt_cli.vbm.shape import ROUND, cell_gaussians
 
     voxel, pixel = min(plan.grid.step), pixel_width(plan.size)
-    axes = np.array(plan.axes).reshape(3, 3)
     for leaves in batches(forest.leaves(threshold), BATCH):
-        yield transform(as_stored(cell_gaussians(leaves, voxel, pixel, opaque, ROUND)), axes)
+        yield as_stored(cell_gaussians(leaves, voxel, pixel, opaque, ROUND))
 
 
 @contextmanager

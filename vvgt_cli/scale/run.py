@@ -6,7 +6,7 @@ import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import asdict, astuple, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,6 +28,7 @@ from vvgt_cli.scale.parts import Parts
 from vvgt_cli.scale.plan import Plan, finest_level, most_cells
 from vvgt_cli.scale.runners import Here, Processes, Runner
 from vvgt_cli.scale.settings import BlockOptions, block_edge, cell_grid, counted_boxes
+from vvgt_cli.scale.sight import Sight
 from vvgt_cli.scale.source import InBlocks, Samples, needs_histogram, open_in_blocks, resolved
 from vvgt_cli.share import format_of
 
@@ -52,14 +53,14 @@ def init_in_blocks(request: ConvertRequest, options: BlockOptions, console: Cons
     Raises:
         UsageError, DataError: as `vvgt_cli.conversion.convert.initialise_only`; what blocks cannot do.
     """
-    _refuse(request, options)
+    refuse(request, options)
     run = Run(console or Console(), ConversionReport("init"))
     if options.shard is not None:
         assert request.output is not None
         _shard(run, request, options, Parts(Path(request.output).absolute()))
         return run.finish()
-    with claimed(request.outputs(), request.inputs(), request.overwrite), _folder(request.output) as parts:
-        _make_parts(run, request, options, parts)
+    with claimed(request.outputs(), request.inputs(), request.overwrite), beside(request.output) as parts:
+        make_parts(run, request, options, parts, Sight(request.fit.size))
         write_merged(run, parts, request.output or STDOUT, request.overwrite)
         run.finish()
         if request.report:
@@ -85,7 +86,7 @@ def merge(folder: str, output: str, overwrite: bool = False, console: Console | 
     return run.finish()
 
 
-def _refuse(request: ConvertRequest, options: BlockOptions) -> None:
+def refuse(request: ConvertRequest, options: BlockOptions) -> None:
     """What is not done in blocks."""
     if request.fit.init != "vbm":
         raise UsageError(f"--init {request.fit.init}: needs the whole volume in memory; in blocks: vbm")
@@ -107,7 +108,7 @@ def _refuse(request: ConvertRequest, options: BlockOptions) -> None:
 
 
 @contextmanager
-def _folder(output: str | None) -> Iterator[Parts]:
+def beside(output: str | None) -> Iterator[Parts]:
     """Where blocks are kept: beside the output, so that the same command goes on there after it was ended."""
     if output is None or output == STDOUT:
         with tempfile.TemporaryDirectory(prefix="vvgt-") as folder:
@@ -126,7 +127,7 @@ def _runner(options: BlockOptions) -> Runner:
     return Processes(options.workers, threads) if options.workers > 1 else Here()
 
 
-def _settings(request: ConvertRequest, opened: InBlocks) -> dict[str, Any]:
+def _settings(request: ConvertRequest, opened: InBlocks, sight: Sight) -> dict[str, Any]:
     """All that parts depend on."""
     path = opened.request.path
     facts = [os.stat(path).st_size, os.stat(path).st_mtime_ns] if os.path.exists(path) else []
@@ -138,6 +139,7 @@ def _settings(request: ConvertRequest, opened: InBlocks) -> dict[str, Any]:
         "function": [text, request.source.tf_range, request.source.unit_distance],
         "gaussians": request.fit.max_gaussians,
         "size": request.fit.size,
+        "views": list(astuple(sight)),
         "ply": [request.ply.frame, request.up, request.ply.sh_degree, request.ply.comments],
     }
 
@@ -145,7 +147,7 @@ def _settings(request: ConvertRequest, opened: InBlocks) -> dict[str, Any]:
 def _shard(run: Run, request: ConvertRequest, options: BlockOptions, parts: Parts) -> None:
     """Do a shard's share of what can be done now, and say what is left."""
     try:
-        _make_parts(run, request, options, parts)
+        make_parts(run, request, options, parts, Sight(request.fit.size))
     except Later as later:
         run.console.say(
             f"{later.what}: this shard's share is done, {later.missing} blocks are other shards'; run the same array "
@@ -155,8 +157,11 @@ def _shard(run: Run, request: ConvertRequest, options: BlockOptions, parts: Part
         run.console.say(f"all blocks are there; next: vvgt merge {request.output} -o OUT.ply")
 
 
-def _make_parts(run: Run, request: ConvertRequest, options: BlockOptions, parts: Parts) -> None:
+def make_parts(run: Run, request: ConvertRequest, options: BlockOptions, parts: Parts, sight: Sight) -> Source:
     """Every block's part, those that are there taken as they are; and the plan of the file.
+
+    Returns:
+        What was read: a volume whose values stay where they are.
 
     Raises:
         Later: other shards' blocks are missing.
@@ -168,7 +173,7 @@ def _make_parts(run: Run, request: ConvertRequest, options: BlockOptions, parts:
     with run.stage("open") as stage:
         opened = open_in_blocks(request.source, options, pixel_width(request.fit.size))
         volume = opened.volume
-        settings = _settings(request, opened)
+        settings = _settings(request, opened, sight)
         edge = parts.kept_edge(settings) if options.size is None else None
         edge = edge or block_edge(volume, options)
         there = parts.open(settings | {"blocks": edge}, ours=options.shard is None)
@@ -191,9 +196,10 @@ def _make_parts(run: Run, request: ConvertRequest, options: BlockOptions, parts:
     source, limits, samples = resolved(opened, counts, second)
     for line in (describe_source(source), *remarks(source.volume, ply_options(request, source))):
         run.console.say(line)
-    cells = _cells(request, source, limits, samples, place, edge)
+    cells = _cells(request, source, limits, samples, place, edge, sight)
     _plan(request, source, cells.grid).save(parts)
     _do(run, runner, cells, options, "integrate")
+    return source
 
 
 def _counted(opened: InBlocks) -> bool:
@@ -228,8 +234,9 @@ def _plan(request: ConvertRequest, source: Source, grid: CellGrid) -> Plan:
 
 
 def _cells(
-    request: ConvertRequest, source: Source, limits: tuple[float, float], samples: Samples, place: Any, edge: int
-) -> CellBlocks:
+    request: ConvertRequest, source: Source, limits: tuple[float, float], samples: Samples, place: Any, edge: int,
+    sight: Sight,
+) -> CellBlocks:  # fmt: skip
     """The pass that integrates, with the cells' size from the samples."""
     from vvgt_cli.cameras import default_views
     from vvgt_cli.dvr.scene import kernel_rule
@@ -251,16 +258,17 @@ def _cells(
     march = widening(
         np.array(volume.dims), exponent, np.array(frame.step), default_views("train", size=MARCH_SIZE)
     )  # fmt: skip
-    return CellBlocks(place, cell_grid(volume, exponent, edge, march), rule, tables)
+    return CellBlocks(place, cell_grid(volume, exponent, edge, march), rule, sight, tables)
 
 
 def _exponent(request: ConvertRequest, step: np.ndarray, voxels: float) -> np.ndarray:
     """Exponents (3,) of the base cells: no finer than the screen tells, and than budget and disk have use for."""
-    from vvgt_cli.scale.grid import TILE
+    from vvgt_cli.scale.grid import TILE_BITS
     from vvgt_cli.vbm.closed_form import level_within
     from vvgt_cli.vbm.moments import blocks, exponents
 
     level = level_within(step, voxels, most_cells(request.fit.max_gaussians), finest_level(step, request.fit.size))
-    while blocks(exponents(step, level))[1].max() > TILE:  # of voxels so thin that a block of them is many cells
+    most = 1 << TILE_BITS
+    while blocks(exponents(step, level))[1].max() > most:  # of voxels so thin that a block of them is many cells
         level += 1
     return exponents(step, level)

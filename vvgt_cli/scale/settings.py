@@ -9,7 +9,7 @@ import numpy as np
 
 from vvgt_cli.errors import UsageError
 from vvgt_cli.resources import free_memory
-from vvgt_cli.scale.grid import TILE, Boxes, CellGrid, Triple
+from vvgt_cli.scale.grid import Boxes, CellGrid, Triple, tile_bits
 from vvgt_cli.volume import Volume
 from vvgt_cli.volume.stored import Stored
 
@@ -91,13 +91,15 @@ def counted_boxes(volume: Volume, edge: int, spacing: int) -> Boxes:
 def cell_grid(volume: Volume, exponent: np.ndarray, edge: int, march: int) -> CellGrid:
     """The grid of base cells of 2^``exponent`` (3,) voxels, in blocks of about ``edge`` voxels and whole tiles."""
     from vvgt_cli.vbm.inset import averaged_down
+    from vvgt_cli.vbm.moments import blocks
 
     frame = volume.unit_frame()
-    tile = np.round(TILE * 2.0**exponent).astype(np.int64)
-    wanted = np.array(shape_of(volume, edge))
-    x, y, z = (int(t * max(round(w / t), 1)) for t, w in zip(tile, wanted, strict=True))
     step = np.array(frame.step)
     field = averaged_down(2.0**exponent * step, np.array(frame.half), MAX_FIELD)
+    bits = tile_bits(exponent, max(march, field, int(blocks(exponent)[1].max()).bit_length() - 1))
+    tile = np.round(2.0 ** (exponent + bits)).astype(np.int64)
+    wanted = np.array(shape_of(volume, edge))
+    x, y, z = (int(t * max(w // t, 1)) for t, w in zip(tile, wanted, strict=True))
     i, j, k = (int(e) for e in exponent)
     points = 1 if min(i, j, k) >= 1 else 2
-    return CellGrid(Boxes(volume.dims, (x, y, z)), (i, j, k), frame.half, frame.step, points, march, field)
+    return CellGrid(Boxes(volume.dims, (x, y, z)), (i, j, k), frame.half, frame.step, points, march, field, bits)

@@ -11,8 +11,9 @@ import numpy as np
 from vvgt_cli.dvr.layout import Optics, Voxels
 from vvgt_cli.dvr.scene import KernelRule
 from vvgt_cli.files import atomic_write
-from vvgt_cli.scale.grid import SAMPLE, TILE, Boxes, CellGrid, samples_in
+from vvgt_cli.scale.grid import SAMPLE, Boxes, CellGrid, samples_in
 from vvgt_cli.scale.parts import CELLS, COUNTS, HISTOGRAM, Parts
+from vvgt_cli.scale.sight import SUFFIX, Sight, segments
 from vvgt_cli.synth.sources import open_volume
 from vvgt_cli.transfer.tables import OpticalTables
 from vvgt_cli.vbm.columns import MASS, MOMENTS
@@ -117,12 +118,14 @@ class CellBlocks:
     Attributes:
         place, grid: what is read, and how it is cut.
         rule: how stored values become those that kernels read.
+        sight: views that are marched on the way.
         tables: optics over these.
     """
 
     place: Place
     grid: CellGrid
     rule: KernelRule
+    sight: Sight
     tables: OpticalTables = field(repr=False)
     kind: str = CELLS
 
@@ -130,7 +133,7 @@ class CellBlocks:
         return len(self.grid.blocks)
 
     def __call__(self, number: int) -> None:
-        """Leave the part of block ``number``: rows of cells in one file, what there is of each tile in another."""
+        """Leave the part of block ``number``: rows of cells, what it shows of rays, and what there is of each tile."""
         grid, parts = self.grid, self.place.parts
         lo, hi = grid.blocks.at(number)
         begin = np.maximum(lo - 1, 0)
@@ -146,14 +149,15 @@ class CellBlocks:
                 if not len(index):
                     continue
                 stream.write(np.ascontiguousarray(moments).data)
-                stream.write((index - tile * TILE).astype(np.uint8).tobytes())
+                stream.write((index - tile * grid.tile_cells).astype(np.uint8).tobytes())
                 tiles.append(tile)
                 counts.append(len(index))
-                summary = self._summary(index - (tile * TILE).astype(np.int32), moments[:, MASS])
+                summary = self._summary(index - (tile * grid.tile_cells).astype(np.int32), moments[:, MASS])
                 coarse.append(summary[0])
                 field.append(summary[1])
                 deepest = max(deepest, summary[2])
-        edges = [TILE >> grid.march] * 3, [TILE >> grid.field] * 3
+        parts.save(CELLS, number, SUFFIX, **segments(values, begin, number, grid, self.tables, self.sight))
+        edges = [grid.tile_cells >> grid.march] * 3, [grid.tile_cells >> grid.field] * 3
         parts.save(
             CELLS,
             number,
@@ -188,7 +192,7 @@ class CellBlocks:
 
         grid = self.grid
         depth = opaque_depth(mass, grid.cell_edge, np.array(grid.step))
-        march, wide = np.full(3, TILE >> grid.march), np.full(3, TILE >> grid.field)
+        march, wide = np.full(3, grid.tile_cells >> grid.march), np.full(3, grid.tile_cells >> grid.field)
         field = summed(local >> grid.field, np.minimum(depth, 1) / 8.0**grid.field, wide)
         return summed(local >> grid.march, mass, march), field.astype(np.float32), float(depth.max())
 
