@@ -252,4 +252,31 @@ def test_a_label_map_by_name_is_not_taken_for_scalars_in_blocks(vvgt, raw, tmp_p
     run = vvgt("init", named, "-o", tmp_path / "a.ply", *FIT, "--blocks", "32")
     assert run.code == 2
     assert "label map" in run.err
+    assert "--labels none" in run.err
+    assert not (tmp_path / ".a.ply.blocks").exists()  # before anything is counted
     assert vvgt("init", named, "-o", tmp_path / "a.ply", *FIT, "--blocks", "32", "--labels", "none").code == 0
+
+
+def test_a_box_that_is_counted_slice_by_slice_has_the_counts_and_samples_of_the_whole(raw, tmp_path):
+    from vvgt_cli.scale.grid import Boxes
+    from vvgt_cli.scale.parts import COUNTS, Parts
+    from vvgt_cli.scale.tasks import CountBlocks, Place
+
+    merged = []
+    for slices in (1, 7, 80):
+        parts = Parts(tmp_path / str(slices))
+        (parts.folder / COUNTS).mkdir(parents=True)
+        place = Place(str(raw), ReadOptions(stored=True), str(parts.folder))
+        task = CountBlocks(place, Boxes((100, 90, 80), (64, 64, 64)), slices)
+        for number in range(len(task)):
+            task(number)
+        merged.append(task.merged())
+    whole, samples, weights = merged[0]
+    assert whole.counts.sum() == 100 * 90 * 80
+    assert len(samples) == len(weights) > 100
+    x, y, z = (n // 16 * 16 + 3 for n in (50, 40, 30))
+    assert (samples == read_volume(str(raw)).data[z : z + 9, y : y + 9, x : x + 9]).all(axis=(1, 2, 3)).any()
+    for other in merged[1:]:
+        assert np.array_equal(other[0].counts, whole.counts)
+        assert np.array_equal(other[1], samples)
+        assert np.array_equal(other[2], weights)

@@ -66,12 +66,18 @@ _shard_option = {
     ),
 }  # fmt: skip
 block_options = group("blocks", **_options)
-shared_block_options = group("blocks", **_options, **_shard_option)
+levels_option = click.option(
+    "--levels", type=click.IntRange(1, 8), default=1, show_default=True, metavar="N",
+    help="Levels of detail: OUT-1.ply, ... beside OUT.ply, each with a quarter of the Gaussians, and an index "
+    "OUT-levels.json.",
+)  # fmt: skip
+shared_block_options = group("blocks", **_options, **_shard_option, levels=levels_option)
+ONE = ("workers", "levels")  # options that are 1 where they are not given
 
 
 def asked_for(blocks: dict[str, Any]) -> bool:
     """Whether any of the options is given."""
-    return blocks["workers"] > 1 or any(value is not None for key, value in blocks.items() if key != "workers")
+    return any(value is not None and (key not in ONE or value > 1) for key, value in blocks.items())
 
 
 def chosen(blocks: dict[str, Any], request: ConvertRequest, console: Console) -> BlockOptions | None:

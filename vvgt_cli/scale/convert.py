@@ -24,7 +24,7 @@ from vvgt_cli.runs.place import out_of_box
 from vvgt_cli.runs.record import ConversionReport, Run
 from vvgt_cli.runs.source import tf_record, volume_record
 from vvgt_cli.runs.views import Views
-from vvgt_cli.scale.merge import cut, pyramid
+from vvgt_cli.scale.merge import Cut, pyramid
 from vvgt_cli.scale.parts import Parts
 from vvgt_cli.scale.plan import Plan as BlockPlan
 from vvgt_cli.scale.run import beside, make_parts, refuse
@@ -143,7 +143,7 @@ def _made(run: Run, request: ConvertRequest, source: Source, parts: Parts, sight
     }  # fmt: skip
     with run.stage("closed form") as stage:
         forest, opaque = pyramid(parts, blocks)
-        gaussians, spared = cut(forest, opaque, blocks)
+        gaussians, spared = Cut(forest, opaque, blocks).whole()
         stage.note = f"{len(gaussians)} Gaussians, of {forest.base} cells in {len(forest.tiles)} tiles"
     if spared:
         run.leave_out(f"{spared} Gaussians", "so faint that viewers differ on what they draw of them")

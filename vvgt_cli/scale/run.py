@@ -23,11 +23,12 @@ from vvgt_cli.runs.place import remarks
 from vvgt_cli.runs.record import ConversionReport, Run
 from vvgt_cli.runs.source import Source, describe_source, tf_record, volume_record
 from vvgt_cli.scale.grid import sample_spacing
+from vvgt_cli.scale.levels import level_outputs
 from vvgt_cli.scale.merge import write_merged
 from vvgt_cli.scale.parts import Parts
 from vvgt_cli.scale.plan import Plan, finest_level, most_cells
 from vvgt_cli.scale.runners import Here, Processes, Runner
-from vvgt_cli.scale.settings import BlockOptions, block_edge, cell_grid, counted_boxes
+from vvgt_cli.scale.settings import BlockOptions, block_edge, cell_grid, counted_boxes, slices_at_once
 from vvgt_cli.scale.sight import Sight
 from vvgt_cli.scale.source import InBlocks, Samples, needs_histogram, open_in_blocks, resolved
 from vvgt_cli.share import format_of
@@ -59,9 +60,10 @@ def init_in_blocks(request: ConvertRequest, options: BlockOptions, console: Cons
         assert request.output is not None
         _shard(run, request, options, Parts(Path(request.output).absolute()))
         return run.finish()
-    with claimed(request.outputs(), request.inputs(), request.overwrite), beside(request.output) as parts:
+    outputs = [*request.outputs(), *level_outputs(request.output, options.levels)]
+    with claimed(outputs, request.inputs(), request.overwrite), beside(request.output) as parts:
         make_parts(run, request, options, parts, Sight(request.fit.size))
-        write_merged(run, parts, request.output or STDOUT, request.overwrite)
+        write_merged(run, parts, request.output or STDOUT, request.overwrite, options.levels)
         run.finish()
         if request.report:
             write_text(request.report, run.report.to_json(), request.overwrite)
@@ -69,8 +71,10 @@ def init_in_blocks(request: ConvertRequest, options: BlockOptions, console: Cons
     return run.report
 
 
-def merge(folder: str, output: str, overwrite: bool = False, console: Console | None = None) -> ConversionReport:
-    """Make a `.ply` of the blocks that shards have left in a folder.
+def merge(
+    folder: str, output: str, overwrite: bool = False, console: Console | None = None, levels: int = 1
+) -> ConversionReport:
+    """Make a `.ply`, or one of each of ``levels`` of detail, of the blocks that shards have left in a folder.
 
     Raises:
         UsageError: not such a folder, or an output that may not be written.
@@ -81,8 +85,9 @@ def merge(folder: str, output: str, overwrite: bool = False, console: Console | 
     run = Run(console or Console(), ConversionReport("merge"))
     parts = Parts(Path(folder))
     parts.settings()
-    with claimed([Output("-o", output, (".ply",), splats=True)], [], overwrite):
-        write_merged(run, parts, output, overwrite)
+    outputs = [Output("-o", output, (".ply",), splats=True), *level_outputs(output, levels)]
+    with claimed(outputs, [], overwrite):
+        write_merged(run, parts, output, overwrite, levels)
     return run.finish()
 
 
@@ -103,6 +108,8 @@ def refuse(request: ConvertRequest, options: BlockOptions) -> None:
         raise UsageError(f"-o {request.output}: blocks are written as a .ply; give a name that ends in .ply")
     if options.shard is not None and options.scheduler is not None:
         raise UsageError("--shard and --scheduler both share the blocks out; give one of them")
+    if options.shard is not None and options.levels > 1:
+        raise UsageError("--levels: a shard leaves blocks; give it to 'vvgt merge'")
     if options.shard is not None and (request.output in (None, STDOUT) or request.report):
         raise UsageError("--shard: -o is a folder of blocks then, there is no --report; 'vvgt merge' makes the .ply")
 
@@ -184,7 +191,8 @@ def make_parts(run: Run, request: ConvertRequest, options: BlockOptions, parts: 
     run.compile(BLOCKS, kernel_type(volume))
     runner = _runner(options)
     place = Place(opened.request.path, opened.request.read, str(parts.folder))
-    counts = CountBlocks(place, counted_boxes(volume, edge, sample_spacing(volume.dims)))
+    boxes = counted_boxes(volume, edge, sample_spacing(volume.dims))
+    counts = CountBlocks(place, boxes, slices_at_once(volume, edge, boxes))
     _do(run, runner, counts, options, "count")
     second = None
     if needs_histogram(request.source) and not _counted(opened):

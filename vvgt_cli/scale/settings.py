@@ -32,6 +32,7 @@ class BlockOptions:
         scheduler: "local" or the address of a Dask scheduler; None: without Dask.
         shard: part (from 1) and count of a job array, None for the whole.
         level: of a file of several resolutions: a number, "full", or None: the one that matches the screen.
+        levels: of detail that are written.
     """
 
     size: int | None = None
@@ -39,6 +40,7 @@ class BlockOptions:
     scheduler: str | None = None
     shard: tuple[int, int] | None = None
     level: int | str | None = None
+    levels: int = 1
 
     def __post_init__(self) -> None:
         if self.size is not None and (self.size < SMALLEST or self.size & (self.size - 1)):
@@ -86,6 +88,12 @@ def counted_boxes(volume: Volume, edge: int, spacing: int) -> Boxes:
     """The boxes in which values are counted: of whole steps of the lattice of samples."""
     x, y, z = (max(e, spacing) for e in shape_of(volume, edge))
     return Boxes(volume.dims, (x, y, z))
+
+
+def slices_at_once(volume: Volume, edge: int, boxes: Boxes) -> int:
+    """Slices of a box of ``boxes`` that hold as many voxels as a block of ``edge``."""
+    x, y, _ = boxes.edge
+    return max(math.prod(shape_of(volume, edge)) // (x * y), 1)
 
 
 def cell_grid(volume: Volume, exponent: np.ndarray, edge: int, march: int) -> CellGrid:

@@ -57,11 +57,13 @@ class CountBlocks:
 
     Attributes:
         place, boxes: what is read, and how it is cut.
+        slices: of a box that are in memory at once.
         limits: data values, of a second pass: their histogram.
     """
 
     place: Place
     boxes: Boxes
+    slices: int
     limits: tuple[float, float] | None = None
 
     @property
@@ -75,12 +77,12 @@ class CountBlocks:
         """Leave the part of block ``number``."""
         volume = self.place.volume()
         lo, hi = self.boxes.at(number)
-        values = read_block(volume, lo, hi)
-        size = np.minimum(SAMPLE, self.boxes.dims)
-        places, weights = samples_in(self.boxes.dims, lo, hi)
-        found = tally(values, volume, self.limits)
-        samples = [values[z : z + size[2], y : y + size[1], x : x + size[0]] for x, y, z in places - lo]
-        bricks = np.array(samples) if samples else np.empty((0, *size[::-1]), values.dtype)
+        found: Tally | None = None
+        for z in range(lo[2], hi[2], self.slices):
+            part = tally(read_block(volume, *_slices(lo, hi, z, self.slices)), volume, self.limits)
+            found = part if found is None else found.plus(part)
+        assert found is not None, "a box has a slice"
+        bricks, weights = self._samples(volume, lo, hi)
         self.place.parts.save(
             self.kind,
             number,
@@ -88,9 +90,22 @@ class CountBlocks:
             ends=np.array([found.lo, found.hi, *found.stored]),
             numbers=np.array([found.nan, found.finite], np.int64),
             histogram=found.histogram,
-            samples=bricks if self.limits is None else bricks[:0],
+            samples=bricks,
             weights=weights,
         )
+
+    def _samples(self, volume: Volume, lo: np.ndarray, hi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The bricks (n, z, y, x) of a box, of a first pass, and the voxels (n,) that each stands for."""
+        x, y, z = np.minimum(SAMPLE, self.boxes.dims)
+        places, weights = samples_in(self.boxes.dims, lo, hi)
+        count = len(places) if self.limits is None else 0
+        found = np.empty((count, z, y, x), volume.data.dtype.newbyteorder("="))
+        for first in np.unique(places[:count, 2]):
+            layer = read_block(volume, *_slices(lo, hi, first, z))
+            for n in np.flatnonzero(places[:, 2] == first):
+                i, j, _ = places[n] - lo
+                found[n] = layer[:, j : j + y, i : i + x]
+        return found, weights
 
     def merged(self) -> tuple[Tally, np.ndarray, np.ndarray]:
         """The sum over all blocks, their samples (n, z, y, x), and the voxels (n,) that each stands for.
@@ -109,6 +124,11 @@ class CountBlocks:
             weights.append(part["weights"])
         assert whole is not None, "a volume has a block"
         return whole, np.concatenate(samples), np.concatenate(weights)
+
+
+def _slices(lo: np.ndarray, hi: np.ndarray, z: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """First voxel (3,) of ``count`` slices of a box from slice ``z`` of the volume on, and that behind the last."""
+    return np.array([lo[0], lo[1], z]), np.array([hi[0], hi[1], min(z + count, hi[2])])
 
 
 @dataclass(frozen=True)
