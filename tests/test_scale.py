@@ -230,8 +230,8 @@ def test_what_blocks_cannot_do_is_a_line(vvgt, raw, tmp_path):
         (("--blocks", "48"), "power of two"),
         (("--blocks", "auto", "--init", "wavelet"), "whole volume in memory"),
         (("--blocks", "auto", "--light", "headlight"), "lit by nothing"),
-        (("--blocks", "auto", "--labels", "auto"), "not in blocks"),
-        (("--blocks", "auto", "--layer", str(raw)), "not in blocks"),
+        (("--blocks", "auto", "--labels", "auto"), "not blocks of it"),
+        (("--blocks", "auto", "--layer", str(raw)), "not blocks of it"),
         (("--shard", "1/2", "--report", "r.json"), "vvgt merge"),
         (("--shard", "3/2"), "I from 1 to N"),
     ):
