@@ -19,6 +19,7 @@ MAX_FIELD = 1 << 24  # cells of the field of opacity
 A_BLOCK = 0.3  # of the memory of a worker: what its voxels may take; as much again where they are converted
 COUNTED = 3  # bytes a voxel of counting: a copy, and the bins
 ALWAYS = 400 << 20  # bytes: coarse grids, a tile's tree, a batch of Gaussians
+WIDE = 3  # exponent of cells whose voxels get one point of quadrature in place of eight: quicker, less exact
 MOST_WIDER = 6  # powers of two that a coarse cell is wider than a base cell: a tile
 
 
@@ -109,5 +110,5 @@ def cell_grid(volume: Volume, exponent: np.ndarray, edge: int, march: int) -> Ce
     wanted = np.array(shape_of(volume, edge))
     x, y, z = (int(t * max(w // t, 1)) for t, w in zip(tile, wanted, strict=True))
     i, j, k = (int(e) for e in exponent)
-    points = 1 if min(i, j, k) >= 1 else 2
+    points = 1 if min(i, j, k) >= WIDE else 2
     return CellGrid(Boxes(volume.dims, (x, y, z)), (i, j, k), frame.half, frame.step, points, march, field, bits)
