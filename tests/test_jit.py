@@ -171,6 +171,8 @@ def test_commands_need_what_is_compiled_ahead_and_nothing_else(tmp_path):
     (tmp_path / "v_24x24x24_uint8.raw").write_bytes(bytes(range(216)) * 64)
     blocks = wanted(tmp_path, "init", "v_24x24x24_uint8.raw", *fit, "--blocks", 16, "-o", "k.ply")
     assert blocks == set(ahead.BLOCKS) - rare
+    fitted = wanted(tmp_path, "convert", "v_24x24x24_uint8.raw", *fit, "--steps", 24, "--blocks", 16, "-o", "m.ply")
+    assert fitted == {*ahead.BLOCKS, *(name for name in ahead.CONVERT if ".dvr." not in name)} - rare
     few = wanted(tmp_path, "convert", SOURCE, *fit, "--steps", 0, "-o", "b.ply")
     assert set(ahead.BACK_PROJECT) <= few <= {*ahead.CONVERT, *ahead.BACK_PROJECT}
     views = ("--views", 6, "--test-views", 2, "--size", 40, "-q", "-o", "views")

@@ -213,9 +213,12 @@ def test_memory_decides_by_itself(vvgt, tmp_path, monkeypatch):
     assert "more than the memory holds" in less.err
     assert same_gaussians(tmp_path / "a.ply", tmp_path / "b.ply")
     monkeypatch.setattr("vvgt_cli.volume.blocks.free_memory", lambda: 1 << 20)
-    whole = vvgt("convert", source, "-o", tmp_path / "c.ply", *FIT[:-1])
+    whole = vvgt("render-views", source, "-o", tmp_path / "views", "--size", "40", "--views", "2")
     assert whole.code == 1
-    assert "try 'vvgt init', which goes through it in blocks" in whole.err
+    assert "which go through it in blocks" in whole.err
+    fitted = vvgt("convert", source, "-o", tmp_path / "d.ply", *FIT[:-1], "--steps", "8")
+    assert fitted.code == 0
+    assert "more than the memory holds" in fitted.err
     monkeypatch.setattr("vvgt_cli.scale.settings.free_memory", lambda: 200 << 20)
     none = vvgt("init", source, "-o", tmp_path / "c.ply", *FIT[:-1])
     assert none.code == 2
@@ -227,8 +230,8 @@ def test_what_blocks_cannot_do_is_a_line(vvgt, raw, tmp_path):
         (("--blocks", "48"), "power of two"),
         (("--blocks", "auto", "--init", "wavelet"), "whole volume in memory"),
         (("--blocks", "auto", "--light", "headlight"), "lit by nothing"),
-        (("--blocks", "auto", "--labels", "auto"), "not in blocks"),
-        (("--blocks", "auto", "--layer", str(raw)), "not in blocks"),
+        (("--blocks", "auto", "--labels", "auto"), "not blocks of it"),
+        (("--blocks", "auto", "--layer", str(raw)), "not blocks of it"),
         (("--shard", "1/2", "--report", "r.json"), "vvgt merge"),
         (("--shard", "3/2"), "I from 1 to N"),
     ):
@@ -249,4 +252,31 @@ def test_a_label_map_by_name_is_not_taken_for_scalars_in_blocks(vvgt, raw, tmp_p
     run = vvgt("init", named, "-o", tmp_path / "a.ply", *FIT, "--blocks", "32")
     assert run.code == 2
     assert "label map" in run.err
+    assert "--labels none" in run.err
+    assert not (tmp_path / ".a.ply.blocks").exists()  # before anything is counted
     assert vvgt("init", named, "-o", tmp_path / "a.ply", *FIT, "--blocks", "32", "--labels", "none").code == 0
+
+
+def test_a_box_that_is_counted_slice_by_slice_has_the_counts_and_samples_of_the_whole(raw, tmp_path):
+    from vvgt_cli.scale.grid import Boxes
+    from vvgt_cli.scale.parts import COUNTS, Parts
+    from vvgt_cli.scale.tasks import CountBlocks, Place
+
+    merged = []
+    for slices in (1, 7, 80):
+        parts = Parts(tmp_path / str(slices))
+        (parts.folder / COUNTS).mkdir(parents=True)
+        place = Place(str(raw), ReadOptions(stored=True), str(parts.folder))
+        task = CountBlocks(place, Boxes((100, 90, 80), (64, 64, 64)), slices)
+        for number in range(len(task)):
+            task(number)
+        merged.append(task.merged())
+    whole, samples, weights = merged[0]
+    assert whole.counts.sum() == 100 * 90 * 80
+    assert len(samples) == len(weights) > 100
+    x, y, z = (n // 16 * 16 + 3 for n in (50, 40, 30))
+    assert (samples == read_volume(str(raw)).data[z : z + 9, y : y + 9, x : x + 9]).all(axis=(1, 2, 3)).any()
+    for other in merged[1:]:
+        assert np.array_equal(other[0].counts, whole.counts)
+        assert np.array_equal(other[1], samples)
+        assert np.array_equal(other[2], weights)

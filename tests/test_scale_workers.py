@@ -162,3 +162,57 @@ def test_a_killed_run_goes_on_where_it_was(raw, alone, vvgt, tmp_path):
     assert "0 of 48 blocks" in again.err
     assert (tmp_path / "a.ply").read_bytes() == alone
     assert not (tmp_path / ".a.ply.blocks").exists()
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
+def test_a_killed_worker_of_dask_costs_nothing_but_time(raw, alone, tmp_path):
+    pytest.importorskip("distributed")
+    options = ("--blocks", 16, "--workers", 2, "--scheduler", "local")
+    run = start("init", raw, "-o", tmp_path / "two.ply", *FIT, *options)
+    killed, until = 0, time.monotonic() + 900
+    while run.poll() is None and time.monotonic() < until:
+        workers = [pid for pid, line in children(run.pid).items() if b"spawn_main" in line]
+        if len(workers) > 1 and not killed and list(tmp_path.glob(".two.ply.blocks/counts/*.npz")):
+            os.kill(workers[-1], signal.SIGKILL)
+            killed += 1
+        time.sleep(0.01)
+    said = run.communicate(timeout=60)[1]
+    assert run.returncode == 0, said
+    assert killed == 1
+    assert said == ""
+    assert (tmp_path / "two.ply").read_bytes() == alone
+
+
+def test_two_runs_to_one_file_do_not_meet(raw, alone, vvgt, tmp_path):
+    first = start("init", raw, "-o", tmp_path / "a.ply", *FIT, *SIZE)
+    while first.poll() is None and not list(tmp_path.glob(".a.ply.blocks/*/*.npz")):
+        time.sleep(0.005)
+    assert first.poll() is None, "it ended too early to be met"
+    first.send_signal(signal.SIGSTOP)
+    try:
+        second = vvgt("init", raw, "-o", tmp_path / "a.ply", *FIT, *SIZE)
+        assert second.code == 2
+        assert "another run" in second.err
+        assert second.err.count("\n") == 1
+    finally:
+        first.send_signal(signal.SIGCONT)
+    assert first.wait(900) == 0
+    assert (tmp_path / "a.ply").read_bytes() == alone
+
+
+@pytest.mark.parametrize("kilobytes", [4, 100])
+def test_a_disk_that_takes_no_more_is_a_line_and_the_run_goes_on_when_it_does(raw, alone, vvgt, tmp_path, kilobytes):
+    """Files that may not grow any further stand for it: parts of counts, rows of cells."""
+    resource = pytest.importorskip("resource")
+    full = subprocess.run(
+        [sys.executable, "-m", "vvgt_cli.cli.main", *map(str, ("init", raw, "-o", tmp_path / "a.ply", *FIT, *SIZE))],
+        env={**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}, capture_output=True, text=True,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (kilobytes << 10,) * 2),
+    )  # fmt: skip
+    assert full.returncode == 1
+    assert full.stderr.count("\n") == 1
+    assert "File too large" in full.stderr
+    assert not (tmp_path / "a.ply").exists()
+    assert list((tmp_path / ".a.ply.blocks").rglob(".*")) == []  # temporary files
+    assert vvgt("init", raw, "-o", tmp_path / "a.ply", *FIT, *SIZE).code == 0
+    assert (tmp_path / "a.ply").read_bytes() == alone

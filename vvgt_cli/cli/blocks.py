@@ -39,31 +39,45 @@ def _level(ctx: click.Context, param: click.Parameter, value: str | None) -> int
     return int(value)
 
 
-block_options = group(
-    "blocks",
-    block_size=click.option(
+_options = {
+    "block_size": click.option(
         "--blocks", "block_size", metavar="SIZE|auto", callback=_size,
         help="Read the volume in blocks of SIZE voxels along an edge (a power of two), or as the memory allows. "
         "Default: only where the memory does not hold it.",
     ),
-    workers=click.option(
+    "workers": click.option(
         "--workers", type=click.IntRange(1, 1024), default=1, show_default=True, metavar="N",
         help="Processes that go through blocks at once; with --scheduler local, its workers.",
     ),
-    scheduler=click.option(
+    "scheduler": click.option(
         "--scheduler", metavar="local|ADDRESS",
         help="Let Dask's workers go through the blocks: of this machine, or of the scheduler at "
         "ADDRESS (tcp://...). Needs the extra cluster.",
     ),
-    shard=click.option(
-        "--shard", metavar="I/N", callback=_shard,
-        help="Part I of N of a job array: -o is a folder of blocks then, for 'vvgt merge'.",
-    ),
-    level=click.option(
+    "level": click.option(
         "--level", metavar="full|N", callback=_level,
         help="Of an OME-Zarr image in blocks, 0 the finest. Default: the coarsest that --size cannot tell from it.",
     ),
+}  # fmt: skip
+_shard_option = {
+    "shard": click.option(
+        "--shard", metavar="I/N", callback=_shard,
+        help="Part I of N of a job array: -o is a folder of blocks then, for 'vvgt merge'.",
+    ),
+}  # fmt: skip
+block_options = group("blocks", **_options)
+levels_option = click.option(
+    "--levels", type=click.IntRange(1, 8), default=1, show_default=True, metavar="N",
+    help="Levels of detail: OUT-1.ply, ... beside OUT.ply, each with a quarter of the Gaussians, and an index "
+    "OUT-levels.json.",
 )  # fmt: skip
+shared_block_options = group("blocks", **_options, **_shard_option, levels=levels_option)
+ONE = ("workers", "levels")  # options that are 1 where they are not given
+
+
+def asked_for(blocks: dict[str, Any]) -> bool:
+    """Whether any of the options is given."""
+    return any(value is not None and (key not in ONE or value > 1) for key, value in blocks.items())
 
 
 def chosen(blocks: dict[str, Any], request: ConvertRequest, console: Console) -> BlockOptions | None:
@@ -75,11 +89,9 @@ def chosen(blocks: dict[str, Any], request: ConvertRequest, console: Console) ->
     from vvgt_cli.scale.settings import BlockOptions
     from vvgt_cli.scale.source import beyond_memory
 
-    size = blocks.pop("block_size")
-    given = [value for key, value in blocks.items() if key != "workers"]
-    asked = size is not None or blocks["workers"] > 1 or any(value is not None for value in given)
-    if not asked:
+    if not asked_for(blocks):
         if not beyond_memory(request.source):
             return None
         console.say("more than the memory holds: in blocks (docs/scale.md)")
+    size = blocks.pop("block_size")
     return BlockOptions(**{**blocks, "size": None if size == "auto" else size})

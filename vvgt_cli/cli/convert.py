@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from vvgt_cli.cli.blocks import asked_for, block_options, chosen
 from vvgt_cli.cli.fit import fit_options, limit_options, ply_options, rule_option
 from vvgt_cli.cli.options import common_options, light_options, overwrite_option, placed_read_options, tfs_options
 from vvgt_cli.progress import Console
@@ -51,12 +52,14 @@ if TYPE_CHECKING:
 @click.option(
     "--split-labels", is_flag=True, help="Of a label map: one file a label, its name for {} in OUT.ply, and an index."
 )
+@block_options
 @click.option("--shard", metavar="I/N", help="Of a series: convert part I of N, for job arrays; I counts from 1.")
 @overwrite_option
 @common_options
 def command(
-    volume: str, shard: str | None, dry_run: bool, split_labels: bool, console: Console, **options: Any
-) -> None:
+    volume: str, shard: str | None, dry_run: bool, split_labels: bool, console: Console, blocks: dict[str, Any],
+    **options: Any,
+) -> None:  # fmt: skip
     """Convert VOLUME into a standard 3D Gaussian Splatting .ply.
 
     VOLUME is a file (raw with a header or with --dims and --dtype, NRRD, NIfTI, MetaImage, VTK, TIFF, ...),
@@ -94,9 +97,9 @@ def command(
     options["optics"]["tf"] = functions[0] if functions else None
     request = convert_request(volume, **options)
     if split_labels:
-        _split(request, functions, dry_run or shard is not None, console)
+        _split(request, functions, dry_run or shard is not None or asked_for(blocks), console)
     else:
-        _convert(request, functions, shard, dry_run, console)
+        _convert(request, functions, shard, dry_run, console, blocks)
 
 
 def _split(request: ConvertRequest, functions: Sequence[str], other: bool, console: Console) -> None:
@@ -105,20 +108,25 @@ def _split(request: ConvertRequest, functions: Sequence[str], other: bool, conso
     from vvgt_cli.errors import UsageError
 
     if functions or other or request.checkpoint is not None:
-        raise UsageError("--split-labels is of one label map; leave out --tf, --dry-run, --shard and --checkpoint")
+        raise UsageError(
+            "--split-labels is of one label map in memory; leave out --tf, --dry-run, --shard and --checkpoint"
+        )
     convert_labels(request, console)
 
 
 def _convert(
-    request: ConvertRequest, functions: Sequence[str], shard: str | None, dry_run: bool, console: Console
-) -> None:
-    """One volume, a series, or several functions."""
+    request: ConvertRequest, functions: Sequence[str], shard: str | None, dry_run: bool, console: Console,
+    blocks: dict[str, Any],
+) -> None:  # fmt: skip
+    """One volume, whole or in blocks, a series, or several functions."""
     from vvgt_cli.batches.functions import convert_functions
     from vvgt_cli.batches.series import convert_series, is_pattern
     from vvgt_cli.conversion.convert import convert, planned
     from vvgt_cli.errors import UsageError
 
     several = len(functions) > 1
+    if asked_for(blocks) and (several or dry_run or is_pattern(request.output or "")):
+        raise UsageError("--blocks, --workers, --scheduler, --level: of one volume and function; leave out --dry-run")
     if several and (dry_run or shard is not None or request.checkpoint is not None):
         raise UsageError(f"{len(functions)} functions; expected one with --dry-run, --shard or --checkpoint")
     series = is_pattern(request.output or "") and not several
@@ -136,5 +144,9 @@ def _convert(
         raise UsageError(f"--shard {shard} is of a series; give -o a place for the frame's number, as out_{{:04d}}.ply")
     elif dry_run:
         click.echo(planned(request, console).text())
+    elif (asked := chosen(blocks, request, console)) is not None:
+        from vvgt_cli.scale.convert import convert_in_blocks
+
+        convert_in_blocks(request, asked, console)
     else:
         convert(request, console)

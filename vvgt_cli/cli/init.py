@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from vvgt_cli.cli.blocks import block_options
+from vvgt_cli.cli.blocks import shared_block_options
 from vvgt_cli.cli.fit import fit_options, ply_options
 from vvgt_cli.cli.options import common_options, light_options, overwrite_option, placed_read_options, tf_options
 from vvgt_cli.progress import Console
@@ -27,7 +27,7 @@ from vvgt_cli.progress import Console
 @light_options
 @placed_read_options
 @click.option("--report", metavar="R.json", help="Write the times of every stage as JSON; - is standard output.")
-@block_options
+@shared_block_options
 @overwrite_option
 @common_options
 def command(volume: str, console: Console, blocks: dict[str, Any], **options: Any) -> None:

@@ -151,15 +151,19 @@ def _fit(work: Work, request: ConvertRequest, planner: Planner, plan: Plan) -> P
     planner = replace(planner, wide=wide(work.made(), work.fit.size), sh_degree=degree)
     plan = planner.plan(replace(plan.case.at(pace), degree=work.made().degree), work.run.elapsed(), begun=True)
     check_memory(plan)
-    _improve(work, plan)
+    improve(work, plan)
     work.gaussians = as_stored(work.made())  # what is scored is what the file holds
     if not _interrupted(work.run):
         work.checkpoint.save(FITTED, work.gaussians)
     return plan
 
 
-def _improve(work: Work, plan: Plan) -> None:
-    """The stages that views pay for; from where a target is reached on, none."""
+def improve(work: Work, plan: Plan) -> None:
+    """The stages that views pay for; from where a target is reached on, none.
+
+    Raises:
+        DataError, UsageError: as the stages.
+    """
     ahead = [stage for stage in plan.stages if not stage.scores]
     told = improved = False
     for n, stage in enumerate([*ahead, None]):

@@ -78,3 +78,9 @@ class Gaussians:
             shared = min(terms.shape[1], self.harmonics.shape[1])
             terms[:, :shared] = self.harmonics[:, :shared]
         return replace(self, harmonics=terms if degree else None)
+
+
+def together(parts: list[Gaussians]) -> Gaussians:
+    """One set of several, of one degree, in their order."""
+    fields = parts[0].arrays()
+    return Gaussians(**{field: np.concatenate([getattr(part, field) for part in parts]) for field in fields})

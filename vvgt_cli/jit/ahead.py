@@ -36,9 +36,11 @@ BACK_PROJECT = ("vvgt_cli.splat.tiles:gather", "vvgt_cli.splat.tiles:reduce_pair
 
 VIEWS = (*RAYCAST, *CLOSED_FORM[:-2])  # and points to start from
 INIT = (*CLOSED_FORM, "vvgt_cli.dvr.bricks:_ranges")
-MERGE = tuple(name for name in CLOSED_FORM if "block_moments" not in name and "compact" not in name)
+MERGE = (*(name for name in CLOSED_FORM if "block_moments" not in name and "compact" not in name), *DRAW)
 BLOCKS = (
     *CLOSED_FORM,
+    *DRAW,
+    "vvgt_cli.dvr.segments:cast_segments",
     "vvgt_cli.vbm.ranges:block_ranges",
     "vvgt_cli.volume.count_kernel:count_values",
 )  # of a volume that is gone through in blocks
@@ -55,7 +57,7 @@ ALL = (
     *HARMONICS,
     *STEPPED,
     *DEPOSITS,
-    *BLOCKS[-2:],
+    *BLOCKS[-3:],
     "vvgt_cli.volume.slc_kernel:decode_plane",
 )
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vvgt_cli.scale.grid import TILE, TILE_BITS, CellGrid
+from vvgt_cli.scale.grid import CellGrid
 from vvgt_cli.scale.parts import CELLS, Parts
 from vvgt_cli.scale.tasks import read_rows
 from vvgt_cli.vbm.moments import Cells, morton
@@ -102,7 +102,7 @@ class Forest:
 
     def __init__(self, parts: Parts, grid: CellGrid, seen: Visibility, coarse: Coarse, scratch: Path) -> None:
         self._parts, self._grid, self._seen, self._scratch = parts, grid, seen, scratch
-        self._levels = None if len(coarse.tiles) == 1 else TILE_BITS
+        self._levels = None if len(coarse.tiles) == 1 else grid.bits
         self.tiles: list[Tile] = []
         self._sizes: list[tuple[int, int]] = []  # cells and base cells of each tree
         moments, largest = [], []
@@ -129,7 +129,8 @@ class Forest:
             rows[:], top[:] = moments, largest
 
         places = np.array([tile.place for tile in self.tiles], np.int32)
-        edge = self._tree(self.tiles[0]).edge[-1] if self._levels is None else self._grid.cell_edge * TILE
+        grid = self._grid
+        edge = self._tree(self.tiles[0]).edge[-1] if self._levels is None else grid.cell_edge * grid.tile_cells
         self.top = pyramid(places, edge, fill)
         self._capped = cap_by_ancestors(self.top, split_score(self.top))
         self._above = self._capped[self.top.parent]
@@ -137,7 +138,7 @@ class Forest:
 
     def _tree(self, tile: Tile) -> Tree:
         moments, local = read_rows(self._parts, tile.block, tile.offset, tile.cells)
-        index = local + np.array(tile.place, np.int32) * TILE
+        index = local + np.array(tile.place, np.int32) * self._grid.tile_cells
         cells = Cells(index, moments, self._grid.cell_edge, np.array(self._grid.exponent, np.int64))
         return build_tree(cells, self._seen, np.array(self._grid.step), self._levels)
 

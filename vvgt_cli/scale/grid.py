@@ -1,7 +1,8 @@
 """How a volume is cut: blocks that are read, tiles of cells that are kept, coarse grids that are marched through.
 
-A tile is a cube of 64 base cells along each axis, a block a box of whole tiles. What is kept of a tile depends on the
-volume and the base cells alone, so that everything that follows is the same to the byte whatever blocks were read.
+A tile is a cube of base cells, 64 along each axis or fewer where they are wide, a block a box of whole tiles. What is
+kept of a tile depends on the volume and the base cells alone, so that everything that follows is the same to the byte
+whatever blocks were read.
 """
 
 from __future__ import annotations
@@ -11,8 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-TILE_BITS = 6
-TILE = 1 << TILE_BITS  # base cells along the edge of a tile
+TILE_BITS = 6  # a tile has at most 2^6 base cells along its edge
+TILE_VOXELS = 7  # and 2^7 voxels, where it has 2^3 cells or more: memory holds blocks of whole tiles
+FEWEST_BITS = 3
 SAMPLES = 4096  # bricks, at most, that the share of visible voxels is estimated from
 SAMPLE = 9  # voxels along their edge
 Triple = tuple[int, int, int]
@@ -53,6 +55,7 @@ class CellGrid:
         points: of quadrature a voxel and axis.
         march: the cells that visibility is marched through are 2^march times as wide.
         field: those of the field of opacity, 2^field times.
+        bits: a tile has 2^bits base cells along its edge.
     """
 
     blocks: Boxes
@@ -62,6 +65,7 @@ class CellGrid:
     points: int
     march: int
     field: int
+    bits: int = TILE_BITS
 
     @property
     def dims(self) -> np.ndarray:
@@ -81,9 +85,14 @@ class CellGrid:
         return result
 
     @property
+    def tile_cells(self) -> int:
+        """Base cells along the edge of a tile."""
+        return 1 << self.bits
+
+    @property
     def tile(self) -> np.ndarray:
         """Edges (3,) of a tile, voxels."""
-        return np.round(TILE * self.cell).astype(np.int64)
+        return np.round(self.tile_cells * self.cell).astype(np.int64)
 
     def tiles(self, number: int) -> np.ndarray:
         """Numbers (n, 3) int64, (x, y, z), of the tiles in a block."""
@@ -96,6 +105,11 @@ class CellGrid:
     def coarse_shape(self, wider: int) -> np.ndarray:
         """Cells (3,) along each axis, x first, of the grid of cells 2^``wider`` times as wide."""
         return np.ceil(self.dims / (self.cell * 2.0**wider)).astype(np.int64)
+
+
+def tile_bits(exponent: np.ndarray, least: int) -> int:
+    """`CellGrid.bits` of cells of 2^``exponent`` (3,) voxels, of which 2^``least`` must lie in one tile."""
+    return max(min(TILE_BITS, TILE_VOXELS - int(exponent.max())), FEWEST_BITS, least)
 
 
 def sample_spacing(dims: Triple) -> int:

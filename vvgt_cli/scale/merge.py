@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import IO, TYPE_CHECKING, NamedTuple
+from dataclasses import asdict, dataclass, replace
+from typing import IO, TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -17,11 +19,16 @@ from vvgt_cli.errors import NothingVisible
 from vvgt_cli.files import atomic_write, check_room, is_stream
 from vvgt_cli.gaussians.frames import transform
 from vvgt_cli.gaussians.ply import as_stored, ply_header, ply_rows
+from vvgt_cli.gaussians.types import together
 from vvgt_cli.jit.ahead import MERGE
+from vvgt_cli.resources import free_memory
 from vvgt_cli.runs.outputs import STDOUT
 from vvgt_cli.runs.record import Run
+from vvgt_cli.scale.levels import PART, level_name, write_index
 from vvgt_cli.scale.parts import Parts
 from vvgt_cli.scale.plan import Plan
+from vvgt_cli.scale.sight import Box, drawing_bytes, score_gaussians, score_text
+from vvgt_cli.splat.rules import INRIA
 
 if TYPE_CHECKING:
     from vvgt_cli.gaussians import Gaussians
@@ -32,15 +39,10 @@ BATCH = 1 << 16  # Gaussians that are made at once
 SCRATCH = "scores"
 
 
-class Box(NamedTuple):
-    """A volume's half extents and voxel edges (3,), unit frame, as cameras ask for them."""
-
-    half: np.ndarray
-    step: np.ndarray
-
-
-def write_merged(run: Run, parts: Parts, output: str, overwrite: bool) -> None:
+def write_merged(run: Run, parts: Parts, output: str, overwrite: bool, levels: int = 1) -> None:
     """Cut the pyramid over all parts for the plan's budget and write it; fills the report in.
+
+    With ``levels`` above 1 also for parts of the budget, each into a file of its own, and an index.
 
     Raises:
         DataError: parts are missing or damaged, or nothing is visible.
@@ -52,20 +54,50 @@ def write_merged(run: Run, parts: Parts, output: str, overwrite: bool) -> None:
     report.options = {"max_gaussians": plan.budget, "size": plan.size, "frame": plan.ply.frame, "up": plan.ply.up}
     run.compile(MERGE)
     with run.stage("pyramid") as stage:
-        forest, opaque = _forest(parts, plan)
+        forest, opaque = pyramid(parts, plan)
         stage.note = f"{forest.base} cells in {len(forest.tiles)} tiles"
+    written: list[dict[str, Any]] = []
+    for level in range(levels):
+        budget = max(written[0]["gaussians"] // PART**level, 1) if level else plan.budget
+        cut = Cut(forest, opaque, replace(plan, budget=budget))
+        written.append(_level(run, parts, cut, level_name(output, level), overwrite))
+    report.gaussians, report.bytes, report.scores = (written[0][key] for key in ("gaussians", "bytes", "scores"))
+    if levels > 1:
+        for row in written:
+            row["psnr"] = (row.pop("scores") or {}).get("psnr")
+        write_index(output, plan.size, written, overwrite)
+
+
+def _level(run: Run, parts: Parts, cut: Cut, output: str, overwrite: bool) -> dict[str, Any]:
+    """One file: its name, how many Gaussians and bytes it has, and its scores, None where it is not drawn."""
+    plan, size = cut.plan, cut.plan.size
     with run.stage("write") as stage, _sink(parts, output, overwrite) as sink:
-        count, spared = _write(forest, opaque, plan, sink, output)
-        report.gaussians, report.bytes = count, sink.tell()
-        stage.note = f"{output}: {count} Gaussians, {report.bytes / 1e6:.1f} MB"
+        made, spared = _write(cut, sink, output)
+        count, written = made.total, sink.tell()
+        stage.note = f"{output}: {count} Gaussians, {written / 1e6:.1f} MB"
         if not spared and count < NEARLY * plan.budget:
-            stage.note += f", no more: {forest.base} cells that the screen, or {plan.budget} Gaussians, have use for"
+            base = cut.forest.base
+            stage.note += f", no more: {base} cells that the screen, or {plan.budget} Gaussians, have use for"
     if spared:
         run.leave_out(f"{spared} Gaussians", "so faint that viewers differ on what they draw of them")
+    scores = None
+    if made.batches is None:
+        need = drawing_bytes(count, size)
+        run.leave_out("test views", f"{count} Gaussians at once need about {need / 2**30:.1f} GiB of memory")
+    else:
+        with run.stage("test views") as stage:
+            found = score_gaussians(together(made.batches), parts, plan.grid, size, plan.ply.rule or INRIA)
+            scores, stage.note = asdict(found), score_text(found, size)
+    return {"file": os.path.basename(output), "gaussians": count, "bytes": written, "scores": scores}
 
 
-def _forest(parts: Parts, plan: Plan) -> tuple[Forest, Opaque]:
-    """The pyramid over all parts, and where bodies are opaque."""
+def pyramid(parts: Parts, plan: Plan) -> tuple[Forest, Opaque]:
+    """The pyramid over all parts, and where bodies are opaque.
+
+    Raises:
+        NothingVisible: from no view.
+        DataError: parts are missing or damaged.
+    """
     from vvgt_cli.cameras import default_views
     from vvgt_cli.scale.forest import Forest, gather
     from vvgt_cli.vbm.closed_form import MARCH_SIZE
@@ -90,37 +122,65 @@ def _opaque(coarse: Coarse, plan: Plan) -> Opaque:
     return nowhere(edge, half) if coarse.deepest < SURFACE else smoothed(coarse.field, edge, half)
 
 
-def _write(forest: Forest, opaque: Opaque, plan: Plan, sink: IO[bytes], output: str) -> tuple[int, int]:
-    """Write the file; how many Gaussians it has, and how many are left out since they would be too faint."""
-    budget, first = plan.budget, 0
+class Made(NamedTuple):
+    """What was written: how many Gaussians, and themselves in the box frame, None where the memory holds no drawing."""
+
+    total: int
+    batches: list[Gaussians] | None
+
+
+def _write(cut: Cut, sink: IO[bytes], output: str) -> tuple[Made, int]:
+    """Write the file; what it has, and how many Gaussians are left out since they would be too faint."""
+    plan, first, free = cut.plan, 0, free_memory()
+    axes = np.array(plan.axes).reshape(3, 3)
     while True:
-        threshold = forest.threshold(budget)
-        count = forest.count(threshold)
+        threshold = cut.forest.threshold(plan.budget)
+        count = cut.forest.count(threshold)
         first = first or count
         if output != STDOUT:
             check_room(output, count * VERTEX_BYTES)
         sink.seek(0)
         sink.truncate()
         sink.write(ply_header(count, plan.ply.sh_degree or 0, plan.ply))
+        kept: list[Gaussians] | None = [] if free is None or drawing_bytes(count, plan.size) < free else None
         faint = 0
-        for gaussians in gaussians_of(forest, opaque, plan, threshold):
-            sink.write(ply_rows(gaussians, plan.ply).data)
+        for gaussians in cut.gaussians(threshold):
+            sink.write(ply_rows(transform(gaussians, axes), plan.ply).data)
             faint += int((gaussians.opacity_logits < FAINT_LOGIT).sum())
-        if 2 * faint <= count or budget < 2 * FEWEST:
-            return count, first - count
-        budget //= 2
+            if kept is not None:
+                kept.append(gaussians)
+        if 2 * faint <= count or plan.budget < 2 * FEWEST:
+            return Made(count, kept), first - count
+        plan = replace(plan, budget=plan.budget // 2)
 
 
-def gaussians_of(forest: Forest, opaque: Opaque, plan: Plan, threshold: float) -> Iterator[Gaussians]:
-    """Gaussians of the cells that a threshold leaves, in the unit frame, as the file will hold them, in batches."""
-    from vvgt_cli.scale.forest import batches
-    from vvgt_cli.vbm.closed_form import pixel_width
-    from vvgt_cli.vbm.shape import ROUND, cell_gaussians
+@dataclass(frozen=True)
+class Cut:
+    """A pyramid, where bodies are opaque, and the plan that it is cut for."""
 
-    voxel, pixel = min(plan.grid.step), pixel_width(plan.size)
-    axes = np.array(plan.axes).reshape(3, 3)
-    for leaves in batches(forest.leaves(threshold), BATCH):
-        yield transform(as_stored(cell_gaussians(leaves, voxel, pixel, opaque, ROUND)), axes)
+    forest: Forest
+    opaque: Opaque
+    plan: Plan
+
+    def whole(self) -> tuple[Gaussians, int]:
+        """All Gaussians at once; and how many are left out since they would be too faint, as where they are written."""
+        budget, first = self.plan.budget, 0
+        while True:
+            made = together(list(self.gaussians(self.forest.threshold(budget))))
+            first = first or len(made)
+            if 2 * int((made.opacity_logits < FAINT_LOGIT).sum()) <= len(made) or budget < 2 * FEWEST:
+                return made, first - len(made)
+            budget //= 2
+
+    def gaussians(self, threshold: float) -> Iterator[Gaussians]:
+        """Those of the cells that a threshold leaves, in the box frame, as a file holds them, in batches."""
+        from vvgt_cli.scale.forest import batches
+        from vvgt_cli.vbm.closed_form import pixel_width
+        from vvgt_cli.vbm.shape import ROUND, cell_gaussians
+
+        voxel, pixel = min(self.plan.grid.step), pixel_width(self.plan.size)
+        for leaves in batches(self.forest.leaves(threshold), BATCH):
+            yield as_stored(cell_gaussians(leaves, voxel, pixel, self.opaque, ROUND))
 
 
 @contextmanager

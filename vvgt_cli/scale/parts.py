@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -94,33 +94,56 @@ class Parts:
         """Those of ``numbers`` that are not there."""
         return [number for number in numbers if not self.path(kind, number).is_file()]
 
-    def save(self, kind: str, number: int, **arrays: np.ndarray) -> None:
-        """Write a part, whole or not at all.
+    def save(self, kind: str, number: int, suffix: str = ".npz", **arrays: np.ndarray) -> None:
+        """Write a part, whole or not at all; that without a suffix of its own last: the block is done with it.
 
         Raises:
             DataError: the system refuses (a full disk).
         """
-        with atomic_write(self.path(kind, number), overwrite=True) as temporary, open(temporary, "wb") as stream:
+        with (
+            atomic_write(self.path(kind, number, suffix), overwrite=True) as temporary,
+            open(temporary, "wb") as stream,
+        ):
             np.savez(stream, allow_pickle=False, **arrays)
 
-    def load(self, kind: str, number: int) -> dict[str, np.ndarray]:
-        """The arrays of a part.
+    def load(
+        self, kind: str, number: int, suffix: str = ".npz", names: Collection[str] | None = None
+    ) -> dict[str, np.ndarray]:
+        """The arrays of a part, or those of ``names``.
 
         Raises:
             DataError: it is not there, or damaged.
         """
-        path = self.path(kind, number)
+        path = self.path(kind, number, suffix)
         try:
             with np.load(path) as found:
-                return {name: found[name] for name in found.files}
-        except FileNotFoundError:
-            raise DataError(f"{path}: block {number} is missing; run the shard that makes it") from None
-        except Exception as error:  # zipfile, zlib and numpy raise what they like
-            raise DataError(f"{path}: damaged ({error}); remove it and run the same command again") from error
+                return {name: found[name] for name in (found.files if names is None else names)}
+        except Exception as error:
+            raise _unreadable(path, number, error) from error
+
+    def names(self, kind: str, number: int, suffix: str = ".npz") -> frozenset[str]:
+        """Of the arrays of a part.
+
+        Raises:
+            DataError: it is not there, or damaged.
+        """
+        path = self.path(kind, number, suffix)
+        try:
+            with np.load(path) as found:
+                return frozenset(found.files)
+        except Exception as error:
+            raise _unreadable(path, number, error) from error
 
     def remove(self) -> None:
         """The whole folder."""
         shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def _unreadable(path: Path, number: int, error: Exception) -> DataError:
+    """What is wrong with a part: zipfile, zlib and numpy raise what they like."""
+    if isinstance(error, FileNotFoundError):
+        return DataError(f"{path}: block {number} is missing; run the shard that makes it")
+    return DataError(f"{path}: damaged ({error}); remove the block's files and run the same command again")
 
 
 def differences(place: Path, settings: dict[str, Any]) -> str:

@@ -6,7 +6,7 @@ import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import asdict, astuple, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,11 +23,13 @@ from vvgt_cli.runs.place import remarks
 from vvgt_cli.runs.record import ConversionReport, Run
 from vvgt_cli.runs.source import Source, describe_source, tf_record, volume_record
 from vvgt_cli.scale.grid import sample_spacing
+from vvgt_cli.scale.levels import level_outputs
 from vvgt_cli.scale.merge import write_merged
 from vvgt_cli.scale.parts import Parts
 from vvgt_cli.scale.plan import Plan, finest_level, most_cells
 from vvgt_cli.scale.runners import Here, Processes, Runner
-from vvgt_cli.scale.settings import BlockOptions, block_edge, cell_grid, counted_boxes
+from vvgt_cli.scale.settings import BlockOptions, block_edge, cell_grid, counted_boxes, slices_at_once
+from vvgt_cli.scale.sight import Sight
 from vvgt_cli.scale.source import InBlocks, Samples, needs_histogram, open_in_blocks, resolved
 from vvgt_cli.share import format_of
 
@@ -52,15 +54,16 @@ def init_in_blocks(request: ConvertRequest, options: BlockOptions, console: Cons
     Raises:
         UsageError, DataError: as `vvgt_cli.conversion.convert.initialise_only`; what blocks cannot do.
     """
-    _refuse(request, options)
+    refuse(request, options)
     run = Run(console or Console(), ConversionReport("init"))
     if options.shard is not None:
         assert request.output is not None
         _shard(run, request, options, Parts(Path(request.output).absolute()))
         return run.finish()
-    with claimed(request.outputs(), request.inputs(), request.overwrite), _folder(request.output) as parts:
-        _make_parts(run, request, options, parts)
-        write_merged(run, parts, request.output or STDOUT, request.overwrite)
+    outputs = [*request.outputs(), *level_outputs(request.output, options.levels)]
+    with claimed(outputs, request.inputs(), request.overwrite), beside(request.output) as parts:
+        make_parts(run, request, options, parts, Sight(request.fit.size))
+        write_merged(run, parts, request.output or STDOUT, request.overwrite, options.levels)
         run.finish()
         if request.report:
             write_text(request.report, run.report.to_json(), request.overwrite)
@@ -68,8 +71,10 @@ def init_in_blocks(request: ConvertRequest, options: BlockOptions, console: Cons
     return run.report
 
 
-def merge(folder: str, output: str, overwrite: bool = False, console: Console | None = None) -> ConversionReport:
-    """Make a `.ply` of the blocks that shards have left in a folder.
+def merge(
+    folder: str, output: str, overwrite: bool = False, console: Console | None = None, levels: int = 1
+) -> ConversionReport:
+    """Make a `.ply`, or one of each of ``levels`` of detail, of the blocks that shards have left in a folder.
 
     Raises:
         UsageError: not such a folder, or an output that may not be written.
@@ -80,12 +85,13 @@ def merge(folder: str, output: str, overwrite: bool = False, console: Console | 
     run = Run(console or Console(), ConversionReport("merge"))
     parts = Parts(Path(folder))
     parts.settings()
-    with claimed([Output("-o", output, (".ply",), splats=True)], [], overwrite):
-        write_merged(run, parts, output, overwrite)
+    outputs = [Output("-o", output, (".ply",), splats=True), *level_outputs(output, levels)]
+    with claimed(outputs, [], overwrite):
+        write_merged(run, parts, output, overwrite, levels)
     return run.finish()
 
 
-def _refuse(request: ConvertRequest, options: BlockOptions) -> None:
+def refuse(request: ConvertRequest, options: BlockOptions) -> None:
     """What is not done in blocks."""
     if request.fit.init != "vbm":
         raise UsageError(f"--init {request.fit.init}: needs the whole volume in memory; in blocks: vbm")
@@ -102,12 +108,14 @@ def _refuse(request: ConvertRequest, options: BlockOptions) -> None:
         raise UsageError(f"-o {request.output}: blocks are written as a .ply; give a name that ends in .ply")
     if options.shard is not None and options.scheduler is not None:
         raise UsageError("--shard and --scheduler both share the blocks out; give one of them")
+    if options.shard is not None and options.levels > 1:
+        raise UsageError("--levels: a shard leaves blocks; give it to 'vvgt merge'")
     if options.shard is not None and (request.output in (None, STDOUT) or request.report):
         raise UsageError("--shard: -o is a folder of blocks then, there is no --report; 'vvgt merge' makes the .ply")
 
 
 @contextmanager
-def _folder(output: str | None) -> Iterator[Parts]:
+def beside(output: str | None) -> Iterator[Parts]:
     """Where blocks are kept: beside the output, so that the same command goes on there after it was ended."""
     if output is None or output == STDOUT:
         with tempfile.TemporaryDirectory(prefix="vvgt-") as folder:
@@ -126,7 +134,7 @@ def _runner(options: BlockOptions) -> Runner:
     return Processes(options.workers, threads) if options.workers > 1 else Here()
 
 
-def _settings(request: ConvertRequest, opened: InBlocks) -> dict[str, Any]:
+def _settings(request: ConvertRequest, opened: InBlocks, sight: Sight) -> dict[str, Any]:
     """All that parts depend on."""
     path = opened.request.path
     facts = [os.stat(path).st_size, os.stat(path).st_mtime_ns] if os.path.exists(path) else []
@@ -138,6 +146,7 @@ def _settings(request: ConvertRequest, opened: InBlocks) -> dict[str, Any]:
         "function": [text, request.source.tf_range, request.source.unit_distance],
         "gaussians": request.fit.max_gaussians,
         "size": request.fit.size,
+        "views": list(astuple(sight)),
         "ply": [request.ply.frame, request.up, request.ply.sh_degree, request.ply.comments],
     }
 
@@ -145,7 +154,7 @@ def _settings(request: ConvertRequest, opened: InBlocks) -> dict[str, Any]:
 def _shard(run: Run, request: ConvertRequest, options: BlockOptions, parts: Parts) -> None:
     """Do a shard's share of what can be done now, and say what is left."""
     try:
-        _make_parts(run, request, options, parts)
+        make_parts(run, request, options, parts, Sight(request.fit.size))
     except Later as later:
         run.console.say(
             f"{later.what}: this shard's share is done, {later.missing} blocks are other shards'; run the same array "
@@ -155,8 +164,11 @@ def _shard(run: Run, request: ConvertRequest, options: BlockOptions, parts: Part
         run.console.say(f"all blocks are there; next: vvgt merge {request.output} -o OUT.ply")
 
 
-def _make_parts(run: Run, request: ConvertRequest, options: BlockOptions, parts: Parts) -> None:
+def make_parts(run: Run, request: ConvertRequest, options: BlockOptions, parts: Parts, sight: Sight) -> Source:
     """Every block's part, those that are there taken as they are; and the plan of the file.
+
+    Returns:
+        What was read: a volume whose values stay where they are.
 
     Raises:
         Later: other shards' blocks are missing.
@@ -168,7 +180,7 @@ def _make_parts(run: Run, request: ConvertRequest, options: BlockOptions, parts:
     with run.stage("open") as stage:
         opened = open_in_blocks(request.source, options, pixel_width(request.fit.size))
         volume = opened.volume
-        settings = _settings(request, opened)
+        settings = _settings(request, opened, sight)
         edge = parts.kept_edge(settings) if options.size is None else None
         edge = edge or block_edge(volume, options)
         there = parts.open(settings | {"blocks": edge}, ours=options.shard is None)
@@ -179,7 +191,8 @@ def _make_parts(run: Run, request: ConvertRequest, options: BlockOptions, parts:
     run.compile(BLOCKS, kernel_type(volume))
     runner = _runner(options)
     place = Place(opened.request.path, opened.request.read, str(parts.folder))
-    counts = CountBlocks(place, counted_boxes(volume, edge, sample_spacing(volume.dims)))
+    boxes = counted_boxes(volume, edge, sample_spacing(volume.dims))
+    counts = CountBlocks(place, boxes, slices_at_once(volume, edge, boxes))
     _do(run, runner, counts, options, "count")
     second = None
     if needs_histogram(request.source) and not _counted(opened):
@@ -191,9 +204,10 @@ def _make_parts(run: Run, request: ConvertRequest, options: BlockOptions, parts:
     source, limits, samples = resolved(opened, counts, second)
     for line in (describe_source(source), *remarks(source.volume, ply_options(request, source))):
         run.console.say(line)
-    cells = _cells(request, source, limits, samples, place, edge)
+    cells = _cells(request, source, limits, samples, place, edge, sight)
     _plan(request, source, cells.grid).save(parts)
     _do(run, runner, cells, options, "integrate")
+    return source
 
 
 def _counted(opened: InBlocks) -> bool:
@@ -228,8 +242,9 @@ def _plan(request: ConvertRequest, source: Source, grid: CellGrid) -> Plan:
 
 
 def _cells(
-    request: ConvertRequest, source: Source, limits: tuple[float, float], samples: Samples, place: Any, edge: int
-) -> CellBlocks:
+    request: ConvertRequest, source: Source, limits: tuple[float, float], samples: Samples, place: Any, edge: int,
+    sight: Sight,
+) -> CellBlocks:  # fmt: skip
     """The pass that integrates, with the cells' size from the samples."""
     from vvgt_cli.cameras import default_views
     from vvgt_cli.dvr.scene import kernel_rule
@@ -251,16 +266,17 @@ def _cells(
     march = widening(
         np.array(volume.dims), exponent, np.array(frame.step), default_views("train", size=MARCH_SIZE)
     )  # fmt: skip
-    return CellBlocks(place, cell_grid(volume, exponent, edge, march), rule, tables)
+    return CellBlocks(place, cell_grid(volume, exponent, edge, march), rule, sight, tables)
 
 
 def _exponent(request: ConvertRequest, step: np.ndarray, voxels: float) -> np.ndarray:
     """Exponents (3,) of the base cells: no finer than the screen tells, and than budget and disk have use for."""
-    from vvgt_cli.scale.grid import TILE
+    from vvgt_cli.scale.grid import TILE_BITS
     from vvgt_cli.vbm.closed_form import level_within
     from vvgt_cli.vbm.moments import blocks, exponents
 
     level = level_within(step, voxels, most_cells(request.fit.max_gaussians), finest_level(step, request.fit.size))
-    while blocks(exponents(step, level))[1].max() > TILE:  # of voxels so thin that a block of them is many cells
+    most = 1 << TILE_BITS
+    while blocks(exponents(step, level))[1].max() > most:  # of voxels so thin that a block of them is many cells
         level += 1
     return exponents(step, level)

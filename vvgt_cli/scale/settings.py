@@ -9,7 +9,7 @@ import numpy as np
 
 from vvgt_cli.errors import UsageError
 from vvgt_cli.resources import free_memory
-from vvgt_cli.scale.grid import TILE, Boxes, CellGrid, Triple
+from vvgt_cli.scale.grid import Boxes, CellGrid, Triple, tile_bits
 from vvgt_cli.volume import Volume
 from vvgt_cli.volume.stored import Stored
 
@@ -19,6 +19,7 @@ MAX_FIELD = 1 << 24  # cells of the field of opacity
 A_BLOCK = 0.3  # of the memory of a worker: what its voxels may take; as much again where they are converted
 COUNTED = 3  # bytes a voxel of counting: a copy, and the bins
 ALWAYS = 400 << 20  # bytes: coarse grids, a tile's tree, a batch of Gaussians
+WIDE = 3  # exponent of cells whose voxels get one point of quadrature in place of eight: quicker, less exact
 MOST_WIDER = 6  # powers of two that a coarse cell is wider than a base cell: a tile
 
 
@@ -32,6 +33,7 @@ class BlockOptions:
         scheduler: "local" or the address of a Dask scheduler; None: without Dask.
         shard: part (from 1) and count of a job array, None for the whole.
         level: of a file of several resolutions: a number, "full", or None: the one that matches the screen.
+        levels: of detail that are written.
     """
 
     size: int | None = None
@@ -39,6 +41,7 @@ class BlockOptions:
     scheduler: str | None = None
     shard: tuple[int, int] | None = None
     level: int | str | None = None
+    levels: int = 1
 
     def __post_init__(self) -> None:
         if self.size is not None and (self.size < SMALLEST or self.size & (self.size - 1)):
@@ -88,16 +91,24 @@ def counted_boxes(volume: Volume, edge: int, spacing: int) -> Boxes:
     return Boxes(volume.dims, (x, y, z))
 
 
+def slices_at_once(volume: Volume, edge: int, boxes: Boxes) -> int:
+    """Slices of a box of ``boxes`` that hold as many voxels as a block of ``edge``."""
+    x, y, _ = boxes.edge
+    return max(math.prod(shape_of(volume, edge)) // (x * y), 1)
+
+
 def cell_grid(volume: Volume, exponent: np.ndarray, edge: int, march: int) -> CellGrid:
     """The grid of base cells of 2^``exponent`` (3,) voxels, in blocks of about ``edge`` voxels and whole tiles."""
     from vvgt_cli.vbm.inset import averaged_down
+    from vvgt_cli.vbm.moments import blocks
 
     frame = volume.unit_frame()
-    tile = np.round(TILE * 2.0**exponent).astype(np.int64)
-    wanted = np.array(shape_of(volume, edge))
-    x, y, z = (int(t * max(round(w / t), 1)) for t, w in zip(tile, wanted, strict=True))
     step = np.array(frame.step)
     field = averaged_down(2.0**exponent * step, np.array(frame.half), MAX_FIELD)
+    bits = tile_bits(exponent, max(march, field, int(blocks(exponent)[1].max()).bit_length() - 1))
+    tile = np.round(2.0 ** (exponent + bits)).astype(np.int64)
+    wanted = np.array(shape_of(volume, edge))
+    x, y, z = (int(t * max(w // t, 1)) for t, w in zip(tile, wanted, strict=True))
     i, j, k = (int(e) for e in exponent)
-    points = 1 if min(i, j, k) >= 1 else 2
-    return CellGrid(Boxes(volume.dims, (x, y, z)), (i, j, k), frame.half, frame.step, points, march, field)
+    points = 1 if min(i, j, k) >= WIDE else 2
+    return CellGrid(Boxes(volume.dims, (x, y, z)), (i, j, k), frame.half, frame.step, points, march, field, bits)

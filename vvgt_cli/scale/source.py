@@ -42,9 +42,11 @@ def open_in_blocks(request: SourceRequest, options: BlockOptions, pixel: float) 
     """Open a volume without reading it; ``pixel`` is a pixel's width at its centre, unit frame.
 
     Raises:
-        DataError, UsageError: as `read_volume`; a pipe, or compressed values that can be read front to back only.
+        DataError, UsageError: as `read_volume`; a pipe, compressed values that can be read front to back only, or what
+            is named as a label map.
     """
     from vvgt_cli.synth.sources import open_volume
+    from vvgt_cli.volume.label_maps import NAMED
 
     path = request.path
     if path == "-" or (os.path.exists(path) and not (os.path.isfile(path) or os.path.isdir(path))):
@@ -57,6 +59,11 @@ def open_in_blocks(request: SourceRequest, options: BlockOptions, pixel: float) 
         raise UsageError(
             f"{path}: compressed in one piece, which is read front to back; unpack it (raw, .nhdr and .nii files are "
             "mapped), or store it in chunks (Zarr, HDF5)"
+        )
+    if request.tf is None and request.labels is None and volume.data.dtype.kind in "iu" and NAMED.search(volume.name):
+        raise UsageError(
+            f"{volume.name}: named as a label map; labels need the whole volume in memory, not blocks of it: give the "
+            "job more memory (--memory), or take them as scalars (--labels none, or a --tf)"
         )
     return InBlocks(volume, replace(request, volume=absolute, read=read), told)
 
@@ -115,17 +122,13 @@ def resolved(
     """
     from vvgt_cli.runs.layered import NONE
     from vvgt_cli.runs.source import Opened, load
-    from vvgt_cli.volume.label_maps import NAMED
     from vvgt_cli.volume.tallies import statistics_of, with_limits
 
     volume = opened.volume
     whole, samples, weights = counts.merged()
     whole = with_limits(whole, volume)
     numbers = statistics_of(whole, volume, second.merged()[0].histogram if second else None)
-    request = opened.request
-    if request.tf is None and request.labels is None and volume.data.dtype.kind in "iu" and NAMED.search(volume.name):
-        raise UsageError(f"{volume.name}: named as a label map, which blocks are not: give --tf, or --labels none")
-    source = load(replace(request, volume=Opened(volume, numbers), labels=NONE))
+    source = load(replace(opened.request, volume=Opened(volume, numbers), labels=NONE))
     return source, whole.stored, (samples, weights)
 
 

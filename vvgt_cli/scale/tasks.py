@@ -11,8 +11,9 @@ import numpy as np
 from vvgt_cli.dvr.layout import Optics, Voxels
 from vvgt_cli.dvr.scene import KernelRule
 from vvgt_cli.files import atomic_write
-from vvgt_cli.scale.grid import SAMPLE, TILE, Boxes, CellGrid, samples_in
+from vvgt_cli.scale.grid import SAMPLE, Boxes, CellGrid, samples_in
 from vvgt_cli.scale.parts import CELLS, COUNTS, HISTOGRAM, Parts
+from vvgt_cli.scale.sight import SUFFIX, Sight, segments
 from vvgt_cli.synth.sources import open_volume
 from vvgt_cli.transfer.tables import OpticalTables
 from vvgt_cli.vbm.columns import MASS, MOMENTS
@@ -56,11 +57,13 @@ class CountBlocks:
 
     Attributes:
         place, boxes: what is read, and how it is cut.
+        slices: of a box that are in memory at once.
         limits: data values, of a second pass: their histogram.
     """
 
     place: Place
     boxes: Boxes
+    slices: int
     limits: tuple[float, float] | None = None
 
     @property
@@ -74,12 +77,12 @@ class CountBlocks:
         """Leave the part of block ``number``."""
         volume = self.place.volume()
         lo, hi = self.boxes.at(number)
-        values = read_block(volume, lo, hi)
-        size = np.minimum(SAMPLE, self.boxes.dims)
-        places, weights = samples_in(self.boxes.dims, lo, hi)
-        found = tally(values, volume, self.limits)
-        samples = [values[z : z + size[2], y : y + size[1], x : x + size[0]] for x, y, z in places - lo]
-        bricks = np.array(samples) if samples else np.empty((0, *size[::-1]), values.dtype)
+        found: Tally | None = None
+        for z in range(lo[2], hi[2], self.slices):
+            part = tally(read_block(volume, *_slices(lo, hi, z, self.slices)), volume, self.limits)
+            found = part if found is None else found.plus(part)
+        assert found is not None, "a box has a slice"
+        bricks, weights = self._samples(volume, lo, hi)
         self.place.parts.save(
             self.kind,
             number,
@@ -87,9 +90,22 @@ class CountBlocks:
             ends=np.array([found.lo, found.hi, *found.stored]),
             numbers=np.array([found.nan, found.finite], np.int64),
             histogram=found.histogram,
-            samples=bricks if self.limits is None else bricks[:0],
+            samples=bricks,
             weights=weights,
         )
+
+    def _samples(self, volume: Volume, lo: np.ndarray, hi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The bricks (n, z, y, x) of a box, of a first pass, and the voxels (n,) that each stands for."""
+        x, y, z = np.minimum(SAMPLE, self.boxes.dims)
+        places, weights = samples_in(self.boxes.dims, lo, hi)
+        count = len(places) if self.limits is None else 0
+        found = np.empty((count, z, y, x), volume.data.dtype.newbyteorder("="))
+        for first in np.unique(places[:count, 2]):
+            layer = read_block(volume, *_slices(lo, hi, first, z))
+            for n in np.flatnonzero(places[:, 2] == first):
+                i, j, _ = places[n] - lo
+                found[n] = layer[:, j : j + y, i : i + x]
+        return found, weights
 
     def merged(self) -> tuple[Tally, np.ndarray, np.ndarray]:
         """The sum over all blocks, their samples (n, z, y, x), and the voxels (n,) that each stands for.
@@ -110,6 +126,11 @@ class CountBlocks:
         return whole, np.concatenate(samples), np.concatenate(weights)
 
 
+def _slices(lo: np.ndarray, hi: np.ndarray, z: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """First voxel (3,) of ``count`` slices of a box from slice ``z`` of the volume on, and that behind the last."""
+    return np.array([lo[0], lo[1], z]), np.array([hi[0], hi[1], min(z + count, hi[2])])
+
+
 @dataclass(frozen=True)
 class CellBlocks:
     """Integrate the base cells of blocks.
@@ -117,12 +138,14 @@ class CellBlocks:
     Attributes:
         place, grid: what is read, and how it is cut.
         rule: how stored values become those that kernels read.
+        sight: views that are marched on the way.
         tables: optics over these.
     """
 
     place: Place
     grid: CellGrid
     rule: KernelRule
+    sight: Sight
     tables: OpticalTables = field(repr=False)
     kind: str = CELLS
 
@@ -130,7 +153,7 @@ class CellBlocks:
         return len(self.grid.blocks)
 
     def __call__(self, number: int) -> None:
-        """Leave the part of block ``number``: rows of cells in one file, what there is of each tile in another."""
+        """Leave the part of block ``number``: rows of cells, what it shows of rays, and what there is of each tile."""
         grid, parts = self.grid, self.place.parts
         lo, hi = grid.blocks.at(number)
         begin = np.maximum(lo - 1, 0)
@@ -146,14 +169,15 @@ class CellBlocks:
                 if not len(index):
                     continue
                 stream.write(np.ascontiguousarray(moments).data)
-                stream.write((index - tile * TILE).astype(np.uint8).tobytes())
+                stream.write((index - tile * grid.tile_cells).astype(np.uint8).tobytes())
                 tiles.append(tile)
                 counts.append(len(index))
-                summary = self._summary(index - (tile * TILE).astype(np.int32), moments[:, MASS])
+                summary = self._summary(index - (tile * grid.tile_cells).astype(np.int32), moments[:, MASS])
                 coarse.append(summary[0])
                 field.append(summary[1])
                 deepest = max(deepest, summary[2])
-        edges = [TILE >> grid.march] * 3, [TILE >> grid.field] * 3
+        parts.save(CELLS, number, SUFFIX, **segments(values, begin, number, grid, self.tables, self.sight))
+        edges = [grid.tile_cells >> grid.march] * 3, [grid.tile_cells >> grid.field] * 3
         parts.save(
             CELLS,
             number,
@@ -188,7 +212,7 @@ class CellBlocks:
 
         grid = self.grid
         depth = opaque_depth(mass, grid.cell_edge, np.array(grid.step))
-        march, wide = np.full(3, TILE >> grid.march), np.full(3, TILE >> grid.field)
+        march, wide = np.full(3, grid.tile_cells >> grid.march), np.full(3, grid.tile_cells >> grid.field)
         field = summed(local >> grid.field, np.minimum(depth, 1) / 8.0**grid.field, wide)
         return summed(local >> grid.march, mass, march), field.astype(np.float32), float(depth.max())
 

@@ -43,6 +43,14 @@ def block_ranges(
             out[k, j, i, 0], out[k, j, i, 1] = lo, hi
 
 
+def ranges_of(values: np.ndarray, first: np.ndarray, edge: np.ndarray, shape: np.ndarray) -> np.ndarray:
+    """`block_ranges` (bz, by, bx, 2) of ``shape`` (3,) blocks along (x, y, z); other arguments as there."""
+    ranges = np.empty((*(int(n) for n in shape[::-1]), 2))
+    about = np.finfo(values.dtype) if values.dtype.kind == "f" else np.iinfo(values.dtype)
+    block_ranges(values, first.astype(np.int64), edge.astype(np.int64), float(about.min), float(about.max), ranges)
+    return ranges
+
+
 def visible_blocks(
     values: np.ndarray, first: np.ndarray, edge: np.ndarray, shape: np.ndarray, tables: OpticalTables
 ) -> np.ndarray:
@@ -54,10 +62,7 @@ def visible_blocks(
         shape: (3,) blocks along (x, y, z).
         tables: optics over the stored values.
     """
-    ranges = np.empty((*(int(n) for n in shape[::-1]), 2))
-    about = np.finfo(values.dtype) if values.dtype.kind == "f" else np.iinfo(values.dtype)
-    ends = float(about.min), float(about.max)
-    block_ranges(values, first.astype(np.int64), edge.astype(np.int64), *ends, ranges)
+    ranges = ranges_of(values, first, edge, shape)
     positive = np.concatenate([[0], np.cumsum(tables.nodes[:, 3] > 0)])
     none = ranges[..., 1] < ranges[..., 0]
     u = tables.coordinate(np.where(none[..., None], tables.lo, ranges))

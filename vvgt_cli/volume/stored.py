@@ -19,6 +19,7 @@ from vvgt_cli.volume.packed import Packed
 from vvgt_cli.volume.types import Volume
 
 Slices = tuple[slice, ...]
+MAPPED = 32 << 20  # bytes of a mapped file that are held at once
 
 
 class Stored:
@@ -104,10 +105,14 @@ def read_block(volume: Volume, lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
     """
     (x0, y0, z0), (x1, y1, z1) = lo, hi
     data: Any = volume.data
-    part = data[z0:z1][:, y0:y1, x0:x1] if isinstance(data, BrickArray) else data[z0:z1, y0:y1, x0:x1]
-    out = np.array(part, part.dtype.newbyteorder("="), order="C", copy=True)
     under = _map_under(data)
-    if under is not None and hasattr(mmap, "MADV_DONTNEED"):
+    if under is None or not hasattr(mmap, "MADV_DONTNEED"):
+        part = data[z0:z1][:, y0:y1, x0:x1] if isinstance(data, BrickArray) else data[z0:z1, y0:y1, x0:x1]
+        return np.array(part, part.dtype.newbyteorder("="), order="C", copy=True)
+    out = np.empty((z1 - z0, y1 - y0, x1 - x0), data.dtype.newbyteorder("="))
+    slab = max(MAPPED // max(out[0].nbytes, 1), 1)
+    for z in range(0, len(out), slab):
+        out[z : z + slab] = data[z0 + z : min(z0 + z + slab, z1), y0:y1, x0:x1]
         under.madvise(mmap.MADV_DONTNEED)
     return out
 
