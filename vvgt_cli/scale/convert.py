@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vvgt_cli.conversion.case import PROGRAM, Case
+from vvgt_cli.conversion.case import PROGRAM, Case, view_edge
 from vvgt_cli.conversion.convert import improve, ply_options
 from vvgt_cli.conversion.plan import Plan, Planner, check_memory
 from vvgt_cli.conversion.request import ConvertRequest
@@ -81,7 +81,8 @@ def _planned(request: ConvertRequest) -> Plan:
     """The stages after the closed form, with the number and size of the views that blocks are marched for."""
     fit = request.fit
     case = Case(gaussians=fit.max_gaussians, cells=0.0, voxels=0.0, size=fit.size, view=0.0, there=PROGRAM)
-    sparse = fit.max_gaussians <= case.edge**2  # a guess: views are marched before there are Gaussians
+    pixels = (2 * view_edge(fit.size, small=True)) ** 2
+    sparse = fit.max_gaussians <= pixels  # a guess: views are marched before there are Gaussians
     planner = Planner(
         request.limits, fit.max_gaussians, fit.steps, request.ply.sh_degree or 0, fit.size, sparse, fit.model
     )
