@@ -6,8 +6,8 @@
 
 400 px, K = 100,000, RGB dB on the ten test views (half-voxel steps, adaptive rays), wall seconds. `equal` starts both
 from the back-projected closed form: 100 steps of Adam on the file's fields with 3DGS' loss (SSIM included) on 24 views
-of one ray a pixel and steps of a voxel, and our steps on 72 views, as `convert` renders them (half the size where it
-does), for as long as those took, views included on both sides. `curve`: every point is a run of its own from the
+of one ray a pixel and steps of a voxel, and our steps on 120 views, as `convert` renders them (of 200 or 300 px),
+for as long as those took, views included on both sides. `curve`: every point is a run of its own from the
 prepared scene on, views and closed form included. `ours` starts from the closed form as it is (without steps:
 back-projected), `adam` from the back-projected one; `3dgs` from 10,000 uniform samples that grow as in 3DGS, `ivr-gs`
 from as many uniform samples as the limit, with the function's colours, none added; both with 3DGS' loss and Adam, on 72

@@ -11,7 +11,7 @@ from onnx_models import write_model
 from test_cli_infer import DARKER
 
 from vvgt_cli.cameras.blocks import BLOCK, ENOUGH, FEW, spread_blocks
-from vvgt_cli.conversion.case import Case, measure
+from vvgt_cli.conversion.case import Case, expected_wide, measure
 from vvgt_cli.conversion.convert import convert, initialise_only, planned
 from vvgt_cli.conversion.plan import DEFAULT_STEPS, MOST_STEPS, Planner, check_memory
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions, Limits
@@ -98,7 +98,7 @@ def test_views_are_small_where_gaussians_are_wide(size, edge):
     assert (descent.small, descent.steps, views.edge) == (True, DEFAULT_STEPS, edge)
     judged, glanced, whole = drawn(size, ENOUGH), drawn(size, FEW), min(size, 300)
     judge, glance = (1.8 * 0.05 * pixels / whole**2 for pixels in (judged, glanced))
-    step = 0.006 * (whole / 400) ** 2 + 0.020
+    step = 0.013 * (edge / 400) ** 2 + 0.020
     seconds = (
         1
         + FORM
@@ -274,6 +274,7 @@ def test_a_slower_machine_gets_fewer_steps_after_the_closed_form():
 
 def test_views_come_in_sets():
     assert [views_of(steps, True) for steps in (0, 1, 48, 80, 112, 144, 10_000)] == [24, 24, 24, 48, 72, 96, 120]
+    assert [views_of(steps, False) for steps in (0, 24, 60, 112, 10_000)] == [24, 24, 48, 96, 120]
 
 
 @pytest.mark.parametrize(
@@ -369,3 +370,9 @@ def test_a_network_that_makes_it_worse_is_dropped(tmp_path):
     assert worse.scores["psnr"] == plain.scores["psnr"]
     with pytest.raises(UsageError, match="no such folder"):
         done(tmp_path, FitOptions(400, 48, model="no/such"), overwrite=True)
+
+
+def test_without_gaussians_views_are_guessed_by_the_budget():
+    assert expected_wide(100_000, 1080)
+    assert not expected_wide(200_000, 1080)
+    assert not expected_wide(100_000, 300)

@@ -109,7 +109,8 @@ def _split(request: ConvertRequest, functions: Sequence[str], other: bool, conso
 
     if functions or other or request.checkpoint is not None:
         raise UsageError(
-            "--split-labels is of one label map in memory; leave out --tf, --dry-run, --shard and --checkpoint"
+            "--split-labels is of one label map in memory; leave out --tf, --dry-run, --shard, --checkpoint and "
+            "what is of blocks (--blocks, --workers, --scheduler, --level)"
         )
     convert_labels(request, console)
 

@@ -48,7 +48,7 @@ class Case:
 
     @property
     def edge(self) -> int:
-        """Pixels along the edge of a whole training view."""
+        """Pixels along the edge of a large training view."""
         return view_edge(self.size, small=False)
 
     @cached_property
@@ -83,6 +83,11 @@ class Case:
 def view_edge(size: int, small: bool) -> int:
     """Pixels along the edge of a training view: the size that the file is made for, or half of it, within bounds."""
     return min(size // 2, SMALL) if small else min(size, LARGE)
+
+
+def expected_wide(gaussians: int, size: int) -> bool:
+    """A guess before the Gaussians are there: fewer than pixels of a view twice as large as small ones are wide."""
+    return gaussians <= (2 * view_edge(size, small=True)) ** 2
 
 
 def measure(scene: Scene, size: int, gaussians: int) -> Case:

@@ -6,7 +6,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vvgt_cli.conversion.case import measure
+from vvgt_cli.conversion.case import expected_wide, measure
 from vvgt_cli.conversion.plan import Plan, Planner, check_memory
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions, Limits, file_bytes
 from vvgt_cli.conversion.result import Conversion
@@ -130,9 +130,9 @@ def _planned(run: Run, request: ConvertRequest) -> tuple[Source, Work, Planner, 
     degree = degree_of(request, source)
     fit = replace(fit, max_gaussians=request.limits.gaussians(fit.max_gaussians, degree))
     case = replace(measure(scene, fit.size, fit.max_gaussians), degree=degree)
-    sparse = fit.max_gaussians <= case.edge**2  # a guess, until the Gaussians are there
+    guess = expected_wide(fit.max_gaussians, fit.size)
     planner = Planner(
-        request.limits, fit.max_gaussians, fit.steps, request.ply.sh_degree or degree, fit.size, sparse, fit.model,
+        request.limits, fit.max_gaussians, fit.steps, request.ply.sh_degree or degree, fit.size, guess, fit.model,
         request.scored_whole,
     )  # fmt: skip
     plan = planner.plan(case, run.elapsed())

@@ -68,7 +68,7 @@ def view_renderer(scene: Scene, settings: RenderSettings) -> Callable[[Camera], 
     mapper.SetBlendModeToComposite()
     mapper.SetCropping(True)
     mapper.SetCroppingRegionFlagsToSubVolume()
-    mapper.SetCroppingRegionPlanes(*(s * h for h in scene.half for s in (-1, 1)))
+    mapper.SetCroppingRegionPlanes(*(side * h for h in _cropped(scene) for side in (-1, 1)))
     volume = vtkVolume()
     volume.SetMapper(mapper)
     volume.SetProperty(volume_property(scene))
@@ -90,6 +90,17 @@ def view_renderer(scene: Scene, settings: RenderSettings) -> Callable[[Camera], 
         return read_pixels(window, camera.width, camera.height)
 
     return draw
+
+
+def _cropped(scene: Scene) -> np.ndarray:
+    """(3,) half extents of cropping planes that leave the box.
+
+    VTK's shader compares a plane's place between the first and the last of n voxel centres with a texture's coordinate,
+    which is 0 and 1 half a voxel beyond them: at the planes of the box itself it would leave half a voxel too much.
+    """
+    count = np.array(scene.values.shape[::-1]) + 2
+    cropped: np.ndarray = scene.half - 0.5 * scene.step * (1 - 2 / count)
+    return cropped
 
 
 def image_data(scene: Scene, padded: bool) -> Any:

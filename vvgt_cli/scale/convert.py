@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vvgt_cli.conversion.case import PROGRAM, Case, view_edge
+from vvgt_cli.cameras.blocks import BLOCK
+from vvgt_cli.conversion.case import PROGRAM, Case, expected_wide
 from vvgt_cli.conversion.convert import improve, ply_options
 from vvgt_cli.conversion.plan import Plan, Planner, check_memory
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.conversion.stage import Cost, Stage, Work
 from vvgt_cli.conversion.stages import CheckViews, Seats, TestViews, TrainingViews
+from vvgt_cli.conversion.stages.closed_form import MEMORY
 from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians import as_stored
 from vvgt_cli.jit.ahead import CONVERT, MERGE
 from vvgt_cli.network.card import find_model, read_card
 from vvgt_cli.progress import Console
+from vvgt_cli.resources import free_memory
 from vvgt_cli.runs.gaussian_files import write_gaussians
 from vvgt_cli.runs.outputs import claimed, write_text
 from vvgt_cli.runs.place import out_of_box
@@ -28,12 +32,15 @@ from vvgt_cli.scale.merge import Cut, pyramid
 from vvgt_cli.scale.parts import Parts
 from vvgt_cli.scale.plan import Plan as BlockPlan
 from vvgt_cli.scale.run import beside, make_parts, refuse
-from vvgt_cli.scale.settings import BlockOptions
+from vvgt_cli.scale.settings import ALWAYS, BlockOptions
 from vvgt_cli.scale.sight import CHECK, TRAIN, Sight, marched, score_gaussians, score_text
 from vvgt_cli.vbm import Start
 
 if TYPE_CHECKING:
     from vvgt_cli.runs.source import Source
+
+
+A_GAUSSIAN = MEMORY[1]  # bytes
 
 
 def convert_in_blocks(
@@ -52,6 +59,7 @@ def convert_in_blocks(
         read_card(find_model(request.fit.model))  # fails before the work, not after
     plan = _planned(request)
     check_memory(plan)
+    _check_gaussians(plan)
     with claimed(request.outputs(), request.inputs(), request.overwrite), beside(request.output) as parts:
         sight = _sight(plan, request.fit.size)
         source = make_parts(run, request, options, parts, sight)
@@ -81,15 +89,31 @@ def _planned(request: ConvertRequest) -> Plan:
     """The stages after the closed form, with the number and size of the views that blocks are marched for."""
     fit = request.fit
     case = Case(gaussians=fit.max_gaussians, cells=0.0, voxels=0.0, size=fit.size, view=0.0, there=PROGRAM)
-    pixels = (2 * view_edge(fit.size, small=True)) ** 2
-    sparse = fit.max_gaussians <= pixels  # a guess: views are marched before there are Gaussians
+    guess = expected_wide(fit.max_gaussians, fit.size)  # views are marched before there are Gaussians
     planner = Planner(
-        request.limits, fit.max_gaussians, fit.steps, request.ply.sh_degree or 0, fit.size, sparse, fit.model
+        request.limits, fit.max_gaussians, fit.steps, request.ply.sh_degree or 0, fit.size, guess, fit.model
     )
     plan = planner.plan(case, 0.0, begun=True)
     plan.stages = [stage for stage in plan.stages if not isinstance(stage, TestViews | Seats)]
     plan.left_out.append(("seats", "they need the whole volume in memory"))
     return plan
+
+
+def _check_gaussians(plan: Plan) -> None:
+    """Refuse more Gaussians than the memory holds beside the views: they are not gone through in blocks.
+
+    Raises:
+        UsageError: with the number that would fit.
+    """
+    free = free_memory()
+    views = sum(stage.cost(plan.case).memory for stage in plan.stages if isinstance(stage, CheckViews | TrainingViews))
+    room = math.inf if free is None else free - ALWAYS - views
+    if plan.gaussians * A_GAUSSIAN > room:
+        raise UsageError(
+            f"{plan.gaussians} Gaussians need about {plan.gaussians * A_GAUSSIAN / 2**30:.1f} GiB of memory while they "
+            f"are fitted; --max-gaussians {max(int(room / A_GAUSSIAN), 1)} would fit, or 'vvgt init', which writes them "
+            "in blocks"
+        )
 
 
 def _sight(plan: Plan, size: int) -> Sight:
@@ -124,7 +148,7 @@ class Marched(Stage):
             found = list(marched(self.parts, self.plan.grid, self.sight, kind))
             cameras = [look.camera for look, _ in found]
             if kind == CHECK:
-                images = np.stack([image.reshape(-1, 16, 4) for _, image in found])
+                images = np.stack([image.reshape(-1, BLOCK, 4) for _, image in found])
                 work.check = Views(cameras, images, [look.blocks for look, _ in found if look.blocks is not None])
                 stage.note = f"{len(found)} of {self.sight.size} px, blocks of them"
             else:

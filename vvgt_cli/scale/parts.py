@@ -142,7 +142,9 @@ class Parts:
 def _unreadable(path: Path, number: int, error: Exception) -> DataError:
     """What is wrong with a part: zipfile, zlib and numpy raise what they like."""
     if isinstance(error, FileNotFoundError):
-        return DataError(f"{path}: block {number} is missing; run the shard that makes it")
+        return DataError(
+            f"{path}: block {number} is missing; remove what else there is of it and run the shard that makes it"
+        )
     return DataError(f"{path}: damaged ({error}); remove the block's files and run the same command again")
 
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vvgt_cli import __version__
 from vvgt_cli.conversion.convert import ply_options
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import UsageError
@@ -36,6 +37,8 @@ from vvgt_cli.share import format_of
 if TYPE_CHECKING:
     from vvgt_cli.scale.grid import CellGrid
     from vvgt_cli.scale.tasks import CellBlocks, CountBlocks
+
+LAYOUT = 2  # of parts: one more whenever what is in them changes
 
 
 class Later(Exception):
@@ -141,6 +144,7 @@ def _settings(request: ConvertRequest, opened: InBlocks, sight: Sight) -> dict[s
     tf = request.source.tf
     text = Path(tf).read_text("utf-8", "replace") if isinstance(tf, str) and os.path.isfile(tf) else repr(tf)
     return {
+        "version": [__version__, LAYOUT],
         "volume": [path, *facts],
         "read": {key: value for key, value in asdict(opened.request.read).items() if value is not None},
         "function": [text, request.source.tf_range, request.source.unit_distance],

@@ -20,7 +20,6 @@ A_BLOCK = 0.3  # of the memory of a worker: what its voxels may take; as much ag
 COUNTED = 3  # bytes a voxel of counting: a copy, and the bins
 ALWAYS = 400 << 20  # bytes: coarse grids, a tile's tree, a batch of Gaussians
 WIDE = 3  # exponent of cells whose voxels get one point of quadrature in place of eight: quicker, less exact
-MOST_WIDER = 6  # powers of two that a coarse cell is wider than a base cell: a tile
 
 
 @dataclass(frozen=True)

@@ -102,9 +102,11 @@ def looks(sight: Sight) -> tuple[Look, ...]:
         blocks = _some(spread_blocks(camera.width, camera.height, number), camera)
         places = _places(camera, blocks)
         found.append(Look(CHECK, camera, blocks, np.arange(len(places)), places, rays))
-    for camera in default_views("train", sight.train, size=sight.edge) if sight.train else []:
-        places = _places(camera, None)
-        found.append(Look(TRAIN, camera, None, np.arange(len(places)), places, np.zeros((1, 2)), FIT_STEP))
+    cameras = default_views("train", sight.train, size=sight.edge) if sight.train else []
+    if cameras:
+        places, middle = _places(cameras[0], None), np.zeros((1, 2))
+        every_pixel = np.arange(len(places))
+        found += [Look(TRAIN, camera, None, every_pixel, places, middle, FIT_STEP) for camera in cameras]
     return tuple(found)
 
 

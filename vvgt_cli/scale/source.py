@@ -20,6 +20,7 @@ from vvgt_cli.volume.stored import Stored, lies_in_file, readable_in_blocks
 LARGE = 0.25  # of the free memory: a file of less is read as ever
 Samples = tuple[np.ndarray, np.ndarray]  # bricks (n, z, y, x) of stored values, voxels (n,) that each stands for
 PROGRAM, A_CELL = 3e8, 300  # bytes: interpreter, libraries and kernels; a base cell in memory
+ZARR = {".zarray", ".zgroup", ".zattrs", "zarr.json"}  # files of which a folder has one
 RANGES = 0.15  # bytes a voxel: the map of empty space
 
 
@@ -99,6 +100,8 @@ def beyond_memory(request: SourceRequest) -> bool:
     if not isinstance(path, str) or free is None or path == "-":
         return False
     place = path.rpartition(":/")[0] if not os.path.exists(path) and ":/" in path else path
+    if os.path.isdir(place) and not ZARR & set(os.listdir(place)):
+        return False  # slices, which are read whole
     if not os.path.isdir(place) and not (os.path.isfile(place) and os.path.getsize(place) > LARGE * free):
         h5 = place.lower().endswith((".h5", ".hdf5", ".he5", ".hdf", ".nc"))  # packed: few bytes may hold many voxels
         if not (h5 and os.path.isfile(place)):

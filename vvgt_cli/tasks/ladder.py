@@ -223,7 +223,9 @@ def _begin(source: SourceRequest, rung: Rung) -> tuple[Run, Scene]:
 
 
 def _views_of(report: ConversionReport, fit: FitOptions) -> int:
-    """Training views that were planned, or that a baseline takes."""
+    """Training views that there were: those of gradient descent, or else of the plan."""
+    if report.refinement:
+        return int(report.refinement["views"])
     if report.plan is None:
         return views_of(fit.steps or 0, small=False)
     return sum(stage["count"] for stage in report.plan["stages"] if stage["name"] == TrainingViews.name)

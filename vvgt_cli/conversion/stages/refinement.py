@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from vvgt_cli.cameras import default_views
-from vvgt_cli.conversion.case import Case
+from vvgt_cli.conversion.case import Case, view_edge
 from vvgt_cli.conversion.stage import Cost, Stage, Work
 from vvgt_cli.descent import OptimizeOptions, OptimizeRecord, optimize
 from vvgt_cli.gaussians import Gaussians, as_stored
@@ -17,7 +17,7 @@ from vvgt_cli.runs.views import Views
 from vvgt_cli.splat.constants import MIN_ALPHA
 
 STEP = 0.013, 0.024  # seconds per 400 x 400 px, per 100,000 Gaussians
-SMALL_STEP = 0.006, 0.020  # likewise, on a small view
+SMALL_STEP = 0.013, 0.020  # likewise, on small views
 HARMONICS = 1.0, 1.1, 1.25, 1.4  # times as long with harmonics of degree 0 to 3
 LOOK = 25  # steps between two looks at the check views where a target ends the run; else one is taken in the middle
 SMALLEST = 0.5  # standard deviation of the longest axis in pixels of the screen: viewers drop or fade less
@@ -31,7 +31,7 @@ REASONS = {
 def step_seconds(case: Case, small: bool) -> float:
     """Of a step with its share of the looks at check views."""
     each = SMALL_STEP if small else STEP
-    one = case.pace * (each[0] * (case.edge / 400) ** 2 + each[1] * case.gaussians / 1e5)
+    one = case.pace * (each[0] * (view_edge(case.size, small) / 400) ** 2 + each[1] * case.gaussians / 1e5)
     return HARMONICS[case.degree] * one
 
 
@@ -100,7 +100,7 @@ def refine(run: Run, start: Gaussians, train: Views, check: Views, options: Opti
         stage.psnr_before, stage.psnr = record.psnr_before, record.psnr_after
         stage.note = _note(record, options)
     drawn = {"rule": options.rule.name, "dilation": options.rule.dilation}
-    run.report.refinement = asdict(record) | {"method": options.method} | drawn
+    run.report.refinement = asdict(record) | {"method": options.method, "views": len(train)} | drawn
     return as_stored(result)
 
 
