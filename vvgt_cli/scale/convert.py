@@ -111,8 +111,8 @@ def _check_gaussians(plan: Plan) -> None:
     if plan.gaussians * A_GAUSSIAN > room:
         raise UsageError(
             f"{plan.gaussians} Gaussians need about {plan.gaussians * A_GAUSSIAN / 2**30:.1f} GiB of memory while they "
-            f"are fitted; --max-gaussians {max(int(room / A_GAUSSIAN), 1)} would fit, or 'vvgt init', which writes them "
-            "in blocks"
+            f"are fitted; --max-gaussians {max(int(room / A_GAUSSIAN), 1)} would fit, or 'vvgt init', which writes "
+            "them in blocks"
         )
 
 
