@@ -39,7 +39,7 @@ def ended(monkeypatch, target: str, calls: int) -> None:
 @pytest.mark.parametrize(
     ("target", "calls", "left"),
     [
-        ("convert._improve", 0, {"closed-form.npz"}),
+        ("convert.improve", 0, {"closed-form.npz"}),
         ("loop.step", 4, {"closed-form.npz", "refinement.npz"}),
         ("scores.score_test_views", 0, {"closed-form.npz", "refinement.npz", "fitted.npz"}),
         ("convert.write_gaussians", 0, {"closed-form.npz", "refinement.npz", "fitted.npz"}),
@@ -54,7 +54,7 @@ def test_a_conversion_goes_on_where_it_was_ended(target, calls, left, folder, vv
     assert {path.name for path in (folder / "kept").iterdir()} == left
     with monkeypatch.context() as patch:  # nothing is done twice
         if "fitted.npz" in left:
-            ended(patch, "convert._improve", 0)
+            ended(patch, "convert.improve", 0)
         ended(patch, "loop.step", 20 if "refinement.npz" in left else 24)
         patch.setattr("vvgt_cli.vbm.initialise", None)
         result = vvgt(*line)

@@ -123,7 +123,7 @@ def test_a_checkpoint_holds_them(method, tmp_path):
 
 def test_the_plan_knows_that_steps_with_harmonics_take_longer():
     case = Case(100_000, 1e6, 1e6, 400, 0.05)
-    seconds = [step_seconds(replace(case, degree=degree), half=False) for degree in range(4)]
+    seconds = [step_seconds(replace(case, degree=degree), small=False) for degree in range(4)]
     assert seconds == sorted(seconds)
     assert [s / seconds[0] for s in seconds] == pytest.approx(HARMONICS)
 
