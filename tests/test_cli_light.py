@@ -140,3 +140,12 @@ def test_the_library_takes_names_directions_and_options():
     _, dark = vvgt_cli.render_views(SOURCE, function, cameras=1, size=32)
     assert np.abs(images - dark).max() > 0.05
     np.testing.assert_allclose(images[..., 3], dark[..., 3], atol=0.02)  # other pixels get more rays
+
+
+def test_a_network_is_refused_before_the_closed_form_where_colours_depend_on_the_view(folder, vvgt):
+    call = ("convert", SOURCE, *tf(folder), *SMALL, "--model", "vvgt-small", "-o", folder / "m.ply")
+    result = vvgt(*call, "--light", "headlight")
+    assert result.code == 2
+    assert "colours that are the same from all sides" in result.err
+    assert "closed form" not in result.err
+    assert not (folder / "m.ply").exists()

@@ -128,6 +128,11 @@ def _planned(run: Run, request: ConvertRequest) -> tuple[Source, Work, Planner, 
         read_card(find_model(fit.model))  # fails before the work, not after
     source, scene = _begin(run, request)
     degree = degree_of(request, source)
+    if fit.model is not None and degree:
+        raise UsageError(
+            f"--model {fit.model}: a network knows only colours that are the same from all sides; leave it out, or "
+            "give --sh-degree 0 or a light that does not depend on the view"
+        )
     fit = replace(fit, max_gaussians=request.limits.gaussians(fit.max_gaussians, degree))
     case = replace(measure(scene, fit.size, fit.max_gaussians), degree=degree)
     guess = expected_wide(fit.max_gaussians, fit.size)
