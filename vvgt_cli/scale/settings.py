@@ -9,7 +9,7 @@ import numpy as np
 
 from vvgt_cli.errors import UsageError
 from vvgt_cli.resources import free_memory
-from vvgt_cli.scale.grid import Boxes, CellGrid, Triple, tile_bits
+from vvgt_cli.scale.grid import TILE_VOXELS, Boxes, CellGrid, Triple, tile_bits
 from vvgt_cli.volume import Volume
 from vvgt_cli.volume.stored import Stored
 
@@ -60,11 +60,12 @@ def block_edge(volume: Volume, options: BlockOptions) -> int:
     edge = LARGEST
     while edge > SMALLEST and block_bytes(volume, edge) > room:
         edge //= 2
-    if block_bytes(volume, edge) > max(free - ALWAYS, 0):
-        need = block_bytes(volume, edge) + ALWAYS
+    whole = max(edge, 1 << TILE_VOXELS)  # what is integrated at once is whole tiles
+    if block_bytes(volume, whole) > max(free - ALWAYS, 0):
+        need = block_bytes(volume, whole) + ALWAYS
         raise UsageError(
-            f"blocks of {edge} voxels and the coarse grids need about {need >> 20} MiB of memory, {free >> 20} MiB are "
-            f"free; give the job {(need - free >> 20) + 1} MiB more"
+            f"blocks of {whole} voxels and the coarse grids need about {need >> 20} MiB of memory, {free >> 20} MiB "
+            f"are free; give the job {(need - free >> 20) + 1} MiB more"
         )
     return edge
 
