@@ -143,7 +143,7 @@ def _unreadable(path: Path, number: int, error: Exception) -> DataError:
     """What is wrong with a part: zipfile, zlib and numpy raise what they like."""
     if isinstance(error, FileNotFoundError):
         return DataError(
-            f"{path}: block {number} is missing; remove what else there is of it and run the shard that makes it"
+            f"{path}: block {number} is missing; run the shard that makes it (remove first what else there is of it)"
         )
     return DataError(f"{path}: damaged ({error}); remove the block's files and run the same command again")
 
