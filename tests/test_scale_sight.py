@@ -130,6 +130,21 @@ def test_what_a_conversion_in_blocks_cannot_do_is_a_line(vvgt, tmp_path):
         assert word in run.err
 
 
+@pytest.mark.parametrize(
+    ("mib", "advice"), [(800, r"--max-gaussians [1-9]\d* would fit"), (300, "give the job more memory")]
+)
+def test_more_gaussians_than_fit_are_refused_before_anything_is_read(vvgt, tmp_path, monkeypatch, mib, advice):
+    path = tmp_path / "v_100x90x80_uint8.raw"
+    path.write_bytes(bytes(720000))
+    monkeypatch.setattr("vvgt_cli.scale.convert.free_memory", lambda: mib << 20)
+    run = vvgt(
+        "convert", path, "-o", tmp_path / "a.ply", "--max-gaussians", "1000000", "--size", "150", "--blocks", "32"
+    )
+    assert run.code == 2
+    assert re.search(rf"1000000 Gaussians need about 1\.2 GiB.*{advice}.*vvgt init", run.error)
+    assert not list(tmp_path.glob(".*blocks"))
+
+
 def test_levels_are_cuts_of_one_pyramid_with_an_index(vvgt, tmp_path):
     path = tmp_path / "v_100x90x80_uint8.raw"
     path.write_bytes(np.round(bodies() * 255).astype(np.uint8).tobytes())

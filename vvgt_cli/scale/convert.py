@@ -103,16 +103,17 @@ def _check_gaussians(plan: Plan) -> None:
     """Refuse more Gaussians than the memory holds beside the views: they are not gone through in blocks.
 
     Raises:
-        UsageError: with the number that would fit.
+        UsageError: with the number that would fit, if any does.
     """
     free = free_memory()
     views = sum(stage.cost(plan.case).memory for stage in plan.stages if isinstance(stage, CheckViews | TrainingViews))
     room = math.inf if free is None else free - ALWAYS - views
     if plan.gaussians * A_GAUSSIAN > room:
+        fewer = int(room / A_GAUSSIAN)
         raise UsageError(
             f"{plan.gaussians} Gaussians need about {plan.gaussians * A_GAUSSIAN / 2**30:.1f} GiB of memory while they "
-            f"are fitted; --max-gaussians {max(int(room / A_GAUSSIAN), 1)} would fit, or 'vvgt init', which writes "
-            "them in blocks"
+            f"are fitted; {f'--max-gaussians {fewer} would fit' if fewer > 0 else 'give the job more memory'}, or try "
+            "'vvgt init', which writes them in blocks"
         )
 
 
