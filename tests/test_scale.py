@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -83,15 +85,22 @@ def test_opaque_anisotropic_and_turned_volumes_too(vvgt, tmp_path):
         assert same_gaussians(one, other)
 
 
-@pytest.mark.parametrize("dtype", ["uint8", "int16", "float32", "float64", "int32"])
-def test_counts_of_blocks_add_up_to_the_statistics(tmp_path, dtype):
-    values = bodies((30, 20, 25)) * 200 - 50
+@pytest.mark.parametrize(
+    ("dtype", "factor", "scale"),
+    [
+        *(("uint8", 1, (1, 0)), ("int16", 1, (1, 0)), ("int16", 1, (-0.37, 11)), ("int32", 1, (1, 0))),
+        *(("int32", 1e6, (-0.1, 3)), ("float32", 1, (1, 0)), ("float32", 1, (0.37, -11)), ("float32", 1e36, (-1, 0))),
+        *(("float64", 1, (1, 0)), ("float64", 1.1e306, (1, 0)), ("float64", 1, (1.3e306, 0)), ("float16", 1, (1, 0))),
+    ],
+)
+def test_counts_of_blocks_add_up_to_the_statistics(tmp_path, dtype, factor, scale):
+    values = (bodies((30, 20, 25)) * 200 - 50) * factor
     values = values.astype(dtype) if dtype != "uint8" else np.round(bodies((30, 20, 25)) * 255).astype(dtype)
     if values.dtype.kind == "f":
         values[3, 4, 5:9], values[0, 0, 0] = np.nan, np.inf
     np.save(tmp_path / "v.npy", values)
-    volume = read_volume(str(tmp_path / "v.npy"))
-    parts = [values[a:b] for a, b in ((11, 25), (0, 3), (3, 11))]
+    volume = replace(read_volume(str(tmp_path / "v.npy")), slope=float(scale[0]), intercept=float(scale[1]))
+    parts = [volume.data[a:b].copy() for a, b in ((11, 25), (0, 3), (3, 11))]
     whole = tally(parts[0], volume).plus(tally(parts[1], volume)).plus(tally(parts[2], volume))
     whole, histogram = with_limits(whole, volume), None
     if not counted(volume):
@@ -103,6 +112,8 @@ def test_counts_of_blocks_add_up_to_the_statistics(tmp_path, dtype):
         theirs.nan_count,
         theirs.inf_count,
     )
+    finite = volume.data[np.isfinite(volume.data)]
+    assert whole.stored == pytest.approx((finite.min(), finite.max()), rel=1e-12)
     assert np.array_equal(ours.histogram, theirs.histogram)
     assert np.array_equal(ours.edges, theirs.edges)
 

@@ -10,13 +10,13 @@ import pytest
 
 from tests.test_scale import FIT, bodies
 from vvgt_cli.dvr import RenderSettings, render_view
-from vvgt_cli.dvr.render import FIT_VIEWS
+from vvgt_cli.dvr.render import FIT_VIEWS, camera_arrays
 from vvgt_cli.gaussians import read_ply
 from vvgt_cli.metrics import score_views
 from vvgt_cli.runs.source import SourceRequest, load
 from vvgt_cli.scale.grid import Boxes, CellGrid
 from vvgt_cli.scale.parts import CELLS, Parts
-from vvgt_cli.scale.sight import CHECK, SUFFIX, TEST, TRAIN, Sight, looks, marched, segments
+from vvgt_cli.scale.sight import CHECK, SUFFIX, TEST, TRAIN, Box, Sight, looks, marched, meeting, segments
 from vvgt_cli.splat import render
 from vvgt_cli.volume import Volume
 
@@ -58,6 +58,32 @@ def test_parts_of_rays_compose_to_the_rays_of_the_renderer(tmp_path, spacing):
             assert np.abs(ours - theirs).max() <= tolerance * (4 if look.kind == TRAIN else 1)  # by step squared
 
 
+def test_a_block_casts_the_rays_that_may_meet_it_and_no_others(tmp_path, monkeypatch):
+    values = np.round(bodies((70, 61, 50)) * 255).astype(np.uint8)
+    scene = load(SourceRequest(Volume(values, (0.6, 1.0, 2.1)))).scene()
+    sight, counts = Sight(150, check=True, train=12, edge=40), []
+
+    def counted(*args):
+        counts.append(len(meeting(*args)))
+        return meeting(*args)
+
+    monkeypatch.setattr("vvgt_cli.scale.sight.meeting", counted)
+    few = through_blocks(tmp_path / "few", scene, 16, sight)
+    monkeypatch.setattr("vvgt_cli.scale.sight.meeting", lambda look, *rest: np.arange(len(look.pixels)))
+    every = through_blocks(tmp_path / "every", scene, 16, sight)
+    assert all(np.array_equal(one, other) for (_, one), (_, other) in zip(few, every, strict=True))
+    assert any((image[..., 3] > 0.5).any() for _, image in every)
+    pixels = sum(len(look.pixels) for look in looks(sight))
+    assert sum(counts) < 0.1 * pixels * len(counts) / len(looks(sight))
+
+
+def test_a_camera_within_a_block_casts_all_its_rays():
+    look = looks(Sight(150))[0]
+    eye, basis, lens = camera_arrays(Box(np.ones(3), np.full(3, 0.02)), look.camera)
+    assert len(meeting(look, eye, basis, lens, eye - 5, eye + 5)) == len(look.pixels)
+    assert 0 < len(meeting(look, eye, basis, lens, np.zeros(3), np.full(3, 9.0))) < len(look.pixels) / 4
+
+
 def test_init_in_blocks_says_its_error_against_the_volume(vvgt, tmp_path):
     path = tmp_path / "v_100x90x80_uint8.raw"
     path.write_bytes(np.round(bodies() * 255).astype(np.uint8).tobytes())
@@ -88,11 +114,13 @@ def test_a_file_that_no_memory_draws_is_written_without_a_score(vvgt, tmp_path, 
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
 
 
-def test_convert_in_blocks_fits_to_views_of_the_volume_itself(vvgt, tmp_path):
+def test_convert_in_blocks_fits_to_views_of_the_volume_itself(vvgt, tmp_path, monkeypatch):
     path = tmp_path / "v_100x90x80_uint8.raw"
     path.write_bytes(np.round(bodies() * 255).astype(np.uint8).tobytes())
     fit = (*FIT[:-1], "--steps", "48", "--report")
-    memory = vvgt("convert", path, "-o", tmp_path / "memory.ply", *fit, tmp_path / "memory.json")
+    with monkeypatch.context() as patch:  # in blocks the cells are those of the moments
+        patch.setattr("vvgt_cli.vbm.cut_by_error", lambda start, *_: start.gaussians)
+        memory = vvgt("convert", path, "-o", tmp_path / "memory.ply", *fit, tmp_path / "memory.json")
     assert memory.code == 0
     start = vvgt(
         "init", path, "-o", tmp_path / "start.ply", *FIT, "--blocks", "32", "--report", tmp_path / "start.json"

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -120,15 +122,15 @@ def test_a_scheduler_that_is_not_there_is_a_line(vvgt, raw, tmp_path, monkeypatc
     assert vvgt("init", raw, "-o", tmp_path / "a", *FIT, "--shard", "1/2", "--scheduler", "local").code == 2
 
 
-def children(pid):
-    """Processes that a process has started, by their command line."""
+def everyone(parent=None):
+    """Command lines of all processes, or of those that one has started, by their number."""
     found = {}
     for path in Path("/proc").glob("[0-9]*"):
         try:
             stat, line = (path / "stat").read_text(), (path / "cmdline").read_bytes()
         except OSError:
             continue
-        if int(stat.rpartition(")")[2].split()[1]) == pid:
+        if parent in (None, int(stat.rpartition(")")[2].split()[1])):
             found[int(path.name)] = line
     return found
 
@@ -138,7 +140,7 @@ def test_a_killed_worker_costs_nothing_but_time(raw, alone, tmp_path):
     run = start("init", raw, "-o", tmp_path / "two.ply", *FIT, "--blocks", 16, "--workers", 2)
     killed, until = 0, time.monotonic() + 900
     while run.poll() is None and time.monotonic() < until:
-        workers = [pid for pid, line in children(run.pid).items() if b"spawn_main" in line]
+        workers = [pid for pid, line in everyone(run.pid).items() if b"spawn_main" in line]
         parts = list(tmp_path.glob(".two.ply.blocks/counts/*.npz"))
         if workers and parts and not killed:
             os.kill(workers[0], signal.SIGKILL)
@@ -171,7 +173,7 @@ def test_a_killed_worker_of_dask_costs_nothing_but_time(raw, alone, tmp_path):
     run = start("init", raw, "-o", tmp_path / "two.ply", *FIT, *options)
     killed, until = 0, time.monotonic() + 900
     while run.poll() is None and time.monotonic() < until:
-        workers = [pid for pid, line in children(run.pid).items() if b"spawn_main" in line]
+        workers = [pid for pid, line in everyone(run.pid).items() if b"spawn_main" in line]
         if len(workers) > 1 and not killed and list(tmp_path.glob(".two.ply.blocks/counts/*.npz")):
             os.kill(workers[-1], signal.SIGKILL)
             killed += 1
@@ -216,3 +218,103 @@ def test_a_disk_that_takes_no_more_is_a_line_and_the_run_goes_on_when_it_does(ra
     assert list((tmp_path / ".a.ply.blocks").rglob(".*")) == []  # temporary files
     assert vvgt("init", raw, "-o", tmp_path / "a.ply", *FIT, *SIZE).code == 0
     assert (tmp_path / "a.ply").read_bytes() == alone
+
+
+SBATCH = """#!/bin/sh
+eval script=\\${$#}
+[ -z "$SBATCH_REFUSES" ] || { echo "sbatch: error: invalid partition" >&2; exit 1; }
+[ "$1" != --test-only ] || exit 0
+cp "$script" "$SLURM_FAKE/job-$$.sh"
+setsid bash "$SLURM_FAKE/job-$$.sh" >"$SLURM_FAKE/job-$$.log" 2>&1 &
+echo "Submitted batch job $!"
+"""
+SCANCEL = """#!/bin/sh
+for job; do kill -TERM -"$job" 2>/dev/null; done
+true
+"""
+
+
+@pytest.fixture
+def slurm(tmp_path):
+    """A folder with an sbatch that runs jobs on this machine, and the variables under which it is found."""
+    pytest.importorskip("dask_jobqueue")
+    folder = tmp_path / "slurm"
+    folder.mkdir()
+    for name, text in (("sbatch", SBATCH), ("scancel", SCANCEL)):
+        (folder / name).write_text(text)
+        (folder / name).chmod(0o755)
+    settings = {"DASK_JOBQUEUE__SLURM__INTERFACE": "lo", "DASK_JOBQUEUE__SLURM__ACCOUNT": "geology"}
+    return folder, {"PATH": f"{folder}:{os.environ['PATH']}", "SLURM_FAKE": str(folder), **settings}
+
+
+def test_jobs_under_slurm_leave_the_same_bytes(raw, alone, tmp_path, slurm):
+    folder, variables = slurm
+    options = ("--workers", 2, "--scheduler", "slurm", "--memory", "3G", "--threads", 1)
+    run = start("init", raw, "-o", tmp_path / "two.ply", *FIT[:-1], *SIZE, *options, **variables)
+    said = run.communicate(timeout=900)[1]
+    assert run.returncode == 0, said
+    assert "2 workers" in said
+    assert (tmp_path / "two.ply").read_bytes() == alone
+    scripts = [path.read_text() for path in folder.glob("job-*.sh")]
+    assert len(scripts) == 2  # for all passes
+    for line in ("#SBATCH -J vvgt-blocks", "#SBATCH -A geology", "#SBATCH --cpus-per-task=1", "#SBATCH --mem=3G"):
+        assert all(line in script for script in scripts)
+    assert all("export NUMBA_NUM_THREADS=1" in script for script in scripts)
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
+def test_a_slurm_job_that_ends_is_followed_by_another(raw, alone, tmp_path, slurm):
+    folder, variables = slurm
+    options = ("--blocks", 16, "--scheduler", "slurm", "--memory", "3G", "--threads", 1)
+    run = start("init", raw, "-o", tmp_path / "a.ply", *FIT, *options, **variables)
+    until = time.monotonic() + 900
+    while run.poll() is None and time.monotonic() < until:
+        if list(tmp_path.glob(".a.ply.blocks/counts/*.npz")):
+            jobs = [path.name[4:-3] for path in folder.glob("job-*.sh")]
+            for pid, line in everyone().items():
+                if f"{folder}/job-{jobs[0]}.sh".encode() in line:
+                    os.killpg(pid, signal.SIGKILL)
+            break
+        time.sleep(0.01)
+    said = run.communicate(timeout=900)[1]
+    assert run.returncode == 0, said
+    assert len(list(folder.glob("job-*.sh"))) == 2
+    assert (tmp_path / "a.ply").read_bytes() == alone
+
+
+def test_slurm_that_is_not_there_or_refuses_is_a_line(vvgt, raw, tmp_path, slurm, monkeypatch):
+    _, variables = slurm
+    call = ("init", raw, "-o", tmp_path / "a.ply", *FIT, *SIZE, "--scheduler", "slurm")
+    with monkeypatch.context() as patch:
+        patch.setenv("PATH", "")
+        run = vvgt(*call, "--memory", "3G")
+    assert (run.code, run.err.count("\n")) == (1, 1)
+    assert "there is no sbatch here" in run.err
+    for name, value in {**variables, "SBATCH_REFUSES": "1"}.items():
+        monkeypatch.setenv(name, value)
+    run = vvgt(*call)
+    assert run.code == 2
+    assert "give --memory" in run.err
+    run = start(*call, "--memory", "3G", **variables, SBATCH_REFUSES="1")
+    said = run.communicate(timeout=300)[1]
+    assert (run.returncode, said.count("\n")) == (1, 1), said
+    assert "sbatch refuses the job (sbatch: error: invalid partition)" in said
+
+
+def test_a_disk_without_room_for_the_blocks_is_said_before_they_are_made(vvgt, raw, tmp_path, monkeypatch):
+    disk = SimpleNamespace(f_frsize=512, f_blocks=100000, f_bavail=2000)
+    monkeypatch.setattr(os, "statvfs", lambda folder: disk)
+    run = vvgt("init", raw, "-o", tmp_path / "a.ply", *FIT, *SIZE)
+    assert run.code == 1
+    assert run.err.count("\n") == 1
+    assert "No space left on device: needs" in run.err
+    assert "1024000 are free in" in run.err
+    assert list((tmp_path / ".a.ply.blocks" / "cells").iterdir()) == []
+    disk.f_bavail = 400000
+    run = vvgt("init", raw, "-o", tmp_path / "a.ply", *FIT[:-1], *SIZE)
+    assert run.code == 0
+    need = float(re.search(r"on disk meanwhile: about (\d+) MB in .*\.a\.ply\.blocks", run.err)[1])
+    folder = tmp_path / "v.blocks"
+    assert vvgt("init", raw, "-o", folder, *FIT, *SIZE, "--shard", "1/1").code == 0
+    taken = sum(path.stat().st_size for path in (folder / "cells").iterdir()) + (tmp_path / "a.ply").stat().st_size
+    assert 0.8 * taken < need * 1e6 < 1.5 * taken

@@ -35,6 +35,11 @@ def set_memory(limit: int | None) -> None:
     _asked = limit
 
 
+def asked_memory() -> int | None:
+    """What `set_memory` was told."""
+    return _asked
+
+
 def free_memory() -> int | None:
     """Bytes of memory that this process can still have, or None where the system does not say.
 

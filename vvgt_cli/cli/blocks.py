@@ -47,11 +47,11 @@ _options = {
     ),
     "workers": click.option(
         "--workers", type=click.IntRange(1, 1024), default=1, show_default=True, metavar="N",
-        help="Processes that go through blocks at once; with --scheduler local, its workers.",
+        help="Processes that go through blocks at once; with --scheduler local, its workers; with slurm, jobs.",
     ),
     "scheduler": click.option(
-        "--scheduler", metavar="local|ADDRESS",
-        help="Let Dask's workers go through the blocks: of this machine, or of the scheduler at "
+        "--scheduler", metavar="local|slurm|ADDRESS",
+        help="Let Dask's workers go through the blocks: of this machine, of as many SLURM jobs, or of the scheduler at "
         "ADDRESS (tcp://...). Needs the extra cluster.",
     ),
     "level": click.option(

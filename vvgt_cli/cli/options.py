@@ -110,8 +110,8 @@ unit_distance_option = click.option(
 LABELS = dict(
     labels=click.option(
         "--labels", metavar="TABLE|auto|none",
-        help="VOLUME is a label map: its table (3D Slicer, ITK-SNAP, FreeSurfer, .seg.nrrd, JSON), or auto for "
-        "distinct colours. Default: auto where it is recognised by name and type; none: scalars.",
+        help="VOLUME is a label map: its table (3D Slicer, ITK-SNAP, FreeSurfer, .seg.nrrd, DICOM SEG, JSON), or auto "
+        "for distinct colours. Default: auto where it is recognised by name and type; none: scalars.",
     ),
     layers=click.option(
         "--layer", "layers", multiple=True, metavar="FILE[,tf=TF][,labels=TABLE]...",

@@ -1,16 +1,21 @@
-"""Blocks on Dask's workers: of this machine, or of a scheduler that is there already."""
+"""Blocks on Dask's workers: of this machine, of a scheduler that is there already, or of jobs under SLURM."""
 
 from __future__ import annotations
 
 import importlib
 import logging
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+import shutil
+import subprocess
+from collections.abc import Sequence
+from contextlib import ExitStack
 from typing import Any
 
-from vvgt_cli.errors import DataError
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.resources import asked_memory
 from vvgt_cli.scale.runners import Progress, Task
 
+LOCAL, SLURM = "local", "slurm"
+AGAIN = 30_000  # milliseconds until a job that has ended is followed by another
 TRIES = 3  # of a block whose worker was lost
 WAIT = "15s"  # for a scheduler to answer
 
@@ -28,67 +33,124 @@ def _need(name: str) -> Any:
 
 
 class Dask:
-    """See the module.
+    """See the module. A context: workers that are started for it stay from pass to pass, and end with it.
 
     Attributes:
         workers: that are asked for.
     """
 
     def __init__(self, scheduler: str, workers: int, threads: int) -> None:
-        """``scheduler`` is "local" or an address; ``threads`` of all local workers.
+        """``scheduler`` is "local", "slurm" or an address; ``threads`` of all local workers, or of each job.
 
         Raises:
-            DataError: Dask is not installed.
+            DataError: Dask is not installed, or SLURM.
+            UsageError: jobs without a size of memory.
         """
         _need("distributed")
         logging.getLogger("distributed").setLevel(logging.CRITICAL)  # errors are lines of our own
-        self._scheduler, self.workers = scheduler, workers
-        self._threads = max(threads // workers, 1)
+        self._scheduler, self.workers, self._threads = scheduler, workers, threads
+        self._stack, self._client = ExitStack(), None
+        if scheduler == SLURM:
+            _need("dask_jobqueue")
+            if shutil.which("sbatch") is None:
+                raise DataError(
+                    "--scheduler slurm: there is no sbatch here; run it on a node that submits jobs, or try local"
+                )
+            if asked_memory() is None:
+                raise UsageError("--scheduler slurm: give --memory, which every job asks for, as --memory 16G")
+
+    def __enter__(self) -> Dask:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._stack.close()
 
     def run(self, task: Task, numbers: Sequence[int], progress: Progress | None) -> None:
         """Do the tasks; those of a worker that was lost are done anew, by another.
 
         Raises:
-            DataError: no scheduler, or workers that are lost again and again.
+            DataError: no scheduler, jobs that are refused, or workers that are lost again and again.
         """
         if not numbers:
             return
         distributed = _need("distributed")
-        with self._client() as client:
-            futures = client.map(task, list(numbers), retries=TRIES, pure=False)
-            try:
-                for done, future in enumerate(distributed.as_completed(futures), 1):
-                    future.result()
-                    if progress:
-                        progress(done, len(numbers))
-            except distributed.KilledWorker as error:
-                raise DataError(
-                    f"workers were ended {TRIES} times at one block (out of memory?); try --blocks with a smaller size"
-                ) from error
+        client = self._client = self._client or self._connected()
+        futures = client.map(task, list(numbers), retries=TRIES, pure=False)
+        try:
+            for done, future in enumerate(distributed.as_completed(futures), 1):
+                future.result()
+                if progress:
+                    progress(done, len(numbers))
+        except distributed.KilledWorker as error:
+            raise DataError(
+                f"workers were ended {TRIES} times at one block (out of memory?); try --blocks with a smaller size"
+            ) from error
 
-    @contextmanager
-    def _client(self) -> Iterator[Any]:
-        """A client of the scheduler; what was started for it ends with the block."""
+    def _connected(self) -> Any:
+        """A client of the scheduler; what is started for it ends with the context."""
         distributed = _need("distributed")
-        if self._scheduler != "local":
-            try:
-                client = distributed.Client(self._scheduler, timeout=WAIT)
-            except (OSError, ValueError) as error:
-                raise DataError(
-                    f"--scheduler {self._scheduler}: no Dask scheduler answers there; start one with 'dask scheduler' "
-                    "(it says its address), or try --scheduler local"
-                ) from error
-            with client:
-                yield client
-            return
-        with self._cluster() as cluster, distributed.Client(cluster) as client:
-            yield client
+        if self._scheduler in (LOCAL, SLURM):
+            cluster = self._stack.enter_context(self._local() if self._scheduler == LOCAL else self._jobs())
+            if self._scheduler == SLURM:
+                self._keep(cluster)
+            return self._stack.enter_context(distributed.Client(cluster))
+        try:
+            client = distributed.Client(self._scheduler, timeout=WAIT)
+        except (OSError, ValueError) as error:
+            raise DataError(
+                f"--scheduler {self._scheduler}: no Dask scheduler answers there; start one with 'dask scheduler' "
+                "(it says its address), or try --scheduler local"
+            ) from error
+        return self._stack.enter_context(client)
 
-    def _cluster(self) -> Any:
+    def _local(self) -> Any:
         dask = _need("dask")
-        threads = {name: str(self._threads) for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS")}
+        threads = _environment(max(self._threads // self.workers, 1))
         dask.config.set({"distributed.nanny.pre-spawn-environ": threads})
         return _need("distributed").LocalCluster(
             n_workers=self.workers, threads_per_worker=1, dashboard_address=None, memory_limit=0,
             silence_logs=logging.CRITICAL,
         )  # fmt: skip
+
+    def _jobs(self) -> Any:
+        """One worker a job; account, partition and time are those of Dask's own settings, `jobqueue.slurm`.
+
+        Raises:
+            DataError: a job is refused.
+        """
+        jobqueue = _need("dask_jobqueue")
+        try:
+            cluster = jobqueue.SLURMCluster(
+                job_name="vvgt-blocks", processes=1, cores=1, job_cpu=self._threads, memory=f"{asked_memory()}B",
+                job_script_prologue=[f"export {name}={n}" for name, n in _environment(self._threads).items()],
+                worker_extra_args=["--memory-limit", "0"], silence_logs=logging.CRITICAL,
+                scheduler_options={"dashboard_address": None},
+            )  # fmt: skip
+        except (OSError, RuntimeError, TypeError, ValueError) as error:
+            raise DataError(f"--scheduler slurm: {error}; settings are those of jobqueue.slurm in Dask's") from error
+        tried = subprocess.run(["sbatch", "--test-only"], input=cluster.job_script(), capture_output=True, text=True)
+        if tried.returncode:
+            cluster.close()
+            said = [line.strip() for line in tried.stderr.splitlines() if line.strip()] or ["no reason given"]
+            why = next((line for line in said if "error" in line.lower()), said[-1])
+            raise DataError(
+                f"--scheduler slurm: sbatch refuses the job ({why}); account, partition and time are those of "
+                "jobqueue.slurm in Dask's settings"
+            )
+        return cluster
+
+    def _keep(self, cluster: Any) -> None:
+        """Ask for the jobs, and again for those that have ended, until the context does.
+
+        A job that ends before its worker has answered is not seen as ended: then this waits for the others.
+        """
+        cluster.scale(jobs=self.workers)
+        callback = importlib.import_module("tornado.ioloop").PeriodicCallback
+        again = callback(lambda: cluster.scale(jobs=self.workers), AGAIN)
+        self._stack.callback(cluster.loop.add_callback, again.stop)
+        cluster.loop.add_callback(again.start)
+
+
+def _environment(threads: int) -> dict[str, str]:
+    """Of a worker of so many threads."""
+    return {name: str(threads) for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS")}

@@ -115,7 +115,7 @@ class Forest:
                 stream.write(capped[tree.parent].tobytes() + capped.tobytes())
                 self.tiles.append(tile)
                 self._sizes.append((len(tree), int((tree.children == 0).sum())))
-                moments.append(tree.moments[-1])
+                moments.append(tree.moments[-1].copy())  # a view would keep the tree
                 largest.append(tree.largest[-1])
         self.cells = sum(size for size, _ in self._sizes)
         self.top: Tree | None = None

@@ -13,9 +13,11 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import atomic_write
+from vvgt_cli.vbm.columns import MOMENTS
 
 RUN = "run.json"
 COUNTS, HISTOGRAM, CELLS = "counts", "histogram", "cells"
+ROW = MOMENTS * 8 + 3  # bytes a cell: moments float64, place in its tile uint8
 PASSES = (COUNTS, HISTOGRAM, CELLS)
 
 
@@ -133,6 +135,11 @@ class Parts:
                 return frozenset(found.files)
         except Exception as error:
             raise _unreadable(path, number, error) from error
+
+    def bytes(self, kind: str) -> int:
+        """Of all that lies there of a pass and is whole."""
+        whole = (path for path in (self.folder / kind).iterdir() if not path.name.startswith("."))
+        return sum(path.stat().st_size for path in whole)
 
     def remove(self) -> None:
         """The whole folder."""

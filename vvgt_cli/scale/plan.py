@@ -10,15 +10,17 @@ from typing import Any
 
 import numpy as np
 
+from vvgt_cli.conversion.request import VERTEX_BYTES
 from vvgt_cli.errors import DataError
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import PlyOptions
 from vvgt_cli.runs.record import plain
 from vvgt_cli.scale.grid import Boxes, CellGrid
-from vvgt_cli.scale.parts import Parts
+from vvgt_cli.scale.parts import ROW, Parts
 from vvgt_cli.volume.types import UnitFrame
 
 PLAN = "plan.json"
+A_SCORE, A_RAY = 20, 20  # bytes: of a base cell's scores with those above it, of what a block shows of a ray
 A_GAUSSIAN = 8  # base cells there may be a Gaussian, where the budget is so large that it decides
 
 
@@ -87,3 +89,11 @@ def most_cells(budget: int) -> int:
     from vvgt_cli.vbm.closed_form import most_cells as in_memory
 
     return max(in_memory(budget), A_GAUSSIAN * budget)
+
+
+def disk_bytes(grid: CellGrid, voxels: float, budget: int, rays: int) -> int:
+    """What parts and output take on disk, about, where ``voxels`` are visible and ``rays`` are marched."""
+    cells = voxels / float(grid.cell.prod())
+    met = rays * max(grid.blocks.shape) / 2  # blocks along a ray, half of which show something of it
+    coarse = math.prod(-(-grid.dims // grid.tile)) * grid.tile_cells**3 * (8 / 8**grid.march + 4 / 8**grid.field)
+    return int(cells * (ROW + A_SCORE) + coarse + met * A_RAY + min(budget, cells) * VERTEX_BYTES)

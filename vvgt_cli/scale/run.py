@@ -16,7 +16,8 @@ from vvgt_cli import __version__
 from vvgt_cli.conversion.convert import ply_options
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import UsageError
-from vvgt_cli.jit.ahead import BLOCKS
+from vvgt_cli.files import check_room
+from vvgt_cli.jit.ahead import BLOCKS, COUNT_REAL, COUNT_WHOLE
 from vvgt_cli.progress import Console
 from vvgt_cli.runs.layered import ALL, COLOR, NONE
 from vvgt_cli.runs.outputs import STDOUT, claimed, write_text
@@ -26,12 +27,12 @@ from vvgt_cli.runs.source import Source, describe_source, tf_record, volume_reco
 from vvgt_cli.scale.grid import sample_spacing
 from vvgt_cli.scale.levels import level_outputs
 from vvgt_cli.scale.merge import write_merged
-from vvgt_cli.scale.parts import Parts
-from vvgt_cli.scale.plan import Plan, finest_level, most_cells
+from vvgt_cli.scale.parts import CELLS, Parts
+from vvgt_cli.scale.plan import Plan, disk_bytes, finest_level, most_cells
 from vvgt_cli.scale.runners import Here, Processes, Runner
 from vvgt_cli.scale.settings import BlockOptions, block_edge, cell_grid, counted_boxes, slices_at_once
-from vvgt_cli.scale.sight import Sight
-from vvgt_cli.scale.source import InBlocks, Samples, needs_histogram, open_in_blocks, resolved
+from vvgt_cli.scale.sight import Sight, looks
+from vvgt_cli.scale.source import InBlocks, Samples, files_of, needs_histogram, open_in_blocks, resolved
 from vvgt_cli.share import format_of
 
 if TYPE_CHECKING:
@@ -140,7 +141,8 @@ def _runner(options: BlockOptions) -> Runner:
 def _settings(request: ConvertRequest, opened: InBlocks, sight: Sight) -> dict[str, Any]:
     """All that parts depend on."""
     path = opened.request.path
-    facts = [os.stat(path).st_size, os.stat(path).st_mtime_ns] if os.path.exists(path) else []
+    found = [file.stat() for file in files_of(path)]
+    facts = [sum(f.st_size for f in found), max(f.st_mtime_ns for f in found)] if found else []
     tf = request.source.tf
     text = Path(tf).read_text("utf-8", "replace") if isinstance(tf, str) and os.path.isfile(tf) else repr(tf)
     return {
@@ -177,8 +179,35 @@ def make_parts(run: Run, request: ConvertRequest, options: BlockOptions, parts: 
     Raises:
         Later: other shards' blocks are missing.
     """
-    from vvgt_cli.dvr.scene import kernel_type
     from vvgt_cli.scale.tasks import CountBlocks, Place
+
+    opened, edge = _opened(run, request, options, parts, sight)
+    place = Place(opened.request.path, opened.request.read, str(parts.folder))
+    boxes = counted_boxes(opened.volume, edge, sample_spacing(opened.volume.dims))
+    counts, second = CountBlocks(place, boxes, slices_at_once(opened.volume, edge, boxes)), None
+    with _runner(options) as runner:
+        _do(run, runner, counts, options, "count")
+        if needs_histogram(request.source) and not _counted(opened):
+            from vvgt_cli.volume.tallies import with_limits
+
+            whole = with_limits(counts.merged()[0], opened.volume)
+            second = replace(counts, limits=(whole.lo, whole.hi))
+            _do(run, runner, second, options, "histogram")
+        source, limits, samples = resolved(opened, counts, second)
+        for line in (describe_source(source), *remarks(source.volume, ply_options(request, source))):
+            run.console.say(line)
+        cells, voxels = _cells(request, source, limits, samples, place, edge, sight)
+        _plan(request, source, cells.grid).save(parts)
+        _check_disk(run, cells, voxels, request.fit.max_gaussians)
+        _do(run, runner, cells, options, "integrate")
+    return source
+
+
+def _opened(
+    run: Run, request: ConvertRequest, options: BlockOptions, parts: Parts, sight: Sight
+) -> tuple[InBlocks, int]:
+    """The volume, and the edge of its blocks in voxels; their folder is there then, and kernels are compiled."""
+    from vvgt_cli.dvr.scene import kernel_type
     from vvgt_cli.vbm.closed_form import pixel_width
 
     with run.stage("open") as stage:
@@ -193,25 +222,11 @@ def make_parts(run: Run, request: ConvertRequest, options: BlockOptions, parts: 
         if line:
             run.console.say(line)
     run.compile(BLOCKS, kernel_type(volume))
-    runner = _runner(options)
-    place = Place(opened.request.path, opened.request.read, str(parts.folder))
-    boxes = counted_boxes(volume, edge, sample_spacing(volume.dims))
-    counts = CountBlocks(place, boxes, slices_at_once(volume, edge, boxes))
-    _do(run, runner, counts, options, "count")
-    second = None
-    if needs_histogram(request.source) and not _counted(opened):
-        from vvgt_cli.volume.tallies import with_limits
-
-        whole = with_limits(counts.merged()[0], volume)
-        second = replace(counts, limits=(whole.lo, whole.hi))
-        _do(run, runner, second, options, "histogram")
-    source, limits, samples = resolved(opened, counts, second)
-    for line in (describe_source(source), *remarks(source.volume, ply_options(request, source))):
-        run.console.say(line)
-    cells = _cells(request, source, limits, samples, place, edge, sight)
-    _plan(request, source, cells.grid).save(parts)
-    _do(run, runner, cells, options, "integrate")
-    return source
+    if _counted(opened):
+        run.compile(COUNT_WHOLE)
+    else:  # as `tallies.tally` gives them
+        run.compile(COUNT_REAL, "float32" if volume.data.dtype == np.float32 else "float64")
+    return opened, edge
 
 
 def _counted(opened: InBlocks) -> bool:
@@ -245,11 +260,24 @@ def _plan(request: ConvertRequest, source: Source, grid: CellGrid) -> Plan:
     )  # fmt: skip
 
 
+def _check_disk(run: Run, cells: CellBlocks, voxels: float, budget: int) -> None:
+    """Say what the blocks will take on disk, of ``voxels`` that are visible.
+
+    Raises:
+        DataError: more than is free.
+    """
+    parts, rays = cells.place.parts, sum(len(look.pixels) * len(look.offsets) for look in looks(cells.sight))
+    need = disk_bytes(cells.grid, voxels, budget, rays) - parts.bytes(CELLS)
+    if need > 0 and parts.missing(CELLS, range(len(cells))):
+        run.console.say(f"on disk meanwhile: about {need / 1e6:.0f} MB in {parts.folder}")
+        check_room(parts.folder / CELLS, need)
+
+
 def _cells(
     request: ConvertRequest, source: Source, limits: tuple[float, float], samples: Samples, place: Any, edge: int,
     sight: Sight,
-) -> CellBlocks:  # fmt: skip
-    """The pass that integrates, with the cells' size from the samples."""
+) -> tuple[CellBlocks, float]:  # fmt: skip
+    """The pass that integrates, with the cells' size from the samples, and how many voxels they say are visible."""
     from vvgt_cli.cameras import default_views
     from vvgt_cli.dvr.scene import kernel_rule
     from vvgt_cli.scale.tasks import CellBlocks
@@ -265,12 +293,13 @@ def _cells(
         source.tf, (source.statistics.lo, source.statistics.hi), slope=rule.slope, intercept=rule.intercept,
         unit_distance=source.unit_distance, world_per_unit=1 / frame.scale,
     )  # fmt: skip
-    visible = sum(w * visible_share(tables, rule.apply(brick)) for brick, w in zip(*samples, strict=True))
-    exponent = _exponent(request, np.array(frame.step), visible * volume.data.size / samples[1].sum())
+    share = sum(w * visible_share(tables, rule.apply(brick)) for brick, w in zip(*samples, strict=True))
+    visible = share * volume.data.size / samples[1].sum()
+    exponent = _exponent(request, np.array(frame.step), visible)
     march = widening(
         np.array(volume.dims), exponent, np.array(frame.step), default_views("train", size=MARCH_SIZE)
     )  # fmt: skip
-    return CellBlocks(place, cell_grid(volume, exponent, edge, march), rule, sight, tables)
+    return CellBlocks(place, cell_grid(volume, exponent, edge, march), rule, sight, tables), visible
 
 
 def _exponent(request: ConvertRequest, step: np.ndarray, voxels: float) -> np.ndarray:

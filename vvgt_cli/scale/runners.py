@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from typing import Protocol
+from typing import Any, Protocol, Self
 
 from vvgt_cli.errors import DataError
 
@@ -19,15 +19,28 @@ class Task(Protocol):
 
 
 class Runner(Protocol):
-    """Does tasks, each at least once; ``workers`` are at work at once."""
+    """Does tasks, each at least once; ``workers`` are at work at once. A context: with it ends what was started."""
 
     @property
     def workers(self) -> int: ...
 
+    def __enter__(self) -> Any: ...
+
+    def __exit__(self, *error: object) -> None: ...
+
     def run(self, task: Task, numbers: Sequence[int], progress: Progress | None) -> None: ...
 
 
-class Here:
+class Alone:
+    """A runner of which nothing is left between two passes."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None: ...
+
+
+class Here(Alone):
     """One block after the other, in this process."""
 
     workers = 1
@@ -45,7 +58,7 @@ def _begin(threads: int) -> None:
     os.environ["NUMBA_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = str(threads)
 
 
-class Processes:
+class Processes(Alone):
     """Processes of this machine, started afresh; what a killed one had begun is begun anew."""
 
     def __init__(self, workers: int, threads: int) -> None:

@@ -17,7 +17,7 @@ LARGEST, SMALLEST = 512, 16  # voxels along the edge of a block
 SHARED = 256  # of a shard, whatever the memory of its node: all shards must agree
 MAX_FIELD = 1 << 24  # cells of the field of opacity
 A_BLOCK = 0.3  # of the memory of a worker: what its voxels may take; as much again where they are converted
-COUNTED = 3  # bytes a voxel of counting: a copy, and the bins
+COUNTED = 3  # bytes a voxel, of types that are counted, beside it
 ALWAYS = 400 << 20  # bytes: coarse grids, a tile's tree, a batch of Gaussians
 WIDE = 3  # exponent of cells whose voxels get one point of quadrature in place of eight: quicker, less exact
 
@@ -29,7 +29,7 @@ class BlockOptions:
     Attributes:
         size: voxels along the edge of a block, None: by the memory.
         workers: processes.
-        scheduler: "local" or the address of a Dask scheduler; None: without Dask.
+        scheduler: "local", "slurm" or the address of a Dask scheduler; None: without Dask.
         shard: part (from 1) and count of a job array, None for the whole.
         level: of a file of several resolutions: a number, "full", or None: the one that matches the screen.
         levels: of detail that are written.
@@ -56,7 +56,7 @@ def block_edge(volume: Volume, options: BlockOptions) -> int:
     free = free_memory()
     if options.size is not None or free is None or options.shard is not None:
         return options.size or SHARED
-    room = A_BLOCK * max(free - ALWAYS, 0) / max(options.workers if options.scheduler is None else 1, 1)
+    room = A_BLOCK * max(free - ALWAYS, 0) / max(options.workers if options.scheduler in (None, "local") else 1, 1)
     edge = LARGEST
     while edge > SMALLEST and block_bytes(volume, edge) > room:
         edge //= 2
@@ -74,7 +74,8 @@ def block_bytes(volume: Volume, edge: int) -> int:
     """Bytes that a block takes while it is integrated."""
     sizes = [min(e + 2, n) for e, n in zip(shape_of(volume, edge), volume.dims, strict=True)]
     one = volume.data.dtype.itemsize
-    return math.prod(sizes) * (one + (4 if one > 2 and volume.data.dtype != np.float32 else COUNTED))
+    beside = 0 if volume.data.dtype == np.float32 else 4 if one > 2 else COUNTED
+    return math.prod(sizes) * (one + beside)
 
 
 def shape_of(volume: Volume, edge: int) -> Triple:

@@ -5,6 +5,7 @@ A block leaves what it shows of each ray; front to back these compose to what a 
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
@@ -156,15 +157,39 @@ def segments(
     box = Box(np.array(grid.half), np.array(grid.step))
     found: dict[str, np.ndarray] = {}
     for n, look in enumerate(looks(sight)):
-        seen = np.zeros((len(look.pixels), len(look.offsets), 4), np.float32)
+        camera = camera_arrays(box, look.camera)
+        near = meeting(look, *camera, lo - 0.5, hi - 0.5)
+        seen = np.zeros((len(near), len(look.offsets), 4), np.float32)
         cast_segments(
-            Voxels(values), optics, empty, faces, begin.astype(np.float64), *camera_arrays(box, look.camera), look.step,
-            look.pixels, look.offsets, seen,
+            Voxels(values), optics, empty, faces, begin.astype(np.float64), *camera, look.step, look.pixels[near],
+            look.offsets, seen,
         )  # fmt: skip
         rays = np.flatnonzero(seen[..., 3])
         if len(rays):
-            found[f"rays{n}"], found[f"rgba{n}"] = rays.astype(np.int32), seen.reshape(-1, 4)[rays]
+            each = len(look.offsets)
+            found[f"rays{n}"] = (near[rays // each] * each + rays % each).astype(np.int32)
+            found[f"rgba{n}"] = seen.reshape(-1, 4)[rays]
     return found
+
+
+def meeting(
+    look: Look, eye: np.ndarray, basis: np.ndarray, lens: np.ndarray, lo: np.ndarray, hi: np.ndarray
+) -> np.ndarray:
+    """Places (n,) int64, ascending, of the pixels of a look that may meet the box from ``lo`` to ``hi`` (3,), voxels.
+
+    ``eye``, ``basis``, ``lens`` as `camera_arrays` has them. Those within the rectangle around the picture of the
+    box's corners; all, where a corner is not in front of the eye.
+    """
+    corners = np.array(list(itertools.product(*zip(lo, hi, strict=True))), np.float64) - eye
+    across, down, ahead = np.linalg.solve(basis.T, corners.T)
+    if ahead.min() <= 1e-6 * np.abs(ahead).max():
+        return np.arange(len(look.pixels))
+    edge = 1.0  # a pixel's own width, and what rounding moves
+    x, y = across / ahead / lens[0] + lens[2] - 0.5, down / ahead / lens[1] + lens[3] - 0.5
+    column, row = look.pixels.T
+    inside = (column >= x.min() - edge) & (column <= x.max() + edge) & (row >= y.min() - edge) & (row <= y.max() + edge)
+    result: np.ndarray = np.flatnonzero(inside)
+    return result
 
 
 def marched(parts: Parts, grid: CellGrid, sight: Sight, kind: str) -> Iterator[tuple[Look, np.ndarray]]:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vvgt_cli.errors import UsageError
+from vvgt_cli.errors import SeveralComponents, UsageError
 from vvgt_cli.resources import free_memory
 from vvgt_cli.runs.source import Source, SourceRequest
 from vvgt_cli.scale.settings import BlockOptions
@@ -87,26 +87,43 @@ def _at_level(read: ReadOptions, path: str, options: BlockOptions, pixel: float)
     return replace(read, level=level), f"level {level} of {len(shapes)} ({sizes}): finer ones the screen cannot tell"
 
 
+def files_of(path: str) -> list[Path]:
+    """The slices in a folder or of a glob; a file, or a folder of anything else, itself; none where nothing is."""
+    from vvgt_cli.volume.slices import matching, slices_of
+
+    if not os.path.exists(path):
+        return matching(path)
+    return (slices_of(Path(path)) if os.path.isdir(path) else []) or [Path(path)]
+
+
 def beyond_memory(request: SourceRequest) -> bool:
-    """Whether a volume is better gone through in blocks: a large file that the memory does not hold with the rest.
+    """Whether a volume is better gone through in blocks: a large field that the memory does not hold with the rest.
+
+    Colours and channels together are not: blocks take one field.
 
     Raises:
         DataError, UsageError: as `read_volume`.
     """
+    from vvgt_cli.runs.layered import ALL, COLOR
     from vvgt_cli.synth.sources import open_volume
     from vvgt_cli.vbm.closed_form import MAX_BASE_CELLS
 
     path, free = request.volume, free_memory()
-    if not isinstance(path, str) or free is None or path == "-":
+    if not isinstance(path, str) or free is None or path == "-" or request.read.component in (ALL, COLOR):
         return False
-    place = path.rpartition(":/")[0] if not os.path.exists(path) and ":/" in path else path
-    if os.path.isdir(place) and not ZARR & set(os.listdir(place)):
-        return False  # slices, which are read whole
-    if not os.path.isdir(place) and not (os.path.isfile(place) and os.path.getsize(place) > LARGE * free):
-        h5 = place.lower().endswith((".h5", ".hdf5", ".he5", ".hdf", ".nc"))  # packed: few bytes may hold many voxels
-        if not (h5 and os.path.isfile(place)):
-            return False
-    volume = open_volume(path, replace(request.read, stored=True, packed=True))
+    inside = not os.path.exists(path) and not files_of(path) and ":/" in path
+    place = path.rpartition(":/")[0] if inside else path
+    zarr = os.path.isdir(place) and ZARR & set(os.listdir(place))
+    h5 = os.path.isfile(place) and place.lower().endswith((".h5", ".hdf5", ".he5", ".hdf", ".nc"))
+    files = files_of(place)
+    tiff = files and files[0].suffix.lower() in (".tif", ".tiff")
+    packed = zarr or h5 or tiff  # few bytes may hold many voxels
+    if not packed and sum(file.stat().st_size for file in files) <= LARGE * free:
+        return False
+    try:
+        volume = open_volume(path, replace(request.read, stored=True, packed=True))
+    except SeveralComponents:  # colours, or to be chosen: said where it is read
+        return False
     if not lies_in_file(volume):
         return False
     own = volume.data.dtype.name not in ("uint8", "uint16", "float32")

@@ -12,7 +12,7 @@ from vvgt_cli.dvr.layout import Optics, Voxels
 from vvgt_cli.dvr.scene import KernelRule
 from vvgt_cli.files import atomic_write
 from vvgt_cli.scale.grid import SAMPLE, Boxes, CellGrid, samples_in
-from vvgt_cli.scale.parts import CELLS, COUNTS, HISTOGRAM, Parts
+from vvgt_cli.scale.parts import CELLS, COUNTS, HISTOGRAM, ROW, Parts
 from vvgt_cli.scale.sight import SUFFIX, Sight, segments
 from vvgt_cli.synth.sources import open_volume
 from vvgt_cli.transfer.tables import OpticalTables
@@ -20,8 +20,6 @@ from vvgt_cli.vbm.columns import MASS, MOMENTS
 from vvgt_cli.volume import ReadOptions, Volume
 from vvgt_cli.volume.stored import read_block
 from vvgt_cli.volume.tallies import Tally, tally
-
-ROW = MOMENTS * 8 + 3  # bytes a cell: moments float64, place in its tile uint8
 
 
 @dataclass(frozen=True)
@@ -77,12 +75,21 @@ class CountBlocks:
         """Leave the part of block ``number``."""
         volume = self.place.volume()
         lo, hi = self.boxes.at(number)
+        size = np.minimum(SAMPLE, self.boxes.dims)
+        places, weights = samples_in(self.boxes.dims, lo, hi)
+        wanted = len(places) if self.limits is None else 0
+        bricks = np.empty((wanted, *size[::-1]), volume.data.dtype.newbyteorder("="))
         found: Tally | None = None
         for z in range(lo[2], hi[2], self.slices):
-            part = tally(read_block(volume, *_slices(lo, hi, z, self.slices)), volume, self.limits)
+            begin, end = np.array([lo[0], lo[1], z]), np.array([hi[0], hi[1], min(z + self.slices, hi[2])])
+            values = read_block(volume, begin, end)
+            part = tally(values, volume, self.limits)
             found = part if found is None else found.plus(part)
+            for n in range(wanted):
+                if z <= places[n, 2] < end[2]:
+                    bricks[n] = _brick(volume, values, begin, end, places[n], size)
+            del values  # before the next slices are read
         assert found is not None, "a box has a slice"
-        bricks, weights = self._samples(volume, lo, hi)
         self.place.parts.save(
             self.kind,
             number,
@@ -93,19 +100,6 @@ class CountBlocks:
             samples=bricks,
             weights=weights,
         )
-
-    def _samples(self, volume: Volume, lo: np.ndarray, hi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The bricks (n, z, y, x) of a box, of a first pass, and the voxels (n,) that each stands for."""
-        x, y, z = np.minimum(SAMPLE, self.boxes.dims)
-        places, weights = samples_in(self.boxes.dims, lo, hi)
-        count = len(places) if self.limits is None else 0
-        found = np.empty((count, z, y, x), volume.data.dtype.newbyteorder("="))
-        for first in np.unique(places[:count, 2]):
-            layer = read_block(volume, *_slices(lo, hi, first, z))
-            for n in np.flatnonzero(places[:, 2] == first):
-                i, j, _ = places[n] - lo
-                found[n] = layer[:, j : j + y, i : i + x]
-        return found, weights
 
     def merged(self) -> tuple[Tally, np.ndarray, np.ndarray]:
         """The sum over all blocks, their samples (n, z, y, x), and the voxels (n,) that each stands for.
@@ -126,9 +120,14 @@ class CountBlocks:
         return whole, np.concatenate(samples), np.concatenate(weights)
 
 
-def _slices(lo: np.ndarray, hi: np.ndarray, z: int, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """First voxel (3,) of ``count`` slices of a box from slice ``z`` of the volume on, and that behind the last."""
-    return np.array([lo[0], lo[1], z]), np.array([hi[0], hi[1], min(z + count, hi[2])])
+def _brick(
+    volume: Volume, values: np.ndarray, begin: np.ndarray, end: np.ndarray, first: np.ndarray, size: np.ndarray
+) -> np.ndarray:
+    """``size`` voxels from ``first`` on (3,), of the ``values`` from ``begin`` to ``end`` where they hold them."""
+    if (first + size > end).any():
+        return read_block(volume, first, first + size)
+    (x, y, z), (i, j, k) = first - begin, size
+    return values[z : z + k, y : y + j, x : x + i]
 
 
 @dataclass(frozen=True)
@@ -157,7 +156,7 @@ class CellBlocks:
         grid, parts = self.grid, self.place.parts
         lo, hi = grid.blocks.at(number)
         begin = np.maximum(lo - 1, 0)
-        values = self.rule.apply(read_block(self.place.volume(), begin, np.minimum(hi + 1, grid.dims)))
+        values = _for_kernels(read_block(self.place.volume(), begin, np.minimum(hi + 1, grid.dims)), self.rule)
         values.flags.writeable = False  # as those of a whole volume are: kernels are compiled for such
         tiles, counts, coarse, field, deepest = [], [], [], [], 0.0
         with (
@@ -215,6 +214,16 @@ class CellBlocks:
         march, wide = np.full(3, grid.tile_cells >> grid.march), np.full(3, grid.tile_cells >> grid.field)
         field = summed(local >> grid.field, np.minimum(depth, 1) / 8.0**grid.field, wide)
         return summed(local >> grid.march, mass, march), field.astype(np.float32), float(depth.max())
+
+
+def _for_kernels(stored: np.ndarray, rule: KernelRule) -> np.ndarray:
+    """A block (z, y, x) as kernels read it; what is converted goes slice by slice, as it is float64 on the way."""
+    if rule.half_width is None and stored.dtype == rule.dtype:
+        return stored
+    values = np.empty(stored.shape, rule.dtype)
+    for z, plane in enumerate(stored):
+        values[z] = rule.apply(plane)
+    return values
 
 
 def read_rows(parts: Parts, number: int, offset: int, count: int) -> tuple[np.ndarray, np.ndarray]:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import glob
 import re
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +15,7 @@ from vvgt_cli.volume.blocks import check_memory
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import Reader, register
 from vvgt_cli.volume.tiff import SUFFIXES, read_tiff
+from vvgt_cli.volume.tiff_stored import checked, files_left
 from vvgt_cli.volume.types import Volume
 
 MOST = 100_000  # files
@@ -28,7 +31,8 @@ def matching(pattern: str) -> list[Path]:
     return sorted((path for path in map(Path, glob.glob(pattern)) if path.is_file()), key=by_number)
 
 
-def _slices(folder: Path) -> list[Path]:
+def slices_of(folder: Path) -> list[Path]:
+    """The TIFF files in a folder, sorted by the numbers in their names."""
     files = (p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith("."))
     return sorted((p for p in files if p.is_file()), key=by_number)
 
@@ -39,7 +43,7 @@ def read_folder(folder: Path, options: ReadOptions) -> Volume:
     Raises:
         DataError: as `read_slices`.
     """
-    return read_slices(_slices(folder), options, str(folder), folder.resolve().name)
+    return read_slices(slices_of(folder), options, str(folder), folder.resolve().name)
 
 
 def read_slices(files: list[Path], options: ReadOptions, source: str, name: str) -> Volume:
@@ -51,28 +55,28 @@ def read_slices(files: list[Path], options: ReadOptions, source: str, name: str)
     """
     if len(files) > MOST:
         raise DataError(f"{source}: {len(files)} files; expected at most {MOST} slices")
-    out: np.ndarray | None = None
-    spacing = (1.0, 1.0, 1.0)
-    for z, path in enumerate(files):
-        volume = read_tiff(path, options)
-        plane = volume.data
-        if plane.shape[0] != 1:
-            raise DataError(
-                f"{path}: {plane.shape[0]} slices in one of {len(files)} files; expected one slice a file (of an OME "
-                "set give one of the files alone)"
-            )
-        if out is None:
-            check_memory(len(files) * plane.nbytes, source)
-            out, spacing = np.empty((len(files), *plane.shape[1:]), plane.dtype), volume.spacing
-        if plane.shape[1:] != out.shape[1:] or plane.dtype != out.dtype:
-            raise DataError(
-                f"{path}: {plane.shape[2]} x {plane.shape[1]} {plane.dtype}; expected {out.shape[2]} x {out.shape[1]} "
-                f"{out.dtype} as in {files[0].name}"
-            )
-        out[z] = plane[0]
-    if out is None:
+    if not files:
         raise DataError(f"{source}: no TIFF slices")
-    return Volume(out, spacing, name=name)
+
+    def plane_of(path: Path) -> Volume:
+        volume = read_tiff(path, replace(options, stored=False))
+        if volume.data.shape[0] != 1:
+            raise DataError(
+                f"{path}: {volume.data.shape[0]} slices in one of {len(files)} files; expected one slice a file (of an "
+                "OME set give one of the files alone)"
+            )
+        return volume
+
+    first = plane_of(files[0])
+    plane = first.data
+    if options.stored:
+        field: Any = files_left(files, plane, lambda path: plane_of(path).data, source)
+        return Volume(field, first.spacing, name=name)
+    check_memory(len(files) * plane.nbytes, source)
+    out = np.empty((len(files), *plane.shape[1:]), plane.dtype)
+    for z, path in enumerate(files):
+        out[z] = checked(plane_of(path).data if z else plane, plane, path, files[0])[0]
+    return Volume(out, first.spacing, name=name)
 
 
 def read_glob(pattern: str, options: ReadOptions) -> Volume | None:
@@ -94,5 +98,5 @@ def read_glob(pattern: str, options: ReadOptions) -> Volume | None:
 
 
 READER = register(
-    Reader("TIFF slices", (), lambda head: False, read_folder, holds=lambda folder: bool(_slices(folder)))
+    Reader("TIFF slices", (), lambda head: False, read_folder, holds=lambda folder: bool(slices_of(folder)))
 )

@@ -98,13 +98,16 @@ def lies_in_file(volume: Volume) -> bool:
 def read_block(volume: Volume, lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
     """The stored values of voxels ``lo`` to ``hi`` (3,) int, x first, the latter not in it: (z, y, x), native.
 
-    A copy; pages of a mapped file that it came from are given back to the system.
+    The caller's own; pages of a mapped file that it came from are given back to the system.
 
     Raises:
         DataError: the file ends early, or a chunk is damaged.
     """
     (x0, y0, z0), (x1, y1, z1) = lo, hi
     data: Any = volume.data
+    if isinstance(data, Stored):  # what it gives is nobody else's
+        part = data[z0:z1, y0:y1, x0:x1]
+        return np.require(part, part.dtype.newbyteorder("="), ["C", "A", "W"])
     under = _map_under(data)
     if under is None or not hasattr(mmap, "MADV_DONTNEED"):
         part = data[z0:z1][:, y0:y1, x0:x1] if isinstance(data, BrickArray) else data[z0:z1, y0:y1, x0:x1]

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.stats import BINS, Statistics, bins_of, check_range, edges_of, finite_values, integer_statistics
+from vvgt_cli.volume.stats import BINS, Statistics, check_range, edges_of, integer_statistics
 from vvgt_cli.volume.types import Volume
 
 PARTS = 4  # of a block, counted at once
@@ -67,17 +67,32 @@ def tally(values: np.ndarray, volume: Volume, limits: tuple[float, float] | None
         values.flags.writeable = False  # kernels are compiled for such
         count_values(values.view(f"u{values.dtype.itemsize}"), found)
         return Tally(found.sum(axis=(0, 1)))
-    numbers = finite_values(values, volume)
-    none = np.empty(0, np.int64)
-    if limits is not None:
-        edges = edges_of(*limits)
-        return Tally(none, histogram=np.bincount(bins_of(numbers, float(edges[0]), float(edges[-1])), minlength=BINS))
-    nan = int(np.isnan(values).sum()) if numbers.size < values.size else 0
-    if not numbers.size:
-        return Tally(none, nan=nan)
-    flat = values[np.isfinite(values)] if values.dtype.kind == "f" and numbers.size < values.size else values
-    stored = float(flat.min()), float(flat.max())
-    return Tally(none, float(numbers.min()), float(numbers.max()), stored, nan, numbers.size)
+    values = values if values.dtype == np.float32 else values.astype(np.float64)
+    values.flags.writeable = False
+    return _range(values, volume) if limits is None else _binned(values, volume, limits)
+
+
+def _range(values: np.ndarray, volume: Volume) -> Tally:
+    """Range and finite voxels of ``values``, float32 or float64."""
+    from vvgt_cli.volume.count_kernel import FINITE, HIGH, LOW, NAN, STORED_HIGH, STORED_LOW, range_values
+
+    ends, numbers = np.empty((PARTS, 4)), np.zeros((PARTS, 2), np.int64)
+    range_values(values, volume.slope, volume.intercept, volume.data.dtype.kind != "f", ends, numbers)
+    low, high = ends.min(axis=0), ends.max(axis=0)
+    nan, finite = int(numbers[:, NAN].sum()), int(numbers[:, FINITE].sum())
+    none, stored = np.empty(0, np.int64), (float(low[STORED_LOW]), float(high[STORED_HIGH]))
+    return Tally(none, float(low[LOW]), float(high[HIGH]), stored, nan, finite) if finite else Tally(none, nan=nan)
+
+
+def _binned(values: np.ndarray, volume: Volume, limits: tuple[float, float]) -> Tally:
+    """Histogram of ``values``, float32 or float64, over ``limits``."""
+    from vvgt_cli.volume.count_kernel import LANES, bin_values
+
+    edges = edges_of(*limits)
+    lo, hi = float(edges[0]), float(edges[-1])
+    found = np.zeros((PARTS, LANES, BINS + 1), np.int64)
+    bin_values(values, volume.slope, volume.intercept, lo, hi, 1.0 if np.isfinite(hi - lo) else 0.5, found)
+    return Tally(np.empty(0, np.int64), histogram=found.sum(axis=(0, 1))[:BINS])
 
 
 def with_limits(whole: Tally, volume: Volume) -> Tally:

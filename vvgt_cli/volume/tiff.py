@@ -25,9 +25,11 @@ from vvgt_cli.volume.components import contiguous, magnitude
 from vvgt_cli.volume.libraries import library_errors
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import Reader, register, volume_name
+from vvgt_cli.volume.stored import Stored
 from vvgt_cli.volume.tiff_decode import Pages
 from vvgt_cli.volume.tiff_facts import Facts, imagej_facts, ome_facts, ome_root
 from vvgt_cli.volume.tiff_pages import check_pages
+from vvgt_cli.volume.tiff_stored import pages_left
 from vvgt_cli.volume.types import Volume
 
 SUFFIXES = (".tif", ".tiff")
@@ -74,7 +76,49 @@ def read_tiff(path: Path, options: ReadOptions) -> Volume:
         facts = _facts(file, root, series, number, path)
         layout = _layout(series, path)
         index, several = _choose(layout, facts, options, path, series.dtype)
-        values = _values(file, series, layout, index, path)
+        mapped = _mappable(series) and _together(layout, index)
+        if options.stored and _paged(layout, index, several) and not mapped:
+            _whole(series, path)
+            field: Any = _left(path, number, layout, index, series.dtype)
+        else:
+            field = _in_memory(_values(file, series, layout, index, path), layout, index, several, path)
+    spacing, guessed = facts.voxel(options, field.shape[0], str(path))
+    if guessed:
+        warnings.warn(
+            f"{path}: no distance between its slices; taken as wide as its pixels (--spacing X Y Z sets it)",
+            stacklevel=2,
+        )
+    return Volume(field, spacing, name=volume_name(path))
+
+
+def _paged(layout: Layout, index: tuple[int | slice, ...], several: bool) -> bool:
+    """Whether slices are pages, and nothing but rows and columns is kept of one."""
+    kept = [a for a, i in zip(layout.axes, index, strict=True) if isinstance(i, slice)]
+    ahead = [a for a, i in zip(layout.axes[: layout.lead], index, strict=False) if isinstance(i, slice)]
+    return not several and ahead == ["Z"] and sorted(kept) == ["X", "Y", "Z"]
+
+
+def _together(layout: Layout, index: tuple[int | slice, ...]) -> bool:
+    """Whether what is kept lies in the file as (z, y, x), without anything between."""
+    rest = [
+        (a, i, n) for a, i, n in zip(layout.axes, index, layout.shape, strict=True) if n > 1 or isinstance(i, slice)
+    ]
+    kept = [isinstance(i, slice) for _, i, _ in rest]
+    return all(kept[kept.index(True) :]) and [a for a, i, _ in rest if isinstance(i, slice)] == ["Z", "Y", "X"]
+
+
+def _left(path: Path, number: int, layout: Layout, index: tuple[int | slice, ...], dtype: np.dtype) -> Stored:
+    """The slices of a series whose pages stay in the file."""
+    turned = layout.axes.index("X") < layout.axes.index("Y")
+    return pages_left(
+        path, number, layout.shape[: layout.lead], layout.shape[layout.lead :], index, np.dtype(dtype), turned
+    )
+
+
+def _in_memory(
+    values: np.ndarray, layout: Layout, index: tuple[int | slice, ...], several: bool, path: Path
+) -> np.ndarray:
+    """(z, y, x) of what was read, the magnitude of several channels."""
     order = [*(_kept(layout, index, a) for a in "ZYX"), *([_kept(layout, index, c) for c in "CS"] if several else [])]
     field = _arranged(values, order, layout, index)
     if several:
@@ -82,13 +126,7 @@ def read_tiff(path: Path, options: ReadOptions) -> Volume:
         field = magnitude(field)
     elif not field.flags.c_contiguous:
         check_memory(field.nbytes, str(path))
-    spacing, guessed = facts.voxel(options, field.shape[0], str(path))
-    if guessed:
-        warnings.warn(
-            f"{path}: no distance between its slices; taken as wide as its pixels (--spacing X Y Z sets it)",
-            stacklevel=2,
-        )
-    return Volume(contiguous(field), spacing, name=volume_name(path))
+    return contiguous(field)
 
 
 @contextmanager
@@ -240,19 +278,14 @@ def _arranged(
 
 def _values(file: Any, series: Any, layout: Layout, index: tuple[int | slice, ...], path: Path) -> np.ndarray:
     """The values at an index of a series: mapped where they lie together plainly, else decoded page by page."""
-    if series.dataoffset is not None and not series.is_multifile and series.keyframe.is_memmappable:
+    if _mappable(series):
         offset, need = int(series.dataoffset), math.prod(layout.shape) * series.dtype.itemsize
         size = path.stat().st_size
         if offset + need > size:
             raise DataError(f"{path}: {size_text(size)}; its pixels need {size_text(offset + need)}: is it whole?")
         dtype = series.dtype.newbyteorder(file.byteorder)
         return np.memmap(path, dtype, "r", offset, layout.shape)[index]
-    missing = [number for number, page in enumerate(series[:]) if page is None]
-    if missing:
-        raise DataError(
-            f"{path}: {len(missing)} of {len(series)} planes are missing, the first is number {missing[0]}; check that "
-            "the file, or the set, is whole"
-        )
+    _whole(series, path)
     whole = [isinstance(i, slice) for i in index]
     sizes = [n for n, kept in zip(layout.shape, whole, strict=True) if kept]
     check_memory(math.prod(sizes) * series.dtype.itemsize, str(path))
@@ -267,6 +300,21 @@ def _values(file: Any, series: Any, layout: Layout, index: tuple[int | slice, ..
             number = int(np.ravel_multi_index(place, lead)) if place else 0
             row[...] = pages.decoded(series[number], series).reshape(inner)[index[layout.lead :]]
     return out
+
+
+def _mappable(series: Any) -> bool:
+    """Whether the values of a series lie together plainly."""
+    return series.dataoffset is not None and not series.is_multifile and bool(series.keyframe.is_memmappable)
+
+
+def _whole(series: Any, path: Path) -> None:
+    """Refuse a series that lacks planes."""
+    missing = [number for number, page in enumerate(series[:]) if page is None]
+    if missing:
+        raise DataError(
+            f"{path}: {len(missing)} of {len(series)} planes are missing, the first is number {missing[0]}; check that "
+            "the file, or the set, is whole"
+        )
 
 
 def _sniff(head: bytes) -> bool:

@@ -49,6 +49,7 @@ class Volume:
         slope, intercept: stored-value scaling (NIfTI, DICOM), slope finite and not 0.
         space: anatomical space that direction and origin are in, "RAS" or "LPS", None where there is none.
         hounsfield: whether the file says that data values are Hounsfield units.
+        reference: UID of DICOM's frame of reference: positions of two volumes compare where it is the same.
 
     Raises:
         DataError: wrong rank, empty axis, dtype that is not real, spacing not finite and positive, axes in a plane.
@@ -63,6 +64,7 @@ class Volume:
     intercept: float = 0.0
     space: str | None = None
     hounsfield: bool = False
+    reference: str | None = None
 
     def __post_init__(self) -> None:
         if self.data.ndim != 3 or min(self.data.shape) < 1:

@@ -1,0 +1,158 @@
+"""What blocks read and keep: slices of TIFF page by page, every voxel once, no more than a worker's memory."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.test_scale import FIT, bodies, sorted_rows
+from vvgt_cli.scale.settings import BlockOptions, block_edge
+from vvgt_cli.volume import ReadOptions, Volume
+from vvgt_cli.volume.stored import Stored
+from vvgt_cli.volume.tiff import read_tiff
+
+
+@pytest.mark.parametrize("coding", [None, "zlib"])
+def test_slices_of_tiff_are_read_in_blocks_page_by_page(vvgt, tmp_path, coding):
+    import tifffile
+
+    values = np.round(bodies((50, 61, 40)) * 255).astype(np.uint8)
+    folder = tmp_path / "slices"
+    folder.mkdir()
+    for z, plane in enumerate(values):
+        tifffile.imwrite(folder / f"s{z}.tif", plane, compression=coding)
+    tifffile.imwrite(
+        tmp_path / "v.ome.tif", values[None, :, None], compression=coding or "lzma", metadata={"axes": "TZCYX"}
+    )
+    two = np.stack([values, values[::-1]], axis=1)  # channels within slices
+    tifffile.imwrite(tmp_path / "two.tif", two, compression="zlib", imagej=False, metadata={"axes": "ZCYX"})
+    tifffile.imwrite(tmp_path / "plain.tif", two, imagej=False, metadata={"axes": "ZCYX"})
+    plain = read_tiff(tmp_path / "plain.tif", ReadOptions(stored=True, component=1))
+    assert isinstance(plain.data, Stored)  # neither whole nor a copy of a channel
+    assert np.array_equal(plain.data[3:5, 2:9, 1:7], two[3:5, 1, 2:9, 1:7])
+    one = ("--channel", "0")
+    for source, more in ((folder, ()), (f"{folder}/*.tif", ()), (tmp_path / "v.ome.tif", ()),
+                         (tmp_path / "two.tif", one), (tmp_path / "plain.tif", one)):  # fmt: skip
+        files = []
+        for blocks in ((), ("--blocks", "16"), ("--blocks", "64")):
+            path = tmp_path / "a.ply"
+            run = vvgt("init", source, "-o", path, *FIT, *more, *blocks, "--overwrite")
+            assert run.code == 0, run.err
+            files.append(sorted_rows(path)[1])
+        assert np.array_equal(files[0], files[1])
+        assert np.array_equal(files[0], files[2])
+
+
+def test_slices_that_do_not_fit_together_are_a_line_in_blocks_too(vvgt, tmp_path):
+    import tifffile
+
+    for z in range(20):
+        tifffile.imwrite(tmp_path / f"s{z}.tif", np.zeros((8, 9 if z == 17 else 10), np.uint8))
+    run = vvgt("init", tmp_path, "-o", tmp_path / "a.ply", *FIT, "--blocks", "16")
+    assert run.code == 1
+    assert "s17.tif: 9 x 8 uint8; expected 10 x 8 uint8 as in s0.tif" in run.error
+
+
+def test_slices_beyond_the_memory_are_gone_through_in_blocks_by_themselves(vvgt, tmp_path, monkeypatch):
+    import tifffile
+
+    values = np.round(bodies((50, 61, 40)) * 255).astype(np.uint8)
+    (tmp_path / "slices").mkdir()
+    for z, plane in enumerate(values):
+        tifffile.imwrite(tmp_path / "slices" / f"s{z}.tif", plane, compression="zlib")
+    monkeypatch.setattr("vvgt_cli.scale.source.free_memory", lambda: 100_000)
+    run = vvgt("init", tmp_path / "slices", "-o", tmp_path / "a.ply", *FIT[:-1])
+    assert run.code == 0, run.err
+    assert "in blocks" in run.err
+
+
+def test_a_small_file_that_unpacks_to_much_is_gone_through_in_blocks(vvgt, tmp_path, monkeypatch):
+    import tifffile
+
+    values = np.round(bodies((50, 61, 40))).astype(np.uint8)
+    tifffile.imwrite(tmp_path / "v.tif", values, compression="zlib")
+    monkeypatch.setattr("vvgt_cli.scale.source.free_memory", lambda: 100_000)
+    assert (tmp_path / "v.tif").stat().st_size < 25_000
+    run = vvgt("init", tmp_path / "v.tif", "-o", tmp_path / "a.ply", *FIT[:-1])
+    assert run.code == 0, run.err
+    assert "in blocks" in run.err
+
+
+def test_threads_share_a_file_of_pages(tmp_path):
+    from concurrent.futures import ThreadPoolExecutor
+
+    import tifffile
+
+    values = np.random.default_rng(0).integers(0, 255, (60, 64, 64)).astype(np.uint8)
+    tifffile.imwrite(tmp_path / "v.tif", values, compression="zlib")
+    pages = read_tiff(tmp_path / "v.tif", ReadOptions(stored=True)).data
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda z: pages[z : z + 1, 0:64, 0:64], [*range(60)] * 4))
+    assert np.array_equal(np.concatenate(found), np.concatenate([values] * 4))
+
+
+def stored(dims, dtype, read=None, chunk=64):
+    """A volume of ``dims`` (x, y, z) in chunks that nobody holds."""
+    from vvgt_cli.volume.stored import Stored
+
+    return Volume(Stored(read or (lambda slices: None), np.dtype(dtype), dims[::-1], (chunk,) * 3, "v"), (1.0,) * 3)
+
+
+def test_counting_reads_every_voxel_once_and_little_more(tmp_path, monkeypatch):
+    from vvgt_cli.scale import tasks
+    from vvgt_cli.scale.grid import Boxes
+    from vvgt_cli.scale.parts import COUNTS, Parts
+
+    values, read = bodies((100, 90, 80)).astype(np.float32), []
+
+    def part(slices):
+        read.append(values[slices].size)
+        return values[slices].copy()
+
+    volume = stored((100, 90, 80), np.float32, part)
+    monkeypatch.setattr(tasks, "open_volume", lambda source, options: volume)
+    parts = Parts(tmp_path)
+    (parts.folder / COUNTS).mkdir()
+    place = tasks.Place("counted once", ReadOptions(stored=True), str(parts.folder))
+    task = tasks.CountBlocks(place, Boxes((100, 90, 80), (64, 64, 64)), 24)
+    for number in range(len(task)):
+        task(number)
+    assert values.size <= sum(read) < 1.1 * values.size
+    whole, samples, _ = task.merged()
+    assert (whole.lo, whole.hi) == (values.min(), values.max())
+    assert (samples == values[3:12, 3:12, 3:12]).all(axis=(1, 2, 3)).any()
+
+
+def test_the_memory_of_a_block_is_that_of_its_worker(monkeypatch):
+    monkeypatch.setattr("vvgt_cli.scale.settings.free_memory", lambda: 3 << 30)
+    volume = stored((1536, 1536, 1536), np.float32)
+    edges = {
+        (who, n): block_edge(volume, BlockOptions(workers=n, scheduler=who))
+        for who in (None, "local", "slurm")
+        for n in (1, 8)
+    }
+    assert {edges[who, 1] for who in (None, "local", "slurm")} == {512}
+    assert edges["local", 8] == edges[None, 8] == 256  # processes of one machine share it
+    assert edges["slurm", 8] == 512  # each job has its own
+    assert block_edge(stored((1536, 1536, 1536), np.float64), BlockOptions()) == 256
+
+
+def test_of_a_tiles_tree_nothing_but_its_top_stays_in_memory(vvgt, tmp_path, monkeypatch):
+    import weakref
+
+    from vvgt_cli.scale import forest
+
+    values, made = np.round(bodies((128, 90, 120)) * 255).astype(np.uint8), []
+    path = tmp_path / "v_128x90x120_uint8.raw"
+    path.write_bytes(values.tobytes())
+
+    def watched(*args, build=forest.build_tree):
+        assert sum(one() is not None for one in made) <= 1  # the one before
+        tree = build(*args)
+        made.append(weakref.ref(tree.moments))
+        return tree
+
+    monkeypatch.setattr(forest, "build_tree", watched)
+    run = vvgt("init", path, "-o", tmp_path / "a.ply", *FIT, "--blocks", "64")
+    assert run.code == 0, run.err
+    assert len(made) > 6
