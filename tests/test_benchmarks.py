@@ -31,6 +31,7 @@ RUN = (
         "dvr_pixels",
         "dvr_steps",
         "dvr_vtk",
+        "grids",
         "light_vtk",
         "network",
         "optimize",
@@ -144,6 +145,15 @@ def test_dvr_vtk(bench, scenes, tmp_path):
     rows = rows_of(tmp_path / "a.csv")
     assert {row["scene"] for row in rows} == {"blob"}
     assert min(float(row["vtk_db"]) for row in rows) > 15
+
+
+def test_grids(bench, scenes, tmp_path):
+    module = bench("grids", K=60, SIZE=SIZE)
+    call(module.main, *scenes, "-o", tmp_path / "a.csv", "--repeats", 1)
+    scalars, grid = rows_of(tmp_path / "a.csv")
+    assert (scalars["kind"], grid["kind"]) == ("scalars", "grid")
+    assert all(float(row[column]) > 0 for row in (scalars, grid) for column in ("mb", "view_s", "closed_form_s"))
+    assert "| grid |" in call(module.main, "--table", tmp_path / "a.csv")
 
 
 def test_light_vtk(bench, scenes, tmp_path):

@@ -13,6 +13,7 @@ import vvgt_cli as library
 from vvgt_cli.dvr.layers import grid_of
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import read_ply
+from vvgt_cli.runs.gaussian_files import layout_of
 from vvgt_cli.runs.source import SourceRequest, load
 from vvgt_cli.transfer.label_files import read_labels
 from vvgt_cli.transfer.labels import LabelTable, distinct
@@ -179,6 +180,17 @@ def test_a_segmentation_is_its_own_table(tmp_path: Path) -> None:
     assert [(e.number, e.name) for e in table.labels] == [(1, "skin"), (3, "inner_core")]
 
 
+@pytest.mark.filterwarnings("ignore:.*taken as a label map")
+def test_a_session_of_a_file_keeps_its_segments(tmp_path: Path) -> None:
+    path = tmp_path / "x.seg.nrrd"
+    path.write_bytes(SEGMENTS.replace("sizes: 2 2 2", "sizes: 24 24 24").encode() + balls().tobytes())
+    how = {"max_gaussians": 100, "size": 48, "steps": 0}
+    session = library.Session(path)
+    found, wanted = session.convert(**how).gaussians, library.convert(path, **how).gaussians
+    np.testing.assert_array_equal(found.colors, wanted.colors)
+    assert not np.array_equal(session.convert("gray", **how).gaussians.colors, found.colors)
+
+
 def test_one_file_a_label_and_they_add_up(vvgt, tmp_path: Path, seg: Path) -> None:
     labels = table(tmp_path, JSON, "a.json")
     done = vvgt("convert", seg, "--labels", labels, "--split-labels", *SMALL, "-o", tmp_path / "p_{}.ply")
@@ -324,3 +336,45 @@ def test_labels_of_a_series_are_those_that_there_are(vvgt, tmp_path: Path) -> No
     colors = read_ply(str(tmp_path / "o_1.ply"))[0].colors
     near = np.abs(colors[:, None] - [e.color for e in distinct([1, 2_000_000_000]).labels]).max(axis=2).min(axis=1)
     assert np.median(near) < 0.1
+
+
+def test_tables_are_listed_and_told_from_functions(vvgt, tmp_path: Path) -> None:
+    for text, name in ((SLICER, "a.ctbl"), (FREESURFER, "LUT.txt"), (SNAP, "a.label"), (JSON, "a.json")):
+        path = table(tmp_path, text, name)
+        facts = json.loads(vvgt("info", path, "--json").out)
+        shown = [(e["label"], e["name"]) for e in facts["entries"] if e["label"]]
+        assert (facts["kind"], shown) == ("table of labels", [(1, "skin"), (3, "inner_core")]), name
+        lines = vvgt("info", path).out.decode().splitlines()
+        assert lines[-1].strip().startswith("label 3, name inner_core, color 0 0 1, opacity 1")
+        for call in (
+            ("tf", "show", path, "-o", tmp_path / "a.png"),
+            ("init", "example:blob:8", "--tf", path, "-o", "b.ply"),
+        ):
+            assert "a table of labels; expected a transfer function: give the table to --labels" in vvgt(*call).error
+    with pytest.raises(DataError, match="not a transfer function"):
+        library.convert(balls(), table(tmp_path, '{"range": 1}', "b.json"))
+    (tmp_path / "notes.txt").write_text("nothing of the kind")
+    assert "notes.txt" in vvgt("info", tmp_path / "notes.txt").error
+
+
+def test_evaluate_says_where_the_labels_are_others(vvgt, tmp_path: Path, seg: Path) -> None:
+    ply, labels = tmp_path / "a.ply", table(tmp_path, JSON, "a.json")
+    assert vvgt("init", seg, "--labels", labels, *SMALL[:4], "-o", ply).code == 0
+    again = table(
+        tmp_path, JSON.replace("inner_core", "heart").replace("}}", '}, "7": {"color": [1, 1, 1]}}'), "b.json"
+    )
+    asked = ("evaluate", ply, "--volume", seg, "--no-seats", "--step", 0.5, "-q")
+    for options, others in (
+        (("--labels", labels), False),
+        (("--labels", again), False),  # other names, and a label that the volume has not got
+        (("--labels", "auto"), True),
+        (("--labels", "none"), True),
+        (("--labels", labels, "--layer", "example:blob:8,tf=gray"), True),
+    ):
+        done = vvgt(*asked[:-1], *options)
+        assert done.code == 0, done.err
+        assert ("made under other labels, functions or layers" in done.err) is others, options
+    assert vvgt("init", seg, "--labels", "none", *SMALL[:4], "-o", tmp_path / "s.ply").code == 0
+    assert read_ply(str(tmp_path / "s.ply"))[1].optics is None  # of scalars the header is what it was
+    header = read_ply(str(ply))[1]
+    assert layout_of(header).optics == header.optics

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pydicom.dataset import Dataset
 from pydicom.encaps import encapsulate
 from pydicom.uid import HTJ2K, MPEG2MPML, UID, JPEG2000Lossless, JPEGBaseline8Bit, JPEGLosslessSV1, JPEGLSLossless
 
@@ -89,22 +88,6 @@ def test_series_of_scouts_segmentations_and_pictures_are_left_out(tmp_path: Path
     write_series(tmp_path, "1.2.4", 2)
     with pytest.raises(UsageError, match=r"several series: 1 .*CT, 3 slices.*choose one by number, UID or description"):
         read_volume(str(tmp_path))
-
-
-def test_segmentations_and_other_objects_are_refused_in_their_own_words(tmp_path: Path) -> None:
-    labels = []
-    for name in ("liver", "spleen"):
-        labels.append(Dataset())
-        labels[-1].SegmentLabel = name
-    kind = UID("1.2.840.10008.5.1.4.1.1.66.4")
-    write_series(tmp_path / "seg", SOPClassUID=kind, Modality="SEG", SegmentSequence=labels)
-    with pytest.raises(
-        DataError, match=r"a segmentation \(DICOM SEG\) of 2 segments \(liver, spleen\), bits and no val"
-    ):
-        read_volume(str(tmp_path / "seg"))
-    write_series(tmp_path / "rt", Modality="RTSTRUCT", Rows=None, Columns=None)
-    with pytest.raises(DataError, match=r"no DICOM images \(3 RTSTRUCT\)"):
-        read_volume(str(tmp_path / "rt"))
 
 
 @pytest.mark.parametrize("heights", [False, True])

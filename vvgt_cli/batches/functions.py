@@ -11,6 +11,7 @@ from vvgt_cli.conversion.convert import convert
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import UsageError
 from vvgt_cli.progress import Console
+from vvgt_cli.runs.layered import open_parts
 from vvgt_cli.runs.outputs import check_outputs
 from vvgt_cli.runs.record import ConversionReport, Run
 from vvgt_cli.runs.source import Opened
@@ -23,8 +24,6 @@ def convert_functions(request: ConvertRequest, functions: Sequence[str], console
         UsageError: outputs without a place for the name, or two functions of one name; found before anything is read.
         DataError: as `convert`; what is done before stays.
     """
-    from vvgt_cli.synth.sources import open_volume
-
     console = console or Console()
     requests = [_one(request, tf) for tf in functions]
     for one in requests:
@@ -34,11 +33,13 @@ def convert_functions(request: ConvertRequest, functions: Sequence[str], console
         raise UsageError(f"{len(functions)} functions, named {names}: the files would have the same name; rename one")
     run = Run(console, ConversionReport("convert"))
     with run.stage("volume") as stage:
-        opened = Opened.of(open_volume(request.source.path, request.source.read))
-        stage.note = f"{opened.volume.name}, for {len(functions)} functions"
-    for number, one in enumerate(requests, 1):
-        console.say(f"{one.source.tf}: function {number} of {len(requests)}, to {one.output}")
-        report = convert(replace(one, source=replace(one.source, volume=opened)), console)
+        content = open_parts(request.source.path, request.source.read)
+        stage.note = f"{content.volumes[0].name}, for {len(functions)} functions"
+        opened = Opened.of(content)
+        requests = [replace(one, source=replace(one.source, volume=opened)) for one in requests]
+    for number, (one, tf) in enumerate(zip(requests, functions, strict=True), 1):
+        console.say(f"{tf}: function {number} of {len(requests)}, to {one.output}")
+        report = convert(one, console)
         if report.refinement and report.refinement["reason"] == "interrupted":
             raise KeyboardInterrupt
 

@@ -25,7 +25,7 @@ from vvgt_cli.runs.outputs import check_outputs
 from vvgt_cli.runs.place import way_up
 from vvgt_cli.runs.record import ConversionReport, Run
 from vvgt_cli.runs.source import SourceRequest
-from vvgt_cli.transfer.label_files import read_labels
+from vvgt_cli.transfer.label_files import holds_table, read_labels
 from vvgt_cli.transfer.labels import LabelTable, distinct
 from vvgt_cli.volume import ReadOptions, Statistics, Volume, statistics
 from vvgt_cli.volume.label_maps import labels_in, recognised
@@ -116,7 +116,7 @@ def survey(steps: Sequence[Step], labels: str | LabelTable | None, tf: object, c
         first = first or replace(content, volumes=tuple(map(_hollow, content.volumes)))
         _check_frame(step, steps[0], content, first)
         if k == 0 and labels is None and tf is None and content.one_field:
-            mapped = recognised(content.volumes[0])
+            mapped = holds_table(content.path) or recognised(content.volumes[0])
         if mapped and content.one_field:
             found.update(labels_in(content.volumes[0]))
         numbers.append([statistics(volume) for volume in content.classified])

@@ -162,7 +162,7 @@ def _thinned(scene: Scene, every: np.ndarray) -> Scene:
     x, y, z = (float(length) for length in volume.spacing * every)
     if scene.grid is not None:
         volume, world = replace(volume, data=data[..., 3], spacing=(x, y, z)), np.float32(volume.unit_frame().scale)
-        return type(scene).of_grid(volume, scene.tf, scene.unit_distance, data * world, scene.lighting)
+        return type(scene).of_grid(volume, scene.tf, scene.unit_distance, data * world, scene.lighting, scene.labels)
     volume, tf = replace(volume, data=data, spacing=(x, y, z)), cast(TransferFunctionLike, scene.tf)
     return type(scene).build(volume, tf, scene.unit_distance, lighting=scene.lighting)
 

@@ -16,7 +16,7 @@ from vvgt_cli.progress import Console
 @placed_read_options
 @common_options
 def command(file: str, as_json: bool, read: dict[str, Any], console: Console) -> None:
-    """Say what FILE holds, found out from its content: a volume, a transfer function, a view set
+    """Say what FILE holds, found out from its content: a volume, a transfer function, a table of labels, a view set
     (transforms.json) or a .ply of Gaussians.
 
     \b
@@ -37,7 +37,9 @@ def command(file: str, as_json: bool, read: dict[str, Any], console: Console) ->
         return
     width = max(map(len, facts)) + 2
     for key, value in facts.items():
-        click.echo(f"{key:<{width}}{_text(value)}")
+        rows = value if isinstance(value, list) and value and isinstance(value[0], dict) else [value]
+        for n, row in enumerate(rows):  # of tables a line an entry
+            click.echo(f"{'' if n else key:<{width}}{_text(row)}")
 
 
 def _text(value: object) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -103,6 +104,12 @@ def common_grid(layers: Sequence[Layer]) -> Volume:
     first = layers[0].volume
     finer = np.ones(3, np.int64)
     for layer in layers[1:]:
+        if first.reference and layer.volume.reference not in (None, first.reference):
+            warnings.warn(
+                f"{layer.volume.name}: of another frame of reference (DICOM) than {first.name}: where it lies may not "
+                "be right",
+                stacklevel=3,
+            )
         if same_grid(first, layer.volume):
             continue
         inner = np.linalg.inv(layer.volume.affine) @ first.affine

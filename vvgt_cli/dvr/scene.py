@@ -54,6 +54,7 @@ class Scene:
             function's.
         grid: (nz, ny, nx, 4) float32 extinction times (r, g, b, 1) per unit-frame length, of an optics grid: what is
             drawn. ``values`` and ``tables`` then hold its extinction alone: what light, shadows and bricks ask for.
+        labels: the grid is one of labels alone.
     """
 
     volume: Volume
@@ -67,6 +68,7 @@ class Scene:
     lighting: Lighting | None = None
     light: Light | None = None
     grid: np.ndarray | None = None
+    labels: bool = False
 
     @property
     def texels(self) -> Texels:
@@ -123,8 +125,9 @@ class Scene:
 
     @classmethod
     def of_grid(
-        cls, volume: Volume, tf: Named, unit_distance: float, grid: np.ndarray, lighting: Lighting | None = None
-    ) -> Scene:
+        cls, volume: Volume, tf: Named, unit_distance: float, grid: np.ndarray, lighting: Lighting | None = None,
+        labels: bool = False,
+    ) -> Scene:  # fmt: skip
         """An optics grid (nz, ny, nx, 4) float32 per world length, taken over and scaled, on the grid of ``volume``."""
         from vvgt_cli.dvr import bricks
 
@@ -136,7 +139,7 @@ class Scene:
         tables = OpticalTables(0.0, 1 / top, nodes, np.cumsum(nodes / 2, axis=0))
         empty = bricks.empty_distance(bricks.brick_ranges(values), tables)
         half, step = np.array(frame.half), np.array(frame.step)
-        scene = cls(volume, tf, unit_distance, values, tables, empty, half, step, grid=grid)
+        scene = cls(volume, tf, unit_distance, values, tables, empty, half, step, grid=grid, labels=labels)
         return scene if lighting is None else scene.lit(lighting)
 
     def lit(self, lighting: Lighting) -> Scene:

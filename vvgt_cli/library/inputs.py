@@ -12,7 +12,7 @@ from typing import Any, BinaryIO, TypedDict
 from vvgt_cli.conversion.result import Result
 from vvgt_cli.errors import UsageError
 from vvgt_cli.progress import Console
-from vvgt_cli.runs.layered import LayerRequest, parse_layer
+from vvgt_cli.runs.layered import Content, LayerRequest, open_parts, parse_layer
 from vvgt_cli.runs.source import Opened, SourceRequest
 from vvgt_cli.transfer import TransferFunction
 from vvgt_cli.transfer.label_files import table_of
@@ -74,6 +74,17 @@ def volume_of(volume: VolumeLike, reading: Reading, name: str = "array") -> Volu
             raise UsageError("affine and origin are of arrays; a file says itself where it is; leave them out")
         return open_volume(os.fspath(volume), options)
     return cut(volume_in_memory(volume, options, origin=origin, affine=affine, name=name), options)
+
+
+def content_of(volume: VolumeLike, reading: Reading) -> Volume | Content:
+    """`volume_of`, and of a file its colours, channels or segments too.
+
+    Raises:
+        DataError, UsageError: as `volume_of`.
+    """
+    if isinstance(volume, str | os.PathLike):
+        return open_parts(os.fspath(volume), _options(reading))
+    return volume_of(volume, reading)
 
 
 def _options(reading: Mapping[str, Any]) -> ReadOptions:

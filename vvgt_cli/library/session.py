@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Unpack
 
-from vvgt_cli.library.inputs import FunctionLike, Reading, VolumeLike, volume_of
+from vvgt_cli.library.inputs import FunctionLike, Reading, VolumeLike, content_of
 from vvgt_cli.runs.source import Opened
 
 if TYPE_CHECKING:
@@ -30,11 +30,11 @@ class Session:
     """
 
     def __init__(self, volume: VolumeLike, **reading: Unpack[Reading]) -> None:
-        self.opened = Opened.of(volume_of(volume, reading))
+        self.opened = Opened.of(content_of(volume, reading))
 
     @property
     def volume(self) -> Volume:
-        """What was read."""
+        """What was read: of colours and channels the first."""
         return self.opened.volume
 
     def convert(self, tf: FunctionLike | None = None, **options: Any) -> Conversion:

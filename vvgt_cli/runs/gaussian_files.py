@@ -65,6 +65,7 @@ def layout_of(header: PlyHeader) -> PlyOptions:
         space=header.space or "none",
         affine=header.affine,
         light=None if header.light is None else header.light.text(),
+        optics=header.optics,
     )
 
 

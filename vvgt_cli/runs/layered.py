@@ -24,13 +24,12 @@ from vvgt_cli.transfer import (
     unit_distance,
 )
 from vvgt_cli.transfer.histogram import UNIT_SHARE
-from vvgt_cli.transfer.label_files import read_labels, segments_of
+from vvgt_cli.transfer.label_files import holds_table, read_labels, segments_of
 from vvgt_cli.transfer.labels import LabelTable, distinct
 from vvgt_cli.volume import ReadOptions, Statistics, Volume, statistics
 from vvgt_cli.volume.label_maps import labels_in, recognised
 
 AUTO, NONE = "auto", "none"
-SEGMENTATION = ".seg.nrrd"  # a label map whose header is its table
 COLOR, ALL = "color", "all"  # of --component
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709
 CHANNEL_COLORS = ((0, 1, 0), (1, 0, 1), (0, 1, 1), (1, 0.5, 0), (0.4, 0.4, 1), (1, 1, 0), (1, 0, 0))
@@ -125,7 +124,7 @@ def open_parts(source: str, read: ReadOptions) -> Content:
     try:
         volume = open_volume(source, replace(read, component=None) if asked else read)
     except SeveralComponents as error:
-        overlapping = not asked and source.endswith(SEGMENTATION)
+        overlapping = not asked and holds_table(source)
         if not asked and not error.color and not overlapping:
             raise
         if asked == COLOR and error.count not in (3, 4):
@@ -147,7 +146,7 @@ def is_plain(opened: Content, tf: object, labels: str | LabelTable | None, layer
     """Whether it is one scalar field under a function; a label map that is recognised is not."""
     if not opened.one_field or layers or labels not in (None, NONE):
         return False
-    return tf is not None or labels == NONE or not recognised(opened.volumes[0])
+    return tf is not None or labels == NONE or not (holds_table(opened.path) or recognised(opened.volumes[0]))
 
 
 def layers_of(
@@ -173,7 +172,7 @@ def layers_of(
     """
     labels = _asked(opened, tf, labels)
     if labels not in (None, NONE):
-        own = labels == AUTO and str(opened.path).endswith(SEGMENTATION)
+        own = labels == AUTO and holds_table(opened.path)
         if opened.overlapping:
             return _overlapping(opened, labels, own, distance)
         if own and opened.layer is not None:
@@ -211,12 +210,12 @@ def _asked(
         raise UsageError(f"{volume.name}: several components; expected one of labels: choose it with --component N")
     if labels not in (None, NONE) and tf is not None:
         raise UsageError(f"{volume.name}: both a function and a table of labels; expected one of --tf and --labels")
-    if labels is None and tf is None and opened.one_field and recognised(volume):
-        warnings.warn(
-            f"{volume.name}: taken as a label map, by its name and its few integers (--labels none: as scalars)",
-            stacklevel=3,
-        )
-        return AUTO
+    if labels is None and tf is None and opened.one_field:
+        own = holds_table(opened.path)
+        if own or recognised(volume):
+            reason = "its segments" if own else "its name and its few integers"
+            warnings.warn(f"{volume.name}: taken as a label map, by {reason} (--labels none: as scalars)", stacklevel=3)
+            return AUTO
     return labels
 
 
@@ -243,7 +242,10 @@ def _white(opened: Content) -> float:
 
 
 def _overlapping(opened: Content, labels: str | LabelTable | None, own: bool, distance: str | None) -> list[Layer]:
-    """Of the layers of a .seg.nrrd, each under its own segments, or all under one table; empty ones are left out."""
+    """Of layers (.seg.nrrd) or segments (DICOM) that overlap, each under its own, or all under one table.
+
+    Empty ones are left out.
+    """
     found = []
     for k, volume in enumerate(opened.volumes):
         if any(labels_in(volume)):

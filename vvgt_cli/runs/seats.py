@@ -126,7 +126,7 @@ def score_seats(gaussians: Gaussians, seen: Iterable[SeatView], rules: Collectio
     errors: dict[tuple[str, int, float], list[float]] = {}
     for view in seen:
         for rule in rules:
-            ours = np.clip(render(gaussians, view.camera, rule, blocks=view.blocks)[..., :3], 0, 1)
+            ours = render(gaussians, view.camera, rule, blocks=view.blocks)[..., :3]
             shown = ours if view.blocks is None else view.blocks.pick(ours)
             errors.setdefault((rule, view.size, view.field_of_view), []).append(psnr(view.reference, shown))
     found = [Seat(*seat, float(np.mean(dbs))) for seat, dbs in errors.items()]

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from vvgt_cli.dvr.layers import Layer
     from vvgt_cli.dvr.scene import Layout
 
+OPTICS = 12  # hexadecimal digits of `Source.optics`
+
 
 @dataclass(frozen=True)
 class Opened:
@@ -30,19 +32,23 @@ class Opened:
         volume: as it was read.
         statistics: of its values.
         layout: for the kernels, where it is known.
+        content: all that its file holds, the volume first; None: the volume alone.
     """
 
     volume: Volume
     statistics: Statistics
     layout: Layout | None = None
+    content: Content | None = None
 
     @classmethod
-    def of(cls, volume: Volume) -> Opened:
+    def of(cls, content: Volume | Content) -> Opened:
         """Count and lay out."""
         from vvgt_cli.dvr.scene import Layout
         from vvgt_cli.volume import statistics
 
-        return cls(volume, statistics(volume), Layout.of(volume))
+        known = content if isinstance(content, Content) else Content((content,))
+        volume = known.volumes[0]
+        return cls(volume, statistics(volume), Layout.of(volume) if known.one_field else None, known)
 
 
 @dataclass(frozen=True)
@@ -127,6 +133,18 @@ class Source:
             parts += [volume_digest(band) for band in layer.colors or ()]
         return digest(*parts)
 
+    def optics(self) -> str | None:
+        """Digest of an optics grid's tables, functions and unit distances, not of its volumes; None of scalars."""
+        parts: list[Any] = []
+        for layer in self.layers:
+            tf = layer.tf
+            if isinstance(tf, LabelTable):
+                parts += [(e.number, e.color, e.opacity) for e in tf.labels if e.opacity > 0]
+            else:
+                parts += [tf.opacity_nodes, None if layer.colors else tf.color_map]
+            parts.append(f"{layer.unit_distance:.6g}")
+        return digest(*parts)[:OPTICS] if parts else None
+
     def kernels(self, names: tuple[str, ...]) -> tuple[str, ...]:
         """The kernels of a command, of the kind of scene and light that this is."""
         lit = names if self.lighting is None else for_light(names, self.lighting.attenuated)
@@ -148,7 +166,8 @@ class Source:
             from vvgt_cli.dvr.layers import grid_of
 
             grid = grid_of(self.layers, self.volume)
-            return Scene.of_grid(self.volume, Title(self.name), self.unit_distance, grid, self.lighting)
+            labels = all(isinstance(layer.tf, LabelTable) for layer in self.layers)
+            return Scene.of_grid(self.volume, Title(self.name), self.unit_distance, grid, self.lighting, labels)
         assert isinstance(self.tf, TransferFunction)
         limits = (self.statistics.lo, self.statistics.hi)
         return Scene.build(self.volume, self.tf, self.unit_distance, limits, lighting=self.lighting, layout=self.layout)
@@ -190,8 +209,10 @@ def load_all(request: SourceRequest, tfs: Sequence[str | TransferFunction | None
     opened = request.volume if isinstance(request.volume, Opened) else None
     if isinstance(request.volume, str):
         content = open_parts(request.volume, request.read)
+    elif opened is not None:
+        content = opened.content or Content((opened.volume,))
     else:
-        content = Content((request.volume if opened is None else opened.volume,))  # type: ignore[arg-type]
+        content = Content((request.volume,))  # type: ignore[arg-type]
     if not is_plain(content, functions[0], request.labels, request.layers):
         return [_layered(request, content, tf, tf_range) for tf in functions]
     volume = content.volumes[0]

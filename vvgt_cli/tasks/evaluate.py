@@ -136,6 +136,11 @@ def evaluate(request: EvaluateRequest, console: Console | None = None) -> Evalua
         stage.note = f"{len(gaussians)} Gaussians; {describe_source(source)}"
     if header.affine is not None and not np.allclose(header.affine, source.volume.affine[:3].ravel(), rtol=1e-6):
         run.console.say(f"{request.ply}: its header's affine is not that of {source.volume.name}: of another volume?")
+    if header.optics is not None and header.optics != source.optics():
+        run.console.say(
+            f"{request.ply}: made under other labels, functions or layers than {source.name}, as its header says "
+            f"({header.optics}, not {source.optics() or 'scalars'})"
+        )
     run.compile(source.kernels(for_degree(EVALUATE, gaussians.degree)), source.kernel_type())
     with run.stage("scene"):
         scene = source.scene()

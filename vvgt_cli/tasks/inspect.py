@@ -5,15 +5,19 @@ from __future__ import annotations
 import io
 import os
 import sys
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from vvgt_cli.cameras.files import read_cameras
+from vvgt_cli.errors import DataError
 from vvgt_cli.files import seekable
 from vvgt_cli.gaussians import describe, read_ply
 from vvgt_cli.runs.gaussian_files import STDIN
 from vvgt_cli.share import format_of, read_splats
+from vvgt_cli.transfer.label_files import holds_table, is_table, read_labels, segments_of
+from vvgt_cli.transfer.labels import LabelTable
 from vvgt_cli.transfer.readers import SUFFIXES
 from vvgt_cli.volume import ReadOptions
 from vvgt_cli.volume.packed import Packed
@@ -43,6 +47,8 @@ def inspect(file: str, read: ReadOptions) -> dict[str, Any]:
     if head.startswith(_PLY) or known:
         facts = {"kind": "gaussians", "name": name.name, **describe(*read_splats(file))}
         return facts | ({"bytes": path.stat().st_size, "format": known.suffix} if known else {})
+    if is_table(name):
+        return _table(file)
     if name.suffix.lower() in SUFFIXES or head.lstrip()[:1] in (b"{", b"["):
         if b'"frames"' in head:
             return _views(name)
@@ -85,6 +91,15 @@ def _transfer_function(file: str) -> dict[str, Any]:
     return facts
 
 
+def _table(file: str) -> dict[str, Any]:
+    table = read_labels(file)
+    return {"kind": "table of labels", "name": table.name, "labels": len(table.labels), "entries": _entries(table)}
+
+
+def _entries(table: LabelTable) -> list[dict[str, Any]]:
+    return [{"label": e.number, "name": e.name, "color": e.color, "opacity": e.opacity} for e in table.labels]
+
+
 def _volume(file: str, read: ReadOptions) -> dict[str, Any]:
     from vvgt_cli.runs.layered import open_parts
     from vvgt_cli.transfer import unit_distance
@@ -102,6 +117,11 @@ def _volume(file: str, read: ReadOptions) -> dict[str, Any]:
         kinds["channels"] = len(content.volumes)
     elif not isinstance(volume.data, Packed) and recognised(volume):
         kinds["label_map"] = True
+    if holds_table(content.path) and not content.overlapping:
+        kinds["label_map"] = True
+        with suppress(DataError):  # a header that says less of its segments than colours need
+            one = content.layer
+            kinds["segments"] = _entries(read_labels(file) if one is None else segments_of(file, one))
     numbers = statistics(volume)
     return {
         "kind": "volume",

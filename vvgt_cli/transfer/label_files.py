@@ -1,9 +1,10 @@
-"""Tables of labels: 3D Slicer's .ctbl, ITK-SNAP's .label, FreeSurfer's LUT, the header of a .seg.nrrd, and JSON.
+"""Tables of labels: 3D Slicer's .ctbl, ITK-SNAP's .label, FreeSurfer's LUT, .seg.nrrd, DICOM SEG, and JSON.
 
 - 3D Slicer, `number name R G B A` with 0 to 255 each.
 - FreeSurfer (FreeSurferColorLUT.txt): the same, but A is transparency; 0 is opaque.
 - ITK-SNAP: `number R G B A VIS MSH "name"`, colours 0 to 255, A in [0, 1], VIS 0 or 1.
 - .seg.nrrd: `Segment0_LabelValue:=1`, `Segment0_Name:=`, `Segment0_Color:=0.5 0.4 0.1`.
+- DICOM SEG: segment numbers, labels and recommended CIELab colours, else distinct ones.
 - JSON: `{"1": {"name": "liver", "color": [0.6, 0.3, 0.2], "opacity": 0.8}}`; a colour may be "#aabbcc".
 """
 
@@ -16,19 +17,45 @@ from pathlib import Path
 from typing import Any
 
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.transfer.labels import SOLID, Label, LabelTable
+from vvgt_cli.transfer.labels import SOLID, Label, LabelTable, distinct
 from vvgt_cli.transfer.readers.fields import json_of, number, rgb, text_of
+from vvgt_cli.volume.dicom_seg import is_segmentation_file
+from vvgt_cli.volume.dicom_seg import segments as dicom_segments
 
+SEGMENTATION = ".seg.nrrd"  # a label map whose header is its table
+TABLES, TEXTS = (".ctbl", ".label"), (".txt", ".lut", ".json")  # endings of tables, and of what may be one
 MOST = 2**31  # of a label's number
 HEADER = 2**20  # bytes of a .seg.nrrd that are looked at
 EXPECTED = (
-    "expected a table of labels: 3D Slicer (.ctbl), ITK-SNAP (.label), FreeSurfer (number name R G B A), a .seg.nrrd, "
-    'or JSON {"1": {"name": ..., "color": [r, g, b], "opacity": a}}'
+    "expected a table of labels: 3D Slicer (.ctbl), ITK-SNAP (.label), FreeSurfer (number name R G B A), .seg.nrrd, "
+    'DICOM SEG, or JSON {"1": {"name": ..., "color": [r, g, b], "opacity": a}}'
 )
 _WHOLE = re.compile(r"-?[0-9]{1,10}")
 _SNAP = re.compile(
     r'(-?[0-9]{1,10})\s+([0-9]{1,3})\s+([0-9]{1,3})\s+([0-9]{1,3})\s+([0-9]{1,3}(?:\.[0-9]*)?)\s+([01])\s+([01])\s+"(.*)"'
 )
+
+
+def holds_table(source: str | None) -> bool:
+    """Whether a file is a label map that brings its own table: a .seg.nrrd, or a DICOM segmentation."""
+    return source is not None and (source.endswith(SEGMENTATION) or is_segmentation_file(source))
+
+
+def is_table(path: Path) -> bool:
+    """Whether a file holds a table of labels and nothing else, by its name and the way that it begins."""
+    suffix = path.suffix.lower()
+    if suffix not in TEXTS:
+        return suffix in TABLES
+    try:
+        text = text_of(path, "a table of labels")
+        if text.lstrip().startswith("{"):
+            parsed = json_of(text, path, "a table of labels")
+            return bool(parsed) and all(_WHOLE.fullmatch(key) and isinstance(v, dict) for key, v in parsed.items())
+    except DataError:
+        return False
+    rows = (line.strip() for line in text.splitlines())
+    first = next((row for row in rows if row and not row.startswith("#")), "")
+    return bool(_SNAP.fullmatch(first) or _plain(first))
 
 
 def read_labels(source: str) -> LabelTable:
@@ -43,6 +70,8 @@ def read_labels(source: str) -> LabelTable:
         raise UsageError(f"--labels {source}: no such file; {EXPECTED}, or auto, or none")
     with path.open("rb") as stream:
         head = stream.read(HEADER)
+    if is_segmentation_file(source):
+        return _table(_dicom(source), source)
     if not head.startswith(b"NRRD") and (text := text_of(path, "a table of labels")).lstrip().startswith(("{", "[")):
         return table_of(json_of(text, path, "a table of labels"), str(path))
     if head.startswith(b"NRRD"):
@@ -53,11 +82,16 @@ def read_labels(source: str) -> LabelTable:
 
 
 def segments_of(source: str, layer: int) -> LabelTable:
-    """The segments of one layer of a .seg.nrrd in which segments overlap; numbers of labels are those of the layer.
+    """The segments of one layer of a .seg.nrrd in which segments overlap, or that of a DICOM SEG (a layer each).
+
+    Numbers of labels are those of the layer.
 
     Raises:
         DataError: none in this layer, or faulty ones.
     """
+    if is_segmentation_file(source):
+        own = sorted((label for label in _dicom(source) if label.number), key=lambda label: label.number)
+        return replace(_table(own[layer : layer + 1], source), name=f"{Path(source).name} segment {layer}")
     with Path(source).open("rb") as stream:
         head = stream.read(HEADER).partition(b"\n\n")[0].decode("utf-8", "replace")
     found = _table(_segments(head, source, layer), f"{source}: layer {layer}")
@@ -119,6 +153,13 @@ def _segments(header: str, what: str, layer: int | None = None) -> list[Label]:
         name = part.get("Name", part.get("ID", f"label {label}"))
         found.append(_label(f"{what}: segment {index}", int(label), name, [float(c) for c in color], SOLID))
     return found
+
+
+def _dicom(source: str) -> list[Label]:
+    """Of a DICOM segmentation; 0 is the background."""
+    found = dicom_segments(source)
+    colors = {label.number: label.color for label in distinct(sorted({one.number for one in found})).labels}
+    return [Label(one.number, one.name, one.color or colors[one.number], SOLID if one.number else 0.0) for one in found]
 
 
 def table_of(parsed: Any, what: str) -> LabelTable:

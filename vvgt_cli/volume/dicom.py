@@ -19,7 +19,8 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import check_memory
 from vvgt_cli.volume.components import select_component
-from vvgt_cli.volume.dicom_select import choose_series, one_stack
+from vvgt_cli.volume.dicom_seg import is_segmentation, names_of, read_segmentation
+from vvgt_cli.volume.dicom_select import Files, choose_series, one_stack
 from vvgt_cli.volume.libraries import library_errors, need
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import Reader, register
@@ -97,6 +98,8 @@ def read_dicom(path: Path, options: ReadOptions) -> Volume:
         files = _files(path) if path.is_dir() else [path]
         headers = [(file, pydicom.dcmread(file, stop_before_pixels=True)) for file in files]
         title, chosen, stack = choose_series(headers, options.array, path)
+        if is_segmentation(chosen[0][1]):
+            return _segmentation(path, chosen, options)
         slices = [s for file, header in chosen for s in _frames(file, header)]
         slices = _ordered(one_stack(slices, _alike, stack, title, path))
         spacing, direction = _steps(slices, path)
@@ -105,10 +108,22 @@ def read_dicom(path: Path, options: ReadOptions) -> Volume:
         values, options.component, str(path), label="each pixel", scaling=(slope, intercept)
     )
     told = all(s.hounsfield for s in slices)
+    reference = slices[0].header.get("FrameOfReferenceUID")
     return Volume(
         field, options.spacing_or(spacing), tuple(slices[0].position.tolist()), direction,
         f"{path.resolve().name.removesuffix('.dcm')}{title}", slope, intercept, "LPS", told,
+        None if reference is None else str(reference),
     )  # fmt: skip
+
+
+def _segmentation(path: Path, chosen: Files, options: ReadOptions) -> Volume:
+    """The label map of a file; of a folder the error names the file, whose own table goes with it."""
+    if path.is_dir():
+        raise DataError(
+            f"{path}: a segmentation (DICOM SEG) of {names_of(chosen[0][1])}; give its file, {chosen[0][0]}, or the "
+            "images that it was made on"
+        )
+    return read_segmentation(path, options)
 
 
 def _frames(path: Path, header: Any) -> Iterator[_Slice]:

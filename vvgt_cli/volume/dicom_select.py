@@ -15,11 +15,8 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.volume.dicom_seg import is_segmentation
 
-_SEGMENTATIONS = (
-    "1.2.840.10008.5.1.4.1.1.66.4",
-    "1.2.840.10008.5.1.4.1.1.66.7",
-)  # Segmentation, Label Map Segmentation
 _FEW = 2  # slices: fewer than make a stack, beside one that has more
 _LISTED = 12
 _SPACE = ("sagittal", "coronal", "axial")
@@ -39,7 +36,7 @@ def choose_series(headers: Sequence[tuple[Path, Any]], wanted: str | None, path:
         What to add to the volume's name, the files of the series, and the stack's number or None.
 
     Raises:
-        DataError: no images, or a segmentation.
+        DataError: no images.
         UsageError: several series and none chosen, or none of that name.
     """
     found: dict[str, Files] = {}
@@ -49,7 +46,9 @@ def choose_series(headers: Sequence[tuple[Path, Any]], wanted: str | None, path:
     if not found:
         kinds = Counter(str(header.get("Modality", "?")) for _, header in headers)
         listing = ", ".join(f"{n} {kind}" for kind, n in kinds.items()) or "no DICOM files"
-        raise DataError(f"{path}: no DICOM images ({listing}); expected files with rows and columns of pixels")
+        structures = kinds["RTSTRUCT"] == kinds.total() > 0
+        hint = "; of contours (RTSTRUCT) nothing is filled: export them as a label map or SEG" if structures else ""
+        raise DataError(f"{path}: no DICOM images ({listing}); expected files with rows and columns of pixels{hint}")
     stack = None
     if wanted is None:
         title, chosen = "", _only(found, path)
@@ -62,19 +61,14 @@ def choose_series(headers: Sequence[tuple[Path, Any]], wanted: str | None, path:
         if not chosen:
             raise UsageError(f"{path}: no one series {wanted!r}; it has {_listed(found)}; choose with --series SERIES")
         title = f":{wanted}"
-    if _segmentation(chosen[0][1]):
-        header = chosen[0][1]
-        labels = [str(s.get("SegmentLabel", "?")) for s in header.get("SegmentSequence", [])]
-        raise DataError(
-            f"{path}: a segmentation (DICOM SEG) of {len(labels)} segments ({', '.join(labels[:_LISTED])}), bits and "
-            "no values; give the images that it was made on, or export a label map as NIfTI or NRRD"
-        )
     return title, chosen, stack
 
 
 def _only(found: dict[str, Files], path: Path) -> Files:
     """The only series of images that are placed, no scouts, no segmentation."""
-    aside = {uid: f for uid, f in found.items() if all(_localiser(h) or _segmentation(h) or _unplaced(h) for _, h in f)}
+    aside = {
+        uid: f for uid, f in found.items() if all(_localiser(h) or is_segmentation(h) or _unplaced(h) for _, h in f)
+    }
     left = {uid: f for uid, f in found.items() if uid not in aside} or found
     if len(left) > 1:
         raise UsageError(
@@ -111,10 +105,6 @@ def _listed(found: dict[str, Files]) -> str:
 
 def _localiser(header: Any) -> bool:
     return "LOCALIZER" in [str(word).upper() for word in header.get("ImageType") or []]
-
-
-def _segmentation(header: Any) -> bool:
-    return str(header.get("SOPClassUID", "")) in _SEGMENTATIONS
 
 
 def _unplaced(header: Any) -> bool:

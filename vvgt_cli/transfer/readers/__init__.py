@@ -49,7 +49,17 @@ def read_transfer_function(source: str | os.PathLike[str] | Mapping[str, Any]) -
         if pick or "/" in source or "\\" in source or Path(source).suffix.lower() in SUFFIXES:
             raise UsageError(f"{path}: no such file; expected a transfer function ({', '.join(SUFFIXES)})")
         return colormap_name.read(source)
-    return _read(load(path), str(path), pick)
+    try:
+        return _read(load(path), str(path), pick)
+    except DataError:
+        from vvgt_cli.transfer.label_files import is_table
+
+        if not pick and is_table(path):
+            raise DataError(
+                f"{path}: a table of labels; expected a transfer function: give the table to --labels, 'vvgt info' "
+                "lists it"
+            ) from None
+        raise
 
 
 def _read(parsed: Any, what: str, pick: str) -> TransferFunction:

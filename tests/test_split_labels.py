@@ -1,0 +1,142 @@
+"""`--split-labels`: the files' Gaussians are those of the whole, each once, and what the whole hides is there too."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vvgt_cli.batches import labels as split
+from vvgt_cli.dvr import RenderSettings
+from vvgt_cli.gaussians import Gaussians, read_ply
+from vvgt_cli.runs.owners import hidden_in, owners
+from vvgt_cli.runs.score import score_test_views
+from vvgt_cli.runs.source import SourceRequest, load
+from vvgt_cli.transfer.labels import distinct
+from vvgt_cli.volume import Volume
+
+SMALL = ("--max-gaussians", 600, "--size", 64, "--steps", 0)
+
+
+def nested(n: int = 24, cut: bool = False) -> np.ndarray:
+    """A ball of label 3 in one of label 1, both solid, an octant of the outer one cut away where asked for."""
+    z, y, x = np.mgrid[:n, :n, :n] - (n - 1) / 2
+    radius = np.sqrt(x * x + y * y + z * z)
+    found = np.where(radius < n / 4, 3, np.where(radius < n / 2.2, 1, 0)).astype(np.uint8)
+    return np.where((x > 0) & (y > 0) & (z > 0) & (found == 1), 0, found).astype(np.uint8) if cut else found
+
+
+def converted(vvgt, tmp_path: Path, values: np.ndarray, *options) -> dict[int, Gaussians]:
+    np.save(tmp_path / "v.npy", values)
+    out = ("--split-labels", *SMALL, "-o", tmp_path / "p_{}.ply", "--overwrite")
+    done = vvgt("convert", tmp_path / "v.npy", "--labels", "auto", *out, *options)
+    assert done.code == 0, done.err
+    index = json.loads((tmp_path / "p_index.json").read_text())
+    return {row["label"]: read_ply(str(tmp_path / row["file"]))[0] for row in index["files"]}
+
+
+def rows(gaussians: Gaussians) -> list[bytes]:
+    return [row.tobytes() for row in np.column_stack([gaussians.means, gaussians.opacity_logits])]
+
+
+def test_the_files_hold_the_gaussians_of_the_whole(vvgt, tmp_path: Path, monkeypatch) -> None:
+    made = []
+    fitted = split.fitted
+    monkeypatch.setattr(split, "fitted", lambda run, request: made.append(fitted(run, request)) or made[-1])
+    files = converted(vvgt, tmp_path, nested(cut=True))
+    whole, together = rows(made[-1]), [row for part in files.values() for row in rows(part)]
+    assert sorted(files) == [1, 3]
+    assert len(together) <= 600
+    assert len(set(together)) == len(together)
+    assert set(whole) < set(together)  # and what the cut does not show of the core
+    for number, part in files.items():
+        wanted = distinct([number]).labels[0].color
+        assert np.median(np.abs(part.colors - wanted).max(axis=1)) < 0.1  # on borders with a touch of the other's
+
+
+def test_what_others_hide_is_there_when_they_are_switched_off(vvgt, tmp_path: Path) -> None:
+    report = ("--report", tmp_path / "r_{}.json")
+    files = converted(vvgt, tmp_path, nested(), *report)
+    core = files[3]
+    np.testing.assert_allclose(core.means.max(axis=0) - core.means.min(axis=0), 1.0, atol=0.25)  # 12 voxels of 24
+    assert len(core) > 50
+    scores = json.loads((tmp_path / "r_3-label-3.json").read_text())
+    assert scores["scores"]["psnr"] > 25
+    assert [stage["name"] for stage in scores["plan"]["stages"]] == ["test views", "seats"]
+    assert scores["gaussians"] == len(core)
+
+
+def test_a_single_label_and_one_that_is_nowhere(vvgt, tmp_path: Path) -> None:
+    values = nested()
+    assert list(converted(vvgt, tmp_path, np.where(values == 3, 3, 0))) == [3]
+    line = ("convert", tmp_path / "v.npy", "--labels", "auto", "--split-labels", "-o", "p_{}.ply")
+    size = vvgt(*line, "--max-size", 1)
+    assert "--max-size is of one file" in size.error
+    time = vvgt(
+        "convert", tmp_path / "v.npy", "--labels", "auto", "--split-labels", "--time-budget", 9, "-o", "p_{}.ply"
+    )
+    assert (time.code, "--time-budget is of one file" in time.error) == (2, True)
+
+
+def test_standard_input_is_read_once(tmp_path: Path) -> None:
+    raw = ("--dims", "24", "24", "24", "--dtype", "uint8", "--labels", "auto", "--split-labels", "-o", "p_{}.ply")
+    line = [sys.executable, "-m", "vvgt_cli.cli.main", "convert", "-", *raw, *map(str, SMALL)]
+    done = subprocess.run(line, cwd=tmp_path, input=nested(cut=True).tobytes(), capture_output=True, check=False)
+    assert done.returncode == 0, done.stderr.decode()
+    assert len(list(tmp_path.glob("p_*.ply"))) == 2
+
+
+def test_the_surface_of_labels_is_where_a_grazing_ray_is_half_covered(monkeypatch) -> None:
+    """The closed form of a solid ball, nearer than with the surface where a cell is half opaque."""
+    from vvgt_cli.vbm import VbmOptions, initialise, inset
+
+    source = load(SourceRequest(Volume(np.where(nested() > 0, 1, 0).astype(np.uint8)), labels=distinct([1])))
+    assert source.scene().labels
+
+    def score() -> float:
+        gaussians = initialise(source.scene(), VbmOptions(max_gaussians=1500, size=256)).gaussians
+        return score_test_views(source.scene(), gaussians, 256, RenderSettings(), perceptual=False).psnr
+
+    ours = score()
+    monkeypatch.setattr(inset, "LABEL_DEPTH", inset.OPAQUE_DEPTH)
+    assert ours > score() + 1
+
+
+def test_whose_a_gaussian_is() -> None:
+    """A box of label 1 beside one of label 2 along x, which is faint."""
+    values = np.zeros((8, 8, 16), np.uint8)
+    values[:, :, 2:8], values[:, :, 8:14] = 1, 2
+    volume = Volume(values)
+    table = distinct([1, 2])
+    shown = [(volume, table, label) for label in table.labels]
+    x = np.array([-0.5, 0.5, 0.02, -0.95])
+    means = np.column_stack([x, 0 * x, 0 * x])
+    wide = np.log(np.broadcast_to([[0.05, 0.01, 0.01]], (4, 3)))
+    turned = np.tile([1.0, 0, 0, 0], (4, 1))
+    colors = np.array([table.labels[k].color for k in (1, 0, 0, 1)])  # as it should not be told
+    gaussians = Gaussians(means, wide, turned, np.zeros(4), colors)
+    np.testing.assert_array_equal(owners(gaussians, shown), [0, 1, 1, 1])  # the last is near none: by its colour
+    along_y = Gaussians(means, wide, np.tile([np.sqrt(0.5), 0, 0, np.sqrt(0.5)], (4, 1)), np.zeros(4), colors)
+    np.testing.assert_array_equal(owners(along_y, shown)[:3], [0, 1, 1])
+    faint = [(volume, table, label) for label in (shown[0][2], split.replace(shown[1][2], opacity=0.01))]
+    assert owners(gaussians, faint)[2] == 0  # most of its extinction, not of its voxels
+
+
+@pytest.mark.parametrize("cut", [False, True])
+def test_what_is_hidden(cut: bool) -> None:
+    values = nested(cut=cut)
+    source = load(SourceRequest(Volume(values), labels="auto"))
+    hides = hidden_in(source.scene(), 600, 64)
+    assert hides.any_of(source.volume, 3)
+    assert hides.any_of(source.volume, 1)  # its wall towards the core
+    apart = np.where(values == 3, 3, 0)
+    alone = load(SourceRequest(Volume(apart), labels="auto"))
+    assert not hidden_in(alone.scene(), 600, 64).any_of(alone.volume, 3)
+    centre = np.zeros((2, 3))
+    centre[1] = -0.95 / np.sqrt(3)  # on the outer surface, opposite to the cut
+    points = Gaussians(centre, centre * 0 - 3, np.tile([1.0, 0, 0, 0], (2, 1)), np.zeros(2), centre)
+    np.testing.assert_array_equal(hides.whether(points), [True, False])
