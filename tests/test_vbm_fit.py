@@ -10,7 +10,7 @@ from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.splat import blend, project, render
 from vvgt_cli.splat.rules import INRIA
 from vvgt_cli.vbm import fit as fit_module
-from vvgt_cli.vbm.fit import BRIGHTEST, PRIOR, image_errors, solve_colors
+from vvgt_cli.vbm.fit import BRIGHTEST, PRIOR, blending_weights, image_errors, solve_colors, weights_and_errors
 
 CAMERAS = default_views("train", 4, size=40)
 
@@ -195,3 +195,7 @@ def test_image_errors() -> None:
     a = design(truth)
     expected = a.T @ (0.6 * a[:, 17])  # weight x error: three channels that are 0.2 a[:, 17] off
     np.testing.assert_allclose(errors, expected, rtol=1e-3, atol=1e-4)
+    weights, again = weights_and_errors(wrong, CAMERAS, views)
+    np.testing.assert_array_equal(again, errors)
+    np.testing.assert_allclose(weights, a.sum(axis=0), rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(blending_weights(wrong, CAMERAS), weights, rtol=1e-12)

@@ -36,8 +36,8 @@ VIEW_DEGREE = 2  # of harmonics by default where the light depends on the view: 
 SMALLER = (8, 4, 2)  # parts of the budget that a target is tried with first
 
 
-def convert(request: ConvertRequest, console: Console | None = None) -> ConversionReport:
-    """Volume to `.ply`: `made`, and its outputs written.
+def convert(request: ConvertRequest, console: Console | None = None, made: Gaussians | None = None) -> ConversionReport:
+    """Volume to `.ply`: `run_conversion`, and its outputs written.
 
     Raises:
         UsageError: an output that may not be written; found before anything is read.
@@ -48,7 +48,7 @@ def convert(request: ConvertRequest, console: Console | None = None) -> Conversi
         raise UsageError("--checkpoint is of runs that repeat to the byte, --time-budget of others; give one of both")
     run = Run(console or Console(), ConversionReport("convert"))
     with claimed(request.outputs(), request.inputs(), request.overwrite), checkpoint_folder(request.checkpoint):
-        conversion = run_conversion(run, request)
+        conversion = run_conversion(run, request, made)
         report = _write(run, request, conversion)
         if request.checkpoint is not None and not _interrupted(run):
             Checkpoint(Path(request.checkpoint)).finish()
@@ -94,11 +94,24 @@ def planned(request: ConvertRequest, console: Console | None = None) -> Plan:
     return _planned(run, request)[-1]
 
 
-def run_conversion(run: Run, request: ConvertRequest) -> Conversion:
+def fitted(run: Run, request: ConvertRequest) -> Gaussians:
+    """The Gaussians of a conversion, box frame, not scored and not written.
+
+    Raises:
+        DataError, UsageError: as `convert`.
+    """
+    _, work, planner, plan = _planned(run, request)
+    check_memory(plan, work.scene)
+    _fit(work, request, planner, plan)
+    return work.made()
+
+
+def run_conversion(run: Run, request: ConvertRequest, made: Gaussians | None = None) -> Conversion:
     """Closed form, what views can improve of it, scores on the test views; only checkpoints are written.
 
     What of these is done, and with how many Gaussians, follows from the request's limits and what the stages cost
-    (`vvgt_cli.conversion.plan`); the check views decide. What is left out is said, and costs nothing.
+    (`vvgt_cli.conversion.plan`); the check views decide. What is left out is said, and costs nothing. Of Gaussians that
+    are ``made`` already, box frame, there are scores alone.
 
     Returns:
         The conversion; the run's report is still open.
@@ -107,10 +120,16 @@ def run_conversion(run: Run, request: ConvertRequest) -> Conversion:
         DataError, UsageError: as `convert`.
     """
     source, work, planner, plan = _planned(run, request)
+    if made is not None:
+        plan.stages, plan.left_out = [stage for stage in plan.stages if stage.scores], []
+        plan.gaussians = len(made)
+        run.report.plan = plan.record()
     check_memory(plan, work.scene)
     work.checkpoint = checkpoint_of(request.checkpoint, source, work.fit, request.limits)
     kept = work.checkpoint.load(FITTED)
-    if kept:
+    if made is not None:
+        work.gaussians = as_stored(made)
+    elif kept:
         work.gaussians = kept[0]
         run.console.say(f"{request.checkpoint} holds the fitted Gaussians: only the scores are left")
     else:
@@ -138,7 +157,7 @@ def _planned(run: Run, request: ConvertRequest) -> tuple[Source, Work, Planner, 
     guess = expected_wide(fit.max_gaussians, fit.size)
     planner = Planner(
         request.limits, fit.max_gaussians, fit.steps, request.ply.sh_degree or degree, fit.size, guess, fit.model,
-        request.scored_whole,
+        request.scored_whole, fit.init == "vbm",
     )  # fmt: skip
     plan = planner.plan(case, run.elapsed())
     run.report.plan = plan.record()
@@ -266,6 +285,7 @@ def ply_options(request: ConvertRequest, source: Source) -> PlyOptions:
         made_for=request.fit.size,
         rule=request.fit.rule,
         light=None if source.lighting is None else source.lighting.text(),
+        optics=source.optics(),
     )
     return placed(ply, source.volume)
 

@@ -11,6 +11,7 @@ from vvgt_cli.conversion.request import Limits, file_bytes
 from vvgt_cli.conversion.stage import Stage
 from vvgt_cli.conversion.stages import (
     BackProjection,
+    CellsByError,
     CheckViews,
     ClosedFormStage,
     Network,
@@ -123,6 +124,7 @@ class Planner:
         wide: Gaussians are wide enough to be seen in small views.
         model: network that the user asks for.
         whole: all ten test views are scored.
+        cuts: there will be a pyramid to cut once more.
     """
 
     limits: Limits
@@ -133,6 +135,7 @@ class Planner:
     wide: bool = True
     model: str | None = None
     whole: bool = False
+    cuts: bool = False
 
     def plan(self, case: Case, spent: float, begun: bool = False) -> Plan:
         """Which stages fit, after ``spent`` seconds; ``begun``: the closed form is done."""
@@ -143,8 +146,11 @@ class Planner:
         if self.limits.time_budget is not None:
             left = self.limits.time_budget - spent - plan.seconds_of([*([] if begun else first), *last])
         between = self._improvements(plan, left)
-        if self.limits.target_psnr is not None or any(isinstance(stage, BackProjection) for stage in between):
+        cut = any(isinstance(stage, CellsByError) for stage in between)
+        if self._anew() or any(isinstance(stage, BackProjection) for stage in between):
             first = [ClosedFormStage(anew=True)]
+        elif cut:
+            first = [ClosedFormStage(cut=True)]
         plan.stages = [*([] if begun else first), *between, *last]
         return plan
 
@@ -165,15 +171,22 @@ class Planner:
             plan.left_out.append(("network", "gradient descent gains more in its time; --model runs it"))
         if not few:
             plan.left_out.append(("back-projection", "gradient descent gains more in its time"))
-        chosen = self._descent(steps, small, wanted)
-        return [*chosen[:2], *([BackProjection()] if few else []), *network, chosen[2]]
+        *before, descent = self._descent(steps, small, wanted)
+        return [*before, *([BackProjection()] if few else []), *network, descent]
 
     def _descent(self, steps: int, small: bool, most: int) -> list[Stage]:
+        """Gradient descent and its views; cells by error but before few steps, and before a network."""
+        cut = self.cuts and self.model is None and steps >= ENOUGH_STEPS
         return [
             CheckViews(),
             TrainingViews(views_of(steps, small), view_edge(self.size, small)),
+            *([CellsByError(small, keep=not self._anew())] if cut else []),
             Refinement(steps, most, small),
         ]
+
+    def _anew(self) -> bool:
+        """Whether the cells may be cut for fewer Gaussians in the end."""
+        return self.limits.target_psnr is not None
 
     def _seconds(self, case: Case, steps: int, small: bool) -> float:
         """Of so many steps, with their views, ``small`` ones or not, and the check views."""

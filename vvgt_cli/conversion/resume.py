@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from vvgt_cli.conversion.request import FitOptions, Limits
     from vvgt_cli.runs.source import Source
 
-CLOSED_FORM, FITTED = "closed-form.npz", "fitted.npz"
+CLOSED_FORM, CELLS, FITTED = "closed-form.npz", "cells.npz", "fitted.npz"
 DESCENT = "refinement.npz"  # of `vvgt_cli.descent.checkpoint`
 _FAULTS = (
     *(OSError, KeyError, ValueError, TypeError, AttributeError, EOFError, MemoryError, RuntimeError, DataError),
@@ -92,7 +92,7 @@ class Checkpoint:
     def finish(self) -> None:
         """Remove what is of no use once the output is written."""
         if self.folder is not None:
-            for name in (CLOSED_FORM, DESCENT, FITTED):
+            for name in (CLOSED_FORM, CELLS, DESCENT, FITTED):
                 (self.folder / name).unlink(missing_ok=True)
 
 

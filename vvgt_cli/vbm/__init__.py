@@ -78,6 +78,22 @@ def initialise(scene: Scene, options: VbmOptions, progress: Progress | None = No
     return Start(gaussians, kept)
 
 
+def cut_by_error(start: Start, cameras: Sequence[Camera], views: np.ndarray, rule: Rule = INRIA) -> Gaussians:
+    """The closed form of other cells of the pyramid, as many: more where views of the first ones are wrong.
+
+    Args:
+        start: from `initialise`, with a pyramid.
+        cameras, views: of training, (n, h, w, 4) float32 premultiplied.
+        rule: by which they are drawn.
+
+    Raises:
+        UsageError: there is no pyramid.
+    """
+    if start.form is None:
+        raise UsageError("Gaussians without a pyramid; expected those of `initialise` by moments, as they came from it")
+    return start.form.cut_by_error(start.gaussians, cameras, views, rule)
+
+
 def backproject(
     start: Start,
     cameras: Sequence[Camera],
@@ -104,4 +120,4 @@ def backproject(
     return fit(start.form, cameras, views, progress, rule)
 
 
-__all__ = ["METHODS", "Start", "VbmOptions", "backproject", "initialise"]
+__all__ = ["METHODS", "Start", "VbmOptions", "backproject", "cut_by_error", "initialise"]

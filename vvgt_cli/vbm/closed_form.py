@@ -16,11 +16,12 @@ from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.splat import render
 from vvgt_cli.splat.rules import INRIA, Rule
 from vvgt_cli.transfer.tables import OpticalTables
-from vvgt_cli.vbm.fit import image_errors, solve_colors
+from vvgt_cli.vbm.error import scores_by_error, unseen
+from vvgt_cli.vbm.fit import blending_weights, image_errors, solve_colors, weights_and_errors
 from vvgt_cli.vbm.inset import Opaque, opaque_field
 from vvgt_cli.vbm.moments import base_cells, exponents
 from vvgt_cli.vbm.shape import ROUND, STYLES, SurfaceStyle, cell_gaussians
-from vvgt_cli.vbm.tree import Leaves, Tree, build_tree, leaves_of, select, split
+from vvgt_cli.vbm.tree import Leaves, Tree, build_tree, leaves_of, select, split, split_score
 from vvgt_cli.vbm.visibility import Visibility, visibility
 
 MAX_BASE_CELLS = 5_000_000  # an upper bound: half of them are there, as a rule; 104 bytes each, twice for the pyramid
@@ -28,6 +29,8 @@ CELLS_A_GAUSSIAN, FEW_CELLS = 256, 500_000  # more are of no use to a small budg
 FINEST = -2  # cells of a quarter voxel at most
 MIN_CELL = 1.2  # pixels: a smaller base cell cannot be told from its neighbours
 MARCH_SIZE = 128  # pixels of the visibility march
+FEW = 0.04  # share of hidden cells that are left where they are: of some fogs, which lose by it
+SMALLER = 1.75  # power: of smaller cells more are hidden (2: fogs lose 0.2 dB, 1.5: bone loses as much)
 REFINE_FROM = 0.3  # share of the budget given out before views say where the error is
 REFINE_ROUNDS = 2
 REFINE_VIEWS = 8
@@ -78,6 +81,23 @@ class ClosedForm:
 
         return lit(found, self.scene, self.tree, leaves, self.degree)
 
+    def cut_by_error(self, drawn: Gaussians, cameras: Sequence[Camera], views: np.ndarray, rule: Rule) -> Gaussians:
+        """`gaussians` of cells chosen by what views (n, h, w, 4) show of the error of those, ``drawn``, by ``rule``.
+
+        Where some of those drawn are hidden in all views, more are cut than the budget has, and the hidden left out.
+        """
+        score = split_score(self.tree)
+        ids = select(self.tree, self.budget, score)
+        weights, errors = weights_and_errors(drawn, cameras, views, rule, power=2)
+        score = scores_by_error(self.tree, ids, errors, score)
+        seen = 1 - float(unseen(weights, self.budget).sum()) / max(len(weights), 1)
+        if seen > 1 - FEW:
+            return self._of(leaves_of(self.tree, select(self.tree, self.budget, score)), ROUND)
+        wanted = round(self.budget * min(seen**-SMALLER, 2.0))
+        found = self._of(leaves_of(self.tree, select(self.tree, wanted, score)), ROUND)
+        hidden = unseen(blending_weights(found, cameras, rule), self.budget)
+        return found.take(np.flatnonzero(~hidden))
+
     def refined(self, cameras: Sequence[Camera], views: np.ndarray, style: SurfaceStyle, rule: Rule) -> Gaussians:
         """Gaussians for the budget: three tenths by the moments, then cells with the largest error are split."""
         start = max(int(self.budget * REFINE_FROM), 1)
@@ -119,7 +139,7 @@ def closed_form(
     level = base_level(scene, pixel_width(size), budget)
     cells = base_cells(scene, exponents(step, level), progress=within(0, 50))
     seen = visibility(scene, cells, cameras or default_views("train", size=MARCH_SIZE), progress=within(50, 75))
-    opaque = opaque_field(cells, step, np.asarray(scene.half))
+    opaque = opaque_field(cells, step, np.asarray(scene.half), scene.labels)
     within(75, 80)(1)
     tree = build_tree(cells, seen, step)
     within(80, 95)(1)

@@ -22,14 +22,35 @@ BRIGHTEST = 2.0  # colours are kept in [0, 2]: more would flare up where other v
 Progress = Callable[[int, int], None]
 
 
-def image_errors(gaussians: Gaussians, cameras: Sequence[Camera], views: np.ndarray, rule: Rule = INRIA) -> np.ndarray:
-    """(K,) sum over views and pixels of blending weight x absolute error of RGB and alpha; ``views`` (n, h, w, 4)."""
+def image_errors(
+    gaussians: Gaussians, cameras: Sequence[Camera], views: np.ndarray, rule: Rule = INRIA, power: int = 1
+) -> np.ndarray:
+    """(K,) sum over views and pixels of blending weight x error of RGB and alpha; ``views`` (n, h, w, 4).
+
+    Of each of the four absolute errors the ``power``.
+    """
+    return weights_and_errors(gaussians, cameras, views, rule, power)[1]
+
+
+def weights_and_errors(
+    gaussians: Gaussians, cameras: Sequence[Camera], views: np.ndarray, rule: Rule = INRIA, power: int = 1
+) -> tuple[np.ndarray, np.ndarray]:
+    """(K,) sums over views and pixels of blending weight, and `image_errors`."""
     sums = np.zeros((len(gaussians), 5))
     for camera, view in zip(cameras, views, strict=True):
         projection = project(gaussians, camera, rule)
-        error = np.abs(view - render(gaussians, camera, projection=projection)).sum(axis=-1)
-        gather(projection, np.ascontiguousarray(np.broadcast_to(error, (4, *error.shape)), np.float32), sums)
-    return sums[:, 1]
+        error = (np.abs(view - render(gaussians, camera, projection=projection)) ** power).sum(axis=-1)
+        gather(projection, np.broadcast_to(error, (4, *error.shape)), sums)
+    return sums[:, 0], sums[:, 1]
+
+
+def blending_weights(gaussians: Gaussians, cameras: Sequence[Camera], rule: Rule = INRIA) -> np.ndarray:
+    """(K,) sum over views and pixels of blending weight, T alpha."""
+    sums = np.zeros((len(gaussians), 5))
+    for camera in cameras:
+        nothing = np.zeros((4, camera.height, camera.width), np.float32)
+        gather(project(gaussians, camera, rule), nothing, sums)
+    return sums[:, 0]
 
 
 def solve_colors(

@@ -21,6 +21,8 @@ from vvgt_cli.vbm.visibility import summed
 
 OPAQUE_DEPTH = 5.0  # optical depth a voxel at which a cell counts as wholly opaque; half of it is the surface
 SURFACE = 0.5  # of that
+LABEL_DEPTH = 1.0  # the same of labels that are opaque somewhere: extinction rises linearly from the empty voxel before
+# their surface on, and a ray that grazes it goes through many voxels: half covered where it has hardly begun
 MAX_FIELD = 1 << 26  # cells of the opacity field; finer scenes are averaged down to it
 FLAT = 0.02  # change of opacity over a cell below which there is no surface to speak of
 
@@ -30,7 +32,7 @@ class Opaque:
     """Saturated opacity on the grid of base cells.
 
     Attributes:
-        field: (nz, ny, nx) float32 in [0, 1], min(1, optical depth a voxel / 5).
+        field: (nz, ny, nx) float32 in [0, 1], min(1, optical depth a voxel / 5), of labels / 1.
         smooth: the same, blurred by the binomial [1, 4, 6, 4, 1] / 16 along each axis, for normals.
         edge: (3,) cell edge (x, y, z), unit frame.
         half: (3,) half extents of the box.
@@ -47,11 +49,13 @@ class Opaque:
         return self.field.size > 0
 
 
-def opaque_field(cells: Cells, step: np.ndarray, half: np.ndarray) -> Opaque:
-    """Where the scene is opaque: empty fields where it is nowhere."""
+def opaque_field(cells: Cells, step: np.ndarray, half: np.ndarray, labels: bool = False) -> Opaque:
+    """Where the scene, perhaps one of ``labels``, is opaque: empty fields where it is nowhere."""
     depth = opaque_depth(cells.moments[:, MASS], cells.edge, step)
     if not len(depth) or depth.max() < SURFACE:
         return nowhere(cells.edge, half)
+    if labels:
+        depth *= OPAQUE_DEPTH / LABEL_DEPTH
     wider = averaged_down(cells.edge, half, MAX_FIELD)
     edge = cells.edge * 2.0**wider
     shape = np.ceil(2 * half / edge - 1e-6).astype(np.int64)

@@ -1,6 +1,7 @@
 """The stages, a file each with what it costs. A new one is a file here and a line in `vvgt_cli.conversion.plan`."""
 
 from vvgt_cli.conversion.stages.back_projection import BackProjection
+from vvgt_cli.conversion.stages.cells import CellsByError
 from vvgt_cli.conversion.stages.closed_form import ClosedFormStage
 from vvgt_cli.conversion.stages.network import Network
 from vvgt_cli.conversion.stages.refinement import Refinement
@@ -9,6 +10,7 @@ from vvgt_cli.conversion.stages.views import CheckViews, TrainingViews
 
 __all__ = [
     "BackProjection",
+    "CellsByError",
     "CheckViews",
     "ClosedFormStage",
     "Network",

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from vvgt_cli.conversion.case import Case
-from vvgt_cli.conversion.resume import CLOSED_FORM
+from vvgt_cli.conversion.resume import CELLS, CLOSED_FORM
 from vvgt_cli.conversion.stage import Cost, Stage, Work
 from vvgt_cli.errors import NothingVisible
 
@@ -30,10 +30,12 @@ class ClosedFormStage(Stage):
 
     Attributes:
         anew: a stage after it may cut the cells anew: nothing is kept of it, since only Gaussians are.
+        cut: a stage after it cuts the cells by error: only where that has been done is no pyramid needed again.
     """
 
     name: ClassVar[str] = "closed form"
     anew: bool = False
+    cut: bool = False
 
     def cost(self, case: Case) -> Cost:
         """By cells and voxels."""
@@ -50,7 +52,8 @@ class ClosedFormStage(Stage):
         from vvgt_cli.vbm.closed_form import bound
 
         run, fit, scene = work.run, work.fit, work.scene
-        kept = None if self.anew else work.checkpoint.load(CLOSED_FORM)
+        whole = self.anew or (self.cut and work.checkpoint.load(CELLS) is None)
+        kept = None if whole else work.checkpoint.load(CLOSED_FORM)
         if kept:
             with run.stage(self.name) as stage:
                 stage.note = f"{len(kept[0])} Gaussians, as kept in {work.checkpoint.folder}"

@@ -1,0 +1,42 @@
+"""Cells by error: when they are cut, and when they are kept."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.test_conversion_plan import CASE, darkened, done, of
+from vvgt_cli.conversion.plan import Planner
+from vvgt_cli.conversion.request import FitOptions, Limits
+from vvgt_cli.conversion.stages import CellsByError
+from vvgt_cli.vbm.fit import solve_colors
+
+pytestmark = pytest.mark.usefixtures("small_seats")
+
+
+def test_cells_by_error_are_kept_where_the_check_views_gain_and_dropped_where_they_lose(tmp_path, monkeypatch):
+    def colored(start, cameras, views, rule):
+        return solve_colors(start.gaussians, cameras, views, rule=rule)
+
+    fit = FitOptions(200, 48, steps=24)
+    monkeypatch.setattr("vvgt_cli.vbm.cut_by_error", colored)
+    stage = next(stage for stage in done(tmp_path, fit).stages if stage.name == "cells by error")
+    assert stage.kept
+    assert stage.psnr > stage.psnr_before
+    monkeypatch.setattr("vvgt_cli.vbm.cut_by_error", lambda start, *_: darkened(start.gaussians))
+    stages = done(tmp_path, fit, overwrite=True).stages
+    stage = next(stage for stage in stages if stage.name == "cells by error")
+    assert not stage.kept
+    assert stage.psnr < stage.psnr_before
+    refined = next(stage for stage in stages if stage.name == "refinement")
+    assert refined.psnr_before == pytest.approx(stage.psnr_before, abs=1e-3)
+
+
+def test_cells_are_cut_by_error_where_there_is_a_pyramid_and_steps_follow():
+    def cut(steps, cuts=True, model=None, **limits):
+        found = Planner(Limits(**limits), 1000, steps, 0, 400, model=model, cuts=cuts).plan(CASE, 1.0)
+        return of(found, CellsByError)
+
+    assert cut(24) is not None
+    assert cut(None).keep
+    assert not cut(None, target_psnr=40.0).keep  # fewer Gaussians may be enough: the pyramid is needed again
+    assert cut(None, cuts=False) is cut(23) is cut(0) is cut(24, model="some") is None
