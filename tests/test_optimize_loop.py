@@ -164,9 +164,10 @@ def test_a_step_is_the_exponential_of_e_to_second_order():
     rates = np.array([0.05, 0.2, 0.15, 0.03, 0.008])  # E^2 / 2 is a tenth of E
     expected = exact_steps(state, frames, rates, 0.3)
     means, factors, logits, colors = state.arrays
-    nothing = np.zeros(200, np.float32), np.zeros((200, 3), np.float32)
+    slopes = np.zeros((13, 200), np.float32)
+    slopes[:9] = frames.T
     steps.own_frame(
-        frames, *nothing, rates, np.array([0.5, 1.0, 0.3]), state.spread, *state.BETAS, 1,
+        slopes, rates, np.array([0.5, 1.0, 0.3]), state.spread, *state.BETAS, 1,
         means, factors, logits, colors, state.darkest, state.first, state.second,
     )  # fmt: skip
     np.testing.assert_allclose(means, expected[0], atol=1e-6)

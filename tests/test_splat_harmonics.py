@@ -130,7 +130,7 @@ def test_own_frame_gradients_match_the_twin():
     ours = own_frame_backward(g.means, factors, seen, c, p, pairs, g.harmonics)
     twin = render_backward_reference(g, c, grad.astype(np.float64))
     steps = np.einsum("kji,kj->ki", factors, twin["means"])
-    for a, b in ((ours.frame[:, :3], steps), (ours.harmonics, twin["harmonics"])):
+    for a, b in ((ours.rows[:3].T, steps), (ours.harmonics, twin["harmonics"])):
         a, b = a.reshape(200, -1), b.reshape(200, -1)
         scale = np.abs(b).max(axis=1) + 1e-2 * np.abs(b).mean()
         assert (np.abs(a - b).max(axis=1) > 5e-3 * scale).mean() < 0.05

@@ -16,6 +16,7 @@ from vvgt_cli.splat.rules import INRIA, Rule
 
 WARM_UP = 3  # steps
 SMALLEST = 1e-7  # standard deviation, unit frame
+GIVEN = 0.3  # of the rate of harmonics, where the start has some: a view alone says little of them (docs/log.md)
 
 
 def _last(arrays: tuple[np.ndarray, ...], index: int) -> np.ndarray | None:
@@ -23,11 +24,20 @@ def _last(arrays: tuple[np.ndarray, ...], index: int) -> np.ndarray | None:
     return arrays[index] if len(arrays) > index else None
 
 
+def _has_harmonics(harmonics: np.ndarray | None) -> bool:
+    """Whether the highest degree of ``harmonics`` (K, M, 3), which has most of them, holds something."""
+    if harmonics is None:
+        return False
+    degree = math.isqrt(harmonics.shape[1] + 1) - 1
+    return bool(harmonics[:, degree**2 - 1 :].any())
+
+
 class OwnFrame:
     """Covariance ``M M^T``; steps ``mu += M d``, ``M <- M (I + E + E^2 / 2)``, of opacity logits, colours, harmonics.
 
     Rates go with the root of the running error of the pictures: the nearer, the smaller; and from the middle of the
-    run on in a straight line to zero.
+    run on in a straight line to zero. Harmonics up to a degree that the start has change by `GIVEN` of the rate
+    of those that begin at zero.
     """
 
     # d, E on and off the diagonal, logit, colour, and what harmonics together change it (RMS over directions)
@@ -49,9 +59,10 @@ class OwnFrame:
             np.maximum(gaussians.colors, 0) if harmonics is None else gaussians.colors.copy(),
             *([] if harmonics is None else [harmonics.copy()]),
         )
+        self.harmonic_rate = float(self.RATES[5]) * (GIVEN if _has_harmonics(harmonics) else 1.0)
         self.running = [np.zeros_like(array) for array in self.arrays[4:] for _ in range(2)]
         self.darkest = 0.0 if harmonics is None else -math.inf  # what is negative may be lighter from elsewhere
-        self.first, self.second = (np.zeros((len(gaussians), steps.COUNT), np.float32) for _ in range(2))
+        self.first, self.second = (np.zeros((steps.COUNT, len(gaussians)), np.float32) for _ in range(2))
         pixel = float(np.median([np.linalg.norm(camera.position) / camera.fx for camera in cameras]))
         self.spread = rule.dilation * pixel**2
         self.step = 0
@@ -85,11 +96,11 @@ class OwnFrame:
         pace = speed * min(1.0, 2 * (1 - share))
         pace *= min(self.LARGEST, math.sqrt(error / self.ERROR)) * min(1.0, self.step / WARM_UP)
         steps.own_frame(
-            slopes.frame, slopes.opacity_logits, slopes.colors, self.RATES * pace, self.CLIPS, self.spread,
+            slopes.rows, self.RATES * pace, self.CLIPS, self.spread,
             *self.BETAS, self.step, means, factors, logits, colors, self.darkest, self.first, self.second,
         )  # fmt: skip
         if harmonics is not None and slopes.harmonics is not None:
-            rate = self.RATES[5] * math.sqrt(4 * math.pi / harmonics.shape[1])
+            rate = self.harmonic_rate * math.sqrt(4 * math.pi / harmonics.shape[1])
             first, second = (array.reshape(-1) for array in self.running)
             values, slope = harmonics.reshape(-1), slopes.harmonics.reshape(-1)
             steps.adam(values, slope, rate * pace, *self.BETAS, self.step, first, second)
@@ -98,21 +109,26 @@ class OwnFrame:
         """All that the next steps depend on."""
         named = {f"array_{i}": array for i, array in enumerate(self.arrays)}
         named |= {f"running_{i}": array for i, array in enumerate(self.running)}
-        return named | {"first": self.first, "second": self.second, "step": np.array(self.step)}
+        return named | {"first": self.first.T, "second": self.second.T, "step": np.array(self.step)}
 
     def restore(self, saved: dict[str, np.ndarray]) -> None:
         """Put back what `saved` gave."""
         self.arrays = tuple(saved[f"array_{i}"] for i in range(len(self.arrays)))
         self.running = [saved[f"running_{i}"] for i in range(len(self.running))]
-        self.first, self.second, self.step = saved["first"], saved["second"], int(saved["step"])
+        self.first, self.second = (np.ascontiguousarray(saved[name].T) for name in ("first", "second"))
+        self.step = int(saved["step"])
 
     def gaussians(self) -> Gaussians:
-        """As a file has them: singular values and vectors of M."""
+        """As a file has them: principal axes of ``M M^T``."""
+        from vvgt_cli.vbm.pyramid import principal_axes
         from vvgt_cli.vbm.shape import quaternions
 
         means, factors, logits, *colors = self.arrays
-        axes, scales, _ = np.linalg.svd(factors.astype(np.float64))
-        return Gaussians(means, np.log(np.maximum(scales, SMALLEST)), quaternions(axes), logits, *colors)
+        spreads = factors.astype(np.float64) @ factors.transpose(0, 2, 1)
+        variances, axes = np.empty((len(means), 3)), np.empty((len(means), 3, 3))
+        principal_axes(spreads, variances, axes)
+        log_scales = 0.5 * np.log(np.maximum(variances, SMALLEST**2))
+        return Gaussians(means, log_scales, quaternions(axes), logits, *colors)
 
 
 class Fields:

@@ -9,24 +9,13 @@ import numba as nb
 import numpy as np
 
 from vvgt_cli.jit.decorators import inlined, kernel
+from vvgt_cli.splat.lanes import LANES, U
 
 f32: Any = np.float32
-ONE, HALF, FOUR, EPSILON = f32(1), f32(0.5), f32(4), f32(1e-15)
+ONE, HALF, FOUR, NINE, EPSILON = f32(1), f32(0.5), f32(4), f32(9), f32(1e-15)
 COUNT = 13  # own frame: d (3), E (6), opacity logit, colour (3)
+_P1, PLACE = U(LANES), U(COUNT * LANES)  # of a buffer: from plane to plane; where the nine of M begin
 _jit = inlined()
-
-
-@_jit
-def _adam(
-    g: float, k: int, i: int, first: np.ndarray, second: np.ndarray, beta1: float, beta2: float, fix1: float,
-    fix2: float,
-) -> float:  # fmt: skip
-    """One value's direction, about 1 in size; updates the running moments ``first`` and ``second`` (K, COUNT)."""
-    m: float = beta1 * first[k, i] + (ONE - beta1) * g
-    v: float = beta2 * second[k, i] + (ONE - beta2) * g * g
-    first[k, i], second[k, i] = m, v
-    direction: float = m * fix1 / (math.sqrt(v * fix2) + EPSILON)
-    return direction
 
 
 @_jit
@@ -36,79 +25,101 @@ def _clip(value: float, bound: float) -> float:
 
 
 @_jit
-def _gain(factors: np.ndarray, k: int, i: int, spread: float) -> float:
-    """How much further axis i, column i of ``factors`` (K, 3, 3), may go than a long one.
+def _turn(
+    slopes: np.ndarray, begin: int, count: int, first: np.ndarray, second: np.ndarray, ways: tuple[float, ...],
+    buf: np.ndarray,
+) -> None:  # fmt: skip
+    """Adam's directions, about 1 in size, of ``count`` Gaussians from ``begin`` on into planes 0 to 12.
 
-    The dilation, of variance ``spread``, hides part of its step.
+    ``slopes`` and the running moments ``first`` and ``second``, which are updated, (COUNT, K); ``ways`` beta1, beta2
+    and what undoes their start from zero.
     """
-    x, y, z = factors[k, 0, i], factors[k, 1, i], factors[k, 2, i]
-    return math.sqrt(min(ONE + spread / max(x * x + y * y + z * z, f32(1e-30)), f32(9)))
+    beta1, beta2, fix1, fix2 = ways
+    start, lanes = U(begin), U(count)
+    for field in range(U(COUNT)):
+        for i in range(lanes):
+            g, k = slopes[field, start + i], start + i
+            m = beta1 * first[field, k] + (ONE - beta1) * g
+            v = beta2 * second[field, k] + (ONE - beta2) * g * g
+            first[field, k], second[field, k] = m, v
+            buf[field * _P1 + i] = m * fix1 / (math.sqrt(v * fix2) + EPSILON)
 
 
 @_jit
-def _directions(
-    frame: np.ndarray, k: int, first: np.ndarray, second: np.ndarray, beta1: float, beta2: float, fix1: float,
-    fix2: float,
-) -> tuple[float, ...]:  # fmt: skip
-    """Adam's directions of d (3) and E (6), from row k of ``frame`` (K, 9)."""
-    return (
-        _adam(frame[k, 0], k, 0, first, second, beta1, beta2, fix1, fix2),
-        _adam(frame[k, 1], k, 1, first, second, beta1, beta2, fix1, fix2),
-        _adam(frame[k, 2], k, 2, first, second, beta1, beta2, fix1, fix2),
-        _adam(frame[k, 3], k, 3, first, second, beta1, beta2, fix1, fix2),
-        _adam(frame[k, 4], k, 4, first, second, beta1, beta2, fix1, fix2),
-        _adam(frame[k, 5], k, 5, first, second, beta1, beta2, fix1, fix2),
-        _adam(frame[k, 6], k, 6, first, second, beta1, beta2, fix1, fix2),
-        _adam(frame[k, 7], k, 7, first, second, beta1, beta2, fix1, fix2),
-        _adam(frame[k, 8], k, 8, first, second, beta1, beta2, fix1, fix2),
-    )
+def _gain(buf: np.ndarray, at: int, spread: float) -> float:
+    """How much further an axis may go than a long one: a column of M, from ``at`` on.
 
-
-@kernel(
-    "f4:2 f4:1 f4:2 f8:1 f8:1 f8 f8 f8 i8 f4:2 f4:3 f4:1 f4:2 f8 f4:2 f4:2",
-    parallel=True,
-)
-def own_frame(
-    frame: np.ndarray, logit_grad: np.ndarray, color_grad: np.ndarray, rates: np.ndarray, clips: np.ndarray,
-    spread: float, beta1: float, beta2: float, step: int, means: np.ndarray, factors: np.ndarray, logits: np.ndarray,
-    colors: np.ndarray, darkest: float, first: np.ndarray, second: np.ndarray,
-) -> None:  # fmt: skip
-    """mu += M d, M <- M (I + E + E^2 / 2): d, E, logit and colour by Adam; ``step`` counts from 1.
-
-    Gradients ``frame`` (K, 9), ``logit_grad`` (K,), ``color_grad`` (K, 3) and what they are of, ``means`` (K, 3),
-    ``factors`` (K, 3, 3), ``logits`` (K,), ``colors`` (K, 3), are float32, as are Adam's moments ``first`` and
-    ``second`` (K, COUNT) and what is computed. ``rates`` (5 or more,): d, E on and off the diagonal, logit, colour.
-    ``clips`` (3,): d, logit, E. ``spread`` is the dilation's variance at the scene, ``darkest`` the least that a colour
-    becomes.
+    The dilation, of variance ``spread``, hides part of its step.
     """
-    fix1, fix2 = f32(1 / (1 - beta1**step)), f32(1 / (1 - beta2**step))
-    b1, b2, hidden, least = f32(beta1), f32(beta2), f32(spread), f32(darkest)
-    r0, r1, r2, r3, r4 = f32(rates[0]), f32(rates[1]), f32(rates[2]), f32(rates[3]), f32(rates[4])
-    c0, c1, c2 = f32(clips[0]), f32(clips[1]), f32(clips[2])
-    for k in nb.prange(means.shape[0]):
-        p0, p1, p2 = _gain(factors, k, 0, hidden), _gain(factors, k, 1, hidden), _gain(factors, k, 2, hidden)
-        d0, d1, d2, e00, e11, e22, e01, e02, e12 = _directions(frame, k, first, second, b1, b2, fix1, fix2)
-        d0, d1, d2 = _clip(d0 * r0 * p0, c0), _clip(d1 * r0 * p1, c0), _clip(d2 * r0 * p2, c0)
-        e00 = _clip(e00 * r1 * min(p0 * p0, FOUR), c2)
-        e11 = _clip(e11 * r1 * min(p1 * p1, FOUR), c2)
-        e22 = _clip(e22 * r1 * min(p2 * p2, FOUR), c2)
-        e01 = _clip(e01 * r2 * min(p0 * p1, FOUR), c2)
-        e02 = _clip(e02 * r2 * min(p0 * p2, FOUR), c2)
-        e12 = _clip(e12 * r2 * min(p1 * p2, FOUR), c2)
-        for i in range(3):
-            m0, m1, m2 = factors[k, i, 0], factors[k, i, 1], factors[k, i, 2]
-            means[k, i] -= m0 * d0 + m1 * d1 + m2 * d2
+    x, y, z = buf[at], buf[at + U(3) * _P1], buf[at + U(6) * _P1]
+    return math.sqrt(min(ONE + spread / max(x * x + y * y + z * z, f32(1e-30)), NINE))
+
+
+@_jit
+def _move(buf: np.ndarray, rates: tuple[float, ...], clips: tuple[float, ...], spread: float) -> None:
+    """What is subtracted from means, and M after the step, into planes 0 to 2 and from `PLACE` on."""
+    r0, r1, r2 = rates
+    c0, c1 = clips
+    for i in range(U(LANES)):
+        at = i + PLACE
+        p0, p1, p2 = _gain(buf, at, spread), _gain(buf, at + _P1, spread), _gain(buf, at + U(2) * _P1, spread)
+        d0 = _clip(buf[i] * r0 * p0, c0)
+        d1 = _clip(buf[i + _P1] * r0 * p1, c0)
+        d2 = _clip(buf[i + U(2) * _P1] * r0 * p2, c0)
+        e00 = _clip(buf[i + U(3) * _P1] * r1 * min(p0 * p0, FOUR), c1)
+        e11 = _clip(buf[i + U(4) * _P1] * r1 * min(p1 * p1, FOUR), c1)
+        e22 = _clip(buf[i + U(5) * _P1] * r1 * min(p2 * p2, FOUR), c1)
+        e01 = _clip(buf[i + U(6) * _P1] * r2 * min(p0 * p1, FOUR), c1)
+        e02 = _clip(buf[i + U(7) * _P1] * r2 * min(p0 * p2, FOUR), c1)
+        e12 = _clip(buf[i + U(8) * _P1] * r2 * min(p1 * p2, FOUR), c1)
+        for row in range(3):
+            here = at + U(3 * row) * _P1
+            m0, m1, m2 = buf[here], buf[here + _P1], buf[here + U(2) * _P1]
+            buf[i + U(row) * _P1] = m0 * d0 + m1 * d1 + m2 * d2
             s0 = m0 * e00 + m1 * e01 + m2 * e02  # M E
             s1 = m0 * e01 + m1 * e11 + m2 * e12
             s2 = m0 * e02 + m1 * e12 + m2 * e22
-            factors[k, i, 0] = m0 - s0 + HALF * (s0 * e00 + s1 * e01 + s2 * e02)
-            factors[k, i, 1] = m1 - s1 + HALF * (s0 * e01 + s1 * e11 + s2 * e12)
-            factors[k, i, 2] = m2 - s2 + HALF * (s0 * e02 + s1 * e12 + s2 * e22)
-        turn = _adam(logit_grad[k], k, 9, first, second, b1, b2, fix1, fix2) * r3
-        logits[k] -= _clip(turn, c1)
-        for i in range(3):
-            tint = _adam(color_grad[k, i], k, 10 + i, first, second, b1, b2, fix1, fix2) * r4
-            colors[k, i] = max(colors[k, i] - tint, least)
+            buf[here] = m0 - s0 + HALF * (s0 * e00 + s1 * e01 + s2 * e02)
+            buf[here + _P1] = m1 - s1 + HALF * (s0 * e01 + s1 * e11 + s2 * e12)
+            buf[here + U(2) * _P1] = m2 - s2 + HALF * (s0 * e02 + s1 * e12 + s2 * e22)
+
+
+@kernel("f4:2 f8:1 f8:1 f8 f8 f8 i8 f4:2 f4:3 f4:1 f4:2 f8 f4:2 f4:2", parallel=True)
+def own_frame(
+    slopes: np.ndarray, rates: np.ndarray, clips: np.ndarray, spread: float, beta1: float, beta2: float, step: int,
+    means: np.ndarray, factors: np.ndarray, logits: np.ndarray, colors: np.ndarray, darkest: float, first: np.ndarray,
+    second: np.ndarray,
+) -> None:  # fmt: skip
+    """mu += M d, M <- M (I + E + E^2 / 2): d, E, logit and colour by Adam; ``step`` counts from 1.
+
+    Gradients ``slopes`` (COUNT, K) as `FrameGradients.rows` and what they are of, ``means`` (K, 3), ``factors``
+    (K, 3, 3), ``logits`` (K,), ``colors`` (K, 3), are float32, as are Adam's moments ``first`` and ``second``
+    (COUNT, K) and what is computed, `LANES` Gaussians at a time. ``rates`` (5 or more,): d, E on and off the diagonal,
+    logit, colour. ``clips`` (3,): d, logit, E. ``spread`` is the dilation's variance at the scene, ``darkest`` the
+    least that a colour becomes.
+    """
+    ways = f32(beta1), f32(beta2), f32(1 / (1 - beta1**step)), f32(1 / (1 - beta2**step))
+    paces, bounds = (f32(rates[0]), f32(rates[1]), f32(rates[2])), (f32(clips[0]), f32(clips[2]))
+    by_logit, by_color, farthest = f32(rates[3]), f32(rates[4]), f32(clips[1])
+    hidden, least, total = f32(spread), f32(darkest), means.shape[0]
+    for chunk in nb.prange((total + LANES - 1) // LANES):
+        begin = chunk * LANES
+        count = min(LANES, total - begin)
+        buf = np.ones((COUNT + 9) * LANES, np.float32)
+        _turn(slopes, begin, count, first, second, ways, buf)
+        for i in range(count):
+            for entry in range(9):
+                buf[U(i) + PLACE + U(entry) * _P1] = factors[begin + i, entry // 3, entry % 3]
+        _move(buf, paces, bounds, hidden)
+        for i in range(count):
+            k, at = begin + i, U(i)
+            for axis in range(3):
+                means[k, axis] -= buf[at + U(axis) * _P1]
+                tint = buf[at + U(10 + axis) * _P1] * by_color
+                colors[k, axis] = max(colors[k, axis] - tint, least)
+            for entry in range(9):
+                factors[k, entry // 3, entry % 3] = buf[at + PLACE + U(entry) * _P1]
+            logits[k] -= _clip(buf[at + U(9) * _P1] * by_logit, farthest)
 
 
 @kernel("f4:1 f4:1 f8 f8 f8 i8 f4:1 f4:1", parallel=True)

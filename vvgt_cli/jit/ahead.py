@@ -37,15 +37,16 @@ BACK_PROJECT = ("vvgt_cli.splat.tiles:gather", "vvgt_cli.splat.tiles:reduce_pair
 VIEWS = (*RAYCAST, *CLOSED_FORM[:-2])  # and points to start from
 INIT = (*CLOSED_FORM, "vvgt_cli.dvr.bricks:_ranges")
 MERGE = (*(name for name in CLOSED_FORM if "block_moments" not in name and "compact" not in name), *DRAW)
+COUNT_WHOLE = ("vvgt_cli.volume.count_kernel:count_values",)  # of types of which every number is counted
+COUNT_REAL = ("vvgt_cli.volume.count_kernel:range_values", "vvgt_cli.volume.count_kernel:bin_values")  # of others
 BLOCKS = (
     *CLOSED_FORM,
     *DRAW,
     "vvgt_cli.dvr.segments:cast_segments",
     "vvgt_cli.vbm.ranges:block_ranges",
-    "vvgt_cli.volume.count_kernel:count_values",
 )  # of a volume that is gone through in blocks
-CONVERT = (RAYCAST[0], REFINE[0], *CLOSED_FORM, *DRAW, *REFINE[1:], *RAYCAST[1:])
-OPTIMIZE = (*REFINE, *DRAW)
+CONVERT = (RAYCAST[0], REFINE[0], *CLOSED_FORM, *DRAW, *REFINE[1:], *RAYCAST[1:], *BACK_PROJECT)
+OPTIMIZE = (*REFINE, *DRAW, "vvgt_cli.vbm.pyramid:principal_axes")
 EVALUATE = (*RAYCAST, *DRAW)
 INFER = (*DRAW, SLOPES[0], "vvgt_cli.splat.backward:standard", *BACK_PROJECT)
 ALL = (
@@ -53,11 +54,13 @@ ALL = (
     *LIGHT,
     *GRID.values(),
     "vvgt_cli.dvr.place:place",
-    *INFER[len(DRAW) + 1 :],
+    "vvgt_cli.splat.backward:standard",
     *HARMONICS,
     *STEPPED,
     *DEPOSITS,
-    *BLOCKS[-3:],
+    *BLOCKS[-2:],
+    *COUNT_WHOLE,
+    *COUNT_REAL,
     "vvgt_cli.volume.slc_kernel:decode_plane",
 )
 

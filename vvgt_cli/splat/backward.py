@@ -41,8 +41,18 @@ from vvgt_cli.splat.buffer import (
 )
 from vvgt_cli.splat.constants import TILE
 from vvgt_cli.splat.kernel import rotation_column, to_camera, turned, unit_quaternion
+from vvgt_cli.splat.lanes import (
+    CONIC,
+    LANES,
+    SLOPED,
+    TOTALS,
+    centre_slope,
+    load_place,
+    pose_of,
+    screen_slope,
+    slope_lanes,
+)
 
-SINGULAR = 1e-9  # det S of det S' below which the gradient of the compensation is left out
 # alpha dL/dalpha; G = -dalpha/dp dL/dalpha, p the exponent, x dx, dy, dx^2, dx dy, dy^2; weight x dL/d(r, g, b)
 SUMS = 9
 _T = U(TILE)
@@ -174,24 +184,11 @@ def _total(first: np.ndarray, pairs: np.ndarray, k: int) -> tuple[float, ...]:
 def _screen(
     flat: np.ndarray, k: int, total: tuple[float, ...], dilation: float, compensate: float
 ) -> tuple[float, ...]:
-    """Gradients with respect to the projected centre (u, v) and the projected covariance (H, symmetric).
-
-    Where opacity is compensated by sqrt(det S / det S'), half of S^-1 - S'^-1 for each part of its gradient is added.
-    """
-    a, b, c = np.float64(flat[k, 2]), np.float64(flat[k, 3]), np.float64(flat[k, 4])
-    du, dv = a * total[1] + b * total[2], b * total[1] + c * total[2]
-    p0, p1 = a * total[3] + b * total[4], a * total[4] + b * total[5]  # conic x second moments
-    q0, q1 = b * total[3] + c * total[4], b * total[4] + c * total[5]
-    h00, h01, h11 = 0.5 * (p0 * a + p1 * b), 0.5 * (p0 * b + p1 * c), 0.5 * (q0 * b + q1 * c)
-    if compensate > 0.0:
-        det = 1.0 / (a * c - b * b)
-        sxx, sxy, syy = c * det - dilation, -b * det, a * det - dilation
-        own = sxx * syy - sxy * sxy
-        if own > SINGULAR * det:
-            h00 += 0.5 * total[0] * (syy / own - a)
-            h01 -= 0.5 * total[0] * (sxy / own + b)
-            h11 += 0.5 * total[0] * (sxx / own - c)
-    return du, dv, h00, h01, h11
+    """`screen_slope` of Gaussian k."""
+    return screen_slope(
+        np.float64(flat[k, 2]), np.float64(flat[k, 3]), np.float64(flat[k, 4]), total[0], total[1], total[2], total[3],
+        total[4], total[5], dilation, compensate,
+    )  # fmt: skip
 
 
 @kernel(parallel=True)
@@ -203,20 +200,6 @@ def screen(first: np.ndarray, pairs: np.ndarray, flat: np.ndarray, out: np.ndarr
             total = _total(first, pairs, k)
             du, dv, _, _, _ = _screen(flat, k, total, 0.0, 0.0)
             out[k] = np.sqrt(du * du + dv * dv)
-
-
-@_exact
-def _center(
-    x: float, y: float, z: float, fx: float, fy: float, du: float, dv: float, d00: float, d02: float, d11: float,
-    d12: float,
-) -> tuple[float, float, float]:  # fmt: skip
-    """Gradient with respect to the centre in camera coordinates; d is the gradient of the Jacobian J."""
-    inv = 1.0 / z
-    jx, jy, jxz, jyz = fx * inv, fy * inv, -fx * x * inv * inv, -fy * y * inv * inv
-    dx = jx * (du - d02 * inv)
-    dy = jy * (dv - d12 * inv)
-    dz = jxz * du + jyz * dv - (jx * d00 + jy * d11 + 2.0 * (jxz * d02 + jyz * d12)) * inv
-    return dx, dy, dz
 
 
 @_exact
@@ -232,54 +215,47 @@ def _colors_and_logit(
 
 
 @_exact
-def _axis(
-    factors: np.ndarray, k: int, i: int, rot: np.ndarray, jx: float, jy: float, jxz: float, jyz: float
-) -> tuple[float, ...]:
-    """Column i of W M (3) and of N = J W M (2)."""
-    v0, v1, v2 = turned(rot, np.float64(factors[k, 0, i]), np.float64(factors[k, 1, i]), np.float64(factors[k, 2, i]))
-    return v0, v1, v2, jx * v0 + jxz * v2, jy * v1 + jyz * v2
+def _load_slope(
+    buf: np.ndarray, i: int, k: int, flat: np.ndarray, means: np.ndarray, factors: np.ndarray, total: tuple[float, ...]
+) -> None:
+    """Gaussian k into lane i, for `slope_lanes`."""
+    load_place(buf, U(i), k, means, factors)
+    for f in range(3):
+        buf[U((CONIC + f) * LANES + i)] = flat[k, 2 + f]
+    for f in range(SUMS):
+        buf[U((TOTALS + f) * LANES + i)] = total[f]
 
 
-@kernel(
-    "i8:1 f4:2 i4:2 f4:2 f4:2 f4:3 f4:2 f8:2 f8:1 f8:1 f8:1 f4:2 f4:1 f4:2",
-    parallel=True,
-)
+@kernel("i8:1 f4:2 i4:2 f4:2 f4:2 f4:3 f4:2 f8:2 f8:1 f8:1 f8:1 f4:2", parallel=True)
 def own_frame(
     first: np.ndarray, pairs: np.ndarray, extent: np.ndarray, flat: np.ndarray, means: np.ndarray, factors: np.ndarray,
-    colors: np.ndarray, rot: np.ndarray, trans: np.ndarray, lens: np.ndarray, rule: np.ndarray, out_frame: np.ndarray,
-    out_logits: np.ndarray, out_colors: np.ndarray,
+    colors: np.ndarray, rot: np.ndarray, trans: np.ndarray, lens: np.ndarray, rule: np.ndarray, out: np.ndarray,
 ) -> None:  # fmt: skip
     """Gradients for steps in each Gaussian's own frame: mu += M d, M <- M (I + E), E symmetric.
 
-    ``out_logits`` (K,), ``out_colors`` (K, 3), ``out_frame`` (K, 9) float32: d (3), then E: xx, yy, zz, xy, xz, yz (an
-    entry off the diagonal stands for both).
+    ``out`` (13, K) float32, a row a field: d (3), then E: xx, yy, zz, xy, xz, yz (an entry off the diagonal stands for
+    both), opacity logit, colour (3). Every row is written.
     """
-    fx, fy = lens[0], lens[1]
-    for k in nb.prange(means.shape[0]):
-        out_frame[k] = 0.0
-        out_logits[k] = 0.0
-        out_colors[k] = 0.0
-        if extent[k, 2] <= extent[k, 0]:
-            continue
-        total = _total(first, pairs, k)
-        _colors_and_logit(k, flat, colors, total, out_logits, out_colors)
-        x, y, z = to_camera(means, k, rot, trans)
-        du, dv, h00, h01, h11 = _screen(flat, k, total, rule[0], rule[1])
-        jx, jy, jxz, jyz = fx / z, fy / z, -fx * x / (z * z), -fy * y / (z * z)
-        d00 = d02 = d11 = d12 = 0.0
-        for i in range(3):
-            v0, v1, v2, n0, n1 = _axis(factors, k, i, rot, jx, jy, jxz, jyz)
-            e0, e1 = 2.0 * (h00 * n0 + h01 * n1), 2.0 * (h01 * n0 + h11 * n1)  # dL/dN
-            d00, d02, d11, d12 = d00 + e0 * v0, d02 + e0 * v2, d11 + e1 * v1, d12 + e1 * v2
-        dx, dy, dz = _center(x, y, z, fx, fy, du, dv, d00, d02, d11, d12)
-        for i in range(3):
-            v0, v1, v2, n0, n1 = _axis(factors, k, i, rot, jx, jy, jxz, jyz)
-            out_frame[k, i] = dx * v0 + dy * v1 + dz * v2
-            e0, e1 = 2.0 * (h00 * n0 + h01 * n1), 2.0 * (h01 * n0 + h11 * n1)
-            out_frame[k, 3 + i] = e0 * n0 + e1 * n1
-            for j in range(i + 1, 3):
-                _, _, _, m0, m1 = _axis(factors, k, j, rot, jx, jy, jxz, jyz)
-                out_frame[k, 5 + i + j] = 2.0 * (e0 * m0 + e1 * m1)
+    count, pose, way = means.shape[0], pose_of(rot, trans), (lens[0], lens[1])
+    for chunk in nb.prange((count + LANES - 1) // LANES):
+        begin, end = chunk * LANES, min((chunk + 1) * LANES, count)
+        buf, seen = np.ones(SLOPED * LANES), np.zeros(LANES, np.bool_)
+        for k in range(begin, end):
+            i = k - begin
+            seen[i] = extent[k, 2] > extent[k, 0]
+            if seen[i]:
+                total = _total(first, pairs, k)
+                _load_slope(buf, i, k, flat, means, factors, total)
+                out[9, k] = total[0] * (1.0 - flat[k, 6])
+                out[10, k] = total[6] if colors[k, 0] >= 0.0 else 0.0
+                out[11, k] = total[7] if colors[k, 1] >= 0.0 else 0.0
+                out[12, k] = total[8] if colors[k, 2] >= 0.0 else 0.0
+            else:
+                out[9, k] = out[10, k] = out[11, k] = out[12, k] = 0.0
+        slope_lanes(buf, pose, way, rule[0], rule[1])
+        for f in range(9):
+            for k in range(begin, end):
+                out[f, k] = buf[U(f * LANES + k - begin)] if seen[k - begin] else 0.0
 
 
 @_exact
@@ -353,7 +329,7 @@ def standard(
         s2, c2, d2 = _column(turn, 2, log_scales[k, 2], rot, screen_slopes)
         out_scales[k, 0], out_scales[k, 1], out_scales[k, 2] = s0, s1, s2
         d00, d02, d11, d12 = d0[0] + d1[0] + d2[0], d0[1] + d1[1] + d2[1], d0[2] + d1[2] + d2[2], d0[3] + d1[3] + d2[3]
-        dx, dy, dz = _center(x, y, z, fx, fy, du, dv, d00, d02, d11, d12)
+        dx, dy, dz = centre_slope(x, y, z, fx, fy, du, dv, d00, d02, d11, d12)
         for j in range(3):
             out_means[k, j] = rot[0, j] * dx + rot[1, j] * dy + rot[2, j] * dz
         _quaternion(w, a, b, c, n, c0, c1, c2, out_quats[k])

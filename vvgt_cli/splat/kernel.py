@@ -15,7 +15,19 @@ import numba as nb
 import numpy as np
 
 from vvgt_cli.jit.decorators import inlined, kernel
-from vvgt_cli.splat.constants import NEAR, TILE
+from vvgt_cli.splat.constants import TILE
+from vvgt_cli.splat.lanes import (
+    LANES,
+    OPACITY,
+    PROJECTED,
+    U,
+    boxes,
+    load_place,
+    pose_of,
+    project_lanes,
+    put_column,
+    store_projected,
+)
 
 _jit = inlined()
 SHIFT = TILE.bit_length() - 1
@@ -61,52 +73,24 @@ def turned(rot: np.ndarray, r0: float, r1: float, r2: float) -> tuple[float, flo
 
 
 @_jit
-def _clear(k: int, depth: np.ndarray, extent: np.ndarray) -> None:
-    """Row k is not seen."""
-    extent[k, 0] = extent[k, 1] = extent[k, 2] = extent[k, 3] = 0
-    depth[k] = 0
+def _finish(
+    buf: np.ndarray, begin: int, count: int, pose: tuple[float, ...], lens: np.ndarray, rule: np.ndarray,
+    flat: np.ndarray, depth: np.ndarray, extent: np.ndarray,
+) -> None:  # fmt: skip
+    """What `project` and `project_factors` do once ``count`` Gaussians from ``begin`` on are in their lanes."""
+    fx, fy, cx, cy, width, height = lens
+    dilation, compensate, min_alpha, farthest, min_variance = rule
+    way = dilation, compensate, min_alpha, farthest, min_variance
+    project_lanes(buf, pose, (fx, fy, cx, cy), way)
+    boxes(buf, farthest, width, height)
+    store_projected(buf, begin, count, flat, depth, extent)
 
 
 @_jit
-def _place(
-    k: int, x: float, y: float, z: float, sxx: float, sxy: float, syy: float, opacity: float, lens: np.ndarray,
-    rule: np.ndarray, flat: np.ndarray, depth: np.ndarray, extent: np.ndarray,
-) -> None:  # fmt: skip
-    """Fill row k of ``flat``, ``depth`` and ``extent``, unless nothing of the Gaussian is seen.
-
-    Of its centre (x, y, z) in camera coordinates, covariance sxx, sxy, syy in px^2 without dilation, and opacity.
-    """
-    fx, fy, cx, cy, width, height = lens
-    dilation, compensate, min_alpha, farthest, min_variance = rule
-    inv = 1.0 / z
-    own = sxx * syy - sxy * sxy
-    sxx += dilation
-    syy += dilation
-    det = sxx * syy - sxy * sxy
-    if not (det > 0.0 and det < np.inf):
-        return
-    flat[k, 6] = opacity
-    if compensate > 0.0:
-        opacity *= math.sqrt(max(own, 0.0) / det)
-    if opacity < min_alpha:
-        return
-    if min_variance > 0.0:
-        middle, half = 0.5 * (sxx + syy), 0.5 * (sxx - syy)
-        if middle + math.sqrt(half * half + sxy * sxy) < min_variance:
-            return
-    u, v = fx * x * inv + cx, fy * y * inv + cy
-    reach = 2.0 * min(math.log(opacity / min_alpha), farthest)
-    ex, ey = math.sqrt(reach * sxx), math.sqrt(reach * syy)
-    x0, x1 = max(math.ceil(u - ex - 0.5), 0.0), min(math.floor(u + ex - 0.5) + 1.0, width)
-    y0, y1 = max(math.ceil(v - ey - 0.5), 0.0), min(math.floor(v + ey - 0.5) + 1.0, height)
-    if not (x1 > x0 and y1 > y0):
-        return
-    extent[k, 0], extent[k, 1], extent[k, 2], extent[k, 3] = int(x0), int(y0), int(x1), int(y1)
-    flat[k, 0], flat[k, 1] = u, v
-    per_det = 1.0 / det
-    flat[k, 2], flat[k, 3], flat[k, 4] = syy * per_det, -sxy * per_det, sxx * per_det
-    flat[k, 5] = opacity
-    depth[k] = z
+def _opacity(logits: np.ndarray, k: int) -> float:
+    """Sigmoid of ``logits`` (K,) of Gaussian k, float64."""
+    opacity: float = 1.0 / (1.0 + math.exp(-np.float64(logits[k])))
+    return opacity
 
 
 @kernel(
@@ -117,29 +101,21 @@ def project(
     means: np.ndarray, log_scales: np.ndarray, quats: np.ndarray, logits: np.ndarray, rot: np.ndarray,
     trans: np.ndarray, lens: np.ndarray, rule: np.ndarray, flat: np.ndarray, depth: np.ndarray, extent: np.ndarray,
 ) -> None:  # fmt: skip
-    """EWA projection of every Gaussian, into ``flat``, ``depth`` and ``extent``."""
-    fx, fy = lens[0], lens[1]
-    for k in nb.prange(means.shape[0]):
-        _clear(k, depth, extent)
-        x, y, z = to_camera(means, k, rot, trans)
-        opacity = 1.0 / (1.0 + math.exp(-np.float64(logits[k])))
-        if not z > NEAR or opacity < rule[2]:
-            continue
-        w, a, b, c, _ = unit_quaternion(quats, k)
-        inv = 1.0 / z
-        jx, jy = fx * inv, fy * inv
-        jxz, jyz = -fx * x * inv * inv, -fy * y * inv * inv
-        sxx = sxy = syy = 0.0
-        for axis in range(3):  # column `axis` of R diag(s), into the camera, then through the Jacobian
-            r0, r1, r2 = rotation_column(w, a, b, c, axis)
-            v0, v1, v2 = turned(rot, r0, r1, r2)
-            s = math.exp(np.float64(log_scales[k, axis]))
-            v0, v1, v2 = v0 * s, v1 * s, v2 * s
-            px, py = jx * v0 + jxz * v2, jy * v1 + jyz * v2
-            sxx += px * px
-            sxy += px * py
-            syy += py * py
-        _place(k, x, y, z, sxx, sxy, syy, opacity, lens, rule, flat, depth, extent)
+    """EWA projection of every Gaussian, into ``flat``, ``depth`` and ``extent``: every row is written."""
+    total, pose = means.shape[0], pose_of(rot, trans)
+    for chunk in nb.prange((total + LANES - 1) // LANES):
+        begin = chunk * LANES
+        count = min(LANES, total - begin)
+        buf = np.zeros(PROJECTED * LANES)
+        for i in range(count):
+            k, j = begin + i, U(i)
+            buf[j], buf[j + U(LANES)], buf[j + U(2 * LANES)] = means[k, 0], means[k, 1], means[k, 2]
+            w, a, b, c, _ = unit_quaternion(quats, k)
+            put_column(buf, j, 0, rotation_column(w, a, b, c, 0), math.exp(np.float64(log_scales[k, 0])))
+            put_column(buf, j, 1, rotation_column(w, a, b, c, 1), math.exp(np.float64(log_scales[k, 1])))
+            put_column(buf, j, 2, rotation_column(w, a, b, c, 2), math.exp(np.float64(log_scales[k, 2])))
+            buf[j + OPACITY] = _opacity(logits, k)
+        _finish(buf, begin, count, pose, lens, rule, flat, depth, extent)
 
 
 @kernel(
@@ -151,26 +127,15 @@ def project_factors(
     rule: np.ndarray, flat: np.ndarray, depth: np.ndarray, extent: np.ndarray,
 ) -> None:  # fmt: skip
     """`project` for covariances ``M M^T`` given by ``factors`` (K, 3, 3) M."""
-    fx, fy = lens[0], lens[1]
-    for k in nb.prange(means.shape[0]):
-        _clear(k, depth, extent)
-        x, y, z = to_camera(means, k, rot, trans)
-        opacity = 1.0 / (1.0 + math.exp(-np.float64(logits[k])))
-        if not z > NEAR or opacity < rule[2]:
-            continue
-        inv = 1.0 / z
-        jx, jy = fx * inv, fy * inv
-        jxz, jyz = -fx * x * inv * inv, -fy * y * inv * inv
-        sxx = sxy = syy = 0.0
-        for axis in range(3):
-            v0, v1, v2 = turned(
-                rot, np.float64(factors[k, 0, axis]), np.float64(factors[k, 1, axis]), np.float64(factors[k, 2, axis])
-            )
-            px, py = jx * v0 + jxz * v2, jy * v1 + jyz * v2
-            sxx += px * px
-            sxy += px * py
-            syy += py * py
-        _place(k, x, y, z, sxx, sxy, syy, opacity, lens, rule, flat, depth, extent)
+    total, pose = means.shape[0], pose_of(rot, trans)
+    for chunk in nb.prange((total + LANES - 1) // LANES):
+        begin = chunk * LANES
+        count = min(LANES, total - begin)
+        buf = np.zeros(PROJECTED * LANES)
+        for i in range(count):
+            load_place(buf, U(i), begin + i, means, factors)
+            buf[U(i) + OPACITY] = _opacity(logits, begin + i)
+        _finish(buf, begin, count, pose, lens, rule, flat, depth, extent)
 
 
 @kernel("i8:1 i4:2 i8 i8 i8", parallel=True)

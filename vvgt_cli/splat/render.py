@@ -68,7 +68,7 @@ def _projected(
     from vvgt_cli.splat import kernel
 
     rule, count = rule_of(rule), len(arrays[0])
-    flat = np.zeros((count, 7), np.float32)
+    flat = np.empty((count, 7), np.float32)
     depth = np.empty(count, np.float32)
     extent = np.empty((count, 4), np.int32)
     kernel_project(*arrays, *pose(camera), rule.projecting(), flat, depth, extent)
@@ -261,15 +261,12 @@ class FrameGradients:
     """Gradients for steps in each Gaussian's own frame, ``mu += M d``, ``M <- M (I + E)``, E symmetric.
 
     Attributes:
-        frame: (K, 9) float32 d (3), then E: xx, yy, zz, xy, xz, yz; one off the diagonal stands for both entries.
-        opacity_logits: (K,) float32.
-        colors: (K, 3) float32.
+        rows: (13, K) float32, a row a field: d (3), then E: xx, yy, zz, xy, xz, yz, one off the diagonal for both
+            entries, opacity logit, colour (3).
         harmonics: (K, M, 3) float32, None where there are none.
     """
 
-    frame: np.ndarray
-    opacity_logits: np.ndarray
-    colors: np.ndarray
+    rows: np.ndarray
     harmonics: np.ndarray | None = None
 
 
@@ -289,15 +286,12 @@ def own_frame_backward(
     """
     from vvgt_cli.splat import backward
 
-    p, count = projection, len(means)
-    out = FrameGradients(*(np.empty(shape, np.float32) for shape in ((count, 9), (count,), (count, 3))))
+    p, rows = projection, np.empty((13, len(means)), np.float32)
     backward.own_frame(
-        p.first, pairs, p.extent, p.flat, means, factors, colors, *pose(camera),
-        p.rule.projecting(),
-        out.frame, out.opacity_logits, out.colors,
-    )  # fmt: skip
+        p.first, pairs, p.extent, p.flat, means, factors, colors, *pose(camera), p.rule.projecting(), rows
+    )
     if harmonics is None:
-        return out
-    by_harmonics, by_means = seen_slopes(means, harmonics, camera.position, out.colors)
-    out.frame[:, :3] += np.einsum("kji,kj->ki", factors, by_means)
-    return replace(out, harmonics=by_harmonics)
+        return FrameGradients(rows)
+    by_harmonics, by_means = seen_slopes(means, harmonics, camera.position, np.ascontiguousarray(rows[10:].T))
+    rows[:3] += np.einsum("kji,kj->ik", factors, by_means)
+    return FrameGradients(rows, by_harmonics)
