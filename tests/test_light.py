@@ -272,11 +272,13 @@ def test_renderers_say_which_light_they_do_not_know():
 BY_VTK = """
 import sys
 import numpy as np
-from test_light import both, STEP, by_cpu_mapper, distant
-from vvgt_cli.dvr.backends import view_renderer
+from test_light import both, long_box, STEP, by_cpu_mapper, distant
+from vvgt_cli.dvr.vtk import view_renderer
 found = {}
+for name in ("stretched", "mended"):
+    found[name] = view_renderer(long_box(), STEP, mended=name == "mended")(distant())
 for name, (scene, step) in both().items():
-    found[name] = view_renderer("vtk", scene, STEP)(distant())
+    found[name] = view_renderer(scene, STEP)(distant())
     found[name + " cpu"] = by_cpu_mapper(scene, distant())
 np.savez(sys.argv[1], **found)
 """
@@ -288,9 +290,9 @@ def distant():
     return look_at((22.0, -16.0, 11.0), width=384, height=384, fov=4)
 
 
-def smooth_ball():
-    """A ball with a soft edge: values far from zero gradients where it is seen."""
-    z, y, x = np.meshgrid(*[np.linspace(-1, 1, 32)] * 3, indexing="ij")
+def smooth_ball(long=1):
+    """A ball with a soft edge: values far from zero gradients where it is seen; the box is ``long`` times as high."""
+    z, y, x = np.meshgrid(np.linspace(-long, long, 32 * long), *[np.linspace(-1, 1, 32)] * 2, indexing="ij")
     data = (1.2 - np.sqrt(x * x + y * y + z * z)).astype(np.float32)
     return Scene.build(Volume(data), function([0.3, 0.5, 1.2], [0, 0.9, 0.9], [[1, 0.5, 0.2]] * 3), 1.0)
 
@@ -299,6 +301,10 @@ def both():
     ball = smooth_ball()
     fixed = Lighting(False, (SLANTED,), 0, 0.9, 0)
     return {"headlight": (ball.lit(Lighting()), STEP), "fixed": (ball.lit(fixed), STEP)}
+
+
+def long_box():
+    return smooth_ball(2).lit(Lighting(False, (SLANTED,), 0, 0.9, 0))
 
 
 def by_cpu_mapper(scene, view):
@@ -347,5 +353,16 @@ def test_both_mappers_of_vtk_shade_alike(from_vtk, name, mapper):
     assert seen.mean() > 0.2
     if name == "fixed" and mapper:  # it lights no surface from behind: what is turned away stays dark
         seen &= theirs[..., 0] > 0.1
+    assert decibels(theirs, ours, seen) > 40
+
+
+def decibels(theirs, ours, seen):
     a, b = (np.round(255 * np.clip(i[..., :3], 0, 1)) / 255 for i in (theirs, ours))
-    assert -10 * np.log10(np.mean((a - b)[seen] ** 2)) > 40
+    return -10 * np.log10(np.mean((a - b)[seen] ** 2))
+
+
+def test_vtk_stretches_normals_along_the_screen_where_the_box_is_no_cube(from_vtk):
+    ours = render_view(long_box(), distant(), STEP)
+    seen = ours[..., 3] > 0.01
+    assert decibels(from_vtk["stretched"], ours, seen) < 25
+    assert decibels(from_vtk["mended"], ours, seen) > 40

@@ -21,6 +21,10 @@ from vvgt_cli.errors import DataError
 NODES = 4096  # of the functions handed to VTK: it tabulates them anyway
 REFLECTED = 0.25  # of the power: of the angle to the reflected ray, twice that to the half vector
 NEAR = 1e-3  # unit-frame lengths: an eye inside the volume sees what is around it
+EYE_NORMALS = (  # in the fragment shader: VTK's own, and without the box's extents along the screen's axes
+    "in_textureToEye[0] * vec4(shading_gradient.xyz, 0.0)",
+    "in_modelViewMatrix * in_volumeMatrix[0] * vec4(shading_gradient.xyz, 0.0)",
+)
 MODULES = ("vtkRenderingOpenGL2", "vtkRenderingVolumeOpenGL2")  # their import registers what the classes below become
 PROBE = (
     "import vtkmodules.vtkRenderingOpenGL2\n"
@@ -44,11 +48,12 @@ def require_opengl() -> None:
         )
 
 
-def view_renderer(scene: Scene, settings: RenderSettings) -> Callable[[Camera], np.ndarray]:
+def view_renderer(scene: Scene, settings: RenderSettings, mended: bool = False) -> Callable[[Camera], np.ndarray]:
     """A function from a camera to VTK's view, (height, width, 4) float32, premultiplied RGBA in steps of 1/255.
 
     One ray a pixel at ``settings.step`` voxels of the mean edge. The volume is padded by its edge voxels and cropped to
-    the box, because VTK's own bounds end at the outermost voxel centres.
+    the box, because VTK's own bounds end at the outermost voxel centres. ``mended`` turns normals to the eye without
+    stretching them, which VTK does under lights from directions where the box is no cube (docs/light.md).
 
     Raises:
         DataError: no off-screen OpenGL here.
@@ -72,6 +77,8 @@ def view_renderer(scene: Scene, settings: RenderSettings) -> Callable[[Camera], 
     volume = vtkVolume()
     volume.SetMapper(mapper)
     volume.SetProperty(volume_property(scene))
+    if mended:
+        volume.GetShaderProperty().AddFragmentShaderReplacement(EYE_NORMALS[0], False, EYE_NORMALS[1], True)
     renderer = vtkRenderer()
     renderer.SetBackground(0, 0, 0)
     renderer.SetBackgroundAlpha(0)

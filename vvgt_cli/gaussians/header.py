@@ -42,6 +42,7 @@ class PlyHeader:
         space: anatomical space of the world, "RAS", "LPS" or "none"; None where no comment says.
         affine: 3 x 4 row-major, voxel index (i, j, k, 1) of the volume to world position.
         light: what fell on the scene, None where no comment says.
+        optics: digest of the tables and functions of an optics grid, None where no comment says.
         version: of the vvgt that wrote it, None for other programs.
     """
 
@@ -61,6 +62,7 @@ class PlyHeader:
     space: str | None = None
     affine: tuple[float, ...] | None = None
     light: Lighting | None = None
+    optics: str | None = None
     version: str | None = None
 
 
@@ -202,6 +204,8 @@ def _one_comment(words: list[str]) -> dict[str, Any]:
         return {"space": words[1]}
     if words[0] == "light":
         return {"light": parse_lighting(" ".join(words[1:]))}
+    if words[0] == "optics":
+        return {"optics": words[1]}
     if words[0] == "affine":
         affine = _finite(words[1:])
         axes = np.reshape(affine, (3, 4))[:, :3]  # another count: ValueError

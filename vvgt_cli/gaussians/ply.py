@@ -42,6 +42,7 @@ class PlyOptions:
         space: anatomical space of the world, "RAS", "LPS" or "none", recorded in the comments with the affine.
         affine: 3 x 4 row-major, voxel index to world, recorded in the comments.
         light: what fell on the scene, as `vvgt_cli.transfer.lighting.Lighting.text` has it, recorded in the comments.
+        optics: digest of the tables and functions of an optics grid, recorded in the comments.
     """
 
     frame: str = "unit"
@@ -56,6 +57,7 @@ class PlyOptions:
     space: str = "none"
     affine: tuple[float, ...] | None = None
     light: str | None = None
+    optics: str | None = None
 
     def __post_init__(self) -> None:
         up_matrix(self.up)
@@ -111,6 +113,8 @@ def _comments(options: PlyOptions) -> list[str]:
         lines.append(f"comment vvgt size {options.made_for} rule {options.rule or 'inria'}")
     if options.light is not None:
         lines.append(f"comment vvgt light {options.light}")
+    if options.optics is not None:
+        lines.append(f"comment vvgt optics {options.optics}")
     if options.rule == "compensated":
         lines.append(MIP)
     return lines

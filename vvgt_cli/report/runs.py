@@ -23,7 +23,8 @@ SCORING = ("test views", "seats")  # stages that only measure
 KINDS = ("closed form", "network", "steps", "baseline")
 STAGES = {  # colours of the stages that are known, in order
     "read": "#8a949e", "scene": "#b4bbc2", "samples": "#8f7bbf", "closed form": "#2f7fbf", "check views": "#f2c76b",
-    "views": "#e69f00", "back-projection": "#56b4e9", "network": "#cc79a7", "judge": "#e3b5cd", "refinement": "#009e73",
+    "views": "#e69f00", "cells by error": "#0f8f8f", "back-projection": "#56b4e9", "network": "#cc79a7",
+    "judge": "#e3b5cd", "refinement": "#009e73",
     "write": "#777c83", "test views": "#dddddd", "seats": "#e8e8e8",
 }  # fmt: skip
 OTHER = "#a05d3b"
