@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from tests.test_scale import FIT, bodies
+from vvgt_cli.errors import DataError
 
 ROOT = Path(__file__).parent.parent
 SIZE = ("--blocks", "32")
@@ -225,8 +226,13 @@ eval script=\\${$#}
 [ -z "$SBATCH_REFUSES" ] || { echo "sbatch: error: invalid partition" >&2; exit 1; }
 [ "$1" != --test-only ] || exit 0
 cp "$script" "$SLURM_FAKE/job-$$.sh"
-setsid bash "$SLURM_FAKE/job-$$.sh" >"$SLURM_FAKE/job-$$.log" 2>&1 &
+setsid bash -c "${SLURM_FIRST:-true}; bash '$SLURM_FAKE/job-$$.sh'" >"$SLURM_FAKE/job-$$.log" 2>&1 &
 echo "Submitted batch job $!"
+"""
+SQUEUE = """#!/bin/sh
+jobs=$(eval echo \\${$#} | tr '=,' '  ')
+for job in ${jobs#* }; do kill -0 "$job" 2>/dev/null && { echo "$job"; known=1; }; done
+[ -n "$known" ] || { echo "slurm_load_jobs error: Invalid job id specified" >&2; exit 1; }
 """
 SCANCEL = """#!/bin/sh
 for job; do kill -TERM -"$job" 2>/dev/null; done
@@ -240,7 +246,7 @@ def slurm(tmp_path):
     pytest.importorskip("dask_jobqueue")
     folder = tmp_path / "slurm"
     folder.mkdir()
-    for name, text in (("sbatch", SBATCH), ("scancel", SCANCEL)):
+    for name, text in (("sbatch", SBATCH), ("scancel", SCANCEL), ("squeue", SQUEUE)):
         (folder / name).write_text(text)
         (folder / name).chmod(0o755)
     settings = {"DASK_JOBQUEUE__SLURM__INTERFACE": "lo", "DASK_JOBQUEUE__SLURM__ACCOUNT": "geology"}
@@ -299,6 +305,33 @@ def test_slurm_that_is_not_there_or_refuses_is_a_line(vvgt, raw, tmp_path, slurm
     said = run.communicate(timeout=300)[1]
     assert (run.returncode, said.count("\n")) == (1, 1), said
     assert "sbatch refuses the job (sbatch: error: invalid partition)" in said
+
+
+@pytest.fixture
+def jobs(slurm, monkeypatch):
+    """Jobs in this process, looked at twice a second; the variables of SLURM's stand-in as given."""
+    from vvgt_cli.scale import dask_runner
+
+    monkeypatch.setattr(dask_runner, "AGAIN", 0.5)
+    monkeypatch.setattr(dask_runner, "asked_memory", lambda: 1e9)
+    for name, value in slurm[1].items():
+        monkeypatch.setenv(name, value)
+    return lambda: dask_runner.Dask("slurm", 2, 1)
+
+
+def test_slurm_jobs_that_all_end_before_they_work_are_said(slurm, jobs, monkeypatch):
+    monkeypatch.setenv("SLURM_FIRST", "echo no python here; exit 3")
+    with jobs() as runner, pytest.raises(DataError, match=r"all jobs have ended, .* \(slurm-\d+\.out\)"):
+        runner.run(print, range(3), None)
+    assert len(list(slurm[0].glob("job-*.sh"))) == 2
+
+
+def test_slurm_jobs_that_are_long_in_coming_are_waited_for(jobs, monkeypatch):
+    monkeypatch.setenv("SLURM_FIRST", "sleep 4")
+    told = []
+    with jobs() as runner:
+        runner.run(print, range(3), lambda done, total: told.append((done, total)))
+    assert told == [(1, 3), (2, 3), (3, 3)]
 
 
 def test_a_disk_without_room_for_the_blocks_is_said_before_they_are_made(vvgt, raw, tmp_path, monkeypatch):

@@ -6,7 +6,9 @@ import importlib
 import logging
 import shutil
 import subprocess
+import threading
 from collections.abc import Sequence
+from concurrent.futures import CancelledError
 from contextlib import ExitStack
 from typing import Any
 
@@ -15,7 +17,8 @@ from vvgt_cli.resources import asked_memory
 from vvgt_cli.scale.runners import Progress, Task
 
 LOCAL, SLURM = "local", "slurm"
-AGAIN = 30_000  # milliseconds until a job that has ended is followed by another
+AGAIN = 30.0  # seconds until a job that has ended is followed by another
+ANSWER = 120.0  # seconds for SLURM to answer
 TRIES = 3  # of a block whose worker was lost
 WAIT = "15s"  # for a scheduler to answer
 
@@ -50,6 +53,8 @@ class Dask:
         logging.getLogger("distributed").setLevel(logging.CRITICAL)  # errors are lines of our own
         self._scheduler, self.workers, self._threads = scheduler, workers, threads
         self._stack, self._client = ExitStack(), None
+        self._futures: Sequence[Any] = ()
+        self._lost: str | None = None  # why no worker will come any more
         if scheduler == SLURM:
             _need("dask_jobqueue")
             if shutil.which("sbatch") is None:
@@ -75,7 +80,7 @@ class Dask:
             return
         distributed = _need("distributed")
         client = self._client = self._client or self._connected()
-        futures = client.map(task, list(numbers), retries=TRIES, pure=False)
+        futures = self._futures = client.map(task, list(numbers), retries=TRIES, pure=False)
         try:
             for done, future in enumerate(distributed.as_completed(futures), 1):
                 future.result()
@@ -85,6 +90,8 @@ class Dask:
             raise DataError(
                 f"workers were ended {TRIES} times at one block (out of memory?); try --blocks with a smaller size"
             ) from error
+        except CancelledError:
+            raise DataError(self._lost or "the blocks were cancelled at the scheduler") from None
 
     def _connected(self) -> Any:
         """A client of the scheduler; what is started for it ends with the context."""
@@ -128,7 +135,11 @@ class Dask:
             )  # fmt: skip
         except (OSError, RuntimeError, TypeError, ValueError) as error:
             raise DataError(f"--scheduler slurm: {error}; settings are those of jobqueue.slurm in Dask's") from error
-        tried = subprocess.run(["sbatch", "--test-only"], input=cluster.job_script(), capture_output=True, text=True)
+        try:
+            tried = _asked(["sbatch", "--test-only"], cluster.job_script())
+        except subprocess.TimeoutExpired:
+            cluster.close()
+            raise DataError(f"--scheduler slurm: sbatch does not answer within {ANSWER:g} s; try later") from None
         if tried.returncode:
             cluster.close()
             said = [line.strip() for line in tried.stderr.splitlines() if line.strip()] or ["no reason given"]
@@ -142,13 +153,48 @@ class Dask:
     def _keep(self, cluster: Any) -> None:
         """Ask for the jobs, and again for those that have ended, until the context does.
 
-        A job that ends before its worker has answered is not seen as ended: then this waits for the others.
+        Where all have ended and no worker answers, the tasks are cancelled.
         """
         cluster.scale(jobs=self.workers)
-        callback = importlib.import_module("tornado.ioloop").PeriodicCallback
-        again = callback(lambda: cluster.scale(jobs=self.workers), AGAIN)
-        self._stack.callback(cluster.loop.add_callback, again.stop)
-        cluster.loop.add_callback(again.start)
+        over = threading.Event()
+
+        def watch() -> None:
+            gone: set[str] = set()
+            while not over.wait(AGAIN):
+                found = jobs_gone(cluster)
+                if over.is_set() or self._client is None:
+                    continue
+                if found and found == gone:  # seen twice: no job that has only just ended
+                    self._lost = (
+                        f"--scheduler slurm: all jobs have ended, with blocks left to do; why is in the files of their "
+                        f"output (slurm-{min(found, key=int)}.out); the same command goes on with what is done"
+                    )
+                    self._client.cancel(self._futures, force=True)
+                    return
+                gone = found
+                cluster.scale(jobs=self.workers)
+
+        self._stack.callback(over.set)
+        threading.Thread(target=watch, daemon=True).start()
+
+
+def jobs_gone(cluster: Any) -> set[str]:
+    """Numbers of the jobs of a cluster without workers, where SLURM knows none of them any more; else none."""
+    numbers = {str(job.job_id) for job in cluster.workers.values() if job.job_id}
+    if cluster.scheduler_info["workers"] or not numbers:
+        return set()
+    try:
+        asked = _asked(["squeue", "--noheader", "--format=%A", f"--jobs={','.join(sorted(numbers))}"])
+    except (OSError, subprocess.TimeoutExpired):
+        return set()
+    if asked.returncode and "nvalid job id" not in asked.stderr:  # what squeue says of jobs long ended
+        return set()
+    return set() if numbers & set(asked.stdout.split()) else numbers
+
+
+def _asked(command: list[str], given: str = "") -> subprocess.CompletedProcess[str]:
+    """What a command of SLURM says."""
+    return subprocess.run(command, input=given, capture_output=True, text=True, timeout=ANSWER)
 
 
 def _environment(threads: int) -> dict[str, str]:
