@@ -58,13 +58,31 @@ def test_blocks_leave_the_gaussians_that_memory_does_in_any_size_of_block(vvgt, 
     assert [p.name for p in tmp_path.iterdir() if "blocks" in p.name] == []
 
 
-@pytest.mark.parametrize("budget", ["1", "7", "64", "400", "100000"])
+@pytest.mark.parametrize("budget", ["1", "7", "64", "400", "60000"])
 def test_any_budget_is_cut_as_in_memory(vvgt, raw, tmp_path, budget):
     one, other = tmp_path / "a.ply", tmp_path / "b.ply"
     fit = ("--max-gaussians", budget, "--size", "100", "-q")
     assert vvgt("init", raw, "-o", one, *fit).code == 0
     assert vvgt("init", raw, "-o", other, *fit, "--blocks", "32").code == 0
     assert same_gaussians(one, other)
+
+
+def test_of_several_batches_all_but_some_colours_are_those_of_memory(vvgt, raw, tmp_path):
+    one, other = tmp_path / "a.ply", tmp_path / "b.ply"
+    fit = ("--max-gaussians", "100000", "--size", "100", "-q")
+    assert vvgt("init", raw, "-o", one, *fit).code == 0
+    assert vvgt("init", raw, "-o", other, *fit, "--blocks", "32").code == 0
+    both = []
+    for path in (one, other):
+        found = read_ply(path)[0]
+        both.append(found.take(np.lexsort(found.means.T)))
+    assert len(both[0]) == len(both[1]) > 65536
+    for name, values in both[0].arrays().items():
+        if name != "colors":
+            np.testing.assert_array_equal(values, both[1].arrays()[name])
+    apart = np.abs(both[0].colors - both[1].colors).max(axis=1)
+    assert 0 < (apart > 0).mean() < 0.4  # neighbours are those of a batch
+    assert np.sqrt((apart**2).mean()) < 0.01
 
 
 def test_opaque_anisotropic_and_turned_volumes_too(vvgt, tmp_path):

@@ -20,6 +20,7 @@ CLOSED_FORM = (
     "vvgt_cli.vbm.pyramid:sum_children",
     "vvgt_cli.vbm.pyramid:score_splits",
     "vvgt_cli.vbm.pyramid:principal_axes",
+    "vvgt_cli.vbm.sharpen:mix_neighbours",
     "vvgt_cli.vbm.inset:_shift",
     "vvgt_cli.vbm.inset:_blur",
 )

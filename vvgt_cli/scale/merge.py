@@ -176,11 +176,14 @@ class Cut:
         """Those of the cells that a threshold leaves, in the box frame, as a file holds them, in batches."""
         from vvgt_cli.scale.forest import batches
         from vvgt_cli.vbm.closed_form import pixel_width
+        from vvgt_cli.vbm.columns import MASS, SEEN
         from vvgt_cli.vbm.shape import ROUND, cell_gaussians
+        from vvgt_cli.vbm.sharpen import sharpened
 
         voxel, pixel = min(self.plan.grid.step), pixel_width(self.plan.size)
         for leaves in batches(self.forest.leaves(threshold), BATCH):
-            yield as_stored(cell_gaussians(leaves, voxel, pixel, self.opaque, ROUND))
+            made = cell_gaussians(leaves, voxel, pixel, self.opaque, ROUND)
+            yield as_stored(sharpened(made, leaves.moments[:, SEEN] / leaves.moments[:, MASS]))
 
 
 @contextmanager

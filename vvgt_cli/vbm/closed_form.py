@@ -16,11 +16,13 @@ from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.splat import render
 from vvgt_cli.splat.rules import INRIA, Rule
 from vvgt_cli.transfer.tables import OpticalTables
+from vvgt_cli.vbm.columns import MASS, SEEN
 from vvgt_cli.vbm.error import scores_by_error, unseen
 from vvgt_cli.vbm.fit import blending_weights, image_errors, solve_colors, weights_and_errors
 from vvgt_cli.vbm.inset import Opaque, opaque_field
 from vvgt_cli.vbm.moments import base_cells, exponents
 from vvgt_cli.vbm.shape import ROUND, STYLES, SurfaceStyle, cell_gaussians
+from vvgt_cli.vbm.sharpen import sharpened
 from vvgt_cli.vbm.tree import Leaves, Tree, build_tree, leaves_of, select, split, split_score
 from vvgt_cli.vbm.visibility import Visibility, visibility
 
@@ -75,11 +77,11 @@ class ClosedForm:
 
     def _of(self, leaves: Leaves, style: SurfaceStyle) -> Gaussians:
         found = cell_gaussians(leaves, self.voxel, self.pixel, self.opaque, style)
-        if self.scene.light is None:
-            return found
-        from vvgt_cli.vbm.lit import lit
+        if self.scene.light is not None:
+            from vvgt_cli.vbm.lit import lit
 
-        return lit(found, self.scene, self.tree, leaves, self.degree)
+            found = lit(found, self.scene, self.tree, leaves, self.degree)
+        return sharpened(found, leaves.moments[:, SEEN] / leaves.moments[:, MASS])
 
     def cut_by_error(self, drawn: Gaussians, cameras: Sequence[Camera], views: np.ndarray, rule: Rule) -> Gaussians:
         """`gaussians` of cells chosen by what views (n, h, w, 4) show of the error of those, ``drawn``, by ``rule``.
