@@ -190,7 +190,7 @@ def test_commands_need_what_is_compiled_ahead_and_nothing_else(tmp_path):
     assert lit == set(ahead.for_degree(ahead.for_light(ahead.CONVERT, False), 2)) - rare
     np.save(tmp_path / "seg.npy", (np.indices((9, 9, 9)).sum(axis=0) // 9).astype(np.uint8))
     labels = wanted(tmp_path, "convert", "seg.npy", *fit, "--steps", 24, "-o", "g.ply")
-    assert labels == set(ahead.for_grid(ahead.CONVERT))
+    assert labels == set(ahead.for_grid(ahead.CONVERT)) - {"vvgt_cli.vbm.sharpen:mix_neighbours"}  # of other grids
     assert one_by_one(tmp_path, "convert", "seg.npy", *large, "-o", "h.ply") == []
     dark = ("--light", "above", "--shadows", "--specular", 0)
     flat = wanted(tmp_path, "convert", SOURCE, *fit, "--steps", 24, *dark, "-o", "f.ply")

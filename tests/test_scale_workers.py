@@ -321,7 +321,7 @@ def jobs(slurm, monkeypatch):
 
 def test_slurm_jobs_that_all_end_before_they_work_are_said(slurm, jobs, monkeypatch):
     monkeypatch.setenv("SLURM_FIRST", "echo no python here; exit 3")
-    with jobs() as runner, pytest.raises(DataError, match=r"all jobs have ended, .* \(slurm-\d+\.out\)"):
+    with jobs() as runner, pytest.raises(DataError, match=r"all jobs have ended, .*slurm-\d+\.out"):
         runner.run(print, range(3), None)
     assert len(list(slurm[0].glob("job-*.sh"))) == 2
 

@@ -18,6 +18,7 @@ from vvgt_cli.vbm import VbmOptions, closed_form, initialise, sharpen
 from vvgt_cli.vbm.sharpen import AMOUNT, BRIGHTEST, WINDOW, curves, sharpened
 from vvgt_cli.volume import Volume
 
+BOX = np.array([1.0, 1.0, 1.0])
 BLUE, YELLOW = [0.1, 0.3, 0.9], [0.9, 0.8, 0.1]
 
 
@@ -56,10 +57,10 @@ def unbounded(monkeypatch):
 @pytest.mark.usefixtures("unbounded")
 def test_the_kernel_is_its_twin():
     gaussians, seen = cloud(700), np.random.default_rng(8).random(700) ** 3
-    _, places = curves(gaussians.means)
+    _, places = curves(gaussians.means, BOX)
     near = (np.abs(places[:, :, None] - places[:, None, :]) <= WINDOW).any(axis=0)
     assert 0.01 < near.mean() < 0.2
-    np.testing.assert_allclose(sharpened(gaussians, seen).colors, twin(gaussians, near, seen), atol=2e-6)
+    np.testing.assert_allclose(sharpened(gaussians, seen, BOX).colors, twin(gaussians, near, seen), atol=2e-6)
 
 
 @pytest.mark.usefixtures("unbounded")
@@ -70,21 +71,21 @@ def test_nearly_all_who_overlap_are_found(kind):
         places = (np.stack(np.meshgrid(*[np.arange(12)] * 3), axis=-1).reshape(-1, 3) + 0.5) / 12
         gaussians = replace(gaussians, means=places.astype(np.float32))
     alike = np.ones(1728)
-    wrong = np.abs(sharpened(gaussians, alike).colors - twin(gaussians, np.ones((1728, 1728), bool), alike))
+    wrong = np.abs(sharpened(gaussians, alike, BOX).colors - twin(gaussians, np.ones((1728, 1728), bool), alike))
     assert np.sqrt((wrong**2).mean()) < 0.065 * AMOUNT  # of colours even in [0, 1]: far ones are left out
     assert np.abs(wrong).max() < 0.3 * AMOUNT
 
 
 def test_one_colour_stays_and_order_and_scale_do_not_matter():
     plain = replace(cloud(300, 2), colors=np.full((300, 3), 0.3, np.float32))
-    np.testing.assert_allclose(sharpened(plain, np.ones(300)).colors, plain.colors, atol=1e-6)
+    np.testing.assert_allclose(sharpened(plain, np.ones(300), BOX).colors, plain.colors, atol=1e-6)
     gaussians = cloud(300, 3)
     rng = np.random.default_rng(4)
     seen, order = rng.random(300), rng.permutation(300)
-    found = sharpened(gaussians, seen).colors
-    np.testing.assert_array_equal(sharpened(gaussians.take(order), seen[order]).colors, found[order])
+    found = sharpened(gaussians, seen, BOX).colors
+    np.testing.assert_array_equal(sharpened(gaussians.take(order), seen[order], BOX).colors, found[order])
     larger = replace(gaussians, means=64 * gaussians.means, log_scales=gaussians.log_scales + np.float32(np.log(64)))
-    np.testing.assert_allclose(sharpened(larger, seen).colors, found, atol=1e-5)
+    np.testing.assert_allclose(sharpened(larger, seen, 64 * BOX).colors, found, atol=1e-5)
 
 
 def test_what_is_extreme_stays_finite_and_within_its_range():
@@ -95,22 +96,23 @@ def test_what_is_extreme_stays_finite_and_within_its_range():
     gaussians.opacity_logits[60:200] = -800
     gaussians.colors[210:220] = 3.0  # brighter than the limit before
     seen = np.where(np.arange(400) % 3 == 0, 0.0, 1e-9)
-    found = sharpened(gaussians, seen).colors
+    found = sharpened(gaussians, seen, BOX).colors
     assert np.isfinite(found).all()
     assert (found >= 0).all()
     assert (np.delete(found, range(210, 220), axis=0) <= BRIGHTEST).all()
     assert (found[210:220] <= 3.0).all()
-    faint = sharpened(replace(gaussians, opacity_logits=np.full(400, -800, np.float32)), seen)  # areas of nothing
+    faint = sharpened(replace(gaussians, opacity_logits=np.full(400, -800, np.float32)), seen, BOX)  # areas of nothing
     assert np.isfinite(faint.colors).all()
     for n in (0, 1):
-        assert len(sharpened(gaussians.take(np.arange(n)), seen[:n])) == n
+        assert len(sharpened(gaussians.take(np.arange(n)), seen[:n], BOX)) == n
 
 
+@pytest.mark.usefixtures("unbounded")
 def test_harmonics_are_sharpened_as_colours_are():
     gaussians = cloud(300, 6, harmonics=8)
     assert gaussians.harmonics is not None
     second = replace(gaussians, colors=np.ascontiguousarray(gaussians.harmonics[:, 3]))
-    found, beside = sharpened(gaussians, np.ones(300)).harmonics, sharpened(second, np.ones(300)).colors
+    found, beside = sharpened(gaussians, np.ones(300), BOX).harmonics, sharpened(second, np.ones(300), BOX).colors
     np.testing.assert_allclose(found[:, 3], beside, atol=1e-6)
 
 
@@ -128,9 +130,9 @@ def test_what_is_hidden_takes_the_colour_of_what_hides_it():
     both = replace(behind.take(np.arange(400)), colors=np.tile(np.float32(YELLOW), (400, 1)))
     both = together([both, replace(front, colors=np.tile(np.float32(BLUE), (400, 1)))])
     seen = np.concatenate([np.full(400, 0.01), np.ones(400)])
-    found = sharpened(both, seen).colors
+    found = sharpened(both, seen, BOX).colors
     assert np.abs(found[:400] - BLUE).mean() < 0.1 * np.abs(np.subtract(YELLOW, BLUE)).mean()
-    alike = sharpened(both, np.ones(800)).colors
+    alike = sharpened(both, np.ones(800), BOX).colors
     assert np.abs(alike[:400] - YELLOW).mean() < 0.3 * np.abs(np.subtract(YELLOW, BLUE)).mean()
 
 
@@ -143,5 +145,5 @@ def test_the_closed_form_gains_where_colours_vary(monkeypatch):
         return np.mean([psnr(view[..., :3], render(made, c)[..., :3]) for c, view in zip(cameras, views, strict=True)])
 
     with_it = score()
-    monkeypatch.setattr(closed_form, "sharpened", lambda gaussians, seen: gaussians)
+    monkeypatch.setattr(closed_form, "sharpened", lambda gaussians, seen, half: gaussians)
     assert with_it > score() + 1

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import importlib
 import logging
+import os
 import shutil
 import subprocess
 import threading
 from collections.abc import Sequence
 from concurrent.futures import CancelledError
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from typing import Any
 
 from vvgt_cli.errors import DataError, UsageError
@@ -74,7 +75,7 @@ class Dask:
         """Do the tasks; those of a worker that was lost are done anew, by another.
 
         Raises:
-            DataError: no scheduler, jobs that are refused, or workers that are lost again and again.
+            DataError: no scheduler, jobs that are refused or have all ended, or workers that are lost again and again.
         """
         if not numbers:
             return
@@ -91,7 +92,8 @@ class Dask:
                 f"workers were ended {TRIES} times at one block (out of memory?); try --blocks with a smaller size"
             ) from error
         except CancelledError:
-            raise DataError(self._lost or "the blocks were cancelled at the scheduler") from None
+            told = f"--scheduler {self._scheduler}: it has ended, or cancelled the blocks; the same command goes on"
+            raise DataError(self._lost or told) from None
 
     def _connected(self) -> Any:
         """A client of the scheduler; what is started for it ends with the context."""
@@ -123,7 +125,7 @@ class Dask:
         """One worker a job; account, partition and time are those of Dask's own settings, `jobqueue.slurm`.
 
         Raises:
-            DataError: a job is refused.
+            DataError: a job is refused, or SLURM does not answer.
         """
         jobqueue = _need("dask_jobqueue")
         try:
@@ -166,13 +168,17 @@ class Dask:
                     continue
                 if found and found == gone:  # seen twice: no job that has only just ended
                     self._lost = (
-                        f"--scheduler slurm: all jobs have ended, with blocks left to do; why is in the files of their "
-                        f"output (slurm-{min(found, key=int)}.out); the same command goes on with what is done"
+                        "--scheduler slurm: all jobs have ended, with blocks left to do; why is in the files of their "
+                        f"output (slurm-{min(found, key=int)}.out, or where jobqueue.slurm in Dask's settings puts "
+                        "it); the same command goes on with what is done"
                     )
-                    self._client.cancel(self._futures, force=True)
-                    return
+                    with suppress(
+                        Exception
+                    ):  # blocks of a pass that has just ended: the next look has those of the next
+                        self._client.cancel(self._futures, force=True)
+                    continue
                 gone = found
-                cluster.scale(jobs=self.workers)
+                cluster.loop.add_callback(cluster.scale, jobs=self.workers)
 
         self._stack.callback(over.set)
         threading.Thread(target=watch, daemon=True).start()
@@ -180,11 +186,12 @@ class Dask:
 
 def jobs_gone(cluster: Any) -> set[str]:
     """Numbers of the jobs of a cluster without workers, where SLURM knows none of them any more; else none."""
-    numbers = {str(job.job_id) for job in cluster.workers.values() if job.job_id}
-    if cluster.scheduler_info["workers"] or not numbers:
+    numbers = {str(job.job_id) for job in list(cluster.workers.values()) if job.job_id}
+    elsewhere = any(line.startswith(("#SBATCH -M", "#SBATCH --cluster")) for line in cluster.job_script().splitlines())
+    if cluster.scheduler_info["workers"] or not numbers or elsewhere:
         return set()
     try:
-        asked = _asked(["squeue", "--noheader", "--format=%A", f"--jobs={','.join(sorted(numbers))}"])
+        asked = _asked(["squeue", "--all", "--noheader", "--format=%A", f"--jobs={','.join(sorted(numbers))}"])
     except (OSError, subprocess.TimeoutExpired):
         return set()
     if asked.returncode and "nvalid job id" not in asked.stderr:  # what squeue says of jobs long ended
@@ -194,7 +201,8 @@ def jobs_gone(cluster: Any) -> set[str]:
 
 def _asked(command: list[str], given: str = "") -> subprocess.CompletedProcess[str]:
     """What a command of SLURM says."""
-    return subprocess.run(command, input=given, capture_output=True, text=True, timeout=ANSWER)
+    plain = {name: value for name, value in os.environ.items() if not name.startswith("SQUEUE_")}  # no filters
+    return subprocess.run(command, input=given, capture_output=True, text=True, timeout=ANSWER, env=plain)
 
 
 def _environment(threads: int) -> dict[str, str]:

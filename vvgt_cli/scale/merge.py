@@ -183,7 +183,7 @@ class Cut:
         voxel, pixel = min(self.plan.grid.step), pixel_width(self.plan.size)
         for leaves in batches(self.forest.leaves(threshold), BATCH):
             made = cell_gaussians(leaves, voxel, pixel, self.opaque, ROUND)
-            yield as_stored(sharpened(made, leaves.moments[:, SEEN] / leaves.moments[:, MASS]))
+            yield as_stored(sharpened(made, leaves.moments[:, SEEN] / leaves.moments[:, MASS], self.opaque.half))
 
 
 @contextmanager

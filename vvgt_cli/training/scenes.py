@@ -25,7 +25,7 @@ from vvgt_cli.progress import Console
 from vvgt_cli.training.config import GROWTH, SceneConfig
 from vvgt_cli.transfer.suggest import Suggestion
 
-VERSION = 3  # raised when scenes are made otherwise
+VERSION = 4  # raised when scenes are made otherwise
 FEWEST = 256  # Gaussians: a scene with less shows next to nothing
 FULL = 65535  # images are kept as uint16
 TARGET_SHIFT = 0.31  # of the targets' Fibonacci sphere: none of the three default sets'

@@ -76,12 +76,21 @@ class ClosedForm:
         return self._of(leaves_of(self.tree, select(self.tree, self.budget)), style)
 
     def _of(self, leaves: Leaves, style: SurfaceStyle) -> Gaussians:
-        found = cell_gaussians(leaves, self.voxel, self.pixel, self.opaque, style)
-        if self.scene.light is not None:
-            from vvgt_cli.vbm.lit import lit
+        return self._sharpened(leaves, self._cells(leaves, style))
 
-            found = lit(found, self.scene, self.tree, leaves, self.degree)
-        return sharpened(found, leaves.moments[:, SEEN] / leaves.moments[:, MASS])
+    def _cells(self, leaves: Leaves, style: SurfaceStyle) -> Gaussians:
+        found = cell_gaussians(leaves, self.voxel, self.pixel, self.opaque, style)
+        if self.scene.light is None:
+            return found
+        from vvgt_cli.vbm.lit import lit
+
+        return lit(found, self.scene, self.tree, leaves, self.degree)
+
+    def _sharpened(self, leaves: Leaves, found: Gaussians) -> Gaussians:
+        """`sharpened`, but labels: each is of one colour, and may be written to a file of its own."""
+        if self.scene.labels:
+            return found
+        return sharpened(found, leaves.moments[:, SEEN] / leaves.moments[:, MASS], np.asarray(self.scene.half))
 
     def cut_by_error(self, drawn: Gaussians, cameras: Sequence[Camera], views: np.ndarray, rule: Rule) -> Gaussians:
         """`gaussians` of cells chosen by what views (n, h, w, 4) show of the error of those, ``drawn``, by ``rule``.
@@ -96,9 +105,10 @@ class ClosedForm:
         if seen > 1 - FEW:
             return self._of(leaves_of(self.tree, select(self.tree, self.budget, score)), ROUND)
         wanted = round(self.budget * min(seen**-SMALLER, 2.0))
-        found = self._of(leaves_of(self.tree, select(self.tree, wanted, score)), ROUND)
-        hidden = unseen(blending_weights(found, cameras, rule), self.budget)
-        return found.take(np.flatnonzero(~hidden))
+        leaves = leaves_of(self.tree, select(self.tree, wanted, score))
+        found = self._cells(leaves, ROUND)
+        shown = np.flatnonzero(~unseen(blending_weights(found, cameras, rule), self.budget))
+        return self._sharpened(leaves.take(shown), found.take(shown))
 
     def refined(self, cameras: Sequence[Camera], views: np.ndarray, style: SurfaceStyle, rule: Rule) -> Gaussians:
         """Gaussians for the budget: three tenths by the moments, then cells with the largest error are split."""

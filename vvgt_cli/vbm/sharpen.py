@@ -2,9 +2,9 @@
 
 A cell's colour is the mean of what is in it, but Gaussians overlap, so that a picture shows each mixed with its
 neighbours. ``c + a (c - B c)``, B the mean over neighbours by how much they overlap, is a step of van Cittert's
-iteration (1931) towards the colours that show the cells' own once they are mixed. Cells that are seen much less than
-their neighbours, behind something opaque, ought not to be seen at all: as far as Gaussians leave gaps before them, they
-do least harm in the colour of what is in front.
+iteration (Z. Physik 68, 1931) towards the colours that show the cells' own once they are mixed. Cells that are seen
+much less than their neighbours, behind something opaque, ought not to be seen at all: as far as Gaussians leave gaps
+before them, they do least harm in the colour of what is in front.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def mix_neighbours(
     ``means`` (n, 3): ``mixed`` (n, m), and ``around`` (n,) of what is ``seen`` (n,); times what is seen of them:
     ``front`` (n, m). ``orders`` (c, n) are the Gaussians along each curve, ``places`` (c, n) where each is.
     """
-    curves, n = orders.shape
+    several, n = orders.shape
     count = values.shape[1]
     for i in nb.prange(n):
         total = max(areas[i], TINY)
@@ -45,7 +45,7 @@ def mix_neighbours(
         sums, ahead = np.empty(count), np.empty(count)
         for m in range(count):
             sums[m], ahead[m] = total * values[i, m], open_ * values[i, m]
-        for c in range(curves):
+        for c in range(several):
             here = places[c, i]
             for place in range(max(here - WINDOW, 0), min(here + WINDOW + 1, n)):
                 k = orders[c, place]
@@ -70,15 +70,16 @@ def mix_neighbours(
             front[i, m] = ahead[m] / open_ if open_ > TINY else values[i, m]
 
 
-def sharpened(gaussians: Gaussians, seen: np.ndarray) -> Gaussians:
+def sharpened(gaussians: Gaussians, seen: np.ndarray, half: np.ndarray) -> Gaussians:
     """With colours, harmonics too, that show what they were once neighbours are mixed in.
 
     Args:
-        gaussians: of the closed form, their colours those of their cells; any frame.
+        gaussians: of the closed form, box frame, their colours those of their cells.
         seen: (n,) mean transmittance from the cameras to each.
+        half: (3,) half extents of the box.
 
     Returns:
-        As many, in their order; without harmonics colours stay between `DARKEST` and `BRIGHTEST`.
+        As many, in their order; colours of degree 0 between `DARKEST` and `BRIGHTEST`, or what they were, if more.
     """
     if len(gaussians) < 2:
         return gaussians
@@ -89,20 +90,21 @@ def sharpened(gaussians: Gaussians, seen: np.ndarray) -> Gaussians:
     values = np.ascontiguousarray(np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1), np.float32)
     means, seen = np.ascontiguousarray(gaussians.means, np.float32), np.ascontiguousarray(seen, np.float64)
     mixed, front, around = np.empty_like(values), np.empty_like(values), np.empty(len(means))
-    mix_neighbours(*curves(means), means, widths, areas, seen, values, mixed, front, around)
+    mix_neighbours(*curves(means, half), means, widths, areas, seen, values, mixed, front, around)
     hidden = np.clip(1 - seen / np.maximum(around, TINY), 0, 1).astype(np.float32)[:, None]
     found = values + (1 - hidden) * AMOUNT * (values - mixed) + hidden * (front - values)
-    colors = found[:, :3]
+    colors = np.clip(found[:, :3], DARKEST, np.maximum(BRIGHTEST, gaussians.colors))
     if gaussians.harmonics is None:
-        return replace(gaussians, colors=np.clip(colors, DARKEST, np.maximum(BRIGHTEST, gaussians.colors)))
+        return replace(gaussians, colors=colors)
     return replace(gaussians, colors=colors, harmonics=found[:, 3:].reshape(gaussians.harmonics.shape))
 
 
-def curves(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Gaussians at ``means`` (n, 3) along `CURVES` Z-orders (c, n) int32, and their places there (c, n) int32."""
-    low = means.min(axis=0).astype(np.float64)
-    edge = max(float((means.max(axis=0) - low).max()), 1e-30)
-    within = (means - low) / edge  # in [0, 1]
+def curves(means: np.ndarray, half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Gaussians at ``means`` (n, 3) along `CURVES` Z-orders (c, n) int32, and their places there (c, n) int32.
+
+    The orders are of the box of half extents ``half`` (3,): some of the Gaussians lie in them as they do among all.
+    """
+    within = np.clip(0.5 + means / (2 * float(np.max(half))), 0, 1)
     orders = np.empty((CURVES, len(means)), np.int32)
     places = np.empty_like(orders)
     for c in range(CURVES):
