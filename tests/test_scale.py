@@ -81,8 +81,8 @@ def test_of_several_batches_all_but_some_colours_are_those_of_memory(vvgt, raw, 
         if name != "colors":
             np.testing.assert_array_equal(values, both[1].arrays()[name])
     apart = np.abs(both[0].colors - both[1].colors).max(axis=1)
-    assert 0 < (apart > 0).mean() < 0.4  # neighbours are those of a batch
-    assert np.sqrt((apart**2).mean()) < 0.01
+    assert 0 < (apart > 0).mean() < 0.15  # at the borders: neighbours are those of a batch
+    assert np.sqrt((apart**2).mean()) < 0.004
 
 
 def test_opaque_anisotropic_and_turned_volumes_too(vvgt, tmp_path):
