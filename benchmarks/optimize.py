@@ -58,7 +58,9 @@ def part_calls(gaussians: Gaussians, target: np.ndarray) -> dict[str, Callable[[
         "(ssim)": lambda: add_ssim_gradient(image, target, 0.2, np.zeros_like(grad)),
         "moments": lambda: moments(p, colors, image, grad),
         "gradients": lambda: own_frame_backward(means, factors, colors, camera, p, pairs),
-        "update": lambda: own_frame(slopes.rows, *still, *state.arrays, state.darkest, state.first, state.second),
+        "update": lambda: own_frame(
+            slopes.rows, *still, *state.arrays, state.darkest, state.first, state.second, *state.common(slopes.rows)
+        ),
     }
 
 

@@ -8,6 +8,7 @@ import pytest
 from vvgt_cli.cameras import default_views
 from vvgt_cli.descent import OptimizeOptions, OptimizeRecord, optimize
 from vvgt_cli.descent.loop import FALLEN, Judge
+from vvgt_cli.descent.shared import NONE
 from vvgt_cli.descent.states import Fields, OwnFrame
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import Gaussians
@@ -17,6 +18,7 @@ from vvgt_cli.splat.half import halved
 from vvgt_cli.splat.reference import covariances
 from vvgt_cli.splat.rules import INRIA
 
+NO_FLOORS = np.full(13, 1e-15, np.float32)
 FIELDS = ("means", "log_scales", "quaternions", "opacity_logits", "colors")
 CAMERAS, CHECKS = default_views("train", 6, size=48), default_views("check", 2, size=48)
 
@@ -168,7 +170,7 @@ def test_a_step_is_the_exponential_of_e_to_second_order():
     slopes[:9] = frames.T
     steps.own_frame(
         slopes, rates, np.array([0.5, 1.0, 0.3]), state.spread, *state.BETAS, 1,
-        means, factors, logits, colors, state.darkest, state.first, state.second,
+        means, factors, logits, colors, state.darkest, state.first, state.second, NO_FLOORS, *NONE,
     )  # fmt: skip
     np.testing.assert_allclose(means, expected[0], atol=1e-6)
     np.testing.assert_allclose(factors, expected[1], atol=1e-6)

@@ -8,6 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from vvgt_cli.cameras import Camera
+from vvgt_cli.descent.shared import NONE, sampled, shared_steps
+from vvgt_cli.descent.steps import EPSILON
 from vvgt_cli.gaussians import SH_C0, Gaussians
 from vvgt_cli.splat import Projection, project
 from vvgt_cli.splat.reference import rotations
@@ -16,6 +18,7 @@ from vvgt_cli.splat.rules import INRIA, Rule
 
 WARM_UP = 3  # steps
 SMALLEST = 1e-7  # standard deviation, unit frame
+WEAKEST = 0.1  # of the mean size of slopes that one counts at least: what is hardly seen goes less far than the rest
 GIVEN = 0.3  # of the rate of harmonics, where the start has some: a view alone says little of them (docs/log.md)
 
 
@@ -41,7 +44,7 @@ class OwnFrame:
     """
 
     # d, E on and off the diagonal, logit, colour, and what harmonics together change it (RMS over directions)
-    RATES = np.array([0.05, 0.025, 0.0125, 0.03, 0.008, 0.008])
+    RATES = np.array([0.0375, 0.025, 0.0125, 0.0225, 0.006, 0.008])
     CLIPS = np.array([0.5, 1.0, 0.3])  # d, logit, E
     ERROR, LARGEST = 0.05, 1.5
     BETAS = 0.6, 0.999
@@ -66,6 +69,7 @@ class OwnFrame:
         pixel = float(np.median([np.linalg.norm(camera.position) / camera.fx for camera in cameras]))
         self.spread = rule.dilation * pixel**2
         self.step = 0
+        self.shared = shared_steps(*self.arrays[:4])
 
     def colors_from(self, camera: Camera) -> np.ndarray:
         """(K, 3) colours as the camera sees them, which may be negative."""
@@ -98,12 +102,27 @@ class OwnFrame:
         steps.own_frame(
             slopes.rows, self.RATES * pace, self.CLIPS, self.spread,
             *self.BETAS, self.step, means, factors, logits, colors, self.darkest, self.first, self.second,
+            *self.common(slopes.rows),
         )  # fmt: skip
         if harmonics is not None and slopes.harmonics is not None:
             rate = self.harmonic_rate * math.sqrt(4 * math.pi / harmonics.shape[1])
             first, second = (array.reshape(-1) for array in self.running)
             values, slope = harmonics.reshape(-1), slopes.harmonics.reshape(-1)
             steps.adam(values, slope, rate * pace, *self.BETAS, self.step, first, second)
+
+    def common(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Adam's least divisors, features and weights of what is shared, from the slopes ``rows`` (COUNT, K)."""
+        some, first, second = (sampled(array) for array in (rows, self.first, self.second))
+        beta1, beta2 = self.BETAS
+        with np.errstate(over="ignore", invalid="ignore"):  # of a Gaussian whose slopes are beyond float32
+            first = beta1 * first + (1 - beta1) * some
+            sizes = np.sqrt((beta2 * second + (1 - beta2) * some * some) / (1 - beta2**self.step))
+        sizes = np.nan_to_num(sizes, copy=False, posinf=0)
+        floors = WEAKEST * sizes.sum(axis=1) / max(sizes.shape[1], 1) + EPSILON
+        if self.shared is None:
+            return floors, *NONE
+        directions = first / (1 - beta1**self.step) / (sizes + floors[:, None])
+        return floors, self.shared.features, self.shared.weights(directions)
 
     def saved(self) -> dict[str, np.ndarray]:
         """All that the next steps depend on."""

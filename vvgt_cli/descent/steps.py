@@ -14,6 +14,8 @@ from vvgt_cli.splat.lanes import LANES, U
 f32: Any = np.float32
 ONE, HALF, FOUR, NINE, EPSILON = f32(1), f32(0.5), f32(4), f32(9), f32(1e-15)
 COUNT = 13  # own frame: d (3), E (6), opacity logit, colour (3)
+KNOWN = 10  # of them that Gaussians share: not E off the diagonal
+FEATURES = 64  # that these are linear in
 _P1, PLACE = U(LANES), U(COUNT * LANES)  # of a buffer: from plane to plane; where the nine of M begin
 _jit = inlined()
 
@@ -27,12 +29,12 @@ def _clip(value: float, bound: float) -> float:
 @_jit
 def _turn(
     slopes: np.ndarray, begin: int, count: int, first: np.ndarray, second: np.ndarray, ways: tuple[float, ...],
-    buf: np.ndarray,
+    floors: np.ndarray, buf: np.ndarray,
 ) -> None:  # fmt: skip
     """Adam's directions, about 1 in size, of ``count`` Gaussians from ``begin`` on into planes 0 to 12.
 
     ``slopes`` and the running moments ``first`` and ``second``, which are updated, (COUNT, K); ``ways`` beta1, beta2
-    and what undoes their start from zero.
+    and what undoes their start from zero; ``floors`` (COUNT,) is what slopes count at least.
     """
     beta1, beta2, fix1, fix2 = ways
     start, lanes = U(begin), U(count)
@@ -42,7 +44,18 @@ def _turn(
             m = beta1 * first[field, k] + (ONE - beta1) * g
             v = beta2 * second[field, k] + (ONE - beta2) * g * g
             first[field, k], second[field, k] = m, v
-            buf[field * _P1 + i] = m * fix1 / (math.sqrt(v * fix2) + EPSILON)
+            buf[field * _P1 + i] = m * fix1 / (math.sqrt(v * fix2) + floors[field])
+
+
+@_jit
+def _share(features: np.ndarray, chunk: int, weights: np.ndarray, buf: np.ndarray) -> None:
+    """Add what ``weights`` (KNOWN, FEATURES) foretell of the ``features`` (blocks, FEATURES, LANES) of a block."""
+    for row in range(KNOWN):
+        plane = U(row if row < 6 else row + 3) * _P1
+        for f in range(FEATURES):
+            weight = weights[row, f]
+            for i in range(U(LANES)):
+                buf[plane + i] += weight * f32(features[chunk, f, i])
 
 
 @_jit
@@ -84,11 +97,11 @@ def _move(buf: np.ndarray, rates: tuple[float, ...], clips: tuple[float, ...], s
             buf[here + U(2) * _P1] = m2 - s2 + HALF * (s0 * e02 + s1 * e12 + s2 * e22)
 
 
-@kernel("f4:2 f8:1 f8:1 f8 f8 f8 i8 f4:2 f4:3 f4:1 f4:2 f8 f4:2 f4:2", parallel=True)
+@kernel("f4:2 f8:1 f8:1 f8 f8 f8 i8 f4:2 f4:3 f4:1 f4:2 f8 f4:2 f4:2 f4:1 i1:3 f4:2", parallel=True)
 def own_frame(
     slopes: np.ndarray, rates: np.ndarray, clips: np.ndarray, spread: float, beta1: float, beta2: float, step: int,
     means: np.ndarray, factors: np.ndarray, logits: np.ndarray, colors: np.ndarray, darkest: float, first: np.ndarray,
-    second: np.ndarray,
+    second: np.ndarray, floors: np.ndarray, features: np.ndarray, weights: np.ndarray,
 ) -> None:  # fmt: skip
     """mu += M d, M <- M (I + E + E^2 / 2): d, E, logit and colour by Adam; ``step`` counts from 1.
 
@@ -96,7 +109,8 @@ def own_frame(
     (K, 3, 3), ``logits`` (K,), ``colors`` (K, 3), are float32, as are Adam's moments ``first`` and ``second``
     (COUNT, K) and what is computed, `LANES` Gaussians at a time. ``rates`` (5 or more,): d, E on and off the diagonal,
     logit, colour. ``clips`` (3,): d, logit, E. ``spread`` is the dilation's variance at the scene, ``darkest`` the
-    least that a colour becomes.
+    least that a colour becomes. Adam's divisor is at least ``floors`` (COUNT,). Added to its directions are those of
+    ``weights`` (KNOWN, FEATURES) for the ``features`` (blocks or none, FEATURES, LANES) of each Gaussian.
     """
     ways = f32(beta1), f32(beta2), f32(1 / (1 - beta1**step)), f32(1 / (1 - beta2**step))
     paces, bounds = (f32(rates[0]), f32(rates[1]), f32(rates[2])), (f32(clips[0]), f32(clips[2]))
@@ -106,7 +120,9 @@ def own_frame(
         begin = chunk * LANES
         count = min(LANES, total - begin)
         buf = np.ones((COUNT + 9) * LANES, np.float32)
-        _turn(slopes, begin, count, first, second, ways, buf)
+        _turn(slopes, begin, count, first, second, ways, floors, buf)
+        if chunk < features.shape[0]:
+            _share(features, chunk, weights, buf)
         for i in range(count):
             for entry in range(9):
                 buf[U(i) + PLACE + U(entry) * _P1] = factors[begin + i, entry // 3, entry % 3]

@@ -1,0 +1,179 @@
+"""Steps in common: what is known of Gaussians, the regression on it, and the kernel against a twin in float64."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from vvgt_cli.cameras import default_views
+from vvgt_cli.descent import OptimizeOptions, optimize, shared, steps
+from vvgt_cli.descent.states import OwnFrame
+from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.metrics import psnr
+from vvgt_cli.splat import render
+
+CAMERAS = default_views("train", 6, size=64)
+MANY = 2_100  # not a multiple of LANES
+
+
+def many(count=MANY):
+    rng = np.random.default_rng(4)
+    return Gaussians(
+        rng.uniform(-0.6, 0.6, (count, 3)),
+        np.log(0.03) + rng.normal(0, 0.4, (count, 3)),
+        rng.normal(size=(count, 4)),
+        rng.normal(-1, 1, count),
+        rng.uniform(0, 1, (count, 3)),
+    )
+
+
+def parts(g):
+    """Means, factors, logits and colours, axes as the file has them."""
+    return [array.copy() for array in unshared(g).arrays[:4]]
+
+
+def unshared(g):
+    """The state as the file has it, axes as they are."""
+    few, shared.LEAST = shared.LEAST, len(g) + 1
+    try:
+        return OwnFrame(g, CAMERAS)
+    finally:
+        shared.LEAST = few
+
+
+def features(found):
+    """(K, FEATURES) of `SharedSteps`."""
+    return found.features.transpose(0, 2, 1).reshape(-1, steps.FEATURES).astype(np.float64)
+
+
+def test_axes_are_put_in_order_and_the_covariance_stays():
+    means, factors, logits, colors = parts(many())
+    before = factors.astype(np.float64)
+    known = shared.aligned(means, factors, logits, colors)
+    after = factors.astype(np.float64)
+    np.testing.assert_allclose(after @ after.transpose(0, 2, 1), before @ before.transpose(0, 2, 1), atol=1e-9)
+    lengths = np.linalg.norm(after, axis=1)
+    assert (np.diff(lengths, axis=1) >= -1e-9).all()
+    assert known.shape == (MANY, shared.INPUTS)
+    assert np.abs(known.mean(axis=0)).max() < 0.1
+    assert np.abs(known).max() <= shared.FARTHEST
+
+
+def test_axes_point_to_where_neighbours_lie():
+    """A dense ball beside each of a few: its axes have a positive part that way."""
+    rng = np.random.default_rng(0)
+    lone = np.array([[-0.5, 0.1, 0.2], [0.4, -0.3, 0.5], [0.1, 0.6, -0.4]])
+    way = np.array([0.6, 0.64, 0.48]) * 0.06
+    near = (lone[:, None] + way + rng.normal(0, 0.002, (3, 30, 3))).reshape(-1, 3)
+    means = np.concatenate([lone, near]).astype(np.float32)
+    factors = np.tile(np.diag([0.04, 0.05, 0.06]).astype(np.float32), (len(means), 1, 1))
+    factors[1] *= -1
+    shared.aligned(means, factors, np.zeros(len(means), np.float32), np.zeros((len(means), 3), np.float32))
+    assert (np.einsum("kij,i->kj", factors[:3].astype(np.float64), way) > 0).all()
+
+
+def test_known_numbers_do_not_depend_on_the_scene_s_size():
+    g = many()
+    means, factors, logits, colors = parts(g)
+    known = shared.aligned(means, factors.copy(), logits, colors)
+    half = shared.aligned(means * np.float32(0.5), factors * np.float32(0.5), logits, colors)
+    np.testing.assert_allclose(half, known, atol=1e-4)
+
+
+@pytest.mark.parametrize("count", [MANY, 30_011])
+def test_what_is_linear_in_the_features_is_foretold(count):
+    """Directions that are a fixed sum of features, with noise three times as large, come back without the noise."""
+    g = many(count)
+    found = shared.SharedSteps(shared.aligned(*parts(g)))
+    phi = features(found)[:count] / shared.ONE
+    rng = np.random.default_rng(1)
+    truth = rng.normal(size=(steps.FEATURES, 13)) / 8
+    exact = phi @ truth
+    noisy = (exact + 3 * exact.std() * rng.normal(size=exact.shape)).astype(np.float32)
+    weights = found.weights(shared.sampled(noisy.T)) / shared.GAIN
+    foretold = phi * shared.ONE @ weights.T
+    kept = [0, 1, 2, 3, 4, 5, 9, 10, 11, 12]
+    off = np.square(foretold - exact[:, kept]).mean(axis=0) / exact[:, kept].var(axis=0)
+    samples = found.solver.shape[1]
+    assert off.max() < 3 * 9 * steps.FEATURES / samples
+    assert samples <= 1.5 * shared.SAMPLE
+
+
+def test_a_step_with_shares_and_floors_is_that_of_the_twin():
+    """Opacity, colours and places after two steps, float64: Adam's directions with floors, and the features' shares."""
+    state, rng = OwnFrame(many(), CAMERAS), np.random.default_rng(2)
+    assert state.shared is not None
+    means, factors, logits, colors = state.arrays
+    exact = [array.astype(np.float64) for array in (means, logits, colors)]
+    phi = features(state.shared)[:MANY]
+    weights = (rng.normal(size=(steps.KNOWN, steps.FEATURES)) / 200).astype(np.float32)
+    floors = np.linspace(0.05, 0.5, 13).astype(np.float32)
+    rates, clips = np.array([0.05, 0.0, 0.0, 0.03, 0.008]), np.array([0.5, 1.0, 0.3])
+    m = v = np.zeros((13, MANY))
+    length = np.square(factors.astype(np.float64)).sum(axis=1)
+    reach = np.sqrt(np.minimum(1 + state.spread / length, 9))
+    for n in (1, 2):
+        slopes = rng.normal(size=(13, MANY)).astype(np.float32)
+        steps.own_frame(
+            slopes, rates, clips, state.spread, 0.6, 0.999, n, means, factors, logits, colors, 0.0,
+            state.first, state.second, floors, state.shared.features, weights,
+        )  # fmt: skip
+        m, v = 0.6 * m + 0.4 * slopes, 0.999 * v + 0.001 * slopes.astype(np.float64) ** 2
+        u = m / (1 - 0.6**n) / (np.sqrt(v / (1 - 0.999**n)) + floors[:, None])
+        u[[0, 1, 2, 3, 4, 5, 9, 10, 11, 12]] += (phi @ weights.T.astype(np.float64)).T
+        exact[0] -= np.einsum("kij,kj->ki", factors.astype(np.float64), np.clip(0.05 * reach * u[:3].T, -0.5, 0.5))
+        exact[1] -= np.clip(0.03 * u[9], -1, 1)
+        exact[2] = np.maximum(exact[2] - 0.008 * u[10:].T, 0)
+    for found, wanted in zip((means, logits, colors), exact, strict=True):
+        np.testing.assert_allclose(found, wanted, atol=2e-5)
+
+
+def systematic():
+    """Gaussians that made views, and the same with an error that follows from what is known of each."""
+    truth = many()
+    wider = truth.log_scales + 0.25 * np.tanh(truth.opacity_logits)[:, None]
+    start = replace(truth, log_scales=wider, opacity_logits=truth.opacity_logits - 0.6)
+    return truth, start
+
+
+def test_errors_in_common_are_undone_in_fewer_steps(monkeypatch):
+    truth, start = systematic()
+    cameras = default_views("train", 12, size=64)
+    images = np.stack([render(truth, camera) for camera in cameras])
+    unseen = default_views("check", 3, size=64)
+    ends = []
+    for least in (shared.LEAST, MANY + 1):
+        monkeypatch.setattr(shared, "LEAST", least)
+        result, _ = optimize(start, cameras, images, OptimizeOptions(steps=24))
+        ends.append(np.mean([psnr(render(truth, c)[..., :3], render(result, c)[..., :3]) for c in unseen]))
+    assert ends[0] > ends[1] + 0.5
+
+
+def test_few_gaussians_share_nothing():
+    state = OwnFrame(many(shared.LEAST - 1), CAMERAS)
+    assert state.shared is None
+    state.step = 1
+    assert state.common(np.ones((13, shared.LEAST - 1), np.float32))[1].size == 0
+
+
+@pytest.mark.parametrize("kind", ["alike", "in one place", "wide and narrow", "slopes not finite"])
+def test_steps_stay_finite_where_gaussians_are_extreme(kind):
+    g = many()
+    if kind == "alike":
+        g = g.take(np.zeros(MANY, np.int64))
+    elif kind == "in one place":
+        g = replace(g, means=np.zeros_like(g.means))
+    elif kind == "wide and narrow":
+        g = replace(g, log_scales=np.where(np.arange(3 * MANY).reshape(-1, 3) % 7 == 0, -16, 2).astype(np.float32))
+    state = OwnFrame(g, CAMERAS)
+    rows = np.random.default_rng(0).normal(size=(13, MANY)).astype(np.float32)
+    if kind == "slopes not finite":
+        rows[:, 5] = np.inf
+    state.step = 1
+    floors, features_, weights = state.common(rows)
+    assert np.isfinite(floors).all()
+    assert np.abs(weights).max() < 100
+    assert features_.dtype == np.int8
+    assert np.isfinite(state.arrays[1]).all()
