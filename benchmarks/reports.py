@@ -4,14 +4,19 @@
 
 The list has a line a scene: name, volume, options of reading, function, separated by tabs. Opacity is per mean spacing.
 Scenes that have their report.json are left out, so that the same command goes on where it was. `index.md` holds a row a
-scene, from the JSON. For a machine that does nothing else: runs are timed once. For docs/: `-- --picture-size 160`.
+scene, from the JSON. For a machine that does nothing else: runs are timed once. `--publish DIR` copies pages, curves
+and numbers to DIR, as docs/reports has them: pictures as JPEG, without the machine's folders.
 """
 
 from __future__ import annotations
 
+import base64
 import json
+import re
+import shutil
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import click
@@ -47,12 +52,43 @@ def index(folder: Path) -> str:
     return "\n".join([*lines, "", *sorted(machines), ""])
 
 
+PICTURE_OR_FOLDER = re.compile(r"data:image/png;base64,([A-Za-z0-9+/=]+)|(?<![\w.:/<])/(?:[\w.-]+/)+(?=[\w.-]+)")
+
+
+def shorter(found: re.Match[str]) -> str:
+    """An embedded PNG as an embedded JPEG, a tenth as large; nothing in place of a folder."""
+    import OpenImageIO as oiio
+
+    if not found[1]:
+        return ""
+    with tempfile.TemporaryDirectory() as folder:
+        png, jpeg = str(Path(folder) / "a.png"), str(Path(folder) / "a.jpg")
+        Path(png).write_bytes(base64.b64decode(found[1]))
+        image = oiio.ImageBuf(png)
+        image.specmod().attribute("Compression", "jpeg:88")
+        if not image.write(jpeg):
+            raise SystemExit(image.geterror())
+        return f"data:image/jpeg;base64,{base64.b64encode(Path(jpeg).read_bytes()).decode()}"
+
+
+def publish(folder: Path, to: Path) -> None:
+    """Each scene's page as NAME.html, its curve as NAME.png and its numbers as NAME.csv, and the index of them."""
+    to.mkdir(parents=True, exist_ok=True)
+    for path in sorted(folder.glob("*/report.html")):
+        name = path.parent.name
+        (to / f"{name}.html").write_text(PICTURE_OR_FOLDER.sub(shorter, path.read_text("utf-8")), "utf-8")
+        shutil.copyfile(path.parent / "psnr-seconds.png", to / f"{name}.png")
+        shutil.copyfile(path.parent / "report.csv", to / f"{name}.csv")
+    (to / "index.md").write_text(index(folder).replace("/report.html)", ".html)"), "utf-8")
+
+
 @click.command()
 @click.argument("paths", nargs=3)
 @click.option("-o", "--output", required=True, help="Folder: one within it a scene.")
 @click.option("--only", multiple=True, help="Scenes to measure (default: all).")
+@click.option("--publish", "to", help="Folder to copy pages to.")
 @click.argument("options", nargs=-1, type=click.UNPROCESSED)
-def main(paths, output, only, options):
+def main(paths, output, only, to, options):
     """Make every report that is not there yet."""
     scenes, data, functions = map(Path, paths)
     folder = Path(output)
@@ -65,6 +101,8 @@ def main(paths, output, only, options):
         print(name, file=sys.stderr)
         subprocess.run([*call, "-o", str(folder / name), "--overwrite", *options], check=True)
     (folder / "index.md").write_text(index(folder), "utf-8")
+    if to:
+        publish(folder, Path(to))
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import csv
 import importlib
 import json
@@ -16,7 +17,7 @@ from report_runs import document
 from vvgt_cli.cameras import default_views
 from vvgt_cli.cli.main import run
 from vvgt_cli.dvr import RenderSettings
-from vvgt_cli.images import read_png
+from vvgt_cli.images import read_png, write_png
 from vvgt_cli.synth import open_volume
 from vvgt_cli.volume.nrrd_write import write_nrrd
 
@@ -35,6 +36,7 @@ RUN = (
         "light_vtk",
         "network",
         "optimize",
+        "parts",
         "plan",
         "refinement",
     ),
@@ -186,6 +188,17 @@ def test_optimize(bench):
     assert "forward" in text
 
 
+def test_parts(bench, scenes, tmp_path):
+    module = bench("parts")
+    call(module.main, *scenes, "-o", tmp_path / "a.csv", "--", "--max-gaussians", 40, "--size", SIZE, "--steps", 4)
+    rows = {row["part"]: row for row in rows_of(tmp_path / "a.csv")}
+    assert list(rows) == list(module.PARTS)
+    assert float(rows["all"]["start"]) > 10
+    for part in ("colours not sharpened", "no floor of slopes"):
+        assert rows[part]["psnr"] != rows["all"]["psnr"]
+    assert "| no cells by error |" in call(module.main, "--table", tmp_path / "a.csv")
+
+
 def test_plan(bench, scenes, tmp_path):
     few = ("--max-gaussians", "40", "--size", str(SIZE), "--steps", "1")
     module = bench("plan", KINDS={"default": few})
@@ -216,6 +229,11 @@ def test_reports(bench, scenes, tmp_path, monkeypatch):
         runs = [run | {"cost": run["seconds"]} for run in document()["runs"]]
         front = [run["name"] for run in runs[:9]]
         (folder / "report.json").write_text(json.dumps(document(runs=runs, front=front, knee=front[4])))
+        write_png(folder / "psnr-seconds.png", np.zeros((8, 8, 3), np.uint8))
+        picture = base64.b64encode((folder / "psnr-seconds.png").read_bytes()).decode()
+        page = f'<code>vvgt report /some/where/a.nrrd -o b/c</code><img src="data:image/png;base64,{picture}"></a>'
+        (folder / "report.html").write_text(page)
+        (folder / "report.csv").write_text("run\n")
 
     module = bench("reports")
     monkeypatch.setattr(module.subprocess, "run", report)
@@ -225,6 +243,12 @@ def test_reports(bench, scenes, tmp_path, monkeypatch):
     assert command[:4] == [sys.executable, "-m", "vvgt_cli.cli.main", "report"]
     assert command[-2:] == ["--picture-size", "160"]
     assert "[blob](blob/report.html)" in (tmp_path / "out" / "index.md").read_text()
+    call(module.main, *scenes, "-o", tmp_path / "out", "--publish", tmp_path / "docs")
+    page = (tmp_path / "docs" / "blob.html").read_text()
+    assert page.startswith('<code>vvgt report a.nrrd -o b/c</code><img src="data:image/jpeg;base64,/9j/')
+    assert page.endswith('"></a>')
+    assert (tmp_path / "docs" / "blob.csv").read_text() == "run\n"
+    assert "[blob](blob.html)" in (tmp_path / "docs" / "index.md").read_text()
 
 
 def test_automatic(bench, tmp_path, capsys):

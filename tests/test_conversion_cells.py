@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from tests.test_conversion_plan import CASE, darkened, done, of
@@ -29,6 +30,26 @@ def test_cells_by_error_are_kept_where_the_check_views_gain_and_dropped_where_th
     assert stage.psnr < stage.psnr_before
     refined = next(stage for stage in stages if stage.name == "refinement")
     assert refined.psnr_before == pytest.approx(stage.psnr_before, abs=1e-3)
+
+
+def test_cells_are_chosen_by_views_from_all_sides(tmp_path, monkeypatch):
+    """Of 120 views of a spiral, every fifth would stand in bands with holes of 67 degrees."""
+    used = []
+
+    def seen(start, cameras, views, rule):
+        used.extend(cameras)
+        assert len(views) == len(cameras)
+        return start.gaussians
+
+    monkeypatch.setattr("vvgt_cli.vbm.cut_by_error", seen)
+    monkeypatch.setattr("vvgt_cli.conversion.stages.refinement.refine", lambda run, start, *_: start)
+    done(tmp_path, FitOptions(60, 16, steps=200))
+    eyes = np.array([camera.position for camera in used])
+    eyes /= np.linalg.norm(eyes, axis=1, keepdims=True)
+    ways = np.random.default_rng(0).normal(size=(4000, 3))
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    assert len(used) == 24
+    assert np.degrees(np.arccos((ways @ eyes.T).max(axis=1))).max() < 45
 
 
 def test_cells_are_cut_by_error_where_there_is_a_pyramid_and_steps_follow():

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vvgt_cli.cameras import default_views
+from vvgt_cli.cameras import default_views, farthest_cameras
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.network import NAMED, GeometryConfig, ImageConfig, NetworkConfig
@@ -17,7 +17,6 @@ from vvgt_cli.network import tables as tb
 from vvgt_cli.network.config import SLOPES
 from vvgt_cli.network.curves import CURVES, curve_code, hilbert, interleave
 from vvgt_cli.network.prepare import filter_matrix, pack, prepare, quaternion, resize, unpack, view_arrays
-from vvgt_cli.network.runtime import farthest_cameras
 
 SMALL = NAMED["small"]
 

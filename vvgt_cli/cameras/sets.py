@@ -90,3 +90,23 @@ def orbit_views(
         eye = (ring * math.cos(azimuth), ring * math.sin(azimuth), height)
         cameras.append(look_at(eye, width=size, height=size, fov=fov, name=f"orbit_{i:03d}"))
     return cameras
+
+
+def farthest_cameras(cameras: Sequence[Camera], count: int) -> list[int]:
+    """Numbers, ascending, of at most ``count`` cameras that stand far apart: farthest-point choice.
+
+    It begins with the camera farthest from all others' centre. Ties go to the camera with the smaller position, so
+    that the order of the cameras does not matter.
+    """
+    eyes = np.array([camera.position for camera in cameras])
+    if len(eyes) <= count:
+        return list(range(len(eyes)))
+    tie = np.lexsort(eyes.T)  # smallest first
+    eyes = eyes[tie]
+    gap = np.linalg.norm(eyes - eyes[np.argmax(np.linalg.norm(eyes - eyes.mean(axis=0), axis=1))], axis=1)
+    chosen = [int(np.argmin(gap))]
+    while len(chosen) < count:
+        nearest = int(np.argmax(np.where(np.isin(np.arange(len(eyes)), chosen), -1.0, gap)))
+        chosen.append(nearest)
+        gap = np.minimum(gap, np.linalg.norm(eyes - eyes[nearest], axis=1))
+    return sorted(int(tie[i]) for i in chosen)

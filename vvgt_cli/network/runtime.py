@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.cameras import Camera
+from vvgt_cli.cameras import Camera, farthest_cameras
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.network import tables
@@ -23,26 +23,6 @@ from vvgt_cli.splat.rules import INRIA, Rule
 PROVIDERS = {"cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider"}
 _AGAIN = "export the checkpoint again"
 POINTS = 160_000  # Gaussians of one run of the second graph: the paper's 150,000 go at once
-
-
-def farthest_cameras(cameras: Sequence[Camera], count: int) -> list[int]:
-    """Numbers, ascending, of at most ``count`` cameras that stand far apart: farthest-point choice.
-
-    It begins with the camera farthest from all others' centre. Ties go to the camera with the smaller position, so
-    that the order of the cameras does not matter.
-    """
-    eyes = np.array([camera.position for camera in cameras])
-    if len(eyes) <= count:
-        return list(range(len(eyes)))
-    tie = np.lexsort(eyes.T)  # smallest first
-    eyes = eyes[tie]
-    gap = np.linalg.norm(eyes - eyes[np.argmax(np.linalg.norm(eyes - eyes.mean(axis=0), axis=1))], axis=1)
-    chosen = [int(np.argmin(gap))]
-    while len(chosen) < count:
-        nearest = int(np.argmax(np.where(np.isin(np.arange(len(eyes)), chosen), -1.0, gap)))
-        chosen.append(nearest)
-        gap = np.minimum(gap, np.linalg.norm(eyes - eyes[nearest], axis=1))
-    return sorted(int(tie[i]) for i in chosen)
 
 
 def views_of_round(views: Sequence[int], number: int, rounds: int) -> list[int]:

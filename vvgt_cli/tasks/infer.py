@@ -47,7 +47,7 @@ def divide(cameras: Sequence[Camera], wanted: int) -> tuple[list[int], list[int]
 
     The judges are views that it does not read, as far apart as may be; all of its own where there are no others.
     """
-    from vvgt_cli.network.runtime import farthest_cameras
+    from vvgt_cli.cameras import farthest_cameras
 
     read = farthest_cameras(cameras, wanted)
     others = [i for i in range(len(cameras)) if i not in read]

@@ -10,12 +10,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from vvgt_cli.cameras import Camera
+from vvgt_cli.cameras import Camera, farthest_cameras
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.metrics import psnr
 from vvgt_cli.network.model import Vvgt
 from vvgt_cli.network.prepare import Prepared, prepare
-from vvgt_cli.network.runtime import farthest_cameras, views_of_round
+from vvgt_cli.network.runtime import views_of_round
 from vvgt_cli.splat import render
 from vvgt_cli.training.config import TrainConfig
 from vvgt_cli.training.losses import decibels, view_loss

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-import numpy as np
-
+from vvgt_cli.cameras import farthest_cameras
 from vvgt_cli.conversion.case import Case
 from vvgt_cli.conversion.resume import CELLS
 from vvgt_cli.conversion.stage import Cost, Stage, Work
@@ -49,7 +48,7 @@ class CellsByError(Stage):
             work.gaussians = kept[0]
             return
         with run.stage(self.name) as stage:
-            chosen = np.unique(np.linspace(0, len(train.cameras) - 1, VIEWS).round().astype(int))
+            chosen = farthest_cameras(train.cameras, VIEWS)  # every fourth or fifth would stand in bands
             cameras = [train.cameras[i] for i in chosen]
             before = work.psnr(work.made())
             found = cut_by_error(work.start, cameras, train.images[chosen], work.train_rule)
