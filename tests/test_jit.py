@@ -164,7 +164,10 @@ def one_by_one(tmp_path, *args):
 def test_commands_need_what_is_compiled_ahead_and_nothing_else(tmp_path):
     rare = {"vvgt_cli.vbm.inset:_shift", "vvgt_cli.vbm.inset:_blur"}  # of opaque scenes
     fit = ("--max-gaussians", 200, "--size", 64, "-q")
+    rare |= {ahead.SHARED[0]}  # and of more than a few Gaussians
     assert wanted(tmp_path, "convert", SOURCE, *fit, "--steps", 24, "-o", "a.ply") == set(ahead.CONVERT) - rare
+    many = ("--max-gaussians", 1500, "--size", 64, "-q", "--steps", 24)
+    assert ahead.SHARED[0] in wanted(tmp_path, "convert", SOURCE, *many, "-o", "o.ply")
     large = ("--max-gaussians", 200, "--size", 650, "-q", "--steps", 24)  # scored on blocks
     assert one_by_one(tmp_path, "convert", SOURCE, *large, "-o", "l.ply") == []
     assert wanted(tmp_path, "init", SOURCE, *fit, "-o", "i.ply") == set(ahead.INIT) - rare
@@ -182,7 +185,10 @@ def test_commands_need_what_is_compiled_ahead_and_nothing_else(tmp_path):
     views = ("--views", 6, "--test-views", 2, "--size", 40, "-q", "-o", "views")
     assert wanted(tmp_path, "render-views", SOURCE, *views) == set(ahead.VIEWS)
     seen = ("a.ply", "--views", "views")
-    assert wanted(tmp_path, "optimize", *seen, "--steps", 3, "-qo", "c.ply") == set(ahead.OPTIMIZE)
+    alone = set(ahead.OPTIMIZE) - set(ahead.SHARED)
+    assert wanted(tmp_path, "optimize", *seen, "--steps", 3, "-qo", "c.ply") == alone
+    seen_by_many = ("o.ply", *seen[1:], "--steps", 3, "-qo", "p.ply")
+    assert set(ahead.SHARED) <= wanted(tmp_path, "optimize", *seen_by_many) <= set(ahead.OPTIMIZE)
     assert wanted(tmp_path, "infer", *seen, "--model", "vvgt-small", "-qo", "d.ply") == set(ahead.INFER)
     assert wanted(tmp_path, "evaluate", "a.ply", "--volume", SOURCE, "--size", 24, "-q") == set(ahead.EVALUATE)
     assert wanted(tmp_path, "render", "a.ply", "--orbit", 1, "--size", 24, "-qo", "r") == set(ahead.DRAW)
@@ -190,7 +196,7 @@ def test_commands_need_what_is_compiled_ahead_and_nothing_else(tmp_path):
     assert lit == set(ahead.for_degree(ahead.for_light(ahead.CONVERT, False), 2)) - rare
     np.save(tmp_path / "seg.npy", (np.indices((9, 9, 9)).sum(axis=0) // 9).astype(np.uint8))
     labels = wanted(tmp_path, "convert", "seg.npy", *fit, "--steps", 24, "-o", "g.ply")
-    assert labels == set(ahead.for_grid(ahead.CONVERT)) - {"vvgt_cli.vbm.sharpen:mix_neighbours"}  # of other grids
+    assert labels == set(ahead.for_grid(ahead.CONVERT)) - set(ahead.SHARED[:2])  # of other grids, and of more
     assert one_by_one(tmp_path, "convert", "seg.npy", *large, "-o", "h.ply") == []
     dark = ("--light", "above", "--shadows", "--specular", 0)
     flat = wanted(tmp_path, "convert", SOURCE, *fit, "--steps", 24, *dark, "-o", "f.ply")

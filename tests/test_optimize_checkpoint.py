@@ -47,21 +47,22 @@ def after(steps):
     return lambda: next(count) == steps
 
 
-@pytest.mark.parametrize("method", ["frame", "adam", "3dgs"])
-def test_an_interrupted_run_ends_as_a_whole_one(method, tmp_path):
-    path = tmp_path / "run.npz"
-    whole, expected = run(method=method)
+@pytest.mark.parametrize(("method", "count"), [("frame", 40), ("adam", 40), ("3dgs", 40), ("frame", 700)])
+def test_an_interrupted_run_ends_as_a_whole_one(method, count, tmp_path):
+    """700 share what their steps have in common, which is found from the start again."""
+    path, start = tmp_path / "run.npz", cloud(count)
+    whole, expected = run(method=method, start=start)
     for steps in (7, 8):  # ends after 7, then after 15, where a look is due
-        part, record = run(path, after(steps), method)
+        part, record = run(path, after(steps), method, start)
         assert record.reason == "interrupted"
         assert len(part)
     assert record.steps == 15
-    result, record = run(path, method=method)
+    result, record = run(path, method=method, start=start)
     assert (record.steps, record.kept, record.reason) == (30, expected.kept, "steps")
     assert [(step, db) for step, _, db in record.checks] == [(step, db) for step, _, db in expected.checks]
     for field in FIELDS:
         assert getattr(result, field).tobytes() == getattr(whole, field).tobytes(), field
-    again, record = run(path, method=method)  # at its end: nothing is left to do
+    again, record = run(path, method=method, start=start)  # at its end: nothing is left to do
     assert record.steps == 30
     assert again.means.tobytes() == whole.means.tobytes()
 

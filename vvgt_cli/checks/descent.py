@@ -142,6 +142,10 @@ def cases() -> Iterator[Case]:
         yield Case(STAGE, f"{method}, back to where views come from", partial(_better, method))
     needles = shaped((0.8, 1e-4, 1e-4))
     yield Case(STAGE, "frame, needles, rates x 100", partial(_run, "frame", 100.0, needles))
+    many = cloud(700)
+    alike = many.take(np.zeros(700, np.int64))
+    for name, gaussians in (("that share steps", many), ("all alike", alike)):
+        yield Case(STAGE, f"frame, Gaussians {name}, rates x 100", partial(_run, "frame", 100.0, gaussians))
     for count in (0, 1, 10):
         yield Case(STAGE, f"K = {count}", partial(_few, cloud(count), SIZE))
     yield Case(STAGE, "views of one pixel", partial(_few, cloud(20), 1))

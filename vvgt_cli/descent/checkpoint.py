@@ -28,10 +28,12 @@ _FAULTS = (
     *(zipfile.BadZipFile, struct.error),
 )
 
+STEPPED = 2  # raised when the same start and options step otherwise
+
 
 def fingerprint(gaussians: Gaussians, options: OptimizeOptions, *views: Any) -> str:
     """Hash of all that a run depends on; ``views``: `Train`, `Check` or None."""
-    found = hashlib.sha256(repr(replace(options, checkpoint=None)).encode())
+    found = hashlib.sha256(f"{STEPPED} {replace(options, checkpoint=None)!r}".encode())
     for array in gaussians.arrays().values():
         found.update(array.tobytes())
     for part in filter(None, views):

@@ -12,13 +12,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from vvgt_cli.descent.steps import COUNT, FEATURES, KNOWN
+from vvgt_cli.descent import steps
+from vvgt_cli.descent.steps import FEATURES, KNOWN
 from vvgt_cli.splat.lanes import LANES
 from vvgt_cli.vbm.sharpen import curves, mix_neighbours
 
 GAIN = 7.0  # times what is foretold (docs/log.md)
-LEAST = 2_000  # Gaussians: of fewer, noise is foretold too
-SAMPLE = 12_000  # Gaussians that are regressed on, about
+LEAST = 500  # Gaussians: of fewer, noise is foretold too
+SAMPLE = 12_000  # Gaussians that are regressed on, or up to twice as many
 RUN = 16  # of them that lie side by side in memory
 RIDGE = 1e-3  # of a feature's squares
 FARTHEST = 3.0  # standard deviations that a number counts
@@ -52,15 +53,16 @@ def aligned(means: np.ndarray, factors: np.ndarray, logits: np.ndarray, colors: 
     mixed, front, around = np.empty_like(values), np.empty_like(values), np.empty(len(means))
     ones, half = np.ones(len(means)), np.full(3, max(float(np.abs(means).max()), 1e-12))
     mix_neighbours(*curves(means, half), means, lengths.mean(axis=1), ones, ones, values, mixed, front, around)
-    beside = (mixed - values).astype(np.float64)
+    beside = mixed - values
     pull = np.einsum("kij,ki->kj", factors, beside[:, 7:]) / lengths**2
     factors *= np.where(pull < 0, np.float32(-1), np.float32(1))[:, None, :]
-    known = np.concatenate([values[:, :7], beside[:, :7], np.abs(pull)], axis=1)
+    far = np.minimum(np.abs(pull), FARTHEST).astype(np.float32)  # in lengths of the axis: flat ones have no bound
+    known = np.concatenate([values[:, :7], beside[:, :7], far], axis=1)
     return _standard(known)
 
 
 def sampled(numbers: np.ndarray) -> np.ndarray:
-    """(m, n) of ``numbers`` (m, K): of all where they are few, else of about `SAMPLE`, every so many runs of `RUN`."""
+    """(m, n) of ``numbers`` (m, K): all up to `SAMPLE`, else as many to twice as many, in runs of `RUN`."""
     rows, count = numbers.shape
     if count <= SAMPLE:
         return numbers
@@ -71,8 +73,8 @@ def sampled(numbers: np.ndarray) -> np.ndarray:
 
 def _standard(numbers: np.ndarray) -> np.ndarray:
     """Of mean 0 and variance 1 over the first axis, within `FARTHEST`; 0 where all are the same."""
-    spread = numbers.std(axis=0)
-    found = (numbers - numbers.mean(axis=0)) / np.where(spread > 1e-9, spread, np.inf)
+    spread = numbers.std(axis=0, dtype=np.float64)
+    found = (numbers - numbers.mean(axis=0, dtype=np.float64)) / np.where(spread > 1e-9, spread, np.inf)
     standard: np.ndarray = np.clip(found, -FARTHEST, FARTHEST).astype(np.float32)
     return standard
 
@@ -115,10 +117,13 @@ class SharedSteps:
             self.features[begin // LANES : begin // LANES + len(blocks)] = blocks.transpose(0, 2, 1)
 
     def weights(self, directions: np.ndarray) -> np.ndarray:
-        """(KNOWN, FEATURES) float32, `GAIN` times what foretells ``directions`` (COUNT, n) of the sample."""
-        shared = np.concatenate([directions[:6], directions[9:COUNT]])  # not what turns the axes: it has no sign
-        found = GAIN * (np.nan_to_num(shared, posinf=0, neginf=0) @ self.solver.T)
-        return np.ascontiguousarray(found, np.float32)
+        """(KNOWN, FEATURES) float32, `GAIN` times what foretells ``directions`` (COUNT, n) of the sample.
+
+        Not of what turns the axes: it has no sign that means the same for all.
+        """
+        found = np.empty((KNOWN, FEATURES), np.float32)
+        steps.regress(self.solver, np.nan_to_num(directions, posinf=0, neginf=0), GAIN, found)
+        return found
 
 
 def shared_steps(means: np.ndarray, factors: np.ndarray, logits: np.ndarray, colors: np.ndarray) -> SharedSteps | None:

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from vvgt_cli.cameras import Camera
+from vvgt_cli.descent import steps
 from vvgt_cli.descent.shared import NONE, sampled, shared_steps
 from vvgt_cli.descent.steps import EPSILON
 from vvgt_cli.gaussians import SH_C0, Gaussians
@@ -18,7 +19,9 @@ from vvgt_cli.splat.rules import INRIA, Rule
 
 WARM_UP = 3  # steps
 SMALLEST = 1e-7  # standard deviation, unit frame
-WEAKEST = 0.1  # of the mean size of slopes that one counts at least: what is hardly seen goes less far than the rest
+WEAKEST = 0.1  # of the mean size of slopes, added to one's own: what is hardly seen goes less far than the rest
+MEDIAN = 7  # one of so many of the sample is in the median
+OUTLIER = 100.0  # times the median that a slope counts in that mean
 GIVEN = 0.3  # of the rate of harmonics, where the start has some: a view alone says little of them (docs/log.md)
 
 
@@ -39,20 +42,20 @@ class OwnFrame:
     """Covariance ``M M^T``; steps ``mu += M d``, ``M <- M (I + E + E^2 / 2)``, of opacity logits, colours, harmonics.
 
     Rates go with the root of the running error of the pictures: the nearer, the smaller; and from the middle of the
-    run on in a straight line to zero. Harmonics up to a degree that the start has change by `GIVEN` of the rate
-    of those that begin at zero.
+    run on in a straight line to zero. Where Gaussians share what their steps have in common (`shared_steps`), what is
+    their own counts `OWN` times, and slopes that are small beside the others' count less. Harmonics up to a degree that
+    the start has change by `GIVEN` of the rate of those that begin at zero.
     """
 
     # d, E on and off the diagonal, logit, colour, and what harmonics together change it (RMS over directions)
-    RATES = np.array([0.0375, 0.025, 0.0125, 0.0225, 0.006, 0.008])
+    RATES = np.array([0.05, 0.025, 0.0125, 0.03, 0.008, 0.008])
+    OWN = np.array([0.75, 1.0, 1.0, 0.75, 0.75, 1.0])
     CLIPS = np.array([0.5, 1.0, 0.3])  # d, logit, E
     ERROR, LARGEST = 0.05, 1.5
     BETAS = 0.6, 0.999
     STEADY = True  # what falls far behind its best can be put back there, and a run without gain is at its end
 
     def __init__(self, gaussians: Gaussians, cameras: Sequence[Camera], rule: Rule = INRIA) -> None:
-        from vvgt_cli.descent import steps
-
         scales = np.exp(gaussians.log_scales.astype(np.float64))
         harmonics = gaussians.harmonics
         self.arrays: tuple[np.ndarray, ...] = (
@@ -90,8 +93,6 @@ class OwnFrame:
         speed: float,
     ) -> None:
         """One step; ``error`` RMS of the pictures so far, ``share`` of the run behind, ``speed`` a factor of rates."""
-        from vvgt_cli.descent import steps
-
         means, factors, logits, colors = self.arrays[:4]
         harmonics, seen = _last(self.arrays, 4), self.colors_from(camera)
         pairs = moments(projection, seen, image, grad)
@@ -99,8 +100,9 @@ class OwnFrame:
         self.step += 1
         pace = speed * min(1.0, 2 * (1 - share))
         pace *= min(self.LARGEST, math.sqrt(error / self.ERROR)) * min(1.0, self.step / WARM_UP)
+        rates = self.RATES * pace if self.shared is None else self.RATES * self.OWN * pace
         steps.own_frame(
-            slopes.rows, self.RATES * pace, self.CLIPS, self.spread,
+            slopes.rows, rates, self.CLIPS, self.spread,
             *self.BETAS, self.step, means, factors, logits, colors, self.darkest, self.first, self.second,
             *self.common(slopes.rows),
         )  # fmt: skip
@@ -111,21 +113,22 @@ class OwnFrame:
             steps.adam(values, slope, rate * pace, *self.BETAS, self.step, first, second)
 
     def common(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Adam's least divisors, features and weights of what is shared, from the slopes ``rows`` (COUNT, K)."""
+        """What is added to Adam's divisors, features and weights of what is shared; from slopes ``rows`` (COUNT, K)."""
+        if self.shared is None:
+            return np.full(len(rows), EPSILON, np.float32), *NONE
         some, first, second = (sampled(array) for array in (rows, self.first, self.second))
         beta1, beta2 = self.BETAS
         with np.errstate(over="ignore", invalid="ignore"):  # of a Gaussian whose slopes are beyond float32
             first = beta1 * first + (1 - beta1) * some
             sizes = np.sqrt((beta2 * second + (1 - beta2) * some * some) / (1 - beta2**self.step))
-        sizes = np.nan_to_num(sizes, copy=False, posinf=0)
-        floors = WEAKEST * sizes.sum(axis=1) / max(sizes.shape[1], 1) + EPSILON
-        if self.shared is None:
-            return floors, *NONE
-        directions = first / (1 - beta1**self.step) / (sizes + floors[:, None])
+            middle = np.array([np.median(row[row > 0]) if (row > 0).any() else 0.0 for row in sizes[:, ::MEDIAN]])
+            usual = np.fmin(sizes, (OUTLIER * middle)[:, None].astype(np.float32))
+            floors = (WEAKEST * usual.mean(axis=1) + EPSILON).astype(np.float32)
+            directions = first / (1 - beta1**self.step) / (sizes + floors[:, None])
         return floors, self.shared.features, self.shared.weights(directions)
 
     def saved(self) -> dict[str, np.ndarray]:
-        """All that the next steps depend on."""
+        """All that the next steps depend on, beside what is made of the start again."""
         named = {f"array_{i}": array for i, array in enumerate(self.arrays)}
         named |= {f"running_{i}": array for i, array in enumerate(self.running)}
         return named | {"first": self.first.T, "second": self.second.T, "step": np.array(self.step)}
@@ -187,8 +190,6 @@ class Fields:
         self, camera: Camera, projection: Projection, pairs: np.ndarray, seen: np.ndarray, rates: Sequence[float]
     ) -> None:
         """Adam with ``rates`` for the fields, from the `moments` of a picture with the colours ``seen`` (K, 3)."""
-        from vvgt_cli.descent import steps
-
         gaussians = self.gaussians()
         slopes = fields_backward(gaussians, camera, projection, pairs, seen)
         self.step += 1

@@ -138,6 +138,30 @@ def own_frame(
             logits[k] -= _clip(buf[at + U(9) * _P1] * by_logit, farthest)
 
 
+@kernel("f4:2 f4:2 f8 f4:2", parallel=True)
+def regress(solver: np.ndarray, directions: np.ndarray, gain: float, weights: np.ndarray) -> None:
+    """``weights`` (KNOWN, FEATURES) = ``gain`` times ``directions`` (COUNT, n) by ``solver`` (FEATURES, n), float32.
+
+    Of the directions those that are shared, all finite. Sums have one order for any number of threads, unlike BLAS'.
+    """
+    whole = directions.shape[1] // LANES * LANES
+    for f in nb.prange(FEATURES):
+        sums = np.empty(LANES, np.float32)
+        for row in range(KNOWN):
+            field = row if row < 6 else row + 3
+            for i in range(U(LANES)):
+                sums[i] = f32(0)
+            for begin in range(0, whole, LANES):
+                for i in range(U(LANES)):
+                    sums[i] += solver[f, U(begin) + i] * directions[field, U(begin) + i]
+            total = f32(0)
+            for k in range(whole, directions.shape[1]):
+                total += solver[f, k] * directions[field, k]
+            for i in range(U(LANES)):
+                total += sums[i]
+            weights[row, f] = f32(gain) * total
+
+
 @kernel("f4:1 f4:1 f8 f8 f8 i8 f4:1 f4:1", parallel=True)
 def adam(
     values: np.ndarray, slopes: np.ndarray, rate: float, beta1: float, beta2: float, step: int, first: np.ndarray,

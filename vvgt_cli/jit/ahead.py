@@ -30,6 +30,11 @@ SLOPES = (
     "vvgt_cli.splat.kernel:project_factors",
 )
 REFINE = ("vvgt_cli.descent.steps:own_frame", *SLOPES, "vvgt_cli.descent.loss:loss_gradient")
+SHARED = (
+    "vvgt_cli.descent.steps:regress",
+    "vvgt_cli.vbm.sharpen:mix_neighbours",
+    "vvgt_cli.vbm.pyramid:morton_codes",
+)  # of runs of more than a few Gaussians
 HARMONICS = ("vvgt_cli.splat.harmonics:view_slopes", "vvgt_cli.splat.harmonics:view_colors")
 STEPPED = ("vvgt_cli.descent.steps:adam",)  # harmonics, in a run whose other steps are in the own frame
 DEPOSITS = ("vvgt_cli.splat.harmonics:deposit_squares", "vvgt_cli.splat.harmonics:deposit")
@@ -46,8 +51,8 @@ BLOCKS = (
     "vvgt_cli.dvr.segments:cast_segments",
     "vvgt_cli.vbm.ranges:block_ranges",
 )  # of a volume that is gone through in blocks
-CONVERT = (RAYCAST[0], REFINE[0], *CLOSED_FORM, *DRAW, *REFINE[1:], *RAYCAST[1:], *BACK_PROJECT)
-OPTIMIZE = (*REFINE, *DRAW, "vvgt_cli.vbm.pyramid:principal_axes")
+CONVERT = (RAYCAST[0], REFINE[0], *CLOSED_FORM, *DRAW, *REFINE[1:], SHARED[0], *RAYCAST[1:], *BACK_PROJECT)
+OPTIMIZE = (*REFINE, *DRAW, "vvgt_cli.vbm.pyramid:principal_axes", *SHARED)
 EVALUATE = (*RAYCAST, *DRAW)
 INFER = (*DRAW, SLOPES[0], "vvgt_cli.splat.backward:standard", *BACK_PROJECT)
 ALL = (
