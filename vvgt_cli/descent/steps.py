@@ -34,7 +34,7 @@ def _turn(
     """Adam's directions, about 1 in size, of ``count`` Gaussians from ``begin`` on into planes 0 to 12.
 
     ``slopes`` and the running moments ``first`` and ``second``, which are updated, (COUNT, K); ``ways`` beta1, beta2
-    and what undoes their start from zero; ``floors`` (COUNT,) is what slopes count at least.
+    and what undoes their start from zero; ``floors`` (COUNT,) are added to the divisors.
     """
     beta1, beta2, fix1, fix2 = ways
     start, lanes = U(begin), U(count)
@@ -109,7 +109,7 @@ def own_frame(
     (K, 3, 3), ``logits`` (K,), ``colors`` (K, 3), are float32, as are Adam's moments ``first`` and ``second``
     (COUNT, K) and what is computed, `LANES` Gaussians at a time. ``rates`` (5 or more,): d, E on and off the diagonal,
     logit, colour. ``clips`` (3,): d, logit, E. ``spread`` is the dilation's variance at the scene, ``darkest`` the
-    least that a colour becomes. Adam's divisor is at least ``floors`` (COUNT,). Added to its directions are those of
+    least that a colour becomes. ``floors`` (COUNT,) are added to Adam's divisors, and to its directions those of
     ``weights`` (KNOWN, FEATURES) for the ``features`` (blocks or none, FEATURES, LANES) of each Gaussian.
     """
     ways = f32(beta1), f32(beta2), f32(1 / (1 - beta1**step)), f32(1 / (1 - beta2**step))
