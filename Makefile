@@ -1,8 +1,8 @@
-# make test | quick | lint | long | viewers | page | ci
+# make test | quick | lint | long | viewers | page | model | ci
 VENV ?= .venv-test
 PYTHON ?= python3
 
-.PHONY: test quick lint format long fuzz viewers page ci
+.PHONY: test quick lint format long fuzz viewers page model ci
 
 $(VENV)/bin/pytest: pyproject.toml constraints.txt
 	[ -x $(VENV)/bin/python ] || $(PYTHON) -m venv $(VENV)
@@ -44,6 +44,16 @@ viewers: $(VENV)/bin/pytest
 # The viewer that `vvgt view` serves, anew of the npm packages that page/package.json pins; node and npm are needed.
 page:
 	vvgt_cli/share/page/build.sh
+
+# The shipped model trained again, data first: out/model/vvgt-small (docs/train.md). Half an hour of two cores; needs torch:
+# its build for CPUs, put into $(VENV) before, spares gigabytes.
+PROCESSES ?= $(shell nproc)
+model: $(VENV)/bin/pytest
+	$(VENV)/bin/pip install -qq --disable-pip-version-check -c constraints.txt -e '.[test,train]'
+	$(VENV)/bin/python benchmarks/training.py data out/model/data
+	PATH="$(CURDIR)/$(VENV)/bin:$$PATH" torchrun --standalone --nproc-per-node $(PROCESSES) -m vvgt_cli.cli.main train \
+		--data out/model/data --config examples/vvgt-small.yaml -o out/model/run --threads 1
+	$(VENV)/bin/vvgt export out/model/run/best.pt -o out/model/vvgt-small --overwrite
 
 ci:
 	.ci/run
