@@ -47,7 +47,7 @@ page:
 
 # The shipped model trained again, data first: out/model/vvgt-small (docs/train.md). Half an hour of two cores; needs torch:
 # its build for CPUs, put into $(VENV) before, spares gigabytes.
-PROCESSES ?= $(shell nproc)
+PROCESSES ?= $(shell OMP_NUM_THREADS= nproc)
 model: $(VENV)/bin/pytest
 	$(VENV)/bin/pip install -qq --disable-pip-version-check -c constraints.txt -e '.[test,train]'
 	$(VENV)/bin/python benchmarks/training.py data out/model/data
