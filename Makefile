@@ -45,7 +45,7 @@ viewers: $(VENV)/bin/pytest
 page:
 	vvgt_cli/share/page/build.sh
 
-# The shipped model trained again, data first: out/model/vvgt-small (docs/train.md). Half an hour of two cores; needs torch:
+# The shipped model trained again, data first: out/model/vvgt-small (docs/train.md). An hour of two cores; needs torch:
 # its build for CPUs, put into $(VENV) before, spares gigabytes.
 PROCESSES ?= $(shell OMP_NUM_THREADS= nproc)
 model: $(VENV)/bin/pytest
