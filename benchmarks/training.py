@@ -63,26 +63,25 @@ def main() -> None:
     """Benchmarks of training."""
 
 
-def shapes(folder: Path) -> None:
-    """All shapes."""
-    for part, seeds in (("train", TRAINED), ("held", HELD)):
-        for number, kind in enumerate(KINDS):
-            for seed in seeds:
-                own = seed + MORE * KINDS[:number].count(kind)
-                path = folder / part / f"{kind}_{own}.nrrd"
-                if not path.exists():
-                    write_nrrd(path, make_shape(kind, SIZES[own % len(SIZES)], own))
+def shapes(folder: Path, kinds: tuple[str, ...], sizes: tuple[int, ...], seeds: range) -> None:
+    """Shapes of all kinds and seeds."""
+    for number, kind in enumerate(kinds):
+        for seed in seeds:
+            own = seed + MORE * kinds[:number].count(kind)
+            path = folder / f"{kind}_{own}.nrrd"
+            if not path.exists():
+                write_nrrd(path, make_shape(kind, sizes[own % len(sizes)], own))
 
 
-def turbulence(folder: Path, kind: str, seed: int, snapshots: int) -> None:
-    """Snapshots of one flow, every field a file; a flow that is there already is left out."""
+def turbulence(folder: Path, kind: str, grid: int, seed: int, turnovers: list[float]) -> None:
+    """Snapshots of one flow that many ``turnovers`` apart, every field a file; a flow that is there is left out."""
     name = lambda field, number: folder / f"{kind}_{seed}_{number}_{field}.nrrd"  # noqa: E731
-    if name("speed", snapshots - 1).exists():
+    if name("speed", len(turnovers) - 1).exists():
         return
-    solver = Solver(flow_of(kind, GRID))
+    solver = Solver(flow_of(kind, grid))
     state = solver.start(seed)
-    for number in range(snapshots):
-        state = run(solver, state, TURNOVER * (EVERY if number else FIRST))
+    for number, turnover in enumerate(turnovers):
+        state = run(solver, state, TURNOVER * turnover)
         Console().say(f"{kind} {seed}, snapshot {number}: E {solver.energy(state):.3f}, "
                     f"dissipation {solver.dissipation(state):.3f}")  # fmt: skip
         for field, values in fields(solver, state).items():
@@ -93,13 +92,17 @@ def turbulence(folder: Path, kind: str, seed: int, snapshots: int) -> None:
 @click.argument("folder", type=Path)
 def data(folder: Path) -> None:
     """Write the volumes."""
-    for part in ("train", "held"):
-        (folder / part).mkdir(parents=True, exist_ok=True)
-    flows = ("isotropic", "stratified")
+    train, held = folder / "train", folder / "held"
+    for part in (train, held):
+        part.mkdir(parents=True, exist_ok=True)
+    later = [EVERY] * (SNAPSHOTS - 1)
+    # new processes read this file anew: what they make is named in full
     with ProcessPoolExecutor(len(os.sched_getaffinity(0)), get_context("spawn")) as pool:
-        jobs = [pool.submit(turbulence, folder / "train", kind, 0, SNAPSHOTS) for kind in flows]
-        jobs += [pool.submit(turbulence, folder / "held", kind, HELD_SEED, 1) for kind in flows]
-        jobs.append(pool.submit(shapes, folder))
+        jobs = []
+        for kind in ("isotropic", "stratified"):
+            jobs.append(pool.submit(turbulence, train, kind, GRID, 0, [FIRST, *later]))
+            jobs.append(pool.submit(turbulence, held, kind, GRID, HELD_SEED, [FIRST]))
+        jobs += [pool.submit(shapes, part, KINDS, SIZES, seeds) for part, seeds in ((train, TRAINED), (held, HELD))]
         for job in jobs:
             job.result()
 
