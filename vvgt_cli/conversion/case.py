@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vvgt_cli.cameras.blocks import BLOCK, ENOUGH, FEW, spread_blocks
+from vvgt_cli.gaussians import Gaussians, as_stored
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
 
-SORT = 0.95e-3  # seconds in which 200,000 random float64 sort on the two cores that costs were fitted on
+SPLAT = 3.8e-3  # seconds of `_splats`'s picture on the two cores that costs were fitted on
 PROBE = 80  # pixels along the edge of the view that is timed
-VIEW, FINER = 1.1, 1.8  # of the view that is timed: a training view, and as much again where it is to judge by
+VIEW, FINER = 0.7, 1.8  # of the view that is timed: a training view, and as much again where it is to judge by
 LARGE, SMALL = 300, 200  # pixels along the edge of a training view, at most: more show no more (docs/optimize.md)
 PROGRAM = 2.6e8  # bytes: interpreter, libraries and kernels
 
@@ -91,7 +92,7 @@ def expected_wide(gaussians: int, size: int) -> bool:
 
 
 def measure(scene: Scene, size: int, gaussians: int) -> Case:
-    """The case of a scene: counted, a small view timed, the machine's pace by a sort."""
+    """The case of a scene: counted, a small view timed, the machine's pace by a picture of Gaussians."""
     from vvgt_cli.dvr.scene import BRICK
     from vvgt_cli.vbm.closed_form import expected_cells
 
@@ -133,10 +134,10 @@ def _view_seconds(scene: Scene, size: int) -> float:
     return _quickest(lambda: render_view(scene, camera, settings)) * (size / PROBE) ** 2
 
 
-def _quickest(call: Callable[[], object]) -> float:
-    """Seconds of the quickest of three calls."""
+def _quickest(call: Callable[[], object], calls: int = 3) -> float:
+    """Seconds of the quickest of some calls."""
     taken = []
-    for _ in range(3):
+    for _ in range(calls):
         begin = time.perf_counter()
         call()
         taken.append(time.perf_counter() - begin)
@@ -144,8 +145,18 @@ def _quickest(call: Callable[[], object]) -> float:
 
 
 def _pace() -> float:
-    """How many times as long as the machine of the fit this one takes: a sort, and the threads."""
-    import numba
+    """How many times as long as the machine of the fit this one takes: to draw Gaussians, on as many threads."""
+    from vvgt_cli.cameras import default_views
+    from vvgt_cli.splat import render
 
-    values = np.random.default_rng(0).random(200_000)
-    return float(_quickest(lambda: np.sort(values)) / SORT * (2 / numba.get_num_threads()) ** 0.7)
+    cloud, camera = _splats(20_000, 0.012), default_views("check", 1, size=200)[0]
+    render(cloud, camera)  # compiled, or loaded
+    return _quickest(lambda: render(cloud, camera), 5) / SPLAT
+
+
+def _splats(count: int, width: float) -> Gaussians:
+    """Faint balls of standard deviation ``width``, the same each time."""
+    rng = np.random.default_rng(0)
+    means, colors = rng.uniform(-0.5, 0.5, (count, 3)), rng.random((count, 3))
+    quaternions = np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
+    return as_stored(Gaussians(means, np.full((count, 3), np.log(width)), quaternions, np.full(count, -1.5), colors))

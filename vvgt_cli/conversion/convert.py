@@ -171,9 +171,11 @@ def _fit(work: Work, request: ConvertRequest, planner: Planner, plan: Plan) -> P
     degree = work.made().degree if request.ply.sh_degree is None else request.ply.sh_degree
     if request.output is not None and request.output != STDOUT:
         check_room(request.output, file_bytes(len(work.made()), degree))
-    pace = max(work.run.report.stages[-1].seconds / first.cost(plan.case).seconds, QUICKEST)
+    # halfway between its pace and that of drawing: steps follow neither alone on every machine
+    pace = max(work.run.report.stages[-1].seconds / first.cost(plan.case).seconds, QUICKEST) ** 0.5
     planner = replace(planner, wide=wide(work.made(), work.fit.size), sh_degree=degree)
-    plan = planner.plan(replace(plan.case.at(pace), degree=work.made().degree), work.run.elapsed(), begun=True)
+    case = replace(plan.case.at(pace), gaussians=len(work.made()), degree=work.made().degree)
+    plan = planner.plan(case, work.run.elapsed(), begun=True)
     check_memory(plan)
     improve(work, plan)
     work.gaussians = as_stored(work.made())  # what is scored is what the file holds

@@ -10,7 +10,7 @@ from vvgt_cli.conversion.stage import Cost, Stage, Work
 from vvgt_cli.conversion.stages.refinement import step_seconds
 from vvgt_cli.jit.ahead import BACK_PROJECT
 
-STEPS = 140.0  # of gradient descent on whole views that take as long
+STEPS = 105.0  # of gradient descent on whole views that take as long
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import ClassVar
 from vvgt_cli.conversion.case import Case
 from vvgt_cli.conversion.stage import Cost, Stage, Work
 
-SECONDS = 0.5, 4.0  # always, per 100,000 Gaussians (docs/network.md)
+SECONDS = 0.2, 2.1  # always, per 100,000 Gaussians (docs/network.md)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from vvgt_cli.runs.score import psnr_note, score_test_views
 from vvgt_cli.runs.seats import PREVIEW_VIEWS, SIDE, from_above, score_seats, seat_views
 
 SCORE, SCORE_ALL = (3, 0.03), (10, 0.2)  # views, and seconds a view beside its rendering
-SEATS = 2, 0.3  # check views, and seconds beside them
+SEATS = 2, 0.15, 0.155  # check views, and seconds beside them: always, per 100,000 Gaussians
 
 
 @dataclass(frozen=True)
@@ -61,8 +61,8 @@ class Seats(Stage):
     scores: ClassVar[bool] = True
 
     def cost(self, case: Case) -> Cost:
-        """By pixels."""
-        return Cost(SEATS[0] * case.glance + case.pace * SEATS[1])
+        """By pixels and Gaussians."""
+        return Cost(SEATS[0] * case.glance + case.pace * (SEATS[1] + SEATS[2] * case.gaussians / 1e5))
 
     def run(self, work: Work) -> None:
         """Score."""
