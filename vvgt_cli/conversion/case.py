@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 SPLAT = 3.8e-3  # seconds of `_splats`'s picture on the two cores that costs were fitted on
 PROBE = 80  # pixels along the edge of the view that is timed
-VIEW, FINER = 0.7, 1.8  # of the view that is timed: a training view, and as much again where it is to judge by
+VIEW, FINER = 0.7, 1.2  # of the view that is timed: a training view, and as much again where it is to judge by
 LARGE, SMALL = 300, 200  # pixels along the edge of a training view, at most: more show no more (docs/optimize.md)
 PROGRAM = 2.6e8  # bytes: interpreter, libraries and kernels
 
@@ -66,15 +66,14 @@ class Case:
         blocks = spread_blocks(self.size, self.size, enough=enough)
         return self.size**2 if blocks is None else blocks.numbers.size * BLOCK**2
 
-    @property
-    def judge(self) -> float:
-        """Seconds of a test view's reference."""
-        return FINER * self.view * self.judged / self.edge**2
+    def judging(self, pixels: int) -> float:
+        """Seconds of a reference of so many pixels."""
+        return FINER * self.view * pixels / self.edge**2
 
     @property
     def glance(self) -> float:
         """Seconds of a check view's reference."""
-        return FINER * self.view * self.glanced / self.edge**2
+        return self.judging(self.glanced)
 
     def at(self, pace: float) -> Case:
         """The same on a machine that takes ``pace`` times as long; what was timed stays."""

@@ -8,10 +8,10 @@ from typing import ClassVar
 from vvgt_cli.cameras.blocks import FEW
 from vvgt_cli.conversion.case import Case
 from vvgt_cli.conversion.stage import Cost, Stage, Work
-from vvgt_cli.runs.score import psnr_note, score_test_views
+from vvgt_cli.runs.score import WHOLE, psnr_note, score_test_views
 from vvgt_cli.runs.seats import PREVIEW_VIEWS, SIDE, from_above, score_seats, seat_views
 
-SCORE, SCORE_ALL = (3, 0.03), (10, 0.2)  # views, and seconds a view beside its rendering
+SCORE, SCORE_ALL = (3, 0, 0.03), (10, len(WHOLE), 0.1)  # views, whole ones of them, seconds beside per 400 x 400 px
 SEATS = 2, 0.15, 0.155  # check views, and seconds beside them: always, per 100,000 Gaussians
 
 
@@ -30,8 +30,9 @@ class TestViews(Stage):
 
     def cost(self, case: Case) -> Cost:
         """By pixels."""
-        views, beside = SCORE_ALL if self.whole else SCORE
-        return Cost(views * (case.judge + case.pace * beside * case.judged / 400**2))
+        views, whole, beside = SCORE_ALL if self.whole else SCORE
+        pixels = whole * case.size**2 + (views - whole) * case.judged
+        return Cost(case.judging(pixels) + case.pace * beside * pixels / 400**2)
 
     def run(self, work: Work) -> None:
         """Score."""
