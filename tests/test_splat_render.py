@@ -202,6 +202,9 @@ def test_depths_sort_stably_and_tiles_are_dealt_out_whole():
     rng = np.random.default_rng(0)
     depth = np.float32(rng.choice([0, 1e-30, 0.5, 1, 1.0000001, 3e38], 2000) * rng.integers(1, 3, 2000) / 2)
     np.testing.assert_array_equal(depth_order(depth), np.argsort(depth, kind="stable"))
+    anywhere = rng.integers(0, np.float32(np.inf).view(np.uint32) + 1, 5000).astype(np.uint32).view(np.float32)
+    np.testing.assert_array_equal(depth_order(anywhere), np.argsort(anywhere, kind="stable"))
+    assert depth_order(depth[:0]).shape == (0,)
     np.testing.assert_array_equal(np.sort(balance(rng.integers(0, 9, 101))), np.arange(101))
 
 

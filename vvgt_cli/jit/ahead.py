@@ -9,7 +9,12 @@ GRID = {
     "vvgt_cli.dvr.lit:render_lit_tiles": "vvgt_cli.dvr.grid:render_lit_grid_tiles",
     "vvgt_cli.vbm.quadrature:block_moments": "vvgt_cli.vbm.grid:grid_moments",
 }
-DRAW = ("vvgt_cli.splat.kernel:tile_lists", "vvgt_cli.splat.tiles:blend", "vvgt_cli.splat.kernel:project")
+DRAW = (
+    "vvgt_cli.splat.kernel:tile_lists",
+    "vvgt_cli.splat.tiles:blend",
+    "vvgt_cli.splat.kernel:project",
+    "vvgt_cli.splat.kernel:stable_order",
+)
 CLOSED_FORM = (
     "vvgt_cli.vbm.visibility:march",
     "vvgt_cli.vbm.quadrature:block_moments",

@@ -138,6 +138,37 @@ def project_factors(
         _finish(buf, begin, count, pose, lens, rule, flat, depth, extent)
 
 
+@kernel("u4:1")
+def stable_order(keys: np.ndarray) -> np.ndarray:
+    """Order (K,) int64 that sorts ``keys`` (K,) uint32, equal ones as they come (radix sort, 11 bits a pass)."""
+    begin = np.zeros((3, 1 << 11), np.int64)
+    for key in keys:
+        begin[0, key & 0x7FF] += 1
+        begin[1, (key >> 11) & 0x7FF] += 1
+        begin[2, key >> 22] += 1
+    for digit in range(3):
+        place = 0
+        for value in range(1 << 11):
+            count = begin[digit, value]
+            begin[digit, value] = place
+            place += count
+    rows, more = np.empty(len(keys), np.uint64), np.empty(len(keys), np.uint64)  # key and number
+    for k in range(len(keys)):
+        value = keys[k] & 0x7FF
+        rows[begin[0, value]] = np.uint64(keys[k]) << np.uint64(32) | np.uint64(k)
+        begin[0, value] += 1
+    for row in rows:
+        middle = row >> np.uint64(43) & np.uint64(0x7FF)
+        more[begin[1, middle]] = row
+        begin[1, middle] += 1
+    order = np.empty(len(keys), np.int64)
+    for row in more:
+        top = row >> np.uint64(54)
+        order[begin[2, top]] = row & np.uint64(0xFFFFFFFF)
+        begin[2, top] += 1
+    return order
+
+
 @kernel("i8:1 i4:2 i8 i8 i8", parallel=True)
 def tile_lists(
     order: np.ndarray, extent: np.ndarray, tiles_x: int, tiles_y: int, workers: int

@@ -85,10 +85,10 @@ def pose(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def depth_order(depth: np.ndarray) -> np.ndarray:
-    """Stable order of depths (K,) float32 >= 0, whose bits sort as integers; unique keys make any sort stable."""
-    keys = depth.view(np.uint32).astype(np.uint64) << np.uint64(32) | np.arange(len(depth), dtype=np.uint64)
-    keys.sort()
-    return (keys & np.uint64(0xFFFFFFFF)).astype(np.int64)
+    """Stable order of depths (K,) float32 >= 0, whose bits sort as integers."""
+    from vvgt_cli.splat import kernel
+
+    return kernel.stable_order(depth.view(np.uint32))
 
 
 def balance(work: np.ndarray) -> np.ndarray:
