@@ -82,7 +82,7 @@ def test_without_limits_the_default_steps_are_planned_and_back_projection_is_not
     assert steps_of(found) == DEFAULT_STEPS
     assert [name for name, _ in found.left_out] == ["network", "back-projection"]
     assert found.seconds == pytest.approx(sum(seconds for _, seconds in found.costs()))
-    step = 0.027 * (48 / 400) ** 2 + 0.031
+    step = 0.027 * (48 / 400) ** 2 + 0.0275
     assert found.seconds == pytest.approx(1 + FORM + DEFAULT_STEPS * step + 96 * 0.05 + 4 * 0.06 + ending())
     assert found.bytes == 1000 + 1000 * 68
     assert f"{DEFAULT_STEPS} steps" in found.text()
@@ -95,7 +95,7 @@ def test_views_are_small_where_gaussians_are_wide(size, edge):
     assert (descent.small, descent.steps, views.edge) == (True, DEFAULT_STEPS, edge)
     judged, glanced, whole = drawn(size, ENOUGH), drawn(size, FEW), min(size, 300)
     judge, glance = (1.2 * 0.05 * pixels / whole**2 for pixels in (judged, glanced))
-    step = 0.027 * (edge / 400) ** 2 + 0.031
+    step = 0.027 * (edge / 400) ** 2 + 0.0275
     seconds = (
         1
         + FORM

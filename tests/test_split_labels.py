@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 
 from vvgt_cli.batches import labels as split
+from vvgt_cli.conversion.request import file_bytes
+from vvgt_cli.conversion.stages import Seats
 from vvgt_cli.dvr import RenderSettings
 from vvgt_cli.gaussians import Gaussians, read_ply
 from vvgt_cli.runs.owners import hidden_in, owners
@@ -68,6 +70,18 @@ def test_what_others_hide_is_there_when_they_are_switched_off(vvgt, tmp_path: Pa
     assert scores["scores"]["psnr"] > 25
     assert [stage["name"] for stage in scores["plan"]["stages"]] == ["test views", "seats"]
     assert scores["gaussians"] == len(core)
+
+
+def test_the_plan_of_a_part_is_of_the_gaussians_that_it_got(vvgt, tmp_path: Path, monkeypatch) -> None:
+    counts, cost = [], Seats.cost
+    monkeypatch.setattr(Seats, "cost", lambda stage, case: counts.append(case.gaussians) or cost(stage, case))
+    files = converted(vvgt, tmp_path, nested(cut=True), "--report", tmp_path / "r_{}.json")
+    names = {1: "r_1-label-1.json", 3: "r_3-label-3.json"}
+    for number, name in names.items():
+        plan = json.loads((tmp_path / name).read_text())["plan"]
+        assert plan["gaussians"] == len(files[number])
+        assert plan["bytes"] == file_bytes(len(files[number]), 0)
+        assert len(files[number]) in counts
 
 
 def test_a_single_label_and_one_that_is_nowhere(vvgt, tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from vvgt_cli.gaussians import Gaussians, as_stored
 if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
 
-SPLAT = 3.8e-3  # seconds of `_splats`'s picture on the two cores that costs were fitted on
+SPLAT = 3.35e-3  # seconds of `_splats`'s picture on the two cores that costs were fitted on
 PROBE = 80  # pixels along the edge of the view that is timed
 VIEW, FINER = 0.7, 1.2  # of the view that is timed: a training view, and as much again where it is to judge by
 LARGE, SMALL = 300, 200  # pixels along the edge of a training view, at most: more show no more (docs/optimize.md)

@@ -122,7 +122,8 @@ def run_conversion(run: Run, request: ConvertRequest, made: Gaussians | None = N
     source, work, planner, plan = _planned(run, request)
     if made is not None:
         plan.stages, plan.left_out = [stage for stage in plan.stages if stage.scores], []
-        plan.gaussians = len(made)
+        plan.gaussians, plan.case = len(made), replace(plan.case, gaussians=len(made))
+        plan.bytes = file_bytes(len(made), planner.sh_degree)
         run.report.plan = plan.record()
     check_memory(plan, work.scene)
     work.checkpoint = checkpoint_of(request.checkpoint, source, work.fit, request.limits)

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numba
+from numba.core import config
 from numba.core.registry import cpu_target
 
 from vvgt_cli.jit.store import PACKAGE, folder_for_writing, folders, warn_once
@@ -39,8 +40,10 @@ class Job:
 
 
 def usual_jobs(names: Iterable[str], volumes: Sequence[str] = VOLUMES) -> list[Job]:
-    """Jobs for the declared argument types of kernels ("vvgt_cli.room.module:function")."""
-    jobs = []
+    """Jobs for the declared argument types of kernels ("vvgt_cli.room.module:function"); none where numba is off."""
+    jobs: list[Job] = []
+    if config.DISABLE_JIT:  # type: ignore[attr-defined]
+        return jobs
     for name in names:
         module, function = name.split(":")
         dispatcher = getattr(import_module(module), function)

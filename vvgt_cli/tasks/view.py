@@ -15,7 +15,7 @@ from pathlib import Path
 
 from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians import Gaussians, PlyOptions, write_ply
-from vvgt_cli.jit.ahead import DRAW
+from vvgt_cli.jit.ahead import DRAW, for_degree
 from vvgt_cli.progress import Console
 from vvgt_cli.runs.gaussian_files import STDIN, layout_of, open_gaussians, write_gaussians
 from vvgt_cli.runs.outputs import Output, claimed
@@ -74,7 +74,7 @@ def view(request: ViewRequest, announce: Callable[[str], None], console: Console
     with claimed([Output("-o", request.output, SUFFIXES, splats=True)], files, request.overwrite):
         gaussians, options = _opened(run, request, files[0])
         write_gaussians(run, request.output, gaussians, options, request.overwrite)
-        run.compile(DRAW)
+        run.compile(for_degree(DRAW, gaussians.degree))
         tell_agreement(run, request.output, gaussians, options)
 
 

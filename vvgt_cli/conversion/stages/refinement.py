@@ -16,7 +16,7 @@ from vvgt_cli.runs.record import Run
 from vvgt_cli.runs.views import Views
 from vvgt_cli.splat.constants import MIN_ALPHA
 
-STEP = 0.027, 0.031  # seconds per 400 x 400 px, per 100,000 Gaussians
+STEP = 0.027, 0.0275  # seconds per 400 x 400 px, per 100,000 Gaussians
 HARMONICS = 1.0, 1.1, 1.25, 1.4  # times as long with harmonics of degree 0 to 3
 LOOK = 25  # steps between two looks at the check views where a target ends the run; else one is taken in the middle
 SMALLEST = 0.5  # standard deviation of the longest axis in pixels of the screen: viewers drop or fade less

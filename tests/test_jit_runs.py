@@ -1,0 +1,52 @@
+"""What commands have compiled, and what runs where numba is off."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from vvgt_cli.gaussians import Gaussians, write_ply
+from vvgt_cli.jit import ahead
+from vvgt_cli.jit.compile import usual_jobs
+from vvgt_cli.runs.record import Run
+
+
+def some(count: int = 60, degree: int = 0) -> Gaussians:
+    """Gaussians here and there."""
+    rng = np.random.default_rng(0)
+    means, colors, log_scales = rng.uniform(-0.4, 0.4, (count, 3)), rng.random((count, 3)), np.full((count, 3), -3.0)
+    harmonics = rng.normal(0, 0.02, (count, (degree + 1) ** 2 - 1, 3)) if degree else None
+    return Gaussians(means, log_scales, rng.normal(size=(count, 4)), rng.normal(size=count), colors, harmonics)
+
+
+def test_view_has_harmonics_compiled_where_there_are_some(vvgt, tmp_path: Path, monkeypatch) -> None:
+    asked: list[tuple[str, ...]] = []
+    monkeypatch.setattr(Run, "compile", lambda run, kernels, volume=None: asked.append(tuple(kernels)))
+    for degree in (0, 2):
+        write_ply(str(tmp_path / "a.ply"), some(degree=degree))
+        done = vvgt("view", tmp_path / "a.ply", "-o", tmp_path / f"a{degree}.spz")
+        assert done.code == 0, done.err
+    assert asked == [ahead.DRAW, ahead.for_degree(ahead.DRAW, 2)]
+
+
+def test_drawing_runs_as_python_where_numba_is_off(vvgt, tmp_path: Path) -> None:
+    write_ply(str(tmp_path / "a.ply"), some())
+    line = ("render", tmp_path / "a.ply", "--orbit", "2", "--size", "24", "-o")
+    assert vvgt(*line, tmp_path / "compiled").code == 0
+    plain = subprocess.run(
+        [sys.executable, "-m", "vvgt_cli.cli.main", *map(str, line), str(tmp_path / "plain")],
+        env=os.environ | {"NUMBA_DISABLE_JIT": "1"}, capture_output=True, text=True,
+    )  # fmt: skip
+    assert plain.returncode == 0, plain.stderr
+    for name in ("orbit_000.png", "orbit_001.png"):
+        assert (tmp_path / "plain" / name).read_bytes() == (tmp_path / "compiled" / name).read_bytes()
+
+
+def test_nothing_is_compiled_where_numba_is_off(monkeypatch) -> None:
+    assert len(usual_jobs(ahead.DRAW, ("float32",))) == len(ahead.DRAW)
+    monkeypatch.setattr("numba.config.DISABLE_JIT", 1)
+    assert usual_jobs(ahead.DRAW) == []
