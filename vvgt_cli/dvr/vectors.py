@@ -10,10 +10,27 @@ from typing import Any, TypeAlias
 
 from llvmlite import ir
 from numba import extending, types
+from numba.core import config
 from numba.core.errors import TypingError
 from numba.extending import models, register_model
 
-intrinsic: Any = extending.intrinsic  # called without its first argument, which type checkers do not know
+from vvgt_cli.errors import UsageError
+
+
+def _missing(_: Any) -> Any:
+    """In place of what there is in compiled code alone."""
+
+    def call(*_: Any) -> Any:
+        raise UsageError(
+            "NUMBA_DISABLE_JIT is set, and volumes are drawn by vector instructions, which Python has not; expected "
+            "it unset or 0 (what draws Gaussians alone, as vvgt render, runs with it)"
+        )
+
+    return call
+
+
+# called without its first argument, which type checkers do not know
+intrinsic: Any = _missing if config.DISABLE_JIT else extending.intrinsic  # type: ignore[attr-defined]
 DOUBLE = ir.DoubleType()
 QUAD = ir.VectorType(DOUBLE, 4)
 FLAGS = ("contract", "nsz")
