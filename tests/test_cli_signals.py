@@ -46,6 +46,44 @@ print("alive", flush=True)
 os.kill(os.getpid(), signal.SIGTERM)
 time.sleep(60)
 """
+# Signals at many moments of a command that does nothing but draw one Gaussian; a run after the other in one process.
+OFTEN = """
+import os, random, signal, sys, threading, time, types
+import click, numpy as np
+from vvgt_cli.cameras import default_views
+from vvgt_cli.cli import main, process
+from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.splat import render
+
+@click.command()
+def command():
+    ready.set()
+    latest = time.monotonic() + process.GRACE
+    while time.monotonic() < latest:
+        render(gaussian, camera)
+    sys.exit(128 + number)  # nothing that is raised gets through in __del__: the other thread ends the process then
+
+def send():
+    ready.wait()
+    ready.clear()
+    time.sleep(rng.uniform(0, 5e-3))
+    os.kill(os.getpid(), number)
+
+gaussian = Gaussians(np.zeros((1, 3)), np.full((1, 3), -3.0), np.eye(1, 4), np.zeros(1), np.full((1, 3), 0.5))
+camera = default_views("test", 1, size=16)[0]
+render(gaussian, camera)  # loads the kernels
+ready, rng, number = threading.Event(), random.Random(0), getattr(signal, sys.argv[1])
+main.COMMANDS["often"], sys.modules["often"] = "often", types.SimpleNamespace(command=command)
+process._listen = lambda reader: None  # nothing but what is raised ends a run
+signal.signal(signal.SIGINT, signal.default_int_handler)
+process.end_on_signals()
+for _ in range(200):
+    thread = threading.Thread(target=send)
+    thread.start()
+    print(main.run(["often"]), flush=True)
+    thread.join()
+os._exit(0)
+"""
 
 
 def start(code: str, folder: Path, *args: str) -> subprocess.Popen[str]:
@@ -76,3 +114,12 @@ def test_a_hangup_that_is_ignored_stays_so(tmp_path):
     child = start(ALONE, tmp_path)
     out, told = child.communicate()
     assert (child.returncode, out, told) == (128 + signal.SIGTERM, "alive\n", "")
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGINT"])
+def test_no_kernel_that_is_being_called_swallows_a_signal(name, tmp_path):
+    number = getattr(signal, name)
+    out, told = start(OFTEN, tmp_path, name).communicate(timeout=120)
+    status, line = (130, "interrupted") if name == "SIGINT" else (128 + number, f"ended by {name}")
+    assert out.split() == 200 * [str(status)], told[-2000:]
+    assert told.splitlines() == 200 * [f"vvgt: error: {line}"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import importlib
 import os
+import signal
 import sys
 import time
 import traceback
@@ -16,7 +17,7 @@ import click
 
 from vvgt_cli import __version__
 from vvgt_cli.cli.numbers import expand
-from vvgt_cli.cli.process import end_on_signals, ended_by, first_of_group, open_streams
+from vvgt_cli.cli.process import end_on_signals, ended_by, first_of_group, heard, open_streams
 from vvgt_cli.errors import UsageError, VvgtError
 
 COMMANDS = {
@@ -125,6 +126,7 @@ def _stdout_fails() -> bool:
 
 def run(args: Sequence[str] | None = None) -> int:
     """Run a command line and return its exit status; every error is one line on standard error."""
+    heard.clear()
     try:
         # not cli.main: it would turn a broken pipe and an interrupt into statuses of its own
         with cli.make_context("vvgt", expand(sys.argv[1:] if args is None else args)) as context:
@@ -134,7 +136,12 @@ def run(args: Sequence[str] | None = None) -> int:
     except BaseException as error:
         if os.environ.get(DEBUG):
             traceback.print_exc()
-        return _status(error)
+        return _status(_ended(heard[0]) if heard else error)
+
+
+def _ended(number: int) -> BaseException:
+    """What a signal raises, whatever a kernel that was being called has made of it."""
+    return KeyboardInterrupt() if number == signal.SIGINT else SystemExit(128 + number)
 
 
 def _status(error: BaseException) -> int:

@@ -14,8 +14,9 @@ from typing import Any
 from vvgt_cli.files import discard_leftovers
 from vvgt_cli.progress import MessageStream
 
-GRACE = 1.0  # seconds to end as an exception does, after which the process ends as it is
+GRACE = 0.5  # seconds to end as an exception does, after which the process ends as it is
 ENDING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
+heard: list[int] = []  # signals that have ended the present run; what is raised after one is its doing
 
 
 def open_streams() -> None:
@@ -37,8 +38,10 @@ def open_streams() -> None:
 
 
 def end_on_signals() -> None:
-    """Let SIGTERM and SIGHUP (unless it is ignored, as under nohup) end the process as an exception does.
+    """Let SIGTERM, SIGINT and SIGHUP (unless it is ignored, as under nohup) end the process as an exception does.
 
+    A compiled kernel that is being called at that moment turns the exception into another, so the signal is noted in
+    `heard` as well, and `vvgt_cli.cli.main.run` goes by that.
     Python runs handlers between two steps of its own, so that one second in a kernel would go by unanswered, or
     twenty. So another thread listens too: what has not ended after `GRACE` seconds ends without unwinding, its
     temporary files removed. Where somebody else has taken a signal over (training does), it is theirs.
@@ -46,6 +49,8 @@ def end_on_signals() -> None:
     for number in ENDING:
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _end)
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _interrupt)
     if os.name == "posix":
         reader, writer = os.pipe()
         os.set_blocking(writer, False)
@@ -81,16 +86,16 @@ def interruption(say: Callable[[str], None]) -> Iterator[Callable[[], bool]]:
 @contextmanager
 def ending() -> Iterator[list[int]]:
     """Within the block signals to end only put their number into the list: the step ends first, and is saved."""
-    heard: list[int] = []
+    told: list[int] = []
     if threading.current_thread() is not threading.main_thread():
-        yield heard  # handlers belong to the main thread
+        yield told  # handlers belong to the main thread
         return
     names = ("SIGTERM", "SIGINT", "SIGHUP")
     numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
     numbers = [number for number in numbers if signal.getsignal(number) is not signal.SIG_IGN]  # as under nohup
-    before = [signal.signal(number, lambda n, frame: heard.append(n)) for number in numbers]
+    before = [signal.signal(number, lambda n, frame: told.append(n)) for number in numbers]
     try:
-        yield heard
+        yield told
     finally:
         for number, handler in zip(numbers, before, strict=True):
             signal.signal(number, handler)
@@ -102,7 +107,13 @@ def first_of_group() -> bool:
 
 
 def _end(number: int, frame: object) -> None:
+    heard.append(number)
     sys.exit(128 + number)
+
+
+def _interrupt(number: int, frame: object) -> None:
+    heard.append(number)
+    raise KeyboardInterrupt
 
 
 def _listen(reader: int) -> None:
