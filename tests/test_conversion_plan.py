@@ -242,7 +242,7 @@ def test_the_seconds_of_a_network_are_not_spent_on_steps_too():
 def test_views_are_fitted_to_at_their_size_and_judged_at_the_screens(tmp_path, monkeypatch):
     asked = []
 
-    def refine(run, gaussians, train, check, options):
+    def refine(run, gaussians, train, check, options, begin=None):
         asked.append((options.rule, options.judge))
         return gaussians
 

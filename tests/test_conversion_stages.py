@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from vvgt_cli.cameras import default_views
-from vvgt_cli.conversion.stages.refinement import drawn_by_all
+from vvgt_cli.conversion.stages.refinement import drawn_by_all, refine
 from vvgt_cli.conversion.stages.views import fine_enough, wide
+from vvgt_cli.descent import OptimizeOptions
 from vvgt_cli.dvr import RenderSettings, Scene, render_view
 from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.runs.views import judging_views
+from vvgt_cli.progress import Console
+from vvgt_cli.runs.record import ConversionReport, Run
+from vvgt_cli.runs.views import Views, judging_views
+from vvgt_cli.splat import render
 from vvgt_cli.splat.rules import INRIA
 from vvgt_cli.transfer.readers import minimal
 from vvgt_cli.vbm import VbmOptions, initialise
@@ -72,3 +78,24 @@ def test_hard_edges_get_adaptive_rays(edge, samples):
     start = initialise(scene, VbmOptions(4000, 128)).gaussians
     for size, rule in ((128, INRIA), (64, INRIA.at(0.5))):
         assert fine_enough(scene, start, size, rule).samples == samples
+
+
+def test_descent_may_begin_elsewhere_but_never_ends_below_the_start():
+    rng = np.random.default_rng(0)
+    means, colors = rng.uniform(-0.4, 0.4, (30, 3)), rng.random((30, 3))
+    truth = Gaussians(means, np.full((30, 3), -2.0), np.eye(1, 4).repeat(30, 0), np.full(30, 1.0), colors)
+    cameras = default_views("train", 4, size=48)
+    views = Views(cameras, np.stack([render(truth, camera) for camera in cameras]))
+    start = replace(truth, colors=np.clip(colors + 0.05, 0, 1))
+    run, options = Run(Console(quiet=True), ConversionReport("convert")), OptimizeOptions(steps=12)
+    wrecked = replace(start, colors=1 - colors)
+    kept = refine(run, start, views, views, options, wrecked)
+    np.testing.assert_allclose(kept.colors, start.colors, atol=1e-6)
+    stage = run.report.stages[-1]
+    assert stage.kept is False
+    assert stage.psnr_before == stage.psnr == pytest.approx(views.psnr(start), abs=1e-6)
+    near = replace(start, colors=np.clip(colors + 0.02, 0, 1))
+    result = refine(run, start, views, views, options, near)
+    assert views.psnr(result) > max(views.psnr(start), views.psnr(near))
+    assert run.report.stages[-1].psnr_before == pytest.approx(views.psnr(start), abs=1e-6)
+    assert run.report.refinement["psnr_before"] == run.report.stages[-1].psnr_before

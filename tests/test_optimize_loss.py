@@ -7,6 +7,7 @@ import pytest
 
 from vvgt_cli.descent.loss import loss_gradient
 from vvgt_cli.descent.ssim import KERNEL, add_ssim_gradient
+from vvgt_cli.descent.texture import SMOOTH, add_texture_gradient
 from vvgt_cli.metrics import ssim
 from vvgt_cli.metrics.ssim import C1, C2
 
@@ -63,6 +64,45 @@ def test_ssim_gradient_is_the_twins_slope(size):
             abs(((grad - 2)[..., :3] * d[..., :3]).sum() - slope)
             < 2e-3 * np.abs((grad - 2)[..., :3] * d[..., :3]).sum()
         )
+
+
+def texture_twin(image, target):
+    """Sum over pixels and RGB of the error less its blur, squared, by how smooth the target is; float64."""
+    channels = range(3)
+    variance = sum(np.maximum(blurred(target[..., c] ** 2) - blurred(target[..., c]) ** 2, 0) for c in channels) / 3
+    errors = [image[..., c] - target[..., c] for c in channels]
+    return sum(((e - blurred(e)) ** 2 * SMOOTH / (SMOOTH + variance)).sum() for e in errors)
+
+
+@pytest.mark.parametrize("size", [(31, 26), (7, 5), (1, 1)])
+def test_the_texture_term_is_the_twins_and_its_gradient_the_twins_slope(size):
+    x, y = (p.astype(np.float32) for p in pictures(*size))
+    grad = np.full(x.shape, 2.0, np.float32)
+    assert add_texture_gradient(x, y, 0.7, grad) == pytest.approx(texture_twin(x.astype(float), y.astype(float)), 1e-4)
+    assert (grad[..., 3] == 2).all()
+    rng = np.random.default_rng(1)
+    for _ in range(10):
+        d = rng.normal(size=x.shape) * 1e-4
+        slope = 0.7 * (texture_twin(x + d, y.astype(float)) - texture_twin(x - d, y.astype(float))) / 2
+        found = (grad - 2)[..., :3] * d[..., :3]
+        assert abs(found.sum() - slope) < 2e-3 * np.abs(found).sum()
+
+
+def test_the_texture_term_spares_edges_and_what_is_off_as_a_whole():
+    flat = np.full((40, 40, 4), 0.5, np.float32)
+    edge = flat.copy()
+    edge[:, 20:, :3] = 1.0
+    rough = flat + np.float32(0.02) * (-1) ** np.arange(40, dtype=np.float32)[:, None]
+
+    def term(image, target, part):
+        grad = np.zeros(image.shape, np.float32)
+        add_texture_gradient(image, target, 1.0, grad)
+        return np.abs(grad[12:28, part]).max()
+
+    middle, near = slice(12, 28), slice(18, 22)
+    assert term(rough, flat, middle) == pytest.approx(2 * 0.02, rel=0.02)  # all of it is texture
+    assert term(flat + np.float32(0.02), flat, middle) < 0.02 * 2e-3
+    assert term(edge + (rough - flat), edge, near) < 0.2 * 2 * 0.02
 
 
 def test_pixel_losses_by_hand():

@@ -9,9 +9,9 @@ from tests.vbm_scenes import Tent, scene_of
 from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.blocks import Blocks
 from vvgt_cli.dvr import RenderSettings, render_view
-from vvgt_cli.metrics import psnr, score_view, ssim
+from vvgt_cli.metrics import psnr, score_view, ssim, texture
 from vvgt_cli.runs.score import score_seen, score_test_views
-from vvgt_cli.runs.seats import Seat, score_seats, seat_views, seats_of, zoomed
+from vvgt_cli.runs.seats import Seat, score_seats, score_texture, seat_views, seats_of, texture_note, zoomed
 from vvgt_cli.splat import render
 from vvgt_cli.synth import open_volume
 from vvgt_cli.vbm import VbmOptions, initialise
@@ -48,6 +48,20 @@ def test_seats_are_what_they_say_worst_first(pair):
         assert seat.psnr == pytest.approx(expected, abs=1e-6)
     assert Seat("inria", 400, 10.0, 30.0).name() == "inria 400 px close up"
     assert seats_of(1080) == [(400, 40), (800, 40), (1080, 40), (2160, 40), (1080, 10)]
+
+
+def test_texture_is_of_the_seats_views_from_near(pair):
+    _, gaussians = pair
+    scene = scene_of(open_volume("example:blob:12"), Tent(width=0.45, top=0.9999))  # opaque inside
+    ticks = []
+    found = score_texture(scene, gaussians, 96, "playcanvas", ONE_RAY, lambda *done: ticks.append(done))
+    cameras = [zoomed(default_views("test", size=96)[i], 14.0) for i in (0, 4, 9)]
+    pictures = [(render_view(scene, c, ONE_RAY), render(gaussians, c, "playcanvas")) for c in cameras]
+    assert found == texture(pictures)
+    assert found.blocks > 0
+    assert ticks == [(1, 3), (2, 3), (3, 3)]
+    assert f"{found.ours:.2f} levels" in texture_note(found)
+    assert texture_note(texture([])) == "nothing in it is opaque and smooth"
 
 
 def test_errors_are_of_the_blocks_and_perception_is_of_the_whole():

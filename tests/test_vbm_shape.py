@@ -20,9 +20,9 @@ from vvgt_cli.synth import analytic
 from vvgt_cli.vbm.closed_form import closed_form
 from vvgt_cli.vbm.inset import inset, opaque_field
 from vvgt_cli.vbm.moments import base_cells
-from vvgt_cli.vbm.opacity import dilogarithm, inverse_dilogarithm, peak_opacity
+from vvgt_cli.vbm.opacity import dilogarithm, inverse_dilogarithm, opacity_when_reshaped, peak_opacity
 from vvgt_cli.vbm.pyramid import principal_axes
-from vvgt_cli.vbm.shape import ROUND, make_gaussians, quaternions
+from vvgt_cli.vbm.shape import ROUND, make_gaussians, quaternions, widened
 from vvgt_cli.vbm.wavelet import box_surrogate
 from vvgt_cli.volume import Volume
 
@@ -262,3 +262,33 @@ def test_principal_axes_against_lapack(spread: float) -> None:
     rebuilt = (vectors * values[:, None, :]) @ vectors.transpose(0, 2, 1)
     np.testing.assert_allclose(rebuilt / size[..., None], cov / size[..., None], atol=1e-13)
     np.testing.assert_allclose(vectors @ vectors.transpose(0, 2, 1), np.broadcast_to(np.eye(3), cov.shape), atol=1e-13)
+
+
+def test_opacity_follows_a_change_of_shape_as_the_mass_has_it() -> None:
+    rng = np.random.default_rng(3)
+    mass, pixel = rng.uniform(1e-5, 2e-4, 200), 0.004
+    before = np.exp(rng.uniform(-10, -8, (200, 1))) * np.ones(3)  # of balls, whose areas are the same from all sides
+    after = before * rng.uniform(1.0, 1.6, (200, 1))
+    opacity = peak_opacity(mass, before, pixel)
+    inside = opacity < MAX_ALPHA
+    found = opacity_when_reshaped(opacity, before, after, pixel)
+    np.testing.assert_allclose(found[inside], peak_opacity(mass, after, pixel)[inside], atol=1e-6)
+    np.testing.assert_allclose(opacity_when_reshaped(opacity, before, before, pixel), opacity, atol=1e-9)
+    assert inside.sum() > 50
+
+
+def test_wider_gaussians_keep_their_shortest_axis_their_place_and_their_mass() -> None:
+    variances = np.array([[1e-6, 4e-5, 9e-5], [3e-5, 3e-5, 3e-5]])
+    axes, color = np.tile(np.eye(3), (2, 1, 1)), np.full((2, 3), 0.5)
+    flat = make_gaussians(np.zeros((2, 3)), variances, axes, np.array([0.6, 0.6]), color)
+    wide = widened(flat, 1.3, 1e-9)
+    np.testing.assert_allclose(np.exp(wide.log_scales - flat.log_scales)[0], [1, 1.3, 1.3], rtol=1e-5)
+    np.testing.assert_array_equal(wide.means, flat.means)
+    np.testing.assert_array_equal(wide.log_scales[1], flat.log_scales[1])  # a ball has no shortest axis
+    assert wide.opacity_logits[1] == pytest.approx(flat.opacity_logits[1], abs=1e-5)
+    opacity = 1 / (1 + np.exp(-wide.opacity_logits.astype(float)))
+    assert opacity[0] == pytest.approx(
+        float(inverse_dilogarithm(dilogarithm(np.array(0.6)) / 1.69)), abs=0.03
+    )  # seen flat; less from the side
+    saturated = replace(flat, opacity_logits=np.full(2, 4.6, np.float32))
+    assert np.isfinite(widened(saturated, 1.1, 1e-3).opacity_logits).all()

@@ -21,7 +21,7 @@ from vvgt_cli.progress import Console
 @rule_option("How to draw: as which viewers do. Default: the file's rule, or inria.")
 @click.option(
     "--no-seats", "seats", is_flag=True, default=True, flag_value=False,
-    help="Leave out the table of every rule, several sizes and close-ups.",
+    help="Leave out the table of every rule, several sizes and close-ups, and the texture of smooth areas.",
 )  # fmt: skip
 @click.option(
     "--step", type=click.FloatRange(0, 4, min_open=True), default=0.125, show_default=True, metavar="VOXELS",

@@ -158,7 +158,7 @@ def _planned(run: Run, request: ConvertRequest) -> tuple[Source, Work, Planner, 
     guess = expected_wide(fit.max_gaussians, fit.size)
     planner = Planner(
         request.limits, fit.max_gaussians, fit.steps, request.ply.sh_degree or degree, fit.size, guess, fit.model,
-        request.scored_whole, fit.init == "vbm",
+        request.scored_whole, fit.init == "vbm", fit.init == "vbm",
     )  # fmt: skip
     plan = planner.plan(case, run.elapsed())
     run.report.plan = plan.record()

@@ -125,6 +125,7 @@ class Planner:
         model: network that the user asks for.
         whole: all ten test views are scored.
         cuts: there will be a pyramid to cut once more.
+        cells: the closed form is of cells, a Gaussian each.
     """
 
     limits: Limits
@@ -136,6 +137,7 @@ class Planner:
     model: str | None = None
     whole: bool = False
     cuts: bool = False
+    cells: bool = True
 
     def plan(self, case: Case, spent: float, begun: bool = False) -> Plan:
         """Which stages fit, after ``spent`` seconds; ``begun``: the closed form is done."""
@@ -176,12 +178,12 @@ class Planner:
 
     def _descent(self, steps: int, small: bool, most: int) -> list[Stage]:
         """Gradient descent and its views; cells by error but before few steps, and before a network."""
-        cut = self.cuts and self.model is None and steps >= ENOUGH_STEPS
+        enough = steps >= ENOUGH_STEPS
         return [
             CheckViews(),
             TrainingViews(views_of(steps, small), view_edge(self.size, small)),
-            *([CellsByError(small, keep=not self._anew())] if cut else []),
-            Refinement(steps, most, small),
+            *([CellsByError(small, keep=not self._anew())] if enough and self.cuts and self.model is None else []),
+            Refinement(steps, most, small, overlap=enough and self.cells),
         ]
 
     def _anew(self) -> bool:

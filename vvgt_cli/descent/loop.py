@@ -130,6 +130,7 @@ def step(
     """
     from vvgt_cli.descent.loss import loss_gradient
     from vvgt_cli.descent.ssim import add_ssim_gradient
+    from vvgt_cli.descent.texture import add_texture_gradient
 
     projection = state.project(camera, options.rule)
     image = blend(projection, np.maximum(state.colors_from(camera), 0), camera.height, camera.width)
@@ -138,6 +139,8 @@ def step(
     squares = loss_gradient(image, target, l1, l2, alpha, grad)
     if options.ssim > 0:
         add_ssim_gradient(image, target, options.ssim, grad)
+    if options.texture > 0:
+        add_texture_gradient(image, target, options.texture, grad)
     now = math.sqrt(squares / ((3 + options.alpha) * camera.height * camera.width))
     error = now if error is None else MEMORY * error + (1 - MEMORY) * now
     state.descend(camera, projection, image, grad, error, share, speed)

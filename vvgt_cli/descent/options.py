@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 METHODS = ("frame", "adam", "3dgs")
 LOSS_3DGS = {"l1": 0.8, "l2": 0.0, "ssim": 0.2, "alpha": 0.0}
+TEXTURE = 6.0  # weight of the term for texture beside that of the squares (docs/log.md)
+LOSSES: dict[str, dict[str, float]] = {"frame": {"texture": TEXTURE}, "3dgs": LOSS_3DGS}
 Progress = Callable[[int, int], None]
 Train: TypeAlias = "tuple[Sequence[Camera], np.ndarray]"
 Check: TypeAlias = "Train | tuple[Sequence[Camera], np.ndarray, Sequence[Blocks] | None]"
@@ -37,6 +39,8 @@ class OptimizeOptions:
         target_psnr: dB on the check views at which to stop.
         l1, l2, ssim: weights of the sums over pixels and RGB of |r|, r^2 and 1 - SSIM.
         alpha: weight of the alpha channel's |r| and r^2 beside a colour channel's.
+        texture: weight of what of r changes from pixel to pixel, squared, where the view is smooth
+            (`vvgt_cli.descent.texture`).
         rule: by which the training views are drawn: ``rule.at(w / W)`` where they are w px wide and the file is made
             for W.
         judge: by which the check views are drawn.
@@ -55,6 +59,7 @@ class OptimizeOptions:
     l2: float = 1.0
     ssim: float = 0.0
     alpha: float = 0.5
+    texture: float = 0.0
     rule: Rule = INRIA
     judge: Rule = INRIA
     check_every: int = 25
@@ -75,13 +80,13 @@ class OptimizeOptions:
             raise UsageError(f"check every {self.check_every} steps, patience {self.patience}; expected at least 1")
         if self.time_budget is not None and not self.time_budget >= 0:
             raise UsageError(f"time budget {self.time_budget} s; expected 0 or more")
-        if not min(self.l1, self.l2, self.ssim, self.alpha) >= 0 or self.l1 + self.l2 + self.ssim <= 0:
+        if not min(self.l1, self.l2, self.ssim, self.alpha, self.texture) >= 0 or self.l1 + self.l2 + self.ssim <= 0:
             raise UsageError("weights of the loss: expected none below 0 and one of l1, l2, ssim above")
 
     @classmethod
     def of(cls, method: str, **options: Any) -> OptimizeOptions:
-        """Options with the loss that belongs to a method: squares, or 3DGS' 0.8 L1 + 0.2 (1 - SSIM) of RGB alone."""
-        return cls(method=method, **((LOSS_3DGS | options) if method == "3dgs" else options))
+        """Options with the loss that belongs to a method: squares, of texture too, or 3DGS' 0.8 L1 + 0.2 (1 - SSIM)."""
+        return cls(method=method, **(LOSSES.get(method, {}) | options))
 
 
 @dataclass

@@ -21,7 +21,7 @@ KERNEL = (KERNEL / KERNEL.sum()).astype(np.float32)
 f32: Any = np.float32
 
 
-@kernel(parallel=True, fastmath=True, error_model="numpy")
+@kernel("f4:3 f4:1 f4:3 f4:3", parallel=True, fastmath=True, error_model="numpy")
 def blur(planes: np.ndarray, kernel: np.ndarray, padded: np.ndarray, out: np.ndarray) -> None:
     """Correlate ``planes`` (n, h, w) with the outer square of ``kernel`` (2 r + 1,), zeros beyond the border.
 

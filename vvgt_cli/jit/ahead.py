@@ -34,7 +34,12 @@ SLOPES = (
     "vvgt_cli.splat.backward:own_frame",
     "vvgt_cli.splat.kernel:project_factors",
 )
-REFINE = ("vvgt_cli.descent.steps:own_frame", *SLOPES, "vvgt_cli.descent.loss:loss_gradient")
+REFINE = (
+    "vvgt_cli.descent.steps:own_frame",
+    *SLOPES,
+    "vvgt_cli.descent.loss:loss_gradient",
+    "vvgt_cli.descent.ssim:blur",
+)
 SHARED = (
     "vvgt_cli.descent.steps:regress",
     "vvgt_cli.vbm.sharpen:mix_neighbours",

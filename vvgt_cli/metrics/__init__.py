@@ -1,8 +1,12 @@
-"""PSNR, SSIM and FLIP as the conventions define them."""
+"""PSNR, SSIM, FLIP and texture as the conventions define them."""
 
 from vvgt_cli.metrics.flip import flip, flip_map
 from vvgt_cli.metrics.psnr import psnr
 from vvgt_cli.metrics.scores import Scores, ViewScore, mean_scores, score_view, score_views
 from vvgt_cli.metrics.ssim import ssim
+from vvgt_cli.metrics.texture import Texture, texture
 
-__all__ = ["Scores", "ViewScore", "flip", "flip_map", "mean_scores", "psnr", "score_view", "score_views", "ssim"]
+__all__ = [
+    "Scores", "Texture", "ViewScore", "flip", "flip_map", "mean_scores", "psnr", "score_view", "score_views", "ssim",
+    "texture",
+]  # fmt: skip

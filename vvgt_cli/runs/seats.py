@@ -13,13 +13,15 @@ from vvgt_cli.cameras.blocks import ENOUGH, Blocks, spread_blocks
 from vvgt_cli.cameras.sets import FIELD_OF_VIEW
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.progress import ProgressCallback
-from vvgt_cli.splat.rules import RULES
+from vvgt_cli.splat.rules import INRIA, RULES, Rule
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import RenderSettings, Scene
+    from vvgt_cli.metrics import Texture
 
 SIZES = (400, 800, 2160)  # pixels: a small window, half a screen, a 4K screen
 CLOSE = 10.0  # degrees: a quarter of the default views' field
+NEAR = 14.0  # degrees, of the pictures in which texture is measured: faces fill them, and cells are some pixels wide
 VIEWS = (0, 4, 9)  # test views: above, side, below
 SIDE = (4,)  # enough to find the worst seat
 PREVIEW_VIEWS = (0, 4, 9)  # test views of previews, and of the score without a report: above, side, below
@@ -110,6 +112,48 @@ def seat_views(
             done += 1
             if progress:
                 progress(done, len(places) * len(views))
+
+
+def score_texture(
+    scene: Scene,
+    gaussians: Gaussians,
+    size: int,
+    rule: str | Rule = INRIA,
+    settings: RenderSettings | None = None,
+    progress: ProgressCallback | None = None,
+) -> Texture:
+    """Texture on smooth areas, in the `VIEWS` seen from near (`NEAR`), whole.
+
+    Args:
+        scene, gaussians: what is compared.
+        size: pixels along a picture's edge.
+        rule: by which Gaussians are drawn.
+        settings: of the reference; the renderer's default without.
+        progress: called after each view.
+    """
+    from vvgt_cli.dvr import render_view
+    from vvgt_cli.metrics import texture
+    from vvgt_cli.splat import render
+
+    def pairs() -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        cameras = default_views("test", size=size)
+        for done, i in enumerate(VIEWS):
+            camera = zoomed(cameras[i], NEAR)
+            yield render_view(scene, camera, settings), render(gaussians, camera, rule)
+            if progress:
+                progress(done + 1, len(VIEWS))
+
+    return texture(pairs())
+
+
+def texture_note(found: Texture) -> str:
+    """Texture as messages have it."""
+    if found.ours is None:
+        return "nothing in it is opaque and smooth"
+    return (
+        f"{found.ours:.2f} levels of 255, the volume {found.reference:.2f}; "
+        f"worst tenth {found.ours_worst:.2f} and {found.reference_worst:.2f}"
+    )
 
 
 def score_seats(gaussians: Gaussians, seen: Iterable[SeatView], rules: Collection[str] = tuple(RULES)) -> list[Seat]:

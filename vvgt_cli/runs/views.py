@@ -44,6 +44,13 @@ class Views:
             image = render(gaussians, camera, rule, blocks=blocks)
             yield image if blocks is None else blocks.pick(image)
 
+    def psnr(self, gaussians: Gaussians, rule: Rule = INRIA) -> float:
+        """Mean dB of RGB over black of Gaussians drawn as the views are."""
+        from vvgt_cli.metrics import psnr
+
+        pairs = zip(self.images, self.pictures(gaussians, rule), strict=True)
+        return float(np.mean([psnr(view[..., :3], image[..., :3]) for view, image in pairs]))
+
 
 def judging_views(scene: Scene, cameras: Sequence[Camera], settings: RenderSettings) -> Views:
     """Views to judge by, of `FEW` blocks where they have more."""

@@ -10,16 +10,27 @@ import numpy as np
 from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.sets import SIZE
 from vvgt_cli.errors import UsageError
-from vvgt_cli.gaussians import PlyHeader
+from vvgt_cli.gaussians import Gaussians, PlyHeader
 from vvgt_cli.jit.ahead import EVALUATE, for_degree
+from vvgt_cli.metrics.texture import Texture
 from vvgt_cli.progress import Console
 from vvgt_cli.runs.gaussian_files import STDIN, file_rule, open_gaussians
 from vvgt_cli.runs.outputs import Output, check_outputs
 from vvgt_cli.runs.place import into_box, preview, upright
 from vvgt_cli.runs.record import ConversionReport, Run, Stage, document
 from vvgt_cli.runs.score import psnr_note, score_test_views
-from vvgt_cli.runs.seats import CLOSE, Seat, score_seats, seat_views, seats_of, zoomed
+from vvgt_cli.runs.seats import (
+    CLOSE,
+    Seat,
+    score_seats,
+    score_texture,
+    seat_views,
+    seats_of,
+    texture_note,
+    zoomed,
+)
 from vvgt_cli.runs.source import Source, SourceRequest, describe_source, load, tf_record, volume_record
+from vvgt_cli.splat.rules import Rule
 from vvgt_cli.transfer.lighting import LightOptions
 
 if TYPE_CHECKING:
@@ -39,7 +50,7 @@ class EvaluateRequest:
         size: pixels along an image's edge; None: what the file is made for.
         rule: of `vvgt_cli.splat.rules` to draw by; None: the file's.
         step: of the reference, in voxels.
-        seats: score every rule at several sizes and close up as well.
+        seats: score every rule at several sizes and close up as well, and texture on smooth areas.
         preview: PNG to write (reference, ours, difference of a test view and of a close-up), None for none.
         overwrite: replace it if it exists.
     """
@@ -72,6 +83,7 @@ class Evaluation:
     reference_psnr: float
     scores: dict[str, Any] = field(default_factory=dict)
     seats: list[dict[str, Any]] = field(default_factory=list)
+    texture: dict[str, Any] | None = None
     stages: list[Stage] = field(default_factory=list)
     seconds: float = 0.0
 
@@ -86,6 +98,8 @@ class Evaluation:
             if key != "per_view":
                 lines.append(f"{key.replace('_', ' '):<24}{_cell(value):>12}")
         lines.append(f"reference against a finer one: PSNR {self.reference_psnr:.2f} dB (middle of the first view)")
+        if self.texture is not None:
+            lines.append(f"texture on smooth areas, near: {texture_note(Texture(**self.texture))}")
         if self.seats:
             lines.append(f"\n{'seat':<32}{'psnr':>10}")
         lines += [f"{Seat(**seat).name():<32}{seat['psnr']:>10.2f}" for seat in self.seats]
@@ -165,13 +179,23 @@ def evaluate(request: EvaluateRequest, console: Console | None = None) -> Evalua
             sheet = preview(scene, gaussians, [camera, zoomed(camera, CLOSE)], axes, rule)
             write_png(request.preview, sheet, request.overwrite)
     if request.seats:
-        with run.stage("seats") as stage:
-            seats = score_seats(gaussians, seat_views(scene, seats_of(size), progress=run.console.bar("seats")))
-            evaluation.seats = [asdict(seat) for seat in seats]
-            stage.note = f"worst: {seats[0].name()}, {seats[0].psnr:.2f} dB"
+        _look_around(run, evaluation, scene, gaussians, rule)
     evaluation.stages = run.report.stages
     evaluation.seconds = run.finish().seconds
     return evaluation
+
+
+def _look_around(run: Run, evaluation: Evaluation, scene: Scene, gaussians: Gaussians, rule: Rule) -> None:
+    """Seats, and texture from near."""
+    size = evaluation.size
+    with run.stage("seats") as stage:
+        seats = score_seats(gaussians, seat_views(scene, seats_of(size), progress=run.console.bar("seats")))
+        evaluation.seats = [asdict(seat) for seat in seats]
+        stage.note = f"worst: {seats[0].name()}, {seats[0].psnr:.2f} dB"
+    with run.stage("texture") as stage:
+        found = score_texture(scene, gaussians, size, rule, progress=run.console.bar("texture"))
+        evaluation.texture = asdict(found)
+        stage.note = texture_note(found)
 
 
 def _reference_psnr(scene: Scene, size: int, step: float) -> float:

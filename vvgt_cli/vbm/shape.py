@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.splat.constants import MAX_ALPHA
 from vvgt_cli.vbm.columns import COLOR, MASS, SEEN, SEEN_COLOR
 from vvgt_cli.vbm.inset import Opaque, inset
-from vvgt_cli.vbm.opacity import peak_opacity
+from vvgt_cli.vbm.opacity import opacity_when_reshaped, peak_opacity
 from vvgt_cli.vbm.pyramid import principal_axes
 from vvgt_cli.vbm.tree import Leaves, central
 
 FLOOR = 0.05  # smallest standard deviation, in the smaller of voxel and cell edge
 TRANSLUCENT_SPREAD = 2.0  # what a cell that its mass fills adds to its second moment; nothing across a sheet
-OPAQUE_SPREAD = np.array([1.0, 2.4, 2.4])  # factors of the ascending principal moments of an opaque cell
+OPAQUE_SPREAD = np.array([0.85, 2.6, 2.6])  # factors of the ascending principal moments of an opaque cell
+LEAST_ALPHA = 1e-4  # of what has some mass
 DEBLUR = 0.3  # px^2 that an opaque cell gives back: the renderer's dilation adds them
 
 
@@ -76,6 +78,19 @@ def cell_gaussians(leaves: Leaves, voxel: float, pixel: float, opaque: Opaque, s
     return make_gaussians(mean, spread, axes, opacity, seen_color(moments))
 
 
+def widened(gaussians: Gaussians, factor: float, pixel: float) -> Gaussians:
+    """Of the same mass, wider by ``factor`` along all axes but the shortest: neighbours on a surface overlap more.
+
+    Cells stand on a lattice: Gaussians of standard deviation s at distances a ripple by ``2 exp(-2 pi^2 s^2 / a^2)`` of
+    their mean. ``pixel``: as for `peak_opacity`.
+    """
+    scales = np.exp(gaussians.log_scales.astype(np.float64))
+    wider = np.where(scales > scales.min(axis=1, keepdims=True), factor * scales, scales)
+    before = 1 / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64)))
+    opacity = np.clip(opacity_when_reshaped(before, scales**2, wider**2, pixel), LEAST_ALPHA, MAX_ALPHA)
+    return replace(gaussians, log_scales=np.log(wider), opacity_logits=np.log(opacity / (1 - opacity)))
+
+
 def seen_color(moments: np.ndarray) -> np.ndarray:
     """(n, 3) mean colour as the views see it; of all the extinction where they see none."""
     mass, seen = moments[:, [MASS]], moments[:, [SEEN]]  # (n, 1)
@@ -87,7 +102,7 @@ def make_gaussians(
     mean: np.ndarray, variances: np.ndarray, axes: np.ndarray, opacity: np.ndarray, color: np.ndarray
 ) -> Gaussians:
     """Pack means (n, 3), principal variances (n, 3) with ``axes`` (n, 3, 3; columns), alpha (n,) and RGB (n, 3)."""
-    opacity = np.clip(opacity, 1e-4, 0.99)
+    opacity = np.clip(opacity, LEAST_ALPHA, MAX_ALPHA)
     return Gaussians(mean, 0.5 * np.log(variances), quaternions(axes), np.log(opacity / (1 - opacity)), color)
 
 

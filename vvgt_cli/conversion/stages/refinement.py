@@ -18,6 +18,7 @@ from vvgt_cli.splat.constants import MIN_ALPHA
 
 STEP = 0.027, 0.0275  # seconds per 400 x 400 px, per 100,000 Gaussians
 HARMONICS = 1.0, 1.1, 1.25, 1.4  # times as long with harmonics of degree 0 to 3
+WIDER = 1.1  # times as wide along surfaces: what that blurs is sharp again after some steps, the lattice stays away
 LOOK = 25  # steps between two looks at the check views where a target ends the run; else one is taken in the middle
 SMALLEST = 0.5  # standard deviation of the longest axis in pixels of the screen: viewers drop or fade less
 MOST = 0.99  # of the Gaussians: as many are left where small ones are widened, as a rule
@@ -41,6 +42,7 @@ class Refinement(Stage):
         steps: that there should be time for.
         most: where there is more time than that.
         small: its training views are small.
+        overlap: the Gaussians stand on the lattice of cells: descent begins with wider ones (`WIDER`).
     """
 
     name: ClassVar[str] = "refinement"
@@ -48,6 +50,7 @@ class Refinement(Stage):
     steps: int = 0
     most: int = 0
     small: bool = False
+    overlap: bool = False
 
     def cost(self, case: Case) -> Cost:
         """By steps."""
@@ -59,6 +62,9 @@ class Refinement(Stage):
 
     def run(self, work: Work) -> None:
         """Descend, and leave out what viewers do."""
+        from vvgt_cli.vbm.closed_form import pixel_width
+        from vvgt_cli.vbm.shape import widened
+
         assert work.train is not None
         assert work.check is not None
         assert work.train_rule is not None
@@ -66,12 +72,14 @@ class Refinement(Stage):
         if work.limits.time_budget is not None:
             left = max(work.limits.time_budget - work.run.elapsed() - work.ending, 0.0)
         target = work.limits.target_psnr
-        options = OptimizeOptions(
-            steps=self.most, time_budget=left, target_psnr=target, rule=work.train_rule, judge=work.rule,
+        options = OptimizeOptions.of(
+            "frame", steps=self.most, time_budget=left, target_psnr=target, rule=work.train_rule, judge=work.rule,
             seed=work.fit.seed, checkpoint=work.checkpoint.descent,
             check_every=LOOK if target is not None else max(LOOK, self.most // 2),
         )  # fmt: skip
-        work.gaussians = _seen(work, refine(work.run, work.made(), work.train, work.check, options))
+        start = work.made()
+        begin = widened(start, WIDER, pixel_width(work.fit.size)) if self.overlap else None
+        work.gaussians = _seen(work, refine(work.run, start, work.train, work.check, options, begin))
 
 
 def _seen(work: Work, gaussians: Gaussians) -> Gaussians:
@@ -82,11 +90,16 @@ def _seen(work: Work, gaussians: Gaussians) -> Gaussians:
     return max(kept, drawn_by_all(gaussians, work.fit.size, work.rule.dilation), key=work.psnr)
 
 
-def refine(run: Run, start: Gaussians, train: Views, check: Views, options: OptimizeOptions) -> Gaussians:
-    """The stage: the best that the check views have seen, as a file holds it; the input where nothing was better."""
+def refine(
+    run: Run, start: Gaussians, train: Views, check: Views, options: OptimizeOptions, begin: Gaussians | None = None
+) -> Gaussians:
+    """The stage: the best that the check views have seen, as a file holds it; ``start`` where nothing was better.
+
+    Descent begins with ``begin``, where that is given.
+    """
     with run.stage("refinement") as stage, run.console.interruption(run.console.say) as stop:
         result, record = optimize(
-            start,
+            start if begin is None else begin,
             train.cameras,
             train.images,
             options,
@@ -94,6 +107,10 @@ def refine(run: Run, start: Gaussians, train: Views, check: Views, options: Opti
             progress=run.console.bar("refinement"),
             stop=stop,
         )
+        if begin is not None:
+            record.psnr_before = check.psnr(start, options.judge)
+            if record.kept == 0 or (record.psnr_after or 0.0) <= record.psnr_before:
+                result, record.kept, record.psnr_after = start, 0, record.psnr_before
         stage.kept = record.kept > 0
         stage.psnr_before, stage.psnr = record.psnr_before, record.psnr_after
         stage.note = _note(record, options)
