@@ -9,6 +9,7 @@ import pytest
 
 from tests.test_volume_slices import write_series
 from vvgt_cli.runs.source import SourceRequest, load
+from vvgt_cli.transfer.histogram import _side
 from vvgt_cli.volume import ReadOptions, read_volume
 
 
@@ -43,3 +44,12 @@ def test_a_volume_of_one_value_is_a_box_and_that_is_said(tmp_path: Path) -> None
     with pytest.warns(UserWarning, match=r"zero: every voxel is 0, so that only the box is seen; check --dtype"):
         source = load(SourceRequest(str(tmp_path / "zero.npy")))
     assert 0 < source.tf.opacity(np.zeros(1))[0] < 0.05
+
+
+def test_colours_go_half_by_rank_and_half_by_value() -> None:
+    """Five bins of a hundred voxels; colours that are their own numbers."""
+    counts, colors = np.array([0.0, 10, 30, 0, 60]), np.repeat(np.arange(5.0)[:, None], 3, axis=1)
+    x, _, rgb = _side(counts, 100.0, colors)
+    assert x.tolist() == [0, 1.5, 2.5, 4.5, 5]
+    rank, value = np.array([0, 0.05, 0.25, 0.7, 1]), x / 5
+    np.testing.assert_allclose(rgb[:, 0], 4 * (rank + value) / 2)

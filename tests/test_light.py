@@ -168,6 +168,22 @@ def test_an_opaque_wall_throws_a_shadow():
     assert plain[..., :3].max() > 0.5
 
 
+@pytest.mark.parametrize("thick", [1, 2, 3])
+def test_a_thin_sheet_right_behind_empty_bricks_throws_its_shadow(thick):
+    """A leap over what is empty ends at the sheet's brick, however far from the place the ray begins."""
+    data = np.zeros((40, 24, 24), np.float32)
+    data[16 : 16 + thick] = 1.0
+    tf = function([0, 0.5, 1], [0, 0, 0.9])
+    scene = Scene.build(Volume(data), tf, 1.0)
+    directions = np.array([[0.0, 0.0, 1.0], [0.28, 0.0, 0.96]])
+    points = np.array([[12.0, 12.0, z] for z in (3.0, 5.0, 8.0)])
+    for offset in (1.5, 4.0):
+        grid = transmittance(scene, directions, 1, step=0.125, offset=offset)
+        found = grid_values(grid, points)
+        np.testing.assert_allclose(found, brute_force(scene, points, directions, offset), atol=0.03)
+        assert found.max() < 0.6
+
+
 def test_occlusion_leaves_a_plane_open_and_darkens_a_corner():
     data = np.zeros((24, 24, 24), np.float32)
     data[:8] = 1.0

@@ -11,7 +11,7 @@ from vvgt_cli.cameras.blocks import Blocks
 from vvgt_cli.dvr import RenderSettings, render_view
 from vvgt_cli.metrics import psnr, score_view, ssim, texture
 from vvgt_cli.runs.score import score_seen, score_test_views
-from vvgt_cli.runs.seats import Seat, score_seats, score_texture, seat_views, seats_of, texture_note, zoomed
+from vvgt_cli.runs.seats import Seat, from_above, score_seats, score_texture, seat_views, seats_of, texture_note, zoomed
 from vvgt_cli.splat import render
 from vvgt_cli.synth import open_volume
 from vvgt_cli.vbm import VbmOptions, initialise
@@ -47,6 +47,9 @@ def test_seats_are_what_they_say_worst_first(pair):
         expected = np.mean([psnr(theirs[..., :3], np.clip(ours[..., :3], 0, 1)) for theirs, ours in pictures])
         assert seat.psnr == pytest.approx(expected, abs=1e-6)
     assert Seat("inria", 400, 10.0, 30.0).name() == "inria 400 px close up"
+    assert from_above(1080) == [(1080, 40), (2160, 40)]
+    assert from_above(2160) == [(2160, 40), (4320, 40)]
+    assert from_above(2159) == [(2159, 40), (2160, 40)]
     assert seats_of(1080) == [(400, 40), (800, 40), (1080, 40), (2160, 40), (1080, 10)]
 
 

@@ -8,6 +8,7 @@ import json
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -118,6 +119,19 @@ def test_other_methods_get_nothing(site, method):
     status, body, headers = ask(site, method=method)
     assert (status, body) == (405, b"")
     assert "Access-Control-Allow-Origin" not in headers
+
+
+def test_what_was_sent_with_a_request_that_is_refused_is_not_read_as_another(site):
+    host, port, word = urlsplit(site).hostname, urlsplit(site).port, urlsplit(site).path
+    inner = f"GET {word} HTTP/1.1\r\nHost: {host}:{port}\r\n\r\n".encode()
+    outer = f"POST {word} HTTP/1.1\r\nHost: {host}:{port}\r\nContent-Length: {len(inner)}\r\n\r\n".encode()
+    with socket.create_connection((host, port), timeout=10) as line:
+        line.sendall(outer + inner)
+        told = b""
+        while part := line.recv(4096):
+            told += part
+    assert told.count(b"HTTP/1.") == 1
+    assert b" 405 " in told.splitlines()[0]
 
 
 def test_two_servers_have_two_ports_and_two_words():

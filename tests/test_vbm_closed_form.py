@@ -317,3 +317,24 @@ def test_quality(name: str) -> None:
         assert result[method][1] > result[method][0], result
     assert result["vbm"][1] > result["wavelet"][1] + 1, result
     assert result["wavelet"][1] > result["uniform"][1] + 0.5, result
+
+
+@pytest.mark.parametrize(("size", "count"), [(48, 12_000), (2000, 60_000)])  # pixels wider than voxels, and finer
+def test_cells_are_split_down_to_the_finest_that_voxels_and_pixels_tell(size: int, count: int, monkeypatch) -> None:
+    scene = scene_of(noise((14, 10, 12)) if count > 12_000 else noise(), Tent(width=0.05))
+    form = initialise(scene, VbmOptions(count, size)).form
+    assert form is not None
+    asked: list[np.ndarray] = []
+    split = closed_form_module.split
+
+    def noted(tree, leaves, order, *rest):
+        asked.append(leaves.edge[order].min(axis=1))
+        return split(tree, leaves, order, *rest)
+
+    monkeypatch.setattr(closed_form_module, "split", noted)
+    cameras = default_views("train", 4, size=32)
+    form.refined(cameras, render_views(scene, cameras, EVERYWHERE), closed_form_module.ROUND, closed_form_module.INRIA)
+    finest = max(2 * closed_form_module.MIN_CELL * pixel_width(size), 0.5 * form.voxel)
+    assert len(asked) == closed_form_module.REFINE_ROUNDS
+    assert min(edges.min() for edges in asked if len(edges)) >= finest
+    assert any(len(edges) for edges in asked)

@@ -253,3 +253,18 @@ def test_info_takes_folders_globs_and_inner_paths(vvgt, tmp_path: Path) -> None:
         assert json.loads(done.out)["dims"] == [5, 4, 3]
     (tmp_path / "empty").mkdir()
     assert "a folder; expected a volume file" in vvgt("info", tmp_path / "empty").error
+
+
+@pytest.mark.parametrize(("spacing", "shift"), [(1.0, 0.0299), (5.0, 0.149), (0.2, 0.0299)])
+def test_dicom_slices_may_be_off_by_a_hundredth_of_the_largest_edge_each(tmp_path, spacing, shift):
+    """Three slices a millimetre apart, pixels of ``spacing``: the middle one is off to the side."""
+
+    def read(off):
+        place = lambda k: [1.5 * off * (k == 1), 0, k]  # noqa: E731 - of which two thirds are off the line of the three
+        folder = tmp_path / f"{off:g}"
+        write_series(folder, ImagePositionPatient=place, PixelSpacing=[spacing, spacing])
+        return read_volume(str(folder), LPS)
+
+    assert read(shift / 1.5).dims == (5, 4, 3)
+    with pytest.raises(DataError, match="shift sideways unevenly"):
+        read(1.02 * shift / 1.5 / 0.99)

@@ -142,7 +142,6 @@ class _Handler(BaseHTTPRequestHandler):
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
         """A status and nothing else; what was sent along is not read."""
-        self.close_connection = True
         self.send_response_only(405 if code == 501 else code)  # of a method that there is not
         self.send_header("Content-Length", "0")
         self.send_header("Connection", "close")
