@@ -10,9 +10,9 @@ import pytest
 
 from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.dvr import RenderSettings, Scene, render_view, render_view_reference, render_views
+from vvgt_cli.dvr.layout import BRICK
 from vvgt_cli.dvr.render import ray_offsets
 from vvgt_cli.dvr.runs import NEAR
-from vvgt_cli.dvr.scene import BRICK
 from vvgt_cli.errors import UsageError
 from vvgt_cli.transfer.colormap import ColorMap
 from vvgt_cli.transfer.lighting import Lighting

@@ -98,16 +98,12 @@ def test_damaged_files_are_one_line(known, tmp_path):
         assert path.name in str(error.value)
 
 
-@pytest.mark.parametrize(("ending", "module", "extra"), [
-    (".spz", "gsply", "share"), (".compressed.ply", "gsply", "share"), (".html", "gsply", "share"),
-    (".usdc", "pxr", "share"),
-])  # fmt: skip
-def test_a_library_that_is_missing_is_named_before_the_work(ending, module, extra, tmp_path, vvgt, monkeypatch):
-    monkeypatch.setitem(sys.modules, module, None)
-    monkeypatch.setitem(sys.modules, f"{module}.Usd", None)
-    result = vvgt("convert", "example:frog", "-o", tmp_path / f"a{ending}")
+def test_a_library_that_is_missing_is_named_before_the_work(tmp_path, vvgt, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pxr", None)
+    monkeypatch.setitem(sys.modules, "pxr.Usd", None)
+    result = vvgt("convert", "example:frog", "-o", tmp_path / "a.usdc")
     assert result.code == 1
-    assert f"pip install 'vvgt[{extra}]'" in result.error
+    assert "pip install 'vvgt[share]'" in result.error
     assert "read" not in result.err.replace(result.error, "")  # no stage ran
     assert not list(tmp_path.iterdir())
 

@@ -9,7 +9,7 @@ import pytest
 
 from tests.vbm_scenes import Above, Ramp, Tent, scene_of
 from vvgt_cli.dvr import Scene
-from vvgt_cli.dvr.scene import BRICK
+from vvgt_cli.dvr.layout import BRICK
 from vvgt_cli.synth import analytic
 from vvgt_cli.transfer.tables import extinction
 from vvgt_cli.vbm import moments as moments_module

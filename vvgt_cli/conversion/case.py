@@ -92,7 +92,7 @@ def expected_wide(gaussians: int, size: int) -> bool:
 
 def measure(scene: Scene, size: int, gaussians: int) -> Case:
     """The case of a scene: counted, a small view timed, the machine's pace by a picture of Gaussians."""
-    from vvgt_cli.dvr.scene import BRICK
+    from vvgt_cli.dvr.layout import BRICK
     from vvgt_cli.vbm.closed_form import expected_cells
 
     cells = expected_cells(scene, size, gaussians)

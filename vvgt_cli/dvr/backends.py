@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 
@@ -48,23 +48,3 @@ def view_renderer(
     from vvgt_cli.dvr import vtk
 
     return vtk.view_renderer(scene, settings)
-
-
-def render_views_with(
-    renderer: str,
-    scene: Scene,
-    cameras: Sequence[Camera],
-    settings: RenderSettings | None = None,
-    progress: Callable[[int, int], None] | None = None,
-) -> np.ndarray:
-    """Views of one size: (n, height, width, 4) float32, premultiplied; arguments and errors as `view_renderer`.
-
-    ``progress(done, total)`` is called after each view.
-    """
-    draw = view_renderer(renderer, scene, settings)
-    images = []
-    for i, camera in enumerate(cameras):
-        images.append(draw(camera))
-        if progress:
-            progress(i + 1, len(cameras))
-    return np.stack(images)

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vvgt_cli.dvr.layout import BRICK as BRICK  # for pipeline.plan, until it asks layout
 from vvgt_cli.dvr.layout import Light, Optics, Texels, Voxels, pairs_fit
 from vvgt_cli.transfer.lighting import Lighting
 from vvgt_cli.transfer.tables import OpticalTables, build_tables

@@ -27,10 +27,6 @@ if TYPE_CHECKING:
     from vvgt_cli.metrics import Scores
 
 HOLD_OUT = 8  # of so many training views one decides, where the folder has no check views
-REASONS = {
-    "steps": "", "time": "time is up", "target": "target reached", "no gain": "ended early: no gain any more",
-    "interrupted": "interrupted",
-}  # fmt: skip
 
 
 @dataclass(frozen=True)
