@@ -85,3 +85,19 @@ def test_a_series_goes_to_its_frames(file: Path, tmp_path: Path) -> None:
     expected = render(white, orbit_views(1, size=SIZE)[0], rule="inria")[..., :3]
     assert psnr(expected, shot) > 38
     assert psnr(ours(file), shot) < 25
+
+
+def test_a_page_of_several_in_a_file_goes_to_each(file: Path, tmp_path: Path) -> None:
+    from vvgt_cli.gaussians import write_ply
+
+    gaussians = read_ply(file)[0]
+    white = replace(gaussians, colors=np.ones_like(gaussians.colors))
+    for name, frame in (("f0.ply", gaussians), ("f1.ply", white)):
+        write_ply(tmp_path / name, frame)
+    files = [str(tmp_path / f"f{k}.ply") for k in (0, 1)]
+    assert run(["view", *files, "-o", str(tmp_path / "both.html"), "--quiet"]) == 0
+    expected = render(white, orbit_views(1, size=SIZE)[0], rule="inria")[..., :3]
+    for frame, picture in ((0, ours(file)), (1, expected)):
+        shot, noted = shoot((tmp_path / "both.html").as_uri(), tmp_path, frame=frame)
+        assert noted["frames"] == 2
+        assert psnr(picture, shot) > 36

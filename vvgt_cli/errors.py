@@ -44,7 +44,7 @@ class SeveralSteps(UsageError):
     def __init__(self, source: str, steps: int, what: str = "time steps") -> None:
         super().__init__(
             f"{source}: {steps} {what}; expected one: try --time N (0 to {steps - 1}), or a number in the output of "
-            "vvgt convert, as -o 'p_{:02d}.ply', which makes a series of them"
+            "vvgt convert, as -o 'p_{:02d}.ply', which makes a series of them, or -o p.html, a page of them all"
         )
         self.steps = steps
 

@@ -29,7 +29,7 @@ def convert_functions(request: ConvertRequest, functions: Sequence[str], console
     for one in requests:
         check_outputs(one.outputs(), one.inputs(), one.overwrite)
     if len({one.output for one in requests}) < len(requests):
-        names = ", ".join(dict.fromkeys(map(_name, functions)))
+        names = ", ".join(dict.fromkeys(map(function_name, functions)))
         raise UsageError(f"{len(functions)} functions, named {names}: the files would have the same name; rename one")
     run = Run(console, ConversionReport("convert"))
     with run.stage("volume") as stage:
@@ -46,7 +46,7 @@ def convert_functions(request: ConvertRequest, functions: Sequence[str], console
 
 def _one(request: ConvertRequest, tf: str) -> ConvertRequest:
     """The request of one function."""
-    return named(replace(request, source=replace(request.source, tf=tf)), _name(tf), "function")
+    return named(replace(request, source=replace(request.source, tf=tf)), function_name(tf), "function")
 
 
 def named(request: ConvertRequest, name: str, what: str) -> ConvertRequest:
@@ -71,6 +71,6 @@ def named(request: ConvertRequest, name: str, what: str) -> ConvertRequest:
     )
 
 
-def _name(tf: str) -> str:
+def function_name(tf: str) -> str:
     """Of a file without folder and endings; of a preset of several (FILE#NAME) its own."""
     return tf.rpartition("#")[2] if "#" in tf else Path(tf).name.partition(".")[0]

@@ -198,7 +198,7 @@ def convert_series(request: ConvertRequest, shard: Shard, console: Console | Non
         raise UsageError("--overwrite with --shard: parts would remove each other's files; remove the files instead")
     console = console or Console()
     source = request.source
-    steps = _steps(source)
+    steps = steps_of(source)
     names = _outputs(request, len(steps))
     run = Run(console, ConversionReport("convert"))
     with run.stage("frames") as stage:
@@ -284,8 +284,13 @@ def _table(labels: str | LabelTable | None, found: Sequence[int]) -> LabelTable:
     return labels if isinstance(labels, LabelTable) else distinct(found)
 
 
-def _steps(source: SourceRequest) -> list[Step]:
-    """The files of a glob, or the time steps of the one file that is named."""
+def steps_of(source: SourceRequest) -> list[Step]:
+    """The files of a glob, or the time steps of the one file that is named.
+
+    Raises:
+        UsageError: a glob that matches nothing.
+        DataError: a file that cannot be read.
+    """
     from vvgt_cli.volume.slices import matching
 
     files = [] if os.path.exists(source.path) else matching(source.path)

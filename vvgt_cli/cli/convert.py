@@ -77,6 +77,7 @@ def command(
     With a place for a number in OUT.ply, VOLUME is a time series: a glob of its frames, or one file of several
     time steps. One .ply a frame, under one function and one range of values. The same command again goes on
     where it was. With --tf several times, {} in OUT.ply stands for each function's name, and VOLUME is read once.
+    A page takes them all: -o OUT.html, without a place, has a list and a slider of frames, functions or labels.
 
     \b
     Examples:
@@ -87,6 +88,7 @@ def command(
       vvgt convert - --dims 64 64 93 --dtype uint16 -o - < head.raw > head.ply
       vvgt convert 'run_*.vti' --tf tf.json -o 'out_{:04d}.ply'
       vvgt convert head.nrrd --tf bone.json --tf skin.json -o 'head_{}.ply'
+      vvgt convert four.nii -o four.html
       vvgt convert cells.ome.tif --channel GFP --time 0 -o cells.ply
       vvgt convert atlas.nii.gz --labels atlas.label --split-labels -o 'atlas_{}.ply'
       vvgt convert ct.nrrd --tf bone.json --layer organs.seg.nrrd -o both.ply
@@ -105,38 +107,47 @@ def command(
 def _split(request: ConvertRequest, functions: Sequence[str], other: bool, console: Console) -> None:
     """One file a label; ``other``: options that go with one file are given."""
     from vvgt_cli.batches.labels import convert_labels
+    from vvgt_cli.batches.pages import page_of_labels
+    from vvgt_cli.batches.series import is_pattern
     from vvgt_cli.errors import UsageError
+    from vvgt_cli.runs.gaussian_files import is_page
 
     if functions or other or request.checkpoint is not None:
         raise UsageError(
             "--split-labels is of one label map in memory; leave out --tf, --dry-run, --shard, --checkpoint and "
             "what is of blocks (--blocks, --workers, --scheduler, --level)"
         )
-    convert_labels(request, console)
+    if is_page(request.output) and not is_pattern(request.output or ""):
+        page_of_labels(request, console)
+    else:
+        convert_labels(request, console)
 
 
 def _convert(
     request: ConvertRequest, functions: Sequence[str], shard: str | None, dry_run: bool, console: Console,
     blocks: dict[str, Any],
 ) -> None:  # fmt: skip
-    """One volume, whole or in blocks, a series, or several functions."""
+    """One volume, whole or in blocks, a series, or several functions; of a page, several clouds in one file."""
     from vvgt_cli.batches.functions import convert_functions
+    from vvgt_cli.batches.pages import page_of_functions, page_of_volume
     from vvgt_cli.batches.series import convert_series, is_pattern
-    from vvgt_cli.conversion.convert import convert, planned
+    from vvgt_cli.conversion.convert import planned
     from vvgt_cli.errors import UsageError
+    from vvgt_cli.runs.gaussian_files import is_page
 
     several = len(functions) > 1
-    if asked_for(blocks) and (several or dry_run or is_pattern(request.output or "")):
+    numbered = is_pattern(request.output or "")
+    if asked_for(blocks) and (several or dry_run or numbered):
         raise UsageError("--blocks, --workers, --scheduler, --level: of one volume and function; leave out --dry-run")
     if several and (dry_run or shard is not None or request.checkpoint is not None):
         raise UsageError(f"{len(functions)} functions; expected one with --dry-run, --shard or --checkpoint")
-    series = is_pattern(request.output or "") and not several
+    series, joined = numbered and not several, is_page(request.output) and not numbered
     if series and request.checkpoint is not None:
         raise UsageError("--checkpoint is of one volume; a series goes on by its manifest: leave the option out")
     if series and dry_run:
         raise UsageError("--dry-run of a series: expected one volume; try it on one of the frames")
     if several:
-        convert_functions(request, functions, console)
+        (page_of_functions if joined else convert_functions)(request, functions, console)
     elif series:
         from vvgt_cli.batches.render_views import parse_shard
 
@@ -145,9 +156,20 @@ def _convert(
         raise UsageError(f"--shard {shard} is of a series; give -o a place for the frame's number, as out_{{:04d}}.ply")
     elif dry_run:
         click.echo(planned(request, console).text())
-    elif (asked := chosen(blocks, request, console)) is not None:
-        from vvgt_cli.scale.convert import convert_in_blocks
-
-        convert_in_blocks(request, asked, console)
+    elif joined:
+        page_of_volume(request, lambda: _one(request, console, blocks), console)
     else:
+        _one(request, console, blocks)
+
+
+def _one(request: ConvertRequest, console: Console, blocks: dict[str, Any]) -> None:
+    """One volume to one file, in memory or in blocks."""
+    from vvgt_cli.conversion.convert import convert
+
+    asked = chosen(blocks, request, console)
+    if asked is None:
         convert(request, console)
+        return
+    from vvgt_cli.scale.convert import convert_in_blocks
+
+    convert_in_blocks(request, asked, console)

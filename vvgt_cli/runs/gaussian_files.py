@@ -6,6 +6,7 @@ import os
 import secrets
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import BinaryIO
 
@@ -17,6 +18,8 @@ from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions, in_unit_frame, 
 from vvgt_cli.runs.outputs import STDOUT
 from vvgt_cli.runs.record import Run
 from vvgt_cli.share import encoded, format_of, read_splats
+from vvgt_cli.share.page_file import html_of_several, upright
+from vvgt_cli.share.splats import splats_of
 from vvgt_cli.splat.rules import INRIA, Rule, rule_of
 from vvgt_cli.volume.types import UnitFrame
 
@@ -90,6 +93,38 @@ def write_gaussians(
             report.bytes = _write_file(output, gaussians, options, overwrite, normals)
         report.gaussians = len(gaussians)
         stage.note = f"{output}: {len(gaussians)} Gaussians, {report.bytes / 1e6:.1f} MB"
+
+
+def is_page(output: str | None) -> bool:
+    """Whether an output is a page, which takes several clouds."""
+    known = None if output in (None, STDOUT) else format_of(str(output))
+    return known is not None and known.suffix == ".html"
+
+
+def write_page(run: Run, output: str | None, clouds: Sequence[tuple[str, str]], overwrite: bool) -> None:
+    """The stage that writes several files of Gaussians as one page.
+
+    Args:
+        run: gets the stage and the size.
+        output: the page.
+        clouds: (name in the page's list, file) of each.
+        overwrite: replace it if it exists.
+
+    Raises:
+        DataError: a file that is none of Gaussians.
+    """
+    assert output is not None
+    with run.stage("write") as stage:
+        shown = []
+        for name, file in clouds:
+            gaussians, header = open_gaussians(file)
+            shown.append((name, splats_of(gaussians, upright(layout_of(header)))))
+            run.report.gaussians += len(gaussians)
+        with atomic_write(output, overwrite) as temporary:
+            run.report.bytes = temporary.write_bytes(html_of_several(shown, output))
+        stage.note = (
+            f"{output}: {len(clouds)} clouds, {run.report.gaussians} Gaussians, {run.report.bytes / 1e6:.1f} MB"
+        )
 
 
 def _write_file(

@@ -27,7 +27,7 @@ from vvgt_cli.splat.rules import INRIA, RULES
 PROGRAM = "viewer.js.gz"
 _RULE = re.compile(r"vvgt size \d+ rule (\w+)$")
 _UNIT = re.compile(r"vvgt frame unit\b")
-_SPLATS = re.compile(rb'<script type="application/octet-stream" id="splats">([A-Za-z0-9+/=]+)</script>')
+_SPLATS = re.compile(rb'<script type="application/octet-stream" id="splats-\d+">([A-Za-z0-9+/=]+)</script>')
 _FAR = 99  # percentile of the distances from the middle that a camera stands back by
 _DISTANCE, _FIELD = 3.0, 40.0  # of the orbits' cameras, in half edges of the unit frame and in degrees
 
@@ -72,20 +72,16 @@ def drawing(splats: Splats) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def page(title: str, splats: Splats, frames: Sequence[tuple[str, str]], parts: str) -> str:
+def page(title: str, splats: Splats, frames: Sequence[dict[str, str]], parts: str) -> str:
     """The page's text.
 
     Args:
         title: of the window.
         splats: of the first frame.
-        frames: (name, file) of each.
+        frames: of each its ``name``, its ``file``, and what it is ``held`` in, where that is in the page.
         parts: elements that bring the viewer.
     """
-    scene = {
-        "rule": drawing(splats),
-        "camera": camera(splats),
-        "frames": [{"name": name, "file": file} for name, file in frames],
-    }
+    scene = {"rule": drawing(splats), "camera": camera(splats), "frames": list(frames)}
     said = json.dumps(scene).replace("<", "\\u003c")  # no name ends the script
     text = asset("page.html").decode("utf-8")
     for place, value in (("TITLE", escape(title)), ("SCENE", said), ("PARTS", parts)):
@@ -94,27 +90,46 @@ def page(title: str, splats: Splats, frames: Sequence[tuple[str, str]], parts: s
 
 
 def html(splats: Splats, name: str) -> bytes:
-    """The page as one file: the viewer packed by gzip, the Gaussians as a `.compressed.ply`, both in base64."""
-    held = {
-        "program": ("text/plain", asset(PROGRAM)),
-        "splats": ("application/octet-stream", compressed_ply(splats, name)),
-    }
+    """The page of one cloud as one file."""
+    return html_of_several([(_title(name), splats)], name)
+
+
+def html_of_several(clouds: Sequence[tuple[str, Splats]], name: str) -> bytes:
+    """The page as one file: the viewer packed by gzip, each cloud as a `.compressed.ply`, all in base64.
+
+    Args:
+        clouds: each one's name, as the page's list has it, and columns; the first is shown at first.
+        name: of the file.
+    """
+    held = [("program", "text/plain", asset(PROGRAM))]
+    for k, (cloud, splats) in enumerate(clouds):
+        held.append((f"splats-{k}", "application/octet-stream", compressed_ply(splats, cloud)))
     elements = [
         f'<script type="{kind}" id="{key}">{base64.b64encode(content).decode("ascii")}</script>'
-        for key, (kind, content) in held.items()
+        for key, kind, content in held
     ]
     parts = [*elements, f"<script>{asset('inflate.js').decode('utf-8')}</script>"]
-    title = re.split(r"[/\\]", name)[-1].removesuffix(".html")
-    return page(title, splats, [(title, "scene.compressed.ply")], "\n".join(parts)).encode("utf-8")
+    frames = [
+        {"name": cloud, "file": f"{k}.compressed.ply", "held": f"splats-{k}"} for k, (cloud, _) in enumerate(clouds)
+    ]
+    return page(_title(name), clouds[0][1], frames, "\n".join(parts)).encode("utf-8")
+
+
+def _title(name: str) -> str:
+    return re.split(r"[/\\]", name)[-1].removesuffix(".html")
 
 
 def read_html(content: bytes, name: str) -> Splats:
     """The columns of a page that `html` wrote.
 
     Raises:
-        DataError: another page.
+        DataError: another page, or one of several clouds.
     """
-    found = _SPLATS.search(content)
-    if found is None:
+    found = _SPLATS.findall(content)
+    if not found:
         raise DataError(f"{name}: a page without Gaussians; expected one that vvgt wrote")
-    return read_compressed_ply(base64.b64decode(found[1]), name)
+    if len(found) > 1:
+        raise DataError(
+            f"{name}: a page of {len(found)} clouds of Gaussians; expected one: try the .ply of one of them"
+        )
+    return read_compressed_ply(base64.b64decode(found[0]), name)

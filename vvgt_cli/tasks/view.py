@@ -17,7 +17,7 @@ from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians import Gaussians, PlyOptions, write_ply
 from vvgt_cli.jit.ahead import DRAW, for_degree
 from vvgt_cli.progress import Console
-from vvgt_cli.runs.gaussian_files import STDIN, layout_of, open_gaussians, write_gaussians
+from vvgt_cli.runs.gaussian_files import STDIN, is_page, layout_of, open_gaussians, write_gaussians, write_page
 from vvgt_cli.runs.outputs import Output, claimed
 from vvgt_cli.runs.readback import tell_agreement
 from vvgt_cli.runs.record import ConversionReport, Run
@@ -70,12 +70,33 @@ def view(request: ViewRequest, announce: Callable[[str], None], console: Console
         _serve(run, request, files, announce)
         return
     if len(files) > 1:
-        raise UsageError(f"-o {request.output} is of one file, got {len(files)}; write them one by one")
+        _join(run, request, files)
+        return
     with claimed([Output("-o", request.output, SUFFIXES, splats=True)], files, request.overwrite):
         gaussians, options = _opened(run, request, files[0])
         write_gaussians(run, request.output, gaussians, options, request.overwrite)
         run.compile(for_degree(DRAW, gaussians.degree))
         tell_agreement(run, request.output, gaussians, options)
+
+
+def _join(run: Run, request: ViewRequest, files: Sequence[str]) -> None:
+    """Several files into one page."""
+    _only_gaussians(files)
+    if request.output is None or not is_page(request.output):
+        raise UsageError(
+            f"-o {request.output} is of one file, got {len(files)}; expected a page (.html), which takes them all"
+        )
+    with claimed([Output("-o", request.output, (".html",), splats=True)], files, request.overwrite):
+        write_page(run, request.output, [(Path(name).stem, name) for name in files], request.overwrite)
+
+
+def _only_gaussians(files: Sequence[str]) -> None:
+    """Of several files."""
+    volumes = [name for name in files if name != STDIN and not is_splats(name)]
+    if len(files) > 1 and (volumes or STDIN in files):
+        raise UsageError(
+            f"{(volumes or [STDIN])[0]}: of several files expected all to hold Gaussians; convert it first"
+        )
 
 
 def expanded(names: Sequence[str]) -> list[str]:
@@ -118,11 +139,7 @@ def _stored(gaussians: Gaussians, options: PlyOptions) -> bytes:
 
 
 def _serve(run: Run, request: ViewRequest, files: Sequence[str], announce: Callable[[str], None]) -> None:
-    volumes = [name for name in files if name != STDIN and not is_splats(name)]
-    if len(files) > 1 and (volumes or STDIN in files):
-        raise UsageError(
-            f"{(volumes or [STDIN])[0]}: of several files expected all to hold Gaussians; convert it first"
-        )
+    _only_gaussians(files)
     first = _stored(*_opened(run, request, files[0]))
 
     @cache
@@ -135,8 +152,8 @@ def _serve(run: Run, request: ViewRequest, files: Sequence[str], announce: Calla
         gaussians, header = open_gaussians(files[k])
         return _stored(gaussians, layout_of(header))
 
-    frames = [(Path(name).name, name_of(k)) for k, name in enumerate(files)]
-    text = page(f"{frames[0][0]} - vvgt", columns_of(first, files[0]), frames, '<script src="viewer.js"></script>')
+    frames = [{"name": Path(name).name, "file": name_of(k)} for k, name in enumerate(files)]
+    text = page(f"{frames[0]['name']} - vvgt", columns_of(first, files[0]), frames, '<script src="viewer.js"></script>')
     parts = {
         "": Part("text/html; charset=utf-8", lambda: text.encode("utf-8")),
         "viewer.js": Part("text/javascript; charset=utf-8", lambda: asset(PROGRAM), packed=True),

@@ -1,5 +1,5 @@
 // The page of `vvgt view` and of `-o out.html`: SuperSplat's viewer, its camera where `vvgt render --orbit` begins, and a
-// slider where there are several frames. Splats are drawn by the file's rule (docs/viewers.md). `make page` bundles it with its packages to viewer.js.gz.
+// slider and a list where there are several frames, functions or labels. Splats are drawn by the file's rule (docs/viewers.md). `make page` bundles it with its packages to viewer.js.gz.
 import css from '@playcanvas/supersplat-viewer/viewer.css';
 import { createViewer } from '@playcanvas/supersplat-viewer/viewer';
 import { Asset, SHADERLANGUAGE_GLSL, ShaderChunks } from 'playcanvas';
@@ -21,12 +21,12 @@ const settings = {
 };
 
 // what the file itself holds (base64), or the server's answer
-function content(frame) {
-  const held = document.getElementById('splats');
-  if (!held) return fetch(frame.file);
-  const text = atob(held.textContent), bytes = new Uint8Array(text.length);
+function content({ file, held }) {
+  if (!held) return fetch(file);
+  const element = document.getElementById(held);
+  const text = atob(element.textContent), bytes = new Uint8Array(text.length);
   for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i);
-  held.remove();
+  if (scene.frames.length === 1) element.remove();  // of several, one that left memory is read again
   return Promise.resolve(new Response(bytes));
 }
 
@@ -47,17 +47,18 @@ function series(viewer) {
   const assets = new Map([[0, Promise.resolve(app.assets.get(entity.gsplat.asset))]]);  // by frame, the last used last
   const box = document.createElement('div');
   box.id = 'series';
-  box.innerHTML = '<button>▶</button><input type="range" min="0" value="0" aria-label="frame"><span></span>';
-  const [button, slider, name] = box.children;
+  box.innerHTML = '<button aria-label="play">▶</button><input type="range" min="0" value="0" aria-label="frame"><select aria-label="name"></select>';
+  const [button, slider, list] = box.children;
   slider.max = scene.frames.length - 1;
+  list.append(...scene.frames.map((frame) => new Option(frame.name)));
   document.body.append(box);
   let wanted = 0, playing = false;
 
   function loaded(k) {
     if (!assets.has(k)) {
-      const { file } = scene.frames[k];
+      const { file, held } = scene.frames[k], contents = held && content(scene.frames[k]);
       assets.set(k, new Promise((done, fail) => {
-        const asset = new Asset(file, 'gsplat', { url: file, filename: file });
+        const asset = new Asset(file, 'gsplat', { url: file, filename: file, contents });
         asset.once('load', () => done(asset));
         asset.once('error', fail);
         app.assets.add(asset);
@@ -72,8 +73,7 @@ function series(viewer) {
 
   async function show(k) {
     wanted = k;
-    slider.value = k;
-    name.textContent = scene.frames[k].name;
+    slider.value = list.selectedIndex = k;
     try {
       const asset = await loaded(k);
       if (wanted !== k) return;
@@ -101,12 +101,12 @@ function series(viewer) {
   }
 
   slider.addEventListener('input', () => show(Number(slider.value)));
+  list.addEventListener('input', () => show(list.selectedIndex));
   button.addEventListener('click', () => {
     playing = !playing;
     button.textContent = playing ? '❚❚' : '▶';
     if (playing) play();
   });
-  name.textContent = scene.frames[0].name;
   return show;
 }
 

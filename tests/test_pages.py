@@ -1,0 +1,134 @@
+"""Several clouds in one page: frames of a series, functions, labels, files; each with its name, as alone."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vvgt_cli.gaussians import read_ply
+from vvgt_cli.share.gsply_files import read_compressed_ply
+
+HOW = ("--max-gaussians", "60", "--size", "32", "--steps", "2")
+
+
+def clouds(page: Path) -> dict[str, np.ndarray]:
+    """Name to sorted opacities of each cloud that a page holds, in the order of its list."""
+    text = page.read_text("utf-8")
+    scene = json.loads(re.search(r'id="scene">(.*?)</script>', text, re.S)[1])
+    found = {}
+    for frame in scene["frames"]:
+        content = re.search(rf'id="{frame["held"]}">([^<]+)</script>', text)[1]
+        found[frame["name"]] = np.sort(read_compressed_ply(base64.b64decode(content), "page").logits)
+    assert len(found) == len(scene["frames"])
+    return found
+
+
+def same(held: np.ndarray, file: Path) -> bool:
+    """As a `.compressed.ply` holds it: opacities in 8 bits."""
+    own = np.sort(read_ply(str(file))[0].opacity_logits)
+    alpha = lambda logits: 1 / (1 + np.exp(-logits))  # noqa: E731
+    return len(own) == len(held) and bool(np.abs(alpha(own) - alpha(held)).max() < 1 / 200)
+
+
+@pytest.fixture
+def steps(tmp_path):
+    """A file of three steps, of which the second shows nothing, and the files of a glob."""
+    z, y, x = np.meshgrid(*[np.linspace(-1, 1, 12)] * 3, indexing="ij")
+    ball = np.exp(-4 * (x * x + y * y + z * z)).astype(np.float32)
+    import nibabel
+
+    nibabel.save(nibabel.Nifti1Image(np.stack([ball, 0 * ball, ball**2], axis=-1), np.eye(4)), tmp_path / "four.nii")
+    for k, values in enumerate((ball, ball**2)):
+        np.save(tmp_path / f"run_{k}.npy", values)
+    node = lambda v, o: {"x": v, "rgb": [1, 0.5, 0.2], "opacity": o}  # noqa: E731
+    (tmp_path / "tf.json").write_text(json.dumps({"range": [0, 1], "points": [node(0.1, 0), node(1, 0.6)]}))
+    return tmp_path
+
+
+def test_a_file_of_several_steps_is_a_page_of_them(vvgt, steps):
+    page, how = steps / "four.html", ("--tf", steps / "tf.json", *HOW)
+    done = vvgt("convert", steps / "four.nii", "-o", page, *how)
+    assert done.code == 0, done.err
+    assert vvgt("convert", steps / "four.nii", "-o", steps / "f_{}.ply", *how).code == 0
+    held = clouds(page)
+    assert list(held) == ["four.nii time 0", "four.nii time 2"]  # the other one shows nothing
+    assert same(held["four.nii time 0"], steps / "f_0.ply")
+    assert same(held["four.nii time 2"], steps / "f_2.ply")
+    assert not same(held["four.nii time 0"], steps / "f_2.ply")
+    assert "2 clouds" in done.err
+    one = vvgt("convert", steps / "four.nii", "--time", "2", "-o", steps / "one.html", *how)
+    assert (one.code, list(clouds(steps / "one.html"))) == (0, ["one"])
+    again = vvgt("convert", steps / "four.nii", "-o", page, *how)
+    assert (again.code, "four.html" in again.error) == (2, True)
+    assert vvgt("convert", steps / "four.nii", "-o", page, "--overwrite", "--light", "headlight", *how).code == 0
+    assert list(clouds(page)) == list(held)
+
+
+def test_a_glob_of_volumes_is_a_page_and_one_of_slices_a_volume(vvgt, steps):
+    done = vvgt("convert", str(steps / "run_*.npy"), "--tf", steps / "tf.json", "-o", steps / "run.html", *HOW)
+    assert done.code == 0, done.err
+    assert list(clouds(steps / "run.html")) == ["run_0.npy", "run_1.npy"]
+    import tifffile
+
+    for k in range(6):
+        tifffile.imwrite(steps / f"slice_{k}.tif", np.full((8, 9), 40 * k, np.uint8))
+    assert vvgt("convert", str(steps / "slice_*.tif"), "-o", steps / "stack.html", *HOW).code == 0
+    assert list(clouds(steps / "stack.html")) == ["stack"]
+
+
+def test_functions_and_labels_have_their_names(vvgt, steps):
+    (steps / "other.json").write_text((steps / "tf.json").read_text().replace("0.6", "0.1"))
+    two = ("--tf", steps / "tf.json", "--tf", steps / "other.json")
+    assert vvgt("convert", steps / "run_0.npy", *two, "-o", steps / "two.html", *HOW).code == 0
+    held = clouds(steps / "two.html")
+    assert list(held) == ["tf", "other"]
+    assert held["tf"].mean() > held["other"].mean()
+    labels = np.zeros((12, 12, 12), np.uint8)
+    labels[3:6, 3:9, 3:9], labels[6:9, 3:9, 3:9] = 1, 2
+    np.save(steps / "map.npy", labels)
+    how = ("--labels", "auto", "--split-labels", *HOW)
+    assert vvgt("convert", steps / "map.npy", *how, "-o", steps / "map.html").code == 0
+    index = vvgt("convert", steps / "map.npy", *how, "-o", steps / "map_{}.ply")
+    assert index.code == 0
+    files = json.loads((steps / "map_index.json").read_text())["files"]
+    held = clouds(steps / "map.html")
+    assert list(held) == [row["name"] for row in files]
+    assert all(same(held[row["name"]], steps / row["file"]) for row in files)
+
+
+def test_files_are_joined(vvgt, steps):
+    files = []
+    for k, budget in enumerate((40, 60)):
+        files.append(steps / f"<b>{k}.ply")
+        assert vvgt("init", "example:blob:12", "--max-gaussians", budget, "-o", files[-1]).code == 0
+    done = vvgt("view", *files, "-o", steps / "both.html")
+    assert done.code == 0, done.err
+    held = clouds(steps / "both.html")
+    assert list(held) == ["<b>0", "<b>1"]
+    assert all(same(cloud, file) for cloud, file in zip(held.values(), files, strict=True))
+    assert "<b>" not in (steps / "both.html").read_text("utf-8")
+
+
+def test_what_pages_of_several_cannot_is_one_line(vvgt, steps, monkeypatch):
+    monkeypatch.chdir(steps)
+    how = ("--tf", "tf.json", *HOW)
+    for extra in ("--report", "r.json"), ("--preview", "p.png"), ("--checkpoint", "c"):
+        done = vvgt("convert", "four.nii", "-o", "four.html", *extra, *how)
+        assert (done.code, len(done.error.splitlines())) == (2, 1)
+        assert "give -o a place for the name or number" in done.error
+    assert not list(steps.glob("*.html"))
+    assert vvgt("convert", "four.nii", "-o", "four.html", *how).code == 0
+    for command in (
+        ("evaluate", "four.html", "--volume", "run_0.npy"),
+        ("render", "four.html", "--orbit", "1", "-o", "o"),
+    ):
+        done = vvgt(*command)
+        assert (done.code, "a page of 2 clouds of Gaussians; expected one" in done.error) == (1, True)
+    assert vvgt("init", "example:blob:12", "--max-gaussians", "40", "-o", "a.ply").code == 0
+    done = vvgt("view", "a.ply", "a.ply", "-o", "b.spz")
+    assert (done.code, "expected a page (.html), which takes them all" in done.error) == (2, True)
