@@ -17,7 +17,9 @@ from vvgt_cli.conversion.plan import DEFAULT_STEPS, MOST_STEPS, Planner, check_m
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions, Limits
 from vvgt_cli.conversion.stage import Work
 from vvgt_cli.conversion.stages import BackProjection, Network, Refinement, TrainingViews
+from vvgt_cli.conversion.stages.refinement import WIDER
 from vvgt_cli.conversion.stages.views import views_of
+from vvgt_cli.descent.options import TEXTURE
 from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply
 from vvgt_cli.progress import Console
@@ -243,13 +245,19 @@ def test_views_are_fitted_to_at_their_size_and_judged_at_the_screens(tmp_path, m
     asked = []
 
     def refine(run, gaussians, train, check, options, begin=None):
-        asked.append((options.rule, options.judge))
+        asked.append((options.rule, options.judge, options.texture, gaussians, begin))
         return gaussians
 
     monkeypatch.setattr("vvgt_cli.conversion.stages.refinement.refine", refine)
     done(tmp_path, FitOptions(100, 128, steps=30, rule="playcanvas"))
     rule = RULES["playcanvas"]
-    assert asked == [(rule.at(0.5), rule)]
+    assert asked[0][:3] == (rule.at(0.5), rule, TEXTURE)
+    start, begin = asked[0][3:]
+    wider = np.sort(np.exp(begin.log_scales - start.log_scales), axis=1)
+    np.testing.assert_allclose(wider, np.tile([1, WIDER, WIDER], (len(start), 1)), rtol=1e-4)
+    done(tmp_path, FitOptions(100, 128, steps=30, init="uniform"), overwrite=True)  # which stand on no lattice
+    done(tmp_path, FitOptions(100, 128, steps=10), overwrite=True)  # too few to make it sharp again
+    assert [found[-1] for found in asked[1:]] == [None, None]
 
 
 def test_a_slower_machine_gets_fewer_steps_after_the_closed_form():

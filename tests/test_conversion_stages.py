@@ -95,6 +95,9 @@ def test_descent_may_begin_elsewhere_but_never_ends_below_the_start():
     assert stage.kept is False
     assert stage.psnr_before == stage.psnr == pytest.approx(views.psnr(start), abs=1e-6)
     near = replace(start, colors=np.clip(colors + 0.02, 0, 1))
+    still = OptimizeOptions(steps=0)
+    assert views.psnr(refine(run, start, views, views, still, near)) == pytest.approx(views.psnr(near), abs=1e-3)
+    assert run.report.stages[-1].kept is True
     result = refine(run, start, views, views, options, near)
     assert views.psnr(result) > max(views.psnr(start), views.psnr(near))
     assert run.report.stages[-1].psnr_before == pytest.approx(views.psnr(start), abs=1e-6)

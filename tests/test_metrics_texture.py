@@ -71,6 +71,12 @@ def test_means_are_over_the_blocks_of_all_views_and_the_worst_tenth_is_each_pict
     assert texture([(quiet, FLAT)]).reference_worst == pytest.approx(one.ours_worst)
 
 
+def test_what_no_screen_shows_is_no_texture():
+    white = picture(255.0)
+    beyond = picture(300 + 20 * np.cos(2 * np.pi * X / 8))
+    assert texture([(white, beyond)]).ours == pytest.approx(0, abs=1e-3)
+
+
 def test_colours_count_each_and_what_is_smaller_than_a_block_has_no_texture():
     red = FLAT.copy()
     red[..., 0] = picture(100 + np.cos(2 * np.pi * X / 8))[..., 0]

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from vvgt_cli.cameras import default_views
+from vvgt_cli.descent import OptimizeOptions
+from vvgt_cli.descent.loop import begin, step
 from vvgt_cli.descent.loss import loss_gradient
+from vvgt_cli.descent.options import TEXTURE
 from vvgt_cli.descent.ssim import KERNEL, add_ssim_gradient
 from vvgt_cli.descent.texture import SMOOTH, add_texture_gradient
+from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.metrics import ssim
 from vvgt_cli.metrics.ssim import C1, C2
 
@@ -113,3 +120,23 @@ def test_pixel_losses_by_hand():
     squares = loss_gradient(image, target, np.float32(1), np.float32(2), np.float32(0.5), grad)
     assert squares == pytest.approx(0.25 + 0.0625 + 1.0 + 0.5 * 0.25)
     np.testing.assert_allclose(grad[0], [[3, 0, 2, 1.5], [0, -5, 0, 0]])
+
+
+def test_steps_of_our_method_follow_the_texture_term():
+    rng = np.random.default_rng(0)
+    colors = rng.random((40, 3))
+    start = Gaussians(
+        rng.uniform(-0.4, 0.4, (40, 3)), np.full((40, 3), -2.5), np.eye(1, 4).repeat(40, 0), np.ones(40), colors
+    )
+    camera = default_views("train", 1, size=40)[0]
+    target = np.full((40, 40, 4), 0.5, np.float32)
+    usual = OptimizeOptions.of("frame", steps=4)
+    assert usual.texture == TEXTURE > 0
+    assert OptimizeOptions.of("adam", steps=4).texture == OptimizeOptions.of("3dgs", steps=4).texture == 0
+    ends = []
+    for options in (usual, replace(usual, texture=0.0)):
+        state = begin(start, [camera], options)
+        for _ in range(4):
+            step(state, camera, target, options, 0.05, 0.0, 1.0)
+        ends.append(state.gaussians().colors)
+    assert np.abs(ends[0] - ends[1]).max() > 1e-4

@@ -79,12 +79,20 @@ def test_a_glob_of_volumes_is_a_page_and_one_of_slices_a_volume(vvgt, steps):
         tifffile.imwrite(steps / f"slice_{k}.tif", np.full((8, 9), 40 * k, np.uint8))
     assert vvgt("convert", str(steps / "slice_*.tif"), "-o", steps / "stack.html", *HOW).code == 0
     assert list(clouds(steps / "stack.html")) == ["stack"]
+    for k in range(6):
+        tifffile.imwrite(steps / f"color_{k}.tif", np.full((8, 9, 3), 40 * k, np.uint8), photometric="rgb")
+    assert vvgt("convert", str(steps / "color_*.tif"), "-o", steps / "color.html", *HOW).code == 0
+    assert vvgt("convert", str(steps / "run_0*.npy"), "--tf", steps / "tf.json", "-o", steps / "r.html", *HOW).code == 0
+    assert list(clouds(steps / "r.html")) == ["run_0.npy"]
+    assert not list(steps.glob(".*"))
 
 
 def test_functions_and_labels_have_their_names(vvgt, steps):
     (steps / "other.json").write_text((steps / "tf.json").read_text().replace("0.6", "0.1"))
     two = ("--tf", steps / "tf.json", "--tf", steps / "other.json")
     assert vvgt("convert", steps / "run_0.npy", *two, "-o", steps / "two.html", *HOW).code == 0
+    big = vvgt("convert", steps / "run_0.npy", *two, "-o", steps / "big.html", "--max-size", "1")
+    assert (big.code, "--max-size is of one file" in big.error) == (2, True)
     held = clouds(steps / "two.html")
     assert list(held) == ["tf", "other"]
     assert held["tf"].mean() > held["other"].mean()
@@ -109,7 +117,7 @@ def test_files_are_joined(vvgt, steps):
     done = vvgt("view", *files, "-o", steps / "both.html")
     assert done.code == 0, done.err
     held = clouds(steps / "both.html")
-    assert list(held) == ["<b>0", "<b>1"]
+    assert list(held) == ["<b>0.ply", "<b>1.ply"]
     assert all(same(cloud, file) for cloud, file in zip(held.values(), files, strict=True))
     assert "<b>" not in (steps / "both.html").read_text("utf-8")
 
@@ -121,7 +129,19 @@ def test_what_pages_of_several_cannot_is_one_line(vvgt, steps, monkeypatch):
         done = vvgt("convert", "four.nii", "-o", "four.html", *extra, *how)
         assert (done.code, len(done.error.splitlines())) == (2, 1)
         assert "give -o a place for the name or number" in done.error
+    done = vvgt("convert", "four.nii", "-o", "four.html", "--max-size", "1", "--tf", "tf.json", "--size", "32")
+    assert (done.code, "--max-size is of" in done.error) == (2, True)
+    dark = json.dumps(
+        {
+            "range": [0, 1],
+            "points": [{"x": 8, "rgb": [1, 1, 1], "opacity": 0}, {"x": 9, "rgb": [1, 1, 1], "opacity": 1}],
+        }
+    )
+    Path("dark.json").write_text(dark)
+    done = vvgt("convert", "four.nii", "-o", "four.html", "--tf", "dark.json", *HOW)
+    assert (done.code, "shows nothing" in done.error) == (1, True)
     assert not list(steps.glob("*.html"))
+    assert not list(steps.glob(".*"))
     assert vvgt("convert", "four.nii", "-o", "four.html", *how).code == 0
     for command in (
         ("evaluate", "four.html", "--volume", "run_0.npy"),

@@ -221,8 +221,28 @@ def _locked(lock: Path, target: Path) -> IO[bytes] | None:
         held.close()  # the run that held it has ended and taken the file away
 
 
+@contextmanager
+def temporary_folder(target: str | os.PathLike[str]) -> Iterator[Path]:
+    """A hidden folder beside ``target``, for what it is put together of; gone after the block.
+
+    Raises:
+        OSError: nothing can be written there.
+    """
+    place = Path(target)
+    folder = Path(tempfile.mkdtemp(prefix=f".{place.name}.", dir=place.parent))
+    _leftovers.add(folder)
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+        _leftovers.discard(folder)
+
+
 def discard_leftovers() -> None:
-    """Remove temporary files and locks of this process: for those who end it without unwinding."""
+    """Remove temporary files, folders and locks of this process: for those who end it without unwinding."""
     for path in list(_leftovers):
         with suppress(OSError):
-            path.unlink(missing_ok=True)
+            if path.is_dir():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                path.unlink(missing_ok=True)

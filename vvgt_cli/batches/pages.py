@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import os
-import tempfile
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,12 +13,13 @@ from vvgt_cli.batches.manifest import Shard
 from vvgt_cli.batches.series import convert_series, steps_of
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import SeveralSteps, UsageError
+from vvgt_cli.files import temporary_folder
 from vvgt_cli.progress import Console
 from vvgt_cli.runs.gaussian_files import write_page
 from vvgt_cli.runs.outputs import claimed
 from vvgt_cli.runs.record import ConversionReport, Run
-from vvgt_cli.volume import read_volume
 from vvgt_cli.volume.slices import matching
+from vvgt_cli.volume.tiff import SUFFIXES
 
 Clouds = list[tuple[str, str]]  # name and file of each
 
@@ -31,7 +30,7 @@ def page_of_volume(request: ConvertRequest, alone: Callable[[], object], console
     Raises:
         UsageError, DataError: as `convert` and `convert_series`.
     """
-    if not _is_glob_of_volumes(request):
+    if not _is_glob_of_volumes(request.source.path):
         try:
             alone()
             return
@@ -82,23 +81,32 @@ def _page(request: ConvertRequest, make: Callable[[ConvertRequest, Path], Clouds
             f"{request.output} gets several clouds of Gaussians: --report, --preview and --checkpoint are of one each; "
             "leave them out, or give -o a place for the name or number, as out_{:04d}.ply"
         )
+    if request.limits.max_megabytes is not None:
+        raise UsageError(f"--max-size is of one file; {request.output} holds several: give --max-gaussians for each")
+    assert request.output is not None
     run = Run(console, ConversionReport("convert"))
-    with claimed(request.outputs(), request.inputs(), request.overwrite), _folder() as folder:
+    with claimed(request.outputs(), request.inputs(), request.overwrite), temporary_folder(request.output) as folder:
         clouds = make(replace(request, overwrite=True), folder)
         write_page(run, request.output, clouds, request.overwrite)
         run.finish()
 
 
-@contextmanager
-def _folder() -> Iterator[Path]:
-    with tempfile.TemporaryDirectory(prefix="vvgt-") as name:
-        yield Path(name)
-
-
-def _is_glob_of_volumes(request: ConvertRequest) -> bool:
-    """Whether the source is several files, each a volume of its own and no slice."""
-    path = request.source.path
+def _is_glob_of_volumes(path: str) -> bool:
+    """Whether a path is a glob of files that are volumes of their own, and not TIFF slices of one."""
     if os.path.exists(path) or not set(path) & set("*?["):
         return False
     files = matching(path)
-    return len(files) > 1 and read_volume(str(files[0]), request.source.read).dims[2] > 1
+    if any(file.suffix.lower() not in SUFFIXES for file in files):
+        return True
+    return bool(files) and _pages(files[0]) > 1
+
+
+def _pages(path: Path) -> int:
+    """Of a TIFF; 1 where it cannot be read, which reading it says."""
+    import tifffile
+
+    try:
+        with tifffile.TiffFile(path) as file:
+            return len(file.pages)
+    except Exception:  # whatever a damaged file makes of it
+        return 1

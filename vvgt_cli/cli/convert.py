@@ -72,7 +72,7 @@ def command(
     decide which stages run; what is left out is said, and why. Ctrl-C ends gradient descent only.
 
     OUT.ply may end in .html (one file that shows it in a browser), .spz, .compressed.ply, .sog, .glb or .usdc: what the
-    format costs is printed.
+    format costs is printed, but for a page of several.
 
     With a place for a number in OUT.ply, VOLUME is a time series: a glob of its frames, or one file of several
     time steps. One .ply a frame, under one function and one range of values. The same command again goes on
@@ -156,7 +156,7 @@ def _convert(
         raise UsageError(f"--shard {shard} is of a series; give -o a place for the frame's number, as out_{{:04d}}.ply")
     elif dry_run:
         click.echo(planned(request, console).text())
-    elif joined:
+    elif joined and not asked_for(blocks):
         page_of_volume(request, lambda: _one(request, console, blocks), console)
     else:
         _one(request, console, blocks)

@@ -70,7 +70,7 @@ def _of_view(reference: np.ndarray, ours: np.ndarray) -> tuple[np.ndarray, np.nd
 
 def band(image: np.ndarray) -> np.ndarray:
     """(h, w, 3) of RGB in levels of 255, blurred by `FINE` less blurred by `COARSE` pixels; edges are continued."""
-    levels = np.asarray(image[..., :3], np.float32) * 255
+    levels = np.clip(np.asarray(image[..., :3], np.float32), 0, 1) * 255  # as a screen shows them
     result: np.ndarray = _blurred(levels, FINE) - _blurred(levels, COARSE)
     return result
 

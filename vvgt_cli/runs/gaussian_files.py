@@ -101,7 +101,7 @@ def is_page(output: str | None) -> bool:
     return known is not None and known.suffix == ".html"
 
 
-def write_page(run: Run, output: str | None, clouds: Sequence[tuple[str, str]], overwrite: bool) -> None:
+def write_page(run: Run, output: str, clouds: Sequence[tuple[str, str]], overwrite: bool) -> None:
     """The stage that writes several files of Gaussians as one page.
 
     Args:
@@ -111,17 +111,21 @@ def write_page(run: Run, output: str | None, clouds: Sequence[tuple[str, str]], 
         overwrite: replace it if it exists.
 
     Raises:
-        DataError: a file that is none of Gaussians.
+        DataError: a file that is none of Gaussians, or no file.
     """
-    assert output is not None
+    if not clouds:
+        raise DataError(f"{output}: nothing is visible in any of what it was to show; try another function")
     with run.stage("write") as stage:
-        shown = []
+        shown, rules = [], set[str]()
         for name, file in clouds:
             gaussians, header = open_gaussians(file)
+            rules.add(header.rule or INRIA.name)
             shown.append((name, splats_of(gaussians, upright(layout_of(header)))))
             run.report.gaussians += len(gaussians)
         with atomic_write(output, overwrite) as temporary:
             run.report.bytes = temporary.write_bytes(html_of_several(shown, output))
+        if len(rules) > 1:
+            run.console.say(f"{output}: made for {', '.join(sorted(rules))}; the page draws all as it draws the first")
         stage.note = (
             f"{output}: {len(clouds)} clouds, {run.report.gaussians} Gaussians, {run.report.bytes / 1e6:.1f} MB"
         )

@@ -82,12 +82,25 @@ def view(request: ViewRequest, announce: Callable[[str], None], console: Console
 def _join(run: Run, request: ViewRequest, files: Sequence[str]) -> None:
     """Several files into one page."""
     _only_gaussians(files)
+    _refuse_reading(request.source, files[0])
     if request.output is None or not is_page(request.output):
         raise UsageError(
             f"-o {request.output} is of one file, got {len(files)}; expected a page (.html), which takes them all"
         )
     with claimed([Output("-o", request.output, (".html",), splats=True)], files, request.overwrite):
-        write_page(run, request.output, [(Path(name).stem, name) for name in files], request.overwrite)
+        names = [Path(name).name for name in files]
+        if len(set(names)) < len(names):
+            names = list(files)
+        write_page(run, request.output, list(zip(names, files, strict=True)), request.overwrite)
+
+
+def _refuse_reading(given: SourceRequest, name: str) -> None:
+    """Options that are of volumes, with a file of Gaussians."""
+    plain = SourceRequest(given.volume)
+    if replace(given, volume=plain.volume, light=plain.light) != plain:
+        raise UsageError(
+            f"{name} holds Gaussians: --tf, --labels, --layer and options of reading are of volumes; leave them out"
+        )
 
 
 def _only_gaussians(files: Sequence[str]) -> None:
@@ -118,11 +131,7 @@ def _opened(run: Run, request: ViewRequest, name: str) -> tuple[Gaussians, PlyOp
     """Gaussians in the unit frame and how a file of them is laid out; a volume is converted."""
     given = request.source
     if name == STDIN or is_splats(name):
-        plain = SourceRequest(given.volume)
-        if replace(given, volume=plain.volume, light=plain.light) != plain:
-            raise UsageError(
-                f"{name} holds Gaussians: --tf, --labels, --layer and options of reading are of volumes; leave them out"
-            )
+        _refuse_reading(given, name)
         gaussians, header = open_gaussians(name)
         return gaussians, layout_of(header)
     from vvgt_cli.conversion.convert import in_memory

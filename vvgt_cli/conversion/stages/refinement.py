@@ -109,9 +109,9 @@ def refine(
         )
         if begin is not None:
             record.psnr_before = check.psnr(start, options.judge)
-            if record.kept == 0 or (record.psnr_after or 0.0) <= record.psnr_before:
+            if (record.psnr_after or 0.0) <= record.psnr_before:
                 result, record.kept, record.psnr_after = start, 0, record.psnr_before
-        stage.kept = record.kept > 0
+        stage.kept = result is not start
         stage.psnr_before, stage.psnr = record.psnr_before, record.psnr_after
         stage.note = _note(record, options)
     drawn = {"rule": options.rule.name, "dilation": options.rule.dilation}
