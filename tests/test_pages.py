@@ -131,15 +131,11 @@ def test_what_pages_of_several_cannot_is_one_line(vvgt, steps, monkeypatch):
         assert "give -o a place for the name or number" in done.error
     done = vvgt("convert", "four.nii", "-o", "four.html", "--max-size", "1", "--tf", "tf.json", "--size", "32")
     assert (done.code, "--max-size is of" in done.error) == (2, True)
-    dark = json.dumps(
-        {
-            "range": [0, 1],
-            "points": [{"x": 8, "rgb": [1, 1, 1], "opacity": 0}, {"x": 9, "rgb": [1, 1, 1], "opacity": 1}],
-        }
-    )
+    white = {"rgb": [1, 1, 1]}
+    dark = json.dumps({"points": [{"x": 900, "opacity": 0, **white}, {"x": 901, "opacity": 1, **white}]})
     Path("dark.json").write_text(dark)
     done = vvgt("convert", "four.nii", "-o", "four.html", "--tf", "dark.json", *HOW)
-    assert (done.code, "shows nothing" in done.error) == (1, True)
+    assert (done.code, "shows nothing in any of 3 frames" in done.error) == (1, True)
     assert not list(steps.glob("*.html"))
     assert not list(steps.glob(".*"))
     assert vvgt("convert", "four.nii", "-o", "four.html", *how).code == 0
