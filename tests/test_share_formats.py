@@ -98,10 +98,13 @@ def test_damaged_files_are_one_line(known, tmp_path):
         assert path.name in str(error.value)
 
 
-def test_a_library_that_is_missing_is_named_before_the_work(tmp_path, vvgt, monkeypatch):
-    monkeypatch.setitem(sys.modules, "pxr", None)
-    monkeypatch.setitem(sys.modules, "pxr.Usd", None)
-    result = vvgt("convert", "example:frog", "-o", tmp_path / "a.usdc")
+@pytest.mark.parametrize(
+    ("ending", "module"), [(".spz", "gsply"), (".compressed.ply", "gsply"), (".html", "gsply"), (".usdc", "pxr")]
+)
+def test_a_library_that_is_missing_is_named_before_the_work(ending, module, tmp_path, vvgt, monkeypatch):
+    monkeypatch.setitem(sys.modules, module, None)
+    monkeypatch.setitem(sys.modules, f"{module}.Usd", None)
+    result = vvgt("convert", "example:frog", "-o", tmp_path / f"a{ending}")
     assert result.code == 1
     assert "pip install 'vvgt[share]'" in result.error
     assert "read" not in result.err.replace(result.error, "")  # no stage ran

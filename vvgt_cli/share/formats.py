@@ -32,17 +32,17 @@ class Format:
     suffix: str
     write: Callable[[Splats, str], bytes]
     read: Callable[[bytes, str], Splats]
-    needs: Callable[[str], object] = lambda name: None
+    needs: Callable[[str], object]
     layout: Callable[[PlyOptions], PlyOptions] = lambda options: options
 
 
 FORMATS = (
-    Format(".compressed.ply", gsply_files.compressed_ply, gsply_files.read_compressed_ply),
-    Format(".spz", gsply_files.spz, gsply_files.read_spz),
+    Format(".compressed.ply", gsply_files.compressed_ply, gsply_files.read_compressed_ply, gsply_files.gsply),
+    Format(".spz", gsply_files.spz, gsply_files.read_spz, gsply_files.gsply),
     Format(".sog", sog.sog, sog.read_sog, sog.program),
-    Format(".glb", gltf.glb, gltf.read_glb),
+    Format(".glb", gltf.glb, gltf.read_glb, lambda name: None),
     Format(".usdc", usd.usdc, usd.read_usdc, usd.library),
-    Format(".html", page_file.html, page_file.read_html, layout=page_file.upright),
+    Format(".html", page_file.html, page_file.read_html, gsply_files.gsply, page_file.upright),
 )
 SUFFIXES = (".ply", *(known.suffix for known in FORMATS))
 

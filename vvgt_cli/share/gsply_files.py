@@ -13,20 +13,29 @@ import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.share.splats import Splats, near_each_other
-from vvgt_cli.volume.libraries import library_errors
+from vvgt_cli.volume.libraries import library_errors, need
 
+EXTRA = "share"
 _FRACTION = 20  # bits of a coordinate behind the point, where its 23 leave as many: 1e-6
 _COMMENT = 16  # gzip's flag for a comment in its header (RFC 1952)
 _FRONT = struct.Struct("<2sBBIBB")  # magic, method, flags, time, extra flags, system
 
 
+def gsply(source: str) -> Any:
+    """The library.
+
+    Raises:
+        DataError: it is not installed.
+    """
+    return need("gsply", EXTRA, source, "this format")
+
+
 def compressed_ply(splats: Splats, name: str) -> bytes:
     """A `.compressed.ply`: 16 bytes a Gaussian and 72 for 256 of them, which lie near each other."""
-    import gsply
-
+    library = gsply(name)
     s = splats.take(near_each_other(splats.means))
     rest = s.f_rest if s.f_rest.shape[1] else None
-    content: bytes = gsply.compress_to_bytes(s.means, s.log_scales, s.quaternions, s.logits, s.f_dc, rest)
+    content: bytes = library.compress_to_bytes(s.means, s.log_scales, s.quaternions, s.logits, s.f_dc, rest)
     said = "".join(f"comment {line}\n" for line in s.comments).encode()
     head, end, body = content.partition(b"end_header\n")
     return head + said + end + body
@@ -36,30 +45,28 @@ def read_compressed_ply(content: bytes, name: str) -> Splats:
     """The columns of a `.compressed.ply`.
 
     Raises:
-        DataError: gsply cannot read it.
+        DataError: gsply cannot read it, or is not installed.
     """
-    import gsply
-
+    library = gsply(name)
     with library_errors(name, "a compressed .ply"):
         head = content[: content.index(b"end_header")].decode("utf-8")
-        data = gsply.decompress_from_bytes(content)
+        data = library.decompress_from_bytes(content)
         return _columns(data, [line[8:] for line in head.splitlines() if line.startswith("comment ")])
 
 
 def spz(splats: Splats, name: str) -> bytes:
     """An `.spz` of version 3, in the axes of the `.ply`; its gzip header's comment holds the `.ply`'s comments."""
-    import gsply
-
+    library = gsply(name)
     largest = max(float(np.abs(splats.means).max()), 1e-6)
     bits = min(int(np.floor(np.log2((2**23 - 1) / largest))), _FRACTION)
     if bits < 1:
         raise DataError(f"{name}: positions up to {largest:g}; expected less than 4e6 in an .spz; try --frame unit")
     s = splats
     rest = s.f_rest if s.f_rest.shape[1] else None
-    data = gsply.GSData.from_arrays(s.means, s.log_scales, s.quaternions, s.logits, s.f_dc, rest, format="ply")
+    data = library.GSData.from_arrays(s.means, s.log_scales, s.quaternions, s.logits, s.f_dc, rest, format="ply")
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "out.spz"
-        gsply.write_spz(path, data, version=3, fractional_bits=bits)
+        library.write_spz(path, data, version=3, fractional_bits=bits)
         return _packed(gzip.decompress(path.read_bytes()), s.comments)
 
 
@@ -75,14 +82,13 @@ def read_spz(content: bytes, name: str) -> Splats:
     """The columns of an `.spz`.
 
     Raises:
-        DataError: gsply cannot read it.
+        DataError: gsply cannot read it, or is not installed.
     """
-    import gsply
-
+    library = gsply(name)
     with library_errors(name, "an .spz"), tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "in.spz"
         path.write_bytes(content)
-        return _columns(gsply.read_spz(path), _comments(content))
+        return _columns(library.read_spz(path), _comments(content))
 
 
 def _comments(content: bytes) -> list[str]:
