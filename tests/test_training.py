@@ -339,7 +339,10 @@ def test_two_processes_have_the_loss_of_one(data, straight, tmp_path):
     (tmp_path / "given.yaml").write_text(config_text(CONFIG))
     torchrun = (sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2",
                 "-m", "vvgt_cli.cli.main")  # fmt: skip
-    subprocess.run(command(tmp_path, data, *torchrun), env=ENVIRONMENT, check=True, capture_output=True, timeout=300)
+    ran = subprocess.run(
+        command(tmp_path, data, *torchrun), env=ENVIRONMENT, capture_output=True, text=True, timeout=300
+    )
+    assert ran.returncode == 0, ran.stderr
     for key in ("loss", "gain", "norm"):
         one, two = ([float(row[key]) for row in rows_of(folder)] for folder in (straight, tmp_path / "run"))
         assert np.allclose(one, two, rtol=1e-4, atol=1e-5), key
