@@ -25,7 +25,7 @@ from dvr_scenes import commit, print_table, read_scenes, write_rows
 from floors import machine
 
 from vvgt_cli.cameras import Camera, default_views
-from vvgt_cli.conversion.case import view_edge
+from vvgt_cli.field.case import view_edge
 from vvgt_cli.conversion.stages.views import LARGE, REFINE_VIEWS, fine_enough, views_of, wide
 from vvgt_cli.descent import LOSS_3DGS, OptimizeOptions, optimize
 from vvgt_cli.dvr import Scene, render_views

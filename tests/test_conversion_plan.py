@@ -11,7 +11,7 @@ from onnx_models import write_model
 from test_cli_infer import DARKER
 
 from vvgt_cli.cameras.blocks import BLOCK, ENOUGH, FEW, spread_blocks
-from vvgt_cli.conversion.case import Case, expected_wide
+from vvgt_cli.field.case import Case, expected_wide
 from vvgt_cli.conversion.convert import convert, initialise_only, planned
 from vvgt_cli.conversion.plan import DEFAULT_STEPS, MOST_STEPS, Planner, check_memory
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions, Limits

@@ -11,7 +11,7 @@ import vvgt_cli as vvgt
 from tests.test_gaussians_harmonics import cloud
 from vvgt_cli import vbm
 from vvgt_cli.cameras import default_views
-from vvgt_cli.conversion.case import Case
+from vvgt_cli.field.case import Case
 from vvgt_cli.conversion.plan import Planner
 from vvgt_cli.conversion.stages.refinement import HARMONICS, step_seconds
 from vvgt_cli.descent import METHODS, OptimizeOptions, OptimizeRecord, optimize

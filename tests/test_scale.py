@@ -236,7 +236,7 @@ def test_memory_decides_by_itself(vvgt, tmp_path, monkeypatch):
     plain = vvgt("init", source, "-o", tmp_path / "a.ply", *FIT[:-1])
     assert plain.code == 0
     assert "blocks" not in plain.err
-    monkeypatch.setattr("vvgt_cli.scale.source.free_memory", lambda: 200 << 20)
+    monkeypatch.setattr("vvgt_cli.field.source.free_memory", lambda: 200 << 20)
     less = vvgt("init", source, "-o", tmp_path / "b.ply", *FIT[:-1])
     assert less.code == 0
     assert "more than the memory holds" in less.err
@@ -248,7 +248,7 @@ def test_memory_decides_by_itself(vvgt, tmp_path, monkeypatch):
     fitted = vvgt("convert", source, "-o", tmp_path / "d.ply", *FIT[:-1], "--steps", "8")
     assert fitted.code == 0
     assert "more than the memory holds" in fitted.err
-    monkeypatch.setattr("vvgt_cli.scale.settings.free_memory", lambda: 200 << 20)
+    monkeypatch.setattr("vvgt_cli.field.settings.free_memory", lambda: 200 << 20)
     none = vvgt("init", source, "-o", tmp_path / "c.ply", *FIT[:-1])
     assert none.code == 2
     assert "MiB more" in none.err
@@ -287,8 +287,8 @@ def test_a_label_map_by_name_is_not_taken_for_scalars_in_blocks(vvgt, raw, tmp_p
 
 
 def test_a_box_that_is_counted_slice_by_slice_has_the_counts_and_samples_of_the_whole(raw, tmp_path):
-    from vvgt_cli.scale.grid import Boxes
-    from vvgt_cli.scale.parts import COUNTS, Parts
+    from vvgt_cli.field.grid import Boxes
+    from vvgt_cli.field.parts import COUNTS, Parts
     from vvgt_cli.scale.tasks import CountBlocks, Place
 
     merged = []

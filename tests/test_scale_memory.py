@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.test_scale import FIT, bodies, sorted_rows
-from vvgt_cli.scale.settings import BlockOptions, block_edge
+from vvgt_cli.field.settings import BlockOptions, block_edge
 from vvgt_cli.volume import ReadOptions, Volume
 from vvgt_cli.volume.stored import Stored
 from vvgt_cli.volume.tiff import read_tiff
@@ -60,7 +60,7 @@ def test_slices_beyond_the_memory_are_gone_through_in_blocks_by_themselves(vvgt,
     (tmp_path / "slices").mkdir()
     for z, plane in enumerate(values):
         tifffile.imwrite(tmp_path / "slices" / f"s{z}.tif", plane, compression="zlib")
-    monkeypatch.setattr("vvgt_cli.scale.source.free_memory", lambda: 100_000)
+    monkeypatch.setattr("vvgt_cli.field.source.free_memory", lambda: 100_000)
     run = vvgt("init", tmp_path / "slices", "-o", tmp_path / "a.ply", *FIT[:-1])
     assert run.code == 0, run.err
     assert "in blocks" in run.err
@@ -71,7 +71,7 @@ def test_a_small_file_that_unpacks_to_much_is_gone_through_in_blocks(vvgt, tmp_p
 
     values = np.round(bodies((50, 61, 40))).astype(np.uint8)
     tifffile.imwrite(tmp_path / "v.tif", values, compression="zlib")
-    monkeypatch.setattr("vvgt_cli.scale.source.free_memory", lambda: 100_000)
+    monkeypatch.setattr("vvgt_cli.field.source.free_memory", lambda: 100_000)
     assert (tmp_path / "v.tif").stat().st_size < 25_000
     run = vvgt("init", tmp_path / "v.tif", "-o", tmp_path / "a.ply", *FIT[:-1])
     assert run.code == 0, run.err
@@ -100,8 +100,8 @@ def stored(dims, dtype, read=None, chunk=64):
 
 def test_counting_reads_every_voxel_once_and_little_more(tmp_path, monkeypatch):
     from vvgt_cli.scale import tasks
-    from vvgt_cli.scale.grid import Boxes
-    from vvgt_cli.scale.parts import COUNTS, Parts
+    from vvgt_cli.field.grid import Boxes
+    from vvgt_cli.field.parts import COUNTS, Parts
 
     values, read = bodies((100, 90, 80)).astype(np.float32), []
 
@@ -124,7 +124,7 @@ def test_counting_reads_every_voxel_once_and_little_more(tmp_path, monkeypatch):
 
 
 def test_the_memory_of_a_block_is_that_of_its_worker(monkeypatch):
-    monkeypatch.setattr("vvgt_cli.scale.settings.free_memory", lambda: 3 << 30)
+    monkeypatch.setattr("vvgt_cli.field.settings.free_memory", lambda: 3 << 30)
     volume = stored((1536, 1536, 1536), np.float32)
     edges = {
         (who, n): block_edge(volume, BlockOptions(workers=n, scheduler=who))

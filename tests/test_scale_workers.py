@@ -111,7 +111,7 @@ def test_dasks_workers_leave_the_same_bytes(raw, alone, tmp_path):
 
 def test_a_scheduler_that_is_not_there_is_a_line(vvgt, raw, tmp_path, monkeypatch):
     pytest.importorskip("distributed")
-    monkeypatch.setattr("vvgt_cli.scale.dask_runner.WAIT", "1s")
+    monkeypatch.setattr("vvgt_cli.field.dask_runner.WAIT", "1s")
     for scheduler, code, word in (
         ("tcp://127.0.0.1:9", 1, "no Dask scheduler answers"),
         ("nonsense://x", 1, "no Dask scheduler answers"),

@@ -10,6 +10,7 @@ from vvgt_cli.batches.series import is_pattern
 from vvgt_cli.conversion.convert import convert
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import UsageError
+from vvgt_cli.field.open import automatic
 from vvgt_cli.progress import Console
 from vvgt_cli.runs.layered import open_parts
 from vvgt_cli.runs.outputs import check_outputs
@@ -31,17 +32,25 @@ def convert_functions(request: ConvertRequest, functions: Sequence[str], console
     if len({one.output for one in requests}) < len(requests):
         names = ", ".join(dict.fromkeys(map(function_name, functions)))
         raise UsageError(f"{len(functions)} functions, named {names}: the files would have the same name; rename one")
-    run = Run(console, ConversionReport("convert"))
-    with run.stage("volume") as stage:
-        content = open_parts(request.source.path, request.source.read)
-        stage.note = f"{content.volumes[0].name}, for {len(functions)} functions"
-        opened = Opened.of(content)
-        requests = [replace(one, source=replace(one.source, volume=opened)) for one in requests]
+    blocks = request.blocks or automatic(request.source, console)
+    if blocks is not None:
+        requests = [replace(one, blocks=blocks) for one in requests]
+    else:
+        requests = _opened(Run(console, ConversionReport("convert")), request, requests)
     for number, (one, tf) in enumerate(zip(requests, functions, strict=True), 1):
         console.say(f"{tf}: function {number} of {len(requests)}, to {one.output}")
         report = convert(one, console)
         if report.refinement and report.refinement["reason"] == "interrupted":
             raise KeyboardInterrupt
+
+
+def _opened(run: Run, request: ConvertRequest, requests: list[ConvertRequest]) -> list[ConvertRequest]:
+    """The requests with the volume, which is read once."""
+    with run.stage("volume") as stage:
+        content = open_parts(request.source.path, request.source.read)
+        stage.note = f"{content.volumes[0].name}, for {len(requests)} functions"
+        opened = Opened.of(content)
+    return [replace(one, source=replace(one.source, volume=opened)) for one in requests]
 
 
 def _one(request: ConvertRequest, tf: str) -> ConvertRequest:

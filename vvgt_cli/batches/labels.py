@@ -16,20 +16,22 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vvgt_cli.batches.functions import named
-from vvgt_cli.conversion.convert import convert, fitted
+from vvgt_cli.conversion.convert import convert, fitted, opened
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import NothingVisible, UsageError
+from vvgt_cli.field.open import automatic
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.types import together
-from vvgt_cli.jit.ahead import INIT
 from vvgt_cli.progress import Console
-from vvgt_cli.runs.layered import AUTO, NONE, layers_of, open_parts
+from vvgt_cli.runs.layered import AUTO, NONE, Content, layers_of, open_parts
 from vvgt_cli.runs.outputs import Output, check_outputs, write_text
 from vvgt_cli.runs.owners import hidden_in, owners
 from vvgt_cli.runs.record import ConversionReport, Run, plain
-from vvgt_cli.runs.source import load
+from vvgt_cli.runs.source import SourceRequest
 from vvgt_cli.transfer.labels import Label, LabelTable
+from vvgt_cli.transfer.lighting import LightOptions
 from vvgt_cli.volume import Volume
+from vvgt_cli.volume.stored import planes
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr.layers import Layer
@@ -74,8 +76,12 @@ def convert_labels(request: ConvertRequest, console: Console | None = None) -> d
     named(request, INDEX, "label")  # its errors come before the volume
     run = Run(console, ConversionReport("convert"))
     with run.stage("volume") as stage:
-        maps = layers_of(open_parts(source.path, source.read), None, source.labels or AUTO)
-        parts = _parts(request, maps)
+        blocks = request.blocks or automatic(source, console)
+        request = replace(request, blocks=blocks)
+        read = source.read if blocks is None else replace(source.read, stored=True, packed=True)
+        content = open_parts(source.path, read)
+        maps = layers_of(content, None, source.labels or AUTO)
+        parts = _parts(request, content, maps)
         tables = " + ".join(layer.tf.name for layer in maps)
         stage.note = f"{maps[0].volume.name}, {len(parts)} labels of {tables}"
     index = str(Path(str(request.output).replace("{}", INDEX)).with_suffix(".json"))
@@ -94,7 +100,7 @@ def convert_labels(request: ConvertRequest, console: Console | None = None) -> d
     return found
 
 
-def _parts(request: ConvertRequest, maps: Sequence[Layer]) -> list[Part]:
+def _parts(request: ConvertRequest, content: Content, maps: Sequence[Layer]) -> list[Part]:
     """The visible labels, each with a request of its own; the budget is that of its share."""
     shown = [
         (layer.volume, layer.tf, label)
@@ -106,7 +112,7 @@ def _parts(request: ConvertRequest, maps: Sequence[Layer]) -> list[Part]:
     numbers = [label.number for *_, label in shown]
     parts = []
     for (volume, table, label), share in zip(shown, shares(shown, request.fit.max_gaussians), strict=True):
-        source = replace(request.source, volume=volume, labels=table.only(label.number))
+        source = replace(_source(request, content, volume), labels=table.only(label.number))
         alone = replace(request, source=source, fit=replace(request.fit, max_gaussians=share))
         again = numbers.count(label.number) > 1  # of segments that overlap
         name = f"{volume.name.rpartition(' ')[2]}-{file_name(label)}" if again else file_name(label)
@@ -114,16 +120,28 @@ def _parts(request: ConvertRequest, maps: Sequence[Layer]) -> list[Part]:
     return parts
 
 
+def _source(request: ConvertRequest, content: Content, volume: Volume) -> SourceRequest:
+    """One label map of the file: as it was read, or in blocks where it is."""
+    source = request.source
+    if request.blocks is None:
+        return replace(source, volume=volume)
+    if len(content.volumes) == 1:
+        return source
+    number = next(k for k, other in enumerate(content.volumes) if other is volume)
+    return replace(source, read=replace(source.read, component=number))
+
+
 def _gaussians(request: ConvertRequest, parts: Sequence[Part], run: Run) -> list[Gaussians | None]:
     """Of every part, box frame: what the whole hides of it, and its share of the whole; None where nothing is seen."""
     console = run.console
     if len(parts) == 1 or len({id(part.volume) for part in parts}) > 1:
         return [_alone(part, console) for part in parts]  # of segments that overlap colours would mix in a Gaussian
-    whole = replace(request, source=replace(request.source, volume=parts[0].volume, labels=parts[0].table))
-    source = replace(load(whole.source), lighting=None)
-    run.compile(source.kernels(INIT), source.kernel_type())
-    with run.stage("hidden"):
-        hides = hidden_in(source.scene(), request.fit.max_gaussians, request.fit.size)
+    whole = replace(request, source=replace(parts[0].request.source, labels=parts[0].table))
+    plain = replace(whole, source=replace(whole.source, light=LightOptions()))
+    with opened(run, plain) as field, run.stage("hidden"):
+        near, edge = field.hidden(request.fit.max_gaussians, request.fit.size)
+        frame = field.source.volume.unit_frame()
+        hides = hidden_in(near, edge, np.array(frame.half), np.array(frame.step))
     hidden: list[list[Gaussians]] = []
     for part in parts:
         hidden.append([])
@@ -181,8 +199,8 @@ def _voxels(shown: Sequence[tuple[Volume, LabelTable, Label]]) -> list[int]:
         if id(volume) in counts:
             continue
         own = counts[id(volume)] = {}
-        for z in range(len(volume.data)):
-            values, many = np.unique(volume.data[z], return_counts=True)
+        for plane in planes(volume):
+            values, many = np.unique(plane, return_counts=True)
             for value, n in zip(volume.slope * values.astype(np.float64) + volume.intercept, many, strict=True):
                 own[float(value)] = own.get(float(value), 0) + int(n)
     return [counts[id(volume)].get(float(label.number), 0) for volume, _, label in shown]

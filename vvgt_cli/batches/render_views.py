@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,26 +14,32 @@ import numpy as np
 
 from vvgt_cli import __version__
 from vvgt_cli.batches.manifest import Manifest, Shard
-from vvgt_cli.batches.view_files import CONTACT, Layout, View, start_points, thumbnails
+from vvgt_cli.batches.view_files import CONTACT, POINTS, Layout, View, field_points, start_points, thumbnails
 from vvgt_cli.cameras import Camera, default_views, orbit_views
-from vvgt_cli.cameras.boxed import drawn_in_box
+from vvgt_cli.cameras.boxed import boxed, drawn_in_box
 from vvgt_cli.cameras.files import read_frames
 from vvgt_cli.cameras.sets import FIELD_OF_VIEW, RADIUS, SET_VIEWS, SIZE
 from vvgt_cli.errors import DataError, NothingVisible, UsageError
+from vvgt_cli.field.blocked import Blocked
+from vvgt_cli.field.field import Picture
+from vvgt_cli.field.open import Wanted, automatic, beside, blocked
+from vvgt_cli.field.settings import BlockOptions
 from vvgt_cli.files import atomic_write, claim
 from vvgt_cli.images import write_png
-from vvgt_cli.jit.ahead import VIEWS
+from vvgt_cli.jit.ahead import VIEWS, for_blocks
 from vvgt_cli.progress import Console
 from vvgt_cli.runs.digests import cameras_digest, volume_digest
 from vvgt_cli.runs.record import ConversionReport, Run
-from vvgt_cli.runs.source import Source, SourceRequest, load_all
+from vvgt_cli.runs.source import Source, SourceRequest, describe_source, load_all
 from vvgt_cli.volume.space import shear_text
 from vvgt_cli.volume.types import IDENTITY
 
 if TYPE_CHECKING:
-    from vvgt_cli.dvr import Scene
+    from vvgt_cli.dvr import RenderSettings, Scene
 
+Draw = Callable[[Camera], np.ndarray]
 NO_POINTS = np.zeros((0, 3))
+TOGETHER = 1 << 24  # pixels of views of a volume in blocks that are made at once
 
 SPHERE, ORBIT = "sphere", "orbit"
 
@@ -114,6 +121,7 @@ class ViewsRequest:
         step: sampling distance in voxels.
         shard: which part of the views to render.
         overwrite: start afresh where another run's views are.
+        blocks: how the volume is gone through in blocks; None: it is in memory, or in blocks where that is better.
     """
 
     source: SourceRequest
@@ -126,6 +134,7 @@ class ViewsRequest:
     step: float = 0.5
     shard: Shard = field(default_factory=Shard)
     overwrite: bool = False
+    blocks: BlockOptions | None = None
 
     def folders(self) -> list[Path]:
         """A folder a function.
@@ -164,6 +173,7 @@ class _Job:
     manifest: Manifest
     pending: list[View]  # this part's
     files: list[str]  # of the descriptions and models that this part writes
+    field: Blocked | None = None  # where the volume is not in memory
 
     @property
     def folder(self) -> Path:
@@ -185,25 +195,53 @@ def render_view_sets(request: ViewsRequest, console: Console | None = None) -> i
         raise UsageError(f"--samples {request.samples}: VTK shoots one ray a pixel; leave it out")
     run = Run(console or Console(), ConversionReport("render-views"))
     views, folders = request.cameras.make(), request.folders()
-    with run.stage("read") as stage:
-        sources = load_all(request.source, request.tfs or (None,))
+    with ExitStack() as stack:
+        fields = _fields(run, request, folders, stack)
+        if fields is None:
+            with run.stage("read") as stage:
+                sources = load_all(request.source, request.tfs or (None,))
+                stage.note = describe_source(sources[0])
+        else:
+            sources = [field.source for field in fields]
         volume = sources[0].volume
         if volume.sheared:
             raise DataError(
                 f"{volume.name}: {shear_text(volume.axes)}; expected right angles: no pinhole camera sees a sheared "
                 "volume; resample it first ('vvgt convert' takes it)"
             )
-        stage.note = f"{volume.name}: {' x '.join(map(str, volume.dims))} {volume.data.dtype.name}"
-    lit = [source for source in sources if source.lighting is not None]
-    lit.sort(key=lambda source: source.lighting is not None and source.lighting.attenuated)
-    run.compile((lit or sources)[-1].kernels(VIEWS), sources[0].kernel_type())
-    with run.stage("plan") as stage:
-        jobs = _plan(request, views, folders, sources)
-        total = sum(len(job.pending) for job in jobs)
-        stage.note = f"{len(jobs) * len(views)} views, {total} to render here"
-    for job in jobs:
-        _work(run, request, job, views)
+        lit = [source for source in sources if source.lighting is not None]
+        lit.sort(key=lambda source: source.lighting is not None and source.lighting.attenuated)
+        kernels = (lit or sources)[-1].kernels(VIEWS)
+        run.compile(kernels if fields is None else for_blocks(kernels), sources[0].kernel_type())
+        with run.stage("plan") as stage:
+            jobs = _plan(request, views, folders, sources, fields)
+            total = sum(len(job.pending) for job in jobs)
+            stage.note = f"{len(jobs) * len(views)} views, {total} to render here"
+        for job in jobs:
+            _work(run, request, job, views)
+            if job.field is not None:
+                job.field.do.parts.remove()
     return total
+
+
+def _fields(run: Run, request: ViewsRequest, folders: list[Path], stack: ExitStack) -> list[Blocked] | None:
+    """A field in blocks for each function, None where the volume is read as a whole.
+
+    Raises:
+        UsageError: a renderer that needs it in memory.
+    """
+    options = request.blocks or automatic(request.source, run.console)
+    if options is None:
+        return None
+    if request.renderer != "cpu":
+        raise UsageError(f"--renderer {request.renderer}: needs the whole volume in memory; in blocks: cpu")
+    fields = []
+    for tf, folder in zip(request.tfs or (None,), folders, strict=True):
+        parts = stack.enter_context(beside(str(folder)))
+        source = replace(request.source, tf=tf)
+        wanted = Wanted(POINTS, request.cameras.size or SIZE)
+        fields.append(stack.enter_context(blocked(run, source, options, parts, wanted)))
+    return fields
 
 
 def _settings(request: ViewsRequest, views: Sequence[View], source: Source, content: str) -> dict[str, Any]:
@@ -231,7 +269,9 @@ def _settings(request: ViewsRequest, views: Sequence[View], source: Source, cont
     }
 
 
-def _plan(request: ViewsRequest, views: list[View], folders: list[Path], sources: list[Source]) -> list[_Job]:
+def _plan(
+    request: ViewsRequest, views: list[View], folders: list[Path], sources: list[Source], fields: list[Blocked] | None
+) -> list[_Job]:
     """See in every folder what is there, before anything is written."""
     content, layout = volume_digest(sources[0].volume), request.layout
     first = request.shard.index == 1  # the first part describes the set
@@ -244,7 +284,7 @@ def _plan(request: ViewsRequest, views: list[View], folders: list[Path], sources
         mine = [view for j, view in enumerate(views) if request.shard.holds(i * len(views) + j)]
         pending = [view for view in mine if not all(map(manifest.complete, layout.files(view)))]
         missing = [name for name in files if first and not manifest.complete(name)]
-        jobs.append(_Job(source, manifest, pending, missing))
+        jobs.append(_Job(source, manifest, pending, missing, None if fields is None else fields[i]))
     return jobs
 
 
@@ -256,37 +296,61 @@ def _work(run: Run, request: ViewsRequest, job: _Job, views: list[View]) -> None
     manifest, layout = job.manifest, request.layout
     built = layout.descriptions(views)
     models = any(name not in built for name in job.files)
-    if job.pending or models:
+    settings = RenderSettings(request.step, request.samples)
+    draw: Draw | None = None
+    if job.field is not None:
+        draw = _in_blocks(job.field, settings, [view.camera for view in job.pending])
+    elif job.pending or models:
         with run.stage("scene") as stage:
             scene = job.source.scene()
             stage.note = f"{job.source.name}, opacity per {job.source.unit_distance:g} ({job.source.unit_label})"
-    if job.pending:
-        inside = view_renderer(request.renderer, scene, RenderSettings(request.step, request.samples))
-        draw = drawn_in_box(inside, scene.volume.axes)
-    if models:
-        built |= layout.models(views, *(_points(run, scene, views) if layout.points else (NO_POINTS, NO_POINTS)))
+        inside = view_renderer(request.renderer, scene, settings) if job.pending else None
+        draw = None if inside is None else drawn_in_box(inside, scene.volume.axes)
+    if models and layout.points:
+        built |= layout.models(views, *_points(run, job.field or scene, views))
+    elif models:
+        built |= layout.models(views, NO_POINTS, NO_POINTS)
     for name in ("", *layout.folders(views)):
         (job.folder / name).mkdir(parents=True, exist_ok=True)
     with claim(job.folder / request.shard.manifest):
         if job.files or not (job.folder / request.shard.manifest).exists():
             manifest.record()  # first: it says whose the folder is
             _write(manifest, {name: built[name] for name in job.files})
-        if job.pending:
+        if job.pending and draw is not None:
             _render(run, request, job, draw)
         _contact(run, job, layout, views)
 
 
-def _points(run: Run, scene: Scene, views: list[View]) -> tuple[np.ndarray, np.ndarray]:
+def _in_blocks(field: Blocked, settings: RenderSettings, cameras: Sequence[Camera]) -> Draw:
+    """What draws a volume in blocks, so many of the views that are to come at once as `TOGETHER` allows."""
+    axes = field.source.volume.axes
+    left = list(cameras)
+
+    def inside(camera: Camera) -> np.ndarray:
+        if not field.pictures:
+            many = max(TOGETHER // (camera.width * camera.height), 1)
+            field.expect([Picture(boxed(other, axes)[0], settings) for other in left[:many]])
+            del left[:many]
+        image = field.view(camera, settings)
+        field.forget(Picture(camera, settings))
+        return image
+
+    return drawn_in_box(inside, axes)
+
+
+def _points(run: Run, scene: Scene | Blocked, views: list[View]) -> tuple[np.ndarray, np.ndarray]:
     """The cloud to start from: centres and colours, (n, 3) each."""
     with run.stage("points") as stage:
-        points, colors = start_points(scene, views[0].camera.height)
+        size = views[0].camera.height
+        points, colors = field_points(scene, size) if isinstance(scene, Blocked) else start_points(scene, size)
         if not len(points):
-            raise NothingVisible(scene.volume.name, scene.tf.name)
+            source = scene.source if isinstance(scene, Blocked) else scene
+            raise NothingVisible(source.volume.name, source.tf.name)
         stage.note = f"{len(points)} points to start from"
     return points, colors
 
 
-def _render(run: Run, request: ViewsRequest, job: _Job, draw: Callable[[Camera], np.ndarray]) -> None:
+def _render(run: Run, request: ViewsRequest, job: _Job, draw: Draw) -> None:
     _remove_leftovers(job, request.layout)
     with run.stage("views") as stage:
         bar = run.console.bar("views")

@@ -16,6 +16,7 @@ from vvgt_cli.batches.manifest import Manifest, Shard
 from vvgt_cli.conversion.convert import convert
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import DataError, SeveralComponents, UsageError
+from vvgt_cli.field.open import automatic
 from vvgt_cli.files import claim, read_text
 from vvgt_cli.network.card import CARD, find_model
 from vvgt_cli.progress import Console
@@ -93,13 +94,16 @@ class Frames:
         return self.first.volumes[0]
 
 
-def survey(steps: Sequence[Step], labels: str | LabelTable | None, tf: object, console: Console) -> Frames:
+def survey(
+    steps: Sequence[Step], labels: str | LabelTable | None, tf: object, console: Console, stored: bool = False
+) -> Frames:
     """Read every frame once, for the range and the digest of all.
 
     Args:
         steps: the frames.
         labels, tf: as they are asked for.
         console: for progress.
+        stored: values stay in their files, of which slabs are read.
 
     Raises:
         DataError: a frame that cannot be read, or on another grid than the first.
@@ -110,7 +114,7 @@ def survey(steps: Sequence[Step], labels: str | LabelTable | None, tf: object, c
     mapped, found = labels not in (None, NONE), set[int]()
     bar = console.bar("range")
     for k, step in enumerate(steps):
-        content = open_parts(step.volume, step.read)
+        content = open_parts(step.volume, replace(step.read, stored=True, packed=True) if stored else step.read)
         if content.overlapping:
             raise UsageError(f"{step.name}: segments that overlap, in several layers; convert such frames one by one")
         first = first or replace(content, volumes=tuple(map(_hollow, content.volumes)))
@@ -199,10 +203,13 @@ def convert_series(request: ConvertRequest, shard: Shard, console: Console | Non
     console = console or Console()
     source = request.source
     steps = steps_of(source)
+    if request.blocks is None:
+        first = replace(source, volume=steps[0].volume, read=steps[0].read)
+        request = replace(request, blocks=automatic(first, console))
     names = _outputs(request, len(steps))
     run = Run(console, ConversionReport("convert"))
     with run.stage("frames") as stage:
-        frames = survey(steps, source.labels, source.tf, console)
+        frames = survey(steps, source.labels, source.tf, console, request.blocks is not None)
         source = replace(source, statistics=frames.whole)
         if source.labels is None and frames.labels is not None:
             source = replace(source, labels=AUTO)

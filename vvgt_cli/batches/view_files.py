@@ -18,6 +18,7 @@ from vvgt_cli.transfer.types import TransferFunctionLike
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
+    from vvgt_cli.field.field import Field
 
 FORMATS = ("both", "exr", "png")
 CONTACT = "contact.png"
@@ -150,6 +151,16 @@ def start_points(scene: Scene, size: int) -> tuple[np.ndarray, np.ndarray]:
         gaussians = closed_form(scene, POINTS, size).gaussians()
         means = gaussians.means.astype(np.float64)
     return np.clip(means, -scene.half, scene.half) @ scene.volume.axes.T, np.clip(gaussians.colors, 0, 1)
+
+
+def field_points(field: Field, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """`start_points` of a volume in blocks."""
+    from vvgt_cli.vbm import VbmOptions
+
+    found = field.start(VbmOptions(POINTS, size)).gaussians
+    half = np.array(field.source.volume.unit_frame().half)
+    points = np.clip(found.means.astype(np.float64), -half, half)
+    return points @ field.source.volume.axes.T, np.clip(found.colors, 0, 1)
 
 
 def _thinned(scene: Scene, every: np.ndarray) -> Scene:

@@ -7,11 +7,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from vvgt_cli.cli.options import group
-from vvgt_cli.progress import Console
 
 if TYPE_CHECKING:
-    from vvgt_cli.conversion.request import ConvertRequest
-    from vvgt_cli.scale.settings import BlockOptions
+    from vvgt_cli.field.settings import BlockOptions
 
 
 def _size(ctx: click.Context, param: click.Parameter, value: str | None) -> int | str | None:
@@ -80,18 +78,15 @@ def asked_for(blocks: dict[str, Any]) -> bool:
     return any(value is not None and (key not in ONE or value > 1) for key, value in blocks.items())
 
 
-def chosen(blocks: dict[str, Any], request: ConvertRequest, console: Console) -> BlockOptions | None:
-    """What the options add up to; None: the volume is read as a whole.
+def chosen(blocks: dict[str, Any]) -> BlockOptions | None:
+    """What the options add up to; None: the program chooses.
 
     Raises:
-        DataError, UsageError: options that do not fit, a volume that cannot be opened.
+        UsageError: options that do not fit.
     """
-    from vvgt_cli.scale.settings import BlockOptions
-    from vvgt_cli.scale.source import beyond_memory
+    from vvgt_cli.field.settings import BlockOptions
 
     if not asked_for(blocks):
-        if not beyond_memory(request.source):
-            return None
-        console.say("more than the memory holds: in blocks (docs/scale.md)")
+        return None
     size = blocks.pop("block_size")
     return BlockOptions(**{**blocks, "size": None if size == "auto" else size})

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from vvgt_cli.cli.blocks import asked_for, block_options, chosen
+from vvgt_cli.cli.blocks import block_options, chosen
 from vvgt_cli.cli.fit import fit_options, limit_options, ply_options, rule_option
 from vvgt_cli.cli.options import common_options, light_options, overwrite_option, placed_read_options, tfs_options
 from vvgt_cli.progress import Console
@@ -97,11 +98,11 @@ def command(
 
     functions = options["optics"].pop("tf")
     options["optics"]["tf"] = functions[0] if functions else None
-    request = convert_request(volume, **options)
+    request = replace(convert_request(volume, **options), blocks=chosen(blocks))
     if split_labels:
-        _split(request, functions, dry_run or shard is not None or asked_for(blocks), console)
+        _split(request, functions, dry_run or shard is not None, console)
     else:
-        _convert(request, functions, shard, dry_run, console, blocks)
+        _convert(request, functions, shard, dry_run, console)
 
 
 def _split(request: ConvertRequest, functions: Sequence[str], other: bool, console: Console) -> None:
@@ -113,10 +114,7 @@ def _split(request: ConvertRequest, functions: Sequence[str], other: bool, conso
     from vvgt_cli.runs.gaussian_files import is_page
 
     if functions or other or request.checkpoint is not None:
-        raise UsageError(
-            "--split-labels is of one label map in memory; leave out --tf, --dry-run, --shard, --checkpoint and "
-            "what is of blocks (--blocks, --workers, --scheduler, --level)"
-        )
+        raise UsageError("--split-labels is of one label map: leave out --tf, --dry-run, --shard and --checkpoint")
     if is_page(request.output) and not is_pattern(request.output or ""):
         page_of_labels(request, console)
     else:
@@ -124,21 +122,18 @@ def _split(request: ConvertRequest, functions: Sequence[str], other: bool, conso
 
 
 def _convert(
-    request: ConvertRequest, functions: Sequence[str], shard: str | None, dry_run: bool, console: Console,
-    blocks: dict[str, Any],
-) -> None:  # fmt: skip
-    """One volume, whole or in blocks, a series, or several functions; of a page, several clouds in one file."""
+    request: ConvertRequest, functions: Sequence[str], shard: str | None, dry_run: bool, console: Console
+) -> None:
+    """One volume, a series, or several functions; of a page, several clouds in one file."""
     from vvgt_cli.batches.functions import convert_functions
     from vvgt_cli.batches.pages import page_of_functions, page_of_volume
     from vvgt_cli.batches.series import convert_series, is_pattern
-    from vvgt_cli.conversion.convert import planned
+    from vvgt_cli.conversion.convert import convert, planned
     from vvgt_cli.errors import UsageError
     from vvgt_cli.runs.gaussian_files import is_page
 
     several = len(functions) > 1
     numbered = is_pattern(request.output or "")
-    if asked_for(blocks) and (several or dry_run or numbered):
-        raise UsageError("--blocks, --workers, --scheduler, --level: of one volume and function; leave out --dry-run")
     if several and (dry_run or shard is not None or request.checkpoint is not None):
         raise UsageError(f"{len(functions)} functions; expected one with --dry-run, --shard or --checkpoint")
     series, joined = numbered and not several, is_page(request.output) and not numbered
@@ -156,20 +151,7 @@ def _convert(
         raise UsageError(f"--shard {shard} is of a series; give -o a place for the frame's number, as out_{{:04d}}.ply")
     elif dry_run:
         click.echo(planned(request, console).text())
-    elif joined and not asked_for(blocks):
-        page_of_volume(request, lambda: _one(request, console, blocks), console)
+    elif joined:
+        page_of_volume(request, lambda: convert(request, console), console)
     else:
-        _one(request, console, blocks)
-
-
-def _one(request: ConvertRequest, console: Console, blocks: dict[str, Any]) -> None:
-    """One volume to one file, in memory or in blocks."""
-    from vvgt_cli.conversion.convert import convert
-
-    asked = chosen(blocks, request, console)
-    if asked is None:
         convert(request, console)
-        return
-    from vvgt_cli.scale.convert import convert_in_blocks
-
-    convert_in_blocks(request, asked, console)

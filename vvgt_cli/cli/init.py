@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import click
@@ -47,11 +48,9 @@ def command(volume: str, console: Console, blocks: dict[str, Any], **options: An
     from vvgt_cli.cli.blocks import chosen
     from vvgt_cli.cli.fit import convert_request
     from vvgt_cli.conversion.convert import initialise_only
-    from vvgt_cli.scale.run import init_in_blocks
+    from vvgt_cli.field.open import automatic
+    from vvgt_cli.scale.run import init_in_blocks, streams
 
     request = convert_request(volume, **options)
-    asked = chosen(blocks, request, console)
-    if asked is None:
-        initialise_only(request, console)
-    else:
-        init_in_blocks(request, asked, console)
+    request = replace(request, blocks=chosen(blocks) or automatic(request.source, console))
+    (init_in_blocks if streams(request) else initialise_only)(request, console)

@@ -6,6 +6,7 @@ from typing import Any
 
 import click
 
+from vvgt_cli.cli.blocks import block_options, chosen
 from vvgt_cli.cli.fit import source_request
 from vvgt_cli.cli.options import (
     LABELS,
@@ -104,6 +105,7 @@ optics_options = group(
 @optics_options
 @light_options
 @placed_read_options
+@block_options
 @click.option("--shard", default="1/1", metavar="I/N", help="Render part I of N, for job arrays; I counts from 1.")
 @click.option("--overwrite", is_flag=True, help="Start afresh where another run's views are.")
 @common_options
@@ -116,6 +118,7 @@ def command(
     optics: dict[str, Any],
     light: dict[str, Any],
     read: dict[str, Any],
+    blocks: dict[str, Any],
     shard: str,
     overwrite: bool,
     console: Console,
@@ -142,6 +145,6 @@ def command(
     source = source_request(volume, read, optics | {"tf": None}, light)
     request = ViewsRequest(
         source, optics["tf"], output, CameraRequest(**cameras), Layout(**layout),
-        shard=parse_shard(shard), overwrite=overwrite, **rays,
+        shard=parse_shard(shard), overwrite=overwrite, blocks=chosen(blocks), **rays,
     )  # fmt: skip
     render_view_sets(request, console)

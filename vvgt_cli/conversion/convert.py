@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import weakref
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from vvgt_cli.conversion.case import expected_wide, measure
 from vvgt_cli.conversion.plan import Plan, Planner, check_memory
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions, Limits, file_bytes
 from vvgt_cli.conversion.result import Conversion
@@ -15,9 +16,12 @@ from vvgt_cli.conversion.stage import Work
 from vvgt_cli.conversion.stages import CheckViews, ClosedFormStage
 from vvgt_cli.conversion.stages.views import wide
 from vvgt_cli.errors import UsageError
+from vvgt_cli.field.case import expected_wide
+from vvgt_cli.field.field import Field, Resident
+from vvgt_cli.field.open import Wanted, automatic, beside, blocked
 from vvgt_cli.files import check_room
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored
-from vvgt_cli.jit.ahead import CONVERT, EVALUATE, INIT, for_degree
+from vvgt_cli.jit.ahead import CONVERT, EVALUATE, INIT, for_blocks, for_degree
 from vvgt_cli.network.card import find_model, read_card
 from vvgt_cli.progress import Console
 from vvgt_cli.runs.gaussian_files import write_gaussians
@@ -27,9 +31,6 @@ from vvgt_cli.runs.readback import tell_cost
 from vvgt_cli.runs.record import ConversionReport, Run
 from vvgt_cli.runs.source import Source, SourceRequest, describe_source, load, tf_record, volume_record
 from vvgt_cli.share import format_of
-
-if TYPE_CHECKING:
-    from vvgt_cli.dvr import Scene
 
 QUICKEST = 0.5  # of the estimate, where the closed form took less: the rest then takes less too
 VIEW_DEGREE = 2  # of harmonics by default where the light depends on the view: abs(n . v) is even
@@ -47,8 +48,12 @@ def convert(request: ConvertRequest, console: Console | None = None, made: Gauss
     if request.checkpoint is not None and request.limits.time_budget is not None:
         raise UsageError("--checkpoint is of runs that repeat to the byte, --time-budget of others; give one of both")
     run = Run(console or Console(), ConversionReport("convert"))
-    with claimed(request.outputs(), request.inputs(), request.overwrite), checkpoint_folder(request.checkpoint):
-        conversion = run_conversion(run, request, made)
+    with (
+        claimed(request.outputs(), request.inputs(), request.overwrite),
+        checkpoint_folder(request.checkpoint),
+        opened(run, request) as field,
+    ):
+        conversion = run_conversion(run, request, field, made)
         report = _write(run, request, conversion)
         if request.checkpoint is not None and not _interrupted(run):
             Checkpoint(Path(request.checkpoint)).finish()
@@ -64,7 +69,10 @@ def in_memory(
         DataError, UsageError: as `convert`.
     """
     run = Run(console or Console(), ConversionReport("convert"))
-    conversion = run_conversion(run, ConvertRequest(source, None, fit, limits, all_views=all_views))
+    request = ConvertRequest(source, None, fit, limits, all_views=all_views)
+    with ExitStack() as stack:
+        conversion = run_conversion(run, request, stack.enter_context(opened(run, request)))
+        weakref.finalize(conversion, stack.pop_all().close)  # what it draws is there as long as it is
     run.finish()
     return conversion
 
@@ -76,11 +84,10 @@ def initialise_only(request: ConvertRequest, console: Console | None = None) -> 
         UsageError, DataError: as `convert`.
     """
     run = Run(console or Console(), ConversionReport("init"))
-    with claimed(request.outputs(), request.inputs(), request.overwrite):
-        source, scene = _begin(run, request)
-        work = Work(run, scene, request.fit, degree=degree_of(request, source))
+    with claimed(request.outputs(), request.inputs(), request.overwrite), opened(run, request) as field:
+        work = Work(run, field, request.fit, degree=degree_of(request, field.source))
         ClosedFormStage().run(work)
-        return _write(run, request, _conversion(request, source, work, as_stored(work.made())))
+        return _write(run, request, _conversion(request, work, as_stored(work.made())))
 
 
 def planned(request: ConvertRequest, console: Console | None = None) -> Plan:
@@ -91,7 +98,8 @@ def planned(request: ConvertRequest, console: Console | None = None) -> Plan:
     """
     run = Run(console or Console(), ConversionReport("convert"))
     check_outputs(request.outputs(), request.inputs(), request.overwrite)
-    return _planned(run, request)[-1]
+    with opened(run, replace(request, output=None)) as field:
+        return _planned(run, request, field)[-1]
 
 
 def fitted(run: Run, request: ConvertRequest) -> Gaussians:
@@ -100,13 +108,14 @@ def fitted(run: Run, request: ConvertRequest) -> Gaussians:
     Raises:
         DataError, UsageError: as `convert`.
     """
-    _, work, planner, plan = _planned(run, request)
-    check_memory(plan, work.scene)
-    _fit(work, request, planner, plan)
-    return work.made()
+    with opened(run, request) as field:
+        work, planner, plan = _planned(run, request, field)
+        check_memory(plan)
+        _fit(work, request, planner, plan)
+        return work.made()
 
 
-def run_conversion(run: Run, request: ConvertRequest, made: Gaussians | None = None) -> Conversion:
+def run_conversion(run: Run, request: ConvertRequest, field: Field, made: Gaussians | None = None) -> Conversion:
     """Closed form, what views can improve of it, scores on the test views; only checkpoints are written.
 
     What of these is done, and with how many Gaussians, follows from the request's limits and what the stages cost
@@ -119,14 +128,14 @@ def run_conversion(run: Run, request: ConvertRequest, made: Gaussians | None = N
     Raises:
         DataError, UsageError: as `convert`.
     """
-    source, work, planner, plan = _planned(run, request)
+    work, planner, plan = _planned(run, request, field)
     if made is not None:
         plan.stages, plan.left_out = [stage for stage in plan.stages if stage.scores], []
         plan.gaussians, plan.case = len(made), replace(plan.case, gaussians=len(made))
         plan.bytes = file_bytes(len(made), planner.sh_degree)
         run.report.plan = plan.record()
-    check_memory(plan, work.scene)
-    work.checkpoint = checkpoint_of(request.checkpoint, source, work.fit, request.limits)
+    check_memory(plan)
+    work.checkpoint = checkpoint_of(request.checkpoint, work.field, work.fit, request.limits)
     kept = work.checkpoint.load(FITTED)
     if made is not None:
         work.gaussians = as_stored(made)
@@ -138,23 +147,17 @@ def run_conversion(run: Run, request: ConvertRequest, made: Gaussians | None = N
     for stage in plan.stages:
         if stage.scores:
             stage.run(work)
-    return _conversion(request, source, work, work.made())
+    return _conversion(request, work, work.made())
 
 
-def _planned(run: Run, request: ConvertRequest) -> tuple[Source, Work, Planner, Plan]:
+def _planned(run: Run, request: ConvertRequest, field: Field) -> tuple[Work, Planner, Plan]:
     """All that comes before the first stage."""
     fit = replace(request.fit, max_gaussians=request.budget())
     if fit.model is not None:
         read_card(find_model(fit.model))  # fails before the work, not after
-    source, scene = _begin(run, request)
-    degree = degree_of(request, source)
-    if fit.model is not None and degree:
-        raise UsageError(
-            f"--model {fit.model}: a network knows only colours that are the same from all sides; leave it out, or "
-            "give --sh-degree 0 or a light that does not depend on the view"
-        )
+    degree = degree_of(request, field.source)
     fit = replace(fit, max_gaussians=request.limits.gaussians(fit.max_gaussians, degree))
-    case = replace(measure(scene, fit.size, fit.max_gaussians), degree=degree)
+    case = replace(field.case(fit.size, fit.max_gaussians), degree=degree)
     guess = expected_wide(fit.max_gaussians, fit.size)
     planner = Planner(
         request.limits, fit.max_gaussians, fit.steps, request.ply.sh_degree or degree, fit.size, guess, fit.model,
@@ -162,7 +165,8 @@ def _planned(run: Run, request: ConvertRequest) -> tuple[Source, Work, Planner, 
     )  # fmt: skip
     plan = planner.plan(case, run.elapsed())
     run.report.plan = plan.record()
-    return source, Work(run, scene, fit, request.limits, degree), planner, plan
+    field.expect([view for stage in plan.stages for view in stage.views(fit)])
+    return Work(run, field, fit, request.limits, degree), planner, plan
 
 
 def _fit(work: Work, request: ConvertRequest, planner: Planner, plan: Plan) -> Plan:
@@ -229,30 +233,50 @@ def _interrupted(run: Run) -> bool:
     return run.report.refinement is not None and run.report.refinement["reason"] == "interrupted"
 
 
-def _conversion(request: ConvertRequest, source: Source, work: Work, gaussians: Gaussians) -> Conversion:
-    return Conversion(
-        out_of_box(gaussians, source.volume), work.run.report, ply_options(request, source), source, work.scene
-    )
+def _conversion(request: ConvertRequest, work: Work, gaussians: Gaussians) -> Conversion:
+    source = work.field.source
+    return Conversion(out_of_box(gaussians, source.volume), work.run.report, ply_options(request, source), work.field)
 
 
-def _begin(run: Run, request: ConvertRequest) -> tuple[Source, Scene]:
-    """Read, and lay the volume out for the kernels."""
-    with run.stage("read") as stage:
-        source = load(request.source)
-        stage.note = describe_source(source)
-        ply = ply_options(request, source)
+@contextmanager
+def opened(run: Run, request: ConvertRequest) -> Iterator[Field]:
+    """The volume of a request under all that it is shown by, in memory or in blocks; kernels are compiled.
+
+    Blocks lie beside the output until it is written: the same command goes on with those that an ended one has left.
+
+    Raises:
+        DataError, UsageError: as `vvgt_cli.runs.source.load`.
+    """
+    options = request.blocks or automatic(request.source, run.console)
+    if options is None:
+        with run.stage("read") as stage:
+            source = load(request.source)
+            stage.note = describe_source(source)
+        _tell(run, request, source)
+        run.compile(_kernels(run, request, source), source.kernel_type())
+        with run.stage("scene"):
+            field = Resident(source, source.scene())
+        yield field
+        return
+    wanted = Wanted(request.budget(), request.fit.size, request.ply.sh_degree)
+    with beside(request.output) as parts, blocked(run, request.source, options, parts, wanted) as found:
+        _tell(run, request, found.source)
+        run.compile(for_blocks(_kernels(run, request, found.source)), found.source.kernel_type())
+        yield found
+        parts.remove()
+
+
+def _tell(run: Run, request: ConvertRequest, source: Source) -> None:
+    """Say and record what was read."""
+    ply = ply_options(request, source)
     flattened = _flattened(degree_of(request, source), source)
     for remark in [*remarks(source.volume, ply), *([flattened] if flattened else [])]:
         run.console.say(remark)
-    run.compile(_kernels(run, request, source), source.kernel_type())
-    with run.stage("scene"):
-        scene = source.scene()
     run.report.volume = volume_record(source)
     run.report.transfer_function = tf_record(source, request.source)
     run.report.options = asdict(request.fit) | asdict(request.limits) | {
         "frame": ply.frame, "up": ply.up, "sh_degree": ply.sh_degree,
     }  # fmt: skip
-    return source, scene
 
 
 def _kernels(run: Run, request: ConvertRequest, source: Source) -> tuple[str, ...]:
@@ -301,9 +325,9 @@ def _write(run: Run, request: ConvertRequest, conversion: Conversion) -> Convers
     assert request.output is not None
     write_gaussians(run, request.output, conversion.gaussians, conversion.ply, request.overwrite, conversion.normals())
     if format_of(request.output):
-        run.compile(conversion.source.kernels(EVALUATE), conversion.source.kernel_type())
-        volume = conversion.source.volume
-        tell_cost(run, request.output, conversion.gaussians, conversion.ply, conversion.scene, volume)
+        source = conversion.field.source
+        run.compile(source.kernels(EVALUATE), source.kernel_type())
+        tell_cost(run, request.output, conversion.gaussians, conversion.ply, conversion.field, source.volume)
     if request.preview:
         with run.stage("preview"):
             write_png(request.preview, conversion.preview(), request.overwrite)

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from vvgt_cli.conversion.case import Case, view_edge, with_fewer
 from vvgt_cli.conversion.request import Limits, file_bytes
 from vvgt_cli.conversion.stage import Stage
 from vvgt_cli.conversion.stages import (
@@ -22,10 +21,8 @@ from vvgt_cli.conversion.stages import (
 )
 from vvgt_cli.conversion.stages.views import views_of
 from vvgt_cli.errors import UsageError
+from vvgt_cli.field.case import Case, for_budget, view_edge
 from vvgt_cli.resources import free_memory
-
-if TYPE_CHECKING:
-    from vvgt_cli.dvr import Scene
 
 DEFAULT_STEPS = 112  # of gradient descent: the knee of error against seconds (docs/plan.md)
 MOST_STEPS = 400  # where a target or a time asks for as many as it takes
@@ -224,12 +221,11 @@ def _room(left: float | None) -> str:
     return f"{max(left or 0.0, 0.0):.1f} s are left"
 
 
-def check_memory(plan: Plan, scene: Scene | None = None) -> None:
+def check_memory(plan: Plan) -> None:
     """Refuse what would not fit, rather than have the system end it.
 
     Args:
         plan: of the stages that are left.
-        scene: where the closed form is still to come: fewer Gaussians are tried.
 
     Raises:
         UsageError: with the size or the Gaussians that would fit.
@@ -244,10 +240,10 @@ def check_memory(plan: Plan, scene: Scene | None = None) -> None:
             f"{max(int(size * (free / views) ** 0.5), 1)} would fit, or 'vvgt init', which renders none"
         )
     need = SURE * plan.working_memory
-    if scene is None or need <= free:
+    form, fewer = plan.stages[0], plan.gaussians
+    if not isinstance(form, ClosedFormStage) or need <= free:
         return
-    form, fewer = ClosedFormStage(), plan.gaussians
-    while fewer > 1 and SURE * (form.cost(with_fewer(plan.case, scene, fewer)).memory + views) > free:
+    while fewer > 1 and SURE * (form.cost(for_budget(plan.case, fewer)).memory + views) > free:
         fewer //= 2
     raise UsageError(
         f"{plan.gaussians} Gaussians need about {need / 2**30:.2f} GiB of memory more, {free / 2**30:.2f} GiB are "

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, field
 
 from vvgt_cli.errors import UsageError
+from vvgt_cli.field.settings import BlockOptions
 from vvgt_cli.gaussians import PlyOptions
 from vvgt_cli.runs.outputs import Output
 from vvgt_cli.runs.place import AUTO
@@ -102,6 +103,7 @@ class ConvertRequest:
         preview: PNG to write (reference, ours, difference of a few test views), None for none.
         overwrite: replace files that exist.
         checkpoint: folder that keeps what the stages make, until the output is written; None for none.
+        blocks: how the volume is gone through in blocks; None: it is in memory, or in blocks where that is better.
         all_views: score on all ten test views, by SSIM and FLIP too, as a report has it.
     """
 
@@ -116,6 +118,7 @@ class ConvertRequest:
     overwrite: bool = False
     checkpoint: str | None = None
     all_views: bool = False
+    blocks: BlockOptions | None = None
 
     def budget(self) -> int:
         """Gaussians that fit.

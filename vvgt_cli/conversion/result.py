@@ -16,12 +16,11 @@ from vvgt_cli.gaussians import Gaussians, PlyOptions, write_ply
 from vvgt_cli.runs.place import AUTO, NONE, into_box, preview, upright, way_up
 from vvgt_cli.runs.record import ConversionReport, Stage
 from vvgt_cli.runs.seats import PREVIEW_VIEWS
-from vvgt_cli.runs.source import Source
 from vvgt_cli.share import encoded, format_of
 from vvgt_cli.splat.rules import INRIA, rule_of
 
 if TYPE_CHECKING:
-    from vvgt_cli.dvr import Scene
+    from vvgt_cli.field.field import Field
 
 FROM_THE_SIDE = 4  # test view that pictures show where none is asked for
 
@@ -128,21 +127,18 @@ class Conversion(Result):
     """What became of a volume under a transfer function.
 
     Attributes:
-        source: the volume and the function on its values.
-        scene: the volume as kernels read it.
+        field: the volume under its function, labels, layers and light.
     """
 
-    source: Source
-    scene: Scene
+    field: Field
 
     def normals(self) -> np.ndarray | None:
         """Directions (K, 3) of the mean gradient around each Gaussian, unit frame; None where nothing is lit."""
-        if self.scene.light is None:
+        volume = self.field.source.volume
+        normals = self.field.normals(into_box(self.gaussians, volume))
+        if normals is None:
             return None
-        from vvgt_cli.vbm.lit import mean_normals
-
-        axes = np.linalg.inv(self.source.volume.axes)
-        turned = mean_normals(into_box(self.gaussians, self.source.volume), self.scene) @ axes
+        turned = normals @ np.linalg.inv(volume.axes)
         found: np.ndarray = turned / np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-30)
         return found
 
@@ -157,9 +153,9 @@ class Conversion(Result):
             (h, 3 w, 3) float32 RGB in [0, 1], rows below each other.
         """
         cameras = default_views("test", size=size or self.ply.made_for or SIZE)
-        axes = upright(self.source.volume, self.ply.up)
-        inside = into_box(self.gaussians, self.source.volume)
-        return preview(self.scene, inside, [cameras[n] for n in views], axes, self.ply.rule or INRIA)
+        volume = self.field.source.volume
+        axes, inside = upright(volume, self.ply.up), into_box(self.gaussians, volume)
+        return preview(self.field, inside, [cameras[n] for n in views], axes, self.ply.rule or INRIA)
 
     def _repr_png_(self) -> bytes:
         """What notebooks show."""

@@ -23,11 +23,11 @@ from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import atomic_write, claim, read_text
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.network.card import CARD, find_model
-from vvgt_cli.runs.digests import digest, volume_digest
+from vvgt_cli.runs.digests import digest
 
 if TYPE_CHECKING:
     from vvgt_cli.conversion.request import FitOptions, Limits
-    from vvgt_cli.runs.source import Source
+    from vvgt_cli.field.field import Field
 
 CLOSED_FORM, CELLS, FITTED = "closed-form.npz", "cells.npz", "fitted.npz"
 DESCENT = "refinement.npz"  # of `vvgt_cli.descent.checkpoint`
@@ -121,7 +121,7 @@ def checkpoint_folder(folder: str | None) -> Iterator[None]:
             Path(folder).rmdir()  # refused where something lies in it
 
 
-def checkpoint_of(folder: str | None, source: Source, fit: FitOptions, limits: Limits) -> Checkpoint:
+def checkpoint_of(folder: str | None, field: Field, fit: FitOptions, limits: Limits) -> Checkpoint:
     """The stages of a conversion, under the key of what they depend on.
 
     Raises:
@@ -129,9 +129,10 @@ def checkpoint_of(folder: str | None, source: Source, fit: FitOptions, limits: L
     """
     if folder is None:
         return Checkpoint()
+    source = field.source
     depends = {
         "version": __version__,
-        "volume": volume_digest(source.volume),
+        "volume": field.digest(),
         "function": source.look(),
         "opacity_unit_distance": source.unit_distance,
         "light": None if source.lighting is None else source.lighting.text(),

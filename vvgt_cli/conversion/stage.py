@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
-from vvgt_cli.conversion.case import Case
 from vvgt_cli.conversion.request import FitOptions, Limits
 from vvgt_cli.conversion.resume import Checkpoint
+from vvgt_cli.field.case import Case
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.runs.record import Run
 from vvgt_cli.runs.views import Views
 from vvgt_cli.splat.rules import Rule, rule_of
 
 if TYPE_CHECKING:
-    from vvgt_cli.dvr import Scene
+    from vvgt_cli.field.field import Field, Picture
     from vvgt_cli.vbm import Start
 
 
@@ -32,7 +33,7 @@ class Work:
 
     Attributes:
         run: times stages and tells the console.
-        scene: the volume under the function.
+        field: the volume under its function, labels, layers and light.
         fit, limits: what is asked for.
         degree: of the harmonics that colours have where the light depends on the view.
         checkpoint: where stages keep what they made; `Checkpoint` of no folder for nowhere.
@@ -44,11 +45,11 @@ class Work:
     """
 
     run: Run
-    scene: Scene
+    field: Field
     fit: FitOptions
-    limits: Limits = field(default_factory=Limits)
+    limits: Limits = dataclasses.field(default_factory=Limits)
     degree: int = 0
-    checkpoint: Checkpoint = field(default_factory=Checkpoint)
+    checkpoint: Checkpoint = dataclasses.field(default_factory=Checkpoint)
     ending: float = 0.0
     start: Start | None = None
     gaussians: Gaussians | None = None
@@ -105,6 +106,10 @@ class Stage(ABC):
     @abstractmethod
     def run(self, work: Work) -> None:
         """Do it."""
+
+    def views(self, fit: FitOptions) -> list[Picture]:
+        """Pictures of the volume that it will ask for, as far as they are known before there are Gaussians."""
+        return []
 
     def label(self) -> str:
         """The name with what the plan chose, for `--dry-run`."""

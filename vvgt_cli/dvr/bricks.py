@@ -55,7 +55,7 @@ def empty_distance(ranges: np.ndarray, tables: OpticalTables) -> np.ndarray:
     distance = np.full(active.shape, MAX_DISTANCE, np.uint8)
     distance[active] = 0
     for d in range(1, MAX_DISTANCE):
-        grown = _dilate(active)
+        grown = dilate(active)
         if grown.sum() == active.sum():
             break
         distance[grown & ~active] = d
@@ -63,7 +63,7 @@ def empty_distance(ranges: np.ndarray, tables: OpticalTables) -> np.ndarray:
     return distance
 
 
-def _dilate(mask: np.ndarray) -> np.ndarray:
+def dilate(mask: np.ndarray) -> np.ndarray:
     """Chebyshev dilation by one cell."""
     out = mask
     for axis in range(3):

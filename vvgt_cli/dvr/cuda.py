@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.cameras import Camera
-from vvgt_cli.dvr.render import RenderSettings, cast_tiers
+from vvgt_cli.dvr.render import RenderSettings, tiers
 from vvgt_cli.dvr.scene import Scene
 from vvgt_cli.errors import DataError, UsageError
 
@@ -38,11 +38,10 @@ def view_renderer(scene: Scene, settings: RenderSettings, device: str = "cuda") 
     def draw(camera: Camera) -> np.ndarray:
         image = np.zeros((camera.height, camera.width, 4), np.float32)
 
-        def cast(offsets: np.ndarray, mask: np.ndarray, known: int) -> None:
-            new = field.pixels(camera, np.array(np.nonzero(mask)), offsets, settings.step)
-            image[mask] = (known * image[mask] + len(offsets) * new) / (known + len(offsets))
-
-        cast_tiers(settings, image, cast)
+        for rays in tiers(settings, image):
+            for offsets, mask, known in rays:
+                new = field.pixels(camera, np.array(np.nonzero(mask)), offsets, settings.step)
+                image[mask] = (known * image[mask] + len(offsets) * new) / (known + len(offsets))
         return image
 
     return draw

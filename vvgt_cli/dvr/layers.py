@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import warnings
 from collections.abc import Sequence
@@ -16,8 +17,10 @@ from vvgt_cli.transfer.labels import LabelTable
 from vvgt_cli.transfer.tables import extinction
 from vvgt_cli.volume import Volume
 from vvgt_cli.volume.blocks import check_memory
+from vvgt_cli.volume.stored import read_block
 
 SAME = 1e-3  # voxels up to which two grids are one
+SLAB = 16  # slices that are laid out at once
 MOST_FINER = 8  # times along an axis that a layer's voxels may refine the first volume's
 VOXEL_BYTES = 20  # of a scene: four float32, and extinction once more
 
@@ -73,19 +76,22 @@ class Layer:
         stored = bits.astype(np.float64) if kind.kind == "b" else bits.view(kind).astype(np.float64)
         return self.classify(self.volume.slope * stored + self.volume.intercept)
 
-    def slab(self, z: int) -> np.ndarray:
-        """The optics of slice ``z`` of its own grid, (ny, nx, 4) float32."""
-        volume, stored = self.volume, self.volume.data[z]
+    def box(self, lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
+        """The optics of voxels ``lo`` to ``hi`` (3,) of its own grid, x first: (z, y, x, 4) float32."""
+        volume, stored = self.volume, read_block(self.volume, lo, hi)
         if self._table is not None:
-            native = np.ascontiguousarray(stored, stored.dtype.newbyteorder("="))
-            out: np.ndarray = self._table[native.view(f"u{native.dtype.itemsize}")]
+            out: np.ndarray = self._table[stored.view(f"u{stored.dtype.itemsize}")]
         else:
             out = self.classify(volume.slope * stored.astype(np.float64) + volume.intercept)
-        if self.colors is not None:
-            for c, band in enumerate(self.colors):
-                value = (band.slope * band.data[z].astype(np.float64) + band.intercept) / self.white
-                out[..., c] *= np.clip(np.nan_to_num(value), 0, 1)
+        for c, band in enumerate(self.colors or ()):
+            value = (band.slope * read_block(band, lo, hi).astype(np.float64) + band.intercept) / self.white
+            out[..., c] *= np.clip(np.nan_to_num(value), 0, 1)
         return out
+
+    @property
+    def largest(self) -> float:
+        """No extinction of it per world length is above this."""
+        return float(extinction(np.array(1.0), self.unit_distance))
 
 
 def same_grid(a: Volume, b: Volume) -> bool:
@@ -95,8 +101,10 @@ def same_grid(a: Volume, b: Volume) -> bool:
     return a.dims == b.dims and bool(np.abs(off).max() <= SAME * min(a.spacing))
 
 
-def common_grid(layers: Sequence[Layer]) -> Volume:
+def common_grid(layers: Sequence[Layer], stored: bool = False) -> Volume:
     """The grid that layers add up on: the first one's box, in the finest voxels along each of its axes; no values.
+
+    Where layers are ``stored`` it is never there as a whole.
 
     Raises:
         DataError: a layer that does not meet the first, or more voxels than there is memory for.
@@ -121,7 +129,8 @@ def common_grid(layers: Sequence[Layer]) -> Volume:
         return first
     shape = tuple(int(n * f) for n, f in zip(first.data.shape, finer[::-1], strict=True))
     spacing = tuple(float(s / f) for s, f in zip(first.spacing, finer, strict=True))
-    check_memory(VOXEL_BYTES * math.prod(shape), first.name)
+    if not stored:
+        check_memory(VOXEL_BYTES * math.prod(shape), first.name)
     origin = tuple((first.affine @ [*((1 / finer - 1) / 2), 1.0])[:3].tolist())
     empty = np.broadcast_to(np.uint8(0), shape)
     return replace(first, data=empty, spacing=spacing, origin=origin, slope=1.0, intercept=0.0)  # type: ignore[arg-type]
@@ -143,23 +152,44 @@ def _check_meeting(first: Volume, other: Volume, inner: np.ndarray) -> None:
 
 def grid_of(layers: Sequence[Layer], target: Volume) -> np.ndarray:
     """What layers add up to on the grid of ``target``: (nz, ny, nx, 4) float32 per world length."""
-    from vvgt_cli.dvr.place import place
-    from vvgt_cli.dvr.scene import kernel_values
+    nx, ny, nz = target.dims
+    out = np.zeros((nz, ny, nx, 4), np.float32)
+    for z in range(0, nz, SLAB):
+        end = min(z + SLAB, nz)
+        out[z:end] = grid_box(layers, target, np.array([0, 0, z]), np.array([nx, ny, end]))
+    return out
 
-    out = np.zeros((*target.data.shape, 4), np.float32)
+
+def grid_box(layers: Sequence[Layer], target: Volume, lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
+    """`grid_of` for voxels ``lo`` to ``hi`` (3,) of it, x first: the same values whatever the box."""
+    out = np.zeros((*(hi - lo)[::-1], 4), np.float32)
     for layer in layers:
         if same_grid(layer.volume, target):
-            for z in range(len(out)):
-                out[z] += layer.slab(z)
-            continue
-        matrix = np.ascontiguousarray((np.linalg.inv(layer.volume.affine) @ target.affine)[:3])
-        if not layer.interpolated:
-            own = np.stack([layer.slab(z) for z in range(len(layer.volume.data))])
-            place(own, matrix, 0.0, out)
-            continue
-        values, slope, intercept = kernel_values(layer.volume)
-        scalars = np.zeros((*target.data.shape, 1), np.float32)
-        place(np.array(values[..., None], np.float32), matrix, np.nan, scalars)
-        for z in range(len(out)):
-            out[z] += layer.classify(slope * scalars[z, ..., 0].astype(np.float64) + intercept)
+            out += layer.box(lo, hi)
+        else:
+            _placed(layer, target, lo, hi, out)
     return out
+
+
+def _placed(layer: Layer, target: Volume, lo: np.ndarray, hi: np.ndarray, out: np.ndarray) -> None:
+    """Add the part of a layer on another grid; of it what the box meets is read, with a voxel around."""
+    from vvgt_cli.dvr.place import place
+
+    matrix = np.ascontiguousarray((np.linalg.inv(layer.volume.affine) @ target.affine)[:3])
+    corners = np.array(list(itertools.product(*zip(lo, hi - 1, strict=True))), np.float64)
+    met, dims = corners @ matrix[:, :3].T + matrix[:, 3], np.array(layer.volume.dims)
+    first = np.clip(np.floor(met.min(axis=0)).astype(np.int64) - 1, 0, dims)
+    last = np.clip(np.ceil(met.max(axis=0)).astype(np.int64) + 2, 0, dims)
+    if (last <= first).any():
+        return
+    about = lo.astype(np.int64), first.astype(np.int64), dims.astype(np.int64)
+    if not layer.interpolated:
+        colors = np.zeros(out.shape)
+        place(layer.box(first, last).astype(np.float64), matrix, *about, 0.0, colors)
+        out += colors.astype(np.float32)
+        return
+    volume = layer.volume
+    values = volume.slope * read_block(volume, first, last).astype(np.float64) + volume.intercept
+    scalars = np.zeros((*out.shape[:3], 1), np.float64)
+    place(values[..., None], matrix, *about, np.nan, scalars)
+    out += layer.classify(scalars[..., 0])

@@ -101,6 +101,7 @@ class Light(NamedTuple):
         shadows, occlusion: 1 where ``shade`` has them, else 0.
         inv_cell: cells of ``shade`` a voxel.
         edge: (3,) float64 voxel edges, unit-frame lengths, (x, y, z).
+        origin: (3,) float64 voxel that ``shade`` is relative to: the first of a block, zeros for a whole volume.
     """
 
     ambient: float
@@ -114,10 +115,11 @@ class Light(NamedTuple):
     occlusion: int
     inv_cell: float
     edge: np.ndarray
+    origin: np.ndarray
 
 
 # Types of the fields, for `jit.decorators.kernel`.
 TUPLES: dict[type, str] = {Voxels: "V", Optics: "f8 f8 f8:2 f8:2 f8:1"}
-LIT: dict[type, str] = {**TUPLES, Light: "f8 f8 f8 f8 i8 f8:2 f4:4 i8 i8 f8 f8:1"}
+LIT: dict[type, str] = {**TUPLES, Light: "f8 f8 f8 f8 i8 f8:2 f4:4 i8 i8 f8 f8:1 f8:1"}
 GRID: dict[type, str] = {Texels: "f4:4"}
 LIT_GRID: dict[type, str] = {**LIT, **GRID}

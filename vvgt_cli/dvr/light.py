@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
-from vvgt_cli.dvr.layout import BRICK, Light
+from vvgt_cli.dvr.layout import Light, Optics, Voxels
 from vvgt_cli.transfer.lighting import Lighting
-
-if TYPE_CHECKING:
-    from vvgt_cli.dvr.scene import Scene
+from vvgt_cli.transfer.tables import OpticalTables
 
 MAX_CELLS = 1 << 21  # of a grid: 128^3; more cost more time than they show
 ANGLE = 3.0  # degrees: radius of a light as it is seen; six times the sun's
@@ -22,55 +22,124 @@ STEP = 1.0  # voxels
 FAR = 1e300
 
 
-def lights_of(scene: Scene, lighting: Lighting, max_cells: int = MAX_CELLS) -> Light:
-    """What falls on a scene.
+def lights_of(
+    lighting: Lighting,
+    axes: np.ndarray,
+    step: np.ndarray,
+    shape: Sequence[int],
+    extinction: Callable[[int], np.ndarray],
+) -> Light:
+    """What falls on a volume.
 
     Args:
-        scene: without light.
         lighting: in world axes; a direction is taken through the volume's axes.
-        max_cells: of each grid of shadows and occlusion: cubes of 1, 2, 4, ... voxels, as fine as that allows.
+        axes: (3, 3) of the volume, as `Volume.axes`.
+        step: (3,) voxel edges, unit-frame lengths, (x, y, z).
+        shape: voxels (z, y, x).
+        extinction: mean extinction (cz, cy, cx) float32 of cubes of so many voxels; asked for where there are shadows
+            or occlusion, which are marched through it.
     """
-    inward = np.linalg.inv(scene.volume.axes)
+    from vvgt_cli.dvr.bricks import dilate
+
+    inward = np.linalg.inv(axes)
     directions = np.array([_unit(inward @ np.array(d)) for d in lighting.directions]).reshape(-1, 3)
-    cell = 1
-    while math.prod(-(-n // cell) for n in scene.values.shape) > max_cells:
-        cell *= 2
-    grids = []
-    if lighting.shadows:
-        grids += [transmittance(scene, cone(d, ANGLE, RAYS), cell) for d in directions]
-    if lighting.occlusion is not None:
-        around = transmittance(scene, sphere(AROUND), cell, lighting.occlusion)
-        grids.append(np.minimum(2 * around, 1))  # a plane is open
-    shade = np.stack(grids) if grids else np.ones((1, 1, 1, 1), np.float32)
+    cell, shade = shade_cell(shape), np.ones((1, 1, 1, 1), np.float32)
+    if lighting.attenuated:
+        found, grids = extinction(cell), []
+        matter, wanted = Matter.of(found, step * cell), dilate(found > 0)  # where there is nothing, nothing is lit
+        if lighting.shadows:
+            grids += [transmittance(matter, cone(d, ANGLE, RAYS), 1, wanted=wanted) for d in directions]
+        if lighting.occlusion is not None:
+            around = transmittance(matter, sphere(AROUND), 1, lighting.occlusion, wanted=wanted)
+            grids.append(np.minimum(2 * around, 1))  # a plane is open
+        shade = np.stack(grids)
     return Light(
         float(lighting.ambient), float(lighting.diffuse), float(lighting.specular), float(lighting.specular_power),
         int(lighting.headlight),
         np.ascontiguousarray(directions), shade, int(lighting.shadows), int(lighting.occlusion is not None),
-        1.0 / cell, np.ascontiguousarray(scene.step, np.float64),
+        1.0 / cell, np.ascontiguousarray(step, np.float64), np.zeros(3),
     )  # fmt: skip
 
 
+def shade_cell(shape: Sequence[int]) -> int:
+    """Voxels along the edge of a cell of the grids of shadows and occlusion: 1, 2, 4, ..., for `MAX_CELLS` at most."""
+    cell = 1
+    while math.prod(-(-n // cell) for n in shape) > MAX_CELLS:
+        cell *= 2
+    return cell
+
+
+def mean_extinction(scene: Absorbing, cell: int) -> np.ndarray:
+    """Mean extinction per unit-frame length of the voxels of each cube of ``cell`` of them, (cz, cy, cx) float32."""
+    from vvgt_cli.dvr.shadows import cell_extinction
+
+    out = np.empty(tuple(-(-n // cell) for n in scene.voxels.values.shape), np.float32)
+    cell_extinction(scene.voxels, scene.optics, scene.empty, cell, out)
+    return out
+
+
+class Absorbing(Protocol):
+    """What rays are attenuated in, as kernels take it, and its voxels' edges (3,) in the unit frame."""
+
+    @property
+    def voxels(self) -> Voxels: ...
+    @property
+    def optics(self) -> Optics: ...
+    @property
+    def empty(self) -> np.ndarray: ...
+    @property
+    def step(self) -> np.ndarray: ...
+
+
+@dataclass(frozen=True)
+class Matter:
+    """A grid of extinction, as `Absorbing` has it."""
+
+    voxels: Voxels
+    optics: Optics
+    empty: np.ndarray
+    step: np.ndarray
+
+    @classmethod
+    def of(cls, extinction: np.ndarray, step: np.ndarray) -> Matter:
+        """Of (nz, ny, nx) float32 per unit-frame length; ``step`` (3,) edges of its cells, unit frame."""
+        from vvgt_cli.dvr.bricks import brick_ranges, empty_distance
+
+        extinction.flags.writeable = False  # as volumes' values are: kernels are compiled for such
+        tables = linear_tables(float(extinction.max()))
+        optics = Optics(tables.lo, tables.inv_width, tables.nodes, tables.cumulative, tables.dark)
+        return cls(Voxels(extinction), optics, empty_distance(brick_ranges(extinction), tables), step)
+
+
+def linear_tables(top: float) -> OpticalTables:
+    """Optics of values from 0 to ``top`` that are extinction themselves, black."""
+    nodes = np.array([[0.0, 0, 0, 0], [0, 0, 0, top or 1.0]])
+    return OpticalTables(0.0, 1 / (top or 1.0), nodes, np.cumsum(nodes / 2, axis=0))
+
+
 def transmittance(
-    scene: Scene, directions: np.ndarray, cell: int, reach: float = FAR, step: float = STEP, offset: float | None = None
-) -> np.ndarray:
+    matter: Absorbing, directions: np.ndarray, cell: int, reach: float = FAR, step: float = STEP,
+    offset: float | None = None, wanted: np.ndarray | None = None,
+) -> np.ndarray:  # fmt: skip
     """Mean transmittance from the centres of cells along ``directions``, (cz, cy, cx) float32 in [0, 1].
 
     Args:
-        scene: what lies before the lights.
+        matter: what lies before the lights.
         directions: (n, 3) unit vectors, box frame.
-        cell: edge of a cell in voxels; cells that touch nothing visible have 1.
+        cell: edge of a cell in voxels.
         reach: unit-frame length beyond which nothing counts.
         step: of the march, in voxels.
         offset: voxels along each direction from where on matter counts; None: `OFFSET` cells.
+        wanted: (cz, cy, cx) bool: others have 1; None: all.
     """
     from vvgt_cli.dvr.shadows import mean_transmittance
 
-    out = np.empty(tuple(-(-n // cell) for n in scene.values.shape), np.float32)
+    out = np.empty(tuple(-(-n // cell) for n in matter.voxels.values.shape), np.float32)
     first = OFFSET * cell if offset is None else offset
-    near = 1 + cell // BRICK
     mean_transmittance(
-        scene.voxels, scene.optics, scene.empty, np.ascontiguousarray(directions / scene.step), near, float(cell),
-        float(first), float(reach), float(step), out,
+        matter.voxels, matter.optics, matter.empty, np.ascontiguousarray(directions / matter.step),
+        np.ones(out.shape, bool) if wanted is None else wanted, float(cell), float(first), float(reach), float(step),
+        out,
     )  # fmt: skip
     return out
 

@@ -9,21 +9,26 @@ from vvgt_cli.dvr.kernel import FLAGS
 from vvgt_cli.jit.decorators import kernel
 
 
-@kernel("f4:4 f8:2 f8 f4:4", parallel=True, fastmath=FLAGS, error_model="numpy")
-def place(values: np.ndarray, matrix: np.ndarray, outside: float, out: np.ndarray) -> None:
-    """Add samples of ``values`` (nz, ny, nx, c) float32 to ``out`` (mz, my, mx, c).
+@kernel("f8:4 f8:2 i8:1 i8:1 i8:1 f8 f8:4", parallel=True, fastmath=FLAGS, error_model="numpy")
+def place(
+    values: np.ndarray, matrix: np.ndarray, lo: np.ndarray, first: np.ndarray, dims: np.ndarray, outside: float,
+    out: np.ndarray,
+) -> None:  # fmt: skip
+    """Add samples of ``values`` (z, y, x, c), a part of a layer, to ``out`` (mz, my, mx, c), a part of the target.
 
-    ``matrix`` (3, 4) float64 leads from voxel indices (x, y, z, 1) of ``out`` to those of ``values``; beyond its box
+    ``matrix`` (3, 4) float64 leads from voxel indices (x, y, z, 1) of the target to those of the layer, of ``dims``
+    voxels; ``lo`` and ``first`` (3,) are where ``out`` and ``values`` begin, (x, y, z). Beyond the layer's box
     ``outside`` is added, in the rim of half a voxel the edge's.
     """
-    nz, ny, nx, channels = values.shape
+    nx, ny, nz, channels = dims[0], dims[1], dims[2], values.shape[3]
     mz, my, mx, _ = out.shape
     for k in nb.prange(mz):
         for j in range(my):
             for i in range(mx):
-                x = matrix[0, 0] * i + matrix[0, 1] * j + matrix[0, 2] * k + matrix[0, 3]
-                y = matrix[1, 0] * i + matrix[1, 1] * j + matrix[1, 2] * k + matrix[1, 3]
-                z = matrix[2, 0] * i + matrix[2, 1] * j + matrix[2, 2] * k + matrix[2, 3]
+                u, v, w = i + lo[0], j + lo[1], k + lo[2]
+                x = matrix[0, 0] * u + matrix[0, 1] * v + matrix[0, 2] * w + matrix[0, 3]
+                y = matrix[1, 0] * u + matrix[1, 1] * v + matrix[1, 2] * w + matrix[1, 3]
+                z = matrix[2, 0] * u + matrix[2, 1] * v + matrix[2, 2] * w + matrix[2, 3]
                 inside = -0.5 <= x <= nx - 0.5 and -0.5 <= y <= ny - 0.5 and -0.5 <= z <= nz - 0.5
                 if not inside:
                     for c in range(channels):
@@ -33,6 +38,8 @@ def place(values: np.ndarray, matrix: np.ndarray, outside: float, out: np.ndarra
                 i0, j0, k0 = int(x), int(y), int(z)
                 i1, j1, k1 = min(i0 + 1, nx - 1), min(j0 + 1, ny - 1), min(k0 + 1, nz - 1)
                 fx, fy, fz = x - i0, y - j0, z - k0
+                i0, i1, j0, j1 = i0 - first[0], i1 - first[0], j0 - first[1], j1 - first[1]
+                k0, k1 = k0 - first[2], k1 - first[2]
                 for c in range(channels):
                     c00 = values[k0, j0, i0, c] * (1 - fx) + values[k0, j0, i1, c] * fx
                     c01 = values[k0, j1, i0, c] * (1 - fx) + values[k0, j1, i1, c] * fx

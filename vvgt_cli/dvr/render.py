@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -76,6 +76,13 @@ class Placed(Protocol):
     def step(self) -> np.ndarray: ...
 
 
+class Box(NamedTuple):
+    """A volume's half extents and voxel edges (3,), as `Placed` has them."""
+
+    half: np.ndarray
+    step: np.ndarray
+
+
 def camera_arrays(scene: Placed, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Eye (3,) in voxel coordinates, basis (3, 3) in voxels per unit length, lens (1/fx, 1/fy, cx, cy)."""
     eye = (camera.position + scene.half) / scene.step - 0.5
@@ -95,34 +102,39 @@ def tile_order(height: int, width: int, blocks: Blocks | None = None) -> np.ndar
     return np.concatenate([tiles[first::threads] for first in range(threads)])
 
 
-def cast_tiers(
-    settings: RenderSettings,
-    image: np.ndarray,
-    cast: Callable[[np.ndarray, np.ndarray, int], None],
-    blocks: Blocks | None = None,
-) -> None:
-    """Fill ``image`` (h, w, 4) by ``cast(offsets, mask, known)``: rays at ``offsets`` in the pixels of ``mask``,
-    averaged with the ``known`` ones that the image holds. With ``blocks`` only those."""
+class Rays(NamedTuple):
+    """Rays to cast: at ``offsets`` (m, 2) of every pixel in ``mask`` (h, w), averaged with ``known`` ones before."""
+
+    offsets: np.ndarray
+    mask: np.ndarray
+    known: int
+
+
+def tiers(settings: RenderSettings, image: np.ndarray, blocks: Blocks | None = None) -> Iterator[list[Rays]]:
+    """What fills ``image`` (h, w, 4), or its ``blocks``: rays to be cast into it before the next are asked for."""
     from vvgt_cli.dvr.contrast import contrast
 
     everywhere = np.ones(image.shape[:2], bool) if blocks is None else blocks.mask()
     if settings.samples is not None:
-        cast(ray_offsets(settings.samples**2) * settings.footprint, everywhere, 0)
+        yield [Rays(ray_offsets(settings.samples**2) * settings.footprint, everywhere, 0)]
         return
-    cast(np.zeros((1, 2)), everywhere, 0)
+    yield [Rays(np.zeros((1, 2)), everywhere, 0)]
     differ = contrast(image, everywhere)
-    ends = [threshold for threshold, _ in settings.tiers[1:]]
+    ends, more = [threshold for threshold, _ in settings.tiers[1:]], []
     for (low, count), high in zip(settings.tiers, [*ends, np.inf], strict=True):
         mask = (differ > low) & (differ <= high)
         if mask.any():
             offsets = ray_offsets(count) * settings.footprint
             new = np.any(offsets != 0, axis=1)  # a grid of an even edge has no ray in the middle
-            cast(offsets[new], mask, int(not new.all()))
+            more.append(Rays(offsets[new], mask, int(not new.all())))
+    yield more
 
 
-def _thinner_than_a_pixel(scene: Scene, camera: Camera) -> bool:
-    """Whether all of the box may lie between the middles of two rows or columns of pixels."""
-    return bool(2 * scene.half.min() * camera.fx < np.linalg.norm(camera.position))
+def for_thin(settings: RenderSettings, box: Placed, camera: Camera) -> RenderSettings:
+    """Many rays for every pixel, where all of the box may lie between the middles of two rows or columns of them."""
+    if 2 * box.half.min() * camera.fx >= np.linalg.norm(camera.position):
+        return settings
+    return replace(settings, tiers=((-1.0, settings.tiers[-1][1]),))  # a first ray a pixel may show nothing
 
 
 def _rays(scene: Scene) -> Callable[..., None]:
@@ -142,27 +154,31 @@ def _rays(scene: Scene) -> Callable[..., None]:
     return partial(grid.render_lit_grid_tiles, scene.texels, scene.voxels, scene.empty, scene.light)
 
 
+class Viewed(Protocol):
+    """What draws its own pictures, as a volume does of which only blocks are in memory."""
+
+    def view(self, camera: Camera, settings: RenderSettings, blocks: Blocks | None = None) -> np.ndarray: ...
+
+
 def render_view(
-    scene: Scene, camera: Camera, settings: RenderSettings | None = None, blocks: Blocks | None = None
+    scene: Scene | Viewed, camera: Camera, settings: RenderSettings | None = None, blocks: Blocks | None = None
 ) -> np.ndarray:
     """One view: (height, width, 4) float32, premultiplied RGBA over nothing; with ``blocks`` zero elsewhere."""
     settings = settings or RenderSettings()
-    if _thinner_than_a_pixel(scene, camera):
-        settings = replace(settings, tiers=((-1.0, settings.tiers[-1][1]),))  # a first ray a pixel may show nothing
+    if not isinstance(scene, Scene):
+        return scene.view(camera, settings, blocks)
     draw = _rays(scene)
     eye, basis, lens = camera_arrays(scene, camera)
     out = np.zeros((camera.height, camera.width, 4), np.float32)
     order = tile_order(camera.height, camera.width, blocks)
-
-    def cast(offsets: np.ndarray, mask: np.ndarray, known: int) -> None:
-        draw(eye, basis, lens, float(settings.step), order, offsets, mask, known, out)
-
-    cast_tiers(settings, out, cast, blocks)
+    for rays in tiers(for_thin(settings, scene, camera), out, blocks):
+        for offsets, mask, known in rays:
+            draw(eye, basis, lens, float(settings.step), order, offsets, mask, known, out)
     return out
 
 
 def render_views(
-    scene: Scene,
+    scene: Scene | Viewed,
     cameras: Sequence[Camera],
     settings: RenderSettings | None = None,
     progress: Callable[[int, int], None] | None = None,

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vvgt_cli.dvr.layout import Light, Optics, Texels, Voxels, pairs_fit
+from vvgt_cli.dvr.light import lights_of, linear_tables, mean_extinction
 from vvgt_cli.transfer.lighting import Lighting
 from vvgt_cli.transfer.tables import OpticalTables, build_tables
 from vvgt_cli.transfer.types import Named, TransferFunctionLike
@@ -133,9 +134,7 @@ class Scene:
         frame = volume.unit_frame()
         grid *= np.float32(1 / frame.scale)
         values = _read_only(grid[..., 3], grid.dtype)
-        top = float(values.max()) or 1.0
-        nodes = np.array([[0.0, 0, 0, 0], [0, 0, 0, top]])
-        tables = OpticalTables(0.0, 1 / top, nodes, np.cumsum(nodes / 2, axis=0))
+        tables = linear_tables(float(values.max()))
         empty = bricks.empty_distance(bricks.brick_ranges(values), tables)
         half, step = np.array(frame.half), np.array(frame.step)
         scene = cls(volume, tf, unit_distance, values, tables, empty, half, step, grid=grid, labels=labels)
@@ -143,9 +142,10 @@ class Scene:
 
     def lit(self, lighting: Lighting) -> Scene:
         """The same scene under light; shadows and occlusion are marched here."""
-        from vvgt_cli.dvr.light import lights_of
-
-        return replace(self, lighting=lighting, light=lights_of(self, lighting))
+        light = lights_of(
+            lighting, self.volume.axes, self.step, self.values.shape, lambda cell: mean_extinction(self, cell)
+        )
+        return replace(self, lighting=lighting, light=light)
 
 
 def kernel_values(volume: Volume) -> tuple[np.ndarray, float, float]:

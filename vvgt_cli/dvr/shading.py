@@ -69,9 +69,9 @@ def normal(values: np.ndarray, edge: np.ndarray, x: float, y: float, z: float) -
 def shade_at(light: Light, channel: int, x: float, y: float, z: float) -> float:
     """``light.shade`` of a channel at voxel coordinates, trilinear between the cells' centres."""
     nz, ny, nx = light.shade.shape[1:]
-    x = min(max((x + 0.5) * light.inv_cell - 0.5, 0.0), nx - 1.0)
-    y = min(max((y + 0.5) * light.inv_cell - 0.5, 0.0), ny - 1.0)
-    z = min(max((z + 0.5) * light.inv_cell - 0.5, 0.0), nz - 1.0)
+    x = min(max((x + light.origin[0] + 0.5) * light.inv_cell - 0.5, 0.0), nx - 1.0)
+    y = min(max((y + light.origin[1] + 0.5) * light.inv_cell - 0.5, 0.0), ny - 1.0)
+    z = min(max((z + light.origin[2] + 0.5) * light.inv_cell - 0.5, 0.0), nz - 1.0)
     i, j, k = int(x), int(y), int(z)
     fx, fy, fz = x - i, y - j, z - k
     total = 0.0

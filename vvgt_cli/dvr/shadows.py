@@ -67,13 +67,13 @@ def _transmittance(
     return math.exp(-depth)
 
 
-@kernel("Voxels Optics u1:3 f8:2 i8 f8 f8 f8 f8 f4:3", TUPLES, parallel=True, fastmath=FLAGS, error_model="numpy")
+@kernel("Voxels Optics u1:3 f8:2 b1:3 f8 f8 f8 f8 f4:3", TUPLES, parallel=True, fastmath=FLAGS, error_model="numpy")
 def mean_transmittance(
     voxels: Voxels,
     optics: Optics,
     empty: np.ndarray,
     directions: np.ndarray,
-    near: int,
+    wanted: np.ndarray,
     cell: float,
     first: float,
     last: float,
@@ -82,7 +82,7 @@ def mean_transmittance(
 ) -> None:
     """Mean over ``directions`` (n, 3), voxels a unit-frame length, at the centres of cubes of ``cell`` voxels.
 
-    ``out`` (cz, cy, cx) float32; cells whose centre lies more than ``near`` bricks from all that has extinction get 1.
+    ``out`` (cz, cy, cx) float32; cells that are not ``wanted`` (cz, cy, cx) get 1.
     Rays begin ``first`` voxels from there and end at the unit-frame length ``last``; ``step`` in voxels.
     """
     nz, ny, nx = voxels.values.shape
@@ -92,12 +92,7 @@ def mean_transmittance(
         z, y = min((k + 0.5) * cell, nz - 0.5) - 0.5, min((j + 0.5) * cell, ny - 0.5) - 0.5
         for i in range(cx):
             x = min((i + 0.5) * cell, nx - 0.5) - 0.5
-            at = empty[
-                min(max(int(z), 0), nz - 1) >> BRICK_BITS,
-                min(max(int(y), 0), ny - 1) >> BRICK_BITS,
-                min(max(int(x), 0), nx - 1) >> BRICK_BITS,
-            ]
-            if at > near:
+            if not wanted[k, j, i]:
                 out[k, j, i] = 1.0
                 continue
             total = 0.0
@@ -107,3 +102,25 @@ def mean_transmittance(
                     first, last, step,
                 )  # fmt: skip
             out[k, j, i] = total / directions.shape[0]
+
+
+@kernel("Voxels Optics u1:3 i8 f4:3", TUPLES, parallel=True, fastmath=FLAGS, error_model="numpy")
+def cell_extinction(voxels: Voxels, optics: Optics, empty: np.ndarray, cell: int, out: np.ndarray) -> None:
+    """Mean extinction of the voxels in each cube of ``cell`` of them along an edge, into ``out`` (cz, cy, cx)."""
+    nz, ny, nx = voxels.values.shape
+    cz, cy, cx = out.shape
+    for flat in nb.prange(cz * cy):
+        k, j = flat // cy, flat % cy
+        z0, z1, y0, y1 = k * cell, min((k + 1) * cell, nz), j * cell, min((j + 1) * cell, ny)
+        for i in range(cx):
+            x0, x1, total = i * cell, min((i + 1) * cell, nx), 0.0
+            for z in range(z0, z1):
+                for y in range(y0, y1):
+                    for x in range(x0, x1):
+                        if empty[z >> BRICK_BITS, y >> BRICK_BITS, x >> BRICK_BITS] > 0:
+                            continue
+                        u = table_coordinate(np.float64(voxels.values[z, y, x]), optics)
+                        if u >= 0.0:
+                            n = min(int(u), optics.nodes.shape[0] - 2)
+                            total += optics.nodes[n, 3] + (u - n) * (optics.nodes[n + 1, 3] - optics.nodes[n, 3])
+            out[k, j, i] = total / ((z1 - z0) * (y1 - y0) * (x1 - x0))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 RAYCAST = ("vvgt_cli.dvr.kernel:render_tiles", "vvgt_cli.dvr.bricks:_ranges", "vvgt_cli.dvr.contrast:_contrast")
-LIGHT = ("vvgt_cli.dvr.lit:render_lit_tiles", "vvgt_cli.vbm.lit:_shade", "vvgt_cli.dvr.shadows:mean_transmittance")
+LIGHT = ("vvgt_cli.dvr.lit:render_lit_tiles", "vvgt_cli.vbm.lit:_shade", "vvgt_cli.vbm.lit:point_normals")
+ATTENUATED = ("vvgt_cli.dvr.shadows:mean_transmittance", "vvgt_cli.dvr.shadows:cell_extinction")
 GRID = {
     "vvgt_cli.dvr.kernel:render_tiles": "vvgt_cli.dvr.grid:render_grid_tiles",
     "vvgt_cli.dvr.lit:render_lit_tiles": "vvgt_cli.dvr.grid:render_lit_grid_tiles",
@@ -55,12 +56,13 @@ INIT = (*CLOSED_FORM, "vvgt_cli.dvr.bricks:_ranges")
 MERGE = (*(name for name in CLOSED_FORM if "block_moments" not in name and "compact" not in name), *DRAW)
 COUNT_WHOLE = ("vvgt_cli.volume.count_kernel:count_values",)  # of types of which every number is counted
 COUNT_REAL = ("vvgt_cli.volume.count_kernel:range_values", "vvgt_cli.volume.count_kernel:bin_values")  # of others
-BLOCKS = (
-    *CLOSED_FORM,
-    *DRAW,
-    "vvgt_cli.dvr.segments:cast_segments",
-    "vvgt_cli.vbm.ranges:block_ranges",
-)  # of a volume that is gone through in blocks
+SEGMENTS = {
+    "vvgt_cli.dvr.kernel:render_tiles": "vvgt_cli.dvr.segments:cast_segments",
+    "vvgt_cli.dvr.lit:render_lit_tiles": "vvgt_cli.dvr.segments:cast_lit_segments",
+    "vvgt_cli.dvr.grid:render_grid_tiles": "vvgt_cli.dvr.segments:cast_grid_segments",
+    "vvgt_cli.dvr.grid:render_lit_grid_tiles": "vvgt_cli.dvr.segments:cast_lit_grid_segments",
+}
+RANGES = "vvgt_cli.vbm.ranges:block_ranges"  # of blocks of which not all is read
 CONVERT = (RAYCAST[0], REFINE[0], *CLOSED_FORM, *DRAW, *REFINE[1:], SHARED[0], *RAYCAST[1:], *BACK_PROJECT)
 OPTIMIZE = (*REFINE, *DRAW, "vvgt_cli.vbm.pyramid:principal_axes", *SHARED)
 EVALUATE = (*RAYCAST, *DRAW)
@@ -68,13 +70,15 @@ INFER = (*DRAW, SLOPES[0], "vvgt_cli.splat.backward:standard", *BACK_PROJECT)
 ALL = (
     *CONVERT,
     *LIGHT,
+    *ATTENUATED,
     *GRID.values(),
     "vvgt_cli.dvr.place:place",
     "vvgt_cli.splat.backward:standard",
     *HARMONICS,
     *STEPPED,
     *DEPOSITS,
-    *BLOCKS[-2:],
+    *SEGMENTS.values(),
+    RANGES,
     *COUNT_WHOLE,
     *COUNT_REAL,
     "vvgt_cli.volume.slc_kernel:decode_plane",
@@ -84,8 +88,8 @@ ALL = (
 def for_light(names: tuple[str, ...], attenuated: bool) -> tuple[str, ...]:
     """Kernels of a command whose scene is lit, ``attenuated`` by shadows or occlusion: others follow the rays."""
     rays = tuple(LIGHT[0] if name == RAYCAST[0] else name for name in names)
-    shaded = LIGHT[1:2] if CLOSED_FORM[0] in names else ()
-    return (*rays, *shaded, *(LIGHT[2:] if attenuated else ()))
+    shaded = LIGHT[1:] if CLOSED_FORM[0] in names else ()
+    return (*rays, *shaded, *(ATTENUATED if attenuated else ()))
 
 
 def for_degree(names: tuple[str, ...], degree: int) -> tuple[str, ...]:
@@ -99,3 +103,8 @@ def for_degree(names: tuple[str, ...], degree: int) -> tuple[str, ...]:
 def for_grid(names: tuple[str, ...]) -> tuple[str, ...]:
     """Kernels of a command whose scene is an optics grid."""
     return tuple(GRID.get(name, name) for name in names)
+
+
+def for_blocks(names: tuple[str, ...]) -> tuple[str, ...]:
+    """Kernels of a command whose volume is gone through in blocks."""
+    return (*(SEGMENTS.get(name, name) for name in names), RANGES)

@@ -6,7 +6,8 @@ import re
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from functools import cached_property
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -28,6 +29,7 @@ from vvgt_cli.transfer.label_files import holds_table, read_labels, segments_of
 from vvgt_cli.transfer.labels import LabelTable, distinct
 from vvgt_cli.volume import ReadOptions, Statistics, Volume, statistics
 from vvgt_cli.volume.label_maps import labels_in, recognised
+from vvgt_cli.volume.stored import Stored, chunks_of, read_block
 
 AUTO, NONE = "auto", "none"
 COLOR, ALL = "color", "all"  # of --component
@@ -91,6 +93,7 @@ class Content:
         path: of the file, None where it is in memory.
         overlapping: they are the layers of a segmentation whose segments overlap.
         layer: number of the one component that was asked for, None where none was.
+        stored: values stay where they are: what is made of them is made block by block.
     """
 
     volumes: tuple[Volume, ...]
@@ -99,19 +102,51 @@ class Content:
     path: str | None = None
     overlapping: bool = False
     layer: int | None = None
+    stored: bool = False
 
     @property
     def one_field(self) -> bool:
         """Whether it is scalars or labels alone."""
         return not self.color and len(self.volumes) == 1
 
-    @property
+    @cached_property
     def classified(self) -> tuple[Volume, ...]:
         """What functions are of: opacity or luminance of colours, else the volumes themselves."""
         if not self.color:
             return self.volumes
-        source = self.volumes[3] if len(self.volumes) > 3 else _luminance(*self.volumes[:3])
+        source = self.volumes[3] if len(self.volumes) > 3 else _luminance(self.stored, *self.volumes[:3])
         return (replace(source, name=self.volumes[0].name),)
+
+
+class Access(Protocol):
+    """How volumes are opened, and what their values are: in memory, or block by block."""
+
+    def open(self, source: str | Volume, read: ReadOptions) -> Content:
+        """A file, or a volume that is there already."""
+
+    def statistics(self, volume: Volume) -> Statistics: ...
+
+    def labels(self, volume: Volume) -> list[int]:
+        """Those that it holds, ascending."""
+
+
+class InMemory:
+    """`Access` to volumes that are read as a whole."""
+
+    def open(self, source: str | Volume, read: ReadOptions) -> Content:
+        """See `open_parts`."""
+        return open_parts(source, read) if isinstance(source, str) else Content((source,))
+
+    def statistics(self, volume: Volume) -> Statistics:
+        """See `vvgt_cli.volume.statistics`."""
+        return statistics(volume)
+
+    def labels(self, volume: Volume) -> list[int]:
+        """See `labels_in`."""
+        return labels_in(volume)
+
+
+IN_MEMORY = InMemory()
 
 
 def open_parts(source: str, read: ReadOptions) -> Content:
@@ -133,20 +168,27 @@ def open_parts(source: str, read: ReadOptions) -> Content:
             ) from None
         parts = tuple(open_volume(source, replace(read, component=k)) for k in range(error.count))
         if asked == COLOR or (error.color and not asked and not overlapping):
-            return Content(parts, True)
+            return Content(parts, True, stored=read.stored)
         colors = error.colors or [None] * error.count
         named = tuple(replace(v, name=f"{v.name} {k}") for k, v in enumerate(parts))
-        return Content(named, colors=colors, path=source, overlapping=overlapping)
+        return Content(named, colors=colors, path=source, overlapping=overlapping, stored=read.stored)
     if asked:
         raise UsageError(f"{source}: one component; leave out --component {asked}")
-    return Content((volume,), path=source, layer=read.component if isinstance(read.component, int) else None)
+    layer = read.component if isinstance(read.component, int) else None
+    return Content((volume,), path=source, layer=layer, stored=read.stored)
 
 
-def is_plain(opened: Content, tf: object, labels: str | LabelTable | None, layers: Sequence[LayerRequest]) -> bool:
+def is_plain(
+    opened: Content, tf: object, labels: str | LabelTable | None, layers: Sequence[LayerRequest], access: Access
+) -> bool:
     """Whether it is one scalar field under a function; a label map that is recognised is not."""
     if not opened.one_field or layers or labels not in (None, NONE):
         return False
-    return tf is not None or labels == NONE or not (holds_table(opened.path) or recognised(opened.volumes[0]))
+    return (
+        tf is not None
+        or labels == NONE
+        or not (holds_table(opened.path) or recognised(opened.volumes[0], access.labels))
+    )
 
 
 def layers_of(
@@ -156,6 +198,7 @@ def layers_of(
     tf_range: str | tuple[float, float] = "data",
     distance: str | None = None,
     whole: Sequence[Statistics] = (),
+    access: Access = IN_MEMORY,
 ) -> list[Layer]:
     """The layers that a file's content makes.
 
@@ -165,24 +208,25 @@ def layers_of(
         labels: table of labels, its file, ``auto``, ``none`` or None.
         tf_range, distance: of functions.
         whole: statistics of `Content.classified` over a whole series; none: the volumes' own.
+        access: to the values.
 
     Raises:
         DataError: labels that do not fit the table, nothing that is visible.
         UsageError: a table and a function at once.
     """
-    labels = _asked(opened, tf, labels)
+    labels = _asked(opened, tf, labels, access)
     if labels not in (None, NONE):
         own = labels == AUTO and holds_table(opened.path)
         if opened.overlapping:
-            return _overlapping(opened, labels, own, distance)
+            return _overlapping(opened, labels, own, distance, access)
         if own and opened.layer is not None:
             labels = segments_of(str(opened.path), opened.layer)
         elif own:
             labels = opened.path
-        return [_labelled(opened.volumes[0], labels, distance)]
+        return [_labelled(opened.volumes[0], labels, distance, access)]
     function = read_transfer_function(tf) if isinstance(tf, str) else tf
     sources = opened.classified
-    numbers = whole or [statistics(volume) for volume in sources]
+    numbers = whole or [access.statistics(volume) for volume in sources]
     shown = functions_of(opened, numbers, function, tf_range)
     colors = (opened.volumes[0], opened.volumes[1], opened.volumes[2]) if opened.color else None
     layers = []
@@ -195,7 +239,7 @@ def layers_of(
 
 
 def _asked(
-    opened: Content, tf: str | TransferFunction | None, labels: str | LabelTable | None
+    opened: Content, tf: str | TransferFunction | None, labels: str | LabelTable | None, access: Access
 ) -> str | LabelTable | None:
     """The labels asked for, ``auto`` where the content is recognised; see `layers_of`."""
     volume = opened.volumes[0]
@@ -212,7 +256,7 @@ def _asked(
         raise UsageError(f"{volume.name}: both a function and a table of labels; expected one of --tf and --labels")
     if labels is None and tf is None and opened.one_field:
         own = holds_table(opened.path)
-        if own or recognised(volume):
+        if own or recognised(volume, access.labels):
             reason = "its segments" if own else "its name and its few integers"
             warnings.warn(f"{volume.name}: taken as a label map, by {reason} (--labels none: as scalars)", stacklevel=3)
             return AUTO
@@ -241,23 +285,25 @@ def _white(opened: Content) -> float:
     return float(np.iinfo(kind).max) if opened.color and kind.kind in "iu" else 1.0
 
 
-def _overlapping(opened: Content, labels: str | LabelTable | None, own: bool, distance: str | None) -> list[Layer]:
+def _overlapping(
+    opened: Content, labels: str | LabelTable | None, own: bool, distance: str | None, access: Access
+) -> list[Layer]:
     """Of layers (.seg.nrrd) or segments (DICOM) that overlap, each under its own, or all under one table.
 
     Empty ones are left out.
     """
     found = []
     for k, volume in enumerate(opened.volumes):
-        if any(labels_in(volume)):
+        if any(access.labels(volume)):
             table = segments_of(str(opened.path), k) if own else labels
-            found.append(_labelled(volume, table, distance))
+            found.append(_labelled(volume, table, distance, access))
     if not found:
         raise DataError(f"{opened.path}: no label but 0 in any of its layers; expected some to show")
     return found
 
 
-def _labelled(volume: Volume, labels: str | LabelTable | None, distance: str | None) -> Layer:
-    numbers = labels_in(volume)
+def _labelled(volume: Volume, labels: str | LabelTable | None, distance: str | None, access: Access) -> Layer:
+    numbers = access.labels(volume)
     if isinstance(labels, str) and labels != AUTO:
         table = read_labels(labels).of(numbers, volume.name)
     elif isinstance(labels, LabelTable):
@@ -269,13 +315,22 @@ def _labelled(volume: Volume, labels: str | LabelTable | None, distance: str | N
     return Layer(volume, table, *unit_distance(distance, volume))
 
 
-def _luminance(*bands: Volume) -> Volume:
-    """(nz, ny, nx) float32, in the data values of the colours."""
-    out = np.zeros(bands[0].data.shape, np.float32)
-    for weight, band in zip(LUMINANCE, bands, strict=True):
-        for z in range(len(out)):
-            out[z] += weight * (band.slope * band.data[z].astype(np.float32) + band.intercept)
-    return replace(bands[0], data=out, slope=1.0, intercept=0.0)
+def _luminance(stored: bool, *bands: Volume) -> Volume:
+    """(nz, ny, nx) float32, in the data values of the colours; where they are ``stored`` made block by block."""
+
+    def block(slices: tuple[slice, ...]) -> np.ndarray:
+        z, y, x = slices
+        out = np.zeros((z.stop - z.start, y.stop - y.start, x.stop - x.start), np.float32)
+        lo, hi = np.array([x.start, y.start, z.start]), np.array([x.stop, y.stop, z.stop])
+        for weight, band in zip(LUMINANCE, bands, strict=True):
+            own = read_block(band, lo, hi)
+            for k in range(len(out)):
+                out[k] += weight * (band.slope * own[k].astype(np.float32) + band.intercept)
+        return out
+
+    shape, kind = bands[0].data.shape, np.dtype(np.float32)
+    lazy: Any = Stored(block, kind, shape, chunks_of(bands[0]), bands[0].name)
+    return replace(bands[0], data=lazy if stored else lazy[:], slope=1.0, intercept=0.0)
 
 
 def _channel(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,9 +12,7 @@ from vvgt_cli.gaussians.frames import rotations
 from vvgt_cli.transfer.labels import Label, LabelTable
 from vvgt_cli.transfer.tables import extinction
 from vvgt_cli.volume import Volume
-
-if TYPE_CHECKING:
-    from vvgt_cli.dvr import Scene
+from vvgt_cli.volume.stored import planes, values_at
 
 OFFSETS = (-2.0, -1.0, 0.0, 1.0, 2.0)  # standard deviations along each axis, where a Gaussian is asked whose it is
 
@@ -47,9 +44,10 @@ class Hidden:
         middles = [np.arange(n) + 0.5 for n in volume.dims]
         x, y, z = (self._along(axis, middles[axis]) for axis in range(3))
         none = np.zeros(volume.data.shape[1:], bool)
-        before, here = none, self._label(volume, 0, number)
+        stored = (volume.slope * plane.astype(np.float64) + volume.intercept == number for plane in planes(volume))
+        before, here = none, next(stored)
         for k in range(len(volume.data)):
-            after = self._label(volume, k + 1, number) if k + 1 < len(volume.data) else none
+            after = next(stored, none)
             inside = here & before & after
             inside[1:] &= here[:-1]
             inside[:-1] &= here[1:]
@@ -61,11 +59,6 @@ class Hidden:
             before, here = here, after
         return False
 
-    @staticmethod
-    def _label(volume: Volume, z: int, number: int) -> np.ndarray:
-        found: np.ndarray = volume.slope * volume.data[z].astype(np.float64) + volume.intercept == number
-        return found
-
     def _along(self, axis: int, voxels: np.ndarray) -> np.ndarray:
         """Index of the cell along an axis of positions in voxels from the box's corner, (n,)."""
         n = self.cells.shape[2 - axis]
@@ -73,13 +66,13 @@ class Hidden:
         return found
 
 
-def hidden_in(scene: Scene, budget: int, size: int) -> Hidden:
-    """What of a scene no training view sees, as the closed form of ``budget`` Gaussians for ``size`` px has it."""
-    from vvgt_cli.vbm.closed_form import closed_form
-    from vvgt_cli.vbm.tree import HIDDEN
+def hidden_in(near: np.ndarray, edge: np.ndarray, half: np.ndarray, step: np.ndarray) -> Hidden:
+    """What no training view sees.
 
-    seen = closed_form(scene, budget, size).seen
-    near = seen.largest > HIDDEN
+    Args:
+        near: (nz, ny, nx) bool: the cells that one sees; ``edge`` (3,) their edges in voxels.
+        half, step: (3,) of the volume, unit frame.
+    """
     for axis in range(3):
         wider = near.copy()
         ahead, behind = [slice(None)] * 3, [slice(None)] * 3
@@ -87,7 +80,7 @@ def hidden_in(scene: Scene, budget: int, size: int) -> Hidden:
         wider[tuple(ahead)] |= near[tuple(behind)]
         wider[tuple(behind)] |= near[tuple(ahead)]
         near = wider
-    return Hidden(~near, seen.edge, np.asarray(scene.half), np.asarray(scene.step))
+    return Hidden(~near, edge, half, step)
 
 
 def owners(gaussians: Gaussians, shown: Sequence[tuple[Volume, LabelTable, Label]]) -> np.ndarray:
@@ -121,9 +114,8 @@ def _vote(
     maps = {id(volume): volume for volume, *_ in shown}
     dims = np.array(shown[0][0].dims)
     rows = np.flatnonzero(((index >= 0) & (index < dims)).all(axis=1))
-    x, y, z = index[rows].T
     for key, volume in maps.items():
-        values = volume.slope * np.asarray(volume.data[z, y, x], np.float64) + volume.intercept
+        values = values_at(volume, index[rows])
         own = [(label.number, k) for k, (other, _, label) in enumerate(shown) if id(other) == key]
         numbers, columns = (np.array(part) for part in zip(*sorted(own), strict=True))
         at = np.minimum(np.searchsorted(numbers, values), len(numbers) - 1)

@@ -18,6 +18,7 @@ from vvgt_cli.volume.space import shear_text, world_axis
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
+    from vvgt_cli.dvr.render import Viewed
 
 AUTO, NONE = "auto", "none"
 
@@ -83,7 +84,7 @@ def upright(volume: Volume, up: str) -> np.ndarray:
 
 
 def preview(
-    scene: Scene, gaussians: Gaussians, cameras: Sequence[Camera], axes: np.ndarray, rule: str | Rule = INRIA
+    scene: Scene | Viewed, gaussians: Gaussians, cameras: Sequence[Camera], axes: np.ndarray, rule: str | Rule = INRIA
 ) -> np.ndarray:
     """Reference, ours and their difference, a row a camera of the frame that ``axes`` (`upright`) leads to."""
     from vvgt_cli.dvr import RenderSettings, render_view

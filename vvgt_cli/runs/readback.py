@@ -19,6 +19,7 @@ from vvgt_cli.splat.rules import INRIA, rule_of
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
+    from vvgt_cli.dvr.render import Viewed
     from vvgt_cli.volume import Volume
 
 
@@ -48,7 +49,9 @@ def tell_agreement(run: Run, output: str, gaussians: Gaussians, options: PlyOpti
         stage.note = f"{np.mean(found):.2f} dB from the Gaussians as they were, {len(found)} views of {size} px"
 
 
-def tell_cost(run: Run, output: str, gaussians: Gaussians, options: PlyOptions, scene: Scene, volume: Volume) -> None:
+def tell_cost(
+    run: Run, output: str, gaussians: Gaussians, options: PlyOptions, scene: Scene | Viewed, volume: Volume
+) -> None:
     """Say how much further from its volume a file just written is than the Gaussians were; of a `.ply` nothing.
 
     Args:

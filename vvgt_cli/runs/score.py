@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vvgt_cli.cameras import default_views
+from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.cameras.blocks import Blocks, spread_blocks
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.progress import ProgressCallback
@@ -16,13 +16,24 @@ from vvgt_cli.splat.rules import INRIA, Rule
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import RenderSettings, Scene
+    from vvgt_cli.dvr.render import Viewed
     from vvgt_cli.metrics import Scores, ViewScore
 
 WHOLE = (0, 4, 9)  # test views of which large ones are drawn whole, for what blocks cannot tell
 
 
+def scored(size: int, perceptual: bool, only: Collection[int] | None = None) -> list[tuple[int, Camera, Blocks | None]]:
+    """Number and camera of each test view that is scored, with the blocks of it that are drawn, None for all of it."""
+    cameras = default_views("test", size=size)
+    found = []
+    for i in sorted(range(len(cameras)) if only is None else only):
+        blocks = spread_blocks(cameras[i].width, cameras[i].height, i)
+        found.append((i, cameras[i], None if perceptual and i in WHOLE else blocks))
+    return found
+
+
 def score_test_views(
-    scene: Scene,
+    scene: Scene | Viewed,
     gaussians: Gaussians,
     size: int,
     settings: RenderSettings,
@@ -47,18 +58,13 @@ def score_test_views(
     from vvgt_cli.metrics import mean_scores
     from vvgt_cli.splat import render
 
-    cameras = default_views("test", size=size)
-    numbers = sorted(range(len(cameras)) if only is None else only)
-    views = []
-    for done, i in enumerate(numbers):
-        camera = cameras[i]
-        blocks = spread_blocks(camera.width, camera.height, i)
-        whole = blocks is None or (perceptual and i in WHOLE)
-        part = None if whole else blocks
+    views, wanted = [], scored(size, perceptual, only)
+    for done, (i, camera, part) in enumerate(wanted):
         reference, ours = render_view(scene, camera, settings, part), render(gaussians, camera, rule, blocks=part)
-        views.append(score_seen(reference, ours, blocks, whole, perceptual))
+        blocks = spread_blocks(camera.width, camera.height, i)
+        views.append(score_seen(reference, ours, blocks, part is None, perceptual))
         if progress:
-            progress(done + 1, len(numbers))
+            progress(done + 1, len(wanted))
     return mean_scores(views)
 
 

@@ -17,6 +17,7 @@ from vvgt_cli.splat.rules import INRIA, RULES, Rule
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import RenderSettings, Scene
+    from vvgt_cli.dvr.render import Viewed
     from vvgt_cli.metrics import Texture
 
 SIZES = (400, 800, 2160)  # pixels: a small window, half a screen, a 4K screen
@@ -81,8 +82,21 @@ class SeatView:
     reference: np.ndarray
 
 
+def seat_pictures(
+    places: Iterable[tuple[int, float]], views: Collection[int] = VIEWS, enough: int = ENOUGH
+) -> list[tuple[tuple[int, float], Camera, Blocks | None]]:
+    """Every place with the camera of each view from there, and the blocks of its picture that are scored."""
+    found = []
+    for size, field_of_view in places:
+        cameras = default_views("test", size=size)
+        for i in views:
+            camera, blocks = zoomed(cameras[i], field_of_view), spread_blocks(size, size, i, enough)
+            found.append(((size, field_of_view), camera, blocks))
+    return found
+
+
 def seat_views(
-    scene: Scene,
+    scene: Scene | Viewed,
     places: Iterable[tuple[int, float]],
     settings: RenderSettings | None = None,
     *,
@@ -102,20 +116,16 @@ def seat_views(
     """
     from vvgt_cli.dvr import render_view
 
-    places, done = list(places), 0
-    for size, field_of_view in places:
-        cameras = default_views("test", size=size)
-        for i in views:
-            camera, blocks = zoomed(cameras[i], field_of_view), spread_blocks(size, size, i, enough)
-            image = render_view(scene, camera, settings, blocks)[..., :3]
-            yield SeatView(size, field_of_view, camera, blocks, image if blocks is None else blocks.pick(image))
-            done += 1
-            if progress:
-                progress(done, len(places) * len(views))
+    wanted = seat_pictures(places, views, enough)
+    for done, (place, camera, blocks) in enumerate(wanted, 1):
+        image = render_view(scene, camera, settings, blocks)[..., :3]
+        yield SeatView(*place, camera, blocks, image if blocks is None else blocks.pick(image))
+        if progress:
+            progress(done, len(wanted))
 
 
 def score_texture(
-    scene: Scene,
+    scene: Scene | Viewed,
     gaussians: Gaussians,
     size: int,
     rule: str | Rule = INRIA,

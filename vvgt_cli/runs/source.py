@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from vvgt_cli.errors import UsageError
 from vvgt_cli.jit.ahead import for_grid, for_light
 from vvgt_cli.runs.digests import digest, volume_digest
-from vvgt_cli.runs.layered import AUTO, NONE, Content, LayerRequest, is_plain, layers_of, open_parts
+from vvgt_cli.runs.layered import AUTO, IN_MEMORY, NONE, Access, Content, LayerRequest, is_plain, layers_of
 from vvgt_cli.transfer.function import TransferFunction
 from vvgt_cli.transfer.labels import LabelTable
 from vvgt_cli.transfer.lighting import Lighting, LightOptions
@@ -121,6 +121,11 @@ class Source:
         """Of the function, or of all layers."""
         return " + ".join(layer.name for layer in self.layers) or self.tf.name
 
+    @property
+    def labels_alone(self) -> bool:
+        """Whether all of it is labels."""
+        return bool(self.layers) and all(isinstance(layer.tf, LabelTable) for layer in self.layers)
+
     def look(self) -> str:
         """Digest of all that gives the volume its colours, other volumes included."""
         if isinstance(self.tf, TransferFunction) and not self.layers:
@@ -166,8 +171,10 @@ class Source:
             from vvgt_cli.dvr.layers import grid_of
 
             grid = grid_of(self.layers, self.volume)
-            labels = all(isinstance(layer.tf, LabelTable) for layer in self.layers)
-            return Scene.of_grid(self.volume, Title(self.name), self.unit_distance, grid, self.lighting, labels)
+            title = Title(self.name)
+            return Scene.of_grid(
+                self.volume, title, self.unit_distance, grid, self.lighting, self.labels_alone
+            )  # fmt: skip
         assert isinstance(self.tf, TransferFunction)
         limits = (self.statistics.lo, self.statistics.hi)
         return Scene.build(self.volume, self.tf, self.unit_distance, limits, lighting=self.lighting, layout=self.layout)
@@ -180,17 +187,19 @@ class Title:
     name: str
 
 
-def load(request: SourceRequest) -> Source:
-    """Read the function, then the volume, and bring them together.
+def load(request: SourceRequest, access: Access = IN_MEMORY) -> Source:
+    """Read the function, then the volume, and bring them together; ``access`` reads it as a whole or in blocks.
 
     Raises:
         DataError: a file that is not what it must be, or a function that shows nothing of this volume.
         UsageError: options that do not fit the file.
     """
-    return load_all(request, (request.tf,))[0]
+    return load_all(request, (request.tf,), access)[0]
 
 
-def load_all(request: SourceRequest, tfs: Sequence[str | TransferFunction | None]) -> list[Source]:
+def load_all(
+    request: SourceRequest, tfs: Sequence[str | TransferFunction | None], access: Access = IN_MEMORY
+) -> list[Source]:
     """One volume under each of several functions; ``request.tf`` is not used.
 
     Raises:
@@ -198,7 +207,6 @@ def load_all(request: SourceRequest, tfs: Sequence[str | TransferFunction | None
     """
     from vvgt_cli.transfer import check_visible, from_histogram, read_transfer_function, resolve, unit_distance
     from vvgt_cli.transfer.resolve import parse_tf_range
-    from vvgt_cli.volume import statistics
 
     tf_range = parse_tf_range(request.tf_range)
     functions = [
@@ -207,18 +215,16 @@ def load_all(request: SourceRequest, tfs: Sequence[str | TransferFunction | None
     if None in functions and tf_range != "data":
         raise UsageError("--tf-range says where the nodes of a function lie; it needs --tf")
     opened = request.volume if isinstance(request.volume, Opened) else None
-    if isinstance(request.volume, str):
-        content = open_parts(request.volume, request.read)
-    elif opened is not None:
-        content = opened.content or Content((opened.volume,))
+    if isinstance(request.volume, Opened):
+        content = request.volume.content or Content((request.volume.volume,))
     else:
-        content = Content((request.volume,))  # type: ignore[arg-type]
-    if not is_plain(content, functions[0], request.labels, request.layers):
-        return [_layered(request, content, tf, tf_range) for tf in functions]
+        content = access.open(request.volume, request.read)
+    if not is_plain(content, functions[0], request.labels, request.layers, access):
+        return [_layered(request, content, tf, tf_range, access) for tf in functions]
     volume = content.volumes[0]
     unit_distance(request.unit_distance, volume)  # its errors come first
     lights = [request.light.lighting(None if tf is None else tf.lighting, volume.space) for tf in functions]
-    numbers = opened.statistics if opened else statistics(volume)
+    numbers = opened.statistics if opened else access.statistics(volume)
     sources = []
     for tf, lighting in zip(functions, lights, strict=True):
         whole = request.statistics[0] if request.statistics else numbers
@@ -237,21 +243,21 @@ def load_all(request: SourceRequest, tfs: Sequence[str | TransferFunction | None
 
 
 def _layered(
-    request: SourceRequest, content: Content, tf: TransferFunction | None, tf_range: str | tuple[float, float]
-) -> Source:
+    request: SourceRequest, content: Content, tf: TransferFunction | None, tf_range: str | tuple[float, float],
+    access: Access,
+) -> Source:  # fmt: skip
     """The optics grid that a volume and its layers add up to."""
     from vvgt_cli.dvr.layers import common_grid
-    from vvgt_cli.volume import statistics
 
     lighting = request.light.lighting(None if tf is None else tf.lighting, content.volumes[0].space)
-    layers = layers_of(content, tf, request.labels, tf_range, request.unit_distance, request.statistics)
+    layers = layers_of(content, tf, request.labels, tf_range, request.unit_distance, request.statistics, access)
     for other in request.layers:
-        inner = open_parts(other.volume, other.read) if isinstance(other.volume, str) else Content((other.volume,))
-        layers += layers_of(inner, other.tf, other.labels, "data", other.distance)
-    first = layers[0]
+        inner = access.open(other.volume, other.read)
+        layers += layers_of(inner, other.tf, other.labels, "data", other.distance, access=access)
+    first, grid = layers[0], common_grid(layers, content.stored)
+    numbers = access.statistics(first.volume)
     return Source(
-        common_grid(layers), statistics(first.volume), first.tf, first.unit_distance, first.unit_label, lighting,
-        layers=tuple(layers),
+        grid, numbers, first.tf, first.unit_distance, first.unit_label, lighting, layers=tuple(layers)
     )  # fmt: skip
 
 

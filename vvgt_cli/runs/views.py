@@ -15,6 +15,7 @@ from vvgt_cli.splat.rules import INRIA, Rule
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import RenderSettings, Scene
+    from vvgt_cli.dvr.render import Viewed
 
 VIEW_BYTES = 2 * 16  # of memory a pixel: float32 RGBA, and as much again while views are stacked
 
@@ -52,14 +53,18 @@ class Views:
         return float(np.mean([psnr(view[..., :3], image[..., :3]) for view, image in pairs]))
 
 
-def judging_views(scene: Scene, cameras: Sequence[Camera], settings: RenderSettings) -> Views:
+def judged(cameras: Sequence[Camera]) -> list[tuple[Camera, Blocks | None]]:
+    """Cameras, each with the blocks of its picture that are judged by, None for all of it."""
+    return [(camera, spread_blocks(camera.width, camera.height, i, FEW)) for i, camera in enumerate(cameras)]
+
+
+def judging_views(scene: Scene | Viewed, cameras: Sequence[Camera], settings: RenderSettings) -> Views:
     """Views to judge by, of `FEW` blocks where they have more."""
     from vvgt_cli.dvr import render_view
 
-    blocks = [spread_blocks(camera.width, camera.height, i, FEW) for i, camera in enumerate(cameras)]
-    images = []
-    for camera, part in zip(cameras, blocks, strict=True):
+    images, known = [], []
+    for camera, part in judged(cameras):
         image = render_view(scene, camera, settings, part)
         images.append(image if part is None else part.pick(image))
-    known = [part for part in blocks if part is not None]
+        known += [] if part is None else [part]
     return Views(list(cameras), np.stack(images), known or None)

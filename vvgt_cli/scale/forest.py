@@ -13,9 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vvgt_cli.scale.grid import CellGrid
-from vvgt_cli.scale.parts import CELLS, Parts
-from vvgt_cli.scale.tasks import read_rows
+from vvgt_cli.field.cells import read_rows
+from vvgt_cli.field.grid import CellGrid
+from vvgt_cli.field.parts import CELLS, Parts
 from vvgt_cli.vbm.moments import Cells, morton
 from vvgt_cli.vbm.tree import Leaves, Tree, build_tree, cap_by_ancestors, leaves_of, pyramid, split_score
 from vvgt_cli.vbm.visibility import Visibility

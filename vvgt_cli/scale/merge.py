@@ -15,7 +15,9 @@ import numpy as np
 
 from vvgt_cli.conversion.request import VERTEX_BYTES
 from vvgt_cli.conversion.stages.closed_form import FAINT_LOGIT, FEWEST, NEARLY
+from vvgt_cli.dvr.render import Box
 from vvgt_cli.errors import NothingVisible
+from vvgt_cli.field.parts import Parts
 from vvgt_cli.files import atomic_write, check_room, is_stream
 from vvgt_cli.gaussians.frames import transform
 from vvgt_cli.gaussians.ply import as_stored, ply_header, ply_rows
@@ -25,9 +27,8 @@ from vvgt_cli.resources import free_memory
 from vvgt_cli.runs.outputs import STDOUT
 from vvgt_cli.runs.record import Run
 from vvgt_cli.scale.levels import PART, level_name, write_index
-from vvgt_cli.scale.parts import Parts
 from vvgt_cli.scale.plan import Plan
-from vvgt_cli.scale.sight import Box, drawing_bytes, score_gaussians, score_text
+from vvgt_cli.scale.score import drawing_bytes, score_gaussians, score_text
 from vvgt_cli.splat.rules import INRIA
 
 if TYPE_CHECKING:
@@ -86,7 +87,7 @@ def _level(run: Run, parts: Parts, cut: Cut, output: str, overwrite: bool) -> di
         run.leave_out("test views", f"{count} Gaussians at once need about {need / 2**30:.1f} GiB of memory")
     else:
         with run.stage("test views") as stage:
-            found = score_gaussians(together(made.batches), parts, plan.grid, size, plan.ply.rule or INRIA)
+            found = score_gaussians(together(made.batches), parts, plan, plan.ply.rule or INRIA)
             scores, stage.note = asdict(found), score_text(found, size)
     return {"file": os.path.basename(output), "gaussians": count, "bytes": written, "scores": scores}
 
@@ -162,16 +163,6 @@ class Cut:
     opaque: Opaque
     plan: Plan
 
-    def whole(self) -> tuple[Gaussians, int]:
-        """All Gaussians at once; and how many are left out since they would be too faint, as where they are written."""
-        budget, first = self.plan.budget, 0
-        while True:
-            made = together(list(self.gaussians(self.forest.threshold(budget))))
-            first = first or len(made)
-            if 2 * int((made.opacity_logits < FAINT_LOGIT).sum()) <= len(made) or budget < 2 * FEWEST:
-                return made, first - len(made)
-            budget //= 2
-
     def gaussians(self, threshold: float) -> Iterator[Gaussians]:
         """Those of the cells that a threshold leaves, in the box frame, as a file holds them, in batches."""
         from vvgt_cli.scale.forest import batches
@@ -183,7 +174,9 @@ class Cut:
         voxel, pixel = min(self.plan.grid.step), pixel_width(self.plan.size)
         for leaves in batches(self.forest.leaves(threshold), BATCH):
             made = cell_gaussians(leaves, voxel, pixel, self.opaque, ROUND)
-            yield as_stored(sharpened(made, leaves.moments[:, SEEN] / leaves.moments[:, MASS], self.opaque.half))
+            if not self.plan.labels:
+                made = sharpened(made, leaves.moments[:, SEEN] / leaves.moments[:, MASS], self.opaque.half)
+            yield as_stored(made)
 
 
 @contextmanager

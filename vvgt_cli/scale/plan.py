@@ -8,15 +8,13 @@ import math
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-import numpy as np
-
 from vvgt_cli.conversion.request import VERTEX_BYTES
 from vvgt_cli.errors import DataError
+from vvgt_cli.field.grid import Boxes, CellGrid
+from vvgt_cli.field.parts import ROW, Parts
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import PlyOptions
 from vvgt_cli.runs.record import plain
-from vvgt_cli.scale.grid import Boxes, CellGrid
-from vvgt_cli.scale.parts import ROW, Parts
 from vvgt_cli.volume.types import UnitFrame
 
 PLAN = "plan.json"
@@ -34,6 +32,8 @@ class Plan:
         axes: (9,) row-major world directions of the index axes, as `Volume.direction`.
         ply: how the file is written.
         volume, function: as reports show them.
+        rays: name of the file of the rays that it is scored by.
+        labels: it is one of labels alone.
     """
 
     grid: CellGrid
@@ -43,6 +43,8 @@ class Plan:
     ply: PlyOptions
     volume: dict[str, Any]
     function: dict[str, Any]
+    rays: str
+    labels: bool = False
 
     def save(self, parts: Parts) -> None:
         """Write it beside the parts."""
@@ -75,13 +77,6 @@ class Plan:
 
 def _tupled(value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value
-
-
-def finest_level(step: np.ndarray, size: int) -> int:
-    """Level of the cells that a screen of ``size`` px just tells apart; ``step`` (3,) voxel edges, unit frame."""
-    from vvgt_cli.vbm.closed_form import FINEST, MIN_CELL, pixel_width
-
-    return max(FINEST, math.floor(math.log2(MIN_CELL * pixel_width(size) / float(step.min()))))
 
 
 def most_cells(budget: int) -> int:

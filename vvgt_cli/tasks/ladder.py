@@ -15,13 +15,13 @@ import numpy as np
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.cameras.blocks import Blocks, spread_blocks
 from vvgt_cli.cameras.boxed import drawn_in_box
-from vvgt_cli.conversion.case import view_edge
 from vvgt_cli.conversion.convert import convert
 from vvgt_cli.conversion.plan import DEFAULT_STEPS
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.conversion.stages.refinement import refine
 from vvgt_cli.conversion.stages.views import TrainingViews, views_of
 from vvgt_cli.descent import OptimizeOptions
+from vvgt_cli.field.case import view_edge
 from vvgt_cli.gaussians import Gaussians, as_stored, read_ply, write_ply
 from vvgt_cli.gaussians.frames import transform
 from vvgt_cli.progress import Console

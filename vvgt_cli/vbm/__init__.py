@@ -59,22 +59,26 @@ class Start:
 def initialise(scene: Scene, options: VbmOptions, progress: Progress | None = None) -> Start:
     """The closed form alone: no view is rendered. No Gaussians where no view sees anything."""
     from vvgt_cli.vbm.closed_form import closed_form
+
+    form = closed_form(scene, options.max_gaussians, options.size, progress=progress, degree=options.degree)
+    if progress:
+        progress(100, 100)
+    return start_of(form, options)
+
+
+def start_of(form: ClosedForm, options: VbmOptions) -> Start:
+    """The Gaussians of the method asked for, from a closed form."""
     from vvgt_cli.vbm.uniform import uniform_gaussians
     from vvgt_cli.vbm.wavelet import wavelet_gaussians
 
-    form = closed_form(scene, options.max_gaussians, options.size, progress=progress, degree=options.degree)
     if options.method == "wavelet":
         gaussians, kept = wavelet_gaussians(form.tree, form.budget, form.pixel), None
     elif options.method == "uniform":
         gaussians, kept = uniform_gaussians(form.tree, form.budget, form.pixel, options.seed), None
     else:
         gaussians, kept = form.gaussians(), form
-    if kept is None and scene.light is not None:
-        from vvgt_cli.vbm.lit import lit_alone
-
-        gaussians = lit_alone(gaussians, scene, options.degree)
-    if progress:
-        progress(100, 100)
+    if kept is None and form.shading is not None:
+        gaussians = form.shading.alone(gaussians, options.degree)
     return Start(gaussians, kept)
 
 

@@ -10,20 +10,21 @@ import numpy as np
 
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.cameras.sets import FIELD_OF_VIEW, RADIUS
-from vvgt_cli.dvr.layout import BRICK
+from vvgt_cli.dvr.render import Box
 from vvgt_cli.dvr.scene import Scene
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.splat import render
 from vvgt_cli.splat.rules import INRIA, Rule
-from vvgt_cli.transfer.tables import OpticalTables
 from vvgt_cli.vbm.columns import MASS, SEEN
 from vvgt_cli.vbm.error import scores_by_error, unseen
 from vvgt_cli.vbm.fit import blending_weights, image_errors, solve_colors, weights_and_errors
 from vvgt_cli.vbm.inset import Opaque, opaque_field
-from vvgt_cli.vbm.moments import base_cells, exponents
+from vvgt_cli.vbm.lit import Shading, centroids
+from vvgt_cli.vbm.moments import Cells, base_cells, exponents
+from vvgt_cli.vbm.samples import visible_voxels
 from vvgt_cli.vbm.shape import ROUND, STYLES, SurfaceStyle, cell_gaussians
 from vvgt_cli.vbm.sharpen import sharpened
-from vvgt_cli.vbm.tree import Leaves, Tree, build_tree, leaves_of, select, split, split_score
+from vvgt_cli.vbm.tree import Leaves, Tree, build_tree, leaves_of, select, shown, split, split_score
 from vvgt_cli.vbm.visibility import Visibility, visibility
 
 MAX_BASE_CELLS = 5_000_000  # an upper bound: half of them are there, as a rule; 104 bytes each, twice for the pyramid
@@ -49,27 +50,33 @@ def pixel_width(size: int) -> float:
 
 @dataclass(frozen=True)
 class ClosedForm:
-    """A scene's pyramid, ready to be cut for any budget.
+    """A volume's pyramid, ready to be cut for any budget.
 
     Attributes:
-        scene: volume under its transfer function.
         seen: what the cameras see of it.
         tree: moments of every cell that some view sees.
         opaque: where bodies are opaque.
-        voxel: finest voxel edge, unit frame.
+        half, step: (3,) half extents and voxel edges, unit frame.
         pixel: a pixel's width at the centre, unit frame.
         budget: most Gaussians.
+        labels: it is one of labels alone.
+        shading: of its light, None where nothing is lit; ``normals`` (n, 3) at the centroids of the tree's base cells.
         degree: of the harmonics that colours have under a light that depends on the view.
+        scene: what base cells are split from; None: they are not split, as only blocks of the volume are in memory.
     """
 
-    scene: Scene
     seen: Visibility
     tree: Tree
     opaque: Opaque
-    voxel: float
+    half: np.ndarray
+    step: np.ndarray
     pixel: float
     budget: int
+    labels: bool = False
+    shading: Shading | None = None
+    normals: np.ndarray | None = None
     degree: int = 0
+    scene: Scene | None = None
 
     def gaussians(self, style: SurfaceStyle = ROUND) -> Gaussians:
         """Gaussians of the cells that the moments alone choose."""
@@ -79,18 +86,16 @@ class ClosedForm:
         return self._sharpened(leaves, self._cells(leaves, style))
 
     def _cells(self, leaves: Leaves, style: SurfaceStyle) -> Gaussians:
-        found = cell_gaussians(leaves, self.voxel, self.pixel, self.opaque, style)
-        if self.scene.light is None:
+        found = cell_gaussians(leaves, float(self.step.min()), self.pixel, self.opaque, style)
+        if self.shading is None or self.normals is None:
             return found
-        from vvgt_cli.vbm.lit import lit
-
-        return lit(found, self.scene, self.tree, leaves, self.degree)
+        return self.shading.lit(found, self.tree, leaves, self.degree, self.normals)
 
     def _sharpened(self, leaves: Leaves, found: Gaussians) -> Gaussians:
         """`sharpened`, but labels: each is of one colour, and may be written to a file of its own."""
-        if self.scene.labels:
+        if self.labels:
             return found
-        return sharpened(found, leaves.moments[:, SEEN] / leaves.moments[:, MASS], np.asarray(self.scene.half))
+        return sharpened(found, leaves.moments[:, SEEN] / leaves.moments[:, MASS], self.half)
 
     def cut_by_error(self, drawn: Gaussians, cameras: Sequence[Camera], views: np.ndarray, rule: Rule) -> Gaussians:
         """`gaussians` of cells chosen by what views (n, h, w, 4) show of the error of those, ``drawn``, by ``rule``.
@@ -114,7 +119,7 @@ class ClosedForm:
         """Gaussians for the budget: three tenths by the moments, then cells with the largest error are split."""
         start = max(int(self.budget * REFINE_FROM), 1)
         leaves = leaves_of(self.tree, select(self.tree, start))
-        smallest = max(2 * MIN_CELL * self.pixel, 2.0 ** (FINEST + 1) * self.voxel)  # edge of a cell to split
+        smallest = max(2 * MIN_CELL * self.pixel, 2.0 ** (FINEST + 1) * self.step.min())  # edge of a cell to split
         for done in range(1, REFINE_ROUNDS + 1):
             gaussians = solve_colors(self._of(leaves, style), cameras, views, rounds=1, rule=rule)
             error = image_errors(gaussians, cameras, views, rule)
@@ -143,24 +148,59 @@ def closed_form(
         progress: called with (per cent done, 100), within parts that take long too.
         degree: of the harmonics under a light that depends on the view.
     """
-    step = np.asarray(scene.step)
+    step, half = np.asarray(scene.step), np.asarray(scene.half)
+    exponent = exponents(step, base_level(scene, size, budget))
+    cells = base_cells(scene, exponent, progress=part(progress, 0, 50))
+    return form_of(
+        cells, half, step, budget, size, cameras, part(progress, 50, 95), scene.labels, Shading.of(scene), degree, scene
+    )  # fmt: skip
 
-    def within(first: int, last: int) -> Callable[[float], None]:
-        return lambda share: progress(round(first + (last - first) * share), 100) if progress else None
 
-    level = base_level(scene, pixel_width(size), budget)
-    cells = base_cells(scene, exponents(step, level), progress=within(0, 50))
-    seen = visibility(scene, cells, cameras or default_views("train", size=MARCH_SIZE), progress=within(50, 75))
-    opaque = opaque_field(cells, step, np.asarray(scene.half), scene.labels)
-    within(75, 80)(1)
+def part(progress: Progress | None, first: int, last: int) -> Callable[[float], None]:
+    """What is told the share that is done of something that takes from ``first`` to ``last`` per cent of the whole."""
+    return lambda share: progress(round(first + (last - first) * share), 100) if progress else None
+
+
+def form_of(
+    cells: Cells,
+    half: np.ndarray,
+    step: np.ndarray,
+    budget: int,
+    size: int,
+    cameras: Sequence[Camera] | None = None,
+    progress: Callable[[float], None] | None = None,
+    labels: bool = False,
+    shading: Shading | None = None,
+    degree: int = 0,
+    scene: Scene | None = None,
+) -> ClosedForm:
+    """The closed form over base cells, wherever the volume's values are; arguments as of `closed_form` and its result.
+
+    ``progress`` is told the share that is done.
+    """
+    tell = progress or (lambda share: None)
+    box = Box(half, step)
+    cameras = cameras or default_views("train", size=MARCH_SIZE)
+    seen = visibility(box, cells, cameras, progress=lambda share: tell(0.5 * share))
+    opaque = opaque_field(cells, step, half, labels)
+    tell(0.6)
     tree = build_tree(cells, seen, step)
-    within(80, 95)(1)
-    return ClosedForm(scene, seen, tree, opaque, float(step.min()), pixel_width(size), budget, degree)
+    normals = None
+    if shading is not None:
+        base = int((tree.children == 0).sum())
+        own = cells.normals
+        normals = shading.normals(centroids(tree.moments[:base])) if own is None else own[shown(cells, seen, step)]
+    tell(1)
+    return ClosedForm(
+        seen, tree, opaque, half, step, pixel_width(size), budget, labels, shading, normals, degree, scene
+    )  # fmt: skip
 
 
-def base_level(scene: Scene, pixel: float, budget: int) -> int:
+def base_level(scene: Scene, size: int, budget: int) -> int:
     """Finest level whose base cells fit the memory bound and the budget, and are not finer than the images can tell."""
-    return level_within(scene.step, _visible_voxels(scene), most_cells(budget), _finest_level(scene, pixel))
+    return level_within(
+        scene.step, visible_voxels(scene), most_cells(budget), finest_level(scene.step, pixel_width(size))
+    )
 
 
 def most_cells(budget: int) -> int:
@@ -177,49 +217,23 @@ def level_within(step: np.ndarray, voxels: float, most: float, finest: int) -> i
     return level
 
 
-def _finest_level(scene: Scene, pixel: float) -> int:
-    return max(FINEST, min(0, math.floor(math.log2(MIN_CELL * pixel / float(scene.step.min())))))
+def finest_level(step: np.ndarray, pixel: float) -> int:
+    """Level of the cells that pixels just tell apart; ``step`` (3,) voxel edges, ``pixel`` a pixel's, unit frame."""
+    return max(FINEST, math.floor(math.log2(MIN_CELL * pixel / float(step.min()))))
 
 
 def bound(form: ClosedForm) -> str:
     """Why there are no more Gaussians, where there are fewer than the budget."""
-    if base_level(form.scene, form.pixel, form.budget) > _finest_level(form.scene, form.pixel):
+    finest = 2.0 ** exponents(form.step, finest_level(form.step, form.pixel)) * form.step
+    if (form.tree.edge[0] > 1.5 * finest).any():
         return f"memory for at most {MAX_BASE_CELLS} cells"
     return "the screen cannot tell smaller cells apart"
 
 
-def expected_cells(scene: Scene, size: int, budget: int) -> float:
+def expected_cells(voxels: float, step: np.ndarray, size: int, budget: int) -> float:
     """About how many base cells the closed form of ``budget`` Gaussians for images of ``size`` px will have."""
-    level = base_level(scene, pixel_width(size), budget)
-    return _visible_voxels(scene) / float(np.prod(2.0 ** exponents(scene.step, level)))
-
-
-def _visible_voxels(scene: Scene, samples: int = 256) -> float:
-    """About how many voxels have extinction: bricks that do, times the share in a sample of them."""
-    bricks = np.argwhere(scene.empty == 0) * BRICK
-    if not len(bricks):
-        return 0.0
-    chosen = bricks[np.linspace(0, len(bricks) - 1, min(samples, len(bricks))).astype(np.int64)]
-    corner = BRICK + 1
-    share = [
-        visible_share(scene.tables, scene.values[z : z + corner, y : y + corner, x : x + corner]) for z, y, x in chosen
-    ]
-    return float(np.mean(share)) * len(bricks) * BRICK**3
-
-
-def visible_share(tables: OpticalTables, values: np.ndarray) -> float:
-    """Part of the cubes of eight voxels of ``values`` (z, y, x) that hold extinction."""
-    positive = np.concatenate([[0], np.cumsum(tables.nodes[:, 3] > 0)])
-    u = tables.coordinate(values)
-    u = np.where(np.isfinite(u), u, 0)
-    low, high = u, u
-    for axis in range(3):  # range over the corners of each cube of eight voxels
-        if u.shape[axis] > 1:
-            n = low.shape[axis]
-            low = np.minimum(np.take(low, range(n - 1), axis), np.take(low, range(1, n), axis))
-            high = np.maximum(np.take(high, range(n - 1), axis), np.take(high, range(1, n), axis))
-    visible = positive[np.ceil(high).astype(np.int64) + 1] > positive[np.floor(low).astype(np.int64)]
-    return float(visible.mean())
+    level = level_within(step, voxels, most_cells(budget), finest_level(step, pixel_width(size)))
+    return voxels / float(np.prod(2.0 ** exponents(step, level)))
 
 
 def fit(

@@ -62,10 +62,10 @@ def _gather(
             cell[BLUE] += lane(total, 2)
 
 
-@kernel("Texels f8:2 i8:1 f8:1 f8:1 f8:1 f8:5", GRID, parallel=True, fastmath=FLAGS, error_model="numpy")
+@kernel("Texels f8:2 i8:1 f8:1 f8:1 f8:1 f8:1 f8:5", GRID, parallel=True, fastmath=FLAGS, error_model="numpy")
 def grid_moments(
     texels: Texels, blocks: np.ndarray, points: np.ndarray, cell: np.ndarray, half: np.ndarray, step: np.ndarray,
-    out: np.ndarray,
+    begin: np.ndarray, out: np.ndarray,
 ) -> None:  # fmt: skip
     """`quadrature.block_moments` of a grid, arguments as there."""
     values = texels.values
@@ -96,6 +96,7 @@ def grid_moments(
                 _gather(row, at, share, points[0], box[0], ly, lz, out[b, cz, cy])
         for cz, cy, cx in np.ndindex(out.shape[1:4]):
             if out[b, cz, cy, cx, MASS] > 0.0:
-                x = (x0 + cx * cell[0]) * step[0] - half[0]
-                y, z = (y0 + cy * cell[1]) * step[1] - half[1], (z0 + cz * cell[2]) * step[2] - half[2]
+                x = (begin[0] + x0 + cx * cell[0]) * step[0] - half[0]
+                y = (begin[1] + y0 + cy * cell[1]) * step[1] - half[1]
+                z = (begin[2] + z0 + cz * cell[2]) * step[2] - half[2]
                 moved(out[b, cz, cy, cx], x, y, z, box)

@@ -9,15 +9,15 @@ lights at infinity are projected onto the harmonics for the main axis of Q.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numba as nb
 import numpy as np
 
-from vvgt_cli.dvr.kernel import FLAGS
-from vvgt_cli.dvr.layout import LIT, Light, Voxels
+from vvgt_cli.dvr.kernel import FLAGS, mean_optics, sample, table_coordinate
+from vvgt_cli.dvr.layout import LIT, Light, Optics, Voxels
 from vvgt_cli.dvr.light import sphere
-from vvgt_cli.dvr.reference import optics_at
 from vvgt_cli.dvr.scene import Scene
 from vvgt_cli.dvr.shading import arrives, fixed_diffuse, normal, openness
 from vvgt_cli.gaussians import Gaussians
@@ -35,10 +35,23 @@ CHUNK = 1 << 14  # Gaussians whose highlights are projected at once
 BRIGHTEST = 2.0  # as `vvgt_cli.vbm.fit` has it
 
 
-@kernel("Voxels Light f8:2 i8:1 i8:1 f8:1 f8:1 f8:2", LIT, parallel=True, fastmath=FLAGS, error_model="numpy")
+@kernel("Voxels Optics f8:1 f8:2 f8:2", LIT, parallel=True, fastmath=FLAGS, error_model="numpy")
+def point_normals(voxels: Voxels, optics: Optics, edge: np.ndarray, points: np.ndarray, out: np.ndarray) -> None:
+    """Normal (x, y, z) and extinction at voxel coordinates ``points`` (n, 3), into ``out`` (n, 4).
+
+    ``edge`` (3,) of `Light`; extinction per unit-frame length, the edge voxels' beyond the box.
+    """
+    for k in nb.prange(len(points)):
+        x, y, z = points[k, 0], points[k, 1], points[k, 2]
+        out[k, 0], out[k, 1], out[k, 2] = normal(voxels.values, edge, x, y, z)
+        u = table_coordinate(sample(voxels.values, x, y, z), optics)
+        out[k, 3] = max(mean_optics(u, u, optics)[3], 0.0) if u >= 0.0 else 0.0
+
+
+@kernel("Light f8:2 f8:2 i8:1 i8:1 f8:1 f8:1 f8:2", LIT, parallel=True, fastmath=FLAGS, error_model="numpy")
 def _shade(
-    voxels: Voxels,
     light: Light,
+    normals: np.ndarray,
     moments: np.ndarray,
     first: np.ndarray,
     last: np.ndarray,
@@ -49,9 +62,9 @@ def _shade(
     """Sums over rows ``first[k]`` to ``last[k]`` of ``moments`` (n, 17) into ``out`` (k, 16 + lights).
 
     Weight (what is seen), times n n^T (xx, xy, xz, yy, yz, zz), colour where it is open, colour without what depends on
-    the view, times n, and what arrives of each light. ``half``, ``step`` (3,) of `Scene`.
+    the view, times n, and what arrives of each light. ``normals`` (n, 3) at the rows' centroids; ``half``, ``step``
+    (3,) of `Scene`.
     """
-    values = voxels.values
     for k in nb.prange(len(first)):
         row = out[k]
         row[:] = 0.0
@@ -69,7 +82,7 @@ def _shade(
             x = (cell[X] / cell[MASS] + half[0]) / step[0] - 0.5
             y = (cell[Y] / cell[MASS] + half[1]) / step[1] - 0.5
             z = (cell[Z] / cell[MASS] + half[2]) / step[2] - 0.5
-            n0, n1, n2 = normal(values, light.edge, x, y, z)
+            n0, n1, n2 = normals[m, 0], normals[m, 1], normals[m, 2]
             open_ = openness(light, x, y, z)
             factor = open_ * (light.ambient + light.diffuse * fixed_diffuse(light, n0, n1, n2, x, y, z))
             row[0] += w
@@ -89,40 +102,107 @@ def _shade(
                 row[16 + which] += w * arrives(light, which, x, y, z)
 
 
-def lit(gaussians: Gaussians, scene: Scene, tree: Tree, leaves: Leaves, degree: int) -> Gaussians:
-    """Gaussians of ``leaves`` with the colours of their cells under the scene's light, harmonics up to ``degree``."""
-    inside = leaves.node >= 0  # others lie below the tree's base: a row of their own
-    sums = np.empty((len(leaves), _width(scene)))
-    sums[inside] = _sums(scene, tree.moments, *_base_rows(tree, leaves.node[inside]))
-    sums[~inside] = _sums(scene, leaves.moments[~inside])
-    return _colored(gaussians, scene, sums, degree)
+@dataclass(frozen=True)
+class Shading:
+    """What the colours of cells under light follow from, wherever the volume's values are.
 
-
-def lit_alone(gaussians: Gaussians, scene: Scene, degree: int) -> Gaussians:
-    """Gaussians with their own colours under the scene's light, as it is at their centres."""
-    rows = _rows(gaussians.means)
-    rows[:, COLOR] = rows[:, SEEN_COLOR] = gaussians.colors
-    return _colored(gaussians, scene, _sums(scene, rows), degree)
-
-
-def mean_normals(gaussians: Gaussians, scene: Scene) -> np.ndarray:
-    """(K, 3) unit directions of the mean gradient of the optical mass around Gaussians, box frame; zeros for none.
-
-    A mean over the centre and the six points a standard deviation along the axes, weighted by the extinction there.
+    Attributes:
+        light: as kernels take it.
+        half, step: (3,) of the volume, as `Scene` has them.
+        normals: unit normals (n, 3) at points (n, 3) of the box frame, zeros where there is no gradient.
     """
+
+    light: Light
+    half: np.ndarray
+    step: np.ndarray
+    normals: Callable[[np.ndarray], np.ndarray]
+
+    @classmethod
+    def of(cls, scene: Scene) -> Shading | None:
+        """Of a scene in memory; None where nothing is lit."""
+        if scene.light is None:
+            return None
+        return cls(scene.light, scene.half, scene.step, lambda points: at_points(scene, points)[:, :3])
+
+    def lit(self, gaussians: Gaussians, tree: Tree, leaves: Leaves, degree: int, base: np.ndarray) -> Gaussians:
+        """Gaussians of ``leaves`` with the colours of their cells, harmonics up to ``degree``.
+
+        ``base`` (n, 3): normals at the centroids of the tree's base cells.
+        """
+        inside = leaves.node >= 0  # others lie below the tree's base: a row of their own
+        sums = np.empty((len(leaves), ARRIVING + len(self.light.directions)))
+        sums[inside] = self.sums(tree.moments, base, *_base_rows(tree, leaves.node[inside]))
+        below = leaves.moments[~inside]
+        if len(below):
+            sums[~inside] = self.sums(below, self.normals(centroids(below)))
+        return _colored(gaussians, self.light, sums, degree)
+
+    def alone(self, gaussians: Gaussians, degree: int) -> Gaussians:
+        """Gaussians with their own colours under the light, as it is at their centres."""
+        rows = _rows(gaussians.means)
+        rows[:, COLOR] = rows[:, SEEN_COLOR] = gaussians.colors
+        return _colored(gaussians, self.light, self.sums(rows, self.normals(rows[:, FIRST])), degree)
+
+    def sums(
+        self, rows: np.ndarray, normals: np.ndarray, first: np.ndarray | None = None, last: np.ndarray | None = None
+    ) -> np.ndarray:
+        """`_shade` of each row, or of the rows from ``first`` to ``last``, over the weight: means (k, 16 + lights)."""
+        if first is None or last is None:
+            first, last = np.arange(len(rows)), np.arange(1, len(rows) + 1)
+        out = np.empty((len(first), ARRIVING + len(self.light.directions)))
+        _shade(
+            self.light,
+            np.ascontiguousarray(normals),
+            np.ascontiguousarray(rows),
+            first,
+            last,
+            self.half,
+            self.step,
+            out,
+        )
+        out /= np.maximum(out[:, :1], np.finfo(np.float64).tiny)
+        return out
+
+
+def centroids(moments: np.ndarray) -> np.ndarray:
+    """(n, 3) of rows of moments, box frame."""
+    result: np.ndarray = moments[:, FIRST] / moments[:, [MASS]]
+    return result
+
+
+def at_points(scene: Scene, points: np.ndarray) -> np.ndarray:
+    """Normals and extinction (n, 4) of `point_normals` at points (n, 3) of the box frame."""
+    out = np.empty((len(points), 4))
+    point_normals(
+        scene.voxels, scene.optics, scene.step, np.ascontiguousarray((points + scene.half) / scene.step - 0.5), out
+    )
+    return out
+
+
+def normal_points(gaussians: Gaussians) -> np.ndarray:
+    """(7 K, 3) points for `mean_normals`, box frame: each centre, and those a standard deviation along the axes."""
     axes = rotations(gaussians.quaternions.astype(np.float64))  # columns
     arms = (axes * np.exp(gaussians.log_scales.astype(np.float64))[:, None, :]).transpose(0, 2, 1)  # (K, 3, 3)
     arms = np.concatenate([np.zeros_like(arms[:, :1]), arms, -arms], axis=1)
-    points = (gaussians.means[:, None, :] + arms).reshape(-1, 3)
-    rows = _rows(points)
-    rows[:, SEEN] = extinction_at(scene, (points + scene.half) / scene.step - 0.5)
-    rows[:, MASS] = np.maximum(rows[:, SEEN], 1e-6 * max(scene.tables.largest_extinction(), 1e-300))
-    rows[:, FIRST] *= rows[:, [MASS]]
-    first = 7 * np.arange(len(gaussians))
-    mean = _sums(scene, rows, first, first + 7)[:, MEAN]
-    length = np.linalg.norm(mean, axis=1, keepdims=True)
-    found: np.ndarray = np.where(length > 1e-3, mean / np.where(length > 1e-3, length, 1), 0)
+    found: np.ndarray = (gaussians.means[:, None, :] + arms).reshape(-1, 3)
     return found
+
+
+def mean_normals(points: np.ndarray, found: np.ndarray, half: np.ndarray) -> np.ndarray:
+    """(K, 3) unit directions of the mean gradient of the optical mass around Gaussians, box frame; zeros for none.
+
+    Args:
+        points: (7 K, 3) of `normal_points`; the mean over each seven is weighted by the extinction there.
+        found: (7 K, 4) normals and extinction at them.
+        half: (3,) half extents of the box: beyond it nothing counts.
+    """
+    inside = (np.abs(points) < half).all(axis=1)
+    weight = np.where(inside, found[:, 3], 0)
+    weight[::7] = np.maximum(weight[::7], 1e-12)  # where there is nothing, the direction at the centre
+    mean = (weight[:, None] * found[:, :3]).reshape(-1, 7, 3).sum(axis=1) / weight.reshape(-1, 7).sum(axis=1)[:, None]
+    length = np.linalg.norm(mean, axis=1, keepdims=True)
+    result: np.ndarray = np.where(length > 1e-3, mean / np.where(length > 1e-3, length, 1), 0)
+    return result
 
 
 def _rows(points: np.ndarray) -> np.ndarray:
@@ -131,30 +211,6 @@ def _rows(points: np.ndarray) -> np.ndarray:
     rows[:, [MASS, SEEN]] = 1
     rows[:, FIRST] = points
     return rows
-
-
-def extinction_at(scene: Scene, points: np.ndarray) -> np.ndarray:
-    """Extinction (n,) at voxel coordinates (n, 3); 0 outside the box."""
-    inside = ((points > -0.5) & (points < np.array(scene.volume.dims) - 0.5)).all(axis=1)
-    return np.where(inside, optics_at(scene, points)[0], 0)
-
-
-def _width(scene: Scene) -> int:
-    assert scene.light is not None
-    return ARRIVING + len(scene.light.directions)
-
-
-def _sums(
-    scene: Scene, rows: np.ndarray, first: np.ndarray | None = None, last: np.ndarray | None = None
-) -> np.ndarray:
-    """`_shade` of each row, or of the rows from ``first`` to ``last``, over the weight: means (k, 16 + lights)."""
-    assert scene.light is not None
-    if first is None or last is None:
-        first, last = np.arange(len(rows)), np.arange(1, len(rows) + 1)
-    out = np.empty((len(first), _width(scene)))
-    _shade(scene.voxels, scene.light, np.ascontiguousarray(rows), first, last, scene.half, scene.step, out)
-    out /= np.maximum(out[:, :1], np.finfo(np.float64).tiny)
-    return out
 
 
 def _base_rows(tree: Tree, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -166,10 +222,8 @@ def _base_rows(tree: Tree, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return first, last + 1
 
 
-def _colored(gaussians: Gaussians, scene: Scene, out: np.ndarray, degree: int) -> Gaussians:
-    """Gaussians with the colours that the means ``out`` (K, 16 + lights) of `_sums` stand for."""
-    light = scene.light
-    assert light is not None
+def _colored(gaussians: Gaussians, light: Light, out: np.ndarray, degree: int) -> Gaussians:
+    """Gaussians with the colours that the means ``out`` (K, 16 + lights) of `Shading.sums` stand for."""
     colors, terms = out[:, FIXED].copy(), np.zeros((len(out), HARMONICS[degree], 3))
     normals = symmetric(out[:, NORMALS])
     white = np.ones((1, 3))

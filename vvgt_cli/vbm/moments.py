@@ -19,6 +19,7 @@ from vvgt_cli.vbm.pyramid import morton_codes
 from vvgt_cli.vbm.quadrature import block_moments, compact
 
 FINEST_CUT = -4
+WIDE = 3  # exponent of cells whose voxels get one point of quadrature in place of eight
 CHUNK_CELLS, CHUNK_BLOCKS = 1 << 17, 16  # cells of the dense scratch buffer; blocks at least
 MOST_CELLS = 32  # along the edge of a block that is made a cube of cells
 
@@ -32,12 +33,14 @@ class Cells:
         moments: (n, 13) float64 integrals of tau over the cell by `columns` (unit-frame lengths: the mass is an area).
         edge: (3,) cell edge in unit-frame lengths (x, y, z).
         exponent: (3,) int cell edge in voxels = 2^exponent.
+        normals: (n, 3) float64 at their centroids, where light asks for them and the volume is not in memory.
     """
 
     index: np.ndarray
     moments: np.ndarray
     edge: np.ndarray
     exponent: np.ndarray
+    normals: np.ndarray | None = None
 
 
 def exponents(step: np.ndarray, level: int) -> np.ndarray:
@@ -56,8 +59,16 @@ def morton(index: np.ndarray) -> np.ndarray:
     return out
 
 
+def points_of(exponent: np.ndarray) -> int:
+    """Points of quadrature a voxel and axis: of wide cells one, which is quicker and less exact."""
+    return 1 if int(exponent.min()) >= WIDE else 2
+
+
 def base_cells(
-    scene: Scene, exponent: np.ndarray, points_per_voxel: int = 2, progress: Callable[[float], None] | None = None
+    scene: Scene,
+    exponent: np.ndarray,
+    points_per_voxel: int | None = None,
+    progress: Callable[[float], None] | None = None,
 ) -> Cells:
     """Moments of every base cell with extinction (see `Cells`); memory is that of the result plus a fixed scratch.
 
@@ -65,7 +76,8 @@ def base_cells(
     """
     block, _ = blocks(exponent)
     origins = _active_blocks(scene, block)
-    index, moments = region_cells(Region.whole(scene), origins, exponent, points_per_voxel, progress)
+    points = points_per_voxel or points_of(exponent)
+    index, moments = region_cells(Region.whole(scene), origins, exponent, points, progress)
     return Cells(index, moments, 2.0**exponent * scene.step, exponent)
 
 
@@ -77,7 +89,7 @@ class Region:
         voxels, optics: as kernels take them.
         half, step: (3,) of the whole volume, as `Scene` has them.
         begin: (3,) float64 voxel of the whole volume that ``voxels`` begin with, (x, y, z).
-        texels: of an optics grid, which is there as a whole.
+        texels: of an optics grid.
     """
 
     voxels: Voxels
@@ -127,7 +139,7 @@ def region_cells(
         if progress:
             progress(min(first + chunk, len(origins)) / len(origins))
     del scratch
-    return _in_order(np.concatenate(index), moments)
+    return in_order(np.concatenate(index), moments)
 
 
 def _integrate(region: Region, at: np.ndarray, points: np.ndarray, cell: np.ndarray, out: np.ndarray) -> None:
@@ -139,7 +151,7 @@ def _integrate(region: Region, at: np.ndarray, points: np.ndarray, cell: np.ndar
     else:
         from vvgt_cli.vbm.grid import grid_moments  # loaded for what needs it only
 
-        grid_moments(region.texels, at, points, cell, region.half, region.step, out)
+        grid_moments(region.texels, at, points, cell, region.half, region.step, region.begin, out)
 
 
 def blocks(exponent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -154,7 +166,7 @@ def blocks(exponent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.round(cells * cell).astype(np.int64), cells
 
 
-def _in_order(index: np.ndarray, parts: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def in_order(index: np.ndarray, parts: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Indices (n, 3) and the rows of ``parts`` in Morton order; parts are let go of as they are laid in their place."""
     codes = morton(index)
     moments, done = np.empty((len(index), MOMENTS)), 0

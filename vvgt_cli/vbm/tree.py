@@ -48,13 +48,18 @@ def build_tree(cells: Cells, seen: Visibility, step: np.ndarray, levels: int | N
     To the first cell that holds all of them, or so many ``levels``.
     """
     through = seen.at(cells.index, cells.edge / step)
-    keep = np.flatnonzero(through[:, 1] > HIDDEN)
+    keep = shown(cells, seen, step)
     return pyramid(
         cells.index[keep],
         cells.edge,
         lambda moments, top: take_base(cells.moments, keep, through, moments, top),
         levels,
     )
+
+
+def shown(cells: Cells, seen: Visibility, step: np.ndarray) -> np.ndarray:
+    """Rows (n,) int64 of the cells that some view sees: the base of their tree."""
+    return np.flatnonzero(seen.at(cells.index, cells.edge / step)[:, 1] > HIDDEN)
 
 
 def pyramid(
@@ -192,20 +197,24 @@ def leaves_of(tree: Tree, ids: np.ndarray) -> Leaves:
     return Leaves(tree.moments[ids], tree.index[ids], tree.edge[ids], ids)
 
 
-def split(tree: Tree, leaves: Leaves, order: np.ndarray, room: int, scene: Scene, seen: Visibility) -> Leaves:
+def split(tree: Tree, leaves: Leaves, order: np.ndarray, room: int, scene: Scene | None, seen: Visibility) -> Leaves:
     """Replace leaves by their children, in the given order, until ``room`` more leaves are there.
 
-    Children come from the tree, or are integrated from the volume below its base. Leaves without visible children stay.
+    Children come from the tree, or are integrated below its base from a volume that is there. Leaves without visible
+    children stay.
     """
     order = order[: max(room, 0)]  # every split but that of an only child's parent adds one or more
     inside = (leaves.node[order] >= 0) & (tree.children[np.maximum(leaves.node[order], 0)] > 0)
     counts = np.zeros(len(order), np.int64)
     counts[inside] = tree.children[leaves.node[order[inside]]]
     below = np.flatnonzero(~inside)
-    if len(below):  # integrate no more than can be used: most have at least three visible children
+    if len(below) and scene is not None:
+        # integrate no more than can be used: most have at least three visible children
         below = below[: np.searchsorted(np.cumsum(np.where(inside, counts - 1, 2)), room, "right") + 1]
         owner, grown = _children_below(leaves.take(order[below]), scene, seen)
         counts[below] = np.bincount(owner, minlength=len(below))
+    else:
+        below = below[:0]
     splits = np.flatnonzero(counts > 0)
     splits = splits[: np.searchsorted(np.cumsum(counts[splits] - 1), room, "right")]
     parts = []

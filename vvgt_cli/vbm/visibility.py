@@ -12,7 +12,6 @@ import numpy as np
 from vvgt_cli.cameras import Camera
 from vvgt_cli.dvr.kernel import FLAGS, absorbed
 from vvgt_cli.dvr.render import Placed, camera_arrays
-from vvgt_cli.dvr.scene import Scene
 from vvgt_cli.jit.decorators import inlined, kernel
 from vvgt_cli.vbm.columns import MASS
 from vvgt_cli.vbm.moments import Cells
@@ -152,12 +151,18 @@ def _rays_a_cell(edge: np.ndarray, cameras: Sequence[Camera]) -> float:
     )
 
 
-def _mean_extinction(cells: Cells, scene: Scene, wider: int) -> np.ndarray:
+def _mean_extinction(cells: Cells, scene: Placed, wider: int) -> np.ndarray:
     """(nz, ny, nx) float32 mean extinction of cells ``2^wider`` times as wide as ``cells`` along each axis."""
     edge = 2.0 ** (cells.exponent + wider)
-    shape = np.ceil(np.array(scene.values.shape[::-1]) / edge).astype(np.int64)
+    shape = np.ceil(voxels_of(scene) / edge).astype(np.int64)
     mass = summed(cells.index >> wider, cells.moments[:, MASS], shape)
     result: np.ndarray = (mass / (edge * scene.step).prod()).astype(np.float32)
+    return result
+
+
+def voxels_of(box: Placed) -> np.ndarray:
+    """Voxels (3,) along x, y, z of a box."""
+    result: np.ndarray = np.round(2 * np.asarray(box.half) / np.asarray(box.step))
     return result
 
 
@@ -169,14 +174,14 @@ def summed(index: np.ndarray, values: np.ndarray, shape: np.ndarray) -> np.ndarr
 
 
 def visibility(
-    scene: Scene, cells: Cells, cameras: Sequence[Camera], progress: Callable[[float], None] | None = None
+    scene: Placed, cells: Cells, cameras: Sequence[Camera], progress: Callable[[float], None] | None = None
 ) -> Visibility:
     """March every camera (square images of one size) through the mean extinction of cells: what is seen of each.
 
     The cells are ``cells``, or wider by a power of two where these are too many or meet too few rays. ``progress`` is
     told the share that is done.
     """
-    wider = widening(np.array(scene.values.shape[::-1]), cells.exponent, scene.step, cameras)
+    wider = widening(voxels_of(scene), cells.exponent, scene.step, cameras)
     extinction = _mean_extinction(cells, scene, wider)
     return seen_through(extinction, 2.0 ** (cells.exponent + wider), scene, cameras, progress)
 

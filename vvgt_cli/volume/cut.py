@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.volume.stored import Stored, chunks_of, read_block
 from vvgt_cli.volume.types import Volume
 
 Box = tuple[tuple[int | None, int | None], ...]
@@ -40,14 +42,18 @@ def crop(volume: Volume, box: Box) -> Volume:
         raise UsageError(f"--crop from {first} on: nothing of {volume.name}, which has {dims} voxels, is in it")
     index = tuple(slice(a, b) for a, b in reversed(box))
     origin = tuple((volume.affine @ [*first, 1.0])[:3].tolist())
-    return replace(volume, data=volume.data[index], origin=origin)
+    data: Any = volume.data
+    part: Any = data.part(index) if isinstance(data, Stored) else data[index]
+    return replace(volume, data=part, origin=origin)
 
 
-def masked(volume: Volume, mask: Volume) -> Volume:
+def masked(volume: Volume, mask: Volume, stored: bool = False) -> Volume:
     """The volume with NaN where a mask is 0 or not finite; of integers as float32 or float64, which hold them exactly.
 
+    Where it is ``stored``, that is done block by block.
+
     Raises:
-        DataError: a mask of another size, or one that keeps nothing.
+        DataError: a mask of another size, or one that keeps nothing (of a stored one only its blocks know).
     """
     if mask.dims != volume.dims:
         found, wanted = (" x ".join(map(str, v.dims)) for v in (mask, volume))
@@ -55,14 +61,22 @@ def masked(volume: Volume, mask: Volume) -> Volume:
             f"--mask {mask.name}: {found} voxels; expected the {wanted} of {volume.name}: resample it onto that grid"
         )
     small = volume.data.dtype.itemsize <= (4 if volume.data.dtype.kind == "f" else 2)
-    out = np.empty(volume.data.shape, np.float32 if small else np.float64)
-    any_left = False
-    for z in range(len(out)):
+    kind = np.dtype(np.float32 if small else np.float64)
+
+    def block(slices: tuple[slice, ...]) -> np.ndarray:
+        z, y, x = slices
+        lo, hi = np.array([x.start, y.start, z.start]), np.array([x.stop, y.stop, z.stop])
         with np.errstate(invalid="ignore"):
-            value = mask.slope * mask.data[z].astype(np.float64) + mask.intercept
-            keep = np.isfinite(value) & (value != 0)
-        any_left = any_left or bool(keep.any())
-        out[z] = np.where(keep, volume.data[z], np.nan)
-    if not any_left:
+            value = mask.slope * read_block(mask, lo, hi).astype(np.float64) + mask.intercept
+            return np.where(np.isfinite(value) & (value != 0), read_block(volume, lo, hi), np.nan).astype(kind)
+
+    if stored:
+        lazy: Any = Stored(block, kind, volume.data.shape, chunks_of(volume), volume.name)
+        return replace(volume, data=lazy)
+    out = np.empty(volume.data.shape, kind)
+    nx, ny, nz = volume.dims
+    for z in range(nz):
+        out[z : z + 1] = block((slice(z, z + 1), slice(0, ny), slice(0, nx)))
+    if np.isnan(out).all():
         raise DataError(f"--mask {mask.name}: all of it is 0; expected some voxels that are not, to keep")
     return replace(volume, data=out)

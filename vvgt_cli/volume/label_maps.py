@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 
 import numpy as np
 
@@ -41,9 +42,10 @@ def labels_in(volume: Volume) -> list[int]:
     return [int(value) for value in found]
 
 
-def recognised(volume: Volume) -> bool:
-    """Whether a volume is a label map: integers, few of them, and named so."""
+def recognised(volume: Volume, labels: Callable[[Volume], list[int]] = labels_in) -> bool:
+    """Whether a volume is a label map: integers, few of them, and named so; ``labels`` finds those that it holds."""
     if volume.data.dtype.kind not in "iu" or not NAMED.search(volume.name):
         return False
-    first = np.unique(volume.data[len(volume.data) // 2])  # most are told by one slice
-    return len(first) <= FEW and len(labels_in(volume)) <= FEW
+    middle = len(volume.data) // 2
+    first = np.unique(volume.data[middle : middle + 1])  # most are told by one slice
+    return len(first) <= FEW and len(labels(volume)) <= FEW

@@ -52,11 +52,12 @@ def cut(volume: Volume, options: ReadOptions) -> Volume:
         DataError, UsageError: a mask of another size, a crop outside.
     """
     box = None if options.crop is None else parse_crop(options.crop)
-    mask = read_volume(options.mask) if isinstance(options.mask, str) else options.mask
+    how = ReadOptions(stored=options.stored)
+    mask = read_volume(options.mask, how) if isinstance(options.mask, str) else options.mask
     if mask is not None and box is not None and mask.dims == volume.dims:
         mask = crop(mask, box)
     volume = volume if box is None else crop(volume, box)
-    return volume if mask is None else masked(volume, mask)
+    return volume if mask is None else masked(volume, mask, options.stored)
 
 
 def _read(source: str, options: ReadOptions) -> Volume:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 import math
 import mmap
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from vvgt_cli.volume.packed import Packed
 from vvgt_cli.volume.types import Volume
 
 Slices = tuple[slice, ...]
+POINTS_BOX = 64  # voxels along the edge of what is read for the values of some
 MAPPED = 32 << 20  # bytes of a mapped file that are held at once
 
 
@@ -66,6 +67,15 @@ class Stored:
         except Exception as error:  # whatever codecs raise
             raise self._damaged(slices, error) from error
 
+    def part(self, index: Slices) -> Stored:
+        """What three slices with step 1 leave of it, still in its file."""
+        spans = [k.indices(n)[:2] for k, n in zip(index, self.shape, strict=True)]
+
+        def read(slices: Slices) -> np.ndarray:
+            return self[tuple(slice(a + k.start, a + k.stop) for (a, _), k in zip(spans, slices, strict=True))]
+
+        return Stored(read, self.dtype, tuple(b - a for a, b in spans), self.chunks, self.source)
+
     def _damaged(self, slices: Slices, error: Exception) -> DataError:
         """The error of the first chunk in the block that cannot be read."""
         spans = [range(s.start // c, -(-s.stop // c)) for s, c in zip(slices, self.chunks, strict=True)]
@@ -88,6 +98,11 @@ class Stored:
 def readable_in_blocks(volume: Volume) -> bool:
     """Whether parts of a volume's array can be had without the rest: mapped, `Stored`, bricks, or in memory."""
     return not isinstance(volume.data, Packed)
+
+
+def chunks_of(volume: Volume) -> tuple[int, ...]:
+    """Voxels (z, y, x) of what a volume's file packs together; of plain values a slice."""
+    return volume.data.chunks if isinstance(volume.data, Stored) else (1, *volume.data.shape[1:])
 
 
 def lies_in_file(volume: Volume) -> bool:
@@ -118,6 +133,33 @@ def read_block(volume: Volume, lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
         out[z : z + slab] = data[z0 + z : min(z0 + z + slab, z1), y0:y1, x0:x1]
         under.madvise(mmap.MADV_DONTNEED)
     return out
+
+
+def values_at(volume: Volume, index: np.ndarray) -> np.ndarray:
+    """Data values (n,) float64 of voxels ``index`` (n, 3) int, (x, y, z), which lie in the volume."""
+    found = np.empty(len(index))
+    edge = np.array([max(c, POINTS_BOX) for c in chunks_of(volume)[::-1]]) if isinstance(volume.data, Stored) else None
+    if edge is None:
+        x, y, z = index.T
+        stored: np.ndarray = volume.data[z, y, x]
+        found[:] = stored
+        return volume.slope * found + volume.intercept
+    boxes, which = np.unique(index // edge, axis=0, return_inverse=True)
+    order = np.argsort(which.ravel(), kind="stable")
+    for box, rows in zip(boxes, np.split(order, np.cumsum(np.bincount(which.ravel()))[:-1]), strict=True):
+        lo = box * edge
+        part = read_block(volume, lo, np.minimum(lo + edge, volume.dims))
+        x, y, z = (index[rows] - lo).T
+        found[rows] = part[z, y, x]
+    return volume.slope * found + volume.intercept
+
+
+def planes(volume: Volume) -> Iterator[np.ndarray]:
+    """The stored values of each slice (ny, nx), one after the other."""
+    nx, ny, nz = volume.dims
+    depth = chunks_of(volume)[0]
+    for z in range(0, nz, depth):
+        yield from read_block(volume, np.array([0, 0, z]), np.array([nx, ny, min(z + depth, nz)]))
 
 
 def _map_under(data: Any) -> mmap.mmap | None:

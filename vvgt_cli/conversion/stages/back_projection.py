@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from vvgt_cli.conversion.case import Case
 from vvgt_cli.conversion.stage import Cost, Stage, Work
 from vvgt_cli.conversion.stages.refinement import step_seconds
+from vvgt_cli.field.case import Case
 from vvgt_cli.jit.ahead import BACK_PROJECT
 
 STEPS = 105.0  # of gradient descent on whole views that take as long

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from vvgt_cli.conversion.case import Case
 from vvgt_cli.conversion.resume import CELLS, CLOSED_FORM
 from vvgt_cli.conversion.stage import Cost, Stage, Work
 from vvgt_cli.errors import NothingVisible
+from vvgt_cli.field.case import Case
 
 if TYPE_CHECKING:
     from vvgt_cli.vbm import Start
@@ -49,10 +49,10 @@ class ClosedFormStage(Stage):
         Raises:
             NothingVisible: nothing is visible from any view.
         """
-        from vvgt_cli.vbm import Start, VbmOptions, initialise
+        from vvgt_cli.vbm import Start, VbmOptions
         from vvgt_cli.vbm.closed_form import bound
 
-        run, fit, scene = work.run, work.fit, work.scene
+        run, fit, source = work.run, work.fit, work.field.source
         whole = self.anew or (self.cut and work.checkpoint.load(CELLS) is None)
         kept = None if whole else work.checkpoint.load(CLOSED_FORM)
         if kept:
@@ -64,9 +64,9 @@ class ClosedFormStage(Stage):
             max_gaussians=fit.max_gaussians, size=fit.size, method=fit.init, seed=fit.seed, degree=work.degree
         )
         with run.stage(self.name) as stage:
-            start = initialise(scene, options, progress=run.console.bar(self.name))
+            start = work.field.start(options, run.console.bar(self.name))
             if not len(start.gaussians):
-                raise NothingVisible(scene.volume.name, scene.tf.name)
+                raise NothingVisible(source.volume.name, source.name)
             found = len(start.gaussians)
             start, spared = thinned(start)
             stage.note = f"{len(start.gaussians)} Gaussians ({fit.init})"

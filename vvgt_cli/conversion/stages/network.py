@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
-from vvgt_cli.conversion.case import Case
 from vvgt_cli.conversion.stage import Cost, Stage, Work
+from vvgt_cli.field.case import Case
 
 SECONDS = 0.2, 2.1  # always, per 100,000 Gaussians (docs/network.md)
 
@@ -41,12 +41,12 @@ class Network(Stage):
 
         assert work.train is not None
         assert work.train_rule is not None
-        run, given = work.run, work.made()
+        run, given, train = work.run, work.made(), work.train
         with run.stage(self.name) as stage:
             model = Model.open(find_model(self.model), numba.get_num_threads())
-            better = model.improve(
-                given, work.train.cameras, work.train.images, progress=run.console.bar(self.name), rule=work.train_rule
-            )
+            bar, plain = run.console.bar(self.name), given.of_degree(0)  # it knows nothing of harmonics
+            better = model.improve(plain, train.cameras, train.images, progress=bar, rule=work.train_rule)
+            better = replace(better, harmonics=given.harmonics)
             before, after = work.psnr(given), work.psnr(better)
             stage.kept = work.keep_better(before, after, better)
             stage.psnr_before, stage.psnr = before, after

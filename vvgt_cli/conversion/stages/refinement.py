@@ -8,9 +8,9 @@ from typing import ClassVar
 import numpy as np
 
 from vvgt_cli.cameras import default_views
-from vvgt_cli.conversion.case import Case, view_edge
 from vvgt_cli.conversion.stage import Cost, Stage, Work
 from vvgt_cli.descent import OptimizeOptions, OptimizeRecord, optimize
+from vvgt_cli.field.case import Case, view_edge
 from vvgt_cli.gaussians import Gaussians, as_stored
 from vvgt_cli.runs.record import Run
 from vvgt_cli.runs.views import Views

@@ -6,10 +6,12 @@ from dataclasses import asdict, dataclass
 from typing import ClassVar
 
 from vvgt_cli.cameras.blocks import FEW
-from vvgt_cli.conversion.case import Case
+from vvgt_cli.conversion.request import FitOptions
 from vvgt_cli.conversion.stage import Cost, Stage, Work
-from vvgt_cli.runs.score import WHOLE, psnr_note, score_test_views
-from vvgt_cli.runs.seats import PREVIEW_VIEWS, SIDE, from_above, score_seats, seat_views
+from vvgt_cli.field.case import Case
+from vvgt_cli.field.field import Picture
+from vvgt_cli.runs.score import WHOLE, psnr_note, score_test_views, scored
+from vvgt_cli.runs.seats import PREVIEW_VIEWS, SIDE, from_above, score_seats, seat_pictures, seat_views
 
 SCORE, SCORE_ALL = (3, 0, 0.03), (10, len(WHOLE), 0.1)  # views, whole ones of them, seconds beside per 400 x 400 px
 SEATS = 2, 0.15, 0.155  # check views, and seconds beside them: always, per 100,000 Gaussians
@@ -34,6 +36,13 @@ class TestViews(Stage):
         pixels = whole * case.size**2 + (views - whole) * case.judged
         return Cost(case.judging(pixels) + case.pace * beside * pixels / 400**2)
 
+    def views(self, fit: FitOptions) -> list[Picture]:
+        """What is scored."""
+        from vvgt_cli.dvr import RenderSettings
+
+        only = None if self.whole else PREVIEW_VIEWS
+        return [Picture(camera, RenderSettings(), part) for _, camera, part in scored(fit.size, self.whole, only)]
+
     def run(self, work: Work) -> None:
         """Score."""
         from vvgt_cli.dvr import RenderSettings
@@ -41,7 +50,7 @@ class TestViews(Stage):
         fit, run = work.fit, work.run
         with run.stage(self.name) as stage:
             scores = score_test_views(
-                work.scene,
+                work.field,
                 work.made(),
                 fit.size,
                 RenderSettings(),
@@ -65,6 +74,13 @@ class Seats(Stage):
         """By pixels and Gaussians."""
         return Cost(SEATS[0] * case.glance + case.pace * (SEATS[1] + SEATS[2] * case.gaussians / 1e5))
 
+    def views(self, fit: FitOptions) -> list[Picture]:
+        """What is scored."""
+        from vvgt_cli.dvr import RenderSettings
+
+        wanted = seat_pictures(from_above(fit.size), SIDE, FEW)
+        return [Picture(camera, RenderSettings(), blocks) for _, camera, blocks in wanted]
+
     def run(self, work: Work) -> None:
         """Score."""
         run, budget = work.run, work.limits.time_budget
@@ -72,7 +88,7 @@ class Seats(Stage):
             run.leave_out(self.name, "time is up")
             return
         with run.stage(self.name) as stage:
-            seen = seat_views(work.scene, from_above(work.fit.size), views=SIDE, enough=FEW)
+            seen = seat_views(work.field, from_above(work.fit.size), views=SIDE, enough=FEW)
             seats = score_seats(work.made(), seen)
             run.report.seats = [asdict(seat) for seat in seats]
             stage.note = f"worst of {len(seats)}: {seats[0].name()}, {seats[0].psnr:.2f} dB"

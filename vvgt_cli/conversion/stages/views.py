@@ -7,17 +7,20 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from vvgt_cli.cameras import default_views
-from vvgt_cli.cameras.blocks import spread_blocks
+from vvgt_cli.cameras import Camera, default_views
+from vvgt_cli.cameras.blocks import Blocks, spread_blocks
 from vvgt_cli.cameras.sets import SET_VIEWS
-from vvgt_cli.conversion.case import Case, view_edge
+from vvgt_cli.conversion.request import FitOptions
 from vvgt_cli.conversion.stage import Cost, Stage, Work
+from vvgt_cli.field.case import Case, view_edge
+from vvgt_cli.field.field import Picture
 from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.runs.views import VIEW_BYTES, Views, judging_views
+from vvgt_cli.runs.views import VIEW_BYTES, Views, judged, judging_views
 from vvgt_cli.splat.rules import Rule
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import RenderSettings, Scene
+    from vvgt_cli.dvr.render import Viewed
 
 REFINE_VIEWS = 120  # training views of gradient descent at most
 A_STEP = 0.65, 0.85  # of them, small and large: fewer are learned by heart, more take the time of steps (docs/log.md)
@@ -51,6 +54,14 @@ class CheckViews(Stage):
         count = SET_VIEWS["check"]
         return Cost(count * case.glance, (count * case.glanced + case.size**2) * VIEW_BYTES)
 
+    def views(self, fit: FitOptions) -> list[Picture]:
+        """They."""
+        from vvgt_cli.dvr import RenderSettings
+        from vvgt_cli.dvr.render import FIT_VIEWS
+
+        settings = RenderSettings() if self.fine else FIT_VIEWS
+        return [Picture(camera, settings, part) for camera, part in judged(default_views("check", size=fit.size))]
+
     def run(self, work: Work) -> None:
         """Render them."""
         from vvgt_cli.dvr import RenderSettings
@@ -59,7 +70,7 @@ class CheckViews(Stage):
         size = work.fit.size
         cameras = default_views("check", size=size)
         with work.run.stage(self.name) as stage:
-            work.check = judging_views(work.scene, cameras, RenderSettings() if self.fine else FIT_VIEWS)
+            work.check = judging_views(work.field, cameras, RenderSettings() if self.fine else FIT_VIEWS)
             stage.note = f"{len(cameras)} of {size} px" + (", blocks of them" if work.check.blocks else "")
 
 
@@ -86,6 +97,16 @@ class TrainingViews(Stage):
         """With their number and size."""
         return f"{self.count} views of {self.edge} px"
 
+    def views(self, fit: FitOptions) -> list[Picture]:
+        """They, with one ray a pixel, and what says whether that is enough."""
+        from vvgt_cli.dvr.render import FIT_VIEWS
+
+        found = [Picture(camera, FIT_VIEWS) for camera in default_views("train", self.count, size=self.edge)]
+        if self.fitted:
+            camera, blocks = _probe(self.edge)
+            found += [Picture(camera, settings, blocks) for settings in _tried(_spread(self.edge / fit.size))]
+        return found
+
     def run(self, work: Work) -> None:
         """Render them, as finely as the Gaussians ask for."""
         from vvgt_cli.dvr import render_views
@@ -95,17 +116,36 @@ class TrainingViews(Stage):
         work.train_rule = work.rule.at(footprint)
         settings = FIT_VIEWS
         if self.fitted:
-            spread = 1.0 if footprint >= LARGE else footprint
-            settings = fine_enough(work.scene, work.made(), self.edge, work.train_rule, spread)
+            settings = fine_enough(work.field, work.made(), self.edge, work.train_rule, _spread(footprint))
         cameras = default_views("train", self.count, size=self.edge)
         with work.run.stage(self.name) as stage:
-            images = render_views(work.scene, cameras, settings, progress=work.run.console.bar(self.name))
+            images = render_views(work.field, cameras, settings, progress=work.run.console.bar(self.name))
             rays = "one ray" if settings.samples == 1 else "adaptive rays"
             stage.note = f"{self.count} of {self.edge} px to fit to, {rays} a pixel, steps of {settings.step:g}"
         work.train = Views(cameras, images)
 
 
-def fine_enough(scene: Scene, start: Gaussians, size: int, rule: Rule, footprint: float = 1.0) -> RenderSettings:
+def _spread(footprint: float) -> float:
+    """Part of a pixel's edge that the rays of a training view cover, which is ``footprint`` of the screen's size."""
+    return 1.0 if footprint >= LARGE else footprint
+
+
+def _probe(size: int) -> tuple[Camera, Blocks | None]:
+    """The check view, and the blocks of it, that settings are tried on."""
+    return default_views("check", size=size)[0], spread_blocks(size, size, enough=PROBED)
+
+
+def _tried(footprint: float) -> tuple[RenderSettings, RenderSettings, RenderSettings]:
+    """Adaptive rays, and one a pixel with longer and shorter steps."""
+    from vvgt_cli.dvr import RenderSettings
+    from vvgt_cli.dvr.render import FIT_VIEWS
+
+    return RenderSettings(footprint=footprint), FIT_VIEWS, RenderSettings(samples=1)
+
+
+def fine_enough(
+    scene: Scene | Viewed, start: Gaussians, size: int, rule: Rule, footprint: float = 1.0
+) -> RenderSettings:
     """One ray a pixel where its error is `MARGIN` or `SAMPLES` below that of ``start``, else adaptive rays.
 
     The error is that of a check view of ``size`` px drawn by ``rule``, against the same finely rendered. Gradient
@@ -113,22 +153,20 @@ def fine_enough(scene: Scene, start: Gaussians, size: int, rule: Rule, footprint
     `LONGER` below that too with steps of a voxel, these are taken. Rays are spread over ``footprint`` of a pixel's
     edge: views are samples of the screen's pixels, not means over their own.
     """
-    from vvgt_cli.dvr import RenderSettings, render_view
-    from vvgt_cli.dvr.render import FIT_VIEWS
+    from vvgt_cli.dvr import render_view
     from vvgt_cli.metrics import psnr
     from vvgt_cli.splat import render
 
-    camera = default_views("check", size=size)[0]
-    blocks = spread_blocks(size, size, enough=PROBED)
+    camera, blocks = _probe(size)
 
     def picked(image: np.ndarray) -> np.ndarray:
         return (image if blocks is None else blocks.pick(image))[..., :3]
 
-    many = RenderSettings(footprint=footprint)
+    many, longer, shorter = _tried(footprint)
     fine = picked(render_view(scene, camera, many, blocks))
     wanted = psnr(fine, picked(render(start, camera, rule, blocks=blocks)))
     wanted += MARGIN if footprint == 1 else SAMPLES
-    for single, more in ((FIT_VIEWS, LONGER), (RenderSettings(samples=1), 0.0)):
+    for single, more in ((longer, LONGER), (shorter, 0.0)):
         if psnr(fine, picked(render_view(scene, camera, single, blocks))) >= wanted + more:
             return single
     return many

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from vvgt_cli.errors import UsageError
+from vvgt_cli.field.grid import TILE_VOXELS, Boxes, CellGrid, Triple, piece_edge, tile_bits
 from vvgt_cli.resources import free_memory
-from vvgt_cli.scale.grid import TILE_VOXELS, Boxes, CellGrid, Triple, tile_bits
 from vvgt_cli.volume import Volume
 from vvgt_cli.volume.stored import Stored
 
@@ -19,7 +19,6 @@ MAX_FIELD = 1 << 24  # cells of the field of opacity
 A_BLOCK = 0.3  # of the memory of a worker: what its voxels may take; as much again where they are converted
 COUNTED = 3  # bytes a voxel, of types that are counted, beside it
 ALWAYS = 400 << 20  # bytes: coarse grids, a tile's tree, a batch of Gaussians
-WIDE = 3  # exponent of cells whose voxels get one point of quadrature in place of eight: quicker, less exact
 
 
 @dataclass(frozen=True)
@@ -47,8 +46,10 @@ class BlockOptions:
             raise UsageError(f"--blocks {self.size}: expected auto, or a power of two from {SMALLEST} on")
 
 
-def block_edge(volume: Volume, options: BlockOptions) -> int:
+def block_edge(volume: Volume, options: BlockOptions, voxel: int | None = None) -> int:
     """Voxels along the edge of a block (of rows of which the file is mapped: across them).
+
+    ``voxel``: bytes that one takes, None: by the volume's type.
 
     Raises:
         UsageError: not even the smallest fits the memory.
@@ -58,11 +59,11 @@ def block_edge(volume: Volume, options: BlockOptions) -> int:
         return options.size or SHARED
     room = A_BLOCK * max(free - ALWAYS, 0) / max(options.workers if options.scheduler in (None, "local") else 1, 1)
     edge = LARGEST
-    while edge > SMALLEST and block_bytes(volume, edge) > room:
+    while edge > SMALLEST and block_bytes(volume, edge, voxel) > room:
         edge //= 2
     whole = max(edge, 1 << TILE_VOXELS)  # what is integrated at once is whole tiles
-    if block_bytes(volume, whole) > max(free - ALWAYS, 0):
-        need = block_bytes(volume, whole) + ALWAYS
+    if block_bytes(volume, whole, voxel) > max(free - ALWAYS, 0):
+        need = block_bytes(volume, whole, voxel) + ALWAYS
         raise UsageError(
             f"blocks of {whole} voxels and the coarse grids need about {need >> 20} MiB of memory, {free >> 20} MiB "
             f"are free; give the job {(need - free >> 20) + 1} MiB more"
@@ -70,12 +71,12 @@ def block_edge(volume: Volume, options: BlockOptions) -> int:
     return edge
 
 
-def block_bytes(volume: Volume, edge: int) -> int:
-    """Bytes that a block takes while it is integrated."""
+def block_bytes(volume: Volume, edge: int, voxel: int | None = None) -> int:
+    """Bytes that a block takes while it is integrated; ``voxel`` of which a voxel."""
     sizes = [min(e + 2, n) for e, n in zip(shape_of(volume, edge), volume.dims, strict=True)]
     one = volume.data.dtype.itemsize
     beside = 0 if volume.data.dtype == np.float32 else 4 if one > 2 else COUNTED
-    return math.prod(sizes) * (one + beside)
+    return math.prod(sizes) * (voxel or one + beside)
 
 
 def shape_of(volume: Volume, edge: int) -> Triple:
@@ -98,18 +99,21 @@ def slices_at_once(volume: Volume, edge: int, boxes: Boxes) -> int:
     return max(math.prod(shape_of(volume, edge)) // (x * y), 1)
 
 
-def cell_grid(volume: Volume, exponent: np.ndarray, edge: int, march: int) -> CellGrid:
-    """The grid of base cells of 2^``exponent`` (3,) voxels, in blocks of about ``edge`` voxels and whole tiles."""
+def cell_grid(volume: Volume, exponent: np.ndarray, edge: int, march: int, least: int = 1) -> CellGrid:
+    """The grid of base cells of 2^``exponent`` (3,) voxels, in blocks of about ``edge`` voxels.
+
+    Blocks are of whole tiles, pieces of rays, and cubes of ``least`` voxels: all of powers of two.
+    """
     from vvgt_cli.vbm.inset import averaged_down
-    from vvgt_cli.vbm.moments import blocks
+    from vvgt_cli.vbm.moments import blocks, points_of
 
     frame = volume.unit_frame()
     step = np.array(frame.step)
     field = averaged_down(2.0**exponent * step, np.array(frame.half), MAX_FIELD)
     bits = tile_bits(exponent, max(march, field, int(blocks(exponent)[1].max()).bit_length() - 1))
     tile = np.round(2.0 ** (exponent + bits)).astype(np.int64)
-    wanted = np.array(shape_of(volume, edge))
-    x, y, z = (int(t * max(w // t, 1)) for t, w in zip(tile, wanted, strict=True))
+    whole = np.maximum(tile, max(piece_edge(volume.dims), least))
+    x, y, z = (int(t * max(w // t, 1)) for t, w in zip(whole, shape_of(volume, edge), strict=True))
     i, j, k = (int(e) for e in exponent)
-    points = 1 if min(i, j, k) >= WIDE else 2
+    points = points_of(exponent)
     return CellGrid(Boxes(volume.dims, (x, y, z)), (i, j, k), frame.half, frame.step, points, march, field, bits)

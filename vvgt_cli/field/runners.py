@@ -13,7 +13,12 @@ IDLE = 3  # pools that broke one after the other without a block done: it is not
 
 
 class Task(Protocol):
-    """Does one block and leaves its part."""
+    """Does one block and leaves its part, of a kind."""
+
+    @property
+    def kind(self) -> str: ...
+
+    def __len__(self) -> int: ...
 
     def __call__(self, number: int) -> None: ...
 

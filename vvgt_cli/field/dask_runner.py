@@ -14,8 +14,8 @@ from contextlib import ExitStack, suppress
 from typing import Any
 
 from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.field.runners import Progress, Task
 from vvgt_cli.resources import asked_memory
-from vvgt_cli.scale.runners import Progress, Task
 
 LOCAL, SLURM = "local", "slurm"
 AGAIN = 30.0  # seconds until a job that has ended is followed by another

@@ -15,8 +15,8 @@ import numpy as np
 TILE_BITS = 6  # a tile has at most 2^6 base cells along its edge
 TILE_VOXELS = 7  # and 2^7 voxels, where it has 2^3 cells or more: memory holds blocks of whole tiles
 FEWEST_BITS = 3
-SAMPLES = 4096  # bricks, at most, that the share of visible voxels is estimated from
-SAMPLE = 9  # voxels along their edge
+PIECES = 8  # along the longest axis, into which rays are cut; each of a power of two voxels
+SMALLEST_PIECE, LARGEST_PIECE = 16, 128
 Triple = tuple[int, int, int]
 
 
@@ -112,28 +112,9 @@ def tile_bits(exponent: np.ndarray, least: int) -> int:
     return max(min(TILE_BITS, TILE_VOXELS - int(exponent.max())), FEWEST_BITS, least)
 
 
-def sample_spacing(dims: Triple) -> int:
-    """Voxels between two bricks of samples."""
-    spacing = 16
-    while math.prod(-(-n // spacing) for n in dims) > SAMPLES:
-        spacing *= 2
-    return spacing
-
-
-def samples_in(dims: Triple, lo: np.ndarray, hi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """First voxels (n, 3) of the bricks of samples in a box from ``lo`` to ``hi`` (3,), and what each stands for, (n,).
-
-    One lies in the middle of every cube of `sample_spacing` voxels, of which the box holds whole ones; at the volume's
-    end it is moved into what is left of the cube, or there is none.
-    """
-    spacing, axes, weights = sample_spacing(dims), [], []
-    for n, a, b in zip(dims, lo, hi, strict=True):
-        begin = np.arange(a, b, spacing)
-        end = np.minimum(begin + spacing, n)
-        first = np.minimum(begin + (spacing - SAMPLE) // 2, np.maximum(end - min(SAMPLE, n), 0))
-        fits = (first >= begin) | (n <= SAMPLE)
-        axes.append(first[fits])
-        weights.append((end - begin)[fits].astype(np.float64))
-    places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    x, y, z = weights
-    return places, (x[:, None, None] * y[:, None] * z).ravel()
+def piece_edge(dims: Triple) -> int:
+    """Voxels along the edge of the pieces that rays are cut into: they follow from the volume, not from the blocks."""
+    edge = SMALLEST_PIECE
+    while edge < LARGEST_PIECE and edge * PIECES < max(dims):
+        edge *= 2
+    return edge

@@ -36,6 +36,8 @@ class Case:
         pace: how many times as long as the machine of the fit this one takes.
         there: bytes that the program and the volume have taken when the plan is made.
         degree: of the Gaussians' harmonics.
+        visible: voxels that have extinction, about.
+        step: (3,) voxel edges, unit frame.
     """
 
     gaussians: int
@@ -46,6 +48,8 @@ class Case:
     pace: float = 1.0
     there: float = PROGRAM
     degree: int = 0
+    visible: float = 0.0
+    step: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
     @property
     def edge(self) -> int:
@@ -93,25 +97,28 @@ def expected_wide(gaussians: int, size: int) -> bool:
 def measure(scene: Scene, size: int, gaussians: int) -> Case:
     """The case of a scene: counted, a small view timed, the machine's pace by a picture of Gaussians."""
     from vvgt_cli.dvr.layout import BRICK
-    from vvgt_cli.vbm.closed_form import expected_cells
+    from vvgt_cli.vbm.samples import visible_voxels
 
-    cells = expected_cells(scene, size, gaussians)
-    return Case(
-        gaussians=int(min(gaussians, cells)),
-        cells=cells,
+    x, y, z = (float(edge) for edge in scene.step)
+    case = Case(
+        gaussians=gaussians,
+        cells=0.0,
         voxels=float(np.count_nonzero(scene.empty == 0)) * BRICK**3,
         size=size,
         view=VIEW * _view_seconds(scene, view_edge(size, small=False)),
-        pace=_pace(),
+        pace=pace(),
         there=PROGRAM + _volume_bytes(scene),
+        visible=visible_voxels(scene),
+        step=(x, y, z),
     )
+    return for_budget(case, gaussians)
 
 
-def with_fewer(case: Case, scene: Scene, gaussians: int) -> Case:
+def for_budget(case: Case, gaussians: int) -> Case:
     """The same case with another budget; nothing is timed again."""
     from vvgt_cli.vbm.closed_form import expected_cells
 
-    cells = expected_cells(scene, case.size, gaussians)
+    cells = expected_cells(case.visible, np.array(case.step), case.size, gaussians)
     return replace(case, cells=cells, gaussians=int(min(gaussians, cells)))
 
 
@@ -143,7 +150,7 @@ def _quickest(call: Callable[[], object], calls: int = 3) -> float:
     return min(taken)
 
 
-def _pace() -> float:
+def pace() -> float:
     """How many times as long as the machine of the fit this one takes: to draw Gaussians, on as many threads."""
     from vvgt_cli.cameras import default_views
     from vvgt_cli.splat import render

@@ -16,9 +16,8 @@ from vvgt_cli.files import atomic_write
 from vvgt_cli.vbm.columns import MOMENTS
 
 RUN = "run.json"
-COUNTS, HISTOGRAM, CELLS = "counts", "histogram", "cells"
+COUNTS, HISTOGRAM, LABELS, CELLS = "counts", "histogram", "labels", "cells"
 ROW = MOMENTS * 8 + 3  # bytes a cell: moments float64, place in its tile uint8
-PASSES = (COUNTS, HISTOGRAM, CELLS)
 
 
 @dataclass(frozen=True)
@@ -56,8 +55,7 @@ class Parts:
                 shutil.rmtree(self.folder, ignore_errors=True)
         there = place.is_file()
         try:
-            for name in PASSES:
-                (self.folder / name).mkdir(parents=True, exist_ok=True)
+            self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise DataError(f"{self.folder}: cannot be made ({error.strerror or error})") from error
         if not there:
@@ -91,6 +89,17 @@ class Parts:
     def path(self, kind: str, number: int, suffix: str = ".npz") -> Path:
         """Of a part."""
         return self.folder / kind / f"{number:06d}{suffix}"
+
+    def prepare(self, kind: str) -> None:
+        """Make the folder of a pass.
+
+        Raises:
+            DataError: the system refuses.
+        """
+        try:
+            (self.folder / kind).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise DataError(f"{self.folder}: cannot be written ({error.strerror or error})") from error
 
     def missing(self, kind: str, numbers: Iterable[int]) -> list[int]:
         """Those of ``numbers`` that are not there."""
@@ -138,7 +147,8 @@ class Parts:
 
     def bytes(self, kind: str) -> int:
         """Of all that lies there of a pass and is whole."""
-        whole = (path for path in (self.folder / kind).iterdir() if not path.name.startswith("."))
+        folder = self.folder / kind
+        whole = (path for path in (folder.iterdir() if folder.is_dir() else ()) if not path.name.startswith("."))
         return sum(path.stat().st_size for path in whole)
 
     def remove(self) -> None:

@@ -1,0 +1,237 @@
+"""Every feature with a volume in memory and in blocks: it works, and the errors of the two agree."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vvgt_cli.images import read_exr, read_png
+
+nib = pytest.importorskip("nibabel")
+tifffile = pytest.importorskip("tifffile")
+
+DIMS = (28, 24, 30)  # z, y, x: eight blocks of 16 voxels
+AGREE, CLOSER = 0.1, 0.3  # dB: of the test views, and of the worst viewing condition, where single pixels decide
+SMALL = ("--size", "64", "--max-gaussians", "800", "--steps", "30")
+BLOCKS = ("--blocks", "16")
+RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
+
+
+def function(*points):
+    """JSON of a function: (value, opacity, r, g, b) each."""
+    return json.dumps({"points": [{"x": x, "opacity": a, "rgb": rgb} for x, a, *rgb in points]})
+
+
+TF = function((0, 0, 0.2, 0.3, 0.9), (0.25, 0, 0.4, 0.3, 0.6), (0.6, 0.3, 0.9, 0.4, 0.2), (1, 0.8, 1, 0.9, 0.6))
+OTHER = function((0, 0, 0.9, 0.3, 0.1), (0.5, 0, 0.9, 0.3, 0.1), (1, 0.9, 0.2, 0.9, 0.6))
+
+
+def ball(center, radius):
+    z, y, x = (axis - c for axis, c in zip(np.indices(DIMS).astype(float), center, strict=True))
+    return np.clip(1.5 - np.sqrt(z * z + y * y + x * x) / radius, 0, 1)
+
+
+def nifti(path, data):
+    """Data (z, y, x[, t]) as NIfTI has them."""
+    order = (2, 1, 0, *range(3, data.ndim))
+    nib.save(nib.Nifti1Image(np.ascontiguousarray(data.transpose(order)), RAS), path)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    """Two balls that touch, as scalars, labels, colours, channels and a series."""
+    folder = tmp_path_factory.mktemp("matrix")
+    one, two = ball((13, 11, 11), 6), ball((17, 14, 21), 5)
+    values = np.maximum(one, 0.7 * two)
+    labels = (one > 0.5) + 2 * ((two > 0.5) & (one <= 0.5)) + 2 * (ball((13, 11, 11), 3) > 0.5)
+    nifti(folder / "scalars.nii", values.astype(np.float32))
+    nifti(folder / "labels.nii", labels.astype(np.uint8))
+    nifti(folder / "mask.nii", (np.indices(DIMS)[2] > 9).astype(np.uint8))
+    nifti(folder / "four.nii", np.stack([values, np.roll(values, 2, axis=1)], axis=-1).astype(np.float32))
+    for k in range(2):
+        nifti(folder / f"labels_{k}.nii", np.roll(labels, k, axis=1).astype(np.uint8))
+        colors = np.stack([values * 255, 200 * (values > 0) * (1 - values), values * 128], axis=-1).astype(np.uint8)
+        tifffile.imwrite(folder / f"rgb_{k}.tif", np.roll(colors, k, axis=1), photometric="rgb")
+    (folder / "tf.json").write_text(TF)
+    (folder / "other.json").write_text(OTHER)
+    return folder
+
+
+@pytest.fixture
+def at(data, monkeypatch):
+    monkeypatch.chdir(data)
+    return data
+
+
+# name: (volume, options); all of `convert`, to one .ply
+ROWS = {
+    "function": ("scalars.nii", ("--tf", "tf.json")),
+    "no function": ("scalars.nii", ()),
+    "headlight": ("scalars.nii", ("--tf", "tf.json", "--light", "headlight")),
+    "directions": ("scalars.nii", ("--tf", "tf.json", "--light", "1,1,2", "--light", "left")),
+    "shadows": ("scalars.nii", ("--tf", "tf.json", "--light", "above", "--shadows")),
+    "occlusion": ("scalars.nii", ("--tf", "tf.json", "--light", "headlight", "--ambient-occlusion", "0.3")),
+    "labels": ("labels.nii", ("--labels", "auto")),
+    "recognised labels": ("labels.nii", ()),
+    "labels, lit": ("labels.nii", ("--labels", "auto", "--light", "headlight")),
+    "layers": ("scalars.nii", ("--tf", "tf.json", "--layer", "labels.nii,labels=auto")),
+    "layers, lit": ("scalars.nii", ("--tf", "tf.json", "--layer", "labels.nii,labels=auto", "--light", "above")),
+    "colours": ("rgb_0.tif", ()),
+    "colours, lit": ("rgb_0.tif", ("--light", "headlight")),
+    "channels": ("rgb_0.tif", ("--component", "all")),
+    "a channel": ("rgb_0.tif", ("--component", "0")),
+    "time": ("four.nii", ("--time", "1", "--tf", "tf.json")),
+    "crop": ("scalars.nii", ("--tf", "tf.json", "--crop", "3:28,:,2:")),
+    "mask": ("scalars.nii", ("--tf", "tf.json", "--mask", "mask.nii")),
+    "masked labels": ("labels.nii", ("--labels", "auto", "--mask", "mask.nii")),
+    "target": ("scalars.nii", ("--tf", "tf.json", "--target-psnr", "35")),
+    "size": ("scalars.nii", ("--tf", "tf.json", "--max-size", "0.05")),
+    "steps": ("scalars.nii", ("--tf", "tf.json", "--steps", "12")),
+    "no steps": ("scalars.nii", ("--tf", "tf.json", "--steps", "0")),
+    "wavelet": ("scalars.nii", ("--tf", "tf.json", "--init", "wavelet")),
+    "uniform": ("scalars.nii", ("--tf", "tf.json", "--init", "uniform")),
+    "wavelet, lit": ("scalars.nii", ("--tf", "tf.json", "--init", "wavelet", "--light", "headlight")),
+    "model": ("scalars.nii", ("--tf", "tf.json", "--model", "vvgt-small")),
+    "model, lit": ("scalars.nii", ("--tf", "tf.json", "--model", "vvgt-small", "--light", "headlight")),
+    "rule": ("scalars.nii", ("--tf", "tf.json", "--rule", "playcanvas")),
+    "harmonics": ("scalars.nii", ("--tf", "tf.json", "--light", "headlight", "--sh-degree", "3")),
+    "world": ("scalars.nii", ("--tf", "tf.json", "--frame", "world", "--up", "superior")),
+}
+
+
+def converted(vvgt, volume, options, out: Path, *more):
+    """The report of a conversion."""
+    report = out.with_suffix(".report.json")
+    found = vvgt("convert", volume, *options, *SMALL, *more, "-o", out, "--report", report, "--overwrite")
+    assert found.code == 0, found.err
+    return json.loads(report.read_text())
+
+
+@pytest.mark.parametrize("row", ROWS)
+def test_a_feature_works_in_memory_and_in_blocks_and_errors_agree(vvgt, at, tmp_path, row):
+    volume, options = ROWS[row]
+    memory = converted(vvgt, volume, options, tmp_path / "memory.ply")
+    blocks = converted(vvgt, volume, options, tmp_path / "blocks.ply", *BLOCKS)
+    assert abs(memory["scores"]["psnr"] - blocks["scores"]["psnr"]) <= AGREE
+    assert abs(memory["seats"][0]["psnr"] - blocks["seats"][0]["psnr"]) <= CLOSER
+    assert memory["scores"]["psnr"] > 20
+    assert [stage["name"] for stage in memory["stages"] if stage["name"] not in ("scene", "compile")] == [
+        stage["name"] for stage in blocks["stages"] if stage["name"] != "compile"
+    ]
+    assert not [path for path in tmp_path.iterdir() if path.name.endswith(".blocks")]
+
+
+FEW = ("function", "shadows", "labels, lit", "layers, lit", "colours", "masked labels", "wavelet, lit")
+
+
+@pytest.mark.parametrize("row", [row if row in FEW else pytest.param(row, marks=pytest.mark.long) for row in ROWS])
+def test_the_bytes_do_not_depend_on_the_blocks(vvgt, at, tmp_path, row):
+    volume, options = ROWS[row]
+    files = []
+    for blocks in (("16",), ("32",), ("16", "--workers", "2")) if row == FEW[0] else (("16",), ("32",)):
+        out = tmp_path / f"{'-'.join(blocks)}.ply"
+        found = vvgt("convert", volume, *SMALL, *options, "--blocks", *blocks, "-o", out)
+        assert found.code == 0, found.err
+        files.append(out.read_bytes())
+    assert len(set(files)) == 1
+
+
+@pytest.mark.parametrize("blocks", [(), BLOCKS], ids=["memory", "blocks"])
+class TestEitherWay:
+    """What has no error of its own to compare."""
+
+    @pytest.mark.parametrize("ending", [".html", ".spz", ".compressed.ply", ".glb", ".usdc"])
+    def test_every_format(self, vvgt, at, tmp_path, blocks, ending):
+        found = vvgt("convert", "scalars.nii", "--tf", "tf.json", *SMALL, *blocks, "-o", tmp_path / f"x{ending}")
+        assert found.code == 0, found.err
+        assert "the format costs" in found.err
+        assert [path.name for path in tmp_path.iterdir()] == [f"x{ending}"]
+
+    def test_preview_and_checkpoint(self, vvgt, at, tmp_path, blocks):
+        found = vvgt(
+            "convert", "scalars.nii", "--tf", "tf.json", *SMALL, *blocks, "-o", tmp_path / "x.ply",
+            "--preview", tmp_path / "x.png", "--checkpoint", tmp_path / "kept",
+        )  # fmt: skip
+        assert found.code == 0, found.err
+        picture = read_png(tmp_path / "x.png")
+        assert picture.shape[:2] == (3 * 64, 3 * 64)
+        assert picture[:, :64].max() > 0.5
+        assert np.abs(picture[:, :64] - picture[:, 64:128]).mean() < 0.02
+
+    def test_time_budget_and_dry_run(self, vvgt, at, tmp_path, blocks):
+        base = ("convert", "scalars.nii", "--tf", "tf.json", "--size", "64", "--max-gaussians", "800", *blocks)
+        found = vvgt(*base, "--time-budget", "60", "-o", tmp_path / "x.ply")
+        assert found.code == 0, found.err
+        found = vvgt(*base, "--dry-run", "-o", tmp_path / "y.ply")
+        assert found.code == 0, found.err
+        assert b"closed form" in found.out
+        assert [path.name for path in tmp_path.iterdir()] == ["x.ply"]
+
+    def test_several_functions(self, vvgt, at, tmp_path, blocks):
+        both = ("--tf", "tf.json", "--tf", "other.json")
+        assert vvgt("convert", "scalars.nii", *both, *SMALL, *blocks, "-o", tmp_path / "x_{}.ply").code == 0
+        found = vvgt("convert", "scalars.nii", *both, *SMALL, *blocks, "-o", tmp_path / "x.html")
+        assert found.code == 0, found.err
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["x.html", "x_other.ply", "x_tf.ply"]
+
+    @pytest.mark.parametrize(
+        ("volume", "options"),
+        [
+            ("four.nii", ("--tf", "tf.json")),
+            ("four.nii", ("--tf", "tf.json", "--light", "headlight")),
+            ("labels_*.nii", ("--labels", "auto")),
+            ("rgb_*.tif", ()),
+        ],
+        ids=["scalars", "lit", "labels", "colours"],
+    )
+    def test_a_series(self, vvgt, at, tmp_path, blocks, volume, options):
+        found = vvgt("convert", volume, *options, *SMALL, *blocks, "-o", tmp_path / "x_{}.ply")
+        assert found.code == 0, found.err
+        assert {"x_0.ply", "x_1.ply"} <= {path.name for path in tmp_path.iterdir()}
+
+    def test_a_series_as_a_page(self, vvgt, at, tmp_path, blocks):
+        found = vvgt("convert", "four.nii", "--tf", "tf.json", *SMALL, *blocks, "-o", tmp_path / "x.html")
+        assert found.code == 0, found.err
+        assert [path.name for path in tmp_path.iterdir()] == ["x.html"]
+
+    @pytest.mark.parametrize("light", [(), ("--light", "headlight")], ids=["unlit", "lit"])
+    def test_labels_one_by_one(self, vvgt, at, tmp_path, blocks, light):
+        found = vvgt("convert", "labels.nii", "--split-labels", *light, *SMALL, *blocks, "-o", tmp_path / "x_{}.ply")
+        assert found.code == 0, found.err
+        index = json.loads((tmp_path / "x_index.json").read_text())
+        assert [row["label"] for row in index["files"]] == [1, 2, 3]
+
+    @pytest.mark.parametrize("row", ["function", "shadows", "labels, lit", "colours", "layers", "wavelet"])
+    def test_the_closed_form_alone(self, vvgt, at, tmp_path, blocks, row):
+        volume, options = ROWS[row]
+        fit = ("--size", "64", "--max-gaussians", "800")
+        found = vvgt("init", volume, *options, *fit, *blocks, "-o", tmp_path / "x.ply")
+        assert found.code == 0, found.err
+        assert vvgt("init", volume, *options, *fit, *blocks, "-o", tmp_path / "x.spz").code == 0
+
+    @pytest.mark.parametrize("row", ["function", "shadows", "labels, lit", "colours"])
+    def test_views_for_trainers(self, vvgt, at, tmp_path, blocks, row):
+        volume, options = ROWS[row]
+        found = vvgt(
+            "render-views", volume, *options, *blocks, "--views", "3", "--test-views", "1", "--size", "48",
+            "-o", tmp_path / "views",
+        )  # fmt: skip
+        assert found.code == 0, found.err
+        assert [path.name for path in tmp_path.iterdir()] == ["views"]
+
+
+@pytest.mark.parametrize("row", ["function", "shadows", "labels, lit", "colours"])
+def test_pictures_of_blocks_are_those_of_memory(vvgt, at, tmp_path, row):
+    volume, options = ROWS[row]
+    for name, blocks in (("memory", ()), ("blocks", BLOCKS)):
+        few = ("--views", "2", "--test-views", "1", "--size", "48")
+        found = vvgt("render-views", volume, *options, *blocks, *few, "-o", tmp_path / name)
+        assert found.code == 0, found.err
+    for path in sorted((tmp_path / "memory").glob("t*/*.exr")):
+        one, other = (read_exr(tmp_path / name / path.parent.name / path.name)[0] for name in ("memory", "blocks"))
+        assert one.max() > 0.3
+        np.testing.assert_allclose(one, other, atol=2e-3)
+        assert np.abs(one - other).mean() < 1e-4

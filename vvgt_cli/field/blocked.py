@@ -1,0 +1,335 @@
+"""`Blocked`: a field of which only blocks are ever in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vvgt_cli.cameras import Camera, default_views
+from vvgt_cli.cameras.blocks import Blocks
+from vvgt_cli.dvr.layout import Light
+from vvgt_cli.dvr.render import Box as Frame
+from vvgt_cli.dvr.render import Rays, RenderSettings, for_thin, tiers
+from vvgt_cli.field.case import PROGRAM, VIEW, Case, for_budget, pace, view_edge
+from vvgt_cli.field.cells import NORMALS, CellBlocks, ExtinctionBlocks, PointBlocks, RayBlocks, read_rows
+from vvgt_cli.field.field import Picture
+from vvgt_cli.field.grid import CellGrid
+from vvgt_cli.field.parts import CELLS, Parts
+from vvgt_cli.field.rays import Bundle, RayFile, composed
+from vvgt_cli.field.runners import Runner, Task
+from vvgt_cli.field.settings import cell_grid
+from vvgt_cli.files import atomic_write
+from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.runs.digests import digest
+from vvgt_cli.runs.source import Source
+
+if TYPE_CHECKING:
+    from vvgt_cli.field.cells import Reader
+    from vvgt_cli.vbm import Start, VbmOptions
+
+Progress = Callable[[int, int], None]
+Todo = list[tuple[str, np.ndarray, Iterator[list[Rays]]]]  # key, picture and rays of what is to be drawn
+A_STEP = 4e-9  # seconds of a step of a ray through what is not empty
+WAY = 1.5  # unit-frame lengths of a ray through the box, about
+
+
+@dataclass
+class Pass:
+    """What does the blocks of a task that are missing.
+
+    Attributes:
+        runner: of the workers.
+        parts: where what they leave is.
+        bar: a progress bar by its name, None for none.
+        shard: part (from 1) and count of the blocks that are this run's; None: all.
+    """
+
+    runner: Runner
+    parts: Parts
+    bar: Callable[[str], Progress | None]
+    shard: tuple[int, int] | None = None
+
+    def __call__(self, task: Task, name: str, numbers: Sequence[int] | None = None) -> int:
+        """Do them; how many there were to do.
+
+        Raises:
+            Later: others are missing, of other shards.
+            DataError: as the task.
+        """
+        self.parts.prepare(task.kind)
+        everything = range(len(task)) if numbers is None else numbers
+        index, count = self.shard or (1, 1)
+        own = self.parts.missing(task.kind, (n for n in everything if n % count == index - 1))
+        if own:
+            self.runner.run(task, own, self.bar(name))
+        missing = self.parts.missing(task.kind, everything)
+        if missing:
+            raise Later(name, len(missing))
+        return len(own)
+
+
+class Later(Exception):
+    """Parts of other shards are missing: nothing more can be done now."""
+
+    def __init__(self, what: str, missing: int) -> None:
+        super().__init__(what)
+        self.what, self.missing = what, missing
+
+
+@dataclass
+class Blocked:
+    """See the module, and `vvgt_cli.field.field.Field` for what it does.
+
+    Attributes:
+        source: what was opened, and what it is shown by.
+        reader: of boxes of it.
+        do: what does passes.
+        edge: voxels along the edge of blocks, about.
+        visible: voxels that have extinction, about.
+        key: digest of all that it depends on.
+        pictures: that are there, or are expected; by what they show.
+        grid: of its cells, once they are there.
+        early: rays that were cast in the pass over them.
+    """
+
+    source: Source
+    reader: Reader
+    do: Pass
+    edge: int
+    visible: float
+    key: str
+    pictures: dict[str, tuple[Picture, np.ndarray | None]] = field(default_factory=dict)
+    grid: CellGrid | None = None
+    early: RayFile | None = None
+
+    @cached_property
+    def frame(self) -> Frame:
+        """Half extents and voxel edges, unit frame."""
+        frame = self.source.volume.unit_frame()
+        return Frame(np.array(frame.half), np.array(frame.step))
+
+    @cached_property
+    def light(self) -> Light | None:
+        """What falls on it; shadows and occlusion take a pass."""
+        lighting, volume = self.source.lighting, self.source.volume
+        if lighting is None:
+            return None
+        from vvgt_cli.dvr.light import lights_of
+
+        def extinction(cell: int) -> np.ndarray:
+            task = ExtinctionBlocks(self.reader, self._grid(np.zeros(3, np.int64), cell), self.do.parts, cell)
+            self.do(task, "light")
+            return task.gathered()
+
+        return lights_of(lighting, volume.axes, self.frame.step, volume.data.shape, extinction)
+
+    def _grid(self, exponent: np.ndarray, least: int = 1) -> CellGrid:
+        """Cells of 2^``exponent`` voxels, in blocks of whole cubes of ``least`` voxels."""
+        from vvgt_cli.vbm.closed_form import MARCH_SIZE
+        from vvgt_cli.vbm.visibility import widening
+
+        dims, step = np.array(self.source.volume.dims), self.frame.step
+        march = widening(dims, exponent, step, default_views("train", size=MARCH_SIZE))
+        return cell_grid(self.source.volume, exponent, self.edge, march, least)
+
+    def case(self, size: int, gaussians: int) -> Case:
+        """See `Field`: a view's time follows from the steps of its rays, nothing is timed."""
+        x, y, z = (float(edge) for edge in self.frame.step)
+        share = (self.visible / self.source.volume.data.size) ** (1 / 3)
+        steps = view_edge(size, small=False) ** 2 * WAY / min(x, y, z) * max(share, 0.1)
+        case = Case(
+            gaussians=gaussians, cells=0.0, voxels=self.visible, size=size, view=VIEW * A_STEP * steps, pace=pace(),
+            there=PROGRAM + self.edge**3 * self.reader.voxel_bytes, visible=self.visible, step=(x, y, z),
+        )  # fmt: skip
+        return for_budget(case, gaussians)
+
+    def cells(self, size: int, budget: int, most: int | None = None) -> CellBlocks:
+        """The pass over base cells for images of ``size`` px; at most ``most`` cells, None: as many as memory holds."""
+        from vvgt_cli.field.grid import TILE_BITS
+        from vvgt_cli.vbm.closed_form import finest_level, level_within, most_cells, pixel_width
+        from vvgt_cli.vbm.moments import blocks, exponents
+
+        step = self.frame.step
+        finest = finest_level(step, pixel_width(size))
+        level = level_within(step, self.visible, most or most_cells(budget), finest)
+        while blocks(exponents(step, level))[1].max() > 1 << TILE_BITS:
+            level += 1  # of voxels so thin that a block of them is many cells
+        rays = self.early = self._first_rays()
+        return CellBlocks(self.reader, self._grid(exponents(step, level)), self.do.parts, rays, self.light)
+
+    def _first_rays(self) -> RayFile | None:
+        """The first rays of the pictures that are expected: they are cast in the pass over the cells."""
+        todo = self._todo()
+        return self._file(todo, [next(rays) for *_, rays in todo]) if todo else None
+
+    def start(self, options: VbmOptions, progress: Progress | None = None) -> Start:
+        """See `Field`."""
+        from vvgt_cli.vbm import start_of
+        from vvgt_cli.vbm.closed_form import form_of
+        from vvgt_cli.vbm.lit import Shading
+        from vvgt_cli.vbm.moments import Cells
+
+        task = self.cells(options.size, options.max_gaussians)
+        self.do(task, "integrate")
+        self.grid, half, step = task.grid, *self.frame
+        index, moments, normals = _gathered(task)
+        grid = task.grid
+        cells = Cells(index, moments, grid.cell_edge, np.array(grid.exponent, np.int64), normals)
+        shading = None if self.light is None else Shading(self.light, half, step, self._normals_at)
+        form = form_of(
+            cells, half, step, options.max_gaussians, options.size, None, None, self._labels, shading, options.degree
+        )  # fmt: skip
+        return start_of(form, options)
+
+    @property
+    def _labels(self) -> bool:
+        """Whether it is one of labels alone."""
+        return self.source.labels_alone
+
+    def expect(self, views: Sequence[Picture]) -> None:
+        """See `Field`."""
+        for view in views:
+            self.pictures.setdefault(_key(view), (view, None))
+
+    def view(self, camera: Camera, settings: RenderSettings, blocks: Blocks | None = None) -> np.ndarray:
+        """See `Field`: all pictures that are expected are made with the first that is asked for."""
+        view = Picture(camera, settings, blocks)
+        self.expect([view])
+        if self.pictures[_key(view)][1] is None:
+            self._march()
+        picked = self.pictures[_key(view)][1]
+        assert picked is not None
+        if blocks is None:
+            return picked
+        image = np.zeros((camera.height, camera.width, 4), np.float32)
+        image[blocks.mask()] = picked
+        return image
+
+    def forget(self, view: Picture) -> None:
+        """Let go of a picture."""
+        self.pictures.pop(_key(view), None)
+
+    def _todo(self) -> Todo:
+        """Key, picture and rays of all that are expected."""
+        todo = []
+        for key, (view, made) in self.pictures.items():
+            if made is None:
+                image = np.zeros((view.camera.height, view.camera.width, 4), np.float32)
+                settings = for_thin(view.settings, self.frame, view.camera)
+                todo.append((key, image, tiers(settings, image, view.blocks)))
+        return todo
+
+    def _file(self, todo: Todo, rays: list[list[Rays]]) -> RayFile:
+        """The rays that pictures ask for next, in a file."""
+        bundles = [
+            Bundle(view.camera, view.settings.step, np.argwhere(mask)[:, ::-1], offsets)
+            for (key, *_), wanted in zip(todo, rays, strict=True)
+            for view in [self.pictures[key][0]]
+            for offsets, mask, _ in wanted
+        ]
+        return RayFile.of(bundles, self.frame, self.do.parts)
+
+    def _march(self) -> None:
+        """Make every picture that is expected, all of them together: at most two passes."""
+        todo, grid = self._todo(), self.grid or self._grid(np.zeros(3, np.int64))
+        while True:
+            wanted = [next(rays, None) for *_, rays in todo]
+            rays = [one or [] for one in wanted]
+            if not any(rays):
+                break
+            file = self._file(todo, rays)
+            kind, numbers = file.kind, self._shown()
+            if file == self.early:
+                kind = CELLS
+            else:
+                task = RayBlocks(self.reader, grid, self.do.parts, file, self.light)
+                self.do(task, "views", numbers)
+            seen = iter(composed(file, self.do.parts, kind, numbers, self.source.volume.dims))
+            for (_, image, _), asked in zip(todo, rays, strict=True):
+                for offsets, mask, known in asked:
+                    total = next(seen).sum(axis=1)
+                    image[mask] = (known * image[mask] + total) / (known + len(offsets))
+        for key, image, _ in todo:
+            view = self.pictures[key][0]
+            self.pictures[key] = view, image if view.blocks is None else image[view.blocks.mask()]
+
+    def _shown(self) -> list[int]:
+        """Blocks that hold anything visible, as far as the pass over the cells has found it out."""
+        if self.grid is None:
+            return list(range(len(self._grid(np.zeros(3, np.int64)).blocks)))
+        parts = self.do.parts
+        return [n for n in range(len(self.grid.blocks)) if len(parts.load(CELLS, n, names=("counts",))["counts"])]
+
+    def normals(self, gaussians: Gaussians) -> np.ndarray | None:
+        """See `Field`."""
+        if self.light is None:
+            return None
+        from vvgt_cli.vbm.lit import mean_normals, normal_points
+
+        points = normal_points(gaussians)
+        return mean_normals(points, self._under(points), self.frame.half)
+
+    def _normals_at(self, points: np.ndarray) -> np.ndarray:
+        return self._under(points)[:, :3]
+
+    def _under(self, points: np.ndarray) -> np.ndarray:
+        """Normals and extinction (n, 4) at points (n, 3) of the box frame."""
+        grid = self.grid or self._grid(np.zeros(3, np.int64))
+        at = (points + self.frame.half) / self.frame.step - 0.5
+        parts, kind = self.do.parts, f"points-{digest(at)[:16]}"
+        path = parts.folder / f"{kind}.npy"
+        with atomic_write(path, overwrite=True) as temporary, open(temporary, "wb") as stream:
+            np.save(stream, at)
+        task = PointBlocks(self.reader, grid, parts, str(path), kind)
+        self.do(task, "normals")
+        out = np.zeros((len(at), 4))
+        for number in range(len(task)):
+            part = parts.load(kind, number)
+            out[part["which"]] = part["found"]
+        return out
+
+    def digest(self) -> str:
+        """See `Field`."""
+        return self.key
+
+    def hidden(self, budget: int, size: int) -> tuple[np.ndarray, np.ndarray]:
+        """See `Field`."""
+        from vvgt_cli.vbm import VbmOptions
+        from vvgt_cli.vbm.tree import HIDDEN
+
+        form = self.start(VbmOptions(budget, size)).form
+        assert form is not None
+        return form.seen.largest > HIDDEN, form.seen.edge
+
+
+def _key(view: Picture) -> str:
+    camera, blocks = view.camera, view.blocks
+    lens = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
+    numbers = None if blocks is None else blocks.numbers
+    return digest(camera.rotation, camera.translation, lens, view.settings, numbers)
+
+
+def _gathered(task: CellBlocks) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Index (n, 3), moments (n, 13) and normals (n, 3) of all cells, in Morton order; None where nothing is lit."""
+    from vvgt_cli.vbm.moments import in_order, morton
+
+    index, moments, normals = [np.empty((0, 3), np.int32)], [], []
+    for number in range(len(task)):
+        part = task.parts.load(CELLS, number, names=("tiles", "counts"))
+        offset = 0
+        for tile, count in zip(part["tiles"], part["counts"].tolist(), strict=True):
+            rows, local = read_rows(task.parts, number, offset, count)
+            index.append(local + (tile * task.grid.tile_cells).astype(np.int32))
+            moments.append(rows)
+            offset += count
+        if task.light is not None:
+            normals.append(np.load(task.parts.path(CELLS, number, NORMALS)))
+    whole = np.concatenate(index)
+    lit = None
+    if task.light is not None:
+        lit = np.concatenate(normals)[np.argsort(morton(whole), kind="stable")]
+    return *in_order(whole, moments), lit

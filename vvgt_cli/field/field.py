@@ -1,0 +1,113 @@
+"""`Field`: a volume under its function, labels, layers and light, wherever its values are; and one in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple, Protocol
+
+import numpy as np
+
+from vvgt_cli.cameras import Camera
+from vvgt_cli.cameras.blocks import Blocks
+from vvgt_cli.field.case import Case, measure
+from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.runs.digests import volume_digest
+from vvgt_cli.runs.source import Source
+
+if TYPE_CHECKING:
+    from vvgt_cli.dvr import RenderSettings, Scene
+    from vvgt_cli.vbm import Start, VbmOptions
+
+
+class Picture(NamedTuple):
+    """A picture of the volume: the arguments of `vvgt_cli.dvr.render_view`."""
+
+    camera: Camera
+    settings: RenderSettings
+    blocks: Blocks | None = None
+
+
+class Field(Protocol):
+    """What a conversion asks of a volume.
+
+    Attributes:
+        source: the volume, whose values may lie in its file, and all that it is shown by.
+    """
+
+    @property
+    def source(self) -> Source: ...
+
+    def case(self, size: int, gaussians: int) -> Case:
+        """What the costs of stages follow from, for images of ``size`` px and a budget of Gaussians."""
+
+    def start(self, options: VbmOptions, progress: Callable[[int, int], None] | None = None) -> Start:
+        """The closed form."""
+
+    def expect(self, views: Sequence[Picture]) -> None:
+        """Pictures that will be asked for: those of a volume in blocks are made together."""
+
+    def view(self, camera: Camera, settings: RenderSettings, blocks: Blocks | None = None) -> np.ndarray:
+        """A picture (h, w, 4) float32, premultiplied RGBA; with ``blocks`` zero elsewhere."""
+
+    def normals(self, gaussians: Gaussians) -> np.ndarray | None:
+        """Directions (K, 3) of the mean gradient around Gaussians, all in the box frame; None where nothing is lit."""
+
+    def digest(self) -> str:
+        """Of the volume's content."""
+
+    def hidden(self, budget: int, size: int) -> tuple[np.ndarray, np.ndarray]:
+        """Cells (nz, ny, nx) bool that some training view sees, and their edges (3,) in voxels."""
+
+
+@dataclass(frozen=True)
+class Resident:
+    """A field whose values are in memory.
+
+    Attributes:
+        source: what was read.
+        scene: the same laid out for the kernels.
+    """
+
+    source: Source
+    scene: Scene
+
+    def case(self, size: int, gaussians: int) -> Case:
+        """See `Field`."""
+        return measure(self.scene, size, gaussians)
+
+    def start(self, options: VbmOptions, progress: Callable[[int, int], None] | None = None) -> Start:
+        """See `Field`."""
+        from vvgt_cli.vbm import initialise
+
+        return initialise(self.scene, options, progress)
+
+    def expect(self, views: Sequence[Picture]) -> None:
+        """Nothing: each is drawn when it is asked for."""
+
+    def view(self, camera: Camera, settings: RenderSettings, blocks: Blocks | None = None) -> np.ndarray:
+        """See `Field`."""
+        from vvgt_cli.dvr import render_view
+
+        return render_view(self.scene, camera, settings, blocks)
+
+    def normals(self, gaussians: Gaussians) -> np.ndarray | None:
+        """See `Field`."""
+        if self.scene.light is None:
+            return None
+        from vvgt_cli.vbm.lit import at_points, mean_normals, normal_points
+
+        points = normal_points(gaussians)
+        return mean_normals(points, at_points(self.scene, points), self.scene.half)
+
+    def digest(self) -> str:
+        """See `Field`."""
+        return volume_digest(self.source.volume)
+
+    def hidden(self, budget: int, size: int) -> tuple[np.ndarray, np.ndarray]:
+        """See `Field`."""
+        from vvgt_cli.vbm.closed_form import closed_form
+        from vvgt_cli.vbm.tree import HIDDEN
+
+        seen = closed_form(self.scene, budget, size).seen
+        return seen.largest > HIDDEN, seen.edge

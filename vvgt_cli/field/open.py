@@ -1,0 +1,309 @@
+"""A volume's field, wherever its values are: in memory, or in blocks where it is asked for or quicker."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vvgt_cli import __version__
+from vvgt_cli.errors import NothingVisible, SeveralComponents, UsageError
+from vvgt_cli.field.blocked import Blocked, Pass
+from vvgt_cli.field.counting import Counted
+from vvgt_cli.field.parts import Parts
+from vvgt_cli.field.runners import Here, Processes, Runner
+from vvgt_cli.field.settings import BlockOptions, block_edge
+from vvgt_cli.jit.ahead import COUNT_REAL, COUNT_WHOLE
+from vvgt_cli.progress import Console
+from vvgt_cli.resources import free_memory
+from vvgt_cli.runs.digests import digest
+from vvgt_cli.runs.layered import NONE, open_parts
+from vvgt_cli.runs.outputs import STDOUT
+from vvgt_cli.runs.record import Run
+from vvgt_cli.runs.source import Opened, Source, SourceRequest, describe_source, load
+from vvgt_cli.volume import ReadOptions, Volume
+from vvgt_cli.volume.readers import SCHEMES
+from vvgt_cli.volume.stored import Stored, lies_in_file
+
+if TYPE_CHECKING:
+    from vvgt_cli.field.cells import Reader
+    from vvgt_cli.field.reader import Layers, Place
+
+LAYOUT = 3  # of parts: one more whenever what is in them changes
+LARGE = 0.25  # of the free memory: a file of less is read as ever
+PROGRAM, A_CELL = 3e8, 300  # bytes: interpreter, libraries and kernels; a base cell in memory
+ZARR = {".zarray", ".zgroup", ".zattrs", "zarr.json"}  # files of which a folder has one
+RANGES = 0.15  # bytes a voxel: the map of empty space
+LAYERED_BYTES = 60  # of a voxel of an optics grid while a block of it is there
+FEW_SAMPLES = 512  # bricks of layers: each is read for itself
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What a field is opened for.
+
+    Attributes:
+        gaussians, size: budget, and pixels of the screen.
+        degree: of harmonics that are asked for.
+    """
+
+    gaussians: int
+    size: int
+    degree: int | None = None
+
+
+@contextmanager
+def beside(output: str | None) -> Iterator[Parts]:
+    """Where blocks are kept: beside the output, so that the same command goes on there after it was ended.
+
+    They are removed where the same command would end the same way.
+    """
+    if output is None or output == STDOUT:
+        with tempfile.TemporaryDirectory(prefix="vvgt-") as folder:
+            yield Parts(Path(folder) / "blocks")
+        return
+    target = Path(output).absolute()
+    parts = Parts(target.with_name(f".{target.name[:80]}.blocks"))
+    try:
+        yield parts
+    except (UsageError, NothingVisible):
+        parts.remove()
+        raise
+
+
+@contextmanager
+def blocked(run: Run, request: SourceRequest, options: BlockOptions, parts: Parts, wanted: Wanted) -> Iterator[Blocked]:
+    """A field in blocks; its workers end with the context, its parts stay.
+
+    Raises:
+        DataError, UsageError: as `vvgt_cli.runs.source.load`; a pipe, or compressed values that can be read front to
+            back only.
+        Later: other shards' blocks are missing.
+    """
+    request, told = _settled(request, options, wanted.size)
+    if told:
+        run.console.say(told)
+    settings = _settings(request, wanted)
+    edge = parts.kept_edge(settings) if options.size is None else options.size
+    edge = edge or _edge(request, options)
+    with _runner(options) as runner:
+        do = Pass(runner, parts, run.console.bar, options.shard)
+        if parts.open({**settings, "blocks": edge}, ours=options.shard is None):
+            run.console.say(f"going on with the blocks in {parts.folder}")
+        run.compile(COUNT_WHOLE + COUNT_REAL)
+        access = Counted(parts, edge, lambda task: do(task, "count"), needs_histogram(request))
+        with run.stage("read") as stage:
+            source = load(request, access)
+            reader, visible = _reader(source, access)
+            shared = f", {runner.workers} workers" if runner.workers > 1 else ""
+            stage.note = f"{describe_source(source)}; in blocks of {edge}{shared}"
+        yield Blocked(source, reader, do, edge, visible, digest(str(sorted(settings.items()))))
+
+
+def _edge(request: SourceRequest, options: BlockOptions) -> int:
+    """Voxels along the edge of blocks, by the memory and what a voxel takes of it."""
+    given, layered = request.volume, request.labels not in (None, NONE) or bool(request.layers)
+    if isinstance(given, str):
+        read = replace(request.read, stored=True, packed=True)
+        content = open_parts(given, read)
+        volume, layered = content.volumes[0], layered or not content.one_field or request.tf is None
+    else:
+        volume = given.volume if isinstance(given, Opened) else given
+    return block_edge(volume, options, LAYERED_BYTES if layered else None)
+
+
+def _settled(request: SourceRequest, options: BlockOptions, size: int) -> tuple[SourceRequest, str | None]:
+    """The request as workers take it too: absolute paths, the level of a file that has several; and what to say."""
+    if isinstance(request.volume, Opened):
+        request = replace(request, volume=request.volume.volume)
+    if not isinstance(request.volume, str):
+        return request, None
+    path = request.volume
+    if path == "-" or (os.path.exists(path) and not (os.path.isfile(path) or os.path.isdir(path))):
+        raise UsageError(f"{path}: a pipe is read front to back, once; blocks need a file")
+    absolute = _absolute(path)
+    layers = tuple(
+        replace(layer, volume=_absolute(layer.volume)) if isinstance(layer.volume, str) else layer
+        for layer in request.layers
+    )
+    read, told = _at_level(request.read, absolute, options, size)
+    if isinstance(read.mask, str):
+        read = replace(read, mask=str(Path(read.mask).absolute()))
+    return replace(request, volume=absolute, read=read, layers=layers), told
+
+
+def _absolute(path: str) -> str:
+    """A path as other processes find it, too; a scheme's name is one already."""
+    scheme = path.partition(":")[0] in SCHEMES and not os.path.exists(path)
+    return path if scheme else str(Path(path).absolute())
+
+
+def _reader(source: Source, access: Counted) -> tuple[Reader, float]:
+    """What reads boxes of a source, and about how many of its voxels are visible."""
+    from vvgt_cli.dvr.light import linear_tables
+    from vvgt_cli.dvr.scene import kernel_rule
+    from vvgt_cli.field.reader import LayerPlace, Layers, Scalars
+    from vvgt_cli.transfer.tables import build_tables
+    from vvgt_cli.vbm.samples import estimate, visible_share
+
+    volume, frame = source.volume, source.volume.unit_frame()
+    if not source.layers:
+        task, whole, numbers = access.counts(volume)
+        rule = kernel_rule(volume, lambda: whole.stored)
+        tables = build_tables(
+            source.tf, (numbers.lo, numbers.hi), slope=rule.slope, intercept=rule.intercept,
+            unit_distance=source.unit_distance, world_per_unit=1 / frame.scale,
+        )  # fmt: skip
+        bricks, weights = task.samples()
+        visible = estimate(visible_share(tables, rule.apply(bricks)), weights, volume.data.size)
+        return Scalars(access.place(volume), rule, tables), visible
+    layers = tuple(
+        LayerPlace(
+            access.place(layer.volume), layer.tf, layer.unit_distance, layer.unit_label,
+            None if layer.colors is None else _three(*map(access.place, layer.colors)), layer.white,
+        )
+        for layer in source.layers
+    )  # fmt: skip
+    top = sum(layer.largest for layer in source.layers) / frame.scale
+    grid = replace(volume, data=np.zeros((1, 1, 1), np.uint8))
+    reader = Layers(layers, grid, volume.dims, frame.scale, linear_tables(top))
+    return reader, _visible_of(reader, volume)
+
+
+def _three(red: Place, green: Place, blue: Place) -> tuple[Place, Place, Place]:
+    return red, green, blue
+
+
+def _visible_of(reader: Layers, volume: Volume) -> float:
+    """About how many voxels of an optics grid are visible: samples of it are read."""
+    from vvgt_cli.vbm.samples import SAMPLE, estimate, samples_in, visible_share
+
+    places, weights = samples_in(volume.dims, np.zeros(3, np.int64), np.array(volume.dims))
+    size = np.minimum(SAMPLE, volume.dims)
+    few = np.unique(np.linspace(0, len(places) - 1, min(len(places), FEW_SAMPLES)).astype(np.int64))
+    bricks = np.stack([reader.box(places[n], places[n] + size).values for n in few])
+    return estimate(visible_share(reader.tables, bricks), weights[few], volume.data.size)
+
+
+def _at_level(read: ReadOptions, path: str, options: BlockOptions, size: int) -> tuple[ReadOptions, str | None]:
+    """The level of an OME-Zarr image: as asked for, else the coarsest whose voxels the screen cannot tell apart."""
+    from vvgt_cli.vbm.closed_form import MIN_CELL, pixel_width
+    from vvgt_cli.volume.zarr_store import level_shapes
+
+    shapes = level_shapes(path, read)
+    if not shapes:
+        if options.level is not None:
+            raise UsageError(f"{path}: no OME-Zarr image, which alone has levels; leave out --level {options.level}")
+        return read, None
+    if options.level is not None:
+        return replace(read, level=0 if options.level == "full" else int(options.level)), None
+    fits = [n for n, shape in enumerate(shapes) if shape and 2 / max(shape) <= MIN_CELL * pixel_width(size)]
+    level = max(fits, default=0)
+    sizes = " x ".join(map(str, reversed(shapes[level])))
+    return replace(read, level=level), f"level {level} of {len(shapes)} ({sizes}): finer ones the screen cannot tell"
+
+
+def files_of(path: str) -> list[Path]:
+    """The slices in a folder or of a glob; a file, or a folder of anything else, itself; none where nothing is."""
+    from vvgt_cli.volume.slices import matching, slices_of
+
+    if not os.path.exists(path):
+        return matching(path)
+    return (slices_of(Path(path)) if os.path.isdir(path) else []) or [Path(path)]
+
+
+def automatic(request: SourceRequest, console: Console) -> BlockOptions | None:
+    """Blocks where nothing is asked for: of a volume that the memory does not hold; None: it is read as a whole.
+
+    Raises:
+        DataError, UsageError: as `read_volume`.
+    """
+    if not beyond_memory(request):
+        return None
+    console.say("more than the memory holds: in blocks (docs/scale.md)")
+    return BlockOptions()
+
+
+def beyond_memory(request: SourceRequest) -> bool:
+    """Whether a volume is better gone through in blocks: a large field that the memory does not hold with the rest.
+
+    Colours and channels together are not: blocks take one field.
+
+    Raises:
+        DataError, UsageError: as `read_volume`.
+    """
+    from vvgt_cli.runs.layered import ALL, COLOR
+    from vvgt_cli.synth.sources import open_volume
+    from vvgt_cli.vbm.closed_form import MAX_BASE_CELLS
+
+    path, free = request.volume, free_memory()
+    if not isinstance(path, str) or free is None or path == "-" or request.read.component in (ALL, COLOR):
+        return False
+    inside = not os.path.exists(path) and not files_of(path) and ":/" in path
+    place = path.rpartition(":/")[0] if inside else path
+    zarr = os.path.isdir(place) and ZARR & set(os.listdir(place))
+    h5 = os.path.isfile(place) and place.lower().endswith((".h5", ".hdf5", ".he5", ".hdf", ".nc"))
+    files = files_of(place)
+    tiff = files and files[0].suffix.lower() in (".tif", ".tiff")
+    packed = zarr or h5 or tiff  # few bytes may hold many voxels
+    if not packed and sum(file.stat().st_size for file in files) <= LARGE * free:
+        return False
+    try:
+        volume = open_volume(path, replace(request.read, stored=True, packed=True))
+    except SeveralComponents:  # colours, or to be chosen: said where it is read
+        return False
+    if not lies_in_file(volume):
+        return False
+    own = volume.data.dtype.name not in ("uint8", "uint16", "float32")
+    held = volume.data.nbytes if isinstance(volume.data, Stored) else 0
+    voxels = volume.data.size
+    return held + (4 * own + RANGES) * voxels + PROGRAM + A_CELL * min(voxels, MAX_BASE_CELLS) > free
+
+
+def needs_histogram(request: SourceRequest) -> bool:
+    """Whether a function follows from the histogram of the values, and not from their range alone."""
+    from vvgt_cli.transfer import read_transfer_function
+
+    if request.tf is None:
+        return True
+    tf = read_transfer_function(request.tf) if isinstance(request.tf, str) else request.tf
+    return tf.domain == "percentile" or any(layer.tf is None and layer.labels is None for layer in request.layers)
+
+
+def _runner(options: BlockOptions) -> Runner:
+    threads = int(os.environ.get("NUMBA_NUM_THREADS", "1"))
+    if options.scheduler is not None:
+        from vvgt_cli.field.dask_runner import Dask
+
+        return Dask(options.scheduler, options.workers, threads)
+    return Processes(options.workers, threads) if options.workers > 1 else Here()
+
+
+def _settings(request: SourceRequest, wanted: Wanted) -> dict[str, Any]:
+    """All that parts depend on."""
+    tf = request.tf
+    text = Path(tf).read_text("utf-8", "replace") if isinstance(tf, str) and os.path.isfile(tf) else repr(tf)
+    return {
+        "version": [__version__, LAYOUT],
+        "volume": _facts(request.volume),
+        "read": {key: repr(value) for key, value in asdict(request.read).items() if value is not None},
+        "function": [text, request.tf_range, request.unit_distance],
+        "look": [repr(request.light), _facts(request.labels), *(repr(layer) for layer in request.layers)],
+        "series": digest(*request.statistics),
+        "gaussians": [wanted.gaussians, wanted.degree],
+        "size": wanted.size,
+    }
+
+
+def _facts(volume: Any) -> list[Any]:
+    """A file's name, size and time, or what else a volume or table is."""
+    if not isinstance(volume, str):
+        return [digest(volume.data) if isinstance(volume, Volume) else repr(volume)]
+    found = [file.stat() for file in files_of(volume)]
+    return [volume, sum(f.st_size for f in found), max(f.st_mtime_ns for f in found)] if found else [volume]
