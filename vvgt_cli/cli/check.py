@@ -7,11 +7,12 @@ from typing import Any
 import click
 
 from vvgt_cli.cli.options import common_options, read_options, tf_options
+from vvgt_cli.cli.sections import SectionedCommand
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.progress import Console
 
 
-@click.command("check", short_help="Run the stability suite, or measure how stiff a scene is.")
+@click.command("check", cls=SectionedCommand, short_help="Run the stability suite, or measure how stiff a scene is.")
 @click.argument("volume", required=False)
 @click.option(
     "--tolerance", type=click.FloatRange(0, 1, min_open=True), default=0.002, show_default=True, metavar="RMS",

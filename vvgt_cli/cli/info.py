@@ -7,10 +7,11 @@ from typing import Any
 import click
 
 from vvgt_cli.cli.options import common_options, placed_read_options
+from vvgt_cli.cli.sections import SectionedCommand
 from vvgt_cli.progress import Console
 
 
-@click.command("info", short_help="Describe a volume, transfer function, view set or .ply.")
+@click.command("info", cls=SectionedCommand, short_help="Describe a volume, transfer function, view set or .ply.")
 @click.argument("file")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
 @placed_read_options
