@@ -25,11 +25,11 @@ from dvr_scenes import commit, print_table, read_scenes, write_rows
 from floors import machine
 
 from vvgt_cli.cameras import Camera, default_views
-from vvgt_cli.field.case import view_edge
 from vvgt_cli.conversion.stages.views import LARGE, REFINE_VIEWS, fine_enough, views_of, wide
 from vvgt_cli.descent import LOSS_3DGS, OptimizeOptions, optimize
 from vvgt_cli.dvr import Scene, render_views
 from vvgt_cli.dvr.render import FIT_VIEWS
+from vvgt_cli.field.case import view_edge
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.metrics import score_views
 from vvgt_cli.runs.views import Views

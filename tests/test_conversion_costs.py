@@ -6,9 +6,9 @@ import pytest
 
 from vvgt_cli.cameras.blocks import BLOCK, ENOUGH, FEW, spread_blocks
 from vvgt_cli.conversion import case as case_module
-from vvgt_cli.field.case import Case, measure
 from vvgt_cli.conversion.stages import CheckViews, TestViews, TrainingViews
 from vvgt_cli.dvr import Scene
+from vvgt_cli.field.case import Case, measure
 from vvgt_cli.synth import open_volume
 from vvgt_cli.transfer.readers import minimal
 

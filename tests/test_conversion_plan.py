@@ -11,7 +11,6 @@ from onnx_models import write_model
 from test_cli_infer import DARKER
 
 from vvgt_cli.cameras.blocks import BLOCK, ENOUGH, FEW, spread_blocks
-from vvgt_cli.field.case import Case, expected_wide
 from vvgt_cli.conversion.convert import convert, initialise_only, planned
 from vvgt_cli.conversion.plan import DEFAULT_STEPS, MOST_STEPS, Planner, check_memory
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions, Limits
@@ -21,6 +20,7 @@ from vvgt_cli.conversion.stages.refinement import WIDER
 from vvgt_cli.conversion.stages.views import views_of
 from vvgt_cli.descent.options import TEXTURE
 from vvgt_cli.errors import UsageError
+from vvgt_cli.field.case import Case, expected_wide
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply
 from vvgt_cli.progress import Console
 from vvgt_cli.runs.record import ConversionReport, Run

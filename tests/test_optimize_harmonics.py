@@ -11,7 +11,6 @@ import vvgt_cli as vvgt
 from tests.test_gaussians_harmonics import cloud
 from vvgt_cli import vbm
 from vvgt_cli.cameras import default_views
-from vvgt_cli.field.case import Case
 from vvgt_cli.conversion.plan import Planner
 from vvgt_cli.conversion.stages.refinement import HARMONICS, step_seconds
 from vvgt_cli.descent import METHODS, OptimizeOptions, OptimizeRecord, optimize
@@ -19,6 +18,7 @@ from vvgt_cli.descent.checkpoint import fingerprint, resume, save
 from vvgt_cli.descent.densify import SLOPE, Densified, densify
 from vvgt_cli.descent.loop import Judge, begin, step
 from vvgt_cli.descent.states import GIVEN
+from vvgt_cli.field.case import Case
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.metrics import psnr
 from vvgt_cli.splat import blend, render

@@ -287,9 +287,10 @@ def test_a_label_map_by_name_is_not_taken_for_scalars_in_blocks(vvgt, raw, tmp_p
 
 
 def test_a_box_that_is_counted_slice_by_slice_has_the_counts_and_samples_of_the_whole(raw, tmp_path):
+    from vvgt_cli.scale.tasks import CountBlocks, Place
+
     from vvgt_cli.field.grid import Boxes
     from vvgt_cli.field.parts import COUNTS, Parts
-    from vvgt_cli.scale.tasks import CountBlocks, Place
 
     merged = []
     for slices in (1, 7, 80):

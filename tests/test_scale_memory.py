@@ -99,9 +99,9 @@ def stored(dims, dtype, read=None, chunk=64):
 
 
 def test_counting_reads_every_voxel_once_and_little_more(tmp_path, monkeypatch):
-    from vvgt_cli.scale import tasks
     from vvgt_cli.field.grid import Boxes
     from vvgt_cli.field.parts import COUNTS, Parts
+    from vvgt_cli.scale import tasks
 
     values, read = bodies((100, 90, 80)).astype(np.float32), []
 

@@ -7,16 +7,16 @@ import re
 
 import numpy as np
 import pytest
+from vvgt_cli.scale.sight import CHECK, SUFFIX, TEST, TRAIN, Box, Sight, looks, marched, meeting, segments
 
 from tests.test_scale import FIT, bodies
 from vvgt_cli.dvr import RenderSettings, render_view
 from vvgt_cli.dvr.render import FIT_VIEWS, camera_arrays
+from vvgt_cli.field.grid import Boxes, CellGrid
+from vvgt_cli.field.parts import CELLS, Parts
 from vvgt_cli.gaussians import read_ply
 from vvgt_cli.metrics import score_views
 from vvgt_cli.runs.source import SourceRequest, load
-from vvgt_cli.field.grid import Boxes, CellGrid
-from vvgt_cli.field.parts import CELLS, Parts
-from vvgt_cli.scale.sight import CHECK, SUFFIX, TEST, TRAIN, Box, Sight, looks, marched, meeting, segments
 from vvgt_cli.splat import render
 from vvgt_cli.volume import Volume
 

@@ -40,34 +40,34 @@ def _level(ctx: click.Context, param: click.Parameter, value: str | None) -> int
 _options = {
     "block_size": click.option(
         "--blocks", "block_size", metavar="SIZE|auto", callback=_size,
-        help="Read the volume in blocks of SIZE voxels along an edge (a power of two), or as the memory allows. "
-        "Default: only where the memory does not hold it.",
+        help="Process the volume in blocks of SIZE voxels along an edge (a power of two); 'auto' chooses by memory. "
+        "Default: blocks only if the volume does not fit in memory.",
     ),
     "workers": click.option(
         "--workers", type=click.IntRange(1, 1024), default=1, show_default=True, metavar="N",
-        help="Processes that go through blocks at once; with --scheduler local, its workers; with slurm, jobs.",
+        help="Number of parallel worker processes, or of SLURM jobs with --scheduler slurm.",
     ),
     "scheduler": click.option(
         "--scheduler", metavar="local|slurm|ADDRESS",
-        help="Let Dask's workers go through the blocks: of this machine, of as many SLURM jobs, or of the scheduler at "
-        "ADDRESS (tcp://...). Needs the extra cluster.",
+        help="Process blocks with Dask: on this machine, as SLURM jobs, or through the scheduler at ADDRESS "
+        "(tcp://...). Needs the extra 'cluster'.",
     ),
     "level": click.option(
         "--level", metavar="full|N", callback=_level,
-        help="Of an OME-Zarr image in blocks, 0 the finest. Default: the coarsest that --size cannot tell from it.",
+        help="Resolution level of an OME-Zarr image in blocks, 0 the finest. Default: the coarsest sufficient for "
+        "--size.",
     ),
 }  # fmt: skip
 _shard_option = {
     "shard": click.option(
         "--shard", metavar="I/N", callback=_shard,
-        help="Part I of N of a job array: -o is a folder of blocks then, for 'vvgt merge'.",
+        help="Process part I of N in a job array; -o is then a folder of blocks for 'vvgt merge'.",
     ),
 }  # fmt: skip
 block_options = group("blocks", **_options)
 levels_option = click.option(
     "--levels", type=click.IntRange(1, 8), default=1, show_default=True, metavar="N",
-    help="Levels of detail: OUT-1.ply, ... beside OUT.ply, each with a quarter of the Gaussians, and an index "
-    "OUT-levels.json.",
+    help="Levels of detail to write: OUT-1.ply, ... with a quarter of the Gaussians each, and OUT-levels.json.",
 )  # fmt: skip
 shared_block_options = group("blocks", **_options, **_shard_option, levels=levels_option)
 ONE = ("workers", "levels")  # options that are 1 where they are not given

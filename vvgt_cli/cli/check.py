@@ -7,27 +7,28 @@ from typing import Any
 import click
 
 from vvgt_cli.cli.options import common_options, read_options, tf_options
+from vvgt_cli.cli.sections import SectionedCommand
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.progress import Console
 
 
-@click.command("check", short_help="The stability suite, or how stiff a scene is.")
+@click.command("check", cls=SectionedCommand, short_help="Run the stability suite, or measure how stiff a scene is.")
 @click.argument("volume", required=False)
 @click.option(
     "--tolerance", type=click.FloatRange(0, 1, min_open=True), default=0.002, show_default=True, metavar="RMS",
-    help="Of VOLUME's views: error that the step is chosen for, root mean square of RGBA.",
+    help="RMS error of VOLUME's views (RGBA) that the sampling step is chosen for.",
 )  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a table.")
 @tf_options
 @read_options
 @common_options
 def command(volume: str | None, tolerance: float, as_json: bool, console: Console, **options: Any) -> None:
-    """Run stiff and extreme cases through every stage; a table on standard output, exit status 1 if one fails.
+    """Run stiff and extreme cases through every stage and print a table; exit status 1 if a case fails.
 
-    Fast kernels are compared with their float64 twins; optical mass must be kept, pictures stay in range, files
-    come back to the bit, and nothing may be NaN or crash. A minute or two on two cores.
+    Kernels are compared with float64 twins, optical mass must be conserved, pictures must stay in range, files must
+    round-trip to the bit, and nothing may crash or become NaN. Takes a minute or two on two cores.
 
-    With VOLUME, only that scene is looked at: cases of its own, its stiffness, and the step that views of it need.
+    With VOLUME, only that scene is examined: a few cases, its stiffness, and the sampling step that its views need.
 
     \b
     Examples:
@@ -41,7 +42,7 @@ def command(volume: str | None, tolerance: float, as_json: bool, console: Consol
     given = [f"--{key.replace('_', '-')}" for key, value in (options["optics"] | options["read"]).items() if value]
     given = [name for name in given if name != "--tf-range" or options["optics"]["tf_range"] != "data"]
     if volume is None and given:
-        raise UsageError(f"{', '.join(given)}: of a volume, and none is given; expected VOLUME too")
+        raise UsageError(f"{', '.join(given)}: only with a volume; expected VOLUME too")
     source = None if volume is None else source_request(volume, options["read"], options["optics"])
     report = check(source, tolerance, console)
     click.echo(report.to_json() if as_json else report.table(), nl=False)

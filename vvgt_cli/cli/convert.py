@@ -11,74 +11,66 @@ import click
 from vvgt_cli.cli.blocks import block_options, chosen
 from vvgt_cli.cli.fit import fit_options, limit_options, ply_options, rule_option
 from vvgt_cli.cli.options import common_options, light_options, overwrite_option, placed_read_options, tfs_options
+from vvgt_cli.cli.sections import SectionedCommand
 from vvgt_cli.progress import Console
 
 if TYPE_CHECKING:
     from vvgt_cli.conversion.request import ConvertRequest
 
 
-@click.command("convert", short_help="Volume and transfer function to .ply.")
+@click.command("convert", cls=SectionedCommand, short_help="Convert a volume to a .ply of Gaussians.")
 @click.argument("volume")
 @click.option(
-    "-o",
-    "--output",
-    required=True,
-    metavar="OUT.ply",
-    help="File to write, in the format of its ending; - is standard output.",
-)
+    "-o", "--output", required=True, metavar="OUT.ply",
+    help="Output file; its ending selects the format, - is standard output.",
+)  # fmt: skip
+@tfs_options
 @fit_options
-@rule_option("Viewers that the file is fitted to: how they draw a Gaussian.", "inria")
+@limit_options
+@light_options
+@click.option(
+    "--preview", metavar="P.png", help="Save volume, splats and difference side by side, in three test views."
+)
+@click.option("--dry-run", is_flag=True, help="Print the plan with estimated time, memory and size; write nothing.")
+@overwrite_option
+@rule_option("Viewer to optimise for, by how it draws a Gaussian.", "inria")
 @click.option(
     "--steps", type=click.IntRange(0, 10_000_000), metavar="N",
-    help="Steps of gradient descent after the closed form, one view each, at most; 0 for none. Without: by the plan.",
+    help="Maximum number of gradient descent steps; 0 for none. Default: chosen by the plan.",
+)  # fmt: skip
+@click.option("--model", metavar="NAME", help="Trained network to run before the steps; discarded if it does not help.")
+@ply_options
+@placed_read_options
+@click.option("--report", metavar="R.json", help="Save times and errors of all stages as JSON; - is standard output.")
+@click.option(
+    "--checkpoint", metavar="FOLDER",
+    help="Save progress here, so that the same command resumes after an interruption.",
 )  # fmt: skip
 @click.option(
-    "--model", metavar="NAME", help="Trained network that runs before the steps; kept where the check views agree."
-)
-@limit_options
-@click.option("--dry-run", is_flag=True, help="Print the plan with estimated time, memory and size; write nothing.")
-@ply_options
-@tfs_options
-@light_options
-@placed_read_options
-@click.option("--report", metavar="R.json", help="Write times and errors of every stage as JSON; - is standard output.")
-@click.option(
-    "--preview", metavar="P.png", help="Write reference, ours and difference of three test views, at the screen's size."
-)
-@click.option(
-    "--checkpoint",
-    metavar="FOLDER",
-    help="For long runs: keeps what each stage made until OUT.ply is written; the same command goes on there.",
-)
-@click.option(
-    "--split-labels", is_flag=True, help="Of a label map: one file a label, its name for {} in OUT.ply, and an index."
-)
+    "--split-labels", is_flag=True,
+    help="Write one file per label of a label map, named by {} in OUT.ply, and an index.",
+)  # fmt: skip
 @block_options
-@click.option("--shard", metavar="I/N", help="Of a series: convert part I of N, for job arrays; I counts from 1.")
-@overwrite_option
+@click.option("--shard", metavar="I/N", help="Convert part I of N of a time series, for job arrays; I starts at 1.")
 @common_options
 def command(
     volume: str, shard: str | None, dry_run: bool, split_labels: bool, console: Console, blocks: dict[str, Any],
     **options: Any,
 ) -> None:  # fmt: skip
-    """Convert VOLUME into a standard 3D Gaussian Splatting .ply.
+    """Convert VOLUME to a standard 3D Gaussian Splatting .ply.
 
-    VOLUME is a file (raw with a header or with --dims and --dtype, NRRD, NIfTI, MetaImage, VTK, TIFF, ...),
-    "example:NAME" for one of the volumes that come with the program, or "-" for raw values on standard
-    input. Without --tf a function is made: tissue by Hounsfield units
-    where values are such, else from the histogram, background transparent, what is rare more opaque.
+    VOLUME is a file (NRRD, NIfTI, MetaImage, DICOM, TIFF, VTK, raw, ...), "example:NAME" for one of the volumes
+    that come with the program, or "-" for raw values on standard input. Without --tf, a transfer function is
+    made from the data.
 
-    The Gaussians are made for images of --size pixels and scored on three test views that nothing was fitted
-    to (ten with --report); the error is printed. --target-psnr, --time-budget and --max-size, any or none,
-    decide which stages run; what is left out is said, and why. Ctrl-C ends gradient descent only.
+    The result is scored on test views that it was not fitted to, and the error is printed. --target-psnr,
+    --time-budget and --max-size decide which stages run. Ctrl-C ends gradient descent early and writes the result.
 
-    OUT.ply may end in .html (one file that shows it in a browser), .spz, .compressed.ply, .sog, .glb or .usdc: what the
-    format costs is printed, but for a page of several.
+    OUT.ply may end in .html (a page that opens in a browser), .spz, .compressed.ply, .sog, .glb or .usdc.
 
-    With a place for a number in OUT.ply, VOLUME is a time series: a glob of its frames, or one file of several
-    time steps. One .ply a frame, under one function and one range of values. The same command again goes on
-    where it was. With --tf several times, {} in OUT.ply stands for each function's name, and VOLUME is read once.
-    A page takes them all: -o OUT.html, without a place, has a list and a slider of frames, functions or labels.
+    For a time series, VOLUME is a glob or a file with several time steps, and OUT.ply has a place for the number, such
+    as {:04d}. All frames share one function and value range; run the command again to resume. A name ending in
+    .html without a place makes one page of all frames, functions or labels.
 
     \b
     Examples:
@@ -114,7 +106,7 @@ def _split(request: ConvertRequest, functions: Sequence[str], other: bool, conso
     from vvgt_cli.runs.gaussian_files import is_page
 
     if functions or other or request.checkpoint is not None:
-        raise UsageError("--split-labels is of one label map: leave out --tf, --dry-run, --shard and --checkpoint")
+        raise UsageError("--split-labels converts one label map; leave out --tf, --dry-run, --shard and --checkpoint")
     if is_page(request.output) and not is_pattern(request.output or ""):
         page_of_labels(request, console)
     else:

@@ -8,28 +8,29 @@ import click
 
 from vvgt_cli.cli.fit import rule_option
 from vvgt_cli.cli.options import common_options, light_options, overwrite_option, placed_read_options, tf_options
+from vvgt_cli.cli.sections import SectionedCommand
 from vvgt_cli.progress import Console
 
 
-@click.command("evaluate", short_help="How far a .ply is from its volume.")
+@click.command("evaluate", cls=SectionedCommand, short_help="Measure the error of a .ply against its volume.")
 @click.argument("ply", metavar="OUT.ply")
-@click.option("--volume", required=True, metavar="VOLUME", help="The volume that the file was made from.")
+@click.option("--volume", required=True, metavar="VOLUME", help="Volume that OUT.ply was made from.")
 @click.option(
     "--size", type=click.IntRange(16, 8192), metavar="PX",
-    help="Image size to score at. Default: what the file is made for, or 400.",
+    help="Image size to score at. Default: the size recorded in the file, or 400.",
 )  # fmt: skip
-@rule_option("How to draw: as which viewers do. Default: the file's rule, or inria.")
+@rule_option("Viewer to imitate when drawing. Default: the one recorded in the file, or inria.")
 @click.option(
     "--no-seats", "seats", is_flag=True, default=True, flag_value=False,
-    help="Leave out the table of every rule, several sizes and close-ups, and the texture of smooth areas.",
+    help="Skip the table of viewing conditions (viewers, sizes, close-ups) and the texture of smooth areas.",
 )  # fmt: skip
 @click.option(
     "--step", type=click.FloatRange(0, 4, min_open=True), default=0.125, show_default=True, metavar="VOXELS",
-    help="Sampling distance of the reference; 0.5 is what convert scores with.",
+    help="Sampling distance of the reference, in voxels; 'vvgt convert' uses 0.5.",
 )  # fmt: skip
 @click.option(
     "--preview", metavar="FILE.png",
-    help="Reference, result and 8 times their difference, of a test view from the side and close up.",
+    help="Save volume, splats and difference side by side, from the side and close up.",
 )  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a table.")
 @tf_options
@@ -38,12 +39,14 @@ from vvgt_cli.progress import Console
 @overwrite_option
 @common_options
 def command(ply: str, volume: str, as_json: bool, console: Console, **options: Any) -> None:
-    """Score OUT.ply against the volume it was made from: on the ten test views, and from every seat.
+    """Score OUT.ply against the volume it was made from.
 
-    A seat is a rule of drawing (docs/viewers.md), a size (400, 800, the file's own and 2160 px) or a close-up
-    (field of view 10 degrees); three test views each, worst first. Large pictures are scored on blocks of 16 px.
-    The reference is ray-cast with steps of 1/8 voxel and up to 9 rays a pixel (seats: as convert's); its own
-    error is printed with the scores. Size, rule, light and --opacity-unit-distance are the file's own unless given.
+    Scores are means over ten test views. A table lists the viewing conditions, worst first: how each viewer draws
+    (docs/viewers.md), at 400, 800 and 2160 px and the file's own size, and close up, in three views each. Pictures
+    above 565 px are scored on a sample of blocks.
+
+    The reference is ray-cast with steps of 1/8 voxel and up to 9 rays per pixel; its own error is printed too. Size,
+    viewer, light and opacity unit distance are those recorded in the file unless given.
 
     \b
     Example:

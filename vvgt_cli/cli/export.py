@@ -8,20 +8,20 @@ from vvgt_cli.cli.options import common_options, overwrite_option
 from vvgt_cli.progress import Console
 
 
-@click.command("export", short_help="Turn a trained network into a model that infer runs.")
+@click.command("export", short_help="Export a trained network as a model for infer.")
 @click.argument("checkpoint", metavar="CHECKPOINT")
-@click.option("-o", "--output", required=True, metavar="DIR", help="Folder to make; its name is the model's.")
+@click.option("-o", "--output", required=True, metavar="DIR", help="Folder to create; its name becomes the model's.")
 @click.option(
     "--storage", type=click.Choice(["float32", "float16"]), default="float32", show_default=True,
-    help="Type of the stored weights; float16 halves the files, arithmetic stays float32.",
+    help="Storage type of the weights; float16 halves the files, computation stays float32.",
 )  # fmt: skip
 @overwrite_option
 @common_options
 def command(checkpoint: str, output: str, storage: str, overwrite: bool, console: Console) -> None:
     """Write the network of CHECKPOINT as two ONNX graphs and a model card.
 
-    onnxruntime is compared with torch on random scenes before the folder appears in its place; the largest difference
-    is in the card. Needs torch, onnx and onnxscript: install vvgt[train].
+    Before the folder is created, onnxruntime is compared with torch on random scenes; the largest difference is
+    recorded in the card. Requires torch, onnx and onnxscript: install vvgt[train].
 
     \b
     Example:

@@ -17,17 +17,20 @@ fit_options = group(
     "fit",
     max_gaussians=click.option(
         "--max-gaussians", type=click.IntRange(1, 100_000_000), default=100_000, show_default=True, metavar="K",
-        help="Budget: no more Gaussians than this.",
+        help="Maximum number of Gaussians.",
     ),
     size=click.option(
         "--size", type=click.IntRange(16, 8192), default=1080, show_default=True, metavar="PX",
-        help="Screen that the file is made for, in pixels along the edge; it is scored there.",
+        help="Screen size that the file is optimised for and scored at, in pixels along an edge.",
     ),
     init=click.option(
         "--init", type=click.Choice(["vbm", "wavelet", "uniform"]), default="vbm", show_default=True,
-        help="Closed form: multi-resolution moments, one isotropic Gaussian a wavelet atom, or random samples.",
+        help="Closed form: multi-resolution moments, one isotropic Gaussian per wavelet atom, or random samples.",
     ),
-    seed=click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of random samples."),
+    seed=click.option(
+        "--seed", type=click.IntRange(0), default=0, show_default=True, metavar="N",
+        help="Random seed of --init uniform.",
+    ),
 )  # fmt: skip
 
 RULES = ("inria", "compensated", "spark", "playcanvas", "viser")  # `vvgt_cli.splat.rules.RULES`; a test compares
@@ -44,13 +47,15 @@ limit_options = group(
     "limits",
     target_psnr=click.option(
         "--target-psnr", type=click.FloatRange(0, 150), metavar="DB",
-        help="Enough: stages and Gaussians beyond it are left out.",
+        help="Stop at this PSNR, skipping stages and Gaussians that are not needed for it.",
     ),
     time_budget=click.option(
-        "--time-budget", type=float, metavar="SECONDS", help="Of the whole run: what does not fit is left out.",
+        "--time-budget", type=float, metavar="SECONDS",
+        help="Time for the whole run; stages that do not fit are skipped.",
     ),
     max_megabytes=click.option(
-        "--max-size", "max_megabytes", type=float, metavar="MB", help="Of the file (10^6 bytes): fewer Gaussians.",
+        "--max-size", "max_megabytes", type=float, metavar="MB",
+        help="Maximum file size in 10^6 bytes; reduces the number of Gaussians.",
     ),
 )  # fmt: skip
 
@@ -58,7 +63,7 @@ ply_options = group(
     "ply",
     frame=click.option(
         "--frame", type=click.Choice(["unit", "world"]), default="unit", show_default=True,
-        help="World directions, box centred with longest edge 2; or the volume's physical space.",
+        help="Coordinates: centred and scaled to a longest edge of 2, or those of the volume's physical space.",
     ),
     up=click.option(
         "--up", metavar="DIRECTION", default="auto", show_default=True,
@@ -66,15 +71,15 @@ ply_options = group(
             *("auto", "none", "x", "-x", "y", "-y", "z", "-z"),
             *("superior", "inferior", "anterior", "posterior", "left", "right"),
         ]),
-        help="What viewers show upwards: superior, ..., right, or a world axis (x, -x, ..., -z); none leaves axes "
-        "as they are; auto is superior in the unit frame of an anatomical space, else none.",
+        help="Direction that viewers show upwards: anatomical, or a world axis. 'none' keeps the axes; 'auto' is "
+        "superior for anatomical volumes in the unit frame, else none.",
     ),
     sh_degree=click.option(
         "--sh-degree", type=click.IntRange(0, 3), metavar="N",
-        help="Degree of the file: zeros where there are no harmonics, those above it left out. Default: as they are.",
+        help="Degree of the spherical harmonics in the file, padded with zeros or truncated. Default: as computed.",
     ),
     comments=click.option("--no-comments", "comments", is_flag=True, default=True, flag_value=False,
-        help="Leave frame, unit distance and version out of the header."),
+        help="Omit the comments (frame, unit distance, version, ...) from the header."),
 )  # fmt: skip
 
 

@@ -7,16 +7,17 @@ from typing import Any
 import click
 
 from vvgt_cli.cli.options import common_options, placed_read_options
+from vvgt_cli.cli.sections import SectionedCommand
 from vvgt_cli.progress import Console
 
 
-@click.command("info", short_help="What a volume, transfer function, view set or .ply holds.")
+@click.command("info", cls=SectionedCommand, short_help="Describe a volume, transfer function, view set or .ply.")
 @click.argument("file")
-@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of lines.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
 @placed_read_options
 @common_options
 def command(file: str, as_json: bool, read: dict[str, Any], console: Console) -> None:
-    """Say what FILE holds, found out from its content: a volume, a transfer function, a table of labels, a view set
+    """Describe FILE, whose type is detected from its content: a volume, a transfer function, a label table, a view set
     (transforms.json) or a .ply of Gaussians.
 
     \b

@@ -10,35 +10,32 @@ import click
 from vvgt_cli.cli.blocks import shared_block_options
 from vvgt_cli.cli.fit import fit_options, ply_options
 from vvgt_cli.cli.options import common_options, light_options, overwrite_option, placed_read_options, tf_options
+from vvgt_cli.cli.sections import SectionedCommand
 from vvgt_cli.progress import Console
 
 
-@click.command("init", short_help="The closed form alone: no image is rendered.")
+@click.command("init", cls=SectionedCommand, short_help="Compute the closed form only, without rendering.")
 @click.argument("volume")
 @click.option(
-    "-o",
-    "--output",
-    required=True,
-    metavar="OUT.ply",
-    help="File to write, in the format of its ending; - is standard output.",
-)
-@fit_options
-@ply_options
+    "-o", "--output", required=True, metavar="OUT.ply",
+    help="Output file; its ending selects the format, - is standard output.",
+)  # fmt: skip
 @tf_options
+@fit_options
 @light_options
-@placed_read_options
-@click.option("--report", metavar="R.json", help="Write the times of every stage as JSON; - is standard output.")
-@shared_block_options
 @overwrite_option
+@ply_options
+@placed_read_options
+@click.option("--report", metavar="R.json", help="Save the times of all stages as JSON; - is standard output.")
+@shared_block_options
 @common_options
 def command(volume: str, console: Console, blocks: dict[str, Any], **options: Any) -> None:
-    """Turn VOLUME into Gaussians in closed form, without rendering an image.
+    """Compute Gaussians of VOLUME in closed form, without rendering an image.
 
-    The first stage of 'vvgt convert', for a quick look or as the start of an optimisation elsewhere. What
-    'convert' does beyond it: gradient descent on views of the volume, and a score.
+    This is the first stage of 'vvgt convert', for a quick look or as the start of an optimisation elsewhere.
 
-    A VOLUME that the memory does not hold is gone through in blocks, by itself or as --blocks, --workers,
-    --scheduler and --shard say; the file is the same whatever the blocks and however many are at work.
+    Volumes larger than memory are processed in blocks, automatically or as set by --blocks, --workers, --scheduler
+    and --shard. The output does not depend on the partition.
 
     \b
     Examples:

@@ -72,11 +72,11 @@ class LazyGroup(click.Group):
 @click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, "-V", "--version", prog_name="vvgt", message="%(prog)s %(version)s")
 def cli() -> None:
-    """Turn a scientific volume and a transfer function into a 3D Gaussian Splatting .ply.
+    """Convert scientific volumes to 3D Gaussian splats.
 
-    Standard output carries data, standard error the talk; "-" stands for either stream where a file
-    is asked for. No file is overwritten without --overwrite. Exit status: 0 done, 1 a file or its
-    data is not what it must be, 2 the call itself is wrong, 130 interrupted.
+    Data goes to standard output, messages to standard error; "-" stands for either stream wherever a file is
+    expected. Nothing is overwritten without --overwrite. Exit status: 0 success, 1 invalid data, 2 wrong usage, 130
+    interrupted.
     """
 
 

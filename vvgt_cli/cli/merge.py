@@ -9,16 +9,16 @@ from vvgt_cli.cli.options import common_options, overwrite_option
 from vvgt_cli.progress import Console
 
 
-@click.command("merge", short_help="A .ply of the blocks that the shards of 'init' have left.")
+@click.command("merge", short_help="Merge the blocks of 'init --shard' into a .ply.")
 @click.argument("folder")
-@click.option("-o", "--output", required=True, metavar="OUT.ply", help="File to write; - is standard output.")
+@click.option("-o", "--output", required=True, metavar="OUT.ply", help="Output file; - is standard output.")
 @levels_option
 @overwrite_option
 @common_options
 def command(folder: str, output: str, levels: int, overwrite: bool, console: Console) -> None:
-    """Make a .ply of FOLDER, in which 'vvgt init --shard I/N' has left the blocks of a volume.
+    """Merge the blocks that 'vvgt init --shard I/N' has written to FOLDER into a .ply.
 
-    The volume is not needed any more. FOLDER stays as it is.
+    The volume is no longer needed. FOLDER is left unchanged.
 
     \b
     Example:

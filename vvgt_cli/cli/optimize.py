@@ -13,50 +13,53 @@ from vvgt_cli.progress import Console
 
 @click.command("optimize", short_help="Refine a .ply by gradient descent on views.")
 @click.argument("ply", metavar="IN.ply")
-@click.option("--views", required=True, metavar="DIR", help="Folder that 'vvgt render-views' wrote.")
-@click.option("-o", "--output", required=True, metavar="OUT.ply", help="File to write; - is standard output.")
-@click.option("--steps", type=click.IntRange(0, 10_000_000), metavar="N", help="Steps of one view each, at most.")
+@click.option("--views", required=True, metavar="DIR", help="Views of the volume, written by 'vvgt render-views'.")
+@click.option("-o", "--output", required=True, metavar="OUT.ply", help="Output file; - is standard output.")
+@click.option(
+    "--steps", type=click.IntRange(0, 10_000_000), metavar="N", help="Maximum number of steps, one view each."
+)
 @click.option(
     "--time-budget", type=click.FloatRange(0, min_open=True), metavar="SECONDS",
-    help="In place of --steps: wall time of the descent.",
+    help="Time for the descent, instead of --steps.",
 )  # fmt: skip
 @click.option(
-    "--target-psnr", type=click.FloatRange(0, 150), metavar="DB", help="End where the check views have this PSNR."
+    "--target-psnr", type=click.FloatRange(0, 150), metavar="DB", help="Stop when the check views reach this PSNR."
 )
 @click.option(
     "--method", type=click.Choice(["frame", "adam", "3dgs"]), default="frame", show_default=True,
-    help="Steps in each Gaussian's own frame; or, to compare with: plain Adam, Adam with 3DGS' density control.",
+    help="Steps in each Gaussian's own frame or, for comparison, plain Adam or Adam with 3DGS' density control.",
 )  # fmt: skip
 @click.option(
     "--max-gaussians", type=click.IntRange(1, 100_000_000), metavar="K",
-    help="Of --method 3dgs: grow to no more than this. Default: as many as IN.ply has.",
+    help="Maximum number of Gaussians with --method 3dgs. Default: as many as IN.ply has.",
 )  # fmt: skip
 @click.option(
     "--checkpoint", metavar="FILE.npz",
-    help="For long runs: written at every look at the check views and at the end; the same command goes on there.",
+    help="Save progress here, so that the same command resumes after an interruption.",
 )  # fmt: skip
 @click.option(
     "--size", type=click.IntRange(16, 8192), metavar="PX",
-    help="Screen that the file is made for, of which the views are samples. Default: the file's, or the views' size.",
+    help="Screen size to optimise for, in pixels. Default: the size recorded in IN.ply, or that of the views.",
 )  # fmt: skip
-@rule_option("Viewers to fit to: how they draw a Gaussian. Default: the file's rule, or inria.")
+@rule_option("Viewer to optimise for. Default: the one recorded in IN.ply, or inria.")
 @click.option(
     "--sh-degree", type=click.IntRange(0, 3), metavar="N",
-    help="Of the spherical harmonics that are refined: those above it are left out, those that are missing begin with "
-    "0. Default: that of IN.ply.",
+    help="Degree of the spherical harmonics to refine; missing ones start at 0. Default: that of IN.ply.",
 )  # fmt: skip
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of the order of views.")
-@click.option("--report", metavar="R.json", help="Write times and errors of every stage as JSON; - is standard output.")
+@click.option(
+    "--seed", type=click.IntRange(0), default=0, show_default=True, help="Random seed for the order of views."
+)
+@click.option("--report", metavar="R.json", help="Save times and errors of all stages as JSON; - is standard output.")
 @overwrite_option
 @common_options
 def command(
     ply: str, views: str, output: str, report: str | None, overwrite: bool, console: Console, **options: Any
 ) -> None:
-    """Refine IN.ply until its pictures match the views in DIR.
+    """Refine IN.ply so that its pictures match the views in DIR.
 
-    Fitted to the training views, decided by the check views, and scored on the test views, which are used for
-    nothing else. What is written is the best that the check views have seen: never worse than IN.ply. A folder
-    without check views gives every 8th training view for them. Ctrl-C ends the descent and writes what there is.
+    Training views are fitted, check views decide what is kept, and test views only score the result. The best state
+    on the check views is written, never worse than IN.ply. If the folder has no check views, every 8th training view
+    is used instead. Ctrl-C ends the descent early and writes the result.
 
     \b
     Examples:
@@ -70,7 +73,7 @@ def command(
 
     method, most = options["method"], options["max_gaussians"]
     if most is not None and method != "3dgs":
-        raise UsageError(f"--max-gaussians is of --method 3dgs; --method {method} keeps the number as it is")
+        raise UsageError(f"--max-gaussians applies to --method 3dgs; --method {method} does not change the number")
     how = OptimizeOptions.of(
         method, max_gaussians=most, target_psnr=options["target_psnr"], seed=options["seed"],
         checkpoint=options["checkpoint"],

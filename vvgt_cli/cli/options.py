@@ -48,79 +48,67 @@ def _component(ctx: click.Context, param: click.Parameter, value: str | None) ->
 
 _READ = dict(
     dims=click.option(
-        "--dims",
-        nargs=3,
-        type=click.IntRange(1),
-        metavar="X Y Z",
-        help="Voxels of a raw file, or of the grid to resample a mesh to; also X,Y,Z.",
+        "--dims", nargs=3, type=click.IntRange(1), metavar="X Y Z",
+        help="Voxels along x, y and z of a raw file, or of the grid that a mesh is resampled to.",
     ),
-    dtype=click.option("--dtype", metavar="TYPE", help="Type of a raw file's values: uint8, int16, float32, ..."),
-    byte_order=click.option("--byte-order", type=click.Choice(["little", "big"]), help="Of a raw file."),
+    dtype=click.option("--dtype", metavar="TYPE", help="Data type of a raw file: uint8, int16, float32, ..."),
+    byte_order=click.option("--byte-order", type=click.Choice(["little", "big"]), help="Byte order of a raw file."),
     header_bytes=click.option(
-        "--header-bytes", type=click.IntRange(0), default=0, metavar="N", help="Bytes before a raw file's values."
+        "--header-bytes", type=click.IntRange(0), default=0, metavar="N",
+        help="Size of a raw file's header, which is skipped.",
     ),
     spacing=click.option(
-        "--spacing", nargs=3, type=float, metavar="X Y Z", help="Voxel edges, in place of the file's; also X,Y,Z."
+        "--spacing", nargs=3, type=float, metavar="X Y Z", help="Voxel spacing, overriding the file's."
     ),
     array=click.option(
-        "--array",
-        "--grid",
-        "--series",
-        "array",
-        metavar="NAME",
-        help="Which array, grid or series (of DICOM: number, UID or description), where there are several.",
+        "--array", "--grid", "--series", "array", metavar="NAME",
+        help="Array, grid or DICOM series (number, UID or description) to read if there are several.",
     ),
     component=click.option(
-        "--component",
-        "--channel",
-        "component",
-        metavar="N|NAME|magnitude|color|all",
-        callback=_component,
-        help="Which component of vectors, or which channel: its number from 0, or its name; color: components are "
-        "red, green, blue and perhaps opacity; all: every channel in its own colour.",
+        "--component", "--channel", "component", metavar="N|NAME|magnitude|color|all", callback=_component,
+        help="Vector component or channel to read, by number (from 0) or name; 'color' reads the components as RGB or "
+        "RGBA, 'all' shows every channel in its own colour.",
     ),
-    time=click.option(
-        "--time", type=click.IntRange(0), metavar="N", help="Which time step, from 0, where the file holds several."
-    ),
+    time=click.option("--time", type=click.IntRange(0), metavar="N", help="Time step to read, counted from 0."),
     crop=click.option(
-        "--crop", metavar="X0:X1,Y0:Y1,Z0:Z1", help="Voxels to keep, from 0, the last excluded; ends may be left out."
+        "--crop", metavar="X0:X1,Y0:Y1,Z0:Z1",
+        help="Range of voxels to keep, as Python slices: counted from 0, end excluded, either bound optional.",
     ),
-    mask=click.option("--mask", metavar="FILE", help="Volume of the same size: where it is 0 nothing is shown."),
-)
+    mask=click.option("--mask", metavar="FILE", help="Volume of the same size; voxels where it is 0 are hidden."),
+)  # fmt: skip
 read_options = group("read", **_READ)
 placed_read_options = group(
     "read",
     **_READ,
     space=click.option(
-        "--space", type=click.Choice(["RAS", "LPS"]), help="World of a volume with an anatomical space. Default: RAS."
+        "--space", type=click.Choice(["RAS", "LPS"]), help="World space of anatomical volumes. Default: RAS."
     ),
 )
 
 tf_range_option = click.option(
     "--tf-range", default="data", show_default=True, metavar="data|rescale|LO,HI",
-    help="Where the function's nodes lie: at their own data values, stretched to the data's range, or to LO,HI "
-    "(LO HI).",
+    help="Place the function's nodes at their own data values, or stretch them to the range of the data, or to LO,HI.",
 )  # fmt: skip
 
 unit_distance_option = click.option(
     "--opacity-unit-distance", metavar="LENGTH|paraview|mean-spacing",
-    help="Distance that the function's opacity refers to. Default: the function's own, else paraview.",
+    help="Distance over which the function's opacity accumulates. Default: given by the function, else paraview.",
 )  # fmt: skip
 
 LABELS = dict(
     labels=click.option(
         "--labels", metavar="TABLE|auto|none",
-        help="VOLUME is a label map: its table (3D Slicer, ITK-SNAP, FreeSurfer, .seg.nrrd, DICOM SEG, JSON), or auto "
-        "for distinct colours. Default: auto where it is recognised by name and type; none: scalars.",
+        help="Treat VOLUME as a label map coloured by TABLE (3D Slicer, ITK-SNAP, FreeSurfer, .seg.nrrd, DICOM SEG, "
+        "JSON); 'auto' assigns distinct colours, 'none' treats it as scalars. Default: detected from name and type.",
     ),
     layers=click.option(
         "--layer", "layers", multiple=True, metavar="FILE[,tf=TF][,labels=TABLE]...",
-        help="Lay another volume over VOLUME, where both say they are, with its own tf, labels, distance, array, "
-        "component (channel) or time; may be repeated.",
+        help="Add another volume in its place in the world, with its own tf, labels, distance, array, component "
+        "(channel) or time. Repeatable.",
     ),
 )  # fmt: skip
 
-TF_HELP = "Transfer function: a file, or a matplotlib colour map's name. Default: made from the values."
+TF_HELP = "Transfer function: a file or the name of a matplotlib colour map. Default: made from the data."
 tf_options = group(
     "optics",
     tf=click.option("--tf", metavar="TF", help=TF_HELP),
@@ -131,38 +119,37 @@ tf_options = group(
 tfs_options = group(
     "optics",
     tf=click.option(
-        "--tf", metavar="TF", multiple=True, help=f"{TF_HELP} Again: one file a function, its name for {{}} in OUT.ply."
+        "--tf", metavar="TF", multiple=True,
+        help=f"{TF_HELP} Repeatable: each function gets a file, named by {{}} in OUT.ply.",
     ),
     tf_range=tf_range_option,
     opacity_unit_distance=unit_distance_option,
     **LABELS,
-)
+)  # fmt: skip
 
 light_options = group(
     "light",
     lights=click.option(
         "--light", "lights", multiple=True, metavar="none|headlight|X,Y,Z|left|above|...",
-        help="Light at the eye, or from a direction in the world: X,Y,Z, an axis (x, -x, ...), above, below, left, "
-        "right, anterior, ...; may be repeated. Default: the function's, if its file has one, else none.",
+        help="Light at the eye ('headlight') or from a direction in the world: X,Y,Z, an axis (x, -x, ...), above, "
+        "below, left, right, anterior, ... Repeatable. Default: given by the function's file, else none.",
     ),
-    ambient=click.option(
-        "--ambient", type=float, metavar="KA", help="Part of the colour that is there without light. Default: 0.1."
+    shadows=click.option("--shadows", is_flag=True, help="Let directional lights cast soft shadows."),
+    ambient=click.option("--ambient", type=float, metavar="KA", help="Ambient coefficient. Default: 0.1."),
+    diffuse=click.option("--diffuse", type=float, metavar="KD", help="Diffuse coefficient. Default: 0.7."),
+    specular=click.option(
+        "--specular", type=float, metavar="KS", help="Specular coefficient; highlights are white. Default: 0.2."
     ),
-    diffuse=click.option(
-        "--diffuse", type=float, metavar="KD", help="Part of the colour where light falls straight. Default: 0.7."
-    ),
-    specular=click.option("--specular", type=float, metavar="KS", help="White of the highlights. Default: 0.2."),
     specular_power=click.option(
-        "--specular-power", type=float, metavar="P", help="The larger, the smaller are highlights. Default: 10."
+        "--specular-power", type=float, metavar="P", help="Specular exponent; larger is glossier. Default: 10."
     ),
-    shadows=click.option("--shadows", is_flag=True, help="Lights from directions throw shadows, with soft edges."),
     occlusion=click.option(
         "--ambient-occlusion", "occlusion", type=float, is_flag=False, flag_value=0.1, metavar="[RADIUS]",
-        help="Darker where much is around, within RADIUS (the longest edge is 2; without a number 0.1).",
+        help="Darken crevices within RADIUS, where the volume's longest edge is 2. RADIUS is 0.1 if omitted.",
     ),
 )  # fmt: skip
 
-overwrite_option = click.option("--overwrite", is_flag=True, help="Replace files that exist.")
+overwrite_option = click.option("--overwrite", is_flag=True, help="Overwrite existing files.")
 
 
 def default_threads() -> int:
@@ -205,16 +192,16 @@ def common_options(function: Callable[..., Any]) -> Callable[..., Any]:
         metavar="N",
         callback=_threads,
         expose_value=False,
-        help="CPU threads. Default: OMP_NUM_THREADS, SLURM_CPUS_PER_TASK, or all that may be used.",
+        help="Number of threads. Default: NUMBA_NUM_THREADS, OMP_NUM_THREADS, SLURM_CPUS_PER_TASK or all CPUs.",
     )
     @click.option(
         "--memory",
         metavar="SIZE",
         callback=_memory,
         expose_value=False,
-        help="Memory to count on, as 4G. Default: what machine, cgroups and limits leave the process.",
+        help="Memory limit, such as 4G. Default: what the machine, cgroups and ulimit allow.",
     )
-    @click.option("-q", "--quiet", is_flag=True, help="Say nothing on standard error but errors.")
+    @click.option("-q", "--quiet", is_flag=True, help="Print only errors.")
     @functools.wraps(function)
     def wrapper(*args: Any, quiet: bool, **kwargs: Any) -> Any:
         with warnings.catch_warnings():

@@ -9,29 +9,30 @@ from vvgt_cli.cli.options import common_options, overwrite_option
 from vvgt_cli.progress import Console
 
 
-@click.command("render", short_help="Pictures of a .ply, or a movie.")
+@click.command("render", short_help="Render pictures or a movie of a .ply.")
 @click.argument("ply", metavar="OUT.ply")
-@click.option("--camera", metavar="FILE", help="Views of a transforms.json (in the unit frame).")
-@click.option("--orbit", type=click.IntRange(1, 10_000), metavar="N", help="N views on a circle around the way up.")
+@click.option("--camera", metavar="FILE", help="Camera poses from a transforms.json, in the unit frame.")
+@click.option("--orbit", type=click.IntRange(1, 10_000), metavar="N", help="N views on a circle around the up axis.")
 @click.option(
     "--size",
     type=click.IntRange(1, 16384),
     metavar="PX",
-    help="Image height. Default: the view set's, for an orbit what the .ply is made for, or 400.",
+    help="Image height in pixels. Default: that of the camera file, for an orbit the size recorded in the .ply, or "
+    "400.",
 )
 @click.option(
     "-o", "--output", required=True, metavar="DIR|FILE",
-    help="Directory for the images, made if it is not there; or a movie: turn.gif, turn.mp4.",
+    help="Output directory, created if missing, or a movie such as turn.gif or turn.mp4.",
 )  # fmt: skip
-@click.option("--exr", is_flag=True, help="Write float EXR (premultiplied RGBA) beside each PNG.")
+@click.option("--exr", is_flag=True, help="Also write float EXR images (premultiplied RGBA).")
 @click.option(
     "--background",
     type=float,
     nargs=3,
     metavar="R G B",
-    help="Put pictures over this colour. Default: transparent PNG, black movies.",
+    help="Background colour, 0 to 1. Default: transparent for PNG, black for movies.",
 )
-@rule_option("How to draw: as which viewers do. Default: the file's rule, or inria.")
+@rule_option("Viewer to imitate when drawing. Default: the one recorded in the file, or inria.")
 @overwrite_option
 @common_options
 def command(
@@ -46,11 +47,10 @@ def command(
     overwrite: bool,
     console: Console,
 ) -> None:
-    """Render the Gaussians of OUT.ply as the standard viewers do, one PNG a view, and a transforms.json.
+    """Render the Gaussians of OUT.ply as viewers do: one PNG per view and a transforms.json.
 
-    With -o turn.gif or turn.mp4 the views are the pictures of a movie, 25 a second; that of an orbit goes on from its
-    last picture to its first without a jump. OUT.ply may be "-" for standard input. Give the views with --camera or
-    with --orbit. The way up is the one that OUT.ply was made with (--up), else +z.
+    Choose the views with --camera or --orbit. With -o turn.gif or turn.mp4 they become a movie at 25 frames per second,
+    which loops seamlessly for an orbit. The up axis is the one recorded in OUT.ply, else +z. OUT.ply may be "-".
 
     \b
     Examples:

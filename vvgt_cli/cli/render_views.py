@@ -10,6 +10,7 @@ from vvgt_cli.cli.blocks import block_options, chosen
 from vvgt_cli.cli.fit import source_request
 from vvgt_cli.cli.options import (
     LABELS,
+    TF_HELP,
     common_options,
     group,
     light_options,
@@ -17,6 +18,7 @@ from vvgt_cli.cli.options import (
     tf_range_option,
     unit_distance_option,
 )
+from vvgt_cli.cli.sections import SectionedCommand
 from vvgt_cli.progress import Console
 
 
@@ -32,15 +34,17 @@ camera_options = group(
     "cameras",
     kind=click.option(
         "--cameras", "kind", default="sphere", show_default=True, metavar="sphere|orbit|FILE",
-        help="Fibonacci sphere, a circle around +z, or the views of a transforms.json (in the unit frame).",
+        help="Camera positions: a Fibonacci sphere, a circle around +z, or a transforms.json (in the unit frame).",
     ),
-    views=click.option("--views", type=click.IntRange(1, 10_000), metavar="N", help="Training views. Default: 24."),
+    views=click.option("--views", type=click.IntRange(1, 10_000), metavar="N",
+    help="Number of training views. Default: 24."),
     test_views=click.option(
         "--test-views", type=click.IntRange(0, 10_000), metavar="N",
-        help="Test views, on a sphere of their own; 0 for none. Default: 10.",
+        help="Number of separate test views; 0 for none. Default: 10.",
     ),
     size=click.option(
-        "--size", type=click.IntRange(16, 16384), metavar="PX", help="Image height. Default: the file's, or 400."
+        "--size", type=click.IntRange(16, 16384), metavar="PX",
+        help="Image height in pixels. Default: that of the camera file, or 400."
     ),
     fov=click.option(
         "--fov", type=click.FloatRange(0, 180, min_open=True, max_open=True), metavar="DEGREES",
@@ -48,7 +52,7 @@ camera_options = group(
     ),
     radius=click.option(
         "--radius", type=click.FloatRange(0, 1000, min_open=True), metavar="R",
-        help="Distance from the centre, where the volume's longest edge is 2. Default: 3.",
+        help="Camera distance from the centre, where the volume's longest edge is 2. Default: 3.",
     ),
 )  # fmt: skip
 
@@ -56,30 +60,30 @@ image_options = group(
     "layout",
     format=click.option(
         "--format", type=click.Choice(["both", "exr", "png"]), default="both", show_default=True,
-        help="EXR (float, exact), PNG (8 bits, with a COLMAP model), or both.",
+        help="EXR (exact floats), PNG (8 bits, with a COLMAP model), or both.",
     ),
-    half=click.option("--half", is_flag=True, help="EXR in 16 bits: half the size, three digits."),
+    half=click.option("--half", is_flag=True, help="Write 16-bit EXR: half the size, three significant digits."),
     background=click.option(
         "--background", type=click.FloatRange(0, 1), nargs=3, default=(0.0, 0.0, 0.0), metavar="R G B",
-        help="Behind the opaque images for COLMAP and the contact sheet. Default: black.",
+        help="Background of the COLMAP images and the contact sheet. Default: black.",
     ),
     points=click.option("--no-points", "points", is_flag=True, default=True, flag_value=False,
-        help="Leave out the cloud to start from; the COLMAP model then has no points."),
+        help="Omit the initial point cloud; the COLMAP model then has no points."),
 )  # fmt: skip
 
 ray_options = group(
     "rays",
     renderer=click.option(
         "--renderer", type=click.Choice(["cpu", "cuda", "vtk"]), default="cpu", show_default=True,
-        help="Our kernels on the CPU or with torch on CUDA, or VTK's ray caster.",
+        help="Ray caster: our own on the CPU or, with torch, on CUDA; or VTK's.",
     ),
     samples=click.option(
         "--samples", default="adaptive", show_default=True, callback=_samples, metavar="adaptive|N",
-        help="Rays a pixel: 5 or 13 where neighbours differ and one elsewhere, or N x N everywhere.",
+        help="Rays per pixel: 5 or 13 where neighbours differ and 1 elsewhere, or N x N everywhere.",
     ),
     step=click.option(
         "--step", type=click.FloatRange(0, 4, min_open=True), default=0.5, show_default=True, metavar="VOXELS",
-        help="Sampling distance along a ray.",
+        help="Sampling distance along a ray, in voxels.",
     ),
 )  # fmt: skip
 
@@ -87,8 +91,7 @@ optics_options = group(
     "optics",
     tf=click.option(
         "--tf", multiple=True, metavar="TF",
-        help="Transfer function: a file, or a matplotlib colour map's name; may be repeated. "
-        "Default: made from the values.",
+        help=f"{TF_HELP} Repeatable: each function gets a folder.",
     ),
     tf_range=tf_range_option,
     opacity_unit_distance=unit_distance_option,
@@ -96,18 +99,18 @@ optics_options = group(
 )  # fmt: skip
 
 
-@click.command("render-views", short_help="Calibrated views of a volume, for trainers.")
+@click.command("render-views", cls=SectionedCommand, short_help="Render calibrated views of a volume, for trainers.")
 @click.argument("volume")
-@click.option("-o", "--output", required=True, metavar="DIR", help="Directory for the views; made if it is not there.")
+@click.option("-o", "--output", required=True, metavar="DIR", help="Output directory, created if missing.")
+@optics_options
 @camera_options
+@light_options
 @image_options
 @ray_options
-@optics_options
-@light_options
 @placed_read_options
 @block_options
-@click.option("--shard", default="1/1", metavar="I/N", help="Render part I of N, for job arrays; I counts from 1.")
-@click.option("--overwrite", is_flag=True, help="Start afresh where another run's views are.")
+@click.option("--shard", default="1/1", metavar="I/N", help="Render part I of N, for job arrays; I starts at 1.")
+@click.option("--overwrite", is_flag=True, help="Replace the views of another run.")
 @common_options
 def command(
     volume: str,
@@ -126,9 +129,8 @@ def command(
     """Render views of VOLUME with known cameras, and the files that 3DGS trainers start from.
 
     DIR gets EXR and PNG images, transforms.json (nerfstudio), transforms_train.json and transforms_test.json
-    (Blender style), a COLMAP model, a point cloud to start from and a contact sheet. With several --tf each
-    function gets DIR/NAME of its own. The same command again renders only what is missing or damaged; another
-    one is refused, unless --overwrite is given.
+    (Blender style), a COLMAP model, an initial point cloud and a contact sheet. Several --tf get DIR/NAME each.
+    Running the same command again renders only what is missing or damaged.
 
     \b
     Examples:
@@ -141,7 +143,7 @@ def command(
     from vvgt_cli.errors import UsageError
 
     if layout["half"] and layout["format"] == "png":
-        raise UsageError("--half is of EXR, which --format png leaves out; leave out one of the two")
+        raise UsageError("--half applies to EXR, which --format png does not write; leave out one of the two")
     source = source_request(volume, read, optics | {"tf": None}, light)
     request = ViewsRequest(
         source, optics["tf"], output, CameraRequest(**cameras), Layout(**layout),

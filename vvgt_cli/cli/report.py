@@ -9,6 +9,7 @@ import click
 from click.core import ParameterSource
 
 from vvgt_cli.cli.options import common_options, light_options, overwrite_option, read_options, tf_options
+from vvgt_cli.cli.sections import SectionedCommand
 from vvgt_cli.errors import UsageError
 from vvgt_cli.progress import Console
 
@@ -35,31 +36,34 @@ def command_line(ctx: click.Context) -> str:
     return shlex.join(words)
 
 
-@click.command("report", short_help="Error against run time, as a page, plots and tables.")
+@click.command("report", cls=SectionedCommand, short_help="Plot error against run time, as an HTML page and tables.")
 @click.argument("paths", nargs=-1, required=True, metavar="VOLUME | A.json B.json ...")
-@click.option("-o", "--output", required=True, metavar="DIR", help="Folder to write to; made if it is not there.")
-@click.option("--compare", is_flag=True, help="Overlay reports: report.json files, or --report files of convert.")
+@click.option("-o", "--output", required=True, metavar="DIR", help="Output folder, created if missing.")
+@click.option(
+    "--compare", is_flag=True, help="Overlay existing reports: report.json files, or JSON of 'vvgt convert --report'."
+)
 @click.option(
     "--max-gaussians", type=click.IntRange(1, 100_000_000), default=100_000, show_default=True, metavar="K",
-    help="Largest budget; the closed form runs with 1/64, 1/16 and 1/4 of it too.",
+    help="Maximum number of Gaussians; the closed form also runs with 1/64, 1/16 and 1/4 of it.",
 )  # fmt: skip
 @click.option(
     "--size", type=click.IntRange(16, 2048), default=1080, show_default=True, metavar="PX",
-    help="Size of the screen that files are made for and scored on.",
+    help="Screen size that files are optimised for and scored at.",
 )  # fmt: skip
 @click.option(
     "--steps", type=click.IntRange(1, 10_000_000), multiple=True, default=(25, 120, 200, 400), show_default=True,
-    metavar="N", help="Steps of gradient descent, a run each; may be repeated. The baselines take the largest.",
+    metavar="N", help="Number of gradient descent steps. Repeatable, one run each; the baselines use the largest.",
 )  # fmt: skip
 @click.option(
     "--picture-size", type=click.IntRange(16, 2048), default=400, show_default=True, metavar="PX",
-    help="Pictures on the page are averaged down to at most this.",
+    help="Maximum size of the pictures on the page.",
 )  # fmt: skip
 @click.option(
     "--model", metavar="MODEL",
-    help="Network: a folder of 'vvgt export' or a shipped one's name. Default: the shipped one, if any.",
+    help="Network: a folder written by 'vvgt export', or the name of a shipped model. Default: the shipped one, if "
+    "any.",
 )  # fmt: skip
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of whatever draws random numbers.")
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Random seed.")
 @tf_options
 @light_options
 @read_options
@@ -69,12 +73,12 @@ def command_line(ctx: click.Context) -> str:
 def command(
     ctx: click.Context, /, paths: tuple[str, ...], output: str, compare: bool, console: Console, **options: Any
 ) -> None:
-    """Make the Gaussians of VOLUME by ever dearer means and show what each costs and gains.
+    """Convert VOLUME in increasingly expensive ways and show what each costs and gains.
 
-    The closed form at several budgets, a network where there is one, gradient descent of several lengths, and
-    two baselines: 3DGS from random points, and iVR-GS' setting (3DGS from samples of the volume). Each is timed on
-    its own, views and all, and scored on the same ten test views. DIR gets report.html (one file, opens offline),
-    report.json, report.csv and four PNG plots.
+    Runs the closed form with several budgets, a network if there is one, gradient descent of several lengths, and two
+    baselines: 3DGS from random points, and the iVR-GS setting (3DGS from samples of the volume). Each run is timed
+    separately, including its views, and scored on the same ten test views. DIR gets report.html (one file, works
+    offline), report.json, report.csv and four PNG plots.
 
     \b
     Examples:
@@ -88,7 +92,7 @@ def command(
     if compare:
         other = [p.opts[-1] for p in _typed(ctx) if p.name not in OF_BOTH]
         if other:
-            raise UsageError(f"{', '.join(other)}: of a volume's report; --compare only overlays reports")
+            raise UsageError(f"{', '.join(other)}: not with --compare, which only overlays reports")
         pipeline.compare(paths, output, options["overwrite"], console)
         return
     if len(paths) != 1:

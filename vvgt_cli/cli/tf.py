@@ -10,15 +10,15 @@ from vvgt_cli.cli.options import common_options, overwrite_option, read_options,
 from vvgt_cli.progress import Console
 
 
-@click.group("tf", short_help="Look at transfer functions, convert them, or have some made.")
+@click.group("tf", short_help="Show, convert and suggest transfer functions.")
 def command() -> None:
-    """Look at transfer functions, convert them, or have some made."""
+    """Show, convert and suggest transfer functions."""
 
 
 @command.command("show", short_help="Draw a transfer function over a histogram.")
 @click.argument("tf")
-@click.option("-o", "--output", required=True, metavar="OUT.png", help="File to write.")
-@click.option("--volume", metavar="VOLUME", help="Draw over this volume's histogram.")
+@click.option("-o", "--output", required=True, metavar="OUT.png", help="Output file.")
+@click.option("--volume", metavar="VOLUME", help="Volume whose histogram is drawn behind the function.")
 @tf_range_option
 @read_options
 @overwrite_option
@@ -26,7 +26,7 @@ def command() -> None:
 def show(
     tf: str, output: str, volume: str | None, tf_range: str, read: dict[str, Any], overwrite: bool, console: Console
 ) -> None:
-    """Draw the colours and the opacity of TF, over the histogram of --volume where one is given.
+    """Draw the colours and opacity of TF, over the histogram of --volume if given.
 
     \b
     Example:
@@ -43,15 +43,15 @@ def show(
 @click.argument("output", metavar="OUT")
 @click.option(
     "--format", "form", type=click.Choice(["minimal", "paraview"]), default="minimal", show_default=True,
-    help="Minimal JSON, which holds the unit distance, or a ParaView preset, which holds midpoints and sharpness.",
+    help="Minimal JSON, which stores the unit distance, or a ParaView preset, which stores midpoints and sharpness.",
 )  # fmt: skip
 @tf_range_option
 @overwrite_option
 @common_options
 def convert(tf: str, output: str, form: str, tf_range: str, overwrite: bool, console: Console) -> None:
-    """Write the transfer function IN (any format that is read, or the name of a colour map) as the JSON file OUT.
+    """Convert the transfer function IN (any supported format, or the name of a colour map) to the JSON file OUT.
 
-    What the format cannot hold is refused, and named. OUT may be - for standard output.
+    Features that the format cannot store are an error. OUT may be - for standard output.
 
     \b
     Examples:
@@ -63,21 +63,26 @@ def convert(tf: str, output: str, form: str, tf_range: str, overwrite: bool, con
     convert_transfer_function(tf, output, form, tf_range, overwrite, console)
 
 
-@command.command("suggest", short_help="Make functions that show a range of values each.")
+@command.command("suggest", short_help="Suggest functions that each show one range of values.")
 @click.argument("volume")
 @click.option(
-    "-n", "--number", type=click.IntRange(1, 100), default=10, show_default=True, metavar="N", help="Functions to make."
+    "-n",
+    "--number",
+    type=click.IntRange(1, 100),
+    default=10,
+    show_default=True,
+    metavar="N",
+    help="Number of functions.",
 )
-@click.option("-o", "--output", required=True, metavar="DIR", help="Directory for the files; made if it is not there.")
+@click.option("-o", "--output", required=True, metavar="DIR", help="Output directory, created if missing.")
 @read_options
 @overwrite_option
 @common_options
 def suggest(volume: str, number: int, output: str, read: dict[str, Any], overwrite: bool, console: Console) -> None:
-    """Write N transfer functions for VOLUME, each of which shows one range of its values in a colour of its own.
+    """Write N transfer functions for VOLUME, each showing one range of values in its own colour.
 
-    The ranges follow from the histogram: the background is left out, the rest is shared evenly, half by value
-    and half by number of voxels. The files are minimal JSON, to be used as they are or edited; their paths go
-    to standard output.
+    The background is excluded and the remaining values are divided evenly, half by value and half by number of
+    voxels. The files are minimal JSON, ready to use or edit; their paths are printed.
 
     \b
     Example:

@@ -9,21 +9,27 @@ from vvgt_cli.progress import Console
 
 
 @click.command("train", short_help="Train the network on volumes.")
-@click.option("--data", required=True, metavar="DIR", help="Volumes in DIR/train and DIR/held; scenes to DIR/scenes.")
-@click.option("-o", "--output", required=True, metavar="RUN", help="Folder of the run: made, or gone on with.")
-@click.option("--config", "path", metavar="FILE.yaml", help="What differs from the defaults, or a run's config.yaml.")
+@click.option(
+    "--data",
+    required=True,
+    metavar="DIR",
+    help="Folder with volumes in DIR/train and DIR/held; scenes are cached in DIR/scenes.",
+)
+@click.option("-o", "--output", required=True, metavar="RUN", help="Folder of the run, created or resumed.")
+@click.option(
+    "--config", "path", metavar="FILE.yaml", help="Settings that differ from the defaults, or a run's config.yaml."
+)
 @common_options
 def command(data: str, output: str, path: str | None, console: Console) -> None:
-    """Train a network on scenes made of the volumes in DIR, and keep what is best on held-out ones.
+    """Train a network on scenes made from the volumes in DIR, keeping the best on held-out scenes.
 
-    A scene is a volume under one of ten suggested functions, with views of it and the Gaussians of the closed form;
-    scenes are made first, once for all runs with the same scene settings. RUN gets config.yaml, metrics.csv (a row a
-    step), held.csv (a row a look at held-out volumes and functions), last.pt and best.pt; tensorboard/ where
-    TensorBoard is installed.
+    A scene is a volume with one of ten suggested functions, views of it, and the Gaussians of the closed form. Scenes
+    are made first and reused by all runs with the same scene settings. RUN gets config.yaml, metrics.csv (one row per
+    step), held.csv (one row per evaluation), last.pt, best.pt, and tensorboard/ if TensorBoard is installed.
 
-    After SIGTERM or Ctrl-C the step is finished and saved; the same command goes on from there, to the same weights.
-    Several processes: torchrun --nproc-per-node N -m vvgt_cli.cli.main train ... shares out the scenes of a step.
-    Needs torch and PyYAML: install vvgt[train].
+    After SIGTERM or Ctrl-C the current step is saved; run the same command again to resume with identical results. To
+    use several processes: torchrun --nproc-per-node N -m vvgt_cli.cli.main train ... Requires torch and PyYAML:
+    install vvgt[train].
 
     \b
     Example:

@@ -7,19 +7,27 @@ from typing import Any
 import click
 
 from vvgt_cli.cli.options import common_options, overwrite_option, placed_read_options, tf_options
+from vvgt_cli.cli.sections import SectionedCommand
 from vvgt_cli.progress import Console
 
 
-@click.command("view", short_help="Gaussians, or a volume, in a browser; or as a page to send.")
+@click.command("view", cls=SectionedCommand, short_help="Show Gaussians or a volume in a browser, or save a page.")
 @click.argument("files", metavar="FILE...", nargs=-1, required=True)
 @click.option(
     "-o", "--output", metavar="OUT.html",
-    help="Write instead of showing: a page that opens by itself, or another format, by the name's ending.",
+    help="Save a page that works offline, or another format by its ending, instead of showing.",
 )  # fmt: skip
 @click.option(
-    "--port", type=click.IntRange(1, 65535), metavar="N", help="Of the server, for tunnels. Default: one that is free."
+    "--port", type=click.IntRange(1, 65535), metavar="N", help="Port of the local server. Default: any free port."
 )
-@click.option("--no-browser", "browser", is_flag=True, default=True, flag_value=False, help="Only print the address.")
+@click.option(
+    "--no-browser",
+    "browser",
+    is_flag=True,
+    default=True,
+    flag_value=False,
+    help="Print the address without opening a browser.",
+)
 @tf_options
 @placed_read_options
 @overwrite_option
@@ -34,14 +42,13 @@ def command(
     overwrite: bool,
     console: Console,
 ) -> None:
-    """Show FILE, a .ply or another file of Gaussians, in a browser; a volume is converted first.
+    """Show FILE in a browser: Gaussians in any supported format, or a volume, which is converted first.
 
-    A server on this machine's own address (127.0.0.1) hands the page to the browser, and to nobody else; nothing
-    comes from the network. The address is printed; Ctrl-C ends. Several files, or a glob, are a series: a slider
-    goes through them.
+    A server on 127.0.0.1 serves the page to the browser and nobody else; nothing is loaded from the network. The
+    address is printed; Ctrl-C ends it. Several files or a glob form a series with a slider.
 
-    With -o nothing is shown: OUT.html holds viewer and Gaussians and opens by double click; .spz, .compressed.ply,
-    .sog, .glb and .usdc are for other programs. What the format costs is printed.
+    With -o, nothing is shown: OUT.html holds viewer and Gaussians and opens by double click; .spz, .compressed.ply,
+    .sog, .glb and .usdc are for other programs. The loss due to the format is printed.
 
     \b
     Examples:

@@ -8,14 +8,14 @@ from vvgt_cli.cli.options import common_options
 from vvgt_cli.progress import Console
 
 
-@click.command("warmup", short_help="Compile the kernels before they are needed.")
+@click.command("warmup", short_help="Compile the kernels ahead of time.")
 @common_options
 def command(console: Console) -> None:
-    """Compile what the commands need, and print the folder where it lies.
+    """Compile the numerical kernels ahead of time and print the folder where they are stored.
 
-    A first run compiles for half a minute otherwise. For container images, job arrays and CI: whoever can read
-    the folder starts warm. It is the package's own where that can be written to, else one in the user's
-    cache; NUMBA_CACHE_DIR names another. Code is kept per processor type: on a cluster of several, once on each.
+    Otherwise the first run compiles for about half a minute. Useful for container images, job arrays and CI. The folder
+    is inside the package if that is writable, else in the user's cache; NUMBA_CACHE_DIR overrides it. Code is specific
+    to the processor type: on a mixed cluster, run this once per type.
 
     \b
     Examples:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 METHODS = ("frame", "adam", "3dgs")
 LOSS_3DGS = {"l1": 0.8, "l2": 0.0, "ssim": 0.2, "alpha": 0.0}
-TEXTURE = 6.0  # weight of the term for texture beside that of the squares (docs/log.md)
+TEXTURE = 6.0  # weight of the term for texture beside that of the squares (docs/log/closed-form.md)
 LOSSES: dict[str, dict[str, float]] = {"frame": {"texture": TEXTURE}, "3dgs": LOSS_3DGS}
 Progress = Callable[[int, int], None]
 Train: TypeAlias = "tuple[Sequence[Camera], np.ndarray]"

@@ -17,7 +17,7 @@ from vvgt_cli.descent.steps import FEATURES, KNOWN
 from vvgt_cli.splat.lanes import LANES
 from vvgt_cli.vbm.sharpen import curves, mix_neighbours
 
-GAIN = 7.0  # times what is foretold (docs/log.md)
+GAIN = 7.0  # factor on the predicted steps (docs/log/refinement.md)
 LEAST = 500  # Gaussians: of fewer, noise is foretold too
 SAMPLE = 12_000  # Gaussians that are regressed on, or up to twice as many
 RUN = 16  # of them that lie side by side in memory

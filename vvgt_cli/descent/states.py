@@ -22,7 +22,7 @@ SMALLEST = 1e-7  # standard deviation, unit frame
 WEAKEST = 0.1  # of the mean size of slopes, added to one's own: what is hardly seen goes less far than the rest
 MEDIAN = 7  # one of so many of the sample is in the median
 OUTLIER = 100.0  # times the median that a slope counts in that mean
-GIVEN = 0.3  # of the rate of harmonics, where the start has some: a view alone says little of them (docs/log.md)
+GIVEN = 0.3  # of the rate of harmonics, where the start has some (docs/log/light.md)
 
 
 def _last(arrays: tuple[np.ndarray, ...], index: int) -> np.ndarray | None:

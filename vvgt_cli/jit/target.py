@@ -2,7 +2,7 @@
 
 LLVM keeps to vectors of 256 bits on Intel's processors with AVX-512, for the clock of the first of them fell with wider
 ones. The splatter's loops over rows of 16 pixels are one vector of 512 bits; from `WIDE` on (Ice Lake, Zen 4) clocks
-hardly fall (docs/log.md).
+hardly fall (docs/log/refinement.md).
 """
 
 from __future__ import annotations

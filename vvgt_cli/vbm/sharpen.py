@@ -18,7 +18,7 @@ from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.jit.decorators import kernel
 from vvgt_cli.vbm.moments import morton
 
-AMOUNT = np.float32(0.45)  # a; one step: a second gains nothing, more shows the cells' lattice (docs/log.md)
+AMOUNT = np.float32(0.45)  # more makes the lattice of cells visible (docs/log/closed-form.md)
 CURVES = 4  # Z-orders, each shifted against the one before by a fifth of the box: who is near is near along one of them
 WINDOW = 6  # places along a curve, each way, in which neighbours are looked for
 BITS = 20  # of a curve, an axis

@@ -11,7 +11,7 @@ from vvgt_cli.conversion.stage import Cost, Stage, Work
 from vvgt_cli.conversion.stages.refinement import step_seconds
 from vvgt_cli.field.case import Case
 
-VIEWS = 24  # of the training views: half as many lose 0.1 to 0.3 dB (docs/log.md)
+VIEWS = 24  # of the training views: half as many lose 0.1 to 0.3 dB (docs/log/closed-form.md)
 A_VIEW, ALWAYS = 1.1, 12.0  # in steps of gradient descent: a view, and the second cut with a look at the check views
 
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from vvgt_cli.dvr.render import Viewed
 
 REFINE_VIEWS = 120  # training views of gradient descent at most
-A_STEP = 0.65, 0.85  # of them, small and large: fewer are learned by heart, more take the time of steps (docs/log.md)
+A_STEP = 0.65, 0.85  # of them, small and large: fewer overfit, more cost steps (docs/log/refinement.md)
 MARGIN, SAMPLES = 4.0, 12.0  # dB, where views are means over their pixels, and where they are samples of a screen's
 LONGER = 6.0  # dB more, for longer steps: their errors are the same from all sides
 PROBED = 72  # blocks of a view that rays are tried on

@@ -1,0 +1,34 @@
+"""`--help` in sections."""
+
+from __future__ import annotations
+
+import re
+
+import click
+import pytest
+
+from vvgt_cli.cli.main import cli
+from vvgt_cli.cli.sections import SECTIONS, SectionedCommand
+
+
+def options(command: str) -> list[click.Option]:
+    found = cli.get_command(click.Context(cli), command)
+    assert isinstance(found, SectionedCommand)
+    return [parameter for parameter in found.get_params(click.Context(found)) if isinstance(parameter, click.Option)]
+
+
+@pytest.mark.parametrize("command", ["convert", "init", "render-views", "evaluate", "report", "view", "check", "info"])
+def test_help_lists_every_option_once_and_the_main_ones_first(command, vvgt):
+    text = vvgt(command, "--help").out.decode()
+    listed = re.findall(r"^  (--?[a-z].*?)(?:  |$)", text.partition("\nOptions:\n")[2], re.M)
+    names = [row.split()[0].strip(",") for row in listed]
+    assert sorted(names) == sorted(option.opts[0] for option in options(command))
+    heads = re.findall(r"^(\w+):$", text, re.M)
+    assert [head for head in heads if head in SECTIONS] == [head for head in SECTIONS if head in heads]
+    first = re.findall(r"^  (--?[a-z].*?)(?:  |$)", text.partition("\nOptions:\n")[2].partition("\nInput:\n")[0], re.M)
+    assert 2 <= len(first) <= 15
+
+
+def test_every_name_in_the_sections_is_an_option():
+    names = {option.name for command in ("convert", "init", "render-views", "evaluate") for option in options(command)}
+    assert not set(" ".join(SECTIONS.values()).split()) - names
