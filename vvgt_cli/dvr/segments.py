@@ -15,9 +15,9 @@ import numpy as np
 
 from vvgt_cli.dvr.grid import composite as mixed
 from vvgt_cli.dvr.grid import texel_at
-from vvgt_cli.dvr.kernel import FLAGS, OPAQUE, U, box_span, composite, inverse, sample, skip, table_coordinate
+from vvgt_cli.dvr.kernel import FLAGS, OPAQUE, U, any_light, box_span, composite, inverse, skip
 from vvgt_cli.dvr.layout import GRID, LIT, LIT_GRID, TUPLES, Light, Optics, Texels, Voxels
-from vvgt_cli.dvr.runs import BORROWED
+from vvgt_cli.dvr.runs import BORROWED, RUN, sample_run, stack_run
 from vvgt_cli.dvr.shading import shading
 from vvgt_cli.dvr.vectors import Quad, lane, zeros4
 from vvgt_cli.jit.decorators import inlined, kernel
@@ -61,33 +61,37 @@ def _classified(
     ``p`` in voxels of the block; segment i goes from t0 + i dt on. ``light`` (`Light`) or None.
     """
     (px, py, pz), (dx, dy, dz) = p, d
-    seen: Quad = zeros4()
+    run, seen = stack_run(), zeros4()
     trans, red, green, blue = 1.0, 0.0, 0.0, 0.0
     opaque = OPAQUE * min(step * step, 1.0)
     ix, iy, iz, per_step = inverse(dx), inverse(dy), inverse(dz), 1.0 / dt
-    u0, known = -1.0, False
-    i, stop = first, first
+    u0 = -1.0  # -1: no sample there, or not finite
+    i = first
     while i <= last and trans >= opaque:
-        if i >= stop:
-            at = i - 1 if known else i  # the segment that comes from there is still to be seen
-            start = skip(voxels.values.shape, empty, px, py, pz, dx, dy, dz, ix, iy, iz, t0, dt, per_step, last, at)
-            if start >= last:
-                break
-            if start > at:
-                known, i = False, start
-            stop = i + LEAP
+        at = i - 1 if u0 >= 0.0 else i  # the segment that comes from there is still to be seen
+        start = skip(voxels.values.shape, empty, px, py, pz, dx, dy, dz, ix, iy, iz, t0, dt, per_step, last, at)
+        if start >= last:
+            break
+        if start > at:
+            u0, i = -1.0, start
         t = t0 + i * dt
-        u1 = table_coordinate(sample(voxels.values, px + t * dx, py + t * dy, pz + t * dz), optics)
-        low = min(u0, u1)
-        if known and low >= 0.0 and max(u0, u1) > optics.dark[U(int(low))]:
-            if light is None:
-                seen, trans = composite(u0, u1, dt, optics, seen, trans)
-            else:
-                own, trans = composite(u0, u1, dt, optics, zeros4(), trans)
-                r, g, b_ = _lit(own, light, voxels.values, p, d, t - 0.5 * dt)
-                red, green, blue = red + r, green + g, blue + b_
-        u0, known = u1, True
-        i += 1
+        sample_run(voxels, px + t * dx, py + t * dy, pz + t * dz, dx * dt, dy * dt, dz * dt, optics, run)
+        if any_light(run, u0, optics.dark):
+            for n in range(min(RUN, last + 1 - i)):
+                u1 = run[n]
+                low = min(u0, u1)
+                if low >= 0.0 and max(u0, u1) > optics.dark[U(int(low))]:
+                    if light is None:
+                        seen, trans = composite(u0, u1, dt, optics, seen, trans)
+                    else:
+                        own, trans = composite(u0, u1, dt, optics, zeros4(), trans)
+                        r, g, b_ = _lit(own, light, voxels.values, p, d, t + (n - 0.5) * dt)
+                        red, green, blue = red + r, green + g, blue + b_
+                    if trans < opaque:
+                        break
+                u0 = u1
+        u0 = run[RUN - 1]
+        i += RUN
     if light is None:
         red, green, blue = lane(seen, 0), lane(seen, 1), lane(seen, 2)
     return red, green, blue, 1.0 - trans

@@ -1,0 +1,249 @@
+"""Pictures of a volume in blocks: rays cut at pieces of it compose to those of the renderer, whatever the blocks."""
+
+from __future__ import annotations
+
+import json
+import re
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+from tests.test_scale import FIT, bodies
+from vvgt_cli.cameras import default_views
+from vvgt_cli.cameras.blocks import spread_blocks
+from vvgt_cli.dvr import RenderSettings, render_view
+from vvgt_cli.dvr.render import FIT_VIEWS, Box, camera_arrays
+from vvgt_cli.field.field import Picture
+from vvgt_cli.field.grid import Boxes, piece_edge
+from vvgt_cli.field.open import Wanted, blocked
+from vvgt_cli.field.parts import Parts
+from vvgt_cli.field.rays import Cast, front_to_back, meeting, pieces_of
+from vvgt_cli.field.settings import BlockOptions
+from vvgt_cli.gaussians import read_ply
+from vvgt_cli.metrics import score_views
+from vvgt_cli.progress import Console
+from vvgt_cli.runs.record import ConversionReport, Run
+from vvgt_cli.runs.source import SourceRequest, load
+from vvgt_cli.scale.score import scored_views
+from vvgt_cli.splat import render
+from vvgt_cli.transfer.lighting import LightOptions
+from vvgt_cli.vbm import VbmOptions
+from vvgt_cli.volume import Volume
+
+LIT = LightOptions(lights=("1,1,2", "headlight"), shadows=True, occlusion=0.2)
+
+
+def volume_of(dims, spacing=(1.0, 1.0, 1.0)):
+    return Volume(np.round(bodies(dims) * 255).astype(np.uint8), spacing, name="bodies")
+
+
+def labels_of(dims):
+    body = bodies(dims)
+    return Volume(((body > 0.2).astype(np.uint8) + (body > 0.6)).astype(np.uint8), name="labels")
+
+
+@contextmanager
+def in_blocks(request, edge, folder, workers=1):
+    """The field of a request in blocks of ``edge`` voxels."""
+    run = Run(Console(quiet=True), ConversionReport("convert"))
+    with blocked(run, request, BlockOptions(edge, workers), Parts(folder), Wanted(500, 64)) as field:
+        yield field
+
+
+def views():
+    """One as judged by, one to fit to, one of blocks of pixels."""
+    judged, fitted = default_views("test", size=96), default_views("train", 4, size=40)
+    wide = default_views("check", size=640)[1]
+    return [
+        Picture(judged[0], RenderSettings()), Picture(fitted[2], FIT_VIEWS),
+        Picture(judged[4], RenderSettings(samples=2)),
+        Picture(wide, RenderSettings(), spread_blocks(640, 640, 1, 40)),
+    ]  # fmt: skip
+
+
+KINDS = {
+    "scalars": (SourceRequest(volume_of((70, 61, 50))), 3e-3),
+    "anisotropic": (SourceRequest(volume_of((70, 61, 50), (0.6, 1.0, 2.1))), 3e-3),
+    "lit": (SourceRequest(volume_of((50, 61, 40)), light=LIT), 3e-3),
+    "labels": (SourceRequest(labels_of((50, 61, 40)), labels="auto"), 3e-3),
+    "labels, lit": (SourceRequest(labels_of((50, 61, 40)), labels="auto", light=LIT), 3e-3),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_pictures_of_blocks_are_those_of_the_renderer_and_the_same_for_any_blocks(tmp_path, kind):
+    request, tolerance = KINDS[kind]
+    scene, found = load(request).scene(), []
+    for edge in (16, 32, 128):
+        with in_blocks(request, edge, tmp_path / str(edge)) as field:
+            field.expect(views())
+            found.append([field.view(*view) for view in views()])
+    for view, *ours in zip(views(), *found, strict=True):
+        theirs = render_view(scene, *view)
+        assert (theirs[..., 3] > 0.5).any()
+        assert np.array_equal(ours[0], ours[1])
+        assert np.array_equal(ours[0], ours[2])
+        off = np.abs(ours[0] - theirs)
+        assert off.max() < tolerance * (4 if view.settings is FIT_VIEWS else 1) or np.sort(off.ravel())[-40] < tolerance
+        assert off.mean() < 1e-4
+
+
+def test_pictures_that_were_not_expected_are_made_when_they_are_asked_for(tmp_path):
+    request = SourceRequest(volume_of((40, 36, 44)))
+    camera, settings = default_views("test", size=48)[3], RenderSettings()
+    with in_blocks(request, 16, tmp_path / "a") as field:
+        field.start(VbmOptions(400, 64))
+        late = field.view(camera, settings)
+    with in_blocks(request, 16, tmp_path / "b") as field:
+        field.expect([Picture(camera, settings), Picture(camera, FIT_VIEWS)])
+        field.start(VbmOptions(400, 64))
+        assert np.array_equal(field.view(camera, settings), late)
+    assert late[..., 3].max() > 0.5
+
+
+@pytest.mark.parametrize("light", [LightOptions(), LIT], ids=["unlit", "lit"])
+@pytest.mark.parametrize("method", ["vbm", "wavelet", "uniform"])
+def test_the_closed_form_of_blocks_is_that_of_memory(tmp_path, light, method):
+    request = SourceRequest(volume_of((40, 36, 44)), light=light)
+    source = load(request)
+    options = VbmOptions(300, 64, method, degree=2 if source.lighting else 0)
+    from vvgt_cli.field.field import Resident
+
+    memory = Resident(source, source.scene())
+    ours = memory.start(options).gaussians
+    with in_blocks(request, 16, tmp_path / "parts") as field:
+        theirs = field.start(options).gaussians
+        assert len(ours) == len(theirs)
+        for name, array in ours.arrays().items():
+            np.testing.assert_allclose(theirs.arrays()[name], array, atol=1e-5, err_msg=name)
+        normals, others = memory.normals(ours), field.normals(ours)
+    if source.lighting is None:
+        assert normals is None
+        assert others is None
+    else:
+        np.testing.assert_allclose(normals, others, atol=1e-9)
+        assert (np.linalg.norm(normals, axis=1) > 0.9).mean() > 0.9
+
+
+def cast_of(camera, half=1.0, step=0.02):
+    eye, basis, lens = camera_arrays(Box(np.full(3, half), np.full(3, step)), camera)
+    rows, columns = np.indices((camera.height, camera.width))
+    pixels = np.stack([columns, rows], axis=-1).reshape(-1, 2)
+    return Cast(eye, basis, lens, 0.5, pixels, np.zeros((1, 2)))
+
+
+def test_a_piece_casts_the_rays_that_may_meet_it_and_no_others(tmp_path, monkeypatch):
+    request, counts = SourceRequest(volume_of((70, 61, 50), (0.6, 1.0, 2.1))), []
+
+    def counted(cast, *box):
+        found = meeting(cast, *box)
+        counts.append(len(found) / len(cast.pixels))
+        return found
+
+    pictures = []
+    for name, which in (("few", counted), ("every", lambda cast, *_: np.arange(len(cast.pixels)))):
+        monkeypatch.setattr("vvgt_cli.field.rays.meeting", which)
+        with in_blocks(request, 16, tmp_path / name) as field:
+            pictures.append([field.view(*view) for view in views()[:2]])
+    assert all(np.array_equal(one, other) for one, other in zip(*pictures, strict=True))
+    assert np.mean(counts) < 0.2
+
+
+def test_a_camera_within_a_piece_casts_all_its_rays():
+    cast = cast_of(default_views("test", size=60)[0])
+    assert len(meeting(cast, cast.eye - 5, cast.eye + 5)) == len(cast.pixels)
+    assert 0 < len(meeting(cast, np.zeros(3), np.full(3, 9.0))) < len(cast.pixels) / 4
+
+
+def test_pieces_follow_from_the_volume_and_come_front_to_back():
+    assert [piece_edge((n, 9, 20)) for n in (40, 128, 129, 256, 257, 1024, 4096)] == [16, 16, 32, 32, 64, 128, 128]
+    pieces = pieces_of((64, 48, 40))
+    assert pieces == Boxes((64, 48, 40), (16, 16, 16))
+    eye = np.array([70.0, 20.0, -9.0])
+    order = front_to_back(pieces, eye, range(len(pieces)))
+    assert sorted(order) == list(range(len(pieces)))
+    ranks = np.empty(len(pieces))
+    ranks[order] = np.arange(len(pieces))
+    direction = np.array([-0.9, 0.1, 0.5])
+    points = eye + np.arange(0, 120, 0.5)[:, None] * direction
+    inside = points[((points >= -0.5) & (points < np.array(pieces.dims) - 0.5)).all(axis=1)]
+    index = np.floor((inside + 0.5) / 16).astype(int)
+    met = [ranks[(k * pieces.shape[1] + j) * pieces.shape[0] + i] for i, j, k in index]
+    assert met == sorted(met)
+    assert len(set(met)) > 3
+
+
+def test_init_in_blocks_says_its_error_against_the_volume(vvgt, tmp_path):
+    path = tmp_path / "v_100x90x80_uint8.raw"
+    path.write_bytes(np.round(bodies() * 255).astype(np.uint8).tobytes())
+    notes = []
+    for blocks in ("32", "128"):
+        run = vvgt("init", path, "-o", tmp_path / f"{blocks}.ply", *FIT[:-1], "--blocks", blocks, "--report", "-")
+        assert run.code == 0
+        notes.append(re.search(r"PSNR ([\d.]+) dB .* 3 views of 150 px, through all voxels", run.err))
+        scores = json.loads(run.out)["scores"]
+        assert f"{scores['psnr']:.2f}" == notes[-1][1]
+    assert notes[0][1] == notes[1][1]
+    scene, gaussians = load(SourceRequest(str(path))).scene(), read_ply(tmp_path / "32.ply")[0]
+    seen = scored_views(150)
+    theirs = score_views(
+        [render_view(scene, *view) for view in seen],
+        [render(gaussians, view.camera) for view in seen],
+        perceptual=False,
+    )
+    assert theirs.psnr == pytest.approx(scores["psnr"], abs=0.02)
+
+
+def test_a_file_that_no_memory_draws_is_written_without_a_score(vvgt, tmp_path, monkeypatch):
+    path = tmp_path / "v_100x90x80_uint8.raw"
+    path.write_bytes(np.round(bodies() * 255).astype(np.uint8).tobytes())
+    assert vvgt("init", path, "-o", tmp_path / "a.ply", *FIT, "--blocks", "64").code == 0
+    monkeypatch.setattr("vvgt_cli.scale.score.A_GAUSSIAN", 1 << 40)
+    run = vvgt("init", path, "-o", tmp_path / "b.ply", *FIT[:-1], "--blocks", "64")
+    assert run.code == 0
+    assert "left out: test views" in run.err
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+
+
+def test_what_blocks_cannot_do_is_a_line(vvgt, tmp_path):
+    path = tmp_path / "v_100x90x80_uint8.raw"
+    path.write_bytes(bytes(720000))
+    for command, options, word in (
+        ("init", ("--levels", "2", "--light", "headlight", "-o", tmp_path / "a.ply"), "unlit"),
+        ("init", ("--shard", "1/2", "--init", "wavelet", "-o", tmp_path / "a"), "unlit"),
+        ("render-views", ("--blocks", "32", "--renderer", "vtk", "-o", tmp_path / "v"), "needs the whole volume"),
+    ):
+        run = vvgt(command, path, *options)
+        assert run.code == 2, run.err
+        assert word in run.err
+
+
+def test_levels_are_cuts_of_one_pyramid_with_an_index(vvgt, tmp_path):
+    path = tmp_path / "v_100x90x80_uint8.raw"
+    path.write_bytes(np.round(bodies() * 255).astype(np.uint8).tobytes())
+    out = tmp_path / "a.ply"
+    assert vvgt("init", path, "-o", out, *FIT, "--levels", "3").code == 0
+    index = json.loads((tmp_path / "a-levels.json").read_text())
+    assert (index["format"], index["size"]) == ("vvgt-levels", 150)
+    assert [level["file"] for level in index["levels"]] == ["a.ply", "a-1.ply", "a-2.ply"]
+    counts = [len(read_ply(tmp_path / level["file"])[0]) for level in index["levels"]]
+    assert counts == [level["gaussians"] for level in index["levels"]]
+    assert counts[0] / 4 * 0.9 < counts[1] <= counts[0] / 4
+    assert [(tmp_path / level["file"]).stat().st_size for level in index["levels"]] == [
+        level["bytes"] for level in index["levels"]
+    ]
+    psnr = [level["psnr"] for level in index["levels"]]
+    assert psnr[0] > psnr[1] > psnr[2] > psnr[0] - 20
+    alone = ("--max-gaussians", str(counts[0] // 4), "--size", "150", "-q", "--blocks", "32")
+    folder = tmp_path / "v.blocks"
+    assert vvgt("init", path, "-o", folder, *FIT, "--shard", "1/1", "--blocks", "32").code == 0
+    assert vvgt("merge", folder, "-o", tmp_path / "m.ply", "--levels", "3", "-q").code == 0
+    for level in ("", "-1", "-2"):
+        assert (tmp_path / f"m{level}.ply").read_bytes() == (tmp_path / f"a{level}.ply").read_bytes()
+    again = vvgt("init", path, "-o", tmp_path / "b.ply", *alone)
+    assert again.code == 0
+    assert len(read_ply(tmp_path / "b.ply")[0]) == pytest.approx(counts[1], rel=0.1)
+    assert vvgt("init", path, "-o", out, *FIT, "--levels", "3").code == 2  # they exist
+    assert vvgt("init", path, "-o", "-", *FIT, "--levels", "3").code == 2
+    assert vvgt("init", path, "-o", folder, *FIT, "--levels", "3", "--shard", "1/2").code == 2
