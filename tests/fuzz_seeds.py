@@ -343,11 +343,11 @@ def checkpoint() -> list[Seed]:
 
     from vvgt_cli.descent import OptimizeOptions, OptimizeRecord
     from vvgt_cli.descent.checkpoint import resume, save
-    from vvgt_cli.descent.loop import Judge, begin
+    from vvgt_cli.descent.judge import Judge
+    from vvgt_cli.descent.loop import begin
 
     def fresh(method: str) -> tuple[Any, Judge, OptimizeRecord]:
-        record = OptimizeRecord()
-        state = begin(cloud(4), CAMERAS, OptimizeOptions.of(method, max_gaussians=8))
+        record, state = OptimizeRecord(), begin(cloud(4), CAMERAS, OptimizeOptions.of(method, max_gaussians=8))
         return state, Judge(state, None, record), record
 
     seeds = []

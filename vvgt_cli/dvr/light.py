@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import NamedTuple
 
 import numpy as np
 
-from vvgt_cli.dvr.layout import BRICK, Light
+from vvgt_cli.dvr.layout import BRICK, Light, Optics, Voxels
 from vvgt_cli.transfer.lighting import Lighting
-
-if TYPE_CHECKING:
-    from vvgt_cli.dvr.scene import Scene
 
 MAX_CELLS = 1 << 21  # of a grid: 128^3; more cost more time than they show
 ANGLE = 3.0  # degrees: radius of a light as it is seen; six times the sun's
@@ -22,41 +19,56 @@ STEP = 1.0  # voxels
 FAR = 1e300
 
 
-def lights_of(scene: Scene, lighting: Lighting, max_cells: int = MAX_CELLS) -> Light:
+class Matter(NamedTuple):
+    """What attenuates light: the fields of `vvgt_cli.dvr.scene.Scene` of these names."""
+
+    voxels: Voxels
+    optics: Optics
+    empty: np.ndarray
+    step: np.ndarray
+
+
+def lights_of(matter: Matter, axes: np.ndarray, lighting: Lighting, max_cells: int = MAX_CELLS) -> Light:
     """What falls on a scene.
 
     Args:
-        scene: without light.
-        lighting: in world axes; a direction is taken through the volume's axes.
+        matter: of the scene.
+        axes: (3, 3), of its volume.
+        lighting: in world axes; a direction is taken through ``axes``.
         max_cells: of each grid of shadows and occlusion: cubes of 1, 2, 4, ... voxels, as fine as that allows.
     """
-    inward = np.linalg.inv(scene.volume.axes)
+    inward = np.linalg.inv(axes)
     directions = np.array([_unit(inward @ np.array(d)) for d in lighting.directions]).reshape(-1, 3)
     cell = 1
-    while math.prod(-(-n // cell) for n in scene.values.shape) > max_cells:
+    while math.prod(-(-n // cell) for n in matter.voxels.values.shape) > max_cells:
         cell *= 2
     grids = []
     if lighting.shadows:
-        grids += [transmittance(scene, cone(d, ANGLE, RAYS), cell) for d in directions]
+        grids += [transmittance(matter, cone(d, ANGLE, RAYS), cell) for d in directions]
     if lighting.occlusion is not None:
-        around = transmittance(scene, sphere(AROUND), cell, lighting.occlusion)
+        around = transmittance(matter, sphere(AROUND), cell, lighting.occlusion)
         grids.append(np.minimum(2 * around, 1))  # a plane is open
     shade = np.stack(grids) if grids else np.ones((1, 1, 1, 1), np.float32)
     return Light(
         float(lighting.ambient), float(lighting.diffuse), float(lighting.specular), float(lighting.specular_power),
         int(lighting.headlight),
         np.ascontiguousarray(directions), shade, int(lighting.shadows), int(lighting.occlusion is not None),
-        1.0 / cell, np.ascontiguousarray(scene.step, np.float64),
+        1.0 / cell, np.ascontiguousarray(matter.step, np.float64),
     )  # fmt: skip
 
 
 def transmittance(
-    scene: Scene, directions: np.ndarray, cell: int, reach: float = FAR, step: float = STEP, offset: float | None = None
+    matter: Matter,
+    directions: np.ndarray,
+    cell: int,
+    reach: float = FAR,
+    step: float = STEP,
+    offset: float | None = None,
 ) -> np.ndarray:
     """Mean transmittance from the centres of cells along ``directions``, (cz, cy, cx) float32 in [0, 1].
 
     Args:
-        scene: what lies before the lights.
+        matter: what lies before the lights.
         directions: (n, 3) unit vectors, box frame.
         cell: edge of a cell in voxels; cells that touch nothing visible have 1.
         reach: unit-frame length beyond which nothing counts.
@@ -65,11 +77,11 @@ def transmittance(
     """
     from vvgt_cli.dvr.shadows import mean_transmittance
 
-    out = np.empty(tuple(-(-n // cell) for n in scene.values.shape), np.float32)
+    out = np.empty(tuple(-(-n // cell) for n in matter.voxels.values.shape), np.float32)
     first = OFFSET * cell if offset is None else offset
     near = 1 + cell // BRICK
     mean_transmittance(
-        scene.voxels, scene.optics, scene.empty, np.ascontiguousarray(directions / scene.step), near, float(cell),
+        matter.voxels, matter.optics, matter.empty, np.ascontiguousarray(directions / matter.step), near, float(cell),
         float(first), float(reach), float(step), out,
     )  # fmt: skip
     return out

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vvgt_cli.dvr.layout import Light, Optics, Texels, Voxels, pairs_fit
+from vvgt_cli.dvr.light import Matter, lights_of
 from vvgt_cli.transfer.lighting import Lighting
 from vvgt_cli.transfer.tables import OpticalTables, build_tables
 from vvgt_cli.transfer.types import Named, TransferFunctionLike
@@ -86,6 +87,11 @@ class Scene:
         t = self.tables
         return Optics(t.lo, t.inv_width, t.nodes, t.cumulative, t.dark)
 
+    @property
+    def matter(self) -> Matter:
+        """What attenuates light."""
+        return Matter(self.voxels, self.optics, self.empty, self.step)
+
     @classmethod
     def build(
         cls,
@@ -143,9 +149,7 @@ class Scene:
 
     def lit(self, lighting: Lighting) -> Scene:
         """The same scene under light; shadows and occlusion are marched here."""
-        from vvgt_cli.dvr.light import lights_of
-
-        return replace(self, lighting=lighting, light=lights_of(self, lighting))
+        return replace(self, lighting=lighting, light=lights_of(self.matter, self.volume.axes, lighting))
 
 
 def kernel_values(volume: Volume) -> tuple[np.ndarray, float, float]:

@@ -9,12 +9,12 @@ from typing import BinaryIO
 
 import numpy as np
 
-from vvgt_cli import __version__
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import seekable
 from vvgt_cli.gaussians.frames import rescale, turn, up_matrix
 from vvgt_cli.gaussians.header import PlyHeader, parse_header, rest_names
 from vvgt_cli.gaussians.types import HARMONICS, SH_C0, Gaussians
+from vvgt_cli.version import VERSION
 from vvgt_cli.volume.space import axis_facts
 from vvgt_cli.volume.types import UnitFrame
 
@@ -98,7 +98,7 @@ def property_names(sh_degree: int = 0) -> list[str]:
 
 
 def _comments(options: PlyOptions) -> list[str]:
-    lines = [f"comment vvgt {__version__}"]
+    lines = [f"comment vvgt {VERSION}"]
     frame = f"comment vvgt frame {options.frame}"
     if options.unit_frame is not None:
         centre = " ".join(repr(float(c)) for c in options.unit_frame.centre)

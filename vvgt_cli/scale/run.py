@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vvgt_cli import __version__
 from vvgt_cli.conversion.convert import ply_options
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import UsageError
@@ -34,6 +33,7 @@ from vvgt_cli.scale.settings import BlockOptions, block_edge, cell_grid, counted
 from vvgt_cli.scale.sight import Sight, looks
 from vvgt_cli.scale.source import InBlocks, Samples, files_of, needs_histogram, open_in_blocks, resolved
 from vvgt_cli.share import format_of
+from vvgt_cli.version import VERSION
 
 if TYPE_CHECKING:
     from vvgt_cli.scale.grid import CellGrid
@@ -146,7 +146,7 @@ def _settings(request: ConvertRequest, opened: InBlocks, sight: Sight) -> dict[s
     tf = request.source.tf
     text = Path(tf).read_text("utf-8", "replace") if isinstance(tf, str) and os.path.isfile(tf) else repr(tf)
     return {
-        "version": [__version__, LAYOUT],
+        "version": [VERSION, LAYOUT],
         "volume": [path, *facts],
         "read": {key: value for key, value in asdict(opened.request.read).items() if value is not None},
         "function": [text, request.source.tf_range, request.source.unit_distance],
