@@ -85,6 +85,7 @@ class Work:
         return after > before
 
 
+@dataclass(frozen=True)
 class Stage(ABC):
     """One step of a conversion: what it is called, what it costs, what it does.
 

@@ -16,6 +16,7 @@ from vvgt_cli.transfer.labels import LabelTable
 from vvgt_cli.transfer.tables import extinction
 from vvgt_cli.volume import Volume
 from vvgt_cli.volume.blocks import check_memory
+from vvgt_cli.volume.types import triple
 
 SAME = 1e-3  # voxels up to which two grids are one
 MOST_FINER = 8  # times along an axis that a layer's voxels may refine the first volume's
@@ -120,11 +121,11 @@ def common_grid(layers: Sequence[Layer]) -> Volume:
     if (finer == 1).all():
         return first
     shape = tuple(int(n * f) for n, f in zip(first.data.shape, finer[::-1], strict=True))
-    spacing = tuple(float(s / f) for s, f in zip(first.spacing, finer, strict=True))
+    spacing = triple(float(s / f) for s, f in zip(first.spacing, finer, strict=True))
     check_memory(VOXEL_BYTES * math.prod(shape), first.name)
     origin = tuple((first.affine @ [*((1 / finer - 1) / 2), 1.0])[:3].tolist())
     empty = np.broadcast_to(np.uint8(0), shape)
-    return replace(first, data=empty, spacing=spacing, origin=origin, slope=1.0, intercept=0.0)  # type: ignore[arg-type]
+    return replace(first, data=empty, spacing=spacing, origin=origin, slope=1.0, intercept=0.0)
 
 
 def _check_meeting(first: Volume, other: Volume, inner: np.ndarray) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.space import world_axis
@@ -83,12 +84,13 @@ def parse_lighting(text: str) -> Lighting:
         ValueError, UsageError: something else.
     """
     words = text.split()
-    numbers, rest = [float(word) for word in words[:4]], words[4:]
+    numbers: list[Any] = [float(word) for word in words[:4]]
+    rest = words[4:]
     occlusion = None
     if "occlusion" in rest:
         at = rest.index("occlusion")
         occlusion, rest = float(rest[at + 1]), rest[:at] + rest[at + 2 :]
-    found = Lighting(HEADLIGHT in rest, _directions([w for w in rest if "," in w], None), *numbers)  # type: ignore[arg-type]
+    found = Lighting(HEADLIGHT in rest, _directions([w for w in rest if "," in w], None), *numbers)
     if known := set(rest) - {HEADLIGHT, "shadows"} - {w for w in rest if "," in w}:
         raise ValueError(known)
     return replace(found, shadows="shadows" in rest, occlusion=occlusion)
@@ -167,7 +169,7 @@ def _direction(light: str, space: str | None) -> Direction:
     return x / length, y / length, z / length
 
 
-def preset_lighting(what: str, shade: bool, fields: dict[str, float]) -> Lighting | None:
+def preset_lighting(what: str, shade: bool, fields: dict[str, Any]) -> Lighting | None:
     """What a volume property says of light: a head-light where it is shaded, None where not.
 
     Raises:
@@ -176,6 +178,6 @@ def preset_lighting(what: str, shade: bool, fields: dict[str, float]) -> Lightin
     if not shade:
         return None
     try:
-        return Lighting(**fields)  # type: ignore[arg-type]
+        return Lighting(**fields)
     except UsageError as error:
         raise DataError(f"{what}: shading with {str(error).lstrip('-')}") from None
