@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from vvgt_cli.scale.grid import CellGrid
     from vvgt_cli.scale.tasks import CellBlocks, CountBlocks
 
-LAYOUT = 2  # of parts: one more whenever what is in them changes
+LAYOUT = 3  # of parts: one more whenever what is in them changes
 
 
 class Later(Exception):
