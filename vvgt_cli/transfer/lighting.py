@@ -13,7 +13,6 @@ from vvgt_cli.volume.space import world_axis
 AMBIENT, DIFFUSE, SPECULAR, POWER = 0.1, 0.7, 0.2, 10.0  # vtkVolumeProperty's
 COEFFICIENTS = ("ambient", "diffuse", "specular", "specular_power")
 HEADLIGHT, NONE = "headlight", "none"
-OCCLUSION = 0.1  # unit-frame lengths: a twentieth of the longest edge
 MOST = 1000.0  # of a coefficient: a highlight with a larger power is a point
 AXES = {axis: tuple(float(letter == axis) for letter in "xyz") for axis in "xyz"}
 WORDS = ("left", "right", "anterior", "posterior", "superior", "inferior", "above", "below")
