@@ -299,16 +299,15 @@ def label_tables() -> list[Seed]:
 
 def ply() -> list[Seed]:
     from vvgt_cli.gaussians import Gaussians, PlyOptions, describe, read_ply, write_ply
-    from vvgt_cli.volume.types import UnitFrame
 
     rng = np.random.default_rng(3)
     shapes = ((4, 3), (4, 3), (4, 4), (4,), (4, 3))
     gaussians = Gaussians(*(rng.standard_normal(shape).astype(np.float32) for shape in shapes))
-    frame = UnitFrame(0.5, (1, 1, 1), (0.1, 0.1, 0.1), (1, 2, 3))
+    world = PlyOptions(frame="world", up="-y", scale=0.5, centre=(1, 2, 3), unit_distance=1.5, sh_degree=1)
     seeds = []
     for name, options in (
         ("a.ply", PlyOptions(comments=False)),
-        ("b.ply", PlyOptions("world", "-y", 1, True, frame, 1.5, "given")),
+        ("b.ply", world),
     ):
         stream = io.BytesIO()
         write_ply(stream, gaussians, options)
@@ -343,11 +342,11 @@ def checkpoint() -> list[Seed]:
 
     from vvgt_cli.descent import OptimizeOptions, OptimizeRecord
     from vvgt_cli.descent.checkpoint import resume, save
-    from vvgt_cli.descent.loop import Judge, begin
+    from vvgt_cli.descent.judge import Judge
+    from vvgt_cli.descent.loop import begin
 
     def fresh(method: str) -> tuple[Any, Judge, OptimizeRecord]:
-        record = OptimizeRecord()
-        state = begin(cloud(4), CAMERAS, OptimizeOptions.of(method, max_gaussians=8))
+        record, state = OptimizeRecord(), begin(cloud(4), CAMERAS, OptimizeOptions.of(method, max_gaussians=8))
         return state, Judge(state, None, record), record
 
     seeds = []

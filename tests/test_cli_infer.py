@@ -24,7 +24,6 @@ from vvgt_cli.progress import Console
 from vvgt_cli.runs.record import ConversionReport, Run
 from vvgt_cli.runs.views import Views
 from vvgt_cli.tasks.infer import divide
-from vvgt_cli.volume.types import UnitFrame
 
 DARK = 0.2
 BRIGHTER, DARKER = (*[0.0] * 11, *[DARK] * 3), (*[0.0] * 11, *[-DARK] * 3)
@@ -40,9 +39,9 @@ def made(tmp_path_factory):
     start = ("init", *volume, "--max-gaussians", 300, "--size", 32, "-o", folder / "init.ply", "--quiet")
     assert run([str(arg) for arg in start]) == 0
     gaussians, _ = read_ply(folder / "init.ply")
-    frame = UnitFrame(0.5, (0.0,) * 3, (0.0,) * 3, (3.0, 4.0, 5.0))
+    world = PlyOptions(frame="world", up="z", scale=0.5, centre=(3.0, 4.0, 5.0), unit_distance=0.7)
     dark = replace(gaussians, colors=gaussians.colors - DARK)
-    write_ply(folder / "in.ply", dark, PlyOptions("world", "z", unit_frame=frame, unit_distance=0.7))
+    write_ply(folder / "in.ply", dark, world)
     write_model(folder / "brighter", BRIGHTER)
     write_model(folder / "darker", DARKER)
     return folder

@@ -19,7 +19,6 @@ from vvgt_cli.cli.main import run
 from vvgt_cli.gaussians import PlyOptions, read_ply, write_ply
 from vvgt_cli.images import write_exr
 from vvgt_cli.tasks.optimize import load_sets
-from vvgt_cli.volume.types import UnitFrame
 
 SCENE = ("example:blob:16", "--tf", "viridis")
 ROOT = Path(__file__).parent.parent
@@ -171,8 +170,8 @@ def test_ctrl_c_writes_what_there_is(folder, tmp_path):
 
 
 def test_the_frame_of_a_file_is_kept_where_it_was_made_elsewhere(folder, call, tmp_path, vvgt):
-    unit_frame = UnitFrame(0.5, (1, 1, 1), (1, 1, 1), (3.0, -2.0, 9.0))
-    write_ply(tmp_path / "far.ply", read_ply(folder / "in.ply")[0], PlyOptions("world", "x", unit_frame=unit_frame))
+    world = PlyOptions(frame="world", up="x", scale=0.5, centre=(3.0, -2.0, 9.0))
+    write_ply(tmp_path / "far.ply", read_ply(folder / "in.ply")[0], world)
     assert vvgt("optimize", "far.ply", "--views", folder / "views", "--steps", 0, "-o", "same.ply", "-q").code == 0
     far, same = read_ply(tmp_path / "far.ply"), read_ply(tmp_path / "same.ply")
     assert (same[1].made_for, same[1].rule) == (

@@ -29,7 +29,6 @@ from vvgt_cli.gaussians.types import HARMONICS
 from vvgt_cli.network.damp import interpolate
 from vvgt_cli.network.prepare import pack
 from vvgt_cli.splat import render
-from vvgt_cli.volume.types import UnitFrame
 
 DEGREES = (1, 2, 3)
 
@@ -255,8 +254,8 @@ def test_the_degree_of_a_file_is_the_one_that_is_asked_for():
 @pytest.mark.parametrize("frame", ["unit", "world"])
 def test_files_of_other_frames_come_back(frame, up):
     g, eye = cloud(), np.array([1.5, -2.0, 0.6])
-    place = UnitFrame(0.013, (1.0, 0.8, 0.5), (0.01, 0.01, 0.02), (-120.0, 35.5, 100.0))
-    stored, header = read_ply(io.BytesIO(written(g, frame=frame, up=up, unit_frame=place)))
+    place = {"scale": 0.013, "centre": (-120.0, 35.5, 100.0)}
+    stored, header = read_ply(io.BytesIO(written(g, frame=frame, up=up, **place)))
     back = in_unit_frame(stored, header)
     np.testing.assert_allclose(back.harmonics, g.harmonics, atol=1e-6)
     np.testing.assert_allclose(view_colors(back, eye), view_colors(as_stored(g), eye), atol=1e-4)

@@ -159,7 +159,9 @@ def test_up_turns_means_and_covariances_alike(up):
 def test_world_frame_is_the_volumes_and_comes_back(up):
     volume = Volume(np.zeros((4, 6, 8), np.uint8), spacing=(2.0, 1.0, 0.5), origin=(10.0, 20.0, 30.0))
     gaussians = random_gaussians()
-    content = written(gaussians, frame="world", up=up, unit_frame=volume.unit_frame(), unit_distance=1.5)
+    frame = volume.unit_frame()
+    place = {"scale": frame.scale, "centre": frame.centre}
+    content = written(gaussians, frame="world", up=up, **place, unit_distance=1.5)
     world, header = read_ply(io.BytesIO(content))
     assert (header.frame, header.unit_distance, header.unit_distance_label) == ("world", 1.5, "given")
     if up == "none":  # unit +1 along x is the face of the box, half a voxel beyond the last centre

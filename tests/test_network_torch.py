@@ -10,15 +10,12 @@ import pytest
 from network_models import FED, TINY, as_rows, scene
 
 from vvgt_cli.cameras import default_views
-from vvgt_cli.errors import DataError
 from vvgt_cli.network import NAMED
 from vvgt_cli.network.prepare import pack, prepare, view_arrays
 
 torch = pytest.importorskip("torch")
 
 from vvgt_cli.network import epipolar, head, layers  # noqa: E402
-from vvgt_cli.network.appearance import ImageEncoder  # noqa: E402
-from vvgt_cli.network.dinov2 import DEVIATION, MEAN, load_dinov2, positions  # noqa: E402
 from vvgt_cli.network.export import randomised  # noqa: E402
 from vvgt_cli.network.geometry import NeighbourConv  # noqa: E402
 from vvgt_cli.network.model import Vvgt  # noqa: E402
@@ -220,56 +217,3 @@ def test_gaussians_a_pixel_stand_on_their_rays():
 
 def test_small_is_small():
     assert 5.0e6 < sum(parameter.numel() for parameter in Vvgt(NAMED["small"]).parameters()) < 6.2e6
-
-
-def dinov2_state(encoder, grid):
-    """Weights in the names and shapes of a DINOv2 checkpoint without registers."""
-    generator = torch.Generator().manual_seed(3)
-    state = {name: torch.randn(value.shape, generator=generator) for name, value in encoder.state_dict().items()}
-    width = encoder.cls_token.shape[-1]
-    del state["register_tokens"]
-    return state | {
-        "mask_token": torch.zeros(1, width),
-        "pos_embed": torch.randn(1, 1 + grid * grid, width, generator=generator),
-        "patch_embed.proj.weight": torch.randn(width, 3, 14, 14, generator=generator),
-    }
-
-
-def test_dinov2_weights_see_normalised_colours_and_no_alpha(tmp_path):
-    encoder = ImageEncoder(TINY.image, 8)
-    registers = encoder.register_tokens.detach().clone()
-    state = dinov2_state(encoder, grid=5)
-    torch.save(state, tmp_path / "dino.pth")
-    load_dinov2(encoder, tmp_path / "dino.pth")
-    image = torch.rand(1, 8, 28, 28)
-    normal = (image[:, :3] - torch.tensor(MEAN)[:, None, None]) / torch.tensor(DEVIATION)[:, None, None]
-    expected = torch.nn.functional.conv2d(
-        normal, state["patch_embed.proj.weight"], state["patch_embed.proj.bias"], stride=14
-    )
-    assert torch.allclose(encoder.patch_embed.proj(image), expected, atol=1e-3)  # of values near 40
-    assert torch.equal(encoder.blocks[0].attn.qkv.weight, state["blocks.0.attn.qkv.weight"])
-    assert torch.equal(encoder.pos_embed[:, :1], state["pos_embed"][:, :1])
-    assert torch.equal(encoder.register_tokens, registers)
-    constant = positions(torch.ones(1, 26, 4), 4)
-    assert constant.shape == (1, 5, 4)
-    assert torch.allclose(constant, torch.ones(1, 5, 4), atol=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda s: s.pop("pos_embed"), "no pos_embed"),
-        (lambda s: s.pop("norm.weight"), "1 weights missing"),
-        (lambda s: s.update(head=torch.zeros(1)), "1 unknown"),
-        (lambda s: s.update({"cls_token": torch.zeros(1, 1, 5)}), "cls_token"),
-        (lambda s: s.update({"patch_embed.proj.weight": torch.zeros(16, 4, 14, 14)}), "three colours"),
-        (lambda s: s.update({"pos_embed": torch.zeros(1, 7, 16)}), "pos_embed"),
-    ],
-)
-def test_weights_that_are_not_dinov2s_are_refused(change, message, tmp_path):
-    encoder = ImageEncoder(TINY.image, 4)
-    state = dinov2_state(encoder, grid=2)
-    change(state)
-    torch.save(state, tmp_path / "dino.pth")
-    with pytest.raises(DataError, match=message):
-        load_dinov2(encoder, tmp_path / "dino.pth")

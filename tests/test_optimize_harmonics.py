@@ -16,7 +16,8 @@ from vvgt_cli.conversion.stages.refinement import HARMONICS, step_seconds
 from vvgt_cli.descent import METHODS, OptimizeOptions, OptimizeRecord, optimize
 from vvgt_cli.descent.checkpoint import fingerprint, resume, save
 from vvgt_cli.descent.densify import SLOPE, Densified, densify
-from vvgt_cli.descent.loop import Judge, begin, step
+from vvgt_cli.descent.judge import Judge
+from vvgt_cli.descent.loop import begin, step
 from vvgt_cli.descent.states import GIVEN
 from vvgt_cli.field.case import Case
 from vvgt_cli.gaussians import Gaussians

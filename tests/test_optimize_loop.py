@@ -7,7 +7,7 @@ import pytest
 
 from vvgt_cli.cameras import default_views
 from vvgt_cli.descent import OptimizeOptions, OptimizeRecord, optimize
-from vvgt_cli.descent.loop import FALLEN, Judge
+from vvgt_cli.descent.judge import FALLEN, Judge
 from vvgt_cli.descent.shared import NONE
 from vvgt_cli.descent.states import Fields, OwnFrame
 from vvgt_cli.errors import DataError, UsageError

@@ -60,7 +60,7 @@ def test_axes_are_put_in_order_and_the_covariance_stays():
     np.testing.assert_allclose(after @ after.transpose(0, 2, 1), before @ before.transpose(0, 2, 1), atol=1e-9)
     lengths = np.linalg.norm(after, axis=1)
     assert (np.diff(lengths, axis=1) >= -1e-9).all()
-    assert known.shape == (MANY, shared.INPUTS)
+    assert known.shape == (MANY, 17)
     assert np.abs(known.mean(axis=0)).max() < 0.1
     assert np.abs(known).max() <= shared.FARTHEST
 

@@ -10,12 +10,14 @@ import importlib
 import os
 from typing import TYPE_CHECKING, Any
 
+from vvgt_cli.version import VERSION
+
 # Read when numba is imported. With TBB a parallel region costs the more the more have run before (docs/log/kernels.md).
 os.environ.setdefault("NUMBA_THREADING_LAYER_PRIORITY", "omp tbb workqueue")
 # Threads that wait for the next region sleep; else they keep processors from whoever has work to do.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
-__version__ = "0.1.0"
+__version__ = VERSION
 
 if TYPE_CHECKING:
     from vvgt_cli.cameras import Camera, default_views, orbit_views

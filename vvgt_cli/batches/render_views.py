@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vvgt_cli import __version__
 from vvgt_cli.batches.manifest import Manifest, Shard
 from vvgt_cli.batches.view_files import CONTACT, POINTS, Layout, View, field_points, start_points, thumbnails
 from vvgt_cli.cameras import Camera, default_views, orbit_views
@@ -31,6 +30,7 @@ from vvgt_cli.progress import Console
 from vvgt_cli.runs.digests import cameras_digest, volume_digest
 from vvgt_cli.runs.record import ConversionReport, Run
 from vvgt_cli.runs.source import Source, SourceRequest, describe_source, load_all
+from vvgt_cli.version import VERSION
 from vvgt_cli.volume.space import shear_text
 from vvgt_cli.volume.types import IDENTITY
 
@@ -249,7 +249,7 @@ def _settings(request: ViewsRequest, views: Sequence[View], source: Source, cont
     cameras = {split: [view.camera for view in views if view.split == split] for split in ("train", "test")}
     sizes = dict.fromkeys(f"{view.camera.width} x {view.camera.height}" for view in views)
     return {
-        "version": __version__,
+        "version": VERSION,
         "volume": content,
         "function": source.look(),
         "opacity_unit_distance": source.unit_distance,

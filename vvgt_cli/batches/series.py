@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vvgt_cli import __version__
 from vvgt_cli.batches.manifest import Manifest, Shard
 from vvgt_cli.conversion.convert import convert
 from vvgt_cli.conversion.request import ConvertRequest
@@ -28,6 +27,7 @@ from vvgt_cli.runs.record import ConversionReport, Run
 from vvgt_cli.runs.source import SourceRequest
 from vvgt_cli.transfer.label_files import holds_table, read_labels
 from vvgt_cli.transfer.labels import LabelTable, distinct
+from vvgt_cli.version import VERSION
 from vvgt_cli.volume import ReadOptions, Statistics, Volume, statistics
 from vvgt_cli.volume.label_maps import labels_in, recognised
 
@@ -363,7 +363,7 @@ def _settings(
     for tf in shown:
         looks += tf.labels if isinstance(tf, LabelTable) else (tf.opacity_nodes, tf.color_map)
     return {
-        "version": __version__,
+        "version": VERSION,
         "volume": frames.content,
         "frames": frames.count,
         "function": digest(*looks),

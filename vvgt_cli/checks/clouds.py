@@ -63,7 +63,7 @@ def _near_plane() -> Gaussians:
 
 
 def _clamped() -> Gaussians:
-    return Gaussians(np.zeros((1, 3)), np.full((1, 3), 5.0), [[1, 0, 0, 0]], [30.0], [[1, 0.5, -1]])  # type: ignore[arg-type]
+    return Gaussians(np.zeros((1, 3)), np.full((1, 3), 5.0), *map(np.array, ([[1, 0, 0, 0]], [30.0], [[1, 0.5, -1]])))
 
 
 def view(width: int = 48, height: int = 48, eye: tuple[float, float, float] = EYE, fov: float = 40.0) -> Camera:

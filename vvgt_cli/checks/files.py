@@ -45,7 +45,7 @@ def _many(count: int) -> Figure:
 def _placed(frame: str, up: str) -> Figure:
     """Placed elsewhere and turned, and back: means and covariances as they were."""
     gaussians = cloud(200, 3)
-    options = PlyOptions(frame=frame, up=up, unit_frame=FRAME)
+    options = PlyOptions(frame=frame, up=up, scale=FRAME.scale, centre=FRAME.centre)
     back = in_unit_frame(*read_ply(io.BytesIO(_written(gaussians, options))))
     centres = np.abs(back.means - gaussians.means).max()
     shapes = np.abs(covariances(back) - covariances(gaussians)).max() / np.abs(covariances(gaussians)).max()

@@ -15,10 +15,10 @@ from difflib import get_close_matches
 
 import click
 
-from vvgt_cli import __version__
 from vvgt_cli.cli.numbers import expand
 from vvgt_cli.cli.process import end_on_signals, ended_by, first_of_group, heard, open_streams
 from vvgt_cli.errors import UsageError, VvgtError
+from vvgt_cli.version import VERSION
 
 COMMANDS = {
     "convert": "vvgt_cli.cli.convert",
@@ -70,7 +70,7 @@ class LazyGroup(click.Group):
 
 
 @click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
-@click.version_option(__version__, "-V", "--version", prog_name="vvgt", message="%(prog)s %(version)s")
+@click.version_option(VERSION, "-V", "--version", prog_name="vvgt", message="%(prog)s %(version)s")
 def cli() -> None:
     """Convert scientific volumes to 3D Gaussian splats.
 

@@ -311,7 +311,7 @@ def ply_options(request: ConvertRequest, source: Source) -> PlyOptions:
         unit_distance_label=source.unit_label,
         made_for=request.fit.size,
         rule=request.fit.rule,
-        light=None if source.lighting is None else source.lighting.text(),
+        light=source.lighting,
         optics=source.optics(),
     )
     return placed(ply, source.volume)

@@ -94,7 +94,7 @@ class Plan:
 
     def _record(self, stage: Stage) -> dict[str, Any]:
         seconds, memory = stage.cost(self.case)
-        chosen = {entry.name: getattr(stage, entry.name) for entry in fields(stage)}  # type: ignore[arg-type]
+        chosen = {entry.name: getattr(stage, entry.name) for entry in fields(stage)}
         return {"name": stage.name, "seconds": seconds, "memory": memory, **chosen}
 
     def text(self) -> str:

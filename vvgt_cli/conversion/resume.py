@@ -17,13 +17,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vvgt_cli import __version__
 from vvgt_cli.descent.checkpoint import load_archive
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import atomic_write, claim, read_text
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.network.card import CARD, find_model
 from vvgt_cli.runs.digests import digest
+from vvgt_cli.version import VERSION
 
 if TYPE_CHECKING:
     from vvgt_cli.conversion.request import FitOptions, Limits
@@ -131,7 +131,7 @@ def checkpoint_of(folder: str | None, field: Field, fit: FitOptions, limits: Lim
         return Checkpoint()
     source = field.source
     depends = {
-        "version": __version__,
+        "version": VERSION,
         "volume": field.digest(),
         "function": source.look(),
         "opacity_unit_distance": source.unit_distance,

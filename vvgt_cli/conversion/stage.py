@@ -86,6 +86,7 @@ class Work:
         return after > before
 
 
+@dataclass(frozen=True)
 class Stage(ABC):
     """One step of a conversion: what it is called, what it costs, what it does.
 

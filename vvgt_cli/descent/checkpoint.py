@@ -21,7 +21,8 @@ from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import Gaussians
 
 if TYPE_CHECKING:
-    from vvgt_cli.descent.loop import Judge, State
+    from vvgt_cli.descent.judge import Judge
+    from vvgt_cli.descent.states import State
 
 _FAULTS = (
     *(OSError, KeyError, ValueError, TypeError, AttributeError, OverflowError, EOFError, MemoryError, RuntimeError),

@@ -24,7 +24,6 @@ RUN = 16  # of them that lie side by side in memory
 RIDGE = 1e-3  # of a feature's squares
 FARTHEST = 3.0  # standard deviations that a number counts
 BENT = 1.5  # length of the random directions
-INPUTS = 17
 ONE, MOST = 40, 127  # of a feature in 8 bits, which is what it is fitted with too
 BATCH = 1024 * LANES  # Gaussians whose features are made at once
 NONE = np.zeros((0, FEATURES, LANES), np.int8), np.zeros((KNOWN, FEATURES), np.float32)  # where nothing is shared
@@ -41,7 +40,7 @@ def aligned(means: np.ndarray, factors: np.ndarray, logits: np.ndarray, colors: 
         colors: (K, 3).
 
     Returns:
-        (K, `INPUTS`) float32 of mean 0 and variance 1, within `FARTHEST`: logit, log lengths of the axes, colour; how
+        (K, 17) float32 of mean 0 and variance 1, within `FARTHEST`: logit, log lengths of the axes, colour; how
         the means of the neighbours' differ from them; where the neighbours lie, along the axes. Neighbours are those of
         `vvgt_cli.vbm.sharpen.mix_neighbours`, each by how near it is.
     """
@@ -90,7 +89,7 @@ class SharedSteps:
     """
 
     def __init__(self, known: np.ndarray) -> None:
-        """Of ``known`` (K, `INPUTS`), as `aligned` returns it."""
+        """Of ``known`` (K, 17), as `aligned` returns it."""
         count, inputs = known.shape
         rng = np.random.default_rng(0)  # the same features in each run
         ways = (rng.normal(size=(inputs, FEATURES - inputs - 1)) * (BENT / np.sqrt(inputs))).astype(np.float32)

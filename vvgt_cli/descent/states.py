@@ -214,3 +214,6 @@ class Fields:
 
     def gaussians(self) -> Gaussians:
         return Gaussians(*self.arrays)
+
+
+State = OwnFrame | Fields

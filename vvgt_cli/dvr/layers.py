@@ -18,6 +18,7 @@ from vvgt_cli.transfer.tables import extinction
 from vvgt_cli.volume import Volume
 from vvgt_cli.volume.blocks import check_memory
 from vvgt_cli.volume.stored import read_block
+from vvgt_cli.volume.types import triple
 
 SAME = 1e-3  # voxels up to which two grids are one
 SLAB = 16  # slices that are laid out at once
@@ -128,12 +129,12 @@ def common_grid(layers: Sequence[Layer], stored: bool = False) -> Volume:
     if (finer == 1).all():
         return first
     shape = tuple(int(n * f) for n, f in zip(first.data.shape, finer[::-1], strict=True))
-    spacing = tuple(float(s / f) for s, f in zip(first.spacing, finer, strict=True))
+    spacing = triple(float(s / f) for s, f in zip(first.spacing, finer, strict=True))
     if not stored:
         check_memory(VOXEL_BYTES * math.prod(shape), first.name)
     origin = tuple((first.affine @ [*((1 / finer - 1) / 2), 1.0])[:3].tolist())
     empty = np.broadcast_to(np.uint8(0), shape)
-    return replace(first, data=empty, spacing=spacing, origin=origin, slope=1.0, intercept=0.0)  # type: ignore[arg-type]
+    return replace(first, data=empty, spacing=spacing, origin=origin, slope=1.0, intercept=0.0)
 
 
 def _check_meeting(first: Volume, other: Volume, inner: np.ndarray) -> None:

@@ -14,8 +14,7 @@ from numba.core import cgutils
 from numba.core.errors import TypingError
 
 from vvgt_cli.dvr.layout import Optics, Voxels
-from vvgt_cli.dvr.vectors import intrinsic
-from vvgt_cli.jit.decorators import inlined
+from vvgt_cli.jit.decorators import inlined, intrinsic
 
 RUN = 32  # samples of a run: two vectors of AVX-512 float32, four of AVX2
 MOST = (1 << 31) - 1

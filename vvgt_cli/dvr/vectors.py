@@ -9,28 +9,12 @@ from __future__ import annotations
 from typing import Any, TypeAlias
 
 from llvmlite import ir
-from numba import extending, types
-from numba.core import config
+from numba import types
 from numba.core.errors import TypingError
 from numba.extending import models, register_model
 
-from vvgt_cli.errors import UsageError
+from vvgt_cli.jit.decorators import intrinsic
 
-
-def _missing(_: Any) -> Any:
-    """In place of what there is in compiled code alone."""
-
-    def call(*_: Any) -> Any:
-        raise UsageError(
-            "NUMBA_DISABLE_JIT is set, and volumes are drawn by vector instructions, which Python has not; expected "
-            "it unset or 0 (what draws Gaussians alone, as vvgt render, runs with it)"
-        )
-
-    return call
-
-
-# called without its first argument, which type checkers do not know
-intrinsic: Any = _missing if config.DISABLE_JIT else extending.intrinsic  # type: ignore[attr-defined]
 DOUBLE = ir.DoubleType()
 QUAD = ir.VectorType(DOUBLE, 4)
 FLAGS = ("contract", "nsz")
@@ -50,7 +34,7 @@ Quad: TypeAlias = Any  # a value of that type, in annotations: Python has none l
 @register_model(QuadType)
 class _QuadModel(models.PrimitiveModel):
     def __init__(self, manager: Any, kind: Any) -> None:
-        super().__init__(manager, kind, QUAD)  # type: ignore[no-untyped-call]
+        models.PrimitiveModel.__init__(self, manager, kind, QUAD)
 
 
 def _splat(builder: Any, scalar: Any) -> Any:

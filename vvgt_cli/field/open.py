@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vvgt_cli import __version__
 from vvgt_cli.errors import NothingVisible, SeveralComponents, UsageError
 from vvgt_cli.field.blocked import Blocked, Pass
 from vvgt_cli.field.counting import Counted
@@ -27,6 +26,7 @@ from vvgt_cli.runs.layered import NONE, open_parts
 from vvgt_cli.runs.outputs import STDOUT
 from vvgt_cli.runs.record import Run
 from vvgt_cli.runs.source import Opened, Source, SourceRequest, describe_source, load
+from vvgt_cli.version import VERSION
 from vvgt_cli.volume import ReadOptions, Volume
 from vvgt_cli.volume.readers import SCHEMES
 from vvgt_cli.volume.stored import Stored, lies_in_file
@@ -290,7 +290,7 @@ def _settings(request: SourceRequest, wanted: Wanted) -> dict[str, Any]:
     tf = request.tf
     text = Path(tf).read_text("utf-8", "replace") if isinstance(tf, str) and os.path.isfile(tf) else repr(tf)
     return {
-        "version": [__version__, LAYOUT],
+        "version": [VERSION, LAYOUT],
         "volume": _facts(request.volume),
         "read": {key: repr(value) for key, value in asdict(request.read).items() if value is not None},
         "function": [text, request.tf_range, request.unit_distance],

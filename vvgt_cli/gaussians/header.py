@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians.frames import up_matrix
 from vvgt_cli.gaussians.types import HARMONICS
 from vvgt_cli.transfer.lighting import Lighting, parse_lighting
+from vvgt_cli.version import VERSION
 
 REST_COUNTS = {3 * terms: degree for degree, terms in HARMONICS.items()}  # f_rest properties: 0, 9, 24, 45
 REQUIRED = (
@@ -21,40 +22,31 @@ REQUIRED = (
 _BASIC = {"char": "i1", "uchar": "u1", "short": "<i2", "ushort": "<u2", "int": "<i4", "uint": "<u4"}
 _SIZED = {"int8": "i1", "uint8": "u1", "int16": "<i2", "uint16": "<u2", "int32": "<i4", "uint32": "<u4"}
 _TYPES = _BASIC | _SIZED | {"float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8"}
+MIP = "comment SplatRenderMode: mip"  # as Brush marks opacity that is to be compensated
 _ADVICE = "expected a binary little-endian 3DGS .ply, as vvgt and SuperSplat write it"
 
 
-@dataclass(frozen=True)
-class PlyHeader:
-    """What the header says.
+@dataclass(frozen=True, kw_only=True)
+class FileFacts:
+    """What a file says about its Gaussians in the comments of its header; None for what it does not say.
 
     Attributes:
-        size: bytes up to and including the line `end_header`.
-        count: vertices.
-        dtype: one vertex, little-endian, packed.
-        sh_degree: spherical-harmonics degree that the file carries (0 to 3).
-        comments: comment lines, without the word.
-        frame: "unit" or "world"; "unit" where no comment says otherwise.
-        scale, centre: of the volume's `UnitFrame`, where the comments give them.
-        up: volume axis that was turned up, "none" where no comment says otherwise.
-        unit_distance, unit_distance_label: what opacity referred to, None where not recorded.
-        made_for, rule: pixels of the screen that it is made for, and the rule by which it is drawn; None: not recorded.
-        space: anatomical space of the world, "RAS", "LPS" or "none"; None where no comment says.
+        frame: "unit" (box-centred, longest edge 2) or "world" (the volume's physical space).
+        up: world axis that points up in viewers, one of `frames.UP_NAMES`.
+        scale, centre: of the volume's `UnitFrame`; a file in world space needs both.
+        unit_distance: world length that opacity refers to.
+        unit_distance_label: how that distance was chosen; None is written as "given".
+        made_for, rule: pixels of the screen that they are made for, and name of the rule by which they are drawn.
+        space: anatomical space of the world, "RAS", "LPS" or "none"; written beside the affine.
         affine: 3 x 4 row-major, voxel index (i, j, k, 1) of the volume to world position.
-        light: what fell on the scene, None where no comment says.
-        optics: digest of the tables and functions of an optics grid, None where no comment says.
-        version: of the vvgt that wrote it, None for other programs.
+        light: what fell on the scene.
+        optics: digest of the tables and functions of an optics grid.
     """
 
-    size: int
-    count: int
-    dtype: np.dtype
-    sh_degree: int
-    comments: tuple[str, ...] = ()
     frame: str = "unit"
+    up: str = "none"
     scale: float | None = None
     centre: tuple[float, float, float] | None = None
-    up: str = "none"
     unit_distance: float | None = None
     unit_distance_label: str | None = None
     made_for: int | None = None
@@ -63,6 +55,30 @@ class PlyHeader:
     affine: tuple[float, ...] | None = None
     light: Lighting | None = None
     optics: str | None = None
+
+    def facts(self) -> dict[str, Any]:
+        """The facts by name."""
+        return {entry.name: getattr(self, entry.name) for entry in fields(FileFacts)}
+
+
+@dataclass(frozen=True)
+class PlyHeader(FileFacts):
+    """What the header says.
+
+    Attributes:
+        size: bytes up to and including the line `end_header`.
+        count: vertices.
+        dtype: one vertex, little-endian, packed.
+        sh_degree: spherical-harmonics degree that the file carries (0 to 3).
+        comments: comment lines, without the word.
+        version: of the vvgt that wrote it, None for other programs.
+    """
+
+    size: int
+    count: int
+    dtype: np.dtype
+    sh_degree: int
+    comments: tuple[str, ...] = ()
     version: str | None = None
 
 
@@ -162,7 +178,7 @@ def parse_header(content: bytes, name: str) -> PlyHeader:
 
 
 def _provenance(comments: list[str], name: str) -> dict[str, Any]:
-    """Fields of `PlyHeader` that our own comments carry."""
+    """`FileFacts` and the version, from our own comments."""
     found: dict[str, Any] = {}
     for comment in comments:
         words = comment.split()
@@ -213,6 +229,30 @@ def _one_comment(words: list[str]) -> dict[str, Any]:
             raise ValueError(words)
         return {"affine": tuple(affine)}
     return {"version": words[0]}
+
+
+def comment_lines(facts: FileFacts) -> list[str]:
+    """Header lines that hold the version and the facts; `parse_header` reads them."""
+    lines = [f"comment vvgt {VERSION}"]
+    frame = f"comment vvgt frame {facts.frame}"
+    if facts.scale is not None and facts.centre is not None:
+        frame += f" scale {float(facts.scale)!r} centre {' '.join(repr(float(c)) for c in facts.centre)}"
+    lines += [frame, f"comment vvgt up {facts.up}"]
+    if facts.affine is not None:
+        numbers = " ".join(repr(float(a)) for a in facts.affine)
+        lines += [f"comment vvgt space {facts.space or 'none'}", f"comment vvgt affine {numbers}"]
+    if facts.unit_distance is not None:
+        label = facts.unit_distance_label or "given"
+        lines.append(f"comment vvgt unit-distance {float(facts.unit_distance)!r} {label}")
+    if facts.made_for is not None:
+        lines.append(f"comment vvgt size {facts.made_for} rule {facts.rule or 'inria'}")
+    if facts.light is not None:
+        lines.append(f"comment vvgt light {facts.light.text()}")
+    if facts.optics is not None:
+        lines.append(f"comment vvgt optics {facts.optics}")
+    if facts.rule == "compensated":
+        lines.append(MIP)
+    return lines
 
 
 def _finite(words: list[str]) -> list[float]:

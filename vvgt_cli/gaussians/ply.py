@@ -9,55 +9,29 @@ from typing import BinaryIO
 
 import numpy as np
 
-from vvgt_cli import __version__
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import seekable
 from vvgt_cli.gaussians.frames import rescale, turn, up_matrix
-from vvgt_cli.gaussians.header import PlyHeader, parse_header, rest_names
+from vvgt_cli.gaussians.header import FileFacts, PlyHeader, comment_lines, parse_header, rest_names
 from vvgt_cli.gaussians.types import HARMONICS, SH_C0, Gaussians
 from vvgt_cli.volume.space import axis_facts
-from vvgt_cli.volume.types import UnitFrame
 
 FRAMES = ("unit", "world")
 _HEADER_LIMIT = 1 << 16  # bytes; a header longer than this is not one
 
 
-MIP = "comment SplatRenderMode: mip"  # as Brush marks opacity that is to be compensated
-
-
 @dataclass(frozen=True)
-class PlyOptions:
-    """What is written and how.
+class PlyOptions(FileFacts):
+    """How a file is written, and what it says.
 
     Attributes:
-        frame: "unit" (box-centred, longest edge 2) or "world" (the volume's physical space).
-        up: world axis that points up in viewers, one of `frames.UP_NAMES`.
         sh_degree: 0 to 3, of the harmonics in the file: zeros where the Gaussians have none, and those above it left
             out; None: as the Gaussians have them.
-        comments: write the transform, the unit distance and the version before `end_header`.
-        unit_frame: frame of the volume; needed for "world", recorded in the comments otherwise.
-        unit_distance: world length that opacity refers to, recorded in the comments.
-        unit_distance_label: how that distance was chosen, one word.
-        made_for, rule: pixels of the screen that they are made for, and name of the rule by which they are drawn.
-        space: anatomical space of the world, "RAS", "LPS" or "none", recorded in the comments with the affine.
-        affine: 3 x 4 row-major, voxel index to world, recorded in the comments.
-        light: what fell on the scene, as `vvgt_cli.transfer.lighting.Lighting.text` has it, recorded in the comments.
-        optics: digest of the tables and functions of an optics grid, recorded in the comments.
+        comments: write the facts and the version before `end_header`.
     """
 
-    frame: str = "unit"
-    up: str = "none"
     sh_degree: int | None = None
     comments: bool = True
-    unit_frame: UnitFrame | None = None
-    unit_distance: float | None = None
-    unit_distance_label: str = "given"
-    made_for: int | None = None
-    rule: str | None = None
-    space: str = "none"
-    affine: tuple[float, ...] | None = None
-    light: str | None = None
-    optics: str | None = None
 
     def __post_init__(self) -> None:
         up_matrix(self.up)
@@ -97,29 +71,6 @@ def property_names(sh_degree: int = 0) -> list[str]:
     ]
 
 
-def _comments(options: PlyOptions) -> list[str]:
-    lines = [f"comment vvgt {__version__}"]
-    frame = f"comment vvgt frame {options.frame}"
-    if options.unit_frame is not None:
-        centre = " ".join(repr(float(c)) for c in options.unit_frame.centre)
-        frame += f" scale {float(options.unit_frame.scale)!r} centre {centre}"
-    lines += [frame, f"comment vvgt up {options.up}"]
-    if options.affine is not None:
-        numbers = " ".join(repr(float(a)) for a in options.affine)
-        lines += [f"comment vvgt space {options.space}", f"comment vvgt affine {numbers}"]
-    if options.unit_distance is not None:
-        lines.append(f"comment vvgt unit-distance {float(options.unit_distance)!r} {options.unit_distance_label}")
-    if options.made_for is not None:
-        lines.append(f"comment vvgt size {options.made_for} rule {options.rule or 'inria'}")
-    if options.light is not None:
-        lines.append(f"comment vvgt light {options.light}")
-    if options.optics is not None:
-        lines.append(f"comment vvgt optics {options.optics}")
-    if options.rule == "compensated":
-        lines.append(MIP)
-    return lines
-
-
 def write_ply(
     target: str | Path | BinaryIO,
     gaussians: Gaussians,
@@ -135,7 +86,7 @@ def write_ply(
 
     Raises:
         DataError: no Gaussians, or a value that float32 cannot hold in the chosen frame.
-        UsageError: the frame is "world" and no unit frame is given.
+        UsageError: the frame is "world" and scale or centre are missing.
     """
     options = options or PlyOptions()
     if not len(gaussians):
@@ -162,10 +113,10 @@ def ply_rows(gaussians: Gaussians, options: PlyOptions, normals: np.ndarray | No
     _check_rotations(gaussians, "Gaussians to write")
     placed = turn(gaussians if options.sh_degree is None else gaussians.of_degree(options.sh_degree), options.up)
     if options.frame == "world":
-        if options.unit_frame is None:
-            raise UsageError("frame 'world' needs the volume's unit frame: pass PlyOptions(unit_frame=...)")
-        centre = up_matrix(options.up) @ np.array(options.unit_frame.centre)
-        placed = rescale(placed, 1 / options.unit_frame.scale, np.zeros(3), centre)
+        if options.scale is None or options.centre is None:
+            raise UsageError("frame 'world' needs the volume's unit frame: pass PlyOptions(scale=..., centre=...)")
+        centre = up_matrix(options.up) @ np.array(options.centre)
+        placed = rescale(placed, 1 / options.scale, np.zeros(3), centre)
     f_dc = colors_to_f_dc(placed.colors)
     if not np.isfinite(f_dc).all():
         raise DataError("colours too large for float32 spherical harmonics; expected values near [0, 1]")
@@ -187,7 +138,7 @@ def ply_header(count: int, degree: int, options: PlyOptions) -> bytes:
     """The header of a file of ``count`` Gaussians with harmonics of ``degree``."""
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]  # some loaders count lines
     lines += [f"property float {name}" for name in property_names(degree)]
-    lines += [*(_comments(options) if options.comments else []), "end_header", ""]
+    lines += [*(comment_lines(options) if options.comments else []), "end_header", ""]
     return "\n".join(lines).encode("ascii")
 
 

@@ -24,12 +24,12 @@ from numba.core import caching, compiler, config
 from numba.core.dispatcher import Dispatcher
 from numba.core.serialize import dumps
 
-from vvgt_cli import __version__
 from vvgt_cli.jit import store
 from vvgt_cli.jit.compile import Job, compile_in_subprocess
 from vvgt_cli.jit.target import features
+from vvgt_cli.version import VERSION
 
-VERSIONS = numba.__version__, llvmlite.__version__, platform.python_version(), sys.implementation.name, __version__
+VERSIONS = numba.__version__, llvmlite.__version__, platform.python_version(), sys.implementation.name, VERSION
 SETTINGS = ("OPT", "LOOP_VECTORIZE", "SLP_VECTORIZE", "BOUNDSCHECK", "DISABLE_INTEL_SVML", "USING_SVML", "CPU_FEATURES")
 
 

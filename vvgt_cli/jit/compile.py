@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import Any
 
 import numba
-from numba.core import config
 from numba.core.registry import cpu_target
 
 from vvgt_cli.jit.store import PACKAGE, folder_for_writing, folders, warn_once
+from vvgt_cli.jit.target import config
 
 VOLUMES = ("uint8", "uint16", "float32")  # types of a volume's values that kernels read
 
@@ -42,7 +42,7 @@ class Job:
 def usual_jobs(names: Iterable[str], volumes: Sequence[str] = VOLUMES) -> list[Job]:
     """Jobs for the declared argument types of kernels ("vvgt_cli.room.module:function"); none where numba is off."""
     jobs: list[Job] = []
-    if config.DISABLE_JIT:  # type: ignore[attr-defined]
+    if config.DISABLE_JIT:
         return jobs
     for name in names:
         module, function = name.split(":")

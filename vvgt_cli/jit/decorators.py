@@ -1,4 +1,7 @@
-"""The two marks of compiled functions: `kernel` for what Python calls, `inlined` for what kernels call."""
+"""Typed decorators of compiled functions.
+
+`kernel` marks what Python calls, `inlined` what kernels call, `intrinsic` what writes LLVM instructions itself.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +9,11 @@ from collections.abc import Callable, Mapping
 from typing import Any, TypeVar, cast
 
 import numba as nb
+from numba import extending
 
+from vvgt_cli.errors import UsageError
 from vvgt_cli.jit.cache import KernelCache
+from vvgt_cli.jit.target import config
 
 F = TypeVar("F", bound=Callable[..., Any])  # a kernel is called as the function that it is made of
 NO_ENTRY: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
@@ -53,3 +59,21 @@ def inlined(**options: Any) -> Callable[[F], F]:
         return cast(F, made)
 
     return wrap
+
+
+def intrinsic(typed: Callable[..., tuple[Any, Any]]) -> Callable[..., Any]:
+    """``numba.extending.intrinsic``: kernels call the result without the first argument of ``typed``.
+
+    Raises:
+        UsageError: on a call outside compiled code, where ``NUMBA_DISABLE_JIT`` is set.
+    """
+    if not config.DISABLE_JIT:
+        return cast(Callable[..., Any], extending.intrinsic(typed))
+
+    def refuse(*_: Any) -> None:
+        raise UsageError(
+            "NUMBA_DISABLE_JIT is set, but rendering a volume uses vector instructions that Python does not have; "
+            "unset it or set it to 0 (rendering Gaussians alone, as in vvgt render, works with it set)"
+        )
+
+    return refuse

@@ -9,15 +9,16 @@ from __future__ import annotations
 
 from typing import Any
 
-from numba.core import config
+from numba.core import config as numba_config
 from numba.core.codegen import JITCPUCodegen
 
+config: Any = numba_config  # it takes its attributes from the environment, which type checkers do not see
 WIDE = "+avx512vbmi2"
 
 
 def features(found: str) -> str:
     """LLVM's features for those that numba has ``found``; what NUMBA_CPU_FEATURES says is left as it is."""
-    if getattr(config, "CPU_FEATURES", None) is not None or WIDE not in found.split(","):
+    if config.CPU_FEATURES is not None or WIDE not in found.split(","):
         return found
     return f"{found},-prefer-256-bit"
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from itertools import zip_longest
+from typing import Any
 
 import numpy as np
 
@@ -119,8 +120,8 @@ def mean_scores(views: list[ViewScore]) -> Scores:
     if not views:
         raise DataError("no views to score; expected at least one")
     seen = [view for view in views if view.psnr_foreground is not None]
-    means = {f.name: _mean([getattr(view, f.name) for view in seen or views]) for f in fields(ViewScore)}
-    return Scores(**means, views=len(views), views_without_foreground=len(views) - len(seen), per_view=views)  # type: ignore[arg-type]
+    means: dict[str, Any] = {f.name: _mean([getattr(v, f.name) for v in seen or views]) for f in fields(ViewScore)}
+    return Scores(**means, views=len(views), views_without_foreground=len(views) - len(seen), per_view=views)
 
 
 def _mean(values: list[float | None]) -> float | None:

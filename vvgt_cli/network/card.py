@@ -9,10 +9,10 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from vvgt_cli import __version__
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import read_text
 from vvgt_cli.network.config import SCALES, NetworkConfig
+from vvgt_cli.version import VERSION
 
 FORMAT, SCHEMA = "vvgt-model", 1  # the schema is raised when a graph's input or output changes its meaning
 CARD = "card.json"
@@ -51,7 +51,7 @@ class ModelCard:
     storage: str
     difference: float
     graphs: dict[str, dict[str, Any]] = field(default_factory=dict)
-    version: str = __version__
+    version: str = VERSION
 
     def to_json(self) -> str:
         """The card's text."""
@@ -102,7 +102,7 @@ def read_card(folder: Path) -> ModelCard:
     if kind != FORMAT or schema != SCHEMA:
         raise DataError(
             f"{path}: {kind} of schema {schema}, written by version {document.get('version')}; this is version "
-            f"{__version__} and reads {FORMAT} of schema {SCHEMA}: export the checkpoint again"
+            f"{VERSION} and reads {FORMAT} of schema {SCHEMA}: export the checkpoint again"
         )
     try:
         card = ModelCard(**document)

@@ -21,7 +21,6 @@ from vvgt_cli.share import encoded, format_of, read_splats
 from vvgt_cli.share.page_file import html_of_several, upright
 from vvgt_cli.share.splats import splats_of
 from vvgt_cli.splat.rules import INRIA, Rule, rule_of
-from vvgt_cli.volume.types import UnitFrame
 
 STDIN = STDOUT
 
@@ -52,24 +51,7 @@ def open_gaussians(source: str | BinaryIO) -> tuple[Gaussians, PlyHeader]:
 
 def layout_of(header: PlyHeader) -> PlyOptions:
     """What makes a file laid out, placed and commented as the one read was."""
-    frame = None
-    if header.scale is not None and header.centre is not None:
-        frame = UnitFrame(header.scale, (1, 1, 1), (1, 1, 1), header.centre)  # of which scale and centre are written
-    return PlyOptions(
-        frame=header.frame,
-        up=header.up,
-        sh_degree=header.sh_degree,
-        comments=header.version is not None,
-        unit_frame=frame,
-        unit_distance=header.unit_distance,
-        unit_distance_label=header.unit_distance_label or "given",
-        made_for=header.made_for,
-        rule=header.rule,
-        space=header.space or "none",
-        affine=header.affine,
-        light=None if header.light is None else header.light.text(),
-        optics=header.optics,
-    )
+    return PlyOptions(sh_degree=header.sh_degree, comments=header.version is not None, **header.facts())
 
 
 def write_gaussians(

@@ -53,9 +53,11 @@ def into_box(gaussians: Gaussians, volume: Volume) -> Gaussians:
 
 def placed(ply: PlyOptions, volume: Volume) -> PlyOptions:
     """The layout of a file, with the records of where the volume is."""
+    frame = volume.unit_frame()
     return replace(
         ply,
-        unit_frame=volume.unit_frame(),
+        scale=frame.scale,
+        centre=frame.centre,
         space=volume.space or NONE,
         affine=tuple(volume.affine[:3].ravel().tolist()),
     )

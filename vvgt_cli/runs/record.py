@@ -13,8 +13,8 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, is_dataclass
 from typing import Any
 
-from vvgt_cli import __version__
 from vvgt_cli.progress import Console
+from vvgt_cli.version import VERSION
 
 SCHEMA = 1  # of the JSON documents; raised when a field changes its meaning
 
@@ -143,7 +143,7 @@ def machine() -> dict[str, Any]:
 
 def versions() -> dict[str, str]:
     """Of this program and of what its numbers depend on; only what has been imported."""
-    found = {"vvgt": __version__, "python": platform.python_version()}
+    found = {"vvgt": VERSION, "python": platform.python_version()}
     for name in ("numpy", "numba", "vtkmodules"):
         module = sys.modules.get(name)
         version = getattr(module, "__version__", None)

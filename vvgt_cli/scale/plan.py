@@ -15,7 +15,6 @@ from vvgt_cli.field.parts import ROW, Parts
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import PlyOptions
 from vvgt_cli.runs.record import plain
-from vvgt_cli.volume.types import UnitFrame
 
 PLAN = "plan.json"
 A_SCORE, A_RAY = 20, 20  # bytes: of a base cell's scores with those above it, of what a block shows of a ray
@@ -64,8 +63,7 @@ class Plan:
             grid, ply = found["grid"], found["ply"]
             boxes = Boxes(*(tuple(grid["blocks"][key]) for key in ("dims", "edge")))
             grid = CellGrid(**{**{key: _tupled(value) for key, value in grid.items()}, "blocks": boxes})
-            frame = UnitFrame(**{key: _tupled(value) for key, value in ply["unit_frame"].items()})
-            options = PlyOptions(**{**{key: _tupled(value) for key, value in ply.items()}, "unit_frame": frame})
+            options = PlyOptions(**{key: _tupled(value) for key, value in ply.items()})
             return replace(cls(**{**found, "grid": grid, "ply": options}), axes=tuple(found["axes"]))
         except FileNotFoundError:
             raise DataError(

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli import __version__
 from vvgt_cli.errors import DataError
 from vvgt_cli.share.splats import Splats, logits_of, opacities_of
+from vvgt_cli.version import VERSION
 
 EXTENSION = "KHR_gaussian_splatting"
 _KERNEL = {
@@ -50,7 +50,7 @@ def glb(splats: Splats, name: str) -> bytes:
     attributes = {attribute: k for k, attribute in enumerate(columns)}
     primitive = {"attributes": attributes, "mode": _POINTS, "extensions": {EXTENSION: _KERNEL}}
     document = {
-        "asset": {"version": "2.0", "generator": f"vvgt {__version__}", "extras": {"comments": list(splats.comments)}},
+        "asset": {"version": "2.0", "generator": f"vvgt {VERSION}", "extras": {"comments": list(splats.comments)}},
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],

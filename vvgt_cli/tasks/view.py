@@ -10,7 +10,7 @@ import webbrowser
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 from vvgt_cli.errors import UsageError
@@ -167,7 +167,7 @@ def _serve(run: Run, request: ViewRequest, files: Sequence[str], announce: Calla
         "": Part("text/html; charset=utf-8", lambda: text.encode("utf-8")),
         "viewer.js": Part("text/javascript; charset=utf-8", lambda: asset(PROGRAM), packed=True),
     }
-    parts |= {name_of(k): Part("application/octet-stream", lambda k=k: content(k)) for k in range(len(files))}  # type: ignore[misc]
+    parts |= {name_of(k): Part("application/octet-stream", partial(content, k)) for k in range(len(files))}
     with served(Site(parts, run.console.say), request.port) as url:
         announce(url)
         opened = request.browser and display() and webbrowser.open(url)

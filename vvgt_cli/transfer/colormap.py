@@ -19,6 +19,7 @@ from vvgt_cli.transfer.curve import (
     sorted_nodes,
     unit_interval,
 )
+from vvgt_cli.volume.types import triple
 
 Space = Callable[[np.ndarray], np.ndarray]
 
@@ -137,8 +138,8 @@ class ColorMap:
             out = np.empty((w.size, 3))
             for segment in np.unique(left):
                 here = left == segment
-                ends = (tuple(map(float, self.rgb[segment])), tuple(map(float, self.rgb[segment + 1])))
-                out[here] = along_path(*ends, w[here])  # type: ignore[arg-type]
+                start, end = (triple(map(float, rgb)) for rgb in self.rgb[segment : segment + 2])
+                out[here] = along_path(start, end, w[here])
             return out
         forward, backward = LINEAR_SPACES[self.space]
         nodes = forward(self.rgb)

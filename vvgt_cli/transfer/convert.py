@@ -13,8 +13,6 @@ from vvgt_cli.transfer.function import TransferFunction
 from vvgt_cli.transfer.lighting import COEFFICIENTS
 from vvgt_cli.transfer.opacity import PiecewiseOpacity
 
-FORMATS = ("minimal", "paraview")
-
 
 def placed(tf: TransferFunction, limits: tuple[float, float] | None) -> TransferFunction:
     """The function on data values, its nodes stretched to ``limits`` where some are given.
@@ -41,7 +39,7 @@ def to_text(tf: TransferFunction, form: str) -> str:
 
     Args:
         tf: see `placed`.
-        form: of `FORMATS`.
+        form: "minimal" or "paraview".
 
     Raises:
         DataError: something that the format cannot hold.

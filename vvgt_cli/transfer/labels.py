@@ -10,6 +10,7 @@ from itertools import pairwise
 import numpy as np
 
 from vvgt_cli.errors import DataError
+from vvgt_cli.volume.types import triple
 
 PALETTES = ("tab10", "tab20b", "tab20c", "Set2", "Dark2", "Set3")  # matplotlib's qualitative ones: 78 colours
 LISTED = 8  # labels that a message names
@@ -123,6 +124,6 @@ def distinct(numbers: Sequence[int]) -> LabelTable:
     """
     from matplotlib import colormaps
 
-    colors = [tuple(map(float, rgb[:3])) for name in PALETTES for rgb in colormaps[name](range(colormaps[name].N))]
-    labels = [Label(n, f"label {n}", colors[(n - 1) % len(colors)], SOLID if n else 0.0) for n in numbers]  # type: ignore[arg-type]
+    colors = [triple(map(float, rgb[:3])) for name in PALETTES for rgb in colormaps[name](range(colormaps[name].N))]
+    labels = [Label(n, f"label {n}", colors[(n - 1) % len(colors)], SOLID if n else 0.0) for n in numbers]
     return LabelTable("distinct colours", tuple(labels))

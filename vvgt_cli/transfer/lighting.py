@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.space import world_axis
@@ -12,7 +13,6 @@ from vvgt_cli.volume.space import world_axis
 AMBIENT, DIFFUSE, SPECULAR, POWER = 0.1, 0.7, 0.2, 10.0  # vtkVolumeProperty's
 COEFFICIENTS = ("ambient", "diffuse", "specular", "specular_power")
 HEADLIGHT, NONE = "headlight", "none"
-OCCLUSION = 0.1  # unit-frame lengths: a twentieth of the longest edge
 MOST = 1000.0  # of a coefficient: a highlight with a larger power is a point
 AXES = {axis: tuple(float(letter == axis) for letter in "xyz") for axis in "xyz"}
 WORDS = ("left", "right", "anterior", "posterior", "superior", "inferior", "above", "below")
@@ -83,12 +83,13 @@ def parse_lighting(text: str) -> Lighting:
         ValueError, UsageError: something else.
     """
     words = text.split()
-    numbers, rest = [float(word) for word in words[:4]], words[4:]
+    numbers: list[Any] = [float(word) for word in words[:4]]
+    rest = words[4:]
     occlusion = None
     if "occlusion" in rest:
         at = rest.index("occlusion")
         occlusion, rest = float(rest[at + 1]), rest[:at] + rest[at + 2 :]
-    found = Lighting(HEADLIGHT in rest, _directions([w for w in rest if "," in w], None), *numbers)  # type: ignore[arg-type]
+    found = Lighting(HEADLIGHT in rest, _directions([w for w in rest if "," in w], None), *numbers)
     if known := set(rest) - {HEADLIGHT, "shadows"} - {w for w in rest if "," in w}:
         raise ValueError(known)
     return replace(found, shadows="shadows" in rest, occlusion=occlusion)
@@ -167,7 +168,7 @@ def _direction(light: str, space: str | None) -> Direction:
     return x / length, y / length, z / length
 
 
-def preset_lighting(what: str, shade: bool, fields: dict[str, float]) -> Lighting | None:
+def preset_lighting(what: str, shade: bool, fields: dict[str, Any]) -> Lighting | None:
     """What a volume property says of light: a head-light where it is shaded, None where not.
 
     Raises:
@@ -176,6 +177,6 @@ def preset_lighting(what: str, shade: bool, fields: dict[str, float]) -> Lightin
     if not shade:
         return None
     try:
-        return Lighting(**fields)  # type: ignore[arg-type]
+        return Lighting(**fields)
     except UsageError as error:
         raise DataError(f"{what}: shading with {str(error).lstrip('-')}") from None

@@ -176,7 +176,7 @@ def fill(stream: Any, need: int) -> tuple[np.ndarray, int]:
         (need,) uint8 and how many of them were read.
     """
     out = np.empty(need, np.uint8)
-    view = memoryview(out)  # type: ignore[arg-type]
+    view = out.data
     filled = 0
     while filled < need:
         chunk = stream.read(min(_CHUNK, need - filled))

@@ -18,7 +18,7 @@ from vvgt_cli.volume.blocks import IN_BLOCKS, check_memory, count
 from vvgt_cli.volume.components import contiguous, select_component
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.stored import Stored
-from vvgt_cli.volume.types import Volume
+from vvgt_cli.volume.types import Volume, triple
 
 EVEN = 0.01  # of a step that a coordinate may be off and still count as evenly spaced (float32 longitudes are)
 AXIS_ATTRIBUTES = ("axis", "standard_name", "units")
@@ -269,8 +269,8 @@ def _placed(
         steps = [1.0 if c is None or c.size < 2 else float((c[-1] - c[0]) / (c.size - 1)) for c in centres]
         if field.shape[0] == 1 and (centres[0] is None or centres[0].size < 2):
             steps[0] = steps[2]  # a single slice is as thick as its pixels are wide
-        origin = [0.0 if c is None else float(c[0]) for c in centres]
-        return Volume(field, tuple(steps[::-1]), tuple(origin[::-1]), name=name, slope=scaling[0], intercept=scaling[1])  # type: ignore[arg-type]
+        origin = tuple(0.0 if c is None else float(c[0]) for c in reversed(centres))
+        return Volume(field, triple(steps[::-1]), origin, name=name, slope=scaling[0], intercept=scaling[1])
     if options.dims is None:
         uneven = [a for a, c in zip(axes, centres, strict=True) if c is not None and not even(c)]
         steps_text = ", ".join(_steps(a) for a in uneven)

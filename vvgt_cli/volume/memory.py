@@ -86,12 +86,12 @@ def _array(values: np.ndarray, options: ReadOptions, origin: Sequence[float] | N
         raise UsageError(f"space {options.space}: says where an affine leads to; give affine too")
     volume = Volume(contiguous(values) if values.ndim == 3 else values, options.spacing or (1.0, 1.0, 1.0), name=name)
     if origin is not None:
-        volume = replace(volume, origin=tuple(map(float, origin)))  # type: ignore[arg-type]
+        volume = replace(volume, origin=tuple(map(float, origin)))
     if affine is None:
         return volume
     matrix = np.asarray(affine, dtype=np.float64)
     if matrix.shape not in ((3, 4), (4, 4)) or not np.isfinite(matrix).all():
         raise UsageError(f"affine: {matrix.shape} {matrix.tolist()}; expected (4, 4) or (3, 4) finite numbers")
     spacing, direction = unit_rows(matrix[:3, :3].T.tolist())
-    place = {"spacing": spacing, "direction": direction, "origin": tuple(matrix[:3, 3].tolist())}
-    return replace(volume, **place, space=options.space if options.space in SPACES else None)  # type: ignore[arg-type]
+    place: dict[str, Any] = {"spacing": spacing, "direction": direction, "origin": tuple(matrix[:3, 3].tolist())}
+    return replace(volume, **place, space=options.space if options.space in SPACES else None)

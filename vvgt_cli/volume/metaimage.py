@@ -130,7 +130,7 @@ def read_metaimage(path: Path, options: ReadOptions) -> Volume:
         block = block[None]
     field, _ = select_component(block, options.component, str(path))
     spacing, direction, origin, space = _geometry(fields, len(sizes))
-    return Volume(field, options.spacing_or(spacing), origin, direction, volume_name(path), space=space)  # type: ignore[arg-type]
+    return Volume(field, options.spacing_or(spacing), origin, direction, volume_name(path), space=space)
 
 
 def _load(fields: Fields, source: Path, dtype: np.dtype, shape: tuple[int, ...], start: int) -> np.ndarray:

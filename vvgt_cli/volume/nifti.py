@@ -279,7 +279,7 @@ def _placed(header: Header, field: np.ndarray, path: Path, options: ReadOptions)
     return Volume(
         field,
         options.spacing_or(steps),
-        origin,  # type: ignore[arg-type]
+        origin,
         direction,
         volume_name(path),
         header.slope,

@@ -236,7 +236,7 @@ def _volume(path: Path, fields: Fields, block: np.ndarray, sizes: list[int], opt
     color = "rgb" in fields.get("kinds", "").lower()
     label = f"axis {axis}" if axis is not None else ""
     field, _ = select_component(block, options.component, str(path), label=label, color=color)
-    return Volume(field, options.spacing_or(spacing), origin, direction, volume_name(path), space=space)  # type: ignore[arg-type]
+    return Volume(field, options.spacing_or(spacing), origin, direction, volume_name(path), space=space)
 
 
 register(Reader("NRRD", (".nrrd", ".nhdr"), lambda head: head.startswith(b"NRRD000"), read_nrrd))

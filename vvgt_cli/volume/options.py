@@ -119,7 +119,7 @@ class ReadOptions:
         """The spacing asked for, else the file's (x, y, z): signs are orientation and dropped."""
         if self.spacing is not None:
             return self.spacing
-        return tuple(abs(float(s)) for s in declared)  # type: ignore[return-value]
+        return tuple(abs(float(s)) for s in declared)  # type: ignore[return-value]  # `Volume` counts them
 
 
 def parse_dtype(name: str, byte_order: str | None = None) -> np.dtype:

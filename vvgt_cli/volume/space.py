@@ -45,7 +45,7 @@ def in_space(volume: Volume, wanted: str | None) -> Volume:
     signs = (-1.0, -1.0, 1.0)
     direction = tuple(signs[k // 3] * v + 0.0 for k, v in enumerate(volume.direction))  # + 0.0: no -0
     origin = tuple(s * o + 0.0 for s, o in zip(signs, volume.origin, strict=True))
-    return replace(volume, direction=direction, origin=origin, space=wanted)  # type: ignore[arg-type]
+    return replace(volume, direction=direction, origin=origin, space=wanted)
 
 
 def millimetres(unit: str) -> float:

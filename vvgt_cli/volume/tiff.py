@@ -167,8 +167,8 @@ def _facts(file: Any, root: Any, series: Any, number: int, path: Path) -> Facts:
             raise DataError(f"{path}: its OME-XML does not fit its pages; check that the file is whole")
     if facts.spacing == (None, None, None) and file.is_imagej and not file.is_shaped:
         first = file.pages.first
-        resolution = tuple(float(n) for n in first.get_resolution())
-        told = imagej_facts(file.imagej_metadata or {}, resolution, int(first.resolutionunit))  # type: ignore[arg-type]
+        x, y = first.get_resolution()
+        told = imagej_facts(file.imagej_metadata or {}, (float(x), float(y)), int(first.resolutionunit))
         facts = replace(told, channels=facts.channels)
         if facts.images > 1 and series.kind != "imagej" and root is None:
             raise DataError(

@@ -16,6 +16,7 @@ from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.labelled import METRES
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.tiff_pages import MAX_PAGES, check_pages
+from vvgt_cli.volume.types import triple
 
 MICROMETRE = 1e-6  # metres
 _MOST_FILES = 10_000
@@ -172,12 +173,12 @@ def _micrometres(numbers: list[float | None], units: list[str]) -> Facts:
     metres = [METRES.get(unit, METRES.get(unit.lower())) for unit in plain]
     told = {u: m for u, m, n in zip(plain, metres, numbers, strict=True) if n is not None}
     if None in told.values():
-        return Facts(tuple(numbers), units=", ".join(told) if len(told) > 1 else "")  # type: ignore[arg-type]
+        return Facts(triple(numbers), units=", ".join(told) if len(told) > 1 else "")
     return Facts(
-        tuple(
+        triple(
             None if n is None else float(f"{n * float(m or 1) / MICROMETRE:.15g}")
             for n, m in zip(numbers, metres, strict=True)
-        )  # type: ignore[arg-type]
+        )
     )
 
 

@@ -50,7 +50,7 @@ def pages_left(
         z, y, x = slices
         out = np.empty((z.stop - z.start, y.stop - y.start, x.stop - x.start), dtype)
         for k in range(z.start, z.stop):
-            place = tuple(k if at == axis else int(i) for at, i in enumerate(index[: len(lead)]))  # type: ignore[arg-type]
+            place = tuple(k if isinstance(i, slice) else int(i) for i in index[: len(lead)])
             with turn:
                 _, series, pages = opened()
                 page = pages.decoded(series[int(np.ravel_multi_index(place, lead))], series)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
@@ -12,6 +14,15 @@ from vvgt_cli.errors import DataError
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 FLAT = 1e-3  # volume of the parallelepiped of three unit axes, below which they lie in a plane
 RIGHT = 1e-4  # cosine up to which axes are at right angles
+
+
+T = TypeVar("T")
+
+
+def triple(values: Iterable[T]) -> tuple[T, T, T]:
+    """Three values as a tuple of known length."""
+    x, y, z = values
+    return x, y, z
 
 
 @dataclass(frozen=True)
@@ -57,7 +68,7 @@ class Volume:
 
     data: np.ndarray
     spacing: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    origin: tuple[float, ...] = (0.0, 0.0, 0.0)
     direction: tuple[float, ...] = IDENTITY
     name: str = "volume"
     slope: float = 1.0
@@ -95,7 +106,8 @@ class Volume:
     @property
     def extent(self) -> tuple[float, float, float]:
         """Edges of the box (x, y, z) in world units; it reaches half a voxel beyond the outer centres."""
-        return tuple(n * s for n, s in zip(self.dims, self.spacing, strict=True))  # type: ignore[return-value]
+        (nx, ny, nz), (x, y, z) = self.dims, self.spacing
+        return nx * x, ny * y, nz * z
 
     @property
     def axes(self) -> np.ndarray:
@@ -120,11 +132,11 @@ class Volume:
         """The frame that cameras and Gaussians of a run live in (conventions: Space)."""
         extent = self.extent
         scale = 2.0 / max(extent)
-        half = tuple(e * scale / 2 for e in extent)
-        step = tuple(s * scale for s in self.spacing)
+        half = triple(e * scale / 2 for e in extent)
+        step = triple(s * scale for s in self.spacing)
         middle = [(n - 1) * s / 2 for n, s in zip(self.dims, self.spacing, strict=True)]
         rows = (self.direction[3 * r : 3 * r + 3] for r in range(3))
-        centre = tuple(
+        centre = triple(
             o + sum(d * m for d, m in zip(row, middle, strict=True)) for o, row in zip(self.origin, rows, strict=True)
         )
-        return UnitFrame(scale, half, step, centre)  # type: ignore[arg-type]
+        return UnitFrame(scale, half, step, centre)

@@ -247,7 +247,7 @@ def read_legacy(path: Path, options: ReadOptions) -> Volume:
     label, color = str(array.info.name), values.dtype == np.uint8
     field, _ = select_component(values, options.component, str(path), label=label, color=color)
     lengths, direction = unit_rows(np.diag(spacing).tolist())
-    return Volume(field, options.spacing_or(lengths), tuple(origin), direction, volume_name(path))  # type: ignore[arg-type]
+    return Volume(field, options.spacing_or(lengths), tuple(origin), direction, volume_name(path))
 
 
 def is_legacy(head: bytes, grid: bool) -> bool:

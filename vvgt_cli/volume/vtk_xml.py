@@ -174,9 +174,9 @@ def _grid(found: _Scan, where: str, path: Path) -> _Grid:
     extent, dims = _extent(found, path), extent_dims(found, path)
     spacing = _numbers(image.get("Spacing", "1 1 1"), 3, path, "Spacing")
     origin = _numbers(image.get("Origin", "0 0 0"), 3, path, "Origin")
-    direction = IDENTITY
+    direction: tuple[float, ...] = IDENTITY
     if "Direction" in image:
-        direction = tuple(_numbers(image["Direction"], 9, path, "Direction"))  # type: ignore[assignment]
+        direction = tuple(_numbers(image["Direction"], 9, path, "Direction"))
     first = [float(extent[2 * k]) for k in range(3)]
     if where == "cell":
         first = [f + 0.5 if d > 1 else f for f, d in zip(first, dims, strict=True)]
@@ -213,7 +213,7 @@ def read_vti(path: Path, options: ReadOptions) -> Volume:
     return Volume(
         component,
         options.spacing_or(grid.spacing),
-        grid.origin,  # type: ignore[arg-type]
+        grid.origin,
         grid.direction,
         volume_name(path),
     )

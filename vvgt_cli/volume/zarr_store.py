@@ -195,8 +195,9 @@ def _multiscale(group: Path) -> dict[str, Any]:
     attributes = _attributes(group)
     inner = attributes.get("ome")
     images = (inner if isinstance(inner, dict) else attributes).get("multiscales")
-    fits = isinstance(images, list) and bool(images) and isinstance(images[0], dict) and images[0].get("datasets")
-    return images[0] if fits else {}  # type: ignore[index]
+    if isinstance(images, list) and images and isinstance(images[0], dict) and images[0].get("datasets"):
+        return images[0]
+    return {}
 
 
 def _ome_axes(place: Path, shape: tuple[int, ...]) -> list[Axis]:

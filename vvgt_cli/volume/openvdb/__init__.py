@@ -82,9 +82,9 @@ def read_vdb(path: Path, options: ReadOptions) -> Volume:
     lo, hi = bounding_box(tree, f"{path}: grid {grid}")
     values = brick_array(tree, lo, hi, options.component, str(path), f"grid {grid.label!r}")
     return Volume(
-        values,  # type: ignore[arg-type]
+        values,  # type: ignore[arg-type]  # a BrickArray, which is read where it is indexed
         options.spacing_or(placement.spacing),
-        placement.at(lo),  # type: ignore[arg-type]
+        placement.at(lo),
         placement.direction,
         volume_name(path),
     )
