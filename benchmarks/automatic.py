@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from scans import cone_beam, head, nuclei, trunk
 
-from vvgt_cli.cameras.boxed import drawn_in_box
+from vvgt_cli.cameras.boxed import render_in_box
 from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.dvr import RenderSettings, Scene, render_view
 from vvgt_cli.images import write_png
@@ -44,7 +44,7 @@ def picture(volume: Volume) -> tuple[np.ndarray, str]:
     level = np.cos(elevation)
     eye = 3 * np.array([np.cos(azimuth) * level, np.sin(azimuth) * level, np.sin(elevation)])
     camera = look_at(eye, width=SIZE, height=SIZE, fov=FIELD)
-    draw = drawn_in_box(lambda boxed: render_view(scene, boxed, RenderSettings()), volume.axes)
+    draw = render_in_box(lambda boxed: render_view(scene, boxed, RenderSettings()), volume.axes)
     return np.clip(draw(camera)[..., :3], 0, 1), tf.name
 
 

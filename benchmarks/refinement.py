@@ -29,7 +29,7 @@ from vvgt_cli.conversion.stages.views import LARGE, REFINE_VIEWS, fine_enough, v
 from vvgt_cli.descent import LOSS_3DGS, OptimizeOptions, optimize
 from vvgt_cli.dvr import Scene, render_views
 from vvgt_cli.dvr.render import FIT_VIEWS
-from vvgt_cli.field.case import view_edge
+from vvgt_cli.field.workload import view_edge
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.metrics import score_views
 from vvgt_cli.runs.views import Views

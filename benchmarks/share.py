@@ -23,8 +23,8 @@ from vvgt_cli.gaussians import Gaussians, in_unit_frame
 from vvgt_cli.runs.gaussian_files import file_rule, layout_of, open_gaussians
 from vvgt_cli.runs.place import into_box, preview, upright
 from vvgt_cli.runs.score import score_test_views
-from vvgt_cli.runs.seats import PREVIEW_VIEWS
 from vvgt_cli.runs.source import Source
+from vvgt_cli.runs.viewing import PREVIEW_VIEWS
 from vvgt_cli.share import encoded, read_splats
 from vvgt_cli.share.formats import FORMATS
 from vvgt_cli.splat.rules import Rule

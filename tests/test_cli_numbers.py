@@ -12,7 +12,7 @@ import pytest
 from vvgt_cli.cli.numbers import expand
 from vvgt_cli.errors import UsageError
 from vvgt_cli.synth.analytic import blob
-from vvgt_cli.volume.order import likelier_dims
+from vvgt_cli.volume.order import guess_dims
 
 FORMS = (
     "64 64 93", "64,64,93", "64x64x93", "64X64X93", "64, 64, 93", "64 x 64 x 93", "64,64 93", "64×64×93", "64 ,64 ,93",
@@ -83,7 +83,7 @@ def test_raw_values_read_in_another_order_than_they_lie_in_are_told(vvgt, recwar
     blob(dims).data.tofile("v.raw")
     for order in permutations(dims):
         data = np.fromfile("v.raw", np.float32).reshape(order[::-1])
-        assert likelier_dims(data) == (None if order == dims else dims)
+        assert guess_dims(data) == (None if order == dims else dims)
         recwarn.clear()
         assert vvgt("info", "v.raw", "--dims", *order, "--dtype", "float32").code == 0
         assert ["did you mean --dims 40 28 20?" in str(w.message) for w in recwarn] == [True] * (order != dims)
@@ -91,7 +91,7 @@ def test_raw_values_read_in_another_order_than_they_lie_in_are_told(vvgt, recwar
 
 def test_of_noise_cubes_and_tiny_volumes_no_order_is_told() -> None:
     rng = np.random.default_rng(0)
-    assert likelier_dims(rng.random((20, 30, 40))) is None
-    assert likelier_dims(blob((24, 24, 24)).data) is None
-    assert likelier_dims(np.arange(24.0).reshape(2, 3, 4)) is None
-    assert likelier_dims(np.full((20, 30, 40), np.nan)) is None
+    assert guess_dims(rng.random((20, 30, 40))) is None
+    assert guess_dims(blob((24, 24, 24)).data) is None
+    assert guess_dims(np.arange(24.0).reshape(2, 3, 4)) is None
+    assert guess_dims(np.full((20, 30, 40), np.nan)) is None

@@ -8,7 +8,7 @@ from vvgt_cli.cameras.blocks import BLOCK, ENOUGH, FEW, spread_blocks
 from vvgt_cli.conversion import case as case_module
 from vvgt_cli.conversion.stages import CheckViews, TestViews, TrainingViews
 from vvgt_cli.dvr import Scene
-from vvgt_cli.field.case import Case, measure
+from vvgt_cli.field.workload import Workload, measure
 from vvgt_cli.synth import open_volume
 from vvgt_cli.transfer.readers import minimal
 
@@ -48,5 +48,5 @@ def test_a_machine_is_as_slow_as_it_draws(scene, monkeypatch):
     [(True, 3 * 1080**2 + 7 * drawn(1080, ENOUGH), 0.1), (False, 3 * drawn(1080, ENOUGH), 0.03)],
 )
 def test_three_large_test_views_are_whole_where_all_ten_are_scored(whole, pixels, beside):
-    case = Case(100_000, 1e6, 10.2e6, 1080, 0.05, pace=2.0)
+    case = Workload(100_000, 1e6, 10.2e6, 1080, 0.05, pace=2.0)
     assert TestViews(whole).cost(case).seconds == pytest.approx(pixels * (1.2 * 0.05 / 300**2 + 2 * beside / 400**2))

@@ -20,7 +20,7 @@ from vvgt_cli.conversion.stages.refinement import WIDER
 from vvgt_cli.conversion.stages.views import views_of
 from vvgt_cli.descent.options import TEXTURE
 from vvgt_cli.errors import UsageError
-from vvgt_cli.field.case import Case, expected_wide
+from vvgt_cli.field.workload import Workload, expected_wide
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply
 from vvgt_cli.progress import Console
 from vvgt_cli.runs.record import ConversionReport, Run
@@ -29,7 +29,7 @@ from vvgt_cli.splat.constants import DILATION
 from vvgt_cli.splat.rules import RULES
 
 pytestmark = pytest.mark.usefixtures("small_seats")
-CASE = Case(gaussians=100_000, cells=1e6, voxels=10.2e6, size=48, view=0.05, pace=1.0, there=2e8)
+CASE = Workload(gaussians=100_000, cells=1e6, voxels=10.2e6, size=48, view=0.05, pace=1.0, there=2e8)
 FORM = 0.4 + 0.62 + 0.03 * 10.2 + 0.28  # seconds of its closed form
 SOURCE = SourceRequest("example:marschner-lobb:24")
 SMALL = FitOptions(400, 48)

@@ -60,7 +60,7 @@ def test_every_pool_at_least_halves_and_keeps_mean_positions(count, seed, coarse
     means = scene(count, seed).means
     means = np.round(means * coarse).astype(np.float32) / coarse  # many share a place
     means = means[tb.canonical_order(means)]
-    stage = tb.Stage(tb.quantise(means), tb.BITS, means, np.ones(count, np.int64))
+    stage = tb.StagePoints(tb.quantise(means), tb.BITS, means, np.ones(count, np.int64))
     whole = np.arange(count)
     for _ in range(4):
         after, parents = tb.pool(stage)
@@ -77,7 +77,7 @@ def test_every_pool_at_least_halves_and_keeps_mean_positions(count, seed, coarse
 def test_neighbours_are_the_cells_around():
     cells = np.unique(np.random.default_rng(2).integers(0, 8, (150, 3)), axis=0)
     cells = cells[np.argsort(interleave(cells))]
-    stage = tb.Stage(cells, 3, np.zeros((len(cells), 3), np.float32), np.ones(len(cells), np.int64))
+    stage = tb.StagePoints(cells, 3, np.zeros((len(cells), 3), np.float32), np.ones(len(cells), np.int64))
     where = {tuple(cell): i for i, cell in enumerate(cells)}
     expected = [[where.get(tuple(cell + offset), len(cells)) for offset in tb.OFFSETS] for cell in cells]
     assert np.array_equal(tb.neighbours(stage), expected)

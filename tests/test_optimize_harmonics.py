@@ -19,7 +19,7 @@ from vvgt_cli.descent.densify import SLOPE, Densified, densify
 from vvgt_cli.descent.judge import Judge
 from vvgt_cli.descent.loop import begin, step
 from vvgt_cli.descent.states import GIVEN
-from vvgt_cli.field.case import Case
+from vvgt_cli.field.workload import Workload
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.metrics import psnr
 from vvgt_cli.splat import blend, render
@@ -140,7 +140,7 @@ def test_a_checkpoint_holds_them(method, tmp_path):
 
 
 def test_the_plan_knows_that_steps_with_harmonics_take_longer():
-    case = Case(100_000, 1e6, 1e6, 400, 0.05)
+    case = Workload(100_000, 1e6, 1e6, 400, 0.05)
     seconds = [step_seconds(replace(case, degree=degree), small=False) for degree in range(4)]
     assert seconds == sorted(seconds)
     assert [s / seconds[0] for s in seconds] == pytest.approx(HARMONICS)

@@ -11,7 +11,16 @@ from vvgt_cli.cameras.blocks import Blocks
 from vvgt_cli.dvr import RenderSettings, render_view
 from vvgt_cli.metrics import psnr, score_view, ssim, texture
 from vvgt_cli.runs.score import score_seen, score_test_views
-from vvgt_cli.runs.seats import Seat, from_above, score_seats, score_texture, seat_views, seats_of, texture_note, zoomed
+from vvgt_cli.runs.viewing import (
+    ViewingCondition,
+    condition_views,
+    from_above,
+    score_conditions,
+    score_texture,
+    texture_note,
+    viewing_conditions,
+    zoomed,
+)
 from vvgt_cli.splat import render
 from vvgt_cli.synth import open_volume
 from vvgt_cli.vbm import VbmOptions, initialise
@@ -38,7 +47,7 @@ def test_a_seat_close_up_is_the_same_place_with_a_narrower_field():
 def test_seats_are_what_they_say_worst_first(pair):
     scene, gaussians = pair
     rules, views = ("inria", "playcanvas"), (4, 9)
-    found = score_seats(gaussians, seat_views(scene, [(24, 40.0), (40, 10.0)], ONE_RAY, views=views), rules)
+    found = score_conditions(gaussians, condition_views(scene, [(24, 40.0), (40, 10.0)], ONE_RAY, views=views), rules)
     assert [seat.psnr for seat in found] == sorted(seat.psnr for seat in found)
     assert len(found) == 4
     for seat in found:
@@ -46,11 +55,11 @@ def test_seats_are_what_they_say_worst_first(pair):
         pictures = [(render_view(scene, c, ONE_RAY), render(gaussians, c, seat.rule)) for c in cameras]
         expected = np.mean([psnr(theirs[..., :3], np.clip(ours[..., :3], 0, 1)) for theirs, ours in pictures])
         assert seat.psnr == pytest.approx(expected, abs=1e-6)
-    assert Seat("inria", 400, 10.0, 30.0).name() == "inria 400 px close up"
+    assert ViewingCondition("inria", 400, 10.0, 30.0).name() == "inria 400 px close up"
     assert from_above(1080) == [(1080, 40), (2160, 40)]
     assert from_above(2160) == [(2160, 40), (4320, 40)]
     assert from_above(2159) == [(2159, 40), (2160, 40)]
-    assert seats_of(1080) == [(400, 40), (800, 40), (1080, 40), (2160, 40), (1080, 10)]
+    assert viewing_conditions(1080) == [(400, 40), (800, 40), (1080, 40), (2160, 40), (1080, 10)]
 
 
 def test_texture_is_of_the_seats_views_from_near(pair):

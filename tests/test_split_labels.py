@@ -12,7 +12,7 @@ import pytest
 
 from vvgt_cli.batches import labels as split
 from vvgt_cli.conversion.request import file_bytes
-from vvgt_cli.conversion.stages import Seats
+from vvgt_cli.conversion.stages import ViewingConditions
 from vvgt_cli.dvr import RenderSettings
 from vvgt_cli.gaussians import Gaussians, read_ply
 from vvgt_cli.runs.owners import hidden_in, owners
@@ -73,8 +73,10 @@ def test_what_others_hide_is_there_when_they_are_switched_off(vvgt, tmp_path: Pa
 
 
 def test_the_plan_of_a_part_is_of_the_gaussians_that_it_got(vvgt, tmp_path: Path, monkeypatch) -> None:
-    counts, cost = [], Seats.cost
-    monkeypatch.setattr(Seats, "cost", lambda stage, case: counts.append(case.gaussians) or cost(stage, case))
+    counts, cost = [], ViewingConditions.cost
+    monkeypatch.setattr(
+        ViewingConditions, "cost", lambda stage, case: counts.append(case.gaussians) or cost(stage, case)
+    )
     files = converted(vvgt, tmp_path, nested(cut=True), "--report", tmp_path / "r_{}.json")
     names = {1: "r_1-label-1.json", 3: "r_3-label-3.json"}
     for number, name in names.items():

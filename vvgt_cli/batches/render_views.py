@@ -15,7 +15,7 @@ import numpy as np
 from vvgt_cli.batches.manifest import Manifest, Shard
 from vvgt_cli.batches.view_files import CONTACT, POINTS, Layout, View, field_points, start_points, thumbnails
 from vvgt_cli.cameras import Camera, default_views, orbit_views
-from vvgt_cli.cameras.boxed import boxed, drawn_in_box
+from vvgt_cli.cameras.boxed import boxed, render_in_box
 from vvgt_cli.cameras.files import read_frames
 from vvgt_cli.cameras.sets import FIELD_OF_VIEW, RADIUS, SET_VIEWS, SIZE
 from vvgt_cli.errors import DataError, NothingVisible, UsageError
@@ -305,7 +305,7 @@ def _work(run: Run, request: ViewsRequest, job: _Job, views: list[View]) -> None
             scene = job.source.scene()
             stage.note = f"{job.source.name}, opacity per {job.source.unit_distance:g} ({job.source.unit_label})"
         inside = view_renderer(request.renderer, scene, settings) if job.pending else None
-        draw = None if inside is None else drawn_in_box(inside, scene.volume.axes)
+        draw = None if inside is None else render_in_box(inside, scene.volume.axes)
     if models and layout.points:
         built |= layout.models(views, *_points(run, job.field or scene, views))
     elif models:
@@ -335,7 +335,7 @@ def _in_blocks(field: Blocked, settings: RenderSettings, cameras: Sequence[Camer
         field.forget(Picture(camera, settings))
         return image
 
-    return drawn_in_box(inside, axes)
+    return render_in_box(inside, axes)
 
 
 def _points(run: Run, scene: Scene | Blocked, views: list[View]) -> tuple[np.ndarray, np.ndarray]:

@@ -38,7 +38,7 @@ def boxed(camera: Camera, axes: np.ndarray) -> tuple[Camera, bool]:
     ), True
 
 
-def drawn_in_box(draw: Callable[[Camera], np.ndarray], axes: np.ndarray) -> Callable[[Camera], np.ndarray]:
+def render_in_box(draw: Callable[[Camera], np.ndarray], axes: np.ndarray) -> Callable[[Camera], np.ndarray]:
     """What draws pictures (h, w, ...) for cameras of the unit frame, from what draws them in the box frame."""
 
     def image(camera: Camera) -> np.ndarray:

@@ -16,9 +16,9 @@ from vvgt_cli.conversion.stage import Work
 from vvgt_cli.conversion.stages import CheckViews, ClosedFormStage
 from vvgt_cli.conversion.stages.views import wide
 from vvgt_cli.errors import UsageError
-from vvgt_cli.field.case import expected_wide
 from vvgt_cli.field.field import Field, Resident
 from vvgt_cli.field.open import Wanted, automatic, beside, blocked
+from vvgt_cli.field.workload import expected_wide
 from vvgt_cli.files import check_room
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored
 from vvgt_cli.jit.ahead import CONVERT, EVALUATE, INIT, for_blocks, for_degree

@@ -15,13 +15,13 @@ from vvgt_cli.conversion.stages import (
     ClosedFormStage,
     Network,
     Refinement,
-    Seats,
     TestViews,
     TrainingViews,
+    ViewingConditions,
 )
 from vvgt_cli.conversion.stages.views import views_of
 from vvgt_cli.errors import UsageError
-from vvgt_cli.field.case import Case, for_budget, view_edge
+from vvgt_cli.field.workload import Workload, for_budget, view_edge
 from vvgt_cli.resources import free_memory
 
 DEFAULT_STEPS = 112  # of gradient descent: the knee of error against seconds (docs/plan.md)
@@ -46,7 +46,7 @@ class Plan:
         left_out: (stage, why) of what is not done.
     """
 
-    case: Case
+    case: Workload
     gaussians: int
     stages: list[Stage]
     spent: float = 0.0
@@ -136,11 +136,11 @@ class Planner:
     cuts: bool = False
     cells: bool = True
 
-    def plan(self, case: Case, spent: float, begun: bool = False) -> Plan:
+    def plan(self, case: Workload, spent: float, begun: bool = False) -> Plan:
         """Which stages fit, after ``spent`` seconds; ``begun``: the closed form is done."""
         plan = Plan(case, self.gaussians, [], spent, file_bytes(self.gaussians, self.sh_degree))
         first: list[Stage] = [ClosedFormStage()]
-        last: list[Stage] = [TestViews(self.whole), Seats()]
+        last: list[Stage] = [TestViews(self.whole), ViewingConditions()]
         left = None
         if self.limits.time_budget is not None:
             left = self.limits.time_budget - spent - plan.seconds_of([*([] if begun else first), *last])
@@ -187,7 +187,7 @@ class Planner:
         """Whether the cells may be cut for fewer Gaussians in the end."""
         return self.limits.target_psnr is not None
 
-    def _seconds(self, case: Case, steps: int, small: bool) -> float:
+    def _seconds(self, case: Workload, steps: int, small: bool) -> float:
         """Of so many steps, with their views, ``small`` ones or not, and the check views."""
         return sum(stage.cost(case).seconds for stage in self._descent(steps, small, steps))
 

@@ -14,8 +14,8 @@ from vvgt_cli.cameras.sets import SIZE
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import Gaussians, PlyOptions, write_ply
 from vvgt_cli.runs.place import AUTO, NONE, into_box, preview, upright, way_up
-from vvgt_cli.runs.record import ConversionReport, Stage
-from vvgt_cli.runs.seats import PREVIEW_VIEWS
+from vvgt_cli.runs.record import ConversionReport, StageRecord
+from vvgt_cli.runs.viewing import PREVIEW_VIEWS
 from vvgt_cli.share import encoded, format_of
 from vvgt_cli.splat.rules import INRIA, rule_of
 
@@ -50,7 +50,7 @@ class Result:
         return self.report.scores
 
     @property
-    def stages(self) -> list[Stage]:
+    def stages(self) -> list[StageRecord]:
         """What was done, in order, each with its seconds."""
         return self.report.stages
 

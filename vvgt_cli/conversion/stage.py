@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 from vvgt_cli.conversion.request import FitOptions, Limits
 from vvgt_cli.conversion.resume import Checkpoint
-from vvgt_cli.field.case import Case
+from vvgt_cli.field.workload import Workload
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.runs.record import Run
 from vvgt_cli.runs.views import Views
@@ -101,7 +101,7 @@ class Stage(ABC):
     scores: ClassVar[bool] = False
 
     @abstractmethod
-    def cost(self, case: Case) -> Cost:
+    def cost(self, case: Workload) -> Cost:
         """What it should cost."""
 
     @abstractmethod

@@ -44,7 +44,7 @@ def run(
     state = begin(gaussians, cameras, options)
     judge = Judge(state, check, record, options.judge)
     keep, course = _checkpoint(options, gaussians, (cameras, images), check, state, judge)
-    entered, order = time.perf_counter(), views_in_turn(len(cameras), options.seed)
+    entered, order = time.perf_counter(), shuffled_views(len(cameras), options.seed)
     if not record.checks:
         judge.measure(0.0)
         record.psnr_before = judge.best
@@ -143,7 +143,7 @@ def step(
     return error
 
 
-def views_in_turn(count: int, seed: int) -> Iterator[int]:
+def shuffled_views(count: int, seed: int) -> Iterator[int]:
     """All views in random order, then again in another."""
     rng = np.random.default_rng(seed)
     while True:

@@ -22,7 +22,7 @@ STEP = 1.0  # voxels
 FAR = 1e300
 
 
-def lights_of(
+def scene_light(
     lighting: Lighting,
     axes: np.ndarray,
     step: np.ndarray,

@@ -67,7 +67,7 @@ def ray_offsets(count: int) -> np.ndarray:
     return np.stack([np.tile(place, edge), np.repeat(place, edge)], axis=1)
 
 
-class Placed(Protocol):
+class BoxGeometry(Protocol):
     """A box: half extents and voxel edges (3,) float64 in the unit frame, (x, y, z), as `Scene` has them."""
 
     @property
@@ -77,13 +77,13 @@ class Placed(Protocol):
 
 
 class Box(NamedTuple):
-    """A volume's half extents and voxel edges (3,), as `Placed` has them."""
+    """A volume's half extents and voxel edges (3,), as `BoxGeometry` has them."""
 
     half: np.ndarray
     step: np.ndarray
 
 
-def camera_arrays(scene: Placed, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def camera_arrays(scene: BoxGeometry, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Eye (3,) in voxel coordinates, basis (3, 3) in voxels per unit length, lens (1/fx, 1/fy, cx, cy)."""
     eye = (camera.position + scene.half) / scene.step - 0.5
     basis = camera.rotation / scene.step[None, :]
@@ -130,7 +130,7 @@ def tiers(settings: RenderSettings, image: np.ndarray, blocks: Blocks | None = N
     yield more
 
 
-def for_thin(settings: RenderSettings, box: Placed, camera: Camera) -> RenderSettings:
+def for_thin(settings: RenderSettings, box: BoxGeometry, camera: Camera) -> RenderSettings:
     """Many rays for every pixel, where all of the box may lie between the middles of two rows or columns of them."""
     if 2 * box.half.min() * camera.fx >= np.linalg.norm(camera.position):
         return settings

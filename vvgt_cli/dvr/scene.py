@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vvgt_cli.dvr.layout import Light, Optics, Texels, Voxels, pairs_fit
-from vvgt_cli.dvr.light import lights_of, linear_tables, mean_extinction
+from vvgt_cli.dvr.light import linear_tables, mean_extinction, scene_light
 from vvgt_cli.transfer.lighting import Lighting
 from vvgt_cli.transfer.tables import OpticalTables, build_tables
 from vvgt_cli.transfer.types import Named, TransferFunctionLike
@@ -16,7 +16,7 @@ from vvgt_cli.volume import Volume
 
 
 @dataclass(frozen=True)
-class Layout:
+class PreparedVolume:
     """What of a scene does not depend on the function.
 
     Attributes:
@@ -30,7 +30,7 @@ class Layout:
     ranges: np.ndarray
 
     @classmethod
-    def of(cls, volume: Volume) -> Layout:
+    def of(cls, volume: Volume) -> PreparedVolume:
         """Lay ``volume`` out."""
         from vvgt_cli.dvr import bricks
 
@@ -95,14 +95,14 @@ class Scene:
         unit_distance: float,
         value_range: tuple[float, float] | None = None,
         bins: int | None = None,
-        layout: Layout | None = None,
+        layout: PreparedVolume | None = None,
         lighting: Lighting | None = None,
     ) -> Scene:
         """Prepare ``volume`` under ``tf``; ``value_range`` (data values) and ``layout`` are taken as they are."""
         from vvgt_cli.dvr import bricks
 
         frame = volume.unit_frame()
-        layout = layout or Layout.of(volume)
+        layout = layout or PreparedVolume.of(volume)
         values, slope, intercept, ranges = layout.values, layout.slope, layout.intercept, layout.ranges
         if value_range is None:
             ends = [
@@ -142,7 +142,7 @@ class Scene:
 
     def lit(self, lighting: Lighting) -> Scene:
         """The same scene under light; shadows and occlusion are marched here."""
-        light = lights_of(
+        light = scene_light(
             lighting, self.volume.axes, self.step, self.values.shape, lambda cell: mean_extinction(self, cell)
         )
         return replace(self, lighting=lighting, light=light)

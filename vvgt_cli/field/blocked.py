@@ -14,7 +14,6 @@ from vvgt_cli.cameras.blocks import Blocks
 from vvgt_cli.dvr.layout import Light
 from vvgt_cli.dvr.render import Box as Frame
 from vvgt_cli.dvr.render import Rays, RenderSettings, for_thin, tiers
-from vvgt_cli.field.case import PROGRAM, VIEW, Case, for_budget, pace, view_edge
 from vvgt_cli.field.cells import NORMALS, CellBlocks, ExtinctionBlocks, PointBlocks, RayBlocks, read_rows
 from vvgt_cli.field.field import Picture
 from vvgt_cli.field.grid import CellGrid
@@ -22,6 +21,7 @@ from vvgt_cli.field.parts import CELLS, Parts
 from vvgt_cli.field.rays import Bundle, RayFile, composed
 from vvgt_cli.field.runners import Runner, Task
 from vvgt_cli.field.settings import cell_grid
+from vvgt_cli.field.workload import PROGRAM, VIEW, Workload, for_budget, pace, view_edge
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.runs.digests import digest
@@ -118,14 +118,14 @@ class Blocked:
         lighting, volume = self.source.lighting, self.source.volume
         if lighting is None:
             return None
-        from vvgt_cli.dvr.light import lights_of
+        from vvgt_cli.dvr.light import scene_light
 
         def extinction(cell: int) -> np.ndarray:
             task = ExtinctionBlocks(self.reader, self._grid(np.zeros(3, np.int64), cell), self.do.parts, cell)
             self.do(task, "light")
             return task.gathered()
 
-        return lights_of(lighting, volume.axes, self.frame.step, volume.data.shape, extinction)
+        return scene_light(lighting, volume.axes, self.frame.step, volume.data.shape, extinction)
 
     def _grid(self, exponent: np.ndarray, least: int = 1) -> CellGrid:
         """Cells of 2^``exponent`` voxels, in blocks of whole cubes of ``least`` voxels."""
@@ -136,12 +136,12 @@ class Blocked:
         march = widening(dims, exponent, step, default_views("train", size=MARCH_SIZE))
         return cell_grid(self.source.volume, exponent, self.edge, march, least)
 
-    def case(self, size: int, gaussians: int) -> Case:
+    def case(self, size: int, gaussians: int) -> Workload:
         """See `Field`: a view's time follows from the steps of its rays, nothing is timed."""
         x, y, z = (float(edge) for edge in self.frame.step)
         share = (self.visible / self.source.volume.data.size) ** (1 / 3)
         steps = view_edge(size, small=False) ** 2 * WAY / min(x, y, z) * max(share, 0.1)
-        case = Case(
+        case = Workload(
             gaussians=gaussians, cells=0.0, voxels=self.visible, size=size, view=VIEW * A_STEP * steps, pace=pace(),
             there=PROGRAM + self.edge**3 * self.reader.voxel_bytes, visible=self.visible, step=(x, y, z),
         )  # fmt: skip

@@ -10,7 +10,7 @@ import numpy as np
 
 from vvgt_cli.cameras import Camera
 from vvgt_cli.cameras.blocks import Blocks
-from vvgt_cli.field.case import Case, measure
+from vvgt_cli.field.workload import Workload, measure
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.runs.digests import volume_digest
 from vvgt_cli.runs.source import Source
@@ -38,7 +38,7 @@ class Field(Protocol):
     @property
     def source(self) -> Source: ...
 
-    def case(self, size: int, gaussians: int) -> Case:
+    def case(self, size: int, gaussians: int) -> Workload:
         """What the costs of stages follow from, for images of ``size`` px and a budget of Gaussians."""
 
     def start(self, options: VbmOptions, progress: Callable[[int, int], None] | None = None) -> Start:
@@ -72,7 +72,7 @@ class Resident:
     source: Source
     scene: Scene
 
-    def case(self, size: int, gaussians: int) -> Case:
+    def case(self, size: int, gaussians: int) -> Workload:
         """See `Field`."""
         return measure(self.scene, size, gaussians)
 

@@ -29,7 +29,7 @@ from vvgt_cli.runs.source import Opened, Source, SourceRequest, describe_source,
 from vvgt_cli.version import VERSION
 from vvgt_cli.volume import ReadOptions, Volume
 from vvgt_cli.volume.readers import SCHEMES
-from vvgt_cli.volume.stored import Stored, lies_in_file
+from vvgt_cli.volume.stored import Stored, is_file_backed
 
 if TYPE_CHECKING:
     from vvgt_cli.field.cells import Reader
@@ -258,7 +258,7 @@ def beyond_memory(request: SourceRequest) -> bool:
         volume = open_volume(path, replace(request.read, stored=True, packed=True))
     except SeveralComponents:  # colours, or to be chosen: said where it is read
         return False
-    if not lies_in_file(volume):
+    if not is_file_backed(volume):
         return False
     own = volume.data.dtype.name not in ("uint8", "uint16", "float32")
     held = volume.data.nbytes if isinstance(volume.data, Stored) else 0

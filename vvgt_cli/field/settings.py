@@ -104,12 +104,12 @@ def cell_grid(volume: Volume, exponent: np.ndarray, edge: int, march: int, least
 
     Blocks are of whole tiles, pieces of rays, and cubes of ``least`` voxels: all of powers of two.
     """
-    from vvgt_cli.vbm.inset import averaged_down
+    from vvgt_cli.vbm.inset import field_coarsening
     from vvgt_cli.vbm.moments import blocks, points_of
 
     frame = volume.unit_frame()
     step = np.array(frame.step)
-    field = averaged_down(2.0**exponent * step, np.array(frame.half), MAX_FIELD)
+    field = field_coarsening(2.0**exponent * step, np.array(frame.half), MAX_FIELD)
     bits = tile_bits(exponent, max(march, field, int(blocks(exponent)[1].max()).bit_length() - 1))
     tile = np.round(2.0 ** (exponent + bits)).astype(np.int64)
     whole = np.maximum(tile, max(piece_edge(volume.dims), least))

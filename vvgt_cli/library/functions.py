@@ -154,7 +154,7 @@ def render_views(
     """
     import numpy as np
 
-    from vvgt_cli.cameras.boxed import drawn_in_box
+    from vvgt_cli.cameras.boxed import render_in_box
     from vvgt_cli.dvr import RenderSettings, render_view
     from vvgt_cli.errors import UsageError
     from vvgt_cli.runs.source import load
@@ -164,7 +164,7 @@ def render_views(
         raise UsageError(f"{len(views)} cameras of several sizes; expected one or more of one size")
     source = load(source_of(volume, tf, tf_range, opacity_unit_distance, reading, light, labels, layers))
     scene = source.scene()
-    draw = drawn_in_box(lambda view: render_view(scene, view, RenderSettings(step=step)), source.volume.axes)
+    draw = render_in_box(lambda view: render_view(scene, view, RenderSettings(step=step)), source.volume.axes)
     return views, np.stack([draw(view) for view in views])
 
 

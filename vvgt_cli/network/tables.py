@@ -16,7 +16,7 @@ OFFSETS = np.array([(i, j, k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (
 
 
 @dataclass(frozen=True)
-class Stage:
+class StagePoints:
     """Points of one stage, in Z-order: at stage 0 Gaussians, later cells.
 
     Attributes:
@@ -76,7 +76,7 @@ def canonical_order(rows: np.ndarray) -> np.ndarray:
     return order
 
 
-def pool(stage: Stage) -> tuple[Stage, np.ndarray]:
+def pool(stage: StagePoints) -> tuple[StagePoints, np.ndarray]:
     """The next stage and the parent (n,) of each point: the finest grid that has no more than half the points.
 
     PTV3 halves the resolution each time; the cells of the closed form have many sizes, and so may need more.
@@ -97,10 +97,10 @@ def pool(stage: Stage) -> tuple[Stage, np.ndarray]:
     counts = np.add.reduceat(stage.counts, first)
     sums = np.add.reduceat(stage.positions.astype(np.float64) * stage.counts[:, None], first, axis=0)
     positions = (sums / counts[:, None]).astype(np.float32)
-    return Stage(stage.cells[first] >> stage.bits - bits, bits, positions, counts), parents
+    return StagePoints(stage.cells[first] >> stage.bits - bits, bits, positions, counts), parents
 
 
-def neighbours(stage: Stage) -> np.ndarray:
+def neighbours(stage: StagePoints) -> np.ndarray:
     """(n, 27) int64: which point is in each of the cells around a point's own; n where none is."""
     count, side = len(stage.cells), 1 << stage.bits
     codes = interleave(stage.cells)  # ascending and distinct
@@ -147,7 +147,7 @@ def build(means: np.ndarray, config: GeometryConfig) -> dict[str, np.ndarray]:
         By name: ``positions`` (n, 3) float32 of the epipolar stage; ``parents_I`` (n_I,) into stage I + 1;
         ``neighbours_I`` (n_I, 27) for I from 1; ``windows_I_C`` and ``slots_I_C`` for each curve C that stage I uses.
     """
-    stage = Stage(quantise(means), BITS, means, np.ones(len(means), np.int64))
+    stage = StagePoints(quantise(means), BITS, means, np.ones(len(means), np.int64))
     wanted: list[list[str]] = [[] for _ in range(STAGES)]
     for number, curves in zip(stages_of_blocks(), block_curves(config), strict=True):
         wanted[number] += [curve for curve in curves if curve not in wanted[number]]

@@ -61,7 +61,7 @@ def psnr(run: Run) -> float | None:
 
 
 def worst_seat(run: Run) -> float | None:
-    """PSNR where the run looks least like the volume (`vvgt_cli.runs.seats`), dB; None without."""
+    """PSNR where the run looks least like the volume (`vvgt_cli.runs.viewing`), dB; None without."""
     return min((seat["psnr"] for seat in run.get("seats") or ()), default=None)
 
 

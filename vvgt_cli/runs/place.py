@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vvgt_cli.cameras import Camera
-from vvgt_cli.cameras.boxed import drawn_in_box
+from vvgt_cli.cameras.boxed import render_in_box
 from vvgt_cli.gaussians import Gaussians, PlyOptions
 from vvgt_cli.gaussians.frames import transform, upright_matrix
 from vvgt_cli.splat.rules import INRIA, Rule
@@ -93,6 +93,6 @@ def preview(
     from vvgt_cli.images import side_by_side
     from vvgt_cli.splat import render
 
-    reference = drawn_in_box(lambda camera: render_view(scene, camera, RenderSettings()), axes)
-    ours = drawn_in_box(lambda camera: render(gaussians, camera, rule), axes)
+    reference = render_in_box(lambda camera: render_view(scene, camera, RenderSettings()), axes)
+    ours = render_in_box(lambda camera: render(gaussians, camera, rule), axes)
     return np.concatenate([side_by_side(reference(camera), ours(camera)) for camera in cameras])

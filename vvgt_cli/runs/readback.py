@@ -13,7 +13,7 @@ from vvgt_cli.gaussians import Gaussians, PlyOptions, in_unit_frame
 from vvgt_cli.runs.place import into_box
 from vvgt_cli.runs.record import Run
 from vvgt_cli.runs.score import score_test_views
-from vvgt_cli.runs.seats import PREVIEW_VIEWS
+from vvgt_cli.runs.viewing import PREVIEW_VIEWS
 from vvgt_cli.share import format_of, read_splats
 from vvgt_cli.splat.rules import INRIA, rule_of
 

@@ -20,7 +20,7 @@ SCHEMA = 1  # of the JSON documents; raised when a field changes its meaning
 
 
 @dataclass
-class Stage:
+class StageRecord:
     """One stage of a run.
 
     Attributes:
@@ -58,7 +58,7 @@ class ConversionReport:
         stages: in the order they ran.
         gaussians, bytes: of the file written.
         scores: on the test views, None for `init`.
-        seats: `convert`'s scores by every rule at the size made for and above (`vvgt_cli.runs.seats`), worst first.
+        seats: `convert`'s scores by every rule at the size made for and above (`vvgt_cli.runs.viewing`), worst first.
         plan: estimates of `convert` (`vvgt_cli.conversion.plan.Plan`): stages, seconds, bytes, memory.
         left_out: (stage, why) of what was not done.
         refinement: what gradient descent did (`vvgt_cli.descent.OptimizeRecord`), None without it.
@@ -69,7 +69,7 @@ class ConversionReport:
     volume: dict[str, Any] = field(default_factory=dict)
     transfer_function: dict[str, Any] = field(default_factory=dict)
     options: dict[str, Any] = field(default_factory=dict)
-    stages: list[Stage] = field(default_factory=list)
+    stages: list[StageRecord] = field(default_factory=list)
     gaussians: int = 0
     bytes: int = 0
     scores: dict[str, Any] | None = None
@@ -161,9 +161,9 @@ class Run:
     start: float = field(default_factory=time.perf_counter)
 
     @contextmanager
-    def stage(self, name: str) -> Iterator[Stage]:
+    def stage(self, name: str) -> Iterator[StageRecord]:
         """Time a block; the block sets psnr, kept and note of the stage that it is given."""
-        stage = Stage(name)
+        stage = StageRecord(name)
         begin = time.perf_counter()
         yield stage
         stage.seconds = time.perf_counter() - begin

@@ -19,7 +19,7 @@ from vvgt_cli.volume import ReadOptions, Statistics, Volume
 if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
     from vvgt_cli.dvr.layers import Layer
-    from vvgt_cli.dvr.scene import Layout
+    from vvgt_cli.dvr.scene import PreparedVolume
 
 OPTICS = 12  # hexadecimal digits of `Source.optics`
 
@@ -37,18 +37,18 @@ class Opened:
 
     volume: Volume
     statistics: Statistics
-    layout: Layout | None = None
+    layout: PreparedVolume | None = None
     content: Content | None = None
 
     @classmethod
     def of(cls, content: Volume | Content) -> Opened:
         """Count and lay out."""
-        from vvgt_cli.dvr.scene import Layout
+        from vvgt_cli.dvr.scene import PreparedVolume
         from vvgt_cli.volume import statistics
 
         known = content if isinstance(content, Content) else Content((content,))
         volume = known.volumes[0]
-        return cls(volume, statistics(volume), Layout.of(volume) if known.one_field else None, known)
+        return cls(volume, statistics(volume), PreparedVolume.of(volume) if known.one_field else None, known)
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ class Source:
     unit_distance: float
     unit_label: str
     lighting: Lighting | None = None
-    layout: Layout | None = None
+    layout: PreparedVolume | None = None
     layers: tuple[Layer, ...] = ()
 
     @property

@@ -102,13 +102,13 @@ def pyramid(parts: Parts, plan: Plan) -> tuple[Forest, Opaque]:
     from vvgt_cli.cameras import default_views
     from vvgt_cli.scale.forest import Forest, gather
     from vvgt_cli.vbm.closed_form import MARCH_SIZE
-    from vvgt_cli.vbm.visibility import seen_through
+    from vvgt_cli.vbm.visibility import march_views
 
     grid, coarse = plan.grid, gather(parts, plan.grid)
     wide = grid.cell * 2.0**grid.march
     box = Box(np.array(grid.half), np.array(grid.step))
     extinction = (coarse.mass / (wide * box.step).prod()).astype(np.float32)
-    seen = seen_through(extinction, wide, box, default_views("train", size=MARCH_SIZE))
+    seen = march_views(extinction, wide, box, default_views("train", size=MARCH_SIZE))
     forest = Forest(parts, grid, seen, coarse, parts.folder / SCRATCH)
     if forest.top is None:
         raise NothingVisible(plan.volume["name"], plan.function["name"])

@@ -11,7 +11,7 @@ from vvgt_cli.cameras.blocks import spread_blocks
 from vvgt_cli.field.field import Picture
 from vvgt_cli.field.parts import CELLS, Parts
 from vvgt_cli.field.rays import RayFile, composed
-from vvgt_cli.runs.seats import PREVIEW_VIEWS
+from vvgt_cli.runs.viewing import PREVIEW_VIEWS
 from vvgt_cli.splat.rules import INRIA, Rule
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.share.splats import Splats, near_each_other
+from vvgt_cli.share.splats import Splats, morton_order
 from vvgt_cli.volume.libraries import library_errors, need
 
 EXTRA = "share"
@@ -33,7 +33,7 @@ def gsply(source: str) -> Any:
 def compressed_ply(splats: Splats, name: str) -> bytes:
     """A `.compressed.ply`: 16 bytes a Gaussian and 72 for 256 of them, which lie near each other."""
     library = gsply(name)
-    s = splats.take(near_each_other(splats.means))
+    s = splats.take(morton_order(splats.means))
     rest = s.f_rest if s.f_rest.shape[1] else None
     content: bytes = library.compress_to_bytes(s.means, s.log_scales, s.quaternions, s.logits, s.f_dc, rest)
     said = "".join(f"comment {line}\n" for line in s.comments).encode()

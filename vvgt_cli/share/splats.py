@@ -121,7 +121,7 @@ def logits_of(opacities: np.ndarray) -> np.ndarray:
     return result
 
 
-def near_each_other(means: np.ndarray) -> np.ndarray:
+def morton_order(means: np.ndarray) -> np.ndarray:
     """An order (K,) along Morton's curve: neighbours in the list are neighbours in space."""
     low, high = means.min(axis=0), means.max(axis=0)
     cells = ((means - low) / np.maximum(high - low, 1e-30) * 1023).astype(np.uint32)

@@ -40,7 +40,7 @@ from vvgt_cli.splat.buffer import (
     tile_jit,
 )
 from vvgt_cli.splat.constants import TILE
-from vvgt_cli.splat.kernel import rotation_column, to_camera, turned, unit_quaternion
+from vvgt_cli.splat.kernel import rotate, rotation_column, to_camera, unit_quaternion
 from vvgt_cli.splat.lanes import (
     CONIC,
     LANES,
@@ -265,7 +265,7 @@ def _column(
     """Of axis i: the gradient of its log-scale, of its column of the rotation (3), and its part of dL/dJ (4)."""
     jx, jy, jxz, jyz, h00, h01, h11 = slopes
     w, a, b, c = turn
-    v0, v1, v2 = turned(rot, *rotation_column(w, a, b, c, i))
+    v0, v1, v2 = rotate(rot, *rotation_column(w, a, b, c, i))
     s = np.exp(np.float64(log_scale))
     n0, n1 = (jx * v0 + jxz * v2) * s, (jy * v1 + jyz * v2) * s
     e0, e1 = 2.0 * (h00 * n0 + h01 * n1), 2.0 * (h01 * n0 + h11 * n1)

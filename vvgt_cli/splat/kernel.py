@@ -63,7 +63,7 @@ def rotation_column(w: float, a: float, b: float, c: float, axis: int) -> tuple[
 
 
 @_jit
-def turned(rot: np.ndarray, r0: float, r1: float, r2: float) -> tuple[float, float, float]:
+def rotate(rot: np.ndarray, r0: float, r1: float, r2: float) -> tuple[float, float, float]:
     """``rot`` (3, 3) times a vector."""
     return (
         rot[0, 0] * r0 + rot[0, 1] * r1 + rot[0, 2] * r2,

@@ -17,19 +17,19 @@ from vvgt_cli.progress import Console
 from vvgt_cli.runs.gaussian_files import STDIN, file_rule, open_gaussians
 from vvgt_cli.runs.outputs import Output, check_outputs
 from vvgt_cli.runs.place import into_box, preview, upright
-from vvgt_cli.runs.record import ConversionReport, Run, Stage, document
+from vvgt_cli.runs.record import ConversionReport, Run, StageRecord, document
 from vvgt_cli.runs.score import psnr_note, score_test_views
-from vvgt_cli.runs.seats import (
+from vvgt_cli.runs.source import Source, SourceRequest, describe_source, load, tf_record, volume_record
+from vvgt_cli.runs.viewing import (
     CLOSE,
-    Seat,
-    score_seats,
+    ViewingCondition,
+    condition_views,
+    score_conditions,
     score_texture,
-    seat_views,
-    seats_of,
     texture_note,
+    viewing_conditions,
     zoomed,
 )
-from vvgt_cli.runs.source import Source, SourceRequest, describe_source, load, tf_record, volume_record
 from vvgt_cli.splat.rules import Rule
 from vvgt_cli.transfer.lighting import LightOptions
 
@@ -84,7 +84,7 @@ class Evaluation:
     scores: dict[str, Any] = field(default_factory=dict)
     seats: list[dict[str, Any]] = field(default_factory=list)
     texture: dict[str, Any] | None = None
-    stages: list[Stage] = field(default_factory=list)
+    stages: list[StageRecord] = field(default_factory=list)
     seconds: float = 0.0
 
     def to_json(self) -> str:
@@ -102,7 +102,7 @@ class Evaluation:
             lines.append(f"texture on smooth areas, near: {texture_note(Texture(**self.texture))}")
         if self.seats:
             lines.append(f"\n{'seat':<32}{'psnr':>10}")
-        lines += [f"{Seat(**seat).name():<32}{seat['psnr']:>10.2f}" for seat in self.seats]
+        lines += [f"{ViewingCondition(**seat).name():<32}{seat['psnr']:>10.2f}" for seat in self.seats]
         return "\n".join(lines) + "\n"
 
 
@@ -189,7 +189,9 @@ def _look_around(run: Run, evaluation: Evaluation, scene: Scene, gaussians: Gaus
     """Seats, and texture from near."""
     size = evaluation.size
     with run.stage("seats") as stage:
-        seats = score_seats(gaussians, seat_views(scene, seats_of(size), progress=run.console.bar("seats")))
+        seats = score_conditions(
+            gaussians, condition_views(scene, viewing_conditions(size), progress=run.console.bar("seats"))
+        )
         evaluation.seats = [asdict(seat) for seat in seats]
         stage.note = f"worst: {seats[0].name()}, {seats[0].psnr:.2f} dB"
     with run.stage("texture") as stage:

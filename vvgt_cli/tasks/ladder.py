@@ -14,22 +14,22 @@ import numpy as np
 
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.cameras.blocks import Blocks, spread_blocks
-from vvgt_cli.cameras.boxed import drawn_in_box
+from vvgt_cli.cameras.boxed import render_in_box
 from vvgt_cli.conversion.convert import convert
 from vvgt_cli.conversion.plan import DEFAULT_STEPS
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.conversion.stages.refinement import refine
 from vvgt_cli.conversion.stages.views import TrainingViews, views_of
 from vvgt_cli.descent import OptimizeOptions
-from vvgt_cli.field.case import view_edge
+from vvgt_cli.field.workload import view_edge
 from vvgt_cli.gaussians import Gaussians, as_stored, read_ply, write_ply
 from vvgt_cli.gaussians.frames import transform
 from vvgt_cli.progress import Console
 from vvgt_cli.report.runs import short
 from vvgt_cli.runs.record import ConversionReport, Run
 from vvgt_cli.runs.score import WHOLE, score_seen
-from vvgt_cli.runs.seats import SIDE, SeatView, from_above, score_seats, seat_views
 from vvgt_cli.runs.source import SourceRequest, load
+from vvgt_cli.runs.viewing import SIDE, ConditionView, condition_views, from_above, score_conditions
 from vvgt_cli.runs.views import Views, judging_views
 from vvgt_cli.splat.rules import INRIA
 
@@ -123,7 +123,7 @@ class Reference:
     rays: int
     axes: np.ndarray
     shown: list[np.ndarray]
-    seats: list[SeatView]
+    seats: list[ConditionView]
 
     @classmethod
     def render(cls, scene: Scene, size: int, console: Console) -> Reference:
@@ -138,7 +138,7 @@ class Reference:
             if bar:
                 bar(i + 1, len(cameras))
         shown = upright(images, cameras, axes, lambda camera: render_view(scene, camera, REFERENCE))
-        seats = list(seat_views(scene, from_above(size), REFERENCE, views=SIDE))
+        seats = list(condition_views(scene, from_above(size), REFERENCE, views=SIDE))
         rays = max(rays for _, rays in REFERENCE.tiers)
         return cls(cameras, blocks, images, REFERENCE.step, rays, axes, shown, seats)
 
@@ -169,7 +169,7 @@ def upright(
     """Images of the box frame for people: those of `PICTURED` drawn anew in the unit frame, where that is another."""
     if np.array_equal(axes, np.eye(3)):
         return list(images)
-    see = drawn_in_box(draw, axes)
+    see = render_in_box(draw, axes)
     return [see(cameras[n]) if n in PICTURED else image for n, image in enumerate(images)]
 
 
@@ -189,7 +189,7 @@ def run_rungs(
         if report.refinement and report.refinement["reason"] == "interrupted":
             raise KeyboardInterrupt
         scores, images = reference.score(gaussians)
-        seats = score_seats(gaussians, reference.seats)
+        seats = score_conditions(gaussians, reference.seats)
         report.scores, report.seats = asdict(scores), [asdict(seat) for seat in seats]
         run = {"name": rung.name, "label": rung.label, "kind": rung.kind, "views": _views_of(report, rung.fit)}
         run |= asdict(report)

@@ -79,9 +79,9 @@ def solve_colors(
     if gaussians.harmonics is None:
         found = np.clip(_descend(_Single(gaussians, projections), views, rounds, progress), 0, BRIGHTEST)
         return replace(gaussians, colors=found)
-    from vvgt_cli.vbm.view_fit import PerView
+    from vvgt_cli.vbm.view_fit import ViewDependentSystem
 
-    system = PerView(gaussians, [camera.position for camera in cameras], projections, PRIOR)
+    system = ViewDependentSystem(gaussians, [camera.position for camera in cameras], projections, PRIOR)
     return system.gaussians(_descend(system, views, rounds, progress), BRIGHTEST)
 
 

@@ -14,7 +14,7 @@ from vvgt_cli.dvr.vectors import add, lane, texel, zeros4
 from vvgt_cli.dvr.vectors import row as row_of
 from vvgt_cli.jit.decorators import inlined, kernel
 from vvgt_cli.vbm.columns import BLUE, GREEN, MASS, RED
-from vvgt_cli.vbm.quadrature import Between, between, deposit, moved
+from vvgt_cli.vbm.quadrature import Between, between, deposit, shift_moments
 
 _jit = inlined(fastmath=FLAGS, error_model="numpy")
 
@@ -99,4 +99,4 @@ def grid_moments(
                 x = (begin[0] + x0 + cx * cell[0]) * step[0] - half[0]
                 y = (begin[1] + y0 + cy * cell[1]) * step[1] - half[1]
                 z = (begin[2] + z0 + cz * cell[2]) * step[2] - half[2]
-                moved(out[b, cz, cy, cx], x, y, z, box)
+                shift_moments(out[b, cz, cy, cx], x, y, z, box)

@@ -56,7 +56,7 @@ def opaque_field(cells: Cells, step: np.ndarray, half: np.ndarray, labels: bool 
         return nowhere(cells.edge, half)
     if labels:
         depth *= OPAQUE_DEPTH / LABEL_DEPTH
-    wider = averaged_down(cells.edge, half, MAX_FIELD)
+    wider = field_coarsening(cells.edge, half, MAX_FIELD)
     edge = cells.edge * 2.0**wider
     shape = np.ceil(2 * half / edge - 1e-6).astype(np.int64)
     field = summed(cells.index >> wider, np.minimum(depth, 1) / 8.0**wider, shape).astype(np.float32)
@@ -75,7 +75,7 @@ def opaque_depth(mass: np.ndarray, edge: np.ndarray, step: np.ndarray) -> np.nda
     return result
 
 
-def averaged_down(edge: np.ndarray, half: np.ndarray, most: int) -> int:
+def field_coarsening(edge: np.ndarray, half: np.ndarray, most: int) -> int:
     """By how many powers of two the field's cells are wider than ``edge`` (3,), for no more than ``most`` of them."""
     wider = 0
     while math.prod(np.ceil(2 * half / (edge * 2.0**wider) - 1e-6)) > most:

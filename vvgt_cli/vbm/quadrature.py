@@ -146,7 +146,7 @@ def _gather(
 
 
 @_jit
-def moved(row: np.ndarray, x: float, y: float, z: float, d: tuple[float, float, float]) -> None:
+def shift_moments(row: np.ndarray, x: float, y: float, z: float, d: tuple[float, float, float]) -> None:
     """Moments about a cell's corner (x, y, z) -> about the origin; a point's own box ``d`` has variance d^2 / 12."""
     mass, first_x, first_y, first_z = row[MASS], row[X], row[Y], row[Z]
     row[XX] += mass * (x * x + d[0] * d[0] / 12) + 2 * x * first_x
@@ -214,7 +214,7 @@ def block_moments(
                 x = (begin[0] + x0 + cx * cell[0]) * step[0] - half[0]
                 y = (begin[1] + y0 + cy * cell[1]) * step[1] - half[1]
                 z = (begin[2] + z0 + cz * cell[2]) * step[2] - half[2]
-                moved(out[b, cz, cy, cx], x, y, z, box)
+                shift_moments(out[b, cz, cy, cx], x, y, z, box)
 
 
 @kernel("f8:5 i8:1 i8:1 f8:2 i4:2", parallel=True)

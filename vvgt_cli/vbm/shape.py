@@ -75,7 +75,7 @@ def cell_gaussians(leaves: Leaves, voxel: float, pixel: float, opaque: Opaque, s
         mean = mean + inset(opaque, mean, spread, axes, solid[:, 0] * reach, style.dilation * pixel**2, 6 * pixel)
         mean = np.clip(mean, -opaque.half, opaque.half)  # where the box cuts a body
     opacity = peak_opacity(mass, spread, pixel)
-    return make_gaussians(mean, spread, axes, opacity, seen_color(moments))
+    return make_gaussians(mean, spread, axes, opacity, visible_color(moments))
 
 
 def widened(gaussians: Gaussians, factor: float, pixel: float) -> Gaussians:
@@ -91,7 +91,7 @@ def widened(gaussians: Gaussians, factor: float, pixel: float) -> Gaussians:
     return replace(gaussians, log_scales=np.log(wider), opacity_logits=np.log(opacity / (1 - opacity)))
 
 
-def seen_color(moments: np.ndarray) -> np.ndarray:
+def visible_color(moments: np.ndarray) -> np.ndarray:
     """(n, 3) mean colour as the views see it; of all the extinction where they see none."""
     mass, seen = moments[:, [MASS]], moments[:, [SEEN]]  # (n, 1)
     hidden = seen <= 1e-12 * mass

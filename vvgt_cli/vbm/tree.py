@@ -241,7 +241,7 @@ def _children_below(leaves: Leaves, scene: Scene, seen: Visibility) -> tuple[np.
         index = 2 * leaves.index[chosen][:, None, :] + CHILDREN  # (n, 8, 3)
         through = seen.at(index.reshape(-1, 3), edge / 2 / step).reshape(-1, 8, 2)
         keep = (moments[..., MASS] > 0) & (through[..., 1] > HIDDEN)
-        rows = with_seen(moments[keep], through[keep, 0])
+        rows = with_visible(moments[keep], through[keep, 0])
         owners.append(np.repeat(chosen, keep.sum(axis=1)))
         found.append(
             Leaves(rows, index[keep], np.broadcast_to(edge / 2, (len(rows), 3)), np.full(len(rows), -1, np.int64))
@@ -253,6 +253,6 @@ def _children_below(leaves: Leaves, scene: Scene, seen: Visibility) -> tuple[np.
     return owner[order], together.take(order)
 
 
-def with_seen(moments: np.ndarray, mean: np.ndarray) -> np.ndarray:
+def with_visible(moments: np.ndarray, mean: np.ndarray) -> np.ndarray:
     """Moments (n, 13) and mean transmittance (n,) -> (n, 17) with the seen mass and colour."""
     return np.concatenate([moments, moments[:, [MASS, RED, GREEN, BLUE]] * mean[:, None]], axis=1)

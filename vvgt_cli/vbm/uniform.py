@@ -7,7 +7,7 @@ import numpy as np
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.vbm.columns import FIRST, MASS
 from vvgt_cli.vbm.opacity import peak_opacity
-from vvgt_cli.vbm.shape import make_gaussians, seen_color
+from vvgt_cli.vbm.shape import make_gaussians, visible_color
 from vvgt_cli.vbm.tree import Tree
 
 
@@ -29,4 +29,4 @@ def uniform_gaussians(tree: Tree, budget: int, pixel: float, seed: int) -> Gauss
     variances = np.full((len(chosen), 3), sigma**2)
     mass = moments[:, MASS] * len(base) / max(len(chosen), 1)
     axes = np.broadcast_to(np.eye(3), (len(chosen), 3, 3))
-    return make_gaussians(points, variances, axes, peak_opacity(mass, variances, pixel), seen_color(moments))
+    return make_gaussians(points, variances, axes, peak_opacity(mass, variances, pixel), visible_color(moments))

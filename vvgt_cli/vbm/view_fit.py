@@ -24,7 +24,7 @@ SHARE = 0.001
 CHUNK = 1 << 14  # Gaussians whose matrices are inverted at once
 
 
-class PerView:
+class ViewDependentSystem:
     """A `vvgt_cli.vbm.fit.System` with unknowns (K, 1 + M, 3): colours, then harmonics."""
 
     def __init__(

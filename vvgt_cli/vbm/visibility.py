@@ -11,7 +11,7 @@ import numpy as np
 
 from vvgt_cli.cameras import Camera
 from vvgt_cli.dvr.kernel import FLAGS, absorbed
-from vvgt_cli.dvr.render import Placed, camera_arrays
+from vvgt_cli.dvr.render import BoxGeometry, camera_arrays
 from vvgt_cli.jit.decorators import inlined, kernel
 from vvgt_cli.vbm.columns import MASS
 from vvgt_cli.vbm.moments import Cells
@@ -151,7 +151,7 @@ def _rays_a_cell(edge: np.ndarray, cameras: Sequence[Camera]) -> float:
     )
 
 
-def _mean_extinction(cells: Cells, scene: Placed, wider: int) -> np.ndarray:
+def _mean_extinction(cells: Cells, scene: BoxGeometry, wider: int) -> np.ndarray:
     """(nz, ny, nx) float32 mean extinction of cells ``2^wider`` times as wide as ``cells`` along each axis."""
     edge = 2.0 ** (cells.exponent + wider)
     shape = np.ceil(voxels_of(scene) / edge).astype(np.int64)
@@ -160,7 +160,7 @@ def _mean_extinction(cells: Cells, scene: Placed, wider: int) -> np.ndarray:
     return result
 
 
-def voxels_of(box: Placed) -> np.ndarray:
+def voxels_of(box: BoxGeometry) -> np.ndarray:
     """Voxels (3,) along x, y, z of a box."""
     result: np.ndarray = np.round(2 * np.asarray(box.half) / np.asarray(box.step))
     return result
@@ -174,7 +174,7 @@ def summed(index: np.ndarray, values: np.ndarray, shape: np.ndarray) -> np.ndarr
 
 
 def visibility(
-    scene: Placed, cells: Cells, cameras: Sequence[Camera], progress: Callable[[float], None] | None = None
+    scene: BoxGeometry, cells: Cells, cameras: Sequence[Camera], progress: Callable[[float], None] | None = None
 ) -> Visibility:
     """March every camera (square images of one size) through the mean extinction of cells: what is seen of each.
 
@@ -183,7 +183,7 @@ def visibility(
     """
     wider = widening(voxels_of(scene), cells.exponent, scene.step, cameras)
     extinction = _mean_extinction(cells, scene, wider)
-    return seen_through(extinction, 2.0 ** (cells.exponent + wider), scene, cameras, progress)
+    return march_views(extinction, 2.0 ** (cells.exponent + wider), scene, cameras, progress)
 
 
 def widening(dims: np.ndarray, exponent: np.ndarray, step: np.ndarray, cameras: Sequence[Camera]) -> int:
@@ -204,10 +204,10 @@ def widening(dims: np.ndarray, exponent: np.ndarray, step: np.ndarray, cameras: 
     return wider
 
 
-def seen_through(
+def march_views(
     extinction: np.ndarray,
     voxels: np.ndarray,
-    scene: Placed,
+    scene: BoxGeometry,
     cameras: Sequence[Camera],
     progress: Callable[[float], None] | None = None,
 ) -> Visibility:

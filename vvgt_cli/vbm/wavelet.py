@@ -13,7 +13,7 @@ import numpy as np
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.vbm.columns import FIRST, MASS
 from vvgt_cli.vbm.opacity import peak_opacity
-from vvgt_cli.vbm.shape import make_gaussians, seen_color
+from vvgt_cli.vbm.shape import make_gaussians, visible_color
 from vvgt_cli.vbm.tree import Tree, select
 
 
@@ -67,4 +67,4 @@ def wavelet_gaussians(tree: Tree, budget: int, pixel: float) -> Gaussians:
     opacity = peak_opacity(moments[:, MASS] * kept, variances, pixel)
     means = moments[:, FIRST] / moments[:, [MASS]]
     axes = np.broadcast_to(np.eye(3), (len(ids), 3, 3))
-    return make_gaussians(means, variances, axes, opacity, seen_color(moments))
+    return make_gaussians(means, variances, axes, opacity, visible_color(moments))

@@ -52,17 +52,17 @@ def _files(folder: Path) -> Iterator[Path]:
             if seen > MOST:
                 raise DataError(f"{folder}: more than {MOST} files; expected the folder of one series")
             path = Path(root, name)
-            if name != "DICOMDIR" and _begins_as_dicom(path):
+            if name != "DICOMDIR" and _has_dicom_prefix(path):
                 yield path
 
 
 def _holds(folder: Path) -> bool:
     """Whether there is a DICOM file among the first `TRIED` of a folder and the folders in it."""
     every = (Path(root, name) for root, _, names in os.walk(folder) for name in names)
-    return any(map(_begins_as_dicom, islice(every, TRIED)))
+    return any(map(_has_dicom_prefix, islice(every, TRIED)))
 
 
-def _begins_as_dicom(path: Path) -> bool:
+def _has_dicom_prefix(path: Path) -> bool:
     try:
         if not path.is_file():  # a pipe would wait
             return False

@@ -12,7 +12,7 @@ LESS = 0.5  # difference of neighbours, of that in the order given, below which 
 LEAST = 4  # voxels along an axis below which there is nothing to tell
 
 
-def likelier_dims(data: np.ndarray) -> tuple[int, int, int] | None:
+def guess_dims(data: np.ndarray) -> tuple[int, int, int] | None:
     """Dimensions (x, y, z) in another order, in which neighbouring values differ by less than half of what they do now.
 
     Rows and slices of a volume are like those beside them; read in another order than they were written they are not.

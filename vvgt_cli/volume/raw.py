@@ -17,7 +17,7 @@ from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.blocks import check_memory, fill, load_block, size_text
 from vvgt_cli.volume.components import select_component
 from vvgt_cli.volume.options import ReadOptions, parse_dtype
-from vvgt_cli.volume.order import likelier_dims
+from vvgt_cli.volume.order import guess_dims
 from vvgt_cli.volume.packed import packed
 from vvgt_cli.volume.readers import Reader, register, volume_name
 from vvgt_cli.volume.types import Volume
@@ -62,7 +62,7 @@ def _mismatch(name: str, size: str, dims: tuple[int, int, int], dtype: np.dtype,
 
 def _volume(data: np.ndarray, name: str, source: str, options: ReadOptions) -> Volume:
     field, _ = select_component(data[..., None], options.component, source)
-    likelier = likelier_dims(field)
+    likelier = guess_dims(field)
     if likelier is not None:
         warnings.warn(
             f"{source}: read as {' x '.join(map(str, field.shape[::-1]))}, neighbours differ more than twice as "

@@ -15,7 +15,7 @@ from vvgt_cli.volume.blocks import check_memory
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import Reader, register
 from vvgt_cli.volume.tiff import SUFFIXES, read_tiff
-from vvgt_cli.volume.tiff_stored import checked, files_left
+from vvgt_cli.volume.tiff_stored import checked, lazy_files
 from vvgt_cli.volume.types import Volume
 
 MOST = 100_000  # files
@@ -70,7 +70,7 @@ def read_slices(files: list[Path], options: ReadOptions, source: str, name: str)
     first = plane_of(files[0])
     plane = first.data
     if options.stored:
-        field: Any = files_left(files, plane, lambda path: plane_of(path).data, source)
+        field: Any = lazy_files(files, plane, lambda path: plane_of(path).data, source)
         return Volume(field, first.spacing, name=name)
     check_memory(len(files) * plane.nbytes, source)
     out = np.empty((len(files), *plane.shape[1:]), plane.dtype)

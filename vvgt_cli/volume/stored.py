@@ -105,7 +105,7 @@ def chunks_of(volume: Volume) -> tuple[int, ...]:
     return volume.data.chunks if isinstance(volume.data, Stored) else (1, *volume.data.shape[1:])
 
 
-def lies_in_file(volume: Volume) -> bool:
+def is_file_backed(volume: Volume) -> bool:
     """Whether a volume's values lie in a file, mapped or `Stored`."""
     return isinstance(volume.data, Stored) or _map_under(volume.data) is not None
 

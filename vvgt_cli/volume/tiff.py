@@ -29,7 +29,7 @@ from vvgt_cli.volume.stored import Stored
 from vvgt_cli.volume.tiff_decode import Pages
 from vvgt_cli.volume.tiff_facts import Facts, imagej_facts, ome_facts, ome_root
 from vvgt_cli.volume.tiff_pages import check_pages
-from vvgt_cli.volume.tiff_stored import pages_left
+from vvgt_cli.volume.tiff_stored import lazy_pages
 from vvgt_cli.volume.types import Volume
 
 SUFFIXES = (".tif", ".tiff")
@@ -38,7 +38,7 @@ _AXES = {"X": "columns", "Y": "rows", "Z": "slices", "T": "time steps", "C": "ch
 
 
 @dataclass(frozen=True)
-class Layout:
+class SeriesAxes:
     """Where the voxels are in the axes of a series.
 
     Attributes:
@@ -91,14 +91,14 @@ def read_tiff(path: Path, options: ReadOptions) -> Volume:
     return Volume(field, spacing, name=volume_name(path))
 
 
-def _paged(layout: Layout, index: tuple[int | slice, ...], several: bool) -> bool:
+def _paged(layout: SeriesAxes, index: tuple[int | slice, ...], several: bool) -> bool:
     """Whether slices are pages, and nothing but rows and columns is kept of one."""
     kept = [a for a, i in zip(layout.axes, index, strict=True) if isinstance(i, slice)]
     ahead = [a for a, i in zip(layout.axes[: layout.lead], index, strict=False) if isinstance(i, slice)]
     return not several and ahead == ["Z"] and sorted(kept) == ["X", "Y", "Z"]
 
 
-def _together(layout: Layout, index: tuple[int | slice, ...]) -> bool:
+def _together(layout: SeriesAxes, index: tuple[int | slice, ...]) -> bool:
     """Whether what is kept lies in the file as (z, y, x), without anything between."""
     rest = [
         (a, i, n) for a, i, n in zip(layout.axes, index, layout.shape, strict=True) if n > 1 or isinstance(i, slice)
@@ -107,16 +107,16 @@ def _together(layout: Layout, index: tuple[int | slice, ...]) -> bool:
     return all(kept[kept.index(True) :]) and [a for a, i, _ in rest if isinstance(i, slice)] == ["Z", "Y", "X"]
 
 
-def _left(path: Path, number: int, layout: Layout, index: tuple[int | slice, ...], dtype: np.dtype) -> Stored:
+def _left(path: Path, number: int, layout: SeriesAxes, index: tuple[int | slice, ...], dtype: np.dtype) -> Stored:
     """The slices of a series whose pages stay in the file."""
     turned = layout.axes.index("X") < layout.axes.index("Y")
-    return pages_left(
+    return lazy_pages(
         path, number, layout.shape[: layout.lead], layout.shape[layout.lead :], index, np.dtype(dtype), turned
     )
 
 
 def _in_memory(
-    values: np.ndarray, layout: Layout, index: tuple[int | slice, ...], several: bool, path: Path
+    values: np.ndarray, layout: SeriesAxes, index: tuple[int | slice, ...], several: bool, path: Path
 ) -> np.ndarray:
     """(z, y, x) of what was read, the magnitude of several channels."""
     order = [*(_kept(layout, index, a) for a in "ZYX"), *([_kept(layout, index, c) for c in "CS"] if several else [])]
@@ -177,7 +177,7 @@ def _facts(file: Any, root: Any, series: Any, number: int, path: Path) -> Facts:
     return facts
 
 
-def _layout(series: Any, path: Path) -> Layout:
+def _layout(series: Any, path: Path) -> SeriesAxes:
     """The axes of a series, and how they lie in its pages."""
     axes, shape = series.get_axes(False), tuple(map(int, series.get_shape(False)))
     keyframe = series.keyframe
@@ -199,7 +199,7 @@ def _layout(series: Any, path: Path) -> Layout:
             f"{path}: {len(series)} pages of {keyframe.size} values; expected {' x '.join(map(str, shape))}; check "
             "that the file is whole"
         )
-    layout = Layout(axes, shape, lead, keyframe.photometric == 2)
+    layout = SeriesAxes(axes, shape, lead, keyframe.photometric == 2)
     if any(len(layout.of(letter)) > 1 for letter in _AXES):
         raise DataError(f"{path}: axes {_described(axes, shape)}; expected one of each")
     return layout
@@ -210,7 +210,7 @@ def _described(axes: str, shape: tuple[int, ...]) -> str:
 
 
 def _choose(
-    layout: Layout, facts: Facts, options: ReadOptions, path: Path, dtype: np.dtype
+    layout: SeriesAxes, facts: Facts, options: ReadOptions, path: Path, dtype: np.dtype
 ) -> tuple[tuple[int | slice, ...], bool]:
     """An index along every axis of a series (whole along those of space), and whether all channels are wanted."""
     space = layout.of("XYZ")
@@ -258,14 +258,14 @@ def _channel(sizes: list[int], facts: Facts, wanted: int | str | None, path: Pat
     raise SeveralComponents(text, n, color and n in (3, 4), facts.colors if len(facts.colors) == n else ())
 
 
-def _kept(layout: Layout, index: tuple[int | slice, ...], letter: str) -> int | None:
+def _kept(layout: SeriesAxes, index: tuple[int | slice, ...], letter: str) -> int | None:
     """Position of a letter's axis among those that an index keeps."""
     kept = [k for k, i in enumerate(index) if isinstance(i, slice)]
     return next((kept.index(k) for k in kept if layout.axes[k] == letter), None)
 
 
 def _arranged(
-    values: np.ndarray, order: list[int | None], layout: Layout, index: tuple[int | slice, ...]
+    values: np.ndarray, order: list[int | None], layout: SeriesAxes, index: tuple[int | slice, ...]
 ) -> np.ndarray:
     """The values with axes z, y, x, and one of channels where there are several."""
     there = [k for k in order if k is not None]
@@ -276,7 +276,7 @@ def _arranged(
     return field if len(order) == 3 else field.reshape(*field.shape[:3], -1)
 
 
-def _values(file: Any, series: Any, layout: Layout, index: tuple[int | slice, ...], path: Path) -> np.ndarray:
+def _values(file: Any, series: Any, layout: SeriesAxes, index: tuple[int | slice, ...], path: Path) -> np.ndarray:
     """The values at an index of a series: mapped where they lie together plainly, else decoded page by page."""
     if _mappable(series):
         offset, need = int(series.dataoffset), math.prod(layout.shape) * series.dtype.itemsize

@@ -15,7 +15,7 @@ from vvgt_cli.volume.stored import Slices, Stored
 from vvgt_cli.volume.tiff_decode import Pages
 
 
-def pages_left(
+def lazy_pages(
     path: Path,
     number: int,
     lead: tuple[int, ...],
@@ -61,7 +61,7 @@ def pages_left(
     return Stored(read, dtype, (lead[axis], rows, columns), (1, rows, columns), str(path))
 
 
-def files_left(files: list[Path], plane: np.ndarray, of: Callable[[Path], np.ndarray], source: str) -> Stored:
+def lazy_files(files: list[Path], plane: np.ndarray, of: Callable[[Path], np.ndarray], source: str) -> Stored:
     """Slice z is file z, read by ``of`` as (1, y, x) as ``plane`` is, the first of them."""
 
     def read(slices: Slices) -> np.ndarray:

@@ -5,7 +5,7 @@ from vvgt_cli.conversion.stages.cells import CellsByError
 from vvgt_cli.conversion.stages.closed_form import ClosedFormStage
 from vvgt_cli.conversion.stages.network import Network
 from vvgt_cli.conversion.stages.refinement import Refinement
-from vvgt_cli.conversion.stages.scores import Seats, TestViews
+from vvgt_cli.conversion.stages.scores import TestViews, ViewingConditions
 from vvgt_cli.conversion.stages.views import CheckViews, TrainingViews
 
 __all__ = [
@@ -15,7 +15,7 @@ __all__ = [
     "ClosedFormStage",
     "Network",
     "Refinement",
-    "Seats",
     "TestViews",
     "TrainingViews",
+    "ViewingConditions",
 ]

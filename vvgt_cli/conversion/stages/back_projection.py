@@ -7,7 +7,7 @@ from typing import ClassVar
 
 from vvgt_cli.conversion.stage import Cost, Stage, Work
 from vvgt_cli.conversion.stages.refinement import step_seconds
-from vvgt_cli.field.case import Case
+from vvgt_cli.field.workload import Workload
 from vvgt_cli.jit.ahead import BACK_PROJECT
 
 STEPS = 105.0  # of gradient descent on whole views that take as long
@@ -20,7 +20,7 @@ class BackProjection(Stage):
     name: ClassVar[str] = "back-projection"
     improves: ClassVar[bool] = True
 
-    def cost(self, case: Case) -> Cost:
+    def cost(self, case: Workload) -> Cost:
         """As so many steps."""
         return Cost(STEPS * step_seconds(case, small=False))
 

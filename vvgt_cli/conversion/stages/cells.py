@@ -9,7 +9,7 @@ from vvgt_cli.cameras import farthest_cameras
 from vvgt_cli.conversion.resume import CELLS
 from vvgt_cli.conversion.stage import Cost, Stage, Work
 from vvgt_cli.conversion.stages.refinement import step_seconds
-from vvgt_cli.field.case import Case
+from vvgt_cli.field.workload import Workload
 
 VIEWS = 24  # of the training views: half as many lose 0.1 to 0.3 dB (docs/log/closed-form.md)
 A_VIEW, ALWAYS = 1.1, 12.0  # in steps of gradient descent: a view, and the second cut with a look at the check views
@@ -29,7 +29,7 @@ class CellsByError(Stage):
     small: bool = False
     keep: bool = True
 
-    def cost(self, case: Case) -> Cost:
+    def cost(self, case: Workload) -> Cost:
         """As so many steps."""
         return Cost((VIEWS * A_VIEW + ALWAYS) * step_seconds(case, self.small))
 

@@ -11,7 +11,7 @@ import numpy as np
 from vvgt_cli.conversion.resume import CELLS, CLOSED_FORM
 from vvgt_cli.conversion.stage import Cost, Stage, Work
 from vvgt_cli.errors import NothingVisible
-from vvgt_cli.field.case import Case
+from vvgt_cli.field.workload import Workload
 
 if TYPE_CHECKING:
     from vvgt_cli.vbm import Start
@@ -37,7 +37,7 @@ class ClosedFormStage(Stage):
     anew: bool = False
     cut: bool = False
 
-    def cost(self, case: Case) -> Cost:
+    def cost(self, case: Workload) -> Cost:
         """By cells, voxels and Gaussians."""
         counts = 1e6, case.cells, case.voxels, case.gaussians
         seconds = sum(each * count for each, count in zip(SECONDS, counts, strict=True)) / 1e6

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 from vvgt_cli.conversion.stage import Cost, Stage, Work
-from vvgt_cli.field.case import Case
+from vvgt_cli.field.workload import Workload
 
 SECONDS = 0.2, 2.1  # always, per 100,000 Gaussians (docs/network.md)
 
@@ -23,7 +23,7 @@ class Network(Stage):
     improves: ClassVar[bool] = True
     model: str = ""
 
-    def cost(self, case: Case) -> Cost:
+    def cost(self, case: Workload) -> Cost:
         """By Gaussians."""
         return Cost(case.pace * (SECONDS[0] + SECONDS[1] * case.gaussians / 1e5))
 

@@ -10,7 +10,7 @@ import numpy as np
 from vvgt_cli.cameras import default_views
 from vvgt_cli.conversion.stage import Cost, Stage, Work
 from vvgt_cli.descent import OptimizeOptions, OptimizeRecord, optimize
-from vvgt_cli.field.case import Case, view_edge
+from vvgt_cli.field.workload import Workload, view_edge
 from vvgt_cli.gaussians import Gaussians, as_stored
 from vvgt_cli.runs.record import Run
 from vvgt_cli.runs.views import Views
@@ -28,7 +28,7 @@ REASONS = {
 }  # fmt: skip
 
 
-def step_seconds(case: Case, small: bool) -> float:
+def step_seconds(case: Workload, small: bool) -> float:
     """Of a step with its share of the looks at check views."""
     one = case.pace * (STEP[0] * (view_edge(case.size, small) / 400) ** 2 + STEP[1] * case.gaussians / 1e5)
     return HARMONICS[case.degree] * one
@@ -52,7 +52,7 @@ class Refinement(Stage):
     small: bool = False
     overlap: bool = False
 
-    def cost(self, case: Case) -> Cost:
+    def cost(self, case: Workload) -> Cost:
         """By steps."""
         return Cost(self.steps * step_seconds(case, self.small))
 

@@ -8,10 +8,10 @@ from typing import ClassVar
 from vvgt_cli.cameras.blocks import FEW
 from vvgt_cli.conversion.request import FitOptions
 from vvgt_cli.conversion.stage import Cost, Stage, Work
-from vvgt_cli.field.case import Case
 from vvgt_cli.field.field import Picture
+from vvgt_cli.field.workload import Workload
 from vvgt_cli.runs.score import WHOLE, psnr_note, score_test_views, scored
-from vvgt_cli.runs.seats import PREVIEW_VIEWS, SIDE, from_above, score_seats, seat_pictures, seat_views
+from vvgt_cli.runs.viewing import PREVIEW_VIEWS, SIDE, condition_views, from_above, score_conditions, seat_pictures
 
 SCORE, SCORE_ALL = (3, 0, 0.03), (10, len(WHOLE), 0.1)  # views, whole ones of them, seconds beside per 400 x 400 px
 SEATS = 2, 0.15, 0.155  # check views, and seconds beside them: always, per 100,000 Gaussians
@@ -30,7 +30,7 @@ class TestViews(Stage):
     scores: ClassVar[bool] = True
     whole: bool = False
 
-    def cost(self, case: Case) -> Cost:
+    def cost(self, case: Workload) -> Cost:
         """By pixels."""
         views, whole, beside = SCORE_ALL if self.whole else SCORE
         pixels = whole * case.size**2 + (views - whole) * case.judged
@@ -64,13 +64,13 @@ class TestViews(Stage):
 
 
 @dataclass(frozen=True)
-class Seats(Stage):
+class ViewingConditions(Stage):
     """Every rule at the size made for and above; left out where time is up."""
 
     name: ClassVar[str] = "seats"
     scores: ClassVar[bool] = True
 
-    def cost(self, case: Case) -> Cost:
+    def cost(self, case: Workload) -> Cost:
         """By pixels and Gaussians."""
         return Cost(SEATS[0] * case.glance + case.pace * (SEATS[1] + SEATS[2] * case.gaussians / 1e5))
 
@@ -88,7 +88,7 @@ class Seats(Stage):
             run.leave_out(self.name, "time is up")
             return
         with run.stage(self.name) as stage:
-            seen = seat_views(work.field, from_above(work.fit.size), views=SIDE, enough=FEW)
-            seats = score_seats(work.made(), seen)
+            seen = condition_views(work.field, from_above(work.fit.size), views=SIDE, enough=FEW)
+            seats = score_conditions(work.made(), seen)
             run.report.seats = [asdict(seat) for seat in seats]
             stage.note = f"worst of {len(seats)}: {seats[0].name()}, {seats[0].psnr:.2f} dB"

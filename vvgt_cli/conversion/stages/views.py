@@ -12,8 +12,8 @@ from vvgt_cli.cameras.blocks import Blocks, spread_blocks
 from vvgt_cli.cameras.sets import SET_VIEWS
 from vvgt_cli.conversion.request import FitOptions
 from vvgt_cli.conversion.stage import Cost, Stage, Work
-from vvgt_cli.field.case import Case, view_edge
 from vvgt_cli.field.field import Picture
+from vvgt_cli.field.workload import Workload, view_edge
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.runs.views import VIEW_BYTES, Views, judged, judging_views
 from vvgt_cli.splat.rules import Rule
@@ -49,7 +49,7 @@ class CheckViews(Stage):
     name: ClassVar[str] = "check views"
     fine: bool = True
 
-    def cost(self, case: Case) -> Cost:
+    def cost(self, case: Workload) -> Cost:
         """One of them is drawn whole, of which blocks are kept."""
         count = SET_VIEWS["check"]
         return Cost(count * case.glance, (count * case.glanced + case.size**2) * VIEW_BYTES)
@@ -89,7 +89,7 @@ class TrainingViews(Stage):
     edge: int = 200
     fitted: bool = True
 
-    def cost(self, case: Case) -> Cost:
+    def cost(self, case: Workload) -> Cost:
         """By pixels."""
         return Cost(self.count * case.view * (self.edge / case.edge) ** 2, self.count * self.edge**2 * VIEW_BYTES)
 

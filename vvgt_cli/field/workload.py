@@ -1,4 +1,4 @@
-"""`Case`: what of a scene and a machine the costs of stages depend on (docs/plan.md says how they were fitted)."""
+"""`Workload`: what of a scene and a machine the costs of stages depend on (docs/plan.md says how they were fitted)."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PROGRAM = 2.6e8  # bytes: interpreter, libraries and kernels
 
 
 @dataclass(frozen=True)
-class Case:
+class Workload:
     """Counts of a scene, and a machine's pace.
 
     Attributes:
@@ -79,7 +79,7 @@ class Case:
         """Seconds of a check view's reference."""
         return self.judging(self.glanced)
 
-    def at(self, pace: float) -> Case:
+    def at(self, pace: float) -> Workload:
         """The same on a machine that takes ``pace`` times as long; what was timed stays."""
         return replace(self, pace=self.pace * pace)
 
@@ -94,13 +94,13 @@ def expected_wide(gaussians: int, size: int) -> bool:
     return gaussians <= (2 * view_edge(size, small=True)) ** 2
 
 
-def measure(scene: Scene, size: int, gaussians: int) -> Case:
+def measure(scene: Scene, size: int, gaussians: int) -> Workload:
     """The case of a scene: counted, a small view timed, the machine's pace by a picture of Gaussians."""
     from vvgt_cli.dvr.layout import BRICK
     from vvgt_cli.vbm.samples import visible_voxels
 
     x, y, z = (float(edge) for edge in scene.step)
-    case = Case(
+    case = Workload(
         gaussians=gaussians,
         cells=0.0,
         voxels=float(np.count_nonzero(scene.empty == 0)) * BRICK**3,
@@ -114,7 +114,7 @@ def measure(scene: Scene, size: int, gaussians: int) -> Case:
     return for_budget(case, gaussians)
 
 
-def for_budget(case: Case, gaussians: int) -> Case:
+def for_budget(case: Workload, gaussians: int) -> Workload:
     """The same case with another budget; nothing is timed again."""
     from vvgt_cli.vbm.closed_form import expected_cells
 

@@ -29,7 +29,7 @@ PREVIEW_VIEWS = (0, 4, 9)  # test views of previews, and of the score without a 
 
 
 @dataclass(frozen=True)
-class Seat:
+class ViewingCondition:
     """One place to look from.
 
     Attributes:
@@ -49,7 +49,7 @@ class Seat:
         return f"{self.rule} {self.size} px" + ("" if self.field_of_view == FIELD_OF_VIEW else " close up")
 
 
-def seats_of(size: int) -> list[tuple[int, float]]:
+def viewing_conditions(size: int) -> list[tuple[int, float]]:
     """(size, field of view) from which a file made for ``size`` px is scored."""
     return [(edge, FIELD_OF_VIEW) for edge in sorted({*SIZES, size})] + [(size, CLOSE)]
 
@@ -66,7 +66,7 @@ def zoomed(camera: Camera, field_of_view: float) -> Camera:
 
 
 @dataclass(frozen=True)
-class SeatView:
+class ConditionView:
     """What is to be seen from a seat in one view.
 
     Attributes:
@@ -95,7 +95,7 @@ def seat_pictures(
     return found
 
 
-def seat_views(
+def condition_views(
     scene: Scene | Viewed,
     places: Iterable[tuple[int, float]],
     settings: RenderSettings | None = None,
@@ -103,7 +103,7 @@ def seat_views(
     views: Collection[int] = VIEWS,
     enough: int = ENOUGH,
     progress: ProgressCallback | None = None,
-) -> Iterator[SeatView]:
+) -> Iterator[ConditionView]:
     """References of every place, one at a time.
 
     Args:
@@ -119,7 +119,7 @@ def seat_views(
     wanted = seat_pictures(places, views, enough)
     for done, (place, camera, blocks) in enumerate(wanted, 1):
         image = render_view(scene, camera, settings, blocks)[..., :3]
-        yield SeatView(*place, camera, blocks, image if blocks is None else blocks.pick(image))
+        yield ConditionView(*place, camera, blocks, image if blocks is None else blocks.pick(image))
         if progress:
             progress(done, len(wanted))
 
@@ -166,12 +166,14 @@ def texture_note(found: Texture) -> str:
     )
 
 
-def score_seats(gaussians: Gaussians, seen: Iterable[SeatView], rules: Collection[str] = tuple(RULES)) -> list[Seat]:
+def score_conditions(
+    gaussians: Gaussians, seen: Iterable[ConditionView], rules: Collection[str] = tuple(RULES)
+) -> list[ViewingCondition]:
     """Every rule at every place, on blocks of the test views; worst first.
 
     Args:
         gaussians: that are drawn.
-        seen: of `seat_views`.
+        seen: of `condition_views`.
         rules: names.
     """
     from vvgt_cli.metrics import psnr
@@ -183,5 +185,5 @@ def score_seats(gaussians: Gaussians, seen: Iterable[SeatView], rules: Collectio
             ours = render(gaussians, view.camera, rule, blocks=view.blocks)[..., :3]
             shown = ours if view.blocks is None else view.blocks.pick(ours)
             errors.setdefault((rule, view.size, view.field_of_view), []).append(psnr(view.reference, shown))
-    found = [Seat(*seat, float(np.mean(dbs))) for seat, dbs in errors.items()]
-    return sorted(found, key=lambda seat: seat.psnr)
+    found = [ViewingCondition(*condition, float(np.mean(dbs))) for condition, dbs in errors.items()]
+    return sorted(found, key=lambda condition: condition.psnr)
