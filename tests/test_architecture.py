@@ -18,7 +18,7 @@ PACKAGE = ROOT / "vvgt_cli"
 ROOMS = (
     *("version", "errors", "resources", "progress", "files", "jit", "volume", "transfer", "cameras", "images"),
     *("metrics", "gaussians", "synth", "dvr", "splat", "share", "vbm", "network", "descent", "training", "checks"),
-    *("report", "runs", "conversion", "scale", "tasks", "batches", "library", "cli"),
+    *("report", "runs", "field", "conversion", "scale", "tasks", "batches", "library", "cli"),
 )
 HEAVY = {
     *("numba", "vtk", "vtkmodules", "pyvista", "onnxruntime", "torch", "matplotlib", "OpenImageIO", "OpenEXR"),

@@ -130,11 +130,11 @@ def test_the_library_takes_names_directions_and_options():
     function = {"points": FUNCTION["points"]}
     few = {"max_gaussians": 100, "size": 40, "steps": 0}
     by_name = vvgt_cli.convert(SOURCE, function, light="headlight", **few)
-    assert by_name.scene.lighting == Lighting()
+    assert by_name.field.source.lighting == Lighting()
     assert by_name.gaussians.degree == 2
     assert by_name.normals().shape == by_name.gaussians.means.shape
     by_direction = vvgt_cli.convert(SOURCE, function, light=(0, 0, 1), **few)
-    assert by_direction.scene.lighting == Lighting(False, ((0, 0, 1),))
+    assert by_direction.field.source.lighting == Lighting(False, ((0, 0, 1),))
     options = LightOptions(("above", "headlight"), shadows=True, specular=0)
     _, images = vvgt_cli.render_views(SOURCE, function, cameras=1, size=32, light=options)
     _, dark = vvgt_cli.render_views(SOURCE, function, cameras=1, size=32)
@@ -142,10 +142,11 @@ def test_the_library_takes_names_directions_and_options():
     np.testing.assert_allclose(images[..., 3], dark[..., 3], atol=0.02)  # other pixels get more rays
 
 
-def test_a_network_is_refused_before_the_closed_form_where_colours_depend_on_the_view(folder, vvgt):
-    call = ("convert", SOURCE, *tf(folder), *SMALL, "--model", "vvgt-small", "-o", folder / "m.ply")
-    result = vvgt(*call, "--light", "headlight")
-    assert result.code == 2
-    assert "colours that are the same from all sides" in result.err
-    assert "closed form" not in result.err
-    assert not (folder / "m.ply").exists()
+def test_a_network_leaves_harmonics_as_they_are(folder, vvgt):
+    call = ("convert", SOURCE, *tf(folder), *SMALL, "--light", "headlight", "--steps", "8")
+    assert vvgt(*call, "-o", folder / "plain.ply").code == 0
+    result = vvgt(*call, "--model", "vvgt-small", "-o", folder / "m.ply", "--report", folder / "m.json")
+    assert result.code == 0, result.err
+    stages = {stage["name"]: stage for stage in json.loads((folder / "m.json").read_text())["stages"]}
+    assert stages["network"]["psnr"] > 15
+    assert read_ply(folder / "m.ply")[0].degree == 2

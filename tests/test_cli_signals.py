@@ -27,10 +27,10 @@ def closed_form(self, work):
     from vvgt_cli.cameras import default_views
     with atomic_write("b.ply") as temporary:
         temporary.write_bytes(b"half")
-        cells = base_cells(work.scene, np.zeros(3, np.int64))
-        visibility(work.scene, cells, default_views("train", 1, size=8))  # loads the kernel
+        cells = base_cells(work.field.scene, np.zeros(3, np.int64))
+        visibility(work.field.scene, cells, default_views("train", 1, size=8))  # loads the kernel
         threading.Timer(1.0, print, ["in the kernel"], {"flush": True}).start()
-        visibility(work.scene, cells, default_views("train", 1, size=50_000))
+        visibility(work.field.scene, cells, default_views("train", 1, size=50_000))
 
 ClosedFormStage.run = closed_form
 main.main()

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from vvgt_cli.cameras.blocks import BLOCK, ENOUGH, FEW, spread_blocks
-from vvgt_cli.conversion import case as case_module
 from vvgt_cli.conversion.stages import CheckViews, TestViews, TrainingViews
 from vvgt_cli.dvr import Scene
+from vvgt_cli.field import workload as case_module
 from vvgt_cli.field.workload import Workload, measure
 from vvgt_cli.synth import open_volume
 from vvgt_cli.transfer.readers import minimal

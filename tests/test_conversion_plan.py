@@ -161,15 +161,15 @@ def test_views_that_do_not_fit_are_refused(monkeypatch):
 
 
 def test_gaussians_that_do_not_fit_are_refused_with_the_number_that_would(monkeypatch):
-    monkeypatch.setattr("vvgt_cli.vbm.closed_form.expected_cells", lambda scene, size, budget: 2.0 * budget)
+    monkeypatch.setattr("vvgt_cli.vbm.closed_form.expected_cells", lambda voxels, step, size, budget: 2.0 * budget)
     case = replace(CASE, gaussians=1_000_000, cells=2e6)
     found = Planner(Limits(), 1_000_000, 0, 0, 48).plan(case, 1.0)
     each, views = 0.8 * (2 * 294 + 1240), 0.8 * 32 * 48**2 * 29
     monkeypatch.setattr("vvgt_cli.conversion.plan.free_memory", lambda: each * 1e6 + views + 1)
-    check_memory(found, object())
+    check_memory(found)
     monkeypatch.setattr("vvgt_cli.conversion.plan.free_memory", lambda: each * 3e5 + views)
     with pytest.raises(UsageError, match="--max-gaussians 250000 would fit"):
-        check_memory(found, object())
+        check_memory(found)
 
 
 def test_no_steps_leave_back_projection():

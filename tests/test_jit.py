@@ -173,13 +173,13 @@ def test_commands_need_what_is_compiled_ahead_and_nothing_else(tmp_path):
     assert wanted(tmp_path, "init", SOURCE, *fit, "-o", "i.ply") == set(ahead.INIT) - rare
     (tmp_path / "v_24x24x24_uint8.raw").write_bytes(bytes(range(216)) * 64)
     blocks = wanted(tmp_path, "init", "v_24x24x24_uint8.raw", *fit, "--blocks", 16, "-o", "k.ply")
-    assert blocks == {*ahead.BLOCKS, *ahead.COUNT_WHOLE} - rare
+    started = ahead.for_blocks((ahead.RENDER, *ahead.INIT, *ahead.DRAW))
+    assert blocks == {*started, *ahead.COUNT_WHOLE} - rare
     np.linspace(0, 1, 24**3, dtype=np.float32).tofile(tmp_path / "f_24x24x24_float32.raw")
     reals = ("init", "f_24x24x24_float32.raw", *fit, "--blocks", 16)
-    assert wanted(tmp_path, *reals, "-o", "n.ply") == {*ahead.BLOCKS, *ahead.COUNT_REAL} - rare
+    assert wanted(tmp_path, *reals, "-o", "n.ply") == {*started, *ahead.COUNT_REAL} - rare
     fitted = wanted(tmp_path, "convert", "v_24x24x24_uint8.raw", *fit, "--steps", 24, "--blocks", 16, "-o", "m.ply")
-    refined = {name for name in ahead.CONVERT if ".dvr." not in name} - {*ahead.BACK_PROJECT}
-    assert fitted == {*ahead.BLOCKS, *ahead.COUNT_WHOLE, *refined} - rare
+    assert fitted == {*ahead.for_blocks(ahead.CONVERT), *ahead.COUNT_WHOLE} - rare
     few = wanted(tmp_path, "convert", SOURCE, *fit, "--steps", 0, "-o", "b.ply")
     assert set(ahead.BACK_PROJECT) <= few <= set(ahead.CONVERT)
     views = ("--views", 6, "--test-views", 2, "--size", 40, "-q", "-o", "views")

@@ -144,7 +144,7 @@ def test_the_grid_of_shadows_converges_to_rays_from_every_place():
     assert exact.max() > 0.9
     errors = []
     for cell in (8, 4, 2, 1):
-        grid = transmittance(scene.matter, directions, cell, step=0.125, offset=1.5)
+        grid = transmittance(scene, directions, cell, step=0.125, offset=1.5)
         errors.append(np.abs(grid_values(grid, (points + 0.5) / cell - 0.5) - exact).mean())
     assert errors == sorted(errors, reverse=True)
     assert errors[-1] < 0.005
@@ -178,7 +178,7 @@ def test_a_thin_sheet_right_behind_empty_bricks_throws_its_shadow(thick):
     directions = np.array([[0.0, 0.0, 1.0], [0.28, 0.0, 0.96]])
     points = np.array([[12.0, 12.0, z] for z in (3.0, 5.0, 8.0)])
     for offset in (1.5, 4.0):
-        grid = transmittance(scene.matter, directions, 1, step=0.125, offset=offset)
+        grid = transmittance(scene, directions, 1, step=0.125, offset=offset)
         found = grid_values(grid, points)
         np.testing.assert_allclose(found, brute_force(scene, points, directions, offset), atol=0.03)
         assert found.max() < 0.6

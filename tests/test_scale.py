@@ -236,18 +236,20 @@ def test_memory_decides_by_itself(vvgt, tmp_path, monkeypatch):
     plain = vvgt("init", source, "-o", tmp_path / "a.ply", *FIT[:-1])
     assert plain.code == 0
     assert "blocks" not in plain.err
-    monkeypatch.setattr("vvgt_cli.field.source.free_memory", lambda: 200 << 20)
+    monkeypatch.setattr("vvgt_cli.field.open.free_memory", lambda: 200 << 20)
     less = vvgt("init", source, "-o", tmp_path / "b.ply", *FIT[:-1])
     assert less.code == 0
-    assert "more than the memory holds" in less.err
+    assert "processed in blocks" in less.err
     assert same_gaussians(tmp_path / "a.ply", tmp_path / "b.ply")
     monkeypatch.setattr("vvgt_cli.volume.blocks.free_memory", lambda: 1 << 20)
-    whole = vvgt("render-views", source, "-o", tmp_path / "views", "--size", "40", "--views", "2")
+    views = vvgt("render-views", source, "-o", tmp_path / "views", "--size", "40", "--views", "2")
+    assert views.code == 0, views.err
+    whole = vvgt("evaluate", tmp_path / "b.ply", "--volume", source)
     assert whole.code == 1
-    assert "which go through it in blocks" in whole.err
+    assert "in blocks" in whole.err
     fitted = vvgt("convert", source, "-o", tmp_path / "d.ply", *FIT[:-1], "--steps", "8")
     assert fitted.code == 0
-    assert "more than the memory holds" in fitted.err
+    assert "processed in blocks" in fitted.err
     monkeypatch.setattr("vvgt_cli.field.settings.free_memory", lambda: 200 << 20)
     none = vvgt("init", source, "-o", tmp_path / "c.ply", *FIT[:-1])
     assert none.code == 2
@@ -257,10 +259,6 @@ def test_memory_decides_by_itself(vvgt, tmp_path, monkeypatch):
 def test_what_blocks_cannot_do_is_a_line(vvgt, raw, tmp_path):
     for options, word in (
         (("--blocks", "48"), "power of two"),
-        (("--blocks", "auto", "--init", "wavelet"), "whole volume in memory"),
-        (("--blocks", "auto", "--light", "headlight"), "lit by nothing"),
-        (("--blocks", "auto", "--labels", "auto"), "not blocks of it"),
-        (("--blocks", "auto", "--layer", str(raw)), "not blocks of it"),
         (("--shard", "1/2", "--report", "r.json"), "vvgt merge"),
         (("--shard", "3/2"), "I from 1 to N"),
     ):
@@ -278,29 +276,29 @@ def test_what_blocks_cannot_do_is_a_line(vvgt, raw, tmp_path):
 def test_a_label_map_by_name_is_not_taken_for_scalars_in_blocks(vvgt, raw, tmp_path):
     named = tmp_path / f"head_labels_{raw.name.split('_', 1)[1]}"
     named.write_bytes(raw.read_bytes())
-    run = vvgt("init", named, "-o", tmp_path / "a.ply", *FIT, "--blocks", "32")
-    assert run.code == 2
-    assert "label map" in run.err
-    assert "--labels none" in run.err
-    assert not (tmp_path / ".a.ply.blocks").exists()  # before anything is counted
-    assert vvgt("init", named, "-o", tmp_path / "a.ply", *FIT, "--blocks", "32", "--labels", "none").code == 0
+    with pytest.warns(UserWarning, match="label map"):
+        assert vvgt("init", named, "-o", tmp_path / "a.ply", *FIT, "--blocks", "32").code == 0
+    assert vvgt("init", named, "-o", tmp_path / "b.ply", *FIT, "--blocks", "32", "--labels", "none").code == 0
+    assert (tmp_path / "a.ply").read_bytes() != (tmp_path / "b.ply").read_bytes()
+    assert not list(tmp_path.glob(".*blocks"))
 
 
 def test_a_box_that_is_counted_slice_by_slice_has_the_counts_and_samples_of_the_whole(raw, tmp_path):
-    from vvgt_cli.scale.tasks import CountBlocks, Place
-
+    from vvgt_cli.field.counting import CountBlocks
     from vvgt_cli.field.grid import Boxes
     from vvgt_cli.field.parts import COUNTS, Parts
+    from vvgt_cli.field.reader import Place
 
     merged = []
     for slices in (1, 7, 80):
         parts = Parts(tmp_path / str(slices))
         (parts.folder / COUNTS).mkdir(parents=True)
-        place = Place(str(raw), ReadOptions(stored=True), str(parts.folder))
-        task = CountBlocks(place, Boxes((100, 90, 80), (64, 64, 64)), slices)
+        task = CountBlocks(
+            Place(str(raw), ReadOptions(stored=True)), Boxes((100, 90, 80), (64, 64, 64)), slices, parts, COUNTS
+        )
         for number in range(len(task)):
             task(number)
-        merged.append(task.merged())
+        merged.append((task.merged(), *task.samples()))
     whole, samples, weights = merged[0]
     assert whole.counts.sum() == 100 * 90 * 80
     assert len(samples) == len(weights) > 100

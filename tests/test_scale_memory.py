@@ -60,10 +60,10 @@ def test_slices_beyond_the_memory_are_gone_through_in_blocks_by_themselves(vvgt,
     (tmp_path / "slices").mkdir()
     for z, plane in enumerate(values):
         tifffile.imwrite(tmp_path / "slices" / f"s{z}.tif", plane, compression="zlib")
-    monkeypatch.setattr("vvgt_cli.field.source.free_memory", lambda: 100_000)
+    monkeypatch.setattr("vvgt_cli.field.open.free_memory", lambda: 100_000)
     run = vvgt("init", tmp_path / "slices", "-o", tmp_path / "a.ply", *FIT[:-1])
     assert run.code == 0, run.err
-    assert "in blocks" in run.err
+    assert "processed in blocks" in run.err
 
 
 def test_a_small_file_that_unpacks_to_much_is_gone_through_in_blocks(vvgt, tmp_path, monkeypatch):
@@ -71,11 +71,11 @@ def test_a_small_file_that_unpacks_to_much_is_gone_through_in_blocks(vvgt, tmp_p
 
     values = np.round(bodies((50, 61, 40))).astype(np.uint8)
     tifffile.imwrite(tmp_path / "v.tif", values, compression="zlib")
-    monkeypatch.setattr("vvgt_cli.field.source.free_memory", lambda: 100_000)
+    monkeypatch.setattr("vvgt_cli.field.open.free_memory", lambda: 100_000)
     assert (tmp_path / "v.tif").stat().st_size < 25_000
     run = vvgt("init", tmp_path / "v.tif", "-o", tmp_path / "a.ply", *FIT[:-1])
     assert run.code == 0, run.err
-    assert "in blocks" in run.err
+    assert "processed in blocks" in run.err
 
 
 def test_threads_share_a_file_of_pages(tmp_path):
@@ -99,9 +99,11 @@ def stored(dims, dtype, read=None, chunk=64):
 
 
 def test_counting_reads_every_voxel_once_and_little_more(tmp_path, monkeypatch):
+    from vvgt_cli.field import reader
+    from vvgt_cli.field.counting import CountBlocks
     from vvgt_cli.field.grid import Boxes
     from vvgt_cli.field.parts import COUNTS, Parts
-    from vvgt_cli.scale import tasks
+    from vvgt_cli.runs.layered import Content
 
     values, read = bodies((100, 90, 80)).astype(np.float32), []
 
@@ -110,15 +112,15 @@ def test_counting_reads_every_voxel_once_and_little_more(tmp_path, monkeypatch):
         return values[slices].copy()
 
     volume = stored((100, 90, 80), np.float32, part)
-    monkeypatch.setattr(tasks, "open_volume", lambda source, options: volume)
+    monkeypatch.setattr(reader, "open_parts", lambda source, options: Content((volume,)))
     parts = Parts(tmp_path)
     (parts.folder / COUNTS).mkdir()
-    place = tasks.Place("counted once", ReadOptions(stored=True), str(parts.folder))
-    task = tasks.CountBlocks(place, Boxes((100, 90, 80), (64, 64, 64)), 24)
+    place = reader.Place("counted once", ReadOptions(stored=True))
+    task = CountBlocks(place, Boxes((100, 90, 80), (64, 64, 64)), 24, parts, COUNTS)
     for number in range(len(task)):
         task(number)
     assert values.size <= sum(read) < 1.1 * values.size
-    whole, samples, _ = task.merged()
+    whole, (samples, _) = task.merged(), task.samples()
     assert (whole.lo, whole.hi) == (values.min(), values.max())
     assert (samples == values[3:12, 3:12, 3:12]).all(axis=(1, 2, 3)).any()
 

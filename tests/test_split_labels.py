@@ -14,6 +14,7 @@ from vvgt_cli.batches import labels as split
 from vvgt_cli.conversion.request import file_bytes
 from vvgt_cli.conversion.stages import ViewingConditions
 from vvgt_cli.dvr import RenderSettings
+from vvgt_cli.field.field import Resident
 from vvgt_cli.gaussians import Gaussians, read_ply
 from vvgt_cli.runs.owners import hidden_in, owners
 from vvgt_cli.runs.score import score_test_views
@@ -142,16 +143,21 @@ def test_whose_a_gaussian_is() -> None:
     assert owners(gaussians, faint)[2] == 0  # most of its extinction, not of its voxels
 
 
+def hidden_of(source):
+    field = Resident(source, source.scene())
+    return hidden_in(*field.hidden(600, 64), field.scene.half, field.scene.step)
+
+
 @pytest.mark.parametrize("cut", [False, True])
 def test_what_is_hidden(cut: bool) -> None:
     values = nested(cut=cut)
     source = load(SourceRequest(Volume(values), labels="auto"))
-    hides = hidden_in(source.scene(), 600, 64)
+    hides = hidden_of(source)
     assert hides.any_of(source.volume, 3)
     assert hides.any_of(source.volume, 1)  # its wall towards the core
     apart = np.where(values == 3, 3, 0)
     alone = load(SourceRequest(Volume(apart), labels="auto"))
-    assert not hidden_in(alone.scene(), 600, 64).any_of(alone.volume, 3)
+    assert not hidden_of(alone).any_of(alone.volume, 3)
     centre = np.zeros((2, 3))
     centre[1] = -0.95 / np.sqrt(3)  # on the outer surface, opposite to the cut
     points = Gaussians(centre, centre * 0 - 3, np.tile([1.0, 0, 0, 0], (2, 1)), np.zeros(2), centre)

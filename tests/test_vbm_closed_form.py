@@ -173,7 +173,7 @@ def test_base_level_keeps_the_memory_bound(monkeypatch: pytest.MonkeyPatch) -> N
         levels = []
         for bound in (10**6, 20_000, 300):
             monkeypatch.setattr(closed_form_module, "MAX_BASE_CELLS", bound)
-            level = base_level(scene, pixel_width(400), 10**6)
+            level = base_level(scene, 400, 10**6)
             levels.append(level)
             count = len(base_cells(scene, exponents(scene.step, level)).index)
             assert count <= 2 * bound  # the estimate counts voxels, and cells at the rim of a body are partly filled
@@ -188,7 +188,8 @@ def test_few_gaussians_have_few_cells_and_it_is_said_why_there_are_no_more(monke
     assert len(forms[0].tree) < len(forms[1].tree) / 3
     assert closed_form_module.bound(forms[1]) == "the screen cannot tell smaller cells apart"
     monkeypatch.setattr(closed_form_module, "MAX_BASE_CELLS", 300)
-    assert closed_form_module.bound(forms[1]) == "memory for at most 300 cells"
+    fewer = closed_form_module.closed_form(scene, 10**6, 400)
+    assert closed_form_module.bound(fewer) == "memory for at most 300 cells"
 
 
 def test_thin_support_between_the_voxels_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -197,7 +198,7 @@ def test_thin_support_between_the_voxels_is_counted(monkeypatch: pytest.MonkeyPa
 
     scene = scene_of(analytic.checkerboard(32, 32), Tent(0.5, 0.1))
     monkeypatch.setattr(closed_form_module, "MAX_BASE_CELLS", 5000)
-    level = base_level(scene, pixel_width(400), 10**6)
+    level = base_level(scene, 400, 10**6)
     assert len(base_cells(scene, exponents(scene.step, level)).index) <= 5000
 
 
@@ -334,7 +335,7 @@ def test_cells_are_split_down_to_the_finest_that_voxels_and_pixels_tell(size: in
     monkeypatch.setattr(closed_form_module, "split", noted)
     cameras = default_views("train", 4, size=32)
     form.refined(cameras, render_views(scene, cameras, EVERYWHERE), closed_form_module.ROUND, closed_form_module.INRIA)
-    finest = max(2 * closed_form_module.MIN_CELL * pixel_width(size), 0.5 * form.voxel)
+    finest = max(2 * closed_form_module.MIN_CELL * pixel_width(size), 0.5 * form.step.min())
     assert len(asked) == closed_form_module.REFINE_ROUNDS
     assert min(edges.min() for edges in asked if len(edges)) >= finest
     assert any(len(edges) for edges in asked)

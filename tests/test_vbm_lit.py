@@ -12,7 +12,7 @@ from vvgt_cli.dvr.reference import normals
 from vvgt_cli.gaussians.harmonics import basis, view_colors
 from vvgt_cli.transfer.lighting import Lighting
 from vvgt_cli.vbm import METHODS, VbmOptions, initialise
-from vvgt_cli.vbm.lit import even, highlights, mean_normals
+from vvgt_cli.vbm.lit import at_points, even, highlights, mean_normals, normal_points
 from vvgt_cli.volume import Volume
 
 DIRECTIONS = sphere(2000)
@@ -104,7 +104,8 @@ def test_of_an_opaque_body_the_surface_counts():
 def test_normals_of_a_ball_point_along_the_radius():
     scene = smooth_ball().lit(Lighting())
     gaussians = made(scene, 2)
-    found = mean_normals(gaussians, scene)
+    points = normal_points(gaussians)
+    found = mean_normals(points, at_points(scene, points), scene.half)
     radius = gaussians.means / np.linalg.norm(gaussians.means, axis=1, keepdims=True)
     surface = np.linalg.norm(gaussians.means, axis=1) > 0.4
     assert np.median(-(found * radius).sum(axis=1)[surface]) > 0.99  # values fall outwards

@@ -13,15 +13,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vvgt_cli.batches.manifest import Manifest, Shard
-from vvgt_cli.batches.view_files import CONTACT, POINTS, Layout, View, field_points, start_points, thumbnails
+from vvgt_cli.batches.view_files import CONTACT, Layout, View, field_points, start_points, thumbnails
+from vvgt_cli.batches.views_in_blocks import draw_in_blocks, fields_of
 from vvgt_cli.cameras import Camera, default_views, orbit_views
-from vvgt_cli.cameras.boxed import boxed, render_in_box
+from vvgt_cli.cameras.boxed import render_in_box
 from vvgt_cli.cameras.files import read_frames
 from vvgt_cli.cameras.sets import FIELD_OF_VIEW, RADIUS, SET_VIEWS, SIZE
 from vvgt_cli.errors import DataError, NothingVisible, UsageError
 from vvgt_cli.field.blocked import Blocked
-from vvgt_cli.field.field import Picture
-from vvgt_cli.field.open import Wanted, automatic, beside, blocked
 from vvgt_cli.field.settings import BlockOptions
 from vvgt_cli.files import atomic_write, claim
 from vvgt_cli.images import write_png
@@ -35,11 +34,10 @@ from vvgt_cli.volume.space import shear_text
 from vvgt_cli.volume.types import IDENTITY
 
 if TYPE_CHECKING:
-    from vvgt_cli.dvr import RenderSettings, Scene
+    from vvgt_cli.dvr import Scene
 
 Draw = Callable[[Camera], np.ndarray]
 NO_POINTS = np.zeros((0, 3))
-TOGETHER = 1 << 24  # pixels of views of a volume in blocks that are made at once
 
 SPHERE, ORBIT = "sphere", "orbit"
 
@@ -196,7 +194,9 @@ def render_view_sets(request: ViewsRequest, console: Console | None = None) -> i
     run = Run(console or Console(), ConversionReport("render-views"))
     views, folders = request.cameras.make(), request.folders()
     with ExitStack() as stack:
-        fields = _fields(run, request, folders, stack)
+        functions = dict(zip(folders, request.tfs or (None,), strict=True))
+        size = views[0].camera.height
+        fields = fields_of(run, request.source, request.blocks, functions, size, request.renderer, stack)
         if fields is None:
             with run.stage("read") as stage:
                 sources = load_all(request.source, request.tfs or (None,))
@@ -222,26 +222,6 @@ def render_view_sets(request: ViewsRequest, console: Console | None = None) -> i
             if job.field is not None:
                 job.field.do.parts.remove()
     return total
-
-
-def _fields(run: Run, request: ViewsRequest, folders: list[Path], stack: ExitStack) -> list[Blocked] | None:
-    """A field in blocks for each function, None where the volume is read as a whole.
-
-    Raises:
-        UsageError: a renderer that needs it in memory.
-    """
-    options = request.blocks or automatic(request.source, run.console)
-    if options is None:
-        return None
-    if request.renderer != "cpu":
-        raise UsageError(f"--renderer {request.renderer}: needs the whole volume in memory; in blocks: cpu")
-    fields = []
-    for tf, folder in zip(request.tfs or (None,), folders, strict=True):
-        parts = stack.enter_context(beside(str(folder)))
-        source = replace(request.source, tf=tf)
-        wanted = Wanted(POINTS, request.cameras.size or SIZE)
-        fields.append(stack.enter_context(blocked(run, source, options, parts, wanted)))
-    return fields
 
 
 def _settings(request: ViewsRequest, views: Sequence[View], source: Source, content: str) -> dict[str, Any]:
@@ -299,7 +279,7 @@ def _work(run: Run, request: ViewsRequest, job: _Job, views: list[View]) -> None
     settings = RenderSettings(request.step, request.samples)
     draw: Draw | None = None
     if job.field is not None:
-        draw = _in_blocks(job.field, settings, [view.camera for view in job.pending])
+        draw = draw_in_blocks(job.field, settings, [view.camera for view in job.pending])
     elif job.pending or models:
         with run.stage("scene") as stage:
             scene = job.source.scene()
@@ -319,23 +299,6 @@ def _work(run: Run, request: ViewsRequest, job: _Job, views: list[View]) -> None
         if job.pending and draw is not None:
             _render(run, request, job, draw)
         _contact(run, job, layout, views)
-
-
-def _in_blocks(field: Blocked, settings: RenderSettings, cameras: Sequence[Camera]) -> Draw:
-    """What draws a volume in blocks, so many of the views that are to come at once as `TOGETHER` allows."""
-    axes = field.source.volume.axes
-    left = list(cameras)
-
-    def inside(camera: Camera) -> np.ndarray:
-        if not field.pictures:
-            many = max(TOGETHER // (camera.width * camera.height), 1)
-            field.expect([Picture(boxed(other, axes)[0], settings) for other in left[:many]])
-            del left[:many]
-        image = field.view(camera, settings)
-        field.forget(Picture(camera, settings))
-        return image
-
-    return render_in_box(inside, axes)
 
 
 def _points(run: Run, scene: Scene | Blocked, views: list[View]) -> tuple[np.ndarray, np.ndarray]:

@@ -41,7 +41,7 @@ _options = {
     "block_size": click.option(
         "--blocks", "block_size", metavar="SIZE|auto", callback=_size,
         help="Process the volume in blocks of SIZE voxels along an edge (a power of two); 'auto' chooses by memory. "
-        "Default: blocks only if the volume does not fit in memory.",
+        "Default: blocks if the volume is larger than 1 GiB or does not fit in memory.",
     ),
     "workers": click.option(
         "--workers", type=click.IntRange(1, 1024), default=1, show_default=True, metavar="N",

@@ -36,10 +36,11 @@ if TYPE_CHECKING:
     from vvgt_cli.field.reader import Layers, Place
 
 LAYOUT = 3  # of parts: one more whenever what is in them changes
+HELD = 1 << 30  # bytes of values: more are processed in blocks, with a tenth of the memory (docs/log/blocks.md)
 LARGE = 0.25  # of the free memory: a file of less is read as ever
 PROGRAM, A_CELL = 3e8, 300  # bytes: interpreter, libraries and kernels; a base cell in memory
 ZARR = {".zarray", ".zgroup", ".zattrs", "zarr.json"}  # files of which a folder has one
-RANGES = 0.15  # bytes a voxel: the map of empty space
+RANGES, LAYER_VOXEL = 0.15, 20  # bytes a voxel: the map of empty space, an optics grid
 LAYERED_BYTES = 60  # of a voxel of an optics grid while a block of it is there
 FEW_SAMPLES = 512  # bricks of layers: each is read for itself
 
@@ -219,31 +220,27 @@ def files_of(path: str) -> list[Path]:
 
 
 def automatic(request: SourceRequest, console: Console) -> BlockOptions | None:
-    """Blocks where nothing is asked for: of a volume that the memory does not hold; None: it is read as a whole.
+    """Blocks where nothing is asked for: of a large volume; None: it is read as a whole.
 
     Raises:
         DataError, UsageError: as `read_volume`.
     """
-    if not beyond_memory(request):
+    if not better_in_blocks(request):
         return None
-    console.say("more than the memory holds: in blocks (docs/scale.md)")
+    console.say("large: processed in blocks (docs/scale.md)")
     return BlockOptions()
 
 
-def beyond_memory(request: SourceRequest) -> bool:
-    """Whether a volume is better gone through in blocks: a large field that the memory does not hold with the rest.
-
-    Colours and channels together are not: blocks take one field.
+def better_in_blocks(request: SourceRequest) -> bool:
+    """Whether a volume in a file is large (`HELD`), or does not fit in memory with the rest.
 
     Raises:
         DataError, UsageError: as `read_volume`.
     """
-    from vvgt_cli.runs.layered import ALL, COLOR
-    from vvgt_cli.synth.sources import open_volume
     from vvgt_cli.vbm.closed_form import MAX_BASE_CELLS
 
     path, free = request.volume, free_memory()
-    if not isinstance(path, str) or free is None or path == "-" or request.read.component in (ALL, COLOR):
+    if not isinstance(path, str) or path == "-":
         return False
     inside = not os.path.exists(path) and not files_of(path) and ":/" in path
     place = path.rpartition(":/")[0] if inside else path
@@ -252,18 +249,24 @@ def beyond_memory(request: SourceRequest) -> bool:
     files = files_of(place)
     tiff = files and files[0].suffix.lower() in (".tif", ".tiff")
     packed = zarr or h5 or tiff  # few bytes may hold many voxels
-    if not packed and sum(file.stat().st_size for file in files) <= LARGE * free:
+    size = sum(file.stat().st_size for file in files)
+    if not packed and size < HELD and (free is None or size <= LARGE * free):
         return False
     try:
-        volume = open_volume(path, replace(request.read, stored=True, packed=True))
-    except SeveralComponents:  # colours, or to be chosen: said where it is read
+        content = open_parts(path, replace(request.read, stored=True, packed=True))
+    except SeveralComponents:  # to be chosen: said where it is read
         return False
-    if not is_file_backed(volume):
+    volumes = content.volumes
+    if not all(map(is_file_backed, volumes)):
         return False
-    own = volume.data.dtype.name not in ("uint8", "uint16", "float32")
-    held = volume.data.nbytes if isinstance(volume.data, Stored) else 0
-    voxels = volume.data.size
-    return held + (4 * own + RANGES) * voxels + PROGRAM + A_CELL * min(voxels, MAX_BASE_CELLS) > free
+    if sum(volume.data.nbytes for volume in volumes) >= HELD:
+        return True
+    if free is None:
+        return False
+    own = LAYER_VOXEL if len(volumes) > 1 else 4 * (volumes[0].data.dtype.name not in ("uint8", "uint16", "float32"))
+    held = sum(volume.data.nbytes for volume in volumes if isinstance(volume.data, Stored))
+    voxels = volumes[0].data.size
+    return held + (own + RANGES) * voxels + PROGRAM + A_CELL * min(voxels, MAX_BASE_CELLS) > free
 
 
 def needs_histogram(request: SourceRequest) -> bool:

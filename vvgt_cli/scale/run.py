@@ -13,7 +13,7 @@ from vvgt_cli.field.open import Wanted, beside, blocked
 from vvgt_cli.field.parts import CELLS, Parts
 from vvgt_cli.field.settings import BlockOptions
 from vvgt_cli.files import check_room
-from vvgt_cli.jit.ahead import DRAW, INIT, for_blocks
+from vvgt_cli.jit.ahead import DRAW, INIT, RENDER, for_blocks
 from vvgt_cli.progress import Console
 from vvgt_cli.runs.outputs import STDOUT, Output, claimed, write_text
 from vvgt_cli.runs.place import remarks
@@ -120,7 +120,7 @@ def make_parts(run: Run, request: ConvertRequest, options: BlockOptions, parts: 
         source, ply = field.source, ply_options(request, field.source)
         for line in remarks(source.volume, ply):
             run.console.say(line)
-        run.compile(for_blocks((*source.kernels(INIT), *DRAW)), source.kernel_type())
+        run.compile(for_blocks(source.kernels((RENDER, *INIT, *DRAW))), source.kernel_type())
         field.expect(scored_views(size))
         cells = field.cells(size, budget, most_cells(budget))
         assert cells.rays is not None
