@@ -1,0 +1,263 @@
+"""Mutation tests: ``python tests/mutants.py [--number N] [--seed N] [--only PATH:LINE:COLUMN] [--again]``.
+
+Changes one token of the package at random (`tests/mutant_sites.py`; the same draw for the same seed) and runs the
+tests that call the changed function, quickest first, until one fails. Which tests call a function is recorded by
+running every test file once (`tests/mutant_map.py`), and again when the file changes. Where no call is seen, as in
+kernels and in other processes, the tests of its callers are run, else the test files that name its module.
+
+Works in copies of the checkout in a temporary folder. Prints a line for each mutant and a summary; all results go to
+``OUT/mutants.json``, from which an interrupted run resumes. ``--again`` retries the mutants that no test noticed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import hashlib
+import importlib.util
+import json
+import os
+import random
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
+from functools import cached_property
+from pathlib import Path
+from threading import Lock
+from typing import Any
+
+from mutant_sites import Site, sites
+
+ROOT = Path(__file__).parent.parent
+KERNELS = Path("vvgt_cli", "__pycache__", "kernels")
+LEFT_OUT = {"architecture", "benchmarks", "browser", "docs_pages", "fuzz", "jit", "mutants", "viewers"}
+MOST_TESTS, MOST_SECONDS = 300, 240.0  # per mutant; seconds as in an unchanged checkout
+
+
+AGAIN = ("DISTURBED", "NOT NOTICED")
+
+
+def environment(**more: str) -> dict[str, str]:
+    """For tests: one thread each, kernels compiled on demand."""
+    threads = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    kept = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"}
+    return kept | threads | {"KERNELS_AHEAD": "0", **more}
+
+
+def file_of(test: str) -> str:
+    return test.split("::")[0]
+
+
+class Tests:
+    """Which tests call what.
+
+    Attributes:
+        seconds: of every test.
+        callers: tests of a function ("path:qualified name").
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.seconds: dict[str, float] = {}
+        self.callers: dict[str, list[str]] = defaultdict(list)
+
+    def learn(self, processes: int) -> None:
+        """Record the test files that have changed; read all records."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        files = [f for f in sorted(ROOT.glob("tests/test_*.py")) if not LEFT_OUT & {f.stem[5:], f.stem.split("_")[-1]}]
+        with ThreadPoolExecutor(processes) as pool:
+            for found in pool.map(self._calls, files):
+                for test, (seconds, functions) in found.items():
+                    self.seconds[test] = seconds
+                    for function in functions:
+                        self.callers[function.replace(".<locals>", "")].append(test)
+
+    def _calls(self, file: Path) -> dict[str, Any]:
+        kept = self.folder / f"{file.stem}-{hashlib.sha256(file.read_bytes()).hexdigest()[:8]}.json"
+        if not kept.exists():
+            print(f"recording what {file.name} calls", flush=True)
+            for old in self.folder.glob(f"{file.stem}-*.json"):
+                old.unlink()
+            path = os.pathsep.join([str(ROOT), str(ROOT / "tests")])
+            command = [sys.executable, "-m", "pytest", "-p", "mutant_map", "-p", "no:cacheprovider", str(file)]
+            subprocess.run(
+                command, cwd=ROOT, env=environment(PYTHONPATH=path, MUTANT_MAP=str(kept)), capture_output=True
+            )
+        found: dict[str, Any] = json.loads(kept.read_text()) if kept.exists() else {}
+        return found
+
+    @cached_property
+    def naming(self) -> dict[str, set[str]]:
+        """Functions ("path:qualified name") of the package that use a name."""
+        found: dict[str, set[str]] = defaultdict(set)
+        for path in (ROOT / "vvgt_cli").rglob("*.py"):
+            waiting: list[tuple[str, ast.AST]] = [("", ast.parse(path.read_text("utf-8")))]
+            while waiting:
+                inside, node = waiting.pop()
+                for child in ast.iter_child_nodes(node):
+                    within = inside
+                    if isinstance(child, ast.FunctionDef | ast.ClassDef):
+                        within = f"{inside}.{child.name}".lstrip(".")
+                    name = child.id if isinstance(child, ast.Name) else getattr(child, "attr", None)
+                    if name and inside:
+                        found[name].add(f"{path.relative_to(ROOT).as_posix()}:{inside}")
+                    waiting.append((within, child))
+        return found
+
+    def of(self, site: Site) -> list[str]:
+        """Tests to run, the quickest file first."""
+        wanted = {f"{site.path}:{site.function}"}
+        seen = set(wanted)
+        tests: set[str] = set()
+        while wanted and not tests:
+            for function in wanted:
+                tests |= set(self.callers.get(function, ()))
+            names = {function.split(":")[1].split(".")[-1] for function in wanted}
+            wanted = {f for name in names for f in self.naming.get(name, ())} - seen
+            seen |= wanted
+        if not tests:
+            module = site.path.removesuffix(".py").replace("/", ".")
+            naming = [f.name for f in ROOT.glob("tests/test_*.py") if module in f.read_text("utf-8")]
+            tests = {test for test in self.seconds if Path(file_of(test)).name in naming}
+        total: dict[str, float] = defaultdict(float)
+        for test in tests:
+            total[file_of(test)] += self.seconds[test]
+        chosen, spent = [], 0.0
+        for test in sorted(tests, key=lambda t: (self.seconds[t] > 5, total[file_of(t)], file_of(t), self.seconds[t])):
+            spent += self.seconds[test]
+            if len(chosen) < MOST_TESTS and spent < MOST_SECONDS:
+                chosen.append(test)
+        return chosen
+
+
+class Copy:
+    """A copy of the checkout that mutants are made in, one at a time."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        files = subprocess.run(
+            ["git", "ls-files", "-co", "--exclude-standard"], cwd=ROOT, capture_output=True, text=True
+        )
+        for name in files.stdout.splitlines():
+            if (ROOT / name).exists():
+                (folder / name).parent.mkdir(parents=True, exist_ok=True)
+                shutil.copy2(ROOT / name, folder / name)
+
+    def kernels(self) -> None:
+        """Restore those of the checkout: compiling a mutant removes the original's."""
+        shutil.rmtree(self.folder / KERNELS, ignore_errors=True)
+        shutil.copytree(ROOT / KERNELS, self.folder / KERNELS)
+
+    def run(self, site: Site, tests: list[str], seconds: float) -> dict[str, Any]:
+        """Try a mutant.
+
+        A test that fails is run without the mutant too, after the same tests; failing there as well is "DISTURBED".
+
+        Returns:
+            {"state": "noticed", "timeout", "DISTURBED" or "NOT NOTICED", "by": the test that failed, "seconds",
+            "tests": how many}.
+        """
+        file = self.folder / site.path
+        file.write_text(site.apply(file.read_text("utf-8")), "utf-8")
+        start = time.monotonic()
+        try:
+            state, by = self._attempt(tests, seconds) if tests else ("NOT NOTICED", "")
+        finally:
+            shutil.copy2(ROOT / site.path, file)
+        if by in tests and self._attempt(tests[: tests.index(by) + 1], seconds)[0] != "NOT NOTICED":
+            state = "DISTURBED"
+        return {"state": state, "by": by, "seconds": round(time.monotonic() - start, 1), "tests": len(tests)}
+
+    def _attempt(self, tests: list[str], seconds: float) -> tuple[str, str]:
+        self.kernels()
+        command = [sys.executable, "-m", "pytest", "-x", "-q", "--tb=no", "-rfE", "-p", "no:cacheprovider", *tests]
+        try:
+            done = self._wait(command, 4 * seconds + 240)
+        except subprocess.TimeoutExpired:
+            return "timeout", ""
+        if not done.returncode:
+            return "NOT NOTICED", ""
+        failed = [line for line in done.stdout.splitlines() if line.startswith(("FAILED ", "ERROR "))]
+        by = next((test for test in tests if any(f" {test} " in f"{line} " for line in failed)), "")
+        return "noticed", by or f"exit status {done.returncode}"
+
+    def _wait(self, command: list[str], limit: float) -> subprocess.CompletedProcess[str]:
+        env = environment(PYTHONPATH=str(self.folder))
+        process = subprocess.Popen(command, cwd=self.folder, env=env, text=True, start_new_session=True,
+                                   stdout=subprocess.PIPE, stderr=subprocess.STDOUT)  # fmt: skip
+        try:
+            out, _ = process.communicate(timeout=limit)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, 9)
+            process.communicate()
+            raise
+        return subprocess.CompletedProcess(command, process.returncode, out)
+
+
+def chosen(number: int, seed: int, only: list[str]) -> list[Site]:
+    """The mutants named, or a random ``number`` of all, without modules that import torch where it is not installed."""
+    everywhere: list[Site] = []
+    for path in sorted((ROOT / "vvgt_cli").rglob("*.py")):
+        if importlib.util.find_spec("torch") or "import torch" not in path.read_text("utf-8"):
+            everywhere += sites(ROOT, path)
+    if only:
+        return [site for site in everywhere if site.name in only]
+    random.Random(seed).shuffle(everywhere)
+    return everywhere[:number]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--number", type=int, default=200, help="how many (200)")
+    parser.add_argument("--seed", type=int, default=0, help="of the random choice (0)")
+    parser.add_argument("--only", action="append", default=[], metavar="PATH:LINE:COLUMN", help="this one; repeatable")
+    parser.add_argument("--again", action="store_true", help="those again that were not noticed")
+    parser.add_argument("--processes", type=int, default=2, help="mutants at a time (2)")
+    parser.add_argument("--out", type=Path, default=ROOT / "out" / "mutants", help="folder (out/mutants)")
+    args = parser.parse_args()
+    subprocess.run([sys.executable, "-m", "vvgt_cli.cli.main", "warmup"], cwd=ROOT, env=environment(), check=True)
+    tests = Tests(args.out / "map")
+    tests.learn(args.processes)
+    kept = args.out / "mutants.json"
+    results: dict[str, Any] = json.loads(kept.read_text()) if kept.exists() else {}
+    mutants = chosen(args.number, args.seed, args.only)
+    tried = {key for key, result in results.items() if not (args.again and result["state"] in AGAIN)}
+    lock = Lock()
+
+    def key(site: Site) -> str:
+        line = (ROOT / site.path).read_text("utf-8").splitlines()[site.line - 1]
+        return f"{site.path}:{site.function} {line.strip()} {site.column} {site.old} -> {site.new}"
+
+    def work(waiting: list[Site]) -> None:
+        with tempfile.TemporaryDirectory(prefix="vvgt-mutants-") as folder:
+            copy = Copy(Path(folder))
+            while True:
+                with lock:
+                    if not waiting:
+                        return
+                    site = waiting.pop(0)
+                names = tests.of(site)
+                result = copy.run(site, names, sum(tests.seconds[name] for name in names))
+                with lock:
+                    results[key(site)] = asdict(site) | result
+                    kept.write_text(json.dumps(results, indent=1))
+                    told = (
+                        f"{result['state']} {site.name} {site.old} -> {site.new} {result['by']} {result['seconds']} s"
+                    )
+                    print(told, flush=True)
+
+    waiting = [site for site in mutants if key(site) not in tried or args.only]
+    with ThreadPoolExecutor(args.processes) as pool:
+        for done in [pool.submit(work, waiting) for _ in range(args.processes)]:
+            done.result()
+    states = [results[key(site)]["state"] for site in mutants]
+    print(*(f"{states.count(state)} {state}" for state in ("noticed", "timeout", "DISTURBED", "NOT NOTICED")), sep=", ")
+
+
+if __name__ == "__main__":
+    main()
