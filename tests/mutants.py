@@ -117,11 +117,11 @@ class Tests:
         wanted = {f"{site.path}:{site.function}"}
         seen = set(wanted)
         tests: set[str] = set()
-        while wanted and not tests:
-            for function in wanted:
-                tests |= set(self.callers.get(function, ()))
-            names = {function.split(":")[1].split(".")[-1] for function in wanted}
-            wanted = {f for name in names for f in self.naming.get(name, ())} - seen
+        while wanted:
+            unseen = {function for function in wanted if not self.callers.get(function)}
+            tests.update(*(self.callers[function] for function in wanted - unseen))
+            names = {function.split(":")[1].split(".")[-1] for function in unseen}
+            wanted = {function for name in names for function in self.naming.get(name, ())} - seen
             seen |= wanted
         if not tests:
             module = site.path.removesuffix(".py").replace("/", ".")
