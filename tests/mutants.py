@@ -3,7 +3,7 @@
 Changes one token of the package at random (`tests/mutant_sites.py`; the same draw for the same seed) and runs the
 tests that call the changed function, the most specific first, until one fails. Which tests call a function is recorded
 by running every test file once (`tests/mutant_map.py`), and again when the file changes. Where no call is seen, as in
-kernels and in other processes, the tests of its callers are run, else the test files that name its module.
+kernels and in other processes, the tests of its callers are run, and the test files that import its module.
 
 Works in copies of the checkout in a temporary folder. Prints a line for each mutant and a summary; all results go to
 ``OUT/mutants.json``, from which an interrupted run resumes. ``--again`` retries the mutants that no test noticed.
@@ -106,6 +106,8 @@ class Tests:
                     within = inside
                     if isinstance(child, ast.FunctionDef | ast.ClassDef):
                         within = f"{inside}.{child.name}".lstrip(".")
+                    elif not inside and isinstance(child, ast.Assign) and isinstance(child.targets[0], ast.Name):
+                        within = child.targets[0].id  # a function made of others: `_tile = tiles_of(cast)`
                     name = child.id if isinstance(child, ast.Name) else getattr(child, "attr", None)
                     if name and inside:
                         found[name].add(f"{path.relative_to(ROOT).as_posix()}:{inside}")
@@ -113,7 +115,8 @@ class Tests:
         return found
 
     def of(self, site: Site) -> list[str]:
-        """Tests to run: those that call the fewest functions first, together with others of their files."""
+        """Tests to run, grouped by file: first those of files that import the module or its room, and of these the most
+        specific, which call the fewest functions."""
         wanted = {f"{site.path}:{site.function}"}
         seen = set(wanted)
         tests: set[str] = set()
@@ -123,13 +126,17 @@ class Tests:
             names = {function.split(":")[1].split(".")[-1] for function in unseen}
             wanted = {function for name in names for function in self.naming.get(name, ())} - seen
             seen |= wanted
-        if not tests:
-            module = site.path.removesuffix(".py").replace("/", ".")
-            naming = [f.name for f in ROOT.glob("tests/test_*.py") if module in f.read_text("utf-8")]
-            tests = {test for test in self.seconds if Path(file_of(test)).name in naming}
+        module = site.path.removesuffix(".py").replace("/", ".")
+        texts = {f"tests/{file.name}": file.read_text("utf-8") for file in ROOT.glob("tests/test_*.py")}
+        naming = {name for name, text in texts.items() if module in text}
+        if not self.callers.get(f"{site.path}:{site.function}"):
+            tests.update(test for test in self.seconds if file_of(test) in naming)
+        room = ".".join(module.split(".")[:2])
+        near = {name: (name not in naming) + (room not in text) for name, text in texts.items()}
+        order = {test: (near[file_of(test)], self.seconds[test] > 5, self.reach[test]) for test in tests}
         tests_of_file: dict[str, list[str]] = defaultdict(list)
         spent = 0.0
-        for test in sorted(tests, key=lambda test: (self.seconds[test] > 5, self.reach[test]))[:MOST_TESTS]:
+        for test in sorted(tests, key=order.__getitem__)[:MOST_TESTS]:
             spent += self.seconds[test]
             if spent < MOST_SECONDS:
                 tests_of_file[file_of(test)].append(test)
