@@ -11,9 +11,8 @@ import pytest
 from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.dvr import RenderSettings, Scene, render_view, render_view_reference, render_views
 from vvgt_cli.dvr.layout import BRICK
-from vvgt_cli.dvr.render import camera_arrays, ray_offsets
+from vvgt_cli.dvr.render import ray_offsets
 from vvgt_cli.dvr.runs import NEAR
-from vvgt_cli.dvr.segments import cast_segments
 from vvgt_cli.errors import UsageError
 from vvgt_cli.transfer.colormap import ColorMap
 from vvgt_cli.transfer.lighting import Lighting
@@ -384,33 +383,3 @@ def test_the_package_functions_render_too():
     scene = Scene.build(Volume(smooth(8)), TransferFunction("t", opacity, colors), 1.0)
     image = render_view(scene, camera(), FINE)
     np.testing.assert_allclose(image, render_view_reference(scene, camera(), step=1 / 32), atol=1e-3)
-
-
-def test_rays_along_an_axis_belong_to_one_block():
-    """Of blocks side by side, one casts the whole ray that runs along an axis, whichever side its face is on."""
-    scene = Scene.build(
-        Volume(np.random.default_rng(0).random((8, 8, 8), np.float32)), Function([0, 1], [0.1, 0.4]), 0.2
-    )
-    optics, pixels, middle = scene.optics, np.array([[2, 2]]), np.zeros((1, 2))
-    empty = np.zeros(tuple(-(-n // BRICK) for n in scene.values.shape), np.uint8)
-    for axis in range(3):
-        eye = np.array([0.03, -0.05, 0.04])
-        target = eye.copy()
-        eye[axis], target[axis] = 3.0, 0.0
-        up = np.roll([0.0, 0.0, 1.0], axis + 1)
-        camera = camera_arrays(scene, look_at(eye, target=target, up=up, width=5, height=5))
-
-        def cast(lower, upper, camera=camera):
-            faces, seen = np.array([lower, upper, [8.0, 8.0, 8.0]]), np.zeros((1, 1, 4), np.float32)
-            cast_segments(scene.voxels, optics, empty, faces, np.zeros(3), *camera, 0.5, pixels, middle, seen)
-            return seen[0, 0]
-
-        whole = cast([-np.inf] * 3, [np.inf] * 3)
-        assert 0.1 < whole[3] < 1
-        for across in {0, 1, 2} - {axis}:
-            place = camera[0][across]
-            for face, sides in ((place - 0.5, (0, 1)), (place + 0.5, (1, 0)), (place, (0, 1))):
-                lower, upper = np.full((2, 3), -np.inf), np.full((2, 3), np.inf)
-                upper[0, across] = lower[1, across] = face
-                for side, share in enumerate(sides):
-                    np.testing.assert_array_equal(cast(lower[side], upper[side]), share * whole)

@@ -14,7 +14,6 @@ import tifffile
 import vvgt_cli as library
 from tests.test_labels import SMALL, balls
 from vvgt_cli.dvr.layers import Layer, common_grid, grid_of, same_grid
-from vvgt_cli.dvr.place import place
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import read_ply
 from vvgt_cli.runs.layered import ALL, LayerRequest, open_parts, parse_layer
@@ -388,18 +387,3 @@ def test_several_functions_over_colours_channels_and_layers(vvgt, tmp_path: Path
         made = [read_ply(str(path)) for path in sorted(tmp_path.glob("o_*.ply"))]
         assert len(made) == 2
         assert not np.array_equal(made[0][0].opacity_logits, made[1][0].opacity_logits)
-
-
-def test_a_linear_field_is_placed_exactly_and_added() -> None:
-    z, y, x = np.indices((5, 6, 7), np.float32)
-    values = np.stack([1 + 2 * x + 3 * y + 5 * z, 7 - x], axis=-1)
-    matrix = np.array([[0.0, 0.5, 0.2, 5.0], [0.7, 0.0, 0.1, 3.0], [0.1, 0.3, 0.0, 0.5]])
-    out = np.full((3, 4, 4, 2), 10, np.float32)
-    place(values, matrix, 100.0, out)
-    k, j, i = np.indices(out.shape[:3])
-    x, y, z = np.einsum("rc,ckji->rkji", matrix, np.stack([i, j, k, np.ones_like(i)]))
-    inside = (y <= 5.5) & (x <= 6.5) & (z <= 4.5)
-    assert 0 < inside.sum() < inside.size
-    x, y = np.minimum(x, 6), np.minimum(y, 5)  # in the rim of half a voxel the edge's
-    expected = np.stack([1 + 2 * x + 3 * y + 5 * z, 7 - x], axis=-1)
-    np.testing.assert_allclose(out, 10 + np.where(inside[..., None], expected, 100), rtol=1e-6)
