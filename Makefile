@@ -1,8 +1,8 @@
-# make test | quick | lint | long | viewers | page | model | ci
+# make test | quick | lint | long | mutants | viewers | page | model | ci
 VENV ?= .venv-test
 PYTHON ?= python3
 
-.PHONY: test quick lint format long fuzz viewers page model ci
+.PHONY: test quick lint format long fuzz mutants viewers page model ci
 
 $(VENV)/bin/pytest: pyproject.toml constraints.txt
 	[ -x $(VENV)/bin/python ] || $(PYTHON) -m venv $(VENV)
@@ -36,6 +36,10 @@ long: $(VENV)/bin/pytest
 # 100,000 damaged files for every reader (part of `long`); what is found lies in out/fuzz.
 fuzz: $(VENV)/bin/pytest
 	$(VENV)/bin/python tests/fuzz.py --inputs 100000 --save out/fuzz
+
+# 200 single-token changes of the package, each of which a test should notice: about an hour on two cores.
+mutants: $(VENV)/bin/pytest
+	$(VENV)/bin/python tests/mutants.py --number 200
 
 # Files in web viewers (part of `long`): needs Chromium, node and npm; packages go to a cache folder.
 viewers: $(VENV)/bin/pytest

@@ -10,6 +10,7 @@ import hypothesis
 import pytest
 
 from vvgt_cli.cli.main import run
+from vvgt_cli.resources import set_memory
 
 hypothesis.settings.register_profile("default", max_examples=100, deadline=None)
 hypothesis.settings.register_profile("long", max_examples=10_000, deadline=None)
@@ -28,7 +29,8 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_collection_finish(session: pytest.Session) -> None:
     """Compile kernels on all cores, before the tests ask for them one by one."""
     parallel = hasattr(session.config, "workerinput")  # of pytest-xdist, whose first process has compiled them
-    if len(session.items) > 20 and not session.config.getoption("collectonly") and not parallel:
+    wanted = os.environ.get("KERNELS_AHEAD") != "0"  # tests/mutants.py: a mutant's are compiled as they are asked for
+    if wanted and len(session.items) > 20 and not session.config.getoption("collectonly") and not parallel:
         compile_kernels()
 
 
@@ -81,7 +83,7 @@ class Result:
 
 
 @pytest.fixture
-def vvgt(capfdbinary: pytest.CaptureFixture[bytes]) -> Callable[..., Result]:
+def vvgt(capfdbinary: pytest.CaptureFixture[bytes]) -> Iterator[Callable[..., Result]]:
     """Run a command line in this process; output is captured at the file descriptors, so VTK's is seen too."""
 
     def call(*args: object) -> Result:
@@ -90,4 +92,5 @@ def vvgt(capfdbinary: pytest.CaptureFixture[bytes]) -> Callable[..., Result]:
         out, err = capfdbinary.readouterr()
         return Result(code, out, err.decode())
 
-    return call
+    yield call
+    set_memory(None)  # `--memory` is of the whole process

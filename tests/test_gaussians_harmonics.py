@@ -29,6 +29,7 @@ from vvgt_cli.gaussians.types import HARMONICS
 from vvgt_cli.network.damp import interpolate
 from vvgt_cli.network.prepare import pack
 from vvgt_cli.splat import render
+from vvgt_cli.splat.harmonics import deposit
 
 DEGREES = (1, 2, 3)
 
@@ -311,3 +312,15 @@ def test_networks_refuse_them_in_one_line():
     with pytest.raises(DataError, match=r"degree 3: a network knows only colours .* degree 0") as caught:
         pack(cloud())
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_slopes_of_one_channel_alone_are_deposited(degree):
+    """Those of the colour times the terms that it is a sum of, 1 first."""
+    rng, eye = np.random.default_rng(3), np.array([2.0, -1.0, 0.5])
+    means, values = rng.uniform(-1, 1, (5, 3)).astype(np.float32), np.array([*np.eye(3), [0, 0, 0], [1, -2, 3]])
+    toward = (means - eye) / np.linalg.norm(means - eye, axis=1, keepdims=True)
+    terms = np.concatenate([np.ones((5, 1)), basis(toward, degree)], axis=1)
+    out = np.ones((5, terms.shape[1], 3))
+    deposit(means, eye, values, out)
+    np.testing.assert_allclose(out, 1 + terms[:, :, None] * values[:, None, :], atol=1e-6)

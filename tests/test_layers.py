@@ -226,6 +226,8 @@ def test_channels_in_their_own_colours_add_up(vvgt, tmp_path: Path) -> None:
     grid = grid_of(source.layers, source.volume)
     assert (grid[..., 0] > 0).tolist() == (values[:, 0] > 0).tolist()
     np.testing.assert_array_equal(grid[..., 1], grid[..., 2])
+    told = json.loads(vvgt("info", tmp_path / "a.ome.tif", "--channel", "all", "--json").out)
+    assert told["channels"] == 2
     assert vvgt("init", tmp_path / "a.ome.tif", "-o", tmp_path / "a.ply").code == 2  # one, or all
     done = vvgt("init", tmp_path / "a.ome.tif", "--channel", "all", *SMALL[:4], "-o", tmp_path / "a.ply")
     assert done.code == 0, done.err

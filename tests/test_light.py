@@ -151,6 +151,17 @@ def test_the_grid_of_shadows_converges_to_rays_from_every_place():
     assert errors[-1] < errors[-3] / 6  # second order
 
 
+def test_shadows_of_the_lowest_and_the_highest_value_are_as_deep_as_any():
+    tf = function([0, 1], [0.05, 0.05])
+    found = []
+    for value in (0.0, 0.5, 1.0):
+        scene = Scene.build(Volume(np.full((16, 16, 16), value, np.float32)), tf, 1.0)
+        found.append(transmittance(scene, np.array([ABOVE, SLANTED]), 4, step=0.5, offset=1.0))
+    assert found[1].min() < 0.7
+    np.testing.assert_allclose(found[0], found[1], atol=1e-5)
+    np.testing.assert_allclose(found[2], found[1], atol=1e-5)
+
+
 def test_an_opaque_wall_throws_a_shadow():
     data = np.zeros((24, 24, 24), np.float32)
     data[16:19, :, :12] = 1.0  # a shelf over half of a block

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from vvgt_cli.cameras import orbit_views
+from vvgt_cli.cameras.files import transforms_json
+from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import Gaussians, PlyOptions, write_ply
 from vvgt_cli.images.movies import write_movie
@@ -70,10 +73,10 @@ def test_a_gif_of_an_orbit_repeats_without_a_jump(ply, tmp_path, vvgt):
 
 def test_an_mp4_of_an_orbit_over_white(ply, tmp_path, vvgt):
     pytest.importorskip("imageio_ffmpeg")
-    result = vvgt("render", ply[1], "--orbit", 10, "--size", 65, "--background", 1, 1, 1, "-o", tmp_path / "turn.mp4")
+    result = vvgt("render", ply[1], "--orbit", 10, "--size", 63, "--background", 1, 1, 1, "-o", tmp_path / "turn.mp4")
     assert result.code == 0, result.err
     pictures, about = mp4(tmp_path / "turn.mp4")
-    assert pictures.shape == (10, 66, 66, 3)
+    assert pictures.shape == (10, 64, 64, 3)
     assert about["fps"] == 25
     assert about["codec"] == "h264"
     assert pictures[:, :3, :3].min() > 0.95  # corners are background
@@ -85,6 +88,14 @@ def test_movies_are_not_replaced_unasked(ply, tmp_path, vvgt):
     assert "exists" in vvgt("render", ply[1], "--orbit", 2, "-o", tmp_path / "turn.gif").error
     assert vvgt("render", ply[1], "--orbit", 2, "--overwrite", "-o", tmp_path / "turn.gif").code == 0
     assert len(gif(tmp_path / "turn.gif")[0]) == 2
+
+
+def test_a_movie_has_one_size(ply, tmp_path, vvgt):
+    views = [replace(look_at((3, 0, 0), width=width, height=16), name=f"v{width}") for width in (16, 18)]
+    (tmp_path / "views.json").write_text(transforms_json(views))
+    result = vvgt("render", ply[1], "--camera", tmp_path / "views.json", "-o", tmp_path / "a.gif")
+    assert result.code == 2
+    assert "views of several sizes" in result.error
 
 
 def test_bad_calls_are_one_line(ply, tmp_path, vvgt, monkeypatch):

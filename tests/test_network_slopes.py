@@ -67,6 +67,16 @@ def test_columns_say_direction_agreement_and_size():
     assert np.allclose(np.abs(shown[seen, 10]), 1, atol=1e-3)  # one view always agrees with itself
 
 
+def test_what_no_view_shows_has_neither_slope_nor_error():
+    gaussians, cameras, images = scene(count=20, views=4)
+    gaussians = unpack(pack(gaussians))
+    gaussians.means[7] = (0, 0, 90)
+    row = slope_rows(gaussians, cameras, images)[7]
+    assert not row[:13].any()
+    np.testing.assert_allclose(row[13:18], np.log(1e-4), rtol=1e-6)
+    np.testing.assert_allclose(row[18:20], [np.log(0.01), 0], atol=1e-6)
+
+
 def test_halved_views_show_what_whole_ones_do():
     gaussians, _, _ = scene(count=50)
     cameras = default_views("train", 2, size=64)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from vvgt_cli.cameras import default_views
+from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.descent import OptimizeOptions, optimize
 from vvgt_cli.descent.densify import DENSE, FAINTEST, SHRINK, SLOPE, Densified, densify
 from vvgt_cli.descent.loop import step
@@ -137,3 +138,9 @@ def test_screen_slopes_are_the_twins():
     slopes = screen_slopes(p, moments(p, g.colors, render(g, camera, projection=p), grad))
     twin = np.linalg.norm(image_gradients(g, camera, grad.astype(np.float64))[0], axis=1)
     assert (np.abs(slopes - twin) > 5e-3 * (twin + 0.01 * twin.mean())).mean() < 0.05
+
+
+def test_the_extent_is_that_of_the_farthest_camera():
+    eyes = ((3.0, 0.0, 0.0), (0.0, 3.0, 0.0), (0.0, -9.0, 0.0))  # of which the middle is (1, -2, 0)
+    state = Densified(cloud(), [look_at(eye) for eye in eyes], OptimizeOptions())
+    assert state.extent == pytest.approx(1.1 * np.hypot(1, 7))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -97,6 +99,17 @@ def test_alpha_is_fitted_where_colour_says_nothing(scene):
     errors = [np.mean([np.mean((render(g, c) - i)[..., 3] ** 2) for c, i in zip(CAMERAS, images, strict=True)])
               for g in (dark, result)]  # fmt: skip
     assert errors[1] < errors[0]
+
+
+@pytest.mark.parametrize("degree", [None, 1])
+def test_colours_are_negative_only_where_harmonics_may_lighten_them(degree):
+    start = truth()
+    start = replace(start, harmonics=None if degree is None else np.zeros((len(start), 3, 3), np.float32))
+    state = OwnFrame(start, CAMERAS)
+    for _ in range(20):  # towards a picture darker than black
+        image = render(state.gaussians(), CAMERAS[0])
+        state.descend(CAMERAS[0], state.project(CAMERAS[0]), image, np.full_like(image, 1e-3), 0.05, 0.0, 20.0)
+    assert (state.arrays[3].min() < 0) == (degree is not None)
 
 
 @pytest.mark.parametrize("method", ["frame", "adam"])

@@ -175,6 +175,24 @@ def test_glb_is_what_the_specification_asks_for():
     assert sum(view["byteLength"] for view in document["bufferViews"]) == document["buffers"][0]["byteLength"]
 
 
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_glb_names_every_harmonic_as_the_specification_does(degree):
+    """Degree l has the coefficients 0 to 2 l, in the order of the columns of a `.ply`."""
+    plain = cloud(5)
+    terms = np.random.default_rng(1).normal(size=(5, (degree + 1) ** 2 - 1, 3)).astype(np.float32)
+    content = encoded(format_of("a.glb"), replace(plain, harmonics=terms if degree else None), PlyOptions(), "a.glb")
+    (size,) = struct.unpack_from("<I", content, 12)
+    document, binary = json.loads(content[20 : 20 + size]), content[28 + size :]
+    attributes = document["meshes"][0]["primitives"][0]["attributes"]
+    found = {name.split(":")[1]: index for name, index in attributes.items() if ":SH_" in name}
+    names = [f"SH_DEGREE_{band}_COEF_{m}" for band in range(degree + 1) for m in range(2 * band + 1)]
+    assert sorted(found) == sorted(names)
+    for name, expected in zip(names[1:], np.moveaxis(terms, 1, 0), strict=True):
+        view = document["bufferViews"][document["accessors"][found[name]]["bufferView"]]
+        values = np.frombuffer(binary, "<f4", 15, view["byteOffset"]).reshape(5, 3)
+        np.testing.assert_allclose(np.sort(values, axis=0), np.sort(expected, axis=0), atol=1e-6)
+
+
 def test_a_usd_stage_is_turned_upright():
     usd = pytest.importorskip("pxr.Usd")
     from pxr import Sdf, UsdGeom

@@ -20,9 +20,10 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 
-from vvgt_cli.errors import DataError
+from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
 from vvgt_cli.share.server import Part, Site, served
+from vvgt_cli.tasks.view import expanded
 
 ROOT = Path(__file__).parent.parent
 
@@ -207,6 +208,17 @@ def test_a_volume_is_converted_and_shown(tmp_path):
     assert len(stored) > 10
     assert header.up == "z"  # +z is up where the volume does not say
     assert list(tmp_path.iterdir()) == [tmp_path / "got.ply"]
+
+
+def test_globs_become_files_of_gaussians_in_the_order_of_their_numbers(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("a_10.ply", "a_2.ply", "[x].ply", "slice_1.tif", "slice_2.tif"):
+        Path(name).write_bytes(b"")
+    assert expanded(["a_*.ply"]) == ["a_2.ply", "a_10.ply"]
+    assert expanded(["[x].ply", "a_?.ply", "none.ply"]) == ["[x].ply", "a_2.ply", "none.ply"]
+    assert expanded(["slice_*.tif"]) == ["slice_*.tif"]  # a volume
+    with pytest.raises(UsageError, match="no such files"):
+        expanded(["b_*.ply"])
 
 
 @pytest.mark.parametrize(

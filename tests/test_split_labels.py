@@ -16,7 +16,7 @@ from vvgt_cli.conversion.stages import ViewingConditions
 from vvgt_cli.dvr import RenderSettings
 from vvgt_cli.field.field import Resident
 from vvgt_cli.gaussians import Gaussians, read_ply
-from vvgt_cli.runs.owners import hidden_in, owners
+from vvgt_cli.runs.owners import Hidden, hidden_in, owners
 from vvgt_cli.runs.score import score_test_views
 from vvgt_cli.runs.source import SourceRequest, load
 from vvgt_cli.transfer.labels import distinct
@@ -162,3 +162,19 @@ def test_what_is_hidden(cut: bool) -> None:
     centre[1] = -0.95 / np.sqrt(3)  # on the outer surface, opposite to the cut
     points = Gaussians(centre, centre * 0 - 3, np.tile([1.0, 0, 0, 0], (2, 1)), np.zeros(2), centre)
     np.testing.assert_array_equal(hides.whether(points), [True, False])
+
+
+def test_of_a_hidden_label_its_surface_counts():
+    """Each voxel hidden alone: its label is hidden somewhere where a neighbour is of another, or the box ends."""
+    numbers = np.ones((5, 6, 7), np.uint8)
+    numbers[1, 4, 3] = numbers[3, 2, 2] = numbers[4, 0, 6] = 2
+    around = np.pad(numbers, 1)
+    for z, y, x in np.ndindex(numbers.shape):
+        cells = np.zeros(numbers.shape, bool)
+        cells[z, y, x] = True
+        hidden = Hidden(cells, np.ones(3), np.full(3, 0.5), np.ones(3))
+        number, middle = numbers[z, y, x], np.array([z, y, x]) + 1
+        moves = np.concatenate([np.eye(3, dtype=int), -np.eye(3, dtype=int)])
+        surface = any(around[tuple(middle + move)] != number for move in moves)
+        assert hidden.any_of(Volume(numbers), number) == surface, (z, y, x)
+        assert not hidden.any_of(Volume(numbers), 3 - number)

@@ -28,9 +28,7 @@ from vvgt_cli.splat.constants import DILATION, NEAR
 from vvgt_cli.synth.shapes import make_shape
 from vvgt_cli.training import LossConfig, SceneConfig, TrainConfig
 from vvgt_cli.training import scenes as training_scenes
-from vvgt_cli.training.scenes import make_scenes, merge_bands, prepare_scenes, recipes
-from vvgt_cli.transfer.readers import minimal
-from vvgt_cli.transfer.suggest import Suggestion
+from vvgt_cli.training.scenes import make_scenes, prepare_scenes, recipes
 from vvgt_cli.volume.nrrd_write import write_nrrd
 
 torch = pytest.importorskip("torch")
@@ -219,21 +217,6 @@ def test_a_scene_that_shows_next_to_nothing_is_left_out(data, monkeypatch):
     monkeypatch.setattr(training_scenes, "_render", render_or_nothing)
     found = prepare_scenes(data, scenes, Console(quiet=True))
     assert [len(scenes) for scenes in found.values()] == [1, 2, 2]
-
-
-def test_functions_together_show_each_where_it_is():
-    band = lambda lo, hi, opacity: Suggestion(  # noqa: E731
-        "band", np.array([lo, hi]), np.array([opacity, opacity]), np.array([[1.0, 0, 0], [0, 1.0, 0]]), 2.0, 0.1
-    )
-    alone = minimal.read(merge_bands([band(0, 1, 0.1)], [1.0]), "t")
-    assert np.allclose(alone.opacity(np.array([0.25, 0.5])), 0.1)
-    denser = minimal.read(merge_bands([band(0, 1, 0.1)], [3.0]), "t")
-    assert np.allclose(denser.opacity(np.array([0.5])), 1 - 0.9**3)
-    both = minimal.read(merge_bands([band(0, 1, 0.1), band(0, 1, 0.3)], [1.0, 1.0]), "t")
-    assert np.allclose(both.opacity(np.array([0.5])), 0.4)
-    solid = merge_bands([band(0, 1, 0.9), band(0, 1, 0.9)], [8.0, 8.0])
-    assert max(point["opacity"] for point in solid["points"]) < 1
-    assert solid["opacity_unit_distance"] == 2.0
 
 
 def test_scenes_hold_what_the_closed_form_and_the_ray_caster_give(data):

@@ -87,6 +87,33 @@ def test_a_ramp_is_lit_as_its_normal_says(method):
         np.testing.assert_allclose(seen, np.broadcast_to(expected, seen.shape), atol=0.02)
 
 
+@pytest.mark.parametrize("degree", [0, 2, 3])
+@pytest.mark.parametrize("method", METHODS)
+def test_a_ramp_shines_as_its_normal_says(method, degree):
+    """Where all normals and colours are alike, a cell has the harmonics of its normal, to the last digits."""
+    ramp = np.broadcast_to(np.linspace(0, 1, 12)[:, None, None], (12, 12, 12)).astype(np.float32)
+    color = np.array([0.2, 0.4, 0.3])
+    dark = Scene.build(Volume(ramp), function([0, 1], [0.2, 0.2], [color] * 2), 1.0)
+    normal = np.diag([0.0, 0.0, 1.0])[None]
+    lights = np.array([SLANTED, ABOVE])
+    shone, shone_terms = highlights(normal, lights, np.ones((1, 2)), 3.0, degree)
+    arriving = 0.1 + 0.3 * (lights[:, 2] @ np.ones(2))
+    fixed = made(dark.lit(Lighting(False, (SLANTED, ABOVE), 0.1, 0.3, 0.2, 3.0)), degree, method)
+    expected = arriving * color + 0.2 * shone
+    np.testing.assert_allclose(fixed.colors, np.broadcast_to(expected, fixed.colors.shape), atol=1e-6)
+    spread, spread_across = even(normal, 1.0, degree)
+    peak, peak_across = even(normal, 3.0, degree)
+    head = made(dark.lit(Lighting(True, (), 0.1, 0.3, 0.2, 3.0)), degree, method)
+    expected = (0.1 + 0.3 * spread) * color + 0.2 * peak
+    np.testing.assert_allclose(head.colors, np.broadcast_to(expected, head.colors.shape), atol=1e-6)
+    if degree:
+        both = 0.2 * shone_terms[0, :, None] * np.ones(3)
+        np.testing.assert_allclose(fixed.harmonics, np.broadcast_to(both, fixed.harmonics.shape), atol=1e-6)
+        both = 0.3 * spread_across[0, :, None] * color + 0.2 * peak_across[0, :, None]
+        np.testing.assert_allclose(head.harmonics[:, 3:8], np.broadcast_to(both, (len(head), 5, 3)), atol=1e-6)
+        assert not head.harmonics[:, :3].any()
+
+
 def test_of_an_opaque_body_the_surface_counts():
     """Inside a body of one value there is no gradient, and ambient light alone; nobody sees that."""
     z, y, x = np.indices((24, 24, 24)) - 11.5

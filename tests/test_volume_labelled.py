@@ -124,6 +124,19 @@ def test_netcdf_scaling_and_missing_values(tmp_path: Path) -> None:
         read_volume(str(path), ReadOptions(array="none"))
 
 
+@pytest.mark.parametrize("kind", ["i1", "u1"])
+def test_netcdf_bytes_have_no_value_for_unwritten(tmp_path: Path, kind: str) -> None:
+    """Every byte is a value, of the library's default fill too (-127, 255), unless the file says otherwise."""
+    every = np.arange(256, dtype="u1").view(kind).reshape(4, 8, 8)
+    with netCDF4.Dataset(tmp_path / "v.nc", "w") as file:
+        for name, size in zip("zyx", every.shape, strict=True):
+            file.createDimension(name, size)
+        file.createVariable("bytes", kind, ("z", "y", "x"))[:] = every
+    volume = read_volume(str(tmp_path / "v.nc"))
+    assert volume.data.dtype == kind
+    assert np.array_equal(volume.data, every)
+
+
 def test_netcdf_time_steps_are_chosen_by_component(tmp_path: Path) -> None:
     path = tmp_path / "v.nc"
     with netCDF4.Dataset(path, "w") as file:

@@ -55,6 +55,15 @@ def test_stored_value_scaling(tmp_path: Path, version: int, suffix: str, slope: 
     np.testing.assert_allclose(data_values(volume), nib.load(source).get_fdata(), rtol=1e-12)
 
 
+@pytest.mark.parametrize("version", [1, 2])
+@pytest.mark.parametrize("shape", [(5,), (5, 4), (5, 4, 3, 1, 1, 1, 1)])
+def test_one_to_seven_axes(tmp_path: Path, shape: tuple[int, ...], version: int) -> None:
+    values = np.arange(np.prod(shape), dtype="u1").reshape(shape)
+    volume = read_volume(save(tmp_path / "v.nii", values, version=version))
+    assert volume.dims == (*shape, 1, 1)[:3]
+    np.testing.assert_array_equal(data_values(volume).ravel(), values.ravel())
+
+
 @pytest.mark.parametrize("slope", [0.0, float("nan")])
 def test_slope_zero_is_no_scaling(tmp_path: Path, slope: float) -> None:
     source = save(tmp_path / "v.nii", VALUES.astype("i2"))

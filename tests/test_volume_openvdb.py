@@ -19,6 +19,8 @@ from vvgt_cli.volume.bricks import BrickArray
 from vvgt_cli.volume.components import magnitude
 from vvgt_cli.volume.openvdb import codec
 from vvgt_cli.volume.openvdb.cursor import Cursor
+from vvgt_cli.volume.openvdb.layout import brick_array
+from vvgt_cli.volume.openvdb.tree import Tree
 
 ARCHIVE = Path(__file__).parent / "fixtures" / "vdb" / "grids.tar.xz"
 
@@ -116,6 +118,20 @@ def test_slabs_are_the_parts_of_the_whole(folder: Path) -> None:
         with pytest.raises(IndexError):
             lazy[len(whole)]
         np.testing.assert_array_equal(lazy[::2, 1:3], whole[::2, 1:3])
+
+
+def test_leaves_beyond_the_box_are_left_out() -> None:
+    """As where none of their voxels is active."""
+    origins = np.array([(x, y, z) for z in (0, 8) for y in (-8, 0, 8) for x in (0, 8, 16)], np.int64)
+    leaves = np.arange(len(origins) * 512, dtype=np.float32).reshape(-1, 8, 8, 8)
+    tree = Tree(np.float32([-1]), [], origins, np.full((len(origins), 64), 255, np.uint8), leaves)
+    for lo, hi in (((0, 0, 0), (7, 7, 7)), ((3, -8, 0), (12, 7, 7)), ((8, 8, 8), (30, 15, 15))):
+        found = np.asarray(brick_array(tree, np.array(lo), np.array(hi), None, "a.vdb", "grid 'a'"))
+        whole = np.full((40, 40, 40), -1, np.float32)  # z, y, x from -8
+        for (x, y, z), leaf in zip(origins + 8, leaves, strict=True):
+            whole[z : z + 8, y : y + 8, x : x + 8] = leaf.T
+        box = tuple(slice(a + 8, b + 9) for a, b in zip(lo[::-1], hi[::-1], strict=True))
+        np.testing.assert_array_equal(found, whole[box])
 
 
 def test_statistics_do_not_lay_the_array_out(folder: Path) -> None:

@@ -189,7 +189,7 @@ def legacy(body: bytes, coding: str = "BINARY", kind: str = "STRUCTURED_POINTS",
 
 def test_legacy_sections_written_by_hand(tmp_path: Path) -> None:
     bits, colours = RNG.integers(0, 2, 60).astype("u1"), RNG.integers(0, 255, (60, 4)).astype("u1")
-    body = b"FIELD FieldData 1\nnote 1 2 string\n" + b"\xc5hello\xc2by\n"
+    body = b"FIELD FieldData 2\nempty 1 0 float\n\nnote 1 2 string\n" + b"\xc5hello\xc2by\n"
     body += b"POINT_DATA 60\nSCALARS mask bit 1\nLOOKUP_TABLE table\n" + np.packbits(bits).tobytes() + b"\n"
     body += b"LOOKUP_TABLE table 2\n" + bytes(8) + b"\nCOLOR_SCALARS rgba 4\n" + colours.tobytes() + b"\n"
     body += b"METADATA\nINFORMATION 0\n\nTENSORS t float\n" + np.arange(540, dtype=">f4").tobytes() + b"\n"
