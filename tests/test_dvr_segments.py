@@ -43,11 +43,16 @@ def test_rays_along_an_axis_belong_to_one_block():
 
 
 def test_a_linear_field_is_placed_exactly_and_added() -> None:
-    z, y, x = np.indices((5, 6, 7), np.float32)
+    z, y, x = np.indices((5, 6, 7), float)
     values = np.stack([1 + 2 * x + 3 * y + 5 * z, 7 - x], axis=-1)
     matrix = np.array([[0.0, 0.5, 0.2, 5.0], [0.7, 0.0, 0.1, 3.0], [0.1, 0.3, 0.0, 0.5]])
-    out = np.full((3, 4, 4, 2), 10, np.float32)
-    place(values, matrix, 100.0, out)
+    dims, none = np.array([7, 6, 5]), np.zeros(3, np.int64)
+    out = np.full((3, 4, 4, 2), 10.0)
+    place(values, matrix, none, none, dims, 100.0, out)
+    lo, first = np.array([1, 2, 1]), np.array([4, 0, 0])  # a part of the target from a part of the layer
+    part = np.full((2, 2, 3, 2), 10.0)
+    place(np.ascontiguousarray(values[:, :, 4:]), matrix, lo, first, dims, 100.0, part)
+    np.testing.assert_array_equal(part, out[1:3, 2:4, 1:4])
     k, j, i = np.indices(out.shape[:3])
     x, y, z = np.einsum("rc,ckji->rkji", matrix, np.stack([i, j, k, np.ones_like(i)]))
     inside = (y <= 5.5) & (x <= 6.5) & (z <= 4.5)
