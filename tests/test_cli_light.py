@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import vvgt_cli
+from vvgt_cli import Look
 from vvgt_cli.gaussians import read_ply
 from vvgt_cli.gaussians.ply import _rows
 from vvgt_cli.transfer.lighting import Lighting, LightOptions
@@ -129,14 +130,14 @@ def test_what_cannot_be_is_refused_before_the_work(folder, vvgt):
 def test_the_library_takes_names_directions_and_options():
     function = {"points": FUNCTION["points"]}
     few = {"max_gaussians": 100, "size": 40, "steps": 0}
-    by_name = vvgt_cli.convert(SOURCE, function, light="headlight", **few)
+    by_name = vvgt_cli.convert(SOURCE, Look(function, light="headlight"), few)
     assert by_name.field.source.lighting == Lighting()
     assert by_name.gaussians.degree == 2
     assert by_name.normals().shape == by_name.gaussians.means.shape
-    by_direction = vvgt_cli.convert(SOURCE, function, light=(0, 0, 1), **few)
+    by_direction = vvgt_cli.convert(SOURCE, Look(function, light=(0, 0, 1)), few)
     assert by_direction.field.source.lighting == Lighting(False, ((0, 0, 1),))
     options = LightOptions(("above", "headlight"), shadows=True, specular=0)
-    _, images = vvgt_cli.render_views(SOURCE, function, cameras=1, size=32, light=options)
+    _, images = vvgt_cli.render_views(SOURCE, Look(function, light=options), cameras=1, size=32)
     _, dark = vvgt_cli.render_views(SOURCE, function, cameras=1, size=32)
     assert np.abs(images - dark).max() > 0.05
     np.testing.assert_allclose(images[..., 3], dark[..., 3], atol=0.02)  # other pixels get more rays

@@ -39,7 +39,7 @@ def field() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def converted(field) -> vvgt.Conversion:
-    return vvgt.convert(field, TF, spacing=SPACING, **HOW)
+    return vvgt.convert(field, TF, HOW, spacing=SPACING)
 
 
 def saved(result: vvgt.Result, path: Path) -> bytes:
@@ -57,8 +57,8 @@ def test_commands_and_library_leave_the_same_bytes(field, converted, tmp_path):
     assert run(["convert", str(tmp_path / "a.raw"), *read, *how, "-o", str(tmp_path / "a.ply")]) == 0
     written = (tmp_path / "a.ply").read_bytes()
     assert saved(converted, tmp_path / "b.ply") == written
-    path = vvgt.convert(tmp_path / "a.raw", tmp_path / "tf.json", dims=(20, 16, 12), dtype="float32", spacing=SPACING,
-                        **HOW)  # fmt: skip
+    read = {"dims": (20, 16, 12), "dtype": "float32", "spacing": SPACING}
+    path = vvgt.convert(tmp_path / "a.raw", tmp_path / "tf.json", HOW, **read)
     assert saved(path, tmp_path / "c.ply") == written
     header = written[: written.index(b"end_header")].decode()
     world = saved_world(converted, tmp_path / "w.ply")
@@ -82,18 +82,18 @@ def test_what_is_in_memory_is_read_alike(field, converted, tmp_path):
     inputs["turned"] = (labelled.transpose("x", "z", "y")[::-1], {})  # its coordinates say where values are
     inputs["volume"] = (vvgt.read_volume(field, spacing=SPACING), {})
     for name, (volume, reading) in inputs.items():
-        result = vvgt.convert(volume, TF, **HOW, **reading)
+        result = vvgt.convert(volume, TF, HOW, **reading)
         assert saved(result, tmp_path / f"{name}.ply") == wanted, name
 
 
 def test_a_session_reads_once_and_leaves_the_same_bytes(field, tmp_path, monkeypatch):
     session = vvgt.Session(field, spacing=SPACING)
-    alone = [saved(vvgt.convert(field, tf, spacing=SPACING, **HOW), tmp_path / f"{tf}.ply") for tf in ("gray", "hot")]
+    alone = [saved(vvgt.convert(field, tf, HOW, spacing=SPACING), tmp_path / f"{tf}.ply") for tf in ("gray", "hot")]
     from vvgt_cli.dvr import bricks
 
     monkeypatch.setattr(bricks, "brick_ranges", None)  # neither laid out again
     monkeypatch.setattr("vvgt_cli.volume.statistics", None)  # nor counted
-    together = [saved(session.convert(tf, **HOW), tmp_path / f"s-{tf}.ply") for tf in ("gray", "hot")]
+    together = [saved(session.convert(tf, HOW), tmp_path / f"s-{tf}.ply") for tf in ("gray", "hot")]
     assert together == alone
     _, images = vvgt.render_views(session, "gray", 1, size=32)
     assert images[..., 3].max() > 0
@@ -175,11 +175,25 @@ def test_bad_input_is_an_exception_that_says_what(volume, reading, words):
         vvgt.read_volume(volume, **reading)
 
 
-def test_nothing_is_overwritten_unasked(converted, tmp_path):
-    converted.save(tmp_path / "a.ply")
+def test_saving_again_replaces_the_file_unless_it_is_told_not_to(converted, tmp_path):
+    small = converted.save(tmp_path / "a.ply")
+    assert converted.save(tmp_path / "a.ply", sh_degree=1) > max(300 * 26 * 4, small)
     with pytest.raises(vvgt.UsageError, match="exists"):
-        converted.save(tmp_path / "a.ply")
-    assert converted.save(tmp_path / "a.ply", sh_degree=1, overwrite=True) > 300 * 26 * 4
+        converted.save(tmp_path / "a.ply", overwrite=False)
+
+
+def test_a_goal_that_is_none_is_a_line():
+    with pytest.raises(vvgt.UsageError, match="goal: steeps; expected any of max_gaussians"):
+        vvgt.convert(np.zeros((4, 4, 4)), None, {"steeps": 3})
+
+
+def test_the_library_goes_through_blocks_too(tmp_path):
+    data = np.random.default_rng(0).random((20, 24, 28)).astype(np.float32)
+    data.tofile(tmp_path / "v_28x24x20_float32.raw")
+    whole, blocks = (vvgt.convert(tmp_path / "v_28x24x20_float32.raw", TF, HOW, blocks=b) for b in (None, 16))
+    assert blocks.scores["psnr"] == pytest.approx(whole.scores["psnr"], abs=0.1)
+    assert blocks.preview(48).shape == (144, 144, 3)  # pictures that nobody foresaw
+    np.testing.assert_allclose(blocks.preview(48)[:, :48], whole.preview(48)[:, :48], atol=0.01)
 
 
 @pytest.mark.parametrize("module", [vvgt, functions])
@@ -202,7 +216,7 @@ def test_importing_costs_nothing_and_is_quiet():
 
 
 def test_a_conversion_says_nothing_unless_asked(field, capfd):
-    vvgt.convert(field, TF, max_gaussians=50, size=32, steps=0)
+    vvgt.convert(field, TF, {"max_gaussians": 50, "size": 32, "steps": 0})
     assert capfd.readouterr() == ("", "")
-    vvgt.convert(field, TF, max_gaussians=50, size=32, steps=0, progress=True)
+    vvgt.convert(field, TF, {"max_gaussians": 50, "size": 32, "steps": 0}, progress=True)
     assert "closed form" in capfd.readouterr().err

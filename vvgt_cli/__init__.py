@@ -1,7 +1,7 @@
 """Scientific volumes to 3D Gaussian splats (VVGT): the library; `docs/python.md` shows it.
 
 >>> import vvgt_cli as vvgt
->>> result = vvgt.convert("example:blob:16", max_gaussians=50, size=48, steps=0)
+>>> result = vvgt.convert("example:blob:16", goal={"max_gaussians": 50, "size": 48, "steps": 0})
 >>> len(result.gaussians) <= 50
 True
 """
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from vvgt_cli.errors import DataError, UsageError, VvgtError
     from vvgt_cli.gaussians import Gaussians, PlyHeader
     from vvgt_cli.library.functions import convert, evaluate, optimize, read_ply, read_volume, render_views
+    from vvgt_cli.library.inputs import Goal, Look
     from vvgt_cli.library.session import Session
     from vvgt_cli.transfer import ColorMap, PiecewiseOpacity, TransferFunction, read_transfer_function
     from vvgt_cli.transfer.lighting import LightOptions
@@ -35,6 +36,7 @@ _WHERE = {  # imported when asked for: `import vvgt_cli` costs nothing
     "errors": ("DataError", "UsageError", "VvgtError"),
     "gaussians": ("Gaussians", "PlyHeader"),
     "library.functions": ("convert", "evaluate", "optimize", "read_ply", "read_volume", "render_views"),
+    "library.inputs": ("Goal", "Look"),
     "library.session": ("Session",),
     "conversion.result": ("Conversion", "Result"),
     "transfer": ("ColorMap", "PiecewiseOpacity", "TransferFunction", "read_transfer_function"),
@@ -49,7 +51,9 @@ __all__ = [
     "Conversion",
     "DataError",
     "Gaussians",
+    "Goal",
     "LightOptions",
+    "Look",
     "PiecewiseOpacity",
     "PlyHeader",
     "Result",

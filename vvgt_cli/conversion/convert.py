@@ -9,7 +9,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 from vvgt_cli.conversion.plan import Plan, Planner, check_memory
-from vvgt_cli.conversion.request import ConvertRequest, FitOptions, Limits, file_bytes
+from vvgt_cli.conversion.request import ConvertRequest, file_bytes
 from vvgt_cli.conversion.result import Conversion
 from vvgt_cli.conversion.resume import FITTED, Checkpoint, checkpoint_folder, checkpoint_of
 from vvgt_cli.conversion.stage import Work
@@ -29,7 +29,7 @@ from vvgt_cli.runs.outputs import STDOUT, check_outputs, claimed, write_text
 from vvgt_cli.runs.place import out_of_box, placed, remarks, way_up
 from vvgt_cli.runs.readback import tell_cost
 from vvgt_cli.runs.record import ConversionReport, Run
-from vvgt_cli.runs.source import Source, SourceRequest, describe_source, load, tf_record, volume_record
+from vvgt_cli.runs.source import Source, describe_source, load, tf_record, volume_record
 from vvgt_cli.share import format_of
 
 QUICKEST = 0.5  # of the estimate, where the closed form took less: the rest then takes less too
@@ -60,16 +60,13 @@ def convert(request: ConvertRequest, console: Console | None = None, made: Gauss
         return report
 
 
-def in_memory(
-    source: SourceRequest, fit: FitOptions, limits: Limits, all_views: bool = False, console: Console | None = None
-) -> Conversion:
+def without_files(request: ConvertRequest, console: Console | None = None) -> Conversion:
     """A conversion of which nothing is written.
 
     Raises:
         DataError, UsageError: as `convert`.
     """
     run = Run(console or Console(), ConversionReport("convert"))
-    request = ConvertRequest(source, None, fit, limits, all_views=all_views)
     with ExitStack() as stack:
         conversion = run_conversion(run, request, stack.enter_context(opened(run, request)))
         weakref.finalize(conversion, stack.pop_all().close)  # what it draws is there as long as it is

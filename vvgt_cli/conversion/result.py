@@ -62,7 +62,7 @@ class Result:
         up: str | None = None,
         sh_degree: int | None = None,
         comments: bool | None = None,
-        overwrite: bool = False,
+        overwrite: bool = True,
     ) -> int:
         """Write a standard ``.ply``, or another format by the name's ending, whole or not at all.
 
@@ -73,7 +73,7 @@ class Result:
                 frame of an anatomical space); "auto" where another frame is asked for.
             sh_degree: 0 to 3, of the file: zeros where there are no harmonics, those above it left out.
             comments: write what the file is into its header.
-            overwrite: replace a file that exists.
+            overwrite: replace a file that exists, as a notebook's cell that is run again must.
 
         Returns:
             Bytes written.

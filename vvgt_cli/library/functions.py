@@ -10,10 +10,9 @@ from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.conversion.result import Conversion, Result
 from vvgt_cli.gaussians import Gaussians, PlyHeader
 from vvgt_cli.library.inputs import (
-    FunctionLike,
-    LabelsLike,
-    LayerLike,
-    LightLike,
+    Goal,
+    GoalLike,
+    LookLike,
     PathLike,
     Reading,
     VolumeLike,
@@ -32,48 +31,26 @@ if TYPE_CHECKING:
 
 def convert(
     volume: VolumeLike,
-    tf: FunctionLike | None = None,
+    look: LookLike = None,
+    goal: GoalLike = None,
     *,
-    max_gaussians: int = 100_000,
-    size: int = 1080,
-    rule: str = "inria",
-    init: str = "vbm",
-    steps: int | None = None,
-    model: str | None = None,
-    seed: int = 0,
-    target_psnr: float | None = None,
-    time_budget: float | None = None,
-    max_megabytes: float | None = None,
-    tf_range: str | Sequence[float] = "data",
-    opacity_unit_distance: str | float | None = None,
-    light: LightLike = None,
-    labels: LabelsLike | None = None,
-    layers: Sequence[LayerLike] = (),
-    all_views: bool = False,
+    blocks: int | str | None = None,
     progress: bool = False,
     **reading: Unpack[Reading],
 ) -> Conversion:
     """A volume under a transfer function as 3D Gaussians: ``vvgt convert`` without its files.
 
     >>> import vvgt_cli as vvgt
-    >>> result = vvgt.convert("example:marschner-lobb:24", max_gaussians=200, size=64, steps=0)
+    >>> result = vvgt.convert("example:marschner-lobb:24", goal={"max_gaussians": 200, "size": 64, "steps": 0})
     >>> result.scores["psnr"] > 15
     True
 
     Args:
         volume: a path (or ``example:NAME``); an array (nz, ny, nx) with ``spacing`` (x, y, z) or ``affine`` (4, 4); an
             xarray.DataArray; a pyvista.ImageData; or a `Volume`.
-        tf: a file, a matplotlib colour map's name, a mapping as a JSON file holds it, or a `TransferFunction`; None
-            makes one from the histogram.
-        max_gaussians, size, rule, init, steps, model, seed: see `vvgt_cli.conversion.convert.FitOptions`.
-        target_psnr, time_budget, max_megabytes: dB that are enough, seconds of the run, 10^6 bytes of the file.
-        tf_range: "data", "rescale" or (lo, hi): where the function's nodes lie.
-        opacity_unit_distance: world length that opacity is per, "paraview" or "mean-spacing".
-        light: "none", "headlight", a direction (x, y, z) or its name, several of these, or `LightOptions`; None: what
-            the function's file says.
-        labels: a label map's table: a file, a mapping {label: {"name", "color", "opacity"}}, "auto", "none".
-        layers: what is laid over it: files as ``--layer`` has them, or `LayerRequest`.
-        all_views: score on all ten test views, by SSIM and FLIP too, as ``--report`` does.
+        look: function, light, labels and layers: a `Look`; or the function alone.
+        goal: budget, screen, limits: a `Goal`, or a mapping of some of its attributes.
+        blocks: voxels along the edge of blocks, or "auto"; None: blocks where the file is large.
         progress: lines and bars on standard error.
         **reading: how to read the volume: see `Reading`.
 
@@ -84,12 +61,17 @@ def convert(
         DataError: input that is not what it must be, or a scene that shows nothing.
         UsageError: options that do not fit.
     """
-    from vvgt_cli.conversion.convert import in_memory
-    from vvgt_cli.conversion.request import FitOptions, Limits
+    from vvgt_cli.conversion.convert import without_files
+    from vvgt_cli.conversion.request import ConvertRequest, FitOptions, Limits
+    from vvgt_cli.field.settings import BlockOptions
 
-    fit = FitOptions(max_gaussians, size, init, rule, seed, steps, model)
-    source = source_of(volume, tf, tf_range, opacity_unit_distance, reading, light, labels, layers)
-    return in_memory(source, fit, Limits(target_psnr, time_budget, max_megabytes), all_views, console_of(progress))
+    want = Goal.of(goal)
+    fit = FitOptions(want.max_gaussians, want.size, want.init, want.rule, want.seed, want.steps, want.model)
+    limits = Limits(want.target_psnr, want.time_budget, want.max_megabytes)
+    cut = None if blocks is None else BlockOptions(None if isinstance(blocks, str) else blocks)
+    source = source_of(volume, look, reading)
+    request = ConvertRequest(source, None, fit, limits, all_views=want.all_views, blocks=cut)
+    return without_files(request, console_of(progress))
 
 
 def read_volume(volume: VolumeLike, **reading: Unpack[Reading]) -> Volume:
@@ -121,16 +103,11 @@ def read_ply(path: PathLike) -> tuple[Gaussians, PlyHeader]:
 
 def render_views(
     volume: VolumeLike,
-    tf: FunctionLike | None = None,
+    look: LookLike = None,
     cameras: Sequence[Camera] | int = 24,
     *,
     size: int = 400,
     step: float = 0.5,
-    tf_range: str | Sequence[float] = "data",
-    opacity_unit_distance: str | float | None = None,
-    light: LightLike = None,
-    labels: LabelsLike | None = None,
-    layers: Sequence[LayerLike] = (),
     **reading: Unpack[Reading],
 ) -> tuple[list[Camera], np.ndarray]:
     """Pictures of a volume by our renderer, in memory; ``vvgt render-views`` writes them for trainers.
@@ -141,7 +118,7 @@ def render_views(
     (2, 32, 32, 4)
 
     Args:
-        volume, tf, tf_range, opacity_unit_distance, light, labels, layers, reading: as of `convert`.
+        volume, look, reading: as of `convert`.
         cameras: in the unit frame, all of one size; or how many of the training views.
         size: pixels along the edge of the training views.
         step: along a ray, in voxels.
@@ -162,7 +139,7 @@ def render_views(
     views = default_views("train", cameras, size=size) if isinstance(cameras, int) else list(cameras)
     if len({(view.width, view.height) for view in views}) != 1:
         raise UsageError(f"{len(views)} cameras of several sizes; expected one or more of one size")
-    source = load(source_of(volume, tf, tf_range, opacity_unit_distance, reading, light, labels, layers))
+    source = load(source_of(volume, look, reading))
     scene = source.scene()
     draw = render_in_box(lambda view: render_view(scene, view, RenderSettings(step=step)), source.volume.axes)
     return views, np.stack([draw(view) for view in views])
@@ -171,17 +148,12 @@ def render_views(
 def evaluate(
     ply: PathLike | Result,
     volume: VolumeLike,
-    tf: FunctionLike | None = None,
+    look: LookLike = None,
     *,
     size: int | None = None,
     rule: str | None = None,
     step: float = 0.125,
     seats: bool = True,
-    tf_range: str | Sequence[float] = "data",
-    opacity_unit_distance: str | float | None = None,
-    light: LightLike = None,
-    labels: LabelsLike | None = None,
-    layers: Sequence[LayerLike] = (),
     progress: bool = False,
     **reading: Unpack[Reading],
 ) -> Evaluation:
@@ -189,7 +161,7 @@ def evaluate(
 
     Args:
         ply: path, or what `convert` or `optimize` returned.
-        volume, tf, tf_range, opacity_unit_distance, light, labels, layers, reading: as of `convert`.
+        volume, look, reading: as of `convert`.
         size, rule: to score at and draw by; None: the file's.
         step: of the reference, in voxels.
         seats: every rule at several sizes and close up, too.
@@ -200,7 +172,7 @@ def evaluate(
     """
     from vvgt_cli.tasks import evaluate as pipeline
 
-    source = source_of(volume, tf, tf_range, opacity_unit_distance, reading, light, labels, layers)
+    source = source_of(volume, look, reading)
     request = pipeline.EvaluateRequest(ply_of(ply), source, size, rule, step, seats)
     return pipeline.evaluate(request, console_of(progress))
 

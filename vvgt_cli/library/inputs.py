@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
 from numbers import Real
 from typing import Any, BinaryIO, TypedDict
 
@@ -26,6 +26,83 @@ LightLike = LightOptions | str | Sequence[float] | Sequence[str | Sequence[float
 LabelsLike = PathLike | Mapping[Any, Mapping[str, Any]] | LabelTable
 LayerLike = PathLike | LayerRequest
 FunctionLike = PathLike | Mapping[str, Any] | TransferFunction
+
+
+@dataclass(frozen=True)
+class Look:
+    """How a volume is shown.
+
+    Attributes:
+        function: a file, a matplotlib colour map's name, a mapping as a JSON file holds it, or a `TransferFunction`;
+            None makes one from the data.
+        range: "data", "rescale" or (lo, hi): where the function's nodes lie.
+        unit_distance: world length that opacity is per, "paraview" or "mean-spacing"; None: the function's own.
+        light: "none", "headlight", a direction (x, y, z) or its name, several of these, or `LightOptions`; None: what
+            the function's file says.
+        labels: a label map's table: a file, a mapping {label: {"name", "color", "opacity"}}, "auto", "none".
+        layers: volumes laid over it: files as ``--layer`` has them, or `LayerRequest`.
+    """
+
+    function: FunctionLike | None = None
+    range: str | Sequence[float] = "data"
+    unit_distance: str | float | None = None
+    light: LightLike = None
+    labels: LabelsLike | None = None
+    layers: Sequence[LayerLike] = ()
+
+    @classmethod
+    def of(cls, look: LookLike) -> Look:
+        """A look, or one of a function alone."""
+        return look if isinstance(look, Look) else cls(look)
+
+
+LookLike = Look | FunctionLike | None
+
+
+@dataclass(frozen=True)
+class Goal:
+    """What a conversion is for; `vvgt_cli.conversion.request` has the same in two parts.
+
+    Attributes:
+        max_gaussians: budget.
+        size: pixels along the edge of the screen.
+        rule: viewer that is fitted to (`vvgt_cli.splat.rules`).
+        init: "vbm", "wavelet" or "uniform".
+        steps: of gradient descent at most; None: chosen by the plan.
+        model: trained network that runs before the steps.
+        seed: of whatever draws random numbers.
+        target_psnr, time_budget, max_megabytes: dB that are enough, seconds of the run, 10^6 bytes of the file.
+        all_views: score on all ten test views, by SSIM and FLIP too, as ``--report`` does.
+    """
+
+    max_gaussians: int = 100_000
+    size: int = 1080
+    rule: str = "inria"
+    init: str = "vbm"
+    steps: int | None = None
+    model: str | None = None
+    seed: int = 0
+    target_psnr: float | None = None
+    time_budget: float | None = None
+    max_megabytes: float | None = None
+    all_views: bool = False
+
+    @classmethod
+    def of(cls, goal: GoalLike) -> Goal:
+        """A goal, or one of a mapping of its attributes.
+
+        Raises:
+            UsageError: an attribute that there is not.
+        """
+        if not isinstance(goal, Mapping):
+            return goal or cls()
+        known = [field.name for field in fields(cls)]
+        if unknown := sorted(set(goal) - set(known)):
+            raise UsageError(f"goal: {unknown[0]}; expected any of {', '.join(known)}")
+        return cls(**goal)
+
+
+GoalLike = Goal | Mapping[str, Any] | None
 
 
 class Reading(TypedDict, total=False):
@@ -122,32 +199,23 @@ def function_of(tf: FunctionLike | None) -> str | TransferFunction | None:
     return os.fspath(tf) if isinstance(tf, os.PathLike) else tf
 
 
-def source_of(
-    volume: VolumeLike,
-    tf: FunctionLike | None,
-    tf_range: str | Sequence[float],
-    opacity_unit_distance: str | float | None,
-    reading: Reading,
-    light: LightLike = None,
-    labels: LabelsLike | None = None,
-    layers: Sequence[LayerLike] = (),
-) -> SourceRequest:
-    """The volume, read, under a function.
+def source_of(volume: VolumeLike, look: LookLike, reading: Reading) -> SourceRequest:
+    """The volume, read, under a look.
 
     Raises:
         DataError, UsageError: as `volume_of` and `function_of`.
     """
-    if not isinstance(tf_range, str):
-        tf_range = ",".join(repr(float(v)) for v in tf_range)
-    distance = None if opacity_unit_distance is None else str(opacity_unit_distance)
+    look = Look.of(look)
+    span = look.range if isinstance(look.range, str) else ",".join(repr(float(v)) for v in look.range)
+    distance = None if look.unit_distance is None else str(look.unit_distance)
     if isinstance(volume, str | os.PathLike):  # colours and channels are several volumes: the source opens them
         options = _options(reading)
         given: Any = os.fspath(volume)
     else:
         options, given = ReadOptions(), _opened(volume, reading) or volume_of(volume, reading)
     return SourceRequest(
-        given, options, function_of(tf), tf_range, distance, light=light_of(light), labels=labels_of(labels),
-        layers=tuple(layer_of(layer) for layer in layers),
+        given, options, function_of(look.function), span, distance, light=light_of(look.light),
+        labels=labels_of(look.labels), layers=tuple(layer_of(layer) for layer in look.layers),
     )  # fmt: skip
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Unpack
 
-from vvgt_cli.library.inputs import FunctionLike, Reading, VolumeLike, content_of
+from vvgt_cli.library.inputs import GoalLike, LookLike, Reading, VolumeLike, content_of
 from vvgt_cli.runs.source import Opened
 
 if TYPE_CHECKING:
@@ -17,7 +17,8 @@ class Session:
 
     >>> import vvgt_cli as vvgt
     >>> session = vvgt.Session("example:blob:16")
-    >>> [len(session.convert(tf, max_gaussians=20, size=32, steps=0).gaussians) for tf in ("gray", "viridis")]
+    >>> few = {"max_gaussians": 20, "size": 32, "steps": 0}
+    >>> [len(session.convert(tf, few).gaussians) for tf in ("gray", "viridis")]
     [20, 20]
 
     It stands for the volume wherever the library takes one.
@@ -37,8 +38,8 @@ class Session:
         """What was read: of colours and channels the first."""
         return self.opened.volume
 
-    def convert(self, tf: FunctionLike | None = None, **options: Any) -> Conversion:
-        """The volume under another function: `convert`, with its options, without reading again."""
+    def convert(self, look: LookLike = None, goal: GoalLike = None, **options: Any) -> Conversion:
+        """The volume under another look: `convert`, with its options, without reading again."""
         from vvgt_cli.library.functions import convert
 
-        return convert(self.opened, tf, **options)
+        return convert(self.opened, look, goal, **options)
