@@ -161,7 +161,7 @@ def test_compare_reads_reports_and_conversions(ladder, vvgt, tmp_path):
         (("report", "example:blob", "example:slab", "-o", "x"), "2 volumes; expected one"),
         (("report", "--compare", "file", "-o", "x"), "expected two or more"),
         (("report", "--compare", "file", "-o", "x", "--threads", 1), "expected two or more"),
-        (("report", "--compare", "file", "file", "-o", "x", "--tf", "viridis"), "--tf: of a volume's report"),
+        (("report", "--compare", "file", "file", "-o", "x", "--tf", "viridis"), "--tf: not with --compare"),
         (("report", "example:blob", "--model", "none", "-o", "x"), "no such folder"),
     ],
 )

@@ -162,7 +162,8 @@ def test_a_killed_run_goes_on_where_it_was(raw, alone, vvgt, tmp_path):
     again = vvgt("init", raw, "-o", tmp_path / "a.ply", *FIT[:-1], "--blocks", "auto")
     assert again.code == 0
     assert "going on with the blocks" in again.err
-    assert "0 of 48 blocks" in again.err
+    done, total = map(int, re.search(r"integrate .* (\d+) of (\d+) blocks", again.err).groups())
+    assert done < total
     assert (tmp_path / "a.ply").read_bytes() == alone
     assert not (tmp_path / ".a.ply.blocks").exists()
 
@@ -310,7 +311,7 @@ def test_slurm_that_is_not_there_or_refuses_is_a_line(vvgt, raw, tmp_path, slurm
 @pytest.fixture
 def jobs(slurm, monkeypatch):
     """Jobs in this process, looked at twice a second; the variables of SLURM's stand-in as given."""
-    from vvgt_cli.scale import dask_runner
+    from vvgt_cli.field import dask_runner
 
     monkeypatch.setattr(dask_runner, "AGAIN", 0.5)
     monkeypatch.setattr(dask_runner, "asked_memory", lambda: 1e9)
@@ -342,7 +343,7 @@ def test_a_disk_without_room_for_the_blocks_is_said_before_they_are_made(vvgt, r
     assert run.err.count("\n") == 1
     assert "No space left on device: needs" in run.err
     assert "1024000 are free in" in run.err
-    assert list((tmp_path / ".a.ply.blocks" / "cells").iterdir()) == []
+    assert not (tmp_path / ".a.ply.blocks" / "cells").exists()
     disk.f_bavail = 400000
     run = vvgt("init", raw, "-o", tmp_path / "a.ply", *FIT[:-1], *SIZE)
     assert run.code == 0

@@ -26,7 +26,7 @@ from vvgt_cli.field.reader import Box
 from vvgt_cli.files import atomic_write
 from vvgt_cli.runs.digests import digest
 
-SUFFIX, TABLE = ".rays.npy", ".rays.npz"
+SUFFIX, TABLE = ".rays.npy", ".table"
 RAY = np.dtype([("ray", np.int32), ("rgba", np.float32, 4)])  # one of a bundle, and what a piece shows of it
 CAMERA = 17  # numbers: eye, basis, lens and step
 LONGEST = 1.0  # voxels of a segment, which ends within a voxel of its piece
