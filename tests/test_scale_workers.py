@@ -154,7 +154,7 @@ def test_a_killed_worker_costs_nothing_but_time(raw, alone, tmp_path):
 
 def test_a_killed_run_goes_on_where_it_was(raw, alone, vvgt, tmp_path):
     run = start("init", raw, "-o", tmp_path / "a.ply", *FIT, "--blocks", 16)
-    while run.poll() is None and not list(tmp_path.glob(".a.ply.blocks/cells/*.npz")):
+    while run.poll() is None and not list(tmp_path.glob(".a.ply.blocks/cells/[0-9]*.npz")):
         time.sleep(0.005)
     run.kill()
     run.wait()
