@@ -186,9 +186,9 @@ def test_a_session_of_a_file_keeps_its_segments(tmp_path: Path) -> None:
     path.write_bytes(SEGMENTS.replace("sizes: 2 2 2", "sizes: 24 24 24").encode() + balls().tobytes())
     how = {"max_gaussians": 100, "size": 48, "steps": 0}
     session = library.Session(path)
-    found, wanted = session.convert(**how).gaussians, library.convert(path, **how).gaussians
+    found, wanted = session.convert(goal=how).gaussians, library.convert(path, goal=how).gaussians
     np.testing.assert_array_equal(found.colors, wanted.colors)
-    assert not np.array_equal(session.convert("gray", **how).gaussians.colors, found.colors)
+    assert not np.array_equal(session.convert("gray", how).gaussians.colors, found.colors)
 
 
 def test_one_file_a_label_and_they_add_up(vvgt, tmp_path: Path, seg: Path) -> None:
@@ -262,15 +262,15 @@ def test_a_series_of_label_maps_has_the_same_colours(vvgt, tmp_path: Path) -> No
 
 def test_in_python() -> None:
     entries = {1: {"color": [1, 0, 0], "opacity": 0.1}, 3: {"color": "#0000ff"}}
-    result = library.convert(balls(), labels=entries, max_gaussians=300, size=64, steps=0)
+    result = library.convert(balls(), library.Look(labels=entries), {"max_gaussians": 300, "size": 64, "steps": 0})
     assert result.gaussians.colors[:, 1].max() < 0.05
-    _, images = library.render_views(balls(), cameras=2, size=32, labels=entries)
+    _, images = library.render_views(balls(), library.Look(labels=entries), cameras=2, size=32)
     assert images[..., 0].max() > 0.1 < images[..., 2].max()
     assert images[..., 1].max() == 0
     with pytest.raises(DataError, match="no entry"):
-        library.convert(balls(), labels={1: {"color": [1, 0, 0]}})
+        library.convert(balls(), library.Look(labels={1: {"color": [1, 0, 0]}}))
     with pytest.raises(UsageError, match="no such file"):
-        library.convert(balls(), labels="nowhere.ctbl")
+        library.convert(balls(), library.Look(labels="nowhere.ctbl"))
     assert isinstance(distinct([1]), LabelTable)
 
 

@@ -350,14 +350,11 @@ def test_a_scan_with_its_segmentation(vvgt, tmp_path: Path) -> None:
 
 
 def test_in_python() -> None:
-    part = library.convert(
-        cloud().data, crop="2:8,:,:", mask=np.ones((10, 12, 14)), max_gaussians=100, size=32, steps=0
-    )
+    few = {"max_gaussians": 100, "size": 32, "steps": 0}
+    part = library.convert(cloud().data, goal=few, crop="2:8,:,:", mask=np.ones((10, 12, 14)))
     assert part.gaussians.means.shape[1] == 3
     request = LayerRequest(Volume(balls(12)), labels="auto")
-    both = library.convert(
-        Volume(balls(12).astype(np.float32)), "gray", layers=[request], max_gaussians=100, size=32, steps=0
-    )
+    both = library.convert(Volume(balls(12).astype(np.float32)), library.Look("gray", layers=[request]), few)
     assert np.ptp(both.gaussians.colors) > 0.1
 
 

@@ -73,7 +73,7 @@ def test_another_run_is_not_mixed_in(vvgt, raw, tmp_path):
     assert vvgt("init", raw, "-o", folder, *FIT, *SIZE, "--shard", "1/2").code == 0
     other = vvgt("init", raw, "-o", folder, *FIT, "--tf", "viridis", *SIZE, "--shard", "1/2")
     assert other.code == 2
-    assert "another run (other function)" in other.err
+    assert "another run (other files, function)" in other.err
     other = vvgt("init", raw, "-o", folder, *FIT, "--blocks", "64", "--shard", "1/2")
     assert other.code == 2
     assert "another run (other blocks)" in other.err

@@ -18,7 +18,11 @@ class DataError(VvgtError):
     exit_code = 1
 
 
-class NothingVisible(DataError):
+class Unsuitable(DataError):
+    """Whole and readable data of which no run can make anything: the same command ends the same way."""
+
+
+class NothingVisible(Unsuitable):
     """A function that shows nothing of a volume, from any view."""
 
     def __init__(self, volume: str, function: str) -> None:

@@ -93,7 +93,6 @@ class Blocked:
         key: digest of all that it depends on.
         pictures: that are there, or are expected; by what they show.
         grid: of its cells, once they are there.
-        early: rays that were cast in the pass over them.
     """
 
     source: Source
@@ -104,7 +103,6 @@ class Blocked:
     key: str
     pictures: dict[str, tuple[Picture, np.ndarray | None]] = field(default_factory=dict)
     grid: CellGrid | None = None
-    early: RayFile | None = None
 
     @cached_property
     def frame(self) -> Frame:
@@ -158,13 +156,11 @@ class Blocked:
         level = level_within(step, self.visible, most or most_cells(budget), finest)
         while blocks(exponents(step, level))[1].max() > 1 << TILE_BITS:
             level += 1  # of voxels so thin that a block of them is many cells
-        rays = self.early = self._first_rays()
-        return CellBlocks(self.reader, self._grid(exponents(step, level)), self.do.parts, rays, self.light)
-
-    def _first_rays(self) -> RayFile | None:
-        """The first rays of the pictures that are expected: they are cast in the pass over the cells."""
-        todo = self._todo()
-        return self._file(todo, [next(rays) for *_, rays in todo]) if todo else None
+        grid, todo = self._grid(exponents(step, level)), self._todo()
+        rays = self._file(todo, [next(rays) for *_, rays in todo], grid) if todo else None
+        if rays is not None:
+            self.do.parts.prepare(rays.kind)
+        return CellBlocks(self.reader, grid, self.do.parts, rays, self.light)
 
     def start(self, options: VbmOptions, progress: Progress | None = None) -> Start:
         """See `Field`."""
@@ -223,7 +219,7 @@ class Blocked:
                 todo.append((key, image, tiers(settings, image, view.blocks)))
         return todo
 
-    def _file(self, todo: Todo, rays: list[list[Rays]]) -> RayFile:
+    def _file(self, todo: Todo, rays: list[list[Rays]], grid: CellGrid) -> RayFile:
         """The rays that pictures ask for next, in a file."""
         bundles = [
             Bundle(view.camera, view.settings.step, np.argwhere(mask)[:, ::-1], offsets)
@@ -231,7 +227,7 @@ class Blocked:
             for view in [self.pictures[key][0]]
             for offsets, mask, _ in wanted
         ]
-        return RayFile.of(bundles, self.frame, self.do.parts)
+        return RayFile.of(bundles, self.frame, grid.blocks, self.do.parts)
 
     def _march(self) -> None:
         """Make every picture that is expected, all of them together: at most two passes."""
@@ -241,14 +237,11 @@ class Blocked:
             rays = [one or [] for one in wanted]
             if not any(rays):
                 break
-            file = self._file(todo, rays)
-            kind, numbers = file.kind, self._shown()
-            if file == self.early:
-                kind = CELLS
-            else:
-                task = RayBlocks(self.reader, grid, self.do.parts, file, self.light)
-                self.do(task, "views", numbers)
-            seen = iter(composed(file, self.do.parts, kind, numbers, self.source.volume.dims))
+            file = self._file(todo, rays, grid)
+            numbers = self._shown()
+            task = RayBlocks(self.reader, grid, self.do.parts, file, self.light)
+            self.do(task, "views", numbers)  # those that the pass over the cells has cast are there
+            seen = iter(composed(file, self.do.parts, numbers, self.source.volume.dims))
             for (_, image, _), asked in zip(todo, rays, strict=True):
                 for offsets, mask, known in asked:
                     total = next(seen).sum(axis=1)

@@ -67,7 +67,7 @@ class CellBlocks:
                 field.append(summary[1])
                 deepest = max(deepest, summary[2])
         if self.rays is not None:
-            leave_rays(self.rays, box, number, grid.blocks, self.light, parts, CELLS)
+            leave_rays(self.rays, box, number, grid.blocks, self.light, parts)
         if self.light is not None:
             path = parts.path(CELLS, number, NORMALS)
             with atomic_write(path, overwrite=True) as temporary, open(temporary, "wb") as stream:
@@ -152,8 +152,7 @@ class RayBlocks:
         lo, hi = self.grid.blocks.at(number)
         halo = HALO if self.light is None else LIT_HALO
         box = self.reader.box(np.maximum(lo - halo, 0), np.minimum(hi + halo, self.grid.dims))
-        leave_rays(self.rays, box, number, self.grid.blocks, self.light, self.parts, self.kind)
-        self.parts.save(self.kind, number)  # it is done
+        leave_rays(self.rays, box, number, self.grid.blocks, self.light, self.parts)
 
 
 @dataclass(frozen=True)

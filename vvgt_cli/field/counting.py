@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.errors import Unsuitable, UsageError
 from vvgt_cli.field.grid import Boxes
 from vvgt_cli.field.parts import COUNTS, HISTOGRAM, LABELS, Parts
 from vvgt_cli.field.reader import CLASSIFIED, Place
@@ -206,11 +206,11 @@ class Counted:
                 self._run(task)
             stored = task.unique()
         if len(stored) > MOST:
-            raise DataError(f"{volume.name}: more than {MOST} different values; expected a label map")
+            raise Unsuitable(f"{volume.name}: more than {MOST} different values; expected a label map")
         values = np.unique(volume.slope * stored + volume.intercept)
         if (values != np.round(values)).any():
             odd = values[values != np.round(values)][0]
-            raise DataError(
+            raise Unsuitable(
                 f"{volume.name}: {volume.data.dtype} values such as {odd:g}; expected a label map, of whole numbers: "
                 "of scalars leave out --labels"
             )

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vvgt_cli.errors import NothingVisible, SeveralComponents, UsageError
+from vvgt_cli.errors import SeveralComponents, Unsuitable, UsageError
 from vvgt_cli.field.blocked import Blocked, Pass
 from vvgt_cli.field.counting import Counted
 from vvgt_cli.field.parts import Parts
@@ -52,11 +52,13 @@ class Wanted:
     Attributes:
         gaussians, size: budget, and pixels of the screen.
         degree: of harmonics that are asked for.
+        most: base cells, None: as many as memory holds.
     """
 
     gaussians: int
     size: int
     degree: int | None = None
+    most: int | None = None
 
 
 @contextmanager
@@ -73,7 +75,7 @@ def beside(output: str | None) -> Iterator[Parts]:
     parts = Parts(target.with_name(f".{target.name[:80]}.blocks"))
     try:
         yield parts
-    except (UsageError, NothingVisible):
+    except (UsageError, Unsuitable):
         parts.remove()
         raise
 
@@ -295,11 +297,12 @@ def _settings(request: SourceRequest, wanted: Wanted) -> dict[str, Any]:
     return {
         "version": [VERSION, LAYOUT],
         "volume": _facts(request.volume),
+        "files": [_facts(path) for path in request.paths()],
         "read": {key: repr(value) for key, value in asdict(request.read).items() if value is not None},
         "function": [text, request.tf_range, request.unit_distance],
         "look": [repr(request.light), _facts(request.labels), *(repr(layer) for layer in request.layers)],
         "series": digest(*request.statistics),
-        "gaussians": [wanted.gaussians, wanted.degree],
+        "gaussians": [wanted.gaussians, wanted.degree, wanted.most],
         "size": wanted.size,
     }
 
@@ -308,5 +311,8 @@ def _facts(volume: Any) -> list[Any]:
     """A file's name, size and time, or what else a volume or table is."""
     if not isinstance(volume, str):
         return [digest(volume.data) if isinstance(volume, Volume) else repr(volume)]
-    found = [file.stat() for file in files_of(volume)]
+    outer = [name for name in (volume, volume.rpartition(":/")[0], volume.partition("#")[0]) if name]
+    files = next((some for name in outer if (some := files_of(name))), [])
+    whole = [inner for file in files for inner in (file.rglob("*") if file.is_dir() else (file,))]
+    found = [file.stat() for file in whole]
     return [volume, sum(f.st_size for f in found), max(f.st_mtime_ns for f in found)] if found else [volume]

@@ -26,7 +26,7 @@ from vvgt_cli.field.reader import Box
 from vvgt_cli.files import atomic_write
 from vvgt_cli.runs.digests import digest
 
-SUFFIX, TABLE = ".rays.npy", ".table"
+SUFFIX = ".rays.npy"
 RAY = np.dtype([("ray", np.int32), ("rgba", np.float32, 4)])  # one of a bundle, and what a piece shows of it
 CAMERA = 17  # numbers: eye, basis, lens and step
 LONGEST = 1.0  # voxels of a segment, which ends within a voxel of its piece
@@ -58,15 +58,15 @@ class RayFile:
 
     Attributes:
         path: of the file.
-        kind: of the parts that they leave, where they are a pass of their own.
+        kind: of the parts that they leave: the same rays have the same.
     """
 
     path: str
     kind: str
 
     @classmethod
-    def of(cls, bundles: Sequence[Bundle], frame: Frame, parts: Parts) -> RayFile:
-        """Write them; ``frame`` is the volume's.
+    def of(cls, bundles: Sequence[Bundle], frame: Frame, blocks: Boxes, parts: Parts) -> RayFile:
+        """Write them; ``frame`` is the volume's, which is cut into ``blocks``.
 
         Raises:
             DataError: the system refuses.
@@ -78,7 +78,7 @@ class RayFile:
             arrays[f"camera{k}"] = np.concatenate([eye, basis.ravel(), lens, [step]])
             arrays[f"pixels{k}"] = bundle.pixels.astype(np.int32)
             arrays[f"offsets{k}"] = bundle.offsets
-        name = f"rays-{digest(*arrays.values())[:16]}"
+        name = f"rays-{digest(blocks, *arrays.values())[:16]}"
         path = parts.folder / f"{name}.npz"
         if not path.is_file():
             with atomic_write(path, overwrite=True) as temporary, open(temporary, "wb") as stream:
@@ -126,9 +126,7 @@ def pieces_of(dims: tuple[int, int, int]) -> Boxes:
     return Boxes(dims, (edge, edge, edge))
 
 
-def leave_rays(
-    rays: RayFile, block: Box, number: int, blocks: Boxes, light: Light | None, parts: Parts, kind: str
-) -> None:
+def leave_rays(rays: RayFile, block: Box, number: int, blocks: Boxes, light: Light | None, parts: Parts) -> None:
     """Cast all rays through the pieces of block ``number``, and leave what they show.
 
     Args:
@@ -136,9 +134,9 @@ def leave_rays(
         block: with `HALO` voxels around it, or `LIT_HALO`.
         number, blocks: which it is; blocks are of whole pieces.
         light: that falls on the volume, None for none.
-        parts, kind: where it goes.
+        parts: where it goes, as a part of the rays' own kind.
     """
-    pieces, halo = pieces_of(blocks.dims), HALO if light is None else LIT_HALO
+    pieces, halo, kind = pieces_of(blocks.dims), HALO if light is None else LIT_HALO, rays.kind
     lo, hi = blocks.at(number)
     table: list[tuple[int, int, int]] = []  # piece, bundle, rays
     found: list[np.ndarray] = []
@@ -149,7 +147,7 @@ def leave_rays(
             found.append(seen)
     with atomic_write(parts.path(kind, number, SUFFIX), overwrite=True) as temporary, open(temporary, "wb") as stream:
         np.save(stream, np.concatenate(found) if found else np.empty(0, RAY))
-    parts.save(kind, number, TABLE, table=np.array(table, np.int64).reshape(-1, 3))
+    parts.save(kind, number, table=np.array(table, np.int64).reshape(-1, 3))
 
 
 def _within(boxes: Boxes, lo: np.ndarray, hi: np.ndarray) -> Iterator[int]:
@@ -223,21 +221,19 @@ def meeting(cast: Cast, lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
     return result
 
 
-def composed(
-    rays: RayFile, parts: Parts, kind: str, numbers: Sequence[int], dims: tuple[int, int, int]
-) -> list[np.ndarray]:
+def composed(rays: RayFile, parts: Parts, numbers: Sequence[int], dims: tuple[int, int, int]) -> list[np.ndarray]:
     """What whole rays see, (n, m, 4) float64 premultiplied of each bundle, from what blocks ``numbers`` have left.
 
     Raises:
         DataError: a part is missing or damaged.
     """
-    pieces, bundles = pieces_of(dims), rays.bundles()
+    pieces, bundles, kind = pieces_of(dims), rays.bundles(), rays.kind
     shown: list[dict[int, tuple[int, slice]]] = [{} for _ in bundles]
     held: dict[int, np.ndarray] = {}
     for number in numbers:
         path = parts.path(kind, number, SUFFIX)
         offset = 0
-        for piece, k, count in parts.load(kind, number, TABLE)["table"].tolist():
+        for piece, k, count in parts.load(kind, number)["table"].tolist():
             shown[k][piece] = number, slice(offset, offset + count)
             offset += count
         if offset:

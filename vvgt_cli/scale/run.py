@@ -115,14 +115,14 @@ def make_parts(run: Run, request: ConvertRequest, options: BlockOptions, parts: 
         Later: other shards' blocks are missing.
     """
     budget, size = request.fit.max_gaussians, request.fit.size
-    wanted = Wanted(budget, size, request.ply.sh_degree)
+    wanted = Wanted(budget, size, request.ply.sh_degree, most_cells(budget))
     with blocked(run, request.source, options, parts, wanted) as field:
         source, ply = field.source, ply_options(request, field.source)
         for line in remarks(source.volume, ply):
             run.console.say(line)
         run.compile(for_blocks(source.kernels((RENDER, *INIT, *DRAW))), source.kernel_type())
         field.expect(scored_views(size))
-        cells = field.cells(size, budget, most_cells(budget))
+        cells = field.cells(size, budget, wanted.most)
         assert cells.rays is not None
         Plan(
             cells.grid, budget, size, source.volume.direction, ply, volume_record(source),

@@ -9,7 +9,7 @@ import numpy as np
 from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.blocks import spread_blocks
 from vvgt_cli.field.field import Picture
-from vvgt_cli.field.parts import CELLS, Parts
+from vvgt_cli.field.parts import Parts
 from vvgt_cli.field.rays import RayFile, composed
 from vvgt_cli.runs.viewing import PREVIEW_VIEWS
 from vvgt_cli.splat.rules import INRIA, Rule
@@ -44,7 +44,7 @@ def score_gaussians(gaussians: Gaussians, parts: Parts, plan: Plan, rule: str | 
 
     rays = RayFile(str(parts.folder / f"{plan.rays}.npz"), plan.rays)
     x, y, z = plan.grid.blocks.dims
-    seen = composed(rays, parts, CELLS, range(len(plan.grid.blocks)), (x, y, z))
+    seen = composed(rays, parts, range(len(plan.grid.blocks)), (x, y, z))
     views = scored_views(plan.size)
 
     def picked(view: Picture) -> np.ndarray:

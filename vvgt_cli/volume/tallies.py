@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from vvgt_cli.errors import DataError
+from vvgt_cli.errors import Unsuitable
 from vvgt_cli.volume.stats import BINS, Statistics, check_range, edges_of, integer_statistics
 from vvgt_cli.volume.types import Volume
 
@@ -99,7 +99,7 @@ def with_limits(whole: Tally, volume: Volume) -> Tally:
     """The sum over all blocks, checked.
 
     Raises:
-        DataError: no voxel has a finite value, or the scaling makes values infinite.
+        Unsuitable: no voxel has a finite value, or the scaling makes values infinite.
     """
     if counted(volume):
         numbers = integer_statistics(whole.counts, volume)
@@ -107,7 +107,7 @@ def with_limits(whole: Tally, volume: Volume) -> Tally:
         return replace(whole, lo=numbers.lo, hi=numbers.hi, stored=(min(ends), max(ends)), finite=volume.data.size)
     if not whole.finite:
         inf = volume.data.size - whole.nan
-        raise DataError(
+        raise Unsuitable(
             f"{volume.name}: none of its {volume.data.size} voxels is finite ({whole.nan} NaN, {inf} infinite); check "
             "the type and byte order (--dtype, --byte-order)"
         )
