@@ -15,7 +15,7 @@ test: $(VENV)/bin/pytest
 # While working, for less than a minute once kernels are compiled: the rooms' order, pages, cameras, pictures, metrics, the
 # splatter and the ray caster's scenes, transfer functions, most formats; ten examples a property, no conversions.
 QUICK := architecture docs_pages cameras_blocks cameras_files images_compose images_files metrics_images \
-	metrics_scores gaussians_ply optimize_loss splat_render dvr_scene transfer_readers transfer_resolve volume_affines \
+	metrics_scores gaussians_ply optimize_loss splat_render dvr_scene look_readers look_resolve volume_affines \
 	volume_headers volume_itk volume_raw volume_registry volume_tiff
 quick: $(VENV)/bin/pytest
 	HYPOTHESIS_PROFILE=quick $(VENV)/bin/pytest -n 2 --dist loadfile $(QUICK:%=tests/test_%.py)
@@ -47,7 +47,7 @@ viewers: $(VENV)/bin/pytest
 
 # The viewer that `vvgt view` serves, anew of the npm packages that page/package.json pins; node and npm are needed.
 page:
-	vvgt_cli/share/page/build.sh
+	vvgt_cli/gaussians/formats/page/build.sh
 
 # The shipped model trained again, data first: out/model/vvgt-small (docs/train.md). An hour of two cores; needs torch:
 # its build for CPUs, put into $(VENV) before, spares gigabytes.

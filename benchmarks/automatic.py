@@ -18,8 +18,8 @@ from vvgt_cli.cameras.boxed import render_in_box
 from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.dvr import RenderSettings, Scene, render_view
 from vvgt_cli.images import write_png
+from vvgt_cli.look import from_histogram, unit_distance
 from vvgt_cli.synth.sources import open_volume
-from vvgt_cli.transfer import from_histogram, unit_distance
 from vvgt_cli.volume import ReadOptions, Volume, statistics
 
 SIZE, AZIMUTH, ELEVATION, FIELD = 180, 60.0, 12.0, 36.0  # px, degrees

@@ -23,12 +23,12 @@ import click
 import numpy as np
 
 from vvgt_cli.cameras import default_views
+from vvgt_cli.closed_form import VbmOptions, backproject, initialise
 from vvgt_cli.dvr import RenderSettings, Scene, render_views
 from vvgt_cli.dvr.render import FIT_VIEWS
-from vvgt_cli.metrics import score_views
-from vvgt_cli.runs.source import SourceRequest, load
+from vvgt_cli.field.source import SourceRequest, load
+from vvgt_cli.images.metrics import score_views
 from vvgt_cli.splat import render
-from vvgt_cli.vbm import VbmOptions, backproject, initialise
 from vvgt_cli.volume import ReadOptions
 
 FIELDS = ["psnr", "psnr_foreground", "psnr_white", "psnr_alpha", "ssim", "psnr_2x", "init_psnr", "gaussians"]

@@ -14,8 +14,8 @@ from floors import alternate, bandwidth, flops, machine
 
 from vvgt_cli.cameras import default_views
 from vvgt_cli.dvr import REFERENCE, RenderSettings, Scene, render_view
+from vvgt_cli.look import from_histogram
 from vvgt_cli.synth import open_volume
-from vvgt_cli.transfer import from_histogram
 from vvgt_cli.volume import statistics
 
 SIZE, REPEATS = 400, 5

@@ -11,7 +11,7 @@ from typing import Any
 
 from closed_form import read_options, scene_rows
 
-from vvgt_cli.runs.source import Source, SourceRequest, load
+from vvgt_cli.field.source import Source, SourceRequest, load
 
 
 def read_scenes(

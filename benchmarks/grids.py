@@ -19,11 +19,11 @@ import click
 from dvr_scenes import commit, print_table, read_scenes, write_rows
 
 from vvgt_cli.cameras import default_views
+from vvgt_cli.closed_form import VbmOptions, initialise
 from vvgt_cli.dvr import Scene, render_view
 from vvgt_cli.dvr.layers import Layer, grid_of
 from vvgt_cli.dvr.render import FIT_VIEWS
-from vvgt_cli.runs.source import Source
-from vvgt_cli.vbm import VbmOptions, initialise
+from vvgt_cli.field.source import Source
 
 K, SIZE, VIEW = 100_000, 1080, 400
 

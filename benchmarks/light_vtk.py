@@ -23,7 +23,7 @@ from dvr_vtk import distance, psnr8, vtk_window
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.dvr import RenderSettings, Scene, render_view
 from vvgt_cli.dvr.vtk import add_lights, aim, read_pixels, view_renderer, volume_property
-from vvgt_cli.transfer.lighting import Lighting
+from vvgt_cli.look.lighting import Lighting
 
 NAMES = ("bonsai-tree", "embryo-shells", "headsq-bone-skin", "spm152-tissue")
 STEP, FAR, VIEWS = 0.25, 10.0, (0, 3)

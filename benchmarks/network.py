@@ -45,10 +45,10 @@ CASES = [
 
 def closed_form(count: int) -> Gaussians:
     """About ``count`` Gaussians of the closed form."""
+    from vvgt_cli.closed_form import VbmOptions, initialise
     from vvgt_cli.dvr import Scene
+    from vvgt_cli.look import from_histogram
     from vvgt_cli.synth import open_volume
-    from vvgt_cli.transfer import from_histogram
-    from vvgt_cli.vbm import VbmOptions, initialise
     from vvgt_cli.volume import statistics as volume_statistics
 
     volume = open_volume(VOLUME)

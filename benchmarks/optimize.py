@@ -16,16 +16,16 @@ from floors import alternate, flops, machine
 from splat import PIXEL_FLOPS, covered_pixels, sampled
 
 from vvgt_cli.cameras import default_views
-from vvgt_cli.descent.loss import loss_gradient
-from vvgt_cli.descent.ssim import add_ssim_gradient
-from vvgt_cli.descent.states import OwnFrame
-from vvgt_cli.descent.steps import own_frame
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.ply import read_ply
+from vvgt_cli.gaussians.rules import INRIA
+from vvgt_cli.refine.loss import loss_gradient
+from vvgt_cli.refine.ssim import add_ssim_gradient
+from vvgt_cli.refine.states import OwnFrame
+from vvgt_cli.refine.steps import own_frame
 from vvgt_cli.splat import blend, render
 from vvgt_cli.splat.kernel import project_factors, tile_lists
 from vvgt_cli.splat.render import depth_order, moments, own_frame_backward, pose
-from vvgt_cli.splat.rules import INRIA
 from vvgt_cli.synth import open_volume
 
 REPEATS = 9

@@ -28,11 +28,11 @@ from vvgt_cli.cli.main import run
 NONE = 10**12
 PARTS: dict[str, dict[str, Any]] = {
     "all": {},
-    "colours not sharpened": {"vvgt_cli.vbm.closed_form.sharpened": lambda found, *_: found},
+    "colours not sharpened": {"vvgt_cli.closed_form.closed_form.sharpened": lambda found, *_: found},
     "no cells by error": {"vvgt_cli.conversion.stages.cells.CellsByError.run": lambda *_: None},
-    "hidden cells too": {"vvgt_cli.vbm.error.UNSEEN": 0.0},
-    "no floor of slopes": {"vvgt_cli.descent.states.WEAKEST": 0.0},
-    "no steps in common": {"vvgt_cli.descent.shared.LEAST": NONE},
+    "hidden cells too": {"vvgt_cli.closed_form.error.UNSEEN": 0.0},
+    "no floor of slopes": {"vvgt_cli.refine.states.WEAKEST": 0.0},
+    "no steps in common": {"vvgt_cli.refine.shared.LEAST": NONE},
 }
 
 

@@ -25,17 +25,17 @@ from dvr_scenes import commit, print_table, read_scenes, write_rows
 from floors import machine
 
 from vvgt_cli.cameras import Camera, default_views
+from vvgt_cli.closed_form import VbmOptions, backproject, initialise
 from vvgt_cli.conversion.stages.views import LARGE, REFINE_VIEWS, fine_enough, views_of, wide
-from vvgt_cli.descent import LOSS_3DGS, OptimizeOptions, optimize
 from vvgt_cli.dvr import Scene, render_views
 from vvgt_cli.dvr.render import FIT_VIEWS
 from vvgt_cli.field.workload import view_edge
 from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.metrics import score_views
-from vvgt_cli.runs.views import Views
+from vvgt_cli.gaussians.rules import INRIA, Rule
+from vvgt_cli.images.metrics import score_views
+from vvgt_cli.refine import LOSS_3DGS, OptimizeOptions, optimize
+from vvgt_cli.score.checks import Views
 from vvgt_cli.splat import render
-from vvgt_cli.splat.rules import INRIA, Rule
-from vvgt_cli.vbm import VbmOptions, backproject, initialise
 
 K, SIZE, ADAM_STEPS, BASE_VIEWS = 100_000, 400, 100, 72
 STEPS = {"ours": (0, 24, 48, 96, 144, 400), "adam": (25, 100, 200), "3dgs": (300, 1000), "ivr-gs": (300, 1000)}

@@ -17,17 +17,17 @@ import numpy as np
 from dvr_scenes import print_table, read_scenes, write_rows
 
 from vvgt_cli.cameras import default_views
+from vvgt_cli.conversion.gaussian_files import file_rule, layout_of, open_gaussians
+from vvgt_cli.conversion.place import into_box, preview, upright
 from vvgt_cli.dvr import RenderSettings, Scene
 from vvgt_cli.errors import DataError
+from vvgt_cli.field.source import Source
 from vvgt_cli.gaussians import Gaussians, in_unit_frame
-from vvgt_cli.runs.gaussian_files import file_rule, layout_of, open_gaussians
-from vvgt_cli.runs.place import into_box, preview, upright
-from vvgt_cli.runs.score import score_test_views
-from vvgt_cli.runs.source import Source
-from vvgt_cli.runs.viewing import PREVIEW_VIEWS
-from vvgt_cli.share import encoded, read_splats
-from vvgt_cli.share.formats import FORMATS
-from vvgt_cli.splat.rules import Rule
+from vvgt_cli.gaussians.formats import encoded, read_splats
+from vvgt_cli.gaussians.formats.choose import FORMATS
+from vvgt_cli.gaussians.rules import Rule
+from vvgt_cli.score.viewing import PREVIEW_VIEWS
+from vvgt_cli.score.views import score_test_views
 
 PICTURED, EDGE, QUALITY = 4, 360, 88  # test view from the side, pixels of a picture, of JPEG
 

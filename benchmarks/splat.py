@@ -15,10 +15,10 @@ from floors import alternate, bandwidth, flops, machine
 
 from vvgt_cli.cameras import default_views
 from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.gaussians.constants import TILE
+from vvgt_cli.look import from_histogram
 from vvgt_cli.splat import Projection, blend, gather, project
-from vvgt_cli.splat.constants import TILE
 from vvgt_cli.synth import open_volume
-from vvgt_cli.transfer import from_histogram
 from vvgt_cli.volume import Volume, statistics
 
 COUNT, REPEATS, SIZES = 100_000, 9, (400, 1600)

@@ -33,22 +33,22 @@ import numpy as np
 from closed_form import read_options, scene_rows
 
 from vvgt_cli.cameras import Camera, default_views
-from vvgt_cli.descent import OptimizeOptions, optimize
+from vvgt_cli.closed_form import VbmOptions, initialise
 from vvgt_cli.dvr import RenderSettings, Scene, render_views
+from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.metrics import score_views, ssim
+from vvgt_cli.images.metrics import score_views, ssim
 from vvgt_cli.network.card import find_model
 from vvgt_cli.network.runtime import Model
+from vvgt_cli.network.training.config import read_config
+from vvgt_cli.network.training.scenes import as_float, prepare_scenes
 from vvgt_cli.progress import Console
-from vvgt_cli.runs.source import SourceRequest, load
+from vvgt_cli.refine import OptimizeOptions, optimize
 from vvgt_cli.splat import render
 from vvgt_cli.splat.half import halved
 from vvgt_cli.synth.analytic import volume_of
 from vvgt_cli.synth.shapes import make_shape
 from vvgt_cli.synth.turbulence import TURNOVER, Solver, fields, flow_of, run
-from vvgt_cli.training.config import read_config
-from vvgt_cli.training.scenes import as_float, prepare_scenes
-from vvgt_cli.vbm import VbmOptions, initialise
 from vvgt_cli.volume.nrrd_write import write_nrrd
 
 GRID, SIZES = 64, (96, 128, 160)

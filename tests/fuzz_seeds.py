@@ -253,9 +253,9 @@ def numpy_files() -> list[Seed]:
 
 
 def transfer() -> list[Seed]:
-    from test_transfer_formats import ITF, XML, mrml, vp, vp_json
+    from test_look_formats import ITF, XML, mrml, vp, vp_json
 
-    from vvgt_cli.transfer import read_transfer_function
+    from vvgt_cli.look import read_transfer_function
 
     def read(path: Path) -> None:
         tf = read_transfer_function(str(path))
@@ -284,7 +284,7 @@ def transfer() -> list[Seed]:
 def label_tables() -> list[Seed]:
     from test_labels import FREESURFER, JSON, SEGMENTS, SLICER, SNAP
 
-    from vvgt_cli.transfer.label_files import read_labels
+    from vvgt_cli.look.label_files import read_labels
 
     read = lambda path: read_labels(str(path)).color(np.array([0.0, 1.0, 3.0, np.nan]))  # noqa: E731
 
@@ -340,10 +340,10 @@ def model_card() -> list[Seed]:
 def checkpoint() -> list[Seed]:
     from test_optimize_checkpoint import CAMERAS, cloud
 
-    from vvgt_cli.descent import OptimizeOptions, OptimizeRecord
-    from vvgt_cli.descent.checkpoint import resume, save
-    from vvgt_cli.descent.judge import Judge
-    from vvgt_cli.descent.loop import begin
+    from vvgt_cli.refine import OptimizeOptions, OptimizeRecord
+    from vvgt_cli.refine.checkpoint import resume, save
+    from vvgt_cli.refine.judge import Judge
+    from vvgt_cli.refine.loop import begin
 
     def fresh(method: str) -> tuple[Any, Judge, OptimizeRecord]:
         record, state = OptimizeRecord(), begin(cloud(4), CAMERAS, OptimizeOptions.of(method, max_gaussians=8))
@@ -361,7 +361,7 @@ def checkpoint() -> list[Seed]:
 
 
 def manifest() -> list[Seed]:
-    from vvgt_cli.batches.manifest import Manifest, read_manifest
+    from vvgt_cli.conversion.manifest import Manifest, read_manifest
 
     document = {
         "format": "vvgt-views", "schema": 1, "hash": "ab" * 32, "settings": {"size": 40, "half": False},

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from tests.test_volume_slices import write_series
-from vvgt_cli.runs.source import SourceRequest, load
-from vvgt_cli.transfer.histogram import _side
+from vvgt_cli.field.source import SourceRequest, load
+from vvgt_cli.look.histogram import _side
 from vvgt_cli.volume import ReadOptions, read_volume
 
 

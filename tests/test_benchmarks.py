@@ -189,7 +189,7 @@ def test_optimize(bench):
 
 
 def test_parts(bench, scenes, tmp_path, monkeypatch):
-    monkeypatch.setattr("vvgt_cli.descent.shared.LEAST", 100)
+    monkeypatch.setattr("vvgt_cli.refine.shared.LEAST", 100)
     module = bench("parts")
     call(module.main, *scenes, "-o", tmp_path / "a.csv", "--", "--max-gaussians", 300, "--size", SIZE, "--steps", 24)
     rows = {row["part"]: row for row in rows_of(tmp_path / "a.csv")}

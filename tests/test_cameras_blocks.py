@@ -10,8 +10,8 @@ from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.checks.clouds import cloud
 from vvgt_cli.dvr import RenderSettings, Scene, render_view
 from vvgt_cli.errors import UsageError
+from vvgt_cli.look.readers import minimal
 from vvgt_cli.splat import render
-from vvgt_cli.transfer.readers import minimal
 from vvgt_cli.volume import Volume
 
 

@@ -63,7 +63,7 @@ def test_what_is_wrong_fails_with_one_line(case, problem):
 
 
 def few(monkeypatch, cases):
-    monkeypatch.setattr("vvgt_cli.tasks.check.all_cases", lambda: iter(cases))
+    monkeypatch.setattr("vvgt_cli.commands.check.all_cases", lambda: iter(cases))
 
 
 def test_the_command_prints_a_table_and_ends_with_status_0(vvgt, monkeypatch):

@@ -15,7 +15,7 @@ import pytest
 from vvgt_cli.cameras.files import read_cameras
 from vvgt_cli.gaussians import in_unit_frame, read_ply
 from vvgt_cli.images import read_exr, read_png
-from vvgt_cli.metrics import psnr
+from vvgt_cli.images.metrics import psnr
 
 ROOT = Path(__file__).parent.parent
 SMALL = ("--max-gaussians", 300, "--size", 48)
@@ -219,7 +219,7 @@ def test_evaluate_draws_what_it_scores_from_afar_and_close_up(converted, vvgt, t
 
 def test_rules_are_the_tables():
     from vvgt_cli.cli.fit import RULES as NAMES
-    from vvgt_cli.splat.rules import RULES
+    from vvgt_cli.gaussians.rules import RULES
 
     assert tuple(RULES) == NAMES
 
@@ -261,7 +261,7 @@ def test_tf_show_draws(folder, vvgt):
 
 
 def test_an_interrupted_run_leaves_nothing(folder, vvgt, monkeypatch):
-    import vvgt_cli.runs.gaussian_files as files
+    import vvgt_cli.conversion.gaussian_files as files
 
     def stop(stream, *args):
         Path(stream).write_bytes(b"half")

@@ -241,7 +241,7 @@ def test_termination_removes_the_temporary_file(folder):
     code = "\n".join(
         [
             "import os, signal, sys",
-            "import vvgt_cli.runs.outputs as outputs",
+            "import vvgt_cli.gaussians.outputs as outputs",
             "from vvgt_cli.cli import main",
             "def work(args=None):",
             "    with outputs.atomic_write('a.txt') as temporary:",

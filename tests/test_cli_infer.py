@@ -12,6 +12,7 @@ from network_models import as_rows
 from onnx_models import write_model
 
 from vvgt_cli.cli.main import run
+from vvgt_cli.commands.infer import divide
 from vvgt_cli.conversion.request import FitOptions
 from vvgt_cli.conversion.stage import Work
 from vvgt_cli.conversion.stages import Network
@@ -21,9 +22,8 @@ from vvgt_cli.network.card import ModelCard
 from vvgt_cli.network.prepare import prepare
 from vvgt_cli.network.runtime import Model
 from vvgt_cli.progress import Console
-from vvgt_cli.runs.record import ConversionReport, Run
-from vvgt_cli.runs.views import Views
-from vvgt_cli.tasks.infer import divide
+from vvgt_cli.score.checks import Views
+from vvgt_cli.score.record import ConversionReport, Run
 
 DARK = 0.2
 BRIGHTER, DARKER = (*[0.0] * 11, *[DARK] * 3), (*[0.0] * 11, *[-DARK] * 3)

@@ -11,7 +11,7 @@ import vvgt_cli
 from vvgt_cli import Look
 from vvgt_cli.gaussians import read_ply
 from vvgt_cli.gaussians.ply import _rows
-from vvgt_cli.transfer.lighting import Lighting, LightOptions
+from vvgt_cli.look.lighting import Lighting, LightOptions
 
 SOURCE = "example:marschner-lobb:24"
 SMALL = ("--max-gaussians", "300", "--size", "48", "--steps", "24")

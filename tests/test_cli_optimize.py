@@ -16,9 +16,9 @@ import pytest
 
 from vvgt_cli.cameras.files import read_cameras
 from vvgt_cli.cli.main import run
+from vvgt_cli.commands.optimize import load_sets
 from vvgt_cli.gaussians import PlyOptions, read_ply, write_ply
 from vvgt_cli.images import write_exr
-from vvgt_cli.tasks.optimize import load_sets
 
 SCENE = ("example:blob:16", "--tf", "viridis")
 ROOT = Path(__file__).parent.parent

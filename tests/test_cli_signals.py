@@ -19,8 +19,8 @@ signal.signal(signal.SIGHUP, signal.SIG_DFL)  # the tests may run under nohup
 from vvgt_cli.conversion.stages import ClosedFormStage
 from vvgt_cli.cli import main
 from vvgt_cli.files import atomic_write
-from vvgt_cli.vbm.moments import base_cells
-from vvgt_cli.vbm.visibility import visibility
+from vvgt_cli.closed_form.moments import base_cells
+from vvgt_cli.closed_form.visibility import visibility
 import numpy as np
 
 def closed_form(self, work):

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from tests.test_conversion_plan import CASE, darkened, done, of
+from vvgt_cli.closed_form.fit import solve_colors
 from vvgt_cli.conversion.plan import Planner
 from vvgt_cli.conversion.request import FitOptions, Limits
 from vvgt_cli.conversion.stages import CellsByError
-from vvgt_cli.vbm.fit import solve_colors
 
 pytestmark = pytest.mark.usefixtures("small_seats")
 
@@ -19,11 +19,11 @@ def test_cells_by_error_are_kept_where_the_check_views_gain_and_dropped_where_th
         return solve_colors(start.gaussians, cameras, views, rule=rule)
 
     fit = FitOptions(200, 48, steps=24)
-    monkeypatch.setattr("vvgt_cli.vbm.cut_by_error", colored)
+    monkeypatch.setattr("vvgt_cli.closed_form.cut_by_error", colored)
     stage = next(stage for stage in done(tmp_path, fit).stages if stage.name == "cells by error")
     assert stage.kept
     assert stage.psnr > stage.psnr_before
-    monkeypatch.setattr("vvgt_cli.vbm.cut_by_error", lambda start, *_: darkened(start.gaussians))
+    monkeypatch.setattr("vvgt_cli.closed_form.cut_by_error", lambda start, *_: darkened(start.gaussians))
     stages = done(tmp_path, fit, overwrite=True).stages
     stage = next(stage for stage in stages if stage.name == "cells by error")
     assert not stage.kept
@@ -41,7 +41,7 @@ def test_cells_are_chosen_by_views_from_all_sides(tmp_path, monkeypatch):
         assert len(views) == len(cameras)
         return start.gaussians
 
-    monkeypatch.setattr("vvgt_cli.vbm.cut_by_error", seen)
+    monkeypatch.setattr("vvgt_cli.closed_form.cut_by_error", seen)
     monkeypatch.setattr("vvgt_cli.conversion.stages.refinement.refine", lambda run, start, *_: start)
     done(tmp_path, FitOptions(60, 16, steps=200))
     eyes = np.array([camera.position for camera in used])

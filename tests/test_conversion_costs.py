@@ -9,8 +9,8 @@ from vvgt_cli.conversion.stages import CheckViews, TestViews, TrainingViews
 from vvgt_cli.dvr import Scene
 from vvgt_cli.field import workload as case_module
 from vvgt_cli.field.workload import Workload, measure
+from vvgt_cli.look.readers import minimal
 from vvgt_cli.synth import open_volume
-from vvgt_cli.transfer.readers import minimal
 
 POINTS = [{"x": x, "rgb": [x, 0.5, 1 - x], "opacity": 0.6 * x} for x in (0.0, 0.5, 1.0)]
 

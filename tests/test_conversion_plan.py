@@ -18,15 +18,15 @@ from vvgt_cli.conversion.stage import Work
 from vvgt_cli.conversion.stages import BackProjection, Network, Refinement, TrainingViews
 from vvgt_cli.conversion.stages.refinement import WIDER
 from vvgt_cli.conversion.stages.views import views_of
-from vvgt_cli.descent.options import TEXTURE
 from vvgt_cli.errors import UsageError
+from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.field.workload import Workload, expected_wide
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply
+from vvgt_cli.gaussians.constants import DILATION
+from vvgt_cli.gaussians.rules import RULES
 from vvgt_cli.progress import Console
-from vvgt_cli.runs.record import ConversionReport, Run
-from vvgt_cli.runs.source import SourceRequest
-from vvgt_cli.splat.constants import DILATION
-from vvgt_cli.splat.rules import RULES
+from vvgt_cli.refine.options import TEXTURE
+from vvgt_cli.score.record import ConversionReport, Run
 
 pytestmark = pytest.mark.usefixtures("small_seats")
 CASE = Workload(gaussians=100_000, cells=1e6, voxels=10.2e6, size=48, view=0.05, pace=1.0, there=2e8)
@@ -162,7 +162,7 @@ def test_views_that_do_not_fit_are_refused(monkeypatch):
 
 
 def test_gaussians_that_do_not_fit_are_refused_with_the_number_that_would(monkeypatch):
-    monkeypatch.setattr("vvgt_cli.vbm.closed_form.expected_cells", lambda voxels, step, size, budget: 2.0 * budget)
+    monkeypatch.setattr("vvgt_cli.closed_form.closed_form.expected_cells", lambda *sizes: 2.0 * sizes[3])
     case = replace(CASE, gaussians=1_000_000, cells=2e6)
     found = Planner(Limits(), 1_000_000, 0, 0, 48).plan(case, 1.0)
     each, views = 0.8 * (2 * 294 + 1240), 0.8 * 32 * 48**2 * 29
@@ -190,7 +190,9 @@ def test_back_projection_is_kept_where_the_check_views_gain_and_dropped_where_th
     assert stage.kept
     assert stage.psnr > stage.psnr_before
     assert not np.array_equal(read_ply(tmp_path / "a.ply")[0].colors, alone.colors)
-    monkeypatch.setattr("vvgt_cli.vbm.backproject", lambda start, *_, **__: (darkened(start.gaussians), "worse"))
+    monkeypatch.setattr(
+        "vvgt_cli.closed_form.backproject", lambda start, *_, **__: (darkened(start.gaussians), "worse")
+    )
     stage = next(stage for stage in done(tmp_path, fit, overwrite=True).stages if stage.name == "back-projection")
     assert not stage.kept
     assert stage.psnr < stage.psnr_before

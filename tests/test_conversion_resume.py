@@ -9,8 +9,8 @@ import pytest
 
 from vvgt_cli.conversion import convert as conversion
 from vvgt_cli.conversion.stages import scores, views
-from vvgt_cli.descent import loop
 from vvgt_cli.dvr import RenderSettings
+from vvgt_cli.refine import loop
 
 LINE = ("convert", "example:blob:8", "--max-gaussians", "200", "--size", "32", "--steps", "24")
 
@@ -66,8 +66,8 @@ def test_a_conversion_goes_on_where_it_was_ended(target, calls, left, folder, vv
             ended(patch, "convert.improve", 0)
         ended(patch, "loop.step", 20 if "refinement.npz" in left else 24)
         if "cells.npz" in left:
-            patch.setattr("vvgt_cli.vbm.initialise", None)
-            patch.setattr("vvgt_cli.vbm.cut_by_error", None)
+            patch.setattr("vvgt_cli.closed_form.initialise", None)
+            patch.setattr("vvgt_cli.closed_form.cut_by_error", None)
         result = vvgt(*line)
     assert result.code == 0, result.err
     assert (folder / "a.ply").read_bytes() == (folder / "whole.ply").read_bytes()

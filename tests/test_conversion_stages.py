@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 
 from vvgt_cli.cameras import default_views
+from vvgt_cli.closed_form import VbmOptions, initialise
 from vvgt_cli.conversion.stages.refinement import drawn_by_all, refine
 from vvgt_cli.conversion.stages.views import fine_enough, wide
-from vvgt_cli.descent import OptimizeOptions
 from vvgt_cli.dvr import RenderSettings, Scene, render_view
 from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.gaussians.rules import INRIA
+from vvgt_cli.look.readers import minimal
 from vvgt_cli.progress import Console
-from vvgt_cli.runs.record import ConversionReport, Run
-from vvgt_cli.runs.views import Views, judging_views
+from vvgt_cli.refine import OptimizeOptions
+from vvgt_cli.score.checks import Views, judging_views
+from vvgt_cli.score.record import ConversionReport, Run
 from vvgt_cli.splat import render
-from vvgt_cli.splat.rules import INRIA
-from vvgt_cli.transfer.readers import minimal
-from vvgt_cli.vbm import VbmOptions, initialise
 from vvgt_cli.volume import Volume
 
 

@@ -17,10 +17,10 @@ from pydicom.uid import UID, generate_uid
 from tests.test_volume_slices import header, write_series
 from vvgt_cli.dvr.layers import common_grid, grid_of
 from vvgt_cli.errors import DataError, SeveralComponents, UsageError
+from vvgt_cli.field.layered import LayerRequest, layers_of, open_parts
+from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.gaussians import read_ply
-from vvgt_cli.runs.layered import LayerRequest, layers_of, open_parts
-from vvgt_cli.runs.source import SourceRequest, load
-from vvgt_cli.transfer.label_files import read_labels
+from vvgt_cli.look.label_files import read_labels
 from vvgt_cli.volume import ReadOptions, read_volume
 from vvgt_cli.volume.dicom_seg import is_segmentation_file
 

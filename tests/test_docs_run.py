@@ -18,7 +18,7 @@ import tifffile
 
 from tests import anatomy
 from tests.docs_commands import blocks, small
-from tests.test_transfer_formats import mrml
+from tests.test_look_formats import mrml
 
 ROOT = Path(__file__).parent.parent
 

@@ -14,9 +14,9 @@ from vvgt_cli.dvr import RenderSettings, Scene, render_view_reference, render_vi
 from vvgt_cli.dvr import vtk as vtk_renderer
 from vvgt_cli.dvr.backends import view_renderer
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.transfer.colormap import ColorMap
-from vvgt_cli.transfer.function import TransferFunction
-from vvgt_cli.transfer.opacity import PiecewiseOpacity
+from vvgt_cli.look.colormap import ColorMap
+from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.look.opacity import PiecewiseOpacity
 from vvgt_cli.volume import Volume
 
 FINE = RenderSettings(step=0.25, samples=1)
@@ -103,7 +103,7 @@ import sys
 import numpy as np
 from test_dvr_backends import FINE, decentred, scene, view
 from vvgt_cli.dvr.backends import view_renderer
-from vvgt_cli.transfer.lighting import Lighting
+from vvgt_cli.look.lighting import Lighting
 draw, lit = (view_renderer("vtk", made, FINE) for made in (scene(), scene().lit(Lighting())))
 np.savez(sys.argv[1], plain=draw(view()), decentred=draw(decentred()), lit=lit(view()))
 """

@@ -14,10 +14,10 @@ from vvgt_cli.dvr.layout import BRICK
 from vvgt_cli.dvr.render import ray_offsets
 from vvgt_cli.dvr.runs import NEAR
 from vvgt_cli.errors import UsageError
-from vvgt_cli.transfer.colormap import ColorMap
-from vvgt_cli.transfer.lighting import Lighting
-from vvgt_cli.transfer.opacity import PiecewiseOpacity
-from vvgt_cli.transfer.tables import extinction
+from vvgt_cli.look.colormap import ColorMap
+from vvgt_cli.look.lighting import Lighting
+from vvgt_cli.look.opacity import PiecewiseOpacity
+from vvgt_cli.look.tables import extinction
 from vvgt_cli.volume import Volume
 
 ONE_RAY = RenderSettings(samples=1)
@@ -376,7 +376,7 @@ def test_settings_are_checked(options):
 
 
 def test_the_package_functions_render_too():
-    from vvgt_cli.transfer.function import TransferFunction
+    from vvgt_cli.look.function import TransferFunction
 
     opacity = PiecewiseOpacity(np.array([0.0, 1.0]), np.array([0.0, 0.5]))
     colors = ColorMap(np.array([0.0, 1.0]), np.array([[0.0, 0, 1], [1, 0, 0]]))

@@ -13,7 +13,7 @@ from vvgt_cli.dvr import RenderSettings, Scene, render_view
 from vvgt_cli.dvr.layout import BRICK, Voxels
 from vvgt_cli.dvr.runs import sample_run, stack_run
 from vvgt_cli.dvr.scene import kernel_type, kernel_values
-from vvgt_cli.transfer.tables import MAX_OPACITY, build_tables, extinction
+from vvgt_cli.look.tables import MAX_OPACITY, build_tables, extinction
 from vvgt_cli.volume import Volume
 
 TYPES = ["b1", "u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f2", "f4", "f8"]

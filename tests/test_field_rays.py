@@ -12,6 +12,8 @@ import pytest
 from tests.test_scale import FIT, bodies
 from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.blocks import spread_blocks
+from vvgt_cli.closed_form import VbmOptions
+from vvgt_cli.conversion.shards.score import scored_views
 from vvgt_cli.dvr import RenderSettings, render_view
 from vvgt_cli.dvr.render import FIT_VIEWS, Box, camera_arrays
 from vvgt_cli.field.field import Picture
@@ -20,15 +22,13 @@ from vvgt_cli.field.open import Wanted, blocked
 from vvgt_cli.field.parts import Parts
 from vvgt_cli.field.rays import Cast, front_to_back, meeting, pieces_of
 from vvgt_cli.field.settings import BlockOptions
+from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.gaussians import read_ply
-from vvgt_cli.metrics import score_views
+from vvgt_cli.images.metrics import score_views
+from vvgt_cli.look.lighting import LightOptions
 from vvgt_cli.progress import Console
-from vvgt_cli.runs.record import ConversionReport, Run
-from vvgt_cli.runs.source import SourceRequest, load
-from vvgt_cli.scale.score import scored_views
+from vvgt_cli.score.record import ConversionReport, Run
 from vvgt_cli.splat import render
-from vvgt_cli.transfer.lighting import LightOptions
-from vvgt_cli.vbm import VbmOptions
 from vvgt_cli.volume import Volume
 
 LIT = LightOptions(lights=("1,1,2", "headlight"), shadows=True, occlusion=0.2)
@@ -199,7 +199,7 @@ def test_a_file_that_no_memory_draws_is_written_without_a_score(vvgt, tmp_path, 
     path = tmp_path / "v_100x90x80_uint8.raw"
     path.write_bytes(np.round(bodies() * 255).astype(np.uint8).tobytes())
     assert vvgt("init", path, "-o", tmp_path / "a.ply", *FIT, "--blocks", "64").code == 0
-    monkeypatch.setattr("vvgt_cli.scale.score.A_GAUSSIAN", 1 << 40)
+    monkeypatch.setattr("vvgt_cli.conversion.shards.score.A_GAUSSIAN", 1 << 40)
     run = vvgt("init", path, "-o", tmp_path / "b.ply", *FIT[:-1], "--blocks", "64")
     assert run.code == 0
     assert "left out: test views" in run.err

@@ -104,7 +104,7 @@ def test_what_the_disk_does_not_take_is_put_elsewhere(tmp_path, vvgt, monkeypatc
     code = "\n".join(
         [
             "import resource, sys, tempfile",
-            "import vvgt_cli.runs.gaussian_files as render",
+            "import vvgt_cli.conversion.gaussian_files as render",
             "from vvgt_cli.cli.main import run",
             f"tempfile.tempdir = {str(elsewhere)!r}",
             "find = tempfile.gettempdir",

@@ -7,20 +7,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from tests.vbm_scenes import Ramp, Tent, scene_of, score
+from tests.closed_form_scenes import Ramp, Tent, scene_of, score
 from vvgt_cli.cameras import default_views
 from vvgt_cli.checks.mapping import cuts, quadrature
 from vvgt_cli.checks.scenes import camera
+from vvgt_cli.closed_form import VbmOptions, backproject, initialise
+from vvgt_cli.closed_form import closed_form as closed_form_module
+from vvgt_cli.closed_form.closed_form import closed_form
+from vvgt_cli.closed_form.moments import base_cells
 from vvgt_cli.dvr import RenderSettings, Scene, render_view, render_view_reference, render_views
 from vvgt_cli.dvr.layout import Texels
 from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.look.lighting import Lighting
 from vvgt_cli.splat import render
 from vvgt_cli.synth import analytic
-from vvgt_cli.transfer.lighting import Lighting
-from vvgt_cli.vbm import VbmOptions, backproject, initialise
-from vvgt_cli.vbm import closed_form as closed_form_module
-from vvgt_cli.vbm.closed_form import closed_form
-from vvgt_cli.vbm.moments import base_cells
 from vvgt_cli.volume import Volume
 
 FINE = RenderSettings(step=0.0625, samples=1)

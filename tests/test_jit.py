@@ -20,7 +20,7 @@ ROOT = Path(__file__).parent.parent
 SOURCE = "example:marschner-lobb:24"
 SMALL = ("--max-gaussians", "200", "--size", "40")
 STEP = (
-    "from vvgt_cli.descent.steps import adam; import numpy as np; a = np.ones(3, np.float32); "
+    "from vvgt_cli.refine.steps import adam; import numpy as np; a = np.ones(3, np.float32); "
     "adam(a, a.copy(), 0.1, 0.9, 0.99, 1, a * 0, a * 0); print(a)"
 )
 
@@ -91,7 +91,7 @@ def cache(tmp_path, monkeypatch):
 
 def test_a_run_that_compiles_leaves_the_bytes_of_one_that_loads(tmp_path, cache):
     """Two kernels of loops over threads and one without are compiled by the first run, one of them by itself."""
-    some = ("vvgt_cli.splat.tiles.blend-", "vvgt_cli.splat.kernel.project-", "vvgt_cli.vbm.pyramid.take_base-")
+    some = ("vvgt_cli.splat.tiles.blend-", "vvgt_cli.splat.kernel.project-", "vvgt_cli.closed_form.pyramid.take_base-")
     for name in kernels(cache):
         if name.startswith(some):
             (cache / name).unlink()
@@ -105,7 +105,7 @@ def test_a_run_that_compiles_leaves_the_bytes_of_one_that_loads(tmp_path, cache)
 
 
 def test_warmup_says_where_and_compiles_what_is_missing(tmp_path, cache):
-    some = ("vvgt_cli.vbm.inset._shift", "vvgt_cli.splat.kernel.project-")
+    some = ("vvgt_cli.closed_form.inset._shift", "vvgt_cli.splat.kernel.project-")
     gone = {name for name in kernels(cache) if name.startswith(some)}
     for name in gone:
         (cache / name).unlink()
@@ -162,7 +162,7 @@ def one_by_one(tmp_path, *args):
 
 
 def test_commands_need_what_is_compiled_ahead_and_nothing_else(tmp_path):
-    rare = {"vvgt_cli.vbm.inset:_shift", "vvgt_cli.vbm.inset:_blur"}  # of opaque scenes
+    rare = {"vvgt_cli.closed_form.inset:_shift", "vvgt_cli.closed_form.inset:_blur"}  # of opaque scenes
     fit = ("--max-gaussians", 200, "--size", 64, "-q")
     rare |= {ahead.REGRESS}  # and of more than a few Gaussians
     assert wanted(tmp_path, "convert", SOURCE, *fit, "--steps", 24, "-o", "a.ply") == set(ahead.CONVERT) - rare
@@ -217,7 +217,7 @@ def kernels(folder: Path) -> list[str]:
 PROBE = """
 from vvgt_cli.dvr.kernel import absorbed
 from vvgt_cli.jit.decorators import kernel
-from vvgt_cli.splat.constants import NEAR
+from vvgt_cli.gaussians.constants import NEAR
 
 @kernel()
 def probe(value):
@@ -243,23 +243,23 @@ def test_an_edit_of_what_a_kernel_calls_or_reads_is_noticed_and_the_old_code_goe
 
     value, name = probe()
     assert value == pytest.approx((1 - math.exp(-3)) / 3 + 0.01)
-    edit("descent/loss.py", '"""Numba', '"""A numba')  # of no use to it
+    edit("refine/loss.py", '"""Numba', '"""A numba')  # of no use to it
     assert probe() == (value, name)
     edit("dvr/kernel.py", "return (1.0 - math.exp(-depth)) / depth", "return (4.0 - math.exp(-depth)) / depth")
     assert probe()[0] == pytest.approx((4 - math.exp(-3)) / 3 + 0.01)
-    edit("splat/constants.py", "NEAR = 0.01", "NEAR = 0.5")
+    edit("gaussians/constants.py", "NEAR = 0.01", "NEAR = 0.5")
     assert probe()[0] == pytest.approx((4 - math.exp(-3)) / 3 + 0.5)
 
 
 def test_what_a_kernel_reaches():
+    from vvgt_cli.closed_form.quadrature import block_moments
     from vvgt_cli.jit.cache import reached
     from vvgt_cli.splat.tiles import blend
-    from vvgt_cli.vbm.quadrature import block_moments
 
     modules, constants = reached(blend.py_func)
     assert "vvgt_cli.splat.tiles" in modules
     assert {"TILE = 16", "HALF = np.float32(0.5)"} <= constants
-    assert {"vvgt_cli.vbm.quadrature", "vvgt_cli.dvr.kernel"} <= reached(block_moments.py_func)[0]
+    assert {"vvgt_cli.closed_form.quadrature", "vvgt_cli.dvr.kernel"} <= reached(block_moments.py_func)[0]
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ import pytest
 from vvgt_cli.gaussians import Gaussians, write_ply
 from vvgt_cli.jit import ahead
 from vvgt_cli.jit.compile import usual_jobs
-from vvgt_cli.runs.record import Run
+from vvgt_cli.score.record import Run
 
 
 def some(count: int = 60, degree: int = 0) -> Gaussians:

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 import vvgt_cli as library
+from vvgt_cli.conversion.gaussian_files import layout_of
 from vvgt_cli.dvr.layers import grid_of
 from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.gaussians import read_ply
-from vvgt_cli.runs.gaussian_files import layout_of
-from vvgt_cli.runs.source import SourceRequest, load
-from vvgt_cli.transfer.label_files import read_labels
-from vvgt_cli.transfer.labels import LabelTable, distinct
+from vvgt_cli.look.label_files import read_labels
+from vvgt_cli.look.labels import LabelTable, distinct
 from vvgt_cli.volume import Volume
 from vvgt_cli.volume.label_maps import labels_in, recognised
 
@@ -170,7 +170,7 @@ def test_a_recognised_label_map_is_said_and_none_takes_it_back(vvgt, tmp_path: P
 
 
 def test_a_segmentation_is_its_own_table(tmp_path: Path) -> None:
-    from vvgt_cli.runs.source import SourceRequest, load
+    from vvgt_cli.field.source import SourceRequest, load
 
     values = np.array([0, 1, 3, 1, 0, 3, 1, 0], np.uint8)
     (tmp_path / "x.seg.nrrd").write_bytes(SEGMENTS.encode() + values.tobytes())

@@ -15,11 +15,11 @@ import vvgt_cli as library
 from tests.test_labels import SMALL, balls
 from vvgt_cli.dvr.layers import Layer, common_grid, grid_of, same_grid
 from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.field.layered import ALL, LayerRequest, open_parts, parse_layer
+from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.gaussians import read_ply
-from vvgt_cli.runs.layered import ALL, LayerRequest, open_parts, parse_layer
-from vvgt_cli.runs.source import SourceRequest, load
-from vvgt_cli.transfer import ColorMap, PiecewiseOpacity, TransferFunction
-from vvgt_cli.transfer.labels import distinct
+from vvgt_cli.look import ColorMap, PiecewiseOpacity, TransferFunction
+from vvgt_cli.look.labels import distinct
 from vvgt_cli.volume import ReadOptions, Volume, read_volume
 from vvgt_cli.volume.cut import crop, masked, parse_crop
 
@@ -193,7 +193,7 @@ def test_rgb_looks_as_vtk_draws_dependent_components() -> None:
     from tests.vtk_colors import dependent
     from vvgt_cli.checks.scenes import camera
     from vvgt_cli.dvr import RenderSettings, Scene, render_view
-    from vvgt_cli.metrics import psnr
+    from vvgt_cli.images.metrics import psnr
 
     values = colors((24, 24, 24), 4)
     bands = tuple(Volume(np.ascontiguousarray(values[..., c])) for c in range(4))

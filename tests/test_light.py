@@ -16,8 +16,8 @@ from vvgt_cli.dvr.backends import view_renderer
 from vvgt_cli.dvr.light import ANGLE, OFFSET, RAYS, cone, sphere, transmittance
 from vvgt_cli.dvr.reference import grid_values, normals, optics, trilinear
 from vvgt_cli.errors import UsageError
-from vvgt_cli.transfer import ColorMap, PiecewiseOpacity, TransferFunction
-from vvgt_cli.transfer.lighting import Lighting, LightOptions, parse_lighting
+from vvgt_cli.look import ColorMap, PiecewiseOpacity, TransferFunction
+from vvgt_cli.look.lighting import Lighting, LightOptions, parse_lighting
 from vvgt_cli.volume import Volume
 
 ABOVE = (0.0, 0.0, 1.0)

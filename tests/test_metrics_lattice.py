@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from vvgt_cli.cameras.sets import look_at
+from vvgt_cli.closed_form import VbmOptions, initialise
 from vvgt_cli.dvr import Scene, render_view
+from vvgt_cli.look.readers import minimal
 from vvgt_cli.splat import render
-from vvgt_cli.transfer.readers import minimal
-from vvgt_cli.vbm import VbmOptions, initialise
 from vvgt_cli.volume import Volume
 
 SPOT = 2  # frequencies around a peak, in cycles a picture

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from vvgt_cli.cameras import default_views
+from vvgt_cli.closed_form import VbmOptions, backproject, initialise
+from vvgt_cli.commands.infer import SHIPPED
 from vvgt_cli.dvr import RenderSettings, Scene, render_views
-from vvgt_cli.metrics import psnr
+from vvgt_cli.images.metrics import psnr
+from vvgt_cli.look import from_histogram
 from vvgt_cli.network.card import find_model
 from vvgt_cli.network.runtime import Model
 from vvgt_cli.splat import render
 from vvgt_cli.synth.shapes import make_shape
-from vvgt_cli.tasks.infer import SHIPPED
-from vvgt_cli.transfer import from_histogram
-from vvgt_cli.vbm import VbmOptions, backproject, initialise
 from vvgt_cli.volume import statistics
 
 ROOT = Path(__file__).parent.parent

@@ -14,8 +14,8 @@ from vvgt_cli.cameras.files import transforms_json
 from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import Gaussians, PlyOptions, write_ply
+from vvgt_cli.images.metrics import psnr
 from vvgt_cli.images.movies import write_movie
-from vvgt_cli.metrics import psnr
 from vvgt_cli.splat import render
 
 

@@ -8,11 +8,11 @@ from network_models import scene
 
 from vvgt_cli.cameras import default_views
 from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.gaussians.constants import DILATION
 from vvgt_cli.network.config import SLOPES
 from vvgt_cli.network.prepare import pack, unpack
 from vvgt_cli.network.slopes import STEP, own_frame, slope_rows
 from vvgt_cli.splat import render, render_backward_reference, render_reference
-from vvgt_cli.splat.constants import DILATION
 from vvgt_cli.splat.half import halved
 from vvgt_cli.splat.reference import rotations
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from vvgt_cli.cameras import default_views
-from vvgt_cli.descent import OptimizeOptions, optimize
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.refine import OptimizeOptions, optimize
 from vvgt_cli.splat import render
 
 FIELDS = ("means", "log_scales", "quaternions", "opacity_logits", "colors")

@@ -7,11 +7,11 @@ import pytest
 
 from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.sets import look_at
-from vvgt_cli.descent import OptimizeOptions, optimize
-from vvgt_cli.descent.densify import DENSE, FAINTEST, SHRINK, SLOPE, Densified, densify
-from vvgt_cli.descent.loop import step
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.ply import opacity
+from vvgt_cli.refine import OptimizeOptions, optimize
+from vvgt_cli.refine.densify import DENSE, FAINTEST, SHRINK, SLOPE, Densified, densify
+from vvgt_cli.refine.loop import step
 from vvgt_cli.splat import project, render
 from vvgt_cli.splat.reference import image_gradients
 from vvgt_cli.splat.render import moments, screen_slopes

@@ -9,19 +9,19 @@ import pytest
 
 import vvgt_cli as vvgt
 from tests.test_gaussians_harmonics import cloud
-from vvgt_cli import vbm
+from vvgt_cli import closed_form
 from vvgt_cli.cameras import default_views
 from vvgt_cli.conversion.plan import Planner
 from vvgt_cli.conversion.stages.refinement import HARMONICS, step_seconds
-from vvgt_cli.descent import METHODS, OptimizeOptions, OptimizeRecord, optimize
-from vvgt_cli.descent.checkpoint import fingerprint, resume, save
-from vvgt_cli.descent.densify import SLOPE, Densified, densify
-from vvgt_cli.descent.judge import Judge
-from vvgt_cli.descent.loop import begin, step
-from vvgt_cli.descent.states import GIVEN
 from vvgt_cli.field.workload import Workload
 from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.metrics import psnr
+from vvgt_cli.images.metrics import psnr
+from vvgt_cli.refine import METHODS, OptimizeOptions, OptimizeRecord, optimize
+from vvgt_cli.refine.checkpoint import fingerprint, resume, save
+from vvgt_cli.refine.densify import SLOPE, Densified, densify
+from vvgt_cli.refine.judge import Judge
+from vvgt_cli.refine.loop import begin, step
+from vvgt_cli.refine.states import GIVEN
 from vvgt_cli.splat import blend, render
 
 CAMERAS, CHECKS = default_views("train", 24, size=40), default_views("check", 2, size=40)
@@ -149,7 +149,7 @@ def test_the_plan_knows_that_steps_with_harmonics_take_longer():
 @pytest.mark.parametrize("steps", [0, 20])
 def test_a_conversion_keeps_what_its_closed_form_has(steps, monkeypatch, tmp_path):
     """Through colours solved or steps, what viewers drop, the checkpoint and the file."""
-    made, planned = vbm.initialise, []
+    made, planned = closed_form.initialise, []
 
     def glossy(*args, **options):
         start = made(*args, **options)
@@ -161,7 +161,7 @@ def test_a_conversion_keeps_what_its_closed_form_has(steps, monkeypatch, tmp_pat
         return plan(self, case, *args, **options)
 
     plan = Planner.plan
-    monkeypatch.setattr(vbm, "initialise", glossy)
+    monkeypatch.setattr(closed_form, "initialise", glossy)
     monkeypatch.setattr(Planner, "plan", seen)
     result = vvgt.convert("example:blob:16", goal={"max_gaussians": 60, "size": 32, "steps": steps})
     assert planned == [(0, 0), (1, 1)]

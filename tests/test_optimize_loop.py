@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 
 from vvgt_cli.cameras import default_views
-from vvgt_cli.descent import OptimizeOptions, OptimizeRecord, optimize
-from vvgt_cli.descent.judge import FALLEN, Judge
-from vvgt_cli.descent.shared import NONE
-from vvgt_cli.descent.states import Fields, OwnFrame
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.metrics import psnr
+from vvgt_cli.gaussians.rules import INRIA
+from vvgt_cli.images.metrics import psnr
+from vvgt_cli.refine import OptimizeOptions, OptimizeRecord, optimize
+from vvgt_cli.refine.judge import FALLEN, Judge
+from vvgt_cli.refine.shared import NONE
+from vvgt_cli.refine.states import Fields, OwnFrame
 from vvgt_cli.splat import render
 from vvgt_cli.splat.half import halved
 from vvgt_cli.splat.reference import covariances
-from vvgt_cli.splat.rules import INRIA
 
 NO_FLOORS = np.full(13, 1e-15, np.float32)
 FIELDS = ("means", "log_scales", "quaternions", "opacity_logits", "colors")
@@ -172,7 +172,7 @@ def exact_steps(state, frames, rates, clip):
 
 
 def test_a_step_is_the_exponential_of_e_to_second_order():
-    from vvgt_cli.descent import steps
+    from vvgt_cli.refine import steps
 
     state, rng = OwnFrame(truth(200), CAMERAS), np.random.default_rng(2)
     frames = rng.normal(size=(200, 9)).astype(np.float32)

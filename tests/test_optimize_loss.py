@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from vvgt_cli.cameras import default_views
-from vvgt_cli.descent import OptimizeOptions
-from vvgt_cli.descent.loop import begin, step
-from vvgt_cli.descent.loss import loss_gradient
-from vvgt_cli.descent.options import TEXTURE
-from vvgt_cli.descent.ssim import KERNEL, add_ssim_gradient
-from vvgt_cli.descent.texture import SMOOTH, add_texture_gradient
 from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.metrics import ssim
-from vvgt_cli.metrics.ssim import C1, C2
+from vvgt_cli.images.metrics import ssim
+from vvgt_cli.images.metrics.ssim import C1, C2
+from vvgt_cli.refine import OptimizeOptions
+from vvgt_cli.refine.loop import begin, step
+from vvgt_cli.refine.loss import loss_gradient
+from vvgt_cli.refine.options import TEXTURE
+from vvgt_cli.refine.ssim import KERNEL, add_ssim_gradient
+from vvgt_cli.refine.texture import SMOOTH, add_texture_gradient
 
 
 def pictures(height=31, width=26, seed=0):

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from vvgt_cli.cameras import default_views
-from vvgt_cli.descent import OptimizeOptions, optimize, shared, steps
-from vvgt_cli.descent.states import OwnFrame
 from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.metrics import psnr
+from vvgt_cli.images.metrics import psnr
+from vvgt_cli.refine import OptimizeOptions, optimize, shared, steps
+from vvgt_cli.refine.states import OwnFrame
 from vvgt_cli.splat import render
 
 CAMERAS = default_views("train", 6, size=64)

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from vvgt_cli.cameras import default_views
-from vvgt_cli.descent import OptimizeOptions, optimize
-from vvgt_cli.descent.states import Fields, OwnFrame
+from vvgt_cli.closed_form import VbmOptions, initialise
 from vvgt_cli.dvr import RenderSettings, Scene, render_views
 from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.look import ColorMap, PiecewiseOpacity, TransferFunction
+from vvgt_cli.refine import OptimizeOptions, optimize
+from vvgt_cli.refine.states import Fields, OwnFrame
 from vvgt_cli.splat import render
 from vvgt_cli.synth import open_volume
-from vvgt_cli.transfer import ColorMap, PiecewiseOpacity, TransferFunction
-from vvgt_cli.vbm import VbmOptions, initialise
 from vvgt_cli.volume import statistics
 
 FIELDS = ("means", "log_scales", "quaternions", "opacity_logits", "colors")

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from vvgt_cli.gaussians import read_ply
-from vvgt_cli.share.gsply_files import read_compressed_ply
+from vvgt_cli.gaussians.formats.gsply_files import read_compressed_ply
 
 HOW = ("--max-gaussians", "60", "--size", "32", "--steps", "2")
 

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from tests.view_sets import BACKGROUND, BASE, TF, VOLUME, make_views
-from vvgt_cli.batches.render_views import CameraRequest, function_name
 from vvgt_cli.cameras import look_at
 from vvgt_cli.cameras.files import camera_to_opengl, read_cameras, transforms_json
+from vvgt_cli.commands.render_views import CameraRequest, function_name
 from vvgt_cli.dvr import RenderSettings, render_view
 from vvgt_cli.errors import DataError
+from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.images import over, read_exr, read_png
 from vvgt_cli.images.viewset import load_views
-from vvgt_cli.runs.source import SourceRequest, load
 
 
 @pytest.fixture(scope="module")

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from tests.view_sets import BASE, SMALL, TF, VOLUME, make_views
-from vvgt_cli.batches.manifest import Manifest, Shard, read_manifest
-from vvgt_cli.batches.render_views import CameraRequest
+from vvgt_cli.commands.render_views import CameraRequest
+from vvgt_cli.conversion.manifest import Manifest, Shard, read_manifest
 from vvgt_cli.errors import DataError
-from vvgt_cli.runs.digests import cameras_digest, volume_digest
+from vvgt_cli.field.digests import cameras_digest, volume_digest
 from vvgt_cli.volume import Volume
 
 

@@ -14,13 +14,13 @@ import pytest
 
 from tests.onnx_models import write_model
 from tests.report_runs import document, run, runs
+from vvgt_cli.commands.ladder import LadderOptions, random_points, rungs
 from vvgt_cli.errors import DataError
 from vvgt_cli.images import read_png
-from vvgt_cli.report.charts import log_ticks, scatter, ticks
-from vvgt_cli.report.page import Pictures, page, points
-from vvgt_cli.report.plots import FILES
-from vvgt_cli.report.runs import Series, cost, front, knee, psnr, read_series, short, table, unit_costs
-from vvgt_cli.tasks.ladder import LadderOptions, random_points, rungs
+from vvgt_cli.score.charts import log_ticks, scatter, ticks
+from vvgt_cli.score.curves import Series, cost, front, knee, psnr, read_series, short, table, unit_costs
+from vvgt_cli.score.page import Pictures, page, points
+from vvgt_cli.score.plots import FILES
 
 SMALL = ("--tf", "viridis", "--size", 24, "--max-gaussians", 60, "--steps", 2)
 VOID = {"meta", "img", "input", "br", "polygon", "polyline", "circle", "line", "i"}

@@ -102,8 +102,8 @@ def test_counting_reads_every_voxel_once_and_little_more(tmp_path, monkeypatch):
     from vvgt_cli.field import reader
     from vvgt_cli.field.counting import CountBlocks
     from vvgt_cli.field.grid import Boxes
+    from vvgt_cli.field.layered import Content
     from vvgt_cli.field.parts import COUNTS, Parts
-    from vvgt_cli.runs.layered import Content
 
     values, read = bodies((100, 90, 80)).astype(np.float32), []
 
@@ -142,7 +142,7 @@ def test_the_memory_of_a_block_is_that_of_its_worker(monkeypatch):
 def test_of_a_tiles_tree_nothing_but_its_top_stays_in_memory(vvgt, tmp_path, monkeypatch):
     import weakref
 
-    from vvgt_cli.scale import forest
+    from vvgt_cli.field import forest
 
     values, made = np.round(bodies((128, 90, 120)) * 255).astype(np.uint8), []
     path = tmp_path / "v_128x90x120_uint8.raw"

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.vbm_scenes import Tent, scene_of
+from tests.closed_form_scenes import Tent, scene_of
 from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.blocks import Blocks
+from vvgt_cli.closed_form import VbmOptions, initialise
 from vvgt_cli.dvr import RenderSettings, render_view
-from vvgt_cli.metrics import psnr, score_view, ssim, texture
-from vvgt_cli.runs.score import score_seen, score_test_views
-from vvgt_cli.runs.viewing import (
+from vvgt_cli.images.metrics import psnr, score_view, ssim, texture
+from vvgt_cli.score.viewing import (
     ViewingCondition,
     condition_views,
     from_above,
@@ -21,9 +21,9 @@ from vvgt_cli.runs.viewing import (
     viewing_conditions,
     zoomed,
 )
+from vvgt_cli.score.views import score_seen, score_test_views
 from vvgt_cli.splat import render
 from vvgt_cli.synth import open_volume
-from vvgt_cli.vbm import VbmOptions, initialise
 
 ONE_RAY = RenderSettings(samples=1)
 

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 import tifffile
 
-from vvgt_cli.batches.series import frame_names, is_pattern, merge_statistics
+from vvgt_cli.conversion.series import frame_names, is_pattern, merge_statistics
 from vvgt_cli.errors import UsageError
-from vvgt_cli.runs.record import ConversionReport
-from vvgt_cli.runs.source import load
+from vvgt_cli.field.source import load
+from vvgt_cli.score.record import ConversionReport
 from vvgt_cli.synth.analytic import blob
 from vvgt_cli.volume import Volume, statistics
 
@@ -46,7 +46,7 @@ def stand_in(monkeypatch: pytest.MonkeyPatch) -> list:
             Path(name).write_text(text)
         return ConversionReport("convert")
 
-    monkeypatch.setattr("vvgt_cli.batches.series.convert", write)
+    monkeypatch.setattr("vvgt_cli.conversion.series.convert", write)
     return calls
 
 
@@ -130,7 +130,7 @@ def test_an_interrupted_frame_is_not_recorded(vvgt, series: Path, monkeypatch: p
         Path(request.output).write_text("short")
         return ConversionReport("convert", refinement={"reason": "interrupted"})
 
-    monkeypatch.setattr("vvgt_cli.batches.series.convert", interrupted)
+    monkeypatch.setattr("vvgt_cli.conversion.series.convert", interrupted)
     run = ("convert", series / "run_*.npy", "--tf", series / "tf.json", "-o", series / "out" / "{:02d}.ply", *SMALL)
     assert vvgt(*run).code == 130
     assert "01.ply" not in (series / "out" / "manifest.json").read_text().split('"files"')[1]

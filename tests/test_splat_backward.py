@@ -7,11 +7,11 @@ import pytest
 
 from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.gaussians.constants import MAX_ALPHA
+from vvgt_cli.gaussians.rules import INRIA, RULES
 from vvgt_cli.splat import project, render, render_backward, render_backward_reference, render_reference
-from vvgt_cli.splat.constants import MAX_ALPHA
 from vvgt_cli.splat.reference import covariances, image_gradients, layers, rotations, space_gradients
 from vvgt_cli.splat.render import moments, own_frame_backward, project_factors
-from vvgt_cli.splat.rules import INRIA, RULES
 
 FIELDS = ("means", "log_scales", "quaternions", "opacity_logits", "colors")
 EYE = (2.0, -1.7, 1.1)

@@ -8,10 +8,10 @@ import pytest
 from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.checks.clouds import cloud
 from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.gaussians.constants import MIN_ALPHA
+from vvgt_cli.gaussians.rules import INRIA, RULES
 from vvgt_cli.splat import blend, gather, gather_reference, project, render, render_reference
-from vvgt_cli.splat.constants import MIN_ALPHA
 from vvgt_cli.splat.render import balance, depth_order
-from vvgt_cli.splat.rules import INRIA, RULES
 
 EYE = (2.0, -1.7, 1.1)
 # Where alpha crosses 1/255, or T 1e-4, float32 may decide otherwise than float64: such a pixel is off by a 1/255 at

@@ -10,16 +10,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vvgt_cli.batches import labels as split
+from vvgt_cli.conversion import labels as split
+from vvgt_cli.conversion.owners import Hidden, hidden_in, owners
 from vvgt_cli.conversion.request import file_bytes
 from vvgt_cli.conversion.stages import ViewingConditions
 from vvgt_cli.dvr import RenderSettings
 from vvgt_cli.field.field import Resident
+from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.gaussians import Gaussians, read_ply
-from vvgt_cli.runs.owners import Hidden, hidden_in, owners
-from vvgt_cli.runs.score import score_test_views
-from vvgt_cli.runs.source import SourceRequest, load
-from vvgt_cli.transfer.labels import distinct
+from vvgt_cli.look.labels import distinct
+from vvgt_cli.score.views import score_test_views
 from vvgt_cli.volume import Volume
 
 SMALL = ("--max-gaussians", 600, "--size", 64, "--steps", 0)
@@ -109,7 +109,7 @@ def test_standard_input_is_read_once(tmp_path: Path) -> None:
 
 def test_the_surface_of_labels_is_where_a_grazing_ray_is_half_covered(monkeypatch) -> None:
     """The closed form of a solid ball, nearer than with the surface where a cell is half opaque."""
-    from vvgt_cli.vbm import VbmOptions, initialise, inset
+    from vvgt_cli.closed_form import VbmOptions, initialise, inset
 
     source = load(SourceRequest(Volume(np.where(nested() > 0, 1, 0).astype(np.uint8)), labels=distinct([1])))
     assert source.scene().labels

@@ -19,25 +19,25 @@ from vvgt_cli.cameras import Camera
 from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.metrics import psnr
-from vvgt_cli.metrics import ssim as ssim_metric
+from vvgt_cli.gaussians.constants import DILATION, NEAR
+from vvgt_cli.images.metrics import psnr
+from vvgt_cli.images.metrics import ssim as ssim_metric
 from vvgt_cli.network.prepare import pack, unpack
+from vvgt_cli.network.training import LossConfig, SceneConfig, TrainConfig
+from vvgt_cli.network.training import scenes as training_scenes
+from vvgt_cli.network.training.scenes import make_scenes, prepare_scenes, recipes
 from vvgt_cli.progress import Console
 from vvgt_cli.splat import project, render, render_backward_reference, render_reference
-from vvgt_cli.splat.constants import DILATION, NEAR
 from vvgt_cli.synth.shapes import make_shape
-from vvgt_cli.training import LossConfig, SceneConfig, TrainConfig
-from vvgt_cli.training import scenes as training_scenes
-from vvgt_cli.training.scenes import make_scenes, prepare_scenes, recipes
 from vvgt_cli.volume.nrrd_write import write_nrrd
 
 torch = pytest.importorskip("torch")
 pytest.importorskip("yaml")
 
 from vvgt_cli.network.checkpoint import load_checkpoint  # noqa: E402
-from vvgt_cli.training import loop, losses, sample  # noqa: E402
-from vvgt_cli.training.config import config_text, read_config  # noqa: E402
-from vvgt_cli.training.splatter import gsplat_picture, splat  # noqa: E402
+from vvgt_cli.network.training import loop, losses, sample  # noqa: E402
+from vvgt_cli.network.training.config import config_text, read_config  # noqa: E402
+from vvgt_cli.network.training.splatter import gsplat_picture, splat  # noqa: E402
 
 STEPPER = replace(
     TINY, variant="wo_vgf", rounds=2, image=replace(TINY.image, views=2),

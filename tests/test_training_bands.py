@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from vvgt_cli.training.scenes import merge_bands
-from vvgt_cli.transfer.readers import minimal
-from vvgt_cli.transfer.suggest import Suggestion
+from vvgt_cli.look.readers import minimal
+from vvgt_cli.look.suggest import Suggestion
+from vvgt_cli.network.training.scenes import merge_bands
 
 
 def test_functions_together_show_each_where_it_is():

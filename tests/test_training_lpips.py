@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.training.config import LossConfig, SceneConfig, TrainConfig
+from vvgt_cli.network.training.config import LossConfig, SceneConfig, TrainConfig
 
 torch = pytest.importorskip("torch")
 
 from test_training import CONFIG, rows_of  # noqa: E402
 from torch.nn import functional  # noqa: E402
 
+from vvgt_cli.network.training import loop  # noqa: E402
+from vvgt_cli.network.training.losses import view_loss  # noqa: E402
+from vvgt_cli.network.training.lpips import load_lpips  # noqa: E402
 from vvgt_cli.progress import Console  # noqa: E402
 from vvgt_cli.synth.shapes import make_shape  # noqa: E402
-from vvgt_cli.training import loop  # noqa: E402
-from vvgt_cli.training.losses import view_loss  # noqa: E402
-from vvgt_cli.training.lpips import load_lpips  # noqa: E402
 from vvgt_cli.volume.nrrd_write import write_nrrd  # noqa: E402
 
 CONVOLUTIONS = {0: 64, 2: 64, 5: 128, 7: 128, 10: 256, 12: 256, 14: 256, 17: 512, 19: 512, 21: 512, 24: 512, 26: 512,

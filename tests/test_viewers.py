@@ -13,12 +13,12 @@ from browser import shoot
 from vvgt_cli.cameras import Camera, default_views, look_at
 from vvgt_cli.cli.main import run
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
-from vvgt_cli.metrics import psnr
-from vvgt_cli.share import encoded, format_of
+from vvgt_cli.gaussians.formats import encoded, format_of
+from vvgt_cli.images.metrics import psnr
 from vvgt_cli.splat import render
 from vvgt_cli.splat.reference import project
 
-RULES = pytest.importorskip("vvgt_cli.splat.rules").RULES
+RULES = pytest.importorskip("vvgt_cli.gaussians.rules").RULES
 RULE = {"supersplat": "playcanvas", "spark": "spark"}  # page: rule
 STEPS = {"supersplat": 255, "spark": 254}  # both keep a scale as one of so many over 21 e-folds from exp(-12)
 SIZE = 540
@@ -159,7 +159,7 @@ class Shown:
 
 def shown(volume: str, folder: Path) -> Shown:
     from vvgt_cli.dvr import render_view
-    from vvgt_cli.runs.source import SourceRequest, load
+    from vvgt_cli.field.source import SourceRequest, load
 
     path = folder / "converted.ply"
     options = ("--max-gaussians", "20000", "--size", "1080", "--steps", "0", "--quiet")

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from vvgt_cli.library.functions import convert, evaluate, optimize, read_ply, read_volume, render_views
     from vvgt_cli.library.inputs import Goal, Look
     from vvgt_cli.library.session import Session
-    from vvgt_cli.transfer import ColorMap, PiecewiseOpacity, TransferFunction, read_transfer_function
-    from vvgt_cli.transfer.lighting import LightOptions
+    from vvgt_cli.look import ColorMap, PiecewiseOpacity, TransferFunction, read_transfer_function
+    from vvgt_cli.look.lighting import LightOptions
     from vvgt_cli.volume import Volume
 
 _WHERE = {  # imported when asked for: `import vvgt_cli` costs nothing

@@ -12,12 +12,12 @@ from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.checks import Case, Figure, require
 from vvgt_cli.checks.clouds import FIELDS, cloud, extremes, shaped
 from vvgt_cli.checks.scenes import build, smooth, step
-from vvgt_cli.descent import METHODS, OptimizeOptions, optimize
+from vvgt_cli.closed_form import VbmOptions, initialise
 from vvgt_cli.dvr import RenderSettings, render_views
 from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.metrics import psnr
+from vvgt_cli.images.metrics import psnr
+from vvgt_cli.refine import METHODS, OptimizeOptions, optimize
 from vvgt_cli.splat import render
-from vvgt_cli.vbm import VbmOptions, initialise
 
 STAGE = "optimiser"
 SIZE, STEPS = 32, 40
@@ -43,7 +43,7 @@ def sound(gaussians: Gaussians, cameras: list[Camera]) -> float:
 
 def _run(method: str, factor: float, start: Gaussians | None) -> Figure:
     """`STEPS` steps with all rates ``factor`` times what they are."""
-    from vvgt_cli.descent import loop
+    from vvgt_cli.refine import loop
 
     own, cameras, views = _stiff()
     options = OptimizeOptions.of(method, steps=STEPS, max_gaussians=300)
@@ -104,7 +104,7 @@ def _few(gaussians: Gaussians, size: int) -> Figure:
 
 def _adam(size: float) -> Figure:
     """The kernel against Adam in float64, slopes of one size."""
-    from vvgt_cli.descent import steps
+    from vvgt_cli.refine import steps
 
     rng = np.random.default_rng(0)
     values = rng.normal(size=500).astype(np.float32)
@@ -120,7 +120,7 @@ def _adam(size: float) -> Figure:
 
 def _loss(weights: tuple[float, float, float]) -> Figure:
     """Slopes of the loss against its formula in float64; ``weights`` of |r|, r^2 and alpha."""
-    from vvgt_cli.descent.loss import loss_gradient
+    from vvgt_cli.refine.loss import loss_gradient
 
     rng = np.random.default_rng(0)
     image, target = (rng.random((9, 7, 4)).astype(np.float32) * 1e3 for _ in range(2))

@@ -10,8 +10,8 @@ import numpy as np
 from vvgt_cli.checks import Case, Figure, require
 from vvgt_cli.checks.clouds import Cloud, cloud, extremes, hard_clouds, view
 from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.gaussians.constants import MAX_ALPHA, MIN_TRANSMITTANCE
 from vvgt_cli.splat import blend, project, render, render_reference
-from vvgt_cli.splat.constants import MAX_ALPHA, MIN_TRANSMITTANCE
 
 STAGE = "splats"
 JUMP = 0.01  # a pixel at the cut of alpha, or at the end of its transmittance, may fall either way

@@ -12,8 +12,8 @@ import numpy as np
 from vvgt_cli.checks import Case, Figure, require
 from vvgt_cli.checks.scenes import RAMP_RGB, RAMP_X, RAMP_Y, function, ramp, step
 from vvgt_cli.errors import DataError
-from vvgt_cli.transfer import TransferFunction, from_histogram, resolve
-from vvgt_cli.transfer.tables import MAX_OPACITY, OpticalTables, build_tables, extinction
+from vvgt_cli.look import TransferFunction, from_histogram, resolve
+from vvgt_cli.look.tables import MAX_OPACITY, OpticalTables, build_tables, extinction
 from vvgt_cli.volume import Volume, statistics
 
 STAGE = "function"
@@ -73,7 +73,7 @@ def _outside() -> Figure:
 
 def _bounded(sharpness: float, midpoint: float) -> Figure:
     """Bent segments stay between their ends, and colours in [0, 1]."""
-    from vvgt_cli.transfer import PiecewiseOpacity
+    from vvgt_cli.look import PiecewiseOpacity
 
     x = np.array([0.0, 0.4, 0.4, 1.0])
     y = np.array([0.1, 0.9, 0.2, 0.7])

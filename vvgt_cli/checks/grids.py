@@ -13,11 +13,11 @@ from vvgt_cli.checks.mapping import SIZE, hard
 from vvgt_cli.checks.raycast import bounded, difference
 from vvgt_cli.checks.scenes import Hard, camera, function, rough
 from vvgt_cli.checks.whole import whole
+from vvgt_cli.closed_form import VbmOptions, initialise
 from vvgt_cli.dvr import Scene
 from vvgt_cli.dvr.layers import Layer, common_grid, grid_of
 from vvgt_cli.errors import DataError
-from vvgt_cli.transfer.labels import Label, LabelTable, distinct
-from vvgt_cli.vbm import VbmOptions, initialise
+from vvgt_cli.look.labels import Label, LabelTable, distinct
 from vvgt_cli.volume import Volume
 
 STAGE = "optics grid"

@@ -15,12 +15,12 @@ from vvgt_cli.checks import Case, Figure, require
 from vvgt_cli.checks.clouds import cloud, view
 from vvgt_cli.checks.files import one_line
 from vvgt_cli.checks.forward import sane
-from vvgt_cli.descent import OptimizeOptions, optimize
+from vvgt_cli.closed_form.fit import solve_colors
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
 from vvgt_cli.gaussians.frames import transform
 from vvgt_cli.gaussians.types import HARMONICS
+from vvgt_cli.refine import OptimizeOptions, optimize
 from vvgt_cli.splat import project, render, render_backward, render_backward_reference, render_reference
-from vvgt_cli.vbm.fit import solve_colors
 
 STAGE = "harmonics"
 QUARTERS = {

@@ -12,11 +12,11 @@ from vvgt_cli.cameras import default_views
 from vvgt_cli.checks import Case, Figure, require
 from vvgt_cli.checks.raycast import FINE, difference, sane
 from vvgt_cli.checks.scenes import Hard, build, camera, function, hard_scenes, ramp, rough, smooth, step
+from vvgt_cli.closed_form import METHODS, VbmOptions, initialise
 from vvgt_cli.dvr import Scene, render_view
 from vvgt_cli.gaussians.harmonics import view_colors
+from vvgt_cli.look.lighting import Lighting
 from vvgt_cli.splat import render
-from vvgt_cli.transfer.lighting import Lighting
-from vvgt_cli.vbm import METHODS, VbmOptions, initialise
 
 STAGE = "light"
 SIZE, BUDGET = 64, 200

@@ -11,16 +11,16 @@ import numpy as np
 from vvgt_cli.cameras import default_views
 from vvgt_cli.checks import Case, Figure, require
 from vvgt_cli.checks.scenes import Hard, build, camera, function, hard_scenes, ramp, rough, smooth, step
+from vvgt_cli.closed_form import METHODS, VbmOptions, backproject, initialise
 from vvgt_cli.dvr import RenderSettings, Scene, render_views
 from vvgt_cli.dvr.reference import optics_at
 from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.splat import render
-from vvgt_cli.vbm import METHODS, VbmOptions, backproject, initialise
 from vvgt_cli.volume import Volume
 
 if TYPE_CHECKING:
-    from vvgt_cli.vbm.tree import Tree
+    from vvgt_cli.closed_form.tree import Tree
 
 STAGE = "closed form"
 SIZE = 64  # pixels
@@ -48,8 +48,8 @@ def sound(gaussians: Gaussians, scene: Scene, budget: int) -> None:
 
 def hard(row: Hard) -> Figure:
     """Mass of the base cells against quadrature; the pyramid keeps it, and every cut through it."""
-    from vvgt_cli.vbm.closed_form import closed_form
-    from vvgt_cli.vbm.moments import base_cells
+    from vvgt_cli.closed_form.closed_form import closed_form
+    from vvgt_cli.closed_form.moments import base_cells
 
     scene = row.make()
     cells = base_cells(scene, np.zeros(3, np.int64))
@@ -68,7 +68,7 @@ def hard(row: Hard) -> Figure:
 
 def cuts(tree: Tree) -> None:
     """No cut through the pyramid gains or loses mass, or exceeds its budget."""
-    from vvgt_cli.vbm.tree import leaves_of, select
+    from vvgt_cli.closed_form.tree import leaves_of, select
 
     whole = float(tree.moments[-1, 0])
     for budget in (1, 10, 300):
@@ -80,8 +80,8 @@ def cuts(tree: Tree) -> None:
 
 def levels(scene: Scene) -> Figure:
     """Cells of two voxels hold the mass of cells of one, and no cut through the pyramid changes it."""
-    from vvgt_cli.vbm.closed_form import closed_form
-    from vvgt_cli.vbm.moments import base_cells
+    from vvgt_cli.closed_form.closed_form import closed_form
+    from vvgt_cli.closed_form.moments import base_cells
 
     fine, coarse = (base_cells(scene, np.full(3, level)).moments[:, 0].sum() for level in (0, 1))
     form = closed_form(scene, 1000, SIZE)

@@ -12,7 +12,7 @@ import numpy as np
 from vvgt_cli.cameras import Camera
 from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.dvr import Scene
-from vvgt_cli.transfer import ColorMap, PiecewiseOpacity, TransferFunction
+from vvgt_cli.look import ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.volume import Volume
 
 EYE = (2.2, -1.6, 1.1)

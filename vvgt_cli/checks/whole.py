@@ -11,12 +11,12 @@ import numpy as np
 from vvgt_cli.cameras import default_views
 from vvgt_cli.checks import Case, Figure, require
 from vvgt_cli.checks.scenes import Hard, hard_scenes
-from vvgt_cli.descent import OptimizeOptions, optimize
+from vvgt_cli.closed_form import VbmOptions, backproject, initialise
 from vvgt_cli.dvr import Scene, render_views
 from vvgt_cli.gaussians import as_stored, read_ply, write_ply
-from vvgt_cli.metrics import score_views
+from vvgt_cli.images.metrics import score_views
+from vvgt_cli.refine import OptimizeOptions, optimize
 from vvgt_cli.splat import render
-from vvgt_cli.vbm import VbmOptions, backproject, initialise
 
 STAGE = "whole way"
 SIZE, BUDGET, STEPS = 48, 200, 25

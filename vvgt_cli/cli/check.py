@@ -37,7 +37,7 @@ def command(volume: str | None, tolerance: float, as_json: bool, console: Consol
       vvgt check --json | jq '.outcomes[] | select(.passed | not)'
     """
     from vvgt_cli.cli.fit import source_request
-    from vvgt_cli.tasks.check import check
+    from vvgt_cli.commands.check import check
 
     given = [f"--{key.replace('_', '-')}" for key, value in (options["optics"] | options["read"]).items() if value]
     given = [name for name in given if name != "--tf-range" or options["optics"]["tf_range"] != "data"]

@@ -99,11 +99,11 @@ def command(
 
 def _split(request: ConvertRequest, functions: Sequence[str], other: bool, console: Console) -> None:
     """One file a label; ``other``: options that go with one file are given."""
-    from vvgt_cli.batches.labels import convert_labels
-    from vvgt_cli.batches.pages import page_of_labels
-    from vvgt_cli.batches.series import is_pattern
+    from vvgt_cli.conversion.gaussian_files import is_page
+    from vvgt_cli.conversion.labels import convert_labels
+    from vvgt_cli.conversion.pages import page_of_labels
+    from vvgt_cli.conversion.series import is_pattern
     from vvgt_cli.errors import UsageError
-    from vvgt_cli.runs.gaussian_files import is_page
 
     if functions or other or request.checkpoint is not None:
         raise UsageError("--split-labels converts one label map; leave out --tf, --dry-run, --shard and --checkpoint")
@@ -117,12 +117,12 @@ def _convert(
     request: ConvertRequest, functions: Sequence[str], shard: str | None, dry_run: bool, console: Console
 ) -> None:
     """One volume, a series, or several functions; of a page, several clouds in one file."""
-    from vvgt_cli.batches.functions import convert_functions
-    from vvgt_cli.batches.pages import page_of_functions, page_of_volume
-    from vvgt_cli.batches.series import convert_series, is_pattern
     from vvgt_cli.conversion.convert import convert, planned
+    from vvgt_cli.conversion.functions import convert_functions
+    from vvgt_cli.conversion.gaussian_files import is_page
+    from vvgt_cli.conversion.pages import page_of_functions, page_of_volume
+    from vvgt_cli.conversion.series import convert_series, is_pattern
     from vvgt_cli.errors import UsageError
-    from vvgt_cli.runs.gaussian_files import is_page
 
     several = len(functions) > 1
     numbered = is_pattern(request.output or "")
@@ -136,7 +136,7 @@ def _convert(
     if several:
         (page_of_functions if joined else convert_functions)(request, functions, console)
     elif series:
-        from vvgt_cli.batches.render_views import parse_shard
+        from vvgt_cli.commands.render_views import parse_shard
 
         convert_series(request, parse_shard(shard or "1/1"), console)
     elif shard is not None:

@@ -53,7 +53,7 @@ def command(ply: str, volume: str, as_json: bool, console: Console, **options: A
       vvgt evaluate head.ply --volume head.nrrd --tf bone.json --json
     """
     from vvgt_cli.cli.fit import source_request
-    from vvgt_cli.tasks.evaluate import EvaluateRequest, evaluate
+    from vvgt_cli.commands.evaluate import EvaluateRequest, evaluate
 
     source = source_request(volume, options["read"], options["optics"], options["light"])
     names = ("size", "rule", "step", "seats", "preview", "overwrite")

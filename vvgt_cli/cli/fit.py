@@ -11,7 +11,7 @@ from vvgt_cli.cli.options import group
 
 if TYPE_CHECKING:
     from vvgt_cli.conversion.request import ConvertRequest
-    from vvgt_cli.runs.source import SourceRequest
+    from vvgt_cli.field.source import SourceRequest
 
 fit_options = group(
     "fit",
@@ -33,7 +33,7 @@ fit_options = group(
     ),
 )  # fmt: skip
 
-RULES = ("inria", "compensated", "spark", "playcanvas", "viser")  # `vvgt_cli.splat.rules.RULES`; a test compares
+RULES = ("inria", "compensated", "spark", "playcanvas", "viser")  # `vvgt_cli.gaussians.rules.RULES`; a test compares
 
 
 def rule_option(help: str, default: str | None = None) -> Callable[[Any], Any]:
@@ -87,9 +87,9 @@ def source_request(
     volume: str, read: dict[str, Any], optics: dict[str, Any], light: dict[str, Any] | None = None
 ) -> SourceRequest:
     """What the shared options of `options.py` add up to."""
-    from vvgt_cli.runs.layered import parse_layer
-    from vvgt_cli.runs.source import SourceRequest
-    from vvgt_cli.transfer.lighting import LightOptions
+    from vvgt_cli.field.layered import parse_layer
+    from vvgt_cli.field.source import SourceRequest
+    from vvgt_cli.look.lighting import LightOptions
     from vvgt_cli.volume import ReadOptions
 
     return SourceRequest(

@@ -34,6 +34,6 @@ def command(
       vvgt render-views head.nrrd --tf bone.json -o views
       vvgt init head.nrrd --tf bone.json -o - | vvgt infer - --views views --model small -o head.ply
     """
-    from vvgt_cli.tasks.infer import InferRequest, infer_file
+    from vvgt_cli.commands.infer import InferRequest, infer_file
 
     infer_file(InferRequest(ply, views, model, output, provider, report, overwrite), console)

@@ -26,8 +26,8 @@ def command(file: str, as_json: bool, read: dict[str, Any], console: Console) ->
       vvgt info frog.ply --json | jq .gaussians
       vvgt info presets.xml#CT-AAA
     """
-    from vvgt_cli.runs.record import plain
-    from vvgt_cli.tasks.inspect import inspect
+    from vvgt_cli.commands.inspect import inspect
+    from vvgt_cli.score.record import plain
     from vvgt_cli.volume import ReadOptions
 
     facts = plain(inspect(file, ReadOptions(**read)))

@@ -45,8 +45,8 @@ def command(volume: str, console: Console, blocks: dict[str, Any], **options: An
     from vvgt_cli.cli.blocks import chosen
     from vvgt_cli.cli.fit import convert_request
     from vvgt_cli.conversion.convert import initialise_only
+    from vvgt_cli.conversion.shards.run import init_in_blocks, streams
     from vvgt_cli.field.open import automatic
-    from vvgt_cli.scale.run import init_in_blocks, streams
 
     request = convert_request(volume, **options)
     request = replace(request, blocks=chosen(blocks) or automatic(request.source, console))

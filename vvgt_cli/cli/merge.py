@@ -24,6 +24,6 @@ def command(folder: str, output: str, levels: int, overwrite: bool, console: Con
     Example:
       vvgt merge huge.blocks -o huge.ply
     """
-    from vvgt_cli.scale.run import merge
+    from vvgt_cli.conversion.shards.run import merge
 
     merge(folder, output, overwrite, console, levels)

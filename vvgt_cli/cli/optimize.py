@@ -67,9 +67,9 @@ def command(
       vvgt optimize head.ply --views views --steps 200 -o better.ply
       vvgt optimize head.ply --views views --time-budget 60 --target-psnr 40 -o better.ply
     """
-    from vvgt_cli.descent import OptimizeOptions
+    from vvgt_cli.commands.optimize import OptimizeRequest, budget, optimize_file
     from vvgt_cli.errors import UsageError
-    from vvgt_cli.tasks.optimize import OptimizeRequest, budget, optimize_file
+    from vvgt_cli.refine import OptimizeOptions
 
     method, most = options["method"], options["max_gaussians"]
     if most is not None and method != "3dgs":

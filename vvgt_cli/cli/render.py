@@ -58,8 +58,8 @@ def command(
       vvgt render frog.ply --orbit 100 --size 480 -o turn.gif
       vvgt convert example:frog -o - | vvgt render - --orbit 8 -o turn
     """
+    from vvgt_cli.commands.render import RenderRequest, render_file
     from vvgt_cli.errors import UsageError
-    from vvgt_cli.tasks.render import RenderRequest, render_file
 
     if (camera is None) == (orbit is None):
         raise UsageError("give the views with either --camera FILE or --orbit N")

@@ -87,7 +87,7 @@ def command(
       vvgt report --compare head-report/report.json other/report.json -o both
     """
     from vvgt_cli.cli.fit import source_request
-    from vvgt_cli.tasks import report as pipeline
+    from vvgt_cli.commands import report as pipeline
 
     if compare:
         other = [p.opts[-1] for p in _typed(ctx) if p.name not in OF_BOTH]

@@ -46,6 +46,6 @@ def command(
       vvgt synth tubes --seed 3 -o tubes.nrrd
       vvgt convert tubes.nrrd -o tubes.ply
     """
-    from vvgt_cli.tasks.synth import SynthRequest, synthesise
+    from vvgt_cli.commands.synth import SynthRequest, synthesise
 
     synthesise(SynthRequest(kind, output, size, seed, field, turnovers, overwrite), console)

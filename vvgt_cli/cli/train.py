@@ -49,8 +49,8 @@ def command(data: str, output: str, path: str | None, console: Console) -> None:
         import yaml  # noqa: F401
     except ImportError as error:
         raise UsageError(f"vvgt train needs {error.name}; install vvgt[train]") from None
-    from vvgt_cli.training.config import TrainConfig, read_config
-    from vvgt_cli.training.loop import train
+    from vvgt_cli.network.training.config import TrainConfig, read_config
+    from vvgt_cli.network.training.loop import train
 
     with ending() as ended:
         status = train(read_config(path) if path else TrainConfig(), data, output, console, ended)

@@ -58,8 +58,8 @@ def command(
       vvgt view frog.ply -o frog.html
     """
     from vvgt_cli.cli.fit import source_request
+    from vvgt_cli.commands.view import ViewRequest, view
     from vvgt_cli.errors import UsageError
-    from vvgt_cli.tasks.view import ViewRequest, view
 
     if output is not None and (port is not None or not browser):
         raise UsageError("-o writes a file and serves nothing: leave --port and --no-browser out")

@@ -25,7 +25,7 @@ def command(console: Console) -> None:
     from vvgt_cli.errors import DataError
     from vvgt_cli.jit.ahead import ALL
     from vvgt_cli.jit.compile import compile_ahead
-    from vvgt_cli.runs.record import ConversionReport, Run
+    from vvgt_cli.score.record import ConversionReport, Run
 
     run = Run(console, ConversionReport("warmup"))
     with run.stage("compile") as stage:

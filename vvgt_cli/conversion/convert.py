@@ -8,7 +8,10 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 
+from vvgt_cli.conversion.gaussian_files import write_gaussians
+from vvgt_cli.conversion.place import out_of_box, placed, remarks, way_up
 from vvgt_cli.conversion.plan import Plan, Planner, check_memory
+from vvgt_cli.conversion.readback import tell_cost
 from vvgt_cli.conversion.request import ConvertRequest, file_bytes
 from vvgt_cli.conversion.result import Conversion
 from vvgt_cli.conversion.resume import FITTED, Checkpoint, checkpoint_folder, checkpoint_of
@@ -18,19 +21,16 @@ from vvgt_cli.conversion.stages.views import wide
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.field import Field, Resident
 from vvgt_cli.field.open import Wanted, automatic, beside, blocked
+from vvgt_cli.field.source import Source, describe_source, load, tf_record, volume_record
 from vvgt_cli.field.workload import expected_wide
 from vvgt_cli.files import check_room
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored
+from vvgt_cli.gaussians.formats import format_of
+from vvgt_cli.gaussians.outputs import STDOUT, check_outputs, claimed, write_text
 from vvgt_cli.jit.ahead import CONVERT, EVALUATE, INIT, for_blocks, for_degree
 from vvgt_cli.network.card import find_model, read_card
 from vvgt_cli.progress import Console
-from vvgt_cli.runs.gaussian_files import write_gaussians
-from vvgt_cli.runs.outputs import STDOUT, check_outputs, claimed, write_text
-from vvgt_cli.runs.place import out_of_box, placed, remarks, way_up
-from vvgt_cli.runs.readback import tell_cost
-from vvgt_cli.runs.record import ConversionReport, Run
-from vvgt_cli.runs.source import Source, describe_source, load, tf_record, volume_record
-from vvgt_cli.share import format_of
+from vvgt_cli.score.record import ConversionReport, Run
 
 QUICKEST = 0.5  # of the estimate, where the closed form took less: the rest then takes less too
 VIEW_DEGREE = 2  # of harmonics by default where the light depends on the view: abs(n . v) is even
@@ -242,7 +242,7 @@ def opened(run: Run, request: ConvertRequest) -> Iterator[Field]:
     Blocks lie beside the output until it is written: the same command goes on with those that an ended one has left.
 
     Raises:
-        DataError, UsageError: as `vvgt_cli.runs.source.load`.
+        DataError, UsageError: as `vvgt_cli.field.source.load`.
     """
     options = request.blocks or automatic(request.source, run.console)
     if options is None:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
+from vvgt_cli.conversion.place import AUTO
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.settings import BlockOptions
+from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import PlyOptions
-from vvgt_cli.runs.outputs import Output
-from vvgt_cli.runs.place import AUTO
-from vvgt_cli.runs.source import SourceRequest
-from vvgt_cli.share import SUFFIXES, format_of
+from vvgt_cli.gaussians.formats import SUFFIXES, format_of
+from vvgt_cli.gaussians.outputs import Output
 
 VERTEX_BYTES = 68  # x y z, normals, three colours, opacity, three scales, four of rotation: float32
 HARMONIC_BYTES = {0: 0, 1: 36, 2: 96, 3: 180}  # up to a degree
@@ -26,7 +26,7 @@ class FitOptions:
         max_gaussians: budget K.
         size: pixels along an image's edge that the file is made for.
         init: "vbm", "wavelet" or "uniform".
-        rule: of `vvgt_cli.splat.rules` that is fitted to and scored by.
+        rule: of `vvgt_cli.gaussians.rules` that is fitted to and scored by.
         seed: of whatever draws random numbers.
         model: network that runs before the steps: a folder or the name of a shipped one, None for none.
         steps: of gradient descent after the closed form, at most; None: what the plan finds worth its time.
@@ -93,7 +93,7 @@ class ConvertRequest:
 
     Attributes:
         source: what to read.
-        output: file to write, of any format of `vvgt_cli.share`, "-" for a `.ply` on standard output, None for none.
+        output: file to write, any of `vvgt_cli.gaussians.formats`, "-" for a `.ply` on standard output, None for none.
         fit: what the Gaussians are made for.
         limits: error, time and size that decide what is done.
         ply: how the file is written; up, the volume's place and the distance are filled in from the source.

@@ -11,13 +11,13 @@ import numpy as np
 
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.cameras.sets import SIZE
+from vvgt_cli.conversion.place import AUTO, NONE, into_box, preview, upright, way_up
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import Gaussians, PlyOptions, write_ply
-from vvgt_cli.runs.place import AUTO, NONE, into_box, preview, upright, way_up
-from vvgt_cli.runs.record import ConversionReport, StageRecord
-from vvgt_cli.runs.viewing import PREVIEW_VIEWS
-from vvgt_cli.share import encoded, format_of
-from vvgt_cli.splat.rules import INRIA, rule_of
+from vvgt_cli.gaussians.formats import encoded, format_of
+from vvgt_cli.gaussians.rules import INRIA, rule_of
+from vvgt_cli.score.record import ConversionReport, StageRecord
+from vvgt_cli.score.viewing import PREVIEW_VIEWS
 
 if TYPE_CHECKING:
     from vvgt_cli.field.field import Field
@@ -67,7 +67,7 @@ class Result:
         """Write a standard ``.ply``, or another format by the name's ending, whole or not at all.
 
         Args:
-            path: the file: ``.ply``, ``.html`` (a page that shows them) or another of `vvgt_cli.share.SUFFIXES`.
+            path: the file: ``.ply``, ``.html`` (a page that shows them), one of `vvgt_cli.gaussians.formats.SUFFIXES`.
             frame: "unit" or "world"; None, here and below: as `ply` says.
             up: what viewers show upwards: a world axis, an anatomical direction, "none" or "auto" (superior in the unit
                 frame of an anatomical space); "auto" where another frame is asked for.
@@ -107,7 +107,7 @@ class Result:
         Args:
             camera: in the unit frame; None: a test view from the side.
             size: pixels along the edge where no camera is given; None: what the Gaussians are made for.
-            rule: of `vvgt_cli.splat.rules`; None: that of the Gaussians.
+            rule: of `vvgt_cli.gaussians.rules`; None: that of the Gaussians.
 
         Returns:
             (h, w, 4) float32, premultiplied RGBA.

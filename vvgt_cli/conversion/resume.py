@@ -17,12 +17,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vvgt_cli.descent.checkpoint import load_archive
 from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.field.digests import digest
 from vvgt_cli.files import atomic_write, claim, read_text
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.network.card import CARD, find_model
-from vvgt_cli.runs.digests import digest
+from vvgt_cli.refine.checkpoint import load_archive
 from vvgt_cli.version import VERSION
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from vvgt_cli.field.field import Field
 
 CLOSED_FORM, CELLS, FITTED = "closed-form.npz", "cells.npz", "fitted.npz"
-DESCENT = "refinement.npz"  # of `vvgt_cli.descent.checkpoint`
+DESCENT = "refinement.npz"  # of `vvgt_cli.refine.checkpoint`
 _FAULTS = (
     *(OSError, KeyError, ValueError, TypeError, AttributeError, EOFError, MemoryError, RuntimeError, DataError),
     *(zipfile.BadZipFile, struct.error),

@@ -11,13 +11,13 @@ from vvgt_cli.conversion.request import FitOptions, Limits
 from vvgt_cli.conversion.resume import Checkpoint
 from vvgt_cli.field.workload import Workload
 from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.runs.record import Run
-from vvgt_cli.runs.views import Views
-from vvgt_cli.splat.rules import Rule, rule_of
+from vvgt_cli.gaussians.rules import Rule, rule_of
+from vvgt_cli.score.checks import Views
+from vvgt_cli.score.record import Run
 
 if TYPE_CHECKING:
+    from vvgt_cli.closed_form import Start
     from vvgt_cli.field.field import Field, Picture
-    from vvgt_cli.vbm import Start
 
 
 class Cost(NamedTuple):
@@ -69,7 +69,7 @@ class Work:
 
     def psnr(self, gaussians: Gaussians) -> float:
         """On the check views."""
-        from vvgt_cli.metrics import score_views
+        from vvgt_cli.images.metrics import score_views
 
         assert self.check is not None, "a stage that judges stands before the check views"
         return score_views(self.check.images, self.check.pictures(gaussians, self.rule), perceptual=False).psnr

@@ -7,7 +7,7 @@ import numpy as np
 
 from vvgt_cli.dvr.layout import BRICK
 from vvgt_cli.jit.decorators import kernel
-from vvgt_cli.transfer.tables import OpticalTables
+from vvgt_cli.look.tables import OpticalTables
 
 MAX_DISTANCE = 15  # bricks; a longer leap saves nothing measurable
 

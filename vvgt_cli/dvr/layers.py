@@ -12,9 +12,9 @@ from functools import cached_property
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.transfer.function import TransferFunction
-from vvgt_cli.transfer.labels import LabelTable
-from vvgt_cli.transfer.tables import extinction
+from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.look.labels import LabelTable
+from vvgt_cli.look.tables import extinction
 from vvgt_cli.volume import Volume
 from vvgt_cli.volume.blocks import check_memory
 from vvgt_cli.volume.stored import read_block

@@ -10,8 +10,8 @@ from typing import Protocol
 import numpy as np
 
 from vvgt_cli.dvr.layout import Light, Optics, Voxels
-from vvgt_cli.transfer.lighting import Lighting
-from vvgt_cli.transfer.tables import OpticalTables
+from vvgt_cli.look.lighting import Lighting
+from vvgt_cli.look.tables import OpticalTables
 
 MAX_CELLS = 1 << 21  # of a grid: 128^3; more cost more time than they show
 ANGLE = 3.0  # degrees: radius of a light as it is seen; six times the sun's

@@ -15,21 +15,21 @@ from vvgt_cli.dvr.layout import Light
 from vvgt_cli.dvr.render import Box as Frame
 from vvgt_cli.dvr.render import Rays, RenderSettings, for_thin, tiers
 from vvgt_cli.field.cells import NORMALS, CellBlocks, ExtinctionBlocks, PointBlocks, RayBlocks, read_rows
+from vvgt_cli.field.digests import digest
 from vvgt_cli.field.field import Picture
 from vvgt_cli.field.grid import CellGrid
 from vvgt_cli.field.parts import CELLS, Parts
 from vvgt_cli.field.rays import Bundle, RayFile, composed
 from vvgt_cli.field.runners import Runner, Task
 from vvgt_cli.field.settings import cell_grid
+from vvgt_cli.field.source import Source
 from vvgt_cli.field.workload import PROGRAM, VIEW, Workload, for_budget, pace, view_edge
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.runs.digests import digest
-from vvgt_cli.runs.source import Source
 
 if TYPE_CHECKING:
+    from vvgt_cli.closed_form import Start, VbmOptions
     from vvgt_cli.field.cells import Reader
-    from vvgt_cli.vbm import Start, VbmOptions
 
 Progress = Callable[[int, int], None]
 Todo = list[tuple[str, np.ndarray, Iterator[list[Rays]]]]  # key, picture and rays of what is to be drawn
@@ -127,8 +127,8 @@ class Blocked:
 
     def _grid(self, exponent: np.ndarray, least: int = 1) -> CellGrid:
         """Cells of 2^``exponent`` voxels, in blocks of whole cubes of ``least`` voxels."""
-        from vvgt_cli.vbm.closed_form import MARCH_SIZE
-        from vvgt_cli.vbm.visibility import widening
+        from vvgt_cli.closed_form.closed_form import MARCH_SIZE
+        from vvgt_cli.closed_form.visibility import widening
 
         dims, step = np.array(self.source.volume.dims), self.frame.step
         march = widening(dims, exponent, step, default_views("train", size=MARCH_SIZE))
@@ -147,9 +147,9 @@ class Blocked:
 
     def cells(self, size: int, budget: int, most: int | None = None) -> CellBlocks:
         """The pass over base cells for images of ``size`` px; at most ``most`` cells, None: as many as memory holds."""
+        from vvgt_cli.closed_form.closed_form import finest_level, level_within, most_cells, pixel_width
+        from vvgt_cli.closed_form.moments import blocks, exponents
         from vvgt_cli.field.grid import TILE_BITS
-        from vvgt_cli.vbm.closed_form import finest_level, level_within, most_cells, pixel_width
-        from vvgt_cli.vbm.moments import blocks, exponents
 
         step = self.frame.step
         finest = finest_level(step, pixel_width(size))
@@ -164,10 +164,10 @@ class Blocked:
 
     def start(self, options: VbmOptions, progress: Progress | None = None) -> Start:
         """See `Field`."""
-        from vvgt_cli.vbm import start_of
-        from vvgt_cli.vbm.closed_form import form_of
-        from vvgt_cli.vbm.lit import Shading
-        from vvgt_cli.vbm.moments import Cells
+        from vvgt_cli.closed_form import start_of
+        from vvgt_cli.closed_form.closed_form import form_of
+        from vvgt_cli.closed_form.lit import Shading
+        from vvgt_cli.closed_form.moments import Cells
 
         task = self.cells(options.size, options.max_gaussians)
         self.do(task, "integrate")
@@ -257,7 +257,7 @@ class Blocked:
         """See `Field`."""
         if self.light is None:
             return None
-        from vvgt_cli.vbm.lit import mean_normals, normal_points
+        from vvgt_cli.closed_form.lit import mean_normals, normal_points
 
         points = normal_points(gaussians)
         return mean_normals(points, self._under(points), self.frame.half)
@@ -287,8 +287,8 @@ class Blocked:
 
     def hidden(self, budget: int, size: int) -> tuple[np.ndarray, np.ndarray]:
         """See `Field`."""
-        from vvgt_cli.vbm import VbmOptions
-        from vvgt_cli.vbm.tree import HIDDEN
+        from vvgt_cli.closed_form import VbmOptions
+        from vvgt_cli.closed_form.tree import HIDDEN
 
         form = self.start(VbmOptions(budget, size)).form
         assert form is not None
@@ -304,7 +304,7 @@ def _key(view: Picture) -> str:
 
 def _gathered(task: CellBlocks) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """Index (n, 3), moments (n, 13) and normals (n, 3) of all cells, in Morton order; None where nothing is lit."""
-    from vvgt_cli.vbm.moments import in_order, morton
+    from vvgt_cli.closed_form.moments import in_order, morton
 
     index, moments, normals = [np.empty((0, 3), np.int32)], [], []
     for number in range(len(task)):

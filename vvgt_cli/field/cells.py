@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vvgt_cli.closed_form.columns import FIRST, MASS, MOMENTS
 from vvgt_cli.dvr.layout import Light
 from vvgt_cli.errors import DataError
 from vvgt_cli.field.grid import CellGrid
@@ -13,7 +14,6 @@ from vvgt_cli.field.parts import CELLS, ROW, Parts
 from vvgt_cli.field.rays import HALO, LIT_HALO, RayFile, leave_rays
 from vvgt_cli.field.reader import Box, Layers, Scalars, texels_of
 from vvgt_cli.files import atomic_write
-from vvgt_cli.vbm.columns import FIRST, MASS, MOMENTS
 
 NORMALS = ".normals.npy"
 Reader = Scalars | Layers
@@ -85,8 +85,8 @@ class CellBlocks:
 
     def _cells(self, box: Box, tile: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Cells with extinction of a tile (x, y, z) in a box."""
-        from vvgt_cli.vbm.moments import Region, blocks, region_cells
-        from vvgt_cli.vbm.ranges import visible_blocks
+        from vvgt_cli.closed_form.moments import Region, blocks, region_cells
+        from vvgt_cli.closed_form.ranges import visible_blocks
 
         grid = self.grid
         exponent = np.array(grid.exponent, np.int64)
@@ -108,8 +108,8 @@ class CellBlocks:
 
     def _summary(self, local: np.ndarray, mass: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
         """Of a tile's cells ``local`` (n, 3): mass in cells of the march, opacity of the field, largest of a cell."""
-        from vvgt_cli.vbm.inset import opaque_depth
-        from vvgt_cli.vbm.visibility import summed
+        from vvgt_cli.closed_form.inset import opaque_depth
+        from vvgt_cli.closed_form.visibility import summed
 
         grid = self.grid
         depth = opaque_depth(mass, grid.cell_edge, np.array(grid.step))
@@ -120,7 +120,7 @@ class CellBlocks:
 
 def normals_in(box: Box, points: np.ndarray, step: np.ndarray) -> np.ndarray:
     """Normals and extinction (n, 4) at voxel coordinates ``points`` (n, 3) of the volume that lie in a box."""
-    from vvgt_cli.vbm.lit import point_normals
+    from vvgt_cli.closed_form.lit import point_normals
 
     out = np.empty((len(points), 4))
     point_normals(box.voxels, box.optics, step, np.ascontiguousarray(points - box.begin), out)

@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from vvgt_cli.closed_form.samples import SAMPLE, sample_spacing, samples_in
 from vvgt_cli.errors import Unsuitable, UsageError
 from vvgt_cli.field.grid import Boxes
+from vvgt_cli.field.layered import Content, open_parts
 from vvgt_cli.field.parts import COUNTS, HISTOGRAM, LABELS, Parts
 from vvgt_cli.field.reader import CLASSIFIED, Place
 from vvgt_cli.field.settings import counted_boxes, slices_at_once
-from vvgt_cli.runs.layered import Content, open_parts
-from vvgt_cli.vbm.samples import SAMPLE, sample_spacing, samples_in
 from vvgt_cli.volume import ReadOptions, Statistics, Volume
 from vvgt_cli.volume.label_maps import MOST
 from vvgt_cli.volume.stored import read_block, readable_in_blocks
@@ -116,7 +116,7 @@ def _brick(
 
 
 class Counted:
-    """`vvgt_cli.runs.layered.Access` block by block: every volume is counted once, when it is asked for."""
+    """`vvgt_cli.field.layered.Access` block by block: every volume is counted once, when it is asked for."""
 
     def __init__(
         self, parts: Parts, edge: int, run: Callable[[CountBlocks], object], histogram: bool

@@ -10,14 +10,14 @@ import numpy as np
 
 from vvgt_cli.cameras import Camera
 from vvgt_cli.cameras.blocks import Blocks
+from vvgt_cli.field.digests import volume_digest
+from vvgt_cli.field.source import Source
 from vvgt_cli.field.workload import Workload, measure
 from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.runs.digests import volume_digest
-from vvgt_cli.runs.source import Source
 
 if TYPE_CHECKING:
+    from vvgt_cli.closed_form import Start, VbmOptions
     from vvgt_cli.dvr import RenderSettings, Scene
-    from vvgt_cli.vbm import Start, VbmOptions
 
 
 class Picture(NamedTuple):
@@ -78,7 +78,7 @@ class Resident:
 
     def start(self, options: VbmOptions, progress: Callable[[int, int], None] | None = None) -> Start:
         """See `Field`."""
-        from vvgt_cli.vbm import initialise
+        from vvgt_cli.closed_form import initialise
 
         return initialise(self.scene, options, progress)
 
@@ -95,7 +95,7 @@ class Resident:
         """See `Field`."""
         if self.scene.light is None:
             return None
-        from vvgt_cli.vbm.lit import at_points, mean_normals, normal_points
+        from vvgt_cli.closed_form.lit import at_points, mean_normals, normal_points
 
         points = normal_points(gaussians)
         return mean_normals(points, at_points(self.scene, points), self.scene.half)
@@ -106,8 +106,8 @@ class Resident:
 
     def hidden(self, budget: int, size: int) -> tuple[np.ndarray, np.ndarray]:
         """See `Field`."""
-        from vvgt_cli.vbm.closed_form import closed_form
-        from vvgt_cli.vbm.tree import HIDDEN
+        from vvgt_cli.closed_form.closed_form import closed_form
+        from vvgt_cli.closed_form.tree import HIDDEN
 
         seen = closed_form(self.scene, budget, size).seen
         return seen.largest > HIDDEN, seen.edge

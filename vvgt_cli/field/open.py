@@ -15,17 +15,17 @@ import numpy as np
 from vvgt_cli.errors import SeveralComponents, Unsuitable, UsageError
 from vvgt_cli.field.blocked import Blocked, Pass
 from vvgt_cli.field.counting import Counted
+from vvgt_cli.field.digests import digest
+from vvgt_cli.field.layered import NONE, open_parts
 from vvgt_cli.field.parts import Parts
 from vvgt_cli.field.runners import Here, Processes, Runner
 from vvgt_cli.field.settings import BlockOptions, block_edge
+from vvgt_cli.field.source import Opened, Source, SourceRequest, describe_source, load
+from vvgt_cli.gaussians.outputs import STDOUT
 from vvgt_cli.jit.ahead import COUNT_REAL, COUNT_WHOLE
 from vvgt_cli.progress import Console
 from vvgt_cli.resources import free_memory
-from vvgt_cli.runs.digests import digest
-from vvgt_cli.runs.layered import NONE, open_parts
-from vvgt_cli.runs.outputs import STDOUT
-from vvgt_cli.runs.record import Run
-from vvgt_cli.runs.source import Opened, Source, SourceRequest, describe_source, load
+from vvgt_cli.score.record import Run
 from vvgt_cli.version import VERSION
 from vvgt_cli.volume import ReadOptions, Volume
 from vvgt_cli.volume.readers import SCHEMES
@@ -85,7 +85,7 @@ def blocked(run: Run, request: SourceRequest, options: BlockOptions, parts: Part
     """A field in blocks; its workers end with the context, its parts stay.
 
     Raises:
-        DataError, UsageError: as `vvgt_cli.runs.source.load`; a pipe, or compressed values that can be read front to
+        DataError, UsageError: as `vvgt_cli.field.source.load`; a pipe, or compressed values that can be read front to
             back only.
         Later: other shards' blocks are missing.
     """
@@ -149,11 +149,11 @@ def _absolute(path: str) -> str:
 
 def _reader(source: Source, access: Counted) -> tuple[Reader, float]:
     """What reads boxes of a source, and about how many of its voxels are visible."""
+    from vvgt_cli.closed_form.samples import estimate, visible_share
     from vvgt_cli.dvr.light import linear_tables
     from vvgt_cli.dvr.scene import kernel_rule
     from vvgt_cli.field.reader import LayerPlace, Layers, Scalars
-    from vvgt_cli.transfer.tables import build_tables
-    from vvgt_cli.vbm.samples import estimate, visible_share
+    from vvgt_cli.look.tables import build_tables
 
     volume, frame = source.volume, source.volume.unit_frame()
     if not source.layers:
@@ -185,7 +185,7 @@ def _three(red: Place, green: Place, blue: Place) -> tuple[Place, Place, Place]:
 
 def _visible_of(reader: Layers, volume: Volume) -> float:
     """About how many voxels of an optics grid are visible: samples of it are read."""
-    from vvgt_cli.vbm.samples import SAMPLE, estimate, samples_in, visible_share
+    from vvgt_cli.closed_form.samples import SAMPLE, estimate, samples_in, visible_share
 
     places, weights = samples_in(volume.dims, np.zeros(3, np.int64), np.array(volume.dims))
     size = np.minimum(SAMPLE, volume.dims)
@@ -196,7 +196,7 @@ def _visible_of(reader: Layers, volume: Volume) -> float:
 
 def _at_level(read: ReadOptions, path: str, options: BlockOptions, size: int) -> tuple[ReadOptions, str | None]:
     """The level of an OME-Zarr image: as asked for, else the coarsest whose voxels the screen cannot tell apart."""
-    from vvgt_cli.vbm.closed_form import MIN_CELL, pixel_width
+    from vvgt_cli.closed_form.closed_form import MIN_CELL, pixel_width
     from vvgt_cli.volume.zarr_store import level_shapes
 
     shapes = level_shapes(path, read)
@@ -239,7 +239,7 @@ def better_in_blocks(request: SourceRequest) -> bool:
     Raises:
         DataError, UsageError: as `read_volume`.
     """
-    from vvgt_cli.vbm.closed_form import MAX_BASE_CELLS
+    from vvgt_cli.closed_form.closed_form import MAX_BASE_CELLS
 
     path, free = request.volume, free_memory()
     if not isinstance(path, str) or path == "-":
@@ -273,7 +273,7 @@ def better_in_blocks(request: SourceRequest) -> bool:
 
 def needs_histogram(request: SourceRequest) -> bool:
     """Whether a function follows from the histogram of the values, and not from their range alone."""
-    from vvgt_cli.transfer import read_transfer_function
+    from vvgt_cli.look import read_transfer_function
 
     if request.tf is None:
         return True

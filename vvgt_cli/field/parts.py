@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from vvgt_cli.closed_form.columns import MOMENTS
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import atomic_write
-from vvgt_cli.vbm.columns import MOMENTS
 
 RUN = "run.json"
 COUNTS, HISTOGRAM, LABELS, CELLS = "counts", "histogram", "labels", "cells"

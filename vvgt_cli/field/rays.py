@@ -20,11 +20,11 @@ from vvgt_cli.dvr.layout import Light
 from vvgt_cli.dvr.render import Box as Frame
 from vvgt_cli.dvr.render import camera_arrays
 from vvgt_cli.errors import DataError
+from vvgt_cli.field.digests import digest
 from vvgt_cli.field.grid import Boxes, piece_edge
 from vvgt_cli.field.parts import Parts
 from vvgt_cli.field.reader import Box
 from vvgt_cli.files import atomic_write
-from vvgt_cli.runs.digests import digest
 
 SUFFIX = ".rays.npy"
 RAY = np.dtype([("ray", np.int32), ("rgba", np.float32, 4)])  # one of a bundle, and what a piece shows of it

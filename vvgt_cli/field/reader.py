@@ -11,10 +11,10 @@ import numpy as np
 from vvgt_cli.dvr.layers import Layer, grid_box
 from vvgt_cli.dvr.layout import Optics, Texels, Voxels
 from vvgt_cli.dvr.scene import KernelRule
-from vvgt_cli.runs.layered import Content, open_parts
-from vvgt_cli.transfer.function import TransferFunction
-from vvgt_cli.transfer.labels import LabelTable
-from vvgt_cli.transfer.tables import OpticalTables
+from vvgt_cli.field.layered import Content, open_parts
+from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.look.labels import LabelTable
+from vvgt_cli.look.tables import OpticalTables
 from vvgt_cli.volume import ReadOptions, Volume
 from vvgt_cli.volume.stored import read_block
 

@@ -104,8 +104,8 @@ def cell_grid(volume: Volume, exponent: np.ndarray, edge: int, march: int, least
 
     Blocks are of whole tiles, pieces of rays, and cubes of ``least`` voxels: all of powers of two.
     """
-    from vvgt_cli.vbm.inset import field_coarsening
-    from vvgt_cli.vbm.moments import blocks, points_of
+    from vvgt_cli.closed_form.inset import field_coarsening
+    from vvgt_cli.closed_form.moments import blocks, points_of
 
     frame = volume.unit_frame()
     step = np.array(frame.step)

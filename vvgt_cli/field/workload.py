@@ -96,8 +96,8 @@ def expected_wide(gaussians: int, size: int) -> bool:
 
 def measure(scene: Scene, size: int, gaussians: int) -> Workload:
     """The case of a scene: counted, a small view timed, the machine's pace by a picture of Gaussians."""
+    from vvgt_cli.closed_form.samples import visible_voxels
     from vvgt_cli.dvr.layout import BRICK
-    from vvgt_cli.vbm.samples import visible_voxels
 
     x, y, z = (float(edge) for edge in scene.step)
     case = Workload(
@@ -116,7 +116,7 @@ def measure(scene: Scene, size: int, gaussians: int) -> Workload:
 
 def for_budget(case: Workload, gaussians: int) -> Workload:
     """The same case with another budget; nothing is timed again."""
-    from vvgt_cli.vbm.closed_form import expected_cells
+    from vvgt_cli.closed_form.closed_form import expected_cells
 
     cells = expected_cells(case.visible, np.array(case.step), case.size, gaussians)
     return replace(case, cells=cells, gaussians=int(min(gaussians, cells)))

@@ -11,7 +11,7 @@ import numpy as np
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians.frames import up_matrix
 from vvgt_cli.gaussians.types import HARMONICS
-from vvgt_cli.transfer.lighting import Lighting, parse_lighting
+from vvgt_cli.look.lighting import Lighting, parse_lighting
 from vvgt_cli.version import VERSION
 
 REST_COUNTS = {3 * terms: degree for degree, terms in HARMONICS.items()}  # f_rest properties: 0, 9, 24, 45

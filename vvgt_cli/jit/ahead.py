@@ -4,22 +4,22 @@ from __future__ import annotations
 
 RENDER, RENDER_LIT = "vvgt_cli.dvr.kernel:render_tiles", "vvgt_cli.dvr.lit:render_lit_tiles"
 BRICK_RANGES = "vvgt_cli.dvr.bricks:_ranges"
-SHADE = ("vvgt_cli.vbm.lit:_shade", "vvgt_cli.vbm.lit:point_normals")
+SHADE = ("vvgt_cli.closed_form.lit:_shade", "vvgt_cli.closed_form.lit:point_normals")
 SHADOWS = ("vvgt_cli.dvr.shadows:mean_transmittance", "vvgt_cli.dvr.shadows:cell_extinction")
-MARCH = "vvgt_cli.vbm.visibility:march"
-BLOCK_MOMENTS, COMPACT = "vvgt_cli.vbm.quadrature:block_moments", "vvgt_cli.vbm.quadrature:compact"
-MORTON, MIX = "vvgt_cli.vbm.pyramid:morton_codes", "vvgt_cli.vbm.sharpen:mix_neighbours"
-FRAME_STEPS, REGRESS = "vvgt_cli.descent.steps:own_frame", "vvgt_cli.descent.steps:regress"
+MARCH = "vvgt_cli.closed_form.visibility:march"
+BLOCK_MOMENTS, COMPACT = "vvgt_cli.closed_form.quadrature:block_moments", "vvgt_cli.closed_form.quadrature:compact"
+MORTON, MIX = "vvgt_cli.closed_form.pyramid:morton_codes", "vvgt_cli.closed_form.sharpen:mix_neighbours"
+FRAME_STEPS, REGRESS = "vvgt_cli.refine.steps:own_frame", "vvgt_cli.refine.steps:regress"
 PAIR_SUMS, STANDARD = "vvgt_cli.splat.backward:moments", "vvgt_cli.splat.backward:standard"
 VIEW_SLOPES, VIEW_COLORS = "vvgt_cli.splat.harmonics:view_slopes", "vvgt_cli.splat.harmonics:view_colors"
-FIELD_STEPS = "vvgt_cli.descent.steps:adam"  # harmonics take them even where all else steps in the own frame
+FIELD_STEPS = "vvgt_cli.refine.steps:adam"  # harmonics take them even where all else steps in the own frame
 
 RAYCAST_REST = (BRICK_RANGES, "vvgt_cli.dvr.contrast:_contrast")
 RAYCAST = (RENDER, *RAYCAST_REST)
 GRID = {
     RENDER: "vvgt_cli.dvr.grid:render_grid_tiles",
     RENDER_LIT: "vvgt_cli.dvr.grid:render_lit_grid_tiles",
-    BLOCK_MOMENTS: "vvgt_cli.vbm.grid:grid_moments",
+    BLOCK_MOMENTS: "vvgt_cli.closed_form.grid:grid_moments",
 }
 DRAW = (
     "vvgt_cli.splat.kernel:tile_lists",
@@ -31,21 +31,21 @@ CELLS = (
     MARCH,
     BLOCK_MOMENTS,
     COMPACT,
-    "vvgt_cli.vbm.pyramid:look_up",
+    "vvgt_cli.closed_form.pyramid:look_up",
     MORTON,
-    "vvgt_cli.vbm.pyramid:take_base",
-    "vvgt_cli.vbm.pyramid:sum_children",
-    "vvgt_cli.vbm.pyramid:score_splits",
-    "vvgt_cli.vbm.pyramid:principal_axes",
+    "vvgt_cli.closed_form.pyramid:take_base",
+    "vvgt_cli.closed_form.pyramid:sum_children",
+    "vvgt_cli.closed_form.pyramid:score_splits",
+    "vvgt_cli.closed_form.pyramid:principal_axes",
     MIX,
 )
-CLOSED_FORM = (*CELLS, "vvgt_cli.vbm.inset:_shift", "vvgt_cli.vbm.inset:_blur")
+CLOSED_FORM = (*CELLS, "vvgt_cli.closed_form.inset:_shift", "vvgt_cli.closed_form.inset:_blur")
 DESCENT = (
     PAIR_SUMS,
     "vvgt_cli.splat.backward:own_frame",
     "vvgt_cli.splat.kernel:project_factors",
-    "vvgt_cli.descent.loss:loss_gradient",
-    "vvgt_cli.descent.ssim:blur",
+    "vvgt_cli.refine.loss:loss_gradient",
+    "vvgt_cli.refine.ssim:blur",
 )
 REFINE = (FRAME_STEPS, *DESCENT)
 SHARED = (REGRESS, MIX, MORTON)  # of runs of more than a few Gaussians
@@ -63,9 +63,9 @@ SEGMENTS = {
     GRID[RENDER]: "vvgt_cli.dvr.segments:cast_grid_segments",
     GRID[RENDER_LIT]: "vvgt_cli.dvr.segments:cast_lit_grid_segments",
 }
-BLOCK_RANGES = "vvgt_cli.vbm.ranges:block_ranges"  # of blocks of which not all is read
+BLOCK_RANGES = "vvgt_cli.closed_form.ranges:block_ranges"  # of blocks of which not all is read
 CONVERT = (RENDER, FRAME_STEPS, *CLOSED_FORM, *DRAW, *DESCENT, REGRESS, *RAYCAST_REST, *BACK_PROJECT)
-OPTIMIZE = (*REFINE, *DRAW, "vvgt_cli.vbm.pyramid:principal_axes", *SHARED)
+OPTIMIZE = (*REFINE, *DRAW, "vvgt_cli.closed_form.pyramid:principal_axes", *SHARED)
 EVALUATE = (*RAYCAST, *DRAW)
 INFER = (*DRAW, PAIR_SUMS, STANDARD, *BACK_PROJECT)
 ALL = (

@@ -26,7 +26,7 @@ from vvgt_cli.volume import Volume
 if TYPE_CHECKING:
     import numpy as np
 
-    from vvgt_cli.tasks.evaluate import Evaluation
+    from vvgt_cli.commands.evaluate import Evaluation
 
 
 def convert(
@@ -96,7 +96,7 @@ def read_ply(path: PathLike) -> tuple[Gaussians, PlyHeader]:
     Raises:
         DataError: not a 3DGS ``.ply``, or one without Gaussians.
     """
-    from vvgt_cli.runs.gaussian_files import open_gaussians
+    from vvgt_cli.conversion.gaussian_files import open_gaussians
 
     return open_gaussians(os.fspath(path))
 
@@ -134,7 +134,7 @@ def render_views(
     from vvgt_cli.cameras.boxed import render_in_box
     from vvgt_cli.dvr import RenderSettings, render_view
     from vvgt_cli.errors import UsageError
-    from vvgt_cli.runs.source import load
+    from vvgt_cli.field.source import load
 
     views = default_views("train", cameras, size=size) if isinstance(cameras, int) else list(cameras)
     if len({(view.width, view.height) for view in views}) != 1:
@@ -170,7 +170,7 @@ def evaluate(
     Raises:
         DataError, UsageError: as `convert`.
     """
-    from vvgt_cli.tasks import evaluate as pipeline
+    from vvgt_cli.commands import evaluate as pipeline
 
     source = source_of(volume, look, reading)
     request = pipeline.EvaluateRequest(ply_of(ply), source, size, rule, step, seats)
@@ -212,9 +212,9 @@ def optimize(
         DataError: a ``.ply`` or a folder of views that is not one.
         UsageError: both of steps and time_budget, or none.
     """
-    from vvgt_cli.descent import OptimizeOptions
-    from vvgt_cli.runs.record import ConversionReport, Run
-    from vvgt_cli.tasks.optimize import OptimizeRequest, budget, optimized
+    from vvgt_cli.commands.optimize import OptimizeRequest, budget, optimized
+    from vvgt_cli.refine import OptimizeOptions
+    from vvgt_cli.score.record import ConversionReport, Run
 
     how = OptimizeOptions.of(
         method, max_gaussians=max_gaussians, target_psnr=target_psnr, seed=seed, **budget(steps, time_budget)

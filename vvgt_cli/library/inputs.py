@@ -11,13 +11,13 @@ from typing import Any, BinaryIO, TypedDict
 
 from vvgt_cli.conversion.result import Result
 from vvgt_cli.errors import UsageError
+from vvgt_cli.field.layered import Content, LayerRequest, open_parts, parse_layer
+from vvgt_cli.field.source import Opened, SourceRequest
+from vvgt_cli.look import TransferFunction
+from vvgt_cli.look.label_files import table_of
+from vvgt_cli.look.labels import LabelTable
+from vvgt_cli.look.lighting import LightOptions
 from vvgt_cli.progress import Console
-from vvgt_cli.runs.layered import Content, LayerRequest, open_parts, parse_layer
-from vvgt_cli.runs.source import Opened, SourceRequest
-from vvgt_cli.transfer import TransferFunction
-from vvgt_cli.transfer.label_files import table_of
-from vvgt_cli.transfer.labels import LabelTable
-from vvgt_cli.transfer.lighting import LightOptions
 from vvgt_cli.volume import ReadOptions, Volume
 
 PathLike = str | os.PathLike[str]
@@ -66,7 +66,7 @@ class Goal:
     Attributes:
         max_gaussians: budget.
         size: pixels along the edge of the screen.
-        rule: viewer that is fitted to (`vvgt_cli.splat.rules`).
+        rule: viewer that is fitted to (`vvgt_cli.gaussians.rules`).
         init: "vbm", "wavelet" or "uniform".
         steps: of gradient descent at most; None: chosen by the plan.
         model: trained network that runs before the steps.
@@ -192,7 +192,7 @@ def function_of(tf: FunctionLike | None) -> str | TransferFunction | None:
     Raises:
         DataError: a mapping that is not a function.
     """
-    from vvgt_cli.transfer import read_transfer_function
+    from vvgt_cli.look import read_transfer_function
 
     if isinstance(tf, Mapping):
         return read_transfer_function(tf)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Unpack
 
+from vvgt_cli.field.source import Opened
 from vvgt_cli.library.inputs import GoalLike, LookLike, Reading, VolumeLike, content_of
-from vvgt_cli.runs.source import Opened
 
 if TYPE_CHECKING:
     from vvgt_cli.conversion.result import Conversion

@@ -159,7 +159,7 @@ class NetworkConfig:
 
     @property
     def start(self) -> str:
-        """Which Gaussians training starts from, a method of `vvgt_cli.vbm`."""
+        """Which Gaussians training starts from, a method of `vvgt_cli.closed_form`."""
         return "uniform" if self.variant == "wo_vbm" else "vbm"
 
     def to_dict(self) -> dict[str, Any]:

@@ -8,8 +8,8 @@ import numpy as np
 
 from vvgt_cli.cameras import Camera
 from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.gaussians.rules import INRIA, Rule
 from vvgt_cli.splat.half import halved
-from vvgt_cli.splat.rules import INRIA, Rule
 
 VIEWS = 3  # of those that the network has read
 SMALLEST = 1 / 16  # share of a step; below it none is taken

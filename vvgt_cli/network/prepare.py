@@ -11,11 +11,11 @@ import numpy as np
 from vvgt_cli.cameras import Camera
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.gaussians.rules import INRIA, Rule
 from vvgt_cli.network import tables
 from vvgt_cli.network.config import NetworkConfig
 from vvgt_cli.network.damp import damped
 from vvgt_cli.network.slopes import slope_rows
-from vvgt_cli.splat.rules import INRIA, Rule
 
 UNIT_RADIUS = math.sqrt(3)  # half-diagonal of the unit frame's cube
 

@@ -13,9 +13,9 @@ import numpy as np
 
 from vvgt_cli.cameras import Camera
 from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.gaussians.rules import INRIA, Rule
 from vvgt_cli.network.config import STEP
 from vvgt_cli.splat.half import halved
-from vvgt_cli.splat.rules import INRIA, Rule
 
 FIELDS = ((0, 3), (3, 6), (6, 9), (9, 10), (10, 13))  # d, e, w, logit, colour: columns of a step
 

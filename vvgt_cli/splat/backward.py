@@ -13,6 +13,7 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
+from vvgt_cli.gaussians.constants import TILE
 from vvgt_cli.jit.decorators import inlined, kernel
 from vvgt_cli.splat.buffer import (
     AREA,
@@ -39,7 +40,6 @@ from vvgt_cli.splat.buffer import (
     open_tile,
     tile_jit,
 )
-from vvgt_cli.splat.constants import TILE
 from vvgt_cli.splat.kernel import rotate, rotation_column, to_camera, unit_quaternion
 from vvgt_cli.splat.lanes import (
     CONIC,

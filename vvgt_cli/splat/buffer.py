@@ -18,8 +18,8 @@ from typing import Any
 import numba as nb
 import numpy as np
 
+from vvgt_cli.gaussians.constants import TILE
 from vvgt_cli.jit.decorators import inlined
-from vvgt_cli.splat.constants import TILE
 
 f32: Any = np.float32  # its sums are float here: numba keeps them float32
 U: Any = nb.uint64

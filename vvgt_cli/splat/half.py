@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from vvgt_cli.cameras import Camera
-from vvgt_cli.splat.rules import INRIA, Rule
+from vvgt_cli.gaussians.rules import INRIA, Rule
 
 
 def halved(cameras: Sequence[Camera], images: np.ndarray, rule: Rule = INRIA) -> tuple[list[Camera], np.ndarray, Rule]:

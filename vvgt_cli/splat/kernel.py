@@ -14,8 +14,8 @@ import math
 import numba as nb
 import numpy as np
 
+from vvgt_cli.gaussians.constants import TILE
 from vvgt_cli.jit.decorators import inlined, kernel
-from vvgt_cli.splat.constants import TILE
 from vvgt_cli.splat.lanes import (
     LANES,
     OPACITY,

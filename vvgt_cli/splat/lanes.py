@@ -18,8 +18,8 @@ from typing import Any
 import numba as nb
 import numpy as np
 
+from vvgt_cli.gaussians.constants import NEAR
 from vvgt_cli.jit.decorators import inlined
-from vvgt_cli.splat.constants import NEAR
 
 LANES = 64
 U: Any = nb.uint64

@@ -8,9 +8,9 @@ import numpy as np
 
 from vvgt_cli.cameras import Camera
 from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.gaussians.constants import NEAR
 from vvgt_cli.gaussians.harmonics import view_colors, view_slopes
-from vvgt_cli.splat.constants import NEAR
-from vvgt_cli.splat.rules import INRIA, Rule
+from vvgt_cli.gaussians.rules import INRIA, Rule
 
 
 def rotations(quaternions: np.ndarray) -> np.ndarray:

@@ -11,8 +11,8 @@ import numpy as np
 from vvgt_cli.cameras import Camera
 from vvgt_cli.cameras.blocks import Blocks
 from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.splat.constants import TILE
-from vvgt_cli.splat.rules import INRIA, Rule, rule_of
+from vvgt_cli.gaussians.constants import TILE
+from vvgt_cli.gaussians.rules import INRIA, Rule, rule_of
 
 
 @dataclass(frozen=True)

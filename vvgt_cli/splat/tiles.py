@@ -12,6 +12,7 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
+from vvgt_cli.gaussians.constants import TILE
 from vvgt_cli.jit.decorators import kernel
 from vvgt_cli.splat.buffer import (
     AREA,
@@ -38,7 +39,6 @@ from vvgt_cli.splat.buffer import (
     open_tile,
     tile_jit,
 )
-from vvgt_cli.splat.constants import TILE
 
 
 @tile_jit

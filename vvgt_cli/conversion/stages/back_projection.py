@@ -26,7 +26,7 @@ class BackProjection(Stage):
 
     def run(self, work: Work) -> None:
         """Split and solve."""
-        from vvgt_cli.vbm import backproject
+        from vvgt_cli.closed_form import backproject
 
         assert work.start is not None
         assert work.train is not None

@@ -35,7 +35,7 @@ class CellsByError(Stage):
 
     def run(self, work: Work) -> None:
         """Cut, or take what is kept of it."""
-        from vvgt_cli.vbm import cut_by_error
+        from vvgt_cli.closed_form import cut_by_error
 
         assert work.train is not None
         assert work.train_rule is not None

@@ -14,7 +14,7 @@ from vvgt_cli.errors import NothingVisible
 from vvgt_cli.field.workload import Workload
 
 if TYPE_CHECKING:
-    from vvgt_cli.vbm import Start
+    from vvgt_cli.closed_form import Start
 
 SECONDS = 0.4, 0.62, 0.03, 2.8  # always, per 10^6 cells, 10^6 voxels in bricks that are not empty, 10^6 Gaussians
 MEMORY = 294.0, 1240.0  # bytes: a cell, a Gaussian (with what later stages keep of it)
@@ -49,8 +49,8 @@ class ClosedFormStage(Stage):
         Raises:
             NothingVisible: nothing is visible from any view.
         """
-        from vvgt_cli.vbm import Start, VbmOptions
-        from vvgt_cli.vbm.closed_form import bound
+        from vvgt_cli.closed_form import Start, VbmOptions
+        from vvgt_cli.closed_form.closed_form import bound
 
         run, fit, source = work.run, work.fit, work.field.source
         whole = self.anew or (self.cut and work.checkpoint.load(CELLS) is None)

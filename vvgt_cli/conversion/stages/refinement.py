@@ -9,12 +9,12 @@ import numpy as np
 
 from vvgt_cli.cameras import default_views
 from vvgt_cli.conversion.stage import Cost, Stage, Work
-from vvgt_cli.descent import OptimizeOptions, OptimizeRecord, optimize
 from vvgt_cli.field.workload import Workload, view_edge
 from vvgt_cli.gaussians import Gaussians, as_stored
-from vvgt_cli.runs.record import Run
-from vvgt_cli.runs.views import Views
-from vvgt_cli.splat.constants import MIN_ALPHA
+from vvgt_cli.gaussians.constants import MIN_ALPHA
+from vvgt_cli.refine import OptimizeOptions, OptimizeRecord, optimize
+from vvgt_cli.score.checks import Views
+from vvgt_cli.score.record import Run
 
 STEP = 0.027, 0.0275  # seconds per 400 x 400 px, per 100,000 Gaussians
 HARMONICS = 1.0, 1.1, 1.25, 1.4  # times as long with harmonics of degree 0 to 3
@@ -62,8 +62,8 @@ class Refinement(Stage):
 
     def run(self, work: Work) -> None:
         """Descend, and leave out what viewers do."""
-        from vvgt_cli.vbm.closed_form import pixel_width
-        from vvgt_cli.vbm.shape import widened
+        from vvgt_cli.closed_form.closed_form import pixel_width
+        from vvgt_cli.closed_form.shape import widened
 
         assert work.train is not None
         assert work.check is not None

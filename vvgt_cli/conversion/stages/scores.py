@@ -10,8 +10,8 @@ from vvgt_cli.conversion.request import FitOptions
 from vvgt_cli.conversion.stage import Cost, Stage, Work
 from vvgt_cli.field.field import Picture
 from vvgt_cli.field.workload import Workload
-from vvgt_cli.runs.score import WHOLE, psnr_note, score_test_views, scored
-from vvgt_cli.runs.viewing import PREVIEW_VIEWS, SIDE, condition_views, from_above, score_conditions, seat_pictures
+from vvgt_cli.score.viewing import PREVIEW_VIEWS, SIDE, condition_views, from_above, score_conditions, seat_pictures
+from vvgt_cli.score.views import WHOLE, psnr_note, score_test_views, scored
 
 SCORE, SCORE_ALL = (3, 0, 0.03), (10, len(WHOLE), 0.1)  # views, whole ones of them, seconds beside per 400 x 400 px
 SEATS = 2, 0.15, 0.155  # check views, and seconds beside them: always, per 100,000 Gaussians

@@ -15,8 +15,8 @@ from vvgt_cli.conversion.stage import Cost, Stage, Work
 from vvgt_cli.field.field import Picture
 from vvgt_cli.field.workload import Workload, view_edge
 from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.runs.views import VIEW_BYTES, Views, judged, judging_views
-from vvgt_cli.splat.rules import Rule
+from vvgt_cli.gaussians.rules import Rule
+from vvgt_cli.score.checks import VIEW_BYTES, Views, judged, judging_views
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import RenderSettings, Scene
@@ -154,7 +154,7 @@ def fine_enough(
     edge: views are samples of the screen's pixels, not means over their own.
     """
     from vvgt_cli.dvr import render_view
-    from vvgt_cli.metrics import psnr
+    from vvgt_cli.images.metrics import psnr
     from vvgt_cli.splat import render
 
     camera, blocks = _probe(size)

@@ -1,0 +1,232 @@
+"""Moments of base cells against a float64 twin in plain numpy, and against integrals with a closed form."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from tests.closed_form_scenes import Above, Ramp, Tent, scene_of
+from vvgt_cli.closed_form import moments as moments_module
+from vvgt_cli.closed_form.moments import Cells, base_cells, exponents
+from vvgt_cli.dvr import Scene
+from vvgt_cli.dvr.layout import BRICK
+from vvgt_cli.look.tables import extinction
+from vvgt_cli.synth import analytic
+from vvgt_cli.volume import Volume
+
+
+def trilinear(values: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """Values on the product grid of voxel coordinates x (a,), y (b,), z (c,), clamped to edge -> (c, b, a)."""
+    out = values.astype(np.float64)
+    for axis, p in enumerate((z, y, x)):
+        p = np.clip(p, 0, values.shape[axis] - 1)
+        i = np.floor(p).astype(int)
+        f = (p - i).reshape([-1 if a == axis else 1 for a in range(3)])
+        out = np.take(out, i, axis) * (1 - f) + np.take(out, np.minimum(i + 1, values.shape[axis] - 1), axis) * f
+    return out
+
+
+def twin(scene: Scene, tf, distance: float, exponent: np.ndarray, points_per_voxel: int = 2) -> np.ndarray:
+    """The quadrature of `base_cells`, over all cells: dense (cz, cy, cx, 13).
+
+    Midpoint rule in space; at each point tau(s) is averaged over [s - w, s + w] by 200 midpoints, with 2 w the root of
+    the summed squared differences of s over the point's box.
+    """
+    volume, dims = scene.volume, np.array(scene.volume.dims)
+    cell = 2.0**exponent
+    points = np.maximum(np.round(cell * points_per_voxel), 2).astype(int)
+    count = np.ceil(dims / cell).astype(int)
+    d = cell / points
+    axes = [(np.arange(count[a] * points[a]) + 0.5) * d[a] - 0.5 for a in range(3)]
+    values = volume.slope * volume.data.astype(np.float64) + volume.intercept
+    square = 0.0
+    for a in range(3):
+        ahead, behind = list(axes), list(axes)
+        ahead[a], behind[a] = axes[a] + d[a] / 2, axes[a] - d[a] / 2
+        square = square + (trilinear(values, *ahead) - trilinear(values, *behind)) ** 2
+    s, w = trilinear(values, *axes), 0.5 * np.sqrt(square)
+    lo, hi = values.min(), values.max()  # the tables end with the data
+    mean = np.zeros((4, *s.shape))
+    per_unit = 1 / volume.unit_frame().scale
+    for k in range(200):
+        x = np.clip(s + w * ((2 * k + 1) / 200 - 1), lo, hi).ravel()
+        tau = extinction(tf.opacity(x), distance) * per_unit
+        mean += np.concatenate([tau[None], tau * tf.color(x).T]).reshape(mean.shape) / 200
+    inside = [a <= n - 0.5 for a, n in zip(axes, dims, strict=True)]
+    mean *= inside[2][:, None, None] & inside[1][:, None] & inside[0]
+    tau, box = mean[0] * (d * scene.step).prod(), (d * scene.step) ** 2 / 12
+    x, y, z = ((a + 0.5) * scene.step[i] - scene.half[i] for i, a in enumerate(axes))
+    x, y, z = x[None, None, :], y[None, :, None], z[:, None, None]
+    second = [x * x + box[0], x * y, x * z, y * y + box[1], y * z, z * z + box[2]]
+    rows = [tau * f for f in (1, x, y, z, *second)] + [c * (d * scene.step).prod() for c in mean[1:]]
+    dense = np.stack(rows, axis=-1)  # (z, y, x, 13)
+    blocks = dense.reshape(count[2], points[2], count[1], points[1], count[0], points[0], 13)
+    return blocks.sum(axis=(1, 3, 5))
+
+
+def dense(cells: Cells, like: np.ndarray) -> np.ndarray:
+    out = np.zeros_like(like)
+    x, y, z = cells.index.T
+    out[z, y, x] = cells.moments
+    return out
+
+
+def rough(dims: tuple[int, int, int], spacing=(1.0, 1.0, 1.0), dtype=np.float32) -> Volume:
+    data = analytic.random_field(dims, cycles=3, seed=4).data
+    return Volume((data * 255).astype(dtype) if dtype is not np.float32 else data, spacing)
+
+
+@pytest.mark.parametrize("exponent", [(0, 0, 0), (-1, -1, -1), (-2, -1, 0), (1, 1, 1), (2, 0, -1), (4, 3, 2)])
+@pytest.mark.parametrize("tf", [Ramp(2.0), Tent()], ids=lambda tf: tf.name)
+def test_twin(exponent: tuple[int, int, int], tf) -> None:
+    volume = rough((19, 9, 13), (1.0, 2.5, 0.7))
+    scene = scene_of(volume, tf, 2.0)
+    cells = base_cells(scene, np.array(exponent))
+    expected = twin(scene, tf, 2.0, np.array(exponent))
+    # the tables interpolate tau linearly between 2048 bins or more
+    scale = np.abs(expected).max(axis=(0, 1, 2))
+    assert (np.abs(dense(cells, expected) - expected).max(axis=(0, 1, 2)) / scale).max() < 1e-4
+    np.testing.assert_allclose(cells.edge, 2.0 ** np.array(exponent) * scene.step)
+
+
+def test_twin_of_integer_and_scaled_values() -> None:
+    tf = Tent(0.5, 0.3)
+    bytes_ = rough((10, 11, 9), dtype=np.uint8)
+    volume = Volume(bytes_.data, bytes_.spacing, slope=1 / 255)
+    scene = scene_of(volume, tf, 1.0)
+    expected = twin(scene, tf, 1.0, np.zeros(3))
+    got = dense(base_cells(scene, np.zeros(3, np.int64)), expected)
+    np.testing.assert_allclose(got[..., 0], expected[..., 0], atol=1e-4 * expected[..., 0].max())
+
+
+@pytest.mark.parametrize("corner", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 0), (1, 1, 1)])
+def test_matter_that_ends_at_a_brick_reaches_into_the_next(corner: tuple[int, int, int]) -> None:
+    """Voxels up to a brick's last one: the half voxel behind it lies in blocks whose own bricks are empty."""
+    data = np.zeros([BRICK + 2 if along else 3 for along in corner], np.float32)
+    data[tuple(slice(0, BRICK if along else None) for along in corner)] = 1
+    scene, tf = scene_of(Volume(data), Ramp(2.0), 2.0), Ramp(2.0)
+    assert (scene.empty > 0).any()
+    expected = twin(scene, tf, 2.0, np.zeros(3))
+    got = dense(base_cells(scene, np.zeros(3, np.int64)), expected)
+    behind = tuple(slice(BRICK, None) if along else slice(None) for along in corner)
+    assert expected[behind][..., 0].max() > 0.1 ** sum(corner) * expected[..., 0].max()
+    rough = 0.25 if sum(corner) > 1 else 0  # where edges meet, the spread of a point's voxels is not that of its box
+    np.testing.assert_allclose(got[..., 0], expected[..., 0], rtol=rough, atol=1e-4 * expected[..., 0].max())
+
+
+def test_scratch_bound_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = scene_of(rough((33, 17, 25)), Tent())
+    whole = base_cells(scene, np.zeros(3, np.int64))
+    monkeypatch.setattr(moments_module, "CHUNK_CELLS", 600)
+    pieces = base_cells(scene, np.zeros(3, np.int64))
+    np.testing.assert_array_equal(whole.index, pieces.index)
+    np.testing.assert_array_equal(whole.moments, pieces.moments)
+
+
+@pytest.mark.parametrize("level", [1, 2, 3, 4])
+def test_mass_is_the_same_at_any_level(level: int) -> None:
+    """At and above the voxel the quadrature points are the same ones."""
+    scene = scene_of(rough((19, 9, 13), (1.0, 1.0, 3.0)), Tent())
+    fine = base_cells(scene, np.zeros(3, np.int64))
+    coarse = base_cells(scene, np.full(3, level), points_per_voxel=2)
+    np.testing.assert_allclose(coarse.moments.sum(axis=0), fine.moments.sum(axis=0), rtol=1e-11, atol=1e-14)
+    assert len(coarse.index) < len(fine.index)
+
+
+def test_a_mean_over_the_spread_beats_points() -> None:
+    """A step function: mass within 0.3 % of that of 12 points a voxel edge, at 2."""
+    scene = scene_of(analytic.sphere(24, 0.6), Above(0.8))
+    exact = base_cells(scene, np.zeros(3, np.int64), points_per_voxel=12).moments[:, 0].sum()
+    mass = base_cells(scene, np.zeros(3, np.int64)).moments[:, 0].sum()
+    assert mass == pytest.approx(exact, rel=3e-3)
+
+
+def test_blob_mass_converges_with_order_2() -> None:
+    """A blob that the box cuts: the rim clamped to the edge value leaves an error of h^2."""
+    sigma, k, sizes = 0.6, 3.0, np.array([8, 12, 16, 24, 32, 48])
+    exact = k * (math.sqrt(2 * math.pi) * sigma * math.erf(1 / (sigma * math.sqrt(2)))) ** 3
+    errors = []
+    for n in sizes:
+        scene = scene_of(analytic.blob(int(n), sigma), Ramp(k), 1.0)
+        errors.append(abs(base_cells(scene, np.zeros(3, np.int64)).moments[:, 0].sum() - exact) / exact)
+    order = -np.polyfit(np.log(sizes), np.log(errors), 1)[0]
+    assert order == pytest.approx(2, abs=0.2)
+    assert errors[-1] < 1e-3
+
+
+def test_blob_moments() -> None:
+    """Trilinear interpolation keeps the mass and adds h^2/6 to the variance; colours follow the extinction."""
+    n, sigma, k = 40, 0.2, 3.0
+    scene = scene_of(analytic.blob(n, sigma), Ramp(k), 1.0)
+    total = base_cells(scene, np.zeros(3, np.int64)).moments.sum(axis=0)
+    mass = k * (2 * math.pi * sigma**2) ** 1.5
+    assert total[0] == pytest.approx(mass, rel=2e-4)
+    np.testing.assert_allclose(total[1:4], 0, atol=1e-9)
+    np.testing.assert_allclose(total[[4, 7, 9]] / total[0], sigma**2 + (2 / n) ** 2 / 6, rtol=3e-3)
+    np.testing.assert_allclose(total[[5, 6, 8]], 0, atol=1e-9)
+    assert total[11] == pytest.approx(0.25 * total[0], rel=1e-9)
+    assert total[10] + total[12] == pytest.approx(total[0], rel=1e-9)
+
+
+@pytest.mark.parametrize("level", [-2, 0, 2])
+def test_slab_mass(level: int) -> None:
+    """Linear extinction in a slab that ends between voxels: trilinear interpolation keeps its integral exactly."""
+    scene = scene_of(analytic.slab((9, 10, 31), 0.77), Ramp(5.0), 1.0)
+    half = scene.half
+    cells = base_cells(scene, np.full(3, level))
+    assert cells.moments[:, 0].sum() == pytest.approx(5.0 * 0.77 * 4 * half[0] * half[1], rel=1e-6)
+
+
+@pytest.mark.parametrize("spacing", [(1.0, 1.0, 1.0), (0.1, 7.0, 30.0)])
+@pytest.mark.parametrize("value", [0.0, 0.3, 1.0, 5.0])
+def test_constant(value: float, spacing: tuple[float, float, float]) -> None:
+    """All of the box, the half-voxel rim included, at the function's value there (the end's beyond its nodes)."""
+    volume = Volume(np.full((9, 11, 5), value, np.float32), spacing)
+    scene = scene_of(volume, Ramp(2.0), 4.0)
+    cells = base_cells(scene, np.zeros(3, np.int64))
+    tau = 2.0 * min(value, 1.0) / 4.0 / volume.unit_frame().scale
+    assert cells.moments[:, 0].sum() == pytest.approx(tau * (2 * scene.half).prod(), rel=1e-5)
+    if value == 0:
+        assert len(cells.index) == 0
+        return
+    assert len(cells.index) == 9 * 11 * 5
+    np.testing.assert_allclose(cells.moments[:, 0], tau * scene.step.prod(), rtol=1e-5)
+    centre = (cells.index + 0.5) * scene.step - scene.half
+    np.testing.assert_allclose(cells.moments[:, 1:4] / cells.moments[:, :1], centre, atol=1e-9)
+    second = cells.moments[:, [4, 7, 9]] / cells.moments[:, :1] - centre**2
+    np.testing.assert_allclose(second, np.broadcast_to(scene.step**2 / 12, second.shape), rtol=1e-6)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_not_finite_voxels_are_transparent(bad: float) -> None:
+    data = np.ones((12, 12, 12), np.float32)
+    data[4, 5, 6] = bad
+    scene = scene_of(Volume(data), Ramp(1.0), 1.0)
+    cells = base_cells(scene, np.zeros(3, np.int64))
+    assert np.isfinite(cells.moments).all()
+    assert len(cells.index) == 12**3 - 1
+    # neighbours across a face, an edge, a corner lose the half, quarter, eighth that interpolates with it
+    away = np.abs(cells.index - [6, 5, 4])
+    near = away.max(axis=1) <= 1
+    kept = np.where(near, 1 - 0.5 ** away.sum(axis=1), 1)
+    tau = cells.moments[~near, 0][0]
+    np.testing.assert_allclose(cells.moments[:, 0] / tau, kept, rtol=1e-6)
+
+
+def test_exponents_make_cells_near_cubic() -> None:
+    for step in np.array([(1, 1, 1), (1, 1, 10), (0.3, 1, 1000), (1, 1.4, 1.5)]):
+        for level in (-2, 0, 3):
+            exponent = exponents(step, level)
+            edge = step * 2.0**exponent
+            assert edge[step.argmin()] == pytest.approx(step.min() * 2.0**level)
+            cut = exponent == moments_module.FINEST_CUT  # of a voxel far longer than the others no more pieces are made
+            assert edge[~cut].max() / edge[~cut].min() <= 2
+            assert (edge[cut] >= edge.min()).all()
+
+
+def test_order_is_morton() -> None:
+    cells = base_cells(scene_of(rough((19, 9, 13)), Tent()), np.zeros(3, np.int64))
+    codes = [sum((int(v) >> b & 1) << (3 * b + a) for a, v in enumerate(row) for b in range(8)) for row in cells.index]
+    assert codes == sorted(set(codes))

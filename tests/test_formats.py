@@ -1,0 +1,315 @@
+"""Other programs' formats of Gaussians: what each keeps, what it costs, and what it does with bad input."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import re
+import shutil
+import struct
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vvgt_cli.errors import DataError
+from vvgt_cli.gaussians import Gaussians, PlyOptions, in_unit_frame, read_ply, write_ply
+from vvgt_cli.gaussians.formats import encoded, format_of, read_splats, ready
+from vvgt_cli.gaussians.formats.choose import FORMATS
+from vvgt_cli.gaussians.formats.splats import Splats, columns_of, gaussians_of, ply_bytes, splats_of
+from vvgt_cli.images import read_png
+from vvgt_cli.images.metrics import psnr
+
+# largest error of means, log-scales, rotation (1 - |q.q'|), opacity, colours
+ROUNDED = {
+    ".compressed.ply": (2e-3, 4e-3, 1e-5, 2.1e-3, 3e-3),
+    ".html": (2e-3, 4e-3, 1e-5, 2.1e-3, 3e-3),
+    ".spz": (1e-6, 0.0313, 1e-5, 2.1e-3, 4e-3),
+    ".glb": (0, 1e-6, 1e-6, 1e-6, 1e-6),
+    ".usdc": (0, 1e-6, 1e-6, 1e-6, 1e-6),
+}
+HERE = [known for known in FORMATS if known.suffix in ROUNDED]
+suffix = pytest.mark.parametrize("known", HERE, ids=lambda known: known.suffix)
+
+
+def cloud(count: int = 700) -> Gaussians:
+    rng = np.random.default_rng(5)
+    means, scales = rng.uniform(-1.4, 1.4, (count, 3)), rng.uniform(-7, -1, (count, 3))
+    logits = np.concatenate([rng.normal(0, 3, count - 2), [-30, 30]])
+    return Gaussians(means, scales, 3 * rng.normal(size=(count, 4)), logits, rng.uniform(-0.1, 1.1, (count, 3)))
+
+
+def unit(quaternions: np.ndarray) -> np.ndarray:
+    return quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
+
+
+def errors(before: Gaussians, after: Gaussians) -> tuple[float, ...]:
+    """As `ROUNDED` has them; in whatever order the Gaussians are."""
+    nearest = ((after.means[None] - before.means[:, None]) ** 2).sum(axis=2).argmin(axis=1)
+    assert len(np.unique(nearest)) == len(before) == len(after)
+    after = after.take(nearest)
+    opacity = [1 / (1 + np.exp(-g.opacity_logits.astype(np.float64))) for g in (before, after)]
+    turned = 1 - abs((unit(before.quaternions) * unit(after.quaternions)).sum(axis=1))
+    away = [getattr(before, name) - getattr(after, name) for name in ("means", "log_scales", "colors")]
+    largest = [float(abs(a).max()) for a in away]
+    return largest[0], largest[1], float(turned.max()), float(abs(opacity[0] - opacity[1]).max()), largest[2]
+
+
+@suffix
+@pytest.mark.parametrize("up", ["none", "x", "-y"])
+def test_what_is_written_is_read_again(known, up, tmp_path):
+    before, path = cloud(), tmp_path / f"a{known.suffix}"
+    options = PlyOptions(up=up, made_for=300, rule="spark", unit_distance=2.5, unit_distance_label="given")
+    path.write_bytes(encoded(known, before, options, path.name))
+    assert path.read_bytes() == encoded(known, before, options, path.name) or known.suffix == ".usdc"
+    gaussians, header = read_splats(path)
+    found = errors(before, in_unit_frame(gaussians, header))
+    assert all(a <= b for a, b in zip(found, ROUNDED[known.suffix], strict=True)), found
+    assert (header.made_for, header.rule, header.unit_distance) == (300, "spark", 2.5)
+    assert header.up == ("z" if up == "none" and known.suffix == ".html" else up)
+
+
+@suffix
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_harmonics_are_kept_each_in_its_place(known, degree):
+    base = splats_of(cloud(300), PlyOptions(comments=False))
+    count = {1: 3, 2: 8, 3: 15}[degree]
+    rest = np.random.default_rng(degree).uniform(-0.9, 0.9, (300, count, 3)).astype(np.float32)
+    before = Splats(base.means, base.log_scales, base.quaternions, base.logits, base.f_dc, rest)
+    after = known.read(known.write(before, "a"), "a")
+    order = ((after.means[None] - before.means[:, None]) ** 2).sum(axis=2).argmin(axis=1)
+    step = {".glb": 0, ".usdc": 0, ".spz": 1 / 256 + 1e-6}.get(known.suffix, 1 / 31)
+    assert abs(after.f_rest[order] - rest).max() <= step
+    assert columns_of(ply_bytes(before), "a").f_rest.tobytes() == rest.tobytes()
+
+
+@suffix
+def test_damaged_files_are_one_line(known, tmp_path):
+    content = encoded(known, cloud(100), PlyOptions(), "a")
+    path = tmp_path / f"a{known.suffix}"
+    for damaged in (b"", b"ply\n", content[: len(content) // 2], bytes(len(content)), b"<!doctype html>", b"glTF" * 10):
+        path.write_bytes(damaged)
+        with pytest.raises(DataError) as error:
+            read_splats(path)
+        assert "\n" not in str(error.value)
+        assert path.name in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("ending", "module"), [(".spz", "gsply"), (".compressed.ply", "gsply"), (".html", "gsply"), (".usdc", "pxr")]
+)
+def test_a_library_that_is_missing_is_named_before_the_work(ending, module, tmp_path, vvgt, monkeypatch):
+    monkeypatch.setitem(sys.modules, module, None)
+    monkeypatch.setitem(sys.modules, f"{module}.Usd", None)
+    result = vvgt("convert", "example:frog", "-o", tmp_path / f"a{ending}")
+    assert result.code == 1
+    assert "pip install 'vvgt[share]'" in result.error
+    assert "read" not in result.err.replace(result.error, "")  # no stage ran
+    assert not list(tmp_path.iterdir())
+
+
+def test_sog_without_its_program_says_what_to_install(tmp_path, vvgt, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    result = vvgt("convert", "example:frog", "-o", tmp_path / "a.sog")
+    assert result.code == 1
+    assert "npm install -g @playcanvas/splat-transform" in result.error
+
+
+def test_an_old_openusd_is_told(monkeypatch):
+    usd = pytest.importorskip("pxr.Usd")
+    monkeypatch.setattr(usd, "GetVersion", lambda: (0, 25, 11))
+    with pytest.raises(DataError, match=r"OpenUSD 25\.11 knows no ParticleField3DGaussianSplat.*usd-core>=26\.3"):
+        ready("a.usdc")
+
+
+@pytest.mark.parametrize("name", ["a.obj", "a", "a.spz.gz", "a.splat"])
+def test_unknown_endings_are_refused(name, tmp_path, vvgt):
+    result = vvgt("convert", "example:blob:8", "-o", tmp_path / name)
+    assert result.code == 2
+    assert ".spz" in result.error
+    assert ".html" in result.error
+
+
+def test_a_size_limit_is_of_a_ply(tmp_path, vvgt):
+    result = vvgt("convert", "example:blob:8", "-o", tmp_path / "a.spz", "--max-size", 1)
+    assert result.code == 2
+    assert "--max-gaussians" in result.error
+
+
+def test_positions_that_spz_cannot_hold(tmp_path):
+    far = cloud(10)
+    far = Gaussians(1e8 * far.means, far.log_scales, far.quaternions, far.opacity_logits, far.colors)
+    with pytest.raises(DataError, match="expected less than"):
+        encoded(format_of("a.spz"), far, PlyOptions(), "a.spz")
+
+
+def test_files_of_other_programs_have_no_comments(tmp_path):
+    plain = gzip.compress(gzip.decompress(encoded(format_of("a.spz"), cloud(50), PlyOptions(up="x"), "a.spz")))
+    (tmp_path / "b.spz").write_bytes(plain)
+    header = read_splats(tmp_path / "b.spz")[1]
+    assert (header.version, header.up) == (None, "none")
+
+
+def test_a_compressed_ply_is_known_under_any_name(tmp_path):
+    (tmp_path / "a.ply").write_bytes(encoded(FORMATS[0], cloud(50), PlyOptions(), "a"))
+    assert len(read_splats(tmp_path / "a.ply")[0]) == 50
+
+
+def test_glb_is_what_the_specification_asks_for():
+    content = encoded(format_of("a.glb"), cloud(33), PlyOptions(), "a.glb")
+    magic, version, length, size, kind = struct.unpack_from("<4s4I", content)
+    assert (magic, version, length, kind) == (b"glTF", 2, len(content), 0x4E4F534A)
+    assert size % 4 == 0
+    document = json.loads(content[20 : 20 + size])
+    assert document["extensionsUsed"] == ["KHR_gaussian_splatting"]
+    (primitive,) = document["meshes"][0]["primitives"]
+    assert primitive["mode"] == 0
+    assert set(primitive["extensions"]["KHR_gaussian_splatting"]) >= {"kernel", "colorSpace"}
+    for accessor in document["accessors"]:
+        view = document["bufferViews"][accessor["bufferView"]]
+        width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]]
+        assert view["byteLength"] == 4 * width * accessor["count"] == 4 * width * 33
+    assert sum(view["byteLength"] for view in document["bufferViews"]) == document["buffers"][0]["byteLength"]
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_glb_names_every_harmonic_as_the_specification_does(degree):
+    """Degree l has the coefficients 0 to 2 l, in the order of the columns of a `.ply`."""
+    plain = cloud(5)
+    terms = np.random.default_rng(1).normal(size=(5, (degree + 1) ** 2 - 1, 3)).astype(np.float32)
+    content = encoded(format_of("a.glb"), replace(plain, harmonics=terms if degree else None), PlyOptions(), "a.glb")
+    (size,) = struct.unpack_from("<I", content, 12)
+    document, binary = json.loads(content[20 : 20 + size]), content[28 + size :]
+    attributes = document["meshes"][0]["primitives"][0]["attributes"]
+    found = {name.split(":")[1]: index for name, index in attributes.items() if ":SH_" in name}
+    names = [f"SH_DEGREE_{band}_COEF_{m}" for band in range(degree + 1) for m in range(2 * band + 1)]
+    assert sorted(found) == sorted(names)
+    for name, expected in zip(names[1:], np.moveaxis(terms, 1, 0), strict=True):
+        view = document["bufferViews"][document["accessors"][found[name]]["bufferView"]]
+        values = np.frombuffer(binary, "<f4", 15, view["byteOffset"]).reshape(5, 3)
+        np.testing.assert_allclose(np.sort(values, axis=0), np.sort(expected, axis=0), atol=1e-6)
+
+
+def test_a_usd_stage_is_turned_upright():
+    usd = pytest.importorskip("pxr.Usd")
+    from pxr import Sdf, UsdGeom
+
+    layer = Sdf.Layer.CreateAnonymous(".usdc")
+    path = Path(layer.realPath or "/nonexistent")
+    assert not path.exists()
+    content = encoded(format_of("a.usdc"), cloud(20), PlyOptions(), "a.usdc")
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / "a.usdc").write_bytes(content)
+        stage = usd.Stage.Open(f"{folder}/a.usdc")
+        prim = stage.GetDefaultPrim()
+        assert UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y
+        up = UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(0).TransformDir((0, -1, 0))
+        assert tuple(round(v, 6) for v in up) == (0, 1, 0)  # PLY -y is up
+
+
+def test_convert_says_what_the_format_costs(tmp_path, vvgt):
+    little = ("--max-gaussians", 300, "--size", 64, "--steps", 24, "--tf", "viridis", "--report", tmp_path / "r.json")
+    result = vvgt("convert", "example:marschner-lobb:16", *little, "-o", tmp_path / "a.spz")
+    assert result.code == 0, result.err
+    found = re.search(r"PSNR ([\d.]+) dB, a \.ply has ([\d.]+): the format costs (-?[\d.]+) dB", result.err)
+    after, before, cost = map(float, found.groups())
+    assert cost == pytest.approx(before - after, abs=0.011)
+    assert 0 < before < 60
+    told = json.loads((tmp_path / "r.json").read_text())
+    assert told["bytes"] == (tmp_path / "a.spz").stat().st_size
+    scored = vvgt("evaluate", tmp_path / "a.spz", "--volume", "example:marschner-lobb:16", "--tf", "viridis", "--json",
+                  "--no-seats", "--step", 0.5)  # fmt: skip
+    assert scored.code == 0, scored.err
+    assert json.loads(scored.out)["size"] == 64
+
+
+def test_view_writes_formats_and_says_how_near_they_are(tmp_path, vvgt):
+    write_ply(tmp_path / "a.ply", cloud(), PlyOptions(made_for=64))
+    for ending, least in ((".html", 35), (".spz", 30), (".glb", 80), (".usdc", 80), (".ply", None)):
+        result = vvgt("view", tmp_path / "a.ply", "-o", tmp_path / f"b{ending}")
+        assert result.code == 0, result.err
+        found = re.search(r"([\d.]+|inf) dB from the Gaussians as they were, 3 views of 64 px", result.err)
+        assert (found is None) == (least is None)
+        assert least is None or float(found[1]) > least, result.err
+        assert json.loads(vvgt("info", tmp_path / f"b{ending}", "--json").out)["gaussians"] == 700
+    assert (tmp_path / "b.ply").read_bytes() == (tmp_path / "a.ply").read_bytes()
+    for name in ("a.ply", "b.spz", "b.html"):
+        folder = tmp_path / f"{name}-views"
+        assert vvgt("render", tmp_path / name, "--orbit", 1, "--size", 64, "-o", folder).code == 0
+    pictures = [read_png(tmp_path / f"{name}-views" / "orbit_000.png") for name in ("a.ply", "b.spz", "b.html")]
+    assert psnr(pictures[0], pictures[1]) > 30
+    assert psnr(pictures[0], pictures[2]) > 35
+
+
+def test_the_page_is_one_small_file(tmp_path):
+    rng = np.random.default_rng(0)
+    many = 100_000
+    scene = Gaussians(
+        rng.uniform(-1, 1, (many, 3)), rng.uniform(-6, -3, (many, 3)), rng.normal(size=(many, 4)),
+        rng.normal(size=many),
+        rng.uniform(0, 1, (many, 3)),
+    )  # fmt: skip
+    content = encoded(format_of("a.html"), scene, PlyOptions(), "</script><b>.html")
+    assert len(content) < 5e6
+    text = content.decode()
+    assert "</script><b>" not in text
+    assert not re.findall(r"""(?:src|href)=["']?(?!data:)\w""", text)  # nothing is fetched
+    (tmp_path / "b.html").write_text("<!doctype html><title>another</title>")
+    with pytest.raises(DataError, match="a page without Gaussians"):
+        read_splats(tmp_path / "b.html")
+
+
+def test_the_licences_of_what_the_page_holds_are_beside_it():
+    page = Path(__file__).parent.parent / "vvgt_cli" / "gaussians" / "formats" / "page"
+    wanted = json.loads((page / "package.json").read_text())["dependencies"]
+    text = (page / "LICENSES.txt").read_text()
+    for name in ("@playcanvas/supersplat-viewer", "playcanvas"):
+        assert f"{name} {wanted[name]}\n" in text
+    assert text.count("Permission is hereby granted") == 2
+    assert (page / "viewer.js.gz").stat().st_size < 2e6
+
+
+@pytest.fixture(scope="module")
+def transform() -> list[str]:
+    """splat-transform as a command."""
+    found = shutil.which("splat-transform")
+    if found is None:
+        pytest.skip("splat-transform is not on the path (npm install -g @playcanvas/splat-transform@3.7.0)")
+    return [found, "-q", "-g", "cpu", "-w"]
+
+
+@pytest.mark.parametrize("ending", [".compressed.ply", ".spz", ".sog"])
+def test_splat_transform_reads_what_is_written(ending, transform, tmp_path):
+    path, middling = tmp_path / f"a{ending}", cloud()  # of 8-bit opacity 0 and 1 it makes infinite logits
+    middling = replace(middling, opacity_logits=np.clip(middling.opacity_logits, -4, 4))
+    path.write_bytes(encoded(format_of(path), middling, PlyOptions(up="x"), path.name))
+    subprocess.run([*transform, path, tmp_path / "b.ply"], check=True, capture_output=True)
+    theirs, ours = read_ply(tmp_path / "b.ply")[0], read_splats(path)[0]
+    found = errors(ours, theirs)
+    assert max(found) < 2e-3, found
+
+
+def test_glb_holds_what_splat_transform_writes(transform, tmp_path):
+    """The other writer of the extension; it turns the data, where ours turns the node."""
+    before = cloud()
+    write_ply(tmp_path / "a.ply", before, PlyOptions())
+    subprocess.run([*transform, tmp_path / "a.ply", tmp_path / "b.glb"], check=True, capture_output=True)
+    content = (tmp_path / "b.glb").read_bytes()
+    size = struct.unpack_from("<I", content, 12)[0]
+    document = json.loads(content[20 : 20 + size])
+    document["nodes"] = [{"mesh": 0, "rotation": [0.0, 0.0, 1.0, 0.0]}]
+    head = json.dumps(document).encode()
+    head += b" " * (-len(head) % 4)
+    turned = content[:12] + struct.pack("<2I", len(head), 0x4E4F534A) + head + content[20 + size :]
+    theirs = gaussians_of(format_of("b.glb").read(turned, "b.glb"), "b.glb")[0]
+    half = Gaussians(  # 180 degrees about z
+        before.means * (-1, -1, 1), before.log_scales, unit(before.quaternions) @ np.array(
+            [[0, 0, 0, 1], [0, 0, 1, 0], [0, -1, 0, 0], [-1, 0, 0, 0]]
+        ), before.opacity_logits, before.colors,
+    )  # fmt: skip
+    assert max(errors(half, theirs)) < 1e-5

@@ -1,1 +1,0 @@
-"""Many files of one run: sets of views and series, by manifest and in parts."""

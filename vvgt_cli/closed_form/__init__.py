@@ -1,0 +1,127 @@
+"""Variable Basis Mapping: volume to Gaussians in closed form, and what views can mend without moving anything."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from vvgt_cli.errors import UsageError
+from vvgt_cli.gaussians.rules import INRIA, Rule
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from vvgt_cli.cameras import Camera
+    from vvgt_cli.closed_form.closed_form import ClosedForm
+    from vvgt_cli.dvr import Scene
+    from vvgt_cli.gaussians import Gaussians
+
+METHODS = ("vbm", "wavelet", "uniform")
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class VbmOptions:
+    """What the Gaussians are made for.
+
+    Attributes:
+        max_gaussians: budget.
+        size: image edge in pixels at the default views; opacities allow for the renderer's dilation there.
+        method: "vbm", "wavelet" (isotropic bank) or "uniform" (random samples).
+        seed: of the random samples.
+        degree: of the harmonics that colours have under a light that depends on the view.
+    """
+
+    max_gaussians: int = 100_000
+    size: int = 400
+    method: str = "vbm"
+    seed: int = 0
+    degree: int = 0
+
+    def __post_init__(self) -> None:
+        if self.method not in METHODS:
+            raise UsageError(f"init {self.method!r}; expected one of {', '.join(METHODS)}")
+        if self.max_gaussians < 1:
+            raise UsageError(f"{self.max_gaussians} Gaussians; expected at least 1")
+        if self.size < 1:
+            raise UsageError(f"size {self.size} px; expected at least 1")
+
+
+@dataclass(frozen=True)
+class Start:
+    """Gaussians of the stage, and the pyramid that views may cut anew (None for the comparison methods)."""
+
+    gaussians: Gaussians
+    form: ClosedForm | None
+
+
+def initialise(scene: Scene, options: VbmOptions, progress: Progress | None = None) -> Start:
+    """The closed form alone: no view is rendered. No Gaussians where no view sees anything."""
+    from vvgt_cli.closed_form.closed_form import closed_form
+
+    form = closed_form(scene, options.max_gaussians, options.size, progress=progress, degree=options.degree)
+    if progress:
+        progress(100, 100)
+    return start_of(form, options)
+
+
+def start_of(form: ClosedForm, options: VbmOptions) -> Start:
+    """The Gaussians of the method asked for, from a closed form."""
+    from vvgt_cli.closed_form.uniform import uniform_gaussians
+    from vvgt_cli.closed_form.wavelet import wavelet_gaussians
+
+    if options.method == "wavelet":
+        gaussians, kept = wavelet_gaussians(form.tree, form.budget, form.pixel), None
+    elif options.method == "uniform":
+        gaussians, kept = uniform_gaussians(form.tree, form.budget, form.pixel, options.seed), None
+    else:
+        gaussians, kept = form.gaussians(), form
+    if kept is None and form.shading is not None:
+        gaussians = form.shading.alone(gaussians, options.degree)
+    return Start(gaussians, kept)
+
+
+def cut_by_error(start: Start, cameras: Sequence[Camera], views: np.ndarray, rule: Rule = INRIA) -> Gaussians:
+    """The closed form of other cells of the pyramid, as many: more where views of the first ones are wrong.
+
+    Args:
+        start: from `initialise`, with a pyramid.
+        cameras, views: of training, (n, h, w, 4) float32 premultiplied.
+        rule: by which they are drawn.
+
+    Raises:
+        UsageError: there is no pyramid.
+    """
+    if start.form is None:
+        raise UsageError("Gaussians without a pyramid; expected those of `initialise` by moments, as they came from it")
+    return start.form.cut_by_error(start.gaussians, cameras, views, rule)
+
+
+def backproject(
+    start: Start,
+    cameras: Sequence[Camera],
+    views: np.ndarray,
+    progress: Progress | None = None,
+    rule: Rule = INRIA,
+) -> tuple[Gaussians, str]:
+    """What views can mend without gradient descent: which cells are split, the style of surfaces, and the colours.
+
+    Args:
+        start: from `initialise`.
+        cameras, views: training views, (n, h, w, 4) float32 premultiplied.
+        progress: called after each part.
+        rule: by which they are drawn.
+
+    Returns:
+        Gaussians, and one line that says what was done.
+    """
+    from vvgt_cli.closed_form.closed_form import fit
+    from vvgt_cli.closed_form.fit import solve_colors
+
+    if start.form is None:
+        return solve_colors(start.gaussians, cameras, views, progress=progress, rule=rule), "colours"
+    return fit(start.form, cameras, views, progress, rule)
+
+
+__all__ = ["METHODS", "Start", "VbmOptions", "backproject", "cut_by_error", "initialise"]

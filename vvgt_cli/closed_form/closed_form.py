@@ -1,0 +1,285 @@
+"""The stage itself: moments, visibility, pyramid, choice of cells, Gaussians; and what views can mend."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vvgt_cli.cameras import Camera, default_views
+from vvgt_cli.cameras.sets import FIELD_OF_VIEW, RADIUS
+from vvgt_cli.closed_form.columns import MASS, SEEN
+from vvgt_cli.closed_form.error import scores_by_error, unseen
+from vvgt_cli.closed_form.fit import blending_weights, image_errors, solve_colors, weights_and_errors
+from vvgt_cli.closed_form.inset import Opaque, opaque_field
+from vvgt_cli.closed_form.lit import Shading, centroids
+from vvgt_cli.closed_form.moments import Cells, base_cells, exponents
+from vvgt_cli.closed_form.samples import visible_voxels
+from vvgt_cli.closed_form.shape import ROUND, STYLES, SurfaceStyle, cell_gaussians
+from vvgt_cli.closed_form.sharpen import sharpened
+from vvgt_cli.closed_form.tree import Leaves, Tree, build_tree, leaves_of, select, shown, split, split_score
+from vvgt_cli.closed_form.visibility import Visibility, visibility
+from vvgt_cli.dvr.render import Box
+from vvgt_cli.dvr.scene import Scene
+from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.gaussians.rules import INRIA, Rule
+from vvgt_cli.splat import render
+
+MAX_BASE_CELLS = 5_000_000  # an upper bound: half of them are there, as a rule; 104 bytes each, twice for the pyramid
+CELLS_A_GAUSSIAN, FEW_CELLS = 256, 500_000  # more are of no use to a small budget, but so many cost nothing
+FINEST = -2  # cells of a quarter voxel at most
+MIN_CELL = 1.2  # pixels: a smaller base cell cannot be told from its neighbours
+MARCH_SIZE = 128  # pixels of the visibility march
+FEW = 0.04  # share of hidden cells that are left where they are: of some fogs, which lose by it
+SMALLER = 1.75  # power: of smaller cells more are hidden (2: fogs lose 0.2 dB, 1.5: bone loses as much)
+REFINE_FROM = 0.3  # share of the budget given out before views say where the error is
+REFINE_ROUNDS = 2
+REFINE_VIEWS = 8
+TWICE = 0.6  # weight of the error at twice the size where styles of surface compete
+TWICE_EVERY = 6  # of so many views one counts as seen at twice its size when colours are solved
+
+Progress = Callable[[int, int], None]
+
+
+def pixel_width(size: int) -> float:
+    """Width of a pixel at the volume's centre in the default views, unit frame."""
+    return 2 * RADIUS * math.tan(math.radians(FIELD_OF_VIEW) / 2) / size
+
+
+@dataclass(frozen=True)
+class ClosedForm:
+    """A volume's pyramid, ready to be cut for any budget.
+
+    Attributes:
+        seen: what the cameras see of it.
+        tree: moments of every cell that some view sees.
+        opaque: where bodies are opaque.
+        half, step: (3,) half extents and voxel edges, unit frame.
+        pixel: a pixel's width at the centre, unit frame.
+        budget: most Gaussians.
+        labels: it is one of labels alone.
+        shading: of its light, None where nothing is lit; ``normals`` (n, 3) at the centroids of the tree's base cells.
+        degree: of the harmonics that colours have under a light that depends on the view.
+        scene: what base cells are split from; None: they are not split, as only blocks of the volume are in memory.
+    """
+
+    seen: Visibility
+    tree: Tree
+    opaque: Opaque
+    half: np.ndarray
+    step: np.ndarray
+    pixel: float
+    budget: int
+    labels: bool = False
+    shading: Shading | None = None
+    normals: np.ndarray | None = None
+    degree: int = 0
+    scene: Scene | None = None
+
+    def gaussians(self, style: SurfaceStyle = ROUND) -> Gaussians:
+        """Gaussians of the cells that the moments alone choose."""
+        return self._of(leaves_of(self.tree, select(self.tree, self.budget)), style)
+
+    def _of(self, leaves: Leaves, style: SurfaceStyle) -> Gaussians:
+        return self._sharpened(leaves, self._cells(leaves, style))
+
+    def _cells(self, leaves: Leaves, style: SurfaceStyle) -> Gaussians:
+        found = cell_gaussians(leaves, float(self.step.min()), self.pixel, self.opaque, style)
+        if self.shading is None or self.normals is None:
+            return found
+        return self.shading.lit(found, self.tree, leaves, self.degree, self.normals)
+
+    def _sharpened(self, leaves: Leaves, found: Gaussians) -> Gaussians:
+        """`sharpened`, but labels: each is of one colour, and may be written to a file of its own."""
+        if self.labels:
+            return found
+        return sharpened(found, leaves.moments[:, SEEN] / leaves.moments[:, MASS], self.half)
+
+    def cut_by_error(self, drawn: Gaussians, cameras: Sequence[Camera], views: np.ndarray, rule: Rule) -> Gaussians:
+        """`gaussians` of cells chosen by what views (n, h, w, 4) show of the error of those, ``drawn``, by ``rule``.
+
+        Where some of those drawn are hidden in all views, more are cut than the budget has, and the hidden left out.
+        """
+        score = split_score(self.tree)
+        ids = select(self.tree, self.budget, score)
+        weights, errors = weights_and_errors(drawn, cameras, views, rule, power=2)
+        score = scores_by_error(self.tree, ids, errors, score)
+        seen = 1 - float(unseen(weights, self.budget).sum()) / max(len(weights), 1)
+        if seen > 1 - FEW:
+            return self._of(leaves_of(self.tree, select(self.tree, self.budget, score)), ROUND)
+        wanted = round(self.budget * min(seen**-SMALLER, 2.0))
+        leaves = leaves_of(self.tree, select(self.tree, wanted, score))
+        found = self._cells(leaves, ROUND)
+        shown = np.flatnonzero(~unseen(blending_weights(found, cameras, rule), self.budget))
+        return self._sharpened(leaves.take(shown), found.take(shown))
+
+    def refined(self, cameras: Sequence[Camera], views: np.ndarray, style: SurfaceStyle, rule: Rule) -> Gaussians:
+        """Gaussians for the budget: three tenths by the moments, then cells with the largest error are split."""
+        start = max(int(self.budget * REFINE_FROM), 1)
+        leaves = leaves_of(self.tree, select(self.tree, start))
+        smallest = max(2 * MIN_CELL * self.pixel, 2.0 ** (FINEST + 1) * self.step.min())  # edge of a cell to split
+        for done in range(1, REFINE_ROUNDS + 1):
+            gaussians = solve_colors(self._of(leaves, style), cameras, views, rounds=1, rule=rule)
+            error = image_errors(gaussians, cameras, views, rule)
+            room = start + (self.budget - start) * done // REFINE_ROUNDS - len(leaves)
+            order = np.argsort(-error, kind="stable")
+            order = order[leaves.edge[order].min(axis=1) >= smallest]
+            leaves = split(self.tree, leaves, order, room, self.scene, self.seen)
+        return self._of(leaves, style)
+
+
+def closed_form(
+    scene: Scene,
+    budget: int,
+    size: int,
+    cameras: Sequence[Camera] | None = None,
+    progress: Progress | None = None,
+    degree: int = 0,
+) -> ClosedForm:
+    """Moments, visibility and pyramid of a scene.
+
+    Args:
+        scene: volume under a transfer function.
+        budget: most Gaussians.
+        size: image edge in pixels that the file is made for.
+        cameras: what may see the scene; by default the training views.
+        progress: called with (per cent done, 100), within parts that take long too.
+        degree: of the harmonics under a light that depends on the view.
+    """
+    step, half = np.asarray(scene.step), np.asarray(scene.half)
+    exponent = exponents(step, base_level(scene, size, budget))
+    cells = base_cells(scene, exponent, progress=part(progress, 0, 50))
+    return form_of(
+        cells, half, step, budget, size, cameras, part(progress, 50, 95), scene.labels, Shading.of(scene), degree, scene
+    )  # fmt: skip
+
+
+def part(progress: Progress | None, first: int, last: int) -> Callable[[float], None]:
+    """What is told the share that is done of something that takes from ``first`` to ``last`` per cent of the whole."""
+    return lambda share: progress(round(first + (last - first) * share), 100) if progress else None
+
+
+def form_of(
+    cells: Cells,
+    half: np.ndarray,
+    step: np.ndarray,
+    budget: int,
+    size: int,
+    cameras: Sequence[Camera] | None = None,
+    progress: Callable[[float], None] | None = None,
+    labels: bool = False,
+    shading: Shading | None = None,
+    degree: int = 0,
+    scene: Scene | None = None,
+) -> ClosedForm:
+    """The closed form over base cells, wherever the volume's values are; arguments as of `closed_form` and its result.
+
+    ``progress`` is told the share that is done.
+    """
+    tell = progress or (lambda share: None)
+    box = Box(half, step)
+    cameras = cameras or default_views("train", size=MARCH_SIZE)
+    seen = visibility(box, cells, cameras, progress=lambda share: tell(0.5 * share))
+    opaque = opaque_field(cells, step, half, labels)
+    tell(0.6)
+    tree = build_tree(cells, seen, step)
+    normals = None
+    if shading is not None:
+        base = int((tree.children == 0).sum())
+        own = cells.normals
+        normals = shading.normals(centroids(tree.moments[:base])) if own is None else own[shown(cells, seen, step)]
+    tell(1)
+    return ClosedForm(
+        seen, tree, opaque, half, step, pixel_width(size), budget, labels, shading, normals, degree, scene
+    )  # fmt: skip
+
+
+def base_level(scene: Scene, size: int, budget: int) -> int:
+    """Finest level whose base cells fit the memory bound and the budget, and are not finer than the images can tell."""
+    return level_within(
+        scene.step, visible_voxels(scene), most_cells(budget), finest_level(scene.step, pixel_width(size))
+    )
+
+
+def most_cells(budget: int) -> int:
+    """Base cells that a budget has use for, and memory holds."""
+    return min(MAX_BASE_CELLS, max(CELLS_A_GAUSSIAN * budget, FEW_CELLS))
+
+
+def level_within(step: np.ndarray, voxels: float, most: float, finest: int) -> int:
+    """Finest level, from ``finest`` on, that cuts ``voxels`` voxels of edges ``step`` into ``most`` cells or fewer."""
+    level = finest
+    # a long voxel holds more cells than 8^-level
+    while voxels / np.prod(2.0 ** exponents(step, level)) > most:
+        level += 1
+    return level
+
+
+def finest_level(step: np.ndarray, pixel: float) -> int:
+    """Level of the cells that pixels just tell apart; ``step`` (3,) voxel edges, ``pixel`` a pixel's, unit frame."""
+    return max(FINEST, math.floor(math.log2(MIN_CELL * pixel / float(step.min()))))
+
+
+def bound(form: ClosedForm) -> str:
+    """Why there are no more Gaussians, where there are fewer than the budget."""
+    finest = 2.0 ** exponents(form.step, finest_level(form.step, form.pixel)) * form.step
+    if (form.tree.edge[0] > 1.5 * finest).any():
+        return f"memory for at most {MAX_BASE_CELLS} cells"
+    return "the screen cannot tell smaller cells apart"
+
+
+def expected_cells(voxels: float, step: np.ndarray, size: int, budget: int) -> float:
+    """About how many base cells the closed form of ``budget`` Gaussians for images of ``size`` px will have."""
+    level = level_within(step, voxels, most_cells(budget), finest_level(step, pixel_width(size)))
+    return voxels / float(np.prod(2.0 ** exponents(step, level)))
+
+
+def fit(
+    form: ClosedForm,
+    cameras: Sequence[Camera],
+    views: np.ndarray,
+    progress: Progress | None = None,
+    rule: Rule = INRIA,
+) -> tuple[Gaussians, str]:
+    """The pyramid cut where views see errors, then coloured by all of them.
+
+    Where bodies are opaque, styles of surface compete on every third view.
+
+    Args:
+        form: what to cut.
+        cameras, views: training views, (n, h, w, 4) float32 premultiplied.
+        progress: called after each cut and at the end.
+        rule: by which the views are drawn.
+
+    Returns:
+        The Gaussians and one line that says what was done.
+    """
+    few = range(0, len(cameras), max(len(cameras) // REFINE_VIEWS, 1))
+    some, images = [cameras[i] for i in few], views[list(few)]
+    styles = list(STYLES) if form.opaque.any else ["round"]
+    tick = progress or (lambda done, total: None)
+    cuts = []
+    for number, name in enumerate(styles):
+        cuts.append(solve_colors(form.refined(some, images, STYLES[name], rule), some, images, rounds=1, rule=rule))
+        tick(number + 1, len(styles) + 1)
+    best = 0
+    if len(cuts) > 1:
+        best = int(np.argmin([_loss(cut, some, images, rule) for cut in cuts]))
+    gaussians = solve_colors(cuts[best], cameras, views, twice_every=TWICE_EVERY, rule=rule)
+    tick(len(styles) + 1, len(styles) + 1)
+    return gaussians, "cells by image error" + (f", {styles[best]} surfaces" if form.opaque.any else "")
+
+
+def _loss(gaussians: Gaussians, cameras: Sequence[Camera], views: np.ndarray, rule: Rule) -> float:
+    """Mean squared colour error at the views' size, plus `TWICE` times that at twice the size (averaged 2 x 2).
+
+    A file that leans on the renderer's 0.3 px looks right at one size only.
+    """
+    total = 0.0
+    for camera, view in zip(cameras, views, strict=True):
+        halved = render(gaussians, camera, rule.at(0.5))
+        total += float(np.mean((render(gaussians, camera, rule) - view)[..., :3] ** 2))
+        total += TWICE * float(np.mean((halved - view)[..., :3] ** 2))
+    return total / len(cameras)

@@ -1,0 +1,177 @@
+"""What views can mend in closed-form Gaussians without moving them: cells split by error, colours by least squares."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Protocol
+
+import numpy as np
+
+from vvgt_cli.cameras import Camera
+from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.gaussians.rules import INRIA, Rule
+from vvgt_cli.splat import Projection, blend, gather, project, render
+
+SEEN = 1e-2  # blending weight (pixels, over all views) below which views say nothing about a splat
+PRIOR = 1.0  # pixels of weight that the closed form's colour counts for
+ROUNDS = 6
+ENOUGH = 0.005  # share of the squared error below which another round is not worth its time
+BRIGHTEST = 2.0  # colours are kept in [0, 2]: more would flare up where other views thin the splats in front
+
+Progress = Callable[[int, int], None]
+
+
+def image_errors(
+    gaussians: Gaussians, cameras: Sequence[Camera], views: np.ndarray, rule: Rule = INRIA, power: int = 1
+) -> np.ndarray:
+    """(K,) sum over views and pixels of blending weight x error of RGB and alpha; ``views`` (n, h, w, 4).
+
+    Of each of the four absolute errors the ``power``.
+    """
+    return weights_and_errors(gaussians, cameras, views, rule, power)[1]
+
+
+def weights_and_errors(
+    gaussians: Gaussians, cameras: Sequence[Camera], views: np.ndarray, rule: Rule = INRIA, power: int = 1
+) -> tuple[np.ndarray, np.ndarray]:
+    """(K,) sums over views and pixels of blending weight, and `image_errors`."""
+    sums = np.zeros((len(gaussians), 5))
+    for camera, view in zip(cameras, views, strict=True):
+        projection = project(gaussians, camera, rule)
+        error = (np.abs(view - render(gaussians, camera, projection=projection)) ** power).sum(axis=-1)
+        gather(projection, np.broadcast_to(error, (4, *error.shape)), sums)
+    return sums[:, 0], sums[:, 1]
+
+
+def blending_weights(gaussians: Gaussians, cameras: Sequence[Camera], rule: Rule = INRIA) -> np.ndarray:
+    """(K,) sum over views and pixels of blending weight, T alpha."""
+    sums = np.zeros((len(gaussians), 5))
+    for camera in cameras:
+        nothing = np.zeros((4, camera.height, camera.width), np.float32)
+        gather(project(gaussians, camera, rule), nothing, sums)
+    return sums[:, 0]
+
+
+def solve_colors(
+    gaussians: Gaussians,
+    cameras: Sequence[Camera],
+    views: np.ndarray,
+    rounds: int = ROUNDS,
+    progress: Progress | None = None,
+    twice_every: int = 0,
+    rule: Rule = INRIA,
+    degree: int | None = None,
+) -> Gaussians:
+    """Least-squares colours by preconditioned conjugate gradients: images are linear in them.
+
+    Minimises ``sum |blend(c) - view|^2 + PRIOR |c - c0|^2`` over all views and RGB; ``views`` (n, h, w, 4) float32
+    premultiplied. The preconditioner is the blending weight of each splat, so that one round is the normalised
+    back-projection of the residual. Rounds end early where one lowers the squared error by less than `ENOUGH`. Every
+    ``twice_every``-th view (0: none) counts as seen at twice its size; ``rule`` is that of the views. Colours and
+    harmonics of ``degree`` (None: the Gaussians' own) are solved together: see `vvgt_cli.closed_form.view_fit`.
+    """
+    gaussians = gaussians if degree is None else gaussians.of_degree(degree)
+    projections = [
+        project(gaussians, camera, rule.at(0.5) if twice_every and i % twice_every == twice_every - 1 else rule)
+        for i, camera in enumerate(cameras)
+    ]
+    if gaussians.harmonics is None:
+        found = np.clip(_descend(_Single(gaussians, projections), views, rounds, progress), 0, BRIGHTEST)
+        return replace(gaussians, colors=found)
+    from vvgt_cli.closed_form.view_fit import ViewDependentSystem
+
+    system = ViewDependentSystem(gaussians, [camera.position for camera in cameras], projections, PRIOR)
+    return system.gaussians(_descend(system, views, rounds, progress), BRIGHTEST)
+
+
+class System(Protocol):
+    """Pictures as a linear function of unknowns (K, ..., 3), channel by channel.
+
+    Attributes:
+        start: unknowns to begin with, float64.
+    """
+
+    start: np.ndarray
+
+    def forward(self, view: int, unknowns: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+        """RGB picture (h, w, 3) of a view, of ``shape`` (h, w, ...)."""
+
+    def back(self, images: Sequence[np.ndarray]) -> np.ndarray:
+        """The adjoint of `forward`, summed over the views' ``images``; float64 like the unknowns."""
+
+    def pull(self, change: np.ndarray) -> np.ndarray:
+        """Half the gradient of what is asked of a ``change`` of the unknowns: to be small."""
+
+    def scaled(self, gradient: np.ndarray) -> np.ndarray:
+        """The preconditioned gradient; `back` has been called."""
+
+
+class _Single:
+    """One colour a Gaussian: unknowns (K, 3)."""
+
+    def __init__(self, gaussians: Gaussians, projections: Sequence[Projection]) -> None:
+        self.projections, self.start = projections, gaussians.colors.astype(np.float64)
+        self.weight = np.zeros((len(gaussians), 1))
+
+    def forward(self, view: int, unknowns: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+        return _forward(self.projections[view], unknowns, shape)
+
+    def back(self, images: Sequence[np.ndarray]) -> np.ndarray:
+        sums = _back(self.projections, images, len(self.start))
+        self.weight = np.maximum(sums[:, :1], SEEN) + PRIOR
+        return sums[:, 1:4]
+
+    def pull(self, change: np.ndarray) -> np.ndarray:
+        return PRIOR * change
+
+    def scaled(self, gradient: np.ndarray) -> np.ndarray:
+        result: np.ndarray = gradient / self.weight
+        return result
+
+
+def _descend(system: System, views: np.ndarray, rounds: int, progress: Progress | None) -> np.ndarray:
+    """The unknowns after conjugate gradients of `solve_colors`."""
+    found = system.start.copy()
+    rows = tuple(range(found.ndim - 1))  # all axes but the channels
+    residuals = [view[..., :3] - system.forward(i, found, view.shape) for i, view in enumerate(views)]
+    gradient = system.back(residuals)
+    direction = system.scaled(gradient)
+    slope = (gradient * direction).sum(axis=rows)
+    error = sum(float(np.vdot(r, r)) for r in residuals)
+    for done in range(rounds):
+        images = [system.forward(i, direction, view.shape) for i, view in enumerate(views)]
+        curvature = sum((image.astype(np.float64) ** 2).sum(axis=(0, 1)) for image in images)
+        curvature = curvature + (direction * system.pull(direction)).sum(axis=rows)
+        length = np.where(curvature > 0, slope / np.where(curvature > 0, curvature, 1), 0)
+        found += length * direction
+        gained = float((length * slope).sum())  # an exact line search lowers the squared error by this
+        last = done == rounds - 1 or gained <= ENOUGH * error
+        if progress:
+            progress(rounds if last else done + 1, rounds)
+        if last:
+            break
+        error -= gained
+        for residual, image in zip(residuals, images, strict=True):
+            residual -= length.astype(np.float32) * image
+        gradient = system.back(residuals) - system.pull(found - system.start)
+        scaled = system.scaled(gradient)
+        new = (gradient * scaled).sum(axis=rows)
+        direction = scaled + np.where(slope > 0, new / np.where(slope > 0, slope, 1), 0) * direction
+        slope = new
+    return found
+
+
+def _forward(projection: Projection, colors: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """RGB image (h, w, 3) of signed colours."""
+    return blend(projection, np.ascontiguousarray(colors, np.float32), shape[0], shape[1])[..., :3]
+
+
+def _back(projections: Sequence[Projection], images: Sequence[np.ndarray], count: int) -> np.ndarray:
+    """(K, 5): blending weights, then the adjoint of `_forward` in columns 1 to 3."""
+    sums = np.zeros((count, 5))
+    for projection, image in zip(projections, images, strict=True):
+        fields = np.zeros((4, *image.shape[:2]), np.float32)
+        fields[:3] = image.transpose(2, 0, 1)
+        gather(projection, fields, sums)
+    return sums

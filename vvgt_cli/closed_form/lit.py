@@ -1,0 +1,288 @@
+"""Colours of cells under light in closed form: what does not depend on the view, and harmonics of what does.
+
+Every base cell is shaded at its centroid and counts by what the cameras see of it, so that of an opaque body its
+surface counts. The head-light's terms are even in n . d: with ``|x|^p = A + B x^2``, least squares over [0, 1] weighted
+by x (what is seen at a grazing angle covers few pixels), a Gaussian's colour is the quadratic form ``A g + B d^T Q d``
+of its direction d, Q the mean of n n^T and g its trace: harmonics of degree 0 and 2, without a picture. Highlights of
+lights at infinity are projected onto the harmonics for the main axis of Q.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numba as nb
+import numpy as np
+
+from vvgt_cli.closed_form.columns import COLOR, COLUMNS, FIRST, MASS, RED, SEEN, SEEN_COLOR, SEEN_RED, X, Y, Z
+from vvgt_cli.closed_form.tree import Leaves, Tree
+from vvgt_cli.dvr.kernel import FLAGS, mean_optics, sample, table_coordinate
+from vvgt_cli.dvr.layout import LIT, Light, Optics, Voxels
+from vvgt_cli.dvr.light import sphere
+from vvgt_cli.dvr.scene import Scene
+from vvgt_cli.dvr.shading import arrives, fixed_diffuse, normal, openness
+from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.gaussians.frames import rotations
+from vvgt_cli.gaussians.harmonics import C2, basis
+from vvgt_cli.gaussians.types import HARMONICS, SH_C0
+from vvgt_cli.jit.decorators import kernel
+
+NORMALS, TINT, FIXED, MEAN, ARRIVING = slice(1, 7), slice(7, 10), slice(10, 13), slice(13, 16), 16
+SEEN_LITTLE = 1e-12  # of the mass: all of it counts where the cameras see no more
+AROUND = 96  # directions that highlights are projected on
+CHUNK = 1 << 14  # Gaussians whose highlights are projected at once
+BRIGHTEST = 2.0  # as `vvgt_cli.closed_form.fit` has it
+
+
+@kernel("Voxels Optics f8:1 f8:2 f8:2", LIT, parallel=True, fastmath=FLAGS, error_model="numpy")
+def point_normals(voxels: Voxels, optics: Optics, edge: np.ndarray, points: np.ndarray, out: np.ndarray) -> None:
+    """Normal (x, y, z) and extinction at voxel coordinates ``points`` (n, 3), into ``out`` (n, 4).
+
+    ``edge`` (3,) of `Light`; extinction per unit-frame length, the edge voxels' beyond the box.
+    """
+    for k in nb.prange(len(points)):
+        x, y, z = points[k, 0], points[k, 1], points[k, 2]
+        out[k, 0], out[k, 1], out[k, 2] = normal(voxels.values, edge, x, y, z)
+        u = table_coordinate(sample(voxels.values, x, y, z), optics)
+        out[k, 3] = max(mean_optics(u, u, optics)[3], 0.0) if u >= 0.0 else 0.0
+
+
+@kernel("Light f8:2 f8:2 i8:1 i8:1 f8:1 f8:1 f8:2", LIT, parallel=True, fastmath=FLAGS, error_model="numpy")
+def _shade(
+    light: Light,
+    normals: np.ndarray,
+    moments: np.ndarray,
+    first: np.ndarray,
+    last: np.ndarray,
+    half: np.ndarray,
+    step: np.ndarray,
+    out: np.ndarray,
+) -> None:
+    """Sums over rows ``first[k]`` to ``last[k]`` of ``moments`` (n, 17) into ``out`` (k, 16 + lights).
+
+    Weight (what is seen), times n n^T (xx, xy, xz, yy, yz, zz), colour where it is open, colour without what depends on
+    the view, times n, and what arrives of each light. ``normals`` (n, 3) at the rows' centroids; ``half``, ``step``
+    (3,) of `Scene`.
+    """
+    for k in nb.prange(len(first)):
+        row = out[k]
+        row[:] = 0.0
+        mass = seen = 0.0
+        for m in range(first[k], last[k]):
+            mass += moments[m, MASS]
+            seen += moments[m, SEEN]
+        shift = SEEN if seen > SEEN_LITTLE * mass else MASS
+        color = SEEN_RED if seen > SEEN_LITTLE * mass else RED
+        for m in range(first[k], last[k]):
+            cell = moments[m]
+            w = cell[shift]
+            if not w > 0.0:
+                continue
+            x = (cell[X] / cell[MASS] + half[0]) / step[0] - 0.5
+            y = (cell[Y] / cell[MASS] + half[1]) / step[1] - 0.5
+            z = (cell[Z] / cell[MASS] + half[2]) / step[2] - 0.5
+            n0, n1, n2 = normals[m, 0], normals[m, 1], normals[m, 2]
+            open_ = openness(light, x, y, z)
+            factor = open_ * (light.ambient + light.diffuse * fixed_diffuse(light, n0, n1, n2, x, y, z))
+            row[0] += w
+            row[1] += w * n0 * n0
+            row[2] += w * n0 * n1
+            row[3] += w * n0 * n2
+            row[4] += w * n1 * n1
+            row[5] += w * n1 * n2
+            row[6] += w * n2 * n2
+            for c in range(3):
+                row[7 + c] += open_ * cell[color + c]
+                row[10 + c] += factor * cell[color + c]
+            row[13] += w * n0
+            row[14] += w * n1
+            row[15] += w * n2
+            for which in range(light.directions.shape[0]):
+                row[16 + which] += w * arrives(light, which, x, y, z)
+
+
+@dataclass(frozen=True)
+class Shading:
+    """What the colours of cells under light follow from, wherever the volume's values are.
+
+    Attributes:
+        light: as kernels take it.
+        half, step: (3,) of the volume, as `Scene` has them.
+        normals: unit normals (n, 3) at points (n, 3) of the box frame, zeros where there is no gradient.
+    """
+
+    light: Light
+    half: np.ndarray
+    step: np.ndarray
+    normals: Callable[[np.ndarray], np.ndarray]
+
+    @classmethod
+    def of(cls, scene: Scene) -> Shading | None:
+        """Of a scene in memory; None where nothing is lit."""
+        if scene.light is None:
+            return None
+        return cls(scene.light, scene.half, scene.step, lambda points: at_points(scene, points)[:, :3])
+
+    def lit(self, gaussians: Gaussians, tree: Tree, leaves: Leaves, degree: int, base: np.ndarray) -> Gaussians:
+        """Gaussians of ``leaves`` with the colours of their cells, harmonics up to ``degree``.
+
+        ``base`` (n, 3): normals at the centroids of the tree's base cells.
+        """
+        inside = leaves.node >= 0  # others lie below the tree's base: a row of their own
+        sums = np.empty((len(leaves), ARRIVING + len(self.light.directions)))
+        sums[inside] = self.sums(tree.moments, base, *_base_rows(tree, leaves.node[inside]))
+        below = leaves.moments[~inside]
+        if len(below):
+            sums[~inside] = self.sums(below, self.normals(centroids(below)))
+        return _colored(gaussians, self.light, sums, degree)
+
+    def alone(self, gaussians: Gaussians, degree: int) -> Gaussians:
+        """Gaussians with their own colours under the light, as it is at their centres."""
+        rows = _rows(gaussians.means)
+        rows[:, COLOR] = rows[:, SEEN_COLOR] = gaussians.colors
+        return _colored(gaussians, self.light, self.sums(rows, self.normals(rows[:, FIRST])), degree)
+
+    def sums(
+        self, rows: np.ndarray, normals: np.ndarray, first: np.ndarray | None = None, last: np.ndarray | None = None
+    ) -> np.ndarray:
+        """`_shade` of each row, or of the rows from ``first`` to ``last``, over the weight: means (k, 16 + lights)."""
+        if first is None or last is None:
+            first, last = np.arange(len(rows)), np.arange(1, len(rows) + 1)
+        out = np.empty((len(first), ARRIVING + len(self.light.directions)))
+        _shade(
+            self.light,
+            np.ascontiguousarray(normals),
+            np.ascontiguousarray(rows),
+            first,
+            last,
+            self.half,
+            self.step,
+            out,
+        )
+        out /= np.maximum(out[:, :1], np.finfo(np.float64).tiny)
+        return out
+
+
+def centroids(moments: np.ndarray) -> np.ndarray:
+    """(n, 3) of rows of moments, box frame."""
+    result: np.ndarray = moments[:, FIRST] / moments[:, [MASS]]
+    return result
+
+
+def at_points(scene: Scene, points: np.ndarray) -> np.ndarray:
+    """Normals and extinction (n, 4) of `point_normals` at points (n, 3) of the box frame."""
+    out = np.empty((len(points), 4))
+    point_normals(
+        scene.voxels, scene.optics, scene.step, np.ascontiguousarray((points + scene.half) / scene.step - 0.5), out
+    )
+    return out
+
+
+def normal_points(gaussians: Gaussians) -> np.ndarray:
+    """(7 K, 3) points for `mean_normals`, box frame: each centre, and those a standard deviation along the axes."""
+    axes = rotations(gaussians.quaternions.astype(np.float64))  # columns
+    arms = (axes * np.exp(gaussians.log_scales.astype(np.float64))[:, None, :]).transpose(0, 2, 1)  # (K, 3, 3)
+    arms = np.concatenate([np.zeros_like(arms[:, :1]), arms, -arms], axis=1)
+    found: np.ndarray = (gaussians.means[:, None, :] + arms).reshape(-1, 3)
+    return found
+
+
+def mean_normals(points: np.ndarray, found: np.ndarray, half: np.ndarray) -> np.ndarray:
+    """(K, 3) unit directions of the mean gradient of the optical mass around Gaussians, box frame; zeros for none.
+
+    Args:
+        points: (7 K, 3) of `normal_points`; the mean over each seven is weighted by the extinction there.
+        found: (7 K, 4) normals and extinction at them.
+        half: (3,) half extents of the box: beyond it nothing counts.
+    """
+    inside = (np.abs(points) < half).all(axis=1)
+    weight = np.where(inside, found[:, 3], 0)
+    weight[::7] = np.maximum(weight[::7], 1e-12)  # where there is nothing, the direction at the centre
+    mean = (weight[:, None] * found[:, :3]).reshape(-1, 7, 3).sum(axis=1) / weight.reshape(-1, 7).sum(axis=1)[:, None]
+    length = np.linalg.norm(mean, axis=1, keepdims=True)
+    result: np.ndarray = np.where(length > 1e-3, mean / np.where(length > 1e-3, length, 1), 0)
+    return result
+
+
+def _rows(points: np.ndarray) -> np.ndarray:
+    """Rows of moments (n, 17) of mass 1 at points (n, 3), black."""
+    rows = np.zeros((len(points), COLUMNS))
+    rows[:, [MASS, SEEN]] = 1
+    rows[:, FIRST] = points
+    return rows
+
+
+def _base_rows(tree: Tree, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """First and last + 1 of the base cells, in Morton order, within ``nodes`` (k,) of a tree."""
+    first, last = nodes, nodes
+    while (inner := tree.children[first] > 0).any():
+        down = tree.first[last] + tree.children[last] - 1
+        first, last = np.where(inner, tree.first[first], first), np.where(inner, down, last)
+    return first, last + 1
+
+
+def _colored(gaussians: Gaussians, light: Light, out: np.ndarray, degree: int) -> Gaussians:
+    """Gaussians with the colours that the means ``out`` (K, 16 + lights) of `Shading.sums` stand for."""
+    colors, terms = out[:, FIXED].copy(), np.zeros((len(out), HARMONICS[degree], 3))
+    normals = symmetric(out[:, NORMALS])
+    white = np.ones((1, 3))
+    if light.head:
+        for tint, factor, power in ((out[:, TINT], light.diffuse, 1.0), (white, light.specular, light.power)):
+            mean, across = even(normals, power, degree)
+            colors += factor * mean[:, None] * tint
+            if degree >= 2:
+                terms[:, 3:8] += factor * across[:, :, None] * tint[:, None, :]
+    if light.specular > 0 and len(light.directions):
+        mean, all_terms = highlights(normals, light.directions, out[:, ARRIVING:], light.power, degree)
+        colors += light.specular * mean[:, None]
+        terms += light.specular * all_terms[:, :, None]
+    return replace(gaussians, colors=np.clip(colors, 0, BRIGHTEST), harmonics=terms if degree else None)
+
+
+def symmetric(columns: np.ndarray) -> np.ndarray:
+    """(n, 3, 3) of xx, xy, xz, yy, yz, zz (n, 6)."""
+    return columns[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+
+
+def even(normals: np.ndarray, power: float, degree: int) -> tuple[np.ndarray, np.ndarray]:
+    """Mean over directions (n,) and coefficients of degree 2 (n, 5) of the mean of abs(n . d)^power.
+
+    ``normals`` (n, 3, 3) are means of n n^T, of a trace below 1 where some have no normal.
+    """
+    trace = np.trace(normals, axis1=1, axis2=2)
+    if degree < 2:
+        return trace * 2 / (power + 2), np.zeros((len(normals), 5))
+    at_zero, square = 48 * np.array([[1 / 6, -1 / 4], [-1 / 4, 1 / 2]]) @ [1 / (power + 2), 1 / (power + 4)]
+    m = square * (normals - trace[:, None, None] * np.eye(3) / 3)
+    across = [
+        2 * m[:, 0, 1] / C2[0], -2 * m[:, 1, 2] / C2[0], m[:, 2, 2] / 2 / C2[1], -2 * m[:, 0, 2] / C2[0],
+        (m[:, 0, 0] - m[:, 1, 1]) / 2 / C2[2],
+    ]  # fmt: skip
+    return trace * (at_zero + square / 3), np.stack(across, axis=1)
+
+
+def highlights(
+    normals: np.ndarray, directions: np.ndarray, arriving: np.ndarray, power: float, degree: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean over directions (n,) and coefficients (n, M) of the highlights of lights at infinity.
+
+    Args:
+        normals: (n, 3, 3) means of n n^T.
+        directions: (lights, 3) towards them; ``arriving`` (n, lights) what arrives.
+        power: of abs(n . h).
+        degree: of the harmonics.
+    """
+    eyes = sphere(AROUND)  # directions that cameras look along
+    projected = np.concatenate([np.full((AROUND, 1), SH_C0), basis(eyes, degree)], axis=1) * (4 * np.pi / AROUND)
+    half = directions[:, None, :] - eyes
+    half /= np.maximum(np.linalg.norm(half, axis=2, keepdims=True), 1e-9)
+    found = np.zeros((len(normals), 1 + HARMONICS[degree]))
+    for start in range(0, len(normals), CHUNK):
+        part = slice(start, start + CHUNK)
+        main = np.linalg.eigh(normals[part])[1][:, :, 2]
+        trace = np.trace(normals[part], axis1=1, axis2=2)
+        for k in range(len(directions)):
+            weight = (trace * arriving[part, k])[:, None]
+            found[part] += weight * (np.minimum(np.abs(main @ half[k].T), 1) ** power @ projected)
+    return found[:, 0] * SH_C0, found[:, 1:]

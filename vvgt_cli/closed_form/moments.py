@@ -1,0 +1,210 @@
+"""Optical moments of base cells: a streaming reduction of the volume, brick by brick.
+
+A base cell is a box of ``2^e`` voxels along each axis (e may be negative). Its moments are integrals of the extinction
+``tau(trilinear(scalar))`` by midpoint quadrature, each point averaged over the scalar's spread within its own box
+(so that a step function needs no finer points).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from vvgt_cli.closed_form.columns import MASS, MOMENTS
+from vvgt_cli.closed_form.pyramid import morton_codes
+from vvgt_cli.closed_form.quadrature import block_moments, compact
+from vvgt_cli.dvr.layout import BRICK, Optics, Texels, Voxels
+from vvgt_cli.dvr.scene import Scene
+
+FINEST_CUT = -4
+WIDE = 3  # exponent of cells whose voxels get one point of quadrature in place of eight
+CHUNK_CELLS, CHUNK_BLOCKS = 1 << 17, 16  # cells of the dense scratch buffer; blocks at least
+MOST_CELLS = 32  # along the edge of a block that is made a cube of cells
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Base cells with extinction, in Morton order.
+
+    Attributes:
+        index: (n, 3) int32 cell indices (x, y, z) from the box's corner.
+        moments: (n, 13) float64 integrals of tau over the cell by `columns` (unit-frame lengths: the mass is an area).
+        edge: (3,) cell edge in unit-frame lengths (x, y, z).
+        exponent: (3,) int cell edge in voxels = 2^exponent.
+        normals: (n, 3) float64 at their centroids, where light asks for them and the volume is not in memory.
+    """
+
+    index: np.ndarray
+    moments: np.ndarray
+    edge: np.ndarray
+    exponent: np.ndarray
+    normals: np.ndarray | None = None
+
+
+def exponents(step: np.ndarray, level: int) -> np.ndarray:
+    """Per-axis exponents of cells of about ``2^level`` x the finest voxel edge, as cubic as powers of two allow.
+
+    No voxel is cut into more than ``2^-FINEST_CUT`` along an axis: trilinear matter has nothing to show below that.
+    """
+    target = float(step.min()) * 2.0**level
+    return np.maximum(np.round(np.log2(target / step)), FINEST_CUT).astype(np.int64)
+
+
+def morton(index: np.ndarray) -> np.ndarray:
+    """(n, 3) cell indices below 2^21 -> (n,) uint64 Morton codes, x lowest."""
+    out = np.empty(len(index), np.uint64)
+    morton_codes(np.ascontiguousarray(index, np.int32), out)
+    return out
+
+
+def points_of(exponent: np.ndarray) -> int:
+    """Points of quadrature a voxel and axis: of wide cells one, which is quicker and less exact."""
+    return 1 if int(exponent.min()) >= WIDE else 2
+
+
+def base_cells(
+    scene: Scene,
+    exponent: np.ndarray,
+    points_per_voxel: int | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Cells:
+    """Moments of every base cell with extinction (see `Cells`); memory is that of the result plus a fixed scratch.
+
+    ``progress`` is told the share that is done.
+    """
+    block, _ = blocks(exponent)
+    origins = _active_blocks(scene, block)
+    points = points_per_voxel or points_of(exponent)
+    index, moments = region_cells(Region.whole(scene), origins, exponent, points, progress)
+    return Cells(index, moments, 2.0**exponent * scene.step, exponent)
+
+
+@dataclass(frozen=True)
+class Region:
+    """Voxels of a volume, or of a part of it with a margin of one voxel towards the rest.
+
+    Attributes:
+        voxels, optics: as kernels take them.
+        half, step: (3,) of the whole volume, as `Scene` has them.
+        begin: (3,) float64 voxel of the whole volume that ``voxels`` begin with, (x, y, z).
+        texels: of an optics grid.
+    """
+
+    voxels: Voxels
+    optics: Optics
+    half: np.ndarray
+    step: np.ndarray
+    begin: np.ndarray
+    texels: Texels | None = None
+
+    @classmethod
+    def whole(cls, scene: Scene) -> Region:
+        """All of a scene."""
+        texels = None if scene.grid is None else scene.texels
+        return cls(scene.voxels, scene.optics, np.asarray(scene.half), np.asarray(scene.step), np.zeros(3), texels)
+
+
+def region_cells(
+    region: Region,
+    origins: np.ndarray,
+    exponent: np.ndarray,
+    points_per_voxel: int,
+    progress: Callable[[float], None] | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Cells with extinction in the blocks of `blocks` at ``origins`` (n, 3), voxels (x, y, z) of the whole volume.
+
+    Returns:
+        Indices (m, 3) int32 and moments (m, 13), as in `Cells`: the same bytes whatever part of the volume is there.
+    """
+    cell = 2.0**exponent
+    block, cells = blocks(exponent)
+    points = np.maximum(np.round(cell * points_per_voxel), min(points_per_voxel, 2)).astype(np.int64)
+    origins = origins[np.argsort(morton(origins // block))]
+    chunk = max(int(CHUNK_CELLS // cells.prod()), CHUNK_BLOCKS)
+    scratch = np.empty((min(chunk, max(len(origins), 1)), *cells[::-1], MOMENTS))
+    order = np.argsort(morton(np.argwhere(np.ones(cells[::-1]))[:, ::-1]))
+    moments, index = [np.empty((0, MOMENTS))], [np.empty((0, 3), np.int32)]
+    for first in range(0, len(origins), chunk):
+        part = origins[first : first + chunk]
+        dense = scratch[: len(part)]
+        at = part - region.begin
+        _integrate(region, at, points, cell, dense)
+        counts = np.count_nonzero(dense[..., MASS].reshape(len(part), -1), axis=1)
+        rows, local = np.empty((counts.sum(), MOMENTS)), np.empty((counts.sum(), 3), np.int32)
+        compact(dense, order, np.cumsum(counts) - counts, rows, local)
+        moments.append(rows)
+        index.append(local + np.repeat(np.round(part / cell).astype(np.int32), counts, axis=0))
+        if progress:
+            progress(min(first + chunk, len(origins)) / len(origins))
+    del scratch
+    return in_order(np.concatenate(index), moments)
+
+
+def _integrate(region: Region, at: np.ndarray, points: np.ndarray, cell: np.ndarray, out: np.ndarray) -> None:
+    """`block_moments` by the kernel of the region's kind."""
+    if region.texels is None:
+        block_moments(
+            region.voxels, region.optics, at, points, cell, region.half, region.step, region.begin, out
+        )  # fmt: skip
+    else:
+        from vvgt_cli.closed_form.grid import grid_moments  # loaded for what needs it only
+
+        grid_moments(region.texels, at, points, cell, region.half, region.step, region.begin, out)
+
+
+def blocks(exponent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Edges of a block in voxels and in cells, (3,): as many cells along each axis, where that is not too many.
+
+    Such blocks, taken in Morton order, leave cells in Morton order.
+    """
+    cell = 2.0**exponent
+    cells = np.round(np.maximum(BRICK, cell) / cell).astype(np.int64)
+    if cells.max() <= MOST_CELLS:
+        cells[:] = cells.max()
+    return np.round(cells * cell).astype(np.int64), cells
+
+
+def in_order(index: np.ndarray, parts: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Indices (n, 3) and the rows of ``parts`` in Morton order; parts are let go of as they are laid in their place."""
+    codes = morton(index)
+    moments, done = np.empty((len(index), MOMENTS)), 0
+    order = None if (codes[1:] > codes[:-1]).all() else np.argsort(codes, kind="stable")
+    place = np.empty_like(order) if order is not None else None
+    if order is not None and place is not None:
+        place[order] = np.arange(len(order))
+    parts.reverse()
+    while parts:
+        part = parts.pop()
+        here = slice(done, done + len(part))
+        moments[here if place is None else place[here]] = part
+        done += len(part)
+    return index if order is None else index[order], moments
+
+
+# offsets (x, y, z) of a cell's children, x fastest
+CHILDREN = np.array([(x, y, z) for z in (0, 1) for y in (0, 1) for x in (0, 1)], np.int32)
+
+
+def cell_moments(scene: Scene, corners: np.ndarray, edge: np.ndarray, points_per_voxel: int = 2) -> np.ndarray:
+    """Moments (n, 8, 13) of the children of cells of ``edge`` (3,) voxels, ``corners`` (n, 3) voxels from the box's."""
+    child = edge / 2
+    points = np.maximum(np.round(child * points_per_voxel), 2).astype(np.int64)
+    out = np.empty((len(corners), 2, 2, 2, MOMENTS))
+    at = np.ascontiguousarray(corners, np.float64)
+    _integrate(Region.whole(scene), at, points, child, out)
+    return out.reshape(len(corners), 8, MOMENTS)
+
+
+def _active_blocks(scene: Scene, block: np.ndarray) -> np.ndarray:
+    """Origins (n, 3) in voxels (x, y, z) of the blocks that hold a brick with extinction, in (z, y, x) order."""
+    mask = scene.empty == 0
+    for axis in range(3):  # a block's first half voxel interpolates with the brick before it
+        ahead = [slice(None)] * 3
+        behind = [slice(None)] * 3
+        ahead[axis], behind[axis] = slice(1, None), slice(None, -1)
+        mask[tuple(ahead)] |= mask[tuple(behind)].copy()
+    bricks = np.argwhere(mask)[:, ::-1]  # (x, y, z)
+    result: np.ndarray = np.unique((bricks * BRICK // block)[:, ::-1], axis=0)[:, ::-1] * block
+    return result

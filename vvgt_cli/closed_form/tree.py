@@ -1,0 +1,258 @@
+"""The dyadic pyramid of optical moments (Haar scaling coefficients) and the choice of its cells for a budget."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from vvgt_cli.closed_form.columns import BLUE, COLUMNS, FIRST, GREEN, MASS, RED, SECOND
+from vvgt_cli.closed_form.moments import CHILDREN, Cells, cell_moments, morton
+from vvgt_cli.closed_form.pyramid import score_splits, sum_children, take_base
+from vvgt_cli.closed_form.visibility import Visibility
+from vvgt_cli.dvr.scene import Scene
+
+HIDDEN = 1e-3  # cells that no view sees with more transmittance are dropped
+
+
+@dataclass(frozen=True)
+class Tree:
+    """Every cell of every scale that holds extinction some view sees; base cells first, the root last.
+
+    Attributes:
+        moments: (n, 17) float64 by `columns`: the 13 of `Cells`, then the same cells' seen mass and colour.
+        largest: (n,) float64 largest transmittance over the views.
+        index: (n, 3) int32 cell indices (x, y, z) from the box's corner, in cells of the row's own size.
+        edge: (n, 3) float64 cell edges, unit-frame lengths.
+        first: (n,) int64 first child of each cell; children are contiguous.
+        children: (n,) int64 number of children, 0 for base cells.
+        parent: (n,) int64, the root its own.
+    """
+
+    moments: np.ndarray
+    largest: np.ndarray
+    index: np.ndarray
+    edge: np.ndarray
+    first: np.ndarray
+    children: np.ndarray
+    parent: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.largest)
+
+
+def build_tree(cells: Cells, seen: Visibility, step: np.ndarray, levels: int | None = None) -> Tree:
+    """Sum moments upwards, eight (or fewer) cells at a time; ``step`` is the voxel edge in the unit frame (3,).
+
+    To the first cell that holds all of them, or so many ``levels``.
+    """
+    through = seen.at(cells.index, cells.edge / step)
+    keep = shown(cells, seen, step)
+    return pyramid(
+        cells.index[keep],
+        cells.edge,
+        lambda moments, top: take_base(cells.moments, keep, through, moments, top),
+        levels,
+    )
+
+
+def shown(cells: Cells, seen: Visibility, step: np.ndarray) -> np.ndarray:
+    """Rows (n,) int64 of the cells that some view sees: the base of their tree."""
+    return np.flatnonzero(seen.at(cells.index, cells.edge / step)[:, 1] > HIDDEN)
+
+
+def pyramid(
+    base: np.ndarray, base_edge: np.ndarray, fill: Callable[[np.ndarray, np.ndarray], None], levels: int | None = None
+) -> Tree:
+    """The tree over cells ``base`` (n, 3) in Morton order, of edges ``base_edge`` (3,).
+
+    ``fill`` is given their moments (n, 17) and largest transmittance (n,) to write.
+    """
+    codes = [morton(base)]
+    starts: list[np.ndarray] = []
+    while len(codes[-1]) > 1 if levels is None else len(codes[-1]) > 0 and len(starts) < levels:
+        above = codes[-1] >> np.uint64(3)
+        starts.append(np.flatnonzero(np.concatenate([[True], above[1:] != above[:-1]])))
+        codes.append(above[starts[-1]])
+    counts = [len(code) for code in codes]
+    total = sum(counts)
+    moments, top = np.empty((total, COLUMNS)), np.empty(total)
+    index, edge, parent = np.empty((total, 3), np.int32), np.empty((total, 3)), np.empty(total, np.int64)
+    first, children = np.zeros(total, np.int64), np.zeros(total, np.int64)
+    fill(moments[: counts[0]], top[: counts[0]])
+    edge[: counts[0]] = base_edge
+    index[: counts[0]] = base
+    offset = 0
+    for level, start in enumerate(starts):
+        here = slice(offset, offset + counts[level])
+        up = slice(here.stop, here.stop + counts[level + 1])
+        sum_children(moments[here], top[here], start, moments[up], top[up])
+        edge[up] = base_edge * 2.0 ** (level + 1)
+        index[up] = index[here][start] >> 1
+        first[up] = offset + start
+        children[up] = np.diff(np.append(start, counts[level]))
+        parent[here] = up.start + np.repeat(np.arange(counts[level + 1]), children[up])
+        offset = here.stop
+    parent[offset:] = np.arange(offset, total)
+    return Tree(moments, top, index, edge, first, children, parent)
+
+
+def central(moments: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mass (n,), centroid (n, 3) and covariance (n, 3, 3) of rows of moments."""
+    mass = moments[:, MASS]
+    mean = moments[:, FIRST] / mass[:, None]
+    second = moments[:, SECOND] / mass[:, None]
+    cov = np.empty((len(moments), 3, 3))
+    for column, (i, j) in enumerate([(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]):
+        cov[:, i, j] = cov[:, j, i] = second[:, column] - mean[:, i] * mean[:, j]
+    return mass, mean, cov
+
+
+def split_score(tree: Tree) -> np.ndarray:
+    """(n,) what a cell's spread costs the image: saturated mass x visibility x variance."""
+    score = np.empty(len(tree))
+    score_splits(tree.moments, tree.largest, tree.edge, score)
+    return score
+
+
+def select(tree: Tree, budget: int, score: np.ndarray | None = None) -> np.ndarray:
+    """At most ``budget`` cells that cover the scene: split while the score is above a threshold found by bisection.
+
+    Returns ids into the tree, ascending. A cell is split only where all above it are.
+    """
+    if not len(tree) or budget < 1:
+        return np.empty(0, np.int64)
+    capped = cap_by_ancestors(tree, split_score(tree) if score is None else score)
+    above = capped[tree.parent]
+    above[-1] = np.inf  # the root is there at any threshold
+    inner = tree.children > 0
+    # cells at threshold t: those whose parent is split, minus those split themselves; only large scores can matter
+    split_scores = capped[inner]
+    kept = min(len(split_scores), budget)  # every split adds a cell, or replaces one by an only child
+    while True:
+        floor = np.partition(split_scores, len(split_scores) - kept)[len(split_scores) - kept] if kept else np.inf
+        exits, entries = np.sort(split_scores[split_scores >= floor]), np.sort(above[above >= floor])
+        if kept == len(split_scores) or _cells_above(entries, exits, floor) > budget:
+            break
+        kept = min(2 * kept, len(split_scores))
+    thresholds = np.unique(exits)
+    low, high = -1, len(thresholds) - 1  # at thresholds[high] nothing but the root is left
+    while high - low > 1:
+        middle = (low + high) // 2
+        fits = _cells_above(entries, exits, thresholds[middle]) <= budget
+        low, high = (low, middle) if fits else (middle, high)
+    threshold = thresholds[high] if len(thresholds) else -np.inf  # the root alone
+    if high == 0 and len(thresholds) and len(tree) - inner.sum() <= budget:
+        threshold = -np.inf  # even all base cells fit
+    return np.flatnonzero((above > threshold) & ((capped <= threshold) | ~inner))
+
+
+def _cells_above(entries: np.ndarray, exits: np.ndarray, threshold: float) -> int:
+    """Number of cells when all with a score above ``threshold`` are split (both arrays ascending)."""
+    exist = len(entries) - np.searchsorted(entries, threshold, "right")
+    return int(exist - (len(exits) - np.searchsorted(exits, threshold, "right")))
+
+
+def cap_by_ancestors(tree: Tree, score: np.ndarray) -> np.ndarray:
+    """Each cell's score, lowered to the smallest above it."""
+    capped = score.copy()
+    end = len(tree) - 1
+    level = np.array([end])
+    while len(level):
+        inner = level[tree.children[level] > 0]
+        if not len(inner):
+            break
+        lo, hi = tree.first[inner[0]], tree.first[inner[-1]] + tree.children[inner[-1]]
+        level = np.arange(lo, hi)  # a level is contiguous
+        capped[lo:hi] = np.minimum(capped[lo:hi], capped[tree.parent[lo:hi]])
+    return capped
+
+
+@dataclass(frozen=True)
+class Leaves:
+    """Cells that become Gaussians, one each: rows of a tree, or cells below its base.
+
+    Attributes:
+        moments: (k, 17), as in `Tree`.
+        index: (k, 3) int32, as in `Tree`.
+        edge: (k, 3) float64, as in `Tree`.
+        node: (k,) int64 row of the tree, -1 below its base.
+    """
+
+    moments: np.ndarray
+    index: np.ndarray
+    edge: np.ndarray
+    node: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.node)
+
+    def take(self, which: np.ndarray) -> Leaves:
+        return Leaves(self.moments[which], self.index[which], self.edge[which], self.node[which])
+
+
+def leaves_of(tree: Tree, ids: np.ndarray) -> Leaves:
+    """The rows ``ids`` of a tree."""
+    return Leaves(tree.moments[ids], tree.index[ids], tree.edge[ids], ids)
+
+
+def split(tree: Tree, leaves: Leaves, order: np.ndarray, room: int, scene: Scene | None, seen: Visibility) -> Leaves:
+    """Replace leaves by their children, in the given order, until ``room`` more leaves are there.
+
+    Children come from the tree, or are integrated below its base from a volume that is there. Leaves without visible
+    children stay.
+    """
+    order = order[: max(room, 0)]  # every split but that of an only child's parent adds one or more
+    inside = (leaves.node[order] >= 0) & (tree.children[np.maximum(leaves.node[order], 0)] > 0)
+    counts = np.zeros(len(order), np.int64)
+    counts[inside] = tree.children[leaves.node[order[inside]]]
+    below = np.flatnonzero(~inside)
+    if len(below) and scene is not None:
+        # integrate no more than can be used: most have at least three visible children
+        below = below[: np.searchsorted(np.cumsum(np.where(inside, counts - 1, 2)), room, "right") + 1]
+        owner, grown = _children_below(leaves.take(order[below]), scene, seen)
+        counts[below] = np.bincount(owner, minlength=len(below))
+    else:
+        below = below[:0]
+    splits = np.flatnonzero(counts > 0)
+    splits = splits[: np.searchsorted(np.cumsum(counts[splits] - 1), room, "right")]
+    parts = []
+    if len(below):
+        parts.append(grown.take(np.flatnonzero(np.isin(below[owner], splits))))
+    nodes = leaves.node[order[splits[inside[splits]]]]
+    many = tree.children[nodes]
+    offsets = np.arange(many.sum()) - np.repeat(np.cumsum(many) - many, many)
+    parts.append(leaves_of(tree, np.repeat(tree.first[nodes], many) + offsets))
+    kept = np.ones(len(leaves), bool)
+    kept[order[splits]] = False
+    parts.insert(0, leaves.take(np.flatnonzero(kept)))
+    fields = ("moments", "index", "edge", "node")
+    return Leaves(*(np.concatenate([getattr(part, field) for part in parts]) for field in fields))
+
+
+def _children_below(leaves: Leaves, scene: Scene, seen: Visibility) -> tuple[np.ndarray, Leaves]:
+    """Visible children of cells at or below a tree's base: their parents (n,), ascending, and themselves."""
+    step = np.asarray(scene.step)
+    owners, found = [], []
+    for edge in np.unique(leaves.edge, axis=0):
+        chosen = np.flatnonzero((leaves.edge == edge).all(axis=1))
+        moments = cell_moments(scene, leaves.index[chosen] * (edge / step), edge / step)  # (n, 8, 13)
+        index = 2 * leaves.index[chosen][:, None, :] + CHILDREN  # (n, 8, 3)
+        through = seen.at(index.reshape(-1, 3), edge / 2 / step).reshape(-1, 8, 2)
+        keep = (moments[..., MASS] > 0) & (through[..., 1] > HIDDEN)
+        rows = with_visible(moments[keep], through[keep, 0])
+        owners.append(np.repeat(chosen, keep.sum(axis=1)))
+        found.append(
+            Leaves(rows, index[keep], np.broadcast_to(edge / 2, (len(rows), 3)), np.full(len(rows), -1, np.int64))
+        )
+    owner = np.concatenate(owners)
+    fields = ("moments", "index", "edge", "node")
+    together = Leaves(*(np.concatenate([getattr(part, field) for part in found]) for field in fields))
+    order = np.argsort(owner, kind="stable")
+    return owner[order], together.take(order)
+
+
+def with_visible(moments: np.ndarray, mean: np.ndarray) -> np.ndarray:
+    """Moments (n, 13) and mean transmittance (n,) -> (n, 17) with the seen mass and colour."""
+    return np.concatenate([moments, moments[:, [MASS, RED, GREEN, BLUE]] * mean[:, None]], axis=1)

@@ -1,0 +1,218 @@
+"""`evaluate`: a `.ply` against the volume it was made from, on the test views, and from every seat."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field, replace
+from typing import TYPE_CHECKING, Any, BinaryIO
+
+import numpy as np
+
+from vvgt_cli.cameras import default_views
+from vvgt_cli.cameras.sets import SIZE
+from vvgt_cli.conversion.gaussian_files import STDIN, file_rule, open_gaussians
+from vvgt_cli.conversion.place import into_box, preview, upright
+from vvgt_cli.errors import UsageError
+from vvgt_cli.field.source import Source, SourceRequest, describe_source, load, tf_record, volume_record
+from vvgt_cli.gaussians import Gaussians, PlyHeader
+from vvgt_cli.gaussians.outputs import Output, check_outputs
+from vvgt_cli.gaussians.rules import Rule
+from vvgt_cli.images.metrics.texture import Texture
+from vvgt_cli.jit.ahead import EVALUATE, for_degree
+from vvgt_cli.look.lighting import LightOptions
+from vvgt_cli.progress import Console
+from vvgt_cli.score.record import ConversionReport, Run, StageRecord, document
+from vvgt_cli.score.viewing import (
+    CLOSE,
+    ViewingCondition,
+    condition_views,
+    score_conditions,
+    score_texture,
+    texture_note,
+    viewing_conditions,
+    zoomed,
+)
+from vvgt_cli.score.views import psnr_note, score_test_views
+
+if TYPE_CHECKING:
+    from vvgt_cli.dvr import Scene
+
+PICTURED = 4  # test view of the preview: from the side
+MIDDLE = 200  # pixels along the edge of what the reference's own error is measured on
+
+
+@dataclass(frozen=True)
+class EvaluateRequest:
+    """What to score.
+
+    Attributes:
+        ply: Gaussians, "-" for standard input, or a stream of them.
+        source: the volume and the function that they were made from.
+        size: pixels along an image's edge; None: what the file is made for.
+        rule: of `vvgt_cli.gaussians.rules` to draw by; None: the file's.
+        step: of the reference, in voxels.
+        seats: score every rule at several sizes and close up as well, and texture on smooth areas.
+        preview: PNG to write (reference, ours, difference of a test view and of a close-up), None for none.
+        overwrite: replace it if it exists.
+    """
+
+    ply: str | BinaryIO
+    source: SourceRequest
+    size: int | None = None
+    rule: str | None = None
+    step: float = 0.125
+    seats: bool = True
+    preview: str | None = None
+    overwrite: bool = False
+
+    def inputs(self) -> list[str]:
+        """Files that are read."""
+        return [*self.source.paths(), *([self.ply] if isinstance(self.ply, str) else [])]
+
+
+@dataclass
+class Evaluation:
+    """Scores and seats, with what they were measured on; `to_json` is documented in docs/report.md."""
+
+    gaussians: int
+    size: int
+    rule: str
+    step: float
+    views: int
+    volume: dict[str, Any]
+    transfer_function: dict[str, Any]
+    reference_psnr: float
+    scores: dict[str, Any] = field(default_factory=dict)
+    seats: list[dict[str, Any]] = field(default_factory=list)
+    texture: dict[str, Any] | None = None
+    stages: list[StageRecord] = field(default_factory=list)
+    seconds: float = 0.0
+
+    def to_json(self) -> str:
+        """JSON with machine and versions."""
+        return document("vvgt-evaluation", asdict(self))
+
+    def table(self) -> str:
+        """The scores, a row a number, then the seats by PSNR, worst first."""
+        lines = [f"made for {self.size} px, drawn as {self.rule}"]
+        for key, value in self.scores.items():
+            if key != "per_view":
+                lines.append(f"{key.replace('_', ' '):<24}{_cell(value):>12}")
+        lines.append(f"reference against a finer one: PSNR {self.reference_psnr:.2f} dB (middle of the first view)")
+        if self.texture is not None:
+            lines.append(f"texture on smooth areas, near: {texture_note(Texture(**self.texture))}")
+        if self.seats:
+            lines.append(f"\n{'seat':<32}{'psnr':>10}")
+        lines += [f"{ViewingCondition(**seat).name():<32}{seat['psnr']:>10.2f}" for seat in self.seats]
+        return "\n".join(lines) + "\n"
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.4f}" if isinstance(value, float) else str(value)
+
+
+def _load(request: SourceRequest, header: PlyHeader) -> Source:
+    """The source, with the file's own anatomical space, light and unit distance where none is asked for."""
+    asked = request.light
+    source = _load_dark(replace(request, light=LightOptions()), header)
+    preset = source.lighting if header.version is None else header.light
+    return replace(source, lighting=asked.lighting(preset, source.volume.space))
+
+
+def _load_dark(request: SourceRequest, header: PlyHeader) -> Source:
+    if request.read.space is None and header.space == "LPS":
+        request = replace(request, read=replace(request.read, space="LPS"))
+    if request.unit_distance is not None or header.unit_distance is None:
+        return load(request)
+    source = load(replace(request, unit_distance=repr(header.unit_distance)))
+    return replace(source, unit_label=f"{header.unit_distance_label}, as the .ply records")
+
+
+def evaluate(request: EvaluateRequest, console: Console | None = None) -> Evaluation:
+    """Score a `.ply` against its volume.
+
+    Raises:
+        UsageError, DataError: inputs that are not what they must be.
+    """
+    from vvgt_cli.dvr import REFERENCE
+    from vvgt_cli.images import write_png
+
+    if request.ply == STDIN == request.source.volume:
+        raise UsageError("both OUT.ply and --volume are '-': standard input holds one of them")
+    run = Run(console or Console(), ConversionReport("evaluate"))
+    if request.preview:
+        check_outputs([Output("--preview", request.preview, (".png",))], request.inputs(), request.overwrite)
+    with run.stage("read") as stage:
+        gaussians, header = open_gaussians(request.ply)
+        source = _load(request.source, header)
+        gaussians = into_box(gaussians, source.volume)
+        stage.note = f"{len(gaussians)} Gaussians; {describe_source(source)}"
+    if header.affine is not None and not np.allclose(header.affine, source.volume.affine[:3].ravel(), rtol=1e-6):
+        run.console.say(f"{request.ply}: its header's affine is not that of {source.volume.name}: of another volume?")
+    if header.optics is not None and header.optics != source.optics():
+        run.console.say(
+            f"{request.ply}: made under other labels, functions or layers than {source.name}, as its header says "
+            f"({header.optics}, not {source.optics() or 'scalars'})"
+        )
+    run.compile(source.kernels(for_degree(EVALUATE, gaussians.degree)), source.kernel_type())
+    with run.stage("scene"):
+        scene = source.scene()
+    size, rule = request.size or header.made_for or SIZE, file_rule(header, request.rule)
+    with run.stage("reference") as stage:
+        own = _reference_psnr(scene, size, request.step)
+        stage.note = f"its own error {own:.1f} dB"
+    evaluation = Evaluation(
+        len(gaussians), size, rule.name, request.step, len(default_views("test")), volume_record(source),
+        tf_record(source, request.source), own,
+    )  # fmt: skip
+    with run.stage("test views") as stage:
+        settings = replace(REFERENCE, step=request.step)
+        bar = run.console.bar("test views")
+        scores = score_test_views(scene, gaussians, size, settings, rule=rule, progress=bar)
+        evaluation.scores = asdict(scores)
+        stage.note = f"{psnr_note(scores)}, {size} px"
+    if request.preview:
+        with run.stage("preview"):
+            camera = default_views("test", size=size)[PICTURED]
+            axes = upright(source.volume, header.up)
+            sheet = preview(scene, gaussians, [camera, zoomed(camera, CLOSE)], axes, rule)
+            write_png(request.preview, sheet, request.overwrite)
+    if request.seats:
+        _look_around(run, evaluation, scene, gaussians, rule)
+    evaluation.stages = run.report.stages
+    evaluation.seconds = run.finish().seconds
+    return evaluation
+
+
+def _look_around(run: Run, evaluation: Evaluation, scene: Scene, gaussians: Gaussians, rule: Rule) -> None:
+    """Seats, and texture from near."""
+    size = evaluation.size
+    with run.stage("seats") as stage:
+        seats = score_conditions(
+            gaussians, condition_views(scene, viewing_conditions(size), progress=run.console.bar("seats"))
+        )
+        evaluation.seats = [asdict(seat) for seat in seats]
+        stage.note = f"worst: {seats[0].name()}, {seats[0].psnr:.2f} dB"
+    with run.stage("texture") as stage:
+        found = score_texture(scene, gaussians, size, rule, progress=run.console.bar("texture"))
+        evaluation.texture = asdict(found)
+        stage.note = texture_note(found)
+
+
+def _reference_psnr(scene: Scene, size: int, step: float) -> float:
+    """PSNR of the reference against half its step and twice its rays along a pixel's edge.
+
+    Measured on the middle of the first test view: the whole of it would cost as much as eight views.
+    """
+    from vvgt_cli.dvr import REFERENCE, render_view
+    from vvgt_cli.images.metrics import score_view
+
+    whole = default_views("test", size=size)[0]
+    edge = min(size // 2, MIDDLE)
+    offset = (size - edge) // 2
+    middle = replace(whole, cx=whole.cx - offset, cy=whole.cy - offset, width=edge, height=edge)
+    settings = replace(REFERENCE, step=step)
+    finer = replace(settings, step=settings.step / 2, tiers=tuple((edge, 4 * rays) for edge, rays in settings.tiers))
+    images = [render_view(scene, middle, s) for s in (finer, settings)]
+    return score_view(images[0], images[1], perceptual=False).psnr

@@ -1,0 +1,147 @@
+"""What a file holds, for `vvgt info`."""
+
+from __future__ import annotations
+
+import io
+import os
+import sys
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from vvgt_cli.cameras.files import read_cameras
+from vvgt_cli.conversion.gaussian_files import STDIN
+from vvgt_cli.errors import DataError
+from vvgt_cli.files import seekable
+from vvgt_cli.gaussians import describe, read_ply
+from vvgt_cli.gaussians.formats import format_of, read_splats
+from vvgt_cli.look.label_files import holds_table, is_table, read_labels, segments_of
+from vvgt_cli.look.labels import LabelTable
+from vvgt_cli.look.readers import SUFFIXES
+from vvgt_cli.volume import ReadOptions
+from vvgt_cli.volume.packed import Packed
+from vvgt_cli.volume.space import axis_facts
+
+_PLY = (b"ply\n", b"ply\r")
+_HEAD = 65536  # bytes that tell a view set from a transfer function
+
+
+def inspect(file: str, read: ReadOptions) -> dict[str, Any]:
+    """Facts about a volume, a transfer function, a view set or a `.ply`, by key; the first key is "kind".
+
+    Raises:
+        DataError, UsageError: as the reader of that kind.
+    """
+    if file == STDIN and _head_of_stdin().startswith(_PLY):
+        return {"kind": "gaussians", "name": "standard input", **describe(*read_ply(sys.stdin.buffer))}
+    if not os.path.exists(file) and os.path.isfile(file.rpartition("#")[0]):  # a preset of several
+        return _transfer_function(file)
+    path = seekable(file)
+    if not os.path.isfile(path):  # standard input, example:NAME, a folder, a glob, FILE:/array, or nothing
+        return _volume(file, read)
+    name = Path(file)
+    with path.open("rb") as stream:
+        head = stream.read(_HEAD)
+    known = format_of(name)
+    if head.startswith(_PLY) or known:
+        facts = {"kind": "gaussians", "name": name.name, **describe(*read_splats(file))}
+        return facts | ({"bytes": path.stat().st_size, "format": known.suffix} if known else {})
+    if is_table(name):
+        return _table(file)
+    if name.suffix.lower() in SUFFIXES or head.lstrip()[:1] in (b"{", b"["):
+        if b'"frames"' in head:
+            return _views(name)
+        return _transfer_function(file)
+    return _volume(file, read)
+
+
+def _head_of_stdin() -> bytes:
+    """First bytes of standard input, left to be read."""
+    stream = sys.stdin.buffer
+    return stream.peek(4) if isinstance(stream, io.BufferedReader) else b""
+
+
+def _views(path: Path) -> dict[str, Any]:
+    cameras = read_cameras(path)
+    first = cameras[0]
+    return {
+        "kind": "views",
+        "name": path.name,
+        "views": len(cameras),
+        "sizes": sorted({f"{c.width} x {c.height}" for c in cameras}),
+        "focal": [first.fx, first.fy],
+        "distance": [
+            min(float((c.position**2).sum() ** 0.5) for c in cameras),
+            max(float((c.position**2).sum() ** 0.5) for c in cameras),
+        ],
+    }
+
+
+def _transfer_function(file: str) -> dict[str, Any]:
+    from vvgt_cli.look import read_transfer_function
+
+    tf = read_transfer_function(file)
+    lo, hi = tf.node_range()
+    facts: dict[str, Any] = {"kind": "transfer function", "name": tf.name, "nodes": [lo, hi]}
+    if tf.opacity_unit_distance is not None:
+        facts["opacity_per"] = f"{tf.opacity_unit_distance:g} ({tf.opacity_unit_label})"
+    if tf.lighting is not None:
+        facts["light"] = tf.lighting.text()
+    return facts
+
+
+def _table(file: str) -> dict[str, Any]:
+    table = read_labels(file)
+    return {"kind": "table of labels", "name": table.name, "labels": len(table.labels), "entries": _entries(table)}
+
+
+def _entries(table: LabelTable) -> list[dict[str, Any]]:
+    return [{"label": e.number, "name": e.name, "color": e.color, "opacity": e.opacity} for e in table.labels]
+
+
+def _volume(file: str, read: ReadOptions) -> dict[str, Any]:
+    from vvgt_cli.field.layered import open_parts
+    from vvgt_cli.look import unit_distance
+    from vvgt_cli.volume import statistics
+    from vvgt_cli.volume.label_maps import recognised
+
+    content = open_parts(file, replace(read, packed=True))
+    volume = content.volumes[0]
+    kinds: dict[str, Any] = {}
+    if content.color:
+        kinds["colors"] = "RGBA"[: len(content.volumes)]
+    elif content.overlapping:
+        kinds["segment_layers"] = len(content.volumes)
+    elif len(content.volumes) > 1:
+        kinds["channels"] = len(content.volumes)
+    elif not isinstance(volume.data, Packed) and recognised(volume):
+        kinds["label_map"] = True
+    if holds_table(content.path) and not content.overlapping:
+        kinds["label_map"] = True
+        with suppress(DataError):  # a header that says less of its segments than colours need
+            one = content.layer
+            kinds["segments"] = _entries(read_labels(file) if one is None else segments_of(file, one))
+    numbers = statistics(volume)
+    return {
+        "kind": "volume",
+        "name": volume.name,
+        **kinds,
+        "dims": volume.dims,
+        "dtype": volume.data.dtype.name,
+        "byte_order": sys.byteorder
+        if volume.data.dtype.isnative
+        else {"little": "big", "big": "little"}[sys.byteorder],
+        "bytes": volume.data.nbytes,
+        "spacing": volume.spacing,
+        "origin": volume.origin,
+        "direction": volume.direction,
+        "space": volume.space or "none",
+        **axis_facts(volume.affine, volume.space),
+        "extent": volume.extent,
+        "scaling": [volume.slope, volume.intercept],
+        "range": [numbers.lo, numbers.hi],
+        "nan": numbers.nan_count,
+        "inf": numbers.inf_count,
+        "unit_distance": {name: unit_distance(name, volume, None)[0] for name in ("paraview", "mean-spacing")},
+    }

@@ -1,0 +1,297 @@
+"""The ladder of `report`: one scene by ever dearer means, each run timed on its own and scored on the same views."""
+
+from __future__ import annotations
+
+import io
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vvgt_cli.cameras import Camera, default_views
+from vvgt_cli.cameras.blocks import Blocks, spread_blocks
+from vvgt_cli.cameras.boxed import render_in_box
+from vvgt_cli.conversion.convert import convert
+from vvgt_cli.conversion.plan import DEFAULT_STEPS
+from vvgt_cli.conversion.request import ConvertRequest, FitOptions
+from vvgt_cli.conversion.stages.refinement import refine
+from vvgt_cli.conversion.stages.views import TrainingViews, views_of
+from vvgt_cli.field.source import SourceRequest, load
+from vvgt_cli.field.workload import view_edge
+from vvgt_cli.gaussians import Gaussians, as_stored, read_ply, write_ply
+from vvgt_cli.gaussians.frames import transform
+from vvgt_cli.gaussians.rules import INRIA
+from vvgt_cli.progress import Console
+from vvgt_cli.refine import OptimizeOptions
+from vvgt_cli.score.checks import Views, judging_views
+from vvgt_cli.score.curves import short
+from vvgt_cli.score.record import ConversionReport, Run
+from vvgt_cli.score.viewing import SIDE, ConditionView, condition_views, from_above, score_conditions
+from vvgt_cli.score.views import WHOLE, score_seen
+
+if TYPE_CHECKING:
+    from vvgt_cli.dvr import Scene
+    from vvgt_cli.images.metrics import Scores
+
+SHARES = (64, 16, 4)  # of the budget, for the closed form at several K
+STARTS = 2  # of the budget, what the baselines begin with: they grow
+FAINT = 0.1  # opacity of 3DGS' first points
+PICTURED = (0, 4)  # test views on the page: from above, from the side
+NEIGHBOURS = 0.72  # mean distance to the three nearest of n random points, over (volume / n)^(1/3)
+
+
+@dataclass(frozen=True)
+class LadderOptions:
+    """Which rungs there are.
+
+    Attributes:
+        max_gaussians: largest budget K.
+        size: pixels along the edge of the screen that files are made for and scored on.
+        steps: of gradient descent, a rung each; the baselines take as many as the longest.
+        model: folder or name of an exported network, None for none.
+        seed: of whatever draws random numbers.
+    """
+
+    max_gaussians: int = 100_000
+    size: int = 1080
+    steps: tuple[int, ...] = (25, DEFAULT_STEPS, 200, 400)
+    model: str | None = None
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Rung:
+    """One way of making the file.
+
+    Attributes:
+        name: for tables; ``label`` for charts.
+        kind: one of `vvgt_cli.score.curves.KINDS`.
+        fit: of a conversion, and what the others take their sizes from.
+        start: of the baselines: "points" (random in the box) or "samples" (of what the function shows).
+    """
+
+    name: str
+    label: str
+    kind: str
+    fit: FitOptions
+    start: str | None = None
+
+
+def rungs(options: LadderOptions) -> list[Rung]:
+    """From the cheapest on, then the baselines."""
+    most, size, seed = options.max_gaussians, options.size, options.seed
+    budgets = sorted({max(most // share, 1) for share in SHARES} | {most})
+    found = [
+        Rung(f"closed form, K = {short(k)}", short(k), "closed form", FitOptions(k, size, seed=seed, steps=0))
+        for k in budgets
+    ]
+    if options.model:
+        fit = FitOptions(most, size, seed=seed, steps=0, model=options.model)
+        found.append(Rung(f"network {Path(options.model).name}", "network", "network", fit))
+    for steps in sorted(set(options.steps)):
+        fit = FitOptions(most, size, seed=seed, steps=steps)
+        found.append(Rung(f"{steps} steps", f"{steps} steps", "steps", fit))
+    most_steps = max(options.steps, default=0)
+    longest = FitOptions(most, size, seed=seed, steps=most_steps)
+    if most_steps:
+        for name, start in (("3DGS", "points"), ("iVR-GS setting", "samples")):
+            found.append(Rung(f"{name}, {most_steps} steps", name, "baseline", longest, start))
+    return found
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What every rung is scored against: test views, rendered once and in no rung's time.
+
+    Attributes:
+        cameras: of the views; ``blocks`` of each that are scored, None for all of it.
+        images: (h, w, 4) float32 each; of those that are not in `WHOLE` only the blocks are drawn.
+        step: voxels; ``rays`` a pixel, at most.
+        axes: (3, 3) `Volume.axes`: from the box frame, in which the views are, to the unit frame.
+        shown: images as `upright` makes them.
+        seats: what is seen from the size made for, and from the next larger.
+    """
+
+    cameras: list[Camera]
+    blocks: list[Blocks | None]
+    images: list[np.ndarray]
+    step: float
+    rays: int
+    axes: np.ndarray
+    shown: list[np.ndarray]
+    seats: list[ConditionView]
+
+    @classmethod
+    def render(cls, scene: Scene, size: int, console: Console) -> Reference:
+        """The test views as `vvgt evaluate` has them."""
+        from vvgt_cli.dvr import REFERENCE, render_view
+
+        cameras, axes = default_views("test", size=size), scene.volume.axes
+        blocks = [spread_blocks(size, size, i) for i in range(len(cameras))]
+        images, bar = [], console.bar("reference")
+        for i, camera in enumerate(cameras):
+            images.append(render_view(scene, camera, REFERENCE, _drawn(blocks, i)))
+            if bar:
+                bar(i + 1, len(cameras))
+        shown = upright(images, cameras, axes, lambda camera: render_view(scene, camera, REFERENCE))
+        seats = list(condition_views(scene, from_above(size), REFERENCE, views=SIDE))
+        rays = max(rays for _, rays in REFERENCE.tiers)
+        return cls(cameras, blocks, images, REFERENCE.step, rays, axes, shown, seats)
+
+    def score(self, gaussians: Gaussians) -> tuple[Scores, list[np.ndarray]]:
+        """Scores as `vvgt evaluate` has them, and our images."""
+        from vvgt_cli.images.metrics import mean_scores
+        from vvgt_cli.splat import render
+
+        ours, scores = [], []
+        for i, camera in enumerate(self.cameras):
+            drawn = _drawn(self.blocks, i)
+            ours.append(render(gaussians, camera, blocks=drawn))
+            scores.append(score_seen(self.images[i], ours[i], self.blocks[i], drawn is None))
+        return mean_scores(scores), ours
+
+
+def _drawn(blocks: Sequence[Blocks | None], view: int) -> Blocks | None:
+    """What of a test view is drawn."""
+    return None if view in WHOLE else blocks[view]
+
+
+def upright(
+    images: np.ndarray | Sequence[np.ndarray],
+    cameras: Sequence[Camera],
+    axes: np.ndarray,
+    draw: Callable[[Camera], np.ndarray],
+) -> list[np.ndarray]:
+    """Images of the box frame for people: those of `PICTURED` drawn anew in the unit frame, where that is another."""
+    if np.array_equal(axes, np.eye(3)):
+        return list(images)
+    see = render_in_box(draw, axes)
+    return [see(cameras[n]) if n in PICTURED else image for n, image in enumerate(images)]
+
+
+def run_rungs(
+    source: SourceRequest, options: LadderOptions, reference: Reference, console: Console
+) -> Iterator[tuple[dict[str, Any], list[np.ndarray]]]:
+    """Each rung's run (a dict, see `vvgt_cli.score.curves`) and its pictures of the reference's views.
+
+    Raises:
+        DataError, UsageError: as `vvgt_cli.conversion.convert.convert`.
+        KeyboardInterrupt: a refinement was interrupted; what came after it would not be comparable.
+    """
+    from vvgt_cli.splat import render
+
+    for rung in rungs(options):
+        report, gaussians = _run(source, rung, reference.axes)
+        if report.refinement and report.refinement["reason"] == "interrupted":
+            raise KeyboardInterrupt
+        scores, images = reference.score(gaussians)
+        seats = score_conditions(gaussians, reference.seats)
+        report.scores, report.seats = asdict(scores), [asdict(seat) for seat in seats]
+        run = {"name": rung.name, "label": rung.label, "kind": rung.kind, "views": _views_of(report, rung.fit)}
+        run |= asdict(report)
+        yield run, upright(images, reference.cameras, reference.axes, partial(render, gaussians))
+
+
+def warm_up(source: SourceRequest, options: LadderOptions) -> None:
+    """Run every kind of rung once at next to no size: kernels are compiled or loaded before any clock starts."""
+    few = LadderOptions(100, 64, (2,) if options.steps else (), options.model, options.seed)
+    for rung in rungs(few)[-4:]:
+        _run(source, rung, np.eye(3))
+
+
+def _run(source: SourceRequest, rung: Rung, axes: np.ndarray) -> tuple[ConversionReport, Gaussians]:
+    """What became of it, Gaussians in the box frame; ``axes`` as `Reference` has them."""
+    if rung.kind == "baseline":
+        return _baseline(source, rung)
+    with tempfile.TemporaryDirectory() as folder:
+        path = str(Path(folder) / "rung.ply")
+        report = convert(ConvertRequest(source, path, rung.fit, up="none"), Console(quiet=True))
+        return report, transform(read_ply(path)[0], np.linalg.inv(axes))
+
+
+def _begin(source: SourceRequest, rung: Rung) -> tuple[Run, Scene]:
+    run = Run(Console(quiet=True), ConversionReport("report", options=asdict(rung.fit)))
+    with run.stage("read"):
+        loaded = load(source)
+    with run.stage("scene"):
+        scene = loaded.scene()
+    return run, scene
+
+
+def _views_of(report: ConversionReport, fit: FitOptions) -> int:
+    """Training views that there were: those of gradient descent, or else of the plan."""
+    if report.refinement:
+        return int(report.refinement["views"])
+    if report.plan is None:
+        return views_of(fit.steps or 0, small=False)
+    return sum(stage["count"] for stage in report.plan["stages"] if stage["name"] == TrainingViews.name)
+
+
+def _views(run: Run, scene: Scene, fit: FitOptions) -> tuple[Views, Views]:
+    from vvgt_cli.dvr import RenderSettings, render_views
+
+    train = default_views("train", views_of(fit.steps or 0, small=False), size=view_edge(fit.size, small=False))
+    with run.stage("check views"):
+        judges = judging_views(scene, default_views("check", size=fit.size), RenderSettings())
+    with run.stage("views"):
+        return Views(train, render_views(scene, train)), judges
+
+
+def _finish(run: Run, gaussians: Gaussians) -> tuple[ConversionReport, Gaussians]:
+    stored = as_stored(gaussians)
+    with run.stage("write"):
+        run.report.bytes = write_ply(io.BytesIO(), stored)
+    run.report.gaussians = len(stored)
+    return run.finish(), stored
+
+
+def _baseline(source: SourceRequest, rung: Rung) -> tuple[ConversionReport, Gaussians]:
+    """3DGS (Kerbl et al. 2023): its loss, rates and density control, from random points or samples of the volume."""
+    from vvgt_cli.closed_form import VbmOptions, initialise
+
+    run, scene = _begin(source, rung)
+    fit = rung.fit
+    count = max(fit.max_gaussians // STARTS, 1)
+    with run.stage("samples"):
+        if rung.start == "points":
+            start = random_points(scene.half, count, fit.seed)
+        else:
+            start = initialise(scene, VbmOptions(count, fit.size, "uniform", fit.seed)).gaussians
+    train, check = _views(run, scene, fit)
+    options = OptimizeOptions.of(
+        "3dgs", steps=fit.steps, max_gaussians=fit.max_gaussians, seed=fit.seed,
+        rule=INRIA.at(train.cameras[0].width / fit.size), judge=INRIA,
+    )  # fmt: skip
+    return _finish(run, refine(run, start, train, check, options))
+
+
+def random_points(half: np.ndarray, count: int, seed: int) -> Gaussians:
+    """What 3DGS begins with where it has no points: ``count`` anywhere in the box, of any colour, round and faint.
+
+    Sizes are the mean distance to the three nearest points; ``half`` (3,) are the box's half extents.
+    """
+    rng = np.random.default_rng(seed)
+    scale = NEIGHBOURS * (8 * float(np.prod(half)) / count) ** (1 / 3)
+    return Gaussians(
+        rng.uniform(-1, 1, (count, 3)) * half,
+        np.full((count, 3), np.log(scale)),
+        np.tile([1.0, 0, 0, 0], (count, 1)),
+        np.full(count, np.log(FAINT / (1 - FAINT))),
+        rng.random((count, 3)),
+    )
+
+
+def pictures(images: Sequence[np.ndarray] | np.ndarray, numbers: Sequence[int], limit: int) -> list[np.ndarray]:
+    """RGB over black of some views, (h, w, 3) in [0, 1], averaged over squares of pixels to sides of ``limit``."""
+    found = []
+    for n in numbers:
+        image = np.clip(images[n][..., :3], 0, 1)
+        factor = -(-max(image.shape[:2]) // limit)
+        height, width = (side // factor for side in image.shape[:2])
+        squares = image[: height * factor, : width * factor].reshape(height, factor, width, factor, 3)
+        found.append(squares.mean(axis=(1, 3)))
+    return found

@@ -1,0 +1,372 @@
+"""`render-views`: calibrated views of a volume that trainers can use, resumable and in parts."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vvgt_cli.cameras import Camera, default_views, orbit_views
+from vvgt_cli.cameras.boxed import render_in_box
+from vvgt_cli.cameras.files import read_frames
+from vvgt_cli.cameras.sets import FIELD_OF_VIEW, RADIUS, SET_VIEWS, SIZE
+from vvgt_cli.commands.view_files import CONTACT, Layout, View, field_points, start_points, thumbnails
+from vvgt_cli.commands.views_in_blocks import draw_in_blocks, fields_of
+from vvgt_cli.conversion.manifest import Manifest, Shard
+from vvgt_cli.errors import DataError, NothingVisible, UsageError
+from vvgt_cli.field.blocked import Blocked
+from vvgt_cli.field.digests import cameras_digest, volume_digest
+from vvgt_cli.field.settings import BlockOptions
+from vvgt_cli.field.source import Source, SourceRequest, describe_source, load_all
+from vvgt_cli.files import atomic_write, claim
+from vvgt_cli.images import write_png
+from vvgt_cli.jit.ahead import VIEWS, for_blocks
+from vvgt_cli.progress import Console
+from vvgt_cli.score.record import ConversionReport, Run
+from vvgt_cli.version import VERSION
+from vvgt_cli.volume.space import shear_text
+from vvgt_cli.volume.types import IDENTITY
+
+if TYPE_CHECKING:
+    from vvgt_cli.dvr import Scene
+
+Draw = Callable[[Camera], np.ndarray]
+NO_POINTS = np.zeros((0, 3))
+
+SPHERE, ORBIT = "sphere", "orbit"
+
+
+@dataclass(frozen=True)
+class CameraRequest:
+    """Which views.
+
+    Attributes:
+        kind: ``sphere``, ``orbit`` or the path of a `transforms.json`.
+        views, test_views: their numbers; None: 24 and 10. With a file both come from it.
+        size: image height in pixels; None: the file's, or 400.
+        fov: vertical field of view in degrees, None: 40.
+        radius: distance from the centre, unit frame, None: 3.
+    """
+
+    kind: str = SPHERE
+    views: int | None = None
+    test_views: int | None = None
+    size: int | None = None
+    fov: float | None = None
+    radius: float | None = None
+
+    def make(self) -> list[View]:
+        """The views, those for training first.
+
+        Raises:
+            UsageError: options that a file of cameras decides, or no such file.
+            DataError: a file that is none, or views of one name.
+        """
+        if self.kind not in (SPHERE, ORBIT):
+            return self._read()
+        size, fov, radius = self.size or SIZE, self.fov or FIELD_OF_VIEW, self.radius or RADIUS
+        count = SET_VIEWS["train"] if self.views is None else self.views
+        if self.kind == SPHERE:
+            train = default_views("train", count, size=size, radius=radius, fov=fov)
+        else:
+            train = orbit_views(count, size=size, radius=radius, fov=fov)
+        kept = SET_VIEWS["test"] if self.test_views is None else self.test_views
+        test = default_views("test", kept, size=size, radius=radius, fov=fov)
+        return [View("train", camera) for camera in train] + [View("test", camera) for camera in test]
+
+    def _read(self) -> list[View]:
+        given = {
+            "--views": self.views, "--test-views": self.test_views, "--fov": self.fov, "--radius": self.radius
+        }  # fmt: skip
+        for option, value in given.items():
+            if value is not None:
+                raise UsageError(f"{option} {value}: with --cameras FILE the file says that; leave it out")
+        if not Path(self.kind).is_file():
+            raise UsageError(f"--cameras {self.kind}: no such file; expected sphere, orbit or a transforms.json")
+        views: dict[str, View] = {}
+        frames = read_frames(self.kind, self.size)
+        for frame in sorted(frames, key=lambda frame: frame.test):
+            # the Blender style names images without a suffix, so a dot would be read as one
+            name = re.sub(r"[^\w-]", "_", frame.camera.name)
+            if name in views:
+                raise DataError(
+                    f"{self.kind}: two views become {name!r}; expected names that differ in letters or digits"
+                )
+            views[name] = View("test" if frame.test else "train", replace(frame.camera, name=name))
+        if all(frame.test for frame in frames):
+            raise DataError(f"{self.kind}: every view is one for testing; expected some to train on")
+        return list(views.values())
+
+
+@dataclass(frozen=True)
+class ViewsRequest:
+    """A set of views for each of some functions.
+
+    Attributes:
+        source: what to read; its ``tf`` is not used.
+        tfs: transfer functions; none: one made from the histogram.
+        output: directory; with several functions each gets a directory of its name in it.
+        cameras: which views.
+        layout: which files.
+        renderer: ``cpu``, ``cuda`` or ``vtk``.
+        samples: rays along a pixel's edge everywhere, None: 5 or 13 where neighbours differ, else 1.
+        step: sampling distance in voxels.
+        shard: which part of the views to render.
+        overwrite: start afresh where another run's views are.
+        blocks: how the volume is gone through in blocks; None: it is in memory, or in blocks where that is better.
+    """
+
+    source: SourceRequest
+    tfs: tuple[str, ...]
+    output: str
+    cameras: CameraRequest = field(default_factory=CameraRequest)
+    layout: Layout = field(default_factory=Layout)
+    renderer: str = "cpu"
+    samples: int | None = None
+    step: float = 0.5
+    shard: Shard = field(default_factory=Shard)
+    overwrite: bool = False
+    blocks: BlockOptions | None = None
+
+    def folders(self) -> list[Path]:
+        """A folder a function.
+
+        Raises:
+            UsageError: two functions of one name, or a folder that cannot be made.
+        """
+        root = Path(self.output)
+        if root.exists() and not root.is_dir():
+            raise UsageError(f"-o {root}: is a file; expected a directory for the views")
+        if not root.parent.is_dir():
+            raise UsageError(f"-o {root}: no directory {root.parent}; make it first")
+        if len(self.tfs) < 2:
+            return [root]
+        names: dict[str, str] = {}
+        for tf in self.tfs:
+            name = function_name(tf)
+            if name in names:
+                raise UsageError(f"--tf {names[name]} and --tf {tf} would both go to {root / name}; rename one")
+            names[name] = tf
+        return [root / name for name in names]
+
+
+def function_name(tf: str) -> str:
+    """Folder of a function: its file's stem, `#Preset` and colour-map ranges with it, as plain characters."""
+    path, _, pick = tf.partition("#")
+    name = re.sub(r"\.json$", "", path.replace("\\", "/").rpartition("/")[2], flags=re.I)
+    return re.sub(r"[^\w.-]+", "_", f"{name}-{pick}" if pick else name).strip(".") or "function"
+
+
+@dataclass
+class _Job:
+    """One function's folder and what is to be done in it."""
+
+    source: Source
+    manifest: Manifest
+    pending: list[View]  # this part's
+    files: list[str]  # of the descriptions and models that this part writes
+    field: Blocked | None = None  # where the volume is not in memory
+
+    @property
+    def folder(self) -> Path:
+        return self.manifest.folder
+
+
+def render_view_sets(request: ViewsRequest, console: Console | None = None) -> int:
+    """Render what is missing; returns the number of views rendered.
+
+    Raises:
+        UsageError: a folder with another run's views or unknown files, or options that do not fit.
+        DataError: input that is not what it must be, or a function that shows nothing.
+    """
+    if request.overwrite and request.shard.count > 1:
+        raise UsageError(
+            "--overwrite with --shard: parts would remove each other's files; remove the directory instead"
+        )
+    if request.renderer == "vtk" and request.samples not in (None, 1):
+        raise UsageError(f"--samples {request.samples}: VTK shoots one ray a pixel; leave it out")
+    run = Run(console or Console(), ConversionReport("render-views"))
+    views, folders = request.cameras.make(), request.folders()
+    with ExitStack() as stack:
+        functions = dict(zip(folders, request.tfs or (None,), strict=True))
+        size = views[0].camera.height
+        fields = fields_of(run, request.source, request.blocks, functions, size, request.renderer, stack)
+        if fields is None:
+            with run.stage("read") as stage:
+                sources = load_all(request.source, request.tfs or (None,))
+                stage.note = describe_source(sources[0])
+        else:
+            sources = [field.source for field in fields]
+        volume = sources[0].volume
+        if volume.sheared:
+            raise DataError(
+                f"{volume.name}: {shear_text(volume.axes)}; expected right angles: no pinhole camera sees a sheared "
+                "volume; resample it first ('vvgt convert' takes it)"
+            )
+        lit = [source for source in sources if source.lighting is not None]
+        lit.sort(key=lambda source: source.lighting is not None and source.lighting.attenuated)
+        kernels = (lit or sources)[-1].kernels(VIEWS)
+        run.compile(kernels if fields is None else for_blocks(kernels), sources[0].kernel_type())
+        with run.stage("plan") as stage:
+            jobs = _plan(request, views, folders, sources, fields)
+            total = sum(len(job.pending) for job in jobs)
+            stage.note = f"{len(jobs) * len(views)} views, {total} to render here"
+        for job in jobs:
+            _work(run, request, job, views)
+            if job.field is not None:
+                job.field.do.parts.remove()
+    return total
+
+
+def _settings(request: ViewsRequest, views: Sequence[View], source: Source, content: str) -> dict[str, Any]:
+    """Everything that the files depend on; named as the command line names it."""
+    cameras = {split: [view.camera for view in views if view.split == split] for split in ("train", "test")}
+    sizes = dict.fromkeys(f"{view.camera.width} x {view.camera.height}" for view in views)
+    return {
+        "version": VERSION,
+        "volume": content,
+        "function": source.look(),
+        "opacity_unit_distance": source.unit_distance,
+        **({} if source.lighting is None else {"light": source.lighting.text()}),
+        "views": len(cameras["train"]),
+        "test_views": len(cameras["test"]),
+        "size": ", ".join(sizes),
+        "cameras": cameras_digest(cameras["train"] + cameras["test"]),
+        **({} if source.volume.direction == IDENTITY else {"direction": list(source.volume.direction)}),
+        "renderer": request.renderer,
+        "samples": 1 if request.renderer == "vtk" else request.samples or "adaptive",
+        "step": request.step,
+        "format": request.layout.format,
+        "half": request.layout.half,
+        "background": list(request.layout.background),
+        **({} if request.layout.points else {"points": False}),
+    }
+
+
+def _plan(
+    request: ViewsRequest, views: list[View], folders: list[Path], sources: list[Source], fields: list[Blocked] | None
+) -> list[_Job]:
+    """See in every folder what is there, before anything is written."""
+    content, layout = volume_digest(sources[0].volume), request.layout
+    first = request.shard.index == 1  # the first part describes the set
+    jobs = []
+    for i, (folder, source) in enumerate(zip(folders, sources, strict=True)):
+        manifest = Manifest(folder, _settings(request, views, source, content), request.shard)
+        files = [*layout.descriptions(views), *layout.model_names()]
+        planned = [name for view in views for name in layout.files(view)]
+        manifest.open([*planned, *files, CONTACT], request.overwrite)
+        mine = [view for j, view in enumerate(views) if request.shard.holds(i * len(views) + j)]
+        pending = [view for view in mine if not all(map(manifest.complete, layout.files(view)))]
+        missing = [name for name in files if first and not manifest.complete(name)]
+        jobs.append(_Job(source, manifest, pending, missing, None if fields is None else fields[i]))
+    return jobs
+
+
+def _work(run: Run, request: ViewsRequest, job: _Job, views: list[View]) -> None:
+    """Whatever is missing of one function's folder; nothing is written before all that may fail early has not."""
+    from vvgt_cli.dvr import RenderSettings
+    from vvgt_cli.dvr.backends import view_renderer
+
+    manifest, layout = job.manifest, request.layout
+    built = layout.descriptions(views)
+    models = any(name not in built for name in job.files)
+    settings = RenderSettings(request.step, request.samples)
+    draw: Draw | None = None
+    if job.field is not None:
+        draw = draw_in_blocks(job.field, settings, [view.camera for view in job.pending])
+    elif job.pending or models:
+        with run.stage("scene") as stage:
+            scene = job.source.scene()
+            stage.note = f"{job.source.name}, opacity per {job.source.unit_distance:g} ({job.source.unit_label})"
+        inside = view_renderer(request.renderer, scene, settings) if job.pending else None
+        draw = None if inside is None else render_in_box(inside, scene.volume.axes)
+    if models and layout.points:
+        built |= layout.models(views, *_points(run, job.field or scene, views))
+    elif models:
+        built |= layout.models(views, NO_POINTS, NO_POINTS)
+    for name in ("", *layout.folders(views)):
+        (job.folder / name).mkdir(parents=True, exist_ok=True)
+    with claim(job.folder / request.shard.manifest):
+        if job.files or not (job.folder / request.shard.manifest).exists():
+            manifest.record()  # first: it says whose the folder is
+            _write(manifest, {name: built[name] for name in job.files})
+        if job.pending and draw is not None:
+            _render(run, request, job, draw)
+        _contact(run, job, layout, views)
+
+
+def _points(run: Run, scene: Scene | Blocked, views: list[View]) -> tuple[np.ndarray, np.ndarray]:
+    """The cloud to start from: centres and colours, (n, 3) each."""
+    with run.stage("points") as stage:
+        size = views[0].camera.height
+        points, colors = field_points(scene, size) if isinstance(scene, Blocked) else start_points(scene, size)
+        if not len(points):
+            source = scene.source if isinstance(scene, Blocked) else scene
+            raise NothingVisible(source.volume.name, source.tf.name)
+        stage.note = f"{len(points)} points to start from"
+    return points, colors
+
+
+def _render(run: Run, request: ViewsRequest, job: _Job, draw: Draw) -> None:
+    _remove_leftovers(job, request.layout)
+    with run.stage("views") as stage:
+        bar = run.console.bar("views")
+        with ThreadPoolExecutor(1) as writer:  # compresses one view while the next is rendered
+            written: Future[list[str]] = writer.submit(list)
+            try:
+                for done, view in enumerate(job.pending, 1):
+                    image = draw(view.camera)
+                    job.manifest.record(written.result())
+                    written = writer.submit(request.layout.write, job.folder, view, image)
+                    if bar:
+                        bar(done, len(job.pending))
+            finally:
+                job.manifest.record(written.result())
+        camera = job.pending[0].camera
+        stage.note = f"{len(job.pending)} views of {camera.width} x {camera.height} px in {job.folder}"
+
+
+def _remove_leftovers(job: _Job, layout: Layout) -> None:
+    """Remove the temporary files of this part's views that a run killed outright has left."""
+    for path in (job.folder / name for view in job.pending for name in layout.files(view)):
+        for left in path.parent.glob(f".{path.stem}.{'[0-9a-f]' * 8}{path.suffix}"):
+            left.unlink(missing_ok=True)
+
+
+def _contact(run: Run, job: _Job, layout: Layout, views: list[View]) -> None:
+    """The contact sheet, once every part's views are there: whoever finds them all writes it."""
+    manifest = job.manifest
+    manifest.refresh()
+    names = [name for view in views for name in layout.files(view)]
+    if not all(manifest.complete(name, content=False) for name in names):
+        run.console.say(f"{job.folder}: other parts' views are missing; the part that completes them writes {CONTACT}")
+        return
+    if job.pending or not manifest.complete(CONTACT):
+        with run.stage("contact sheet"):
+            write_png(job.folder / CONTACT, thumbnails(job.folder, views, layout.background), overwrite=True)
+            manifest.record([CONTACT])
+
+
+def _write(manifest: Manifest, files: dict[str, bytes]) -> None:
+    for name, data in files.items():
+        with atomic_write(manifest.folder / name, overwrite=True) as temporary:
+            temporary.write_bytes(data)
+    manifest.record(files)
+
+
+def parse_shard(text: str) -> Shard:
+    """``I/N``, I from 1 to N.
+
+    Raises:
+        UsageError: anything else.
+    """
+    match = re.fullmatch(r"(\d{1,6})/(\d{1,6})", text)
+    if match is None or not 1 <= int(match[1]) <= int(match[2]):
+        raise UsageError(f"--shard {text}: expected I/N with I from 1 to N, as 3/8")
+    return Shard(int(match[1]), int(match[2]))

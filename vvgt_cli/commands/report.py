@@ -1,0 +1,189 @@
+"""`report`: the ladder of a scene as JSON, CSV, plots and a page; or several reports over each other."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vvgt_cli.commands.infer import SHIPPED
+from vvgt_cli.commands.ladder import PICTURED, LadderOptions, Reference, pictures, run_rungs, rungs, warm_up
+from vvgt_cli.errors import UsageError
+from vvgt_cli.field.source import SourceRequest, describe_source, load, tf_record, volume_record
+from vvgt_cli.gaussians.outputs import STDOUT, Output, check_outputs, write_text
+from vvgt_cli.network.card import find_model
+from vvgt_cli.progress import Console
+from vvgt_cli.score.curves import Series, cost, front, knee, psnr, read_series, table, unit_costs, worst_seat
+from vvgt_cli.score.page import Pictures, page
+from vvgt_cli.score.plots import FILES, write_plots
+from vvgt_cli.score.record import document
+from vvgt_cli.volume.blocks import check_memory
+
+PAGE, TABLE, DATA = "report.html", "report.csv", "report.json"
+VIEWS, VIEW_BYTES = 24, 16  # test views, ours and those shown; a pixel: float32 RGBA
+
+
+@dataclass(frozen=True)
+class ReportRequest:
+    """A ladder.
+
+    Attributes:
+        source: the scene.
+        output: folder to write to; made if it is not there.
+        ladder: which rungs there are.
+        picture_size: pixels along an edge that pictures on the page are averaged down to.
+        overwrite: replace files that exist.
+        command_line: what the user typed, for the page.
+    """
+
+    source: SourceRequest
+    output: str
+    ladder: LadderOptions = field(default_factory=LadderOptions)
+    picture_size: int = 400
+    overwrite: bool = False
+    command_line: str = ""
+
+
+def report(request: ReportRequest, console: Console | None = None) -> dict[str, Any]:
+    """Run the ladder and write `report.json`, `report.csv`, the plots and `report.html`; returns the JSON's content.
+
+    Raises:
+        UsageError: an output that may not be written, or standard input as the volume: every rung reads it anew.
+        DataError: input that is not what it must be.
+    """
+    console = console or Console()
+    if request.source.volume == STDOUT:
+        raise UsageError("VOLUME is '-': every run of the ladder reads it anew; expected a file")
+    folder = _folder(request.output, (DATA, TABLE, PAGE, *FILES), request.overwrite)
+    request = replace(request, ladder=_with_model(request.ladder))
+    size = request.ladder.size
+    check_memory(VIEWS * size**2 * VIEW_BYTES, f"--size {size}: test views and ours")
+    source = load(request.source)
+    console.say(describe_source(source))
+    warm_up(request.source, request.ladder)
+    reference = Reference.render(source.scene(), size, console)
+    runs, ours = [], []
+    total = len(rungs(request.ladder))
+    for run, images in run_rungs(request.source, request.ladder, reference, console):
+        runs.append(run)
+        ours.append(_pngs(pictures(images, PICTURED, request.picture_size)))
+        score = f"PSNR {psnr(run):.2f} dB, worst seat {worst_seat(run):.2f} dB"
+        megabytes = f"{run['gaussians']} Gaussians, {run['bytes'] / 1e6:.1f} MB"
+        console.stage(f"{len(runs)}/{total}", cost(run), f"{run['name']}: {score}, {megabytes}")
+    text = document("vvgt-report", _document(request, source, reference, runs))
+    found: dict[str, Any] = json.loads(text)
+    series = [Series(source.volume.name, runs, found)]
+    shown = _pngs(pictures(reference.shown, PICTURED, request.picture_size))
+    folder.mkdir(exist_ok=True)
+    write_text(str(folder / DATA), text, request.overwrite)
+    title = f"Error against run time: {source.volume.name}"
+    _write(folder, series, title, table(runs), Pictures(list(PICTURED), shown, ours), request.overwrite)
+    console.say(f"{folder / PAGE}")
+    return found
+
+
+def _with_model(ladder: LadderOptions) -> LadderOptions:
+    """The shipped network where none is named and one is there."""
+    if ladder.model is not None:
+        return ladder
+    try:
+        find_model(SHIPPED)
+    except UsageError:
+        return ladder
+    return replace(ladder, model=SHIPPED)
+
+
+def _document(request: ReportRequest, source: Any, reference: Reference, runs: list[dict[str, Any]]) -> dict[str, Any]:
+    best, bend = [run["name"] for run in front(runs)], knee(runs)
+    return {
+        "command_line": request.command_line,
+        "volume": volume_record(source),
+        "transfer_function": tf_record(source, request.source),
+        "options": asdict(request.ladder),
+        "reference": {
+            "views": len(reference.cameras), "size": request.ladder.size, "step": reference.step,
+            "rays": reference.rays,
+        },
+        "front": best,
+        "knee": bend["name"] if bend else None,
+        "unit_costs": unit_costs(runs),
+        "runs": [run | {"cost": cost(run)} for run in runs],
+    }  # fmt: skip
+
+
+def compare(paths: Sequence[str], output: str, overwrite: bool, console: Console | None = None) -> None:
+    """Several reports over each other: `report.csv`, the plots and `report.html`.
+
+    Args:
+        paths: `report.json` of `vvgt report`, or `--report` of `vvgt convert`.
+        output: folder to write to; made if it is not there.
+
+    Raises:
+        UsageError: fewer than two, or outputs that may not be written.
+        DataError: a file that is neither.
+    """
+    console = console or Console()
+    if len(paths) < 2:
+        raise UsageError(f"--compare: {len(paths)} report; expected two or more, as --compare A.json B.json")
+    folder = _folder(output, (TABLE, PAGE, *FILES), overwrite, paths)
+    series = _distinct([read_series(path) for path in paths])
+    rows = [run | {"name": f"{one.name}: {run['name']}"} for one in series for run in one.runs]
+    folder.mkdir(exist_ok=True)
+    _write(folder, series, "Error against run time, compared", table(rows), None, overwrite)
+    for one in series:
+        best = max(one.scored(), key=lambda run: psnr(run) or 0)
+        console.say(f"{one.name}: {len(one.runs)} runs, nearest {best['name']} with {psnr(best):.2f} dB")
+    console.say(f"{folder / PAGE}")
+
+
+def _distinct(series: list[Series]) -> list[Series]:
+    """Reports of one name get a number."""
+    names = [one.name for one in series]
+    return [
+        Series(one.name if names.count(one.name) == 1 else f"{one.name} ({n + 1})", one.runs, one.document)
+        for n, one in enumerate(series)
+    ]
+
+
+def _folder(output: str, names: Sequence[str], overwrite: bool, inputs: Sequence[str] = ()) -> Path:
+    """The folder, if all files may be written there."""
+    folder = Path(output)
+    if output == STDOUT:
+        raise UsageError("-o -: a report is a folder of files; expected a folder's name")
+    if folder.exists() and not folder.is_dir():
+        raise UsageError(f"-o {folder}: is a file; expected a folder's name")
+    if not folder.parent.is_dir():
+        raise UsageError(f"-o {folder}: the folder {folder.parent} does not exist; make it first")
+    if not os.access(folder if folder.is_dir() else folder.parent, os.W_OK):
+        raise UsageError(f"-o {folder}: may not be written to; expected a folder of yours")
+    if folder.is_dir():
+        check_outputs([Output("-o", str(folder / name)) for name in names], list(inputs), overwrite)
+    return folder
+
+
+def _pngs(images: Sequence[np.ndarray]) -> list[bytes]:
+    """8-bit PNG files of RGB images, as bytes."""
+    from vvgt_cli.images import write_png
+
+    found = []
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "view.png"
+        for image in images:
+            write_png(path, image, overwrite=True)
+            found.append(path.read_bytes())
+    return found
+
+
+def _write(folder: Path, series: list[Series], title: str, rows: str, shown: Pictures | None, overwrite: bool) -> None:
+    write_text(str(folder / TABLE), rows, overwrite)
+    write_plots(folder, series, overwrite)
+    write_text(str(folder / PAGE), page(series, title, shown), overwrite)
+
+
+__all__ = ["LadderOptions", "ReportRequest", "compare", "report"]

@@ -1,0 +1,182 @@
+"""`view`: Gaussians in a browser, from a server on this machine, or written as what others can open."""
+
+from __future__ import annotations
+
+import io
+import os
+import sys
+import time
+import webbrowser
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from pathlib import Path
+
+from vvgt_cli.commands.server import Part, Site, served
+from vvgt_cli.conversion.gaussian_files import STDIN, is_page, layout_of, open_gaussians, write_gaussians, write_page
+from vvgt_cli.conversion.readback import tell_agreement
+from vvgt_cli.errors import UsageError
+from vvgt_cli.field.source import SourceRequest
+from vvgt_cli.gaussians import Gaussians, PlyOptions, write_ply
+from vvgt_cli.gaussians.formats import SUFFIXES, is_splats
+from vvgt_cli.gaussians.formats.page_file import PROGRAM, asset, page, upright
+from vvgt_cli.gaussians.formats.splats import columns_of
+from vvgt_cli.gaussians.outputs import Output, claimed
+from vvgt_cli.jit.ahead import DRAW, for_degree
+from vvgt_cli.progress import Console
+from vvgt_cli.score.record import ConversionReport, Run
+from vvgt_cli.volume.slices import matching
+
+TICK = 0.2  # seconds within which Ctrl-C is answered
+
+
+@dataclass(frozen=True)
+class ViewRequest:
+    """What to show.
+
+    Attributes:
+        files: of Gaussians, or globs of them; several are a series. Or one volume.
+        source: how to read the volume, and its function; of files of Gaussians as it is by default.
+        output: file to write in place of showing, None for none.
+        port: of the server; 0 takes a free one.
+        browser: open one, where there is a display.
+        overwrite: replace the file if it exists.
+    """
+
+    files: tuple[str, ...]
+    source: SourceRequest
+    output: str | None = None
+    port: int = 0
+    browser: bool = True
+    overwrite: bool = False
+
+
+def view(request: ViewRequest, announce: Callable[[str], None], console: Console | None = None) -> None:
+    """Show Gaussians until an interrupt, or write them.
+
+    Args:
+        request: what and how.
+        announce: is told the page's URL, once it can be opened.
+        console: for talk.
+
+    Raises:
+        UsageError: several volumes, options of volumes with files of Gaussians, a port or an output that cannot be.
+        DataError: a file that is not what it must be.
+    """
+    run = Run(console or Console(), ConversionReport("view"))
+    files = expanded(request.files)
+    if request.output is None:
+        _serve(run, request, files, announce)
+        return
+    if len(files) > 1:
+        _join(run, request, files)
+        return
+    with claimed([Output("-o", request.output, SUFFIXES, splats=True)], files, request.overwrite):
+        gaussians, options = _opened(run, request, files[0])
+        write_gaussians(run, request.output, gaussians, options, request.overwrite)
+        run.compile(for_degree(DRAW, gaussians.degree))
+        tell_agreement(run, request.output, gaussians, options)
+
+
+def _join(run: Run, request: ViewRequest, files: Sequence[str]) -> None:
+    """Several files into one page."""
+    _only_gaussians(files)
+    _refuse_reading(request.source, files[0])
+    if request.output is None or not is_page(request.output):
+        raise UsageError(
+            f"-o {request.output} is of one file, got {len(files)}; expected a page (.html), which takes them all"
+        )
+    with claimed([Output("-o", request.output, (".html",), splats=True)], files, request.overwrite):
+        names = [Path(name).name for name in files]
+        if len(set(names)) < len(names):
+            names = list(files)
+        write_page(run, request.output, list(zip(names, files, strict=True)), request.overwrite)
+
+
+def _refuse_reading(given: SourceRequest, name: str) -> None:
+    """Options that are of volumes, with a file of Gaussians."""
+    plain = SourceRequest(given.volume)
+    if replace(given, volume=plain.volume, light=plain.light) != plain:
+        raise UsageError(
+            f"{name} holds Gaussians: --tf, --labels, --layer and options of reading are of volumes; leave them out"
+        )
+
+
+def _only_gaussians(files: Sequence[str]) -> None:
+    """Of several files."""
+    volumes = [name for name in files if name != STDIN and not is_splats(name)]
+    if len(files) > 1 and (volumes or STDIN in files):
+        raise UsageError(
+            f"{(volumes or [STDIN])[0]}: of several files expected all to hold Gaussians; convert it first"
+        )
+
+
+def expanded(names: Sequence[str]) -> list[str]:
+    """Files of names and globs; those of a glob by the numbers in their names.
+
+    Raises:
+        UsageError: a glob that matches nothing.
+    """
+    files: list[str] = []
+    for name in names:
+        found = [] if os.path.exists(name) or not set(name) & set("*?[") else [str(path) for path in matching(name)]
+        if not found and set(name) & set("*?[") and not os.path.exists(name):
+            raise UsageError(f"{name}: no such files; expected files of Gaussians ({', '.join(SUFFIXES)}), or a volume")
+        files += found if any(map(is_splats, found)) else [name]  # a glob may be a volume: slices
+    return files
+
+
+def _opened(run: Run, request: ViewRequest, name: str) -> tuple[Gaussians, PlyOptions]:
+    """Gaussians in the unit frame and how a file of them is laid out; a volume is converted."""
+    given = request.source
+    if name == STDIN or is_splats(name):
+        _refuse_reading(given, name)
+        gaussians, header = open_gaussians(name)
+        return gaussians, layout_of(header)
+    from vvgt_cli.conversion.convert import without_files
+    from vvgt_cli.conversion.request import ConvertRequest
+
+    conversion = without_files(ConvertRequest(replace(given, volume=name)), run.console)
+    return conversion.gaussians, conversion.ply
+
+
+def _stored(gaussians: Gaussians, options: PlyOptions) -> bytes:
+    stream = io.BytesIO()
+    write_ply(stream, gaussians, upright(options))
+    return stream.getvalue()
+
+
+def _serve(run: Run, request: ViewRequest, files: Sequence[str], announce: Callable[[str], None]) -> None:
+    _only_gaussians(files)
+    first = _stored(*_opened(run, request, files[0]))
+
+    @cache
+    def name_of(k: int) -> str:
+        return f"{k}.ply"
+
+    def content(k: int) -> bytes:
+        if k == 0:
+            return first
+        gaussians, header = open_gaussians(files[k])
+        return _stored(gaussians, layout_of(header))
+
+    frames = [{"name": Path(name).name, "file": name_of(k)} for k, name in enumerate(files)]
+    text = page(f"{frames[0]['name']} - vvgt", columns_of(first, files[0]), frames, '<script src="viewer.js"></script>')
+    parts = {
+        "": Part("text/html; charset=utf-8", lambda: text.encode("utf-8")),
+        "viewer.js": Part("text/javascript; charset=utf-8", lambda: asset(PROGRAM), packed=True),
+    }
+    parts |= {name_of(k): Part("application/octet-stream", partial(content, k)) for k in range(len(files))}
+    with served(Site(parts, run.console.say), request.port) as url:
+        announce(url)
+        opened = request.browser and display() and webbrowser.open(url)
+        run.console.say(f"{'shown in a browser' if opened else 'open this address in a browser'}; Ctrl-C ends")
+        with suppress(KeyboardInterrupt):
+            while True:
+                time.sleep(TICK)  # a signal may reach another thread, which wakes nobody here
+
+
+def display() -> bool:
+    """Whether a browser would have a screen: else `webbrowser` may start one of those for terminals."""
+    return sys.platform in ("darwin", "win32") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

@@ -1,0 +1,81 @@
+"""Views for trainers of a volume of which only blocks are in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vvgt_cli.cameras import Camera
+from vvgt_cli.cameras.boxed import boxed, render_in_box
+from vvgt_cli.commands.view_files import POINTS
+from vvgt_cli.errors import UsageError
+from vvgt_cli.field.blocked import Blocked
+from vvgt_cli.field.field import Picture
+from vvgt_cli.field.open import Wanted, automatic, beside, blocked
+from vvgt_cli.score.record import Run
+
+if TYPE_CHECKING:
+    from vvgt_cli.dvr import RenderSettings
+    from vvgt_cli.field.settings import BlockOptions
+    from vvgt_cli.field.source import SourceRequest
+
+TOGETHER = 1 << 24  # pixels of views that are made at once
+
+
+def fields_of(
+    run: Run,
+    source: SourceRequest,
+    options: BlockOptions | None,
+    functions: dict[Path, str | None],
+    size: int,
+    renderer: str,
+    stack: ExitStack,
+) -> list[Blocked] | None:
+    """A field in blocks for each function, None where the volume is read as a whole.
+
+    Args:
+        run: tells the console.
+        source: the volume; its ``tf`` is not used.
+        options: of blocks, None: as is better.
+        functions: of each folder.
+        size: pixels of a view's height.
+        renderer: that is asked for.
+        stack: what the fields are closed with.
+
+    Raises:
+        UsageError: a renderer that needs the volume in memory.
+    """
+    options = options or automatic(source, run.console)
+    if options is None:
+        return None
+    if renderer != "cpu":
+        raise UsageError(f"--renderer {renderer}: needs the whole volume in memory; in blocks: cpu")
+    fields = []
+    for folder, tf in functions.items():
+        parts = stack.enter_context(beside(str(folder)))
+        fields.append(stack.enter_context(blocked(run, replace(source, tf=tf), options, parts, Wanted(POINTS, size))))
+    return fields
+
+
+def draw_in_blocks(
+    field: Blocked, settings: RenderSettings, cameras: Sequence[Camera]
+) -> Callable[[Camera], np.ndarray]:
+    """What draws a volume in blocks, as many of the ``cameras`` to come at once as `TOGETHER` allows."""
+    axes = field.source.volume.axes
+    left = list(cameras)
+
+    def inside(camera: Camera) -> np.ndarray:
+        if not field.pictures:
+            many = max(TOGETHER // (camera.width * camera.height), 1)
+            field.expect([Picture(boxed(other, axes)[0], settings) for other in left[:many]])
+            del left[:many]
+        image = field.view(camera, settings)
+        field.forget(Picture(camera, settings))
+        return image
+
+    return render_in_box(inside, axes)

@@ -1,0 +1,172 @@
+"""The manifest of a folder of views or frames: which run it belongs to, and which of its files are complete."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.field.digests import digest
+from vvgt_cli.files import atomic_write, read_text
+
+SCHEMA = 1
+COMMANDS = {"views": "vvgt render-views", "frames": "vvgt convert"}  # by what a folder holds
+NAME = re.compile(r"manifest(-\d+-of-\d+)?\.json")
+DIGESTS = {"volume": "another volume", "function": "another transfer function", "cameras": "other cameras"}
+FRESH = "choose another directory, or pass --overwrite to start afresh"
+
+
+@dataclass(frozen=True)
+class Shard:
+    """Part ``index`` (from 1) of ``count`` of a job array."""
+
+    index: int = 1
+    count: int = 1
+
+    def holds(self, number: int) -> bool:
+        """Whether view ``number`` (from 0) is this part's."""
+        return number % self.count == self.index - 1
+
+    @property
+    def manifest(self) -> str:
+        """Name of this part's manifest: parts never write one file."""
+        return "manifest.json" if self.count == 1 else f"manifest-{self.index}-of-{self.count}.json"
+
+
+def file_digest(path: Path) -> str:
+    """sha256 of a file, hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+@dataclass
+class Manifest:
+    """What a run has written into ``folder``.
+
+    Attributes:
+        folder: of one function's views, or of a series' frames.
+        settings: everything that the files depend on, plain values; the hash is theirs.
+        shard: whose manifest this is.
+        files: relative path -> {"bytes", "sha256"} of each file that was written whole, other parts' included.
+        own: those of ``files`` that this part records.
+        what: the folder holds, a key of `COMMANDS`.
+    """
+
+    folder: Path
+    settings: dict[str, Any]
+    shard: Shard = field(default_factory=Shard)
+    files: dict[str, dict[str, Any]] = field(default_factory=dict)
+    own: dict[str, dict[str, Any]] = field(default_factory=dict)
+    what: str = "views"
+
+    @property
+    def hash(self) -> str:
+        """sha256 of the settings."""
+        return digest(json.dumps(self.settings, sort_keys=True))
+
+    def open(self, planned: Iterable[str], overwrite: bool) -> None:
+        """Take up what an earlier run of the same settings left, or see that nothing is in the way.
+
+        Args:
+            planned: relative paths of what will be written.
+            overwrite: remove what an earlier run wrote, whatever its settings.
+
+        Raises:
+            UsageError: the folder holds another run's files, or files that no manifest knows.
+            DataError: a manifest that is none.
+        """
+        found = self._manifests()
+        if overwrite:
+            self._clear(found)
+        for path in [] if overwrite else found:
+            document = read_manifest(path, self.what)
+            if document["hash"] != self.hash:
+                raise UsageError(
+                    f"{self.folder}: {difference(document['settings'], self.settings, self.what)}; {FRESH}"
+                )
+            self.files |= document["files"]
+            if path.name == self.shard.manifest:
+                self.own = document["files"]
+        self.files |= self.own
+        if not found and not overwrite:
+            for name in planned:
+                if (self.folder / name).exists():
+                    raise UsageError(f"{self.folder}: {name} exists, and no manifest; {FRESH}")
+
+    def refresh(self) -> None:
+        """Take in what other parts have recorded meanwhile."""
+        for path in self._manifests():
+            if path.name != self.shard.manifest:
+                self.files |= read_manifest(path, self.what)["files"]
+
+    def _manifests(self) -> list[Path]:
+        if not self.folder.is_dir():
+            return []
+        return sorted(path for path in self.folder.iterdir() if NAME.fullmatch(path.name))
+
+    def _clear(self, found: list[Path]) -> None:
+        for path in found:
+            try:
+                written = read_manifest(path, self.what)["files"]
+            except DataError:  # not ours: it is replaced, nothing else is
+                written = {}
+            for name in written:
+                (self.folder / name).unlink(missing_ok=True)
+            path.unlink()
+
+    def complete(self, name: str, content: bool = True) -> bool:
+        """Whether a file is there as it was recorded; ``content``: by its hash, not by its size alone."""
+        record, path = self.files.get(name), self.folder / name
+        if record is None or not path.is_file() or path.stat().st_size != record["bytes"]:
+            return False
+        return not content or file_digest(path) == record["sha256"]
+
+    def record(self, names: Iterable[str] = ()) -> None:
+        """Note files as complete and write the manifest."""
+        for name in names:
+            path = self.folder / name
+            self.files[name] = self.own[name] = {"bytes": path.stat().st_size, "sha256": file_digest(path)}
+        document = {
+            "format": f"vvgt-{self.what}", "schema": SCHEMA, "hash": self.hash, "settings": self.settings,
+            "files": self.own,
+        }  # fmt: skip
+        with atomic_write(self.folder / self.shard.manifest, overwrite=True) as temporary:
+            temporary.write_text(json.dumps(document, indent=1) + "\n", "utf-8")
+
+
+def read_manifest(path: Path, what: str = "views") -> dict[str, Any]:
+    """A manifest's document, of a folder of ``what`` (a key of `COMMANDS`).
+
+    Raises:
+        DataError: not one, or one that names files outside its folder.
+    """
+    try:
+        document = json.loads(read_text(path))
+        entries = [(PurePosixPath(name), entry["bytes"], entry["sha256"]) for name, entry in document["files"].items()]
+        known = (document["format"], document["schema"]) == (f"vvgt-{what}", SCHEMA)
+        known = known and isinstance(document["hash"], str) and isinstance(document["settings"], dict)
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        known, entries = False, []
+    if not known or any(name.is_absolute() or ".." in name.parts for name, _, _ in entries):
+        raise DataError(f"{path}: not a manifest of '{COMMANDS[what]}' (schema {SCHEMA}); {FRESH}")
+    result: dict[str, Any] = document
+    return result
+
+
+def difference(there: dict[str, Any], here: dict[str, Any], what: str = "views") -> str:
+    """What two runs differ in, one line."""
+    parts = []
+    for key in dict.fromkeys([*here, *there]):
+        a, b = there.get(key), here.get(key)
+        if a != b:
+            parts.append(DIGESTS.get(key) or f"{key.replace('_', ' ')} {_shown(a)} there, {_shown(b)} here")
+    return f"holds {what} of another run: " + (", ".join(parts) or "its manifest was edited")
+
+
+def _shown(value: Any) -> str:
+    return " ".join(map(str, value)) if isinstance(value, list) else str(value)

@@ -1,0 +1,123 @@
+"""Whose a Gaussian of a label map is, and what of a label the others hide; all in the box frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.gaussians.frames import rotations
+from vvgt_cli.look.labels import Label, LabelTable
+from vvgt_cli.look.tables import extinction
+from vvgt_cli.volume import Volume
+from vvgt_cli.volume.stored import planes, values_at
+
+OFFSETS = (-2.0, -1.0, 0.0, 1.0, 2.0)  # standard deviations along each axis, where a Gaussian is asked whose it is
+
+
+@dataclass(frozen=True)
+class Hidden:
+    """Where no view sees anything, nor one cell around.
+
+    Attributes:
+        cells: (nz, ny, nx) bool.
+        edge: (3,) edges of a cell in voxels, (x, y, z).
+        half, step: (3,) of the scene, unit frame.
+    """
+
+    cells: np.ndarray
+    edge: np.ndarray
+    half: np.ndarray
+    step: np.ndarray
+
+    def whether(self, gaussians: Gaussians) -> np.ndarray:
+        """(K,) whether the centre of each is hidden."""
+        voxels = (gaussians.means.astype(np.float64) + self.half) / self.step
+        i, j, k = (self._along(axis, voxels[:, axis]) for axis in range(3))
+        found: np.ndarray = self.cells[k, j, i]
+        return found
+
+    def any_of(self, volume: Volume, number: int) -> bool:
+        """Whether some of a label's surface, where it touches another label or the box's end, is hidden."""
+        middles = [np.arange(n) + 0.5 for n in volume.dims]
+        x, y, z = (self._along(axis, middles[axis]) for axis in range(3))
+        none = np.zeros(volume.data.shape[1:], bool)
+        stored = (volume.slope * plane.astype(np.float64) + volume.intercept == number for plane in planes(volume))
+        before, here = none, next(stored)
+        for k in range(len(volume.data)):
+            after = next(stored, none)
+            inside = here & before & after
+            inside[1:] &= here[:-1]
+            inside[:-1] &= here[1:]
+            inside[:, 1:] &= here[:, :-1]
+            inside[:, :-1] &= here[:, 1:]
+            inside[[0, -1]] = inside[:, [0, -1]] = False
+            if (here & ~inside & self.cells[z[k]][y][:, x]).any():
+                return True
+            before, here = here, after
+        return False
+
+    def _along(self, axis: int, voxels: np.ndarray) -> np.ndarray:
+        """Index of the cell along an axis of positions in voxels from the box's corner, (n,)."""
+        n = self.cells.shape[2 - axis]
+        found: np.ndarray = np.clip(np.floor(voxels / self.edge[axis]), 0, n - 1).astype(np.int64)
+        return found
+
+
+def hidden_in(near: np.ndarray, edge: np.ndarray, half: np.ndarray, step: np.ndarray) -> Hidden:
+    """What no training view sees.
+
+    Args:
+        near: (nz, ny, nx) bool: the cells that one sees; ``edge`` (3,) their edges in voxels.
+        half, step: (3,) of the volume, unit frame.
+    """
+    for axis in range(3):
+        wider = near.copy()
+        ahead, behind = [slice(None)] * 3, [slice(None)] * 3
+        ahead[axis], behind[axis] = slice(1, None), slice(None, -1)
+        wider[tuple(ahead)] |= near[tuple(behind)]
+        wider[tuple(behind)] |= near[tuple(ahead)]
+        near = wider
+    return Hidden(~near, edge, half, step)
+
+
+def owners(gaussians: Gaussians, shown: Sequence[tuple[Volume, LabelTable, Label]]) -> np.ndarray:
+    """(K,) int64 index of the label that owns most of each Gaussian's extinction; where none is near, by colour.
+
+    Args:
+        gaussians: box frame.
+        shown: labels, each with its map and table; all maps are on one grid.
+    """
+    frame = shown[0][0].unit_frame()
+    votes = np.zeros((len(gaussians), len(shown)), np.float32)
+    tau = extinction(np.array([label.opacity for *_, label in shown]), 1.0)
+    axes = rotations(gaussians.quaternions) * np.exp(gaussians.log_scales.astype(np.float64))[:, None, :]  # columns
+    for axis in range(3):
+        for offset in OFFSETS:
+            points = gaussians.means + offset * axes[:, :, axis]
+            index = np.floor((points + frame.half) / frame.step).astype(np.int64)
+            _vote(index, np.exp(-0.5 * offset**2) * tau, shown, votes)
+    found: np.ndarray = votes.argmax(axis=1)
+    lost = votes.max(axis=1) == 0
+    colors = np.array([label.color for *_, label in shown])
+    for k in np.flatnonzero(lost):
+        found[k] = np.abs(colors - gaussians.colors[k]).sum(axis=1).argmin()
+    return found
+
+
+def _vote(
+    index: np.ndarray, weights: np.ndarray, shown: Sequence[tuple[Volume, LabelTable, Label]], votes: np.ndarray
+) -> None:
+    """Add the ``weights`` (labels,) of the labels of voxels ``index`` (K, 3) (x, y, z) to ``votes`` (K, labels)."""
+    maps = {id(volume): volume for volume, *_ in shown}
+    dims = np.array(shown[0][0].dims)
+    rows = np.flatnonzero(((index >= 0) & (index < dims)).all(axis=1))
+    for key, volume in maps.items():
+        values = values_at(volume, index[rows])
+        own = [(label.number, k) for k, (other, _, label) in enumerate(shown) if id(other) == key]
+        numbers, columns = (np.array(part) for part in zip(*sorted(own), strict=True))
+        at = np.minimum(np.searchsorted(numbers, values), len(numbers) - 1)
+        there = numbers[at] == values
+        votes[rows[there], columns[at[there]]] += weights[columns[at[there]]].astype(np.float32)

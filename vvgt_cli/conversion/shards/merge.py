@@ -1,0 +1,197 @@
+"""From blocks to a file: visibility through the coarse grid, a threshold for the budget, Gaussians in batches."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from typing import IO, TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from vvgt_cli.conversion.request import VERTEX_BYTES
+from vvgt_cli.conversion.shards.levels import PART, level_name, write_index
+from vvgt_cli.conversion.shards.plan import Plan
+from vvgt_cli.conversion.shards.score import drawing_bytes, score_gaussians, score_text
+from vvgt_cli.conversion.stages.closed_form import FAINT_LOGIT, FEWEST, NEARLY
+from vvgt_cli.dvr.render import Box
+from vvgt_cli.errors import NothingVisible
+from vvgt_cli.field.parts import Parts
+from vvgt_cli.files import atomic_write, check_room, is_stream
+from vvgt_cli.gaussians.frames import transform
+from vvgt_cli.gaussians.outputs import STDOUT
+from vvgt_cli.gaussians.ply import as_stored, ply_header, ply_rows
+from vvgt_cli.gaussians.rules import INRIA
+from vvgt_cli.gaussians.types import together
+from vvgt_cli.jit.ahead import MERGE
+from vvgt_cli.resources import free_memory
+from vvgt_cli.score.record import Run
+
+if TYPE_CHECKING:
+    from vvgt_cli.closed_form.inset import Opaque
+    from vvgt_cli.field.forest import Coarse, Forest
+    from vvgt_cli.gaussians import Gaussians
+
+BATCH = 1 << 16  # Gaussians that are made at once
+SCRATCH = "scores"
+
+
+def write_merged(run: Run, parts: Parts, output: str, overwrite: bool, levels: int = 1) -> None:
+    """Cut the pyramid over all parts for the plan's budget and write it; fills the report in.
+
+    With ``levels`` above 1 also for parts of the budget, each into a file of its own, and an index.
+
+    Raises:
+        DataError: parts are missing or damaged, or nothing is visible.
+        UsageError: an output that may not be written.
+    """
+    plan = Plan.load(parts)
+    report = run.report
+    report.volume, report.transfer_function = plan.volume, plan.function
+    report.options = {"max_gaussians": plan.budget, "size": plan.size, "frame": plan.ply.frame, "up": plan.ply.up}
+    run.compile(MERGE)
+    with run.stage("pyramid") as stage:
+        forest, opaque = pyramid(parts, plan)
+        stage.note = f"{forest.base} cells in {len(forest.tiles)} tiles"
+    written: list[dict[str, Any]] = []
+    for level in range(levels):
+        budget = max(written[0]["gaussians"] // PART**level, 1) if level else plan.budget
+        cut = Cut(forest, opaque, replace(plan, budget=budget))
+        written.append(_level(run, parts, cut, level_name(output, level), overwrite))
+    report.gaussians, report.bytes, report.scores = (written[0][key] for key in ("gaussians", "bytes", "scores"))
+    if levels > 1:
+        for row in written:
+            row["psnr"] = (row.pop("scores") or {}).get("psnr")
+        write_index(output, plan.size, written, overwrite)
+
+
+def _level(run: Run, parts: Parts, cut: Cut, output: str, overwrite: bool) -> dict[str, Any]:
+    """One file: its name, how many Gaussians and bytes it has, and its scores, None where it is not drawn."""
+    plan, size = cut.plan, cut.plan.size
+    with run.stage("write") as stage, _sink(parts, output, overwrite) as sink:
+        made, spared = _write(cut, sink, output)
+        count, written = made.total, sink.tell()
+        stage.note = f"{output}: {count} Gaussians, {written / 1e6:.1f} MB"
+        if not spared and count < NEARLY * plan.budget:
+            base = cut.forest.base
+            stage.note += f", no more: {base} cells that the screen, or {plan.budget} Gaussians, have use for"
+    if spared:
+        run.leave_out(f"{spared} Gaussians", "so faint that viewers differ on what they draw of them")
+    scores = None
+    if made.batches is None:
+        need = drawing_bytes(count, size)
+        run.leave_out("test views", f"{count} Gaussians at once need about {need / 2**30:.1f} GiB of memory")
+    else:
+        with run.stage("test views") as stage:
+            found = score_gaussians(together(made.batches), parts, plan, plan.ply.rule or INRIA)
+            scores, stage.note = asdict(found), score_text(found, size)
+    return {"file": os.path.basename(output), "gaussians": count, "bytes": written, "scores": scores}
+
+
+def pyramid(parts: Parts, plan: Plan) -> tuple[Forest, Opaque]:
+    """The pyramid over all parts, and where bodies are opaque.
+
+    Raises:
+        NothingVisible: from no view.
+        DataError: parts are missing or damaged.
+    """
+    from vvgt_cli.cameras import default_views
+    from vvgt_cli.closed_form.closed_form import MARCH_SIZE
+    from vvgt_cli.closed_form.visibility import march_views
+    from vvgt_cli.field.forest import Forest, gather
+
+    grid, coarse = plan.grid, gather(parts, plan.grid)
+    wide = grid.cell * 2.0**grid.march
+    box = Box(np.array(grid.half), np.array(grid.step))
+    extinction = (coarse.mass / (wide * box.step).prod()).astype(np.float32)
+    seen = march_views(extinction, wide, box, default_views("train", size=MARCH_SIZE))
+    forest = Forest(parts, grid, seen, coarse, parts.folder / SCRATCH)
+    if forest.top is None:
+        raise NothingVisible(plan.volume["name"], plan.function["name"])
+    return forest, _opaque(coarse, plan)
+
+
+def _opaque(coarse: Coarse, plan: Plan) -> Opaque:
+    from vvgt_cli.closed_form.inset import SURFACE, nowhere, smoothed
+
+    grid, half = plan.grid, np.array(plan.grid.half)
+    edge = grid.cell_edge * 2.0**grid.field
+    return nowhere(edge, half) if coarse.deepest < SURFACE else smoothed(coarse.field, edge, half)
+
+
+class Made(NamedTuple):
+    """What was written: how many Gaussians, and themselves in the box frame, None where the memory holds no drawing."""
+
+    total: int
+    batches: list[Gaussians] | None
+
+
+def _write(cut: Cut, sink: IO[bytes], output: str) -> tuple[Made, int]:
+    """Write the file; what it has, and how many Gaussians are left out since they would be too faint."""
+    plan, first, free = cut.plan, 0, free_memory()
+    axes = np.array(plan.axes).reshape(3, 3)
+    while True:
+        threshold = cut.forest.threshold(plan.budget)
+        count = cut.forest.count(threshold)
+        first = first or count
+        if output != STDOUT:
+            check_room(output, count * VERTEX_BYTES)
+        sink.seek(0)
+        sink.truncate()
+        sink.write(ply_header(count, plan.ply.sh_degree or 0, plan.ply))
+        kept: list[Gaussians] | None = [] if free is None or drawing_bytes(count, plan.size) < free else None
+        faint = 0
+        for gaussians in cut.gaussians(threshold):
+            sink.write(ply_rows(transform(gaussians, axes), plan.ply).data)
+            faint += int((gaussians.opacity_logits < FAINT_LOGIT).sum())
+            if kept is not None:
+                kept.append(gaussians)
+        if 2 * faint <= count or plan.budget < 2 * FEWEST:
+            return Made(count, kept), first - count
+        plan = replace(plan, budget=plan.budget // 2)
+
+
+@dataclass(frozen=True)
+class Cut:
+    """A pyramid, where bodies are opaque, and the plan that it is cut for."""
+
+    forest: Forest
+    opaque: Opaque
+    plan: Plan
+
+    def gaussians(self, threshold: float) -> Iterator[Gaussians]:
+        """Those of the cells that a threshold leaves, in the box frame, as a file holds them, in batches."""
+        from vvgt_cli.closed_form.closed_form import pixel_width
+        from vvgt_cli.closed_form.columns import MASS, SEEN
+        from vvgt_cli.closed_form.shape import ROUND, cell_gaussians
+        from vvgt_cli.closed_form.sharpen import sharpened
+        from vvgt_cli.field.forest import batches
+
+        voxel, pixel = min(self.plan.grid.step), pixel_width(self.plan.size)
+        for leaves in batches(self.forest.leaves(threshold), BATCH):
+            made = cell_gaussians(leaves, voxel, pixel, self.opaque, ROUND)
+            if not self.plan.labels:
+                made = sharpened(made, leaves.moments[:, SEEN] / leaves.moments[:, MASS], self.opaque.half)
+            yield as_stored(made)
+
+
+@contextmanager
+def _sink(parts: Parts, output: str, overwrite: bool) -> Iterator[IO[bytes]]:
+    """A file to write to, which takes the output's place, or goes down its pipe, when it is whole."""
+    if output != STDOUT and not is_stream(output):
+        with atomic_write(output, overwrite) as temporary, open(temporary, "w+b") as sink:
+            yield sink
+        return
+    with tempfile.TemporaryFile(dir=parts.folder) as sink:
+        yield sink
+        sink.seek(0)
+        if output == STDOUT:
+            shutil.copyfileobj(sink, sys.stdout.buffer)
+            sys.stdout.buffer.flush()
+        else:
+            with open(output, "ab") as stream:
+                shutil.copyfileobj(sink, stream)

@@ -1,0 +1,92 @@
+"""What the blocks of a run have in common and its file depends on, beside them on disk: enough to merge without the
+volume."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+from vvgt_cli.conversion.request import VERTEX_BYTES
+from vvgt_cli.errors import DataError
+from vvgt_cli.field.grid import Boxes, CellGrid
+from vvgt_cli.field.parts import ROW, Parts
+from vvgt_cli.files import atomic_write
+from vvgt_cli.gaussians import PlyOptions
+from vvgt_cli.score.record import plain
+
+PLAN = "plan.json"
+A_SCORE, A_RAY = 20, 20  # bytes: of a base cell's scores with those above it, of what a block shows of a ray
+A_GAUSSIAN = 8  # base cells there may be a Gaussian, where the budget is so large that it decides
+
+
+@dataclass(frozen=True)
+class Plan:
+    """See the module.
+
+    Attributes:
+        grid: the cells.
+        budget, size: most Gaussians, and pixels of the screen that they are made for.
+        axes: (9,) row-major world directions of the index axes, as `Volume.direction`.
+        ply: how the file is written.
+        volume, function: as reports show them.
+        rays: name of the file of the rays that it is scored by.
+        labels: it is one of labels alone.
+    """
+
+    grid: CellGrid
+    budget: int
+    size: int
+    axes: tuple[float, ...]
+    ply: PlyOptions
+    volume: dict[str, Any]
+    function: dict[str, Any]
+    rays: str
+    labels: bool = False
+
+    def save(self, parts: Parts) -> None:
+        """Write it beside the parts."""
+        with atomic_write(parts.folder / PLAN, overwrite=True) as temporary:
+            temporary.write_text(json.dumps(plain(asdict(self)), indent=1), "utf-8")
+
+    @classmethod
+    def load(cls, parts: Parts) -> Plan:
+        """The plan beside parts.
+
+        Raises:
+            DataError: there is none, or it is damaged.
+        """
+        path = parts.folder / PLAN
+        try:
+            found = json.loads(path.read_text("utf-8"))
+            grid, ply = found["grid"], found["ply"]
+            boxes = Boxes(*(tuple(grid["blocks"][key]) for key in ("dims", "edge")))
+            grid = CellGrid(**{**{key: _tupled(value) for key, value in grid.items()}, "blocks": boxes})
+            options = PlyOptions(**{key: _tupled(value) for key, value in ply.items()})
+            return replace(cls(**{**found, "grid": grid, "ply": options}), axes=tuple(found["axes"]))
+        except FileNotFoundError:
+            raise DataError(
+                f"{path}: is missing: not all shards have counted their blocks; run the same array again"
+            ) from None
+        except (ValueError, KeyError, TypeError) as error:
+            raise DataError(f"{path}: damaged ({error}); remove it and run a shard again") from error
+
+
+def _tupled(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value
+
+
+def most_cells(budget: int) -> int:
+    """Base cells that a budget has use for, on disk: as many as in memory, more where there are more Gaussians."""
+    from vvgt_cli.closed_form.closed_form import most_cells as in_memory
+
+    return max(in_memory(budget), A_GAUSSIAN * budget)
+
+
+def disk_bytes(grid: CellGrid, voxels: float, budget: int, rays: int) -> int:
+    """What parts and output take on disk, about, where ``voxels`` are visible and ``rays`` are marched."""
+    cells = voxels / float(grid.cell.prod())
+    met = rays * max(grid.blocks.shape) / 2  # blocks along a ray, half of which show something of it
+    coarse = math.prod(-(-grid.dims // grid.tile)) * grid.tile_cells**3 * (8 / 8**grid.march + 4 / 8**grid.field)
+    return int(cells * (ROW + A_SCORE) + coarse + met * A_RAY + min(budget, cells) * VERTEX_BYTES)

@@ -1,0 +1,150 @@
+"""`vvgt init` in blocks: count, choose the cells' size, integrate, cut, write; as a whole, or by shards and a merge."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from vvgt_cli.conversion.convert import ply_options
+from vvgt_cli.conversion.place import remarks
+from vvgt_cli.conversion.request import ConvertRequest
+from vvgt_cli.conversion.shards.levels import level_outputs
+from vvgt_cli.conversion.shards.merge import write_merged
+from vvgt_cli.conversion.shards.plan import Plan, disk_bytes, most_cells
+from vvgt_cli.conversion.shards.score import scored_views
+from vvgt_cli.errors import UsageError
+from vvgt_cli.field.blocked import Blocked, Later
+from vvgt_cli.field.cells import CellBlocks
+from vvgt_cli.field.open import Wanted, beside, blocked
+from vvgt_cli.field.parts import CELLS, Parts
+from vvgt_cli.field.settings import BlockOptions
+from vvgt_cli.field.source import tf_record, volume_record
+from vvgt_cli.files import check_room
+from vvgt_cli.gaussians.formats import format_of
+from vvgt_cli.gaussians.outputs import STDOUT, Output, claimed, write_text
+from vvgt_cli.jit.ahead import DRAW, INIT, RENDER, for_blocks
+from vvgt_cli.progress import Console
+from vvgt_cli.score.record import ConversionReport, Run
+
+
+def streams(request: ConvertRequest) -> bool:
+    """Whether a closed form in blocks is written batch by batch, without its Gaussians in memory at once."""
+    options, light = request.blocks, request.source.light
+    lit = light.shadows or light.occlusion is not None or any(name != "none" for name in light.lights)
+    other = request.fit.init != "vbm" or bool(request.output and options is not None and format_of(request.output))
+    if options is not None and (options.shard is not None or options.levels > 1):
+        if lit or other:
+            raise UsageError(
+                "--levels and --shard write .ply files of unlit moments: leave out --light, --init and other formats, "
+                "or convert it as a whole (docs/scale.md)"
+            )
+        return True
+    return options is not None and not (lit or other)
+
+
+def init_in_blocks(request: ConvertRequest, console: Console | None = None) -> ConversionReport:
+    """Volume to `.ply` by the closed form, of which only blocks are ever in memory.
+
+    With ``shard`` of ``request.blocks`` the output is a folder of blocks, which `merge` puts together.
+
+    Raises:
+        UsageError, DataError: as `vvgt_cli.conversion.convert.initialise_only`; shards that do not fit the rest.
+    """
+    options = request.blocks or BlockOptions()
+    _refuse(request, options)
+    run = Run(console or Console(), ConversionReport("init"))
+    if options.shard is not None:
+        assert request.output is not None
+        _shard(run, request, options, Parts(Path(request.output).absolute()))
+        return run.finish()
+    outputs = [*request.outputs(), *level_outputs(request.output, options.levels)]
+    with claimed(outputs, request.inputs(), request.overwrite), beside(request.output) as parts:
+        make_parts(run, request, options, parts)
+        write_merged(run, parts, request.output or STDOUT, request.overwrite, options.levels)
+        run.finish()
+        if request.report:
+            write_text(request.report, run.report.to_json(), request.overwrite)
+        parts.remove()
+    return run.report
+
+
+def merge(
+    folder: str, output: str, overwrite: bool = False, console: Console | None = None, levels: int = 1
+) -> ConversionReport:
+    """Make a `.ply`, or one of each of ``levels`` of detail, of the blocks that shards have left in a folder.
+
+    Raises:
+        UsageError: not such a folder, or an output that may not be written.
+        DataError: blocks are missing or damaged.
+    """
+    run = Run(console or Console(), ConversionReport("merge"))
+    parts = Parts(Path(folder))
+    parts.settings()
+    outputs = [Output("-o", output, (".ply",), splats=True), *level_outputs(output, levels)]
+    with claimed(outputs, [], overwrite):
+        write_merged(run, parts, output, overwrite, levels)
+    return run.finish()
+
+
+def _refuse(request: ConvertRequest, options: BlockOptions) -> None:
+    """What does not go together."""
+    if options.shard is not None and options.scheduler is not None:
+        raise UsageError("--shard and --scheduler both share the blocks out; give one of them")
+    if options.shard is not None and options.levels > 1:
+        raise UsageError("--levels: a shard leaves blocks; give it to 'vvgt merge'")
+    if options.shard is not None and (request.output in (None, STDOUT) or request.report):
+        raise UsageError("--shard: -o is a folder of blocks then, there is no --report; 'vvgt merge' makes the .ply")
+
+
+def _shard(run: Run, request: ConvertRequest, options: BlockOptions, parts: Parts) -> None:
+    """Do a shard's share of what can be done now, and say what is left."""
+    try:
+        make_parts(run, request, options, parts)
+    except Later as later:
+        run.console.say(
+            f"{later.what}: this shard's share is done, {later.missing} blocks are other shards'; run the same array "
+            "again when they are"
+        )
+    else:
+        run.console.say(f"all blocks are there; next: vvgt merge {request.output} -o OUT.ply")
+
+
+def make_parts(run: Run, request: ConvertRequest, options: BlockOptions, parts: Parts) -> None:
+    """Every block's part, those that are there taken as they are; and the plan of the file.
+
+    Raises:
+        Later: other shards' blocks are missing.
+    """
+    budget, size = request.fit.max_gaussians, request.fit.size
+    wanted = Wanted(budget, size, request.ply.sh_degree, most_cells(budget))
+    with blocked(run, request.source, options, parts, wanted) as field:
+        source, ply = field.source, ply_options(request, field.source)
+        for line in remarks(source.volume, ply):
+            run.console.say(line)
+        run.compile(for_blocks(source.kernels((RENDER, *INIT, *DRAW))), source.kernel_type())
+        field.expect(scored_views(size))
+        cells = field.cells(size, budget, wanted.most)
+        assert cells.rays is not None
+        Plan(
+            cells.grid, budget, size, source.volume.direction, ply, volume_record(source),
+            tf_record(source, request.source), cells.rays.kind, source.labels_alone,
+        ).save(parts)  # fmt: skip
+        _check_disk(run, field, cells, budget)
+        with run.stage("integrate") as stage:
+            done = field.do(cells, "integrate")
+            workers = field.do.runner.workers
+            stage.note = f"{done} of {len(cells)} blocks" + (f", {workers} workers" if workers > 1 else "")
+
+
+def _check_disk(run: Run, field: Blocked, cells: CellBlocks, budget: int) -> None:
+    """Say what the blocks will take on disk.
+
+    Raises:
+        DataError: more than is free.
+    """
+    assert cells.rays is not None
+    rays = sum(len(cast.pixels) * len(cast.offsets) for cast in cells.rays.bundles())
+    parts = cells.parts
+    need = disk_bytes(cells.grid, field.visible, budget, rays) - parts.bytes(CELLS)
+    if need > 0 and parts.missing(CELLS, range(len(cells))):
+        run.console.say(f"on disk meanwhile: about {need / 1e6:.0f} MB in {parts.folder}")
+        check_room(parts.folder, need)

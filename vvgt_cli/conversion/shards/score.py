@@ -1,0 +1,68 @@
+"""The error of Gaussians cut from blocks, against rays through all voxels: what a merge needs no volume for."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vvgt_cli.cameras import default_views
+from vvgt_cli.cameras.blocks import spread_blocks
+from vvgt_cli.field.field import Picture
+from vvgt_cli.field.parts import Parts
+from vvgt_cli.field.rays import RayFile, composed
+from vvgt_cli.gaussians.rules import INRIA, Rule
+from vvgt_cli.score.viewing import PREVIEW_VIEWS
+
+if TYPE_CHECKING:
+    from vvgt_cli.conversion.shards.plan import Plan
+    from vvgt_cli.gaussians import Gaussians
+    from vvgt_cli.images.metrics import Scores
+
+FEW = 64  # blocks of 16 x 16 px of each test view
+RAYS = 2  # along a pixel's edge
+A_GAUSSIAN = 400  # bytes that drawing one takes
+
+
+def scored_views(size: int) -> list[Picture]:
+    """Blocks of three test views of ``size`` px."""
+    from vvgt_cli.dvr import RenderSettings
+
+    cameras = default_views("test", size=size)
+    settings = RenderSettings(samples=RAYS)
+    return [Picture(cameras[i], settings, spread_blocks(size, size, i, FEW)) for i in PREVIEW_VIEWS]
+
+
+def score_gaussians(gaussians: Gaussians, parts: Parts, plan: Plan, rule: str | Rule = INRIA) -> Scores:
+    """Gaussians of the box frame, drawn by a rule, against the volume's views.
+
+    Raises:
+        DataError: a part is missing or damaged.
+    """
+    from vvgt_cli.images.metrics import score_views
+    from vvgt_cli.splat import render
+
+    rays = RayFile(str(parts.folder / f"{plan.rays}.npz"), plan.rays)
+    x, y, z = plan.grid.blocks.dims
+    seen = composed(rays, parts, range(len(plan.grid.blocks)), (x, y, z))
+    views = scored_views(plan.size)
+
+    def picked(view: Picture) -> np.ndarray:
+        drawn = render(gaussians, view.camera, rule, blocks=view.blocks)
+        shown = drawn if view.blocks is None else drawn[view.blocks.mask()]
+        return shown.reshape(-1, 1, 4)
+
+    whole = [rays.mean(axis=1, keepdims=True).astype(np.float32) for rays in seen]
+    return score_views(whole, map(picked, views), perceptual=False)
+
+
+def score_text(scores: Scores, size: int) -> str:
+    """What there is to say of them."""
+    from vvgt_cli.score.views import psnr_note
+
+    return f"{psnr_note(scores)}, blocks of {scores.views} views of {size} px, through all voxels"
+
+
+def drawing_bytes(gaussians: int, size: int) -> int:
+    """Memory that scoring so many Gaussians takes."""
+    return A_GAUSSIAN * gaussians + 2 * 16 * size**2

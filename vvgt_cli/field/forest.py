@@ -1,0 +1,225 @@
+"""The pyramid over all tiles, of which only the tops are in memory; the choice of its cells for a budget.
+
+Every tile's cells form a tree up to the tile's own cell; the trees' tops form one more. Scores are kept in a file, two
+numbers a cell, so that a threshold is found without the moments.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from vvgt_cli.closed_form.moments import Cells, morton
+from vvgt_cli.closed_form.tree import Leaves, Tree, build_tree, cap_by_ancestors, leaves_of, pyramid, split_score
+from vvgt_cli.closed_form.visibility import Visibility
+from vvgt_cli.field.cells import read_rows
+from vvgt_cli.field.grid import CellGrid
+from vvgt_cli.field.parts import CELLS, Parts
+
+FRACTION_BITS = 9  # of a score that a bin of the histogram tells apart, below its exponent
+BINS = 1 << 16
+LOWEST = (1023 - 110) << FRACTION_BITS  # exponent 2^-110: less is as good as nothing
+FIELDS = ("moments", "index", "edge", "node")
+
+
+class Tile(NamedTuple):
+    """Where a tile's cells lie: place (x, y, z), block, cells of the block before them, how many they are."""
+
+    place: tuple[int, int, int]
+    block: int
+    offset: int
+    cells: int
+
+
+class Scores(NamedTuple):
+    """Of some cells: the score that splits the cell above, the own one, and whether it has cells below."""
+
+    above: np.ndarray
+    capped: np.ndarray
+    inner: np.ndarray
+
+
+@dataclass(frozen=True)
+class Coarse:
+    """What of all blocks is held in memory.
+
+    Attributes:
+        mass: (nz, ny, nx) float64 in cells of the march.
+        field: (nz, ny, nx) float32 opacity.
+        deepest: largest opacity of a base cell.
+        tiles: in Morton order.
+    """
+
+    mass: np.ndarray
+    field: np.ndarray
+    deepest: float
+    tiles: list[Tile]
+
+
+def gather(parts: Parts, grid: CellGrid) -> Coarse:
+    """Put the summaries of all blocks together.
+
+    Raises:
+        DataError: a block is missing or damaged.
+    """
+    march, fine = grid.coarse_shape(grid.march), grid.coarse_shape(grid.field)
+    mass, field, deepest = np.zeros(march[::-1]), np.zeros(fine[::-1], np.float32), 0.0
+    tiles = []
+    for number in range(len(grid.blocks)):
+        part = parts.load(CELLS, number)
+        deepest = max(deepest, float(part["deepest"]))
+        offset = 0
+        for place, count, one, other in zip(
+            part["tiles"].tolist(), part["counts"].tolist(), part["coarse"], part["field"], strict=True
+        ):
+            _lay(mass, one, place)
+            _lay(field, other, place)
+            tiles.append(Tile(tuple(place), number, offset, count))
+            offset += count
+    order = np.argsort(morton(np.array([tile.place for tile in tiles], np.int32).reshape(-1, 3)))
+    return Coarse(mass, field, deepest, [tiles[k] for k in order])
+
+
+def _lay(grid: np.ndarray, part: np.ndarray, place: list[int]) -> None:
+    """Put the cells of a tile into a grid; what lies beyond the volume is left out."""
+    x, y, z = (n * part.shape[0] for n in place)
+    target = grid[z : z + part.shape[0], y : y + part.shape[1], x : x + part.shape[2]]
+    target[:] = part[: target.shape[0], : target.shape[1], : target.shape[2]]
+
+
+class Forest:
+    """Trees of tiles; see the module.
+
+    Attributes:
+        top: the tree over the tiles' own cells, None where nothing is seen.
+        tiles: those with something seen, in Morton order, as the base of ``top``.
+        cells: in all trees, the base cells among them.
+    """
+
+    def __init__(self, parts: Parts, grid: CellGrid, seen: Visibility, coarse: Coarse, scratch: Path) -> None:
+        self._parts, self._grid, self._seen, self._scratch = parts, grid, seen, scratch
+        self._levels = None if len(coarse.tiles) == 1 else grid.bits
+        self.tiles: list[Tile] = []
+        self._sizes: list[tuple[int, int]] = []  # cells and base cells of each tree
+        moments, largest = [], []
+        with open(scratch, "wb") as stream:
+            for tile in coarse.tiles:
+                tree = self._tree(tile)
+                if not len(tree):
+                    continue
+                capped = cap_by_ancestors(tree, split_score(tree))
+                stream.write(capped[tree.parent].tobytes() + capped.tobytes())
+                self.tiles.append(tile)
+                self._sizes.append((len(tree), int((tree.children == 0).sum())))
+                moments.append(tree.moments[-1].copy())  # a view would keep the tree
+                largest.append(tree.largest[-1])
+        self.cells = sum(size for size, _ in self._sizes)
+        self.top: Tree | None = None
+        if self.tiles:
+            self._over(np.array(moments), np.array(largest))
+
+    def _over(self, moments: np.ndarray, largest: np.ndarray) -> None:
+        """The tree over the tiles' own cells."""
+
+        def fill(rows: np.ndarray, top: np.ndarray) -> None:
+            rows[:], top[:] = moments, largest
+
+        places = np.array([tile.place for tile in self.tiles], np.int32)
+        grid = self._grid
+        edge = self._tree(self.tiles[0]).edge[-1] if self._levels is None else grid.cell_edge * grid.tile_cells
+        self.top = pyramid(places, edge, fill)
+        self._capped = cap_by_ancestors(self.top, split_score(self.top))
+        self._above = self._capped[self.top.parent]
+        self._above[-1] = np.inf  # the root is there at any threshold
+
+    def _tree(self, tile: Tile) -> Tree:
+        moments, local = read_rows(self._parts, tile.block, tile.offset, tile.cells)
+        index = local + np.array(tile.place, np.int32) * self._grid.tile_cells
+        cells = Cells(index, moments, self._grid.cell_edge, np.array(self._grid.exponent, np.int64))
+        return build_tree(cells, self._seen, np.array(self._grid.step), self._levels)
+
+    @property
+    def base(self) -> int:
+        """Base cells that some view sees."""
+        return sum(base for _, base in self._sizes)
+
+    def scores(self) -> Iterator[Scores]:
+        """Of each tile in turn, and of the cells above them."""
+        if self.top is None:
+            return
+        with open(self._scratch, "rb") as stream:
+            for row, (size, base) in enumerate(self._sizes):
+                above, capped = np.frombuffer(stream.read(16 * size)).reshape(2, size)
+                cap = self._capped[row]
+                above, capped = np.minimum(above, cap), np.minimum(capped, cap)
+                above[-1] = self._above[row]
+                yield Scores(above, capped, np.arange(size) >= base)
+        over = slice(len(self.tiles), None)
+        yield Scores(self._above[over], self._capped[over], np.ones(len(self.top) - len(self.tiles), bool))
+
+    def threshold(self, budget: int) -> float:
+        """The score above which cells are split, for at most ``budget``, as `vvgt_cli.closed_form.tree.select`."""
+        if self.base <= budget:
+            return -np.inf
+        counts = np.zeros(BINS, np.int64)  # cells that are there, less those that are split
+        for scores in self.scores():
+            counts += np.bincount(_bins(scores.above), minlength=BINS)
+            counts -= np.bincount(_bins(scores.capped[scores.inner]), minlength=BINS)
+        left = np.cumsum(counts[::-1])[::-1]  # with all from a bin on split
+        first = int(np.argmax(left <= budget)) if (left <= budget).any() else BINS - 1
+        entries, exits = [], []
+        for scores in self.scores():
+            entries.append(scores.above[_bins(scores.above) == first - 1])
+            own = scores.capped[scores.inner]
+            exits.append(own[_bins(own) == first - 1])
+        entry, exit_ = np.sort(np.concatenate(entries)), np.sort(np.concatenate(exits))
+        there = int(left[first]) if first < BINS else 1
+        for value in np.unique(exit_):  # ascending: the first that fits leaves the most cells
+            more = len(entry) - np.searchsorted(entry, value, "right")
+            less = len(exit_) - np.searchsorted(exit_, value, "right")
+            if there + more - less <= budget:
+                return float(value)
+        return float(exit_[-1]) if len(exit_) else np.inf
+
+    def leaves(self, threshold: float) -> Iterator[Leaves]:
+        """The cells that a threshold leaves, tile by tile, those above them last."""
+        for row, scores in enumerate(self.scores()):
+            which = np.flatnonzero((scores.above > threshold) & ((scores.capped <= threshold) | ~scores.inner))
+            if not len(which):
+                continue
+            if row < len(self.tiles):
+                yield leaves_of(self._tree(self.tiles[row]), which)
+            else:
+                assert self.top is not None, "scores come of a top"
+                yield leaves_of(self.top, which + len(self.tiles))
+
+    def count(self, threshold: float) -> int:
+        """How many cells a threshold leaves."""
+        return sum(int(((s.above > threshold) & ((s.capped <= threshold) | ~s.inner)).sum()) for s in self.scores())
+
+
+def batches(leaves: Iterator[Leaves], size: int) -> Iterator[Leaves]:
+    """The same cells, so many at a time or a few more."""
+    waiting: list[Leaves] = []
+    for part in leaves:
+        waiting.append(part)
+        if sum(map(len, waiting)) >= size:
+            yield _together(waiting)
+            waiting = []
+    if waiting:
+        yield _together(waiting)
+
+
+def _together(parts: list[Leaves]) -> Leaves:
+    return Leaves(*(np.concatenate([getattr(part, field) for part in parts]) for field in FIELDS))
+
+
+def _bins(scores: np.ndarray) -> np.ndarray:
+    """Bin of each score, ascending with it."""
+    bits = np.ascontiguousarray(scores).view(np.int64) >> (52 - FRACTION_BITS)
+    result: np.ndarray = np.clip(bits - LOWEST, 0, BINS - 1)
+    return result

@@ -1,0 +1,359 @@
+"""Volumes that are not one scalar field: label maps, colours, channels, and layers that add up (docs/layers.md)."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Protocol
+
+import numpy as np
+
+from vvgt_cli.dvr.layers import Layer
+from vvgt_cli.errors import DataError, SeveralComponents, UsageError
+from vvgt_cli.look import (
+    ColorMap,
+    PiecewiseOpacity,
+    TransferFunction,
+    check_visible,
+    from_histogram,
+    read_transfer_function,
+    resolve,
+    unit_distance,
+)
+from vvgt_cli.look.histogram import UNIT_SHARE
+from vvgt_cli.look.label_files import holds_table, read_labels, segments_of
+from vvgt_cli.look.labels import LabelTable, distinct
+from vvgt_cli.synth.sources import open_volume
+from vvgt_cli.volume import ReadOptions, Statistics, Volume, statistics
+from vvgt_cli.volume.label_maps import labels_in, recognised
+from vvgt_cli.volume.stored import Stored, chunks_of, read_block
+
+AUTO, NONE = "auto", "none"
+COLOR, ALL = "color", "all"  # of --component
+LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709
+CHANNEL_COLORS = ((0, 1, 0), (1, 0, 1), (0, 1, 1), (1, 0.5, 0), (0.4, 0.4, 1), (1, 1, 0), (1, 0, 0))
+DARK, BRIGHT = 0.5, 0.998  # shares of a channel's voxels between which its opacity rises
+KEYS = {"tf": str, "labels": str, "distance": str, "array": str, "component": str, "channel": str, "time": int}
+
+
+@dataclass(frozen=True)
+class LayerRequest:
+    """A volume to be laid over the first.
+
+    Attributes:
+        volume: path, or a volume.
+        tf: its function; None makes one.
+        labels: its table of labels, ``auto``, ``none``, or None: ``auto`` where it is recognised.
+        distance: world length that its opacity is per, as `SourceRequest.unit_distance`.
+        read: how to read it.
+    """
+
+    volume: str | Volume
+    tf: str | TransferFunction | None = None
+    labels: str | LabelTable | None = None
+    distance: str | None = None
+    read: ReadOptions = field(default_factory=ReadOptions)
+
+
+def parse_layer(text: str, space: str | None = None) -> LayerRequest:
+    """``FILE[,tf=TF][,labels=TABLE][,component=N]...``.
+
+    Raises:
+        UsageError: a key that is none.
+    """
+    path, *rest = re.split(r",(?=[a-z]+=)", text)
+    given: dict[str, Any] = {}
+    for part in rest:
+        key, _, value = part.partition("=")
+        if key not in KEYS or not value or (KEYS[key] is int and not value.isdecimal()):
+            raise UsageError(
+                f"--layer {text}: {part!r}; expected FILE and any of {', '.join(f'{k}=...' for k in KEYS)}"
+            )
+        given["component" if key == "channel" else key] = KEYS[key](value)
+    if not path:
+        raise UsageError(f"--layer {text}: no file; expected FILE, as seg.nrrd or pet.nii,tf=hot.json")
+    component = given.pop("component", None)
+    if component is not None and component.isdecimal():
+        component = int(component)
+    tf, labels, distance = (given.pop(key, None) for key in ("tf", "labels", "distance"))
+    return LayerRequest(path, tf, labels, distance, ReadOptions(component=component, space=space, **given))
+
+
+@dataclass(frozen=True)
+class Content:
+    """What a file holds.
+
+    Attributes:
+        volumes: the scalar field; or red, green, blue and perhaps opacity; or a channel each; or label maps.
+        color: they are colours.
+        colors: RGB of each channel, None where the file says none.
+        path: of the file, None where it is in memory.
+        overlapping: they are the layers of a segmentation whose segments overlap.
+        layer: number of the one component that was asked for, None where none was.
+        stored: values stay where they are: what is made of them is made block by block.
+    """
+
+    volumes: tuple[Volume, ...]
+    color: bool = False
+    colors: Sequence[tuple[float, float, float] | None] = ()
+    path: str | None = None
+    overlapping: bool = False
+    layer: int | None = None
+    stored: bool = False
+
+    @property
+    def one_field(self) -> bool:
+        """Whether it is scalars or labels alone."""
+        return not self.color and len(self.volumes) == 1
+
+    @cached_property
+    def classified(self) -> tuple[Volume, ...]:
+        """What functions are of: opacity or luminance of colours, else the volumes themselves."""
+        if not self.color:
+            return self.volumes
+        source = self.volumes[3] if len(self.volumes) > 3 else _luminance(self.stored, *self.volumes[:3])
+        return (replace(source, name=self.volumes[0].name),)
+
+
+class Access(Protocol):
+    """How volumes are opened, and what their values are: in memory, or block by block."""
+
+    def open(self, source: str | Volume, read: ReadOptions) -> Content:
+        """A file, or a volume that is there already."""
+
+    def statistics(self, volume: Volume) -> Statistics: ...
+
+    def labels(self, volume: Volume) -> list[int]:
+        """Those that it holds, ascending."""
+
+
+class InMemory:
+    """`Access` to volumes that are read as a whole."""
+
+    def open(self, source: str | Volume, read: ReadOptions) -> Content:
+        """See `open_parts`."""
+        return open_parts(source, read) if isinstance(source, str) else Content((source,))
+
+    def statistics(self, volume: Volume) -> Statistics:
+        """See `vvgt_cli.volume.statistics`."""
+        return statistics(volume)
+
+    def labels(self, volume: Volume) -> list[int]:
+        """See `labels_in`."""
+        return labels_in(volume)
+
+
+IN_MEMORY = InMemory()
+
+
+def open_parts(source: str, read: ReadOptions) -> Content:
+    """A volume; where ``read.component`` is "color" or "all", or the file says that it holds colours, its components.
+
+    Raises:
+        DataError, UsageError: as `open_volume`; components that are no colours.
+    """
+    asked = read.component if read.component in (COLOR, ALL) else None
+    try:
+        volume = open_volume(source, replace(read, component=None) if asked else read)
+    except SeveralComponents as error:
+        overlapping = not asked and holds_table(source)
+        if not asked and not error.color and not overlapping:
+            raise
+        if asked == COLOR and error.count not in (3, 4):
+            raise UsageError(
+                f"{source}: {error.count} components; expected three or four for --component color"
+            ) from None
+        parts = tuple(open_volume(source, replace(read, component=k)) for k in range(error.count))
+        if asked == COLOR or (error.color and not asked and not overlapping):
+            return Content(parts, True, stored=read.stored)
+        colors = error.colors or [None] * error.count
+        named = tuple(replace(v, name=f"{v.name} {k}") for k, v in enumerate(parts))
+        return Content(named, colors=colors, path=source, overlapping=overlapping, stored=read.stored)
+    if asked:
+        raise UsageError(f"{source}: one component; leave out --component {asked}")
+    layer = read.component if isinstance(read.component, int) else None
+    return Content((volume,), path=source, layer=layer, stored=read.stored)
+
+
+def is_plain(
+    opened: Content, tf: object, labels: str | LabelTable | None, layers: Sequence[LayerRequest], access: Access
+) -> bool:
+    """Whether it is one scalar field under a function; a label map that is recognised is not."""
+    if not opened.one_field or layers or labels not in (None, NONE):
+        return False
+    return (
+        tf is not None
+        or labels == NONE
+        or not (holds_table(opened.path) or recognised(opened.volumes[0], access.labels))
+    )
+
+
+def layers_of(
+    opened: Content,
+    tf: str | TransferFunction | None,
+    labels: str | LabelTable | None,
+    tf_range: str | tuple[float, float] = "data",
+    distance: str | None = None,
+    whole: Sequence[Statistics] = (),
+    access: Access = IN_MEMORY,
+) -> list[Layer]:
+    """The layers that a file's content makes.
+
+    Args:
+        opened: the content.
+        tf: function, None makes one; of colours its opacity is taken, over their luminance or opacity.
+        labels: table of labels, its file, ``auto``, ``none`` or None.
+        tf_range, distance: of functions.
+        whole: statistics of `Content.classified` over a whole series; none: the volumes' own.
+        access: to the values.
+
+    Raises:
+        DataError: labels that do not fit the table, nothing that is visible.
+        UsageError: a table and a function at once.
+    """
+    labels = _asked(opened, tf, labels, access)
+    if labels not in (None, NONE):
+        own = labels == AUTO and holds_table(opened.path)
+        if opened.overlapping:
+            return _overlapping(opened, labels, own, distance, access)
+        if own and opened.layer is not None:
+            labels = segments_of(str(opened.path), opened.layer)
+        elif own:
+            labels = opened.path
+        return [_labelled(opened.volumes[0], labels, distance, access)]
+    function = read_transfer_function(tf) if isinstance(tf, str) else tf
+    sources = opened.classified
+    numbers = whole or [access.statistics(volume) for volume in sources]
+    shown = functions_of(opened, numbers, function, tf_range)
+    colors = (opened.volumes[0], opened.volumes[1], opened.volumes[2]) if opened.color else None
+    layers = []
+    for volume, one, its in zip(sources, shown, numbers, strict=True):
+        if opened.one_field or opened.color:
+            check_visible(one, its)
+        given = function if function is not None and opened.one_field else one
+        layers.append(Layer(volume, one, *unit_distance(distance, volume, given), colors, _white(opened)))
+    return layers
+
+
+def _asked(
+    opened: Content, tf: str | TransferFunction | None, labels: str | LabelTable | None, access: Access
+) -> str | LabelTable | None:
+    """The labels asked for, ``auto`` where the content is recognised; see `layers_of`."""
+    volume = opened.volumes[0]
+    if opened.overlapping:
+        if tf is not None or labels == NONE:
+            raise UsageError(
+                f"{opened.path}: {len(opened.volumes)} layers of segments that overlap; expected labels: leave out "
+                "--tf and --labels none, or take one layer with --component N"
+            )
+        return labels or AUTO
+    if labels not in (None, NONE) and not opened.one_field:
+        raise UsageError(f"{volume.name}: several components; expected one of labels: choose it with --component N")
+    if labels not in (None, NONE) and tf is not None:
+        raise UsageError(f"{volume.name}: both a function and a table of labels; expected one of --tf and --labels")
+    if labels is None and tf is None and opened.one_field:
+        own = holds_table(opened.path)
+        if own or recognised(volume, access.labels):
+            reason = "its segments" if own else "its name and its few integers"
+            warnings.warn(f"{volume.name}: taken as a label map, by {reason} (--labels none: as scalars)", stacklevel=3)
+            return AUTO
+    return labels
+
+
+def functions_of(
+    opened: Content,
+    numbers: Sequence[Statistics],
+    tf: TransferFunction | None,
+    tf_range: str | tuple[float, float] = "data",
+) -> list[TransferFunction]:
+    """What `Content.classified` is shown by, on data values; arguments as `layers_of`, ``numbers`` of each."""
+    if opened.color:
+        kind = "opacity of the file" if len(opened.volumes) > 3 else "opacity by luminance"
+        return [resolve(tf, numbers[0], tf_range) if tf else _function(kind, 0.0, _white(opened), (1, 1, 1))]
+    if opened.one_field:
+        made = None if tf else from_histogram(numbers[0], opened.volumes[0].hounsfield)
+        return [made or resolve(tf, numbers[0], tf_range)]  # type: ignore[arg-type]
+    return [_channel(k, opened.colors[k], its, tf, tf_range) for k, its in enumerate(numbers)]
+
+
+def _white(opened: Content) -> float:
+    """Data value of colours that is 1."""
+    kind = opened.volumes[0].data.dtype
+    return float(np.iinfo(kind).max) if opened.color and kind.kind in "iu" else 1.0
+
+
+def _overlapping(
+    opened: Content, labels: str | LabelTable | None, own: bool, distance: str | None, access: Access
+) -> list[Layer]:
+    """Of layers (.seg.nrrd) or segments (DICOM) that overlap, each under its own, or all under one table.
+
+    Empty ones are left out.
+    """
+    found = []
+    for k, volume in enumerate(opened.volumes):
+        if any(access.labels(volume)):
+            table = segments_of(str(opened.path), k) if own else labels
+            found.append(_labelled(volume, table, distance, access))
+    if not found:
+        raise DataError(f"{opened.path}: no label but 0 in any of its layers; expected some to show")
+    return found
+
+
+def _labelled(volume: Volume, labels: str | LabelTable | None, distance: str | None, access: Access) -> Layer:
+    numbers = access.labels(volume)
+    if isinstance(labels, str) and labels != AUTO:
+        table = read_labels(labels).of(numbers, volume.name)
+    elif isinstance(labels, LabelTable):
+        table = labels.of(numbers, volume.name)
+    elif any(numbers):
+        table = distinct(numbers)
+    else:
+        raise DataError(f"{volume.name}: no label but 0; expected some to show")
+    return Layer(volume, table, *unit_distance(distance, volume))
+
+
+def _luminance(stored: bool, *bands: Volume) -> Volume:
+    """(nz, ny, nx) float32, in the data values of the colours; where they are ``stored`` made block by block."""
+
+    def block(slices: tuple[slice, ...]) -> np.ndarray:
+        z, y, x = slices
+        out = np.zeros((z.stop - z.start, y.stop - y.start, x.stop - x.start), np.float32)
+        lo, hi = np.array([x.start, y.start, z.start]), np.array([x.stop, y.stop, z.stop])
+        for weight, band in zip(LUMINANCE, bands, strict=True):
+            own = read_block(band, lo, hi)
+            for k in range(len(out)):
+                out[k] += weight * (band.slope * own[k].astype(np.float32) + band.intercept)
+        return out
+
+    shape, kind = bands[0].data.shape, np.dtype(np.float32)
+    lazy: Any = Stored(block, kind, shape, chunks_of(bands[0]), bands[0].name)
+    return replace(bands[0], data=lazy if stored else lazy[:], slope=1.0, intercept=0.0)
+
+
+def _channel(
+    number: int,
+    color: tuple[float, float, float] | None,
+    numbers: Statistics,
+    tf: TransferFunction | None,
+    tf_range: str | tuple[float, float],
+) -> TransferFunction:
+    """A channel in its colour; the function's opacity, or a ramp over its brighter voxels."""
+    from vvgt_cli.look.resolve import percentiles
+
+    rgb = color or CHANNEL_COLORS[number % len(CHANNEL_COLORS)]
+    if tf is not None:
+        shown = resolve(tf, numbers, tf_range)
+        lo, hi = shown.node_range()
+        return replace(shown, color_map=_function("", lo, max(hi, lo + 1e-9), rgb).color_map)
+    lo, hi = percentiles(numbers, np.array([DARK, BRIGHT]))
+    return _function(f"channel {number}", float(lo), float(hi) if hi > lo else float(lo) + 1, rgb)
+
+
+def _function(name: str, lo: float, hi: float, rgb: Sequence[float]) -> TransferFunction:
+    """One colour, opacity from 0 at ``lo`` to 1 at ``hi``."""
+    x = np.array([lo, hi])
+    opacity, colors = PiecewiseOpacity(x, np.array([0.0, 1.0])), ColorMap(x, np.array([rgb, rgb], float))
+    return TransferFunction(name, opacity, colors, opacity_unit_share=UNIT_SHARE, opacity_unit_label="automatic")

@@ -1,0 +1,302 @@
+"""What a run starts from: a volume under a transfer function, read and checked."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from vvgt_cli.errors import UsageError
+from vvgt_cli.field.digests import digest, volume_digest
+from vvgt_cli.field.layered import AUTO, IN_MEMORY, NONE, Access, Content, LayerRequest, is_plain, layers_of
+from vvgt_cli.jit.ahead import for_grid, for_light
+from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.look.labels import LabelTable
+from vvgt_cli.look.lighting import Lighting, LightOptions
+from vvgt_cli.volume import ReadOptions, Statistics, Volume
+
+if TYPE_CHECKING:
+    from vvgt_cli.dvr import Scene
+    from vvgt_cli.dvr.layers import Layer
+    from vvgt_cli.dvr.scene import PreparedVolume
+
+OPTICS = 12  # hexadecimal digits of `Source.optics`
+
+
+@dataclass(frozen=True)
+class Opened:
+    """A volume with what does not depend on the function: for several functions, one after the other.
+
+    Attributes:
+        volume: as it was read.
+        statistics: of its values.
+        layout: for the kernels, where it is known.
+        content: all that its file holds, the volume first; None: the volume alone.
+    """
+
+    volume: Volume
+    statistics: Statistics
+    layout: PreparedVolume | None = None
+    content: Content | None = None
+
+    @classmethod
+    def of(cls, content: Volume | Content) -> Opened:
+        """Count and lay out."""
+        from vvgt_cli.dvr.scene import PreparedVolume
+        from vvgt_cli.volume import statistics
+
+        known = content if isinstance(content, Content) else Content((content,))
+        volume = known.volumes[0]
+        return cls(volume, statistics(volume), PreparedVolume.of(volume) if known.one_field else None, known)
+
+
+@dataclass(frozen=True)
+class SourceRequest:
+    """What to read.
+
+    Attributes:
+        volume: path, `example:NAME`, or "-" for raw values on standard input; or a volume that is there already, with
+            what does not depend on the function or without.
+        read: how to read it.
+        tf: transfer-function file or colour-map name, or a function; None makes one from the histogram.
+        tf_range: "data", "rescale" or "LO,HI".
+        unit_distance: a length, "paraview", "mean-spacing", or None: the function's own, else "paraview".
+        statistics: what the functions' nodes follow from in place of the volume's own: those of the whole series, of
+            every component.
+        light: what falls on it; without options what the function's file says, else nothing.
+        labels: table of its labels, the file of one, "auto", "none", or None: "auto" where it is recognised.
+        layers: what is laid over it.
+    """
+
+    volume: str | Volume | Opened
+    read: ReadOptions = field(default_factory=ReadOptions)
+    tf: str | TransferFunction | None = None
+    tf_range: str = "data"
+    unit_distance: str | None = None
+    statistics: tuple[Statistics, ...] = ()
+    light: LightOptions = field(default_factory=LightOptions)
+    labels: str | LabelTable | None = None
+    layers: tuple[LayerRequest, ...] = ()
+
+    @property
+    def path(self) -> str:
+        """Of the volume's file.
+
+        Raises:
+            UsageError: a volume that is there already.
+        """
+        if not isinstance(self.volume, str):
+            volume = self.volume.volume if isinstance(self.volume, Opened) else self.volume
+            raise UsageError(f"{volume.name}: a volume in memory; expected a path here")
+        return self.volume
+
+    def paths(self) -> list[str]:
+        """What of it is read from files."""
+        given = [self.volume, self.tf, self.labels, self.read.mask]
+        given += [part for layer in self.layers for part in (layer.volume, layer.tf, layer.labels)]
+        return [path for path in given if isinstance(path, str) and path not in (AUTO, NONE)]
+
+
+@dataclass(frozen=True)
+class Source:
+    """What was read: the function is visible somewhere in the volume.
+
+    ``unit_distance`` is the world length that opacity refers to, ``unit_label`` how it was chosen, ``lighting`` what
+    falls on it, None for nothing; ``layout`` is the volume's, where it is known. ``layers`` are what adds up to it
+    where it is an optics grid: on the grid of ``volume``; ``tf`` and unit distance are the first one's.
+    """
+
+    volume: Volume
+    statistics: Statistics
+    tf: TransferFunction | LabelTable
+    unit_distance: float
+    unit_label: str
+    lighting: Lighting | None = None
+    layout: PreparedVolume | None = None
+    layers: tuple[Layer, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Of the function, or of all layers."""
+        return " + ".join(layer.name for layer in self.layers) or self.tf.name
+
+    @property
+    def labels_alone(self) -> bool:
+        """Whether all of it is labels."""
+        return bool(self.layers) and all(isinstance(layer.tf, LabelTable) for layer in self.layers)
+
+    def look(self) -> str:
+        """Digest of all that gives the volume its colours, other volumes included."""
+        if isinstance(self.tf, TransferFunction) and not self.layers:
+            return digest(self.tf.opacity_nodes, self.tf.color_map)
+        parts: list[Any] = []
+        for layer in self.layers:
+            tf = layer.tf
+            parts += tf.labels if isinstance(tf, LabelTable) else (tf.opacity_nodes, tf.color_map)
+            parts += [layer.unit_distance, layer.volume.affine, volume_digest(layer.volume), layer.white]
+            parts += [volume_digest(band) for band in layer.colors or ()]
+        return digest(*parts)
+
+    def optics(self) -> str | None:
+        """Digest of an optics grid's tables, functions and unit distances, not of its volumes; None of scalars."""
+        parts: list[Any] = []
+        for layer in self.layers:
+            tf = layer.tf
+            if isinstance(tf, LabelTable):
+                parts += [(e.number, e.color, e.opacity) for e in tf.labels if e.opacity > 0]
+            else:
+                parts += [tf.opacity_nodes, None if layer.colors else tf.color_map]
+            parts.append(f"{layer.unit_distance:.6g}")
+        return digest(*parts)[:OPTICS] if parts else None
+
+    def kernels(self, names: tuple[str, ...]) -> tuple[str, ...]:
+        """The kernels of a command, of the kind of scene and light that this is."""
+        lit = names if self.lighting is None else for_light(names, self.lighting.attenuated)
+        return for_grid(lit) if self.layers else lit
+
+    def kernel_type(self) -> str:
+        """Name of the type in which kernels read the volume's values."""
+        from vvgt_cli.dvr.scene import kernel_type
+
+        if self.layers:
+            return "float32"
+        return kernel_type(self.volume)
+
+    def scene(self) -> Scene:
+        """The volume laid out for the kernels."""
+        from vvgt_cli.dvr import Scene
+
+        if self.layers:
+            from vvgt_cli.dvr.layers import grid_of
+
+            grid = grid_of(self.layers, self.volume)
+            title = Title(self.name)
+            return Scene.of_grid(
+                self.volume, title, self.unit_distance, grid, self.lighting, self.labels_alone
+            )  # fmt: skip
+        assert isinstance(self.tf, TransferFunction)
+        limits = (self.statistics.lo, self.statistics.hi)
+        return Scene.build(self.volume, self.tf, self.unit_distance, limits, lighting=self.lighting, layout=self.layout)
+
+
+@dataclass(frozen=True)
+class Title:
+    """What layers are called together."""
+
+    name: str
+
+
+def load(request: SourceRequest, access: Access = IN_MEMORY) -> Source:
+    """Read the function, then the volume, and bring them together; ``access`` reads it as a whole or in blocks.
+
+    Raises:
+        DataError: a file that is not what it must be, or a function that shows nothing of this volume.
+        UsageError: options that do not fit the file.
+    """
+    return load_all(request, (request.tf,), access)[0]
+
+
+def load_all(
+    request: SourceRequest, tfs: Sequence[str | TransferFunction | None], access: Access = IN_MEMORY
+) -> list[Source]:
+    """One volume under each of several functions; ``request.tf`` is not used.
+
+    Raises:
+        DataError, UsageError: as `load`.
+    """
+    from vvgt_cli.look import check_visible, from_histogram, read_transfer_function, resolve, unit_distance
+    from vvgt_cli.look.resolve import parse_tf_range
+
+    tf_range = parse_tf_range(request.tf_range)
+    functions = [
+        read_transfer_function(tf) if isinstance(tf, str) else tf for tf in tfs
+    ]  # small: their errors come first
+    if None in functions and tf_range != "data":
+        raise UsageError("--tf-range says where the nodes of a function lie; it needs --tf")
+    opened = request.volume if isinstance(request.volume, Opened) else None
+    if isinstance(request.volume, Opened):
+        content = request.volume.content or Content((request.volume.volume,))
+    else:
+        content = access.open(request.volume, request.read)
+    if not is_plain(content, functions[0], request.labels, request.layers, access):
+        return [_layered(request, content, tf, tf_range, access) for tf in functions]
+    volume = content.volumes[0]
+    unit_distance(request.unit_distance, volume)  # its errors come first
+    lights = [request.light.lighting(None if tf is None else tf.lighting, volume.space) for tf in functions]
+    numbers = opened.statistics if opened else access.statistics(volume)
+    sources = []
+    for tf, lighting in zip(functions, lights, strict=True):
+        whole = request.statistics[0] if request.statistics else numbers
+        shown = resolve(tf, whole, tf_range) if tf else from_histogram(whole, volume.hounsfield)
+        if tf is None and whole.lo == whole.hi:
+            warnings.warn(
+                f"{volume.name}: every voxel is {whole.lo:g}, so that only the box is seen; check --dtype, --component "
+                "or --array, or give a --tf",
+                stacklevel=2,
+            )
+        check_visible(shown, numbers)
+        distance, label = unit_distance(request.unit_distance, volume, tf or shown)
+        layout = opened.layout if opened else None
+        sources.append(Source(volume, numbers, shown, distance, label, lighting, layout))
+    return sources
+
+
+def _layered(
+    request: SourceRequest, content: Content, tf: TransferFunction | None, tf_range: str | tuple[float, float],
+    access: Access,
+) -> Source:  # fmt: skip
+    """The optics grid that a volume and its layers add up to."""
+    from vvgt_cli.dvr.layers import common_grid
+
+    lighting = request.light.lighting(None if tf is None else tf.lighting, content.volumes[0].space)
+    layers = layers_of(content, tf, request.labels, tf_range, request.unit_distance, request.statistics, access)
+    for other in request.layers:
+        inner = access.open(other.volume, other.read)
+        layers += layers_of(inner, other.tf, other.labels, "data", other.distance, access=access)
+    first, grid = layers[0], common_grid(layers, content.stored)
+    numbers = access.statistics(first.volume)
+    return Source(
+        grid, numbers, first.tf, first.unit_distance, first.unit_label, lighting, layers=tuple(layers)
+    )  # fmt: skip
+
+
+def describe_source(source: Source) -> str:
+    """One line: grid, type, values, function, unit distance."""
+    volume, numbers = source.volume, source.statistics
+    grid = " x ".join(map(str, volume.dims))
+    holes = [f"{n} {what} (transparent)" for n, what in ((numbers.nan_count, "NaN"), (numbers.inf_count, "inf")) if n]
+    values = ", ".join([f"values {numbers.lo:g} to {numbers.hi:g}", *holes])
+    distance = f"opacity per {source.unit_distance:g} ({source.unit_label})"
+    light = "" if source.lighting is None else f"; light {source.lighting.text()}"
+    name = source.name if len(source.layers) > 1 else source.tf.name
+    return f"{volume.name}: {grid} {volume.data.dtype.name}, {values}; {name}: {distance}{light}"
+
+
+def volume_record(source: Source) -> dict[str, Any]:
+    """The volume as reports show it."""
+    volume, numbers = source.volume, source.statistics
+    return {
+        "name": volume.name,
+        "dims": volume.dims,
+        "dtype": volume.data.dtype.name,
+        "spacing": volume.spacing,
+        "space": volume.space or "none",
+        "range": (numbers.lo, numbers.hi),
+        "nan": numbers.nan_count,
+        "inf": numbers.inf_count,
+    }
+
+
+def tf_record(source: Source, request: SourceRequest) -> dict[str, Any]:
+    """The transfer function as reports show it."""
+    return {
+        "name": source.name if len(source.layers) > 1 else source.tf.name,
+        "given": request.tf is not None,
+        "tf_range": request.tf_range,
+        "nodes": source.tf.node_range(),
+        "unit_distance": source.unit_distance,
+        "unit_distance_label": source.unit_label,
+        **({} if source.lighting is None else {"light": source.lighting.text()}),
+        **({"layers": [layer.name for layer in source.layers]} if source.layers else {}),
+    }

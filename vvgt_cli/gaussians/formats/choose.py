@@ -1,0 +1,104 @@
+"""Which format a name stands for, how it is written, and how what was written is read again."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from vvgt_cli.errors import DataError
+from vvgt_cli.files import seekable
+from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions, read_ply
+from vvgt_cli.gaussians.formats import gltf, gsply_files, page_file, sog, usd
+from vvgt_cli.gaussians.formats.splats import Splats, gaussians_of, splats_of
+
+_HEAD = 1024  # bytes that tell a .ply of another kind
+_LARGEST = 1 << 32  # bytes of a file that is read whole
+
+
+@dataclass(frozen=True)
+class Format:
+    """Another format than the standard `.ply`.
+
+    Attributes:
+        suffix: that names end in.
+        write: columns and a name for errors -> the file's bytes.
+        read: bytes and a name for errors -> columns.
+        needs: given a name for errors, raises DataError where a library or a program is not installed.
+        layout: how Gaussians are laid out for it, given how a `.ply` would be.
+    """
+
+    suffix: str
+    write: Callable[[Splats, str], bytes]
+    read: Callable[[bytes, str], Splats]
+    needs: Callable[[str], object]
+    layout: Callable[[PlyOptions], PlyOptions] = lambda options: options
+
+
+FORMATS = (
+    Format(".compressed.ply", gsply_files.compressed_ply, gsply_files.read_compressed_ply, gsply_files.gsply),
+    Format(".spz", gsply_files.spz, gsply_files.read_spz, gsply_files.gsply),
+    Format(".sog", sog.sog, sog.read_sog, sog.program),
+    Format(".glb", gltf.glb, gltf.read_glb, lambda name: None),
+    Format(".usdc", usd.usdc, usd.read_usdc, usd.library),
+    Format(".html", page_file.html, page_file.read_html, gsply_files.gsply, page_file.upright),
+)
+SUFFIXES = (".ply", *(known.suffix for known in FORMATS))
+
+
+def format_of(path: str | os.PathLike[str]) -> Format | None:
+    """The format that a name stands for; None for the standard `.ply`, and for names that say nothing."""
+    name = Path(path).name.lower()
+    return next((known for known in FORMATS if name.endswith(known.suffix)), None)
+
+
+def ready(path: str | Path) -> None:
+    """See that the format of a name can be written here.
+
+    Raises:
+        DataError: a library or a program that it needs is not installed; the error names it.
+    """
+    known = format_of(path)
+    if known is not None:
+        known.needs(str(path))
+
+
+def encoded(known: Format, gaussians: Gaussians, options: PlyOptions, name: str) -> bytes:
+    """Gaussians (unit frame) as a file of another format, laid out as `PlyOptions` say.
+
+    Raises:
+        DataError: values that it cannot hold, a library or a program that is not installed, or fails.
+    """
+    return known.write(splats_of(gaussians, known.layout(options)), name)
+
+
+def is_splats(path: str | Path) -> bool:
+    """Whether a path is a file of Gaussians by its name, or by the `ply` that it begins with."""
+    if Path(path).name.lower().endswith(SUFFIXES):
+        return True
+    try:
+        with open(seekable(path), "rb") as stream:
+            return stream.read(4) in (b"ply\n", b"ply\r")
+    except OSError:
+        return False
+
+
+def read_splats(path: str | Path) -> tuple[Gaussians, PlyHeader]:
+    """Read a file of Gaussians of any format, in the frame that it is in; the header's comments are the file's.
+
+    Raises:
+        DataError: not a file of its format, or its library is not installed.
+    """
+    known, place = format_of(path) or _compressed(path), seekable(path)
+    if known is None:
+        return read_ply(path)
+    if place.stat().st_size > _LARGEST:
+        raise DataError(f"{path}: more than 4 GiB; expected less of this format, or a standard .ply")
+    return gaussians_of(known.read(place.read_bytes(), str(path)), str(path))
+
+
+def _compressed(path: str | Path) -> Format | None:
+    """`.compressed.ply` under another name."""
+    with open(seekable(path), "rb") as stream:
+        return FORMATS[0] if b"\nelement chunk " in stream.read(_HEAD) else None

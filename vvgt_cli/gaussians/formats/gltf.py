@@ -1,0 +1,135 @@
+"""Binary glTF with KHR_gaussian_splatting: float32 attributes of a mesh of points, nothing rounded.
+
+The data are the `.ply`'s, in its axes; the node turns them by 180 degrees about z, to glTF's +y upwards.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from vvgt_cli.errors import DataError
+from vvgt_cli.gaussians.formats.splats import Splats, logits_of, opacities_of
+from vvgt_cli.version import VERSION
+
+EXTENSION = "KHR_gaussian_splatting"
+_KERNEL = {
+    "kernel": "ellipse", "colorSpace": "srgb_rec709_display", "sortingMethod": "cameraDistance",
+    "projection": "perspective",
+}  # fmt: skip
+_MAGIC, _JSON, _BINARY = 0x46546C67, 0x4E4F534A, 0x004E4942
+_FLOAT, _ARRAY, _POINTS = 5126, 34962, 0
+_TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+_HALF_TURN = [0.0, 0.0, 1.0, 0.0]  # about z, (x, y, z, w)
+
+
+def glb(splats: Splats, name: str) -> bytes:
+    """A `.glb` of the columns."""
+    columns = {
+        "POSITION": splats.means,
+        f"{EXTENSION}:ROTATION": splats.quaternions[:, [1, 2, 3, 0]],
+        f"{EXTENSION}:SCALE": np.exp(splats.log_scales.astype(np.float64)),
+        f"{EXTENSION}:OPACITY": opacities_of(splats.logits)[:, None],
+        f"{EXTENSION}:SH_DEGREE_0_COEF_0": splats.f_dc,
+    }
+    for m in range(splats.f_rest.shape[1]):
+        columns[_harmonic(m)] = splats.f_rest[:, m]
+    parts = [np.ascontiguousarray(column, "<f4") for column in columns.values()]
+    views: list[dict[str, Any]] = []
+    accessors: list[dict[str, Any]] = []
+    start = 0
+    for part in parts:
+        views.append({"buffer": 0, "byteOffset": start, "byteLength": part.nbytes, "target": _ARRAY})
+        accessors.append(_accessor(len(accessors), part))
+        start += part.nbytes
+    accessors[0] |= {"min": splats.means.min(axis=0).tolist(), "max": splats.means.max(axis=0).tolist()}
+    attributes = {attribute: k for k, attribute in enumerate(columns)}
+    primitive = {"attributes": attributes, "mode": _POINTS, "extensions": {EXTENSION: _KERNEL}}
+    document = {
+        "asset": {"version": "2.0", "generator": f"vvgt {VERSION}", "extras": {"comments": list(splats.comments)}},
+        "extensionsUsed": [EXTENSION],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "rotation": _HALF_TURN}],
+        "meshes": [{"primitives": [primitive]}],
+        "buffers": [{"byteLength": start}],
+        "bufferViews": views,
+        "accessors": accessors,
+    }
+    head = json.dumps(document, separators=(",", ":")).encode()
+    head += b" " * (-len(head) % 4)
+    length = 12 + 8 + len(head) + 8 + start
+    front = struct.pack("<5I", _MAGIC, 2, length, len(head), _JSON) + head + struct.pack("<2I", start, _BINARY)
+    return front + b"".join(part.tobytes() for part in parts)
+
+
+def _accessor(view: int, part: np.ndarray) -> dict[str, Any]:
+    return {"bufferView": view, "componentType": _FLOAT, "count": len(part), "type": _TYPES[part.shape[1]]}
+
+
+def _harmonic(m: int) -> str:
+    """Attribute of harmonic ``m``, counted from 0 above degree 0."""
+    degree = 1 if m < 3 else 2 if m < 8 else 3
+    return f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{m - (degree**2 - 1)}"
+
+
+def read_glb(content: bytes, name: str) -> Splats:
+    """The columns of a `.glb` as `glb` writes it: one mesh, float32.
+
+    Raises:
+        DataError: another file, or of another kind of data.
+    """
+    try:
+        return _read(content, name)
+    except (KeyError, IndexError, TypeError, ValueError, struct.error) as error:
+        raise DataError(
+            f"{name}: not a .glb of Gaussians ({type(error).__name__}: {error}); expected one mesh with {EXTENSION} "
+            "in float32, as vvgt writes it"
+        ) from None
+
+
+def _read(content: bytes, name: str) -> Splats:
+    magic, _, _, size, kind = struct.unpack_from("<5I", content)
+    if (magic, kind) != (_MAGIC, _JSON):
+        raise ValueError("no JSON chunk in front")
+    document, binary = json.loads(content[20 : 20 + size]), content[28 + size :]
+    attributes = document["meshes"][0]["primitives"][0]["attributes"]
+
+    def column(attribute: str, width: int) -> np.ndarray:
+        accessor = document["accessors"][attributes[attribute]]
+        view = document["bufferViews"][accessor["bufferView"]]
+        if accessor["componentType"] != _FLOAT or accessor["type"] != _TYPES[width] or "byteStride" in view:
+            raise ValueError(f"{attribute} of type {accessor['componentType']} {accessor['type']}")
+        start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
+        values = np.frombuffer(binary, "<f4", accessor["count"] * width, start)
+        return values.reshape(-1, width) if width > 1 else values
+
+    _only_the_half_turn(document["nodes"])
+    known = [m for m in range(15) if _harmonic(m) in attributes]
+    means, count = column("POSITION", 3), len(column("POSITION", 3))
+    f_rest = [column(_harmonic(m), 3) for m in known]
+    with np.errstate(divide="ignore"):
+        log_scales = np.log(column(f"{EXTENSION}:SCALE", 3).astype(np.float64))
+    comments = document["asset"].get("extras", {}).get("comments", [])
+    return Splats(
+        means,
+        np.maximum(log_scales, -80).astype(np.float32),
+        column(f"{EXTENSION}:ROTATION", 4)[:, [3, 0, 1, 2]],
+        logits_of(column(f"{EXTENSION}:OPACITY", 1)),
+        column(f"{EXTENSION}:SH_DEGREE_0_COEF_0", 3),
+        np.stack(f_rest, axis=1) if f_rest else np.zeros((count, 0, 3), np.float32),
+        tuple(str(line).replace("\n", " ") for line in comments),
+    )
+
+
+def _only_the_half_turn(nodes: Sequence[dict[str, Any]]) -> None:
+    """Raise ValueError for nodes that place the mesh otherwise than `glb` does."""
+    placed = [
+        {key: node[key] for key in node if key in ("rotation", "translation", "scale", "matrix")} for node in nodes
+    ]
+    if placed != [{"rotation": _HALF_TURN}]:
+        raise ValueError("its nodes place the mesh otherwise")

@@ -1,0 +1,107 @@
+"""`.spz` (Niantic's, version 3) and `.compressed.ply` (PlayCanvas') through gsply."""
+
+from __future__ import annotations
+
+import gzip
+import struct
+import tempfile
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vvgt_cli.errors import DataError
+from vvgt_cli.gaussians.formats.splats import Splats, morton_order
+from vvgt_cli.volume.libraries import library_errors, need
+
+EXTRA = "share"
+_FRACTION = 20  # bits of a coordinate behind the point, where its 23 leave as many: 1e-6
+_COMMENT = 16  # gzip's flag for a comment in its header (RFC 1952)
+_FRONT = struct.Struct("<2sBBIBB")  # magic, method, flags, time, extra flags, system
+
+
+def gsply(source: str) -> Any:
+    """The library.
+
+    Raises:
+        DataError: it is not installed.
+    """
+    return need("gsply", EXTRA, source, "this format")
+
+
+def compressed_ply(splats: Splats, name: str) -> bytes:
+    """A `.compressed.ply`: 16 bytes a Gaussian and 72 for 256 of them, which lie near each other."""
+    library = gsply(name)
+    s = splats.take(morton_order(splats.means))
+    rest = s.f_rest if s.f_rest.shape[1] else None
+    content: bytes = library.compress_to_bytes(s.means, s.log_scales, s.quaternions, s.logits, s.f_dc, rest)
+    said = "".join(f"comment {line}\n" for line in s.comments).encode()
+    head, end, body = content.partition(b"end_header\n")
+    return head + said + end + body
+
+
+def read_compressed_ply(content: bytes, name: str) -> Splats:
+    """The columns of a `.compressed.ply`.
+
+    Raises:
+        DataError: gsply cannot read it, or is not installed.
+    """
+    library = gsply(name)
+    with library_errors(name, "a compressed .ply"):
+        head = content[: content.index(b"end_header")].decode("utf-8")
+        data = library.decompress_from_bytes(content)
+        return _columns(data, [line[8:] for line in head.splitlines() if line.startswith("comment ")])
+
+
+def spz(splats: Splats, name: str) -> bytes:
+    """An `.spz` of version 3, in the axes of the `.ply`; its gzip header's comment holds the `.ply`'s comments."""
+    library = gsply(name)
+    largest = max(float(np.abs(splats.means).max()), 1e-6)
+    bits = min(int(np.floor(np.log2((2**23 - 1) / largest))), _FRACTION)
+    if bits < 1:
+        raise DataError(f"{name}: positions up to {largest:g}; expected less than 4e6 in an .spz; try --frame unit")
+    s = splats
+    rest = s.f_rest if s.f_rest.shape[1] else None
+    data = library.GSData.from_arrays(s.means, s.log_scales, s.quaternions, s.logits, s.f_dc, rest, format="ply")
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "out.spz"
+        library.write_spz(path, data, version=3, fractional_bits=bits)
+        return _packed(gzip.decompress(path.read_bytes()), s.comments)
+
+
+def _packed(content: bytes, comments: tuple[str, ...]) -> bytes:
+    """gzip with comments, and the same bytes every time."""
+    packer = zlib.compressobj(9, zlib.DEFLATED, -15)
+    said = "\n".join(comments).encode("ascii", "replace").replace(b"\0", b" ")
+    front = _FRONT.pack(b"\x1f\x8b", 8, _COMMENT if said else 0, 0, 2, 255) + (said + b"\0" if said else b"")
+    return front + packer.compress(content) + packer.flush() + struct.pack("<II", zlib.crc32(content), len(content))
+
+
+def read_spz(content: bytes, name: str) -> Splats:
+    """The columns of an `.spz`.
+
+    Raises:
+        DataError: gsply cannot read it, or is not installed.
+    """
+    library = gsply(name)
+    with library_errors(name, "an .spz"), tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "in.spz"
+        path.write_bytes(content)
+        return _columns(library.read_spz(path), _comments(content))
+
+
+def _comments(content: bytes) -> list[str]:
+    """Those that `_packed` left."""
+    if len(content) < _FRONT.size or _FRONT.unpack_from(content)[2] != _COMMENT:
+        return []
+    said = content[_FRONT.size : content.index(b"\0", _FRONT.size)]
+    return said.decode("ascii", "replace").splitlines()
+
+
+def _columns(data: Any, comments: list[str]) -> Splats:
+    count = len(data.means)
+    rest = np.zeros((count, 0, 3)) if data.shN is None else np.reshape(data.shN, (count, -1, 3))
+    found = (data.means, data.scales, data.quats, np.reshape(data.opacities, count), data.sh0, rest)
+    means, log_scales, quaternions, logits, f_dc, f_rest = (np.array(column, np.float32) for column in found)
+    return Splats(means, log_scales, quaternions, logits, f_dc, f_rest, tuple(comments))

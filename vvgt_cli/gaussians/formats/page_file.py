@@ -1,0 +1,135 @@
+"""The page that shows Gaussians: its text, and the whole of it as one file that opens without a server.
+
+`page/` holds its text, and `viewer.js.gz`, which `make page` builds of `page.mjs`, SuperSplat's viewer and the
+PlayCanvas engine (docs/dependencies.md).
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from html import escape
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+
+from vvgt_cli.cameras import orbit_views
+from vvgt_cli.errors import DataError
+from vvgt_cli.gaussians import PlyOptions
+from vvgt_cli.gaussians.formats.gsply_files import compressed_ply, read_compressed_ply
+from vvgt_cli.gaussians.formats.splats import Splats
+from vvgt_cli.gaussians.rules import INRIA, RULES
+
+PROGRAM = "viewer.js.gz"
+_RULE = re.compile(r"vvgt size \d+ rule (\w+)$")
+_UNIT = re.compile(r"vvgt frame unit\b")
+_SPLATS = re.compile(rb'<script type="application/octet-stream" id="splats-\d+">([A-Za-z0-9+/=]+)</script>')
+_FAR = 99  # percentile of the distances from the middle that a camera stands back by
+_DISTANCE, _FIELD = 3.0, 40.0  # of the orbits' cameras, in half edges of the unit frame and in degrees
+
+
+def asset(name: str) -> bytes:
+    """A file of `page/`."""
+    return files("vvgt_cli.gaussians.formats").joinpath("page", name).read_bytes()
+
+
+def upright(options: PlyOptions) -> PlyOptions:
+    """How Gaussians are laid out to be looked at: in the unit frame, with the way up of `vvgt render` upwards.
+
+    Viewers turn every file as 3DGS' files want it: PLY -y is up. Files that do not say where they are stay as they are.
+    """
+    if not options.comments:
+        return options
+    return replace(options, frame="unit", up="z" if options.up == "none" else options.up)
+
+
+def camera(splats: Splats) -> dict[str, Any]:
+    """Where the page's camera begins: where `vvgt render --orbit` does, or as far from the middle of other files.
+
+    Returns:
+        Position and target in the viewer's axes, which have PLY (x, y, z) at (-x, -y, z); the field of view in degrees.
+    """
+    middle, half = np.zeros(3), 1.0
+    if not any(_UNIT.match(line) for line in splats.comments):
+        middle = np.median(splats.means, axis=0).astype(np.float64)
+        half = float(np.percentile(np.linalg.norm(splats.means - middle, axis=1), _FAR)) or 1.0
+    x, y, z = orbit_views(1, radius=_DISTANCE * half)[0].position  # +z is up
+    target = middle * (-1, -1, 1)
+    return {"position": (target + np.array([-x, z, y])).tolist(), "target": target.tolist(), "fov": _FIELD}
+
+
+def drawing(splats: Splats) -> dict[str, Any]:
+    """What the page's viewer changes to draw by the rule that the file names, or by the usual one."""
+    said = (_RULE.match(line) for line in splats.comments)
+    rule = RULES.get(next((found[1] for found in said if found), ""), INRIA)
+    return {
+        "dilation": rule.dilation, "compensate": rule.compensate, "shifted": rule.shifted,
+        "minAlpha": rule.min_alpha, "minVariance": rule.min_variance,
+    }  # fmt: skip
+
+
+def page(title: str, splats: Splats, frames: Sequence[dict[str, str]], parts: str) -> str:
+    """The page's text.
+
+    Args:
+        title: of the window.
+        splats: of the first frame.
+        frames: of each its ``name``, its ``file``, and what it is ``held`` in, where that is in the page.
+        parts: elements that bring the viewer.
+    """
+    scene = {"rule": drawing(splats), "camera": camera(splats), "frames": list(frames)}
+    said = json.dumps(scene).replace("<", "\\u003c")  # no name ends the script
+    text = asset("page.html").decode("utf-8")
+    for place, value in (("TITLE", escape(title)), ("SCENE", said), ("PARTS", parts)):
+        text = text.replace(f"<!--{place}-->", value, 1)
+    return text
+
+
+def html(splats: Splats, name: str) -> bytes:
+    """The page of one cloud as one file."""
+    return html_of_several([(_title(name), splats)], name)
+
+
+def html_of_several(clouds: Sequence[tuple[str, Splats]], name: str) -> bytes:
+    """The page as one file: the viewer packed by gzip, each cloud as a `.compressed.ply`, all in base64.
+
+    Args:
+        clouds: each one's name, as the page's list has it, and columns; the first is shown at first.
+        name: of the file.
+    """
+    held = [("program", "text/plain", asset(PROGRAM))]
+    for k, (cloud, splats) in enumerate(clouds):
+        held.append((f"splats-{k}", "application/octet-stream", compressed_ply(splats, cloud)))
+    elements = [
+        f'<script type="{kind}" id="{key}">{base64.b64encode(content).decode("ascii")}</script>'
+        for key, kind, content in held
+    ]
+    parts = [*elements, f"<script>{asset('inflate.js').decode('utf-8')}</script>"]
+    frames = [
+        {"name": cloud, "file": f"{k}.compressed.ply", "held": f"splats-{k}"} for k, (cloud, _) in enumerate(clouds)
+    ]
+    return page(_title(name), clouds[0][1], frames, "\n".join(parts)).encode("utf-8")
+
+
+def _title(name: str) -> str:
+    return re.split(r"[/\\]", name)[-1].removesuffix(".html")
+
+
+def read_html(content: bytes, name: str) -> Splats:
+    """The columns of a page that `html` wrote.
+
+    Raises:
+        DataError: another page, or one of several clouds.
+    """
+    found = _SPLATS.findall(content)
+    if not found:
+        raise DataError(f"{name}: a page without Gaussians; expected one that vvgt wrote")
+    if len(found) > 1:
+        raise DataError(
+            f"{name}: a page of {len(found)} clouds of Gaussians; expected one: try the .ply of one of them"
+        )
+    return read_compressed_ply(base64.b64decode(found[0]), name)

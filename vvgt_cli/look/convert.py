@@ -1,0 +1,122 @@
+"""Transfer functions written to files: our minimal JSON and ParaView's preset JSON."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.look.colormap import ColorMap
+from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.look.lighting import COEFFICIENTS
+from vvgt_cli.look.opacity import PiecewiseOpacity
+
+
+def placed(tf: TransferFunction, limits: tuple[float, float] | None) -> TransferFunction:
+    """The function on data values, its nodes stretched to ``limits`` where some are given.
+
+    Raises:
+        UsageError: fractions of a range and no limits, or limits for percentiles.
+    """
+    if tf.domain == "percentile":
+        if limits is not None:
+            raise UsageError(f"{tf.name}: its nodes are percentiles of the data; leave out --tf-range")
+        return tf
+    if tf.domain == "fraction":
+        if limits is None:
+            raise UsageError(
+                f"{tf.name}: its nodes are fractions of the range of the data; say of which: --tf-range LO,HI"
+            )
+        share = tf.breakpoints()
+        return tf.moved(limits[0] * (1 - share) + limits[1] * share)
+    return tf if limits is None else tf.rescaled(*limits)
+
+
+def to_text(tf: TransferFunction, form: str) -> str:
+    """The JSON text of a function on data values or percentiles.
+
+    Args:
+        tf: see `placed`.
+        form: "minimal" or "paraview".
+
+    Raises:
+        DataError: something that the format cannot hold.
+    """
+    body = _minimal(tf) if form == "minimal" else _paraview(tf)
+    return json.dumps(body, indent=1, allow_nan=False) + "\n"
+
+
+def _linear(function: PiecewiseOpacity | ColorMap) -> bool:
+    """Whether values between nodes are on straight lines, in their colour space."""
+    inner = slice(0, -1)  # the last node's are of no segment
+    straight = (function.midpoint[inner] == 0.5) & (function.sharpness[inner] == 0)
+    return bool(straight.all()) and not function.log_scale
+
+
+def _refuse(tf: TransferFunction, what: str, form: str, hint: str) -> DataError:
+    return DataError(f"{tf.name}: {what}; {form} cannot hold that: {hint}")
+
+
+def _check_share(tf: TransferFunction, form: str) -> None:
+    if tf.opacity_unit_share is not None:
+        raise _refuse(
+            tf, "its opacity is per a share of the volume's edge", form, "use the file as it is, or state the length"
+        )
+
+
+def _minimal(tf: TransferFunction) -> dict[str, Any]:
+    hint = "try --format paraview"
+    _check_share(tf, "the minimal format")
+    if not _linear(tf.opacity_nodes) or not _linear(tf.color_map):
+        raise _refuse(tf, "midpoints, sharpness or a logarithmic scale", "the minimal format", hint)
+    if tf.color_map.space == "HSV" and not tf.color_map.hsv_wrap:
+        raise _refuse(tf, "HSV the long way round", "the minimal format", hint)
+    body: dict[str, Any] = {"name": tf.name}
+    if tf.domain == "percentile":
+        body["range"] = "percentile"
+    body["points"] = _points(tf)
+    if tf.color_map.space != "RGB":
+        body["color_space"] = tf.color_map.space
+    if tf.opacity_unit_distance is not None:
+        body["opacity_unit_distance"] = tf.opacity_unit_distance
+    if tf.lighting is not None:
+        body["lighting"] = {name: getattr(tf.lighting, name) for name in COEFFICIENTS}
+    return body
+
+
+def _points(tf: TransferFunction) -> list[dict[str, Any]]:
+    """Nodes of opacity and of colour; one point where both have the same nodes."""
+    opacity, color = tf.opacity_nodes, tf.color_map
+    if np.array_equal(opacity.x, color.x):
+        rows = zip(opacity.x.tolist(), color.rgb.tolist(), opacity.y.tolist(), strict=True)
+        return [{"x": x, "rgb": rgb, "opacity": y} for x, rgb, y in rows]
+    points: list[dict[str, Any]] = [
+        {"x": x, "opacity": y} for x, y in zip(opacity.x.tolist(), opacity.y.tolist(), strict=True)
+    ]
+    points += [{"x": x, "rgb": rgb} for x, rgb in zip(color.x.tolist(), color.rgb.tolist(), strict=True)]
+    return sorted(points, key=lambda point: point["x"])
+
+
+def _paraview(tf: TransferFunction) -> list[dict[str, Any]]:
+    opacity, color = tf.opacity_nodes, tf.color_map
+    _check_share(tf, "a ParaView preset")
+    if tf.domain == "percentile":
+        raise _refuse(tf, "its nodes are percentiles", "a ParaView preset", "try --format minimal")
+    inner = slice(0, -1)
+    if (color.midpoint[inner] != 0.5).any() or (color.sharpness[inner] != 0).any():
+        raise _refuse(tf, "midpoints or sharpness of colours", "a ParaView preset", "use the file as it is")
+    if opacity.log_scale:
+        raise _refuse(tf, "opacity on a logarithmic scale", "a ParaView preset", "use the file as it is")
+    preset = {
+        "Name": tf.name,
+        "ColorSpace": color.space,
+        "HSVWrap": int(color.hsv_wrap),
+        "NanColor": list(color.nan_color),
+        "RGBPoints": np.column_stack([color.x, color.rgb]).ravel().tolist(),
+        "Points": np.column_stack([opacity.x, opacity.y, opacity.midpoint, opacity.sharpness]).ravel().tolist(),
+    }
+    if color.log_scale:
+        preset["UseLogScale"] = 1
+    return [preset]

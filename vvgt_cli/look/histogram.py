@@ -1,0 +1,195 @@
+"""The function used when none is given: tissue by Hounsfield units, or a part in the picture for every value."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from vvgt_cli.errors import DataError
+from vvgt_cli.look.colormap import ColorMap
+from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.look.opacity import PiecewiseOpacity
+from vvgt_cli.look.resolve import StatisticsLike
+
+NAME = "automatic (histogram)"
+HOUNSFIELD = "automatic (Hounsfield units)"
+UNIT_SHARE = 1 / 256  # of the box's longest edge: what opacities are per, so that they do not depend on voxels or units
+DOMINANT = 0.25  # share of the voxels from which a peak counts as a background
+AMID = 0.125  # share of the value range that a background spans at most, where it is not the lowest (ambient)
+SIDE = 0.02  # share of the foreground that a side of the background must hold to be shown
+SIDE_WIDTH = 0.125  # share of the value range that it must span: less is padding or clipping
+PADDING_BINS = 2  # a first peak this narrow, at the low end, may be padding with the air peak behind it
+BEHIND_AIR = 0.2  # share of the voxels other than padding that must lie behind a peak for it to be air
+DEPTH = 4.0  # optical depth of the foreground along the longest edge, on average over the box
+RISE = 2.0  # power of the distance from the background by which ranges of values share that depth
+NODES = 33  # of opacity, a side
+SMOOTH = 3.0  # filled bins: standard deviation of what counts are averaged by
+LABELS = 0.25  # share of the bins up to which those that are filled are values of their own, not averaged
+OPAQUE = 0.5  # most opacity per unit distance
+FAINT = 0.01  # opacity of data of a single value
+# Lightness rises from 25 to 97 (CIE L*), from brown over flesh to ivory; below an ambient value from blue to white
+COLORS = np.array(
+    [
+        [0.36, 0.17, 0.12],
+        [0.60, 0.30, 0.20],
+        [0.80, 0.49, 0.33],
+        [0.91, 0.70, 0.50],
+        [0.97, 0.87, 0.72],
+        [1, 0.98, 0.93],
+    ]
+)
+COLD = COLORS[:, ::-1]
+AIR, BETWEEN, TISSUE = (-1100.0, -850.0), (-700.0, -250.0), (-200.0, 300.0)  # HU
+SHARE = 0.03  # of the voxels that must be air's, and tissue's, for values to be Hounsfield units
+PEAK = 2.0  # times as many voxels per HU as between the two
+# HU, opacity per unit distance, colour: air; skin, lungs' and bowels' walls; fat; organs; vessels with contrast; bone
+TISSUES = (
+    (-700, 0.0, (0.75, 0.45, 0.35)),
+    (-450, 0.014, (0.80, 0.52, 0.40)),
+    (-250, 0.008, (0.85, 0.60, 0.45)),
+    (-120, 0.001, (0.90, 0.72, 0.48)),
+    (-20, 0.0015, (0.80, 0.45, 0.35)),
+    (60, 0.005, (0.72, 0.30, 0.24)),
+    (130, 0.015, (0.80, 0.25, 0.18)),
+    (220, 0.07, (0.88, 0.35, 0.22)),
+    (400, 0.14, (0.95, 0.70, 0.48)),
+    (700, 0.30, (0.98, 0.92, 0.80)),
+    (1500, 0.5, (1.0, 0.99, 0.95)),
+)
+
+
+def from_histogram(statistics: StatisticsLike, hounsfield: bool = False) -> TransferFunction:
+    """A transfer function chosen from the histogram; deterministic.
+
+    Hounsfield units (told, or air near -1000 and tissue around 0) get `TISSUES`. Of other values the peak that holds
+    most voxels is background: its foot is found by the triangle method (Zack, Rogers, Latt 1977), on each side that
+    leads to more data; a second dominant peak right behind it (air behind narrow padding) is skipped too. Every value
+    in front of it has its part of an optical depth of `DEPTH`, by the square of its distance from the background and
+    however many voxels hold it: what is common (the inside of things) is thin, what is rare (small things, the
+    brightest) is thick. Data without a dominant peak are shown whole.
+
+    Args:
+        statistics: range and histogram of the data.
+        hounsfield: whether the file says that data values are Hounsfield units.
+
+    Returns:
+        The function on data values, opacity per `UNIT_SHARE`, named `NAME` or `HOUNSFIELD`.
+
+    Raises:
+        DataError: no finite voxel.
+    """
+    counts = np.asarray(statistics.histogram, dtype=np.float64)
+    edges = np.asarray(statistics.edges, dtype=np.float64)
+    lo, hi = float(statistics.lo), float(statistics.hi)
+    if not (math.isfinite(lo) and math.isfinite(hi)) or counts.sum() <= 0:
+        raise DataError("the data have no finite voxel; expected some to choose a transfer function from")
+    if lo == hi:  # a box, seen through
+        return _function(NAME, np.array([lo]), np.array([FAINT]), ColorMap(np.array([lo]), COLORS[3:4], space="Lab"))
+    if hounsfield or in_hounsfield(counts, edges):
+        x, y, rgb = (np.array(column, dtype=np.float64) for column in zip(*TISSUES, strict=True))
+        tissues = _function(HOUNSFIELD, x, y, ColorMap(x, rgb, space="Lab"))
+        if tissues.support(lo, hi):
+            return tissues
+    first, last = background_bins(counts)
+    left, right = (_worth_showing(side, counts) for side in (slice(0, first), slice(last, None)))
+    if not (left or right):
+        first = last = 0
+    positions: list[float] = []
+    opacities: list[float] = []
+    colors: list[np.ndarray] = []
+    if left:
+        x, y, rgb = _side(counts[:first][::-1], counts.sum(), COLD)
+        positions += (first - x)[::-1].tolist()
+        opacities += y[::-1].tolist()
+        colors += [*rgb[::-1]]
+    if right or not left:
+        x, y, rgb = _side(counts[last:], counts.sum(), COLORS)
+        positions += (last + x).tolist()
+        opacities += y.tolist()
+        colors += [*rgb]
+    at = np.interp(positions, np.arange(counts.size + 1), edges)
+    return _function(NAME, at, np.array(opacities), ColorMap(at, np.array(colors), space="Lab"))
+
+
+def _function(name: str, x: np.ndarray, y: np.ndarray, colors: ColorMap) -> TransferFunction:
+    return TransferFunction(
+        name, PiecewiseOpacity(x, y), colors, opacity_unit_share=UNIT_SHARE, opacity_unit_label="automatic"
+    )
+
+
+def in_hounsfield(counts: np.ndarray, edges: np.ndarray) -> bool:
+    """Whether data values are Hounsfield units: a peak of them is air's, another one is tissue's."""
+    cumulative = np.concatenate([[0.0], np.cumsum(counts)]) / counts.sum()
+    spans = (AIR, BETWEEN, TISSUE)
+    air, between, tissue = (float(np.diff(np.interp(span, edges, cumulative))[0]) for span in spans)
+    highest = PEAK * between / (BETWEEN[1] - BETWEEN[0])
+    peaks = air / (AIR[1] - AIR[0]) > highest and tissue / (TISSUE[1] - TISSUE[0]) > highest
+    return peaks and min(air, tissue) >= SHARE
+
+
+def _side(counts: np.ndarray, total: float, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Nodes of the values on one side of the background, from it outwards: bins from it, opacity, RGB."""
+    bins, filled = counts.size, np.flatnonzero(counts)
+    common = counts[filled] if filled.size <= LABELS * bins else _averaged(counts[filled])
+    weight = ((filled + 0.5) / bins) ** RISE
+    # the optical depth of a bin along the longest edge is its extinction, times its share of the voxels, times 256
+    extinction = DEPTH * weight / weight.sum() / (common / total) * UNIT_SHARE
+    extinction = np.minimum(extinction, -math.log1p(-OPAQUE))
+    x = np.linspace(0, bins, NODES)
+    if filled.size <= NODES:  # labels: nothing of its own between them
+        x = np.unique(np.concatenate([[0.0], filled + 0.5, [float(bins)]]))
+    y = -np.expm1(-np.interp(x, filled + 0.5, extinction))
+    y[0] = 0.0
+    rank = np.interp(x, np.arange(bins + 1), np.concatenate([[0.0], np.cumsum(counts)]) / counts.sum())
+    along = 0.5 * (rank + x / bins) * (len(colors) - 1)
+    rgb = np.stack([np.interp(along, np.arange(len(colors)), channel) for channel in colors.T], axis=1)
+    return x, y, rgb
+
+
+def _averaged(counts: np.ndarray) -> np.ndarray:
+    """Counts of neighbouring filled bins, averaged by a Gaussian, (n,); all above 0."""
+    reach = np.arange(-int(4 * SMOOTH), int(4 * SMOOTH) + 1)
+    kernel = np.exp(-0.5 * (reach / SMOOTH) ** 2)
+    return np.convolve(np.pad(counts, reach[-1], mode="edge"), kernel / kernel.sum(), mode="valid")
+
+
+def _worth_showing(side: slice, counts: np.ndarray) -> bool:
+    """Whether a side of the background is wide and full enough to be more than padding or stray voxels."""
+    inside = counts[side]
+    # of the foreground as a whole: all but the voxels of the highest bin, which is always background
+    return inside.size >= SIDE_WIDTH * counts.size and inside.sum() >= SIDE * (counts.sum() - counts.max()) > 0
+
+
+def background_bins(counts: np.ndarray) -> tuple[int, int]:
+    """Bins [first, last) of the background; an empty range at 0 when no peak dominates, or a wide one above others."""
+    total = counts.sum()
+    first, last = _peak(counts)
+    if counts[first:last].sum() < DOMINANT * total:
+        return 0, 0
+    if counts[:first].sum() >= SIDE * (total - counts.max()) > 0 and last - first > AMID * counts.size:
+        return 0, 0
+    rest = counts[last:]
+    if first == 0 and last <= PADDING_BINS and rest.sum() > 0:
+        a, b = _peak(rest)
+        behind = rest[b:].sum()
+        apart = 0 < a <= counts.size // 2  # at 0 it is the padding's own falling tail
+        if apart and rest[a:b].sum() >= DOMINANT * total and behind >= BEHIND_AIR * rest.sum():
+            last += b
+    return first, last
+
+
+def _peak(counts: np.ndarray) -> tuple[int, int]:
+    """Bins [first, last) of the highest peak, out to its feet."""
+    top = int(np.argmax(counts))
+    return top - _foot(counts[top::-1]) + 1, top + _foot(counts[top:])
+
+
+def _foot(falling: np.ndarray) -> int:
+    """Bins from the peak (bin 0) to its foot: farthest below the line from the peak to the last filled bin."""
+    filled = np.flatnonzero(falling)
+    end = int(filled[-1])
+    if end < 2:
+        return end + 1
+    line = falling[0] + (falling[end] - falling[0]) * np.arange(end + 1) / end
+    return max(1, int(np.argmax(line - falling[: end + 1])))

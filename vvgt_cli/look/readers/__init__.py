@@ -1,0 +1,74 @@
+"""Transfer functions from files and names: `read_transfer_function`."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.look.readers import colormap_name, inviwo, minimal, paraview, paraview_xml, slicer, vtkjs
+from vvgt_cli.look.readers.fields import load
+
+# vtkjs before paraview: its presets are ParaView's with opacity under another name
+# each: matches(parsed) -> bool, read(parsed, what, pick) -> TransferFunction
+FORMATS = (vtkjs, paraview, minimal, slicer, paraview_xml, inviwo)
+SUFFIXES = (".json", ".xml", ".itf", ".vp")
+__all__ = ["read_transfer_function"]
+
+
+def read_transfer_function(source: str | os.PathLike[str] | Mapping[str, Any]) -> TransferFunction:
+    """Read a transfer function; the format of a file is told by its content.
+
+    Args:
+        source: path of a file (``presets.json#Name`` picks one of several functions; the modules of this room say of
+            which formats), or a matplotlib colour-map name with an opacity ramp, ``NAME[:LO,HI[:MAX]]``
+            (`vvgt_cli.look.readers.colormap_name`); or what such a JSON file holds, parsed.
+
+    Returns:
+        The function; `vvgt_cli.look.resolve.resolve` puts it on the data.
+
+    Raises:
+        DataError: the file is not a transfer function, or a faulty one.
+        UsageError: neither a file nor a colour-map name.
+    """
+    if isinstance(source, Mapping):
+        return _read(dict(source), "transfer function", "")
+    source = os.fspath(source)
+    if not source.strip():
+        raise UsageError("an empty name; expected a transfer-function file or a colour-map name")
+    path, pick = Path(source), ""
+    if not path.exists() and "#" in source:
+        head, _, pick = source.rpartition("#")
+        path = Path(head)
+    if path.is_dir():
+        raise UsageError(f"{path} is a folder; expected a transfer-function file or a colour-map name")
+    if not path.exists():
+        if pick or "/" in source or "\\" in source or Path(source).suffix.lower() in SUFFIXES:
+            raise UsageError(f"{path}: no such file; expected a transfer function ({', '.join(SUFFIXES)})")
+        return colormap_name.read(source)
+    try:
+        return _read(load(path), str(path), pick)
+    except DataError:
+        from vvgt_cli.look.label_files import is_table
+
+        if not pick and is_table(path):
+            raise DataError(
+                f"{path}: a table of labels; expected a transfer function: give the table to --labels, 'vvgt info' "
+                "lists it"
+            ) from None
+        raise
+
+
+def _read(parsed: Any, what: str, pick: str) -> TransferFunction:
+    """The function of a parsed file, by the first format that matches."""
+    for reader in FORMATS:
+        if reader.matches(parsed):
+            result: TransferFunction = reader.read(parsed, what, pick)
+            return result
+    raise DataError(
+        f"{what}: not a transfer function; expected a preset of ParaView or vtk.js (RGBPoints), an object with points, "
+        "a volume property of 3D Slicer, XML of ParaView (ColorMap) or of Inviwo (Points)"
+    )

@@ -1,0 +1,72 @@
+"""Inviwo transfer functions (``.itf``): ``<Points><Point><pos content/><rgba x y z w/></Point> ...`` with a mask.
+
+Positions are fractions of the data range (``type`` 0) or data values (1). Values outside of ``maskMin`` to ``maskMax``
+are transparent. Opacity is per reference step, which Inviwo's shaders have at 1/150 of the volume's edge
+(REF_SAMPLING_INTERVAL); of a box that is no cube it is taken as 1/150 of the longest edge.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from vvgt_cli.errors import DataError
+from vvgt_cli.look.colormap import ColorMap
+from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.look.opacity import PiecewiseOpacity
+from vvgt_cli.look.readers.fields import Elements, attribute, named
+
+REFERENCE_STEP = 1 / 150
+
+
+def matches(parsed: Any) -> bool:
+    """Whether it is XML of Inviwo's with points."""
+    return isinstance(parsed, Elements) and parsed.root.startswith("inviwo")
+
+
+def read(parsed: Elements, what: str, pick: str = "") -> TransferFunction:
+    """The function of the file; of versions before 2 too, which write ``dataPoints`` and positions with x and y.
+
+    Raises:
+        DataError: no points, a field that is not what it must be, ``pick`` of a preset by name.
+    """
+    if pick:
+        raise DataError(f"{what}: one function, no presets to pick {pick!r} from; leave out #{pick}")
+    places, colors, facts = [], [], {"maskmin": 0.0, "maskmax": 1.0, "type": 0.0}
+    for tag, attributes in parsed.items:
+        if tag in facts:
+            facts[tag] = attribute(f"{what}: {tag}", attributes, "content")
+        elif tag == "pos":
+            places.append(attribute(f"{what}: pos", attributes, "content" if "content" in attributes else "x"))
+        elif tag == "rgba":
+            colors.append([attribute(f"{what}: rgba", attributes, key) for key in "xyzw"])
+    if not places or len(places) != len(colors):
+        raise DataError(f"{what}: {len(places)} positions and {len(colors)} colours; expected points with both")
+    try:
+        nodes, rgba = np.array(places), np.array(colors)
+        masked = _masked(PiecewiseOpacity(nodes, rgba[:, 3]), facts["maskmin"], facts["maskmax"], facts["type"] == 0)
+        return TransferFunction(
+            "Inviwo transfer function",
+            masked,
+            ColorMap(nodes, rgba[:, :3]),
+            domain="data" if facts["type"] else "fraction",
+            opacity_unit_share=REFERENCE_STEP,
+        )
+    except DataError as error:
+        raise named(what, error) from error
+
+
+def _masked(opacity: PiecewiseOpacity, lo: float, hi: float, fraction: bool) -> PiecewiseOpacity:
+    """The opacity cut to nothing outside of [lo, hi] by steps; a mask of everything changes nothing."""
+    if (lo <= 0 and hi >= 1) if fraction else (lo, hi) == (0, 1):  # the defaults, which are fractions
+        return opacity
+    if not lo < hi:
+        raise DataError(f"mask from {lo:g} to {hi:g}; expected two ascending numbers")
+    inside = (opacity.x > lo) & (opacity.x < hi)
+    low, high = opacity(np.array([lo, hi]))
+    x, y = [lo, lo, *opacity.x[inside], hi, hi], [0.0, low, *opacity.y[inside], high, 0.0]
+    if fraction:  # a mask to the end of the range cuts nothing there
+        first, last = int(lo <= 0), len(x) - int(hi >= 1)
+        x, y = x[first:last], y[first:last]
+    return PiecewiseOpacity(np.array(x), np.array(y))

@@ -1,0 +1,120 @@
+"""Our own minimal JSON transfer function.
+
+An object with these keys, and no others::
+
+    {
+      "name": "bone",                        optional
+      "range": [0, 4095],                    optional: see below
+      "points": [{"x": 0.2, "rgb": [1, 1, 1], "opacity": 0.5}, ...],
+      "color_space": "RGB",                  optional: a ParaView ColorSpace
+      "opacity_unit_distance": 1.5,          optional: world length that the opacities are per
+      "lighting": {"ambient": 0.1, "diffuse": 0.7, "specular": 0.2, "specular_power": 10}
+    }                                        optional: a head-light with these coefficients, or VTK's
+
+``x`` is a data value without ``range``; in [0, 1] from one end of ``"range": [lo, hi]`` to the other; or,
+with ``"range": "percentile"``, the fraction of the voxels that lie below (0.5 is the median). A point
+carries ``rgb`` (three numbers in [0, 1]), ``opacity`` (in [0, 1]) or both; at least one point carries each.
+Between points both are linear; beyond the ends they are constant.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from vvgt_cli.errors import DataError
+from vvgt_cli.look.colormap import ColorMap
+from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.look.lighting import COEFFICIENTS, Lighting, preset_lighting
+from vvgt_cli.look.opacity import PiecewiseOpacity
+from vvgt_cli.look.readers.fields import named, number, rgb
+
+KEYS = {"name", "range", "points", "color_space", "opacity_unit_distance", "lighting"}
+POINT_KEYS = {"x", "rgb", "opacity"}
+
+
+def matches(parsed: Any) -> bool:
+    """Whether parsed JSON is an object with points."""
+    return isinstance(parsed, dict) and "points" in parsed
+
+
+def read(parsed: dict[str, Any], what: str, pick: str = "") -> TransferFunction:
+    """The function that the object describes (see the module).
+
+    Raises:
+        DataError: an unknown key, a field that is not what it must be, ``pick`` of a preset by name.
+    """
+    if pick:
+        raise DataError(f"{what}: one function, no presets to pick {pick!r} from; leave out #{pick}")
+    unknown = sorted(set(parsed) - KEYS)
+    if unknown:
+        raise DataError(f"{what}: unknown key {unknown[0]!r}; expected {', '.join(sorted(KEYS))}")
+    opacities, colors = _points(parsed["points"], what)
+    domain, lo, hi = _range(parsed.get("range"), what)
+    distance = parsed.get("opacity_unit_distance")
+    if distance is not None:
+        distance = number(f"{what}: opacity_unit_distance", distance)
+    (xo, y), (xc, c) = zip(*opacities, strict=True), zip(*colors, strict=True)
+    try:
+        if domain == "data" and hi > lo:
+            if min(xo + xc) < 0 or max(xo + xc) > 1:
+                raise DataError(f"points x in [{min(xo + xc):g}, {max(xo + xc):g}]; with a range expected x in [0, 1]")
+            xo, xc = (tuple(lo + (hi - lo) * np.array(x)) for x in (xo, xc))
+        return TransferFunction(
+            str(parsed.get("name", "")).strip() or "transfer function",
+            PiecewiseOpacity(np.array(xo), np.array(y)),
+            ColorMap(np.array(xc), np.array(c), space=str(parsed.get("color_space", "RGB"))),
+            distance,
+            domain,
+            lighting=_lighting(parsed.get("lighting"), what),
+        )
+    except DataError as error:
+        raise named(what, error) from error
+
+
+def _lighting(value: Any, what: str) -> Lighting | None:
+    if value is None:
+        return None
+    if not isinstance(value, dict) or not set(value) <= set(COEFFICIENTS):
+        raise DataError(f"{what}: lighting; expected an object of {', '.join(COEFFICIENTS)}, any or none")
+    return preset_lighting(what, True, {key: number(f"{what}: lighting.{key}", v) for key, v in value.items()})
+
+
+def _range(value: Any, what: str) -> tuple[str, float, float]:
+    """Domain of the points and the range they are fractions of ((0, 0): none)."""
+    if value is None:
+        return "data", 0.0, 0.0
+    if value == "percentile":
+        return "percentile", 0.0, 0.0
+    if not isinstance(value, list) or len(value) != 2:
+        raise DataError(f'{what}: range {value!r}; expected [lo, hi] or "percentile"')
+    lo, hi = (number(f"{what}: range", v) for v in value)
+    if not lo < hi:
+        raise DataError(f"{what}: range [{lo:g}, {hi:g}]; expected lo below hi")
+    return "data", lo, hi
+
+
+def _points(value: Any, what: str) -> tuple[list[tuple[float, float]], list[tuple[float, tuple[float, float, float]]]]:
+    """(x, opacity) and (x, rgb) of the points."""
+    if not isinstance(value, list) or not value or not all(isinstance(p, dict) for p in value):
+        raise DataError(f"{what}: points; expected a list of objects with x, rgb and opacity")
+    opacities, colors = [], []
+    for i, point in enumerate(value):
+        here = f"{what}: points[{i}]"
+        unknown = sorted(set(point) - POINT_KEYS)
+        if unknown:
+            raise DataError(f"{here}: unknown key {unknown[0]!r}; expected x, rgb, opacity")
+        if "x" not in point or len(point) < 2:
+            raise DataError(
+                f"{here}: has {', '.join(sorted(point)) or 'nothing'}; expected x with rgb or opacity or both"
+            )
+        x = number(f"{here}.x", point["x"])
+        if "opacity" in point:
+            opacities.append((x, number(f"{here}.opacity", point["opacity"])))
+        if "rgb" in point:
+            colors.append((x, rgb(f"{here}.rgb", point["rgb"])))
+    for missing, found in (("opacity", opacities), ("rgb", colors)):
+        if not found:
+            raise DataError(f"{what}: no point has {missing}; expected at least one")
+    return opacities, colors

@@ -1,0 +1,62 @@
+"""ParaView colour-map XML (``.xml``).
+
+``<ColorMaps><ColorMap name space indexedLookup><Point x o r g b/> ... <NaN r g b/>``: older ParaViews exported it, and
+colour-map sites still offer it. ``o`` is opacity; a map whose points all have the same one says nothing of opacity and
+gets a linear ramp, as a preset without opacity does.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from vvgt_cli.errors import DataError
+from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.look.readers import paraview
+from vvgt_cli.look.readers.fields import Elements, attribute
+
+# what the files say in place of the names of today's presets
+_SPACES = {"cielab": "Lab", "wrapped hsv": "HSV", "hsvwrap": "HSV"}
+
+
+def matches(parsed: Any) -> bool:
+    """Whether it is XML with a ColorMap."""
+    return isinstance(parsed, Elements) and any(tag == "colormap" for tag, _ in parsed.items)
+
+
+def read(parsed: Elements, what: str, pick: str = "") -> TransferFunction:
+    """One colour map as a `TransferFunction` on data values.
+
+    Raises:
+        DataError: several maps and no ``pick``, an indexed map, a field that is not what it must be.
+    """
+    presets: list[dict[str, Any]] = []
+    for tag, attributes in parsed.items:
+        if tag == "colormap":
+            presets.append(_preset(attributes))
+        elif presets and tag in ("point", "nan"):
+            here = f"{what}: {presets[-1]['Name'] or 'ColorMap'}: {tag}"
+            color = [attribute(here, attributes, key) for key in "rgb"]
+            if tag == "nan":
+                presets[-1]["NanColor"] = color
+                continue
+            x, opacity = attribute(here, attributes, "x"), attribute(here, {"o": "1", **attributes}, "o")
+            presets[-1]["RGBPoints"] += [x, *color]
+            presets[-1]["Points"] += [x, opacity, 0.5, 0.0]
+    preset = dict(paraview.choose(presets, what, pick))
+    if preset.pop("indexed"):
+        raise DataError(f"{what}: an indexed colour map (indexedLookup); expected one over a range of values")
+    if len(set(preset["Points"][1::4])) < 2:
+        del preset["Points"]
+    return paraview.read(preset, what)
+
+
+def _preset(attributes: dict[str, str]) -> dict[str, Any]:
+    space = attributes.get("space", "RGB")
+    return {
+        "Name": attributes.get("name", ""),
+        "ColorSpace": _SPACES.get(space.lower(), space),
+        "HSVWrap": space.lower() in ("wrapped hsv", "hsvwrap"),
+        "RGBPoints": [],
+        "Points": [],
+        "indexed": attributes.get("indexedLookup", "false").lower() in ("true", "1"),
+    }

@@ -1,0 +1,166 @@
+"""Putting a transfer function on the data: ``--tf-range``, ``--opacity-unit-distance``, and what is visible."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from typing import Protocol
+
+import numpy as np
+
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.volume.types import Volume
+
+ABOUT_ONE = 2.0  # span of data up to which nodes in [0, 1] are values of theirs
+
+
+class StatisticsLike(Protocol):
+    """What this room needs to know of the data.
+
+    Attributes:
+        lo, hi: smallest and largest finite data value.
+        histogram: (bins,) counts of finite voxels, equal bins over [lo, hi].
+        edges: (bins + 1,) bin edges, data values.
+    """
+
+    @property
+    def lo(self) -> float: ...
+    @property
+    def hi(self) -> float: ...
+    @property
+    def histogram(self) -> np.ndarray: ...
+    @property
+    def edges(self) -> np.ndarray: ...
+
+
+def parse_tf_range(spec: str | tuple[float, float]) -> str | tuple[float, float]:
+    """``data``, ``rescale`` or two ascending numbers.
+
+    Raises:
+        UsageError: anything else.
+    """
+    if spec in ("data", "rescale"):
+        return spec
+    try:
+        lo, hi = (float(v) for v in (spec.split(",") if isinstance(spec, str) else spec))
+    except ValueError:
+        raise UsageError(f"--tf-range {spec!r}; expected data, rescale or two numbers LO,HI") from None
+    if not (math.isfinite(lo) and math.isfinite(hi) and lo < hi):
+        raise UsageError(f"--tf-range {lo:g},{hi:g}; expected two finite numbers, LO below HI")
+    return lo, hi
+
+
+def resolve(
+    tf: TransferFunction, statistics: StatisticsLike, tf_range: str | tuple[float, float] = "data"
+) -> TransferFunction:
+    """The function with its nodes on data values.
+
+    Args:
+        tf: as read; of any domain.
+        statistics: of the data.
+        tf_range: ``data`` takes the nodes as they are (fractions and percentiles: of the data), ``rescale``
+            stretches them linearly to the data range, ``LO,HI`` to that range.
+
+    With ``data``, nodes in [0, 1] over data that are not may be meant as fractions of the range. A note says which
+    was taken: values where the data overlap [0, 1] and span no more than `ABOUT_ONE`, else as with ``rescale``.
+
+    Raises:
+        DataError: no finite voxel; a function of one position to stretch.
+        UsageError: a ``tf_range`` that is none, or a range for a function of percentiles.
+    """
+    chosen = parse_tf_range(tf_range)
+    lo, hi = _data_range(statistics)
+    if tf.domain == "percentile":
+        if chosen != "data":
+            raise UsageError(f"{tf.name}: its nodes are percentiles of the data; leave out --tf-range")
+        return tf.moved(percentiles(statistics, tf.breakpoints()))
+    if tf.domain == "fraction":
+        a, b = (lo, hi) if isinstance(chosen, str) else chosen
+        fraction = tf.breakpoints()
+        return tf.moved(a * (1 - fraction) + b * fraction)
+    if chosen == "rescale":
+        return tf.rescaled(lo, hi)
+    if not isinstance(chosen, str):
+        return tf.rescaled(*chosen)
+    first, last = tf.node_range()
+    if not (first >= 0 and last <= 1 and (lo < 0 or hi > 1)):
+        return tf
+    where = f"{tf.name}: all nodes lie in [{first:g}, {last:g}], the data in [{lo:g}, {hi:g}]"
+    if first == last or (lo <= 1 and hi >= 0 and hi / 2 - lo / 2 <= ABOUT_ONE / 2):
+        warnings.warn(f"{where}; taken as data values (--tf-range rescale stretches them to the data)", stacklevel=2)
+        return tf
+    asked = f"--tf-range {first:g},{last:g}"
+    warnings.warn(f"{where}; stretched to the data, as with --tf-range rescale ({asked}: data values)", stacklevel=2)
+    return tf.rescaled(lo, hi)
+
+
+def percentiles(statistics: StatisticsLike, fraction: np.ndarray) -> np.ndarray:
+    """Data values below which ``fraction`` (n,) in [0, 1] of the voxels lie, linear within a histogram bin, (n,)."""
+    counts = np.asarray(statistics.histogram, dtype=np.float64)
+    cumulative = np.concatenate([[0.0], np.cumsum(counts)])
+    if cumulative[-1] <= 0:
+        raise DataError("the data have no finite voxel; expected some to take percentiles of")
+    result: np.ndarray = np.interp(
+        fraction, cumulative / cumulative[-1], np.asarray(statistics.edges, dtype=np.float64)
+    )
+    return result
+
+
+def unit_distance(spec: str | float | None, volume: Volume, tf: TransferFunction | None = None) -> tuple[float, str]:
+    """The world length that opacities are per, and where it comes from.
+
+    Args:
+        spec: a positive number; ``paraview``: diagonal of the box of voxel centres over the cube root of the
+            number of cells, prod(dims - 1), as ParaView's domain of ScalarOpacityUnitDistance does (axes of one
+            voxel are left out: with k others it is the k-th root; a single voxel has the mean spacing);
+            ``mean-spacing``: arithmetic mean of the three spacings; None: the function's own, or ``paraview``.
+
+    Returns:
+        (distance, label), the label one of ``given``, ``file``, ``paraview``, ``mean-spacing``, or the function's own.
+
+    Raises:
+        UsageError: anything else.
+    """
+    if spec is None:
+        if tf is not None and tf.opacity_unit_distance is not None:
+            return tf.opacity_unit_distance, tf.opacity_unit_label
+        if tf is not None and tf.opacity_unit_share is not None:
+            return tf.opacity_unit_share * max(volume.extent), tf.opacity_unit_label
+        spec = "paraview"
+    mean = sum(volume.spacing) / 3
+    if spec == "mean-spacing":
+        return mean, "mean-spacing"
+    if spec == "paraview":
+        axes = [(n - 1, s) for n, s in zip(volume.dims, volume.spacing, strict=True) if n > 1]
+        if not axes:
+            return mean, "paraview"
+        diagonal = math.hypot(*(n * s for n, s in axes))
+        return diagonal / math.prod(n for n, _ in axes) ** (1 / len(axes)), "paraview"
+    try:
+        distance = float(spec)
+    except ValueError:
+        distance = math.nan
+    if not (math.isfinite(distance) and distance > 0):
+        raise UsageError(f"--opacity-unit-distance {spec}; expected a positive number, paraview or mean-spacing")
+    return distance, "given"
+
+
+def check_visible(tf: TransferFunction, statistics: StatisticsLike) -> None:
+    """Raise DataError when the function (on data values) makes every value of the data transparent."""
+    lo, hi = _data_range(statistics)
+    if tf.support(lo, hi):
+        return
+    everywhere = tf.support(-math.inf, math.inf)
+    shown = ", ".join(f"[{a:g}, {b:g}]" for a, b in everywhere[:6]) + (", ..." if len(everywhere) > 6 else "")
+    raise DataError(
+        f"{tf.name}: nothing is visible: the data lie in [{lo:g}, {hi:g}], opacity is above 0 "
+        f"{'in ' + shown if shown else 'nowhere'}; try --tf-range rescale, or another function"
+    )
+
+
+def _data_range(statistics: StatisticsLike) -> tuple[float, float]:
+    lo, hi = float(statistics.lo), float(statistics.hi)
+    if not (math.isfinite(lo) and math.isfinite(hi) and lo <= hi):
+        raise DataError("the data have no finite voxel; expected some to colour")
+    return lo, hi

@@ -1,0 +1,85 @@
+"""A picture of a transfer function over the histogram."""
+
+from __future__ import annotations
+
+from os import PathLike
+from typing import Any
+
+import numpy as np
+
+from vvgt_cli.errors import UsageError
+from vvgt_cli.files import atomic_write
+from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.look.resolve import StatisticsLike
+
+SAMPLES = 1024
+X_LABEL = {"data": "data value", "fraction": "fraction of the data range", "percentile": "fraction of the voxels"}
+
+
+def draw(
+    tf: TransferFunction, statistics: StatisticsLike | None, path: str | PathLike[str], overwrite: bool = False
+) -> None:
+    """Write a PNG: the opacity curve, filled with the function's colours, over the histogram (log counts).
+
+    Args:
+        tf: the function; drawn over the data range with ``statistics`` (then on data values), else over its nodes.
+        statistics: of the data, or None.
+        path: the PNG; written beside and renamed.
+        overwrite: replace an existing file.
+
+    Raises:
+        UsageError: the file exists, or matplotlib is missing.
+    """
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError:  # pyvista brings it
+        raise UsageError("drawing needs matplotlib; try: pip install matplotlib") from None
+    figure = Figure(figsize=(9, 4.5), dpi=120, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    lo, hi = _limits(tf, statistics)
+    if statistics is not None:
+        _draw_histogram(axes, statistics)
+    x = np.unique(np.concatenate([np.linspace(lo, hi, SAMPLES), np.clip(tf.breakpoints(), lo, hi)]))
+    _draw_curve(axes, tf, x)
+    axes.set(xlim=(lo, hi), ylim=(0, 1.02), xlabel=X_LABEL[tf.domain], ylabel="opacity per unit distance")
+    axes.set_title(tf.name, parse_math=False)
+    with atomic_write(path, overwrite) as temporary:
+        figure.savefig(temporary, format="png", metadata={"Software": None})
+
+
+def _limits(tf: TransferFunction, statistics: StatisticsLike | None) -> tuple[float, float]:
+    """Ends of the horizontal axis: the data's range, or the nodes'."""
+    lo, hi = tf.node_range() if statistics is None else (float(statistics.lo), float(statistics.hi))
+    if lo == hi:
+        margin = abs(lo) * 0.5 or 0.5
+        return lo - margin, hi + margin
+    return lo, hi
+
+
+def _draw_curve(axes: Any, tf: TransferFunction, x: np.ndarray) -> None:
+    from matplotlib.patches import Polygon
+
+    y = tf.opacity(x)
+    colors = tf.color(np.linspace(x[0], x[-1], SAMPLES))[None]  # (1, SAMPLES, 3)
+    outline = np.concatenate([[(x[0], 0)], np.column_stack([x, y]), [(x[-1], 0)]])
+    under = Polygon(outline, closed=True, transform=axes.transData)
+    axes.imshow(colors, aspect="auto", extent=(x[0], x[-1], 0, 1.02), clip_path=under, zorder=1)
+    nodes = tf.opacity_nodes
+    axes.plot(x, y, color="black", linewidth=1.2)
+    axes.plot(nodes.x, nodes.y, "o", color="black", markerfacecolor="white", markersize=4, clip_on=False)
+    bar = axes.inset_axes((0, -0.045, 1, 0.03), transform=axes.transAxes)
+    bar.imshow(colors, aspect="auto", extent=(0, 1, 0, 1))
+    bar.set_axis_off()
+    axes.tick_params(axis="x", pad=10)
+
+
+def _draw_histogram(axes: Any, statistics: StatisticsLike) -> None:
+    behind = axes.twinx()
+    counts, edges = np.asarray(statistics.histogram), np.asarray(statistics.edges)
+    behind.stairs(counts, edges, fill=True, color="0.85")
+    behind.set_yscale("symlog", linthresh=1)
+    behind.set(ylim=(0, max(1.0, float(counts.max()) * 2)), ylabel="voxels (log)")
+    axes.set_zorder(behind.get_zorder() + 1)  # the curve in front
+    axes.patch.set_visible(False)

@@ -1,0 +1,142 @@
+"""Transfer functions that highlight one range of values each, from the histogram alone (`vvgt tf suggest`).
+
+The set-up of the VVGT paper (Experiment Setup, Datasets): about ten functions a volume, "to highlight different
+scalar value ranges and internal structures".
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from vvgt_cli.errors import DataError
+from vvgt_cli.look.colorspace import lab_to_rgb
+from vvgt_cli.look.histogram import background_bins
+from vvgt_cli.look.resolve import StatisticsLike
+
+BY_VALUE = 0.5  # bands are equal half by the voxels in them, half by their width
+WIDE = 0.25  # share of the value range; air and padding are narrow, a turbulent field's peak is the field
+PLATEAU = 0.5  # share of a band at its peak opacity; the rest are ramps on either side
+OPTICAL_DEPTH = 1.5  # wanted along a ray through the whole volume, on average
+PEAK = (1e-3, 0.5)  # opacity per voxel at a band's plateau: rare values cannot be more than opaque
+LIGHTNESS, CHROMA = (45.0, 70.0, 92.0), (45.0, 60.0, 25.0)  # CIE LCh at a band's low end, middle and high end
+FIRST_HUE, HUES = 275.0, 235.0  # degrees in CIE Lab: from blue for low values over green to red for high ones
+
+Bins = tuple[int, int]  # [first, last)
+
+
+@dataclass(frozen=True)
+class Suggestion:
+    """A function that shows one band of values.
+
+    Attributes:
+        name: says which band.
+        x: (k,) ascending data values.
+        opacity: (k,) per ``unit_distance``.
+        rgb: (k, 3) in [0, 1].
+        unit_distance: world length that the opacities are per.
+        share: share of the finite voxels inside the band.
+    """
+
+    name: str
+    x: np.ndarray
+    opacity: np.ndarray
+    rgb: np.ndarray
+    unit_distance: float
+    share: float
+
+    def to_json(self) -> str:
+        """The minimal JSON form (`vvgt_cli.look.readers.minimal`); numbers keep every bit."""
+        points: list[dict[str, Any]] = [
+            {"x": float(x), "rgb": [round(float(c), 4) for c in rgb], "opacity": float(opacity)}
+            for x, rgb, opacity in zip(self.x, self.rgb, self.opacity, strict=True)
+        ]
+        document = {"name": self.name, "opacity_unit_distance": self.unit_distance, "points": points}
+        return json.dumps(document, indent=1) + "\n"
+
+
+def suggest(statistics: StatisticsLike, count: int, voxels: float, spacing: float) -> list[Suggestion]:
+    """Functions for ``count`` bands of the values in front of the background, low values first; deterministic.
+
+    A band is a trapezoid: transparent outside, constant in its middle half and up to the ends of the data. Its
+    height lets a ray through the volume meet an optical depth of 1.5 on average, so that common values are fog and
+    rare ones are solid. A peak that spans more than a quarter of the values is no background.
+
+    Args:
+        statistics: range and histogram of the data.
+        count: functions, at least 1.
+        voxels: along a ray through the volume, for instance the mean of its dimensions.
+        spacing: a voxel's edge, world units: what opacities are per.
+
+    Raises:
+        DataError: no finite voxel, or a single value.
+    """
+    counts = np.asarray(statistics.histogram, dtype=np.float64)
+    edges = np.asarray(statistics.edges, dtype=np.float64)
+    lo, hi = float(statistics.lo), float(statistics.hi)
+    if not (math.isfinite(lo) and math.isfinite(hi)) or counts.sum() <= 0:
+        raise DataError("the data have no finite voxel; expected some to choose transfer functions from")
+    if lo == hi:
+        raise DataError(f"every value of the data is {lo:g}; expected some that differ to choose ranges from")
+    background = _background(counts)
+    data, grid = (counts, edges, background), (voxels, spacing)
+    return [_suggestion(band, data, (k, count), grid) for k, band in enumerate(_bands(counts, background, count))]
+
+
+def _background(counts: np.ndarray) -> Bins:
+    """Bins [first, last) that no function shows; (0, 0) for none."""
+    first, last = background_bins(counts)
+    alone = counts[first:last].sum() == counts.sum()
+    return (0, 0) if alone or last - first > WIDE * counts.size else (first, last)
+
+
+def _bands(counts: np.ndarray, background: Bins, count: int) -> list[Bins]:
+    """Bins [first, last) of each band: some, on one side of the background, and some voxels among them."""
+    sides = [(0, background[0]), (background[1], counts.size)]
+    sides = [(a, b) for a, b in sides if counts[a:b].sum() > 0]
+    bins = np.concatenate([np.arange(a, b) for a, b in sides])
+    weight = (1 - BY_VALUE) * counts[bins] / counts[bins].sum() + BY_VALUE / bins.size
+    ends = np.interp(np.arange(count + 1) / count, np.concatenate([[0.0], np.cumsum(weight)]), np.arange(bins.size + 1))
+    bands = []
+    for low, high in pairwise(ends):
+        i = min(round(float(low)), bins.size - 1)
+        chosen = slice(i, max(round(float(high)), i + 1))
+        parts = [(bins[chosen], weight[chosen], side) for side in sides]
+        inside = [(w[(b >= s[0]) & (b < s[1])].sum(), b[(b >= s[0]) & (b < s[1])], s) for b, w, s in parts]
+        _, mine, (start, stop) = max(inside, key=lambda part: part[0])  # where it straddles: the heavier part
+        first, last = int(mine[0]), int(mine[-1]) + 1
+        while not counts[first:last].any():
+            first, last = max(first - 1, start), min(last + 1, stop)
+        bands.append((first, last))
+    return bands
+
+
+def _suggestion(
+    band: tuple[int, int], data: tuple[np.ndarray, np.ndarray, Bins], which: tuple[int, int], grid: tuple[float, float]
+) -> Suggestion:
+    """The function of a band of bins, number ``which[0]`` of ``which[1]``.
+
+    ``data`` is (counts, edges, background), ``grid`` (voxels, spacing).
+    """
+    (first, last), (counts, edges, background), (k, count), (voxels, spacing) = band, data, which, grid
+    low, high, rim = float(edges[first]), float(edges[last]), float(edges[1] - edges[0])
+    ramp = (1 - PLATEAU) / 2 * (high - low)
+    # a bin more on either side, as whole numbers lie on the edges of bins; not towards the background
+    left, right = (rim * (edge not in background) for edge in band)
+    x = np.array([low - left, low + ramp, high - ramp, high + right])
+    shape = np.array([float(first == 0), 1, 1, float(last == counts.size)])  # solid up to the ends of the data
+    weight = np.interp(0.5 * (edges[:-1] + edges[1:]), x, shape)
+    share = float((counts * weight).sum() / counts.sum())
+    # -ln(1 - peak) per voxel, times the voxels of the band that a ray meets, is the optical depth wanted
+    peak = min(max(-math.expm1(-OPTICAL_DEPTH / (share * voxels)), PEAK[0]), PEAK[1])
+    hue = math.radians(FIRST_HUE - HUES * (k / (count - 1) if count > 1 else 0.5))
+    lab = np.array([[v, c * math.cos(hue), c * math.sin(hue)] for v, c in zip(LIGHTNESS, CHROMA, strict=True)])
+    colors = lab_to_rgb(np.array([lab[0], 0.5 * (lab[0] + lab[1]), 0.5 * (lab[1] + lab[2]), lab[2]]))
+    name = f"band {k + 1} of {count}: {low:g} to {high:g}"
+    inside = float(counts[first:last].sum() / counts.sum())
+    return Suggestion(name, x, peak * shape, np.clip(colors, 0, 1), spacing, inside)

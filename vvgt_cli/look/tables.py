@@ -1,0 +1,95 @@
+"""`OpticalTables`: a transfer function tabulated with the cumulative integrals that pre-integration needs."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from vvgt_cli.look.types import TransferFunctionLike
+
+MAX_OPACITY = 1 - 1e-5  # conventions: every integral has a limit
+MIN_BINS, MAX_BINS = 2048, 65536
+BINS_PER_GAP = 8  # bins inside the narrowest gap between two nodes, where MAX_BINS allows
+
+
+def extinction(opacity: np.ndarray, unit_distance: float) -> np.ndarray:
+    """``tau = -ln(1 - a) / d`` with a capped at 1 - 1e-5; ``opacity`` any shape, result per unit of d."""
+    result: np.ndarray = -np.log1p(-np.clip(opacity, 0.0, MAX_OPACITY)) / unit_distance
+    return result
+
+
+@dataclass(frozen=True)
+class OpticalTables:
+    """Extinction and colour over ``u = (stored - lo) * inv_width`` in [0, n]; values beyond take the end's.
+
+    Attributes:
+        lo: stored value at u = 0.
+        inv_width: bins per stored unit (negative where the stored scaling's slope is).
+        nodes: (n + 1, 4) float64, tau * (r, g, b) and tau at the bin edges, per unit-frame length.
+        cumulative: (n + 1, 4) float64, integral over u of the same (trapezoid: exact for linear tau within a bin).
+        dark: (n + 1,) float64, the u up to which extinction is zero from bin i on: [u0, u1] is transparent if and only
+            if u1 <= dark[floor(u0)].
+    """
+
+    lo: float
+    inv_width: float
+    nodes: np.ndarray
+    cumulative: np.ndarray
+    dark: np.ndarray = field(init=False)
+
+    def __post_init__(self) -> None:
+        count = len(self.nodes)
+        positive = np.where(self.nodes[:, 3] > 0, np.arange(count), count + 1)
+        dark = np.minimum.accumulate(positive[::-1])[::-1] - 1.0
+        object.__setattr__(self, "dark", np.ascontiguousarray(dark))
+
+    @property
+    def bins(self) -> int:
+        return len(self.nodes) - 1
+
+    def coordinate(self, stored: np.ndarray) -> np.ndarray:
+        """Table coordinate u of stored values, clamped to [0, n]; NaN stays NaN."""
+        with np.errstate(invalid="ignore", over="ignore"):
+            return np.clip((np.asarray(stored, np.float64) - self.lo) * self.inv_width, 0.0, float(self.bins))
+
+    def largest_extinction(self) -> float:
+        return float(self.nodes[:, 3].max())
+
+
+def _bin_count(tf: TransferFunctionLike, lo: float, hi: float) -> int:
+    nodes = np.asarray(getattr(tf, "breakpoints", tf.node_range)(), np.float64)
+    gaps = np.diff(np.unique(np.clip(nodes, lo, hi)))
+    gaps = gaps[gaps > (hi - lo) / MAX_BINS]
+    wanted = BINS_PER_GAP * (hi - lo) / gaps.min() if len(gaps) else MAX_BINS
+    return int(2 ** math.ceil(math.log2(min(max(wanted, MIN_BINS), MAX_BINS))))
+
+
+def build_tables(
+    tf: TransferFunctionLike,
+    value_range: tuple[float, float],
+    *,
+    slope: float = 1.0,
+    intercept: float = 0.0,
+    unit_distance: float,
+    world_per_unit: float,
+    bins: int | None = None,
+) -> OpticalTables:
+    """Tabulate ``tf`` over the part of ``value_range`` (data values) in which it is not constant.
+
+    ``unit_distance`` is in world units, ``world_per_unit`` the world length of one unit-frame length.
+    """
+    first, last = tf.node_range()
+    lo, hi = max(value_range[0], first), min(value_range[1], last)
+    if not hi > lo:  # data wholly beyond one end node, or a constant: one value of the function is used
+        lo = hi = min(max(value_range[0], first), last)
+        hi = math.nextafter(lo + max(abs(lo), 1e-30) * 1e-6, math.inf)
+    count = bins or _bin_count(tf, lo, hi)
+    x = lo + (hi - lo) * (np.arange(count + 1) / count)
+    x[-1] = hi
+    tau = extinction(tf.opacity(x), unit_distance) * world_per_unit
+    nodes = np.concatenate([tf.color(x) * tau[:, None], tau[:, None]], axis=1)
+    cumulative = np.zeros_like(nodes)
+    np.cumsum(0.5 * (nodes[1:] + nodes[:-1]), axis=0, out=cumulative[1:])
+    return OpticalTables((lo - intercept) / slope, slope * count / (hi - lo), nodes, cumulative)

@@ -1,0 +1,231 @@
+"""What a training run does, in one dataclass, and its YAML file."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from vvgt_cli.closed_form import METHODS
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.network import NAMED, NetworkConfig
+
+INSTALL = "install vvgt[train]"
+SMALLEST_LPIPS = 16  # pixels: VGG-16 pools four times
+GROWTH = 1.3  # of Gaussians with the size of images
+
+
+@dataclass(frozen=True)
+class SceneConfig:
+    """Which scenes are made of the volumes.
+
+    Attributes:
+        size: pixels along an image's edge, or several, of which each scene gets one.
+        gaussians: fewest and most Gaussians of a scene at the first size, drawn evenly by their logarithm; as many more
+            as the size is larger, to the power `GROWTH`.
+        start: what the network is given, a method of `vvgt_cli.closed_form`; "uniform" for the ablation "wo_vbm".
+        back_projection: improve it by back-projection of the views, as `vvgt convert` does; without, the closed form
+            alone.
+        functions: transfer functions suggested a volume.
+        held_functions: those of them (from 0) that are never trained on.
+        per_volume: scenes to train on of each volume, each with a function of its own.
+        bands: fewest and most of the suggested functions in a scene's function.
+        densities: least and largest factor of a band's extinction, drawn evenly by its logarithm: fog and solid bodies.
+        inputs: views that the network may be shown, the default training set.
+        targets: other views, that the loss is taken on.
+        held: scenes of held-out volumes, and as many of held-out functions.
+        seed: of what is drawn here.
+    """
+
+    size: int | tuple[int, ...] = 256
+    gaussians: tuple[int, int] = (8_000, 40_000)
+    start: str = "vbm"
+    back_projection: bool = True
+    functions: int = 10
+    held_functions: tuple[int, ...] = (3, 7)
+    per_volume: int = 3
+    bands: tuple[int, int] = (1, 1)
+    densities: tuple[float, float] = (1.0, 8.0)
+    inputs: int = 24
+    targets: int = 8
+    held: int = 8
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("gaussians", "held_functions", "bands", "densities"):
+            object.__setattr__(self, name, tuple(getattr(self, name)))
+        if not isinstance(self.size, int):
+            object.__setattr__(self, "size", tuple(self.size))
+        if self.start not in METHODS:
+            raise UsageError(f"scenes.start {self.start!r}: expected one of {', '.join(METHODS)}")
+        if len(self.gaussians) != 2 or not 1 <= self.gaussians[0] <= self.gaussians[1]:
+            raise UsageError(f"scenes.gaussians {self.gaussians}: expected the fewest and the most")
+        trained = self.functions - len(set(self.held_functions))
+        if trained < 1 or not set(self.held_functions) <= set(range(self.functions)):
+            raise UsageError(f"scenes.held_functions {self.held_functions}: expected some of {self.functions}, from 0")
+        if len(self.bands) != 2 or not 1 <= self.bands[0] <= self.bands[1] <= trained:
+            raise UsageError(f"scenes.bands {self.bands}: expected the fewest and the most, 1 to {trained}")
+        if len(self.densities) != 2 or not 0 < self.densities[0] <= self.densities[1]:
+            raise UsageError(f"scenes.densities {self.densities}: expected the least and the largest, above 0")
+        if not self.sizes or min(*self.sizes, self.per_volume, self.inputs, self.targets, self.held) < 1:
+            raise UsageError("scenes: size, per_volume, inputs, targets and held must be at least 1")
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """All sizes of images."""
+        return (self.size,) if isinstance(self.size, int) else self.size
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """Weights of the loss, of one rendered view.
+
+    Attributes:
+        l1: mean absolute difference of RGBA.
+        ssim: 1 - SSIM of RGB.
+        decibel: minus a tenth of the gain in PSNR over the Gaussians that the network was given (not in the paper):
+            scenes of 30 and of 45 dB count alike.
+        lpips: LPIPS of RGB (the paper: 0.05), where both its files are given.
+        lpips_backbone: VGG-16 as torchvision has it.
+        lpips_linear: LPIPS' linear weights for it, version 0.1.
+    """
+
+    l1: float = 0.8
+    ssim: float = 0.2
+    decibel: float = 0.0
+    lpips: float = 0.0
+    lpips_backbone: str = ""
+    lpips_linear: str = ""
+
+    def __post_init__(self) -> None:
+        weights = self.l1, self.ssim, self.decibel, self.lpips
+        if min(weights) < 0 or not sum(weights) > 0:
+            raise UsageError("loss: weights must be at least 0, one of them above")
+        if bool(self.lpips) != bool(self.lpips_backbone) or bool(self.lpips) != bool(self.lpips_linear):
+            raise UsageError("loss: lpips needs lpips_backbone and lpips_linear, files of weights, and they need lpips")
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """A run: everything but the folders.
+
+    Attributes:
+        network, scenes, loss: see there.
+        steps: of the optimiser.
+        batch: scenes a step, over all processes.
+        views: target views that the loss of a scene is taken on.
+        view_sets: choices of views to show, drawn once for each scene; images and slopes of each are made once.
+        keep: inputs kept in memory, a few megabytes each.
+        rate, last_rate: AdamW's, from the end of the warm-up down to the last step along a cosine.
+        warmup: steps of a linear rise.
+        weight_decay: AdamW's.
+        clip: largest norm of the gradient; a longer one is shortened.
+        check_every: steps between two looks at the held-out scenes.
+        save_every: steps between two checkpoints.
+        seed: of weights, scenes and views.
+    """
+
+    network: NetworkConfig = field(default_factory=lambda: NAMED["small"])
+    scenes: SceneConfig = field(default_factory=SceneConfig)
+    loss: LossConfig = field(default_factory=LossConfig)
+    steps: int = 40_000
+    batch: int = 8
+    views: int = 4
+    view_sets: int = 4
+    keep: int = 256
+    rate: float = 1e-4
+    last_rate: float = 1e-6
+    warmup: int = 100
+    weight_decay: float = 0.01
+    clip: float = 1.0
+    check_every: int = 500
+    save_every: int = 100
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        counts = ("steps", "batch", "views", "view_sets", "keep", "check_every", "save_every")
+        if min(getattr(self, name) for name in counts) < 1 or self.warmup < 0:
+            raise UsageError(f"train config: {', '.join(counts)} must be at least 1, warmup at least 0")
+        if not 0 < self.last_rate <= self.rate or not self.clip > 0 or self.weight_decay < 0:
+            raise UsageError("train config: expected 0 < last_rate <= rate, clip above 0, weight_decay at least 0")
+        if (self.network.variant == "wo_vbm") != (self.scenes.start == "uniform"):
+            raise UsageError("train config: scenes.start is 'uniform' for the variant wo_vbm, and only there")
+        if self.views > self.scenes.targets:
+            raise UsageError(f"train config: views {self.views}, but a scene has {self.scenes.targets} targets")
+        if self.network.total_views > self.scenes.inputs:
+            raise UsageError(
+                f"train config: the network reads {self.network.total_views} views, scenes.inputs gives fewer"
+            )
+        if self.loss.lpips and min(self.scenes.sizes) < SMALLEST_LPIPS:
+            raise UsageError(f"loss.lpips: pictures of {min(self.scenes.sizes)} px; expected {SMALLEST_LPIPS} or more")
+        if not self.network.has_geometry and self.loss.decibel:
+            raise UsageError("loss.decibel compares with the Gaussians given; the variant wo_3dt is given none")
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> TrainConfig:
+        """Defaults, with ``values`` in their place; ``network`` may be the name of a configuration.
+
+        Raises:
+            DataError: a field that is unknown, or of a value that makes no run.
+            UsageError: values that do not go together.
+        """
+        values = dict(values)
+        network = values.pop("network", "small")
+        if isinstance(network, str):
+            if network not in NAMED:
+                raise DataError(f"network {network!r}: expected one of {', '.join(NAMED)}, or all fields of a network")
+            network = NAMED[network]
+        else:
+            network = NetworkConfig.from_dict(network)
+        try:
+            scenes, loss = SceneConfig(**values.pop("scenes", {})), LossConfig(**values.pop("loss", {}))
+            return cls(network=network, scenes=scenes, loss=loss, **values)
+        except TypeError as error:
+            raise DataError(f"train config: {error}; expected fields of TrainConfig") from None
+
+
+def read_config(path: str | Path) -> TrainConfig:
+    """A configuration from YAML; fields that are left out have their defaults.
+
+    Raises:
+        UsageError: no such file, or PyYAML is missing.
+        DataError: not YAML, or not a configuration.
+    """
+    yaml = _yaml()
+    if not Path(path).is_file():
+        raise UsageError(f"{path}: no such file; expected a training configuration (YAML)")
+    try:
+        values = yaml.safe_load(Path(path).read_text("utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise DataError(f"{path}: not YAML ({' '.join(str(error).split())[:150]})") from None
+    if not isinstance(values, dict | None):
+        raise DataError(f"{path}: a {type(values).__name__}; expected fields and values")
+    try:
+        return TrainConfig.from_dict(values or {})
+    except (DataError, UsageError) as error:
+        raise DataError(f"{path}: {error}") from None
+
+
+def config_text(config: TrainConfig) -> str:
+    """The YAML that `read_config` reads."""
+    plain = _lists(config.to_dict())
+    return str(_yaml().safe_dump(plain, sort_keys=False))
+
+
+def _lists(value: Any) -> Any:
+    """YAML's safe form has no tuples."""
+    if isinstance(value, dict):
+        return {key: _lists(entry) for key, entry in value.items()}
+    return [_lists(entry) for entry in value] if isinstance(value, tuple | list) else value
+
+
+def _yaml() -> Any:
+    try:
+        import yaml
+    except ImportError:
+        raise UsageError(f"training configurations need PyYAML; {INSTALL}") from None
+    return yaml

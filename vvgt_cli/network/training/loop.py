@@ -1,0 +1,242 @@
+"""The loop: AdamW along a cosine, checkpoints, runs that go on where they ended to the bit."""
+
+from __future__ import annotations
+
+import math
+import signal
+import subprocess
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.files import atomic_write
+from vvgt_cli.network.checkpoint import Checkpoint, load_weights, read_tensors, save_checkpoint
+from vvgt_cli.network.model import Vvgt
+from vvgt_cli.network.training.config import TrainConfig, config_text, read_config
+from vvgt_cli.network.training.lpips import Lpips, load_lpips
+from vvgt_cli.network.training.parallel import World, world
+from vvgt_cli.network.training.record import Recorder
+from vvgt_cli.network.training.sample import Feeder, accumulate_gradients, score_scene
+from vvgt_cli.network.training.scenes import TrainingScene, make_scenes, prepare_scenes
+from vvgt_cli.progress import Console
+
+LAST, BEST, CONFIG = "last.pt", "best.pt", "config.yaml"
+Scenes = dict[str, list[TrainingScene]]
+
+
+@dataclass
+class Progress:
+    """What changes from step to step beside weights and optimiser; saved with them.
+
+    Attributes:
+        step: steps done.
+        skipped: of them, those without an update because something was not finite.
+        best: largest mean gain on held-out scenes so far, dB.
+        seconds: of training, over all resumptions.
+        found: the last scores of the held-out scenes.
+    """
+
+    step: int = 0
+    skipped: int = 0
+    best: float = -math.inf
+    seconds: float = 0.0
+    found: dict[str, float] = field(default_factory=dict)
+
+
+def train(config: TrainConfig, data: str, output: str, console: Console, ended: Sequence[int] = ()) -> int:
+    """Train to the end of the run in folder ``output``, from its last checkpoint if there is one.
+
+    ``ended``: numbers of signals that somebody notes while it runs: the step ends first, and is saved.
+
+    Returns the exit status: 0, or 128 + the signal's number where one ended it (a checkpoint is written first).
+
+    Raises:
+        UsageError: folders that are not what they must be, or a run with another configuration.
+        DataError: volumes or a checkpoint that cannot be read.
+    """
+    folder, lpips = Path(output), load_lpips(config.loss)  # fails before the work, not after
+    with world() as here:
+        messages = console if here.first else Console(quiet=True)
+        if here.first:
+            _open_run(folder, config)
+        here.wait()
+        make_scenes(Path(data), config.scenes, messages, (here.rank, here.size))
+        here.wait()
+        scenes = prepare_scenes(Path(data), config.scenes, messages)
+        torch.manual_seed(config.seed)
+        run = _Run(config, data, folder, here, scenes, messages, lpips)
+        return run.to_the_end(ended)
+
+
+def _open_run(folder: Path, config: TrainConfig) -> None:
+    """Make the folder and its configuration, or see that the run there has the same one."""
+    if not folder.parent.is_dir():
+        raise UsageError(f"-o {folder}: the folder {folder.parent} does not exist; make it first")
+    if folder.exists() and not folder.is_dir():
+        raise UsageError(f"-o {folder}: is a file; expected a folder for the run")
+    folder.mkdir(exist_ok=True)
+    place = folder / CONFIG
+    if place.exists():
+        if read_config(place) != config:
+            raise UsageError(f"-o {folder}: a run with another configuration ({place}); give another folder")
+        return
+    if any(folder.iterdir()):
+        raise UsageError(f"-o {folder}: is not empty and holds no run; give another folder")
+    with atomic_write(place) as temporary:
+        temporary.write_text(config_text(config), "utf-8")
+
+
+def rate(step: int, config: TrainConfig) -> float:
+    """Of step ``step``, from 0: a linear rise, then a cosine from ``rate`` to ``last_rate`` at the last step."""
+    if step < config.warmup:
+        return config.rate * (step + 1) / config.warmup
+    share = (step - config.warmup) / max(config.steps - 1 - config.warmup, 1)
+    return config.last_rate + (config.rate - config.last_rate) * 0.5 * (1 + math.cos(math.pi * min(share, 1.0)))
+
+
+class _Run:
+    """A run in one process."""
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        data: str,
+        folder: Path,
+        here: World,
+        scenes: Scenes,
+        console: Console,
+        lpips: Lpips | None,
+    ) -> None:
+        self.config, self.data, self.folder, self.here, self.scenes = config, data, folder, here, scenes
+        self.network = Vvgt(config.network).to(here.device)
+        self.optimizer = torch.optim.AdamW(self.network.parameters(), lr=config.rate, weight_decay=config.weight_decay)
+        self.commit = commit()  # now: the checkout may move on while this runs
+        self.feeder = Feeder(scenes["train"], config)
+        self.lpips = lpips.to(here.device) if lpips else None
+        self.progress = Progress()
+        if (folder / LAST).exists():
+            self._resume()
+            console.say(f"goes on from step {self.progress.step} of {config.steps}")
+        self.recorder = Recorder(folder, self.progress.step, config.steps, console) if here.first else None
+        self.console = console
+
+    def to_the_end(self, ended: Sequence[int]) -> int:
+        """All steps that are left; the exit status."""
+        config, state = self.config, self.progress
+        stop = 0
+        while state.step < config.steps and not stop:
+            began = time.monotonic()
+            stop = self._step(ended)
+            state.seconds += time.monotonic() - began
+            if state.step % config.check_every == 0 or state.step == config.steps:
+                self._validate()
+            if stop or state.step % config.save_every == 0 or state.step == config.steps:
+                self._save()
+        if self.recorder is not None:
+            self.recorder.close()
+        if stop:
+            self.console.say(f"ended by signal {stop} after step {state.step}; the same command goes on from there")
+        return 128 + stop if stop else 0
+
+    def _step(self, ended: Sequence[int]) -> int:
+        """One step; a signal that some process has heard, else 0: all end after the same step."""
+        config, state, here = self.config, self.progress, self.here
+        self.optimizer.zero_grad(set_to_none=True)
+        pace = rate(state.step, config)
+        tally = np.zeros(3)
+        for index in range(here.rank, config.batch, here.size):
+            rng = np.random.default_rng([config.seed, state.step, index])
+            one = accumulate_gradients(self.network, self.feeder, rng, here.device, self.lpips)
+            tally += [one.loss, one.gain, one.bad]
+        here.add_gradients(self.network)
+        loss, gain, bad, stop = here.total([*tally, bool(ended)])
+        norm = float(torch.nn.utils.clip_grad_norm_(self.network.parameters(), config.clip))
+        if bad or not math.isfinite(norm):
+            state.skipped += 1
+            self.console.say(f"step {state.step + 1} skipped: {int(bad)} scenes or the gradient not finite")
+        else:
+            for group in self.optimizer.param_groups:
+                group["lr"] = pace
+            self.optimizer.step()
+        state.step += 1
+        if self.recorder is not None:
+            share = max(config.batch - bad, 1)
+            self.recorder.step({
+                "step": state.step, "loss": loss / share, "gain": gain / share, "rate": pace, "norm": norm,
+                "skipped": state.skipped, "seconds": round(state.seconds, 3),
+            })  # fmt: skip
+        if not stop:
+            return 0
+        return int(max(ended, default=signal.SIGTERM))
+
+    def _validate(self) -> None:
+        """Score the held-out scenes; keep the best network."""
+        parts = [part for part in self.scenes if part != "train"]
+        row: dict[str, Any] = {"step": self.progress.step}
+        gains = []
+        for part in parts:
+            mine = self.scenes[part][self.here.rank :: self.here.size]
+            found = np.array([score_scene(self.network, scene, self.config, self.here.device) for scene in mine])
+            rounds = self.config.network.rounds
+            sums = found.sum(axis=0) if len(found) else np.zeros(rounds + 1)
+            means = np.array(self.here.total(sums)) / len(self.scenes[part])
+            row[f"{part}: psnr before"] = float(means[0])
+            row |= {f"{part}: gain {number}": float(means[number] - means[0]) for number in range(1, rounds + 1)}
+            gains.append(row[f"{part}: gain {rounds}"])
+        self.progress.found = {key: value for key, value in row.items() if key != "step"}
+        if float(np.mean(gains)) > self.progress.best:
+            self.progress.best = float(np.mean(gains))
+            self._write(BEST, {})
+        if self.recorder is not None:
+            self.recorder.validation(row)
+
+    def _save(self) -> None:
+        self._write(LAST, {"optimizer": self.optimizer.state_dict(), "progress": asdict(self.progress)})
+
+    def _write(self, name: str, more: dict[str, Any]) -> None:
+        """A checkpoint that `vvgt export` reads, with ``more`` for the loop itself."""
+        if not self.here.first:
+            return
+        state = self.progress
+        training = {
+            "config": {key: value for key, value in self.config.to_dict().items() if key != "network"},
+            "data": Path(self.data).name, "scenes": {part: len(scenes) for part, scenes in self.scenes.items()},
+            "step": state.step, "skipped": state.skipped, "seconds": round(state.seconds, 1),
+            "processes": self.here.size, "device": self.here.device.type, "torch": str(torch.__version__),
+        }  # fmt: skip
+        checkpoint = Checkpoint(self.network, plain(training), plain(state.found), self.commit)
+        with atomic_write(self.folder / name, overwrite=True) as temporary:
+            save_checkpoint(temporary, checkpoint, more)
+
+    def _resume(self) -> None:
+        path = self.folder / LAST
+        document = read_tensors(path)
+        try:
+            load_weights(self.network, document["state"], str(path))
+            self.optimizer.load_state_dict(document["optimizer"])
+            self.progress = Progress(**document["progress"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise DataError(f"{path}: not a checkpoint of a run ({error}); remove the folder to start afresh") from None
+
+
+def plain(value: Any) -> Any:
+    """Without tuples, which checkpoints and cards do not tell from lists."""
+    if isinstance(value, dict):
+        return {key: plain(entry) for key, entry in value.items()}
+    return [plain(entry) for entry in value] if isinstance(value, tuple | list) else value
+
+
+def commit() -> str:
+    """Of the checkout that this runs from; "unknown" elsewhere."""
+    here = Path(__file__).parent
+    try:
+        found = subprocess.run(["git", "rev-parse", "HEAD"], cwd=here, capture_output=True, text=True, timeout=10)
+    except (OSError, subprocess.SubprocessError):
+        return "unknown"
+    return found.stdout.strip() or "unknown"

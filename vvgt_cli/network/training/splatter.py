@@ -1,0 +1,66 @@
+"""The splatter as a function that torch differentiates: gsplat where the rows are on a GPU, else numba on the host."""
+
+from __future__ import annotations
+
+import importlib.util
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from vvgt_cli.cameras import Camera
+from vvgt_cli.gaussians.constants import DILATION, NEAR
+from vvgt_cli.network.prepare import unpack
+from vvgt_cli.splat import project, render, render_backward
+
+
+class Splat(torch.autograd.Function):
+    """`vvgt_cli.splat.render` and `render_backward`; rows as `vvgt_cli.network.prepare.pack` has them."""
+
+    @staticmethod
+    def forward(ctx: Any, rows: Tensor, camera: Camera) -> Tensor:
+        gaussians = unpack(rows.detach().float().cpu().numpy())
+        projection = project(gaussians, camera)
+        image = render(gaussians, camera, projection=projection)
+        ctx.kept = gaussians, camera, projection, image
+        return torch.from_numpy(image).to(rows.device)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None]:
+        gaussians, camera, projection, image = ctx.kept
+        g = render_backward(gaussians, camera, projection, image, grads[0].float().cpu().numpy())
+        fields = g.means, g.log_scales, g.quaternions, g.opacity_logits[:, None], g.colors
+        return torch.from_numpy(np.concatenate(fields, axis=1)).to(grads[0].device), None
+
+
+def splat(rows: Tensor, camera: Camera) -> Tensor:
+    """Picture (height, width, 4) float32 of Gaussians (K, 14), premultiplied; rows must be finite.
+
+    On a CUDA device with gsplat (extra ``cuda``) that draws, else the numba kernels on the host do.
+    """
+    if rows.is_cuda and importlib.util.find_spec("gsplat"):
+        return gsplat_picture(rows, camera)
+    picture: Tensor = Splat.apply(rows, camera)
+    return picture
+
+
+def gsplat_picture(rows: Tensor, camera: Camera) -> Tensor:
+    """`splat` by gsplat (Ye et al. 2024), differentiable.
+
+    Its alpha ends at 0.999 where ours does at 0.99, and it takes the Jacobian of what lies beside the frustum at the
+    frustum's edge: pictures differ there.
+    """
+    from gsplat import rasterization
+
+    means, log_scales, quaternions, logits, colors = rows.float().split([3, 3, 4, 1, 3], dim=1)
+    view = torch.eye(4, device=rows.device)
+    view[:3, :3] = torch.as_tensor(camera.rotation, dtype=torch.float32)
+    view[:3, 3] = torch.as_tensor(camera.translation, dtype=torch.float32)
+    lens = [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]
+    rgb, alpha, _ = rasterization(
+        means, quaternions, log_scales.exp(), logits[:, 0].sigmoid(), colors.clamp(min=0), view[None],
+        torch.tensor([lens], dtype=torch.float32, device=rows.device), camera.width, camera.height,
+        near_plane=NEAR, eps2d=DILATION, packed=False,
+    )  # fmt: skip
+    return torch.cat([rgb[0], alpha[0]], dim=-1)

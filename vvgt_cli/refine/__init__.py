@@ -1,0 +1,45 @@
+"""Image-space refinement: gradient descent on Gaussians until their pictures match given views."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+from vvgt_cli.refine.options import LOSS_3DGS, METHODS, Check, OptimizeOptions, OptimizeRecord, Progress
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from vvgt_cli.cameras import Camera
+    from vvgt_cli.gaussians import Gaussians
+
+
+def optimize(
+    gaussians: Gaussians,
+    cameras: Sequence[Camera],
+    images: np.ndarray,
+    options: OptimizeOptions | None = None,
+    check: Check | None = None,
+    progress: Progress | None = None,
+    stop: Callable[[], bool] | None = None,
+) -> tuple[Gaussians, OptimizeRecord]:
+    """Descend on the difference between pictures of Gaussians and views.
+
+    Args:
+        gaussians: where to start.
+        cameras, images: training views, (n, h, w, 4) float32 premultiplied.
+        options: how, and when to stop.
+        check: cameras and images to judge by, and `Blocks` of each where the images hold only those: what is returned
+            is the best that they have seen, the input included. Without them the last step's Gaussians are returned.
+        progress: called after each step with the steps taken and expected.
+        stop: asked before each step; True ends the run as a time budget would.
+
+    Raises:
+        DataError: no views, or images that do not fit their cameras.
+    """
+    from vvgt_cli.refine.loop import run
+
+    return run(gaussians, cameras, images, options or OptimizeOptions(), check, progress, stop)
+
+
+__all__ = ["LOSS_3DGS", "METHODS", "OptimizeOptions", "OptimizeRecord", "optimize"]

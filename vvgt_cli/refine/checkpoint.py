@@ -1,0 +1,120 @@
+"""Runs that go on where they ended: one .npz with the state, what is best so far, and how far the run is.
+
+A run that is resumed gives the bytes of one that was never interrupted, on as many threads.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import struct
+import zipfile
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.files import atomic_write
+from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.refine.options import OptimizeOptions, OptimizeRecord
+
+if TYPE_CHECKING:
+    from vvgt_cli.refine.judge import Judge
+    from vvgt_cli.refine.states import State
+
+_FAULTS = (
+    *(OSError, KeyError, ValueError, TypeError, AttributeError, OverflowError, EOFError, MemoryError, RuntimeError),
+    *(zipfile.BadZipFile, struct.error),
+)
+
+STEPPED = 2  # raised when the same start and options step otherwise
+
+
+def fingerprint(gaussians: Gaussians, options: OptimizeOptions, *views: Any) -> str:
+    """Hash of all that a run depends on; ``views``: `Train`, `Check` or None."""
+    found = hashlib.sha256(f"{STEPPED} {replace(options, checkpoint=None)!r}".encode())
+    for array in gaussians.arrays().values():
+        found.update(array.tobytes())
+    for part in filter(None, views):
+        found.update(repr(part[2:]).encode())
+        for camera, image in zip(part[0], part[1], strict=True):
+            found.update(repr(camera).encode())
+            found.update(image.tobytes())
+    return found.hexdigest()
+
+
+def save(path: str, key: str, state: State, judge: Judge, record: OptimizeRecord, walk: dict[str, Any]) -> None:
+    """Replace the file at ``path``; ``walk`` is plain values.
+
+    Raises:
+        DataError: the operating system refuses.
+    """
+    arrays: dict[str, Any] = {f"state_{name}": array for name, array in state.saved().items()}
+    arrays |= {f"best_{i}": array for i, array in enumerate(judge.kept or ())}
+    about = {"key": key, "walk": walk, "best": judge.best, "idle": judge.idle, "record": asdict(record)}
+    with atomic_write(path, overwrite=True) as temporary, open(temporary, "wb") as stream:
+        np.savez(stream, about=np.array(json.dumps(about)), **arrays)
+
+
+def resume(path: str, key: str, state: State, judge: Judge, record: OptimizeRecord) -> dict[str, Any] | None:
+    """Fill ``state``, ``judge`` and ``record`` from the file at ``path``; returns the walk, None without a file.
+
+    Raises:
+        DataError: not a checkpoint.
+        UsageError: of another run.
+    """
+    if not Path(path).exists():
+        return None
+    try:
+        about, arrays = load_archive(path)
+        if about["key"] != key:
+            raise UsageError(f"{path}: checkpoint of a run with other Gaussians, views or options; name another file")
+        own = state.saved()
+        saved = {name.removeprefix("state_"): array for name, array in arrays.items() if name.startswith("state_")}
+        _check_like(saved, own)
+        kept = [arrays[name] for name in sorted(arrays) if name.startswith("best_")]
+        if kept:
+            own = {name: array for name, array in own.items() if name.startswith("array_")}
+            _check_like({f"array_{i}": array for i, array in enumerate(kept)}, own)
+        state.restore(saved)
+        best, idle, walk = about["best"], int(about["idle"]), dict(about["walk"])
+        told = {field: about["record"][field] for field in asdict(record)}
+        told["checks"] = [tuple(look) for look in told["checks"]]
+    except _FAULTS as error:
+        text = " ".join(str(error).split())[:200]
+        raise DataError(f"{path}: not a checkpoint of 'vvgt optimize' ({text}); remove it to start afresh") from None
+    judge.best, judge.idle, judge.kept = best, idle, tuple(kept) or None
+    for field, value in told.items():
+        setattr(record, field, value)
+    return walk
+
+
+def load_archive(path: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """What was said about the run, and the arrays; all as it lies in the file, so that nothing grows in memory."""
+    with zipfile.ZipFile(path) as archive:
+        entries = archive.infolist()
+        if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
+            raise ValueError("compressed entries")
+        if sum(entry.file_size for entry in entries) > Path(path).stat().st_size:
+            raise ValueError("entries that are larger than the file")
+    with np.load(path, allow_pickle=False) as file:
+        about = json.loads(str(file["about"]))
+        return about, {name: file[name] for name in file.files if name != "about"}
+
+
+def _check_like(saved: dict[str, np.ndarray], own: dict[str, np.ndarray]) -> None:
+    """See that arrays are those of a state of any number of Gaussians: kernels do not check.
+
+    Raises:
+        ValueError: other names, types or shapes.
+    """
+    if set(saved) != set(own):
+        raise ValueError("other arrays")
+    for name, array in own.items():
+        there = saved[name]
+        rows = (len(saved["array_0"]),) if array.ndim and name != "last" else array.shape[:1]
+        same = there.dtype == array.dtype or there.dtype.kind == array.dtype.kind == "U"
+        if not same or there.shape != (*rows, *array.shape[1:]):
+            raise ValueError(f"{name} is {there.dtype} of shape {there.shape}")

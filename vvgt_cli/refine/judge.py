@@ -1,0 +1,66 @@
+"""Looks at the check views in the course of a run."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.gaussians.rules import INRIA, Rule
+from vvgt_cli.images.metrics import psnr
+from vvgt_cli.refine.options import Check, OptimizeRecord
+from vvgt_cli.refine.states import State
+from vvgt_cli.splat import blend
+
+GAIN = 0.01  # dB: less is none
+FALLEN = 3.0  # dB below the best: rates were too large
+
+
+class Judge:
+    """Looks at the check views, and remembers the best state that they have seen."""
+
+    def __init__(self, state: State, check: Check | None, record: OptimizeRecord, rule: Rule = INRIA) -> None:
+        self.state, self.check, self.record, self.rule = state, check, record, rule
+        self.best: float | None = None
+        self.kept: tuple[np.ndarray, ...] | None = None
+        self.idle = 0
+
+    def measure(self, seconds: float, settling: bool = False) -> bool:
+        """Score the state, unless that has been done; True if it has fallen, and was put back to the best.
+
+        Rates are kept up in the first half of a run, and pictures may get worse on the way: looks without gain count
+        when it is ``settling``, and after a fall.
+        """
+        record = self.record
+        if self.check is None or (record.checks and record.checks[-1][0] == record.steps):
+            return False
+        scores = []
+        cameras, views, *rest = self.check
+        blocks = rest[0] if rest else None
+        for i, (camera, view) in enumerate(zip(cameras, views, strict=True)):
+            part = None if blocks is None else blocks[i]
+            projection = self.state.project(camera, self.rule)
+            image = blend(projection, np.maximum(self.state.colors_from(camera), 0), camera.height, camera.width, part)
+            scores.append(psnr(view[..., :3], (image if part is None else part.pick(image))[..., :3]))
+        now = float(np.mean(scores))
+        record.checks.append((record.steps, seconds, now))
+        fallen = self.best is not None and now < self.best - FALLEN and self.state.STEADY
+        gained = self.best is None or now > self.best + GAIN
+        self.idle = 0 if gained else self.idle + ((settling and self.state.STEADY) or fallen)
+        if self.best is None or now > self.best:
+            self.best, self.kept, record.kept = now, tuple(a.copy() for a in self.state.arrays), record.steps
+        if fallen:
+            self._put_back()
+        return fallen
+
+    def _put_back(self) -> None:
+        assert self.kept is not None
+        self.state.arrays = tuple(kept.copy() for kept in self.kept)
+
+    def result(self, start: Gaussians) -> Gaussians:
+        """The best state as Gaussians; the input itself where nothing was better."""
+        self.record.psnr_after = self.best
+        if self.check is None:
+            self.record.kept = self.record.steps
+        else:
+            self._put_back()
+        return self.state.gaussians() if self.record.kept else start

@@ -1,0 +1,187 @@
+"""The loop: a view a step, looks at the check views in between, the best kept."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from vvgt_cli.cameras import Camera
+from vvgt_cli.cameras.blocks import BLOCK, Blocks
+from vvgt_cli.errors import DataError
+from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.refine.checkpoint import fingerprint, resume, save
+from vvgt_cli.refine.densify import Densified
+from vvgt_cli.refine.judge import Judge
+from vvgt_cli.refine.options import Check, OptimizeOptions, OptimizeRecord, Progress, Train
+from vvgt_cli.refine.states import Fields, OwnFrame, State
+from vvgt_cli.splat import blend
+
+SLOWER = 0.5  # rates after a fall
+LOOKS = 8  # at the check views in a run, where that leaves enough steps between two
+SETTLING = 0.5  # share of the run from which on looks without gain count: rates fall only then
+MEMORY = 0.9  # of the running error, a step
+KEEP = 30.0  # seconds after which a run is kept, looks or not
+
+
+def run(
+    gaussians: Gaussians,
+    cameras: Sequence[Camera],
+    images: np.ndarray,
+    options: OptimizeOptions,
+    check: Check | None,
+    progress: Progress | None,
+    stop: Callable[[], bool] | None,
+) -> tuple[Gaussians, OptimizeRecord]:
+    """`optimize` without its defaults."""
+    _fit("training", cameras, images)
+    if check is not None:
+        _fit("check", *check)
+    record = OptimizeRecord()
+    state = begin(gaussians, cameras, options)
+    judge = Judge(state, check, record, options.judge)
+    keep, course = _checkpoint(options, gaussians, (cameras, images), check, state, judge)
+    entered, order = time.perf_counter(), shuffled_views(len(cameras), options.seed)
+    if not record.checks:
+        judge.measure(0.0)
+        record.psnr_before = judge.best
+    saved = entered
+    spent, began = course.elapsed, time.perf_counter() - course.elapsed
+    for _ in range(record.steps):
+        next(order)
+    while True:
+        course.elapsed = time.perf_counter() - began
+        reason = _reason(options, judge, course.elapsed, stop)
+        if reason:
+            record.reason = reason
+            break
+        view = next(order)
+        share = _share(options, record.steps, course.elapsed)
+        course.error = step(state, cameras[view], images[view], options, course.error, share, course.speed)
+        record.steps += 1
+        expected = _expected(options, record.steps, course.elapsed)
+        if progress:
+            progress(record.steps, expected)
+        if record.steps >= course.looked + max(options.check_every, expected // LOOKS):
+            course.looked = record.steps
+            if judge.measure(time.perf_counter() - began, share >= SETTLING):
+                course.speed *= SLOWER
+        elif time.perf_counter() < saved + KEEP:
+            continue
+        keep()
+        saved = time.perf_counter()
+    keep()  # before the last look: a run that goes on from here would not have taken it
+    judge.measure(time.perf_counter() - began)
+    result = judge.result(gaussians)
+    record.seconds = spent + time.perf_counter() - entered
+    return result, record
+
+
+@dataclass
+class _Course:
+    """What changes from step to step beside the state."""
+
+    error: float | None = None
+    speed: float = 1.0
+    elapsed: float = 0.0
+    looked: int = 0
+
+
+def _checkpoint(
+    options: OptimizeOptions, gaussians: Gaussians, train: Train, check: Check | None, state: State, judge: Judge
+) -> tuple[Callable[[], None], _Course]:
+    """What saves the run, and where it begins: the end of the last one where there is a checkpoint."""
+    path = options.checkpoint
+    if path is None:
+        return lambda: None, _Course()
+    key = fingerprint(gaussians, options, train, check)
+    course = _Course(**(resume(path, key, state, judge, judge.record) or {}))
+    return lambda: save(path, key, state, judge, judge.record, asdict(course)), course
+
+
+def begin(gaussians: Gaussians, cameras: Sequence[Camera], options: OptimizeOptions) -> State:
+    """What the method descends on."""
+    if options.method == "3dgs":
+        return Densified(gaussians, cameras, options)
+    if options.method == "adam":
+        return Fields(gaussians, cameras)
+    return OwnFrame(gaussians, cameras, options.rule)
+
+
+def step(
+    state: State,
+    camera: Camera,
+    target: np.ndarray,
+    options: OptimizeOptions,
+    error: float | None,
+    share: float,
+    speed: float,
+) -> float:
+    """Forward, loss, backward, update for one view; takes and returns the running RMS error.
+
+    ``share`` in [0, 1] of the run lies behind; rates are multiplied by ``speed``.
+    """
+    from vvgt_cli.refine.loss import loss_gradient
+    from vvgt_cli.refine.ssim import add_ssim_gradient
+    from vvgt_cli.refine.texture import add_texture_gradient
+
+    projection = state.project(camera, options.rule)
+    image = blend(projection, np.maximum(state.colors_from(camera), 0), camera.height, camera.width)
+    grad = np.empty_like(image)
+    l1, l2, alpha = np.float32(options.l1), np.float32(options.l2), np.float32(options.alpha)
+    squares = loss_gradient(image, target, l1, l2, alpha, grad)
+    if options.ssim > 0:
+        add_ssim_gradient(image, target, options.ssim, grad)
+    if options.texture > 0:
+        add_texture_gradient(image, target, options.texture, grad)
+    now = math.sqrt(squares / ((3 + options.alpha) * camera.height * camera.width))
+    error = now if error is None else MEMORY * error + (1 - MEMORY) * now
+    state.descend(camera, projection, image, grad, error, share, speed)
+    return error
+
+
+def shuffled_views(count: int, seed: int) -> Iterator[int]:
+    """All views in random order, then again in another."""
+    rng = np.random.default_rng(seed)
+    while True:
+        yield from map(int, rng.permutation(count))
+
+
+def _share(options: OptimizeOptions, steps: int, elapsed: float) -> float:
+    """Of the run that lies behind, by steps or by time, whichever is more."""
+    by_steps = steps / options.steps if options.steps else 0.0
+    by_time = elapsed / options.time_budget if options.time_budget else 0.0
+    return min(max(by_steps, by_time), 1.0)
+
+
+def _expected(options: OptimizeOptions, steps: int, elapsed: float) -> int:
+    """Steps in all, as far as can be told."""
+    share = _share(options, steps, elapsed)
+    return max(steps, round(steps / share)) if options.time_budget and share > 0 else options.steps or steps
+
+
+def _reason(options: OptimizeOptions, judge: Judge, elapsed: float, stop: Callable[[], bool] | None) -> str | None:
+    """Why to stop before the next step; None to go on."""
+    if options.steps is not None and judge.record.steps >= options.steps:
+        return "steps"
+    if options.time_budget is not None and elapsed >= options.time_budget:
+        return "time"
+    if options.target_psnr is not None and judge.best is not None and judge.best >= options.target_psnr:
+        return "target"
+    if judge.idle >= options.patience:
+        return "no gain"
+    return "interrupted" if stop and stop() else None
+
+
+def _fit(name: str, cameras: Sequence[Camera], images: np.ndarray, blocks: Sequence[Blocks] | None = None) -> None:
+    if not len(cameras) or len(cameras) != len(images):
+        raise DataError(f"{len(images)} {name} images for {len(cameras)} cameras; expected as many, and at least one")
+    for i, (camera, image) in enumerate(zip(cameras, images, strict=True)):
+        expected = (camera.height, camera.width, 4)
+        if blocks is not None:
+            expected = (blocks[i].numbers.size * BLOCK, BLOCK, 4)
+        if image.shape != expected:
+            raise DataError(f"{name} view {camera.name}: image of shape {image.shape}; expected {expected}")

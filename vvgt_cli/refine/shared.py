@@ -1,0 +1,132 @@
+"""What the steps of Gaussians that are alike have in common, which one Gaussian's own slopes tell too noisily.
+
+A Gaussian's step is Adam's: of its own slopes, view by view, most of which is noise. But what the closed form gets
+wrong it gets wrong alike in Gaussians that are alike: too wide where the opacity is high, too pale beside what is dark.
+So the directions of all are regressed, each step anew, on what is known of each Gaussian at the start, and what the
+regression foretells is added to each one's step, `GAIN` times over: a mean over thousands has hardly any noise, and may
+go further. That is descent on the parameters ``theta_i + A phi_i`` of Gaussian i, in which A is shared by all. phi
+are the numbers known and random features of them (Rahimi and Recht 2007), so that A phi may bend.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vvgt_cli.closed_form.sharpen import curves, mix_neighbours
+from vvgt_cli.refine import steps
+from vvgt_cli.refine.steps import FEATURES, KNOWN
+from vvgt_cli.splat.lanes import LANES
+
+GAIN = 7.0  # factor on the predicted steps (docs/log/refinement.md)
+LEAST = 500  # Gaussians: of fewer, noise is foretold too
+SAMPLE = 12_000  # Gaussians that are regressed on, or up to twice as many
+RUN = 16  # of them that lie side by side in memory
+RIDGE = 1e-3  # of a feature's squares
+FARTHEST = 3.0  # standard deviations that a number counts
+BENT = 1.5  # length of the random directions
+ONE, MOST = 40, 127  # of a feature in 8 bits, which is what it is fitted with too
+BATCH = 1024 * LANES  # Gaussians whose features are made at once
+NONE = np.zeros((0, FEATURES, LANES), np.int8), np.zeros((KNOWN, FEATURES), np.float32)  # where nothing is shared
+
+
+def aligned(means: np.ndarray, factors: np.ndarray, logits: np.ndarray, colors: np.ndarray) -> np.ndarray:
+    """Numbers known of each Gaussian; and its axes in an order and with signs that mean the same for all.
+
+    Args:
+        means: (K, 3) float32.
+        factors: (K, 3, 3) float32 with covariance ``M M^T``; columns are put in order in place: the shortest first,
+            each towards where the neighbours lie. The covariance stays.
+        logits: (K,) of opacity.
+        colors: (K, 3).
+
+    Returns:
+        (K, 17) float32 of mean 0 and variance 1, within `FARTHEST`: logit, log lengths of the axes, colour; how
+        the means of the neighbours' differ from them; where the neighbours lie, along the axes. Neighbours are those of
+        `vvgt_cli.closed_form.sharpen.mix_neighbours`, each by how near it is.
+    """
+    lengths = np.sqrt(np.square(factors.astype(np.float64)).sum(axis=1))
+    order = np.argsort(lengths, axis=1, kind="stable")
+    lengths = np.maximum(np.take_along_axis(lengths, order, axis=1), 1e-12)
+    factors[:] = np.take_along_axis(factors, order[:, None, :], axis=2)
+    values = np.concatenate([logits[:, None], np.log(lengths), colors, means], axis=1, dtype=np.float32)
+    mixed, front, around = np.empty_like(values), np.empty_like(values), np.empty(len(means))
+    ones, half = np.ones(len(means)), np.full(3, max(float(np.abs(means).max()), 1e-12))
+    mix_neighbours(*curves(means, half), means, lengths.mean(axis=1), ones, ones, values, mixed, front, around)
+    beside = mixed - values
+    pull = np.einsum("kij,ki->kj", factors, beside[:, 7:]) / lengths**2
+    factors *= np.where(pull < 0, np.float32(-1), np.float32(1))[:, None, :]
+    far = np.minimum(np.abs(pull), FARTHEST).astype(np.float32)  # in lengths of the axis: flat ones have no bound
+    known = np.concatenate([values[:, :7], beside[:, :7], far], axis=1)
+    return _standard(known)
+
+
+def sampled(numbers: np.ndarray) -> np.ndarray:
+    """(m, n) of ``numbers`` (m, K): all up to `SAMPLE`, else as many to twice as many, in runs of `RUN`."""
+    rows, count = numbers.shape
+    if count <= SAMPLE:
+        return numbers
+    runs = numbers[:, : count - count % RUN].reshape(rows, -1, RUN)
+    some: np.ndarray = runs[:, :: count // SAMPLE].reshape(rows, -1)
+    return some
+
+
+def _standard(numbers: np.ndarray) -> np.ndarray:
+    """Of mean 0 and variance 1 over the first axis, within `FARTHEST`; 0 where all are the same."""
+    spread = numbers.std(axis=0, dtype=np.float64)
+    found = (numbers - numbers.mean(axis=0, dtype=np.float64)) / np.where(spread > 1e-9, spread, np.inf)
+    standard: np.ndarray = np.clip(found, -FARTHEST, FARTHEST).astype(np.float32)
+    return standard
+
+
+class SharedSteps:
+    """The regression, made once a run: features of all, and what turns directions of the sample into weights.
+
+    Attributes:
+        features: (ceil(K / LANES), FEATURES, LANES) int8, of which `ONE` is 1: 1, the numbers known, random features;
+            the last block is filled up with 0.
+        solver: (FEATURES, n) float32, ridge regression on the n Gaussians of the sample: their directions (n,) to the
+            features' weights.
+    """
+
+    def __init__(self, known: np.ndarray) -> None:
+        """Of ``known`` (K, 17), as `aligned` returns it."""
+        count, inputs = known.shape
+        rng = np.random.default_rng(0)  # the same features in each run
+        ways = (rng.normal(size=(inputs, FEATURES - inputs - 1)) * (BENT / np.sqrt(inputs))).astype(np.float32)
+        offsets = rng.normal(size=ways.shape[1]).astype(np.float32)
+        some = sampled(known.T).T
+        middle = np.maximum(some @ ways + offsets, 0).mean(axis=0)
+
+        def rows(part: np.ndarray) -> np.ndarray:
+            bent = np.maximum(part @ ways + offsets, 0) - middle
+            found = np.concatenate([np.ones((len(part), 1), np.float32), part, bent], axis=1)
+            rounded: np.ndarray = np.clip(np.rint(found * ONE), -MOST, MOST)
+            return rounded
+
+        numbers = rows(some).astype(np.float64)
+        square = numbers.T @ numbers
+        square[np.diag_indices(FEATURES)] *= 1 + RIDGE
+        square[np.diag_indices(FEATURES)] += 1e-9  # of a feature that none has
+        self.solver = np.linalg.solve(square, numbers.T).astype(np.float32)
+        self.features = np.zeros((-(-count // LANES), FEATURES, LANES), np.int8)
+        for begin in range(0, count, BATCH):
+            part = np.zeros((-(-min(BATCH, count - begin) // LANES) * LANES, FEATURES), np.int8)
+            part[: min(BATCH, count - begin)] = rows(known[begin : begin + BATCH])
+            blocks = part.reshape(-1, LANES, FEATURES)
+            self.features[begin // LANES : begin // LANES + len(blocks)] = blocks.transpose(0, 2, 1)
+
+    def weights(self, directions: np.ndarray) -> np.ndarray:
+        """(KNOWN, FEATURES) float32, `GAIN` times what foretells ``directions`` (COUNT, n) of the sample.
+
+        Not of what turns the axes: it has no sign that means the same for all.
+        """
+        found = np.empty((KNOWN, FEATURES), np.float32)
+        steps.regress(self.solver, np.nan_to_num(directions, posinf=0, neginf=0), GAIN, found)
+        return found
+
+
+def shared_steps(means: np.ndarray, factors: np.ndarray, logits: np.ndarray, colors: np.ndarray) -> SharedSteps | None:
+    """Of a start, whose axes are put in order in place; None where there are too few Gaussians for it."""
+    if len(means) < LEAST:
+        return None
+    return SharedSteps(aligned(means, factors, logits, colors))

@@ -1,0 +1,219 @@
+"""What is descended on: a state renders itself, takes steps, and can be put back to where it was."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from vvgt_cli.cameras import Camera
+from vvgt_cli.gaussians import SH_C0, Gaussians
+from vvgt_cli.gaussians.rules import INRIA, Rule
+from vvgt_cli.refine import steps
+from vvgt_cli.refine.shared import NONE, sampled, shared_steps
+from vvgt_cli.refine.steps import EPSILON
+from vvgt_cli.splat import Projection, project
+from vvgt_cli.splat.reference import rotations
+from vvgt_cli.splat.render import fields_backward, moments, own_frame_backward, project_factors, seen_colors
+
+WARM_UP = 3  # steps
+SMALLEST = 1e-7  # standard deviation, unit frame
+WEAKEST = 0.1  # of the mean size of slopes, added to one's own: what is hardly seen goes less far than the rest
+MEDIAN = 7  # one of so many of the sample is in the median
+OUTLIER = 100.0  # times the median that a slope counts in that mean
+GIVEN = 0.3  # of the rate of harmonics, where the start has some (docs/log/light.md)
+
+
+def _last(arrays: tuple[np.ndarray, ...], index: int) -> np.ndarray | None:
+    """The harmonics, where there are any: the last of a state's arrays."""
+    return arrays[index] if len(arrays) > index else None
+
+
+def _has_harmonics(harmonics: np.ndarray | None) -> bool:
+    """Whether the highest degree of ``harmonics`` (K, M, 3), which has most of them, holds something."""
+    if harmonics is None:
+        return False
+    degree = math.isqrt(harmonics.shape[1] + 1) - 1
+    return bool(harmonics[:, degree**2 - 1 :].any())
+
+
+class OwnFrame:
+    """Covariance ``M M^T``; steps ``mu += M d``, ``M <- M (I + E + E^2 / 2)``, of opacity logits, colours, harmonics.
+
+    Rates go with the root of the running error of the pictures: the nearer, the smaller; and from the middle of the
+    run on in a straight line to zero. Where Gaussians share what their steps have in common (`shared_steps`), what is
+    their own counts `OWN` times, and slopes that are small beside the others' count less. Harmonics up to a degree that
+    the start has change by `GIVEN` of the rate of those that begin at zero.
+    """
+
+    # d, E on and off the diagonal, logit, colour, and what harmonics together change it (RMS over directions)
+    RATES = np.array([0.05, 0.025, 0.0125, 0.03, 0.008, 0.008])
+    OWN = np.array([0.75, 1.0, 1.0, 0.75, 0.75, 1.0])
+    CLIPS = np.array([0.5, 1.0, 0.3])  # d, logit, E
+    ERROR, LARGEST = 0.05, 1.5
+    BETAS = 0.6, 0.999
+    STEADY = True  # what falls far behind its best can be put back there, and a run without gain is at its end
+
+    def __init__(self, gaussians: Gaussians, cameras: Sequence[Camera], rule: Rule = INRIA) -> None:
+        scales = np.exp(gaussians.log_scales.astype(np.float64))
+        harmonics = gaussians.harmonics
+        self.arrays: tuple[np.ndarray, ...] = (
+            gaussians.means.copy(),
+            np.ascontiguousarray(rotations(gaussians.quaternions) * scales[:, None, :], np.float32),
+            gaussians.opacity_logits.copy(),
+            np.maximum(gaussians.colors, 0) if harmonics is None else gaussians.colors.copy(),
+            *([] if harmonics is None else [harmonics.copy()]),
+        )
+        self.harmonic_rate = float(self.RATES[5]) * (GIVEN if _has_harmonics(harmonics) else 1.0)
+        self.running = [np.zeros_like(array) for array in self.arrays[4:] for _ in range(2)]
+        self.darkest = 0.0 if harmonics is None else -math.inf  # what is negative may be lighter from elsewhere
+        self.first, self.second = (np.zeros((steps.COUNT, len(gaussians)), np.float32) for _ in range(2))
+        pixel = float(np.median([np.linalg.norm(camera.position) / camera.fx for camera in cameras]))
+        self.spread = rule.dilation * pixel**2
+        self.step = 0
+        self.shared = shared_steps(*self.arrays[:4])
+
+    def colors_from(self, camera: Camera) -> np.ndarray:
+        """(K, 3) colours as the camera sees them, which may be negative."""
+        return seen_colors(self.arrays[0], self.arrays[3], _last(self.arrays, 4), camera.position)
+
+    def project(self, camera: Camera, rule: Rule = INRIA) -> Projection:
+        means, factors, logits = self.arrays[:3]
+        return project_factors(means, factors, logits, camera, rule)
+
+    def descend(
+        self,
+        camera: Camera,
+        projection: Projection,
+        image: np.ndarray,
+        grad: np.ndarray,
+        error: float,
+        share: float,
+        speed: float,
+    ) -> None:
+        """One step; ``error`` RMS of the pictures so far, ``share`` of the run behind, ``speed`` a factor of rates."""
+        means, factors, logits, colors = self.arrays[:4]
+        harmonics, seen = _last(self.arrays, 4), self.colors_from(camera)
+        pairs = moments(projection, seen, image, grad)
+        slopes = own_frame_backward(means, factors, seen, camera, projection, pairs, harmonics)
+        self.step += 1
+        pace = speed * min(1.0, 2 * (1 - share))
+        pace *= min(self.LARGEST, math.sqrt(error / self.ERROR)) * min(1.0, self.step / WARM_UP)
+        rates = self.RATES * pace if self.shared is None else self.RATES * self.OWN * pace
+        steps.own_frame(
+            slopes.rows, rates, self.CLIPS, self.spread,
+            *self.BETAS, self.step, means, factors, logits, colors, self.darkest, self.first, self.second,
+            *self.common(slopes.rows),
+        )  # fmt: skip
+        if harmonics is not None and slopes.harmonics is not None:
+            rate = self.harmonic_rate * math.sqrt(4 * math.pi / harmonics.shape[1])
+            first, second = (array.reshape(-1) for array in self.running)
+            values, slope = harmonics.reshape(-1), slopes.harmonics.reshape(-1)
+            steps.adam(values, slope, rate * pace, *self.BETAS, self.step, first, second)
+
+    def common(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What is added to Adam's divisors, features and weights of what is shared; from slopes ``rows`` (COUNT, K)."""
+        if self.shared is None:
+            return np.full(len(rows), EPSILON, np.float32), *NONE
+        some, first, second = (sampled(array) for array in (rows, self.first, self.second))
+        beta1, beta2 = self.BETAS
+        with np.errstate(over="ignore", invalid="ignore"):  # of a Gaussian whose slopes are beyond float32
+            first = beta1 * first + (1 - beta1) * some
+            sizes = np.sqrt((beta2 * second + (1 - beta2) * some * some) / (1 - beta2**self.step))
+            middle = np.array([np.median(row[row > 0]) if (row > 0).any() else 0.0 for row in sizes[:, ::MEDIAN]])
+            usual = np.fmin(sizes, (OUTLIER * middle)[:, None].astype(np.float32))
+            floors = (WEAKEST * usual.mean(axis=1) + EPSILON).astype(np.float32)
+            directions = first / (1 - beta1**self.step) / (sizes + floors[:, None])
+        return floors, self.shared.features, self.shared.weights(directions)
+
+    def saved(self) -> dict[str, np.ndarray]:
+        """All that the next steps depend on, beside what is made of the start again."""
+        named = {f"array_{i}": array for i, array in enumerate(self.arrays)}
+        named |= {f"running_{i}": array for i, array in enumerate(self.running)}
+        return named | {"first": self.first.T, "second": self.second.T, "step": np.array(self.step)}
+
+    def restore(self, saved: dict[str, np.ndarray]) -> None:
+        """Put back what `saved` gave."""
+        self.arrays = tuple(saved[f"array_{i}"] for i in range(len(self.arrays)))
+        self.running = [saved[f"running_{i}"] for i in range(len(self.running))]
+        self.first, self.second = (np.ascontiguousarray(saved[name].T) for name in ("first", "second"))
+        self.step = int(saved["step"])
+
+    def gaussians(self) -> Gaussians:
+        """As a file has them: principal axes of ``M M^T``."""
+        from vvgt_cli.closed_form.pyramid import principal_axes
+        from vvgt_cli.closed_form.shape import quaternions
+
+        means, factors, logits, *colors = self.arrays
+        spreads = factors.astype(np.float64) @ factors.transpose(0, 2, 1)
+        variances, axes = np.empty((len(means), 3)), np.empty((len(means), 3, 3))
+        principal_axes(spreads, variances, axes)
+        log_scales = 0.5 * np.log(np.maximum(variances, SMALLEST**2))
+        return Gaussians(means, log_scales, quaternions(axes), logits, *colors)
+
+
+class Fields:
+    """Adam on the fields of `Gaussians` with the rates of 3DGS (Kerbl et al. 2023), nothing else of theirs."""
+
+    RATES = (5e-4, 5e-3, 1e-3, 5e-2, 2.5e-3 * SH_C0, 2.5e-3 / 20)  # lengths: 1.6e-4 x an extent of 3.3
+    BETAS = 0.9, 0.999
+    STEADY = True
+
+    def __init__(self, gaussians: Gaussians, cameras: Sequence[Camera]) -> None:
+        self.arrays: tuple[np.ndarray, ...] = tuple(array.copy() for array in gaussians.arrays().values())
+        self.running = [(np.zeros_like(array), np.zeros_like(array)) for array in self.arrays]
+        self.step = 0
+
+    def colors_from(self, camera: Camera) -> np.ndarray:
+        """(K, 3) colours as the camera sees them, which may be negative."""
+        return seen_colors(self.arrays[0], self.arrays[4], _last(self.arrays, 5), camera.position)
+
+    def project(self, camera: Camera, rule: Rule = INRIA) -> Projection:
+        return project(self.gaussians(), camera, rule)
+
+    def descend(
+        self,
+        camera: Camera,
+        projection: Projection,
+        image: np.ndarray,
+        grad: np.ndarray,
+        error: float,
+        share: float,
+        speed: float,
+    ) -> None:
+        """One step; the error does not matter, nor does the schedule: 3DGS' rates are constant over so few steps."""
+        seen = self.colors_from(camera)
+        self.update(camera, projection, moments(projection, seen, image, grad), seen, self.RATES)
+
+    def update(
+        self, camera: Camera, projection: Projection, pairs: np.ndarray, seen: np.ndarray, rates: Sequence[float]
+    ) -> None:
+        """Adam with ``rates`` for the fields, from the `moments` of a picture with the colours ``seen`` (K, 3)."""
+        gaussians = self.gaussians()
+        slopes = fields_backward(gaussians, camera, projection, pairs, seen)
+        self.step += 1
+        found = [getattr(slopes, field) for field in gaussians.arrays()]
+        used = rates[: len(found)]
+        for array, slope, rate, (first, second) in zip(self.arrays, found, used, self.running, strict=True):
+            values, moment, square = array.reshape(-1), first.reshape(-1), second.reshape(-1)
+            steps.adam(values, slope.reshape(-1), rate, *self.BETAS, self.step, moment, square)
+
+    def saved(self) -> dict[str, np.ndarray]:
+        """All that the next steps depend on."""
+        named = {f"array_{i}": array for i, array in enumerate(self.arrays)}
+        for i, (first, second) in enumerate(self.running):
+            named |= {f"first_{i}": first, f"second_{i}": second}
+        return named | {"step": np.array(self.step)}
+
+    def restore(self, saved: dict[str, np.ndarray]) -> None:
+        """Put back what `saved` gave."""
+        self.arrays = tuple(saved[f"array_{i}"] for i in range(len(self.arrays)))
+        self.running = [(saved[f"first_{i}"], saved[f"second_{i}"]) for i in range(len(self.arrays))]
+        self.step = int(saved["step"])
+
+    def gaussians(self) -> Gaussians:
+        return Gaussians(*self.arrays)
+
+
+State = OwnFrame | Fields

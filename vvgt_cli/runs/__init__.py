@@ -1,1 +1,0 @@
-"""What every run shares: source, record, outputs, places, files of Gaussians, scores."""

@@ -1,0 +1,210 @@
+"""Runs as reports hold them: what they cost, which of them nothing beats, and as a table.
+
+A run is a plain dict with the fields of a `vvgt-conversion` document (docs/report.md), and ``name`` and ``kind``.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import statistics
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from vvgt_cli.errors import DataError
+
+Run = dict[str, Any]
+FORMATS = ("vvgt-report", "vvgt-conversion")
+SCORING = ("test views", "seats")  # stages that only measure
+KINDS = ("closed form", "network", "steps", "baseline")
+STAGES = {  # colours of the stages that are known, in order
+    "read": "#8a949e", "scene": "#b4bbc2", "samples": "#8f7bbf", "closed form": "#2f7fbf", "check views": "#f2c76b",
+    "views": "#e69f00", "cells by error": "#0f8f8f", "back-projection": "#56b4e9", "network": "#cc79a7",
+    "judge": "#e3b5cd", "refinement": "#009e73",
+    "write": "#777c83", "test views": "#dddddd", "seats": "#e8e8e8",
+}  # fmt: skip
+OTHER = "#a05d3b"
+SCORES = ("psnr", "psnr_foreground", "psnr_white", "psnr_alpha", "ssim", "flip")
+
+
+@dataclass(frozen=True)
+class Series:
+    """Runs of one report.
+
+    Attributes:
+        name: of the report, for legends.
+        runs: in its order.
+        document: the whole of it.
+    """
+
+    name: str
+    runs: list[Run]
+    document: dict[str, Any] = field(default_factory=dict)
+
+    def scored(self) -> list[Run]:
+        """Runs that have scores and took time."""
+        return [run for run in self.runs if psnr(run) is not None and cost(run) > 0]
+
+
+def cost(run: Run) -> float:
+    """Wall seconds to the file: every stage but those that score."""
+    return float(sum(stage["seconds"] for stage in run["stages"] if stage["name"] not in SCORING))
+
+
+def psnr(run: Run) -> float | None:
+    """PSNR on the test views, whole frame over black, dB; None without."""
+    return None if not run.get("scores") else run["scores"]["psnr"]
+
+
+def worst_seat(run: Run) -> float | None:
+    """PSNR where the run looks least like the volume (`vvgt_cli.score.viewing`), dB; None without."""
+    return min((seat["psnr"] for seat in run.get("seats") or ()), default=None)
+
+
+def front(runs: Sequence[Run]) -> list[Run]:
+    """Runs that none beats in both time and PSNR, by time (the Pareto front)."""
+    best, kept = -math.inf, []
+    for run in sorted(runs, key=lambda run: (cost(run), -(psnr(run) or 0))):
+        found = psnr(run)
+        if found is not None and found > best:
+            best = found
+            kept.append(run)
+    return kept
+
+
+def knee(runs: Sequence[Run]) -> Run | None:
+    """Of the front, the run farthest above the line from its first to its last, over the logarithm of seconds."""
+    ends = front(runs)
+    if len(ends) < 3:
+        return ends[-1] if ends else None
+    x = [math.log(cost(run)) for run in ends]
+    y = [float(psnr(run) or 0) for run in ends]
+    wide, high = x[-1] - x[0] or 1.0, y[-1] - y[0] or 1.0
+    above = [(b - y[0]) / high - (a - x[0]) / wide for a, b in zip(x, y, strict=True)]
+    return ends[above.index(max(above))]
+
+
+def unit_costs(runs: Sequence[Run]) -> dict[str, float]:
+    """Medians over runs of what a stage costs a unit of its work; stages without runs are left out.
+
+    Keys say the unit: a training view, a step of refinement, a megabyte, a run.
+    """
+    found: dict[str, list[float]] = {}
+
+    def note(key: str, seconds: float, units: float) -> None:
+        if units > 0:
+            found.setdefault(key, []).append(seconds / units)
+
+    for run in runs:
+        for stage in run["stages"]:
+            name, seconds = stage["name"], stage["seconds"]
+            if name == "views":
+                note("views, a view", seconds, run.get("views") or 0)
+            elif name == "refinement" and run["kind"] == "steps":
+                note("refinement, a step", seconds, (run.get("refinement") or {}).get("steps") or 0)
+            elif name == "write":
+                note("write, a megabyte", seconds, run["bytes"] / 1e6)
+            elif name not in SCORING and run["kind"] != "baseline":
+                note(f"{name}, a run", seconds, 1)
+    return {key: statistics.median(values) for key, values in found.items()}
+
+
+def table(runs: Sequence[Run]) -> str:
+    """CSV, a row a run: name, kind, seconds, Gaussians, bytes, scores, and a column a stage."""
+    stages = stage_names(runs)
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    heads = [
+        "name",
+        "kind",
+        "seconds",
+        "gaussians",
+        "bytes",
+        *SCORES,
+        "worst_seat",
+        "pareto",
+        *(f"seconds: {s}" for s in stages),
+    ]
+    writer.writerow(heads)
+    best = {id(run) for run in front(runs)}
+    for run in runs:
+        scores = run.get("scores") or {}
+        row = [run["name"], run["kind"], f"{cost(run):.4f}", run["gaussians"], run["bytes"]]
+        numbers = [*(scores.get(key) for key in SCORES), worst_seat(run)]
+        row += ["" if number is None else f"{number:.4f}" for number in numbers]
+        seconds = _seconds(run)
+        row += [int(id(run) in best), *(f"{seconds[s]:.4f}" if s in seconds else "" for s in stages)]
+        writer.writerow(row)
+    return stream.getvalue()
+
+
+def stage_names(runs: Sequence[Run]) -> list[str]:
+    """Names of the stages of any run: those that are known in their order, then others."""
+    found = {stage["name"] for run in runs for stage in run["stages"]}
+    return [name for name in STAGES if name in found] + sorted(found - set(STAGES))
+
+
+def _seconds(run: Run) -> dict[str, float]:
+    """Seconds by stage; stages of one name are added."""
+    found: dict[str, float] = {}
+    for stage in run["stages"]:
+        found[stage["name"]] = found.get(stage["name"], 0.0) + float(stage["seconds"])
+    return found
+
+
+def read_series(path: str) -> Series:
+    """Runs of a `report.json`, or the one run of a `--report` of convert.
+
+    Raises:
+        DataError: neither, or one without runs that have scores.
+    """
+    try:
+        document = json.loads(Path(path).read_text("utf-8"))
+        kind = document["format"]
+        if kind not in FORMATS:
+            raise DataError(f"{path}: a {kind} document; expected one that 'vvgt report' or 'convert --report' wrote")
+        runs = document["runs"] if kind == "vvgt-report" else [_named(document)]
+        series = Series(_title(path, document), runs, document)
+        for run in runs:
+            _check(run)
+        count = len(series.scored())
+    except (OSError, UnicodeDecodeError, ValueError, KeyError, TypeError, AttributeError) as error:
+        what = error.strerror if isinstance(error, OSError) else f"{type(error).__name__} {error}"
+        raise DataError(f"{path}: not a report ({what}); expected report.json of 'vvgt report'") from None
+    if not count:
+        raise DataError(f"{path}: no run with scores; expected report.json, or --report of 'vvgt convert'")
+    return series
+
+
+def _check(run: Run) -> None:
+    """Raise where what tables and charts read of a run is missing or of another type."""
+    if run["kind"] not in KINDS:
+        raise ValueError(f"a run of kind {run['kind']!r}")
+    if not (isinstance(run["name"], str) and isinstance(run["gaussians"], int) and isinstance(run["bytes"], int)):
+        raise TypeError("a run's name, Gaussians or bytes")
+
+
+def _named(document: dict[str, Any]) -> Run:
+    options = document["options"]
+    steps = options.get("steps") or 0
+    budget = options.get("max_gaussians") or document["gaussians"]
+    name = f"{document['command']}, K {short(budget)}" + (f", {steps} steps" if steps else "")
+    return document | {"name": name, "kind": "steps" if steps else "closed form"}
+
+
+def _title(path: str, document: dict[str, Any]) -> str:
+    """The file's name; that of its folder for a report.json, which are all called so."""
+    own = Path(path)
+    return own.resolve().parent.name if own.name == "report.json" else own.stem
+
+
+def short(number: float) -> str:
+    """1536 -> 1.5k, 100000 -> 100k, 2500000 -> 2.5M."""
+    for size, suffix in ((1e6, "M"), (1e3, "k")):
+        if number >= size:
+            return f"{number / size:.3g}{suffix}"
+    return f"{number:g}"

@@ -1,0 +1,245 @@
+"""One HTML page that needs nothing else: charts, bars, a table, and pictures to compare."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import Any
+
+from vvgt_cli.score.charts import Point, legend, mark, scatter, stage_bars
+from vvgt_cli.score.curves import KINDS, Run, Series, cost, front, knee, psnr, short, worst_seat
+from vvgt_cli.score.style import CSS, SCRIPT
+
+AXES = (
+    ("seconds", "seconds to the file", "Error against time"),
+    ("gaussians", "Gaussians", "Error against Gaussians"),
+    ("megabytes", "megabytes", "Error against file size"),
+)
+GAIN = 8  # of the difference at first
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """What the page compares: PNG files as bytes.
+
+    Attributes:
+        views: their numbers among the test views.
+        reference: a file a view.
+        ours: of each run, a file a view.
+    """
+
+    views: list[int]
+    reference: list[bytes]
+    ours: list[list[bytes]]
+
+
+def _x(run: Run, axis: str) -> float:
+    if axis == "seconds":
+        return cost(run)
+    return float(run["gaussians"]) if axis == "gaussians" else run["bytes"] / 1e6
+
+
+def points(series: Sequence[Series], axis: str) -> list[list[Point]]:
+    """Marks of each series: coloured by kind where there is one series, by series where there are several."""
+    found = []
+    for n, one in enumerate(series):
+        best = {id(run) for run in front(one.scored())} if axis == "seconds" else set()
+        marks = []
+        for run in one.scored():
+            kind = KINDS.index(run["kind"])
+            name = run["name"] if len(series) == 1 else f"{one.name}: {run['name']}"
+            title = f"{name}: {psnr(run):.2f} dB, {cost(run):.2f} s, {run['gaussians']} Gaussians"
+            color = f"c{n % 4}" if len(series) > 1 else f"k{kind}"
+            x, y = _x(run, axis), float(psnr(run) or 0)
+            marks.append(Point(x, y, run.get("label") or run["name"], kind, color, id(run) in best, title))
+        found.append([p for p in marks if p.x > 0])
+    return found
+
+
+def chart(series: Sequence[Series], axis: str, x_label: str) -> str:
+    """One of `AXES`, with its front where it is time."""
+    marks = points(series, axis)
+    lines = [sorted((p for p in some if p.front), key=lambda p: p.x) for some in marks]
+    return scatter([p for some in marks for p in some], x_label, "PSNR, dB", [line for line in lines if len(line) > 1])
+
+
+def page(series: Sequence[Series], title: str, pictures: Pictures | None = None) -> str:
+    """The page of one report, or of several over each other."""
+    parts = [_head(series, title), _facts(series)]
+    charts = [
+        f"<section><h2>{head}</h2>{_keys(series)}{chart(series, axis, label)}{note}</section>"
+        for (axis, label, head), note in zip(AXES, (FRONT_NOTE, "", ""), strict=True)
+    ]
+    charts.append(_unit_costs(series))
+    parts.append(f'<div class="grid2">{"".join(charts)}</div>')
+    if pictures:
+        parts.append(_compare(series[0].runs, pictures))
+    longest = max(sum(stage["seconds"] for stage in run["stages"]) for one in series for run in one.runs)
+    parts += [f"<section><h2>{_title(s, series)}</h2>{stage_bars(s.runs, longest)}</section>" for s in series]
+    parts.append(_table(series))
+    parts += [_machine(s, len(series) > 1) for s in series]
+    script = f"<script>{SCRIPT}</script>" if pictures else ""
+    return (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width,initial-scale=1">'
+        f"<title>{escape(title)}</title><style>{CSS}</style></head><body><main>{''.join(parts)}</main>{script}</body></html>\n"
+    )
+
+
+FRONT_NOTE = (
+    "<p><small>Ringed and joined: no run is both faster and nearer. Seconds are those to the file: reading, views, "
+    "every stage, writing; not the scoring. PSNR: ten test views, whole frame over black.</small></p>"
+)
+
+
+def _title(one: Series, series: Sequence[Series]) -> str:
+    return "Where the time goes" + (f": {escape(one.name)}" if len(series) > 1 else "")
+
+
+def _head(series: Sequence[Series], title: str) -> str:
+    lines = []
+    for one in series:
+        volume, tf = one.document.get("volume") or {}, one.document.get("transfer_function") or {}
+        about = [one.name] if len(series) > 1 else []
+        if volume:
+            about += [f"{volume['name']}, {' × '.join(map(str, volume['dims']))} {volume['dtype']}"]
+        if tf:
+            about += [f"{tf['name']}, opacity per {tf['unit_distance']:g} ({tf['unit_distance_label']})"]
+        lines.append(f'<p class="soft">{escape("; ".join(about))}</p>')
+    return f"<h1>{escape(title)}</h1>{''.join(lines)}"
+
+
+def _facts(series: Sequence[Series]) -> str:
+    cells = []
+    for one in series:
+        runs = one.scored()
+        best, quick = max(runs, key=lambda r: psnr(r) or 0), min(runs, key=cost)
+        for what, run in (("quickest", quick), ("knee of the curve", knee(runs)), ("nearest", best)):
+            if run is not None and (len(series) == 1 or what == "nearest"):
+                head = what if len(series) == 1 else f"{one.name}: {what}"
+                size = f"{cost(run):.1f} s, {short(run['gaussians'])} Gaussians"
+                cells.append(
+                    f"<div><small>{escape(head)}</small><b>{psnr(run):.1f} dB</b>"
+                    f"<small>{escape(run['name'])}<br>{size}</small></div>"
+                )
+    return f'<div class="facts">{"".join(cells)}</div>'
+
+
+def _keys(series: Sequence[Series]) -> str:
+    kinds = sorted({KINDS.index(run["kind"]) for one in series for run in one.scored()})
+    colors = [f"k{kind}" if len(series) == 1 else "" for kind in kinds]
+    several = "".join(
+        f'<span><svg viewBox="0 0 18 18" class="key c{n % 4}">{mark(0, 9, 9)}</svg>{escape(one.name)}</span>'
+        for n, one in enumerate(series)
+        if len(series) > 1
+    )
+    return f'<div class="keys">{several}{legend(kinds, colors)}</div>'
+
+
+def _unit_costs(series: Sequence[Series]) -> str:
+    rows = []
+    for one in series:
+        for key, seconds in (one.document.get("unit_costs") or {}).items():
+            text = f"{seconds * 1e3:.3g} ms" if seconds < 1 else f"{seconds:.3g} s"
+            own = f"{one.name}: " if len(series) > 1 else ""
+            rows.append(f"<tr><td>{escape(own + key)}</td><td>{text}</td></tr>")
+    if not rows:
+        return ""
+    return f"<section><h2>What a stage costs</h2><table>{''.join(rows)}</table><p><small>Medians.</small></p></section>"
+
+
+def _uri(png: bytes) -> str:
+    import base64
+
+    return "data:image/png;base64," + base64.b64encode(png).decode("ascii")
+
+
+def _compare(runs: Sequence[Run], pictures: Pictures) -> str:
+    data: dict[str, Any] = {
+        "reference": [_uri(png) for png in pictures.reference],
+        "runs": [
+            {
+                "name": run["name"],
+                "images": [_uri(png) for png in own],
+                "scores": [f"{run['scores']['per_view'][v]['psnr']:.2f} dB in this view" for v in pictures.views],
+            }
+            for run, own in zip(runs, pictures.ours, strict=True)
+        ],
+    }
+    held = json.dumps(data).replace("<", "\\u003c")  # no name ends the script
+    chosen = runs.index(max(runs, key=lambda run: psnr(run) or 0))
+    options = "".join(
+        f'<option value="{n}"{" selected" if n == chosen else ""}>{escape(run["name"])} ({psnr(run):.1f} dB)</option>'
+        for n, run in enumerate(runs)
+    )
+    choices = "".join(f'<option value="{n}">test view {v + 1}</option>' for n, v in enumerate(pictures.views))
+    both = (
+        f'<img class="reference" alt="reference" src="{data["reference"][0]}">'
+        f'<img class="ours" alt="ours" src="{data["runs"][chosen]["images"][0]}">'
+    )
+    return (
+        '<section><h2>Pictures</h2><div class="tools">'
+        f'<label>Run <select id="run">{options}</select></label>'
+        f'<label>View <select id="view">{choices}</select></label>'
+        f'<label>Difference × <span id="gain-value">{GAIN}</span> '
+        f'<input id="gain" type="range" min="1" max="32" value="{GAIN}"></label></div>'
+        f'<div class="pair"><figure><div class="stage wipe">{both}<span class="tag l">reference</span>'
+        '<span class="tag r">ours</span><input id="wipe" type="range" min="0" max="100" value="50" '
+        'aria-label="where the picture passes from the reference to ours"></div>'
+        '<figcaption>Drag: reference on the left, <span id="ours-name"></span> on the right; <span id="score"></span>'
+        f'</figcaption></figure><figure><div class="stage gap" style="filter:brightness({GAIN})">{both}</div>'
+        "<figcaption>Difference, brightened.</figcaption></figure></div>"
+        f'<script type="application/json" id="images">{held}</script></section>'
+    )
+
+
+def _cell(value: Any, digits: int) -> str:
+    return "–" if value is None else f"{value:.{digits}f}"
+
+
+def _table(series: Sequence[Series]) -> str:
+    heads = ("run", "seconds", "PSNR", "foreground", "worst seat", "SSIM", "FLIP", "Gaussians", "MB")
+    rows = []
+    for one in series:
+        best = {id(run) for run in front(one.scored())}
+        for run in one.runs:
+            scores = run.get("scores") or {}
+            name = run["name"] if len(series) == 1 else f"{one.name}: {run['name']}"
+            cells = [
+                f"{cost(run):.2f}", _cell(scores.get("psnr"), 2), _cell(scores.get("psnr_foreground"), 2),
+                _cell(worst_seat(run), 2), _cell(scores.get("ssim"), 4), _cell(scores.get("flip"), 4),
+                f"{run['gaussians']:,}",
+                f"{run['bytes'] / 1e6:.2f}",
+            ]  # fmt: skip
+            mark = ' class="best"' if id(run) in best else ""
+            rows.append(f"<tr{mark}><td>{escape(name)}</td>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>")
+    head = "".join(f"<th>{name}</th>" for name in heads)
+    return (
+        f'<section><h2>All runs</h2><div class="scroll"><table><tr>{head}</tr>{"".join(rows)}</table></div>'
+        "<p><small>Bold: nothing is both faster and nearer. Worst seat: the lowest PSNR of every rule of drawing, "
+        "at the size made for and on the next larger screen, in one view.</small></p></section>"
+    )
+
+
+def _machine(one: Series, named: bool) -> str:
+    document = one.document
+    machine, versions = document.get("machine") or {}, document.get("versions") or {}
+    load, reference = machine.get("load"), document.get("reference") or {}
+    rows = {
+        "processor": f"{machine.get('cpu')}, {machine.get('cpus')} CPUs, {machine.get('threads')} threads used",
+        "system": f"{machine.get('system')} {machine.get('architecture')}",
+        "load at the end": "not known" if not load else ", ".join(f"{v:.2f}" for v in load) + " (1, 5, 15 minutes)",
+        "versions": ", ".join(f"{name} {version}" for name, version in versions.items()),
+    }
+    if reference:
+        rows["reference"] = (
+            f"{reference['views']} test views of {reference['size']} px, steps of {reference['step']:g} voxels, "
+            f"up to {reference['rays']} rays a pixel"
+        )
+    items = "".join(f"<dt>{escape(key)}</dt><dd>{escape(value)}</dd>" for key, value in rows.items())
+    command = document.get("command_line")
+    code = f"<code>{escape(command)}</code>" if command else ""
+    head = f"Machine and command{f': {escape(one.name)}' if named else ''}"
+    return f"<section><h2>{head}</h2>{code}<dl>{items}</dl></section>"

@@ -1,0 +1,200 @@
+"""The record of a run: what was asked, what came of it, and on which machine (docs/report.md)."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import platform
+import sys
+import time
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, is_dataclass
+from typing import Any
+
+from vvgt_cli.progress import Console
+from vvgt_cli.version import VERSION
+
+SCHEMA = 1  # of the JSON documents; raised when a field changes its meaning
+
+
+@dataclass
+class StageRecord:
+    """One stage of a run.
+
+    Attributes:
+        name: what was done.
+        seconds: wall time.
+        psnr: dB on the check views after it, None where none was rendered; ``psnr_before`` before it, where measured.
+        kept: False where the stage did not lower the error and was dropped.
+        note: what else there is to say, one line.
+    """
+
+    name: str
+    seconds: float = 0.0
+    psnr: float | None = None
+    kept: bool = True
+    note: str = ""
+    psnr_before: float | None = None
+
+    def detail(self) -> str:
+        """The stage's result as the console shows it."""
+        parts = [self.note] if self.note else []
+        if self.psnr is not None:
+            parts.append(f"check views {self.psnr:.2f} dB")
+        if not self.kept:
+            parts.append("no gain: dropped")
+        return ", ".join(parts)
+
+
+@dataclass
+class ConversionReport:
+    """What `vvgt convert`, `vvgt init` and `vvgt optimize` did; `to_json` is the `--report` file.
+
+    Attributes:
+        command: "convert", "init" or "optimize".
+        volume, transfer_function, options: what went in, plain values.
+        stages: in the order they ran.
+        gaussians, bytes: of the file written.
+        scores: on the test views, None for `init`.
+        seats: `convert`'s scores by every rule at the size made for and above (`vvgt_cli.score.viewing`), worst first.
+        plan: estimates of `convert` (`vvgt_cli.conversion.plan.Plan`): stages, seconds, bytes, memory.
+        left_out: (stage, why) of what was not done.
+        refinement: what gradient descent did (`vvgt_cli.refine.OptimizeRecord`), None without it.
+        seconds: wall time of the whole run, without the interpreter's start.
+    """
+
+    command: str
+    volume: dict[str, Any] = field(default_factory=dict)
+    transfer_function: dict[str, Any] = field(default_factory=dict)
+    options: dict[str, Any] = field(default_factory=dict)
+    stages: list[StageRecord] = field(default_factory=list)
+    gaussians: int = 0
+    bytes: int = 0
+    scores: dict[str, Any] | None = None
+    seats: list[dict[str, Any]] | None = None
+    refinement: dict[str, Any] | None = None
+    plan: dict[str, Any] | None = None
+    left_out: list[tuple[str, str]] = field(default_factory=list)
+    seconds: float = 0.0
+
+    def to_json(self) -> str:
+        """JSON with the machine and the versions beside the numbers; see docs/report.md."""
+        return document("vvgt-conversion", asdict(self))
+
+
+def document(kind: str, body: dict[str, Any]) -> str:
+    """A JSON document of this program: kind, schema, body, machine, versions; values not finite become null."""
+    whole = {"format": kind, "schema": SCHEMA, **body, "machine": machine(), "versions": versions()}
+    return json.dumps(plain(whole), indent=2, allow_nan=False) + "\n"
+
+
+def plain(value: Any) -> Any:
+    """``value`` with dataclasses, tuples and numpy numbers made JSON's own; floats not finite become None."""
+    if is_dataclass(value) and not isinstance(value, type):
+        value = asdict(value)
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if hasattr(value, "tolist"):  # numpy
+        return plain(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def _cpu() -> str:
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8", errors="replace") as lines:
+            return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or "unknown"
+
+
+def peak_memory() -> int | None:
+    """Largest resident size of this process so far in bytes, None where the system does not tell."""
+    try:
+        import resource
+    except ImportError:
+        return None
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
+
+
+def machine() -> dict[str, Any]:
+    """What times depend on: CPU, threads, load. No host name."""
+    threads = os.environ.get("NUMBA_NUM_THREADS")
+    if "numba" in sys.modules:
+        import numba
+
+        threads = str(numba.get_num_threads())
+    return {
+        "system": platform.system(),
+        "architecture": platform.machine(),
+        "cpu": _cpu(),
+        "cpus": os.cpu_count(),
+        "threads": int(threads) if threads else None,
+        "load": list(os.getloadavg()) if hasattr(os, "getloadavg") else None,
+        "peak_memory_bytes": peak_memory(),
+    }
+
+
+def versions() -> dict[str, str]:
+    """Of this program and of what its numbers depend on; only what has been imported."""
+    found = {"vvgt": VERSION, "python": platform.python_version()}
+    for name in ("numpy", "numba", "vtkmodules"):
+        module = sys.modules.get(name)
+        version = getattr(module, "__version__", None)
+        if version:
+            found["vtk" if name == "vtkmodules" else name] = str(version)
+    return found
+
+
+@dataclass
+class Run:
+    """Times stages, tells the console, and keeps the report."""
+
+    console: Console
+    report: ConversionReport
+    start: float = field(default_factory=time.perf_counter)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[StageRecord]:
+        """Time a block; the block sets psnr, kept and note of the stage that it is given."""
+        stage = StageRecord(name)
+        begin = time.perf_counter()
+        yield stage
+        stage.seconds = time.perf_counter() - begin
+        self.report.stages.append(stage)
+        self.console.stage(name, stage.seconds, stage.detail())
+
+    def compile(self, kernels: Collection[str], volume: str | None = None) -> None:
+        """Have kernels compiled whose code does not lie on disk: a stage of a first run, nothing in later ones.
+
+        Args:
+            kernels: of `vvgt_cli.jit.ahead`.
+            volume: type of the volume's values, where kernels read any.
+        """
+        from vvgt_cli.jit.compile import VOLUMES, compile_in_subprocess, missing, usual_jobs
+
+        todo = missing(usual_jobs(kernels, (volume,) if volume else VOLUMES))
+        if todo:
+            with self.stage("compile") as stage:
+                compile_in_subprocess(todo, self.console.bar("compile"))
+                stage.note = f"{len(todo)} kernels, on a first run (vvgt warmup does it beforehand)"
+
+    def elapsed(self) -> float:
+        """Wall seconds since the run began."""
+        return time.perf_counter() - self.start
+
+    def leave_out(self, stage: str, why: str) -> None:
+        """Say and record that a stage is not done."""
+        self.report.left_out.append((stage, why))
+        self.console.say(f"left out: {stage} ({why})")
+
+    def finish(self) -> ConversionReport:
+        """Close the report with the whole run's time."""
+        self.report.seconds = self.elapsed()
+        return self.report

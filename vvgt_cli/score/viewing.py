@@ -1,0 +1,189 @@
+"""Where a file is looked at: every rule of `vvgt_cli.gaussians.rules`, several sizes, from afar and close up."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Iterator
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vvgt_cli.cameras import Camera, default_views
+from vvgt_cli.cameras.blocks import ENOUGH, Blocks, spread_blocks
+from vvgt_cli.cameras.sets import FIELD_OF_VIEW
+from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.gaussians.rules import INRIA, RULES, Rule
+from vvgt_cli.progress import ProgressCallback
+
+if TYPE_CHECKING:
+    from vvgt_cli.dvr import RenderSettings, Scene
+    from vvgt_cli.dvr.render import Viewed
+    from vvgt_cli.images.metrics import Texture
+
+SIZES = (400, 800, 2160)  # pixels: a small window, half a screen, a 4K screen
+CLOSE = 10.0  # degrees: a quarter of the default views' field
+NEAR = 14.0  # degrees, of the pictures in which texture is measured: faces fill them, and cells are some pixels wide
+VIEWS = (0, 4, 9)  # test views: above, side, below
+SIDE = (4,)  # enough to find the worst seat
+PREVIEW_VIEWS = (0, 4, 9)  # test views of previews, and of the score without a report: above, side, below
+
+
+@dataclass(frozen=True)
+class ViewingCondition:
+    """One place to look from.
+
+    Attributes:
+        rule: by which the splats are drawn.
+        size: pixels along the picture's edge.
+        field_of_view: degrees.
+        psnr: dB, over black, mean of the views.
+    """
+
+    rule: str
+    size: int
+    field_of_view: float
+    psnr: float
+
+    def name(self) -> str:
+        """As tables and messages have it."""
+        return f"{self.rule} {self.size} px" + ("" if self.field_of_view == FIELD_OF_VIEW else " close up")
+
+
+def viewing_conditions(size: int) -> list[tuple[int, float]]:
+    """(size, field of view) from which a file made for ``size`` px is scored."""
+    return [(edge, FIELD_OF_VIEW) for edge in sorted({*SIZES, size})] + [(size, CLOSE)]
+
+
+def from_above(size: int) -> list[tuple[int, float]]:
+    """The size made for, and the next larger screen."""
+    return [(size, FIELD_OF_VIEW), (2160 if size < 2160 else 2 * size, FIELD_OF_VIEW)]
+
+
+def zoomed(camera: Camera, field_of_view: float) -> Camera:
+    """The same place with another field of view, degrees; square pixels."""
+    focal = camera.height / 2 / float(np.tan(np.radians(field_of_view) / 2))
+    return replace(camera, fx=focal, fy=focal)
+
+
+@dataclass(frozen=True)
+class ConditionView:
+    """What is to be seen from a seat in one view.
+
+    Attributes:
+        size, field_of_view: of the seat, pixels and degrees.
+        camera: of the view; ``blocks`` of it that are scored, None for all.
+        reference: (h, w, 3) float32 of the blocks, or of the whole.
+    """
+
+    size: int
+    field_of_view: float
+    camera: Camera
+    blocks: Blocks | None
+    reference: np.ndarray
+
+
+def seat_pictures(
+    places: Iterable[tuple[int, float]], views: Collection[int] = VIEWS, enough: int = ENOUGH
+) -> list[tuple[tuple[int, float], Camera, Blocks | None]]:
+    """Every place with the camera of each view from there, and the blocks of its picture that are scored."""
+    found = []
+    for size, field_of_view in places:
+        cameras = default_views("test", size=size)
+        for i in views:
+            camera, blocks = zoomed(cameras[i], field_of_view), spread_blocks(size, size, i, enough)
+            found.append(((size, field_of_view), camera, blocks))
+    return found
+
+
+def condition_views(
+    scene: Scene | Viewed,
+    places: Iterable[tuple[int, float]],
+    settings: RenderSettings | None = None,
+    *,
+    views: Collection[int] = VIEWS,
+    enough: int = ENOUGH,
+    progress: ProgressCallback | None = None,
+) -> Iterator[ConditionView]:
+    """References of every place, one at a time.
+
+    Args:
+        scene: what is looked at.
+        places: (size in pixels, field of view in degrees).
+        settings: of the reference; the renderer's default without.
+        views: numbers of the test views.
+        enough: blocks of a view, about.
+        progress: called after each view of a place.
+    """
+    from vvgt_cli.dvr import render_view
+
+    wanted = seat_pictures(places, views, enough)
+    for done, (place, camera, blocks) in enumerate(wanted, 1):
+        image = render_view(scene, camera, settings, blocks)[..., :3]
+        yield ConditionView(*place, camera, blocks, image if blocks is None else blocks.pick(image))
+        if progress:
+            progress(done, len(wanted))
+
+
+def score_texture(
+    scene: Scene | Viewed,
+    gaussians: Gaussians,
+    size: int,
+    rule: str | Rule = INRIA,
+    settings: RenderSettings | None = None,
+    progress: ProgressCallback | None = None,
+) -> Texture:
+    """Texture on smooth areas, in the `VIEWS` seen from near (`NEAR`), whole.
+
+    Args:
+        scene, gaussians: what is compared.
+        size: pixels along a picture's edge.
+        rule: by which Gaussians are drawn.
+        settings: of the reference; the renderer's default without.
+        progress: called after each view.
+    """
+    from vvgt_cli.dvr import render_view
+    from vvgt_cli.images.metrics import texture
+    from vvgt_cli.splat import render
+
+    def pairs() -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        cameras = default_views("test", size=size)
+        for done, i in enumerate(VIEWS):
+            camera = zoomed(cameras[i], NEAR)
+            yield render_view(scene, camera, settings), render(gaussians, camera, rule)
+            if progress:
+                progress(done + 1, len(VIEWS))
+
+    return texture(pairs())
+
+
+def texture_note(found: Texture) -> str:
+    """Texture as messages have it."""
+    if found.ours is None:
+        return "nothing in it is opaque and smooth"
+    return (
+        f"{found.ours:.2f} levels of 255, the volume {found.reference:.2f}; "
+        f"worst tenth {found.ours_worst:.2f} and {found.reference_worst:.2f}"
+    )
+
+
+def score_conditions(
+    gaussians: Gaussians, seen: Iterable[ConditionView], rules: Collection[str] = tuple(RULES)
+) -> list[ViewingCondition]:
+    """Every rule at every place, on blocks of the test views; worst first.
+
+    Args:
+        gaussians: that are drawn.
+        seen: of `condition_views`.
+        rules: names.
+    """
+    from vvgt_cli.images.metrics import psnr
+    from vvgt_cli.splat import render
+
+    errors: dict[tuple[str, int, float], list[float]] = {}
+    for view in seen:
+        for rule in rules:
+            ours = render(gaussians, view.camera, rule, blocks=view.blocks)[..., :3]
+            shown = ours if view.blocks is None else view.blocks.pick(ours)
+            errors.setdefault((rule, view.size, view.field_of_view), []).append(psnr(view.reference, shown))
+    found = [ViewingCondition(*condition, float(np.mean(dbs))) for condition, dbs in errors.items()]
+    return sorted(found, key=lambda condition: condition.psnr)
