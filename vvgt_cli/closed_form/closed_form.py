@@ -184,12 +184,11 @@ def form_of(
     seen = visibility(box, cells, cameras, progress=lambda share: tell(0.5 * share))
     opaque = opaque_field(cells, step, half, labels)
     tell(0.6)
+    normals = None if cells.normals is None else cells.normals[shown(cells, seen, step)]
     tree = build_tree(cells, seen, step)
-    normals = None
-    if shading is not None:
+    if shading is not None and normals is None:
         base = int((tree.children == 0).sum())
-        own = cells.normals
-        normals = shading.normals(centroids(tree.moments[:base])) if own is None else own[shown(cells, seen, step)]
+        normals = shading.normals(centroids(tree.moments[:base]))
     tell(1)
     return ClosedForm(
         seen, tree, opaque, half, step, pixel_width(size), budget, labels, shading, normals, degree, scene
@@ -225,7 +224,7 @@ def finest_level(step: np.ndarray, pixel: float) -> int:
 def bound(form: ClosedForm) -> str:
     """Why there are no more Gaussians, where there are fewer than the budget."""
     finest = 2.0 ** exponents(form.step, finest_level(form.step, form.pixel)) * form.step
-    if (form.tree.edge[0] > 1.5 * finest).any():
+    if (form.tree.edges[0] > 1.5 * finest).any():
         return f"memory for at most {MAX_BASE_CELLS} cells"
     return "the screen cannot tell smaller cells apart"
 

@@ -78,12 +78,12 @@ def sum_children(rows: np.ndarray, top: np.ndarray, start: np.ndarray, out: np.n
             out_top[m] = max(out_top[m], top[n])
 
 
-@kernel("f8:2 f8:1 f8:2 f8:1", parallel=True, error_model="numpy")
+@kernel("f8:2 f8:1 f8:1 f8:1", parallel=True, error_model="numpy")
 def score_splits(moments: np.ndarray, top: np.ndarray, edge: np.ndarray, out: np.ndarray) -> None:
-    """`tree.split_score` ``out`` (n,) of rows of ``moments`` (n, 17), ``top`` (n,) and edges ``edge`` (n, 3)."""
+    """`tree.split_score` ``out`` (n,) of rows of ``moments`` (n, 17), ``top`` (n,), of edges ``edge`` (3,)."""
+    area = (edge[0] * edge[1] * edge[2]) ** (2.0 / 3.0)
     for n in nb.prange(len(out)):
         row, mass = moments[n], moments[n, MASS]
-        area = (edge[n, 0] * edge[n, 1] * edge[n, 2]) ** (2.0 / 3.0)
         x, y, z = row[X] / mass, row[Y] / mass, row[Z] / mass
         variance = max((row[XX] + row[YY] + row[ZZ]) / mass - (x * x + y * y + z * z), 0.0)
         out[n] = -math.expm1(-mass / area) * area * math.sqrt(top[n] * row[SEEN] / mass) * variance

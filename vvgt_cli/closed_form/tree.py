@@ -24,22 +24,30 @@ class Tree:
         moments: (n, 17) float64 by `columns`: the 13 of `Cells`, then the same cells' seen mass and colour.
         largest: (n,) float64 largest transmittance over the views.
         index: (n, 3) int32 cell indices (x, y, z) from the box's corner, in cells of the row's own size.
-        edge: (n, 3) float64 cell edges, unit-frame lengths.
-        first: (n,) int64 first child of each cell; children are contiguous.
-        children: (n,) int64 number of children, 0 for base cells.
-        parent: (n,) int64, the root its own.
+        level: (n,) int8 of each cell, 0 for base cells, ascending.
+        edges: (levels, 3) float64 edges of the cells of a level, unit-frame lengths.
+        first: (n,) int32 first child of each cell; children are contiguous.
+        children: (n,) int8 number of children, 0 for base cells.
+        parent: (n,) int32, the root its own.
     """
 
     moments: np.ndarray
     largest: np.ndarray
     index: np.ndarray
-    edge: np.ndarray
+    level: np.ndarray
+    edges: np.ndarray
     first: np.ndarray
     children: np.ndarray
     parent: np.ndarray
 
     def __len__(self) -> int:
         return len(self.largest)
+
+    @property
+    def edge(self) -> np.ndarray:
+        """(n, 3) float64 cell edges, unit-frame lengths."""
+        result: np.ndarray = self.edges[self.level]
+        return result
 
 
 def build_tree(cells: Cells, seen: Visibility, step: np.ndarray, levels: int | None = None) -> Tree:
@@ -48,7 +56,7 @@ def build_tree(cells: Cells, seen: Visibility, step: np.ndarray, levels: int | N
     To the first cell that holds all of them, or so many ``levels``.
     """
     through = seen.at(cells.index, cells.edge / step)
-    keep = shown(cells, seen, step)
+    keep = np.flatnonzero(through[:, 1] > HIDDEN)
     return pyramid(
         cells.index[keep],
         cells.edge,
@@ -78,24 +86,24 @@ def pyramid(
     counts = [len(code) for code in codes]
     total = sum(counts)
     moments, top = np.empty((total, COLUMNS)), np.empty(total)
-    index, edge, parent = np.empty((total, 3), np.int32), np.empty((total, 3)), np.empty(total, np.int64)
-    first, children = np.zeros(total, np.int64), np.zeros(total, np.int64)
+    index, parent = np.empty((total, 3), np.int32), np.empty(total, np.int32)
+    first, children = np.zeros(total, np.int32), np.zeros(total, np.int8)
     fill(moments[: counts[0]], top[: counts[0]])
-    edge[: counts[0]] = base_edge
     index[: counts[0]] = base
     offset = 0
     for level, start in enumerate(starts):
         here = slice(offset, offset + counts[level])
         up = slice(here.stop, here.stop + counts[level + 1])
         sum_children(moments[here], top[here], start, moments[up], top[up])
-        edge[up] = base_edge * 2.0 ** (level + 1)
         index[up] = index[here][start] >> 1
         first[up] = offset + start
         children[up] = np.diff(np.append(start, counts[level]))
         parent[here] = up.start + np.repeat(np.arange(counts[level + 1]), children[up])
         offset = here.stop
     parent[offset:] = np.arange(offset, total)
-    return Tree(moments, top, index, edge, first, children, parent)
+    height = np.arange(len(counts))
+    edges = base_edge * 2.0 ** height[:, None]
+    return Tree(moments, top, index, np.repeat(height.astype(np.int8), counts), edges, first, children, parent)
 
 
 def central(moments: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -111,8 +119,9 @@ def central(moments: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def split_score(tree: Tree) -> np.ndarray:
     """(n,) what a cell's spread costs the image: saturated mass x visibility x variance."""
-    score = np.empty(len(tree))
-    score_splits(tree.moments, tree.largest, tree.edge, score)
+    score, ends = np.empty(len(tree)), np.searchsorted(tree.level, np.arange(len(tree.edges) + 1))
+    for edge, first, last in zip(tree.edges, ends[:-1], ends[1:], strict=True):
+        score_splits(tree.moments[first:last], tree.largest[first:last], edge, score[first:last])
     return score
 
 
@@ -194,7 +203,7 @@ class Leaves:
 
 def leaves_of(tree: Tree, ids: np.ndarray) -> Leaves:
     """The rows ``ids`` of a tree."""
-    return Leaves(tree.moments[ids], tree.index[ids], tree.edge[ids], ids)
+    return Leaves(tree.moments[ids], tree.index[ids], tree.edges[tree.level[ids]], ids)
 
 
 def split(tree: Tree, leaves: Leaves, order: np.ndarray, room: int, scene: Scene | None, seen: Visibility) -> Leaves:

@@ -21,7 +21,7 @@ def uniform_gaussians(tree: Tree, budget: int, pixel: float, seed: int) -> Gauss
         base = base[:0]
     rng = np.random.default_rng(seed)
     chosen = np.sort(rng.integers(0, max(len(base), 1), budget if len(base) else 0))
-    moments, edge = tree.moments[base[chosen]], tree.edge[base[chosen]]
+    moments, edge = tree.moments[base[chosen]], np.broadcast_to(tree.edges[0], (len(chosen), 3))
     centre = moments[:, FIRST] / moments[:, [MASS]]
     points = centre + edge * (rng.random(centre.shape) - 0.5)
     volume = len(base) * (edge[0].prod() if len(edge) else 0.0)

@@ -61,7 +61,7 @@ def detail_energy(tree: Tree) -> np.ndarray:
 def wavelet_gaussians(tree: Tree, budget: int, pixel: float) -> Gaussians:
     """At most ``budget`` isotropic Gaussians; ``pixel`` is a pixel's width at the centre, unit frame."""
     ids = select(tree, budget, detail_energy(tree))
-    moments, edge = tree.moments[ids], np.cbrt(tree.edge[ids].prod(axis=1))
+    moments, edge = tree.moments[ids], np.cbrt(tree.edges[tree.level[ids]].prod(axis=1))
     sigma, kept = box_surrogate()
     variances = np.repeat((sigma * edge)[:, None] ** 2, 3, axis=1)
     opacity = peak_opacity(moments[:, MASS] * kept, variances, pixel)

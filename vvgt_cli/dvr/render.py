@@ -112,13 +112,24 @@ class Rays(NamedTuple):
 
 def tiers(settings: RenderSettings, image: np.ndarray, blocks: Blocks | None = None) -> Iterator[list[Rays]]:
     """What fills ``image`` (h, w, 4), or its ``blocks``: rays to be cast into it before the next are asked for."""
+    everywhere = np.ones(image.shape[:2], bool) if blocks is None else blocks.mask()
+    yield first_rays(settings, everywhere)
+    yield more_rays(settings, image, everywhere)
+
+
+def first_rays(settings: RenderSettings, everywhere: np.ndarray) -> list[Rays]:
+    """All rays of pixels ``everywhere`` (h, w) bool, or one each where their contrast decides on `more_rays`."""
+    if settings.samples is not None:
+        return [Rays(ray_offsets(settings.samples**2) * settings.footprint, everywhere, 0)]
+    return [Rays(np.zeros((1, 2)), everywhere, 0)]
+
+
+def more_rays(settings: RenderSettings, image: np.ndarray, everywhere: np.ndarray) -> list[Rays]:
+    """Rays that ``image`` (h, w, 4), of one ray for each pixel of ``everywhere`` (h, w) bool, still needs."""
     from vvgt_cli.dvr.contrast import contrast
 
-    everywhere = np.ones(image.shape[:2], bool) if blocks is None else blocks.mask()
     if settings.samples is not None:
-        yield [Rays(ray_offsets(settings.samples**2) * settings.footprint, everywhere, 0)]
-        return
-    yield [Rays(np.zeros((1, 2)), everywhere, 0)]
+        return []
     differ = contrast(image, everywhere)
     ends, more = [threshold for threshold, _ in settings.tiers[1:]], []
     for (low, count), high in zip(settings.tiers, [*ends, np.inf], strict=True):
@@ -127,7 +138,7 @@ def tiers(settings: RenderSettings, image: np.ndarray, blocks: Blocks | None = N
             offsets = ray_offsets(count) * settings.footprint
             new = np.any(offsets != 0, axis=1)  # a grid of an even edge has no ray in the middle
             more.append(Rays(offsets[new], mask, int(not new.all())))
-    yield more
+    return more
 
 
 def for_thin(settings: RenderSettings, box: BoxGeometry, camera: Camera) -> RenderSettings:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -13,7 +13,7 @@ from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.cameras.blocks import Blocks
 from vvgt_cli.dvr.layout import Light
 from vvgt_cli.dvr.render import Box as Frame
-from vvgt_cli.dvr.render import Rays, RenderSettings, for_thin, tiers
+from vvgt_cli.dvr.render import Rays, RenderSettings, first_rays, for_thin, more_rays
 from vvgt_cli.field.cells import NORMALS, CellBlocks, ExtinctionBlocks, PointBlocks, RayBlocks, read_rows
 from vvgt_cli.field.digests import digest
 from vvgt_cli.field.field import Picture
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from vvgt_cli.field.cells import Reader
 
 Progress = Callable[[int, int], None]
-Todo = list[tuple[str, np.ndarray, Iterator[list[Rays]]]]  # key, picture and rays of what is to be drawn
 A_STEP = 2e-8  # seconds of a step of a ray through what is not empty: bonsai-tree in blocks of 128, two threads
 WAY = 1.5  # unit-frame lengths of a ray through the box, about
 
@@ -157,7 +156,7 @@ class Blocked:
         while blocks(exponents(step, level))[1].max() > 1 << TILE_BITS:
             level += 1  # of voxels so thin that a block of them is many cells
         grid, todo = self._grid(exponents(step, level)), self._todo()
-        rays = self._file(todo, [next(rays) for *_, rays in todo], grid) if todo else None
+        rays = self._file([(one, one.first()) for one in todo], grid) if todo else None
         if rays is not None:
             self.do.parts.prepare(rays.kind)
         return CellBlocks(self.reader, grid, self.do.parts, rays, self.light)
@@ -205,46 +204,41 @@ class Blocked:
         """Let go of a picture."""
         self.pictures.pop(_key(view), None)
 
-    def _todo(self) -> Todo:
-        """Key, picture and rays of all that are expected."""
-        todo = []
-        for key, (view, made) in self.pictures.items():
-            if made is None:
-                image = np.zeros((view.camera.height, view.camera.width, 4), np.float32)
-                settings = for_thin(view.settings, self.frame, view.camera)
-                todo.append((key, image, tiers(settings, image, view.blocks)))
-        return todo
+    def _todo(self) -> list[Drawing]:
+        """All that are expected."""
+        return [
+            Drawing(key, view.camera, for_thin(view.settings, self.frame, view.camera), view.blocks)
+            for key, (view, made) in self.pictures.items()
+            if made is None
+        ]
 
-    def _file(self, todo: Todo, rays: list[list[Rays]], grid: CellGrid) -> RayFile:
+    def _file(self, wanted: Sequence[tuple[Drawing, list[Rays]]], grid: CellGrid) -> RayFile:
         """The rays that pictures ask for next, in a file."""
         bundles = [
-            Bundle(view.camera, view.settings.step, np.argwhere(mask)[:, ::-1], offsets)
-            for (key, *_), wanted in zip(todo, rays, strict=True)
-            for view in [self.pictures[key][0]]
-            for offsets, mask, _ in wanted
+            Bundle(one.camera, one.settings.step, np.argwhere(mask)[:, ::-1], offsets)
+            for one, rays in wanted
+            for offsets, mask, _ in rays
         ]
         return RayFile.of(bundles, self.frame, grid.blocks, self.do.parts)
 
     def _march(self) -> None:
         """Make every picture that is expected, all of them together: at most two passes."""
         todo, grid = self._todo(), self.grid or self._grid(np.zeros(3, np.int64))
-        while True:
-            wanted = [next(rays, None) for *_, rays in todo]
-            rays = [one or [] for one in wanted]
-            if not any(rays):
-                break
-            file = self._file(todo, rays, grid)
+        for asked in (Drawing.first, Drawing.more):
+            wanted = [(one, rays) for one in todo if (rays := asked(one))]
+            if not wanted:
+                continue
+            file = self._file(wanted, grid)
             numbers = self._shown()
             task = RayBlocks(self.reader, grid, self.do.parts, file, self.light)
             self.do(task, "views", numbers)  # those that the pass over the cells has cast are there
-            seen = iter(composed(file, self.do.parts, numbers, self.source.volume.dims))
-            for (_, image, _), asked in zip(todo, rays, strict=True):
-                for offsets, mask, known in asked:
-                    total = next(seen).sum(axis=1)
-                    image[mask] = (known * image[mask] + total) / (known + len(offsets))
-        for key, image, _ in todo:
-            view = self.pictures[key][0]
-            self.pictures[key] = view, image if view.blocks is None else image[view.blocks.mask()]
+            seen = composed(file, self.do.parts, numbers, self.source.volume.dims)
+            for one, rays in wanted:
+                for part in rays:
+                    one.add(part, next(seen))
+        for one in todo:
+            image = one.seen if one.blocks is not None else one.image()
+            self.pictures[one.key] = self.pictures[one.key][0], image
 
     def _shown(self) -> list[int]:
         """Blocks that hold anything visible, as far as the pass over the cells has found it out."""
@@ -293,6 +287,51 @@ class Blocked:
         form = self.start(VbmOptions(budget, size)).form
         assert form is not None
         return form.seen.largest > HIDDEN, form.seen.edge
+
+
+@dataclass
+class Drawing:
+    """A picture that is being made: of its blocks' pixels alone, as screens are large.
+
+    Attributes:
+        key: of the picture.
+        camera, settings, blocks: as of `Picture`.
+    """
+
+    key: str
+    camera: Camera
+    settings: RenderSettings
+    blocks: Blocks | None
+
+    @cached_property
+    def seen(self) -> np.ndarray:
+        """(n, 4) float32 of the pixels of `everywhere`, row by row."""
+        return np.zeros((int(self.everywhere().sum()), 4), np.float32)
+
+    def everywhere(self) -> np.ndarray:
+        """(h, w) bool: its pixels."""
+        shape = self.camera.height, self.camera.width
+        return np.ones(shape, bool) if self.blocks is None else self.blocks.mask()
+
+    def image(self) -> np.ndarray:
+        """(h, w, 4), zero outside the blocks."""
+        whole = np.zeros((self.camera.height, self.camera.width, 4), np.float32)
+        whole[self.everywhere()] = self.seen
+        return whole
+
+    def first(self) -> list[Rays]:
+        """Rays of the first pass."""
+        return first_rays(self.settings, self.everywhere())
+
+    def more(self) -> list[Rays]:
+        """Rays of the second."""
+        return more_rays(self.settings, self.image(), self.everywhere())
+
+    def add(self, rays: Rays, shown: np.ndarray) -> None:
+        """Mix in what ``rays`` show, (pixels, rays, 4) float64."""
+        offsets, mask, known = rays
+        at = mask[self.everywhere()]
+        self.seen[at] = (known * self.seen[at] + shown.sum(axis=1)) / (known + len(offsets))
 
 
 def _key(view: Picture) -> str:

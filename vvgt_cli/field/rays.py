@@ -221,8 +221,8 @@ def meeting(cast: Cast, lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
     return result
 
 
-def composed(rays: RayFile, parts: Parts, numbers: Sequence[int], dims: tuple[int, int, int]) -> list[np.ndarray]:
-    """What whole rays see, (n, m, 4) float64 premultiplied of each bundle, from what blocks ``numbers`` have left.
+def composed(rays: RayFile, parts: Parts, numbers: Sequence[int], dims: tuple[int, int, int]) -> Iterator[np.ndarray]:
+    """What whole rays see, (n, m, 4) float64 premultiplied, bundle by bundle, from what blocks ``numbers`` have left.
 
     Raises:
         DataError: a part is missing or damaged.
@@ -238,7 +238,6 @@ def composed(rays: RayFile, parts: Parts, numbers: Sequence[int], dims: tuple[in
             offset += count
         if offset:
             held[number] = _mapped(path, offset)
-    out = []
     for bundle, found in zip(bundles, shown, strict=True):
         each = len(bundle.offsets)
         color, through = np.zeros((len(bundle.pixels) * each, 3)), np.ones(len(bundle.pixels) * each)
@@ -247,8 +246,7 @@ def composed(rays: RayFile, parts: Parts, numbers: Sequence[int], dims: tuple[in
             ray, rgba = held[number]["ray"][part], held[number]["rgba"][part]
             color[ray] += through[ray, None] * rgba[:, :3]
             through[ray] *= 1.0 - rgba[:, 3]
-        out.append(np.concatenate([color, 1 - through[:, None]], axis=1).reshape(-1, each, 4))
-    return out
+        yield np.concatenate([color, 1 - through[:, None]], axis=1).reshape(-1, each, 4)
 
 
 def _mapped(path: os.PathLike[str], count: int) -> np.ndarray:
