@@ -124,6 +124,19 @@ def test_a_feature_works_in_memory_and_in_blocks_and_errors_agree(vvgt, at, tmp_
     assert not [path for path in tmp_path.iterdir() if path.name.endswith(".blocks")]
 
 
+@pytest.mark.parametrize("row", ["headlight", "layers", "labels"])
+def test_a_file_has_the_same_scores_in_memory_and_in_blocks(vvgt, at, tmp_path, row):
+    volume, options = ROWS[row]
+    assert vvgt("convert", volume, *options, *SMALL, "-o", tmp_path / "a.ply").code == 0
+    shared = ("evaluate", tmp_path / "a.ply", "--volume", volume, *options, "--json")
+    memory, blocks = (json.loads(vvgt(*shared, *more).out) for more in ((), BLOCKS))
+    assert memory["reference_psnr"] == pytest.approx(blocks["reference_psnr"], abs=CLOSER)
+    assert memory["scores"]["psnr"] == pytest.approx(blocks["scores"]["psnr"], abs=AGREE)
+    for one, other in zip(memory["seats"], blocks["seats"], strict=True):
+        assert one["psnr"] == pytest.approx(other["psnr"], abs=CLOSER)
+    assert memory["texture"] == pytest.approx(blocks["texture"], abs=0.05, nan_ok=True)
+
+
 FEW = ("function", "shadows", "labels, lit", "layers, lit", "colours", "masked labels", "wavelet, lit")
 
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import click
 
+from vvgt_cli.cli.blocks import block_options
 from vvgt_cli.cli.fit import rule_option
 from vvgt_cli.cli.options import common_options, light_options, overwrite_option, placed_read_options, tf_options
 from vvgt_cli.cli.sections import SectionedCommand
@@ -36,9 +37,10 @@ from vvgt_cli.progress import Console
 @tf_options
 @light_options
 @placed_read_options
+@block_options
 @overwrite_option
 @common_options
-def command(ply: str, volume: str, as_json: bool, console: Console, **options: Any) -> None:
+def command(ply: str, volume: str, as_json: bool, blocks: dict[str, Any], console: Console, **options: Any) -> None:
     """Score OUT.ply against the volume it was made from.
 
     Scores are means over ten test views. A table lists the viewing conditions, worst first: how each viewer draws
@@ -52,10 +54,12 @@ def command(ply: str, volume: str, as_json: bool, console: Console, **options: A
     Example:
       vvgt evaluate head.ply --volume head.nrrd --tf bone.json --json
     """
+    from vvgt_cli.cli.blocks import chosen
     from vvgt_cli.cli.fit import source_request
     from vvgt_cli.commands.evaluate import EvaluateRequest, evaluate
 
     source = source_request(volume, options["read"], options["optics"], options["light"])
     names = ("size", "rule", "step", "seats", "preview", "overwrite")
-    evaluation = evaluate(EvaluateRequest(ply, source, **{name: options[name] for name in names}), console)
+    asked = {name: options[name] for name in names}
+    evaluation = evaluate(EvaluateRequest(ply, source, blocks=chosen(blocks), **asked), console)
     click.echo(evaluation.to_json() if as_json else evaluation.table(), nl=False)

@@ -36,7 +36,7 @@ FEW = 0.04  # share of hidden cells that are left where they are: of some fogs, 
 SMALLER = 1.75  # power: of smaller cells more are hidden (2: fogs lose 0.2 dB, 1.5: bone loses as much)
 REFINE_FROM = 0.3  # share of the budget given out before views say where the error is
 REFINE_ROUNDS = 2
-REFINE_VIEWS = 8
+CUT_VIEWS = 8
 TWICE = 0.6  # weight of the error at twice the size where styles of surface compete
 TWICE_EVERY = 6  # of so many views one counts as seen at twice its size when colours are solved
 
@@ -255,7 +255,7 @@ def fit(
     Returns:
         The Gaussians and one line that says what was done.
     """
-    few = range(0, len(cameras), max(len(cameras) // REFINE_VIEWS, 1))
+    few = range(0, len(cameras), max(len(cameras) // CUT_VIEWS, 1))
     some, images = [cameras[i] for i in few], views[list(few)]
     styles = list(STYLES) if form.opaque.any else ["round"]
     tick = progress or (lambda done, total: None)

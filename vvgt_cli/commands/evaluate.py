@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -12,12 +14,15 @@ from vvgt_cli.cameras.sets import SIZE
 from vvgt_cli.conversion.gaussian_files import STDIN, file_rule, open_gaussians
 from vvgt_cli.conversion.place import into_box, preview, upright
 from vvgt_cli.errors import UsageError
+from vvgt_cli.field.field import Field, Picture, Resident
+from vvgt_cli.field.open import Wanted, automatic, beside, blocked
+from vvgt_cli.field.settings import BlockOptions
 from vvgt_cli.field.source import Source, SourceRequest, describe_source, load, tf_record, volume_record
 from vvgt_cli.gaussians import Gaussians, PlyHeader
 from vvgt_cli.gaussians.outputs import Output, check_outputs
 from vvgt_cli.gaussians.rules import Rule
 from vvgt_cli.images.metrics.texture import Texture
-from vvgt_cli.jit.ahead import EVALUATE, for_degree
+from vvgt_cli.jit.ahead import EVALUATE, for_blocks, for_degree
 from vvgt_cli.look.lighting import LightOptions
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run, StageRecord, document
@@ -25,16 +30,15 @@ from vvgt_cli.score.viewing import (
     CLOSE,
     ViewingCondition,
     condition_views,
+    near_cameras,
     score_conditions,
     score_texture,
+    seat_pictures,
     texture_note,
     viewing_conditions,
     zoomed,
 )
-from vvgt_cli.score.views import psnr_note, score_test_views
-
-if TYPE_CHECKING:
-    from vvgt_cli.dvr import Scene
+from vvgt_cli.score.views import psnr_note, score_test_views, scored
 
 PICTURED = 4  # test view of the preview: from the side
 MIDDLE = 200  # pixels along the edge of what the reference's own error is measured on
@@ -51,6 +55,7 @@ class EvaluateRequest:
         rule: of `vvgt_cli.gaussians.rules` to draw by; None: the file's.
         step: of the reference, in voxels.
         seats: score every rule at several sizes and close up as well, and texture on smooth areas.
+        blocks: how the volume is processed in blocks; None: in memory, or in blocks where it is large.
         preview: PNG to write (reference, ours, difference of a test view and of a close-up), None for none.
         overwrite: replace it if it exists.
     """
@@ -61,6 +66,7 @@ class EvaluateRequest:
     rule: str | None = None
     step: float = 0.125
     seats: bool = True
+    blocks: BlockOptions | None = None
     preview: str | None = None
     overwrite: bool = False
 
@@ -112,21 +118,45 @@ def _cell(value: Any) -> str:
     return f"{value:.4f}" if isinstance(value, float) else str(value)
 
 
-def _load(request: SourceRequest, header: PlyHeader) -> Source:
-    """The source, with the file's own anatomical space, light and unit distance where none is asked for."""
-    asked = request.light
-    source = _load_dark(replace(request, light=LightOptions()), header)
-    preset = source.lighting if header.version is None else header.light
-    return replace(source, lighting=asked.lighting(preset, source.volume.space))
+@contextmanager
+def _opened(run: Run, request: EvaluateRequest, gaussians: Gaussians, header: PlyHeader) -> Iterator[Field]:
+    """The volume, with the file's own anatomical space, light and unit distance where none is asked for."""
+    size, asked = request.size or header.made_for or SIZE, request.source.light
+    dark = replace(request.source, light=LightOptions())
+    if dark.read.space is None and header.space == "LPS":
+        dark = replace(dark, read=replace(dark.read, space="LPS"))
+    recorded = dark.unit_distance is None and header.unit_distance is not None
+    if recorded:
+        dark = replace(dark, unit_distance=repr(header.unit_distance))
+
+    def lit(source: Source) -> Source:
+        preset = source.lighting if header.version is None else header.light
+        label = f"{header.unit_distance_label}, as the .ply records" if recorded else source.unit_label
+        return replace(source, unit_label=label, lighting=asked.lighting(preset, source.volume.space))
+
+    kernels, options = for_degree(EVALUATE, gaussians.degree), request.blocks or automatic(dark, run.console)
+    if options is None:
+        with run.stage("read") as stage:
+            source = lit(load(dark))
+            stage.note = describe_source(source)
+        run.compile(source.kernels(kernels), source.kernel_type())
+        with run.stage("scene"):
+            resident = Resident(source, source.scene())
+        yield resident
+        return
+    with beside(None) as parts, blocked(run, dark, options, parts, Wanted(len(gaussians), size)) as found:
+        found.source = lit(found.source)
+        run.compile(for_blocks(found.source.kernels(kernels)), found.source.kernel_type())
+        yield found
 
 
-def _load_dark(request: SourceRequest, header: PlyHeader) -> Source:
-    if request.read.space is None and header.space == "LPS":
-        request = replace(request, read=replace(request.read, space="LPS"))
-    if request.unit_distance is not None or header.unit_distance is None:
-        return load(request)
-    source = load(replace(request, unit_distance=repr(header.unit_distance)))
-    return replace(source, unit_label=f"{header.unit_distance_label}, as the .ply records")
+@contextmanager
+def _together(field: Field, pictures: Sequence[Picture]) -> Iterator[None]:
+    """Pictures that are asked for within: those of a volume in blocks are made together, and let go of."""
+    field.expect(pictures)
+    yield
+    for picture in pictures:
+        field.forget(picture)
 
 
 def evaluate(request: EvaluateRequest, console: Console | None = None) -> Evaluation:
@@ -135,72 +165,84 @@ def evaluate(request: EvaluateRequest, console: Console | None = None) -> Evalua
     Raises:
         UsageError, DataError: inputs that are not what they must be.
     """
-    from vvgt_cli.dvr import REFERENCE
-    from vvgt_cli.images import write_png
-
     if request.ply == STDIN == request.source.volume:
         raise UsageError("both OUT.ply and --volume are '-': standard input holds one of them")
     run = Run(console or Console(), ConversionReport("evaluate"))
     if request.preview:
         check_outputs([Output("--preview", request.preview, (".png",))], request.inputs(), request.overwrite)
-    with run.stage("read") as stage:
-        gaussians, header = open_gaussians(request.ply)
-        source = _load(request.source, header)
+    gaussians, header = open_gaussians(request.ply)
+    with _opened(run, request, gaussians, header) as volume:
+        source = volume.source
         gaussians = into_box(gaussians, source.volume)
-        stage.note = f"{len(gaussians)} Gaussians; {describe_source(source)}"
+        for remark in _doubts(request, header, source):
+            run.console.say(f"{request.ply}: {remark}")
+        return _scored(run, request, volume, gaussians, header)
+
+
+def _doubts(request: EvaluateRequest, header: PlyHeader, source: Source) -> Iterator[str]:
+    """What speaks against the file being of this volume, looked at so."""
     if header.affine is not None and not np.allclose(header.affine, source.volume.affine[:3].ravel(), rtol=1e-6):
-        run.console.say(f"{request.ply}: its header's affine is not that of {source.volume.name}: of another volume?")
+        yield f"its header's affine is not that of {source.volume.name}: of another volume?"
     if header.optics is not None and header.optics != source.optics():
-        run.console.say(
-            f"{request.ply}: made under other labels, functions or layers than {source.name}, as its header says "
+        yield (
+            f"made under other labels, functions or layers than {source.name}, as its header says "
             f"({header.optics}, not {source.optics() or 'scalars'})"
         )
-    run.compile(source.kernels(for_degree(EVALUATE, gaussians.degree)), source.kernel_type())
-    with run.stage("scene"):
-        scene = source.scene()
+
+
+def _scored(run: Run, request: EvaluateRequest, volume: Field, gaussians: Gaussians, header: PlyHeader) -> Evaluation:
+    """The scores, and a preview."""
+    from vvgt_cli.dvr import REFERENCE
+    from vvgt_cli.images import write_png
+
+    source = volume.source
     size, rule = request.size or header.made_for or SIZE, file_rule(header, request.rule)
     with run.stage("reference") as stage:
-        own = _reference_psnr(scene, size, request.step)
+        own = _reference_psnr(volume, size, request.step)
         stage.note = f"its own error {own:.1f} dB"
     evaluation = Evaluation(
         len(gaussians), size, rule.name, request.step, len(default_views("test")), volume_record(source),
         tf_record(source, request.source), own,
     )  # fmt: skip
-    with run.stage("test views") as stage:
-        settings = replace(REFERENCE, step=request.step)
+    settings = replace(REFERENCE, step=request.step)
+    wanted = [Picture(camera, settings, part) for _, camera, part in scored(size, perceptual=True)]
+    with run.stage("test views") as stage, _together(volume, wanted):
         bar = run.console.bar("test views")
-        scores = score_test_views(scene, gaussians, size, settings, rule=rule, progress=bar)
+        scores = score_test_views(volume, gaussians, size, settings, rule=rule, progress=bar)
         evaluation.scores = asdict(scores)
         stage.note = f"{psnr_note(scores)}, {size} px"
     if request.preview:
+        camera, axes = default_views("test", size=size)[PICTURED], upright(source.volume, header.up)
         with run.stage("preview"):
-            camera = default_views("test", size=size)[PICTURED]
-            axes = upright(source.volume, header.up)
-            sheet = preview(scene, gaussians, [camera, zoomed(camera, CLOSE)], axes, rule)
+            sheet = preview(volume, gaussians, [camera, zoomed(camera, CLOSE)], axes, rule)
             write_png(request.preview, sheet, request.overwrite)
     if request.seats:
-        _look_around(run, evaluation, scene, gaussians, rule)
+        _look_around(run, evaluation, volume, gaussians, rule)
     evaluation.stages = run.report.stages
     evaluation.seconds = run.finish().seconds
     return evaluation
 
 
-def _look_around(run: Run, evaluation: Evaluation, scene: Scene, gaussians: Gaussians, rule: Rule) -> None:
+def _look_around(run: Run, evaluation: Evaluation, volume: Field, gaussians: Gaussians, rule: Rule) -> None:
     """Seats, and texture from near."""
-    size = evaluation.size
-    with run.stage("seats") as stage:
-        seats = score_conditions(
-            gaussians, condition_views(scene, viewing_conditions(size), progress=run.console.bar("seats"))
-        )
+    from vvgt_cli.dvr import RenderSettings
+
+    size, settings = evaluation.size, RenderSettings()
+    places = viewing_conditions(size)
+    wanted = [Picture(camera, settings, blocks) for _, camera, blocks in seat_pictures(places)]
+    with run.stage("seats") as stage, _together(volume, wanted):
+        seen = condition_views(volume, places, settings, progress=run.console.bar("seats"))
+        seats = score_conditions(gaussians, seen)
         evaluation.seats = [asdict(seat) for seat in seats]
         stage.note = f"worst: {seats[0].name()}, {seats[0].psnr:.2f} dB"
-    with run.stage("texture") as stage:
-        found = score_texture(scene, gaussians, size, rule, progress=run.console.bar("texture"))
+    near = [Picture(camera, settings) for camera in near_cameras(size)]
+    with run.stage("texture") as stage, _together(volume, near):
+        found = score_texture(volume, gaussians, size, rule, settings, progress=run.console.bar("texture"))
         evaluation.texture = asdict(found)
         stage.note = texture_note(found)
 
 
-def _reference_psnr(scene: Scene, size: int, step: float) -> float:
+def _reference_psnr(volume: Field, size: int, step: float) -> float:
     """PSNR of the reference against half its step and twice its rays along a pixel's edge.
 
     Measured on the middle of the first test view: the whole of it would cost as much as eight views.
@@ -214,5 +256,6 @@ def _reference_psnr(scene: Scene, size: int, step: float) -> float:
     middle = replace(whole, cx=whole.cx - offset, cy=whole.cy - offset, width=edge, height=edge)
     settings = replace(REFERENCE, step=step)
     finer = replace(settings, step=settings.step / 2, tiers=tuple((edge, 4 * rays) for edge, rays in settings.tiers))
-    images = [render_view(scene, middle, s) for s in (finer, settings)]
+    with _together(volume, [Picture(middle, finer), Picture(middle, settings)]):
+        images = [render_view(volume, middle, s) for s in (finer, settings)]
     return score_view(images[0], images[1], perceptual=False).psnr

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from vvgt_cli.field.cells import Reader
 
 Progress = Callable[[int, int], None]
-A_STEP = 2e-8  # seconds of a step of a ray through what is not empty: bonsai-tree in blocks of 128, two threads
+RAY_STEP = 2e-8  # seconds of a step of a ray through what is not empty: bonsai-tree in blocks of 128, two threads
 WAY = 1.5  # unit-frame lengths of a ray through the box, about
 
 
@@ -139,7 +139,7 @@ class Blocked:
         share = (self.visible / self.source.volume.data.size) ** (1 / 3)
         steps = view_edge(size, small=False) ** 2 * WAY / min(x, y, z) * max(share, 0.1)
         case = Workload(
-            gaussians=gaussians, cells=0.0, voxels=self.visible, size=size, view=VIEW * A_STEP * steps, pace=pace(),
+            gaussians=gaussians, cells=0.0, voxels=self.visible, size=size, view=VIEW * RAY_STEP * steps, pace=pace(),
             there=PROGRAM + self.edge**3 * self.reader.voxel_bytes, visible=self.visible, step=(x, y, z),
         )  # fmt: skip
         return for_budget(case, gaussians)

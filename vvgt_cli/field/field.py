@@ -50,6 +50,9 @@ class Field(Protocol):
     def view(self, camera: Camera, settings: RenderSettings, blocks: Blocks | None = None) -> np.ndarray:
         """A picture (h, w, 4) float32, premultiplied RGBA; with ``blocks`` zero elsewhere."""
 
+    def forget(self, view: Picture) -> None:
+        """A picture that is not asked for again."""
+
     def normals(self, gaussians: Gaussians) -> np.ndarray | None:
         """Directions (K, 3) of the mean gradient around Gaussians, all in the box frame; None where nothing is lit."""
 
@@ -90,6 +93,9 @@ class Resident:
         from vvgt_cli.dvr import render_view
 
         return render_view(self.scene, camera, settings, blocks)
+
+    def forget(self, view: Picture) -> None:
+        """Nothing: none is kept."""
 
     def normals(self, gaussians: Gaussians) -> np.ndarray | None:
         """See `Field`."""

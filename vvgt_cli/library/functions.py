@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from vvgt_cli.commands.evaluate import Evaluation
+    from vvgt_cli.field.settings import BlockOptions
 
 
 def convert(
@@ -63,15 +64,19 @@ def convert(
     """
     from vvgt_cli.conversion.convert import without_files
     from vvgt_cli.conversion.request import ConvertRequest, FitOptions, Limits
-    from vvgt_cli.field.settings import BlockOptions
 
     want = Goal.of(goal)
     fit = FitOptions(want.max_gaussians, want.size, want.init, want.rule, want.seed, want.steps, want.model)
     limits = Limits(want.target_psnr, want.time_budget, want.max_megabytes)
-    cut = None if blocks is None else BlockOptions(None if isinstance(blocks, str) else blocks)
     source = source_of(volume, look, reading)
-    request = ConvertRequest(source, None, fit, limits, all_views=want.all_views, blocks=cut)
+    request = ConvertRequest(source, None, fit, limits, all_views=want.all_views, blocks=_blocks(blocks))
     return without_files(request, console_of(progress))
+
+
+def _blocks(blocks: int | str | None) -> BlockOptions | None:
+    from vvgt_cli.field.settings import BlockOptions
+
+    return None if blocks is None else BlockOptions(None if isinstance(blocks, str) else blocks)
 
 
 def read_volume(volume: VolumeLike, **reading: Unpack[Reading]) -> Volume:
@@ -154,6 +159,7 @@ def evaluate(
     rule: str | None = None,
     step: float = 0.125,
     seats: bool = True,
+    blocks: int | str | None = None,
     progress: bool = False,
     **reading: Unpack[Reading],
 ) -> Evaluation:
@@ -165,6 +171,7 @@ def evaluate(
         size, rule: to score at and draw by; None: the file's.
         step: of the reference, in voxels.
         seats: every rule at several sizes and close up, too.
+        blocks: as of `convert`.
         progress: lines and bars on standard error.
 
     Raises:
@@ -173,7 +180,7 @@ def evaluate(
     from vvgt_cli.commands import evaluate as pipeline
 
     source = source_of(volume, look, reading)
-    request = pipeline.EvaluateRequest(ply_of(ply), source, size, rule, step, seats)
+    request = pipeline.EvaluateRequest(ply_of(ply), source, size, rule, step, seats, _blocks(blocks))
     return pipeline.evaluate(request, console_of(progress))
 
 

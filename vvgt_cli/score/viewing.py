@@ -146,14 +146,18 @@ def score_texture(
     from vvgt_cli.splat import render
 
     def pairs() -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        cameras = default_views("test", size=size)
-        for done, i in enumerate(VIEWS):
-            camera = zoomed(cameras[i], NEAR)
+        for done, camera in enumerate(near_cameras(size)):
             yield render_view(scene, camera, settings), render(gaussians, camera, rule)
             if progress:
                 progress(done + 1, len(VIEWS))
 
     return texture(pairs())
+
+
+def near_cameras(size: int) -> list[Camera]:
+    """Those of `score_texture`."""
+    cameras = default_views("test", size=size)
+    return [zoomed(cameras[i], NEAR) for i in VIEWS]
 
 
 def texture_note(found: Texture) -> str:

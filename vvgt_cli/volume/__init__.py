@@ -1,6 +1,6 @@
 """Volumes and their readers."""
 
-from vvgt_cli.volume import (  # noqa: F401  each registers its formats, in this order
+from vvgt_cli.volume import (  # noqa: F401  each registers its formats
     dicom,
     examples,
     hdf5,

@@ -22,8 +22,11 @@ if TYPE_CHECKING:
     from vvgt_cli.dvr import RenderSettings, Scene
     from vvgt_cli.dvr.render import Viewed
 
-REFINE_VIEWS = 120  # training views of gradient descent at most
-A_STEP = 0.65, 0.85  # of them, small and large: fewer overfit, more cost steps (docs/log/refinement.md)
+MOST_VIEWS = 120  # training views of gradient descent at most, in whole sets
+VIEWS_A_STEP = (
+    0.65,
+    0.85,
+)  # views a step, small and large: fewer overfit, more cost steps (docs/log/refinement.md)
 MARGIN, SAMPLES = 4.0, 12.0  # dB, where views are means over their pixels, and where they are samples of a screen's
 LONGER = 6.0  # dB more, for longer steps: their errors are the same from all sides
 PROBED = 72  # blocks of a view that rays are tried on
@@ -34,8 +37,8 @@ SOLID = 0.9  # median opacity of opaque bodies
 
 def views_of(steps: int, small: bool) -> int:
     """Training views of so many steps, in whole sets."""
-    fewest, each = SET_VIEWS["train"], A_STEP[0] if small else A_STEP[1]
-    return fewest * min(max(round(each * steps / fewest), 1), REFINE_VIEWS // fewest)
+    fewest, each = SET_VIEWS["train"], VIEWS_A_STEP[0] if small else VIEWS_A_STEP[1]
+    return fewest * min(max(round(each * steps / fewest), 1), MOST_VIEWS // fewest)
 
 
 @dataclass(frozen=True)
@@ -85,7 +88,7 @@ class TrainingViews(Stage):
     """
 
     name: ClassVar[str] = "views"
-    count: int = 24
+    count: int = SET_VIEWS["train"]
     edge: int = 200
     fitted: bool = True
 
