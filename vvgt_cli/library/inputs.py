@@ -19,9 +19,11 @@ from vvgt_cli.look.labels import LabelTable
 from vvgt_cli.look.lighting import LightOptions
 from vvgt_cli.progress import Console
 from vvgt_cli.volume import ReadOptions, Volume
+from vvgt_cli.volume.dask_arrays import is_dask, lazy
+from vvgt_cli.volume.stored import Stored
 
 PathLike = str | os.PathLike[str]
-VolumeLike = Any  # a path, a Volume, a Session, an array, an xarray.DataArray, a pyvista (VTK) dataset
+VolumeLike = Any  # a path, a Volume, a Session, an array (of Dask, too), an xarray.DataArray, a pyvista (VTK) dataset
 LightLike = LightOptions | str | Sequence[float] | Sequence[str | Sequence[float]] | None
 LabelsLike = PathLike | Mapping[Any, Mapping[str, Any]] | LabelTable
 LayerLike = PathLike | LayerRequest
@@ -150,7 +152,8 @@ def volume_of(volume: VolumeLike, reading: Reading, name: str = "array") -> Volu
         if affine is not None or origin is not None:
             raise UsageError("affine and origin are of arrays; a file says itself where it is; leave them out")
         return open_volume(os.fspath(volume), options)
-    return cut(volume_in_memory(volume, options, origin=origin, affine=affine, name=name), options)
+    found = volume_in_memory(volume, options, origin=origin, affine=affine, name=name)
+    return cut(found, replace(options, stored=isinstance(found.data, Stored)))
 
 
 def content_of(volume: VolumeLike, reading: Reading) -> Volume | Content:
@@ -182,7 +185,11 @@ def _options(reading: Mapping[str, Any]) -> ReadOptions:
             given[key] = tuple(float(v) if key == "spacing" else int(v) for v in given[key])
     if given.get("mask") is not None and not isinstance(given["mask"], str | Volume):
         mask = given["mask"]
-        given["mask"] = os.fspath(mask) if isinstance(mask, os.PathLike) else Volume(np.asarray(mask), name="mask")
+        if isinstance(mask, os.PathLike):
+            given["mask"] = os.fspath(mask)
+        else:
+            values: Any = lazy(mask, "mask") if is_dask(mask) else np.asarray(mask)
+            given["mask"] = Volume(values, name="mask")
     return ReadOptions(**given)
 
 
