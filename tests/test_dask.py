@@ -45,8 +45,8 @@ LOOKS = {
 def test_bytes_are_those_of_the_array_in_blocks(values, tmp_path, name):
     values = np.digitize(values, [0.3, 0.6]).astype(np.uint8) if name == "labels" else values
     array = da.from_array(values, chunks=(13, 16, 20))  # aligned with no block
-    lazy = vvgt.convert(array, LOOKS[name], HOW, spacing=(1, 1, 1.5))
-    whole = vvgt.convert(values, LOOKS[name], HOW, spacing=(1, 1, 1.5), blocks=16)
+    lazy = vvgt.convert(array, LOOKS[name], HOW, spacing=(1, 1, 1.5), blocks=16)
+    whole = vvgt.convert(values, LOOKS[name], HOW, spacing=(1, 1, 1.5), blocks=32)
     assert saved(lazy, tmp_path / "lazy.ply") == saved(whole, tmp_path / "whole.ply")
     assert lazy.scores == whole.scores
 
@@ -101,7 +101,7 @@ def test_few_chunks_are_there_at_once(counted, light):
     result = vvgt.convert(array, vvgt.Look(TF, light=light), HOW, blocks=32)
     assert len(result.gaussians) > 100
     assert counts["made"] >= 2 * 64  # counted, integrated: every chunk was needed
-    assert counts["most"] <= 3 + 3 + 1  # kept, computed at once, and the one that is replaced
+    assert 3 <= counts["most"] <= 3 + 3 + 1  # kept, computed at once, and one that is let go of
 
 
 def test_parts_and_what_needs_the_whole(values, tmp_path):
