@@ -6,7 +6,6 @@ what the whole hides is converted label by label, and of that the hidden Gaussia
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,7 +15,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vvgt_cli.conversion.convert import convert, fitted, opened
-from vvgt_cli.conversion.functions import named
+from vvgt_cli.conversion.functions import beside, named
+from vvgt_cli.conversion.index import INDEX, LABELS, entry_of, index_of, index_output, write_index
 from vvgt_cli.conversion.owners import hidden_in, owners
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import NothingVisible, UsageError
@@ -24,19 +24,18 @@ from vvgt_cli.field.layered import AUTO, NONE, Content, layers_of, open_parts
 from vvgt_cli.field.open import automatic
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.outputs import Output, check_outputs, write_text
+from vvgt_cli.gaussians.outputs import check_outputs
 from vvgt_cli.gaussians.types import together
 from vvgt_cli.look.labels import Label, LabelTable
 from vvgt_cli.look.lighting import LightOptions
 from vvgt_cli.progress import Console
-from vvgt_cli.score.record import ConversionReport, Run, plain
+from vvgt_cli.score.record import ConversionReport, Run
 from vvgt_cli.volume import Volume
 from vvgt_cli.volume.stored import planes
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr.layers import Layer
 
-INDEX = "index"  # in the place of a label's name
 LONGEST = 80  # characters of a label's name in a file's
 
 
@@ -48,6 +47,12 @@ class Part:
     table: LabelTable
     label: Label
     request: ConvertRequest
+
+    def entry(self, report: ConversionReport) -> dict[str, Any]:
+        """In the index, without its file."""
+        label = self.label
+        facts = {"label": label.number, "color": label.color, "opacity": label.opacity}
+        return entry_of(label.name, report, **facts)
 
 
 def convert_labels(request: ConvertRequest, console: Console | None = None) -> dict[str, Any]:
@@ -74,6 +79,8 @@ def convert_labels(request: ConvertRequest, console: Console | None = None) -> d
             "--time-budget is of one file; --split-labels fits several times: give --steps or leave it out"
         )
     named(request, INDEX, "label")  # its errors come before the volume
+    index = index_output(str(request.output))
+    check_outputs([index], source.paths(), request.overwrite)
     run = Run(console, ConversionReport("convert"))
     with run.stage("volume") as stage:
         blocks = request.blocks or automatic(source, console)
@@ -84,19 +91,19 @@ def convert_labels(request: ConvertRequest, console: Console | None = None) -> d
         parts = _parts(request, content, maps)
         tables = " + ".join(layer.tf.name for layer in maps)
         stage.note = f"{maps[0].volume.name}, {len(parts)} labels of {tables}"
-    index = str(Path(str(request.output).replace("{}", INDEX)).with_suffix(".json"))
     outputs = [output for part in parts for output in part.request.outputs()]
-    check_outputs([*outputs, Output("-o", index, (".json",), binary=False)], source.paths(), request.overwrite)
+    check_outputs([*outputs, index], source.paths(), request.overwrite)
     rows = []
     for part, gaussians in zip(parts, _gaussians(request, parts, run), strict=True):
         if gaussians is None:
             console.say(f"label {part.label.number}, {part.label.name}: nothing visible; it gets no file")
             continue
         console.say(f"label {part.label.number}, {part.label.name}: to {part.request.output}")
-        rows.append(_row(part, convert(part.request, console, gaussians)))
-    found = {"format": "vvgt-labels", "volume": maps[0].volume.name, "table": tables, "files": rows}
-    write_text(index, json.dumps(plain(found), indent=2) + "\n", request.overwrite)
-    console.say(f"{index}: {len(rows)} labels")
+        report = convert(part.request, console, gaussians)
+        rows.append({**part.entry(report), "file": beside(str(part.request.output), Path(index.path).parent)})
+    found = index_of(LABELS, maps[0].volume.name, rows, table=tables)
+    write_index(index.path, found, request.overwrite)
+    console.say(f"{index.path}: {len(rows)} labels")
     return found
 
 
@@ -174,15 +181,6 @@ def _fitted(request: ConvertRequest, console: Console) -> Gaussians:
     if run.report.refinement and run.report.refinement["reason"] == "interrupted":
         raise KeyboardInterrupt
     return found
-
-
-def _row(part: Part, report: ConversionReport) -> dict[str, Any]:
-    """A label's entry in the index."""
-    label = part.label
-    return {
-        "label": label.number, "name": label.name, "color": label.color, "opacity": label.opacity,
-        "file": Path(str(part.request.output)).name, "gaussians": report.gaussians,
-    }  # fmt: skip
 
 
 def shares(shown: Sequence[tuple[Volume, LabelTable, Label]], budget: int) -> list[int]:
