@@ -100,7 +100,7 @@ def read_index(path: str | Path) -> dict[str, Any]:
         index: dict[str, Any] = json.loads(read_text(Path(path)))
         names = [PurePosixPath(row["file"]) for row in index["files"]]
         known = (index["format"], index["schema"]) == (FORMAT, SCHEMA)
-        known = known and all(isinstance(row["name"], str) for row in index["files"])
+        known = known and isinstance(index["kind"], str) and all(isinstance(row["name"], str) for row in index["files"])
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         known, names = False, []
     if not known or not names or any(name.is_absolute() or ".." in name.parts for name in names):
