@@ -29,7 +29,7 @@ def page_of_volume(request: ConvertRequest, alone: Callable[[], object], console
     Raises:
         UsageError, DataError: as `convert` and `convert_series`.
     """
-    if not _is_glob_of_volumes(request.source.path):
+    if not is_glob_of_volumes(request.source.path):
         try:
             alone()
             return
@@ -74,7 +74,7 @@ def _page(request: ConvertRequest, make: Callable[[ConvertRequest], dict[str, An
         run.finish()
 
 
-def _is_glob_of_volumes(path: str) -> bool:
+def is_glob_of_volumes(path: str) -> bool:
     """Whether a path is a glob of files that are volumes of their own, and not TIFF slices of one."""
     if os.path.exists(path) or not set(path) & set("*?["):
         return False

@@ -9,6 +9,7 @@ from dataclasses import dataclass, fields, replace
 from numbers import Real
 from typing import Any, BinaryIO, TypedDict
 
+from vvgt_cli.conversion.functions import function_name
 from vvgt_cli.conversion.result import Result
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.layered import Content, LayerRequest, open_parts, parse_layer
@@ -59,6 +60,43 @@ class Look:
 
 
 LookLike = Look | FunctionLike | None
+LooksLike = LookLike | Sequence[LookLike] | Mapping[str, LookLike]
+
+
+def looks_of(look: LooksLike) -> dict[str, Look] | None:
+    """Several looks by name, None where it is one.
+
+    A mapping is of several looks where all its values are functions or looks; a function's own holds lists of numbers.
+
+    Raises:
+        UsageError: none, or two of one name.
+        DataError: a mapping that is no function.
+    """
+    if isinstance(look, Mapping):
+        if not look or not all(
+            isinstance(v, Look | str | os.PathLike | Mapping | TransferFunction) for v in look.values()
+        ):
+            return None
+        return {str(name): Look.of(one) for name, one in look.items()}
+    if not isinstance(look, list | tuple):
+        return None
+    looks = [Look.of(one) for one in look]
+    names = [_name_of(one.function) for one in looks]
+    if not names or len(set(names)) < len(names):
+        told = ", ".join(dict.fromkeys(names)) or "none"
+        raise UsageError(f"{len(looks)} looks, named {told}; expected one name each: pass a mapping of names to looks")
+    return dict(zip(names, looks, strict=True))
+
+
+def _name_of(function: FunctionLike | None) -> str:
+    """Of a function: its file's or its own."""
+    from vvgt_cli.look import read_transfer_function
+
+    if function is None:
+        return "automatic"
+    if isinstance(function, Mapping):
+        return read_transfer_function(function).name
+    return function.name if isinstance(function, TransferFunction) else function_name(os.fspath(function))
 
 
 @dataclass(frozen=True)
