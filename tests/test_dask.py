@@ -91,7 +91,8 @@ def counted(monkeypatch):
         weakref.finalize(out, gone)
         return out
 
-    monkeypatch.setattr(dask_arrays, "KEPT", 3 * 32**3 * 4)
+    monkeypatch.setattr(dask_arrays, "AT_ONCE", 3 * 32**3 * 4)
+    monkeypatch.setattr(dask_arrays, "KEPT", 0)
     return da.map_blocks(chunk, chunks=((32,) * 4,) * 3, dtype="f4", meta=np.empty((0, 0, 0), "f4")), counts
 
 
@@ -102,6 +103,14 @@ def test_few_chunks_are_there_at_once(counted, light):
     assert len(result.gaussians) > 100
     assert counts["made"] >= 2 * 64  # counted, integrated: every chunk was needed
     assert 3 <= counts["most"] <= 3 + 3 + 1  # kept, computed at once, and one that is let go of
+
+
+def test_chunks_that_memory_holds_are_made_once(counted, monkeypatch):
+    array, counts = counted
+    monkeypatch.setattr(dask_arrays, "KEPT", 0.125)
+    monkeypatch.setattr(dask_arrays, "free_memory", lambda: 8 * array.nbytes)
+    vvgt.convert(array, TF, HOW, blocks=32)
+    assert counts["made"] == 64
 
 
 def test_parts_and_what_needs_the_whole(values, tmp_path):

@@ -21,6 +21,7 @@ from vvgt_cli.library.inputs import (
     Reading,
     VolumeLike,
     console_of,
+    content_of,
     looks_of,
     ply_of,
     source_of,
@@ -117,12 +118,11 @@ def _under(
 ) -> tuple[dict[str, ConvertRequest], str]:  # fmt: skip
     """A request a look, and the volume's name: in memory it is read and laid out once."""
     from vvgt_cli.field.open import automatic
-    from vvgt_cli.library.session import Session
 
     sources = {name: source_of(volume, look, reading) for name, look in looks.items()}
     first = next(iter(sources.values()))
     if blocks is None and automatic(first, console) is None:
-        opened = first.volume if isinstance(first.volume, Opened) else Session(volume, **reading)
+        opened = first.volume if isinstance(first.volume, Opened) else Opened.of(content_of(volume, reading))
         sources = {name: source_of(opened, look, {}) for name, look in looks.items()}
     given = first.volume.volume if isinstance(first.volume, Opened) else first.volume
     name = os.path.basename(given) if isinstance(given, str) else given.name

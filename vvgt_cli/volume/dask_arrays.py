@@ -11,9 +11,11 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError, VvgtError
+from vvgt_cli.resources import free_memory
 from vvgt_cli.volume.stored import Stored
 
-KEPT = 64 << 20  # bytes of computed chunks that are kept, and of those that are computed at once; one at least
+AT_ONCE = 64 << 20  # bytes of chunks that are computed at once, and are kept at the least; one chunk in any case
+KEPT = 0.125  # of the free memory: computed chunks that are kept, as blocks need the voxels around them too
 
 Number = tuple[int, ...]
 
@@ -56,6 +58,7 @@ class Chunks:
         self._ends = [np.cumsum([0, *sizes]).tolist() for sizes in array.chunks]
         self.largest = tuple(max(sizes, default=1) for sizes in array.chunks)
         self._kept: OrderedDict[Number, np.ndarray] = OrderedDict()
+        self._room = max(int(KEPT * (free_memory() or 0)), AT_ONCE)
 
     def __call__(self, index: tuple[Any, ...]) -> np.ndarray:
         """The values of a slice (step 1) or a number an axis; the caller's own.
@@ -78,7 +81,7 @@ class Chunks:
             else:
                 missing.append(number)
         one = math.prod(self.largest) * self._array.dtype.itemsize
-        at_once = max(KEPT // max(one, 1), 1)
+        at_once = max(AT_ONCE // max(one, 1), 1)
         for k in range(0, len(missing), at_once):
             for number, chunk in self._computed(missing[k : k + at_once]):
                 self._put(out, spans, number, chunk)
@@ -119,5 +122,5 @@ class Chunks:
     def _keep(self, number: Number, chunk: np.ndarray) -> None:
         """Keep a chunk, and let go of those that were used longest ago."""
         self._kept[number] = chunk
-        while len(self._kept) > 1 and sum(kept.nbytes for kept in self._kept.values()) > KEPT:
+        while len(self._kept) > 1 and sum(kept.nbytes for kept in self._kept.values()) > self._room:
             self._kept.popitem(last=False)
