@@ -188,7 +188,10 @@ class TestEitherWay:
         assert vvgt("convert", "scalars.nii", *both, *SMALL, *blocks, "-o", tmp_path / "x_{}.ply").code == 0
         found = vvgt("convert", "scalars.nii", *both, *SMALL, *blocks, "-o", tmp_path / "x.html")
         assert found.code == 0, found.err
-        assert sorted(path.name for path in tmp_path.iterdir()) == ["x.html", "x_other.ply", "x_tf.ply"]
+        names = ["x.html", "x_index.json", "x_other.ply", "x_tf.ply"]
+        assert sorted(path.name for path in tmp_path.iterdir()) == names
+        rows = json.loads((tmp_path / "x_index.json").read_text())["files"]
+        assert [(row["name"], row["file"]) for row in rows] == [("tf", "x_tf.ply"), ("other", "x_other.ply")]
 
     @pytest.mark.parametrize(
         ("volume", "options"),
@@ -204,6 +207,10 @@ class TestEitherWay:
         found = vvgt("convert", volume, *options, *SMALL, *blocks, "-o", tmp_path / "x_{}.ply")
         assert found.code == 0, found.err
         assert {"x_0.ply", "x_1.ply"} <= {path.name for path in tmp_path.iterdir()}
+        index = json.loads((tmp_path / "x_index.json").read_text())
+        assert [(row["frame"], row["file"], row["psnr"] > 15) for row in index["files"]] == [
+            (0, "x_0.ply", True), (1, "x_1.ply", True)
+        ]  # fmt: skip
 
     def test_a_series_as_a_page(self, vvgt, at, tmp_path, blocks):
         found = vvgt("convert", "four.nii", "--tf", "tf.json", *SMALL, *blocks, "-o", tmp_path / "x.html")

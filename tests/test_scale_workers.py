@@ -109,6 +109,23 @@ def test_dasks_workers_leave_the_same_bytes(raw, alone, tmp_path):
     assert out.read_bytes() == alone
 
 
+@pytest.mark.parametrize(
+    "options", [("--light", "headlight"), ("--light", "above", "--shadows"), ("--labels", "auto")], ids=" ".join
+)
+def test_dasks_workers_convert_what_is_lit_and_labels(vvgt, tmp_path, options):
+    pytest.importorskip("distributed")
+    values = bodies((140, 60, 50))
+    labels = np.digitize(values, [0.2, 0.6]).astype(np.uint8)
+    np.save(tmp_path / "v.npy", labels if "--labels" in options else values.astype(np.float32))
+    how = (*options, "--max-gaussians", 600, "--size", 64, "--steps", 6, "--blocks", 64)
+    assert vvgt("convert", tmp_path / "v.npy", "-o", tmp_path / "one.ply", *how, "-q").code == 0
+    run = start("convert", tmp_path / "v.npy", "-o", tmp_path / "two.ply", *how, "--workers", 2, "--scheduler", "local")
+    said = run.communicate(timeout=900)[1]
+    assert run.returncode == 0, said
+    assert "2 workers" in said
+    assert (tmp_path / "two.ply").read_bytes() == (tmp_path / "one.ply").read_bytes()
+
+
 def test_a_scheduler_that_is_not_there_is_a_line(vvgt, raw, tmp_path, monkeypatch):
     pytest.importorskip("distributed")
     monkeypatch.setattr("vvgt_cli.field.dask_runner.WAIT", "1s")

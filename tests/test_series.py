@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 import tifffile
 
-from vvgt_cli.conversion.series import frame_names, is_pattern, merge_statistics
+from vvgt_cli.conversion.frames import merge_statistics
+from vvgt_cli.conversion.index import frame_names, is_pattern
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.source import load
 from vvgt_cli.score.record import ConversionReport

@@ -21,6 +21,7 @@ __version__ = VERSION
 
 if TYPE_CHECKING:
     from vvgt_cli.cameras import Camera, default_views, orbit_views
+    from vvgt_cli.conversion.clouds import Clouds
     from vvgt_cli.conversion.result import Conversion, Result
     from vvgt_cli.errors import DataError, UsageError, VvgtError
     from vvgt_cli.gaussians import Gaussians, PlyHeader
@@ -38,6 +39,7 @@ _WHERE = {  # imported when asked for: `import vvgt_cli` costs nothing
     "library.functions": ("convert", "evaluate", "optimize", "read_ply", "read_volume", "render_views"),
     "library.inputs": ("Goal", "Look"),
     "library.session": ("Session",),
+    "conversion.clouds": ("Clouds",),
     "conversion.result": ("Conversion", "Result"),
     "look": ("ColorMap", "PiecewiseOpacity", "TransferFunction", "read_transfer_function"),
     "look.lighting": ("LightOptions",),
@@ -47,6 +49,7 @@ _MODULES = {name: module for module, names in _WHERE.items() for name in names}
 
 __all__ = [
     "Camera",
+    "Clouds",
     "ColorMap",
     "Conversion",
     "DataError",

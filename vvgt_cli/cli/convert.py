@@ -100,9 +100,9 @@ def command(
 def _split(request: ConvertRequest, functions: Sequence[str], other: bool, console: Console) -> None:
     """One file a label; ``other``: options that go with one file are given."""
     from vvgt_cli.conversion.gaussian_files import is_page
+    from vvgt_cli.conversion.index import is_pattern
     from vvgt_cli.conversion.labels import convert_labels
     from vvgt_cli.conversion.pages import page_of_labels
-    from vvgt_cli.conversion.series import is_pattern
     from vvgt_cli.errors import UsageError
 
     if functions or other or request.checkpoint is not None:
@@ -120,8 +120,9 @@ def _convert(
     from vvgt_cli.conversion.convert import convert, planned
     from vvgt_cli.conversion.functions import convert_functions
     from vvgt_cli.conversion.gaussian_files import is_page
+    from vvgt_cli.conversion.index import is_pattern
     from vvgt_cli.conversion.pages import page_of_functions, page_of_volume
-    from vvgt_cli.conversion.series import convert_series, is_pattern
+    from vvgt_cli.conversion.series import convert_series
     from vvgt_cli.errors import UsageError
 
     several = len(functions) > 1

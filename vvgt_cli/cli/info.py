@@ -18,7 +18,7 @@ from vvgt_cli.progress import Console
 @common_options
 def command(file: str, as_json: bool, read: dict[str, Any], console: Console) -> None:
     """Describe FILE, whose type is detected from its content: a volume, a transfer function, a label table, a view set
-    (transforms.json) or a .ply of Gaussians.
+    (transforms.json), a .ply of Gaussians, or the index of several.
 
     \b
     Examples:

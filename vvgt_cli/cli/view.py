@@ -45,7 +45,8 @@ def command(
     """Show FILE in a browser: Gaussians in any supported format, or a volume, which is converted first.
 
     A server on 127.0.0.1 serves the page to the browser and nobody else; nothing is loaded from the network. The
-    address is printed; Ctrl-C ends it. Several files or a glob form a series with a slider.
+    address is printed; Ctrl-C ends it. Several files, a glob or the index that convert writes beside several form a
+    series with a slider.
 
     With -o, nothing is shown: OUT.html holds viewer and Gaussians and opens by double click; .spz, .compressed.ply,
     .sog, .glb and .usdc are for other programs. The loss due to the format is printed.
@@ -54,6 +55,7 @@ def command(
     Examples:
       vvgt view frog.ply
       vvgt view example:frog
+      vvgt view head_index.json
       vvgt view 'run/*.ply' --port 8000 --no-browser
       vvgt view frog.ply -o frog.html
     """

@@ -12,6 +12,7 @@ from typing import Any
 
 from vvgt_cli.cameras.files import read_cameras
 from vvgt_cli.conversion.gaussian_files import STDIN
+from vvgt_cli.conversion.index import is_index, read_index
 from vvgt_cli.errors import DataError
 from vvgt_cli.files import seekable
 from vvgt_cli.gaussians import describe, read_ply
@@ -28,7 +29,7 @@ _HEAD = 65536  # bytes that tell a view set from a transfer function
 
 
 def inspect(file: str, read: ReadOptions) -> dict[str, Any]:
-    """Facts about a volume, a transfer function, a view set or a `.ply`, by key; the first key is "kind".
+    """Facts about a volume, a transfer function, a view set, a `.ply` or an index of several; the first is "kind".
 
     Raises:
         DataError, UsageError: as the reader of that kind.
@@ -47,6 +48,10 @@ def inspect(file: str, read: ReadOptions) -> dict[str, Any]:
     if head.startswith(_PLY) or known:
         facts = {"kind": "gaussians", "name": name.name, **describe(*read_splats(file))}
         return facts | ({"bytes": path.stat().st_size, "format": known.suffix} if known else {})
+    if is_index(name):
+        index = read_index(name)
+        about: dict[str, Any] = {key: index[key] for key in ("volume", "table") if key in index}
+        return {"kind": f"index of {index['kind']}", "name": name.name, **about, "clouds": index["files"]}
     if is_table(name):
         return _table(file)
     if name.suffix.lower() in SUFFIXES or head.lstrip()[:1] in (b"{", b"["):

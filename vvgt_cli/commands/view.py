@@ -15,6 +15,7 @@ from pathlib import Path
 
 from vvgt_cli.commands.server import Part, Site, served
 from vvgt_cli.conversion.gaussian_files import STDIN, is_page, layout_of, open_gaussians, write_gaussians, write_page
+from vvgt_cli.conversion.index import files_of, is_index
 from vvgt_cli.conversion.readback import tell_agreement
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.source import SourceRequest
@@ -36,7 +37,7 @@ class ViewRequest:
     """What to show.
 
     Attributes:
-        files: of Gaussians, or globs of them; several are a series. Or one volume.
+        files: of Gaussians, globs of them, or indexes of `vvgt convert`; several are a series. Or one volume.
         source: how to read the volume, and its function; of files of Gaussians as it is by default.
         output: file to write in place of showing, None for none.
         port: of the server; 0 takes a free one.
@@ -65,22 +66,24 @@ def view(request: ViewRequest, announce: Callable[[str], None], console: Console
         DataError: a file that is not what it must be.
     """
     run = Run(console or Console(), ConversionReport("view"))
-    files = expanded(request.files)
+    clouds = named_files(request.files)
     if request.output is None:
-        _serve(run, request, files, announce)
+        _serve(run, request, clouds, announce)
         return
-    if len(files) > 1:
-        _join(run, request, files)
+    if len(clouds) > 1:
+        _join(run, request, clouds)
         return
-    with claimed([Output("-o", request.output, SUFFIXES, splats=True)], files, request.overwrite):
-        gaussians, options = _opened(run, request, files[0])
+    file = clouds[0][1]
+    with claimed([Output("-o", request.output, SUFFIXES, splats=True)], [file], request.overwrite):
+        gaussians, options = _opened(run, request, file)
         write_gaussians(run, request.output, gaussians, options, request.overwrite)
         run.compile(for_degree(DRAW, gaussians.degree))
         tell_agreement(run, request.output, gaussians, options)
 
 
-def _join(run: Run, request: ViewRequest, files: Sequence[str]) -> None:
+def _join(run: Run, request: ViewRequest, clouds: Sequence[tuple[str, str]]) -> None:
     """Several files into one page."""
+    files = [file for _, file in clouds]
     _only_gaussians(files)
     _refuse_reading(request.source, files[0])
     if request.output is None or not is_page(request.output):
@@ -88,7 +91,7 @@ def _join(run: Run, request: ViewRequest, files: Sequence[str]) -> None:
             f"-o {request.output} is of one file, got {len(files)}; expected a page (.html), which takes them all"
         )
     with claimed([Output("-o", request.output, (".html",), splats=True)], files, request.overwrite):
-        names = [Path(name).name for name in files]
+        names = [name for name, _ in clouds]
         if len(set(names)) < len(names):
             names = list(files)
         write_page(run, request.output, list(zip(names, files, strict=True)), request.overwrite)
@@ -110,6 +113,19 @@ def _only_gaussians(files: Sequence[str]) -> None:
         raise UsageError(
             f"{(volumes or [STDIN])[0]}: of several files expected all to hold Gaussians; convert it first"
         )
+
+
+def named_files(names: Sequence[str]) -> list[tuple[str, str]]:
+    """Name and file of what files, globs and indexes of `vvgt convert` hold.
+
+    Raises:
+        UsageError: as `expanded`.
+        DataError: as `vvgt_cli.conversion.index.files_of`.
+    """
+    found: list[tuple[str, str]] = []
+    for name in names:
+        found += files_of(name) if is_index(name) else [(Path(file).name, file) for file in expanded([name])]
+    return found
 
 
 def expanded(names: Sequence[str]) -> list[str]:
@@ -147,7 +163,10 @@ def _stored(gaussians: Gaussians, options: PlyOptions) -> bytes:
     return stream.getvalue()
 
 
-def _serve(run: Run, request: ViewRequest, files: Sequence[str], announce: Callable[[str], None]) -> None:
+def _serve(
+    run: Run, request: ViewRequest, clouds: Sequence[tuple[str, str]], announce: Callable[[str], None]
+) -> None:  # fmt: skip
+    files = [file for _, file in clouds]
     _only_gaussians(files)
     first = _stored(*_opened(run, request, files[0]))
 
@@ -161,7 +180,7 @@ def _serve(run: Run, request: ViewRequest, files: Sequence[str], announce: Calla
         gaussians, header = open_gaussians(files[k])
         return _stored(gaussians, layout_of(header))
 
-    frames = [{"name": Path(name).name, "file": name_of(k)} for k, name in enumerate(files)]
+    frames = [{"name": name, "file": name_of(k)} for k, (name, _) in enumerate(clouds)]
     text = page(f"{frames[0]['name']} - vvgt", columns_of(first, files[0]), frames, '<script src="viewer.js"></script>')
     parts = {
         "": Part("text/html; charset=utf-8", lambda: text.encode("utf-8")),

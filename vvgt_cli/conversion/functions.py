@@ -1,14 +1,17 @@
-"""`vvgt convert` of one volume under several transfer functions: it is read and laid out once."""
+"""`vvgt convert` of one volume under several transfer functions, with an index: it is read and laid out once."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from vvgt_cli.conversion.convert import convert
+from vvgt_cli.conversion.frames import interrupted
+from vvgt_cli.conversion.index import FUNCTIONS, entry_of, index_of, index_output, is_pattern, write_index
 from vvgt_cli.conversion.request import ConvertRequest
-from vvgt_cli.conversion.series import is_pattern
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.layered import open_parts
 from vvgt_cli.field.open import automatic
@@ -18,8 +21,13 @@ from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
 
 
-def convert_functions(request: ConvertRequest, functions: Sequence[str], console: Console | None = None) -> None:
-    """One `.ply` a function; ``{}`` in the outputs of ``request`` is its file's name without endings.
+def convert_functions(
+    request: ConvertRequest, functions: Sequence[str], console: Console | None = None
+) -> dict[str, Any]:
+    """One `.ply` a function, and their index; ``{}`` in the outputs of ``request`` is its file's name without endings.
+
+    Returns:
+        The index.
 
     Raises:
         UsageError: outputs without a place for the name, or two functions of one name; found before anything is read.
@@ -27,21 +35,35 @@ def convert_functions(request: ConvertRequest, functions: Sequence[str], console
     """
     console = console or Console()
     requests = [_one(request, tf) for tf in functions]
+    names = [function_name(tf) for tf in functions]
+    index = index_output(str(request.output))
     for one in requests:
-        check_outputs(one.outputs(), one.inputs(), one.overwrite)
-    if len({one.output for one in requests}) < len(requests):
-        names = ", ".join(dict.fromkeys(map(function_name, functions)))
-        raise UsageError(f"{len(functions)} functions, named {names}: the files would have the same name; rename one")
+        check_outputs([*one.outputs(), index], one.inputs(), one.overwrite)
+    if len(set(names)) < len(names):
+        told = ", ".join(dict.fromkeys(names))
+        raise UsageError(f"{len(functions)} functions, named {told}: the files would have the same name; rename one")
     blocks = request.blocks or automatic(request.source, console)
     if blocks is not None:
         requests = [replace(one, blocks=blocks) for one in requests]
     else:
         requests = _opened(Run(console, ConversionReport("convert")), request, requests)
-    for number, (one, tf) in enumerate(zip(requests, functions, strict=True), 1):
+    files = []
+    folder = Path(index.path).parent
+    for number, (one, name, tf) in enumerate(zip(requests, names, functions, strict=True), 1):
         console.say(f"{tf}: function {number} of {len(requests)}, to {one.output}")
         report = convert(one, console)
-        if report.refinement and report.refinement["reason"] == "interrupted":
+        if interrupted(report):
             raise KeyboardInterrupt
+        files.append({**entry_of(name, report, function=tf), "file": beside(str(one.output), folder)})
+    found = index_of(FUNCTIONS, Path(request.source.path).name, files)
+    write_index(index.path, found, request.overwrite)
+    console.say(f"{index.path}: {len(files)} functions")
+    return found
+
+
+def beside(file: str, folder: Path) -> str:
+    """A file's name as an index in ``folder`` has it."""
+    return Path(os.path.relpath(file, folder)).as_posix()
 
 
 def _opened(run: Run, request: ConvertRequest, requests: list[ConvertRequest]) -> list[ConvertRequest]:

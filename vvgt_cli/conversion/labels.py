@@ -6,9 +6,8 @@ what the whole hides is converted label by label, and of that the hidden Gaussia
 
 from __future__ import annotations
 
-import json
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,27 +15,27 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vvgt_cli.conversion.convert import convert, fitted, opened
-from vvgt_cli.conversion.functions import named
+from vvgt_cli.conversion.functions import beside, named
+from vvgt_cli.conversion.index import INDEX, LABELS, entry_of, index_of, index_output, write_index
 from vvgt_cli.conversion.owners import hidden_in, owners
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import NothingVisible, UsageError
 from vvgt_cli.field.layered import AUTO, NONE, Content, layers_of, open_parts
 from vvgt_cli.field.open import automatic
-from vvgt_cli.field.source import SourceRequest
+from vvgt_cli.field.source import Opened, SourceRequest
 from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.outputs import Output, check_outputs, write_text
+from vvgt_cli.gaussians.outputs import check_outputs
 from vvgt_cli.gaussians.types import together
 from vvgt_cli.look.labels import Label, LabelTable
 from vvgt_cli.look.lighting import LightOptions
 from vvgt_cli.progress import Console
-from vvgt_cli.score.record import ConversionReport, Run, plain
+from vvgt_cli.score.record import ConversionReport, Run
 from vvgt_cli.volume import Volume
 from vvgt_cli.volume.stored import planes
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr.layers import Layer
 
-INDEX = "index"  # in the place of a label's name
 LONGEST = 80  # characters of a label's name in a file's
 
 
@@ -48,6 +47,27 @@ class Part:
     table: LabelTable
     label: Label
     request: ConvertRequest
+    stem: str  # in the place of a name
+
+    def facts(self) -> dict[str, Any]:
+        """What an index says of it."""
+        return {"label": self.label.number, "color": self.label.color, "opacity": self.label.opacity}
+
+
+@dataclass(frozen=True)
+class Split:
+    """A label map in its parts.
+
+    Attributes:
+        request: of the whole, in blocks where it is large.
+        parts: the visible labels.
+        volume, table: names.
+    """
+
+    request: ConvertRequest
+    parts: Sequence[Part]
+    volume: str
+    table: str
 
 
 def convert_labels(request: ConvertRequest, console: Console | None = None) -> dict[str, Any]:
@@ -64,6 +84,32 @@ def convert_labels(request: ConvertRequest, console: Console | None = None) -> d
         DataError: as `convert`.
     """
     console = console or Console()
+    named(request, INDEX, "label")  # its errors come before the volume
+    index, inputs = index_output(str(request.output)), request.source.paths()
+    check_outputs([index], inputs, request.overwrite)
+    run = Run(console, ConversionReport("convert"))
+    whole = split(run, request)
+    outputs = [output for part in whole.parts for output in part.request.outputs()]
+    check_outputs([*outputs, index], inputs, request.overwrite)
+    rows = []
+    for part, gaussians in shared_out(run, whole):
+        console.say(f"label {part.label.number}, {part.label.name}: to {part.request.output}")
+        report = convert(part.request, console, gaussians)
+        row = entry_of(part.label.name, report, **part.facts())
+        rows.append({**row, "file": beside(str(part.request.output), Path(index.path).parent)})
+    found = index_of(LABELS, whole.volume, rows, table=whole.table)
+    write_index(index.path, found, request.overwrite)
+    console.say(f"{index.path}: {len(rows)} labels")
+    return found
+
+
+def split(run: Run, request: ConvertRequest) -> Split:
+    """Read a label map: its visible labels, each with a request of its own.
+
+    Raises:
+        UsageError: a function or layers beside the labels, a size or time.
+        DataError: as `convert`.
+    """
     source = request.source
     if source.tf is not None or source.layers or source.labels == NONE:
         raise UsageError("--split-labels is of one label map: leave out --tf, --layer and --labels none")
@@ -73,31 +119,38 @@ def convert_labels(request: ConvertRequest, console: Console | None = None) -> d
         raise UsageError(
             "--time-budget is of one file; --split-labels fits several times: give --steps or leave it out"
         )
-    named(request, INDEX, "label")  # its errors come before the volume
-    run = Run(console, ConversionReport("convert"))
     with run.stage("volume") as stage:
-        blocks = request.blocks or automatic(source, console)
+        blocks = request.blocks or automatic(source, run.console)
         request = replace(request, blocks=blocks)
-        read = source.read if blocks is None else replace(source.read, stored=True, packed=True)
-        content = open_parts(source.path, read)
+        content = _content(source, blocks is not None)
         maps = layers_of(content, None, source.labels or AUTO)
         parts = _parts(request, content, maps)
         tables = " + ".join(layer.tf.name for layer in maps)
         stage.note = f"{maps[0].volume.name}, {len(parts)} labels of {tables}"
-    index = str(Path(str(request.output).replace("{}", INDEX)).with_suffix(".json"))
-    outputs = [output for part in parts for output in part.request.outputs()]
-    check_outputs([*outputs, Output("-o", index, (".json",), binary=False)], source.paths(), request.overwrite)
-    rows = []
-    for part, gaussians in zip(parts, _gaussians(request, parts, run), strict=True):
+    return Split(request, parts, maps[0].volume.name, tables)
+
+
+def shared_out(run: Run, whole: Split) -> Iterator[tuple[Part, Gaussians]]:
+    """The Gaussians of each label, box frame; of one that shows nothing a line is said.
+
+    Raises:
+        DataError, UsageError: as `convert`.
+    """
+    for part, gaussians in zip(whole.parts, _gaussians(whole.request, whole.parts, run), strict=True):
         if gaussians is None:
-            console.say(f"label {part.label.number}, {part.label.name}: nothing visible; it gets no file")
-            continue
-        console.say(f"label {part.label.number}, {part.label.name}: to {part.request.output}")
-        rows.append(_row(part, convert(part.request, console, gaussians)))
-    found = {"format": "vvgt-labels", "volume": maps[0].volume.name, "table": tables, "files": rows}
-    write_text(index, json.dumps(plain(found), indent=2) + "\n", request.overwrite)
-    console.say(f"{index}: {len(rows)} labels")
-    return found
+            run.console.say(f"label {part.label.number}, {part.label.name}: nothing visible; it gets no file")
+        else:
+            yield part, gaussians
+
+
+def _content(source: SourceRequest, stored: bool) -> Content:
+    """What the map's file holds, or the map itself."""
+    if isinstance(source.volume, Volume):
+        return Content((source.volume,))
+    if isinstance(source.volume, Opened):
+        return source.volume.content or Content((source.volume.volume,))
+    read = replace(source.read, stored=True, packed=True) if stored else source.read
+    return open_parts(source.path, read)
 
 
 def _parts(request: ConvertRequest, content: Content, maps: Sequence[Layer]) -> list[Part]:
@@ -116,7 +169,7 @@ def _parts(request: ConvertRequest, content: Content, maps: Sequence[Layer]) -> 
         alone = replace(request, source=source, fit=replace(request.fit, max_gaussians=share))
         again = numbers.count(label.number) > 1  # of segments that overlap
         name = f"{volume.name.rpartition(' ')[2]}-{file_name(label)}" if again else file_name(label)
-        parts.append(Part(volume, table, label, named(alone, name, "label")))
+        parts.append(Part(volume, table, label, named(alone, name, "label"), name))
     return parts
 
 
@@ -174,15 +227,6 @@ def _fitted(request: ConvertRequest, console: Console) -> Gaussians:
     if run.report.refinement and run.report.refinement["reason"] == "interrupted":
         raise KeyboardInterrupt
     return found
-
-
-def _row(part: Part, report: ConversionReport) -> dict[str, Any]:
-    """A label's entry in the index."""
-    label = part.label
-    return {
-        "label": label.number, "name": label.name, "color": label.color, "opacity": label.opacity,
-        "file": Path(str(part.request.output)).name, "gaussians": report.gaussians,
-    }  # fmt: skip
 
 
 def shares(shown: Sequence[tuple[Volume, LabelTable, Label]], budget: int) -> list[int]:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
+from types import MappingProxyType
 from typing import Any
 
 from vvgt_cli.errors import DataError, UsageError
@@ -126,11 +127,12 @@ class Manifest:
             return False
         return not content or file_digest(path) == record["sha256"]
 
-    def record(self, names: Iterable[str] = ()) -> None:
-        """Note files as complete and write the manifest."""
+    def record(self, names: Iterable[str] = (), facts: Mapping[str, dict[str, Any]] = MappingProxyType({})) -> None:
+        """Note files as complete, with what else is known of some, and write the manifest."""
         for name in names:
             path = self.folder / name
-            self.files[name] = self.own[name] = {"bytes": path.stat().st_size, "sha256": file_digest(path)}
+            known = {"bytes": path.stat().st_size, "sha256": file_digest(path), **facts.get(name, {})}
+            self.files[name] = self.own[name] = known
         document = {
             "format": f"vvgt-{self.what}", "schema": SCHEMA, "hash": self.hash, "settings": self.settings,
             "files": self.own,

@@ -6,13 +6,14 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-from vvgt_cli.conversion.functions import convert_functions, function_name
+from vvgt_cli.conversion.functions import convert_functions
 from vvgt_cli.conversion.gaussian_files import write_page
 from vvgt_cli.conversion.labels import convert_labels
 from vvgt_cli.conversion.manifest import Shard
 from vvgt_cli.conversion.request import ConvertRequest
-from vvgt_cli.conversion.series import convert_series, steps_of
+from vvgt_cli.conversion.series import convert_series
 from vvgt_cli.errors import SeveralSteps, UsageError
 from vvgt_cli.files import temporary_folder
 from vvgt_cli.gaussians.outputs import claimed
@@ -21,8 +22,6 @@ from vvgt_cli.score.record import ConversionReport, Run
 from vvgt_cli.volume.slices import matching
 from vvgt_cli.volume.tiff import SUFFIXES
 
-Clouds = list[tuple[str, str]]  # name and file of each
-
 
 def page_of_volume(request: ConvertRequest, alone: Callable[[], object], console: Console) -> None:
     """One volume, which ``alone`` converts, or the frames of a series: a file of several steps, or a glob of volumes.
@@ -30,20 +29,13 @@ def page_of_volume(request: ConvertRequest, alone: Callable[[], object], console
     Raises:
         UsageError, DataError: as `convert` and `convert_series`.
     """
-    if not _is_glob_of_volumes(request.source.path):
+    if not is_glob_of_volumes(request.source.path):
         try:
             alone()
             return
         except SeveralSteps:
             pass
-    steps = steps_of(request.source)
-
-    def frames(one: ConvertRequest, folder: Path) -> Clouds:
-        convert_series(replace(one, output=str(folder / "{:06d}.ply")), Shard(), console)
-        files = [(step.name, folder / f"{k:06d}.ply") for k, step in enumerate(steps)]
-        return [(name, str(file)) for name, file in files if file.exists()]  # those that show nothing have no file
-
-    _page(request, frames, console)
+    _page(request, lambda one: convert_series(one, Shard(), console), console)
 
 
 def page_of_functions(request: ConvertRequest, functions: Sequence[str], console: Console) -> None:
@@ -52,12 +44,7 @@ def page_of_functions(request: ConvertRequest, functions: Sequence[str], console
     Raises:
         UsageError, DataError: as `convert_functions`.
     """
-
-    def made(one: ConvertRequest, folder: Path) -> Clouds:
-        convert_functions(replace(one, output=str(folder / "{}.ply")), functions, console)
-        return [(name, str(folder / f"{name}.ply")) for name in map(function_name, functions)]
-
-    _page(request, made, console)
+    _page(request, lambda one: convert_functions(one, functions, console), console)
 
 
 def page_of_labels(request: ConvertRequest, console: Console) -> None:
@@ -66,16 +53,11 @@ def page_of_labels(request: ConvertRequest, console: Console) -> None:
     Raises:
         UsageError, DataError: as `convert_labels`.
     """
-
-    def made(one: ConvertRequest, folder: Path) -> Clouds:
-        found = convert_labels(replace(one, output=str(folder / "{}.ply")), console)
-        return [(row["name"], str(folder / row["file"])) for row in found["files"]]
-
-    _page(request, made, console)
+    _page(request, lambda one: convert_labels(one, console), console)
 
 
-def _page(request: ConvertRequest, make: Callable[[ConvertRequest, Path], Clouds], console: Console) -> None:
-    """Let ``make`` write a `.ply` a cloud into a folder that goes again, and join them."""
+def _page(request: ConvertRequest, make: Callable[[ConvertRequest], dict[str, Any]], console: Console) -> None:
+    """Let ``make`` write a `.ply` a cloud into a folder that goes again, and join them by its index."""
     if request.report or request.preview or request.checkpoint:
         raise UsageError(
             f"{request.output} gets several clouds of Gaussians: --report, --preview and --checkpoint are of one each; "
@@ -86,12 +68,13 @@ def _page(request: ConvertRequest, make: Callable[[ConvertRequest, Path], Clouds
     assert request.output is not None
     run = Run(console, ConversionReport("convert"))
     with claimed(request.outputs(), request.inputs(), request.overwrite), temporary_folder(request.output) as folder:
-        clouds = make(replace(request, overwrite=True), folder)
+        index = make(replace(request, output=str(folder / "{}.ply"), overwrite=True))
+        clouds = [(row["name"], str(folder / row["file"])) for row in index["files"]]
         write_page(run, request.output, clouds, request.overwrite)
         run.finish()
 
 
-def _is_glob_of_volumes(path: str) -> bool:
+def is_glob_of_volumes(path: str) -> bool:
     """Whether a path is a glob of files that are volumes of their own, and not TIFF slices of one."""
     if os.path.exists(path) or not set(path) & set("*?["):
         return False

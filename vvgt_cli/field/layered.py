@@ -29,7 +29,7 @@ from vvgt_cli.look.labels import LabelTable, distinct
 from vvgt_cli.synth.sources import open_volume
 from vvgt_cli.volume import ReadOptions, Statistics, Volume, statistics
 from vvgt_cli.volume.label_maps import labels_in, recognised
-from vvgt_cli.volume.stored import Stored, chunks_of, read_block
+from vvgt_cli.volume.stored import Stored, chunks_of, held, read_block
 
 AUTO, NONE = "auto", "none"
 COLOR, ALL = "color", "all"  # of --component
@@ -135,7 +135,7 @@ class InMemory:
 
     def open(self, source: str | Volume, read: ReadOptions) -> Content:
         """See `open_parts`."""
-        return open_parts(source, read) if isinstance(source, str) else Content((source,))
+        return open_parts(source, read) if isinstance(source, str) else Content((held(source),))
 
     def statistics(self, volume: Volume) -> Statistics:
         """See `vvgt_cli.volume.statistics`."""

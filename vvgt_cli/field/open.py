@@ -222,11 +222,14 @@ def files_of(path: str) -> list[Path]:
 
 
 def automatic(request: SourceRequest, console: Console) -> BlockOptions | None:
-    """Blocks where nothing is asked for: of a large volume; None: it is read as a whole.
+    """Blocks where nothing is asked for: of a large volume or a lazy array; None: it is read as a whole.
 
     Raises:
         DataError, UsageError: as `read_volume`.
     """
+    if isinstance(request.volume, Volume) and isinstance(request.volume.data, Stored):
+        console.say("a Dask array: processed in blocks (docs/scale.md)")
+        return BlockOptions()
     if not better_in_blocks(request):
         return None
     console.say("large: processed in blocks (docs/scale.md)")

@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Unpack
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Unpack
 
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.conversion.result import Conversion, Result
+from vvgt_cli.errors import SeveralSteps, UsageError
+from vvgt_cli.field.source import Opened
 from vvgt_cli.gaussians import Gaussians, PlyHeader
 from vvgt_cli.library.inputs import (
     Goal,
     GoalLike,
+    Look,
     LookLike,
+    LooksLike,
     PathLike,
     Reading,
     VolumeLike,
     console_of,
+    content_of,
+    looks_of,
     ply_of,
     source_of,
     volume_of,
@@ -27,18 +33,23 @@ if TYPE_CHECKING:
     import numpy as np
 
     from vvgt_cli.commands.evaluate import Evaluation
+    from vvgt_cli.conversion.clouds import Clouds
+    from vvgt_cli.conversion.request import ConvertRequest
     from vvgt_cli.field.settings import BlockOptions
+    from vvgt_cli.field.source import SourceRequest
+    from vvgt_cli.progress import Console
 
 
 def convert(
     volume: VolumeLike,
-    look: LookLike = None,
+    look: LooksLike = None,
     goal: GoalLike = None,
     *,
+    split_labels: bool = False,
     blocks: int | str | None = None,
     progress: bool = False,
     **reading: Unpack[Reading],
-) -> Conversion:
+) -> Conversion | Clouds:
     """A volume under a transfer function as 3D Gaussians: ``vvgt convert`` without its files.
 
     >>> import vvgt_cli as vvgt
@@ -47,30 +58,74 @@ def convert(
     True
 
     Args:
-        volume: a path (or ``example:NAME``); an array (nz, ny, nx) with ``spacing`` (x, y, z) or ``affine`` (4, 4); an
-            xarray.DataArray; a pyvista.ImageData; or a `Volume`.
-        look: function, light, labels and layers: a `Look`; or the function alone.
+        volume: a path (or ``example:NAME``); an array (nz, ny, nx), of numpy or Dask, with ``spacing`` (x, y, z) or
+            ``affine`` (4, 4); an xarray.DataArray; a pyvista.ImageData; or a `Volume`. A file of several time steps
+            without ``time``, or a glob of volumes, is a series. Arrays of Dask are never computed as a whole.
+        look: function, light, labels and layers: a `Look`; or the function alone. Several: a list of them, or a mapping
+            of names to them.
         goal: budget, screen, limits: a `Goal`, or a mapping of some of its attributes.
+        split_labels: of a label map, a result a label.
         blocks: voxels along the edge of blocks, or "auto"; None: blocks where the file is large.
         progress: lines and bars on standard error.
         **reading: how to read the volume: see `Reading`.
 
     Returns:
-        Gaussians in the unit frame with scores, stages, `save`, `render` and `preview`.
+        Gaussians in the unit frame with scores, stages, `save`, `render` and `preview`; of several frames, looks or
+        labels `Clouds`: a mapping of names to results, with a `save` of all.
 
     Raises:
         DataError: input that is not what it must be, or a scene that shows nothing.
         UsageError: options that do not fit.
     """
+    from vvgt_cli.conversion.clouds import frames_in_memory, labels_in_memory, looks_in_memory
     from vvgt_cli.conversion.convert import without_files
+    from vvgt_cli.conversion.pages import is_glob_of_volumes
+
+    console, looks = console_of(progress), looks_of(look)
+    if looks is not None:
+        if split_labels:
+            raise UsageError(f"split_labels with {len(looks)} looks; expected one")
+        requests, name = _under(looks, volume, reading, goal, blocks, console)
+        return looks_in_memory(requests, name, console)
+    one: Any = look
+    request = _request(source_of(volume, one, reading), goal, blocks)
+    if split_labels:
+        return labels_in_memory(request, console)
+    path = request.source.volume
+    if isinstance(path, str) and is_glob_of_volumes(path):
+        return frames_in_memory(request, console)
+    try:
+        return without_files(request, console)
+    except SeveralSteps:
+        if not isinstance(path, str):
+            raise
+        return frames_in_memory(request, console)
+
+
+def _request(source: SourceRequest, goal: GoalLike, blocks: int | str | None) -> ConvertRequest:
     from vvgt_cli.conversion.request import ConvertRequest, FitOptions, Limits
 
     want = Goal.of(goal)
     fit = FitOptions(want.max_gaussians, want.size, want.init, want.rule, want.seed, want.steps, want.model)
     limits = Limits(want.target_psnr, want.time_budget, want.max_megabytes)
-    source = source_of(volume, look, reading)
-    request = ConvertRequest(source, None, fit, limits, all_views=want.all_views, blocks=_blocks(blocks))
-    return without_files(request, console_of(progress))
+    return ConvertRequest(source, None, fit, limits, all_views=want.all_views, blocks=_blocks(blocks))
+
+
+def _under(
+    looks: Mapping[str, Look], volume: VolumeLike, reading: Reading, goal: GoalLike, blocks: int | str | None,
+    console: Console,
+) -> tuple[dict[str, ConvertRequest], str]:  # fmt: skip
+    """A request a look, and the volume's name: in memory it is read and laid out once."""
+    from vvgt_cli.field.open import automatic
+
+    sources = {name: source_of(volume, look, reading) for name, look in looks.items()}
+    first = next(iter(sources.values()))
+    if blocks is None and automatic(first, console) is None:
+        opened = first.volume if isinstance(first.volume, Opened) else Opened.of(content_of(volume, reading))
+        sources = {name: source_of(opened, look, {}) for name, look in looks.items()}
+    given = first.volume.volume if isinstance(first.volume, Opened) else first.volume
+    name = os.path.basename(given) if isinstance(given, str) else given.name
+    return {name: _request(source, goal, blocks) for name, source in sources.items()}, name
 
 
 def _blocks(blocks: int | str | None) -> BlockOptions | None:
@@ -138,7 +193,6 @@ def render_views(
 
     from vvgt_cli.cameras.boxed import render_in_box
     from vvgt_cli.dvr import RenderSettings, render_view
-    from vvgt_cli.errors import UsageError
     from vvgt_cli.field.source import load
 
     views = default_views("train", cameras, size=size) if isinstance(cameras, int) else list(cameras)

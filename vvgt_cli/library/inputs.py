@@ -9,6 +9,7 @@ from dataclasses import dataclass, fields, replace
 from numbers import Real
 from typing import Any, BinaryIO, TypedDict
 
+from vvgt_cli.conversion.functions import function_name
 from vvgt_cli.conversion.result import Result
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.layered import Content, LayerRequest, open_parts, parse_layer
@@ -19,9 +20,11 @@ from vvgt_cli.look.labels import LabelTable
 from vvgt_cli.look.lighting import LightOptions
 from vvgt_cli.progress import Console
 from vvgt_cli.volume import ReadOptions, Volume
+from vvgt_cli.volume.dask_arrays import is_dask, lazy
+from vvgt_cli.volume.stored import Stored
 
 PathLike = str | os.PathLike[str]
-VolumeLike = Any  # a path, a Volume, a Session, an array, an xarray.DataArray, a pyvista (VTK) dataset
+VolumeLike = Any  # a path, a Volume, a Session, an array (of Dask, too), an xarray.DataArray, a pyvista (VTK) dataset
 LightLike = LightOptions | str | Sequence[float] | Sequence[str | Sequence[float]] | None
 LabelsLike = PathLike | Mapping[Any, Mapping[str, Any]] | LabelTable
 LayerLike = PathLike | LayerRequest
@@ -57,6 +60,43 @@ class Look:
 
 
 LookLike = Look | FunctionLike | None
+LooksLike = LookLike | Sequence[LookLike] | Mapping[str, LookLike]
+
+
+def looks_of(look: LooksLike) -> dict[str, Look] | None:
+    """Several looks by name, None where it is one.
+
+    A mapping is of several looks where all its values are functions or looks; a function's own holds lists of numbers.
+
+    Raises:
+        UsageError: none, or two of one name.
+        DataError: a mapping that is no function.
+    """
+    if isinstance(look, Mapping):
+        if not look or not all(
+            isinstance(v, Look | str | os.PathLike | Mapping | TransferFunction) for v in look.values()
+        ):
+            return None
+        return {str(name): Look.of(one) for name, one in look.items()}
+    if not isinstance(look, list | tuple):
+        return None
+    looks = [Look.of(one) for one in look]
+    names = [_name_of(one.function) for one in looks]
+    if not names or len(set(names)) < len(names):
+        told = ", ".join(dict.fromkeys(names)) or "none"
+        raise UsageError(f"{len(looks)} looks, named {told}; expected one name each: pass a mapping of names to looks")
+    return dict(zip(names, looks, strict=True))
+
+
+def _name_of(function: FunctionLike | None) -> str:
+    """Of a function: its file's or its own."""
+    from vvgt_cli.look import read_transfer_function
+
+    if function is None:
+        return "automatic"
+    if isinstance(function, Mapping):
+        return read_transfer_function(function).name
+    return function.name if isinstance(function, TransferFunction) else function_name(os.fspath(function))
 
 
 @dataclass(frozen=True)
@@ -150,7 +190,8 @@ def volume_of(volume: VolumeLike, reading: Reading, name: str = "array") -> Volu
         if affine is not None or origin is not None:
             raise UsageError("affine and origin are of arrays; a file says itself where it is; leave them out")
         return open_volume(os.fspath(volume), options)
-    return cut(volume_in_memory(volume, options, origin=origin, affine=affine, name=name), options)
+    found = volume_in_memory(volume, options, origin=origin, affine=affine, name=name)
+    return cut(found, replace(options, stored=isinstance(found.data, Stored)))
 
 
 def content_of(volume: VolumeLike, reading: Reading) -> Volume | Content:
@@ -182,7 +223,11 @@ def _options(reading: Mapping[str, Any]) -> ReadOptions:
             given[key] = tuple(float(v) if key == "spacing" else int(v) for v in given[key])
     if given.get("mask") is not None and not isinstance(given["mask"], str | Volume):
         mask = given["mask"]
-        given["mask"] = os.fspath(mask) if isinstance(mask, os.PathLike) else Volume(np.asarray(mask), name="mask")
+        if isinstance(mask, os.PathLike):
+            given["mask"] = os.fspath(mask)
+        else:
+            values: Any = lazy(mask, "mask") if is_dask(mask) else np.asarray(mask)
+            given["mask"] = Volume(values, name="mask")
     return ReadOptions(**given)
 
 

@@ -163,7 +163,10 @@ def _split_axes(axes: list[Axis], options: ReadOptions, source: str) -> tuple[li
     elif options.time:
         raise UsageError(f"{source}: axes {listing}, none of time; leave out --time {options.time}")
     elif times and (len(odd) > 1 or options.component is None):
-        raise SeveralSteps(source, axes[times[0]].size)
+        along = axes[times[0]]
+        raise SeveralSteps(
+            source, along.size, times=None if along.centres is None else along.centres.tolist(), unit=along.units
+        )
     if len(odd) > 1 or len(space) not in (2, 3):
         raise DataError(
             f"{source}: axes {listing}; expected two or three axes of space, and at most one of time and one more"

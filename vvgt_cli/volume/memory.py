@@ -1,4 +1,4 @@
-"""Volumes of what is in memory already: numpy arrays, xarray's DataArray, pyvista's (VTK's) images and grids."""
+"""Volumes of what a caller has: numpy and Dask arrays, xarray's DataArray, pyvista's (VTK's) images and grids."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from vvgt_cli.errors import UsageError
 from vvgt_cli.volume.components import contiguous
+from vvgt_cli.volume.dask_arrays import Chunks, is_dask, lazy
 from vvgt_cli.volume.headers import unit_rows
 from vvgt_cli.volume.labelled import axis, labelled_volume
 from vvgt_cli.volume.options import ReadOptions
@@ -25,7 +26,7 @@ def volume_in_memory(
     affine: Any = None,
     name: str = "array",
 ) -> Volume:
-    """The volume of an object; nothing is copied where its layout allows that.
+    """The volume of an object; nothing is copied where its layout allows that, and no Dask array is computed.
 
     Args:
         data: array of three axes, (nz, ny, nx) as slices are stacked; an xarray.DataArray, whose coordinates say where
@@ -49,7 +50,8 @@ def volume_in_memory(
     if hasattr(data, "dims") and hasattr(data, "coords") and hasattr(data, "attrs"):
         _refuse(placed, "the coordinates of a DataArray say where it is")
         return _labelled(data, options, name)
-    return _array(np.asarray(data), options, origin, affine, name)
+    values: Any = lazy(data, name) if is_dask(data) else np.asarray(data)
+    return _array(values, options, origin, affine, name)
 
 
 def dataset_volume(data: Any, options: ReadOptions, name: str) -> Volume:
@@ -65,7 +67,7 @@ def _refuse(given: Sequence[str], why: str) -> None:
 
 
 def _labelled(data: Any, options: ReadOptions, name: str) -> Volume:
-    """Of an xarray.DataArray; one that is lazy (dask) is computed for the part that is asked for."""
+    """Of an xarray.DataArray; one of Dask is computed block by block, or as a whole for a magnitude or another grid."""
     axes = []
     for dim, size in zip(data.dims, data.shape, strict=True):
         coordinate = data.coords.get(dim)
@@ -74,17 +76,23 @@ def _labelled(data: Any, options: ReadOptions, name: str) -> Volume:
             centres = np.asarray(coordinate.values, np.float64)
         axes.append(axis(str(dim), size, centres, getattr(coordinate, "attrs", None)))
     label = str(data.name or name)
-    return labelled_volume(lambda index: data[index].values, data.dtype, axes, data.attrs, options, label, label)
+    if data.chunks is None:
+        return labelled_volume(lambda index: data[index].values, data.dtype, axes, data.attrs, options, label, label)
+    read = Chunks(data.data, label)
+    blockwise = options.component != "magnitude" and options.dims is None
+    options = replace(options, stored=blockwise)
+    return labelled_volume(read, data.dtype, axes, data.attrs, options, label, label, read.largest)
 
 
-def _array(values: np.ndarray, options: ReadOptions, origin: Sequence[float] | None, affine: Any, name: str) -> Volume:
+def _array(values: Any, options: ReadOptions, origin: Sequence[float] | None, affine: Any, name: str) -> Volume:
     chosen = [key for key in ("array", "component", "time") if getattr(options, key) is not None]
     _refuse([*chosen, *options.raw_flags], "an array is one volume")
     if affine is not None and (options.spacing is not None or origin is not None):
         raise UsageError("affine: holds spacing and origin too; leave out those or the affine")
     if options.space is not None and affine is None:
         raise UsageError(f"space {options.space}: says where an affine leads to; give affine too")
-    volume = Volume(contiguous(values) if values.ndim == 3 else values, options.spacing or (1.0, 1.0, 1.0), name=name)
+    ready = contiguous(values) if isinstance(values, np.ndarray) and values.ndim == 3 else values
+    volume = Volume(ready, options.spacing or (1.0, 1.0, 1.0), name=name)
     if origin is not None:
         volume = replace(volume, origin=tuple(map(float, origin)))
     if affine is None:

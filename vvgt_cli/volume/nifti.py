@@ -63,6 +63,8 @@ class Header:
     sform: tuple[float, ...] | None
     unit: float = 1.0  # mm
     samples: int = 0  # bytes of a voxel that is a colour
+    start: float = 0.0  # of time, in its unit
+    time_unit: str = ""  # where the header says one
 
 
 def _order(head: bytes) -> tuple[str, int] | None:
@@ -98,12 +100,12 @@ def parse_header(head: bytes, name: str) -> Header:
         magic, dim, (code,), pixdim = head[344:348], get("8h", 40), get("h", 70), get("8f", 76)
         offset, slope, intercept = get("3f", 108)
         q_code, s_code = get("2h", 252)
-        quatern, sform, units = get("6f", 256), get("12f", 280), head[123]
+        quatern, sform, units, (start,) = get("6f", 256), get("12f", 280), head[123], get("f", 136)
     else:
         magic, dim, (code,), pixdim = head[4:8], get("8q", 16), get("h", 12), get("8d", 104)
         (offset,), (slope, intercept) = get("q", 168), get("2d", 176)
         q_code, s_code = get("2i", 344)
-        quatern, sform, (units,) = get("6d", 352), get("12d", 400), get("i", 500)
+        quatern, sform, (units,), (start,) = get("6d", 352), get("12d", 400), get("i", 500), get("d", 216)
     if not 1 <= dim[0] <= 7 or min(dim[1 : dim[0] + 1]) < 1:
         raise DataError(f"{name}: dim {dim}; expected 1 to 7 axes of at least 1 voxel each")
     if code not in _DTYPES and code not in _COLORS:
@@ -128,6 +130,8 @@ def parse_header(head: bytes, name: str) -> Header:
         sform if s_code > 0 else None,
         {1: 1e3, 3: 1e-3}.get(units & 7, 1.0),  # metres, micrometres
         _COLORS.get(code, 0),
+        start,
+        {8: "s", 16: "ms", 24: "us"}.get(units & 0x38, ""),
     )
 
 
@@ -205,7 +209,10 @@ def _times(header: Header, options: ReadOptions, source: str) -> tuple[int, int]
     times, rest = math.prod(header.dims[3:4]), math.prod(header.dims[4:])
     if options.time is None and times > 1:
         if rest > 1 or options.component is None:
-            raise SeveralSteps(source, times)
+            step = header.pixdim[4]
+            known = header.time_unit and math.isfinite(step) and step > 0 and math.isfinite(header.start)
+            at = [header.start + k * step for k in range(times)] if known else None
+            raise SeveralSteps(source, times, times=at, unit=header.time_unit)
         return 1, times
     if (options.time or 0) >= times:
         raise UsageError(f"{source}: --time {options.time}: it has {times} time steps; expected 0 to {times - 1}")

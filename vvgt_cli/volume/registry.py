@@ -95,8 +95,8 @@ def _from_pipe(kept: Path, path: Path, source: str, options: ReadOptions) -> Vol
         raise
 
 
-def time_steps(source: str, options: ReadOptions) -> int:
-    """How many time steps a source has, where ``options`` choose none.
+def time_steps(source: str, options: ReadOptions) -> list[tuple[float, str] | None]:
+    """Time and unit of each step of a source, where ``options`` choose none; None where it does not say.
 
     Raises:
         DataError, UsageError: as `read_volume`.
@@ -104,8 +104,10 @@ def time_steps(source: str, options: ReadOptions) -> int:
     try:
         read_volume(source, options)
     except SeveralSteps as error:
-        return error.steps
-    return 1
+        if error.times is None:
+            return [None] * error.steps
+        return [(float(time), error.unit) for time in error.times]
+    return [None]
 
 
 def _inner(source: str, options: ReadOptions) -> tuple[Path, ReadOptions]:

@@ -1,4 +1,4 @@
-"""`Stored`: a (nz, ny, nx) array that stays in its file and is read block by block (Zarr, HDF5).
+"""`Stored`: a (nz, ny, nx) array that stays in its file (Zarr, HDF5), or lazy (Dask), and is read block by block.
 
 It stands where a `Volume` has its array, and gives parts of it to whoever asks for them by three slices.
 """
@@ -9,11 +9,13 @@ import itertools
 import math
 import mmap
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from vvgt_cli.errors import DataError, VvgtError
+from vvgt_cli.volume.blocks import IN_BLOCKS, check_memory
 from vvgt_cli.volume.bricks import BrickArray
 from vvgt_cli.volume.packed import Packed
 from vvgt_cli.volume.types import Volume
@@ -98,6 +100,19 @@ class Stored:
 def readable_in_blocks(volume: Volume) -> bool:
     """Whether parts of a volume's array can be had without the rest: mapped, `Stored`, bricks, or in memory."""
     return not isinstance(volume.data, Packed)
+
+
+def held(volume: Volume) -> Volume:
+    """The volume with its values in memory.
+
+    Raises:
+        DataError: they do not fit.
+    """
+    if not isinstance(volume.data, Stored):
+        return volume
+    check_memory(volume.data.nbytes, volume.name, IN_BLOCKS)
+    nx, ny, nz = volume.dims
+    return replace(volume, data=read_block(volume, np.zeros(3, np.int64), np.array([nx, ny, nz])))
 
 
 def chunks_of(volume: Volume) -> tuple[int, ...]:
