@@ -93,7 +93,7 @@ class CellBlocks:
         lo = tile * grid.tile
         edge, _ = blocks(exponent)
         shape = -(-(np.minimum(lo + grid.tile, grid.dims) - lo) // edge)
-        which = visible_blocks(box.values, lo - box.begin, edge, shape, box.tables)
+        which = visible_blocks(box.values, lo - box.begin, edge, shape, box.optics)
         if not len(which):
             return np.empty((0, 3), np.int32), np.empty((0, MOMENTS))
         half, step = np.array(grid.half), np.array(grid.step)
@@ -207,7 +207,7 @@ class ExtinctionBlocks:
 
         box = self.reader.box(*self.grid.blocks.at(number))
         out = np.empty(tuple(-(-n // self.cell) for n in box.values.shape), np.float32)
-        empty = empty_distance(brick_ranges(box.values), box.tables)
+        empty = empty_distance(brick_ranges(box.values), box.optics)
         cell_extinction(box.voxels, box.optics, empty, self.cell, out)
         self.parts.save(self.kind, number, extinction=out)
 

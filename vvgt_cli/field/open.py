@@ -150,22 +150,21 @@ def _absolute(path: str) -> str:
 def _reader(source: Source, access: Counted) -> tuple[Reader, float]:
     """What reads boxes of a source, and about how many of its voxels are visible."""
     from vvgt_cli.closed_form.samples import estimate, visible_share
-    from vvgt_cli.dvr.light import linear_tables
     from vvgt_cli.dvr.scene import kernel_rule
     from vvgt_cli.field.reader import LayerPlace, Layers, Scalars
-    from vvgt_cli.look.tables import build_tables
+    from vvgt_cli.look.tables import Optics, build_tables
 
     volume, frame = source.volume, source.volume.unit_frame()
     if not source.layers:
         task, whole, numbers = access.counts(volume)
         rule = kernel_rule(volume, lambda: whole.stored)
-        tables = build_tables(
+        optics = build_tables(
             source.tf, (numbers.lo, numbers.hi), slope=rule.slope, intercept=rule.intercept,
             unit_distance=source.unit_distance, world_per_unit=1 / frame.scale,
         )  # fmt: skip
         bricks, weights = task.samples()
-        visible = estimate(visible_share(tables, rule.apply(bricks)), weights, volume.data.size)
-        return Scalars(access.place(volume), rule, tables), visible
+        visible = estimate(visible_share(optics, rule.apply(bricks)), weights, volume.data.size)
+        return Scalars(access.place(volume), rule, optics), visible
     layers = tuple(
         LayerPlace(
             access.place(layer.volume), layer.tf, layer.unit_distance, layer.unit_label,
@@ -175,7 +174,7 @@ def _reader(source: Source, access: Counted) -> tuple[Reader, float]:
     )  # fmt: skip
     top = sum(layer.largest for layer in source.layers) / frame.scale
     grid = replace(volume, data=np.zeros((1, 1, 1), np.uint8))
-    reader = Layers(layers, grid, volume.dims, frame.scale, linear_tables(top))
+    reader = Layers(layers, grid, volume.dims, frame.scale, Optics.linear(top))
     return reader, _visible_of(reader, volume)
 
 
@@ -191,7 +190,7 @@ def _visible_of(reader: Layers, volume: Volume) -> float:
     size = np.minimum(SAMPLE, volume.dims)
     few = np.unique(np.linspace(0, len(places) - 1, min(len(places), FEW_SAMPLES)).astype(np.int64))
     bricks = np.stack([reader.box(places[n], places[n] + size).values for n in few])
-    return estimate(visible_share(reader.tables, bricks), weights[few], volume.data.size)
+    return estimate(visible_share(reader.optics, bricks), weights[few], volume.data.size)
 
 
 def _at_level(read: ReadOptions, path: str, options: BlockOptions, size: int) -> tuple[ReadOptions, str | None]:

@@ -164,7 +164,7 @@ def _piece_rays(
     """Of the piece from voxel ``lo`` to ``hi`` (3,): number of a bundle, and those of its rays that show something."""
     from vvgt_cli.dvr.bricks import brick_ranges, empty_distance
 
-    empty = empty_distance(brick_ranges(box.values), box.tables)
+    empty = empty_distance(brick_ranges(box.values), box.optics)
     if empty.all():
         return
     faces = np.stack([

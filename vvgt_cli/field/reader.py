@@ -9,12 +9,12 @@ from functools import lru_cache
 import numpy as np
 
 from vvgt_cli.dvr.layers import Layer, grid_box
-from vvgt_cli.dvr.layout import Optics, Texels, Voxels
+from vvgt_cli.dvr.layout import Texels, Voxels
 from vvgt_cli.dvr.scene import KernelRule
 from vvgt_cli.field.layered import Content, open_parts
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.labels import LabelTable
-from vvgt_cli.look.tables import OpticalTables
+from vvgt_cli.look.tables import Optics
 from vvgt_cli.volume import ReadOptions, Volume
 from vvgt_cli.volume.stored import read_block
 
@@ -53,13 +53,13 @@ class Box:
     Attributes:
         values: (z, y, x) that optics are over; of an optics grid its extinction.
         texels: (z, y, x, 4) float32 of an optics grid, else None.
-        tables: optics over ``values``.
+        optics: over ``values``.
         begin: (3,) first voxel of it in the volume, (x, y, z).
     """
 
     values: np.ndarray
     texels: np.ndarray | None
-    tables: OpticalTables
+    optics: Optics
     begin: np.ndarray
 
     @property
@@ -67,19 +67,13 @@ class Box:
         """The values."""
         return Voxels(self.values)
 
-    @property
-    def optics(self) -> Optics:
-        """The tables."""
-        t = self.tables
-        return Optics(t.lo, t.inv_width, t.nodes, t.cumulative, t.dark)
-
     def part(self, lo: np.ndarray, hi: np.ndarray) -> Box:
         """The voxels ``lo`` to ``hi`` (3,) of the volume that lie in it, laid out anew."""
         a = np.maximum(lo - self.begin, 0)
         b = np.minimum(hi - self.begin, self.values.shape[::-1])
         index = tuple(slice(int(p), int(q)) for p, q in zip(a[::-1], b[::-1], strict=True))
         texels = None if self.texels is None else np.ascontiguousarray(self.texels[index])
-        return Box(_kept(self.values[index]), texels, self.tables, self.begin + a)
+        return Box(_kept(self.values[index]), texels, self.optics, self.begin + a)
 
 
 def _kept(values: np.ndarray) -> np.ndarray:
@@ -97,12 +91,12 @@ class Scalars:
     Attributes:
         place: of the volume.
         rule: how stored values become those that kernels read.
-        tables: optics over these.
+        optics: over these.
     """
 
     place: Place
     rule: KernelRule
-    tables: OpticalTables = field(repr=False)
+    optics: Optics = field(repr=False)
 
     @property
     def voxel_bytes(self) -> int:
@@ -123,7 +117,7 @@ class Scalars:
             for z, plane in enumerate(stored):  # in between it is float64
                 values[z] = self.rule.apply(plane)
         values.flags.writeable = False
-        return Box(values, None, self.tables, lo.astype(np.int64))
+        return Box(values, None, self.optics, lo.astype(np.int64))
 
 
 @dataclass(frozen=True)
@@ -152,14 +146,14 @@ class Layers:
         grid: their common grid: a volume of one voxel, with the dims beside it.
         dims: voxels along (x, y, z).
         scale: unit-frame lengths per world length.
-        tables: optics over extinction.
+        optics: over extinction.
     """
 
     layers: tuple[LayerPlace, ...]
     grid: Volume
     dims: tuple[int, int, int]
     scale: float
-    tables: OpticalTables = field(repr=False)
+    optics: Optics = field(repr=False)
     voxel_bytes = 60
 
     def box(self, lo: np.ndarray, hi: np.ndarray) -> Box:
@@ -168,7 +162,7 @@ class Layers:
         texels *= np.float32(1 / self.scale)
         values = np.ascontiguousarray(texels[..., 3])
         values.flags.writeable = False
-        return Box(values, texels, self.tables, lo.astype(np.int64))
+        return Box(values, texels, self.optics, lo.astype(np.int64))
 
 
 def _layers(places: tuple[LayerPlace, ...]) -> list[Layer]:
