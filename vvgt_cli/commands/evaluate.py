@@ -126,7 +126,9 @@ def _load_dark(request: SourceRequest, header: PlyHeader) -> Source:
     if request.unit_distance is not None or header.unit_distance is None:
         return load(request)
     source = load(replace(request, unit_distance=repr(header.unit_distance)))
-    return replace(source, unit_label=f"{header.unit_distance_label}, as the .ply records")
+    first, *others = source.layers
+    first = replace(first, unit_label=f"{header.unit_distance_label}, as the .ply records")
+    return replace(source, layers=(first, *others))
 
 
 def evaluate(request: EvaluateRequest, console: Console | None = None) -> Evaluation:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Unpack
 
-from vvgt_cli.field.source import Opened
 from vvgt_cli.library.inputs import GoalLike, LookLike, Reading, VolumeLike, content_of
 
 if TYPE_CHECKING:
@@ -31,15 +30,15 @@ class Session:
     """
 
     def __init__(self, volume: VolumeLike, **reading: Unpack[Reading]) -> None:
-        self.opened = Opened.of(content_of(volume, reading))
+        self.content = content_of(volume, reading)
 
     @property
     def volume(self) -> Volume:
         """What was read: of colours and channels the first."""
-        return self.opened.volume
+        return self.content.volumes[0]
 
     def convert(self, look: LookLike = None, goal: GoalLike = None, **options: Any) -> Conversion:
         """The volume under another look: `convert`, with its options, without reading again."""
         from vvgt_cli.library.functions import convert
 
-        return convert(self.opened, look, goal, **options)
+        return convert(self, look, goal, **options)
