@@ -47,6 +47,7 @@ def _opened(run: Run, request: ConvertRequest, requests: list[ConvertRequest]) -
     """The requests with the volume, which is read once."""
     with run.stage("volume") as stage:
         content = open_parts(request.source.path, request.source.read)
+        content.prepare()
         stage.note = f"{content.volumes[0].name}, for {len(requests)} functions"
     return [replace(one, source=replace(one.source, volume=content)) for one in requests]
 

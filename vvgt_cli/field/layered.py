@@ -87,6 +87,11 @@ class Content:
 
         return PreparedVolume.of(self.volumes[0])
 
+    def prepare(self) -> None:
+        """Count and lay out a scalar field now, and not under every function."""
+        if self.one_field:
+            _ = self.statistics, self.layout  # both are kept
+
 
 class Access(Protocol):
     """How volumes are opened, and what their values are: in memory, or block by block."""

@@ -31,6 +31,7 @@ class Session:
 
     def __init__(self, volume: VolumeLike, **reading: Unpack[Reading]) -> None:
         self.content = content_of(volume, reading)
+        self.content.prepare()
 
     @property
     def volume(self) -> Volume:
