@@ -207,9 +207,7 @@ def kernel_rule(volume: Volume, limits: Callable[[], tuple[float, float]]) -> Ke
 
 def kernel_type(volume: Volume) -> str:
     """Name of the type that `kernel_values` gives a volume's values."""
-    kind = volume.data.dtype.newbyteorder("=")
-    narrow = kind in (np.bool_, np.uint8, np.uint16) and pairs_fit(volume.data.shape)
-    return "float32" if not narrow else "uint16" if kind == np.uint16 else "uint8"
+    return kernel_rule(volume, lambda: (0.0, 1.0)).dtype.name
 
 
 def _read_only(data: np.ndarray, dtype: np.dtype) -> np.ndarray:

@@ -192,9 +192,8 @@ def _caster(box: Box, empty: np.ndarray, light: Light | None) -> Callable[..., N
     from functools import partial
 
     from vvgt_cli.dvr import segments
-    from vvgt_cli.field.reader import texels_of
 
-    texels = texels_of(box)
+    texels = box.texels
     if texels is None:
         if light is None:
             return partial(segments.cast_segments, box.voxels, box.optics, empty)

@@ -51,28 +51,33 @@ class Box:
 
     Attributes:
         values: (z, y, x) that optics are over; of an optics grid its extinction.
-        texels: (z, y, x, 4) float32 of an optics grid, else None.
+        grid: (z, y, x, 4) float32 of an optics grid, else None.
         optics: over ``values``.
         begin: (3,) first voxel of it in the volume, (x, y, z).
     """
 
     values: np.ndarray
-    texels: np.ndarray | None
+    grid: np.ndarray | None
     optics: Optics
     begin: np.ndarray
 
     @property
     def voxels(self) -> Voxels:
-        """The values."""
+        """`values` as kernels take them."""
         return Voxels(self.values)
+
+    @property
+    def texels(self) -> Texels | None:
+        """`grid` as kernels take it."""
+        return None if self.grid is None else Texels(self.grid)
 
     def part(self, lo: np.ndarray, hi: np.ndarray) -> Box:
         """The voxels ``lo`` to ``hi`` (3,) of the volume that lie in it, laid out anew."""
         a = np.maximum(lo - self.begin, 0)
         b = np.minimum(hi - self.begin, self.values.shape[::-1])
         index = tuple(slice(int(p), int(q)) for p, q in zip(a[::-1], b[::-1], strict=True))
-        texels = None if self.texels is None else np.ascontiguousarray(self.texels[index])
-        return Box(_kept(self.values[index]), texels, self.optics, self.begin + a)
+        grid = None if self.grid is None else np.ascontiguousarray(self.grid[index])
+        return Box(_kept(self.values[index]), grid, self.optics, self.begin + a)
 
 
 def _kept(values: np.ndarray) -> np.ndarray:
@@ -165,8 +170,3 @@ class Layers:
 def hollow(volume: Volume, dims: Sequence[int]) -> Volume:
     """The grid of a volume of ``dims`` (x, y, z) voxels, without values."""
     return replace(volume, data=np.broadcast_to(np.uint8(0), tuple(dims)[::-1]), slope=1.0, intercept=0.0)
-
-
-def texels_of(box: Box) -> Texels | None:
-    """Of an optics grid."""
-    return None if box.texels is None else Texels(box.texels)
