@@ -37,7 +37,7 @@ def as_grid(source: Source) -> Scene:
 
 def held(scene: Scene) -> int:
     """Bytes of a scene's arrays."""
-    arrays = [scene.values, scene.empty, scene.tables.nodes, scene.tables.cumulative]
+    arrays = [scene.values, scene.empty, scene.optics.nodes, scene.optics.cumulative]
     return sum(array.nbytes for array in [*arrays, *([] if scene.grid is None else [scene.grid])])
 
 

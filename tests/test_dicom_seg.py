@@ -17,7 +17,7 @@ from pydicom.uid import UID, generate_uid
 from tests.test_volume_slices import header, write_series
 from vvgt_cli.dvr.layers import common_grid, grid_of
 from vvgt_cli.errors import DataError, SeveralComponents, UsageError
-from vvgt_cli.field.layered import LayerRequest, layers_of, open_parts
+from vvgt_cli.field.layered import layers_of, open_parts
 from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.gaussians import read_ply
 from vvgt_cli.look.label_files import read_labels
@@ -123,7 +123,7 @@ def test_without_colours_they_are_distinct(tmp_path: Path) -> None:
 def test_a_scan_with_its_segmentation(tmp_path: Path) -> None:
     write_seg(tmp_path / "s.dcm", scan(tmp_path / "ct"), organs())
     source = load(
-        SourceRequest(str(tmp_path / "ct"), tf="gray:0,0.01", layers=(LayerRequest(str(tmp_path / "s.dcm")),))
+        SourceRequest(str(tmp_path / "ct"), tf="gray:0,0.01", layers=(SourceRequest(str(tmp_path / "s.dcm")),))
     )
     grid = grid_of(source.layers, source.volume)
     assert grid.shape[:3] == SHAPE

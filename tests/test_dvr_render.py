@@ -167,7 +167,7 @@ def test_opacity_one_is_capped_so_that_it_has_a_limit():
     image = render_view(scene, camera(9, 9), ONE_RAY)
     assert_sane(image)
     np.testing.assert_allclose(image[4, 4], 1, atol=2e-5)
-    assert scene.tables.largest_extinction() == pytest.approx(extinction(np.array([1.0]), 1.0)[0] * 3)
+    assert scene.optics.largest_extinction() == pytest.approx(extinction(np.array([1.0]), 1.0)[0] * 3)
 
 
 @pytest.mark.parametrize(

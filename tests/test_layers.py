@@ -15,8 +15,8 @@ import vvgt_cli as library
 from tests.test_labels import SMALL, balls
 from vvgt_cli.dvr.layers import Layer, common_grid, grid_of, same_grid
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.field.layered import ALL, LayerRequest, open_parts, parse_layer
-from vvgt_cli.field.source import SourceRequest, load
+from vvgt_cli.field.layered import ALL, open_parts
+from vvgt_cli.field.source import SourceRequest, load, parse_layer
 from vvgt_cli.gaussians import read_ply
 from vvgt_cli.look import ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.labels import distinct
@@ -314,7 +314,8 @@ def test_layers_that_do_not_meet_or_fit_are_refused(vvgt, tmp_path: Path) -> Non
     for text in ("", "a.nii,hue=3", "a.nii,time=x", "a.nii,tf="):
         with pytest.raises(UsageError, match="--layer"):
             parse_layer(text)
-    assert parse_layer("a,b.nii,tf=hot:0.2,0.8,labels=none") == LayerRequest("a,b.nii", "hot:0.2,0.8", "none")
+    asked = SourceRequest("a,b.nii", tf="hot:0.2,0.8", labels="none")
+    assert parse_layer("a,b.nii,tf=hot:0.2,0.8,labels=none") == asked
     gone = vvgt("init", "example:blob:8", "--layer", tmp_path / "no.nii", "-o", tmp_path / "a.ply")
     assert "no such file" in gone.error
 
@@ -353,7 +354,7 @@ def test_in_python() -> None:
     few = {"max_gaussians": 100, "size": 32, "steps": 0}
     part = library.convert(cloud().data, goal=few, crop="2:8,:,:", mask=np.ones((10, 12, 14)))
     assert part.gaussians.means.shape[1] == 3
-    request = LayerRequest(Volume(balls(12)), labels="auto")
+    request = SourceRequest(Volume(balls(12)), labels="auto")
     both = library.convert(Volume(balls(12).astype(np.float32)), library.Look("gray", layers=[request]), few)
     assert np.ptp(both.gaussians.colors) > 0.1
 

@@ -12,6 +12,7 @@ import nibabel
 import numpy as np
 import pytest
 import pyvista
+import tifffile
 import xarray
 
 import vvgt_cli as vvgt
@@ -100,6 +101,17 @@ def test_a_session_reads_once_and_leaves_the_same_bytes(field, tmp_path, monkeyp
     assert session.volume.spacing == SPACING
     with pytest.raises(vvgt.UsageError, match="spacing: a session's volume has been read"):
         vvgt.convert(session, "gray", spacing=SPACING)
+
+
+def test_a_session_of_colours_is_its_file_in_blocks_too(field, tmp_path):
+    colors = np.stack([field * 255, field * 40, 255 - field * 255], axis=-1).astype(np.uint8)
+    tifffile.imwrite(tmp_path / "rgb.tif", colors, photometric="rgb")
+    few = HOW | {"max_gaussians": 40, "steps": 0}
+    made = [
+        saved(vvgt.convert(volume, None, few, blocks=16), tmp_path / f"{k}.ply")
+        for k, volume in enumerate((tmp_path / "rgb.tif", vvgt.Session(tmp_path / "rgb.tif")))
+    ]
+    assert made[0] == made[1]
 
 
 def test_an_affine_is_nibabels(field, tmp_path):

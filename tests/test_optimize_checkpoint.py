@@ -6,10 +6,10 @@ import itertools
 
 import numpy as np
 import pytest
+from random_clouds import random_cloud
 
 from vvgt_cli.cameras import default_views
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.refine import OptimizeOptions, optimize
 from vvgt_cli.splat import render
 
@@ -18,14 +18,7 @@ CAMERAS, CHECKS = default_views("train", 5, size=32), default_views("check", 2, 
 
 
 def cloud(count=40, seed=0, sigma=0.1):
-    rng = np.random.default_rng(seed)
-    return Gaussians(
-        rng.uniform(-0.6, 0.6, (count, 3)),
-        np.log(sigma) + rng.normal(0, 0.2, (count, 3)),
-        rng.normal(size=(count, 4)),
-        rng.normal(0, 1, count),
-        rng.uniform(0, 1, (count, 3)),
-    )
+    return random_cloud(count, seed, sigma, 0.2, (0, 1))
 
 
 def views(g, cameras):

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from random_clouds import random_cloud
 
 from vvgt_cli.cameras import default_views
 from vvgt_cli.errors import DataError, UsageError
@@ -26,14 +27,7 @@ CAMERAS, CHECKS = default_views("train", 6, size=48), default_views("check", 2, 
 
 
 def truth(count=40):
-    rng = np.random.default_rng(0)
-    return Gaussians(
-        rng.uniform(-0.6, 0.6, (count, 3)),
-        np.log(0.12) + rng.normal(0, 0.4, (count, 3)),
-        rng.normal(size=(count, 4)),
-        rng.normal(0.5, 1, count),
-        rng.uniform(0, 1, (count, 3)),
-    )
+    return random_cloud(count, 0, 0.12, 0.4, (0.5, 1))
 
 
 def shaken(g, size=0.05):

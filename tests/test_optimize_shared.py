@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from random_clouds import random_cloud
 
 from vvgt_cli.cameras import default_views
-from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.images.metrics import psnr
 from vvgt_cli.refine import OptimizeOptions, optimize, shared, steps
 from vvgt_cli.refine.states import OwnFrame
@@ -23,14 +23,7 @@ MANY = 2_100  # not a multiple of LANES
 
 
 def many(count=MANY):
-    rng = np.random.default_rng(4)
-    return Gaussians(
-        rng.uniform(-0.6, 0.6, (count, 3)),
-        np.log(0.03) + rng.normal(0, 0.4, (count, 3)),
-        rng.normal(size=(count, 4)),
-        rng.normal(-1, 1, count),
-        rng.uniform(0, 1, (count, 3)),
-    )
+    return random_cloud(count, 4, 0.03, 0.4, (-1, 1))
 
 
 def parts(g):
@@ -183,15 +176,16 @@ def test_what_slopes_tell_of_all_is_that_of_the_twin(count):
 
 def test_weights_are_the_same_bytes_for_any_number_of_threads():
     code = (
-        "import hashlib; from tests.test_optimize_shared import *; s = OwnFrame(many(12_500), CAMERAS); s.step = 1\n"
+        "import hashlib; from test_optimize_shared import *; s = OwnFrame(many(12_500), CAMERAS); s.step = 1\n"
         "w = s.common(np.random.default_rng(0).normal(size=(13, 12_500)).astype(np.float32))\n"
         "print(hashlib.sha256(b''.join(a.tobytes() for a in w)).hexdigest())"
     )
     root = str(Path(__file__).parent.parent)
+    places = f"{root}{os.pathsep}{root}/tests"
     found = {
         subprocess.run(
             [sys.executable, "-c", code],
-            env=os.environ | {"OPENBLAS_NUM_THREADS": n, "NUMBA_NUM_THREADS": n, "PYTHONPATH": root},
+            env=os.environ | {"OPENBLAS_NUM_THREADS": n, "NUMBA_NUM_THREADS": n, "PYTHONPATH": places},
             capture_output=True,
             check=True,
             cwd=root,

@@ -57,23 +57,21 @@ class Frame:
 def transforms_json(
     cameras: Sequence[Camera],
     *,
-    suffix: str = ".png",
     ply_file_path: str | None = None,
     paths: Sequence[str] | None = None,
     splits: dict[str, list[str]] | None = None,
 ) -> str:
-    """The text of a `transforms.json` for ``cameras``; images are ``NAME + suffix`` beside it.
+    """The text of a `transforms.json` for ``cameras``; images are ``NAME.png`` beside it.
 
     Intrinsics stand at the top where all cameras share them, and in each frame where they do not.
 
     Args:
         cameras: in the order of the frames.
-        suffix: of the images.
         ply_file_path: point cloud to start from (nerfstudio, OpenSplat).
-        paths: images in place of ``NAME + suffix``.
+        paths: images in place of ``NAME.png``.
         splits: nerfstudio's split: ``{"train": paths, "val": paths, "test": paths}``.
     """
-    paths = [f"{camera.name}{suffix}" for camera in cameras] if paths is None else paths
+    paths = [f"{camera.name}.png" for camera in cameras] if paths is None else paths
     document: dict[str, Any] = {"camera_model": "OPENCV"}
     if ply_file_path:
         document["ply_file_path"] = ply_file_path

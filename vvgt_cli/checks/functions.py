@@ -13,14 +13,14 @@ from vvgt_cli.checks import Case, Figure, require
 from vvgt_cli.checks.scenes import RAMP_RGB, RAMP_X, RAMP_Y, function, ramp, step
 from vvgt_cli.errors import DataError
 from vvgt_cli.look import TransferFunction, from_histogram, resolve
-from vvgt_cli.look.tables import MAX_OPACITY, OpticalTables, build_tables, extinction
+from vvgt_cli.look.tables import MAX_OPACITY, Optics, build_tables, extinction
 from vvgt_cli.volume import Volume, statistics
 
 STAGE = "function"
 LARGEST = -math.log1p(-MAX_OPACITY)
 
 
-def _tables(tf: TransferFunction, lo: float, hi: float, distance: float, slope: float) -> OpticalTables:
+def _tables(tf: TransferFunction, lo: float, hi: float, distance: float, slope: float) -> Optics:
     function: Any = tf  # frozen, the protocol's name is not
     return build_tables(function, (lo, hi), slope=slope, unit_distance=distance, world_per_unit=1.0)
 

@@ -68,14 +68,14 @@ class _Ranges:
 
 def changes(scene: Scene, progress: Callable[[int, int], None] | None = None) -> tuple[float, float]:
     """`Stiffness.change_per_voxel` and `Stiffness.abrupt`; neighbours that are not finite are left out."""
-    ranges = None if scene.grid is not None else _Ranges(scene.tables.nodes[:, 3])  # a grid holds extinction itself
-    top = scene.tables.largest_extinction()
+    ranges = None if scene.grid is not None else _Ranges(scene.optics.nodes[:, 3])  # a grid holds extinction itself
+    top = scene.optics.largest_extinction()
     nz, ny, nx = scene.values.shape
     thick = max(1, SLAB // (ny * nx))
     largest, abrupt, visible = 0.0, 0, 0
     for z in range(0, nz, thick):
         u = scene.values[z : z + thick + 1]
-        u = u.astype(np.float64) if ranges is None else scene.tables.coordinate(u)
+        u = u.astype(np.float64) if ranges is None else scene.optics.coordinate(u)
         for axis in range(3):
             count = u.shape[axis]
             a, b = np.take(u, range(count - 1), axis), np.take(u, range(1, count), axis)
@@ -112,7 +112,7 @@ def step_errors(scene: Scene) -> dict[float, float]:
 def stiffness(scene: Scene, tolerance: float, progress: Callable[[int, int], None] | None = None) -> Stiffness:
     """Measure a scene; ``tolerance`` is the root-mean-square error of RGBA that views may have."""
     change, abrupt = changes(scene, progress)
-    depth = scene.tables.largest_extinction() * float(scene.step.min())  # of one voxel
+    depth = scene.optics.largest_extinction() * float(scene.step.min())  # of one voxel
     errors = step_errors(scene)
     needed = None
     for step in reversed(STEPS):  # from the finest on

@@ -87,8 +87,7 @@ def source_request(
     volume: str, read: dict[str, Any], optics: dict[str, Any], light: dict[str, Any] | None = None
 ) -> SourceRequest:
     """What the shared options of `options.py` add up to."""
-    from vvgt_cli.field.layered import parse_layer
-    from vvgt_cli.field.source import SourceRequest
+    from vvgt_cli.field.source import SourceRequest, parse_layer
     from vvgt_cli.look.lighting import LightOptions
     from vvgt_cli.volume import ReadOptions
 

@@ -22,20 +22,15 @@ BRIGHTEST = 2.0  # colours are kept in [0, 2]: more would flare up where other v
 Progress = Callable[[int, int], None]
 
 
-def image_errors(
-    gaussians: Gaussians, cameras: Sequence[Camera], views: np.ndarray, rule: Rule = INRIA, power: int = 1
-) -> np.ndarray:
-    """(K,) sum over views and pixels of blending weight x error of RGB and alpha; ``views`` (n, h, w, 4).
-
-    Of each of the four absolute errors the ``power``.
-    """
-    return weights_and_errors(gaussians, cameras, views, rule, power)[1]
+def image_errors(gaussians: Gaussians, cameras: Sequence[Camera], views: np.ndarray, rule: Rule = INRIA) -> np.ndarray:
+    """(K,) sum over views and pixels of blending weight x error of RGB and alpha; ``views`` (n, h, w, 4)."""
+    return weights_and_errors(gaussians, cameras, views, rule)[1]
 
 
 def weights_and_errors(
     gaussians: Gaussians, cameras: Sequence[Camera], views: np.ndarray, rule: Rule = INRIA, power: int = 1
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(K,) sums over views and pixels of blending weight, and `image_errors`."""
+    """(K,) sums over views and pixels of blending weight, and `image_errors` of the errors' ``power``."""
     sums = np.zeros((len(gaussians), 5))
     for camera, view in zip(cameras, views, strict=True):
         projection = project(gaussians, camera, rule)

@@ -187,10 +187,10 @@ def in_order(index: np.ndarray, parts: list[np.ndarray]) -> tuple[np.ndarray, np
 CHILDREN = np.array([(x, y, z) for z in (0, 1) for y in (0, 1) for x in (0, 1)], np.int32)
 
 
-def cell_moments(scene: Scene, corners: np.ndarray, edge: np.ndarray, points_per_voxel: int = 2) -> np.ndarray:
+def cell_moments(scene: Scene, corners: np.ndarray, edge: np.ndarray) -> np.ndarray:
     """Moments (n, 8, 13) of the children of cells of ``edge`` (3,) voxels, ``corners`` (n, 3) voxels from the box's."""
     child = edge / 2
-    points = np.maximum(np.round(child * points_per_voxel), 2).astype(np.int64)
+    points = np.maximum(np.round(child * 2), 2).astype(np.int64)
     out = np.empty((len(corners), 2, 2, 2, MOMENTS))
     at = np.ascontiguousarray(corners, np.float64)
     _integrate(Region.whole(scene), at, points, child, out)

@@ -6,7 +6,7 @@ import numba as nb
 import numpy as np
 
 from vvgt_cli.jit.decorators import kernel
-from vvgt_cli.look.tables import OpticalTables
+from vvgt_cli.look.tables import Optics
 
 
 @kernel("V i8:1 i8:1 f8 f8 f8:4", parallel=True)
@@ -52,7 +52,7 @@ def ranges_of(values: np.ndarray, first: np.ndarray, edge: np.ndarray, shape: np
 
 
 def visible_blocks(
-    values: np.ndarray, first: np.ndarray, edge: np.ndarray, shape: np.ndarray, tables: OpticalTables
+    values: np.ndarray, first: np.ndarray, edge: np.ndarray, shape: np.ndarray, tables: Optics
 ) -> np.ndarray:
     """Numbers (n, 3) int64 (x, y, z) of the blocks that may hold extinction.
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from vvgt_cli.dvr.layout import BRICK
 from vvgt_cli.dvr.scene import Scene
-from vvgt_cli.look.tables import OpticalTables
+from vvgt_cli.look.tables import Optics
 
 SAMPLES = 4096  # bricks at most
 SAMPLE = 9  # voxels along their edge: eight cubes of eight voxels
@@ -42,7 +42,7 @@ def samples_in(dims: Triple, lo: np.ndarray, hi: np.ndarray) -> tuple[np.ndarray
     return places, (x[:, None, None] * y[:, None] * z).ravel()
 
 
-def visible_share(tables: OpticalTables, values: np.ndarray) -> np.ndarray:
+def visible_share(tables: Optics, values: np.ndarray) -> np.ndarray:
     """Share (n,) of the cubes of eight voxels of bricks ``values`` (n, z, y, x) that hold extinction."""
     positive = np.concatenate([[0], np.cumsum(tables.nodes[:, 3] > 0)])
     u = tables.coordinate(values)
@@ -78,5 +78,5 @@ def visible_voxels(scene: Scene) -> float:
     shares = np.zeros(len(places))
     if seen.any():
         bricks = np.stack([scene.values[k : k + z, j : j + y, i : i + x] for i, j, k in places[seen]])
-        shares[seen] = visible_share(scene.tables, bricks)
+        shares[seen] = visible_share(scene.optics, bricks)
     return estimate(shares, weights, nx * ny * nz)

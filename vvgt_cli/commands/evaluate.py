@@ -131,8 +131,10 @@ def _opened(run: Run, request: EvaluateRequest, gaussians: Gaussians, header: Pl
 
     def lit(source: Source) -> Source:
         preset = source.lighting if header.version is None else header.light
-        label = f"{header.unit_distance_label}, as the .ply records" if recorded else source.unit_label
-        return replace(source, unit_label=label, lighting=asked.lighting(preset, source.volume.space))
+        first, *others = source.layers
+        if recorded:
+            first = replace(first, unit_label=f"{header.unit_distance_label}, as the .ply records")
+        return replace(source, layers=(first, *others), lighting=asked.lighting(preset, source.volume.space))
 
     kernels, options = for_degree(EVALUATE, gaussians.degree), request.blocks or automatic(dark, run.console)
     if options is None:

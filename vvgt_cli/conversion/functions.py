@@ -15,7 +15,6 @@ from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.layered import open_parts
 from vvgt_cli.field.open import automatic
-from vvgt_cli.field.source import Opened
 from vvgt_cli.gaussians.outputs import check_outputs
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
@@ -70,9 +69,9 @@ def _opened(run: Run, request: ConvertRequest, requests: list[ConvertRequest]) -
     """The requests with the volume, which is read once."""
     with run.stage("volume") as stage:
         content = open_parts(request.source.path, request.source.read)
+        content.prepare()
         stage.note = f"{content.volumes[0].name}, for {len(requests)} functions"
-        opened = Opened.of(content)
-    return [replace(one, source=replace(one.source, volume=opened)) for one in requests]
+    return [replace(one, source=replace(one.source, volume=content)) for one in requests]
 
 
 def _one(request: ConvertRequest, tf: str) -> ConvertRequest:

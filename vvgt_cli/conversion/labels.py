@@ -20,9 +20,9 @@ from vvgt_cli.conversion.index import INDEX, LABELS, entry_of, index_of, index_o
 from vvgt_cli.conversion.owners import hidden_in, owners
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import NothingVisible, UsageError
-from vvgt_cli.field.layered import AUTO, NONE, Content, layers_of, open_parts
+from vvgt_cli.field.layered import AUTO, NONE, Content, content_of, layers_of, open_parts
 from vvgt_cli.field.open import automatic
-from vvgt_cli.field.source import Opened, SourceRequest
+from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.outputs import check_outputs
 from vvgt_cli.gaussians.types import together
@@ -145,10 +145,8 @@ def shared_out(run: Run, whole: Split) -> Iterator[tuple[Part, Gaussians]]:
 
 def _content(source: SourceRequest, stored: bool) -> Content:
     """What the map's file holds, or the map itself."""
-    if isinstance(source.volume, Volume):
-        return Content((source.volume,))
-    if isinstance(source.volume, Opened):
-        return source.volume.content or Content((source.volume.volume,))
+    if not isinstance(source.volume, str):
+        return content_of(source.volume)
     read = replace(source.read, stored=True, packed=True) if stored else source.read
     return open_parts(source.path, read)
 

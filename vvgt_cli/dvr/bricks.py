@@ -7,7 +7,7 @@ import numpy as np
 
 from vvgt_cli.dvr.layout import BRICK
 from vvgt_cli.jit.decorators import kernel
-from vvgt_cli.look.tables import OpticalTables
+from vvgt_cli.look.tables import Optics
 
 MAX_DISTANCE = 15  # bricks; a longer leap saves nothing measurable
 
@@ -44,7 +44,7 @@ def brick_ranges(values: np.ndarray) -> np.ndarray:
     return out
 
 
-def empty_distance(ranges: np.ndarray, tables: OpticalTables) -> np.ndarray:
+def empty_distance(ranges: np.ndarray, tables: Optics) -> np.ndarray:
     """Chebyshev distance in bricks to the nearest one whose value range has extinction, (bz, by, bx) uint8."""
     positive = np.concatenate([[0], np.cumsum(tables.nodes[:, 3] > 0)])
     none = ranges[..., 1] < ranges[..., 0]

@@ -61,7 +61,7 @@ class Field:
         import torch
 
         values = torch.from_numpy(scene.values.astype(np.float32)).to(device)[None, None]
-        nodes, cumulative = (torch.from_numpy(t).to(device) for t in (scene.tables.nodes, scene.tables.cumulative))
+        nodes, cumulative = (torch.from_numpy(t).to(device) for t in (scene.optics.nodes, scene.optics.cumulative))
         return cls(scene, values, nodes, cumulative)
 
     def pixels(self, camera: Camera, pixels: np.ndarray, offsets: np.ndarray, step: float) -> np.ndarray:
@@ -144,7 +144,7 @@ class Field:
             at = [(high if up else low)[:, axis] for axis, up in enumerate(corner)]
             w = [f[:, axis] if up else 1 - f[:, axis] for axis, up in enumerate(corner)]
             total += w[0] * w[1] * w[2] * flat[(at[2] * ny + at[1]) * nx + at[0]]
-        tables = self.scene.tables
+        tables = self.scene.optics
         u = ((total - tables.lo) * tables.inv_width).clamp(0.0, float(tables.bins))
         return torch.where(torch.isfinite(total), u, torch.nan)
 

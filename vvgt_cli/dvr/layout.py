@@ -8,6 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from vvgt_cli.look.tables import Optics as Optics  # kernels' modules have all their tuples from here
+
 BRICK_BITS = 3
 BRICK = 1 << BRICK_BITS  # voxels along the edge of a brick of the empty-space map
 TYPES = (np.dtype(np.uint8), np.dtype(np.uint16), np.dtype(np.float32))  # of values that kernels read
@@ -69,24 +71,6 @@ class Texels(_Grid):
         if not (values.flags.c_contiguous and values.flags.aligned and values.flags.writeable):
             raise ValueError(f"grid {values.shape}; expected aligned, C-contiguous and writable memory")
         return super().__new__(cls, values)
-
-
-class Optics(NamedTuple):
-    """Tables of optics over ``u = (stored - lo) * inv_width``, as `OpticalTables` has them.
-
-    Attributes:
-        lo: stored value at u = 0.
-        inv_width: bins per stored unit.
-        nodes: (n + 1, 4) float64 tau * (r, g, b) and tau at the bin edges, per unit-frame length.
-        cumulative: (n + 1, 4) float64 their integrals over u.
-        dark: (n + 1,) float64 the u up to which extinction is zero from bin i on.
-    """
-
-    lo: float
-    inv_width: float
-    nodes: np.ndarray
-    cumulative: np.ndarray
-    dark: np.ndarray
 
 
 class Light(NamedTuple):

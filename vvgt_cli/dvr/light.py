@@ -9,9 +9,9 @@ from typing import Protocol
 
 import numpy as np
 
-from vvgt_cli.dvr.layout import Light, Optics, Voxels
+from vvgt_cli.dvr.layout import Light, Voxels
 from vvgt_cli.look.lighting import Lighting
-from vvgt_cli.look.tables import OpticalTables
+from vvgt_cli.look.tables import Optics
 
 MAX_CELLS = 1 << 21  # of a grid: 128^3; more cost more time than they show
 ANGLE = 3.0  # degrees: radius of a light as it is seen; six times the sun's
@@ -106,15 +106,8 @@ class Matter:
         from vvgt_cli.dvr.bricks import brick_ranges, empty_distance
 
         extinction.flags.writeable = False  # as volumes' values are: kernels are compiled for such
-        tables = linear_tables(float(extinction.max()))
-        optics = Optics(tables.lo, tables.inv_width, tables.nodes, tables.cumulative, tables.dark)
-        return cls(Voxels(extinction), optics, empty_distance(brick_ranges(extinction), tables), step)
-
-
-def linear_tables(top: float) -> OpticalTables:
-    """Optics of values from 0 to ``top`` that are extinction themselves, black."""
-    nodes = np.array([[0.0, 0, 0, 0], [0, 0, 0, top or 1.0]])
-    return OpticalTables(0.0, 1 / (top or 1.0), nodes, np.cumsum(nodes / 2, axis=0))
+        optics = Optics.linear(float(extinction.max()))
+        return cls(Voxels(extinction), optics, empty_distance(brick_ranges(extinction), optics), step)
 
 
 def transmittance(

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vvgt_cli.dvr.layout import Light, Optics, Texels, Voxels, pairs_fit
-from vvgt_cli.dvr.light import linear_tables, mean_extinction, scene_light
+from vvgt_cli.dvr.layout import Light, Texels, Voxels, pairs_fit
+from vvgt_cli.dvr.light import mean_extinction, scene_light
 from vvgt_cli.look.lighting import Lighting
-from vvgt_cli.look.tables import OpticalTables, build_tables
+from vvgt_cli.look.tables import Optics, build_tables
 from vvgt_cli.look.types import Named, TransferFunctionLike
 from vvgt_cli.volume import Volume
 
@@ -47,13 +47,13 @@ class Scene:
         tf: the transfer function, in data values.
         unit_distance: world length that the function's opacity refers to.
         values: (nz, ny, nx) uint8, uint16 or float32 stored values in native byte order (a view where possible).
-        tables: optics over stored values, extinction per unit-frame length.
+        optics: over stored values, extinction per unit-frame length.
         empty: (bz, by, bx) uint8 Chebyshev distance, in bricks, to the nearest brick with extinction (0: has some).
         half, step: (3,) float64 half extents and voxel edges in the unit frame, (x, y, z).
         lighting: in world axes; ``light`` the same as kernels take it, with its shadows; None: colours are the
             function's.
         grid: (nz, ny, nx, 4) float32 extinction times (r, g, b, 1) per unit-frame length, of an optics grid: what is
-            drawn. ``values`` and ``tables`` then hold its extinction alone: what light, shadows and bricks ask for.
+            drawn. ``values`` and ``optics`` then hold its extinction alone: what light, shadows and bricks ask for.
         labels: the grid is one of labels alone.
     """
 
@@ -61,7 +61,7 @@ class Scene:
     tf: Named
     unit_distance: float
     values: np.ndarray
-    tables: OpticalTables
+    optics: Optics
     empty: np.ndarray
     half: np.ndarray
     step: np.ndarray
@@ -80,12 +80,6 @@ class Scene:
     def voxels(self) -> Voxels:
         """`values` as kernels take them."""
         return Voxels(self.values)
-
-    @property
-    def optics(self) -> Optics:
-        """`tables` as kernels take them."""
-        t = self.tables
-        return Optics(t.lo, t.inv_width, t.nodes, t.cumulative, t.dark)
 
     @classmethod
     def build(
@@ -110,7 +104,7 @@ class Scene:
                 slope * float(np.nanmax(ranges[..., 1])) + intercept,
             ]
             value_range = (min(ends), max(ends))
-        tables = build_tables(
+        optics = build_tables(
             tf,
             value_range,
             slope=slope,
@@ -119,8 +113,8 @@ class Scene:
             world_per_unit=1 / frame.scale,
             bins=bins,
         )
-        empty = bricks.empty_distance(ranges, tables)
-        scene = cls(volume, tf, unit_distance, values, tables, empty, np.array(frame.half), np.array(frame.step))
+        empty = bricks.empty_distance(ranges, optics)
+        scene = cls(volume, tf, unit_distance, values, optics, empty, np.array(frame.half), np.array(frame.step))
         return scene if lighting is None else scene.lit(lighting)
 
     @classmethod
@@ -134,10 +128,10 @@ class Scene:
         frame = volume.unit_frame()
         grid *= np.float32(1 / frame.scale)
         values = _read_only(grid[..., 3], grid.dtype)
-        tables = linear_tables(float(values.max()))
-        empty = bricks.empty_distance(bricks.brick_ranges(values), tables)
+        optics = Optics.linear(float(values.max()))
+        empty = bricks.empty_distance(bricks.brick_ranges(values), optics)
         half, step = np.array(frame.half), np.array(frame.step)
-        scene = cls(volume, tf, unit_distance, values, tables, empty, half, step, grid=grid, labels=labels)
+        scene = cls(volume, tf, unit_distance, values, optics, empty, half, step, grid=grid, labels=labels)
         return scene if lighting is None else scene.lit(lighting)
 
     def lit(self, lighting: Lighting) -> Scene:
@@ -213,9 +207,7 @@ def kernel_rule(volume: Volume, limits: Callable[[], tuple[float, float]]) -> Ke
 
 def kernel_type(volume: Volume) -> str:
     """Name of the type that `kernel_values` gives a volume's values."""
-    kind = volume.data.dtype.newbyteorder("=")
-    narrow = kind in (np.bool_, np.uint8, np.uint16) and pairs_fit(volume.data.shape)
-    return "float32" if not narrow else "uint16" if kind == np.uint16 else "uint8"
+    return kernel_rule(volume, lambda: (0.0, 1.0)).dtype.name
 
 
 def _read_only(data: np.ndarray, dtype: np.dtype) -> np.ndarray:

@@ -117,7 +117,7 @@ def image_data(scene: Scene, padded: bool) -> Any:
 
     values = np.pad(scene.values, 1, mode="edge") if padded else scene.values
     if values.dtype.kind == "f":  # what is not drawn must not reach the interpolation
-        values = np.where(np.isfinite(values), values, scene.tables.lo).astype(np.float32)
+        values = np.where(np.isfinite(values), values, scene.optics.lo).astype(np.float32)
     image = vtkImageData()
     image.SetDimensions(*values.shape[::-1])
     image.SetSpacing(*scene.step)
@@ -155,7 +155,7 @@ def volume_property(scene: Scene, highlight: float = REFLECTED) -> Any:
     from vtkmodules.vtkCommonDataModel import vtkPiecewiseFunction
     from vtkmodules.vtkRenderingCore import vtkColorTransferFunction, vtkVolumeProperty
 
-    tables = scene.tables
+    tables = scene.optics
     edges = np.arange(tables.bins + 1)
     u = np.linspace(0, tables.bins, min(tables.bins, NODES) + 1)
     stored = tables.lo + u / tables.inv_width

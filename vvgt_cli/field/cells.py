@@ -12,7 +12,7 @@ from vvgt_cli.errors import DataError
 from vvgt_cli.field.grid import CellGrid
 from vvgt_cli.field.parts import CELLS, ROW, Parts
 from vvgt_cli.field.rays import HALO, LIT_HALO, RayFile, leave_rays
-from vvgt_cli.field.reader import Box, Layers, Scalars, texels_of
+from vvgt_cli.field.reader import Box, Layers, Scalars
 from vvgt_cli.files import atomic_write
 
 NORMALS = ".normals.npy"
@@ -20,32 +20,44 @@ Reader = Scalars | Layers
 
 
 @dataclass(frozen=True)
-class CellBlocks:
-    """Integrate the base cells of blocks.
+class Blockwise:
+    """A task for every block of cells.
 
     Attributes:
         reader, grid: what is read, and how it is cut.
         parts: where what comes of it goes.
-        rays: that are cast on the way, None for none.
-        light: that falls on the volume: cells then have normals.
     """
 
     reader: Reader
     grid: CellGrid
     parts: Parts
-    rays: RayFile | None = None
-    light: Light | None = None
-    kind: str = CELLS
 
     def __len__(self) -> int:
         return len(self.grid.blocks)
 
+    def box(self, number: int, halo: int) -> Box:
+        """Block ``number`` with ``halo`` voxels around it."""
+        lo, hi = self.grid.blocks.at(number)
+        return self.reader.box(np.maximum(lo - halo, 0), np.minimum(hi + halo, self.grid.dims))
+
+
+@dataclass(frozen=True)
+class CellBlocks(Blockwise):
+    """Integrate the base cells of blocks.
+
+    Attributes:
+        rays: that are cast on the way, None for none.
+        light: that falls on the volume: cells then have normals.
+    """
+
+    rays: RayFile | None = None
+    light: Light | None = None
+    kind: str = CELLS
+
     def __call__(self, number: int) -> None:
         """Leave the part of block ``number``: rows of cells, what it shows of rays, and what there is of each tile."""
         grid, parts = self.grid, self.parts
-        lo, hi = grid.blocks.at(number)
-        halo = HALO if self.light is None else LIT_HALO
-        box = self.reader.box(np.maximum(lo - halo, 0), np.minimum(hi + halo, grid.dims))
+        box = self.box(number, HALO if self.light is None else LIT_HALO)
         tiles, counts, coarse, field, deepest = [], [], [], [], 0.0
         normals = [np.empty((0, 3))]
         with (
@@ -93,11 +105,11 @@ class CellBlocks:
         lo = tile * grid.tile
         edge, _ = blocks(exponent)
         shape = -(-(np.minimum(lo + grid.tile, grid.dims) - lo) // edge)
-        which = visible_blocks(box.values, lo - box.begin, edge, shape, box.tables)
+        which = visible_blocks(box.values, lo - box.begin, edge, shape, box.optics)
         if not len(which):
             return np.empty((0, 3), np.int32), np.empty((0, MOMENTS))
         half, step = np.array(grid.half), np.array(grid.step)
-        region = Region(box.voxels, box.optics, half, step, box.begin.astype(np.float64), texels_of(box))
+        region = Region(box.voxels, box.optics, half, step, box.begin.astype(np.float64), box.texels)
         return region_cells(region, lo + which * edge, exponent, grid.points)
 
     def _normals(self, box: Box, moments: np.ndarray) -> np.ndarray:
@@ -128,15 +140,9 @@ def normals_in(box: Box, points: np.ndarray, step: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class RayBlocks:
-    """Cast rays through blocks: a pass for pictures that were not known before.
+class RayBlocks(Blockwise):
+    """Cast rays through blocks: a pass for pictures that were not known before. Attributes: as of `CellBlocks`."""
 
-    Attributes: as of `CellBlocks`.
-    """
-
-    reader: Reader
-    grid: CellGrid
-    parts: Parts
     rays: RayFile
     light: Light | None = None
 
@@ -144,32 +150,18 @@ class RayBlocks:
     def kind(self) -> str:
         return self.rays.kind
 
-    def __len__(self) -> int:
-        return len(self.grid.blocks)
-
     def __call__(self, number: int) -> None:
         """Leave what block ``number`` shows of them."""
-        lo, hi = self.grid.blocks.at(number)
-        halo = HALO if self.light is None else LIT_HALO
-        box = self.reader.box(np.maximum(lo - halo, 0), np.minimum(hi + halo, self.grid.dims))
+        box = self.box(number, HALO if self.light is None else LIT_HALO)
         leave_rays(self.rays, box, number, self.grid.blocks, self.light, self.parts)
 
 
 @dataclass(frozen=True)
-class PointBlocks:
-    """Normals and extinction at points.
+class PointBlocks(Blockwise):
+    """Normals and extinction at ``points``, a file of voxel coordinates (n, 3)."""
 
-    Attributes: as of `CellBlocks`; ``points``: file of voxel coordinates (n, 3).
-    """
-
-    reader: Reader
-    grid: CellGrid
-    parts: Parts
     points: str
     kind: str
-
-    def __len__(self) -> int:
-        return len(self.grid.blocks)
 
     def __call__(self, number: int) -> None:
         """Leave those of the points that lie in block ``number``."""
@@ -179,35 +171,28 @@ class PointBlocks:
         which = np.flatnonzero(((points >= low) & (points < high)).all(axis=1))
         found = np.empty((0, 4))
         if len(which):
-            box = self.reader.box(np.maximum(lo - LIT_HALO, 0), np.minimum(hi + LIT_HALO, self.grid.dims))
-            found = normals_in(box, points[which], np.array(self.grid.step))
+            found = normals_in(self.box(number, LIT_HALO), points[which], np.array(self.grid.step))
         self.parts.save(self.kind, number, which=which, found=found)
 
 
 @dataclass(frozen=True)
-class ExtinctionBlocks:
+class ExtinctionBlocks(Blockwise):
     """Mean extinction of the cells that shadows and occlusion are marched through.
 
-    Attributes: as of `CellBlocks`; ``cell``: voxels along their edge, of which blocks hold whole ones.
+    ``cell``: voxels along their edge, of which blocks hold whole ones.
     """
 
-    reader: Reader
-    grid: CellGrid
-    parts: Parts
     cell: int
     kind: str = "extinction"
-
-    def __len__(self) -> int:
-        return len(self.grid.blocks)
 
     def __call__(self, number: int) -> None:
         """Leave those of block ``number``."""
         from vvgt_cli.dvr.bricks import brick_ranges, empty_distance
         from vvgt_cli.dvr.shadows import cell_extinction
 
-        box = self.reader.box(*self.grid.blocks.at(number))
+        box = self.box(number, 0)
         out = np.empty(tuple(-(-n // self.cell) for n in box.values.shape), np.float32)
-        empty = empty_distance(brick_ranges(box.values), box.tables)
+        empty = empty_distance(brick_ranges(box.values), box.optics)
         cell_extinction(box.voxels, box.optics, empty, self.cell, out)
         self.parts.save(self.kind, number, extinction=out)
 

@@ -10,7 +10,7 @@ import numpy as np
 from vvgt_cli.closed_form.samples import SAMPLE, sample_spacing, samples_in
 from vvgt_cli.errors import Unsuitable, UsageError
 from vvgt_cli.field.grid import Boxes
-from vvgt_cli.field.layered import Content, open_parts
+from vvgt_cli.field.layered import Content, content_of, open_parts
 from vvgt_cli.field.parts import COUNTS, HISTOGRAM, LABELS, Parts
 from vvgt_cli.field.reader import CLASSIFIED, Place
 from vvgt_cli.field.settings import counted_boxes, slices_at_once
@@ -134,11 +134,13 @@ class Counted:
         self._done: dict[int, tuple[CountBlocks, Tally, Statistics]] = {}
         self._count = 0
 
-    def open(self, source: str | Volume, read: ReadOptions) -> Content:
-        """A file, of which nothing is read yet, or a volume that is in memory."""
+    def open(self, source: str | Volume | Content, read: ReadOptions) -> Content:
+        """A file, of which nothing is read yet, or what is in memory."""
         if not isinstance(source, str):
-            self._places[id(source)] = source, Place(source, read)
-            return Content((source,))
+            content = content_of(source)
+            for volume in (*content.volumes, *content.classified):
+                self._places[id(volume)] = volume, Place(volume, read)
+            return content
         read = replace(read, stored=True, packed=True)
         content = open_parts(source, read)
         for number, volume in enumerate(content.volumes):

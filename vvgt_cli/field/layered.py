@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import re
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -31,55 +30,14 @@ from vvgt_cli.volume import ReadOptions, Statistics, Volume, statistics
 from vvgt_cli.volume.label_maps import labels_in, recognised
 from vvgt_cli.volume.stored import Stored, chunks_of, held, read_block
 
+if TYPE_CHECKING:
+    from vvgt_cli.dvr.scene import PreparedVolume
+
 AUTO, NONE = "auto", "none"
 COLOR, ALL = "color", "all"  # of --component
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709
 CHANNEL_COLORS = ((0, 1, 0), (1, 0, 1), (0, 1, 1), (1, 0.5, 0), (0.4, 0.4, 1), (1, 1, 0), (1, 0, 0))
 DARK, BRIGHT = 0.5, 0.998  # shares of a channel's voxels between which its opacity rises
-KEYS = {"tf": str, "labels": str, "distance": str, "array": str, "component": str, "channel": str, "time": int}
-
-
-@dataclass(frozen=True)
-class LayerRequest:
-    """A volume to be laid over the first.
-
-    Attributes:
-        volume: path, or a volume.
-        tf: its function; None makes one.
-        labels: its table of labels, ``auto``, ``none``, or None: ``auto`` where it is recognised.
-        distance: world length that its opacity is per, as `SourceRequest.unit_distance`.
-        read: how to read it.
-    """
-
-    volume: str | Volume
-    tf: str | TransferFunction | None = None
-    labels: str | LabelTable | None = None
-    distance: str | None = None
-    read: ReadOptions = field(default_factory=ReadOptions)
-
-
-def parse_layer(text: str, space: str | None = None) -> LayerRequest:
-    """``FILE[,tf=TF][,labels=TABLE][,component=N]...``.
-
-    Raises:
-        UsageError: a key that is none.
-    """
-    path, *rest = re.split(r",(?=[a-z]+=)", text)
-    given: dict[str, Any] = {}
-    for part in rest:
-        key, _, value = part.partition("=")
-        if key not in KEYS or not value or (KEYS[key] is int and not value.isdecimal()):
-            raise UsageError(
-                f"--layer {text}: {part!r}; expected FILE and any of {', '.join(f'{k}=...' for k in KEYS)}"
-            )
-        given["component" if key == "channel" else key] = KEYS[key](value)
-    if not path:
-        raise UsageError(f"--layer {text}: no file; expected FILE, as seg.nrrd or pet.nii,tf=hot.json")
-    component = given.pop("component", None)
-    if component is not None and component.isdecimal():
-        component = int(component)
-    tf, labels, distance = (given.pop(key, None) for key in ("tf", "labels", "distance"))
-    return LayerRequest(path, tf, labels, distance, ReadOptions(component=component, space=space, **given))
 
 
 @dataclass(frozen=True)
@@ -117,12 +75,36 @@ class Content:
         source = self.volumes[3] if len(self.volumes) > 3 else _luminance(self.stored, *self.volumes[:3])
         return (replace(source, name=self.volumes[0].name),)
 
+    @cached_property
+    def statistics(self) -> Statistics:
+        """Of the first volume, whose values are in memory: for one function after the other."""
+        return statistics(self.volumes[0])
+
+    @cached_property
+    def layout(self) -> PreparedVolume:
+        """Of the first volume, as `statistics`."""
+        from vvgt_cli.dvr.scene import PreparedVolume
+
+        return PreparedVolume.of(self.volumes[0])
+
+    def held(self) -> Content:
+        """The same with the values of arrays that are computed on demand in memory."""
+        volumes = tuple(map(held, self.volumes))
+        return (
+            self if all(a is b for a, b in zip(volumes, self.volumes, strict=True)) else replace(self, volumes=volumes)
+        )
+
+    def prepare(self) -> None:
+        """Count and lay out a scalar field now, and not under every function."""
+        if self.one_field:
+            _ = self.statistics, self.layout  # both are kept
+
 
 class Access(Protocol):
     """How volumes are opened, and what their values are: in memory, or block by block."""
 
-    def open(self, source: str | Volume, read: ReadOptions) -> Content:
-        """A file, or a volume that is there already."""
+    def open(self, source: str | Volume | Content, read: ReadOptions) -> Content:
+        """A file, or what is there already."""
 
     def statistics(self, volume: Volume) -> Statistics: ...
 
@@ -133,9 +115,9 @@ class Access(Protocol):
 class InMemory:
     """`Access` to volumes that are read as a whole."""
 
-    def open(self, source: str | Volume, read: ReadOptions) -> Content:
+    def open(self, source: str | Volume | Content, read: ReadOptions) -> Content:
         """See `open_parts`."""
-        return open_parts(source, read) if isinstance(source, str) else Content((held(source),))
+        return open_parts(source, read) if isinstance(source, str) else content_of(source).held()
 
     def statistics(self, volume: Volume) -> Statistics:
         """See `vvgt_cli.volume.statistics`."""
@@ -147,6 +129,11 @@ class InMemory:
 
 
 IN_MEMORY = InMemory()
+
+
+def content_of(source: Volume | Content) -> Content:
+    """A volume as the content of a file that holds nothing else."""
+    return source if isinstance(source, Content) else Content((source,))
 
 
 def open_parts(source: str, read: ReadOptions) -> Content:
@@ -179,7 +166,7 @@ def open_parts(source: str, read: ReadOptions) -> Content:
 
 
 def is_plain(
-    opened: Content, tf: object, labels: str | LabelTable | None, layers: Sequence[LayerRequest], access: Access
+    opened: Content, tf: object, labels: str | LabelTable | None, layers: Sequence[object], access: Access
 ) -> bool:
     """Whether it is one scalar field under a function; a label map that is recognised is not."""
     if not opened.one_field or layers or labels not in (None, NONE):

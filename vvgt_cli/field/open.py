@@ -16,11 +16,11 @@ from vvgt_cli.errors import SeveralComponents, Unsuitable, UsageError
 from vvgt_cli.field.blocked import Blocked, Pass
 from vvgt_cli.field.counting import Counted
 from vvgt_cli.field.digests import digest
-from vvgt_cli.field.layered import NONE, open_parts
+from vvgt_cli.field.layered import NONE, Content, content_of, open_parts
 from vvgt_cli.field.parts import Parts
 from vvgt_cli.field.runners import Here, Processes, Runner
 from vvgt_cli.field.settings import BlockOptions, block_edge
-from vvgt_cli.field.source import Opened, Source, SourceRequest, describe_source, load
+from vvgt_cli.field.source import Source, SourceRequest, describe_source, load
 from vvgt_cli.gaussians.outputs import STDOUT
 from vvgt_cli.jit.ahead import COUNT_REAL, COUNT_WHOLE
 from vvgt_cli.progress import Console
@@ -33,7 +33,7 @@ from vvgt_cli.volume.stored import Stored, is_file_backed
 
 if TYPE_CHECKING:
     from vvgt_cli.field.cells import Reader
-    from vvgt_cli.field.reader import Layers, Place
+    from vvgt_cli.field.reader import Layers
 
 LAYOUT = 3  # of parts: one more whenever what is in them changes
 HELD = 1 << 30  # bytes of values: more are processed in blocks, with a tenth of the memory (docs/log/blocks.md)
@@ -117,14 +117,12 @@ def _edge(request: SourceRequest, options: BlockOptions) -> int:
         content = open_parts(given, read)
         volume, layered = content.volumes[0], layered or not content.one_field or request.tf is None
     else:
-        volume = given.volume if isinstance(given, Opened) else given
+        volume = content_of(given).volumes[0]
     return block_edge(volume, options, LAYERED_BYTES if layered else None)
 
 
 def _settled(request: SourceRequest, options: BlockOptions, size: int) -> tuple[SourceRequest, str | None]:
     """The request as workers take it too: absolute paths, the level of a file that has several; and what to say."""
-    if isinstance(request.volume, Opened):
-        request = replace(request, volume=request.volume.volume)
     if not isinstance(request.volume, str):
         return request, None
     path = request.volume
@@ -150,37 +148,27 @@ def _absolute(path: str) -> str:
 def _reader(source: Source, access: Counted) -> tuple[Reader, float]:
     """What reads boxes of a source, and about how many of its voxels are visible."""
     from vvgt_cli.closed_form.samples import estimate, visible_share
-    from vvgt_cli.dvr.light import linear_tables
     from vvgt_cli.dvr.scene import kernel_rule
-    from vvgt_cli.field.reader import LayerPlace, Layers, Scalars
-    from vvgt_cli.look.tables import build_tables
+    from vvgt_cli.field.reader import Layers, Scalars
+    from vvgt_cli.look.tables import Optics, build_tables
 
     volume, frame = source.volume, source.volume.unit_frame()
-    if not source.layers:
+    if not source.gridded:
         task, whole, numbers = access.counts(volume)
         rule = kernel_rule(volume, lambda: whole.stored)
-        tables = build_tables(
+        optics = build_tables(
             source.tf, (numbers.lo, numbers.hi), slope=rule.slope, intercept=rule.intercept,
             unit_distance=source.unit_distance, world_per_unit=1 / frame.scale,
         )  # fmt: skip
         bricks, weights = task.samples()
-        visible = estimate(visible_share(tables, rule.apply(bricks)), weights, volume.data.size)
-        return Scalars(access.place(volume), rule, tables), visible
-    layers = tuple(
-        LayerPlace(
-            access.place(layer.volume), layer.tf, layer.unit_distance, layer.unit_label,
-            None if layer.colors is None else _three(*map(access.place, layer.colors)), layer.white,
-        )
-        for layer in source.layers
-    )  # fmt: skip
+        visible = estimate(visible_share(optics, rule.apply(bricks)), weights, volume.data.size)
+        return Scalars(access.place(volume), rule, optics), visible
     top = sum(layer.largest for layer in source.layers) / frame.scale
     grid = replace(volume, data=np.zeros((1, 1, 1), np.uint8))
-    reader = Layers(layers, grid, volume.dims, frame.scale, linear_tables(top))
+    places = tuple(tuple(map(access.place, (layer.volume, *(layer.colors or ())))) for layer in source.layers)
+    layers = tuple(replace(layer, volume=grid, colors=None) for layer in source.layers)
+    reader = Layers(layers, places, grid, volume.dims, frame.scale, Optics.linear(top))
     return reader, _visible_of(reader, volume)
-
-
-def _three(red: Place, green: Place, blue: Place) -> tuple[Place, Place, Place]:
-    return red, green, blue
 
 
 def _visible_of(reader: Layers, volume: Volume) -> float:
@@ -191,7 +179,7 @@ def _visible_of(reader: Layers, volume: Volume) -> float:
     size = np.minimum(SAMPLE, volume.dims)
     few = np.unique(np.linspace(0, len(places) - 1, min(len(places), FEW_SAMPLES)).astype(np.int64))
     bricks = np.stack([reader.box(places[n], places[n] + size).values for n in few])
-    return estimate(visible_share(reader.tables, bricks), weights[few], volume.data.size)
+    return estimate(visible_share(reader.optics, bricks), weights[few], volume.data.size)
 
 
 def _at_level(read: ReadOptions, path: str, options: BlockOptions, size: int) -> tuple[ReadOptions, str | None]:
@@ -227,7 +215,8 @@ def automatic(request: SourceRequest, console: Console) -> BlockOptions | None:
     Raises:
         DataError, UsageError: as `read_volume`.
     """
-    if isinstance(request.volume, Volume) and isinstance(request.volume.data, Stored):
+    given = request.volume
+    if not isinstance(given, str) and any(isinstance(one.data, Stored) for one in content_of(given).volumes):
         console.say("a Dask array: processed in blocks (docs/scale.md)")
         return BlockOptions()
     if not better_in_blocks(request):
@@ -313,7 +302,8 @@ def _settings(request: SourceRequest, wanted: Wanted) -> dict[str, Any]:
 def _facts(volume: Any) -> list[Any]:
     """A file's name, size and time, or what else a volume or table is."""
     if not isinstance(volume, str):
-        return [digest(volume.data) if isinstance(volume, Volume) else repr(volume)]
+        held = content_of(volume).volumes if isinstance(volume, Volume | Content) else ()
+        return [digest(*(one.data for one in held)) if held else repr(volume)]
     outer = [name for name in (volume, volume.rpartition(":/")[0], volume.partition("#")[0]) if name]
     files = next((some for name in outer if (some := files_of(name))), [])
     whole = [inner for file in files for inner in (file.rglob("*") if file.is_dir() else (file,))]

@@ -164,7 +164,7 @@ def _piece_rays(
     """Of the piece from voxel ``lo`` to ``hi`` (3,): number of a bundle, and those of its rays that show something."""
     from vvgt_cli.dvr.bricks import brick_ranges, empty_distance
 
-    empty = empty_distance(brick_ranges(box.values), box.tables)
+    empty = empty_distance(brick_ranges(box.values), box.optics)
     if empty.all():
         return
     faces = np.stack([
@@ -192,9 +192,8 @@ def _caster(box: Box, empty: np.ndarray, light: Light | None) -> Callable[..., N
     from functools import partial
 
     from vvgt_cli.dvr import segments
-    from vvgt_cli.field.reader import texels_of
 
-    texels = texels_of(box)
+    texels = box.texels
     if texels is None:
         if light is None:
             return partial(segments.cast_segments, box.voxels, box.optics, empty)

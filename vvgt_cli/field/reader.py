@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property, lru_cache
 
 import numpy as np
 
 from vvgt_cli.dvr.layers import Layer, grid_box
-from vvgt_cli.dvr.layout import Optics, Texels, Voxels
+from vvgt_cli.dvr.layout import Texels, Voxels
 from vvgt_cli.dvr.scene import KernelRule
-from vvgt_cli.field.layered import Content, open_parts
-from vvgt_cli.look.function import TransferFunction
-from vvgt_cli.look.labels import LabelTable
-from vvgt_cli.look.tables import OpticalTables
+from vvgt_cli.field.layered import Content, content_of, open_parts
+from vvgt_cli.look.tables import Optics
 from vvgt_cli.volume import ReadOptions, Volume
 from vvgt_cli.volume.stored import read_block
+from vvgt_cli.volume.types import triple
 
 OPEN = 16  # files that a process keeps open
 CLASSIFIED = -1  # in the place of a component: what the opacity of colours follows from
@@ -37,7 +36,7 @@ class Place:
 
     def volume(self) -> Volume:
         """The volume, opened once a process."""
-        content = _opened(self.source, self.read) if isinstance(self.source, str) else Content((self.source,))
+        content = _opened(self.source, self.read) if isinstance(self.source, str) else content_of(self.source)
         return content.classified[0] if self.component == CLASSIFIED else content.volumes[self.component]
 
 
@@ -52,34 +51,33 @@ class Box:
 
     Attributes:
         values: (z, y, x) that optics are over; of an optics grid its extinction.
-        texels: (z, y, x, 4) float32 of an optics grid, else None.
-        tables: optics over ``values``.
+        grid: (z, y, x, 4) float32 of an optics grid, else None.
+        optics: over ``values``.
         begin: (3,) first voxel of it in the volume, (x, y, z).
     """
 
     values: np.ndarray
-    texels: np.ndarray | None
-    tables: OpticalTables
+    grid: np.ndarray | None
+    optics: Optics
     begin: np.ndarray
 
     @property
     def voxels(self) -> Voxels:
-        """The values."""
+        """`values` as kernels take them."""
         return Voxels(self.values)
 
     @property
-    def optics(self) -> Optics:
-        """The tables."""
-        t = self.tables
-        return Optics(t.lo, t.inv_width, t.nodes, t.cumulative, t.dark)
+    def texels(self) -> Texels | None:
+        """`grid` as kernels take it."""
+        return None if self.grid is None else Texels(self.grid)
 
     def part(self, lo: np.ndarray, hi: np.ndarray) -> Box:
         """The voxels ``lo`` to ``hi`` (3,) of the volume that lie in it, laid out anew."""
         a = np.maximum(lo - self.begin, 0)
         b = np.minimum(hi - self.begin, self.values.shape[::-1])
         index = tuple(slice(int(p), int(q)) for p, q in zip(a[::-1], b[::-1], strict=True))
-        texels = None if self.texels is None else np.ascontiguousarray(self.texels[index])
-        return Box(_kept(self.values[index]), texels, self.tables, self.begin + a)
+        grid = None if self.grid is None else np.ascontiguousarray(self.grid[index])
+        return Box(_kept(self.values[index]), grid, self.optics, self.begin + a)
 
 
 def _kept(values: np.ndarray) -> np.ndarray:
@@ -97,12 +95,12 @@ class Scalars:
     Attributes:
         place: of the volume.
         rule: how stored values become those that kernels read.
-        tables: optics over these.
+        optics: over these.
     """
 
     place: Place
     rule: KernelRule
-    tables: OpticalTables = field(repr=False)
+    optics: Optics = field(repr=False)
 
     @property
     def voxel_bytes(self) -> int:
@@ -123,24 +121,7 @@ class Scalars:
             for z, plane in enumerate(stored):  # in between it is float64
                 values[z] = self.rule.apply(plane)
         values.flags.writeable = False
-        return Box(values, None, self.tables, lo.astype(np.int64))
-
-
-@dataclass(frozen=True)
-class LayerPlace:
-    """A `Layer` whose volumes are opened where they are needed; attributes as there."""
-
-    volume: Place
-    tf: TransferFunction | LabelTable
-    unit_distance: float
-    unit_label: str
-    colors: tuple[Place, Place, Place] | None
-    white: float
-
-    def layer(self) -> Layer:
-        """With its volumes."""
-        colors = None if self.colors is None else tuple(place.volume() for place in self.colors)
-        return Layer(self.volume.volume(), self.tf, self.unit_distance, self.unit_label, colors, self.white)  # type: ignore[arg-type]
+        return Box(values, None, self.optics, lo.astype(np.int64))
 
 
 @dataclass(frozen=True)
@@ -148,46 +129,44 @@ class Layers:
     """Reads boxes of the optics grid that layers add up to.
 
     Attributes:
-        layers: they.
+        layers: they, without their volumes.
+        places: where the volume of each comes from, and its colours.
         grid: their common grid: a volume of one voxel, with the dims beside it.
         dims: voxels along (x, y, z).
         scale: unit-frame lengths per world length.
-        tables: optics over extinction.
+        optics: over extinction.
     """
 
-    layers: tuple[LayerPlace, ...]
+    layers: tuple[Layer, ...]
+    places: tuple[tuple[Place, ...], ...]
     grid: Volume
     dims: tuple[int, int, int]
     scale: float
-    tables: OpticalTables = field(repr=False)
+    optics: Optics = field(repr=False)
     voxel_bytes = 60
+
+    def __getstate__(self) -> dict[str, object]:
+        """What other processes get: they open the volumes for themselves."""
+        return {one.name: getattr(self, one.name) for one in fields(self)}
+
+    @cached_property
+    def _opened(self) -> list[Layer]:
+        """The layers with their volumes."""
+        found = []
+        for layer, places in zip(self.layers, self.places, strict=True):
+            volume, *colors = [place.volume() for place in places]
+            found.append(replace(layer, volume=volume, colors=triple(colors) if colors else None))
+        return found
 
     def box(self, lo: np.ndarray, hi: np.ndarray) -> Box:
         """See `Scalars.box`."""
-        texels = grid_box(_layers(self.layers), hollow(self.grid, self.dims), lo, hi)
+        texels = grid_box(self._opened, hollow(self.grid, self.dims), lo, hi)
         texels *= np.float32(1 / self.scale)
         values = np.ascontiguousarray(texels[..., 3])
         values.flags.writeable = False
-        return Box(values, texels, self.tables, lo.astype(np.int64))
-
-
-def _layers(places: tuple[LayerPlace, ...]) -> list[Layer]:
-    """Opened once a process; tables of functions are no keys."""
-    found = _KNOWN.get(id(places))
-    if found is None or found[0] is not places:
-        _KNOWN.clear()
-        found = _KNOWN[id(places)] = (places, [place.layer() for place in places])
-    return found[1]
-
-
-_KNOWN: dict[int, tuple[Sequence[LayerPlace], list[Layer]]] = {}
+        return Box(values, texels, self.optics, lo.astype(np.int64))
 
 
 def hollow(volume: Volume, dims: Sequence[int]) -> Volume:
     """The grid of a volume of ``dims`` (x, y, z) voxels, without values."""
     return replace(volume, data=np.broadcast_to(np.uint8(0), tuple(dims)[::-1]), slope=1.0, intercept=0.0)
-
-
-def texels_of(box: Box) -> Texels | None:
-    """Of an optics grid."""
-    return None if box.texels is None else Texels(box.texels)

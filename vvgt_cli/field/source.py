@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from vvgt_cli.dvr.layers import Layer, common_grid, grid_of
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.digests import digest, volume_digest
-from vvgt_cli.field.layered import AUTO, IN_MEMORY, NONE, Access, Content, LayerRequest, is_plain, layers_of
+from vvgt_cli.field.layered import AUTO, IN_MEMORY, NONE, Access, Content, content_of, is_plain, layers_of
 from vvgt_cli.jit.ahead import for_grid, for_light
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.labels import LabelTable
@@ -18,37 +20,10 @@ from vvgt_cli.volume import ReadOptions, Statistics, Volume
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
-    from vvgt_cli.dvr.layers import Layer
     from vvgt_cli.dvr.scene import PreparedVolume
 
 OPTICS = 12  # hexadecimal digits of `Source.optics`
-
-
-@dataclass(frozen=True)
-class Opened:
-    """A volume with what does not depend on the function: for several functions, one after the other.
-
-    Attributes:
-        volume: as it was read.
-        statistics: of its values.
-        layout: for the kernels, where it is known.
-        content: all that its file holds, the volume first; None: the volume alone.
-    """
-
-    volume: Volume
-    statistics: Statistics
-    layout: PreparedVolume | None = None
-    content: Content | None = None
-
-    @classmethod
-    def of(cls, content: Volume | Content) -> Opened:
-        """Count and lay out."""
-        from vvgt_cli.dvr.scene import PreparedVolume
-        from vvgt_cli.volume import statistics
-
-        known = content if isinstance(content, Content) else Content((content,))
-        volume = known.volumes[0]
-        return cls(volume, statistics(volume), PreparedVolume.of(volume) if known.one_field else None, known)
+KEYS = {"tf": str, "labels": str, "distance": str, "array": str, "component": str, "channel": str, "time": int}
 
 
 @dataclass(frozen=True)
@@ -56,8 +31,7 @@ class SourceRequest:
     """What to read.
 
     Attributes:
-        volume: path, `example:NAME`, or "-" for raw values on standard input; or a volume that is there already, with
-            what does not depend on the function or without.
+        volume: path, `example:NAME`, or "-" for raw values on standard input; or what is there already.
         read: how to read it.
         tf: transfer-function file or colour-map name, or a function; None makes one from the histogram.
         tf_range: "data", "rescale" or "LO,HI".
@@ -66,10 +40,10 @@ class SourceRequest:
             every component.
         light: what falls on it; without options what the function's file says, else nothing.
         labels: table of its labels, the file of one, "auto", "none", or None: "auto" where it is recognised.
-        layers: what is laid over it.
+        layers: what is laid over it, each under its own look but the light.
     """
 
-    volume: str | Volume | Opened
+    volume: str | Volume | Content
     read: ReadOptions = field(default_factory=ReadOptions)
     tf: str | TransferFunction | None = None
     tf_range: str = "data"
@@ -77,7 +51,7 @@ class SourceRequest:
     statistics: tuple[Statistics, ...] = ()
     light: LightOptions = field(default_factory=LightOptions)
     labels: str | LabelTable | None = None
-    layers: tuple[LayerRequest, ...] = ()
+    layers: tuple[SourceRequest, ...] = ()
 
     @property
     def path(self) -> str:
@@ -87,8 +61,7 @@ class SourceRequest:
             UsageError: a volume that is there already.
         """
         if not isinstance(self.volume, str):
-            volume = self.volume.volume if isinstance(self.volume, Opened) else self.volume
-            raise UsageError(f"{volume.name}: a volume in memory; expected a path here")
+            raise UsageError(f"{content_of(self.volume).volumes[0].name}: a volume in memory; expected a path here")
         return self.volume
 
     def paths(self) -> list[str]:
@@ -98,37 +71,82 @@ class SourceRequest:
         return [path for path in given if isinstance(path, str) and path not in (AUTO, NONE)]
 
 
+def parse_layer(text: str, space: str | None = None) -> SourceRequest:
+    """``FILE[,tf=TF][,labels=TABLE][,component=N]...``.
+
+    Raises:
+        UsageError: a key that is none.
+    """
+    path, *rest = re.split(r",(?=[a-z]+=)", text)
+    given: dict[str, Any] = {}
+    for part in rest:
+        key, _, value = part.partition("=")
+        if key not in KEYS or not value or (KEYS[key] is int and not value.isdecimal()):
+            raise UsageError(
+                f"--layer {text}: {part!r}; expected FILE and any of {', '.join(f'{k}=...' for k in KEYS)}"
+            )
+        given["component" if key == "channel" else key] = KEYS[key](value)
+    if not path:
+        raise UsageError(f"--layer {text}: no file; expected FILE, as seg.nrrd or pet.nii,tf=hot.json")
+    component = given.pop("component", None)
+    if component is not None and component.isdecimal():
+        component = int(component)
+    tf, labels, distance = (given.pop(key, None) for key in ("tf", "labels", "distance"))
+    read = ReadOptions(component=component, space=space, **given)
+    return SourceRequest(path, read, tf, unit_distance=distance, labels=labels)
+
+
 @dataclass(frozen=True)
 class Source:
-    """What was read: the function is visible somewhere in the volume.
+    """What was read, and all that it is shown by: something of it is visible.
 
-    ``unit_distance`` is the world length that opacity refers to, ``unit_label`` how it was chosen, ``lighting`` what
-    falls on it, None for nothing; ``layout`` is the volume's, where it is known. ``layers`` are what adds up to it
-    where it is an optics grid: on the grid of ``volume``; ``tf`` and unit distance are the first one's.
+    Attributes:
+        layers: what adds up to it; one where it is a scalar field.
+        volume: the scalar field, or the grid that the layers add up on.
+        statistics: of the first layer's volume.
+        lighting: what falls on it, None for nothing.
+        layout: the volume's, where it is known.
     """
 
+    layers: tuple[Layer, ...]
     volume: Volume
     statistics: Statistics
-    tf: TransferFunction | LabelTable
-    unit_distance: float
-    unit_label: str
     lighting: Lighting | None = None
     layout: PreparedVolume | None = None
-    layers: tuple[Layer, ...] = ()
+
+    @property
+    def gridded(self) -> bool:
+        """Whether it is an optics grid: anything but one scalar field under a function."""
+        return len(self.layers) > 1 or not self.layers[0].interpolated
+
+    @property
+    def tf(self) -> TransferFunction | LabelTable:
+        """Of the first layer."""
+        return self.layers[0].tf
+
+    @property
+    def unit_distance(self) -> float:
+        """World length that the opacity of the first layer refers to."""
+        return self.layers[0].unit_distance
+
+    @property
+    def unit_label(self) -> str:
+        """How it was chosen."""
+        return self.layers[0].unit_label
 
     @property
     def name(self) -> str:
         """Of the function, or of all layers."""
-        return " + ".join(layer.name for layer in self.layers) or self.tf.name
+        return " + ".join(layer.name for layer in self.layers) if self.gridded else self.tf.name
 
     @property
     def labels_alone(self) -> bool:
         """Whether all of it is labels."""
-        return bool(self.layers) and all(isinstance(layer.tf, LabelTable) for layer in self.layers)
+        return all(isinstance(layer.tf, LabelTable) for layer in self.layers)
 
     def look(self) -> str:
         """Digest of all that gives the volume its colours, other volumes included."""
-        if isinstance(self.tf, TransferFunction) and not self.layers:
+        if isinstance(self.tf, TransferFunction) and not self.gridded:
             return digest(self.tf.opacity_nodes, self.tf.color_map)
         parts: list[Any] = []
         for layer in self.layers:
@@ -140,6 +158,8 @@ class Source:
 
     def optics(self) -> str | None:
         """Digest of an optics grid's tables, functions and unit distances, not of its volumes; None of scalars."""
+        if not self.gridded:
+            return None
         parts: list[Any] = []
         for layer in self.layers:
             tf = layer.tf
@@ -148,43 +168,29 @@ class Source:
             else:
                 parts += [tf.opacity_nodes, None if layer.colors else tf.color_map]
             parts.append(f"{layer.unit_distance:.6g}")
-        return digest(*parts)[:OPTICS] if parts else None
+        return digest(*parts)[:OPTICS]
 
     def kernels(self, names: tuple[str, ...]) -> tuple[str, ...]:
         """The kernels of a command, of the kind of scene and light that this is."""
         lit = names if self.lighting is None else for_light(names, self.lighting.attenuated)
-        return for_grid(lit) if self.layers else lit
+        return for_grid(lit) if self.gridded else lit
 
     def kernel_type(self) -> str:
         """Name of the type in which kernels read the volume's values."""
         from vvgt_cli.dvr.scene import kernel_type
 
-        if self.layers:
-            return "float32"
-        return kernel_type(self.volume)
+        return "float32" if self.gridded else kernel_type(self.volume)
 
     def scene(self) -> Scene:
         """The volume laid out for the kernels."""
         from vvgt_cli.dvr import Scene
 
-        if self.layers:
-            from vvgt_cli.dvr.layers import grid_of
-
+        if self.gridded:
             grid = grid_of(self.layers, self.volume)
-            title = Title(self.name)
-            return Scene.of_grid(
-                self.volume, title, self.unit_distance, grid, self.lighting, self.labels_alone
-            )  # fmt: skip
+            return Scene.of_grid(self.volume, self, self.unit_distance, grid, self.lighting, self.labels_alone)
         assert isinstance(self.tf, TransferFunction)
         limits = (self.statistics.lo, self.statistics.hi)
         return Scene.build(self.volume, self.tf, self.unit_distance, limits, lighting=self.lighting, layout=self.layout)
-
-
-@dataclass(frozen=True)
-class Title:
-    """What layers are called together."""
-
-    name: str
 
 
 def load(request: SourceRequest, access: Access = IN_MEMORY) -> Source:
@@ -214,17 +220,14 @@ def load_all(
     ]  # small: their errors come first
     if None in functions and tf_range != "data":
         raise UsageError("--tf-range says where the nodes of a function lie; it needs --tf")
-    opened = request.volume if isinstance(request.volume, Opened) else None
-    if isinstance(request.volume, Opened):
-        content = request.volume.content or Content((request.volume.volume,))
-    else:
-        content = access.open(request.volume, request.read)
+    content = access.open(request.volume, request.read)
+    held = content is request.volume and access is IN_MEMORY  # for several functions
     if not is_plain(content, functions[0], request.labels, request.layers, access):
         return [_layered(request, content, tf, tf_range, access) for tf in functions]
     volume = content.volumes[0]
     unit_distance(request.unit_distance, volume)  # its errors come first
     lights = [request.light.lighting(None if tf is None else tf.lighting, volume.space) for tf in functions]
-    numbers = opened.statistics if opened else access.statistics(volume)
+    numbers = content.statistics if held else access.statistics(volume)
     sources = []
     for tf, lighting in zip(functions, lights, strict=True):
         whole = request.statistics[0] if request.statistics else numbers
@@ -236,9 +239,8 @@ def load_all(
                 stacklevel=2,
             )
         check_visible(shown, numbers)
-        distance, label = unit_distance(request.unit_distance, volume, tf or shown)
-        layout = opened.layout if opened else None
-        sources.append(Source(volume, numbers, shown, distance, label, lighting, layout))
+        layer = Layer(volume, shown, *unit_distance(request.unit_distance, volume, tf or shown))
+        sources.append(Source((layer,), volume, numbers, lighting, content.layout if held else None))
     return sources
 
 
@@ -247,18 +249,13 @@ def _layered(
     access: Access,
 ) -> Source:  # fmt: skip
     """The optics grid that a volume and its layers add up to."""
-    from vvgt_cli.dvr.layers import common_grid
-
     lighting = request.light.lighting(None if tf is None else tf.lighting, content.volumes[0].space)
     layers = layers_of(content, tf, request.labels, tf_range, request.unit_distance, request.statistics, access)
     for other in request.layers:
         inner = access.open(other.volume, other.read)
-        layers += layers_of(inner, other.tf, other.labels, "data", other.distance, access=access)
-    first, grid = layers[0], common_grid(layers, content.stored)
-    numbers = access.statistics(first.volume)
-    return Source(
-        grid, numbers, first.tf, first.unit_distance, first.unit_label, lighting, layers=tuple(layers)
-    )  # fmt: skip
+        layers += layers_of(inner, other.tf, other.labels, other.tf_range, other.unit_distance, access=access)
+    grid = common_grid(layers, content.stored)
+    return Source(tuple(layers), grid, access.statistics(layers[0].volume), lighting)
 
 
 def describe_source(source: Source) -> str:
@@ -298,5 +295,5 @@ def tf_record(source: Source, request: SourceRequest) -> dict[str, Any]:
         "unit_distance": source.unit_distance,
         "unit_distance_label": source.unit_label,
         **({} if source.lighting is None else {"light": source.lighting.text()}),
-        **({"layers": [layer.name for layer in source.layers]} if source.layers else {}),
+        **({"layers": [layer.name for layer in source.layers]} if source.gridded else {}),
     }

@@ -29,20 +29,17 @@ def _rgb(image: np.ndarray, background: Sequence[float]) -> np.ndarray:
     return result
 
 
-def side_by_side(
-    reference: np.ndarray, ours: np.ndarray, gain: float = 8.0, background: Sequence[float] = BLACK
-) -> np.ndarray:
+def side_by_side(reference: np.ndarray, ours: np.ndarray, gain: float = 8.0) -> np.ndarray:
     """reference | ours | gain x absolute difference, (h, 3 w, 3) float32 in [0, 1].
 
     Args:
-        reference, ours: (h, w, 3) RGB or (h, w, 4) premultiplied RGBA, of one size.
+        reference, ours: (h, w, 3) RGB or (h, w, 4) premultiplied RGBA over black, of one size.
         gain: factor of the difference.
-        background: what RGBA images are put over.
 
     Raises:
         DataError: shapes that differ or are no images.
     """
-    left, right = _rgb(reference, background), _rgb(ours, background)
+    left, right = _rgb(reference, BLACK), _rgb(ours, BLACK)
     if left.shape != right.shape:
         raise DataError(f"images of {left.shape[:2]} and {right.shape[:2]} pixels; expected the same size")
     return np.concatenate([left, right, np.clip(gain * np.abs(left - right), 0, 1)], axis=1)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Unpack
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.conversion.result import Conversion, Result
 from vvgt_cli.errors import SeveralSteps, UsageError
-from vvgt_cli.field.source import Opened
+from vvgt_cli.field.layered import Content
 from vvgt_cli.gaussians import Gaussians, PlyHeader
 from vvgt_cli.library.inputs import (
     Goal,
@@ -121,10 +121,11 @@ def _under(
     sources = {name: source_of(volume, look, reading) for name, look in looks.items()}
     first = next(iter(sources.values()))
     if blocks is None and automatic(first, console) is None:
-        opened = first.volume if isinstance(first.volume, Opened) else Opened.of(content_of(volume, reading))
-        sources = {name: source_of(opened, look, {}) for name, look in looks.items()}
-    given = first.volume.volume if isinstance(first.volume, Opened) else first.volume
-    name = os.path.basename(given) if isinstance(given, str) else given.name
+        content = first.volume if isinstance(first.volume, Content) else content_of(volume, reading)
+        content.prepare()
+        sources = {name: source_of(content, look, {}) for name, look in looks.items()}
+    given = first.volume
+    name = os.path.basename(given) if isinstance(given, str) else content_of(given, {}).volumes[0].name
     return {name: _request(source, goal, blocks) for name, source in sources.items()}, name
 
 

@@ -12,8 +12,8 @@ from typing import Any, BinaryIO, TypedDict
 from vvgt_cli.conversion.functions import function_name
 from vvgt_cli.conversion.result import Result
 from vvgt_cli.errors import UsageError
-from vvgt_cli.field.layered import Content, LayerRequest, open_parts, parse_layer
-from vvgt_cli.field.source import Opened, SourceRequest
+from vvgt_cli.field.layered import Content, open_parts
+from vvgt_cli.field.source import SourceRequest, parse_layer
 from vvgt_cli.look import TransferFunction
 from vvgt_cli.look.label_files import table_of
 from vvgt_cli.look.labels import LabelTable
@@ -27,7 +27,7 @@ PathLike = str | os.PathLike[str]
 VolumeLike = Any  # a path, a Volume, a Session, an array (of Dask, too), an xarray.DataArray, a pyvista (VTK) dataset
 LightLike = LightOptions | str | Sequence[float] | Sequence[str | Sequence[float]] | None
 LabelsLike = PathLike | Mapping[Any, Mapping[str, Any]] | LabelTable
-LayerLike = PathLike | LayerRequest
+LayerLike = PathLike | SourceRequest
 FunctionLike = PathLike | Mapping[str, Any] | TransferFunction
 
 
@@ -43,7 +43,7 @@ class Look:
         light: "none", "headlight", a direction (x, y, z) or its name, several of these, or `LightOptions`; None: what
             the function's file says.
         labels: a label map's table: a file, a mapping {label: {"name", "color", "opacity"}}, "auto", "none".
-        layers: volumes laid over it: files as ``--layer`` has them, or `LayerRequest`.
+        layers: volumes laid over it: files as ``--layer`` has them, or `SourceRequest`.
     """
 
     function: FunctionLike | None = None
@@ -194,15 +194,20 @@ def volume_of(volume: VolumeLike, reading: Reading, name: str = "array") -> Volu
     return cut(found, replace(options, stored=isinstance(found.data, Stored)))
 
 
-def content_of(volume: VolumeLike, reading: Reading) -> Volume | Content:
-    """`volume_of`, and of a file its colours, channels or segments too.
+def content_of(volume: VolumeLike, reading: Reading) -> Content:
+    """`volume_of`, and of a file its colours, channels or segments too; what a `Session` holds as it is.
 
     Raises:
         DataError, UsageError: as `volume_of`.
     """
     if isinstance(volume, str | os.PathLike):
         return open_parts(os.fspath(volume), _options(reading))
-    return volume_of(volume, reading)
+    content = getattr(volume, "content", volume)
+    if not isinstance(content, Content):
+        return Content((volume_of(volume, reading),))
+    if reading:
+        raise UsageError(f"{', '.join(reading)}: a session's volume has been read; leave out {', '.join(reading)}")
+    return content
 
 
 def _options(reading: Mapping[str, Any]) -> ReadOptions:
@@ -257,7 +262,7 @@ def source_of(volume: VolumeLike, look: LookLike, reading: Reading) -> SourceReq
         options = _options(reading)
         given: Any = os.fspath(volume)
     else:
-        options, given = ReadOptions(), _opened(volume, reading) or volume_of(volume, reading)
+        options, given = ReadOptions(), content_of(volume, reading)
     return SourceRequest(
         given, options, function_of(look.function), span, distance, light=light_of(look.light),
         labels=labels_of(look.labels), layers=tuple(layer_of(layer) for layer in look.layers),
@@ -275,19 +280,9 @@ def labels_of(labels: LabelsLike | None) -> str | LabelTable | None:
     return os.fspath(labels) if isinstance(labels, os.PathLike) else labels
 
 
-def layer_of(layer: LayerLike) -> LayerRequest:
+def layer_of(layer: LayerLike) -> SourceRequest:
     """A layer as ``--layer`` writes it, or as it is."""
-    return layer if isinstance(layer, LayerRequest) else parse_layer(os.fspath(layer))
-
-
-def _opened(volume: VolumeLike, reading: Reading) -> Opened | None:
-    """What a `Session` holds."""
-    opened = getattr(volume, "opened", volume)
-    if not isinstance(opened, Opened):
-        return None
-    if reading:
-        raise UsageError(f"{', '.join(reading)}: a session's volume has been read; leave out {', '.join(reading)}")
-    return opened
+    return layer if isinstance(layer, SourceRequest) else parse_layer(os.fspath(layer))
 
 
 def light_of(light: LightLike) -> LightOptions:

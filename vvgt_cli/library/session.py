@@ -5,14 +5,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, Unpack
 
 from vvgt_cli.errors import UsageError
-from vvgt_cli.field.source import Opened
 from vvgt_cli.library.inputs import GoalLike, LooksLike, Reading, VolumeLike, content_of
-from vvgt_cli.volume import Volume
 from vvgt_cli.volume.stored import Stored
 
 if TYPE_CHECKING:
     from vvgt_cli.conversion.clouds import Clouds
     from vvgt_cli.conversion.result import Conversion
+    from vvgt_cli.volume import Volume
 
 
 class Session:
@@ -34,21 +33,21 @@ class Session:
     """
 
     def __init__(self, volume: VolumeLike, **reading: Unpack[Reading]) -> None:
-        content = content_of(volume, reading)
-        if isinstance(content, Volume) and isinstance(content.data, Stored):
+        self.content = content_of(volume, reading)
+        if isinstance(self.volume.data, Stored):
             raise UsageError(
-                f"{content.name}: a Dask array, which is not held in memory; convert it without a session, or pass "
+                f"{self.volume.name}: a Dask array, which is not held in memory; convert it without a session, or pass "
                 "what its compute() returns"
             )
-        self.opened = Opened.of(content)
+        self.content.prepare()
 
     @property
     def volume(self) -> Volume:
         """What was read: of colours and channels the first."""
-        return self.opened.volume
+        return self.content.volumes[0]
 
     def convert(self, look: LooksLike = None, goal: GoalLike = None, **options: Any) -> Conversion | Clouds:
         """The volume under another look, or several: `convert`, with its options, without reading again."""
         from vvgt_cli.library.functions import convert
 
-        return convert(self.opened, look, goal, **options)
+        return convert(self, look, goal, **options)

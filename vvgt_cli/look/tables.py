@@ -1,9 +1,9 @@
-"""`OpticalTables`: a transfer function tabulated with the cumulative integrals that pre-integration needs."""
+"""`Optics`: a transfer function tabulated with the cumulative integrals that pre-integration needs."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,9 +20,10 @@ def extinction(opacity: np.ndarray, unit_distance: float) -> np.ndarray:
     return result
 
 
-@dataclass(frozen=True)
-class OpticalTables:
+class Optics(NamedTuple):
     """Extinction and colour over ``u = (stored - lo) * inv_width`` in [0, n]; values beyond take the end's.
+
+    Kernels take it as it is.
 
     Attributes:
         lo: stored value at u = 0.
@@ -37,13 +38,21 @@ class OpticalTables:
     inv_width: float
     nodes: np.ndarray
     cumulative: np.ndarray
-    dark: np.ndarray = field(init=False)
+    dark: np.ndarray
 
-    def __post_init__(self) -> None:
-        count = len(self.nodes)
-        positive = np.where(self.nodes[:, 3] > 0, np.arange(count), count + 1)
+    @classmethod
+    def of(cls, lo: float, inv_width: float, nodes: np.ndarray, cumulative: np.ndarray) -> Optics:
+        """Of everything but ``dark``, which follows from the nodes."""
+        count = len(nodes)
+        positive = np.where(nodes[:, 3] > 0, np.arange(count), count + 1)
         dark = np.minimum.accumulate(positive[::-1])[::-1] - 1.0
-        object.__setattr__(self, "dark", np.ascontiguousarray(dark))
+        return cls(lo, inv_width, nodes, cumulative, np.ascontiguousarray(dark))
+
+    @classmethod
+    def linear(cls, top: float) -> Optics:
+        """Of values from 0 to ``top`` that are extinction themselves, black."""
+        nodes = np.array([[0.0, 0, 0, 0], [0, 0, 0, top or 1.0]])
+        return cls.of(0.0, 1 / (top or 1.0), nodes, np.cumsum(nodes / 2, axis=0))
 
     @property
     def bins(self) -> int:
@@ -75,7 +84,7 @@ def build_tables(
     unit_distance: float,
     world_per_unit: float,
     bins: int | None = None,
-) -> OpticalTables:
+) -> Optics:
     """Tabulate ``tf`` over the part of ``value_range`` (data values) in which it is not constant.
 
     ``unit_distance`` is in world units, ``world_per_unit`` the world length of one unit-frame length.
@@ -92,4 +101,4 @@ def build_tables(
     nodes = np.concatenate([tf.color(x) * tau[:, None], tau[:, None]], axis=1)
     cumulative = np.zeros_like(nodes)
     np.cumsum(0.5 * (nodes[1:] + nodes[:-1]), axis=0, out=cumulative[1:])
-    return OpticalTables((lo - intercept) / slope, slope * count / (hi - lo), nodes, cumulative)
+    return Optics.of((lo - intercept) / slope, slope * count / (hi - lo), nodes, cumulative)

@@ -212,15 +212,15 @@ def read_config(path: str | Path) -> TrainConfig:
 
 def config_text(config: TrainConfig) -> str:
     """The YAML that `read_config` reads."""
-    plain = _lists(config.to_dict())
+    plain = lists(config.to_dict())
     return str(_yaml().safe_dump(plain, sort_keys=False))
 
 
-def _lists(value: Any) -> Any:
-    """YAML's safe form has no tuples."""
+def lists(value: Any) -> Any:
+    """Without tuples: YAML's safe form has none, checkpoints and cards do not tell them from lists."""
     if isinstance(value, dict):
-        return {key: _lists(entry) for key, entry in value.items()}
-    return [_lists(entry) for entry in value] if isinstance(value, tuple | list) else value
+        return {key: lists(entry) for key, entry in value.items()}
+    return [lists(entry) for entry in value] if isinstance(value, tuple | list) else value
 
 
 def _yaml() -> Any:

@@ -18,7 +18,7 @@ from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import atomic_write
 from vvgt_cli.network.checkpoint import Checkpoint, load_weights, read_tensors, save_checkpoint
 from vvgt_cli.network.model import Vvgt
-from vvgt_cli.network.training.config import TrainConfig, config_text, read_config
+from vvgt_cli.network.training.config import TrainConfig, config_text, lists, read_config
 from vvgt_cli.network.training.lpips import Lpips, load_lpips
 from vvgt_cli.network.training.parallel import World, world
 from vvgt_cli.network.training.record import Recorder
@@ -210,7 +210,7 @@ class _Run:
             "step": state.step, "skipped": state.skipped, "seconds": round(state.seconds, 1),
             "processes": self.here.size, "device": self.here.device.type, "torch": str(torch.__version__),
         }  # fmt: skip
-        checkpoint = Checkpoint(self.network, plain(training), plain(state.found), self.commit)
+        checkpoint = Checkpoint(self.network, lists(training), lists(state.found), self.commit)
         with atomic_write(self.folder / name, overwrite=True) as temporary:
             save_checkpoint(temporary, checkpoint, more)
 
@@ -223,13 +223,6 @@ class _Run:
             self.progress = Progress(**document["progress"])
         except (KeyError, TypeError, ValueError) as error:
             raise DataError(f"{path}: not a checkpoint of a run ({error}); remove the folder to start afresh") from None
-
-
-def plain(value: Any) -> Any:
-    """Without tuples, which checkpoints and cards do not tell from lists."""
-    if isinstance(value, dict):
-        return {key: plain(entry) for key, entry in value.items()}
-    return [plain(entry) for entry in value] if isinstance(value, tuple | list) else value
 
 
 def commit() -> str:
