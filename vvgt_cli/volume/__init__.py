@@ -17,6 +17,7 @@ from vvgt_cli.volume import (  # noqa: F401  each registers its formats, in this
     tiff,
     vtk_grids,
     vtk_legacy,
+    vtk_pieces,
     vtk_xml,
     zarr_store,
 )

@@ -23,7 +23,8 @@ from vvgt_cli.volume.resample import resample
 from vvgt_cli.volume.types import Volume
 from vvgt_cli.volume.vtk_blocks import check_blocks
 from vvgt_cli.volume.vtk_legacy import GRIDS, Parser, is_legacy
-from vvgt_cli.volume.vtk_xml import extent_dims, is_xml, quiet_vtk, scan, stored_ratio
+from vvgt_cli.volume.vtk_xml import GRIDS as XML_GRIDS
+from vvgt_cli.volume.vtk_xml import extent_dims, quiet_vtk, scan, stored_ratio, xml_kind
 
 
 def read_xml_grid(path: Path, options: ReadOptions) -> Volume:
@@ -38,7 +39,7 @@ def read_xml_grid(path: Path, options: ReadOptions) -> Volume:
     found = scan(path)
     points, cells = found.points, found.cells
     if found.image:
-        dims = extent_dims(found, path)
+        dims = extent_dims(found.image, path)
         points, cells = count(tuple(dims)), count(tuple(max(d - 1, 1) for d in dims))
     need = 12 * points if found.kind == "StructuredGrid" else 0
     if found.kind == "UnstructuredGrid":
@@ -226,7 +227,7 @@ def _is_vtkhdf(head: bytes) -> bool:
 
 
 for _name, _suffixes, _sniff, _read in (
-    ("VTK grid", (".vtu", ".vtr", ".vts"), lambda head: is_xml(head, grid=True), read_xml_grid),
+    ("VTK grid", (".vtu", ".vtr", ".vts"), lambda head: xml_kind(head) in XML_GRIDS, read_xml_grid),
     ("legacy VTK grid", (), lambda head: is_legacy(head, grid=True), read_legacy_grid),
     ("VTKHDF", (".vtkhdf",), _is_vtkhdf, read_vtkhdf),
 ):
