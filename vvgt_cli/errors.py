@@ -43,14 +43,15 @@ class SeveralSteps(UsageError):
 
     Attributes:
         steps: how many there are.
+        times: of the steps, where the file says.
     """
 
-    def __init__(self, source: str, steps: int, what: str = "time steps") -> None:
+    def __init__(self, source: str, steps: int, what: str = "time steps", times: Sequence[float] = ()) -> None:
         super().__init__(
             f"{source}: {steps} {what}; expected one: try --time N (0 to {steps - 1}), or a number in the output of "
             "vvgt convert, as -o 'p_{:02d}.ply', which makes a series of them, or -o p.html, a page of them all"
         )
-        self.steps = steps
+        self.steps, self.times = steps, tuple(times)
 
 
 class SeveralComponents(UsageError):

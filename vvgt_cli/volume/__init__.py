@@ -15,6 +15,7 @@ from vvgt_cli.volume import (  # noqa: F401  each registers its formats, in this
     slc,
     slices,
     tiff,
+    vtk_family,
     vtk_grids,
     vtk_legacy,
     vtk_pieces,

@@ -20,8 +20,9 @@ from vvgt_cli.volume.components import ArrayInfo, choose_array, select_component
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.packed import SHARE
 from vvgt_cli.volume.readers import Reader, register, volume_name
+from vvgt_cli.volume.resample import kind_of
 from vvgt_cli.volume.stored import Slices, Stored, is_file_backed, read_block
-from vvgt_cli.volume.types import Volume
+from vvgt_cli.volume.types import Volume, triple
 from vvgt_cli.volume.vtk_xml import (
     GHOSTS,
     HIDDEN,
@@ -120,10 +121,7 @@ class _Pieces:
         self.hiding = any(found.find(GHOSTS, where) for where in HIDDEN) and not all(
             map(self._shown, range(len(self.names)))
         )
-        if not self.hiding:
-            return field.dtype
-        small = field.dtype.itemsize <= (4 if field.dtype.kind == "f" else 2)
-        return np.dtype(np.float32 if small else np.float64)
+        return kind_of(field.dtype) if self.hiding else field.dtype
 
     def _shown(self, k: int) -> bool:
         """Whether the header of piece ``k`` says that its ghost marks hide nothing: they only tell who else has it."""
@@ -193,7 +191,7 @@ class _Pieces:
                 f"place that {self.path.name} gives it"
             )
         values = image_values(found, row[0], grid, self.options, file)
-        return Volume(values, grid.spacing, name=file.name), first
+        return Volume(values, triple(grid.spacing), name=file.name), first
 
 
 register(

@@ -22,6 +22,7 @@ from vvgt_cli.volume.components import ArrayInfo, choose_array, select_component
 from vvgt_cli.volume.headers import unit_rows
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import Reader, register, volume_name
+from vvgt_cli.volume.resample import kind_of
 from vvgt_cli.volume.types import IDENTITY, Volume
 from vvgt_cli.volume.vtk_blocks import check_blocks
 
@@ -255,7 +256,7 @@ def image_values(found: Scan, info: ArrayInfo, grid: Grid, options: ReadOptions,
             continue
         marks = _stored(found, row[0], image_grid(found.image, where, path), path)[..., 0]
         hidden = marks.astype(np.uint8) & HIDDEN[where] != 0
-        component = without(component, hidden if where == info.where else _around(hidden, component.shape))
+        component = without(component, hidden if where == info.where else around(hidden, component.shape))
     return component
 
 
@@ -272,11 +273,10 @@ def without(values: np.ndarray, hidden: np.ndarray) -> np.ndarray:
     """``values`` with NaN where ``hidden``; themselves where nothing is."""
     if not hidden.any():
         return values
-    small = values.dtype.itemsize <= (4 if values.dtype.kind == "f" else 2)
-    return np.where(hidden, np.nan, values).astype(np.float32 if small else np.float64)
+    return np.where(hidden, np.nan, values).astype(kind_of(values.dtype))
 
 
-def _around(cells: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+def around(cells: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Points (nz, ny, nx) of which every cell around is in ``cells``, a mask."""
     for axis, n in enumerate(shape):
         if n > cells.shape[axis]:
@@ -332,7 +332,7 @@ def quiet_vtk() -> Iterator[Any]:
         if isinstance(output, bytes):  # with something in it that is no text
             output = output.decode("utf-8", "replace")
         texts = re.findall(r"\(0x[0-9a-f]+\): ([^\n]+)", output)
-        return texts[0].strip() if texts else ""
+        return re.sub(r" \(0x[0-9a-f]+\)", "", texts[0]).strip() if texts else ""
 
     try:
         yield message
