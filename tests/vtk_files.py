@@ -220,7 +220,7 @@ def openfoam(folder: Path) -> Path:
     for k in range(nz + 1):
         for j in range(ny + 1):
             for i in range(nx + 1):
-                for axis, (u, v) in enumerate(((j < ny and k < nz, 0), (i < nx and k < nz, 0), (i < nx and j < ny, 0))):
+                for axis, u in enumerate((j < ny and k < nz, i < nx and k < nz, i < nx and j < ny)):
                     if not u:
                         continue
                     at, n = (i, j, k)[axis], (nx, ny, nz)[axis]

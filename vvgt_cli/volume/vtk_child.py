@@ -1,6 +1,6 @@
 """VTK's readers in a process of their own: what brings one down is one line of error.
 
-The request is a line of JSON on standard input; the answer a line of JSON on standard output, with the values behind it.
+The request is a line of JSON on standard input, the answer one on standard output, with the values behind it.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from vvgt_cli.volume.blocks import check_memory, count
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.types import Volume
+from vvgt_cli.volume.vtk_index import INDEX
 
-INDEX = "index"  # in the place of a program: an index of VTK's own files
 SECONDS, A_BYTE, A_VOXEL = 60, 1e-6, 2e-5  # processor time: at least, of a byte of the files, of a sample
 START = f"from {__name__} import main; main()"
 KEYS = ("dims", "spacing", "array", "component", "time")

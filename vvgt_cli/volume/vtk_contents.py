@@ -12,9 +12,8 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.components import ArrayInfo
 from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.vtk_child import INDEX
 from vvgt_cli.volume.vtk_grids import arrays_of, check_xml_grid, values_of
-from vvgt_cli.volume.vtk_index import Index, files_of, read_index
+from vvgt_cli.volume.vtk_index import INDEX, Index, files_of, read_index
 from vvgt_cli.volume.vtk_leaves import Leaf, arrays_in, leaves_of
 from vvgt_cli.volume.vtk_programs import HDF5, PROGRAMS, read_program
 from vvgt_cli.volume.vtk_xml import GRIDS, INDEXES, quiet_vtk, xml_kind

@@ -10,8 +10,8 @@ from typing import Any
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import HEAD_BYTES, Reader, register
 from vvgt_cli.volume.types import Volume
-from vvgt_cli.volume.vtk_child import INDEX, contents_by_child, volume_by_child
-from vvgt_cli.volume.vtk_index import PIECES, Index, files_of, read_index
+from vvgt_cli.volume.vtk_child import contents_by_child, volume_by_child
+from vvgt_cli.volume.vtk_index import INDEX, PIECES, Index, files_of, read_index
 from vvgt_cli.volume.vtk_programs import PROGRAMS
 from vvgt_cli.volume.vtk_xml import INDEXES, xml_kind
 
