@@ -75,7 +75,7 @@ def multiblock(folder: Path, images: bool = False) -> Path:
     return write(vtkIOXML.vtkXMLMultiBlockDataWriter(), blocks, folder / "v.vtm")
 
 
-def amr(folder: Path, suffix: str) -> Path:
+def amr(folder: Path) -> Path:
     """Two levels: 4 x 4 x 4 cells of 1, and of those x < 2 again, as cells of 0.5 (their values 1 higher)."""
     found = vtkOverlappingAMR()
     found.Initialize([1, 1])
@@ -92,8 +92,32 @@ def amr(folder: Path, suffix: str) -> Path:
         grid.GetCellData().SetScalars(values)
         found.SetAMRBox(level, 0, vtkAMRBox((0, 0, 0), tuple(k - 1 for k in n)))
         found.SetDataSet(level, 0, grid)
-    writer = vtkHDFWriter() if suffix == "vtkhdf" else vtkIOXML.vtkXMLUniformGridAMRWriter()
-    return write(writer, found, folder / f"v.{suffix}")
+    return write(vtkIOXML.vtkXMLUniformGridAMRWriter(), found, folder / "v.vthb")
+
+
+def hdf_root(file: h5py.File, kind: str) -> h5py.Group:
+    root = file.create_group("VTKHDF")
+    root.attrs["Version"] = np.array([2, 0])
+    root.attrs.create("Type", kind.encode(), dtype=h5py.string_dtype("ascii", len(kind)))
+    return root
+
+
+def hdf_amr(folder: Path) -> Path:
+    """The levels of `amr`, by h5py: https://docs.vtk.org/en/latest/vtk_file_formats/vtkhdf_file_format."""
+    path = folder / "v.vtkhdf"
+    with h5py.File(path, "w") as file:
+        root = hdf_root(file, "OverlappingAMR")
+        root.attrs["Origin"] = np.array([10.0, 20.0, 30.0])
+        root.attrs.create("GridDescription", b"XYZ", dtype=h5py.string_dtype("ascii", 3))
+        for level, n, edge in ((0, (4, 4, 4), 1.0), (1, (4, 8, 8), 0.5)):
+            group = root.create_group(f"Level{level}")
+            group.attrs["Spacing"] = np.full(3, edge)
+            group["AMRBox"] = np.array([[0, n[0] - 1, 0, n[1] - 1, 0, n[2] - 1]])
+            axes = [o + edge * (np.arange(k) + 0.5) for o, k in zip((10, 20, 30), n, strict=True)]
+            group["CellData/cells"] = (ramp(*axes) + level).ravel()
+            group.create_group("PointData")
+            group.create_group("FieldData")
+    return path
 
 
 def collection(folder: Path, suffix: str = "vti") -> Path:
@@ -137,9 +161,7 @@ def hdf_steps(folder: Path) -> Path:
     """An image of two steps, by h5py: https://docs.vtk.org/en/latest/vtk_file_formats/vtkhdf_file_format."""
     path = folder / "v.vtkhdf"
     with h5py.File(path, "w") as file:
-        root = file.create_group("VTKHDF")
-        root.attrs["Version"] = np.array([2, 0])
-        root.attrs.create("Type", b"ImageData", dtype=h5py.string_dtype("ascii", len(b"ImageData")))
+        root = hdf_root(file, "ImageData")
         root.attrs["WholeExtent"] = np.array([0, 4, 0, 3, 0, 2])
         root.attrs["Origin"], root.attrs["Spacing"] = np.array([X[0], Y[0], Z[0]]), np.array([0.25, 0.5, 2.0])
         root.attrs["Direction"] = np.eye(3).ravel()

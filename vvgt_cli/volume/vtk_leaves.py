@@ -48,8 +48,8 @@ def leaves_of(found: Any, name: str = "") -> Iterator[Leaf]:
         return
     if not found.IsA("vtkCompositeDataSet"):
         return
-    amr = found.IsA("vtkUniformGridAMR") or found.IsA("vtkAMRDataObject")
     walk = found.NewIterator()
+    amr = hasattr(walk, "GetCurrentLevel")
     walk.InitTraversal()
     while not walk.IsDoneWithTraversal():
         data = walk.GetCurrentDataObject()
@@ -103,13 +103,19 @@ def volume_of(leaves: Sequence[Leaf], options: ReadOptions, source: str, name: s
     grid = lattice or _samples([leaf for leaf, _ in fields], options.dims, source)
     check_memory(count(grid.dims) * (kind_of(dtype).itemsize + 1), source)
     out = np.full(grid.dims[::-1], np.nan, kind_of(dtype))
-    for leaf, values in sorted(fields, key=lambda row: row[0].level):
+    for leaf, values in sorted(fields, key=_coarseness):
         _paint(leaf.data, values, info.where, grid, out)
     inside = ~np.isnan(out)
     if lattice is None:
         return sampled_volume(out, inside, dtype, grid, options.dims, source, name)
     whole = inside.all() and dtype.kind in "iu"
     return Volume(out.astype(dtype) if whole else out, grid.spacing, grid.origin, name=name)
+
+
+def _coarseness(row: tuple[Leaf, np.ndarray]) -> tuple[int, float]:
+    """Sorting key that puts coarse blocks first: by level, images of one level by their cells."""
+    data = row[0].data
+    return row[0].level, -float(np.prod(data.GetSpacing())) if data.IsA("vtkImageData") else 0.0
 
 
 def _fills(data: Any) -> bool:
