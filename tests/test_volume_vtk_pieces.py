@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import pyvista as pv
-from vtkmodules.vtkImagingCore import vtkRTAnalyticSource
 from vtkmodules.vtkIOXML import vtkXMLImageDataWriter
 
 from tests import vtk_files as files
@@ -20,15 +21,7 @@ PLAIN = {"DataMode": 2, "EncodeAppendedData": False, "CompressorType": 0}  # raw
 CODINGS = {"plain": PLAIN, "packed": {"DataMode": 2, "CompressorType": 1}, "ascii": {"DataMode": 0}}
 
 
-def wavelet(n: int = 12) -> vtkRTAnalyticSource:
-    """n x n x (n - 2) points from (3, -2, 5) on, which VTK's writer can ask for in parts."""
-    source = vtkRTAnalyticSource()
-    source.SetWholeExtent(3, n + 2, -2, n - 3, 5, n + 2)
-    source.SetCenter(n / 2, n / 2, n / 2)
-    return source
-
-
-def whole(folder: Path, source: vtkRTAnalyticSource) -> Path:
+def whole(folder: Path, source: Any) -> Path:
     source.UpdateWholeExtent()
     return files.write(vtkXMLImageDataWriter(), source.GetOutput(), folder / "v.vti", **PLAIN)
 
@@ -36,7 +29,7 @@ def whole(folder: Path, source: vtkRTAnalyticSource) -> Path:
 @pytest.mark.parametrize("coding", CODINGS)
 @pytest.mark.parametrize("ghosts", [0, 1])
 def test_pieces_are_the_image(tmp_path: Path, coding: str, ghosts: int) -> None:
-    source = wavelet()
+    source = files.wavelet()
     path = files.parallel_image(tmp_path, source, 8, GhostLevel=ghosts, **CODINGS[coding])
     image, found = (read_volume(str(p)) for p in (whole(tmp_path, source), path))
     assert found.data.dtype == image.data.dtype == np.float32
@@ -50,12 +43,10 @@ def test_pieces_are_the_image(tmp_path: Path, coding: str, ghosts: int) -> None:
     np.testing.assert_array_equal(stored.data[3:7, 2:9, 5:6], image.data[3:7, 2:9, 5:6])
 
 
-def by_hand(
-    folder: Path, cuts: tuple[int, ...] = (0, 2, 4), more: str = "", marks: dict[int, int] | None = None
-) -> Path:
+def by_hand(folder: Path, cuts: tuple[int, ...] = (0, 2, 4), marks: dict[int, int] | None = None) -> Path:
     """Pieces along x of the image of tests/vtk_files.py; ``marks`` are ghost marks of the first cell of a piece."""
     rows = ""
-    for k, (lo, hi) in enumerate(zip(cuts, cuts[1:], strict=False)):
+    for k, (lo, hi) in enumerate(itertools.pairwise(cuts)):
         part = files.image(lo, hi)
         part.extent = (lo, hi, 0, 3, 0, 2)
         part.origin = files.image().origin
@@ -67,7 +58,7 @@ def by_hand(
     path = folder / "v.pvti"
     path.write_text(
         '<VTKFile type="PImageData"><PImageData WholeExtent="0 4 0 3 0 2" GhostLevel="0" Origin="0.5 -3 10" '
-        f'Spacing="0.25 0.5 2" {more}><PPointData><PDataArray type="Float64" Name="ramp"/></PPointData><PCellData>'
+        f'Spacing="0.25 0.5 2"><PPointData><PDataArray type="Float64" Name="ramp"/></PPointData><PCellData>'
         f'<PDataArray type="Float64" Name="cells"/>{ghosts}</PCellData>{rows}</PImageData></VTKFile>'
     )
     return path
@@ -188,7 +179,7 @@ def test_very_many_pieces_are_read_one_by_one(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("more", [(), ("--blocks", "16"), ("--blocks", "32", "--workers", "2")])
 def test_the_same_bytes_as_of_one_file(tmp_path: Path, vvgt, more: tuple[str, ...]) -> None:
-    source = wavelet(24)
+    source = files.wavelet(24)
     whole(tmp_path, source)
     files.parallel_image(tmp_path, source, 64, **PLAIN)
     made = []

@@ -15,6 +15,7 @@ import numpy as np
 import pyvista as pv
 from vtkmodules import vtkIOParallelXML, vtkIOXML
 from vtkmodules.vtkCommonDataModel import vtkAMRBox, vtkOverlappingAMR, vtkUniformGrid
+from vtkmodules.vtkImagingCore import vtkRTAnalyticSource
 from vtkmodules.vtkIOHDF import vtkHDFWriter
 from vtkmodules.vtkIOIOSS import vtkIOSSWriter
 from vtkmodules.vtkIOXdmf2 import vtkXdmfWriter
@@ -329,6 +330,14 @@ def cgns(folder: Path) -> Path:
             node(found, "GridLocation", "GridLocation_t", place)
             node(found, {"Nodes": "ramp", "Cells": "cells"}[name], "DataArray_t", values)
     return path
+
+
+def wavelet(n: int = 12) -> vtkRTAnalyticSource:
+    """n x n x (n - 2) points from (3, -2, 5) on, which VTK's writer can ask for in parts."""
+    source = vtkRTAnalyticSource()
+    source.SetWholeExtent(3, n + 2, -2, n - 3, 5, n + 2)
+    source.SetCenter(n / 2, n / 2, n / 2)
+    return source
 
 
 def parallel_image(folder: Path, source: Any, count: int, **settings: Any) -> Path:

@@ -310,14 +310,15 @@ def steps_of(source: SourceRequest) -> list[Step]:
         return [Step(file.name, str(file), source.read) for file in files]
     volume = str(files[0]) if files else source.path
     name = Path(volume).name
-    count = _count(volume, source.read)
-    if count == 1:
+    times = _times(volume, source.read)
+    if len(times) == 1:
         return [Step(name, volume, source.read)]
-    return [Step(f"{name} time {k}", volume, replace(source.read, time=k)) for k in range(count)]
+    told = ["" if time is None else f" ({time:g})" for time in times]
+    return [Step(f"{name} time {k}{t}", volume, replace(source.read, time=k)) for k, t in enumerate(told)]
 
 
-def _count(volume: str, read: ReadOptions) -> int:
-    """Time steps of a file, whatever its components are."""
+def _times(volume: str, read: ReadOptions) -> Sequence[float | None]:
+    """Time of each step of a file (None: it does not say), whatever its components are."""
     from vvgt_cli.volume.registry import time_steps
 
     if read.component in (COLOR, ALL):

@@ -7,6 +7,7 @@ import os
 import re
 import struct
 import zlib
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -96,8 +97,8 @@ def _from_pipe(kept: Path, path: Path, source: str, options: ReadOptions) -> Vol
         raise
 
 
-def time_steps(source: str, options: ReadOptions) -> int:
-    """How many time steps a source has, where ``options`` choose none.
+def time_steps(source: str, options: ReadOptions) -> Sequence[float | None]:
+    """The time of each step that a source has, where ``options`` choose none; None where it does not say.
 
     Raises:
         DataError, UsageError: as `read_volume`.
@@ -105,8 +106,8 @@ def time_steps(source: str, options: ReadOptions) -> int:
     try:
         read_volume(source, options)
     except SeveralSteps as error:
-        return error.steps
-    return 1
+        return error.times or [None] * error.steps
+    return [None]
 
 
 def contents(source: str, options: ReadOptions) -> dict[str, Any]:
@@ -226,7 +227,7 @@ def _find(path: Path, head: bytes, options: ReadOptions) -> Reader:
         if zipped and not found.unzips:
             raise DataError(f"{path}: a gzip-compressed {found.name} file; unpack it first (gunzip)")
         return found
-    if options.dims and not (named is not None and named.by_name and named.resamples):
+    if options.dims and (options.dtype or named is None or not named.resamples):
         return raw.READER
     if head.startswith((b"ply\n", b"ply\r\n")):
         raise DataError(

@@ -12,6 +12,7 @@ import signal
 import subprocess
 import sys
 import warnings
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any, cast
@@ -54,13 +55,25 @@ def contents_by_child(program: str, path: Path, options: ReadOptions) -> dict[st
 
 
 def _asked(program: str, path: Path, options: ReadOptions, task: str) -> tuple[dict[str, Any], np.ndarray]:
-    free = free_memory()
     samples = count(options.dims) if options.dims else 512**3
     seconds = math.ceil(SECONDS + A_BYTE * _bytes_near(path) + A_VOXEL * samples)
     request = {
-        "program": program, "path": str(path), "task": task, "free": free, "seconds": seconds,
+        "program": program, "path": str(path), "task": task, "free": free_memory(), "seconds": seconds,
         "options": {key: getattr(options, key) for key in KEYS},
     }  # fmt: skip
+    found, status = run(request)
+    if found is None:
+        raise _ended(path, program, status, seconds)
+    facts, values = found
+    for line in facts.pop("notes", ()):
+        warnings.warn(line, stacklevel=2)
+    if "error" in facts:
+        raise _error(facts)
+    return facts, values
+
+
+def run(request: dict[str, Any]) -> tuple[tuple[dict[str, Any], np.ndarray] | None, int]:
+    """The answer of a process to a request, None where it gives none, and its exit status."""
     paths = os.pathsep.join(filter(None, [str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")]))
     with subprocess.Popen(
         [sys.executable, "-c", START], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
@@ -68,23 +81,14 @@ def _asked(program: str, path: Path, options: ReadOptions, task: str) -> tuple[d
     ) as child:  # fmt: skip
         to, back = cast(IO[bytes], child.stdin), cast(IO[bytes], child.stdout)
         try:
-            try:
+            with suppress(BrokenPipeError):  # it has ended: what it left says how
                 to.write(json.dumps(request).encode() + b"\n")
                 to.close()
-            except BrokenPipeError:
-                pass
-            answer = _answer(back)
+            found = received(back)
         except BaseException:
             child.kill()
             raise
-    if answer is None:
-        raise _ended(path, program, child.returncode, seconds)
-    facts, values = answer
-    for line in facts.pop("notes", ()):
-        warnings.warn(line, stacklevel=2)
-    if "error" in facts:
-        raise _error(facts)
-    return facts, values
+    return found, child.returncode
 
 
 def _bytes_near(path: Path) -> int:
@@ -97,7 +101,7 @@ def _bytes_near(path: Path) -> int:
     return total
 
 
-def _answer(stream: IO[bytes]) -> tuple[dict[str, Any], np.ndarray] | None:
+def received(stream: IO[bytes]) -> tuple[dict[str, Any], np.ndarray] | None:
     """Facts and values, None where they end early."""
     line = stream.readline(LARGEST)
     if not line.endswith(b"\n"):
@@ -198,6 +202,13 @@ def bound(free: int | None, seconds: int) -> None:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
+def send(stream: IO[bytes], facts: dict[str, Any], values: np.ndarray | None) -> None:
+    """Write an answer, for `received`."""
+    stream.write(json.dumps(facts).encode() + b"\n")
+    if values is not None:
+        stream.write(values.reshape(-1).view(np.uint8).data)
+
+
 def main() -> None:
     """Answer one request; libraries that print do so elsewhere."""
     with os.fdopen(os.dup(1), "wb") as stream:
@@ -206,8 +217,5 @@ def main() -> None:
         import vtkmodules.vtkCommonCore  # noqa: F401  its libraries count as there already
 
         bound(request["free"], request["seconds"])
-        facts, values = answer(request)
-        stream.write(json.dumps(facts).encode() + b"\n")
-        if values is not None:
-            stream.write(values.reshape(-1).view(np.uint8).data)
+        send(stream, *answer(request))
     os._exit(0)  # whatever a damaged file left behind is not taken apart

@@ -101,6 +101,8 @@ class _Pieces:
             self.image = {**found.image, "Direction": opened.image["Direction"]}  # VTK's writer leaves it out
         extent_dims(self.image, path)
         self.dtype = self._dtype(found)
+        if self.hiding and info.where == "point":  # one is hidden where all pieces that have it say so
+            self._hi, self._overlap = boxes[..., 1] - self._first + 1, True
         z, y, x = (self._hi - self._lo).max(axis=0)[::-1].tolist()
         self.chunks = (min(z, DEPTH), y, x)
 

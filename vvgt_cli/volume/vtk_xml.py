@@ -318,7 +318,7 @@ def _mapped(
 
 @contextmanager
 def quiet_vtk() -> Iterator[Any]:
-    """Keep VTK's messages from the terminal; yields a function that returns them as one line."""
+    """Keep VTK's messages from the terminal; yields a function that returns the first of them, or of the errors alone."""
     from vtkmodules.vtkCommonCore import vtkLogger, vtkOutputWindow, vtkStringOutputWindow
 
     window, before = vtkStringOutputWindow(), vtkOutputWindow.GetInstance()
@@ -326,12 +326,13 @@ def quiet_vtk() -> Iterator[Any]:
     vtkOutputWindow.SetInstance(window)
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
 
-    def message() -> str:
+    def message(errors: bool = False) -> str:
         # "ERROR: In file, line n\nclass (0x..): text"
         output = window.GetOutput() or ""
         if isinstance(output, bytes):  # with something in it that is no text
             output = output.decode("utf-8", "replace")
-        texts = re.findall(r"\(0x[0-9a-f]+\): ([^\n]+)", output)
+        head = r"ERROR: In [^\n]*\n[^\n]*" if errors else ""
+        texts = re.findall(head + r"\((?:0x[0-9a-f]+|nullptr)\): ([^\n]+)", output)
         return re.sub(r" \(0x[0-9a-f]+\)", "", texts[0]).strip() if texts else ""
 
     try:
