@@ -60,13 +60,7 @@ def seeds_of(make: Make, changed: tuple[str, ...], **options: Any) -> list[Seed]
             np.asarray(volume.data[z])
 
     return [
-        Seed(
-            name,
-            content[name],
-            lambda path, name=name: read(path, name),
-            {k: v for k, v in content.items() if k != name},
-        )
-        for name in changed
+        Seed(name, content[name], lambda path, name=name: read(path, name), content | {name: b""}) for name in changed
     ]
 
 

@@ -24,10 +24,11 @@ from vvgt_cli.resources import free_memory
 from vvgt_cli.volume.blocks import check_memory, count
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
+from vvgt_cli.volume.resample import MOST
 from vvgt_cli.volume.types import Volume
 from vvgt_cli.volume.vtk_index import INDEX
 
-SECONDS, A_BYTE, A_VOXEL = 60, 1e-6, 2e-5  # processor time: at least, of a byte of the files, of a sample
+SECONDS, A_BYTE, A_VOXEL = 60, 1e-6, 4e-6  # processor time: at least, of a byte of the files, of a sample
 START = f"from {__name__} import main; main()"
 KEYS = ("dims", "spacing", "array", "component", "time")
 LARGEST = 1 << 20  # bytes of the line of an answer
@@ -55,8 +56,9 @@ def contents_by_child(program: str, path: Path, options: ReadOptions) -> dict[st
 
 
 def _asked(program: str, path: Path, options: ReadOptions, task: str) -> tuple[dict[str, Any], np.ndarray]:
-    samples = count(options.dims) if options.dims else 512**3
-    seconds = math.ceil(SECONDS + A_BYTE * _bytes_near(path) + A_VOXEL * samples)
+    size = _bytes_near(path)
+    samples = count(options.dims) if options.dims else min(40 * size, MOST**3)
+    seconds = math.ceil(SECONDS + A_BYTE * size + A_VOXEL * samples)
     request = {
         "program": program, "path": str(path), "task": task, "free": free_memory(), "seconds": seconds,
         "options": {key: getattr(options, key) for key in KEYS},

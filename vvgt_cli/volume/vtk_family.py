@@ -69,7 +69,7 @@ for _program in PROGRAMS.values():
     register(
         Reader(
             _program.name, _program.suffixes, _program.sniff, partial(volume_by_child, _program.name),
-            named_arrays=True, times=True, resamples=True, by_name=True, within=_program.within, empty=_program.empty,
-            contents=partial(_contents, _program.name),
+            named_arrays=True, times=True, resamples=True, by_name=_program.by_name, empty=_program.by_name,
+            within=_program.within, contents=partial(_contents, _program.name),
         )
     )  # fmt: skip

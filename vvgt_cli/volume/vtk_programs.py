@@ -34,7 +34,7 @@ class Program:
         sniff: as `Reader.sniff`.
         reader: what makes VTK's reader of a file, all arrays enabled.
         within: formats that its files may be taken for by their content.
-        empty: a file of it may be empty.
+        by_name: its files have no beginning of their own: the name decides. They may be empty.
     """
 
     name: str
@@ -42,7 +42,7 @@ class Program:
     sniff: Callable[[bytes], bool]
     reader: Callable[[Path], Any]
     within: tuple[str, ...] = ()
-    empty: bool = False
+    by_name: bool = False
 
 
 def read_program(program: Program, path: Path, time: int | None) -> tuple[list[Leaf], list[float]]:
@@ -59,7 +59,7 @@ def read_program(program: Program, path: Path, time: int | None) -> tuple[list[L
         reader.UpdateInformation()
         facts = reader.GetOutputInformation(0)
         times = list(facts.Get(vtkStreamingDemandDrivenPipeline.TIME_STEPS()) or ())
-        told = message()
+        told = message(errors=True)
         chosen = chosen_time(times, time, str(path))
         if chosen is None:
             reader.Update()
@@ -67,11 +67,10 @@ def read_program(program: Program, path: Path, time: int | None) -> tuple[list[L
             reader.UpdateTimeStep(chosen)
         found = reader.GetOutputDataObject(0)
         leaves = [leaf for leaf in leaves_of(found) if leaf.data.GetNumberOfPoints() > 0]
-        error = message() or told
-    if not leaves or (error and reader.GetErrorCode()):
-        raise DataError(
-            f"{path}: VTK finds no dataset in it ({error or 'no message'}); is the {program.name} file whole?"
-        )
+        error = message(errors=True) or told
+    if error or not leaves:
+        fault = f"cannot read it ({error})" if leaves else f"finds no dataset in it ({error or 'no message'})"
+        raise DataError(f"{path}: VTK {fault}; is the {program.name} file whole?")
     return leaves, times
 
 
@@ -134,10 +133,12 @@ def _exodus(path: Path) -> Any:
 def _openfoam(path: Path) -> Any:
     from vtkmodules.vtkIOParallel import vtkPOpenFOAMReader
 
+    whole, parts = (path.parent / "constant" / "polyMesh").is_dir(), (path.parent / "processor0").is_dir()
+    if not whole and not parts:
+        raise DataError(f"{path}: no case beside it; expected a folder with constant/polyMesh or processor0 in it")
     reader = vtkPOpenFOAMReader()
     reader.SetFileName(str(path))
-    parts = not (path.parent / "constant" / "polyMesh").exists() and (path.parent / "processor0").is_dir()
-    reader.SetCaseType(0 if parts else 1)  # decomposed, or reconstructed
+    reader.SetCaseType(1 if whole else 0)  # reconstructed, or decomposed
     reader.CreateCellToPointOff()  # values as they are stored
     reader.UpdateInformation()
     reader.EnableAllCellArrays()
@@ -283,7 +284,7 @@ PROGRAMS = {
             _exodus,
             within=("NetCDF", "HDF5"),
         ),
-        Program("OpenFOAM", (".foam",), lambda head: False, _openfoam, empty=True),
+        Program("OpenFOAM", (".foam",), lambda head: False, _openfoam, by_name=True),
         Program("XDMF", (".xdmf", ".xmf", ".xdmf2", ".xdmf3"), _is_xdmf, _xdmf),
         Program(
             "CGNS",
@@ -294,6 +295,6 @@ PROGRAMS = {
             _cgns,
             within=("HDF5",),
         ),
-        Program("Plot3D", (".p3d", ".xyz"), lambda head: False, _plot3d),
+        Program("Plot3D", (".p3d", ".xyz"), lambda head: False, _plot3d, by_name=True),
     )
 }

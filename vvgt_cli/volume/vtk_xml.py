@@ -318,7 +318,7 @@ def _mapped(
 
 @contextmanager
 def quiet_vtk() -> Iterator[Any]:
-    """Keep VTK's messages from the terminal; yields a function that returns the first of them, or of the errors alone."""
+    """Keep VTK's messages from the terminal; yields a function that returns the first, or the first error."""
     from vtkmodules.vtkCommonCore import vtkLogger, vtkOutputWindow, vtkStringOutputWindow
 
     window, before = vtkStringOutputWindow(), vtkOutputWindow.GetInstance()
