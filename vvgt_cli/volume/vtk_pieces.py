@@ -21,7 +21,7 @@ from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.packed import SHARE
 from vvgt_cli.volume.readers import Reader, register, volume_name
 from vvgt_cli.volume.resample import kind_of
-from vvgt_cli.volume.stored import Slices, Stored, is_file_backed, read_block
+from vvgt_cli.volume.stored import Slices, Stored, is_file_backed, put_block, read_block
 from vvgt_cli.volume.types import Volume, triple
 from vvgt_cli.volume.vtk_xml import (
     GHOSTS,
@@ -38,6 +38,7 @@ from vvgt_cli.volume.vtk_xml import (
 HELD = 256 << 20  # bytes of unpacked pieces that a process keeps
 OPEN = 64  # mapped pieces that a process keeps open
 DEPTH = 64  # slices that are read at once where the volume is walked through
+FEW = 4096  # pieces of which every pair is compared
 CLOSE = 1e-3  # spacings that a piece may lie off
 
 
@@ -91,8 +92,7 @@ class _Pieces:
         self._hi = boxes[..., 1] - self._first
         # a point on the face between two pieces is taken from one of them
         self._hi += (boxes[..., 1] == whole[:, 1]) if info.where == "point" else (whole[:, 0] == whole[:, 1])
-        total, n = sum(map(math.prod, (self._hi - self._lo).tolist())), (whole[:, 1] - whole[:, 0]).tolist()
-        self._overlap = total != math.prod(k + 1 if info.where == "point" else max(k, 1) for k in n)
+        self._overlap: bool = _overlapping(self._lo, self._hi)
         self._kept: OrderedDict[int, tuple[Volume, np.ndarray]] = OrderedDict()
         self._lock = Lock()
         self.image = found.image
@@ -134,21 +134,23 @@ class _Pieces:
         """The values of a box, (z, y, x)."""
         lo = np.array([s.start for s in slices[::-1]])
         hi = np.array([s.stop for s in slices[::-1]])
-        out = np.full((hi - lo)[::-1], np.nan if self.dtype.kind == "f" else 0, self.dtype)
+        out = np.full((hi - lo)[::-1], np.nan, self.dtype) if self.hiding else np.empty((hi - lo)[::-1], self.dtype)
         begin, end = np.maximum(self._lo, lo), np.minimum(self._hi, hi)
         met = np.flatnonzero((begin < end).all(axis=1))
         self._check_whole(begin[met] - lo, end[met] - lo, out.shape)
         for k in met.tolist():
             volume, first = self._piece(k)
             target = out[tuple(slice(a, b) for a, b in zip((begin[k] - lo)[::-1], (end[k] - lo)[::-1], strict=True))]
-            part = read_block(volume, begin[k] - first, end[k] - first)
-            np.copyto(target, part, where=~np.isnan(part) if self.hiding else True, casting="unsafe")
+            if self.hiding:
+                part = read_block(volume, begin[k] - first, end[k] - first)
+                np.copyto(target, part, where=~np.isnan(part))
+            else:
+                put_block(volume.data, begin[k] - first, target)
         return out
 
     def _check_whole(self, begin: np.ndarray, end: np.ndarray, shape: tuple[int, ...]) -> None:
         """Refuse a box that pieces do not cover."""
-        sizes = [math.prod(size) for size in (end - begin).tolist()]
-        if sum(sizes) == math.prod(shape) and not self._overlap:
+        if not self._overlap and sum(map(math.prod, (end - begin).tolist())) == math.prod(shape):
             return
         missing = np.ones(shape, bool)
         for a, b in zip(begin[:, ::-1], end[:, ::-1], strict=True):
@@ -194,6 +196,13 @@ class _Pieces:
             )
         values = image_values(found, row[0], grid, self.options, file)
         return Volume(values, triple(grid.spacing), name=file.name), first
+
+
+def _overlapping(lo: np.ndarray, hi: np.ndarray) -> bool:
+    """Whether boxes (n, 3) from ``lo`` to ``hi`` overlap; of more than `FEW` nobody looks, and they count as if."""
+    if len(lo) > FEW:
+        return True
+    return any(((lo[k + 1 :] < hi[k]) & (lo[k] < hi[k + 1 :])).all(axis=1).any() for k in range(len(lo)))
 
 
 register(

@@ -262,10 +262,8 @@ def _vtkhdf(path: Path) -> Any:
 
 
 def _is_xdmf(head: bytes) -> bool:
-    return (
-        re.match(rb"\s*(?:<\?xml[^>]*>\s*)?(?:<!--.*?-->\s*|<!DOCTYPE[^>]*>\s*)*<Xdmf[\s>]", head, re.DOTALL)
-        is not None
-    )
+    start = rb"\s*(?:<\?xml[^>]*>\s*)?(?:<!--.*?-->\s*)*(?:<Xdmf[\s>]|<!DOCTYPE\s+Xdmf\s)"
+    return re.match(start, head, re.DOTALL) is not None
 
 
 def _is_ensight(head: bytes) -> bool:
