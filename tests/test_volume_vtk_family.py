@@ -164,6 +164,25 @@ def test_contents_say_what_there_is_and_how_to_choose_it(tmp_path: Path) -> None
     assert [(row["type"], row["cells"]) for row in found["blocks"]] == [("UnstructuredGrid", 12)] * 2
 
 
+def test_info_shows_steps_and_then_the_step_that_is_chosen(tmp_path: Path, vvgt) -> None:
+    path = str(IMAGE_STEPS["pvd"](tmp_path))
+    listed = json.loads(vvgt("info", path, "--json").out)
+    assert [row["option"] for row in listed["steps"]] == ["--time 0", "--time 1"]
+    assert "2 time steps" in listed["choice"]
+    one = json.loads(vvgt("info", path, "--json", "--time", "1", "--array", "ramp").out)
+    assert one["dims"] == [5, 4, 3]
+    assert one["range"] == [float(ramp(X, Y, Z).min()) + files.STEP, float(ramp(X, Y, Z).max()) + files.STEP]
+
+
+def test_a_series_is_converted_with_its_times(tmp_path: Path, vvgt) -> None:
+    path = str(IMAGE_STEPS["vtk.series"](tmp_path))
+    how = ("--max-gaussians", "50", "--size", "64", "--steps", "0")
+    told = vvgt("convert", path, "--array", "ramp", "-o", str(tmp_path / "p_{:02d}.ply"), *how).err
+    assert "v.vtk.series time 0 (0.5): frame 1 of 2" in told
+    assert "v.vtk.series time 1 (1.25): frame 2 of 2" in told
+    assert {"p_00.ply", "p_01.ply"} <= {file.name for file in tmp_path.iterdir()}
+
+
 def index(folder: Path, *names: str) -> Path:
     rows = "".join(f'<DataSet index="{k}" file="{name}"/>' for k, name in enumerate(names))
     text = f'<VTKFile type="vtkMultiBlockDataSet"><vtkMultiBlockDataSet>{rows}</vtkMultiBlockDataSet></VTKFile>'

@@ -15,6 +15,7 @@ from vtkmodules.vtkIOXML import vtkXMLImageDataWriter
 from tests import vtk_files as files
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume import ReadOptions, read_volume, vtk_pieces
+from vvgt_cli.volume.registry import contents
 from vvgt_cli.volume.stored import Stored, is_file_backed
 
 PLAIN = {"DataMode": 2, "EncodeAppendedData": False, "CompressorType": 0}  # raw, appended
@@ -62,6 +63,19 @@ def by_hand(folder: Path, cuts: tuple[int, ...] = (0, 2, 4), marks: dict[int, in
         f'<PDataArray type="Float64" Name="cells"/>{ghosts}</PCellData>{rows}</PImageData></VTKFile>'
     )
     return path
+
+
+def test_contents_tell_arrays_ranges_and_pieces(tmp_path: Path, vvgt) -> None:
+    found = contents(str(by_hand(tmp_path)), ReadOptions())
+    values = read_volume(str(tmp_path / "v.pvti"), ReadOptions(array="ramp")).data
+    assert found["blocks"] == [{"pieces": 2, "first": "p0.vti"}]
+    assert [(row["array"], row["option"]) for row in found["arrays"]] == [
+        ("ramp", "--array ramp"), ("cells", "--array cells"),
+    ]  # fmt: skip
+    assert found["arrays"][0]["range"] == [values.min(), values.max()]
+    told = vvgt("info", str(tmp_path / "v.pvti")).out.decode()
+    assert "several arrays" in told
+    assert "--array cells" in told
 
 
 def test_points_and_cells_lie_where_they_do_in_the_whole(tmp_path: Path) -> None:

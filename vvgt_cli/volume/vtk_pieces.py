@@ -39,6 +39,7 @@ HELD = 256 << 20  # bytes of unpacked pieces that a process keeps
 OPEN = 64  # mapped pieces that a process keeps open
 DEPTH = 64  # slices that are read at once where the volume is walked through
 FEW = 4096  # pieces of which every pair is compared
+LISTED = 1000  # pieces whose headers are read for the ranges of arrays
 CLOSE = 1e-3  # spacings that a piece may lie off
 
 
@@ -205,6 +206,34 @@ def _overlapping(lo: np.ndarray, hi: np.ndarray) -> bool:
     return any(((lo[k + 1 :] < hi[k]) & (lo[k] < hi[k + 1 :])).all(axis=1).any() for k in range(len(lo)))
 
 
+def contents_of(path: Path, options: ReadOptions) -> dict[str, Any]:
+    """The arrays of a ``.pvti``, a row each with the range that the headers of its pieces tell, and its pieces.
+
+    Raises:
+        DataError: damaged.
+    """
+    index = scan(path)
+    pieces = [scan(data_file(path, name)) for name, _ in index.sources[:LISTED]]
+    rows = []
+    for info in index.infos:
+        told = [found[1] for piece in pieces if (found := piece.find(info.name, info.where))]
+        row: dict[str, Any] = {
+            "array": info.name,
+            "data": info.where,
+            "dtype": info.dtype,
+            "components": info.components,
+        }
+        if len(told) == len(index.sources) and all({"RangeMin", "RangeMax"} <= set(a) for a in told):
+            ends = [float(a[key]) for a in told for key in ("RangeMin", "RangeMax")]
+            row["range"] = [min(ends), max(ends)]
+        rows.append({**row, "option": f"--array {info.name}"})
+    blocks = [{"pieces": len(index.sources), "first": index.sources[0][0]}] if index.sources else []
+    return {"arrays": rows, "blocks": blocks}
+
+
 register(
-    Reader("parallel VTK image", (".pvti",), lambda head: xml_kind(head) == "PImageData", read_pvti, named_arrays=True)
-)
+    Reader(
+        "parallel VTK image", (".pvti",), lambda head: xml_kind(head) == "PImageData", read_pvti, named_arrays=True,
+        contents=contents_of,
+    )
+)  # fmt: skip
