@@ -123,11 +123,23 @@ def test_the_finest_level_wins_where_there_is_one(tmp_path: Path, make: Make) ->
     np.testing.assert_allclose(volume.data[:, :, 4:], ramp(*coarse))
 
 
+def test_a_decomposed_case(tmp_path: Path) -> None:
+    path = files.openfoam(tmp_path)
+    (tmp_path / "processor0").mkdir()
+    for name in ("constant", *map(str, files.TIMES)):
+        (tmp_path / name).rename(tmp_path / "processor0" / name)
+    check_samples(path, 1, points=False)
+    (tmp_path / "processor0").rename(tmp_path / "elsewhere")
+    with pytest.raises(DataError, match="no case beside it"):
+        read_volume(str(path))
+
+
 def test_plot3d_with_functions(tmp_path: Path) -> None:
     path = files.plot3d(tmp_path)
-    volume = read_volume(str(path), ReadOptions(dims=(8, 6, 4)))
-    check_place(volume)
-    np.testing.assert_allclose(volume.data, ramp(*axes_of(volume)), rtol=1e-6)
+    for name in ("v.p3d", "v.xyz"):
+        volume = read_volume(str(tmp_path / name), ReadOptions(dims=(8, 6, 4)))
+        check_place(volume)
+        np.testing.assert_allclose(volume.data, ramp(*axes_of(volume)), rtol=1e-6)
     described = json.loads(path.read_text())
     path.write_text(json.dumps({**described, "filenames": [{"xyz": "v.xyz"}]}))
     with pytest.raises(DataError, match="coordinates alone; expected values beside them"):
