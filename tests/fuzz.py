@@ -41,7 +41,7 @@ class Seed:
     """A file to change.
 
     Attributes:
-        name: of the file.
+        name: of the file, with folders.
         data: its content.
         read: takes the path; returns whatever, having looked at some of the values.
         beside: other files of the folder, which stay as they are.
@@ -126,10 +126,10 @@ CHANGES = (_flip, _byte, _number, _number, _float, _word, _word, _word, _delete,
 
 def limits() -> None:
     """Bound this process: memory that may be added, and a signal for inputs that take too long."""
-    from vvgt_cli.volume import blocks
+    from vvgt_cli.volume import blocks, vtk_child, vtk_pieces
     from vvgt_cli.volume.openvdb import tree
 
-    blocks.free_memory = tree.free_memory = lambda: FREE  # type: ignore[assignment]
+    blocks.free_memory = tree.free_memory = vtk_child.free_memory = vtk_pieces.free_memory = lambda: FREE  # type: ignore[assignment]
     pages = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (pages + MEMORY, pages + MEMORY))
 
@@ -230,21 +230,24 @@ def _keep(name: str, seeds: list[Seed], i: int, save: Path | None) -> None:
     if save is not None:
         save.mkdir(parents=True, exist_ok=True)
         number, data = changed(name, seeds, i)
-        (save / f"{name.replace(' ', '_')}-{i}-{seeds[number].name}").write_bytes(seeds[number].pack(data))
+        (save / f"{name.replace(' ', '_')}-{i}-{Path(seeds[number].name).name}").write_bytes(seeds[number].pack(data))
 
 
 def _lay(folder: Path, seed: Seed, data: bytes) -> Path:
     if not folder.exists():
         folder.mkdir()
         for name, content in seed.beside.items():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / name).write_bytes(content)
     path = folder / seed.name
+    path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(seed.pack(data))
     return path
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the readers that are asked for; 1 if anything was found."""
+    import fuzz_vtk
     from fuzz_seeds import readers
 
     parser = argparse.ArgumentParser()
@@ -253,7 +256,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--reader", action="append", help="by name; all without")
     parser.add_argument("--save", type=Path, help="folder for inputs that show something")
     options = parser.parse_args(arguments)
-    table = readers()
+    table = readers() | fuzz_vtk.readers()
     names = options.reader or list(table)
     status = 0
     for name in names:

@@ -13,7 +13,7 @@ from typing import Any
 from vvgt_cli.cameras.files import read_cameras
 from vvgt_cli.conversion.gaussian_files import STDIN
 from vvgt_cli.conversion.index import is_index, read_index
-from vvgt_cli.errors import DataError
+from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import seekable
 from vvgt_cli.gaussians import describe, read_ply
 from vvgt_cli.gaussians.formats import format_of, read_splats
@@ -22,7 +22,9 @@ from vvgt_cli.look.labels import LabelTable
 from vvgt_cli.look.readers import SUFFIXES
 from vvgt_cli.volume import ReadOptions
 from vvgt_cli.volume.packed import Packed
+from vvgt_cli.volume.registry import contents
 from vvgt_cli.volume.space import axis_facts
+from vvgt_cli.volume.vtk_family import is_index as is_vtk_index
 
 _PLY = (b"ply\n", b"ply\r")
 _HEAD = 65536  # bytes that tell a view set from a transfer function
@@ -54,6 +56,8 @@ def inspect(file: str, read: ReadOptions) -> dict[str, Any]:
         return {"kind": f"index of {index['kind']}", "name": name.name, **about, "clouds": index["files"]}
     if is_table(name):
         return _table(file)
+    if is_vtk_index(head) or name.suffix.lower() == ".p3d":  # JSON of ParaView's
+        return _volume(file, read)
     if name.suffix.lower() in SUFFIXES or head.lstrip()[:1] in (b"{", b"["):
         if b'"frames"' in head:
             return _views(name)
@@ -111,7 +115,13 @@ def _volume(file: str, read: ReadOptions) -> dict[str, Any]:
     from vvgt_cli.volume import statistics
     from vvgt_cli.volume.label_maps import recognised
 
-    content = open_parts(file, replace(read, packed=True))
+    listed = contents(file, read)
+    try:
+        content = open_parts(file, replace(read, packed=True))
+    except UsageError as error:  # a choice that is missing: the lists say how to make it
+        if not listed or (read.array, read.component, read.time) != (None, None, None):
+            raise
+        return {"kind": "several volumes", "name": Path(file).name, **listed, "choice": str(error)}
     volume = content.volumes[0]
     kinds: dict[str, Any] = {}
     if content.color:
@@ -149,4 +159,5 @@ def _volume(file: str, read: ReadOptions) -> dict[str, Any]:
         "nan": numbers.nan_count,
         "inf": numbers.inf_count,
         "unit_distance": {name: unit_distance(name, volume, None)[0] for name in ("paraview", "mean-spacing")},
+        **listed,
     }

@@ -43,6 +43,12 @@ class Step:
     read: ReadOptions
     time: tuple[float, str] | None = None
 
+    def told(self) -> str:
+        """Name and time."""
+        return (
+            self.name if self.time is None else f"{self.name} ({' '.join([f'{self.time[0]:g}', self.time[1]]).strip()})"
+        )
+
     def facts(self) -> dict[str, Any]:
         """Its time as an index has it."""
         if self.time is None:

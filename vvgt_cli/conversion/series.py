@@ -72,7 +72,7 @@ def _frames(
         if series.dark[k]:
             console.say(f"{step.name}: nothing of it is visible; it gets no file")
             continue
-        console.say(f"{step.name}: frame {k + 1} of {len(series.steps)}, to {names[k][0]}")
+        console.say(f"{step.told()}: frame {k + 1} of {len(series.steps)}, to {names[k][0]}")
         report = convert(_frame(request, series.source_of(step), names[k]), console)
         if interrupted(report):
             raise KeyboardInterrupt  # the frame is there, but not what it would be: it is made again

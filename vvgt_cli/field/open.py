@@ -40,6 +40,7 @@ HELD = 1 << 30  # bytes of values: more are processed in blocks, with a tenth of
 LARGE = 0.25  # of the free memory: a file of less is read as ever
 PROGRAM, A_CELL = 3e8, 300  # bytes: interpreter, libraries and kernels; a base cell in memory
 ZARR = {".zarray", ".zgroup", ".zattrs", "zarr.json"}  # files of which a folder has one
+INDEXES = (".pvti", ".pvd", ".series")  # of files elsewhere
 RANGES, LAYER_VOXEL = 0.15, 20  # bytes a voxel: the map of empty space, an optics grid
 LAYERED_BYTES = 60  # of a voxel of an optics grid while a block of it is there
 FEW_SAMPLES = 512  # bricks of layers: each is read for itself
@@ -242,7 +243,8 @@ def better_in_blocks(request: SourceRequest) -> bool:
     h5 = os.path.isfile(place) and place.lower().endswith((".h5", ".hdf5", ".he5", ".hdf", ".nc"))
     files = files_of(place)
     tiff = files and files[0].suffix.lower() in (".tif", ".tiff")
-    packed = zarr or h5 or tiff  # few bytes may hold many voxels
+    index = os.path.isfile(place) and place.lower().endswith(INDEXES)
+    packed = zarr or h5 or tiff or index  # few bytes may hold many voxels
     size = sum(file.stat().st_size for file in files)
     if not packed and size < HELD and (free is None or size <= LARGE * free):
         return False

@@ -15,8 +15,10 @@ from vvgt_cli.volume import (  # noqa: F401  each registers its formats
     slc,
     slices,
     tiff,
+    vtk_family,
     vtk_grids,
     vtk_legacy,
+    vtk_pieces,
     vtk_xml,
     zarr_store,
 )

@@ -10,6 +10,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.types import Volume
@@ -34,6 +35,9 @@ class Reader:
         resamples: takes ``--dims`` as the grid to sample on.
         holds: does this folder hold the format? Of formats that are folders.
         by_whole: such a folder is one volume whatever else lies in it.
+        within: formats that its files are recognised as; a file's name decides for it.
+        empty: a file may be empty: others beside it hold the values.
+        contents: steps, arrays and blocks of a file, each a list of rows, for `vvgt info`.
     """
 
     name: str
@@ -48,6 +52,9 @@ class Reader:
     resamples: bool = False
     holds: Callable[[Path], bool] | None = None
     by_whole: bool = False
+    within: tuple[str, ...] = ()
+    empty: bool = False
+    contents: Callable[[Path, ReadOptions], dict[str, Any]] | None = None
 
 
 Scheme = Callable[[str, ReadOptions], Volume]

@@ -10,6 +10,7 @@ import zlib
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 from vvgt_cli.errors import DataError, SeveralSteps, UsageError, VvgtError
 from vvgt_cli.files import seekable
@@ -104,10 +105,23 @@ def time_steps(source: str, options: ReadOptions) -> list[tuple[float, str] | No
     try:
         read_volume(source, options)
     except SeveralSteps as error:
-        if error.times is None:
+        if not error.times:
             return [None] * error.steps
         return [(float(time), error.unit) for time in error.times]
     return [None]
+
+
+def contents(source: str, options: ReadOptions) -> dict[str, Any]:
+    """Steps, arrays and blocks of a file, each a list of rows with the option that chooses it; empty of most formats.
+
+    Raises:
+        DataError: no such file, or a damaged one.
+    """
+    path, options = _inner(source, options)
+    if not os.path.isfile(path):
+        return {}
+    reader = _find(path, _head(path, source), options)
+    return {} if reader.contents is None else reader.contents(path, options)
 
 
 def _inner(source: str, options: ReadOptions) -> tuple[Path, ReadOptions]:
@@ -177,7 +191,8 @@ def _head(path: Path, source: str) -> bytes:
         raise DataError(f"{source}: no such file; expected a volume file, - or example:NAME{hint}") from None
     except (OSError, ValueError) as error:
         raise DataError(f"{source}: cannot be read ({getattr(error, 'strerror', None) or error})") from error
-    if not head:
+    named = _by_name(path)
+    if not head and not (named and named.empty):
         raise DataError(f"{source}: the file is empty; expected a volume")
     return head
 
@@ -205,13 +220,15 @@ def _find(path: Path, head: bytes, options: ReadOptions) -> Reader:
 
     named = _by_name(path)
     found, zipped = _by_content(path, head)
+    if found is not None and named is not None and found.name in named.within:
+        found = named
     if found is not None and found is not named and not found.resamples and (options.dims or raw.parse_name(path.name)):
         return raw.READER  # a raw volume may begin with any bytes; where its layout is stated, believe that
     if found is not None:
         if zipped and not found.unzips:
             raise DataError(f"{path}: a gzip-compressed {found.name} file; unpack it first (gunzip)")
         return found
-    if options.dims:
+    if options.dims and (options.dtype or named is None or not named.resamples):
         return raw.READER
     if head.startswith((b"ply\n", b"ply\r\n")):
         raise DataError(

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import check_memory, count
-from vvgt_cli.volume.types import Volume
+from vvgt_cli.volume.types import Volume, triple
 
 MOST = 512  # voxels along an axis, where nobody said how many
 
@@ -45,41 +47,102 @@ def resample(
     Raises:
         DataError: an empty mesh, or memory that does not suffice.
     """
+    if mesh.GetNumberOfCells() < 1:
+        raise DataError(f"{source}: a mesh without cells; expected some to sample")
+    grid = grid_of(np.array(mesh.GetBounds()).reshape(3, 2), dims, mesh.GetNumberOfCells(), source)
+    check_memory(count(grid.dims) * 2 * values.itemsize, source)
+    sampled, inside = probe(mesh, values, where, grid)
+    return sampled_volume(np.where(inside, sampled, np.nan), inside, values.dtype, grid, dims, source, name)
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Where values are sampled: dims, spacing, and the first sample, (x, y, z)."""
+
+    dims: tuple[int, int, int]
+    spacing: tuple[float, float, float]
+    origin: tuple[float, float, float]
+
+
+def grid_of(bounds: np.ndarray, dims: tuple[int, int, int] | None, cells: int, source: str) -> Samples:
+    """Samples at the centres of voxels that fill ``bounds`` (3, 2).
+
+    Raises:
+        DataError: bounds that are not finite.
+    """
+    if not np.isfinite(bounds).all():
+        raise DataError(f"{source}: its bounding box {bounds.ravel().tolist()} is not finite")
+    size, spacing = _grid(bounds, dims, cells)
+    flat = bounds[:, 0] == bounds[:, 1]
+    return Samples(size, spacing, triple(np.where(flat, bounds[:, 0], bounds[:, 0] + np.array(spacing) / 2).tolist()))
+
+
+def probe(mesh: Any, values: np.ndarray, where: str, grid: Samples) -> tuple[np.ndarray, np.ndarray]:
+    """Values on a vtkDataSet at samples, by vtkProbeFilter.
+
+    Args:
+        mesh: a vtkDataSet.
+        values: (n,) scalars of its points or cells.
+        where: ``point`` or ``cell``.
+        grid: the samples.
+
+    Returns:
+        (nz, ny, nx) values, and a mask of those that lie in a cell.
+    """
     from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
     from vtkmodules.vtkCommonDataModel import vtkImageData
     from vtkmodules.vtkFiltersCore import vtkProbeFilter
 
-    if mesh.GetNumberOfCells() < 1:
-        raise DataError(f"{source}: a mesh without cells; expected some to sample")
-    bounds = np.array(mesh.GetBounds()).reshape(3, 2)  # x, y, z
-    if not np.isfinite(bounds).all():
-        raise DataError(f"{source}: its bounding box {bounds.ravel().tolist()} is not finite")
-    size, spacing = _grid(bounds, dims, mesh.GetNumberOfCells())
-    check_memory(count(size) * 2 * values.itemsize, source)
     image = vtkImageData()
-    image.SetDimensions(*size)
-    image.SetSpacing(*spacing)
-    flat = bounds[:, 0] == bounds[:, 1]
-    origin = np.where(flat, bounds[:, 0], bounds[:, 0] + np.array(spacing) / 2)
-    image.SetOrigin(*origin)
+    image.SetDimensions(*grid.dims)
+    image.SetSpacing(*grid.spacing)
+    image.SetOrigin(*grid.origin)
     single = mesh.NewInstance()
     single.CopyStructure(mesh)
     array = numpy_to_vtk(np.ascontiguousarray(values), deep=True)
     array.SetName("values")
     (single.GetPointData() if where == "point" else single.GetCellData()).AddArray(array)
-    probe = vtkProbeFilter()
-    probe.SetInputData(image)
-    probe.SetSourceData(single)
-    probe.Update()
-    found = probe.GetOutput().GetPointData()
-    inside = vtk_to_numpy(found.GetArray(probe.GetValidPointMaskArrayName())).astype(bool)
+    filtered = vtkProbeFilter()
+    filtered.SetInputData(image)
+    filtered.SetSourceData(single)
+    filtered.Update()
+    found = filtered.GetOutput().GetPointData()
+    inside = vtk_to_numpy(found.GetArray(filtered.GetValidPointMaskArrayName())).astype(bool)
+    shape = grid.dims[::-1]
+    return vtk_to_numpy(found.GetArray("values")).reshape(shape), inside.reshape(shape)
+
+
+def kind_of(dtype: np.dtype) -> np.dtype:
+    """The floats that hold values of a type, and NaN."""
+    return np.dtype(np.float32 if dtype.itemsize <= (4 if dtype.kind == "f" else 2) else np.float64)
+
+
+def sampled_volume(
+    values: np.ndarray, inside: np.ndarray, dtype: np.dtype, grid: Samples, dims: object, source: str, name: str
+) -> Volume:
+    """The volume of samples; a message says how many they are where nobody did.
+
+    Args:
+        values: (nz, ny, nx), NaN where not ``inside``.
+        dtype: of the values before.
+        grid: the samples.
+        dims: what was asked for, None: nothing.
+        source: for messages.
+        name: of the volume.
+
+    Raises:
+        DataError: none is inside.
+    """
     if not inside.any():
-        raise DataError(f"{source}: no sample of {_text(size)} lies in a cell of the mesh; try other --dims")
-    sampled = vtk_to_numpy(found.GetArray("values"))
-    small = values.dtype.itemsize <= (4 if values.dtype.kind == "f" else 2)
-    out = np.where(inside, sampled, np.nan).astype(np.float32 if small else np.float64).reshape(size[::-1])
-    label = f"{name} (resampled to {_text(size)})"
-    return Volume(out, spacing, tuple(origin.tolist()), name=label)
+        raise DataError(f"{source}: no sample of {_text(grid.dims)} lies in a cell of the mesh; try other --dims")
+    if dims is None:
+        edges = " x ".join(f"{edge:.6g}" for edge in grid.spacing)
+        warnings.warn(
+            f"{source}: resampled to {_text(grid.dims)} voxels of {edges}, by its cells (--dims X Y Z decides)",
+            stacklevel=2,
+        )
+    label = f"{name} (resampled to {_text(grid.dims)})"
+    return Volume(values.astype(kind_of(dtype)), grid.spacing, grid.origin, name=label)
 
 
 def _text(size: Sequence[int]) -> str:
@@ -100,4 +163,4 @@ def _grid(
         wanted = np.where(thick, dims, 1)
     steps = np.where(thick, extent / wanted, 0.0)
     steps = np.where(thick, steps, steps[thick].mean() if thick.any() else 1.0)
-    return tuple(wanted.tolist()), tuple(steps.tolist())
+    return triple(wanted.tolist()), triple(steps.tolist())

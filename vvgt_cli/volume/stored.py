@@ -138,16 +138,25 @@ def read_block(volume: Volume, lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
     if isinstance(data, Stored):  # what it gives is nobody else's
         part = data[z0:z1, y0:y1, x0:x1]
         return np.require(part, part.dtype.newbyteorder("="), ["C", "A", "W"])
+    out = np.empty((z1 - z0, y1 - y0, x1 - x0), data.dtype.newbyteorder("="))
+    put_block(data, lo, out)
+    return out
+
+
+def put_block(data: Any, lo: np.ndarray, out: np.ndarray) -> None:
+    """Write what a box of an array (not `Stored`) from ``lo`` (3,), x first, on holds into ``out`` (z, y, x).
+
+    Pages of a mapped file that it came from are given back to the system.
+    """
+    (x0, y0, z0), (z1, y1, x1) = lo, np.asarray(lo)[::-1] + out.shape
     under = _map_under(data)
     if under is None or not hasattr(mmap, "MADV_DONTNEED"):
-        part = data[z0:z1][:, y0:y1, x0:x1] if isinstance(data, BrickArray) else data[z0:z1, y0:y1, x0:x1]
-        return np.array(part, part.dtype.newbyteorder("="), order="C", copy=True)
-    out = np.empty((z1 - z0, y1 - y0, x1 - x0), data.dtype.newbyteorder("="))
+        out[...] = data[z0:z1][:, y0:y1, x0:x1] if isinstance(data, BrickArray) else data[z0:z1, y0:y1, x0:x1]
+        return
     slab = max(MAPPED // max(out[0].nbytes, 1), 1)
     for z in range(0, len(out), slab):
         out[z : z + slab] = data[z0 + z : min(z0 + z + slab, z1), y0:y1, x0:x1]
         under.madvise(mmap.MADV_DONTNEED)
-    return out
 
 
 def values_at(volume: Volume, index: np.ndarray) -> np.ndarray:

@@ -1,7 +1,6 @@
-"""VTK meshes and grids (``.vtu``, ``.vtr``, ``.vts``, legacy ``.vtk``, VTKHDF), read by VTK and resampled.
+"""VTK meshes and grids (``.vtu``, ``.vtr``, ``.vts``, legacy ``.vtk``), read by VTK and resampled.
 
-Declared sizes are checked against the file before VTK allocates (VTKHDF: by VTK alone), cells against points before
-VTK walks them.
+Declared sizes are checked against the file before VTK allocates, cells against points before VTK walks them.
 """
 
 from __future__ import annotations
@@ -23,7 +22,18 @@ from vvgt_cli.volume.resample import resample
 from vvgt_cli.volume.types import Volume
 from vvgt_cli.volume.vtk_blocks import check_blocks
 from vvgt_cli.volume.vtk_legacy import GRIDS, Parser, is_legacy
-from vvgt_cli.volume.vtk_xml import extent_dims, is_xml, quiet_vtk, scan, stored_ratio
+from vvgt_cli.volume.vtk_xml import (
+    GHOSTS,
+    HIDDEN,
+    around,
+    extent_dims,
+    quiet_vtk,
+    scan,
+    stored_ratio,
+    without,
+    xml_kind,
+)
+from vvgt_cli.volume.vtk_xml import GRIDS as XML_GRIDS
 
 
 def read_xml_grid(path: Path, options: ReadOptions) -> Volume:
@@ -35,10 +45,20 @@ def read_xml_grid(path: Path, options: ReadOptions) -> Volume:
     """
     from vtkmodules import vtkIOXML
 
+    kind = check_xml_grid(path)
+    return _sampled(getattr(vtkIOXML, f"vtkXML{kind}Reader"), path, options)
+
+
+def check_xml_grid(path: Path) -> str:
+    """See that a ``.vtu``, ``.vtr`` or ``.vts`` can hold what it declares; returns its type of dataset.
+
+    Raises:
+        DataError: damaged, or it cannot.
+    """
     found = scan(path)
     points, cells = found.points, found.cells
     if found.image:
-        dims = extent_dims(found, path)
+        dims = extent_dims(found.image, path)
         points, cells = count(tuple(dims)), count(tuple(max(d - 1, 1) for d in dims))
     need = 12 * points if found.kind == "StructuredGrid" else 0
     if found.kind == "UnstructuredGrid":
@@ -50,7 +70,7 @@ def read_xml_grid(path: Path, options: ReadOptions) -> Volume:
         raise DataError(f"{path}: {size_text(size)} cannot hold {points} points and {cells} cells; is the file whole?")
     check_memory(need, str(path))
     check_blocks(path, found.root, found.appended, found.data_start, stored_ratio(found, path))
-    return _sampled(getattr(vtkIOXML, f"vtkXML{found.kind}Reader"), path, options)
+    return found.kind
 
 
 class _Sections(Parser):
@@ -105,18 +125,6 @@ def read_legacy_grid(path: Path, options: ReadOptions) -> Volume:
     return _sampled(reader, path, options)
 
 
-def read_vtkhdf(path: Path, options: ReadOptions) -> Volume:
-    """Read VTKHDF: an image as it is, an unstructured grid resampled.
-
-    Raises:
-        DataError: damaged, or another kind of dataset.
-        UsageError: a choice of array or component that is missing or does not exist.
-    """
-    from vtkmodules.vtkIOHDF import vtkHDFReader
-
-    return _sampled(vtkHDFReader, path, options)
-
-
 def _sampled(make: Callable[[], Any], path: Path, options: ReadOptions) -> Volume:
     with quiet_vtk() as message:
         reader = make()
@@ -145,7 +153,7 @@ def dataset_volume(mesh: Any, options: ReadOptions, source: str, name: str) -> V
         raise DataError(f"{source}: a {mesh.GetClassName()}; expected one image, grid or mesh of cells")
     if mesh.IsA("vtkPolyData"):
         raise DataError(f"{source}: a surface (vtkPolyData); expected cells that fill a volume")
-    infos = _arrays(mesh)
+    infos = arrays_of(mesh)
     info = infos[choose_array(infos, options.array, source)]
     if mesh.IsA("vtkImageData"):
         return _image(mesh, info, options, source, name)
@@ -153,15 +161,17 @@ def dataset_volume(mesh: Any, options: ReadOptions, source: str, name: str) -> V
         raise UsageError(
             f"{source}: its points say where values are; leave out --spacing (--dims says how many to take)"
         )
-    _check_cells(mesh, source)
-    values = _values(mesh, info).reshape(1, 1, -1, info.components)
+    check_cells(mesh, source)
+    mesh = shown(mesh)
+    values = values_of(mesh, info).reshape(1, 1, -1, info.components)
     field, _ = select_component(
         values, options.component, source, label=f"array {info.name!r}", color=values.dtype == np.uint8
     )
     return resample(mesh, field.ravel(), info.where, options.dims, source, name)
 
 
-def _values(mesh: Any, info: ArrayInfo) -> np.ndarray:
+def values_of(mesh: Any, info: ArrayInfo) -> np.ndarray:
+    """The numbers of an array: (n,), or (n, c) with components."""
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
     data = mesh.GetPointData() if info.where == "point" else mesh.GetCellData()
@@ -169,7 +179,7 @@ def _values(mesh: Any, info: ArrayInfo) -> np.ndarray:
     return result
 
 
-def _arrays(mesh: Any) -> list[ArrayInfo]:
+def arrays_of(mesh: Any) -> list[ArrayInfo]:
     """The arrays of numbers; ghost marks left out."""
     from vtkmodules.util.numpy_support import get_vtk_to_numpy_typemap
 
@@ -179,7 +189,7 @@ def _arrays(mesh: Any) -> list[ArrayInfo]:
         active = data.GetScalars()
         for k in range(data.GetNumberOfArrays()):
             array = data.GetArray(k)
-            if array is None or array.GetDataType() not in types or array.GetName() == "vtkGhostType":
+            if array is None or array.GetDataType() not in types or array.GetName() == GHOSTS:
                 continue
             if not array.GetName():
                 array.SetName(f"array{k}")
@@ -188,7 +198,7 @@ def _arrays(mesh: Any) -> list[ArrayInfo]:
     return found
 
 
-def _check_cells(mesh: Any, source: str) -> None:
+def check_cells(mesh: Any, source: str) -> None:
     """Refuse cells that name points which are not there: VTK would read beyond the array."""
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
@@ -202,32 +212,82 @@ def _check_cells(mesh: Any, source: str) -> None:
         raise DataError(f"{source}: its cells name points that do not exist; check that the file is whole")
 
 
+def shown(mesh: Any) -> Any:
+    """A grid or mesh without its hidden cells, those with a hidden point among them; itself where it has none."""
+    from vtkmodules.vtkCommonCore import vtkIdList
+    from vtkmodules.vtkFiltersCore import vtkExtractCells
+
+    marks = _hidden(mesh, "cell")
+    points = _hidden(mesh, "point")
+    if points is not None:
+        ids, odd = vtkIdList(), np.zeros(mesh.GetNumberOfCells(), bool)
+        for point in np.flatnonzero(points).tolist():
+            mesh.GetPointCells(point, ids)
+            odd[[ids.GetId(k) for k in range(ids.GetNumberOfIds())]] = True
+        marks = odd if marks is None else marks | odd
+    if marks is None:
+        return mesh
+    chosen = vtkIdList()
+    for cell in np.flatnonzero(~marks).tolist():
+        chosen.InsertNextId(cell)
+    keep = vtkExtractCells()
+    keep.SetInputData(mesh)
+    keep.SetCellList(chosen)
+    keep.Update()
+    return keep.GetOutput()
+
+
+def _hidden(mesh: Any, where: str) -> np.ndarray | None:
+    """Mask of the points or cells that ghost marks hide; None where they hide none."""
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    array = (mesh.GetPointData() if where == "point" else mesh.GetCellData()).GetArray(GHOSTS)
+    if array is None or array.GetNumberOfComponents() != 1:
+        return None
+    hidden: np.ndarray = vtk_to_numpy(array).astype(np.uint8) & HIDDEN[where] != 0
+    return hidden if hidden.any() else None
+
+
+def visible(image: Any, field: np.ndarray, where: str) -> np.ndarray:
+    """The values (nz, ny, nx) of an image, NaN where they are hidden."""
+    for kind in ("point", "cell"):
+        hidden = None if (kind, where) == ("point", "cell") else _hidden(image, kind)
+        if hidden is not None:
+            hidden = hidden.reshape(image_place(image, kind)[0][::-1])
+            field = without(field, hidden if kind == where else around(hidden, field.shape))
+    return field
+
+
+def image_place(image: Any, where: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Dims, spacing and first position (x, y, z) of the points of a vtkImageData, or of its cell centres."""
+    low = np.array(image.GetExtent()[::2], float)
+    dims, spacing = np.array(image.GetDimensions()), np.array(image.GetSpacing())
+    if where == "cell":
+        low, dims = low + np.where(dims > 1, 0.5, 0.0), np.maximum(dims - 1, 1)
+    return dims, spacing, np.array(image.GetOrigin()) + _direction(image) @ (low * spacing)
+
+
+def _direction(image: Any) -> np.ndarray:
+    matrix = image.GetDirectionMatrix()
+    return np.array([[matrix.GetElement(r, c) for c in range(3)] for r in range(3)])
+
+
 def _image(image: Any, info: ArrayInfo, options: ReadOptions, source: str, name: str) -> Volume:
     """A vtkImageData as it is: point data, or cell data on the grid of cell centres."""
     if options.dims is not None:
         raise UsageError(f"{source}: an image, which is a regular grid already; leave out --dims")
-    low = np.array(image.GetExtent()[::2], float)
-    dims, spacing = np.array(image.GetDimensions()), np.array(image.GetSpacing())
-    if info.where == "cell":
-        low, dims = low + np.where(dims > 1, 0.5, 0.0), np.maximum(dims - 1, 1)
-    matrix = image.GetDirectionMatrix()
-    direction = np.array([[matrix.GetElement(r, c) for c in range(3)] for r in range(3)])
-    origin = np.array(image.GetOrigin()) + direction @ (low * spacing)
-    values = _values(image, info).reshape(*dims[::-1], info.components)
+    dims, spacing, origin = image_place(image, info.where)
+    values = values_of(image, info).reshape(*dims[::-1], info.components)
     field, _ = select_component(
         values, options.component, source, label=f"array {info.name!r}", color=values.dtype == np.uint8
     )
-    lengths, turned = unit_rows((direction * spacing).T.tolist())
+    lengths, turned = unit_rows((_direction(image) * spacing).T.tolist())
+    field = visible(image, field, info.where)
     return Volume(field, options.spacing_or(lengths), tuple(origin.tolist()), turned, name)
 
 
-def _is_vtkhdf(head: bytes) -> bool:
-    return head.startswith(b"\x89HDF\r\n\x1a\n") and b"VTKHDF" in head
-
-
 for _name, _suffixes, _sniff, _read in (
-    ("VTK grid", (".vtu", ".vtr", ".vts"), lambda head: is_xml(head, grid=True), read_xml_grid),
+    ("VTK grid", (".vtu", ".vtr", ".vts"), lambda head: xml_kind(head) in XML_GRIDS, read_xml_grid),
     ("legacy VTK grid", (), lambda head: is_legacy(head, grid=True), read_legacy_grid),
-    ("VTKHDF", (".vtkhdf",), _is_vtkhdf, read_vtkhdf),
 ):
     register(Reader(_name, _suffixes, _sniff, _read, named_arrays=True, resamples=True))

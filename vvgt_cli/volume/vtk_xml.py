@@ -22,6 +22,7 @@ from vvgt_cli.volume.components import ArrayInfo, choose_array, select_component
 from vvgt_cli.volume.headers import unit_rows
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import Reader, register, volume_name
+from vvgt_cli.volume.resample import kind_of
 from vvgt_cli.volume.types import IDENTITY, Volume
 from vvgt_cli.volume.vtk_blocks import check_blocks
 
@@ -42,11 +43,22 @@ _DTYPES = {
 _RATIO = {"": 4, "vtkZLibDataCompressor": 1040, "vtkLZ4DataCompressor": 256, "vtkLZMADataCompressor": 10000}
 _CHUNK = 1 << 16
 GRIDS = ("UnstructuredGrid", "RectilinearGrid", "StructuredGrid")
+INDEXES = (
+    *("PImageData", "PUnstructuredGrid", "PRectilinearGrid", "PStructuredGrid", "Collection", "vtkMultiBlockDataSet"),
+    *("vtkMultiGroupDataSet", "vtkPartitionedDataSet", "vtkPartitionedDataSetCollection", "vtkOverlappingAMR"),
+    *("vtkNonOverlappingAMR", "vtkHierarchicalBoxDataSet", "vtkUniformGridAMR"),
+)
+DATA = {"PointData": "point", "CellData": "cell", "PPointData": "point", "PCellData": "cell"}
+GHOSTS = "vtkGhostType"  # array of marks: bit 1 of a point and bit 5 of a cell hide it (vtkDataSetAttributes)
+HIDDEN = {"point": 2, "cell": 32}
 
 
 @dataclass
-class _Scan:
-    """What the XML says; arrays are those of the first piece, points and cells of all."""
+class Scan:
+    """What the XML says; arrays are those of the first piece, points and cells of all.
+
+    Of an index of pieces (``.pvti`` and the like) ``sources`` are the files that it names, with their extents.
+    """
 
     kind: str = ""
     root: dict[str, str] = field(default_factory=dict)
@@ -57,38 +69,50 @@ class _Scan:
     where: str = ""
     active: dict[str, str] = field(default_factory=dict)
     arrays: list[tuple[ArrayInfo, dict[str, str]]] = field(default_factory=list)
+    sources: list[tuple[str, str]] = field(default_factory=list)
     appended: str = ""
     data_start: int = -1
 
+    @property
+    def infos(self) -> list[ArrayInfo]:
+        """The arrays that may be chosen: ghost marks are not values."""
+        return [info for info, _ in self.arrays if info.name != GHOSTS]
 
-def scan(path: Path) -> _Scan:
+    def find(self, name: str, where: str) -> tuple[ArrayInfo, dict[str, str]] | None:
+        """An array and its attributes, None where there is none of the name."""
+        return next((row for row in self.arrays if (row[0].name, row[0].where) == (name, where)), None)
+
+
+def scan(path: Path) -> Scan:
     """Scan the elements of a VTK XML file, up to its appended data.
 
     Raises:
         DataError: not well-formed, or not a VTKFile.
     """
-    found = _Scan()
+    found = Scan()
     parser = expat.ParserCreate()
 
     def start(tag: str, attributes: dict[str, str]) -> None:
         if tag == "VTKFile":
             found.root, found.kind = attributes, attributes.get("type", "")
-        elif tag in ("ImageData", "RectilinearGrid", "StructuredGrid"):
+        elif tag.removeprefix("P") in ("ImageData", "RectilinearGrid", "StructuredGrid"):
             found.image = attributes
         elif tag == "Piece":
             found.pieces += 1
             found.points += int(attributes.get("NumberOfPoints", "0"))
             found.cells += int(attributes.get("NumberOfCells", "0"))
-        elif tag in ("PointData", "CellData"):
-            found.where = tag[:-4].lower()
+            if "Source" in attributes:
+                found.sources.append((attributes["Source"], attributes.get("Extent", "")))
+        elif tag in DATA:
+            found.where = DATA[tag]
             found.active[found.where] = attributes.get("Scalars", "")
-        elif tag == "DataArray" and found.where and found.pieces == 1:
+        elif tag in ("DataArray", "PDataArray") and found.where and found.pieces == (tag == "DataArray"):
             _note_array(found, attributes, path)
         elif tag == "AppendedData":
             found.appended, found.data_start = attributes.get("encoding", ""), parser.CurrentByteIndex
 
     def end(tag: str) -> None:
-        if tag in ("PointData", "CellData"):
+        if tag in DATA:
             found.where = ""
 
     parser.StartElementHandler, parser.EndElementHandler = start, end
@@ -106,7 +130,7 @@ def scan(path: Path) -> _Scan:
     return found
 
 
-def _note_array(found: _Scan, attributes: dict[str, str], path: Path) -> None:
+def _note_array(found: Scan, attributes: dict[str, str], path: Path) -> None:
     dtype = _DTYPES.get(attributes.get("type", "").lower())
     if dtype is None:
         return
@@ -130,7 +154,7 @@ def _numbers(text: str, n: int, path: Path, what: str) -> list[float]:
 
 
 @dataclass(frozen=True)
-class _Grid:
+class Grid:
     """Dims, origin and spacing (x, y, z) of the values, direction row-major."""
 
     dims: tuple[int, ...]
@@ -139,24 +163,29 @@ class _Grid:
     direction: tuple[float, ...]
 
 
-def _extent(found: _Scan, path: Path) -> list[int]:
-    return [int(e) for e in _numbers(found.image.get("WholeExtent", ""), 6, path, "WholeExtent")]
+def extent_of(text: str, path: Path, what: str = "WholeExtent") -> list[int]:
+    """The six numbers of an extent.
+
+    Raises:
+        DataError: they are not.
+    """
+    return [int(e) for e in _numbers(text, 6, path, what)]
 
 
-def extent_dims(found: _Scan, path: Path) -> list[int]:
-    """Points along (x, y, z) of an image or a structured grid.
+def extent_dims(image: dict[str, str], path: Path) -> list[int]:
+    """Points along (x, y, z) of an image or a structured grid, by its attributes.
 
     Raises:
         DataError: none along an axis.
     """
-    extent = _extent(found, path)
+    extent = extent_of(image.get("WholeExtent", ""), path)
     dims = [extent[2 * k + 1] - extent[2 * k] + 1 for k in range(3)]
     if min(dims) < 1:
         raise DataError(f"{path}: WholeExtent {extent} is empty; expected at least one voxel along each axis")
     return dims
 
 
-def stored_ratio(found: _Scan, path: Path) -> int:
+def stored_ratio(found: Scan, path: Path) -> int:
     """Most bytes of values that a byte of the file can stand for.
 
     Raises:
@@ -168,10 +197,13 @@ def stored_ratio(found: _Scan, path: Path) -> int:
     return _RATIO[compressor]
 
 
-def _grid(found: _Scan, where: str, path: Path) -> _Grid:
-    """The grid of points, or of cell centres (half a voxel further, one fewer along each axis)."""
-    image = found.image
-    extent, dims = _extent(found, path), extent_dims(found, path)
+def image_grid(image: dict[str, str], where: str, path: Path) -> Grid:
+    """The grid of points, or of cell centres (half a voxel further, one fewer along each axis), by its attributes.
+
+    Raises:
+        DataError: numbers that are none.
+    """
+    extent, dims = extent_of(image.get("WholeExtent", ""), path), extent_dims(image, path)
     spacing = _numbers(image.get("Spacing", "1 1 1"), 3, path, "Spacing")
     origin = _numbers(image.get("Origin", "0 0 0"), 3, path, "Origin")
     direction: tuple[float, ...] = IDENTITY
@@ -184,7 +216,7 @@ def _grid(found: _Scan, where: str, path: Path) -> _Grid:
     step = [f * s for f, s in zip(first, spacing, strict=True)]
     origin = [o + sum(direction[3 * row + k] * step[k] for k in range(3)) for row, o in enumerate(origin)]
     axes = [[direction[3 * row + k] * spacing[k] for row in range(3)] for k in range(3)]
-    return _Grid(tuple(dims), tuple(origin), *unit_rows(axes))
+    return Grid(tuple(dims), tuple(origin), *unit_rows(axes))
 
 
 def read_vti(path: Path, options: ReadOptions) -> Volume:
@@ -200,26 +232,60 @@ def read_vti(path: Path, options: ReadOptions) -> Volume:
             f"{path}: a VTK file of type {found.kind or 'unknown'}; expected ImageData (.vti); resample it first "
             "(ParaView: Resample To Image)"
         )
-    info, attributes = found.arrays[choose_array([a for a, _ in found.arrays], options.array, str(path))]
-    grid = _grid(found, info.where, path)
-    shape = (*reversed(grid.dims), info.components)
-    _check_size(found, info, count(shape), path)
-    values = _mapped(found, attributes, info, shape, path)
-    if values is None:
-        values = _by_vtk(path, info, shape)
+    infos = found.infos
+    info = infos[choose_array(infos, options.array, str(path))]
+    grid = image_grid(found.image, info.where, path)
+    values = image_values(found, info, grid, options, path)
+    return Volume(values, options.spacing_or(grid.spacing), grid.origin, grid.direction, volume_name(path))
+
+
+def image_values(found: Scan, info: ArrayInfo, grid: Grid, options: ReadOptions, path: Path) -> np.ndarray:
+    """The values (nz, ny, nx) of an image's array, mapped where they are stored plainly; NaN where they are hidden.
+
+    Raises:
+        DataError: sizes that the file cannot hold, or it is damaged.
+        UsageError: a choice of component that is missing or does not exist.
+    """
+    values = _stored(found, info, grid, path)
     component, _ = select_component(
         values, options.component, str(path), label=f"array {info.name!r}", color=values.dtype == np.uint8
     )
-    return Volume(
-        component,
-        options.spacing_or(grid.spacing),
-        grid.origin,
-        grid.direction,
-        volume_name(path),
-    )
+    for where in ("point", "cell"):
+        row = found.find(GHOSTS, where)
+        if row is None or (where == "point" and info.where == "cell") or row[0].components != 1:
+            continue
+        marks = _stored(found, row[0], image_grid(found.image, where, path), path)[..., 0]
+        hidden = marks.astype(np.uint8) & HIDDEN[where] != 0
+        component = without(component, hidden if where == info.where else around(hidden, component.shape))
+    return component
 
 
-def _check_size(found: _Scan, info: ArrayInfo, n_values: int, path: Path) -> None:
+def _stored(found: Scan, info: ArrayInfo, grid: Grid, path: Path) -> np.ndarray:
+    """(nz, ny, nx, c) values of an array, mapped or by VTK."""
+    row = found.find(info.name, info.where)
+    shape = (*reversed(grid.dims), info.components)
+    _check_size(found, info, count(shape), path)
+    values = None if row is None else _mapped(found, row[1], info, shape, path)
+    return _by_vtk(path, info, shape) if values is None else values
+
+
+def without(values: np.ndarray, hidden: np.ndarray) -> np.ndarray:
+    """``values`` with NaN where ``hidden``; themselves where nothing is."""
+    if not hidden.any():
+        return values
+    return np.where(hidden, np.nan, values).astype(kind_of(values.dtype))
+
+
+def around(cells: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Points (nz, ny, nx) of which every cell around is in ``cells``, a mask."""
+    for axis, n in enumerate(shape):
+        if n > cells.shape[axis]:
+            ones = np.ones_like(np.take(cells, [0], axis))
+            cells = np.concatenate([ones, cells], axis) & np.concatenate([cells, ones], axis)
+    return cells
+
+
+def _check_size(found: Scan, info: ArrayInfo, n_values: int, path: Path) -> None:
     need = n_values * np.dtype(info.dtype).itemsize
     size = path.stat().st_size
     if need > size * stored_ratio(found, path):
@@ -232,7 +298,7 @@ def _check_size(found: _Scan, info: ArrayInfo, n_values: int, path: Path) -> Non
 
 
 def _mapped(
-    found: _Scan, attributes: dict[str, str], info: ArrayInfo, shape: tuple[int, ...], path: Path
+    found: Scan, attributes: dict[str, str], info: ArrayInfo, shape: tuple[int, ...], path: Path
 ) -> np.ndarray | None:
     """The array memory-mapped, if it is stored plainly, in one piece."""
     plain = found.appended == "raw" and not found.root.get("compressor") and found.data_start >= 0
@@ -252,7 +318,7 @@ def _mapped(
 
 @contextmanager
 def quiet_vtk() -> Iterator[Any]:
-    """Keep VTK's messages from the terminal; yields a function that returns them as one line."""
+    """Keep VTK's messages from the terminal; yields a function that returns the first, or the first error."""
     from vtkmodules.vtkCommonCore import vtkLogger, vtkOutputWindow, vtkStringOutputWindow
 
     window, before = vtkStringOutputWindow(), vtkOutputWindow.GetInstance()
@@ -260,13 +326,14 @@ def quiet_vtk() -> Iterator[Any]:
     vtkOutputWindow.SetInstance(window)
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
 
-    def message() -> str:
+    def message(errors: bool = False) -> str:
         # "ERROR: In file, line n\nclass (0x..): text"
         output = window.GetOutput() or ""
         if isinstance(output, bytes):  # with something in it that is no text
             output = output.decode("utf-8", "replace")
-        texts = re.findall(r"\(0x[0-9a-f]+\): ([^\n]+)", output)
-        return texts[0].strip() if texts else ""
+        head = r"ERROR: In [^\n]*\n[^\n]*" if errors else ""
+        texts = re.findall(head + r"\((?:0x[0-9a-f]+|nullptr)\): ([^\n]+)", output)
+        return re.sub(r" \(0x[0-9a-f]+\)", "", texts[0]).strip() if texts else ""
 
     try:
         yield message
@@ -305,14 +372,18 @@ def _by_vtk(path: Path, info: ArrayInfo, shape: tuple[int, ...]) -> np.ndarray:
     return result
 
 
-def is_xml(head: bytes, grid: bool) -> bool:
-    """Whether a file begins as a VTK XML file of a mesh or grid (`GRIDS`), or of anything else."""
+def xml_kind(head: bytes) -> str | None:
+    """Type of dataset that a VTK XML file begins with ("" where it says none), None of any other file."""
+    if re.search(rb"^\s*(?:<\?xml[^>]*>\s*)?(?:<!--.*?-->\s*)*<VTKFile\s", head, re.DOTALL) is None:
+        return None
     kind = re.search(rb'<VTKFile\s[^>]*?type\s*=\s*["\'](\w+)["\']', head)
-    found = kind is not None and kind[1].decode() in GRIDS
-    return (
-        found == grid
-        and re.search(rb"^\s*(?:<\?xml[^>]*>\s*)?(?:<!--.*?-->\s*)*<VTKFile\s", head, re.DOTALL) is not None
-    )
+    return "" if kind is None else kind[1].decode()
 
 
-register(Reader("VTK XML", (".vti",), lambda head: is_xml(head, grid=False), read_vti, named_arrays=True))
+def _is_other(head: bytes) -> bool:
+    """Whether no other reader takes it: an image, or what the error tells about."""
+    kind = xml_kind(head)
+    return kind is not None and kind not in (*GRIDS, *INDEXES)
+
+
+register(Reader("VTK XML", (".vti",), _is_other, read_vti, named_arrays=True))

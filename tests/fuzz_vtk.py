@@ -1,0 +1,101 @@
+"""Seeds of tests/fuzz.py for what VTK reads in a process of its own: indexes, and other programs' files.
+
+Here that process is a fork, for speed: what it cannot survive is one line of error, as it is in the program.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from fuzz import SECONDS, Seed
+
+sys.path.insert(0, str(Path(__file__).parent.parent))
+
+from tests import vtk_files as files
+from vvgt_cli.volume import ReadOptions, read_volume, vtk_child
+
+Make = Callable[[Path], Path]
+DIMS = (8, 6, 4)
+
+
+def run_fork(request: dict[str, Any]) -> tuple[tuple[dict[str, Any], np.ndarray] | None, int]:
+    """As `vtk_child.run`, by a fork that is bounded alike."""
+    back, writer = os.pipe()
+    child = os.fork()
+    if not child:
+        os.close(back)
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, 1)
+        os.dup2(null, 2)
+        resource.setrlimit(resource.RLIMIT_CPU, (int(SECONDS), int(SECONDS) + 1))
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        with os.fdopen(writer, "wb") as stream:
+            vtk_child.send(stream, *vtk_child.answer(request))
+        os._exit(0)
+    os.close(writer)
+    with os.fdopen(back, "rb") as stream:
+        found = vtk_child.received(stream)
+    return found, os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+
+def seeds_of(make: Make, changed: tuple[str, ...], **options: Any) -> list[Seed]:
+    """Seeds of what ``make`` writes: each of the files named is changed, the others stay."""
+    with tempfile.TemporaryDirectory() as folder:
+        opened = make(Path(folder)).relative_to(folder)
+        content = {str(p.relative_to(folder)): p.read_bytes() for p in Path(folder).rglob("*") if p.is_file()}
+
+    def read(path: Path, name: str) -> None:
+        root = path
+        for _ in Path(name).parts:
+            root = root.parent
+        volume = read_volume(str(root / opened), ReadOptions(**options))
+        for z in (0, -1):
+            np.asarray(volume.data[z])
+
+    return [
+        Seed(name, content[name], lambda path, name=name: read(path, name), content | {name: b""}) for name in changed
+    ]
+
+
+def indexes() -> list[Seed]:
+    return [
+        *seeds_of(lambda f: files.parallel_image(f, files.wavelet(6), 4, DataMode=0), ("v.pvti", "v_1.vti")),
+        *seeds_of(files.collection, ("v.pvd", "s0_0.vti"), array="ramp", time=0),
+        *seeds_of(lambda f: files.collection(f, "vtu"), ("v.pvd", "s1_0.vtu"), array="cells", time=1, dims=DIMS),
+        *seeds_of(lambda f: files.series(f, "vtk"), ("v.vtk.series",), array="ramp", time=1),
+        *seeds_of(lambda f: files.pieces(f, "pvts"), ("v.pvts", "part1.vts"), array="ramp", dims=DIMS),
+        *seeds_of(lambda f: files.pieces(f, "pvtr"), ("v.pvtr",), array="cells", dims=DIMS),
+        *seeds_of(files.multiblock, ("v.vtm", "v/v_0.vtu"), array="ramp", dims=DIMS),
+        *seeds_of(files.amr, ("v.vthb", "v/v_1.vti")),
+    ]
+
+
+def programs() -> list[Seed]:
+    return [
+        *seeds_of(files.hdf_image, ("v.vtkhdf",), array="ramp"),
+        *seeds_of(files.hdf_mesh, ("v.vtkhdf",), array="ramp", dims=DIMS),
+        *seeds_of(files.hdf_amr, ("v.vtkhdf",)),
+        *seeds_of(files.hdf_steps, ("v.vtkhdf",), time=1),
+        *seeds_of(files.exodus, ("v.exo",), array="ramp", dims=DIMS),
+        *seeds_of(files.xdmf3, ("v.xdmf", "v.h5"), time=1),
+        *seeds_of(files.ensight, ("v.case", "v.geo", "v.ramp.01"), array="ramp", time=1, dims=DIMS),
+        *seeds_of(files.cgns, ("v.cgns",), array="ramp", dims=DIMS),
+        *seeds_of(files.plot3d, ("v.p3d", "v.xyz", "v.f"), dims=DIMS),
+        *seeds_of(
+            files.openfoam, ("system/controlDict", "constant/polyMesh/owner", "constant/polyMesh/faces", "0.5/cells"),
+            time=0, dims=DIMS,
+        ),
+    ]  # fmt: skip
+
+
+def readers() -> dict[str, list[Seed]]:
+    """Seeds by reader."""
+    vtk_child.run = run_fork
+    return {"VTK index": indexes(), "programs by VTK": programs()}

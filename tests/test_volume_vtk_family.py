@@ -1,0 +1,282 @@
+"""Indexes of VTK files, and other programs' files that VTK reads (tests/vtk_files.py): places, values, steps."""
+
+from __future__ import annotations
+
+import json
+import re
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import pyvista as pv
+
+from tests import vtk_files as files
+from tests.ramps import X, Y, Z, axes_of, check_grid, ramp
+from vvgt_cli.errors import DataError, SeveralSteps, UsageError
+from vvgt_cli.volume import ReadOptions, Volume, read_volume
+from vvgt_cli.volume.registry import contents, time_steps
+
+BOUNDS = [(X[0], X[-1]), (Y[0], Y[-1]), (Z[0], Z[-1])]
+MM = 0.01
+Make = Callable[[Path], Path]
+MESHES: dict[str, Make] = {
+    "pvtu": lambda f: files.pieces(f, "pvtu"),
+    "pvtr": lambda f: files.pieces(f, "pvtr"),
+    "pvts": lambda f: files.pieces(f, "pvts"),
+    "vtm": files.multiblock,
+    "vtkhdf": files.hdf_mesh,
+    "exodus": files.exodus,
+    "xdmf 2": files.xdmf2,
+    "cgns": files.cgns,
+}
+STEPS: dict[str, Make] = {
+    "pvd of parts": lambda f: files.collection(f, "vtu"),
+    "vtm.series": lambda f: files.series(f, "vtm"),
+    "ensight": files.ensight,
+    "openfoam": files.openfoam,
+}
+IMAGES: dict[str, Make] = {"vtm of images": lambda f: files.multiblock(f, images=True), "vtkhdf": files.hdf_image}
+IMAGE_STEPS: dict[str, Make] = {
+    "pvd": files.collection,
+    "vtk.series": lambda f: files.series(f, "vtk"),
+    "vtkhdf": files.hdf_steps,
+    "xdmf 3": files.xdmf3,
+}
+
+
+def check_place(volume: Volume) -> None:
+    """Voxels fill the box of the mesh."""
+    for along, (lo, hi), n in zip(axes_of(volume), BOUNDS, volume.dims, strict=True):
+        step = (hi - lo) / n
+        np.testing.assert_allclose(along, lo + step / 2 + step * np.arange(n), atol=MM)
+
+
+def check_samples(path: Path, step: int | None, points: bool = True) -> None:
+    """Points are interpolated, cells are what they are; everything is where it belongs."""
+    rise = files.STEP * (step or 0)
+    for array, dims in (("ramp", (8, 6, 4)), ("cells", (4, 3, 2))):
+        if array == "ramp" and not points:
+            continue
+        volume = read_volume(str(path), ReadOptions(array=array, dims=dims, time=step))
+        assert volume.dims == dims
+        assert volume.name.endswith(f"(resampled to {' x '.join(map(str, dims))})")
+        check_place(volume)
+        np.testing.assert_allclose(volume.data, ramp(*axes_of(volume)) + rise, atol=0.05)
+
+
+@pytest.mark.parametrize("kind", MESHES)
+def test_meshes_of_several_files_and_programs_are_resampled(tmp_path: Path, kind: str) -> None:
+    check_samples(MESHES[kind](tmp_path), None)
+
+
+@pytest.mark.parametrize("kind", STEPS)
+def test_steps_of_meshes_are_chosen_by_time(tmp_path: Path, kind: str) -> None:
+    path = STEPS[kind](tmp_path)
+    assert time_steps(str(path), ReadOptions()) == [(time, "") for time in files.TIMES]
+    for step in range(2):
+        check_samples(path, step, points=kind != "openfoam")
+    with pytest.raises(SeveralSteps) as raised:
+        read_volume(str(path), ReadOptions(array="cells"))
+    assert tuple(raised.value.times) == files.TIMES
+    with pytest.raises(UsageError, match="--time 2: it has 2 time steps; expected 0 to 1"):
+        read_volume(str(path), ReadOptions(array="cells", time=2))
+
+
+@pytest.mark.parametrize("kind", IMAGES)
+def test_images_are_read_as_they_are(tmp_path: Path, kind: str) -> None:
+    path = IMAGES[kind](tmp_path)
+    check_grid(read_volume(str(path), ReadOptions(array="ramp")))
+    cells = read_volume(str(path), ReadOptions(array="cells"))
+    assert cells.dims == (4, 3, 2)
+    np.testing.assert_allclose(cells.origin, [X[0] + 0.125, Y[0] + 0.25, Z[0] + 1], atol=MM)
+    np.testing.assert_allclose(cells.data, ramp(*axes_of(cells)))
+
+
+@pytest.mark.parametrize("kind", IMAGE_STEPS)
+def test_steps_of_images(tmp_path: Path, kind: str) -> None:
+    path = IMAGE_STEPS[kind](tmp_path)
+    for step in range(2):
+        volume = read_volume(str(path), ReadOptions(array="ramp", time=step))
+        for along, expected in zip(axes_of(volume), (X, Y, Z), strict=True):
+            np.testing.assert_allclose(along, expected, atol=MM)
+        np.testing.assert_allclose(volume.data, ramp(X, Y, Z) + files.STEP * step)
+    with pytest.raises(SeveralSteps) as raised:
+        read_volume(str(path), ReadOptions(array="ramp"))
+    assert tuple(raised.value.times) == files.TIMES
+
+
+@pytest.mark.parametrize("make", [files.amr, files.hdf_amr])
+def test_the_finest_level_wins_where_there_is_one(tmp_path: Path, make: Make) -> None:
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        volume = read_volume(str(make(tmp_path)))
+    assert [re.sub(r"^.*: ", "", str(one.message)) for one in told] == [
+        "resampled to 8 x 8 x 8 voxels of 0.5 x 0.5 x 0.5, by its cells (--dims X Y Z decides)"
+    ]
+    assert volume.dims == (8, 8, 8)
+    np.testing.assert_allclose(volume.origin, [10.25, 20.25, 30.25], atol=MM)
+    fine, (x, y, z) = volume.data[:, :, :4], axes_of(volume)
+    np.testing.assert_allclose(fine, ramp(x[:4], y, z) + 1)
+    coarse = [np.floor(a) + 0.5 for a in (x[4:], y, z)]
+    np.testing.assert_allclose(volume.data[:, :, 4:], ramp(*coarse))
+
+
+def test_a_decomposed_case(tmp_path: Path) -> None:
+    path = files.openfoam(tmp_path)
+    (tmp_path / "processor0").mkdir()
+    for name in ("constant", *map(str, files.TIMES)):
+        (tmp_path / name).rename(tmp_path / "processor0" / name)
+    check_samples(path, 1, points=False)
+    (tmp_path / "processor0").rename(tmp_path / "elsewhere")
+    with pytest.raises(DataError, match="no case beside it"):
+        read_volume(str(path))
+
+
+def test_plot3d_with_functions(tmp_path: Path) -> None:
+    path = files.plot3d(tmp_path)
+    for name in ("v.p3d", "v.xyz"):
+        volume = read_volume(str(tmp_path / name), ReadOptions(dims=(8, 6, 4)))
+        check_place(volume)
+        np.testing.assert_allclose(volume.data, ramp(*axes_of(volume)), rtol=1e-6)
+    described = json.loads(path.read_text())
+    path.write_text(json.dumps({**described, "filenames": [{"xyz": "v.xyz"}]}))
+    with pytest.raises(DataError, match="coordinates alone; expected values beside them"):
+        read_volume(str(path))
+
+
+def test_hidden_cells_are_nan(tmp_path: Path) -> None:
+    for k, block in enumerate((files.hexahedra(0, 2), files.image(2, 4))):
+        marks = np.zeros(block.n_cells, np.uint8)
+        marks[0] = 32
+        block.cell_data["vtkGhostType"] = marks
+        block.save(tmp_path / f"b{k}.{'vti' if k else 'vtu'}")
+    rows = '<DataSet index="0" file="b0.vtu"/><DataSet index="1" file="b1.vti"/>'
+    text = f'<VTKFile type="vtkMultiBlockDataSet"><vtkMultiBlockDataSet>{rows}</vtkMultiBlockDataSet></VTKFile>'
+    (tmp_path / "v.vtm").write_text(text)
+    for array in ("cells", "ramp"):
+        volume = read_volume(str(tmp_path / "v.vtm"), ReadOptions(array=array, dims=(4, 3, 2)))
+        assert np.argwhere(np.isnan(volume.data)).tolist() == [[0, 0, 0], [0, 0, 2]]
+    for name in ("b0.vtu", "b1.vti"):
+        dims = (2, 3, 2) if name == "b0.vtu" else None
+        alone = read_volume(str(tmp_path / name), ReadOptions(array="cells", dims=dims))
+        assert np.argwhere(np.isnan(alone.data)).tolist() == [[0, 0, 0]]
+
+
+def test_contents_say_what_there_is_and_how_to_choose_it(tmp_path: Path) -> None:
+    found = contents(str(STEPS["pvd of parts"](tmp_path)), ReadOptions())
+    assert [(row["time"], row["option"]) for row in found["steps"]] == [(0.5, "--time 0"), (1.25, "--time 1")]
+    rows = {row["array"]: row for row in found["arrays"]}
+    values = ramp(X, Y, Z)
+    assert rows["ramp"] == {
+        "array": "ramp", "data": "point", "dtype": "float64", "components": 1, "range": [values.min(), values.max()],
+        "blocks": 2, "option": "--array ramp",
+    }  # fmt: skip
+    assert [(row["type"], row["cells"]) for row in found["blocks"]] == [("UnstructuredGrid", 12)] * 2
+
+
+def test_info_shows_steps_and_then_the_step_that_is_chosen(tmp_path: Path, vvgt) -> None:
+    path = str(IMAGE_STEPS["pvd"](tmp_path))
+    listed = json.loads(vvgt("info", path, "--json").out)
+    assert [row["option"] for row in listed["steps"]] == ["--time 0", "--time 1"]
+    assert "2 time steps" in listed["choice"]
+    one = json.loads(vvgt("info", path, "--json", "--time", "1", "--array", "ramp").out)
+    assert one["dims"] == [5, 4, 3]
+    assert one["range"] == [float(ramp(X, Y, Z).min()) + files.STEP, float(ramp(X, Y, Z).max()) + files.STEP]
+
+
+def test_a_series_is_converted_with_its_times(tmp_path: Path, vvgt) -> None:
+    path = str(IMAGE_STEPS["vtk.series"](tmp_path))
+    how = ("--max-gaussians", "50", "--size", "64", "--steps", "0")
+    told = vvgt("convert", path, "--array", "ramp", "-o", str(tmp_path / "p_{:02d}.ply"), *how).err
+    assert "v.vtk.series time 0 (0.5): frame 1 of 2" in told
+    assert "v.vtk.series time 1 (1.25): frame 2 of 2" in told
+    assert {"p_00.ply", "p_01.ply"} <= {file.name for file in tmp_path.iterdir()}
+
+
+def index(folder: Path, *names: str) -> Path:
+    rows = "".join(f'<DataSet index="{k}" file="{name}"/>' for k, name in enumerate(names))
+    text = f'<VTKFile type="vtkMultiBlockDataSet"><vtkMultiBlockDataSet>{rows}</vtkMultiBlockDataSet></VTKFile>'
+    (folder / "v.vtm").write_text(text)
+    return folder / "v.vtm"
+
+
+@pytest.mark.parametrize(
+    ("names", "text"),
+    [
+        (["b0.vti", "gone.vti"], "'gone.vti' does not exist beside it"),
+        (["b0.vti", "../../etc/passwd"], "expected a file in the header's own folder"),
+        (["b0.vti", "/etc/passwd"], "expected a file in the header's own folder"),
+        (["b0.vti", "v.vtm"], "an index that names itself"),
+        (["v.vtm"], "an index that names itself"),
+        (["b0.vti", "a.txt"], "no dataset of VTK's"),
+        ([], "an index that names no files"),
+    ],
+)
+def test_an_index_of_what_is_not_there(tmp_path: Path, names: list[str], text: str) -> None:
+    files.image().save(tmp_path / "b0.vti")
+    (tmp_path / "a.txt").write_text("hello")
+    with pytest.raises(DataError, match=text):
+        read_volume(str(index(tmp_path, *names)), ReadOptions(array="ramp"))
+
+
+def test_an_index_of_very_many_files(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="more than 100000 files"):
+        read_volume(str(index(tmp_path, *["b0.vti"] * 100_001)))
+    files.image().save(tmp_path / "b0.vti")
+    with pytest.raises(DataError, match=r"'gone\.vti' does not exist"):
+        read_volume(str(index(tmp_path, *["b0.vti"] * 50, *["gone.vti"] * 99_950)))
+
+
+def test_case_files_name_nothing_elsewhere(tmp_path: Path) -> None:
+    path = files.ensight(tmp_path)
+    text = path.read_text()
+    for old, new in (("v.geo", "/etc/passwd"), ("v.ramp.**", "../v.ramp.**")):
+        path.write_text(text.replace(old, new))
+        with pytest.raises(DataError, match=r"expected (a file|files) in (the header's|its) own folder"):
+            read_volume(str(path), ReadOptions(time=0))
+    path = files.xdmf3(tmp_path)
+    path.write_text(path.read_text().replace("v.h5:", "../v.h5:"))
+    with pytest.raises(DataError, match="in the header's own folder"):
+        read_volume(str(path), ReadOptions(time=0))
+    path.write_text('<!DOCTYPE Xdmf [<!ENTITY a "b">]><Xdmf/>')
+    with pytest.raises(DataError, match="its XML declares entities"):
+        read_volume(str(path))
+
+
+def test_a_reader_that_breaks_down_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from vvgt_cli.volume import vtk_child
+
+    path = files.exodus(tmp_path)
+    for code, text in (
+        ("import os; os.kill(os.getpid(), 11)", r"broke down \(SIGSEGV\)"),
+        ("import os; os.kill(os.getpid(), 24)", "was stopped"),
+        ("raise SystemExit(3)", r"broke down \(status 3\)"),
+    ):
+        monkeypatch.setattr(vtk_child, "START", code)
+        with pytest.raises(DataError, match=text):
+            read_volume(str(path))
+
+
+def test_memory_and_time_of_a_reader_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from vvgt_cli.volume import vtk_child
+
+    path = files.hdf_mesh(tmp_path)
+    monkeypatch.setattr(vtk_child, "free_memory", lambda: 1 << 20)
+    with pytest.raises(DataError, match=r"memory|no dataset"):
+        read_volume(str(path), ReadOptions(array="ramp", dims=(64, 64, 64)))
+    monkeypatch.undo()
+    endless = "c.answer = lambda request: exec('while True: pass')"
+    monkeypatch.setattr(vtk_child, "SECONDS", 0)
+    monkeypatch.setattr(vtk_child, "A_VOXEL", 0)
+    monkeypatch.setattr(vtk_child, "START", f"import vvgt_cli.volume.vtk_child as c; {endless}; c.main()")
+    with pytest.raises(DataError, match="was stopped"):
+        read_volume(str(path), ReadOptions(array="ramp"))
+
+
+def test_surfaces_alone_are_no_volume(tmp_path: Path) -> None:
+    for name in ("s.vtp", "t.vtp"):
+        pv.Sphere().save(tmp_path / name)
+    with pytest.raises(DataError, match=r"a surface \(vtkPolyData\)"):
+        read_volume(str(index(tmp_path, "s.vtp", "t.vtp")))

@@ -1,0 +1,298 @@
+"""Files of simulation programs, by VTK's readers: EnSight, Exodus, OpenFOAM, XDMF, CGNS, Plot3D, and VTKHDF.
+
+A row of `PROGRAMS` names a format's endings, how it begins and its VTK reader. All of it runs in a process of its own
+(`vvgt_cli.volume.vtk_child`): the readers trust their files.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from xml.parsers import expat
+
+from vvgt_cli.errors import DataError
+from vvgt_cli.volume.blocks import data_file
+from vvgt_cli.volume.vtk_index import MAX_BYTES, chosen_time
+from vvgt_cli.volume.vtk_leaves import Leaf, leaves_of
+from vvgt_cli.volume.vtk_xml import quiet_vtk
+
+HDF5 = b"\x89HDF\r\n\x1a\n"
+MOST_NAMES = 100_000  # files that a case may name
+
+
+@dataclass(frozen=True)
+class Program:
+    """A format.
+
+    Attributes:
+        name: for messages.
+        suffixes: endings of its files.
+        sniff: as `Reader.sniff`.
+        reader: what makes VTK's reader of a file, all arrays enabled.
+        within: formats that its files may be taken for by their content.
+        by_name: its files have no beginning of their own: the name decides. They may be empty.
+    """
+
+    name: str
+    suffixes: tuple[str, ...]
+    sniff: Callable[[bytes], bool]
+    reader: Callable[[Path], Any]
+    within: tuple[str, ...] = ()
+    by_name: bool = False
+
+
+def read_program(program: Program, path: Path, time: int | None) -> tuple[list[Leaf], list[float]]:
+    """The datasets of a time step, and the times of all steps.
+
+    Raises:
+        DataError: damaged, or a file that it names is missing or lies elsewhere.
+        UsageError: several time steps and none chosen, or one that there is not.
+    """
+    from vtkmodules.vtkCommonExecutionModel import vtkStreamingDemandDrivenPipeline
+
+    with quiet_vtk() as message:
+        reader = program.reader(path)
+        reader.UpdateInformation()
+        facts = reader.GetOutputInformation(0)
+        times = list(facts.Get(vtkStreamingDemandDrivenPipeline.TIME_STEPS()) or ())
+        told = message(errors=True)
+        chosen = chosen_time(times, time, str(path))
+        if chosen is None:
+            reader.Update()
+        else:
+            reader.UpdateTimeStep(chosen)
+        found = reader.GetOutputDataObject(0)
+        leaves = [leaf for leaf in leaves_of(found) if leaf.data.GetNumberOfPoints() > 0]
+        error = message(errors=True) or told
+    if error or not leaves:
+        fault = f"cannot read it ({error})" if leaves else f"finds no dataset in it ({error or 'no message'})"
+        raise DataError(f"{path}: VTK {fault}; is the {program.name} file whole?")
+    return leaves, times
+
+
+def _check_name(path: Path, named: str) -> None:
+    """Refuse a file named by another that does not lie in its folder, or is not there; a pattern stands for several."""
+    if not re.search(r"[*%]", named):
+        data_file(path, named)
+    elif Path(named).is_absolute() or ".." in Path(named).parts:
+        raise DataError(f"{path.name}: it names {named!r}; expected files in its own folder")
+
+
+def _check_names(path: Path, names: Sequence[str]) -> None:
+    if len(names) > MOST_NAMES:
+        raise DataError(f"{path}: it names {len(names)} files; expected at most {MOST_NAMES}")
+    for named in dict.fromkeys(names):
+        _check_name(path, named)
+
+
+def _small(path: Path) -> str:
+    """The text of a file that describes others."""
+    if path.stat().st_size > MAX_BYTES:
+        raise DataError(f"{path}: {path.stat().st_size} bytes; expected at most {MAX_BYTES >> 20} MiB of text")
+    return path.read_text("utf-8", "replace")
+
+
+def _ensight(path: Path) -> Any:
+    from vtkmodules.vtkIOEnSight import vtkGenericEnSightReader
+
+    section, names = "", []
+    for line in _small(path).splitlines():
+        line = line.partition("#")[0].strip()
+        if re.fullmatch(r"[A-Z]+", line):
+            section = line
+        key, colon, value = line.partition(":")
+        words = re.findall(r'"[^"]*"|\S+', value)
+        files = section == "GEOMETRY" or (section == "VARIABLE" and "constant" not in key)
+        if colon and files and words:
+            words = [word for word in words if word != "change_coords_only"]
+            names.append(words[-1].strip('"'))
+    _check_names(path, names)
+    reader = vtkGenericEnSightReader()
+    reader.SetFilePath(str(path.parent))
+    reader.SetCaseFileName(path.name)
+    reader.ReadAllVariablesOn()
+    return reader
+
+
+def _exodus(path: Path) -> Any:
+    from vtkmodules.vtkIOExodus import vtkExodusIIReader
+
+    reader = vtkExodusIIReader()
+    reader.SetFileName(str(path))
+    reader.GenerateObjectIdCellArrayOff()
+    reader.UpdateInformation()
+    for kind in (reader.NODAL, reader.ELEM_BLOCK):
+        reader.SetAllArrayStatus(kind, 1)
+    return reader
+
+
+def _openfoam(path: Path) -> Any:
+    from vtkmodules.vtkIOParallel import vtkPOpenFOAMReader
+
+    whole, parts = (path.parent / "constant" / "polyMesh").is_dir(), (path.parent / "processor0").is_dir()
+    if not whole and not parts:
+        raise DataError(f"{path}: no case beside it; expected a folder with constant/polyMesh or processor0 in it")
+    reader = vtkPOpenFOAMReader()
+    reader.SetFileName(str(path))
+    reader.SetCaseType(1 if whole else 0)  # reconstructed, or decomposed
+    reader.CreateCellToPointOff()  # values as they are stored
+    reader.UpdateInformation()
+    reader.EnableAllCellArrays()
+    reader.EnableAllPointArrays()
+    reader.DisableAllPatchArrays()
+    reader.SetPatchArrayStatus("internalMesh", 1)
+    return reader
+
+
+def _xdmf(path: Path) -> Any:
+    from vtkmodules.vtkIOXdmf2 import vtkXdmfReader
+
+    names: list[str] = []
+    texts: list[str] = []
+    coded = False
+    parser = expat.ParserCreate()
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal coded
+        coded = tag == "DataItem" and attributes.get("Format", "XML").upper() in ("HDF", "HDF5", "H5", "BINARY", "TIFF")
+        texts.clear()
+        if tag.endswith("include") and "href" in attributes:
+            names.append(attributes["href"])
+
+    def text(data: str) -> None:
+        if coded:
+            texts.append(data)
+
+    def end(tag: str) -> None:
+        nonlocal coded
+        named = "".join(texts).strip()
+        if coded and named:
+            names.append(named.rpartition(":")[0] if ":" in named else named)
+        coded = False
+        texts.clear()
+
+    def entity(*_: object) -> None:
+        raise DataError(f"{path}: its XML declares entities; expected none")
+
+    parser.StartElementHandler, parser.CharacterDataHandler, parser.EndElementHandler = start, text, end
+    parser.EntityDeclHandler = entity
+    try:
+        with open(path, "rb") as file:
+            parser.ParseFile(file)
+    except expat.ExpatError as error:
+        raise DataError(f"{path}: its XML is damaged ({error}); check that the file is whole") from error
+    _check_names(path, names)
+    reader = vtkXdmfReader()
+    reader.SetFileName(str(path))
+    return reader
+
+
+def _cgns(path: Path) -> Any:
+    from vtkmodules.vtkIOCGNSReader import vtkCGNSReader
+
+    reader = vtkCGNSReader()
+    reader.SetFileName(str(path))
+    reader.UpdateInformation()
+    reader.EnableAllBases()
+    reader.EnableAllPointArrays()
+    reader.EnableAllCellArrays()
+    return reader
+
+
+def _plot3d(path: Path) -> Any:
+    """``NAME.xyz`` with ``NAME.q`` or ``NAME.f`` beside it, or ParaView's ``.p3d``, JSON that names them."""
+    from vtkmodules.vtkIOParallel import vtkMultiBlockPLOT3DReader
+
+    stated: dict[str, Any] = {"auto-detect-format": True}
+    files = {"xyz": path.name}
+    if path.suffix.lower() == ".p3d":
+        try:
+            stated = json.loads(_small(path))
+            rows = stated["filenames"]
+            files = {key: str(rows[0][key]) for key in ("xyz", "q", "function") if key in rows[0]}
+        except (ValueError, TypeError, KeyError, IndexError) as error:
+            raise DataError(
+                f'{path}: damaged ({error}); expected JSON with "filenames", an "xyz" among them'
+            ) from error
+        if len(rows) != 1 or "xyz" not in files:
+            raise DataError(
+                f'{path}: {len(rows)} entries in "filenames"; expected one, with "xyz" and "q" or "function"'
+            )
+    else:
+        for key, suffix in (("q", ".q"), ("function", ".f")):
+            if path.with_suffix(suffix).is_file():
+                files[key] = path.with_suffix(suffix).name
+    if len(files) < 2:
+        raise DataError(f"{path}: coordinates alone; expected values beside them, in {path.stem}.q or {path.stem}.f")
+    _check_names(path, list(files.values()))
+    reader = vtkMultiBlockPLOT3DReader()
+    for key, put in (
+        ("xyz", reader.SetXYZFileName),
+        ("q", reader.SetQFileName),
+        ("function", reader.SetFunctionFileName),
+    ):
+        if key in files:
+            put(str(path.parent / files[key]))
+    _describe_plot3d(reader, stated)
+    return reader
+
+
+def _describe_plot3d(reader: Any, stated: dict[str, Any]) -> None:
+    """Tell the reader what a ``.p3d`` states (vtkPlot3DMetaReader's keys)."""
+    reader.SetAutoDetectFormat(bool(stated.get("auto-detect-format", False)))
+    reader.SetBinaryFile(str(stated.get("format", "binary")).lower() != "ascii")
+    (reader.SetByteOrderToLittleEndian if stated.get("byte-order") == "little" else reader.SetByteOrderToBigEndian)()
+    reader.SetHasByteCount(str(stated.get("language", "C")).lower() == "fortran")
+    reader.SetMultiGrid(bool(stated.get("multi-grid", False)))
+    reader.SetIBlanking(bool(stated.get("blanking", False)))
+    reader.SetTwoDimensionalGeometry(bool(stated.get("2D", False)))
+    reader.SetDoublePrecision(stated.get("precision") == 64)
+
+
+def _vtkhdf(path: Path) -> Any:
+    from vtkmodules.vtkIOHDF import vtkHDFReader
+
+    reader = vtkHDFReader()
+    reader.SetFileName(str(path))
+    return reader
+
+
+def _is_xdmf(head: bytes) -> bool:
+    start = rb"\s*(?:<\?xml[^>]*>\s*)?(?:<!--.*?-->\s*)*(?:<Xdmf[\s>]|<!DOCTYPE\s+Xdmf\s)"
+    return re.match(start, head, re.DOTALL) is not None
+
+
+def _is_ensight(head: bytes) -> bool:
+    return re.search(rb"^\s*FORMAT\s*$(?:\s*#.*$)*\s*type:\s*ensight", head, re.MULTILINE) is not None
+
+
+PROGRAMS = {
+    program.name: program
+    for program in (
+        Program("VTKHDF", (".vtkhdf",), lambda head: head.startswith(HDF5) and b"VTKHDF" in head, _vtkhdf),
+        Program("EnSight", (".case", ".encas"), _is_ensight, _ensight),
+        Program(
+            "Exodus",
+            (".e", ".ex2", ".exo", ".exii", ".g"),
+            lambda head: head.startswith(b"CDF") and b"floating_point_word_size" in head,
+            _exodus,
+            within=("NetCDF", "HDF5"),
+        ),
+        Program("OpenFOAM", (".foam",), lambda head: False, _openfoam, by_name=True),
+        Program("XDMF", (".xdmf", ".xmf", ".xdmf2", ".xdmf3"), _is_xdmf, _xdmf),
+        Program(
+            "CGNS",
+            (".cgns",),
+            lambda head: (
+                (head.startswith(HDF5) and b"CGNSLibraryVersion" in head) or head[4:32].startswith(b"ADF Database")
+            ),
+            _cgns,
+            within=("HDF5",),
+        ),
+        Program("Plot3D", (".p3d", ".xyz"), lambda head: False, _plot3d, by_name=True),
+    )
+}
