@@ -86,7 +86,8 @@ def _axis(variable: Any, name: str, size: int) -> Axis:
 
 
 def _sniff(head: bytes) -> bool:
-    return head[:4] in (b"CDF\x01", b"CDF\x02", b"CDF\x05") or (head.startswith(MAGIC) and b"_NCProperties" in head)
+    classic = head[:4] in (b"CDF\x01", b"CDF\x02", b"CDF\x05") and b"MINC standard" not in head
+    return classic or (head.startswith(MAGIC) and b"_NCProperties" in head)
 
 
 register(Reader("NetCDF", (".nc", ".nc4", ".cdf"), _sniff, read_netcdf, named_arrays=True, resamples=True, times=True))
