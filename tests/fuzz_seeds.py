@@ -111,90 +111,6 @@ def inviwo() -> list[Seed]:
     return [Seed("a.dat", text, READ, beside), Seed("b.dat", series, volume_reader(component=2), beside)]
 
 
-def nifti() -> list[Seed]:
-    import nibabel as nib
-
-    affine = np.diag([1.0, 2, 3, 1])
-    first = nib.Nifti1Image(VALUES.T, affine)
-    first.header.set_slope_inter(2, 1)
-    second = nib.Nifti2Image(np.stack([FLOATS.T] * 2, axis=3), affine)
-    pair = nib.Nifti1Pair(VALUES.T, affine)
-    maps = pair.make_file_map({"header": io.BytesIO(), "image": io.BytesIO()})
-    pair.to_file_map(maps)
-    header, image = (maps[k].fileobj.getvalue() for k in ("header", "image"))
-    return [
-        Seed("a.nii", first.to_bytes(), READ),
-        Seed("b.nii.gz", first.to_bytes(), READ, pack=gzip.compress),
-        Seed("c.nii", second.to_bytes(), volume_reader(component=1)),
-        Seed("d.hdr", header, READ, {"d.img": image}),
-    ]
-
-
-def analyze() -> list[Seed]:
-    import nibabel as nib
-
-    image = nib.Spm2AnalyzeImage(VALUES.T, None)
-    image.header.set_slope_inter(2, 0)
-    maps = image.make_file_map({"header": io.BytesIO(), "image": io.BytesIO()})
-    image.to_file_map(maps)
-    header, values = (maps[k].fileobj.getvalue() for k in ("header", "image"))
-    return [Seed("a.hdr", header, READ, {"a.img": values}), Seed("b.img", values, READ, {"b.hdr": header})]
-
-
-def mgh() -> list[Seed]:
-    import nibabel as nib
-
-    one, two = (nib.MGHImage(data, np.diag([1, 2, 3, 1])) for data in (VALUES.T, np.stack([FLOATS.T] * 2, axis=3)))
-    return [
-        Seed("a.mgh", one.to_bytes(), READ),
-        Seed("b.mgz", one.to_bytes(), READ, pack=gzip.compress),
-        Seed("c.mgh", two.to_bytes(), volume_reader(time=1)),
-    ]
-
-
-def mrc() -> list[Seed]:
-    import mrcfile
-
-    def content(values: np.ndarray, **words: Any) -> bytes:
-        with tempfile.TemporaryDirectory() as folder:
-            with mrcfile.new(f"{folder}/v.mrc", values) as file:
-                file.voxel_size = 1.5
-                for name, value in words.items():
-                    setattr(file.header, name, value)
-            return Path(f"{folder}/v.mrc").read_bytes()
-
-    skewed = content(FLOATS, mapc=3, mapr=1, maps=2, cellb=(70, 80, 110), nxstart=3)
-    return [
-        Seed("a.mrc", content(VALUES), READ),
-        Seed("b.map", skewed, READ),
-        Seed("c.map.gz", skewed, READ, pack=gzip.compress),
-        Seed("d.mrc.bz2", content(VALUES.astype(np.int8)), READ, pack=bz2.compress),
-        Seed("e.mrc", content(np.stack([FLOATS] * 2)), volume_reader(time=1)),
-    ]
-
-
-def minc() -> list[Seed]:
-    import nibabel
-
-    folder = Path(nibabel.__file__).parent / "tests" / "data"
-    names = (("minc1_1_scale.mnc", READ), ("minc1_4d.mnc", volume_reader(time=1)))
-    return [Seed(name, (folder / name).read_bytes(), read) for name, read in names]
-
-
-def text_grids() -> list[Seed]:
-    from test_volume_maps import ATOMS, CUBE, DX, END, GRID, text
-
-    cube = CUBE.format(atoms=2, nval="", n=[3, 4, 5]) + ATOMS + text(GRID[..., 0])
-    orbitals = CUBE.format(atoms=-2, nval="", n=[3, 4, 5]) + ATOMS + " 2 21\n22\n" + text(GRID)
-    binary = DX.format(kind="float", form="lsb ").encode() + GRID[..., 0].tobytes() + END.encode()
-    return [
-        Seed("a.cube", cube.encode(), READ),
-        Seed("b.cube", orbitals.encode(), volume_reader(component=1)),
-        Seed("c.dx", (DX.format(kind="double", form="") + text(GRID[..., 0]) + END).encode(), READ),
-        Seed("d.dx", binary, READ),
-    ]
-
-
 def slc() -> list[Seed]:
     head = b"11111\n5 4 3 8\n1.0 2.0 3.0\n1 0 0\n%d\n2 2 X" + bytes(12)
     values = VALUES.astype(np.uint8)
@@ -326,6 +242,7 @@ def transfer() -> list[Seed]:
     from test_look_formats import ITF, XML, mrml, vp, vp_json
 
     from vvgt_cli.look import read_transfer_function
+    from vvgt_cli.look.readers.named import FILE as NAMED
 
     def read(path: Path) -> None:
         tf = read_transfer_function(str(path))
@@ -347,6 +264,7 @@ def transfer() -> list[Seed]:
         Seed("d.itf", ITF.format(lo=0, hi=0.9, type=0).encode(), read),
         Seed("e.vp", vp().encode(), read),
         Seed("f.vp.json", json.dumps(vp_json()).encode(), read),
+        Seed("named.json", json.dumps(json.loads(NAMED.read_text())[0]["function"], indent=1).encode(), read),
         Seed("presets.xml", mrml().encode(), lambda path: read(Path(f"{path}#CT-AAA"))),
     ]
 
@@ -447,17 +365,14 @@ def manifest() -> list[Seed]:
 
 def readers() -> dict[str, list[Seed]]:
     """Seeds by reader."""
+    from fuzz_seeds_scans import scans
+
     return {
         "raw": raw(),
         "NRRD": nrrd(),
         "MetaImage": metaimage(),
         "Inviwo": inviwo(),
-        "NIfTI": nifti(),
-        "Analyze": analyze(),
-        "MGH": mgh(),
-        "MRC": mrc(),
-        "cube and OpenDX": text_grids(),
-        "MINC 1": minc(),
+        **scans(),
         "SLC": slc(),
         "TIFF": tiff(),
         "VTK legacy": vtk_legacy(),
