@@ -24,7 +24,7 @@ from vvgt_cli.look import from_histogram, read_transfer_function, resolve, unit_
 from vvgt_cli.synth.sources import open_volume
 from vvgt_cli.volume import ReadOptions, Volume, statistics
 
-SIZE, AZIMUTH, ELEVATION, FIELD = 180, 60.0, 12.0, 36.0  # px, degrees
+SIZE, SIZE_NAMED, AZIMUTH, ELEVATION, FIELD = 180, 160, 60.0, 12.0, 36.0  # px, degrees
 MADE: dict[str, Callable[[], Volume]] = {
     "mr-t1": lambda: head("t1"),
     "mr-t2": lambda: head("t2"),
@@ -49,8 +49,9 @@ NAMED: dict[str, Callable[[], Volume]] = {
 
 
 def picture(volume: Volume, name: str | None) -> tuple[np.ndarray, str]:
-    """(SIZE, SIZE, 3) picture over black, and the function's name; without a name that which is made."""
+    """(px, px, 3) picture over black, and the function's name; without a name that which is made."""
     numbers = statistics(volume)
+    size = SIZE if name is None else SIZE_NAMED
     if name is None:
         tf = from_histogram(numbers, volume.hounsfield, volume.density)
     else:
@@ -59,7 +60,7 @@ def picture(volume: Volume, name: str | None) -> tuple[np.ndarray, str]:
     azimuth, elevation = np.radians([AZIMUTH, ELEVATION])
     level = np.cos(elevation)
     eye = 3 * np.array([np.cos(azimuth) * level, np.sin(azimuth) * level, np.sin(elevation)])
-    camera = look_at(eye, width=SIZE, height=SIZE, fov=FIELD)
+    camera = look_at(eye, width=size, height=size, fov=FIELD)
     draw = render_in_box(lambda boxed: render_view(scene, boxed, RenderSettings()), volume.axes)
     return np.clip(draw(camera)[..., :3], 0, 1), tf.name
 
