@@ -154,7 +154,8 @@ def test_info_names_a_function_that_fits(tmp_path: Path, vvgt: Callable) -> None
 
 @pytest.mark.parametrize("name", ["density-contour", "ct-bone", "mr-head"])
 def test_blocks_count_for_functions_of_the_histogram(name: str) -> None:
-    assert needs_histogram(SourceRequest("v.mrc", name))
+    assert needs_histogram(SourceRequest("v.mrc", tf=name))
+    assert not needs_histogram(SourceRequest("v.mrc", tf="viridis"))
 
 
 @pytest.mark.parametrize("tf", [None, "density-contour"])

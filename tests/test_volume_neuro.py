@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -216,3 +217,10 @@ def test_a_sequence_becomes_a_file_a_frame(tmp_path: Path, vvgt: Callable) -> No
     done = vvgt("convert", tmp_path / "v.seq.nrrd", "-o", tmp_path / "p_{}.ply", "--max-gaussians", 50, "--steps", 0)
     assert done.code == 0, done.err
     assert sorted(path.name for path in tmp_path.glob("*.ply")) == ["p_0.ply", "p_1.ply", "p_2.ply"]
+
+
+@pytest.mark.parametrize("module", ["nibabel", "h5py"])
+def test_minc_without_its_libraries_names_the_extra(module: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(DataError, match=rf"needs {module} .*pip install 'vvgt\[minc\]'"):
+        read_volume(str(MINC / "minc2_1_scale.mnc"))

@@ -114,6 +114,13 @@ def test_info_counts_time_steps_and_says_what_is_in_one(case: str, steps: int, t
     assert facts["range"][1] > facts["range"][0]
 
 
+def test_workers_do_not_repeat_what_is_said_of_a_file(tmp_path: Path, vvgt: Callable) -> None:
+    out = tmp_path / "o.ply"
+    done = vvgt("init", analyze(tmp_path), "-o", out, "--max-gaussians", 50, "--blocks", 32, "--workers", 2)
+    assert done.code == 0, done.err
+    assert "Analyze" not in done.err  # of this process the warning goes to pytest
+
+
 def test_a_stack_of_maps_becomes_a_file_each(tmp_path: Path, vvgt: Callable) -> None:
     source = mrc(tmp_path / "v.mrc", np.stack([BALL[:8], 2 * BALL[:8]]).astype("f4"))
     done = vvgt("convert", source, "-o", tmp_path / "p_{}.ply", "--max-gaussians", 50, "--steps", 0)
