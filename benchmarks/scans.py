@@ -188,3 +188,47 @@ def nuclei() -> Volume:
     photons = np.clip(blur(values, (2.5, 1, 1)) * np.exp(-z / 90), 0, None) * 900 + 60
     counts = random.poisson(photons) + random.normal(100, 4, shape)
     return Volume(np.clip(counts, 0, 65535).astype(np.uint16), (0.2, 0.2, 0.5), name="nuclei")
+
+
+def angiography() -> Volume:
+    """Time-of-flight angiography of a head, MR: vessels on a noisy, darker brain, in no units."""
+    body = Body(HEAD, (80, 95, 70), 0)
+    brain = body.radius((0, 0, 0), (70, 88, 66))
+    body.values[brain < 1] = 110
+    body.values[brain < 0.86] = 150
+    for side in (-1, 1):
+        carotid = [(side * 22, 10, -70), (side * 24, 14, -40), (side * 14, 22, -18), (side * 16, 12, -4)]
+        body.tube(carotid, 3.2, 900)
+        body.tube([carotid[-1], (side * 38, 14, 2), (side * 52, 4, 14), (side * 60, -14, 30)], 2.2, 800)
+        body.tube([(side * 38, 14, 2), (side * 50, 28, 18), (side * 52, 30, 40)], 1.6, 700)
+        body.tube([carotid[-1], (side * 4, 32, 2), (side * 4, 52, 18), (side * 4, 46, 42)], 1.8, 750)
+        body.tube([(side * 6, -12, -70), (0, -8, -36)], 2.2, 850)
+        body.tube([(0, -4, -10), (side * 18, -22, -4), (side * 24, -52, 4), (side * 14, -66, 16)], 1.8, 750)
+    body.tube([(0, -8, -36), (0, -4, -10)], 2.8, 880)
+    random = np.random.default_rng(6)
+    values = blur(body.values, 0.7) * (1 + 0.05 * texture(HEAD, 5, 6))
+    values = np.hypot(values + random.normal(0, 12, HEAD), random.normal(0, 12, HEAD))
+    return Volume(values.astype(np.int16), body.spacing, name="angiography", space="RAS")  # type: ignore[arg-type]
+
+
+def density() -> Volume:
+    """The map of a particle by cryo-electron microscopy: a ring of helices in a noisy box, angstroms."""
+    shape = (110, 110, 110)
+    body = Body(shape, (80, 80, 80), 0)
+    turn = np.linspace(0, 6 * np.pi, 60)
+    for k in range(7):
+        angle = 2 * np.pi * k / 7
+        for radius, high in ((44, 0), (30, 10)):
+            middle = radius * np.array([np.cos(angle), np.sin(angle)])
+            coil = [(middle[0] + 5 * np.cos(t), middle[1] + 5 * np.sin(t), high - 30 + 60 * t / turn[-1]) for t in turn]
+            body.tube(coil, 3.0, 1.0)
+    values = blur(body.values, 1.3) + 0.02 * texture(shape, 1.2, 8)
+    return Volume(values.astype(np.float32), body.spacing, name="density", density=True)  # type: ignore[arg-type]
+
+
+def orbital() -> Volume:
+    """A 3d orbital (xy) of hydrogen: lobes of both signs, angstroms."""
+    axis = np.linspace(-14, 14, 100)
+    z, y, x = np.meshgrid(axis, axis, axis, indexing="ij")
+    values = x * y * np.exp(-np.sqrt(x * x + y * y + z * z) / 1.6)
+    return Volume(values.astype(np.float32), (0.28, 0.28, 0.28), name="orbital", density=True)

@@ -70,6 +70,11 @@ def nrrd() -> list[Seed]:
         Seed("f.nrrd", vectors + np.repeat(FLOATS, 3).astype(">f4").tobytes(), volume_reader(component="magnitude")),
         Seed("g.nhdr", head("raw", "data file: LIST\ns0.raw\ns1.raw\ns2.raw")[:-1], READ, slices),
         Seed("h.nhdr", head("raw", "data file: s%d.raw 0 2 1\n"), READ, slices),
+        Seed(
+            "i.seq.nrrd",
+            vectors.replace(b"vector", b"list") + np.repeat(FLOATS, 3).astype(">f4").tobytes(),
+            volume_reader(time=1),
+        ),
     ]
 
 
@@ -104,25 +109,6 @@ def inviwo() -> list[Seed]:
     series = b"ObjectFileName: v.raw\nResolution: 5 4 1\nFormat: SHORT\nSequences: 3\nSliceThickness: 1 1 2\n"
     beside = {"v.raw": b"xx" + VALUES.tobytes()}
     return [Seed("a.dat", text, READ, beside), Seed("b.dat", series, volume_reader(component=2), beside)]
-
-
-def nifti() -> list[Seed]:
-    import nibabel as nib
-
-    affine = np.diag([1.0, 2, 3, 1])
-    first = nib.Nifti1Image(VALUES.T, affine)
-    first.header.set_slope_inter(2, 1)
-    second = nib.Nifti2Image(np.stack([FLOATS.T] * 2, axis=3), affine)
-    pair = nib.Nifti1Pair(VALUES.T, affine)
-    maps = pair.make_file_map({"header": io.BytesIO(), "image": io.BytesIO()})
-    pair.to_file_map(maps)
-    header, image = (maps[k].fileobj.getvalue() for k in ("header", "image"))
-    return [
-        Seed("a.nii", first.to_bytes(), READ),
-        Seed("b.nii.gz", first.to_bytes(), READ, pack=gzip.compress),
-        Seed("c.nii", second.to_bytes(), volume_reader(component=1)),
-        Seed("d.hdr", header, READ, {"d.img": image}),
-    ]
 
 
 def slc() -> list[Seed]:
@@ -256,6 +242,7 @@ def transfer() -> list[Seed]:
     from test_look_formats import ITF, XML, mrml, vp, vp_json
 
     from vvgt_cli.look import read_transfer_function
+    from vvgt_cli.look.readers.named import FILE as NAMED
 
     def read(path: Path) -> None:
         tf = read_transfer_function(str(path))
@@ -277,6 +264,7 @@ def transfer() -> list[Seed]:
         Seed("d.itf", ITF.format(lo=0, hi=0.9, type=0).encode(), read),
         Seed("e.vp", vp().encode(), read),
         Seed("f.vp.json", json.dumps(vp_json()).encode(), read),
+        Seed("named.json", json.dumps(json.loads(NAMED.read_text())[0]["function"], indent=1).encode(), read),
         Seed("presets.xml", mrml().encode(), lambda path: read(Path(f"{path}#CT-AAA"))),
     ]
 
@@ -377,12 +365,14 @@ def manifest() -> list[Seed]:
 
 def readers() -> dict[str, list[Seed]]:
     """Seeds by reader."""
+    from fuzz_seeds_scans import scans
+
     return {
         "raw": raw(),
         "NRRD": nrrd(),
         "MetaImage": metaimage(),
         "Inviwo": inviwo(),
-        "NIfTI": nifti(),
+        **scans(),
         "SLC": slc(),
         "TIFF": tiff(),
         "VTK legacy": vtk_legacy(),

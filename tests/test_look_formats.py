@@ -324,7 +324,7 @@ def test_convert_refusals(vvgt, file, tmp_path: Path) -> None:
     for args, message in (
         ((bent, out, "--format", "paraview"), "midpoints or sharpness of colours; a ParaView preset cannot hold that"),
         ((bent, out), "midpoints, sharpness or a logarithmic scale; the minimal format cannot hold that"),
-        ((itf, out), "a share of the volume's edge"),
+        ((itf, out, "--format", "paraview"), "a share of the volume's edge"),
         ((share, out, "--format", "paraview"), "percentiles; a ParaView preset cannot hold that"),
         ((share, out, "--tf-range", "0,1"), "leave out --tf-range"),
         ((itf, out, "--tf-range", "rescale"), "needs the data"),

@@ -221,7 +221,7 @@ def test_colormap_names():
 @pytest.mark.parametrize(
     ("source", "message"),
     [
-        ("virids", "neither a file nor a matplotlib colour map; did you mean viridis"),
+        ("virids", "neither a file, a name of 'vvgt tf list' nor a matplotlib colour map; did you mean viridis"),
         ("", "an empty name"),
         ("viridis:1", "expected NAME"),
         ("viridis:a,b", "expected NAME"),

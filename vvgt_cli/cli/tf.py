@@ -63,6 +63,23 @@ def convert(tf: str, output: str, form: str, tf_range: str, overwrite: bool, con
     convert_transfer_function(tf, output, form, tf_range, overwrite, console)
 
 
+@command.command("list", short_help="List the named functions.")
+@common_options
+def list_named(console: Console) -> None:
+    """Print the names of the functions that --tf and 'vvgt tf' take besides files and colour maps, and what each shows.
+
+    \b
+    Examples:
+      vvgt tf list
+      vvgt tf convert ct-bone mine.json
+    """
+    from vvgt_cli.look.readers.named import names
+
+    found = names()
+    for name, shows in found.items():
+        click.echo(f"{name:<{max(map(len, found)) + 2}}{shows}")
+
+
 @command.command("suggest", short_help="Suggest functions that each show one range of values.")
 @click.argument("volume")
 @click.option(

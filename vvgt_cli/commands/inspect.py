@@ -20,6 +20,7 @@ from vvgt_cli.gaussians.formats import format_of, read_splats
 from vvgt_cli.look.label_files import holds_table, is_table, read_labels, segments_of
 from vvgt_cli.look.labels import LabelTable
 from vvgt_cli.look.readers import SUFFIXES
+from vvgt_cli.look.readers.named import names
 from vvgt_cli.volume import ReadOptions
 from vvgt_cli.volume.packed import Packed
 from vvgt_cli.volume.registry import contents
@@ -39,6 +40,8 @@ def inspect(file: str, read: ReadOptions) -> dict[str, Any]:
     if file == STDIN and _head_of_stdin().startswith(_PLY):
         return {"kind": "gaussians", "name": "standard input", **describe(*read_ply(sys.stdin.buffer))}
     if not os.path.exists(file) and os.path.isfile(file.rpartition("#")[0]):  # a preset of several
+        return _transfer_function(file)
+    if not os.path.exists(file) and file in names():
         return _transfer_function(file)
     path = seekable(file)
     if not os.path.isfile(path):  # standard input, example:NAME, a folder, a glob, FILE:/array, or nothing
@@ -93,6 +96,10 @@ def _transfer_function(file: str) -> dict[str, Any]:
     tf = read_transfer_function(file)
     lo, hi = tf.node_range()
     facts: dict[str, Any] = {"kind": "transfer function", "name": tf.name, "nodes": [lo, hi]}
+    if tf.domain != "data":
+        facts["nodes_in"] = tf.domain
+    if tf.opacity_unit_share is not None:
+        facts["opacity_per"] = f"{tf.opacity_unit_share:g} of the longest edge"
     if tf.opacity_unit_distance is not None:
         facts["opacity_per"] = f"{tf.opacity_unit_distance:g} ({tf.opacity_unit_label})"
     if tf.lighting is not None:
@@ -112,6 +119,7 @@ def _entries(table: LabelTable) -> list[dict[str, Any]]:
 def _volume(file: str, read: ReadOptions) -> dict[str, Any]:
     from vvgt_cli.field.layered import open_parts
     from vvgt_cli.look import unit_distance
+    from vvgt_cli.look.fitting import fitting
     from vvgt_cli.volume import statistics
     from vvgt_cli.volume.label_maps import recognised
 
@@ -160,4 +168,5 @@ def _volume(file: str, read: ReadOptions) -> dict[str, Any]:
         "inf": numbers.inf_count,
         "unit_distance": {name: unit_distance(name, volume, None)[0] for name in ("paraview", "mean-spacing")},
         **listed,
+        **({"tf": fits} if (fits := None if kinds else fitting(numbers, volume)) else {}),
     }

@@ -27,6 +27,7 @@ def show_transfer_function(
     function = read_transfer_function(tf)
     numbers = None
     if volume is not None:
-        numbers = statistics(open_volume(volume, read))
-        function = resolve(function, numbers, tf_range)
+        data = open_volume(volume, read)
+        numbers = statistics(data)
+        function = resolve(function, numbers, tf_range, data.hounsfield)
     draw(function, numbers, output, overwrite)

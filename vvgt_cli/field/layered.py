@@ -261,8 +261,10 @@ def functions_of(
         kind = "opacity of the file" if len(opened.volumes) > 3 else "opacity by luminance"
         return [resolve(tf, numbers[0], tf_range) if tf else _function(kind, 0.0, _white(opened), (1, 1, 1))]
     if opened.one_field:
-        made = None if tf else from_histogram(numbers[0], opened.volumes[0].hounsfield)
-        return [made or resolve(tf, numbers[0], tf_range)]  # type: ignore[arg-type]
+        one = opened.volumes[0]
+        if tf is None:
+            return [from_histogram(numbers[0], one.hounsfield, one.density)]
+        return [resolve(tf, numbers[0], tf_range, one.hounsfield)]
     return [_channel(k, opened.colors[k], its, tf, tf_range) for k, its in enumerate(numbers)]
 
 

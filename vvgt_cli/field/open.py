@@ -271,8 +271,9 @@ def needs_histogram(request: SourceRequest) -> bool:
 
     if request.tf is None:
         return True
-    tf = read_transfer_function(request.tf) if isinstance(request.tf, str) else request.tf
-    return tf.domain == "percentile" or any(layer.tf is None and layer.labels is None for layer in request.layers)
+    given = [request.tf, *(layer.tf for layer in request.layers if layer.labels is None)]
+    functions = [read_transfer_function(tf) if isinstance(tf, str) else tf for tf in given]
+    return any(tf is None or tf.of_histogram for tf in functions)
 
 
 def _runner(options: BlockOptions) -> Runner:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol, Self
 
@@ -59,7 +60,8 @@ class Here(Alone):
 
 
 def _begin(threads: int) -> None:
-    """Before a process imports its kernels: how many threads they have."""
+    """Before a process imports its kernels: how many threads they have; what is to be said the first process says."""
+    warnings.simplefilter("ignore")
     os.environ["NUMBA_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = str(threads)
 
 

@@ -231,7 +231,10 @@ def load_all(
     sources = []
     for tf, lighting in zip(functions, lights, strict=True):
         whole = request.statistics[0] if request.statistics else numbers
-        shown = resolve(tf, whole, tf_range) if tf else from_histogram(whole, volume.hounsfield)
+        if tf:
+            shown = resolve(tf, whole, tf_range, volume.hounsfield)
+        else:
+            shown = from_histogram(whole, volume.hounsfield, volume.density)
         if tf is None and whole.lo == whole.hi:
             warnings.warn(
                 f"{volume.name}: every voxel is {whole.lo:g}, so that only the box is seen; check --dtype, --component "

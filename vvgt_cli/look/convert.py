@@ -12,6 +12,7 @@ from vvgt_cli.look.colormap import ColorMap
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.lighting import COEFFICIENTS
 from vvgt_cli.look.opacity import PiecewiseOpacity
+from vvgt_cli.look.resolve import BY
 
 
 def placed(tf: TransferFunction, limits: tuple[float, float] | None) -> TransferFunction:
@@ -20,9 +21,9 @@ def placed(tf: TransferFunction, limits: tuple[float, float] | None) -> Transfer
     Raises:
         UsageError: fractions of a range and no limits, or limits for percentiles.
     """
-    if tf.domain == "percentile":
+    if tf.domain in BY:
         if limits is not None:
-            raise UsageError(f"{tf.name}: its nodes are percentiles of the data; leave out --tf-range")
+            raise UsageError(f"{tf.name}: its nodes are {BY[tf.domain]} of the data; leave out --tf-range")
         return tf
     if tf.domain == "fraction":
         if limits is None:
@@ -59,28 +60,25 @@ def _refuse(tf: TransferFunction, what: str, form: str, hint: str) -> DataError:
     return DataError(f"{tf.name}: {what}; {form} cannot hold that: {hint}")
 
 
-def _check_share(tf: TransferFunction, form: str) -> None:
-    if tf.opacity_unit_share is not None:
-        raise _refuse(
-            tf, "its opacity is per a share of the volume's edge", form, "use the file as it is, or state the length"
-        )
-
-
 def _minimal(tf: TransferFunction) -> dict[str, Any]:
     hint = "try --format paraview"
-    _check_share(tf, "the minimal format")
     if not _linear(tf.opacity_nodes) or not _linear(tf.color_map):
         raise _refuse(tf, "midpoints, sharpness or a logarithmic scale", "the minimal format", hint)
     if tf.color_map.space == "HSV" and not tf.color_map.hsv_wrap:
         raise _refuse(tf, "HSV the long way round", "the minimal format", hint)
     body: dict[str, Any] = {"name": tf.name}
-    if tf.domain == "percentile":
-        body["range"] = "percentile"
+    if tf.domain in BY:
+        body["range"] = tf.domain
     body["points"] = _points(tf)
     if tf.color_map.space != "RGB":
         body["color_space"] = tf.color_map.space
     if tf.opacity_unit_distance is not None:
         body["opacity_unit_distance"] = tf.opacity_unit_distance
+    if tf.opacity_unit_share is not None:
+        body["opacity_unit_share"] = tf.opacity_unit_share
+    if tf.otherwise is not None:
+        inner = _minimal(tf.otherwise)
+        body["otherwise"] = {key: inner[key] for key in ("range", "points") if key in inner}
     if tf.lighting is not None:
         body["lighting"] = {name: getattr(tf.lighting, name) for name in COEFFICIENTS}
     return body
@@ -101,9 +99,12 @@ def _points(tf: TransferFunction) -> list[dict[str, Any]]:
 
 def _paraview(tf: TransferFunction) -> list[dict[str, Any]]:
     opacity, color = tf.opacity_nodes, tf.color_map
-    _check_share(tf, "a ParaView preset")
-    if tf.domain == "percentile":
-        raise _refuse(tf, "its nodes are percentiles", "a ParaView preset", "try --format minimal")
+    if tf.opacity_unit_share is not None:
+        raise _refuse(
+            tf, "its opacity is per a share of the volume's edge", "a ParaView preset", "try --format minimal"
+        )
+    if tf.domain in BY:
+        raise _refuse(tf, f"its nodes are {BY[tf.domain]}", "a ParaView preset", "try --format minimal")
     inner = slice(0, -1)
     if (color.midpoint[inner] != 0.5).any() or (color.sharpness[inner] != 0).any():
         raise _refuse(tf, "midpoints or sharpness of colours", "a ParaView preset", "use the file as it is")

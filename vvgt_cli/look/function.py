@@ -12,7 +12,7 @@ from vvgt_cli.look.colormap import ColorMap
 from vvgt_cli.look.lighting import Lighting
 from vvgt_cli.look.opacity import PiecewiseOpacity
 
-DOMAINS = ("data", "fraction", "percentile")
+DOMAINS = ("data", "fraction", "percentile", "foreground", "sigma")
 
 
 @dataclass(frozen=True)
@@ -27,8 +27,10 @@ class TransferFunction:
         opacity_unit_label: where ``opacity_unit_distance`` is from: the ``file``, or a default of its program.
         opacity_unit_share: the same as a share of the longest edge of the volume's box (Inviwo); not both.
         domain: what the node positions are: ``data`` values; a ``fraction`` in [0, 1] of the data range;
-            or a ``percentile`` / 100 of the voxels. `vvgt_cli.look.resolve.resolve` turns all into data values.
+            a ``percentile`` / 100 of the voxels, or of those in the ``foreground``; or ``sigma``, standard deviations
+            above the mean. `vvgt_cli.look.resolve.resolve` turns all into data values.
         lighting: that the source asks for, None where it asks for none.
+        otherwise: the function for data that are not in Hounsfield units, where this one is for those.
 
     Raises:
         DataError: unknown domain, unit distance not finite and above 0, fractions outside [0, 1].
@@ -42,6 +44,7 @@ class TransferFunction:
     opacity_unit_share: float | None = None
     opacity_unit_label: str = "file"
     lighting: Lighting | None = None
+    otherwise: TransferFunction | None = None
 
     def __post_init__(self) -> None:
         if self.domain not in DOMAINS:
@@ -50,8 +53,13 @@ class TransferFunction:
         if distance is not None and not (math.isfinite(distance) and distance > 0):
             raise DataError(f"{self.name}: opacity unit distance {distance}; expected a positive number")
         lo, hi = self.node_range()
-        if self.domain != "data" and not 0 <= lo <= hi <= 1:
+        if self.domain not in ("data", "sigma") and not 0 <= lo <= hi <= 1:
             raise DataError(f"{self.name}: nodes in [{lo:g}, {hi:g}]; expected x in [0, 1] for a {self.domain}")
+
+    @property
+    def of_histogram(self) -> bool:
+        """Whether nodes follow from the histogram of the data, not from their range alone."""
+        return self.domain in ("percentile", "foreground", "sigma") or self.otherwise is not None
 
     def opacity(self, x: np.ndarray) -> np.ndarray:
         """Opacity in [0, 1] per unit distance at data values x (n,), float64 -> (n,); 0 at NaN."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -10,17 +11,16 @@ from vvgt_cli.errors import DataError
 from vvgt_cli.look.colormap import ColorMap
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.opacity import PiecewiseOpacity
-from vvgt_cli.look.resolve import StatisticsLike
+from vvgt_cli.look.readers.named import named_function
+from vvgt_cli.look.recognise import SIDE, background_bins, in_hounsfield, moments
+from vvgt_cli.look.resolve import StatisticsLike, resolve
 
 NAME = "automatic (histogram)"
 HOUNSFIELD = "automatic (Hounsfield units)"
+CONTOUR = "automatic ({})"  # of densities: the named function
+BOTH = 0.5  # depth of the negative side of a density, of that of the positive one, from which it is shown too
 UNIT_SHARE = 1 / 256  # of the box's longest edge: what opacities are per, so that they do not depend on voxels or units
-DOMINANT = 0.25  # share of the voxels from which a peak counts as a background
-AMID = 0.125  # share of the value range that a background spans at most, where it is not the lowest (ambient)
-SIDE = 0.02  # share of the foreground that a side of the background must hold to be shown
 SIDE_WIDTH = 0.125  # share of the value range that it must span: less is padding or clipping
-PADDING_BINS = 2  # a first peak this narrow, at the low end, may be padding with the air peak behind it
-BEHIND_AIR = 0.2  # share of the voxels other than padding that must lie behind a peak for it to be air
 DEPTH = 4.0  # optical depth of the foreground along the longest edge, on average over the box
 RISE = 2.0  # power of the distance from the background by which ranges of values share that depth
 NODES = 33  # of opacity, a side
@@ -40,9 +40,6 @@ COLORS = np.array(
     ]
 )
 COLD = COLORS[:, ::-1]
-AIR, BETWEEN, TISSUE = (-1100.0, -850.0), (-700.0, -250.0), (-200.0, 300.0)  # HU
-SHARE = 0.03  # of the voxels that must be air's, and tissue's, for values to be Hounsfield units
-PEAK = 2.0  # times as many voxels per HU as between the two
 # HU, opacity per unit distance, colour: air; skin, lungs' and bowels' walls; fat; organs; vessels with contrast; bone
 TISSUES = (
     (-700, 0.0, (0.75, 0.45, 0.35)),
@@ -59,22 +56,24 @@ TISSUES = (
 )
 
 
-def from_histogram(statistics: StatisticsLike, hounsfield: bool = False) -> TransferFunction:
+def from_histogram(statistics: StatisticsLike, hounsfield: bool = False, density: bool = False) -> TransferFunction:
     """A transfer function chosen from the histogram; deterministic.
 
-    Hounsfield units (told, or air near -1000 and tissue around 0) get `TISSUES`. Of other values the peak that holds
-    most voxels is background: its foot is found by the triangle method (Zack, Rogers, Latt 1977), on each side that
-    leads to more data; a second dominant peak right behind it (air behind narrow padding) is skipped too. Every value
-    in front of it has its part of an optical depth of `DEPTH`, by the square of its distance from the background and
-    however many voxels hold it: what is common (the inside of things) is thin, what is rare (small things, the
-    brightest) is thick. Data without a dominant peak are shown whole.
+    Densities get contours at standard deviations above the mean, and below it where they go nearly as far down
+    (`contours`). Hounsfield units (told, or air near -1000 and tissue around 0) get `TISSUES`. Of other values the peak
+    that holds most voxels is background: its foot is found by the triangle method (Zack, Rogers, Latt 1977), on each
+    side that leads to more data; a second dominant peak right behind it (air behind narrow padding) is skipped too.
+    Every value in front of it has its part of an optical depth of `DEPTH`, by the square of its distance from the
+    background and however many voxels hold it: what is common (the inside of things) is thin, what is rare (small
+    things, the brightest) is thick. Data without a dominant peak are shown whole.
 
     Args:
         statistics: range and histogram of the data.
         hounsfield: whether the file says that data values are Hounsfield units.
+        density: whether it is a map of densities.
 
     Returns:
-        The function on data values, opacity per `UNIT_SHARE`, named `NAME` or `HOUNSFIELD`.
+        The function on data values, opacity per `UNIT_SHARE`, named `NAME`, `HOUNSFIELD` or `CONTOUR`.
 
     Raises:
         DataError: no finite voxel.
@@ -86,6 +85,13 @@ def from_histogram(statistics: StatisticsLike, hounsfield: bool = False) -> Tran
         raise DataError("the data have no finite voxel; expected some to choose a transfer function from")
     if lo == hi:  # a box, seen through
         return _function(NAME, np.array([lo]), np.array([FAINT]), ColorMap(np.array([lo]), COLORS[3:4], space="Lab"))
+    if density:
+        name = contours(counts, edges)
+        shown = replace(
+            resolve(named_function(name), statistics), name=CONTOUR.format(name), opacity_unit_label="automatic"
+        )
+        if shown.support(lo, hi):
+            return shown
     if hounsfield or in_hounsfield(counts, edges):
         x, y, rgb = (np.array(column, dtype=np.float64) for column in zip(*TISSUES, strict=True))
         tissues = _function(HOUNSFIELD, x, y, ColorMap(x, rgb, space="Lab"))
@@ -112,20 +118,18 @@ def from_histogram(statistics: StatisticsLike, hounsfield: bool = False) -> Tran
     return _function(NAME, at, np.array(opacities), ColorMap(at, np.array(colors), space="Lab"))
 
 
+def contours(counts: np.ndarray, edges: np.ndarray) -> str:
+    """Name of the function for a density: of both signs where its least value is far below the mean too."""
+    mean, _ = moments(counts, edges)
+    filled = np.flatnonzero(counts)
+    below, above = mean - float(edges[filled[0]]), float(edges[filled[-1] + 1]) - mean
+    return "density-difference" if below >= BOTH * above else "density-contour"
+
+
 def _function(name: str, x: np.ndarray, y: np.ndarray, colors: ColorMap) -> TransferFunction:
     return TransferFunction(
         name, PiecewiseOpacity(x, y), colors, opacity_unit_share=UNIT_SHARE, opacity_unit_label="automatic"
     )
-
-
-def in_hounsfield(counts: np.ndarray, edges: np.ndarray) -> bool:
-    """Whether data values are Hounsfield units: a peak of them is air's, another one is tissue's."""
-    cumulative = np.concatenate([[0.0], np.cumsum(counts)]) / counts.sum()
-    spans = (AIR, BETWEEN, TISSUE)
-    air, between, tissue = (float(np.diff(np.interp(span, edges, cumulative))[0]) for span in spans)
-    highest = PEAK * between / (BETWEEN[1] - BETWEEN[0])
-    peaks = air / (AIR[1] - AIR[0]) > highest and tissue / (TISSUE[1] - TISSUE[0]) > highest
-    return peaks and min(air, tissue) >= SHARE
 
 
 def _side(counts: np.ndarray, total: float, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -159,37 +163,3 @@ def _worth_showing(side: slice, counts: np.ndarray) -> bool:
     inside = counts[side]
     # of the foreground as a whole: all but the voxels of the highest bin, which is always background
     return inside.size >= SIDE_WIDTH * counts.size and inside.sum() >= SIDE * (counts.sum() - counts.max()) > 0
-
-
-def background_bins(counts: np.ndarray) -> tuple[int, int]:
-    """Bins [first, last) of the background; an empty range at 0 when no peak dominates, or a wide one above others."""
-    total = counts.sum()
-    first, last = _peak(counts)
-    if counts[first:last].sum() < DOMINANT * total:
-        return 0, 0
-    if counts[:first].sum() >= SIDE * (total - counts.max()) > 0 and last - first > AMID * counts.size:
-        return 0, 0
-    rest = counts[last:]
-    if first == 0 and last <= PADDING_BINS and rest.sum() > 0:
-        a, b = _peak(rest)
-        behind = rest[b:].sum()
-        apart = 0 < a <= counts.size // 2  # at 0 it is the padding's own falling tail
-        if apart and rest[a:b].sum() >= DOMINANT * total and behind >= BEHIND_AIR * rest.sum():
-            last += b
-    return first, last
-
-
-def _peak(counts: np.ndarray) -> tuple[int, int]:
-    """Bins [first, last) of the highest peak, out to its feet."""
-    top = int(np.argmax(counts))
-    return top - _foot(counts[top::-1]) + 1, top + _foot(counts[top:])
-
-
-def _foot(falling: np.ndarray) -> int:
-    """Bins from the peak (bin 0) to its foot: farthest below the line from the peak to the last filled bin."""
-    filled = np.flatnonzero(falling)
-    end = int(filled[-1])
-    if end < 2:
-        return end + 1
-    line = falling[0] + (falling[end] - falling[0]) * np.arange(end + 1) / end
-    return max(1, int(np.argmax(line - falling[: end + 1])))

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import math
 import warnings
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.look.recognise import foreground, in_hounsfield, moments
 from vvgt_cli.volume.types import Volume
 
+BY = {"percentile": "percentiles", "foreground": "percentiles of the foreground", "sigma": "standard deviations"}
 ABOUT_ONE = 2.0  # span of data up to which nodes in [0, 1] are values of theirs
 
 
@@ -52,7 +55,10 @@ def parse_tf_range(spec: str | tuple[float, float]) -> str | tuple[float, float]
 
 
 def resolve(
-    tf: TransferFunction, statistics: StatisticsLike, tf_range: str | tuple[float, float] = "data"
+    tf: TransferFunction,
+    statistics: StatisticsLike,
+    tf_range: str | tuple[float, float] = "data",
+    hounsfield: bool = False,
 ) -> TransferFunction:
     """The function with its nodes on data values.
 
@@ -61,6 +67,7 @@ def resolve(
         statistics: of the data.
         tf_range: ``data`` takes the nodes as they are (fractions and percentiles: of the data), ``rescale``
             stretches them linearly to the data range, ``LO,HI`` to that range.
+        hounsfield: whether the file says that data values are Hounsfield units; else the histogram tells.
 
     With ``data``, nodes in [0, 1] over data that are not may be meant as fractions of the range. A note says which
     was taken: values where the data overlap [0, 1] and span no more than `ABOUT_ONE`, else as with ``rescale``.
@@ -71,10 +78,15 @@ def resolve(
     """
     chosen = parse_tf_range(tf_range)
     lo, hi = _data_range(statistics)
-    if tf.domain == "percentile":
+    if tf.otherwise is not None and chosen == "data" and not (hounsfield or _in_hounsfield(statistics)):
+        warnings.warn(
+            f"{tf.name}: the data are not in Hounsfield units; shown by {BY[tf.otherwise.domain]}", stacklevel=2
+        )
+        tf = replace(tf.otherwise, name=f"{tf.name} ({BY[tf.otherwise.domain]})")
+    if tf.domain in BY:
         if chosen != "data":
-            raise UsageError(f"{tf.name}: its nodes are percentiles of the data; leave out --tf-range")
-        return tf.moved(percentiles(statistics, tf.breakpoints()))
+            raise UsageError(f"{tf.name}: its nodes are {BY[tf.domain]} of the data; leave out --tf-range")
+        return tf.moved(_positions(tf, statistics))
     if tf.domain == "fraction":
         a, b = (lo, hi) if isinstance(chosen, str) else chosen
         fraction = tf.breakpoints()
@@ -95,15 +107,34 @@ def resolve(
     return tf.rescaled(lo, hi)
 
 
+def _in_hounsfield(statistics: StatisticsLike) -> bool:
+    counts = np.asarray(statistics.histogram, dtype=np.float64)
+    return bool(counts.any()) and in_hounsfield(counts, np.asarray(statistics.edges, dtype=np.float64))
+
+
+def _positions(tf: TransferFunction, statistics: StatisticsLike) -> np.ndarray:
+    """Data values of the breakpoints (m,) of a function over what is counted of the data."""
+    counts, edges = (np.asarray(a, dtype=np.float64) for a in (statistics.histogram, statistics.edges))
+    if tf.domain == "sigma" and counts.any():
+        mean, deviation = moments(counts, edges)
+        return mean + deviation * tf.breakpoints()
+    front = foreground(counts) if tf.domain == "foreground" and counts.any() else counts
+    return _quantiles(front, edges, tf.breakpoints())
+
+
 def percentiles(statistics: StatisticsLike, fraction: np.ndarray) -> np.ndarray:
     """Data values below which ``fraction`` (n,) in [0, 1] of the voxels lie, linear within a histogram bin, (n,)."""
-    counts = np.asarray(statistics.histogram, dtype=np.float64)
+    counts, edges = (np.asarray(a, dtype=np.float64) for a in (statistics.histogram, statistics.edges))
+    return _quantiles(counts, edges, fraction)
+
+
+def _quantiles(counts: np.ndarray, edges: np.ndarray, fraction: np.ndarray) -> np.ndarray:
     cumulative = np.concatenate([[0.0], np.cumsum(counts)])
     if cumulative[-1] <= 0:
         raise DataError("the data have no finite voxel; expected some to take percentiles of")
-    result: np.ndarray = np.interp(
-        fraction, cumulative / cumulative[-1], np.asarray(statistics.edges, dtype=np.float64)
-    )
+    # from the first bin that counts to the last
+    first, last = np.flatnonzero(counts)[[0, -1]] + [0, 2]
+    result: np.ndarray = np.interp(fraction, cumulative[first:last] / cumulative[-1], edges[first:last])
     return result
 
 

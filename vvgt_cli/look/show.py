@@ -13,7 +13,13 @@ from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.resolve import StatisticsLike
 
 SAMPLES = 1024
-X_LABEL = {"data": "data value", "fraction": "fraction of the data range", "percentile": "fraction of the voxels"}
+X_LABEL = {
+    "data": "data value",
+    "fraction": "fraction of the data range",
+    "percentile": "fraction of the voxels",
+    "foreground": "fraction of the voxels in front of the background",
+    "sigma": "standard deviations above the mean",
+}
 
 
 def draw(

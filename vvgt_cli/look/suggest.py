@@ -16,7 +16,7 @@ import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.look.colorspace import lab_to_rgb
-from vvgt_cli.look.histogram import background_bins
+from vvgt_cli.look.recognise import background_bins
 from vvgt_cli.look.resolve import StatisticsLike
 
 BY_VALUE = 0.5  # bands are equal half by the voxels in them, half by their width

@@ -1,11 +1,16 @@
 """Volumes and their readers."""
 
 from vvgt_cli.volume import (  # noqa: F401  each registers its formats
+    analyze,
     dicom,
     examples,
+    grid_text,
     hdf5,
     inviwo,
     metaimage,
+    mgh,
+    minc,
+    mrc,
     netcdf,
     nifti,
     nrrd,

@@ -23,6 +23,7 @@ from vvgt_cli.volume.types import Volume
 MAGIC = b"\x89HDF\r\n\x1a\n"
 MOST_LISTED = 12
 MOST_VISITED = 100_000
+_OTHERS = (b"VTKHDF", b"_NCProperties", b"minc-2.0")  # what tells formats that are HDF5 files too
 MAX_CHUNK = 1 << 31  # bytes of one chunk, unpacked
 
 
@@ -37,7 +38,7 @@ def read_hdf5(path: Path, options: ReadOptions) -> Volume:
     with library_errors(str(path), "HDF5"), h5py.File(path, "r") as file:
         dataset = _choose(h5py, file, options.array, path)
         source = f"{path}:{dataset.name}"
-        _check_storage(h5py, dataset, path, source)
+        check_storage(h5py, dataset, path, source)
         mapped = _mapped(dataset, path)
         stored = mapped if mapped is not None else lambda index: dataset[index]
         name = f"{volume_name(path)}:{dataset.name.strip('/')}"
@@ -102,7 +103,7 @@ def _check_links(h5py: Any, file: Any, wanted: str, path: Path) -> None:
         place = place.get(part) if link is not None else None
 
 
-def _check_storage(h5py: Any, dataset: Any, path: Path, source: str) -> None:
+def check_storage(h5py: Any, dataset: Any, path: Path, source: str) -> None:
     """Refuse values in files outside of this one's folder, filters that are not there, and chunks beyond all bounds."""
     if dataset.external:
         raise DataError(f"{source}: its values lie in other files (external storage); try h5repack to bring them in")
@@ -161,7 +162,7 @@ register(
     Reader(
         "HDF5",
         (".h5", ".hdf5", ".he5", ".hdf"),
-        lambda head: head.startswith(MAGIC) and b"VTKHDF" not in head and b"_NCProperties" not in head,
+        lambda head: head.startswith(MAGIC) and not any(other in head for other in _OTHERS),
         read_hdf5,
         named_arrays=True,
         resamples=True,

@@ -86,7 +86,8 @@ def _axis(variable: Any, name: str, size: int) -> Axis:
 
 
 def _sniff(head: bytes) -> bool:
-    classic = head[:4] in (b"CDF\x01", b"CDF\x02", b"CDF\x05") and b"floating_point_word_size" not in head  # Exodus
+    other = b"floating_point_word_size" in head or b"MINC standard" in head  # Exodus, MINC 1
+    classic = head[:4] in (b"CDF\x01", b"CDF\x02", b"CDF\x05") and not other
     return classic or (head.startswith(MAGIC) and b"_NCProperties" in head)
 
 

@@ -6,26 +6,24 @@ Format: nifti1.h and nifti2.h (NIMH); scaling as section "DATA SCALING" has it: 
 
 from __future__ import annotations
 
-import gzip
 import math
 import struct
-import zlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from vvgt_cli.errors import DataError, SeveralSteps, UsageError
+from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import load_block
 from vvgt_cli.volume.components import select_component
+from vvgt_cli.volume.frames import Frames, load_frames, read_head
 from vvgt_cli.volume.headers import unit_rows
 from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.packed import packed
 from vvgt_cli.volume.readers import Reader, register, volume_name
 from vvgt_cli.volume.types import FLAT, IDENTITY, Volume
 
-_DTYPES = {
+DTYPES = {
     2: "u1",
     4: "i2",
     8: "i4",
@@ -45,7 +43,8 @@ _OTHERS = {
     1792: "complex128",
     2048: "complex256",
 }
-_MAGIC = {b"n+1\0": True, b"ni1\0": False, b"n+2\0": True, b"ni2\0": False}
+HEADER = 540  # bytes of the longer one
+MAGIC = {b"n+1\0": True, b"ni1\0": False, b"n+2\0": True, b"ni2\0": False}
 
 
 @dataclass(frozen=True)
@@ -67,7 +66,7 @@ class Header:
     time_unit: str = ""  # where the header says one
 
 
-def _order(head: bytes) -> tuple[str, int] | None:
+def byte_order(head: bytes) -> tuple[str, int] | None:
     """Byte order and version, from sizeof_hdr."""
     for order in "<>":
         if len(head) >= 348 and struct.unpack_from(order + "i", head)[0] == 348:
@@ -78,8 +77,8 @@ def _order(head: bytes) -> tuple[str, int] | None:
 
 
 def _sniff(head: bytes) -> bool:
-    found = _order(head)
-    return found is not None and head[(344 if found[1] == 1 else 4) :][:4] in _MAGIC
+    found = byte_order(head)
+    return found is not None and head[(344 if found[1] == 1 else 4) :][:4] in MAGIC
 
 
 def parse_header(head: bytes, name: str) -> Header:
@@ -88,7 +87,7 @@ def parse_header(head: bytes, name: str) -> Header:
     Raises:
         DataError: no NIfTI header, a type without real numbers, or sizes below 1.
     """
-    found = _order(head)
+    found = byte_order(head)
     if found is None or not _sniff(head):
         raise DataError(f"{name}: no NIfTI header (348 or 540 bytes with the magic n+1, ni1, n+2 or ni2)")
     order, version = found
@@ -108,19 +107,19 @@ def parse_header(head: bytes, name: str) -> Header:
         quatern, sform, (units,), (start,) = get("6d", 352), get("12d", 400), get("i", 500), get("d", 216)
     if not 1 <= dim[0] <= 7 or min(dim[1 : dim[0] + 1]) < 1:
         raise DataError(f"{name}: dim {dim}; expected 1 to 7 axes of at least 1 voxel each")
-    if code not in _DTYPES and code not in _COLORS:
+    if code not in DTYPES and code not in _COLORS:
         raise DataError(
             f"{name}: values are {_OTHERS.get(code, f'of unknown type {code}')}; expected real numbers (convert it "
             "to one channel first)"
         )
     if not math.isfinite(offset) or offset < 0:
         raise DataError(f"{name}: vox_offset {offset}; expected 0 or more")
-    slope, intercept = _scaling(slope, intercept, name)
-    single = _MAGIC[magic]
+    slope, intercept = scaling(slope, intercept, name)
+    single = MAGIC[magic]
     least = {1: 352, 2: 544}[version] if single else 0
     return Header(
         dim[1 : dim[0] + 1],
-        np.dtype(order + _DTYPES.get(code, "u1")),
+        np.dtype(order + DTYPES.get(code, "u1")),
         single,
         max(int(offset), least),
         slope,
@@ -135,7 +134,7 @@ def parse_header(head: bytes, name: str) -> Header:
     )
 
 
-def _scaling(slope: float, intercept: float, name: str) -> tuple[float, float]:
+def scaling(slope: float, intercept: float, name: str) -> tuple[float, float]:
     """Slope and intercept; slope 0 or NaN means that the values are not scaled."""
     if slope == 0 or math.isnan(slope):
         return 1.0, 0.0
@@ -182,18 +181,6 @@ def _rotation(header: Header) -> tuple[float, ...]:
     return tuple(v for row in rows for v in row)
 
 
-def _read_head(path: Path) -> tuple[bytes, bool]:
-    with open(path, "rb") as file:
-        head = file.read(540)
-    if head[:2] != b"\x1f\x8b":
-        return head, False
-    try:
-        with gzip.open(path, "rb") as unzipped:
-            return unzipped.read(540), True
-    except (OSError, EOFError, zlib.error) as error:
-        raise DataError(f"{path}: damaged gzip data ({error}); try to fetch the file again") from error
-
-
 def _image_file(path: Path) -> tuple[Path, bool]:
     """The ``.img`` (or ``.img.gz``) of a pair's header."""
     stem = path.name[:-3] if path.name.endswith(".gz") else path.name
@@ -202,21 +189,6 @@ def _image_file(path: Path) -> tuple[Path, bool]:
         if image.is_file():
             return image, suffix.endswith(".gz")
     raise DataError(f"{path}: the header of a pair, without its .img file beside it")
-
-
-def _times(header: Header, options: ReadOptions, source: str) -> tuple[int, int]:
-    """Time steps and components; a lone fourth axis counts as components where a component is asked for."""
-    times, rest = math.prod(header.dims[3:4]), math.prod(header.dims[4:])
-    if options.time is None and times > 1:
-        if rest > 1 or options.component is None:
-            step = header.pixdim[4]
-            known = header.time_unit and math.isfinite(step) and step > 0 and math.isfinite(header.start)
-            at = [header.start + k * step for k in range(times)] if known else None
-            raise SeveralSteps(source, times, times=at, unit=header.time_unit)
-        return 1, times
-    if (options.time or 0) >= times:
-        raise UsageError(f"{source}: --time {options.time}: it has {times} time steps; expected 0 to {times - 1}")
-    return times, rest
 
 
 def read_nifti(path: Path, options: ReadOptions) -> Volume:
@@ -230,38 +202,22 @@ def read_nifti(path: Path, options: ReadOptions) -> Volume:
         DataError: a header that is damaged or does not fit the data, or complex values.
         UsageError: several components, or time steps (`SeveralSteps`), and none chosen.
     """
-    head, zipped = _read_head(path)
-    header = parse_header(head, str(path))
-    source, offset = path, header.offset
+    head, zipped = read_head(path, HEADER)
+    return read_parsed(parse_header(head, str(path)), path, zipped, options)
+
+
+def read_parsed(header: Header, path: Path, zipped: bool, options: ReadOptions) -> Volume:
+    """The volume of the header in ``path``, a file that may be ``zipped``; arguments and errors as `read_nifti`."""
+    source = path
     if not header.single:
         source, zipped = _image_file(path)
-    spatial = (*header.dims, 1, 1)[:3]
     if header.samples:
+        spatial = (*header.dims, 1, 1)[:3]
         return _placed(header, _colors(header, source, zipped, spatial, path, options), path, options)
-    times, rest = _times(header, options, str(path))
-    step, component = options.time or 0, options.component
-    number = None  # of the one volume that need be unpacked
-    if rest == 1:
-        number = step
-    elif isinstance(component, int) and component < rest:
-        number, component = component * times + step, None
-    if number is not None:
-        offset += number * math.prod(spatial) * header.dtype.itemsize
-        times, rest, step = 1, 1, 0
-    shape = (rest, times, *reversed(spatial))  # (c, t, z, y, x)
-    if zipped and options.packed and (rest, times, options.component) == (1, 1, None):
-        return _placed(header, packed(source, header.dtype, shape[2:], "gzip", skip=offset), path, options)
-    if zipped:
-        block = load_block(source, header.dtype, shape, encoding="gzip", skip=offset)
-    else:
-        block = load_block(source, header.dtype, shape, offset=offset)
-    field, (slope, intercept) = select_component(
-        np.moveaxis(block[:, step], 0, -1),
-        component,
-        str(path),
-        label="the series" if rest > 1 else "",
-        scaling=(header.slope, header.intercept),
-    )
+    frames = Frames(source, header.dtype, header.dims, header.offset, zipped, header.slope, header.intercept)
+    if header.time_unit:
+        frames = replace(frames, start=header.start, step=header.pixdim[4], unit=header.time_unit)
+    field, (slope, intercept) = load_frames(frames, options, str(path))
     return _placed(replace(header, slope=slope, intercept=intercept), field, path, options)
 
 

@@ -1,17 +1,19 @@
 """NRRD, attached (``.nrrd``) and detached (``.nhdr``, with one data file or several).
 
-Encodings: raw (memory-mapped where it is one file), gzip, bzip2 and text.
+Encodings: raw (memory-mapped where it is one file), gzip, bzip2 and text. Along an axis of
+kind ``time``, and of kind ``list`` in sequences of 3D Slicer (``.seq.nrrd``), time runs.
 
 Format: https://teem.sourceforge.net/nrrd/format.html
 """
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
 
-from vvgt_cli.errors import DataError
+from vvgt_cli.errors import DataError, SeveralSteps, UsageError
 from vvgt_cli.volume.blocks import data_file, load_block
 from vvgt_cli.volume.components import select_component
 from vvgt_cli.volume.headers import MAX_HEADER, Fields, unit_rows
@@ -46,6 +48,7 @@ _ENCODINGS = {
     "ascii": "text",
 }
 _SPATIAL_KINDS = {"domain", "space", "???", "none"}
+_SEQUENCE = re.compile(r"\.seq\.n(rrd|hdr)$", re.I)  # how 3D Slicer names them
 
 
 def read_header(path: Path) -> tuple[Fields, int]:
@@ -127,6 +130,31 @@ def _component_axis(fields: Fields, sizes: list[int], vectors: list[list[float] 
     return odd[0] if odd else None
 
 
+def _time_axis(path: Path, fields: Fields, axis: int | None) -> bool:
+    """Whether the axis beyond space is one of time."""
+    kinds = fields.get("kinds", "").lower().split()
+    kind = kinds[axis] if axis is not None and axis < len(kinds) else ""
+    return kind == "time" or (kind == "list" and _SEQUENCE.search(path.name) is not None)
+
+
+def _step(block: np.ndarray, options: ReadOptions, source: str) -> int | str | None:
+    """What is chosen of time steps along a block's last axis: by ``time``, or by ``component``.
+
+    Raises:
+        UsageError: none is (`SeveralSteps`), both are, or one that does not exist.
+    """
+    times = block.shape[-1]
+    if options.time is None:
+        if options.component is None and times > 1:
+            raise SeveralSteps(source, times)
+        return options.component
+    if options.component is not None:
+        raise UsageError(f"{source}: --time and --component both choose along its one axis of time; leave out one")
+    if options.time >= times:
+        raise UsageError(f"{source}: --time {options.time}: it has {times} time steps; expected 0 to {times - 1}")
+    return options.time if times > 1 else None
+
+
 def _geometry(
     fields: Fields, vectors: list[list[float] | None] | None, axis: int | None
 ) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...], str | None]:
@@ -187,7 +215,7 @@ def read_nrrd(path: Path, options: ReadOptions) -> Volume:
 
     Raises:
         DataError: a header that is incomplete or does not fit the data, a data file outside the header's folder.
-        UsageError: several components and none chosen.
+        UsageError: several components, or time steps (`SeveralSteps`), and none chosen.
     """
     fields, offset = read_header(path)
     encoding = _ENCODINGS.get(fields.need("encoding").lower())
@@ -235,8 +263,15 @@ def _volume(path: Path, fields: Fields, block: np.ndarray, sizes: list[int], opt
         block = block[None]
     color = "rgb" in fields.get("kinds", "").lower()
     label = f"axis {axis}" if axis is not None else ""
-    field, _ = select_component(block, options.component, str(path), label=label, color=color)
+    component = options.component
+    if _time_axis(path, fields, axis):
+        component = _step(block, options, str(path))
+    elif options.time:
+        raise UsageError(
+            f"{path}: no axis of time (of kind time, or list in a .seq.nrrd); leave out --time {options.time}"
+        )
+    field, _ = select_component(block, component, str(path), label=label, color=color)
     return Volume(field, options.spacing_or(spacing), origin, direction, volume_name(path), space=space)
 
 
-register(Reader("NRRD", (".nrrd", ".nhdr"), lambda head: head.startswith(b"NRRD000"), read_nrrd))
+register(Reader("NRRD", (".nrrd", ".nhdr"), lambda head: head.startswith(b"NRRD000"), read_nrrd, times=True))

@@ -32,7 +32,8 @@ def _header(stream: IO[bytes], source: str) -> tuple[tuple[int, ...], bool, np.d
     reader = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     try:
         shape, fortran, dtype = reader(stream, max_header_size=_HEADER)
-    except (TokenError, SyntaxError) as error:  # numpy reads headers of Python 2 with a tokenizer, others as Python
+    except (TokenError, SyntaxError, TypeError) as error:
+        # numpy reads headers of Python 2 with a tokenizer, others as Python; of types it takes what it gets
         raise DataError(f"{source}: damaged .npy header ({error.args[0]}); check that it is whole") from error
     if dtype.kind not in "iufb":
         raise DataError(f"{source}: values of type {dtype}; expected integers or floats (objects are never unpickled)")

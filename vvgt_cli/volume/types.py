@@ -61,6 +61,7 @@ class Volume:
         space: anatomical space that direction and origin are in, "RAS" or "LPS", None where there is none.
         hounsfield: whether the file says that data values are Hounsfield units.
         reference: UID of DICOM's frame of reference: positions of two volumes compare where it is the same.
+        density: whether it is a map of densities (MRC, CCP4, cube, OpenDX), which are shown by standard deviations.
 
     Raises:
         DataError: wrong rank, empty axis, dtype that is not real, spacing not finite and positive, axes in a plane.
@@ -76,6 +77,7 @@ class Volume:
     space: str | None = None
     hounsfield: bool = False
     reference: str | None = None
+    density: bool = False
 
     def __post_init__(self) -> None:
         if self.data.ndim != 3 or min(self.data.shape) < 1:

@@ -9,7 +9,7 @@ from typing import Any
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.look.function import TransferFunction
-from vvgt_cli.look.readers import colormap_name, inviwo, minimal, paraview, paraview_xml, slicer, vtkjs
+from vvgt_cli.look.readers import colormap_name, inviwo, minimal, named, paraview, paraview_xml, slicer, vtkjs
 from vvgt_cli.look.readers.fields import load
 
 # vtkjs before paraview: its presets are ParaView's with opacity under another name
@@ -24,15 +24,16 @@ def read_transfer_function(source: str | os.PathLike[str] | Mapping[str, Any]) -
 
     Args:
         source: path of a file (``presets.json#Name`` picks one of several functions; the modules of this room say of
-            which formats), or a matplotlib colour-map name with an opacity ramp, ``NAME[:LO,HI[:MAX]]``
-            (`vvgt_cli.look.readers.colormap_name`); or what such a JSON file holds, parsed.
+            which formats), the name of one of ours (`vvgt_cli.look.readers.named`), or a matplotlib colour-map name
+            with an opacity ramp, ``NAME[:LO,HI[:MAX]]`` (`vvgt_cli.look.readers.colormap_name`); or what such a JSON
+            file holds, parsed.
 
     Returns:
         The function; `vvgt_cli.look.resolve.resolve` puts it on the data.
 
     Raises:
         DataError: the file is not a transfer function, or a faulty one.
-        UsageError: neither a file nor a colour-map name.
+        UsageError: neither a file nor such a name.
     """
     if isinstance(source, Mapping):
         return _read(dict(source), "transfer function", "")
@@ -48,7 +49,7 @@ def read_transfer_function(source: str | os.PathLike[str] | Mapping[str, Any]) -
     if not path.exists():
         if pick or "/" in source or "\\" in source or Path(source).suffix.lower() in SUFFIXES:
             raise UsageError(f"{path}: no such file; expected a transfer function ({', '.join(SUFFIXES)})")
-        return colormap_name.read(source)
+        return named.named_function(source) if source in named.names() else colormap_name.read(source)
     try:
         return _read(load(path), str(path), pick)
     except DataError:

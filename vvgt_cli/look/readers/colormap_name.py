@@ -15,6 +15,7 @@ from vvgt_cli.errors import UsageError
 from vvgt_cli.look.colormap import ColorMap
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.opacity import PiecewiseOpacity
+from vvgt_cli.look.readers.named import names
 
 FORM = "NAME[:LO,HI[:MAX]] with LO, HI and MAX in [0, 1], such as viridis:0.2,0.8:0.5"
 MAX_NODES = 256
@@ -60,8 +61,10 @@ def _colors(name: str) -> np.ndarray:
             "try: pip install matplotlib"
         ) from None
     if name not in colormaps:
-        close = difflib.get_close_matches(name, list(colormaps), n=3)
+        close = difflib.get_close_matches(name, [*names(), *colormaps], n=3)
         hint = f"; did you mean {', '.join(close)}?" if close else ", such as viridis"
-        raise UsageError(f"transfer function {name!r}: neither a file nor a matplotlib colour map{hint}")
+        raise UsageError(
+            f"transfer function {name!r}: neither a file, a name of 'vvgt tf list' nor a matplotlib colour map{hint}"
+        )
     chosen = colormaps[name]
     return np.asarray(chosen(np.linspace(0, 1, min(max(chosen.N, 2), MAX_NODES))), dtype=np.float64)[:, :3]

@@ -8,13 +8,16 @@ An object with these keys, and no others::
       "points": [{"x": 0.2, "rgb": [1, 1, 1], "opacity": 0.5}, ...],
       "color_space": "RGB",                  optional: a ParaView ColorSpace
       "opacity_unit_distance": 1.5,          optional: world length that the opacities are per
+      "opacity_unit_share": 0.004,           optional: the same as a share of the box's longest edge; not both
+      "otherwise": {"range": ..., "points"}  optional: for data that are not in Hounsfield units
       "lighting": {"ambient": 0.1, "diffuse": 0.7, "specular": 0.2, "specular_power": 10}
     }                                        optional: a head-light with these coefficients, or VTK's
 
-``x`` is a data value without ``range``; in [0, 1] from one end of ``"range": [lo, hi]`` to the other; or,
-with ``"range": "percentile"``, the fraction of the voxels that lie below (0.5 is the median). A point
-carries ``rgb`` (three numbers in [0, 1]), ``opacity`` (in [0, 1]) or both; at least one point carries each.
-Between points both are linear; beyond the ends they are constant.
+``x`` is a data value without ``range``; in [0, 1] from one end of ``"range": [lo, hi]`` to the other; with ``"range":
+"percentile"``, the fraction of the voxels that lie below (0.5 is the median), with ``"foreground"`` that of the voxels
+in front of the background; with ``"sigma"``, standard deviations above the mean. A point carries ``rgb`` (three numbers
+in [0, 1]), ``opacity`` (in [0, 1]) or both; at least one point carries each. Between points both are linear; beyond the
+ends they are constant.
 """
 
 from __future__ import annotations
@@ -30,7 +33,17 @@ from vvgt_cli.look.lighting import COEFFICIENTS, Lighting, preset_lighting
 from vvgt_cli.look.opacity import PiecewiseOpacity
 from vvgt_cli.look.readers.fields import named, number, rgb
 
-KEYS = {"name", "range", "points", "color_space", "opacity_unit_distance", "lighting"}
+KEYS = {
+    "name",
+    "range",
+    "points",
+    "color_space",
+    "opacity_unit_distance",
+    "opacity_unit_share",
+    "lighting",
+    "otherwise",
+}
+DOMAINS = ("percentile", "foreground", "sigma")
 POINT_KEYS = {"x", "rgb", "opacity"}
 
 
@@ -55,6 +68,10 @@ def read(parsed: dict[str, Any], what: str, pick: str = "") -> TransferFunction:
     distance = parsed.get("opacity_unit_distance")
     if distance is not None:
         distance = number(f"{what}: opacity_unit_distance", distance)
+    share = parsed.get("opacity_unit_share")
+    if share is not None and (distance is not None or not 0 < number(f"{what}: opacity_unit_share", share) <= 1):
+        raise DataError(f"{what}: opacity_unit_share {share}; expected above 0 to 1, without opacity_unit_distance")
+    otherwise = _otherwise(parsed, what)
     (xo, y), (xc, c) = zip(*opacities, strict=True), zip(*colors, strict=True)
     try:
         if domain == "data" and hi > lo:
@@ -67,10 +84,23 @@ def read(parsed: dict[str, Any], what: str, pick: str = "") -> TransferFunction:
             ColorMap(np.array(xc), np.array(c), space=str(parsed.get("color_space", "RGB"))),
             distance,
             domain,
+            share,
             lighting=_lighting(parsed.get("lighting"), what),
+            otherwise=otherwise,
         )
     except DataError as error:
         raise named(what, error) from error
+
+
+def _otherwise(parsed: dict[str, Any], what: str) -> TransferFunction | None:
+    """The function of points in another range, that is otherwise the same."""
+    inner = parsed.get("otherwise")
+    if inner is None:
+        return None
+    if not isinstance(inner, dict) or not set(inner) <= {"range", "points"} or "points" not in inner:
+        raise DataError(f"{what}: otherwise; expected an object of range and points")
+    outer = {key: value for key, value in parsed.items() if key not in ("otherwise", "range", "points")}
+    return read(outer | inner, f"{what}: otherwise")
 
 
 def _lighting(value: Any, what: str) -> Lighting | None:
@@ -85,10 +115,10 @@ def _range(value: Any, what: str) -> tuple[str, float, float]:
     """Domain of the points and the range they are fractions of ((0, 0): none)."""
     if value is None:
         return "data", 0.0, 0.0
-    if value == "percentile":
-        return "percentile", 0.0, 0.0
+    if value in DOMAINS:
+        return str(value), 0.0, 0.0
     if not isinstance(value, list) or len(value) != 2:
-        raise DataError(f'{what}: range {value!r}; expected [lo, hi] or "percentile"')
+        raise DataError(f"{what}: range {value!r}; expected [lo, hi] or one of {', '.join(DOMAINS)}")
     lo, hi = (number(f"{what}: range", v) for v in value)
     if not lo < hi:
         raise DataError(f"{what}: range [{lo:g}, {hi:g}]; expected lo below hi")

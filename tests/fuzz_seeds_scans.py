@@ -1,0 +1,110 @@
+"""Seeds of tests/fuzz.py: formats of neuroimaging, density maps and molecules."""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import io
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from fuzz import Seed
+from fuzz_seeds import FLOATS, READ, VALUES, volume_reader
+
+
+def nifti() -> list[Seed]:
+    import nibabel as nib
+
+    affine = np.diag([1.0, 2, 3, 1])
+    first = nib.Nifti1Image(VALUES.T, affine)
+    first.header.set_slope_inter(2, 1)
+    second = nib.Nifti2Image(np.stack([FLOATS.T] * 2, axis=3), affine)
+    pair = nib.Nifti1Pair(VALUES.T, affine)
+    maps = pair.make_file_map({"header": io.BytesIO(), "image": io.BytesIO()})
+    pair.to_file_map(maps)
+    header, image = (maps[k].fileobj.getvalue() for k in ("header", "image"))
+    return [
+        Seed("a.nii", first.to_bytes(), READ),
+        Seed("b.nii.gz", first.to_bytes(), READ, pack=gzip.compress),
+        Seed("c.nii", second.to_bytes(), volume_reader(component=1)),
+        Seed("d.hdr", header, READ, {"d.img": image}),
+    ]
+
+
+def analyze() -> list[Seed]:
+    import nibabel as nib
+
+    image = nib.Spm2AnalyzeImage(VALUES.T, None)
+    image.header.set_slope_inter(2, 0)
+    maps = image.make_file_map({"header": io.BytesIO(), "image": io.BytesIO()})
+    image.to_file_map(maps)
+    header, values = (maps[k].fileobj.getvalue() for k in ("header", "image"))
+    return [Seed("a.hdr", header, READ, {"a.img": values}), Seed("b.img", values, READ, {"b.hdr": header})]
+
+
+def mgh() -> list[Seed]:
+    import nibabel as nib
+
+    one, two = (nib.MGHImage(data, np.diag([1, 2, 3, 1])) for data in (VALUES.T, np.stack([FLOATS.T] * 2, axis=3)))
+    return [
+        Seed("a.mgh", one.to_bytes(), READ),
+        Seed("b.mgz", one.to_bytes(), READ, pack=gzip.compress),
+        Seed("c.mgh", two.to_bytes(), volume_reader(time=1)),
+    ]
+
+
+def mrc() -> list[Seed]:
+    import mrcfile
+
+    def content(values: np.ndarray, **words: Any) -> bytes:
+        with tempfile.TemporaryDirectory() as folder:
+            with mrcfile.new(f"{folder}/v.mrc", values) as file:
+                file.voxel_size = 1.5
+                for name, value in words.items():
+                    setattr(file.header, name, value)
+            return Path(f"{folder}/v.mrc").read_bytes()
+
+    skewed = content(FLOATS, mapc=3, mapr=1, maps=2, cellb=(70, 80, 110), nxstart=3)
+    return [
+        Seed("a.mrc", content(VALUES), READ),
+        Seed("b.map", skewed, READ),
+        Seed("c.map.gz", skewed, READ, pack=gzip.compress),
+        Seed("d.mrc.bz2", content(VALUES.astype(np.int8)), READ, pack=bz2.compress),
+        Seed("e.mrc", content(np.stack([FLOATS] * 2)), volume_reader(time=1)),
+    ]
+
+
+def minc() -> list[Seed]:
+    import nibabel
+
+    folder = Path(nibabel.__file__).parent / "tests" / "data"
+    names = (("minc1_1_scale.mnc", READ), ("minc1_4d.mnc", volume_reader(time=1)))
+    return [Seed(name, (folder / name).read_bytes(), read) for name, read in names]
+
+
+def text_grids() -> list[Seed]:
+    from test_volume_maps import ATOMS, CUBE, DX, END, GRID, text
+
+    cube = CUBE.format(atoms=2, nval="", n=[3, 4, 5]) + ATOMS + text(GRID[..., 0])
+    orbitals = CUBE.format(atoms=-2, nval="", n=[3, 4, 5]) + ATOMS + " 2 21\n22\n" + text(GRID)
+    binary = DX.format(kind="float", form="lsb ").encode() + GRID[..., 0].tobytes() + END.encode()
+    return [
+        Seed("a.cube", cube.encode(), READ),
+        Seed("b.cube", orbitals.encode(), volume_reader(component=1)),
+        Seed("c.dx", (DX.format(kind="double", form="") + text(GRID[..., 0]) + END).encode(), READ),
+        Seed("d.dx", binary, READ),
+    ]
+
+
+def scans() -> dict[str, list[Seed]]:
+    """Seeds by reader."""
+    return {
+        "NIfTI": nifti(),
+        "Analyze": analyze(),
+        "MGH": mgh(),
+        "MRC": mrc(),
+        "cube and OpenDX": text_grids(),
+        "MINC 1": minc(),
+    }

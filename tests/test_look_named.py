@@ -1,0 +1,177 @@
+"""Named functions and contours of densities: what they are over, where they lie on data, in memory and in blocks."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import mrcfile
+import numpy as np
+import pytest
+
+from vvgt_cli.errors import UsageError
+from vvgt_cli.field.open import needs_histogram
+from vvgt_cli.field.source import SourceRequest
+from vvgt_cli.look import from_histogram, read_transfer_function, resolve
+from vvgt_cli.look.fitting import fitting
+from vvgt_cli.look.readers.named import names
+from vvgt_cli.look.recognise import foreground, moments
+from vvgt_cli.volume import Volume, statistics
+
+RANDOM = np.random.default_rng(11)
+CT = np.concatenate([RANDOM.normal(-1000, 15, 5000), RANDOM.normal(40, 40, 4000), RANDOM.normal(700, 150, 1000)])
+CT = CT.reshape(20, 20, 25).astype(np.float32)
+
+
+def blob(sign: float = 1.0) -> np.ndarray:
+    """Noise of deviation 0.01 about 0.1, with a ball of about 1 in it; ``sign`` -1: another one below it."""
+    z, y, x = np.indices((24, 24, 24))
+    values = 0.1 + RANDOM.normal(0, 0.01, (24, 24, 24))
+    values += np.exp(-(((z - 12) ** 2 + (y - 12) ** 2 + (x - 7) ** 2) / 8))
+    return (values + min(sign, 0) * np.exp(-(((z - 12) ** 2 + (y - 12) ** 2 + (x - 17) ** 2) / 8))).astype(np.float32)
+
+
+def save(path: Path, values: np.ndarray) -> str:
+    with mrcfile.new(path, values) as file:
+        file.voxel_size = 1.5
+    return str(path)
+
+
+@pytest.mark.parametrize("name", names())
+def test_every_name_is_a_function_that_can_be_written_and_read_again(name: str, tmp_path: Path, vvgt: Callable) -> None:
+    function = read_transfer_function(name)
+    assert function.name == name
+    assert function.opacity_unit_share == 1 / 256
+    assert max(function.opacity_nodes.y) <= 0.5
+    assert (function.otherwise is not None) == name.startswith("ct-")
+    assert vvgt("tf", "convert", name, tmp_path / "own.json").code == 0
+    again = read_transfer_function(str(tmp_path / "own.json"))
+    for one, other in ((function, again), (function.otherwise, again.otherwise)):
+        if one is not None:
+            assert one.domain == other.domain
+            x = np.linspace(*one.node_range(), 50)
+            np.testing.assert_array_equal(one.opacity(x), other.opacity(x))
+            np.testing.assert_array_equal(one.color(x), other.color(x))
+
+
+def test_the_list_names_them_all(vvgt: Callable) -> None:
+    lines = vvgt("tf", "list").out.decode().splitlines()
+    assert [line.split()[0] for line in lines] == list(names())
+    assert all(len(line.split(None, 1)[1]) > 10 for line in lines)
+    with pytest.raises(UsageError, match="did you mean ct-bone"):
+        read_transfer_function("ct-bones")
+
+
+@pytest.mark.parametrize("name", [n for n in names() if n.startswith("ct-")])
+def test_hounsfield_units_are_taken_as_they_are_and_others_by_percentiles(name: str) -> None:
+    function = read_transfer_function(name)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        np.testing.assert_array_equal(resolve(function, statistics(Volume(CT))).breakpoints(), function.breakpoints())
+        crop = statistics(Volume(CT[10:]))  # without air: the file has to say
+        np.testing.assert_array_equal(resolve(function, crop, hounsfield=True).breakpoints(), function.breakpoints())
+    stored = statistics(Volume((CT + 3000) * 0.25))
+    with pytest.warns(UserWarning, match="not in Hounsfield units; shown by percentiles of the foreground"):
+        shown = resolve(function, stored)
+    lo, hi = shown.node_range()
+    assert 500 < lo < hi <= stored.hi
+    assert shown.support(stored.lo, stored.hi)
+    np.testing.assert_allclose(resolve(function, stored, (0, 1)).node_range(), (0, 1))
+
+
+def test_foreground_leaves_air_out_of_percentiles() -> None:
+    """The median of what is not air, however much air there is."""
+    points = [{"x": x, "rgb": [1, 1, 1], "opacity": x} for x in (0.0, 0.5, 1.0)]
+    function = read_transfer_function({"range": "foreground", "points": points})
+    for air in (4000, 40000):
+        values = np.concatenate([RANDOM.normal(10, 2, air), RANDOM.uniform(100, 300, 5000)])[None, None]
+        lo, middle, hi = resolve(function, statistics(Volume(values))).breakpoints()
+        assert 10 < lo < 102
+        assert middle == pytest.approx(200, abs=8)
+        assert hi == pytest.approx(300, abs=1)
+    flat = np.full(256, 10.0)
+    assert foreground(flat) is flat
+
+
+@pytest.mark.parametrize("kind", ["f4", "i2", "u1"])
+def test_sigma_counts_from_the_mean(kind: str) -> None:
+    values = RANDOM.normal(120, 9, 200_000).reshape(20, 100, 100).astype(kind)
+    numbers = statistics(Volume(values))
+    mean, deviation = moments(numbers.histogram.astype(float), numbers.edges)
+    assert mean == pytest.approx(values.mean(dtype=float), abs=0.5)
+    assert deviation == pytest.approx(values.std(dtype=float), rel=0.01)
+    shown = resolve(read_transfer_function("density-contour"), numbers)
+    assert shown.opacity_nodes.x[0] == pytest.approx(mean + 1.5 * deviation)
+
+
+def test_moments_of_extreme_values_are_finite() -> None:
+    numbers = statistics(Volume(np.array([[[-1e308, 0, 1e308]]])))
+    found = moments(numbers.histogram.astype(float), numbers.edges)
+    assert np.isfinite(found).all()
+    assert found[1] == pytest.approx(1e308 * np.sqrt(2 / 3), rel=0.01)
+
+
+@pytest.mark.parametrize(("sign", "name"), [(1, "density-contour"), (-1, "density-difference")])
+def test_densities_are_contoured_when_no_function_is_given(tmp_path: Path, sign: float, name: str) -> None:
+    values = blob(sign)
+    volume = Volume(values, density=True)
+    numbers = statistics(volume)
+    shown = from_histogram(numbers, density=volume.density)
+    assert shown.name == f"automatic ({name})"
+    high, low = values.max(), values.min()
+    noise = np.array([0.1])
+    assert shown.opacity(noise) == 0
+    assert shown.opacity(np.array([high])) > 0.2
+    assert (shown.opacity(np.array([low])) > 0.2) == (sign < 0)
+    assert fitting(numbers, volume) == name
+    assert from_histogram(numbers).name == "automatic (histogram)"
+
+
+def test_a_density_without_anything_above_its_noise_is_shown_by_its_histogram() -> None:
+    values = np.full((4, 4, 4), 1.0)
+    values[:2] = 0
+    assert from_histogram(statistics(Volume(values)), density=True).name == "automatic (histogram)"
+
+
+def test_info_names_a_function_that_fits(tmp_path: Path, vvgt: Callable) -> None:
+    def suggested(source: str) -> str | None:
+        return json.loads(vvgt("info", source, "--json").out).get("tf")
+
+    assert suggested(save(tmp_path / "v.mrc", blob())) == "density-contour"
+    assert suggested(save(tmp_path / "w.mrc", blob(-1))) == "density-difference"
+    np.save(tmp_path / "ct.npy", CT)
+    assert suggested(str(tmp_path / "ct.npy")) == "ct-bone"
+    np.save(tmp_path / "soft.npy", np.where(CT > 200, 40, CT))
+    assert suggested(str(tmp_path / "soft.npy")) == "ct-soft-tissue"
+    np.save(tmp_path / "lung.npy", np.where(CT > 200, -800, CT))
+    assert suggested(str(tmp_path / "lung.npy")) == "ct-lung"
+    np.save(tmp_path / "any.npy", RANDOM.uniform(0, 1, (5, 6, 7)))
+    assert suggested(str(tmp_path / "any.npy")) is None
+    assert b"nodes_in" in vvgt("info", "mr-head").out
+
+
+@pytest.mark.parametrize("name", ["density-contour", "ct-bone", "mr-head"])
+def test_blocks_count_for_functions_of_the_histogram(name: str) -> None:
+    assert needs_histogram(SourceRequest("v.mrc", tf=name))
+    assert not needs_histogram(SourceRequest("v.mrc", tf="viridis"))
+
+
+@pytest.mark.parametrize("tf", [None, "density-contour"])
+def test_contours_in_blocks_are_those_in_memory(tmp_path: Path, vvgt: Callable, tf: str | None) -> None:
+    """The same Gaussians, and the same bytes however the map is divided."""
+    source = save(tmp_path / "v.mrc", np.kron(blob(), np.ones((2, 2, 2), np.float32)))
+    files = []
+    for name, blocks in (("whole", ()), ("wide", ("--blocks", 32)), ("fine", ("--blocks", 16))):
+        given = () if tf is None else ("--tf", tf)
+        files.append(tmp_path / f"{name}.ply")
+        done = vvgt("init", source, "-o", files[-1], "--max-gaussians", 400, *given, *blocks)
+        assert done.code == 0, done.err
+    whole, wide, fine = (path.read_bytes() for path in files)
+    assert wide == fine
+    facts = [json.loads(vvgt("info", path, "--json").out) for path in files]
+    for key, value in facts[0].items():
+        if key in ("gaussians", "unit_distance", "unit_distance_label", "box_min", "box_max", "color_min", "color_max"):
+            assert facts[1][key] == pytest.approx(value, abs=1e-5), key
+    assert len(whole) > 1000

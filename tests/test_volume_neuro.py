@@ -1,0 +1,226 @@
+"""MGH, Analyze and MINC against nibabel and the files of MINC's own tools that it brings; sequences of 3D Slicer."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import nibabel as nib
+import numpy as np
+import pytest
+
+from vvgt_cli.errors import DataError, SeveralSteps, UsageError
+from vvgt_cli.volume import ReadOptions, Volume, read_volume
+from vvgt_cli.volume.stored import Stored, read_block
+
+VALUES = np.random.default_rng(2).integers(0, 100, (5, 4, 3))  # nibabel's axes: x, y, z
+OBLIQUE = nib.affines.from_matvec(
+    nib.eulerangles.euler2mat(0.3, -0.2, 0.5) @ [[-2, 0, 0], [0, 0, 1.5], [0, -0.7, 0]], [10.5, -20.25, 30]
+)
+MINC = Path(nib.__file__).parent / "tests" / "data"
+
+
+def xyz(volume: Volume) -> np.ndarray:
+    """Data values in nibabel's axes."""
+    return (np.asarray(volume.data[:]) * volume.slope + volume.intercept).transpose(2, 1, 0)
+
+
+@pytest.mark.parametrize("code", ["u1", "i2", "i4", "f4"])
+@pytest.mark.parametrize("suffix", [".mgh", ".mgz"])
+def test_mgh_as_nibabel_writes_it(tmp_path: Path, code: str, suffix: str) -> None:
+    source = str(tmp_path / f"v{suffix}")
+    nib.save(nib.MGHImage(VALUES.astype(code), OBLIQUE), source)
+    volume = read_volume(source)
+    np.testing.assert_array_equal(xyz(volume), VALUES)
+    np.testing.assert_allclose(volume.affine, OBLIQUE, atol=1e-4)
+    assert (volume.space, isinstance(volume.data, np.memmap)) == ("RAS", suffix == ".mgh")
+
+
+def test_mgh_without_good_ras_is_coronal(tmp_path: Path) -> None:
+    path = tmp_path / "v.mgh"
+    nib.save(nib.MGHImage(VALUES.astype("f4"), OBLIQUE), str(path))
+    content = bytearray(path.read_bytes())
+    content[28:30] = bytes(2)
+    path.write_bytes(content)
+    expected = [[-1, 0, 0, 2.5], [0, 0, 1, -1.5], [0, -1, 0, 2]]  # FreeSurfer's own; nibabel has the transpose
+    np.testing.assert_allclose(read_volume(str(path)).affine[:3], expected)
+
+
+@pytest.mark.parametrize("suffix", [".mgh", ".mgz"])
+def test_mgh_frames_are_a_series(tmp_path: Path, suffix: str) -> None:
+    source = str(tmp_path / f"v{suffix}")
+    nib.save(nib.MGHImage(np.stack([VALUES, 2 * VALUES], 3).astype("f4"), np.eye(4)), source)
+    with pytest.raises(SeveralSteps) as found:
+        read_volume(source)
+    assert found.value.steps == 2
+    np.testing.assert_array_equal(xyz(read_volume(source, ReadOptions(time=1))), 2 * VALUES)
+
+
+def test_mgh_lies(tmp_path: Path) -> None:
+    path = tmp_path / "v.mgh"
+    nib.save(nib.MGHImage(VALUES.astype("f4"), np.eye(4)), str(path))
+    content = path.read_bytes()
+    path.write_bytes(content[:300])
+    with pytest.raises(DataError, match="check that the file is whole"):
+        read_volume(str(path))
+    path.write_bytes(content[:20] + b"\0\0\0\x07" + content[24:])
+    with pytest.raises(DataError, match="named like a MGH file"):
+        read_volume(str(path))
+
+
+FREESURFER = (
+    "#No. Label Name: R G B A\n0 Unknown 0 0 0 0\n17 Left-Hippocampus 220 216 20 0\n53 Right-Hippocampus 220 216 20 0\n"
+)
+
+
+def test_aseg_is_shown_by_the_table_of_freesurfer(tmp_path: Path, vvgt: Callable) -> None:
+    labels = np.zeros((12, 12, 12), np.int32)
+    labels[2:5, 3:9, 3:9], labels[7:10, 3:9, 3:9] = 17, 53
+    nib.save(nib.MGHImage(labels, OBLIQUE), str(tmp_path / "aseg.mgz"))
+    (tmp_path / "FreeSurferColorLUT.txt").write_text(FREESURFER)
+    facts = vvgt("info", tmp_path / "aseg.mgz")
+    assert facts.code == 0
+    assert "label_map" in facts.out.decode()
+    source = ("init", tmp_path / "aseg.mgz", "--labels", tmp_path / "FreeSurferColorLUT.txt", "--max-gaussians", 300)
+    for name, blocks in (("whole", ()), ("blocks", ("--blocks", 32))):
+        assert vvgt(*source, "-o", tmp_path / f"{name}.ply", *blocks).code == 0
+    assert (tmp_path / "whole.ply").read_bytes().count(b"\n") > 10
+    assert vvgt("info", tmp_path / "blocks.ply").code == 0
+
+
+KINDS = {"analyze": nib.AnalyzeImage, "spm99": nib.Spm99AnalyzeImage, "spm2": nib.Spm2AnalyzeImage}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_analyze_as_nibabel_writes_it(tmp_path: Path, kind: str, order: str) -> None:
+    """Sizes, values, SPM's scaling and origin; axes are as stored, which is what nibabel turns about x."""
+    maker = KINDS[kind]
+    header = maker.header_class(endianness=order)
+    header.set_data_dtype(np.dtype(order + "i2"))
+    header.set_data_shape(VALUES.shape)
+    header.set_zooms((2, 3, 4))
+    if kind != "analyze":
+        header["origin"][:3] = (2, 3, 1)
+    scale = 1.0 if kind == "analyze" else 0.5
+    image = maker((VALUES * scale).astype("i2" if kind == "analyze" else "f4"), None, header)
+    if kind != "analyze":
+        image.header.set_slope_inter(scale, 0)
+    image.to_filename(tmp_path / "v.img")
+    for name in ("v.hdr", "v.img"):
+        with pytest.warns(UserWarning, match="does not say which side is left"):
+            volume = read_volume(str(tmp_path / name))
+        np.testing.assert_allclose(xyz(volume), nib.load(tmp_path / "v.img").get_fdata(), rtol=1e-6)
+        assert volume.space is None
+        assert volume.spacing == (2, 3, 4)
+        expected = (0, 0, 0) if kind == "analyze" else (-2, -6, 0)
+        np.testing.assert_allclose(volume.origin, expected)
+
+
+def test_analyze_says_so_on_one_line(tmp_path: Path, vvgt: Callable) -> None:
+    nib.AnalyzeImage(VALUES.astype("i2"), None).to_filename(tmp_path / "v.img")
+    with pytest.warns(UserWarning, match="^v.hdr: Analyze does not say which side is left; .*$") as said:
+        assert vvgt("info", tmp_path / "v.hdr").code == 0
+    assert len(said) == 1
+    (tmp_path / "v.hdr").unlink()
+    assert "without its .hdr" in vvgt("info", tmp_path / "v.img").error
+
+
+def test_the_img_of_a_nifti_pair(tmp_path: Path) -> None:
+    nib.Nifti1Pair(VALUES.astype("i2"), OBLIQUE).to_filename(tmp_path / "v.img")
+    volume = read_volume(str(tmp_path / "v.img"), ReadOptions(crop="1:3,:,:"))
+    np.testing.assert_array_equal(xyz(volume), VALUES[1:3])
+    assert volume.space == "RAS"
+
+
+@pytest.mark.parametrize(
+    ("name", "least", "most", "mean"),  # as mincstats has them
+    [
+        ("tiny.mnc", 0.20784314, 0.74901961, 0.60602819),
+        ("small.mnc", 0.1185331417, 92.87690699, 31.2127952),
+        ("minc1_1_scale.mnc", 0.2082842439, 0.2094327615, 0.2091292083),
+        ("minc2_1_scale.mnc", 0.2082842439, 0.2094327615, 0.2091292083),
+    ],
+)
+def test_minc(name: str, least: float, most: float, mean: float) -> None:
+    volume = read_volume(str(MINC / name))
+    found = [float(f(volume.data.astype("f8"))) for f in (np.min, np.max, np.mean)]
+    np.testing.assert_allclose(found, (least, most, mean), rtol=1e-6)
+    image = nib.load(MINC / name)
+    corner = [volume.affine @ [i, j, k, 1] for k, j, i in ((0, 0, 0), (3, 5, 7))]
+    np.testing.assert_allclose(corner, [image.affine @ [k, j, i, 1] for k, j, i in ((0, 0, 0), (3, 5, 7))], atol=1e-4)
+    assert (volume.space, volume.data.dtype) == ("RAS", np.float32)
+    lazy = read_volume(str(MINC / name), ReadOptions(stored=True))
+    assert isinstance(lazy.data, Stored)
+    part = read_block(lazy, np.array([3, 2, 1]), np.array([9, 8, 7]))
+    np.testing.assert_array_equal(part, volume.data[1:7, 2:8, 3:9])
+
+
+@pytest.mark.parametrize("name", ["minc1_4d.mnc", "minc2_4d.mnc"])
+def test_minc_over_time(name: str) -> None:
+    with pytest.raises(SeveralSteps) as found:
+        read_volume(str(MINC / name))
+    assert found.value.steps == 2
+    volume = read_volume(str(MINC / name), ReadOptions(time=1))
+    np.testing.assert_allclose(volume.data, nib.load(MINC / name).get_fdata()[1], rtol=1e-6)
+    with pytest.raises(UsageError, match="0 to 1"):
+        read_volume(str(MINC / name), ReadOptions(time=2))
+
+
+@pytest.mark.parametrize("name", ["minc1_1_scale.mnc", "minc2_1_scale.mnc"])
+def test_minc_cut_short(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes((MINC / name).read_bytes()[:-3000])
+    with pytest.raises(DataError, match="whole"):
+        read_volume(str(tmp_path / name))
+
+
+def sequence(kinds: str = "list domain domain domain") -> bytes:
+    """A sequence as 3D Slicer writes it: three frames, the values of a voxel one behind the other."""
+    text = (
+        "NRRD0005\n# Complete NRRD file format specification at:\ntype: short\ndimension: 4\n"
+        "space: left-posterior-superior\nsizes: 3 5 4 3\n"
+        "space directions: none (2,0,0) (0,3,0) (0,0,4)\n"
+        f'kinds: {kinds}\nlabels: "frame" "" "" ""\nendian: little\nencoding: raw\nspace origin: (1,2,3)\n'
+        "axis 0 index type:=numeric\naxis 0 index values:=0 1 2\n\n"
+    )
+    frames = np.stack([VALUES + 1000 * t for t in range(3)], axis=-1).transpose(2, 1, 0, 3)
+    return text.encode() + frames.astype("<i2").tobytes()
+
+
+def test_slicers_sequence_is_a_series(tmp_path: Path) -> None:
+    source = tmp_path / "v.seq.nrrd"
+    source.write_bytes(sequence())
+    with pytest.raises(SeveralSteps) as found:
+        read_volume(str(source))
+    assert found.value.steps == 3
+    for how in (ReadOptions(time=2), ReadOptions(component=2)):
+        volume = read_volume(str(source), how)
+        np.testing.assert_array_equal(xyz(volume), VALUES + 2000)
+        np.testing.assert_allclose(volume.affine[:3, 3], (-1, -2, 3))
+    with pytest.raises(UsageError, match="0 to 2"):
+        read_volume(str(source), ReadOptions(time=3))
+
+
+def test_other_lists_are_components(tmp_path: Path) -> None:
+    (tmp_path / "v.nrrd").write_bytes(sequence())
+    with pytest.raises(UsageError, match="3 components"):
+        read_volume(str(tmp_path / "v.nrrd"))
+    with pytest.raises(UsageError, match="no axis of time"):
+        read_volume(str(tmp_path / "v.nrrd"), ReadOptions(component=1, time=1))
+    (tmp_path / "v.nrrd").write_bytes(sequence("time domain domain domain"))
+    np.testing.assert_array_equal(xyz(read_volume(str(tmp_path / "v.nrrd"), ReadOptions(time=1))), VALUES + 1000)
+
+
+def test_a_sequence_becomes_a_file_a_frame(tmp_path: Path, vvgt: Callable) -> None:
+    (tmp_path / "v.seq.nrrd").write_bytes(sequence())
+    done = vvgt("convert", tmp_path / "v.seq.nrrd", "-o", tmp_path / "p_{}.ply", "--max-gaussians", 50, "--steps", 0)
+    assert done.code == 0, done.err
+    assert sorted(path.name for path in tmp_path.glob("*.ply")) == ["p_0.ply", "p_1.ply", "p_2.ply"]
+
+
+@pytest.mark.parametrize("module", ["nibabel", "h5py"])
+def test_minc_without_its_libraries_names_the_extra(module: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(DataError, match=rf"needs {module} .*pip install 'vvgt\[minc\]'"):
+        read_volume(str(MINC / "minc2_1_scale.mnc"))

@@ -1,0 +1,128 @@
+"""Maps and scans in blocks: the same Gaussians as in memory; what their files hold, and their time steps."""
+
+from __future__ import annotations
+
+import gzip
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import mrcfile
+import nibabel as nib
+import numpy as np
+import pytest
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*Analyze does not say")
+Z, Y, X = np.indices((40, 36, 44))
+BALL = 100 * np.exp(-((X - 15) ** 2 + (Y - 18) ** 2 + (Z - 22) ** 2) / 60)  # z, y, x
+MINC = Path(nib.__file__).parent / "tests" / "data" / "minc2_4d.mnc"
+
+
+def mrc(path: Path, values: np.ndarray, **words: object) -> Path:
+    with mrcfile.new(path, values) as file:
+        file.voxel_size = (1.5, 2.0, 2.5)
+        for name, value in words.items():
+            setattr(file.header, name, value)
+    return path
+
+
+def turned(folder: Path) -> Path:
+    return mrc(folder / "v.map", BALL.astype(">i1"), mapc=2, mapr=3, maps=1, nxstart=-9)
+
+
+def stack(folder: Path) -> Path:
+    return mrc(folder / "v.mrc", np.stack([0 * BALL, BALL]).astype("f4"))
+
+
+def zipped(folder: Path) -> Path:
+    (folder / "v.mrc.gz").write_bytes(gzip.compress(mrc(folder / "w.mrc", BALL.astype("f2")).read_bytes()))
+    return folder / "v.mrc.gz"
+
+
+def cube(folder: Path) -> Path:
+    small = BALL[::2, ::2, ::2]
+    rows = "\n".join(" ".join(f"{v:.5E}" for v in row) for row in small.reshape(-1, small.shape[2]))
+    head = "one\ntwo\n 0 1 2 3\n 20 0 0 0.5\n 18 0 0.4 0\n 22 0.3 0 0\n"
+    (folder / "v.cube").write_text(head + rows + "\n")
+    return folder / "v.cube"
+
+
+def dx(folder: Path) -> Path:
+    head = (
+        "object 1 class gridpositions counts 40 36 44\norigin 1 2 3\ndelta 0 0 0.5\ndelta 0 0.4 0\ndelta 0.3 0 0\n"
+        f"object 3 class array type float rank 0 items {BALL.size} lsb data follows\n"
+    )
+    (folder / "v.dx").write_bytes(head.encode() + BALL.astype("<f4").tobytes())
+    return folder / "v.dx"
+
+
+def mgh(folder: Path, name: str = "v.mgh") -> Path:
+    image = nib.MGHImage(BALL.T.astype("f4"), nib.affines.from_matvec([[-1, 0, 0], [0, 0, 1], [0, -1, 0]], [9, 8, 7]))
+    nib.save(image, str(folder / name))
+    return folder / name
+
+
+def analyze(folder: Path) -> Path:
+    nib.AnalyzeImage(BALL.T.astype("i2"), None).to_filename(folder / "v.img")
+    return folder / "v.hdr"
+
+
+def sequence(folder: Path) -> Path:
+    head = (
+        "NRRD0005\ntype: float\ndimension: 4\nspace: left-posterior-superior\nsizes: 2 44 36 40\n"
+        "space directions: none (1,0,0) (0,1,0) (0,0,1)\nkinds: list domain domain domain\nendian: little\n"
+        "encoding: raw\n\n"
+    )
+    (folder / "v.seq.nrrd").write_bytes(head.encode() + np.stack([0 * BALL, BALL], -1).astype("<f4").tobytes())
+    return folder / "v.seq.nrrd"
+
+
+CASES: dict[str, tuple[Callable[[Path], Path], tuple]] = {
+    "mrc turned": (turned, ()),
+    "mrc stack": (stack, ("--time", 1)),
+    "mrc gzip": (zipped, ()),
+    "cube": (cube, ()),
+    "dx": (dx, ()),
+    "mgh": (mgh, ()),
+    "mgz": (lambda folder: mgh(folder, "v.mgz"), ()),
+    "analyze": (analyze, ()),
+    "sequence": (sequence, ("--time", 1)),
+    "minc": (lambda folder: MINC, ("--time", 1)),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_blocks_give_the_same_gaussians(case: str, tmp_path: Path, vvgt: Callable) -> None:
+    make, options = CASES[case]
+    source, facts = make(tmp_path), []
+    for blocks in ((), ("--blocks", 16)):
+        out = tmp_path / f"o{len(blocks)}.ply"
+        done = vvgt("init", source, "-o", out, "--max-gaussians", 200, "--frame", "world", *options, *blocks)
+        assert done.code == 0, done.err
+        facts.append(json.loads(vvgt("info", out, "--json").out))
+    assert facts[0]["gaussians"] > 20
+    for key in ("gaussians", "affine", "box_min", "box_max", "unit_distance"):
+        np.testing.assert_allclose(facts[1][key], facts[0][key], rtol=1e-5, atol=1e-4, err_msg=key)
+
+
+@pytest.mark.parametrize(("case", "steps"), [("mrc stack", 2), ("sequence", 2), ("minc", 2)])
+def test_info_counts_time_steps_and_says_what_is_in_one(case: str, steps: int, tmp_path: Path, vvgt: Callable) -> None:
+    source = CASES[case][0](tmp_path)
+    assert f"{steps} time steps" in vvgt("info", source).error
+    facts = json.loads(vvgt("info", source, "--json", "--time", 1).out)
+    assert facts["kind"] == "volume"
+    assert facts["range"][1] > facts["range"][0]
+
+
+def test_workers_do_not_repeat_what_is_said_of_a_file(tmp_path: Path, vvgt: Callable) -> None:
+    out = tmp_path / "o.ply"
+    done = vvgt("init", analyze(tmp_path), "-o", out, "--max-gaussians", 50, "--blocks", 32, "--workers", 2)
+    assert done.code == 0, done.err
+    assert "Analyze" not in done.err  # of this process the warning goes to pytest
+
+
+def test_a_stack_of_maps_becomes_a_file_each(tmp_path: Path, vvgt: Callable) -> None:
+    source = mrc(tmp_path / "v.mrc", np.stack([BALL[:8], 2 * BALL[:8]]).astype("f4"))
+    done = vvgt("convert", source, "-o", tmp_path / "p_{}.ply", "--max-gaussians", 50, "--steps", 0)
+    assert done.code == 0, done.err
+    assert sorted(path.name for path in tmp_path.glob("*.ply")) == ["p_0.ply", "p_1.ply"]
