@@ -211,6 +211,8 @@ def convert_series(request: ConvertRequest, shard: Shard, console: Console | Non
     with run.stage("frames") as stage:
         frames = survey(steps, source.labels, source.tf, console, request.blocks is not None)
         source = replace(source, statistics=frames.whole)
+        if frames.first.unasked:  # said once, not for every frame
+            steps = [replace(step, read=replace(step.read, component=ALL)) for step in steps]
         if source.labels is None and frames.labels is not None:
             source = replace(source, labels=AUTO)
         shown, distance = _functions(source, frames)

@@ -5,9 +5,12 @@ from vvgt_cli.volume import (  # noqa: F401  each registers its formats, in this
     examples,
     hdf5,
     inviwo,
+    leica,
     metaimage,
+    n5,
     netcdf,
     nifti,
+    nikon,
     nrrd,
     numpy_file,
     openvdb,
@@ -19,6 +22,7 @@ from vvgt_cli.volume import (  # noqa: F401  each registers its formats, in this
     vtk_legacy,
     vtk_xml,
     zarr_store,
+    zeiss,
 )
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.registry import read_volume

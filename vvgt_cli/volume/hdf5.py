@@ -14,6 +14,7 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.blocks import data_file, load_block, size_text
+from vvgt_cli.volume.imaris import is_imaris, read_imaris
 from vvgt_cli.volume.labelled import AXIS_ATTRIBUTES, CF_ATTRIBUTES, Axis, axis, labelled_volume
 from vvgt_cli.volume.libraries import library_errors, need
 from vvgt_cli.volume.options import ReadOptions
@@ -35,6 +36,10 @@ def read_hdf5(path: Path, options: ReadOptions) -> Volume:
     """
     h5py = need("h5py", "hdf5", str(path), "HDF5")
     with library_errors(str(path), "HDF5"), h5py.File(path, "r") as file:
+        if is_imaris(file):
+            return read_imaris(file, path, options, partial(_check_inside, h5py, path))
+        if options.level is not None:
+            raise UsageError(f"{path}: no Imaris file, which alone has levels; leave out --level {options.level}")
         dataset = _choose(h5py, file, options.array, path)
         source = f"{path}:{dataset.name}"
         _check_storage(h5py, dataset, path, source)
@@ -46,6 +51,12 @@ def read_hdf5(path: Path, options: ReadOptions) -> Volume:
         if mapped is None and options.stored:
             stored = partial(_part, path, dataset.name)
         return labelled_volume(stored, dataset.dtype, _axes(dataset), attributes, options, source, name, chunks)
+
+
+def _check_inside(h5py: Any, path: Path, dataset: Any, source: str) -> None:
+    """As `_check_storage`, and every link to a dataset."""
+    _check_links(h5py, dataset.file, dataset.name, path)
+    _check_storage(h5py, dataset, path, source)
 
 
 def _part(path: Path, name: str, index: tuple[Any, ...]) -> np.ndarray:
@@ -160,7 +171,7 @@ def _text(value: Any) -> str:
 register(
     Reader(
         "HDF5",
-        (".h5", ".hdf5", ".he5", ".hdf"),
+        (".h5", ".hdf5", ".he5", ".hdf", ".ims"),
         lambda head: head.startswith(MAGIC) and b"VTKHDF" not in head and b"_NCProperties" not in head,
         read_hdf5,
         named_arrays=True,

@@ -217,7 +217,8 @@ def _choose(
     index: list[int | slice] = [slice(None) if k in space else 0 for k in range(len(layout.shape))]
     channels = layout.of("CS")
     several = options.component == "magnitude" and bool(channels)
-    number = _channel([layout.shape[k] for k in channels], facts, options.component, path, dtype, layout.color)
+    sizes, own = [layout.shape[k] for k in channels], not layout.of("S")
+    number = _channel(sizes, facts, options.component, path, dtype, layout.color, own)
     for k in reversed(channels):  # the samples of a pixel count faster than the channels
         index[k] = slice(None) if several else number % layout.shape[k]
         number //= layout.shape[k]
@@ -235,8 +236,19 @@ def _choose(
     return tuple(index), several
 
 
-def _channel(sizes: list[int], facts: Facts, wanted: int | str | None, path: Path, dtype: np.dtype, color: bool) -> int:
-    """Number of the channel asked for, or of the only one; 0 for the magnitude of all."""
+def _channel(
+    sizes: list[int],
+    facts: Facts,
+    wanted: int | str | None,
+    path: Path,
+    dtype: np.dtype,
+    color: bool,
+    channels: bool,
+) -> int:
+    """Number of the channel asked for, or of the only one; 0 for the magnitude of all.
+
+    ``color``: they are colours; ``channels``: they are channels of their own, not samples of pixels.
+    """
     n = math.prod(sizes)
     names = facts.channels if len(facts.channels) == n else []
     if wanted == "magnitude" and n > 1:
@@ -255,7 +267,8 @@ def _channel(sizes: list[int], facts: Facts, wanted: int | str | None, path: Pat
     text = f"{what}{found}; expected one: try --channel 0 to {n - 1}, a name, all, or --component magnitude"
     if wanted is not None:
         raise UsageError(text)
-    raise SeveralComponents(text, n, color and n in (3, 4), facts.colors if len(facts.colors) == n else ())
+    colors = facts.colors if len(facts.colors) == n else ()
+    raise SeveralComponents(text, n, color and n in (3, 4), colors, channels, names)
 
 
 def _kept(layout: SeriesAxes, index: tuple[int | slice, ...], letter: str) -> int | None:
