@@ -59,7 +59,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 def small_seats() -> Iterator[None]:
     """Seats of a module's conversions and reports are of the size made for and of twice that, not of a 4K screen."""
     with pytest.MonkeyPatch.context() as patch:
-        for module in ("conversion.stages.scores", "tasks.ladder"):
+        for module in ("conversion.stages.scores", "commands.ladder"):
             patch.setattr(f"vvgt_cli.{module}.from_above", lambda size: [(size, 40.0), (2 * size, 40.0)])
         yield
 

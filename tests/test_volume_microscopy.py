@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import json
 import tarfile
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+import tifffile
 
 from tests import microscopes
 from tests.microscopes import COLORS, NAMES, SPACING, cells
 from tests.test_labels import SMALL
 from vvgt_cli.errors import DataError, SeveralArrays, SeveralComponents, SeveralSteps, UsageError
 from vvgt_cli.field.layered import open_parts
+from vvgt_cli.gaussians import read_ply
 from vvgt_cli.volume import ReadOptions, read_volume
 from vvgt_cli.volume.levels import level_shapes
 from vvgt_cli.volume.stored import Stored
@@ -114,7 +117,7 @@ def test_images_of_a_lif(vvgt, tmp_path: Path) -> None:
     first, second = cells(channels=1), cells(channels=1)[:, :, :3] + np.uint16(7)
     (tmp_path / "a.lif").write_bytes(microscopes.lif([("big", first), ("small", second)]))
     path = str(tmp_path / "a.lif")
-    with pytest.raises(SeveralArrays, match=r"2 images: 0 'big' .8 X x 6 Y x 5 Z uint16.; 1 'small'.*--series NAME"):
+    with pytest.raises(SeveralArrays, match=r"2 images: 0 'big' .5 Z x 6 Y x 8 X uint16.; 1 'small'.*--series NAME"):
         read_volume(path)
     for wanted in ("1", "small"):
         np.testing.assert_array_equal(read_volume(path, ReadOptions(array=wanted)).data, second[0, 0])
@@ -218,3 +221,102 @@ def test_lz4_of_java() -> None:
     assert unpack({"type": "lz4"}, data, len(first) + 4, "x") == first + second
     with pytest.raises(ValueError, match=r"does not fit"):
         unpack({"type": "lz4"}, data, 100, "x")
+
+
+def test_the_only_stack_among_snapshots_is_taken(tmp_path: Path) -> None:
+    pytest.importorskip("liffile")
+    stack, snap = cells(channels=1), cells(channels=1)[:, :, :1]
+    (tmp_path / "a.lif").write_bytes(microscopes.lif([("overview", snap), ("stack", stack), ("later", snap)]))
+    with pytest.warns(UserWarning, match=r"'stack' taken, of 3 images the only one of several slices \(--series"):
+        volume = read_volume(str(tmp_path / "a.lif"))
+    np.testing.assert_array_equal(volume.data, stack[0, 0])
+    tifffile.imwrite(tmp_path / "a.ome.tif", snap[0, 0, 0], ome=True)
+    with tifffile.TiffWriter(tmp_path / "b.ome.tif", ome=True) as file:
+        file.write(snap[0, 0, 0], metadata={"Name": "overview"})
+        file.write(stack[0, 0], metadata={"axes": "ZYX", "Name": "stack"})
+    with pytest.warns(UserWarning, match="'stack' taken"):
+        assert read_volume(str(tmp_path / "b.ome.tif")).dims == (8, 6, 5)
+
+
+# ---- several channels
+
+
+def write_tiff(path: Path, values: np.ndarray) -> None:
+    colors = {"Name": list(NAMES), "Color": [-16776961, 16777215]}  # RGBA as signed 32 bits
+    tifffile.imwrite(path, values[0].transpose(1, 0, 2, 3), ome=True, metadata={"axes": "ZCYX", "Channel": colors})
+
+
+def write_zarr(path: Path, values: np.ndarray) -> None:
+    zarr = pytest.importorskip("zarr")
+    group = zarr.open_group(str(path), mode="w", zarr_format=2)
+    group.create_array("0", data=values[0], chunks=(1, 4, 4, 4))
+    kinds = [{"name": "c", "type": "channel"}, *({"name": a, "type": "space", "unit": "micrometer"} for a in "zyx")]
+    scale = {"type": "scale", "scale": [1, *SPACING[::-1]]}
+    group.attrs["multiscales"] = [
+        {"version": "0.4", "axes": kinds, "datasets": [{"path": "0", "coordinateTransformations": [scale]}]}
+    ]
+    shown = zip(NAMES, ("FF0000", "00FFFF"), strict=True)
+    group.attrs["omero"] = {"channels": [{"label": label, "color": color} for label, color in shown]}
+
+
+EVERY = [*WRITERS, (write_tiff, "a.ome.tif"), (write_zarr, "a.zarr")]
+
+
+def two_cells() -> np.ndarray:
+    """Two channels, bright in either half of x."""
+    values = np.zeros((1, 2, 12, 14, 16), np.uint16)
+    values[0, 0, 3:9, 3:10, 1:6], values[0, 1, 3:9, 3:10, 9:15] = 1000, 3000
+    return values
+
+
+@pytest.mark.parametrize(("write", "name"), EVERY, ids=[name for _, name in EVERY])
+def test_all_channels_in_the_colours_of_the_file(vvgt, tmp_path: Path, write: Callable, name: str) -> None:
+    write(tmp_path / name, two_cells())
+    made = {}
+    for blocks in ((), ("--blocks", 16)):
+        out = tmp_path / f"{len(blocks)}.ply"
+        with warnings.catch_warnings(record=True) as notes:
+            warnings.simplefilter("always")
+            extra = ("--level", "full") if blocks and name in ("a.ims", "a.zarr") else ()
+            done = vvgt("init", tmp_path / name, *SMALL[:4], *blocks, *extra, "-o", out)
+        assert done.code == 0, done.err
+        told = {str(note.message) for note in notes if "all shown" in str(note.message)}
+        assert told == {
+            f"{(tmp_path / name)}: 2 channels, all shown: 0 'DAPI' #ff0000, 1 'GFP' #00ffff (--channel N: one of them)"
+        }
+        made[blocks] = read_ply(str(out))[0]
+    for gaussians in made.values():
+        left = gaussians.means[:, 0] < 0
+        assert 0 < left.sum() < len(left)
+        assert (gaussians.colors[left, 0] > gaussians.colors[left, 1]).all()
+        assert (gaussians.colors[~left, 1] > gaussians.colors[~left, 0]).all()
+    first, second = made.values()
+    np.testing.assert_allclose(len(first), len(second), rtol=0.05)
+
+
+def test_by_every_command_and_in_python(vvgt, tmp_path: Path) -> None:
+    import vvgt_cli as library
+
+    path = tmp_path / "a.ome.tif"
+    write_tiff(path, two_cells())
+    out = tmp_path / "a.ply"
+    for command in (
+        ("convert", path, *SMALL, "-o", out),
+        ("evaluate", out, "--volume", path, "--no-seats", "--json"),
+        ("render-views", path, "-o", tmp_path / "views", "--size", 32, "--views", 3, "--test-views", 1),
+        ("info", path),
+    ):
+        done = vvgt(*command)
+        assert done.code == 0, (command, done.err)
+    one = vvgt("info", path, "--channel", "GFP", "--json")
+    assert json.loads(one.out)["range"] == [0, 3000]
+    made = library.convert(path, goal={"max_gaussians": 200, "size": 32, "steps": 0})
+    assert np.ptp(made.gaussians.colors, axis=0).max() > 0.5
+
+
+def test_many_channels_and_vectors_stay_a_choice(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "many.ome.tif", np.zeros((3, 7, 8, 9), np.uint16), ome=True, metadata={"axes": "ZCYX"})
+    np.save(tmp_path / "vector.npy", np.zeros((3, 8, 9, 2), np.float32))
+    for name in ("many.ome.tif", "vector.npy"):
+        with pytest.raises(UsageError, match=r"component|channel"):
+            open_parts(str(tmp_path / name), ReadOptions())

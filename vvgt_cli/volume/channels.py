@@ -6,6 +6,7 @@ import io
 import math
 import os
 import re
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -142,13 +143,34 @@ def _time(picture: Picture, wanted: int | None, source: str) -> int:
     return wanted or 0
 
 
-def choose_image(names: Sequence[str], facts: Sequence[str], wanted: str | None, what: str, source: str) -> int:
+def only(deep: Sequence[bool], text: str, option: str, choices: Sequence[str], names: Sequence[str]) -> int:
+    """Index of the only image, else of the only one of several slices, which a note says.
+
+    Args:
+        deep: which ones have several slices.
+        text, option, choices, names: as of `SeveralArrays`, which is raised where there is no only one.
+    """
+    if len(deep) > 1 and sum(deep) != 1:
+        raise SeveralArrays(text, option, choices, names)
+    number = deep.index(True) if len(deep) > 1 else 0
+    if len(deep) > 1:
+        told = (
+            f"{text.partition(': ')[0]}: {names[number]!r} taken, of {len(deep)} images the only one of several slices"
+        )
+        warnings.warn(f"{told} ({option} chooses another)", stacklevel=3)
+    return number
+
+
+def choose_image(
+    names: Sequence[str], facts: Sequence[str], wanted: str | None, what: str, source: str, deep: Sequence[bool] = ()
+) -> int:
     """Number of the image, scene or position asked for by number or name, or of the only one.
 
     Args:
         names: of all of them.
         facts: what an error says of each.
         what: they are called, in the plural.
+        deep: which ones have several slices, where they differ.
 
     Raises:
         DataError: there are none.
@@ -161,10 +183,8 @@ def choose_image(names: Sequence[str], facts: Sequence[str], wanted: str | None,
     )
     listing += "; ..." if len(names) > LISTED else ""
     if wanted is None:
-        if len(names) == 1:
-            return 0
         text = f"{source}: {len(names)} {what}: {listing}; choose one by number or name with --series NAME"
-        raise SeveralArrays(text, "--series", [str(k) for k in range(len(names))], names)
+        return only(deep or [False] * len(names), text, "--series", [str(k) for k in range(len(names))], names)
     found = [k for k, name in enumerate(names) if wanted.strip("/") in (str(k), name)]
     if len(found) != 1:
         raise UsageError(f"{source}: {len(found)} {what} {wanted!r}; it has {listing}; choose with --series NAME")

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.errors import DataError, SeveralArrays, UsageError
 from vvgt_cli.volume.blocks import data_file, load_block, size_text
 from vvgt_cli.volume.imaris import is_imaris, read_imaris
 from vvgt_cli.volume.labelled import AXIS_ATTRIBUTES, CF_ATTRIBUTES, Axis, axis, labelled_volume
@@ -82,7 +82,8 @@ def _choose(h5py: Any, file: Any, wanted: str | None, path: Path) -> Any:
     if not fits:
         raise DataError(f"{path}: no dataset of numbers with two axes or more; expected a volume")
     if len(fits) > 1:
-        raise UsageError(f"{path}: several datasets: {listing}; choose one as {path}:{fits[0].name} (or with --array)")
+        text = f"{path}: several datasets: {listing}; choose one as {path}:{fits[0].name} (or with --array)"
+        raise SeveralArrays(text, "--array", [d.name for d in fits])
     return fits[0]
 
 

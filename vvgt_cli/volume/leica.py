@@ -39,7 +39,14 @@ def read_lif(path: Path, options: ReadOptions) -> Volume:
     _check_header(path)
     with library_errors(str(path), "LIF"), _opened(liffile, path) as file:
         images = list(file.images)
-        number = choose_image([i.path for i in images], [_facts(i) for i in images], options.array, "images", str(path))
+        number = choose_image(
+            [i.path for i in images],
+            [_facts(i) for i in images],
+            options.array,
+            "images",
+            str(path),
+            [_deep(i) for i in images],
+        )
         image = images[number]
         inner = image.path if len(images) > 1 else ""
         name = volume_name(path) + (f":{inner}" if inner else "")
@@ -69,6 +76,14 @@ def _facts(image: Any) -> str:
         return " x ".join(f"{n} {a}" for a, n in image.sizes.items() if n > 1) + f" {image.dtype}"
     except (ValueError, KeyError, AssertionError, OverflowError):
         return "not a volume"
+
+
+def _deep(image: Any) -> bool:
+    """Whether it has several slices."""
+    try:
+        return bool(image.sizes.get("Z", 1) > 1)
+    except (ValueError, KeyError, AssertionError, OverflowError):
+        return False
 
 
 def _picture(image: Any, path: Path) -> Picture:

@@ -21,6 +21,7 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, SeveralComponents, SeveralSteps, UsageError
 from vvgt_cli.volume.blocks import check_memory, size_text
+from vvgt_cli.volume.channels import only
 from vvgt_cli.volume.components import contiguous, magnitude
 from vvgt_cli.volume.libraries import library_errors
 from vvgt_cli.volume.options import ReadOptions
@@ -149,9 +150,10 @@ def _series(file: Any, wanted: str | None, path: Path) -> tuple[Any, int]:
         f"{k} {s.name!r} ({' x '.join(map(str, s.shape))}, axes {s.axes}, {s.dtype})" for k, s in found[:_LISTED]
     ) + ("; ..." if len(found) > _LISTED else "")
     if wanted is None:
-        if len(found) > 1:
-            raise UsageError(f"{path}: {len(found)} series: {listing}; choose one by number or name with --series NAME")
-        return found[0][1], found[0][0]
+        text = f"{path}: {len(found)} series: {listing}; choose one by number or name with --series NAME"
+        deep = [any(a in "ZIQ" and n > 1 for a, n in zip(s.axes, s.shape, strict=True)) for _, s in found]
+        number, series = found[only(deep, text, "--series", [str(k) for k, _ in found], [s.name for _, s in found])]
+        return series, number
     fits = [(k, s) for k, s in found if wanted.strip("/") in (str(k), s.name)]
     if len(fits) != 1:
         raise UsageError(f"{path}: {len(fits)} series {wanted!r}; it has {listing}; choose with --series NAME")

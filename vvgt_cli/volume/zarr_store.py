@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.errors import DataError, SeveralArrays, UsageError
 from vvgt_cli.volume.channels import hex_color
 from vvgt_cli.volume.hdf5 import MAX_CHUNK, MOST_LISTED
 from vvgt_cli.volume.labelled import Axis, axis, labelled_volume
@@ -124,7 +124,8 @@ def _choose(path: Path, wanted: str | None, number: int | None) -> tuple[Path, d
     if not fits:
         raise DataError(f"{path}: no array of two axes or more; expected a volume")
     if len(fits) > 1:
-        raise UsageError(f"{path}: several arrays: {listing}; choose one as {path}:/PATH (or with --array)")
+        text = f"{path}: several arrays: {listing}; choose one as {path}:/PATH (or with --array)"
+        raise SeveralArrays(text, "--array", [p.relative_to(path).as_posix() for p, _ in fits])
     return fits[0]
 
 
