@@ -25,6 +25,7 @@ from vvgt_cli.volume.libraries import library_errors, need
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import Reader, register, volume_name
 from vvgt_cli.volume.types import Volume
+from vvgt_cli.volume.zeiss_segments import check_segments
 
 MICROMETRE = 1e-6
 PIXELS = {
@@ -43,6 +44,7 @@ def read_czi(path: Path, options: ReadOptions) -> Volume:
         UsageError: several scenes, channels or time steps and none chosen.
     """
     czi = need("pylibCZIrw.czi", EXTRA, str(path), "CZI")
+    check_segments(path)
     with library_errors(str(path), "CZI"), czi.open_czi(str(path)) as file:
         box = {str(a): (int(b), int(e)) for a, (b, e) in file.total_bounding_box_no_pyramid.items()}
         odd = [a for a, (b, e) in box.items() if a not in "TCZYX" and e - b > 1]
