@@ -402,6 +402,7 @@ def microscopes() -> dict[str, list[Seed]]:
         Seed("a.nd2", written.nd2(several), chosen),
         Seed("b.nd2", written.nd2(several), in_blocks),
         Seed("c.nd2", written.nd2(one), READ),
+        Seed("d.nd2", written.nd2(several, packed=True), chosen),
     ]
     return found
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import struct
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -86,7 +87,7 @@ def _lite(values: dict[str, Any]) -> bytes:
     return out
 
 
-def nd2(values: np.ndarray) -> bytes:
+def nd2(values: np.ndarray, packed: bool = False) -> bytes:
     """An ND2 file, version 3.0, of values (t, c, z, y, x): chunks, and a map of them at the end."""
     times, channels, slices, ny, nx = values.shape
     planes = {
@@ -105,7 +106,8 @@ def nd2(values: np.ndarray) -> bytes:
     facts = {
         b"ImageAttributesLV!": {"SLxImageAttributes": {
             "uiWidth": nx, "uiWidthBytes": nx * channels * values.itemsize, "uiHeight": ny, "uiComp": channels,
-            "uiBpcInMemory": bits, "uiBpcSignificant": bits, "uiSequenceCount": times * slices, "eCompression": 2}},
+            "uiBpcInMemory": bits, "uiBpcSignificant": bits, "uiSequenceCount": times * slices,
+            "eCompression": 0 if packed else 2}},
         b"ImageMetadataSeqLV|0!": {"SLxPictureMetadata": {
             "bCalibrated": True, "dCalibration": SPACING[0],
             "sPicturePlanes": {"uiCount": channels, "sPlaneNew": planes}}},
@@ -113,7 +115,10 @@ def nd2(values: np.ndarray) -> bytes:
     }  # fmt: skip
     chunks = {name: _lite(tree) for name, tree in facts.items()}
     frames = values.transpose(0, 2, 3, 4, 1).reshape(times * slices, -1)  # of a frame the channels are innermost
-    chunks |= {b"ImageDataSeq|%d!" % k: bytes(8) + frame.tobytes() for k, frame in enumerate(frames)}
+    chunks |= {
+        b"ImageDataSeq|%d!" % k: bytes(8) + (zlib.compress(frame.tobytes()) if packed else frame.tobytes())
+        for k, frame in enumerate(frames)
+    }
     out, where = io.BytesIO(), b""
     out.write(struct.pack("<IIQ32s64s", 0x0ABECEDA, 32, 64, b"ND2 FILE SIGNATURE CHUNK NAME01!", b"Ver3.0"))
     for name, data in chunks.items():

@@ -101,9 +101,9 @@ def test_one_channel_in_blocks_as_in_memory(vvgt, tmp_path: Path, write: Callabl
 def test_a_missing_library_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import sys
 
-    for name, module in (("a.lif", "liffile"), ("a.nd2", "nd2"), ("a.czi", "pylibCZIrw.czi")):
-        head = {"a.lif": microscopes.lif([("a", cells())]), "a.nd2": microscopes.nd2(cells()), "a.czi": b"ZISRAWFILE"}
-        (tmp_path / name).write_bytes(head[name])
+    for name, module in (("a.lif", "liffile"), ("a.nd2", "nd2")):
+        data = microscopes.lif([("a", cells())]) if name == "a.lif" else microscopes.nd2(cells())
+        (tmp_path / name).write_bytes(data)
         monkeypatch.setitem(sys.modules, module, None)
         with pytest.raises(DataError, match=r"pip install 'vvgt\[microscopy\]'"):
             read_volume(str(tmp_path / name))
@@ -139,6 +139,15 @@ def test_scenes_and_mosaics_of_a_czi(tmp_path: Path) -> None:
         read_volume(str(tmp_path / "b.czi"))
     found = read_volume(str(tmp_path / "b.czi"), ReadOptions(array="1", component=0)).data
     np.testing.assert_array_equal(found, values[0, 0] + 1)
+
+
+def test_packed_frames_of_an_nd2(tmp_path: Path) -> None:
+    pytest.importorskip("nd2")
+    values = cells()
+    (tmp_path / "a.nd2").write_bytes(microscopes.nd2(values, packed=True))
+    for stored in (False, True):
+        volume = read_volume(str(tmp_path / "a.nd2"), ReadOptions(component=1, stored=stored))
+        np.testing.assert_array_equal(volume.data[1:5], values[0, 1, 1:5])
 
 
 # ---- levels

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import struct
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
@@ -44,14 +45,17 @@ def read_nd2(path: Path, options: ReadOptions) -> Volume:
         place = _position(file, sizes, options, path)
         loops = [a for a in sizes if a not in "CYXS"]
         frames = int(np.prod([sizes[a] for a in loops], dtype=object))
-        if frames > MOST or not there.issuperset(range(frames)):
+        if frames > MOST or not all(k in there for k in range(frames)):
             raise DataError(f"{path}: of {frames} frames {len(there)} are there; check that the file is whole")
         names, colors = _channels(file)
+        told = file.attributes
+        packed = (there, told.heightPx * (told.widthBytes or 0)) if told.compressionType == "lossless" else None
         x, y, z = (float(v) for v in file.voxel_size())
         several = sizes.get("C", 1) > 1
+        read = _reader(path, sizes, loops, place, np.dtype(file.dtype), packed)
         picture = Picture(
             sizes.get("T", 1), sizes.get("C", 1) * sizes.get("S", 1), (sizes.get("Z", 1), sizes["Y"], sizes["X"]),
-            np.dtype(file.dtype), _reader(path, sizes, loops, place, np.dtype(file.dtype)), (1, sizes["Y"], sizes["X"]),
+            np.dtype(file.dtype), read, (1, sizes["Y"], sizes["X"]),
             (x, y, z if sizes.get("Z", 1) > 1 else None), names=names if sizes.get("S", 1) == 1 else (), colors=colors,
             rgb=sizes.get("S", 1) > 1 and not several,
         )  # fmt: skip
@@ -65,8 +69,8 @@ def _opened(nd2: Any, path: Path) -> Iterator[Any]:
         yield file
 
 
-def _frames(path: Path) -> set[int]:
-    """Numbers of the frames that lie in the file by its map of chunks: nd2 reads zeros for others.
+def _frames(path: Path) -> dict[int, int]:
+    """Where the frames lie in the file by its map of chunks, by number: nd2 reads zeros for others.
 
     Raises:
         DataError: no map of chunks at the file's end.
@@ -81,14 +85,15 @@ def _frames(path: Path) -> set[int]:
         magic, title, length = CHUNK.unpack(file.read(CHUNK.size).ljust(CHUNK.size, b"\0"))
         file.seek(place + CHUNK.size + title)
         data = file.read(length)
-    found, at = set(), 0
+    found: dict[int, int] = {}
+    at = 0
     while magic == CHUNK_MAGIC:
         end = data.find(b"!", at) + 1
         if not end or data[at:end] == MAP_END or end + 16 > len(data):
             break
         number = re.fullmatch(rb"ImageDataSeq\|(\d{1,10})!", data[at:end])
-        if number and struct.unpack_from("<Q", data, end)[0] < size:
-            found.add(int(number[1]))
+        if number and (begin := struct.unpack_from("<Q", data, end)[0]) < size:
+            found[int(number[1])] = begin
         at = end + 16
     return found
 
@@ -115,16 +120,29 @@ def _channels(file: Any) -> tuple[list[str], list[Color]]:
     return names, colors
 
 
-def _reader(path: Path, sizes: dict[str, int], loops: list[str], place: int, dtype: np.dtype) -> Any:
-    """Reads boxes, frame by frame."""
+def _reader(
+    path: Path, sizes: dict[str, int], loops: list[str], place: int, dtype: np.dtype,
+    packed: tuple[dict[int, int], int] | None,
+) -> Any:  # fmt: skip
+    """Reads boxes, frame by frame; ``packed`` is where compressed frames lie, and the bytes of one unpacked."""
     turn = Lock()  # one file, one reader: workers may have threads
 
     @cache
     def opened() -> Any:
         import nd2
 
-        stream = Bounded(path)
-        return nd2.ND2File(stream)
+        return nd2.ND2File(Bounded(path))
+
+    def unpacked(number: int) -> np.ndarray:
+        """(c, y, x, s) of a frame of zlib data, unpacked to its size and no further, as nd2 would not."""
+        where, size = packed or ({}, 0)
+        with Bounded(path) as file:
+            file.seek(where[number])
+            _, title, length = CHUNK.unpack(file.read(CHUNK.size))
+            file.seek(title + 8, 1)  # the name and the time
+            values = np.frombuffer(zlib.decompressobj().decompress(file.read(length - 8), size), dtype)
+        rows = values.reshape(sizes["Y"], -1)[:, : sizes["X"] * sizes.get("C", 1) * samples]
+        return rows.reshape(sizes["Y"], sizes["X"], sizes.get("C", 1), samples).transpose(2, 0, 1, 3)
 
     samples = sizes.get("S", 1)
 
@@ -135,7 +153,7 @@ def _reader(path: Path, sizes: dict[str, int], loops: list[str], place: int, dty
             for k in range(z.start, z.stop):
                 at = {"T": time, "P": place, "Z": k}
                 number = int(np.ravel_multi_index([at[a] for a in loops], [sizes[a] for a in loops])) if loops else 0
-                frame = np.asarray(opened().read_frame(number))
+                frame = np.asarray(opened().read_frame(number)) if packed is None else unpacked(number)
                 frame = frame.reshape(sizes.get("C", 1), sizes["Y"], sizes["X"], samples)
                 out[k - z.start] = frame[channel // samples, y, x, channel % samples]
         return out

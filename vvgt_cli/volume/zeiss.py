@@ -1,117 +1,120 @@
-"""Zeiss (``.czi``): one scene of a file, region by region; tiles of a mosaic are put together. Read by pylibCZIrw."""
+"""Zeiss (``.czi``): one scene of a file, tile by tile; tiles of a mosaic are put together.
+
+libCZI (pylibCZIrw) is not used, as damaged files can end the process in it, and czifile of 2019, as it knows no
+Zstandard (docs/log/readers.md).
+"""
 
 from __future__ import annotations
 
 import math
-from functools import cache
+from functools import partial
 from pathlib import Path
-from threading import Lock
 from typing import Any
 
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.channels import (
-    EXTRA,
-    Box,
-    Color,
-    Picture,
-    choose_image,
-    hex_color,
-    picture_volume,
-    safe_xml,
-)  # fmt: skip
-from vvgt_cli.volume.libraries import library_errors, need
+from vvgt_cli.volume.channels import Box, Color, Picture, choose_image, hex_color, picture_volume, safe_xml
+from vvgt_cli.volume.libraries import library_errors
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import Reader, register, volume_name
 from vvgt_cli.volume.types import Volume
-from vvgt_cli.volume.zeiss_segments import check_segments
+from vvgt_cli.volume.zeiss_tiles import PIXELS, SPARSE, Tile, pixels_of, tiles_of
 
 MICROMETRE = 1e-6
-PIXELS = {
-    "Gray8": ("uint8", 1), "Gray16": ("uint16", 1), "Gray32Float": ("float32", 1), "Bgr24": ("uint8", 3),
-    "Bgr48": ("uint16", 3), "Bgra32": ("uint8", 4),
-}  # fmt: skip
-TILE = 512  # pixels along the edge of what is read together
-MOST = 1 << 31  # of an axis
+TILE = 512  # pixels along the edge of what is read together, at least
 
 
 def read_czi(path: Path, options: ReadOptions) -> Volume:
     """Read one scene of a CZI file; spacing in micrometres.
 
     Raises:
-        DataError: pylibCZIrw is not installed, a damaged file, axes or pixels that are none of a volume.
+        DataError: a damaged file, axes or pixels that are none of a volume, more pixels than tiles can fill.
         UsageError: several scenes, channels or time steps and none chosen.
     """
-    czi = need("pylibCZIrw.czi", EXTRA, str(path), "CZI")
-    check_segments(path)
-    with library_errors(str(path), "CZI"), czi.open_czi(str(path)) as file:
-        box = {str(a): (int(b), int(e)) for a, (b, e) in file.total_bounding_box_no_pyramid.items()}
-        odd = [a for a, (b, e) in box.items() if a not in "TCZYX" and e - b > 1]
-        if odd or not {"Y", "X"} <= set(box) or any(not 0 <= e - b <= MOST for b, e in box.values()):
-            raise DataError(f"{path}: axes {box}; expected X and Y, and Z, T and C at most")
-        scene, (x, y, width, height) = _scene(file, box, options, path)
-        kinds = {str(kind) for kind in file.pixel_types.values()}
-        if len(kinds) != 1 or not kinds <= set(PIXELS):
-            raise DataError(f"{path}: pixels of types {', '.join(sorted(kinds))}; expected one of {', '.join(PIXELS)}")
+    with library_errors(str(path), "CZI"):
+        every, xml = tiles_of(path)
+        scene, tiles = _scene(every, options, path)
+        ends = {
+            a: (min(t.at.get(a, 0) for t in tiles), max(t.at.get(a, 0) for t in tiles)) for t in tiles for a in t.at
+        }
+        odd = [a for a, (lo, hi) in ends.items() if a not in "TCZMS" and hi > lo]
+        kinds = {tile.pixel for tile in tiles}
+        if odd or len(kinds) != 1 or not kinds <= set(PIXELS):
+            raise DataError(
+                f"{path}: axes {', '.join(sorted(ends))} (several along {', '.join(odd) or 'none'} of the others), pixels "
+                f"of types {sorted(kinds)}; expected several along T, C and Z at most, and one of {sorted(PIXELS)}"
+            )
         dtype, samples = PIXELS[kinds.pop()]
-        first = {a: box.get(a, (0, 1))[0] for a in "TCZ"}
-        times, channels, slices = (max(e - b, 1) for b, e in (box.get(a, (0, 1)) for a in "TCZ"))
-        spacing, names, colors = _metadata(file.raw_metadata, channels, path)
-        planes = {a: n for a, n in first.items() if a in box}
+        x, y = min(t.x for t in tiles), min(t.y for t in tiles)
+        width, height = max(t.x + t.width for t in tiles) - x, max(t.y + t.height for t in tiles) - y
+        times, channels, slices = (ends[a][1] - ends[a][0] + 1 if a in ends else 1 for a in "TCZ")
+        filled = sum(t.width * t.height for t in tiles)
+        if times * channels * slices * width * height > SPARSE * filled:
+            raise DataError(f"{path}: tiles of {filled} pixels far apart; check that the CZI file is whole")
+        spacing, names, colors = _metadata(xml, channels, path)
+        first = {a: ends[a][0] for a in "TCZ" if a in ends}
+        read = partial(_read, path, _by_plane(tiles, first), (x, y), samples, np.dtype(dtype))
+        chunk = max(TILE, max(t.height for t in tiles)), max(TILE, max(t.width for t in tiles))
         picture = Picture(
-            times, channels * samples, (slices, height, width), np.dtype(dtype),
-            _reader(path, scene, (x, y), planes, samples, dtype), (1, TILE, TILE), spacing,
+            times, channels * samples, (slices, height, width), np.dtype(dtype), read, (1, *chunk), spacing,
             names=names if samples == 1 else (), colors=colors, rgb=samples > 1 and channels == 1,
         )  # fmt: skip
-        name = volume_name(path) + (f":{scene}" if scene else "")
+        name = volume_name(path) + ("" if scene is None else f":{scene}")
         return picture_volume(picture, options, str(path), name)
 
 
-def _scene(file: Any, box: dict[str, tuple[int, int]], options: ReadOptions, path: Path) -> tuple[int | None, Any]:
-    """Number of the scene asked for, None where there are none, and its (x, y, width, height)."""
-    scenes = {
-        int(k): (int(r.x), int(r.y), int(r.w), int(r.h)) for k, r in file.scenes_bounding_rectangle_no_pyramid.items()
-    }
-    if not scenes:
-        (x0, x1), (y0, y1) = box["X"], box["Y"]
-        scenes = {-1: (x0, y0, x1 - x0, y1 - y0)}
-    keys = sorted(scenes)
-    facts = [f"{scenes[k][2]} x {scenes[k][3]} pixels" for k in keys]
-    number = choose_image([f"scene {max(k, 0)}" for k in keys], facts, options.array, "scenes", str(path))
-    found = keys[number]
-    if min(scenes[found][2:]) < 1 or max(scenes[found][2:]) > MOST:
-        raise DataError(f"{path}: a scene of {facts[number]}; expected at least one; check that the file is whole")
-    return None if found < 0 else found, scenes[found]
+def _scene(tiles: list[Tile], options: ReadOptions, path: Path) -> tuple[int | None, list[Tile]]:
+    """Number of the scene asked for, None where there is one, and its tiles."""
+    found: dict[int, list[Tile]] = {}
+    for tile in tiles:
+        found.setdefault(tile.at.get("S", 0), []).append(tile)
+    keys = sorted(found)
+    facts = [
+        f"{max(t.x + t.width for t in found[k]) - min(t.x for t in found[k])} x "
+        f"{max(t.y + t.height for t in found[k]) - min(t.y for t in found[k])} pixels"
+        for k in keys
+    ]
+    number = choose_image([f"scene {k}" for k in keys], facts, options.array, "scenes", str(path))
+    return keys[number] if len(keys) > 1 else None, found[keys[number]]
 
 
-def _reader(
-    path: Path, scene: int | None, corner: tuple[int, int], first: dict[str, int], samples: int, dtype: str
-) -> Any:
-    """Reads boxes, a region of a slice at a time; samples of colours are blue first in the file."""
-    turn = Lock()  # one file, one reader: workers may have threads
+Planes = dict[tuple[int, ...], list[Tile]]
 
-    @cache
-    def opened() -> Any:
-        from pylibCZIrw import czi
 
-        return czi.CziReader(str(path))
+def _by_plane(tiles: list[Tile], first: dict[str, int]) -> Planes:
+    """The tiles of each (time, channel, slice), those that lie above others last."""
+    planes: Planes = {}
+    for tile in sorted(tiles, key=lambda t: t.at.get("M", 0)):
+        key = tuple(tile.at.get(a, 0) - first.get(a, 0) for a in "TCZ")
+        planes.setdefault(key, []).append(tile)
+    return planes
 
-    def read(time: int, channel: int, box: Box) -> np.ndarray:
-        z, y, x = box
-        region = (corner[0] + x.start, corner[1] + y.start, x.stop - x.start, y.stop - y.start)
-        number, sample = divmod(channel, samples)
-        sample = 2 - sample if sample < 3 and samples > 1 else sample
-        out = np.empty([k.stop - k.start for k in box], dtype)
-        with turn, library_errors(str(path), "CZI"):
-            for k in range(z.start, z.stop):
-                at = {"T": time, "C": number, "Z": k}
-                plane = {a: n + at[a] for a, n in first.items()}
-                found = opened().read(roi=region, plane=plane, **({} if scene is None else {"scene": scene}))
-                out[k - z.start] = found[..., sample]
-        return out
 
-    return read
+def _read(
+    path: Path,
+    planes: Planes,
+    corner: tuple[int, int],
+    samples: int,
+    dtype: np.dtype,
+    time: int,
+    channel: int,
+    box: Box,
+) -> np.ndarray:
+    """A box; where no tile is it is 0. Samples of colours are blue first in the file."""
+    z, y, x = box
+    number, sample = divmod(channel, samples)
+    sample = 2 - sample if sample < 3 and samples > 1 else sample
+    out = np.zeros([k.stop - k.start for k in box], dtype)
+    for k in range(z.start, z.stop):
+        for tile in planes.get((time, number, k), ()):
+            left, top = tile.x - corner[0], tile.y - corner[1]
+            x0, x1 = max(left, x.start), min(left + tile.width, x.stop)
+            y0, y1 = max(top, y.start), min(top + tile.height, y.stop)
+            if x0 < x1 and y0 < y1:
+                found = pixels_of(tile, path)[y0 - top : y1 - top, x0 - left : x1 - left, sample]
+                out[k - z.start, y0 - y.start : y1 - y.start, x0 - x.start : x1 - x.start] = found
+    return out
 
 
 def _metadata(xml: str, channels: int, path: Path) -> tuple[Any, list[str], list[Color]]:
