@@ -114,8 +114,7 @@ def labelled_volume(
     """
     if dtype.kind not in "iufb":
         raise DataError(f"{source}: values of type {dtype}; expected integers or floats")
-    options = _numbered(axes, options)
-    space, extra, step = _split_axes(list(axes), options, source)
+    space, extra, step = _split_axes(list(axes), options := _numbered(axes, options), source)
     chosen = None if options.component == "magnitude" else options.component
     index: list[Any] = [slice(None) if k in space else 0 for k in range(len(axes))]
     for k, flag, value in ((extra, "--component", chosen), (step, "--time", options.time)):

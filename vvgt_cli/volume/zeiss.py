@@ -42,8 +42,8 @@ def read_czi(path: Path, options: ReadOptions) -> Volume:
         kinds = {tile.pixel for tile in tiles}
         if odd or len(kinds) != 1 or not kinds <= set(PIXELS):
             raise DataError(
-                f"{path}: axes {', '.join(sorted(ends))} (several along {', '.join(odd) or 'none'} of the others), pixels "
-                f"of types {sorted(kinds)}; expected several along T, C and Z at most, and one of {sorted(PIXELS)}"
+                f"{path}: axes {', '.join(sorted(ends))} (several along {', '.join(odd) or 'none'}), "
+                f"pixels of types {sorted(kinds)}; expected several of T, C and Z at most, and one of {sorted(PIXELS)}"
             )
         dtype, samples = PIXELS[kinds.pop()]
         x, y = min(t.x for t in tiles), min(t.y for t in tiles)
