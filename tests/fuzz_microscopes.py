@@ -17,7 +17,7 @@ def microscopes() -> dict[str, list[Seed]]:
     one, several = written.cells(channels=1), written.cells(times=2)
     chosen = volume_reader(component=1, time=1)
     in_blocks = volume_reader(component=0, time=1, stored=True)
-    found: dict[str, list[Seed]] = {}
+    found = {"N5": n5()}
     with tempfile.TemporaryDirectory() as folder:
         ims, czi, packed = (Path(folder) / name for name in ("a.ims", "a.czi", "b.czi"))
         written.write_ims(ims, several)

@@ -377,8 +377,6 @@ def manifest() -> list[Seed]:
 
 def readers() -> dict[str, list[Seed]]:
     """Seeds by reader."""
-    from fuzz_microscopes import microscopes, n5
-
     return {
         "raw": raw(),
         "NRRD": nrrd(),
@@ -391,8 +389,6 @@ def readers() -> dict[str, list[Seed]]:
         "VTK XML": vti(),
         "OpenVDB": vdb(),
         "NumPy": numpy_files(),
-        "N5": n5(),
-        **microscopes(),
         "transfer function": transfer(),
         "label table": label_tables(),
         "Gaussians": ply(),
