@@ -141,6 +141,28 @@ def test_scenes_and_mosaics_of_a_czi(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found, values[0, 0] + 1)
 
 
+def test_a_missing_frame_of_an_nd2_is_no_zeros(tmp_path: Path) -> None:
+    pytest.importorskip("nd2")
+    data = microscopes.nd2(cells())
+    (tmp_path / "a.nd2").write_bytes(data[:-2000] + data[-2000:].replace(b"ImageDataSeq|3!", b"ImageDataSeq|9!"))
+    with pytest.raises(DataError, match="of 5 frames 4 are there"):
+        read_volume(str(tmp_path / "a.nd2"), ReadOptions(component=0))
+
+
+def test_values_of_imaris_elsewhere_are_refused(tmp_path: Path) -> None:
+    import h5py
+
+    (tmp_path / "inside").mkdir()
+    microscopes.write_ims(tmp_path / "b.ims", cells())
+    microscopes.write_ims(tmp_path / "inside" / "a.ims", cells())
+    with h5py.File(tmp_path / "inside" / "a.ims", "r+") as file:
+        place = "DataSet/ResolutionLevel 0/TimePoint 0/Channel 1"
+        del file[place]
+        file[place] = h5py.ExternalLink("../b.ims", place)
+    with pytest.raises(DataError, match=r"'\.\./b.ims'; expected a file in the header's own folder"):
+        read_volume(str(tmp_path / "inside" / "a.ims"), ReadOptions(component=0))
+
+
 def test_packed_frames_of_an_nd2(tmp_path: Path) -> None:
     pytest.importorskip("nd2")
     values = cells()

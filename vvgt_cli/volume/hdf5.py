@@ -37,7 +37,7 @@ def read_hdf5(path: Path, options: ReadOptions) -> Volume:
     h5py = need("h5py", "hdf5", str(path), "HDF5")
     with library_errors(str(path), "HDF5"), h5py.File(path, "r") as file:
         if is_imaris(file):
-            return read_imaris(file, path, options, partial(_check_inside, h5py, path))
+            return read_imaris(file, path, options, partial(_checked, h5py, file, path))
         if options.level is not None:
             raise UsageError(f"{path}: no Imaris file, which alone has levels; leave out --level {options.level}")
         dataset = _choose(h5py, file, options.array, path)
@@ -53,10 +53,13 @@ def read_hdf5(path: Path, options: ReadOptions) -> Volume:
         return labelled_volume(stored, dataset.dtype, _axes(dataset), attributes, options, source, name, chunks)
 
 
-def _check_inside(h5py: Any, path: Path, dataset: Any, source: str) -> None:
-    """As `_check_storage`, and every link to a dataset."""
-    _check_links(h5py, dataset.file, dataset.name, path)
-    _check_storage(h5py, dataset, path, source)
+def _checked(h5py: Any, file: Any, path: Path, name: str) -> Any:
+    """The dataset of a path that leads into no file elsewhere, whose values can be read."""
+    _check_links(h5py, file, name, path)
+    if not isinstance(file.get(name), h5py.Dataset):
+        raise DataError(f"{path}:/{name}: no dataset; check that the file is whole")
+    _check_storage(h5py, file[name], path, f"{path}:/{name}")
+    return file[name]
 
 
 def _part(path: Path, name: str, index: tuple[Any, ...]) -> np.ndarray:

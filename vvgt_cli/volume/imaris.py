@@ -5,6 +5,7 @@ Format: Imaris 5.5 file format, https://imaris.oxinst.com/support/imaris-file-fo
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,6 @@ from vvgt_cli.volume.types import Volume
 
 MICROMETRE = 1e-6
 MOST = 1_000_000  # time steps or channels
-Check = Any
 
 
 def is_imaris(file: Any) -> bool:
@@ -41,14 +41,14 @@ def level_shapes(path: Path) -> list[tuple[int, ...]]:
         return []  # said where it is read
 
 
-def read_imaris(file: Any, path: Path, options: ReadOptions, check: Any) -> Volume:
+def read_imaris(file: Any, path: Path, options: ReadOptions, checked: Callable[[str], Any]) -> Volume:
     """Read one channel of one time step of an open file, at ``options.level``.
 
     Args:
         file: open, by h5py.
         path: of it.
         options: level, time, component.
-        check: raises where a dataset's values must not be read: (dataset, name).
+        checked: the dataset of a path; raises where its values must not be read.
 
     Raises:
         DataError: a damaged file.
@@ -61,15 +61,14 @@ def read_imaris(file: Any, path: Path, options: ReadOptions, check: Any) -> Volu
         raise UsageError(f"{path}: --level {level}: expected full, or 0 to {levels - 1}")
     times = _count(file[f"DataSet/ResolutionLevel {level}"], "TimePoint", "")
     channels = _count(file[f"DataSet/ResolutionLevel {level}/TimePoint 0"], "Channel", "")
+    first = checked(_place(level, 0, 0))
     shape = _shape(file, level)
     for time in range(times) if options.time is None else [min(options.time, times - 1)]:
         for channel in range(channels):
             name = _place(level, time, channel)
-            dataset = file[name]
-            check(dataset, f"{path}:/{name}")
+            dataset = checked(name)
             if len(dataset.shape) != 3 or any(a < b for a, b in zip(dataset.shape, shape, strict=True)):
                 raise DataError(f"{path}:/{name}: {dataset.shape}; expected at least the image's {shape}")
-    first = file[_place(level, 0, 0)]
     image = file["DataSetInfo/Image"].attrs if "DataSetInfo/Image" in file else {}
     spacing, origin = _placed(image, shape)
     told = [_channel(file, c) for c in range(channels)]

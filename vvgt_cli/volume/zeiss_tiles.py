@@ -132,19 +132,21 @@ def pixels_of(tile: Tile, path: Path) -> np.ndarray:
     kind, samples = PIXELS[tile.pixel]
     shape, dtype = (tile.height, tile.width, samples), np.dtype(kind).newbyteorder("<")
     need_bytes = tile.height * tile.width * samples * dtype.itemsize
+    if tile.compression == NONE:
+        if tile.size < need_bytes:
+            raise DataError(
+                f"{path}: a tile of {tile.size} bytes; {tile.width} x {tile.height} pixels need {need_bytes}"
+            )
+        return np.memmap(path, dtype, "r", tile.place, shape)
     check_memory(2 * need_bytes, f"{path}: a tile of {tile.width} x {tile.height}")
-    if tile.compression == NONE and tile.size < need_bytes:
-        raise DataError(
-            f"{path}: a tile of {tile.size} bytes; its {tile.width} x {tile.height} pixels need {need_bytes}"
-        )
     with Bounded(path) as file:
         file.seek(tile.place)
-        data = file.read(need_bytes if tile.compression == NONE else tile.size)
+        data = file.read(tile.size)
     if tile.compression in (ZSTD, ZSTD_HEADED):
         data = _zstd(data, need_bytes, tile.compression == ZSTD_HEADED, path)
     elif tile.compression == JPEG_XR:
         return _jpeg_xr(data, shape, dtype, path)
-    elif tile.compression != NONE:
+    else:
         name = OTHERS.get(tile.compression, f"number {tile.compression}")
         raise DataError(f"{path}: compression {name}; expected none, Zstandard or JPEG XR: export it with one of them")
     return np.frombuffer(data, dtype).reshape(shape)
