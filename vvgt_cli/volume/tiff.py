@@ -151,7 +151,7 @@ def _series(file: Any, wanted: str | None, path: Path) -> tuple[Any, int]:
     ) + ("; ..." if len(found) > _LISTED else "")
     if wanted is None:
         text = f"{path}: {len(found)} series: {listing}; choose one by number or name with --series NAME"
-        deep = [any(a in "ZIQ" and n > 1 for a, n in zip(s.axes, s.shape, strict=True)) for _, s in found]
+        deep = [s.kind == "ome" and "Z" in s.axes for _, s in found]  # of plain pages sizes differ by damage, too
         number, series = found[only(deep, text, "--series", [str(k) for k, _ in found], [s.name for _, s in found])]
         return series, number
     fits = [(k, s) for k, s in found if wanted.strip("/") in (str(k), s.name)]
