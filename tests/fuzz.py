@@ -248,6 +248,7 @@ def _lay(folder: Path, seed: Seed, data: bytes) -> Path:
 def main(arguments: list[str] | None = None) -> int:
     """Run the readers that are asked for; 1 if anything was found."""
     import fuzz_vtk
+    from fuzz_microscopes import microscopes
     from fuzz_seeds import readers
 
     parser = argparse.ArgumentParser()
@@ -256,7 +257,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--reader", action="append", help="by name; all without")
     parser.add_argument("--save", type=Path, help="folder for inputs that show something")
     options = parser.parse_args(arguments)
-    table = readers() | fuzz_vtk.readers()
+    table = readers() | fuzz_vtk.readers() | microscopes()
     names = options.reader or list(table)
     status = 0
     for name in names:

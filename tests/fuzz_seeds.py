@@ -29,7 +29,7 @@ def volume_reader(**options: Any) -> Callable[[Path], None]:
     def read(path: Path) -> None:
         volume = read_volume(str(path), ReadOptions(**options))
         for z in (0, -1):
-            np.asarray(volume.data[z])
+            np.asarray(volume.data[z:] if options.get("stored") else volume.data[z])
 
     return read
 

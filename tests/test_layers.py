@@ -228,7 +228,9 @@ def test_channels_in_their_own_colours_add_up(vvgt, tmp_path: Path) -> None:
     np.testing.assert_array_equal(grid[..., 1], grid[..., 2])
     told = json.loads(vvgt("info", tmp_path / "a.ome.tif", "--channel", "all", "--json").out)
     assert told["channels"] == 2
-    assert vvgt("init", tmp_path / "a.ome.tif", "-o", tmp_path / "a.ply").code == 2  # one, or all
+    unsure = vvgt("init", tmp_path / "a.ome.tif", "--tf", "hot", "-o", tmp_path / "a.ply")
+    assert unsure.code == 2  # one, or all
+    assert "--channel 0 to 1, a name, all" in unsure.error
     done = vvgt("init", tmp_path / "a.ome.tif", "--channel", "all", *SMALL[:4], "-o", tmp_path / "a.ply")
     assert done.code == 0, done.err
     layer = f"{tmp_path / 'a.ome.tif'},channel=cyan,tf=gray"

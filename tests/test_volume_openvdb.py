@@ -258,4 +258,8 @@ def test_a_grid_by_name_on_the_command_line(vvgt, folder: Path, tmp_path: Path) 
     result = vvgt("info", tmp_path / "sphere.vdb", "--grid", "surface", "--json")
     assert result.code == 0, result.err
     assert b'"float32"' in result.out
-    assert "fog (float)" in vvgt("info", tmp_path / "sphere.vdb").error
+    told = vvgt("info", tmp_path / "sphere.vdb")
+    assert told.code == 0, told.err
+    assert b"--grid surface, dims 41 41 41, dtype float32, range -3 3" in told.out
+    assert b"--grid fog, dims 35 35 35" in told.out
+    assert "fog (float)" in vvgt("init", tmp_path / "sphere.vdb", "-o", tmp_path / "a.ply").error

@@ -296,5 +296,9 @@ def test_info_and_a_series_of_one_file(vvgt, tmp_path: Path) -> None:
     facts = json.loads(done.out)
     assert facts["dims"] == [X, Y, Z]
     assert facts["range"] == [VALUES[2, 1].min(), VALUES[2, 1].max()]
-    assert "2 channels (0 'DAPI', 1 'GFP')" in vvgt("info", source).error
-    assert "3 time steps" in vvgt("info", source, "--channel", "1").error
+    told = json.loads(vvgt("info", source, "--json").out)
+    assert (told["time_steps"], told["channels"]) == (3, 2)
+    assert [row["choice"] for row in told["choices"]] == ["--channel 0", "--channel 1"]
+    assert told["choices"][1]["range"] == [VALUES[0, 1].min(), VALUES[0, 1].max()]
+    assert "2 channels (0 'DAPI', 1 'GFP')" in vvgt("init", source, "--time", 0, "--tf", "hot", "-o", "a.ply").error
+    assert json.loads(vvgt("info", source, "--channel", "1", "--json").out)["time_steps"] == 3

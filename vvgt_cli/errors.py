@@ -61,6 +61,20 @@ class SeveralSteps(UsageError):
         self.steps, self.times, self.unit = steps, times, unit
 
 
+class SeveralArrays(UsageError):
+    """A file of several arrays, images or groups and none chosen.
+
+    Attributes:
+        option: what chooses one.
+        choices: what it may be given.
+        names: of them, for people.
+    """
+
+    def __init__(self, text: str, option: str, choices: Sequence[str], names: Sequence[str] = ()) -> None:
+        super().__init__(text)
+        self.option, self.choices, self.names = option, list(choices), list(names or choices)
+
+
 class SeveralComponents(UsageError):
     """A volume of several components or channels and none chosen.
 
@@ -68,10 +82,18 @@ class SeveralComponents(UsageError):
         count: how many there are.
         color: they are red, green, blue and perhaps opacity.
         colors: RGB in [0, 1] of each channel, None where the file says none.
+        channels: they are channels of a microscope, which are shown together.
+        names: of the channels, where they have any.
     """
 
     def __init__(
-        self, text: str, count: int, color: bool = False, colors: Sequence[tuple[float, float, float] | None] = ()
+        self,
+        text: str,
+        count: int,
+        color: bool = False,
+        colors: Sequence[tuple[float, float, float] | None] = (),
+        channels: bool = False,
+        names: Sequence[str] = (),
     ) -> None:
         super().__init__(text)
-        self.count, self.color, self.colors = count, color, colors
+        self.count, self.color, self.colors, self.channels, self.names = count, color, colors, channels, names

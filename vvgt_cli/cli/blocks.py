@@ -54,8 +54,8 @@ _options = {
     ),
     "level": click.option(
         "--level", metavar="full|N", callback=_level,
-        help="Resolution level of an OME-Zarr image in blocks, 0 the finest. Default: the coarsest sufficient for "
-        "--size.",
+        help="Resolution level of an OME-Zarr, N5 or Imaris image in blocks, 0 the finest. Default: the coarsest "
+        "sufficient for --size.",
     ),
 }  # fmt: skip
 _shard_option = {

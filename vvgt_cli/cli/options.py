@@ -62,7 +62,8 @@ _READ = dict(
     ),
     array=click.option(
         "--array", "--grid", "--series", "array", metavar="NAME",
-        help="Array, grid or DICOM series (number, UID or description) to read if there are several.",
+        help="Array, grid, image, scene or DICOM series (number, name, UID or description) to read if there are "
+        "several.",
     ),
     component=click.option(
         "--component", "--channel", "component", metavar="N|NAME|magnitude|color|all", callback=_component,

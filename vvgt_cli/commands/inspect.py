@@ -8,12 +8,12 @@ import sys
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from vvgt_cli.cameras.files import read_cameras
 from vvgt_cli.conversion.gaussian_files import STDIN
 from vvgt_cli.conversion.index import is_index, read_index
-from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.errors import DataError, SeveralArrays, SeveralComponents, SeveralSteps, UsageError, VvgtError
 from vvgt_cli.files import seekable
 from vvgt_cli.gaussians import describe, read_ply
 from vvgt_cli.gaussians.formats import format_of, read_splats
@@ -27,7 +27,12 @@ from vvgt_cli.volume.registry import contents
 from vvgt_cli.volume.space import axis_facts
 from vvgt_cli.volume.vtk_family import is_index as is_vtk_index
 
+if TYPE_CHECKING:
+    from vvgt_cli.field.layered import Content
+
 _PLY = (b"ply\n", b"ply\r")
+LISTED = 50  # of several volumes in a file
+CHEAP = 64 << 20  # bytes of a volume whose range is looked for
 _HEAD = 65536  # bytes that tell a view set from a transfer function
 
 
@@ -117,6 +122,74 @@ def _entries(table: LabelTable) -> list[dict[str, Any]]:
 
 
 def _volume(file: str, read: ReadOptions) -> dict[str, Any]:
+    """A volume; of a file that holds several the list of them, of time steps the first."""
+    try:
+        return _one(file, read)
+    except SeveralSteps as error:
+        facts = _one(file, replace(read, time=0))
+        head = {"kind": facts.pop("kind"), "name": facts.pop("name")}
+        return {**head, "time_steps": error.steps, "shown": "time step 0 (--time N chooses)", **facts}
+    except SeveralArrays as error:
+        outer = file.rpartition(":/")[0] if not os.path.exists(file) else file
+        pairs = list(zip(error.choices, error.names, strict=True))
+        rows = [
+            _choice(outer or file, replace(read, array=key), f"{error.option} {key}", name)
+            for key, name in pairs[:LISTED]
+        ]
+        return {"kind": "several volumes", "name": Path(file).name, "count": len(pairs), "choices": rows}
+    except SeveralComponents as error:
+        rows = [
+            _choice(file, replace(read, component=k), f"--component {k}", name)
+            for k, name in zip(range(min(error.count, LISTED)), [*error.names] or [""] * error.count, strict=False)
+        ]
+        return {"kind": "several components", "name": Path(file).name, "count": error.count, "choices": rows}
+
+
+def _choice(file: str, read: ReadOptions, option: str, name: str) -> dict[str, Any]:
+    """One of several volumes of a file: size, type, range where few values have to be read for it."""
+    from vvgt_cli.field.layered import open_parts
+    from vvgt_cli.volume import statistics
+
+    facts: dict[str, Any] = {"choice": option, **({"name": name} if name not in ("", option.partition(" ")[2]) else {})}
+    read = replace(read, stored=True, packed=True)
+    try:
+        try:
+            content = open_parts(file, read)
+        except SeveralSteps as error:
+            facts["time_steps"] = error.steps
+            content = open_parts(file, replace(read, time=0))
+        except SeveralComponents as error:
+            facts["components"] = error.count
+            content = open_parts(file, replace(read, component=0))
+        volume = content.volumes[0]
+        facts |= {"dims": volume.dims, "dtype": volume.data.dtype.name}
+        if len(content.volumes) > 1:
+            facts["channels"] = len(content.volumes)
+        elif volume.data.nbytes <= CHEAP:
+            numbers = statistics(volume)
+            facts["range"] = [numbers.lo, numbers.hi]
+    except VvgtError as error:
+        facts["error"] = " ".join(str(error).split())[:200]
+    return facts
+
+
+def _channels(content: Content) -> list[dict[str, Any]]:
+    """Each channel of a volume: what chooses it, its name, colour and range."""
+    from vvgt_cli.field.layered import channel_color
+    from vvgt_cli.volume import statistics
+
+    rows = []
+    for k, volume in enumerate(content.volumes):
+        row: dict[str, Any] = {"choice": f"--channel {k}", "name": content.names[k] if content.names else ""}
+        row |= {"color": [round(v, 4) for v in channel_color(k, content.colors[k])]}
+        if volume.data.nbytes <= CHEAP:
+            numbers = statistics(volume)
+            row["range"] = [numbers.lo, numbers.hi]
+        rows.append(row)
+    return rows
+
+
+def _one(file: str, read: ReadOptions) -> dict[str, Any]:
     from vvgt_cli.field.layered import open_parts
     from vvgt_cli.look import unit_distance
     from vvgt_cli.look.fitting import fitting
@@ -137,7 +210,7 @@ def _volume(file: str, read: ReadOptions) -> dict[str, Any]:
     elif content.overlapping:
         kinds["segment_layers"] = len(content.volumes)
     elif len(content.volumes) > 1:
-        kinds["channels"] = len(content.volumes)
+        kinds |= {"channels": len(content.volumes), "choices": _channels(content)}
     elif not isinstance(volume.data, Packed) and recognised(volume):
         kinds["label_map"] = True
     if holds_table(content.path) and not content.overlapping:

@@ -127,6 +127,8 @@ def common(run: Run, request: ConvertRequest, steps: Sequence[Step]) -> Series:
     with run.stage("frames") as stage:
         frames = survey(steps, source.labels, source.tf, run.console, request.blocks is not None)
         source = replace(source, statistics=frames.whole)
+        if frames.first.unasked:  # said once, not for every frame
+            steps = [replace(step, read=replace(step.read, component=ALL)) for step in steps]
         if source.labels is None and frames.labels is not None:
             source = replace(source, labels=AUTO)
         shown, distance = _functions(source, frames)

@@ -37,6 +37,7 @@ AUTO, NONE = "auto", "none"
 COLOR, ALL = "color", "all"  # of --component
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709
 CHANNEL_COLORS = ((0, 1, 0), (1, 0, 1), (0, 1, 1), (1, 0.5, 0), (0.4, 0.4, 1), (1, 1, 0), (1, 0, 0))
+MOST_CHANNELS = 6  # that are shown together unasked: of more, colours are hard to tell apart
 DARK, BRIGHT = 0.5, 0.998  # shares of a channel's voxels between which its opacity rises
 
 
@@ -52,6 +53,8 @@ class Content:
         overlapping: they are the layers of a segmentation whose segments overlap.
         layer: number of the one component that was asked for, None where none was.
         stored: values stay where they are: what is made of them is made block by block.
+        names: of the channels, where they have any.
+        unasked: they are all channels although none was asked for: what a reader says of them, else None.
     """
 
     volumes: tuple[Volume, ...]
@@ -61,6 +64,8 @@ class Content:
     overlapping: bool = False
     layer: int | None = None
     stored: bool = False
+    names: Sequence[str] = ()
+    unasked: str | None = None
 
     @property
     def one_field(self) -> bool:
@@ -139,6 +144,8 @@ def content_of(source: Volume | Content) -> Content:
 def open_parts(source: str, read: ReadOptions) -> Content:
     """A volume; where ``read.component`` is "color" or "all", or the file says that it holds colours, its components.
 
+    Up to `MOST_CHANNELS` channels of a microscope are "all" where none is asked for.
+
     Raises:
         DataError, UsageError: as `open_volume`; components that are no colours.
     """
@@ -147,7 +154,8 @@ def open_parts(source: str, read: ReadOptions) -> Content:
         volume = open_volume(source, replace(read, component=None) if asked else read)
     except SeveralComponents as error:
         overlapping = not asked and holds_table(source)
-        if not asked and not error.color and not overlapping:
+        unasked = not (asked or error.color or overlapping)
+        if unasked and not (error.channels and error.count <= MOST_CHANNELS):
             raise
         if asked == COLOR and error.count not in (3, 4):
             raise UsageError(
@@ -158,7 +166,9 @@ def open_parts(source: str, read: ReadOptions) -> Content:
             return Content(parts, True, stored=read.stored)
         colors = error.colors or [None] * error.count
         named = tuple(replace(v, name=f"{v.name} {k}") for k, v in enumerate(parts))
-        return Content(named, colors=colors, path=source, overlapping=overlapping, stored=read.stored)
+        return Content(
+            named, False, colors, source, overlapping, None, read.stored, error.names, str(error) if unasked else None
+        )
     if asked:
         raise UsageError(f"{source}: one component; leave out --component {asked}")
     layer = read.component if isinstance(read.component, int) else None
@@ -265,7 +275,33 @@ def functions_of(
         if tf is None:
             return [from_histogram(numbers[0], one.hounsfield, one.density)]
         return [resolve(tf, numbers[0], tf_range, one.hounsfield)]
-    return [_channel(k, opened.colors[k], its, tf, tf_range) for k, its in enumerate(numbers)]
+    if opened.unasked:
+        _say_all(opened, tf)
+    names = opened.names or [""] * len(numbers)
+    return [_channel(k, names[k], opened.colors[k], its, tf, tf_range) for k, its in enumerate(numbers)]
+
+
+def _say_all(opened: Content, tf: TransferFunction | None) -> None:
+    """Say that all channels are shown; refuse a function, of which it is not known whose it is."""
+    if tf is not None:
+        raise UsageError(f"{opened.unasked} (--tf is of one channel; with all, each is shown by its opacity)")
+    known = opened.names or [""] * len(opened.volumes)
+    shown = [
+        f"{k}{f' {name!r}' if name else ''} {_hex(channel_color(k, color))}"
+        for k, (name, color) in enumerate(zip(known, opened.colors, strict=True))
+    ]
+    warnings.warn(
+        f"{opened.path}: {len(shown)} channels, all shown: {', '.join(shown)} (--channel N: one of them)", stacklevel=4
+    )
+
+
+def channel_color(number: int, color: tuple[float, float, float] | None) -> tuple[float, float, float]:
+    """RGB in [0, 1] that a channel is shown in: the file's, else the usual one of its number."""
+    return color or CHANNEL_COLORS[number % len(CHANNEL_COLORS)]
+
+
+def _hex(rgb: Sequence[float]) -> str:
+    return "#" + "".join(f"{round(255 * v):02x}" for v in rgb)
 
 
 def _white(opened: Content) -> float:
@@ -324,6 +360,7 @@ def _luminance(stored: bool, *bands: Volume) -> Volume:
 
 def _channel(
     number: int,
+    name: str,
     color: tuple[float, float, float] | None,
     numbers: Statistics,
     tf: TransferFunction | None,
@@ -332,13 +369,15 @@ def _channel(
     """A channel in its colour; the function's opacity, or a ramp over its brighter voxels."""
     from vvgt_cli.look.resolve import percentiles
 
-    rgb = color or CHANNEL_COLORS[number % len(CHANNEL_COLORS)]
+    rgb = channel_color(number, color)
     if tf is not None:
         shown = resolve(tf, numbers, tf_range)
         lo, hi = shown.node_range()
         return replace(shown, color_map=_function("", lo, max(hi, lo + 1e-9), rgb).color_map)
     lo, hi = percentiles(numbers, np.array([DARK, BRIGHT]))
-    return _function(f"channel {number}", float(lo), float(hi) if hi > lo else float(lo) + 1, rgb)
+    return _function(
+        f"channel {number}{f' {name}' if name else ''}", float(lo), float(hi) if hi > lo else float(lo) + 1, rgb
+    )
 
 
 def _function(name: str, lo: float, hi: float, rgb: Sequence[float]) -> TransferFunction:

@@ -39,8 +39,9 @@ LAYOUT = 3  # of parts: one more whenever what is in them changes
 HELD = 1 << 30  # bytes of values: more are processed in blocks, with a tenth of the memory (docs/log/blocks.md)
 LARGE = 0.25  # of the free memory: a file of less is read as ever
 PROGRAM, A_CELL = 3e8, 300  # bytes: interpreter, libraries and kernels; a base cell in memory
-ZARR = {".zarray", ".zgroup", ".zattrs", "zarr.json"}  # files of which a folder has one
+ZARR = {".zarray", ".zgroup", ".zattrs", "zarr.json", "attributes.json"}  # files of which a folder has one
 INDEXES = (".pvti", ".pvd", ".series")  # of files elsewhere
+PACKED = (".h5", ".hdf5", ".he5", ".hdf", ".nc", ".ims", ".czi", ".nd2")  # files of few bytes may hold many voxels
 RANGES, LAYER_VOXEL = 0.15, 20  # bytes a voxel: the map of empty space, an optics grid
 LAYERED_BYTES = 60  # of a voxel of an optics grid while a block of it is there
 FEW_SAMPLES = 512  # bricks of layers: each is read for itself
@@ -184,14 +185,16 @@ def _visible_of(reader: Layers, volume: Volume) -> float:
 
 
 def _at_level(read: ReadOptions, path: str, options: BlockOptions, size: int) -> tuple[ReadOptions, str | None]:
-    """The level of an OME-Zarr image: as asked for, else the coarsest whose voxels the screen cannot tell apart."""
+    """The level of a file of several: as asked for, else the coarsest whose voxels the screen cannot tell apart."""
     from vvgt_cli.closed_form.closed_form import MIN_CELL, pixel_width
-    from vvgt_cli.volume.zarr_store import level_shapes
+    from vvgt_cli.volume.levels import level_shapes
 
     shapes = level_shapes(path, read)
     if not shapes:
         if options.level is not None:
-            raise UsageError(f"{path}: no OME-Zarr image, which alone has levels; leave out --level {options.level}")
+            raise UsageError(
+                f"{path}: no OME-Zarr, N5 or Imaris image, which alone have levels; leave out --level {options.level}"
+            )
         return read, None
     if options.level is not None:
         return replace(read, level=0 if options.level == "full" else int(options.level)), None
@@ -240,7 +243,7 @@ def better_in_blocks(request: SourceRequest) -> bool:
     inside = not os.path.exists(path) and not files_of(path) and ":/" in path
     place = path.rpartition(":/")[0] if inside else path
     zarr = os.path.isdir(place) and ZARR & set(os.listdir(place))
-    h5 = os.path.isfile(place) and place.lower().endswith((".h5", ".hdf5", ".he5", ".hdf", ".nc"))
+    h5 = os.path.isfile(place) and place.lower().endswith(PACKED)
     files = files_of(place)
     tiff = files and files[0].suffix.lower() in (".tif", ".tiff")
     index = os.path.isfile(place) and place.lower().endswith(INDEXES)

@@ -7,12 +7,15 @@ from vvgt_cli.volume import (  # noqa: F401  each registers its formats
     grid_text,
     hdf5,
     inviwo,
+    leica,
     metaimage,
     mgh,
     minc,
     mrc,
+    n5,
     netcdf,
     nifti,
+    nikon,
     nrrd,
     numpy_file,
     openvdb,
@@ -26,6 +29,7 @@ from vvgt_cli.volume import (  # noqa: F401  each registers its formats
     vtk_pieces,
     vtk_xml,
     zarr_store,
+    zeiss,
 )
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.registry import read_volume

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vvgt_cli.errors import DataError, SeveralComponents, UsageError
+from vvgt_cli.errors import DataError, SeveralArrays, SeveralComponents, UsageError
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,8 @@ def choose_array(infos: Sequence[ArrayInfo], wanted: str | None, source: str) ->
             return index
     if len(infos) == 1:
         return 0
-    raise UsageError(f"{source}: several arrays and none marked as scalars: {listing}; choose one with --array NAME")
+    text = f"{source}: several arrays and none marked as scalars: {listing}; choose one with --array NAME"
+    raise SeveralArrays(text, "--array", list(dict.fromkeys(infos[index].name for index in order)))
 
 
 def select_component(

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.errors import DataError, SeveralArrays, UsageError
 from vvgt_cli.volume.dicom_seg import is_segmentation
 
 _FEW = 2  # slices: fewer than make a stack, beside one that has more
@@ -71,9 +71,11 @@ def _only(found: dict[str, Files], path: Path) -> Files:
     }
     left = {uid: f for uid, f in found.items() if uid not in aside} or found
     if len(left) > 1:
-        raise UsageError(
+        text = (
             f"{path}: several series: {_listed(found)}; choose one by number, UID or description with --series SERIES"
         )
+        titles = [str(f[0][1].get("SeriesDescription", "")).strip() for f in found.values()]
+        raise SeveralArrays(text, "--series", list(found), titles)
     if len(left) < len(found):
         warnings.warn(
             f"{path}: left out: {_listed(aside)} (localisers, segmentations, images without a position)", stacklevel=2

@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.errors import DataError, SeveralArrays, UsageError
 from vvgt_cli.volume.blocks import data_file, load_block, size_text
+from vvgt_cli.volume.imaris import is_imaris, read_imaris
 from vvgt_cli.volume.labelled import AXIS_ATTRIBUTES, CF_ATTRIBUTES, Axis, axis, labelled_volume
 from vvgt_cli.volume.libraries import library_errors, need
 from vvgt_cli.volume.options import ReadOptions
@@ -36,6 +37,10 @@ def read_hdf5(path: Path, options: ReadOptions) -> Volume:
     """
     h5py = need("h5py", "hdf5", str(path), "HDF5")
     with library_errors(str(path), "HDF5"), h5py.File(path, "r") as file:
+        if is_imaris(file):
+            return read_imaris(file, path, options, partial(_checked, h5py, file, path))
+        if options.level is not None:
+            raise UsageError(f"{path}: no Imaris file, which alone has levels; leave out --level {options.level}")
         dataset = _choose(h5py, file, options.array, path)
         source = f"{path}:{dataset.name}"
         check_storage(h5py, dataset, path, source)
@@ -47,6 +52,15 @@ def read_hdf5(path: Path, options: ReadOptions) -> Volume:
         if mapped is None and options.stored:
             stored = partial(_part, path, dataset.name)
         return labelled_volume(stored, dataset.dtype, _axes(dataset), attributes, options, source, name, chunks)
+
+
+def _checked(h5py: Any, file: Any, path: Path, name: str) -> Any:
+    """The dataset of a path that leads into no file elsewhere, whose values can be read."""
+    _check_links(h5py, file, name, path)
+    if not isinstance(file.get(name), h5py.Dataset):
+        raise DataError(f"{path}:/{name}: no dataset; check that the file is whole")
+    check_storage(h5py, file[name], path, f"{path}:/{name}")
+    return file[name]
 
 
 def _part(path: Path, name: str, index: tuple[Any, ...]) -> np.ndarray:
@@ -72,7 +86,8 @@ def _choose(h5py: Any, file: Any, wanted: str | None, path: Path) -> Any:
     if not fits:
         raise DataError(f"{path}: no dataset of numbers with two axes or more; expected a volume")
     if len(fits) > 1:
-        raise UsageError(f"{path}: several datasets: {listing}; choose one as {path}:{fits[0].name} (or with --array)")
+        text = f"{path}: several datasets: {listing}; choose one as {path}:{fits[0].name} (or with --array)"
+        raise SeveralArrays(text, "--array", [d.name for d in fits])
     return fits[0]
 
 
@@ -161,7 +176,7 @@ def _text(value: Any) -> str:
 register(
     Reader(
         "HDF5",
-        (".h5", ".hdf5", ".he5", ".hdf"),
+        (".h5", ".hdf5", ".he5", ".hdf", ".ims"),
         lambda head: head.startswith(MAGIC) and not any(other in head for other in _OTHERS),
         read_hdf5,
         named_arrays=True,

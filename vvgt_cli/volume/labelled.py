@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.errors import DataError, SeveralSteps, UsageError
+from vvgt_cli.errors import DataError, SeveralComponents, SeveralSteps, UsageError
 from vvgt_cli.volume.blocks import IN_BLOCKS, check_memory, count
 from vvgt_cli.volume.components import contiguous, select_component
 from vvgt_cli.volume.options import ReadOptions
@@ -49,7 +49,8 @@ class Axis:
         size: values along it.
         centres: (size,) coordinates of the values, or None.
         units: of the coordinates, or "".
-        role: ``x``, ``y``, ``z``, ``t``, ``c`` (components), or "" where nothing says.
+        role: ``x``, ``y``, ``z``, ``t``, ``c`` (channels), or "" where nothing says.
+        labels, colors: names and RGB of channels, where there are any.
     """
 
     name: str
@@ -57,6 +58,8 @@ class Axis:
     centres: np.ndarray | None = None
     units: str = ""
     role: str = ""
+    labels: tuple[str, ...] = ()
+    colors: tuple[tuple[float, float, float] | None, ...] = ()
 
     def __str__(self) -> str:
         return f"{self.name or 'unnamed'} ({self.size})"
@@ -111,7 +114,7 @@ def labelled_volume(
     """
     if dtype.kind not in "iufb":
         raise DataError(f"{source}: values of type {dtype}; expected integers or floats")
-    space, extra, step = _split_axes(list(axes), options, source)
+    space, extra, step = _split_axes(list(axes), options := _numbered(axes, options), source)
     chosen = None if options.component == "magnitude" else options.component
     index: list[Any] = [slice(None) if k in space else 0 for k in range(len(axes))]
     for k, flag, value in ((extra, "--component", chosen), (step, "--time", options.time)):
@@ -139,6 +142,14 @@ def labelled_volume(
     if field.ndim == 2:
         field, spatial = field[None], [Axis("", 1), *spatial]
     return _placed(field, spatial, (slope, intercept), options, source, name)
+
+
+def _numbered(axes: Sequence[Axis], options: ReadOptions) -> ReadOptions:
+    """The options with the number of a channel in place of its name."""
+    for one in axes:
+        if isinstance(options.component, str) and one.labels.count(options.component) == 1:
+            return replace(options, component=one.labels.index(options.component))
+    return options
 
 
 def _split_axes(axes: list[Axis], options: ReadOptions, source: str) -> tuple[list[int], int | None, int | None]:
@@ -174,11 +185,12 @@ def _split_axes(axes: list[Axis], options: ReadOptions, source: str) -> tuple[li
     if not odd and options.component not in (None, 0):
         raise UsageError(f"{source}: axes {listing}, none of components; leave out --component {options.component}")
     if odd and options.component is None:
-        last = axes[odd[0]].size - 1
-        raise UsageError(
-            f"{source}: axes {listing}; expected three: choose along {axes[odd[0]].name or 'the shortest of them'} "
-            f"with --component 0 to {last} (or --component magnitude)"
+        it = axes[odd[0]]
+        text = (
+            f"{source}: axes {listing}; expected three: choose along {it.name or 'the shortest of them'} "
+            f"with --component 0 to {it.size - 1} (or --component magnitude)"
         )
+        raise SeveralComponents(text, it.size, False, it.colors, it.role == "c", it.labels)
     return space, odd[0] if odd else None, step
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.errors import DataError, SeveralArrays, UsageError
 from vvgt_cli.volume.hdf5 import MAGIC, MOST_LISTED
 from vvgt_cli.volume.labelled import Axis, axis, labelled_volume
 from vvgt_cli.volume.libraries import library_errors, need
@@ -68,7 +68,8 @@ def _choose(file: Any, wanted: str | None, path: Path) -> Any:
     if not deep:
         raise DataError(f"{path}: no variable of numbers with two axes or more; expected a volume")
     if len(deep) > 1:
-        raise UsageError(f"{path}: several variables: {listing}; choose one with --array NAME")
+        text = f"{path}: several variables: {listing}; choose one with --array NAME"
+        raise SeveralArrays(text, "--array", list(deep))
     return next(iter(deep.values()))
 
 

@@ -14,7 +14,7 @@ from typing import IO
 
 import numpy as np
 
-from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.errors import DataError, SeveralArrays, UsageError
 from vvgt_cli.volume.blocks import MAX_RATIO, check_memory, count, fill, load_block, size_text
 from vvgt_cli.volume.labelled import Axis, labelled_volume
 from vvgt_cli.volume.options import ReadOptions
@@ -101,7 +101,7 @@ def _choose(archive: zipfile.ZipFile, members: dict[str, zipfile.ZipInfo], wante
     deep = [name for name, shape in shapes.items() if sum(n > 1 for n in shape) >= 3] or list(members)
     if len(deep) > 1:
         listing = " ".join(", ".join(deep).split())
-        raise UsageError(f"{path}: several arrays: {listing}; choose one with --array NAME")
+        raise SeveralArrays(f"{path}: several arrays: {listing}; choose one with --array NAME", "--array", deep)
     return deep[0]
 
 

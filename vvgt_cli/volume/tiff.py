@@ -21,6 +21,7 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, SeveralComponents, SeveralSteps, UsageError
 from vvgt_cli.volume.blocks import check_memory, size_text
+from vvgt_cli.volume.channels import only
 from vvgt_cli.volume.components import contiguous, magnitude
 from vvgt_cli.volume.libraries import library_errors
 from vvgt_cli.volume.options import ReadOptions
@@ -149,9 +150,10 @@ def _series(file: Any, wanted: str | None, path: Path) -> tuple[Any, int]:
         f"{k} {s.name!r} ({' x '.join(map(str, s.shape))}, axes {s.axes}, {s.dtype})" for k, s in found[:_LISTED]
     ) + ("; ..." if len(found) > _LISTED else "")
     if wanted is None:
-        if len(found) > 1:
-            raise UsageError(f"{path}: {len(found)} series: {listing}; choose one by number or name with --series NAME")
-        return found[0][1], found[0][0]
+        text = f"{path}: {len(found)} series: {listing}; choose one by number or name with --series NAME"
+        deep = [s.kind == "ome" and "Z" in s.axes for _, s in found]  # of plain pages sizes differ by damage, too
+        number, series = found[only(deep, text, "--series", [str(k) for k, _ in found], [s.name for _, s in found])]
+        return series, number
     fits = [(k, s) for k, s in found if wanted.strip("/") in (str(k), s.name)]
     if len(fits) != 1:
         raise UsageError(f"{path}: {len(fits)} series {wanted!r}; it has {listing}; choose with --series NAME")
@@ -217,7 +219,8 @@ def _choose(
     index: list[int | slice] = [slice(None) if k in space else 0 for k in range(len(layout.shape))]
     channels = layout.of("CS")
     several = options.component == "magnitude" and bool(channels)
-    number = _channel([layout.shape[k] for k in channels], facts, options.component, path, dtype, layout.color)
+    sizes, own = [layout.shape[k] for k in channels], not layout.of("S")
+    number = _channel(sizes, facts, options.component, path, dtype, layout.color, own)
     for k in reversed(channels):  # the samples of a pixel count faster than the channels
         index[k] = slice(None) if several else number % layout.shape[k]
         number //= layout.shape[k]
@@ -235,8 +238,19 @@ def _choose(
     return tuple(index), several
 
 
-def _channel(sizes: list[int], facts: Facts, wanted: int | str | None, path: Path, dtype: np.dtype, color: bool) -> int:
-    """Number of the channel asked for, or of the only one; 0 for the magnitude of all."""
+def _channel(
+    sizes: list[int],
+    facts: Facts,
+    wanted: int | str | None,
+    path: Path,
+    dtype: np.dtype,
+    color: bool,
+    channels: bool,
+) -> int:
+    """Number of the channel asked for, or of the only one; 0 for the magnitude of all.
+
+    ``color``: they are colours; ``channels``: they are channels of their own, not samples of pixels.
+    """
     n = math.prod(sizes)
     names = facts.channels if len(facts.channels) == n else []
     if wanted == "magnitude" and n > 1:
@@ -255,7 +269,8 @@ def _channel(sizes: list[int], facts: Facts, wanted: int | str | None, path: Pat
     text = f"{what}{found}; expected one: try --channel 0 to {n - 1}, a name, all, or --component magnitude"
     if wanted is not None:
         raise UsageError(text)
-    raise SeveralComponents(text, n, color and n in (3, 4), facts.colors if len(facts.colors) == n else ())
+    colors = facts.colors if len(facts.colors) == n else ()
+    raise SeveralComponents(text, n, color and n in (3, 4), colors, channels, names)
 
 
 def _kept(layout: SeriesAxes, index: tuple[int | slice, ...], letter: str) -> int | None:

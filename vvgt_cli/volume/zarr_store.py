@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.errors import DataError, SeveralArrays, UsageError
+from vvgt_cli.volume.channels import hex_color
 from vvgt_cli.volume.hdf5 import MAX_CHUNK, MOST_LISTED
 from vvgt_cli.volume.labelled import Axis, axis, labelled_volume
 from vvgt_cli.volume.libraries import library_errors, need
@@ -123,7 +124,8 @@ def _choose(path: Path, wanted: str | None, number: int | None) -> tuple[Path, d
     if not fits:
         raise DataError(f"{path}: no array of two axes or more; expected a volume")
     if len(fits) > 1:
-        raise UsageError(f"{path}: several arrays: {listing}; choose one as {path}:/PATH (or with --array)")
+        text = f"{path}: several arrays: {listing}; choose one as {path}:/PATH (or with --array)"
+        raise SeveralArrays(text, "--array", [p.relative_to(path).as_posix() for p, _ in fits])
     return fits[0]
 
 
@@ -218,8 +220,21 @@ def _ome_axes(place: Path, shape: tuple[int, ...]) -> list[Axis]:
         name = str(facts.get("name", "")).lower()
         role = roles.get(str(facts.get("type", "")), name if name in ("x", "y", "z", "t", "c") else "")
         centres = shift[k] + scale[k] * np.arange(size) if role not in ("t", "c") else None
-        axes.append(Axis(name, size, centres, str(facts.get("unit", "") or ""), role))
+        labels, colors = _rendering(place.parent, size) if role == "c" else ((), ())
+        axes.append(Axis(name, size, centres, str(facts.get("unit", "") or ""), role, labels, colors))
     return axes
+
+
+def _rendering(group: Path, count: int) -> tuple[tuple[str, ...], tuple[tuple[float, float, float] | None, ...]]:
+    """Names and RGB of the channels by the rendering settings (``omero``); none where they are of another number."""
+    attributes = _attributes(group)
+    inner = attributes.get("ome")
+    omero = (inner if isinstance(inner, dict) else attributes).get("omero")
+    channels = omero.get("channels") if isinstance(omero, dict) else None
+    if not isinstance(channels, list) or len(channels) != count or not all(isinstance(c, dict) for c in channels):
+        return (), ()
+    names = tuple(str(c.get("label") or "")[:80] for c in channels)
+    return names if any(names) else (), tuple(hex_color(c.get("color")) for c in channels)
 
 
 register(

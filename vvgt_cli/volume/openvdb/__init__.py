@@ -8,7 +8,7 @@ from __future__ import annotations
 import mmap
 from pathlib import Path
 
-from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.errors import DataError, SeveralArrays, UsageError
 from vvgt_cli.volume.openvdb.archive import MAGIC, TYPES, Grid, read_grid_head, read_header
 from vvgt_cli.volume.openvdb.cursor import Cursor
 from vvgt_cli.volume.openvdb.layout import bounding_box, brick_array
@@ -30,7 +30,8 @@ def choose_grid(grids: list[Grid], wanted: str | None, source: str) -> Grid:
         scalar = [g for g in grids if g.readable and g.components == 1]
         found = scalar or grids
         if len(found) > 1:
-            raise UsageError(f"{source}: several grids: {listing}; choose one with --grid NAME")
+            text = f"{source}: several grids: {listing}; choose one with --grid NAME"
+            raise SeveralArrays(text, "--grid", [g.label for g in found])
     else:
         found = [g for g in grids if g.label == wanted] or [g for g in grids if g.name == wanted]
         if not found:

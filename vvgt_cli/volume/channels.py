@@ -1,0 +1,227 @@
+"""Images of microscopes: one channel and one time step of one as a volume, in memory or left in its file."""
+
+from __future__ import annotations
+
+import io
+import math
+import os
+import re
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+
+from vvgt_cli.errors import DataError, SeveralArrays, SeveralComponents, SeveralSteps, UsageError
+from vvgt_cli.volume.blocks import IN_BLOCKS, check_memory
+from vvgt_cli.volume.components import contiguous, magnitude
+from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.stored import Stored
+from vvgt_cli.volume.types import Volume
+
+EXTRA = "microscopy"
+MAX_XML = 64 << 20
+LISTED = 12  # channels or images that an error lists
+Color = tuple[float, float, float] | None
+Box = tuple[slice, slice, slice]
+
+
+@dataclass(frozen=True)
+class Picture:
+    """An image of a microscope.
+
+    Attributes:
+        times, channels: how many there are.
+        shape: (nz, ny, nx) of each.
+        dtype: of the values.
+        read: (time, channel, slices along z, y, x, step 1) to that box, (z, y, x).
+        chunks: (z, y, x) voxels that are read together.
+        spacing: (x, y, z) in micrometres; None of an axis where the file has none.
+        origin: world position of the centre of voxel (0, 0, 0), (x, y, z), micrometres.
+        names, colors: of the channels, where the file has any.
+        rgb: the channels are red, green, blue and perhaps opacity.
+        mapped: ``read`` gives views of the file, which take no memory.
+    """
+
+    times: int
+    channels: int
+    shape: tuple[int, int, int]
+    dtype: np.dtype
+    read: Callable[[int, int, Box], np.ndarray]
+    chunks: tuple[int, int, int]
+    spacing: tuple[float | None, float | None, float | None] = (None, None, None)
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    names: Sequence[str] = ()
+    colors: Sequence[Color] = ()
+    rgb: bool = False
+    mapped: bool = False
+
+
+def picture_volume(picture: Picture, options: ReadOptions, source: str, name: str) -> Volume:
+    """One channel of one time step, in micrometres; with ``options.stored`` it stays in its file.
+
+    Raises:
+        DataError: sizes or values that are none, or more than the memory holds.
+        UsageError: several channels (`SeveralComponents`) or time steps (`SeveralSteps`) and none chosen, or none such.
+    """
+    if min(picture.times, picture.channels, *picture.shape) < 1 or picture.dtype.kind not in "iuf":
+        raise DataError(f"{source}: {picture.shape} values of type {picture.dtype}; expected integers or floats, z y x")
+    channel = _channel(picture, options.component, source)
+    time = _time(picture, options.time, source)
+    box = (slice(0, picture.shape[0]), slice(0, picture.shape[1]), slice(0, picture.shape[2]))
+    size = math.prod(picture.shape)
+    field: Any
+    if channel is None:
+        if options.stored:
+            raise UsageError(f"{source}: a magnitude cannot be read block by block; choose one channel")
+        check_memory((picture.dtype.itemsize * picture.channels + 4) * size, source, IN_BLOCKS)
+        bands = [picture.read(time, c, box) for c in range(picture.channels)]
+        field = magnitude(np.stack(bands, axis=-1))
+    elif options.stored and not picture.mapped:
+        number = channel
+        field = Stored(
+            lambda s: picture.read(time, number, _box(s)), picture.dtype, picture.shape, picture.chunks, source
+        )
+    else:
+        if not picture.mapped:
+            check_memory(size * picture.dtype.itemsize, source, IN_BLOCKS)
+        field = picture.read(time, channel, box)
+        if not field.flags.c_contiguous:
+            check_memory(size * picture.dtype.itemsize, source, IN_BLOCKS)
+        field = contiguous(field)
+    return Volume(field, _spacing(picture, options), picture.origin, name=name)
+
+
+def _box(slices: tuple[slice, ...]) -> Box:
+    z, y, x = slices
+    return z, y, x
+
+
+def _spacing(picture: Picture, options: ReadOptions) -> tuple[float, float, float]:
+    """As `Facts.voxel` of TIFF: an axis without a size is as wide as the others."""
+    x, y, z = (s if s is not None and math.isfinite(s) and s > 0 else None for s in picture.spacing)
+    across = x or y or z or 1.0
+    return options.spacing_or((x or across, y or across, z or across))
+
+
+def _channel(picture: Picture, wanted: int | str | None, source: str) -> int | None:
+    """Number of the channel asked for, or of the only one; None for the magnitude of all."""
+    n, names = picture.channels, [*picture.names]
+    names = names if len(names) == n and any(names) else []
+    if wanted == "magnitude" and n > 1:
+        return None
+    if isinstance(wanted, str) and names.count(wanted) == 1:
+        return names.index(wanted)
+    if wanted is None and n == 1:
+        return 0
+    if isinstance(wanted, int) and wanted < n:
+        return wanted
+    listing = ", ".join(f"{k} {name[:40]!r}" for k, name in enumerate(names[:LISTED]))
+    listing += ", ..." if len(names) > LISTED else ""
+    what = f"{source}: {n} channel{'s' * (n > 1)}{f' ({listing})' if listing else ''} of type {picture.dtype}"
+    if n == 1:
+        raise UsageError(f"{what}; leave out --channel {wanted}")
+    text = f"{what}; expected one: try --channel 0 to {n - 1}, a name, all, or --component magnitude"
+    if wanted is not None:
+        raise UsageError(text.replace("; expected one", f", not {wanted!r}; expected one"))
+    colors = picture.colors if len(picture.colors) == n else ()
+    raise SeveralComponents(text, n, picture.rgb and n in (3, 4), colors, not picture.rgb, names)
+
+
+def _time(picture: Picture, wanted: int | None, source: str) -> int:
+    if wanted is None and picture.times > 1:
+        raise SeveralSteps(source, picture.times)
+    if (wanted or 0) >= picture.times:
+        last = picture.times - 1
+        raise UsageError(
+            f"{source}: --time {wanted}: it has {picture.times} time step{'s' * (last > 0)}; "
+            + (f"expected 0 to {last}" if last else "leave out --time")
+        )
+    return wanted or 0
+
+
+def only(deep: Sequence[bool], text: str, option: str, choices: Sequence[str], names: Sequence[str]) -> int:
+    """Index of the only image, else of the only one of several slices, which a note says.
+
+    Args:
+        deep: which ones have several slices.
+        text, option, choices, names: as of `SeveralArrays`, which is raised where there is no only one.
+    """
+    if len(deep) > 1 and sum(deep) != 1:
+        raise SeveralArrays(text, option, choices, names)
+    number = deep.index(True) if len(deep) > 1 else 0
+    if len(deep) > 1:
+        told = (
+            f"{text.partition(': ')[0]}: {names[number]!r} taken, of {len(deep)} images the only one of several slices"
+        )
+        warnings.warn(f"{told} ({option} chooses another)", stacklevel=3)
+    return number
+
+
+def choose_image(
+    names: Sequence[str], facts: Sequence[str], wanted: str | None, what: str, source: str, deep: Sequence[bool] = ()
+) -> int:
+    """Number of the image, scene or position asked for by number or name, or of the only one.
+
+    Args:
+        names: of all of them.
+        facts: what an error says of each.
+        what: they are called, in the plural.
+        deep: which ones have several slices, where they differ.
+
+    Raises:
+        DataError: there are none.
+        UsageError: several and none chosen (`SeveralArrays`), or none such.
+    """
+    if not names:
+        raise DataError(f"{source}: no {what}; expected at least one")
+    listing = "; ".join(
+        f"{k} {n[:60]!r} ({f})" for k, (n, f) in enumerate(zip(names, facts, strict=True)) if k < LISTED
+    )
+    listing += "; ..." if len(names) > LISTED else ""
+    if wanted is None:
+        text = f"{source}: {len(names)} {what}: {listing}; choose one by number or name with --series NAME"
+        return only(deep or [False] * len(names), text, "--series", [str(k) for k in range(len(names))], names)
+    found = [k for k, name in enumerate(names) if wanted.strip("/") in (str(k), name)]
+    if len(found) != 1:
+        raise UsageError(f"{source}: {len(found)} {what} {wanted!r}; it has {listing}; choose with --series NAME")
+    return found[0]
+
+
+def hex_color(text: Any) -> Color:
+    """RGB in [0, 1] of ``RRGGBB`` or ``AARRGGBB``, with or without a number sign; None for others, and for black."""
+    found = re.fullmatch(r"#?(?:[0-9a-fA-F]{2})?([0-9a-fA-F]{6})", text.strip()) if isinstance(text, str) else None
+    if found is None or found[1] == "000000":
+        return None
+    red, green, blue = bytes.fromhex(found[1])
+    return red / 255, green / 255, blue / 255
+
+
+def safe_xml(text: str, source: str) -> ElementTree.Element:
+    """The root of a file's metadata.
+
+    Raises:
+        DataError: entities, more than `MAX_XML` characters, or damage.
+    """
+    if "<!DOCTYPE" in text or "<!ENTITY" in text or len(text) > MAX_XML:
+        raise DataError(f"{source}: XML metadata of {len(text)} characters or with entities; expected plain metadata")
+    try:
+        return ElementTree.fromstring(text)
+    except (ElementTree.ParseError, ValueError) as error:
+        raise DataError(f"{source}: damaged XML metadata ({error}); check that the file is whole") from error
+
+
+class Bounded(io.BufferedReader):
+    """A file of which never more is asked for than it has: lengths in it may lie, and memory is set aside first."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(io.FileIO(path))
+        self._size = os.fstat(self.fileno()).st_size
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """As of any file."""
+        rest = max(self._size - self.tell(), 0)
+        return super().read(rest if size is None or size < 0 else min(size, rest))
