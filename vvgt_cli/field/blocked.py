@@ -236,6 +236,7 @@ class Blocked:
             for one, rays in wanted:
                 for part in rays:
                     one.add(part, next(seen))
+            seen.close()  # and with it the files that are mapped
         for one in todo:
             image = one.seen if one.blocks is not None else one.image()
             self.pictures[one.key] = self.pictures[one.key][0], image

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
@@ -25,6 +25,7 @@ from vvgt_cli.field.grid import Boxes, piece_edge
 from vvgt_cli.field.parts import Parts
 from vvgt_cli.field.reader import Box
 from vvgt_cli.files import atomic_write
+from vvgt_cli.volume.stored import give_back
 
 SUFFIX = ".rays.npy"
 RAY = np.dtype([("ray", np.int32), ("rgba", np.float32, 4)])  # one of a bundle, and what a piece shows of it
@@ -220,7 +221,7 @@ def meeting(cast: Cast, lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
     return result
 
 
-def composed(rays: RayFile, parts: Parts, numbers: Sequence[int], dims: tuple[int, int, int]) -> Iterator[np.ndarray]:
+def composed(rays: RayFile, parts: Parts, numbers: Sequence[int], dims: tuple[int, int, int]) -> Generator[np.ndarray]:
     """What whole rays see, (n, m, 4) float64 premultiplied, bundle by bundle, from what blocks ``numbers`` have left.
 
     Raises:
@@ -245,6 +246,8 @@ def composed(rays: RayFile, parts: Parts, numbers: Sequence[int], dims: tuple[in
             ray, rgba = held[number]["ray"][part], held[number]["rgba"][part]
             color[ray] += through[ray, None] * rgba[:, :3]
             through[ray] *= 1.0 - rgba[:, 3]
+        for number in {number for number, _ in found.values()}:
+            give_back(held[number])
         yield np.concatenate([color, 1 - through[:, None]], axis=1).reshape(-1, each, 4)
 
 

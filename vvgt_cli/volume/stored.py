@@ -159,6 +159,13 @@ def put_block(data: Any, lo: np.ndarray, out: np.ndarray) -> None:
         under.madvise(mmap.MADV_DONTNEED)
 
 
+def give_back(data: np.ndarray) -> None:
+    """Give the pages of a mapped file that an array is of back to the system."""
+    under = _map_under(data)
+    if under is not None and hasattr(mmap, "MADV_DONTNEED"):
+        under.madvise(mmap.MADV_DONTNEED)
+
+
 def values_at(volume: Volume, index: np.ndarray) -> np.ndarray:
     """Data values (n,) float64 of voxels ``index`` (n, 3) int, (x, y, z), which lie in the volume."""
     found = np.empty(len(index))
