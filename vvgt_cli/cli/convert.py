@@ -38,6 +38,10 @@ if TYPE_CHECKING:
     "--steps", type=click.IntRange(0, 10_000_000), metavar="N",
     help="Maximum number of gradient descent steps; 0 for none. Default: chosen by the plan.",
 )  # fmt: skip
+@click.option(
+    "--live", is_flag=True,
+    help="Let the Gaussians carry the values under them, so that 'vvgt recolor' can show them under any function.",
+)  # fmt: skip
 @click.option("--model", metavar="NAME", help="Trained network to run before the steps; discarded if it does not help.")
 @ply_options
 @placed_read_options
@@ -54,8 +58,8 @@ if TYPE_CHECKING:
 @click.option("--shard", metavar="I/N", help="Convert part I of N of a time series, for job arrays; I starts at 1.")
 @common_options
 def command(
-    volume: str, shard: str | None, dry_run: bool, split_labels: bool, console: Console, blocks: dict[str, Any],
-    **options: Any,
+    volume: str, shard: str | None, dry_run: bool, split_labels: bool, live: bool, console: Console,
+    blocks: dict[str, Any], **options: Any,
 ) -> None:  # fmt: skip
     """Convert VOLUME to a standard 3D Gaussian Splatting .ply.
 
@@ -90,7 +94,7 @@ def command(
 
     functions = options["optics"].pop("tf")
     options["optics"]["tf"] = functions[0] if functions else None
-    request = replace(convert_request(volume, **options), blocks=chosen(blocks))
+    request = replace(convert_request(volume, **options), blocks=chosen(blocks), live=live)
     if split_labels:
         _split(request, functions, dry_run or shard is not None, console)
     else:

@@ -25,6 +25,11 @@ def offsets() -> np.ndarray:
     return np.concatenate([half, -half])
 
 
+def reach() -> float:
+    """Standard deviations within which all `offsets` lie."""
+    return float(np.linalg.norm(offsets(), axis=1).max())
+
+
 def _radical(k: int, base: int) -> float:
     """Digits of k after the point, in reverse (van der Corput)."""
     found, share = 0.0, 1.0 / base

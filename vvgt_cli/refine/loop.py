@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
@@ -35,13 +35,14 @@ def run(
     check: Check | None,
     progress: Progress | None,
     stop: Callable[[], bool] | None,
+    given: State | None = None,
 ) -> tuple[Gaussians, OptimizeRecord]:
     """`optimize` without its defaults."""
     _fit("training", cameras, images)
     if check is not None:
         _fit("check", *check)
     record = OptimizeRecord()
-    state = begin(gaussians, cameras, options)
+    state = given or begin(gaussians, cameras, options)
     judge = Judge(state, check, record, options.judge)
     keep, course = _checkpoint(options, gaussians, (cameras, images), check, state, judge)
     entered, order = time.perf_counter(), shuffled_views(len(cameras), options.seed)
@@ -103,7 +104,8 @@ def _checkpoint(
 
 
 def begin(gaussians: Gaussians, cameras: Sequence[Camera], options: OptimizeOptions) -> State:
-    """What the method descends on."""
+    """What the method descends on: of Gaussians that carry values, the look that they have."""
+    gaussians = replace(gaussians, live=None)
     if options.method == "3dgs":
         return Densified(gaussians, cameras, options)
     if options.method == "adam":

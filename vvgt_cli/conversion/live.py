@@ -1,0 +1,201 @@
+"""`vvgt convert --live`: Gaussians that carry the values under them, and so can be shown under any function.
+
+They are placed by the closed form of a fog of all values but the background's, and refined on views under functions of
+all kinds at once: place, shape, value, spread and length are what these have in common. The look asked for is baked in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vvgt_cli.cameras import Camera, default_views
+from vvgt_cli.conversion.place import out_of_box
+from vvgt_cli.conversion.request import ConvertRequest
+from vvgt_cli.conversion.result import Conversion
+from vvgt_cli.conversion.stage import Work
+from vvgt_cli.conversion.stages import TestViews, ViewingConditions
+from vvgt_cli.conversion.stages.refinement import SMALLEST
+from vvgt_cli.errors import NothingVisible, UsageError
+from vvgt_cli.field.field import Field
+from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored
+from vvgt_cli.gaussians.live import SHORTEST, Table, lengths, shown_by
+from vvgt_cli.gaussians.live_facts import LiveFacts
+from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.score.record import Run
+
+if TYPE_CHECKING:
+    from vvgt_cli.field.source import Source
+
+FUNCTIONS, JUDGES = 48, 4  # fitted to and judged by, a view each
+EDGE = 540  # pixels along the edge of a view at most, and half the screen's
+STEPS = 120  # of gradient descent
+
+
+def check_live(request: ConvertRequest) -> None:
+    """Refuse what a live file does not go with.
+
+    Raises:
+        UsageError: an option that has no meaning here.
+    """
+    fit, limits, light = request.fit, request.limits, request.source.light
+    given = {
+        "--target-psnr": limits.target_psnr is not None,
+        "--time-budget": limits.time_budget is not None,
+        "--max-size": limits.max_megabytes is not None,
+        "--model": fit.model is not None,
+        "--init": fit.init != "vbm",
+        "--checkpoint": request.checkpoint is not None,
+        "--sh-degree": request.ply.sh_degree is not None,
+        "--no-comments": not request.ply.comments,
+        "--light": light != type(light)(),
+    }
+    if names := [name for name, there in given.items() if there]:
+        raise UsageError(f"--live: a file for every function, unlit and made in one way; leave out {', '.join(names)}")
+
+
+def live_conversion(run: Run, request: ConvertRequest, field: Field, ply: PlyOptions) -> Conversion:
+    """Place, look up, refine, bake, score; ``ply`` as of an ordinary conversion.
+
+    Raises:
+        UsageError: labels, channels or layers.
+        DataError: nothing is visible.
+    """
+    from vvgt_cli.look.fog import fog
+
+    source, fit = field.source, request.fit
+    source.one_field()
+    tf = source.tf
+    assert isinstance(tf, TransferFunction)
+    if source.lighting is not None:
+        run.console.say(f"{tf.name}: its light is left out; a live file is unlit")
+        field = field.shown_by(replace(tf, opacity_unit_distance=source.unit_distance, opacity_unit_share=None))
+    foggy = field.shown_by(fog(source.statistics, tf))
+    gaussians = carrying(run, foggy, placed_by(run, foggy, request))
+    gaussians = _refined(run, field, gaussians, request)
+    table = table_of(source)
+    gaussians = as_stored(shown_by(gaussians, table))
+    work = Work(run, field, fit, gaussians=gaussians)
+    for stage in (TestViews(request.scored_whole), ViewingConditions()):
+        stage.run(work)
+    facts = LiveFacts.of(source.volume, source.statistics, tf)
+    ply = replace(ply, light=None, sh_degree=0, live=facts)
+    return Conversion(out_of_box(gaussians, source.volume), run.report, ply, field)
+
+
+def table_of(source: Source) -> Table:
+    """Of a source's function, lengths in the unit frame."""
+    numbers, tf = source.statistics, source.tf
+    assert isinstance(tf, TransferFunction)
+    return Table.of(tf, numbers.lo, numbers.hi, source.unit_distance * source.volume.unit_frame().scale)
+
+
+def placed_by(run: Run, field: Field, request: ConvertRequest) -> Gaussians:
+    """The closed form of the fog.
+
+    Raises:
+        NothingVisible: nothing but background.
+    """
+    from vvgt_cli.closed_form import VbmOptions
+
+    with run.stage("closed form") as stage:
+        options = VbmOptions(max_gaussians=request.fit.max_gaussians, size=request.fit.size)
+        start = field.start(options, run.console.bar("closed form"))
+        if not len(start.gaussians):
+            raise NothingVisible(field.source.volume.name, field.source.name)
+        stage.note = f"{len(start.gaussians)} Gaussians of all values but the background's"
+    return start.gaussians
+
+
+def carrying(run: Run, field: Field, gaussians: Gaussians) -> Gaussians:
+    """Gaussians of a field's look with the values under them, without those that have none."""
+    with run.stage("values") as stage:
+        values = field.under(gaussians)
+        known = np.flatnonzero(np.isfinite(values).all(axis=1))
+        gaussians, values = gaussians.take(known), values[known]
+        tau = table_of(field.source).at(values[:, 0], values[:, 1])[:, 3]
+        live = np.concatenate([values, lengths(gaussians, tau)[:, None].astype(np.float32)], axis=1)
+        span = field.source.statistics.hi - field.source.statistics.lo
+        stage.note = f"mean spread {100 * float(values[:, 1].mean()) / (span or 1):.1f} % of the range"
+    return replace(gaussians, live=live, harmonics=None)
+
+
+@dataclass
+class Fitted:
+    """Views under functions: cameras, whose names say which table, and what they see."""
+
+    tables: list[Table]
+    which: dict[str, int]
+    cameras: list[Camera]
+    images: list[np.ndarray]
+
+    def add(self, field: Field, tf: TransferFunction, camera: Camera, footprint: float) -> None:
+        """A view under a function."""
+        from vvgt_cli.dvr import RenderSettings
+
+        name = f"{camera.name}-{len(self.tables)}"
+        camera = replace(camera, name=name)
+        shown = field.shown_by(tf)
+        self.which[name] = len(self.tables)
+        self.tables.append(table_of(shown.source))
+        self.cameras.append(camera)
+        self.images.append(shown.view(camera, RenderSettings(footprint=footprint)))
+
+
+def _refined(run: Run, field: Field, gaussians: Gaussians, request: ConvertRequest) -> Gaussians:
+    """Descent on views under many functions at once; kept where views under others agree."""
+    from vvgt_cli.gaussians.rules import rule_of
+    from vvgt_cli.look.varied import varied
+    from vvgt_cli.refine import OptimizeOptions, optimize
+    from vvgt_cli.refine.live import UnderFunctions
+
+    fit = request.fit
+    steps = STEPS if fit.steps is None else fit.steps
+    if not steps:
+        run.leave_out("refinement", "no steps are asked for")
+        return gaussians
+    edge = max(min(fit.size // 2, EDGE), 16)
+    distance = float(np.mean(field.source.volume.spacing))
+    functions = varied(field.source.statistics, FUNCTIONS + JUDGES, distance, fit.seed)
+    views = Fitted([], {}, [], [])
+    with run.stage("views") as stage:
+        cameras = [*_spread(default_views("train", FUNCTIONS, size=edge)), *default_views("check", JUDGES, size=edge)]
+        bar = run.console.bar("views")
+        for k, (tf, camera) in enumerate(zip(functions, cameras, strict=True)):
+            views.add(field, tf, camera, edge / fit.size)
+            if bar:
+                bar(k + 1, len(cameras))
+        stage.note = f"{FUNCTIONS} of {edge} px, each under a function of its own, and {JUDGES} to judge by"
+    rule = rule_of(fit.rule).at(edge / fit.size)
+    options = OptimizeOptions.of("frame", steps=steps, rule=rule, judge=rule, seed=fit.seed, check_every=steps)
+    images = np.stack(views.images)
+    state = UnderFunctions(gaussians, views.cameras, views.tables, views.which, rule)
+    with run.stage("refinement") as stage, run.console.interruption(run.console.say) as stop:
+        found, record = optimize(
+            gaussians, views.cameras[:FUNCTIONS], images[:FUNCTIONS], options,
+            (views.cameras[FUNCTIONS:], images[FUNCTIONS:]), run.console.bar("refinement"), stop, state,
+        )  # fmt: skip
+        stage.kept, stage.psnr, stage.psnr_before = found is not gaussians, record.psnr_after, record.psnr_before
+        stage.note = f"{record.steps} steps under {FUNCTIONS} functions"
+    run.report.refinement = asdict(record) | {"method": "functions", "views": FUNCTIONS}
+    return wide_enough(found, fit.size)
+
+
+def _spread(cameras: Sequence[Camera]) -> list[Camera]:
+    """In an order in which neighbours look from far apart: kinds of functions take turns."""
+    order = np.random.default_rng(0).permutation(len(cameras))
+    return [cameras[k] for k in order]
+
+
+def wide_enough(gaussians: Gaussians, size: int) -> Gaussians:
+    """None narrower than `SMALLEST` px of the screen: viewers leave such out. Their mass stays."""
+    assert gaussians.live is not None
+    camera = default_views("check", 1, size=size)[0]
+    pixel = float(np.linalg.norm(camera.position)) / camera.fx
+    widening = np.maximum(SMALLEST * pixel / np.exp(gaussians.log_scales.max(axis=1).astype(np.float64)), 1)
+    live = gaussians.live.copy()
+    live[:, 2] = np.maximum(live[:, 2] / widening**2, SHORTEST)
+    return replace(gaussians, log_scales=gaussians.log_scales + np.log(widening)[:, None], live=live)
