@@ -67,15 +67,29 @@ def in_voxels(gaussians: Gaussians, half: np.ndarray, step: np.ndarray) -> tuple
     return (gaussians.means.astype(np.float64) + half) / step - 0.5, np.ascontiguousarray(arms)
 
 
-def mean_and_spread(samples: np.ndarray, slope: float, intercept: float) -> np.ndarray:
-    """(K, 2) float32 mean and standard deviation of data values from ``samples`` (K, POINTS) as kernels read them.
+def values_of(samples: np.ndarray, gaussians: Gaussians, slope: float, intercept: float) -> np.ndarray:
+    """(K, 5) float32 of ``samples`` (K, POINTS) at the points of Gaussians: mean, spread and direction of data values.
 
+    The direction is that of the gradient, fitted by least squares, as long as the share of the spread that it explains.
     Samples that are not finite do not count; a row without any has NaN.
+
+    Args:
+        samples: as kernels read them, of which the data value is ``slope * sample + intercept``.
+        gaussians: in the box frame, as is the direction.
+        slope, intercept: see above.
     """
     known = np.isfinite(samples)
     count = known.sum(axis=1)
     values = np.where(known, samples, 0).astype(np.float64)
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = values.sum(axis=1) / count
-        spread = np.sqrt((np.where(known, values - mean[:, None], 0) ** 2).sum(axis=1) / count)
-    return np.stack([mean * slope + intercept, spread * abs(slope)], axis=1).astype(np.float32)
+        apart = np.where(known, values - mean[:, None], 0)
+        spread = np.sqrt((apart**2).sum(axis=1) / count)
+    points = offsets()
+    rise = apart @ points @ np.linalg.inv(points.T @ points) * np.sign(slope)  # a standard deviation along each axis
+    explained = np.sqrt(((rise @ points.T) ** 2).mean(axis=1)) / np.maximum(spread, 1e-30)
+    axes = rotations(gaussians.quaternions.astype(np.float64))
+    gradient = np.einsum("kij,kj->ki", axes, rise / np.exp(gaussians.log_scales.astype(np.float64)))
+    gradient *= (explained.clip(0, 1) / np.maximum(np.linalg.norm(gradient, axis=1), 1e-30))[:, None]
+    found = np.stack([mean * slope + intercept, spread * abs(slope)], axis=1)
+    return np.concatenate([found, gradient], axis=1).astype(np.float32)

@@ -22,10 +22,12 @@ from vvgt_cli.conversion.stages.refinement import SMALLEST
 from vvgt_cli.errors import NothingVisible, UsageError
 from vvgt_cli.field.field import Field
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored
-from vvgt_cli.gaussians.live import SHORTEST, Table, lengths, shown_by
+from vvgt_cli.gaussians.live import LENGTH, SHORTEST, Table, baked, lengths, shown_by
 from vvgt_cli.gaussians.live_facts import LiveFacts
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.score.record import Run
+from vvgt_cli.score.viewing import PREVIEW_VIEWS
+from vvgt_cli.score.views import psnr_note, score_test_views
 
 if TYPE_CHECKING:
     from vvgt_cli.field.source import Source
@@ -64,6 +66,7 @@ def live_conversion(run: Run, request: ConvertRequest, field: Field, ply: PlyOpt
         UsageError: labels, channels or layers.
         DataError: nothing is visible.
     """
+    from vvgt_cli.dvr import RenderSettings
     from vvgt_cli.look.fog import fog
 
     source, fit = field.source, request.fit
@@ -77,10 +80,18 @@ def live_conversion(run: Run, request: ConvertRequest, field: Field, ply: PlyOpt
     gaussians = carrying(run, foggy, placed_by(run, foggy, request))
     gaussians = _refined(run, field, gaussians, request)
     table = table_of(source)
-    gaussians = as_stored(shown_by(gaussians, table))
+    gaussians = as_stored(baked(gaussians, table))
+    with run.stage("live look") as stage:
+        live = score_test_views(
+            field, shown_by(gaussians, table), fit.size, RenderSettings(), rule=fit.rule, perceptual=False,
+            only=PREVIEW_VIEWS,
+        )  # fmt: skip
+        stage.note = (
+            f"{psnr_note(live)} under {tf.name} as 'vvgt recolor' shows it; next as other viewers show the file"
+        )
     work = Work(run, field, fit, gaussians=gaussians)
-    for stage in (TestViews(request.scored_whole), ViewingConditions()):
-        stage.run(work)
+    for stage_of_scores in (TestViews(request.scored_whole), ViewingConditions()):
+        stage_of_scores.run(work)
     facts = LiveFacts.of(source.volume, source.statistics, tf)
     ply = replace(ply, light=None, sh_degree=0, live=facts)
     return Conversion(out_of_box(gaussians, source.volume), run.report, ply, field)
@@ -117,7 +128,7 @@ def carrying(run: Run, field: Field, gaussians: Gaussians) -> Gaussians:
         known = np.flatnonzero(np.isfinite(values).all(axis=1))
         gaussians, values = gaussians.take(known), values[known]
         tau = table_of(field.source).at(values[:, 0], values[:, 1])[:, 3]
-        live = np.concatenate([values, lengths(gaussians, tau)[:, None].astype(np.float32)], axis=1)
+        live = np.insert(values, LENGTH, lengths(gaussians, tau), axis=1)
         span = field.source.statistics.hi - field.source.statistics.lo
         stage.note = f"mean spread {100 * float(values[:, 1].mean()) / (span or 1):.1f} % of the range"
     return replace(gaussians, live=live, harmonics=None)

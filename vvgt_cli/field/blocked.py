@@ -285,7 +285,7 @@ class Blocked:
 
     def under(self, gaussians: Gaussians) -> np.ndarray:
         """See `Field`."""
-        from vvgt_cli.closed_form.under import POINTS, in_voxels, mean_and_spread
+        from vvgt_cli.closed_form.under import POINTS, in_voxels, values_of
 
         self.source.one_field()
         assert isinstance(self.reader, Scalars)
@@ -303,7 +303,7 @@ class Blocked:
             part = parts.load(kind, number)
             samples[part["numbers"]] = part["found"]
         rule = self.reader.rule
-        return mean_and_spread(samples.reshape(-1, POINTS), rule.slope, rule.intercept)
+        return values_of(samples.reshape(-1, POINTS), gaussians, rule.slope, rule.intercept)
 
     def shown_by(self, tf: TransferFunction) -> Blocked:
         """See `Field`: its blocks lie in a folder of their own, within that of this one."""

@@ -60,7 +60,7 @@ class Field(Protocol):
         """Directions (K, 3) of the mean gradient around Gaussians, all in the box frame; None where nothing is lit."""
 
     def under(self, gaussians: Gaussians) -> np.ndarray:
-        """Mean and spread (K, 2) float32 of the data value under Gaussians of the box frame; NaN where there is none.
+        """(K, 5) float32 of `vvgt_cli.closed_form.under.values_of` under Gaussians of the box frame.
 
         Raises:
             UsageError: an optics grid, which has no values.
@@ -129,17 +129,17 @@ class Resident:
 
     def under(self, gaussians: Gaussians) -> np.ndarray:
         """See `Field`."""
-        from vvgt_cli.closed_form.under import POINTS, in_voxels, mean_and_spread, offsets, sample_points
+        from vvgt_cli.closed_form.under import POINTS, in_voxels, offsets, sample_points, values_of
 
         self.source.one_field()
-        scene, values = self.scene, np.empty((len(gaussians), 2), np.float32)
+        scene, values = self.scene, np.empty((len(gaussians), 5), np.float32)
         nothing, dims = np.zeros(3, np.int64), np.array(self.source.volume.dims)
         for k in range(0, len(gaussians), AT_ONCE):
             part = gaussians.take(np.arange(k, min(k + AT_ONCE, len(gaussians))))
             samples = np.full((len(part), POINTS), np.nan, np.float32)
             where = in_voxels(part, scene.half, scene.step)
             sample_points(scene.voxels, *where, offsets(), nothing, nothing, dims, samples)
-            values[k : k + len(part)] = mean_and_spread(samples, self.layout.slope, self.layout.intercept)
+            values[k : k + len(part)] = values_of(samples, part, self.layout.slope, self.layout.intercept)
         return values
 
     def shown_by(self, tf: TransferFunction) -> Resident:

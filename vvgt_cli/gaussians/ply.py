@@ -14,7 +14,7 @@ from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import seekable
 from vvgt_cli.gaussians.frames import rescale, turn, up_matrix
 from vvgt_cli.gaussians.header import FileFacts, PlyHeader, comment_lines, parse_header, rest_names
-from vvgt_cli.gaussians.live_facts import COLUMNS, LABEL, LiveFacts
+from vvgt_cli.gaussians.live_facts import COLUMNS, GRADIENT, LABEL, NORMAL, LiveFacts
 from vvgt_cli.gaussians.types import HARMONICS, SH_C0, Gaussians
 from vvgt_cli.volume.space import axis_facts
 
@@ -98,7 +98,7 @@ def write_ply(
         raise DataError("no Gaussians to write: a .ply needs at least one")
     rows = ply_rows(gaussians, options, normals)
     degree = gaussians.degree if options.sh_degree is None else options.sh_degree
-    header = ply_header(len(gaussians), degree, options, 0 if gaussians.live is None else gaussians.live.shape[1])
+    header = ply_header(len(gaussians), degree, options, 0 if gaussians.live is None else _extra(gaussians.live))
     if isinstance(target, str | Path):
         with open(target, "wb") as stream:
             stream.write(header)
@@ -125,7 +125,7 @@ def ply_rows(gaussians: Gaussians, options: PlyOptions, normals: np.ndarray | No
     f_dc = colors_to_f_dc(placed.colors)
     if not np.isfinite(f_dc).all():
         raise DataError("colours too large for float32 spherical harmonics; expected values near [0, 1]")
-    extra = 0 if placed.live is None else placed.live.shape[1]
+    extra = 0 if placed.live is None else _extra(placed.live)
     names = property_names(placed.degree, extra)
     end = len(names) - extra
     rows = np.zeros((len(placed), len(names)), dtype="<f4")  # (K, properties)
@@ -139,8 +139,13 @@ def ply_rows(gaussians: Gaussians, options: PlyOptions, normals: np.ndarray | No
     rows[:, end - 7 : end - 4] = placed.log_scales
     rows[:, end - 4 : end] = placed.quaternions
     if placed.live is not None:
-        rows[:, end:] = placed.live
+        rows[:, 3:6], rows[:, end:] = placed.live[:, GRADIENT], np.delete(placed.live, GRADIENT, axis=1)
     return rows
+
+
+def _extra(live: np.ndarray) -> int:
+    """Columns of values beside the normals', which hold gradients."""
+    return live.shape[1] - 3
 
 
 def ply_header(count: int, degree: int, options: PlyOptions, live: int = 0) -> bytes:
@@ -217,14 +222,14 @@ def _harmonics(rest: np.ndarray) -> np.ndarray | None:
 
 
 def _values(header: PlyHeader, columns: Callable[..., np.ndarray]) -> np.ndarray | None:
-    """(K, 3 or 4) that Gaussians carry, None of a file without.
+    """(K, 6 or 7) that Gaussians carry, None of a file without.
 
     Raises:
         DataError: a length or a spread that is none.
     """
     if header.live is None:
         return None
-    found = columns(*COLUMNS, *([LABEL] if LABEL in (header.dtype.names or ()) else []))
+    found = columns(*COLUMNS, *NORMAL, *([LABEL] if LABEL in (header.dtype.names or ()) else []))
     if (found[:, 1] < 0).any() or (found[:, 2] <= 0).any():
         raise DataError("spreads below 0, or lengths that are not above it; expected the columns that vvgt writes")
     return found
