@@ -9,8 +9,9 @@ import numpy as np
 
 from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.sets import SIZE
-from vvgt_cli.conversion.gaussian_files import STDIN, file_rule, open_gaussians
+from vvgt_cli.conversion.gaussian_files import STDIN, file_rule, layout_of, open_gaussians
 from vvgt_cli.conversion.place import into_box, preview, upright
+from vvgt_cli.conversion.recolored import under_function
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.source import Source, SourceRequest, describe_source, load, tf_record, volume_record
 from vvgt_cli.gaussians import Gaussians, PlyHeader
@@ -18,6 +19,7 @@ from vvgt_cli.gaussians.outputs import Output, check_outputs
 from vvgt_cli.gaussians.rules import Rule
 from vvgt_cli.images.metrics.texture import Texture
 from vvgt_cli.jit.ahead import EVALUATE, for_degree
+from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.lighting import LightOptions
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run, StageRecord, document
@@ -123,10 +125,19 @@ def _load(request: SourceRequest, header: PlyHeader) -> Source:
 def _load_dark(request: SourceRequest, header: PlyHeader) -> Source:
     if request.read.space is None and header.space == "LPS":
         request = replace(request, read=replace(request.read, space="LPS"))
-    if request.unit_distance is not None or header.unit_distance is None:
+    other = header.live is not None and request.tf is not None  # not the function whose distance the header has
+    if request.unit_distance is not None or header.unit_distance is None or other:
         return load(request)
     source = load(replace(request, unit_distance=repr(header.unit_distance)))
     return replace(source, unit_label=f"{header.unit_distance_label}, as the .ply records")
+
+
+def _shown(gaussians: Gaussians, header: PlyHeader, source: Source, request: SourceRequest) -> Gaussians:
+    """What carries values, under the function that is given; else the look of the file."""
+    if header.live is None or request.tf is None or not isinstance(source.tf, TransferFunction) or source.layers:
+        return gaussians
+    options = replace(layout_of(header), unit_distance=source.unit_distance)
+    return under_function(gaussians, header, source.tf, options)
 
 
 def evaluate(request: EvaluateRequest, console: Console | None = None) -> Evaluation:
@@ -146,6 +157,7 @@ def evaluate(request: EvaluateRequest, console: Console | None = None) -> Evalua
     with run.stage("read") as stage:
         gaussians, header = open_gaussians(request.ply)
         source = _load(request.source, header)
+        gaussians = _shown(gaussians, header, source, request.source)
         gaussians = into_box(gaussians, source.volume)
         stage.note = f"{len(gaussians)} Gaussians; {describe_source(source)}"
     if header.affine is not None and not np.allclose(header.affine, source.volume.affine[:3].ravel(), rtol=1e-6):

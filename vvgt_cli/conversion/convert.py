@@ -47,7 +47,7 @@ def convert(request: ConvertRequest, console: Console | None = None, made: Gauss
     """
     request.budget()
     if request.live:
-        check_live(request)
+        check_live(request)  # before anything is read
     if request.checkpoint is not None and request.limits.time_budget is not None:
         raise UsageError("--checkpoint is of runs that repeat to the byte, --time-budget of others; give one of both")
     run = Run(console or Console(), ConversionReport("convert"))
@@ -129,6 +129,7 @@ def run_conversion(run: Run, request: ConvertRequest, field: Field, made: Gaussi
         DataError, UsageError: as `convert`.
     """
     if request.live:
+        check_live(request)
         return live_conversion(run, request, field, ply_options(request, field.source))
     work, planner, plan = _planned(run, request, field)
     if made is not None:

@@ -145,7 +145,7 @@ def ply_rows(gaussians: Gaussians, options: PlyOptions, normals: np.ndarray | No
 
 def _extra(live: np.ndarray) -> int:
     """Columns of values beside the normals', which hold gradients."""
-    return live.shape[1] - 3
+    return int(live.shape[1]) - 3
 
 
 def ply_header(count: int, degree: int, options: PlyOptions, live: int = 0) -> bytes:

@@ -10,6 +10,7 @@ from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.conversion.result import Conversion, Result
 from vvgt_cli.gaussians import Gaussians, PlyHeader
 from vvgt_cli.library.inputs import (
+    FunctionLike,
     Goal,
     GoalLike,
     LookLike,
@@ -17,6 +18,7 @@ from vvgt_cli.library.inputs import (
     Reading,
     VolumeLike,
     console_of,
+    function_of,
     ply_of,
     source_of,
     volume_of,
@@ -34,6 +36,7 @@ def convert(
     look: LookLike = None,
     goal: GoalLike = None,
     *,
+    live: bool = False,
     blocks: int | str | None = None,
     progress: bool = False,
     **reading: Unpack[Reading],
@@ -50,6 +53,7 @@ def convert(
             xarray.DataArray; a pyvista.ImageData; or a `Volume`.
         look: function, light, labels and layers: a `Look`; or the function alone.
         goal: budget, screen, limits: a `Goal`, or a mapping of some of its attributes.
+        live: the Gaussians carry the values under them: `Result.recolor` shows them under any function (docs/live.md).
         blocks: voxels along the edge of blocks, or "auto"; None: blocks where the file is large.
         progress: lines and bars on standard error.
         **reading: how to read the volume: see `Reading`.
@@ -70,7 +74,7 @@ def convert(
     limits = Limits(want.target_psnr, want.time_budget, want.max_megabytes)
     cut = None if blocks is None else BlockOptions(None if isinstance(blocks, str) else blocks)
     source = source_of(volume, look, reading)
-    request = ConvertRequest(source, None, fit, limits, all_views=want.all_views, blocks=cut)
+    request = ConvertRequest(source, None, fit, limits, live=live, all_views=want.all_views, blocks=cut)
     return without_files(request, console_of(progress))
 
 
@@ -175,6 +179,33 @@ def evaluate(
     source = source_of(volume, look, reading)
     request = pipeline.EvaluateRequest(ply_of(ply), source, size, rule, step, seats)
     return pipeline.evaluate(request, console_of(progress))
+
+
+def recolor(
+    ply: PathLike, look: FunctionLike, *, range: str = "data", unit_distance: str | float | None = None
+) -> Result:
+    """A live ``.ply`` under another function, without its volume: ``vvgt recolor``.
+
+    Args:
+        ply: path of a file that ``vvgt convert --live`` wrote.
+        look: as of `Look`.
+        range, unit_distance: as of `Result.recolor`.
+
+    Returns:
+        An ordinary cloud.
+
+    Raises:
+        DataError: a file whose Gaussians carry no values, or a function that shows nothing of them.
+        UsageError: a range or a distance that is none.
+    """
+    from vvgt_cli.conversion.gaussian_files import layout_of
+    from vvgt_cli.score.record import ConversionReport
+
+    gaussians, header = read_ply(ply)
+    function = function_of(look)
+    assert function is not None
+    result = Result(gaussians, ConversionReport("recolor"), layout_of(header))
+    return result.recolor(function, range=range, unit_distance=None if unit_distance is None else str(unit_distance))
 
 
 def optimize(
