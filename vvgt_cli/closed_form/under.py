@@ -19,9 +19,13 @@ PRIMES = 2, 3, 5
 
 
 def offsets() -> np.ndarray:
-    """(POINTS, 3) points of a Gaussian in its standard deviations: a Halton sequence and its mirror image."""
-    law = NormalDist(0, NARROW)
+    """(POINTS, 3) points of a Gaussian in its standard deviations: a Halton sequence and its mirror image.
+
+    They have the covariance of the law, so that the spread of a linear field is exact.
+    """
+    law = NormalDist()
     half = np.array([[law.inv_cdf(_radical(k, base)) for base in PRIMES] for k in range(1, POINTS // 2 + 1)])
+    half = half @ np.linalg.inv(np.linalg.cholesky(half.T @ half / len(half))).T * NARROW
     return np.concatenate([half, -half])
 
 

@@ -53,8 +53,7 @@ class Table:
         x = lo + (hi - lo) * np.linspace(0, 1, FINE)
         tau = extinction(tf.opacity(x), unit_distance)
         fine = np.concatenate([tf.color(x) * tau[:, None], tau[:, None]], axis=1)
-        law = NormalDist()
-        nodes = np.array([law.inv_cdf((k + 0.5) / NODES) for k in range(NODES)])
+        nodes = law_nodes()
         at = np.linspace(0, 1, MEANS)[:, None, None] + spreads()[:, None] * nodes
         found = fine[np.rint(at.clip(0, 1) * (FINE - 1)).astype(np.int64)]  # (MEANS, SPREADS, NODES, 4)
         moments = found[..., TAU, None] * np.stack([nodes, nodes**2], axis=1)
@@ -81,6 +80,14 @@ class Table:
         near, far = s[i, j] * (1 - g) + s[i, j + 1] * g, s[i + 1, j] * (1 - g) + s[i + 1, j + 1] * g
         found: np.ndarray = near * (1 - f) + far * f
         return found
+
+
+def law_nodes() -> np.ndarray:
+    """(NODES,) quantiles of the normal law, stretched to its variance."""
+    law = NormalDist()
+    found = np.array([law.inv_cdf((k + 0.5) / NODES) for k in range(NODES)])
+    stretched: np.ndarray = found / found.std()
+    return stretched
 
 
 def spreads() -> np.ndarray:
