@@ -14,6 +14,7 @@ from scipy.stats import norm
 import vvgt_cli as vvgt_library
 from vvgt_cli.cameras import default_views
 from vvgt_cli.closed_form.under import POINTS, in_voxels, offsets, sample_points, values_of
+from vvgt_cli.dvr import RenderSettings
 from vvgt_cli.dvr.layout import Voxels
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
 from vvgt_cli.gaussians.formats.live import from_bytes, live_bytes, live_json
@@ -25,10 +26,7 @@ from vvgt_cli.look.colormap import ColorMap
 from vvgt_cli.look.fog import fog
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.opacity import PiecewiseOpacity
-from vvgt_cli.look.varied import varied
-from vvgt_cli.refine.live import UnderFunctions, chain
-from vvgt_cli.refine.loss import loss_gradient
-from vvgt_cli.splat import blend, render
+from vvgt_cli.splat import render
 from vvgt_cli.volume.stats import Statistics, edges_of
 
 LO, HI = -20.0, 80.0
@@ -69,7 +67,7 @@ def test_a_table_holds_means_over_normal_laws(tf: TransferFunction, spread: floa
     tau = -np.log1p(-tf.opacity(at)) / distance
     color = tf.color(at.ravel()).reshape(4, -1, 3)
     wanted = [(tau * color[..., c]).mean(axis=1) for c in range(3)] + [(tau * z**p).mean(axis=1) for p in range(3)]
-    assert np.abs(sums - np.stack(wanted, axis=1)).max() < 0.02 * tau.max()
+    assert np.abs(sums - np.stack(wanted, axis=1)).max() < 0.035 * tau.max()  # of 33 nodes
 
 
 def test_without_spread_a_gaussian_has_the_functions_color_and_extinction() -> None:
@@ -118,7 +116,7 @@ def test_a_look_turns_with_its_gaussians() -> None:
 
 def test_values_under_gaussians_of_a_linear_field() -> None:
     """Mean, spread and direction of v = 3 i - k + 7 in voxels, of which the stored values are negative halves."""
-    z, y, x = np.mgrid[:20, :21, :22]
+    z, _, x = np.mgrid[:20, :21, :22]
     stored = (-(3 * x - z + 7) / 2).astype(np.float32)
     stored.flags.writeable = False
     half, step = np.array([1.1, 1.05, 1.0]), np.full(3, 0.1)
@@ -182,16 +180,6 @@ def test_fog_is_transparent_where_the_background_is_and_only_there() -> None:
     assert fog(statistics(counts), seen).opacity(np.array([LO + 2.0]))[0] > 0
 
 
-def test_varied_functions_repeat_and_differ() -> None:
-    counts = np.full(256, 10)
-    one, two = varied(statistics(counts), 6, 2.0, 3), varied(statistics(counts), 6, 2.0, 3)
-    x = np.linspace(LO, HI, 50)
-    for a, b in zip(one, two, strict=True):
-        np.testing.assert_array_equal(a.opacity(x), b.opacity(x))
-    assert len({tuple(tf.opacity(x)) for tf in one}) > 3
-    assert one[0].opacity_unit_distance == 2.0
-
-
 def test_bytes_for_pages_lose_little() -> None:
     """Below 0.1 dB: what they cost is far below what a file is from its volume, 30 dB or so."""
     some = cloud(400, 3)
@@ -206,79 +194,13 @@ def test_bytes_for_pages_lose_little() -> None:
         assert psnr(*images) > 42  # at 34 dB from the volume that costs 10 log10(1 + 10^-0.8) = 0.6 of errors alike
 
 
-def state(tables: list[Table], some: Gaussians) -> tuple[UnderFunctions, list]:
-    cameras = [replace(camera, name=str(k)) for k, camera in enumerate(default_views("train", len(tables), size=64))]
-    return UnderFunctions(some, cameras, tables, {str(k): k for k in range(len(tables))}), cameras
-
-
-def test_steps_draw_what_files_show() -> None:
-    some = cloud()
-    tables = [Table.of(tf, LO, HI, 0.05) for tf in (RAMP, WINDOW)]
-    under, cameras = state(tables, some)
-    for table, camera in zip(tables, cameras, strict=True):
-        projection = under.project(camera)
-        ours = blend(projection, np.maximum(under.colors_from(camera), 0), 64, 64)
-        np.testing.assert_allclose(ours, render(shown_by(some, table), camera), atol=2e-3)
-    back = under.gaussians()
-    assert back.live is not None
-    np.testing.assert_allclose(back.live, some.live, atol=1e-3)
-
-
-def test_slopes_to_values_and_lengths() -> None:
-    """Against differences of the squared error of a picture, Gaussians without a direction."""
-    some = cloud(12)
-    live = some.live.copy()  # type: ignore[union-attr]
-    live[:, 3:] = 0
-    some = replace(some, live=live)
-    under, (camera,) = state([Table.of(RAMP, LO, HI, 0.05)], some)
-    target = np.zeros((64, 64, 4), np.float32)
-
-    def error() -> float:
-        image = blend(under.project(camera), under.colors_from(camera), 64, 64)
-        return float((image[..., :3].astype(float) ** 2).sum())
-
-    from vvgt_cli.splat.render import moments, own_frame_backward
-
-    projection = under.project(camera)
-    image = blend(projection, under.colors_from(camera), 64, 64)
-    grad = np.empty_like(image)
-    loss_gradient(image, target, np.float32(0), np.float32(1), np.float32(0), grad)
-    moved, thinner, _, colors = under.shown
-    pairs = moments(projection, colors, image, grad)
-    rows = own_frame_backward(moved, thinner, colors, camera, projection, pairs, None).rows
-    _, _, logs, places = under.arrays
-    chain(under.sums[0], places, logs, rows)
-    scale = None
-    for row, array, index in ((9, logs, ()), (10, places, (0,)), (11, places, (1,))):
-        for k in range(len(some)):
-            kept, slopes = array[(k, *index)], []
-            for h in (1e-2, -1e-2) if row == 9 else (2e-4, -2e-4):
-                array[(k, *index)] = kept + h
-                slopes.append((error(), h))
-            array[(k, *index)] = kept
-            numeric = (slopes[0][0] - slopes[1][0]) / (slopes[0][1] - slopes[1][1])
-            scale = scale or numeric / rows[row, k]  # the loss has a factor of its own
-            assert rows[row, k] * scale == pytest.approx(
-                numeric, rel=0.1, abs=0.03 * float(np.abs(rows[row] * scale).max())
-            )
-
-
 @pytest.fixture(scope="module")
 def live_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from vvgt_cli.cli.main import run
 
     folder = tmp_path_factory.mktemp("live")
     (folder / "tf.json").write_text(json.dumps(TF))
-    arguments = [
-        "convert",
-        "example:marschner-lobb:20",
-        "--live",
-        "--tf",
-        str(folder / "tf.json"),
-        "--steps",
-        "8",
-        "-q",
-    ]
+    arguments = ["convert", "example:marschner-lobb:20", "--live", "--tf", str(folder / "tf.json"), "-q"]
     assert run([*arguments, "-o", str(folder / "live.ply"), *map(str, SMALL)]) == 0
     return folder / "live.ply"
 
@@ -324,30 +246,56 @@ def test_render_info_and_other_formats(vvgt, live_file, tmp_path) -> None:
 
 
 def test_what_a_live_file_does_not_go_with(vvgt, tmp_path) -> None:
-    for option in (("--sh-degree", 1), ("--target-psnr", 30), ("--light", "headlight"), ("--no-comments",)):
+    for option in (
+        ("--sh-degree", 1),
+        ("--steps", 9),
+        ("--target-psnr", 30),
+        ("--light", "headlight"),
+        ("--no-comments",),
+    ):
         done = vvgt("convert", "example:blob:12", "--live", "-o", tmp_path / "a.ply", *SMALL, *option)
         assert done.code == 2
         assert option[0] in done.error
-    done = vvgt("convert", "example:balls:12", "--labels", "auto", "--live", "-o", tmp_path / "a.ply", *SMALL)
+    done = vvgt("convert", "example:frog", "--labels", "auto", "--live", "-o", tmp_path / "a.ply", *SMALL)
     assert (done.code, "one scalar" in done.error) == (2, True)
     assert not (tmp_path / "a.ply").exists()
 
 
-def test_blocks_write_the_same_bytes(vvgt, live_file, tmp_path) -> None:
-    tf = live_file.parent / "tf.json"
-    done = vvgt(
-        "convert", "example:marschner-lobb:20", "--live", "--tf", tf, "--steps", 8, "-o", tmp_path / "b.ply", *SMALL,
-        "--blocks", 16,
-    )  # fmt: skip
-    assert done.code == 0, done.err
-    whole, blocks = (read_ply(path)[0] for path in (live_file, tmp_path / "b.ply"))
-    assert len(whole) == len(blocks)
-    np.testing.assert_allclose(blocks.live, whole.live, rtol=1e-3, atol=1e-3)
-    assert [path.name for path in tmp_path.iterdir()] == ["b.ply"]
+def test_blocks_have_the_same_values_to_the_byte(tmp_path) -> None:
+    """Of Gaussians that lie across blocks, and beyond the volume; and a conversion in blocks is as near the volume."""
+    from vvgt_cli.conversion.convert import opened
+    from vvgt_cli.conversion.request import ConvertRequest, FitOptions
+    from vvgt_cli.field.settings import BlockOptions
+    from vvgt_cli.field.source import SourceRequest
+    from vvgt_cli.progress import Console
+    from vvgt_cli.score.record import ConversionReport, Run
+
+    found = []
+    for blocks in (None, BlockOptions(16)):
+        request = ConvertRequest(SourceRequest("example:marschner-lobb:40"), str(tmp_path / "a.ply"), blocks=blocks)
+        request = replace(request, fit=FitOptions(max_gaussians=300, size=64), live=True)
+        with opened(Run(Console(quiet=True), ConversionReport("convert")), request) as field:
+            wide = replace(cloud(200), log_scales=cloud(200).log_scales + 1)
+            foggy = field.shown_by(fog(field.source.statistics))
+            found.append((field.under(wide), foggy.view(default_views("test", size=32)[0], RenderSettings())))
+    np.testing.assert_array_equal(found[0][0], found[1][0])
+    assert np.isfinite(found[0][0]).all(axis=1).mean() > 0.9
+    np.testing.assert_allclose(found[0][1], found[1][1], atol=2e-3)
+
+
+def test_a_conversion_in_blocks_is_as_near(vvgt, live_file, tmp_path) -> None:
+    tf, scores = live_file.parent / "tf.json", []
+    for number, blocks in enumerate(((), ("--blocks", 16))):
+        out, report = tmp_path / f"{number}.ply", tmp_path / f"{number}.json"
+        source = ("example:marschner-lobb:20", "--live", "--tf", tf, *SMALL, *blocks)
+        assert vvgt("convert", *source, "-o", out, "--report", report).code == 0
+        scores.append(json.loads(report.read_text())["scores"]["psnr"])
+    assert scores[0] == pytest.approx(scores[1], abs=0.3)
+    assert sorted(path.suffix for path in tmp_path.iterdir()) == [".json", ".json", ".ply", ".ply"]
 
 
 def test_the_library_recolors_results_and_files(live_file) -> None:
-    result = vvgt_library.convert("example:blob:12", goal={"max_gaussians": 100, "size": 48, "steps": 0}, live=True)
+    result = vvgt_library.convert("example:blob:12", goal={"max_gaussians": 100, "size": 48}, live=True)
     assert result.gaussians.live is not None
     other = result.recolor("viridis")
     assert other.gaussians.live is None

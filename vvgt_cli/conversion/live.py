@@ -1,18 +1,17 @@
 """`vvgt convert --live`: Gaussians that carry the values under them, and so can be shown under any function.
 
-They are placed by the closed form of a fog of all values but the background's, and refined on views under functions of
-all kinds at once: place, shape, value, spread and length are what these have in common. The look asked for is baked in.
+They are placed by the closed form of a fog of all values but the background's; nothing is fitted to views. The look
+asked for is baked in, for programs that know nothing of values.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vvgt_cli.cameras import Camera, default_views
+from vvgt_cli.cameras import default_views
 from vvgt_cli.conversion.place import out_of_box
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.conversion.result import Conversion
@@ -32,10 +31,6 @@ from vvgt_cli.score.views import psnr_note, score_test_views
 if TYPE_CHECKING:
     from vvgt_cli.field.source import Source
 
-FUNCTIONS, JUDGES = 48, 4  # fitted to and judged by, a view each
-EDGE = 540  # pixels along the edge of a view at most, and half the screen's
-STEPS = 120  # of gradient descent
-
 
 def check_live(request: ConvertRequest) -> None:
     """Refuse what a live file does not go with.
@@ -48,6 +43,7 @@ def check_live(request: ConvertRequest) -> None:
         "--target-psnr": limits.target_psnr is not None,
         "--time-budget": limits.time_budget is not None,
         "--max-size": limits.max_megabytes is not None,
+        "--steps": fit.steps is not None,
         "--model": fit.model is not None,
         "--init": fit.init != "vbm",
         "--checkpoint": request.checkpoint is not None,
@@ -60,7 +56,7 @@ def check_live(request: ConvertRequest) -> None:
 
 
 def live_conversion(run: Run, request: ConvertRequest, field: Field, ply: PlyOptions) -> Conversion:
-    """Place, look up, refine, bake, score; ``ply`` as of an ordinary conversion.
+    """Place, look up, bake, score; ``ply`` as of an ordinary conversion.
 
     Raises:
         UsageError: labels, channels or layers.
@@ -78,7 +74,7 @@ def live_conversion(run: Run, request: ConvertRequest, field: Field, ply: PlyOpt
         field = field.shown_by(replace(tf, opacity_unit_distance=source.unit_distance, opacity_unit_share=None))
     foggy = field.shown_by(fog(source.statistics, tf))
     gaussians = carrying(run, foggy, placed_by(run, foggy, request))
-    gaussians = _refined(run, field, gaussians, request)
+    gaussians = wide_enough(gaussians, fit.size)
     table = table_of(source)
     gaussians = as_stored(baked(gaussians, table))
     with run.stage("live look") as stage:
@@ -132,73 +128,6 @@ def carrying(run: Run, field: Field, gaussians: Gaussians) -> Gaussians:
         span = field.source.statistics.hi - field.source.statistics.lo
         stage.note = f"mean spread {100 * float(values[:, 1].mean()) / (span or 1):.1f} % of the range"
     return replace(gaussians, live=live, harmonics=None)
-
-
-@dataclass
-class Fitted:
-    """Views under functions: cameras, whose names say which table, and what they see."""
-
-    tables: list[Table]
-    which: dict[str, int]
-    cameras: list[Camera]
-    images: list[np.ndarray]
-
-    def add(self, field: Field, tf: TransferFunction, camera: Camera, footprint: float) -> None:
-        """A view under a function."""
-        from vvgt_cli.dvr import RenderSettings
-
-        name = f"{camera.name}-{len(self.tables)}"
-        camera = replace(camera, name=name)
-        shown = field.shown_by(tf)
-        self.which[name] = len(self.tables)
-        self.tables.append(table_of(shown.source))
-        self.cameras.append(camera)
-        self.images.append(shown.view(camera, RenderSettings(footprint=footprint)))
-
-
-def _refined(run: Run, field: Field, gaussians: Gaussians, request: ConvertRequest) -> Gaussians:
-    """Descent on views under many functions at once; kept where views under others agree."""
-    from vvgt_cli.gaussians.rules import rule_of
-    from vvgt_cli.look.varied import varied
-    from vvgt_cli.refine import OptimizeOptions, optimize
-    from vvgt_cli.refine.live import UnderFunctions
-
-    fit = request.fit
-    steps = STEPS if fit.steps is None else fit.steps
-    if not steps:
-        run.leave_out("refinement", "no steps are asked for")
-        return gaussians
-    edge = max(min(fit.size // 2, EDGE), 16)
-    distance = float(np.mean(field.source.volume.spacing))
-    functions = varied(field.source.statistics, FUNCTIONS + JUDGES, distance, fit.seed)
-    views = Fitted([], {}, [], [])
-    with run.stage("views") as stage:
-        cameras = [*_spread(default_views("train", FUNCTIONS, size=edge)), *default_views("check", JUDGES, size=edge)]
-        bar = run.console.bar("views")
-        for k, (tf, camera) in enumerate(zip(functions, cameras, strict=True)):
-            views.add(field, tf, camera, edge / fit.size)
-            if bar:
-                bar(k + 1, len(cameras))
-        stage.note = f"{FUNCTIONS} of {edge} px, each under a function of its own, and {JUDGES} to judge by"
-    rule = rule_of(fit.rule).at(edge / fit.size)
-    options = OptimizeOptions.of("frame", steps=steps, rule=rule, judge=rule, seed=fit.seed, check_every=steps)
-    images = np.stack(views.images)
-    state = UnderFunctions(gaussians, views.cameras, views.tables, views.which, rule)
-    with run.stage("refinement") as stage, run.console.interruption(run.console.say) as stop:
-        found, record = optimize(
-            gaussians, views.cameras[:FUNCTIONS], images[:FUNCTIONS], options,
-            (views.cameras[FUNCTIONS:], images[FUNCTIONS:]), run.console.bar("refinement"), stop, state,
-        )  # fmt: skip
-        stage.kept, stage.psnr, stage.psnr_before = found is not gaussians, record.psnr_after, record.psnr_before
-        stage.note = f"{record.steps} steps under {FUNCTIONS} functions"
-    run.report.refinement = asdict(record) | {"method": "functions", "views": FUNCTIONS}
-    return wide_enough(found, fit.size)
-
-
-def _spread(cameras: Sequence[Camera]) -> list[Camera]:
-    """In an order in which neighbours look from far apart: kinds of functions take turns."""
-    order = np.random.default_rng(0).permutation(len(cameras))
-    return [cameras[k] for k in order]
 
 
 def wide_enough(gaussians: Gaussians, size: int) -> Gaussians:

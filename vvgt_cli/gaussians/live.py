@@ -65,12 +65,6 @@ class Table:
         row = ((values.astype(np.float64) - self.lo) / width).clip(0, 1) * (MEANS - 1)
         return row, (spread.astype(np.float64) / width / WIDEST).clip(0, 1) ** (1 / BEND) * (SPREADS - 1)
 
-    def of_places(self, row: np.ndarray, column: np.ndarray) -> np.ndarray:
-        """(K, 2) values and spreads of places: shares (K,) of the rows and of the columns."""
-        width = (self.hi - self.lo) or 1.0
-        value = self.lo + width * row.astype(np.float64)
-        return np.stack([value, width * WIDEST * column.astype(np.float64) ** BEND], axis=1)
-
     def at(self, values: np.ndarray, spread: np.ndarray) -> np.ndarray:
         """(K, 6) `sums` between the rows and columns of values and spreads (K,)."""
         row, column = self.places(values, spread)

@@ -65,7 +65,7 @@ SEGMENTS = {
 }
 BLOCK_RANGES = "vvgt_cli.closed_form.ranges:block_ranges"  # of blocks of which not all is read
 CONVERT = (RENDER, FRAME_STEPS, *CLOSED_FORM, *DRAW, *DESCENT, REGRESS, *RAYCAST_REST, *BACK_PROJECT)
-LIVE = ("vvgt_cli.closed_form.under:sample_points", "vvgt_cli.refine.live:look_up", "vvgt_cli.refine.live:chain")
+LIVE = ("vvgt_cli.closed_form.under:sample_points",)
 OPTIMIZE = (*REFINE, *DRAW, "vvgt_cli.closed_form.pyramid:principal_axes", *SHARED)
 EVALUATE = (*RAYCAST, *DRAW)
 INFER = (*DRAW, PAIR_SUMS, STANDARD, *BACK_PROJECT)

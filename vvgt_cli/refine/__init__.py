@@ -12,7 +12,6 @@ if TYPE_CHECKING:
 
     from vvgt_cli.cameras import Camera
     from vvgt_cli.gaussians import Gaussians
-    from vvgt_cli.refine.states import State
 
 
 def optimize(
@@ -23,7 +22,6 @@ def optimize(
     check: Check | None = None,
     progress: Progress | None = None,
     stop: Callable[[], bool] | None = None,
-    state: State | None = None,
 ) -> tuple[Gaussians, OptimizeRecord]:
     """Descend on the difference between pictures of Gaussians and views.
 
@@ -35,14 +33,13 @@ def optimize(
             is the best that they have seen, the input included. Without them the last step's Gaussians are returned.
         progress: called after each step with the steps taken and expected.
         stop: asked before each step; True ends the run as a time budget would.
-        state: what is descended on; None: what the method of ``options`` makes of the Gaussians.
 
     Raises:
         DataError: no views, or images that do not fit their cameras.
     """
     from vvgt_cli.refine.loop import run
 
-    return run(gaussians, cameras, images, options or OptimizeOptions(), check, progress, stop, state)
+    return run(gaussians, cameras, images, options or OptimizeOptions(), check, progress, stop)
 
 
 __all__ = ["LOSS_3DGS", "METHODS", "OptimizeOptions", "OptimizeRecord", "optimize"]

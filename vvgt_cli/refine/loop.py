@@ -35,14 +35,13 @@ def run(
     check: Check | None,
     progress: Progress | None,
     stop: Callable[[], bool] | None,
-    given: State | None = None,
 ) -> tuple[Gaussians, OptimizeRecord]:
     """`optimize` without its defaults."""
     _fit("training", cameras, images)
     if check is not None:
         _fit("check", *check)
     record = OptimizeRecord()
-    state = given or begin(gaussians, cameras, options)
+    state = begin(gaussians, cameras, options)
     judge = Judge(state, check, record, options.judge)
     keep, course = _checkpoint(options, gaussians, (cameras, images), check, state, judge)
     entered, order = time.perf_counter(), shuffled_views(len(cameras), options.seed)
