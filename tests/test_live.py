@@ -180,6 +180,16 @@ def test_fog_is_transparent_where_the_background_is_and_only_there() -> None:
     assert fog(statistics(counts), seen).opacity(np.array([LO + 2.0]))[0] > 0
 
 
+def test_cells_are_split_where_values_differ() -> None:
+    """Half of a volume is one value, the other half noise: of a small budget most goes there."""
+    rng = np.random.default_rng(0)
+    data = np.full((16, 16, 16), 128, np.uint8)
+    data[:, :, 8:] = rng.integers(60, 250, (16, 16, 8))
+    data[0, 0, 0] = 0
+    result = vvgt_library.convert(data, "viridis", {"max_gaussians": 400, "size": 64}, live=True)
+    assert (result.gaussians.means[:, 0] > 0).mean() > 0.7
+
+
 def test_bytes_for_pages_lose_little() -> None:
     """Below 0.1 dB: what they cost is far below what a file is from its volume, 30 dB or so."""
     some = cloud(400, 3)
@@ -256,6 +266,9 @@ def test_what_a_live_file_does_not_go_with(vvgt, tmp_path) -> None:
         done = vvgt("convert", "example:blob:12", "--live", "-o", tmp_path / "a.ply", *SMALL, *option)
         assert done.code == 2
         assert option[0] in done.error
+    for other in (("--dry-run",), ("--tf", "viridis", "--tf", "magma")):
+        done = vvgt("convert", "example:blob:12", "--live", "-o", tmp_path / "a.ply", *SMALL, *other)
+        assert (done.code, "one file of one volume" in done.error) == (2, True)
     done = vvgt("convert", "example:frog", "--labels", "auto", "--live", "-o", tmp_path / "a.ply", *SMALL)
     assert (done.code, "one scalar" in done.error) == (2, True)
     assert not (tmp_path / "a.ply").exists()

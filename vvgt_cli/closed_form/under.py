@@ -14,7 +14,7 @@ from vvgt_cli.gaussians.frames import rotations
 from vvgt_cli.jit.decorators import kernel
 
 POINTS = 48  # a Gaussian
-NARROW = 0.8  # standard deviations of the points: where Gaussians overlap the values are the neighbours' too
+NARROW = 0.7  # standard deviations of the points: where Gaussians overlap the values are the neighbours' too
 PRIMES = 2, 3, 5
 
 

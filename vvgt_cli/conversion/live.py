@@ -109,7 +109,7 @@ def placed_by(run: Run, field: Field, request: ConvertRequest) -> Gaussians:
     from vvgt_cli.closed_form import VbmOptions
 
     with run.stage("closed form") as stage:
-        options = VbmOptions(max_gaussians=request.fit.max_gaussians, size=request.fit.size)
+        options = VbmOptions(max_gaussians=request.fit.max_gaussians, size=request.fit.size, values=True)
         start = field.start(options, run.console.bar("closed form"))
         if not len(start.gaussians):
             raise NothingVisible(field.source.volume.name, field.source.name)

@@ -18,7 +18,7 @@ from vvgt_cli.look.opacity import PiecewiseOpacity
 from vvgt_cli.volume import Statistics, Volume
 from vvgt_cli.volume.stats import BINS, edges_of
 
-COLUMNS, NORMAL, LABEL = ("value", "spread", "length"), ("nx", "ny", "nz"), "label"
+COLUMNS, NORMAL = ("value", "spread", "length"), ("nx", "ny", "nz")
 GRADIENT = slice(3, 6)  # of what Gaussians carry: in the columns of normals
 SAMPLED = 64  # nodes of a function that the header has no other way of holding
 LONGEST = 12_000  # characters of a function: some loaders read no more than the first 10 KB of a header, ours 64

@@ -14,7 +14,7 @@ from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import seekable
 from vvgt_cli.gaussians.frames import rescale, turn, up_matrix
 from vvgt_cli.gaussians.header import FileFacts, PlyHeader, comment_lines, parse_header, rest_names
-from vvgt_cli.gaussians.live_facts import COLUMNS, GRADIENT, LABEL, NORMAL, LiveFacts
+from vvgt_cli.gaussians.live_facts import COLUMNS, GRADIENT, NORMAL, LiveFacts
 from vvgt_cli.gaussians.types import HARMONICS, SH_C0, Gaussians
 from vvgt_cli.volume.space import axis_facts
 
@@ -64,13 +64,13 @@ def as_stored(gaussians: Gaussians) -> Gaussians:
     return replace(gaussians, colors=f_dc_to_colors(colors_to_f_dc(gaussians.colors)))
 
 
-def property_names(sh_degree: int = 0, live: int = 0) -> list[str]:
-    """Property order of the file, with so many columns of values; all float32."""
+def property_names(sh_degree: int = 0, live: bool = False) -> list[str]:
+    """Property order of the file, of Gaussians that carry values or not; all float32."""
     return [
         *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
         *rest_names(sh_degree),
         *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
-        *(*COLUMNS, LABEL)[:live],
+        *(COLUMNS if live else ()),
     ]
 
 
@@ -98,7 +98,7 @@ def write_ply(
         raise DataError("no Gaussians to write: a .ply needs at least one")
     rows = ply_rows(gaussians, options, normals)
     degree = gaussians.degree if options.sh_degree is None else options.sh_degree
-    header = ply_header(len(gaussians), degree, options, 0 if gaussians.live is None else _extra(gaussians.live))
+    header = ply_header(len(gaussians), degree, options, gaussians.live is not None)
     if isinstance(target, str | Path):
         with open(target, "wb") as stream:
             stream.write(header)
@@ -125,9 +125,8 @@ def ply_rows(gaussians: Gaussians, options: PlyOptions, normals: np.ndarray | No
     f_dc = colors_to_f_dc(placed.colors)
     if not np.isfinite(f_dc).all():
         raise DataError("colours too large for float32 spherical harmonics; expected values near [0, 1]")
-    extra = 0 if placed.live is None else _extra(placed.live)
-    names = property_names(placed.degree, extra)
-    end = len(names) - extra
+    names = property_names(placed.degree, placed.live is not None)
+    end = len(names) - (0 if placed.live is None else len(COLUMNS))
     rows = np.zeros((len(placed), len(names)), dtype="<f4")  # (K, properties)
     rows[:, 0:3] = placed.means
     if normals is not None:
@@ -143,13 +142,8 @@ def ply_rows(gaussians: Gaussians, options: PlyOptions, normals: np.ndarray | No
     return rows
 
 
-def _extra(live: np.ndarray) -> int:
-    """Columns of values beside the normals', which hold gradients."""
-    return int(live.shape[1]) - 3
-
-
-def ply_header(count: int, degree: int, options: PlyOptions, live: int = 0) -> bytes:
-    """The header of a file of ``count`` Gaussians with harmonics of ``degree`` and ``live`` columns of values."""
+def ply_header(count: int, degree: int, options: PlyOptions, live: bool = False) -> bytes:
+    """The header of a file of ``count`` Gaussians with harmonics of ``degree`` and ``live`` columns of values, or without."""
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]  # some loaders count lines
     lines += [f"property float {name}" for name in property_names(degree, live)]
     lines += [*(comment_lines(options) if options.comments else []), "end_header", ""]
@@ -222,14 +216,14 @@ def _harmonics(rest: np.ndarray) -> np.ndarray | None:
 
 
 def _values(header: PlyHeader, columns: Callable[..., np.ndarray]) -> np.ndarray | None:
-    """(K, 6 or 7) that Gaussians carry, None of a file without.
+    """(K, 6) that Gaussians carry, None of a file without.
 
     Raises:
         DataError: a length or a spread that is none.
     """
     if header.live is None:
         return None
-    found = columns(*COLUMNS, *NORMAL, *([LABEL] if LABEL in (header.dtype.names or ()) else []))
+    found = columns(*COLUMNS, *NORMAL)
     if (found[:, 1] < 0).any() or (found[:, 2] <= 0).any():
         raise DataError("spreads below 0, or lengths that are not above it; expected the columns that vvgt writes")
     return found

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import colorsys
-
 import numpy as np
 
 from vvgt_cli.look.colormap import ColorMap
@@ -13,8 +11,8 @@ from vvgt_cli.look.opacity import PiecewiseOpacity
 from vvgt_cli.look.resolve import StatisticsLike
 
 NAME = "fog"
-TURNS = 3.0  # of hue over the range of values: steps tell values apart by their colour
 THIN, THICK = 0.02, 0.3  # opacity per `UNIT_SHARE` of the box's edge, right beside the background and farthest from it
+BETWEEN = 9  # places around a node where the function that is given may show something
 NODES = 129  # of a function over 256 bins
 
 
@@ -26,7 +24,8 @@ def fog(statistics: StatisticsLike, shown: TransferFunction | None = None) -> Tr
         shown: a function, on data values, whose visible values are not transparent.
 
     Returns:
-        Opacity per `UNIT_SHARE`, hue by value.
+        Opacity per `UNIT_SHARE`; red is the value as a share of the range, green its square: their means over a cell
+        say how far its values are spread.
     """
     counts = np.asarray(statistics.histogram, np.float64)
     lo, hi = float(statistics.lo), float(statistics.hi)
@@ -42,12 +41,12 @@ def fog(statistics: StatisticsLike, shown: TransferFunction | None = None) -> Tr
     if lo == hi:
         x, opacity = np.array([lo]), np.array([THIN])
     elif shown is not None:
-        gap = (x[1] - x[0]) / 2
-        visible = np.array([bool(shown.support(v - gap, v + gap)) for v in x])
-        opacity = np.where(visible, np.maximum(opacity, THIN), opacity)
+        about = x[:, None] + (x[1] - x[0]) * np.linspace(-0.5, 0.5, BETWEEN)
+        opacity = np.maximum(opacity, np.minimum(shown.opacity(about).max(axis=1), THIN))
     if not opacity.any():
         opacity[:] = THIN
-    colors = np.array([colorsys.hsv_to_rgb(TURNS * v % 1.0, 1.0, 1.0) for v in t[: len(x)]])
+    share = t[: len(x)]
+    colors = np.stack([share, share**2, np.zeros(len(x))], axis=1)
     return TransferFunction(
         NAME, PiecewiseOpacity(x, opacity), ColorMap(x, colors), opacity_unit_share=UNIT_SHARE, opacity_unit_label=NAME
     )

@@ -7,9 +7,8 @@ Eight bytes a Gaussian, two textures of RGBA8U, in the order of the file:
 | 0 | value m: (m - lo) / (hi - lo) * 255 |
 | 1 | spread s: (s / (hi - lo) / widest)^(1 / bend) * 255, a column of the table over 255 times its columns less one |
 | 2 | log L: (log L - l0) / (l1 - l0) * 255 |
-| 3 | label, 0 for none |
 | 4, 5, 6 | direction in which values rise, as long as the share r that it explains: 128 + 127 times x, y, z |
-| 7 | 0 |
+| 3, 7 | 0 |
 """
 
 from __future__ import annotations
@@ -23,7 +22,6 @@ from vvgt_cli.gaussians.live_facts import GRADIENT, LiveFacts
 from vvgt_cli.gaussians.types import Gaussians
 
 BYTES = 8
-LABEL = 6  # column of what Gaussians carry
 
 
 def live_bytes(gaussians: Gaussians, facts: LiveFacts) -> np.ndarray:
@@ -35,8 +33,6 @@ def live_bytes(gaussians: Gaussians, facts: LiveFacts) -> np.ndarray:
     out[:, 0] = _byte((live[:, VALUE] - facts.lo) / width)
     out[:, 1] = _byte((live[:, SPREAD] / width / WIDEST).clip(0, 1) ** (1 / BEND))
     out[:, 2] = _byte((np.log(live[:, LENGTH]) - first) / ((last - first) or 1.0))
-    if live.shape[1] > LABEL:
-        out[:, 3] = live[:, LABEL]
     out[:, 4:7] = np.rint(128 + 127 * live[:, GRADIENT].clip(-1, 1))
     return out
 
