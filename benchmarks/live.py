@@ -49,7 +49,8 @@ def functions(numbers: Statistics) -> dict[str, TransferFunction]:
     median, middle = (float(np.interp(p, rank, numbers.edges)) for p in (0.5, 0.7))
     foot, part = float(numbers.edges[last]) if last > first else lo, 0.03 * (hi - lo)
     colors = ColorMap(np.array([lo, (lo + hi) / 2, hi]), np.array([[0.1, 0.2, 0.8], [0.9, 0.8, 0.3], [0.8, 0.1, 0.1]]))
-    two = ColorMap(np.array([middle - part, middle + part]), np.array([[1, 0.6, 0.2], [0.3, 0.7, 1]]))
+    tints = [[1, 0.6, 0.2], [1, 0.6, 0.2], [0.3, 0.7, 1], [0.3, 0.7, 1]]
+    two = ColorMap(np.array([lo, middle - part, middle + part, hi]), np.array(tints))
     nodes = {
         "band": ([middle - part, middle, middle + part], [0, 0.3, 0], two),
         "step": ([median - part / 6, median + part / 6], [0, 0.6], colors),

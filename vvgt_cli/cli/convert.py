@@ -110,8 +110,8 @@ def _check_live(request: ConvertRequest, functions: Sequence[str], other: bool) 
 
     if other or len(functions) > 1 or is_pattern(request.output or ""):
         raise UsageError(
-            "--live makes one file of one volume, which 'vvgt recolor' shows under other functions; expected one --tf, no "
-            "place for a number in -o, and no --dry-run, --shard or --split-labels"
+            "--live makes one file of one volume, which 'vvgt recolor' shows under other functions; expected one --tf, "
+            "no place for a number in -o, and no --dry-run, --shard or --split-labels"
         )
 
 

@@ -143,7 +143,7 @@ def ply_rows(gaussians: Gaussians, options: PlyOptions, normals: np.ndarray | No
 
 
 def ply_header(count: int, degree: int, options: PlyOptions, live: bool = False) -> bytes:
-    """The header of a file of ``count`` Gaussians with harmonics of ``degree`` and ``live`` columns of values, or without."""
+    """The header of a file of ``count`` Gaussians with harmonics of ``degree``; ``live``: they carry values."""
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]  # some loaders count lines
     lines += [f"property float {name}" for name in property_names(degree, live)]
     lines += [*(comment_lines(options) if options.comments else []), "end_header", ""]
