@@ -39,8 +39,8 @@ _WHERE = {  # imported when asked for: `import vvgt_cli` costs nothing
     "library.inputs": ("Goal", "Look"),
     "library.session": ("Session",),
     "conversion.result": ("Conversion", "Result"),
-    "transfer": ("ColorMap", "PiecewiseOpacity", "TransferFunction", "read_transfer_function"),
-    "transfer.lighting": ("LightOptions",),
+    "look": ("ColorMap", "PiecewiseOpacity", "TransferFunction", "read_transfer_function"),
+    "look.lighting": ("LightOptions",),
     "volume": ("Volume",),
 }
 _MODULES = {name: module for module, names in _WHERE.items() for name in names}
