@@ -34,6 +34,7 @@ RUN = (
         "dvr_vtk",
         "grids",
         "light_vtk",
+        "live",
         "network",
         "optimize",
         "parts",
@@ -168,6 +169,15 @@ def test_light_vtk(bench, scenes, tmp_path):
     assert set(rows) == {"unlit", "headlight", "fixed"}
     assert min(float(row["gpu_db"]) for row in rows.values()) > 15
     assert "headlight" in call(module.main, "--table", tmp_path / "a.csv")
+
+
+def test_live(bench, scenes, tmp_path):
+    module = bench("live", SIZE=SIZE)
+    call(module.main, *scenes, "-o", tmp_path / "a.csv", "--gaussians", 200, "--direct")
+    rows = rows_of(tmp_path / "a.csv")
+    assert [row["function"] for row in rows] == ["band", "step", "ramp"]
+    assert min(float(row[look]) for row in rows for look in ("live", "converted for it")) > 15
+    assert "| band |" in call(module.main, "--table", tmp_path / "a.csv")
 
 
 def test_network(bench, tmp_path):

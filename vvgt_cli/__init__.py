@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from vvgt_cli.conversion.result import Conversion, Result
     from vvgt_cli.errors import DataError, UsageError, VvgtError
     from vvgt_cli.gaussians import Gaussians, PlyHeader
-    from vvgt_cli.library.functions import convert, evaluate, optimize, read_ply, read_volume, render_views
+    from vvgt_cli.library.functions import convert, evaluate, optimize, read_ply, read_volume, recolor, render_views
     from vvgt_cli.library.inputs import Goal, Look
     from vvgt_cli.library.session import Session
     from vvgt_cli.look import ColorMap, PiecewiseOpacity, TransferFunction, read_transfer_function
@@ -36,7 +36,7 @@ _WHERE = {  # imported when asked for: `import vvgt_cli` costs nothing
     "cameras": ("Camera", "default_views", "orbit_views"),
     "errors": ("DataError", "UsageError", "VvgtError"),
     "gaussians": ("Gaussians", "PlyHeader"),
-    "library.functions": ("convert", "evaluate", "optimize", "read_ply", "read_volume", "render_views"),
+    "library.functions": ("convert", "evaluate", "optimize", "read_ply", "read_volume", "recolor", "render_views"),
     "library.inputs": ("Goal", "Look"),
     "library.session": ("Session",),
     "conversion.clouds": ("Clouds",),
@@ -73,6 +73,7 @@ __all__ = [
     "read_ply",
     "read_transfer_function",
     "read_volume",
+    "recolor",
     "render_views",
 ]
 

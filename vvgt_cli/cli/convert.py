@@ -38,6 +38,10 @@ if TYPE_CHECKING:
     "--steps", type=click.IntRange(0, 10_000_000), metavar="N",
     help="Maximum number of gradient descent steps; 0 for none. Default: chosen by the plan.",
 )  # fmt: skip
+@click.option(
+    "--live", is_flag=True,
+    help="Let the Gaussians carry the values under them, so that 'vvgt recolor' can show them under any function.",
+)  # fmt: skip
 @click.option("--model", metavar="NAME", help="Trained network to run before the steps; discarded if it does not help.")
 @ply_options
 @placed_read_options
@@ -54,8 +58,8 @@ if TYPE_CHECKING:
 @click.option("--shard", metavar="I/N", help="Convert part I of N of a time series, for job arrays; I starts at 1.")
 @common_options
 def command(
-    volume: str, shard: str | None, dry_run: bool, split_labels: bool, console: Console, blocks: dict[str, Any],
-    **options: Any,
+    volume: str, shard: str | None, dry_run: bool, split_labels: bool, live: bool, console: Console,
+    blocks: dict[str, Any], **options: Any,
 ) -> None:  # fmt: skip
     """Convert VOLUME to a standard 3D Gaussian Splatting .ply.
 
@@ -90,11 +94,25 @@ def command(
 
     functions = options["optics"].pop("tf")
     options["optics"]["tf"] = functions[0] if functions else None
-    request = replace(convert_request(volume, **options), blocks=chosen(blocks))
+    request = replace(convert_request(volume, **options), blocks=chosen(blocks), live=live)
+    if live:
+        _check_live(request, functions, split_labels or dry_run or shard is not None)
     if split_labels:
         _split(request, functions, dry_run or shard is not None, console)
     else:
         _convert(request, functions, shard, dry_run, console)
+
+
+def _check_live(request: ConvertRequest, functions: Sequence[str], other: bool) -> None:
+    """One volume, and one look to begin with; ``other``: options that go with several files or none are given."""
+    from vvgt_cli.conversion.index import is_pattern
+    from vvgt_cli.errors import UsageError
+
+    if other or len(functions) > 1 or is_pattern(request.output or ""):
+        raise UsageError(
+            "--live makes one file of one volume, which 'vvgt recolor' shows under other functions; expected one --tf, "
+            "no place for a number in -o, and no --dry-run, --shard or --split-labels"
+        )
 
 
 def _split(request: ConvertRequest, functions: Sequence[str], other: bool, console: Console) -> None:

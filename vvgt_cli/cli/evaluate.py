@@ -45,7 +45,7 @@ def command(ply: str, volume: str, as_json: bool, blocks: dict[str, Any], consol
 
     Scores are means over ten test views. A table lists the viewing conditions, worst first: how each viewer draws
     (docs/viewers.md), at 400, 800 and 2160 px and the file's own size, and close up, in three views each. Pictures
-    above 565 px are scored on a sample of blocks.
+    above 565 px are scored on a sample of blocks. A .ply of 'vvgt convert --live' is scored as it is under --tf.
 
     The reference is ray-cast with steps of 1/8 voxel and up to 9 rays per pixel; its own error is printed too. Size,
     viewer, light and opacity unit distance are those recorded in the file unless given.

@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from vvgt_cli.cli.options import common_options, placed_read_options
+from vvgt_cli.cli.options import common_options, placed_read_options, tf_range_option, unit_distance_option
 from vvgt_cli.cli.sections import SectionedCommand
 from vvgt_cli.progress import Console
 
@@ -14,9 +14,15 @@ from vvgt_cli.progress import Console
 @click.command("info", cls=SectionedCommand, short_help="Describe a volume, transfer function, view set or .ply.")
 @click.argument("file")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
+@click.option("--tf", metavar="TF", help="Transfer function to describe a .ply of 'vvgt convert --live' under.")
+@tf_range_option
+@unit_distance_option
 @placed_read_options
 @common_options
-def command(file: str, as_json: bool, read: dict[str, Any], console: Console) -> None:
+def command(
+    file: str, as_json: bool, tf: str | None, tf_range: str, opacity_unit_distance: str | None, read: dict[str, Any],
+    console: Console,
+) -> None:  # fmt: skip
     """Describe FILE, whose type is detected from its content: a volume, a transfer function, a label table, a view set
     (transforms.json), a .ply of Gaussians, or the index of several.
 
@@ -27,10 +33,11 @@ def command(file: str, as_json: bool, read: dict[str, Any], console: Console) ->
       vvgt info presets.xml#CT-AAA
     """
     from vvgt_cli.commands.inspect import inspect
+    from vvgt_cli.commands.recolor import function_of
     from vvgt_cli.score.record import plain
     from vvgt_cli.volume import ReadOptions
 
-    facts = plain(inspect(file, ReadOptions(**read)))
+    facts = plain(inspect(file, ReadOptions(**read), function_of(tf, tf_range, opacity_unit_distance)))
     if as_json:
         import json
 

@@ -25,6 +25,7 @@ COMMANDS = {
     "init": "vvgt_cli.cli.init",
     "merge": "vvgt_cli.cli.merge",
     "optimize": "vvgt_cli.cli.optimize",
+    "recolor": "vvgt_cli.cli.recolor",
     "view": "vvgt_cli.cli.view",
     "render": "vvgt_cli.cli.render",
     "render-views": "vvgt_cli.cli.render_views",

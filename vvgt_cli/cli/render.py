@@ -5,7 +5,7 @@ from __future__ import annotations
 import click
 
 from vvgt_cli.cli.fit import rule_option
-from vvgt_cli.cli.options import common_options, overwrite_option
+from vvgt_cli.cli.options import common_options, overwrite_option, tf_range_option, unit_distance_option
 from vvgt_cli.progress import Console
 
 
@@ -32,6 +32,9 @@ from vvgt_cli.progress import Console
     metavar="R G B",
     help="Background colour, 0 to 1. Default: transparent for PNG, black for movies.",
 )
+@click.option("--tf", metavar="TF", help="Transfer function to show a .ply of 'vvgt convert --live' under.")
+@tf_range_option
+@unit_distance_option
 @rule_option("Viewer to imitate when drawing. Default: the one recorded in the file, or inria.")
 @overwrite_option
 @common_options
@@ -44,6 +47,9 @@ def command(
     output: str,
     exr: bool,
     background: tuple[float, float, float] | None,
+    tf: str | None,
+    tf_range: str,
+    opacity_unit_distance: str | None,
     overwrite: bool,
     console: Console,
 ) -> None:
@@ -51,6 +57,7 @@ def command(
 
     Choose the views with --camera or --orbit. With -o turn.gif or turn.mp4 they become a movie at 25 frames per second,
     which loops seamlessly for an orbit. The up axis is the one recorded in OUT.ply, else +z. OUT.ply may be "-".
+    A .ply of 'vvgt convert --live' can be shown under any function (--tf).
 
     \b
     Examples:
@@ -58,6 +65,7 @@ def command(
       vvgt render frog.ply --orbit 100 --size 480 -o turn.gif
       vvgt convert example:frog -o - | vvgt render - --orbit 8 -o turn
     """
+    from vvgt_cli.commands.recolor import function_of
     from vvgt_cli.commands.render import RenderRequest, render_file
     from vvgt_cli.errors import UsageError
 
@@ -65,4 +73,5 @@ def command(
         raise UsageError("give the views with either --camera FILE or --orbit N")
     if background is not None and not all(0 <= c <= 1 for c in background):
         raise UsageError(f"--background {' '.join(map(str, background))}: expected three numbers in [0, 1]")
-    render_file(RenderRequest(ply, output, camera, orbit, size, rule, exr, background, overwrite), console)
+    function = function_of(tf, tf_range, opacity_unit_distance)
+    render_file(RenderRequest(ply, output, camera, orbit, size, rule, exr, background, overwrite, function), console)

@@ -31,6 +31,7 @@ class VbmOptions:
         method: "vbm", "wavelet" (isotropic bank) or "uniform" (random samples).
         seed: of the random samples.
         degree: of the harmonics that colours have under a light that depends on the view.
+        values: cells are split where values differ, of which red is the value and green its square, shares of a range.
     """
 
     max_gaussians: int = 100_000
@@ -38,6 +39,7 @@ class VbmOptions:
     method: str = "vbm"
     seed: int = 0
     degree: int = 0
+    values: bool = False
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
@@ -76,7 +78,7 @@ def start_of(form: ClosedForm, options: VbmOptions) -> Start:
     elif options.method == "uniform":
         gaussians, kept = uniform_gaussians(form.tree, form.budget, form.pixel, options.seed), None
     else:
-        gaussians, kept = form.gaussians(), form
+        gaussians, kept = form.gaussians(values=options.values), form
     if kept is None and form.shading is not None:
         gaussians = form.shading.alone(gaussians, options.degree)
     return Start(gaussians, kept)

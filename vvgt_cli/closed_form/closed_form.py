@@ -19,7 +19,17 @@ from vvgt_cli.closed_form.moments import Cells, base_cells, exponents
 from vvgt_cli.closed_form.samples import visible_voxels
 from vvgt_cli.closed_form.shape import ROUND, STYLES, SurfaceStyle, cell_gaussians
 from vvgt_cli.closed_form.sharpen import sharpened
-from vvgt_cli.closed_form.tree import Leaves, Tree, build_tree, leaves_of, select, shown, split, split_score
+from vvgt_cli.closed_form.tree import (
+    Leaves,
+    Tree,
+    build_tree,
+    leaves_of,
+    select,
+    shown,
+    split,
+    split_score,
+    value_score,
+)
 from vvgt_cli.closed_form.visibility import Visibility, visibility
 from vvgt_cli.dvr.render import Box
 from vvgt_cli.dvr.scene import Scene
@@ -78,9 +88,10 @@ class ClosedForm:
     degree: int = 0
     scene: Scene | None = None
 
-    def gaussians(self, style: SurfaceStyle = ROUND) -> Gaussians:
-        """Gaussians of the cells that the moments alone choose."""
-        return self._of(leaves_of(self.tree, select(self.tree, self.budget)), style)
+    def gaussians(self, style: SurfaceStyle = ROUND, values: bool = False) -> Gaussians:
+        """Gaussians of the cells that the moments alone choose; ``values``: those of `tree.value_score`."""
+        score = value_score(self.tree) if values else None
+        return self._of(leaves_of(self.tree, select(self.tree, self.budget, score)), style)
 
     def _of(self, leaves: Leaves, style: SurfaceStyle) -> Gaussians:
         return self._sharpened(leaves, self._cells(leaves, style))

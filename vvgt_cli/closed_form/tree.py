@@ -13,6 +13,7 @@ from vvgt_cli.closed_form.pyramid import score_splits, sum_children, take_base
 from vvgt_cli.closed_form.visibility import Visibility
 from vvgt_cli.dvr.scene import Scene
 
+LEAST_SPREAD = 0.01  # of the range of values, added to that in a cell: noise and places tell little apart
 HIDDEN = 1e-3  # cells that no view sees with more transmittance are dropped
 
 
@@ -123,6 +124,18 @@ def split_score(tree: Tree) -> np.ndarray:
     for edge, first, last in zip(tree.edges, ends[:-1], ends[1:], strict=True):
         score_splits(tree.moments[first:last], tree.largest[first:last], edge, score[first:last])
     return score
+
+
+def value_score(tree: Tree) -> np.ndarray:
+    """`split_score`, times the variance of the values in a cell: any function may tell apart what differs.
+
+    Of a scene whose red is the value, as a share of its range, and green its square.
+    """
+    mass = np.maximum(tree.moments[:, MASS], np.finfo(np.float64).tiny)
+    mean = tree.moments[:, RED] / mass
+    variance = np.maximum(tree.moments[:, GREEN] / mass - mean**2, 0)
+    result: np.ndarray = split_score(tree) * (variance + LEAST_SPREAD**2)
+    return result
 
 
 def select(tree: Tree, budget: int, score: np.ndarray | None = None) -> np.ndarray:

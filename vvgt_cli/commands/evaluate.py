@@ -11,8 +11,9 @@ import numpy as np
 
 from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.sets import SIZE
-from vvgt_cli.conversion.gaussian_files import STDIN, file_rule, open_gaussians
+from vvgt_cli.conversion.gaussian_files import STDIN, file_rule, layout_of, open_gaussians
 from vvgt_cli.conversion.place import into_box, preview, upright
+from vvgt_cli.conversion.recolored import under_function
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.field import Field, Picture, Resident
 from vvgt_cli.field.open import Wanted, automatic, beside, blocked
@@ -23,6 +24,7 @@ from vvgt_cli.gaussians.outputs import Output, check_outputs
 from vvgt_cli.gaussians.rules import Rule
 from vvgt_cli.images.metrics.texture import Texture
 from vvgt_cli.jit.ahead import EVALUATE, for_blocks, for_degree
+from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.lighting import LightOptions
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run, StageRecord, document
@@ -125,7 +127,8 @@ def _opened(run: Run, request: EvaluateRequest, gaussians: Gaussians, header: Pl
     dark = replace(request.source, light=LightOptions())
     if dark.read.space is None and header.space == "LPS":
         dark = replace(dark, read=replace(dark.read, space="LPS"))
-    recorded = dark.unit_distance is None and header.unit_distance is not None
+    other = header.live is not None and dark.tf is not None  # not the function whose distance the header has
+    recorded = dark.unit_distance is None and header.unit_distance is not None and not other
     if recorded:
         dark = replace(dark, unit_distance=repr(header.unit_distance))
 
@@ -161,6 +164,14 @@ def _together(field: Field, pictures: Sequence[Picture]) -> Iterator[None]:
         field.forget(picture)
 
 
+def _shown(gaussians: Gaussians, header: PlyHeader, source: Source, request: SourceRequest) -> Gaussians:
+    """What carries values, under the function that is given; else the look of the file."""
+    if header.live is None or request.tf is None or not isinstance(source.tf, TransferFunction) or source.gridded:
+        return gaussians
+    options = replace(layout_of(header), unit_distance=source.unit_distance)
+    return under_function(gaussians, header, source.tf, options)
+
+
 def evaluate(request: EvaluateRequest, console: Console | None = None) -> Evaluation:
     """Score a `.ply` against its volume.
 
@@ -175,6 +186,7 @@ def evaluate(request: EvaluateRequest, console: Console | None = None) -> Evalua
     gaussians, header = open_gaussians(request.ply)
     with _opened(run, request, gaussians, header) as volume:
         source = volume.source
+        gaussians = _shown(gaussians, header, source, request.source)
         gaussians = into_box(gaussians, source.volume)
         for remark in _doubts(request, header, source):
             run.console.say(f"{request.ply}: {remark}")

@@ -11,11 +11,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vvgt_cli.cameras.files import read_cameras
-from vvgt_cli.conversion.gaussian_files import STDIN
+from vvgt_cli.conversion.gaussian_files import STDIN, open_gaussians
 from vvgt_cli.conversion.index import is_index, read_index
+from vvgt_cli.conversion.recolored import FunctionRequest, placed_function, under_function
 from vvgt_cli.errors import DataError, SeveralArrays, SeveralComponents, SeveralSteps, UsageError, VvgtError
 from vvgt_cli.files import seekable
-from vvgt_cli.gaussians import describe, read_ply
+from vvgt_cli.gaussians import describe, read_ply, write_ply
 from vvgt_cli.gaussians.formats import format_of, read_splats
 from vvgt_cli.look.label_files import holds_table, is_table, read_labels, segments_of
 from vvgt_cli.look.labels import LabelTable
@@ -36,12 +37,16 @@ CHEAP = 64 << 20  # bytes of a volume whose range is looked for
 _HEAD = 65536  # bytes that tell a view set from a transfer function
 
 
-def inspect(file: str, read: ReadOptions) -> dict[str, Any]:
+def inspect(file: str, read: ReadOptions, function: FunctionRequest | None = None) -> dict[str, Any]:
     """Facts about a volume, a transfer function, a view set, a `.ply` or an index of several; the first is "kind".
+
+    Of Gaussians that carry values what they are under ``function``, where one is given.
 
     Raises:
         DataError, UsageError: as the reader of that kind.
     """
+    if function is not None:
+        return {"kind": "gaussians", "name": Path(file).name, **_shown(file, function)}
     if file == STDIN and _head_of_stdin().startswith(_PLY):
         return {"kind": "gaussians", "name": "standard input", **describe(*read_ply(sys.stdin.buffer))}
     if not os.path.exists(file) and os.path.isfile(file.rpartition("#")[0]):  # a preset of several
@@ -71,6 +76,16 @@ def inspect(file: str, read: ReadOptions) -> dict[str, Any]:
             return _views(name)
         return _transfer_function(file)
     return _volume(file, read)
+
+
+def _shown(file: str, function: FunctionRequest) -> dict[str, Any]:
+    gaussians, header = open_gaussians(file)
+    tf, options = placed_function(file, header, function)
+    found = under_function(gaussians, header, tf, options)
+    stream = io.BytesIO()
+    write_ply(stream, found, options)
+    stream.seek(0)
+    return {"function": tf.name, "hidden": len(gaussians) - len(found), **describe(*read_ply(stream))}
 
 
 def _head_of_stdin() -> bytes:

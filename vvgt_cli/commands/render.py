@@ -13,6 +13,7 @@ from vvgt_cli.cameras.boxed import boxed
 from vvgt_cli.cameras.files import read_cameras, transforms_json
 from vvgt_cli.cameras.sets import SIZE
 from vvgt_cli.conversion.gaussian_files import file_rule, open_gaussians
+from vvgt_cli.conversion.recolored import FunctionRequest, shown
 from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.frames import upright_matrix
@@ -41,6 +42,7 @@ class RenderRequest:
         exr: write EXR too.
         background: RGB in [0, 1] that pictures stand on, None for transparent PNGs and black movies.
         overwrite: replace images that exist.
+        function: that Gaussians which carry values are shown under; None: the look of the file.
     """
 
     ply: str
@@ -52,6 +54,7 @@ class RenderRequest:
     exr: bool = False
     background: tuple[float, float, float] | None = None
     overwrite: bool = False
+    function: FunctionRequest | None = None
 
     @property
     def movie(self) -> bool:
@@ -99,6 +102,7 @@ def render_file(request: RenderRequest, console: Console | None = None) -> int:
         _check_directory(request, [*names, VIEWS_FILE])
     with run.stage("read") as stage:
         gaussians, header = open_gaussians(request.ply)
+        gaussians = shown(request.ply, gaussians, header, request.function)
         stage.note = f"{len(gaussians)} Gaussians, {header.frame} frame"
     cameras, rule = request.cameras(header.made_for, header.up), file_rule(header, request.rule)
     run.compile(for_degree(DRAW, gaussians.degree))

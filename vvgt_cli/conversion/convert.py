@@ -9,6 +9,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 from vvgt_cli.conversion.gaussian_files import write_gaussians
+from vvgt_cli.conversion.live import check_live, live_conversion
 from vvgt_cli.conversion.place import out_of_box, placed, remarks, way_up
 from vvgt_cli.conversion.plan import Plan, Planner, check_memory
 from vvgt_cli.conversion.readback import tell_cost
@@ -27,7 +28,7 @@ from vvgt_cli.files import check_room
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored
 from vvgt_cli.gaussians.formats import format_of
 from vvgt_cli.gaussians.outputs import STDOUT, check_outputs, claimed, write_text
-from vvgt_cli.jit.ahead import CONVERT, EVALUATE, INIT, for_blocks, for_degree
+from vvgt_cli.jit.ahead import CONVERT, EVALUATE, INIT, LIVE, for_blocks, for_degree
 from vvgt_cli.network.card import find_model, read_card
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
@@ -45,6 +46,8 @@ def convert(request: ConvertRequest, console: Console | None = None, made: Gauss
         DataError: input that is not what it must be, or a scene that shows nothing.
     """
     request.budget()
+    if request.live:
+        check_live(request)  # before anything is read
     if request.checkpoint is not None and request.limits.time_budget is not None:
         raise UsageError("--checkpoint is of runs that repeat to the byte, --time-budget of others; give one of both")
     run = Run(console or Console(), ConversionReport("convert"))
@@ -125,6 +128,9 @@ def run_conversion(run: Run, request: ConvertRequest, field: Field, made: Gaussi
     Raises:
         DataError, UsageError: as `convert`.
     """
+    if request.live:
+        check_live(request)
+        return live_conversion(run, request, field, ply_options(request, field.source))
     work, planner, plan = _planned(run, request, field)
     if made is not None:
         plan.stages, plan.left_out = [stage for stage in plan.stages if stage.scores], []
@@ -279,6 +285,7 @@ def _tell(run: Run, request: ConvertRequest, source: Source) -> None:
 def _kernels(run: Run, request: ConvertRequest, source: Source) -> tuple[str, ...]:
     """That a run will need."""
     names: tuple[str, ...] = CONVERT if run.report.command == "convert" else INIT
+    names += LIVE if request.live else ()
     return for_degree(source.kernels(names), degree_of(request, source))
 
 

@@ -104,6 +104,7 @@ class ConvertRequest:
         overwrite: replace files that exist.
         checkpoint: folder that keeps what the stages make, until the output is written; None for none.
         blocks: how the volume is gone through in blocks; None: it is in memory, or in blocks where that is better.
+        live: the Gaussians carry values, so that they can be shown under any function (docs/live.md).
         all_views: score on all ten test views, by SSIM and FLIP too, as a report has it.
     """
 
@@ -117,6 +118,7 @@ class ConvertRequest:
     preview: str | None = None
     overwrite: bool = False
     checkpoint: str | None = None
+    live: bool = False
     all_views: bool = False
     blocks: BlockOptions | None = None
 

@@ -21,6 +21,7 @@ from vvgt_cli.score.viewing import PREVIEW_VIEWS
 
 if TYPE_CHECKING:
     from vvgt_cli.field.field import Field
+    from vvgt_cli.look.function import TransferFunction
 
 FROM_THE_SIDE = 4  # test view that pictures show where none is asked for
 
@@ -96,6 +97,24 @@ class Result:
             if known is None:
                 return write_ply(temporary, self.gaussians, ply, self.normals())
             return temporary.write_bytes(encoded(known, self.gaussians, ply, os.fspath(path)))
+
+    def recolor(self, look: str | TransferFunction, *, range: str = "data", unit_distance: str | None = None) -> Result:
+        """What Gaussians that carry values (``convert(..., live=True)``) are under another function: ``vvgt recolor``.
+
+        Args:
+            look: file, colour map's name, or a function.
+            range: "data", "rescale" or "LO,HI": where the function's nodes lie.
+            unit_distance: world length that opacity is per, "paraview" or "mean-spacing"; None: the function's own.
+
+        Raises:
+            DataError: they carry none, or the function shows nothing of them.
+            UsageError: a range or a distance that is none.
+        """
+        from vvgt_cli.conversion.recolored import FunctionRequest, placed_function, under_function
+
+        tf, options = placed_function("result", self.ply, FunctionRequest(look, range, unit_distance))
+        found = under_function(self.gaussians, self.ply, tf, options)
+        return Result(found, ConversionReport("recolor"), options)
 
     def normals(self) -> np.ndarray | None:
         """Normals (K, 3) that a `.ply` of them has, unit frame; None for zeros."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -13,13 +13,15 @@ from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.cameras.blocks import Blocks
 from vvgt_cli.dvr.layout import Light
 from vvgt_cli.dvr.render import Box as Frame
-from vvgt_cli.dvr.render import Rays, RenderSettings, first_rays, for_thin, more_rays
-from vvgt_cli.field.cells import NORMALS, CellBlocks, ExtinctionBlocks, PointBlocks, RayBlocks, read_rows
+from vvgt_cli.dvr.render import Rays, RenderSettings, for_thin
+from vvgt_cli.field.cells import NORMALS, CellBlocks, ExtinctionBlocks, PointBlocks, RayBlocks, ValueBlocks, read_rows
 from vvgt_cli.field.digests import digest
+from vvgt_cli.field.drawing import Drawing
 from vvgt_cli.field.field import Picture
 from vvgt_cli.field.grid import CellGrid
 from vvgt_cli.field.parts import CELLS, Parts
 from vvgt_cli.field.rays import Bundle, RayFile, composed
+from vvgt_cli.field.reader import Scalars
 from vvgt_cli.field.runners import Runner, Task
 from vvgt_cli.field.settings import cell_grid
 from vvgt_cli.field.source import Source
@@ -30,6 +32,7 @@ from vvgt_cli.gaussians import Gaussians
 if TYPE_CHECKING:
     from vvgt_cli.closed_form import Start, VbmOptions
     from vvgt_cli.field.cells import Reader
+    from vvgt_cli.look.function import TransferFunction
 
 Progress = Callable[[int, int], None]
 RAY_STEP = 2e-8  # seconds of a step of a ray through what is not empty: bonsai-tree in blocks of 128, two threads
@@ -276,6 +279,47 @@ class Blocked:
             out[part["which"]] = part["found"]
         return out
 
+    def under(self, gaussians: Gaussians) -> np.ndarray:
+        """See `Field`."""
+        from vvgt_cli.closed_form.under import POINTS, in_voxels, values_of
+
+        self.source.one_field()
+        assert isinstance(self.reader, Scalars)
+        grid, parts = self.grid or self._grid(np.zeros(3, np.int64)), self.do.parts
+        centres, arms = in_voxels(gaussians, *self.frame)
+        rows = np.concatenate([centres, arms.reshape(-1, 9)], axis=1)
+        kind = f"values-{digest(rows)[:16]}"
+        path = parts.folder / f"{kind}.npy"
+        with atomic_write(path, overwrite=True) as temporary, open(temporary, "wb") as stream:
+            np.save(stream, rows)
+        task = ValueBlocks(self.reader, grid, parts, str(path), kind)
+        self.do(task, "values")
+        samples = np.full(len(gaussians) * POINTS, np.nan, np.float32)
+        for number in range(len(task)):
+            part = parts.load(kind, number)
+            samples[part["numbers"]] = part["found"]
+        rule = self.reader.rule
+        return values_of(samples.reshape(-1, POINTS), gaussians, rule.slope, rule.intercept)
+
+    def shown_by(self, tf: TransferFunction) -> Blocked:
+        """See `Field`: its blocks lie in a folder of their own, within that of this one."""
+        from vvgt_cli.look.tables import build_tables
+
+        source, numbers = self.source.shown_by(tf), self.source.statistics
+        assert isinstance(self.reader, Scalars)
+        rule, frame = self.reader.rule, self.source.volume.unit_frame()
+        optics = build_tables(
+            tf, (numbers.lo, numbers.hi), slope=rule.slope, intercept=rule.intercept,
+            unit_distance=source.unit_distance, world_per_unit=1 / frame.scale,
+        )  # fmt: skip
+        middles = (numbers.edges[1:] + numbers.edges[:-1]) / 2
+        visible = float(numbers.histogram[tf.opacity(middles) > 0].sum())
+        key = digest(self.key, source.look(), source.unit_distance)
+        parts = Parts(self.do.parts.folder / f"shown-{key[:16]}")
+        parts.open({"shown": key}, ours=True)
+        reader = replace(self.reader, optics=optics)
+        return Blocked(source, reader, replace(self.do, parts=parts), self.edge, visible, key)
+
     def digest(self) -> str:
         """See `Field`."""
         return self.key
@@ -288,51 +332,6 @@ class Blocked:
         form = self.start(VbmOptions(budget, size)).form
         assert form is not None
         return form.seen.largest > HIDDEN, form.seen.edge
-
-
-@dataclass
-class Drawing:
-    """A picture that is being made: of its blocks' pixels alone, as screens are large.
-
-    Attributes:
-        key: of the picture.
-        camera, settings, blocks: as of `Picture`.
-    """
-
-    key: str
-    camera: Camera
-    settings: RenderSettings
-    blocks: Blocks | None
-
-    @cached_property
-    def seen(self) -> np.ndarray:
-        """(n, 4) float32 of the pixels of `everywhere`, row by row."""
-        return np.zeros((int(self.everywhere().sum()), 4), np.float32)
-
-    def everywhere(self) -> np.ndarray:
-        """(h, w) bool: its pixels."""
-        shape = self.camera.height, self.camera.width
-        return np.ones(shape, bool) if self.blocks is None else self.blocks.mask()
-
-    def image(self) -> np.ndarray:
-        """(h, w, 4), zero outside the blocks."""
-        whole = np.zeros((self.camera.height, self.camera.width, 4), np.float32)
-        whole[self.everywhere()] = self.seen
-        return whole
-
-    def first(self) -> list[Rays]:
-        """Rays of the first pass."""
-        return first_rays(self.settings, self.everywhere())
-
-    def more(self) -> list[Rays]:
-        """Rays of the second."""
-        return more_rays(self.settings, self.image(), self.everywhere())
-
-    def add(self, rays: Rays, shown: np.ndarray) -> None:
-        """Mix in what ``rays`` show, (pixels, rays, 4) float64."""
-        offsets, mask, known = rays
-        at = mask[self.everywhere()]
-        self.seen[at] = (known * self.seen[at] + shown.sum(axis=1)) / (known + len(offsets))
 
 
 def _key(view: Picture) -> str:

@@ -176,6 +176,41 @@ class PointBlocks(Blockwise):
 
 
 @dataclass(frozen=True)
+class ValueBlocks(Blockwise):
+    """Values at the points of Gaussians.
+
+    Attributes:
+        gaussians: file of centres and axes (n, 12) in voxels.
+        kind: of the parts.
+    """
+
+    gaussians: str
+    kind: str
+
+    def __call__(self, number: int) -> None:
+        """Leave the values of those points that lie in block ``number``: numbers of them, over all Gaussians."""
+        from vvgt_cli.closed_form.under import POINTS, offsets, reach, sample_points
+
+        lo, hi = self.grid.blocks.at(number)
+        rows = np.load(self.gaussians, mmap_mode="r")
+        far = np.linalg.norm(rows[:, 3:].reshape(-1, 3, 3), axis=2) * reach()  # of points along each axis, at most
+        near = (rows[:, :3] + far >= lo - 0.5) & (rows[:, :3] - far < hi - 0.5)
+        which = np.flatnonzero(near.all(axis=1))
+        found, numbers = np.empty(0, np.float32), np.empty(0, np.int64)
+        if len(which):
+            box = self.box(number, HALO)
+            samples = np.full((len(which), POINTS), np.nan, np.float32)
+            some, begin = np.array(rows[which]), box.begin.astype(np.int64)
+            sample_points(
+                box.voxels, some[:, :3].copy(), some[:, 3:].reshape(-1, 3, 3).copy(), offsets(), begin,
+                lo.astype(np.int64), hi.astype(np.int64), samples,
+            )  # fmt: skip
+            row, column = np.nonzero(np.isfinite(samples))
+            found, numbers = samples[row, column], which[row] * POINTS + column
+        self.parts.save(self.kind, number, numbers=numbers, found=found)
+
+
+@dataclass(frozen=True)
 class ExtinctionBlocks(Blockwise):
     """Mean extinction of the cells that shadows and occlusion are marched through.
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
@@ -18,6 +19,11 @@ from vvgt_cli.gaussians import Gaussians
 if TYPE_CHECKING:
     from vvgt_cli.closed_form import Start, VbmOptions
     from vvgt_cli.dvr import RenderSettings, Scene
+    from vvgt_cli.dvr.scene import PreparedVolume
+    from vvgt_cli.look.function import TransferFunction
+
+
+AT_ONCE = 1 << 17  # Gaussians whose samples are in memory
 
 
 class Picture(NamedTuple):
@@ -56,6 +62,20 @@ class Field(Protocol):
     def normals(self, gaussians: Gaussians) -> np.ndarray | None:
         """Directions (K, 3) of the mean gradient around Gaussians, all in the box frame; None where nothing is lit."""
 
+    def under(self, gaussians: Gaussians) -> np.ndarray:
+        """(K, 5) float32 of `vvgt_cli.closed_form.under.values_of` under Gaussians of the box frame.
+
+        Raises:
+            UsageError: an optics grid, which has no values.
+        """
+
+    def shown_by(self, tf: TransferFunction) -> Field:
+        """The same volume under another function on data values, unlit.
+
+        Raises:
+            UsageError: an optics grid, which has no function.
+        """
+
     def digest(self) -> str:
         """Of the volume's content."""
 
@@ -74,6 +94,13 @@ class Resident:
 
     source: Source
     scene: Scene
+
+    @cached_property
+    def layout(self) -> PreparedVolume:
+        """Of one field, for the kernels."""
+        from vvgt_cli.dvr.scene import PreparedVolume
+
+        return self.source.layout or PreparedVolume.of(self.source.volume)
 
     def case(self, size: int, gaussians: int) -> Workload:
         """See `Field`."""
@@ -105,6 +132,26 @@ class Resident:
 
         points = normal_points(gaussians)
         return mean_normals(points, at_points(self.scene, points), self.scene.half)
+
+    def under(self, gaussians: Gaussians) -> np.ndarray:
+        """See `Field`."""
+        from vvgt_cli.closed_form.under import POINTS, in_voxels, offsets, sample_points, values_of
+
+        self.source.one_field()
+        scene, values = self.scene, np.empty((len(gaussians), 5), np.float32)
+        nothing, dims = np.zeros(3, np.int64), np.array(self.source.volume.dims)
+        for k in range(0, len(gaussians), AT_ONCE):
+            part = gaussians.take(np.arange(k, min(k + AT_ONCE, len(gaussians))))
+            samples = np.full((len(part), POINTS), np.nan, np.float32)
+            where = in_voxels(part, scene.half, scene.step)
+            sample_points(scene.voxels, *where, offsets(), nothing, nothing, dims, samples)
+            values[k : k + len(part)] = values_of(samples, part, self.layout.slope, self.layout.intercept)
+        return values
+
+    def shown_by(self, tf: TransferFunction) -> Resident:
+        """See `Field`."""
+        source = replace(self.source.shown_by(tf), layout=self.layout)
+        return Resident(source, source.scene())
 
     def digest(self) -> str:
         """See `Field`."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from vvgt_cli.dvr.layers import Layer, common_grid, grid_of
@@ -143,6 +143,31 @@ class Source:
     def labels_alone(self) -> bool:
         """Whether all of it is labels."""
         return all(isinstance(layer.tf, LabelTable) for layer in self.layers)
+
+    def one_field(self) -> None:
+        """Refuse an optics grid.
+
+        Raises:
+            UsageError: labels, channels or several volumes: there is no one value at a place.
+        """
+        if self.gridded:
+            raise UsageError(
+                f"{self.name}: labels, channels or layers, which have no one value at a place; expected one scalar "
+                "field (--labels none takes numbers as values)"
+            )
+
+    def shown_by(self, tf: TransferFunction) -> Source:
+        """The same volume under another function on data values, unlit.
+
+        Raises:
+            UsageError: an optics grid.
+        """
+        from vvgt_cli.look import unit_distance
+
+        self.one_field()
+        distance, label = unit_distance(None, self.volume, tf)
+        layer = replace(self.layers[0], tf=tf, unit_distance=distance, unit_label=label)
+        return replace(self, layers=(layer,), lighting=None)
 
     def look(self) -> str:
         """Digest of all that gives the volume its colours, other volumes included."""

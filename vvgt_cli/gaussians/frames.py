@@ -9,6 +9,7 @@ import numpy as np
 
 from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians.harmonics import turned
+from vvgt_cli.gaussians.live_facts import GRADIENT
 from vvgt_cli.gaussians.types import Gaussians
 
 _HALF = math.sqrt(0.5)
@@ -68,6 +69,7 @@ def turn(gaussians: Gaussians, up: str, *, inverse: bool = False) -> Gaussians:
         means=means.astype(np.float32),
         quaternions=quaternions.astype(np.float32),
         harmonics=turned(gaussians, matrix),
+        live=_gradients_turned(gaussians, matrix),
     )
 
 
@@ -105,16 +107,34 @@ def transform(gaussians: Gaussians, matrix: np.ndarray) -> Gaussians:
     else:
         largest = log_scales.max(axis=1, keepdims=True)
         factors = matrix @ rotations(quaternions) * np.exp(log_scales - largest)[:, None, :]
-        axes, sigma, _ = np.linalg.svd(factors)
-        quaternions = _quaternions(axes * np.sign(np.linalg.det(axes))[:, None, None])
-        log_scales = np.log(np.maximum(sigma, np.finfo(np.float64).tiny)) + largest
+        quaternions, log_scales = factored(factors)
+        log_scales += largest
     return replace(
         gaussians,
         means=(gaussians.means.astype(np.float64) @ matrix.T).astype(np.float32),
         log_scales=log_scales.astype(np.float32),
         quaternions=quaternions.astype(np.float32),
         harmonics=turned(gaussians, matrix),
+        live=_gradients_turned(gaussians, matrix),
     )
+
+
+def _gradients_turned(gaussians: Gaussians, matrix: np.ndarray) -> np.ndarray | None:
+    """What Gaussians carry after a linear map: gradients go with its inverse transposed, their lengths stay."""
+    if gaussians.live is None:
+        return None
+    live = gaussians.live.astype(np.float64)
+    before = np.linalg.norm(live[:, GRADIENT], axis=1, keepdims=True)
+    after = live[:, GRADIENT] @ np.linalg.inv(matrix)
+    live[:, GRADIENT] = after * before / np.maximum(np.linalg.norm(after, axis=1, keepdims=True), 1e-30)
+    return live.astype(np.float32)
+
+
+def factored(factors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Quaternions (K, 4) and log scales (K, 3) of covariances ``M M^T``, M (K, 3, 3)."""
+    axes, sigma, _ = np.linalg.svd(factors)
+    quaternions = _quaternions(axes * np.sign(np.linalg.det(axes))[:, None, None])
+    return quaternions, np.log(np.maximum(sigma, np.finfo(np.float64).tiny))
 
 
 def rotations(quaternions: np.ndarray) -> np.ndarray:

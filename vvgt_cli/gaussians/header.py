@@ -10,6 +10,7 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians.frames import up_matrix
+from vvgt_cli.gaussians.live_facts import WORD, LiveFacts, live_facts, one_comment
 from vvgt_cli.gaussians.types import HARMONICS
 from vvgt_cli.look.lighting import Lighting, parse_lighting
 from vvgt_cli.version import VERSION
@@ -41,6 +42,7 @@ class FileFacts:
         affine: 3 x 4 row-major, voxel index (i, j, k, 1) of the volume to world position.
         light: what fell on the scene.
         optics: digest of the tables and functions of an optics grid.
+        live: of the values that the Gaussians carry; None where they have one look alone.
     """
 
     frame: str = "unit"
@@ -55,6 +57,7 @@ class FileFacts:
     affine: tuple[float, ...] | None = None
     light: Lighting | None = None
     optics: str | None = None
+    live: LiveFacts | None = None
 
     def facts(self) -> dict[str, Any]:
         """The facts by name."""
@@ -174,23 +177,27 @@ def parse_header(content: bytes, name: str) -> PlyHeader:
         raise DataError(f"{name}: no element vertex; {_ADVICE}")
     degree = _sh_degree(fields, name)
     dtype = np.dtype(list(fields.items()))
-    return PlyHeader(size, count, dtype, degree, tuple(comments), **_provenance(comments, name))
+    return PlyHeader(size, count, dtype, degree, tuple(comments), **_provenance(comments, name, list(fields)))
 
 
-def _provenance(comments: list[str], name: str) -> dict[str, Any]:
+def _provenance(comments: list[str], name: str, columns: list[str]) -> dict[str, Any]:
     """`FileFacts` and the version, from our own comments."""
     found: dict[str, Any] = {}
+    live: dict[str, Any] = {}
     for comment in comments:
         words = comment.split()
         if len(words) < 2 or words[0] != "vvgt":
             continue
         try:
-            found |= _one_comment(words[1:])
+            if words[1] == WORD:
+                live |= one_comment(words[2:])
+            else:
+                found |= _one_comment(words[1:])
         except (ValueError, IndexError, UsageError):
             raise DataError(f"{name}: comment {comment[:80]!r} is not one that vvgt writes") from None
     if found.get("frame") == "world" and "scale" not in found:
         raise DataError(f"{name}: in world space, but its comments do not hold scale and centre")
-    return found
+    return found | {"live": live_facts(live, columns)}
 
 
 def _one_comment(words: list[str]) -> dict[str, Any]:
@@ -250,6 +257,8 @@ def comment_lines(facts: FileFacts) -> list[str]:
         lines.append(f"comment vvgt light {facts.light.text()}")
     if facts.optics is not None:
         lines.append(f"comment vvgt optics {facts.optics}")
+    if facts.live is not None:
+        lines += facts.live.lines()
     if facts.rule == "compensated":
         lines.append(MIP)
     return lines

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO
@@ -13,6 +14,7 @@ from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import seekable
 from vvgt_cli.gaussians.frames import rescale, turn, up_matrix
 from vvgt_cli.gaussians.header import FileFacts, PlyHeader, comment_lines, parse_header, rest_names
+from vvgt_cli.gaussians.live_facts import COLUMNS, GRADIENT, NORMAL, LiveFacts
 from vvgt_cli.gaussians.types import HARMONICS, SH_C0, Gaussians
 from vvgt_cli.volume.space import axis_facts
 
@@ -62,12 +64,13 @@ def as_stored(gaussians: Gaussians) -> Gaussians:
     return replace(gaussians, colors=f_dc_to_colors(colors_to_f_dc(gaussians.colors)))
 
 
-def property_names(sh_degree: int = 0) -> list[str]:
-    """Property order of the file; all float32."""
+def property_names(sh_degree: int = 0, live: bool = False) -> list[str]:
+    """Property order of the file, of Gaussians that carry values or not; all float32."""
     return [
         *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
         *rest_names(sh_degree),
         *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+        *(COLUMNS if live else ()),
     ]
 
 
@@ -89,11 +92,13 @@ def write_ply(
         UsageError: the frame is "world" and scale or centre are missing.
     """
     options = options or PlyOptions()
+    if gaussians.live is None or options.live is None:
+        gaussians, options = replace(gaussians, live=None), replace(options, live=None)
     if not len(gaussians):
         raise DataError("no Gaussians to write: a .ply needs at least one")
     rows = ply_rows(gaussians, options, normals)
     degree = gaussians.degree if options.sh_degree is None else options.sh_degree
-    header = ply_header(len(gaussians), degree, options)
+    header = ply_header(len(gaussians), degree, options, gaussians.live is not None)
     if isinstance(target, str | Path):
         with open(target, "wb") as stream:
             stream.write(header)
@@ -120,24 +125,27 @@ def ply_rows(gaussians: Gaussians, options: PlyOptions, normals: np.ndarray | No
     f_dc = colors_to_f_dc(placed.colors)
     if not np.isfinite(f_dc).all():
         raise DataError("colours too large for float32 spherical harmonics; expected values near [0, 1]")
-    names = property_names(placed.degree)
+    names = property_names(placed.degree, placed.live is not None)
+    end = len(names) - (0 if placed.live is None else len(COLUMNS))
     rows = np.zeros((len(placed), len(names)), dtype="<f4")  # (K, properties)
     rows[:, 0:3] = placed.means
     if normals is not None:
         rows[:, 3:6] = normals @ up_matrix(options.up).T
     rows[:, 6:9] = f_dc
     if placed.harmonics is not None:
-        rows[:, 9:-8] = placed.harmonics.transpose(0, 2, 1).reshape(len(placed), -1)
-    rows[:, -8] = placed.opacity_logits
-    rows[:, -7:-4] = placed.log_scales
-    rows[:, -4:] = placed.quaternions
+        rows[:, 9 : end - 8] = placed.harmonics.transpose(0, 2, 1).reshape(len(placed), -1)
+    rows[:, end - 8] = placed.opacity_logits
+    rows[:, end - 7 : end - 4] = placed.log_scales
+    rows[:, end - 4 : end] = placed.quaternions
+    if placed.live is not None:
+        rows[:, 3:6], rows[:, end:] = placed.live[:, GRADIENT], np.delete(placed.live, GRADIENT, axis=1)
     return rows
 
 
-def ply_header(count: int, degree: int, options: PlyOptions) -> bytes:
-    """The header of a file of ``count`` Gaussians with harmonics of ``degree``."""
+def ply_header(count: int, degree: int, options: PlyOptions, live: bool = False) -> bytes:
+    """The header of a file of ``count`` Gaussians with harmonics of ``degree``; ``live``: they carry values."""
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]  # some loaders count lines
-    lines += [f"property float {name}" for name in property_names(degree)]
+    lines += [f"property float {name}" for name in property_names(degree, live)]
     lines += [*(comment_lines(options) if options.comments else []), "end_header", ""]
     return "\n".join(lines).encode("ascii")
 
@@ -193,6 +201,7 @@ def read_ply(source: str | Path | BinaryIO) -> tuple[Gaussians, PlyHeader]:
             np.array(rows["opacity"], dtype=np.float32),
             f_dc_to_colors(columns("f_dc_0", "f_dc_1", "f_dc_2")),
             _harmonics(columns(*rest_names(header.sh_degree))) if header.sh_degree else None,
+            _values(header, columns),
         )
     except DataError as error:
         raise DataError(f"{name}: {error}") from None
@@ -204,6 +213,20 @@ def _harmonics(rest: np.ndarray) -> np.ndarray | None:
     """(K, M, 3) of a file's (K, 3 M), channel after channel; None where not a bit is set."""
     terms = rest.shape[1] // 3
     return rest.reshape(-1, 3, terms).transpose(0, 2, 1) if rest.view(np.uint32).any() else None
+
+
+def _values(header: PlyHeader, columns: Callable[..., np.ndarray]) -> np.ndarray | None:
+    """(K, 6) that Gaussians carry, None of a file without.
+
+    Raises:
+        DataError: a length or a spread that is none.
+    """
+    if header.live is None:
+        return None
+    found = columns(*COLUMNS, *NORMAL)
+    if (found[:, 1] < 0).any() or (found[:, 2] <= 0).any():
+        raise DataError("spreads below 0, or lengths that are not above it; expected the columns that vvgt writes")
+    return found
 
 
 def _check_rotations(gaussians: Gaussians, name: str) -> None:
@@ -226,6 +249,15 @@ def opacity(gaussians: Gaussians) -> np.ndarray:
     return 1 / (1 + np.exp(-np.clip(gaussians.opacity_logits.astype(np.float64), -700, 700)))
 
 
+def live_summary(gaussians: Gaussians, facts: LiveFacts) -> dict[str, object]:
+    """What `describe` says of values that Gaussians carry."""
+    assert gaussians.live is not None
+    found: dict[str, object] = {"live_values": [facts.lo, facts.hi], "live_unit": facts.unit or "none"}
+    for column, name in enumerate(COLUMNS):
+        found[f"live_{name}"] = [float(f"{q:.6g}") for q in np.percentile(gaussians.live[:, column], (0, 50, 100))]
+    return found | {"live_function": facts.baked().get("name", "")}
+
+
 def describe(gaussians: Gaussians, header: PlyHeader) -> dict[str, object]:
     """What `vvgt info` says about a `.ply`: counts, frame, box and the spread of sizes and opacities."""
     summary: dict[str, object] = {
@@ -241,6 +273,7 @@ def describe(gaussians: Gaussians, header: PlyHeader) -> dict[str, object]:
         "unit_distance_label": header.unit_distance_label,
         "version": header.version,
         **({} if header.light is None else {"light": header.light.text()}),
+        **({} if header.live is None else live_summary(gaussians, header.live)),
     }
     if len(gaussians):
         sigma = np.exp(np.clip(gaussians.log_scales.astype(np.float64), -700, 700))

@@ -25,6 +25,9 @@ class Gaussians:
         colors: (K, 3) RGB in display space, 0.5 + SH_C0 * f_dc; may lie outside [0, 1].
         harmonics: (K, M, 3) what is added to the colour by the direction from the eye to the centre, RGB, M = 3, 8 or
             15 coefficients as `vvgt_cli.gaussians.harmonics.basis` orders them; None: the same from everywhere.
+        live: (K, 6) what they can be shown by under any function (`vvgt_cli.gaussians.live`): mean and spread of the
+            data value under each, its length in the unit frame, and the direction of the gradient, as long as the share
+            of the spread that it explains; None: one look.
 
     Raises:
         DataError: wrong shapes, or a value that is not finite.
@@ -36,12 +39,15 @@ class Gaussians:
     opacity_logits: np.ndarray
     colors: np.ndarray
     harmonics: np.ndarray | None = None
+    live: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         count = len(self.means)
         shapes: dict[str, list[tuple[int, ...]]] = {f: [(count, n) if n else (count,)] for f, n in _WIDTHS.items()}
         if self.harmonics is not None:
             shapes["harmonics"] = [(count, terms, 3) for terms in HARMONICS.values() if terms]
+        if self.live is not None:
+            shapes["live"] = [(count, 6)]
         for field, expected in shapes.items():
             array = np.ascontiguousarray(getattr(self, field), dtype=np.float32)
             if array.shape not in expected:
@@ -62,7 +68,7 @@ class Gaussians:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Every field that is there, by name, in the order of the fields."""
-        found = {field: getattr(self, field) for field in (*_WIDTHS, "harmonics")}
+        found = {field: getattr(self, field) for field in (*_WIDTHS, "harmonics", "live")}
         return {field: array for field, array in found.items() if array is not None}
 
     def take(self, index: np.ndarray) -> Gaussians:

@@ -65,6 +65,7 @@ SEGMENTS = {
 }
 BLOCK_RANGES = "vvgt_cli.closed_form.ranges:block_ranges"  # of blocks of which not all is read
 CONVERT = (RENDER, FRAME_STEPS, *CLOSED_FORM, *DRAW, *DESCENT, REGRESS, *RAYCAST_REST, *BACK_PROJECT)
+LIVE = ("vvgt_cli.closed_form.under:sample_points",)
 OPTIMIZE = (*REFINE, *DRAW, "vvgt_cli.closed_form.pyramid:principal_axes", *SHARED)
 EVALUATE = (*RAYCAST, *DRAW)
 INFER = (*DRAW, PAIR_SUMS, STANDARD, *BACK_PROJECT)
@@ -81,6 +82,7 @@ ALL = (
     FIELD_STEPS,
     *DEPOSITS,
     *SEGMENTS.values(),
+    *LIVE,
     BLOCK_RANGES,
     *COUNT_WHOLE,
     *COUNT_REAL,

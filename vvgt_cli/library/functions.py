@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Unpack
 
 from vvgt_cli.cameras import Camera, default_views
@@ -12,6 +13,7 @@ from vvgt_cli.errors import SeveralSteps, UsageError
 from vvgt_cli.field.layered import Content
 from vvgt_cli.gaussians import Gaussians, PlyHeader
 from vvgt_cli.library.inputs import (
+    FunctionLike,
     Goal,
     GoalLike,
     Look,
@@ -22,6 +24,7 @@ from vvgt_cli.library.inputs import (
     VolumeLike,
     console_of,
     content_of,
+    function_of,
     looks_of,
     ply_of,
     source_of,
@@ -46,6 +49,7 @@ def convert(
     goal: GoalLike = None,
     *,
     split_labels: bool = False,
+    live: bool = False,
     blocks: int | str | None = None,
     progress: bool = False,
     **reading: Unpack[Reading],
@@ -65,6 +69,7 @@ def convert(
             of names to them.
         goal: budget, screen, limits: a `Goal`, or a mapping of some of its attributes.
         split_labels: of a label map, a result a label.
+        live: the Gaussians carry the values under them: `Result.recolor` shows them under any function (docs/live.md).
         blocks: voxels along the edge of blocks, or "auto"; None: blocks where the file is large.
         progress: lines and bars on standard error.
         **reading: how to read the volume: see `Reading`.
@@ -77,27 +82,33 @@ def convert(
         DataError: input that is not what it must be, or a scene that shows nothing.
         UsageError: options that do not fit.
     """
-    from vvgt_cli.conversion.clouds import frames_in_memory, labels_in_memory, looks_in_memory
-    from vvgt_cli.conversion.convert import without_files
-    from vvgt_cli.conversion.pages import is_glob_of_volumes
+    from vvgt_cli.conversion.clouds import labels_in_memory, looks_in_memory
 
     console, looks = console_of(progress), looks_of(look)
+    if live and (looks is not None or split_labels):
+        raise UsageError("live: one result of one volume, which `recolor` shows under other looks; expected one look")
     if looks is not None:
         if split_labels:
             raise UsageError(f"split_labels with {len(looks)} looks; expected one")
         requests, name = _under(looks, volume, reading, goal, blocks, console)
         return looks_in_memory(requests, name, console)
     one: Any = look
-    request = _request(source_of(volume, one, reading), goal, blocks)
-    if split_labels:
-        return labels_in_memory(request, console)
+    request = replace(_request(source_of(volume, one, reading), goal, blocks), live=live)
+    return labels_in_memory(request, console) if split_labels else _one_or_frames(request, console)
+
+
+def _one_or_frames(request: ConvertRequest, console: Console) -> Conversion | Clouds:
+    from vvgt_cli.conversion.clouds import frames_in_memory
+    from vvgt_cli.conversion.convert import without_files
+    from vvgt_cli.conversion.pages import is_glob_of_volumes
+
     path = request.source.volume
     if isinstance(path, str) and is_glob_of_volumes(path):
         return frames_in_memory(request, console)
     try:
         return without_files(request, console)
     except SeveralSteps:
-        if not isinstance(path, str):
+        if not isinstance(path, str) or request.live:
             raise
         return frames_in_memory(request, console)
 
@@ -237,6 +248,33 @@ def evaluate(
     source = source_of(volume, look, reading)
     request = pipeline.EvaluateRequest(ply_of(ply), source, size, rule, step, seats, _blocks(blocks))
     return pipeline.evaluate(request, console_of(progress))
+
+
+def recolor(
+    ply: PathLike, look: FunctionLike, *, range: str = "data", unit_distance: str | float | None = None
+) -> Result:
+    """A live ``.ply`` under another function, without its volume: ``vvgt recolor``.
+
+    Args:
+        ply: path of a file that ``vvgt convert --live`` wrote.
+        look: as of `Look`.
+        range, unit_distance: as of `Result.recolor`.
+
+    Returns:
+        An ordinary cloud.
+
+    Raises:
+        DataError: a file whose Gaussians carry no values, or a function that shows nothing of them.
+        UsageError: a range or a distance that is none.
+    """
+    from vvgt_cli.conversion.gaussian_files import layout_of
+    from vvgt_cli.score.record import ConversionReport
+
+    gaussians, header = read_ply(ply)
+    function = function_of(look)
+    assert function is not None
+    result = Result(gaussians, ConversionReport("recolor"), layout_of(header))
+    return result.recolor(function, range=range, unit_distance=None if unit_distance is None else str(unit_distance))
 
 
 def optimize(

@@ -98,7 +98,7 @@ def from_histogram(statistics: StatisticsLike, hounsfield: bool = False, density
         if tissues.support(lo, hi):
             return tissues
     first, last = background_bins(counts)
-    left, right = (_worth_showing(side, counts) for side in (slice(0, first), slice(last, None)))
+    left, right = (worth_showing(side, counts) for side in (slice(0, first), slice(last, None)))
     if not (left or right):
         first = last = 0
     positions: list[float] = []
@@ -158,7 +158,7 @@ def _averaged(counts: np.ndarray) -> np.ndarray:
     return np.convolve(np.pad(counts, reach[-1], mode="edge"), kernel / kernel.sum(), mode="valid")
 
 
-def _worth_showing(side: slice, counts: np.ndarray) -> bool:
+def worth_showing(side: slice, counts: np.ndarray) -> bool:
     """Whether a side of the background is wide and full enough to be more than padding or stray voxels."""
     inside = counts[side]
     # of the foreground as a whole: all but the voxels of the highest bin, which is always background

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
@@ -103,7 +103,8 @@ def _checkpoint(
 
 
 def begin(gaussians: Gaussians, cameras: Sequence[Camera], options: OptimizeOptions) -> State:
-    """What the method descends on."""
+    """What the method descends on: of Gaussians that carry values, the look that they have."""
+    gaussians = replace(gaussians, live=None)
     if options.method == "3dgs":
         return Densified(gaussians, cameras, options)
     if options.method == "adam":

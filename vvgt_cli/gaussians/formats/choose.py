@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from vvgt_cli.errors import DataError
@@ -70,6 +71,11 @@ def encoded(known: Format, gaussians: Gaussians, options: PlyOptions, name: str)
     Raises:
         DataError: values that it cannot hold, a library or a program that is not installed, or fails.
     """
+    if gaussians.live is not None:
+        warnings.warn(
+            f"{name}: {known.suffix} has no columns for values: it has the one look that is baked in", stacklevel=2
+        )
+        gaussians, options = replace(gaussians, live=None), replace(options, live=None)
     return known.write(splats_of(gaussians, known.layout(options)), name)
 
 

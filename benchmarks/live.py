@@ -1,0 +1,126 @@
+"""How near live files are to their volumes under functions that nothing was made for, beside conversions for these.
+
+python benchmarks/live.py SCENES.tsv DATA FUNCTIONS -o docs/live.csv [--scene NAME] [--gaussians N] [--direct]
+python benchmarks/live.py --table docs/live.csv
+
+A file is made for the scene's function, and shown under a band, a step and a ramp that follow from the histogram.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from typing import Any
+
+import click
+import numpy as np
+from dvr_scenes import print_table, read_scenes, write_rows
+
+from vvgt_cli.conversion.convert import fitted
+from vvgt_cli.conversion.live import carrying, placed_by, table_of, wide_enough
+from vvgt_cli.conversion.request import ConvertRequest, FitOptions
+from vvgt_cli.dvr import RenderSettings
+from vvgt_cli.field.field import Resident
+from vvgt_cli.field.source import Opened, SourceRequest
+from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.gaussians.formats.live import from_bytes, live_bytes, live_json
+from vvgt_cli.gaussians.live import baked, shown_by
+from vvgt_cli.gaussians.live_facts import LiveFacts
+from vvgt_cli.look import ColorMap, PiecewiseOpacity, TransferFunction
+from vvgt_cli.look.fog import fog
+from vvgt_cli.look.histogram import background_bins
+from vvgt_cli.progress import Console
+from vvgt_cli.score.record import ConversionReport, Run
+from vvgt_cli.score.viewing import PREVIEW_VIEWS
+from vvgt_cli.score.views import score_test_views
+from vvgt_cli.volume import Statistics
+
+SIZE = 1080
+
+
+def functions(numbers: Statistics) -> dict[str, TransferFunction]:
+    """A tent of 6 % of the range at the 70th percentile of the foreground, a step at its median, a ramp over all."""
+    counts, lo, hi = numbers.histogram.astype(float), numbers.lo, numbers.hi
+    first, last = background_bins(counts)
+    counts[first:last] = 0
+    if last > first and first < len(counts) - last:
+        counts[:first] = 0
+    rank = np.concatenate([[0.0], np.cumsum(counts)]) / counts.sum()
+    median, middle = (float(np.interp(p, rank, numbers.edges)) for p in (0.5, 0.7))
+    foot, part = float(numbers.edges[last]) if last > first else lo, 0.03 * (hi - lo)
+    colors = ColorMap(np.array([lo, (lo + hi) / 2, hi]), np.array([[0.1, 0.2, 0.8], [0.9, 0.8, 0.3], [0.8, 0.1, 0.1]]))
+    tints = [[1, 0.6, 0.2], [1, 0.6, 0.2], [0.3, 0.7, 1], [0.3, 0.7, 1]]
+    two = ColorMap(np.array([lo, middle - part, middle + part, hi]), np.array(tints))
+    nodes = {
+        "band": ([middle - part, middle, middle + part], [0, 0.3, 0], two),
+        "step": ([median - part / 6, median + part / 6], [0, 0.6], colors),
+        "ramp": ([foot, hi], [0, 0.25], colors),
+    }
+    return {
+        name: TransferFunction(name, PiecewiseOpacity(np.array(x), np.array(y, float)), tint)
+        for name, (x, y, tint) in nodes.items()
+    }
+
+
+def direct(field: Resident, tf: TransferFunction, gaussians: int) -> Gaussians:
+    """An ordinary conversion for a function."""
+    opened = Opened(field.source.volume, field.source.statistics, field.layout)
+    source = SourceRequest(opened, tf=tf, unit_distance="mean-spacing", labels="none")
+    request = ConvertRequest(source, None, FitOptions(max_gaussians=gaussians, size=SIZE))
+    return fitted(Run(Console(quiet=True), ConversionReport("convert")), request)
+
+
+def measured(name: str, field: Resident, gaussians: int, beside: bool) -> list[dict[str, Any]]:
+    """A row a function."""
+    source = field.source
+    run = Run(Console(quiet=True), ConversionReport("convert"))
+    request = ConvertRequest(SourceRequest("-"), None, FitOptions(max_gaussians=gaussians, size=SIZE), live=True)
+    start = time.process_time()
+    assert isinstance(source.tf, TransferFunction)
+    foggy = field.shown_by(fog(source.statistics, source.tf))
+    live = wide_enough(carrying(run, foggy, placed_by(run, foggy, request)), SIZE)
+    seconds = time.process_time() - start
+    facts = LiveFacts.of(source.volume, source.statistics, source.tf)
+    packed = replace(live, live=from_bytes(live_bytes(live, facts), live_json(live, facts, 1.0)))
+    rows = []
+    for title, tf in functions(source.statistics).items():
+        spacing = float(np.mean(source.volume.spacing))
+        shown = field.shown_by(replace(tf, opacity_unit_distance=spacing))
+        table = table_of(shown.source)
+        looks = {"live": shown_by(live, table), "bytes": shown_by(packed, table), "other viewers": baked(live, table)}
+        if beside:
+            looks["converted for it"] = direct(field, tf, gaussians)
+        scores = {
+            look: score_test_views(shown, some, SIZE, RenderSettings(), perceptual=False, only=PREVIEW_VIEWS).psnr
+            for look, some in looks.items()
+        }
+        rows.append({"scene": name, "gaussians": gaussians, "function": title, **scores, "seconds": seconds})
+        print(rows[-1], flush=True)
+    return rows
+
+
+@click.command()
+@click.argument("paths", nargs=-1)
+@click.option("-o", "--output")
+@click.option("--scene", "names", multiple=True)
+@click.option("--gaussians", multiple=True, type=int, default=(100_000, 300_000))
+@click.option("--direct", "beside", is_flag=True)
+@click.option("--table", "table")
+def main(
+    paths: tuple[str, ...], output: str | None, names: tuple[str, ...], gaussians: tuple[int, ...], beside: bool,
+    table: str | None,
+) -> None:  # fmt: skip
+    """See the module."""
+    if table:
+        print_table(table)
+        return
+    rows = []
+    for name, source in read_scenes(*paths, names or None):  # type: ignore[misc]
+        field = Resident(source, source.scene())
+        for count in gaussians:
+            rows += measured(name, field, count, beside)
+    write_rows(output, rows)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,326 @@
+"""Gaussians that carry values, and their look under any function."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.special import ndtri
+from scipy.stats import norm
+
+import vvgt_cli as vvgt_library
+from vvgt_cli.cameras import default_views
+from vvgt_cli.closed_form.under import POINTS, in_voxels, offsets, sample_points, values_of
+from vvgt_cli.dvr import RenderSettings
+from vvgt_cli.dvr.layout import Voxels
+from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
+from vvgt_cli.gaussians.formats.live import from_bytes, live_bytes, live_json
+from vvgt_cli.gaussians.frames import rotations, transform, turn
+from vvgt_cli.gaussians.live import MEANS, SPREADS, WIDEST, Table, baked, directions, shown_by, spreads
+from vvgt_cli.gaussians.live_facts import LiveFacts, function_text
+from vvgt_cli.images.metrics import psnr
+from vvgt_cli.look.colormap import ColorMap
+from vvgt_cli.look.fog import fog
+from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.look.opacity import PiecewiseOpacity
+from vvgt_cli.splat import render
+from vvgt_cli.volume.stats import Statistics, edges_of
+
+LO, HI = -20.0, 80.0
+COLORS = ColorMap(np.array([LO, 20, HI]), np.array([[1, 0.2, 0], [0, 1, 0.3], [0.1, 0, 1]]))
+RAMP = TransferFunction("ramp", PiecewiseOpacity(np.array([0.0, HI]), np.array([0.0, 0.6])), COLORS)
+WINDOW = TransferFunction("window", PiecewiseOpacity(np.array([10.0, 20, 30]), np.array([0.0, 0.5, 0.0])), COLORS)
+SMALL = ("--max-gaussians", 600, "--size", 64)
+TF = {"name": "w", "points": [{"x": 0.3, "rgb": [1, 0, 0], "opacity": 0}, {"x": 0.6, "rgb": [0, 1, 0], "opacity": 0.8}]}
+
+
+def cloud(count: int = 40, seed: int = 1) -> Gaussians:
+    rng = np.random.default_rng(seed)
+    gradient = rng.normal(size=(count, 3))
+    gradient *= rng.uniform(0, 1, (count, 1)) / np.linalg.norm(gradient, axis=1, keepdims=True)
+    values = [rng.uniform(LO, HI, count), rng.uniform(0, 20, count), np.exp(rng.uniform(-4, 0, count))]
+    return Gaussians(
+        rng.uniform(-0.6, 0.6, (count, 3)), np.log(rng.uniform(0.02, 0.2, (count, 3))), rng.normal(size=(count, 4)),
+        rng.normal(size=count), rng.uniform(0, 1, (count, 3)), live=np.column_stack([*values, gradient]),
+    )  # fmt: skip
+
+
+def statistics(counts: np.ndarray) -> Statistics:
+    return Statistics(LO, HI, 0, 0, np.asarray(counts, np.int64), edges_of(LO, HI))
+
+
+def facts(tf: TransferFunction = RAMP) -> LiveFacts:
+    return LiveFacts(LO, HI, (9, 8, 7), tuple(range(256)), "HU", function_text(tf, LO, HI))
+
+
+@pytest.mark.parametrize("tf", [RAMP, WINDOW])
+@pytest.mark.parametrize("spread", [0.5, 4.0, 15.0])
+def test_a_table_holds_means_over_normal_laws(tf: TransferFunction, spread: float) -> None:
+    """Against quadrature in float64."""
+    distance, values = 0.05, np.array([-5.0, 12.3, 21.0, 55.0])
+    sums = Table.of(tf, LO, HI, distance).at(values, np.full(4, spread))
+    z = ndtri((np.arange(20001) + 0.5) / 20001)
+    at = np.clip(values[:, None] + spread * z, LO, HI)
+    tau = -np.log1p(-tf.opacity(at)) / distance
+    color = tf.color(at.ravel()).reshape(4, -1, 3)
+    wanted = [(tau * color[..., c]).mean(axis=1) for c in range(3)] + [(tau * z**p).mean(axis=1) for p in range(3)]
+    assert np.abs(sums - np.stack(wanted, axis=1)).max() < 0.035 * tau.max()  # of 33 nodes
+
+
+def test_without_spread_a_gaussian_has_the_functions_color_and_extinction() -> None:
+    some = cloud()
+    assert some.live is not None
+    live = some.live.copy()
+    live[:, 1] = 0
+    shown = baked(replace(some, live=live), Table.of(RAMP, LO, HI, 0.05))
+    tau = -np.log1p(-RAMP.opacity(live[:, 0].astype(float))) / 0.05
+    opacity = 1 / (1 + np.exp(-shown.opacity_logits.astype(float)))
+    np.testing.assert_allclose(opacity, -np.expm1(-tau * live[:, 2]), atol=4e-3)
+    seen = tau > 0.1
+    np.testing.assert_allclose(shown.colors[seen], RAMP.color(live[seen, 0].astype(float)), atol=2e-2)
+
+
+def test_a_gaussian_moves_to_where_the_values_are_seen_and_is_thinner_there() -> None:
+    """One whose values rise along x from LO to HI: a window around 20 lies where 20 is."""
+    live = np.array([[10.0, 20.0, 0.5, 1.0, 0.0, 0.0]])
+    one = Gaussians(np.zeros((1, 3)), np.full((1, 3), np.log(0.1)), [[1, 0, 0, 0]], [0.0], [[1, 1, 1]], live=live)
+    shown = shown_by(one, Table.of(WINDOW, LO, HI, 0.05))
+    np.testing.assert_allclose(shown.means, [[0.1 * (20 - 10) / 20, 0, 0]], atol=5e-3)
+    axes = rotations(shown.quaternions.astype(float))[0] * np.exp(shown.log_scales.astype(float))
+    covariance = axes @ axes.T
+    within = norm.pdf(np.linspace(10, 30, 401), 10, 20)
+    x = (np.linspace(10, 30, 401) - 10) / 20
+    tau = -np.log1p(-WINDOW.opacity(np.linspace(10, 30, 401))) * within
+    variance = (tau * x**2).sum() / tau.sum() - ((tau * x).sum() / tau.sum()) ** 2
+    assert covariance[0, 0] == pytest.approx(0.01 * variance, rel=0.05)
+    assert covariance[1, 1] == pytest.approx(0.01, rel=1e-4)
+    assert shown.live is None
+
+
+def test_a_look_turns_with_its_gaussians() -> None:
+    """Of maps that stretch too: gradients are covectors."""
+    some, table = cloud(), Table.of(WINDOW, LO, HI, 0.05)
+    shear = np.array([[1.0, 0.3, 0.0], [0.0, 0.8, 0.1], [0.0, 0.0, 1.2]])
+    for change in (lambda g: turn(g, "x"), lambda g: transform(g, shear), lambda g: transform(g, -np.eye(3))):
+        before, after = change(shown_by(some, table)), shown_by(change(some), table)
+        np.testing.assert_allclose(after.means, before.means, atol=2e-5)
+        axes = [
+            rotations(g.quaternions.astype(float)) * np.exp(g.log_scales.astype(float))[:, None]
+            for g in (before, after)
+        ]
+        np.testing.assert_allclose(*[m @ m.transpose(0, 2, 1) for m in axes], atol=1e-6)
+
+
+def test_values_under_gaussians_of_a_linear_field() -> None:
+    """Mean, spread and direction of v = 3 i - k + 7 in voxels, of which the stored values are negative halves."""
+    z, _, x = np.mgrid[:20, :21, :22]
+    stored = (-(3 * x - z + 7) / 2).astype(np.float32)
+    stored.flags.writeable = False
+    half, step = np.array([1.1, 1.05, 1.0]), np.full(3, 0.1)
+    some = replace(cloud(), log_scales=np.full((40, 3), np.log(0.05)), means=cloud().means * 0.8)
+    samples = np.full((40, POINTS), np.nan, np.float32)
+    nothing = np.zeros(3, np.int64)
+    where = in_voxels(some, half, step)
+    sample_points(Voxels(stored), *where, offsets(), nothing, nothing, np.array([22, 21, 20]), samples)
+    found = values_of(samples, some, -2.0, 0.0)
+    at = where[0]
+    np.testing.assert_allclose(found[:, 0], 3 * at[:, 0] - at[:, 2] + 7, atol=1e-3)
+    spread = np.sqrt(((offsets() @ np.array([[3, 0, -1]]).T * 0.5) ** 2).mean())
+    np.testing.assert_allclose(found[:, 1], spread, rtol=1e-3)
+    np.testing.assert_allclose(found[:, 2:], np.tile(np.array([3, 0, -1]) / 10**0.5, (40, 1)), atol=1e-3)
+
+
+def test_samples_that_are_not_finite_do_not_count() -> None:
+    samples = np.full((2, POINTS), 5, np.float32)
+    samples[0, ::3] = np.nan
+    samples[1] = np.inf
+    found = values_of(samples, cloud(2), 2.0, 1.0)
+    np.testing.assert_allclose(found[0], [11, 0, 0, 0, 0], atol=1e-6)
+    assert np.isnan(found[1, 0])
+
+
+def test_a_ply_keeps_values_in_columns_that_others_ignore(tmp_path: Path) -> None:
+    some = baked(cloud(), Table.of(RAMP, LO, HI, 0.05))
+    options = PlyOptions(up="y", scale=0.1, centre=(1, 2, 3), frame="world", affine=tuple(range(12)), live=facts())
+    options = replace(options, affine=(1.0, 0, 0, 0, 0, 2.0, 0, 0, 0, 0, 1.0, 0))
+    write_ply(tmp_path / "a.ply", some, options)
+    back, header = read_ply(tmp_path / "a.ply")
+    assert header.live == facts()
+    assert [name for name in header.dtype.names or ()][-3:] == ["value", "spread", "length"]
+    assert back.live is not None
+    np.testing.assert_array_equal(back.live[:, :3], some.live[:, :3])  # type: ignore[index]
+    write_ply(tmp_path / "b.ply", replace(some, live=None), options)
+    assert b"vvgt live" not in (tmp_path / "b.ply").read_bytes()
+    whole = (tmp_path / "a.ply").read_bytes()
+    (tmp_path / "c.ply").write_bytes(whole.replace(b"live values", b"live valuez", 1))
+    with pytest.raises(vvgt_library.DataError, match="not one that vvgt writes"):
+        read_ply(tmp_path / "c.ply")
+
+
+def test_a_function_that_json_cannot_hold_is_sampled() -> None:
+    bent = replace(RAMP, opacity_nodes=PiecewiseOpacity(np.array([0.0, HI]), np.array([0.0, 1.0]), np.full(2, 0.3)))
+    body = json.loads(function_text(bent, LO, HI))
+    at = np.array([point["x"] for point in body["points"]])
+    assert len(at) == 64
+    np.testing.assert_allclose([point["opacity"] for point in body["points"]], bent.opacity(at), atol=1e-4)
+
+
+def test_fog_is_transparent_where_the_background_is_and_only_there() -> None:
+    counts = np.full(256, 10)
+    counts[:20] = 10_000
+    tf = fog(statistics(counts))
+    assert tf.opacity(np.array([LO, LO + 5]))[0] == 0
+    shown = tf.opacity(np.linspace(LO + 12, HI, 100))
+    assert (shown > 0).all()
+    assert shown[-1] > shown[0]
+    seen = replace(RAMP, opacity_nodes=PiecewiseOpacity(np.array([LO, LO + 2, LO + 4]), np.array([0.0, 0.5, 0.0])))
+    assert fog(statistics(counts), seen).opacity(np.array([LO + 2.0]))[0] > 0
+
+
+def test_cells_are_split_where_values_differ() -> None:
+    """Half of a volume is one value, the other half noise: of a small budget most goes there."""
+    rng = np.random.default_rng(0)
+    data = np.full((16, 16, 16), 128, np.uint8)
+    data[:, :, 8:] = rng.integers(60, 250, (16, 16, 8))
+    data[0, 0, 0] = 0
+    result = vvgt_library.convert(data, "viridis", {"max_gaussians": 400, "size": 64}, live=True)
+    assert (result.gaussians.means[:, 0] > 0).mean() > 0.7
+
+
+def test_bytes_for_pages_lose_little() -> None:
+    """About 0.1 dB at most, of a file that is 34 dB from its volume."""
+    some = cloud(400, 3)
+    stream, known = live_bytes(some, facts()), live_json(some, facts(), 0.05)
+    assert stream.shape == (400, 8)
+    assert json.loads(json.dumps(known)) == known
+    back = replace(some, live=from_bytes(stream, known))
+    camera = default_views("test", size=200)[0]
+    for tf in (RAMP, WINDOW):
+        table = Table.of(tf, LO, HI, 0.05)
+        images = [render(shown_by(g, table), camera)[..., :3] for g in (some, back)]
+        assert psnr(*images) > 50  # at 34 dB from the volume 10 log10(1 + 10^-1.6) = 0.1 dB
+
+
+@pytest.fixture(scope="module")
+def live_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    from vvgt_cli.cli.main import run
+
+    folder = tmp_path_factory.mktemp("live")
+    (folder / "tf.json").write_text(json.dumps(TF))
+    arguments = ["convert", "example:marschner-lobb:20", "--live", "--tf", str(folder / "tf.json"), "-q"]
+    assert run([*arguments, "-o", str(folder / "live.ply"), *map(str, SMALL)]) == 0
+    return folder / "live.ply"
+
+
+def test_recolor_shows_other_functions_without_the_volume(vvgt, live_file, tmp_path) -> None:
+    assert vvgt("recolor", live_file, "--tf", "viridis", "-o", tmp_path / "v.ply").code == 0
+    ordinary, header = read_ply(tmp_path / "v.ply")
+    assert header.live is None
+    assert ordinary.live is None
+    assert header.unit_distance_label == "paraview"
+    scores = []
+    for file in (live_file, tmp_path / "v.ply"):
+        done = vvgt(
+            "evaluate", file, "--volume", "example:marschner-lobb:20", "--tf", "viridis", "--json", "--no-seats"
+        )
+        scores.append(json.loads(done.out)["scores"]["psnr"])
+    assert scores[0] == pytest.approx(scores[1], abs=1e-6)
+    assert scores[0] > 20
+    done = vvgt("recolor", tmp_path / "v.ply", "--tf", "viridis", "-o", tmp_path / "w.ply")
+    assert (done.code, "carry no values" in done.error) == (1, True)
+    assert not (tmp_path / "w.ply").exists()
+    nothing = {"points": [{"x": 7, "rgb": [1, 0, 0], "opacity": 0}, {"x": 8, "rgb": [0, 1, 0], "opacity": 0.8}]}
+    (tmp_path / "tf.json").write_text(json.dumps(nothing))
+    done = vvgt("recolor", live_file, "--tf", tmp_path / "tf.json", "-o", tmp_path / "w.ply")
+    assert (done.code, "nothing is visible" in done.error) == (1, True)
+
+
+def test_render_info_and_other_formats(vvgt, live_file, tmp_path) -> None:
+    plain = json.loads(vvgt("info", live_file, "--json").out)
+    assert plain["live_function"] == "w"
+    assert plain["live_values"][0] < plain["live_value"][1] < plain["live_values"][1]
+    under = json.loads(vvgt("info", live_file, "--json", "--tf", "viridis").out)
+    assert under["function"].startswith("viridis")
+    assert under["hidden"] + under["gaussians"] == plain["gaussians"]
+    for name, more in (("a", ()), ("b", ("--tf", "viridis"))):
+        assert vvgt("render", live_file, *more, "--orbit", 1, "--size", 32, "-o", tmp_path / name).code == 0
+    pictures = [next((tmp_path / name).glob("*.png")).read_bytes() for name in "ab"]
+    assert pictures[0] != pictures[1]
+    done = vvgt("render", live_file, "--tf-range", "rescale", "--orbit", 1, "-o", tmp_path / "c")
+    assert (done.code, "give --tf" in done.error) == (2, True)
+    with pytest.warns(UserWarning, match="no columns for values"):
+        assert vvgt("view", live_file, "-o", tmp_path / "one.spz").code == 0
+
+
+def test_what_a_live_file_does_not_go_with(vvgt, tmp_path) -> None:
+    for option in (
+        ("--sh-degree", 1),
+        ("--steps", 9),
+        ("--target-psnr", 30),
+        ("--light", "headlight"),
+        ("--no-comments",),
+    ):
+        done = vvgt("convert", "example:blob:12", "--live", "-o", tmp_path / "a.ply", *SMALL, *option)
+        assert done.code == 2
+        assert option[0] in done.error
+    for other in (("--dry-run",), ("--tf", "viridis", "--tf", "magma")):
+        done = vvgt("convert", "example:blob:12", "--live", "-o", tmp_path / "a.ply", *SMALL, *other)
+        assert (done.code, "one file of one volume" in done.error) == (2, True)
+    done = vvgt("convert", "example:frog", "--labels", "auto", "--live", "-o", tmp_path / "a.ply", *SMALL)
+    assert (done.code, "one scalar" in done.error) == (2, True)
+    assert not (tmp_path / "a.ply").exists()
+
+
+def test_blocks_have_the_same_values_to_the_byte(tmp_path) -> None:
+    """Of Gaussians that lie across blocks, and beyond the volume; and a conversion in blocks is as near the volume."""
+    from vvgt_cli.conversion.convert import opened
+    from vvgt_cli.conversion.request import ConvertRequest, FitOptions
+    from vvgt_cli.field.settings import BlockOptions
+    from vvgt_cli.field.source import SourceRequest
+    from vvgt_cli.progress import Console
+    from vvgt_cli.score.record import ConversionReport, Run
+
+    found = []
+    for blocks in (None, BlockOptions(16)):
+        request = ConvertRequest(SourceRequest("example:marschner-lobb:40"), str(tmp_path / "a.ply"), blocks=blocks)
+        request = replace(request, fit=FitOptions(max_gaussians=300, size=64), live=True)
+        with opened(Run(Console(quiet=True), ConversionReport("convert")), request) as field:
+            wide = replace(cloud(200), log_scales=cloud(200).log_scales + 1)
+            foggy = field.shown_by(fog(field.source.statistics))
+            found.append((field.under(wide), foggy.view(default_views("test", size=32)[0], RenderSettings())))
+    np.testing.assert_array_equal(found[0][0], found[1][0])
+    assert np.isfinite(found[0][0]).all(axis=1).mean() > 0.9
+    np.testing.assert_allclose(found[0][1], found[1][1], atol=2e-3)
+
+
+def test_a_conversion_in_blocks_is_as_near(vvgt, live_file, tmp_path) -> None:
+    tf, scores = live_file.parent / "tf.json", []
+    for number, blocks in enumerate(((), ("--blocks", 16))):
+        out, report = tmp_path / f"{number}.ply", tmp_path / f"{number}.json"
+        source = ("example:marschner-lobb:20", "--live", "--tf", tf, *SMALL, *blocks)
+        assert vvgt("convert", *source, "-o", out, "--report", report).code == 0
+        scores.append(json.loads(report.read_text())["scores"]["psnr"])
+    assert scores[0] == pytest.approx(scores[1], abs=0.3)
+    assert sorted(path.suffix for path in tmp_path.iterdir()) == [".json", ".json", ".ply", ".ply"]
+
+
+def test_the_library_recolors_results_and_files(live_file) -> None:
+    result = vvgt_library.convert("example:blob:12", goal={"max_gaussians": 100, "size": 48}, live=True)
+    assert result.gaussians.live is not None
+    other = result.recolor("viridis")
+    assert other.gaussians.live is None
+    assert len(other.gaussians) <= 100
+    assert len(vvgt_library.recolor(live_file, "magma").gaussians) > 100
+    with pytest.raises(vvgt_library.DataError, match="carry no values"):
+        other.recolor("magma")
+
+
+def test_directions_are_unit_vectors_of_own_axes() -> None:
+    along, share = directions(cloud())
+    np.testing.assert_allclose(np.linalg.norm(along, axis=1), 1, atol=1e-6)
+    assert (share <= 1).all()
+    assert spreads()[-1] == WIDEST
+    assert Table.of(RAMP, LO, HI, 1).sums.shape == (MEANS, SPREADS, 6)

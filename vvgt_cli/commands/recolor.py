@@ -1,0 +1,65 @@
+"""`recolor`: a file whose Gaussians carry values, shown under another function, without the volume."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from vvgt_cli.conversion.gaussian_files import open_gaussians, write_gaussians
+from vvgt_cli.conversion.recolored import FunctionRequest, placed_function, under_function
+from vvgt_cli.errors import UsageError
+from vvgt_cli.gaussians.formats import SUFFIXES
+from vvgt_cli.gaussians.outputs import Output, claimed
+from vvgt_cli.progress import Console
+from vvgt_cli.score.record import ConversionReport, Run
+
+
+@dataclass(frozen=True)
+class RecolorRequest:
+    """What to show, and where.
+
+    Attributes:
+        ply: a file whose Gaussians carry values, "-" for standard input.
+        function: by which.
+        output: file to write, of any format; "-" for a `.ply` on standard output.
+        overwrite: replace it if it exists.
+    """
+
+    ply: str
+    function: FunctionRequest
+    output: str
+    overwrite: bool = False
+
+
+def recolor(request: RecolorRequest, console: Console | None = None) -> None:
+    """Write an ordinary file of the function's look.
+
+    Raises:
+        DataError: a file without values, or a function that shows nothing of them.
+        UsageError: an output that may not be written.
+    """
+    run = Run(console or Console(), ConversionReport("recolor"))
+    function = request.function
+    inputs = [request.ply, *([function.tf] if isinstance(function.tf, str) else [])]
+    with claimed([Output("-o", request.output, SUFFIXES, splats=True)], inputs, request.overwrite):
+        with run.stage("read") as stage:
+            gaussians, header = open_gaussians(request.ply)
+            stage.note = f"{len(gaussians)} Gaussians"
+        with run.stage("recolor") as stage:
+            tf, options = placed_function(request.ply, header, function)
+            found = under_function(gaussians, header, tf, options)
+            stage.note = f"{len(found)} of them visible under {tf.name}"
+        write_gaussians(run, request.output, found, options, request.overwrite)
+    run.finish()
+
+
+def function_of(tf: str | None, tf_range: str, unit_distance: str | None) -> FunctionRequest | None:
+    """What options of a command add up to; None without ``--tf``.
+
+    Raises:
+        UsageError: a range or a distance without a function.
+    """
+    if tf is None:
+        if tf_range != "data" or unit_distance is not None:
+            raise UsageError("--tf-range and --opacity-unit-distance are of a function; give --tf too")
+        return None
+    return FunctionRequest(tf, tf_range, unit_distance)

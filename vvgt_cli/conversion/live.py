@@ -1,0 +1,141 @@
+"""`vvgt convert --live`: Gaussians that carry the values under them, and so can be shown under any function.
+
+They are placed by the closed form of a fog of all values but the background's; nothing is fitted to views. The look
+asked for is baked in, for programs that know nothing of values.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vvgt_cli.cameras import default_views
+from vvgt_cli.conversion.place import out_of_box
+from vvgt_cli.conversion.request import ConvertRequest
+from vvgt_cli.conversion.result import Conversion
+from vvgt_cli.conversion.stage import Work
+from vvgt_cli.conversion.stages import TestViews, ViewingConditions
+from vvgt_cli.conversion.stages.refinement import SMALLEST
+from vvgt_cli.errors import NothingVisible, UsageError
+from vvgt_cli.field.field import Field
+from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored
+from vvgt_cli.gaussians.live import LENGTH, SHORTEST, Table, baked, lengths, shown_by
+from vvgt_cli.gaussians.live_facts import LiveFacts
+from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.score.record import Run
+from vvgt_cli.score.viewing import PREVIEW_VIEWS
+from vvgt_cli.score.views import psnr_note, score_test_views
+
+if TYPE_CHECKING:
+    from vvgt_cli.field.source import Source
+
+
+def check_live(request: ConvertRequest) -> None:
+    """Refuse what a live file does not go with.
+
+    Raises:
+        UsageError: an option that has no meaning here.
+    """
+    fit, limits, light = request.fit, request.limits, request.source.light
+    given = {
+        "--target-psnr": limits.target_psnr is not None,
+        "--time-budget": limits.time_budget is not None,
+        "--max-size": limits.max_megabytes is not None,
+        "--steps": fit.steps is not None,
+        "--model": fit.model is not None,
+        "--init": fit.init != "vbm",
+        "--checkpoint": request.checkpoint is not None,
+        "--sh-degree": request.ply.sh_degree is not None,
+        "--no-comments": not request.ply.comments,
+        "--light": light != type(light)(),
+    }
+    if names := [name for name, there in given.items() if there]:
+        raise UsageError(f"--live: a file for every function, unlit and made in one way; leave out {', '.join(names)}")
+
+
+def live_conversion(run: Run, request: ConvertRequest, field: Field, ply: PlyOptions) -> Conversion:
+    """Place, look up, bake, score; ``ply`` as of an ordinary conversion.
+
+    Raises:
+        UsageError: labels, channels or layers.
+        DataError: nothing is visible.
+    """
+    from vvgt_cli.dvr import RenderSettings
+    from vvgt_cli.look.fog import fog
+
+    source, fit = field.source, request.fit
+    source.one_field()
+    tf = source.tf
+    assert isinstance(tf, TransferFunction)
+    if source.lighting is not None:
+        run.console.say(f"{tf.name}: its light is left out; a live file is unlit")
+        field = field.shown_by(replace(tf, opacity_unit_distance=source.unit_distance, opacity_unit_share=None))
+    foggy = field.shown_by(fog(source.statistics, tf))
+    gaussians = carrying(run, foggy, placed_by(run, foggy, request))
+    gaussians = wide_enough(gaussians, fit.size)
+    table = table_of(source)
+    gaussians = as_stored(baked(gaussians, table))
+    with run.stage("live look") as stage:
+        live = score_test_views(
+            field, shown_by(gaussians, table), fit.size, RenderSettings(), rule=fit.rule, perceptual=False,
+            only=PREVIEW_VIEWS,
+        )  # fmt: skip
+        stage.note = (
+            f"{psnr_note(live)} under {tf.name} as 'vvgt recolor' shows it; next as other viewers show the file"
+        )
+    work = Work(run, field, fit, gaussians=gaussians)
+    for stage_of_scores in (TestViews(request.scored_whole), ViewingConditions()):
+        stage_of_scores.run(work)
+    facts = LiveFacts.of(source.volume, source.statistics, tf)
+    ply = replace(ply, light=None, sh_degree=0, live=facts)
+    return Conversion(out_of_box(gaussians, source.volume), run.report, ply, field)
+
+
+def table_of(source: Source) -> Table:
+    """Of a source's function, lengths in the unit frame."""
+    numbers, tf = source.statistics, source.tf
+    assert isinstance(tf, TransferFunction)
+    return Table.of(tf, numbers.lo, numbers.hi, source.unit_distance * source.volume.unit_frame().scale)
+
+
+def placed_by(run: Run, field: Field, request: ConvertRequest) -> Gaussians:
+    """The closed form of the fog.
+
+    Raises:
+        NothingVisible: nothing but background.
+    """
+    from vvgt_cli.closed_form import VbmOptions
+
+    with run.stage("closed form") as stage:
+        options = VbmOptions(max_gaussians=request.fit.max_gaussians, size=request.fit.size, values=True)
+        start = field.start(options, run.console.bar("closed form"))
+        if not len(start.gaussians):
+            raise NothingVisible(field.source.volume.name, field.source.name)
+        stage.note = f"{len(start.gaussians)} Gaussians of all values but the background's"
+    return start.gaussians
+
+
+def carrying(run: Run, field: Field, gaussians: Gaussians) -> Gaussians:
+    """Gaussians of a field's look with the values under them, without those that have none."""
+    with run.stage("values") as stage:
+        values = field.under(gaussians)
+        known = np.flatnonzero(np.isfinite(values).all(axis=1))
+        gaussians, values = gaussians.take(known), values[known]
+        tau = table_of(field.source).at(values[:, 0], values[:, 1])[:, 3]
+        live = np.insert(values, LENGTH, lengths(gaussians, tau), axis=1)
+        span = field.source.statistics.hi - field.source.statistics.lo
+        stage.note = f"mean spread {100 * float(values[:, 1].mean()) / (span or 1):.1f} % of the range"
+    return replace(gaussians, live=live, harmonics=None)
+
+
+def wide_enough(gaussians: Gaussians, size: int) -> Gaussians:
+    """None narrower than `SMALLEST` px of the screen: viewers leave such out. Their mass stays."""
+    assert gaussians.live is not None
+    camera = default_views("check", 1, size=size)[0]
+    pixel = float(np.linalg.norm(camera.position)) / camera.fx
+    widening = np.maximum(SMALLEST * pixel / np.exp(gaussians.log_scales.max(axis=1).astype(np.float64)), 1)
+    live = gaussians.live.copy()
+    live[:, 2] = np.maximum(live[:, 2] / widening**2, SHORTEST)
+    return replace(gaussians, log_scales=gaussians.log_scales + np.log(widening)[:, None], live=live)

@@ -1,0 +1,57 @@
+"""A picture of a volume in blocks while it is made."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from vvgt_cli.cameras import Camera
+from vvgt_cli.cameras.blocks import Blocks
+from vvgt_cli.dvr.render import Rays, RenderSettings, first_rays, more_rays
+
+
+@dataclass
+class Drawing:
+    """A picture that is being made: of its blocks' pixels alone, as screens are large.
+
+    Attributes:
+        key: of the picture.
+        camera, settings, blocks: as of `Picture`.
+    """
+
+    key: str
+    camera: Camera
+    settings: RenderSettings
+    blocks: Blocks | None
+
+    @cached_property
+    def seen(self) -> np.ndarray:
+        """(n, 4) float32 of the pixels of `everywhere`, row by row."""
+        return np.zeros((int(self.everywhere().sum()), 4), np.float32)
+
+    def everywhere(self) -> np.ndarray:
+        """(h, w) bool: its pixels."""
+        shape = self.camera.height, self.camera.width
+        return np.ones(shape, bool) if self.blocks is None else self.blocks.mask()
+
+    def image(self) -> np.ndarray:
+        """(h, w, 4), zero outside the blocks."""
+        whole = np.zeros((self.camera.height, self.camera.width, 4), np.float32)
+        whole[self.everywhere()] = self.seen
+        return whole
+
+    def first(self) -> list[Rays]:
+        """Rays of the first pass."""
+        return first_rays(self.settings, self.everywhere())
+
+    def more(self) -> list[Rays]:
+        """Rays of the second."""
+        return more_rays(self.settings, self.image(), self.everywhere())
+
+    def add(self, rays: Rays, shown: np.ndarray) -> None:
+        """Mix in what ``rays`` show, (pixels, rays, 4) float64."""
+        offsets, mask, known = rays
+        at = mask[self.everywhere()]
+        self.seen[at] = (known * self.seen[at] + shown.sum(axis=1)) / (known + len(offsets))

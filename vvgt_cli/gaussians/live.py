@@ -1,0 +1,150 @@
+"""Gaussians that carry what the volume is under them, and their look under any function (docs/live.md).
+
+Of each Gaussian the field's mean value m and standard deviation s under it, a length L, and the direction of the mean
+gradient, as long as the share r of s that the gradient explains. Under a function of extinction e and colour c the
+values under it are taken as a normal law N(m, s): its extinction E is the mean of e over it, its colour the mean of c
+weighted by e. Where the value z = (v - m) / s lies along the gradient, there lies the Gaussian: weighted by e, z has a
+mean and a variance, by which the Gaussian moves along the gradient and becomes thinner there, k times as wide. Its
+opacity is 1 - exp(-E L / sqrt(k)). The means are a table over m and s.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from statistics import NormalDist
+
+import numpy as np
+
+from vvgt_cli.gaussians.constants import MIN_ALPHA
+from vvgt_cli.gaussians.frames import factored, rotations
+from vvgt_cli.gaussians.live_facts import GRADIENT
+from vvgt_cli.gaussians.types import Gaussians
+from vvgt_cli.look.tables import extinction
+from vvgt_cli.look.types import TransferFunctionLike
+
+MEANS, SPREADS = 256, 32  # rows and columns of a table
+WIDEST = 0.25  # share of the range of values: the largest spread of a table
+BEND = 1.5  # power of the column by which spreads grow: small ones lie closer
+NODES = 33  # of the normal law, of equal weight
+FINE = 1 << 14  # values over the range that a function is tabulated at
+SHORTEST, LONGEST = 1e-4, 1e2  # unit-frame lengths that L is kept within
+OPAQUE = 1 - 1e-6  # largest opacity that a look has, and one less the smallest: logits are finite
+THINNEST = 0.15  # times as wide as before, at least, along the gradient
+TAU, FIRST, SECOND = 3, 4, 5  # of a table's channels, after r, g and b
+VALUE, SPREAD, LENGTH = 0, 1, 2  # of the columns that Gaussians carry
+
+
+@dataclass(frozen=True)
+class Table:
+    """A function's means over normal laws of values.
+
+    Attributes:
+        lo, hi: range of the values; beyond it the ends' colour and extinction are taken.
+        sums: (MEANS, SPREADS, 6) float64 extinction per unit-frame length times r, g, b, 1, z and z^2.
+    """
+
+    lo: float
+    hi: float
+    sums: np.ndarray
+
+    @classmethod
+    def of(cls, tf: TransferFunctionLike, lo: float, hi: float, unit_distance: float) -> Table:
+        """Of a function on data values whose opacity is per ``unit_distance``, a unit-frame length."""
+        x = lo + (hi - lo) * np.linspace(0, 1, FINE)
+        tau = extinction(tf.opacity(x), unit_distance)
+        fine = np.concatenate([tf.color(x) * tau[:, None], tau[:, None]], axis=1)
+        nodes = law_nodes()
+        at = np.linspace(0, 1, MEANS)[:, None, None] + spreads()[:, None] * nodes
+        found = fine[np.rint(at.clip(0, 1) * (FINE - 1)).astype(np.int64)]  # (MEANS, SPREADS, NODES, 4)
+        moments = found[..., TAU, None] * np.stack([nodes, nodes**2], axis=1)
+        return cls(lo, hi, np.concatenate([found.mean(axis=2), moments.mean(axis=2)], axis=2))
+
+    def places(self, values: np.ndarray, spread: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Row and column, not whole, (K,) float64 of values and spreads (K,)."""
+        width = (self.hi - self.lo) or 1.0
+        row = ((values.astype(np.float64) - self.lo) / width).clip(0, 1) * (MEANS - 1)
+        return row, (spread.astype(np.float64) / width / WIDEST).clip(0, 1) ** (1 / BEND) * (SPREADS - 1)
+
+    def at(self, values: np.ndarray, spread: np.ndarray) -> np.ndarray:
+        """(K, 6) `sums` between the rows and columns of values and spreads (K,)."""
+        row, column = self.places(values, spread)
+        i, j = np.minimum(row.astype(np.int64), MEANS - 2), np.minimum(column.astype(np.int64), SPREADS - 2)
+        f, g = (row - i)[:, None], (column - j)[:, None]
+        s = self.sums
+        near, far = s[i, j] * (1 - g) + s[i, j + 1] * g, s[i + 1, j] * (1 - g) + s[i + 1, j + 1] * g
+        found: np.ndarray = near * (1 - f) + far * f
+        return found
+
+
+def law_nodes() -> np.ndarray:
+    """(NODES,) quantiles of the normal law, stretched to its variance."""
+    law = NormalDist()
+    found = np.array([law.inv_cdf((k + 0.5) / NODES) for k in range(NODES)])
+    stretched: np.ndarray = found / found.std()
+    return stretched
+
+
+def spreads() -> np.ndarray:
+    """(SPREADS,) standard deviations of a table's columns, shares of the range of values."""
+    found: np.ndarray = WIDEST * (np.arange(SPREADS) / (SPREADS - 1)) ** BEND
+    return found
+
+
+def lengths(gaussians: Gaussians, tau: np.ndarray) -> np.ndarray:
+    """L (K,) of Gaussians whose opacity stands for the mean extinction ``tau`` (K,), unit-frame lengths."""
+    depth = np.logaddexp(0, gaussians.opacity_logits.astype(np.float64))  # -log(1 - opacity)
+    found: np.ndarray = (depth / np.maximum(tau, 1e-30)).clip(SHORTEST, LONGEST)
+    return found
+
+
+def baked(gaussians: Gaussians, table: Table) -> Gaussians:
+    """Gaussians that carry values, with the colours and opacities of a function, where they are: for other viewers."""
+    assert gaussians.live is not None
+    sums = table.at(gaussians.live[:, VALUE], gaussians.live[:, SPREAD])
+    colors = sums[:, :TAU] / np.maximum(sums[:, TAU, None], 1e-30)
+    logits = _logits(sums[:, TAU] * gaussians.live[:, LENGTH].astype(np.float64))
+    return replace(gaussians, opacity_logits=logits, colors=colors, harmonics=None)
+
+
+def shown_by(gaussians: Gaussians, table: Table) -> Gaussians:
+    """An ordinary cloud: what Gaussians that carry values are under a function, without those that it hides."""
+    assert gaussians.live is not None
+    sums = table.at(gaussians.live[:, VALUE], gaussians.live[:, SPREAD])
+    visible = -np.expm1(-sums[:, TAU] * gaussians.live[:, LENGTH] / THINNEST**0.5) >= MIN_ALPHA
+    gaussians, sums = gaussians.take(np.flatnonzero(visible)), sums[visible]
+    assert gaussians.live is not None
+    if not len(gaussians):
+        return replace(gaussians, live=None, harmonics=None)
+    tau = np.maximum(sums[:, TAU], 1e-30)
+    first = sums[:, FIRST] / tau
+    variance = np.maximum(sums[:, SECOND] / tau - first**2, 0)
+    along, explained = directions(gaussians)
+    thin = np.sqrt(np.maximum(1 - explained**2 * (1 - variance), THINNEST**2))
+    axes = rotations(gaussians.quaternions.astype(np.float64))
+    axes *= np.exp(gaussians.log_scales.astype(np.float64))[:, None, :]
+    arm = np.einsum("kij,kj->ki", axes, along)
+    quaternions, log_scales = factored(axes + (arm * (thin - 1)[:, None])[:, :, None] * along[:, None, :])
+    return Gaussians(
+        gaussians.means + arm * (explained * first)[:, None],
+        log_scales,
+        quaternions,
+        _logits(tau * gaussians.live[:, LENGTH] / np.sqrt(thin)),
+        sums[:, :TAU] / tau[:, None],
+    )
+
+
+def directions(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:
+    """Where values rise in each Gaussian's own axes, in its standard deviations: (K, 3) unit vectors; and r (K,)."""
+    assert gaussians.live is not None
+    gradient = gaussians.live[:, GRADIENT].astype(np.float64)
+    axes = rotations(gaussians.quaternions.astype(np.float64))
+    along = np.einsum("kij,ki->kj", axes, gradient) * np.exp(gaussians.log_scales.astype(np.float64))
+    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-30)
+    return along, np.minimum(np.linalg.norm(gradient, axis=1), 1)
+
+
+def _logits(depth: np.ndarray) -> np.ndarray:
+    """Of opacity 1 - exp(-depth) (K,)."""
+    opacity = (-np.expm1(-depth)).clip(1 - OPAQUE, OPAQUE)
+    found: np.ndarray = np.log(opacity) - np.log1p(-opacity)
+    return found

@@ -1,0 +1,117 @@
+"""What a file of Gaussians that carry values says of the values, in comments of its header."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from vvgt_cli.errors import DataError
+from vvgt_cli.look.colormap import ColorMap
+from vvgt_cli.look.convert import to_text
+from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.look.opacity import PiecewiseOpacity
+from vvgt_cli.volume import Statistics, Volume
+from vvgt_cli.volume.stats import BINS, edges_of
+
+COLUMNS, NORMAL = ("value", "spread", "length"), ("nx", "ny", "nz")
+GRADIENT = slice(3, 6)  # of what Gaussians carry: in the columns of normals
+SAMPLED = 64  # nodes of a function that the header has no other way of holding
+LONGEST = 12_000  # characters of a function: some loaders read no more than the first 10 KB of a header, ours 64
+WORD = "live"
+
+
+@dataclass(frozen=True)
+class LiveFacts:
+    """Of the volume that the values are of, and of the look that the file has.
+
+    Attributes:
+        lo, hi: range of the data values.
+        dims: voxels along (x, y, z), which unit distances follow from.
+        histogram: (256,) counts over the range.
+        unit: of the values, "" where it is not known.
+        function: minimal JSON of the function that colours and opacities are of.
+    """
+
+    lo: float
+    hi: float
+    dims: tuple[int, int, int]
+    histogram: tuple[int, ...]
+    unit: str = ""
+    function: str = ""
+
+    @classmethod
+    def of(cls, volume: Volume, numbers: Statistics, tf: TransferFunction) -> LiveFacts:
+        """Of a volume, its statistics, and the function that is baked in, on data values."""
+        counts = tuple(int(n) for n in numbers.histogram)
+        unit = "HU" if volume.hounsfield else ""
+        return cls(numbers.lo, numbers.hi, volume.dims, counts, unit, function_text(tf, numbers.lo, numbers.hi))
+
+    def statistics(self) -> Statistics:
+        """As functions are put on the data by."""
+        return Statistics(self.lo, self.hi, 0, 0, np.array(self.histogram, np.int64), edges_of(self.lo, self.hi))
+
+    def baked(self) -> dict[str, Any]:
+        """The function as JSON holds it."""
+        return dict(json.loads(self.function)) if self.function else {}
+
+    def lines(self) -> list[str]:
+        """Comments; `parsed` reads them."""
+        dims = " ".join(map(str, self.dims))
+        unit = ["comment vvgt live unit " + self.unit] if self.unit else []
+        return [
+            f"comment vvgt live values {self.lo!r} {self.hi!r} dims {dims}",
+            *unit,
+            "comment vvgt live histogram " + " ".join(map(str, self.histogram)),
+            "comment vvgt live function " + self.function,
+        ]
+
+
+def function_text(tf: TransferFunction, lo: float, hi: float) -> str:
+    """A function on data values as one line of minimal JSON; of what that cannot hold, `SAMPLED` nodes."""
+    try:
+        text = json.dumps(json.loads(to_text(tf, "minimal")))
+        if len(text) <= LONGEST:
+            return text
+    except DataError:
+        pass
+    x = np.linspace(lo, hi, SAMPLED) if hi > lo else np.array([lo])
+    few = TransferFunction(tf.name, PiecewiseOpacity(x, tf.opacity(x).round(5)), ColorMap(x, tf.color(x).round(4)))
+    return json.dumps(json.loads(to_text(few, "minimal")))
+
+
+def one_comment(words: Sequence[str]) -> dict[str, Any]:
+    """Facts of a comment's words after ``vvgt live``.
+
+    Raises:
+        ValueError, IndexError: not one that `LiveFacts.lines` writes.
+    """
+    if words[0] == "values":
+        lo, hi = float(words[1]), float(words[2])
+        dims = tuple(int(word) for word in words[4:])
+        if words[3] != "dims" or len(dims) != 3 or min(dims) < 1 or not -math.inf < lo <= hi < math.inf:
+            raise ValueError(words)
+        return {"lo": lo, "hi": hi, "dims": dims}
+    if words[0] == "unit":
+        return {"unit": " ".join(words[1:])}
+    if words[0] == "histogram":
+        counts = tuple(int(word) for word in words[1:])
+        if len(counts) != BINS or min(counts) < 0:
+            raise ValueError(words)
+        return {"histogram": counts}
+    if words[0] == "function":
+        text = " ".join(words[1:])
+        if not isinstance(json.loads(text), dict):
+            raise ValueError(text)
+        return {"function": text}
+    raise ValueError(words)
+
+
+def live_facts(found: Mapping[str, Any], columns: Sequence[str]) -> LiveFacts | None:
+    """Facts of the comments of a file with these columns; None where one or the other is missing."""
+    whole = set(COLUMNS) <= set(columns) and {"lo", "histogram"} <= set(found)
+    return LiveFacts(**found) if whole else None
