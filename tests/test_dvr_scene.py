@@ -169,7 +169,7 @@ def test_bricks_without_a_finite_voxel_are_empty():
 def test_tables_hold_the_function_and_its_integral(slope):
     tf = Ramp(2.0, 5.0)
     tables = build_tables(tf, (0, 9), slope=slope, intercept=1.0, unit_distance=0.5, world_per_unit=3.0)
-    x = np.linspace(2, 5, tables.bins + 1)
+    x = np.linspace(0, 9, tables.bins + 1)
     tau = extinction(tf.opacity(x), 0.5) * 3
     np.testing.assert_allclose(tables.nodes, np.column_stack([tf.color(x) * tau[:, None], tau]), atol=1e-12)
     np.testing.assert_allclose(tables.coordinate((x - 1) / slope), np.arange(tables.bins + 1), atol=1e-8)
@@ -192,3 +192,21 @@ def test_dark_spans_are_where_extinction_vanishes():
 def test_extinction_is_capped_where_opacity_is_one():
     largest = -np.log(1 - MAX_OPACITY) / 2
     assert extinction(np.array([0.0, 1.0, 2.0]), 2.0) == pytest.approx([0, largest, largest])
+
+
+def test_a_segment_that_enters_the_nodes_range_is_weighed_by_the_part_within_it():
+    z, y, x = np.indices((20, 20, 20)) / 19
+    volume = Volume((x + 0.1 * np.sin(6 * y) * np.cos(5 * z)).astype(np.float32))
+
+    class Band(Ramp):
+        """Opaque from 0.45 to 0.5, between zeros at 0.43 and 0.52."""
+
+        def opacity(self, x):
+            return np.interp(x, [0.43, 0.45, 0.5, 0.52], [0, 0.6, 0.6, 0])
+
+        def color(self, x):
+            return np.broadcast_to([0.8, 0.5, 0.2], (len(x), 3))
+
+    within, beyond = (view(volume, Band(*ends)) for ends in ((0.43, 0.52), (-1.0, 2.0)))
+    assert beyond.max() > 0.3
+    assert np.abs(within - beyond).max() < 0.01  # 0.1 where the table ends with the nodes

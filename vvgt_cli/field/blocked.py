@@ -31,6 +31,7 @@ from vvgt_cli.gaussians import Gaussians
 
 if TYPE_CHECKING:
     from vvgt_cli.closed_form import Start, VbmOptions
+    from vvgt_cli.closed_form.moments import Cells
     from vvgt_cli.field.cells import Reader
     from vvgt_cli.look.function import TransferFunction
 
@@ -169,18 +170,14 @@ class Blocked:
         from vvgt_cli.closed_form import start_of
         from vvgt_cli.closed_form.closed_form import form_of
         from vvgt_cli.closed_form.lit import Shading
-        from vvgt_cli.closed_form.moments import Cells
 
         task = self.cells(options.size, options.max_gaussians)
         self.do(task, "integrate")
         self.grid, half, step = task.grid, *self.frame
-        index, moments, normals = _gathered(task)
-        grid = task.grid
-        cells = Cells(index, moments, grid.cell_edge, np.array(grid.exponent, np.int64), normals)
         shading = None if self.light is None else Shading(self.light, half, step, self._normals_at)
-        form = form_of(
-            cells, half, step, options.max_gaussians, options.size, None, None, self.source.labels_alone, shading,
-            options.degree,
+        form = form_of(  # which alone holds the cells: their tree takes twice as much
+            _gathered(task), half, step, options.max_gaussians, options.size, None, None, self.source.labels_alone,
+            shading, options.degree,
         )  # fmt: skip
         return start_of(form, options)
 
@@ -341,9 +338,9 @@ def _key(view: Picture) -> str:
     return digest(camera.rotation, camera.translation, lens, view.settings, numbers)
 
 
-def _gathered(task: CellBlocks) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Index (n, 3), moments (n, 13) and normals (n, 3) of all cells, in Morton order; None where nothing is lit."""
-    from vvgt_cli.closed_form.moments import in_order, morton
+def _gathered(task: CellBlocks) -> Cells:
+    """All cells, with their normals where something is lit."""
+    from vvgt_cli.closed_form.moments import Cells, in_order, morton
 
     index, moments, normals = [np.empty((0, 3), np.int32)], [], []
     for number in range(len(task)):
@@ -360,4 +357,5 @@ def _gathered(task: CellBlocks) -> tuple[np.ndarray, np.ndarray, np.ndarray | No
     lit = None
     if task.light is not None:
         lit = np.concatenate(normals)[np.argsort(morton(whole), kind="stable")]
-    return *in_order(whole, moments), lit
+    grid = task.grid
+    return Cells(*in_order(whole, moments), grid.cell_edge, np.array(grid.exponent, np.int64), lit)

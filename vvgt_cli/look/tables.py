@@ -11,6 +11,7 @@ from vvgt_cli.look.types import TransferFunctionLike
 
 MAX_OPACITY = 1 - 1e-5  # conventions: every integral has a limit
 MIN_BINS, MAX_BINS = 2048, 65536
+BESIDE = 4.0  # times the nodes' range that is tabulated on each side: a segment that enters it there begins outside
 BINS_PER_GAP = 8  # bins inside the narrowest gap between two nodes, where MAX_BINS allows
 
 
@@ -85,7 +86,7 @@ def build_tables(
     world_per_unit: float,
     bins: int | None = None,
 ) -> Optics:
-    """Tabulate ``tf`` over the part of ``value_range`` (data values) in which it is not constant.
+    """Tabulate ``tf`` over the part of ``value_range`` (data values) in which it is not constant, and `BESIDE`.
 
     ``unit_distance`` is in world units, ``world_per_unit`` the world length of one unit-frame length.
     """
@@ -94,6 +95,9 @@ def build_tables(
     if not hi > lo:  # data wholly beyond one end node, or a constant: one value of the function is used
         lo = hi = min(max(value_range[0], first), last)
         hi = math.nextafter(lo + max(abs(lo), 1e-30) * 1e-6, math.inf)
+    else:
+        margin = BESIDE * (hi - lo)
+        lo, hi = max(value_range[0], lo - margin), min(value_range[1], hi + margin)
     count = bins or _bin_count(tf, lo, hi)
     x = lo + (hi - lo) * (np.arange(count + 1) / count)
     x[-1] = hi
