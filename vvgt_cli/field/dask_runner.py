@@ -102,9 +102,9 @@ class Dask:
             cluster = self._stack.enter_context(self._local() if self._scheduler == LOCAL else self._jobs())
             if self._scheduler == SLURM:
                 self._keep(cluster)
-            return self._stack.enter_context(distributed.Client(cluster))
+            return self._stack.enter_context(distributed.Client(cluster, set_as_default=False))
         try:
-            client = distributed.Client(self._scheduler, timeout=WAIT)
+            client = distributed.Client(self._scheduler, timeout=WAIT, set_as_default=False)
         except (OSError, ValueError) as error:
             raise DataError(
                 f"--scheduler {self._scheduler}: no Dask scheduler answers there; start one with 'dask scheduler' "
