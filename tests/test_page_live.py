@@ -9,7 +9,6 @@ import re
 import shutil
 import subprocess
 from dataclasses import replace
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -107,10 +106,10 @@ def test_the_pages_program_makes_our_table(tf: TransferFunction, tmp_path: Path)
     if not shutil.which("node"):
         pytest.skip("node is not on the path")
     _, scene = page_of(baked(cloud(), Table.of(tf, LO, HI, 0.05)), options(live=facts(tf)))
-    program = files("vvgt_cli.gaussians.formats").joinpath("page", "live_table.mjs")
+    program = Path(__file__).parent.parent / "vvgt_cli" / "gaussians" / "formats" / "page" / "live_table.mjs"
     (tmp_path / "live.json").write_text(json.dumps(scene["live"]))
     (tmp_path / "run.mjs").write_text(
-        f"import {{ sumsOf, texelsOf }} from {json.dumps(Path(str(program)).as_uri())};\nimport fs from 'node:fs';\n"
+        f"import {{ sumsOf, texelsOf }} from {json.dumps(program.as_uri())};\nimport fs from 'node:fs';\n"
         "const live = JSON.parse(fs.readFileSync('live.json')), sums = sumsOf(live.nodes, live);\n"
         "fs.writeFileSync('sums', sums);\nfs.writeFileSync('texels', texelsOf(sums, live.table));\n"
     )
