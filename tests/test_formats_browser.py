@@ -158,7 +158,7 @@ def test_a_live_page_shows_a_function_as_recolor_does_until_a_node_is_dragged(li
 
 
 def test_a_live_page_is_cut(live: Path, tmp_path: Path) -> None:
-    """At half of the range along x: what stays lies on one side, the two sides together are the whole."""
+    """At half of the range along x: a part stays, and its other side is the rest."""
     url = live.with_suffix(".html").as_uri()
     whole, _ = shoot(url, tmp_path)
     choose = "(() => {"
@@ -170,7 +170,7 @@ def test_a_live_page_is_cut(live: Path, tmp_path: Path) -> None:
     print("lit shares: whole, either half:", lit)
     assert min(lit[1:]) > 0.25 * lit[0]
     assert max(lit[1:]) < 0.75 * lit[0]
-    assert lit[1] + lit[2] == pytest.approx(lit[0], rel=0.1)
+    assert lit[1] + lit[2] > 0.95 * lit[0]  # the view is oblique: both may cover a pixel
 
 
 def test_a_live_page_in_a_browser_without_webgl_says_so(live: Path, tmp_path: Path) -> None:
