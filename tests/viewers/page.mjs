@@ -1,6 +1,7 @@
 // page.mjs JOB.json MODULES: a picture of the page of `vvgt view`, or of one in a file, in headless Chromium; nothing but its
 // own address may be asked for. JOB: {"browser", "url", "size", "camera": {"position", "target", "up", "fov"} in the viewer's
-// axes or null for where the page says that it begins, "frame": number to go to or null, "out": .png}; prints {"asked": [other URLs], "text": what
+// axes or null for where the page says that it begins, "frame": number to go to or null, "before": JavaScript to evaluate first, or
+// none, "out": .png}; prints {"asked": [other URLs], "text": what
 // the page says, "seconds": from opening to the first picture, "frames": how many the slider has}.
 import fs from 'node:fs';
 import path from 'node:path';
@@ -31,6 +32,7 @@ if (!await page.evaluate('window.vvgt !== undefined')) {
   throw new Error(await page.evaluate('document.getElementById("said").textContent'));
 }
 const seconds = (Date.now() - begin) / 1000;
+if (job.before) await Promise.race([broken, page.evaluate(job.before)]);
 const shoot = async ({ camera, frame }) => {
   const { viewer, show } = window.vvgt, { app } = viewer, canvas = app.graphicsDevice.canvas;
   const entity = app.root.findComponent('camera').entity;
@@ -45,7 +47,7 @@ const shoot = async ({ camera, frame }) => {
     entity.translateLocal(shift, 0, 0);
   });
   if (frame !== null) await show(frame);
-  document.querySelectorAll('.sse-ui, #series').forEach((element) => { element.style.display = 'none'; });
+  document.querySelectorAll('.sse-ui, #series, #live').forEach((element) => { element.style.display = 'none'; });
   return settled((by) => { shift = by; }, () => new Promise((done) => {
     app.renderNextFrame = true;
     app.once('frameend', () => done(canvas.toDataURL('image/png')));

@@ -11,7 +11,7 @@ from pathlib import Path
 from vvgt_cli.errors import DataError
 from vvgt_cli.files import seekable
 from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions, read_ply
-from vvgt_cli.gaussians.formats import gltf, gsply_files, page_file, sog, usd
+from vvgt_cli.gaussians.formats import gltf, gsply_files, page_file, page_live, sog, usd
 from vvgt_cli.gaussians.formats.splats import Splats, gaussians_of, splats_of
 
 _HEAD = 1024  # bytes that tell a .ply of another kind
@@ -28,6 +28,8 @@ class Format:
         read: bytes and a name for errors -> columns.
         needs: given a name for errors, raises DataError where a library or a program is not installed.
         layout: how Gaussians are laid out for it, given how a `.ply` would be.
+        live: as ``write``, of Gaussians that carry values (unit frame), and how a `.ply` of them would be laid out;
+            None where the format holds no values.
     """
 
     suffix: str
@@ -35,6 +37,7 @@ class Format:
     read: Callable[[bytes, str], Splats]
     needs: Callable[[str], object]
     layout: Callable[[PlyOptions], PlyOptions] = lambda options: options
+    live: Callable[[Gaussians, PlyOptions, str], bytes] | None = None
 
 
 FORMATS = (
@@ -43,7 +46,7 @@ FORMATS = (
     Format(".sog", sog.sog, sog.read_sog, sog.program),
     Format(".glb", gltf.glb, gltf.read_glb, lambda name: None),
     Format(".usdc", usd.usdc, usd.read_usdc, usd.library),
-    Format(".html", page_file.html, page_file.read_html, gsply_files.gsply, page_file.upright),
+    Format(".html", page_file.html, page_file.read_html, gsply_files.gsply, page_file.upright, page_live.live_html),
 )
 SUFFIXES = (".ply", *(known.suffix for known in FORMATS))
 
@@ -71,6 +74,8 @@ def encoded(known: Format, gaussians: Gaussians, options: PlyOptions, name: str)
     Raises:
         DataError: values that it cannot hold, a library or a program that is not installed, or fails.
     """
+    if gaussians.live is not None and options.live is not None and known.live is not None:
+        return known.live(gaussians, options, name)
     if gaussians.live is not None:
         warnings.warn(
             f"{name}: {known.suffix} has no columns for values: it has the one look that is baked in", stacklevel=2

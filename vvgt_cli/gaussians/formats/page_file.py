@@ -9,10 +9,11 @@ from __future__ import annotations
 import base64
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from html import escape
 from importlib.resources import files
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -72,7 +73,13 @@ def drawing(splats: Splats) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def page(title: str, splats: Splats, frames: Sequence[dict[str, str]], parts: str) -> str:
+def page(
+    title: str,
+    splats: Splats,
+    frames: Sequence[dict[str, str]],
+    parts: str,
+    more: Mapping[str, Any] = MappingProxyType({}),
+) -> str:
     """The page's text.
 
     Args:
@@ -80,8 +87,9 @@ def page(title: str, splats: Splats, frames: Sequence[dict[str, str]], parts: st
         splats: of the first frame.
         frames: of each its ``name``, its ``file``, and what it is ``held`` in, where that is in the page.
         parts: elements that bring the viewer.
+        more: of the scene, for the program.
     """
-    scene = {"rule": drawing(splats), "camera": camera(splats), "frames": list(frames)}
+    scene = {"rule": drawing(splats), "camera": camera(splats), "frames": list(frames), **more}
     said = json.dumps(scene).replace("<", "\\u003c")  # no name ends the script
     text = asset("page.html").decode("utf-8")
     for place, value in (("TITLE", escape(title)), ("SCENE", said), ("PARTS", parts)):
@@ -94,25 +102,33 @@ def html(splats: Splats, name: str) -> bytes:
     return html_of_several([(_title(name), splats)], name)
 
 
-def html_of_several(clouds: Sequence[tuple[str, Splats]], name: str) -> bytes:
+def html_of_several(
+    clouds: Sequence[tuple[str, Splats]],
+    name: str,
+    parts: Mapping[str, bytes] = MappingProxyType({}),
+    more: Mapping[str, Any] = MappingProxyType({}),
+) -> bytes:
     """The page as one file: the viewer packed by gzip, each cloud as a `.compressed.ply`, all in base64.
 
     Args:
         clouds: each one's name, as the page's list has it, and columns; the first is shown at first.
         name: of the file.
+        parts: by the elements' ids, other content that the page holds.
+        more: of the scene, for the program.
     """
     held = [("program", "text/plain", asset(PROGRAM))]
+    held += [(key, "application/octet-stream", content) for key, content in parts.items()]
     for k, (cloud, splats) in enumerate(clouds):
         held.append((f"splats-{k}", "application/octet-stream", compressed_ply(splats, cloud)))
     elements = [
         f'<script type="{kind}" id="{key}">{base64.b64encode(content).decode("ascii")}</script>'
         for key, kind, content in held
     ]
-    parts = [*elements, f"<script>{asset('inflate.js').decode('utf-8')}</script>"]
+    elements.append(f"<script>{asset('inflate.js').decode('utf-8')}</script>")
     frames = [
         {"name": cloud, "file": f"{k}.compressed.ply", "held": f"splats-{k}"} for k, (cloud, _) in enumerate(clouds)
     ]
-    return page(_title(name), clouds[0][1], frames, "\n".join(parts)).encode("utf-8")
+    return page(_title(name), clouds[0][1], frames, "\n".join(elements), more).encode("utf-8")
 
 
 def _title(name: str) -> str:

@@ -12,7 +12,7 @@ if ! cmp -s "$here/package.json" "$cache/installed.json"; then
   cp "$here/package.json" "$cache/installed.json"
 fi
 NODE_PATH="$cache/node_modules" "$cache/node_modules/.bin/esbuild" "$here/page.mjs" --bundle --minify --format=iife \
-  --target=es2022 --charset=utf8 --loader:.css=text --legal-comments=none --log-level=error --outfile="$cache/viewer.js"
+  --target=es2022 --charset=utf8 --loader:.css=text --loader:.glsl=text --legal-comments=none --log-level=error --outfile="$cache/viewer.js"
 python3 - "$cache/viewer.js" "$out/viewer.js.gz" <<'PY'
 import gzip
 import sys

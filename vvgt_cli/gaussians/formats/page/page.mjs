@@ -3,6 +3,9 @@
 import css from '@playcanvas/supersplat-viewer/viewer.css';
 import { createViewer } from '@playcanvas/supersplat-viewer/viewer';
 import { Asset, SHADERLANGUAGE_GLSL, ShaderChunks } from 'playcanvas';
+import { liveLook } from './live.mjs';
+import panelCss from './panel.css';
+import { panel, named } from './panel.mjs';
 
 const KEPT = 16;  // frames of a series that stay in memory
 const PAUSE = 200;  // milliseconds from one frame of a series to the next
@@ -17,7 +20,7 @@ const settings = {
     grading: { ...off, brightness: 1, contrast: 1, saturation: 1, tint: [1, 1, 1] },
     vignette: { ...off, intensity: 0.5, inner: 0.3, outer: 0.75, curvature: 1 }, fringing: { ...off, intensity: 0.5 },
   },
-  animTracks: [], annotations: [], startMode: 'default', cameras: [{ initial: scene.camera }],
+  animTracks: [], annotations: [], startMode: 'default', cameras: [{ initial: fitted(scene.camera) }],
 };
 
 // what the file itself holds (base64), or the server's answer
@@ -110,9 +113,24 @@ function series(viewer) {
   return show;
 }
 
+// The viewer's field of view is along the window's longer side: the camera stands back for the whole to fit the shorter one.
+function fitted({ position, target, fov }) {
+  const back = Math.max(innerWidth, innerHeight, 1) / Math.max(Math.min(innerWidth, innerHeight), 1);
+  return { position: position.map((x, i) => target[i] + back * (x - target[i])), target, fov };
+}
+
+// At first sight without the viewer's list of keys over the picture; its button shows it.
+function hideKeys() {
+  try {
+    if (localStorage.getItem('controlsPanelOpen') === null) localStorage.setItem('controlsPanelOpen', 'false');
+  } catch { /* storage is not to be had everywhere */ }
+}
+
 async function start() {
+  if (!document.createElement('canvas').getContext('webgl2')) throw new Error('it has no WebGL 2, or it is turned off');
+  hideKeys();
   const style = document.createElement('style');
-  style.textContent = css;
+  style.textContent = css + panelCss;
   document.head.append(style);
   const { file } = scene.frames[0];
   const response = await content(scene.frames[0]);
@@ -121,6 +139,7 @@ async function start() {
   const viewer = await createViewer({
     container: document.getElementById('view'), contentUrl: file, contentFilename: file, settings,
     contents: new Promise((done) => { deliver = done; }), aa: scene.rule.compensate,
+    noanim: true,
     renderer: 'webgl',  // the one whose pictures are measured; WebGPU leaves more splats out
   });
   draw(viewer.app, scene.rule);
@@ -128,8 +147,11 @@ async function start() {
   viewer.app.scene.gsplat.minPixelSize = Math.sqrt(32 * scene.rule.minVariance);
   deliver(response);
   if (!viewer.state.loaded) await new Promise((done) => viewer.events.once('loaded:changed', done));
+  viewer.state.cameraMode = 'orbit';  // the viewer would turn the object
+  if (scene.frames.length === 1 && !scene.live) document.body.append(named('baked'));
+  const live = scene.live ? panel(await liveLook(viewer, scene.live), viewer, scene.live) : null;
   said.textContent = '';
-  window.vvgt = { viewer, show: scene.frames.length > 1 ? series(viewer) : null };
+  window.vvgt = { viewer, live, show: scene.frames.length > 1 ? series(viewer) : null };
 }
 
 start().catch((error) => {

@@ -1,0 +1,78 @@
+// A Gaussian under the function: moved and thinned along the gradient (docs/live.md), and cut by a plane. The engine calls
+// modifySplatCenter first. A cut Gaussian becomes the one of the same mean and variance as its part that stays.
+uniform highp sampler2D vvgtTable;
+uniform vec4 vvgtFacts;  // shortest log length, how far it goes, thinnest, spreads
+uniform vec4 vvgtCut;  // dot(xyz, centre) <= w stays
+vec4 vvgtColor, vvgtRotation;
+vec3 vvgtScale;
+
+vec4 vvgtQuaternion(mat3 m) {  // (x, y, z, w), w >= 0
+  vec4 d = vec4(m[0][0] - m[1][1] - m[2][2], m[1][1] - m[0][0] - m[2][2], m[2][2] - m[0][0] - m[1][1], m[0][0] + m[1][1] + m[2][2]) + 1.0;
+  vec3 s = vec3(m[1][2] - m[2][1], m[2][0] - m[0][2], m[0][1] - m[1][0]), p = vec3(m[1][2] + m[2][1], m[2][0] + m[0][2], m[0][1] + m[1][0]);
+  vec4 q = d.w >= max(d.x, max(d.y, d.z)) ? vec4(s, d.w) : d.x >= max(d.y, d.z) ? vec4(d.x, p.z, p.y, s.x)
+    : d.y >= d.z ? vec4(p.z, d.y, p.x, s.y) : vec4(p.y, p.x, d.z, s.z);
+  return normalize(q.w < 0.0 ? -q : q);
+}
+
+void vvgtTurn(inout vec3 a, inout vec3 b) {  // until orthogonal: one-sided Jacobi
+  float c = dot(a, b), aa = dot(a, a), bb = dot(b, b);
+  if (abs(c) < 1e-7 * sqrt(aa * bb)) return;
+  float zeta = (bb - aa) / (2.0 * c), t = (zeta < 0.0 ? -1.0 : 1.0) / (abs(zeta) + sqrt(1.0 + zeta * zeta));
+  float cs = inversesqrt(1.0 + t * t), sn = cs * t;
+  vec3 was = a;
+  a = cs * was - sn * b;
+  b = sn * was + cs * b;
+}
+
+float vvgtCut3(inout vec3 center, inout mat3 axes) {  // depth's factor
+  vec3 own = vvgtCut.xyz * axes;
+  float sigma = length(own);
+  if (sigma < 1e-12) return 1.0;
+  float at = (vvgtCut.w - dot(vvgtCut.xyz, center)) / sigma;
+  if (at > 3.0) return 1.0;
+  if (at < -2.0) return 0.0;
+  own /= sigma;
+  float x = abs(at) * 0.70710678, t = 1.0 / (1.0 + 0.3275911 * x);  // Abramowitz and Stegun 7.1.26
+  float tail = 0.5 * t * (0.254829592 + t * (-0.284496736 + t * (1.421413741 + t * (-1.453152027 + t * 1.061405429)))) * exp(-x * x);
+  float stays = at < 0.0 ? tail : 1.0 - tail, mean = 0.39894228 * exp(-0.5 * at * at) / stays;
+  float thin = sqrt(max(1.0 - at * mean - mean * mean, 0.01));
+  vec3 arm = axes * own;
+  center -= arm * mean;
+  axes += outerProduct(arm * (thin - 1.0), own);
+  return stays / thin;
+}
+
+void modifySplatCenter(inout vec3 center) {
+  uvec4 a = loadVvgtValues(), b = loadVvgtGradient();
+  int spreads = int(vvgtFacts.w), at = int(a.x);
+  float column = float(a.y) * (vvgtFacts.w - 1.0) / 255.0;
+  int j = min(int(column), spreads - 2);
+  float f = column - float(j);
+  vec4 sums = mix(texelFetch(vvgtTable, ivec2(at, j), 0), texelFetch(vvgtTable, ivec2(at, j + 1), 0), f);
+  vec2 z = mix(texelFetch(vvgtTable, ivec2(at, j + spreads), 0).xy, texelFetch(vvgtTable, ivec2(at, j + 1 + spreads), 0).xy, f);
+  float tau = max(sums.a, 1e-12), first = z.x / tau, variance = max(z.y / tau - first * first, 0.0);
+  mat3 turn = quatToMat3(getRotation());
+  vec3 scale = getScale(), gradient = (vec3(b.xyz) - 128.0) / 127.0, along = gradient * turn * scale;
+  along /= max(length(along), 1e-30);
+  float r = min(length(gradient), 1.0), thin = sqrt(max(1.0 - r * r * (1.0 - variance), vvgtFacts.z * vvgtFacts.z));
+  mat3 axes = mat3(matrix_model) * mat3(turn[0] * scale.x, turn[1] * scale.y, turn[2] * scale.z);
+  vec3 arm = axes * along;
+  center += arm * (r * first);
+  axes += outerProduct(arm * (thin - 1.0), along);
+  float depth = tau * exp(vvgtFacts.x + vvgtFacts.y * float(a.z) / 255.0) * inversesqrt(thin) * vvgtCut3(center, axes);
+  vvgtColor = sums.a < 1e-12 ? vec4(0.0) : vec4(sums.rgb / tau, 1.0 - exp(-depth));
+  for (int sweep = 0; sweep < 6; sweep++) {
+    vvgtTurn(axes[0], axes[1]);
+    vvgtTurn(axes[0], axes[2]);
+    vvgtTurn(axes[1], axes[2]);
+  }
+  vvgtScale = vec3(length(axes[0]), length(axes[1]), length(axes[2]));
+  mat3 unit = mat3(axes[0] / vvgtScale.x, axes[1] / vvgtScale.y, axes[2] / vvgtScale.z);
+  if (determinant(unit) < 0.0) unit[2] = -unit[2];
+  vvgtRotation = vvgtQuaternion(unit);
+}
+void modifySplatRotationScale(vec3 original, vec3 modified, inout vec4 rotation, inout vec3 scale) {
+  rotation = vvgtRotation;
+  scale = vvgtScale;
+}
+void modifySplatColor(vec3 center, inout vec4 color) { color = vvgtColor; }

@@ -1,0 +1,60 @@
+// Gaussians that carry values, under any function: their bytes as streams of the engine, the function's table as a texture.
+import { FILTER_NEAREST, PIXELFORMAT_RGBA32F, PIXELFORMAT_RGBA8U, Texture } from 'playcanvas';
+import modifier from './live.glsl';
+import { sumsOf, texelsOf } from './live_table.mjs';
+
+const STREAMS = [['vvgtValues', [0, 1, 2]], ['vvgtGradient', [3, 4, 5]]];  // and the planes of each one's r, g and b
+
+// the planes of bytes, one after the other, that the page holds (gzip in base64)
+async function unpacked(id) {
+  const element = document.getElementById(id), text = atob(element.textContent);
+  const stream = new Blob([Uint8Array.from(text, (c) => c.charCodeAt(0))]).stream();
+  element.remove();
+  return new Uint8Array(await new Response(stream.pipeThrough(new DecompressionStream('gzip'))).arrayBuffer());
+}
+
+// {apply(nodes), cut(axis or null, place, flipped)} of a viewer that has loaded its Gaussians, once they are shown so
+export async function liveLook({ app }, live) {
+  const entity = app.root.findByName('gsplat'), { gsplat } = entity, { resource } = app.assets.get(gsplat.asset);
+  const bytes = await unpacked(live.held), count = bytes.length / 6;
+  resource.format.addExtraStreams(STREAMS.map(([name]) => ({ name, format: PIXELFORMAT_RGBA8U })));
+  for (const [name, planes] of STREAMS) {
+    const texture = resource.getTexture(name), texels = texture.lock();
+    planes.forEach((plane, c) => { for (let i = 0; i < count; i++) texels[4 * i + c] = bytes[plane * count + i]; });
+    texture.unlock();
+  }
+  const [means, spreads] = live.table, nearest = { minFilter: FILTER_NEAREST, magFilter: FILTER_NEAREST };
+  const table = new Texture(app.graphicsDevice, { name: 'vvgtTable', width: means, height: 2 * spreads, format: PIXELFORMAT_RGBA32F, mipmaps: false, ...nearest });
+  const [first, last] = live.log_lengths;
+  let again = 0, shown;
+  const set = (name, value) => {
+    gsplat.setParameter(name, value);
+    app.renderNextFrame = true;
+    again = 2;
+  };
+  // what is set while the engine takes up another state may be lost: set once more when it is ready
+  app.on('update', () => { if (again) app.renderNextFrame = true; });
+  app.systems.gsplat.on('frame:ready', (camera, layer, ready, loading) => {
+    if (!again || !ready || loading) return;
+    gsplat.setParameter('vvgtTable', table);
+    app.renderNextFrame = true;
+    if (!--again) shown();
+  });
+  const look = {
+    apply(nodes) {
+      table.lock().set(texelsOf(sumsOf(nodes, live), live.table));
+      table.unlock();
+      set('vvgtTable', table);
+    },
+    cut(axis, place, flipped) {
+      const sign = flipped ? -1 : 1;
+      set('vvgtCut', axis === null ? [0, 0, 0, 1] : [...live.axes[axis].map((x) => sign * x), sign * place]);
+    },
+  };
+  set('vvgtFacts', [first, last - first, live.thinnest, spreads]);
+  look.cut(null);
+  look.apply(live.nodes);
+  gsplat.setWorkBufferModifier({ glsl: modifier });
+  await new Promise((done) => { shown = done; });
+  return look;
+}

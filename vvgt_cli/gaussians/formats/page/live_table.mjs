@@ -1,0 +1,62 @@
+// A transfer function and its means over normal laws of values, as vvgt_cli/gaussians/live.py has them (its float64 twin).
+const FINE = 1 << 14;  // values over the range that a function is tabulated at
+const MAX_OPACITY = 1 - 1e-5;
+
+// Opacity and colour at x of nodes {x, y, rgb} in ascending order: at an x of several nodes the last one's opacity and the
+// first one's colour, as in VTK.
+export function functionAt(nodes, x) {
+  let after = 0, from = 0;
+  while (after < nodes.length && nodes[after].x <= x) after++;
+  while (from < nodes.length && nodes[from].x < x) from++;
+  const between = (next, of) => {
+    if (next === 0) return of(nodes[0]);
+    if (next === nodes.length) return of(nodes[next - 1]);
+    const [a, b] = [nodes[next - 1], nodes[next]], w = (x - a.x) / (b.x - a.x);
+    return (1 - w) * of(a) + w * of(b);
+  };
+  return { y: between(after, (n) => n.y), rgb: [0, 1, 2].map((c) => between(from, (n) => n.rgb[c])) };
+}
+
+function rint(x) {
+  const low = Math.floor(x), rest = x - low;
+  return rest > 0.5 || (rest === 0.5 && low % 2) ? low + 1 : low;
+}
+
+// (means, spreads, 6) float64: extinction times r, g, b, 1, z and z^2; `live` as live_json of formats/live.py says it
+export function sumsOf(nodes, live) {
+  const [lo, hi] = live.values, [means, spreads] = live.table, { law } = live;
+  const fine = new Float64Array(4 * FINE);
+  for (let i = 0; i < FINE; i++) {
+    const { y, rgb } = functionAt(nodes, lo + (hi - lo) * (i * (1 / (FINE - 1))));
+    const tau = -Math.log1p(-Math.min(Math.max(y, 0), MAX_OPACITY)) / live.unit_distance;
+    fine.set([rgb[0] * tau, rgb[1] * tau, rgb[2] * tau, tau], 4 * i);
+  }
+  const sums = new Float64Array(means * spreads * 6);
+  for (let j = 0; j < spreads; j++) {
+    const spread = live.widest * (j / (spreads - 1)) ** live.bend;
+    for (let i = 0; i < means; i++) {
+      const to = 6 * (i * spreads + j);
+      for (const z of law) {
+        const at = Math.min(Math.max(i * (1 / (means - 1)) + spread * z, 0), 1), k = 4 * rint(at * (FINE - 1)), tau = fine[k + 3];
+        for (let c = 0; c < 4; c++) sums[to + c] += fine[k + c];
+        sums[to + 4] += tau * z;
+        sums[to + 5] += tau * z * z;
+      }
+      for (let c = 0; c < 6; c++) sums[to + c] /= law.length;
+    }
+  }
+  return sums;
+}
+
+// The same as a texture of RGBA32F, means wide: rows of r, g, b and extinction, then as many of z and z^2
+export function texelsOf(sums, [means, spreads]) {
+  const texels = new Float32Array(means * spreads * 2 * 4);
+  for (let i = 0; i < means; i++) {
+    for (let j = 0; j < spreads; j++) {
+      const from = 6 * (i * spreads + j);
+      texels.set(sums.subarray(from, from + 4), 4 * (j * means + i));
+      texels.set(sums.subarray(from + 4, from + 6), 4 * ((spreads + j) * means + i));
+    }
+  }
+  return texels;
+}

@@ -1,0 +1,78 @@
+"""The page of Gaussians that carry values: under a function that is changed in the page, and cut (docs/live.md)."""
+
+from __future__ import annotations
+
+import gzip
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from vvgt_cli.gaussians import Gaussians, PlyOptions
+from vvgt_cli.gaussians.formats.live import live_bytes, live_json
+from vvgt_cli.gaussians.formats.page_file import html_of_several, upright
+from vvgt_cli.gaussians.formats.splats import morton_order, splats_of
+from vvgt_cli.gaussians.frames import turn, up_matrix
+from vvgt_cli.gaussians.live import law_nodes
+from vvgt_cli.gaussians.live_facts import LiveFacts
+from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.look.readers.minimal import read
+
+HELD = "values"  # the element that holds the bytes
+PLANES = (0, 1, 2, 4, 5, 6)  # columns of `live_bytes` that are not 0
+SAMPLED = 96  # nodes of colours on other lines than straight ones in RGB
+_RAMP = {"points": [{"x": 0, "rgb": [1, 1, 1], "opacity": 0}, {"x": 1, "rgb": [1, 1, 1], "opacity": 0.1}]}
+_HALF_TURN = np.diag([-1.0, -1.0, 1.0])  # the viewer has PLY (x, y, z) at (-x, -y, z)
+
+
+def live_html(gaussians: Gaussians, options: PlyOptions, name: str) -> bytes:
+    """The page as one file; ``gaussians`` in the unit frame.
+
+    Raises:
+        DataError, UsageError: as `splats_of`, or a library that is missing.
+    """
+    assert gaussians.live is not None
+    assert options.live is not None
+    facts, laid = options.live, upright(options)
+    gaussians = gaussians.take(morton_order(turn(gaussians, laid.up).means))  # as the page's file has them
+    turned = turn(gaussians, laid.up)
+    splats = splats_of(replace(gaussians, live=None), replace(laid, live=None))
+    planes = np.ascontiguousarray(live_bytes(turned, facts)[:, PLANES].T)
+    parts = {HELD: gzip.compress(planes.tobytes(), 9, mtime=0)}
+    return html_of_several([(name, splats)], name, parts, {"live": _facts(gaussians, options, laid.up)})
+
+
+def _facts(gaussians: Gaussians, options: PlyOptions, up: str) -> dict[str, Any]:
+    """What the page's program needs beside the bytes."""
+    assert options.live is not None
+    facts = options.live
+    said = live_json(gaussians, facts, (options.unit_distance or 1.0) * (options.scale or 1.0))
+    said.pop("function")
+    return said | {
+        "held": HELD,
+        "law": law_nodes().tolist(),
+        "name": facts.baked().get("name", ""),
+        "nodes": nodes_of(facts),
+        "axes": (_HALF_TURN @ up_matrix(up)).T.tolist(),
+        "box": [gaussians.means.min(axis=0).tolist(), gaussians.means.max(axis=0).tolist()],
+    }
+
+
+def nodes_of(facts: LiveFacts) -> list[dict[str, Any]]:
+    """Nodes of both opacity and colour, straight lines between them; two where the function steps."""
+    tf = read(facts.baked() or _RAMP | {"range": [facts.lo, facts.hi]}, "the file's function")
+    places = [tf.opacity_nodes.x, tf.color_map.x]
+    if tf.color_map.space != "RGB":
+        places.append(np.linspace(tf.color_map.x[0], tf.color_map.x[-1], SAMPLED))
+    nodes = []
+    for x in np.unique(np.concatenate(places)).tolist():
+        below, above = (_limit(tf, x, side) for side in (-np.inf, np.inf))
+        nodes += [below] if below == above else [below, above]
+    return nodes
+
+
+def _limit(tf: TransferFunction, x: float, side: float) -> dict[str, Any]:
+    """The function beside x, the nearest number but nodes' own on that side."""
+    beside = np.array([np.nextafter(x, side)])
+    y, rgb = float(tf.opacity(beside)[0]), tf.color(beside)[0]
+    return {"x": x, "y": round(y, 6), "rgb": [round(c, 4) for c in rgb.tolist()]}
