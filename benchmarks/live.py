@@ -21,7 +21,8 @@ from vvgt_cli.conversion.live import carrying, placed_by, table_of, wide_enough
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.dvr import RenderSettings
 from vvgt_cli.field.field import Resident
-from vvgt_cli.field.source import Opened, SourceRequest
+from vvgt_cli.field.layered import Content
+from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.formats.live import from_bytes, live_bytes, live_json
 from vvgt_cli.gaussians.live import baked, shown_by
@@ -64,8 +65,7 @@ def functions(numbers: Statistics) -> dict[str, TransferFunction]:
 
 def direct(field: Resident, tf: TransferFunction, gaussians: int) -> Gaussians:
     """An ordinary conversion for a function."""
-    opened = Opened(field.source.volume, field.source.statistics, field.layout)
-    source = SourceRequest(opened, tf=tf, unit_distance="mean-spacing", labels="none")
+    source = SourceRequest(Content((field.source.volume,)), tf=tf, unit_distance="mean-spacing", labels="none")
     request = ConvertRequest(source, None, FitOptions(max_gaussians=gaussians, size=SIZE))
     return fitted(Run(Console(quiet=True), ConversionReport("convert")), request)
 

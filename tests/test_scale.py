@@ -228,7 +228,7 @@ def test_a_level_of_an_image_is_chosen_by_the_screen(vvgt, tmp_path):
     assert "expected full, or 0 to 2" in run.err
     run = vvgt("init", "example:blob:20", "-o", tmp_path / "a.ply", *options, "--level", "1")
     assert run.code == 2
-    assert "no OME-Zarr image" in run.err
+    assert "no OME-Zarr, N5 or Imaris image" in run.err
 
 
 def test_memory_decides_by_itself(vvgt, tmp_path, monkeypatch):
@@ -245,8 +245,8 @@ def test_memory_decides_by_itself(vvgt, tmp_path, monkeypatch):
     views = vvgt("render-views", source, "-o", tmp_path / "views", "--size", "40", "--views", "2")
     assert views.code == 0, views.err
     whole = vvgt("evaluate", tmp_path / "b.ply", "--volume", source)
-    assert whole.code == 1
-    assert "in blocks" in whole.err
+    assert whole.code == 0, whole.err
+    assert "processed in blocks" in whole.err
     fitted = vvgt("convert", source, "-o", tmp_path / "d.ply", *FIT[:-1], "--steps", "8")
     assert fitted.code == 0
     assert "processed in blocks" in fitted.err

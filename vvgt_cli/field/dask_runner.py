@@ -83,7 +83,7 @@ class Dask:
         client = self._client = self._client or self._connected()
         futures = self._futures = client.map(task, list(numbers), retries=TRIES, pure=False)
         try:
-            for done, future in enumerate(distributed.as_completed(futures), 1):
+            for done, future in enumerate(distributed.as_completed(futures, loop=client.loop), 1):
                 future.result()
                 if progress:
                     progress(done, len(numbers))
