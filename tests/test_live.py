@@ -270,6 +270,11 @@ def test_what_a_live_file_does_not_go_with(vvgt, tmp_path) -> None:
         assert (done.code, "one file of one volume" in done.error) == (2, True)
     done = vvgt("convert", "example:frog", "--labels", "auto", "--live", "-o", tmp_path / "a.ply", *SMALL)
     assert (done.code, "one scalar" in done.error) == (2, True)
+    np.save(tmp_path / "four.npy", np.random.default_rng(0).random((2, 6, 7, 8)))
+    for source in (tmp_path / "four.npy", tmp_path / "*.npy"):
+        done = vvgt("convert", source, "--live", "-o", tmp_path / "a.html", *SMALL)
+        assert done.code == 2, done.err
+    assert not (tmp_path / "a.html").exists()
     assert not (tmp_path / "a.ply").exists()
 
 

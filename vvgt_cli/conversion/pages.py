@@ -58,6 +58,11 @@ def page_of_labels(request: ConvertRequest, console: Console) -> None:
 
 def _page(request: ConvertRequest, make: Callable[[ConvertRequest], dict[str, Any]], console: Console) -> None:
     """Let ``make`` write a `.ply` a cloud into a folder that goes again, and join them by its index."""
+    if request.live:
+        raise UsageError(
+            f"{request.source.path}: several clouds of Gaussians; --live makes a file of one: choose it, with "
+            "--time N of a file of several steps, or leave out --live"
+        )
     if request.report or request.preview or request.checkpoint:
         raise UsageError(
             f"{request.output} gets several clouds of Gaussians: --report, --preview and --checkpoint are of one each; "
