@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from vvgt_cli.gaussians import read_ply
 from vvgt_cli.images import read_exr, read_png
 
 nib = pytest.importorskip("nibabel")
@@ -57,6 +59,7 @@ def data(tmp_path_factory):
         tifffile.imwrite(folder / f"rgb_{k}.tif", np.roll(colors, k, axis=1), photometric="rgb")
     (folder / "tf.json").write_text(TF)
     (folder / "other.json").write_text(OTHER)
+    (folder / "lit.json").write_text(json.dumps(json.loads(TF) | {"lighting": {"ambient": 0.3}}))
     return folder
 
 
@@ -95,7 +98,7 @@ ROWS = {
     "uniform": ("scalars.nii", ("--tf", "tf.json", "--init", "uniform")),
     "wavelet, lit": ("scalars.nii", ("--tf", "tf.json", "--init", "wavelet", "--light", "headlight")),
     "model": ("scalars.nii", ("--tf", "tf.json", "--model", "vvgt-small")),
-    "model, lit": ("scalars.nii", ("--tf", "tf.json", "--model", "vvgt-small", "--light", "headlight")),
+    "model, lit by the function": ("scalars.nii", ("--tf", "lit.json", "--model", "vvgt-small")),
     "rule": ("scalars.nii", ("--tf", "tf.json", "--rule", "playcanvas")),
     "harmonics": ("scalars.nii", ("--tf", "tf.json", "--light", "headlight", "--sh-degree", "3")),
     "world": ("scalars.nii", ("--tf", "tf.json", "--frame", "world", "--up", "superior")),
@@ -156,8 +159,10 @@ def test_the_bytes_do_not_depend_on_the_blocks(vvgt, at, tmp_path, row):
 class TestEitherWay:
     """What has no error of its own to compare."""
 
-    @pytest.mark.parametrize("ending", [".html", ".spz", ".compressed.ply", ".glb", ".usdc"])
+    @pytest.mark.parametrize("ending", [".html", ".spz", ".compressed.ply", ".glb", ".usdc", ".sog"])
     def test_every_format(self, vvgt, at, tmp_path, blocks, ending):
+        if ending == ".sog" and not shutil.which("splat-transform"):
+            pytest.skip("splat-transform is not on the path")
         found = vvgt("convert", "scalars.nii", "--tf", "tf.json", *SMALL, *blocks, "-o", tmp_path / f"x{ending}")
         assert found.code == 0, found.err
         assert "the format costs" in found.err
@@ -231,6 +236,16 @@ class TestEitherWay:
         found = vvgt("init", volume, *options, *fit, *blocks, "-o", tmp_path / "x.ply")
         assert found.code == 0, found.err
         assert vvgt("init", volume, *options, *fit, *blocks, "-o", tmp_path / "x.spz").code == 0
+
+    def test_the_closed_form_alone_under_the_light_of_the_functions_file(self, vvgt, at, tmp_path, blocks):
+        base = ("init", "scalars.nii", "--tf", "lit.json", "--size", "64", "--max-gaussians", "100", *blocks)
+        assert vvgt(*base, "-o", tmp_path / "x.ply").code == 0
+        assert read_ply(tmp_path / "x.ply")[1].light.ambient == 0.3
+        refused = vvgt(*base, "--levels", "2", "-o", tmp_path / "y.ply")
+        assert refused.code == 2
+        assert "--light none turns off that of the function's file" in refused.error
+        assert vvgt(*base, "--levels", "2", "--light", "none", "-o", tmp_path / "y.ply").code == 0
+        assert read_ply(tmp_path / "y.ply")[1].light is None
 
     @pytest.mark.parametrize("row", ["function", "shadows", "labels, lit", "colours"])
     def test_views_for_trainers(self, vvgt, at, tmp_path, blocks, row):
