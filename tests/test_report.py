@@ -49,7 +49,7 @@ class Reader(HTMLParser):
 
 
 @pytest.fixture(scope="module")
-def ladder(tmp_path_factory, small_seats):
+def ladder(tmp_path_factory):
     """A whole report of a small scene with a model that shrinks every Gaussian: (folder, JSON)."""
     from vvgt_cli.cli.main import run as vvgt
 

@@ -201,6 +201,16 @@ def test_metaimage(tmp_path: Path, key: str, big: bool, header: int) -> None:
     np.testing.assert_array_equal(volume.data, VALUES)
 
 
+def test_metaimage_with_a_negative_spacing_runs_the_other_way(tmp_path: Path) -> None:
+    source = write(
+        tmp_path / "v.mha",
+        meta({"ElementSpacing": "1 -2 3", "ElementDataFile": "LOCAL"}) + VALUES.astype("<i2").tobytes(),
+    )
+    volume = read_volume(source)
+    assert volume.spacing == (1, 2, 3)
+    np.testing.assert_array_equal(volume.affine[:3, 1], [0, -2, 0])
+
+
 def test_metaimage_local_compressed_and_text(tmp_path: Path) -> None:
     body = VALUES.astype("<i2").tobytes()
     local = meta({"ElementDataFile": "LOCAL"}) + body
