@@ -363,3 +363,14 @@ def test_netcdf_classic_headers_are_checked_before_the_library(tmp_path: Path, f
         path.write_bytes(whole[:cut])
         with pytest.raises(DataError, match="NetCDF header"):
             read_volume(str(path))
+
+
+def test_names_with_line_breaks_are_listed_in_one_line(tmp_path: Path) -> None:
+    import h5py
+
+    with h5py.File(tmp_path / "v.h5", "w") as file:
+        for name in ("a\nb", "c"):
+            file[name] = np.zeros((2, 3, 4))
+    with pytest.raises(UsageError, match=r"several datasets: /a\?b \(2, 3, 4\)") as raised:
+        read_volume(str(tmp_path / "v.h5"))
+    assert "\n" not in str(raised.value)
