@@ -55,6 +55,7 @@ PACKED = (
     ".vtkhdf",
 )  # files of few bytes may hold many voxels
 RANGES, LAYER_VOXEL = 0.15, 20  # bytes a voxel: the map of empty space, an optics grid
+OWN = {"uint8": 0, "uint16": 0, "float32": 0, "int8": 1}  # bytes a voxel of the kernels' copy; others 4
 LAYERED_BYTES = 60  # of a voxel of an optics grid while a block of it is there
 FEW_SAMPLES = 512  # bricks of layers: each is read for itself
 
@@ -275,7 +276,7 @@ def better_in_blocks(request: SourceRequest) -> bool:
         return True
     if free is None:
         return False
-    own = LAYER_VOXEL if len(volumes) > 1 else 4 * (volumes[0].data.dtype.name not in ("uint8", "uint16", "float32"))
+    own = LAYER_VOXEL if len(volumes) > 1 else OWN.get(volumes[0].data.dtype.name, 4)
     held = sum(volume.data.nbytes for volume in volumes if isinstance(volume.data, Stored))
     voxels = volumes[0].data.size
     return held + (own + RANGES) * voxels + PROGRAM + A_CELL * min(voxels, MAX_BASE_CELLS) > free

@@ -77,7 +77,7 @@ def _image(h5py: Any, file: Any, path: Path, options: ReadOptions) -> Volume:
     dtype = dataset.dtype.newbyteorder("=")
     one = np.zeros((1, 1, 1, info.components), dtype)  # its choice of component alone is of interest
     select_component(one, options.component, source, label=f"array {info.name!r}", color=dtype == np.uint8)
-    behind = (options.component or 0,) if len(dataset.shape) > len(before) + 3 else ()
+    behind = (int(options.component or 0),) if len(dataset.shape) > len(before) + 3 else ()
     read = partial(_read, path, name, before, behind, dtype)
     chunks = dataset.chunks[len(before) : len(before) + 3] if dataset.chunks else (1, *shape[1:])
     stored = Stored(read, dtype, shape, chunks, source)
