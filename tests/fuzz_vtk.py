@@ -1,4 +1,4 @@
-"""Seeds of tests/fuzz.py for what VTK reads in a process of its own: indexes, and other programs' files.
+"""Seeds of tests/fuzz.py for what VTK reads in a process of its own: meshes, indexes, and other programs' files.
 
 Here that process is a fork, for speed: what it cannot survive is one line of error, as it is in the program.
 """
@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 from fuzz import SECONDS, Seed
+from vtkmodules import vtkIOXML
+from vtkmodules.vtkIOLegacy import vtkDataSetWriter
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
@@ -77,6 +79,40 @@ def indexes() -> list[Seed]:
     ]
 
 
+def meshes() -> list[Seed]:
+    """Single grids and meshes, XML and legacy, in every coding."""
+
+    def legacy(name: str, mesh: Any, binary: bool, version: int) -> Make:
+        def write(folder: Path) -> Path:
+            writer = vtkDataSetWriter()
+            writer.SetFileVersion(version)
+            (writer.SetFileTypeToBinary if binary else writer.SetFileTypeToASCII)()
+            return files.write(writer, mesh, folder / name)
+
+        return write
+
+    def xml(name: str, mesh: Any, mode: int) -> Make:
+        def write(folder: Path) -> Path:
+            writer = getattr(vtkIOXML, f"vtkXML{mesh.GetClassName()[3:]}Writer")()
+            writer.SetDataMode(mode)
+            return files.write(writer, mesh, folder / name)
+
+        return write
+
+    image, mesh = files.image(), files.hexahedra()
+    kinds = {"vtr": image.cast_to_rectilinear_grid(), "vts": image.cast_to_structured_grid(), "vtu": mesh}
+    seeds = []
+    for mode in range(3):
+        for suffix, data in kinds.items():
+            array = ("ramp", "cells")[mode % 2]
+            seeds += seeds_of(xml(f"v{mode}.{suffix}", data, mode), (f"v{mode}.{suffix}",), array=array, dims=DIMS)
+    for k, data in enumerate(kinds.values()):
+        for n, (binary, version) in enumerate(((False, 51), (True, 51), (False, 42), (True, 42))):
+            name = f"v{k}{n}.vtk"
+            seeds += seeds_of(legacy(name, data, binary, version), (name,), array=("ramp", "cells")[n % 2], dims=DIMS)
+    return seeds
+
+
 def programs() -> list[Seed]:
     return [
         *seeds_of(files.hdf_image, ("v.vtkhdf",), array="ramp"),
@@ -98,4 +134,4 @@ def programs() -> list[Seed]:
 def readers() -> dict[str, list[Seed]]:
     """Seeds by reader."""
     vtk_child.run = run_fork
-    return {"VTK index": indexes(), "programs by VTK": programs()}
+    return {"VTK mesh": meshes(), "VTK index": indexes(), "programs by VTK": programs()}

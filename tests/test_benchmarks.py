@@ -39,11 +39,12 @@ RUN = (
         "optimize",
         "parts",
         "plan",
+        "readers",
         "refinement",
     ),
     *("reports", "share", "splat", "training"),
 )
-SHARED = ("dvr_scenes", "floors", "scans")  # what the others import
+SHARED = ("dvr_scenes", "floors", "readers_rows", "scans")  # what the others import
 
 
 def test_none_is_left_out():
@@ -114,6 +115,26 @@ def test_closed_form(bench, scenes, tmp_path):
     (row,) = rows_of(tmp_path / "a.csv")
     assert float(row["psnr"]) > 15
     assert "Mean PSNR, vbm" in call(module.main, "--table", tmp_path / "a.csv")
+
+
+def test_readers(bench, tmp_path, capsys):
+    """A small file of every row of the table in docs/formats.md, read whole, in blocks, and where it was written."""
+    module = bench("readers", TIMES=1)
+    module.main(["--edge", "12", "-o", str(tmp_path / "a.csv")])
+    rows = rows_of(tmp_path / "a.csv")
+    documented = rows_of(ROOT / "docs" / "readers.csv")
+    assert [row["format"] for row in rows] == [row["format"] for row in documented]
+    for row, told in zip(rows, documented, strict=True):
+        assert [row[key] for key in ("whole", "blocks", "series")] == [
+            told[key] for key in ("whole", "blocks", "series")
+        ]
+        assert row["whole"] in ("yes", "resampled"), row
+        assert not row["place"] or float(row["place"]) < 0.01, row
+    assert "| NIfTI `.nii` | nibabel |" in capsys.readouterr().out
+    page = (ROOT / "docs" / "formats.md").read_text()
+    for told in documented:
+        cells = [told[key] for key in ("written by", "whole", "blocks", "series", "place", "seconds", "library")]
+        assert f"| {' | '.join(cells)} |" in page
 
 
 def test_dvr(bench, capsys):

@@ -137,6 +137,14 @@ def test_kernel_values_are_native_contiguous_read_only_and_shared_where_they_can
             assert not values.flags.writeable
 
 
+def test_int8_is_raised_to_uint8():
+    data = np.arange(-128, 128, dtype=np.int8).reshape(4, 8, 8)
+    for one in (data, data[:, ::2], np.asfortranarray(data)):
+        values, slope, intercept = kernel_values(Volume(one, slope=0.5, intercept=3))
+        assert values.dtype == np.uint8
+        np.testing.assert_array_equal(slope * values.astype(np.float64) + intercept, 0.5 * one.astype(np.float64) + 3)
+
+
 def test_doubles_keep_24_bits_of_their_range():
     data = 1e9 + np.random.default_rng(3).uniform(0, 1, (4, 4, 4))
     values, slope, intercept = kernel_values(Volume(data))

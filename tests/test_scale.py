@@ -309,3 +309,27 @@ def test_a_box_that_is_counted_slice_by_slice_has_the_counts_and_samples_of_the_
         assert np.array_equal(other[0].counts, whole.counts)
         assert np.array_equal(other[1], samples)
         assert np.array_equal(other[2], weights)
+
+
+def test_only_what_may_be_labels_is_given_the_memory_of_layers(tmp_path, monkeypatch):
+    from vvgt_cli.errors import UsageError
+    from vvgt_cli.field.open import _edge
+    from vvgt_cli.field.settings import BlockOptions
+    from vvgt_cli.field.source import SourceRequest
+
+    monkeypatch.setattr("vvgt_cli.field.settings.free_memory", lambda: 700 << 20)
+    for name, tf, fits in (
+        ("v_1024x512x512_float32.raw", None, True),
+        ("v_1024x512x512_uint8.raw", None, True),
+        ("seg_1024x512x512_uint8.raw", None, False),
+        ("seg_1024x512x512_uint8.raw", "ct-bone", True),
+        ("seg_1024x512x512_float32.raw", None, True),
+    ):
+        with open(tmp_path / name, "wb") as file:
+            file.truncate(1024 * 512 * 512 * (4 if "float" in name else 1))  # a hole: nothing of it is read
+        request = SourceRequest(str(tmp_path / name), tf=tf)
+        if fits:
+            assert _edge(request, BlockOptions()) == 128
+        else:
+            with pytest.raises(UsageError, match="MiB more"):
+                _edge(request, BlockOptions())

@@ -374,3 +374,14 @@ def test_coordinates_are_even_whatever_their_unit(step: float) -> None:
     assert even(centres + 0.005 * off)
     assert not even(centres + 0.02 * off)
     assert not even((centres + 0.02 * off)[::-1])
+
+
+def test_names_with_line_breaks_are_listed_in_one_line(tmp_path: Path) -> None:
+    import h5py
+
+    with h5py.File(tmp_path / "v.h5", "w") as file:
+        for name in ("a\nb", "c"):
+            file[name] = np.zeros((2, 3, 4))
+    with pytest.raises(UsageError, match=r"several datasets: /a\?b \(2, 3, 4\)") as raised:
+        read_volume(str(tmp_path / "v.h5"))
+    assert "\n" not in str(raised.value)

@@ -12,7 +12,8 @@ from vtkmodules.vtkIOLegacy import vtkDataSetWriter
 
 from tests.ramps import X, Y, Z, axes_of, check_ramp
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.volume import ReadOptions, read_volume
+from vvgt_cli.volume import ReadOptions, read_volume, vtk_child
+from vvgt_cli.volume.registry import contents
 
 BOUNDS = [(X[0], X[-1]), (Y[0], Y[-1]), (Z[0], Z[-1])]
 
@@ -119,6 +120,26 @@ def test_components_and_choices(tmp_path: Path) -> None:
             read_volume(str(path), options)
 
 
+@pytest.mark.parametrize("suffix", ["vtr", "vts", "vtu", "vtk"])
+def test_what_brings_vtk_down_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str) -> None:
+    path = tmp_path / f"v.{suffix}"
+    {"vtr": rectilinear, "vts": structured, "vtu": tetrahedra, "vtk": tetrahedra}[suffix]().save(path)
+    code = "import os, vvgt_cli.volume.vtk_child as c; c.answer = lambda request: os.kill(os.getpid(), 11); c.main()"
+    monkeypatch.setattr(vtk_child, "START", code)
+    with pytest.raises(DataError, match=r"VTK's reader of VTK files broke down \(SIGSEGV\)"):
+        read_volume(str(path))
+
+
+def test_arrays_of_a_mesh_are_listed_with_their_options(tmp_path: Path, vvgt) -> None:
+    tetrahedra().save(tmp_path / "v.vtu")
+    rows = contents(str(tmp_path / "v.vtu"), ReadOptions())["arrays"]
+    assert [(row["array"], row["components"], row["option"]) for row in rows] == [
+        ("ramp", 1, "--array ramp"),
+        ("vector", 3, "--array vector"),
+    ]
+    assert b"--array vector" in vvgt("info", tmp_path / "v.vtu").out
+
+
 def test_lies_are_refused_before_vtk_reads(tmp_path: Path) -> None:
     path = tmp_path / "v.vtu"
     tetrahedra().save(path, binary=False)
@@ -135,7 +156,7 @@ def test_lies_are_refused_before_vtk_reads(tmp_path: Path) -> None:
     text = (tmp_path / "v.vtk").read_text()
     for old, new, message in (
         ("POINTS 60 ", "POINTS 6000000000 ", "values are declared"),
-        ("\n4 ", "\n4 777", "name points that do not exist|cannot read"),
+        ("\n4 ", "\n4 777", "name points that do not exist"),
     ):
         assert old in text
         (tmp_path / "v.vtk").write_text(text.replace(old, new, 1))

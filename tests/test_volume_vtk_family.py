@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 import warnings
 from collections.abc import Callable
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 import pyvista as pv
@@ -17,6 +19,7 @@ from tests.ramps import X, Y, Z, axes_of, check_grid, ramp
 from vvgt_cli.errors import DataError, SeveralSteps, UsageError
 from vvgt_cli.volume import ReadOptions, Volume, read_volume
 from vvgt_cli.volume.registry import contents, time_steps
+from vvgt_cli.volume.stored import Stored
 
 BOUNDS = [(X[0], X[-1]), (Y[0], Y[-1]), (Z[0], Z[-1])]
 MM = 0.01
@@ -92,6 +95,49 @@ def test_images_are_read_as_they_are(tmp_path: Path, kind: str) -> None:
     assert cells.dims == (4, 3, 2)
     np.testing.assert_allclose(cells.origin, [X[0] + 0.125, Y[0] + 0.25, Z[0] + 1], atol=MM)
     np.testing.assert_allclose(cells.data, ramp(*axes_of(cells)))
+
+
+@pytest.mark.parametrize("make", [files.hdf_image, files.hdf_steps])
+def test_vtkhdf_images_stay_in_their_file_and_are_what_vtk_reads(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make: Make
+) -> None:
+    path, time = make(tmp_path), 1 if make is files.hdf_steps else None
+    arrays = ("ramp",) if time else ("ramp", "cells")
+    found = {}
+    for array in arrays:
+        stored = read_volume(str(path), ReadOptions(array=array, time=time, stored=True))
+        assert isinstance(stored.data, Stored)
+        found[array] = read_volume(str(path), ReadOptions(array=array, time=time))
+        np.testing.assert_array_equal(stored.data[1:2, 1:3, 2:3], found[array].data[1:2, 1:3, 2:3])
+    with pytest.raises(UsageError, match="leave out --dims"):
+        read_volume(str(path), ReadOptions(array="ramp", time=time, dims=(8, 6, 4)))
+    monkeypatch.setitem(sys.modules, "h5py", None)  # not installed: by VTK, as a whole
+    for array in arrays:
+        volume = read_volume(str(path), ReadOptions(array=array, time=time, stored=True))
+        np.testing.assert_array_equal(volume.data, found[array].data)
+        assert volume.data.dtype == found[array].data.dtype
+        np.testing.assert_allclose(volume.affine, found[array].affine)
+        assert volume.name == found[array].name
+
+
+def test_a_component_of_a_vtkhdf_image(tmp_path: Path) -> None:
+    path = files.hdf_image(tmp_path)
+    with h5py.File(path, "r+") as file:
+        ramp = file["VTKHDF/PointData/ramp"][()]
+        file["VTKHDF/PointData/pair"] = np.stack([ramp, 2 * ramp], axis=-1)
+        file["VTKHDF/PointData/short"] = ramp[:-1]
+    for stored in (False, True):
+        volume = read_volume(str(path), ReadOptions(array="pair", component=1, stored=stored))
+        np.testing.assert_array_equal(volume.data[:], 2 * ramp)
+    for options, text in (
+        (ReadOptions(array="pair"), "2 components"),
+        (ReadOptions(array="pair", component=2), "not component 2"),
+        (ReadOptions(array="none"), "no array 'none'"),
+    ):
+        with pytest.raises(UsageError, match=text):
+            read_volume(str(path), options)
+    with pytest.raises(DataError, match="of shape"):
+        read_volume(str(path), ReadOptions(array="short"))
 
 
 @pytest.mark.parametrize("kind", IMAGE_STEPS)

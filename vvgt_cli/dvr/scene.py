@@ -146,17 +146,17 @@ def kernel_values(volume: Volume) -> tuple[np.ndarray, float, float]:
     """Stored values as uint8, uint16 or float32, with the slope and intercept that make them data values.
 
     The array is C-contiguous, in native byte order and read-only (kernels compile once, for mapped files and arrays
-    in memory alike); it is a view of the volume's where that has such values already. Types that float32 cannot
-    hold (32-bit integers and up, doubles) are shifted and scaled in float64 by slabs, so that ranges of 1e-30 and
-    1e30 keep 24 bits. NaN stays, infinities stay or become NaN: neither is drawn.
+    in memory alike); it is a view of the volume's where that has such values already. int8 is raised to uint8. Types
+    that float32 cannot hold (32-bit integers and up, doubles) are shifted and scaled in float64 by slabs, so that
+    ranges of 1e-30 and 1e30 keep 24 bits. NaN stays, infinities stay or become NaN: neither is drawn.
     """
     data = volume.data
     if data.dtype == np.bool_:
         data = data.view(np.uint8)
     rule = kernel_rule(volume, lambda: _finite_range(data))
-    if rule.half_width is None:
+    if rule.half_width is None and not rule.raised:
         return _read_only(data, rule.dtype), rule.slope, rule.intercept
-    out = np.empty(data.shape, np.float32)
+    out = np.empty(data.shape, rule.dtype)
     for z in range(len(data)):
         out[z] = rule.apply(data[z])
     return _read_only(out, out.dtype), rule.slope, rule.intercept
@@ -170,6 +170,7 @@ class KernelRule:
         dtype: uint8, uint16 or float32.
         slope, intercept: see above.
         lo, half_width: values are shifted by ``lo`` and divided by twice ``half_width``; None: taken as they are.
+        raised: int8 becomes uint8, 128 is added; of int16 interpolated values would lose bits that float32 keeps.
     """
 
     dtype: np.dtype
@@ -177,9 +178,13 @@ class KernelRule:
     intercept: float
     lo: float = 0.0
     half_width: float | None = None
+    raised: bool = False
 
     def apply(self, stored: np.ndarray) -> np.ndarray:
         """Stored values, any shape and byte order, as kernels read them."""
+        if self.raised:
+            raised: np.ndarray = np.ascontiguousarray(stored).view(np.uint8) ^ np.uint8(128)
+            return raised
         if self.half_width is None:
             stored = stored.view(np.uint8) if stored.dtype == np.bool_ else stored
             return stored.astype(self.dtype, copy=False)
@@ -195,6 +200,8 @@ def kernel_rule(volume: Volume, limits: Callable[[], tuple[float, float]]) -> Ke
         kind = np.dtype(np.uint8)
     if kind in (np.uint8, np.uint16) and pairs_fit(volume.data.shape):
         return KernelRule(kind, volume.slope, volume.intercept)
+    if kind == np.int8 and pairs_fit(volume.data.shape):
+        return KernelRule(np.dtype(np.uint8), volume.slope, volume.intercept - 128 * volume.slope, raised=True)
     if kind.itemsize <= 2:  # exact in float32
         return KernelRule(np.dtype(np.float32), volume.slope, volume.intercept)
     lo, hi = limits()

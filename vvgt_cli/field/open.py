@@ -23,11 +23,13 @@ from vvgt_cli.field.settings import BlockOptions, block_edge
 from vvgt_cli.field.source import Source, SourceRequest, describe_source, load
 from vvgt_cli.gaussians.outputs import STDOUT
 from vvgt_cli.jit.ahead import COUNT_REAL, COUNT_WHOLE
+from vvgt_cli.look.label_files import holds_table
 from vvgt_cli.progress import Console
 from vvgt_cli.resources import free_memory
 from vvgt_cli.score.record import Run
 from vvgt_cli.version import VERSION
 from vvgt_cli.volume import ReadOptions, Volume
+from vvgt_cli.volume.label_maps import named_so
 from vvgt_cli.volume.readers import SCHEMES
 from vvgt_cli.volume.stored import Stored, is_file_backed
 
@@ -41,8 +43,19 @@ LARGE = 0.25  # of the free memory: a file of less is read as ever
 PROGRAM, A_CELL = 3e8, 300  # bytes: interpreter, libraries and kernels; a base cell in memory
 ZARR = {".zarray", ".zgroup", ".zattrs", "zarr.json", "attributes.json"}  # files of which a folder has one
 INDEXES = (".pvti", ".pvd", ".series")  # of files elsewhere
-PACKED = (".h5", ".hdf5", ".he5", ".hdf", ".nc", ".ims", ".czi", ".nd2")  # files of few bytes may hold many voxels
+PACKED = (
+    ".h5",
+    ".hdf5",
+    ".he5",
+    ".hdf",
+    ".nc",
+    ".ims",
+    ".czi",
+    ".nd2",
+    ".vtkhdf",
+)  # files of few bytes may hold many voxels
 RANGES, LAYER_VOXEL = 0.15, 20  # bytes a voxel: the map of empty space, an optics grid
+OWN = {"uint8": 0, "uint16": 0, "float32": 0, "int8": 1}  # bytes a voxel of the kernels' copy; others 4
 LAYERED_BYTES = 60  # of a voxel of an optics grid while a block of it is there
 FEW_SAMPLES = 512  # bricks of layers: each is read for itself
 
@@ -117,7 +130,8 @@ def _edge(request: SourceRequest, options: BlockOptions) -> int:
     if isinstance(given, str):
         read = replace(request.read, stored=True, packed=True)
         content = open_parts(given, read)
-        volume, layered = content.volumes[0], layered or not content.one_field or request.tf is None
+        volume, layered = content.volumes[0], layered or not content.one_field
+        layered |= request.tf is None and (holds_table(content.path) or named_so(volume))
     else:
         volume = content_of(given).volumes[0]
     return block_edge(volume, options, LAYERED_BYTES if layered else None)
@@ -262,7 +276,7 @@ def better_in_blocks(request: SourceRequest) -> bool:
         return True
     if free is None:
         return False
-    own = LAYER_VOXEL if len(volumes) > 1 else 4 * (volumes[0].data.dtype.name not in ("uint8", "uint16", "float32"))
+    own = LAYER_VOXEL if len(volumes) > 1 else OWN.get(volumes[0].data.dtype.name, 4)
     held = sum(volume.data.nbytes for volume in volumes if isinstance(volume.data, Stored))
     voxels = volumes[0].data.size
     return held + (own + RANGES) * voxels + PROGRAM + A_CELL * min(voxels, MAX_BASE_CELLS) > free

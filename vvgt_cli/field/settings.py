@@ -18,7 +18,7 @@ SHARED = 256  # of a shard, whatever the memory of its node: all shards must agr
 MAX_FIELD = 1 << 24  # cells of the field of opacity
 A_BLOCK = 0.3  # of the memory of a worker: what its voxels may take; as much again where they are converted
 COUNTED = 3  # bytes a voxel, of types that are counted, beside it
-ALWAYS = 400 << 20  # bytes: coarse grids, a tile's tree, a batch of Gaussians
+ALWAYS = 300 << 20  # bytes: coarse grids, a tile's tree, a batch of Gaussians
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,6 @@ from vvgt_cli.volume import (  # noqa: F401  each registers its formats
     slices,
     tiff,
     vtk_family,
-    vtk_grids,
     vtk_legacy,
     vtk_pieces,
     vtk_xml,

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vvgt_cli.errors import DataError, SeveralArrays, SeveralComponents, UsageError
+from vvgt_cli.volume.headers import printable
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,8 @@ class ArrayInfo:
 
     def __str__(self) -> str:
         plural = "" if self.components == 1 else "s"
-        return f"{self.name or '(unnamed)'} ({self.where} data, {self.dtype}, {self.components} component{plural})"
+        name = printable(self.name) or "(unnamed)"
+        return f"{name} ({self.where} data, {self.dtype}, {self.components} component{plural})"
 
 
 def choose_array(infos: Sequence[ArrayInfo], wanted: str | None, source: str) -> int:

@@ -14,6 +14,7 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, SeveralArrays, UsageError
 from vvgt_cli.volume.blocks import data_file, load_block, size_text
+from vvgt_cli.volume.headers import printable
 from vvgt_cli.volume.imaris import is_imaris, read_imaris
 from vvgt_cli.volume.labelled import AXIS_ATTRIBUTES, CF_ATTRIBUTES, Axis, axis, labelled_volume
 from vvgt_cli.volume.libraries import library_errors, need
@@ -38,11 +39,11 @@ def read_hdf5(path: Path, options: ReadOptions) -> Volume:
     h5py = need("h5py", "hdf5", str(path), "HDF5")
     with library_errors(str(path), "HDF5"), h5py.File(path, "r") as file:
         if is_imaris(file):
-            return read_imaris(file, path, options, partial(_checked, h5py, file, path))
+            return read_imaris(file, path, options, partial(checked_dataset, h5py, file, path))
         if options.level is not None:
             raise UsageError(f"{path}: no Imaris file, which alone has levels; leave out --level {options.level}")
         dataset = _choose(h5py, file, options.array, path)
-        source = f"{path}:{dataset.name}"
+        source = f"{path}:{printable(dataset.name)}"
         check_storage(h5py, dataset, path, source)
         mapped = _mapped(dataset, path)
         stored = mapped if mapped is not None else lambda index: dataset[index]
@@ -54,7 +55,7 @@ def read_hdf5(path: Path, options: ReadOptions) -> Volume:
         return labelled_volume(stored, dataset.dtype, _axes(dataset), attributes, options, source, name, chunks)
 
 
-def _checked(h5py: Any, file: Any, path: Path, name: str) -> Any:
+def checked_dataset(h5py: Any, file: Any, path: Path, name: str) -> Any:
     """The dataset of a path that leads into no file elsewhere, whose values can be read."""
     _check_links(h5py, file, name, path)
     if not isinstance(file.get(name), h5py.Dataset):
@@ -79,14 +80,14 @@ def _choose(h5py: Any, file: Any, wanted: str | None, path: Path) -> Any:
             return found
         file = found if isinstance(found, h5py.Group) else file
     fits = _datasets(h5py, file)
-    listing = "; ".join(f"{d.name} {d.shape} {d.dtype}" for d in fits[:MOST_LISTED]) or "none"
+    listing = printable("; ".join(f"{d.name} {d.shape} {d.dtype}" for d in fits[:MOST_LISTED])) or "none"
     listing += "; ..." if len(fits) > MOST_LISTED else ""
     if wanted is not None and (file.name == "/" or not fits):
         raise UsageError(f"{path}: no dataset {wanted}; it has {listing}; choose one as {path.name}:/path")
     if not fits:
         raise DataError(f"{path}: no dataset of numbers with two axes or more; expected a volume")
     if len(fits) > 1:
-        text = f"{path}: several datasets: {listing}; choose one as {path}:{fits[0].name} (or with --array)"
+        text = f"{path}: several datasets: {listing}; choose one as {path}:{printable(fits[0].name)} (or with --array)"
         raise SeveralArrays(text, "--array", [d.name for d in fits])
     return fits[0]
 

@@ -68,6 +68,11 @@ class Fields(dict[str, str]):
             raise DataError(f"{self.name}: {key} is {text!r}; expected a whole number") from None
 
 
+def printable(text: str) -> str:
+    """``text`` as a message can hold it: what cannot be printed (a line break, say) is a question mark."""
+    return "".join(c if c.isprintable() else "?" for c in text)
+
+
 def unit_rows(vectors: Sequence[Sequence[float]]) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Lengths of three axis vectors, and the row-major direction matrix whose columns are their unit vectors."""
     lengths = tuple(math.hypot(*v) for v in vectors)

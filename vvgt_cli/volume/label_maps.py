@@ -42,9 +42,14 @@ def labels_in(volume: Volume) -> list[int]:
     return [int(value) for value in found]
 
 
+def named_so(volume: Volume) -> bool:
+    """Whether a volume may be a label map: integers, and named so."""
+    return volume.data.dtype.kind in "iu" and NAMED.search(volume.name) is not None
+
+
 def recognised(volume: Volume, labels: Callable[[Volume], list[int]] = labels_in) -> bool:
     """Whether a volume is a label map: integers, few of them, and named so; ``labels`` finds those that it holds."""
-    if volume.data.dtype.kind not in "iu" or not NAMED.search(volume.name):
+    if not named_so(volume):
         return False
     middle = len(volume.data) // 2
     first = np.unique(volume.data[middle : middle + 1])  # most are told by one slice

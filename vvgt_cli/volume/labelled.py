@@ -16,6 +16,7 @@ import numpy as np
 from vvgt_cli.errors import DataError, SeveralComponents, SeveralSteps, UsageError
 from vvgt_cli.volume.blocks import IN_BLOCKS, check_memory, count
 from vvgt_cli.volume.components import contiguous, select_component
+from vvgt_cli.volume.headers import printable
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.stored import Stored
 from vvgt_cli.volume.types import Volume, triple
@@ -62,7 +63,7 @@ class Axis:
     colors: tuple[tuple[float, float, float] | None, ...] = ()
 
     def __str__(self) -> str:
-        return f"{self.name or 'unnamed'} ({self.size})"
+        return f"{printable(self.name) or 'unnamed'} ({self.size})"
 
 
 def axis(name: str, size: int, centres: np.ndarray | None = None, attributes: Mapping[str, Any] | None = None) -> Axis:

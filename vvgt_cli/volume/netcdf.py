@@ -9,6 +9,7 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, SeveralArrays, UsageError
 from vvgt_cli.volume.hdf5 import MAGIC, MOST_LISTED
+from vvgt_cli.volume.headers import printable
 from vvgt_cli.volume.labelled import Axis, axis, labelled_volume
 from vvgt_cli.volume.libraries import library_errors, need
 from vvgt_cli.volume.netcdf3 import check_header
@@ -62,7 +63,7 @@ def _choose(file: Any, wanted: str | None, path: Path) -> Any:
         return found[wanted.strip("/")]
     deep = {name: variable for name, variable in fits.items() if sum(n > 1 for n in variable.shape) >= 3} or fits
     parts = [f"{name} ({', '.join(v.dimensions)}: {' x '.join(map(str, v.shape))})" for name, v in deep.items()]
-    listing = "; ".join(parts[:MOST_LISTED]) + ("; ..." if len(parts) > MOST_LISTED else "") or "none"
+    listing = printable("; ".join(parts[:MOST_LISTED])) + ("; ..." if len(parts) > MOST_LISTED else "") or "none"
     if wanted is not None:
         raise UsageError(f"{path}: no variable {wanted}; it has {listing}; choose one with --array NAME")
     if not deep:

@@ -26,7 +26,7 @@ from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.resample import MOST
 from vvgt_cli.volume.types import Volume
-from vvgt_cli.volume.vtk_index import INDEX
+from vvgt_cli.volume.vtk_index import INDEX, SINGLE
 
 SECONDS, A_BYTE, A_VOXEL = 60, 1e-6, 4e-6  # processor time: at least, of a byte of the files, of a sample
 START = f"from {__name__} import main; main()"
@@ -35,7 +35,7 @@ LARGEST = 1 << 20  # bytes of the line of an answer
 
 
 def volume_by_child(program: str, path: Path, options: ReadOptions) -> Volume:
-    """The volume of a file of `vtk_programs.PROGRAMS`, or of an index.
+    """The volume of a file of `vtk_programs.PROGRAMS`, of an index, or of a mesh or grid.
 
     Raises:
         DataError: damaged, or VTK's reader did not come to an end.
@@ -56,7 +56,7 @@ def contents_by_child(program: str, path: Path, options: ReadOptions) -> dict[st
 
 
 def _asked(program: str, path: Path, options: ReadOptions, task: str) -> tuple[dict[str, Any], np.ndarray]:
-    size = _bytes_near(path)
+    size = path.stat().st_size if program == SINGLE else _bytes_near(path)
     samples = count(options.dims) if options.dims else min(40 * size, MOST**3)
     seconds = math.ceil(SECONDS + A_BYTE * size + A_VOXEL * samples)
     request = {
@@ -122,7 +122,7 @@ def received(stream: IO[bytes]) -> tuple[dict[str, Any], np.ndarray] | None:
 
 
 def _ended(path: Path, program: str, status: int, seconds: int) -> DataError:
-    kind = "VTK" if program == INDEX else program
+    kind = "VTK" if program in (INDEX, SINGLE) else program
     if status in (-signal.SIGXCPU, -signal.SIGKILL):
         return DataError(
             f"{path}: VTK's reader of {kind} files was stopped (after {seconds} s, or for its memory); is it whole?"

@@ -12,9 +12,10 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.components import ArrayInfo
 from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.vtk_grids import arrays_of, check_xml_grid, values_of
-from vvgt_cli.volume.vtk_index import INDEX, Index, files_of, read_index
+from vvgt_cli.volume.vtk_grids import arrays_of, check_legacy_grid, check_xml_grid, values_of
+from vvgt_cli.volume.vtk_index import INDEX, SINGLE, Index, files_of, read_index
 from vvgt_cli.volume.vtk_leaves import Leaf, arrays_in, leaves_of
+from vvgt_cli.volume.vtk_legacy import is_legacy
 from vvgt_cli.volume.vtk_programs import HDF5, PROGRAMS, read_program
 from vvgt_cli.volume.vtk_xml import GRIDS, INDEXES, quiet_vtk, xml_kind
 
@@ -29,6 +30,8 @@ def datasets(program: str, path: Path, time: int | None) -> tuple[list[Leaf], li
         DataError: damaged, or a file that is named is missing or lies elsewhere.
         UsageError: several time steps and none chosen, or one that there is not.
     """
+    if program == SINGLE:
+        return list(_dataset(path, ())), []
     if program != INDEX:
         return read_program(PROGRAMS[program], path, time)
     index = read_index(path)
@@ -74,9 +77,11 @@ def _reader(path: Path, kind: str | None, head: bytes) -> Any:
             check_xml_grid(path)
         return getattr(vtkIOXML, f"vtkXML{kind}Reader")()
     if head.startswith(b"# vtk DataFile"):
+        if is_legacy(head, grid=True):
+            check_legacy_grid(path)
         reader = vtkDataSetReader()
-        for switch in (reader.ReadAllScalarsOn, reader.ReadAllVectorsOn, reader.ReadAllFieldsOn):
-            switch()
+        for what in ("Scalars", "Vectors", "Fields", "Tensors"):
+            getattr(reader, f"ReadAll{what}On")()
         return reader
     raise DataError(f"{path}: no dataset of VTK's ({kind or head[:16]!r}); expected a file that an index may name")
 

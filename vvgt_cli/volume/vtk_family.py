@@ -1,4 +1,4 @@
-"""Readers of what consists of several VTK files, and of other programs' files that VTK reads."""
+"""Readers of VTK's meshes and grids, of what consists of several VTK files, and of other programs' that VTK reads."""
 
 from __future__ import annotations
 
@@ -11,9 +11,11 @@ from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import HEAD_BYTES, Reader, register
 from vvgt_cli.volume.types import Volume
 from vvgt_cli.volume.vtk_child import contents_by_child, volume_by_child
-from vvgt_cli.volume.vtk_index import INDEX, PIECES, Index, files_of, read_index
+from vvgt_cli.volume.vtk_hdf import read_vtkhdf
+from vvgt_cli.volume.vtk_index import INDEX, PIECES, SINGLE, Index, files_of, read_index
+from vvgt_cli.volume.vtk_legacy import is_legacy
 from vvgt_cli.volume.vtk_programs import PROGRAMS
-from vvgt_cli.volume.vtk_xml import INDEXES, xml_kind
+from vvgt_cli.volume.vtk_xml import GRIDS, INDEXES, xml_kind
 
 SUFFIXES = (".pvtu", ".pvtr", ".pvts", ".vtm", ".vtmb", ".vtpd", ".vtpc", ".vth", ".vthb", ".pvd", ".series")
 
@@ -68,8 +70,19 @@ register(
 for _program in PROGRAMS.values():
     register(
         Reader(
-            _program.name, _program.suffixes, _program.sniff, partial(volume_by_child, _program.name),
+            _program.name, _program.suffixes, _program.sniff,
+            read_vtkhdf if _program.name == "VTKHDF" else partial(volume_by_child, _program.name),
             named_arrays=True, times=True, resamples=True, by_name=_program.by_name, empty=_program.by_name,
             within=_program.within, contents=partial(_contents, _program.name),
+        )
+    )  # fmt: skip
+for _name, _suffixes, _sniff in (
+    ("VTK grid", (".vtu", ".vtr", ".vts"), lambda head: xml_kind(head) in GRIDS),
+    ("legacy VTK grid", (), lambda head: is_legacy(head, grid=True)),
+):
+    register(
+        Reader(
+            _name, _suffixes, _sniff, partial(volume_by_child, SINGLE), named_arrays=True, resamples=True,
+            contents=partial(_contents, SINGLE),
         )
     )  # fmt: skip

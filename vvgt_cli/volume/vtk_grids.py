@@ -1,4 +1,4 @@
-"""VTK meshes and grids (``.vtu``, ``.vtr``, ``.vts``, legacy ``.vtk``), read by VTK and resampled.
+"""VTK's meshes and grids: the checks of their files, and datasets in memory as volumes, resampled.
 
 Declared sizes are checked against the file before VTK allocates, cells against points before VTK walks them.
 """
@@ -6,7 +6,6 @@ Declared sizes are checked against the file before VTK allocates, cells against 
 from __future__ import annotations
 
 import mmap
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,36 +16,19 @@ from vvgt_cli.volume.blocks import check_memory, count, size_text
 from vvgt_cli.volume.components import ArrayInfo, choose_array, select_component
 from vvgt_cli.volume.headers import unit_rows
 from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.readers import Reader, register, volume_name
 from vvgt_cli.volume.resample import resample
 from vvgt_cli.volume.types import Volume
 from vvgt_cli.volume.vtk_blocks import check_blocks
-from vvgt_cli.volume.vtk_legacy import GRIDS, Parser, is_legacy
+from vvgt_cli.volume.vtk_legacy import GRIDS, Parser
 from vvgt_cli.volume.vtk_xml import (
     GHOSTS,
     HIDDEN,
     around,
     extent_dims,
-    quiet_vtk,
     scan,
     stored_ratio,
     without,
-    xml_kind,
 )
-from vvgt_cli.volume.vtk_xml import GRIDS as XML_GRIDS
-
-
-def read_xml_grid(path: Path, options: ReadOptions) -> Volume:
-    """Read and resample ``.vtu``, ``.vtr`` or ``.vts``.
-
-    Raises:
-        DataError: damaged, or sizes that the file cannot hold.
-        UsageError: a choice of array or component that is missing or does not exist.
-    """
-    from vtkmodules import vtkIOXML
-
-    kind = check_xml_grid(path)
-    return _sampled(getattr(vtkIOXML, f"vtkXML{kind}Reader"), path, options)
 
 
 def check_xml_grid(path: Path) -> str:
@@ -104,37 +86,14 @@ class _Sections(Parser):
             self.skip(words[1].lower(), n)
 
 
-def read_legacy_grid(path: Path, options: ReadOptions) -> Volume:
-    """Read and resample a legacy ``.vtk`` mesh or grid.
+def check_legacy_grid(path: Path) -> None:
+    """See that a legacy ``.vtk`` mesh or grid holds what its sections declare.
 
     Raises:
-        DataError: damaged, or sizes that the file cannot hold.
-        UsageError: a choice of array or component that is missing or does not exist.
+        DataError: it does not.
     """
-    from vtkmodules.vtkIOLegacy import vtkDataSetReader
-
     with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as text:
         _Sections(text, path).parse()
-
-    def reader() -> Any:
-        made = vtkDataSetReader()
-        for switch in (made.ReadAllScalarsOn, made.ReadAllVectorsOn, made.ReadAllFieldsOn, made.ReadAllTensorsOn):
-            switch()
-        return made
-
-    return _sampled(reader, path, options)
-
-
-def _sampled(make: Callable[[], Any], path: Path, options: ReadOptions) -> Volume:
-    with quiet_vtk() as message:
-        reader = make()
-        reader.SetFileName(str(path))
-        reader.Update()
-        mesh = reader.GetOutputDataObject(0)
-        error = message()
-    if error or reader.GetErrorCode() or mesh is None:
-        raise DataError(f"{path}: VTK cannot read it ({error or 'no message'}); is the file whole?")
-    return dataset_volume(mesh, options, str(path), volume_name(path))
 
 
 def dataset_volume(mesh: Any, options: ReadOptions, source: str, name: str) -> Volume:
@@ -284,10 +243,3 @@ def _image(image: Any, info: ArrayInfo, options: ReadOptions, source: str, name:
     lengths, turned = unit_rows((_direction(image) * spacing).T.tolist())
     field = visible(image, field, info.where)
     return Volume(field, options.spacing_or(lengths), tuple(origin.tolist()), turned, name)
-
-
-for _name, _suffixes, _sniff, _read in (
-    ("VTK grid", (".vtu", ".vtr", ".vts"), lambda head: xml_kind(head) in XML_GRIDS, read_xml_grid),
-    ("legacy VTK grid", (), lambda head: is_legacy(head, grid=True), read_legacy_grid),
-):
-    register(Reader(_name, _suffixes, _sniff, _read, named_arrays=True, resamples=True))

@@ -17,7 +17,7 @@ from xml.parsers import expat
 from vvgt_cli.errors import DataError, SeveralSteps, UsageError
 from vvgt_cli.volume.blocks import data_file
 
-INDEX = "index"  # in the place of a program: an index of VTK's own files
+INDEX, SINGLE = "index", "single"  # in the place of a program: an index of VTK's own files, or one of these
 MOST = 100_000  # files that an index may name
 DEEPEST = 8  # indexes that name indexes
 MAX_BYTES = 64 << 20  # of an index

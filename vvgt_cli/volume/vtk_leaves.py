@@ -83,6 +83,8 @@ def volume_of(leaves: Sequence[Leaf], options: ReadOptions, source: str, name: s
     """
     if not leaves:
         raise DataError(f"{source}: no dataset in it; expected an image, a grid or a mesh")
+    for leaf in leaves:
+        check_cells(leaf.data, source)
     deep = [leaf for leaf in leaves if _fills(leaf.data)]
     if len(leaves) == 1 or not deep:
         return dataset_volume(leaves[0].data, options, source, name)
@@ -125,7 +127,6 @@ def _fills(data: Any) -> bool:
 
 def _field(leaf: Leaf, info: ArrayInfo, options: ReadOptions, source: str) -> tuple[Leaf, np.ndarray]:
     """A dataset whose hidden cells are gone, and the scalars (n,) of its points or cells."""
-    check_cells(leaf.data, source)
     image = leaf.data.IsA("vtkImageData")
     data = leaf.data if image else shown(leaf.data)
     own = next((a for a in arrays_of(data) if (a.name, a.where) == (info.name, info.where)), info)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.headers import unit_rows
+from vvgt_cli.volume.headers import printable, unit_rows
 from vvgt_cli.volume.openvdb.codec import ACTIVE_MASK, BLOSC, ZIP
 from vvgt_cli.volume.openvdb.cursor import Cursor
 from vvgt_cli.volume.types import FLAT
@@ -79,7 +79,7 @@ class Grid:
     def __str__(self) -> str:
         tree = "" if self.levels == _LEVELS else f", tree {self.levels.replace('_', '-') or 'unknown'}"
         text = f"{self.label or '(unnamed)'} ({self.kind}{', stored as half' if self.half else ''}{tree})"
-        return "".join(c if c.isprintable() else "?" for c in text[:100])
+        return printable(text[:100])
 
 
 def read_header(cursor: Cursor) -> list[Grid]:
