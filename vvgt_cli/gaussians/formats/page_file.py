@@ -89,7 +89,16 @@ def page(
         parts: elements that bring the viewer.
         more: of the scene, for the program.
     """
-    scene = {"rule": drawing(splats), "camera": camera(splats), "frames": list(frames), **more}
+    return _text(title, {"rule": drawing(splats), "camera": camera(splats), "frames": list(frames), **more}, parts)
+
+
+def waiting_page(title: str, parts: str) -> str:
+    """The text of a page whose Gaussians are being made: it asks the server how far they are."""
+    place = {"position": [0, 0, _DISTANCE], "target": [0, 0, 0], "fov": _FIELD}
+    return _text(title, {"waits": True, "camera": place, "frames": []}, parts)
+
+
+def _text(title: str, scene: Mapping[str, Any], parts: str) -> str:
     said = json.dumps(scene).replace("<", "\\u003c")  # no name ends the script
     text = asset("page.html").decode("utf-8")
     for place, value in (("TITLE", escape(title)), ("SCENE", said), ("PARTS", parts)):
