@@ -47,12 +47,10 @@ class Made:
     Attributes:
         ply: the file that `vvgt convert` would write.
         psnr: dB on the test views; None where it was not scored.
-        refused: why it is no live file where one was asked for; None where it is as asked.
     """
 
     ply: bytes
     psnr: float | None = None
-    refused: str | None = None
 
 
 @dataclass(frozen=True)
@@ -103,6 +101,11 @@ class Converter:
         return self
 
     def __exit__(self, *error: object) -> None:
+        closing = threading.Thread(target=self._close)  # which a second interrupt does not reach
+        closing.start()
+        closing.join()
+
+    def _close(self) -> None:
         with self.lock:
             self._number += 1
             self._end()

@@ -14,7 +14,7 @@ from dataclasses import replace
 from typing import IO, Any
 
 from vvgt_cli.commands.converter import Failed, Job, Made, Message, Progress, Said, Start
-from vvgt_cli.conversion.convert import opened, ply_options, run_conversion, without_files
+from vvgt_cli.conversion.convert import opened, ply_options, without_files
 from vvgt_cli.conversion.live import live_conversion, refusal
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.conversion.result import Conversion
@@ -60,7 +60,7 @@ class Volume:
     """The volume of a request, read once where it fits into memory."""
 
     def __init__(self, source: SourceRequest, console: Console) -> None:
-        self.source, self.refused = source, None
+        self.source = source
         if automatic(source, console) is None:
             console.bar("reading")
             content = open_parts(source.path, source.read)
@@ -75,10 +75,8 @@ class Volume:
             if why is None:
                 ply = ply_options(request, field.source)
                 return made(live_conversion(run, request, field, ply, scored=False))
-        run = Run(console, ConversionReport("convert"))
-        request = replace(request, live=False)
-        with opened(run, request) as field:
-            return replace(made(run_conversion(run, request, field)), refused=why)
+        console.say(f"not live, but converted: {why}")
+        return made(without_files(replace(request, live=False), console))
 
     def under(self, job: Job, console: Console) -> Made:
         """A conversion for a function, on data values, that says the distance its opacity is per."""

@@ -151,6 +151,7 @@ class Desk:
         self.cloud: Cloud | None = None
         self.better: Cloud | None = None
         self.converter: Converter | None = None
+        self.begun = threading.Event()  # the volume has been read, or cannot be
         self.there = threading.Event()  # the first page, or an error
         self.waited_for = False  # by a page, for the first one
         self.state: dict[str, Any] = {"number": 0, "state": "first", "said": "starting"}
@@ -227,6 +228,7 @@ class Desk:
         if isinstance(message, Said):
             if first:
                 self.console.say(message.line)
+                self.begun.set()
         elif isinstance(message, Progress):
             self.state = {**self.state, "said": message.text}
         elif isinstance(message, Failed):
@@ -234,14 +236,13 @@ class Desk:
                 self.error = message.error
             self.state = {"number": number, "state": "failed", "said": str(message.error)}
             self.there.set()
+            self.begun.set()
         elif first:
             self._first(message)
         else:
             self._better(number, message)
 
     def _first(self, made: Made) -> None:
-        if made.refused is not None:
-            self.console.say(f"not live, but converted: {made.refused}")
         try:
             self.show(Cloud.of(made.ply, self.name))
             self.state = {"number": 0, "state": "none", "said": ""}
@@ -260,5 +261,5 @@ class Desk:
 
 def plain_name(path: str) -> str:
     """A name to save under, of a file's: letters, digits and a few signs."""
-    found = re.sub(r"[^0-9A-Za-z._ -]+", "-", volume_name(Path(path))).strip("-. ")
+    found = re.sub(r"[^0-9A-Za-z._ -]+", "-", volume_name(Path(path.removeprefix("example:")))).strip("-. ")
     return found or "volume"

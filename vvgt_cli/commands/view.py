@@ -31,7 +31,7 @@ from vvgt_cli.score.record import ConversionReport, Run
 from vvgt_cli.volume.slices import matching
 
 TICK = 0.2  # seconds within which Ctrl-C is answered
-SOON = 2.0  # seconds after which a page is shown that waits; what fails sooner is told without one
+SOON = 10.0  # seconds of reading after which a page is shown that waits; what fails sooner is told without one
 LINGER = 1.0  # seconds in which such a page hears why nothing comes
 
 
@@ -181,7 +181,7 @@ def _serve(
         if not parts.get(""):
             source = replace(request.source, volume=files[0])
             desk.await_volume(stack.enter_context(Converter(source, desk.hear)))
-            desk.there.wait(SOON)
+            desk.begun.wait(SOON)
         if desk.error is None:
             announce(url)
             opened = request.browser and display() and webbrowser.open(url)

@@ -90,7 +90,7 @@ export function served(panel, viewer, live, server) {
   text.setAttribute('role', 'status');
   root.append(text, row);
   const better = substitute(viewer);
-  let number = null, told = '', down = false, timer = 0, change = 0;  // number of the better form, and what it is
+  let number = null, told = '', busy = false, down = false, timer = 0, change = 0;  // number of the better form, and what it is
 
   const say = (line, failed) => {
     text.textContent = line;
@@ -100,11 +100,20 @@ export function served(panel, viewer, live, server) {
   const improved = () => number !== null && !panel.cutting();  // a cut is of the live form
   function put() {
     better.put(improved());
-    kind.textContent = improved() ? told : 'live';
+    const [what, ...rest] = (improved() ? told : 'live').split(/(?=, )/);
+    kind.textContent = what;
+    kind.append(Object.assign(document.createElement('span'), { textContent: rest.join('') }));  // where there is room
+    if (!busy) say(rest.length ? told : '');
+  }
+
+  function end(line = '', failed = false) {
+    busy = false;
+    say(line, failed);
   }
 
   async function convert() {
     const mine = change;
+    busy = true;
     try {
       const answer = await send('function', functionFile(panel.nodes(), live));
       if (!answer.ok) throw new Error(await reason(answer));
@@ -112,30 +121,30 @@ export function served(panel, viewer, live, server) {
       while (mine === change) {
         const state = await (await fetch('state')).json();
         if (mine !== change) return;
-        if (state.number !== job) return say('');  // of another page
+        if (state.number !== job) break;  // of another page
         if (state.state === 'failed') throw new Error(state.said);
         if (state.state === 'done') {
           await better.load(state.file, () => mine === change);
           if (mine !== change) return;
-          [number, told] = [job, state.said];
-          put();
-          return say('');
+          [number, told, busy] = [job, state.said, false];
+          return put();
         }
         say(`converting for this function: ${state.said}`);
         await pause(ASK);
       }
+      if (mine === change) end();
     } catch (error) {
-      if (mine === change) say(error instanceof TypeError ? 'vvgt view has ended' : error.message, true);
+      if (mine === change) end(error instanceof TypeError ? 'vvgt view has ended' : error.message, true);
     }
   }
 
   function changed(cut) {
     if (cut) return put();
-    if (change++ && text.textContent) send('function', null).catch(() => {});  // what is being done ends
-    number = null;
+    if (busy) send('function', null).catch(() => {});  // what is being done ends
+    change++;
+    [number, busy] = [null, false];
     better.drop();
     put();
-    say('');
     clearTimeout(timer);
     timer = setTimeout(ready, QUIET);
   }
