@@ -196,7 +196,6 @@ def desk(tmp_path: Path) -> Iterator[tuple[str, Desk]]:
         ({**FUNCTION, "points": [{"x": 0, "opacity": 2, "rgb": [1, 1, 1]}]}, "opacit"),
         ({**FUNCTION, "points": [{"x": "a", "opacity": 1, "rgb": [1, 1, 1]}]}, "points[0].x"),
         ({**FUNCTION, "points": [{"x": 1, "opacity": 1, "rgb": [1, 1]}]}, "points[0].rgb"),
-        ({**FUNCTION, "points": FUNCTION["points"][::-1]}, "ascend"),
         ({**FUNCTION, "opacity_unit_distance": 0}, "unit distance"),
         ({**FUNCTION, "opacity_unit_distance": None}, "opacity_unit_distance"),
         ({**FUNCTION, "range": "foreground"}, "'range'"),
@@ -294,7 +293,7 @@ def test_what_is_never_live_is_converted(monkeypatch: pytest.MonkeyPatch) -> Non
     request = SourceRequest(labels, labels="auto")
     why = refusal(ConvertRequest(request, live=True), load(request))
     assert why is not None
-    assert refusal(ConvertRequest(SourceRequest(labels), live=True), load(SourceRequest(labels, "viridis"))) is None
+    assert refusal(ConvertRequest(SourceRequest(labels), live=True), load(SourceRequest(labels, tf="viridis"))) is None
     asked = []
 
     def conversion(request: ConvertRequest, console: Console) -> str:
@@ -343,3 +342,4 @@ def test_names_to_save_under() -> None:
     assert plain_name("example:blob:12") == "blob-12"
     assert plain_name("/x/</b>.nii.gz") == "b"
     assert plain_name("..") == "volume"
+    assert plain_name("a/head.compressed.ply") == plain_name("head.ply") == plain_name("head.spz") == "head"

@@ -6,6 +6,7 @@ standard input, and answers by pickles on its standard output. When the input cl
 
 from __future__ import annotations
 
+import atexit
 import os
 import pickle
 import shutil
@@ -98,6 +99,7 @@ class Converter:
 
     def __enter__(self) -> Converter:
         self._folder = tempfile.mkdtemp(prefix="vvgt-view-")
+        atexit.register(self._close)  # where interrupts come so fast that the context is not left in order
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -107,10 +109,13 @@ class Converter:
 
     def _close(self) -> None:
         with self.lock:
+            if self._folder is None:
+                return
             self._number += 1
             self._end()
-            shutil.rmtree(self._folder or "", ignore_errors=True)
+            shutil.rmtree(self._folder, ignore_errors=True)
             self._folder = None
+            atexit.unregister(self._close)
 
     def ask(self, job: Job) -> int:
         """Begin a job in place of the one that is being done, if any; returns its number."""

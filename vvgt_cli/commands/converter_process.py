@@ -23,6 +23,7 @@ from vvgt_cli.field.layered import open_parts
 from vvgt_cli.field.open import automatic
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import write_ply
+from vvgt_cli.gaussians.formats import ready
 from vvgt_cli.progress import Console, ProgressCallback
 from vvgt_cli.resources import set_memory
 from vvgt_cli.score.record import ConversionReport, Run
@@ -71,7 +72,7 @@ class Volume:
         run = Run(console, ConversionReport("init"))
         request = ConvertRequest(self.source, live=True)
         with opened(run, request) as field:
-            why = refusal(request, field.source)
+            why = refusal(request, field.source) or _missing()
             if why is None:
                 ply = ply_options(request, field.source)
                 return made(live_conversion(run, request, field, ply, scored=False))
@@ -82,6 +83,15 @@ class Volume:
         """A conversion for a function, on data values, that says the distance its opacity is per."""
         source = replace(self.source, tf=job, tf_range="data", unit_distance=None)
         return made(without_files(ConvertRequest(source), console))
+
+
+def _missing() -> str | None:
+    """What a page of live Gaussians needs and is not installed."""
+    try:
+        ready("the page.html")
+    except DataError as error:
+        return str(error)
+    return None
 
 
 def made(conversion: Conversion) -> Made:

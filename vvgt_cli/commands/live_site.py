@@ -17,7 +17,7 @@ from vvgt_cli.commands.server import Part
 from vvgt_cli.conversion.gaussian_files import layout_of, open_gaussians
 from vvgt_cli.errors import DataError, VvgtError
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored, write_ply
-from vvgt_cli.gaussians.formats import encoded, format_of
+from vvgt_cli.gaussians.formats import SUFFIXES, encoded, format_of
 from vvgt_cli.gaussians.formats.gsply_files import compressed_ply
 from vvgt_cli.gaussians.formats.page_file import page, upright, waiting_page
 from vvgt_cli.gaussians.formats.page_live import HELD, live_parts
@@ -261,5 +261,7 @@ class Desk:
 
 def plain_name(path: str) -> str:
     """A name to save under, of a file's: letters, digits and a few signs."""
-    found = re.sub(r"[^0-9A-Za-z._ -]+", "-", volume_name(Path(path.removeprefix("example:")))).strip("-. ")
+    known = next((suffix for suffix in reversed(SUFFIXES) if path.lower().endswith(suffix)), "")
+    name = volume_name(Path(path.removeprefix("example:")[: len(path) - len(known)]))
+    found = re.sub(r"[^0-9A-Za-z._ -]+", "-", name).strip("-. ")
     return found or "volume"

@@ -140,6 +140,14 @@ def html_of_several(
     return page(_title(name), clouds[0][1], frames, "\n".join(elements), more).encode("utf-8")
 
 
+def framed(content: bytes, name: str) -> str:
+    """A page within another, as notebooks show it: its program reaches nothing of that one, and no network."""
+    text = escape(content.decode("utf-8"))
+    style = "width: 100%; height: 540px; border: 0; background: #000"
+    allowed = 'sandbox="allow-scripts allow-downloads" allow="fullscreen"'
+    return f'<iframe title="{escape(name)}" {allowed} style="{style}" srcdoc="{text}"></iframe>'
+
+
 def _title(name: str) -> str:
     return re.split(r"[/\\]", name)[-1].removesuffix(".html")
 
