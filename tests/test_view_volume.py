@@ -174,7 +174,7 @@ def desk(tmp_path: Path) -> Iterator[tuple[str, Desk]]:
     site = Site({}, print)
     found = Desk(site.parts, site.posts, "x", Console(quiet=True))
     some = baked(live_cloud(), Table.of(RAMP, LO, HI, 0.05))
-    found.converter = Still(SourceRequest("none"), found.hear)
+    found.converter = Still(SourceRequest("none"), "x", found.hear)
     found.parts["state"] = Part("application/json", found._told)
     found.show(Cloud(some, PlyOptions(up="y", scale=0.1, unit_distance=0.5, live=facts()), "x"))
     with served(site) as url:
@@ -276,7 +276,7 @@ def test_a_live_file_is_shown_live_and_an_ordinary_one_as_it_is(tmp_path: Path) 
 def test_a_page_that_waits_hears_how_far_it_is_and_why_nothing_comes(tmp_path: Path) -> None:
     site = Site({}, print)
     desk = Desk(site.parts, site.posts, "x", Console(quiet=True))
-    with served(site) as url, Converter(SourceRequest(str(tmp_path / "none.nrrd")), desk.hear) as converter:
+    with served(site) as url, Converter(SourceRequest(str(tmp_path / "none.nrrd")), "x", desk.hear) as converter:
         desk.await_volume(converter)
         assert scene_of(url)["waits"]
         assert state_of(url)["state"] in ("first", "failed")
@@ -301,13 +301,13 @@ def test_what_is_never_live_is_converted(monkeypatch: pytest.MonkeyPatch) -> Non
         return "conversion"
 
     monkeypatch.setattr(converter_process, "without_files", conversion)
-    monkeypatch.setattr(converter_process, "made", lambda found: Made(b"", None))
+    monkeypatch.setattr(converter_process.Volume, "_paged", lambda volume, found: Made(b"", {}))
     said: list[str] = []
     console = Console(quiet=True)
     console.say = said.append  # type: ignore[method-assign]
     volume = converter_process.Volume.__new__(converter_process.Volume)
     volume.source = request
-    assert volume.live(console) == Made(b"", None)
+    assert volume.live(console) == Made(b"", {})
     assert asked == [False]
     assert f"not live, but converted: {why}" in said
 

@@ -47,10 +47,14 @@ class Made:
 
     Attributes:
         ply: the file that `vvgt convert` would write.
+        parts: of the first job the page's text, named "", and what it asks for; of others the `.ply` that it shows.
+        live: it can be shown under any function.
         psnr: dB on the test views; None where it was not scored.
     """
 
     ply: bytes
+    parts: dict[str, bytes]
+    live: bool = False
     psnr: float | None = None
 
 
@@ -70,11 +74,13 @@ class Start:
 
     Attributes:
         source: the volume, and the function to begin with.
+        name: of what is shown, without ending.
         memory: bytes that it may take (`--memory`).
         folder: for what is temporary; the process removes it where it is left alone.
     """
 
     source: SourceRequest
+    name: str
     memory: int | None
     folder: str
 
@@ -87,11 +93,12 @@ class Converter:
 
     Args:
         source: what to convert.
+        name: of what is shown, without ending.
         heard: is told the number of a job and what there is to say of it, by another thread, which holds the ``lock``.
     """
 
-    def __init__(self, source: SourceRequest, heard: Callable[[int, Message], None]) -> None:
-        self._source, self._heard = source, heard
+    def __init__(self, source: SourceRequest, name: str, heard: Callable[[int, Message], None]) -> None:
+        self._source, self._name, self._heard = source, name, heard
         self.lock = threading.RLock()
         self._process: subprocess.Popen[bytes] | None = None
         self._number, self._busy = 0, False
@@ -153,7 +160,7 @@ class Converter:
             env={**os.environ, "PYTHONPATH": paths, "TMPDIR": folder, "TEMP": folder, "TMP": folder},
         )  # fmt: skip
         with suppress(OSError):
-            pickle.dump(Start(self._source, asked_memory(), folder), cast(IO[bytes], self._process.stdin))
+            pickle.dump(Start(self._source, self._name, asked_memory(), folder), cast(IO[bytes], self._process.stdin))
         threading.Thread(target=self._listen, args=(self._process,), daemon=True).start()
         return self._process
 

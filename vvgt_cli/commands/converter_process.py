@@ -14,6 +14,7 @@ from dataclasses import replace
 from typing import IO, Any
 
 from vvgt_cli.commands.converter import Failed, Job, Made, Message, Progress, Said, Start
+from vvgt_cli.commands.live_site import Cloud, page_of, stored
 from vvgt_cli.conversion.convert import opened, ply_options, without_files
 from vvgt_cli.conversion.live import live_conversion, refusal
 from vvgt_cli.conversion.request import ConvertRequest
@@ -60,8 +61,8 @@ class Telling(Console):
 class Volume:
     """The volume of a request, read once where it fits into memory."""
 
-    def __init__(self, source: SourceRequest, console: Console) -> None:
-        self.source = source
+    def __init__(self, source: SourceRequest, name: str, console: Console) -> None:
+        self.source, self.name = source, name
         if automatic(source, console) is None:
             console.bar("reading")
             content = open_parts(source.path, source.read)
@@ -75,14 +76,23 @@ class Volume:
             why = refusal(request, field.source) or _missing()
             if why is None:
                 ply = ply_options(request, field.source)
-                return made(live_conversion(run, request, field, ply, scored=False))
+                return self._paged(live_conversion(run, request, field, ply, scored=False))
         console.say(f"not live, but converted: {why}")
-        return made(without_files(replace(request, live=False), console))
+        return self._paged(without_files(replace(request, live=False), console))
 
     def under(self, job: Job, console: Console) -> Made:
         """A conversion for a function, on data values, that says the distance its opacity is per."""
         source = replace(self.source, tf=job, tf_range="data", unit_distance=None)
-        return made(without_files(ConvertRequest(source), console))
+        conversion = without_files(ConvertRequest(source), console)
+        shown = stored(conversion.gaussians, conversion.ply)
+        psnr = None if conversion.scores is None else conversion.scores["psnr"]
+        return Made(_file(conversion), {"ply": shown}, psnr=psnr)
+
+    def _paged(self, conversion: Conversion) -> Made:
+        """With the page of it: here the libraries that it takes are there already."""
+        cloud = Cloud.of(_file(conversion), self.name)
+        assert cloud.ply is not None
+        return Made(cloud.ply, page_of(cloud, converts=True), cloud.live)
 
 
 def _missing() -> str | None:
@@ -94,11 +104,10 @@ def _missing() -> str | None:
     return None
 
 
-def made(conversion: Conversion) -> Made:
-    """The file of a conversion."""
+def _file(conversion: Conversion) -> bytes:
     stream = io.BytesIO()
     write_ply(stream, conversion.gaussians, conversion.ply, conversion.normals())
-    return Made(stream.getvalue(), None if conversion.scores is None else conversion.scores["psnr"])
+    return stream.getvalue()
 
 
 def main() -> None:
@@ -122,7 +131,7 @@ def main() -> None:
         warnings.showwarning = note
         console = Telling(tell)
         try:
-            volume = volume or Volume(start.source, console)
+            volume = volume or Volume(start.source, start.name, console)
             tell(volume.live(console) if job is None else volume.under(job, console))
         except VvgtError as error:
             tell(Failed(_plain(error)))

@@ -9,6 +9,7 @@ import re
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -106,32 +107,27 @@ def function_sent(sent: Any) -> TransferFunction:
     return tf
 
 
-def live_page(cloud: Cloud, converts: bool) -> dict[str, Part]:
-    """The page of Gaussians that carry values, and its file.
+def page_of(cloud: Cloud, converts: bool) -> dict[str, bytes]:
+    """The text of a page, named "", and the file that it asks for.
 
     Args:
-        cloud: of it.
+        cloud: what it shows, live where that can be.
         converts: the volume is at hand, to be converted for a function.
 
     Raises:
-        DataError: a library is missing.
+        DataError: a library is missing that pages of live Gaussians need.
     """
-    splats, planes, facts = live_parts(cloud.gaussians, cloud.options)
-    file = compressed_ply(splats, cloud.name)
-    held = base64.b64encode(planes).decode("ascii")
-    parts = f'<script type="{BYTES}" id="{HELD}">{held}</script>\n{SCRIPT}'
-    frames = [{"name": cloud.name, "file": "0.compressed.ply"}]
-    server = {"converts": converts, "name": cloud.name}
-    text = page(cloud.name, splats, frames, parts, {"live": facts, "server": server}).encode("utf-8")
-    return {"": Part(HTML, lambda: text), "0.compressed.ply": Part(BYTES, lambda: file)}
-
-
-def plain_page(cloud: Cloud) -> dict[str, Part]:
-    """The page of Gaussians of one look, and its file."""
-    file = stored(cloud.gaussians, cloud.options)
-    frames = [{"name": cloud.name, "file": "0.ply"}]
-    text = page(cloud.name, columns_of(file, cloud.name), frames, SCRIPT, {"server": {"name": cloud.name}})
-    return {"": Part(HTML, lambda: text.encode("utf-8")), "0.ply": Part(BYTES, lambda: file)}
+    if not cloud.live:
+        file, name = stored(cloud.gaussians, cloud.options), "0.ply"
+        splats, elements, more = columns_of(file, cloud.name), SCRIPT, {}
+    else:
+        splats, planes, facts = live_parts(cloud.gaussians, cloud.options)
+        file, name = compressed_ply(splats, cloud.name), "0.compressed.ply"
+        held = base64.b64encode(planes).decode("ascii")
+        elements = f'<script type="{BYTES}" id="{HELD}">{held}</script>\n{SCRIPT}'
+        more = {"live": facts, "server": {"converts": converts, "name": cloud.name}}
+    text = page(cloud.name, splats, [{"name": cloud.name, "file": name}], elements, more)
+    return {"": text.encode("utf-8"), name: file}
 
 
 class Desk:
@@ -148,8 +144,8 @@ class Desk:
     ) -> None:  # fmt: skip
         self.parts, self.posts, self.name, self.console = parts, posts, name, console
         self.error: VvgtError | None = None
-        self.cloud: Cloud | None = None
-        self.better: Cloud | None = None
+        self.first: Callable[[], Cloud] | None = None
+        self.better: bytes | None = None
         self.converter: Converter | None = None
         self.begun = threading.Event()  # the volume has been read, or cannot be
         self.there = threading.Event()  # the first page, or an error
@@ -166,18 +162,22 @@ class Desk:
             converter.ask(None)
 
     def show(self, cloud: Cloud) -> None:
-        """Show Gaussians, live where they can be."""
-        self.cloud = cloud
-        self.posts["save"] = self.save
-        found = plain_page(cloud)
-        if cloud.live:
-            if self.converter is not None:
-                self.posts["function"] = self.function
-            try:
-                found = live_page(cloud, self.converter is not None)
-            except DataError as error:
-                self.console.say(f"{error}; shown under one function")
-        self.parts.update(found)
+        """Show the Gaussians of a file, live where they can be."""
+        self.first = lambda: cloud
+        try:
+            parts = page_of(cloud, converts=False)
+        except DataError as error:
+            self.console.say(f"{error}; shown under the file's own function")
+            parts = page_of(replace(cloud, gaussians=replace(cloud.gaussians, live=None)), converts=False)
+        self._show(parts, cloud.live)
+
+    def _show(self, parts: dict[str, bytes], live: bool) -> None:
+        if live:
+            self.posts["save"] = self.save
+        if live and self.converter is not None:
+            self.posts["function"] = self.function
+        for name, content in parts.items():
+            self.parts[name] = _part(content, BYTES if name else HTML)
         self.there.set()
 
     def _told(self) -> bytes:
@@ -213,11 +213,11 @@ class Desk:
         keys = {"file", "number", "function"}
         if not isinstance(sent, dict) or sent.get("file") not in ("ply", "html") or not set(sent) <= keys:
             raise DataError("what to save: expected an object with file, ply or html, and a number or a function")
-        cloud, number = self.cloud, sent.get("number")
-        if number is not None:
-            cloud = self.better if number == self.state["number"] else None
-        if cloud is None:
+        better, number = self.better, sent.get("number")
+        if number is not None and (better is None or number != self.state["number"]):
             raise DataError("what was shown is not there any more; try again")
+        assert self.first is not None
+        cloud = self.first() if number is None or better is None else Cloud.of(better, self.name)
         if sent.get("function") is not None and cloud.live:
             cloud = cloud.under(function_sent(sent["function"]))
         return cloud.file(sent["file"])
@@ -243,20 +243,20 @@ class Desk:
             self._better(number, message)
 
     def _first(self, made: Made) -> None:
-        try:
-            self.show(Cloud.of(made.ply, self.name))
-            self.state = {"number": 0, "state": "none", "said": ""}
-        except VvgtError as error:
-            self.error = error
-            self.there.set()
+        self.first = cache(lambda: Cloud.of(made.ply, self.name))
+        self._show(made.parts, made.live)
+        self.state = {"number": 0, "state": "none", "said": ""}
 
     def _better(self, number: int, made: Made) -> None:
-        self.better = Cloud.of(made.ply, self.name)
-        file = stored(self.better.gaussians, self.better.options)
-        self.parts[f"{number}.ply"] = Part(BYTES, lambda: file)
+        self.better = made.ply
+        self.parts[f"{number}.ply"] = _part(made.parts["ply"], BYTES)
         told = "converted" if made.psnr is None else f"converted, {made.psnr:.1f} dB"
         self.state = {"number": number, "state": "done", "said": told, "file": f"{number}.ply"}
         self.console.say(f"{told}, for the function of the page")
+
+
+def _part(content: bytes, kind: str) -> Part:
+    return Part(kind, lambda: content)
 
 
 def plain_name(path: str) -> str:

@@ -180,7 +180,7 @@ def _serve(
         url = stack.enter_context(served(site, request.port))
         if not parts.get(""):
             source = replace(request.source, volume=files[0])
-            desk.await_volume(stack.enter_context(Converter(source, desk.hear)))
+            desk.await_volume(stack.enter_context(Converter(source, desk.name, desk.hear)))
             desk.begun.wait(SOON)
         if desk.error is None:
             announce(url)
