@@ -63,7 +63,7 @@ class Volume:
 
     def __init__(self, source: SourceRequest, name: str, console: Console) -> None:
         self.source, self.name = source, name
-        if automatic(source, console) is None:
+        if automatic(source, Console(quiet=True)) is None:  # `opened` says it
             console.bar("reading")
             content = open_parts(source.path, source.read)
             self.source = replace(source, volume=content, read=ReadOptions())
