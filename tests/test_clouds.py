@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 from pathlib import Path
 
@@ -28,6 +29,9 @@ def test_files_and_index_are_those_of_the_command(vvgt_run, at, kind, blocks):  
     names = [name for name, _ in NAMES[kind]]
     assert (result.kind, list(result), len(result)) == (kind, names, len(names))
     assert repr(result).endswith(f"{names[0]}, {names[1]}>")
+    assert html.unescape(result._repr_html_()).count('<script type="application/octet-stream" id="splats-') == len(
+        names
+    )
     total = result.save("x.ply")
     more = () if blocks is None else ("--blocks", str(blocks))
     assert vvgt_run("convert", *LINES[kind], "-o", "c_{}.ply", *HOW, *more).code == 0

@@ -200,16 +200,6 @@ def test_a_port_of_ones_own_which_may_be_taken(tmp_path, vvgt):
         assert urlsplit(url).port == port
 
 
-def test_a_volume_is_converted_and_shown(tmp_path):
-    args = ("example:blob:12", "--tf", "viridis", "--quiet")
-    with shown(*args, folder=tmp_path) as (_, url):
-        (tmp_path / "got.ply").write_bytes(ask(url, urlsplit(url).path + "0.ply")[1])
-    stored, header = read_ply(tmp_path / "got.ply")
-    assert len(stored) > 10
-    assert header.up == "z"  # +z is up where the volume does not say
-    assert list(tmp_path.iterdir()) == [tmp_path / "got.ply"]
-
-
 def test_globs_become_files_of_gaussians_in_the_order_of_their_numbers(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name in ("a_10.ply", "a_2.ply", "[x].ply", "slice_1.tif", "slice_2.tif"):

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import doctest
+import html
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -16,6 +18,7 @@ import tifffile
 import xarray
 
 import vvgt_cli as vvgt
+from vvgt_cli.gaussians.formats.page_file import read_html
 from vvgt_cli.library import functions
 
 ROOT = Path(__file__).parent.parent
@@ -138,6 +141,10 @@ def test_results_are_drawn_scored_and_shown(field, converted):
     sheet = converted.preview(32)
     assert sheet.shape == (3 * 32, 3 * 32, 3)
     assert converted._repr_png_().startswith(b"\x89PNG")
+    frame = converted._repr_html_()
+    assert re.match(r'<iframe title="array" sandbox="allow-scripts allow-downloads" ', frame)
+    page = html.unescape(re.search(r'srcdoc="([^"]*)"></iframe>$', frame)[1]).encode()
+    assert len(read_html(page, "page")) == len(converted.gaussians)
     scores = vvgt.evaluate(converted, field, TF, spacing=SPACING, seats=False, step=0.5)
     ten = [view["psnr"] for view in scores.scores["per_view"]]
     three = [-10 * np.log10(np.mean([10 ** (-ten[n] / 10) for n in (0, 4, 9)])), np.mean([ten[n] for n in (0, 4, 9)])]

@@ -42,7 +42,10 @@ def command(
     overwrite: bool,
     console: Console,
 ) -> None:
-    """Show FILE in a browser: Gaussians in any supported format, or a volume, which is converted first.
+    """Show FILE in a browser: Gaussians in any supported format, or a volume.
+
+    A volume is shown live within seconds: its transfer function can be changed in the page, for which the volume is
+    then converted in the background.
 
     A server on 127.0.0.1 serves the page to the browser and nobody else; nothing is loaded from the network. The
     address is printed; Ctrl-C ends it. Several files, a glob or the index that convert writes beside several form a
@@ -55,6 +58,7 @@ def command(
     Examples:
       vvgt view frog.ply
       vvgt view example:frog
+      vvgt view head.nrrd --tf bone.json
       vvgt view head_index.json
       vvgt view 'run/*.ply' --port 8000 --no-browser
       vvgt view frog.ply -o frog.html

@@ -6,17 +6,21 @@ part, and what does not name this host, comes from another page, or asks for any
 
 from __future__ import annotations
 
+import json
+import re
 import secrets
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from threading import Thread
+from typing import Any
 from urllib.parse import urlsplit
 
-from vvgt_cli.errors import UsageError, VvgtError
+from vvgt_cli.errors import DataError, UsageError, VvgtError
 
 ADDRESS = "127.0.0.1"
+MOST = 1 << 16  # bytes of what a page may send: a function has hundreds
 NAMES = (ADDRESS, "localhost")  # that a request may know it by; the port is another one behind a tunnel
 _PANELS = "sha256-jHF5hTIlMDyGZRAsNK0HO/WFYrwPvI2I1q0o1xKKB6I="  # event.stopPropagation(), in the viewer's elements
 _HEADERS = {
@@ -50,18 +54,21 @@ class Site:
     """Parts by name; "" is the page.
 
     Attributes:
-        parts: what there is.
+        parts: what there is; may change.
         failed: is told what went wrong with a part.
+        posts: what takes JSON that the page sends to a name, and gives the answer's part; a `VvgtError` is an answer
+            with its reason (400).
         word: random part of the paths.
     """
 
     parts: dict[str, Part]
     failed: Callable[[str], None]
+    posts: dict[str, Callable[[Any], Part]] = field(default_factory=dict)
     word: str = field(default_factory=lambda: secrets.token_urlsafe(12))
 
-    def part(self, path: str) -> Part | None:
-        """What stands at a path of a request, to the letter."""
-        return self.parts.get(path.removeprefix(f"/{self.word}/")) if path.startswith(f"/{self.word}/") else None
+    def name(self, path: str) -> str | None:
+        """What a path of a request names, to the letter; None where it is another's."""
+        return path.removeprefix(f"/{self.word}/") if path.startswith(f"/{self.word}/") else None
 
 
 @contextmanager
@@ -106,7 +113,8 @@ class _Handler(BaseHTTPRequestHandler):
     timeout = 60
 
     def do_GET(self) -> None:
-        part = self.site.part(self.path) if self._ours() else None
+        name = self.site.name(self.path) if self._ours() else None
+        part = None if name is None else self.site.parts.get(name)
         if part is None:
             self.send_error(404 if self._ours() else 403)
             return
@@ -116,7 +124,34 @@ class _Handler(BaseHTTPRequestHandler):
             self.site.failed(str(error))
             self.send_error(500)
             return
-        self.send_response_only(200)
+        self._answer(200, part, content)
+
+    do_HEAD = do_GET
+
+    def do_POST(self) -> None:
+        name = self.site.name(self.path) if self._ours() else None
+        taken = None if name is None else self.site.posts.get(name)
+        if taken is None:
+            self.send_error(405 if self._ours() else 403)
+            return
+        length = self.headers.get("Content-Length", "")
+        if self.headers.get("Content-Type") != "application/json" or not re.fullmatch("[0-9]{1,9}", length):
+            self.send_error(415)  # which a page of another origin cannot send unasked
+            return
+        if int(length) > MOST:
+            self.send_error(413)
+            return
+        try:
+            part = taken(_parsed(self.rfile.read(int(length))))
+            content = part.content()
+        except VvgtError as error:
+            part = Part("text/plain; charset=utf-8", lambda: b"")
+            self._answer(400, part, " ".join(str(error).split()).encode())
+            return
+        self._answer(200, part, content)
+
+    def _answer(self, status: int, part: Part, content: bytes) -> None:
+        self.send_response_only(status)
         self.send_header("Content-Type", part.kind)
         self.send_header("Content-Length", str(len(content)))
         if part.packed:
@@ -126,8 +161,6 @@ class _Handler(BaseHTTPRequestHandler):
         self.end_headers()
         if self.command != "HEAD":
             self.wfile.write(content)
-
-    do_HEAD = do_GET
 
     def _ours(self) -> bool:
         """Whether a request names this machine, and comes from the page itself or from nowhere."""
@@ -149,6 +182,22 @@ class _Handler(BaseHTTPRequestHandler):
 
     def log_message(self, format: str, *args: object) -> None:
         """Requests are not talked about."""
+
+
+def _parsed(content: bytes) -> Any:
+    """JSON that was sent.
+
+    Raises:
+        DataError: it is none.
+    """
+    try:
+        return json.loads(content.decode("utf-8"), parse_constant=_no_number)
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"what was sent is no JSON ({error}); expected an object") from None
+
+
+def _no_number(text: str) -> None:
+    raise ValueError(f"{text} is no number")
 
 
 def _name(url: str) -> str | None:

@@ -2,26 +2,27 @@
 
 from __future__ import annotations
 
-import io
 import os
 import sys
 import time
 import webbrowser
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 
+from vvgt_cli.commands.converter import Converter
+from vvgt_cli.commands.live_site import BYTES, HTML, SCRIPT, Cloud, Desk, plain_name, stored
 from vvgt_cli.commands.server import Part, Site, served
 from vvgt_cli.conversion.gaussian_files import STDIN, is_page, layout_of, open_gaussians, write_gaussians, write_page
 from vvgt_cli.conversion.index import files_of, is_index
 from vvgt_cli.conversion.readback import tell_agreement
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.source import SourceRequest
-from vvgt_cli.gaussians import Gaussians, PlyOptions, write_ply
+from vvgt_cli.gaussians import Gaussians, PlyOptions
 from vvgt_cli.gaussians.formats import SUFFIXES, is_splats
-from vvgt_cli.gaussians.formats.page_file import PROGRAM, asset, page, upright
+from vvgt_cli.gaussians.formats.page_file import PROGRAM, asset, page
 from vvgt_cli.gaussians.formats.splats import columns_of
 from vvgt_cli.gaussians.outputs import Output, claimed
 from vvgt_cli.jit.ahead import DRAW, for_degree
@@ -30,6 +31,8 @@ from vvgt_cli.score.record import ConversionReport, Run
 from vvgt_cli.volume.slices import matching
 
 TICK = 0.2  # seconds within which Ctrl-C is answered
+SOON = 10.0  # seconds of reading after which a page is shown that waits; what fails sooner is told without one
+LINGER = 1.0  # seconds in which such a page hears why nothing comes
 
 
 @dataclass(frozen=True)
@@ -157,43 +160,50 @@ def _opened(run: Run, request: ViewRequest, name: str) -> tuple[Gaussians, PlyOp
     return conversion.gaussians, conversion.ply
 
 
-def _stored(gaussians: Gaussians, options: PlyOptions) -> bytes:
-    stream = io.BytesIO()
-    write_ply(stream, gaussians, upright(options))
-    return stream.getvalue()
-
-
 def _serve(
     run: Run, request: ViewRequest, clouds: Sequence[tuple[str, str]], announce: Callable[[str], None]
 ) -> None:  # fmt: skip
     files = [file for _, file in clouds]
     _only_gaussians(files)
-    first = _stored(*_opened(run, request, files[0]))
+    parts = {"viewer.js": Part("text/javascript; charset=utf-8", lambda: asset(PROGRAM), packed=True)}
+    site = Site(parts, run.console.say)
+    desk = Desk(site.parts, site.posts, plain_name(files[0]), run.console)
+    with ExitStack() as stack:
+        stack.enter_context(suppress(KeyboardInterrupt))
+        if len(files) > 1:
+            _refuse_reading(request.source, files[0])
+            parts |= _series(clouds)
+        elif files[0] == STDIN or is_splats(files[0]):
+            _refuse_reading(request.source, files[0])
+            gaussians, header = open_gaussians(files[0])
+            desk.show(Cloud(gaussians, layout_of(header), desk.name))
+        url = stack.enter_context(served(site, request.port))
+        if not parts.get(""):
+            source = replace(request.source, volume=files[0])
+            desk.await_volume(stack.enter_context(Converter(source, desk.name, desk.hear)))
+            desk.begun.wait(SOON)
+        if desk.error is None:
+            announce(url)
+            opened = request.browser and display() and webbrowser.open(url)
+            run.console.say(f"{'shown in a browser' if opened else 'open this address in a browser'}; Ctrl-C ends")
+        while desk.error is None:
+            time.sleep(TICK)  # a signal may reach another thread, which wakes nobody here
+        if desk.waited_for:
+            time.sleep(LINGER)
+        raise desk.error
 
-    @cache
-    def name_of(k: int) -> str:
-        return f"{k}.ply"
+
+def _series(clouds: Sequence[tuple[str, str]]) -> dict[str, Part]:
+    """The page of several files, and each as it is asked for."""
 
     def content(k: int) -> bytes:
-        if k == 0:
-            return first
-        gaussians, header = open_gaussians(files[k])
-        return _stored(gaussians, layout_of(header))
+        gaussians, header = open_gaussians(clouds[k][1])
+        return stored(gaussians, layout_of(header))
 
-    frames = [{"name": name, "file": name_of(k)} for k, (name, _) in enumerate(clouds)]
-    text = page(f"{frames[0]['name']} - vvgt", columns_of(first, files[0]), frames, '<script src="viewer.js"></script>')
-    parts = {
-        "": Part("text/html; charset=utf-8", lambda: text.encode("utf-8")),
-        "viewer.js": Part("text/javascript; charset=utf-8", lambda: asset(PROGRAM), packed=True),
-    }
-    parts |= {name_of(k): Part("application/octet-stream", partial(content, k)) for k in range(len(files))}
-    with served(Site(parts, run.console.say), request.port) as url:
-        announce(url)
-        opened = request.browser and display() and webbrowser.open(url)
-        run.console.say(f"{'shown in a browser' if opened else 'open this address in a browser'}; Ctrl-C ends")
-        with suppress(KeyboardInterrupt):
-            while True:
-                time.sleep(TICK)  # a signal may reach another thread, which wakes nobody here
+    first, frames = content(0), [{"name": name, "file": f"{k}.ply"} for k, (name, _) in enumerate(clouds)]
+    text = page(f"{clouds[0][0]} - vvgt", columns_of(first, clouds[0][1]), frames, SCRIPT)
+    parts = {f"{k}.ply": Part(BYTES, partial(content, k)) for k in range(len(clouds))}
+    return parts | {"": Part(HTML, lambda: text.encode("utf-8")), "0.ply": Part(BYTES, lambda: first)}
 
 
 def display() -> bool:

@@ -30,7 +30,7 @@ from vvgt_cli.conversion.index import (
 from vvgt_cli.conversion.labels import shared_out, split
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.conversion.result import Conversion, Result
-from vvgt_cli.errors import UsageError
+from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.formats import SUFFIXES, format_of
@@ -137,14 +137,27 @@ class Clouds(Mapping[str, Result]):
 
     def _page(self, path: str, overwrite: bool, how: dict[str, Any]) -> int:
         """All in one file."""
+        if how:
+            raise UsageError(f"{path}: a page shows the unit frame as it is; leave out {', '.join(how)}")
+        with atomic_write(path, overwrite) as temporary:
+            return temporary.write_bytes(self._html(path))
+
+    def _html(self, name: str) -> bytes:
+        """The page of all."""
         from vvgt_cli.gaussians.formats.page_file import html_of_several, upright
         from vvgt_cli.gaussians.formats.splats import splats_of
 
-        if how:
-            raise UsageError(f"{path}: a page shows the unit frame as it is; leave out {', '.join(how)}")
         shown = [(cloud.name, splats_of(cloud.gaussians, upright(cloud.ply))) for cloud in self.clouds]
-        with atomic_write(path, overwrite) as temporary:
-            return temporary.write_bytes(html_of_several(shown, path))
+        return html_of_several(shown, name)
+
+    def _repr_html_(self) -> str | None:
+        """What notebooks show; see `Result`."""
+        from vvgt_cli.gaussians.formats.page_file import framed
+
+        try:
+            return framed(self._html(self.volume), self.volume)
+        except DataError:
+            return None
 
 
 def frames_in_memory(request: ConvertRequest, console: Console) -> Clouds:

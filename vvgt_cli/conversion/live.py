@@ -55,14 +55,25 @@ def check_live(request: ConvertRequest) -> None:
         raise UsageError(f"--live: a file for every function, unlit and made in one way; leave out {', '.join(names)}")
 
 
-def live_conversion(run: Run, request: ConvertRequest, field: Field, ply: PlyOptions) -> Conversion:
-    """Place, look up, bake, score; ``ply`` as of an ordinary conversion.
+def refusal(request: ConvertRequest, source: Source) -> str | None:
+    """Why there is no live file of a source; None where there is one."""
+    try:
+        check_live(request)
+        source.one_field()
+    except UsageError as error:
+        return str(error)
+    return None
+
+
+def live_conversion(
+    run: Run, request: ConvertRequest, field: Field, ply: PlyOptions, scored: bool = True
+) -> Conversion:  # fmt: skip
+    """Place, look up, bake, score where asked to; ``ply`` as of an ordinary conversion.
 
     Raises:
         UsageError: labels, channels or layers.
         DataError: nothing is visible.
     """
-    from vvgt_cli.dvr import RenderSettings
     from vvgt_cli.look.fog import fog
 
     source, fit = field.source, request.fit
@@ -77,6 +88,18 @@ def live_conversion(run: Run, request: ConvertRequest, field: Field, ply: PlyOpt
     gaussians = wide_enough(gaussians, fit.size)
     table = table_of(source)
     gaussians = as_stored(baked(gaussians, table))
+    if scored:
+        _score(run, request, field, gaussians, table)
+    facts = LiveFacts.of(source.volume, source.statistics, tf)
+    ply = replace(ply, light=None, sh_degree=0, live=facts)
+    return Conversion(out_of_box(gaussians, source.volume), run.report, ply, field)
+
+
+def _score(run: Run, request: ConvertRequest, field: Field, gaussians: Gaussians, table: Table) -> None:
+    """As `vvgt recolor` shows them under the function, and as other viewers do."""
+    from vvgt_cli.dvr import RenderSettings
+
+    fit, tf = request.fit, field.source.tf
     with run.stage("live look") as stage:
         live = score_test_views(
             field, shown_by(gaussians, table), fit.size, RenderSettings(), rule=fit.rule, perceptual=False,
@@ -88,9 +111,6 @@ def live_conversion(run: Run, request: ConvertRequest, field: Field, ply: PlyOpt
     work = Work(run, field, fit, gaussians=gaussians)
     for stage_of_scores in (TestViews(request.scored_whole), ViewingConditions()):
         stage_of_scores.run(work)
-    facts = LiveFacts.of(source.volume, source.statistics, tf)
-    ply = replace(ply, light=None, sh_degree=0, live=facts)
-    return Conversion(out_of_box(gaussians, source.volume), run.report, ply, field)
 
 
 def table_of(source: Source) -> Table:

@@ -12,9 +12,11 @@ import numpy as np
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.cameras.sets import SIZE
 from vvgt_cli.conversion.place import AUTO, NONE, into_box, preview, upright, way_up
+from vvgt_cli.errors import DataError
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import Gaussians, PlyOptions, write_ply
 from vvgt_cli.gaussians.formats import encoded, format_of
+from vvgt_cli.gaussians.formats.page_file import framed
 from vvgt_cli.gaussians.rules import INRIA, rule_of
 from vvgt_cli.score.record import ConversionReport, StageRecord
 from vvgt_cli.score.viewing import PREVIEW_VIEWS
@@ -120,6 +122,16 @@ class Result:
         """Normals (K, 3) that a `.ply` of them has, unit frame; None for zeros."""
         return None
 
+    def _repr_html_(self) -> str | None:
+        """What notebooks show: the page, live where the Gaussians are; nothing where a library is missing."""
+        name = str(self.report.volume.get("name") or "result")
+        page = format_of("x.html")
+        assert page is not None
+        try:
+            return framed(encoded(page, self.gaussians, self.ply, name), name)
+        except DataError:
+            return None
+
     def render(self, camera: Camera | None = None, *, size: int | None = None, rule: str | None = None) -> np.ndarray:
         """The Gaussians as viewers draw them.
 
@@ -177,7 +189,7 @@ class Conversion(Result):
         return preview(self.field, inside, [cameras[n] for n in views], axes, self.ply.rule or INRIA)
 
     def _repr_png_(self) -> bytes:
-        """What notebooks show."""
+        """What stands for it where a notebook is not shown by a browser."""
         from vvgt_cli.images import png_bytes
 
         return png_bytes(self.preview(SIZE, (FROM_THE_SIDE,)))

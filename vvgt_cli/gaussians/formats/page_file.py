@@ -89,7 +89,16 @@ def page(
         parts: elements that bring the viewer.
         more: of the scene, for the program.
     """
-    scene = {"rule": drawing(splats), "camera": camera(splats), "frames": list(frames), **more}
+    return _text(title, {"rule": drawing(splats), "camera": camera(splats), "frames": list(frames), **more}, parts)
+
+
+def waiting_page(title: str, parts: str) -> str:
+    """The text of a page whose Gaussians are being made: it asks the server how far they are."""
+    place = {"position": [0, 0, _DISTANCE], "target": [0, 0, 0], "fov": _FIELD}
+    return _text(title, {"waits": True, "camera": place, "frames": []}, parts)
+
+
+def _text(title: str, scene: Mapping[str, Any], parts: str) -> str:
     said = json.dumps(scene).replace("<", "\\u003c")  # no name ends the script
     text = asset("page.html").decode("utf-8")
     for place, value in (("TITLE", escape(title)), ("SCENE", said), ("PARTS", parts)):
@@ -129,6 +138,14 @@ def html_of_several(
         {"name": cloud, "file": f"{k}.compressed.ply", "held": f"splats-{k}"} for k, (cloud, _) in enumerate(clouds)
     ]
     return page(_title(name), clouds[0][1], frames, "\n".join(elements), more).encode("utf-8")
+
+
+def framed(content: bytes, name: str) -> str:
+    """A page within another, as notebooks show it: its program reaches nothing of that one, and no network."""
+    text = escape(content.decode("utf-8"))
+    style = "width: 100%; height: 540px; border: 0; background: #000"
+    allowed = 'sandbox="allow-scripts allow-downloads" allow="fullscreen"'
+    return f'<iframe title="{escape(name)}" {allowed} style="{style}" srcdoc="{text}"></iframe>'
 
 
 def _title(name: str) -> str:

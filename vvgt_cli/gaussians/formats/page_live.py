@@ -11,7 +11,7 @@ import numpy as np
 from vvgt_cli.gaussians import Gaussians, PlyOptions
 from vvgt_cli.gaussians.formats.live import live_bytes, live_json
 from vvgt_cli.gaussians.formats.page_file import html_of_several, upright
-from vvgt_cli.gaussians.formats.splats import morton_order, splats_of
+from vvgt_cli.gaussians.formats.splats import Splats, morton_order, splats_of
 from vvgt_cli.gaussians.frames import turn, up_matrix
 from vvgt_cli.gaussians.live import law_nodes
 from vvgt_cli.gaussians.live_facts import LiveFacts
@@ -31,6 +31,20 @@ def live_html(gaussians: Gaussians, options: PlyOptions, name: str) -> bytes:
     Raises:
         DataError, UsageError: as `splats_of`, or a library that is missing.
     """
+    splats, planes, facts = live_parts(gaussians, options)
+    return html_of_several([(name, splats)], name, {HELD: planes}, {"live": facts})
+
+
+def live_parts(gaussians: Gaussians, options: PlyOptions) -> tuple[Splats, bytes, dict[str, Any]]:
+    """What a page of Gaussians (unit frame) that carry values is made of.
+
+    Returns:
+        the columns, in an order that `.compressed.ply` keeps; the bytes of their values, in that order, packed by
+        gzip; the facts about them that are the scene's ``live``.
+
+    Raises:
+        DataError, UsageError: as `live_html`.
+    """
     assert gaussians.live is not None
     assert options.live is not None
     facts, laid = options.live, upright(options)
@@ -38,8 +52,7 @@ def live_html(gaussians: Gaussians, options: PlyOptions, name: str) -> bytes:
     turned = turn(gaussians, laid.up)
     splats = splats_of(replace(gaussians, live=None), replace(laid, live=None))
     planes = np.ascontiguousarray(live_bytes(turned, facts)[:, PLANES].T)
-    parts = {HELD: gzip.compress(planes.tobytes(), 9, mtime=0)}
-    return html_of_several([(name, splats)], name, parts, {"live": _facts(gaussians, options, laid.up)})
+    return splats, gzip.compress(planes.tobytes(), 9, mtime=0), _facts(gaussians, options, laid.up)
 
 
 def _facts(gaussians: Gaussians, options: PlyOptions, up: str) -> dict[str, Any]:
@@ -50,6 +63,7 @@ def _facts(gaussians: Gaussians, options: PlyOptions, up: str) -> dict[str, Any]
     said.pop("function")
     return said | {
         "held": HELD,
+        "opacity_unit_distance": options.unit_distance or 1.0,
         "law": law_nodes().tolist(),
         "name": facts.baked().get("name", ""),
         "nodes": nodes_of(facts),

@@ -6,6 +6,7 @@ import { Asset, SHADERLANGUAGE_GLSL, ShaderChunks } from 'playcanvas';
 import { liveLook } from './live.mjs';
 import panelCss from './panel.css';
 import { panel, named } from './panel.mjs';
+import { served, waiting } from './server.mjs';
 
 const KEPT = 16;  // frames of a series that stay in memory
 const PAUSE = 200;  // milliseconds from one frame of a series to the next
@@ -132,6 +133,7 @@ async function start() {
   const style = document.createElement('style');
   style.textContent = css + panelCss;
   document.head.append(style);
+  if (scene.waits) return waiting(said);
   const { file } = scene.frames[0];
   const response = await content(scene.frames[0]);
   if (!response.ok) throw new Error(`${scene.frames[0].name} cannot be read`);
@@ -150,6 +152,7 @@ async function start() {
   viewer.state.cameraMode = 'orbit';  // the viewer would turn the object
   if (scene.frames.length === 1 && !scene.live) document.body.append(named('baked'));
   const live = scene.live ? panel(await liveLook(viewer, scene.live), viewer, scene.live) : null;
+  if (live) served(live, viewer, scene.live, scene.server);
   said.textContent = '';
   window.vvgt = { viewer, live, show: scene.frames.length > 1 ? series(viewer) : null };
 }

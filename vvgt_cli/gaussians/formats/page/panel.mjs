@@ -70,7 +70,7 @@ export function panel(look, viewer, live) {
   const find = (selector) => root.querySelector(selector), [lo, hi] = live.values, span = hi - lo || 1;
   const across = (x) => 6 + ((WIDE - 12) * (x - lo)) / span, value = (p) => Math.min(Math.max(lo + (span * (p - 6)) / (WIDE - 12), lo), hi);
   const ready = presets(live), undone = [];
-  let nodes = fewer(live.nodes), exact = live.nodes, chosen = 0, due = false;  // exact: of the file until an edit
+  let nodes = fewer(live.nodes), exact = live.nodes, chosen = 0, due = false, told = () => {};  // exact: of the file until an edit
 
   function draw() {
     const curve = Array.from({ length: WIDE - 11 }, (_, k) => `${k + 6},${height(functionAt(exact ?? nodes, value(k + 6)).y).toFixed(2)}`).join('L');
@@ -101,6 +101,7 @@ export function panel(look, viewer, live) {
 
   function show() {
     draw();
+    told(false);
     if (due) return;
     due = true;
     requestAnimationFrame(() => {
@@ -230,6 +231,7 @@ export function panel(look, viewer, live) {
     const k = axis.selectedIndex - 1, [low, high] = live.box;
     look.cut(k < 0 ? null : k, k < 0 ? 0 : low[k] + ((high[k] - low[k]) * slider.value) / 1000, flip.getAttribute('aria-pressed') === 'true');
     slider.disabled = flip.disabled = k < 0;
+    told(true);
   }
   axis.addEventListener('change', cut);
   slider.addEventListener('input', cut);
@@ -257,5 +259,5 @@ export function panel(look, viewer, live) {
   cut();
   fold(innerWidth < 700);
   draw();
-  return { look, nodes: () => copy(exact ?? nodes), set(now) { keep(); [nodes, exact, chosen] = [copy(now), null, 0]; show(); } };
+  return { root, look, changed(f) { told = f; }, cutting: () => axis.selectedIndex > 0, nodes: () => copy(exact ?? nodes), set(now) { keep(); [nodes, exact, chosen] = [copy(now), null, 0]; show(); } };
 }

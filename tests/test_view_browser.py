@@ -1,0 +1,97 @@
+"""`vvgt view VOLUME` in a browser: live at once, better when it is converted, saved; a page within a notebook's."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from browser import PAGES, browser, packages
+
+import vvgt_cli as vvgt
+from tests.test_formats_browser import shoot
+from tests.test_formats_server import shown
+from vvgt_cli.cameras import orbit_views
+from vvgt_cli.cli.main import run
+from vvgt_cli.gaussians import read_ply
+from vvgt_cli.gaussians.formats import read_splats
+from vvgt_cli.images import read_png
+from vvgt_cli.images.metrics import psnr
+from vvgt_cli.splat import render
+
+pytestmark = pytest.mark.long
+SHELL = {
+    "points": [
+        {"x": 0, "rgb": [1, 0.2, 0.1], "opacity": 0}, {"x": 0.35, "rgb": [1, 0.8, 0.2], "opacity": 0.02},
+        {"x": 0.45, "rgb": [0.2, 0.6, 1], "opacity": 0.3}, {"x": 0.55, "rgb": [0.2, 0.4, 1], "opacity": 0},
+        {"x": 1.5, "rgb": [1, 1, 1], "opacity": 0},
+    ],
+    "opacity_unit_distance": 0.04,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("size", [(1280, 800), (390, 844)], ids="{0[0]}".format)
+def test_a_function_that_is_dragged_is_live_at_once_and_then_converted(size: tuple[int, int], tmp_path: Path) -> None:
+    (tmp_path / "shell.json").write_text(json.dumps(SHELL))
+    with shown("example:blob:24", "--tf", "shell.json", folder=tmp_path) as (_, url):
+        job = {"browser": browser(), "url": url, "size": size, "folder": str(tmp_path)}
+        (tmp_path / "job.json").write_text(json.dumps(job))
+        command = ["node", str(PAGES / "served.mjs"), str(tmp_path / "job.json"), str(packages())]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=2400)
+    assert done.returncode == 0, done.stderr
+    noted = json.loads(done.stdout.splitlines()[-1])
+    assert (noted["began"], noted["dragging"], noted["live"], noted["asked"]) == ("live", "live", "live", "")
+    assert noted["better"].startswith("converted, ")
+    assert float(noted["better"].split()[1]) > 30
+    assert max(noted["moved"]) < 2e-3  # it may still glide
+    assert (noted["cut"], noted["uncut"], noted["changed"]) == ("live", noted["better"], "live")
+    assert noted["refused"] == "not now"
+    assert noted["saved"] == ["blob-24.ply", "blob-24.html", "tf.json"]
+    function = json.loads((tmp_path / "tf.json").read_text())
+    assert [point["x"] for point in function["points"]] != [point["x"] for point in SHELL["points"]]
+    pictures = {name: square(read_png(tmp_path / f"{name}.png")[..., :3]) for name in ("live", "better")}
+    edge = len(pictures["live"])
+    camera = orbit_views(1, size=edge)[0]
+    _, (volume,) = vvgt.render_views("example:blob:24", function, [camera])
+    live, better = (psnr(volume[..., :3], pictures[name]) for name in ("live", "better"))
+    print(f"{size}: against the volume at {edge} px: live {live:.2f} dB, converted {better:.2f} dB")
+    assert better > live + 2
+    saved = render(read_ply(tmp_path / "blob-24.ply")[0], camera, rule="inria")[..., :3]
+    assert psnr(saved, pictures["better"]) > 38
+    assert len(read_splats(tmp_path / "blob-24.html")[0]) == len(read_ply(tmp_path / "blob-24.ply")[0])
+
+
+def square(image: np.ndarray) -> np.ndarray:
+    """The middle of a picture."""
+    height, width = image.shape[:2]
+    edge = min(height, width)
+    top, left = (height - edge) // 2, (width - edge) // 2
+    return image[top : top + edge, left : left + edge]
+
+
+def test_a_live_file_is_served_as_its_page_in_a_file_shows_it(tmp_path: Path) -> None:
+    live = tmp_path / "blob.ply"
+    how = ["--live", "--max-gaussians", "5000", "--size", "256", "--quiet"]
+    assert run(["convert", "example:blob:24", *how, "-o", str(live)]) == 0
+    assert run(["view", str(live), "-o", str(tmp_path / "blob.html"), "--quiet"]) == 0
+    one, _ = shoot((tmp_path / "blob.html").as_uri(), tmp_path)
+    with shown("blob.ply", folder=tmp_path) as (_, url):
+        other, _ = shoot(url, tmp_path)
+    assert psnr(one, other) > 45
+
+
+def test_a_result_is_shown_within_a_notebooks_page(tmp_path: Path) -> None:
+    goal: dict[str, Any] = {"max_gaussians": 3000, "size": 128}
+    frame = vvgt.convert("example:blob:24", "viridis", goal, live=True)._repr_html_()
+    (tmp_path / "notebook.html").write_text(f"<!doctype html><body style='margin:0'>{frame}</body>")
+    job = {"browser": browser(), "url": (tmp_path / "notebook.html").as_uri(), "out": str(tmp_path / "a.png")}
+    (tmp_path / "job.json").write_text(json.dumps(job))
+    command = ["node", str(PAGES / "framed.mjs"), str(tmp_path / "job.json"), str(packages())]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=1200)
+    assert done.returncode == 0, done.stderr
+    noted = json.loads(done.stdout.splitlines()[-1])
+    assert noted == {"asked": [], "errors": [], "kind": "live", "saved": "tf.json"}
+    assert (read_png(tmp_path / "a.png")[..., :3].max(axis=-1) > 0.2).mean() > 0.02

@@ -1,0 +1,345 @@
+"""`vvgt view` of volumes and live files: the page of the live form, conversions for its function, files to save."""
+
+from __future__ import annotations
+
+import http.client
+import io
+import json
+import os
+import re
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+
+from tests.test_formats_server import ask, cloud, shown
+from tests.test_live import HI, LO, RAMP, facts
+from tests.test_live import cloud as live_cloud
+from vvgt_cli.commands.converter import Converter, Failed, Made
+from vvgt_cli.commands.live_site import Cloud, Desk, function_sent, plain_name
+from vvgt_cli.commands.server import Part, Site, served
+from vvgt_cli.conversion.live import refusal
+from vvgt_cli.conversion.request import ConvertRequest
+from vvgt_cli.errors import DataError
+from vvgt_cli.field.source import SourceRequest, load
+from vvgt_cli.gaussians import PlyOptions, read_ply, write_ply
+from vvgt_cli.gaussians.formats.page_file import read_html
+from vvgt_cli.gaussians.live import Table, baked
+from vvgt_cli.progress import Console
+from vvgt_cli.volume import Volume
+
+FUNCTION = {
+    "name": "mine",
+    "points": [{"x": 0.2, "rgb": [1, 0, 0], "opacity": 0}, {"x": 0.9, "rgb": [1, 1, 0], "opacity": 0.5}],
+    "opacity_unit_distance": 0.1,
+}
+AT_ONCE = 30.0  # seconds: a moment, on a busy machine
+
+
+def send(url: str, name: str, what: Any, **headers: str) -> tuple[int, bytes]:
+    """Status and body of what JSON that is sent gets."""
+    place = urlsplit(url)
+    connection = http.client.HTTPConnection("127.0.0.1", place.port, timeout=120)
+    body = what if isinstance(what, bytes) else json.dumps(what).encode()
+    told = {"Content-Type": "application/json"} | {key.replace("_", "-"): value for key, value in headers.items()}
+    connection.request("POST", place.path + name, body, told)
+    answer = connection.getresponse()
+    return answer.status, answer.read()
+
+
+def scene_of(url: str) -> dict[str, Any]:
+    found = re.search(r'id="scene">(.*?)</script>', ask(url)[1].decode(), re.S)
+    assert found is not None
+    return dict(json.loads(found[1]))
+
+
+def state_of(url: str) -> dict[str, Any]:
+    return dict(json.loads(ask(url, urlsplit(url).path + "state")[1]))
+
+
+def until(what: Any, seconds: float = 600) -> None:
+    end = time.monotonic() + seconds
+    while not what():
+        assert time.monotonic() < end
+        time.sleep(0.1)
+
+
+def workers(parent: int) -> dict[int, float]:
+    """Processes of a server, each with the seconds of processor time that it has taken."""
+    rows = subprocess.run(["ps", "-eo", "pid,ppid,cputimes"], capture_output=True, text=True, check=True).stdout
+    table = [list(map(int, row.split())) for row in rows.splitlines()[1:]]
+    return {pid: seconds for pid, above, seconds in table if above == parent}
+
+
+@pytest.fixture
+def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder for temporary files of the programs that a test starts."""
+    folder = tmp_path / "temporary"
+    folder.mkdir()
+    monkeypatch.setenv("TMPDIR", str(folder))
+    return folder
+
+
+def test_a_volume_is_shown_live_and_converted_for_the_pages_function(tmp_path: Path, temporary: Path) -> None:
+    folder = tmp_path / "here"
+    folder.mkdir()
+    with shown("example:blob:12", "--tf", "viridis", folder=folder) as (child, url):
+        until(lambda: not scene_of(url).get("waits"))
+        scene = scene_of(url)
+        assert scene["server"] == {"converts": True, "name": "blob-12"}
+        assert scene["live"]["values"][1] == pytest.approx(0.9, abs=0.1)
+        path = urlsplit(url).path
+        assert len(Cloud.of(send(url, "save", {"file": "ply"})[1], "x").gaussians) > 1000
+        # a function: the next one ends the work for it
+        assert send(url, "function", {**FUNCTION, "name": "first"}) == (200, b'{"number": 2}')
+        first = set(workers(child.pid))
+        assert send(url, "function", FUNCTION) == (200, b'{"number": 3}')
+        assert not first & set(workers(child.pid))
+        until(lambda: state_of(url)["state"] != "working")
+        state = state_of(url)
+        assert (state["number"], state["state"]) == (3, "done")
+        assert re.fullmatch(r"converted, [3-9]\d\.\d dB", state["said"])
+        shown_now, header = read_ply(io.BytesIO(ask(url, path + state["file"])[1]))
+        assert header.live is None
+        assert header.up == "z"
+        status, saved = send(url, "save", {"file": "ply", "number": 3})
+        kept = Cloud.of(saved, "x")
+        assert status == 200
+        assert (kept.options.up, kept.options.unit_distance) == ("none", 0.1)
+        assert len(kept.gaussians) == len(shown_now) > 10
+        assert len(read_html(send(url, "save", {"file": "html", "number": 3})[1], "x")) == len(shown_now)
+        # the live form under the function, as a file that is live
+        status, saved = send(url, "save", {"file": "ply", "function": FUNCTION})
+        live = Cloud.of(saved, "x")
+        assert live.live
+        assert live.options.live is not None
+        assert live.options.live.baked()["name"] == "mine"
+        assert b'"live"' in send(url, "save", {"file": "html", "function": FUNCTION})[1]
+        # no function: nothing is at work, and what was made is gone
+        assert send(url, "function", None)[0] == 200
+        assert ask(url, path + state["file"])[0] == 404
+        assert send(url, "save", {"file": "ply", "number": 3})[0] == 400
+        child.send_signal(signal.SIGINT)
+        _, said = child.communicate(timeout=60)
+        assert child.returncode == 0
+        assert "Traceback" not in said
+    assert list(temporary.iterdir()) == list(folder.iterdir()) == []
+
+
+def test_what_is_cancelled_stops_and_an_interrupt_leaves_nothing(tmp_path: Path, temporary: Path) -> None:
+    with shown("example:blob:12", "--tf", "viridis", folder=tmp_path) as (child, url):
+        until(lambda: not scene_of(url).get("waits"))
+        send(url, "function", FUNCTION)
+        until(lambda: sum(workers(child.pid).values()) > 2)  # at work
+        begin = time.monotonic()
+        assert send(url, "function", None)[0] == 200
+        assert not workers(child.pid)
+        assert time.monotonic() - begin < AT_ONCE
+        assert len(list(temporary.iterdir())) == 1  # the folder itself
+        assert list(next(temporary.iterdir()).iterdir()) == []
+        send(url, "function", FUNCTION)
+        until(lambda: sum(workers(child.pid).values()) > 2)
+        (pid,) = workers(child.pid)
+        child.send_signal(signal.SIGINT)
+        child.send_signal(signal.SIGINT)  # impatiently
+        assert child.wait(60) == 0
+        until(lambda: not os.path.exists(f"/proc/{pid}"), AT_ONCE)
+    assert list(temporary.iterdir()) == []
+
+
+def test_a_conversion_ends_with_a_server_that_is_killed(tmp_path: Path, temporary: Path) -> None:
+    with shown("example:blob:12", "--tf", "viridis", folder=tmp_path) as (child, _):
+        until(lambda: bool(workers(child.pid)))
+        (pid,) = workers(child.pid)
+        child.kill()
+        until(lambda: not os.path.exists(f"/proc/{pid}"), AT_ONCE)
+    assert list(temporary.iterdir()) == []
+
+
+@pytest.fixture
+def desk(tmp_path: Path) -> Iterator[tuple[str, Desk]]:
+    """The site of a live file, which says that it converts, without a process."""
+
+    class Still(Converter):
+        def ask(self, job: Any) -> int:
+            self._number += 1
+            return self._number
+
+    site = Site({}, print)
+    found = Desk(site.parts, site.posts, "x", Console(quiet=True))
+    some = baked(live_cloud(), Table.of(RAMP, LO, HI, 0.05))
+    found.converter = Still(SourceRequest("none"), "x", found.hear)
+    found.parts["state"] = Part("application/json", found._told)
+    found.show(Cloud(some, PlyOptions(up="y", scale=0.1, unit_distance=0.5, live=facts()), "x"))
+    with served(site) as url:
+        yield url, found
+
+
+@pytest.mark.parametrize(
+    ("sent", "said"),
+    [
+        (b"{", "no JSON"),
+        (b"\xff", "no JSON"),
+        (b"[" * 60000, "no JSON"),
+        (b'{"points": NaN}', "NaN is no number"),
+        ([], "a list of at most"),
+        ({}, "a list of at most"),
+        ({**FUNCTION, "points": "x"}, "a list of at most"),
+        ({**FUNCTION, "points": []}, "expected a list of objects"),
+        ({**FUNCTION, "points": [{"x": 0}]}, "points[0]"),
+        ({**FUNCTION, "points": [{"x": 0, "opacity": 2, "rgb": [1, 1, 1]}]}, "opacit"),
+        ({**FUNCTION, "points": [{"x": "a", "opacity": 1, "rgb": [1, 1, 1]}]}, "points[0].x"),
+        ({**FUNCTION, "points": [{"x": 1, "opacity": 1, "rgb": [1, 1]}]}, "points[0].rgb"),
+        ({**FUNCTION, "opacity_unit_distance": 0}, "unit distance"),
+        ({**FUNCTION, "opacity_unit_distance": None}, "opacity_unit_distance"),
+        ({**FUNCTION, "range": "foreground"}, "'range'"),
+        ({**FUNCTION, "file": "/etc/passwd"}, "'file'"),
+    ],
+)  # fmt: skip
+def test_what_is_no_function_is_refused_with_the_reason(desk: tuple[str, Desk], sent: Any, said: str) -> None:
+    url, of = desk
+    status, text = send(url, "function", sent)
+    assert status == 400
+    assert said in text.decode()
+    assert b"\n" not in text
+    assert of.state["number"] == 0
+
+
+def test_who_may_send_what(desk: tuple[str, Desk]) -> None:
+    url, of = desk
+    assert send(url, "function", FUNCTION, Origin="http://evil.example")[0] == 403
+    assert send(url, "function", FUNCTION, Host="evil.example")[0] == 403
+    assert send(url, "function", FUNCTION, Sec_Fetch_Site="cross-site")[0] == 403
+    assert send(url, "function", FUNCTION, Content_Type="text/plain")[0] == 415
+    assert send(url, "function", FUNCTION, Content_Length="-1")[0] == 415
+    assert send(url, "function", b" " * (1 << 17))[0] == 413
+    assert send(url, "", FUNCTION)[0] == 405
+    assert send(url, "../function", FUNCTION)[0] == 405
+    assert ask(url, urlsplit(url).path + "function")[0] == 404
+    assert of.state["number"] == 0
+    assert send(url, "function", FUNCTION, Origin=f"http://127.0.0.1:{urlsplit(url).port}")[0] == 200
+    assert of.state["number"] == 1
+
+
+@pytest.mark.parametrize(
+    "sent",
+    [None, {}, {"file": "png"}, {"file": "../x.ply"}, {"file": "ply", "number": 7}, {"file": "ply", "path": "/tmp/x"},
+     {"file": "ply", "function": {}}],
+)  # fmt: skip
+def test_what_cannot_be_saved_is_refused(desk: tuple[str, Desk], sent: Any) -> None:
+    assert send(desk[0], "save", sent)[0] == 400
+
+
+def test_the_page_hears_why_a_conversion_failed(desk: tuple[str, Desk]) -> None:
+    url, of = desk
+    send(url, "function", FUNCTION)
+    of.hear(1, Failed(DataError("mine: nothing is visible")))
+    assert state_of(url) == {"number": 1, "state": "failed", "said": "mine: nothing is visible"}
+    assert of.error is None
+    assert "live" in scene_of(url)
+
+
+def test_a_saved_live_file_has_the_colours_of_the_function(desk: tuple[str, Desk]) -> None:
+    function = {
+        "points": [{"x": LO, "rgb": [1, 0, 0], "opacity": 0.1}, {"x": HI, "rgb": [0, 0, 1], "opacity": 0.4}],
+        "opacity_unit_distance": 0.5,
+    }
+    saved = Cloud.of(send(desk[0], "save", {"file": "ply", "function": function})[1], "x")
+    wanted = baked(live_cloud(), Table.of(function_sent(function), LO, HI, 0.05))
+    np.testing.assert_allclose(saved.gaussians.colors, wanted.colors, atol=1e-5)
+    np.testing.assert_allclose(saved.gaussians.opacity_logits, wanted.opacity_logits, atol=1e-4)
+    plain = Cloud.of(send(desk[0], "save", {"file": "ply"})[1], "x")
+    assert np.abs(plain.gaussians.colors - wanted.colors).max() > 0.1
+
+
+def test_a_live_file_is_shown_live_and_an_ordinary_one_as_it_is(tmp_path: Path) -> None:
+    some = baked(live_cloud(), Table.of(RAMP, LO, HI, 0.05))
+    write_ply(tmp_path / "live.ply", some, PlyOptions(scale=0.1, unit_distance=0.5, live=facts()))
+    write_ply(tmp_path / "plain.ply", cloud())
+    with shown("live.ply", folder=tmp_path) as (_, url):
+        scene = scene_of(url)
+        assert scene["server"] == {"converts": False, "name": "live"}
+        assert scene["live"]["values"] == [LO, HI]
+        assert ask(url, urlsplit(url).path + scene["frames"][0]["file"])[1].count(b"element chunk")
+        assert send(url, "function", FUNCTION)[0] == 405  # there is no volume
+        assert send(url, "save", {"file": "html"})[0] == 200
+    with shown("plain.ply", folder=tmp_path) as (_, url):
+        assert "live" not in scene_of(url)
+
+
+def test_a_page_that_waits_hears_how_far_it_is_and_why_nothing_comes(tmp_path: Path) -> None:
+    site = Site({}, print)
+    desk = Desk(site.parts, site.posts, "x", Console(quiet=True))
+    with served(site) as url, Converter(SourceRequest(str(tmp_path / "none.nrrd")), "x", desk.hear) as converter:
+        desk.await_volume(converter)
+        assert scene_of(url)["waits"]
+        assert state_of(url)["state"] in ("first", "failed")
+        assert desk.there.wait(120)
+        assert "no such file" in state_of(url)["said"]
+        assert desk.error is not None
+        assert desk.error.exit_code == 1
+
+
+def test_what_is_never_live_is_converted(monkeypatch: pytest.MonkeyPatch) -> None:
+    from vvgt_cli.commands import converter_process
+
+    labels = Volume(np.arange(8, dtype=np.uint8).reshape(2, 2, 2), name="labels")
+    request = SourceRequest(labels, labels="auto")
+    why = refusal(ConvertRequest(request, live=True), load(request))
+    assert why is not None
+    assert refusal(ConvertRequest(SourceRequest(labels), live=True), load(SourceRequest(labels, tf="viridis"))) is None
+    asked = []
+
+    def conversion(request: ConvertRequest, console: Console) -> str:
+        asked.append(request.live)
+        return "conversion"
+
+    monkeypatch.setattr(converter_process, "without_files", conversion)
+    monkeypatch.setattr(converter_process.Volume, "_paged", lambda volume, found: Made(b"", {}))
+    said: list[str] = []
+    console = Console(quiet=True)
+    console.say = said.append  # type: ignore[method-assign]
+    volume = converter_process.Volume.__new__(converter_process.Volume)
+    volume.source = request
+    assert volume.live(console) == Made(b"", {})
+    assert asked == [False]
+    assert f"not live, but converted: {why}" in said
+
+
+@pytest.mark.parametrize(
+    ("args", "code", "said"),
+    [
+        (["none.nrrd"], 1, "no such file"),
+        (["bad.nrrd"], 1, "check that the file is whole"),
+        (["one.npy", "--tf", "hidden.json"], 1, "nothing is visible"),
+        (["example:nope"], 2, "no such example"),
+    ],
+)
+def test_what_cannot_be_shown_is_one_line(
+    args: list[str], code: int, said: str, tmp_path: Path, vvgt: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    np.save("one.npy", np.full((4, 4, 4), 5, np.uint8))
+    head = b"NRRD0004\ntype: uchar\ndimension: 3\nsizes: 8 8 8\nencoding: raw\n\nxx"
+    Path("bad.nrrd").write_bytes(head)
+    Path("hidden.json").write_text(json.dumps({"points": [
+        {"x": 6, "rgb": [1, 1, 1], "opacity": 0}, {"x": 7, "rgb": [1, 1, 1], "opacity": 0.5}]}))  # fmt: skip
+    result = vvgt("view", *args, "--no-browser")
+    assert result.code == code
+    assert said in result.error
+    assert result.error.count("vvgt: error:") == 1
+    assert "Traceback" not in result.error
+
+
+def test_names_to_save_under() -> None:
+    assert plain_name("a/b/head_64x64x93_uint16.raw") == "head"
+    assert plain_name("example:blob:12") == "blob-12"
+    assert plain_name("/x/</b>.nii.gz") == "b"
+    assert plain_name("..") == "volume"
+    assert plain_name("a/head.compressed.ply") == plain_name("head.ply") == plain_name("head.spz") == "head"

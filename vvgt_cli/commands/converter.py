@@ -1,0 +1,202 @@
+"""Conversions for a page that is being looked at, in a process of their own, which is ended when the next one is asked.
+
+The process reads the volume once and keeps it for one function after the other. It is told what to do by pickles on its
+standard input, and answers by pickles on its standard output. When the input closes, it ends.
+"""
+
+from __future__ import annotations
+
+import atexit
+import os
+import pickle
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any, cast
+
+from vvgt_cli.errors import DataError, VvgtError
+from vvgt_cli.field.source import SourceRequest
+from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.resources import asked_memory
+
+
+@dataclass(frozen=True)
+class Said:
+    """A line to be told."""
+
+    line: str
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far it is."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class Made:
+    """What became of a job.
+
+    Attributes:
+        ply: the file that `vvgt convert` would write.
+        parts: of the first job the page's text, named "", and what it asks for; of others the `.ply` that it shows.
+        live: it can be shown under any function.
+        psnr: dB on the test views; None where it was not scored.
+    """
+
+    ply: bytes
+    parts: dict[str, bytes]
+    live: bool = False
+    psnr: float | None = None
+
+
+@dataclass(frozen=True)
+class Failed:
+    """What a job ended by."""
+
+    error: VvgtError
+
+
+Message = Said | Progress | Made | Failed
+
+
+@dataclass(frozen=True)
+class Start:
+    """What a process begins with.
+
+    Attributes:
+        source: the volume, and the function to begin with.
+        name: of what is shown, without ending.
+        memory: bytes that it may take (`--memory`).
+        folder: for what is temporary; the process removes it where it is left alone.
+    """
+
+    source: SourceRequest
+    name: str
+    memory: int | None
+    folder: str
+
+
+Job = TransferFunction | None  # None: the live form
+
+
+class Converter:
+    """A context in which volumes are converted in the background: one job at a time, the latest.
+
+    Args:
+        source: what to convert.
+        name: of what is shown, without ending.
+        heard: is told the number of a job and what there is to say of it, by another thread, which holds the ``lock``.
+    """
+
+    def __init__(self, source: SourceRequest, name: str, heard: Callable[[int, Message], None]) -> None:
+        self._source, self._name, self._heard = source, name, heard
+        self.lock = threading.RLock()
+        self._process: subprocess.Popen[bytes] | None = None
+        self._number, self._busy = 0, False
+        self._folder: str | None = None
+
+    def __enter__(self) -> Converter:
+        self._folder = tempfile.mkdtemp(prefix="vvgt-view-")
+        atexit.register(self._close)  # where interrupts come so fast that the context is not left in order
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        closing = threading.Thread(target=self._close)  # which a second interrupt does not reach
+        closing.start()
+        closing.join()
+
+    def _close(self) -> None:
+        with self.lock:
+            if self._folder is None:
+                return
+            self._number += 1
+            self._end()
+            shutil.rmtree(self._folder, ignore_errors=True)
+            self._folder = None
+            atexit.unregister(self._close)
+
+    def ask(self, job: Job) -> int:
+        """Begin a job in place of the one that is being done, if any; returns its number."""
+        with self.lock:
+            if self._folder is None:
+                return self._number  # it is over
+            if self._busy:
+                self._end()
+            self._number += 1
+            process = self._process or self._begin()
+            with suppress(OSError):  # it has ended: `_listen` says so
+                pickle.dump((self._number, job), cast(IO[bytes], process.stdin))
+                cast(IO[bytes], process.stdin).flush()
+            self._busy = True
+            return self._number
+
+    def cancel(self) -> None:
+        """End the job that is being done, if any."""
+        with self.lock:
+            if self._busy:
+                self._number += 1
+                self._end()
+
+    @property
+    def process(self) -> int | None:
+        """Number of the process, None where there is none."""
+        return self._process.pid if self._process else None
+
+    def _begin(self) -> subprocess.Popen[bytes]:
+        folder = cast(str, self._folder)
+        paths = os.pathsep.join(filter(None, [str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")]))
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", f"from {__package__}.converter_process import main; main()"],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True,
+            env={**os.environ, "PYTHONPATH": paths, "TMPDIR": folder, "TEMP": folder, "TMP": folder},
+        )  # fmt: skip
+        with suppress(OSError):
+            pickle.dump(Start(self._source, self._name, asked_memory(), folder), cast(IO[bytes], self._process.stdin))
+        threading.Thread(target=self._listen, args=(self._process,), daemon=True).start()
+        return self._process
+
+    def _end(self) -> None:
+        """At once, with all that it has started, and what it was writing."""
+        process, self._process, self._busy = self._process, None, False
+        if process is None:
+            return
+        with suppress(OSError):
+            if hasattr(os, "killpg"):
+                os.killpg(process.pid, signal.SIGKILL)
+            else:
+                process.kill()
+        process.wait()
+        for name in os.listdir(cast(str, self._folder)):
+            shutil.rmtree(os.path.join(cast(str, self._folder), name), ignore_errors=True)
+
+    def _listen(self, process: subprocess.Popen[bytes]) -> None:
+        """Pass on what a process says, as long as it is about the latest job."""
+        stream = cast(IO[bytes], process.stdout)
+        while True:
+            try:
+                number, message = cast(tuple[int, Any], pickle.load(stream))
+            except (EOFError, OSError, pickle.UnpicklingError, ValueError):
+                number, message = self._number, None
+            with self.lock:
+                if self._process is not process:
+                    return
+                if message is None:  # it has ended by itself
+                    busy = self._busy
+                    self._end()
+                    message = Failed(DataError("the conversion was ended by the system (out of memory?)"))
+                    if busy:
+                        self._heard(number, message)
+                    return
+                if number != self._number:
+                    continue
+                self._busy = self._busy and not isinstance(message, Made | Failed)
+                self._heard(number, message)

@@ -1,0 +1,174 @@
+"""The process of `converter`: reads a volume once, makes the live form of it, or converts it for a function."""
+
+from __future__ import annotations
+
+import io
+import os
+import pickle
+import shutil
+import threading
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from typing import IO, Any
+
+from vvgt_cli.commands.converter import Failed, Job, Made, Message, Progress, Said, Start
+from vvgt_cli.commands.live_site import Cloud, page_of, stored
+from vvgt_cli.conversion.convert import opened, ply_options, without_files
+from vvgt_cli.conversion.live import live_conversion, refusal
+from vvgt_cli.conversion.request import ConvertRequest
+from vvgt_cli.conversion.result import Conversion
+from vvgt_cli.errors import DataError, VvgtError
+from vvgt_cli.field.layered import open_parts
+from vvgt_cli.field.open import automatic
+from vvgt_cli.field.source import SourceRequest
+from vvgt_cli.gaussians import write_ply
+from vvgt_cli.gaussians.formats import ready
+from vvgt_cli.progress import Console, ProgressCallback
+from vvgt_cli.resources import set_memory
+from vvgt_cli.score.record import ConversionReport, Run
+from vvgt_cli.volume import ReadOptions
+
+INTERVAL = 0.2  # seconds between two words of progress
+
+
+class Telling(Console):
+    """A console whose lines and bars are messages."""
+
+    def __init__(self, tell: Callable[[Message], None]) -> None:
+        super().__init__()
+        self.tell = tell
+
+    def say(self, line: str) -> None:
+        """A line."""
+        self.tell(Said(line))
+
+    def bar(self, label: str) -> ProgressCallback | None:
+        """Progress in words."""
+        last = 0.0
+        self.tell(Progress(label))
+
+        def draw(done: int, total: int) -> None:
+            nonlocal last
+            if time.monotonic() - last >= INTERVAL:
+                last = time.monotonic()
+                self.tell(Progress(f"{label} {100 * done // max(total, 1)} %"))
+
+        return draw
+
+
+class Volume:
+    """The volume of a request, read once where it fits into memory."""
+
+    def __init__(self, source: SourceRequest, name: str, console: Console) -> None:
+        self.source, self.name = source, name
+        if automatic(source, Console(quiet=True)) is None:  # `opened` says it
+            console.bar("reading")
+            content = open_parts(source.path, source.read)
+            self.source = replace(source, volume=content, read=ReadOptions())
+
+    def live(self, console: Console) -> Made:
+        """The live form, or of what has none an ordinary conversion."""
+        run = Run(console, ConversionReport("init"))
+        request = ConvertRequest(self.source, live=True)
+        with opened(run, request) as field:
+            why = refusal(request, field.source) or _missing()
+            if why is None:
+                ply = ply_options(request, field.source)
+                return self._paged(live_conversion(run, request, field, ply, scored=False))
+        console.say(f"not live, but converted: {why}")
+        return self._paged(without_files(replace(request, live=False), console))
+
+    def under(self, job: Job, console: Console) -> Made:
+        """A conversion for a function, on data values, that says the distance its opacity is per."""
+        source = replace(self.source, tf=job, tf_range="data", unit_distance=None)
+        conversion = without_files(ConvertRequest(source), console)
+        shown = stored(conversion.gaussians, conversion.ply)
+        psnr = None if conversion.scores is None else conversion.scores["psnr"]
+        return Made(_file(conversion), {"ply": shown}, psnr=psnr)
+
+    def _paged(self, conversion: Conversion) -> Made:
+        """With the page of it: here the libraries that it takes are there already."""
+        cloud = Cloud.of(_file(conversion), self.name)
+        assert cloud.ply is not None
+        return Made(cloud.ply, page_of(cloud, converts=True), cloud.live)
+
+
+def _missing() -> str | None:
+    """What a page of live Gaussians needs and is not installed."""
+    try:
+        ready("the page.html")
+    except DataError as error:
+        return str(error)
+    return None
+
+
+def _file(conversion: Conversion) -> bytes:
+    stream = io.BytesIO()
+    write_ply(stream, conversion.gaussians, conversion.ply, conversion.normals())
+    return stream.getvalue()
+
+
+def main() -> None:
+    """Do one job after the other until the input ends."""
+    orders, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # what libraries print
+    start: Start = pickle.load(orders)
+    set_memory(start.memory)
+    jobs: list[tuple[int, Job]] = []
+    there = threading.Semaphore(0)
+    threading.Thread(target=_receive, args=(orders, start.folder, jobs, there), daemon=True).start()
+    volume: Volume | None = None
+    while True:
+        there.acquire()
+        number, job = jobs.pop(0)
+
+        def tell(message: Message, number: int = number) -> None:
+            _send(answers, (number, message))
+
+        note: Any = _note(tell)
+        warnings.showwarning = note
+        console = Telling(tell)
+        try:
+            volume = volume or Volume(start.source, start.name, console)
+            tell(volume.live(console) if job is None else volume.under(job, console))
+        except VvgtError as error:
+            tell(Failed(_plain(error)))
+        except MemoryError:
+            tell(Failed(DataError("out of memory: try a smaller volume (--crop)")))
+        except OSError as error:
+            tell(Failed(DataError(f"{error.filename}: {error.strerror}" if error.filename else str(error))))
+        except Exception as error:
+            tell(Failed(DataError(f"internal: {type(error).__name__}: {error} (a bug)")))
+
+
+def _note(tell: Callable[[Message], None]) -> Callable[..., None]:
+    """What shows warnings (`warnings.showwarning`)."""
+    return lambda message, *rest: tell(Said(f"vvgt: note: {message}"))
+
+
+def _plain(error: VvgtError) -> VvgtError:
+    """Without what some errors say to programs beside their line."""
+    found = VvgtError(str(error))
+    found.exit_code = error.exit_code
+    return found
+
+
+def _send(stream: IO[bytes], message: tuple[int, Message]) -> None:
+    try:
+        pickle.dump(message, stream)
+        stream.flush()
+    except OSError:  # nobody is there any more
+        os._exit(0)
+
+
+def _receive(stream: IO[bytes], folder: str, jobs: list[tuple[int, Job]], there: threading.Semaphore) -> None:
+    """Take jobs; where the other side has ended, end, with what lies in the temporary folder."""
+    while True:
+        try:
+            jobs.append(pickle.load(stream))
+        except Exception:  # the end of the input, in the middle of a job too
+            shutil.rmtree(folder, ignore_errors=True)
+            os._exit(0)
+        there.release()

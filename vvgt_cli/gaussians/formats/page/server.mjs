@@ -1,0 +1,184 @@
+// The server behind a live page: it converts the volume for the function that the page shows, and what it makes is swapped
+// in; files to save. Of a page in a file: the function alone.
+import { Asset, Entity } from 'playcanvas';
+
+const QUIET = 300, ASK = 300;  // milliseconds without a change after which the server is asked; between two looks
+const NAMES = { ply: 'the Gaussians', html: 'a page', json: 'the transfer function' };
+const pause = (ms) => new Promise((done) => setTimeout(done, ms));
+
+// A page whose Gaussians are being made: what the server says until they are there.
+export async function waiting(said) {
+  for (;;) {
+    let found;
+    try {
+      found = await (await fetch('state')).json();
+    } catch {
+      if (said.textContent === 'loading' || !said.dataset.failed) said.textContent = 'vvgt view has ended';
+      return;
+    }
+    if (found.state !== 'first' && found.state !== 'failed') return location.reload();
+    said.textContent = found.said;
+    if (found.state === 'failed') said.dataset.failed = true;
+    await pause(ASK);
+  }
+}
+
+// nodes {x, y, rgb} as a file of a function; the ends of the range are nodes, so that no program stretches it
+export function functionFile(nodes, { values: [lo, hi], opacity_unit_distance, name }) {
+  const all = [...nodes];
+  if (all[0].x > lo) all.unshift({ ...all[0], x: lo });
+  if (all.at(-1).x < hi) all.push({ ...all.at(-1), x: hi });
+  const points = all.map(({ x, y, rgb }) => ({ x, rgb: rgb.map((c) => Number(c.toFixed(4))), opacity: Number(y.toPrecision(6)) }));
+  return { name: name || 'transfer function', points, opacity_unit_distance };
+}
+
+function download(content, name) {
+  const link = document.createElement('a');
+  link.href = URL.createObjectURL(content);
+  link.download = name;
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 60000);
+}
+
+const send = (to, what) => fetch(to, { method: 'POST', headers: { 'Content-Type': 'application/json' }, body: JSON.stringify(what) });
+const reason = async (answer) => (answer.status === 400 ? answer.text() : `the server answers ${answer.status}`);
+
+// What is shown in place of the first Gaussians, where they are.
+function substitute({ app }) {
+  const first = app.root.findByName('gsplat');
+  let entity = null;
+  function put(there) {
+    if (entity) entity.enabled = there;
+    first.enabled = !(entity && there);
+    app.renderNextFrame = true;
+  }
+  function drop() {
+    put(false);
+    if (!entity) return;
+    const asset = app.assets.get(entity.gsplat.asset);
+    entity.destroy();
+    entity = null;
+    app.assets.remove(asset);
+    asset.unload();
+  }
+  async function load(file, still) {
+    const asset = new Asset(file, 'gsplat', { url: file, filename: file });
+    await new Promise((done, fail) => {
+      asset.once('load', done);
+      asset.once('error', fail);
+      app.assets.add(asset);
+      app.assets.load(asset);
+    });
+    if (!still()) {
+      app.assets.remove(asset);
+      return asset.unload();
+    }
+    entity = new Entity('better', app);
+    entity.addComponent('gsplat', { asset: asset.id, unified: true });
+    entity.setLocalRotation(first.getLocalRotation());
+    first.parent.addChild(entity);
+  }
+  return { load, put, drop };
+}
+
+// panel: {root, nodes(), changed(f), cutting()}; server: {converts, name}, none of a page in a file
+export function served(panel, viewer, live, server) {
+  const { root } = panel, kind = root.querySelector('.named i'), name = server?.name ?? document.title;
+  const row = document.createElement('div'), text = document.createElement('p');
+  row.className = 'save';
+  row.textContent = 'Save';
+  text.setAttribute('role', 'status');
+  root.append(text, row);
+  const better = substitute(viewer);
+  let number = null, told = '', busy = false, down = false, timer = 0, change = 0;  // number of the better form, and what it is
+
+  const say = (line, failed) => {
+    text.textContent = line;
+    text.className = failed ? 'failed' : '';
+  };
+
+  const improved = () => number !== null && !panel.cutting();  // a cut is of the live form
+  function put() {
+    better.put(improved());
+    const [what, ...rest] = (improved() ? told : 'live').split(/(?=, )/);
+    kind.textContent = what;
+    kind.append(Object.assign(document.createElement('span'), { textContent: rest.join('') }));  // where there is room
+    if (!busy) say(rest.length ? told : '');
+  }
+
+  function end(line = '', failed = false) {
+    busy = false;
+    say(line, failed);
+  }
+
+  async function convert() {
+    const mine = change;
+    busy = true;
+    try {
+      const answer = await send('function', functionFile(panel.nodes(), live));
+      if (!answer.ok) throw new Error(await reason(answer));
+      const job = (await answer.json()).number;
+      while (mine === change) {
+        const state = await (await fetch('state')).json();
+        if (mine !== change) return;
+        if (state.number !== job) break;  // of another page
+        if (state.state === 'failed') throw new Error(state.said);
+        if (state.state === 'done') {
+          await better.load(state.file, () => mine === change);
+          if (mine !== change) return;
+          [number, told, busy] = [job, state.said, false];
+          return put();
+        }
+        say(`converting for this function: ${state.said}`);
+        await pause(ASK);
+      }
+      if (mine === change) end();
+    } catch (error) {
+      if (mine === change) end(error instanceof TypeError ? 'vvgt view has ended' : error.message, true);
+    }
+  }
+
+  function changed(cut) {
+    if (cut) return put();
+    if (busy) send('function', null).catch(() => {});  // what is being done ends
+    change++;
+    [number, busy] = [null, false];
+    better.drop();
+    put();
+    clearTimeout(timer);
+    timer = setTimeout(ready, QUIET);
+  }
+
+  function ready() {
+    clearTimeout(timer);
+    if (down) timer = setTimeout(ready, QUIET);
+    else convert();
+  }
+
+  async function save(file) {
+    if (file === 'json') return download(new Blob([`${JSON.stringify(functionFile(panel.nodes(), live), null, 1)}\n`], { type: 'application/json' }), 'tf.json');
+    try {
+      const answer = await send('save', !improved() ? { file, function: functionFile(panel.nodes(), live) } : { file, number });
+      if (!answer.ok) throw new Error(await reason(answer));
+      download(await answer.blob(), `${name}.${file}`);
+    } catch (error) {
+      say(error instanceof TypeError ? 'vvgt view has ended' : error.message, true);
+    }
+  }
+
+  for (const file of server ? ['ply', 'html', 'json'] : ['json']) {
+    const button = document.createElement('button');
+    button.textContent = file === 'json' ? 'tf.json' : `.${file}`;
+    button.title = `save ${NAMES[file]}`;
+    button.addEventListener('click', () => save(file));
+    row.append(button);
+  }
+  if (server?.converts) {
+    for (const event of ['pointerdown', 'pointerup', 'pointercancel']) {
+      root.addEventListener(event, () => { down = event === 'pointerdown'; }, true);
+    }
+    window.addEventListener('pointerup', () => { down = false; }, true);
+    panel.changed(changed);
+    changed(false);  // for the function to begin with
+  }
+}
