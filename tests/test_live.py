@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 
 import vvgt_cli as vvgt_library
+from tests.closed_form_scenes import scene_of
 from vvgt_cli.cameras import default_views
+from vvgt_cli.closed_form import VbmOptions, initialise
 from vvgt_cli.closed_form.under import POINTS, in_voxels, offsets, sample_points, values_of
 from vvgt_cli.dvr import RenderSettings
 from vvgt_cli.dvr.layout import Voxels
@@ -26,6 +28,7 @@ from vvgt_cli.look.fog import fog
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.opacity import PiecewiseOpacity
 from vvgt_cli.splat import render
+from vvgt_cli.volume import Volume
 from vvgt_cli.volume.stats import Statistics, edges_of
 
 LO, HI = -20.0, 80.0
@@ -187,6 +190,20 @@ def test_cells_are_split_where_values_differ() -> None:
     data[0, 0, 0] = 0
     result = vvgt_library.convert(data, "viridis", {"max_gaussians": 400, "size": 64}, live=True)
     assert (result.gaussians.means[:, 0] > 0).mean() > 0.7
+
+
+def test_what_the_fog_hides_is_there() -> None:
+    """A core in a thick body that lets no light through: another function may make the body transparent."""
+    z, y, x = np.indices((48, 48, 48)) - 23.5
+    radius = np.sqrt(x**2 + y**2 + z**2)
+    opaque = TransferFunction("opaque", PiecewiseOpacity(np.array([0.0, 100]), np.array([0, 0.9])), COLORS)
+    scene = scene_of(Volume(np.where(radius < 20, np.where(radius < 6, 250, 200), 0).astype(np.uint8)), opaque)
+    hidden, there = (
+        initialise(scene, VbmOptions(max_gaussians=4000, size=128, values=values)).gaussians.means
+        for values in (False, True)
+    )
+    nearest, found = (np.linalg.norm(means, axis=1).min() for means in (hidden, there))
+    assert found < 10 / 24 < nearest
 
 
 def test_bytes_for_pages_lose_little() -> None:

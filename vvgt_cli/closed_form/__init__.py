@@ -62,7 +62,9 @@ def initialise(scene: Scene, options: VbmOptions, progress: Progress | None = No
     """The closed form alone: no view is rendered. No Gaussians where no view sees anything."""
     from vvgt_cli.closed_form.closed_form import closed_form
 
-    form = closed_form(scene, options.max_gaussians, options.size, progress=progress, degree=options.degree)
+    form = closed_form(
+        scene, options.max_gaussians, options.size, progress=progress, degree=options.degree, values=options.values
+    )
     if progress:
         progress(100, 100)
     return start_of(form, options)

@@ -48,6 +48,7 @@ REFINE_FROM = 0.3  # share of the budget given out before views say where the er
 REFINE_ROUNDS = 2
 CUT_VIEWS = 8
 TWICE = 0.6  # weight of the error at twice the size where styles of surface compete
+INSIDE = 0.1  # least transmittance of what other functions may show (0: dark insides; 0.3: surfaces lose 1 dB)
 TWICE_EVERY = 6  # of so many views one counts as seen at twice its size when colours are solved
 
 Progress = Callable[[int, int], None]
@@ -148,6 +149,7 @@ def closed_form(
     cameras: Sequence[Camera] | None = None,
     progress: Progress | None = None,
     degree: int = 0,
+    values: bool = False,
 ) -> ClosedForm:
     """Moments, visibility and pyramid of a scene.
 
@@ -158,12 +160,14 @@ def closed_form(
         cameras: what may see the scene; by default the training views.
         progress: called with (per cent done, 100), within parts that take long too.
         degree: of the harmonics under a light that depends on the view.
+        values: of a scene that stands for any function: what it hides counts, too.
     """
     step, half = np.asarray(scene.step), np.asarray(scene.half)
     exponent = exponents(step, base_level(scene, size, budget))
     cells = base_cells(scene, exponent, progress=part(progress, 0, 50))
     return form_of(
-        cells, half, step, budget, size, cameras, part(progress, 50, 95), scene.labels, Shading.of(scene), degree, scene
+        cells, half, step, budget, size, cameras, part(progress, 50, 95), scene.labels, Shading.of(scene), degree,
+        scene, values,
     )  # fmt: skip
 
 
@@ -184,6 +188,7 @@ def form_of(
     shading: Shading | None = None,
     degree: int = 0,
     scene: Scene | None = None,
+    values: bool = False,
 ) -> ClosedForm:
     """The closed form over base cells, wherever the volume's values are; arguments as of `closed_form` and its result.
 
@@ -193,6 +198,8 @@ def form_of(
     box = Box(half, step)
     cameras = cameras or default_views("train", size=MARCH_SIZE)
     seen = visibility(box, cells, cameras, progress=lambda share: tell(0.5 * share))
+    if values:
+        seen = seen.at_least(INSIDE)
     opaque = opaque_field(cells, step, half, labels)
     tell(0.6)
     normals = None if cells.normals is None else cells.normals[shown(cells, seen, step)]

@@ -46,6 +46,11 @@ class Visibility:
         look_up(np.ascontiguousarray(index, np.int32), edge / self.edge, self.mean, self.largest, out)
         return out
 
+    def at_least(self, share: float) -> Visibility:
+        """The same where nothing is hidden altogether: transmittances from ``share`` to 1."""
+        raised = (np.float32(share) + np.float32(1 - share) * values for values in (self.mean, self.largest))
+        return Visibility(*raised, self.edge)
+
 
 @inlined(fastmath=FLAGS, error_model="numpy")
 def _axis(p: float, d: float, t: float, n: int) -> tuple[int, int, float, float]:

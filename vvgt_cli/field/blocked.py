@@ -177,7 +177,7 @@ class Blocked:
         shading = None if self.light is None else Shading(self.light, half, step, self._normals_at)
         form = form_of(  # which alone holds the cells: their tree takes twice as much
             _gathered(task), half, step, options.max_gaussians, options.size, None, None, self.source.labels_alone,
-            shading, options.degree,
+            shading, options.degree, values=options.values,
         )  # fmt: skip
         return start_of(form, options)
 
