@@ -11,7 +11,6 @@ export function rowsOf(name, { facts, world, count, live }) {
     ['opacity per', facts['unit-distance'] && `${length(facts['unit-distance'])} (${facts.label})`],
     ['light', live ? null : facts.light],
     ['Gaussians', number(count)],
-    ['error', facts.psnr && `${facts.psnr} dB PSNR against the volume${live ? ', as it is in the file' : ''}`],
     ['made for', facts.size && `${facts.size} px, drawn by ${facts.rule}`],
     ['axes', world.anatomical ? `${facts.space}, in mm` : `of the file${world.unit && `, in ${world.unit}`}`],
     ['written by', facts.version && `vvgt ${facts.version}`],

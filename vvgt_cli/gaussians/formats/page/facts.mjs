@@ -6,7 +6,7 @@ const UP = {  // world axes as PLY has them, rows, by the axis that is up (frame
 };
 const OPPOSITE = { R: 'L', L: 'R', A: 'P', P: 'A', S: 'I', I: 'S' };
 
-// {version, scale, centre, frame, up, space, 'length-unit', function, psnr, size, rule, 'unit-distance', label, light, unit}: text and numbers
+// {version, scale, centre, frame, up, space, 'length-unit', function, size, rule, 'unit-distance', label, light, unit}: text and numbers
 export function factsOf(comments) {
   const facts = { up: 'none', space: 'none', frame: 'unit' };
   for (const comment of comments ?? []) {
