@@ -10,7 +10,7 @@ import numpy as np
 
 from vvgt_cli.gaussians import Gaussians, PlyOptions
 from vvgt_cli.gaussians.formats.live import live_bytes, live_json
-from vvgt_cli.gaussians.formats.page_file import html_of_several, upright
+from vvgt_cli.gaussians.formats.page_file import html_of_several, title_of, upright
 from vvgt_cli.gaussians.formats.splats import morton_order, splats_of
 from vvgt_cli.gaussians.frames import turn, up_matrix
 from vvgt_cli.gaussians.live import law_nodes
@@ -39,7 +39,7 @@ def live_html(gaussians: Gaussians, options: PlyOptions, name: str) -> bytes:
     splats = splats_of(replace(gaussians, live=None), replace(laid, live=None))
     planes = np.ascontiguousarray(live_bytes(turned, facts)[:, PLANES].T)
     parts = {HELD: gzip.compress(planes.tobytes(), 9, mtime=0)}
-    return html_of_several([(name, splats)], name, parts, {"live": _facts(gaussians, options, laid.up)})
+    return html_of_several([(title_of(name), splats)], name, parts, {"live": _facts(gaussians, options, laid.up)})
 
 
 def _facts(gaussians: Gaussians, options: PlyOptions, up: str) -> dict[str, Any]:
