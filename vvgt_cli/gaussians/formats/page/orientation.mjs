@@ -16,7 +16,7 @@ export function drawLetters(group, { lens, world, left, high }) {
   ends.sort((a, b) => b.far - a.far);
   for (const { letter, x, y, far, color, seen } of ends) {
     if (!seen) continue;
-    const [px, py] = [middle[0] + RADIUS * x, middle[1] - RADIUS * y], opacity = (0.75 - 0.25 * far).toFixed(2), short = 0.7;
+    const [px, py] = [middle[0] + RADIUS * x, middle[1] - RADIUS * y], opacity = (0.75 - 0.25 * far).toFixed(2), short = 0.6;
     group.append(element('line', { x1: middle[0], y1: middle[1], x2: middle[0] + short * RADIUS * x, y2: middle[1] - short * RADIUS * y, stroke: color, 'stroke-width': 2, opacity }));
     group.append(label(letter, px, py + 5, { fill: color, opacity, 'text-anchor': 'middle', 'font-weight': 700, 'font-size': 14 }));
   }
