@@ -4,7 +4,7 @@ import { looksOf, valueAt } from './live_at.mjs';
 import { shown } from './facts.mjs';
 import { element, label } from './svg.mjs';
 
-const STILL = 6, SOON = 700;  // pixels and milliseconds that a click stays within
+const STILL = 6;  // pixels that a click stays within
 const OURS = ['pick', 'orbitTarget:set', 'navigateTo'];  // what the viewer would do at a click
 
 export function rulerOf(viewer, lens, worldNow, dataNow, look, changed) {
@@ -25,11 +25,11 @@ export function rulerOf(viewer, lens, worldNow, dataNow, look, changed) {
   }
 
   canvas.addEventListener('pointerdown', (event) => {
-    down = down || event.button ? null : { id: event.pointerId, x: event.offsetX, y: event.offsetY, time: event.timeStamp };  // not of two fingers
+    down = event.isPrimary && !event.button ? { id: event.pointerId, x: event.offsetX, y: event.offsetY } : null;  // not of two fingers
   });
   canvas.addEventListener('pointerup', (event) => {
     const still = down && event.pointerId === down.id && Math.hypot(event.offsetX - down.x, event.offsetY - down.y) < STILL;
-    if (measuring && still && event.timeStamp - down.time < SOON && !pick(down.x, down.y)) changed('nothing there');
+    if (measuring && still && !pick(down.x, down.y)) changed('nothing there');
     down = null;
   });
   canvas.addEventListener('pointercancel', () => { down = null; });
