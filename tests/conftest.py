@@ -55,9 +55,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
                 item.add_marker(pytest.mark.skip(reason="long: pass --long"))
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session", autouse=True)
 def small_seats() -> Iterator[None]:
-    """Seats of a module's conversions and reports are of the size made for and of twice that, not of a 4K screen."""
+    """Conversions and reports in this process are scored at their size and twice that, not for a 4K screen.
+
+    That would be half the time of a small one; `vvgt` in processes of its own has 4K.
+    """
     with pytest.MonkeyPatch.context() as patch:
         for module in ("conversion.stages.scores", "commands.ladder"):
             patch.setattr(f"vvgt_cli.{module}.from_above", lambda size: [(size, 40.0), (2 * size, 40.0)])

@@ -129,7 +129,6 @@ def test_what_is_there_is_noticed_before_anything_is_read(command, folder, vvgt,
     assert "-o: a.ply exists; give --overwrite" in result.error
 
 
-@pytest.mark.usefixtures("small_seats")
 @pytest.mark.parametrize("late", ["a.ply", "a.json", "a.png"])
 def test_what_appears_during_the_work_is_not_replaced(late, folder, vvgt, monkeypatch):
     """Outputs are checked twice: before the work, and when they are written."""

@@ -10,11 +10,24 @@ import pytest
 from tests.closed_form_scenes import Above, Ramp, Tent, scene_of
 from vvgt_cli.closed_form import moments as moments_module
 from vvgt_cli.closed_form.moments import Cells, base_cells, exponents
+from vvgt_cli.closed_form.ranges import ranges_of
 from vvgt_cli.dvr import Scene
 from vvgt_cli.dvr.layout import BRICK
 from vvgt_cli.look.tables import extinction
 from vvgt_cli.synth import analytic
 from vvgt_cli.volume import Volume
+
+
+def test_ranges_of_blocks_are_those_of_their_voxels_and_the_next() -> None:
+    values = np.random.default_rng(0).permutation(7 * 9 * 21).reshape(7, 9, 21).astype(np.float32)
+    values[3, 4, 5] = np.nan
+    first, edge, shape = np.array([4, 0, 2]), np.array([4, 3, 2]), np.array([4, 2, 2])
+    found = ranges_of(values, first, edge, shape)
+    for x, y, z in np.ndindex(*shape):
+        lo = first + edge * (x, y, z)
+        a, b = np.maximum(lo - 1, 0), lo + edge + 1
+        part = values[a[2] : b[2], a[1] : b[1], a[0] : b[0]]
+        assert tuple(found[z, y, x]) == (np.nanmin(part), np.nanmax(part))
 
 
 def trilinear(values: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:

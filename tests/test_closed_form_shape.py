@@ -170,6 +170,17 @@ def surfaces(volume: Volume, tf=None):
     return scene, opaque_field(cells, scene.step, scene.half)
 
 
+def test_a_field_of_wider_cells_holds_their_means(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, fine = surfaces(analytic.sphere(16, 0.6))
+    monkeypatch.setattr("vvgt_cli.closed_form.inset.MAX_FIELD", fine.field.size // 8)
+    _, wide = surfaces(analytic.sphere(16, 0.6))
+    nz, ny, nx = wide.field.shape
+    assert 2 * np.array(wide.field.shape) == pytest.approx(fine.field.shape)
+    means = fine.field.reshape(nz, 2, ny, 2, nx, 2).mean(axis=(1, 3, 5))
+    np.testing.assert_allclose(wide.field, means, atol=1e-6)
+    assert wide.field.max() == pytest.approx(1)
+
+
 def moved(opaque, points: np.ndarray, sigma: float, reach: float = 2.0, pixel: float = 0.02) -> np.ndarray:
     count = len(points)
     axes = np.broadcast_to(np.eye(3), (count, 3, 3))

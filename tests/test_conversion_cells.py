@@ -11,8 +11,6 @@ from vvgt_cli.conversion.plan import Planner
 from vvgt_cli.conversion.request import FitOptions, Limits
 from vvgt_cli.conversion.stages import CellsByError
 
-pytestmark = pytest.mark.usefixtures("small_seats")
-
 
 def test_cells_by_error_are_kept_where_the_check_views_gain_and_dropped_where_they_lose(tmp_path, monkeypatch):
     def colored(start, cameras, views, rule):

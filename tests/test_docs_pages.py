@@ -80,6 +80,15 @@ def test_files_that_contributors_are_sent_to_are_there():
         assert list(ROOT.glob(name if "/" in name else f"tests/{name}")), name
 
 
+def test_the_map_for_contributors_has_every_room_in_its_order_and_every_test_file():
+    text = (ROOT / "CONTRIBUTING.md").read_text("utf-8")
+    table = text.partition("## Map of the package")[2].partition("\n\n| where")[0]
+    rows = re.findall(r"^\| (`.*?`) \| ", table, re.M)
+    assert tuple(re.findall(r"`(\w+)`", " ".join(rows))) == ROOMS
+    named = {path for name in re.findall(r"`(test_[\w*]+\.py)`", table) for path in ROOT.glob(f"tests/{name}")}
+    assert [path.name for path in ROOT.glob("tests/test_*.py") if path not in named] == []
+
+
 def test_readme_has_the_two_commands_each_on_a_line_with_its_own_set_up():
     lines = [
         line for line in (ROOT / "README.md").read_text("utf-8").splitlines() if line.startswith("python3 -m venv")

@@ -49,7 +49,7 @@ class Reader(HTMLParser):
 
 
 @pytest.fixture(scope="module")
-def ladder(tmp_path_factory, small_seats):
+def ladder(tmp_path_factory):
     """A whole report of a small scene with a model that shrinks every Gaussian: (folder, JSON)."""
     from vvgt_cli.cli.main import run as vvgt
 
@@ -91,6 +91,20 @@ def test_the_ladder_writes_every_file_and_scores_every_rung(ladder):
     assert found["command_line"].startswith("vvgt report example:blob:10 --output ")
     assert "--steps 2" in found["command_line"]
     assert found["machine"]["cpu"]
+
+
+def test_the_ladder_in_blocks_has_the_same_scores(ladder, vvgt, tmp_path):
+    folder, found = ladder
+    args = ("example:blob:10", *SMALL, "--model", folder.parent / "worse", "--blocks", 16)
+    result = vvgt("report", *args, "-o", tmp_path / "out")
+    assert result.code == 0, result.err
+    assert "in blocks of 16" in result.err
+    blocks = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert "--blocks 16" in blocks["command_line"]
+    assert [rung["name"] for rung in blocks["runs"]] == [rung["name"] for rung in found["runs"]]
+    for one, other in zip(found["runs"], blocks["runs"], strict=True):
+        assert one["scores"]["psnr"] == pytest.approx(other["scores"]["psnr"], abs=0.1)
+        assert one["seats"][0]["psnr"] == pytest.approx(other["seats"][0]["psnr"], abs=0.3)
 
 
 def test_the_ladders_page_opens_offline_and_shows_its_pictures(ladder):

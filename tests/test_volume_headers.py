@@ -201,11 +201,22 @@ def test_metaimage(tmp_path: Path, key: str, big: bool, header: int) -> None:
     np.testing.assert_array_equal(volume.data, VALUES)
 
 
+def test_metaimage_with_a_negative_spacing_runs_the_other_way(tmp_path: Path) -> None:
+    source = write(
+        tmp_path / "v.mha",
+        meta({"ElementSpacing": "1 -2 3", "ElementDataFile": "LOCAL"}) + VALUES.astype("<i2").tobytes(),
+    )
+    volume = read_volume(source)
+    assert volume.spacing == (1, 2, 3)
+    np.testing.assert_array_equal(volume.affine[:3, 1], [0, -2, 0])
+
+
 def test_metaimage_local_compressed_and_text(tmp_path: Path) -> None:
     body = VALUES.astype("<i2").tobytes()
     local = meta({"ElementDataFile": "LOCAL"}) + body
     volume = read_volume(write(tmp_path / "a.mha", local))
     assert isinstance(volume.data, np.memmap)
+    assert (volume.spacing, volume.origin) == ((1, 1, 1), (0, 0, 0))
     np.testing.assert_array_equal(volume.data, VALUES)
     packed = meta({"ElementDataFile": "LOCAL", "CompressedData": True}) + zlib.compress(body)
     np.testing.assert_array_equal(read_volume(write(tmp_path / "b.mha", packed)).data, VALUES)
@@ -228,6 +239,12 @@ def test_metaimage_components_and_steps(tmp_path: Path) -> None:
     volume = read_volume(source, ReadOptions(component=1))
     np.testing.assert_array_equal(volume.data, steps[1])
     assert volume.spacing == (1, 2, 3)
+    both = np.stack([channels, 2 * channels])
+    (tmp_path / "v.raw").write_bytes(both.tobytes())
+    source = write(tmp_path / "b.mhd", meta({"NDims": 4, "DimSize": "5 4 3 2", "ElementNumberOfChannels": 3}))
+    for number in range(6):
+        volume = read_volume(source, ReadOptions(component=number))
+        np.testing.assert_array_equal(volume.data, both[number // 3, ..., number % 3])
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ import zarr
 from tests.ramps import X, Y, Z, check_grid, check_ramp, ramp
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume import ReadOptions, read_volume
+from vvgt_cli.volume.labelled import even
 from vvgt_cli.volume.netcdf3 import check_header
 
 VALUES = ramp(X, Y, Z)
@@ -363,3 +364,13 @@ def test_netcdf_classic_headers_are_checked_before_the_library(tmp_path: Path, f
         path.write_bytes(whole[:cut])
         with pytest.raises(DataError, match="NetCDF header"):
             read_volume(str(path))
+
+
+@pytest.mark.parametrize("step", [1e-6, 1.0, 1e6])
+def test_coordinates_are_even_whatever_their_unit(step: float) -> None:
+    centres = step * np.arange(11.0)
+    off = step * (np.arange(11) == 4)
+    assert even(centres)
+    assert even(centres + 0.005 * off)
+    assert not even(centres + 0.02 * off)
+    assert not even((centres + 0.02 * off)[::-1])

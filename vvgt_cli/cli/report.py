@@ -8,6 +8,7 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
+from vvgt_cli.cli.blocks import block_options, chosen
 from vvgt_cli.cli.options import common_options, light_options, overwrite_option, read_options, tf_options
 from vvgt_cli.cli.sections import SectionedCommand
 from vvgt_cli.errors import UsageError
@@ -67,6 +68,7 @@ def command_line(ctx: click.Context) -> str:
 @tf_options
 @light_options
 @read_options
+@block_options
 @overwrite_option
 @common_options
 @click.pass_context
@@ -98,8 +100,9 @@ def command(
     if len(paths) != 1:
         raise UsageError(f"{len(paths)} volumes; expected one (reports to overlay need --compare)")
     ladder = pipeline.LadderOptions(
-        options["max_gaussians"], options["size"], options["steps"], options["model"], options["seed"]
-    )
+        options["max_gaussians"], options["size"], options["steps"], options["model"], options["seed"],
+        chosen(options["blocks"]),
+    )  # fmt: skip
     source = source_request(paths[0], options["read"], options["optics"], options["light"])
     request = pipeline.ReportRequest(
         source, output, ladder, options["picture_size"], options["overwrite"], command_line(ctx)

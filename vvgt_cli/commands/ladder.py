@@ -15,12 +15,14 @@ import numpy as np
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.cameras.blocks import Blocks, spread_blocks
 from vvgt_cli.cameras.boxed import render_in_box
-from vvgt_cli.conversion.convert import convert
+from vvgt_cli.conversion.convert import convert, opened
 from vvgt_cli.conversion.plan import DEFAULT_STEPS
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.conversion.stages.refinement import refine
-from vvgt_cli.conversion.stages.views import TrainingViews, views_of
-from vvgt_cli.field.source import SourceRequest, load
+from vvgt_cli.conversion.stages.views import CheckViews, TrainingViews, views_of
+from vvgt_cli.field.field import Field, Picture
+from vvgt_cli.field.settings import BlockOptions
+from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.field.workload import view_edge
 from vvgt_cli.gaussians import Gaussians, as_stored, read_ply, write_ply
 from vvgt_cli.gaussians.frames import transform
@@ -30,11 +32,10 @@ from vvgt_cli.refine import OptimizeOptions
 from vvgt_cli.score.checks import Views, judging_views
 from vvgt_cli.score.curves import short
 from vvgt_cli.score.record import ConversionReport, Run
-from vvgt_cli.score.viewing import SIDE, ConditionView, condition_views, from_above, score_conditions
+from vvgt_cli.score.viewing import SIDE, ConditionView, condition_views, from_above, score_conditions, seat_pictures
 from vvgt_cli.score.views import WHOLE, score_seen
 
 if TYPE_CHECKING:
-    from vvgt_cli.dvr import Scene
     from vvgt_cli.images.metrics import Scores
 
 SHARES = (64, 16, 4)  # of the budget, for the closed form at several K
@@ -54,6 +55,7 @@ class LadderOptions:
         steps: of gradient descent, a rung each; the baselines take as many as the longest.
         model: folder or name of an exported network, None for none.
         seed: of whatever draws random numbers.
+        blocks: how the volume is processed in blocks; None: in memory, or in blocks where it is large.
     """
 
     max_gaussians: int = 100_000
@@ -61,6 +63,7 @@ class LadderOptions:
     steps: tuple[int, ...] = (25, DEFAULT_STEPS, 200, 400)
     model: str | None = None
     seed: int = 0
+    blocks: BlockOptions | None = None
 
 
 @dataclass(frozen=True)
@@ -126,19 +129,22 @@ class Reference:
     seats: list[ConditionView]
 
     @classmethod
-    def render(cls, scene: Scene, size: int, console: Console) -> Reference:
+    def render(cls, volume: Field, size: int, console: Console) -> Reference:
         """The test views as `vvgt evaluate` has them."""
-        from vvgt_cli.dvr import REFERENCE, render_view
+        from vvgt_cli.dvr import REFERENCE
 
-        cameras, axes = default_views("test", size=size), scene.volume.axes
+        cameras, axes = default_views("test", size=size), volume.source.volume.axes
         blocks = [spread_blocks(size, size, i) for i in range(len(cameras))]
+        around = seat_pictures(from_above(size), SIDE)
+        volume.expect([Picture(camera, REFERENCE, _drawn(blocks, i)) for i, camera in enumerate(cameras)])
+        volume.expect([Picture(camera, REFERENCE, part) for _, camera, part in around])
         images, bar = [], console.bar("reference")
         for i, camera in enumerate(cameras):
-            images.append(render_view(scene, camera, REFERENCE, _drawn(blocks, i)))
+            images.append(volume.view(camera, REFERENCE, _drawn(blocks, i)))
             if bar:
                 bar(i + 1, len(cameras))
-        shown = upright(images, cameras, axes, lambda camera: render_view(scene, camera, REFERENCE))
-        seats = list(condition_views(scene, from_above(size), REFERENCE, views=SIDE))
+        shown = upright(images, cameras, axes, lambda camera: volume.view(camera, REFERENCE))
+        seats = list(condition_views(volume, from_above(size), REFERENCE, views=SIDE))
         rays = max(rays for _, rays in REFERENCE.tiers)
         return cls(cameras, blocks, images, REFERENCE.step, rays, axes, shown, seats)
 
@@ -185,7 +191,7 @@ def run_rungs(
     from vvgt_cli.splat import render
 
     for rung in rungs(options):
-        report, gaussians = _run(source, rung, reference.axes)
+        report, gaussians = _run(source, rung, reference.axes, options.blocks)
         if report.refinement and report.refinement["reason"] == "interrupted":
             raise KeyboardInterrupt
         scores, images = reference.score(gaussians)
@@ -200,26 +206,19 @@ def warm_up(source: SourceRequest, options: LadderOptions) -> None:
     """Run every kind of rung once at next to no size: kernels are compiled or loaded before any clock starts."""
     few = LadderOptions(100, 64, (2,) if options.steps else (), options.model, options.seed)
     for rung in rungs(few)[-4:]:
-        _run(source, rung, np.eye(3))
+        _run(source, rung, np.eye(3), options.blocks)
 
 
-def _run(source: SourceRequest, rung: Rung, axes: np.ndarray) -> tuple[ConversionReport, Gaussians]:
+def _run(
+    source: SourceRequest, rung: Rung, axes: np.ndarray, blocks: BlockOptions | None
+) -> tuple[ConversionReport, Gaussians]:
     """What became of it, Gaussians in the box frame; ``axes`` as `Reference` has them."""
     if rung.kind == "baseline":
-        return _baseline(source, rung)
+        return _baseline(source, rung, blocks)
     with tempfile.TemporaryDirectory() as folder:
         path = str(Path(folder) / "rung.ply")
-        report = convert(ConvertRequest(source, path, rung.fit, up="none"), Console(quiet=True))
+        report = convert(ConvertRequest(source, path, rung.fit, up="none", blocks=blocks), Console(quiet=True))
         return report, transform(read_ply(path)[0], np.linalg.inv(axes))
-
-
-def _begin(source: SourceRequest, rung: Rung) -> tuple[Run, Scene]:
-    run = Run(Console(quiet=True), ConversionReport("report", options=asdict(rung.fit)))
-    with run.stage("read"):
-        loaded = load(source)
-    with run.stage("scene"):
-        scene = loaded.scene()
-    return run, scene
 
 
 def _views_of(report: ConversionReport, fit: FitOptions) -> int:
@@ -231,14 +230,15 @@ def _views_of(report: ConversionReport, fit: FitOptions) -> int:
     return sum(stage["count"] for stage in report.plan["stages"] if stage["name"] == TrainingViews.name)
 
 
-def _views(run: Run, scene: Scene, fit: FitOptions) -> tuple[Views, Views]:
+def _views(run: Run, volume: Field, fit: FitOptions) -> tuple[Views, Views]:
     from vvgt_cli.dvr import RenderSettings, render_views
 
     train = default_views("train", views_of(fit.steps or 0, small=False), size=view_edge(fit.size, small=False))
+    volume.expect([*CheckViews().views(fit), *(Picture(camera, RenderSettings()) for camera in train)])
     with run.stage("check views"):
-        judges = judging_views(scene, default_views("check", size=fit.size), RenderSettings())
+        judges = judging_views(volume, default_views("check", size=fit.size), RenderSettings())
     with run.stage("views"):
-        return Views(train, render_views(scene, train)), judges
+        return Views(train, render_views(volume, train)), judges
 
 
 def _finish(run: Run, gaussians: Gaussians) -> tuple[ConversionReport, Gaussians]:
@@ -249,19 +249,20 @@ def _finish(run: Run, gaussians: Gaussians) -> tuple[ConversionReport, Gaussians
     return run.finish(), stored
 
 
-def _baseline(source: SourceRequest, rung: Rung) -> tuple[ConversionReport, Gaussians]:
+def _baseline(source: SourceRequest, rung: Rung, blocks: BlockOptions | None) -> tuple[ConversionReport, Gaussians]:
     """3DGS (Kerbl et al. 2023): its loss, rates and density control, from random points or samples of the volume."""
-    from vvgt_cli.closed_form import VbmOptions, initialise
+    from vvgt_cli.closed_form import VbmOptions
 
-    run, scene = _begin(source, rung)
-    fit = rung.fit
+    run, fit = Run(Console(quiet=True), ConversionReport("report")), rung.fit
     count = max(fit.max_gaussians // STARTS, 1)
-    with run.stage("samples"):
-        if rung.start == "points":
-            start = random_points(scene.half, count, fit.seed)
-        else:
-            start = initialise(scene, VbmOptions(count, fit.size, "uniform", fit.seed)).gaussians
-    train, check = _views(run, scene, fit)
+    with opened(run, ConvertRequest(source, fit=fit, blocks=blocks)) as volume:
+        with run.stage("samples"):
+            if rung.start == "points":
+                half = np.array(volume.source.volume.unit_frame().half)
+                start = random_points(half, count, fit.seed)
+            else:
+                start = volume.start(VbmOptions(count, fit.size, "uniform", fit.seed)).gaussians
+        train, check = _views(run, volume, fit)
     options = OptimizeOptions.of(
         "3dgs", steps=fit.steps, max_gaussians=fit.max_gaussians, seed=fit.seed,
         rule=INRIA.at(train.cameras[0].width / fit.size), judge=INRIA,

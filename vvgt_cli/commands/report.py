@@ -14,15 +14,17 @@ import numpy as np
 
 from vvgt_cli.commands.infer import SHIPPED
 from vvgt_cli.commands.ladder import PICTURED, LadderOptions, Reference, pictures, run_rungs, rungs, warm_up
+from vvgt_cli.conversion.convert import opened
+from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.errors import UsageError
-from vvgt_cli.field.source import SourceRequest, describe_source, load, tf_record, volume_record
+from vvgt_cli.field.source import SourceRequest, tf_record, volume_record
 from vvgt_cli.gaussians.outputs import STDOUT, Output, check_outputs, write_text
 from vvgt_cli.network.card import find_model
 from vvgt_cli.progress import Console
 from vvgt_cli.score.curves import Series, cost, front, knee, psnr, read_series, table, unit_costs, worst_seat
 from vvgt_cli.score.page import Pictures, page
 from vvgt_cli.score.plots import FILES, write_plots
-from vvgt_cli.score.record import document
+from vvgt_cli.score.record import ConversionReport, Run, document
 from vvgt_cli.volume.blocks import check_memory
 
 PAGE, TABLE, DATA = "report.html", "report.csv", "report.json"
@@ -63,11 +65,13 @@ def report(request: ReportRequest, console: Console | None = None) -> dict[str, 
     folder = _folder(request.output, (DATA, TABLE, PAGE, *FILES), request.overwrite)
     request = replace(request, ladder=_with_model(request.ladder))
     size = request.ladder.size
-    check_memory(VIEWS * size**2 * VIEW_BYTES, f"--size {size}: test views and ours")
-    source = load(request.source)
-    console.say(describe_source(source))
-    warm_up(request.source, request.ladder)
-    reference = Reference.render(source.scene(), size, console)
+    check_memory(VIEWS * size**2 * VIEW_BYTES, f"--size {size}: test views and ours", "try a smaller --size")
+    fit = FitOptions(request.ladder.max_gaussians, size)
+    whole = ConvertRequest(request.source, fit=fit, blocks=request.ladder.blocks)
+    with opened(Run(console, ConversionReport("report")), whole) as volume:
+        source = volume.source
+        warm_up(request.source, request.ladder)
+        reference = Reference.render(volume, size, console)
     runs, ours = [], []
     total = len(rungs(request.ladder))
     for run, images in run_rungs(request.source, request.ladder, reference, console):

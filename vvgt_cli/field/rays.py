@@ -29,7 +29,6 @@ from vvgt_cli.volume.stored import give_back
 
 SUFFIX = ".rays.npy"
 RAY = np.dtype([("ray", np.int32), ("rgba", np.float32, 4)])  # one of a bundle, and what a piece shows of it
-CAMERA = 17  # numbers: eye, basis, lens and step
 LONGEST = 1.0  # voxels of a segment, which ends within a voxel of its piece
 HALO, LIT_HALO = 1, 2  # voxels around a block that are read with it
 

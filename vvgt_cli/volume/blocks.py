@@ -35,7 +35,7 @@ def size_text(n_bytes: int) -> str:
 
 
 MAPPED = "store it uncompressed (raw and .nhdr files are mapped, not loaded)"
-IN_BLOCKS = "try 'vvgt convert' of it alone (without --dry-run) or 'vvgt init', which go through it in blocks"
+IN_BLOCKS = "use 'vvgt convert', 'init', 'evaluate', 'render-views' or 'report', which process it in blocks"
 
 
 def check_memory(need: int, what: str, instead: str = MAPPED) -> None:

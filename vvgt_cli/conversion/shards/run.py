@@ -17,28 +17,37 @@ from vvgt_cli.field.cells import CellBlocks
 from vvgt_cli.field.open import Wanted, beside, blocked
 from vvgt_cli.field.parts import CELLS, Parts
 from vvgt_cli.field.settings import BlockOptions
-from vvgt_cli.field.source import tf_record, volume_record
+from vvgt_cli.field.source import SourceRequest, tf_record, volume_record
 from vvgt_cli.files import check_room
 from vvgt_cli.gaussians.formats import format_of
 from vvgt_cli.gaussians.outputs import STDOUT, Output, claimed, write_text
 from vvgt_cli.jit.ahead import DRAW, INIT, RENDER, for_blocks
+from vvgt_cli.look import read_transfer_function
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
 
 
 def streams(request: ConvertRequest) -> bool:
     """Whether a closed form in blocks is written batch by batch, without its Gaussians in memory at once."""
-    options, light = request.blocks, request.source.light
-    lit = light.shadows or light.occlusion is not None or any(name != "none" for name in light.lights)
+    options, lit = request.blocks, _lit(request.source)
     other = request.fit.init != "vbm" or bool(request.output and options is not None and format_of(request.output))
     if options is not None and (options.shard is not None or options.levels > 1):
         if lit or other:
             raise UsageError(
-                "--levels and --shard write .ply files of unlit moments: leave out --light, --init and other formats, "
-                "or convert it as a whole (docs/scale.md)"
+                "--levels and --shard write .ply files of unlit moments: leave out --light (--light none turns off "
+                "that of the function's file), --init and other formats, or convert it as a whole (docs/scale.md)"
             )
         return True
     return options is not None and not (lit or other)
+
+
+def _lit(source: SourceRequest) -> bool:
+    """Whether there is light: that is asked for, or the function's file has it."""
+    light = source.light
+    if light.lights or light.shadows or light.occlusion is not None:
+        return light.lights != ("none",)
+    tf = read_transfer_function(source.tf) if isinstance(source.tf, str) else source.tf
+    return tf is not None and tf.lighting is not None
 
 
 def init_in_blocks(request: ConvertRequest, console: Console | None = None) -> ConversionReport:
