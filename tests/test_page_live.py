@@ -88,6 +88,13 @@ def test_no_name_is_markup() -> None:
     assert scene["live"]["name"] == "</script><b>x"
 
 
+def test_no_folder_is_in_the_page() -> None:
+    some = baked(cloud(), Table.of(RAMP, LO, HI, 0.05))
+    content, scene = page_of(some, options(), "/home/someone/a.html")
+    assert scene["frames"][0]["name"] == "a"
+    assert b"someone" not in content
+
+
 @pytest.mark.parametrize("tf", [RAMP, WINDOW, STEP, LAB])
 def test_nodes_are_those_of_the_function(tf: TransferFunction) -> None:
     nodes = nodes_of(facts(tf))

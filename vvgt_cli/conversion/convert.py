@@ -316,6 +316,7 @@ def ply_options(request: ConvertRequest, source: Source) -> PlyOptions:
         made_for=request.fit.size,
         rule=request.fit.rule,
         light=source.lighting,
+        function=source.name if len(source.layers) > 1 else source.tf.name,
         optics=source.optics(),
     )
     return placed(ply, source.volume)

@@ -59,6 +59,7 @@ def placed(ply: PlyOptions, volume: Volume) -> PlyOptions:
         scale=frame.scale,
         centre=frame.centre,
         space=volume.space or NONE,
+        length_unit=(volume.unit or None) if volume.space is None else None,
         affine=tuple(volume.affine[:3].ravel().tolist()),
     )
 

@@ -70,7 +70,7 @@ def placed_function(
     check_visible(shown, numbers)
     distance, label = unit_distance(function.unit_distance, volume_of(name, header), tf)
     old = header if isinstance(header, PlyOptions) else layout_of(header)
-    options = replace(old, live=None, unit_distance=distance, unit_distance_label=label)
+    options = replace(old, live=None, unit_distance=distance, unit_distance_label=label, function=shown.name)
     return shown, options
 
 

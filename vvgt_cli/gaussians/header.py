@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import dataclass, fields
 from typing import Any
@@ -43,6 +44,8 @@ class FileFacts:
         light: what fell on the scene.
         optics: digest of the tables and functions of an optics grid.
         live: of the values that the Gaussians carry; None where they have one look alone.
+        length_unit: of the world, where that has no anatomical space (whose unit is mm).
+        function: name of the transfer function.
     """
 
     frame: str = "unit"
@@ -58,6 +61,8 @@ class FileFacts:
     light: Lighting | None = None
     optics: str | None = None
     live: LiveFacts | None = None
+    length_unit: str | None = None
+    function: str | None = None
 
     def facts(self) -> dict[str, Any]:
         """The facts by name."""
@@ -227,6 +232,10 @@ def _one_comment(words: list[str]) -> dict[str, Any]:
         return {"space": words[1]}
     if words[0] == "light":
         return {"light": parse_lighting(" ".join(words[1:]))}
+    if words[0] == "length-unit":
+        return {"length_unit": words[1]}
+    if words[0] == "function":
+        return {"function": str(json.loads(" ".join(words[1:])))}
     if words[0] == "optics":
         return {"optics": words[1]}
     if words[0] == "affine":
@@ -248,6 +257,10 @@ def comment_lines(facts: FileFacts) -> list[str]:
     if facts.affine is not None:
         numbers = " ".join(repr(float(a)) for a in facts.affine)
         lines += [f"comment vvgt space {facts.space or 'none'}", f"comment vvgt affine {numbers}"]
+    if facts.length_unit is not None:
+        lines.append(f"comment vvgt length-unit {facts.length_unit}")
+    if facts.function is not None:
+        lines.append(f"comment vvgt function {json.dumps(facts.function)}")
     if facts.unit_distance is not None:
         label = facts.unit_distance_label or "given"
         lines.append(f"comment vvgt unit-distance {float(facts.unit_distance)!r} {label}")

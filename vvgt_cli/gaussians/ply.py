@@ -272,6 +272,7 @@ def describe(gaussians: Gaussians, header: PlyHeader) -> dict[str, object]:
         "unit_distance": header.unit_distance,
         "unit_distance_label": header.unit_distance_label,
         "version": header.version,
+        **{key: value for key in ("length_unit", "function") if (value := getattr(header, key)) is not None},
         **({} if header.light is None else {"light": header.light.text()}),
         **({} if header.live is None else live_summary(gaussians, header.live)),
     }

@@ -33,6 +33,7 @@ METRES = {
     "mm": 1e-3, "millimeter": 1e-3, "millimetre": 1e-3, "um": 1e-6, "µm": 1e-6, "micron": 1e-6, "micrometer": 1e-6,
     "micrometre": 1e-6, "nm": 1e-9, "nanometer": 1e-9, "nanometre": 1e-9, "angstrom": 1e-10, "pm": 1e-12,
 }  # fmt: skip
+_NAMES = {1e3: "km", 1.0: "m", 1e-2: "cm", 1e-3: "mm", 1e-6: "um", 1e-9: "nm", 1e-10: "angstrom", 1e-12: "pm"}
 _ROLES = {
     "x": {"x", "lon", "longitude", "rlon", "easting", "projection_x_coordinate", "grid_longitude"},
     "y": {"y", "lat", "latitude", "rlat", "northing", "projection_y_coordinate", "grid_latitude"},
@@ -286,7 +287,8 @@ def _placed(
         if field.shape[0] == 1 and (centres[0] is None or centres[0].size < 2):
             steps[0] = steps[2]  # a single slice is as thick as its pixels are wide
         origin = tuple(0.0 if c is None else float(c[0]) for c in reversed(centres))
-        return Volume(field, triple(steps[::-1]), origin, name=name, slope=scaling[0], intercept=scaling[1])
+        step = triple(steps[::-1])
+        return Volume(field, step, origin, name=name, slope=scaling[0], intercept=scaling[1], unit=_length(axes))
     if options.dims is None:
         uneven = [a for a, c in zip(axes, centres, strict=True) if c is not None and not even(c)]
         steps_text = ", ".join(_steps(a) for a in uneven)
@@ -381,6 +383,11 @@ def _one_unit(axes: Sequence[Axis], source: str) -> list[np.ndarray | None]:
         return [None if a.centres is None else a.centres * (METRES.get(_unit(a), base) / base) for a in axes]
     told = ", ".join(f"{a.name or 'unnamed'} in {_unit(a) or 'no unit'}" for a in reversed(axes) if a.size > 1)
     raise UsageError(f"{source}: axes {told}; expected one unit of length: try --spacing X Y Z")
+
+
+def _length(axes: Sequence[Axis]) -> str:
+    """The unit that `_one_unit` leads to, "" where it is none of length."""
+    return _NAMES.get(METRES.get(next((_unit(a) for a in reversed(axes) if a.size > 1), ""), 0.0), "")
 
 
 def _unit(a: Axis) -> str:

@@ -64,6 +64,7 @@ class Header:
     samples: int = 0  # bytes of a voxel that is a colour
     start: float = 0.0  # of time, in its unit
     time_unit: str = ""  # where the header says one
+    unit_known: bool = False  # of lengths
 
 
 def byte_order(head: bytes) -> tuple[str, int] | None:
@@ -131,6 +132,7 @@ def parse_header(head: bytes, name: str) -> Header:
         _COLORS.get(code, 0),
         start,
         {8: "s", 16: "ms", 24: "us"}.get(units & 0x38, ""),
+        units & 7 in (1, 2, 3),
     )
 
 
@@ -248,6 +250,7 @@ def _placed(header: Header, field: np.ndarray, path: Path, options: ReadOptions)
         header.slope,
         header.intercept,
         space,
+        unit="mm" if header.unit_known and options.spacing is None else "",
     )
 
 

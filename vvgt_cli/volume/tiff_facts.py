@@ -33,6 +33,7 @@ class Facts:
         colors: RGB in [0, 1] of the channels, where they have any.
         images: images that must be there for the description to hold; 0 where it does not say.
         units: of the spacing, where they do not compare.
+        length: unit of the spacing, "um" or unknown.
     """
 
     spacing: tuple[float | None, float | None, float | None] = (None, None, None)
@@ -40,6 +41,7 @@ class Facts:
     colors: list[tuple[float, float, float] | None] = field(default_factory=list)
     images: int = 0
     units: str = ""
+    length: str = ""
 
     def voxel(self, options: ReadOptions, slices: int, source: str) -> tuple[tuple[float, float, float], bool]:
         """The spacing to take, and whether the distance of several slices is a guess.
@@ -178,7 +180,8 @@ def _micrometres(numbers: list[float | None], units: list[str]) -> Facts:
         triple(
             None if n is None else float(f"{n * float(m or 1) / MICROMETRE:.15g}")
             for n, m in zip(numbers, metres, strict=True)
-        )
+        ),
+        length="um" if told else "",
     )
 
 

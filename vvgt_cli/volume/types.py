@@ -62,6 +62,7 @@ class Volume:
         hounsfield: whether the file says that data values are Hounsfield units.
         reference: UID of DICOM's frame of reference: positions of two volumes compare where it is the same.
         density: whether it is a map of densities (MRC, CCP4, cube, OpenDX), which are shown by standard deviations.
+        unit: of lengths in the world where there is no anatomical space, whose unit is mm: "um", "m", ...; "" unknown.
 
     Raises:
         DataError: wrong rank, empty axis, dtype that is not real, spacing not finite and positive, axes in a plane.
@@ -78,6 +79,7 @@ class Volume:
     hounsfield: bool = False
     reference: str | None = None
     density: bool = False
+    unit: str = ""
 
     def __post_init__(self) -> None:
         if self.data.ndim != 3 or min(self.data.shape) < 1:

@@ -108,7 +108,7 @@ def _text(title: str, scene: Mapping[str, Any], parts: str) -> str:
 
 def html(splats: Splats, name: str) -> bytes:
     """The page of one cloud as one file."""
-    return html_of_several([(_title(name), splats)], name)
+    return html_of_several([(title_of(name), splats)], name)
 
 
 def html_of_several(
@@ -137,7 +137,7 @@ def html_of_several(
     frames = [
         {"name": cloud, "file": f"{k}.compressed.ply", "held": f"splats-{k}"} for k, (cloud, _) in enumerate(clouds)
     ]
-    return page(_title(name), clouds[0][1], frames, "\n".join(elements), more).encode("utf-8")
+    return page(title_of(name), clouds[0][1], frames, "\n".join(elements), more).encode("utf-8")
 
 
 def framed(content: bytes, name: str) -> str:
@@ -148,7 +148,8 @@ def framed(content: bytes, name: str) -> str:
     return f'<iframe title="{escape(name)}" {allowed} style="{style}" srcdoc="{text}"></iframe>'
 
 
-def _title(name: str) -> str:
+def title_of(name: str) -> str:
+    """Of a page's file: no folder, no ending."""
     return re.split(r"[/\\]", name)[-1].removesuffix(".html")
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from vvgt_cli.gaussians import Gaussians, PlyOptions
 from vvgt_cli.gaussians.formats.live import live_bytes, live_json
-from vvgt_cli.gaussians.formats.page_file import html_of_several, upright
+from vvgt_cli.gaussians.formats.page_file import html_of_several, title_of, upright
 from vvgt_cli.gaussians.formats.splats import Splats, morton_order, splats_of
 from vvgt_cli.gaussians.frames import turn, up_matrix
 from vvgt_cli.gaussians.live import law_nodes
@@ -32,7 +32,7 @@ def live_html(gaussians: Gaussians, options: PlyOptions, name: str) -> bytes:
         DataError, UsageError: as `splats_of`, or a library that is missing.
     """
     splats, planes, facts = live_parts(gaussians, options)
-    return html_of_several([(name, splats)], name, {HELD: planes}, {"live": facts})
+    return html_of_several([(title_of(name), splats)], name, {HELD: planes}, {"live": facts})
 
 
 def live_parts(gaussians: Gaussians, options: PlyOptions) -> tuple[Splats, bytes, dict[str, Any]]:

@@ -11,6 +11,10 @@ if ! cmp -s "$here/package.json" "$cache/installed.json"; then
   (cd "$cache" && npm install --no-audit --no-fund --no-package-lock >&2)
   cp "$here/package.json" "$cache/installed.json"
 fi
+# the viewer's handle does not lead to its camera: how far what it turns about is away, and a pose to go to at once
+handle=$cache/node_modules/@playcanvas/supersplat-viewer/dist/viewer.js
+grep -q 'cameraManager: ()' "$handle" || sed -i 's/^        seek: (time) => viewer.seek(time),$/        cameraManager: () => viewer.cameraManager,\n&/' "$handle"
+grep -q 'cameraManager: ()' "$handle" || { echo "the viewer's handle is another one: see build.sh" >&2; exit 1; }
 NODE_PATH="$cache/node_modules" "$cache/node_modules/.bin/esbuild" "$here/page.mjs" --bundle --minify --format=iife \
   --target=es2022 --charset=utf8 --loader:.css=text --loader:.glsl=text --legal-comments=none --log-level=error --outfile="$cache/viewer.js"
 python3 - "$cache/viewer.js" "$out/viewer.js.gz" <<'PY'

@@ -13,7 +13,7 @@ async function unpacked(id) {
   return new Uint8Array(await new Response(stream.pipeThrough(new DecompressionStream('gzip'))).arrayBuffer());
 }
 
-// {apply(nodes), cut(axis or null, place, flipped)} of a viewer that has loaded its Gaussians, once they are shown so
+// {live, bytes, sums, plane, apply(nodes), cut(axis or null, place, flipped)} of a viewer that has loaded its Gaussians, once they are shown so
 export async function liveLook({ app }, live) {
   const entity = app.root.findByName('gsplat'), { gsplat } = entity, { resource } = app.assets.get(gsplat.asset);
   const bytes = await unpacked(live.held), count = bytes.length / 6;
@@ -41,14 +41,17 @@ export async function liveLook({ app }, live) {
     if (!--again) shown();
   });
   const look = {
+    live, bytes, sums: null, plane: null,  // what a place is found and read by
     apply(nodes) {
-      table.lock().set(texelsOf(sumsOf(nodes, live), live.table));
+      look.sums = sumsOf(nodes, live);
+      table.lock().set(texelsOf(look.sums, live.table));
       table.unlock();
       set('vvgtTable', table);
     },
     cut(axis, place, flipped) {
       const sign = flipped ? -1 : 1;
-      set('vvgtCut', axis === null ? [0, 0, 0, 1] : [...live.axes[axis].map((x) => sign * x), sign * place]);
+      look.plane = axis === null ? null : { normal: live.axes[axis].map((x) => sign * x), place: sign * place };
+      set('vvgtCut', look.plane ? [...look.plane.normal, look.plane.place] : [0, 0, 0, 1]);
     },
   };
   set('vvgtFacts', [first, last - first, live.thinnest, spreads]);

@@ -7,6 +7,8 @@ import { liveLook } from './live.mjs';
 import panelCss from './panel.css';
 import { panel, named } from './panel.mjs';
 import { served, waiting } from './server.mjs';
+import whereCss from './where.css';
+import { where } from './where.mjs';
 
 const KEPT = 16;  // frames of a series that stay in memory
 const PAUSE = 200;  // milliseconds from one frame of a series to the next
@@ -131,7 +133,7 @@ async function start() {
   if (!document.createElement('canvas').getContext('webgl2')) throw new Error('it has no WebGL 2, or it is turned off');
   hideKeys();
   const style = document.createElement('style');
-  style.textContent = css + panelCss;
+  style.textContent = css + panelCss + whereCss;
   document.head.append(style);
   if (scene.waits) return waiting(said);
   const { file } = scene.frames[0];
@@ -153,8 +155,10 @@ async function start() {
   if (scene.frames.length === 1 && !scene.live) document.body.append(named('baked'));
   const live = scene.live ? panel(await liveLook(viewer, scene.live), viewer, scene.live) : null;
   if (live) served(live, viewer, scene.live, scene.server);
+  const show = scene.frames.length > 1 ? series(viewer) : null, here = where(viewer, scene, live, show);
+  await here.restored;
   said.textContent = '';
-  window.vvgt = { viewer, live, show: scene.frames.length > 1 ? series(viewer) : null };
+  window.vvgt = { viewer, live, show, where: here };
 }
 
 start().catch((error) => {

@@ -1,0 +1,128 @@
+"""What files say of where they are, and what the page's program makes of it."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from vvgt_cli.conversion.place import placed
+from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
+from vvgt_cli.gaussians.formats.page_file import upright
+from vvgt_cli.gaussians.formats.splats import Splats, splats_of
+from vvgt_cli.gaussians.frames import UP_NAMES
+from vvgt_cli.volume import ReadOptions, Volume, read_volume
+
+PAGE = Path(__file__).parent.parent / "vvgt_cli" / "gaussians" / "formats" / "page"
+POINT = np.array([0.3, -0.5, 0.7], np.float32)  # in the unit frame
+SCALE, CENTRE = 0.04, (5.0, -6.0, 7.5)
+AFFINE = (1.0, 0, 0, 0, 0, 1.0, 0, 0, 0, 0, 1.0, 0)
+NAME = 'a "b" <i>ü\nc'
+
+
+def one() -> Gaussians:
+    ones = np.ones((1, 3), np.float32)
+    return Gaussians(POINT[None], -4 * ones, np.array([[1, 0, 0, 0]], np.float32), ones[:, 0], ones)
+
+
+def node(text: str, folder: Path) -> Any:
+    """What a program that imports from the page's modules prints, as JSON."""
+    if not shutil.which("node"):
+        pytest.skip("node is not on the path")
+    (folder / "run.mjs").write_text(text.replace("page:", PAGE.as_uri() + "/"))
+    done = subprocess.run(["node", "run.mjs"], cwd=folder, capture_output=True, text=True, check=True, timeout=120)
+    return json.loads(done.stdout)
+
+
+def world_of(splats: Splats, folder: Path) -> dict[str, Any]:
+    """Facts and world of a cloud, and where its first Gaussian is, by the page's program."""
+    x, y, z = splats.means[0].astype(float).tolist()
+    return dict(
+        node(
+            "import { factsOf, worldOf } from 'page:facts.mjs';\n"
+            f"const facts = factsOf({json.dumps(list(splats.comments))}), world = worldOf(facts);\n"
+            f"console.log(JSON.stringify({{ ...world, facts, at: world.place([{-x}, {-y}, {z}]) }}));",
+            folder,
+        )
+    )
+
+
+def test_comments_hold_the_unit_and_the_function() -> None:
+    for options in (PlyOptions(length_unit="um", function=NAME), PlyOptions()):
+        stream = io.BytesIO()
+        write_ply(stream, one(), options)
+        stream.seek(0)
+        header = read_ply(stream)[1]
+        assert (header.length_unit, header.function) == (options.length_unit, options.function)
+
+
+@pytest.mark.parametrize("up", UP_NAMES)
+def test_the_page_knows_the_place_and_the_letters(up: str, tmp_path: Path) -> None:
+    options = PlyOptions(up=up, scale=SCALE, centre=CENTRE, space="LPS", affine=AFFINE, function=NAME)
+    found = world_of(splats_of(one(), upright(options)), tmp_path)
+    np.testing.assert_allclose(found["at"], POINT / SCALE + CENTRE, atol=1e-4)
+    assert found["length"] == pytest.approx(1 / SCALE)
+    assert (found["unit"], found["letters"]) == ("mm", [["R", "L"], ["A", "P"], ["I", "S"]])
+    assert found["facts"]["function"] == NAME
+    axes = np.array(found["axes"])
+    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(axes) == pytest.approx(1)  # no mirror image
+    if up != "none":
+        sign = -1 if up[0] == "-" else 1
+        np.testing.assert_allclose(sign * axes["xyz".index(up[-1])], [0, 1, 0], atol=1e-12)
+
+
+def test_files_without_a_space_have_their_own_axes(tmp_path: Path) -> None:
+    told = PlyOptions(scale=SCALE, centre=CENTRE, space="none", affine=AFFINE, length_unit="um")
+    found = world_of(splats_of(one(), upright(told)), tmp_path)
+    assert (found["unit"], found["letters"][0], found["anatomical"]) == ("µm", ["−x", "x"], False)
+    bare = world_of(splats_of(one(), upright(PlyOptions(comments=False))), tmp_path)
+    assert (bare["unit"], bare["length"]) == ("", 1)
+    np.testing.assert_allclose(bare["at"], POINT, atol=1e-6)
+    other = replace(splats_of(one(), told), comments=("by another program", "vvgt", "vvgt up wide"))
+    assert world_of(other, tmp_path)["unit"] == ""
+
+
+def test_round_lengths_and_values(tmp_path: Path) -> None:
+    text = "import { round } from 'page:scale.mjs';\nimport { ticks } from 'page:legend.mjs';\n"
+    text += "const lengths = [9.99, 10, 49, 50, 0.0021, 3e7].map(round);\n"
+    text += "console.log(JSON.stringify([lengths, ticks(-1000, 3000), ticks(0, 0.29), ticks(5, 5)]));"
+    rounded, wide, small, none = node(text, tmp_path)
+    np.testing.assert_allclose(rounded, [5, 10, 20, 50, 0.002, 2e7])
+    assert wide == [-1000, 0, 1000, 2000, 3000]
+    np.testing.assert_allclose(small, [0, 0.05, 0.1, 0.15, 0.2, 0.25])
+    assert none == [5]
+
+
+def test_units_of_lengths_come_from_the_files(tmp_path: Path) -> None:
+    nib, tifffile, xarray = (pytest.importorskip(name) for name in ("nibabel", "tifffile", "xarray"))
+    values = np.zeros((4, 5, 6), np.float32)
+    tifffile.imwrite(
+        tmp_path / "a.tif",
+        values,
+        imagej=True,
+        resolution=(2, 2),
+        metadata={"unit": "micron", "spacing": 3, "axes": "ZYX"},
+    )
+    tifffile.imwrite(tmp_path / "plain.tif", values, photometric="minisblack")
+    image = nib.Nifti1Image(values, None)
+    image.header.set_xyzt_units("micron")
+    image.header["qform_code"] = image.header["sform_code"] = 0
+    nib.save(image, tmp_path / "a.nii")
+    nib.save(nib.Nifti1Image(values, np.diag([1, 2, 3, 1])), tmp_path / "ras.nii")
+    along = {name: (name, np.arange(n) * 0.5, {"units": "nm"}) for name, n in zip("zyx", values.shape, strict=True)}
+    xarray.DataArray(values, coords=along, dims=("z", "y", "x"), name="v").to_netcdf(tmp_path / "a.nc")
+
+    def unit(name: str, **given: Any) -> str | None:
+        return placed(PlyOptions(), read_volume(str(tmp_path / name), ReadOptions(**given))).length_unit
+
+    assert (unit("a.tif"), unit("plain.tif"), unit("a.tif", spacing=(1.0, 1, 1))) == ("um", None, None)
+    assert (unit("a.nii"), unit("ras.nii"), unit("a.nc")) == ("mm", None, "nm")
+    assert placed(PlyOptions(), Volume(values, unit="um", space="RAS")).length_unit is None

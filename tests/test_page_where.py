@@ -1,0 +1,284 @@
+"""Letters, scale bar, ruler, legend, link and picture of pages, in a real browser, as a person uses it."""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from browser import PAGES, browser, packages
+
+from vvgt_cli.cli.main import run
+from vvgt_cli.gaussians import Gaussians, PlyOptions, write_ply
+from vvgt_cli.images import read_png
+
+pytestmark = pytest.mark.long
+DESK, PHONE = (1280, 800), (390, 844)
+SIZES = [pytest.param(DESK, id="desk"), pytest.param(PHONE, id="phone")]
+CENTRE = np.array([30.0, -20.0, 12.0])  # of the marked volume in the world, mm
+MARK = np.array([20.0, 13.0, 9.0])  # of the mark from there: right, front, up
+SCALE = 0.04  # unit-frame lengths per mm of the two dots
+DOTS = np.array([[-0.7, 0.0, 0.2], [0.6, 0.0, -0.35]])  # red, blue
+TEXT = "[t.textContent, +t.getAttribute('x'), +t.getAttribute('y')]"
+LETTERS = f"[...document.querySelectorAll('#where text')].map((t) => {TEXT})"
+BAR = "(({ scale, lens }) => [scale.length, scale.across, scale.text, lens.flat])(window.vvgt.where)"
+
+
+class Person:
+    """Someone at a browser of a size: its steps are those of `tests/viewers/where.mjs`."""
+
+    def __init__(self, size: tuple[int, int]) -> None:
+        self.size, self.touch = size, size == PHONE
+        job = json.dumps({"browser": browser(), "size": size, "touch": self.touch})
+        command = ["node", str(PAGES / "where.mjs"), job, str(packages())]
+        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+    def __call__(self, what: str, *rest: Any) -> Any:
+        """One step; its answer. Nothing may be asked for, nothing break."""
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        self.process.stdin.write(json.dumps([what, *rest]) + "\n")
+        self.process.stdin.flush()
+        noted = json.loads(self.process.stdout.readline())
+        assert "error" not in noted, noted["error"]
+        assert noted["asked"] == []
+        assert noted["broken"] == []
+        return noted["answer"]
+
+    def picture(self, folder: Path, name: str, *, bare: bool = True) -> np.ndarray:
+        """(height, width, 3) of the page, without what lies over the picture if `bare`."""
+        self("settled")
+        self("bare" if bare else "shot", str(folder / name))
+        return read_png(folder / name)[..., :3]
+
+
+@pytest.fixture(scope="module", params=SIZES)
+def person(request: pytest.FixtureRequest) -> Iterator[Person]:
+    someone = Person(request.param)
+    yield someone
+    someone.process.communicate(timeout=60)
+
+
+def marked_volume(folder: Path) -> Path:
+    """A grey ball of 40 with a mark of 100 to its right; index axes oblique, the first one mirrored."""
+    nib = pytest.importorskip("nibabel")
+    dims, (a, b) = (60, 50, 40), np.radians((20, -15))
+    about_z = [[math.cos(a), -math.sin(a), 0], [math.sin(a), math.cos(a), 0], [0, 0, 1]]
+    about_x = [[1, 0, 0], [0, math.cos(b), -math.sin(b)], [0, math.sin(b), math.cos(b)]]
+    affine = np.eye(4)
+    affine[:3, :3] = np.array(about_z) @ about_x @ np.diag([-1.0, 1.2, 1.5])
+    affine[:3, 3] = CENTRE - affine[:3, :3] @ ((np.array(dims) - 1) / 2)
+    places = np.stack(np.meshgrid(*map(np.arange, dims), indexing="ij"), -1) @ affine[:3, :3].T + affine[:3, 3] - CENTRE
+    values = np.where(np.linalg.norm(places, axis=-1) < 16.5, 40, 0).astype(np.float32)
+    values[np.linalg.norm(places - MARK, axis=-1) < 5] = 100
+    nib.save(nib.Nifti1Image(values, affine), folder / "marked.nii.gz")
+    return folder / "marked.nii.gz"
+
+
+@pytest.fixture(scope="module")
+def marked(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Address of the live page of the marked volume."""
+    folder = tmp_path_factory.mktemp("marked")
+    grey, red = (0.6, 0.6, 0.6), (1, 0, 0)
+    nodes = ((0, grey, 0), (10, grey, 0), (25, grey, 0.95), (50, grey, 0.95), (58, red, 0.95), (100, red, 0.95))
+    points = [{"x": x, "rgb": rgb, "opacity": opacity} for x, rgb, opacity in nodes]
+    (folder / "marks.json").write_text(json.dumps({"name": "marks", "points": points}))
+    command = ["convert", str(marked_volume(folder)), "--live", "--tf", str(folder / "marks.json"), "--quiet"]
+    assert run([*command, "--max-gaussians", "8000", "-o", str(folder / "marked.html")]) == 0
+    return (folder / "marked.html").as_uri()
+
+
+@pytest.fixture(scope="module")
+def dots(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Address of the page of two dots, at places in mm that are known."""
+    folder = tmp_path_factory.mktemp("dots")
+    rgb = np.array([[1, 0, 0], [0, 0, 1]], np.float32)
+    quaternions = np.tile(np.array([1, 0, 0, 0], np.float32), (2, 1))
+    gaussians = Gaussians(
+        DOTS.astype(np.float32),
+        np.full((2, 3), math.log(0.02), np.float32),
+        quaternions,
+        np.full(2, 4, np.float32),
+        rgb,
+    )
+    affine = (1.0, 0, 0, 0, 0, 1.0, 0, 0, 0, 0, 1.0, 0)
+    options = PlyOptions(scale=SCALE, centre=(5.0, 6.0, 7.0), space="RAS", affine=affine, up="z")
+    write_ply(folder / "dots.ply", gaussians, options)
+    name = "<img src=x onerror=alert(1)>.html"
+    assert run(["view", str(folder / "dots.ply"), "-o", str(folder / name), "--quiet"]) == 0
+    return (folder / name).as_uri()
+
+
+def found(picture: np.ndarray, channel: int) -> tuple[np.ndarray | None, int]:
+    """Where a colour is, (x, y) px, None where it is not, and how many pixels have it."""
+    rest = np.delete(picture, channel, axis=-1).max(axis=-1)
+    mask = picture[..., channel] > rest + 0.25
+    if mask.sum() < 5:
+        return None, int(mask.sum())
+    weights = np.where(mask, picture[..., channel] - rest, 0).astype(np.float64)
+    y, x = np.indices(mask.shape)
+    return np.array([(weights * (x + 0.5)).sum(), (weights * (y + 0.5)).sum()]) / weights.sum(), int(mask.sum())
+
+
+VIEWS = {"A": "y", "P": "Shift+Y", "L": "x", "R": "Shift+X", "S": "z", "I": "Shift+Z"}
+
+
+def test_the_mark_is_where_the_letters_say(marked: str, person: Person, tmp_path: Path) -> None:
+    """From six sides, and after a drag, of a volume whose index axes are mirrored and oblique."""
+    person("open", marked)
+    middle, gizmo = np.array(person.size) / 2, np.array([54, person.size[1] - 106])
+    away: dict[str, np.ndarray] = {}
+    for seen_from in [*VIEWS, *([] if person.touch else ["drag"])]:
+        if seen_from == "drag":
+            person("drag", 600, 600, 700, 560)
+        else:
+            person("press", VIEWS[seen_from])
+        place, _ = found(person.picture(tmp_path, f"{seen_from}.png"), 0)
+        letters = {text: np.array([x, y - 5]) - gizmo for text, x, y in person("eval", LETTERS) if text in "RLAPSI"}
+        told = np.zeros(2)
+        for (near, far), length in zip(("RL", "AP", "SI"), MARK, strict=True):
+            told += length * (letters[near] if near in letters else -letters[far])
+        assert place is not None, seen_from
+        away[seen_from] = place - middle
+        cosine = away[seen_from] @ told / np.linalg.norm(away[seen_from]) / np.linalg.norm(told)
+        print(f"{person.size} from {seen_from}: cosine {cosine:.4f} between mark and letters")
+        assert cosine > 0.995, (seen_from, away[seen_from], told)
+        if seen_from in VIEWS:
+            assert np.linalg.norm(letters[seen_from]) < 2  # the side that is nearest
+    for near, far in ("AP", "SI"):  # what is nearer looks larger; from the left, the ball hides a part
+        assert np.linalg.norm(away[near]) > 1.05 * np.linalg.norm(away[far])
+
+
+def test_the_scale_bar_is_as_long_as_it_says(dots: str, person: Person, tmp_path: Path) -> None:
+    person("open", dots)
+    apart = float(np.linalg.norm(DOTS[1] - DOTS[0])) / SCALE  # mm
+    person("press", "y")
+    for flat in (False, True):
+        if flat:
+            person("press", "o")
+        picture = person.picture(tmp_path, "front.png")
+        red, blue = (found(picture, channel)[0] for channel in (0, 2))
+        assert red is not None
+        assert blue is not None
+        length, across, text, now_flat = person("eval", BAR)
+        assert (text, now_flat) == (f"{length:g} mm", flat)
+        told = length * np.linalg.norm(red - blue) / across
+        print(f"{person.size}, orthographic {flat}: {told:.3f} mm by the scale bar, {apart:.3f} mm known")
+        assert told == pytest.approx(apart, rel=0.005)
+
+
+def test_the_ruler_measures_what_is_known(dots: str, person: Person, tmp_path: Path) -> None:
+    apart = float(np.linalg.norm(DOTS[1] - DOTS[0])) / SCALE  # mm
+    person("open", dots)
+    person("eval", "window.vvgt.where.lens.set({ ...window.vvgt.where.lens.pose(), yaw: 37, pitch: -22 })")
+    for flat in (False, True):
+        if flat:
+            person("press", "o")
+        picture = person.picture(tmp_path, "turned.png")
+        person("click", "#tools .measure")
+        for channel in (0, 2):
+            place, _ = found(picture, channel)
+            assert place is not None
+            person("click", *place.tolist())
+        person.picture(tmp_path, f"ruler-{flat}.png", bare=False)
+        distance, text = person(
+            "eval", "[window.vvgt.where.ruler.distance(), document.querySelector('#places').textContent]"
+        )
+        print(f"{person.size}, orthographic {flat}: {distance} mm by the ruler, {apart:.3f} mm known; {text!r}")
+        assert distance == pytest.approx(apart, rel=0.005)
+        assert f"distance {distance:.4g} mm" in text
+        for line, dot in zip(text.splitlines(), DOTS, strict=False):
+            words = [part.split()[:2] for part in line[3:].split(",")]
+            told = [float(number) * (-1 if letter in "LPI" else 1) for letter, number in words]
+            np.testing.assert_allclose(told, dot / SCALE + (5, 6, 7), atol=0.25)
+        person("press", "Escape")
+        person("settled")
+        assert person("eval", "document.querySelector('#places').hidden")
+
+
+def test_a_place_has_the_value_of_the_volume(marked: str, person: Person, tmp_path: Path) -> None:
+    person("open", marked)
+    person("press", "y")
+    mark, _ = found(person.picture(tmp_path, "front.png"), 0)
+    assert mark is not None
+    person("click", "#tools .measure")
+    person("click", *mark.tolist())
+    person("click", 0.6 * person.size[0], person.size[1] / 2 + 0.12 * person.size[0])
+    on_mark, on_ball = person("eval", "window.vvgt.where.ruler.places")
+    print(f"{person.size}: {on_mark}, {on_ball}")
+    person.picture(tmp_path, "places.png", bare=False)
+    assert 50 < on_mark["value"] <= 100  # at a surface it lies between inside and outside: where the function is red
+    assert 10 < on_ball["value"] < 50  # and grey
+    offset = np.array(on_mark["world"]) - CENTRE
+    np.testing.assert_allclose(offset[[0, 2]], MARK[[0, 2]], atol=1.5)
+    assert 1 < offset[1] - MARK[1] < 6.5  # its face
+    assert np.linalg.norm(np.array(on_ball["world"]) - CENTRE) == pytest.approx(16.5, abs=1.5)
+
+
+AXIS = "document.querySelector('#live .axis')"
+NODES = [
+    {"x": 0, "y": 0, "rgb": [1, 1, 1]},
+    {"x": 30, "y": 0.4, "rgb": [1, 0.5, 0]},
+    {"x": 140, "y": 0.9, "rgb": [0, 1, 1]},
+]
+CHANGES = (
+    "document.querySelector('#live.folded .fold')?.click()",
+    f"(() => {{ {AXIS}.selectedIndex = 2; {AXIS}.dispatchEvent(new Event('change')) }})()",
+    f"window.vvgt.live.set({json.dumps(NODES)})",
+)
+
+
+def test_a_link_restores_the_picture(marked: str, person: Person, tmp_path: Path) -> None:
+    person("open", marked)
+    begin = person.picture(tmp_path, "begin.png")
+    for change in CHANGES:
+        person("eval", change)
+    person("press", "x")
+    person("press", "o")
+    if not person.touch:
+        person("drag", 600, 600, 700, 560)
+    before = person.picture(tmp_path, "before.png")
+    person("click", "#tools .link")
+    link = person("eval", "location.href")
+    assert link.startswith(marked + "#projection=orthographic&view=")
+    person("open", link)
+    after = person.picture(tmp_path, "after.png")
+    person.picture(tmp_path, "linked.png", bare=False)
+    print(f"{person.size}: {link.split('#')[1]}; mean difference {np.abs(before - after).mean():.2g}")
+    assert np.abs(before - after).mean() < 1e-3
+    assert np.abs(before - begin).mean() > 1e-2
+
+
+def test_a_saved_picture_has_legend_scale_and_letters(marked: str, person: Person, tmp_path: Path) -> None:
+    person("open", marked)
+    person("press", "y")
+    page = person.picture(tmp_path, "page.png", bare=False)
+    assert person("save", "#tools .picture", str(tmp_path / "saved.png")) == "marked.png"
+    picture, (wide, high) = read_png(tmp_path / "saved.png")[..., :3], person.size
+    assert picture.shape == (high, wide, 3)
+    legend = picture[high - 202 : high - 72, wide - 30 : wide - 12]
+    assert found(legend, 0)[1] > 300  # red, and grey below
+    assert ((abs(legend - 0.6) < 0.02).all(axis=-1)).sum() > 200
+    assert (picture[high - 78 : high - 66, 108:].min(axis=-1) > 0.9).sum() > 60  # the bar
+    assert (picture[high - 160 : high - 60, :100, 2] > 0.6).sum() > 10  # letters
+    over = np.s_[high - 210 : high - 60, :]  # where the page has nothing but the drawing over the picture
+    assert np.abs(picture[over] - page[over]).mean() < 5e-3
+    person("click", "#tools .about")
+    person.picture(tmp_path, "about.png", bare=False)
+    text = person("eval", "document.querySelector('#about').innerText")
+    for word in ("marked", "live", "marks", "RAS, in mm", "vvgt"):
+        assert word in text
+
+
+def test_names_are_text(dots: str, person: Person) -> None:
+    person("open", dots)
+    person("click", "#tools .about")
+    text = person("eval", "document.querySelector('#about').innerText")
+    assert "<img src=x onerror=alert(1)>" in text
+    assert "baked" in text
+    assert person("eval", "document.querySelectorAll('img').length") == 0

@@ -1,0 +1,76 @@
+// where.mjs JOB MODULES: pages in headless Chromium, used as a person uses them. JOB: JSON {"browser", "size": [w, h], "touch"}.
+// Reads steps [what, ...], a JSON list a line, and answers each with a line {"answer", "asked", "broken"} or {"error"}.
+// Steps: open URL; press KEY; click SELECTOR, or X Y; drag X Y X Y; eval JS; settled (until two pictures are the same); shot FILE
+// (the page), bare FILE (without what lies over the picture); save SELECTOR FILE (what a click downloads).
+import path from 'node:path';
+import readline from 'node:readline';
+import { createRequire } from 'node:module';
+
+const [text, modules] = process.argv.slice(2), job = JSON.parse(text);
+const { chromium } = createRequire(path.join(modules, 'x.js'))('playwright-core');
+const args = ['--no-sandbox', '--use-angle=swiftshader', '--enable-unsafe-swiftshader', '--ignore-gpu-blocklist', '--force-color-profile=srgb'];
+const browser = await chromium.launch({ executablePath: job.browser, args });
+const [width, height] = job.size;
+const context = await browser.newContext({ viewport: { width, height }, deviceScaleFactor: 1, hasTouch: job.touch, isMobile: job.touch });
+const page = await context.newPage();
+page.setDefaultTimeout(300000);
+const asked = [], broken = [];
+await page.route(/^(https?|wss?):/, (route) => { asked.push(route.request().url()); return route.abort(); });
+page.on('pageerror', (error) => broken.push(String(error)));
+
+async function open(url) {
+  if (page.url() !== 'about:blank') await page.goto('about:blank');
+  await page.goto(url);
+  await page.waitForFunction('window.vvgt !== undefined');
+  await settled();
+}
+
+async function settled() {
+  let before = null;
+  const frame = 'new Promise((done) => { const { app } = window.vvgt.viewer; app.renderNextFrame = true; app.once("frameend", done); })';
+  for (let n = 0; n < 60; n++) {
+    for (let k = 0; k < 3; k++) await page.evaluate(frame);
+    await page.waitForTimeout(50);
+    const now = (await page.screenshot()).toString('base64');
+    if (now === before) return;
+    before = now;
+  }
+  throw new Error('the picture does not come to rest');
+}
+
+const HIDE = '#tools, #live, #named, #where, #places, #about, .sse-ui { visibility: hidden !important }';
+const steps = {
+  open, settled,
+  press: (key) => page.keyboard.press(key),
+  click: (...at) => {
+    if (at.length === 1) return job.touch ? page.tap(at[0]) : page.click(at[0]);
+    return job.touch ? page.touchscreen.tap(...at) : page.mouse.click(...at);
+  },
+  drag: async (x, y, toX, toY) => {
+    await page.mouse.move(x, y);
+    await page.mouse.down();
+    await page.mouse.move(toX, toY, { steps: 8 });
+    await page.mouse.up();
+  },
+  eval: (text) => page.evaluate(text),
+  shot: async (file) => { await page.screenshot({ path: file }); },
+  bare: async (file) => {
+    const style = await page.addStyleTag({ content: HIDE });
+    await page.screenshot({ path: file });
+    await style.evaluate((element) => element.remove());
+  },
+  save: async (selector, file) => {
+    const [download] = await Promise.all([page.waitForEvent('download'), steps.click(selector)]);
+    await download.saveAs(file);
+    return download.suggestedFilename();
+  },
+};
+for await (const line of readline.createInterface({ input: process.stdin })) {
+  const [what, ...rest] = JSON.parse(line);
+  try {
+    console.log(JSON.stringify({ answer: (await steps[what](...rest)) ?? null, asked, broken }));
+  } catch (error) {
+    console.log(JSON.stringify({ error: String(error.stack) }));
+  }
+}
+await browser.close();

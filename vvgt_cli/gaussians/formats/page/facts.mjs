@@ -1,0 +1,48 @@
+// What the file says of itself: the comments of its header (docs/conventions.md, "The .ply") as the engine hands them on.
+const UP = {  // world axes as PLY has them, rows, by the axis that is up (frames.py)
+  none: [[1, 0, 0], [0, 1, 0], [0, 0, 1]], x: [[0, 1, 0], [-1, 0, 0], [0, 0, 1]], '-x': [[0, -1, 0], [1, 0, 0], [0, 0, 1]],
+  y: [[1, 0, 0], [0, -1, 0], [0, 0, -1]], '-y': [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+  z: [[1, 0, 0], [0, 0, -1], [0, 1, 0]], '-z': [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
+};
+const OPPOSITE = { R: 'L', L: 'R', A: 'P', P: 'A', S: 'I', I: 'S' };
+
+// {version, scale, centre, frame, up, space, 'length-unit', function, size, rule, 'unit-distance', label, light, unit}: text and numbers
+export function factsOf(comments) {
+  const facts = { up: 'none', space: 'none', frame: 'unit' };
+  for (const comment of comments ?? []) {
+    const [ours, key, ...rest] = comment.trim().split(/\s+/), text = rest.join(' ');
+    if (ours !== 'vvgt' || !key) continue;
+    if (key === 'frame') {
+      facts.frame = rest[0];
+      if (rest[1] === 'scale') [facts.scale, facts.centre] = [Number(rest[2]), rest.slice(4, 7).map(Number)];
+    } else if (key === 'unit-distance') [facts[key], facts.label] = [Number(rest[0]), rest.slice(1).join(' ')];
+    else if (key === 'size') [facts.size, facts.rule] = [Number(rest[0]), rest[2]];
+    else if (key === 'function') facts.function = JSON.parse(text);
+    else if (key === 'live') { if (rest[0] === 'unit') facts.unit = rest.slice(1).join(' '); }
+    else if (rest.length) facts[key] = text;
+    else facts.version = key;
+  }
+  if (!(facts.up in UP)) facts.up = 'none';
+  return facts;
+}
+
+// The file's world beside the viewer's axes, which have PLY (x, y, z) at (-x, -y, z): directions of its axes there, the letters
+// at both ends of each, the unit of lengths ('' unknown), and how long one of the viewer's lengths is in it.
+export function worldOf(facts) {
+  const rows = UP[facts.up], half = [-1, -1, 1], unit = facts.frame === 'unit' && facts.scale ? facts.scale : 1;
+  const centre = facts.frame === 'unit' && facts.centre ? facts.centre : [0, 0, 0];
+  const axes = [0, 1, 2].map((k) => [0, 1, 2].map((row) => half[row] * rows[row][k]));
+  const anatomical = /^[RL][AP][SI]$/.test(facts.space);
+  const letters = [0, 1, 2].map((k) => (anatomical ? [OPPOSITE[facts.space[k]], facts.space[k]] : ['−', ''].map((sign) => sign + 'xyz'[k])));
+  const known = anatomical ? 'mm' : (facts['length-unit'] ?? '').replace(/^um$/, 'µm');
+  return {
+    axes, letters, anatomical, unit: known, length: 1 / unit,
+    place: (p) => axes.map((axis, k) => (axis[0] * p[0] + axis[1] * p[1] + axis[2] * p[2]) / unit + centre[k]),
+  };
+}
+
+// A length or a coordinate as it is read
+export function shown(x, digits = 4) {
+  const text = String(Number(x.toPrecision(digits)));
+  return text.replace('-', '−');
+}

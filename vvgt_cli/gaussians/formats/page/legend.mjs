@@ -1,0 +1,36 @@
+// The legend: values of the function's range with their colours, as wide as they are opaque.
+import { shown } from './facts.mjs';
+import { functionAt } from './live_table.mjs';
+import { round } from './scale.mjs';
+import { element, label } from './svg.mjs';
+
+const HIGH = 130, WIDE = 18;
+const hex = (rgb) => `#${rgb.map((c) => Math.round(255 * Math.min(Math.max(c, 0), 1)).toString(16).padStart(2, '0')).join('')}`;
+
+// Round values between two
+export function ticks(lo, hi, many = 4) {
+  const step = round((hi - lo) / many) || 1, found = [];
+  for (let k = Math.ceil(lo / step - 1e-9); k * step <= hi + 1e-9 * step; k++) found.push(Number((k * step).toPrecision(12)));
+  return found;
+}
+
+export function drawLegend(group, { nodes, live, right, bottom }) {
+  const [lo, hi] = live.values, span = hi - lo || 1, top = bottom - HIGH, height = (v) => bottom - (HIGH * (v - lo)) / span;
+  const gradient = element('linearGradient', { id: 'where-legend', gradientUnits: 'userSpaceOnUse', x1: 0, y1: bottom, x2: 0, y2: top });
+  for (const { x, rgb } of nodes) gradient.append(element('stop', { offset: Math.min(Math.max((x - lo) / span, 0), 1), 'stop-color': hex(rgb) }));
+  const edge = Array.from({ length: HIGH + 1 }, (_, k) => {
+    const y = functionAt(nodes, lo + (span * k) / HIGH).y;
+    return `${(right - 2 - (WIDE - 2) * Math.cbrt(Math.min(Math.max(y, 0), 1))).toFixed(1)},${bottom - k}`;
+  });
+  group.append(
+    element('rect', { x: right - WIDE, y: top, width: WIDE, height: HIGH, fill: '#000', 'fill-opacity': 0.5, stroke: '#888' }), gradient,
+    element('path', { d: `M${right},${bottom}L${edge.join('L')}L${right},${top}Z`, fill: 'url(#where-legend)' }),
+  );
+  const values = ticks(lo, hi);
+  for (const v of values) {
+    group.append(element('path', { d: `M${right - WIDE - 4},${height(v)}h4`, stroke: '#ccc' }));
+    group.append(label(shown(v, 5), right - WIDE - 7, height(v) + 4, { 'text-anchor': 'end', 'font-size': 12 }));
+  }
+  group.append(label(live.unit || 'value', right, top - 9, { 'text-anchor': 'end', 'font-size': 12 }));
+  return values;
+}

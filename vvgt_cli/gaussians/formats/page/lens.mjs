@@ -1,0 +1,74 @@
+// The camera of the page: where it is, what a pixel sees, perspective or orthographic, and set to a pose at once.
+import { PROJECTION_ORTHOGRAPHIC, PROJECTION_PERSPECTIVE, Vec3 } from 'playcanvas';
+
+const DEGREES = Math.PI / 180;
+const of = (v) => [v.x, v.y, v.z], vec = (a) => new Vec3(...a);
+export const plus = (a, b, s = 1) => a.map((x, i) => x + s * b[i]), dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+
+// {pose, set, look, project, ray, perPixel, flat, change}; places are in the viewer's axes, pixels are of CSS
+export function lensOf(viewer) {
+  const { app } = viewer, canvas = app.graphicsDevice.canvas, entity = app.root.findComponent('camera').entity, { camera } = entity;
+  const rig = viewer.cameraManager();
+  const focus = new Vec3();
+  let flat = false;
+  const tangent = () => {  // of half the vertical field of view
+    const t = Math.tan((rig.camera.fov * DEGREES) / 2), { clientWidth: w, clientHeight: h } = canvas;
+    return w > h ? (t * h) / w : t;
+  };
+  const target = () => { rig.camera.calcFocusPoint(focus); return of(focus); };
+  const basis = () => ({ right: of(entity.right), up: of(entity.up), forward: of(entity.forward) });
+  const eye = () => of(entity.getPosition());
+
+  // after the viewer's own: it leaves the projection alone. Parallel rays begin before everything, however near the eye is.
+  app.on('update', () => {
+    if (app.xr?.active) return;
+    camera.projection = flat ? PROJECTION_ORTHOGRAPHIC : PROJECTION_PERSPECTIVE;
+    if (!flat) return;
+    const back = rig.camera.distance + 2 * camera.farClip;
+    camera.orthoHeight = rig.camera.distance * tangent();
+    camera.farClip += back;
+    entity.translateLocal(0, 0, back);
+  });
+
+  const lens = {
+    canvas, basis, eye,
+    get flat() { return flat; },
+    set flat(now) {
+      flat = now;
+      app.scene.gsplat.radialSorting = !now;
+      app.renderNextFrame = true;
+    },
+    pose: () => ({ target: target(), pitch: rig.camera.angles.x, yaw: rig.camera.angles.y, distance: rig.camera.distance }),
+    set({ target: at, pitch, yaw, distance }) {
+      viewer.state.cameraMode = 'orbit';
+      const { camera: now } = rig;
+      now.angles.set(pitch, yaw, 0);
+      now.distance = distance;
+      now.position.set(0, 0, 0);
+      now.calcFocusPoint(focus);
+      now.position.copy(vec(at)).sub(focus);
+      rig.snap();
+    },
+    // from a direction onto what is looked at; up is shown upwards where the direction is vertical
+    look(from, up) {
+      const { target: at, distance } = lens.pose(), level = Math.hypot(from[0], from[2]) > 1e-3;
+      const [x, z] = level ? [from[0], from[2]] : from[1] > 0 ? [-up[0], -up[2]] : [up[0], up[2]];
+      lens.set({ target: at, pitch: -Math.asin(Math.max(-1, Math.min(1, from[1]))) / DEGREES, yaw: Math.atan2(x, z) / DEGREES, distance });
+    },
+    // [x, y] in pixels of a place, null behind the eye
+    project(p) {
+      const { right, up, forward } = basis(), d = plus(p, eye(), -1), depth = dot(d, forward), { clientWidth: w, clientHeight: h } = canvas;
+      if (!flat && depth <= 0) return null;
+      const half = flat ? camera.orthoHeight : depth * tangent();
+      return [w / 2 + (dot(d, right) / half) * (h / 2), h / 2 - (dot(d, up) / half) * (h / 2)];
+    },
+    ray(x, y) {
+      const { right, up, forward } = basis(), { clientWidth: w, clientHeight: h } = canvas, half = flat ? camera.orthoHeight : tangent();
+      const [a, b] = [(2 * x - w) / h, (h - 2 * y) / h], aside = plus(plus([0, 0, 0], right, a * half), up, b * half);
+      return flat ? { origin: plus(eye(), aside), direction: forward } : { origin: eye(), direction: plus(forward, aside) };
+    },
+    // how long a pixel is where the view turns about
+    perPixel: () => (2 * rig.camera.distance * tangent()) / canvas.clientHeight,
+  };
+  return lens;
+}

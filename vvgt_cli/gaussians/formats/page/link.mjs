@@ -1,0 +1,68 @@
+// A link that restores what is seen: #view=...&projection=...&frame=...&function=...&cut=... Parts are {key, get, set} of text.
+const number = (x, digits = 6) => String(Number(x.toFixed(digits)));
+const hex = (rgb) => rgb.map((c) => Math.round(255 * Math.min(Math.max(c, 0), 1)).toString(16).padStart(2, '0')).join('');
+
+// the distance is of a square window, as the viewer's field of view is along the longer side
+const shape = () => Math.max(innerWidth, innerHeight, 1) / Math.max(Math.min(innerWidth, innerHeight), 1);
+
+export function viewParts(lens) {
+  return [
+    { key: 'projection', get: () => (lens.flat ? 'orthographic' : ''), set: (text) => { lens.flat = text === 'orthographic'; } },
+    {
+      key: 'view',
+      get: () => {
+        const { target, pitch, yaw, distance } = lens.pose();
+        return [...target, pitch, yaw, distance / shape()].map((x) => number(x)).join(',');
+      },
+      set: (text) => {
+        const [x, y, z, pitch, yaw, distance] = text.split(',').map(Number);
+        if ([x, y, z, pitch, yaw, distance].every(Number.isFinite) && distance > 0) lens.set({ target: [x, y, z], pitch, yaw, distance: distance * shape() });
+      },
+    },
+  ];
+}
+
+export function frameParts(show) {
+  const list = () => document.querySelector('#series select');
+  return [{ key: 'frame', get: () => (list().selectedIndex ? String(list().selectedIndex) : ''), set: (text) => { if (list().options[Number(text)]) return show(Number(text)); } }];
+}
+
+export function liveParts(live, facts) {
+  const find = (selector) => document.querySelector(`#live ${selector}`), pressed = () => find('.flip').getAttribute('aria-pressed') === 'true';
+  const written = (nodes) => nodes.map(({ x, y, rgb }) => `${Number(x.toPrecision(7))}:${number(y, 5)}:${hex(rgb)}`).join(',');
+  return [
+    {
+      key: 'function',
+      get: () => (written(live.nodes()) === written(facts.nodes) ? '' : written(live.nodes())),
+      set: (text) => {
+        const nodes = text.split(',').map((node) => {
+          const [x, y, color = ''] = node.split(':');
+          return { x: Number(x), y: Number(y), rgb: [0, 2, 4].map((k) => parseInt(color.slice(k, k + 2), 16) / 255) };
+        });
+        if (nodes.length > 1 && nodes.every(({ x, y, rgb }, k) => [x, y, ...rgb].every(Number.isFinite) && (!k || x >= nodes[k - 1].x))) live.set(nodes);
+      },
+    },
+    {
+      key: 'cut',
+      get: () => (find('.axis').selectedIndex > 0 ? `${'xyz'[find('.axis').selectedIndex - 1]},${find('input[type=range]').value}${pressed() ? ',other' : ''}` : ''),
+      set: (text) => {
+        const [axis, place, other] = text.split(',');
+        find('.axis').selectedIndex = 'xyz'.indexOf(axis) + 1;
+        find('input[type=range]').value = place;
+        find('.axis').dispatchEvent(new Event('change'));
+        if ((other === 'other') !== pressed()) find('.flip').click();
+      },
+    },
+  ];
+}
+
+export function linkOf(parts) {
+  const said = parts.map(({ key, get }) => [key, get()]).filter(([, text]) => text).map(([key, text]) => `${key}=${text}`);
+  return `${location.href.split('#')[0]}#${said.join('&')}`;
+}
+
+export async function restore(parts) {
+  const said = new Map(decodeURIComponent(location.hash.slice(1)).split('&').map((part) => [part.split('=')[0], part.slice(part.indexOf('=') + 1)]));
+  if (!said.has('view')) return;
+  for (const { key, set } of parts) if (said.has(key) || key === 'projection') await set(said.get(key) ?? '');
+}
