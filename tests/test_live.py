@@ -259,7 +259,6 @@ def test_what_a_live_file_does_not_go_with(vvgt, tmp_path) -> None:
         ("--sh-degree", 1),
         ("--steps", 9),
         ("--target-psnr", 30),
-        ("--light", "headlight"),
         ("--no-comments",),
     ):
         done = vvgt("convert", "example:blob:12", "--live", "-o", tmp_path / "a.ply", *SMALL, *option)

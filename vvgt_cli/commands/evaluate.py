@@ -13,7 +13,7 @@ from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.sets import SIZE
 from vvgt_cli.conversion.gaussian_files import STDIN, file_rule, layout_of, open_gaussians
 from vvgt_cli.conversion.place import into_box, preview, upright
-from vvgt_cli.conversion.recolored import under_function
+from vvgt_cli.conversion.recolored import light_of, under_function
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.field import Field, Picture, Resident
 from vvgt_cli.field.open import Wanted, automatic, beside, blocked
@@ -134,6 +134,8 @@ def _opened(run: Run, request: EvaluateRequest, gaussians: Gaussians, header: Pl
 
     def lit(source: Source) -> Source:
         preset = source.lighting if header.version is None else header.light
+        if other:
+            preset = source.lighting or header.light
         first, *others = source.layers
         if recorded:
             first = replace(first, unit_label=f"{header.unit_distance_label}, as the .ply records")
@@ -168,7 +170,8 @@ def _shown(gaussians: Gaussians, header: PlyHeader, source: Source, request: Sou
     """What carries values, under the function that is given; else the look of the file."""
     if header.live is None or request.tf is None or not isinstance(source.tf, TransferFunction) or source.gridded:
         return gaussians
-    options = replace(layout_of(header), unit_distance=source.unit_distance)
+    light = light_of(request.light, source.lighting, source.volume.space)
+    options = replace(layout_of(header), unit_distance=source.unit_distance, light=light)
     return under_function(gaussians, header, source.tf, options)
 
 

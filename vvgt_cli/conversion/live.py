@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vvgt_cli.cameras import default_views
+from vvgt_cli.closed_form.relit import relit
 from vvgt_cli.conversion.place import out_of_box
+from vvgt_cli.conversion.recolored import lit_by
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.conversion.result import Conversion
 from vvgt_cli.conversion.stage import Work
@@ -21,12 +23,14 @@ from vvgt_cli.conversion.stages.refinement import SMALLEST
 from vvgt_cli.errors import NothingVisible, UsageError
 from vvgt_cli.field.field import Field
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored
-from vvgt_cli.gaussians.live import LENGTH, SHORTEST, Table, baked, lengths, shown_by
-from vvgt_cli.gaussians.live_facts import LiveFacts
+from vvgt_cli.gaussians.live import LENGTH, SHORTEST, Table, baked, lengths
+from vvgt_cli.gaussians.live_facts import GRADIENT, LiveFacts
 from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.look.lighting import Lighting
 from vvgt_cli.score.record import Run
 from vvgt_cli.score.viewing import PREVIEW_VIEWS
 from vvgt_cli.score.views import psnr_note, score_test_views
+from vvgt_cli.volume.types import triple
 
 if TYPE_CHECKING:
     from vvgt_cli.field.source import Source
@@ -49,10 +53,11 @@ def check_live(request: ConvertRequest) -> None:
         "--checkpoint": request.checkpoint is not None,
         "--sh-degree": request.ply.sh_degree is not None,
         "--no-comments": not request.ply.comments,
-        "--light": light != type(light)(),
+        "--shadows": light.shadows,
+        "--ambient-occlusion": light.occlusion is not None,
     }
     if names := [name for name, there in given.items() if there]:
-        raise UsageError(f"--live: a file for every function, unlit and made in one way; leave out {', '.join(names)}")
+        raise UsageError(f"--live: a file for every function, made in one way; leave out {', '.join(names)}")
 
 
 def live_conversion(run: Run, request: ConvertRequest, field: Field, ply: PlyOptions) -> Conversion:
@@ -69,17 +74,15 @@ def live_conversion(run: Run, request: ConvertRequest, field: Field, ply: PlyOpt
     source.one_field()
     tf = source.tf
     assert isinstance(tf, TransferFunction)
-    if source.lighting is not None:
-        run.console.say(f"{tf.name}: its light is left out; a live file is unlit")
-        field = field.shown_by(replace(tf, opacity_unit_distance=source.unit_distance, opacity_unit_share=None))
+    lighting = in_box(source)
     foggy = field.shown_by(fog(source.statistics, tf))
     gaussians = carrying(run, foggy, placed_by(run, foggy, request))
     gaussians = wide_enough(gaussians, fit.size)
     table = table_of(source)
-    gaussians = as_stored(baked(gaussians, table))
+    gaussians = as_stored(lit(baked(gaussians, table), lighting))
     with run.stage("live look") as stage:
         live = score_test_views(
-            field, shown_by(gaussians, table), fit.size, RenderSettings(), rule=fit.rule, perceptual=False,
+            field, lit_by(gaussians, table, lighting), fit.size, RenderSettings(), rule=fit.rule, perceptual=False,
             only=PREVIEW_VIEWS,
         )  # fmt: skip
         stage.note = (
@@ -89,8 +92,27 @@ def live_conversion(run: Run, request: ConvertRequest, field: Field, ply: PlyOpt
     for stage_of_scores in (TestViews(request.scored_whole), ViewingConditions()):
         stage_of_scores.run(work)
     facts = LiveFacts.of(source.volume, source.statistics, tf)
-    ply = replace(ply, light=None, sh_degree=0, live=facts)
+    ply = replace(ply, live=facts)
     return Conversion(out_of_box(gaussians, source.volume), run.report, ply, field)
+
+
+def in_box(source: Source) -> Lighting | None:
+    """A source's light, its directions in the box frame.
+
+    Raises:
+        UsageError: shadows or occlusion, of a preset.
+    """
+    if source.lighting is None:
+        return None
+    inward = np.linalg.inv(source.volume.axes)
+    turned = [triple((inward @ np.array(direction)).tolist()) for direction in source.lighting.directions]
+    return replace(source.lighting, directions=tuple(turned))
+
+
+def lit(gaussians: Gaussians, lighting: Lighting | None) -> Gaussians:
+    """Gaussians that carry values with their colours under a light in their frame."""
+    assert gaussians.live is not None
+    return gaussians if lighting is None else relit(gaussians, gaussians.live[:, GRADIENT], lighting)
 
 
 def table_of(source: Source) -> Table:

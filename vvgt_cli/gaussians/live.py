@@ -106,15 +106,19 @@ def baked(gaussians: Gaussians, table: Table) -> Gaussians:
     return replace(gaussians, opacity_logits=logits, colors=colors, harmonics=None)
 
 
-def shown_by(gaussians: Gaussians, table: Table) -> Gaussians:
-    """An ordinary cloud: what Gaussians that carry values are under a function, without those that it hides."""
+def seen_under(gaussians: Gaussians, table: Table) -> np.ndarray:
+    """Numbers of those that a function does not hide, ascending."""
     assert gaussians.live is not None
-    sums = table.at(gaussians.live[:, VALUE], gaussians.live[:, SPREAD])
-    visible = -np.expm1(-sums[:, TAU] * gaussians.live[:, LENGTH] / THINNEST**0.5) >= MIN_ALPHA
-    gaussians, sums = gaussians.take(np.flatnonzero(visible)), sums[visible]
+    tau = table.at(gaussians.live[:, VALUE], gaussians.live[:, SPREAD])[:, TAU]
+    return np.flatnonzero(-np.expm1(-tau * gaussians.live[:, LENGTH] / THINNEST**0.5) >= MIN_ALPHA)
+
+
+def shown_by(gaussians: Gaussians, table: Table) -> Gaussians:
+    """An ordinary cloud, unlit: what Gaussians that carry values are under a function, all of them."""
     assert gaussians.live is not None
     if not len(gaussians):
         return replace(gaussians, live=None, harmonics=None)
+    sums = table.at(gaussians.live[:, VALUE], gaussians.live[:, SPREAD])
     tau = np.maximum(sums[:, TAU], 1e-30)
     first = sums[:, FIRST] / tau
     variance = np.maximum(sums[:, SECOND] / tau - first**2, 0)

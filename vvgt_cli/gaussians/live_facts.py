@@ -15,6 +15,7 @@ from vvgt_cli.look.colormap import ColorMap
 from vvgt_cli.look.convert import to_text
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.opacity import PiecewiseOpacity
+from vvgt_cli.look.readers.minimal import read
 from vvgt_cli.volume import Statistics, Volume
 from vvgt_cli.volume.stats import BINS, edges_of
 
@@ -58,6 +59,16 @@ class LiveFacts:
     def baked(self) -> dict[str, Any]:
         """The function as JSON holds it."""
         return dict(json.loads(self.function)) if self.function else {}
+
+    def tf(self, name: str) -> TransferFunction:
+        """The function that is baked in, on data values.
+
+        Raises:
+            DataError: the file ``name`` has none.
+        """
+        if not self.function:
+            raise DataError(f"{name}: its header has no function; give one with --tf")
+        return read(self.baked(), f"the function of {name}")
 
     def lines(self) -> list[str]:
         """Comments; `parsed` reads them."""

@@ -13,7 +13,7 @@ async function unpacked(id) {
   return new Uint8Array(await new Response(stream.pipeThrough(new DecompressionStream('gzip'))).arrayBuffer());
 }
 
-// {apply(nodes), cut(axis or null, place, flipped)} of a viewer that has loaded its Gaussians, once they are shown so
+// {apply(nodes), cut(axis or null, place, flipped), light(of light.mjs)} of a viewer that has loaded its Gaussians, once they are shown so
 export async function liveLook({ app }, live) {
   const entity = app.root.findByName('gsplat'), { gsplat } = entity, { resource } = app.assets.get(gsplat.asset);
   const bytes = await unpacked(live.held), count = bytes.length / 6;
@@ -32,6 +32,15 @@ export async function liveLook({ app }, live) {
     app.renderNextFrame = true;
     again = 2;
   };
+  // a light that depends on the eye, or a highlight: again when the camera has moved
+  const camera = app.root.findComponent('camera').entity, eye = [0, 0, 0];
+  let follows = false;
+  app.on('update', () => {
+    const { x, y, z } = camera.getPosition();
+    if (!follows || Math.hypot(x - eye[0], y - eye[1], z - eye[2]) < 1e-4) return;
+    [eye[0], eye[1], eye[2]] = [x, y, z];
+    set('vvgtEye', [...eye]);
+  });
   // what is set while the engine takes up another state may be lost: set once more when it is ready
   app.on('update', () => { if (again) app.renderNextFrame = true; });
   app.systems.gsplat.on('frame:ready', (camera, layer, ready, loading) => {
@@ -51,6 +60,15 @@ export async function liveLook({ app }, live) {
       set('vvgtCut', axis === null ? [0, 0, 0, 1] : [...live.axes[axis].map((x) => sign * x), sign * place]);
     },
   };
+  look.light = ({ kind, from, ambient, diffuse, specular, power }) => {
+    const { x, y, z } = camera.getPosition();
+    follows = kind !== 'none' && (kind === 'headlight' || specular > 0);
+    [eye[0], eye[1], eye[2]] = [x, y, z];
+    gsplat.setParameter('vvgtEye', [...eye]);
+    gsplat.setParameter('vvgtToward', [...from, kind === 'headlight' ? 1 : 0]);
+    set('vvgtLight', [kind === 'none' ? -1 : ambient, diffuse, specular, power]);
+  };
+  look.light(live.light);
   set('vvgtFacts', [first, last - first, live.thinnest, spreads]);
   look.cut(null);
   look.apply(live.nodes);

@@ -1,4 +1,5 @@
 // The panel of a live page: the function over the histogram, its nodes to be dragged; a cut.
+import { light } from './light.mjs';
 import { functionAt } from './live_table.mjs';
 
 const WIDE = 276, HIGH = 92, NEAR = 16, TWICE = 350;  // px; milliseconds between the taps that add a node
@@ -69,7 +70,7 @@ export function panel(look, viewer, live) {
   named('live', root.querySelector('.named'));
   const find = (selector) => root.querySelector(selector), [lo, hi] = live.values, span = hi - lo || 1;
   const across = (x) => 6 + ((WIDE - 12) * (x - lo)) / span, value = (p) => Math.min(Math.max(lo + (span * (p - 6)) / (WIDE - 12), lo), hi);
-  const ready = presets(live), undone = [];
+  const ready = presets(live), undone = [], parts = [];  // parts: what undo goes back to beside the function
   let nodes = fewer(live.nodes), exact = live.nodes, chosen = 0, due = false;  // exact: of the file until an edit
 
   function draw() {
@@ -111,13 +112,17 @@ export function panel(look, viewer, live) {
 
   // before a change: what undo goes back to
   function keep() {
-    undone.push({ nodes: copy(nodes), exact, chosen });
+    undone.push({ nodes: copy(nodes), exact, chosen, states: parts.map((part) => part.state()) });
     if (undone.length > 200) undone.shift();
+    find('.undo').disabled = false;
   }
+  const history = { keep, add: (part) => parts.push(part) };
 
   function undo() {
     if (!undone.length) return;
-    ({ nodes, exact, chosen } = undone.pop());
+    const then = undone.pop();
+    ({ nodes, exact, chosen } = then);
+    parts.forEach((part, k) => { if (part.state() !== then.states[k]) part.set(then.states[k]); });
     show();
   }
 
@@ -237,6 +242,8 @@ export function panel(look, viewer, live) {
     flip.setAttribute('aria-pressed', String(flip.getAttribute('aria-pressed') !== 'true'));
     cut();
   });
+
+  root.append(light(look, viewer, live.light, history));
 
   const fold = (folded) => {
     root.classList.toggle('folded', folded);
