@@ -26,17 +26,21 @@ from vvgt_cli.progress import Console
     "-o", "--output", required=True, metavar="OUT.ply",
     help="Output file; its ending selects the format, - is standard output.",
 )  # fmt: skip
+@click.option(
+    "--labels", metavar="TABLE|auto",
+    help="Table of labels, for a file of a label map; opacity 0 hides one. Default: the one that the file has.",
+)  # fmt: skip
 @tf_range_option
 @unit_distance_option
 @relight_options
 @overwrite_option
 @common_options
 def command(
-    ply: str, tf: str | None, output: str, tf_range: str, opacity_unit_distance: str | None, light: dict[str, Any],
-    overwrite: bool, console: Console,
+    ply: str, tf: str | None, labels: str | None, output: str, tf_range: str, opacity_unit_distance: str | None,
+    light: dict[str, Any], overwrite: bool, console: Console,
 ) -> None:  # fmt: skip
-    """Write what LIVE.ply, made by 'vvgt convert --live', is under the transfer function TF and a light, as an ordinary
-    file.
+    """Write what LIVE.ply, made by 'vvgt convert --live', is under the transfer function TF (of a label map: under
+    TABLE) and a light, as an ordinary file.
 
     The volume is not needed. Gaussians that TF hides are left out. LIVE.ply may be "-".
 
@@ -49,5 +53,5 @@ def command(
     from vvgt_cli.conversion.recolored import FunctionRequest
     from vvgt_cli.look.lighting import LightOptions
 
-    function = FunctionRequest(tf, tf_range, opacity_unit_distance, LightOptions(**light))
+    function = FunctionRequest(tf, tf_range, opacity_unit_distance, labels, LightOptions(**light))
     recolor(RecolorRequest(ply, function, output, overwrite), console)

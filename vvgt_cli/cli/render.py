@@ -40,6 +40,7 @@ from vvgt_cli.progress import Console
     metavar="R G B",
     help="Background colour, 0 to 1. Default: transparent for PNG, black for movies.",
 )
+@click.option("--labels", metavar="TABLE|auto", help="Table of labels to show a live .ply of a label map under.")
 @click.option("--tf", metavar="TF", help="Transfer function to show a .ply of 'vvgt convert --live' under.")
 @tf_range_option
 @unit_distance_option
@@ -57,6 +58,7 @@ def command(
     exr: bool,
     background: tuple[float, float, float] | None,
     tf: str | None,
+    labels: str | None,
     tf_range: str,
     opacity_unit_distance: str | None,
     light: dict[str, Any],
@@ -83,5 +85,5 @@ def command(
         raise UsageError("give the views with either --camera FILE or --orbit N")
     if background is not None and not all(0 <= c <= 1 for c in background):
         raise UsageError(f"--background {' '.join(map(str, background))}: expected three numbers in [0, 1]")
-    function = function_of(tf, tf_range, opacity_unit_distance, light)
+    function = function_of(tf, tf_range, opacity_unit_distance, labels, light)
     render_file(RenderRequest(ply, output, camera, orbit, size, rule, exr, background, overwrite, function), console)

@@ -42,7 +42,7 @@ def recolor(request: RecolorRequest, console: Console | None = None) -> None:
     """
     run = Run(console or Console(), ConversionReport("recolor"))
     function = request.function
-    inputs = [request.ply, *([function.tf] if isinstance(function.tf, str) else [])]
+    inputs = [request.ply, *(path for path in (function.tf, function.labels) if isinstance(path, str))]
     with claimed([Output("-o", request.output, SUFFIXES, splats=True)], inputs, request.overwrite):
         with run.stage("read") as stage:
             gaussians, header = open_gaussians(request.ply)
@@ -56,17 +56,21 @@ def recolor(request: RecolorRequest, console: Console | None = None) -> None:
 
 
 def function_of(
-    tf: str | None, tf_range: str, unit_distance: str | None, light: Mapping[str, Any] | None = None
+    tf: str | None,
+    tf_range: str,
+    unit_distance: str | None,
+    labels: str | None = None,
+    light: Mapping[str, Any] | None = None,
 ) -> FunctionRequest | None:
-    """What options of a command add up to; None where they are of no look: without ``--tf`` and a light.
+    """What options of a command add up to; None where they are of no look: without ``--tf``, ``--labels`` and a light.
 
     Raises:
         UsageError: a range or a distance without a function.
     """
     lights = LightOptions(**(light or {}))
-    if tf is None:
+    if tf is None and labels is None:
         if tf_range != "data" or unit_distance is not None:
             raise UsageError("--tf-range and --opacity-unit-distance are of a function; give --tf too")
         if lights == LightOptions():
             return None
-    return FunctionRequest(tf, tf_range, unit_distance, lights)
+    return FunctionRequest(tf, tf_range, unit_distance, labels, lights)

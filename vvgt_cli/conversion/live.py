@@ -13,8 +13,9 @@ import numpy as np
 
 from vvgt_cli.cameras import default_views
 from vvgt_cli.closed_form.relit import relit
+from vvgt_cli.conversion.live_labels import carrying_labels, fog_of_labels, label_facts, labels_of
 from vvgt_cli.conversion.place import out_of_box
-from vvgt_cli.conversion.recolored import lit_by
+from vvgt_cli.conversion.recolored import lit_by, looked_up
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.conversion.result import Conversion
 from vvgt_cli.conversion.stage import Work
@@ -64,21 +65,24 @@ def live_conversion(run: Run, request: ConvertRequest, field: Field, ply: PlyOpt
     """Place, look up, bake, score; ``ply`` as of an ordinary conversion.
 
     Raises:
-        UsageError: labels, channels or layers.
+        UsageError: channels or layers.
         DataError: nothing is visible.
     """
     from vvgt_cli.dvr import RenderSettings
     from vvgt_cli.look.fog import fog
 
     source, fit = field.source, request.fit
-    source.one_field()
-    tf = source.tf
-    assert isinstance(tf, TransferFunction)
-    lighting = in_box(source)
-    foggy = field.shown_by(fog(source.statistics, tf))
-    gaussians = carrying(run, foggy, placed_by(run, foggy, request))
+    tf, lighting = source.tf, in_box(source)
+    if source.gridded:
+        labels = labels_of(source)
+        foggy, facts = fog_of_labels(field, labels), label_facts(source, labels)
+        gaussians = carrying_labels(run, foggy, placed_by(run, foggy, request), labels)
+    else:
+        assert isinstance(tf, TransferFunction)
+        foggy, facts = field.shown_by(fog(source.statistics, tf)), LiveFacts.of(source.volume, source.statistics, tf)
+        gaussians = carrying(run, foggy, placed_by(run, foggy, request))
     gaussians = wide_enough(gaussians, fit.size)
-    table = table_of(source)
+    table = looked_up(facts, tf, source.unit_distance * source.volume.unit_frame().scale)
     gaussians = as_stored(lit(baked(gaussians, table), lighting))
     with run.stage("live look") as stage:
         live = score_test_views(
@@ -91,7 +95,6 @@ def live_conversion(run: Run, request: ConvertRequest, field: Field, ply: PlyOpt
     work = Work(run, field, fit, gaussians=gaussians)
     for stage_of_scores in (TestViews(request.scored_whole), ViewingConditions()):
         stage_of_scores.run(work)
-    facts = LiveFacts.of(source.volume, source.statistics, tf)
     ply = replace(ply, live=facts)
     return Conversion(out_of_box(gaussians, source.volume), run.report, ply, field)
 
@@ -119,7 +122,7 @@ def table_of(source: Source) -> Table:
     """Of a source's function, lengths in the unit frame."""
     numbers, tf = source.statistics, source.tf
     assert isinstance(tf, TransferFunction)
-    return Table.of(tf, numbers.lo, numbers.hi, source.unit_distance * source.volume.unit_frame().scale)
+    return Table.of_function(tf, numbers.lo, numbers.hi, source.unit_distance * source.volume.unit_frame().scale)
 
 
 def placed_by(run: Run, field: Field, request: ConvertRequest) -> Gaussians:
@@ -135,7 +138,7 @@ def placed_by(run: Run, field: Field, request: ConvertRequest) -> Gaussians:
         start = field.start(options, run.console.bar("closed form"))
         if not len(start.gaussians):
             raise NothingVisible(field.source.volume.name, field.source.name)
-        stage.note = f"{len(start.gaussians)} Gaussians of all values but the background's"
+        stage.note = f"{len(start.gaussians)} Gaussians of what may be shown"
     return start.gaussians
 
 

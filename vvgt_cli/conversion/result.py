@@ -23,6 +23,7 @@ from vvgt_cli.score.viewing import PREVIEW_VIEWS
 if TYPE_CHECKING:
     from vvgt_cli.field.field import Field
     from vvgt_cli.look.function import TransferFunction
+    from vvgt_cli.look.labels import LabelTable
 
 FROM_THE_SIDE = 4  # test view that pictures show where none is asked for
 
@@ -101,7 +102,7 @@ class Result:
 
     def recolor(
         self, look: str | TransferFunction | None = None, *, range: str = "data", unit_distance: str | None = None,
-        light: LightOptions | None = None,
+        labels: str | LabelTable | None = None, light: LightOptions | None = None,
     ) -> Result:  # fmt: skip
         """What Gaussians that carry values (``convert(..., live=True)``) are under another function: ``vvgt recolor``.
 
@@ -109,6 +110,7 @@ class Result:
             look: file, colour map's name, or a function; None: that which they have.
             range: "data", "rescale" or "LO,HI": where the function's nodes lie.
             unit_distance: world length that opacity is per, "paraview" or "mean-spacing"; None: the function's own.
+            labels: of a label map's: a table, its file, or "auto"; None: that which they have.
             light: what falls on them; None: what the function's file says, else what they were made under.
 
         Raises:
@@ -117,7 +119,7 @@ class Result:
         """
         from vvgt_cli.conversion.recolored import FunctionRequest, placed_function, under_function
 
-        asked = FunctionRequest(look, range, unit_distance, light or LightOptions())
+        asked = FunctionRequest(look, range, unit_distance, labels, light or LightOptions())
         tf, options = placed_function("result", self.ply, asked)
         found = under_function(self.gaussians, self.ply, tf, options)
         return Result(found, ConversionReport("recolor"), options)

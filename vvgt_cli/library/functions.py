@@ -16,6 +16,7 @@ from vvgt_cli.library.inputs import (
     FunctionLike,
     Goal,
     GoalLike,
+    LabelsLike,
     LightLike,
     Look,
     LookLike,
@@ -26,6 +27,7 @@ from vvgt_cli.library.inputs import (
     console_of,
     content_of,
     function_of,
+    labels_of,
     light_of,
     looks_of,
     ply_of,
@@ -254,7 +256,7 @@ def evaluate(
 
 def recolor(
     ply: PathLike, look: FunctionLike | None = None, *, range: str = "data", unit_distance: str | float | None = None,
-    light: LightLike = None,
+    labels: LabelsLike | None = None, light: LightLike = None,
 ) -> Result:  # fmt: skip
     """A live ``.ply`` under another function, without its volume: ``vvgt recolor``.
 
@@ -262,6 +264,7 @@ def recolor(
         ply: path of a file that ``vvgt convert --live`` wrote.
         look: a function as of `Look`; None: the file's own.
         range, unit_distance: as of `Result.recolor`.
+        labels: of a label map's file, a table as of `Look`; None: the file's own.
         light: as of `Look`; None: what the function's file says, else what the file was made under.
 
     Returns:
@@ -277,7 +280,9 @@ def recolor(
     gaussians, header = read_ply(ply)
     result = Result(gaussians, ConversionReport("recolor"), layout_of(header))
     distance = None if unit_distance is None else str(unit_distance)
-    return result.recolor(function_of(look), range=range, unit_distance=distance, light=light_of(light))
+    return result.recolor(
+        function_of(look), range=range, unit_distance=distance, labels=labels_of(labels), light=light_of(light)
+    )
 
 
 def optimize(

@@ -20,7 +20,7 @@ from vvgt_cli.look.lighting import Lighting
 from vvgt_cli.look.readers.minimal import read
 
 HELD = "values"  # the element that holds the bytes
-PLANES = (0, 1, 2, 4, 5, 6)  # columns of `live_bytes` that are not 0
+PLANES = (0, 1, 2, 4, 5, 6)  # columns of `live_bytes` that are not 0; of labels all
 SAMPLED = 96  # nodes of colours on other lines than straight ones in RGB
 _RAMP = {"points": [{"x": 0, "rgb": [1, 1, 1], "opacity": 0}, {"x": 1, "rgb": [1, 1, 1], "opacity": 0.1}]}
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0])  # the viewer has PLY (x, y, z) at (-x, -y, z)
@@ -38,9 +38,14 @@ def live_html(gaussians: Gaussians, options: PlyOptions, name: str) -> bytes:
     gaussians = gaussians.take(morton_order(turn(gaussians, laid.up).means))  # as the page's file has them
     turned = turn(gaussians, laid.up)
     splats = splats_of(replace(gaussians, live=None, harmonics=None), replace(laid, live=None, sh_degree=0))
-    planes = np.ascontiguousarray(live_bytes(turned, facts)[:, PLANES].T)
+    planes = np.ascontiguousarray(live_bytes(turned, facts)[:, planes_of(facts)].T)
     parts = {HELD: gzip.compress(planes.tobytes(), 9, mtime=0)}
     return html_of_several([(name, splats)], name, parts, {"live": _facts(gaussians, options, laid.up)})
+
+
+def planes_of(facts: LiveFacts) -> tuple[int, ...]:
+    """Columns of `live_bytes` that a page holds, one after the other."""
+    return (*PLANES, 3, 7) if facts.labels else PLANES
 
 
 def _facts(gaussians: Gaussians, options: PlyOptions, up: str) -> dict[str, Any]:
@@ -55,7 +60,7 @@ def _facts(gaussians: Gaussians, options: PlyOptions, up: str) -> dict[str, Any]
         "light": _light(options.light, axes),
         "law": law_nodes().tolist(),
         "name": facts.baked().get("name", ""),
-        "nodes": nodes_of(facts),
+        "nodes": [] if facts.labels else nodes_of(facts),
         "axes": axes.tolist(),
         "box": [gaussians.means.min(axis=0).tolist(), gaussians.means.max(axis=0).tolist()],
     }

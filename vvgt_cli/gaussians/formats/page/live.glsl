@@ -1,6 +1,7 @@
 // A Gaussian under the function: moved and thinned along the gradient (docs/live.md), and cut by a plane. The engine calls
 // modifySplatCenter first. A cut Gaussian becomes the one of the same mean and variance as its part that stays.
 uniform highp sampler2D vvgtTable;
+uniform highp sampler2D vvgtLabels;  // of a label map a column a label: red, green, blue, extinction; else one column
 uniform vec4 vvgtFacts;  // shortest log length, how far it goes, thinnest, spreads
 uniform vec4 vvgtCut;  // dot(xyz, centre) <= w stays
 uniform vec4 vvgtLight;  // ambient, diffuse, specular, power; ambient < 0: unlit
@@ -62,6 +63,11 @@ void modifySplatCenter(inout vec3 center) {
   float f = column - float(j);
   vec4 sums = mix(texelFetch(vvgtTable, ivec2(at, j), 0), texelFetch(vvgtTable, ivec2(at, j + 1), 0), f);
   vec2 z = mix(texelFetch(vvgtTable, ivec2(at, j + spreads), 0).xy, texelFetch(vvgtTable, ivec2(at, j + 1 + spreads), 0).xy, f);
+  if (textureSize(vvgtLabels, 0).x > 1) {
+    vec4 label = texelFetch(vvgtLabels, ivec2(int(a.w) + 256 * int(b.w), 0), 0);
+    sums = vec4(label.rgb * label.a, label.a);
+    z = vec2(0.0, label.a);
+  }
   float tau = max(sums.a, 1e-12), first = z.x / tau, variance = max(z.y / tau - first * first, 0.0);
   mat3 turn = quatToMat3(getRotation());
   vec3 scale = getScale(), gradient = (vec3(b.xyz) - 128.0) / 127.0, along = gradient * turn * scale;

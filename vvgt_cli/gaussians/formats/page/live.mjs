@@ -3,7 +3,8 @@ import { FILTER_NEAREST, PIXELFORMAT_RGBA32F, PIXELFORMAT_RGBA8U, Texture } from
 import modifier from './live.glsl';
 import { sumsOf, texelsOf } from './live_table.mjs';
 
-const STREAMS = [['vvgtValues', [0, 1, 2]], ['vvgtGradient', [3, 4, 5]]];  // and the planes of each one's r, g and b
+const STREAMS = [['vvgtValues', [0, 1, 2, 6]], ['vvgtGradient', [3, 4, 5, 7]]];  // and the planes of each one's r, g, b and a
+const MOST_OPAQUE = 1 - 1e-5;  // opacity of which there still is an extinction
 
 // the planes of bytes, one after the other, that the page holds (gzip in base64)
 async function unpacked(id) {
@@ -16,15 +17,16 @@ async function unpacked(id) {
 // {apply(nodes), cut(axis or null, place, flipped), light(of light.mjs)} of a viewer that has loaded its Gaussians, once they are shown so
 export async function liveLook({ app }, live) {
   const entity = app.root.findByName('gsplat'), { gsplat } = entity, { resource } = app.assets.get(gsplat.asset);
-  const bytes = await unpacked(live.held), count = bytes.length / 6;
+  const bytes = await unpacked(live.held), planes = live.labels.length ? 8 : 6, count = bytes.length / planes;
   resource.format.addExtraStreams(STREAMS.map(([name]) => ({ name, format: PIXELFORMAT_RGBA8U })));
-  for (const [name, planes] of STREAMS) {
+  for (const [name, own] of STREAMS) {
     const texture = resource.getTexture(name), texels = texture.lock();
-    planes.forEach((plane, c) => { for (let i = 0; i < count; i++) texels[4 * i + c] = bytes[plane * count + i]; });
+    own.forEach((plane, c) => { for (let i = 0; plane < planes && i < count; i++) texels[4 * i + c] = bytes[plane * count + i]; });
     texture.unlock();
   }
   const [means, spreads] = live.table, nearest = { minFilter: FILTER_NEAREST, magFilter: FILTER_NEAREST };
   const table = new Texture(app.graphicsDevice, { name: 'vvgtTable', width: means, height: 2 * spreads, format: PIXELFORMAT_RGBA32F, mipmaps: false, ...nearest });
+  const labels = new Texture(app.graphicsDevice, { name: 'vvgtLabels', width: Math.max(live.labels.length + 1, 1), height: 1, format: PIXELFORMAT_RGBA32F, mipmaps: false, ...nearest });
   const [first, last] = live.log_lengths;
   let again = 0, shown;
   const set = (name, value) => {
@@ -46,6 +48,7 @@ export async function liveLook({ app }, live) {
   app.systems.gsplat.on('frame:ready', (camera, layer, ready, loading) => {
     if (!again || !ready || loading) return;
     gsplat.setParameter('vvgtTable', table);
+    gsplat.setParameter('vvgtLabels', labels);
     app.renderNextFrame = true;
     if (!--again) shown();
   });
@@ -54,6 +57,13 @@ export async function liveLook({ app }, live) {
       table.lock().set(texelsOf(sumsOf(nodes, live), live.table));
       table.unlock();
       set('vvgtTable', table);
+    },
+    // what each label looks like: [{rgb, opacity}], in the order of the file
+    labels(list) {
+      const texels = labels.lock();
+      list.forEach(({ rgb, opacity }, k) => texels.set([...rgb, -Math.log1p(-Math.min(Math.max(opacity, 0), MOST_OPAQUE)) / live.unit_distance], 4 * k));
+      labels.unlock();
+      set('vvgtLabels', labels);
     },
     cut(axis, place, flipped) {
       const sign = flipped ? -1 : 1;
@@ -71,7 +81,9 @@ export async function liveLook({ app }, live) {
   look.light(live.light);
   set('vvgtFacts', [first, last - first, live.thinnest, spreads]);
   look.cut(null);
-  look.apply(live.nodes);
+  if (live.labels.length) set('vvgtTable', table);
+  else look.apply(live.nodes);
+  look.labels(live.labels);
   gsplat.setWorkBufferModifier({ glsl: modifier });
   await new Promise((done) => { shown = done; });
   return look;
