@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vvgt_cli.cameras import default_views
-from vvgt_cli.closed_form.relit import relit
 from vvgt_cli.conversion.live_labels import carrying_labels, fog_of_labels, label_facts, labels_of
 from vvgt_cli.conversion.place import out_of_box
 from vvgt_cli.conversion.recolored import lit_by, looked_up
@@ -114,6 +113,8 @@ def in_box(source: Source) -> Lighting | None:
 
 def lit(gaussians: Gaussians, lighting: Lighting | None) -> Gaussians:
     """Gaussians that carry values with their colours under a light in their frame."""
+    from vvgt_cli.closed_form.relit import relit
+
     assert gaussians.live is not None
     return gaussians if lighting is None else relit(gaussians, gaussians.live[:, GRADIENT], lighting)
 

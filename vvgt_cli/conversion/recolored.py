@@ -100,7 +100,7 @@ def placed_function(
     given, asked = function.labels if header.live.labels else function.tf, function.unit_distance
     if given is None and asked is None and header.unit_distance is not None:
         asked = repr(header.unit_distance)
-    distance, label = unit_distance(asked, volume_of(name, header), tf)
+    distance, label = unit_distance(asked, volume_of(name, header), tf if isinstance(tf, TransferFunction) else None)
     light = light_of(function.light, tf.lighting or header.light, header.space)
     old = header if isinstance(header, PlyOptions) else layout_of(header)
     options = replace(old, live=None, unit_distance=distance, unit_distance_label=label, light=light, sh_degree=None)
