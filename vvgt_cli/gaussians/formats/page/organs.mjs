@@ -6,7 +6,7 @@ const SEARCHED = 12;  // labels that are seen at a glance
 function row({ name, number }, k) {
   const element = document.createElement('li');
   element.dataset.row = k;
-  element.innerHTML = '<button class="eye" aria-pressed="true">●</button><input type="color"><span></span><input type="range" min="0" max="1" step="0.01"><button class="solo" aria-pressed="false">1</button>';
+  element.innerHTML = '<button class="eye" aria-pressed="true">●</button><input type="color"><span></span><input type="range" min="0" max="1" step="0.01"><button class="solo" aria-pressed="false">solo</button>';
   const [eye, color, text, slider, solo] = element.children;
   text.textContent = text.title = name;  // never markup
   for (const [part, what] of [[eye, 'show'], [color, 'colour of'], [slider, 'opacity of'], [solo, 'only']]) {

@@ -246,7 +246,10 @@ export function panel(look, viewer, live) {
   });
 
   root.classList.toggle('labelled', labelled);
-  if (labelled) root.querySelector('div').after(organs(look, live.labels, history));
+  if (labelled) {
+    root.querySelector('div').after(organs(look, live.labels, history));
+    find('.organs div').prepend(find('.undo'));
+  }
   root.append(light(look, viewer, live.light, history));
 
   const fold = (folded) => {
