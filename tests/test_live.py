@@ -275,6 +275,22 @@ def test_what_a_live_file_does_not_go_with(vvgt, tmp_path) -> None:
     assert not (tmp_path / "a.ply").exists()
 
 
+def test_a_series_makes_a_live_file_a_frame(vvgt, tmp_path) -> None:
+    """And an ordinary conversion to the same names does not take them for its own."""
+    for k in range(2):
+        np.save(tmp_path / f"f{k}.npy", np.random.default_rng(k).random((6, 7, 8)).astype(np.float32))
+    source = ("convert", tmp_path / "f?.npy", "--tf", "viridis", "-o", tmp_path / "o_{}.ply", "--max-gaussians", 90)
+    assert vvgt(*source, "--size", 48, "--live").code == 0
+    for k in range(2):
+        gaussians, header = read_ply(tmp_path / f"o_{k}.ply")
+        assert header.live is not None
+        assert gaussians.live is not None
+        assert vvgt("recolor", tmp_path / f"o_{k}.ply", "--tf", "magma", "-o", tmp_path / f"r_{k}.ply").code == 0
+    assert json.loads((tmp_path / "o_index.json").read_text())["files"][1]["file"] == "o_1.ply"
+    done = vvgt(*source, "--size", 48)
+    assert (done.code, "live" in done.error) == (2, True), done.error
+
+
 def test_blocks_have_the_same_values_to_the_byte(tmp_path) -> None:
     """Of Gaussians that lie across blocks, and beyond the volume; and a conversion in blocks is as near the volume."""
     from vvgt_cli.conversion.convert import opened
