@@ -63,7 +63,7 @@ def facts(tf: TransferFunction = RAMP) -> LiveFacts:
 def test_a_table_holds_means_over_normal_laws(tf: TransferFunction, spread: float) -> None:
     """Against quadrature in float64."""
     distance, values = 0.05, np.array([-5.0, 12.3, 21.0, 55.0])
-    sums = Table.of(tf, LO, HI, distance).at(values, np.full(4, spread))
+    sums = Table.of_function(tf, LO, HI, distance).at(values, np.full(4, spread))
     z = np.array([NormalDist().inv_cdf((k + 0.5) / 20001) for k in range(20001)])
     at = np.clip(values[:, None] + spread * z, LO, HI)
     tau = -np.log1p(-tf.opacity(at)) / distance
@@ -77,7 +77,7 @@ def test_without_spread_a_gaussian_has_the_functions_color_and_extinction() -> N
     assert some.live is not None
     live = some.live.copy()
     live[:, 1] = 0
-    shown = baked(replace(some, live=live), Table.of(RAMP, LO, HI, 0.05))
+    shown = baked(replace(some, live=live), Table.of_function(RAMP, LO, HI, 0.05))
     tau = -np.log1p(-RAMP.opacity(live[:, 0].astype(float))) / 0.05
     opacity = 1 / (1 + np.exp(-shown.opacity_logits.astype(float)))
     np.testing.assert_allclose(opacity, -np.expm1(-tau * live[:, 2]), atol=4e-3)
@@ -89,7 +89,7 @@ def test_a_gaussian_moves_to_where_the_values_are_seen_and_is_thinner_there() ->
     """One whose values rise along x from LO to HI: a window around 20 lies where 20 is."""
     live = np.array([[10.0, 20.0, 0.5, 1.0, 0.0, 0.0]])
     one = Gaussians(np.zeros((1, 3)), np.full((1, 3), np.log(0.1)), [[1, 0, 0, 0]], [0.0], [[1, 1, 1]], live=live)
-    shown = shown_by(one, Table.of(WINDOW, LO, HI, 0.05))
+    shown = shown_by(one, Table.of_function(WINDOW, LO, HI, 0.05))
     np.testing.assert_allclose(shown.means, [[0.1 * (20 - 10) / 20, 0, 0]], atol=5e-3)
     axes = rotations(shown.quaternions.astype(float))[0] * np.exp(shown.log_scales.astype(float))
     covariance = axes @ axes.T
@@ -104,7 +104,7 @@ def test_a_gaussian_moves_to_where_the_values_are_seen_and_is_thinner_there() ->
 
 def test_a_look_turns_with_its_gaussians() -> None:
     """Of maps that stretch too: gradients are covectors."""
-    some, table = cloud(), Table.of(WINDOW, LO, HI, 0.05)
+    some, table = cloud(), Table.of_function(WINDOW, LO, HI, 0.05)
     shear = np.array([[1.0, 0.3, 0.0], [0.0, 0.8, 0.1], [0.0, 0.0, 1.2]])
     for change in (lambda g: turn(g, "x"), lambda g: transform(g, shear), lambda g: transform(g, -np.eye(3))):
         before, after = change(shown_by(some, table)), shown_by(change(some), table)
@@ -145,7 +145,7 @@ def test_samples_that_are_not_finite_do_not_count() -> None:
 
 
 def test_a_ply_keeps_values_in_columns_that_others_ignore(tmp_path: Path) -> None:
-    some = baked(cloud(), Table.of(RAMP, LO, HI, 0.05))
+    some = baked(cloud(), Table.of_function(RAMP, LO, HI, 0.05))
     options = PlyOptions(up="y", scale=0.1, centre=(1, 2, 3), frame="world", affine=tuple(range(12)), live=facts())
     options = replace(options, affine=(1.0, 0, 0, 0, 0, 2.0, 0, 0, 0, 0, 1.0, 0))
     write_ply(tmp_path / "a.ply", some, options)
@@ -215,7 +215,7 @@ def test_bytes_for_pages_lose_little() -> None:
     back = replace(some, live=from_bytes(stream, known))
     camera = default_views("test", size=200)[0]
     for tf in (RAMP, WINDOW):
-        table = Table.of(tf, LO, HI, 0.05)
+        table = Table.of_function(tf, LO, HI, 0.05)
         images = [render(shown_by(g, table), camera)[..., :3] for g in (some, back)]
         assert psnr(*images) > 50  # at 34 dB from the volume 10 log10(1 + 10^-1.6) = 0.1 dB
 
@@ -276,7 +276,6 @@ def test_what_a_live_file_does_not_go_with(vvgt, tmp_path) -> None:
         ("--sh-degree", 1),
         ("--steps", 9),
         ("--target-psnr", 30),
-        ("--light", "headlight"),
         ("--no-comments",),
     ):
         done = vvgt("convert", "example:blob:12", "--live", "-o", tmp_path / "a.ply", *SMALL, *option)
@@ -285,14 +284,28 @@ def test_what_a_live_file_does_not_go_with(vvgt, tmp_path) -> None:
     for other in (("--dry-run",), ("--tf", "viridis", "--tf", "magma")):
         done = vvgt("convert", "example:blob:12", "--live", "-o", tmp_path / "a.ply", *SMALL, *other)
         assert (done.code, "one file of one volume" in done.error) == (2, True)
-    done = vvgt("convert", "example:frog", "--labels", "auto", "--live", "-o", tmp_path / "a.ply", *SMALL)
-    assert (done.code, "one scalar" in done.error) == (2, True)
     np.save(tmp_path / "four.npy", np.random.default_rng(0).random((2, 6, 7, 8)))
     for source in (tmp_path / "four.npy", tmp_path / "*.npy"):
         done = vvgt("convert", source, "--live", "-o", tmp_path / "a.html", *SMALL)
         assert done.code == 2, done.err
     assert not (tmp_path / "a.html").exists()
     assert not (tmp_path / "a.ply").exists()
+
+
+def test_a_series_makes_a_live_file_a_frame(vvgt, tmp_path) -> None:
+    """And an ordinary conversion to the same names does not take them for its own."""
+    for k in range(2):
+        np.save(tmp_path / f"f{k}.npy", np.random.default_rng(k).random((6, 7, 8)).astype(np.float32))
+    source = ("convert", tmp_path / "f?.npy", "--tf", "viridis", "-o", tmp_path / "o_{}.ply", "--max-gaussians", 90)
+    assert vvgt(*source, "--size", 48, "--live").code == 0
+    for k in range(2):
+        gaussians, header = read_ply(tmp_path / f"o_{k}.ply")
+        assert header.live is not None
+        assert gaussians.live is not None
+        assert vvgt("recolor", tmp_path / f"o_{k}.ply", "--tf", "magma", "-o", tmp_path / f"r_{k}.ply").code == 0
+    assert json.loads((tmp_path / "o_index.json").read_text())["files"][1]["file"] == "o_1.ply"
+    done = vvgt(*source, "--size", 48)
+    assert (done.code, "live" in done.error) == (2, True), done.error
 
 
 def test_blocks_have_the_same_values_to_the_byte(tmp_path) -> None:
@@ -344,4 +357,4 @@ def test_directions_are_unit_vectors_of_own_axes() -> None:
     np.testing.assert_allclose(np.linalg.norm(along, axis=1), 1, atol=1e-6)
     assert (share <= 1).all()
     assert spreads()[-1] == WIDEST
-    assert Table.of(RAMP, LO, HI, 1).sums.shape == (MEANS, SPREADS, 6)
+    assert Table.of_function(RAMP, LO, HI, 1).sums.shape == (MEANS, SPREADS, 6)

@@ -47,7 +47,7 @@ def options(**given: Any) -> PlyOptions:
 
 
 def test_the_page_holds_what_the_gaussians_carry_in_the_order_of_its_file() -> None:
-    some = baked(cloud(600), Table.of(RAMP, LO, HI, 0.05))
+    some = baked(cloud(600), Table.of_function(RAMP, LO, HI, 0.05))
     content, scene = page_of(some, options())
     live = scene["live"]
     held = re.search(rb'id="values">([^<]+)<', content)
@@ -80,7 +80,7 @@ def test_a_page_without_values_has_none() -> None:
 
 
 def test_no_name_is_markup() -> None:
-    some = baked(cloud(), Table.of(RAMP, LO, HI, 0.05))
+    some = baked(cloud(), Table.of_function(RAMP, LO, HI, 0.05))
     known = facts(replace(RAMP, name="</script><b>x"))
     content, scene = page_of(some, options(live=known), "</title><script>alert(1)</script>.html")
     assert b"<script>alert" not in content
@@ -89,7 +89,7 @@ def test_no_name_is_markup() -> None:
 
 
 def test_no_folder_is_in_the_page() -> None:
-    some = baked(cloud(), Table.of(RAMP, LO, HI, 0.05))
+    some = baked(cloud(), Table.of_function(RAMP, LO, HI, 0.05))
     content, scene = page_of(some, options(), "/home/someone/a.html")
     assert scene["frames"][0]["name"] == "a"
     assert b"someone" not in content
@@ -112,7 +112,7 @@ def test_nodes_are_those_of_the_function(tf: TransferFunction) -> None:
 def test_the_pages_program_makes_our_table(tf: TransferFunction, tmp_path: Path) -> None:
     if not shutil.which("node"):
         pytest.skip("node is not on the path")
-    _, scene = page_of(baked(cloud(), Table.of(tf, LO, HI, 0.05)), options(live=facts(tf)))
+    _, scene = page_of(baked(cloud(), Table.of_function(tf, LO, HI, 0.05)), options(live=facts(tf)))
     program = Path(__file__).parent.parent / "vvgt_cli" / "gaussians" / "formats" / "page" / "live_table.mjs"
     (tmp_path / "live.json").write_text(json.dumps(scene["live"]))
     (tmp_path / "run.mjs").write_text(
@@ -121,7 +121,7 @@ def test_the_pages_program_makes_our_table(tf: TransferFunction, tmp_path: Path)
         "fs.writeFileSync('sums', sums);\nfs.writeFileSync('texels', texelsOf(sums, live.table));\n"
     )
     subprocess.run(["node", "run.mjs"], cwd=tmp_path, check=True, timeout=120)
-    wanted = Table.of(tf, LO, HI, 0.05).sums
+    wanted = Table.of_function(tf, LO, HI, 0.05).sums
     sums = np.fromfile(tmp_path / "sums").reshape(wanted.shape)
     np.testing.assert_allclose(sums, wanted, atol=2e-4 * wanted[..., 3].max())
     texels = np.fromfile(tmp_path / "texels", np.float32).reshape(2, *wanted.shape[1::-1], 4)

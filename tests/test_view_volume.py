@@ -173,7 +173,7 @@ def desk(tmp_path: Path) -> Iterator[tuple[str, Desk]]:
 
     site = Site({}, print)
     found = Desk(site.parts, site.posts, "x", Console(quiet=True))
-    some = baked(live_cloud(), Table.of(RAMP, LO, HI, 0.05))
+    some = baked(live_cloud(), Table.of_function(RAMP, LO, HI, 0.05))
     found.converter = Still(SourceRequest("none"), "x", found.hear)
     found.parts["state"] = Part("application/json", found._told)
     found.show(Cloud(some, PlyOptions(up="y", scale=0.1, unit_distance=0.5, live=facts()), "x"))
@@ -251,7 +251,7 @@ def test_a_saved_live_file_has_the_colours_of_the_function(desk: tuple[str, Desk
         "opacity_unit_distance": 0.5,
     }
     saved = Cloud.of(send(desk[0], "save", {"file": "ply", "function": function})[1], "x")
-    wanted = baked(live_cloud(), Table.of(function_sent(function), LO, HI, 0.05))
+    wanted = baked(live_cloud(), Table.of_function(function_sent(function), LO, HI, 0.05))
     np.testing.assert_allclose(saved.gaussians.colors, wanted.colors, atol=1e-5)
     np.testing.assert_allclose(saved.gaussians.opacity_logits, wanted.opacity_logits, atol=1e-4)
     plain = Cloud.of(send(desk[0], "save", {"file": "ply"})[1], "x")
@@ -259,7 +259,7 @@ def test_a_saved_live_file_has_the_colours_of_the_function(desk: tuple[str, Desk
 
 
 def test_a_live_file_is_shown_live_and_an_ordinary_one_as_it_is(tmp_path: Path) -> None:
-    some = baked(live_cloud(), Table.of(RAMP, LO, HI, 0.05))
+    some = baked(live_cloud(), Table.of_function(RAMP, LO, HI, 0.05))
     write_ply(tmp_path / "live.ply", some, PlyOptions(scale=0.1, unit_distance=0.5, live=facts()))
     write_ply(tmp_path / "plain.ply", cloud())
     with shown("live.ply", folder=tmp_path) as (_, url):

@@ -1,7 +1,8 @@
 // page.mjs JOB.json MODULES: a picture of the page of `vvgt view`, or of one in a file, in headless Chromium; nothing but its
 // own address may be asked for. JOB: {"browser", "url", "size", "camera": {"position", "target", "up", "fov"} in the viewer's
 // axes or null for where the page says that it begins, "frame": number to go to or null, "before": JavaScript to evaluate first, or
-// none, "out": .png}; prints {"asked": [other URLs], "text": what
+// none, "out": .png, "actions": [{"click" | "drag" | "fill" | "key": selector or key, "by": [px, px], "text"}] by mouse, touch and keys in a
+// window of "window": [width, height], and "look": .png of all of it afterwards, or none}; prints {"asked": [other URLs], "text": what
 // the page says, "seconds": from opening to the first picture, "frames": how many the slider has}.
 import fs from 'node:fs';
 import path from 'node:path';
@@ -15,7 +16,8 @@ const args = ['--no-sandbox', '--use-angle=swiftshader', '--enable-unsafe-swifts
   '--disable-background-networking', '--disable-component-update', '--disable-sync', '--no-first-run',
   '--force-color-profile=srgb'];
 const browser = await chromium.launch({ executablePath: job.browser, args });
-const page = await browser.newPage({ viewport: { width: job.size, height: job.size }, deviceScaleFactor: 1 });
+const [width, height] = job.window ?? [job.size, job.size];
+const page = await browser.newPage({ viewport: { width, height }, deviceScaleFactor: 1 });
 page.setDefaultTimeout(600000);
 const asked = [], own = job.url.startsWith('file:') ? job.url : new URL(job.url).origin + '/';
 await page.route((url) => /^(https?|wss?):/.test(url.href) && !url.href.startsWith(own), (route) => {
@@ -33,6 +35,23 @@ if (!await page.evaluate('window.vvgt !== undefined')) {
 }
 const seconds = (Date.now() - begin) / 1000;
 if (job.before) await Promise.race([broken, page.evaluate(job.before)]);
+for (const { click, drag, fill, key, by, text } of job.actions ?? []) {
+  if (click) await page.locator(click).click();
+  if (fill) await page.locator(fill).fill(text);
+  if (key) await page.keyboard.press(key);
+  if (!drag) continue;
+  const box = await page.locator(drag).boundingBox(), x = box.x + box.width / 2, y = box.y + box.height / 2;
+  await page.mouse.move(x, y);
+  await page.mouse.down();
+  await page.mouse.move(x + by[0] / 2, y + by[1] / 2);
+  await page.mouse.move(x + by[0], y + by[1]);
+  await page.mouse.up();
+}
+if (job.look) {
+  await page.waitForTimeout(3000);
+  await page.screenshot({ path: job.look });
+}
+if (job.window) await page.setViewportSize({ width: job.size, height: job.size });
 const shoot = async ({ camera, frame }) => {
   const { viewer, show } = window.vvgt, { app } = viewer, canvas = app.graphicsDevice.canvas;
   const entity = app.root.findComponent('camera').entity;

@@ -96,22 +96,21 @@ def command(
     options["optics"]["tf"] = functions[0] if functions else None
     request = replace(convert_request(volume, **options), blocks=chosen(blocks), live=live)
     if live:
-        _check_live(request, functions, split_labels or dry_run or shard is not None)
+        _check_live(functions, split_labels or dry_run)
     if split_labels:
         _split(request, functions, dry_run or shard is not None, console)
     else:
         _convert(request, functions, shard, dry_run, console)
 
 
-def _check_live(request: ConvertRequest, functions: Sequence[str], other: bool) -> None:
-    """One volume, and one look to begin with; ``other``: options that go with several files or none are given."""
-    from vvgt_cli.conversion.index import is_pattern
+def _check_live(functions: Sequence[str], other: bool) -> None:
+    """One look to begin with; ``other``: options that go with several files or none are given."""
     from vvgt_cli.errors import UsageError
 
-    if other or len(functions) > 1 or is_pattern(request.output or ""):
+    if other or len(functions) > 1:
         raise UsageError(
             "--live makes one file of one volume, which 'vvgt recolor' shows under other functions; expected one --tf, "
-            "no place for a number in -o, and no --dry-run, --shard or --split-labels"
+            "and no --dry-run or --split-labels"
         )
 
 

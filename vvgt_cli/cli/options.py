@@ -128,14 +128,12 @@ tfs_options = group(
     **LABELS,
 )  # fmt: skip
 
-light_options = group(
-    "light",
+_LIGHT = dict(
     lights=click.option(
         "--light", "lights", multiple=True, metavar="none|headlight|X,Y,Z|left|above|...",
         help="Light at the eye ('headlight') or from a direction in the world: X,Y,Z, an axis (x, -x, ...), above, "
         "below, left, right, anterior, ... Repeatable. Default: given by the function's file, else none.",
     ),
-    shadows=click.option("--shadows", is_flag=True, help="Let directional lights cast soft shadows."),
     ambient=click.option("--ambient", type=float, metavar="KA", help="Ambient coefficient. Default: 0.1."),
     diffuse=click.option("--diffuse", type=float, metavar="KD", help="Diffuse coefficient. Default: 0.7."),
     specular=click.option(
@@ -144,6 +142,12 @@ light_options = group(
     specular_power=click.option(
         "--specular-power", type=float, metavar="P", help="Specular exponent; larger is glossier. Default: 10."
     ),
+)  # fmt: skip
+relight_options = group("light", **_LIGHT)
+light_options = group(
+    "light",
+    **_LIGHT,
+    shadows=click.option("--shadows", is_flag=True, help="Let directional lights cast soft shadows."),
     occlusion=click.option(
         "--ambient-occlusion", "occlusion", type=float, is_flag=False, flag_value=0.1, metavar="[RADIUS]",
         help="Darken crevices within RADIUS, where the volume's longest edge is 2. RADIUS is 0.1 if omitted.",

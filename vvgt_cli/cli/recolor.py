@@ -2,39 +2,56 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import click
 
-from vvgt_cli.cli.options import common_options, overwrite_option, tf_range_option, unit_distance_option
+from vvgt_cli.cli.options import (
+    common_options,
+    overwrite_option,
+    relight_options,
+    tf_range_option,
+    unit_distance_option,
+)
 from vvgt_cli.progress import Console
 
 
-@click.command("recolor", short_help="Show a live .ply under another transfer function.")
+@click.command("recolor", short_help="Show a live .ply under another function or light.")
 @click.argument("ply", metavar="LIVE.ply")
 @click.option(
-    "--tf", required=True, metavar="TF", help="Transfer function: a file or the name of a matplotlib colour map."
-)
+    "--tf", metavar="TF",
+    help="Transfer function: a file or the name of a matplotlib colour map. Default: the one that the file has.",
+)  # fmt: skip
 @click.option(
     "-o", "--output", required=True, metavar="OUT.ply",
     help="Output file; its ending selects the format, - is standard output.",
 )  # fmt: skip
+@click.option(
+    "--labels", metavar="TABLE|auto",
+    help="Table of labels, for a file of a label map; opacity 0 hides one. Default: the one that the file has.",
+)  # fmt: skip
 @tf_range_option
 @unit_distance_option
+@relight_options
 @overwrite_option
 @common_options
 def command(
-    ply: str, tf: str, output: str, tf_range: str, opacity_unit_distance: str | None, overwrite: bool, console: Console
-) -> None:
-    """Write what LIVE.ply, made by 'vvgt convert --live', is under the transfer function TF, as an ordinary file.
+    ply: str, tf: str | None, labels: str | None, output: str, tf_range: str, opacity_unit_distance: str | None,
+    light: dict[str, Any], overwrite: bool, console: Console,
+) -> None:  # fmt: skip
+    """Write what LIVE.ply, made by 'vvgt convert --live', is under the transfer function TF (of a label map: under
+    TABLE) and a light, as an ordinary file.
 
     The volume is not needed. Gaussians that TF hides are left out. LIVE.ply may be "-".
 
     \b
     Examples:
       vvgt recolor head-live.ply --tf bone.json -o bone.ply
-      vvgt recolor head-live.ply --tf skin.json -o skin.html
+      vvgt recolor head-live.ply --tf skin.json --light headlight -o skin.html
     """
     from vvgt_cli.commands.recolor import RecolorRequest, recolor
     from vvgt_cli.conversion.recolored import FunctionRequest
+    from vvgt_cli.look.lighting import LightOptions
 
-    function = FunctionRequest(tf, tf_range, opacity_unit_distance)
+    function = FunctionRequest(tf, tf_range, opacity_unit_distance, labels, LightOptions(**light))
     recolor(RecolorRequest(ply, function, output, overwrite), console)

@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import click
 
 from vvgt_cli.cli.fit import rule_option
-from vvgt_cli.cli.options import common_options, overwrite_option, tf_range_option, unit_distance_option
+from vvgt_cli.cli.options import (
+    common_options,
+    overwrite_option,
+    relight_options,
+    tf_range_option,
+    unit_distance_option,
+)
 from vvgt_cli.progress import Console
 
 
@@ -32,9 +40,11 @@ from vvgt_cli.progress import Console
     metavar="R G B",
     help="Background colour, 0 to 1. Default: transparent for PNG, black for movies.",
 )
+@click.option("--labels", metavar="TABLE|auto", help="Table of labels to show a live .ply of a label map under.")
 @click.option("--tf", metavar="TF", help="Transfer function to show a .ply of 'vvgt convert --live' under.")
 @tf_range_option
 @unit_distance_option
+@relight_options
 @rule_option("Viewer to imitate when drawing. Default: the one recorded in the file, or inria.")
 @overwrite_option
 @common_options
@@ -48,8 +58,10 @@ def command(
     exr: bool,
     background: tuple[float, float, float] | None,
     tf: str | None,
+    labels: str | None,
     tf_range: str,
     opacity_unit_distance: str | None,
+    light: dict[str, Any],
     overwrite: bool,
     console: Console,
 ) -> None:
@@ -57,7 +69,7 @@ def command(
 
     Choose the views with --camera or --orbit. With -o turn.gif or turn.mp4 they become a movie at 25 frames per second,
     which loops seamlessly for an orbit. The up axis is the one recorded in OUT.ply, else +z. OUT.ply may be "-".
-    A .ply of 'vvgt convert --live' can be shown under any function (--tf).
+    A .ply of 'vvgt convert --live' can be shown under any function (--tf) and light (--light).
 
     \b
     Examples:
@@ -73,5 +85,5 @@ def command(
         raise UsageError("give the views with either --camera FILE or --orbit N")
     if background is not None and not all(0 <= c <= 1 for c in background):
         raise UsageError(f"--background {' '.join(map(str, background))}: expected three numbers in [0, 1]")
-    function = function_of(tf, tf_range, opacity_unit_distance)
+    function = function_of(tf, tf_range, opacity_unit_distance, labels, light)
     render_file(RenderRequest(ply, output, camera, orbit, size, rule, exr, background, overwrite, function), console)

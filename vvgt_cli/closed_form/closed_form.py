@@ -91,7 +91,7 @@ class ClosedForm:
 
     def gaussians(self, style: SurfaceStyle = ROUND, values: bool = False) -> Gaussians:
         """Gaussians of the cells that the moments alone choose; ``values``: those of `tree.value_score`."""
-        score = value_score(self.tree) if values else None
+        score = value_score(self.tree, self.labels) if values else None
         return self._of(leaves_of(self.tree, select(self.tree, self.budget, score)), style)
 
     def _of(self, leaves: Leaves, style: SurfaceStyle) -> Gaussians:

@@ -135,13 +135,13 @@ class Shading:
         below = leaves.moments[~inside]
         if len(below):
             sums[~inside] = self.sums(below, self.normals(centroids(below)))
-        return _colored(gaussians, self.light, sums, degree)
+        return colored(gaussians, self.light, sums, degree)
 
     def alone(self, gaussians: Gaussians, degree: int) -> Gaussians:
         """Gaussians with their own colours under the light, as it is at their centres."""
         rows = _rows(gaussians.means)
         rows[:, COLOR] = rows[:, SEEN_COLOR] = gaussians.colors
-        return _colored(gaussians, self.light, self.sums(rows, self.normals(rows[:, FIRST])), degree)
+        return colored(gaussians, self.light, self.sums(rows, self.normals(rows[:, FIRST])), degree)
 
     def sums(
         self, rows: np.ndarray, normals: np.ndarray, first: np.ndarray | None = None, last: np.ndarray | None = None
@@ -222,7 +222,7 @@ def _base_rows(tree: Tree, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return first, last + 1
 
 
-def _colored(gaussians: Gaussians, light: Light, out: np.ndarray, degree: int) -> Gaussians:
+def colored(gaussians: Gaussians, light: Light, out: np.ndarray, degree: int) -> Gaussians:
     """Gaussians with the colours that the means ``out`` (K, 16 + lights) of `Shading.sums` stand for."""
     colors, terms = out[:, FIXED].copy(), np.zeros((len(out), HARMONICS[degree], 3))
     normals = symmetric(out[:, NORMALS])

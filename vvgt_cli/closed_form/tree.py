@@ -14,6 +14,7 @@ from vvgt_cli.closed_form.visibility import Visibility
 from vvgt_cli.dvr.scene import Scene
 
 LEAST_SPREAD = 0.01  # of the range of values, added to that in a cell: noise and places tell little apart
+EMPTY = 0.5  # how far what is empty is from any label, of the range of their codes
 HIDDEN = 1e-3  # cells that no view sees with more transmittance are dropped
 
 
@@ -126,15 +127,24 @@ def split_score(tree: Tree) -> np.ndarray:
     return score
 
 
-def value_score(tree: Tree) -> np.ndarray:
+def value_score(tree: Tree, filled: bool = False) -> np.ndarray:
     """`split_score`, times the variance of the values in a cell: any function may tell apart what differs.
 
-    Of a scene whose red is the value, as a share of its range, and green its square.
+    Of a scene whose red is the value, as a share of its range, and green its square. ``filled``: all that is visible
+    has the same extinction, what is empty counts as another value, and blue is how much a part counts.
     """
     mass = np.maximum(tree.moments[:, MASS], np.finfo(np.float64).tiny)
     mean = tree.moments[:, RED] / mass
+    result: np.ndarray
     variance = np.maximum(tree.moments[:, GREEN] / mass - mean**2, 0)
-    result: np.ndarray = split_score(tree) * (variance + LEAST_SPREAD**2)
+    if filled:
+        volume = np.prod(tree.edges, axis=1)[tree.level]
+        share = tree.moments[:, MASS] / volume
+        share = np.minimum(share / max(share.max(initial=0.0), np.finfo(np.float64).tiny), 1)
+        weight = tree.moments[:, BLUE] / mass
+        result = split_score(tree) * weight * (share * (variance + (1 - share) * EMPTY**2) + LEAST_SPREAD**2)
+        return result
+    result = split_score(tree) * (variance + LEAST_SPREAD**2)
     return result
 
 

@@ -48,8 +48,8 @@ class Visibility:
 
     def at_least(self, share: float) -> Visibility:
         """The same where nothing is hidden altogether: transmittances from ``share`` to 1."""
-        raised = (np.float32(share) + np.float32(1 - share) * values for values in (self.mean, self.largest))
-        return Visibility(*raised, self.edge)
+        low, rest = np.float32(share), np.float32(1 - share)
+        return Visibility(low + rest * self.mean, low + rest * self.largest, self.edge)
 
 
 @inlined(fastmath=FLAGS, error_model="numpy")

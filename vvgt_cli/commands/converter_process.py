@@ -25,6 +25,7 @@ from vvgt_cli.field.open import automatic
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import write_ply
 from vvgt_cli.gaussians.formats import ready
+from vvgt_cli.look.lighting import Lighting
 from vvgt_cli.progress import Console, ProgressCallback
 from vvgt_cli.resources import set_memory
 from vvgt_cli.score.record import ConversionReport, Run
@@ -63,6 +64,7 @@ class Volume:
 
     def __init__(self, source: SourceRequest, name: str, console: Console) -> None:
         self.source, self.name = source, name
+        self.lighting: Lighting | None = None  # of the function to begin with
         if automatic(source, Console(quiet=True)) is None:  # `opened` says it
             console.bar("reading")
             content = open_parts(source.path, source.read)
@@ -75,14 +77,16 @@ class Volume:
         with opened(run, request) as field:
             why = refusal(request, field.source) or _missing()
             if why is None:
-                ply = ply_options(request, field.source)
+                ply, self.lighting = ply_options(request, field.source), field.source.tf.lighting
                 return self._paged(live_conversion(run, request, field, ply, scored=False))
         console.say(f"not live, but converted: {why}")
         return self._paged(without_files(replace(request, live=False), console))
 
     def under(self, job: Job, console: Console) -> Made:
         """A conversion for a function, on data values, that says the distance its opacity is per."""
-        source = replace(self.source, tf=job, tf_range="data", unit_distance=None)
+        assert job is not None
+        lit = replace(job, lighting=self.lighting)
+        source = replace(self.source, tf=lit, tf_range="data", unit_distance=None)
         conversion = without_files(ConvertRequest(source), console)
         shown = stored(conversion.gaussians, conversion.ply)
         psnr = None if conversion.scores is None else conversion.scores["psnr"]

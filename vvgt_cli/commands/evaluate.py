@@ -13,7 +13,7 @@ from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.sets import SIZE
 from vvgt_cli.conversion.gaussian_files import STDIN, file_rule, layout_of, open_gaussians
 from vvgt_cli.conversion.place import into_box, preview, upright
-from vvgt_cli.conversion.recolored import under_function
+from vvgt_cli.conversion.recolored import light_of, under_function
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.field import Field, Picture, Resident
 from vvgt_cli.field.open import Wanted, automatic, beside, blocked
@@ -24,7 +24,7 @@ from vvgt_cli.gaussians.outputs import Output, check_outputs
 from vvgt_cli.gaussians.rules import Rule
 from vvgt_cli.images.metrics.texture import Texture
 from vvgt_cli.jit.ahead import EVALUATE, for_blocks, for_degree
-from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.look.labels import LabelTable
 from vvgt_cli.look.lighting import LightOptions
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run, StageRecord, document
@@ -127,13 +127,17 @@ def _opened(run: Run, request: EvaluateRequest, gaussians: Gaussians, header: Pl
     dark = replace(request.source, light=LightOptions())
     if dark.read.space is None and header.space == "LPS":
         dark = replace(dark, read=replace(dark.read, space="LPS"))
-    other = header.live is not None and dark.tf is not None  # not the function whose distance the header has
+    other = header.live is not None and (
+        dark.tf is not None or dark.labels is not None
+    )  # not the function whose distance the header has
     recorded = dark.unit_distance is None and header.unit_distance is not None and not other
     if recorded:
         dark = replace(dark, unit_distance=repr(header.unit_distance))
 
     def lit(source: Source) -> Source:
         preset = source.lighting if header.version is None else header.light
+        if other:
+            preset = source.lighting or header.light
         first, *others = source.layers
         if recorded:
             first = replace(first, unit_label=f"{header.unit_distance_label}, as the .ply records")
@@ -166,9 +170,12 @@ def _together(field: Field, pictures: Sequence[Picture]) -> Iterator[None]:
 
 def _shown(gaussians: Gaussians, header: PlyHeader, source: Source, request: SourceRequest) -> Gaussians:
     """What carries values, under the function that is given; else the look of the file."""
-    if header.live is None or request.tf is None or not isinstance(source.tf, TransferFunction) or source.gridded:
+    if header.live is None or (request.labels if header.live.labels else request.tf) is None:
         return gaussians
-    options = replace(layout_of(header), unit_distance=source.unit_distance)
+    if isinstance(source.tf, LabelTable) != bool(header.live.labels) or len(source.layers) > 1:
+        return gaussians
+    light = light_of(request.light, source.lighting, source.volume.space)
+    options = replace(layout_of(header), unit_distance=source.unit_distance, light=light)
     return under_function(gaussians, header, source.tf, options)
 
 
@@ -197,7 +204,7 @@ def _doubts(request: EvaluateRequest, header: PlyHeader, source: Source) -> Iter
     """What speaks against the file being of this volume, looked at so."""
     if header.affine is not None and not np.allclose(header.affine, source.volume.affine[:3].ravel(), rtol=1e-6):
         yield f"its header's affine is not that of {source.volume.name}: of another volume?"
-    if header.optics is not None and header.optics != source.optics():
+    if header.live is None and header.optics is not None and header.optics != source.optics():
         yield (
             f"made under other labels, functions or layers than {source.name}, as its header says "
             f"({header.optics}, not {source.optics() or 'scalars'})"

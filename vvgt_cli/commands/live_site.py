@@ -84,9 +84,9 @@ class Cloud:
         facts, scale, distance = self.options.live, self.options.scale or 1.0, tf.opacity_unit_distance
         assert facts is not None
         assert distance is not None
-        found = as_stored(baked(self.gaussians, Table.of(tf, facts.lo, facts.hi, distance * scale)))
+        found = as_stored(baked(self.gaussians, Table.of_function(tf, facts.lo, facts.hi, distance * scale)))
         facts = replace(facts, function=function_text(tf, facts.lo, facts.hi))
-        options = replace(self.options, live=facts, unit_distance=distance, unit_distance_label="file")
+        options = replace(self.options, live=facts, unit_distance=distance, unit_distance_label="file", light=None)
         return replace(self, gaussians=found, options=options, ply=None)
 
 

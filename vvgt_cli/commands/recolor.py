@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from vvgt_cli.conversion.gaussian_files import open_gaussians, write_gaussians
 from vvgt_cli.conversion.recolored import FunctionRequest, placed_function, under_function
 from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians.formats import SUFFIXES
 from vvgt_cli.gaussians.outputs import Output, claimed
+from vvgt_cli.look.lighting import LightOptions
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
 
@@ -39,7 +42,7 @@ def recolor(request: RecolorRequest, console: Console | None = None) -> None:
     """
     run = Run(console or Console(), ConversionReport("recolor"))
     function = request.function
-    inputs = [request.ply, *([function.tf] if isinstance(function.tf, str) else [])]
+    inputs = [request.ply, *(path for path in (function.tf, function.labels) if isinstance(path, str))]
     with claimed([Output("-o", request.output, SUFFIXES, splats=True)], inputs, request.overwrite):
         with run.stage("read") as stage:
             gaussians, header = open_gaussians(request.ply)
@@ -52,14 +55,22 @@ def recolor(request: RecolorRequest, console: Console | None = None) -> None:
     run.finish()
 
 
-def function_of(tf: str | None, tf_range: str, unit_distance: str | None) -> FunctionRequest | None:
-    """What options of a command add up to; None without ``--tf``.
+def function_of(
+    tf: str | None,
+    tf_range: str,
+    unit_distance: str | None,
+    labels: str | None = None,
+    light: Mapping[str, Any] | None = None,
+) -> FunctionRequest | None:
+    """What options of a command add up to; None where they are of no look: without ``--tf``, ``--labels`` and a light.
 
     Raises:
         UsageError: a range or a distance without a function.
     """
-    if tf is None:
+    lights = LightOptions(**(light or {}))
+    if tf is None and labels is None:
         if tf_range != "data" or unit_distance is not None:
             raise UsageError("--tf-range and --opacity-unit-distance are of a function; give --tf too")
-        return None
-    return FunctionRequest(tf, tf_range, unit_distance)
+        if lights == LightOptions():
+            return None
+    return FunctionRequest(tf, tf_range, unit_distance, labels, lights)

@@ -31,7 +31,7 @@ from vvgt_cli.look.lighting import LightOptions
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
 from vvgt_cli.volume import Volume
-from vvgt_cli.volume.stored import planes
+from vvgt_cli.volume.label_maps import counts_of
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr.layers import Layer
@@ -238,13 +238,8 @@ def _voxels(shown: Sequence[tuple[Volume, LabelTable, Label]]) -> list[int]:
     """Voxels of each label in its map; every map is counted once."""
     counts: dict[int, dict[float, int]] = {}
     for volume, *_ in shown:
-        if id(volume) in counts:
-            continue
-        own = counts[id(volume)] = {}
-        for plane in planes(volume):
-            values, many = np.unique(plane, return_counts=True)
-            for value, n in zip(volume.slope * values.astype(np.float64) + volume.intercept, many, strict=True):
-                own[float(value)] = own.get(float(value), 0) + int(n)
+        if id(volume) not in counts:
+            counts[id(volume)] = counts_of(volume)
     return [counts[id(volume)].get(float(label.number), 0) for volume, _, label in shown]
 
 

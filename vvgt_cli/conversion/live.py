@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vvgt_cli.cameras import default_views
+from vvgt_cli.conversion.live_labels import carrying_labels, fog_of_labels, label_facts, labels_of
 from vvgt_cli.conversion.place import out_of_box
+from vvgt_cli.conversion.recolored import lit_by, looked_up
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.conversion.result import Conversion
 from vvgt_cli.conversion.stage import Work
@@ -21,12 +23,14 @@ from vvgt_cli.conversion.stages.refinement import SMALLEST
 from vvgt_cli.errors import NothingVisible, UsageError
 from vvgt_cli.field.field import Field
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored
-from vvgt_cli.gaussians.live import LENGTH, SHORTEST, Table, baked, lengths, shown_by
-from vvgt_cli.gaussians.live_facts import LiveFacts
+from vvgt_cli.gaussians.live import LENGTH, SHORTEST, Table, baked, lengths
+from vvgt_cli.gaussians.live_facts import GRADIENT, LiveFacts
 from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.look.lighting import Lighting
 from vvgt_cli.score.record import Run
 from vvgt_cli.score.viewing import PREVIEW_VIEWS
 from vvgt_cli.score.views import psnr_note, score_test_views
+from vvgt_cli.volume.types import triple
 
 if TYPE_CHECKING:
     from vvgt_cli.field.source import Source
@@ -49,17 +53,20 @@ def check_live(request: ConvertRequest) -> None:
         "--checkpoint": request.checkpoint is not None,
         "--sh-degree": request.ply.sh_degree is not None,
         "--no-comments": not request.ply.comments,
-        "--light": light != type(light)(),
+        "--shadows": light.shadows,
+        "--ambient-occlusion": light.occlusion is not None,
     }
     if names := [name for name, there in given.items() if there]:
-        raise UsageError(f"--live: a file for every function, unlit and made in one way; leave out {', '.join(names)}")
+        raise UsageError(f"--live: a file for every function, made in one way; leave out {', '.join(names)}")
 
 
 def refusal(request: ConvertRequest, source: Source) -> str | None:
     """Why there is no live file of a source; None where there is one."""
     try:
         check_live(request)
-        source.one_field()
+        if source.gridded:
+            labels_of(source)
+        in_box(source)
     except UsageError as error:
         return str(error)
     return None
@@ -71,40 +78,39 @@ def live_conversion(
     """Place, look up, bake, score where asked to; ``ply`` as of an ordinary conversion.
 
     Raises:
-        UsageError: labels, channels or layers.
+        UsageError: channels or layers.
         DataError: nothing is visible.
     """
     from vvgt_cli.look.fog import fog
 
     source, fit = field.source, request.fit
-    source.one_field()
-    tf = source.tf
-    assert isinstance(tf, TransferFunction)
-    if source.lighting is not None:
-        run.console.say(f"{tf.name}: its light is left out; a live file is unlit")
-        field = field.shown_by(replace(tf, opacity_unit_distance=source.unit_distance, opacity_unit_share=None))
-    foggy = field.shown_by(fog(source.statistics, tf))
-    gaussians = carrying(run, foggy, placed_by(run, foggy, request))
+    tf, lighting = source.tf, in_box(source)
+    if source.gridded:
+        labels = labels_of(source)
+        foggy, facts = fog_of_labels(field, labels), label_facts(source, labels)
+        gaussians = carrying_labels(run, foggy, placed_by(run, foggy, request), labels)
+    else:
+        assert isinstance(tf, TransferFunction)
+        foggy, facts = field.shown_by(fog(source.statistics, tf)), LiveFacts.of(source.volume, source.statistics, tf)
+        gaussians = carrying(run, foggy, placed_by(run, foggy, request))
     gaussians = wide_enough(gaussians, fit.size)
-    table = table_of(source)
-    gaussians = as_stored(baked(gaussians, table))
+    table = looked_up(facts, tf, source.unit_distance * source.volume.unit_frame().scale)
+    gaussians = as_stored(lit(baked(gaussians, table), lighting))
     if scored:
-        _score(run, request, field, gaussians, table)
-    facts = LiveFacts.of(source.volume, source.statistics, tf)
-    ply = replace(ply, light=None, sh_degree=0, live=facts)
+        _score(run, request, field, gaussians, lit_by(gaussians, table, lighting))
+    ply = replace(ply, live=facts)
     return Conversion(out_of_box(gaussians, source.volume), run.report, ply, field)
 
 
-def _score(run: Run, request: ConvertRequest, field: Field, gaussians: Gaussians, table: Table) -> None:
+def _score(run: Run, request: ConvertRequest, field: Field, gaussians: Gaussians, shown: Gaussians) -> None:
     """As `vvgt recolor` shows them under the function, and as other viewers do."""
     from vvgt_cli.dvr import RenderSettings
 
     fit, tf = request.fit, field.source.tf
     with run.stage("live look") as stage:
         live = score_test_views(
-            field, shown_by(gaussians, table), fit.size, RenderSettings(), rule=fit.rule, perceptual=False,
-            only=PREVIEW_VIEWS,
-        )  # fmt: skip
+            field, shown, fit.size, RenderSettings(), rule=fit.rule, perceptual=False, only=PREVIEW_VIEWS
+        )
         stage.note = (
             f"{psnr_note(live)} under {tf.name} as 'vvgt recolor' shows it; next as other viewers show the file"
         )
@@ -113,11 +119,32 @@ def _score(run: Run, request: ConvertRequest, field: Field, gaussians: Gaussians
         stage_of_scores.run(work)
 
 
+def in_box(source: Source) -> Lighting | None:
+    """A source's light, its directions in the box frame.
+
+    Raises:
+        UsageError: shadows or occlusion, of a preset.
+    """
+    if source.lighting is None:
+        return None
+    inward = np.linalg.inv(source.volume.axes)
+    turned = [triple((inward @ np.array(direction)).tolist()) for direction in source.lighting.directions]
+    return replace(source.lighting, directions=tuple(turned))
+
+
+def lit(gaussians: Gaussians, lighting: Lighting | None) -> Gaussians:
+    """Gaussians that carry values with their colours under a light in their frame."""
+    from vvgt_cli.closed_form.relit import relit
+
+    assert gaussians.live is not None
+    return gaussians if lighting is None else relit(gaussians, gaussians.live[:, GRADIENT], lighting)
+
+
 def table_of(source: Source) -> Table:
     """Of a source's function, lengths in the unit frame."""
     numbers, tf = source.statistics, source.tf
     assert isinstance(tf, TransferFunction)
-    return Table.of(tf, numbers.lo, numbers.hi, source.unit_distance * source.volume.unit_frame().scale)
+    return Table.of_function(tf, numbers.lo, numbers.hi, source.unit_distance * source.volume.unit_frame().scale)
 
 
 def placed_by(run: Run, field: Field, request: ConvertRequest) -> Gaussians:
@@ -133,7 +160,7 @@ def placed_by(run: Run, field: Field, request: ConvertRequest) -> Gaussians:
         start = field.start(options, run.console.bar("closed form"))
         if not len(start.gaussians):
             raise NothingVisible(field.source.volume.name, field.source.name)
-        stage.note = f"{len(start.gaussians)} Gaussians of all values but the background's"
+        stage.note = f"{len(start.gaussians)} Gaussians of what may be shown"
     return start.gaussians
 
 

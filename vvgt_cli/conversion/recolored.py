@@ -2,35 +2,45 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from vvgt_cli.errors import DataError
+from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions
 from vvgt_cli.gaussians.header import FileFacts
-from vvgt_cli.gaussians.live import Table, shown_by
+from vvgt_cli.gaussians.live import Palette, Table, seen_under, shown_by
+from vvgt_cli.gaussians.live_facts import GRADIENT, LiveFacts
 from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.look.labels import LabelTable, distinct
+from vvgt_cli.look.lighting import Lighting, LightOptions
 from vvgt_cli.volume import Volume
 
 
 @dataclass(frozen=True)
 class FunctionRequest:
-    """A function, as the options of commands say it.
+    """A look, as the options of commands say it.
 
     Attributes:
-        tf: file or colour-map name, or a function.
+        tf: file or colour-map name, or a function; None: that which the file has.
         tf_range: "data", "rescale" or "LO,HI".
         unit_distance: a length, "paraview", "mean-spacing", or None: the function's own, else "paraview".
+        labels: table of labels, its file, or "auto", of a file that carries labels; None: that which the file has.
+        light: what falls on it; without options what the function's file says, else what the file was made under.
     """
 
-    tf: str | TransferFunction
+    tf: str | TransferFunction | None = None
     tf_range: str = "data"
     unit_distance: str | None = None
+    labels: str | LabelTable | None = None
+    light: LightOptions = field(default_factory=LightOptions)
 
 
-def under_function(gaussians: Gaussians, facts: FileFacts, tf: TransferFunction, options: PlyOptions) -> Gaussians:
-    """What Gaussians that carry values are under a function on data values, unit frame.
+def under_function(
+    gaussians: Gaussians, facts: FileFacts, tf: TransferFunction | LabelTable, options: PlyOptions
+) -> Gaussians:
+    """What Gaussians that carry values are under a function on data values (or labels under a table) and the light of
+    ``options``, unit frame.
 
     Raises:
         DataError: not one of them is visible.
@@ -38,40 +48,113 @@ def under_function(gaussians: Gaussians, facts: FileFacts, tf: TransferFunction,
     assert facts.live is not None
     assert facts.scale is not None
     assert options.unit_distance is not None
-    table = Table.of(tf, facts.live.lo, facts.live.hi, options.unit_distance * facts.scale)
-    found = shown_by(gaussians, table)
+    table = looked_up(facts.live, tf, options.unit_distance * facts.scale)
+    found = lit_by(gaussians, table, options.light)
     if not len(found):
         raise DataError(f"{tf.name}: not one of {len(gaussians)} Gaussians is visible; try another function")
     return found
 
 
+def looked_up(facts: LiveFacts, tf: TransferFunction | LabelTable, unit_distance: float) -> Table | Palette:
+    """A function, or a table of labels, as Gaussians look it up; opacity per unit-frame length.
+
+    Raises:
+        DataError: a label without an entry.
+    """
+    if not isinstance(tf, LabelTable):
+        return Table.of_function(tf, facts.lo, facts.hi, unit_distance)
+    entries = {label.number: label for label in tf.labels}
+    return Palette.of_labels([entries[label.number] for label in facts.labels], unit_distance)
+
+
+def lit_by(gaussians: Gaussians, table: Table | Palette, lighting: Lighting | None) -> Gaussians:
+    """An ordinary cloud: what is visible of Gaussians that carry values, under a light in their frame."""
+    seen = gaussians.take(seen_under(gaussians, table))
+    assert seen.live is not None
+    found = shown_by(seen, table)
+    if lighting is None:
+        return found
+    from vvgt_cli.closed_form.relit import relit
+
+    return relit(found, seen.live[:, GRADIENT], lighting)
+
+
 def placed_function(
     name: str, header: PlyHeader | PlyOptions, function: FunctionRequest
-) -> tuple[TransferFunction, PlyOptions]:
-    """A function on the data values of a file, and how a file of its look is laid out.
+) -> tuple[TransferFunction | LabelTable, PlyOptions]:
+    """A function on the data values of a file, or a table of its labels, and how a file of its look is laid out.
 
     Raises:
         DataError: a file without values, a function that is none, or shows nothing of the range of values.
-        UsageError: a range or a distance that is none.
+        UsageError: a range or a distance that is none; a function of labels, or a table of values.
     """
     from vvgt_cli.conversion.gaussian_files import layout_of
-    from vvgt_cli.look import check_visible, read_transfer_function, resolve, unit_distance
-    from vvgt_cli.look.resolve import parse_tf_range
+    from vvgt_cli.look import unit_distance
 
-    tf = read_transfer_function(function.tf) if isinstance(function.tf, str) else function.tf
-    tf_range = parse_tf_range(function.tf_range)
     if header.live is None:
         raise DataError(
             f"{name}: its Gaussians carry no values, so that they have one look alone; expected a .ply of 'vvgt "
             "convert --live'"
         )
-    numbers = header.live.statistics()
-    shown = resolve(tf, numbers, tf_range)
-    check_visible(shown, numbers)
-    distance, label = unit_distance(function.unit_distance, volume_of(name, header), tf)
+    tf, shown = _table(name, header.live, function) if header.live.labels else _function(name, header.live, function)
+    given, asked = function.labels if header.live.labels else function.tf, function.unit_distance
+    if given is None and asked is None and header.unit_distance is not None:
+        asked = repr(header.unit_distance)
+    distance, label = unit_distance(asked, volume_of(name, header), tf if isinstance(tf, TransferFunction) else None)
+    light = light_of(function.light, tf.lighting or header.light, header.space)
     old = header if isinstance(header, PlyOptions) else layout_of(header)
-    options = replace(old, live=None, unit_distance=distance, unit_distance_label=label, function=shown.name)
+    options = replace(
+        old, live=None, unit_distance=distance, unit_distance_label=label, light=light, sh_degree=None,
+        function=shown.name,
+    )  # fmt: skip
     return shown, options
+
+
+def _function(name: str, facts: LiveFacts, function: FunctionRequest) -> tuple[TransferFunction, TransferFunction]:
+    """A function as it was given, and on the data values of a file."""
+    from vvgt_cli.look import check_visible, read_transfer_function, resolve
+    from vvgt_cli.look.resolve import parse_tf_range
+
+    if function.labels is not None:
+        raise UsageError(f"{name}: its Gaussians carry values, not labels; give a function (--tf), not --labels")
+    tf_range = parse_tf_range(function.tf_range)
+    given = read_transfer_function(function.tf) if isinstance(function.tf, str) else function.tf
+    tf = given or facts.tf(name)
+    shown = resolve(tf, facts.statistics(), tf_range)
+    check_visible(shown, facts.statistics())
+    return tf, shown
+
+
+def _table(name: str, facts: LiveFacts, function: FunctionRequest) -> tuple[LabelTable, LabelTable]:
+    """A table of labels as it was given, twice."""
+    from vvgt_cli.look.label_files import read_labels
+
+    if function.tf is not None or function.tf_range != "data":
+        raise UsageError(f"{name}: its Gaussians carry labels, not values; give a table (--labels), not --tf")
+    numbers = [label.number for label in facts.labels]
+    if function.labels is None:
+        table = LabelTable("the labels of the file", facts.labels)
+    elif function.labels == "auto":
+        table = distinct(numbers)
+    else:
+        given = read_labels(function.labels) if isinstance(function.labels, str) else function.labels
+        table = given.of(numbers, name)
+    return table, table
+
+
+def light_of(asked: LightOptions, preset: Lighting | None, space: str | None) -> Lighting | None:
+    """The light on Gaussians that carry values, None for none.
+
+    Raises:
+        UsageError: lights that are none; shadows or occlusion, which the volume is needed for.
+    """
+    lighting = asked.lighting(preset, space if space in ("RAS", "LPS") else None)
+    if lighting is not None and lighting.attenuated:
+        raise UsageError(
+            "--shadows and --ambient-occlusion need the volume, which Gaussians that carry values are shown without; "
+            "leave them out"
+        )
+    return lighting
 
 
 def volume_of(name: str, header: FileFacts) -> Volume:

@@ -18,12 +18,14 @@ from vvgt_cli.gaussians import Gaussians, PlyOptions, write_ply
 from vvgt_cli.gaussians.formats import encoded, format_of
 from vvgt_cli.gaussians.formats.page_file import framed
 from vvgt_cli.gaussians.rules import INRIA, rule_of
+from vvgt_cli.look.lighting import LightOptions
 from vvgt_cli.score.record import ConversionReport, StageRecord
 from vvgt_cli.score.viewing import PREVIEW_VIEWS
 
 if TYPE_CHECKING:
     from vvgt_cli.field.field import Field
     from vvgt_cli.look.function import TransferFunction
+    from vvgt_cli.look.labels import LabelTable
 
 FROM_THE_SIDE = 4  # test view that pictures show where none is asked for
 
@@ -100,21 +102,27 @@ class Result:
                 return write_ply(temporary, self.gaussians, ply, self.normals())
             return temporary.write_bytes(encoded(known, self.gaussians, ply, os.fspath(path)))
 
-    def recolor(self, look: str | TransferFunction, *, range: str = "data", unit_distance: str | None = None) -> Result:
+    def recolor(
+        self, look: str | TransferFunction | None = None, *, range: str = "data", unit_distance: str | None = None,
+        labels: str | LabelTable | None = None, light: LightOptions | None = None,
+    ) -> Result:  # fmt: skip
         """What Gaussians that carry values (``convert(..., live=True)``) are under another function: ``vvgt recolor``.
 
         Args:
-            look: file, colour map's name, or a function.
+            look: file, colour map's name, or a function; None: that which they have.
             range: "data", "rescale" or "LO,HI": where the function's nodes lie.
             unit_distance: world length that opacity is per, "paraview" or "mean-spacing"; None: the function's own.
+            labels: of a label map's: a table, its file, or "auto"; None: that which they have.
+            light: what falls on them; None: what the function's file says, else what they were made under.
 
         Raises:
             DataError: they carry none, or the function shows nothing of them.
-            UsageError: a range or a distance that is none.
+            UsageError: a range, a distance or a light that is none.
         """
         from vvgt_cli.conversion.recolored import FunctionRequest, placed_function, under_function
 
-        tf, options = placed_function("result", self.ply, FunctionRequest(look, range, unit_distance))
+        asked = FunctionRequest(look, range, unit_distance, labels, light or LightOptions())
+        tf, options = placed_function("result", self.ply, asked)
         found = under_function(self.gaussians, self.ply, tf, options)
         return Result(found, ConversionReport("recolor"), options)
 

@@ -146,6 +146,7 @@ def _settings(request: ConvertRequest, series: Series) -> dict[str, Any]:
         **({"layers": [repr(layer) for layer in request.source.layers]} if request.source.layers else {}),
         "opacity_unit_distance": series.distance,
         **({} if lighting is None else {"light": lighting.text()}),
+        **({"live": True} if request.live else {}),
         **asdict(request.fit),
         **asdict(request.limits),
         "model": read_text(find_model(request.fit.model) / CARD) if request.fit.model else None,

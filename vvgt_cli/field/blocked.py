@@ -21,7 +21,7 @@ from vvgt_cli.field.field import Picture
 from vvgt_cli.field.grid import CellGrid
 from vvgt_cli.field.parts import CELLS, Parts
 from vvgt_cli.field.rays import Bundle, RayFile, composed
-from vvgt_cli.field.reader import Scalars
+from vvgt_cli.field.reader import Layers, Scalars
 from vvgt_cli.field.runners import Runner, Task
 from vvgt_cli.field.settings import cell_grid
 from vvgt_cli.field.source import Source
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from vvgt_cli.closed_form.moments import Cells
     from vvgt_cli.field.cells import Reader
     from vvgt_cli.look.function import TransferFunction
+    from vvgt_cli.look.labels import LabelTable
 
 Progress = Callable[[int, int], None]
 RAY_STEP = 2e-8  # seconds of a step of a ray through what is not empty: bonsai-tree in blocks of 128, two threads
@@ -312,9 +313,25 @@ class Blocked:
         middles = (numbers.edges[1:] + numbers.edges[:-1]) / 2
         visible = float(numbers.histogram[tf.opacity(middles) > 0].sum())
         key = digest(self.key, source.look(), source.unit_distance)
+        return self._beside(source, replace(self.reader, optics=optics), visible, key)
+
+    def labelled_by(self, tables: Sequence[LabelTable]) -> Blocked:
+        """See `Field`: as `shown_by`."""
+        from vvgt_cli.look.tables import Optics
+
+        source = self.source.labelled_by(tables)
+        assert isinstance(self.reader, Layers)
+        hollow = zip(self.reader.layers, source.layers, strict=True)
+        layers = tuple(replace(old, tf=new.tf, unit_distance=new.unit_distance) for old, new in hollow)
+        top = sum(layer.largest for layer in layers) / self.reader.scale
+        reader = replace(self.reader, layers=layers, optics=Optics.linear(top))
+        own = [(e.number, e.color, e.opacity) for table in tables for e in table.labels]
+        return self._beside(source, reader, self.visible, digest(self.key, own, source.unit_distance))
+
+    def _beside(self, source: Source, reader: Reader, visible: float, key: str) -> Blocked:
+        """The field of another look, whose parts lie in a folder of their own, within that of this one."""
         parts = Parts(self.do.parts.folder / f"shown-{key[:16]}")
         parts.open({"shown": key}, ours=True)
-        reader = replace(self.reader, optics=optics)
         return Blocked(source, reader, replace(self.do, parts=parts), self.edge, visible, key)
 
     def digest(self) -> str:

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from vvgt_cli.dvr import RenderSettings, Scene
     from vvgt_cli.dvr.scene import PreparedVolume
     from vvgt_cli.look.function import TransferFunction
+    from vvgt_cli.look.labels import LabelTable
 
 
 AT_ONCE = 1 << 17  # Gaussians whose samples are in memory
@@ -74,6 +75,13 @@ class Field(Protocol):
 
         Raises:
             UsageError: an optics grid, which has no function.
+        """
+
+    def labelled_by(self, tables: Sequence[LabelTable]) -> Field:
+        """The same label maps under other tables, as `Source.labelled_by`.
+
+        Raises:
+            UsageError: not labels alone.
         """
 
     def digest(self) -> str:
@@ -151,6 +159,11 @@ class Resident:
     def shown_by(self, tf: TransferFunction) -> Resident:
         """See `Field`."""
         source = replace(self.source.shown_by(tf), layout=self.layout)
+        return Resident(source, source.scene())
+
+    def labelled_by(self, tables: Sequence[LabelTable]) -> Resident:
+        """See `Field`."""
+        source = self.source.labelled_by(tables)
         return Resident(source, source.scene())
 
     def digest(self) -> str:

@@ -14,6 +14,7 @@ from vvgt_cli.field.digests import digest, volume_digest
 from vvgt_cli.field.layered import AUTO, IN_MEMORY, NONE, Access, Content, content_of, is_plain, layers_of
 from vvgt_cli.jit.ahead import for_grid, for_light
 from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.look.histogram import UNIT_SHARE
 from vvgt_cli.look.labels import LabelTable
 from vvgt_cli.look.lighting import Lighting, LightOptions
 from vvgt_cli.volume import ReadOptions, Statistics, Volume
@@ -168,6 +169,21 @@ class Source:
         distance, label = unit_distance(None, self.volume, tf)
         layer = replace(self.layers[0], tf=tf, unit_distance=distance, unit_label=label)
         return replace(self, layers=(layer,), lighting=None)
+
+    def labelled_by(self, tables: Sequence[LabelTable]) -> Source:
+        """The same label maps under other tables, one a layer, opacity per `UNIT_SHARE` of the longest edge; unlit.
+
+        Raises:
+            UsageError: not labels alone.
+        """
+        if not self.labels_alone:
+            raise UsageError(f"{self.name}: not labels alone; expected one label map (--labels)")
+        distance = UNIT_SHARE * 2 / self.volume.unit_frame().scale
+        layers = [
+            replace(layer, tf=table, unit_distance=distance, unit_label=table.name)
+            for layer, table in zip(self.layers, tables, strict=True)
+        ]
+        return replace(self, layers=tuple(layers), lighting=None)
 
     def look(self) -> str:
         """Digest of all that gives the volume its colours, other volumes included."""

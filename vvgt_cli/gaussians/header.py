@@ -195,7 +195,8 @@ def _provenance(comments: list[str], name: str, columns: list[str]) -> dict[str,
             continue
         try:
             if words[1] == WORD:
-                live |= one_comment(words[2:])
+                more = one_comment(words[2:])
+                live |= more | {"labels": live.get("labels", ()) + more["labels"]} if "labels" in more else more
             else:
                 found |= _one_comment(words[1:])
         except (ValueError, IndexError, UsageError):

@@ -10,6 +10,7 @@ opacity is 1 - exp(-E L / sqrt(k)). The means are a table over m and s.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from statistics import NormalDist
 
@@ -17,8 +18,9 @@ import numpy as np
 
 from vvgt_cli.gaussians.constants import MIN_ALPHA
 from vvgt_cli.gaussians.frames import factored, rotations
-from vvgt_cli.gaussians.live_facts import GRADIENT
+from vvgt_cli.gaussians.live_facts import GRADIENT, ROW
 from vvgt_cli.gaussians.types import Gaussians
+from vvgt_cli.look.labels import Label
 from vvgt_cli.look.tables import extinction
 from vvgt_cli.look.types import TransferFunctionLike
 
@@ -48,7 +50,7 @@ class Table:
     sums: np.ndarray
 
     @classmethod
-    def of(cls, tf: TransferFunctionLike, lo: float, hi: float, unit_distance: float) -> Table:
+    def of_function(cls, tf: TransferFunctionLike, lo: float, hi: float, unit_distance: float) -> Table:
         """Of a function on data values whose opacity is per ``unit_distance``, a unit-frame length."""
         x = lo + (hi - lo) * np.linspace(0, 1, FINE)
         tau = extinction(tf.opacity(x), unit_distance)
@@ -75,6 +77,33 @@ class Table:
         found: np.ndarray = near * (1 - f) + far * f
         return found
 
+    def of(self, live: np.ndarray) -> np.ndarray:
+        """(K, 6) `sums` of what Gaussians carry."""
+        return self.at(live[:, VALUE], live[:, SPREAD])
+
+
+@dataclass(frozen=True)
+class Palette:
+    """A table of labels as `Table` has a function: no label moves or thins a Gaussian.
+
+    Attributes:
+        sums: (labels, 6) float64 extinction per unit-frame length times r, g, b, 1, 0 and 1.
+    """
+
+    sums: np.ndarray
+
+    @classmethod
+    def of_labels(cls, labels: Sequence[Label], unit_distance: float) -> Palette:
+        """Of labels whose opacity is per ``unit_distance``, a unit-frame length."""
+        tau = extinction(np.array([label.opacity for label in labels]), unit_distance)
+        per = np.array([(*label.color, 1.0, 0.0, 1.0) for label in labels])
+        return cls(per * tau[:, None])
+
+    def of(self, live: np.ndarray) -> np.ndarray:
+        """(K, 6) `sums` of what Gaussians carry."""
+        found: np.ndarray = self.sums[live[:, ROW].astype(np.int64)]
+        return found
+
 
 def law_nodes() -> np.ndarray:
     """(NODES,) quantiles of the normal law, stretched to its variance."""
@@ -97,24 +126,28 @@ def lengths(gaussians: Gaussians, tau: np.ndarray) -> np.ndarray:
     return found
 
 
-def baked(gaussians: Gaussians, table: Table) -> Gaussians:
+def baked(gaussians: Gaussians, table: Table | Palette) -> Gaussians:
     """Gaussians that carry values, with the colours and opacities of a function, where they are: for other viewers."""
     assert gaussians.live is not None
-    sums = table.at(gaussians.live[:, VALUE], gaussians.live[:, SPREAD])
+    sums = table.of(gaussians.live)
     colors = sums[:, :TAU] / np.maximum(sums[:, TAU, None], 1e-30)
     logits = _logits(sums[:, TAU] * gaussians.live[:, LENGTH].astype(np.float64))
     return replace(gaussians, opacity_logits=logits, colors=colors, harmonics=None)
 
 
-def shown_by(gaussians: Gaussians, table: Table) -> Gaussians:
-    """An ordinary cloud: what Gaussians that carry values are under a function, without those that it hides."""
+def seen_under(gaussians: Gaussians, table: Table | Palette) -> np.ndarray:
+    """Numbers of those that a function does not hide, ascending."""
     assert gaussians.live is not None
-    sums = table.at(gaussians.live[:, VALUE], gaussians.live[:, SPREAD])
-    visible = -np.expm1(-sums[:, TAU] * gaussians.live[:, LENGTH] / THINNEST**0.5) >= MIN_ALPHA
-    gaussians, sums = gaussians.take(np.flatnonzero(visible)), sums[visible]
+    tau = table.of(gaussians.live)[:, TAU]
+    return np.flatnonzero(-np.expm1(-tau * gaussians.live[:, LENGTH] / THINNEST**0.5) >= MIN_ALPHA)
+
+
+def shown_by(gaussians: Gaussians, table: Table | Palette) -> Gaussians:
+    """An ordinary cloud, unlit: what Gaussians that carry values are under a function, all of them."""
     assert gaussians.live is not None
     if not len(gaussians):
         return replace(gaussians, live=None, harmonics=None)
+    sums = table.of(gaussians.live)
     tau = np.maximum(sums[:, TAU], 1e-30)
     first = sums[:, FIRST] / tau
     variance = np.maximum(sums[:, SECOND] / tau - first**2, 0)

@@ -14,13 +14,19 @@ from vvgt_cli.errors import DataError
 from vvgt_cli.look.colormap import ColorMap
 from vvgt_cli.look.convert import to_text
 from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.look.labels import Label
 from vvgt_cli.look.opacity import PiecewiseOpacity
+from vvgt_cli.look.readers.minimal import read
 from vvgt_cli.volume import Statistics, Volume
 from vvgt_cli.volume.stats import BINS, edges_of
+from vvgt_cli.volume.types import triple
 
-COLUMNS, NORMAL = ("value", "spread", "length"), ("nx", "ny", "nz")
+COLUMNS, NORMAL, LABEL = ("value", "spread", "length"), ("nx", "ny", "nz"), "label"
+CARRIED, ROW = slice(0, 3), 6  # of what Gaussians carry: columns of their own, and the row of a label
 GRADIENT = slice(3, 6)  # of what Gaussians carry: in the columns of normals
+LONGEST_NAME = 80  # characters of a label's
 SAMPLED = 64  # nodes of a function that the header has no other way of holding
+MOST_LABELS = 500  # that a header has room for
 LONGEST = 12_000  # characters of a function: some loaders read no more than the first 10 KB of a header, ours 64
 WORD = "live"
 
@@ -35,14 +41,16 @@ class LiveFacts:
         histogram: (256,) counts over the range.
         unit: of the values, "" where it is not known.
         function: minimal JSON of the function that colours and opacities are of.
+        labels: of a label map, in the order of the rows that Gaussians carry; then there are no values and no function.
     """
 
     lo: float
     hi: float
     dims: tuple[int, int, int]
-    histogram: tuple[int, ...]
+    histogram: tuple[int, ...] = ()
     unit: str = ""
     function: str = ""
+    labels: tuple[Label, ...] = ()
 
     @classmethod
     def of(cls, volume: Volume, numbers: Statistics, tf: TransferFunction) -> LiveFacts:
@@ -59,12 +67,25 @@ class LiveFacts:
         """The function as JSON holds it."""
         return dict(json.loads(self.function)) if self.function else {}
 
+    def tf(self, name: str) -> TransferFunction:
+        """The function that is baked in, on data values.
+
+        Raises:
+            DataError: the file ``name`` has none.
+        """
+        if not self.function:
+            raise DataError(f"{name}: its header has no function; give one with --tf")
+        return read(self.baked(), f"the function of {name}")
+
     def lines(self) -> list[str]:
         """Comments; `parsed` reads them."""
         dims = " ".join(map(str, self.dims))
         unit = ["comment vvgt live unit " + self.unit] if self.unit else []
+        values = f"comment vvgt live values {self.lo!r} {self.hi!r} dims {dims}"
+        if self.labels:
+            return [values, *(f"comment vvgt live label {label_text(label)}" for label in self.labels)]
         return [
-            f"comment vvgt live values {self.lo!r} {self.hi!r} dims {dims}",
+            values,
             *unit,
             "comment vvgt live histogram " + " ".join(map(str, self.histogram)),
             "comment vvgt live function " + self.function,
@@ -82,6 +103,12 @@ def function_text(tf: TransferFunction, lo: float, hi: float) -> str:
     x = np.linspace(lo, hi, SAMPLED) if hi > lo else np.array([lo])
     few = TransferFunction(tf.name, PiecewiseOpacity(x, tf.opacity(x).round(5)), ColorMap(x, tf.color(x).round(4)))
     return json.dumps(json.loads(to_text(few, "minimal")))
+
+
+def label_text(label: Label) -> str:
+    """Number, colour, opacity and name; of the name what is not ASCII is escaped."""
+    color = " ".join(f"{channel:.4g}" for channel in label.color)
+    return f"{label.number} {color} {label.opacity:.6g} {json.dumps(label.name[:LONGEST_NAME])}"
 
 
 def one_comment(words: Sequence[str]) -> dict[str, Any]:
@@ -103,6 +130,12 @@ def one_comment(words: Sequence[str]) -> dict[str, Any]:
         if len(counts) != BINS or min(counts) < 0:
             raise ValueError(words)
         return {"histogram": counts}
+    if words[0] == "label":
+        number, rgb, opacity = int(words[1]), [float(word) for word in words[2:5]], float(words[5])
+        name = json.loads(" ".join(words[6:]))
+        if not isinstance(name, str) or not all(0 <= x <= 1 for x in (*rgb, opacity)):
+            raise ValueError(words)
+        return {"labels": (Label(number, name, triple(rgb), opacity),)}
     if words[0] == "function":
         text = " ".join(words[1:])
         if not isinstance(json.loads(text), dict):
@@ -113,5 +146,6 @@ def one_comment(words: Sequence[str]) -> dict[str, Any]:
 
 def live_facts(found: Mapping[str, Any], columns: Sequence[str]) -> LiveFacts | None:
     """Facts of the comments of a file with these columns; None where one or the other is missing."""
-    whole = set(COLUMNS) <= set(columns) and {"lo", "histogram"} <= set(found)
+    whole = set(COLUMNS) <= set(columns) and "lo" in found
+    whole = whole and ("histogram" in found or (LABEL in columns and "labels" in found))
     return LiveFacts(**found) if whole else None

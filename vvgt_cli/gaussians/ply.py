@@ -14,12 +14,12 @@ from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import seekable
 from vvgt_cli.gaussians.frames import rescale, turn, up_matrix
 from vvgt_cli.gaussians.header import FileFacts, PlyHeader, comment_lines, parse_header, rest_names
-from vvgt_cli.gaussians.live_facts import COLUMNS, GRADIENT, NORMAL, LiveFacts
+from vvgt_cli.gaussians.live_facts import CARRIED, COLUMNS, GRADIENT, LABEL, NORMAL, ROW, LiveFacts
 from vvgt_cli.gaussians.types import HARMONICS, SH_C0, Gaussians
 from vvgt_cli.volume.space import axis_facts
 
 FRAMES = ("unit", "world")
-_HEADER_LIMIT = 1 << 16  # bytes; a header longer than this is not one
+_HEADER_LIMIT = 1 << 18  # bytes; a header longer than this is not one
 
 
 @dataclass(frozen=True)
@@ -138,14 +138,25 @@ def ply_rows(gaussians: Gaussians, options: PlyOptions, normals: np.ndarray | No
     rows[:, end - 7 : end - 4] = placed.log_scales
     rows[:, end - 4 : end] = placed.quaternions
     if placed.live is not None:
-        rows[:, 3:6], rows[:, end:] = placed.live[:, GRADIENT], np.delete(placed.live, GRADIENT, axis=1)
+        rows[:, 3:6], rows[:, end:] = placed.live[:, GRADIENT], placed.live[:, CARRIED]
+        if options.live is not None and options.live.labels:
+            return _with_labels(rows, placed.live[:, ROW], len(options.live.labels))
     return rows
+
+
+def _with_labels(rows: np.ndarray, labels: np.ndarray, count: int) -> np.ndarray:
+    """Rows (K,) of floats and the row of a label in a byte, or two of more than 256."""
+    out = np.empty(len(rows), [("floats", "<f4", rows.shape[1]), (LABEL, "u1" if count <= 256 else "<u2")])
+    out["floats"], out[LABEL] = rows, labels
+    return out
 
 
 def ply_header(count: int, degree: int, options: PlyOptions, live: bool = False) -> bytes:
     """The header of a file of ``count`` Gaussians with harmonics of ``degree``; ``live``: they carry values."""
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]  # some loaders count lines
     lines += [f"property float {name}" for name in property_names(degree, live)]
+    if live and options.live is not None and options.live.labels:
+        lines.append(f"property {'uchar' if len(options.live.labels) <= 256 else 'ushort'} {LABEL}")
     lines += [*(comment_lines(options) if options.comments else []), "end_header", ""]
     return "\n".join(lines).encode("ascii")
 
@@ -223,7 +234,9 @@ def _values(header: PlyHeader, columns: Callable[..., np.ndarray]) -> np.ndarray
     """
     if header.live is None:
         return None
-    found = columns(*COLUMNS, *NORMAL)
+    found = columns(*COLUMNS, *NORMAL, *([LABEL] if header.live.labels else []))
+    if header.live.labels and found[:, ROW].max(initial=0) >= len(header.live.labels):
+        raise DataError(f"a label of row {found[:, ROW].max():g}; expected fewer than {len(header.live.labels)}")
     if (found[:, 1] < 0).any() or (found[:, 2] <= 0).any():
         raise DataError("spreads below 0, or lengths that are not above it; expected the columns that vvgt writes")
     return found
@@ -252,6 +265,10 @@ def opacity(gaussians: Gaussians) -> np.ndarray:
 def live_summary(gaussians: Gaussians, facts: LiveFacts) -> dict[str, object]:
     """What `describe` says of values that Gaussians carry."""
     assert gaussians.live is not None
+    if facts.labels:
+        counts = np.bincount(gaussians.live[:, ROW].astype(np.int64), minlength=len(facts.labels)).tolist()
+        rows = zip(facts.labels, counts, strict=True)
+        return {"live_labels": [{"label": e.number, "name": e.name, "gaussians": n} for e, n in rows]}
     found: dict[str, object] = {"live_values": [facts.lo, facts.hi], "live_unit": facts.unit or "none"}
     for column, name in enumerate(COLUMNS):
         found[f"live_{name}"] = [float(f"{q:.6g}") for q in np.percentile(gaussians.live[:, column], (0, 50, 100))]

@@ -16,6 +16,8 @@ from vvgt_cli.library.inputs import (
     FunctionLike,
     Goal,
     GoalLike,
+    LabelsLike,
+    LightLike,
     Look,
     LookLike,
     LooksLike,
@@ -25,6 +27,8 @@ from vvgt_cli.library.inputs import (
     console_of,
     content_of,
     function_of,
+    labels_of,
+    light_of,
     looks_of,
     ply_of,
     source_of,
@@ -251,30 +255,34 @@ def evaluate(
 
 
 def recolor(
-    ply: PathLike, look: FunctionLike, *, range: str = "data", unit_distance: str | float | None = None
-) -> Result:
+    ply: PathLike, look: FunctionLike | None = None, *, range: str = "data", unit_distance: str | float | None = None,
+    labels: LabelsLike | None = None, light: LightLike = None,
+) -> Result:  # fmt: skip
     """A live ``.ply`` under another function, without its volume: ``vvgt recolor``.
 
     Args:
         ply: path of a file that ``vvgt convert --live`` wrote.
-        look: as of `Look`.
+        look: a function as of `Look`; None: the file's own.
         range, unit_distance: as of `Result.recolor`.
+        labels: of a label map's file, a table as of `Look`; None: the file's own.
+        light: as of `Look`; None: what the function's file says, else what the file was made under.
 
     Returns:
         An ordinary cloud.
 
     Raises:
         DataError: a file whose Gaussians carry no values, or a function that shows nothing of them.
-        UsageError: a range or a distance that is none.
+        UsageError: a range, a distance or a light that is none.
     """
     from vvgt_cli.conversion.gaussian_files import layout_of
     from vvgt_cli.score.record import ConversionReport
 
     gaussians, header = read_ply(ply)
-    function = function_of(look)
-    assert function is not None
     result = Result(gaussians, ConversionReport("recolor"), layout_of(header))
-    return result.recolor(function, range=range, unit_distance=None if unit_distance is None else str(unit_distance))
+    distance = None if unit_distance is None else str(unit_distance)
+    return result.recolor(
+        function_of(look), range=range, unit_distance=distance, labels=labels_of(labels), light=light_of(light)
+    )
 
 
 def optimize(

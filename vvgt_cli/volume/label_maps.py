@@ -9,6 +9,7 @@ import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.stats import count_integers, slabs
+from vvgt_cli.volume.stored import planes
 from vvgt_cli.volume.types import Volume
 
 FEW = 512  # labels up to which a volume that is named so is taken for a label map
@@ -54,3 +55,13 @@ def recognised(volume: Volume, labels: Callable[[Volume], list[int]] = labels_in
     middle = len(volume.data) // 2
     first = np.unique(volume.data[middle : middle + 1])  # most are told by one slice
     return len(first) <= FEW and len(labels(volume)) <= FEW
+
+
+def counts_of(volume: Volume) -> dict[float, int]:
+    """Voxels of each data value, slice by slice."""
+    found: dict[float, int] = {}
+    for plane in planes(volume):
+        values, many = np.unique(plane, return_counts=True)
+        for value, n in zip(volume.slope * values.astype(np.float64) + volume.intercept, many, strict=True):
+            found[float(value)] = found.get(float(value), 0) + int(n)
+    return found

@@ -8,7 +8,7 @@ Eight bytes a Gaussian, two textures of RGBA8U, in the order of the file:
 | 1 | spread s: (s / (hi - lo) / widest)^(1 / bend) * 255, a column of the table over 255 times its columns less one |
 | 2 | log L: (log L - l0) / (l1 - l0) * 255 |
 | 4, 5, 6 | direction in which values rise, as long as the share r that it explains: 128 + 127 times x, y, z |
-| 3, 7 | 0 |
+| 3, 7 | of a label map the row of the label, its low and its high byte; else 0 |
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.gaussians.live import BEND, LENGTH, MEANS, NODES, SPREAD, SPREADS, THINNEST, VALUE, WIDEST
-from vvgt_cli.gaussians.live_facts import GRADIENT, LiveFacts
+from vvgt_cli.gaussians.live_facts import GRADIENT, ROW, LiveFacts
 from vvgt_cli.gaussians.types import Gaussians
 
 BYTES = 8
@@ -34,6 +34,9 @@ def live_bytes(gaussians: Gaussians, facts: LiveFacts) -> np.ndarray:
     out[:, 1] = _byte((live[:, SPREAD] / width / WIDEST).clip(0, 1) ** (1 / BEND))
     out[:, 2] = _byte((np.log(live[:, LENGTH]) - first) / ((last - first) or 1.0))
     out[:, 4:7] = np.rint(128 + 127 * live[:, GRADIENT].clip(-1, 1))
+    if facts.labels:
+        row = live[:, ROW].astype(np.int64)
+        out[:, 3], out[:, 7] = row & 255, row >> 8
     return out
 
 
@@ -45,7 +48,9 @@ def live_json(gaussians: Gaussians, facts: LiveFacts, unit_distance: float) -> d
         facts: of their values.
         unit_distance: unit-frame length that the opacity of the function in ``facts`` is per.
     """
+    labels = [{"number": e.number, "name": e.name, "rgb": list(e.color), "opacity": e.opacity} for e in facts.labels]
     return {
+        "labels": labels,
         "values": [facts.lo, facts.hi],
         "unit": facts.unit,
         "histogram": list(facts.histogram),
@@ -61,14 +66,16 @@ def live_json(gaussians: Gaussians, facts: LiveFacts, unit_distance: float) -> d
 
 
 def from_bytes(stream: np.ndarray, facts: dict[str, Any]) -> np.ndarray:
-    """(K, 6) float32 of bytes and facts: what a page makes of them, and `Gaussians.live` holds."""
+    """(K, 6) or (K, 7) float32 of bytes and facts: what a page makes of them, and `Gaussians.live` holds."""
     (lo, hi), (first, last) = facts["values"], facts["log_lengths"]
     share = stream.astype(np.float64) / 255
     value = lo + (hi - lo) * share[:, 0]
     spread = ((hi - lo) or 1.0) * facts["widest"] * share[:, 1] ** facts["bend"]
     length = np.exp(first + (last - first) * share[:, 2])
     gradient = (stream[:, 4:7].astype(np.float64) - 128) / 127
-    found: np.ndarray = np.column_stack([value, spread, length, gradient]).astype(np.float32)
+    row = stream[:, 3] + 256.0 * stream[:, 7]
+    carried = [value, spread, length, gradient, *([row] if facts["labels"] else [])]
+    found: np.ndarray = np.column_stack(carried).astype(np.float32)
     return found
 
 

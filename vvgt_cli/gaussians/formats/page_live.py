@@ -16,10 +16,11 @@ from vvgt_cli.gaussians.frames import turn, up_matrix
 from vvgt_cli.gaussians.live import law_nodes
 from vvgt_cli.gaussians.live_facts import LiveFacts
 from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.look.lighting import Lighting
 from vvgt_cli.look.readers.minimal import read
 
 HELD = "values"  # the element that holds the bytes
-PLANES = (0, 1, 2, 4, 5, 6)  # columns of `live_bytes` that are not 0
+PLANES = (0, 1, 2, 4, 5, 6)  # columns of `live_bytes` that are not 0; of labels all
 SAMPLED = 96  # nodes of colours on other lines than straight ones in RGB
 _RAMP = {"points": [{"x": 0, "rgb": [1, 1, 1], "opacity": 0}, {"x": 1, "rgb": [1, 1, 1], "opacity": 0.1}]}
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0])  # the viewer has PLY (x, y, z) at (-x, -y, z)
@@ -50,9 +51,14 @@ def live_parts(gaussians: Gaussians, options: PlyOptions) -> tuple[Splats, bytes
     facts, laid = options.live, upright(options)
     gaussians = gaussians.take(morton_order(turn(gaussians, laid.up).means))  # as the page's file has them
     turned = turn(gaussians, laid.up)
-    splats = splats_of(replace(gaussians, live=None), replace(laid, live=None))
-    planes = np.ascontiguousarray(live_bytes(turned, facts)[:, PLANES].T)
+    splats = splats_of(replace(gaussians, live=None, harmonics=None), replace(laid, live=None, sh_degree=0))
+    planes = np.ascontiguousarray(live_bytes(turned, facts)[:, planes_of(facts)].T)
     return splats, gzip.compress(planes.tobytes(), 9, mtime=0), _facts(gaussians, options, laid.up)
+
+
+def planes_of(facts: LiveFacts) -> tuple[int, ...]:
+    """Columns of `live_bytes` that a page holds, one after the other."""
+    return (*PLANES, 3, 7) if facts.labels else PLANES
 
 
 def _facts(gaussians: Gaussians, options: PlyOptions, up: str) -> dict[str, Any]:
@@ -61,15 +67,28 @@ def _facts(gaussians: Gaussians, options: PlyOptions, up: str) -> dict[str, Any]
     facts = options.live
     said = live_json(gaussians, facts, (options.unit_distance or 1.0) * (options.scale or 1.0))
     said.pop("function")
+    axes = (_HALF_TURN @ up_matrix(up)).T
     return said | {
         "held": HELD,
         "opacity_unit_distance": options.unit_distance or 1.0,
+        "light": _light(options.light, axes),
         "law": law_nodes().tolist(),
         "name": facts.baked().get("name", ""),
-        "nodes": nodes_of(facts),
-        "axes": (_HALF_TURN @ up_matrix(up)).T.tolist(),
+        "nodes": [] if facts.labels else nodes_of(facts),
+        "axes": axes.tolist(),
         "box": [gaussians.means.min(axis=0).tolist(), gaussians.means.max(axis=0).tolist()],
     }
+
+
+def _light(lighting: Lighting | None, axes: np.ndarray) -> dict[str, Any]:
+    """What the page begins with: the file's light (of several the one at the eye, else the first), or none."""
+    one = lighting or Lighting()
+    kind = "none" if lighting is None else "headlight" if one.headlight else "direction"
+    toward = np.array(one.directions[0] if one.directions else (-0.5, -0.7, 0.5)) @ axes
+    return {
+        "kind": kind, "from": (toward / np.linalg.norm(toward)).tolist(), "ambient": one.ambient,
+        "diffuse": one.diffuse, "specular": one.specular, "power": one.specular_power,
+    }  # fmt: skip
 
 
 def nodes_of(facts: LiveFacts) -> list[dict[str, Any]]:

@@ -6,7 +6,7 @@ export function rowsOf(name, { facts, world, count, live }) {
   const function_ = live ? live.name : facts.function;
   return [
     ['file', name],
-    ['look', live ? 'live: the function can be changed' : 'baked'],
+    ['look', !live ? 'baked' : live.labels.length ? 'live: labels and light can be changed' : 'live: function and light can be changed'],
     ['function', function_],
     ['opacity per', facts['unit-distance'] && `${length(facts['unit-distance'])} (${facts.label})`],
     ['light', live ? null : facts.light],

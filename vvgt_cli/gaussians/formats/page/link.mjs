@@ -1,4 +1,4 @@
-// A link that restores what is seen: #view=...&projection=...&frame=...&function=...&cut=... Parts are {key, get, set} of text.
+// A link that restores what is seen: #view=...&projection=...&frame=...&function=...&cut=...&light=...&labels=... Parts are {key, get, set} of text.
 const number = (x, digits = 6) => String(Number(x.toFixed(digits)));
 const hex = (rgb) => rgb.map((c) => Math.round(255 * Math.min(Math.max(c, 0), 1)).toString(16).padStart(2, '0')).join('');
 
@@ -27,11 +27,27 @@ export function frameParts(show) {
   return [{ key: 'frame', get: () => (list().selectedIndex ? String(list().selectedIndex) : ''), set: (text) => { if (list().options[Number(text)]) return show(Number(text)); } }];
 }
 
+// light, labels: what the panel goes back to by undo, as JSON; of labels the rows that are as in the file are left out
+function stateOf({ key, state, set }) {
+  const begun = state(), written = (now) => JSON.stringify(now, (name, value) => (typeof value === 'number' ? Number(value.toFixed(4)) : value));
+  const short = ({ rows, solo }) => ({ rows: rows.map((row, k) => [k, row]).filter(([k, row]) => written(row) !== written(begun.rows[k])), solo });
+  const long = ({ rows, solo }) => ({ rows: begun.rows.map((row, k) => ({ ...row, ...(rows.find(([j]) => j === k)?.[1] ?? {}) })), solo });
+  return {
+    key,
+    get: () => (written(state()) === written(begun) ? '' : encodeURIComponent(written(begun.rows ? short(state()) : state()))),
+    set: (text) => {
+      const then = JSON.parse(text);
+      set(begun.rows ? long(then) : { ...begun, ...then });
+    },
+  };
+}
+
 export function liveParts(live, facts) {
   const find = (selector) => document.querySelector(`#live ${selector}`), pressed = () => find('.flip').getAttribute('aria-pressed') === 'true';
   const written = (nodes) => nodes.map(({ x, y, rgb }) => `${Number(x.toPrecision(7))}:${number(y, 5)}:${hex(rgb)}`).join(',');
   return [
-    {
+    ...live.parts.map(stateOf),
+    ...live.labelled ? [] : [{
       key: 'function',
       get: () => (written(live.nodes()) === written(facts.nodes) ? '' : written(live.nodes())),
       set: (text) => {
@@ -41,7 +57,7 @@ export function liveParts(live, facts) {
         });
         if (nodes.length > 1 && nodes.every(({ x, y, rgb }, k) => [x, y, ...rgb].every(Number.isFinite) && (!k || x >= nodes[k - 1].x))) live.set(nodes);
       },
-    },
+    }],
     {
       key: 'cut',
       get: () => (find('.axis').selectedIndex > 0 ? `${'xyz'[find('.axis').selectedIndex - 1]},${find('input[type=range]').value}${pressed() ? ',other' : ''}` : ''),
@@ -64,5 +80,7 @@ export function linkOf(parts) {
 export async function restore(parts) {
   const said = new Map(decodeURIComponent(location.hash.slice(1)).split('&').map((part) => [part.split('=')[0], part.slice(part.indexOf('=') + 1)]));
   if (!said.has('view')) return;
-  for (const { key, set } of parts) if (said.has(key) || key === 'projection') await set(said.get(key) ?? '');
+  for (const { key, set } of parts) {
+    if (said.has(key) || key === 'projection') await Promise.resolve(said.get(key) ?? '').then(set).catch(() => {});  // a damaged part is left as it is
+  }
 }

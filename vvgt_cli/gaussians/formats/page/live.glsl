@@ -1,8 +1,12 @@
 // A Gaussian under the function: moved and thinned along the gradient (docs/live.md), and cut by a plane. The engine calls
 // modifySplatCenter first. A cut Gaussian becomes the one of the same mean and variance as its part that stays.
 uniform highp sampler2D vvgtTable;
+uniform highp sampler2D vvgtLabels;  // of a label map a column a label: red, green, blue, extinction; else one column
 uniform vec4 vvgtFacts;  // shortest log length, how far it goes, thinnest, spreads
 uniform vec4 vvgtCut;  // dot(xyz, centre) <= w stays
+uniform vec4 vvgtLight;  // ambient, diffuse, specular, power; ambient < 0: unlit
+uniform vec4 vvgtToward;  // direction towards the light, or with w = 1 the eye's place: a light there
+uniform vec3 vvgtEye;
 vec4 vvgtColor, vvgtRotation;
 vec3 vvgtScale;
 
@@ -42,6 +46,15 @@ float vvgtCut3(inout vec3 center, inout mat3 axes) {  // depth's factor
   return stays / thin;
 }
 
+vec3 vvgtLit(vec3 color, vec3 gradient, vec3 center) {  // Blinn and Phong's (docs/light.md)
+  if (vvgtLight.x < 0.0) return color;
+  float rises = length(gradient);
+  if (rises == 0.0) return color * vvgtLight.x;
+  vec3 n = gradient / rises, d = normalize(center - vvgtEye), l = vvgtToward.w > 0.0 ? -d : vvgtToward.xyz, h = l - d;
+  float facing = min(abs(dot(n, h)) / max(length(h), 1e-9), 1.0);
+  return min(color * (vvgtLight.x + vvgtLight.y * abs(dot(n, l))) + vvgtLight.z * pow(facing, vvgtLight.w), vec3(1.0));
+}
+
 void modifySplatCenter(inout vec3 center) {
   uvec4 a = loadVvgtValues(), b = loadVvgtGradient();
   int spreads = int(vvgtFacts.w), at = int(a.x);
@@ -50,6 +63,11 @@ void modifySplatCenter(inout vec3 center) {
   float f = column - float(j);
   vec4 sums = mix(texelFetch(vvgtTable, ivec2(at, j), 0), texelFetch(vvgtTable, ivec2(at, j + 1), 0), f);
   vec2 z = mix(texelFetch(vvgtTable, ivec2(at, j + spreads), 0).xy, texelFetch(vvgtTable, ivec2(at, j + 1 + spreads), 0).xy, f);
+  if (textureSize(vvgtLabels, 0).x > 1) {
+    vec4 label = texelFetch(vvgtLabels, ivec2(int(a.w) + 256 * int(b.w), 0), 0);
+    sums = vec4(label.rgb * label.a, label.a);
+    z = vec2(0.0, label.a);
+  }
   float tau = max(sums.a, 1e-12), first = z.x / tau, variance = max(z.y / tau - first * first, 0.0);
   mat3 turn = quatToMat3(getRotation());
   vec3 scale = getScale(), gradient = (vec3(b.xyz) - 128.0) / 127.0, along = gradient * turn * scale;
@@ -59,8 +77,10 @@ void modifySplatCenter(inout vec3 center) {
   vec3 arm = axes * along;
   center += arm * (r * first);
   axes += outerProduct(arm * (thin - 1.0), along);
+  vec3 place = center;
   float depth = tau * exp(vvgtFacts.x + vvgtFacts.y * float(a.z) / 255.0) * inversesqrt(thin) * vvgtCut3(center, axes);
-  vvgtColor = sums.a < 1e-12 ? vec4(0.0) : vec4(sums.rgb / tau, 1.0 - exp(-depth));
+  vec3 color = vvgtLit(sums.rgb / tau, mat3(matrix_model) * gradient, place);
+  vvgtColor = sums.a < 1e-12 ? vec4(0.0) : vec4(color, 1.0 - exp(-depth));
   for (int sweep = 0; sweep < 6; sweep++) {
     vvgtTurn(axes[0], axes[1]);
     vvgtTurn(axes[0], axes[2]);

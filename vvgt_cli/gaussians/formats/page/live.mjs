@@ -3,7 +3,8 @@ import { FILTER_NEAREST, PIXELFORMAT_RGBA32F, PIXELFORMAT_RGBA8U, Texture } from
 import modifier from './live.glsl';
 import { sumsOf, texelsOf } from './live_table.mjs';
 
-const STREAMS = [['vvgtValues', [0, 1, 2]], ['vvgtGradient', [3, 4, 5]]];  // and the planes of each one's r, g and b
+const STREAMS = [['vvgtValues', [0, 1, 2, 6]], ['vvgtGradient', [3, 4, 5, 7]]];  // and the planes of each one's r, g, b and a
+const MOST_OPAQUE = 1 - 1e-5;  // opacity of which there still is an extinction
 
 // the planes of bytes, one after the other, that the page holds (gzip in base64)
 async function unpacked(id) {
@@ -13,18 +14,19 @@ async function unpacked(id) {
   return new Uint8Array(await new Response(stream.pipeThrough(new DecompressionStream('gzip'))).arrayBuffer());
 }
 
-// {live, bytes, sums, plane, apply(nodes), cut(axis or null, place, flipped)} of a viewer that has loaded its Gaussians, once they are shown so
+// {live, bytes, count, sums, rows, plane, apply(nodes), labels(list), cut(axis or null, place, flipped), light(of light.mjs)} of a viewer that has loaded its Gaussians, once they are shown so
 export async function liveLook({ app }, live) {
   const entity = app.root.findByName('gsplat'), { gsplat } = entity, { resource } = app.assets.get(gsplat.asset);
-  const bytes = await unpacked(live.held), count = bytes.length / 6;
+  const bytes = await unpacked(live.held), planes = live.labels.length ? 8 : 6, count = bytes.length / planes;
   resource.format.addExtraStreams(STREAMS.map(([name]) => ({ name, format: PIXELFORMAT_RGBA8U })));
-  for (const [name, planes] of STREAMS) {
+  for (const [name, own] of STREAMS) {
     const texture = resource.getTexture(name), texels = texture.lock();
-    planes.forEach((plane, c) => { for (let i = 0; i < count; i++) texels[4 * i + c] = bytes[plane * count + i]; });
+    own.forEach((plane, c) => { for (let i = 0; plane < planes && i < count; i++) texels[4 * i + c] = bytes[plane * count + i]; });
     texture.unlock();
   }
   const [means, spreads] = live.table, nearest = { minFilter: FILTER_NEAREST, magFilter: FILTER_NEAREST };
   const table = new Texture(app.graphicsDevice, { name: 'vvgtTable', width: means, height: 2 * spreads, format: PIXELFORMAT_RGBA32F, mipmaps: false, ...nearest });
+  const labels = new Texture(app.graphicsDevice, { name: 'vvgtLabels', width: Math.max(live.labels.length + 1, 1), height: 1, format: PIXELFORMAT_RGBA32F, mipmaps: false, ...nearest });
   const [first, last] = live.log_lengths;
   let again = 0, shown;
   const set = (name, value) => {
@@ -32,21 +34,39 @@ export async function liveLook({ app }, live) {
     app.renderNextFrame = true;
     again = 2;
   };
+  // a light that depends on the eye, or a highlight: again when the camera has moved
+  const camera = app.root.findComponent('camera').entity, eye = [0, 0, 0];
+  let follows = false;
+  app.on('update', () => {
+    const { x, y, z } = camera.getPosition();
+    if (!follows || Math.hypot(x - eye[0], y - eye[1], z - eye[2]) < 1e-4) return;
+    [eye[0], eye[1], eye[2]] = [x, y, z];
+    set('vvgtEye', [...eye]);
+  });
   // what is set while the engine takes up another state may be lost: set once more when it is ready
   app.on('update', () => { if (again) app.renderNextFrame = true; });
   app.systems.gsplat.on('frame:ready', (camera, layer, ready, loading) => {
     if (!again || !ready || loading) return;
     gsplat.setParameter('vvgtTable', table);
+    gsplat.setParameter('vvgtLabels', labels);
     app.renderNextFrame = true;
     if (!--again) shown();
   });
   const look = {
-    live, bytes, sums: null, plane: null,  // what a place is found and read by
+    live, bytes, count, sums: null, rows: [], plane: null,  // what a place is found and read by
     apply(nodes) {
       look.sums = sumsOf(nodes, live);
       table.lock().set(texelsOf(look.sums, live.table));
       table.unlock();
       set('vvgtTable', table);
+    },
+    // what each label looks like: [{rgb, opacity}], in the order of the file
+    labels(list) {
+      look.rows = list;
+      const texels = labels.lock();
+      list.forEach(({ rgb, opacity }, k) => texels.set([...rgb, -Math.log1p(-Math.min(Math.max(opacity, 0), MOST_OPAQUE)) / live.unit_distance], 4 * k));
+      labels.unlock();
+      set('vvgtLabels', labels);
     },
     cut(axis, place, flipped) {
       const sign = flipped ? -1 : 1;
@@ -54,9 +74,20 @@ export async function liveLook({ app }, live) {
       set('vvgtCut', look.plane ? [...look.plane.normal, look.plane.place] : [0, 0, 0, 1]);
     },
   };
+  look.light = ({ kind, from, ambient, diffuse, specular, power }) => {
+    const { x, y, z } = camera.getPosition();
+    follows = kind !== 'none' && (kind === 'headlight' || specular > 0);
+    [eye[0], eye[1], eye[2]] = [x, y, z];
+    gsplat.setParameter('vvgtEye', [...eye]);
+    gsplat.setParameter('vvgtToward', [...from, kind === 'headlight' ? 1 : 0]);
+    set('vvgtLight', [kind === 'none' ? -1 : ambient, diffuse, specular, power]);
+  };
+  look.light(live.light);
   set('vvgtFacts', [first, last - first, live.thinnest, spreads]);
   look.cut(null);
-  look.apply(live.nodes);
+  if (live.labels.length) set('vvgtTable', table);
+  else look.apply(live.nodes);
+  look.labels(live.labels);
   gsplat.setWorkBufferModifier({ glsl: modifier });
   await new Promise((done) => { shown = done; });
   return look;

@@ -1,10 +1,13 @@
 // The panel of a live page: the function over the histogram, its nodes to be dragged; a cut.
+import { hex, rgbOf } from './color.mjs';
+import { light } from './light.mjs';
+import { organs } from './organs.mjs';
 import { functionAt } from './live_table.mjs';
 
 const WIDE = 276, HIGH = 92, NEAR = 16, TWICE = 350;  // px; milliseconds between the taps that add a node
 const MANY = 14, CLOSE = 0.03;  // nodes that are all offered, and how far fewer of them may be from the function
 const SVG = 'http://www.w3.org/2000/svg';
-const HTML = `<header><span class="named"><b></b><i></i></span><output></output><button class="fold" aria-label="transfer function" title="transfer function">▾</button></header>
+const HTML = `<header><span class="named"><b></b><i></i></span><output></output><button class="fold" aria-label="panel" title="panel">▾</button></header>
 <svg viewBox="0 0 ${WIDE} ${HIGH}" role="group" aria-label="opacity over value; double click adds a node, Delete removes one">
 <defs><linearGradient id="live-fill"></linearGradient></defs><path class="counts" fill="#667"/><path class="area" fill="url(#live-fill)" fill-opacity="0.75"/>
 <path class="line" fill="none" stroke="#fff"/><g></g></svg>
@@ -14,7 +17,6 @@ const HTML = `<header><span class="named"><b></b><i></i></span><output></output>
 <button class="flip" aria-pressed="false" aria-label="other side" title="other side">⇄</button></div>`;
 
 const height = (y) => HIGH - 4 - (HIGH - 8) * Math.cbrt(y), opacity = (h) => Math.min(Math.max((HIGH - 4 - h) / (HIGH - 8), 0), 1) ** 3;
-const hex = (rgb) => `#${rgb.map((c) => Math.round(255 * Math.min(Math.max(c, 0), 1)).toString(16).padStart(2, '0')).join('')}`;
 const copy = (nodes) => nodes.map(({ x, y, rgb }) => ({ x, y, rgb: [...rgb] }));
 
 // the file's name and what kind it is
@@ -69,10 +71,12 @@ export function panel(look, viewer, live) {
   named('live', root.querySelector('.named'));
   const find = (selector) => root.querySelector(selector), [lo, hi] = live.values, span = hi - lo || 1;
   const across = (x) => 6 + ((WIDE - 12) * (x - lo)) / span, value = (p) => Math.min(Math.max(lo + (span * (p - 6)) / (WIDE - 12), lo), hi);
-  const ready = presets(live), undone = [];
+  const labelled = live.labels.length > 0, ready = labelled ? {} : presets(live), undone = [], parts = [];  // parts: what undo goes back to beside the function
   let nodes = fewer(live.nodes), exact = live.nodes, chosen = 0, due = false, told = () => {};  // exact: of the file until an edit
 
   function draw() {
+    find('.undo').disabled = !undone.length;
+    if (labelled) return;
     const curve = Array.from({ length: WIDE - 11 }, (_, k) => `${k + 6},${height(functionAt(exact ?? nodes, value(k + 6)).y).toFixed(2)}`).join('L');
     find('.line').setAttribute('d', `M${curve}`);
     find('.area').setAttribute('d', `M6,${HIGH - 4}L${curve}L${WIDE - 6},${HIGH - 4}Z`);
@@ -93,7 +97,6 @@ export function panel(look, viewer, live) {
     });
     find('output').textContent = text(nodes[chosen]);
     find('input[type=color]').value = hex(nodes[chosen].rgb);
-    find('.undo').disabled = !undone.length;
     find('.remove').disabled = nodes.length < 3;
   }
 
@@ -102,7 +105,7 @@ export function panel(look, viewer, live) {
   function show() {
     draw();
     told(false);
-    if (due) return;
+    if (due || labelled) return;
     due = true;
     requestAnimationFrame(() => {
       due = false;
@@ -112,13 +115,17 @@ export function panel(look, viewer, live) {
 
   // before a change: what undo goes back to
   function keep() {
-    undone.push({ nodes: copy(nodes), exact, chosen });
+    undone.push({ nodes: copy(nodes), exact, chosen, states: parts.map((part) => part.state()) });
     if (undone.length > 200) undone.shift();
+    find('.undo').disabled = false;
   }
+  const history = { keep, add: (part) => parts.push(part), changed: () => told(true) };
 
   function undo() {
     if (!undone.length) return;
-    ({ nodes, exact, chosen } = undone.pop());
+    const then = undone.pop();
+    ({ nodes, exact, chosen } = then);
+    parts.forEach((part, k) => { if (part.state() !== then.states[k]) part.set(then.states[k]); });
     show();
   }
 
@@ -210,7 +217,7 @@ export function panel(look, viewer, live) {
   find('input[type=color]').addEventListener('input', ({ target }) => {
     if (!coloring) keep();
     [coloring, exact] = [true, null];
-    nodes[chosen].rgb = [1, 3, 5].map((k) => parseInt(target.value.slice(k, k + 2), 16) / 255);
+    nodes[chosen].rgb = rgbOf(target.value);
     show();
   });
   find('input[type=color]').addEventListener('change', () => { coloring = false; });
@@ -240,6 +247,14 @@ export function panel(look, viewer, live) {
     cut();
   });
 
+  root.classList.toggle('labelled', labelled);
+  if (labelled) {
+    root.querySelector('div').after(organs(look, live.labels, history));
+    find('.organs div').prepend(find('.undo'));
+  }
+  root.append(light(look, viewer, live.light, history));
+  const lamp = parts.at(-1), begun = lamp.state();
+
   const fold = (folded) => {
     root.classList.toggle('folded', folded);
     find('.fold').textContent = folded ? '▸' : '▾';
@@ -259,5 +274,5 @@ export function panel(look, viewer, live) {
   cut();
   fold(innerWidth < 700);
   draw();
-  return { root, look, changed(f) { told = f; }, cutting: () => axis.selectedIndex > 0, nodes: () => copy(exact ?? nodes), set(now) { keep(); [nodes, exact, chosen] = [copy(now), null, 0]; show(); } };
+  return { root, look, changed(f) { told = f; }, alone: () => axis.selectedIndex > 0 || lamp.state() !== begun, labelled, parts, nodes: () => copy(exact ?? nodes), set(now) { keep(); [nodes, exact, chosen] = [copy(now), null, 0]; show(); } };
 }

@@ -52,7 +52,7 @@ export function rulerOf(viewer, lens, worldNow, dataNow, look, changed) {
 export function placeText({ world, value }, { letters, anatomical, unit }, live) {
   const digits = (x) => shown(x, Math.abs(x) < 100 ? 3 : 5);
   const along = world.map((x, k) => (anatomical ? `${letters[k][x < 0 ? 0 : 1]} ${digits(Math.abs(x))}` : `${letters[k][1]} ${digits(x)}`));
-  const read = value === null ? '' : `: ${shown(value, 4)}${live.unit && ` ${live.unit}`}`;
+  const read = value === null ? '' : `: ${typeof value === 'string' ? value : shown(value, 4)}${live.unit && ` ${live.unit}`}`;
   return `${along.join(', ')}${unit && ` ${unit}`}${read}`;
 }
 

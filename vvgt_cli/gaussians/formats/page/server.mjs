@@ -81,8 +81,9 @@ function substitute({ app }) {
   return { load, put, drop };
 }
 
-// panel: {root, nodes(), changed(f), cutting()}; server: {converts, name}, none of a page in a file
+// panel: {root, nodes(), changed(f), alone(): a cut or another light, which the live form alone has}; server: {converts, name}, none of a page in a file
 export function served(panel, viewer, live, server) {
+  if (panel.labelled) return;  // no function to convert for, or to save
   const { root } = panel, kind = root.querySelector('.named i'), name = server?.name ?? document.title;
   const row = document.createElement('div'), text = document.createElement('p');
   row.className = 'save';
@@ -97,7 +98,7 @@ export function served(panel, viewer, live, server) {
     text.className = failed ? 'failed' : '';
   };
 
-  const improved = () => number !== null && !panel.cutting();  // a cut is of the live form
+  const improved = () => number !== null && !panel.alone();
   function put() {
     better.put(improved());
     const [what, ...rest] = (improved() ? told : 'live').split(/(?=, )/);

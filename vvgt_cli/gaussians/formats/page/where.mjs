@@ -91,7 +91,7 @@ export function where(viewer, scene, live, show) {
     const group = element('g');
     state.letters = drawLetters(group, all);
     state.scale = drawScale(group, { ...all, left: LEFT + 96 });
-    state.legend = scene.live ? drawLegend(group, { nodes: live.nodes(), live: scene.live, right: wide - 12 - (high < 620 ? 44 : 0), bottom: high - 72 }) : null;
+    state.legend = scene.live && !live.labelled ? drawLegend(group, { nodes: live.nodes(), live: scene.live, right: wide - 12 - (high < 620 ? 44 : 0), bottom: high - 72 }) : null;
     drawRuler(group, all);
     svg.replaceChildren(group);
     const facing = [...state.letters].map(({ letter }) => letter).join(' ');

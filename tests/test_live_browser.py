@@ -1,0 +1,112 @@
+"""Labels and light of live pages in a real browser, by clicking, dragging and typing."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from browser import PAGES, browser, packages
+
+from vvgt_cli.cameras import orbit_views
+from vvgt_cli.cli.main import run
+from vvgt_cli.gaussians import read_ply
+from vvgt_cli.images import read_png
+from vvgt_cli.images.metrics import psnr
+from vvgt_cli.splat import render
+
+SIZE = 300
+DESK, PHONE = (1280, 800), (390, 844)
+Actions = list[dict[str, Any]]
+pytestmark = pytest.mark.long
+
+
+def after(file: Path, actions: Actions, folder: Path, window: tuple[int, int] = DESK) -> np.ndarray:
+    """Picture (SIZE, SIZE, 3) of the page of a file, after ``actions`` in a window."""
+    page = file.with_suffix(".html")
+    if not page.exists():
+        assert run(["view", str(file), "-o", str(page), "--quiet"]) == 0
+    job = {
+        "browser": browser(), "url": page.as_uri(), "size": SIZE, "camera": None, "frame": None,
+        "actions": actions, "window": window, "look": str(folder / "look.png"), "out": str(folder / "a.png"),
+    }  # fmt: skip
+    (folder / "job.json").write_text(json.dumps(job))
+    command = ["node", str(PAGES / "page.mjs"), str(folder / "job.json"), str(packages())]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=1200)
+    assert done.returncode == 0, done.stderr
+    return read_png(folder / "a.png")[..., :3]
+
+
+def ours(file: Path, folder: Path, *look: str) -> np.ndarray:
+    """What `vvgt recolor` makes of a file, as `vvgt render --orbit` begins; the file is not turned."""
+    out = folder / "ours.ply"
+    assert run(["recolor", str(file), *look, "--quiet", "--overwrite", "-o", str(out)]) == 0
+    return render(read_ply(out)[0], orbit_views(1, size=SIZE)[0], rule="inria")[..., :3]
+
+
+@pytest.fixture(scope="module")
+def lit(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("lit") / "ml.ply"
+    source = ["convert", "example:marschner-lobb:32", "--live", "--light", "headlight", "--tf", "viridis"]
+    assert run([*source, "--max-gaussians", "8000", "--size", "300", "--quiet", "-o", str(path)]) == 0
+    return path
+
+
+@pytest.fixture(scope="module")
+def labels(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """27 cubes, each a label, whose names are markup."""
+    path = tmp_path_factory.mktemp("many") / "many.ply"
+    z, y, x = np.mgrid[:27, :27, :27] // 9
+    np.save(path.with_name("map.npy"), (1 + x + 3 * y + 9 * z).astype(np.uint8))
+    entries = {n: {"name": f"<i>part {n}</i>", "color": (n % 7 / 6, n % 5 / 4, n % 3 / 2)} for n in range(1, 28)}
+    path.with_name("names.json").write_text(json.dumps(entries))
+    source = ["convert", str(path.with_name("map.npy")), "--live", "--labels", str(path.with_name("names.json"))]
+    assert run([*source, "--max-gaussians", "4000", "--size", "300", "--quiet", "-o", str(path)]) == 0
+    return path
+
+
+def table(file: Path, folder: Path, shown: set[int]) -> str:
+    header = read_ply(file)[1]
+    assert header.live is not None
+    entries = {
+        str(e.number): {"name": e.name, "color": e.color, "opacity": e.opacity if e.number in shown else 0}
+        for e in header.live.labels
+    }
+    (folder / "t.json").write_text(json.dumps(entries))
+    return str(folder / "t.json")
+
+
+def test_a_page_begins_with_the_files_light_and_the_ball_moves_it(lit: Path, tmp_path: Path) -> None:
+    head = after(lit, [], tmp_path)
+    same = psnr(ours(lit, tmp_path), head)
+    print(f"the page under a head-light against our drawing: {same:.2f} dB")
+    assert same > max(32, psnr(ours(lit, tmp_path, "--light", "none"), head) + 3)
+    ball: Actions = [{"click": "#live summary"}, {"drag": "#live .light svg", "by": [-20, -12]}]
+    for window in (DESK, PHONE):
+        actions = ball if window == DESK else [{"click": "#live .fold"}, *ball]
+        dragged = after(lit, actions, tmp_path, window)
+        assert psnr(head, dragged) < 35
+        undone = after(lit, [*actions, {"key": "Control+z"}], tmp_path, window)
+        assert psnr(head, undone) > 45
+
+
+def test_labels_are_switched_off_shown_alone_and_searched(labels: Path, tmp_path: Path) -> None:
+    off: Actions = [{"click": "#live li:nth-child(1) .eye"}, {"click": "#live li:nth-child(3) .eye"}]
+    wanted = ours(labels, tmp_path, "--labels", table(labels, tmp_path, set(range(1, 28)) - {1, 3}))
+    every, shot = ours(labels, tmp_path), after(labels, off, tmp_path)
+    print(f"two labels off: {psnr(wanted, shot):.2f} dB, not {psnr(every, shot):.2f}")
+    assert psnr(wanted, shot) > max(28, psnr(every, shot) + 3)
+    whole = after(labels, [*off, {"key": "Control+z"}, {"key": "Control+z"}], tmp_path)
+    print(f"undone: {psnr(every, whole):.2f} dB, not {psnr(wanted, whole):.2f}")
+    assert psnr(every, whole) > max(28, psnr(wanted, whole) + 3)
+    solo: Actions = [
+        {"click": "#live .fold"}, {"fill": "#live [type=search]", "text": "<i>part 7<"},
+        {"click": "#live li:not([hidden]) .solo"},
+    ]  # fmt: skip
+    alone = ours(labels, tmp_path, "--labels", table(labels, tmp_path, {7}))
+    shot = after(labels, solo, tmp_path, PHONE)
+    print(f"one label alone: {psnr(alone, shot):.2f} dB")
+    assert psnr(alone, shot) > 28

@@ -1,0 +1,211 @@
+"""Gaussians that carry the label under them, and their look under any table."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import vvgt_cli as vvgt_library
+from tests.test_live import SMALL, cloud
+from tests.test_page_live import options, page_of
+from vvgt_cli.closed_form.labelled import labelled
+from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
+from vvgt_cli.gaussians.formats.live import from_bytes, live_bytes, live_json
+from vvgt_cli.gaussians.live import Palette, baked, seen_under, shown_by
+from vvgt_cli.gaussians.live_facts import LiveFacts
+from vvgt_cli.look.label_fog import label_fog
+from vvgt_cli.look.labels import Label, LabelTable
+from vvgt_cli.volume import Volume
+
+LABELS = (
+    Label(3, "liver", (0.6, 0.3, 0.2), 0.5),
+    Label(7, "</script><b>x \u00e9", (0.1, 0.9, 0.4), 1.0),
+    Label(300, "none", (1.0, 1.0, 0.0), 0.0),
+)
+
+
+def labels_cloud(labels: tuple[Label, ...] = LABELS) -> Gaussians:
+    some = cloud()
+    assert some.live is not None
+    row = np.arange(len(some)) % len(labels)
+    return replace(some, live=np.column_stack([np.zeros((len(some), 2)), some.live[:, 2:], row]))
+
+
+def facts(labels: tuple[Label, ...] = LABELS) -> LiveFacts:
+    return LiveFacts(3.0, 300.0, (9, 8, 7), labels=labels)
+
+
+def halves() -> Volume:
+    """A label map: 1 for x below 8, 2 beyond; nothing for z beyond 12."""
+    data = np.ones((16, 16, 16), np.uint8)
+    data[:, :, 8:] = 2
+    data[12:] = 0
+    return Volume(data, (1.0, 1.0, 1.0), name="halves_label")
+
+
+def test_a_gaussian_has_its_labels_color_and_extinction_where_it_is() -> None:
+    some = labels_cloud()
+    assert some.live is not None
+    shown = shown_by(some, Palette.of_labels(LABELS, 0.05))
+    for row, label in enumerate(LABELS[:2]):
+        own = some.live[:, 6] == row
+        np.testing.assert_allclose(shown.colors[own], np.tile(label.color, (own.sum(), 1)), atol=1e-6)
+        tau = -np.log1p(-min(label.opacity, 1 - 1e-5)) / 0.05
+        opacity = 1 / (1 + np.exp(-shown.opacity_logits[own].astype(float)))
+        np.testing.assert_allclose(opacity, -np.expm1(-tau * some.live[own, 2]), atol=2e-5)
+    np.testing.assert_allclose(shown.means, some.means, atol=1e-6)
+    visible = some.live[:, 6] < 2
+    np.testing.assert_allclose(shown.log_scales.sum(axis=1)[visible], some.log_scales.sum(axis=1)[visible], atol=1e-4)
+    assert set(some.live[seen_under(some, Palette.of_labels(LABELS, 0.05)), 6]) == {0, 1}
+
+
+def test_a_ply_keeps_labels_in_a_byte_and_names_in_its_header(tmp_path: Path) -> None:
+    some = baked(labels_cloud(), Palette.of_labels(LABELS, 0.05))
+    write_ply(tmp_path / "a.ply", some, PlyOptions(up="y", scale=0.1, centre=(1, 2, 3), live=facts()))
+    back, header = read_ply(tmp_path / "a.ply")
+    assert header.live == facts()
+    assert header.dtype["label"] == np.uint8
+    assert back.live is not None
+    np.testing.assert_array_equal(back.live[:, [0, 1, 2, 6]], some.live[:, [0, 1, 2, 6]])  # type: ignore[index]
+    many = tuple(Label(n, f"n{n}", (0.5, 0.5, 0.5)) for n in range(1, 301))
+    row = np.full(len(some), 299.0)
+    last = replace(some, live=np.column_stack([labels_cloud().live[:, :6], row]))  # type: ignore[index]
+    write_ply(tmp_path / "b.ply", last, PlyOptions(live=facts(many)))
+    assert read_ply(tmp_path / "b.ply")[1].dtype["label"] == np.dtype("<u2")
+    assert read_ply(tmp_path / "b.ply")[0].live[0, 6] == 299  # type: ignore[index]
+    whole = (tmp_path / "a.ply").read_bytes()
+    (tmp_path / "c.ply").write_bytes(whole.replace(b"live label 300", b"live labex 300", 1))
+    with pytest.raises(vvgt_library.DataError, match="not one that vvgt writes"):
+        read_ply(tmp_path / "c.ply")
+    (tmp_path / "d.ply").write_bytes(whole[:-1] + b"\x09")
+    with pytest.raises(vvgt_library.DataError, match="row 9"):
+        read_ply(tmp_path / "d.ply")
+
+
+def test_bytes_for_pages_hold_the_label() -> None:
+    many = tuple(Label(n, f"n{n}", (0.5, 0.5, 0.5)) for n in range(1, 301))
+    some = labels_cloud(many)
+    live = some.live.copy()  # type: ignore[union-attr]
+    live[:, 6] = np.linspace(0, 299, len(live)).round()
+    some = replace(some, live=live)
+    stream, known = live_bytes(some, facts(many)), live_json(some, facts(many), 0.05)
+    np.testing.assert_array_equal(from_bytes(stream, known)[:, 6], live[:, 6])
+    assert json.loads(json.dumps(known)) == known
+
+
+def test_names_of_labels_are_no_markup_in_the_page() -> None:
+    some = baked(labels_cloud(), Palette.of_labels(LABELS, 0.05))
+    content, scene = page_of(some, options(live=facts()))
+    assert b"</script><b>x" not in content
+    assert [label["name"] for label in scene["live"]["labels"]] == [label.name for label in LABELS]
+    assert scene["live"]["nodes"] == []
+
+
+def test_labels_under_gaussians_and_the_way_they_end() -> None:
+    """Of Gaussians right and left of the border x = 8 of two labels, and beyond the labels."""
+    volume = halves()
+    frame = volume.unit_frame()
+    half, step = np.array(frame.half), np.array(frame.step)
+    at = np.array([[6.2, 8, 5], [8.9, 7, 5], [3, 8, 5], [12, 8, 6], [8, 8, 15.4]])
+    some = Gaussians(
+        at * step - half, np.full((5, 3), np.log(0.8 * step[0])), np.tile([1, 0, 0, 0], (5, 1)), np.zeros(5),
+        np.zeros((5, 3)),
+    )  # fmt: skip
+    owner, gradient = labelled(some, [(volume, [1, 2])], half, step)
+    np.testing.assert_array_equal(owner, [0, 1, 0, 1, -1])
+    assert (gradient[2:4] == 0).all()
+    assert abs(gradient[0] @ [1, 0, 0]) > 0.9
+    assert gradient[0, 0] < 0 < gradient[1, 0]
+
+
+def test_a_fog_of_labels_tells_them_apart() -> None:
+    table = label_fog(LabelTable("t", LABELS), {3: 1000, 7: 8, 300: 0})
+    assert len({label.color[0] for label in table.labels}) == 3
+    assert [label.opacity > 0 for label in table.labels] == [True, True, False]
+    assert table.labels[0].opacity == table.labels[1].opacity
+    for label in table.labels:
+        assert label.color[1] == pytest.approx(label.color[0] ** 2)
+    assert table.labels[1].color[2] > 3 * table.labels[0].color[2]
+
+
+def test_cells_do_not_straddle_labels() -> None:
+    """Where the budget allows it nearly no Gaussian of one label lies in the other."""
+    result = vvgt_library.convert(
+        halves(), vvgt_library.Look(labels="auto"), {"max_gaussians": 800, "size": 48}, live=True
+    )
+    live, means = result.gaussians.live, result.gaussians.means
+    assert live is not None
+    assert set(live[:, 6]) == {0, 1}
+    right = (means[:, 0] > 0) == (live[:, 6] == 1)
+    assert right.mean() > 0.97
+
+
+@pytest.fixture(scope="module")
+def label_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    from vvgt_cli.cli.main import run
+
+    folder = tmp_path_factory.mktemp("labels")
+    np.save(folder / "map_label.npy", halves().data)
+    arguments = ["convert", str(folder / "map_label.npy"), "--labels", "auto", "--live", "-q", "-o"]
+    assert run([*arguments, str(folder / "live.ply"), *map(str, SMALL)]) == 0
+    return folder / "live.ply"
+
+
+def test_recolor_takes_another_table_and_hides_labels(vvgt, label_file, tmp_path) -> None:
+    table = {"1": {"name": "one", "color": [1, 0, 0]}, "2": {"name": "two", "color": [0, 0, 1], "opacity": 0}}
+    (tmp_path / "t.json").write_text(json.dumps(table))
+    whole = read_ply(label_file)[0]
+    assert vvgt("recolor", label_file, "--labels", tmp_path / "t.json", "-o", tmp_path / "a.ply").code == 0
+    found, header = read_ply(tmp_path / "a.ply")
+    assert header.live is None
+    assert len(found) == (whole.live[:, 6] == 0).sum()  # type: ignore[index]
+    np.testing.assert_allclose(found.colors, np.tile([1, 0, 0], (len(found), 1)), atol=1e-6)
+    scores = []
+    for file in (label_file, tmp_path / "a.ply"):
+        shown = ("evaluate", file, "--volume", label_file.parent / "map_label.npy", "--labels", tmp_path / "t.json")
+        scores.append(json.loads(vvgt(*shown, "--json", "--no-seats").out)["scores"]["psnr"])
+    assert scores[0] == pytest.approx(scores[1], abs=1e-6)
+    assert scores[0] > 18
+    told = json.loads(vvgt("info", label_file, "--json").out)["live_labels"]
+    assert [entry["label"] for entry in told] == [1, 2]
+    assert sum(entry["gaussians"] for entry in told) == len(whole)
+    again = vvgt_library.recolor(label_file, labels=tmp_path / "t.json")
+    assert len(again.gaussians) == len(found)
+
+
+def test_what_labels_do_not_go_with(vvgt, label_file, tmp_path) -> None:
+    table = {
+        "1": {"name": "one", "color": [1, 0, 0], "opacity": 0},
+        "2": {"name": "two", "color": "#ffffff", "opacity": 0},
+    }
+    (tmp_path / "t.json").write_text(json.dumps(table | {"9": {"name": "nine", "color": "#ffffff"}}))
+    (tmp_path / "one.json").write_text(json.dumps({"1": {"name": "one", "color": "#ffffff"}}))
+    for more, code, said in (
+        (("--tf", "viridis"), 2, "carry labels"),
+        (("--labels", tmp_path / "t.json"), 1, "none of them visible"),
+        (("--labels", tmp_path / "one.json"), 1, "1 labels have no entry"),
+        (("--labels", tmp_path / "missing.json"), 2, "no such file"),
+    ):
+        done = vvgt("recolor", label_file, *more, "-o", tmp_path / "a.ply")
+        assert (done.code, said in done.error) == (code, True), done.error
+    done = vvgt("convert", "example:blob:12", "--layer", "example:blob:12", "--live", "-o", tmp_path / "a.ply", *SMALL)
+    assert (done.code, "one scalar field, or one label map" in done.error) == (2, True)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["one.json", "t.json"]
+
+
+def test_a_label_map_in_blocks_is_as_near(vvgt, label_file, tmp_path) -> None:
+    volume, found = label_file.parent / "map_label.npy", []
+    assert (
+        vvgt("convert", volume, "--labels", "auto", "--live", "--blocks", 16, "-o", tmp_path / "b.ply", *SMALL).code
+        == 0
+    )
+    for file in (label_file, tmp_path / "b.ply"):
+        gaussians = read_ply(file)[0]
+        assert gaussians.live is not None
+        found.append((gaussians.means.mean(axis=0), np.bincount(gaussians.live[:, 6].astype(int)) / len(gaussians)))
+    np.testing.assert_allclose(found[0][0], found[1][0], atol=0.02)
+    np.testing.assert_allclose(found[0][1], found[1][1], atol=0.05)

@@ -1,0 +1,137 @@
+"""Light on Gaussians that carry values, without the volume."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import vvgt_cli as vvgt_library
+from tests.test_live import HI, LO, RAMP, SMALL, cloud, facts
+from tests.test_page_live import options, page_of
+from vvgt_cli.closed_form.relit import relit
+from vvgt_cli.dvr.light import sphere
+from vvgt_cli.gaussians import Gaussians, read_ply
+from vvgt_cli.gaussians.frames import turn, up_matrix
+from vvgt_cli.gaussians.harmonics import basis, view_colors
+from vvgt_cli.gaussians.live import Table, baked, shown_by
+from vvgt_cli.look.lighting import Lighting, LightOptions
+
+SIDE = Lighting(False, ((0.6, 0.0, 0.8),), 0.2, 0.6, 0.3, 4.0)
+HEAD = Lighting(True, (), 0.1, 0.7, 0.2, 3.0)
+
+
+def grey(gradient: np.ndarray) -> Gaussians:
+    count = len(gradient)
+    return Gaussians(
+        np.zeros((count, 3)), np.zeros((count, 3)), np.tile([1, 0, 0, 0], (count, 1)), np.zeros(count),
+        np.full((count, 3), [0.5, 0.3, 0.1]),
+    )  # fmt: skip
+
+
+def exact(color: np.ndarray, n: np.ndarray, d: np.ndarray, light: Lighting) -> np.ndarray:
+    """The formula of docs/light.md in float64, one normal and one direction at a time."""
+    toward = -d if light.headlight else np.array(light.directions[0])
+    half = toward - d
+    facing = min(abs(float(n @ half)) / max(float(np.linalg.norm(half)), 1e-9), 1.0)
+    diffuse = light.ambient + light.diffuse * abs(float(n @ toward))
+    return color * diffuse + light.specular * facing**light.specular_power
+
+
+@pytest.mark.parametrize("light", [HEAD, SIDE, replace(HEAD, specular=0.0), replace(SIDE, specular=0.0)])
+def test_lit_colors_are_those_of_the_formula_in_harmonics_of_degree_2(light: Lighting) -> None:
+    rng = np.random.default_rng(2)
+    gradient = rng.normal(size=(5, 3)) * rng.uniform(0.1, 1, (5, 1))
+    shaded = relit(grey(gradient), gradient, light)
+    assert shaded.degree == (2 if light.depends_on_view else 0)
+    eyes = sphere(400)
+    for k in range(5):
+        n = gradient[k] / np.linalg.norm(gradient[k])
+        wanted = np.array([exact(np.array([0.5, 0.3, 0.1]), n, d, light) for d in eyes])
+        found = np.tile(shaded.colors[k].astype(float), (400, 1))
+        if shaded.harmonics is not None:
+            found += basis(eyes, 2) @ shaded.harmonics[k].astype(float)
+        np.testing.assert_allclose(found.mean(axis=0), wanted.mean(axis=0), atol=0.02)
+        assert np.sqrt(((found - wanted) ** 2).mean()) < 0.05
+
+
+def test_where_there_is_no_gradient_there_is_ambient_light_alone() -> None:
+    for light in (HEAD, SIDE):
+        shaded = relit(grey(np.zeros((2, 3))), np.zeros((2, 3)), light)
+        np.testing.assert_allclose(
+            view_colors(shaded, np.array([3.0, 1, 0])), np.tile([0.5, 0.3, 0.1], (2, 1)) * light.ambient, atol=1e-6
+        )
+
+
+def test_a_light_turns_with_its_gaussians() -> None:
+    some, table, eye = cloud(), Table.of_function(RAMP, LO, HI, 0.05), np.array([2.0, -1.0, 0.7])
+
+    def shade(gaussians: Gaussians, light: Lighting) -> Gaussians:
+        assert gaussians.live is not None
+        return relit(shown_by(gaussians, table), gaussians.live[:, 3:], light)
+
+    turned = replace(SIDE, directions=(tuple((up_matrix("x") @ np.array(SIDE.directions[0])).tolist()),))
+    for light, other in ((SIDE, turned), (HEAD, HEAD)):
+        before, after = shade(some, light), shade(turn(some, "x"), other)
+        np.testing.assert_allclose(view_colors(before, eye), view_colors(after, up_matrix("x") @ eye), atol=5e-3)
+
+
+@pytest.fixture(scope="module")
+def lit_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    from vvgt_cli.cli.main import run
+
+    path = tmp_path_factory.mktemp("lit") / "live.ply"
+    tail = ["-q", "-o", str(path), *map(str, SMALL)]
+    assert (
+        run(["convert", "example:marschner-lobb:20", "--live", "--tf", "viridis", "--light", "headlight", *tail]) == 0
+    )
+    return path
+
+
+def test_recolor_lights_as_it_is_told_and_else_as_the_file_is_lit(vvgt, lit_file, tmp_path) -> None:
+    _, header = read_ply(lit_file)
+    assert (header.light, header.sh_degree) == (Lighting(), 2)
+    found = {}
+    for name, more in {"as": (), "none": ("--light", "none"), "x": ("--light", "x", "--specular", 0)}.items():
+        assert vvgt("recolor", lit_file, *more, "-o", tmp_path / f"{name}.ply").code == 0
+        found[name] = read_ply(tmp_path / f"{name}.ply")
+    assert found["as"][1].light == header.light
+    assert found["none"][1].light is None
+    assert found["none"][0].harmonics is None
+    assert found["x"][1].light == Lighting(False, ((1.0, 0.0, 0.0),), specular=0.0)
+    assert found["x"][0].harmonics is None
+    assert found["x"][0].colors.mean() < found["none"][0].colors.mean()
+    again = vvgt_library.recolor(lit_file, light=LightOptions(("x",), specular=0.0))
+    np.testing.assert_allclose(again.gaussians.colors, found["x"][0].colors, atol=1e-6)
+    scores = {}
+    for light in ("headlight", "none"):
+        shown = ("evaluate", lit_file, "--volume", "example:marschner-lobb:20", "--tf", "viridis", "--light", light)
+        scores[light] = json.loads(vvgt(*shown, "--json", "--no-seats", "--size", 48).out)["scores"]["psnr"]
+    assert scores["headlight"] > scores["none"] - 2
+    assert vvgt("render", lit_file, "--light", "x", "--orbit", 1, "--size", 32, "-o", tmp_path / "a").code == 0
+    assert vvgt("render", lit_file, "--orbit", 1, "--size", 32, "-o", tmp_path / "b").code == 0
+    assert next((tmp_path / "a").glob("*.png")).read_bytes() != next((tmp_path / "b").glob("*.png")).read_bytes()
+
+
+def test_light_that_needs_the_volume_is_refused(vvgt, lit_file, tmp_path) -> None:
+    for more in (("--light", "x", "--shadows"), ("--light", "headlight", "--ambient-occlusion")):
+        done = vvgt("convert", "example:blob:12", "--live", *more, "-o", tmp_path / "a.ply", *SMALL)
+        assert (done.code, more[2] in done.error) == (2, True)
+    with pytest.raises(vvgt_library.UsageError, match="need the volume"):
+        vvgt_library.recolor(lit_file, light=LightOptions(("x",), shadows=True))
+    done = vvgt("recolor", lit_file, "--ambient", "0.5", "--light", "none", "-o", tmp_path / "a.ply")
+    assert (done.code, "nothing is lit" in done.error) == (2, True)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_page_begins_with_the_files_light() -> None:
+    some = baked(cloud(), Table.of_function(RAMP, LO, HI, 0.05))
+    for light, kind in ((None, "none"), (HEAD, "headlight"), (SIDE, "direction")):
+        _, scene = page_of(some, options(live=facts(), light=light))
+        assert scene["live"]["light"]["kind"] == kind
+    there = (up_matrix("y") @ np.array(SIDE.directions[0])) * (-1, -1, 1)
+    np.testing.assert_allclose(scene["live"]["light"]["from"], there, atol=1e-12)
+    assert scene["live"]["light"]["power"] == 4.0

@@ -1,0 +1,71 @@
+"""`vvgt convert --live` of a label map: each Gaussian belongs to one label, whose look can be changed afterwards."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.field.field import Field
+from vvgt_cli.field.source import Source
+from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.gaussians.live import lengths
+from vvgt_cli.gaussians.live_facts import MOST_LABELS, LiveFacts
+from vvgt_cli.look.fog import THIN
+from vvgt_cli.look.histogram import UNIT_SHARE
+from vvgt_cli.look.label_fog import label_fog
+from vvgt_cli.look.labels import Label, LabelTable
+from vvgt_cli.look.tables import extinction
+from vvgt_cli.score.record import Run
+from vvgt_cli.volume.label_maps import counts_of
+
+
+def labels_of(source: Source) -> tuple[Label, ...]:
+    """The visible labels of a source: those that Gaussians can belong to.
+
+    Raises:
+        UsageError: anything but one label map.
+        DataError: too many.
+    """
+    table = source.tf
+    if len(source.layers) > 1 or not isinstance(table, LabelTable):
+        raise UsageError(
+            f"{source.name}: channels, layers, colours, or segments that overlap; --live expects one scalar field, or "
+            "one label map: choose it with --component N, or leave out --live"
+        )
+    found = tuple(label for label in table.labels if label.opacity > 0)
+    if len(found) > MOST_LABELS:
+        raise DataError(f"{source.name}: {len(found)} visible labels; expected at most {MOST_LABELS} with --live")
+    return found
+
+
+def label_facts(source: Source, labels: tuple[Label, ...]) -> LiveFacts:
+    """What a file of these labels says."""
+    numbers = [float(label.number) for label in labels]
+    return LiveFacts(min(numbers), max(numbers), source.volume.dims, labels=labels)
+
+
+def fog_of_labels(field: Field, labels: tuple[Label, ...]) -> Field:
+    """The label map with all visible labels as one thin fog, told apart by their colours."""
+    layer = field.source.layers[0]
+    assert isinstance(layer.tf, LabelTable)
+    voxels = counts_of(layer.volume)
+    return field.labelled_by([label_fog(layer.tf, {e.number: voxels.get(float(e.number), 0) for e in labels})])
+
+
+def carrying_labels(run: Run, field: Field, gaussians: Gaussians, labels: tuple[Label, ...]) -> Gaussians:
+    """Gaussians of the fog with the rows of their labels, without those that lie in none."""
+    from vvgt_cli.closed_form.labelled import labelled
+
+    frame, source = field.source.volume.unit_frame(), field.source
+    with run.stage("labels") as stage:
+        maps = [(source.layers[0].volume, [label.number for label in labels])]
+        owner, gradient = labelled(gaussians, maps, np.array(frame.half), np.array(frame.step))
+        known = np.flatnonzero(owner >= 0)
+        gaussians, owner, gradient = gaussians.take(known), owner[known], gradient[known]
+        tau = float(extinction(np.array(THIN), 2 * UNIT_SHARE))
+        length = lengths(gaussians, np.full(len(gaussians), tau))
+        live = np.column_stack([np.zeros((len(owner), 2)), length, gradient, owner])
+        stage.note = f"{len(np.unique(owner))} of {len(labels)} labels have Gaussians"
+    return replace(gaussians, live=live, harmonics=None)

@@ -1,0 +1,72 @@
+// The list of labels of a live page: of each its colour, opacity, whether it is shown, or alone; a search where there are many.
+import { hex, rgbOf } from './color.mjs';
+
+const SEARCHED = 12;  // labels that are seen at a glance
+
+function row({ name, number }, k) {
+  const element = document.createElement('li');
+  element.dataset.row = k;
+  element.innerHTML = '<button class="eye" aria-pressed="true">●</button><input type="color"><span></span><input type="range" min="0" max="1" step="0.01"><button class="solo" aria-pressed="false">solo</button>';
+  const [eye, color, text, slider, solo] = element.children;
+  text.textContent = text.title = name;  // never markup
+  for (const [part, what] of [[eye, 'show'], [color, 'colour of'], [slider, 'opacity of'], [solo, 'only']]) {
+    part.setAttribute('aria-label', `${what} ${name}`);
+    part.title = `${what} ${name} (${number})`;
+  }
+  return element;
+}
+
+// The element; `history` as light.mjs has it
+export function organs(look, labels, history) {
+  const root = document.createElement('div');
+  root.className = 'organs';
+  root.innerHTML = `<div><input type="search" placeholder="${labels.length} labels" aria-label="search the labels"><button class="all" title="show all">all</button><button class="none" title="hide all">none</button></div><ul></ul>`;
+  const find = (selector) => root.querySelector(selector), list = find('ul');
+  find('[type=search]').hidden = labels.length <= SEARCHED;
+  list.append(...labels.map(row));
+  let now = { rows: labels.map(({ rgb, opacity }) => ({ rgb, opacity, on: true })), solo: -1 }, due = false, moving = false;
+
+  // opacity on a cubic scale, as the function's
+  function show() {
+    now.rows.forEach(({ rgb, opacity, on }, k) => {
+      const [eye, color, , slider, solo] = list.children[k].children, seen = now.solo < 0 ? on : now.solo === k;
+      eye.setAttribute('aria-pressed', String(on));
+      solo.setAttribute('aria-pressed', String(now.solo === k));
+      list.children[k].classList.toggle('off', !seen);
+      color.value = hex(rgb);
+      slider.value = Math.cbrt(opacity);
+    });
+    if (due) return;
+    due = true;
+    requestAnimationFrame(() => {
+      due = false;
+      look.labels(now.rows.map(({ rgb, opacity, on }, k) => ({ rgb, opacity: (now.solo < 0 ? on : now.solo === k) ? opacity : 0 })));
+    });
+  }
+
+  const change = (k, by) => { now = { ...now, rows: now.rows.map((one, j) => (j === k ? { ...one, ...by } : one)) }; };
+  const every = (on) => { now = { rows: now.rows.map((one) => ({ ...one, on })), solo: -1 }; };
+  const rowOf = (target) => Number(target.closest('li').dataset.row);
+  root.addEventListener('click', ({ target }) => {
+    if (target.tagName !== 'BUTTON') return;
+    history.keep();
+    if (target.className === 'all' || target.className === 'none') every(target.className === 'all');
+    else if (target.className === 'eye') change(rowOf(target), { on: !now.rows[rowOf(target)].on });
+    else now = { ...now, solo: now.solo === rowOf(target) ? -1 : rowOf(target) };
+    show();
+  });
+  list.addEventListener('input', ({ target }) => {
+    if (!moving) history.keep();
+    moving = true;
+    change(rowOf(target), target.type === 'color' ? { rgb: rgbOf(target.value) } : { opacity: Number(target.value) ** 3 });
+    show();
+  });
+  list.addEventListener('change', () => { moving = false; });
+  find('[type=search]').addEventListener('input', ({ target }) => {
+    const wanted = target.value.trim().toLowerCase();
+    labels.forEach(({ name, number }, k) => { list.children[k].hidden = !`${number} ${name}`.toLowerCase().includes(wanted); });
+  });
+  history.add({ key: 'labels', state: () => now, set: (then) => { now = then; show(); } });
+  show();
+  return root;
+}
