@@ -31,6 +31,7 @@ from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.gaussians import PlyOptions, read_ply, write_ply
 from vvgt_cli.gaussians.formats.page_file import read_html
 from vvgt_cli.gaussians.live import Table, baked
+from vvgt_cli.look.lighting import LightOptions
 from vvgt_cli.progress import Console
 from vvgt_cli.volume import Volume
 
@@ -290,10 +291,11 @@ def test_what_is_never_live_is_converted(monkeypatch: pytest.MonkeyPatch) -> Non
     from vvgt_cli.commands import converter_process
 
     labels = Volume(np.arange(8, dtype=np.uint8).reshape(2, 2, 2), name="labels")
-    request = SourceRequest(labels, labels="auto")
+    request = SourceRequest(labels, tf="viridis", light=LightOptions(lights=("0,0,1",), shadows=True))
     why = refusal(ConvertRequest(request, live=True), load(request))
     assert why is not None
-    assert refusal(ConvertRequest(SourceRequest(labels), live=True), load(SourceRequest(labels, tf="viridis"))) is None
+    for other in (SourceRequest(labels, tf="viridis"), SourceRequest(labels, labels="auto")):
+        assert refusal(ConvertRequest(other, live=True), load(other)) is None
     asked = []
 
     def conversion(request: ConvertRequest, console: Console) -> str:
