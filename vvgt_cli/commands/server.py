@@ -20,7 +20,7 @@ from urllib.parse import urlsplit
 from vvgt_cli.errors import DataError, UsageError, VvgtError
 
 ADDRESS = "127.0.0.1"
-MOST = 1 << 16  # bytes of what a page may send: a function has hundreds
+MOST = 1 << 20  # bytes of what a page may send: a function of 4096 nodes has 400 KB
 NAMES = (ADDRESS, "localhost")  # that a request may know it by; the port is another one behind a tunnel
 _PANELS = "sha256-jHF5hTIlMDyGZRAsNK0HO/WFYrwPvI2I1q0o1xKKB6I="  # event.stopPropagation(), in the viewer's elements
 _HEADERS = {
