@@ -282,3 +282,29 @@ def test_names_are_text(dots: str, person: Person) -> None:
     assert "<img src=x onerror=alert(1)>" in text
     assert "baked" in text
     assert person("eval", "document.querySelectorAll('img').length") == 0
+
+
+def test_a_link_restores_labels_light_and_cut(person: Person, tmp_path: Path) -> None:
+    z, y, x = np.mgrid[:12, :12, :12] // 6
+    np.save(tmp_path / "map.npy", (1 + x + 2 * y + 4 * z).astype(np.uint8))
+    source = ["convert", str(tmp_path / "map.npy"), "--live", "--labels", "auto", "--max-gaussians", "400"]
+    assert run([*source, "--size", "100", "--quiet", "-o", str(tmp_path / "map.html")]) == 0
+    page = (tmp_path / "map.html").as_uri()
+    person("open", page)
+    for change in (
+        f"(() => {{ {AXIS}.selectedIndex = 1; {AXIS}.dispatchEvent(new Event('change')) }})()",
+        f"(() => {{ const s = {AXIS}.nextElementSibling; s.value = 300; s.dispatchEvent(new Event('input')) }})()",
+        "document.querySelector('#live li:nth-child(2) .eye').click()",
+        "(({ key, state, set }) => set({ ...state(), kind: 'headlight', from: [0, 0, 1] }))(window.vvgt.live.parts[1])",
+    ):
+        person("eval", change)
+    told = f"[{AXIS}.nextElementSibling.value, JSON.stringify(window.vvgt.live.parts.map(({{ state }}) => state()))]"
+    before, link = person("eval", told), person("eval", "window.vvgt.where.link()")
+    assert "cut=x,300" in link
+    person("open", link)
+    assert person("eval", told) == before
+
+
+def test_an_address_that_is_no_link_is_let_be(dots: str, person: Person) -> None:
+    person("open", dots + "#100%")
+    assert person("eval", "window.vvgt.where.link()").startswith(dots + "#view=")

@@ -11,6 +11,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -24,14 +25,15 @@ from tests.test_live import cloud as live_cloud
 from vvgt_cli.commands.converter import Converter, Failed, Made
 from vvgt_cli.commands.live_site import Cloud, Desk, function_sent, plain_name
 from vvgt_cli.commands.server import Part, Site, served
-from vvgt_cli.conversion.live import refusal
+from vvgt_cli.conversion.live import lit, refusal
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import DataError
 from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.gaussians import PlyOptions, read_ply, write_ply
 from vvgt_cli.gaussians.formats.page_file import read_html
+from vvgt_cli.gaussians.formats.page_live import live_parts
 from vvgt_cli.gaussians.live import Table, baked
-from vvgt_cli.look.lighting import LightOptions
+from vvgt_cli.look.lighting import Lighting, LightOptions
 from vvgt_cli.progress import Console
 from vvgt_cli.volume import Volume
 
@@ -219,7 +221,7 @@ def test_who_may_send_what(desk: tuple[str, Desk]) -> None:
     assert send(url, "function", FUNCTION, Sec_Fetch_Site="cross-site")[0] == 403
     assert send(url, "function", FUNCTION, Content_Type="text/plain")[0] == 415
     assert send(url, "function", FUNCTION, Content_Length="-1")[0] == 415
-    assert send(url, "function", b" " * (1 << 17))[0] == 413
+    assert send(url, "function", b" ", Content_Length=str((1 << 20) + 1))[0] == 413
     assert send(url, "", FUNCTION)[0] == 405
     assert send(url, "../function", FUNCTION)[0] == 405
     assert ask(url, urlsplit(url).path + "function")[0] == 404
@@ -257,6 +259,41 @@ def test_a_saved_live_file_has_the_colours_of_the_function(desk: tuple[str, Desk
     np.testing.assert_allclose(saved.gaussians.opacity_logits, wanted.opacity_logits, atol=1e-4)
     plain = Cloud.of(send(desk[0], "save", {"file": "ply"})[1], "x")
     assert np.abs(plain.gaussians.colors - wanted.colors).max() > 0.1
+
+
+def test_a_long_function_is_taken(desk: tuple[str, Desk]) -> None:
+    points = [{"x": LO + k / 7e3, "rgb": [0.1234, 0.5678, 0.9012], "opacity": 0.123456} for k in range(4096)]
+    assert send(desk[0], "function", {**FUNCTION, "points": points})[0] == 200
+
+
+def test_a_saved_file_has_the_light_of_the_file_or_of_the_page(desk: tuple[str, Desk]) -> None:
+    url, of = desk
+    assert of.first is not None
+    plain, side = of.first(), Lighting(False, ((0.6, 0.0, 0.8),), 0.2, 0.6, 0.3, 4.0)
+    lit_file = replace(plain, options=replace(plain.options, light=side))
+    of.first = lambda: lit_file
+    table = Table.of_function(function_sent(FUNCTION), LO, HI, 0.1 * 0.1)
+    dark = baked(live_cloud(), table)
+
+    def saved(**more: Any) -> Cloud:
+        return Cloud.of(send(url, "save", {"file": "ply", "function": FUNCTION, **more})[1], "x")
+
+    kept = saved()
+    assert kept.options.light == side
+    assert kept.options.function == "mine"
+    np.testing.assert_allclose(kept.gaussians.colors, lit(dark, side).colors, atol=1e-5)
+    begun = live_parts(lit_file.gaussians, lit_file.options)[2]["light"]
+    again = saved(light=begun).options.light
+    assert again is not None
+    np.testing.assert_allclose(again.directions, side.directions, atol=1e-12)
+    assert replace(again, directions=side.directions) == side
+    assert saved(light=begun | {"kind": "headlight"}).options.light == replace(side, headlight=True, directions=())
+    none = saved(light=begun | {"kind": "none"})
+    assert none.options.light is None
+    np.testing.assert_allclose(none.gaussians.colors, dark.colors, atol=1e-5)
+    for wrong in ([], {}, {"kind": "sun"}, begun | {"from": [0, 0, 0]}, begun | {"from": 1}, begun | {"ambient": "x"},
+                  begun | {"power": None}, begun | {"diffuse": -1}, begun | {"from": [1e999, 0, 0]}):  # fmt: skip
+        assert send(url, "save", {"file": "ply", "function": FUNCTION, "light": wrong})[0] == 400
 
 
 def test_a_live_file_is_shown_live_and_an_ordinary_one_as_it_is(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored, write_ply
 from vvgt_cli.gaussians.formats import SUFFIXES, encoded, format_of
 from vvgt_cli.gaussians.formats.gsply_files import compressed_ply
 from vvgt_cli.gaussians.formats.page_file import page, upright, waiting_page
-from vvgt_cli.gaussians.formats.page_live import HELD, live_parts
+from vvgt_cli.gaussians.formats.page_live import HELD, light_sent, live_parts
 from vvgt_cli.gaussians.formats.splats import columns_of
 from vvgt_cli.gaussians.live import Table, baked
 from vvgt_cli.gaussians.live_facts import function_text
@@ -79,14 +79,31 @@ class Cloud:
         write_ply(stream, self.gaussians, self.options)
         return Part(BYTES, stream.getvalue)
 
-    def under(self, tf: TransferFunction) -> Cloud:
-        """The same with the colours of another function, on data values, with an opacity_unit_distance."""
+    def under(self, tf: TransferFunction, light: Any = None) -> Cloud:
+        """The same with the colours of another function, on data values, with an opacity_unit_distance.
+
+        Args:
+            tf: the function.
+            light: as the page sends it; None: the file's own.
+
+        Raises:
+            DataError, UsageError: it is no light, or the Gaussians carry labels.
+        """
+        from vvgt_cli.conversion.live import lit
+
         facts, scale, distance = self.options.live, self.options.scale or 1.0, tf.opacity_unit_distance
         assert facts is not None
         assert distance is not None
-        found = as_stored(baked(self.gaussians, Table.of_function(tf, facts.lo, facts.hi, distance * scale)))
+        if facts.labels:
+            raise DataError("what is shown carries labels; expected no function")
+        lighting = self.options.light if light is None else light_sent(light, self.options)
+        table = Table.of_function(tf, facts.lo, facts.hi, distance * scale)
+        found = as_stored(lit(baked(self.gaussians, table), lighting))
         facts = replace(facts, function=function_text(tf, facts.lo, facts.hi))
-        options = replace(self.options, live=facts, unit_distance=distance, unit_distance_label="file", light=None)
+        options = replace(
+            self.options, live=facts, unit_distance=distance, unit_distance_label="file", light=lighting,
+            function=tf.name, sh_degree=None,
+        )  # fmt: skip
         return replace(self, gaussians=found, options=options, ply=None)
 
 
@@ -210,16 +227,18 @@ class Desk:
         Raises:
             DataError: something else is asked for, or what was shown is not there any more.
         """
-        keys = {"file", "number", "function"}
+        keys = {"file", "number", "function", "light"}
         if not isinstance(sent, dict) or sent.get("file") not in ("ply", "html") or not set(sent) <= keys:
-            raise DataError("what to save: expected an object with file, ply or html, and a number or a function")
+            raise DataError(
+                "what to save: expected an object with file, ply or html, and a number, or a function and a light"
+            )
         better, number = self.better, sent.get("number")
         if number is not None and (better is None or number != self.state["number"]):
             raise DataError("what was shown is not there any more; try again")
         assert self.first is not None
         cloud = self.first() if number is None or better is None else Cloud.of(better, self.name)
         if sent.get("function") is not None and cloud.live:
-            cloud = cloud.under(function_sent(sent["function"]))
+            cloud = cloud.under(function_sent(sent["function"]), sent.get("light"))
         return cloud.file(sent["file"])
 
     def hear(self, number: int, message: Message) -> None:

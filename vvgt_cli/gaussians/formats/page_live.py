@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import Gaussians, PlyOptions
 from vvgt_cli.gaussians.formats.live import live_bytes, live_json
 from vvgt_cli.gaussians.formats.page_file import html_of_several, title_of, upright
@@ -16,8 +17,9 @@ from vvgt_cli.gaussians.frames import turn, up_matrix
 from vvgt_cli.gaussians.live import law_nodes
 from vvgt_cli.gaussians.live_facts import LiveFacts
 from vvgt_cli.look.function import TransferFunction
-from vvgt_cli.look.lighting import Lighting
+from vvgt_cli.look.lighting import MOST, Lighting
 from vvgt_cli.look.readers.minimal import read
+from vvgt_cli.volume.types import triple
 
 HELD = "values"  # the element that holds the bytes
 PLANES = (0, 1, 2, 4, 5, 6)  # columns of `live_bytes` that are not 0; of labels all
@@ -67,7 +69,7 @@ def _facts(gaussians: Gaussians, options: PlyOptions, up: str) -> dict[str, Any]
     facts = options.live
     said = live_json(gaussians, facts, (options.unit_distance or 1.0) * (options.scale or 1.0))
     said.pop("function")
-    axes = (_HALF_TURN @ up_matrix(up)).T
+    axes = _axes(up)
     return said | {
         "held": HELD,
         "opacity_unit_distance": options.unit_distance or 1.0,
@@ -89,6 +91,36 @@ def _light(lighting: Lighting | None, axes: np.ndarray) -> dict[str, Any]:
         "kind": kind, "from": (toward / np.linalg.norm(toward)).tolist(), "ambient": one.ambient,
         "diffuse": one.diffuse, "specular": one.specular, "power": one.specular_power,
     }  # fmt: skip
+
+
+def light_sent(sent: Any, options: PlyOptions) -> Lighting | None:
+    """The light that a page of a file laid out so sends: what `_light` says, changed.
+
+    Raises:
+        DataError, UsageError: it is none.
+    """
+    numbers = ("ambient", "diffuse", "specular", "power")
+    if not isinstance(sent, dict) or sent.get("kind") not in ("none", "headlight", "direction"):
+        raise DataError("the page's light: expected an object of kind none, headlight or direction")
+    toward = sent.get("from")
+    if not isinstance(toward, list) or len(toward) != 3:
+        raise DataError("the page's light: expected from, three numbers")
+    if not all(isinstance(x, int | float) and abs(x) <= MOST for x in (*toward, *map(sent.get, numbers))) or not any(
+        toward
+    ):
+        raise DataError(f"the page's light: expected finite numbers for from, {', '.join(numbers)}")
+    if sent["kind"] == "none":
+        return None
+    found = _axes(upright(options).up) @ np.array(toward, np.float64)
+    directions = () if sent["kind"] == "headlight" else (triple((found / np.linalg.norm(found)).tolist()),)
+    ambient, diffuse, specular, power = (float(sent[name]) for name in numbers)
+    return Lighting(sent["kind"] == "headlight", directions, ambient, diffuse, specular, power)
+
+
+def _axes(up: str) -> np.ndarray:
+    """Rows: the axes of the unit frame in the viewer's."""
+    found: np.ndarray = (_HALF_TURN @ up_matrix(up)).T
+    return found
 
 
 def nodes_of(facts: LiveFacts) -> list[dict[str, Any]]:

@@ -60,11 +60,11 @@ export function liveParts(live, facts) {
     }],
     {
       key: 'cut',
-      get: () => (find('.axis').selectedIndex > 0 ? `${'xyz'[find('.axis').selectedIndex - 1]},${find('input[type=range]').value}${pressed() ? ',other' : ''}` : ''),
+      get: () => (find('.axis').selectedIndex > 0 ? `${'xyz'[find('.axis').selectedIndex - 1]},${find('.axis + input').value}${pressed() ? ',other' : ''}` : ''),
       set: (text) => {
         const [axis, place, other] = text.split(',');
         find('.axis').selectedIndex = 'xyz'.indexOf(axis) + 1;
-        find('input[type=range]').value = place;
+        find('.axis + input').value = place;
         find('.axis').dispatchEvent(new Event('change'));
         if ((other === 'other') !== pressed()) find('.flip').click();
       },
@@ -78,7 +78,9 @@ export function linkOf(parts) {
 }
 
 export async function restore(parts) {
-  const said = new Map(decodeURIComponent(location.hash.slice(1)).split('&').map((part) => [part.split('=')[0], part.slice(part.indexOf('=') + 1)]));
+  let text = '';
+  try { text = decodeURIComponent(location.hash.slice(1)); } catch { return; }  // not a link of ours
+  const said = new Map(text.split('&').map((part) => [part.split('=')[0], part.slice(part.indexOf('=') + 1)]));
   if (!said.has('view')) return;
   for (const { key, set } of parts) {
     if (said.has(key) || key === 'projection') await Promise.resolve(said.get(key) ?? '').then(set).catch(() => {});  // a damaged part is left as it is

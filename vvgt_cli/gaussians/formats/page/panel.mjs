@@ -274,5 +274,5 @@ export function panel(look, viewer, live) {
   cut();
   fold(innerWidth < 700);
   draw();
-  return { root, look, changed(f) { told = f; }, alone: () => axis.selectedIndex > 0 || lamp.state() !== begun, labelled, parts, nodes: () => copy(exact ?? nodes), set(now) { keep(); [nodes, exact, chosen] = [copy(now), null, 0]; show(); } };
+  return { root, look, changed(f) { told = f; }, alone: () => axis.selectedIndex > 0 || lamp.state() !== begun, lit: () => (lamp.state() === begun ? null : lamp.state()), labelled, parts, nodes: () => copy(exact ?? nodes), set(now) { keep(); [nodes, exact, chosen] = [copy(now), null, 0]; show(); } };
 }

@@ -81,7 +81,7 @@ function substitute({ app }) {
   return { load, put, drop };
 }
 
-// panel: {root, nodes(), changed(f), alone(): a cut or another light, which the live form alone has}; server: {converts, name}, none of a page in a file
+// panel: {root, nodes(), changed(f), alone(): a cut or another light, which the live form alone has; lit(): the other light, or null}; server: {converts, name}, none of a page in a file
 export function served(panel, viewer, live, server) {
   if (panel.labelled) return;  // no function to convert for, or to save
   const { root } = panel, kind = root.querySelector('.named i'), name = server?.name ?? document.title;
@@ -159,7 +159,7 @@ export function served(panel, viewer, live, server) {
   async function save(file) {
     if (file === 'json') return download(new Blob([`${JSON.stringify(functionFile(panel.nodes(), live), null, 1)}\n`], { type: 'application/json' }), 'tf.json');
     try {
-      const answer = await send('save', !improved() ? { file, function: functionFile(panel.nodes(), live) } : { file, number });
+      const answer = await send('save', improved() ? { file, number } : { file, function: functionFile(panel.nodes(), live), light: panel.lit() });
       if (!answer.ok) throw new Error(await reason(answer));
       download(await answer.blob(), `${name}.${file}`);
     } catch (error) {
