@@ -86,6 +86,17 @@ def test_a_ply_keeps_labels_in_a_byte_and_names_in_its_header(tmp_path: Path) ->
         read_ply(tmp_path / "d.ply")
 
 
+def test_labels_in_the_header_of_a_file_without_their_column_are_let_be(tmp_path: Path) -> None:
+    write_ply(tmp_path / "a.ply", cloud(), options())
+    content = (tmp_path / "a.ply").read_bytes()
+    (tmp_path / "b.ply").write_bytes(
+        content.replace(b"end_header\n", b'comment vvgt live label 1 0 0 0 1 "a"\nend_header\n', 1)
+    )
+    gaussians, header = read_ply(tmp_path / "b.ply")
+    assert header.live is None
+    assert gaussians.live is None
+
+
 def test_bytes_for_pages_hold_the_label() -> None:
     many = tuple(Label(n, f"n{n}", (0.5, 0.5, 0.5)) for n in range(1, 301))
     some = labels_cloud(many)

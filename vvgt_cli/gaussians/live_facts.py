@@ -147,5 +147,5 @@ def one_comment(words: Sequence[str]) -> dict[str, Any]:
 def live_facts(found: Mapping[str, Any], columns: Sequence[str]) -> LiveFacts | None:
     """Facts of the comments of a file with these columns; None where one or the other is missing."""
     whole = set(COLUMNS) <= set(columns) and "lo" in found
-    whole = whole and ("histogram" in found or (LABEL in columns and "labels" in found))
+    whole = whole and (LABEL in columns if "labels" in found else "histogram" in found)
     return LiveFacts(**found) if whole else None
