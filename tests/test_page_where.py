@@ -298,7 +298,8 @@ def test_a_link_restores_labels_light_and_cut(person: Person, tmp_path: Path) ->
         "(({ key, state, set }) => set({ ...state(), kind: 'headlight', from: [0, 0, 1] }))(window.vvgt.live.parts[1])",
     ):
         person("eval", change)
-    told = f"[{AXIS}.nextElementSibling.value, JSON.stringify(window.vvgt.live.parts.map(({{ state }}) => state()))]"
+    states = "JSON.stringify(window.vvgt.live.parts.map((part) => part.state()), (key, x) => (x.toFixed?.(4) ?? x))"
+    told = f"[{AXIS}.nextElementSibling.value, {states}]"
     before, link = person("eval", told), person("eval", "window.vvgt.where.link()")
     assert "cut=x,300" in link
     person("open", link)
