@@ -271,6 +271,14 @@ def test_render_info_and_other_formats(vvgt, live_file, tmp_path) -> None:
         assert vvgt("view", live_file, "-o", tmp_path / "one.spz").code == 0
 
 
+def test_a_live_page_is_not_read_back(vvgt, tmp_path) -> None:
+    """It computes look and light anew: its columns alone are another picture."""
+    for name, told in (("a.html", False), ("a.spz", True)):
+        done = vvgt("convert", "example:blob:16", "--live", "--light", "headlight", "-o", tmp_path / name, *SMALL)
+        assert done.code == 0
+        assert ("read back" in done.err) == told
+
+
 def test_what_a_live_file_does_not_go_with(vvgt, tmp_path) -> None:
     for option in (
         ("--sh-degree", 1),

@@ -39,6 +39,7 @@ from vvgt_cli.splat import render
 
 MAX_BASE_CELLS = 5_000_000  # an upper bound: half of them are there, as a rule; 104 bytes each, twice for the pyramid
 CELLS_A_GAUSSIAN, FEW_CELLS = 256, 500_000  # more are of no use to a small budget, but so many cost nothing
+OF_VALUES = 20  # cells a Gaussian that stands for any function, which is seldom small (5: -1 dB)
 FINEST = -2  # cells of a quarter voxel at most
 MIN_CELL = 1.2  # pixels: a smaller base cell cannot be told from its neighbours
 MARCH_SIZE = 128  # pixels of the visibility march
@@ -163,7 +164,7 @@ def closed_form(
         values: of a scene that stands for any function: what it hides counts, too.
     """
     step, half = np.asarray(scene.step), np.asarray(scene.half)
-    exponent = exponents(step, base_level(scene, size, budget))
+    exponent = exponents(step, base_level(scene, size, budget, values))
     cells = base_cells(scene, exponent, progress=part(progress, 0, 50))
     return form_of(
         cells, half, step, budget, size, cameras, part(progress, 50, 95), scene.labels, Shading.of(scene), degree,
@@ -213,16 +214,16 @@ def form_of(
     )  # fmt: skip
 
 
-def base_level(scene: Scene, size: int, budget: int) -> int:
+def base_level(scene: Scene, size: int, budget: int, values: bool = False) -> int:
     """Finest level whose base cells fit the memory bound and the budget, and are not finer than the images can tell."""
     return level_within(
-        scene.step, visible_voxels(scene), most_cells(budget), finest_level(scene.step, pixel_width(size))
+        scene.step, visible_voxels(scene), most_cells(budget, values), finest_level(scene.step, pixel_width(size))
     )
 
 
-def most_cells(budget: int) -> int:
-    """Base cells that a budget has use for, and memory holds."""
-    return min(MAX_BASE_CELLS, max(CELLS_A_GAUSSIAN * budget, FEW_CELLS))
+def most_cells(budget: int, values: bool = False) -> int:
+    """Base cells that a budget has use for, and memory holds; ``values``: as of `closed_form`."""
+    return min(MAX_BASE_CELLS, max((OF_VALUES if values else CELLS_A_GAUSSIAN) * budget, FEW_CELLS))
 
 
 def level_within(step: np.ndarray, voxels: float, most: float, finest: int) -> int:

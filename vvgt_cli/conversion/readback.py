@@ -23,6 +23,12 @@ if TYPE_CHECKING:
     from vvgt_cli.volume import Volume
 
 
+def _is_drawn(output: str, options: PlyOptions) -> bool:
+    """Whether viewers draw the columns of a file of another format. A live page computes its look and light anew."""
+    found = format_of(output)
+    return found is not None and (found.suffix != ".html" or options.live is None)
+
+
 def tell_agreement(run: Run, output: str, gaussians: Gaussians, options: PlyOptions) -> None:
     """Say how near pictures of a file just written are to those of the Gaussians; of a `.ply` nothing.
 
@@ -35,7 +41,7 @@ def tell_agreement(run: Run, output: str, gaussians: Gaussians, options: PlyOpti
     from vvgt_cli.images.metrics import psnr
     from vvgt_cli.splat import render
 
-    if format_of(output) is None:
+    if not _is_drawn(output, options):
         return
     with run.stage("read back") as stage:
         back = in_unit_frame(*read_splats(output))
@@ -63,7 +69,7 @@ def tell_cost(
     """
     from vvgt_cli.dvr import RenderSettings
 
-    if format_of(output) is None:
+    if not _is_drawn(output, options):
         return
     with run.stage("read back") as stage:
         size, rule = options.made_for or SIZE, options.rule or INRIA

@@ -169,10 +169,11 @@ class Blocked:
     def start(self, options: VbmOptions, progress: Progress | None = None) -> Start:
         """See `Field`."""
         from vvgt_cli.closed_form import start_of
-        from vvgt_cli.closed_form.closed_form import form_of
+        from vvgt_cli.closed_form.closed_form import form_of, most_cells
         from vvgt_cli.closed_form.lit import Shading
 
-        task = self.cells(options.size, options.max_gaussians)
+        most = most_cells(options.max_gaussians, options.values)
+        task = self.cells(options.size, options.max_gaussians, most)
         self.do(task, "integrate")
         self.grid, half, step = task.grid, *self.frame
         shading = None if self.light is None else Shading(self.light, half, step, self._normals_at)
