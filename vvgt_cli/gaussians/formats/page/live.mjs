@@ -7,23 +7,30 @@ const STREAMS = [['vvgtValues', [0, 1, 2, 6]], ['vvgtGradient', [3, 4, 5, 7]]]; 
 const MOST_OPAQUE = 1 - 1e-5;  // opacity of which there still is an extinction
 
 // the planes of bytes, one after the other, that the page holds (gzip in base64)
-async function unpacked(id) {
+async function unpacked(id, alone) {
   const element = document.getElementById(id), text = atob(element.textContent);
   const stream = new Blob([Uint8Array.from(text, (c) => c.charCodeAt(0))]).stream();
-  element.remove();
+  if (alone) element.remove();  // of several frames, one that left memory is read again
   return new Uint8Array(await new Response(stream.pipeThrough(new DecompressionStream('gzip'))).arrayBuffer());
 }
 
-// {live, bytes, count, sums, rows, planes, apply(nodes), labels(list), cut(planes), light(of light.mjs)} of a viewer that has loaded its Gaussians, once they are shown so
+// {live, bytes, count, sums, rows, planes, apply(nodes), labels(list), cut(planes), light(of light.mjs), frame(k, resource)} of a viewer that has loaded its Gaussians, once they are shown so
 export async function liveLook({ app }, live) {
   const entity = app.root.findByName('gsplat'), { gsplat } = entity, { resource } = app.assets.get(gsplat.asset);
-  const bytes = await unpacked(live.held), planes = live.labels.length ? 8 : 6, count = bytes.length / planes;
-  resource.format.addExtraStreams(STREAMS.map(([name]) => ({ name, format: PIXELFORMAT_RGBA8U })));
-  for (const [name, own] of STREAMS) {
-    const texture = resource.getTexture(name), texels = texture.lock();
-    own.forEach((plane, c) => { for (let i = 0; plane < planes && i < count; i++) texels[4 * i + c] = bytes[plane * count + i]; });
-    texture.unlock();
+  const planes = live.labels.length ? 8 : 6, carried = new WeakMap();  // bytes of the resources that have them
+  async function carry(k, to) {
+    if (carried.has(to)) return carried.get(to);
+    const bytes = await unpacked(live.held[k], live.held.length === 1), count = bytes.length / planes;
+    to.format.addExtraStreams(STREAMS.map(([name]) => ({ name, format: PIXELFORMAT_RGBA8U })));
+    for (const [name, own] of STREAMS) {
+      const texture = to.getTexture(name), texels = texture.lock();
+      own.forEach((plane, c) => { for (let i = 0; plane < planes && i < count; i++) texels[4 * i + c] = bytes[plane * count + i]; });
+      texture.unlock();
+    }
+    carried.set(to, bytes);
+    return bytes;
   }
+  const bytes = await carry(0, resource), count = bytes.length / planes;
   const [means, spreads] = live.table, nearest = { minFilter: FILTER_NEAREST, magFilter: FILTER_NEAREST };
   const table = new Texture(app.graphicsDevice, { name: 'vvgtTable', width: means, height: 2 * spreads, format: PIXELFORMAT_RGBA32F, mipmaps: false, ...nearest });
   const labels = new Texture(app.graphicsDevice, { name: 'vvgtLabels', width: Math.max(live.labels.length + 1, 1), height: 1, format: PIXELFORMAT_RGBA32F, mipmaps: false, ...nearest });
@@ -79,6 +86,12 @@ export async function liveLook({ app }, live) {
       look.planes = planes;
       set('vvgtCut[0]', numbers);
     },
+  };
+  // what frame k's Gaussians carry goes with them, before they are shown
+  look.frame = async (k, to) => {
+    look.bytes = await carry(k, to);
+    look.count = look.bytes.length / planes;
+    again = 2;
   };
   look.light = ({ kind, from, ambient, diffuse, specular, power }) => {
     follows = kind !== 'none' && (kind === 'headlight' || specular > 0);
