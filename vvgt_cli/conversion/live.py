@@ -91,7 +91,7 @@ def live_conversion(
         gaussians = carrying_labels(run, foggy, placed_by(run, foggy, request), labels)
     else:
         assert isinstance(tf, TransferFunction)
-        foggy, facts = field.shown_by(fog(source.statistics, tf)), LiveFacts.of(source.volume, source.statistics, tf)
+        foggy, facts = field.shown_by(fog(source.overall, tf)), LiveFacts.of(source.volume, source.overall, tf)
         gaussians = carrying(run, foggy, placed_by(run, foggy, request))
     gaussians = wide_enough(gaussians, fit.size)
     table = looked_up(facts, tf, source.unit_distance * source.volume.unit_frame().scale)
@@ -142,7 +142,7 @@ def lit(gaussians: Gaussians, lighting: Lighting | None) -> Gaussians:
 
 def table_of(source: Source) -> Table:
     """Of a source's function, lengths in the unit frame."""
-    numbers, tf = source.statistics, source.tf
+    numbers, tf = source.overall, source.tf
     assert isinstance(tf, TransferFunction)
     return Table.of_function(tf, numbers.lo, numbers.hi, source.unit_distance * source.volume.unit_frame().scale)
 
@@ -172,7 +172,7 @@ def carrying(run: Run, field: Field, gaussians: Gaussians) -> Gaussians:
         gaussians, values = gaussians.take(known), values[known]
         tau = table_of(field.source).at(values[:, 0], values[:, 1])[:, 3]
         live = np.insert(values, LENGTH, lengths(gaussians, tau), axis=1)
-        span = field.source.statistics.hi - field.source.statistics.lo
+        span = field.source.overall.hi - field.source.overall.lo
         stage.note = f"mean spread {100 * float(values[:, 1].mean()) / (span or 1):.1f} % of the range"
     return replace(gaussians, live=live, harmonics=None)
 
