@@ -130,6 +130,25 @@ def _split(request: ConvertRequest, functions: Sequence[str], other: bool, conso
         convert_labels(request, console)
 
 
+def _streamed(request: ConvertRequest, functions: Sequence[str], other: bool, console: Console) -> None:
+    """Levels of the closed form; ``other``: options that go with one file are given."""
+    from vvgt_cli.conversion.request import Limits
+    from vvgt_cli.conversion.shards.run import init_in_blocks, streams
+    from vvgt_cli.errors import UsageError
+    from vvgt_cli.field.open import automatic
+
+    fit = request.fit
+    refined = fit.steps or fit.model is not None or request.limits != Limits() or fit.rule != "inria"
+    if other or len(functions) > 1 or refined or request.live or request.checkpoint or request.preview:
+        raise UsageError(
+            f"-o {request.output} has levels of one closed form: leave out --steps, --model, --rule, --target-psnr, "
+            "--time-budget, --max-size, --live, --checkpoint, --preview, --dry-run, --shard and all but one --tf"
+        )
+    request = replace(request, blocks=request.blocks or automatic(request.source, console))
+    if streams(request):
+        init_in_blocks(request, console)
+
+
 def _convert(
     request: ConvertRequest, functions: Sequence[str], shard: str | None, dry_run: bool, console: Console
 ) -> None:
@@ -140,8 +159,12 @@ def _convert(
     from vvgt_cli.conversion.index import is_pattern
     from vvgt_cli.conversion.pages import page_of_functions, page_of_volume
     from vvgt_cli.conversion.series import convert_series
+    from vvgt_cli.conversion.shards.streamed import is_streamed
     from vvgt_cli.errors import UsageError
 
+    if is_streamed(request.output):
+        _streamed(request, functions, shard is not None or dry_run, console)
+        return
     several = len(functions) > 1
     numbered = is_pattern(request.output or "")
     if several and (dry_run or shard is not None or request.checkpoint is not None):

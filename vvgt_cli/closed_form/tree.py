@@ -229,6 +229,14 @@ def leaves_of(tree: Tree, ids: np.ndarray) -> Leaves:
     return Leaves(tree.moments[ids], tree.index[ids], tree.edges[tree.level[ids]], ids)
 
 
+def spread_of(leaves: Leaves) -> np.ndarray:
+    """Opacity x area of cells, and that x the variance of what is in each, both summed (2,)."""
+    mass, _, covariance = central(leaves.moments)
+    area = leaves.edge.prod(axis=1) ** (2 / 3)
+    weight = -np.expm1(-mass / area) * area
+    return np.array([weight.sum(), (weight * np.trace(covariance, axis1=1, axis2=2)).sum()])
+
+
 def split(tree: Tree, leaves: Leaves, order: np.ndarray, room: int, scene: Scene | None, seen: Visibility) -> Leaves:
     """Replace leaves by their children, in the given order, until ``room`` more leaves are there.
 

@@ -6,7 +6,7 @@ numbers a cell, so that a threshold is found without the moments.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -197,6 +197,16 @@ class Forest:
                 assert self.top is not None, "scores come of a top"
                 yield leaves_of(self.top, which + len(self.tiles))
 
+    def cuts(self, thresholds: np.ndarray) -> Iterator[list[Leaves]]:
+        """Of each tile the cells that each of its ``thresholds`` (tiles, n) leaves: at least the tile's own cell."""
+        for row, scores in enumerate(self.scores()):
+            if row == len(self.tiles):
+                return
+            tree, above = self._tree(self.tiles[row]), scores.above.copy()
+            above[-1] = np.inf
+            kept = [(above > value) & ((scores.capped <= value) | ~scores.inner) for value in thresholds[row]]
+            yield [leaves_of(tree, np.flatnonzero(which)) for which in kept]
+
     def count(self, threshold: float) -> int:
         """How many cells a threshold leaves."""
         return sum(int(((s.above > threshold) & ((s.capped <= threshold) | ~s.inner)).sum()) for s in self.scores())
@@ -208,13 +218,14 @@ def batches(leaves: Iterator[Leaves], size: int) -> Iterator[Leaves]:
     for part in leaves:
         waiting.append(part)
         if sum(map(len, waiting)) >= size:
-            yield _together(waiting)
+            yield joined(waiting)
             waiting = []
     if waiting:
-        yield _together(waiting)
+        yield joined(waiting)
 
 
-def _together(parts: list[Leaves]) -> Leaves:
+def joined(parts: Sequence[Leaves]) -> Leaves:
+    """The cells of all parts."""
     return Leaves(*(np.concatenate([getattr(part, field) for part in parts]) for field in FIELDS))
 
 

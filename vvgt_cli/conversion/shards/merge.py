@@ -17,6 +17,7 @@ from vvgt_cli.conversion.request import VERTEX_BYTES
 from vvgt_cli.conversion.shards.levels import PART, level_name, write_index
 from vvgt_cli.conversion.shards.plan import Plan
 from vvgt_cli.conversion.shards.score import drawing_bytes, score_gaussians, score_text
+from vvgt_cli.conversion.shards.streamed import is_streamed, write_streamed
 from vvgt_cli.conversion.stages.closed_form import FAINT_LOGIT, FEWEST, NEARLY
 from vvgt_cli.dvr.render import Box
 from vvgt_cli.errors import NothingVisible
@@ -33,6 +34,7 @@ from vvgt_cli.score.record import Run
 
 if TYPE_CHECKING:
     from vvgt_cli.closed_form.inset import Opaque
+    from vvgt_cli.closed_form.tree import Leaves
     from vvgt_cli.field.forest import Coarse, Forest
     from vvgt_cli.gaussians import Gaussians
 
@@ -57,6 +59,9 @@ def write_merged(run: Run, parts: Parts, output: str, overwrite: bool, levels: i
     with run.stage("pyramid") as stage:
         forest, opaque = pyramid(parts, plan)
         stage.note = f"{forest.base} cells in {len(forest.tiles)} tiles"
+    if is_streamed(output):
+        write_streamed(run, Cut(forest, opaque, plan), output, overwrite)
+        return
     written: list[dict[str, Any]] = []
     for level in range(levels):
         budget = max(written[0]["gaussians"] // PART**level, 1) if level else plan.budget
@@ -165,18 +170,42 @@ class Cut:
 
     def gaussians(self, threshold: float) -> Iterator[Gaussians]:
         """Those of the cells that a threshold leaves, in the box frame, as a file holds them, in batches."""
+        from vvgt_cli.field.forest import batches
+
+        for leaves in batches(self.forest.leaves(threshold), BATCH):
+            yield self.made(leaves)
+
+    def nodes(self, thresholds: np.ndarray) -> Iterator[tuple[list[Gaussians], list[np.ndarray]]]:
+        """Of each tile, for each of its ``thresholds`` (tiles, n): Gaussians, and `spread_of` their cells.
+
+        They are made some tiles at a time: the colours of neighbours matter to each other.
+        """
+        from vvgt_cli.closed_form.tree import spread_of
+        from vvgt_cli.field.forest import joined
+
+        waiting: list[list[Leaves]] = []
+        for row, leaves in enumerate(self.forest.cuts(thresholds)):
+            waiting.append(leaves)
+            if sum(len(node[0]) for node in waiting) < BATCH and row + 1 < len(self.forest.tiles):
+                continue
+            sizes = np.array([[len(part) for part in node] for node in waiting])
+            whole = [self.made(joined([node[k] for node in waiting])) for k in range(sizes.shape[1])]
+            for node, size, end in zip(waiting, sizes, np.cumsum(sizes, axis=0), strict=True):
+                parts = [each.take(np.arange(e - n, e)) for each, n, e in zip(whole, size, end, strict=True)]
+                yield parts, [spread_of(part) for part in node]
+            waiting = []
+
+    def made(self, leaves: Leaves) -> Gaussians:
+        """Those of some cells, one each, in their order."""
         from vvgt_cli.closed_form.closed_form import pixel_width
         from vvgt_cli.closed_form.columns import MASS, SEEN
         from vvgt_cli.closed_form.shape import ROUND, cell_gaussians
         from vvgt_cli.closed_form.sharpen import sharpened
-        from vvgt_cli.field.forest import batches
 
-        voxel, pixel = min(self.plan.grid.step), pixel_width(self.plan.size)
-        for leaves in batches(self.forest.leaves(threshold), BATCH):
-            made = cell_gaussians(leaves, voxel, pixel, self.opaque, ROUND)
-            if not self.plan.labels:
-                made = sharpened(made, leaves.moments[:, SEEN] / leaves.moments[:, MASS], self.opaque.half)
-            yield as_stored(made)
+        made = cell_gaussians(leaves, min(self.plan.grid.step), pixel_width(self.plan.size), self.opaque, ROUND)
+        if not self.plan.labels:
+            made = sharpened(made, leaves.moments[:, SEEN] / leaves.moments[:, MASS], self.opaque.half)
+        return as_stored(made)
 
 
 @contextmanager

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 from vvgt_cli.conversion.convert import ply_options
@@ -11,6 +14,7 @@ from vvgt_cli.conversion.shards.levels import level_outputs
 from vvgt_cli.conversion.shards.merge import write_merged
 from vvgt_cli.conversion.shards.plan import Plan, disk_bytes, most_cells
 from vvgt_cli.conversion.shards.score import scored_views
+from vvgt_cli.conversion.shards.streamed import folder_of, is_streamed
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.blocked import Blocked, Later
 from vvgt_cli.field.cells import CellBlocks
@@ -30,6 +34,13 @@ from vvgt_cli.score.record import ConversionReport, Run
 def streams(request: ConvertRequest) -> bool:
     """Whether a closed form in blocks is written batch by batch, without its Gaussians in memory at once."""
     options, lit = request.blocks, _lit(request.source)
+    if is_streamed(request.output):
+        if lit or request.fit.init != "vbm" or (options is not None and (options.levels > 1 or options.shard)):
+            raise UsageError(
+                f"-o {request.output} is made of unlit moments: leave out --light (--light none turns off that of the "
+                "function's file), --init, --levels and --shard (docs/scale.md)"
+            )
+        return True
     other = request.fit.init != "vbm" or bool(request.output and options is not None and format_of(request.output))
     if options is not None and (options.shard is not None or options.levels > 1):
         if lit or other:
@@ -65,8 +76,11 @@ def init_in_blocks(request: ConvertRequest, console: Console | None = None) -> C
         assert request.output is not None
         _shard(run, request, options, Parts(Path(request.output).absolute()))
         return run.finish()
-    outputs = [*request.outputs(), *level_outputs(request.output, options.levels)]
-    with claimed(outputs, request.inputs(), request.overwrite), beside(request.output) as parts:
+    with (
+        _written(request.output, options.levels, request) as outputs,
+        claimed(outputs, request.inputs(), request.overwrite),
+        beside(request.output) as parts,
+    ):
         make_parts(run, request, options, parts)
         write_merged(run, parts, request.output or STDOUT, request.overwrite, options.levels)
         run.finish()
@@ -88,10 +102,22 @@ def merge(
     run = Run(console or Console(), ConversionReport("merge"))
     parts = Parts(Path(folder))
     parts.settings()
-    outputs = [Output("-o", output, (".ply",), splats=True), *level_outputs(output, levels)]
-    with claimed(outputs, [], overwrite):
+    with _written(output, levels) as outputs, claimed(outputs, [], overwrite):
         write_merged(run, parts, output, overwrite, levels)
     return run.finish()
+
+
+@contextmanager
+def _written(output: str | None, levels: int, request: ConvertRequest | None = None) -> Iterator[list[Output]]:
+    """What will be written; the folder of a streamed SOG is made."""
+    if output is not None and is_streamed(output):
+        more = [] if request is None else replace(request, output=None).outputs()
+        with folder_of(output):
+            yield [Output("-o", output), *more]
+    elif request is not None:
+        yield [*request.outputs(), *level_outputs(output, levels)]
+    else:
+        yield [Output("-o", output or STDOUT, (".ply",), splats=True), *level_outputs(output, levels)]
 
 
 def _refuse(request: ConvertRequest, options: BlockOptions) -> None:

@@ -1,0 +1,105 @@
+"""Which cut of each node a level takes: what ever coarser cuts cost is measured; nodes have the same error."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vvgt_cli.conversion.shards.apart import errors_apart
+
+if TYPE_CHECKING:
+    from vvgt_cli.conversion.shards.merge import Cut
+
+RUNGS = 10
+STEP = 4.0  # times the score from a rung to the next: a cell's grows as the fourth power of its edge
+FEWER = 9  # times fewer Gaussians from a level to the next: three times the edge, on a surface
+MOST_LEVELS = 6
+FEWEST = 4  # Gaussians a node, on average, below which no further level is made
+
+
+@dataclass(frozen=True)
+class Ladder:
+    """What cuts of N nodes cost; the first of each node is the finest.
+
+    Attributes:
+        thresholds: (RUNGS,) of scores.
+        counts: (N, RUNGS) Gaussians.
+        squares: (N, RUNGS) squared differences from the finest, RGBA.
+        energies: (N,) squares of the finest.
+        pixels: (N,) that it covers.
+    """
+
+    thresholds: np.ndarray
+    counts: np.ndarray
+    squares: np.ndarray
+    energies: np.ndarray
+    pixels: np.ndarray
+
+    @property
+    def errors(self) -> np.ndarray:
+        """(N, RUNGS) root mean square of a channel over the pixels that a node covers."""
+        found: np.ndarray = np.sqrt(self.squares / np.maximum(4 * self.pixels, 1)[:, None])
+        return found
+
+    def within(self, error: float) -> np.ndarray:
+        """(N,) the coarsest rung of each node up to an error."""
+        found: np.ndarray = (self.errors <= error).sum(axis=1) - 1
+        return found
+
+    def for_count(self, count: float) -> np.ndarray:
+        """(N,) rungs of the smallest error, the same for all, that takes at most ``count`` Gaussians."""
+        values = np.unique(self.errors)
+        low, high = 0, len(values) - 1  # what the last takes is the fewest there are
+        while low < high:
+            middle = (low + high) // 2
+            fits = self.total(self.within(values[middle])) <= count
+            low, high = (low, middle) if fits else (middle + 1, high)
+        return self.within(values[low])
+
+    def total(self, rungs: np.ndarray) -> int:
+        """Gaussians of a choice."""
+        return int(self.counts[np.arange(len(rungs)), rungs].sum())
+
+    def rms(self, rungs: np.ndarray) -> float:
+        """Root mean square error of a choice over all nodes."""
+        squares = self.squares[np.arange(len(rungs)), rungs].sum()
+        return math.sqrt(squares / max(4 * self.pixels.sum(), 1))
+
+    def levels(self) -> list[np.ndarray]:
+        """Rungs (N,) of each level: the finest, and errors that take a ninth of the Gaussians of the level before."""
+        found = [np.zeros(len(self.counts), np.int64)]
+        before = self.total(found[0])
+        while len(found) < MOST_LEVELS and before >= FEWEST * len(self.counts):
+            further = self.for_count(before / FEWER)
+            count = self.total(further)
+            if 2 * count > before:
+                break
+            found.append(further)
+            before = count
+        return found
+
+    def facts(self, row: int, rungs: list[int]) -> dict[str, Any]:
+        """Of a node's levels: the squared error of the squares, as splat-transform's `errors`; and our `errors`."""
+        energy = max(float(self.energies[row]), 1e-30)
+        relative = [float(self.squares[row, rung] / energy) for rung in rungs]
+        return {"errors": relative, "rms": [float(self.errors[row, rung]) for rung in rungs]}
+
+
+def measured(cut: Cut) -> Ladder:
+    """Make and draw `RUNGS` cuts of every node."""
+    forest = cut.forest
+    finest = forest.threshold(cut.plan.budget)
+    second = max(forest.threshold(max(forest.count(finest) // 2, 1)), np.finfo(float).tiny)
+    values = np.array([finest, *(second * STEP ** np.arange(RUNGS - 1))])
+    values = np.minimum(values, np.finfo(float).max)
+    counts, squares, energies, pixels = [], [], [], []
+    for made, _ in cut.nodes(np.tile(values, (len(forest.tiles), 1))):
+        square, energy, covered = errors_apart(made)
+        counts.append([len(gaussians) for gaussians in made])
+        squares.append(square)
+        energies.append(energy)
+        pixels.append(covered)
+    return Ladder(values, np.array(counts), np.array(squares), np.array(energies), np.array(pixels))

@@ -1,0 +1,148 @@
+"""Streamed SOG: nodes by place, each in levels of the same error, in files of SOG's images; and `lod-meta.json`.
+
+As PlayCanvas 2.23.3 (`scene/gsplat-unified/gsplat-octree.js`, `gsplat-lod-table.js`) and splat-transform 3.7.0
+(`writers/write-lod.ts`) have it. A node is a tile of the pyramid (`vvgt_cli.field.forest`); what its levels are is
+measured (`ladder`).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vvgt_cli.conversion.shards.ladder import measured
+from vvgt_cli.conversion.shards.streamed_files import Files, Level
+from vvgt_cli.errors import UsageError
+from vvgt_cli.files import atomic_write
+from vvgt_cli.gaussians import Gaussians, PlyOptions
+from vvgt_cli.gaussians.formats.splats import Splats, splats_of
+from vvgt_cli.gaussians.frames import transform
+from vvgt_cli.gaussians.header import comment_lines
+from vvgt_cli.score.record import Run, plain
+from vvgt_cli.version import VERSION
+
+if TYPE_CHECKING:
+    from vvgt_cli.conversion.shards.merge import Cut
+
+MANIFEST = "lod-meta.json"
+# Of the unit frame. The engine shows level 0 nearer than 5 (`lodBaseDistance`) and level 1 nearer than 15, so that the
+# whole is seen in level 1 from where `vvgt render --orbit` begins, at 3 in the unit frame.
+SCALE = 4.0
+REACH = 2.0  # standard deviations that a node's bounds lie beyond its centres
+
+
+def is_streamed(output: str | None) -> bool:
+    """Whether an output is the manifest of a folder."""
+    return output is not None and Path(output).name == MANIFEST
+
+
+@contextmanager
+def folder_of(output: str) -> Iterator[None]:
+    """Make the folder of a manifest; it goes again where nothing was left in it."""
+    folder = Path(output).absolute().parent
+    made = not folder.exists() and folder.parent.is_dir()
+    if made:
+        folder.mkdir()
+    try:
+        yield
+    finally:
+        if made:
+            with suppress(OSError):
+                folder.rmdir()
+
+
+def write_streamed(run: Run, cut: Cut, output: str, overwrite: bool) -> None:
+    """Write the files and, last of all, the manifest.
+
+    Raises:
+        UsageError: a frame in which distances are not the engine's.
+    """
+    if cut.plan.ply.frame != "unit":
+        raise UsageError(f"-o {output}: levels go by distances in the unit frame; leave out --frame")
+    forest = cut.forest
+    with run.stage("errors") as stage:
+        ladder = measured(cut)
+        choices = ladder.levels()
+        levels = [Level(number) for number in range(len(choices))]
+        stage.note = f"{len(levels)} levels of {len(forest.tiles)} nodes"
+    files, nodes = Files(Path(output).absolute().parent), []
+    with run.stage("write") as stage, atomic_write(Path(output), overwrite) as temporary:
+        for row, (made, spreads) in enumerate(cut.nodes(ladder.thresholds[np.stack(choices, axis=1)])):
+            rungs = [choice[row] for choice in choices]
+            nodes.append(_node(cut, files, levels, made, spreads) | ladder.facts(row, rungs))
+        for level in levels:
+            files.write(level)
+        facts = [ladder.rms(choice) for choice in choices]
+        temporary.write_text(
+            json.dumps(plain(_manifest(cut, levels, files.names, nodes, facts)), separators=(",", ":"))
+        )
+        total = sum(level.bytes for level in levels)
+        stage.note = f"{output}: {len(nodes)} nodes, {len(files.names)} files, {total / 1e6:.1f} MB; Gaussians "
+        stage.note += ", ".join(f"{level.gaussians:,}" for level in levels)
+        if levels[0].gaussians < cut.plan.budget // 2:
+            stage.note += f", no more: {forest.base} cells that the screen, or {cut.plan.budget}, have use for"
+    files.remove_others()
+    run.report.gaussians, run.report.bytes = levels[0].gaussians, total
+
+
+def _node(
+    cut: Cut, files: Files, levels: list[Level], made: list[Gaussians], spreads: list[np.ndarray]
+) -> dict[str, Any]:
+    """Put a node into the files; its entry in the manifest."""
+    axes, options = np.array(cut.plan.axes).reshape(3, 3), replace(cut.plan.ply, sh_degree=0, comments=False)
+    lods, low, high = {}, np.full(3, np.inf), np.full(3, -np.inf)
+    for level, gaussians, spread in zip(levels, made, spreads, strict=True):
+        splats = _scaled(gaussians, axes, options)
+        reach = REACH * np.exp(splats.log_scales.max(axis=1, keepdims=True))
+        low = np.minimum(low, (splats.means - reach).min(axis=0))
+        high = np.maximum(high, (splats.means + reach).max(axis=0))
+        lods[str(level.number)] = files.add(level, splats)
+        level.spread += spread
+    return {
+        "bound": {"min": low.tolist(), "max": high.tolist()},
+        "lods": lods,
+        "spreads": [SCALE * float(np.sqrt(square / weight)) for weight, square in spreads],
+    }
+
+
+def _scaled(gaussians: Gaussians, axes: np.ndarray, options: PlyOptions) -> Splats:
+    splats = splats_of(transform(gaussians, axes), options)
+    return replace(
+        splats, means=splats.means * np.float32(SCALE), log_scales=splats.log_scales + np.float32(math.log(SCALE))
+    )
+
+
+def _manifest(
+    cut: Cut, levels: list[Level], names: list[str], nodes: list[dict[str, Any]], errors: list[float]
+) -> dict[str, Any]:
+    low = np.min([node["bound"]["min"] for node in nodes], axis=0)
+    high = np.max([node["bound"]["max"] for node in nodes], axis=0)
+    comments = [line.removeprefix("comment ") for line in comment_lines(cut.plan.ply)]
+    facts = [
+        {
+            "gaussians": level.gaussians,
+            "bytes": level.bytes,
+            "files": level.files,
+            "spread": SCALE * float(np.sqrt(level.spread[1] / level.spread[0])),
+            "rms": errors[level.number],
+        }
+        for level in levels
+    ]
+    return {
+        "version": 1,
+        "asset": {"generator": f"vvgt {VERSION}"},
+        "count": sum(level.gaussians for level in levels),
+        "counts": [level.gaussians for level in levels],
+        "lodLevels": len(levels),
+        "lodErrors": True,
+        "filenames": names,
+        "tree": {"bound": {"min": low.tolist(), "max": high.tolist()}, "children": nodes},
+        "vvgt": {"schema": 1, "scale": SCALE, "size": cut.plan.size, "levels": facts, "comments": comments},
+    }

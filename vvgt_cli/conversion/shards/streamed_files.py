@@ -1,0 +1,91 @@
+"""The files of a streamed SOG: Gaussians of neighbouring nodes, a level each, as SOG's images in a folder."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vvgt_cli.files import atomic_write
+from vvgt_cli.gaussians.formats.sog_images import META, images_of, webp
+from vvgt_cli.gaussians.formats.splats import Splats, morton_order
+
+A_FILE = 1 << 17  # Gaussians of a file, or a node more
+
+
+@dataclass
+class Level:
+    """What is written of a level.
+
+    Attributes:
+        number: 0 is the finest.
+        waiting: Gaussians of the next file.
+        rows: how many.
+        files: that are full.
+        gaussians, bytes: of all of it, so far.
+        spread: sums over Gaussians of opacity x area of their cells, and of that x variance in them.
+    """
+
+    number: int
+    waiting: list[Splats] = field(default_factory=list)
+    rows: int = 0
+    files: int = 0
+    gaussians: int = 0
+    bytes: int = 0
+    spread: np.ndarray = field(default_factory=lambda: np.zeros(2))
+
+
+class Files:
+    """Those of all levels; ``names`` of their `meta.json`, as the manifest has them."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self.names: list[str] = []
+        self._begun: dict[int, int] = {}  # number of the name of each level's next file
+
+    def add(self, level: Level, splats: Splats) -> dict[str, int]:
+        """Put a node's Gaussians into the next file of a level; where they are."""
+        if level.number not in self._begun:
+            self._begun[level.number] = len(self.names)
+            self.names.append(f"{level.number}_{level.files}/{META}")
+        place = {"file": self._begun[level.number], "offset": level.rows, "count": len(splats)}
+        level.waiting.append(splats.take(morton_order(splats.means)))
+        level.rows += len(splats)
+        level.gaussians += len(splats)
+        if level.rows >= A_FILE:
+            self.write(level)
+        return place
+
+    def write(self, level: Level) -> None:
+        """Write the file that is waiting, if there is one."""
+        if not level.rows:
+            return
+        columns = ("means", "log_scales", "quaternions", "logits", "f_dc", "f_rest")
+        joined: dict[str, Any] = {
+            name: np.concatenate([getattr(part, name) for part in level.waiting]) for name in columns
+        }
+        images, meta = images_of(replace(level.waiting[0], **joined))
+        target = self._folder / self.names[self._begun.pop(level.number)]
+        target.parent.mkdir(exist_ok=True)
+        for name, image in images.items():
+            level.bytes += _put(target.with_name(name), webp(image))
+        level.bytes += _put(target, json.dumps(meta, separators=(",", ":")).encode())
+        level.waiting, level.rows, level.files = [], 0, level.files + 1
+
+    def remove_others(self) -> None:
+        """Remove what an earlier run of more files has left: folders that are named like ours."""
+        ours = {name.split("/")[0] for name in self.names}
+        for path in self._folder.iterdir():
+            level, _, number = path.name.partition("_")
+            if path.is_dir() and level.isdecimal() and number.isdecimal() and path.name not in ours:
+                shutil.rmtree(path)
+
+
+def _put(path: Path, content: bytes) -> int:
+    with atomic_write(path, overwrite=True) as temporary:
+        temporary.write_bytes(content)
+    return len(content)
