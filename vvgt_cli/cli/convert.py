@@ -159,8 +159,8 @@ def _convert(
     from vvgt_cli.conversion.index import is_pattern
     from vvgt_cli.conversion.pages import page_of_functions, page_of_volume
     from vvgt_cli.conversion.series import convert_series
-    from vvgt_cli.conversion.shards.streamed import is_streamed
     from vvgt_cli.errors import UsageError
+    from vvgt_cli.gaussians.formats.streamed import is_streamed
 
     if is_streamed(request.output):
         _streamed(request, functions, shard is not None or dry_run, console)

@@ -18,6 +18,7 @@ from vvgt_cli.errors import DataError, SeveralArrays, SeveralComponents, Several
 from vvgt_cli.files import seekable
 from vvgt_cli.gaussians import describe, read_ply, write_ply
 from vvgt_cli.gaussians.formats import format_of, read_splats
+from vvgt_cli.gaussians.formats.streamed import facts_of, is_streamed
 from vvgt_cli.look.label_files import holds_table, is_table, read_labels, segments_of
 from vvgt_cli.look.labels import LabelTable
 from vvgt_cli.look.readers import SUFFIXES
@@ -59,6 +60,8 @@ def inspect(file: str, read: ReadOptions, function: FunctionRequest | None = Non
     name = Path(file)
     with path.open("rb") as stream:
         head = stream.read(_HEAD)
+    if is_streamed(name):
+        return {"kind": "streamed gaussians", "name": name.name, **facts_of(path)}
     known = format_of(name)
     if head.startswith(_PLY) or known:
         facts = {"kind": "gaussians", "name": name.name, **describe(*read_splats(file))}

@@ -15,6 +15,7 @@ from pathlib import Path
 from vvgt_cli.commands.converter import Converter
 from vvgt_cli.commands.live_site import BYTES, HTML, SCRIPT, Cloud, Desk, plain_name, stored
 from vvgt_cli.commands.server import Part, Site, served
+from vvgt_cli.commands.streamed_site import streamed_parts
 from vvgt_cli.conversion.gaussian_files import STDIN, is_page, layout_of, open_gaussians, write_gaussians, write_page
 from vvgt_cli.conversion.index import files_of, is_index
 from vvgt_cli.conversion.readback import tell_agreement
@@ -24,6 +25,7 @@ from vvgt_cli.gaussians import Gaussians, PlyOptions
 from vvgt_cli.gaussians.formats import SUFFIXES, is_splats
 from vvgt_cli.gaussians.formats.page_file import PROGRAM, asset, page
 from vvgt_cli.gaussians.formats.splats import columns_of
+from vvgt_cli.gaussians.formats.streamed import MANIFEST, is_streamed
 from vvgt_cli.gaussians.outputs import Output, claimed
 from vvgt_cli.jit.ahead import DRAW, for_degree
 from vvgt_cli.progress import Console
@@ -77,6 +79,8 @@ def view(request: ViewRequest, announce: Callable[[str], None], console: Console
         _join(run, request, clouds)
         return
     file = clouds[0][1]
+    if is_streamed(file):
+        _only_gaussians([file])
     with claimed([Output("-o", request.output, SUFFIXES, splats=True)], [file], request.overwrite):
         gaussians, options = _opened(run, request, file)
         write_gaussians(run, request.output, gaussians, options, request.overwrite)
@@ -111,6 +115,8 @@ def _refuse_reading(given: SourceRequest, name: str) -> None:
 
 def _only_gaussians(files: Sequence[str]) -> None:
     """Of several files."""
+    if any(map(is_streamed, files)):
+        raise UsageError(f"{next(filter(is_streamed, files))}: is shown by itself; expected no other file, and no -o")
     volumes = [name for name in files if name != STDIN and not is_splats(name)]
     if len(files) > 1 and (volumes or STDIN in files):
         raise UsageError(
@@ -127,6 +133,7 @@ def named_files(names: Sequence[str]) -> list[tuple[str, str]]:
     """
     found: list[tuple[str, str]] = []
     for name in names:
+        name = os.path.join(name, MANIFEST) if os.path.isfile(os.path.join(name, MANIFEST)) else name
         found += files_of(name) if is_index(name) else [(Path(file).name, file) for file in expanded([name])]
     return found
 
@@ -164,13 +171,17 @@ def _serve(
     run: Run, request: ViewRequest, clouds: Sequence[tuple[str, str]], announce: Callable[[str], None]
 ) -> None:  # fmt: skip
     files = [file for _, file in clouds]
-    _only_gaussians(files)
+    if len(files) > 1:
+        _only_gaussians(files)
     parts = {"viewer.js": Part("text/javascript; charset=utf-8", lambda: asset(PROGRAM), packed=True)}
     site = Site(parts, run.console.say)
     desk = Desk(site.parts, site.posts, plain_name(files[0]), run.console)
     with ExitStack() as stack:
         stack.enter_context(suppress(KeyboardInterrupt))
-        if len(files) > 1:
+        if is_streamed(files[0]):
+            _refuse_reading(request.source, files[0])
+            parts |= streamed_parts(files[0])
+        elif len(files) > 1:
             _refuse_reading(request.source, files[0])
             parts |= _series(clouds)
         elif files[0] == STDIN or is_splats(files[0]):

@@ -17,12 +17,13 @@ from vvgt_cli.conversion.request import VERTEX_BYTES
 from vvgt_cli.conversion.shards.levels import PART, level_name, write_index
 from vvgt_cli.conversion.shards.plan import Plan
 from vvgt_cli.conversion.shards.score import drawing_bytes, score_gaussians, score_text
-from vvgt_cli.conversion.shards.streamed import is_streamed, write_streamed
+from vvgt_cli.conversion.shards.streamed import write_streamed
 from vvgt_cli.conversion.stages.closed_form import FAINT_LOGIT, FEWEST, NEARLY
 from vvgt_cli.dvr.render import Box
 from vvgt_cli.errors import NothingVisible
 from vvgt_cli.field.parts import Parts
 from vvgt_cli.files import atomic_write, check_room, is_stream
+from vvgt_cli.gaussians.formats.streamed import is_streamed
 from vvgt_cli.gaussians.frames import transform
 from vvgt_cli.gaussians.outputs import STDOUT
 from vvgt_cli.gaussians.ply import as_stored, ply_header, ply_rows

@@ -14,7 +14,7 @@ from vvgt_cli.conversion.shards.levels import level_outputs
 from vvgt_cli.conversion.shards.merge import write_merged
 from vvgt_cli.conversion.shards.plan import Plan, disk_bytes, most_cells
 from vvgt_cli.conversion.shards.score import scored_views
-from vvgt_cli.conversion.shards.streamed import folder_of, is_streamed
+from vvgt_cli.conversion.shards.streamed import folder_of
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.blocked import Blocked, Later
 from vvgt_cli.field.cells import CellBlocks
@@ -24,6 +24,7 @@ from vvgt_cli.field.settings import BlockOptions
 from vvgt_cli.field.source import SourceRequest, tf_record, volume_record
 from vvgt_cli.files import check_room
 from vvgt_cli.gaussians.formats import format_of
+from vvgt_cli.gaussians.formats.streamed import is_streamed
 from vvgt_cli.gaussians.outputs import STDOUT, Output, claimed, write_text
 from vvgt_cli.jit.ahead import DRAW, INIT, RENDER, for_blocks
 from vvgt_cli.look import read_transfer_function

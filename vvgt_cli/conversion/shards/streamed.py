@@ -31,16 +31,10 @@ from vvgt_cli.version import VERSION
 if TYPE_CHECKING:
     from vvgt_cli.conversion.shards.merge import Cut
 
-MANIFEST = "lod-meta.json"
 # Of the unit frame. The engine shows level 0 nearer than 5 (`lodBaseDistance`) and level 1 nearer than 15, so that the
 # whole is seen in level 1 from where `vvgt render --orbit` begins, at 3 in the unit frame.
 SCALE = 4.0
 REACH = 2.0  # standard deviations that a node's bounds lie beyond its centres
-
-
-def is_streamed(output: str | None) -> bool:
-    """Whether an output is the manifest of a folder."""
-    return output is not None and Path(output).name == MANIFEST
 
 
 @contextmanager

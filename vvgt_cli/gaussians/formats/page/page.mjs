@@ -2,7 +2,7 @@
 // slider and a list where there are several frames, functions or labels. Splats are drawn by the file's rule (docs/viewers.md). `make page` bundles it with its packages to viewer.js.gz.
 import css from '@playcanvas/supersplat-viewer/viewer.css';
 import { createViewer } from '@playcanvas/supersplat-viewer/viewer';
-import { Asset, SHADERLANGUAGE_GLSL, ShaderChunks } from 'playcanvas';
+import { Asset, GSPLAT_BUDGET_LIMIT, SHADERLANGUAGE_GLSL, ShaderChunks } from 'playcanvas';
 import { liveLook } from './live.mjs';
 import panelCss from './panel.css';
 import { panel, named } from './panel.mjs';
@@ -139,21 +139,27 @@ async function start() {
   document.head.append(style);
   if (scene.waits) return waiting(said);
   const { file } = scene.frames[0];
-  const response = await content(scene.frames[0]);
-  if (!response.ok) throw new Error(`${scene.frames[0].name} cannot be read`);
+  const response = scene.streamed ? null : await content(scene.frames[0]);  // what is streamed the engine fetches itself
+  if (response && !response.ok) throw new Error(`${scene.frames[0].name} cannot be read`);
   let deliver;
   const viewer = await createViewer({
     container: document.getElementById('view'), contentUrl: file, contentFilename: file, settings,
-    contents: new Promise((done) => { deliver = done; }), aa: scene.rule.compensate,
+    contents: response ? new Promise((done) => { deliver = done; }) : undefined, aa: scene.rule.compensate,
     noanim: true,
     renderer: 'webgl',  // the one whose pictures are measured; WebGPU leaves more splats out
   });
   draw(viewer.app, scene.rule);
   viewer.app.scene.gsplat.alphaClipForward = scene.rule.minAlpha;
   viewer.app.scene.gsplat.minPixelSize = Math.sqrt(32 * scene.rule.minVariance);
-  deliver(response);
+  if (scene.streamed) viewer.app.scene.gsplat.splatBudgetMode = GSPLAT_BUDGET_LIMIT;  // levels by distance, not as many as fit
+  deliver?.(response);
   if (!viewer.state.loaded) await new Promise((done) => viewer.events.once('loaded:changed', done));
   viewer.state.cameraMode = 'orbit';  // the viewer would turn the object
+  if (scene.streamed) {
+    said.textContent = '';
+    window.vvgt = { viewer, show: null };
+    return;
+  }
   if (scene.frames.length === 1 && !scene.live) document.body.append(named('baked'));
   const live = scene.live ? panel(await liveLook(viewer, scene.live), viewer, scene.live) : null;
   if (live) served(live, viewer, scene.live, scene.server);

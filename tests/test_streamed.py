@@ -1,0 +1,222 @@
+"""Streamed SOG: what the engine would take from the manifest and its files, errors drawn again, what is refused."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.test_formats_server import ask
+from tests.test_scale import bodies
+from vvgt_cli.commands.server import Site, served
+from vvgt_cli.commands.streamed_site import streamed_parts
+from vvgt_cli.commands.view import named_files
+from vvgt_cli.conversion.shards.apart import errors_apart
+from vvgt_cli.conversion.shards.ladder import Ladder
+from vvgt_cli.errors import DataError
+from vvgt_cli.gaussians import read_ply
+from vvgt_cli.gaussians.formats.sog_images import splats_in
+from vvgt_cli.gaussians.formats.splats import Splats, gaussians_of
+from vvgt_cli.gaussians.formats.streamed import nodes_of, read_manifest
+
+FIT = ("--max-gaussians", "9000", "--size", "150", "-q")
+
+
+@pytest.fixture(scope="module")
+def volume(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("streamed") / "v_100x90x80_uint8.raw"
+    path.write_bytes(np.round(bodies() * 255).astype(np.uint8).tobytes())
+    return path
+
+
+@pytest.fixture(scope="module")
+def folder(volume: Path) -> Path:
+    from vvgt_cli.cli.main import run
+
+    out = volume.parent / "out"
+    assert run(["convert", str(volume), *FIT, "--blocks", "32", "-o", str(out / "lod-meta.json")]) == 0
+    return out
+
+
+def decoded(folder: Path, manifest: dict[str, Any]) -> list[Splats]:
+    found = []
+    for name in manifest["filenames"]:
+        place = (folder / name).parent
+        meta = json.loads((folder / name).read_bytes())
+        found.append(splats_in(meta, lambda image, place=place: (place / image).read_bytes(), name))
+    return found
+
+
+def test_nodes_share_out_every_file(folder: Path) -> None:
+    manifest = json.loads((folder / "lod-meta.json").read_text())
+    assert (manifest["version"], manifest["lodLevels"]) == (1, len(manifest["counts"]))
+    assert manifest["lodLevels"] >= 2
+    files, taken = decoded(folder, manifest), [[] for _ in manifest["filenames"]]
+    counts = [0] * manifest["lodLevels"]
+    for node in manifest["tree"]["children"]:
+        assert sorted(node["lods"]) == [str(level) for level in range(manifest["lodLevels"])]
+        for level, place in node["lods"].items():
+            taken[place["file"]].append((place["offset"], place["count"]))
+            counts[int(level)] += place["count"]
+            part = files[place["file"]].means[place["offset"] : place["offset"] + place["count"]]
+            assert (part > np.array(node["bound"]["min"])).all()
+            assert (part < np.array(node["bound"]["max"])).all()
+            assert manifest["filenames"][place["file"]].startswith(f"{level}_")
+    assert counts == manifest["counts"]
+    assert sum(counts) == manifest["count"]
+    for splats, places in zip(files, taken, strict=True):
+        ends = np.cumsum([count for _, count in sorted(places)])
+        assert [offset for offset, _ in sorted(places)] == [0, *ends[:-1]]
+        assert ends[-1] == len(splats)
+    assert {path.name for path in folder.iterdir()} == {
+        "lod-meta.json", *(name.split("/")[0] for name in manifest["filenames"])
+    }  # fmt: skip
+
+
+def test_the_finest_level_is_the_closed_form_four_times_as_large(vvgt, volume: Path, folder: Path) -> None:
+    assert vvgt("init", volume, *FIT, "--blocks", "32", "-o", volume.parent / "a.ply").code == 0
+    expected = read_ply(volume.parent / "a.ply")[0]
+    manifest = read_manifest(folder / "lod-meta.json")
+    files = decoded(folder, manifest)
+    finest = [s for s, name in zip(files, manifest["filenames"], strict=True) if name.startswith("0_")]
+    means = np.concatenate([s.means for s in finest]) / 4
+    assert len(means) == pytest.approx(len(expected), rel=0.02)  # a node has one at least
+    apart = [float(np.linalg.norm(means - mean, axis=1).min()) for mean in expected.means[::50]]
+    assert np.median(apart) < 1e-4
+    assert np.mean(np.array(apart) < 2e-3) > 0.97
+
+
+def test_errors_are_those_of_what_is_in_the_files(folder: Path) -> None:
+    manifest = read_manifest(folder / "lod-meta.json")
+    files = decoded(folder, manifest)
+    nodes = nodes_of(manifest, "a")
+    for node in sorted(nodes, key=lambda node: -node["lods"]["0"]["count"])[:3]:
+        cuts = []
+        for level in range(manifest["lodLevels"]):
+            place = node["lods"][str(level)]
+            rows = np.arange(place["offset"], place["offset"] + place["count"])
+            cuts.append(gaussians_of(files[place["file"]].take(rows), "a")[0])
+        squares, energy, pixels = errors_apart(cuts)
+        np.testing.assert_allclose(squares / energy, node["errors"], rtol=0.1, atol=2e-4)
+        np.testing.assert_allclose(np.sqrt(squares / pixels) / 2, node["rms"], rtol=0.1, atol=2e-3)
+        assert node["errors"] == sorted(node["errors"])
+        assert node["spreads"] == sorted(node["spreads"])
+        assert node["errors"][0] == 0 < node["errors"][-1]
+
+
+def test_levels_have_the_same_error_in_all_nodes_and_few_enough_gaussians() -> None:
+    rng = np.random.default_rng(6)
+    counts = 1000 * rng.integers(1, 9, (30, 1)) // 2 ** np.arange(10)
+    squares = np.cumsum(rng.uniform(0, 1, (30, 10)) * 3.0 ** np.arange(10), axis=1)
+    squares[:, 0] = 0
+    ladder = Ladder(np.arange(10.0), counts, squares, np.full(30, 1e4), np.full(30, 100))
+    for count in (counts[:, 0].sum() / 9, counts[:, 0].sum() / 81):
+        rungs = ladder.for_count(count)
+        assert ladder.total(rungs) <= count
+        largest = ladder.errors[np.arange(30), rungs].max()
+        beyond = ladder.errors[np.arange(30), np.minimum(rungs + 1, 9)]
+        assert (beyond[rungs < 9] > largest).all()  # no node could be coarser within the same error
+        finer = ladder.within(np.unique(ladder.errors)[np.searchsorted(np.unique(ladder.errors), largest) - 1])
+        assert ladder.total(finer) > count  # and no smaller error fits
+    levels = ladder.levels()
+    assert (levels[0] == 0).all()
+    assert all((a <= b).all() for a, b in pairwise(levels))
+    assert ladder.rms(levels[0]) == 0 < ladder.rms(levels[1]) < ladder.rms(levels[2])
+
+
+def test_the_bytes_do_not_depend_on_how(vvgt, volume: Path, folder: Path, tmp_path: Path) -> None:
+    whole = {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    assert vvgt("convert", volume, *FIT, "-o", tmp_path / "whole" / "lod-meta.json").code == 0
+    assert vvgt("init", volume, *FIT, "--shard", "1/1", "--blocks", "64", "-o", tmp_path / "parts").code == 0
+    assert vvgt("merge", tmp_path / "parts", "-q", "-o", tmp_path / "merged" / "lod-meta.json").code == 0
+    for other in (tmp_path / "whole", tmp_path / "merged"):
+        assert {p.relative_to(other): p.read_bytes() for p in other.rglob("*") if p.is_file()} == whole
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        (("--light", "headlight"), "unlit moments"),
+        (("--init", "wavelet"), "unlit moments"),
+        (("--frame", "world"), "leave out --frame"),
+        (("--steps", "50"), "levels of one closed form"),
+        (("--live",), "levels of one closed form"),
+        (("--target-psnr", "30"), "levels of one closed form"),
+        (("--dry-run",), "levels of one closed form"),
+        (("--preview", "p.png"), "levels of one closed form"),
+    ],
+)
+def test_what_has_no_levels_is_refused_in_a_line(vvgt, volume: Path, tmp_path: Path, options, text) -> None:
+    found = vvgt("convert", volume, *FIT, *options, "-o", tmp_path / "out" / "lod-meta.json")
+    assert found.code == 2, found.err
+    assert text in found.error
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_existing_folder_is_replaced_only_when_told(vvgt, volume: Path, folder: Path) -> None:
+    stale = folder / "3_7"
+    stale.mkdir()
+    assert vvgt("convert", volume, *FIT, "-o", folder / "lod-meta.json").code == 2
+    assert vvgt("convert", volume, *FIT, "--overwrite", "-o", folder / "lod-meta.json").code == 0
+    assert not stale.exists()
+
+
+def test_info_lists_levels_with_their_errors(vvgt, folder: Path) -> None:
+    facts = json.loads(vvgt("info", folder / "lod-meta.json", "--json").out)
+    manifest = json.loads((folder / "lod-meta.json").read_text())
+    assert facts["kind"] == "streamed gaussians"
+    assert [level["gaussians"] for level in facts["levels"]] == manifest["counts"]
+    rms = [level["rms"] for level in facts["levels"]]
+    assert rms[0] == 0
+    assert rms == sorted(rms)
+
+
+def test_the_page_and_its_files_are_served(folder: Path, tmp_path: Path) -> None:
+    assert [file for _, file in named_files([str(folder)])] == [str(folder / "lod-meta.json")]
+    with served(Site(streamed_parts(str(folder / "lod-meta.json")), print)) as url:
+        path = url[url.index("/", 8) :]
+        status, text, _ = ask(url)
+        assert (status, b'"streamed": true' in text) == (200, True)
+        for name in ("lod-meta.json", "0_0/meta.json", "1_0/means_u.webp"):
+            assert ask(url, path + name)[:2] == (200, (folder / name).read_bytes())
+        assert ask(url, f"{path}../secret")[0] == 404
+
+
+def test_a_folder_with_a_file_missing_is_told(vvgt, folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "lod-meta.json").write_bytes((folder / "lod-meta.json").read_bytes())
+    found = vvgt("view", tmp_path, "--no-browser")
+    assert (found.code, "is missing; expected the whole folder" in found.error) == (1, True)
+    found = vvgt("view", tmp_path, "-o", tmp_path / "a.html")
+    assert (found.code, "is shown by itself" in found.error) == (2, True)
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (lambda m: m.update(lodLevels=0), "no lodLevels"),
+        (lambda m: m.update(filenames=["../../etc/passwd"]), "expected files FOLDER/meta.json"),
+        (lambda m: m.update(filenames=["a/../../b/meta.json"]), "expected files FOLDER/meta.json"),
+        (lambda m: m.update(filenames=["/0_0/meta.json"]), "expected files FOLDER/meta.json"),
+        (lambda m: m.update(filenames=[3]), "expected files FOLDER/meta.json"),
+        (lambda m: m.update(tree=5), "expected nodes with children or lods"),
+        (lambda m: m["tree"]["children"].append({"children": [7]}), "expected nodes with children or lods"),
+        (lambda m: m["tree"]["children"][0]["lods"].update({"0": {"file": 99, "offset": 0, "count": 1}}), "a node has"),
+        (lambda m: m["tree"]["children"][0]["lods"].update({"x": {"file": 0, "offset": 0, "count": 1}}), "a node has"),
+        (lambda m: m["tree"]["children"][0]["lods"].update({"0": []}), "a node has"),
+    ],
+)
+def test_manifests_that_cannot_be_are_one_line(
+    folder: Path, tmp_path: Path, change: Callable[[Any], None], text: str
+) -> None:
+    manifest = json.loads((folder / "lod-meta.json").read_text())
+    change(manifest)
+    (tmp_path / "lod-meta.json").write_text(json.dumps(manifest))
+    with pytest.raises(DataError) as error:
+        read_manifest(tmp_path / "lod-meta.json")
+    assert text in str(error.value)
+    assert "\n" not in str(error.value)

@@ -1,0 +1,117 @@
+"""`lod-meta.json` of streamed SOG: what PlayCanvas' engine takes of it, and what vvgt says beside that."""
+
+from __future__ import annotations
+
+import json
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vvgt_cli.errors import DataError
+from vvgt_cli.gaussians.formats.sog_images import META
+from vvgt_cli.gaussians.formats.splats import Splats
+
+MANIFEST = "lod-meta.json"
+_LARGEST = 1 << 28  # bytes of a manifest
+_MOST_LEVELS = 64
+
+
+def is_streamed(path: str | Path | None) -> bool:
+    """Whether a name is that of the manifest of a folder."""
+    return path is not None and Path(path).name == MANIFEST
+
+
+def read_manifest(path: str | Path) -> dict[str, Any]:
+    """The JSON, of which what the engine needs is there: levels, files, and in the tree nodes with bounds.
+
+    Raises:
+        DataError: it is another file, or damaged.
+    """
+    path = Path(path)
+    if path.stat().st_size > _LARGEST:
+        raise DataError(f"{path}: more than {_LARGEST >> 20} MiB; expected a manifest of streamed SOG")
+    try:
+        found = json.loads(path.read_bytes())
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{path}: no JSON ({' '.join(str(error).split())[:200]}); expected streamed SOG") from None
+    levels = found.get("lodLevels") if isinstance(found, dict) else None
+    files = found.get("filenames") if isinstance(found, dict) else None
+    if type(levels) is not int or not 0 < levels <= _MOST_LEVELS or not isinstance(files, list):
+        raise DataError(f"{path}: no lodLevels from 1 to {_MOST_LEVELS} or no filenames; expected streamed SOG")
+    for name in files:
+        parts = name.split("/") if isinstance(name, str) else []
+        if not parts or parts[-1] != META or any(part in ("", ".", "..") or "\\" in part for part in parts):
+            raise DataError(f"{path}: names {name!r:.80}; expected files FOLDER/{META} beside it")
+    for node in nodes_of(found, path):
+        for level, place in node["lods"].items():
+            numbers = [place.get(key) if isinstance(place, dict) else None for key in ("file", "offset", "count")]
+            whole = [number for number in numbers if type(number) is int and number >= 0]
+            if len(whole) < 3 or not level.isdecimal() or int(level) >= levels or whole[0] >= len(files):
+                raise DataError(
+                    f"{path}: a node has {place!r:.80} in level {level!r:.20}; expected file, offset and count of "
+                    f"{levels} levels and {len(files)} files"
+                )
+    assert isinstance(found, dict)
+    return found
+
+
+def nodes_of(manifest: dict[str, Any], path: str | Path) -> list[dict[str, Any]]:
+    """The nodes that have levels, in the order of the tree.
+
+    Raises:
+        DataError: something else in the tree.
+    """
+    found, waiting = [], [manifest.get("tree")]
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, dict) and isinstance(node.get("lods"), dict):
+            found.append(node)
+        elif isinstance(node, dict) and isinstance(node.get("children"), list):
+            waiting += reversed(node["children"])
+        else:
+            raise DataError(f"{path}: its tree has {node!r:.80}; expected nodes with children or lods")
+    return found
+
+
+def facts_of(path: str | Path) -> dict[str, Any]:
+    """What `vvgt info` says of it: of each level Gaussians and nodes, and bytes and errors where vvgt wrote it.
+
+    Raises:
+        DataError: as `read_manifest`.
+    """
+    manifest = read_manifest(path)
+    nodes, said = nodes_of(manifest, path), manifest.get("vvgt")
+    facts = said.get("levels") if isinstance(said, dict) else None
+    levels = []
+    for level in range(manifest["lodLevels"]):
+        places = [node["lods"][str(level)] for node in nodes if str(level) in node["lods"]]
+        row = {"level": level, "nodes": len(places), "gaussians": sum(place["count"] for place in places)}
+        if isinstance(facts, list) and level < len(facts) and isinstance(facts[level], dict):
+            row |= {key: facts[level].get(key) for key in ("files", "bytes", "rms", "spread")}
+        levels.append(row)
+    asset = manifest.get("asset")
+    return {
+        "written_by": asset.get("generator") if isinstance(asset, dict) else None,
+        "files": len(manifest["filenames"]),
+        "nodes": len(nodes),
+        "levels": levels,
+    }
+
+
+def placed(manifest: dict[str, Any]) -> tuple[Splats, float]:
+    """A stand-in with the comments of the file, for where the page's camera begins, and by what its frame is larger."""
+    said = manifest.get("vvgt")
+    said = said if isinstance(said, dict) else {}
+    scale, lines = said.get("scale"), said.get("comments")
+    comments = tuple(str(line) for line in lines) if isinstance(lines, list) else ()
+    tree = manifest["tree"].get("bound")
+    corners = np.array([[-1.0] * 3, [1.0] * 3])
+    if not comments and isinstance(tree, dict):
+        with suppress(KeyError, TypeError, ValueError):
+            corners = np.array([tree["min"], tree["max"]], np.float64).reshape(2, 3)
+    empty = np.zeros((2, 3), np.float32)
+    turned = np.tile(np.array([1, 0, 0, 0], np.float32), (2, 1))
+    splats = Splats(corners.astype(np.float32), empty, turned, empty[:, 0], empty, np.zeros((2, 0, 3)), comments)
+    return splats, float(scale) if comments and isinstance(scale, (int, float)) and 0 < scale < 1e6 else 1.0
