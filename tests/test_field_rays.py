@@ -210,40 +210,10 @@ def test_what_blocks_cannot_do_is_a_line(vvgt, tmp_path):
     path = tmp_path / "v_100x90x80_uint8.raw"
     path.write_bytes(bytes(720000))
     for command, options, word in (
-        ("init", ("--levels", "2", "--light", "headlight", "-o", tmp_path / "a.ply"), "unlit"),
+        ("init", ("--light", "headlight", "-o", tmp_path / "a" / "lod-meta.json"), "unlit"),
         ("init", ("--shard", "1/2", "--init", "wavelet", "-o", tmp_path / "a"), "unlit"),
         ("render-views", ("--blocks", "32", "--renderer", "vtk", "-o", tmp_path / "v"), "needs the whole volume"),
     ):
         run = vvgt(command, path, *options)
         assert run.code == 2, run.err
         assert word in run.err
-
-
-def test_levels_are_cuts_of_one_pyramid_with_an_index(vvgt, tmp_path):
-    path = tmp_path / "v_100x90x80_uint8.raw"
-    path.write_bytes(np.round(bodies() * 255).astype(np.uint8).tobytes())
-    out = tmp_path / "a.ply"
-    assert vvgt("init", path, "-o", out, *FIT, "--levels", "3").code == 0
-    index = json.loads((tmp_path / "a-levels.json").read_text())
-    assert (index["format"], index["size"]) == ("vvgt-levels", 150)
-    assert [level["file"] for level in index["levels"]] == ["a.ply", "a-1.ply", "a-2.ply"]
-    counts = [len(read_ply(tmp_path / level["file"])[0]) for level in index["levels"]]
-    assert counts == [level["gaussians"] for level in index["levels"]]
-    assert counts[0] / 4 * 0.9 < counts[1] <= counts[0] / 4
-    assert [(tmp_path / level["file"]).stat().st_size for level in index["levels"]] == [
-        level["bytes"] for level in index["levels"]
-    ]
-    psnr = [level["psnr"] for level in index["levels"]]
-    assert psnr[0] > psnr[1] > psnr[2] > psnr[0] - 20
-    alone = ("--max-gaussians", str(counts[0] // 4), "--size", "150", "-q", "--blocks", "32")
-    folder = tmp_path / "v.blocks"
-    assert vvgt("init", path, "-o", folder, *FIT, "--shard", "1/1", "--blocks", "32").code == 0
-    assert vvgt("merge", folder, "-o", tmp_path / "m.ply", "--levels", "3", "-q").code == 0
-    for level in ("", "-1", "-2"):
-        assert (tmp_path / f"m{level}.ply").read_bytes() == (tmp_path / f"a{level}.ply").read_bytes()
-    again = vvgt("init", path, "-o", tmp_path / "b.ply", *alone)
-    assert again.code == 0
-    assert len(read_ply(tmp_path / "b.ply")[0]) == pytest.approx(counts[1], rel=0.1)
-    assert vvgt("init", path, "-o", out, *FIT, "--levels", "3").code == 2  # they exist
-    assert vvgt("init", path, "-o", "-", *FIT, "--levels", "3").code == 2
-    assert vvgt("init", path, "-o", folder, *FIT, "--levels", "3", "--shard", "1/2").code == 2

@@ -248,11 +248,10 @@ class TestEitherWay:
         base = ("init", "scalars.nii", "--tf", "lit.json", "--size", "64", "--max-gaussians", "100", *blocks)
         assert vvgt(*base, "-o", tmp_path / "x.ply").code == 0
         assert read_ply(tmp_path / "x.ply")[1].light.ambient == 0.3
-        refused = vvgt(*base, "--levels", "2", "-o", tmp_path / "y.ply")
+        refused = vvgt(*base, "-o", tmp_path / "y" / "lod-meta.json")
         assert refused.code == 2
         assert "--light none turns off that of the function's file" in refused.error
-        assert vvgt(*base, "--levels", "2", "--light", "none", "-o", tmp_path / "y.ply").code == 0
-        assert read_ply(tmp_path / "y.ply")[1].light is None
+        assert vvgt(*base, "--light", "none", "-o", tmp_path / "y" / "lod-meta.json").code == 0
 
     @pytest.mark.parametrize("row", ["function", "shadows", "labels, lit", "colours"])
     def test_views_for_trainers(self, vvgt, at, tmp_path, blocks, row):

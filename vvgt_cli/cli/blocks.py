@@ -65,12 +65,8 @@ _shard_option = {
     ),
 }  # fmt: skip
 block_options = group("blocks", **_options)
-levels_option = click.option(
-    "--levels", type=click.IntRange(1, 8), default=1, show_default=True, metavar="N",
-    help="Levels of detail to write: OUT-1.ply, ... with a quarter of the Gaussians each, and OUT-levels.json.",
-)  # fmt: skip
-shared_block_options = group("blocks", **_options, **_shard_option, levels=levels_option)
-ONE = ("workers", "levels")  # options that are 1 where they are not given
+shared_block_options = group("blocks", **_options, **_shard_option)
+ONE = ("workers",)  # options that are 1 where they are not given
 
 
 def asked_for(blocks: dict[str, Any]) -> bool:

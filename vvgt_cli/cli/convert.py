@@ -71,6 +71,7 @@ def command(
     --time-budget and --max-size decide which stages run. Ctrl-C ends gradient descent early and writes the result.
 
     OUT.ply may end in .html (a page that opens in a browser), .spz, .compressed.ply, .sog, .glb or .usdc.
+    FOLDER/lod-meta.json writes levels of detail that viewers load as they are needed.
 
     For a time series, VOLUME is a glob or a file with several time steps, and OUT.ply has a place for the number, such
     as {:04d}. All frames share one function and value range; run the command again to resume. A name ending in
@@ -81,6 +82,7 @@ def command(
       vvgt convert example:frog -o frog.ply --preview frog.png
       vvgt convert head.nrrd --tf bone.json -o head.ply --max-gaussians 50000 --steps 200
       vvgt convert head.nrrd --tf bone.json -o head.ply --time-budget 10
+      vvgt convert huge.zarr -o huge/lod-meta.json --max-gaussians 10000000
       vvgt convert head.nrrd --tf bone.json -o head.ply --target-psnr 35 --max-size 5
       vvgt convert - --dims 64 64 93 --dtype uint16 -o - < head.raw > head.ply
       vvgt convert 'run_*.vti' --tf tf.json -o 'out_{:04d}.ply'

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import click
 
-from vvgt_cli.cli.blocks import levels_option
 from vvgt_cli.cli.options import common_options, overwrite_option
 from vvgt_cli.progress import Console
 
 
 @click.command("merge", short_help="Merge the blocks of 'init --shard' into a .ply.")
 @click.argument("folder")
-@click.option("-o", "--output", required=True, metavar="OUT.ply", help="Output file; - is standard output.")
-@levels_option
+@click.option(
+    "-o", "--output", required=True, metavar="OUT.ply",
+    help="Output file, or FOLDER/lod-meta.json for streamed levels; - is standard output.",
+)  # fmt: skip
 @overwrite_option
 @common_options
-def command(folder: str, output: str, levels: int, overwrite: bool, console: Console) -> None:
+def command(folder: str, output: str, overwrite: bool, console: Console) -> None:
     """Merge the blocks that 'vvgt init --shard I/N' has written to FOLDER into a .ply.
 
     The volume is no longer needed. FOLDER is left unchanged.
@@ -23,7 +24,8 @@ def command(folder: str, output: str, levels: int, overwrite: bool, console: Con
     \b
     Example:
       vvgt merge huge.blocks -o huge.ply
+      vvgt merge huge.blocks -o huge/lod-meta.json
     """
     from vvgt_cli.conversion.shards.run import merge
 
-    merge(folder, output, overwrite, console, levels)
+    merge(folder, output, overwrite, console)

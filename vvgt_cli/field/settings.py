@@ -31,7 +31,6 @@ class BlockOptions:
         scheduler: "local", "slurm" or the address of a Dask scheduler; None: without Dask.
         shard: part (from 1) and count of a job array, None for the whole.
         level: of a file of several resolutions: a number, "full", or None: the one that matches the screen.
-        levels: of detail that are written.
     """
 
     size: int | None = None
@@ -39,7 +38,6 @@ class BlockOptions:
     scheduler: str | None = None
     shard: tuple[int, int] | None = None
     level: int | str | None = None
-    levels: int = 1
 
     def __post_init__(self) -> None:
         if self.size is not None and (self.size < SMALLEST or self.size & (self.size - 1)):

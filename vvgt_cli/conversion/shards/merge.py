@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
-from typing import IO, TYPE_CHECKING, Any, NamedTuple
+from typing import IO, TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from vvgt_cli.conversion.request import VERTEX_BYTES
-from vvgt_cli.conversion.shards.levels import PART, level_name, write_index
 from vvgt_cli.conversion.shards.plan import Plan
 from vvgt_cli.conversion.shards.score import drawing_bytes, score_gaussians, score_text
 from vvgt_cli.conversion.shards.streamed import write_streamed
@@ -43,10 +41,8 @@ BATCH = 1 << 16  # Gaussians that are made at once
 SCRATCH = "scores"
 
 
-def write_merged(run: Run, parts: Parts, output: str, overwrite: bool, levels: int = 1) -> None:
+def write_merged(run: Run, parts: Parts, output: str, overwrite: bool) -> None:
     """Cut the pyramid over all parts for the plan's budget and write it; fills the report in.
-
-    With ``levels`` above 1 also for parts of the budget, each into a file of its own, and an index.
 
     Raises:
         DataError: parts are missing or damaged, or nothing is visible.
@@ -63,20 +59,11 @@ def write_merged(run: Run, parts: Parts, output: str, overwrite: bool, levels: i
     if is_streamed(output):
         write_streamed(run, Cut(forest, opaque, plan), output, overwrite)
         return
-    written: list[dict[str, Any]] = []
-    for level in range(levels):
-        budget = max(written[0]["gaussians"] // PART**level, 1) if level else plan.budget
-        cut = Cut(forest, opaque, replace(plan, budget=budget))
-        written.append(_level(run, parts, cut, level_name(output, level), overwrite))
-    report.gaussians, report.bytes, report.scores = (written[0][key] for key in ("gaussians", "bytes", "scores"))
-    if levels > 1:
-        for row in written:
-            row["psnr"] = (row.pop("scores") or {}).get("psnr")
-        write_index(output, plan.size, written, overwrite)
+    _write_ply(run, parts, Cut(forest, opaque, plan), output, overwrite)
 
 
-def _level(run: Run, parts: Parts, cut: Cut, output: str, overwrite: bool) -> dict[str, Any]:
-    """One file: its name, how many Gaussians and bytes it has, and its scores, None where it is not drawn."""
+def _write_ply(run: Run, parts: Parts, cut: Cut, output: str, overwrite: bool) -> None:
+    """One file; how many Gaussians and bytes it has, and its scores where it is drawn, into the report."""
     plan, size = cut.plan, cut.plan.size
     with run.stage("write") as stage, _sink(parts, output, overwrite) as sink:
         made, spared = _write(cut, sink, output)
@@ -87,15 +74,14 @@ def _level(run: Run, parts: Parts, cut: Cut, output: str, overwrite: bool) -> di
             stage.note += f", no more: {base} cells that the screen, or {plan.budget} Gaussians, have use for"
     if spared:
         run.leave_out(f"{spared} Gaussians", "so faint that viewers differ on what they draw of them")
-    scores = None
+    run.report.gaussians, run.report.bytes = count, written
     if made.batches is None:
         need = drawing_bytes(count, size)
         run.leave_out("test views", f"{count} Gaussians at once need about {need / 2**30:.1f} GiB of memory")
     else:
         with run.stage("test views") as stage:
             found = score_gaussians(together(made.batches), parts, plan, plan.ply.rule or INRIA)
-            scores, stage.note = asdict(found), score_text(found, size)
-    return {"file": os.path.basename(output), "gaussians": count, "bytes": written, "scores": scores}
+            run.report.scores, stage.note = asdict(found), score_text(found, size)
 
 
 def pyramid(parts: Parts, plan: Plan) -> tuple[Forest, Opaque]:

@@ -10,7 +10,6 @@ from pathlib import Path
 from vvgt_cli.conversion.convert import ply_options
 from vvgt_cli.conversion.place import remarks
 from vvgt_cli.conversion.request import ConvertRequest
-from vvgt_cli.conversion.shards.levels import level_outputs
 from vvgt_cli.conversion.shards.merge import write_merged
 from vvgt_cli.conversion.shards.plan import Plan, disk_bytes, most_cells
 from vvgt_cli.conversion.shards.score import scored_views
@@ -36,17 +35,17 @@ def streams(request: ConvertRequest) -> bool:
     """Whether a closed form in blocks is written batch by batch, without its Gaussians in memory at once."""
     options, lit = request.blocks, _lit(request.source)
     if is_streamed(request.output):
-        if lit or request.fit.init != "vbm" or (options is not None and (options.levels > 1 or options.shard)):
+        if lit or request.fit.init != "vbm" or (options is not None and options.shard):
             raise UsageError(
                 f"-o {request.output} is made of unlit moments: leave out --light (--light none turns off that of the "
-                "function's file), --init, --levels and --shard (docs/scale.md)"
+                "function's file), --init and --shard, whose blocks 'vvgt merge' takes (docs/scale.md)"
             )
         return True
     other = request.fit.init != "vbm" or bool(request.output and options is not None and format_of(request.output))
-    if options is not None and (options.shard is not None or options.levels > 1):
+    if options is not None and options.shard is not None:
         if lit or other:
             raise UsageError(
-                "--levels and --shard write .ply files of unlit moments: leave out --light (--light none turns off "
+                "--shard writes blocks of unlit moments: leave out --light (--light none turns off "
                 "that of the function's file), --init and other formats, or convert it as a whole (docs/scale.md)"
             )
         return True
@@ -78,12 +77,12 @@ def init_in_blocks(request: ConvertRequest, console: Console | None = None) -> C
         _shard(run, request, options, Parts(Path(request.output).absolute()))
         return run.finish()
     with (
-        _written(request.output, options.levels, request) as outputs,
+        _written(request.output, request) as outputs,
         claimed(outputs, request.inputs(), request.overwrite),
         beside(request.output) as parts,
     ):
         make_parts(run, request, options, parts)
-        write_merged(run, parts, request.output or STDOUT, request.overwrite, options.levels)
+        write_merged(run, parts, request.output or STDOUT, request.overwrite)
         run.finish()
         if request.report:
             write_text(request.report, run.report.to_json(), request.overwrite)
@@ -91,10 +90,8 @@ def init_in_blocks(request: ConvertRequest, console: Console | None = None) -> C
     return run.report
 
 
-def merge(
-    folder: str, output: str, overwrite: bool = False, console: Console | None = None, levels: int = 1
-) -> ConversionReport:
-    """Make a `.ply`, or one of each of ``levels`` of detail, of the blocks that shards have left in a folder.
+def merge(folder: str, output: str, overwrite: bool = False, console: Console | None = None) -> ConversionReport:
+    """Make a `.ply`, or streamed SOG, of the blocks that shards have left in a folder.
 
     Raises:
         UsageError: not such a folder, or an output that may not be written.
@@ -103,30 +100,28 @@ def merge(
     run = Run(console or Console(), ConversionReport("merge"))
     parts = Parts(Path(folder))
     parts.settings()
-    with _written(output, levels) as outputs, claimed(outputs, [], overwrite):
-        write_merged(run, parts, output, overwrite, levels)
+    with _written(output) as outputs, claimed(outputs, [], overwrite):
+        write_merged(run, parts, output, overwrite)
     return run.finish()
 
 
 @contextmanager
-def _written(output: str | None, levels: int, request: ConvertRequest | None = None) -> Iterator[list[Output]]:
+def _written(output: str | None, request: ConvertRequest | None = None) -> Iterator[list[Output]]:
     """What will be written; the folder of a streamed SOG is made."""
     if output is not None and is_streamed(output):
         more = [] if request is None else replace(request, output=None).outputs()
         with folder_of(output):
             yield [Output("-o", output), *more]
     elif request is not None:
-        yield [*request.outputs(), *level_outputs(output, levels)]
+        yield request.outputs()
     else:
-        yield [Output("-o", output or STDOUT, (".ply",), splats=True), *level_outputs(output, levels)]
+        yield [Output("-o", output or STDOUT, (".ply",), splats=True)]
 
 
 def _refuse(request: ConvertRequest, options: BlockOptions) -> None:
     """What does not go together."""
     if options.shard is not None and options.scheduler is not None:
         raise UsageError("--shard and --scheduler both share the blocks out; give one of them")
-    if options.shard is not None and options.levels > 1:
-        raise UsageError("--levels: a shard leaves blocks; give it to 'vvgt merge'")
     if options.shard is not None and (request.output in (None, STDOUT) or request.report):
         raise UsageError("--shard: -o is a folder of blocks then, there is no --report; 'vvgt merge' makes the .ply")
 

@@ -22,6 +22,7 @@ from vvgt_cli.conversion.shards.streamed_files import Files, Level
 from vvgt_cli.errors import UsageError
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import Gaussians, PlyOptions
+from vvgt_cli.gaussians.formats.page_file import upright
 from vvgt_cli.gaussians.formats.splats import Splats, splats_of
 from vvgt_cli.gaussians.frames import transform
 from vvgt_cli.gaussians.header import comment_lines
@@ -90,7 +91,7 @@ def _node(
     cut: Cut, files: Files, levels: list[Level], made: list[Gaussians], spreads: list[np.ndarray]
 ) -> dict[str, Any]:
     """Put a node into the files; its entry in the manifest."""
-    axes, options = np.array(cut.plan.axes).reshape(3, 3), replace(cut.plan.ply, sh_degree=0, comments=False)
+    axes, options = np.array(cut.plan.axes).reshape(3, 3), replace(upright(cut.plan.ply), sh_degree=0, comments=False)
     lods, low, high = {}, np.full(3, np.inf), np.full(3, -np.inf)
     for level, gaussians, spread in zip(levels, made, spreads, strict=True):
         splats = _scaled(gaussians, axes, options)
@@ -118,7 +119,7 @@ def _manifest(
 ) -> dict[str, Any]:
     low = np.min([node["bound"]["min"] for node in nodes], axis=0)
     high = np.max([node["bound"]["max"] for node in nodes], axis=0)
-    comments = [line.removeprefix("comment ") for line in comment_lines(cut.plan.ply)]
+    comments = [line.removeprefix("comment ") for line in comment_lines(upright(cut.plan.ply))]
     facts = [
         {
             "gaussians": level.gaussians,
