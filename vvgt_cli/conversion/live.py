@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vvgt_cli.cameras import default_views
+from vvgt_cli.cameras.sets import pixel_width
+from vvgt_cli.closed_form.columns import MASS
 from vvgt_cli.conversion.live_labels import carrying_labels, fog_of_labels, label_facts, labels_of
 from vvgt_cli.conversion.place import out_of_box
 from vvgt_cli.conversion.recolored import lit_by, looked_up
@@ -23,7 +24,7 @@ from vvgt_cli.conversion.stages.refinement import SMALLEST
 from vvgt_cli.errors import NothingVisible, UsageError
 from vvgt_cli.field.field import Field
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored
-from vvgt_cli.gaussians.live import LENGTH, SHORTEST, Table, baked, lengths
+from vvgt_cli.gaussians.live import LENGTH, Table, baked, lengths
 from vvgt_cli.gaussians.live_facts import GRADIENT, LiveFacts
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.lighting import Lighting
@@ -33,6 +34,7 @@ from vvgt_cli.score.views import psnr_note, score_test_views
 from vvgt_cli.volume.types import triple
 
 if TYPE_CHECKING:
+    from vvgt_cli.closed_form import Start
     from vvgt_cli.field.source import Source
 
 
@@ -95,9 +97,10 @@ def live_conversion(
         gaussians = carrying(run, foggy, placed_by(run, foggy, request))
     gaussians = wide_enough(gaussians, fit.size)
     table = looked_up(facts, tf, source.unit_distance * source.volume.unit_frame().scale)
-    gaussians = as_stored(lit(baked(gaussians, table), lighting))
+    pixel = pixel_width(fit.size)
+    gaussians = as_stored(lit(baked(gaussians, table, pixel), lighting))
     if scored:
-        _score(run, request, field, gaussians, lit_by(gaussians, table, lighting))
+        _score(run, request, field, gaussians, lit_by(gaussians, table, lighting, pixel))
     ply = replace(ply, live=facts)
     return Conversion(out_of_box(gaussians, source.volume), run.report, ply, field)
 
@@ -147,7 +150,7 @@ def table_of(source: Source) -> Table:
     return Table.of_function(tf, numbers.lo, numbers.hi, source.unit_distance * source.volume.unit_frame().scale)
 
 
-def placed_by(run: Run, field: Field, request: ConvertRequest) -> Gaussians:
+def placed_by(run: Run, field: Field, request: ConvertRequest) -> Start:
     """The closed form of the fog.
 
     Raises:
@@ -161,17 +164,19 @@ def placed_by(run: Run, field: Field, request: ConvertRequest) -> Gaussians:
         if not len(start.gaussians):
             raise NothingVisible(field.source.volume.name, field.source.name)
         stage.note = f"{len(start.gaussians)} Gaussians of what may be shown"
-    return start.gaussians
+    return start
 
 
-def carrying(run: Run, field: Field, gaussians: Gaussians) -> Gaussians:
+def carrying(run: Run, field: Field, start: Start) -> Gaussians:
     """Gaussians of a field's look with the values under them, without those that have none."""
+    assert start.leaves is not None
     with run.stage("values") as stage:
-        values = field.under(gaussians)
+        values = field.under(start.gaussians)
         known = np.flatnonzero(np.isfinite(values).all(axis=1))
-        gaussians, values = gaussians.take(known), values[known]
+        gaussians, values, leaves = start.gaussians.take(known), values[known], start.leaves.take(known)
         tau = table_of(field.source).at(values[:, 0], values[:, 1])[:, 3]
-        live = np.insert(values, LENGTH, lengths(gaussians, tau), axis=1)
+        length = lengths(leaves.moments[:, MASS], tau, leaves.edge.prod(axis=1))
+        live = np.insert(values, LENGTH, length, axis=1)
         span = field.source.overall.hi - field.source.overall.lo
         stage.note = f"mean spread {100 * float(values[:, 1].mean()) / (span or 1):.1f} % of the range"
     return replace(gaussians, live=live, harmonics=None)
@@ -179,10 +184,6 @@ def carrying(run: Run, field: Field, gaussians: Gaussians) -> Gaussians:
 
 def wide_enough(gaussians: Gaussians, size: int) -> Gaussians:
     """None narrower than `SMALLEST` px of the screen: viewers leave such out. Their mass stays."""
-    assert gaussians.live is not None
-    camera = default_views("check", 1, size=size)[0]
-    pixel = float(np.linalg.norm(camera.position)) / camera.fx
-    widening = np.maximum(SMALLEST * pixel / np.exp(gaussians.log_scales.max(axis=1).astype(np.float64)), 1)
-    live = gaussians.live.copy()
-    live[:, 2] = np.maximum(live[:, 2] / widening**2, SHORTEST)
-    return replace(gaussians, log_scales=gaussians.log_scales + np.log(widening)[:, None], live=live)
+    least = np.log(SMALLEST * pixel_width(size))
+    widening = np.maximum(least - gaussians.log_scales.max(axis=1).astype(np.float64), 0)
+    return replace(gaussians, log_scales=gaussians.log_scales + widening[:, None])

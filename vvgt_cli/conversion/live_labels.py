@@ -6,6 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from vvgt_cli.closed_form import Start
+from vvgt_cli.closed_form.columns import MASS
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.field.field import Field
 from vvgt_cli.field.source import Source
@@ -54,18 +56,20 @@ def fog_of_labels(field: Field, labels: tuple[Label, ...]) -> Field:
     return field.labelled_by([label_fog(layer.tf, {e.number: voxels.get(float(e.number), 0) for e in labels})])
 
 
-def carrying_labels(run: Run, field: Field, gaussians: Gaussians, labels: tuple[Label, ...]) -> Gaussians:
+def carrying_labels(run: Run, field: Field, start: Start, labels: tuple[Label, ...]) -> Gaussians:
     """Gaussians of the fog with the rows of their labels, without those that lie in none."""
     from vvgt_cli.closed_form.labelled import labelled
 
+    assert start.leaves is not None
     frame, source = field.source.volume.unit_frame(), field.source
     with run.stage("labels") as stage:
         maps = [(source.layers[0].volume, [label.number for label in labels])]
-        owner, gradient = labelled(gaussians, maps, np.array(frame.half), np.array(frame.step))
+        owner, gradient = labelled(start.gaussians, maps, np.array(frame.half), np.array(frame.step))
         known = np.flatnonzero(owner >= 0)
-        gaussians, owner, gradient = gaussians.take(known), owner[known], gradient[known]
-        tau = float(extinction(np.array(THIN), 2 * UNIT_SHARE))
-        length = lengths(gaussians, np.full(len(gaussians), tau))
+        gaussians, leaves = start.gaussians.take(known), start.leaves.take(known)
+        owner, gradient = owner[known], gradient[known]
+        tau = extinction(np.full(len(known), THIN), 2 * UNIT_SHARE)
+        length = lengths(leaves.moments[:, MASS], tau, leaves.edge.prod(axis=1))
         live = np.column_stack([np.zeros((len(owner), 2)), length, gradient, owner])
         stage.note = f"{len(np.unique(owner))} of {len(labels)} labels have Gaussians"
     return replace(gaussians, live=live, harmonics=None)

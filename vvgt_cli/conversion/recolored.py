@@ -6,11 +6,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from vvgt_cli.cameras.sets import SIZE, pixel_width
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions
+from vvgt_cli.gaussians.constants import MIN_ALPHA
 from vvgt_cli.gaussians.header import FileFacts
 from vvgt_cli.gaussians.live import Palette, Table, seen_under, shown_by
 from vvgt_cli.gaussians.live_facts import GRADIENT, LiveFacts
+from vvgt_cli.gaussians.ply import opacity
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.labels import LabelTable, distinct
 from vvgt_cli.look.lighting import Lighting, LightOptions
@@ -49,7 +52,7 @@ def under_function(
     assert facts.scale is not None
     assert options.unit_distance is not None
     table = looked_up(facts.live, tf, options.unit_distance * facts.scale)
-    found = lit_by(gaussians, table, options.light)
+    found = lit_by(gaussians, table, options.light, pixel_width(options.made_for or SIZE))
     if not len(found):
         raise DataError(f"{tf.name}: not one of {len(gaussians)} Gaussians is visible; try another function")
     return found
@@ -67,16 +70,21 @@ def looked_up(facts: LiveFacts, tf: TransferFunction | LabelTable, unit_distance
     return Palette.of_labels([entries[label.number] for label in facts.labels], unit_distance)
 
 
-def lit_by(gaussians: Gaussians, table: Table | Palette, lighting: Lighting | None) -> Gaussians:
-    """An ordinary cloud: what is visible of Gaussians that carry values, under a light in their frame."""
-    seen = gaussians.take(seen_under(gaussians, table))
+def lit_by(gaussians: Gaussians, table: Table | Palette, lighting: Lighting | None, pixel: float) -> Gaussians:
+    """An ordinary cloud: what is visible of Gaussians that carry values, under a light in their frame.
+
+    ``pixel``: as for `shown_by`.
+    """
+    seen = gaussians.take(seen_under(gaussians, table, pixel))
     assert seen.live is not None
-    found = shown_by(seen, table)
+    found = shown_by(seen, table, pixel)
+    there = np.flatnonzero(opacity(found) >= MIN_ALPHA)
+    found, gradient = found.take(there), seen.live[there, GRADIENT]
     if lighting is None:
         return found
     from vvgt_cli.closed_form.relit import relit
 
-    return relit(found, seen.live[:, GRADIENT], lighting)
+    return relit(found, gradient, lighting)
 
 
 def placed_function(

@@ -11,6 +11,7 @@ import numpy as np
 
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.cameras.blocks import Blocks
+from vvgt_cli.cameras.sets import pixel_width
 from vvgt_cli.dvr.layout import Light
 from vvgt_cli.dvr.render import Box as Frame
 from vvgt_cli.dvr.render import Rays, RenderSettings, for_thin
@@ -151,7 +152,7 @@ class Blocked:
 
     def cells(self, size: int, budget: int, most: int | None = None) -> CellBlocks:
         """The pass over base cells for images of ``size`` px; at most ``most`` cells, None: as many as memory holds."""
-        from vvgt_cli.closed_form.closed_form import finest_level, level_within, most_cells, pixel_width
+        from vvgt_cli.closed_form.closed_form import finest_level, level_within, most_cells
         from vvgt_cli.closed_form.moments import blocks, exponents
         from vvgt_cli.field.grid import TILE_BITS
 

@@ -187,7 +187,8 @@ def _reader(source: Source, access: Counted) -> tuple[Reader, float]:
 
 def _at_level(read: ReadOptions, path: str, options: BlockOptions, size: int) -> tuple[ReadOptions, str | None]:
     """The level of a file of several: as asked for, else the coarsest whose voxels the screen cannot tell apart."""
-    from vvgt_cli.closed_form.closed_form import MIN_CELL, pixel_width
+    from vvgt_cli.cameras.sets import pixel_width
+    from vvgt_cli.closed_form.closed_form import MIN_CELL
     from vvgt_cli.volume.levels import level_shapes
 
     shapes = level_shapes(path, read)
