@@ -111,8 +111,9 @@ def test_a_look_turns_with_its_gaussians() -> None:
     assert some.live is not None
     fine = replace(some, live=np.where(np.arange(6) == 2, 1e-5, some.live))
     shear = np.array([[1.0, 0.3, 0.0], [0.0, 0.8, 0.1], [0.0, 0.0, 1.2]])
+    mirrored = -np.eye(3)
     for of, change in (
-        (some, lambda g: turn(g, "x")), (fine, lambda g: transform(g, shear)), (some, lambda g: transform(g, -np.eye(3)))
+        (some, lambda g: turn(g, "x")), (fine, lambda g: transform(g, shear)), (some, lambda g: transform(g, mirrored))
     ):  # fmt: skip
         before, after = change(shown_by(of, table)), shown_by(change(of), table)
         np.testing.assert_allclose(after.means, before.means, atol=2e-5)

@@ -155,7 +155,8 @@ def test_the_pages_program_shows_gaussians_as_we_do(tf: TransferFunction, tmp_pa
         shutil.copy(page / name, tmp_path / name)
     (tmp_path / "cloud.mjs").write_text("export const around = () => [];\n")  # without the engine, which it is of
     (tmp_path / "run.mjs").write_text(
-        "import { sumsOf } from './live_table.mjs';\nimport { looksOf } from './live_at.mjs';\nimport fs from 'node:fs';\n"
+        "import { sumsOf } from './live_table.mjs';\nimport { looksOf } from './live_at.mjs';\n"
+        "import fs from 'node:fs';\n"
         "const { live, bytes, centers, arms } = JSON.parse(fs.readFileSync('given.json'));\n"
         "const look = looksOf({ live, bytes, count: centers.length, sums: sumsOf(live.nodes, live), plane: null });\n"
         "const found = centers.map((center, i) => look(i, { center, arms: arms[i] }));\n"

@@ -295,7 +295,8 @@ def test_a_link_restores_labels_light_and_cut(person: Person, tmp_path: Path) ->
         f"(() => {{ {AXIS}.selectedIndex = 1; {AXIS}.dispatchEvent(new Event('change')) }})()",
         f"(() => {{ const s = {AXIS}.nextElementSibling; s.value = 300; s.dispatchEvent(new Event('input')) }})()",
         "document.querySelector('#live li:nth-child(2) .eye').click()",
-        "(({ key, state, set }) => set({ ...state(), kind: 'headlight', from: [0, 0, 1] }))(window.vvgt.live.parts[1])",
+        "(({ state, set }) => set({ ...state(), kind: 'headlight', from: [0, 0, 1] }))"
+        "(window.vvgt.live.parts.find((part) => part.key === 'light'))",
     ):
         person("eval", change)
     states = "JSON.stringify(window.vvgt.live.parts.map((part) => part.state()), (key, x) => (x.toFixed?.(4) ?? x))"
