@@ -1,10 +1,10 @@
-// A Gaussian under the function: moved and thinned along the gradient, of the opacity of its mass (docs/live.md), and cut by a plane. The engine calls
-// modifySplatCenter first. A cut Gaussian becomes the one of the same mean and variance as its part that stays.
+// A Gaussian under the function: moved and thinned along the gradient, of the opacity of its mass (docs/live.md), and cut by planes. The engine calls
+// modifySplatCenter first. A cut Gaussian becomes one of the mass and mean of its part that stays, no wider than that and up to the plane.
 uniform highp sampler2D vvgtTable;
 uniform highp sampler2D vvgtLabels;  // of a label map a column a label: red, green, blue, extinction; else one column
 uniform vec4 vvgtFacts;  // shortest log length, how far it goes, thinnest, spreads
 uniform vec3 vvgtOpaque;  // of the variance of what is opaque along its shortest axis, and along the others; variance of the screen's dilation
-uniform vec4 vvgtCut;  // dot(xyz, centre) <= w stays
+uniform vec4 vvgtCut[6];  // dot(xyz, centre) <= w of each stays; of none the normal is zero
 uniform vec4 vvgtLight;  // ambient, diffuse, specular, power; ambient < 0: unlit
 uniform vec4 vvgtToward;  // direction towards the light; with w = 1 it is at the eye
 uniform vec4 vvgtEye;  // its place, or with w = 1 the direction of parallel rays
@@ -96,11 +96,7 @@ void modifySplatCenter(inout vec3 center) {
   center += arm * (r * first);
   axes += outerProduct(arm * (thin - 1.0), along);
   vec3 place = center;
-<<<<<<< HEAD
-  float edge = exp(vvgtFacts.x + vvgtFacts.y * float(a.z) / 255.0), mass = tau * edge * edge * edge * vvgtCut3(center, axes);
-=======
-  float depth = tau * exp(vvgtFacts.x + vvgtFacts.y * float(a.z) / 255.0) * inversesqrt(thin) * vvgtCutAll(center, axes);
->>>>>>> main
+  float edge = exp(vvgtFacts.x + vvgtFacts.y * float(a.z) / 255.0), mass = tau * edge * edge * edge * vvgtCutAll(center, axes);
   vec3 color = vvgtLit(sums.rgb / tau, mat3(matrix_model) * gradient, place);
   for (int sweep = 0; sweep < 6; sweep++) {
     vvgtTurn(axes[0], axes[1]);
