@@ -109,9 +109,9 @@ void modifySplatCenter(inout vec3 center) {
   vvgtRotation = vvgtQuaternion(unit);
   float shortest = min(vvgtScale.x, min(vvgtScale.y, vvgtScale.z));
   vec3 opaque = mix(vec3(vvgtOpaque.y), vec3(vvgtOpaque.x), vec3(lessThanEqual(vvgtScale, vec3(shortest))));
-  vec3 variance = vvgtScale * vvgtScale * mix(opaque, vec3(1.0), exp(-tau * edge));
-  vvgtScale = sqrt(variance);
-  vvgtColor = sums.a < 1e-12 ? vec4(0.0) : vec4(color, vvgtPeak(mass, variance));
+  vec3 squares = vvgtScale * vvgtScale * mix(opaque, vec3(1.0), exp(-tau * edge));
+  vvgtScale = sqrt(squares);
+  vvgtColor = sums.a < 1e-12 ? vec4(0.0) : vec4(color, vvgtPeak(mass, squares));
 }
 void modifySplatRotationScale(vec3 original, vec3 modified, inout vec4 rotation, inout vec3 scale) {
   rotation = vvgtRotation;
