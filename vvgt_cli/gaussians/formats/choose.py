@@ -74,6 +74,8 @@ def encoded(known: Format, gaussians: Gaussians, options: PlyOptions, name: str)
     Raises:
         DataError: values that it cannot hold, a library or a program that is not installed, or fails.
     """
+    if known.suffix == ".html":
+        options = page_file.dated(options)
     if gaussians.live is not None and options.live is not None and known.live is not None:
         return known.live(gaussians, options, name)
     if gaussians.live is not None:
