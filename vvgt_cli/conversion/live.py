@@ -97,16 +97,23 @@ def live_conversion(
         gaussians = carrying(run, foggy, placed_by(run, foggy, request))
     gaussians = wide_enough(gaussians, fit.size)
     table = looked_up(facts, tf, source.unit_distance * source.volume.unit_frame().scale)
+<<<<<<< HEAD
     pixel = pixel_width(fit.size)
     gaussians = as_stored(lit(baked(gaussians, table, pixel), lighting))
     if scored:
         _score(run, request, field, gaussians, lit_by(gaussians, table, lighting, pixel))
+=======
+    gaussians = as_stored(lit(baked(gaussians, table), lighting))
+>>>>>>> main
     ply = replace(ply, live=facts)
+    if scored:
+        psnr = _score(run, request, field, gaussians, lit_by(gaussians, table, lighting))
+        ply = replace(ply, error=f"{psnr:.1f} dB live, on test views of {fit.size} px")
     return Conversion(out_of_box(gaussians, source.volume), run.report, ply, field)
 
 
-def _score(run: Run, request: ConvertRequest, field: Field, gaussians: Gaussians, shown: Gaussians) -> None:
-    """As `vvgt recolor` shows them under the function, and as other viewers do."""
+def _score(run: Run, request: ConvertRequest, field: Field, gaussians: Gaussians, shown: Gaussians) -> float:
+    """As `vvgt recolor` shows them under the function (dB, returned), and as other viewers do."""
     from vvgt_cli.dvr import RenderSettings
 
     fit, tf = request.fit, field.source.tf
@@ -120,6 +127,7 @@ def _score(run: Run, request: ConvertRequest, field: Field, gaussians: Gaussians
     work = Work(run, field, fit, gaussians=gaussians)
     for stage_of_scores in (TestViews(request.scored_whole), ViewingConditions()):
         stage_of_scores.run(work)
+    return live.psnr
 
 
 def in_box(source: Source) -> Lighting | None:
