@@ -97,17 +97,11 @@ def live_conversion(
         gaussians = carrying(run, foggy, placed_by(run, foggy, request))
     gaussians = wide_enough(gaussians, fit.size)
     table = looked_up(facts, tf, source.unit_distance * source.volume.unit_frame().scale)
-<<<<<<< HEAD
     pixel = pixel_width(fit.size)
     gaussians = as_stored(lit(baked(gaussians, table, pixel), lighting))
-    if scored:
-        _score(run, request, field, gaussians, lit_by(gaussians, table, lighting, pixel))
-=======
-    gaussians = as_stored(lit(baked(gaussians, table), lighting))
->>>>>>> main
     ply = replace(ply, live=facts)
     if scored:
-        psnr = _score(run, request, field, gaussians, lit_by(gaussians, table, lighting))
+        psnr = _score(run, request, field, gaussians, lit_by(gaussians, table, lighting, pixel))
         ply = replace(ply, error=f"{psnr:.1f} dB live, on test views of {fit.size} px")
     return Conversion(out_of_box(gaussians, source.volume), run.report, ply, field)
 
