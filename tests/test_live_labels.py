@@ -229,8 +229,6 @@ def test_what_labels_do_not_go_with(vvgt, label_file, tmp_path) -> None:
         assert (done.code, said in done.error) == (code, True), done.error
     done = vvgt("render", label_file, "--tf-range", "0,1", "--orbit", 1, "-o", tmp_path / "r")
     assert (done.code, "leave out --tf-range" in done.error) == (2, True), done.error
-    done = vvgt("convert", "example:blob:12", "--layer", "example:blob:12", "--live", "-o", tmp_path / "a.ply", *SMALL)
-    assert (done.code, "one scalar field, or one label map" in done.error) == (2, True)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["one.json", "t.json"]
 
 

@@ -68,7 +68,7 @@ class Cloud:
     @property
     def live(self) -> bool:
         """Whether they can be shown under any function."""
-        return self.gaussians.live is not None and self.options.live is not None
+        return self.gaussians.live is not None and self.options.live is not None and not self.options.live.others
 
     def file(self, suffix: str) -> Part:
         """As it is saved."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from vvgt_cli.closed_form import Start
 from vvgt_cli.closed_form.columns import MASS
-from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.errors import DataError
 from vvgt_cli.field.field import Field
 from vvgt_cli.field.source import Source
 from vvgt_cli.gaussians import Gaussians
@@ -27,15 +27,10 @@ def labels_of(source: Source) -> tuple[Label, ...]:
     """The labels of a source that Gaussians can belong to: hidden ones too, which other tables may show.
 
     Raises:
-        UsageError: anything but one label map.
         DataError: too many.
     """
     table = source.tf
-    if len(source.layers) > 1 or not isinstance(table, LabelTable):
-        raise UsageError(
-            f"{source.name}: channels, layers, colours, or segments that overlap; --live expects one scalar field, or "
-            "one label map: choose it with --component N, or leave out --live"
-        )
+    assert isinstance(table, LabelTable)
     found = tuple(label for label in table.labels if label.number != 0 or label.opacity > 0)
     if len(found) > MOST_LABELS:
         raise DataError(f"{source.name}: {len(found)} labels; expected at most {MOST_LABELS} with --live")

@@ -98,6 +98,7 @@ class Blocked:
         key: digest of all that it depends on.
         pictures: that are there, or are expected; by what they show.
         grid: of its cells, once they are there.
+        single: one of several layers: its source, what reads it, and about how many of its voxels are visible.
     """
 
     source: Source
@@ -108,6 +109,7 @@ class Blocked:
     key: str
     pictures: dict[str, tuple[Picture, np.ndarray | None]] = field(default_factory=dict)
     grid: CellGrid | None = None
+    single: Callable[[int], tuple[Source, Reader, float]] | None = None
 
     @cached_property
     def frame(self) -> Frame:
@@ -329,6 +331,11 @@ class Blocked:
         reader = replace(self.reader, layers=layers, optics=Optics.linear(top))
         own = [(e.number, e.color, e.opacity) for table in tables for e in table.labels]
         return self._beside(source, reader, reader.visible(), digest(self.key, own, source.unit_distance))
+
+    def alone(self, number: int) -> Blocked:
+        """See `Field`: as `shown_by`."""
+        assert self.single is not None
+        return self._beside(*self.single(number), digest(self.key, number))
 
     def _beside(self, source: Source, reader: Reader, visible: float, key: str) -> Blocked:
         """The field of another look, whose parts lie in a folder of their own, within that of this one."""

@@ -119,7 +119,13 @@ def blocked(run: Run, request: SourceRequest, options: BlockOptions, parts: Part
             reader, visible = _reader(source, access)
             shared = f", {runner.workers} workers" if runner.workers > 1 else ""
             stage.note = f"{describe_source(source)}; in blocks of {edge}{shared}"
-        yield Blocked(source, reader, do, edge, visible, digest(str(sorted(settings.items()))))
+        key = digest(str(sorted(settings.items())))
+
+        def single(number: int) -> tuple[Source, Reader, float]:
+            one = source.alone(number, access.statistics(source.layers[number].volume))
+            return one, *_reader(one, access)
+
+        yield Blocked(source, reader, do, edge, visible, key, single=single)
 
 
 def _edge(request: SourceRequest, options: BlockOptions) -> int:

@@ -76,6 +76,8 @@ def in_common(facts: Sequence[LiveFacts | None]) -> LiveFacts | None:
     first, *others = facts
     if first is None or any(one is None or bool(one.labels) != bool(first.labels) for one in others):
         return None
+    if any(one is not None and one.others for one in facts):
+        return None
     if first.labels:
         labels = {label.number: label for one in reversed(facts) if one is not None for label in one.labels}
         return replace(first, labels=tuple(labels[number] for number in sorted(labels)))
