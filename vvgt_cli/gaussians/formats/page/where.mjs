@@ -1,7 +1,7 @@
 // Where one is: the drawing over the picture (letters, scale bar, legend, ruler), its buttons and keys.
 import { fill, rowsOf } from './about.mjs';
 import { factsOf, shown, worldOf } from './facts.mjs';
-import { drawLegend } from './legend.mjs';
+import { drawLabels, drawLegend } from './legend.mjs';
 import { handlesOf } from './handles.mjs';
 import { lensOf } from './lens.mjs';
 import { frameParts, linkOf, liveParts, restore, viewParts } from './link.mjs';
@@ -89,12 +89,19 @@ export function where(viewer, scene, live, show) {
   });
   addEventListener('hashchange', () => restore(parts).then(again));
 
+  function legend(group, wide, high) {
+    const baked = live ? null : facts.legend, place = { right: wide - 12 - (high < 620 ? 44 : 0), bottom: high - 72 };
+    if (baked?.labels) return drawLabels(group, { ...baked, ...place, high });
+    if (baked) return drawLegend(group, { nodes: baked.nodes, live: baked, ...place });
+    return live && !live.labelled ? drawLegend(group, { nodes: live.nodes(), live: scene.live, ...place }) : null;
+  }
+
   function draw() {
     const wide = svg.clientWidth, high = svg.clientHeight, all = { lens, world, wide, high, ruler, left: LEFT };
     const group = element('g');
     state.letters = drawLetters(group, all);
     state.scale = drawScale(group, { ...all, left: LEFT + 96 });
-    state.legend = scene.live && !live.labelled ? drawLegend(group, { nodes: live.nodes(), live: scene.live, right: wide - 12 - (high < 620 ? 44 : 0), bottom: high - 72 }) : null;
+    state.legend = legend(group, wide, high);
     drawRuler(group, all);
     svg.replaceChildren(group);
     handles?.draw(world);
