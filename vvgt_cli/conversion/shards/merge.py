@@ -158,7 +158,6 @@ class Cut:
 
     def gaussians(self, threshold: float) -> Iterator[Gaussians]:
         """Those of the cells that a threshold leaves, in the box frame, as a file holds them, in batches."""
-<<<<<<< HEAD
         from vvgt_cli.field.forest import batches
 
         for leaves in batches(self.forest.leaves(threshold), BATCH):
@@ -186,9 +185,6 @@ class Cut:
 
     def made(self, leaves: Leaves) -> Gaussians:
         """Those of some cells, one each, in their order."""
-        from vvgt_cli.closed_form.closed_form import pixel_width
-=======
->>>>>>> main
         from vvgt_cli.closed_form.columns import MASS, SEEN
         from vvgt_cli.closed_form.shape import ROUND, cell_gaussians
         from vvgt_cli.closed_form.sharpen import sharpened
