@@ -13,6 +13,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from vvgt_cli.cameras.sets import SIZE, pixel_width
 from vvgt_cli.commands.converter import Converter, Failed, Made, Message, Progress, Said
 from vvgt_cli.commands.server import Part
 from vvgt_cli.conversion.gaussian_files import layout_of, open_gaussians
@@ -21,7 +22,7 @@ from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored, write_ply
 from vvgt_cli.gaussians.formats import SUFFIXES, encoded, format_of
 from vvgt_cli.gaussians.formats.gsply_files import compressed_ply
 from vvgt_cli.gaussians.formats.page_file import page, upright, waiting_page
-from vvgt_cli.gaussians.formats.page_live import HELD, light_sent, live_parts
+from vvgt_cli.gaussians.formats.page_live import light_sent, live_parts
 from vvgt_cli.gaussians.formats.splats import columns_of
 from vvgt_cli.gaussians.live import Table, baked
 from vvgt_cli.gaussians.live_facts import function_text
@@ -67,7 +68,7 @@ class Cloud:
     @property
     def live(self) -> bool:
         """Whether they can be shown under any function."""
-        return self.gaussians.live is not None and self.options.live is not None
+        return self.gaussians.live is not None and self.options.live is not None and not self.options.live.others
 
     def file(self, suffix: str) -> Part:
         """As it is saved."""
@@ -98,7 +99,8 @@ class Cloud:
             raise DataError("what is shown carries labels; expected no function")
         lighting = self.options.light if light is None else light_sent(light, self.options)
         table = Table.of_function(tf, facts.lo, facts.hi, distance * scale)
-        found = as_stored(lit(baked(self.gaussians, table), lighting))
+        pixel = pixel_width(self.options.made_for or SIZE)
+        found = as_stored(lit(baked(self.gaussians, table, pixel), lighting))
         facts = replace(facts, function=function_text(tf, facts.lo, facts.hi))
         options = replace(
             self.options, live=facts, unit_distance=distance, unit_distance_label="file", light=lighting,
@@ -138,10 +140,10 @@ def page_of(cloud: Cloud, converts: bool) -> dict[str, bytes]:
         file, name = stored(cloud.gaussians, cloud.options), "0.ply"
         splats, elements, more = columns_of(file, cloud.name), SCRIPT, {}
     else:
-        splats, planes, facts = live_parts(cloud.gaussians, cloud.options)
+        [splats], [planes], facts = live_parts([(cloud.gaussians, cloud.options)])
         file, name = compressed_ply(splats, cloud.name), "0.compressed.ply"
         held = base64.b64encode(planes).decode("ascii")
-        elements = f'<script type="{BYTES}" id="{HELD}">{held}</script>\n{SCRIPT}'
+        elements = f'<script type="{BYTES}" id="{facts["held"][0]}">{held}</script>\n{SCRIPT}'
         more = {"live": facts, "server": {"converts": converts, "name": cloud.name}}
     text = page(cloud.name, splats, [{"name": cloud.name, "file": name}], elements, more)
     return {"": text.encode("utf-8"), name: file}
