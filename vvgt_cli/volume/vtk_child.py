@@ -98,7 +98,7 @@ def run(request: dict[str, Any]) -> tuple[tuple[dict[str, Any], np.ndarray] | No
     return found, child.returncode
 
 
-def _watch(child: subprocess.Popen, ended: Event) -> None:
+def _watch(child: subprocess.Popen[bytes], ended: Event) -> None:
     """Kill a child that sleeps for good: a lock of a library that broke down is never free again."""
     stat, last, idle = Path(f"/proc/{child.pid}/stat"), "", 0.0
     while not ended.wait(LOOK) and idle < IDLE:
