@@ -107,6 +107,22 @@ def test_twin(exponent: tuple[int, int, int], tf, bend: float, monkeypatch: pyte
     np.testing.assert_allclose(cells.edge, 2.0 ** np.array(exponent) * scene.step)
 
 
+class White(Ramp):
+    """Of one colour: straight from end to end."""
+
+    def color(self, x: np.ndarray) -> np.ndarray:
+        return np.ones((*np.shape(x), 3))
+
+
+@pytest.mark.parametrize("exponent", [(1, 1, 1), (3, 2, 1)])
+def test_one_point_gives_what_eight_do_under_a_straight_function(exponent: tuple[int, int, int]) -> None:
+    scene = scene_of(rough((19, 9, 13), (1.0, 2.5, 0.7)), White(2.0), 2.0)
+    assert straight_module.straight_until(scene.optics)[0] == scene.optics.bins
+    expected = twin(scene, White(2.0), 2.0, np.array(exponent))
+    off = np.abs(dense(base_cells(scene, np.array(exponent)), expected) - expected).max(axis=(0, 1, 2))
+    assert (off / np.abs(expected).max(axis=(0, 1, 2))).max() < 1e-4
+
+
 def test_twin_of_integer_and_scaled_values() -> None:
     tf = Tent(0.5, 0.3)
     bytes_ = rough((10, 11, 9), dtype=np.uint8)
