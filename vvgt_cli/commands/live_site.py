@@ -13,6 +13,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from vvgt_cli.cameras.sets import SIZE, pixel_width
 from vvgt_cli.commands.converter import Converter, Failed, Job, Made, Message, Progress, Said
 from vvgt_cli.commands.server import Part
 from vvgt_cli.conversion.gaussian_files import layout_of, open_gaussians
@@ -69,7 +70,7 @@ class Cloud:
     @property
     def live(self) -> bool:
         """Whether they can be shown under any function."""
-        return self.gaussians.live is not None and self.options.live is not None
+        return self.gaussians.live is not None and self.options.live is not None and not self.options.live.others
 
     def file(self, suffix: str) -> Part:
         """As it is saved."""
@@ -121,7 +122,8 @@ class Cloud:
         from vvgt_cli.conversion.live import lit
 
         lighting = self.options.light if light is None else light_sent(light, self.options)
-        found = as_stored(lit(baked(self.gaussians, table), lighting))
+        pixel = pixel_width(self.options.made_for or SIZE)
+        found = as_stored(lit(baked(self.gaussians, table, pixel), lighting))
         return replace(self, gaussians=found, options=replace(options, light=lighting, sh_degree=None), ply=None)
 
 
