@@ -2,7 +2,12 @@
 // slider and a list where there are several frames, functions or labels. Splats are drawn by the file's rule (docs/viewers.md). `make page` bundles it with its packages to viewer.js.gz.
 import css from '@playcanvas/supersplat-viewer/viewer.css';
 import { createViewer } from '@playcanvas/supersplat-viewer/viewer';
+<<<<<<< HEAD
 import { Asset, GSPLAT_BUDGET_LIMIT, SHADERLANGUAGE_GLSL, ShaderChunks } from 'playcanvas';
+=======
+import { Asset, SHADERLANGUAGE_GLSL, ShaderChunks } from 'playcanvas';
+import { Damaged, unlessFailing, wholePly } from './damage.mjs';
+>>>>>>> main
 import { liveLook } from './live.mjs';
 import panelCss from './panel.css';
 import { panel, named } from './panel.mjs';
@@ -32,6 +37,7 @@ function content({ file, held }) {
   const element = document.getElementById(held);
   const text = atob(element.textContent), bytes = new Uint8Array(text.length);
   for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i);
+  if (!wholePly(bytes)) throw new Damaged('its Gaussians are not whole');
   if (scene.frames.length === 1) element.remove();  // of several, one that left memory is read again
   return Promise.resolve(new Response(bytes));
 }
@@ -151,9 +157,14 @@ async function start() {
   draw(viewer.app, scene.rule);
   viewer.app.scene.gsplat.alphaClipForward = scene.rule.minAlpha;
   viewer.app.scene.gsplat.minPixelSize = Math.sqrt(32 * scene.rule.minVariance);
+<<<<<<< HEAD
   if (scene.streamed) viewer.app.scene.gsplat.splatBudgetMode = GSPLAT_BUDGET_LIMIT;  // levels by distance, not as many as fit
   deliver?.(response);
   if (!viewer.state.loaded) await new Promise((done) => viewer.events.once('loaded:changed', done));
+=======
+  deliver(response);
+  if (!viewer.state.loaded) await unlessFailing(viewer.app, new Promise((done) => viewer.events.once('loaded:changed', done)));
+>>>>>>> main
   viewer.state.cameraMode = 'orbit';  // the viewer would turn the object
   if (scene.streamed) {
     said.textContent = '';
@@ -170,5 +181,7 @@ async function start() {
 }
 
 start().catch((error) => {
-  said.textContent = `This browser does not show it: ${error.message ?? error}`;
+  const text = error.message ?? String(error);
+  said.textContent = error instanceof Damaged ? `This page is damaged: ${text}; get it anew` : `This browser does not show it: ${text}`;
+  document.getElementById('view').hidden = true;
 });
