@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from fuzz import Seed
+from fuzz_splats import ply, sog
 
 from vvgt_cli.volume import ReadOptions, read_volume
 
@@ -199,16 +200,21 @@ def vti() -> list[Seed]:
         ("b.vti", "Binary", "ZLib"),
         ("c.vti", "Appended", "LZ4"),
         ("d.vti", "Appended", "None"),
+        ("e.vti", "Appended", "ZLib"),
+        ("f.vti", "Appended", "LZMA"),
     ):
         writer = vtkXMLImageDataWriter()
         writer.SetInputData(image)
         writer.WriteToOutputStringOn()
         getattr(writer, f"SetDataModeTo{mode}")()
         getattr(writer, f"SetCompressorTypeTo{compressor}")()
-        writer.SetEncodeAppendedData(compressor != "None")
+        writer.SetEncodeAppendedData(compressor == "LZ4")
         writer.Write()
         written = writer.GetOutputString()  # text where it is text, else bytes
-        seeds.append(Seed(name, written.encode() if isinstance(written, str) else written, READ))
+        content = written.encode() if isinstance(written, str) else written
+        seeds.append(Seed(name, content, READ))
+        if mode == "Appended":
+            seeds.append(Seed(name.replace(".", "2."), content, volume_reader(stored=True)))
     return seeds
 
 
@@ -283,24 +289,6 @@ def label_tables() -> list[Seed]:
         Seed("a.json", JSON.encode(), read),
         Seed("a.seg.nrrd", SEGMENTS.encode() + bytes(8), read),
     ]
-
-
-def ply() -> list[Seed]:
-    from vvgt_cli.gaussians import Gaussians, PlyOptions, describe, read_ply, write_ply
-
-    rng = np.random.default_rng(3)
-    shapes = ((4, 3), (4, 3), (4, 4), (4,), (4, 3))
-    gaussians = Gaussians(*(rng.standard_normal(shape).astype(np.float32) for shape in shapes))
-    world = PlyOptions(frame="world", up="-y", scale=0.5, centre=(1, 2, 3), unit_distance=1.5, sh_degree=1)
-    seeds = []
-    for name, options in (
-        ("a.ply", PlyOptions(comments=False)),
-        ("b.ply", world),
-    ):
-        stream = io.BytesIO()
-        write_ply(stream, gaussians, options)
-        seeds.append(Seed(name, stream.getvalue(), lambda path: describe(*read_ply(path))))
-    return seeds
 
 
 def cameras() -> list[Seed]:
@@ -382,6 +370,7 @@ def readers() -> dict[str, list[Seed]]:
         "transfer function": transfer(),
         "label table": label_tables(),
         "Gaussians": ply(),
+        "SOG": sog(),
         "view set": cameras(),
         "model card": model_card(),
         "manifest of views": manifest(),

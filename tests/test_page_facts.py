@@ -13,11 +13,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from vvgt_cli.conversion.gaussian_files import layout_of
 from vvgt_cli.conversion.place import placed
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
 from vvgt_cli.gaussians.formats.page_file import upright
 from vvgt_cli.gaussians.formats.splats import Splats, splats_of
 from vvgt_cli.gaussians.frames import UP_NAMES
+from vvgt_cli.gaussians.legend import checked, legend_text
+from vvgt_cli.look.labels import Label, LabelTable
+from vvgt_cli.look.readers.minimal import read
 from vvgt_cli.volume import ReadOptions, Volume, read_volume
 
 PAGE = Path(__file__).parent.parent / "vvgt_cli" / "gaussians" / "formats" / "page"
@@ -126,3 +130,34 @@ def test_units_of_lengths_come_from_the_files(tmp_path: Path) -> None:
     assert (unit("a.tif"), unit("plain.tif"), unit("a.tif", spacing=(1.0, 1, 1))) == ("um", None, None)
     assert (unit("a.nii"), unit("ras.nii"), unit("a.nc")) == ("mm", None, "nm")
     assert placed(PlyOptions(), Volume(values, unit="um", space="RAS")).length_unit is None
+
+
+def test_a_legend_is_read_back_and_drawn_by_its_nodes(tmp_path: Path) -> None:
+    points = [{"x": 10, "rgb": [1, 0, 0], "opacity": 0}, {"x": 30, "rgb": [1, 0, 0], "opacity": 0.5}]
+    points += [{"x": 30, "rgb": [0, 1, 0], "opacity": 1}, {"x": 90, "rgb": [0, 0, 1], "opacity": 1}]
+    text = legend_text(read({"name": "t", "points": points}, "t"), 0.0, 60.0, "HU")
+    assert text is not None
+    stream = io.BytesIO()
+    write_ply(stream, one(), PlyOptions(legend=text, error="41.2 dB", date="2026-11-25"))
+    stream.seek(0)
+    header = read_ply(stream)[1]
+    assert (header.legend, header.error, header.date) == (text, "41.2 dB", "2026-11-25")
+    assert layout_of(header).error is None  # of what is written then
+    facts = world_of(splats_of(one(), PlyOptions(legend=text)), tmp_path)["facts"]
+    found = facts["legend"]
+    assert (found["values"], found["unit"]) == ([0, 60], "HU")
+    assert [(n["x"], n["y"]) for n in found["nodes"]] == [(0, 0), (10, 0), (30, 0.5), (30, 1), (60, 1)]
+    np.testing.assert_allclose(found["nodes"][-1]["rgb"], (0, 0.5, 0.5), atol=3e-3)
+    for damaged in ("{", "[1]", "3"):
+        with pytest.raises(ValueError, match=r"."):
+            checked(damaged)
+    long = json.dumps({"values": [0, 1], "nodes": 3})
+    assert world_of(splats_of(one(), PlyOptions(legend=long)), tmp_path)["facts"]["legend"] is None
+
+
+def test_a_legend_of_labels_names_those_that_are_shown() -> None:
+    labels = [Label(n, f"part {n}", (1.0, 0.0, 0.5), float(n != 2)) for n in range(1, 40)]
+    found = json.loads(legend_text(LabelTable("t", tuple(labels)), 0.0, 0.0, "") or "")
+    assert found["of"] == 38
+    assert found["labels"][:2] == [["part 1", "ff0080"], ["part 3", "ff0080"]]
+    assert len(found["labels"]) == 24

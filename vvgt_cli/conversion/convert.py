@@ -8,8 +8,12 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 
+<<<<<<< HEAD
 from vvgt_cli.conversion.carried import Carry
 from vvgt_cli.conversion.gaussian_files import write_gaussians
+=======
+from vvgt_cli.conversion.gaussian_files import is_page, write_gaussians
+>>>>>>> main
 from vvgt_cli.conversion.live import check_live, live_conversion
 from vvgt_cli.conversion.place import out_of_box, placed, remarks, way_up
 from vvgt_cli.conversion.plan import Plan, Planner, check_memory
@@ -28,8 +32,10 @@ from vvgt_cli.field.workload import expected_wide
 from vvgt_cli.files import check_room
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored
 from vvgt_cli.gaussians.formats import format_of
+from vvgt_cli.gaussians.legend import legend_text
 from vvgt_cli.gaussians.outputs import STDOUT, check_outputs, claimed, write_text
 from vvgt_cli.jit.ahead import CONVERT, EVALUATE, INIT, LIVE, for_blocks, for_degree
+from vvgt_cli.look.labels import LabelTable
 from vvgt_cli.network.card import find_model, read_card
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
@@ -336,8 +342,19 @@ def ply_options(request: ConvertRequest, source: Source) -> PlyOptions:
         light=source.lighting,
         function=source.name if len(source.layers) > 1 else source.tf.name,
         optics=source.optics(),
+        legend=_legend(source),
     )
     return placed(ply, source.volume)
+
+
+def _legend(source: Source) -> str | None:
+    """Of one function or one table of labels."""
+    if len(source.layers) > 1:
+        return None
+    labelled, volume = isinstance(source.tf, LabelTable), source.volume
+    numbers = None if labelled else source.statistics
+    lo, hi = (0.0, 0.0) if numbers is None else (numbers.lo, numbers.hi)
+    return legend_text(source.tf, lo, hi, "HU" if volume.hounsfield else "")
 
 
 def _write(run: Run, request: ConvertRequest, conversion: Conversion) -> ConversionReport:
@@ -346,7 +363,10 @@ def _write(run: Run, request: ConvertRequest, conversion: Conversion) -> Convers
 
     report = run.report
     assert request.output is not None
-    write_gaussians(run, request.output, conversion.gaussians, conversion.ply, request.overwrite, conversion.normals())
+    ply = conversion.ply if is_page(request.output) else replace(conversion.ply, error=None)
+    if is_page(request.output) and ply.error is None and conversion.scores is not None:
+        ply = replace(ply, error=f"{conversion.scores['psnr']:.1f} dB on test views of {request.fit.size} px")
+    write_gaussians(run, request.output, conversion.gaussians, ply, request.overwrite, conversion.normals())
     if format_of(request.output):
         source = conversion.field.source
         run.compile(source.kernels(EVALUATE), source.kernel_type())

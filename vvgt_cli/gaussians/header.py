@@ -11,6 +11,7 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians.frames import up_matrix
+from vvgt_cli.gaussians.legend import checked
 from vvgt_cli.gaussians.live_facts import WORD, LiveFacts, live_facts, one_comment
 from vvgt_cli.gaussians.types import HARMONICS
 from vvgt_cli.look.lighting import Lighting, parse_lighting
@@ -46,6 +47,8 @@ class FileFacts:
         live: of the values that the Gaussians carry; None where they have one look alone.
         length_unit: of the world, where that has no anatomical space (whose unit is mm).
         function: name of the transfer function.
+        legend: of the look that the file has (`legend.legend_text`); of a live file ``live`` says it.
+        error: of the conversion, in words; ``date``: when it was written, YYYY-MM-DD. Pages alone say these two.
     """
 
     frame: str = "unit"
@@ -63,6 +66,9 @@ class FileFacts:
     live: LiveFacts | None = None
     length_unit: str | None = None
     function: str | None = None
+    legend: str | None = None
+    error: str | None = None
+    date: str | None = None
 
     def facts(self) -> dict[str, Any]:
         """The facts by name."""
@@ -188,7 +194,7 @@ def parse_header(content: bytes, name: str) -> PlyHeader:
 def _provenance(comments: list[str], name: str, columns: list[str]) -> dict[str, Any]:
     """`FileFacts` and the version, from our own comments."""
     found: dict[str, Any] = {}
-    live: dict[str, Any] = {}
+    lives: list[dict[str, Any]] = [{}]
     for comment in comments:
         words = comment.split()
         if len(words) < 2 or words[0] != "vvgt":
@@ -196,6 +202,9 @@ def _provenance(comments: list[str], name: str, columns: list[str]) -> dict[str,
         try:
             if words[1] == WORD:
                 more = one_comment(words[2:])
+                if "name" in more and lives[-1]:
+                    lives.append({})
+                live = lives[-1]
                 live |= more | {"labels": live.get("labels", ()) + more["labels"]} if "labels" in more else more
             else:
                 found |= _one_comment(words[1:])
@@ -203,7 +212,7 @@ def _provenance(comments: list[str], name: str, columns: list[str]) -> dict[str,
             raise DataError(f"{name}: comment {comment[:80]!r} is not one that vvgt writes") from None
     if found.get("frame") == "world" and "scale" not in found:
         raise DataError(f"{name}: in world space, but its comments do not hold scale and centre")
-    return found | {"live": live_facts(live, columns)}
+    return found | {"live": live_facts(lives, columns)}
 
 
 def _one_comment(words: list[str]) -> dict[str, Any]:
@@ -237,6 +246,10 @@ def _one_comment(words: list[str]) -> dict[str, Any]:
         return {"length_unit": words[1]}
     if words[0] == "function":
         return {"function": str(json.loads(" ".join(words[1:])))}
+    if words[0] == "legend":
+        return {"legend": checked(" ".join(words[1:]))}
+    if words[0] in ("error", "date"):
+        return {words[0]: " ".join(words[1:])}
     if words[0] == "optics":
         return {"optics": words[1]}
     if words[0] == "affine":
@@ -262,6 +275,9 @@ def comment_lines(facts: FileFacts) -> list[str]:
         lines.append(f"comment vvgt length-unit {facts.length_unit}")
     if facts.function is not None:
         lines.append(f"comment vvgt function {json.dumps(facts.function)}")
+    for word, text in (("legend", None if facts.live else facts.legend), ("error", facts.error), ("date", facts.date)):
+        if text is not None:
+            lines.append(f"comment vvgt {word} {text}")
     if facts.unit_distance is not None:
         label = facts.unit_distance_label or "given"
         lines.append(f"comment vvgt unit-distance {float(facts.unit_distance)!r} {label}")

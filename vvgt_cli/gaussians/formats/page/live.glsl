@@ -1,12 +1,13 @@
-// A Gaussian under the function: moved and thinned along the gradient (docs/live.md), and cut by a plane. The engine calls
-// modifySplatCenter first. A cut Gaussian becomes the one of the same mean and variance as its part that stays.
+// A Gaussian under the function: moved and thinned along the gradient, of the opacity of its mass (docs/live.md), and cut by planes. The engine calls
+// modifySplatCenter first. A cut Gaussian becomes one of the mass and mean of its part that stays, no wider than that and up to the plane.
 uniform highp sampler2D vvgtTable;
 uniform highp sampler2D vvgtLabels;  // of a label map a column a label: red, green, blue, extinction; else one column
 uniform vec4 vvgtFacts;  // shortest log length, how far it goes, thinnest, spreads
-uniform vec4 vvgtCut;  // dot(xyz, centre) <= w stays
+uniform vec3 vvgtOpaque;  // of the variance of what is opaque along its shortest axis, and along the others; variance of the screen's dilation
+uniform vec4 vvgtCut[6];  // dot(xyz, centre) <= w of each stays; of none the normal is zero
 uniform vec4 vvgtLight;  // ambient, diffuse, specular, power; ambient < 0: unlit
-uniform vec4 vvgtToward;  // direction towards the light, or with w = 1 the eye's place: a light there
-uniform vec3 vvgtEye;
+uniform vec4 vvgtToward;  // direction towards the light; with w = 1 it is at the eye
+uniform vec4 vvgtEye;  // its place, or with w = 1 the direction of parallel rays
 vec4 vvgtColor, vvgtRotation;
 vec3 vvgtScale;
 
@@ -28,29 +29,46 @@ void vvgtTurn(inout vec3 a, inout vec3 b) {  // until orthogonal: one-sided Jaco
   b = sn * was + cs * b;
 }
 
-float vvgtCut3(inout vec3 center, inout mat3 axes) {  // depth's factor
-  vec3 own = vvgtCut.xyz * axes;
+float vvgtAlpha(float y) {  // whose dilogarithm is y, to 3e-4
+  y = min(y, 1.5886);
+  return min(y * (1.0006751 + y * (-0.2572020 + y * (0.0395146 + y * (-0.0420802 + y * (0.0288972 - y * 0.0082833))))), 0.99);
+}
+
+float vvgtPeak(float mass, vec3 variance) {  // the mean over views along the axes, by the areas that these see
+  vec3 v = variance + vvgtOpaque.z, area = 6.2831853 * sqrt(v.yzx * v.zxy), y = mass / area;
+  y += min(y, vec3(1.0 / 255.0));
+  return dot(vec3(vvgtAlpha(y.x), vvgtAlpha(y.y), vvgtAlpha(y.z)), area) / (area.x + area.y + area.z);
+}
+
+float vvgtCutBy(vec4 plane, inout vec3 center, inout mat3 axes) {  // mass's factor
+  vec3 own = plane.xyz * axes;
   float sigma = length(own);
   if (sigma < 1e-12) return 1.0;
-  float at = (vvgtCut.w - dot(vvgtCut.xyz, center)) / sigma;
+  float at = (plane.w - dot(plane.xyz, center)) / sigma;
   if (at > 3.0) return 1.0;
   if (at < -2.0) return 0.0;
   own /= sigma;
   float x = abs(at) * 0.70710678, t = 1.0 / (1.0 + 0.3275911 * x);  // Abramowitz and Stegun 7.1.26
   float tail = 0.5 * t * (0.254829592 + t * (-0.284496736 + t * (1.421413741 + t * (-1.453152027 + t * 1.061405429)))) * exp(-x * x);
   float stays = at < 0.0 ? tail : 1.0 - tail, mean = 0.39894228 * exp(-0.5 * at * at) / stays;
-  float thin = sqrt(max(1.0 - at * mean - mean * mean, 0.01));
+  float thin = clamp(sqrt(max(1.0 - at * mean - mean * mean, 0.0)), 0.1, max(0.5 * (at + mean), 0.1));  // two deviations reach the plane
   vec3 arm = axes * own;
   center -= arm * mean;
   axes += outerProduct(arm * (thin - 1.0), own);
-  return stays / thin;
+  return stays;
+}
+
+float vvgtCutAll(inout vec3 center, inout mat3 axes) {
+  float stays = 1.0;
+  for (int i = 0; i < 6 && stays > 0.0; i++) stays *= vvgtCutBy(vvgtCut[i], center, axes);
+  return stays;
 }
 
 vec3 vvgtLit(vec3 color, vec3 gradient, vec3 center) {  // Blinn and Phong's (docs/light.md)
   if (vvgtLight.x < 0.0) return color;
   float rises = length(gradient);
   if (rises == 0.0) return color * vvgtLight.x;
-  vec3 n = gradient / rises, d = normalize(center - vvgtEye), l = vvgtToward.w > 0.0 ? -d : vvgtToward.xyz, h = l - d;
+  vec3 n = gradient / rises, d = vvgtEye.w > 0.0 ? vvgtEye.xyz : normalize(center - vvgtEye.xyz), l = vvgtToward.w > 0.0 ? -d : vvgtToward.xyz, h = l - d;
   float facing = min(abs(dot(n, h)) / max(length(h), 1e-9), 1.0);
   return min(color * (vvgtLight.x + vvgtLight.y * abs(dot(n, l))) + vvgtLight.z * pow(facing, vvgtLight.w), vec3(1.0));
 }
@@ -78,9 +96,8 @@ void modifySplatCenter(inout vec3 center) {
   center += arm * (r * first);
   axes += outerProduct(arm * (thin - 1.0), along);
   vec3 place = center;
-  float depth = tau * exp(vvgtFacts.x + vvgtFacts.y * float(a.z) / 255.0) * inversesqrt(thin) * vvgtCut3(center, axes);
+  float edge = exp(vvgtFacts.x + vvgtFacts.y * float(a.z) / 255.0), mass = tau * edge * edge * edge * vvgtCutAll(center, axes);
   vec3 color = vvgtLit(sums.rgb / tau, mat3(matrix_model) * gradient, place);
-  vvgtColor = sums.a < 1e-12 ? vec4(0.0) : vec4(color, 1.0 - exp(-depth));
   for (int sweep = 0; sweep < 6; sweep++) {
     vvgtTurn(axes[0], axes[1]);
     vvgtTurn(axes[0], axes[2]);
@@ -90,6 +107,11 @@ void modifySplatCenter(inout vec3 center) {
   mat3 unit = mat3(axes[0] / vvgtScale.x, axes[1] / vvgtScale.y, axes[2] / vvgtScale.z);
   if (determinant(unit) < 0.0) unit[2] = -unit[2];
   vvgtRotation = vvgtQuaternion(unit);
+  float shortest = min(vvgtScale.x, min(vvgtScale.y, vvgtScale.z));
+  vec3 opaque = mix(vec3(vvgtOpaque.y), vec3(vvgtOpaque.x), vec3(lessThanEqual(vvgtScale, vec3(shortest))));
+  vec3 squares = vvgtScale * vvgtScale * mix(opaque, vec3(1.0), exp(-tau * edge));
+  vvgtScale = sqrt(squares);
+  vvgtColor = sums.a < 1e-12 ? vec4(0.0) : vec4(color, vvgtPeak(mass, squares));
 }
 void modifySplatRotationScale(vec3 original, vec3 modified, inout vec4 rotation, inout vec3 scale) {
   rotation = vvgtRotation;

@@ -1,5 +1,5 @@
 // Gaussians that carry values, under any function: their bytes as streams of the engine, the function's table as a texture.
-import { FILTER_NEAREST, PIXELFORMAT_RGBA32F, PIXELFORMAT_RGBA8U, Texture } from 'playcanvas';
+import { FILTER_NEAREST, PIXELFORMAT_RGBA32F, PIXELFORMAT_RGBA8U, PROJECTION_ORTHOGRAPHIC, Texture } from 'playcanvas';
 import modifier from './live.glsl';
 import { sumsOf, texelsOf } from './live_table.mjs';
 
@@ -14,7 +14,7 @@ async function unpacked(id, alone) {
   return new Uint8Array(await new Response(stream.pipeThrough(new DecompressionStream('gzip'))).arrayBuffer());
 }
 
-// {live, bytes, count, sums, rows, plane, apply(nodes), labels(list), cut(axis or null, place, flipped), light(of light.mjs), frame(k, resource)} of a viewer that has loaded its Gaussians, once they are shown so
+// {live, bytes, count, sums, rows, planes, apply(nodes), labels(list), cut(planes), light(of light.mjs), frame(k, resource)} of a viewer that has loaded its Gaussians, once they are shown so
 export async function liveLook({ app }, live) {
   const entity = app.root.findByName('gsplat'), { gsplat } = entity, { resource } = app.assets.get(gsplat.asset);
   const planes = live.labels.length ? 8 : 6, carried = new WeakMap();  // bytes of the resources that have them
@@ -42,13 +42,17 @@ export async function liveLook({ app }, live) {
     again = 2;
   };
   // a light that depends on the eye, or a highlight: again when the camera has moved
-  const camera = app.root.findComponent('camera').entity, eye = [0, 0, 0];
-  let follows = false;
+  const camera = app.root.findComponent('camera').entity;
+  let follows = false, eye = [0, 0, 0, 0];
+  const eyeNow = () => {
+    const flat = camera.camera.projection === PROJECTION_ORTHOGRAPHIC, { x, y, z } = flat ? camera.forward : camera.getPosition();
+    return [x, y, z, Number(flat)];
+  };
   app.on('update', () => {
-    const { x, y, z } = camera.getPosition();
-    if (!follows || Math.hypot(x - eye[0], y - eye[1], z - eye[2]) < 1e-4) return;
-    [eye[0], eye[1], eye[2]] = [x, y, z];
-    set('vvgtEye', [...eye]);
+    const now = eyeNow();
+    if (!follows || Math.hypot(...now.map((x, k) => x - eye[k])) < 1e-4) return;
+    eye = now;
+    set('vvgtEye', eye);
   });
   // what is set while the engine takes up another state may be lost: set once more when it is ready
   app.on('update', () => { if (again) app.renderNextFrame = true; });
@@ -60,7 +64,7 @@ export async function liveLook({ app }, live) {
     if (!--again) shown();
   });
   const look = {
-    live, bytes, count, sums: null, rows: [], plane: null,  // what a place is found and read by
+    live, bytes, count, sums: null, rows: [], planes: [],  // what a place is found and read by
     apply(nodes) {
       look.sums = sumsOf(nodes, live);
       table.lock().set(texelsOf(look.sums, live.table));
@@ -75,10 +79,12 @@ export async function liveLook({ app }, live) {
       labels.unlock();
       set('vvgtLabels', labels);
     },
-    cut(axis, place, flipped) {
-      const sign = flipped ? -1 : 1;
-      look.plane = axis === null ? null : { normal: live.axes[axis].map((x) => sign * x), place: sign * place };
-      set('vvgtCut', look.plane ? [...look.plane.normal, look.plane.place] : [0, 0, 0, 1]);
+    // at most six {normal, place}: dot(normal, x) <= place stays
+    cut(planes) {
+      const numbers = new Float32Array(24);
+      planes.forEach(({ normal, place }, k) => numbers.set([...normal, place], 4 * k));
+      look.planes = planes;
+      set('vvgtCut[0]', numbers);
     },
   };
   // what frame k's Gaussians carry goes with them, before they are shown
@@ -88,16 +94,16 @@ export async function liveLook({ app }, live) {
     again = 2;
   };
   look.light = ({ kind, from, ambient, diffuse, specular, power }) => {
-    const { x, y, z } = camera.getPosition();
     follows = kind !== 'none' && (kind === 'headlight' || specular > 0);
-    [eye[0], eye[1], eye[2]] = [x, y, z];
-    gsplat.setParameter('vvgtEye', [...eye]);
+    eye = eyeNow();
+    gsplat.setParameter('vvgtEye', eye);
     gsplat.setParameter('vvgtToward', [...from, kind === 'headlight' ? 1 : 0]);
     set('vvgtLight', [kind === 'none' ? -1 : ambient, diffuse, specular, power]);
   };
   look.light(live.light);
+  gsplat.setParameter('vvgtOpaque', [...live.opaque, live.dilation]);
   set('vvgtFacts', [first, last - first, live.thinnest, spreads]);
-  look.cut(null);
+  look.cut([]);
   if (live.labels.length) set('vvgtTable', table);
   else look.apply(live.nodes);
   look.labels(live.labels);
