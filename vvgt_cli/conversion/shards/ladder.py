@@ -11,7 +11,7 @@ import numpy as np
 from vvgt_cli.conversion.shards.apart import errors_apart
 
 if TYPE_CHECKING:
-    from vvgt_cli.conversion.shards.merge import Cut
+    from vvgt_cli.conversion.shards.cut import Cut
 
 RUNGS = 10
 STEP = 4.0  # times the score from a rung to the next: a cell's grows as the fourth power of its edge

@@ -30,7 +30,7 @@ from vvgt_cli.score.record import Run, plain
 from vvgt_cli.version import VERSION
 
 if TYPE_CHECKING:
-    from vvgt_cli.conversion.shards.merge import Cut
+    from vvgt_cli.conversion.shards.cut import Cut
 
 # Of the unit frame. The engine shows level 0 nearer than 5 (`lodBaseDistance`) and level 1 nearer than 15, so that the
 # whole is seen in level 1 from where `vvgt render --orbit` begins, at 3 in the unit frame.

@@ -1,0 +1,68 @@
+"""A pyramid that is cut: Gaussians of the cells that a threshold leaves, in batches."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vvgt_cli.cameras.sets import pixel_width
+from vvgt_cli.conversion.shards.plan import Plan
+from vvgt_cli.gaussians.ply import as_stored
+
+if TYPE_CHECKING:
+    from vvgt_cli.closed_form.inset import Opaque
+    from vvgt_cli.closed_form.tree import Leaves
+    from vvgt_cli.field.forest import Forest
+    from vvgt_cli.gaussians import Gaussians
+
+BATCH = 1 << 16  # Gaussians that are made at once
+
+
+@dataclass(frozen=True)
+class Cut:
+    """A pyramid, where bodies are opaque, and the plan that it is cut for."""
+
+    forest: Forest
+    opaque: Opaque
+    plan: Plan
+
+    def gaussians(self, threshold: float) -> Iterator[Gaussians]:
+        """Those of the cells that a threshold leaves, in the box frame, as a file holds them, in batches."""
+        from vvgt_cli.field.forest import batches
+
+        for leaves in batches(self.forest.leaves(threshold), BATCH):
+            yield self.made(leaves)
+
+    def nodes(self, thresholds: np.ndarray) -> Iterator[tuple[list[Gaussians], list[np.ndarray]]]:
+        """Of each tile, for each of its ``thresholds`` (tiles, n): Gaussians, and `spread_of` their cells.
+
+        They are made some tiles at a time: the colours of neighbours matter to each other.
+        """
+        from vvgt_cli.closed_form.tree import spread_of
+        from vvgt_cli.field.forest import joined
+
+        waiting: list[list[Leaves]] = []
+        for row, leaves in enumerate(self.forest.cuts(thresholds)):
+            waiting.append(leaves)
+            if sum(len(node[0]) for node in waiting) < BATCH and row + 1 < len(self.forest.tiles):
+                continue
+            sizes = np.array([[len(part) for part in node] for node in waiting])
+            whole = [self.made(joined([node[k] for node in waiting])) for k in range(sizes.shape[1])]
+            for node, size, end in zip(waiting, sizes, np.cumsum(sizes, axis=0), strict=True):
+                parts = [each.take(np.arange(e - n, e)) for each, n, e in zip(whole, size, end, strict=True)]
+                yield parts, [spread_of(part) for part in node]
+            waiting = []
+
+    def made(self, leaves: Leaves) -> Gaussians:
+        """Those of some cells, one each, in their order."""
+        from vvgt_cli.closed_form.columns import MASS, SEEN
+        from vvgt_cli.closed_form.shape import ROUND, cell_gaussians
+        from vvgt_cli.closed_form.sharpen import sharpened
+
+        made = cell_gaussians(leaves, min(self.plan.grid.step), pixel_width(self.plan.size), self.opaque, ROUND)
+        if not self.plan.labels:
+            made = sharpened(made, leaves.moments[:, SEEN] / leaves.moments[:, MASS], self.opaque.half)
+        return as_stored(made)
