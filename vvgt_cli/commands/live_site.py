@@ -101,8 +101,8 @@ class Cloud:
         found = as_stored(lit(baked(self.gaussians, table), lighting))
         facts = replace(facts, function=function_text(tf, facts.lo, facts.hi))
         options = replace(
-            self.options, live=facts, unit_distance=distance, unit_distance_label="file", light=lighting,
-            function=tf.name, sh_degree=None,
+            self.options, live=facts, certificate=None, unit_distance=distance, unit_distance_label="file",
+            light=lighting, function=tf.name, sh_degree=None,
         )  # fmt: skip
         return replace(self, gaussians=found, options=options, ply=None)
 

@@ -8,6 +8,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 
+from vvgt_cli.conversion.certify import certified
 from vvgt_cli.conversion.gaussian_files import write_gaussians
 from vvgt_cli.conversion.live import check_live, live_conversion
 from vvgt_cli.conversion.place import out_of_box, placed, remarks, way_up
@@ -237,8 +238,9 @@ def _interrupted(run: Run) -> bool:
 
 
 def _conversion(request: ConvertRequest, work: Work, gaussians: Gaussians) -> Conversion:
-    source = work.field.source
-    return Conversion(out_of_box(gaussians, source.volume), work.run.report, ply_options(request, source), work.field)
+    source, found = work.field.source, out_of_box(gaussians, work.field.source.volume)
+    ply = certified(ply_options(request, source), work.run, work.field, work.fit, found, request.command)
+    return Conversion(found, work.run.report, ply, work.field)
 
 
 @contextmanager

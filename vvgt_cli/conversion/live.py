@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vvgt_cli.cameras import default_views
+from vvgt_cli.conversion.certify import certified
 from vvgt_cli.conversion.live_labels import carrying_labels, fog_of_labels, label_facts, labels_of
 from vvgt_cli.conversion.place import out_of_box
 from vvgt_cli.conversion.recolored import lit_by, looked_up
@@ -98,8 +99,9 @@ def live_conversion(
     gaussians = as_stored(lit(baked(gaussians, table), lighting))
     if scored:
         _score(run, request, field, gaussians, lit_by(gaussians, table, lighting))
-    ply = replace(ply, live=facts)
-    return Conversion(out_of_box(gaussians, source.volume), run.report, ply, field)
+    found = out_of_box(gaussians, source.volume)
+    ply = certified(replace(ply, live=facts), run, field, fit, found, request.command)
+    return Conversion(found, run.report, ply, field)
 
 
 def _score(run: Run, request: ConvertRequest, field: Field, gaussians: Gaussians, shown: Gaussians) -> None:

@@ -104,8 +104,8 @@ def placed_function(
     light = light_of(function.light, tf.lighting or header.light, header.space)
     old = header if isinstance(header, PlyOptions) else layout_of(header)
     options = replace(
-        old, live=None, unit_distance=distance, unit_distance_label=label, light=light, sh_degree=None,
-        function=shown.name,
+        old, live=None, certificate=None, unit_distance=distance, unit_distance_label=label, light=light,
+        sh_degree=None, function=shown.name,
     )  # fmt: skip
     return shown, options
 

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.gaussians.certificate import WORD as CERTIFICATE
+from vvgt_cli.gaussians.certificate import Certificate
 from vvgt_cli.gaussians.frames import up_matrix
 from vvgt_cli.gaussians.live_facts import WORD, LiveFacts, live_facts, one_comment
 from vvgt_cli.gaussians.types import HARMONICS
@@ -46,6 +48,7 @@ class FileFacts:
         live: of the values that the Gaussians carry; None where they have one look alone.
         length_unit: of the world, where that has no anatomical space (whose unit is mm).
         function: name of the transfer function.
+        certificate: what was measured when the Gaussians were made; None of Gaussians that were changed since.
     """
 
     frame: str = "unit"
@@ -63,6 +66,7 @@ class FileFacts:
     live: LiveFacts | None = None
     length_unit: str | None = None
     function: str | None = None
+    certificate: Certificate | None = None
 
     def facts(self) -> dict[str, Any]:
         """The facts by name."""
@@ -197,6 +201,8 @@ def _provenance(comments: list[str], name: str, columns: list[str]) -> dict[str,
             if words[1] == WORD:
                 more = one_comment(words[2:])
                 live |= more | {"labels": live.get("labels", ()) + more["labels"]} if "labels" in more else more
+            elif words[1] == CERTIFICATE:
+                found[CERTIFICATE] = Certificate.of(comment.split(None, 2)[2])
             else:
                 found |= _one_comment(words[1:])
         except (ValueError, IndexError, UsageError):
@@ -273,6 +279,8 @@ def comment_lines(facts: FileFacts) -> list[str]:
         lines.append(f"comment vvgt optics {facts.optics}")
     if facts.live is not None:
         lines += facts.live.lines()
+    if facts.certificate is not None:
+        lines.append(f"comment {facts.certificate.line()}")
     if facts.rule == "compensated":
         lines.append(MIP)
     return lines
