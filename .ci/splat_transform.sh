@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# splat_transform.sh FILE.ply...: read each file with @playcanvas/splat-transform 3.7 and assert that it finds
+# splat_transform.sh FILE...: read each file with @playcanvas/splat-transform 3.7 and assert that it finds
 # Gaussians, no NaN and no inf. Exit 3: node >= 22 cannot be had here.
 set -euo pipefail
 here=$(cd "$(dirname "$0")" && pwd)

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from fuzz import Seed
+from fuzz_splats import ply, sog
 
 from vvgt_cli.volume import ReadOptions, read_volume
 
@@ -285,24 +286,6 @@ def label_tables() -> list[Seed]:
     ]
 
 
-def ply() -> list[Seed]:
-    from vvgt_cli.gaussians import Gaussians, PlyOptions, describe, read_ply, write_ply
-
-    rng = np.random.default_rng(3)
-    shapes = ((4, 3), (4, 3), (4, 4), (4,), (4, 3))
-    gaussians = Gaussians(*(rng.standard_normal(shape).astype(np.float32) for shape in shapes))
-    world = PlyOptions(frame="world", up="-y", scale=0.5, centre=(1, 2, 3), unit_distance=1.5, sh_degree=1)
-    seeds = []
-    for name, options in (
-        ("a.ply", PlyOptions(comments=False)),
-        ("b.ply", world),
-    ):
-        stream = io.BytesIO()
-        write_ply(stream, gaussians, options)
-        seeds.append(Seed(name, stream.getvalue(), lambda path: describe(*read_ply(path))))
-    return seeds
-
-
 def cameras() -> list[Seed]:
     from vvgt_cli.cameras import default_views
     from vvgt_cli.cameras.files import blender_json, read_frames, transforms_json
@@ -382,6 +365,7 @@ def readers() -> dict[str, list[Seed]]:
         "transfer function": transfer(),
         "label table": label_tables(),
         "Gaussians": ply(),
+        "SOG": sog(),
         "view set": cameras(),
         "model card": model_card(),
         "manifest of views": manifest(),

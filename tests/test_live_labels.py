@@ -103,7 +103,7 @@ def test_bytes_for_pages_hold_the_label() -> None:
     live = some.live.copy()  # type: ignore[union-attr]
     live[:, 6] = np.linspace(0, 299, len(live)).round()
     some = replace(some, live=live)
-    stream, known = live_bytes(some, facts(many)), live_json(some, facts(many), 0.05)
+    stream, known = live_bytes(some, facts(many)), live_json([some], facts(many), 0.05)
     np.testing.assert_array_equal(from_bytes(stream, known)[:, 6], live[:, 6])
     assert json.loads(json.dumps(known)) == known
 
@@ -134,9 +134,12 @@ def test_labels_under_gaussians_and_the_way_they_end() -> None:
 
 
 def test_a_fog_of_labels_tells_them_apart() -> None:
-    table = label_fog(LabelTable("t", LABELS), {3: 1000, 7: 8, 300: 0})
+    table = label_fog(LabelTable("t", LABELS), {3: 1000, 7: 8})
     assert len({label.color[0] for label in table.labels}) == 3
     assert [label.opacity > 0 for label in table.labels] == [True, True, False]
+    hidden = label_fog(LabelTable("t", LABELS), {3: 8, 7: 8, 300: 8}).labels
+    assert hidden[2].opacity == hidden[1].opacity
+    assert 0 < hidden[2].color[2] < hidden[1].color[2]
     assert table.labels[0].opacity == table.labels[1].opacity
     for label in table.labels:
         assert label.color[1] == pytest.approx(label.color[0] ** 2)
@@ -188,6 +191,24 @@ def test_recolor_takes_another_table_and_hides_labels(vvgt, label_file, tmp_path
     assert len(again.gaussians) == len(found)
 
 
+def test_labels_that_are_hidden_at_first_can_be_shown_later(vvgt, label_file, tmp_path) -> None:
+    table = {"1": {"name": "one", "color": [1, 0, 0]}, "2": {"name": "two", "color": [0, 0, 1], "opacity": 0}}
+    (tmp_path / "t.json").write_text(json.dumps(table))
+    volume, first = label_file.parent / "map_label.npy", tmp_path / "first.ply"
+    for more in ((), ("--blocks", 16)):
+        source = (volume, "--labels", tmp_path / "t.json", "--live", *more, "-o", first, "--overwrite")
+        assert vvgt("convert", *source, *SMALL).code == 0
+        gaussians, header = read_ply(first)
+        assert header.live is not None
+        assert [label.opacity for label in header.live.labels] == [1, 0]
+        assert gaussians.live is not None
+        counts = np.bincount(gaussians.live[:, 6].astype(int))
+        assert 0.05 < counts[1] / counts.sum() < 0.5
+        assert gaussians.opacity_logits[gaussians.live[:, 6] == 1].max() < -10
+        assert vvgt("recolor", first, "--labels", "auto", "-o", tmp_path / "a.ply", "--overwrite").code == 0
+        assert len(read_ply(tmp_path / "a.ply")[0]) == len(gaussians)
+
+
 def test_what_labels_do_not_go_with(vvgt, label_file, tmp_path) -> None:
     table = {
         "1": {"name": "one", "color": [1, 0, 0], "opacity": 0},
@@ -196,13 +217,16 @@ def test_what_labels_do_not_go_with(vvgt, label_file, tmp_path) -> None:
     (tmp_path / "t.json").write_text(json.dumps(table | {"9": {"name": "nine", "color": "#ffffff"}}))
     (tmp_path / "one.json").write_text(json.dumps({"1": {"name": "one", "color": "#ffffff"}}))
     for more, code, said in (
-        (("--tf", "viridis"), 2, "carry labels"),
+        (("--tf", "viridis"), 2, "leave out --tf (--labels gives"),
+        (("--tf-range", "0,1"), 2, "leave out --tf-range (--labels gives"),
         (("--labels", tmp_path / "t.json"), 1, "none of them visible"),
         (("--labels", tmp_path / "one.json"), 1, "1 labels have no entry"),
         (("--labels", tmp_path / "missing.json"), 2, "no such file"),
     ):
         done = vvgt("recolor", label_file, *more, "-o", tmp_path / "a.ply")
         assert (done.code, said in done.error) == (code, True), done.error
+    done = vvgt("render", label_file, "--tf-range", "0,1", "--orbit", 1, "-o", tmp_path / "r")
+    assert (done.code, "leave out --tf-range" in done.error) == (2, True), done.error
     done = vvgt("convert", "example:blob:12", "--layer", "example:blob:12", "--live", "-o", tmp_path / "a.ply", *SMALL)
     assert (done.code, "one scalar field, or one label map" in done.error) == (2, True)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["one.json", "t.json"]

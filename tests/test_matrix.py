@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -171,8 +170,6 @@ class TestEitherWay:
 
     @pytest.mark.parametrize("ending", [".html", ".spz", ".compressed.ply", ".glb", ".usdc", ".sog"])
     def test_every_format(self, vvgt, at, tmp_path, blocks, ending):
-        if ending == ".sog" and not shutil.which("splat-transform"):
-            pytest.skip("splat-transform is not on the path")
         found = vvgt("convert", "scalars.nii", "--tf", "tf.json", *SMALL, *blocks, "-o", tmp_path / f"x{ending}")
         assert found.code == 0, found.err
         assert "the format costs" in found.err

@@ -13,11 +13,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from vvgt_cli.conversion.gaussian_files import layout_of
 from vvgt_cli.conversion.place import placed
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
+from vvgt_cli.gaussians.certificate import Certificate
 from vvgt_cli.gaussians.formats.page_file import upright
 from vvgt_cli.gaussians.formats.splats import Splats, splats_of
 from vvgt_cli.gaussians.frames import UP_NAMES
+from vvgt_cli.gaussians.legend import checked, legend_text
+from vvgt_cli.look.labels import Label, LabelTable
+from vvgt_cli.look.readers.minimal import read
 from vvgt_cli.volume import ReadOptions, Volume, read_volume
 
 PAGE = Path(__file__).parent.parent / "vvgt_cli" / "gaussians" / "formats" / "page"
@@ -126,3 +131,47 @@ def test_units_of_lengths_come_from_the_files(tmp_path: Path) -> None:
     assert (unit("a.tif"), unit("plain.tif"), unit("a.tif", spacing=(1.0, 1, 1))) == ("um", None, None)
     assert (unit("a.nii"), unit("ras.nii"), unit("a.nc")) == ("mm", None, "nm")
     assert placed(PlyOptions(), Volume(values, unit="um", space="RAS")).length_unit is None
+
+
+def test_a_legend_is_read_back_and_drawn_by_its_nodes(tmp_path: Path) -> None:
+    points = [{"x": 10, "rgb": [1, 0, 0], "opacity": 0}, {"x": 30, "rgb": [1, 0, 0], "opacity": 0.5}]
+    points += [{"x": 30, "rgb": [0, 1, 0], "opacity": 1}, {"x": 90, "rgb": [0, 0, 1], "opacity": 1}]
+    text = legend_text(read({"name": "t", "points": points}, "t"), 0.0, 60.0, "HU")
+    assert text is not None
+    stream = io.BytesIO()
+    write_ply(stream, one(), PlyOptions(legend=text, date="2026-11-25"))
+    stream.seek(0)
+    header = read_ply(stream)[1]
+    assert (header.legend, header.date) == (text, "2026-11-25")
+    assert layout_of(header).date is None  # of what is written then
+    facts = world_of(splats_of(one(), PlyOptions(legend=text)), tmp_path)["facts"]
+    found = facts["legend"]
+    assert (found["values"], found["unit"]) == ([0, 60], "HU")
+    assert [(n["x"], n["y"]) for n in found["nodes"]] == [(0, 0), (10, 0), (30, 0.5), (30, 1), (60, 1)]
+    np.testing.assert_allclose(found["nodes"][-1]["rgb"], (0, 0.5, 0.5), atol=3e-3)
+    for damaged in ("{", "[1]", "3"):
+        with pytest.raises(ValueError, match=r"."):
+            checked(damaged)
+    long = json.dumps({"values": [0, 1], "nodes": 3})
+    assert world_of(splats_of(one(), PlyOptions(legend=long)), tmp_path)["facts"]["legend"] is None
+
+
+def test_the_error_is_that_of_the_certificate(tmp_path: Path) -> None:
+    given = Certificate("v", None, "0", 400, "inria", 41.234, 3)
+
+    def error(certificate: Certificate) -> Any:
+        return world_of(splats_of(one(), PlyOptions(certificate=certificate)), tmp_path)["facts"].get("error")
+
+    assert error(given) == "41.2 dB on test views of 400 px"
+    assert error(replace(given, live_psnr=33.33)) == "33.3 dB live, on test views of 400 px"
+    splats = splats_of(one(), PlyOptions(certificate=given))
+    broken = tuple(line.replace("41.234", '"41"') for line in splats.comments)
+    assert world_of(replace(splats, comments=broken), tmp_path)["facts"].get("error") is None
+
+
+def test_a_legend_of_labels_names_those_that_are_shown() -> None:
+    labels = [Label(n, f"part {n}", (1.0, 0.0, 0.5), float(n != 2)) for n in range(1, 40)]
+    found = json.loads(legend_text(LabelTable("t", tuple(labels)), 0.0, 0.0, "") or "")
+    assert found["of"] == 38
+    assert found["labels"][:2] == [["part 1", "ff0080"], ["part 3", "ff0080"]]
+    assert len(found["labels"]) == 24

@@ -50,7 +50,7 @@ def test_the_page_holds_what_the_gaussians_carry_in_the_order_of_its_file() -> N
     some = baked(cloud(600), Table.of_function(RAMP, LO, HI, 0.05))
     content, scene = page_of(some, options())
     live = scene["live"]
-    held = re.search(rb'id="values">([^<]+)<', content)
+    held = re.search(rb'id="values-0">([^<]+)<', content)
     assert held is not None
     planes = np.frombuffer(gzip.decompress(base64.b64decode(held[1])), np.uint8).reshape(len(PLANES), -1)
     stream = np.zeros((600, 8), np.uint8)

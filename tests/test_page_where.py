@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -295,7 +296,8 @@ def test_a_link_restores_labels_light_and_cut(person: Person, tmp_path: Path) ->
         f"(() => {{ {AXIS}.selectedIndex = 1; {AXIS}.dispatchEvent(new Event('change')) }})()",
         f"(() => {{ const s = {AXIS}.nextElementSibling; s.value = 300; s.dispatchEvent(new Event('input')) }})()",
         "document.querySelector('#live li:nth-child(2) .eye').click()",
-        "(({ key, state, set }) => set({ ...state(), kind: 'headlight', from: [0, 0, 1] }))(window.vvgt.live.parts[1])",
+        "(({ state, set }) => set({ ...state(), kind: 'headlight', from: [0, 0, 1] }))"
+        "(window.vvgt.live.parts.find((part) => part.key === 'light'))",
     ):
         person("eval", change)
     states = "JSON.stringify(window.vvgt.live.parts.map((part) => part.state()), (key, x) => (x.toFixed?.(4) ?? x))"
@@ -309,3 +311,22 @@ def test_a_link_restores_labels_light_and_cut(person: Person, tmp_path: Path) ->
 def test_an_address_that_is_no_link_is_let_be(dots: str, person: Person) -> None:
     person("open", dots + "#100%")
     assert person("eval", "window.vvgt.where.link()").startswith(dots + "#view=")
+
+
+def test_a_baked_page_has_legend_error_and_date(person: Person, tmp_path: Path) -> None:
+    """One in a file, and the frames of a series, each its own."""
+    ramp = np.broadcast_to(np.linspace(0, 80, 16, dtype=np.float32)[:, None, None], (16, 16, 16))
+    how = ["--tf", "viridis", "--max-gaussians", "300", "--size", "100", "--steps", "0", "--quiet"]
+    for k in (0, 1):
+        np.save(tmp_path / f"ramp{k}.npy", ramp + k)
+    assert run(["convert", str(tmp_path / "ramp0.npy"), *how, "-o", str(tmp_path / "one.html")]) == 0
+    assert run(["convert", str(tmp_path / "ramp*.npy"), *how, "-o", str(tmp_path / "two.html")]) == 0
+    person("open", (tmp_path / "one.html").as_uri())
+    assert person("eval", "window.vvgt.where.legend") == [0, 20, 40, 60, 80]
+    person("click", "#tools .about")
+    text = person("eval", "document.querySelector('#about').innerText")
+    assert re.search(r"\d\d\.\d dB on test views of 100 px", text)
+    assert re.search(r"20\d\d-\d\d-\d\d, by vvgt", text)
+    person("open", (tmp_path / "two.html").as_uri())
+    assert person("eval", "window.vvgt.where.legend") == [0, 20, 40, 60, 80]
+    person.picture(tmp_path, "series.png", bare=False)

@@ -344,6 +344,18 @@ def test_slurm_jobs_that_all_end_before_they_work_are_said(slurm, jobs, monkeypa
     assert len(list(slurm[0].glob("job-*.sh"))) == 2
 
 
+def test_a_slurm_job_that_ends_before_it_answers_is_followed_by_another(slurm, jobs, monkeypatch, tmp_path):
+    """One job works meanwhile; the other's first try finds a broken node."""
+    monkeypatch.setenv("SLURM_FIRST", f"mkdir {tmp_path}/broken && exit 3")
+    with jobs() as runner:
+        until, working = time.monotonic() + 60, 0
+        while working < 2 and time.monotonic() < until:
+            runner.run(time.sleep, [0.2] * 4, None)
+            working = sum("Registered to" in path.read_text() for path in slurm[0].glob("job-*.log"))
+    assert working == 2
+    assert len(list(slurm[0].glob("job-*.sh"))) == 3
+
+
 def test_slurm_jobs_that_are_long_in_coming_are_waited_for(jobs, monkeypatch):
     monkeypatch.setenv("SLURM_FIRST", "sleep 4")
     told = []

@@ -282,7 +282,7 @@ def test_a_saved_file_has_the_light_of_the_file_or_of_the_page(desk: tuple[str, 
     assert kept.options.light == side
     assert kept.options.function == "mine"
     np.testing.assert_allclose(kept.gaussians.colors, lit(dark, side).colors, atol=1e-5)
-    begun = live_parts(lit_file.gaussians, lit_file.options)[2]["light"]
+    begun = live_parts([(lit_file.gaussians, lit_file.options)])[2]["light"]
     again = saved(light=begun).options.light
     assert again is not None
     np.testing.assert_allclose(again.directions, side.directions, atol=1e-12)

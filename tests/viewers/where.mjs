@@ -38,7 +38,7 @@ async function settled() {
   throw new Error('the picture does not come to rest');
 }
 
-const HIDE = '#tools, #live, #named, #where, #places, #about, .sse-ui { visibility: hidden !important }';
+const HIDE = '#cut, #tools, #live, #named, #where, #places, #about, .sse-ui { visibility: hidden !important }';
 const steps = {
   open, settled,
   press: (key) => page.keyboard.press(key),
@@ -47,6 +47,13 @@ const steps = {
     return job.touch ? page.touchscreen.tap(...at) : page.mouse.click(...at);
   },
   drag: async (x, y, toX, toY) => {
+    if (job.touch) {
+      const fingers = await context.newCDPSession(page), at = (k) => [{ x: x + (k / 8) * (toX - x), y: y + (k / 8) * (toY - y) }];
+      await fingers.send('Input.dispatchTouchEvent', { type: 'touchStart', touchPoints: at(0) });
+      for (let k = 1; k <= 8; k++) await fingers.send('Input.dispatchTouchEvent', { type: 'touchMove', touchPoints: at(k) });
+      await fingers.send('Input.dispatchTouchEvent', { type: 'touchEnd', touchPoints: [] });
+      return;
+    }
     await page.mouse.move(x, y);
     await page.mouse.down();
     await page.mouse.move(toX, toY, { steps: 8 });

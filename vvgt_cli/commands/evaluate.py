@@ -173,11 +173,19 @@ def _together(field: Field, pictures: Sequence[Picture]) -> Iterator[None]:
 
 
 def _shown(gaussians: Gaussians, header: PlyHeader, source: Source, request: SourceRequest) -> Gaussians:
-    """What carries values, under the function that is given; else the look of the file."""
-    if header.live is None or (request.labels if header.live.labels else request.tf) is None:
+    """What carries values, under the function that is given; else the look of the file.
+
+    Raises:
+        UsageError: values that are looked at as labels, or the other way round.
+    """
+    if header.live is None or (request.labels is None and request.tf is None):
         return gaussians
     if isinstance(source.tf, LabelTable) != bool(header.live.labels) or len(source.layers) > 1:
-        return gaussians
+        carried = "labels" if header.live.labels else "values"
+        raise UsageError(
+            f"{source.name}: the Gaussians carry {carried} of one volume; expected the volume under "
+            f"{'--labels' if header.live.labels else '--tf'}, or neither option, to score the look of the file"
+        )
     light = light_of(request.light, source.lighting, source.volume.space)
     options = replace(layout_of(header), unit_distance=source.unit_distance, light=light)
     return under_function(gaussians, header, source.tf, options)

@@ -21,7 +21,7 @@ from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored, write_ply
 from vvgt_cli.gaussians.formats import SUFFIXES, encoded, format_of
 from vvgt_cli.gaussians.formats.gsply_files import compressed_ply
 from vvgt_cli.gaussians.formats.page_file import page, upright, waiting_page
-from vvgt_cli.gaussians.formats.page_live import HELD, light_sent, live_parts
+from vvgt_cli.gaussians.formats.page_live import light_sent, live_parts
 from vvgt_cli.gaussians.formats.splats import columns_of
 from vvgt_cli.gaussians.live import Table, baked
 from vvgt_cli.gaussians.live_facts import function_text
@@ -138,10 +138,10 @@ def page_of(cloud: Cloud, converts: bool) -> dict[str, bytes]:
         file, name = stored(cloud.gaussians, cloud.options), "0.ply"
         splats, elements, more = columns_of(file, cloud.name), SCRIPT, {}
     else:
-        splats, planes, facts = live_parts(cloud.gaussians, cloud.options)
+        [splats], [planes], facts = live_parts([(cloud.gaussians, cloud.options)])
         file, name = compressed_ply(splats, cloud.name), "0.compressed.ply"
         held = base64.b64encode(planes).decode("ascii")
-        elements = f'<script type="{BYTES}" id="{HELD}">{held}</script>\n{SCRIPT}'
+        elements = f'<script type="{BYTES}" id="{facts["held"][0]}">{held}</script>\n{SCRIPT}'
         more = {"live": facts, "server": {"converts": converts, "name": cloud.name}}
     text = page(cloud.name, splats, [{"name": cloud.name, "file": name}], elements, more)
     return {"": text.encode("utf-8"), name: file}

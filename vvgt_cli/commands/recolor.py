@@ -8,7 +8,6 @@ from typing import Any
 
 from vvgt_cli.conversion.gaussian_files import open_gaussians, write_gaussians
 from vvgt_cli.conversion.recolored import FunctionRequest, placed_function, under_function
-from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians.formats import SUFFIXES
 from vvgt_cli.gaussians.outputs import Output, claimed
 from vvgt_cli.look.lighting import LightOptions
@@ -62,15 +61,6 @@ def function_of(
     labels: str | None = None,
     light: Mapping[str, Any] | None = None,
 ) -> FunctionRequest | None:
-    """What options of a command add up to; None where they are of no look: without ``--tf``, ``--labels`` and a light.
-
-    Raises:
-        UsageError: a range or a distance without a function.
-    """
-    lights = LightOptions(**(light or {}))
-    if tf is None and labels is None:
-        if tf_range != "data" or unit_distance is not None:
-            raise UsageError("--tf-range and --opacity-unit-distance are of a function; give --tf too")
-        if lights == LightOptions():
-            return None
-    return FunctionRequest(tf, tf_range, unit_distance, labels, lights)
+    """What options of a command add up to; None where none is given."""
+    found = FunctionRequest(tf, tf_range, unit_distance, labels, LightOptions(**(light or {})))
+    return None if found == FunctionRequest() else found

@@ -24,8 +24,9 @@ WITHIN = 0.1  # dB that a file may have lost, by its format
 
 
 def certified(
-    ply: PlyOptions, run: Run, field: Field, fit: FitOptions, gaussians: Gaussians, command: str | None
-) -> PlyOptions:
+    ply: PlyOptions, run: Run, field: Field, fit: FitOptions, gaussians: Gaussians, command: str | None,
+    live_psnr: float | None = None,
+) -> PlyOptions:  # fmt: skip
     """Options of a file with the certificate of what the run has measured.
 
     Args:
@@ -34,7 +35,7 @@ def certified(
         field: the volume under its look.
         fit: what the Gaussians were made for.
         gaussians: as they are written, unit frame.
-        command: as `Certificate.command`.
+        command: as `Certificate.command`; ``live_psnr``: as of it, not rounded.
     """
     scores, seats = run.report.scores, [ViewingCondition(**seat) for seat in run.report.seats or ()]
     if not ply.comments or scores is None:
@@ -47,6 +48,7 @@ def certified(
         rule=fit.rule,
         psnr=round(first_views(scores), 2),
         views=len(PREVIEW_VIEWS),
+        live_psnr=None if live_psnr is None else round(live_psnr, 2),
         seats=tuple((seat.name(), round(seat.psnr, 2)) for seat in seats),
         position_error=position_error(gaussians, ply),
         seconds=None if REPRODUCIBLE in os.environ else round(run.elapsed(), 1),

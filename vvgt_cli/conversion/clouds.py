@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -37,6 +37,9 @@ from vvgt_cli.gaussians.formats import SUFFIXES, format_of
 from vvgt_cli.gaussians.outputs import Output, check_outputs
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
+
+if TYPE_CHECKING:
+    from vvgt_cli.look.function import TransferFunction
 
 
 @dataclass(repr=False)
@@ -126,6 +129,22 @@ class Clouds(Mapping[str, Result]):
         write_index(index.path, index_of(self.kind, self.volume, rows, **self.facts), overwrite)
         return total
 
+    def recolor(self, look: str | TransferFunction | None = None, **how: Any) -> Clouds:
+        """All of them under one other function, of clouds that carry values: `Result.recolor` of each.
+
+        Args:
+            look: file, colour map's name, or a function; None: that which they have.
+            **how: range, unit_distance, labels and light, as of `Result.recolor`.
+
+        Raises:
+            DataError, UsageError: as `Result.recolor`.
+        """
+        found = []
+        for cloud in self.clouds:
+            other = cloud.recolor(look, **how)
+            found.append(replace(cloud, gaussians=other.gaussians, report=other.report, ply=other.ply, directions=None))
+        return replace(self, clouds=found)
+
     def _named(self, pattern: str, cloud: Cloud) -> str:
         """The file of a cloud."""
         places = FIELD.findall(pattern)
@@ -144,11 +163,9 @@ class Clouds(Mapping[str, Result]):
 
     def _html(self, name: str) -> bytes:
         """The page of all."""
-        from vvgt_cli.gaussians.formats.page_file import html_of_several, upright
-        from vvgt_cli.gaussians.formats.splats import splats_of
+        from vvgt_cli.gaussians.formats.page_live import page_of_several
 
-        shown = [(cloud.name, splats_of(cloud.gaussians, upright(cloud.ply))) for cloud in self.clouds]
-        return html_of_several(shown, name)
+        return page_of_several([(cloud.name, cloud.gaussians, cloud.ply) for cloud in self.clouds], name)
 
     def _repr_html_(self) -> str | None:
         """What notebooks show; see `Result`."""

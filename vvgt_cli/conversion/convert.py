@@ -28,8 +28,10 @@ from vvgt_cli.field.workload import expected_wide
 from vvgt_cli.files import check_room
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored
 from vvgt_cli.gaussians.formats import format_of
+from vvgt_cli.gaussians.legend import legend_text
 from vvgt_cli.gaussians.outputs import STDOUT, check_outputs, claimed, write_text
 from vvgt_cli.jit.ahead import CONVERT, EVALUATE, INIT, LIVE, for_blocks, for_degree
+from vvgt_cli.look.labels import LabelTable
 from vvgt_cli.network.card import find_model, read_card
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
@@ -320,8 +322,19 @@ def ply_options(request: ConvertRequest, source: Source) -> PlyOptions:
         light=source.lighting,
         function=source.name if len(source.layers) > 1 else source.tf.name,
         optics=source.optics(),
+        legend=_legend(source),
     )
     return placed(ply, source.volume)
+
+
+def _legend(source: Source) -> str | None:
+    """Of one function or one table of labels."""
+    if len(source.layers) > 1:
+        return None
+    labelled, volume = isinstance(source.tf, LabelTable), source.volume
+    numbers = None if labelled else source.statistics
+    lo, hi = (0.0, 0.0) if numbers is None else (numbers.lo, numbers.hi)
+    return legend_text(source.tf, lo, hi, "HU" if volume.hounsfield else "")
 
 
 def _write(run: Run, request: ConvertRequest, conversion: Conversion) -> ConversionReport:

@@ -16,8 +16,7 @@ from vvgt_cli.errors import DataError, VvgtError
 from vvgt_cli.files import atomic_write, is_stream
 from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions, in_unit_frame, read_ply, write_ply
 from vvgt_cli.gaussians.formats import encoded, format_of, read_splats
-from vvgt_cli.gaussians.formats.page_file import html_of_several, upright
-from vvgt_cli.gaussians.formats.splats import splats_of
+from vvgt_cli.gaussians.formats.page_live import page_of_several
 from vvgt_cli.gaussians.outputs import STDOUT
 from vvgt_cli.gaussians.rules import INRIA, Rule, rule_of
 from vvgt_cli.score.record import Run
@@ -51,7 +50,8 @@ def open_gaussians(source: str | BinaryIO) -> tuple[Gaussians, PlyHeader]:
 
 def layout_of(header: PlyHeader) -> PlyOptions:
     """What makes a file laid out, placed and commented as the one read was."""
-    return PlyOptions(sh_degree=header.sh_degree, comments=header.version is not None, **header.facts())
+    told = header.facts() | {"date": None}  # of what was written then
+    return PlyOptions(sh_degree=header.sh_degree, comments=header.version is not None, **told)
 
 
 def write_gaussians(
@@ -98,14 +98,15 @@ def write_page(run: Run, output: str, clouds: Sequence[tuple[str, str]], overwri
     if not clouds:
         raise DataError(f"{output}: nothing is visible in any of what it was to show; try another function")
     with run.stage("write") as stage:
-        shown, rules = [], set[str]()
+        shown: list[tuple[str, Gaussians, PlyOptions]] = []
+        rules = set[str]()
         for name, file in clouds:
             gaussians, header = open_gaussians(file)
             rules.add(header.rule or INRIA.name)
-            shown.append((name, splats_of(gaussians, upright(layout_of(header)))))
+            shown.append((name, gaussians, layout_of(header)))
             run.report.gaussians += len(gaussians)
         with atomic_write(output, overwrite) as temporary:
-            run.report.bytes = temporary.write_bytes(html_of_several(shown, output))
+            run.report.bytes = temporary.write_bytes(page_of_several(shown, output))
         if len(rules) > 1:
             run.console.say(f"{output}: made for {', '.join(sorted(rules))}; the page draws all as it draws the first")
         stage.note = (

@@ -92,20 +92,19 @@ def live_conversion(
         gaussians = carrying_labels(run, foggy, placed_by(run, foggy, request), labels)
     else:
         assert isinstance(tf, TransferFunction)
-        foggy, facts = field.shown_by(fog(source.statistics, tf)), LiveFacts.of(source.volume, source.statistics, tf)
+        foggy, facts = field.shown_by(fog(source.overall, tf)), LiveFacts.of(source.volume, source.overall, tf)
         gaussians = carrying(run, foggy, placed_by(run, foggy, request))
     gaussians = wide_enough(gaussians, fit.size)
     table = looked_up(facts, tf, source.unit_distance * source.volume.unit_frame().scale)
     gaussians = as_stored(lit(baked(gaussians, table), lighting))
-    if scored:
-        _score(run, request, field, gaussians, lit_by(gaussians, table, lighting))
+    psnr = _score(run, request, field, gaussians, lit_by(gaussians, table, lighting)) if scored else None
     found = out_of_box(gaussians, source.volume)
-    ply = certified(replace(ply, live=facts), run, field, fit, found, request.command)
+    ply = certified(replace(ply, live=facts), run, field, fit, found, request.command, psnr)
     return Conversion(found, run.report, ply, field)
 
 
-def _score(run: Run, request: ConvertRequest, field: Field, gaussians: Gaussians, shown: Gaussians) -> None:
-    """As `vvgt recolor` shows them under the function, and as other viewers do."""
+def _score(run: Run, request: ConvertRequest, field: Field, gaussians: Gaussians, shown: Gaussians) -> float:
+    """As `vvgt recolor` shows them under the function (dB, returned), and as other viewers do."""
     from vvgt_cli.dvr import RenderSettings
 
     fit, tf = request.fit, field.source.tf
@@ -119,6 +118,7 @@ def _score(run: Run, request: ConvertRequest, field: Field, gaussians: Gaussians
     work = Work(run, field, fit, gaussians=gaussians)
     for stage_of_scores in (TestViews(request.scored_whole), ViewingConditions()):
         stage_of_scores.run(work)
+    return live.psnr
 
 
 def in_box(source: Source) -> Lighting | None:
@@ -144,7 +144,7 @@ def lit(gaussians: Gaussians, lighting: Lighting | None) -> Gaussians:
 
 def table_of(source: Source) -> Table:
     """Of a source's function, lengths in the unit frame."""
-    numbers, tf = source.statistics, source.tf
+    numbers, tf = source.overall, source.tf
     assert isinstance(tf, TransferFunction)
     return Table.of_function(tf, numbers.lo, numbers.hi, source.unit_distance * source.volume.unit_frame().scale)
 
@@ -174,7 +174,7 @@ def carrying(run: Run, field: Field, gaussians: Gaussians) -> Gaussians:
         gaussians, values = gaussians.take(known), values[known]
         tau = table_of(field.source).at(values[:, 0], values[:, 1])[:, 3]
         live = np.insert(values, LENGTH, lengths(gaussians, tau), axis=1)
-        span = field.source.statistics.hi - field.source.statistics.lo
+        span = field.source.overall.hi - field.source.overall.lo
         stage.note = f"mean spread {100 * float(values[:, 1].mean()) / (span or 1):.1f} % of the range"
     return replace(gaussians, live=live, harmonics=None)
 

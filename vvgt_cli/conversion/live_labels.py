@@ -22,7 +22,7 @@ from vvgt_cli.volume.label_maps import counts_of
 
 
 def labels_of(source: Source) -> tuple[Label, ...]:
-    """The visible labels of a source: those that Gaussians can belong to.
+    """The labels of a source that Gaussians can belong to: hidden ones too, which other tables may show.
 
     Raises:
         UsageError: anything but one label map.
@@ -34,9 +34,9 @@ def labels_of(source: Source) -> tuple[Label, ...]:
             f"{source.name}: channels, layers, colours, or segments that overlap; --live expects one scalar field, or "
             "one label map: choose it with --component N, or leave out --live"
         )
-    found = tuple(label for label in table.labels if label.opacity > 0)
+    found = tuple(label for label in table.labels if label.number != 0 or label.opacity > 0)
     if len(found) > MOST_LABELS:
-        raise DataError(f"{source.name}: {len(found)} visible labels; expected at most {MOST_LABELS} with --live")
+        raise DataError(f"{source.name}: {len(found)} labels; expected at most {MOST_LABELS} with --live")
     return found
 
 
@@ -47,7 +47,7 @@ def label_facts(source: Source, labels: tuple[Label, ...]) -> LiveFacts:
 
 
 def fog_of_labels(field: Field, labels: tuple[Label, ...]) -> Field:
-    """The label map with all visible labels as one thin fog, told apart by their colours."""
+    """The label map with these labels as one thin fog, told apart by their colours."""
     layer = field.source.layers[0]
     assert isinstance(layer.tf, LabelTable)
     voxels = counts_of(layer.volume)

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from vvgt_cli.conversion.frames import steps_of
 from vvgt_cli.conversion.functions import convert_functions
 from vvgt_cli.conversion.gaussian_files import write_page
 from vvgt_cli.conversion.labels import convert_labels
@@ -22,6 +23,8 @@ from vvgt_cli.score.record import ConversionReport, Run
 from vvgt_cli.volume.slices import matching
 from vvgt_cli.volume.tiff import SUFFIXES
 
+MOST = 3_000_000  # Gaussians of all frames of a live page: 90 MB of it
+
 
 def page_of_volume(request: ConvertRequest, alone: Callable[[], object], console: Console) -> None:
     """One volume, which ``alone`` converts, or the frames of a series: a file of several steps, or a glob of volumes.
@@ -35,7 +38,19 @@ def page_of_volume(request: ConvertRequest, alone: Callable[[], object], console
             return
         except SeveralSteps:
             pass
+    if request.live:
+        request = _bounded(request, console)
     _page(request, lambda one: convert_series(one, Shard(), console), console)
+
+
+def _bounded(request: ConvertRequest, console: Console) -> ConvertRequest:
+    """As many Gaussians a frame as a page of all frames can hold."""
+    frames, asked = len(steps_of(request.source)), request.fit.max_gaussians
+    most = max(MOST // frames, 1)
+    if asked <= most:
+        return request
+    console.say(f"{request.output}: {frames} frames in one page; {most} Gaussians each in the place of {asked}")
+    return replace(request, fit=replace(request.fit, max_gaussians=most))
 
 
 def page_of_functions(request: ConvertRequest, functions: Sequence[str], console: Console) -> None:
@@ -58,11 +73,6 @@ def page_of_labels(request: ConvertRequest, console: Console) -> None:
 
 def _page(request: ConvertRequest, make: Callable[[ConvertRequest], dict[str, Any]], console: Console) -> None:
     """Let ``make`` write a `.ply` a cloud into a folder that goes again, and join them by its index."""
-    if request.live:
-        raise UsageError(
-            f"{request.source.path}: several clouds of Gaussians; --live makes a file of one: choose it, with "
-            "--time N of a file of several steps, or leave out --live"
-        )
     if request.report or request.preview or request.checkpoint:
         raise UsageError(
             f"{request.output} gets several clouds of Gaussians: --report, --preview and --checkpoint are of one each; "

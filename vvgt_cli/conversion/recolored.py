@@ -129,8 +129,11 @@ def _table(name: str, facts: LiveFacts, function: FunctionRequest) -> tuple[Labe
     """A table of labels as it was given, twice."""
     from vvgt_cli.look.label_files import read_labels
 
-    if function.tf is not None or function.tf_range != "data":
-        raise UsageError(f"{name}: its Gaussians carry labels, not values; give a table (--labels), not --tf")
+    wrong = ["--tf"] * (function.tf is not None) + ["--tf-range"] * (function.tf_range != "data")
+    if wrong:
+        raise UsageError(
+            f"{name}: its Gaussians carry labels, not values; leave out {' and '.join(wrong)} (--labels gives a table)"
+        )
     numbers = [label.number for label in facts.labels]
     if function.labels is None:
         table = LabelTable("the labels of the file", facts.labels)

@@ -328,7 +328,7 @@ class Blocked:
         top = sum(layer.largest for layer in layers) / self.reader.scale
         reader = replace(self.reader, layers=layers, optics=Optics.linear(top))
         own = [(e.number, e.color, e.opacity) for table in tables for e in table.labels]
-        return self._beside(source, reader, self.visible, digest(self.key, own, source.unit_distance))
+        return self._beside(source, reader, reader.visible(), digest(self.key, own, source.unit_distance))
 
     def _beside(self, source: Source, reader: Reader, visible: float, key: str) -> Blocked:
         """The field of another look, whose parts lie in a folder of their own, within that of this one."""

@@ -155,48 +155,69 @@ class Dask:
     def _keep(self, cluster: Any) -> None:
         """Ask for the jobs, and again for those that have ended, until the context does.
 
-        Where all have ended and no worker answers, the tasks are cancelled.
+        Where all have ended and no worker answers, the tasks are cancelled. A job that ends before its worker has
+        answered is followed by another, `TRIES` times for each that was asked for.
         """
         cluster.scale(jobs=self.workers)
         over = threading.Event()
 
+        def again(names: Sequence[Any]) -> None:
+            for name in names:
+                cluster.worker_spec.pop(name, None)  # the cluster waits for its worker for ever
+            cluster.scale(jobs=self.workers)
+
         def watch() -> None:
-            gone: set[str] = set()
+            before: set[str] = set()
+            left = TRIES * self.workers
             while not over.wait(AGAIN):
-                found = jobs_gone(cluster)
+                found, all_of_them = jobs_gone(cluster)
                 if over.is_set() or self._client is None:
                     continue
-                if found and found == gone:  # seen twice: no job that has only just ended
+                gone = {name: job for name, job in found.items() if job in before}  # no job that has only just ended
+                before = set(found.values())
+                if gone and all_of_them:
                     self._lost = (
                         "--scheduler slurm: all jobs have ended, with blocks left to do; why is in the files of their "
-                        f"output (slurm-{min(found, key=int)}.out, or where jobqueue.slurm in Dask's settings puts "
-                        "it); the same command goes on with what is done"
+                        f"output (slurm-{min(gone.values(), key=int)}.out, or where jobqueue.slurm in Dask's settings "
+                        "puts it); the same command goes on with what is done"
                     )
                     with suppress(
                         Exception
                     ):  # blocks of a pass that has just ended: the next look has those of the next
                         self._client.cancel(self._futures, force=True)
                     continue
-                gone = found
-                cluster.loop.add_callback(cluster.scale, jobs=self.workers)
+                names = list(gone)[:left]
+                left -= len(names)
+                cluster.loop.add_callback(again, names)
 
         self._stack.callback(over.set)
         threading.Thread(target=watch, daemon=True).start()
 
 
-def jobs_gone(cluster: Any) -> set[str]:
-    """Numbers of the jobs of a cluster without workers, where SLURM knows none of them any more; else none."""
-    numbers = {str(job.job_id) for job in list(cluster.workers.values()) if job.job_id}
+def jobs_gone(cluster: Any) -> tuple[dict[Any, str], bool]:
+    """Numbers of the jobs of a cluster that SLURM does not know any more, without a worker that answers.
+
+    Returns:
+        Them by the cluster's name of their workers, and whether there are no others and no worker at all.
+    """
+    answering = {worker.get("name") for worker in cluster.scheduler_info["workers"].values()}
+    silent = {
+        name: str(job.job_id)
+        for name, job in list(cluster.workers.items())
+        if job.job_id and name not in answering and name in cluster.worker_spec
+    }
     elsewhere = any(line.startswith(("#SBATCH -M", "#SBATCH --cluster")) for line in cluster.job_script().splitlines())
-    if cluster.scheduler_info["workers"] or not numbers or elsewhere:
-        return set()
+    if not silent or elsewhere:
+        return {}, False
     try:
-        asked = _asked(["squeue", "--all", "--noheader", "--format=%A", f"--jobs={','.join(sorted(numbers))}"])
+        asked = _asked(["squeue", "--all", "--noheader", "--format=%A", f"--jobs={','.join(sorted(silent.values()))}"])
     except (OSError, subprocess.TimeoutExpired):
-        return set()
+        return {}, False
     if asked.returncode and "nvalid job id" not in asked.stderr:  # what squeue says of jobs long ended
-        return set()
-    return set() if numbers & set(asked.stdout.split()) else numbers
+        return {}, False
+    known = set(asked.stdout.split())
+    gone = {name: job for name, job in silent.items() if job not in known}
+    return gone, not answering and len(gone) == len(silent)
 
 
 def _asked(command: list[str], given: str = "") -> subprocess.CompletedProcess[str]:

@@ -35,7 +35,6 @@ from vvgt_cli.volume.stored import Stored, is_file_backed
 
 if TYPE_CHECKING:
     from vvgt_cli.field.cells import Reader
-    from vvgt_cli.field.reader import Layers
 
 LAYOUT = 3  # of parts: one more whenever what is in them changes
 HELD = 1 << 30  # bytes of values: more are processed in blocks, with a tenth of the memory (docs/log/blocks.md)
@@ -57,7 +56,6 @@ PACKED = (
 RANGES, LAYER_VOXEL = 0.15, 20  # bytes a voxel: the map of empty space, an optics grid
 OWN = {"uint8": 0, "uint16": 0, "float32": 0, "int8": 1}  # bytes a voxel of the kernels' copy; others 4
 LAYERED_BYTES = 60  # of a voxel of an optics grid while a block of it is there
-FEW_SAMPLES = 512  # bricks of layers: each is read for itself
 
 
 @dataclass(frozen=True)
@@ -184,18 +182,7 @@ def _reader(source: Source, access: Counted) -> tuple[Reader, float]:
     places = tuple(tuple(map(access.place, (layer.volume, *(layer.colors or ())))) for layer in source.layers)
     layers = tuple(replace(layer, volume=grid, colors=None) for layer in source.layers)
     reader = Layers(layers, places, grid, volume.dims, frame.scale, Optics.linear(top))
-    return reader, _visible_of(reader, volume)
-
-
-def _visible_of(reader: Layers, volume: Volume) -> float:
-    """About how many voxels of an optics grid are visible: samples of it are read."""
-    from vvgt_cli.closed_form.samples import SAMPLE, estimate, samples_in, visible_share
-
-    places, weights = samples_in(volume.dims, np.zeros(3, np.int64), np.array(volume.dims))
-    size = np.minimum(SAMPLE, volume.dims)
-    few = np.unique(np.linspace(0, len(places) - 1, min(len(places), FEW_SAMPLES)).astype(np.int64))
-    bricks = np.stack([reader.box(places[n], places[n] + size).values for n in few])
-    return estimate(visible_share(reader.optics, bricks), weights[few], volume.data.size)
+    return reader, reader.visible()
 
 
 def _at_level(read: ReadOptions, path: str, options: BlockOptions, size: int) -> tuple[ReadOptions, str | None]:

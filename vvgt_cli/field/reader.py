@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, lru_cache
@@ -18,6 +19,7 @@ from vvgt_cli.volume.stored import read_block
 from vvgt_cli.volume.types import triple
 
 OPEN = 16  # files that a process keeps open
+FEW_SAMPLES = 512  # bricks of layers: each is read for itself
 CLASSIFIED = -1  # in the place of a component: what the opacity of colours follows from
 
 
@@ -175,6 +177,16 @@ class Layers:
         values = np.ascontiguousarray(texels[..., 3])
         values.flags.writeable = False
         return Box(values, texels, self.optics, lo.astype(np.int64))
+
+    def visible(self) -> float:
+        """About how many voxels are visible: samples of them are read."""
+        from vvgt_cli.closed_form.samples import SAMPLE, estimate, samples_in, visible_share
+
+        places, weights = samples_in(self.dims, np.zeros(3, np.int64), np.array(self.dims))
+        size = np.minimum(SAMPLE, self.dims)
+        few = np.unique(np.linspace(0, len(places) - 1, min(len(places), FEW_SAMPLES)).astype(np.int64))
+        bricks = np.stack([self.box(places[n], places[n] + size).values for n in few])
+        return estimate(visible_share(self.optics, bricks), weights[few], math.prod(self.dims))
 
 
 def hollow(volume: Volume, dims: Sequence[int]) -> Volume:

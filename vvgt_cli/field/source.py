@@ -107,6 +107,7 @@ class Source:
         statistics: of the first layer's volume.
         lighting: what falls on it, None for nothing.
         layout: the volume's, where it is known.
+        series: as ``statistics``, of all frames of the series that it is one of; None: it is of none.
     """
 
     layers: tuple[Layer, ...]
@@ -114,6 +115,12 @@ class Source:
     statistics: Statistics
     lighting: Lighting | None = None
     layout: PreparedVolume | None = None
+    series: Statistics | None = None
+
+    @property
+    def overall(self) -> Statistics:
+        """What frames of a series share: of all of them, else its own."""
+        return self.series or self.statistics
 
     @property
     def gridded(self) -> bool:
@@ -290,7 +297,8 @@ def load_all(
             )
         check_visible(shown, numbers)
         layer = Layer(volume, shown, *unit_distance(request.unit_distance, volume, tf or shown))
-        sources.append(Source((layer,), volume, numbers, lighting, content.layout if held else None))
+        series = request.statistics[0] if request.statistics else None
+        sources.append(Source((layer,), volume, numbers, lighting, content.layout if held else None, series))
     return sources
 
 

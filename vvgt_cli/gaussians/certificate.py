@@ -21,6 +21,7 @@ class Certificate:
         size, rule: pixels of the screen, and name of the rule of `vvgt_cli.gaussians.rules`, that they are scored by.
         psnr: dB, mean of the first scored views against the volume.
         views: number of these views.
+        live_psnr: dB of a live file as `vvgt recolor` shows it under its own function; None of others.
         seats: name of a viewing condition and dB of each that was scored, worst first.
         position_error: greatest distance of a centre in the file from where it was computed, in units of the world.
         seconds: wall time until the scores; None where `SOURCE_DATE_EPOCH` asks for files that can be made again.
@@ -34,6 +35,7 @@ class Certificate:
     rule: str
     psnr: float
     views: int
+    live_psnr: float | None = None
     seats: tuple[tuple[str, float], ...] = ()
     position_error: float = 0.0
     seconds: float | None = None
@@ -61,7 +63,7 @@ class Certificate:
         seats = tuple((str(name), _number(value)) for name, value in found.pop("seats", {}).items())
         kinds = {
             "volume": str, "sha256": str, "look": str, "size": int, "rule": str, "psnr": float, "views": int,
-            "position_error": float, "seconds": float, "command": str,
+            "live_psnr": float, "position_error": float, "seconds": float, "command": str,
         }  # fmt: skip
         if not {"volume", "look", "size", "rule", "psnr", "views"} <= set(found) <= set(kinds):
             raise ValueError(text)

@@ -13,6 +13,7 @@ from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians.certificate import WORD as CERTIFICATE
 from vvgt_cli.gaussians.certificate import Certificate
 from vvgt_cli.gaussians.frames import up_matrix
+from vvgt_cli.gaussians.legend import checked
 from vvgt_cli.gaussians.live_facts import WORD, LiveFacts, live_facts, one_comment
 from vvgt_cli.gaussians.types import HARMONICS
 from vvgt_cli.look.lighting import Lighting, parse_lighting
@@ -49,6 +50,8 @@ class FileFacts:
         length_unit: of the world, where that has no anatomical space (whose unit is mm).
         function: name of the transfer function.
         certificate: what was measured when the Gaussians were made; None of Gaussians that were changed since.
+        legend: of the look that the file has (`legend.legend_text`); of a live file ``live`` says it.
+        date: when it was written, YYYY-MM-DD, of pages alone.
     """
 
     frame: str = "unit"
@@ -67,6 +70,8 @@ class FileFacts:
     length_unit: str | None = None
     function: str | None = None
     certificate: Certificate | None = None
+    legend: str | None = None
+    date: str | None = None
 
     def facts(self) -> dict[str, Any]:
         """The facts by name."""
@@ -243,6 +248,10 @@ def _one_comment(words: list[str]) -> dict[str, Any]:
         return {"length_unit": words[1]}
     if words[0] == "function":
         return {"function": str(json.loads(" ".join(words[1:])))}
+    if words[0] == "legend":
+        return {"legend": checked(" ".join(words[1:]))}
+    if words[0] == "date":
+        return {"date": " ".join(words[1:])}
     if words[0] == "optics":
         return {"optics": words[1]}
     if words[0] == "affine":
@@ -268,6 +277,9 @@ def comment_lines(facts: FileFacts) -> list[str]:
         lines.append(f"comment vvgt length-unit {facts.length_unit}")
     if facts.function is not None:
         lines.append(f"comment vvgt function {json.dumps(facts.function)}")
+    for word, text in (("legend", None if facts.live else facts.legend), ("date", facts.date)):
+        if text is not None:
+            lines.append(f"comment vvgt {word} {text}")
     if facts.unit_distance is not None:
         label = facts.unit_distance_label or "given"
         lines.append(f"comment vvgt unit-distance {float(facts.unit_distance)!r} {label}")

@@ -87,6 +87,8 @@ ALL = (
     *COUNT_WHOLE,
     *COUNT_REAL,
     "vvgt_cli.volume.slc_kernel:decode_plane",
+    "vvgt_cli.gaussians.formats.codebook_kernels:cut_clusters",
+    "vvgt_cli.gaussians.formats.codebook_kernels:divide",
 )
 
 

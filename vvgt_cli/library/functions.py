@@ -107,12 +107,12 @@ def _one_or_frames(request: ConvertRequest, console: Console) -> Conversion | Cl
     from vvgt_cli.conversion.pages import is_glob_of_volumes
 
     path = request.source.volume
-    if isinstance(path, str) and not request.live and is_glob_of_volumes(path):
+    if isinstance(path, str) and is_glob_of_volumes(path):
         return frames_in_memory(request, console)
     try:
         return without_files(request, console)
     except SeveralSteps:
-        if not isinstance(path, str) or request.live:
+        if not isinstance(path, str):
             raise
         return frames_in_memory(request, console)
 

@@ -43,7 +43,7 @@ class Format:
 FORMATS = (
     Format(".compressed.ply", gsply_files.compressed_ply, gsply_files.read_compressed_ply, gsply_files.gsply),
     Format(".spz", gsply_files.spz, gsply_files.read_spz, gsply_files.gsply),
-    Format(".sog", sog.sog, sog.read_sog, sog.program),
+    Format(".sog", sog.sog, sog.read_sog, lambda name: None),
     Format(".glb", gltf.glb, gltf.read_glb, lambda name: None),
     Format(".usdc", usd.usdc, usd.read_usdc, usd.library),
     Format(".html", page_file.html, page_file.read_html, gsply_files.gsply, page_file.upright, page_live.live_html),
@@ -74,6 +74,8 @@ def encoded(known: Format, gaussians: Gaussians, options: PlyOptions, name: str)
     Raises:
         DataError: values that it cannot hold, a library or a program that is not installed, or fails.
     """
+    if known.suffix == ".html":
+        options = page_file.dated(options)
     if gaussians.live is not None and options.live is not None and known.live is not None:
         return known.live(gaussians, options, name)
     if gaussians.live is not None:

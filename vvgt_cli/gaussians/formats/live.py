@@ -13,6 +13,7 @@ Eight bytes a Gaussian, two textures of RGBA8U, in the order of the file:
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -24,11 +25,14 @@ from vvgt_cli.gaussians.types import Gaussians
 BYTES = 8
 
 
-def live_bytes(gaussians: Gaussians, facts: LiveFacts) -> np.ndarray:
-    """(K, 8) uint8 of Gaussians that carry values; directions are in the frame that these are in."""
+def live_bytes(gaussians: Gaussians, facts: LiveFacts, logs: tuple[float, float] | None = None) -> np.ndarray:
+    """(K, 8) uint8 of Gaussians that carry values; directions are in the frame that these are in.
+
+    ``logs``: `log_lengths` of all that are in one page; None: their own.
+    """
     assert gaussians.live is not None
     live, width = gaussians.live.astype(np.float64), (facts.hi - facts.lo) or 1.0
-    first, last = _lengths(gaussians)
+    first, last = logs or log_lengths([gaussians])
     out = np.zeros((len(live), BYTES), np.uint8)
     out[:, 0] = _byte((live[:, VALUE] - facts.lo) / width)
     out[:, 1] = _byte((live[:, SPREAD] / width / WIDEST).clip(0, 1) ** (1 / BEND))
@@ -40,11 +44,11 @@ def live_bytes(gaussians: Gaussians, facts: LiveFacts) -> np.ndarray:
     return out
 
 
-def live_json(gaussians: Gaussians, facts: LiveFacts, unit_distance: float) -> dict[str, Any]:
+def live_json(clouds: Sequence[Gaussians], facts: LiveFacts, unit_distance: float) -> dict[str, Any]:
     """Facts beside the bytes, plain values.
 
     Args:
-        gaussians: that the bytes are of.
+        clouds: that the bytes are of.
         facts: of their values.
         unit_distance: unit-frame length that the opacity of the function in ``facts`` is per.
     """
@@ -56,7 +60,7 @@ def live_json(gaussians: Gaussians, facts: LiveFacts, unit_distance: float) -> d
         "histogram": list(facts.histogram),
         "function": facts.baked(),
         "unit_distance": unit_distance,
-        "log_lengths": list(_lengths(gaussians)),
+        "log_lengths": list(log_lengths(clouds)),
         "widest": WIDEST,
         "bend": BEND,
         "table": [MEANS, SPREADS],
@@ -79,11 +83,10 @@ def from_bytes(stream: np.ndarray, facts: dict[str, Any]) -> np.ndarray:
     return found
 
 
-def _lengths(gaussians: Gaussians) -> tuple[float, float]:
+def log_lengths(clouds: Sequence[Gaussians]) -> tuple[float, float]:
     """Logs of the shortest and the longest."""
-    assert gaussians.live is not None
-    logs = np.log(gaussians.live[:, LENGTH].astype(np.float64))
-    return float(logs.min()), float(logs.max())
+    logs = [np.log(cloud.live[:, LENGTH].astype(np.float64)) for cloud in clouds if cloud.live is not None]
+    return min(float(some.min()) for some in logs), max(float(some.max()) for some in logs)
 
 
 def _byte(share: np.ndarray) -> np.ndarray:

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import base64
 import json
+import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from datetime import UTC, datetime
 from html import escape
 from importlib.resources import files
 from types import MappingProxyType
@@ -46,6 +48,15 @@ def upright(options: PlyOptions) -> PlyOptions:
     if not options.comments:
         return options
     return replace(options, frame="unit", up="z" if options.up == "none" else options.up)
+
+
+def dated(options: PlyOptions) -> PlyOptions:
+    """With the day on which a page is written, or that of SOURCE_DATE_EPOCH (seconds), for the same bytes every day."""
+    if not options.comments:
+        return options
+    seconds = os.environ.get("SOURCE_DATE_EPOCH", "")
+    when = datetime.fromtimestamp(int(seconds), UTC) if seconds.isdecimal() else datetime.now()
+    return replace(options, date=f"{when:%Y-%m-%d}")
 
 
 def camera(splats: Splats) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -10,18 +11,18 @@ import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import Gaussians, PlyOptions
-from vvgt_cli.gaussians.formats.live import live_bytes, live_json
+from vvgt_cli.gaussians.formats.live import live_bytes, live_json, log_lengths
 from vvgt_cli.gaussians.formats.page_file import html_of_several, title_of, upright
 from vvgt_cli.gaussians.formats.splats import Splats, morton_order, splats_of
 from vvgt_cli.gaussians.frames import turn, up_matrix
 from vvgt_cli.gaussians.live import law_nodes
-from vvgt_cli.gaussians.live_facts import LiveFacts
+from vvgt_cli.gaussians.live_facts import ROW, LiveFacts
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.lighting import MOST, Lighting
 from vvgt_cli.look.readers.minimal import read
 from vvgt_cli.volume.types import triple
 
-HELD = "values"  # the element that holds the bytes
+HELD = "values"  # of the elements that hold the bytes, with the number of the cloud
 PLANES = (0, 1, 2, 4, 5, 6)  # columns of `live_bytes` that are not 0; of labels all
 SAMPLED = 96  # nodes of colours on other lines than straight ones in RGB
 _RAMP = {"points": [{"x": 0, "rgb": [1, 1, 1], "opacity": 0}, {"x": 1, "rgb": [1, 1, 1], "opacity": 0.1}]}
@@ -34,28 +35,88 @@ def live_html(gaussians: Gaussians, options: PlyOptions, name: str) -> bytes:
     Raises:
         DataError, UsageError: as `splats_of`, or a library that is missing.
     """
-    splats, planes, facts = live_parts(gaussians, options)
-    return html_of_several([(title_of(name), splats)], name, {HELD: planes}, {"live": facts})
+    return live_html_of_several([(title_of(name), gaussians, options)], name)
 
 
-def live_parts(gaussians: Gaussians, options: PlyOptions) -> tuple[Splats, bytes, dict[str, Any]]:
-    """What a page of Gaussians (unit frame) that carry values is made of.
+def live_html_of_several(clouds: Sequence[tuple[str, Gaussians, PlyOptions]], name: str) -> bytes:
+    """The page of several that are shown under one function, each by its name; `in_common` says whether they can be.
+
+    Raises:
+        DataError, UsageError: as `live_html`.
+    """
+    shown, planes, facts = live_parts([(gaussians, options) for _, gaussians, options in clouds])
+    held = dict(zip(facts["held"], planes, strict=True))
+    return html_of_several(
+        [(one[0], splats) for one, splats in zip(clouds, shown, strict=True)], name, held, {"live": facts}
+    )
+
+
+def page_of_several(clouds: Sequence[tuple[str, Gaussians, PlyOptions]], name: str) -> bytes:
+    """The page of several clouds, each by its name: live where they can be shown under one function, else baked.
+
+    Raises:
+        DataError, UsageError: as `live_html`.
+    """
+    if in_common([None if gaussians.live is None else options.live for _, gaussians, options in clouds]):
+        return live_html_of_several(clouds, name)
+    baked = [
+        (cloud, splats_of(replace(gaussians, live=None), replace(upright(options), live=None)))
+        for cloud, gaussians, options in clouds
+    ]
+    return html_of_several(baked, name)
+
+
+def in_common(facts: Sequence[LiveFacts | None]) -> LiveFacts | None:
+    """What files say of the values that their Gaussians carry, as one page has it; None where none can show all.
+
+    Values are of one range under one function; of label maps, each label of any of them is there once.
+    """
+    first, *others = facts
+    if first is None or any(one is None or bool(one.labels) != bool(first.labels) for one in others):
+        return None
+    if first.labels:
+        labels = {label.number: label for one in reversed(facts) if one is not None for label in one.labels}
+        return replace(first, labels=tuple(labels[number] for number in sorted(labels)))
+    alike = all(one and (one.lo, one.hi, one.function) == (first.lo, first.hi, first.function) for one in others)
+    return first if alike else None
+
+
+def live_parts(
+    clouds: Sequence[tuple[Gaussians, PlyOptions]],
+) -> tuple[list[Splats], list[bytes], dict[str, Any]]:
+    """What a page of Gaussians (unit frame) that carry values is made of, of one cloud or several.
 
     Returns:
-        the columns, in an order that `.compressed.ply` keeps; the bytes of their values, in that order, packed by
+        of each its columns, in an order that `.compressed.ply` keeps; the bytes of its values, in that order, packed by
         gzip; the facts about them that are the scene's ``live``.
 
     Raises:
         DataError, UsageError: as `live_html`.
     """
-    assert gaussians.live is not None
-    assert options.live is not None
-    facts, laid = options.live, upright(options)
-    gaussians = gaussians.take(morton_order(turn(gaussians, laid.up).means))  # as the page's file has them
-    turned = turn(gaussians, laid.up)
-    splats = splats_of(replace(gaussians, live=None, harmonics=None), replace(laid, live=None, sh_degree=0))
-    planes = np.ascontiguousarray(live_bytes(turned, facts)[:, planes_of(facts)].T)
-    return splats, gzip.compress(planes.tobytes(), 9, mtime=0), _facts(gaussians, options, laid.up)
+    facts = in_common([options.live for _, options in clouds])
+    assert facts is not None
+    ordered, splats = [], []
+    for gaussians, options in clouds:
+        laid = upright(options)
+        assert options.live is not None
+        some = renumbered(gaussians, options.live, facts).take(morton_order(turn(gaussians, laid.up).means))
+        splats.append(splats_of(replace(some, live=None, harmonics=None), replace(laid, live=None, sh_degree=0)))
+        ordered.append(some)
+    logs, planes = log_lengths(ordered), []
+    for some, (_, options) in zip(ordered, clouds, strict=True):
+        rows = live_bytes(turn(some, upright(options).up), facts, logs)[:, planes_of(facts)]
+        planes.append(gzip.compress(np.ascontiguousarray(rows.T).tobytes(), 9, mtime=0))
+    return splats, planes, _facts(ordered, facts, clouds[0][1])
+
+
+def renumbered(gaussians: Gaussians, own: LiveFacts, facts: LiveFacts) -> Gaussians:
+    """Gaussians with the rows that ``facts`` have in the place of their ``own``, of labels."""
+    if own.labels == facts.labels or gaussians.live is None:
+        return gaussians
+    rows = {label.number: row for row, label in enumerate(facts.labels)}
+    live, to = gaussians.live.copy(), np.array([rows[label.number] for label in own.labels])
+    live[:, ROW] = to[live[:, ROW].astype(np.int64)]
+    return replace(gaussians, live=live)
 
 
 def planes_of(facts: LiveFacts) -> tuple[int, ...]:
@@ -63,22 +124,23 @@ def planes_of(facts: LiveFacts) -> tuple[int, ...]:
     return (*PLANES, 3, 7) if facts.labels else PLANES
 
 
-def _facts(gaussians: Gaussians, options: PlyOptions, up: str) -> dict[str, Any]:
-    """What the page's program needs beside the bytes."""
-    assert options.live is not None
-    facts = options.live
-    said = live_json(gaussians, facts, (options.unit_distance or 1.0) * (options.scale or 1.0))
+def _facts(clouds: Sequence[Gaussians], facts: LiveFacts, options: PlyOptions) -> dict[str, Any]:
+    """What the page's program needs beside the bytes; ``options`` of the first cloud."""
+    said = live_json(clouds, facts, (options.unit_distance or 1.0) * (options.scale or 1.0))
     said.pop("function")
-    axes = _axes(up)
+    axes = _axes(upright(options).up)
     return said | {
-        "held": HELD,
+        "held": [f"{HELD}-{k}" for k in range(len(clouds))],
         "opacity_unit_distance": options.unit_distance or 1.0,
         "light": _light(options.light, axes),
         "law": law_nodes().tolist(),
         "name": facts.baked().get("name", ""),
         "nodes": [] if facts.labels else nodes_of(facts),
         "axes": axes.tolist(),
-        "box": [gaussians.means.min(axis=0).tolist(), gaussians.means.max(axis=0).tolist()],
+        "box": [
+            np.min([cloud.means.min(axis=0) for cloud in clouds], axis=0).tolist(),
+            np.max([cloud.means.max(axis=0) for cloud in clouds], axis=0).tolist(),
+        ],
     }
 
 

@@ -1,79 +1,61 @@
-"""`.sog` (PlayCanvas' images of sorted values) through the program splat-transform, which needs node."""
+"""`.sog`: SOG's images and facts (`sog_images`) in a zip that is not compressed again."""
 
 from __future__ import annotations
 
+import io
 import json
-import shutil
-import subprocess
-import tempfile
 import zipfile
 from dataclasses import replace
-from pathlib import Path
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.gaussians.formats.splats import Splats, columns_of, ply_bytes
+from vvgt_cli.gaussians.formats.sog_images import META, MOST, images_of, splats_in, webp
+from vvgt_cli.gaussians.formats.splats import Splats, morton_order
+from vvgt_cli.volume.libraries import library_errors
 
-PROGRAM = "splat-transform"
-_COMMENTS = "vvgt.json"  # a member of the archive that others pass over
-
-
-def program(source: str) -> str:
-    """Path of splat-transform.
-
-    Raises:
-        DataError: it is not installed.
-    """
-    found = shutil.which(PROGRAM)
-    if found is None:
-        raise DataError(
-            f"{source}: .sog needs {PROGRAM} on the path; install node 22 or newer, then: "
-            "npm install -g @playcanvas/splat-transform@3.7.0"
-        )
-    return found
+COMMENTS = "vvgt.json"  # a member of the archive that others pass over
+_LARGEST = 1 << 30  # bytes of a member
+_LARGEST_TEXT = 1 << 20
 
 
 def sog(splats: Splats, name: str) -> bytes:
-    """A `.sog` of the columns.
+    """A `.sog` of the columns, along Morton's curve.
 
     Raises:
-        DataError: splat-transform fails, or is not installed.
+        DataError: more Gaussians than a file holds.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        source, target = Path(folder, "in.ply"), Path(folder, "out.sog")
-        source.write_bytes(ply_bytes(splats))
-        _run(name, source, target)
-        with zipfile.ZipFile(target, "a", zipfile.ZIP_STORED) as archive:
-            archive.writestr(zipfile.ZipInfo(_COMMENTS), json.dumps(list(splats.comments)))
-        return target.read_bytes()
+    if len(splats) > MOST:
+        raise DataError(f"{name}: {len(splats):,} Gaussians; expected at most {MOST:,} in a .sog; try a .ply")
+    images, meta = images_of(splats.take(morton_order(splats.means)))
+    members = {META: json.dumps(meta, separators=(",", ":")).encode()}
+    members |= {file: webp(image) for file, image in images.items()}
+    members[COMMENTS] = json.dumps(list(splats.comments)).encode()
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_STORED) as archive:
+        for file, content in members.items():
+            archive.writestr(zipfile.ZipInfo(file), content)
+    return stream.getvalue()
 
 
 def read_sog(content: bytes, name: str) -> Splats:
-    """The columns of a `.sog`.
+    """The columns of a `.sog` of version 2.
 
     Raises:
-        DataError: splat-transform fails, or is not installed.
+        DataError: it is not one.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        source, target = Path(folder, "in.sog"), Path(folder, "out.ply")
-        source.write_bytes(content)
-        _run(name, source, target)
-        return replace(columns_of(target.read_bytes(), name), comments=tuple(_comments(source)))
+    with library_errors(name, "a .sog"), zipfile.ZipFile(io.BytesIO(content)) as archive:
 
+        def read(file: str, largest: int = _LARGEST) -> bytes:
+            try:
+                size = archive.getinfo(file).file_size
+            except KeyError:
+                raise DataError(f"{name}: no {file[:80]!r} in the archive; expected a .sog, with {META}") from None
+            if size > largest:
+                raise DataError(f"{name}: {file[:80]!r} has {size:,} bytes; expected at most {largest:,}")
+            return archive.read(file)
 
-def _comments(path: Path) -> list[str]:
-    try:
-        with zipfile.ZipFile(path) as archive:
-            found = json.loads(archive.read(_COMMENTS))
-    except (KeyError, zipfile.BadZipFile, ValueError):
-        return []
-    return [str(line).replace("\n", " ") for line in found] if isinstance(found, list) else []
-
-
-def _run(name: str, source: Path, target: Path) -> None:
-    command = [program(name), "-q", "-g", "cpu", "-w", str(source), str(target)]
-    done = subprocess.run(command, capture_output=True, text=True)
-    if done.returncode or not target.is_file():
-        said = " ".join((done.stderr or done.stdout).split())[-300:]
-        raise DataError(
-            f"{name}: {PROGRAM} failed ({said or done.returncode}); try: {PROGRAM} --version (3.7 expected)"
-        )
+        splats = splats_in(json.loads(read(META, _LARGEST_TEXT)), read, name)
+        if COMMENTS not in archive.namelist():
+            return splats
+        said = json.loads(read(COMMENTS, _LARGEST_TEXT))
+        lines = said if isinstance(said, list) else []
+        return replace(splats, comments=tuple(str(line).replace("\n", " ") for line in lines))

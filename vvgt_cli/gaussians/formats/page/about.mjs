@@ -10,10 +10,11 @@ export function rowsOf(name, { facts, world, count, live }) {
     ['function', function_],
     ['opacity per', facts['unit-distance'] && `${length(facts['unit-distance'])} (${facts.label})`],
     ['light', live ? null : facts.light],
+    ['error', facts.error],
     ['Gaussians', number(count)],
     ['made for', facts.size && `${facts.size} px, drawn by ${facts.rule}`],
     ['axes', world.anatomical ? `${facts.space}, in mm` : `of the file${world.unit && `, in ${world.unit}`}`],
-    ['written by', facts.version && `vvgt ${facts.version}`],
+    ['written', facts.version && `${facts.date ? `${facts.date}, ` : ''}by vvgt ${facts.version}`],
   ].filter(([, value]) => value);
 }
 

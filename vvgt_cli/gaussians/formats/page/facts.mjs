@@ -6,7 +6,25 @@ const UP = {  // world axes as PLY has them, rows, by the axis that is up (frame
 };
 const OPPOSITE = { R: 'L', L: 'R', A: 'P', P: 'A', S: 'I', I: 'S' };
 
-// {version, scale, centre, frame, up, space, 'length-unit', function, size, rule, 'unit-distance', label, light, unit}: text and numbers
+// The legend of a baked look, of JSON {values, unit, nodes} or {labels, of}; null where it is damaged
+function legendOf(text) {
+  try {
+    const { values, unit, nodes, labels, of } = JSON.parse(text), rgb = (hex) => [0, 2, 4].map((k) => parseInt(hex.slice(k, k + 2), 16) / 255);
+    if (labels) return { labels: labels.map(([name, hex]) => ({ name: String(name), rgb: rgb(hex) })), of };
+    if (!values.every(Number.isFinite)) return null;
+    return { values, unit, nodes: nodes.map(([x, y, hex]) => ({ x, y, rgb: rgb(hex) })) };
+  } catch { return null; }
+}
+
+// The error that the conversion measured, of the JSON of a certificate (docs/certificate.md); null where it is damaged
+function errorOf(text) {
+  try {
+    const { psnr, live_psnr: live, size } = JSON.parse(text), dB = live ?? psnr;
+    return Number.isFinite(dB) ? `${dB.toFixed(1)} dB ${live == null ? '' : 'live, '}on test views of ${Number(size)} px` : null;
+  } catch { return null; }
+}
+
+// {version, scale, centre, frame, up, space, 'length-unit', function, size, rule, 'unit-distance', label, light, unit, legend, error, date}: text and numbers
 export function factsOf(comments) {
   const facts = { up: 'none', space: 'none', frame: 'unit' };
   for (const comment of comments ?? []) {
@@ -18,6 +36,8 @@ export function factsOf(comments) {
     } else if (key === 'unit-distance') [facts[key], facts.label] = [Number(rest[0]), rest.slice(1).join(' ')];
     else if (key === 'size') [facts.size, facts.rule] = [Number(rest[0]), rest[2]];
     else if (key === 'function') facts.function = JSON.parse(text);
+    else if (key === 'legend') facts.legend = legendOf(text);
+    else if (key === 'certificate') facts.error = errorOf(text);
     else if (key === 'live') { if (rest[0] === 'unit') facts.unit = rest.slice(1).join(' '); }
     else if (rest.length) facts[key] = text;
     else facts.version = key;

@@ -1,11 +1,12 @@
-// The legend: values of the function's range with their colours, as wide as they are opaque.
+// The legend: values of the function's range with their colours, as wide as they are opaque; or labels with their colours.
+import { hex } from './color.mjs';
 import { shown } from './facts.mjs';
 import { functionAt } from './live_table.mjs';
 import { round } from './scale.mjs';
 import { element, label } from './svg.mjs';
 
 const HIGH = 130, WIDE = 18;
-const hex = (rgb) => `#${rgb.map((c) => Math.round(255 * Math.min(Math.max(c, 0), 1)).toString(16).padStart(2, '0')).join('')}`;
+const ROW = 18, LONGEST = 24, MOST = 12;  // px of a label, characters of its name, labels at most
 
 // Round values between two
 export function ticks(lo, hi, many = 4) {
@@ -33,4 +34,16 @@ export function drawLegend(group, { nodes, live, right, bottom }) {
   }
   group.append(label(live.unit || 'value', right, top - 9, { 'text-anchor': 'end', 'font-size': 12 }));
   return values;
+}
+
+// Of labels the first ones, from the bottom up
+export function drawLabels(group, { labels, of, right, bottom, high }) {
+  const many = Math.min(labels.length, MOST, Math.max(Math.floor(high / 3 / ROW), 1)), rest = of - many;
+  const lines = [...labels.slice(0, many), ...(rest > 0 ? [{ name: `and ${rest} more` }] : [])];
+  lines.forEach(({ name, rgb }, k) => {
+    const y = bottom - (lines.length - 1 - k) * ROW, text = name.length > LONGEST ? `${name.slice(0, LONGEST - 1)}…` : name;
+    if (rgb) group.append(element('rect', { x: right - 12, y: y - 11, width: 12, height: 12, rx: 2, fill: hex(rgb), stroke: '#000', 'stroke-opacity': 0.6 }));
+    group.append(label(text, right - 18, y, { 'text-anchor': 'end', 'font-size': 12 }));
+  });
+  return lines.map(({ name }) => name);
 }

@@ -1,4 +1,5 @@
-// A link that restores what is seen: #view=...&projection=...&frame=...&function=...&cut=...&light=...&labels=... Parts are {key, get, set} of text.
+// A link that restores what is seen: #view=...&projection=...&frame=...&function=...&cut=...&light=...&labels=... Parts are {key, get, set} of text,
+// which is '' for what the page begins with.
 const number = (x, digits = 6) => String(Number(x.toFixed(digits)));
 const hex = (rgb) => rgb.map((c) => Math.round(255 * Math.min(Math.max(c, 0), 1)).toString(16).padStart(2, '0')).join('');
 
@@ -24,11 +25,12 @@ export function viewParts(lens) {
 
 export function frameParts(show) {
   const list = () => document.querySelector('#series select');
-  return [{ key: 'frame', get: () => (list().selectedIndex ? String(list().selectedIndex) : ''), set: (text) => { if (list().options[Number(text)]) return show(Number(text)); } }];
+  return [{ key: 'frame', get: () => (list().selectedIndex > 0 ? String(list().selectedIndex) : ''), set: (text) => { if (list().options[Number(text)]) return show(Number(text)); } }];
 }
 
 // light, labels: what the panel goes back to by undo, as JSON; of labels the rows that are as in the file are left out
-function stateOf({ key, state, set }) {
+function stateOf({ key, state, set, text: own, read }) {
+  if (own) return { key, get: own, set: (text) => set(read(text)) };
   const begun = state(), written = (now) => JSON.stringify(now, (name, value) => (typeof value === 'number' ? Number(value.toFixed(4)) : value));
   const short = ({ rows, solo }) => ({ rows: rows.map((row, k) => [k, row]).filter(([k, row]) => written(row) !== written(begun.rows[k])), solo });
   const long = ({ rows, solo }) => ({ rows: begun.rows.map((row, k) => ({ ...row, ...(rows.find(([j]) => j === k)?.[1] ?? {}) })), solo });
@@ -36,14 +38,13 @@ function stateOf({ key, state, set }) {
     key,
     get: () => (written(state()) === written(begun) ? '' : encodeURIComponent(written(begun.rows ? short(state()) : state()))),
     set: (text) => {
-      const then = JSON.parse(text);
-      set(begun.rows ? long(then) : { ...begun, ...then });
+      const then = text ? JSON.parse(text) : null;
+      set(!then ? begun : begun.rows ? long(then) : { ...begun, ...then });
     },
   };
 }
 
 export function liveParts(live, facts) {
-  const find = (selector) => document.querySelector(`#live ${selector}`), pressed = () => find('.flip').getAttribute('aria-pressed') === 'true';
   const written = (nodes) => nodes.map(({ x, y, rgb }) => `${Number(x.toPrecision(7))}:${number(y, 5)}:${hex(rgb)}`).join(',');
   return [
     ...live.parts.map(stateOf),
@@ -51,6 +52,7 @@ export function liveParts(live, facts) {
       key: 'function',
       get: () => (written(live.nodes()) === written(facts.nodes) ? '' : written(live.nodes())),
       set: (text) => {
+        if (!text) return live.set(facts.nodes);
         const nodes = text.split(',').map((node) => {
           const [x, y, color = ''] = node.split(':');
           return { x: Number(x), y: Number(y), rgb: [0, 2, 4].map((k) => parseInt(color.slice(k, k + 2), 16) / 255) };
@@ -58,17 +60,6 @@ export function liveParts(live, facts) {
         if (nodes.length > 1 && nodes.every(({ x, y, rgb }, k) => [x, y, ...rgb].every(Number.isFinite) && (!k || x >= nodes[k - 1].x))) live.set(nodes);
       },
     }],
-    {
-      key: 'cut',
-      get: () => (find('.axis').selectedIndex > 0 ? `${'xyz'[find('.axis').selectedIndex - 1]},${find('.axis + input').value}${pressed() ? ',other' : ''}` : ''),
-      set: (text) => {
-        const [axis, place, other] = text.split(',');
-        find('.axis').selectedIndex = 'xyz'.indexOf(axis) + 1;
-        find('.axis + input').value = place;
-        find('.axis').dispatchEvent(new Event('change'));
-        if ((other === 'other') !== pressed()) find('.flip').click();
-      },
-    },
   ];
 }
 
@@ -82,7 +73,8 @@ export async function restore(parts) {
   try { text = decodeURIComponent(location.hash.slice(1)); } catch { return; }  // not a link of ours
   const said = new Map(text.split('&').map((part) => [part.split('=')[0], part.slice(part.indexOf('=') + 1)]));
   if (!said.has('view')) return;
-  for (const { key, set } of parts) {
-    if (said.has(key) || key === 'projection') await Promise.resolve(said.get(key) ?? '').then(set).catch(() => {});  // a damaged part is left as it is
+  for (const { key, get, set } of parts) {
+    const text = said.get(key) ?? '';
+    if (text !== decodeURIComponent(get())) await Promise.resolve(text).then(set).catch(() => {});  // a damaged part is left as it is
   }
 }

@@ -1,12 +1,12 @@
-// A Gaussian under the function: moved and thinned along the gradient (docs/live.md), and cut by a plane. The engine calls
-// modifySplatCenter first. A cut Gaussian becomes the one of the same mean and variance as its part that stays.
+// A Gaussian under the function: moved and thinned along the gradient (docs/live.md), and cut by planes. The engine calls
+// modifySplatCenter first. A cut Gaussian becomes one of the mass and mean of its part that stays, no wider than that and up to the plane.
 uniform highp sampler2D vvgtTable;
 uniform highp sampler2D vvgtLabels;  // of a label map a column a label: red, green, blue, extinction; else one column
 uniform vec4 vvgtFacts;  // shortest log length, how far it goes, thinnest, spreads
-uniform vec4 vvgtCut;  // dot(xyz, centre) <= w stays
+uniform vec4 vvgtCut[6];  // dot(xyz, centre) <= w of each stays; of none the normal is zero
 uniform vec4 vvgtLight;  // ambient, diffuse, specular, power; ambient < 0: unlit
-uniform vec4 vvgtToward;  // direction towards the light, or with w = 1 the eye's place: a light there
-uniform vec3 vvgtEye;
+uniform vec4 vvgtToward;  // direction towards the light; with w = 1 it is at the eye
+uniform vec4 vvgtEye;  // its place, or with w = 1 the direction of parallel rays
 vec4 vvgtColor, vvgtRotation;
 vec3 vvgtScale;
 
@@ -28,29 +28,35 @@ void vvgtTurn(inout vec3 a, inout vec3 b) {  // until orthogonal: one-sided Jaco
   b = sn * was + cs * b;
 }
 
-float vvgtCut3(inout vec3 center, inout mat3 axes) {  // depth's factor
-  vec3 own = vvgtCut.xyz * axes;
+float vvgtCutBy(vec4 plane, inout vec3 center, inout mat3 axes) {  // depth's factor
+  vec3 own = plane.xyz * axes;
   float sigma = length(own);
   if (sigma < 1e-12) return 1.0;
-  float at = (vvgtCut.w - dot(vvgtCut.xyz, center)) / sigma;
+  float at = (plane.w - dot(plane.xyz, center)) / sigma;
   if (at > 3.0) return 1.0;
   if (at < -2.0) return 0.0;
   own /= sigma;
   float x = abs(at) * 0.70710678, t = 1.0 / (1.0 + 0.3275911 * x);  // Abramowitz and Stegun 7.1.26
   float tail = 0.5 * t * (0.254829592 + t * (-0.284496736 + t * (1.421413741 + t * (-1.453152027 + t * 1.061405429)))) * exp(-x * x);
   float stays = at < 0.0 ? tail : 1.0 - tail, mean = 0.39894228 * exp(-0.5 * at * at) / stays;
-  float thin = sqrt(max(1.0 - at * mean - mean * mean, 0.01));
+  float thin = clamp(sqrt(max(1.0 - at * mean - mean * mean, 0.0)), 0.1, max(0.5 * (at + mean), 0.1));  // two deviations reach the plane
   vec3 arm = axes * own;
   center -= arm * mean;
   axes += outerProduct(arm * (thin - 1.0), own);
   return stays / thin;
 }
 
+float vvgtCutAll(inout vec3 center, inout mat3 axes) {
+  float stays = 1.0;
+  for (int i = 0; i < 6 && stays > 0.0; i++) stays *= vvgtCutBy(vvgtCut[i], center, axes);
+  return stays;
+}
+
 vec3 vvgtLit(vec3 color, vec3 gradient, vec3 center) {  // Blinn and Phong's (docs/light.md)
   if (vvgtLight.x < 0.0) return color;
   float rises = length(gradient);
   if (rises == 0.0) return color * vvgtLight.x;
-  vec3 n = gradient / rises, d = normalize(center - vvgtEye), l = vvgtToward.w > 0.0 ? -d : vvgtToward.xyz, h = l - d;
+  vec3 n = gradient / rises, d = vvgtEye.w > 0.0 ? vvgtEye.xyz : normalize(center - vvgtEye.xyz), l = vvgtToward.w > 0.0 ? -d : vvgtToward.xyz, h = l - d;
   float facing = min(abs(dot(n, h)) / max(length(h), 1e-9), 1.0);
   return min(color * (vvgtLight.x + vvgtLight.y * abs(dot(n, l))) + vvgtLight.z * pow(facing, vvgtLight.w), vec3(1.0));
 }
@@ -78,7 +84,7 @@ void modifySplatCenter(inout vec3 center) {
   center += arm * (r * first);
   axes += outerProduct(arm * (thin - 1.0), along);
   vec3 place = center;
-  float depth = tau * exp(vvgtFacts.x + vvgtFacts.y * float(a.z) / 255.0) * inversesqrt(thin) * vvgtCut3(center, axes);
+  float depth = tau * exp(vvgtFacts.x + vvgtFacts.y * float(a.z) / 255.0) * inversesqrt(thin) * vvgtCutAll(center, axes);
   vec3 color = vvgtLit(sums.rgb / tau, mat3(matrix_model) * gradient, place);
   vvgtColor = sums.a < 1e-12 ? vec4(0.0) : vec4(color, 1.0 - exp(-depth));
   for (int sweep = 0; sweep < 6; sweep++) {

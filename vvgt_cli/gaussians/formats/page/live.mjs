@@ -1,5 +1,5 @@
 // Gaussians that carry values, under any function: their bytes as streams of the engine, the function's table as a texture.
-import { FILTER_NEAREST, PIXELFORMAT_RGBA32F, PIXELFORMAT_RGBA8U, Texture } from 'playcanvas';
+import { FILTER_NEAREST, PIXELFORMAT_RGBA32F, PIXELFORMAT_RGBA8U, PROJECTION_ORTHOGRAPHIC, Texture } from 'playcanvas';
 import modifier from './live.glsl';
 import { sumsOf, texelsOf } from './live_table.mjs';
 
@@ -7,23 +7,30 @@ const STREAMS = [['vvgtValues', [0, 1, 2, 6]], ['vvgtGradient', [3, 4, 5, 7]]]; 
 const MOST_OPAQUE = 1 - 1e-5;  // opacity of which there still is an extinction
 
 // the planes of bytes, one after the other, that the page holds (gzip in base64)
-async function unpacked(id) {
+async function unpacked(id, alone) {
   const element = document.getElementById(id), text = atob(element.textContent);
   const stream = new Blob([Uint8Array.from(text, (c) => c.charCodeAt(0))]).stream();
-  element.remove();
+  if (alone) element.remove();  // of several frames, one that left memory is read again
   return new Uint8Array(await new Response(stream.pipeThrough(new DecompressionStream('gzip'))).arrayBuffer());
 }
 
-// {live, bytes, count, sums, rows, plane, apply(nodes), labels(list), cut(axis or null, place, flipped), light(of light.mjs)} of a viewer that has loaded its Gaussians, once they are shown so
+// {live, bytes, count, sums, rows, planes, apply(nodes), labels(list), cut(planes), light(of light.mjs), frame(k, resource)} of a viewer that has loaded its Gaussians, once they are shown so
 export async function liveLook({ app }, live) {
   const entity = app.root.findByName('gsplat'), { gsplat } = entity, { resource } = app.assets.get(gsplat.asset);
-  const bytes = await unpacked(live.held), planes = live.labels.length ? 8 : 6, count = bytes.length / planes;
-  resource.format.addExtraStreams(STREAMS.map(([name]) => ({ name, format: PIXELFORMAT_RGBA8U })));
-  for (const [name, own] of STREAMS) {
-    const texture = resource.getTexture(name), texels = texture.lock();
-    own.forEach((plane, c) => { for (let i = 0; plane < planes && i < count; i++) texels[4 * i + c] = bytes[plane * count + i]; });
-    texture.unlock();
+  const planes = live.labels.length ? 8 : 6, carried = new WeakMap();  // bytes of the resources that have them
+  async function carry(k, to) {
+    if (carried.has(to)) return carried.get(to);
+    const bytes = await unpacked(live.held[k], live.held.length === 1), count = bytes.length / planes;
+    to.format.addExtraStreams(STREAMS.map(([name]) => ({ name, format: PIXELFORMAT_RGBA8U })));
+    for (const [name, own] of STREAMS) {
+      const texture = to.getTexture(name), texels = texture.lock();
+      own.forEach((plane, c) => { for (let i = 0; plane < planes && i < count; i++) texels[4 * i + c] = bytes[plane * count + i]; });
+      texture.unlock();
+    }
+    carried.set(to, bytes);
+    return bytes;
   }
+  const bytes = await carry(0, resource), count = bytes.length / planes;
   const [means, spreads] = live.table, nearest = { minFilter: FILTER_NEAREST, magFilter: FILTER_NEAREST };
   const table = new Texture(app.graphicsDevice, { name: 'vvgtTable', width: means, height: 2 * spreads, format: PIXELFORMAT_RGBA32F, mipmaps: false, ...nearest });
   const labels = new Texture(app.graphicsDevice, { name: 'vvgtLabels', width: Math.max(live.labels.length + 1, 1), height: 1, format: PIXELFORMAT_RGBA32F, mipmaps: false, ...nearest });
@@ -35,13 +42,17 @@ export async function liveLook({ app }, live) {
     again = 2;
   };
   // a light that depends on the eye, or a highlight: again when the camera has moved
-  const camera = app.root.findComponent('camera').entity, eye = [0, 0, 0];
-  let follows = false;
+  const camera = app.root.findComponent('camera').entity;
+  let follows = false, eye = [0, 0, 0, 0];
+  const eyeNow = () => {
+    const flat = camera.camera.projection === PROJECTION_ORTHOGRAPHIC, { x, y, z } = flat ? camera.forward : camera.getPosition();
+    return [x, y, z, Number(flat)];
+  };
   app.on('update', () => {
-    const { x, y, z } = camera.getPosition();
-    if (!follows || Math.hypot(x - eye[0], y - eye[1], z - eye[2]) < 1e-4) return;
-    [eye[0], eye[1], eye[2]] = [x, y, z];
-    set('vvgtEye', [...eye]);
+    const now = eyeNow();
+    if (!follows || Math.hypot(...now.map((x, k) => x - eye[k])) < 1e-4) return;
+    eye = now;
+    set('vvgtEye', eye);
   });
   // what is set while the engine takes up another state may be lost: set once more when it is ready
   app.on('update', () => { if (again) app.renderNextFrame = true; });
@@ -53,7 +64,7 @@ export async function liveLook({ app }, live) {
     if (!--again) shown();
   });
   const look = {
-    live, bytes, count, sums: null, rows: [], plane: null,  // what a place is found and read by
+    live, bytes, count, sums: null, rows: [], planes: [],  // what a place is found and read by
     apply(nodes) {
       look.sums = sumsOf(nodes, live);
       table.lock().set(texelsOf(look.sums, live.table));
@@ -68,23 +79,30 @@ export async function liveLook({ app }, live) {
       labels.unlock();
       set('vvgtLabels', labels);
     },
-    cut(axis, place, flipped) {
-      const sign = flipped ? -1 : 1;
-      look.plane = axis === null ? null : { normal: live.axes[axis].map((x) => sign * x), place: sign * place };
-      set('vvgtCut', look.plane ? [...look.plane.normal, look.plane.place] : [0, 0, 0, 1]);
+    // at most six {normal, place}: dot(normal, x) <= place stays
+    cut(planes) {
+      const numbers = new Float32Array(24);
+      planes.forEach(({ normal, place }, k) => numbers.set([...normal, place], 4 * k));
+      look.planes = planes;
+      set('vvgtCut[0]', numbers);
     },
   };
+  // what frame k's Gaussians carry goes with them, before they are shown
+  look.frame = async (k, to) => {
+    look.bytes = await carry(k, to);
+    look.count = look.bytes.length / planes;
+    again = 2;
+  };
   look.light = ({ kind, from, ambient, diffuse, specular, power }) => {
-    const { x, y, z } = camera.getPosition();
     follows = kind !== 'none' && (kind === 'headlight' || specular > 0);
-    [eye[0], eye[1], eye[2]] = [x, y, z];
-    gsplat.setParameter('vvgtEye', [...eye]);
+    eye = eyeNow();
+    gsplat.setParameter('vvgtEye', eye);
     gsplat.setParameter('vvgtToward', [...from, kind === 'headlight' ? 1 : 0]);
     set('vvgtLight', [kind === 'none' ? -1 : ambient, diffuse, specular, power]);
   };
   look.light(live.light);
   set('vvgtFacts', [first, last - first, live.thinnest, spreads]);
-  look.cut(null);
+  look.cut([]);
   if (live.labels.length) set('vvgtTable', table);
   else look.apply(live.nodes);
   look.labels(live.labels);

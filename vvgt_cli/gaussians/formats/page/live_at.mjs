@@ -21,7 +21,7 @@ const along = (gradient, arms) => {
 
 // the row of the label that a Gaussian belongs to
 const label = ({ bytes, count }, i) => bytes[6 * count + i] + 256 * bytes[7 * count + i];
-const beyond = ({ plane }, center) => plane && dot(plane.normal, center) > plane.place;  // what is cut is not looked at
+const beyond = ({ planes }, center) => planes.some(({ normal, place }) => dot(normal, center) > place);  // what is cut is not looked at
 
 function labelled(look) {
   return (i, { center, arms }) => {

@@ -48,7 +48,7 @@ function draw(app, { dilation, shifted }) {
   if (!shifted) change('gsplatPS', '(exp(x * -4.0) - EXP4) * INV_EXP4', 'exp(x * -4.0)');
 }
 
-function series(viewer) {
+function series(viewer, live) {
   const { app } = viewer, entity = app.root.findByName('gsplat');
   const assets = new Map([[0, Promise.resolve(app.assets.get(entity.gsplat.asset))]]);  // by frame, the last used last
   const box = document.createElement('div');
@@ -82,6 +82,8 @@ function series(viewer) {
     slider.value = list.selectedIndex = k;
     try {
       const asset = await loaded(k);
+      if (wanted !== k) return;
+      if (live) await live.look.frame(k, asset.resource);
       if (wanted !== k) return;
       entity.gsplat.asset = asset.id;
       app.renderNextFrame = true;
@@ -155,7 +157,7 @@ async function start() {
   if (scene.frames.length === 1 && !scene.live) document.body.append(named('baked'));
   const live = scene.live ? panel(await liveLook(viewer, scene.live), viewer, scene.live) : null;
   if (live) served(live, viewer, scene.live, scene.server);
-  const show = scene.frames.length > 1 ? series(viewer) : null, here = where(viewer, scene, live, show);
+  const show = scene.frames.length > 1 ? series(viewer, live) : null, here = where(viewer, scene, live, show);
   await here.restored;
   said.textContent = '';
   window.vvgt = { viewer, live, show, where: here };

@@ -1,5 +1,6 @@
 // The panel of a live page: the function over the histogram, its nodes to be dragged; a cut.
 import { hex, rgbOf } from './color.mjs';
+import { cutOf } from './cut.mjs';
 import { light } from './light.mjs';
 import { organs } from './organs.mjs';
 import { functionAt } from './live_table.mjs';
@@ -12,9 +13,7 @@ const HTML = `<header><span class="named"><b></b><i></i></span><output></output>
 <defs><linearGradient id="live-fill"></linearGradient></defs><path class="counts" fill="#667"/><path class="area" fill="url(#live-fill)" fill-opacity="0.75"/>
 <path class="line" fill="none" stroke="#fff"/><g></g></svg>
 <div><select aria-label="function" title="function"></select><button class="undo" aria-label="undo" title="undo (Ctrl+Z)">↶</button>
-<button class="remove" aria-label="remove the node" title="remove the node (Delete)">−</button><input type="color" aria-label="colour of the node" title="colour of the node"></div>
-<div><select class="axis" aria-label="cut" title="cut"></select><input type="range" min="0" max="1000" value="500" aria-label="place of the cut">
-<button class="flip" aria-pressed="false" aria-label="other side" title="other side">⇄</button></div>`;
+<button class="remove" aria-label="remove the node" title="remove the node (Delete)">−</button><input type="color" aria-label="colour of the node" title="colour of the node"></div>`;
 
 const height = (y) => HIGH - 4 - (HIGH - 8) * Math.cbrt(y), opacity = (h) => Math.min(Math.max((HIGH - 4 - h) / (HIGH - 8), 0), 1) ** 3;
 const copy = (nodes) => nodes.map(({ x, y, rgb }) => ({ x, y, rgb: [...rgb] }));
@@ -232,20 +231,8 @@ export function panel(look, viewer, live) {
     show();
   });
 
-  const axis = find('.axis'), slider = find('input[type=range]'), flip = find('.flip');
-  axis.append(...['no cut', 'cut x', 'cut y', 'cut z'].map((name) => new Option(name)));
-  function cut() {
-    const k = axis.selectedIndex - 1, [low, high] = live.box;
-    look.cut(k < 0 ? null : k, k < 0 ? 0 : low[k] + ((high[k] - low[k]) * slider.value) / 1000, flip.getAttribute('aria-pressed') === 'true');
-    slider.disabled = flip.disabled = k < 0;
-    told(true);
-  }
-  axis.addEventListener('change', cut);
-  slider.addEventListener('input', cut);
-  flip.addEventListener('click', () => {
-    flip.setAttribute('aria-pressed', String(flip.getAttribute('aria-pressed') !== 'true'));
-    cut();
-  });
+  const cut = cutOf(look, live, viewer, history, () => { draw(); told(true); });
+  root.append(cut.root);
 
   root.classList.toggle('labelled', labelled);
   if (labelled) {
@@ -271,8 +258,7 @@ export function panel(look, viewer, live) {
 
   const counts = live.histogram, most = Math.log1p(Math.max(...counts)) || 1, bar = (WIDE - 12) / counts.length;
   find('.counts').setAttribute('d', counts.map((n, k) => `M${(6 + k * bar).toFixed(2)},${HIGH}v${((-HIGH * 0.9 * Math.log1p(n)) / most).toFixed(2)}h${bar.toFixed(2)}V${HIGH}Z`).join(''));
-  cut();
   fold(innerWidth < 700);
   draw();
-  return { root, look, changed(f) { told = f; }, alone: () => axis.selectedIndex > 0 || lamp.state() !== begun, lit: () => (lamp.state() === begun ? null : lamp.state()), labelled, parts, nodes: () => copy(exact ?? nodes), set(now) { keep(); [nodes, exact, chosen] = [copy(now), null, 0]; show(); } };
+  return { root, look, changed(f) { told = f; }, cut, alone: () => cut.planes().length > 0 || lamp.state() !== begun, lit: () => (lamp.state() === begun ? null : lamp.state()), labelled, parts, nodes: () => copy(exact ?? nodes), set(now) { keep(); [nodes, exact, chosen] = now === live.nodes ? [fewer(now), now, 0] : [copy(now), null, 0]; show(); } };
 }

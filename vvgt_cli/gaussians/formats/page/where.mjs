@@ -1,7 +1,8 @@
 // Where one is: the drawing over the picture (letters, scale bar, legend, ruler), its buttons and keys.
 import { fill, rowsOf } from './about.mjs';
 import { factsOf, shown, worldOf } from './facts.mjs';
-import { drawLegend } from './legend.mjs';
+import { drawLabels, drawLegend } from './legend.mjs';
+import { handlesOf } from './handles.mjs';
 import { lensOf } from './lens.mjs';
 import { frameParts, linkOf, liveParts, restore, viewParts } from './link.mjs';
 import { drawLetters, seenFrom, sides } from './orientation.mjs';
@@ -20,7 +21,8 @@ const ICONS = {
 
 export function where(viewer, scene, live, show) {
   const lens = lensOf(viewer), { app } = viewer, svg = element('svg', { id: 'where', role: 'img' });
-  document.querySelector('#view .sse-sceneLayer').append(svg);
+  const handles = live && handlesOf(lens, live.cut);
+  document.querySelector('#view .sse-sceneLayer').append(svg, ...(handles ? [handles.svg] : []));
   const box = document.createElement('div');
   box.id = 'tools';
   const about = Object.assign(document.createElement('section'), { id: 'about', hidden: true, innerHTML: '<dl></dl>' });
@@ -42,6 +44,7 @@ export function where(viewer, scene, live, show) {
     world = worldOf(facts);
     if (ruler.measuring) ruler.measure(true);
     sides(world).forEach(([, axis, sign], k) => { views[k].textContent = world.letters[axis][sign < 0 ? 0 : 1]; });
+    live?.cut.name(world.letters);
     fill(about.firstChild, rowsOf(scene.frames[frame()].name, { facts, world, count: now.numSplats, live: scene.live }));
   }
 
@@ -86,14 +89,22 @@ export function where(viewer, scene, live, show) {
   });
   addEventListener('hashchange', () => restore(parts).then(again));
 
+  function legend(group, wide, high) {
+    const baked = live ? null : facts.legend, place = { right: wide - 12 - (high < 620 ? 44 : 0), bottom: high - 72 };
+    if (baked?.labels) return drawLabels(group, { ...baked, ...place, high });
+    if (baked) return drawLegend(group, { nodes: baked.nodes, live: baked, ...place });
+    return live && !live.labelled ? drawLegend(group, { nodes: live.nodes(), live: scene.live, ...place }) : null;
+  }
+
   function draw() {
     const wide = svg.clientWidth, high = svg.clientHeight, all = { lens, world, wide, high, ruler, left: LEFT };
     const group = element('g');
     state.letters = drawLetters(group, all);
     state.scale = drawScale(group, { ...all, left: LEFT + 96 });
-    state.legend = scene.live && !live.labelled ? drawLegend(group, { nodes: live.nodes(), live: scene.live, right: wide - 12 - (high < 620 ? 44 : 0), bottom: high - 72 }) : null;
+    state.legend = legend(group, wide, high);
     drawRuler(group, all);
     svg.replaceChildren(group);
+    handles?.draw(world);
     const facing = [...state.letters].map(({ letter }) => letter).join(' ');
     svg.setAttribute('aria-label', `axes ${facing}${state.scale ? `; scale bar ${state.scale.text}` : ''}`);
     const lines = ruler.places.map((place, k) => `${k + 1}: ${placeText(place, world, scene.live)}`);
@@ -108,7 +119,7 @@ export function where(viewer, scene, live, show) {
   app.on('update', () => {
     const now = dataNow();
     if (now !== data) { take(now); stamp++; }
-    const pose = lens.pose(), said = JSON.stringify([pose, lens.flat, svg.clientWidth, svg.clientHeight, stamp, live?.nodes()]);
+    const pose = lens.pose(), said = JSON.stringify([pose, lens.flat, svg.clientWidth, svg.clientHeight, stamp, live?.nodes(), live?.cut.state()]);
     if (said === drawn) return;
     drawn = said;
     draw();

@@ -1,0 +1,220 @@
+"""PlayCanvas' SOG, version 2: Gaussians as images, a pixel each, and the facts beside them, both ways.
+
+As the engine 2.23.3 and splat-transform 3.7.0 read it:
+
+| image | red, green, blue | alpha |
+| --- | --- | --- |
+| `means_l`, `means_u` | low and high byte of sign(x) log(1 + abs(x)), in 65,535 steps from `mins` to `maxs` | 255 |
+| `quats` | the three smaller components, from -1/sqrt(2) to 1/sqrt(2), in the order w, x, y, z; the largest is positive | 252 plus the number of the largest |
+| `scales` | places of the log-scales in a codebook of 256 | 255 |
+| `sh0` | places of the harmonics of degree 0 in another | opacity times 255 |
+| `shN_labels` | row of the palette, low and high byte | 255 |
+| `shN_centroids` | 64 rows of the palette a line, 3, 8 or 15 pixels each: places in a codebook | 255 |
+"""  # noqa: E501
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from vvgt_cli.errors import DataError
+from vvgt_cli.gaussians.formats.codebooks import LARGEST_PALETTE, SIZE, codebook, palette, places_in
+from vvgt_cli.gaussians.formats.splats import DEGREES, HARMONICS, Splats, logits_of, opacities_of
+from vvgt_cli.gaussians.formats.turns import nearest_turn
+from vvgt_cli.version import VERSION
+
+MOST = 1 << 26  # Gaussians of one set of images
+META = "meta.json"
+_STEPS, _BYTE = 65535, 255
+_FIRST = 252  # alpha of a quaternion whose w is the largest
+_ROW = 64  # rows of the palette in a line of `shN_centroids`
+_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+_SPARE = 4096  # pixels that an image may have beyond four for each Gaussian
+_LARGEST_LOG = 80.0  # of a coordinate: float32 ends at 88
+
+
+def images_of(splats: Splats) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Images by name, (h, w, 4) uint8, and what `meta.json` says; Gaussians stay in their order.
+
+    Raises:
+        DataError: more than `MOST`.
+    """
+    count = len(splats)
+    width = 4 * math.ceil(math.sqrt(count) / 4)
+    height = 4 * math.ceil(count / width / 4)
+
+    def image(columns: np.ndarray, alpha: np.ndarray | int = _BYTE) -> np.ndarray:
+        pixels = np.zeros((height * width, 4), np.uint8)
+        pixels[:count, : columns.shape[1]], pixels[:count, 3] = columns, alpha
+        return pixels.reshape(height, width, 4)
+
+    means = splats.means.astype(np.float64)
+    logs = np.sign(means) * np.log1p(np.abs(means))
+    low, high = logs.min(axis=0), logs.max(axis=0)
+    steps = np.rint((logs - low) / np.where(high > low, high - low, 1.0) * _STEPS).astype(np.int64)
+    quaternions, log_scales = nearest_turn(splats.quaternions, splats.log_scales)
+    largest = np.abs(quaternions).argmax(axis=1)
+    signs = np.where(np.take_along_axis(quaternions, largest[:, None], axis=1) < 0, -1.0, 1.0)
+    others = np.take_along_axis(quaternions * signs, _OTHERS[largest], axis=1)
+    scales, colors = codebook(log_scales), codebook(splats.f_dc)
+    opacities = np.rint(opacities_of(splats.logits).astype(np.float64) * _BYTE)
+    images = {
+        "means_l.webp": image(steps & _BYTE),
+        "means_u.webp": image(steps >> 8),
+        "quats.webp": image(np.rint((others / math.sqrt(2) + 0.5) * _BYTE).clip(0, _BYTE), _FIRST + largest),
+        "scales.webp": image(places_in(scales, log_scales)),
+        "sh0.webp": image(places_in(colors, splats.f_dc), opacities),
+    }
+    meta: dict[str, Any] = {
+        "version": 2,
+        "asset": {"generator": f"vvgt {VERSION}"},
+        "count": count,
+        "means": {"mins": low.tolist(), "maxs": high.tolist(), "files": ["means_l.webp", "means_u.webp"]},
+        "scales": {"codebook": scales.tolist(), "files": ["scales.webp"]},
+        "quats": {"files": ["quats.webp"]},
+        "sh0": {"codebook": colors.tolist(), "files": ["sh0.webp"]},
+    }
+    if splats.f_rest.shape[1]:
+        rows, labels = _palette(splats.f_rest)
+        book = codebook(rows)
+        lines = np.zeros((math.ceil(len(rows) / _ROW) * _ROW, rows.shape[1], 4), np.uint8)
+        lines[: len(rows), :, :3], lines[: len(rows), :, 3] = places_in(book, rows), _BYTE
+        images["shN_centroids.webp"] = lines.reshape(-1, _ROW * rows.shape[1], 4)
+        images["shN_labels.webp"] = image(np.stack([labels & _BYTE, labels >> 8], axis=1))
+        meta["shN"] = {
+            "count": len(rows),
+            "bands": DEGREES[rows.shape[1]],
+            "codebook": book.tolist(),
+            "files": ["shN_centroids.webp", "shN_labels.webp"],
+        }
+    return images, meta
+
+
+def _palette(f_rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows (m, M, 3) for harmonics (K, M, 3), and the row of each: as many as splat-transform makes, 1024 at least."""
+    count, few = len(f_rest), LARGEST_PALETTE
+    while few > max(count, 1024):
+        few //= 2
+    rows, labels = palette(f_rest.reshape(count, -1), few)
+    return rows.reshape(len(rows), -1, 3), labels
+
+
+def webp(image: np.ndarray) -> bytes:
+    """An image (h, w, 4) uint8 as lossless WebP, every pixel as it is."""
+    from PIL import Image
+
+    stream = io.BytesIO()
+    # the other methods take up to 70 times as long for files that are no smaller
+    Image.fromarray(image).save(stream, "WEBP", lossless=True, quality=30, method=1, exact=True)
+    return stream.getvalue()
+
+
+def splats_in(meta: Any, read: Callable[[str], bytes], name: str) -> Splats:
+    """The columns of what `meta.json` describes, without comments.
+
+    Args:
+        meta: the parsed JSON.
+        read: the bytes of an image, given its name.
+        name: for errors.
+
+    Raises:
+        DataError: facts or images that are not what they must be.
+    """
+    if not isinstance(meta, dict) or meta.get("version") != 2:
+        found = meta.get("version") if isinstance(meta, dict) else None
+        raise DataError(f"{name}: {META} has version {found!r:.40}; expected SOG of version 2")
+    count = meta.get("count")
+    if type(count) is not int or not 0 < count <= MOST:
+        raise DataError(f"{name}: {META} has count {count!r:.40}; expected 1 to {MOST}")
+
+    def pixels(part: str, number: int = 0, width: int = 0, needed: int = count) -> np.ndarray:
+        return _pixels(read, _files(meta, part, name), number, width, needed, name)
+
+    low, high = (_numbers(meta, "means", key, 3, name) for key in ("mins", "maxs"))
+    if max(np.abs(low).max(), np.abs(high).max()) > _LARGEST_LOG:
+        raise DataError(
+            f"{name}: {META} has means up to exp({max(np.abs(low).max(), np.abs(high).max()):.4g}); expected float32"
+        )
+    steps = pixels("means")[:, :3] + 256.0 * pixels("means", 1)[:, :3]
+    logs = low + (high - low) * (steps / _STEPS)
+    quats = pixels("quats")
+    if quats[:, 3].min() < _FIRST:
+        raise DataError(f"{name}: quats have {quats[:, 3].min()} as their largest component; expected 252 to 255")
+    sh0 = pixels("sh0")
+    return Splats(
+        (np.sign(logs) * np.expm1(np.abs(logs))).astype(np.float32),
+        _numbers(meta, "scales", "codebook", SIZE, name)[pixels("scales")[:, :3]].astype(np.float32),
+        _quaternions(quats),
+        logits_of(sh0[:, 3] / np.float32(_BYTE)),
+        _numbers(meta, "sh0", "codebook", SIZE, name)[sh0[:, :3]].astype(np.float32),
+        _harmonics(meta, pixels, name) if meta.get("shN") else np.zeros((count, 0, 3), np.float32),
+    )
+
+
+def _quaternions(pixels: np.ndarray) -> np.ndarray:
+    others = (pixels[:, :3] / _BYTE - 0.5) * math.sqrt(2)
+    largest = pixels[:, 3].astype(np.int64) - _FIRST
+    result = np.zeros((len(pixels), 4))
+    np.put_along_axis(result, _OTHERS[largest], others, axis=1)
+    rest = np.sqrt(np.maximum(1 - (others**2).sum(axis=1), 0))
+    np.put_along_axis(result, largest[:, None], rest[:, None], axis=1)
+    result /= np.maximum(np.linalg.norm(result, axis=1, keepdims=True), 1e-6)
+    return result.astype(np.float32)
+
+
+def _harmonics(meta: dict[str, Any], pixels: Callable[..., np.ndarray], name: str) -> np.ndarray:
+    rows, bands = (meta["shN"].get(key) if isinstance(meta["shN"], dict) else None for key in ("count", "bands"))
+    if type(rows) is not int or not 0 < rows <= LARGEST_PALETTE or bands not in (1, 2, 3):
+        raise DataError(
+            f"{name}: shN has count {rows!r:.40}, bands {bands!r:.40}; expected to {LARGEST_PALETTE}, 1 to 3"
+        )
+    each = HARMONICS[int(bands)]
+    labels = pixels("shN", 1).astype(np.int64)
+    labels = labels[:, 0] + 256 * labels[:, 1]
+    needed = math.ceil((int(labels.max()) + 1) / _ROW) * _ROW * each
+    centroids = pixels("shN", 0, _ROW * each, needed)[:, :3].reshape(-1, each, 3)
+    book: np.ndarray = _numbers(meta, "shN", "codebook", SIZE, name).astype(np.float32)
+    harmonics: np.ndarray = book[centroids][labels]
+    return harmonics
+
+
+def _part(meta: dict[str, Any], part: str, key: str) -> Any:
+    found = meta.get(part)
+    return found.get(key) if isinstance(found, dict) else None
+
+
+def _files(meta: dict[str, Any], part: str, name: str) -> list[str]:
+    found, needed = _part(meta, part, "files"), 2 if part in ("means", "shN") else 1
+    if not isinstance(found, list) or len(found) != needed or not all(isinstance(file, str) for file in found):
+        raise DataError(f"{name}: {META} names no images of {part}; expected {needed}")
+    return found
+
+
+def _numbers(meta: dict[str, Any], part: str, key: str, count: int, name: str) -> np.ndarray:
+    found = _part(meta, part, key)
+    if isinstance(found, list) and len(found) == count and all(type(value) in (int, float) for value in found):
+        with np.errstate(over="ignore"):
+            values = np.array([float(value) if abs(value) < 1e300 else np.inf for value in found]).astype(np.float32)
+        if np.isfinite(values).all():
+            return values.astype(np.float64)
+    raise DataError(f"{name}: {META} has no {key} of {part}; expected {count} finite numbers")
+
+
+def _pixels(
+    read: Callable[[str], bytes], files: list[str], number: int, width: int, needed: int, name: str
+) -> np.ndarray:
+    """The first ``needed`` pixels (n, 4) uint8 of an image, ``width`` pixels wide if that is not 0."""
+    from PIL import Image
+
+    what = f"{name}: {files[number][:80]!r}"
+    with Image.open(io.BytesIO(read(files[number])), formats=["WEBP"]) as image:
+        size = image.width * image.height
+        if not needed <= size <= 4 * needed + _SPARE + image.width * 64 or (width and image.width != width):
+            wide = f"lines of {width}, " if width else ""
+            raise DataError(f"{what} is of {image.width} x {image.height} px; expected {wide}{needed} px or a few more")
+        pixels: np.ndarray = np.array(image.convert("RGBA")).reshape(-1, 4)[:needed]
+        return pixels
