@@ -16,6 +16,7 @@ import click
 import numpy as np
 from dvr_scenes import print_table, read_scenes, write_rows
 
+from vvgt_cli.cameras.sets import pixel_width
 from vvgt_cli.conversion.convert import fitted
 from vvgt_cli.conversion.live import carrying, placed_by, table_of, wide_enough
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
@@ -82,12 +83,15 @@ def measured(name: str, field: Resident, gaussians: int, beside: bool) -> list[d
     seconds = time.process_time() - start
     facts = LiveFacts.of(source.volume, source.statistics, source.tf)
     packed = replace(live, live=from_bytes(live_bytes(live, facts), live_json([live], facts, 1.0)))
-    rows = []
+    rows, pixel = [], pixel_width(SIZE)
     for title, tf in functions(source.statistics).items():
         spacing = float(np.mean(source.volume.spacing))
         shown = field.shown_by(replace(tf, opacity_unit_distance=spacing))
         table = table_of(shown.source)
-        looks = {"live": shown_by(live, table), "bytes": shown_by(packed, table), "other viewers": baked(live, table)}
+        looks = {
+            "live": shown_by(live, table, pixel), "bytes": shown_by(packed, table, pixel),
+            "other viewers": baked(live, table, pixel),
+        }  # fmt: skip
         if beside:
             looks["converted for it"] = direct(field, tf, gaussians)
         scores = {

@@ -5,7 +5,8 @@
 Every row of `ROWS` names the library that writes a file of edge^3 int16 (smooth, with noise) on a grid of steps
 (0.5, 0.7, 1.1) from (12, -34, 56), and what reads it without vvgt. Both run in a process of their own, libraries
 imported beforehand, with the file in the page cache; the median of three. `place` is the largest distance of a corner
-voxel from where it was written; `whole`: every voxel as it was written. Prints a table in Markdown.
+voxel (of the box, where a mesh is resampled) from where it was written; `whole`: every voxel as it was written. Prints
+a table in Markdown.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import os
 import statistics
 import tempfile
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -42,8 +43,10 @@ class Row:
         write: folder and values (z, y, x) to the path that is opened.
         alone: the path to all values, by the library that wrote it or by another; None where there is none.
         signs, origin: where voxels are expected: each axis of the grid's as written or reversed, its first voxel.
+        spacing: of its voxels.
         options: of `ReadOptions`.
-        placed: it says where voxels are, and gives them as they were written.
+        placed: it says where voxels are.
+        cells: values are those of cells; else of points, between which a resampled grid lies.
         most: voxels along an edge, at most (text and meshes).
     """
 
@@ -54,8 +57,10 @@ class Row:
     alone: Callable[[Path], Any] | None
     signs: tuple[float, float, float] = (1.0, 1.0, 1.0)
     origin: tuple[float, float, float] = ORIGIN
+    spacing: tuple[float, float, float] = SPACING
     options: dict[str, Any] = field(default_factory=dict)
     placed: bool = True
+    cells: bool = False
     most: int = 1 << 12
 
 
@@ -75,7 +80,7 @@ def world() -> np.ndarray:
 
 def expected(row: Row) -> np.ndarray:
     """(4, 4) of where the row's voxels are."""
-    affine = np.diag([*SPACING, 1.0])
+    affine = np.diag([*row.spacing, 1.0])
     affine[:3, 3] = row.origin
     return np.diag([*row.signs, 1.0]) @ affine
 
@@ -85,12 +90,20 @@ def order_of(volume: Volume) -> list[int]:
     return [int(axis) for axis in np.abs(volume.axes).argmax(axis=0)]
 
 
-def off(volume: Volume, row: Row) -> float:
-    """Largest distance of a corner voxel from where it was written."""
-    ends = np.array(np.meshgrid(*[(0, n - 1) for n in volume.dims])).reshape(3, -1)
-    corners = np.vstack([ends, np.ones(8)])
+def corners(low: float, dims: Sequence[int]) -> np.ndarray:
+    """(4, 8) homogeneous indices of the corners of a grid, from ``low`` on, and as far inside the last voxels."""
+    ends = np.array(np.meshgrid(*[(low, n - 1 - low) for n in dims])).reshape(3, -1)
+    return np.vstack([ends, np.ones(8)])
+
+
+def off(volume: Volume, row: Row, edge: int) -> float:
+    """Largest distance of a corner voxel, of a resampled volume of a corner of its box, from where it was written."""
+    if "resampled" in volume.name:  # its box is that of the cells
+        given = corners(-0.5, volume.dims)
+        written = corners(-0.5 if row.cells else 0.0, (edge,) * 3)
+        return float(np.linalg.norm(volume.affine @ given - expected(row) @ written, axis=0).max())
     moved = volume.affine - expected(row)[:, [*order_of(volume), 3]]
-    return float(np.linalg.norm(moved @ corners, axis=0).max())
+    return float(np.linalg.norm(moved @ corners(0.0, volume.dims), axis=0).max())
 
 
 def read_all(path: Path, row: Row) -> Volume:
@@ -148,7 +161,7 @@ def measured(row: Row, edge: int) -> dict[str, Any]:
             "whole": "yes" if whole else "resampled" if "resampled" in volume.name else "no",
             "blocks": "yes" if blocks else "no",
             "series": "yes" if next(r for r in READERS if r.name == row.reader).times else "files",
-            "place": f"{off(volume, row):.4f}" if row.placed else "",
+            "place": f"{off(volume, row, edge):.4f}" if row.placed else "",
             "seconds": f"{seconds(lambda: read_all(path, row)):.2f}",
             "library": "" if alone is None else f"{seconds(lambda: alone(path)):.2f}",
         }

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from readers import LPS, ORIGIN, SPACING, Row, world
+from readers_vtk import by_vtk, hexahedra, vtk_class, vtk_image, write_vtk
 
 BOHR = 0.529177210903  # angstroms
 
@@ -49,62 +50,19 @@ def _by_itk(path: Path) -> Any:
     return SimpleITK.GetArrayFromImage(SimpleITK.ReadImage(str(path)))
 
 
-def _vtk_image(values: np.ndarray) -> Any:
-    from vtkmodules.util.numpy_support import numpy_to_vtk
-    from vtkmodules.vtkCommonDataModel import vtkImageData
-
-    image = vtkImageData()
-    image.SetDimensions(*values.shape[::-1])
-    image.SetSpacing(*SPACING)
-    image.SetOrigin(*ORIGIN)
-    array = numpy_to_vtk(values.ravel())
-    array.SetName("values")
-    image.GetPointData().SetScalars(array)
-    return image
-
-
 def _vtk(writer: str, name: str, *settings: str, mesh: bool = False) -> Any:
     """By a writer of VTK, ``MODULE.CLASS``; of cells of six faces where it is a ``mesh``."""
 
     def write(folder: Path, values: np.ndarray) -> Path:
-        import importlib
-
-        module, _, kind = writer.partition(".")
-        made = getattr(importlib.import_module(f"vtkmodules.{module}"), kind)()
+        made = vtk_class(writer)
         for setting in settings:
             getattr(made, setting)()
-        image = _vtk_image(values)
-        if mesh:
-            from vtkmodules.vtkFiltersCore import vtkAppendFilter
-            from vtkmodules.vtkFiltersGeneral import vtkImageDataToPointSet
-
-            points, append = vtkImageDataToPointSet(), vtkAppendFilter()
-            points.SetInputData(image)
-            append.AddInputConnection(points.GetOutputPort())
-            append.Update()
-            image = append.GetOutput()
-        made.SetInputDataObject(0, image)
-        made.SetFileName(str(folder / name))
         if hasattr(made, "SetEndPiece"):
             made.SetNumberOfPieces(4)
             made.SetEndPiece(3)
-        made.Write()
-        return folder / name
+        return write_vtk(made, hexahedra(values) if mesh else vtk_image(values), folder / name)
 
     return write
-
-
-def _by_vtk(reader: str) -> Any:
-    def read(path: Path) -> Any:
-        import importlib
-
-        module, _, kind = reader.partition(".")
-        made = getattr(importlib.import_module(f"vtkmodules.{module}"), kind)()
-        made.SetFileName(str(path))
-        made.Update()
-        return made.GetOutputDataObject(0)
-
-    return read
 
 
 def _mrc(folder: Path, values: np.ndarray) -> Path:
@@ -272,25 +230,25 @@ ROWS = (
     Row(
         "`.vti`, raw", "VTK", "VTK XML",
         _vtk(f"{IMAGE}Writer", "v.vti", "EncodeAppendedDataOff", "SetCompressorTypeToNone"),
-        _by_vtk(f"{IMAGE}Reader"),
+        by_vtk(f"{IMAGE}Reader"),
     ),
-    Row("`.vti`, zlib", "VTK", "VTK XML", _vtk(f"{IMAGE}Writer", "v.vti"), _by_vtk(f"{IMAGE}Reader")),
+    Row("`.vti`, zlib", "VTK", "VTK XML", _vtk(f"{IMAGE}Writer", "v.vti"), by_vtk(f"{IMAGE}Reader")),
     Row(
         "`.pvti`, zlib", "VTK", "parallel VTK image", _vtk("vtkIOParallelXML.vtkXMLPImageDataWriter", "v.pvti"),
-        _by_vtk("vtkIOXML.vtkXMLPImageDataReader"),
+        by_vtk("vtkIOXML.vtkXMLPImageDataReader"),
     ),
     Row(
         "legacy `.vtk`", "VTK", "legacy VTK",
-        _vtk("vtkIOLegacy.vtkDataSetWriter", "v.vtk", "SetFileTypeToBinary"), _by_vtk("vtkIOLegacy.vtkDataSetReader"),
+        _vtk("vtkIOLegacy.vtkDataSetWriter", "v.vtk", "SetFileTypeToBinary"), by_vtk("vtkIOLegacy.vtkDataSetReader"),
     ),
-    Row("VTKHDF image", "VTK", "VTKHDF", _vtk("vtkIOHDF.vtkHDFWriter", "v.vtkhdf"), _by_vtk("vtkIOHDF.vtkHDFReader")),
+    Row("VTKHDF image", "VTK", "VTKHDF", _vtk("vtkIOHDF.vtkHDFWriter", "v.vtkhdf"), by_vtk("vtkIOHDF.vtkHDFReader")),
     Row(
         "`.vtu`", "VTK", "VTK grid", _vtk("vtkIOXML.vtkXMLUnstructuredGridWriter", "v.vtu", mesh=True),
-        _by_vtk("vtkIOXML.vtkXMLUnstructuredGridReader"), placed=False, most=64,
+        by_vtk("vtkIOXML.vtkXMLUnstructuredGridReader"), most=64,
     ),
     Row(
         "Exodus II", "VTK", "Exodus", _vtk("vtkIOIOSS.vtkIOSSWriter", "v.exo", mesh=True),
-        _by_vtk("vtkIOExodus.vtkExodusIIReader"), placed=False, most=64,
+        by_vtk("vtkIOExodus.vtkExodusIIReader"), most=64,
     ),
     Row("HDF5, gzip", "h5py", "HDF5", _h5, _by_h5py("values")),
     Row("NetCDF 4, zlib", "xarray, netCDF4", "NetCDF", _nc, _by_xarray),

@@ -200,16 +200,21 @@ def vti() -> list[Seed]:
         ("b.vti", "Binary", "ZLib"),
         ("c.vti", "Appended", "LZ4"),
         ("d.vti", "Appended", "None"),
+        ("e.vti", "Appended", "ZLib"),
+        ("f.vti", "Appended", "LZMA"),
     ):
         writer = vtkXMLImageDataWriter()
         writer.SetInputData(image)
         writer.WriteToOutputStringOn()
         getattr(writer, f"SetDataModeTo{mode}")()
         getattr(writer, f"SetCompressorTypeTo{compressor}")()
-        writer.SetEncodeAppendedData(compressor != "None")
+        writer.SetEncodeAppendedData(compressor == "LZ4")
         writer.Write()
         written = writer.GetOutputString()  # text where it is text, else bytes
-        seeds.append(Seed(name, written.encode() if isinstance(written, str) else written, READ))
+        content = written.encode() if isinstance(written, str) else written
+        seeds.append(Seed(name, content, READ))
+        if mode == "Appended":
+            seeds.append(Seed(name.replace(".", "2."), content, volume_reader(stored=True)))
     return seeds
 
 

@@ -80,7 +80,8 @@ def minc() -> list[Seed]:
     import nibabel
 
     folder = Path(nibabel.__file__).parent / "tests" / "data"
-    names = (("minc1_1_scale.mnc", READ), ("minc1_4d.mnc", volume_reader(time=1)))
+    names: tuple[tuple[str, Any], ...] = (("minc1_1_scale.mnc", READ), ("minc1_4d.mnc", volume_reader(time=1)))
+    names += (("minc2_1_scale.mnc", READ), ("minc2_4d.mnc", volume_reader(time=1, stored=True)))
     return [Seed(name, (folder / name).read_bytes(), read) for name, read in names]
 
 
@@ -106,5 +107,5 @@ def scans() -> dict[str, list[Seed]]:
         "MGH": mgh(),
         "MRC": mrc(),
         "cube and OpenDX": text_grids(),
-        "MINC 1": minc(),
+        "MINC": minc(),
     }

@@ -24,7 +24,9 @@ def cells(times: int = 1, channels: int = 2, dtype: str = "uint16") -> np.ndarra
     return np.round(values).astype(dtype)
 
 
-def lif(images: Sequence[tuple[str, np.ndarray]]) -> bytes:
+def lif(
+    images: Sequence[tuple[str, np.ndarray]], spacing: Sequence[float] = SPACING, origin: Sequence[float] = (0, 0, 0)
+) -> bytes:
     """A LIF file, version 2: header, XML in UTF-16, and a memory block an image; values are (t, c, z, y, x)."""
     elements, blocks = "", b""
     for number, (name, values) in enumerate(images):
@@ -37,11 +39,12 @@ def lif(images: Sequence[tuple[str, np.ndarray]]) -> bytes:
             if kind == "c":
                 channel_step = step
             elif size > 1 or kind in "12":
-                length = 0.0 if kind == "4" else (size - 1) * SPACING[int(kind) - 1] * 1e-6
+                length = 0.0 if kind == "4" else (size - 1) * spacing[int(kind) - 1] * 1e-6
+                first = 0.0 if kind == "4" else origin[int(kind) - 1] * 1e-6
                 unit = "s" if kind == "4" else "m"
                 dims += (
-                    f'<DimensionDescription DimID="{kind}" NumberOfElements="{size}" Origin="0" Length="{length!r}" '
-                    f'Unit="{unit}" BitInc="0" BytesInc="{step}"/>'
+                    f'<DimensionDescription DimID="{kind}" NumberOfElements="{size}" Origin="{first!r}" '
+                    f'Length="{length!r}" Unit="{unit}" BitInc="0" BytesInc="{step}"/>'
                 )
             step *= size
         channels = "".join(
@@ -87,7 +90,7 @@ def _lite(values: dict[str, Any]) -> bytes:
     return out
 
 
-def nd2(values: np.ndarray, packed: bool = False) -> bytes:
+def nd2(values: np.ndarray, packed: bool = False, spacing: Sequence[float] = SPACING) -> bytes:
     """An ND2 file, version 3.0, of values (t, c, z, y, x): chunks, and a map of them at the end."""
     times, channels, slices, ny, nx = values.shape
     planes = {
@@ -96,8 +99,8 @@ def nd2(values: np.ndarray, packed: bool = False) -> bytes:
         for c in range(channels)
     }  # fmt: skip
     loop: dict[str, Any] = {
-        "eType": 4, "uLoopPars": {"uiCount": slices, "dZLow": 0.0, "dZHigh": SPACING[2] * (slices - 1),
-                                  "dZStep": SPACING[2], "dZHome": 0.0, "iType": 0},
+        "eType": 4, "uLoopPars": {"uiCount": slices, "dZLow": 0.0, "dZHigh": spacing[2] * (slices - 1),
+                                  "dZStep": spacing[2], "dZHome": 0.0, "iType": 0},
     }  # fmt: skip
     if times > 1:
         pars = {"uiCount": times, "dStart": 0.0, "dPeriod": 1.0, "dDuration": 1.0 * times}
@@ -109,7 +112,7 @@ def nd2(values: np.ndarray, packed: bool = False) -> bytes:
             "uiBpcInMemory": bits, "uiBpcSignificant": bits, "uiSequenceCount": times * slices,
             "eCompression": 0 if packed else 2}},
         b"ImageMetadataSeqLV|0!": {"SLxPictureMetadata": {
-            "bCalibrated": True, "dCalibration": SPACING[0],
+            "bCalibrated": True, "dCalibration": spacing[0],
             "sPicturePlanes": {"uiCount": channels, "sPlaneNew": planes}}},
         b"ImageMetadataLV!": {"SLxExperiment": loop},
     }  # fmt: skip

@@ -44,7 +44,15 @@ RUN = (
     ),
     *("reports", "share", "splat", "training"),
 )
-SHARED = ("dvr_scenes", "floors", "readers_rows", "scans")  # what the others import
+SHARED = (
+    "dvr_scenes",
+    "floors",
+    "readers_layouts",
+    "readers_rows",
+    "readers_simulations",
+    "readers_vtk",
+    "scans",
+)  # what the others import
 
 
 def test_none_is_left_out():

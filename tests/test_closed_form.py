@@ -9,9 +9,10 @@ import pytest
 
 from tests.closed_form_scenes import Above, Ramp, Tent, scene_of, score
 from vvgt_cli.cameras import Camera, default_views
+from vvgt_cli.cameras.sets import pixel_width
 from vvgt_cli.closed_form import METHODS, VbmOptions, backproject, initialise
 from vvgt_cli.closed_form import closed_form as closed_form_module
-from vvgt_cli.closed_form.closed_form import base_level, pixel_width
+from vvgt_cli.closed_form.closed_form import base_level
 from vvgt_cli.dvr import RenderSettings, Scene, render_views
 from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians import Gaussians

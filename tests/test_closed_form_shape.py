@@ -14,13 +14,13 @@ from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.closed_form.closed_form import closed_form
 from vvgt_cli.closed_form.inset import inset, opaque_field
 from vvgt_cli.closed_form.moments import base_cells
-from vvgt_cli.closed_form.opacity import dilogarithm, inverse_dilogarithm, opacity_when_reshaped, peak_opacity
 from vvgt_cli.closed_form.pyramid import principal_axes
 from vvgt_cli.closed_form.shape import ROUND, make_gaussians, quaternions, widened
 from vvgt_cli.closed_form.wavelet import box_surrogate
 from vvgt_cli.dvr import render_view
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians.constants import MAX_ALPHA, MIN_ALPHA
+from vvgt_cli.gaussians.opacity import dilogarithm, inverse_dilogarithm, opacity_when_reshaped, peak_opacity
 from vvgt_cli.splat import render
 from vvgt_cli.splat.reference import rotations
 from vvgt_cli.synth import analytic

@@ -22,6 +22,7 @@ from vvgt_cli.gaussians.formats.live import from_bytes, live_bytes, live_json
 from vvgt_cli.gaussians.frames import rotations, transform, turn
 from vvgt_cli.gaussians.live import MEANS, SPREADS, WIDEST, Table, baked, directions, shown_by, spreads
 from vvgt_cli.gaussians.live_facts import LiveFacts, function_text
+from vvgt_cli.gaussians.opacity import peak_opacity
 from vvgt_cli.images.metrics import psnr
 from vvgt_cli.look.colormap import ColorMap
 from vvgt_cli.look.fog import fog
@@ -80,14 +81,16 @@ def test_without_spread_a_gaussian_has_the_functions_color_and_extinction() -> N
     shown = baked(replace(some, live=live), Table.of_function(RAMP, LO, HI, 0.05))
     tau = -np.log1p(-RAMP.opacity(live[:, 0].astype(float))) / 0.05
     opacity = 1 / (1 + np.exp(-shown.opacity_logits.astype(float)))
-    np.testing.assert_allclose(opacity, -np.expm1(-tau * live[:, 2]), atol=4e-3)
+    wanted = peak_opacity(tau * live[:, 2] ** 3, np.exp(2 * some.log_scales.astype(float)), 0.0)
+    np.testing.assert_allclose(opacity[tau > 0.1], wanted[tau > 0.1], atol=6e-3)
+    assert opacity[tau == 0].max() < 1e-5
     seen = tau > 0.1
     np.testing.assert_allclose(shown.colors[seen], RAMP.color(live[seen, 0].astype(float)), atol=2e-2)
 
 
 def test_a_gaussian_moves_to_where_the_values_are_seen_and_is_thinner_there() -> None:
     """One whose values rise along x from LO to HI: a window around 20 lies where 20 is."""
-    live = np.array([[10.0, 20.0, 0.5, 1.0, 0.0, 0.0]])
+    live = np.array([[10.0, 20.0, 1e-5, 1.0, 0.0, 0.0]])
     one = Gaussians(np.zeros((1, 3)), np.full((1, 3), np.log(0.1)), [[1, 0, 0, 0]], [0.0], [[1, 1, 1]], live=live)
     shown = shown_by(one, Table.of_function(WINDOW, LO, HI, 0.05))
     np.testing.assert_allclose(shown.means, [[0.1 * (20 - 10) / 20, 0, 0]], atol=5e-3)
@@ -103,11 +106,16 @@ def test_a_gaussian_moves_to_where_the_values_are_seen_and_is_thinner_there() ->
 
 
 def test_a_look_turns_with_its_gaussians() -> None:
-    """Of maps that stretch too: gradients are covectors."""
+    """Of maps that stretch too, where nothing is opaque: gradients are covectors."""
     some, table = cloud(), Table.of_function(WINDOW, LO, HI, 0.05)
+    assert some.live is not None
+    fine = replace(some, live=np.where(np.arange(6) == 2, 1e-5, some.live))
     shear = np.array([[1.0, 0.3, 0.0], [0.0, 0.8, 0.1], [0.0, 0.0, 1.2]])
-    for change in (lambda g: turn(g, "x"), lambda g: transform(g, shear), lambda g: transform(g, -np.eye(3))):
-        before, after = change(shown_by(some, table)), shown_by(change(some), table)
+    mirrored = -np.eye(3)
+    for of, change in (
+        (some, lambda g: turn(g, "x")), (fine, lambda g: transform(g, shear)), (some, lambda g: transform(g, mirrored))
+    ):  # fmt: skip
+        before, after = change(shown_by(of, table)), shown_by(change(of), table)
         np.testing.assert_allclose(after.means, before.means, atol=2e-5)
         axes = [
             rotations(g.quaternions.astype(float)) * np.exp(g.log_scales.astype(float))[:, None]

@@ -110,3 +110,33 @@ def test_labels_are_switched_off_shown_alone_and_searched(labels: Path, tmp_path
     shot = after(labels, solo, tmp_path, PHONE)
     print(f"one label alone: {psnr(alone, shot):.2f} dB")
     assert psnr(alone, shot) > 28
+
+
+def test_a_frame_of_a_series_is_shown_under_the_function_of_the_page(tmp_path: Path) -> None:
+    """Chosen in the list; under the file's function, and once the panel has shown another one."""
+    for k in range(2):
+        z, y, x = np.mgrid[:24, :24, :24] - 11.5
+        ball = np.exp(-(((x - 5 * k) / 6) ** 2 + (y / 4) ** 2 + (z / 7) ** 2)).astype(np.float32)
+        np.save(tmp_path / f"f{k}.npy", ball)
+    source = [
+        "convert",
+        str(tmp_path / "f?.npy"),
+        "--tf",
+        "viridis",
+        "--live",
+        "--max-gaussians",
+        "6000",
+        "--size",
+        "300",
+    ]
+    assert run([*source, "--quiet", "-o", str(tmp_path / "all.html")]) == 0
+    assert run([*source, "--quiet", "-o", str(tmp_path / "f_{}.ply")]) == 0
+    wanted = [ours(tmp_path / f"f_{k}.ply", tmp_path) for k in range(2)]
+    shot = after(tmp_path / "all.ply", [{"select": "#series select", "text": "f1.npy"}], tmp_path)
+    print(f"the second frame: {psnr(wanted[1], shot):.2f} dB, not {psnr(wanted[0], shot):.2f}")
+    assert psnr(wanted[1], shot) > max(32, psnr(wanted[0], shot) + 5)
+    ramp: Actions = [{"select": "#live select[aria-label=function]", "text": "step"}]
+    other = after(tmp_path / "all.ply", [*ramp, {"select": "#series select", "text": "f1.npy"}], tmp_path)
+    again = after(tmp_path / "all.ply", [{"select": "#series select", "text": "f1.npy"}, *ramp], tmp_path)
+    assert psnr(other, again) > 40
+    assert psnr(other, shot) < 30

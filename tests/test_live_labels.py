@@ -15,7 +15,7 @@ from tests.test_page_live import options, page_of
 from vvgt_cli.closed_form.labelled import labelled
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
 from vvgt_cli.gaussians.formats.live import from_bytes, live_bytes, live_json
-from vvgt_cli.gaussians.live import Palette, baked, seen_under, shown_by
+from vvgt_cli.gaussians.live import FLAT, SHARP, Palette, baked, opacities, seen_under, shown_by
 from vvgt_cli.gaussians.live_facts import LiveFacts
 from vvgt_cli.look.label_fog import label_fog
 from vvgt_cli.look.labels import Label, LabelTable
@@ -56,10 +56,12 @@ def test_a_gaussian_has_its_labels_color_and_extinction_where_it_is() -> None:
         np.testing.assert_allclose(shown.colors[own], np.tile(label.color, (own.sum(), 1)), atol=1e-6)
         tau = -np.log1p(-min(label.opacity, 1 - 1e-5)) / 0.05
         opacity = 1 / (1 + np.exp(-shown.opacity_logits[own].astype(float)))
-        np.testing.assert_allclose(opacity, -np.expm1(-tau * some.live[own, 2]), atol=2e-5)
+        length, variances = some.live[own, 2].astype(float), np.exp(2 * shown.log_scales[own].astype(float))
+        np.testing.assert_allclose(opacity, opacities(tau * length**3, variances, 0.0), atol=2e-5)
+        smaller = np.sort(shown.log_scales[own], axis=1) - np.sort(some.log_scales[own], axis=1)
+        opaque = -np.expm1(-tau * length)[:, None]
+        np.testing.assert_allclose(np.exp(2 * smaller), 1 - opaque * (1 - np.array([SHARP, FLAT, FLAT])), atol=1e-3)
     np.testing.assert_allclose(shown.means, some.means, atol=1e-6)
-    visible = some.live[:, 6] < 2
-    np.testing.assert_allclose(shown.log_scales.sum(axis=1)[visible], some.log_scales.sum(axis=1)[visible], atol=1e-4)
     assert set(some.live[seen_under(some, Palette.of_labels(LABELS, 0.05)), 6]) == {0, 1}
 
 
@@ -227,8 +229,6 @@ def test_what_labels_do_not_go_with(vvgt, label_file, tmp_path) -> None:
         assert (done.code, said in done.error) == (code, True), done.error
     done = vvgt("render", label_file, "--tf-range", "0,1", "--orbit", 1, "-o", tmp_path / "r")
     assert (done.code, "leave out --tf-range" in done.error) == (2, True), done.error
-    done = vvgt("convert", "example:blob:12", "--layer", "example:blob:12", "--live", "-o", tmp_path / "a.ply", *SMALL)
-    assert (done.code, "one scalar field, or one label map" in done.error) == (2, True)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["one.json", "t.json"]
 
 

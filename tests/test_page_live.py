@@ -16,13 +16,15 @@ import numpy as np
 import pytest
 
 from tests.test_live import COLORS, HI, LO, RAMP, WINDOW, cloud, facts
+from vvgt_cli.cameras.sets import pixel_width
 from vvgt_cli.gaussians import Gaussians, PlyOptions
 from vvgt_cli.gaussians.formats import encoded, format_of
 from vvgt_cli.gaussians.formats.live import from_bytes
 from vvgt_cli.gaussians.formats.page_file import read_html
 from vvgt_cli.gaussians.formats.page_live import PLANES, nodes_of
-from vvgt_cli.gaussians.frames import turn, up_matrix
-from vvgt_cli.gaussians.live import Table, baked
+from vvgt_cli.gaussians.formats.splats import morton_order
+from vvgt_cli.gaussians.frames import rotations, turn, up_matrix
+from vvgt_cli.gaussians.live import Table, baked, shown_by
 from vvgt_cli.look.colormap import ColorMap
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.opacity import PiecewiseOpacity
@@ -127,3 +129,49 @@ def test_the_pages_program_makes_our_table(tf: TransferFunction, tmp_path: Path)
     texels = np.fromfile(tmp_path / "texels", np.float32).reshape(2, *wanted.shape[1::-1], 4)
     np.testing.assert_allclose(texels[0], wanted[..., :4].transpose(1, 0, 2), atol=2e-4 * wanted[..., 3].max())
     np.testing.assert_allclose(texels[1, ..., :2], wanted[..., 4:].transpose(1, 0, 2), atol=2e-3 * wanted[..., 3].max())
+
+
+@pytest.mark.parametrize("tf", [RAMP, WINDOW, STEP])
+def test_the_pages_program_shows_gaussians_as_we_do(tf: TransferFunction, tmp_path: Path) -> None:
+    """Place, shape and opacity of each, as live_at.mjs has them for what is picked; live.glsl has the same formulas."""
+    if not shutil.which("node"):
+        pytest.skip("node is not on the path")
+    some, laid = baked(cloud(), Table.of_function(tf, LO, HI, 0.05)), options(live=facts(tf), up="none", made_for=300)
+    content, scene = page_of(some, laid)
+    held = re.search(rb'id="values-0">([^<]+)<', content)
+    assert held is not None
+    planes = gzip.decompress(base64.b64decode(held[1]))
+    wanted = turn(some, "z").take(morton_order(turn(some, "z").means))
+    stream = np.zeros((len(some), 8), np.uint8)
+    stream[:, PLANES] = np.frombuffer(planes, np.uint8).reshape(len(PLANES), -1).T
+    wanted = replace(wanted, live=from_bytes(stream, scene["live"]))
+    axes = rotations(wanted.quaternions.astype(float)) * np.exp(wanted.log_scales.astype(float))[:, None, :]
+    flip = np.array([-1.0, -1, 1])  # the viewer has PLY (x, y, z) at (-x, -y, z)
+    given = {"live": scene["live"], "bytes": list(planes), "centers": (wanted.means * flip).tolist()}
+    given["arms"] = (axes * flip[:, None]).transpose(0, 2, 1).tolist()
+    page = Path(__file__).parent.parent / "vvgt_cli" / "gaussians" / "formats" / "page"
+    (tmp_path / "given.json").write_text(json.dumps(given))
+    for name in ("live_table.mjs", "live_at.mjs"):
+        shutil.copy(page / name, tmp_path / name)
+    (tmp_path / "cloud.mjs").write_text("export const around = () => [];\n")  # without the engine, which it is of
+    (tmp_path / "run.mjs").write_text(
+        "import { sumsOf } from './live_table.mjs';\nimport { looksOf } from './live_at.mjs';\n"
+        "import fs from 'node:fs';\n"
+        "const { live, bytes, centers, arms } = JSON.parse(fs.readFileSync('given.json'));\n"
+        "const look = looksOf({ live, bytes, count: centers.length, sums: sumsOf(live.nodes, live), plane: null });\n"
+        "const found = centers.map((center, i) => look(i, { center, arms: arms[i] }));\n"
+        "fs.writeFileSync('found.json', JSON.stringify(found));\n"
+    )
+    subprocess.run(["node", "run.mjs"], cwd=tmp_path, check=True, timeout=120)
+    found = json.loads((tmp_path / "found.json").read_text())
+    ours = shown_by(wanted, Table.of_function(tf, LO, HI, 0.05), pixel_width(300))
+    alpha = 1 / (1 + np.exp(-ours.opacity_logits.astype(float)))
+    axes = rotations(ours.quaternions.astype(float)) * np.exp(ours.log_scales.astype(float))[:, None, :]
+    for k, one in enumerate(found):
+        if one is None:
+            assert alpha[k] < 1e-3
+            continue
+        np.testing.assert_allclose(np.array(one["center"]) * flip, ours.means[k], atol=2e-3)
+        assert one["opacity"] == pytest.approx(alpha[k], abs=2e-3)
+        own = np.array(one["arms"]) * flip
+        np.testing.assert_allclose(own.T @ own, axes[k] @ axes[k].T, atol=2e-5)

@@ -22,6 +22,7 @@ import pytest
 from tests.test_formats_server import ask, cloud, shown
 from tests.test_live import HI, LO, RAMP, facts
 from tests.test_live import cloud as live_cloud
+from vvgt_cli.cameras.sets import SIZE, pixel_width
 from vvgt_cli.commands.converter import Converter, Failed, Made
 from vvgt_cli.commands.live_site import Cloud, Desk, function_sent, plain_name
 from vvgt_cli.commands.server import Part, Site, served
@@ -254,7 +255,7 @@ def test_a_saved_live_file_has_the_colours_of_the_function(desk: tuple[str, Desk
         "opacity_unit_distance": 0.5,
     }
     saved = Cloud.of(send(desk[0], "save", {"file": "ply", "function": function})[1], "x")
-    wanted = baked(live_cloud(), Table.of_function(function_sent(function), LO, HI, 0.05))
+    wanted = baked(live_cloud(), Table.of_function(function_sent(function), LO, HI, 0.05), pixel_width(SIZE))
     np.testing.assert_allclose(saved.gaussians.colors, wanted.colors, atol=1e-5)
     np.testing.assert_allclose(saved.gaussians.opacity_logits, wanted.opacity_logits, atol=1e-4)
     plain = Cloud.of(send(desk[0], "save", {"file": "ply"})[1], "x")
@@ -273,7 +274,7 @@ def test_a_saved_file_has_the_light_of_the_file_or_of_the_page(desk: tuple[str, 
     lit_file = replace(plain, options=replace(plain.options, light=side))
     of.first = lambda: lit_file
     table = Table.of_function(function_sent(FUNCTION), LO, HI, 0.1 * 0.1)
-    dark = baked(live_cloud(), table)
+    dark = baked(live_cloud(), table, pixel_width(SIZE))
 
     def saved(**more: Any) -> Cloud:
         return Cloud.of(send(url, "save", {"file": "ply", "function": FUNCTION, **more})[1], "x")

@@ -9,6 +9,9 @@ from pathlib import Path
 import nibabel as nib
 import numpy as np
 import pytest
+from vtkmodules.util.numpy_support import numpy_to_vtk
+from vtkmodules.vtkCommonDataModel import vtkImageData
+from vtkmodules.vtkIOMINC import vtkMINCImageWriter
 
 from vvgt_cli.errors import DataError, SeveralSteps, UsageError
 from vvgt_cli.volume import ReadOptions, Volume, read_volume
@@ -219,8 +222,36 @@ def test_a_sequence_becomes_a_file_a_frame(tmp_path: Path, vvgt: Callable) -> No
     assert sorted(path.name for path in tmp_path.glob("*.ply")) == ["p_0.ply", "p_1.ply", "p_2.ply"]
 
 
-@pytest.mark.parametrize("module", ["nibabel", "h5py"])
-def test_minc_without_its_libraries_names_the_extra(module: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(DataError, match=rf"needs {module} .*pip install 'vvgt\[minc\]'"):
+def test_minc_2_without_h5py_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    with pytest.raises(DataError, match=r"needs h5py .*pip install 'vvgt\[hdf5\]'"):
         read_volume(str(MINC / "minc2_1_scale.mnc"))
+
+
+@pytest.mark.parametrize("code", ["u1", "i2", "f4"])
+def test_minc_1_as_vtk_writes_it(tmp_path: Path, code: str) -> None:
+    """Without the names by which nibabel knows MINC, nor ends of slices: values as they are stored."""
+    values = np.ascontiguousarray(VALUES.transpose(2, 1, 0)).astype(code)
+    image, array = vtkImageData(), numpy_to_vtk(values.ravel())
+    image.SetDimensions(5, 4, 3)
+    image.SetSpacing(0.5, 1.5, 2)
+    image.SetOrigin(1, -2, 3)
+    image.GetPointData().SetScalars(array)
+    writer = vtkMINCImageWriter()
+    writer.SetInputData(image)
+    writer.SetFileName(str(tmp_path / "v.mnc"))
+    writer.Write()
+    volume = read_volume(str(tmp_path / "v.mnc"))
+    np.testing.assert_array_equal(volume.data, values)
+    np.testing.assert_allclose(volume.affine, [[0.5, 0, 0, 1], [0, 1.5, 0, -2], [0, 0, 2, 3], [0, 0, 0, 1]])
+    assert volume.space == "RAS"
+
+
+@pytest.mark.parametrize(("old", "new", "message"), [
+    (b"regular__", b"irregular", "irregular steps"),
+    (b"zspace", b"qspace", "expected three in space"),
+])  # fmt: skip
+def test_minc_1_that_is_no_regular_volume(tmp_path: Path, old: bytes, new: bytes, message: str) -> None:
+    (tmp_path / "v.mnc").write_bytes((MINC / "minc1_1_scale.mnc").read_bytes().replace(old, new))
+    with pytest.raises(DataError, match=message):
+        read_volume(str(tmp_path / "v.mnc"))

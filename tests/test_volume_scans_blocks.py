@@ -8,9 +8,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import mrcfile
+import netCDF4
 import nibabel as nib
 import numpy as np
 import pytest
+import pyvista
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*Analyze does not say")
 Z, Y, X = np.indices((40, 36, 44))
@@ -77,6 +79,21 @@ def sequence(folder: Path) -> Path:
     return folder / "v.seq.nrrd"
 
 
+def netcdf(folder: Path) -> Path:
+    with netCDF4.Dataset(folder / "v.nc", "w") as file:
+        for name, size in zip("zyx", BALL.shape, strict=True):
+            file.createDimension(name, size)
+        file.createVariable("ball", "f4", ("z", "y", "x"), zlib=True, chunksizes=(16, 16, 16))[:] = BALL
+    return folder / "v.nc"
+
+
+def vti(folder: Path) -> Path:
+    image = pyvista.ImageData(dimensions=BALL.shape[::-1])
+    image["ball"] = BALL.astype("f4").ravel()
+    image.save(folder / "v.vti")
+    return folder / "v.vti"
+
+
 CASES: dict[str, tuple[Callable[[Path], Path], tuple]] = {
     "mrc turned": (turned, ()),
     "mrc stack": (stack, ("--time", 1)),
@@ -88,6 +105,9 @@ CASES: dict[str, tuple[Callable[[Path], Path], tuple]] = {
     "analyze": (analyze, ()),
     "sequence": (sequence, ("--time", 1)),
     "minc": (lambda folder: MINC, ("--time", 1)),
+    "minc 1": (lambda folder: MINC.with_name("minc1_4d.mnc"), ("--time", 1)),
+    "netcdf": (netcdf, ()),
+    "vti": (vti, ()),
 }
 
 
@@ -119,6 +139,18 @@ def test_workers_do_not_repeat_what_is_said_of_a_file(tmp_path: Path, vvgt: Call
     done = vvgt("init", analyze(tmp_path), "-o", out, "--max-gaussians", 50, "--blocks", 32, "--workers", 2)
     assert done.code == 0, done.err
     assert "Analyze" not in done.err  # of this process the warning goes to pytest
+
+
+@pytest.mark.parametrize("make", [netcdf, vti])
+def test_packed_values_give_the_bytes_of_plain_ones(make: Callable, tmp_path: Path, vvgt: Callable) -> None:
+    """In blocks, with processes of workers."""
+    np.save(tmp_path / "v.npy", BALL.astype("f4"))
+    files = []
+    for source in (tmp_path / "v.npy", make(tmp_path)):
+        files.append(tmp_path / f"{source.suffix[1:]}.ply")
+        how = ("--max-gaussians", 200, "--blocks", 32, "--workers", 2, "--no-comments")
+        assert vvgt("init", source, "-o", files[-1], *how).code == 0
+    assert files[0].read_bytes() == files[1].read_bytes()
 
 
 def test_a_stack_of_maps_becomes_a_file_each(tmp_path: Path, vvgt: Callable) -> None:

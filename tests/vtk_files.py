@@ -7,6 +7,7 @@ the ramp at their centres.
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -236,48 +237,57 @@ def foam_text(kind: str, name: str, body: str) -> str:
 
 def openfoam(folder: Path) -> Path:
     """A case of 4 x 3 x 2 hexahedra, two times of a field of cells."""
-    nx, ny, nz = 4, 3, 2
-    point = lambda i, j, k: i + 5 * (j + 4 * k)  # noqa: E731
-    cell = lambda i, j, k: i + nx * (j + ny * k)  # noqa: E731
-    faces: list[tuple[list[int], int, int]] = []
-    for k in range(nz + 1):
-        for j in range(ny + 1):
-            for i in range(nx + 1):
-                for axis, u in enumerate((j < ny and k < nz, i < nx and k < nz, i < nx and j < ny)):
-                    if not u:
-                        continue
-                    at, n = (i, j, k)[axis], (nx, ny, nz)[axis]
-                    e, f = (np.eye(3, dtype=int)[a] for a in ((1, 2), (2, 0), (0, 1))[axis])
-                    base = np.array([i, j, k])
-                    corners = [point(*c) for c in (base, base + e, base + e + f, base + f)]
-                    low = base - np.eye(3, dtype=int)[axis]
-                    owner, other = (cell(*low) if at else -1), (cell(*base) if at < n else -1)
-                    faces.append((corners, owner, other) if at else (corners[::-1], other, -1))
-    inner = sorted((f for f in faces if f[2] >= 0), key=lambda f: (f[1], f[2]))
-    faces = inner + [f for f in faces if f[2] < 0]
+    fields = {str(time): ramp(*map(centres, (X, Y, Z))) + STEP * k for k, time in enumerate(TIMES)}
+    return write_openfoam(folder, (X, Y, Z), fields)
+
+
+def _foam_faces(n: tuple[int, ...]) -> list[np.ndarray]:
+    """Of each axis (faces, 6): four points, the cell on its lower side, that on its upper, -1 where none is."""
+    points = np.arange(int(np.prod(np.add(n, 1)))).reshape(np.add(n, 1)[::-1]).transpose()  # x, y, z
+    found = []
+    for axis in range(3):
+        grid = np.moveaxis(points, (axis, (axis + 1) % 3, (axis + 2) % 3), (0, 1, 2))
+        four = [grid[:, :-1, :-1], grid[:, 1:, :-1], grid[:, 1:, 1:], grid[:, :-1, 1:]]
+        cells = np.arange(int(np.prod(n))).reshape(n[::-1]).transpose()
+        cells = np.moveaxis(cells, (axis, (axis + 1) % 3, (axis + 2) % 3), (0, 1, 2))
+        edge = np.full((1, *cells.shape[1:]), -1)
+        sides = np.concatenate([edge, cells]), np.concatenate([cells, edge])
+        found.append(np.stack([part.ravel() for part in (*four, *sides)], axis=1))
+    return found
+
+
+def write_openfoam(folder: Path, axes: Sequence[np.ndarray], fields: dict[str, np.ndarray]) -> Path:
+    """A case in ASCII of hexahedra between the planes of ``axes``, with the ``cells`` (z, y, x) of each time."""
+    faces = np.concatenate(_foam_faces(tuple(len(axis) - 1 for axis in axes)))
+    turned = faces[:, 4] < 0  # they point out of their owner
+    faces[turned] = faces[turned][:, [3, 2, 1, 0, 5, 4]]
+    inner = faces[faces[:, 5] >= 0]
+    inner = inner[np.lexsort((inner[:, 5], inner[:, 4]))]
+    faces = np.concatenate([inner, faces[faces[:, 5] < 0]])
     mesh = folder / "constant" / "polyMesh"
     mesh.mkdir(parents=True)
     (folder / "system").mkdir()
-    points = "\n".join(f"({x} {y} {z})" for z in Z for y in Y for x in X)
-    listing = "\n".join(f"4({' '.join(map(str, f[0]))})" for f in faces)
-    owners, others = "\n".join(str(f[1]) for f in faces), "\n".join(str(f[2]) for f in inner)
-    for name, kind, n, body in (
-        ("points", "vectorField", 60, points), ("faces", "faceList", len(faces), listing),
-        ("owner", "labelList", len(faces), owners), ("neighbour", "labelList", len(inner), others),
-    ):  # fmt: skip
-        (mesh / name).write_text(foam_text(kind, name, f"{n}\n(\n{body}\n)"))
+    x, y, z = axes
+    places = [f"({a} {b} {c})" for c in z for b in y for a in x]
+    for name, kind, rows in (
+        ("points", "vectorField", places),
+        ("faces", "faceList", ["4({} {} {} {})".format(*row) for row in faces[:, :4].tolist()]),
+        ("owner", "labelList", list(map(str, faces[:, 4].tolist()))),
+        ("neighbour", "labelList", list(map(str, inner[:, 5].tolist()))),
+    ):
+        (mesh / name).write_text(foam_text(kind, name, f"{len(rows)}\n(\n" + "\n".join(rows) + "\n)"))
     walls = f"1\n(\nwalls\n{{\ntype wall;\nnFaces {len(faces) - len(inner)};\nstartFace {len(inner)};\n}}\n)"
     (mesh / "boundary").write_text(foam_text("polyBoundaryMesh", "boundary", walls))
     control = (
         "application x; startFrom startTime; startTime 0; stopAt endTime; endTime 2; deltaT 0.25; writeInterval 1;"
     )
     (folder / "system" / "controlDict").write_text(foam_text("dictionary", "controlDict", control))
-    for k, time in enumerate(TIMES):
-        (folder / str(time)).mkdir()
-        values = "\n".join(map(str, (ramp(*map(centres, (X, Y, Z))) + STEP * k).ravel()))
-        body = f"dimensions [0 0 0 0 0 0 0];\ninternalField nonuniform List<scalar>\n24\n(\n{values}\n)\n;\n"
+    for time, values in fields.items():
+        (folder / time).mkdir()
+        listed = "\n".join(map(str, values.ravel().tolist()))
+        body = f"dimensions [0 0 0 0 0 0 0];\ninternalField nonuniform List<scalar>\n{values.size}\n(\n{listed}\n)\n;\n"
         body += "boundaryField\n{\nwalls\n{\ntype zeroGradient;\n}\n}"
-        (folder / str(time) / "cells").write_text(foam_text("volScalarField", "cells", body))
+        (folder / time / "cells").write_text(foam_text("volScalarField", "cells", body))
     path = folder / "v.foam"
     path.touch()
     return path
@@ -294,8 +304,14 @@ def plot3d(folder: Path) -> Path:
 
 
 def cgns(folder: Path) -> Path:
-    """A structured zone by h5py: https://cgns.github.io/standard/FMM/hdf5.html; nodes and cell centres."""
-    path = folder / "v.cgns"
+    points = [np.broadcast_to(a, (3, 4, 5)) for a in (X, Y[:, None], Z[:, None, None])]
+    return write_cgns(folder / "v.cgns", points, {"ramp": ramp(X, Y, Z)}, {"cells": ramp(*map(centres, (X, Y, Z)))})
+
+
+def write_cgns(
+    path: Path, points: Sequence[np.ndarray], nodes: dict[str, np.ndarray], cells: dict[str, np.ndarray] | None = None
+) -> Path:
+    """A structured zone by h5py: https://cgns.github.io/standard/FMM/hdf5.html; nodes and cell centres, (z, y, x)."""
 
     def node(parent: Any, name: str, label: str, values: Any = None) -> Any:
         group = parent.create_group(name, track_order=True)
@@ -317,18 +333,17 @@ def cgns(folder: Path) -> Path:
         file.create_dataset(" hdf5version", data=np.frombuffer(b"HDF5 Version 1.8.15".ljust(33, b"\0"), np.int8))
         node(file, "CGNSLibraryVersion", "CGNSLibraryVersion_t", np.array([3.3], np.float32))
         base = node(file, "Base", "CGNSBase_t", np.array([3, 3], np.int32))
-        zone = node(base, "Zone", "Zone_t", np.array([[5, 4, 3], [4, 3, 2], [0, 0, 0]], np.int32))
+        size = np.array(points[0].shape[::-1])
+        zone = node(base, "Zone", "Zone_t", np.array([size, size - 1, 0 * size], np.int32))
         node(zone, "ZoneType", "ZoneType_t", b"Structured")
         grid = node(zone, "GridCoordinates", "GridCoordinates_t")
-        for k, a in enumerate((X, Y[:, None], Z[:, None, None])):
-            node(grid, f"Coordinate{'XYZ'[k]}", "DataArray_t", np.array(np.broadcast_to(a, (3, 4, 5)), np.float64))
-        for name, place, values in (
-            ("Nodes", b"Vertex", ramp(X, Y, Z)),
-            ("Cells", b"CellCenter", ramp(*map(centres, (X, Y, Z)))),
-        ):
+        for k, a in enumerate(points):
+            node(grid, f"Coordinate{'XYZ'[k]}", "DataArray_t", np.array(a, np.float64))
+        for name, place, fields in (("Nodes", b"Vertex", nodes), ("Cells", b"CellCenter", cells or {})):
             found = node(zone, name, "FlowSolution_t")
             node(found, "GridLocation", "GridLocation_t", place)
-            node(found, {"Nodes": "ramp", "Cells": "cells"}[name], "DataArray_t", values)
+            for label, values in fields.items():
+                node(found, label, "DataArray_t", values)
     return path
 
 

@@ -1,7 +1,7 @@
 // page.mjs JOB.json MODULES: a picture of the page of `vvgt view`, or of one in a file, in headless Chromium; nothing but its
 // own address may be asked for. JOB: {"browser", "url", "size", "camera": {"position", "target", "up", "fov"} in the viewer's
 // axes or null for where the page says that it begins, "frame": number to go to or null, "before": JavaScript to evaluate first, or
-// none, "out": .png, "actions": [{"click" | "drag" | "fill" | "key": selector or key, "by": [px, px], "text"}] by mouse, touch and keys in a
+// none, "out": .png, "actions": [{"click" | "drag" | "fill" | "select" | "key": selector or key, "by": [px, px], "text"}] by mouse, touch and keys in a
 // window of "window": [width, height], and "look": .png of all of it afterwards, or none}; prints {"asked": [other URLs], "text": what
 // the page says, "seconds": from opening to the first picture, "frames": how many the slider has}.
 import fs from 'node:fs';
@@ -35,9 +35,10 @@ if (!await page.evaluate('window.vvgt !== undefined')) {
 }
 const seconds = (Date.now() - begin) / 1000;
 if (job.before) await Promise.race([broken, page.evaluate(job.before)]);
-for (const { click, drag, fill, key, by, text } of job.actions ?? []) {
+for (const { click, drag, fill, select, key, by, text } of job.actions ?? []) {
   if (click) await page.locator(click).click();
   if (fill) await page.locator(fill).fill(text);
+  if (select) await page.locator(select).selectOption(text);
   if (key) await page.keyboard.press(key);
   if (!drag) continue;
   const box = await page.locator(drag).boundingBox(), x = box.x + box.width / 2, y = box.y + box.height / 2;

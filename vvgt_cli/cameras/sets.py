@@ -110,3 +110,8 @@ def farthest_cameras(cameras: Sequence[Camera], count: int) -> list[int]:
         chosen.append(nearest)
         gap = np.minimum(gap, np.linalg.norm(eyes - eyes[nearest], axis=1))
     return sorted(int(tie[i]) for i in chosen)
+
+
+def pixel_width(size: int) -> float:
+    """Width of a pixel at the volume's centre in the default views, unit frame."""
+    return 2 * RADIUS * math.tan(math.radians(FIELD_OF_VIEW) / 2) / size

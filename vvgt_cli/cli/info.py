@@ -6,7 +6,13 @@ from typing import Any
 
 import click
 
-from vvgt_cli.cli.options import common_options, placed_read_options, tf_range_option, unit_distance_option
+from vvgt_cli.cli.options import (
+    common_options,
+    layer_looks_option,
+    placed_read_options,
+    tf_range_option,
+    unit_distance_option,
+)
 from vvgt_cli.cli.sections import SectionedCommand
 from vvgt_cli.progress import Console
 
@@ -15,13 +21,14 @@ from vvgt_cli.progress import Console
 @click.argument("file")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
 @click.option("--tf", metavar="TF", help="Transfer function to describe a .ply of 'vvgt convert --live' under.")
+@layer_looks_option
 @tf_range_option
 @unit_distance_option
 @placed_read_options
 @common_options
 def command(
-    file: str, as_json: bool, tf: str | None, tf_range: str, opacity_unit_distance: str | None, read: dict[str, Any],
-    console: Console,
+    file: str, as_json: bool, tf: str | None, layers: tuple[str, ...], tf_range: str,
+    opacity_unit_distance: str | None, read: dict[str, Any], console: Console,
 ) -> None:  # fmt: skip
     """Describe FILE, whose type is detected from its content: a volume, a transfer function, a label table, a view set
     (transforms.json), a .ply of Gaussians, or the index of several.
@@ -37,7 +44,7 @@ def command(
     from vvgt_cli.score.record import plain
     from vvgt_cli.volume import ReadOptions
 
-    facts = plain(inspect(file, ReadOptions(**read), function_of(tf, tf_range, opacity_unit_distance)))
+    facts = plain(inspect(file, ReadOptions(**read), function_of(tf, tf_range, opacity_unit_distance, layers=layers)))
     if as_json:
         import json
 

@@ -143,6 +143,10 @@ _LIGHT = dict(
         "--specular-power", type=float, metavar="P", help="Specular exponent; larger is glossier. Default: 10."
     ),
 )  # fmt: skip
+layer_looks_option = click.option(
+    "--layer", "layers", multiple=True, metavar="LAYER,tf=TF",
+    help="Function (tf=) or table (labels=) of one layer or channel of several, by number or name; repeat for others.",
+)  # fmt: skip
 relight_options = group("light", **_LIGHT)
 light_options = group(
     "light",

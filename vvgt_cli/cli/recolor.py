@@ -8,6 +8,7 @@ import click
 
 from vvgt_cli.cli.options import (
     common_options,
+    layer_looks_option,
     overwrite_option,
     relight_options,
     tf_range_option,
@@ -30,14 +31,15 @@ from vvgt_cli.progress import Console
     "--labels", metavar="TABLE|auto",
     help="Table of labels, for a file of a label map; opacity 0 hides one. Default: the one that the file has.",
 )  # fmt: skip
+@layer_looks_option
 @tf_range_option
 @unit_distance_option
 @relight_options
 @overwrite_option
 @common_options
 def command(
-    ply: str, tf: str | None, labels: str | None, output: str, tf_range: str, opacity_unit_distance: str | None,
-    light: dict[str, Any], overwrite: bool, console: Console,
+    ply: str, tf: str | None, labels: str | None, layers: tuple[str, ...], output: str, tf_range: str,
+    opacity_unit_distance: str | None, light: dict[str, Any], overwrite: bool, console: Console,
 ) -> None:  # fmt: skip
     """Write what LIVE.ply, made by 'vvgt convert --live', is under the transfer function TF (of a label map: under
     TABLE) and a light, as an ordinary file.
@@ -48,10 +50,10 @@ def command(
     Examples:
       vvgt recolor head-live.ply --tf bone.json -o bone.ply
       vvgt recolor head-live.ply --tf skin.json --light headlight -o skin.html
+      vvgt recolor cells-live.ply --layer 1,tf=magenta.json -o cells.ply
     """
-    from vvgt_cli.commands.recolor import RecolorRequest, recolor
+    from vvgt_cli.commands.recolor import RecolorRequest, function_of, recolor
     from vvgt_cli.conversion.recolored import FunctionRequest
-    from vvgt_cli.look.lighting import LightOptions
 
-    function = FunctionRequest(tf, tf_range, opacity_unit_distance, labels, LightOptions(**light))
+    function = function_of(tf, tf_range, opacity_unit_distance, labels, light, layers) or FunctionRequest()
     recolor(RecolorRequest(ply, function, output, overwrite), console)

@@ -9,6 +9,7 @@ import click
 from vvgt_cli.cli.fit import rule_option
 from vvgt_cli.cli.options import (
     common_options,
+    layer_looks_option,
     overwrite_option,
     relight_options,
     tf_range_option,
@@ -42,6 +43,7 @@ from vvgt_cli.progress import Console
 )
 @click.option("--labels", metavar="TABLE|auto", help="Table of labels to show a live .ply of a label map under.")
 @click.option("--tf", metavar="TF", help="Transfer function to show a .ply of 'vvgt convert --live' under.")
+@layer_looks_option
 @tf_range_option
 @unit_distance_option
 @relight_options
@@ -59,6 +61,7 @@ def command(
     background: tuple[float, float, float] | None,
     tf: str | None,
     labels: str | None,
+    layers: tuple[str, ...],
     tf_range: str,
     opacity_unit_distance: str | None,
     light: dict[str, Any],
@@ -85,5 +88,5 @@ def command(
         raise UsageError("give the views with either --camera FILE or --orbit N")
     if background is not None and not all(0 <= c <= 1 for c in background):
         raise UsageError(f"--background {' '.join(map(str, background))}: expected three numbers in [0, 1]")
-    function = function_of(tf, tf_range, opacity_unit_distance, labels, light)
+    function = function_of(tf, tf_range, opacity_unit_distance, labels, light, layers)
     render_file(RenderRequest(ply, output, camera, orbit, size, rule, exr, background, overwrite, function), console)

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
     from vvgt_cli.cameras import Camera
     from vvgt_cli.closed_form.closed_form import ClosedForm
+    from vvgt_cli.closed_form.tree import Leaves
     from vvgt_cli.dvr import Scene
     from vvgt_cli.gaussians import Gaussians
 
@@ -52,10 +53,17 @@ class VbmOptions:
 
 @dataclass(frozen=True)
 class Start:
-    """Gaussians of the stage, and the pyramid that views may cut anew (None for the comparison methods)."""
+    """Gaussians of the stage, and the pyramid that views may cut anew (None for the comparison methods).
+
+    Attributes:
+        gaussians: one a cell.
+        form: the pyramid.
+        leaves: the cells, where they are those of ``values``.
+    """
 
     gaussians: Gaussians
     form: ClosedForm | None
+    leaves: Leaves | None = None
 
 
 def initialise(scene: Scene, options: VbmOptions, progress: Progress | None = None) -> Start:
@@ -75,12 +83,15 @@ def start_of(form: ClosedForm, options: VbmOptions) -> Start:
     from vvgt_cli.closed_form.uniform import uniform_gaussians
     from vvgt_cli.closed_form.wavelet import wavelet_gaussians
 
+    if options.values:
+        leaves = form.cells_of_values()
+        return Start(form.gaussians_of(leaves), form, leaves)
     if options.method == "wavelet":
         gaussians, kept = wavelet_gaussians(form.tree, form.budget, form.pixel), None
     elif options.method == "uniform":
         gaussians, kept = uniform_gaussians(form.tree, form.budget, form.pixel, options.seed), None
     else:
-        gaussians, kept = form.gaussians(values=options.values), form
+        gaussians, kept = form.gaussians(), form
     if kept is None and form.shading is not None:
         gaussians = form.shading.alone(gaussians, options.degree)
     return Start(gaussians, kept)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vvgt_cli.cameras import Camera, default_views
-from vvgt_cli.cameras.sets import FIELD_OF_VIEW, RADIUS
+from vvgt_cli.cameras.sets import pixel_width
 from vvgt_cli.closed_form.columns import MASS, SEEN
 from vvgt_cli.closed_form.error import scores_by_error, unseen
 from vvgt_cli.closed_form.fit import blending_weights, image_errors, solve_colors, weights_and_errors
@@ -55,11 +55,6 @@ TWICE_EVERY = 6  # of so many views one counts as seen at twice its size when co
 Progress = Callable[[int, int], None]
 
 
-def pixel_width(size: int) -> float:
-    """Width of a pixel at the volume's centre in the default views, unit frame."""
-    return 2 * RADIUS * math.tan(math.radians(FIELD_OF_VIEW) / 2) / size
-
-
 @dataclass(frozen=True)
 class ClosedForm:
     """A volume's pyramid, ready to be cut for any budget.
@@ -90,12 +85,16 @@ class ClosedForm:
     degree: int = 0
     scene: Scene | None = None
 
-    def gaussians(self, style: SurfaceStyle = ROUND, values: bool = False) -> Gaussians:
-        """Gaussians of the cells that the moments alone choose; ``values``: those of `tree.value_score`."""
-        score = value_score(self.tree, self.labels) if values else None
-        return self._of(leaves_of(self.tree, select(self.tree, self.budget, score)), style)
+    def gaussians(self, style: SurfaceStyle = ROUND) -> Gaussians:
+        """Gaussians of the cells that the moments alone choose."""
+        return self.gaussians_of(leaves_of(self.tree, select(self.tree, self.budget)), style)
 
-    def _of(self, leaves: Leaves, style: SurfaceStyle) -> Gaussians:
+    def cells_of_values(self) -> Leaves:
+        """Cells for any function: those of `tree.value_score`."""
+        return leaves_of(self.tree, select(self.tree, self.budget, value_score(self.tree, self.labels)))
+
+    def gaussians_of(self, leaves: Leaves, style: SurfaceStyle = ROUND) -> Gaussians:
+        """Gaussians of cells."""
         return self._sharpened(leaves, self._cells(leaves, style))
 
     def _cells(self, leaves: Leaves, style: SurfaceStyle) -> Gaussians:
@@ -121,7 +120,7 @@ class ClosedForm:
         score = scores_by_error(self.tree, ids, errors, score)
         seen = 1 - float(unseen(weights, self.budget).sum()) / max(len(weights), 1)
         if seen > 1 - FEW:
-            return self._of(leaves_of(self.tree, select(self.tree, self.budget, score)), ROUND)
+            return self.gaussians_of(leaves_of(self.tree, select(self.tree, self.budget, score)), ROUND)
         wanted = round(self.budget * min(seen**-SMALLER, 2.0))
         leaves = leaves_of(self.tree, select(self.tree, wanted, score))
         found = self._cells(leaves, ROUND)
@@ -134,13 +133,13 @@ class ClosedForm:
         leaves = leaves_of(self.tree, select(self.tree, start))
         smallest = max(2 * MIN_CELL * self.pixel, 2.0 ** (FINEST + 1) * self.step.min())  # edge of a cell to split
         for done in range(1, REFINE_ROUNDS + 1):
-            gaussians = solve_colors(self._of(leaves, style), cameras, views, rounds=1, rule=rule)
+            gaussians = solve_colors(self.gaussians_of(leaves, style), cameras, views, rounds=1, rule=rule)
             error = image_errors(gaussians, cameras, views, rule)
             room = start + (self.budget - start) * done // REFINE_ROUNDS - len(leaves)
             order = np.argsort(-error, kind="stable")
             order = order[leaves.edge[order].min(axis=1) >= smallest]
             leaves = split(self.tree, leaves, order, room, self.scene, self.seen)
-        return self._of(leaves, style)
+        return self.gaussians_of(leaves, style)
 
 
 def closed_form(

@@ -2,7 +2,8 @@
 
 A base cell is a box of ``2^e`` voxels along each axis (e may be negative). Its moments are integrals of the extinction
 ``tau(trilinear(scalar))`` by midpoint quadrature, each point averaged over the scalar's spread within its own box
-(so that a step function needs no finer points).
+(so that a step function needs no finer points). Of cells of whole voxels, one under whose values the function is
+straight takes one point for eight.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ from vvgt_cli.dvr.layout import BRICK, Optics, Texels, Voxels
 from vvgt_cli.dvr.scene import Scene
 
 FINEST_CUT = -4
-WIDE = 3  # exponent of cells whose voxels get one point of quadrature in place of eight
+POINTS = 2  # of quadrature a voxel and axis
+WIDE = 1  # exponent of cells under whose voxels it is asked where the function is straight
 CHUNK_CELLS, CHUNK_BLOCKS = 1 << 17, 16  # cells of the dense scratch buffer; blocks at least
 MOST_CELLS = 32  # along the edge of a block that is made a cube of cells
 
@@ -59,15 +61,10 @@ def morton(index: np.ndarray) -> np.ndarray:
     return out
 
 
-def points_of(exponent: np.ndarray) -> int:
-    """Points of quadrature a voxel and axis: of wide cells one, which is quicker and less exact."""
-    return 1 if int(exponent.min()) >= WIDE else 2
-
-
 def base_cells(
     scene: Scene,
     exponent: np.ndarray,
-    points_per_voxel: int | None = None,
+    points_per_voxel: int = POINTS,
     progress: Callable[[float], None] | None = None,
 ) -> Cells:
     """Moments of every base cell with extinction (see `Cells`); memory is that of the result plus a fixed scratch.
@@ -76,8 +73,7 @@ def base_cells(
     """
     block, _ = blocks(exponent)
     origins = _active_blocks(scene, block)
-    points = points_per_voxel or points_of(exponent)
-    index, moments = region_cells(Region.whole(scene), origins, exponent, points, progress)
+    index, moments = region_cells(Region.whole(scene), origins, exponent, points_per_voxel, progress)
     return Cells(index, moments, 2.0**exponent * scene.step, exponent)
 
 
@@ -110,7 +106,7 @@ def region_cells(
     region: Region,
     origins: np.ndarray,
     exponent: np.ndarray,
-    points_per_voxel: int,
+    points_per_voxel: int = POINTS,
     progress: Callable[[float], None] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Cells with extinction in the blocks of `blocks` at ``origins`` (n, 3), voxels (x, y, z) of the whole volume.
@@ -121,6 +117,7 @@ def region_cells(
     cell = 2.0**exponent
     block, cells = blocks(exponent)
     points = np.maximum(np.round(cell * points_per_voxel), min(points_per_voxel, 2)).astype(np.int64)
+    whole = region.texels is None and exponent.min() >= WIDE and points_per_voxel == POINTS
     origins = origins[np.argsort(morton(origins // block))]
     chunk = max(int(CHUNK_CELLS // cells.prod()), CHUNK_BLOCKS)
     scratch = np.empty((min(chunk, max(len(origins), 1)), *cells[::-1], MOMENTS))
@@ -130,7 +127,10 @@ def region_cells(
         part = origins[first : first + chunk]
         dense = scratch[: len(part)]
         at = part - region.begin
-        _integrate(region, at, points, cell, dense)
+        if whole:
+            _integrate_voxels(region, at, exponent, dense)
+        else:
+            _integrate(region, at, points, cell, dense)
         counts = np.count_nonzero(dense[..., MASS].reshape(len(part), -1), axis=1)
         rows, local = np.empty((counts.sum(), MOMENTS)), np.empty((counts.sum(), 3), np.int32)
         compact(dense, order, np.cumsum(counts) - counts, rows, local)
@@ -144,14 +144,24 @@ def region_cells(
 
 def _integrate(region: Region, at: np.ndarray, points: np.ndarray, cell: np.ndarray, out: np.ndarray) -> None:
     """`block_moments` by the kernel of the region's kind."""
+    where = region.half, region.step, region.begin
     if region.texels is None:
-        block_moments(
-            region.voxels, region.optics, at, points, cell, region.half, region.step, region.begin, out
-        )  # fmt: skip
+        block_moments(region.voxels, region.optics, at, points, cell, *where, out)
     else:
         from vvgt_cli.closed_form.grid import grid_moments  # loaded for what needs it only
 
-        grid_moments(region.texels, at, points, cell, region.half, region.step, region.begin, out)
+        grid_moments(region.texels, at, points, cell, *where, out)
+
+
+def _integrate_voxels(region: Region, at: np.ndarray, exponent: np.ndarray, out: np.ndarray) -> None:
+    """The same of cells of whole voxels, two points a voxel and axis or what comes to the same."""
+    from vvgt_cli.closed_form.straight import straight_until
+    from vvgt_cli.closed_form.voxelwise import voxel_moments
+
+    straight = straight_until(region.optics)
+    voxel_moments(
+        region.voxels, region.optics, straight, at, exponent, region.half, region.step, region.begin, out
+    )  # fmt: skip
 
 
 def blocks(exponent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -8,11 +8,11 @@ import numpy as np
 
 from vvgt_cli.closed_form.columns import COLOR, MASS, SEEN, SEEN_COLOR
 from vvgt_cli.closed_form.inset import Opaque, inset
-from vvgt_cli.closed_form.opacity import opacity_when_reshaped, peak_opacity
 from vvgt_cli.closed_form.pyramid import principal_axes
 from vvgt_cli.closed_form.tree import Leaves, central
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.constants import MAX_ALPHA
+from vvgt_cli.gaussians.opacity import opacity_when_reshaped, peak_opacity
 
 FLOOR = 0.05  # smallest standard deviation, in the smaller of voxel and cell edge
 TRANSLUCENT_SPREAD = 2.0  # what a cell that its mass fills adds to its second moment; nothing across a sheet

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from vvgt_cli.closed_form.columns import FIRST, MASS
-from vvgt_cli.closed_form.opacity import peak_opacity
 from vvgt_cli.closed_form.shape import make_gaussians, visible_color
 from vvgt_cli.closed_form.tree import Tree
 from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.gaussians.opacity import peak_opacity
 
 
 def uniform_gaussians(tree: Tree, budget: int, pixel: float, seed: int) -> Gaussians:

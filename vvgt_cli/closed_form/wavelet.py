@@ -11,10 +11,10 @@ import functools
 import numpy as np
 
 from vvgt_cli.closed_form.columns import FIRST, MASS
-from vvgt_cli.closed_form.opacity import peak_opacity
 from vvgt_cli.closed_form.shape import make_gaussians, visible_color
 from vvgt_cli.closed_form.tree import Tree, select
 from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.gaussians.opacity import peak_opacity
 
 
 @functools.cache

@@ -14,7 +14,7 @@ from vvgt_cli.cameras.sets import SIZE
 from vvgt_cli.conversion.certify import checked
 from vvgt_cli.conversion.gaussian_files import STDIN, file_rule, layout_of, open_gaussians
 from vvgt_cli.conversion.place import into_box, preview, upright
-from vvgt_cli.conversion.recolored import light_of, under_function
+from vvgt_cli.conversion.recolored import SeveralLooks, light_of, under_function
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.field import Field, Picture, Resident
 from vvgt_cli.field.open import Wanted, automatic, beside, blocked
@@ -178,17 +178,19 @@ def _shown(gaussians: Gaussians, header: PlyHeader, source: Source, request: Sou
     Raises:
         UsageError: values that are looked at as labels, or the other way round.
     """
-    if header.live is None or (request.labels is None and request.tf is None):
+    if header.live is None or (request.labels is None and request.tf is None and not request.layers):
         return gaussians
-    if isinstance(source.tf, LabelTable) != bool(header.live.labels) or len(source.layers) > 1:
-        carried = "labels" if header.live.labels else "values"
+    carried = ["labels" if one.labels else "values" for one in header.live.layers]
+    shown = ["labels" if isinstance(layer.tf, LabelTable) else "values" for layer in source.layers]
+    if carried != shown:
         raise UsageError(
-            f"{source.name}: the Gaussians carry {carried} of one volume; expected the volume under "
-            f"{'--labels' if header.live.labels else '--tf'}, or neither option, to score the look of the file"
+            f"{source.name}: {', '.join(shown)}, but the Gaussians carry {', '.join(carried)}; expected the volume and "
+            "--tf, --labels or --layer as they were converted with, or none of these, to score the look of the file"
         )
+    looks = SeveralLooks(tuple((layer.tf, layer.unit_distance) for layer in source.layers))
     light = light_of(request.light, source.lighting, source.volume.space)
     options = replace(layout_of(header), unit_distance=source.unit_distance, light=light)
-    return under_function(gaussians, header, source.tf, options)
+    return under_function(gaussians, header, looks if header.live.others else source.tf, options)
 
 
 def evaluate(request: EvaluateRequest, console: Console | None = None) -> Evaluation:

@@ -13,6 +13,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from vvgt_cli.cameras.sets import SIZE, pixel_width
 from vvgt_cli.commands.converter import Converter, Failed, Made, Message, Progress, Said
 from vvgt_cli.commands.server import Part
 from vvgt_cli.conversion.gaussian_files import layout_of, open_gaussians
@@ -67,7 +68,7 @@ class Cloud:
     @property
     def live(self) -> bool:
         """Whether they can be shown under any function."""
-        return self.gaussians.live is not None and self.options.live is not None
+        return self.gaussians.live is not None and self.options.live is not None and not self.options.live.others
 
     def file(self, suffix: str) -> Part:
         """As it is saved."""
@@ -98,7 +99,8 @@ class Cloud:
             raise DataError("what is shown carries labels; expected no function")
         lighting = self.options.light if light is None else light_sent(light, self.options)
         table = Table.of_function(tf, facts.lo, facts.hi, distance * scale)
-        found = as_stored(lit(baked(self.gaussians, table), lighting))
+        pixel = pixel_width(self.options.made_for or SIZE)
+        found = as_stored(lit(baked(self.gaussians, table, pixel), lighting))
         facts = replace(facts, function=function_text(tf, facts.lo, facts.hi))
         options = replace(
             self.options, live=facts, certificate=None, unit_distance=distance, unit_distance_label="file",

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from vvgt_cli.conversion.gaussian_files import open_gaussians, write_gaussians
-from vvgt_cli.conversion.recolored import FunctionRequest, placed_function, under_function
+from vvgt_cli.conversion.recolored import FunctionRequest, parse_layer_look, placed_function, under_function
 from vvgt_cli.gaussians.formats import SUFFIXES
 from vvgt_cli.gaussians.outputs import Output, claimed
 from vvgt_cli.look.lighting import LightOptions
@@ -41,7 +41,7 @@ def recolor(request: RecolorRequest, console: Console | None = None) -> None:
     """
     run = Run(console or Console(), ConversionReport("recolor"))
     function = request.function
-    inputs = [request.ply, *(path for path in (function.tf, function.labels) if isinstance(path, str))]
+    inputs = [request.ply, *function.paths()]
     with claimed([Output("-o", request.output, SUFFIXES, splats=True)], inputs, request.overwrite):
         with run.stage("read") as stage:
             gaussians, header = open_gaussians(request.ply)
@@ -60,7 +60,13 @@ def function_of(
     unit_distance: str | None,
     labels: str | None = None,
     light: Mapping[str, Any] | None = None,
+    layers: Sequence[str] = (),
 ) -> FunctionRequest | None:
-    """What options of a command add up to; None where none is given."""
-    found = FunctionRequest(tf, tf_range, unit_distance, labels, LightOptions(**(light or {})))
+    """What options of a command add up to; None where none is given.
+
+    Raises:
+        UsageError: a layer's look that is none.
+    """
+    looks = tuple(map(parse_layer_look, layers))
+    found = FunctionRequest(tf, tf_range, unit_distance, labels, LightOptions(**(light or {})), looks)
     return None if found == FunctionRequest() else found

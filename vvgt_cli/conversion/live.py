@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vvgt_cli.cameras import default_views
+from vvgt_cli.cameras.sets import pixel_width
+from vvgt_cli.closed_form.columns import MASS
 from vvgt_cli.conversion.certify import certified
 from vvgt_cli.conversion.live_labels import carrying_labels, fog_of_labels, label_facts, labels_of
-from vvgt_cli.conversion.place import out_of_box
-from vvgt_cli.conversion.recolored import lit_by, looked_up
+from vvgt_cli.conversion.place import in_frame_of, into_box, out_of_box
+from vvgt_cli.conversion.recolored import Look, SeveralLooks, lit_by, looked_up
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.conversion.result import Conversion
 from vvgt_cli.conversion.stage import Work
@@ -24,9 +25,11 @@ from vvgt_cli.conversion.stages.refinement import SMALLEST
 from vvgt_cli.errors import NothingVisible, UsageError
 from vvgt_cli.field.field import Field
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored
-from vvgt_cli.gaussians.live import LENGTH, SHORTEST, Table, baked, lengths
-from vvgt_cli.gaussians.live_facts import GRADIENT, LiveFacts
+from vvgt_cli.gaussians.live import LENGTH, Table, baked, lengths
+from vvgt_cli.gaussians.live_facts import GRADIENT, NUMBER, LiveFacts
+from vvgt_cli.gaussians.types import together
 from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.look.labels import LabelTable
 from vvgt_cli.look.lighting import Lighting
 from vvgt_cli.score.record import Run
 from vvgt_cli.score.viewing import PREVIEW_VIEWS
@@ -34,6 +37,7 @@ from vvgt_cli.score.views import psnr_note, score_test_views
 from vvgt_cli.volume.types import triple
 
 if TYPE_CHECKING:
+    from vvgt_cli.closed_form import Start
     from vvgt_cli.field.source import Source
 
 
@@ -65,8 +69,7 @@ def refusal(request: ConvertRequest, source: Source) -> str | None:
     """Why there is no live file of a source; None where there is one."""
     try:
         check_live(request)
-        if source.gridded:
-            labels_of(source)
+        check_layers(source)
         in_box(source)
     except UsageError as error:
         return str(error)
@@ -79,42 +82,87 @@ def live_conversion(
     """Place, look up, bake, score where asked to; ``ply`` as of an ordinary conversion.
 
     Raises:
-        UsageError: channels or layers.
+        UsageError: colours, or a light that needs the volume.
         DataError: nothing is visible.
     """
-    from vvgt_cli.look.fog import fog
-
     source, fit = field.source, request.fit
-    tf, lighting = source.tf, in_box(source)
-    if source.gridded:
-        labels = labels_of(source)
-        foggy, facts = fog_of_labels(field, labels), label_facts(source, labels)
-        gaussians = carrying_labels(run, foggy, placed_by(run, foggy, request), labels)
+    lighting, pixel = in_box(source), pixel_width(fit.size)
+    check_layers(source)
+    if len(source.layers) > 1:
+        gaussians, facts = _of_layers(run, request, field)
+        look: Look = SeveralLooks(tuple((layer.tf, layer.unit_distance) for layer in source.layers))
     else:
-        assert isinstance(tf, TransferFunction)
-        foggy, facts = field.shown_by(fog(source.overall, tf)), LiveFacts.of(source.volume, source.overall, tf)
-        gaussians = carrying(run, foggy, placed_by(run, foggy, request))
-    gaussians = wide_enough(gaussians, fit.size)
-    table = looked_up(facts, tf, source.unit_distance * source.volume.unit_frame().scale)
-    gaussians = as_stored(lit(baked(gaussians, table), lighting))
-    psnr = _score(run, request, field, gaussians, lit_by(gaussians, table, lighting)) if scored else None
+        gaussians, facts = _of_one(run, request, field)
+        look = source.tf
+    table = looked_up(facts, look, source.unit_distance, source.volume.unit_frame().scale)
+    gaussians = as_stored(lit(baked(gaussians, table, pixel), lighting))
+    psnr = _score(run, request, field, gaussians, lit_by(gaussians, table, lighting, pixel)) if scored else None
     found = out_of_box(gaussians, source.volume)
     ply = certified(replace(ply, live=facts), run, field, fit, found, request.command, psnr)
     return Conversion(found, run.report, ply, field)
+
+
+def _of_one(run: Run, request: ConvertRequest, field: Field, several: int = 1) -> tuple[Gaussians, LiveFacts]:
+    """Gaussians of one layer, box frame, that carry what is under them; ``several``: layers that share a header."""
+    from vvgt_cli.look.fog import fog
+
+    source = field.source
+    if isinstance(source.tf, LabelTable):
+        labels = labels_of(source)
+        foggy, facts = fog_of_labels(field, labels), label_facts(source, labels)
+        found = carrying_labels(run, foggy, placed_by(run, foggy, request), labels)
+    else:
+        foggy = field.shown_by(fog(source.overall, source.tf))
+        facts = LiveFacts.of(source.volume, source.overall, source.tf, several)
+        found = carrying(run, foggy, placed_by(run, foggy, request))
+    return wide_enough(found, request.fit.size), facts
+
+
+def _of_layers(run: Run, request: ConvertRequest, field: Field) -> tuple[Gaussians, LiveFacts]:
+    """Gaussians of each layer, in the box frame of the first; they share the budget evenly."""
+    source, parts, facts = field.source, [], []
+    count, left, half = len(source.layers), request.fit.max_gaussians, np.array(source.volume.unit_frame().half)
+    for number, layer in enumerate(source.layers):
+        share = replace(request, fit=replace(request.fit, max_gaussians=max(left // (count - number), 1)))
+        run.console.say(f"layer {number} of {count}: {layer.name}")
+        some, said = _of_one(run, share, field.alone(number), count)
+        some = into_box(in_frame_of(out_of_box(some, layer.volume), layer.volume, source.volume), source.volume)
+        some = some.take(np.flatnonzero((np.abs(some.means) <= half + 1e-6).all(axis=1)))
+        assert some.live is not None
+        live = np.zeros((len(some), NUMBER + 1), np.float32)
+        live[:, : some.live.shape[1]] = some.live
+        live[:, NUMBER] = number
+        parts.append(replace(some, live=live))
+        facts.append(replace(said, name=layer.volume.name, distance=layer.unit_distance, dims=source.volume.dims))
+        left -= len(some)
+    first, *others = facts
+    return together(parts), replace(first, others=tuple(others))
+
+
+def check_layers(source: Source) -> None:
+    """Refuse what has neither values nor labels.
+
+    Raises:
+        UsageError: colours of their own.
+    """
+    if any(layer.colors for layer in source.layers):
+        raise UsageError(
+            f"{source.name}: colours, of which a Gaussian cannot carry one value; expected scalars or labels with "
+            "--live: take one component with --component N, or leave out --live"
+        )
 
 
 def _score(run: Run, request: ConvertRequest, field: Field, gaussians: Gaussians, shown: Gaussians) -> float:
     """As `vvgt recolor` shows them under the function (dB, returned), and as other viewers do."""
     from vvgt_cli.dvr import RenderSettings
 
-    fit, tf = request.fit, field.source.tf
+    fit, source = request.fit, field.source
+    name = source.name if len(source.layers) > 1 else source.tf.name
     with run.stage("live look") as stage:
         live = score_test_views(
             field, shown, fit.size, RenderSettings(), rule=fit.rule, perceptual=False, only=PREVIEW_VIEWS
         )
-        stage.note = (
-            f"{psnr_note(live)} under {tf.name} as 'vvgt recolor' shows it; next as other viewers show the file"
-        )
+        stage.note = f"{psnr_note(live)} under {name} as 'vvgt recolor' shows it; next as other viewers show the file"
     work = Work(run, field, fit, gaussians=gaussians)
     for stage_of_scores in (TestViews(request.scored_whole), ViewingConditions()):
         stage_of_scores.run(work)
@@ -149,7 +197,7 @@ def table_of(source: Source) -> Table:
     return Table.of_function(tf, numbers.lo, numbers.hi, source.unit_distance * source.volume.unit_frame().scale)
 
 
-def placed_by(run: Run, field: Field, request: ConvertRequest) -> Gaussians:
+def placed_by(run: Run, field: Field, request: ConvertRequest) -> Start:
     """The closed form of the fog.
 
     Raises:
@@ -163,17 +211,19 @@ def placed_by(run: Run, field: Field, request: ConvertRequest) -> Gaussians:
         if not len(start.gaussians):
             raise NothingVisible(field.source.volume.name, field.source.name)
         stage.note = f"{len(start.gaussians)} Gaussians of what may be shown"
-    return start.gaussians
+    return start
 
 
-def carrying(run: Run, field: Field, gaussians: Gaussians) -> Gaussians:
+def carrying(run: Run, field: Field, start: Start) -> Gaussians:
     """Gaussians of a field's look with the values under them, without those that have none."""
+    assert start.leaves is not None
     with run.stage("values") as stage:
-        values = field.under(gaussians)
+        values = field.under(start.gaussians)
         known = np.flatnonzero(np.isfinite(values).all(axis=1))
-        gaussians, values = gaussians.take(known), values[known]
+        gaussians, values, leaves = start.gaussians.take(known), values[known], start.leaves.take(known)
         tau = table_of(field.source).at(values[:, 0], values[:, 1])[:, 3]
-        live = np.insert(values, LENGTH, lengths(gaussians, tau), axis=1)
+        length = lengths(leaves.moments[:, MASS], tau, leaves.edge.prod(axis=1))
+        live = np.insert(values, LENGTH, length, axis=1)
         span = field.source.overall.hi - field.source.overall.lo
         stage.note = f"mean spread {100 * float(values[:, 1].mean()) / (span or 1):.1f} % of the range"
     return replace(gaussians, live=live, harmonics=None)
@@ -181,10 +231,6 @@ def carrying(run: Run, field: Field, gaussians: Gaussians) -> Gaussians:
 
 def wide_enough(gaussians: Gaussians, size: int) -> Gaussians:
     """None narrower than `SMALLEST` px of the screen: viewers leave such out. Their mass stays."""
-    assert gaussians.live is not None
-    camera = default_views("check", 1, size=size)[0]
-    pixel = float(np.linalg.norm(camera.position)) / camera.fx
-    widening = np.maximum(SMALLEST * pixel / np.exp(gaussians.log_scales.max(axis=1).astype(np.float64)), 1)
-    live = gaussians.live.copy()
-    live[:, 2] = np.maximum(live[:, 2] / widening**2, SHORTEST)
-    return replace(gaussians, log_scales=gaussians.log_scales + np.log(widening)[:, None], live=live)
+    least = np.log(SMALLEST * pixel_width(size))
+    widening = np.maximum(least - gaussians.log_scales.max(axis=1).astype(np.float64), 0)
+    return replace(gaussians, log_scales=gaussians.log_scales + widening[:, None])

@@ -6,7 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.closed_form import Start
+from vvgt_cli.closed_form.columns import MASS
+from vvgt_cli.errors import DataError
 from vvgt_cli.field.field import Field
 from vvgt_cli.field.source import Source
 from vvgt_cli.gaussians import Gaussians
@@ -25,15 +27,10 @@ def labels_of(source: Source) -> tuple[Label, ...]:
     """The labels of a source that Gaussians can belong to: hidden ones too, which other tables may show.
 
     Raises:
-        UsageError: anything but one label map.
         DataError: too many.
     """
     table = source.tf
-    if len(source.layers) > 1 or not isinstance(table, LabelTable):
-        raise UsageError(
-            f"{source.name}: channels, layers, colours, or segments that overlap; --live expects one scalar field, or "
-            "one label map: choose it with --component N, or leave out --live"
-        )
+    assert isinstance(table, LabelTable)
     found = tuple(label for label in table.labels if label.number != 0 or label.opacity > 0)
     if len(found) > MOST_LABELS:
         raise DataError(f"{source.name}: {len(found)} labels; expected at most {MOST_LABELS} with --live")
@@ -54,18 +51,20 @@ def fog_of_labels(field: Field, labels: tuple[Label, ...]) -> Field:
     return field.labelled_by([label_fog(layer.tf, {e.number: voxels.get(float(e.number), 0) for e in labels})])
 
 
-def carrying_labels(run: Run, field: Field, gaussians: Gaussians, labels: tuple[Label, ...]) -> Gaussians:
+def carrying_labels(run: Run, field: Field, start: Start, labels: tuple[Label, ...]) -> Gaussians:
     """Gaussians of the fog with the rows of their labels, without those that lie in none."""
     from vvgt_cli.closed_form.labelled import labelled
 
+    assert start.leaves is not None
     frame, source = field.source.volume.unit_frame(), field.source
     with run.stage("labels") as stage:
         maps = [(source.layers[0].volume, [label.number for label in labels])]
-        owner, gradient = labelled(gaussians, maps, np.array(frame.half), np.array(frame.step))
+        owner, gradient = labelled(start.gaussians, maps, np.array(frame.half), np.array(frame.step))
         known = np.flatnonzero(owner >= 0)
-        gaussians, owner, gradient = gaussians.take(known), owner[known], gradient[known]
-        tau = float(extinction(np.array(THIN), 2 * UNIT_SHARE))
-        length = lengths(gaussians, np.full(len(gaussians), tau))
+        gaussians, leaves = start.gaussians.take(known), start.leaves.take(known)
+        owner, gradient = owner[known], gradient[known]
+        tau = extinction(np.full(len(known), THIN), 2 * UNIT_SHARE)
+        length = lengths(leaves.moments[:, MASS], tau, leaves.edge.prod(axis=1))
         live = np.column_stack([np.zeros((len(owner), 2)), length, gradient, owner])
         stage.note = f"{len(np.unique(owner))} of {len(labels)} labels have Gaussians"
     return replace(gaussians, live=live, harmonics=None)

@@ -11,7 +11,8 @@ import numpy as np
 from vvgt_cli.cameras import Camera
 from vvgt_cli.cameras.boxed import render_in_box
 from vvgt_cli.gaussians import Gaussians, PlyOptions
-from vvgt_cli.gaussians.frames import transform, upright_matrix
+from vvgt_cli.gaussians.frames import rescale, transform, upright_matrix
+from vvgt_cli.gaussians.live import LENGTH
 from vvgt_cli.gaussians.rules import INRIA, Rule
 from vvgt_cli.volume import Volume
 from vvgt_cli.volume.space import shear_text, world_axis
@@ -49,6 +50,18 @@ def into_box(gaussians: Gaussians, volume: Volume) -> Gaussians:
     axes = volume.axes
     straight = np.array_equal(axes, np.eye(3))
     return gaussians if straight else transform(gaussians, np.linalg.inv(axes))
+
+
+def in_frame_of(gaussians: Gaussians, volume: Volume, other: Volume) -> Gaussians:
+    """Gaussians of a volume's unit frame in that of another; the lengths that they carry, too."""
+    own, its = volume.unit_frame(), other.unit_frame()
+    before, factor = own.scale * (np.array(own.centre) - np.array(its.centre)), its.scale / own.scale
+    moved = rescale(gaussians, factor, before, np.zeros(3))
+    if gaussians.live is None:
+        return moved
+    live = gaussians.live.copy()
+    live[:, LENGTH] *= factor
+    return replace(moved, live=live)
 
 
 def placed(ply: PlyOptions, volume: Volume) -> PlyOptions:

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from vvgt_cli.cameras.sets import SIZE, pixel_width
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions
+from vvgt_cli.gaussians.constants import MIN_ALPHA
 from vvgt_cli.gaussians.header import FileFacts
-from vvgt_cli.gaussians.live import Palette, Table, seen_under, shown_by
+from vvgt_cli.gaussians.live import Looks, Palette, Several, Table, seen_under, shown_by
 from vvgt_cli.gaussians.live_facts import GRADIENT, LiveFacts
+from vvgt_cli.gaussians.ply import opacity
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.labels import LabelTable, distinct
 from vvgt_cli.look.lighting import Lighting, LightOptions
@@ -27,6 +32,7 @@ class FunctionRequest:
         unit_distance: a length, "paraview", "mean-spacing", or None: the function's own, else "paraview".
         labels: table of labels, its file, or "auto", of a file that carries labels; None: that which the file has.
         light: what falls on it; without options what the function's file says, else what the file was made under.
+        layers: of a file of several layers or channels: looks of some of them; the others keep that which the file has.
     """
 
     tf: str | TransferFunction | None = None
@@ -34,11 +40,57 @@ class FunctionRequest:
     unit_distance: str | None = None
     labels: str | LabelTable | None = None
     light: LightOptions = field(default_factory=LightOptions)
+    layers: tuple[LayerLook, ...] = ()
+
+    def paths(self) -> list[str]:
+        """What of it is read from files."""
+        given = [self.tf, self.labels, *(part for one in self.layers for part in (one.tf, one.labels))]
+        return [path for path in given if isinstance(path, str) and path != "auto"]
 
 
-def under_function(
-    gaussians: Gaussians, facts: FileFacts, tf: TransferFunction | LabelTable, options: PlyOptions
-) -> Gaussians:
+@dataclass(frozen=True)
+class LayerLook:
+    """The look of one of several layers; attributes as of `FunctionRequest`.
+
+    Attributes:
+        layer: its number or name, or a part of the name that no other has.
+    """
+
+    layer: str
+    tf: str | TransferFunction | None = None
+    labels: str | LabelTable | None = None
+    unit_distance: str | None = None
+
+
+@dataclass(frozen=True)
+class SeveralLooks:
+    """What each of several layers is shown under, with the world length that its opacity is per."""
+
+    parts: tuple[tuple[TransferFunction | LabelTable, float], ...]
+
+    @property
+    def name(self) -> str:
+        """Of all of them."""
+        return " + ".join(tf.name for tf, _ in self.parts)
+
+
+Look = TransferFunction | LabelTable | SeveralLooks
+
+
+def parse_layer_look(text: str) -> LayerLook:
+    """``LAYER[,tf=TF][,labels=TABLE][,distance=D]``.
+
+    Raises:
+        UsageError: a key that is none, or no look.
+    """
+    name, *rest = re.split(r",(?=[a-z]+=)", text)
+    given = dict(part.split("=", 1) for part in rest if "=" in part)
+    if not name or not rest or set(given) - {"tf", "labels", "distance"} or not all(given.values()):
+        raise UsageError(f"--layer {text}: expected LAYER,tf=TF or LAYER,labels=TABLE, and perhaps distance=LENGTH")
+    return LayerLook(name, given.get("tf"), given.get("labels"), given.get("distance"))
+
+
+def under_function(gaussians: Gaussians, facts: FileFacts, tf: Look, options: PlyOptions) -> Gaussians:
     """What Gaussians that carry values are under a function on data values (or labels under a table) and the light of
     ``options``, unit frame.
 
@@ -48,66 +100,158 @@ def under_function(
     assert facts.live is not None
     assert facts.scale is not None
     assert options.unit_distance is not None
-    table = looked_up(facts.live, tf, options.unit_distance * facts.scale)
-    found = lit_by(gaussians, table, options.light)
+    table = looked_up(facts.live, tf, options.unit_distance, facts.scale)
+    found = lit_by(gaussians, table, options.light, pixel_width(options.made_for or SIZE))
     if not len(found):
         raise DataError(f"{tf.name}: not one of {len(gaussians)} Gaussians is visible; try another function")
     return found
 
 
-def looked_up(facts: LiveFacts, tf: TransferFunction | LabelTable, unit_distance: float) -> Table | Palette:
-    """A function, or a table of labels, as Gaussians look it up; opacity per unit-frame length.
+def looked_up(facts: LiveFacts, tf: Look, distance: float, scale: float) -> Looks:
+    """A function, or a table of labels, as Gaussians look it up.
+
+    Args:
+        facts: of what Gaussians carry.
+        tf: the look.
+        distance: world length that opacity is per; several looks have their own.
+        scale: unit-frame lengths per world length.
 
     Raises:
         DataError: a label without an entry.
     """
+    if isinstance(tf, SeveralLooks):
+        tables = [looked_up(one, part, own, scale) for one, (part, own) in zip(facts.layers, tf.parts, strict=True)]
+        return Several(tuple(table for table in tables if not isinstance(table, Several)))
     if not isinstance(tf, LabelTable):
-        return Table.of_function(tf, facts.lo, facts.hi, unit_distance)
+        return Table.of_function(tf, facts.lo, facts.hi, distance * scale)
     entries = {label.number: label for label in tf.labels}
-    return Palette.of_labels([entries[label.number] for label in facts.labels], unit_distance)
+    return Palette.of_labels([entries[label.number] for label in facts.labels], distance * scale)
 
 
-def lit_by(gaussians: Gaussians, table: Table | Palette, lighting: Lighting | None) -> Gaussians:
-    """An ordinary cloud: what is visible of Gaussians that carry values, under a light in their frame."""
-    seen = gaussians.take(seen_under(gaussians, table))
+def lit_by(gaussians: Gaussians, table: Looks, lighting: Lighting | None, pixel: float) -> Gaussians:
+    """An ordinary cloud: what is visible of Gaussians that carry values, under a light in their frame.
+
+    ``pixel``: as for `shown_by`.
+    """
+    seen = gaussians.take(seen_under(gaussians, table, pixel))
     assert seen.live is not None
-    found = shown_by(seen, table)
+    found = shown_by(seen, table, pixel)
+    there = np.flatnonzero(opacity(found) >= MIN_ALPHA)
+    found, gradient = found.take(there), seen.live[there, GRADIENT]
     if lighting is None:
         return found
     from vvgt_cli.closed_form.relit import relit
 
-    return relit(found, seen.live[:, GRADIENT], lighting)
+    return relit(found, gradient, lighting)
 
 
-def placed_function(
-    name: str, header: PlyHeader | PlyOptions, function: FunctionRequest
-) -> tuple[TransferFunction | LabelTable, PlyOptions]:
-    """A function on the data values of a file, or a table of its labels, and how a file of its look is laid out.
+def placed_function(name: str, header: PlyHeader | PlyOptions, function: FunctionRequest) -> tuple[Look, PlyOptions]:
+    """A function on the data values of a file, a table of its labels, or of several layers a look each; and how a file
+    of that look is laid out.
 
     Raises:
         DataError: a file without values, a function that is none, or shows nothing of the range of values.
         UsageError: a range or a distance that is none; a function of labels, or a table of values.
     """
-    from vvgt_cli.conversion.gaussian_files import layout_of
-    from vvgt_cli.look import unit_distance
-
     if header.live is None:
         raise DataError(
             f"{name}: its Gaussians carry no values, so that they have one look alone; expected a .ply of 'vvgt "
             "convert --live'"
         )
-    tf, shown = _table(name, header.live, function) if header.live.labels else _function(name, header.live, function)
-    given, asked = function.labels if header.live.labels else function.tf, function.unit_distance
-    if given is None and asked is None and header.unit_distance is not None:
-        asked = repr(header.unit_distance)
-    distance, label = unit_distance(asked, volume_of(name, header), tf if isinstance(tf, TransferFunction) else None)
+    if header.live.others:
+        return _several(name, header, function)
+    if function.layers:
+        first = function.layers[0].layer
+        raise UsageError(f"{name}: one layer; expected --tf or --labels in the place of --layer {first}")
+    tf, shown, distance, label = _placed(name, header, header.live, function, header.unit_distance)
     light = light_of(function.light, tf.lighting or header.light, header.space)
+    return shown, _laid(header, shown, distance, label, light)
+
+
+def _placed(
+    name: str, header: PlyHeader | PlyOptions, facts: LiveFacts, function: FunctionRequest, recorded: float | None
+) -> tuple[TransferFunction | LabelTable, TransferFunction | LabelTable, float, str]:
+    """The look of one layer as it was given, and on its values; what opacity is per, and how that was chosen.
+
+    ``recorded``: what it is per in the file.
+    """
+    from vvgt_cli.look import unit_distance
+
+    tf, shown = _table(name, facts, function) if facts.labels else _function(name, facts, function)
+    given, asked = function.labels if facts.labels else function.tf, function.unit_distance
+    if given is None and asked is None and recorded is not None:
+        asked = repr(recorded)
+    return tf, shown, *unit_distance(asked, volume_of(name, header), tf if isinstance(tf, TransferFunction) else None)
+
+
+def _laid(
+    header: PlyHeader | PlyOptions, shown: Look, distance: float, label: str, light: Lighting | None
+) -> PlyOptions:
+    """How a file of a look is laid out."""
+    from vvgt_cli.conversion.gaussian_files import layout_of
+
     old = header if isinstance(header, PlyOptions) else layout_of(header)
-    options = replace(
+    return replace(
         old, live=None, certificate=None, unit_distance=distance, unit_distance_label=label, light=light,
-        sh_degree=None, function=shown.name,
+        sh_degree=None, function=shown.name, optics=None,
     )  # fmt: skip
-    return shown, options
+
+
+def _several(name: str, header: PlyHeader | PlyOptions, function: FunctionRequest) -> tuple[SeveralLooks, PlyOptions]:
+    """Of a file of several layers: the looks that are given, the others as in the file."""
+    assert header.live is not None
+    layers = header.live.layers
+    wrong = {"--tf": function.tf, "--labels": function.labels, "--opacity-unit-distance": function.unit_distance}
+    wrong["--tf-range"] = None if function.tf_range == "data" else function.tf_range
+    if given := [option for option, value in wrong.items() if value is not None]:
+        raise UsageError(
+            f"{name}: {len(layers)} layers, each with a look of its own, as --layer LAYER,tf=TF; leave out "
+            f"{' and '.join(given)}; {_listed(layers)}"
+        )
+    asked = {number_of(name, layers, one.layer): one for one in function.layers}
+    placed = []
+    for k, layer in enumerate(layers):
+        one = asked.get(k, LayerLook(""))
+        request = FunctionRequest(one.tf, "data", one.unit_distance, one.labels)
+        placed.append(_placed(f"{name}, layer {k}", header, layer, request, layer.distance))
+    presets = [tf.lighting for tf, *_ in placed if tf.lighting is not None]
+    light = light_of(function.light, presets[0] if presets else header.light, header.space)
+    looks = SeveralLooks(tuple((shown, distance) for _, shown, distance, _ in placed))
+    return looks, _laid(header, looks, *placed[0][2:], light)
+
+
+def number_of(name: str, layers: Sequence[LiveFacts], asked: str) -> int:
+    """Of the layer that is asked for by number, name, or a part of its name.
+
+    Raises:
+        UsageError: none of that name, or several.
+    """
+    if asked.isdecimal() and int(asked) < len(layers):
+        return int(asked)
+    exact = [k for k, layer in enumerate(layers) if layer.name == asked]
+    found = exact or [k for k, layer in enumerate(layers) if asked.lower() in layer.name.lower()]
+    if len(found) != 1:
+        raise UsageError(f"{name}: --layer {asked}: {len(found) or 'no'} layers of that name; {_listed(layers)}")
+    return found[0]
+
+
+def layer_look(
+    header: PlyHeader | PlyOptions, key: int | str, look: str | TransferFunction | LabelTable
+) -> LayerLook:  # fmt: skip
+    """The look of a layer, a table where it carries labels and a function where it carries values.
+
+    Raises:
+        UsageError: no such layer.
+    """
+    layers = () if header.live is None else header.live.layers
+    labels = bool(layers) and bool(layers[number_of("result", layers, str(key))].labels)
+    if isinstance(look, TransferFunction) or (isinstance(look, str) and not labels):
+        return LayerLook(str(key), tf=look)
+    return LayerLook(str(key), labels=look)
+
+
+def _listed(layers: Sequence[LiveFacts]) -> str:
+    return "expected " + ", ".join(f"{k} ({layer.name})" for k, layer in enumerate(layers))
 
 
 def _function(name: str, facts: LiveFacts, function: FunctionRequest) -> tuple[TransferFunction, TransferFunction]:

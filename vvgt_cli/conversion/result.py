@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -105,6 +105,7 @@ class Result:
     def recolor(
         self, look: str | TransferFunction | None = None, *, range: str = "data", unit_distance: str | None = None,
         labels: str | LabelTable | None = None, light: LightOptions | None = None,
+        layers: Mapping[int | str, str | TransferFunction | LabelTable] | None = None,
     ) -> Result:  # fmt: skip
         """What Gaussians that carry values (``convert(..., live=True)``) are under another function: ``vvgt recolor``.
 
@@ -114,14 +115,17 @@ class Result:
             unit_distance: world length that opacity is per, "paraview" or "mean-spacing"; None: the function's own.
             labels: of a label map's: a table, its file, or "auto"; None: that which they have.
             light: what falls on them; None: what the function's file says, else what they were made under.
+            layers: of several layers or channels: functions, or tables of labels, by number or name; the others keep
+                that which they have.
 
         Raises:
             DataError: they carry none, or the function shows nothing of them.
             UsageError: a range, a distance or a light that is none.
         """
-        from vvgt_cli.conversion.recolored import FunctionRequest, placed_function, under_function
+        from vvgt_cli.conversion.recolored import FunctionRequest, layer_look, placed_function, under_function
 
-        asked = FunctionRequest(look, range, unit_distance, labels, light or LightOptions())
+        others = tuple(layer_look(self.ply, key, one) for key, one in (layers or {}).items())
+        asked = FunctionRequest(look, range, unit_distance, labels, light or LightOptions(), others)
         tf, options = placed_function("result", self.ply, asked)
         found = under_function(self.gaussians, self.ply, tf, options)
         return Result(found, ConversionReport("recolor"), options)

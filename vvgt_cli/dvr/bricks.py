@@ -12,25 +12,33 @@ from vvgt_cli.look.tables import Optics
 MAX_DISTANCE = 15  # bricks; a longer leap saves nothing measurable
 
 
-@kernel("V f8:4", parallel=True)
-def _ranges(values: np.ndarray, out: np.ndarray) -> None:
-    """Finite range over each brick of ``values`` (nz, ny, nx) and its upper neighbours; ``out`` (bz, by, bx, 2)."""
+@kernel("V f8 f8 f8:4", parallel=True)
+def _ranges(values: np.ndarray, least: float, most: float, out: np.ndarray) -> None:
+    """Finite range over each brick of ``values`` (nz, ny, nx) and its upper neighbours; ``out`` (bz, by, bx, 2).
+
+    The values' type goes from ``least`` to ``most``.
+    """
     nz, ny, nx = values.shape
     bz, by, bx = out.shape[:3]
     for flat in nb.prange(bz * by):
         z0, y0 = (flat // by) * BRICK, (flat % by) * BRICK
+        low, high, ends = np.empty(nx, values.dtype), np.empty(nx, values.dtype), np.empty(2, values.dtype)
+        ends[0], ends[1] = least, most
+        low[:], high[:] = ends[1], ends[0]
+        for z in range(z0, min(z0 + BRICK + 1, nz)):
+            for y in range(y0, min(y0 + BRICK + 1, ny)):
+                row = values[z, y]
+                for x in range(nx):  # whole rows: so many at once as the processor can
+                    v = row[x]
+                    low[x] = v if (v < low[x]) & (v >= ends[0]) else low[x]
+                    high[x] = v if (v > high[x]) & (v <= ends[1]) else high[x]
         for b in range(bx):
             lo, hi = np.inf, -np.inf
-            for z in range(z0, min(z0 + BRICK + 1, nz)):
-                for y in range(y0, min(y0 + BRICK + 1, ny)):
-                    for x in range(b * BRICK, min(b * BRICK + BRICK + 1, nx)):
-                        v = np.float64(values[z, y, x])
-                        if v < lo and v > -np.inf:
-                            lo = v
-                        if v > hi and v < np.inf:
-                            hi = v
-            out[z0 // BRICK, y0 // BRICK, b, 0] = lo
-            out[z0 // BRICK, y0 // BRICK, b, 1] = hi
+            for x in range(b * BRICK, min(b * BRICK + BRICK + 1, nx)):
+                lo, hi = min(lo, np.float64(low[x])), max(hi, np.float64(high[x]))
+            none = lo > hi  # a type's own ends, where no voxel is finite
+            out[z0 // BRICK, y0 // BRICK, b, 0] = np.inf if none else lo
+            out[z0 // BRICK, y0 // BRICK, b, 1] = -np.inf if none else hi
 
 
 def brick_ranges(values: np.ndarray) -> np.ndarray:
@@ -40,7 +48,8 @@ def brick_ranges(values: np.ndarray) -> np.ndarray:
     """
     shape = tuple(-(-n // BRICK) for n in values.shape)
     out = np.empty((*shape, 2))
-    _ranges(values, out)
+    about = np.finfo(values.dtype) if values.dtype.kind == "f" else np.iinfo(values.dtype)
+    _ranges(values, float(about.min), float(about.max), out)
     return out
 
 

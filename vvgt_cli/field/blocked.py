@@ -11,6 +11,7 @@ import numpy as np
 
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.cameras.blocks import Blocks
+from vvgt_cli.cameras.sets import pixel_width
 from vvgt_cli.dvr.layout import Light
 from vvgt_cli.dvr.render import Box as Frame
 from vvgt_cli.dvr.render import Rays, RenderSettings, for_thin
@@ -98,6 +99,7 @@ class Blocked:
         key: digest of all that it depends on.
         pictures: that are there, or are expected; by what they show.
         grid: of its cells, once they are there.
+        single: one of several layers: its source, what reads it, and about how many of its voxels are visible.
     """
 
     source: Source
@@ -108,6 +110,7 @@ class Blocked:
     key: str
     pictures: dict[str, tuple[Picture, np.ndarray | None]] = field(default_factory=dict)
     grid: CellGrid | None = None
+    single: Callable[[int], tuple[Source, Reader, float]] | None = None
 
     @cached_property
     def frame(self) -> Frame:
@@ -152,7 +155,7 @@ class Blocked:
 
     def cells(self, size: int, budget: int, most: int | None = None) -> CellBlocks:
         """The pass over base cells for images of ``size`` px; at most ``most`` cells, None: as many as memory holds."""
-        from vvgt_cli.closed_form.closed_form import finest_level, level_within, most_cells, pixel_width
+        from vvgt_cli.closed_form.closed_form import finest_level, level_within, most_cells
         from vvgt_cli.closed_form.moments import blocks, exponents
         from vvgt_cli.field.grid import TILE_BITS
 
@@ -329,6 +332,11 @@ class Blocked:
         reader = replace(self.reader, layers=layers, optics=Optics.linear(top))
         own = [(e.number, e.color, e.opacity) for table in tables for e in table.labels]
         return self._beside(source, reader, reader.visible(), digest(self.key, own, source.unit_distance))
+
+    def alone(self, number: int) -> Blocked:
+        """See `Field`: as `shown_by`."""
+        assert self.single is not None
+        return self._beside(*self.single(number), digest(self.key, number))
 
     def _beside(self, source: Source, reader: Reader, visible: float, key: str) -> Blocked:
         """The field of another look, whose parts lie in a folder of their own, within that of this one."""

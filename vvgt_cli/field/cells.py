@@ -110,7 +110,7 @@ class CellBlocks(Blockwise):
             return np.empty((0, 3), np.int32), np.empty((0, MOMENTS))
         half, step = np.array(grid.half), np.array(grid.step)
         region = Region(box.voxels, box.optics, half, step, box.begin.astype(np.float64), box.texels)
-        return region_cells(region, lo + which * edge, exponent, grid.points)
+        return region_cells(region, lo + which * edge, exponent)
 
     def _normals(self, box: Box, moments: np.ndarray) -> np.ndarray:
         """(n, 3) at the centroids of cells."""

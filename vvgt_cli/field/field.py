@@ -85,6 +85,9 @@ class Field(Protocol):
             UsageError: not labels alone.
         """
 
+    def alone(self, number: int) -> Field:
+        """One of several layers as a field of its own, on its own grid, unlit."""
+
     def digest(self) -> str:
         """Of the volume's content."""
 
@@ -168,6 +171,13 @@ class Resident:
     def labelled_by(self, tables: Sequence[LabelTable]) -> Resident:
         """See `Field`."""
         source = self.source.labelled_by(tables)
+        return Resident(source, source.scene())
+
+    def alone(self, number: int) -> Resident:
+        """See `Field`."""
+        from vvgt_cli.volume import statistics
+
+        source = self.source.alone(number, statistics(self.source.layers[number].volume))
         return Resident(source, source.scene())
 
     def digest(self) -> str:

@@ -52,7 +52,6 @@ class CellGrid:
         blocks: that are read, of whole tiles.
         exponent: a cell's edges are 2^exponent voxels, (x, y, z).
         half, step: of the volume, as `vvgt_cli.dvr.Scene` has them.
-        points: of quadrature a voxel and axis.
         march: the cells that visibility is marched through are 2^march times as wide.
         field: those of the field of opacity, 2^field times.
         bits: a tile has 2^bits base cells along its edge.
@@ -62,7 +61,6 @@ class CellGrid:
     exponent: Triple
     half: tuple[float, float, float]
     step: tuple[float, float, float]
-    points: int
     march: int
     field: int
     bits: int = TILE_BITS

@@ -119,7 +119,13 @@ def blocked(run: Run, request: SourceRequest, options: BlockOptions, parts: Part
             reader, visible = _reader(source, access)
             shared = f", {runner.workers} workers" if runner.workers > 1 else ""
             stage.note = f"{describe_source(source)}; in blocks of {edge}{shared}"
-        yield Blocked(source, reader, do, edge, visible, digest(str(sorted(settings.items()))))
+        key = digest(str(sorted(settings.items())))
+
+        def single(number: int) -> tuple[Source, Reader, float]:
+            one = source.alone(number, access.statistics(source.layers[number].volume))
+            return one, *_reader(one, access)
+
+        yield Blocked(source, reader, do, edge, visible, key, single=single)
 
 
 def _edge(request: SourceRequest, options: BlockOptions) -> int:
@@ -187,7 +193,8 @@ def _reader(source: Source, access: Counted) -> tuple[Reader, float]:
 
 def _at_level(read: ReadOptions, path: str, options: BlockOptions, size: int) -> tuple[ReadOptions, str | None]:
     """The level of a file of several: as asked for, else the coarsest whose voxels the screen cannot tell apart."""
-    from vvgt_cli.closed_form.closed_form import MIN_CELL, pixel_width
+    from vvgt_cli.cameras.sets import pixel_width
+    from vvgt_cli.closed_form.closed_form import MIN_CELL
     from vvgt_cli.volume.levels import level_shapes
 
     shapes = level_shapes(path, read)

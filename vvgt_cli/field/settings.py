@@ -105,7 +105,7 @@ def cell_grid(volume: Volume, exponent: np.ndarray, edge: int, march: int, least
     Blocks are of whole tiles, pieces of rays, and cubes of ``least`` voxels: all of powers of two.
     """
     from vvgt_cli.closed_form.inset import field_coarsening
-    from vvgt_cli.closed_form.moments import blocks, points_of
+    from vvgt_cli.closed_form.moments import blocks
 
     frame = volume.unit_frame()
     step = np.array(frame.step)
@@ -115,5 +115,4 @@ def cell_grid(volume: Volume, exponent: np.ndarray, edge: int, march: int, least
     whole = np.maximum(tile, max(piece_edge(volume.dims), least))
     x, y, z = (int(t * max(w // t, 1)) for t, w in zip(whole, shape_of(volume, edge), strict=True))
     i, j, k = (int(e) for e in exponent)
-    points = points_of(exponent)
-    return CellGrid(Boxes(volume.dims, (x, y, z)), (i, j, k), frame.half, frame.step, points, march, field, bits)
+    return CellGrid(Boxes(volume.dims, (x, y, z)), (i, j, k), frame.half, frame.step, march, field, bits)

@@ -107,7 +107,7 @@ class Source:
         statistics: of the first layer's volume.
         lighting: what falls on it, None for nothing.
         layout: the volume's, where it is known.
-        series: as ``statistics``, of all frames of the series that it is one of; None: it is of none.
+        series: as ``statistics``, of all frames of the series that it is one of, a layer each; else none.
     """
 
     layers: tuple[Layer, ...]
@@ -115,12 +115,17 @@ class Source:
     statistics: Statistics
     lighting: Lighting | None = None
     layout: PreparedVolume | None = None
-    series: Statistics | None = None
+    series: tuple[Statistics, ...] = ()
 
     @property
     def overall(self) -> Statistics:
         """What frames of a series share: of all of them, else its own."""
-        return self.series or self.statistics
+        return self.series[0] if self.series else self.statistics
+
+    def alone(self, number: int, statistics: Statistics) -> Source:
+        """One of the layers as a source of its own, unlit; ``statistics`` are its volume's."""
+        layer = self.layers[number]
+        return Source((layer,), layer.volume, statistics, series=self.series[number : number + 1])
 
     @property
     def gridded(self) -> bool:
@@ -297,8 +302,8 @@ def load_all(
             )
         check_visible(shown, numbers)
         layer = Layer(volume, shown, *unit_distance(request.unit_distance, volume, tf or shown))
-        series = request.statistics[0] if request.statistics else None
-        sources.append(Source((layer,), volume, numbers, lighting, content.layout if held else None, series))
+        layout = content.layout if held else None
+        sources.append(Source((layer,), volume, numbers, lighting, layout, tuple(request.statistics)))
     return sources
 
 
@@ -313,7 +318,8 @@ def _layered(
         inner = access.open(other.volume, other.read)
         layers += layers_of(inner, other.tf, other.labels, other.tf_range, other.unit_distance, access=access)
     grid = common_grid(layers, content.stored)
-    return Source(tuple(layers), grid, access.statistics(layers[0].volume), lighting)
+    numbers = access.statistics(layers[0].volume)
+    return Source(tuple(layers), grid, numbers, lighting, series=tuple(request.statistics))
 
 
 def describe_source(source: Source) -> str:

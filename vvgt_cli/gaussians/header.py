@@ -197,7 +197,7 @@ def parse_header(content: bytes, name: str) -> PlyHeader:
 def _provenance(comments: list[str], name: str, columns: list[str]) -> dict[str, Any]:
     """`FileFacts` and the version, from our own comments."""
     found: dict[str, Any] = {}
-    live: dict[str, Any] = {}
+    lives: list[dict[str, Any]] = [{}]
     for comment in comments:
         words = comment.split()
         if len(words) < 2 or words[0] != "vvgt":
@@ -205,6 +205,9 @@ def _provenance(comments: list[str], name: str, columns: list[str]) -> dict[str,
         try:
             if words[1] == WORD:
                 more = one_comment(words[2:])
+                if "name" in more and lives[-1]:
+                    lives.append({})
+                live = lives[-1]
                 live |= more | {"labels": live.get("labels", ()) + more["labels"]} if "labels" in more else more
             elif words[1] == CERTIFICATE:
                 found[CERTIFICATE] = Certificate.of(comment.split(None, 2)[2])
@@ -214,7 +217,7 @@ def _provenance(comments: list[str], name: str, columns: list[str]) -> dict[str,
             raise DataError(f"{name}: comment {comment[:80]!r} is not one that vvgt writes") from None
     if found.get("frame") == "world" and "scale" not in found:
         raise DataError(f"{name}: in world space, but its comments do not hold scale and centre")
-    return found | {"live": live_facts(live, columns)}
+    return found | {"live": live_facts(lives, columns)}
 
 
 def _one_comment(words: list[str]) -> dict[str, Any]:

@@ -1,11 +1,12 @@
 """Gaussians that carry what the volume is under them, and their look under any function (docs/live.md).
 
-Of each Gaussian the field's mean value m and standard deviation s under it, a length L, and the direction of the mean
-gradient, as long as the share r of s that the gradient explains. Under a function of extinction e and colour c the
-values under it are taken as a normal law N(m, s): its extinction E is the mean of e over it, its colour the mean of c
-weighted by e. Where the value z = (v - m) / s lies along the gradient, there lies the Gaussian: weighted by e, z has a
-mean and a variance, by which the Gaussian moves along the gradient and becomes thinner there, k times as wide. Its
-opacity is 1 - exp(-E L / sqrt(k)). The means are a table over m and s.
+Of each Gaussian the field's mean value m and standard deviation s under it, the edge L of a cube as large as what it
+stands for, and the direction of the mean gradient, as long as the share r of s that the gradient explains. Under a
+function of extinction e and colour c the values under it are taken as a normal law N(m, s): its extinction E is the
+mean of e over it, its colour the mean of c weighted by e. Where the value z = (v - m) / s lies along the gradient,
+there lies the Gaussian: weighted by e, z has a mean and a variance, by which the Gaussian moves along the gradient and
+becomes thinner there. What is opaque, 1 - exp(-E L), is smaller than fog, which overlaps. The opacity is that of the
+optical mass E L^3 (`vvgt_cli.gaussians.opacity`). The means are a table over m and s.
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ import numpy as np
 
 from vvgt_cli.gaussians.constants import MIN_ALPHA
 from vvgt_cli.gaussians.frames import factored, rotations
-from vvgt_cli.gaussians.live_facts import GRADIENT, ROW
+from vvgt_cli.gaussians.live_facts import GRADIENT, NUMBER, ROW
+from vvgt_cli.gaussians.opacity import mean_opacity, projected_areas
 from vvgt_cli.gaussians.types import Gaussians
 from vvgt_cli.look.labels import Label
 from vvgt_cli.look.tables import extinction
@@ -29,7 +31,9 @@ WIDEST = 0.25  # share of the range of values: the largest spread of a table
 BEND = 1.5  # power of the column by which spreads grow: small ones lie closer
 NODES = 33  # of the normal law, of equal weight
 FINE = 1 << 14  # values over the range that a function is tabulated at
-SHORTEST, LONGEST = 1e-4, 1e2  # unit-frame lengths that L is kept within
+SHORTEST, LONGEST = 1e-5, 2.0  # unit-frame lengths that L is kept within
+CLEAR = MIN_ALPHA / 8  # depth below which nothing is seen, however thin
+SHARP, FLAT = 0.4, 0.6  # of the variance along the shortest axis, and along the others, of what is opaque
 OPAQUE = 1 - 1e-6  # largest opacity that a look has, and one less the smallest: logits are finite
 THINNEST = 0.15  # times as wide as before, at least, along the gradient
 TAU, FIRST, SECOND = 3, 4, 5  # of a table's channels, after r, g and b
@@ -105,6 +109,24 @@ class Palette:
         return found
 
 
+@dataclass(frozen=True)
+class Several:
+    """Of several layers the table of each, by its number."""
+
+    tables: tuple[Table | Palette, ...]
+
+    def of(self, live: np.ndarray) -> np.ndarray:
+        """(K, 6) `sums` of what Gaussians carry."""
+        found = np.zeros((len(live), 6))
+        for number, table in enumerate(self.tables):
+            own = np.flatnonzero(live[:, NUMBER] == number)
+            found[own] = table.of(live[own])
+        return found
+
+
+Looks = Table | Palette | Several
+
+
 def law_nodes() -> np.ndarray:
     """(NODES,) quantiles of the normal law, stretched to its variance."""
     law = NormalDist()
@@ -119,31 +141,41 @@ def spreads() -> np.ndarray:
     return found
 
 
-def lengths(gaussians: Gaussians, tau: np.ndarray) -> np.ndarray:
-    """L (K,) of Gaussians whose opacity stands for the mean extinction ``tau`` (K,), unit-frame lengths."""
-    depth = np.logaddexp(0, gaussians.opacity_logits.astype(np.float64))  # -log(1 - opacity)
-    found: np.ndarray = (depth / np.maximum(tau, 1e-30)).clip(SHORTEST, LONGEST)
+def lengths(mass: np.ndarray, tau: np.ndarray, most: np.ndarray) -> np.ndarray:
+    """L (K,) of Gaussians of optical ``mass`` (K,) where the mean extinction is ``tau`` (K,), unit-frame lengths.
+
+    ``most`` (K,): volume that they stand for at most.
+    """
+    found: np.ndarray = np.cbrt(np.minimum(mass / np.maximum(tau, 1e-30), most)).clip(SHORTEST, LONGEST)
     return found
 
 
-def baked(gaussians: Gaussians, table: Table | Palette) -> Gaussians:
-    """Gaussians that carry values, with the colours and opacities of a function, where they are: for other viewers."""
+def baked(gaussians: Gaussians, table: Looks, pixel: float = 0.0) -> Gaussians:
+    """Gaussians that carry values, with the colours and opacities of a function, where they are: for other viewers.
+
+    ``pixel``: as for `shown_by`.
+    """
     assert gaussians.live is not None
     sums = table.of(gaussians.live)
     colors = sums[:, :TAU] / np.maximum(sums[:, TAU, None], 1e-30)
-    logits = _logits(sums[:, TAU] * gaussians.live[:, LENGTH].astype(np.float64))
+    variances = np.exp(2 * gaussians.log_scales.astype(np.float64))
+    logits = _logits(opacities(sums[:, TAU] * _volumes(gaussians), variances, pixel))
     return replace(gaussians, opacity_logits=logits, colors=colors, harmonics=None)
 
 
-def seen_under(gaussians: Gaussians, table: Table | Palette) -> np.ndarray:
-    """Numbers of those that a function does not hide, ascending."""
+def seen_under(gaussians: Gaussians, table: Looks, pixel: float = 0.0) -> np.ndarray:
+    """Numbers of those that a function may show, ascending: all but some that nobody sees."""
     assert gaussians.live is not None
-    tau = table.of(gaussians.live)[:, TAU]
-    return np.flatnonzero(-np.expm1(-tau * gaussians.live[:, LENGTH] / THINNEST**0.5) >= MIN_ALPHA)
+    least = np.exp(2 * gaussians.log_scales.astype(np.float64)) * THINNEST**2 * SHARP
+    mass = table.of(gaussians.live)[:, TAU] * _volumes(gaussians)
+    return np.flatnonzero(mass > CLEAR * projected_areas(least, pixel).min(axis=1))
 
 
-def shown_by(gaussians: Gaussians, table: Table | Palette) -> Gaussians:
-    """An ordinary cloud, unlit: what Gaussians that carry values are under a function, all of them."""
+def shown_by(gaussians: Gaussians, table: Looks, pixel: float = 0.0) -> Gaussians:
+    """An ordinary cloud, unlit: what Gaussians that carry values are under a function, all of them.
+
+    ``pixel``: a pixel's width at the volume's centre, unit frame, of the screen that they are made for.
+    """
     assert gaussians.live is not None
     if not len(gaussians):
         return replace(gaussians, live=None, harmonics=None)
@@ -157,13 +189,31 @@ def shown_by(gaussians: Gaussians, table: Table | Palette) -> Gaussians:
     axes *= np.exp(gaussians.log_scales.astype(np.float64))[:, None, :]
     arm = np.einsum("kij,kj->ki", axes, along)
     quaternions, log_scales = factored(axes + (arm * (thin - 1)[:, None])[:, :, None] * along[:, None, :])
+    variances = np.exp(2 * log_scales)
+    opaque = -np.expm1(-tau * gaussians.live[:, LENGTH])[:, None]
+    shortest = np.arange(3) == variances.argmin(axis=1)[:, None]
+    variances *= 1 - opaque * (1 - np.where(shortest, SHARP, FLAT))
     return Gaussians(
         gaussians.means + arm * (explained * first)[:, None],
-        log_scales,
+        0.5 * np.log(variances),
         quaternions,
-        _logits(tau * gaussians.live[:, LENGTH] / np.sqrt(thin)),
+        _logits(opacities(tau * _volumes(gaussians), variances, pixel)),
         sums[:, :TAU] / tau[:, None],
     )
+
+
+def opacities(mass: np.ndarray, variances: np.ndarray, pixel: float) -> np.ndarray:
+    """Peak alpha (n,) as `peak_opacity`'s, but that what has hardly any mass (n,) is not seen."""
+    areas = projected_areas(variances, pixel)
+    depths = mass[:, None] / areas
+    return mean_opacity(depths + np.minimum(depths, MIN_ALPHA), areas)
+
+
+def _volumes(gaussians: Gaussians) -> np.ndarray:
+    """(K,) unit-frame volumes that their extinction counts for."""
+    assert gaussians.live is not None
+    found: np.ndarray = gaussians.live[:, LENGTH].astype(np.float64) ** 3
+    return found
 
 
 def directions(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:
@@ -176,8 +226,8 @@ def directions(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:
     return along, np.minimum(np.linalg.norm(gradient, axis=1), 1)
 
 
-def _logits(depth: np.ndarray) -> np.ndarray:
-    """Of opacity 1 - exp(-depth) (K,)."""
-    opacity = (-np.expm1(-depth)).clip(1 - OPAQUE, OPAQUE)
-    found: np.ndarray = np.log(opacity) - np.log1p(-opacity)
+def _logits(opacity: np.ndarray) -> np.ndarray:
+    """Of opacities (K,), finite."""
+    kept = opacity.clip(1 - OPAQUE, OPAQUE)
+    found: np.ndarray = np.log(kept) - np.log1p(-kept)
     return found

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -21,8 +21,12 @@ from vvgt_cli.volume import Statistics, Volume
 from vvgt_cli.volume.stats import BINS, edges_of
 from vvgt_cli.volume.types import triple
 
-COLUMNS, NORMAL, LABEL = ("value", "spread", "length"), ("nx", "ny", "nz"), "label"
-CARRIED, ROW = slice(0, 3), 6  # of what Gaussians carry: columns of their own, and the row of a label
+COLUMNS, NORMAL, LABEL, LAYER = ("value", "spread", "length"), ("nx", "ny", "nz"), "label", "layer"
+CARRIED, ROW, NUMBER = (
+    slice(0, 3),
+    6,
+    7,
+)  # of what Gaussians carry: own columns, row of a label, number of a layer
 GRADIENT = slice(3, 6)  # of what Gaussians carry: in the columns of normals
 LONGEST_NAME = 80  # characters of a label's
 SAMPLED = 64  # nodes of a function that the header has no other way of holding
@@ -42,6 +46,9 @@ class LiveFacts:
         unit: of the values, "" where it is not known.
         function: minimal JSON of the function that colours and opacities are of.
         labels: of a label map, in the order of the rows that Gaussians carry; then there are no values and no function.
+        name: of one of several layers: its volume's.
+        distance: of one of several layers: world length that its opacity is per.
+        others: of several layers, or channels, those after the first.
     """
 
     lo: float
@@ -51,13 +58,27 @@ class LiveFacts:
     unit: str = ""
     function: str = ""
     labels: tuple[Label, ...] = ()
+    name: str = ""
+    distance: float | None = None
+    others: tuple[LiveFacts, ...] = ()
+
+    @property
+    def layers(self) -> tuple[LiveFacts, ...]:
+        """Each of several layers alone; of a file of one this one."""
+        return (replace(self, others=()), *self.others)
+
+    @property
+    def most_labels(self) -> int:
+        """Labels of the layer that has most, 0 where all carry values."""
+        return max(len(layer.labels) for layer in self.layers)
 
     @classmethod
-    def of(cls, volume: Volume, numbers: Statistics, tf: TransferFunction) -> LiveFacts:
-        """Of a volume, its statistics, and the function that is baked in, on data values."""
+    def of(cls, volume: Volume, numbers: Statistics, tf: TransferFunction, several: int = 1) -> LiveFacts:
+        """Of a volume, its statistics, and its function on data values; ``several``: layers in a file."""
         counts = tuple(int(n) for n in numbers.histogram)
         unit = "HU" if volume.hounsfield else ""
-        return cls(numbers.lo, numbers.hi, volume.dims, counts, unit, function_text(tf, numbers.lo, numbers.hi))
+        lo, hi = numbers.lo, numbers.hi
+        return cls(lo, hi, volume.dims, counts, unit, function_text(tf, lo, hi, several))
 
     def statistics(self) -> Statistics:
         """As functions are put on the data by."""
@@ -79,6 +100,8 @@ class LiveFacts:
 
     def lines(self) -> list[str]:
         """Comments; `parsed` reads them."""
+        if self.others:
+            return [line for layer in self.layers for line in (layer.title(), *layer.lines())]
         dims = " ".join(map(str, self.dims))
         unit = ["comment vvgt live unit " + self.unit] if self.unit else []
         values = f"comment vvgt live values {self.lo!r} {self.hi!r} dims {dims}"
@@ -91,12 +114,19 @@ class LiveFacts:
             "comment vvgt live function " + self.function,
         ]
 
+    def title(self) -> str:
+        """The comment that begins what a header says of one of several layers."""
+        return f"comment vvgt live layer {self.distance!r} {json.dumps(self.name[:LONGEST_NAME])}"
 
-def function_text(tf: TransferFunction, lo: float, hi: float) -> str:
-    """A function on data values as one line of minimal JSON; of what that cannot hold, `SAMPLED` nodes."""
+
+def function_text(tf: TransferFunction, lo: float, hi: float, several: int = 1) -> str:
+    """A function on data values as one line of minimal JSON; of what that cannot hold, `SAMPLED` nodes.
+
+    ``several``: functions that a header has room for.
+    """
     try:
         text = json.dumps(json.loads(to_text(tf, "minimal")))
-        if len(text) <= LONGEST:
+        if len(text) <= LONGEST // several:
             return text
     except DataError:
         pass
@@ -123,6 +153,11 @@ def one_comment(words: Sequence[str]) -> dict[str, Any]:
         if words[3] != "dims" or len(dims) != 3 or min(dims) < 1 or not -math.inf < lo <= hi < math.inf:
             raise ValueError(words)
         return {"lo": lo, "hi": hi, "dims": dims}
+    if words[0] == "layer":
+        name, distance = json.loads(" ".join(words[2:])), float(words[1])
+        if not isinstance(name, str) or not 0 < distance < math.inf:
+            raise ValueError(words)
+        return {"name": name, "distance": distance}
     if words[0] == "unit":
         return {"unit": " ".join(words[1:])}
     if words[0] == "histogram":
@@ -144,8 +179,11 @@ def one_comment(words: Sequence[str]) -> dict[str, Any]:
     raise ValueError(words)
 
 
-def live_facts(found: Mapping[str, Any], columns: Sequence[str]) -> LiveFacts | None:
-    """Facts of the comments of a file with these columns; None where one or the other is missing."""
-    whole = set(COLUMNS) <= set(columns) and "lo" in found
-    whole = whole and (LABEL in columns if "labels" in found else "histogram" in found)
-    return LiveFacts(**found) if whole else None
+def live_facts(found: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> LiveFacts | None:
+    """Facts of the comments of a file with these columns, a mapping a layer; None where one or the other is missing."""
+    whole = set(COLUMNS) <= set(columns) and all("lo" in one for one in found)
+    whole = whole and all(LABEL in columns if "labels" in one else "histogram" in one for one in found)
+    if not whole or (len(found) > 1 and LAYER not in columns):
+        return None
+    first, *others = [LiveFacts(**one) for one in found]
+    return replace(first, others=tuple(others))

@@ -14,7 +14,7 @@ from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import seekable
 from vvgt_cli.gaussians.frames import rescale, turn, up_matrix
 from vvgt_cli.gaussians.header import FileFacts, PlyHeader, comment_lines, parse_header, rest_names
-from vvgt_cli.gaussians.live_facts import CARRIED, COLUMNS, GRADIENT, LABEL, NORMAL, ROW, LiveFacts
+from vvgt_cli.gaussians.live_facts import CARRIED, COLUMNS, GRADIENT, LABEL, LAYER, NORMAL, NUMBER, ROW, LiveFacts
 from vvgt_cli.gaussians.types import HARMONICS, SH_C0, Gaussians
 from vvgt_cli.volume.space import axis_facts
 
@@ -139,24 +139,42 @@ def ply_rows(gaussians: Gaussians, options: PlyOptions, normals: np.ndarray | No
     rows[:, end - 4 : end] = placed.quaternions
     if placed.live is not None:
         rows[:, 3:6], rows[:, end:] = placed.live[:, GRADIENT], placed.live[:, CARRIED]
-        if options.live is not None and options.live.labels:
-            return _with_labels(rows, placed.live[:, ROW], len(options.live.labels))
+        if options.live is not None:
+            return _with_numbers(rows, placed.live, options.live)
     return rows
 
 
-def _with_labels(rows: np.ndarray, labels: np.ndarray, count: int) -> np.ndarray:
-    """Rows (K,) of floats and the row of a label in a byte, or two of more than 256."""
-    out = np.empty(len(rows), [("floats", "<f4", rows.shape[1]), (LABEL, "u1" if count <= 256 else "<u2")])
-    out["floats"], out[LABEL] = rows, labels
+def _with_numbers(rows: np.ndarray, live: np.ndarray, facts: LiveFacts) -> np.ndarray:
+    """Rows (K,) of floats and of what `_numbers` names; the floats alone where it names nothing."""
+    extra = _numbers(facts)
+    if not extra:
+        return rows
+    out = np.empty(len(rows), [("floats", "<f4", rows.shape[1]), *((name, kind) for name, _, kind, _ in extra)])
+    out["floats"] = rows
+    for name, _, _, column in extra:
+        out[name] = live[:, column]
     return out
+
+
+def _numbers(facts: LiveFacts) -> list[tuple[str, str, str, int]]:
+    """Name and type of columns of whole numbers, in the file and in memory, and which of what Gaussians carry they are.
+
+    The row of a label takes a byte, or two of more than 256; the number of a layer one.
+    """
+    labels, found = facts.most_labels, []
+    if labels:
+        found.append((LABEL, *(("uchar", "u1") if labels <= 256 else ("ushort", "<u2")), ROW))
+    if facts.others:
+        found.append((LAYER, "uchar", "u1", NUMBER))
+    return found
 
 
 def ply_header(count: int, degree: int, options: PlyOptions, live: bool = False) -> bytes:
     """The header of a file of ``count`` Gaussians with harmonics of ``degree``; ``live``: they carry values."""
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]  # some loaders count lines
     lines += [f"property float {name}" for name in property_names(degree, live)]
-    if live and options.live is not None and options.live.labels:
-        lines.append(f"property {'uchar' if len(options.live.labels) <= 256 else 'ushort'} {LABEL}")
+    if live and options.live is not None:
+        lines += [f"property {kind} {name}" for name, kind, _, _ in _numbers(options.live)]
     lines += [*(comment_lines(options) if options.comments else []), "end_header", ""]
     return "\n".join(lines).encode("ascii")
 
@@ -234,9 +252,18 @@ def _values(header: PlyHeader, columns: Callable[..., np.ndarray]) -> np.ndarray
     """
     if header.live is None:
         return None
-    found = columns(*COLUMNS, *NORMAL, *([LABEL] if header.live.labels else []))
-    if header.live.labels and found[:, ROW].max(initial=0) >= len(header.live.labels):
-        raise DataError(f"a label of row {found[:, ROW].max():g}; expected fewer than {len(header.live.labels)}")
+    facts, numbers = header.live, _numbers(header.live)
+    found = columns(*COLUMNS, *NORMAL, *(name for name, *_ in numbers))
+    if facts.others and not facts.most_labels:
+        found = np.insert(found, ROW, 0, axis=1)
+    layer = found[:, NUMBER].astype(np.int64) if facts.others else np.zeros(len(found), np.int64)
+    if layer.max(initial=0) >= len(facts.layers):
+        raise DataError(f"a layer of number {layer.max()}; expected fewer than {len(facts.layers)}")
+    if facts.most_labels:
+        most = np.array([len(one.labels) or 1 for one in facts.layers])[layer]
+        wrong = np.flatnonzero(found[:, ROW] >= most)
+        if len(wrong):
+            raise DataError(f"a label of row {found[wrong[0], ROW]:g}; expected fewer than {most[wrong[0]]}")
     if (found[:, 1] < 0).any() or (found[:, 2] <= 0).any():
         raise DataError("spreads below 0, or lengths that are not above it; expected the columns that vvgt writes")
     return found
@@ -265,6 +292,15 @@ def opacity(gaussians: Gaussians) -> np.ndarray:
 def live_summary(gaussians: Gaussians, facts: LiveFacts) -> dict[str, object]:
     """What `describe` says of values that Gaussians carry."""
     assert gaussians.live is not None
+    if facts.others:
+        told_of: list[dict[str, object]] = []
+        for k, layer in enumerate(facts.layers):
+            own = gaussians.take(np.flatnonzero(gaussians.live[:, NUMBER] == k))
+            told = {"labels": len(layer.labels)} if layer.labels else {
+                "values": [layer.lo, layer.hi], "function": layer.baked().get("name", ""),
+            }  # fmt: skip
+            told_of.append({"layer": k, "name": layer.name, "gaussians": len(own), **told})
+        return {"live_layers": told_of}
     if facts.labels:
         counts = np.bincount(gaussians.live[:, ROW].astype(np.int64), minlength=len(facts.labels)).tolist()
         rows = zip(facts.labels, counts, strict=True)

@@ -27,7 +27,8 @@ class Gaussians:
             15 coefficients as `vvgt_cli.gaussians.harmonics.basis` orders them; None: the same from everywhere.
         live: (K, 6) what they can be shown by under any function (`vvgt_cli.gaussians.live`): mean and spread of the
             data value under each, its length in the unit frame, and the direction of the gradient, as long as the share
-            of the spread that it explains; (K, 7) of a label map: last the row of the label; None: one look.
+            of the spread that it explains; (K, 7) of a label map: then the row of the label; (K, 8) of
+            several layers: last the number of the layer; None: one look.
 
     Raises:
         DataError: wrong shapes, or a value that is not finite.
@@ -47,7 +48,7 @@ class Gaussians:
         if self.harmonics is not None:
             shapes["harmonics"] = [(count, terms, 3) for terms in HARMONICS.values() if terms]
         if self.live is not None:
-            shapes["live"] = [(count, 6), (count, 7)]
+            shapes["live"] = [(count, n) for n in (6, 7, 8)]
         for field, expected in shapes.items():
             array = np.ascontiguousarray(getattr(self, field), dtype=np.float32)
             if array.shape not in expected:

@@ -8,6 +8,7 @@ SHADE = ("vvgt_cli.closed_form.lit:_shade", "vvgt_cli.closed_form.lit:point_norm
 SHADOWS = ("vvgt_cli.dvr.shadows:mean_transmittance", "vvgt_cli.dvr.shadows:cell_extinction")
 MARCH = "vvgt_cli.closed_form.visibility:march"
 BLOCK_MOMENTS, COMPACT = "vvgt_cli.closed_form.quadrature:block_moments", "vvgt_cli.closed_form.quadrature:compact"
+VOXEL_MOMENTS = "vvgt_cli.closed_form.voxelwise:voxel_moments"  # of cells wider than voxels
 MORTON, MIX = "vvgt_cli.closed_form.pyramid:morton_codes", "vvgt_cli.closed_form.sharpen:mix_neighbours"
 FRAME_STEPS, REGRESS = "vvgt_cli.refine.steps:own_frame", "vvgt_cli.refine.steps:regress"
 PAIR_SUMS, STANDARD = "vvgt_cli.splat.backward:moments", "vvgt_cli.splat.backward:standard"
@@ -84,6 +85,7 @@ ALL = (
     *SEGMENTS.values(),
     *LIVE,
     BLOCK_RANGES,
+    VOXEL_MOMENTS,
     *COUNT_WHOLE,
     *COUNT_REAL,
     "vvgt_cli.volume.slc_kernel:decode_plane",

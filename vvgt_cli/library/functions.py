@@ -256,7 +256,7 @@ def evaluate(
 
 def recolor(
     ply: PathLike, look: FunctionLike | None = None, *, range: str = "data", unit_distance: str | float | None = None,
-    labels: LabelsLike | None = None, light: LightLike = None,
+    labels: LabelsLike | None = None, light: LightLike = None, layers: Mapping[int | str, Any] | None = None,
 ) -> Result:  # fmt: skip
     """A live ``.ply`` under another function, without its volume: ``vvgt recolor``.
 
@@ -266,6 +266,7 @@ def recolor(
         range, unit_distance: as of `Result.recolor`.
         labels: of a label map's file, a table as of `Look`; None: the file's own.
         light: as of `Look`; None: what the function's file says, else what the file was made under.
+        layers: of a file of several layers or channels: functions, or tables of labels, by number or name.
 
     Returns:
         An ordinary cloud.
@@ -281,8 +282,9 @@ def recolor(
     result = Result(gaussians, ConversionReport("recolor"), layout_of(header))
     distance = None if unit_distance is None else str(unit_distance)
     return result.recolor(
-        function_of(look), range=range, unit_distance=distance, labels=labels_of(labels), light=light_of(light)
-    )
+        function_of(look), range=range, unit_distance=distance, labels=labels_of(labels), light=light_of(light),
+        layers=layers,
+    )  # fmt: skip
 
 
 def optimize(

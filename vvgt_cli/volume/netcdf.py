@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -12,14 +14,19 @@ from vvgt_cli.volume.hdf5 import MAGIC, MOST_LISTED
 from vvgt_cli.volume.headers import printable
 from vvgt_cli.volume.labelled import Axis, axis, labelled_volume
 from vvgt_cli.volume.libraries import library_errors, need
+from vvgt_cli.volume.minc import is_minc
 from vvgt_cli.volume.netcdf3 import check_header
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import Reader, register, volume_name
 from vvgt_cli.volume.types import Volume
 
+_TURN = Lock()  # the library is not for several threads
+
 
 def read_netcdf(path: Path, options: ReadOptions) -> Volume:
     """Read one variable of a NetCDF file, on the axes that its coordinate variables describe.
+
+    With ``options.stored`` its values stay in the file, and are read box by box.
 
     Raises:
         DataError: netCDF4 is not installed, no variable of numbers, a damaged file.
@@ -39,9 +46,28 @@ def read_netcdf(path: Path, options: ReadOptions) -> Volume:
         source = f"{path}:{variable.name}"
         axes = [_axis(variable, name, size) for name, size in zip(variable.dimensions, variable.shape, strict=True)]
         name = f"{volume_name(path)}:{variable.name}"
-        return labelled_volume(
-            lambda index: variable[index], np.dtype(variable.dtype), axes, attributes, options, source, name
-        )
+        where = f"{variable.group().path.rstrip('/')}/{variable.name}"
+        by_box = options.stored and options.dims is None and options.component != "magnitude"
+        read = partial(_part, path, where) if by_box else lambda index: variable[index]
+        chunks = _chunks(variable) if by_box else None
+        return labelled_volume(read, np.dtype(variable.dtype), axes, attributes, options, source, name, chunks)
+
+
+def _part(path: Path, where: str, index: tuple[Any, ...]) -> np.ndarray:
+    """A part of a variable, of a file that is open no longer than that."""
+    import netCDF4
+
+    with _TURN, netCDF4.Dataset(str(path), "r") as file:
+        file.set_auto_maskandscale(False)
+        return np.asarray(file[where][index])
+
+
+def _chunks(variable: Any) -> list[int]:
+    """Values along each axis of what the file packs together; of plain values a slice."""
+    found = variable.chunking()
+    if isinstance(found, list | tuple):
+        return [int(n) for n in found]
+    return [1] * (len(variable.shape) - 2) + list(variable.shape[-2:])
 
 
 def _choose(file: Any, wanted: str | None, path: Path) -> Any:
@@ -88,7 +114,7 @@ def _axis(variable: Any, name: str, size: int) -> Axis:
 
 
 def _sniff(head: bytes) -> bool:
-    other = b"floating_point_word_size" in head or b"MINC standard" in head  # Exodus, MINC 1
+    other = b"floating_point_word_size" in head or is_minc(head)  # Exodus, MINC 1
     classic = head[:4] in (b"CDF\x01", b"CDF\x02", b"CDF\x05") and not other
     return classic or (head.startswith(MAGIC) and b"_NCProperties" in head)
 

@@ -8,12 +8,49 @@ from __future__ import annotations
 
 import math
 import mmap
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from vvgt_cli.errors import DataError
+from vvgt_cli.volume.blocks import load_block
 
 _DIMENSION, _VARIABLE, _ATTRIBUTE = 10, 11, 12
-_BYTES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 4, 6: 8, 7: 1, 8: 2, 9: 4, 10: 8, 11: 8}  # by type
+_TYPES = {1: "i1", 2: "S1", 3: ">i2", 4: ">i4", 5: ">f4", 6: ">f8", 7: "u1", 8: ">u2", 9: ">u4", 10: ">i8", 11: ">u8"}
+
+
+@dataclass(frozen=True)
+class Variable:
+    """A variable of a classic file.
+
+    Attributes:
+        dims: names of its dimensions, slowest first.
+        shape: values along them; of one without an end, the records that there are.
+        dtype: of the values.
+        begin: byte of the first.
+        endless: whether the first dimension has no end: its records lie `step` bytes apart.
+        attributes: numbers as arrays, text.
+        step: bytes of a record of all variables.
+    """
+
+    dims: tuple[str, ...]
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    begin: int
+    endless: bool
+    attributes: dict[str, Any]
+    step: int = 0
+
+    def mapped(self, path: Path) -> np.ndarray:
+        """The values, mapped."""
+        if not self.endless:
+            return load_block(path, self.dtype, self.shape, offset=self.begin)
+        inner = np.empty(self.shape[1:], np.uint8).strides  # of bytes: a record is in one piece
+        strides = (self.step, *(n * self.dtype.itemsize for n in inner))
+        whole = load_block(path, np.dtype(np.uint8), (path.stat().st_size,))
+        return np.ndarray(self.shape, self.dtype, whole, self.begin, strides)
 
 
 class _Header:
@@ -62,22 +99,30 @@ class _Header:
             raise self.bad(f"has the tag {found} where {tag} was expected")
         return n
 
-    def kind(self) -> int:
-        """Bytes of a value of the type that follows."""
+    def kind(self) -> np.dtype:
+        """The type that follows."""
         found = self.number(4)
-        if found not in _BYTES:
+        if found not in _TYPES:
             raise self.bad(f"has values of type {found}")
-        return _BYTES[found]
+        return np.dtype(_TYPES[found])
 
-    def attributes(self) -> None:
-        names = set()
+    def attributes(self) -> dict[str, Any]:
+        found: dict[str, Any] = {}
         for _ in range(self.items(_ATTRIBUTE)):
-            names.add(self.name())
-            self.skip(self.kind() * self.count())
+            name, kind, n, begin = self.name(), self.kind(), self.count(), self.at
+            self.skip(kind.itemsize * n)
+            data = self.data[begin : begin + kind.itemsize * n]
+            text = kind.kind == "S"
+            found[_plain(name)] = _plain(data) if text else np.frombuffer(data, kind)
+        return found
 
 
-def check_header(path: Path) -> None:
-    """See that a classic file's header and the values it declares lie in the file.
+def _plain(data: bytes) -> str:
+    return data.decode("utf-8", "replace").rstrip("\0")
+
+
+def check_header(path: Path) -> dict[str, Variable]:
+    """See that a classic file's header and the values it declares lie in the file; its variables by name.
 
     Raises:
         DataError: they do not.
@@ -85,29 +130,41 @@ def check_header(path: Path) -> None:
     with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         header = _Header(data, path)
         records = header.number(header.wide)
-        sizes = []
+        sizes: list[tuple[str, int]] = []
         for _ in range(header.items(_DIMENSION)):
-            header.name()
-            sizes.append(header.number(header.wide))
-        if any(n < 0 for n in sizes) or sizes.count(0) > 1:
-            raise header.bad(f"has dimensions of sizes {sizes[:9]}")
+            name = _plain(header.name())
+            sizes.append((name, header.number(header.wide)))
+        lengths = [n for _, n in sizes]
+        if any(n < 0 for n in lengths) or lengths.count(0) > 1:
+            raise header.bad(f"has dimensions of sizes {lengths[:9]}")
         header.attributes()
+        found = {}
         for _ in range(header.items(_VARIABLE)):
-            _variable(header, sizes, records)
+            name = _plain(header.name())
+            found[name] = _variable(header, sizes, records)
+    return _with_steps(found)
 
 
-def _variable(header: _Header, sizes: list[int], records: int) -> None:
-    header.name()
+def _variable(header: _Header, sizes: list[tuple[str, int]], records: int) -> Variable:
     along = [header.number(header.wide) for _ in range(header.count())]
-    if any(not 0 <= k < len(sizes) for k in along) or 0 in [sizes[k] for k in along[1:]]:
+    if any(not 0 <= k < len(sizes) for k in along) or 0 in [sizes[k][1] for k in along[1:]]:
         raise header.bad(f"has a variable along dimensions {along[:9]} of {len(sizes)}")
-    header.attributes()
-    width = header.kind()
+    attributes = header.attributes()
+    kind = header.kind()
     header.number(header.wide)  # vsize, which may be wrong and is redundant
     begin = header.number(header.offset)
-    need = width * math.prod(sizes[k] for k in along if sizes[k])
-    unlimited = bool(along) and sizes[along[0]] == 0
-    if not 0 <= begin <= len(header.data) or (begin + need > len(header.data) and not (unlimited and records == 0)):
+    need = kind.itemsize * math.prod(sizes[k][1] for k in along if sizes[k][1])
+    endless = bool(along) and sizes[along[0]][1] == 0
+    if not 0 <= begin <= len(header.data) or (begin + need > len(header.data) and not (endless and records == 0)):
         raise header.bad(f"places {need} bytes of values at {begin} of {len(header.data)}")
-    if unlimited and records > 0 and need * records > len(header.data):
+    if endless and records > 0 and need * records > len(header.data):
         raise header.bad(f"declares {records} records of {need} bytes")
+    shape = tuple(sizes[k][1] or max(records, 0) for k in along)
+    return Variable(tuple(sizes[k][0] for k in along), shape, kind, begin, endless, attributes)
+
+
+def _with_steps(found: dict[str, Variable]) -> dict[str, Variable]:
+    """Variables with the bytes between their records, each padded to four where there are several."""
+    sizes = [v.dtype.itemsize * math.prod(v.shape[1:]) for v in found.values() if v.endless]
+    step = sizes[0] if len(sizes) == 1 else sum(-(-n // 4) * 4 for n in sizes)
+    return {name: replace(v, step=step) if v.endless else v for name, v in found.items()}

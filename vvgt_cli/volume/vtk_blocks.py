@@ -63,7 +63,7 @@ def check_blocks(path: Path, root: dict[str, str], encoding: str, data_start: in
         if array.attributes.get("format") == "appended":
             start = data_start + int(array.attributes.get("offset", "0"))
             words = (
-                _appended(path, start, word, encoding == "base64") if 0 <= data_start <= start else np.zeros(0, word)
+                block_table(path, start, word, encoding == "base64") if 0 <= data_start <= start else np.zeros(0, word)
             )
         else:
             words = _decode(array.text[: array.wanted], word)
@@ -118,7 +118,13 @@ def _words(data: bytes, word: np.dtype) -> np.ndarray:
     return np.frombuffer(data[: len(data) // word.itemsize * word.itemsize], word)
 
 
-def _appended(path: Path, start: int, word: np.dtype, coded: bool) -> np.ndarray:
+def table_bytes(words: int, word: np.dtype, coded: bool) -> int:
+    """Bytes of the file that so many words before the blocks take."""
+    return 4 * -(-words * word.itemsize // 3) if coded else words * word.itemsize
+
+
+def block_table(path: Path, start: int, word: np.dtype, coded: bool) -> np.ndarray:
+    """The words before the blocks of an array in the appended data, those that are there."""
     size = path.stat().st_size
     with open(path, "rb") as file:
         file.seek(start)

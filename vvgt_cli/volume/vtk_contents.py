@@ -16,8 +16,9 @@ from vvgt_cli.volume.vtk_grids import arrays_of, check_legacy_grid, check_xml_gr
 from vvgt_cli.volume.vtk_index import INDEX, SINGLE, Index, files_of, read_index
 from vvgt_cli.volume.vtk_leaves import Leaf, arrays_in, leaves_of
 from vvgt_cli.volume.vtk_legacy import is_legacy
+from vvgt_cli.volume.vtk_messages import quiet_vtk
 from vvgt_cli.volume.vtk_programs import HDF5, PROGRAMS, read_program
-from vvgt_cli.volume.vtk_xml import GRIDS, INDEXES, quiet_vtk, xml_kind
+from vvgt_cli.volume.vtk_xml import GRIDS, INDEXES, xml_kind
 
 HEAD = 4096
 LISTED = 50  # blocks and steps

@@ -17,7 +17,7 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import load_block, parse_numbers, tokens
 from vvgt_cli.volume.components import ArrayInfo, choose_array, select_component
-from vvgt_cli.volume.headers import unit_rows
+from vvgt_cli.volume.headers import printable, unit_rows
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import Reader, register, volume_name
 from vvgt_cli.volume.types import Volume
@@ -99,8 +99,8 @@ class Parser:
         kind = self.words() or ["nothing"]
         if kind[-1].upper() not in self.KINDS:
             raise DataError(
-                f"{self.path}: a legacy VTK file with dataset {kind[-1]}; expected {' or '.join(self.KINDS)}; "
-                "resample it first (ParaView: Resample To Image) and save it as .vti"
+                f"{self.path}: a legacy VTK file with dataset {printable(kind[-1][:40])}; expected "
+                f"{' or '.join(self.KINDS)}; resample it first (ParaView: Resample To Image) and save it as .vti"
             )
         while (words := self.words()) is not None:
             self.section(words[0].upper(), words)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
+from dataclasses import replace
 from pathlib import Path
 from threading import Lock
 from typing import Any
@@ -79,7 +80,7 @@ class _Pieces:
     """
 
     def __init__(self, found: Scan, info: ArrayInfo, options: ReadOptions, path: Path) -> None:
-        self.path, self.info, self.options = path, info, options
+        self.path, self.info, self.options = path, info, replace(options, stored=False)  # a piece is held as a whole
         self.names = [name for name, _ in found.sources]
         whole = np.array(extent_of(found.image.get("WholeExtent", ""), path)).reshape(3, 2)
         extents = [extent_of(text, path, f"Extent of piece {name!r}") for name, text in found.sources]

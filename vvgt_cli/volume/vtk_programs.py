@@ -18,7 +18,7 @@ from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import data_file
 from vvgt_cli.volume.vtk_index import MAX_BYTES, chosen_time
 from vvgt_cli.volume.vtk_leaves import Leaf, leaves_of
-from vvgt_cli.volume.vtk_xml import quiet_vtk
+from vvgt_cli.volume.vtk_messages import quiet_vtk
 
 HDF5 = b"\x89HDF\r\n\x1a\n"
 MOST_NAMES = 100_000  # files that a case may name

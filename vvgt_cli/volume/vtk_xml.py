@@ -1,14 +1,12 @@
-"""VTK XML images (``.vti``), read by VTK; a plain (raw, appended) array is memory-mapped instead.
+"""VTK XML images (``.vti``), read by VTK; a plain (raw, appended) array is memory-mapped instead, a packed one of which
+boxes are wanted unpacked box by box (`vtk_packed`).
 
-The XML is scanned first: sizes are checked against the file before VTK allocates, and VTK's messages, which go to the
-terminal otherwise, become one error.
+The XML is scanned first: sizes are checked against the file before VTK allocates. VTK's messages become one error.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,6 +23,8 @@ from vvgt_cli.volume.readers import Reader, register, volume_name
 from vvgt_cli.volume.resample import kind_of
 from vvgt_cli.volume.types import IDENTITY, Volume
 from vvgt_cli.volume.vtk_blocks import check_blocks
+from vvgt_cli.volume.vtk_messages import quiet_vtk
+from vvgt_cli.volume.vtk_packed import packed_array
 
 _DTYPES = {
     "int8": "i1",
@@ -57,7 +57,7 @@ HIDDEN = {"point": 2, "cell": 32}
 class Scan:
     """What the XML says; arrays are those of the first piece, points and cells of all.
 
-    Of an index of pieces (``.pvti`` and the like) ``sources`` are the files that it names, with their extents.
+    Of an index of pieces, ``sources`` are the files that it names, with their extents.
     """
 
     kind: str = ""
@@ -242,10 +242,15 @@ def read_vti(path: Path, options: ReadOptions) -> Volume:
 def image_values(found: Scan, info: ArrayInfo, grid: Grid, options: ReadOptions, path: Path) -> np.ndarray:
     """The values (nz, ny, nx) of an image's array, mapped where they are stored plainly; NaN where they are hidden.
 
+    With ``options.stored``, compressed ones stay in the file where they are appended and nothing is hidden.
+
     Raises:
         DataError: sizes that the file cannot hold, or it is damaged.
         UsageError: a choice of component that is missing or does not exist.
     """
+    packed: np.ndarray | None = _packed(found, info, grid, options, path) if options.stored else None
+    if packed is not None:
+        return packed
     values = _stored(found, info, grid, path)
     component, _ = select_component(
         values, options.component, str(path), label=f"array {info.name!r}", color=values.dtype == np.uint8
@@ -286,6 +291,12 @@ def around(cells: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _check_size(found: Scan, info: ArrayInfo, n_values: int, path: Path) -> None:
+    _check_declared(found, info, n_values, path)
+    check_memory(n_values * np.dtype(info.dtype).itemsize, str(path))
+
+
+def _check_declared(found: Scan, info: ArrayInfo, n_values: int, path: Path) -> None:
+    """Refuse sizes that the file cannot hold."""
     need = n_values * np.dtype(info.dtype).itemsize
     size = path.stat().st_size
     if need > size * stored_ratio(found, path):
@@ -293,7 +304,6 @@ def _check_size(found: Scan, info: ArrayInfo, n_values: int, path: Path) -> None
             f"{path}: {size_text(size)} cannot hold the {size_text(need)} of array {info.name!r} that its header "
             "declares; check that the file is whole"
         )
-    check_memory(need, str(path))
     check_blocks(path, found.root, found.appended, found.data_start, stored_ratio(found, path))
 
 
@@ -304,10 +314,8 @@ def _mapped(
     plain = found.appended == "raw" and not found.root.get("compressor") and found.data_start >= 0
     if not plain or found.pieces != 1 or attributes.get("format") != "appended" or attributes["type"] == "Bit":
         return None
-    order = ">" if found.root.get("byte_order") == "BigEndian" else "<"
-    word = np.dtype(order + ("u8" if found.root.get("header_type") == "UInt64" else "u4"))
+    word, dtype = _order(found, info)
     start = found.data_start + int(attributes.get("offset", "0"))
-    dtype = np.dtype(order + np.dtype(info.dtype).str[1:])
     declared = int(load_block(path, word, (1,), offset=start)[0])
     if start < found.data_start or declared != count(shape) * dtype.itemsize:
         raise DataError(
@@ -316,30 +324,33 @@ def _mapped(
     return load_block(path, dtype, shape, offset=start + word.itemsize)
 
 
-@contextmanager
-def quiet_vtk() -> Iterator[Any]:
-    """Keep VTK's messages from the terminal; yields a function that returns the first, or the first error."""
-    from vtkmodules.vtkCommonCore import vtkLogger, vtkOutputWindow, vtkStringOutputWindow
+def _order(found: Scan, info: ArrayInfo) -> tuple[np.dtype, np.dtype]:
+    """Types of the words before an array's values, and of the values, as the file has them."""
+    order = ">" if found.root.get("byte_order") == "BigEndian" else "<"
+    word = np.dtype(order + ("u8" if found.root.get("header_type") == "UInt64" else "u4"))
+    return word, np.dtype(order + np.dtype(info.dtype).str[1:])
 
-    window, before = vtkStringOutputWindow(), vtkOutputWindow.GetInstance()
-    verbosity = vtkLogger.GetCurrentVerbosityCutoff()
-    vtkOutputWindow.SetInstance(window)
-    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
 
-    def message(errors: bool = False) -> str:
-        # "ERROR: In file, line n\nclass (0x..): text"
-        output = window.GetOutput() or ""
-        if isinstance(output, bytes):  # with something in it that is no text
-            output = output.decode("utf-8", "replace")
-        head = r"ERROR: In [^\n]*\n[^\n]*" if errors else ""
-        texts = re.findall(head + r"\((?:0x[0-9a-f]+|nullptr)\): ([^\n]+)", output)
-        return re.sub(r" \(0x[0-9a-f]+\)", "", texts[0]).strip() if texts else ""
-
-    try:
-        yield message
-    finally:
-        vtkOutputWindow.SetInstance(before)
-        vtkLogger.SetStderrVerbosity(verbosity)
+def _packed(found: Scan, info: ArrayInfo, grid: Grid, options: ReadOptions, path: Path) -> Any:
+    """The array in its file, if it is appended and compressed, in one piece, and no value of it is hidden."""
+    row = found.find(info.name, info.where)
+    hidden = any(found.find(GHOSTS, where) for where in HIDDEN)
+    plain = not found.root.get("compressor") or found.appended not in ("raw", "base64") or found.data_start < 0
+    if row is None or plain or hidden or found.pieces != 1 or options.component == "magnitude":
+        return None
+    if row[1].get("format") != "appended" or row[1]["type"] == "Bit":
+        return None
+    shape = (*reversed(grid.dims), info.components)
+    _check_declared(found, info, count(shape), path)
+    start = found.data_start + int(row[1].get("offset", "0"))
+    if start < found.data_start:
+        raise DataError(f"{path}: array {info.name!r} begins before the appended data; check that the file is whole")
+    component = None if options.component is None else int(options.component)
+    word, dtype = _order(found, info)
+    return packed_array(
+        path, found.root["compressor"], word, found.appended == "base64", start, dtype, shape, component,
+        f"array {info.name!r}",
+    )  # fmt: skip
 
 
 def _by_vtk(path: Path, info: ArrayInfo, shape: tuple[int, ...]) -> np.ndarray:

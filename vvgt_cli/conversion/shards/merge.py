@@ -13,6 +13,7 @@ from typing import IO, TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from vvgt_cli.cameras.sets import pixel_width
 from vvgt_cli.conversion.request import VERTEX_BYTES
 from vvgt_cli.conversion.shards.levels import PART, level_name, write_index
 from vvgt_cli.conversion.shards.plan import Plan
@@ -165,7 +166,6 @@ class Cut:
 
     def gaussians(self, threshold: float) -> Iterator[Gaussians]:
         """Those of the cells that a threshold leaves, in the box frame, as a file holds them, in batches."""
-        from vvgt_cli.closed_form.closed_form import pixel_width
         from vvgt_cli.closed_form.columns import MASS, SEEN
         from vvgt_cli.closed_form.shape import ROUND, cell_gaussians
         from vvgt_cli.closed_form.sharpen import sharpened

@@ -8,6 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from vvgt_cli.cameras import default_views
+from vvgt_cli.cameras.sets import pixel_width
 from vvgt_cli.conversion.stage import Cost, Stage, Work
 from vvgt_cli.field.workload import Workload, view_edge
 from vvgt_cli.gaussians import Gaussians, as_stored
@@ -62,7 +63,6 @@ class Refinement(Stage):
 
     def run(self, work: Work) -> None:
         """Descend, and leave out what viewers do."""
-        from vvgt_cli.closed_form.closed_form import pixel_width
         from vvgt_cli.closed_form.shape import widened
 
         assert work.train is not None

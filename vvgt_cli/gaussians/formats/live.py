@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.gaussians.live import BEND, LENGTH, MEANS, NODES, SPREAD, SPREADS, THINNEST, VALUE, WIDEST
+from vvgt_cli.gaussians.live import BEND, FLAT, LENGTH, MEANS, NODES, SHARP, SPREAD, SPREADS, THINNEST, VALUE, WIDEST
 from vvgt_cli.gaussians.live_facts import GRADIENT, ROW, LiveFacts
 from vvgt_cli.gaussians.types import Gaussians
 
@@ -66,6 +66,7 @@ def live_json(clouds: Sequence[Gaussians], facts: LiveFacts, unit_distance: floa
         "table": [MEANS, SPREADS],
         "nodes": NODES,
         "thinnest": THINNEST,
+        "opaque": [SHARP, FLAT],
     }
 
 

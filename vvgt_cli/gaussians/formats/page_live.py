@@ -9,8 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from vvgt_cli.cameras.sets import SIZE, pixel_width
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import Gaussians, PlyOptions
+from vvgt_cli.gaussians.constants import DILATION
 from vvgt_cli.gaussians.formats.live import live_bytes, live_json, log_lengths
 from vvgt_cli.gaussians.formats.page_file import html_of_several, title_of, upright
 from vvgt_cli.gaussians.formats.splats import Splats, morton_order, splats_of
@@ -74,6 +76,8 @@ def in_common(facts: Sequence[LiveFacts | None]) -> LiveFacts | None:
     first, *others = facts
     if first is None or any(one is None or bool(one.labels) != bool(first.labels) for one in others):
         return None
+    if any(one is not None and one.others for one in facts):
+        return None
     if first.labels:
         labels = {label.number: label for one in reversed(facts) if one is not None for label in one.labels}
         return replace(first, labels=tuple(labels[number] for number in sorted(labels)))
@@ -135,6 +139,7 @@ def _facts(clouds: Sequence[Gaussians], facts: LiveFacts, options: PlyOptions) -
         "light": _light(options.light, axes),
         "law": law_nodes().tolist(),
         "name": facts.baked().get("name", ""),
+        "dilation": DILATION * pixel_width(options.made_for or SIZE) ** 2,
         "nodes": [] if facts.labels else nodes_of(facts),
         "axes": axes.tolist(),
         "box": [

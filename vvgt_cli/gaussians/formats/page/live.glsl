@@ -1,8 +1,9 @@
-// A Gaussian under the function: moved and thinned along the gradient (docs/live.md), and cut by planes. The engine calls
+// A Gaussian under the function: moved and thinned along the gradient, of the opacity of its mass (docs/live.md), and cut by planes. The engine calls
 // modifySplatCenter first. A cut Gaussian becomes one of the mass and mean of its part that stays, no wider than that and up to the plane.
 uniform highp sampler2D vvgtTable;
 uniform highp sampler2D vvgtLabels;  // of a label map a column a label: red, green, blue, extinction; else one column
 uniform vec4 vvgtFacts;  // shortest log length, how far it goes, thinnest, spreads
+uniform vec3 vvgtOpaque;  // of the variance of what is opaque along its shortest axis, and along the others; variance of the screen's dilation
 uniform vec4 vvgtCut[6];  // dot(xyz, centre) <= w of each stays; of none the normal is zero
 uniform vec4 vvgtLight;  // ambient, diffuse, specular, power; ambient < 0: unlit
 uniform vec4 vvgtToward;  // direction towards the light; with w = 1 it is at the eye
@@ -28,7 +29,18 @@ void vvgtTurn(inout vec3 a, inout vec3 b) {  // until orthogonal: one-sided Jaco
   b = sn * was + cs * b;
 }
 
-float vvgtCutBy(vec4 plane, inout vec3 center, inout mat3 axes) {  // depth's factor
+float vvgtAlpha(float y) {  // whose dilogarithm is y, to 3e-4
+  y = min(y, 1.5886);
+  return min(y * (1.0006751 + y * (-0.2572020 + y * (0.0395146 + y * (-0.0420802 + y * (0.0288972 - y * 0.0082833))))), 0.99);
+}
+
+float vvgtPeak(float mass, vec3 variance) {  // the mean over views along the axes, by the areas that these see
+  vec3 v = variance + vvgtOpaque.z, area = 6.2831853 * sqrt(v.yzx * v.zxy), y = mass / area;
+  y += min(y, vec3(1.0 / 255.0));
+  return dot(vec3(vvgtAlpha(y.x), vvgtAlpha(y.y), vvgtAlpha(y.z)), area) / (area.x + area.y + area.z);
+}
+
+float vvgtCutBy(vec4 plane, inout vec3 center, inout mat3 axes) {  // mass's factor
   vec3 own = plane.xyz * axes;
   float sigma = length(own);
   if (sigma < 1e-12) return 1.0;
@@ -43,7 +55,7 @@ float vvgtCutBy(vec4 plane, inout vec3 center, inout mat3 axes) {  // depth's fa
   vec3 arm = axes * own;
   center -= arm * mean;
   axes += outerProduct(arm * (thin - 1.0), own);
-  return stays / thin;
+  return stays;
 }
 
 float vvgtCutAll(inout vec3 center, inout mat3 axes) {
@@ -84,9 +96,8 @@ void modifySplatCenter(inout vec3 center) {
   center += arm * (r * first);
   axes += outerProduct(arm * (thin - 1.0), along);
   vec3 place = center;
-  float depth = tau * exp(vvgtFacts.x + vvgtFacts.y * float(a.z) / 255.0) * inversesqrt(thin) * vvgtCutAll(center, axes);
+  float edge = exp(vvgtFacts.x + vvgtFacts.y * float(a.z) / 255.0), mass = tau * edge * edge * edge * vvgtCutAll(center, axes);
   vec3 color = vvgtLit(sums.rgb / tau, mat3(matrix_model) * gradient, place);
-  vvgtColor = sums.a < 1e-12 ? vec4(0.0) : vec4(color, 1.0 - exp(-depth));
   for (int sweep = 0; sweep < 6; sweep++) {
     vvgtTurn(axes[0], axes[1]);
     vvgtTurn(axes[0], axes[2]);
@@ -96,6 +107,11 @@ void modifySplatCenter(inout vec3 center) {
   mat3 unit = mat3(axes[0] / vvgtScale.x, axes[1] / vvgtScale.y, axes[2] / vvgtScale.z);
   if (determinant(unit) < 0.0) unit[2] = -unit[2];
   vvgtRotation = vvgtQuaternion(unit);
+  float shortest = min(vvgtScale.x, min(vvgtScale.y, vvgtScale.z));
+  vec3 opaque = mix(vec3(vvgtOpaque.y), vec3(vvgtOpaque.x), vec3(lessThanEqual(vvgtScale, vec3(shortest))));
+  vec3 squares = vvgtScale * vvgtScale * mix(opaque, vec3(1.0), exp(-tau * edge));
+  vvgtScale = sqrt(squares);
+  vvgtColor = sums.a < 1e-12 ? vec4(0.0) : vec4(color, vvgtPeak(mass, squares));
 }
 void modifySplatRotationScale(vec3 original, vec3 modified, inout vec4 rotation, inout vec3 scale) {
   rotation = vvgtRotation;

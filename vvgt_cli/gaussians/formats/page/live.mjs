@@ -101,6 +101,7 @@ export async function liveLook({ app }, live) {
     set('vvgtLight', [kind === 'none' ? -1 : ambient, diffuse, specular, power]);
   };
   look.light(live.light);
+  gsplat.setParameter('vvgtOpaque', [...live.opaque, live.dilation]);
   set('vvgtFacts', [first, last - first, live.thinnest, spreads]);
   look.cut([]);
   if (live.labels.length) set('vvgtTable', table);

@@ -23,11 +23,37 @@ const along = (gradient, arms) => {
 const label = ({ bytes, count }, i) => bytes[6 * count + i] + 256 * bytes[7 * count + i];
 const beyond = ({ planes }, center) => planes.some(({ normal, place }) => dot(normal, center) > place);  // what is cut is not looked at
 
+// opacity whose dilogarithm is y, to 3e-4
+const alpha = (y) => {
+  const x = Math.min(y, 1.5886);
+  return Math.min(x * (1.0006751 + x * (-0.257202 + x * (0.0395146 + x * (-0.0420802 + x * (0.0288972 - x * 0.0082833))))), 0.99);
+};
+
+// {center, arms, opacity} of what has an extinction tau, as live.glsl has it; arms are made orthogonal
+function seen({ live }, center, arms, tau, length) {
+  const axes = arms.map((arm) => [...arm]);
+  for (let sweep = 0; sweep < 6; sweep++) {
+    for (const [i, j] of [[0, 1], [0, 2], [1, 2]]) {
+      const [a, b] = [axes[i], axes[j]], c = dot(a, b), aa = dot(a, a), bb = dot(b, b);
+      if (Math.abs(c) < 1e-9 * Math.sqrt(aa * bb)) continue;
+      const zeta = (bb - aa) / (2 * c), t = (zeta < 0 ? -1 : 1) / (Math.abs(zeta) + Math.sqrt(1 + zeta * zeta)), cs = 1 / Math.sqrt(1 + t * t);
+      axes[i] = a.map((x, k) => cs * (x - t * b[k]));
+      axes[j] = b.map((x, k) => cs * (x + t * a[k]));
+    }
+  }
+  const squares = axes.map((axis) => dot(axis, axis)), shortest = squares.indexOf(Math.min(...squares)), fog = Math.exp(-tau * length);
+  const factors = squares.map((_, k) => fog + (1 - fog) * live.opaque[k === shortest ? 0 : 1]);
+  const wide = squares.map((v, k) => v * factors[k] + live.dilation), areas = [0, 1, 2].map((k) => 2 * Math.PI * Math.sqrt(wide[(k + 1) % 3] * wide[(k + 2) % 3]));
+  const total = areas.reduce((sum, area) => sum + area), mass = tau * length ** 3;
+  const opacity = areas.reduce((sum, area) => sum + area * alpha(mass / area + Math.min(mass / area, 1 / 255)), 0) / total;
+  return { center, arms: axes.map((axis, k) => axis.map((x) => x * Math.sqrt(factors[k]))), opacity };
+}
+
 function labelled(look) {
   return (i, { center, arms }) => {
     const { opacity } = look.rows[label(look, i)];
     if (opacity <= 0 || beyond(look, center)) return null;
-    return { center, arms, opacity: 1 - (1 - Math.min(opacity, 0.99999)) ** (carried(look, i).length / look.live.unit_distance) };
+    return seen(look, center, arms, -Math.log1p(-Math.min(opacity, 0.99999)) / look.live.unit_distance, carried(look, i).length);
   };
 }
 
@@ -43,8 +69,7 @@ export function looksOf(look) {
     const arm = [0, 1, 2].map((c) => arms[0][c] * unit[0] + arms[1][c] * unit[1] + arms[2][c] * unit[2]);
     const moved = center.map((x, c) => x + arm[c] * r * first);
     if (beyond(look, moved)) return null;
-    const axes = arms.map((one, k) => one.map((x, c) => x + arm[c] * (thin - 1) * unit[k]));
-    return { center: moved, arms: axes, opacity: -Math.expm1((-tau * length) / Math.sqrt(thin)) };
+    return seen(look, moved, arms.map((one, k) => one.map((x, c) => x + arm[c] * (thin - 1) * unit[k])), tau, length);
   };
 }
 

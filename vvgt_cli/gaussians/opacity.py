@@ -42,8 +42,8 @@ def peak_opacity(mass: np.ndarray, variances: np.ndarray, pixel: float) -> np.nd
     3DGS has one opacity for all views: the mean over the views along the three principal axes, weighted by the
     projected areas. ``pixel`` is a pixel's width at the Gaussian (unit-frame lengths): the renderer's dilation counts.
     """
-    areas = _areas(variances, pixel)
-    return _mean_opacity(mass[:, None] / areas + MIN_ALPHA, areas)
+    areas = projected_areas(variances, pixel)
+    return mean_opacity(mass[:, None] / areas + MIN_ALPHA, areas)
 
 
 def opacity_when_reshaped(opacity: np.ndarray, before: np.ndarray, after: np.ndarray, pixel: float) -> np.ndarray:
@@ -51,12 +51,12 @@ def opacity_when_reshaped(opacity: np.ndarray, before: np.ndarray, after: np.nda
 
     Principal variances ``before`` and ``after`` (n, 3), axis by axis; ``pixel`` as in `peak_opacity`.
     """
-    areas = _areas(after, pixel)
-    depths = np.maximum(dilogarithm(opacity) - MIN_ALPHA, 0)[:, None] * (_areas(before, pixel) / areas)
-    return _mean_opacity(depths + MIN_ALPHA, areas)
+    areas = projected_areas(after, pixel)
+    depths = np.maximum(dilogarithm(opacity) - MIN_ALPHA, 0)[:, None] * (projected_areas(before, pixel) / areas)
+    return mean_opacity(depths + MIN_ALPHA, areas)
 
 
-def _areas(variances: np.ndarray, pixel: float) -> np.ndarray:
+def projected_areas(variances: np.ndarray, pixel: float) -> np.ndarray:
     """(n, 3) ``2 pi sqrt(det S)`` as seen along each principal axis."""
     wide = variances + DILATION * pixel**2  # (n, 3)
     result: np.ndarray = (
@@ -65,7 +65,7 @@ def _areas(variances: np.ndarray, pixel: float) -> np.ndarray:
     return result
 
 
-def _mean_opacity(li2: np.ndarray, areas: np.ndarray) -> np.ndarray:
+def mean_opacity(li2: np.ndarray, areas: np.ndarray) -> np.ndarray:
     """(n,) mean over the axes, weighted by ``areas`` (n, 3), of the alpha whose dilogarithm is ``li2`` (n, 3)."""
     opacity = inverse_dilogarithm(li2)
     result: np.ndarray = np.minimum((opacity * areas).sum(axis=1) / areas.sum(axis=1), MAX_ALPHA)

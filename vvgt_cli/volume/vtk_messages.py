@@ -1,0 +1,34 @@
+"""VTK's messages, which go to the terminal otherwise, as text."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+
+@contextmanager
+def quiet_vtk() -> Iterator[Any]:
+    """Keep VTK's messages from the terminal; yields a function that returns the first, or the first error."""
+    from vtkmodules.vtkCommonCore import vtkLogger, vtkOutputWindow, vtkStringOutputWindow
+
+    window, before = vtkStringOutputWindow(), vtkOutputWindow.GetInstance()
+    verbosity = vtkLogger.GetCurrentVerbosityCutoff()
+    vtkOutputWindow.SetInstance(window)
+    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
+
+    def message(errors: bool = False) -> str:
+        # "ERROR: In file, line n\nclass (0x..): text"
+        output = window.GetOutput() or ""
+        if isinstance(output, bytes):  # with something in it that is no text
+            output = output.decode("utf-8", "replace")
+        head = r"ERROR: In [^\n]*\n[^\n]*" if errors else ""
+        texts = re.findall(head + r"\((?:0x[0-9a-f]+|nullptr)\): ([^\n]+)", output)
+        return re.sub(r" \(0x[0-9a-f]+\)", "", texts[0]).strip() if texts else ""
+
+    try:
+        yield message
+    finally:
+        vtkOutputWindow.SetInstance(before)
+        vtkLogger.SetStderrVerbosity(verbosity)
