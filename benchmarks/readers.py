@@ -47,6 +47,7 @@ class Row:
         options: of `ReadOptions`.
         placed: it says where voxels are.
         cells: values are those of cells; else of points, between which a resampled grid lies.
+        steps: its reader's time steps are of this format, too.
         most: voxels along an edge, at most (text and meshes).
     """
 
@@ -61,6 +62,7 @@ class Row:
     options: dict[str, Any] = field(default_factory=dict)
     placed: bool = True
     cells: bool = False
+    steps: bool = True
     most: int = 1 << 12
 
 
@@ -160,7 +162,7 @@ def measured(row: Row, edge: int) -> dict[str, Any]:
             "edge": edge,
             "whole": "yes" if whole else "resampled" if "resampled" in volume.name else "no",
             "blocks": "yes" if blocks else "no",
-            "series": "yes" if next(r for r in READERS if r.name == row.reader).times else "files",
+            "series": "yes" if row.steps and next(r for r in READERS if r.name == row.reader).times else "files",
             "place": f"{off(volume, row, edge):.4f}" if row.placed else "",
             "seconds": f"{seconds(lambda: read_all(path, row)):.2f}",
             "library": "" if alone is None else f"{seconds(lambda: alone(path)):.2f}",

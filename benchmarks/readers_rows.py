@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 from readers import LPS, ORIGIN, SPACING, Row, world
+from readers_layouts import LAYOUTS
+from readers_simulations import SIMULATIONS
 from readers_vtk import by_vtk, hexahedra, vtk_class, vtk_image, write_vtk
 
 BOHR = 0.529177210903  # angstroms
@@ -256,4 +258,6 @@ ROWS = (
     Row("OME-TIFF, deflate", "tifffile", "TIFF", _ome, _by_tifffile, origin=AT_0),
     Row("`.npy`", "numpy", "NumPy", _npy, np.load, placed=False),
     Row("CZI, Zstandard", "libCZI", "CZI", _czi, _by_libczi, origin=AT_0),
+    *LAYOUTS,
+    *SIMULATIONS,
 )  # fmt: skip

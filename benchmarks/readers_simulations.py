@@ -121,5 +121,5 @@ SIMULATIONS = (
     Row("XDMF 2", "VTK", "XDMF", _xdmf2, by_vtk("vtkIOXdmf2.vtkXdmfReader")),
     Row("XDMF 3", "h5py", "XDMF", _xdmf3, by_vtk("vtkIOXdmf2.vtkXdmfReader")),
     Row("CGNS", "h5py", "CGNS", _cgns, by_vtk("vtkIOCGNSReader.vtkCGNSReader"), most=64),
-    Row("Plot3D", "numpy", "Plot3D", _plot3d, _by_vtk_plot3d, most=64),
+    Row("Plot3D", "numpy", "Plot3D", _plot3d, _by_vtk_plot3d, most=64, steps=False),
 )

@@ -10,6 +10,8 @@ import json
 import math
 import os
 import resource
+import select
+import signal
 import sys
 import tempfile
 from collections.abc import Callable
@@ -28,6 +30,7 @@ from vvgt_cli.volume import ReadOptions, read_volume, vtk_child
 
 Make = Callable[[Path], Path]
 DIMS = (8, 6, 4)
+IDLE = 60  # s on the clock for an answer
 EACH = 200  # requests to a fork: what readers lose of memory goes with it
 
 
@@ -81,6 +84,8 @@ def run_fork(request: dict[str, Any]) -> tuple[tuple[dict[str, Any], np.ndarray]
     worker = _workers[0]
     worker.to.write(json.dumps(request).encode() + b"\n")
     worker.to.flush()
+    if not select.select([worker.back], [], [], IDLE)[0]:  # it sleeps: the program's child is killed for that, too
+        os.kill(worker.pid, signal.SIGKILL)
     found = vtk_child.received(worker.back)
     worker.answered += 1
     if found is not None and worker.answered < EACH:

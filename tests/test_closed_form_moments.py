@@ -13,7 +13,7 @@ from vvgt_cli.closed_form import straight as straight_module
 from vvgt_cli.closed_form.moments import Cells, base_cells, exponents
 from vvgt_cli.closed_form.ranges import ranges_of
 from vvgt_cli.dvr import Scene
-from vvgt_cli.dvr.layout import BRICK
+from vvgt_cli.dvr.layout import BRICK, Voxels
 from vvgt_cli.look.tables import Optics, extinction
 from vvgt_cli.synth import analytic
 from vvgt_cli.volume import Volume
@@ -105,6 +105,22 @@ def test_twin(exponent: tuple[int, int, int], tf, bend: float, monkeypatch: pyte
     scale, bound = np.abs(expected).max(axis=(0, 1, 2)), 5e-3 if bend and min(exponent) >= moments_module.WIDE else 1e-4
     assert (np.abs(dense(cells, expected) - expected).max(axis=(0, 1, 2)) / scale).max() < bound
     np.testing.assert_allclose(cells.edge, 2.0 ** np.array(exponent) * scene.step)
+
+
+class White(Ramp):
+    """Of one colour: straight from end to end."""
+
+    def color(self, x: np.ndarray) -> np.ndarray:
+        return np.ones((*np.shape(x), 3))
+
+
+@pytest.mark.parametrize("exponent", [(1, 1, 1), (3, 2, 1)])
+def test_one_point_gives_what_eight_do_under_a_straight_function(exponent: tuple[int, int, int]) -> None:
+    scene = scene_of(rough((19, 9, 13), (1.0, 2.5, 0.7)), White(2.0), 2.0)
+    assert straight_module.straight_until(scene.optics)[0] == scene.optics.bins
+    expected = twin(scene, White(2.0), 2.0, np.array(exponent))
+    off = np.abs(dense(base_cells(scene, np.array(exponent)), expected) - expected).max(axis=(0, 1, 2))
+    assert (off / np.abs(expected).max(axis=(0, 1, 2))).max() < 1e-4
 
 
 def test_twin_of_integer_and_scaled_values() -> None:
@@ -261,8 +277,23 @@ def test_windows_of_bins_are_straight_up_to_a_bend() -> None:
     assert straight_module.straight_until(bent)[5] < 10
 
 
-def test_a_brick_of_wide_cells_ends_with_the_volume() -> None:
-    """Cells of two voxels over the end of the volume hold what cells of one voxel do."""
-    scene = scene_of(rough((11, 9, 13), dtype=np.uint8), Tent(100.0, 60.0))
-    fine, coarse = (base_cells(scene, np.full(3, level)).moments.sum(axis=0) for level in (0, 1))
-    np.testing.assert_allclose(coarse, fine, rtol=2e-3, atol=2e-3 * fine[0])
+@pytest.mark.parametrize("level", [1, 2])
+def test_wide_cells_have_the_same_bytes_whatever_part_of_the_volume_is_there(level: int) -> None:
+    """And hold what cells of one voxel do, also where they reach over the volume's end."""
+    scene = scene_of(Volume(rough((35, 29, 27), dtype=np.uint8).data, slope=1 / 255), Tent(0.5, 0.3))
+    exponent, dims = np.full(3, level), np.array(scene.volume.dims)
+    whole, fine = base_cells(scene, exponent), base_cells(scene, np.zeros(3, np.int64)).moments.sum(axis=0)
+    assert fine[0] > 0
+    np.testing.assert_allclose(whole.moments.sum(axis=0), fine, rtol=2e-3, atol=2e-3 * fine[0])
+    rows = {}
+    for lo in np.argwhere(np.ones(-(-dims // 16))) * 16:
+        a, b = np.maximum(lo - 1, 0), np.minimum(lo + 17, dims)
+        part = np.ascontiguousarray(scene.values[a[2] : b[2], a[1] : b[1], a[0] : b[0]])
+        part.flags.writeable = False
+        region = moments_module.Region(Voxels(part), scene.optics, scene.half, scene.step, a.astype(float))
+        origins = np.argwhere(np.ones(-(-(np.minimum(lo + 16, dims) - lo) // 8))) * 8 + lo
+        index, found = moments_module.region_cells(region, origins, exponent)
+        rows |= {tuple(place): row for place, row in zip(index.tolist(), found, strict=True)}
+    assert len(rows) == len(whole.index)
+    for place, row in zip(whole.index.tolist(), whole.moments, strict=True):
+        np.testing.assert_array_equal(rows[tuple(place)], row)

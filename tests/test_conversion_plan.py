@@ -85,7 +85,7 @@ def test_without_limits_the_default_steps_are_planned_and_back_projection_is_not
     assert found.seconds == pytest.approx(sum(seconds for _, seconds in found.costs()))
     step = 0.027 * (48 / 400) ** 2 + 0.0275
     assert found.seconds == pytest.approx(1 + FORM + DEFAULT_STEPS * step + 96 * 0.05 + 4 * 0.06 + ending())
-    assert found.bytes == 1000 + 1000 * 68
+    assert found.bytes == 3600 + 1000 * 68
     assert f"{DEFAULT_STEPS} steps" in found.text()
 
 
@@ -304,7 +304,7 @@ def test_a_size_is_kept_to_the_byte_and_one_without_room_is_refused(degree, tmp_
     fit, limits = FitOptions(100_000, 48, steps=0), Limits(max_megabytes=0.02)
     report = done(tmp_path, fit, limits=limits, ply=PlyOptions(sh_degree=degree))
     assert report.gaussians == len(read_ply(tmp_path / "a.ply")[0])
-    assert 0.02e6 - 1500 < report.bytes <= 0.02e6
+    assert 0.02e6 - 4500 < report.bytes <= 0.02e6  # room for a long legend is left
     assert (tmp_path / "a.ply").stat().st_size == report.bytes
     with pytest.raises(UsageError, match="no Gaussian fits"):
         done(tmp_path, limits=Limits(max_megabytes=0.001))

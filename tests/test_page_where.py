@@ -33,9 +33,9 @@ BAR = "(({ scale, lens }) => [scale.length, scale.across, scale.text, lens.flat]
 class Person:
     """Someone at a browser of a size: its steps are those of `tests/viewers/where.mjs`."""
 
-    def __init__(self, size: tuple[int, int]) -> None:
+    def __init__(self, size: tuple[int, int], *args: str) -> None:
         self.size, self.touch = size, size == PHONE
-        job = json.dumps({"browser": browser(), "size": size, "touch": self.touch})
+        job = json.dumps({"browser": browser(), "size": size, "touch": self.touch, "args": args})
         command = ["node", str(PAGES / "where.mjs"), job, str(packages())]
         self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 

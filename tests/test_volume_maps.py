@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bz2
 import gzip
+import warnings
 from collections.abc import Callable
 from itertools import permutations
 from pathlib import Path
@@ -90,7 +91,13 @@ def test_mrc_cells_may_be_skewed(tmp_path: Path) -> None:
 
 
 def test_mrc_without_a_cell_has_steps_of_1(tmp_path: Path) -> None:
-    assert read_volume(save(tmp_path / "v.mrc", VALUES.astype("f4"), cella=(0, 0, 0))).spacing == (1, 1, 1)
+    source = save(tmp_path / "v.mrc", VALUES.astype("f4"), cella=(0, 0, 0))
+    with pytest.warns(UserWarning, match=r"no cell; .*1 angstrom wide \(--spacing"):
+        assert read_volume(source).spacing == (1, 1, 1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert read_volume(source, ReadOptions(spacing=(2, 2, 3))).spacing == (2, 2, 3)
+        read_volume(save(tmp_path / "w.mrc", VALUES.astype("f4")))
 
 
 @pytest.mark.parametrize(("suffix", "pack"), [(".mrc.gz", gzip.compress), (".map.bz2", bz2.compress)])

@@ -68,7 +68,7 @@ def test_a_choice_is_obeyed_or_an_error_that_lists(tmp_path: Path) -> None:
         (source, {"component": 2, "time": 0}, r"2 channels .*, not 2; expected one"),
         (source, {"component": "RFP", "time": 0}, r"'GFP'\) of type uint16, not 'RFP'"),
         (source, {"component": 1}, r"3 time steps; expected one: try --time N \(0 to 2\).*-o 'p_{:02d}.ply'"),
-        (source, {"component": 1, "time": 3}, r"--time 3: it has 3 time steps; expected 0 to 2"),
+        (source, {"component": 1, "time": 3}, r"--time 3: expected a time step from 0 to 2"),
         (still, {"time": 1}, r"--time 1: it has 1 time step; leave out --time"),
         (still, {"component": 1}, r"1 channel of type uint16; leave out --channel 1"),
         (still, {"component": "magnitude"}, r"1 channel of type uint16; leave out --channel magnitude"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import sys
+import time
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -83,7 +84,7 @@ def test_steps_of_meshes_are_chosen_by_time(tmp_path: Path, kind: str) -> None:
     with pytest.raises(SeveralSteps) as raised:
         read_volume(str(path), ReadOptions(array="cells"))
     assert tuple(raised.value.times) == files.TIMES
-    with pytest.raises(UsageError, match="--time 2: it has 2 time steps; expected 0 to 1"):
+    with pytest.raises(UsageError, match="--time 2: expected a time step from 0 to 1"):
         read_volume(str(path), ReadOptions(array="cells", time=2))
 
 
@@ -303,6 +304,19 @@ def test_a_reader_that_breaks_down_is_one_line(tmp_path: Path, monkeypatch: pyte
         monkeypatch.setattr(vtk_child, "START", code)
         with pytest.raises(DataError, match=text):
             read_volume(str(path))
+
+
+def test_a_reader_that_sleeps_for_good_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As one does that waits for a lock of its own: no limit of processor time ends it."""
+    from vvgt_cli.volume import vtk_child
+
+    monkeypatch.setattr(vtk_child, "IDLE", 0.4)
+    monkeypatch.setattr(vtk_child, "LOOK", 0.1)
+    monkeypatch.setattr(vtk_child, "START", "import threading; threading.Event().wait(60)")
+    begin = time.monotonic()
+    with pytest.raises(DataError, match="standstill"):
+        read_volume(str(files.exodus(tmp_path)), ReadOptions(array="ramp"))
+    assert time.monotonic() - begin < 30
 
 
 def test_memory_and_time_of_a_reader_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,6 +1,6 @@
-// where.mjs JOB MODULES: pages in headless Chromium, used as a person uses them. JOB: JSON {"browser", "size": [w, h], "touch"}.
+// where.mjs JOB MODULES: pages in headless Chromium, used as a person uses them. JOB: JSON {"browser", "size": [w, h], "touch", "args"}.
 // Reads steps [what, ...], a JSON list a line, and answers each with a line {"answer", "asked", "broken"} or {"error"}.
-// Steps: open URL; press KEY; click SELECTOR, or X Y; drag X Y X Y; eval JS; settled (until two pictures are the same); shot FILE
+// Steps: open URL; refused URL (what a page says that cannot be shown); press KEY; click SELECTOR, or X Y; drag X Y X Y; eval JS; settled (until two pictures are the same); shot FILE
 // (the page), bare FILE (without what lies over the picture); save SELECTOR FILE (what a click downloads).
 import path from 'node:path';
 import readline from 'node:readline';
@@ -8,7 +8,7 @@ import { createRequire } from 'node:module';
 
 const [text, modules] = process.argv.slice(2), job = JSON.parse(text);
 const { chromium } = createRequire(path.join(modules, 'x.js'))('playwright-core');
-const args = ['--no-sandbox', '--use-angle=swiftshader', '--enable-unsafe-swiftshader', '--ignore-gpu-blocklist', '--force-color-profile=srgb'];
+const args = ['--no-sandbox', '--use-angle=swiftshader', '--enable-unsafe-swiftshader', '--ignore-gpu-blocklist', '--force-color-profile=srgb', ...(job.args ?? [])];
 const browser = await chromium.launch({ executablePath: job.browser, args });
 const [width, height] = job.size;
 const context = await browser.newContext({ viewport: { width, height }, deviceScaleFactor: 1, hasTouch: job.touch, isMobile: job.touch });
@@ -41,6 +41,11 @@ async function settled() {
 const HIDE = '#cut, #tools, #live, #named, #where, #places, #about, .sse-ui { visibility: hidden !important }';
 const steps = {
   open, settled,
+  refused: async (url) => {
+    await page.goto(url);
+    await page.waitForFunction(() => !['', 'loading'].includes(document.getElementById('said').textContent) || window.vvgt);
+    return page.locator('#said').textContent();
+  },
   press: (key) => page.keyboard.press(key),
   click: (...at) => {
     if (at.length === 1) return job.touch ? page.tap(at[0]) : page.click(at[0]);

@@ -24,6 +24,7 @@ from typing import IO, Any, cast
 from vvgt_cli.errors import DataError, VvgtError
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.look.labels import LabelTable
 from vvgt_cli.resources import asked_memory
 
 
@@ -85,7 +86,7 @@ class Start:
     folder: str
 
 
-Job = TransferFunction | None  # None: the live form
+Job = TransferFunction | LabelTable | None  # the look to convert for; None: the live form
 
 
 class Converter:

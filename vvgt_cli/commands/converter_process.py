@@ -25,6 +25,7 @@ from vvgt_cli.field.open import automatic
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import write_ply
 from vvgt_cli.gaussians.formats import ready
+from vvgt_cli.look.labels import LabelTable
 from vvgt_cli.look.lighting import Lighting
 from vvgt_cli.progress import Console, ProgressCallback
 from vvgt_cli.resources import set_memory
@@ -65,6 +66,7 @@ class Volume:
     def __init__(self, source: SourceRequest, name: str, console: Console) -> None:
         self.source, self.name = source, name
         self.lighting: Lighting | None = None  # of the function to begin with
+        self.table: LabelTable | None = None  # the labels to begin with
         if automatic(source, Console(quiet=True)) is None:  # `opened` says it
             console.bar("reading")
             content = open_parts(source.path, source.read)
@@ -78,19 +80,30 @@ class Volume:
             why = refusal(request, field.source) or _missing()
             if why is None:
                 ply, self.lighting = ply_options(request, field.source), field.source.tf.lighting
+                self.table = field.source.tf if isinstance(field.source.tf, LabelTable) else None
                 return self._paged(live_conversion(run, request, field, ply, scored=False))
         console.say(f"not live, but converted: {why}")
         return self._paged(without_files(replace(request, live=False), console))
 
     def under(self, job: Job, console: Console) -> Made:
-        """A conversion for a function, on data values, that says the distance its opacity is per."""
+        """A conversion for a function, on data values, that says the distance its opacity is per; or for labels."""
         assert job is not None
-        lit = replace(job, lighting=self.lighting)
-        source = replace(self.source, tf=lit, tf_range="data", unit_distance=None)
+        if isinstance(job, LabelTable):
+            source = replace(self.source, labels=self._labels(job))
+        else:
+            lit = replace(job, lighting=self.lighting)
+            source = replace(self.source, tf=lit, tf_range="data", unit_distance=None)
         conversion = without_files(ConvertRequest(source), console)
         shown = stored(conversion.gaussians, conversion.ply)
         psnr = None if conversion.scores is None else conversion.scores["psnr"]
         return Made(_file(conversion), {"ply": shown}, psnr=psnr)
+
+    def _labels(self, sent: LabelTable) -> LabelTable:
+        """The labels to begin with, in the colours and opacities of those that are sent."""
+        assert self.table is not None
+        new = {label.number: label for label in sent.labels}
+        labels = tuple(replace(new.get(label.number, label), name=label.name) for label in self.table.labels)
+        return replace(self.table, labels=labels)
 
     def _paged(self, conversion: Conversion) -> Made:
         """With the page of it: here the libraries that it takes are there already."""

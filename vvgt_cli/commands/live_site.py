@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from vvgt_cli.cameras.sets import SIZE, pixel_width
-from vvgt_cli.commands.converter import Converter, Failed, Made, Message, Progress, Said
+from vvgt_cli.commands.converter import Converter, Failed, Job, Made, Message, Progress, Said
 from vvgt_cli.commands.server import Part
 from vvgt_cli.conversion.gaussian_files import layout_of, open_gaussians
 from vvgt_cli.errors import DataError, VvgtError
@@ -24,12 +24,14 @@ from vvgt_cli.gaussians.formats.gsply_files import compressed_ply
 from vvgt_cli.gaussians.formats.page_file import page, upright, waiting_page
 from vvgt_cli.gaussians.formats.page_live import light_sent, live_parts
 from vvgt_cli.gaussians.formats.splats import columns_of
-from vvgt_cli.gaussians.live import Table, baked
-from vvgt_cli.gaussians.live_facts import function_text
+from vvgt_cli.gaussians.live import Palette, Table, baked
+from vvgt_cli.gaussians.live_facts import MOST_LABELS, function_text
 from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.look.labels import Label, LabelTable
 from vvgt_cli.look.readers.minimal import read
 from vvgt_cli.progress import Console
 from vvgt_cli.volume.readers import volume_name
+from vvgt_cli.volume.types import triple
 
 JSON, BYTES, HTML = "application/json", "application/octet-stream", "text/html; charset=utf-8"
 SCRIPT = '<script src="viewer.js"></script>'
@@ -90,23 +92,64 @@ class Cloud:
         Raises:
             DataError, UsageError: it is no light, or the Gaussians carry labels.
         """
-        from vvgt_cli.conversion.live import lit
-
         facts, scale, distance = self.options.live, self.options.scale or 1.0, tf.opacity_unit_distance
         assert facts is not None
         assert distance is not None
         if facts.labels:
             raise DataError("what is shown carries labels; expected no function")
-        lighting = self.options.light if light is None else light_sent(light, self.options)
         table = Table.of_function(tf, facts.lo, facts.hi, distance * scale)
-        pixel = pixel_width(self.options.made_for or SIZE)
-        found = as_stored(lit(baked(self.gaussians, table, pixel), lighting))
         facts = replace(facts, function=function_text(tf, facts.lo, facts.hi))
         options = replace(
+<<<<<<< HEAD
             self.options, live=facts, certificate=None, unit_distance=distance, unit_distance_label="file",
             light=lighting, function=tf.name, sh_degree=None,
+=======
+            self.options, live=facts, unit_distance=distance, unit_distance_label="file", function=tf.name
+>>>>>>> main
         )  # fmt: skip
-        return replace(self, gaussians=found, options=options, ply=None)
+        return self._shown(table, light, options)
+
+    def labelled(self, sent: Any, light: Any = None) -> Cloud:
+        """The same with other colours and opacities of its labels; ``sent`` as `labels_sent`, ``light`` as of `under`.
+
+        Raises:
+            DataError, UsageError: they are none, or not of these labels.
+        """
+        facts, entries = self.options.live, {label.number: label for label in labels_sent(sent).labels}
+        if facts is None or sorted(entries) != sorted(label.number for label in facts.labels):
+            raise DataError("the page's labels: other ones than what is shown; expected all of it")
+        labels = tuple(replace(entries[label.number], name=label.name) for label in facts.labels)
+        palette = Palette.of_labels(labels, (self.options.unit_distance or 1.0) * (self.options.scale or 1.0))
+        return self._shown(palette, light, replace(self.options, live=replace(facts, labels=labels)))
+
+    def _shown(self, table: Table | Palette, light: Any, options: PlyOptions) -> Cloud:
+        """Baked under a light that the page sends, or the file's."""
+        from vvgt_cli.conversion.live import lit
+
+        lighting = self.options.light if light is None else light_sent(light, self.options)
+        pixel = pixel_width(self.options.made_for or SIZE)
+        found = as_stored(lit(baked(self.gaussians, table, pixel), lighting))
+        return replace(self, gaussians=found, options=replace(options, light=lighting, sh_degree=None), ply=None)
+
+
+def labels_sent(sent: Any) -> LabelTable:
+    """The labels that a page has sent: a list of number, color (RGB in [0, 1]) and opacity.
+
+    Raises:
+        DataError: they are none.
+    """
+    what = "the page's labels"
+    if not isinstance(sent, list) or not 0 < len(sent) <= MOST_LABELS or not all(isinstance(e, dict) for e in sent):
+        raise DataError(f"{what}: expected a list of at most {MOST_LABELS} objects")
+    found = []
+    for entry in sent:
+        number, color, opacity = entry.get("number"), entry.get("color"), entry.get("opacity")
+        if not isinstance(number, int) or not isinstance(color, list) or len(color) != 3:
+            raise DataError(f"{what}: expected number, color (three numbers) and opacity")
+        if not all(isinstance(x, int | float) and 0 <= x <= 1 for x in (*color, opacity)):
+            raise DataError(f"{what}: label {number}; expected color and opacity in [0, 1]")
+        found.append(Label(number, str(number), triple(list(map(float, color))), float(opacity)))
+    return LabelTable(what, tuple(sorted(found, key=lambda label: label.number)))
 
 
 def function_sent(sent: Any) -> TransferFunction:
@@ -204,13 +247,15 @@ class Desk:
         return json.dumps(self.state).encode()
 
     def function(self, sent: Any) -> Part:
-        """Convert the volume for a function that the page sends, or for none: what is being done ends.
+        """Convert the volume for a function, or labels, that the page sends, or for none: what is being done ends.
 
         Raises:
-            DataError: it is no function.
+            DataError: it is neither.
         """
         assert self.converter is not None
-        tf = None if sent is None else function_sent(sent)
+        tf: Job = None
+        if sent is not None:
+            tf = labels_sent(sent["labels"]) if isinstance(sent, dict) and "labels" in sent else function_sent(sent)
         with self.converter.lock:
             self.parts.pop(f"{self.state['number']}.ply", None)
             self.better = None
@@ -229,10 +274,10 @@ class Desk:
         Raises:
             DataError: something else is asked for, or what was shown is not there any more.
         """
-        keys = {"file", "number", "function", "light"}
+        keys = {"file", "number", "function", "labels", "light"}
         if not isinstance(sent, dict) or sent.get("file") not in ("ply", "html") or not set(sent) <= keys:
             raise DataError(
-                "what to save: expected an object with file, ply or html, and a number, or a function and a light"
+                "what to save: expected file, ply or html, and a number, or a function or labels, and a light"
             )
         better, number = self.better, sent.get("number")
         if number is not None and (better is None or number != self.state["number"]):
@@ -241,6 +286,8 @@ class Desk:
         cloud = self.first() if number is None or better is None else Cloud.of(better, self.name)
         if sent.get("function") is not None and cloud.live:
             cloud = cloud.under(function_sent(sent["function"]), sent.get("light"))
+        if sent.get("labels") is not None and cloud.live:
+            cloud = cloud.labelled(sent["labels"], sent.get("light"))
         return cloud.file(sent["file"])
 
     def hear(self, number: int, message: Message) -> None:

@@ -15,7 +15,7 @@ from vvgt_cli.gaussians.outputs import Output
 
 VERTEX_BYTES = 68  # x y z, normals, three colours, opacity, three scales, four of rotation: float32
 HARMONIC_BYTES = {0: 0, 1: 36, 2: 96, 3: 180}  # up to a degree
-HEADER_BYTES = {0: 1000, 1: 1200, 2: 1600, 3: 2200}
+HEADER_BYTES = {0: 3600, 1: 3800, 2: 4200, 3: 4800}  # a legend takes up to 2500
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import numpy as np
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.labels import LabelTable
 
-MOST_NODES, MOST_LABELS = 40, 24  # a header has little room
+MOST_NODES, MOST_LABELS, LONGEST = 32, 24, 2500  # nodes, labels, characters: a header has little room
 LONGEST_NAME = 40  # characters of a label's
 
 
@@ -25,7 +25,9 @@ def legend_text(tf: object, lo: float, hi: float, unit: str) -> str | None:
     if isinstance(tf, LabelTable):
         shown = [label for label in tf.labels if label.opacity > 0]
         rows = [[label.name[:LONGEST_NAME], _hex(label.color)] for label in shown[:MOST_LABELS]]
-        return json.dumps({"labels": rows, "of": len(shown)})
+        while len(text := json.dumps({"labels": rows, "of": len(shown)})) > LONGEST:
+            rows.pop()
+        return text
     if not isinstance(tf, TransferFunction):
         return None
     places = np.unique(np.concatenate([[lo, hi], tf.opacity_nodes.x, tf.color_map.x]).clip(lo, hi))

@@ -99,5 +99,5 @@ def _times(frames: Frames, options: ReadOptions, source: str) -> tuple[int, int]
             raise SeveralSteps(source, times, times=at, unit=frames.unit)
         return 1, times
     if (options.time or 0) >= times:
-        raise UsageError(f"{source}: --time {options.time}: it has {times} time steps; expected 0 to {times - 1}")
+        raise UsageError(f"{source}: --time {options.time}: expected a time step from 0 to {times - 1}")
     return times, rest

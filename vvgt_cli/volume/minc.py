@@ -164,7 +164,7 @@ def _volume(image: _Image, path: Path, options: ReadOptions) -> Volume:
     if times > 1 and options.time is None:
         raise SeveralSteps(str(path), times)
     if (options.time or 0) >= times:
-        raise UsageError(f"{path}: --time {options.time}: it has {times} time steps; expected 0 to {times - 1}")
+        raise UsageError(f"{path}: --time {options.time}: expected a time step from 0 to {times - 1}")
     if options.component not in (None, 0):
         raise UsageError(f"{path}: a scalar volume; leave out --component {options.component}")
     lead = (options.time or 0,) if len(shape) == 4 else ()

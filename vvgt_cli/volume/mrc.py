@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import struct
+import warnings
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,7 +38,7 @@ class Header:
     """What a header says: ``sizes`` (columns, rows, sections), ``axes`` (of these three: 0 is x, 1 y, 2 z).
 
     ``steps`` are the (x, y, z) vectors of a step along cell axes x, y and z, ``origin`` the centre of the first voxel,
-    both in angstroms.
+    both in angstroms; ``stated``: the header says how long the steps are.
     """
 
     sizes: tuple[int, int, int]
@@ -47,6 +48,7 @@ class Header:
     axes: tuple[int, ...]
     steps: np.ndarray
     origin: np.ndarray
+    stated: bool
 
 
 def _order(head: bytes) -> str:
@@ -103,6 +105,7 @@ def parse_header(head: bytes, name: str) -> Header:
         axes,
         steps,
         origin,
+        all(math.isfinite(c) and c > 0 for c in cell),
     )
 
 
@@ -155,6 +158,11 @@ def read_mrc(path: Path, options: ReadOptions) -> Volume:
     step = options.time or 0
     if step >= header.volumes:
         raise UsageError(f"{path}: --time {step}: it has {header.volumes} volumes; expected 0 to {header.volumes - 1}")
+    if not header.stated and options.spacing is None:
+        warnings.warn(
+            f"{path}: its header states no cell; its voxels are taken as 1 angstrom wide (--spacing X Y Z: otherwise)",
+            stacklevel=2,
+        )
     shape, dtype = header.sizes[::-1], header.dtype
     offset = header.offset + step * math.prod(shape) * dtype.itemsize
     if encoding == "raw":

@@ -151,7 +151,7 @@ def _step(block: np.ndarray, options: ReadOptions, source: str) -> int | str | N
     if options.component is not None:
         raise UsageError(f"{source}: --time and --component both choose along its one axis of time; leave out one")
     if options.time >= times:
-        raise UsageError(f"{source}: --time {options.time}: it has {times} time steps; expected 0 to {times - 1}")
+        raise UsageError(f"{source}: --time {options.time}: expected a time step from 0 to {times - 1}")
     return options.time if times > 1 else None
 
 

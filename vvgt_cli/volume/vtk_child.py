@@ -15,6 +15,7 @@ import warnings
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from threading import Event, Thread
 from typing import IO, Any, cast
 
 import numpy as np
@@ -30,6 +31,7 @@ from vvgt_cli.volume.vtk_index import INDEX, SINGLE
 
 SECONDS, A_BYTE, A_VOXEL = 60, 1e-6, 4e-6  # processor time: at least, of a byte of the files, of a sample
 START = f"from {__name__} import main; main()"
+IDLE, LOOK = 60.0, 2.0  # s without any processor time after which it counts as hung, and between looks
 KEYS = ("dims", "spacing", "array", "component", "time")
 LARGEST = 1 << 20  # bytes of the line of an answer
 
@@ -81,7 +83,8 @@ def run(request: dict[str, Any]) -> tuple[tuple[dict[str, Any], np.ndarray] | No
         [sys.executable, "-c", START], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
         env={**os.environ, "PYTHONPATH": paths},
     ) as child:  # fmt: skip
-        to, back = cast(IO[bytes], child.stdin), cast(IO[bytes], child.stdout)
+        to, back, ended = cast(IO[bytes], child.stdin), cast(IO[bytes], child.stdout), Event()
+        Thread(target=_watch, args=(child, ended), daemon=True).start()
         try:
             with suppress(BrokenPipeError):  # it has ended: what it left says how
                 to.write(json.dumps(request).encode() + b"\n")
@@ -90,7 +93,23 @@ def run(request: dict[str, Any]) -> tuple[tuple[dict[str, Any], np.ndarray] | No
         except BaseException:
             child.kill()
             raise
+        finally:
+            ended.set()
     return found, child.returncode
+
+
+def _watch(child: subprocess.Popen[bytes], ended: Event) -> None:
+    """Kill a child that sleeps for good: a lock of a library that broke down is never free again."""
+    stat, last, idle = Path(f"/proc/{child.pid}/stat"), "", 0.0
+    while not ended.wait(LOOK) and idle < IDLE:
+        try:
+            used = " ".join(stat.read_text().rpartition(")")[2].split()[11:13])
+        except OSError:  # it has ended, or this system has no such file
+            return
+        idle = idle + LOOK if used == last else 0.0
+        last = used
+    if not ended.is_set():
+        child.kill()
 
 
 def _bytes_near(path: Path) -> int:
@@ -125,7 +144,8 @@ def _ended(path: Path, program: str, status: int, seconds: int) -> DataError:
     kind = "VTK" if program in (INDEX, SINGLE) else program
     if status in (-signal.SIGXCPU, -signal.SIGKILL):
         return DataError(
-            f"{path}: VTK's reader of {kind} files was stopped (after {seconds} s, or for its memory); is it whole?"
+            f"{path}: VTK's reader of {kind} files was stopped (after {seconds} s, a minute of standstill, "
+            "or for its memory); is it whole?"
         )
     what = signal.Signals(-status).name if status < 0 else f"status {status}"
     return DataError(

@@ -81,7 +81,7 @@ def chosen_time(times: list[float], time: int | None, source: str) -> float | No
         raise SeveralSteps(source, len(times), times=times)
     steps = max(len(times), 1)
     if time is not None and time >= steps:
-        raise UsageError(f"{source}: --time {time}: it has {steps} time steps; expected 0 to {steps - 1}")
+        raise UsageError(f"{source}: --time {time}: expected a time step from 0 to {steps - 1}")
     return times[time or 0] if times else None
 
 

@@ -1,17 +1,22 @@
 // Gaussians that carry values, under any function: their bytes as streams of the engine, the function's table as a texture.
 import { FILTER_NEAREST, PIXELFORMAT_RGBA32F, PIXELFORMAT_RGBA8U, PROJECTION_ORTHOGRAPHIC, Texture } from 'playcanvas';
+import { Damaged } from './damage.mjs';
 import modifier from './live.glsl';
 import { sumsOf, texelsOf } from './live_table.mjs';
 
 const STREAMS = [['vvgtValues', [0, 1, 2, 6]], ['vvgtGradient', [3, 4, 5, 7]]];  // and the planes of each one's r, g, b and a
 const MOST_OPAQUE = 1 - 1e-5;  // opacity of which there still is an extinction
 
-// the planes of bytes, one after the other, that the page holds (gzip in base64)
-async function unpacked(id, alone) {
-  const element = document.getElementById(id), text = atob(element.textContent);
-  const stream = new Blob([Uint8Array.from(text, (c) => c.charCodeAt(0))]).stream();
-  if (alone) element.remove();  // of several frames, one that left memory is read again
-  return new Uint8Array(await new Response(stream.pipeThrough(new DecompressionStream('gzip'))).arrayBuffer());
+// the planes of bytes, one after the other, that the page holds (gzip in base64), `size` of them
+async function unpacked(id, alone, size) {
+  try {
+    const element = document.getElementById(id), text = atob(element.textContent);
+    const stream = new Blob([Uint8Array.from(text, (c) => c.charCodeAt(0))]).stream();
+    if (alone) element.remove();  // of several frames, one that left memory is read again
+    const bytes = new Uint8Array(await new Response(stream.pipeThrough(new DecompressionStream('gzip'))).arrayBuffer());
+    if (bytes.length === size) return bytes;
+  } catch { /* said below */ }
+  throw new Damaged('its values are not whole');
 }
 
 // {live, bytes, count, sums, rows, planes, apply(nodes), labels(list), cut(planes), light(of light.mjs), frame(k, resource)} of a viewer that has loaded its Gaussians, once they are shown so
@@ -20,7 +25,7 @@ export async function liveLook({ app }, live) {
   const planes = live.labels.length ? 8 : 6, carried = new WeakMap();  // bytes of the resources that have them
   async function carry(k, to) {
     if (carried.has(to)) return carried.get(to);
-    const bytes = await unpacked(live.held[k], live.held.length === 1), count = bytes.length / planes;
+    const bytes = await unpacked(live.held[k], live.held.length === 1, planes * to.gsplatData.numSplats), count = bytes.length / planes;
     to.format.addExtraStreams(STREAMS.map(([name]) => ({ name, format: PIXELFORMAT_RGBA8U })));
     for (const [name, own] of STREAMS) {
       const texture = to.getTexture(name), texels = texture.lock();

@@ -16,7 +16,7 @@ function row({ name, number }, k) {
   return element;
 }
 
-// The element; `history` as light.mjs has it
+// {root, rows(): of each label number, name, color, and the opacity that is seen}; `history` as light.mjs has it
 export function organs(look, labels, history) {
   const root = document.createElement('div');
   root.className = 'organs';
@@ -25,6 +25,8 @@ export function organs(look, labels, history) {
   find('[type=search]').hidden = labels.length <= SEARCHED;
   list.append(...labels.map(row));
   let now = { rows: labels.map(({ rgb, opacity }) => ({ rgb, opacity, on: true })), solo: -1 }, due = false, moving = false;
+
+  const seen = () => now.rows.map(({ rgb, opacity, on }, k) => ({ rgb, opacity: (now.solo < 0 ? on : now.solo === k) ? opacity : 0 }));
 
   // opacity on a cubic scale, as the function's
   function show() {
@@ -36,11 +38,12 @@ export function organs(look, labels, history) {
       color.value = hex(rgb);
       slider.value = Math.cbrt(opacity);
     });
+    history.changed(false);
     if (due) return;
     due = true;
     requestAnimationFrame(() => {
       due = false;
-      look.labels(now.rows.map(({ rgb, opacity, on }, k) => ({ rgb, opacity: (now.solo < 0 ? on : now.solo === k) ? opacity : 0 })));
+      look.labels(seen());
     });
   }
 
@@ -68,5 +71,7 @@ export function organs(look, labels, history) {
   });
   history.add({ key: 'labels', state: () => now, set: (then) => { now = then; show(); } });
   show();
-  return root;
+  const digits = (x, n) => Number(x.toFixed(n));
+  const rows = () => seen().map(({ rgb, opacity }, k) => ({ number: labels[k].number, name: labels[k].name, color: rgb.map((c) => digits(c, 4)), opacity: digits(opacity, 6) }));
+  return { root, rows };
 }

@@ -3,6 +3,7 @@
 import css from '@playcanvas/supersplat-viewer/viewer.css';
 import { createViewer } from '@playcanvas/supersplat-viewer/viewer';
 import { Asset, SHADERLANGUAGE_GLSL, ShaderChunks } from 'playcanvas';
+import { Damaged, unlessFailing, wholePly } from './damage.mjs';
 import { liveLook } from './live.mjs';
 import panelCss from './panel.css';
 import { panel, named } from './panel.mjs';
@@ -32,6 +33,7 @@ function content({ file, held }) {
   const element = document.getElementById(held);
   const text = atob(element.textContent), bytes = new Uint8Array(text.length);
   for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i);
+  if (!wholePly(bytes)) throw new Damaged('its Gaussians are not whole');
   if (scene.frames.length === 1) element.remove();  // of several, one that left memory is read again
   return Promise.resolve(new Response(bytes));
 }
@@ -152,7 +154,7 @@ async function start() {
   viewer.app.scene.gsplat.alphaClipForward = scene.rule.minAlpha;
   viewer.app.scene.gsplat.minPixelSize = Math.sqrt(32 * scene.rule.minVariance);
   deliver(response);
-  if (!viewer.state.loaded) await new Promise((done) => viewer.events.once('loaded:changed', done));
+  if (!viewer.state.loaded) await unlessFailing(viewer.app, new Promise((done) => viewer.events.once('loaded:changed', done)));
   viewer.state.cameraMode = 'orbit';  // the viewer would turn the object
   if (scene.frames.length === 1 && !scene.live) document.body.append(named('baked'));
   const live = scene.live ? panel(await liveLook(viewer, scene.live), viewer, scene.live) : null;
@@ -164,5 +166,7 @@ async function start() {
 }
 
 start().catch((error) => {
-  said.textContent = `This browser does not show it: ${error.message ?? error}`;
+  const text = error.message ?? String(error);
+  said.textContent = error instanceof Damaged ? `This page is damaged: ${text}; get it anew` : `This browser does not show it: ${text}`;
+  document.getElementById('view').hidden = true;
 });

@@ -118,7 +118,7 @@ export function panel(look, viewer, live) {
     if (undone.length > 200) undone.shift();
     find('.undo').disabled = false;
   }
-  const history = { keep, add: (part) => parts.push(part), changed: () => told(true) };
+  const history = { keep, add: (part) => parts.push(part), changed: (alone = true) => told(alone) };
 
   function undo() {
     if (!undone.length) return;
@@ -235,8 +235,9 @@ export function panel(look, viewer, live) {
   root.append(cut.root);
 
   root.classList.toggle('labelled', labelled);
+  const table = labelled ? organs(look, live.labels, history) : null;
   if (labelled) {
-    root.querySelector('div').after(organs(look, live.labels, history));
+    root.querySelector('div').after(table.root);
     find('.organs div').prepend(find('.undo'));
   }
   root.append(light(look, viewer, live.light, history));
@@ -260,5 +261,5 @@ export function panel(look, viewer, live) {
   find('.counts').setAttribute('d', counts.map((n, k) => `M${(6 + k * bar).toFixed(2)},${HIGH}v${((-HIGH * 0.9 * Math.log1p(n)) / most).toFixed(2)}h${bar.toFixed(2)}V${HIGH}Z`).join(''));
   fold(innerWidth < 700);
   draw();
-  return { root, look, changed(f) { told = f; }, cut, alone: () => cut.planes().length > 0 || lamp.state() !== begun, lit: () => (lamp.state() === begun ? null : lamp.state()), labelled, parts, nodes: () => copy(exact ?? nodes), set(now) { keep(); [nodes, exact, chosen] = now === live.nodes ? [fewer(now), now, 0] : [copy(now), null, 0]; show(); } };
+  return { root, look, changed(f) { told = f; }, cut, alone: () => cut.planes().length > 0 || lamp.state() !== begun, lit: () => (lamp.state() === begun ? null : lamp.state()), labelled, rows: () => table.rows(), parts, nodes: () => copy(exact ?? nodes), set(now) { keep(); [nodes, exact, chosen] = now === live.nodes ? [fewer(now), now, 0] : [copy(now), null, 0]; show(); } };
 }

@@ -32,6 +32,9 @@ export function functionFile(nodes, { values: [lo, hi], opacity_unit_distance, n
   return { name: name || 'transfer function', points, opacity_unit_distance };
 }
 
+// labels as a table that --labels reads
+const labelsFile = (rows) => Object.fromEntries(rows.map(({ number, ...rest }) => [number, rest]));
+
 function download(content, name) {
   const link = document.createElement('a');
   link.href = URL.createObjectURL(content);
@@ -81,16 +84,17 @@ function substitute({ app }) {
   return { load, put, drop };
 }
 
-// panel: {root, nodes(), changed(f), alone(): a cut or another light, which the live form alone has; lit(): the other light, or null}; server: {converts, name}, none of a page in a file
+// panel: {root, nodes(), rows(): of labels,  changed(f), alone(): a cut or another light, which the live form alone has; lit(): the other light, or null}; server: {converts, name}, none of a page in a file
 export function served(panel, viewer, live, server) {
-  if (panel.labelled) return;  // no function to convert for, or to save
-  const { root } = panel, kind = root.querySelector('.named i'), name = server?.name ?? document.title;
+  const { root, labelled } = panel, kind = root.querySelector('.named i'), name = server?.name ?? document.title;
   const row = document.createElement('div'), text = document.createElement('p');
   row.className = 'save';
   row.textContent = 'Save';
   text.setAttribute('role', 'status');
   root.append(text, row);
   const better = substitute(viewer);
+  const json = labelled ? 'labels.json' : 'tf.json';
+  const shown = () => (labelled ? { labels: panel.rows().map(({ number, color, opacity }) => ({ number, color, opacity })) } : { function: functionFile(panel.nodes(), live) });
   let number = null, told = '', busy = false, down = false, timer = 0, change = 0;  // number of the better form, and what it is
 
   const say = (line, failed) => {
@@ -116,7 +120,7 @@ export function served(panel, viewer, live, server) {
     const mine = change;
     busy = true;
     try {
-      const answer = await send('function', functionFile(panel.nodes(), live));
+      const answer = await send('function', labelled ? shown() : shown().function);
       if (!answer.ok) throw new Error(await reason(answer));
       const job = (await answer.json()).number;
       while (mine === change) {
@@ -157,9 +161,9 @@ export function served(panel, viewer, live, server) {
   }
 
   async function save(file) {
-    if (file === 'json') return download(new Blob([`${JSON.stringify(functionFile(panel.nodes(), live), null, 1)}\n`], { type: 'application/json' }), 'tf.json');
+    if (file === 'json') return download(new Blob([`${JSON.stringify(labelled ? labelsFile(panel.rows()) : shown().function, null, 1)}\n`], { type: 'application/json' }), json);
     try {
-      const answer = await send('save', improved() ? { file, number } : { file, function: functionFile(panel.nodes(), live), light: panel.lit() });
+      const answer = await send('save', improved() ? { file, number } : { file, ...shown(), light: panel.lit() });
       if (!answer.ok) throw new Error(await reason(answer));
       download(await answer.blob(), `${name}.${file}`);
     } catch (error) {
@@ -169,8 +173,8 @@ export function served(panel, viewer, live, server) {
 
   for (const file of server ? ['ply', 'html', 'json'] : ['json']) {
     const button = document.createElement('button');
-    button.textContent = file === 'json' ? 'tf.json' : `.${file}`;
-    button.title = `save ${NAMES[file]}`;
+    button.textContent = file === 'json' ? json : `.${file}`;
+    button.title = `save ${file === 'json' && labelled ? 'the table of labels' : NAMES[file]}`;
     button.addEventListener('click', () => save(file));
     row.append(button);
   }
