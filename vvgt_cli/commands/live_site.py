@@ -100,12 +100,7 @@ class Cloud:
         table = Table.of_function(tf, facts.lo, facts.hi, distance * scale)
         facts = replace(facts, function=function_text(tf, facts.lo, facts.hi))
         options = replace(
-<<<<<<< HEAD
-            self.options, live=facts, certificate=None, unit_distance=distance, unit_distance_label="file",
-            light=lighting, function=tf.name, sh_degree=None,
-=======
             self.options, live=facts, unit_distance=distance, unit_distance_label="file", function=tf.name
->>>>>>> main
         )  # fmt: skip
         return self._shown(table, light, options)
 
@@ -129,7 +124,8 @@ class Cloud:
         lighting = self.options.light if light is None else light_sent(light, self.options)
         pixel = pixel_width(self.options.made_for or SIZE)
         found = as_stored(lit(baked(self.gaussians, table, pixel), lighting))
-        return replace(self, gaussians=found, options=replace(options, light=lighting, sh_degree=None), ply=None)
+        options = replace(options, light=lighting, sh_degree=None, certificate=None)
+        return replace(self, gaussians=found, options=options, ply=None)
 
 
 def labels_sent(sent: Any) -> LabelTable:
