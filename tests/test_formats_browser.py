@@ -94,11 +94,13 @@ def test_a_page_of_several_in_a_file_goes_to_each(file: Path, tmp_path: Path) ->
     from vvgt_cli.gaussians import write_ply
 
     gaussians = read_ply(file)[0]
-    white = replace(gaussians, colors=np.ones_like(gaussians.colors))
+    here = gaussians.means[:, :1] > 0  # the rest is the same: the second is held as what differs
+    white = replace(gaussians, colors=np.where(here, np.float32(1), gaussians.colors))
     for name, frame in (("f0.ply", gaussians), ("f1.ply", white)):
         write_ply(tmp_path / name, frame)
     files = [str(tmp_path / f"f{k}.ply") for k in (0, 1)]
     assert run(["view", *files, "-o", str(tmp_path / "both.html"), "--quiet"]) == 0
+    assert '"whole": 0' in (tmp_path / "both.html").read_text("utf-8")
     expected = render(white, orbit_views(1, size=SIZE)[0], rule="inria")[..., :3]
     for frame, picture in ((0, ours(file)), (1, expected)):
         shot, noted = shoot((tmp_path / "both.html").as_uri(), tmp_path, frame=frame)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vvgt_cli.conversion.carried import Carry, carries
 from vvgt_cli.conversion.convert import opened, run_conversion
 from vvgt_cli.conversion.frames import common, interrupted, steps_of, with_blocks
 from vvgt_cli.conversion.functions import beside
@@ -186,13 +187,13 @@ def frames_in_memory(request: ConvertRequest, console: Console) -> Clouds:
     steps = steps_of(request.source)
     request = with_blocks(request, steps, console)
     series = common(Run(console, ConversionReport("convert")), request, steps)
-    clouds = []
+    clouds, carry = [], carries(request)
     for k, step in enumerate(steps):
         if series.dark[k]:
             console.say(f"{step.name}: nothing of it is visible; it is left out")
             continue
         one = replace(request, source=series.source_of(step))
-        clouds.append(_cloud(one, console, step.name, str(k), {"frame": k, **step.facts()}))
+        clouds.append(_cloud(one, console, step.name, str(k), {"frame": k, **step.facts()}, carry=carry))
     return Clouds(FRAMES, Path(request.source.path).name, clouds)
 
 
@@ -232,14 +233,15 @@ def labels_in_memory(request: ConvertRequest, console: Console) -> Clouds:
 
 def _cloud(
     request: ConvertRequest, console: Console, name: str, stem: str, facts: dict[str, Any],
-    made: Gaussians | None = None,
+    made: Gaussians | None = None, carry: Carry | None = None,
 ) -> Cloud:  # fmt: skip
     """A conversion of which the volume is let go of."""
     run = Run(console, ConversionReport("convert"))
     with opened(run, request) as volume:
-        found: Conversion = run_conversion(run, request, volume, made)
+        found: Conversion = run_conversion(run, request, volume, made, carry)
         normals = found.normals()
     run.finish()
     if interrupted(found.report):
         raise KeyboardInterrupt
+    facts = facts | (carry.facts() if carry else {})
     return Cloud(found.gaussians, found.report, found.ply, name, stem, facts, normals)

@@ -8,20 +8,25 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 
+<<<<<<< HEAD
 from vvgt_cli.conversion.certify import certified
 from vvgt_cli.conversion.gaussian_files import write_gaussians
+=======
+from vvgt_cli.conversion.carried import Carry
+from vvgt_cli.conversion.gaussian_files import is_page, write_gaussians
+>>>>>>> main
 from vvgt_cli.conversion.live import check_live, live_conversion
 from vvgt_cli.conversion.place import out_of_box, placed, remarks, way_up
 from vvgt_cli.conversion.plan import Plan, Planner, check_memory
 from vvgt_cli.conversion.readback import tell_cost
-from vvgt_cli.conversion.request import ConvertRequest, file_bytes
+from vvgt_cli.conversion.request import ConvertRequest, FitOptions, file_bytes
 from vvgt_cli.conversion.result import Conversion
 from vvgt_cli.conversion.resume import FITTED, Checkpoint, checkpoint_folder, checkpoint_of
 from vvgt_cli.conversion.stage import Work
 from vvgt_cli.conversion.stages import CheckViews, ClosedFormStage
 from vvgt_cli.conversion.stages.views import wide
 from vvgt_cli.errors import UsageError
-from vvgt_cli.field.field import Field, Resident
+from vvgt_cli.field.field import Field, Picture, Resident
 from vvgt_cli.field.open import Wanted, automatic, beside, blocked
 from vvgt_cli.field.source import Source, describe_source, load, tf_record, volume_record
 from vvgt_cli.field.workload import expected_wide
@@ -41,7 +46,9 @@ VIEW_DEGREE = 2  # of harmonics by default where the light depends on the view: 
 SMALLER = (8, 4, 2)  # parts of the budget that a target is tried with first
 
 
-def convert(request: ConvertRequest, console: Console | None = None, made: Gaussians | None = None) -> ConversionReport:
+def convert(
+    request: ConvertRequest, console: Console | None = None, made: Gaussians | None = None, carry: Carry | None = None
+) -> ConversionReport:
     """Volume to `.ply`: `run_conversion`, and its outputs written.
 
     Raises:
@@ -59,7 +66,7 @@ def convert(request: ConvertRequest, console: Console | None = None, made: Gauss
         checkpoint_folder(request.checkpoint),
         opened(run, request) as field,
     ):
-        conversion = run_conversion(run, request, field, made)
+        conversion = run_conversion(run, request, field, made, carry)
         report = _write(run, request, conversion)
         if request.checkpoint is not None and not _interrupted(run):
             Checkpoint(Path(request.checkpoint)).finish()
@@ -118,12 +125,15 @@ def fitted(run: Run, request: ConvertRequest) -> Gaussians:
         return work.made()
 
 
-def run_conversion(run: Run, request: ConvertRequest, field: Field, made: Gaussians | None = None) -> Conversion:
+def run_conversion(
+    run: Run, request: ConvertRequest, field: Field, made: Gaussians | None = None, carry: Carry | None = None
+) -> Conversion:
     """Closed form, what views can improve of it, scores on the test views; only checkpoints are written.
 
     What of these is done, and with how many Gaussians, follows from the request's limits and what the stages cost
     (`vvgt_cli.conversion.plan`); the check views decide. What is left out is said, and costs nothing. Of Gaussians that
-    are ``made`` already, box frame, there are scores alone.
+    are ``made`` already, box frame, there are scores alone. With a ``carry``, it goes on from the frame before where
+    that is as near.
 
     Returns:
         The conversion; the run's report is still open.
@@ -134,7 +144,9 @@ def run_conversion(run: Run, request: ConvertRequest, field: Field, made: Gaussi
     if request.live:
         check_live(request)
         return live_conversion(run, request, field, ply_options(request, field.source))
-    work, planner, plan = _planned(run, request, field)
+    if carry is not None:
+        field = carry.remembered(field)
+    work, planner, plan = _planned(run, request, field, expected=carry is None)
     if made is not None:
         plan.stages, plan.left_out = [stage for stage in plan.stages if stage.scores], []
         plan.gaussians, plan.case = len(made), replace(plan.case, gaussians=len(made))
@@ -148,16 +160,25 @@ def run_conversion(run: Run, request: ConvertRequest, field: Field, made: Gaussi
     elif kept:
         work.gaussians = kept[0]
         run.console.say(f"{request.checkpoint} holds the fitted Gaussians: only the scores are left")
-    else:
-        plan = _fit(work, request, planner, plan)
+    elif carry is None or not carry.goes_on(work, plan, request):
+        if carry is not None:
+            field.expect(_pictures(plan, work.fit))
+        whole, plan = plan, _fit(work, request, planner, plan)
+        if carry is not None:
+            carry.keep(work, whole)
     for stage in plan.stages:
         if stage.scores:
             stage.run(work)
     return _conversion(request, work, work.made())
 
 
-def _planned(run: Run, request: ConvertRequest, field: Field) -> tuple[Work, Planner, Plan]:
-    """All that comes before the first stage."""
+def _pictures(plan: Plan, fit: FitOptions) -> list[Picture]:
+    """That its stages will ask for."""
+    return [view for stage in plan.stages for view in stage.views(fit)]
+
+
+def _planned(run: Run, request: ConvertRequest, field: Field, expected: bool = True) -> tuple[Work, Planner, Plan]:
+    """All that comes before the first stage; the pictures that it needs are ``expected``."""
     fit = replace(request.fit, max_gaussians=request.budget())
     if fit.model is not None:
         read_card(find_model(fit.model))  # fails before the work, not after
@@ -171,7 +192,8 @@ def _planned(run: Run, request: ConvertRequest, field: Field) -> tuple[Work, Pla
     )  # fmt: skip
     plan = planner.plan(case, run.elapsed())
     run.report.plan = plan.record()
-    field.expect([view for stage in plan.stages for view in stage.views(fit)])
+    if expected:
+        field.expect(_pictures(plan, fit))
     return Work(run, field, fit, request.limits, degree), planner, plan
 
 

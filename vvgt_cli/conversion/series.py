@@ -7,6 +7,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+from vvgt_cli.conversion.carried import carries
 from vvgt_cli.conversion.convert import convert
 from vvgt_cli.conversion.frames import Series, common, interrupted, steps_of, with_blocks
 from vvgt_cli.conversion.index import FRAMES, entry, frame_names, index_of, index_output, psnr_of, write_index
@@ -65,6 +66,7 @@ def _frames(
 ) -> int:
     """Convert what is missing of this part's frames; returns how many."""
     done = 0
+    carry = carries(request, manifest.shard.count)
     for k, step in enumerate(series.steps):
         own = [Path(name).name for name in names[k]]
         if not manifest.shard.holds(k) or all(map(manifest.complete, own)):
@@ -73,10 +75,11 @@ def _frames(
             console.say(f"{step.name}: nothing of it is visible; it gets no file")
             continue
         console.say(f"{step.told()}: frame {k + 1} of {len(series.steps)}, to {names[k][0]}")
-        report = convert(_frame(request, series.source_of(step), names[k]), console)
+        report = convert(_frame(request, series.source_of(step), names[k]), console, carry=carry)
         if interrupted(report):
             raise KeyboardInterrupt  # the frame is there, but not what it would be: it is made again
-        manifest.record(own, {own[0]: {"gaussians": report.gaussians, "psnr": psnr_of(report)}})
+        facts = {"gaussians": report.gaussians, "psnr": psnr_of(report), **(carry.facts() if carry else {})}
+        manifest.record(own, {own[0]: facts})
         done += 1
     return done
 
@@ -93,9 +96,8 @@ def _indexed(
         for k, (step, row) in enumerate(zip(series.steps, names, strict=True)):
             file = Path(row[0]).name
             if (there := manifest.files.get(file)) is not None:
-                one = entry(
-                    step.name, there.get("gaussians"), there["bytes"], there.get("psnr"), frame=k, **step.facts()
-                )
+                facts = step.facts() | ({"moved": there["moved"]} if "moved" in there else {})
+                one = entry(step.name, there.get("gaussians"), there["bytes"], there.get("psnr"), frame=k, **facts)
                 files.append({**one, "file": file})
         found = index_of(FRAMES, Path(volume).name, files)
         write_index(index, found, overwrite=True)

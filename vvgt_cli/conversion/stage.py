@@ -17,6 +17,7 @@ from vvgt_cli.score.record import Run
 
 if TYPE_CHECKING:
     from vvgt_cli.closed_form import Start
+    from vvgt_cli.dvr import RenderSettings
     from vvgt_cli.field.field import Field, Picture
 
 
@@ -41,7 +42,7 @@ class Work:
         start: the closed form, once it is there, with the pyramid that it was cut from.
         gaussians: so far, in the box frame.
         check: views to judge by, once they are there; ``train``: views to fit to.
-        train_rule: by which training views are drawn.
+        train_rule: by which training views are drawn; ``train_settings``: what the volume's were rendered with.
     """
 
     run: Run
@@ -56,6 +57,7 @@ class Work:
     check: Views | None = None
     train: Views | None = None
     train_rule: Rule | None = None
+    train_settings: RenderSettings | None = None
 
     @property
     def rule(self) -> Rule:

@@ -22,6 +22,7 @@ def optimize(
     check: Check | None = None,
     progress: Progress | None = None,
     stop: Callable[[], bool] | None = None,
+    free: np.ndarray | None = None,
 ) -> tuple[Gaussians, OptimizeRecord]:
     """Descend on the difference between pictures of Gaussians and views.
 
@@ -33,13 +34,14 @@ def optimize(
             is the best that they have seen, the input included. Without them the last step's Gaussians are returned.
         progress: called after each step with the steps taken and expected.
         stop: asked before each step; True ends the run as a time budget would.
+        free: (K,) bool, those that move, of the method "frame"; None: all.
 
     Raises:
         DataError: no views, or images that do not fit their cameras.
     """
     from vvgt_cli.refine.loop import run
 
-    return run(gaussians, cameras, images, options or OptimizeOptions(), check, progress, stop)
+    return run(gaussians, cameras, images, options or OptimizeOptions(), check, progress, stop, free)
 
 
 __all__ = ["LOSS_3DGS", "METHODS", "OptimizeOptions", "OptimizeRecord", "optimize"]

@@ -35,13 +35,14 @@ def run(
     check: Check | None,
     progress: Progress | None,
     stop: Callable[[], bool] | None,
+    free: np.ndarray | None = None,
 ) -> tuple[Gaussians, OptimizeRecord]:
     """`optimize` without its defaults."""
     _fit("training", cameras, images)
     if check is not None:
         _fit("check", *check)
     record = OptimizeRecord()
-    state = begin(gaussians, cameras, options)
+    state = begin(gaussians, cameras, options, free)
     judge = Judge(state, check, record, options.judge)
     keep, course = _checkpoint(options, gaussians, (cameras, images), check, state, judge)
     entered, order = time.perf_counter(), shuffled_views(len(cameras), options.seed)
@@ -102,14 +103,16 @@ def _checkpoint(
     return lambda: save(path, key, state, judge, judge.record, asdict(course)), course
 
 
-def begin(gaussians: Gaussians, cameras: Sequence[Camera], options: OptimizeOptions) -> State:
+def begin(
+    gaussians: Gaussians, cameras: Sequence[Camera], options: OptimizeOptions, free: np.ndarray | None = None
+) -> State:
     """What the method descends on: of Gaussians that carry values, the look that they have."""
     gaussians = replace(gaussians, live=None)
     if options.method == "3dgs":
         return Densified(gaussians, cameras, options)
     if options.method == "adam":
         return Fields(gaussians, cameras)
-    return OwnFrame(gaussians, cameras, options.rule)
+    return OwnFrame(gaussians, cameras, options.rule, free)
 
 
 def step(

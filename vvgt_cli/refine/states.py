@@ -55,7 +55,10 @@ class OwnFrame:
     BETAS = 0.6, 0.999
     STEADY = True  # what falls far behind its best can be put back there, and a run without gain is at its end
 
-    def __init__(self, gaussians: Gaussians, cameras: Sequence[Camera], rule: Rule = INRIA) -> None:
+    def __init__(
+        self, gaussians: Gaussians, cameras: Sequence[Camera], rule: Rule = INRIA, free: np.ndarray | None = None
+    ) -> None:
+        """``free`` (K,) bool: those that move; None: all."""
         scales = np.exp(gaussians.log_scales.astype(np.float64))
         harmonics = gaussians.harmonics
         self.arrays: tuple[np.ndarray, ...] = (
@@ -73,6 +76,8 @@ class OwnFrame:
         self.spread = rule.dilation * pixel**2
         self.step = 0
         self.shared = shared_steps(*self.arrays[:4])
+        self.fixed = np.empty(0, np.int64) if free is None else np.flatnonzero(~free)
+        self.there = tuple(array[self.fixed] for array in self.arrays)
 
     def colors_from(self, camera: Camera) -> np.ndarray:
         """(K, 3) colours as the camera sees them, which may be negative."""
@@ -111,6 +116,9 @@ class OwnFrame:
             first, second = (array.reshape(-1) for array in self.running)
             values, slope = harmonics.reshape(-1), slopes.harmonics.reshape(-1)
             steps.adam(values, slope, rate * pace, *self.BETAS, self.step, first, second)
+        if len(self.fixed):
+            for array, there in zip(self.arrays, self.there, strict=True):
+                array[self.fixed] = there
 
     def common(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """What is added to Adam's divisors, features and weights of what is shared; from slopes ``rows`` (COUNT, K)."""

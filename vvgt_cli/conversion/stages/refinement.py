@@ -91,11 +91,12 @@ def _seen(work: Work, gaussians: Gaussians) -> Gaussians:
 
 
 def refine(
-    run: Run, start: Gaussians, train: Views, check: Views, options: OptimizeOptions, begin: Gaussians | None = None
-) -> Gaussians:
+    run: Run, start: Gaussians, train: Views, check: Views, options: OptimizeOptions, begin: Gaussians | None = None,
+    free: np.ndarray | None = None,
+) -> Gaussians:  # fmt: skip
     """The stage: the best that the check views have seen, as a file holds it; ``start`` where nothing was better.
 
-    Descent begins with ``begin``, where that is given.
+    Descent begins with ``begin``, where that is given; of ``free`` (K,) bool only those move.
     """
     with run.stage("refinement") as stage, run.console.interruption(run.console.say) as stop:
         result, record = optimize(
@@ -106,6 +107,7 @@ def refine(
             (check.cameras, check.images, check.blocks),
             progress=run.console.bar("refinement"),
             stop=stop,
+            free=free,
         )
         if begin is not None:
             record.psnr_before = check.psnr(start, options.judge)
@@ -131,6 +133,15 @@ def _note(record: OptimizeRecord, options: OptimizeOptions) -> str:
 def drawn_by_all(gaussians: Gaussians, size: int, dilation: float = 0.0) -> Gaussians:
     """Without what viewers leave out: splats that never reach 1/255, and, widened with their mass kept, small ones.
 
+    Arguments as of `widened_small`.
+    """
+    found, kept = widened_small(gaussians, size, dilation)
+    return found.take(kept) if kept.any() else gaussians
+
+
+def widened_small(gaussians: Gaussians, size: int, dilation: float = 0.0) -> tuple[Gaussians, np.ndarray]:
+    """Gaussians of which small ones are widened with their mass kept, and (K,) bool whether they reach 1/255.
+
     Args:
         gaussians: in the unit frame.
         size: pixels along the edge of the screen that the file is made for; none stays narrower than `SMALLEST` there.
@@ -143,9 +154,6 @@ def drawn_by_all(gaussians: Gaussians, size: int, dilation: float = 0.0) -> Gaus
     widening = np.maximum(SMALLEST * pixel / width, 1)
     beside = dilation * (pixel / width) ** 2
     opacity = np.clip(opacity / ((widening**2 + beside) / (1 + beside)), 1e-7, 1 - 1e-7)
-    kept = opacity >= MIN_ALPHA
-    if not kept.any():
-        return gaussians
     logits = np.where(widening > 1, np.log(opacity / (1 - opacity)), gaussians.opacity_logits)
     scales = gaussians.log_scales + np.log(widening)[:, None]
-    return replace(gaussians, log_scales=scales, opacity_logits=logits).take(kept)
+    return replace(gaussians, log_scales=scales, opacity_logits=logits), opacity >= MIN_ALPHA

@@ -125,7 +125,7 @@ class TrainingViews(Stage):
             images = render_views(work.field, cameras, settings, progress=work.run.console.bar(self.name))
             rays = "one ray" if settings.samples == 1 else "adaptive rays"
             stage.note = f"{self.count} of {self.edge} px to fit to, {rays} a pixel, steps of {settings.step:g}"
-        work.train = Views(cameras, images)
+        work.train, work.train_settings = Views(cameras, images), settings
 
 
 def _spread(footprint: float) -> float:

@@ -30,10 +30,13 @@ def gsply(source: str) -> Any:
     return need("gsply", EXTRA, source, "this format")
 
 
-def compressed_ply(splats: Splats, name: str) -> bytes:
-    """A `.compressed.ply`: 16 bytes a Gaussian and 72 for 256 of them, which lie near each other."""
+def compressed_ply(splats: Splats, name: str, order: np.ndarray | None = None) -> bytes:
+    """A `.compressed.ply`: 16 bytes a Gaussian and 72 for 256 of them, which lie near each other.
+
+    ``order`` (K,) of the Gaussians; by default along Morton's curve.
+    """
     library = gsply(name)
-    s = splats.take(morton_order(splats.means))
+    s = splats.take(morton_order(splats.means) if order is None else order)
     rest = s.f_rest if s.f_rest.shape[1] else None
     content: bytes = library.compress_to_bytes(s.means, s.log_scales, s.quaternions, s.logits, s.f_dc, rest)
     said = "".join(f"comment {line}\n" for line in s.comments).encode()

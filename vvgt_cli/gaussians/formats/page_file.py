@@ -23,7 +23,8 @@ import numpy as np
 from vvgt_cli.cameras import orbit_views
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import PlyOptions
-from vvgt_cli.gaussians.formats.gsply_files import compressed_ply, read_compressed_ply
+from vvgt_cli.gaussians.formats.gsply_files import read_compressed_ply
+from vvgt_cli.gaussians.formats.page_frames import held_frames
 from vvgt_cli.gaussians.formats.splats import Splats
 from vvgt_cli.gaussians.rules import INRIA, RULES
 
@@ -87,7 +88,7 @@ def drawing(splats: Splats) -> dict[str, Any]:
 def page(
     title: str,
     splats: Splats,
-    frames: Sequence[dict[str, str]],
+    frames: Sequence[dict[str, Any]],
     parts: str,
     more: Mapping[str, Any] = MappingProxyType({}),
 ) -> str:
@@ -96,7 +97,8 @@ def page(
     Args:
         title: of the window.
         splats: of the first frame.
-        frames: of each its ``name``, its ``file``, and what it is ``held`` in, where that is in the page.
+        frames: of each its ``name``, its ``file``, what it is ``held`` in, where that is in the page, and the number
+            of the ``whole`` frame that it is held as the difference from.
         parts: elements that bring the viewer.
         more: of the scene, for the program.
     """
@@ -130,6 +132,8 @@ def html_of_several(
 ) -> bytes:
     """The page as one file: the viewer packed by gzip, each cloud as a `.compressed.ply`, all in base64.
 
+    Of frames that share Gaussians only the first is whole.
+
     Args:
         clouds: each one's name, as the page's list has it, and columns; the first is shown at first.
         name: of the file.
@@ -138,16 +142,18 @@ def html_of_several(
     """
     held = [("program", "text/plain", asset(PROGRAM))]
     held += [(key, "application/octet-stream", content) for key, content in parts.items()]
-    for k, (cloud, splats) in enumerate(clouds):
-        held.append((f"splats-{k}", "application/octet-stream", compressed_ply(splats, cloud)))
+    shown = held_frames(clouds)
+    held += [(f"splats-{k}", "application/octet-stream", frame.content) for k, frame in enumerate(shown)]
     elements = [
         f'<script type="{kind}" id="{key}">{base64.b64encode(content).decode("ascii")}</script>'
         for key, kind, content in held
     ]
     elements.append(f"<script>{asset('inflate.js').decode('utf-8')}</script>")
-    frames = [
+    frames: list[dict[str, Any]] = [
         {"name": cloud, "file": f"{k}.compressed.ply", "held": f"splats-{k}"} for k, (cloud, _) in enumerate(clouds)
     ]
+    for frame, (_, whole) in zip(frames, shown, strict=True):
+        frame |= {} if whole is None else {"whole": whole}
     return page(title_of(name), clouds[0][1], frames, "\n".join(elements), more).encode("utf-8")
 
 

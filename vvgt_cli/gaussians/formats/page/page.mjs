@@ -7,6 +7,7 @@ import { Damaged, unlessFailing, wholePly } from './damage.mjs';
 import { liveLook } from './live.mjs';
 import panelCss from './panel.css';
 import { panel, named } from './panel.mjs';
+import { patched } from './patch.mjs';
 import { served, waiting } from './server.mjs';
 import whereCss from './where.css';
 import { where } from './where.mjs';
@@ -28,14 +29,18 @@ const settings = {
 };
 
 // what the file itself holds (base64), or the server's answer
-function content({ file, held }) {
+function content({ file, held, whole }) {
   if (!held) return fetch(file);
-  const element = document.getElementById(held);
-  const text = atob(element.textContent), bytes = new Uint8Array(text.length);
-  for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i);
+  const own = heldBytes(held), bytes = whole === undefined ? own : patched(heldBytes(scene.frames[whole].held), own);
   if (!wholePly(bytes)) throw new Damaged('its Gaussians are not whole');
-  if (scene.frames.length === 1) element.remove();  // of several, one that left memory is read again
+  if (scene.frames.length === 1) document.getElementById(held).remove();  // of several, one that left memory is read again
   return Promise.resolve(new Response(bytes));
+}
+
+function heldBytes(held) {
+  const text = atob(document.getElementById(held).textContent), bytes = new Uint8Array(text.length);
+  for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i);
+  return bytes;
 }
 
 // The engine's shaders count in half pixels: their 0.3 is 0.075 px^2. Splats are drawn after this and the first content.

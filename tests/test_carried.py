@@ -1,0 +1,233 @@
+"""Frames of a series that go on from the one before: what stays stays bit for bit, in files, pages and pictures."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.random_clouds import random_cloud
+from vvgt_cli.cameras import default_views
+from vvgt_cli.cameras.blocks import BLOCK
+from vvgt_cli.conversion.changes import EDGE, REACH, Changes, changes
+from vvgt_cli.conversion.pictures import Pictures
+from vvgt_cli.dvr import RenderSettings
+from vvgt_cli.field.field import Resident
+from vvgt_cli.field.source import SourceRequest, load
+from vvgt_cli.gaussians import Gaussians, read_ply
+from vvgt_cli.gaussians.formats.page_frames import patch, patched
+from vvgt_cli.refine import OptimizeOptions, optimize
+from vvgt_cli.splat import render
+from vvgt_cli.splat.reference import covariances
+
+N = 40
+TF = {"points": [
+    {"x": 10, "rgb": [0.2, 0.4, 1], "opacity": 0}, {"x": 60, "rgb": [1, 0.6, 0.2], "opacity": 0.1},
+    {"x": 100, "rgb": [1, 1, 0.9], "opacity": 0.3},
+]}  # fmt: skip
+HOW = ("--max-gaussians", "400", "--size", "96", "--steps", "30")
+
+
+def body(radius: float) -> np.ndarray:
+    """A ball that stands still, and a smaller one of that radius, float32 (N, N, N)."""
+    z, y, x = np.meshgrid(*[np.linspace(-1, 1, N)] * 3, indexing="ij")
+    soft = lambda d: 100 / (1 + np.exp(np.clip(20 * d, -50, 50)))  # noqa: E731
+    still = soft(np.sqrt((x + 0.45) ** 2 + y**2 + z**2) - 0.4)
+    return np.maximum(still, soft(np.sqrt((x - 0.6) ** 2 + y**2 + z**2) - radius)).round().astype(np.float32)
+
+
+@pytest.fixture
+def beat(tmp_path: Path) -> Path:
+    """Four frames, the last as the third, and a function."""
+    for k, radius in enumerate((0.2, 0.208, 0.216, 0.216)):
+        np.save(tmp_path / f"v_{k}.npy", body(radius))
+    (tmp_path / "tf.json").write_text(json.dumps(TF))
+    return tmp_path
+
+
+def sources(folder: Path, *values: np.ndarray, **more) -> list:
+    (folder / "tf.json").write_text(json.dumps(TF))
+    for k, one in enumerate(values):
+        np.save(folder / f"s_{k}.npy", one)
+    whole = load(SourceRequest(str(folder / "s_0.npy"), tf=str(folder / "tf.json"), **more))
+    others = [load(SourceRequest(str(folder / f"s_{k}.npy"), tf=str(folder / "tf.json"), **more)) for k in (0, 1)]
+    return [replace(one, statistics=whole.statistics) for one in others]
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "seen"),
+    [((20, 21, 8), 90, True), ((20, 21, 8), 60.0004, False), ((3, 3, 3), 8, False), ((3, 3, 3), 12, True)],
+    ids=["inside", "by nearly nothing", "below the function", "into the function"],
+)
+def test_blocks_that_differ_are_found(tmp_path, place, value, seen):
+    values = np.where(body(0.2) > 50, 60, 0).astype(np.float32)
+    other = values.copy()
+    other[place] = value
+    found = changes(*sources(tmp_path, values, other))
+    assert found.blocks.any() == seen
+    if seen:  # a voxel and its neighbours
+        expected = np.zeros_like(found.blocks)
+        for voxel in np.ndindex(3, 3, 3):
+            expected[tuple((np.array(place) + voxel - 1) // EDGE)] = True
+        np.testing.assert_array_equal(found.blocks, expected)
+
+
+def test_a_change_beside_what_is_seen_counts(tmp_path):
+    """Values between voxels are interpolated: the surface moves where the empty voxel beside it changes."""
+    values = np.zeros((N, N, N), np.float32)
+    values[10:30, 10:30, 10:30] = 60
+    other = values.copy()
+    other[20, 20, 30] = 9  # shown by nothing itself
+    assert changes(*sources(tmp_path, values, other)).blocks.any()
+    other = values.copy()
+    other[20, 20, 33] = 9
+    assert not changes(*sources(tmp_path, values, other)).blocks.any()
+
+
+def some_changes() -> Changes:
+    blocks = np.random.default_rng(5).random((7, 8, 9)) > 0.97
+    return Changes(blocks, np.array([0.9, 0.8, 0.7]), 2 * np.array([0.9, 0.8, 0.7]) / [9, 8, 7])
+
+
+def test_gaussians_that_meet_them():
+    found, g = some_changes(), random_cloud(300, 0, 0.05, 0.5, (0.5, 1))
+    reach = REACH * np.sqrt(np.einsum("kii->ki", covariances(g)))
+    expected = np.zeros(len(g), bool)
+    for z, y, x in np.argwhere(found.blocks):
+        low = np.array([x, y, z]) * found.edge - found.half
+        expected |= ((g.means + reach >= low) & (g.means - reach < low + found.edge)).all(axis=1)
+    assert 20 < expected.sum() < 280
+    np.testing.assert_array_equal(found.meet(g), expected)
+
+
+def test_pixels_that_show_them():
+    found = some_changes()
+    rng = np.random.default_rng(0)
+    corner = np.argwhere(found.blocks)[:, ::-1].repeat(50, axis=0)
+    points = (corner + rng.random(corner.shape)) * found.edge - found.half
+    for camera in default_views("test", 4, size=200):
+        shown = found.seen_by(camera)
+        assert shown.mean() < 0.7
+        x, y, z = camera.rotation @ points.T + camera.translation[:, None]
+        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+        inside = (u >= 0) & (u < 200) & (v >= 0) & (v < 200)
+        assert shown[(v[inside] // BLOCK).astype(int), (u[inside] // BLOCK).astype(int)].all()
+
+
+def test_pictures_of_the_next_frame_are_as_drawn_anew(tmp_path):
+    first, second = (Resident(one, one.scene()) for one in sources(tmp_path, body(0.2), body(0.26)))
+    kept = Pictures(200)
+    camera, how = default_views("test", 5, size=190)[3], RenderSettings(samples=1)
+    kept.of(first).view(camera, how)
+    found = changes(first.source, second.source)
+    assert 0.02 < found.blocks.mean() < 0.2
+    kept.outdate(found)
+    drawn = []
+
+    class Counted:
+        def view(self, camera, settings, blocks):
+            drawn.append(blocks)
+            return second.view(camera, settings, blocks)
+
+    np.testing.assert_array_equal(kept.of(Counted()).view(camera, how), second.view(camera, how))
+    assert 0 < len(drawn[0].numbers) < 0.8 * 144
+    kept.of(Counted()).view(camera, how)
+    assert len(drawn) == 1
+
+
+def test_descent_moves_what_is_free():
+    g = random_cloud(60, 0, 0.05, 0.3, (0.3, 0.9))
+    cameras = default_views("train", 4, size=48)
+    images = np.stack([render(replace(g, colors=1 - g.colors), camera) for camera in cameras])
+    free = np.arange(60) % 3 == 0
+    found, _ = optimize(g, cameras, images, OptimizeOptions(steps=6), free=free)
+    moved = (found.colors != g.colors).any(axis=1)
+    np.testing.assert_array_equal(moved, free)
+    np.testing.assert_allclose(covariances(found)[~free], covariances(g)[~free], rtol=1e-4, atol=1e-9)
+
+
+def test_patches():
+    rng = np.random.default_rng(2)
+    base = rng.integers(0, 256, 5000, np.uint8)
+    other = base.copy()
+    for at in (0, 700, 710, 3000, 4990):
+        other[at : at + 10] += 1
+    runs = patch(base.tobytes(), other.tobytes())
+    assert len(runs) < 120
+    assert patched(base.tobytes(), runs) == other.tobytes()
+    assert patch(base.tobytes(), base.tobytes()) == b""
+
+
+def rows(file: Path) -> np.ndarray:
+    """(K, n) of a file's columns."""
+    g: Gaussians = read_ply(str(file))[0]
+    return np.column_stack([array.reshape(len(g), -1) for array in g.arrays().values()])
+
+
+@pytest.mark.parametrize("more", [(), ("--light", "headlight"), ("--blocks", "16")], ids=" ".join)
+def test_what_stands_still_stays_bit_for_bit(vvgt, beat, more):
+    run = ("convert", beat / "v_*.npy", "--tf", beat / "tf.json", *HOW, *more)
+    done = vvgt(*run, "-o", beat / "f_{}.ply")
+    assert done.code == 0, done.err
+    files = [rows(beat / f"f_{k}.ply") for k in range(4)]
+    index = json.loads((beat / "f_index.json").read_text())["files"]
+    assert "moved" not in index[0]
+    for k in (1, 2, 3):
+        differ = (files[k] != files[k - 1]).any(axis=1)
+        assert differ.sum() == index[k]["moved"]
+        still = files[k - 1][:, 0] < -0.2  # the other ball
+        assert not differ[still].any(), files[k - 1][differ & still][:, :6]
+        assert still.sum() > 50
+    assert index[3]["moved"] == 0
+    assert 0 < max(row["moved"] for row in index[1:]) < 0.7 * len(files[0])
+    assert vvgt("convert", beat / "v_2.npy", "--tf", beat / "tf.json", *HOW, *more, "-o", beat / "a.ply").code == 0
+    alone = json.loads((beat / "f_index.json").read_text())
+    assert alone["files"][2]["psnr"] > alone["files"][0]["psnr"] - 0.6
+    assert vvgt(*run, "-o", beat / "f.html").code == 0
+    check_page(beat)
+
+
+def check_page(folder: Path) -> None:
+    """The page holds what the files do, and the frames that go on as little as differs."""
+    text = (folder / "f.html").read_text("utf-8")
+    frames = json.loads(re.search(r'id="scene">(.*?)</script>', text, re.S)[1])["frames"]
+    held = [base64.b64decode(re.search(rf'id="{frame["held"]}">([^<]*)</script>', text)[1]) for frame in frames]
+    assert [frame.get("whole") for frame in frames] == [None, 0, 0, 0]
+    from vvgt_cli.gaussians.formats.gsply_files import read_compressed_ply
+
+    whole = [held[0], *(patched(held[0], runs) for runs in held[1:])]
+    for k, content in enumerate(whole):
+        found = np.sort(read_compressed_ply(content, "page").logits)
+        own = np.sort(read_ply(str(folder / f"f_{k}.ply"))[0].opacity_logits)
+        assert np.abs(1 / (1 + np.exp(-found)) - 1 / (1 + np.exp(-own))).max() < 1 / 200
+    assert whole[2] == whole[3]
+    assert len(held[1]) < len(held[0])
+
+
+def test_a_frame_that_shows_something_else_is_converted_by_itself(vvgt, beat):
+    np.save(beat / "v_1.npy", body(0.2)[:, :, ::-1])
+    done = vvgt("convert", beat / "v_[01].npy", "--tf", beat / "tf.json", *HOW, "-o", beat / "f_{}.ply")
+    assert done.code == 0, done.err
+    assert "left out: going on from the frame before" in done.err
+    assert vvgt("convert", beat / "v_1.npy", "--tf", beat / "tf.json", *HOW, "-o", beat / "a.ply").code == 0
+    assert (beat / "a.ply").read_bytes() == (beat / "f_1.ply").read_bytes()
+
+
+@pytest.mark.parametrize(
+    "more",
+    [("--shard", "1/1"), ("--live",), ("--light", "above", "--shadows"), ("--target-psnr", "60")],
+    ids=lambda more: more[0],
+)
+def test_what_cannot_go_on_is_converted_frame_by_frame(vvgt, beat, more):
+    """A part of a series (here all of it) goes on too; the others have each frame by itself."""
+    for file in ("v_2.npy", "v_3.npy"):
+        (beat / file).unlink()
+    how = HOW[:4] if more == ("--live",) else HOW
+    done = vvgt("convert", beat / "v_*.npy", "--tf", beat / "tf.json", *how, *more, "-o", beat / "f_{}.ply")
+    assert done.code == 0, done.err
+    assert ("differences " in done.err) == (more[0] == "--shard")

@@ -1,0 +1,195 @@
+"""A frame of a series from the one before: its Gaussians, of which those move that are where the frames differ."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vvgt_cli.cameras import Camera
+from vvgt_cli.cameras.blocks import BLOCK, Blocks
+from vvgt_cli.conversion.changes import Changes, changes
+from vvgt_cli.conversion.pictures import Pictures
+from vvgt_cli.conversion.plan import Plan
+from vvgt_cli.conversion.request import ConvertRequest
+from vvgt_cli.conversion.stage import Work
+from vvgt_cli.conversion.stages import CheckViews
+from vvgt_cli.conversion.stages.refinement import Refinement, refine, widened_small
+from vvgt_cli.conversion.stages.scores import TestViews
+from vvgt_cli.field.field import Field, Picture
+from vvgt_cli.field.source import Source
+from vvgt_cli.gaussians import Gaussians, as_stored
+from vvgt_cli.gaussians.rules import Rule
+from vvgt_cli.refine import OptimizeOptions
+from vvgt_cli.score.checks import Views
+
+if TYPE_CHECKING:
+    from vvgt_cli.dvr import RenderSettings
+
+STEPS = 25  # of gradient descent on a frame that goes on from another
+ROUNDS = 3  # of so many steps at most
+LEVEL = 0.25 / 255  # of a pixel, that is no change
+VIEWS = 24  # of the training views for them, others in every frame
+WORSE = 0.2  # dB on the check views below the last frame that was converted by itself: then the next is, too
+FAR = 6.0  # dB below it before any step
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """What a frame leaves to the next.
+
+    Attributes:
+        source: its volume.
+        gaussians: box frame, as its file holds them.
+        psnr: on the check views, of the last frame that was converted by itself.
+        cameras, rule, settings: of the training views.
+    """
+
+    source: Source
+    gaussians: Gaussians
+    psnr: float
+    cameras: list[Camera]
+    rule: Rule
+    settings: RenderSettings
+
+
+def carries(request: ConvertRequest, parts: int = 1) -> Carry | None:
+    """What frames of a series are carried on by; None where each is converted by itself (docs/commands/convert.md)."""
+    limited = request.limits.target_psnr is not None or request.limits.time_budget is not None
+    return None if request.live or request.checkpoint or limited or parts > 1 else Carry(request.fit.size)
+
+
+class Carry:
+    """What is carried from frame to frame of one run."""
+
+    def __init__(self, size: int) -> None:
+        self._last: _Frame | None = None
+        self._pictures = Pictures(size)
+        self._turn = 0
+        self._moved: int | None = None  # Gaussians that are not those of the frame before
+
+    def remembered(self, field: Field) -> Field:
+        """The frame's field, of which only those pictures are drawn that are not the last frame's."""
+        return self._pictures.of(field)
+
+    def facts(self) -> dict[str, int]:
+        """Of the frame that was made last, as an index has them."""
+        return {} if self._moved is None else {"moved": self._moved}
+
+    def goes_on(self, work: Work, plan: Plan, request: ConvertRequest) -> bool:
+        """Make the frame from the one before, if that is as near as a conversion by itself; whether it was."""
+        self._moved = None
+        last, self._last = self._last, None
+        lighting = work.field.source.lighting
+        if last is None or (lighting is not None and lighting.attenuated):  # shadows reach far
+            self._pictures.outdate(None)
+            return False
+        with work.run.stage("differences") as stage:
+            found = changes(last.source, work.field.source)
+            free = found.meet(last.gaussians)
+            self._pictures.outdate(found)
+            stage.note = f"{found.blocks.mean():.1%} of the volume, {int(free.sum())} of {len(free)} Gaussians"
+        work.gaussians = last.gaussians
+        if found.blocks.any() and not self._fitted(work, last, found, free):
+            work.gaussians = work.check = work.train = work.train_rule = None
+            return False
+        self._last = replace(last, source=work.field.source, gaussians=work.made())
+        self._moved = _differing(last.gaussians, work.made())
+        plan.stages = [s for s in plan.stages if isinstance(s, TestViews) or (s.scores and request.scored_whole)]
+        return True
+
+    def keep(self, work: Work, plan: Plan) -> None:
+        """Remember a frame that was converted by itself, if it was fitted to views."""
+        if not any(isinstance(stage, Refinement) for stage in plan.stages) or work.check is None:
+            return
+        if work.train is not None and work.train_rule is not None and work.train_settings is not None:
+            made = work.made()
+            self._last = _Frame(
+                work.field.source, made, work.psnr(made), work.train.cameras, work.train_rule, work.train_settings
+            )
+
+    def _fitted(self, work: Work, last: _Frame, found: Changes, free: np.ndarray) -> bool:
+        """Gradient descent of what is ``free`` (K,) bool; whether the frame is near enough then."""
+        from vvgt_cli.dvr import render_views
+
+        turns = max(len(last.cameras) // VIEWS, 1)
+        cameras = last.cameras[self._turn % turns :: turns]
+        self._turn += 1
+        work.train_rule = last.rule
+        judge = CheckViews()
+        work.field.expect([*judge.views(work.fit), *(Picture(camera, last.settings) for camera in cameras)])
+        judge.run(work)
+        if work.psnr(last.gaussians) < last.psnr - FAR:
+            work.run.leave_out("going on from the frame before", "it shows something else")
+            return False
+        with work.run.stage("views") as stage:
+            before = [self._pictures.last(Picture(camera, last.settings)) for camera in cameras]
+            images = render_views(work.field, cameras, last.settings)
+            for camera, image, old in zip(cameras, images, before, strict=True):
+                _still(image, old, last, camera)
+            stage.note = f"{len(cameras)} of {cameras[0].width} px to fit to, where they differ from the frame before"
+        options = OptimizeOptions.of(
+            "frame",
+            steps=STEPS,
+            rule=last.rule,
+            judge=work.rule,
+            seed=work.fit.seed,
+            check_every=STEPS,
+        )
+        assert work.check is not None
+        judged, psnr = _near(work.check, found), 0.0
+        for _ in range(ROUNDS):
+            result = refine(work.run, work.made(), Views(cameras, images), judged, options, free=free)
+            result = as_stored(widened_small(result, work.fit.size)[0])
+            work.gaussians = _moved(last.gaussians, result, free)
+            psnr = work.psnr(work.gaussians)
+            if psnr >= last.psnr - WORSE:
+                return True
+        told = f"{last.psnr - psnr:.1f} dB worse on the check views than the last frame without"
+        work.run.leave_out("going on from the frame before", told)
+        return False
+
+
+def _still(image: np.ndarray, old: np.ndarray | None, last: _Frame, camera: Camera) -> None:
+    """Where a view (h, w, 4) shows what it has shown, fit to what the Gaussians show there: it is to stay."""
+    from vvgt_cli.splat import render
+
+    if old is not None:
+        same = (np.abs(image - old) <= LEVEL).all(axis=2)
+        image[same] = render(last.gaussians, camera, last.rule)[same]
+
+
+def _moved(start: Gaussians, result: Gaussians, free: np.ndarray) -> Gaussians:
+    """``result`` where ``free`` (K,) bool, else ``start``, bit for bit."""
+    arrays = {}
+    for name, array in start.arrays().items():
+        arrays[name] = array.copy()
+        arrays[name][free] = getattr(result, name)[free]
+    return Gaussians(**arrays)
+
+
+def _differing(first: Gaussians, second: Gaussians) -> int:
+    """How many rows are not the same."""
+    pairs = zip(first.arrays().values(), second.arrays().values(), strict=True)
+    return int(np.any([(a != b).reshape(len(first), -1).any(axis=1) for a, b in pairs], axis=0).sum())
+
+
+def _near(views: Views, found: Changes) -> Views:
+    """The blocks of views that show what differs, to judge by; all of them where none does."""
+    cameras, images, parts = [], [], []
+    for k, camera in enumerate(views.cameras):
+        shown = found.seen_by(camera)
+        shown[camera.height // BLOCK :], shown[:, camera.width // BLOCK :] = False, False  # not wholly inside
+        numbers, image = np.flatnonzero(shown), views.images[k]
+        if views.blocks is None:
+            image = Blocks(camera.width, camera.height, numbers).pick(image)
+        else:
+            mine = views.blocks[k].numbers
+            numbers = np.intersect1d(numbers, mine)
+            image = image.reshape(-1, BLOCK, BLOCK, 4)[np.searchsorted(mine, numbers)].reshape(-1, BLOCK, 4)
+        if len(numbers):
+            cameras.append(camera)
+            images.append(image)
+            parts.append(Blocks(camera.width, camera.height, numbers))
+    return Views(cameras, images, parts) if cameras else views  # type: ignore[arg-type] # of several heights

@@ -1,0 +1,101 @@
+"""Pictures of a series' volumes: of a frame, only what differs from the frame before is drawn anew."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from vvgt_cli.cameras import Camera
+from vvgt_cli.cameras.blocks import BLOCK, Blocks
+from vvgt_cli.conversion.changes import Changes
+from vvgt_cli.field.field import Field, Picture
+
+if TYPE_CHECKING:
+    from vvgt_cli.dvr import RenderSettings
+
+
+class Pictures:
+    """Pictures of the last frame, and which of their blocks still hold.
+
+    Attributes:
+        largest: pixels along an edge; larger pictures are not kept.
+    """
+
+    def __init__(self, largest: int) -> None:
+        self.largest = largest
+        self._kept: dict[bytes, tuple[Camera, np.ndarray, np.ndarray]] = {}  # camera, picture, (rows, columns) bool
+
+    def of(self, field: Field) -> Field:
+        """The field with these pictures."""
+        return cast(Field, _Remembered(field, self))
+
+    def outdate(self, changes: Changes | None) -> None:
+        """Let go of what shows something else now; None: of all."""
+        if changes is None:
+            self._kept.clear()
+        for camera, _, known in self._kept.values():
+            known &= ~changes.seen_by(camera) if changes else False
+
+    def last(self, view: Picture) -> np.ndarray | None:
+        """A whole picture (h, w, 4) as it was drawn last, of whichever frames; None where it was not."""
+        found = self._kept.get(_key(view))
+        return None if found is None else found[1].copy()
+
+    def missing(self, view: Picture) -> Blocks | None:
+        """What of a picture has to be drawn; None: all of it."""
+        found = self._kept.get(_key(view))
+        if found is None:
+            return view.blocks
+        numbers = np.flatnonzero(~found[2]) if view.blocks is None else view.blocks.numbers
+        return Blocks(view.camera.width, view.camera.height, numbers[~found[2].ravel()[numbers]])
+
+    def put(self, view: Picture, drawn: Blocks | None, image: np.ndarray) -> np.ndarray:
+        """The picture, of which ``drawn`` is there as ``image`` (h, w, 4), and what was known."""
+        camera, key = view.camera, _key(view)
+        if max(camera.width, camera.height) > self.largest:
+            return image
+        if key not in self._kept:
+            known = np.zeros((-(-camera.height // BLOCK), -(-camera.width // BLOCK)), bool)
+            self._kept[key] = camera, np.zeros_like(image), known
+        _, whole, known = self._kept[key]
+        mask = np.ones(image.shape[:2], bool) if drawn is None else drawn.mask()
+        whole[mask] = image[mask]
+        known.flat[slice(None) if drawn is None else drawn.numbers] = True
+        if view.blocks is None:
+            return whole.copy()
+        return np.where(view.blocks.mask()[..., None], whole, np.float32(0))
+
+
+class _Remembered:
+    """A field whose pictures are those of `Pictures` where they hold."""
+
+    def __init__(self, field: Field, pictures: Pictures) -> None:
+        self._field, self._pictures = field, pictures
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._field, name)
+
+    def expect(self, views: Sequence[Picture]) -> None:
+        """See `Field`."""
+        parts = [view._replace(blocks=self._pictures.missing(view)) for view in views]
+        self._field.expect([part for part in parts if part.blocks is None or len(part.blocks.numbers)])
+
+    def view(self, camera: Camera, settings: RenderSettings, blocks: Blocks | None = None) -> np.ndarray:
+        """See `Field`."""
+        view = Picture(camera, settings, blocks)
+        part = self._pictures.missing(view)
+        if part is not None and not len(part.numbers):
+            image = np.zeros((camera.height, camera.width, 4), np.float32)
+        else:
+            image = self._field.view(camera, settings, part)
+        return self._pictures.put(view, part, image)
+
+
+def _key(view: Picture) -> bytes:
+    camera = view.camera
+    lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height])
+    return b"".join(
+        (camera.rotation.tobytes(), camera.translation.tobytes(), lens.tobytes(), repr(view.settings).encode())
+    )

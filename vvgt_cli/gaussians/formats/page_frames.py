@@ -1,0 +1,80 @@
+"""Frames of a series within a page: whole, or what differs from the last whole one (`page/patch.mjs`)."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from dataclasses import fields
+from typing import NamedTuple
+
+import numpy as np
+
+from vvgt_cli.gaussians.formats.gsply_files import compressed_ply
+from vvgt_cli.gaussians.formats.splats import Splats, morton_order
+
+LEAST = 0.2  # of the Gaussians that a frame shares with another, row by row
+GAP = 16  # bytes that are the same within a run: a run of its own would cost 8
+
+
+class Held(NamedTuple):
+    """What a page holds of a frame: a `.compressed.ply`, or what differs from that of frame ``whole``."""
+
+    content: bytes
+    whole: int | None
+
+
+def held_frames(clouds: Sequence[tuple[str, Splats]]) -> list[Held]:
+    """Every frame (name, columns), those that share rows with the last whole one as what differs from it."""
+    found: list[Held] = []
+    while len(found) < len(clouds):
+        first = len(found)
+        key = clouds[first][1]
+        changed = [_changed(key, splats) for _, splats in clouds[first + 1 :]]
+        count = next((k for k, rows in enumerate(changed) if rows is None), len(changed))
+        ever = np.any([rows for rows in changed[:count] if rows is not None], axis=0) if count else None
+        order = None if ever is None else morton_order(key.means)
+        if order is not None and ever is not None:
+            order = order[np.argsort(ever[order], kind="stable")]  # those that stay, then the others
+        name, splats = clouds[first]
+        base = compressed_ply(splats, name, order)
+        found.append(Held(base, None))
+        for name, splats in clouds[first + 1 : first + 1 + count]:
+            content = compressed_ply(splats, name, order)
+            if len(content) != len(base):  # other comments
+                break
+            found.append(Held(patch(base, content), first))
+    return found
+
+
+def _changed(key: Splats, splats: Splats) -> np.ndarray | None:
+    """(K,) bool: rows that differ; None where the frames have too little in common."""
+    if len(key) != len(splats) or key.f_rest.shape != splats.f_rest.shape:
+        return None
+    rows = np.zeros(len(key), bool)
+    for field in fields(Splats):
+        a, b = getattr(key, field.name), getattr(splats, field.name)
+        if isinstance(a, np.ndarray):
+            rows |= (a != b).reshape(len(rows), -1).any(axis=1)
+    return rows if rows.mean() <= 1 - LEAST else None
+
+
+def patch(base: bytes, content: bytes) -> bytes:
+    """What makes ``content`` of ``base``, which is as long: runs of bytes, each with its place and length (uint32)."""
+    a, b = np.frombuffer(base, np.uint8), np.frombuffer(content, np.uint8)
+    at = np.flatnonzero(a != b)
+    if not len(at):
+        return b""
+    breaks = np.flatnonzero(np.diff(at) > GAP)
+    first, last = at[np.concatenate([[0], breaks + 1])], at[np.concatenate([breaks, [len(at) - 1]])] + 1
+    runs = zip(first.tolist(), last.tolist(), strict=True)
+    return b"".join(struct.pack("<II", i, j - i) + content[i:j] for i, j in runs)
+
+
+def patched(base: bytes, runs: bytes) -> bytes:
+    """The inverse of `patch`."""
+    out, at = bytearray(base), 0
+    while at < len(runs):
+        place, length = struct.unpack_from("<II", runs, at)
+        out[place : place + length] = runs[at + 8 : at + 8 + length]
+        at += 8 + length
+    return bytes(out)
