@@ -8,13 +8,9 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 
-<<<<<<< HEAD
+from vvgt_cli.conversion.carried import Carry
 from vvgt_cli.conversion.certify import certified
 from vvgt_cli.conversion.gaussian_files import write_gaussians
-=======
-from vvgt_cli.conversion.carried import Carry
-from vvgt_cli.conversion.gaussian_files import is_page, write_gaussians
->>>>>>> main
 from vvgt_cli.conversion.live import check_live, live_conversion
 from vvgt_cli.conversion.place import out_of_box, placed, remarks, way_up
 from vvgt_cli.conversion.plan import Plan, Planner, check_memory
