@@ -12,6 +12,8 @@ import pytest
 from vvgt_cli.cli.main import run
 from vvgt_cli.resources import set_memory
 
+os.environ["SOURCE_DATE_EPOCH"] = "0"  # no seconds in files: what is made twice is compared byte by byte
+
 hypothesis.settings.register_profile("default", max_examples=100, deadline=None)
 hypothesis.settings.register_profile("long", max_examples=10_000, deadline=None)
 hypothesis.settings.register_profile("quick", max_examples=10, deadline=None)

@@ -92,16 +92,16 @@ def test_the_report_page_names_every_field(converted):
     assert not missing
 
 
-def test_the_same_command_gives_the_same_bytes(converted, vvgt):
+def test_the_same_command_gives_the_same_bytes(converted):
     folder, _ = converted
-    again = vvgt("convert", SOURCE, *SMALL, "-o", folder / "b.ply", "--quiet")
-    assert (again.code, again.err, again.out) == (0, "", b"")
+    again = run_python(["convert", SOURCE, *SMALL, "-o", folder / "b.ply", "--quiet"], folder)
+    assert (again.returncode, again.stderr, again.stdout) == (0, b"", b"")
     assert (folder / "a.ply").read_bytes() == (folder / "b.ply").read_bytes()
 
 
-def test_convert_to_standard_output(converted, vvgt):
-    result = vvgt("convert", SOURCE, *SMALL, "-o", "-", "-q")
-    assert result.out == (converted[0] / "a.ply").read_bytes()
+def test_convert_to_standard_output(converted):
+    result = run_python(["convert", SOURCE, *SMALL, "-o", "-", "-q"], converted[0])
+    assert result.stdout == (converted[0] / "a.ply").read_bytes()
 
 
 def test_report_to_standard_output(folder, vvgt):

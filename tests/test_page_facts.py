@@ -16,6 +16,7 @@ import pytest
 from vvgt_cli.conversion.gaussian_files import layout_of
 from vvgt_cli.conversion.place import placed
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
+from vvgt_cli.gaussians.certificate import Certificate
 from vvgt_cli.gaussians.formats.page_file import upright
 from vvgt_cli.gaussians.formats.splats import Splats, splats_of
 from vvgt_cli.gaussians.frames import UP_NAMES
@@ -138,11 +139,11 @@ def test_a_legend_is_read_back_and_drawn_by_its_nodes(tmp_path: Path) -> None:
     text = legend_text(read({"name": "t", "points": points}, "t"), 0.0, 60.0, "HU")
     assert text is not None
     stream = io.BytesIO()
-    write_ply(stream, one(), PlyOptions(legend=text, error="41.2 dB", date="2026-11-25"))
+    write_ply(stream, one(), PlyOptions(legend=text, date="2026-11-25"))
     stream.seek(0)
     header = read_ply(stream)[1]
-    assert (header.legend, header.error, header.date) == (text, "41.2 dB", "2026-11-25")
-    assert layout_of(header).error is None  # of what is written then
+    assert (header.legend, header.date) == (text, "2026-11-25")
+    assert layout_of(header).date is None  # of what is written then
     facts = world_of(splats_of(one(), PlyOptions(legend=text)), tmp_path)["facts"]
     found = facts["legend"]
     assert (found["values"], found["unit"]) == ([0, 60], "HU")
@@ -153,6 +154,19 @@ def test_a_legend_is_read_back_and_drawn_by_its_nodes(tmp_path: Path) -> None:
             checked(damaged)
     long = json.dumps({"values": [0, 1], "nodes": 3})
     assert world_of(splats_of(one(), PlyOptions(legend=long)), tmp_path)["facts"]["legend"] is None
+
+
+def test_the_error_is_that_of_the_certificate(tmp_path: Path) -> None:
+    given = Certificate("v", None, "0", 400, "inria", 41.234, 3)
+
+    def error(certificate: Certificate) -> Any:
+        return world_of(splats_of(one(), PlyOptions(certificate=certificate)), tmp_path)["facts"].get("error")
+
+    assert error(given) == "41.2 dB on test views of 400 px"
+    assert error(replace(given, live_psnr=33.33)) == "33.3 dB live, on test views of 400 px"
+    splats = splats_of(one(), PlyOptions(certificate=given))
+    broken = tuple(line.replace("41.234", '"41"') for line in splats.comments)
+    assert world_of(replace(splats, comments=broken), tmp_path)["facts"].get("error") is None
 
 
 def test_a_legend_of_labels_names_those_that_are_shown() -> None:

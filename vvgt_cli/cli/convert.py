@@ -12,6 +12,7 @@ from vvgt_cli.cli.blocks import block_options, chosen
 from vvgt_cli.cli.fit import fit_options, limit_options, ply_options, rule_option
 from vvgt_cli.cli.options import common_options, light_options, overwrite_option, placed_read_options, tfs_options
 from vvgt_cli.cli.sections import SectionedCommand
+from vvgt_cli.cli.typed import ASIDE, command_line
 from vvgt_cli.progress import Console
 
 if TYPE_CHECKING:
@@ -96,7 +97,8 @@ def command(
 
     functions = options["optics"].pop("tf")
     options["optics"]["tf"] = functions[0] if functions else None
-    request = replace(convert_request(volume, **options), blocks=chosen(blocks), live=live)
+    said = command_line(click.get_current_context(), ASIDE, folders=False)
+    request = replace(convert_request(volume, **options), blocks=chosen(blocks), live=live, command=said)
     if live:
         _check_live(functions, split_labels or dry_run)
     if split_labels:

@@ -79,7 +79,7 @@ ply_options = group(
         help="Degree of the spherical harmonics in the file, padded with zeros or truncated. Default: as computed.",
     ),
     comments=click.option("--no-comments", "comments", is_flag=True, default=True, flag_value=False,
-        help="Omit the comments (frame, unit distance, version, ...) from the header."),
+        help="Omit the comments (frame, unit distance, version, certificate, ...) from the header."),
 )  # fmt: skip
 
 

@@ -2,39 +2,18 @@
 
 from __future__ import annotations
 
-import shlex
 from typing import Any
 
 import click
-from click.core import ParameterSource
 
 from vvgt_cli.cli.blocks import block_options, chosen
 from vvgt_cli.cli.options import common_options, light_options, overwrite_option, read_options, tf_options
 from vvgt_cli.cli.sections import SectionedCommand
+from vvgt_cli.cli.typed import command_line, typed
 from vvgt_cli.errors import UsageError
 from vvgt_cli.progress import Console
 
 OF_BOTH = {"paths", "compare", "output", "overwrite", "threads", "quiet"}  # parameters that --compare takes too
-
-
-def _typed(ctx: click.Context) -> list[click.Parameter]:
-    """Parameters that were given on the command line."""
-    return [p for p in ctx.command.params if p.name and ctx.get_parameter_source(p.name) is ParameterSource.COMMANDLINE]
-
-
-def command_line(ctx: click.Context) -> str:
-    """The call, arguments first; without ``--threads``, which the report records by itself."""
-    words = ["vvgt", "report"]
-    for parameter in _typed(ctx):
-        value = ctx.params.get(parameter.name or "")
-        values = list(value) if isinstance(value, tuple) else [value]
-        if isinstance(parameter, click.Argument):
-            words += map(str, values)
-        elif isinstance(parameter, click.Option) and parameter.name in ctx.params:
-            name = parameter.opts[-1]
-            repeated = [[name, str(v)] for v in values] if parameter.multiple else [[name, *map(str, values)]]
-            words += [name] if parameter.is_flag else [word for part in repeated for word in part]
-    return shlex.join(words)
 
 
 @click.command("report", cls=SectionedCommand, short_help="Plot error against run time, as an HTML page and tables.")
@@ -54,6 +33,11 @@ def command_line(ctx: click.Context) -> str:
 @click.option(
     "--steps", type=click.IntRange(1, 10_000_000), multiple=True, default=(25, 120, 200, 400), show_default=True,
     metavar="N", help="Number of gradient descent steps. Repeatable, one run each; the baselines use the largest.",
+)  # fmt: skip
+@click.option(
+    "--peer", "peers", multiple=True, metavar="NAME=COMMAND",
+    help="Another trainer to run and score: {views} in COMMAND is a folder of 'vvgt render-views', {out} the .ply that "
+    "it writes. Repeatable.",
 )  # fmt: skip
 @click.option(
     "--picture-size", type=click.IntRange(16, 2048), default=400, show_default=True, metavar="PX",
@@ -92,7 +76,7 @@ def command(
     from vvgt_cli.commands import report as pipeline
 
     if compare:
-        other = [p.opts[-1] for p in _typed(ctx) if p.name not in OF_BOTH]
+        other = [p.opts[-1] for p in typed(ctx) if p.name not in OF_BOTH]
         if other:
             raise UsageError(f"{', '.join(other)}: not with --compare, which only overlays reports")
         pipeline.compare(paths, output, options["overwrite"], console)
@@ -101,7 +85,7 @@ def command(
         raise UsageError(f"{len(paths)} volumes; expected one (reports to overlay need --compare)")
     ladder = pipeline.LadderOptions(
         options["max_gaussians"], options["size"], options["steps"], options["model"], options["seed"],
-        chosen(options["blocks"]),
+        chosen(options["blocks"]), peers=tuple(pipeline.Peer.of(text) for text in options["peers"]),
     )  # fmt: skip
     source = source_request(paths[0], options["read"], options["optics"], options["light"])
     request = pipeline.ReportRequest(

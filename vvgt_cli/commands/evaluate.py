@@ -11,6 +11,7 @@ import numpy as np
 
 from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.sets import SIZE
+from vvgt_cli.conversion.certify import checked
 from vvgt_cli.conversion.gaussian_files import STDIN, file_rule, layout_of, open_gaussians
 from vvgt_cli.conversion.place import into_box, preview, upright
 from vvgt_cli.conversion.recolored import SeveralLooks, light_of, under_function
@@ -79,7 +80,7 @@ class EvaluateRequest:
 
 @dataclass
 class Evaluation:
-    """Scores and seats, with what they were measured on; `to_json` is documented in docs/report.md."""
+    """Scores and seats, with what they were measured on, and whether the file's certificate holds (docs/report.md)."""
 
     gaussians: int
     size: int
@@ -92,6 +93,7 @@ class Evaluation:
     scores: dict[str, Any] = field(default_factory=dict)
     seats: list[dict[str, Any]] = field(default_factory=list)
     texture: dict[str, Any] | None = None
+    certificate: dict[str, Any] | None = None
     stages: list[StageRecord] = field(default_factory=list)
     seconds: float = 0.0
 
@@ -108,6 +110,8 @@ class Evaluation:
         lines.append(f"reference against a finer one: PSNR {self.reference_psnr:.2f} dB (middle of the first view)")
         if self.texture is not None:
             lines.append(f"texture on smooth areas, near: {texture_note(Texture(**self.texture))}")
+        if self.certificate is not None:
+            lines.append(f"certificate {self.certificate['text']}")
         if self.seats:
             lines.append(f"\n{'seat':<32}{'psnr':>10}")
         lines += [f"{ViewingCondition(**seat).name():<32}{seat['psnr']:>10.2f}" for seat in self.seats]
@@ -242,6 +246,11 @@ def _scored(run: Run, request: EvaluateRequest, volume: Field, gaussians: Gaussi
         scores = score_test_views(volume, gaussians, size, settings, rule=rule, progress=bar)
         evaluation.scores = asdict(scores)
         stage.note = f"{psnr_note(scores)}, {size} px"
+    if header.certificate is not None:
+        with run.stage("certificate") as stage:
+            verdict = checked(header.certificate, volume, gaussians)
+            evaluation.certificate = asdict(verdict) | {"holds": verdict.holds, "text": verdict.text()}
+            stage.note = verdict.text()
     if request.preview:
         camera, axes = default_views("test", size=size)[PICTURED], upright(source.volume, header.up)
         with run.stage("preview"):

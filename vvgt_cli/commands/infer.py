@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -102,7 +102,7 @@ def _infer_file(request: InferRequest, run: Run) -> ConversionReport:
         "psnr_after": after,
     }
     kept = better if stage.kept else gaussians
-    write_gaussians(run, request.output, kept, layout_of(header), request.overwrite)
+    write_gaussians(run, request.output, kept, replace(layout_of(header), certificate=None), request.overwrite)
     report = run.finish()
     if request.report:
         write_text(request.report, report.to_json(), request.overwrite)

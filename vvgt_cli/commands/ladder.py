@@ -15,12 +15,14 @@ import numpy as np
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.cameras.blocks import Blocks, spread_blocks
 from vvgt_cli.cameras.boxed import render_in_box
+from vvgt_cli.commands.peers import Peer, PeerViews, train
 from vvgt_cli.conversion.convert import convert, opened
 from vvgt_cli.conversion.plan import DEFAULT_STEPS
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.conversion.stages.refinement import refine
 from vvgt_cli.conversion.stages.views import CheckViews, TrainingViews, views_of
-from vvgt_cli.field.field import Field, Picture
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.field.field import Field, Picture, Resident
 from vvgt_cli.field.settings import BlockOptions
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.field.workload import view_edge
@@ -56,6 +58,8 @@ class LadderOptions:
         model: folder or name of an exported network, None for none.
         seed: of whatever draws random numbers.
         blocks: how the volume is processed in blocks; None: in memory, or in blocks where it is large.
+        live: with the live form (docs/live.md), which not every scene has.
+        peers: other trainers, a rung each.
     """
 
     max_gaussians: int = 100_000
@@ -64,6 +68,8 @@ class LadderOptions:
     model: str | None = None
     seed: int = 0
     blocks: BlockOptions | None = None
+    live: bool = False
+    peers: tuple[Peer, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -75,6 +81,7 @@ class Rung:
         kind: one of `vvgt_cli.score.curves.KINDS`.
         fit: of a conversion, and what the others take their sizes from.
         start: of the baselines: "points" (random in the box) or "samples" (of what the function shows).
+        peer: of kind "peer".
     """
 
     name: str
@@ -82,16 +89,19 @@ class Rung:
     kind: str
     fit: FitOptions
     start: str | None = None
+    peer: Peer | None = None
 
 
 def rungs(options: LadderOptions) -> list[Rung]:
-    """From the cheapest on, then the baselines."""
+    """Other trainers, which may fail, before ours are run; ours from the cheapest on; the baselines."""
     most, size, seed = options.max_gaussians, options.size, options.seed
     budgets = sorted({max(most // share, 1) for share in SHARES} | {most})
     found = [
         Rung(f"closed form, K = {short(k)}", short(k), "closed form", FitOptions(k, size, seed=seed, steps=0))
         for k in budgets
     ]
+    if options.live:
+        found.append(Rung(f"live form, K = {short(most)}", "live", "live", FitOptions(most, size, seed=seed)))
     if options.model:
         fit = FitOptions(most, size, seed=seed, steps=0, model=options.model)
         found.append(Rung(f"network {Path(options.model).name}", "network", "network", fit))
@@ -103,7 +113,7 @@ def rungs(options: LadderOptions) -> list[Rung]:
     if most_steps:
         for name, start in (("3DGS", "points"), ("iVR-GS setting", "samples")):
             found.append(Rung(f"{name}, {most_steps} steps", name, "baseline", longest, start))
-    return found
+    return [Rung(peer.name, peer.name, "peer", longest, peer=peer) for peer in options.peers] + found
 
 
 @dataclass(frozen=True)
@@ -148,6 +158,22 @@ class Reference:
         rays = max(rays for _, rays in REFERENCE.tiers)
         return cls(cameras, blocks, images, REFERENCE.step, rays, axes, shown, seats)
 
+    def psnr_of(self, renderer: str, field: Field) -> float | None:
+        """Mean PSNR of another renderer's own pictures of the views that are drawn whole; None where it cannot."""
+        from vvgt_cli.dvr.backends import view_renderer
+        from vvgt_cli.images.metrics import score_view
+        from vvgt_cli.volume.vtk_messages import quiet_vtk
+
+        if not isinstance(field, Resident):
+            return None
+        try:
+            with quiet_vtk():  # which says where it looked for a screen
+                draw = view_renderer(renderer, field.scene)
+                found = [score_view(self.images[i], draw(self.cameras[i]), perceptual=False).psnr for i in WHOLE]
+        except (DataError, UsageError):
+            return None
+        return float(np.mean(found))
+
     def score(self, gaussians: Gaussians) -> tuple[Scores, list[np.ndarray]]:
         """Scores as `vvgt evaluate` has them, and our images."""
         from vvgt_cli.images.metrics import mean_scores
@@ -190,34 +216,47 @@ def run_rungs(
     """
     from vvgt_cli.splat import render
 
-    for rung in rungs(options):
-        report, gaussians = _run(source, rung, reference.axes, options.blocks)
-        if report.refinement and report.refinement["reason"] == "interrupted":
-            raise KeyboardInterrupt
-        scores, images = reference.score(gaussians)
-        seats = score_conditions(gaussians, reference.seats)
-        report.scores, report.seats = asdict(scores), [asdict(seat) for seat in seats]
-        run = {"name": rung.name, "label": rung.label, "kind": rung.kind, "views": _views_of(report, rung.fit)}
-        run |= asdict(report)
-        yield run, upright(images, reference.cameras, reference.axes, partial(render, gaussians))
+    with tempfile.TemporaryDirectory() as folder:
+        views = peer_views(source, options, Path(folder)) if options.peers else None
+        for rung in rungs(options):
+            report, gaussians = _run(source, rung, reference.axes, options.blocks, views)
+            if report.refinement and report.refinement["reason"] == "interrupted":
+                raise KeyboardInterrupt
+            scores, images = reference.score(gaussians)
+            seats = score_conditions(gaussians, reference.seats)
+            report.scores, report.seats = asdict(scores), [asdict(seat) for seat in seats]
+            count = views.count if views is not None and rung.peer is not None else _views_of(report, rung.fit)
+            run = {"name": rung.name, "label": rung.label, "kind": rung.kind, "views": count}
+            run |= asdict(report)
+            yield run, upright(images, reference.cameras, reference.axes, partial(render, gaussians))
+
+
+def peer_views(source: SourceRequest, options: LadderOptions, folder: Path) -> PeerViews:
+    """What other trainers read: as many views as our longest run has, of the screen's size."""
+    count = views_of(max(options.steps, default=0), small=False)
+    return PeerViews.render(source, folder / "views", count, options.size, options.blocks)
 
 
 def warm_up(source: SourceRequest, options: LadderOptions) -> None:
     """Run every kind of rung once at next to no size: kernels are compiled or loaded before any clock starts."""
-    few = LadderOptions(100, 64, (2,) if options.steps else (), options.model, options.seed)
-    for rung in rungs(few)[-4:]:
+    few = LadderOptions(100, 64, (2,) if options.steps else (), options.model, options.seed, live=options.live)
+    for rung in rungs(few)[-5:]:
         _run(source, rung, np.eye(3), options.blocks)
 
 
 def _run(
-    source: SourceRequest, rung: Rung, axes: np.ndarray, blocks: BlockOptions | None
+    source: SourceRequest, rung: Rung, axes: np.ndarray, blocks: BlockOptions | None, views: PeerViews | None = None
 ) -> tuple[ConversionReport, Gaussians]:
     """What became of it, Gaussians in the box frame; ``axes`` as `Reference` has them."""
     if rung.kind == "baseline":
         return _baseline(source, rung, blocks)
+    if rung.peer is not None and views is not None:
+        report, gaussians = train(rung.peer, views)
+        return report, transform(gaussians, np.linalg.inv(axes))
     with tempfile.TemporaryDirectory() as folder:
-        path = str(Path(folder) / "rung.ply")
-        report = convert(ConvertRequest(source, path, rung.fit, up="none", blocks=blocks), Console(quiet=True))
+        path, live = str(Path(folder) / "rung.ply"), rung.kind == "live"
+        request = ConvertRequest(source, path, rung.fit, up="none", blocks=blocks, live=live)
+        report = convert(request, Console(quiet=True))
         return report, transform(read_ply(path)[0], np.linalg.inv(axes))
 
 

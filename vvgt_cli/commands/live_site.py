@@ -124,7 +124,8 @@ class Cloud:
         lighting = self.options.light if light is None else light_sent(light, self.options)
         pixel = pixel_width(self.options.made_for or SIZE)
         found = as_stored(lit(baked(self.gaussians, table, pixel), lighting))
-        return replace(self, gaussians=found, options=replace(options, light=lighting, sh_degree=None), ply=None)
+        options = replace(options, light=lighting, sh_degree=None, certificate=None)
+        return replace(self, gaussians=found, options=options, ply=None)
 
 
 def labels_sent(sent: Any) -> LabelTable:

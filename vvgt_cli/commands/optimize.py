@@ -114,7 +114,7 @@ def optimized(run: Run, request: OptimizeRequest) -> Result:
     if test is not None:
         _score(run, test, start, gaussians, rule)
     degree = header.sh_degree if request.sh_degree is None else request.sh_degree
-    layout = replace(layout_of(header), made_for=size, rule=asked.name, sh_degree=degree)
+    layout = replace(layout_of(header), certificate=None, made_for=size, rule=asked.name, sh_degree=degree)
     return Result(gaussians, run.report, layout)
 
 

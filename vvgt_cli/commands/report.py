@@ -14,7 +14,9 @@ import numpy as np
 
 from vvgt_cli.commands.infer import SHIPPED
 from vvgt_cli.commands.ladder import PICTURED, LadderOptions, Reference, pictures, run_rungs, rungs, warm_up
+from vvgt_cli.commands.peers import Peer
 from vvgt_cli.conversion.convert import opened
+from vvgt_cli.conversion.live import refusal
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.source import SourceRequest, tf_record, volume_record
@@ -70,8 +72,11 @@ def report(request: ReportRequest, console: Console | None = None) -> dict[str, 
     whole = ConvertRequest(request.source, fit=fit, blocks=request.ladder.blocks)
     with opened(Run(console, ConversionReport("report")), whole) as volume:
         source = volume.source
+        live = replace(whole, live=True, fit=FitOptions(fit.max_gaussians, size))
+        request = replace(request, ladder=replace(request.ladder, live=refusal(live, source) is None))
         warm_up(request.source, request.ladder)
         reference = Reference.render(volume, size, console)
+        ceiling = reference.psnr_of("vtk", volume)
     runs, ours = [], []
     total = len(rungs(request.ladder))
     for run, images in run_rungs(request.source, request.ladder, reference, console):
@@ -80,7 +85,7 @@ def report(request: ReportRequest, console: Console | None = None) -> dict[str, 
         score = f"PSNR {psnr(run):.2f} dB, worst seat {worst_seat(run):.2f} dB"
         megabytes = f"{run['gaussians']} Gaussians, {run['bytes'] / 1e6:.1f} MB"
         console.stage(f"{len(runs)}/{total}", cost(run), f"{run['name']}: {score}, {megabytes}")
-    text = document("vvgt-report", _document(request, source, reference, runs))
+    text = document("vvgt-report", _document(request, source, reference, runs) | {"vtk_psnr": ceiling})
     found: dict[str, Any] = json.loads(text)
     series = [Series(source.volume.name, runs, found)]
     shown = _pngs(pictures(reference.shown, PICTURED, request.picture_size))
@@ -190,4 +195,4 @@ def _write(folder: Path, series: list[Series], title: str, rows: str, shown: Pic
     write_text(str(folder / PAGE), page(series, title, shown), overwrite)
 
 
-__all__ = ["LadderOptions", "ReportRequest", "compare", "report"]
+__all__ = ["LadderOptions", "Peer", "ReportRequest", "compare", "report"]

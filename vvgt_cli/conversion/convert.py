@@ -9,7 +9,8 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 from vvgt_cli.conversion.carried import Carry
-from vvgt_cli.conversion.gaussian_files import is_page, write_gaussians
+from vvgt_cli.conversion.certify import certified
+from vvgt_cli.conversion.gaussian_files import write_gaussians
 from vvgt_cli.conversion.live import check_live, live_conversion
 from vvgt_cli.conversion.place import out_of_box, placed, remarks, way_up
 from vvgt_cli.conversion.plan import Plan, Planner, check_memory
@@ -257,8 +258,9 @@ def _interrupted(run: Run) -> bool:
 
 
 def _conversion(request: ConvertRequest, work: Work, gaussians: Gaussians) -> Conversion:
-    source = work.field.source
-    return Conversion(out_of_box(gaussians, source.volume), work.run.report, ply_options(request, source), work.field)
+    source, found = work.field.source, out_of_box(gaussians, work.field.source.volume)
+    ply = certified(ply_options(request, source), work.run, work.field, work.fit, found, request.command)
+    return Conversion(found, work.run.report, ply, work.field)
 
 
 @contextmanager
@@ -359,10 +361,7 @@ def _write(run: Run, request: ConvertRequest, conversion: Conversion) -> Convers
 
     report = run.report
     assert request.output is not None
-    ply = conversion.ply if is_page(request.output) else replace(conversion.ply, error=None)
-    if is_page(request.output) and ply.error is None and conversion.scores is not None:
-        ply = replace(ply, error=f"{conversion.scores['psnr']:.1f} dB on test views of {request.fit.size} px")
-    write_gaussians(run, request.output, conversion.gaussians, ply, request.overwrite, conversion.normals())
+    write_gaussians(run, request.output, conversion.gaussians, conversion.ply, request.overwrite, conversion.normals())
     if format_of(request.output):
         source = conversion.field.source
         run.compile(source.kernels(EVALUATE), source.kernel_type())

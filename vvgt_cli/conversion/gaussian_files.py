@@ -50,7 +50,7 @@ def open_gaussians(source: str | BinaryIO) -> tuple[Gaussians, PlyHeader]:
 
 def layout_of(header: PlyHeader) -> PlyOptions:
     """What makes a file laid out, placed and commented as the one read was."""
-    told = header.facts() | {"error": None, "date": None}  # of what was written then
+    told = header.facts() | {"date": None}  # of what was written then
     return PlyOptions(sh_degree=header.sh_degree, comments=header.version is not None, **told)
 
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from vvgt_cli.cameras.sets import pixel_width
 from vvgt_cli.closed_form.columns import MASS
+from vvgt_cli.conversion.certify import certified
 from vvgt_cli.conversion.live_labels import carrying_labels, fog_of_labels, label_facts, labels_of
 from vvgt_cli.conversion.place import in_frame_of, into_box, out_of_box
 from vvgt_cli.conversion.recolored import Look, SeveralLooks, lit_by, looked_up
@@ -95,11 +96,10 @@ def live_conversion(
         look = source.tf
     table = looked_up(facts, look, source.unit_distance, source.volume.unit_frame().scale)
     gaussians = as_stored(lit(baked(gaussians, table, pixel), lighting))
-    ply = replace(ply, live=facts)
-    if scored:
-        psnr = _score(run, request, field, gaussians, lit_by(gaussians, table, lighting, pixel))
-        ply = replace(ply, error=f"{psnr:.1f} dB live, on test views of {fit.size} px")
-    return Conversion(out_of_box(gaussians, source.volume), run.report, ply, field)
+    psnr = _score(run, request, field, gaussians, lit_by(gaussians, table, lighting, pixel)) if scored else None
+    found = out_of_box(gaussians, source.volume)
+    ply = certified(replace(ply, live=facts), run, field, fit, found, request.command, psnr)
+    return Conversion(found, run.report, ply, field)
 
 
 def _of_one(run: Run, request: ConvertRequest, field: Field, several: int = 1) -> tuple[Gaussians, LiveFacts]:

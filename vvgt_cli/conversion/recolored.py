@@ -192,8 +192,8 @@ def _laid(
 
     old = header if isinstance(header, PlyOptions) else layout_of(header)
     return replace(
-        old, live=None, unit_distance=distance, unit_distance_label=label, light=light, sh_degree=None,
-        function=shown.name, optics=None,
+        old, live=None, certificate=None, unit_distance=distance, unit_distance_label=label, light=light,
+        sh_degree=None, function=shown.name, optics=None,
     )  # fmt: skip
 
 

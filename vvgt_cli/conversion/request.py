@@ -105,6 +105,7 @@ class ConvertRequest:
         checkpoint: folder that keeps what the stages make, until the output is written; None for none.
         blocks: how the volume is gone through in blocks; None: it is in memory, or in blocks where that is better.
         live: the Gaussians carry values, so that they can be shown under any function (docs/live.md).
+        command: what is written into the file as the command that made it; None from Python.
         all_views: score on all ten test views, by SSIM and FLIP too, as a report has it.
     """
 
@@ -120,6 +121,7 @@ class ConvertRequest:
     checkpoint: str | None = None
     live: bool = False
     all_views: bool = False
+    command: str | None = None
     blocks: BlockOptions | None = None
 
     def budget(self) -> int:

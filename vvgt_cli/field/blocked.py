@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from vvgt_cli.field.cells import Reader
     from vvgt_cli.look.function import TransferFunction
     from vvgt_cli.look.labels import LabelTable
+    from vvgt_cli.volume import Volume
 
 Progress = Callable[[int, int], None]
 RAY_STEP = 2e-8  # seconds of a step of a ray through what is not empty: bonsai-tree in blocks of 128, two threads
@@ -346,6 +347,10 @@ class Blocked:
     def digest(self) -> str:
         """See `Field`."""
         return self.key
+
+    def volumes(self) -> list[Volume]:
+        """See `Field`."""
+        return [place.volume() for place in self.reader.all_places]
 
     def hidden(self, budget: int, size: int) -> tuple[np.ndarray, np.ndarray]:
         """See `Field`."""

@@ -12,6 +12,10 @@ import numpy as np
 from vvgt_cli.cameras import Camera
 from vvgt_cli.volume import Volume
 from vvgt_cli.volume.stats import slabs
+from vvgt_cli.volume.stored import read_block
+
+BOX = 128  # voxels along the edge of what is read at once
+LARGEST = 16 << 30  # bytes of values that are read once more
 
 
 def digest(*parts: Any) -> str:
@@ -32,6 +36,21 @@ def _feed(state: Any, part: Any) -> None:
         state.update(np.ascontiguousarray(part).data)
     else:
         state.update(f"{type(part).__name__}:{part!r};".encode())
+
+
+def values_digest(volumes: Sequence[Volume]) -> str | None:
+    """sha256 of the values of volumes, hexadecimal, the same in memory and in blocks; None of more than `LARGEST`."""
+    if sum(volume.data.nbytes for volume in volumes) > LARGEST:
+        return None
+    state = hashlib.sha256()
+    for volume in volumes:
+        dims = np.array(volume.dims)
+        _feed(state, volume.dims)
+        _feed(state, (volume.data.dtype.newbyteorder("=").str, float(volume.slope), float(volume.intercept)))
+        for z, y, x in np.ndindex(*(-(-dims[::-1] // BOX))):
+            lo = np.array([x, y, z]) * BOX
+            state.update(read_block(volume, lo, np.minimum(lo + BOX, dims)).data)
+    return state.hexdigest()
 
 
 def volume_digest(volume: Volume) -> str:

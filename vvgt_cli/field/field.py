@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from vvgt_cli.dvr.scene import PreparedVolume
     from vvgt_cli.look.function import TransferFunction
     from vvgt_cli.look.labels import LabelTable
+    from vvgt_cli.volume import Volume
 
 
 AT_ONCE = 1 << 17  # Gaussians whose samples are in memory
@@ -89,6 +90,9 @@ class Field(Protocol):
 
     def digest(self) -> str:
         """Of the volume's content."""
+
+    def volumes(self) -> list[Volume]:
+        """Every volume that is read for it: that of each layer, and its colours."""
 
     def hidden(self, budget: int, size: int) -> tuple[np.ndarray, np.ndarray]:
         """Cells (nz, ny, nx) bool that some training view sees, and their edges (3,) in voxels."""
@@ -179,6 +183,10 @@ class Resident:
     def digest(self) -> str:
         """See `Field`."""
         return volume_digest(self.source.volume)
+
+    def volumes(self) -> list[Volume]:
+        """See `Field`."""
+        return [volume for layer in self.source.layers for volume in (layer.volume, *(layer.colors or ()))]
 
     def hidden(self, budget: int, size: int) -> tuple[np.ndarray, np.ndarray]:
         """See `Field`."""

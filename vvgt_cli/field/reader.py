@@ -105,6 +105,11 @@ class Scalars:
     optics: Optics = field(repr=False)
 
     @property
+    def all_places(self) -> tuple[Place, ...]:
+        """Where each volume comes from."""
+        return (self.place,)
+
+    @property
     def voxel_bytes(self) -> int:
         """Of a voxel while it is read."""
         return self.rule.dtype.itemsize + 8
@@ -146,6 +151,11 @@ class Layers:
     scale: float
     optics: Optics = field(repr=False)
     voxel_bytes = 60
+
+    @property
+    def all_places(self) -> tuple[Place, ...]:
+        """Where each volume comes from."""
+        return tuple(place for places in self.places for place in places)
 
     def __getstate__(self) -> dict[str, object]:
         """What other processes get: they open the volumes for themselves."""

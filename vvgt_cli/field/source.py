@@ -211,8 +211,14 @@ class Source:
 
     def optics(self) -> str | None:
         """Digest of an optics grid's tables, functions and unit distances, not of its volumes; None of scalars."""
-        if not self.gridded:
-            return None
+        return digest(*self._optics())[:OPTICS] if self.gridded else None
+
+    def shown_as(self) -> str:
+        """Digest of functions, tables, unit distances and light, not of any volume."""
+        return digest(*self._optics(), self.lighting and self.lighting.text())[:OPTICS]
+
+    def _optics(self) -> list[Any]:
+        """Tables, functions and unit distances."""
         parts: list[Any] = []
         for layer in self.layers:
             tf = layer.tf
@@ -221,7 +227,7 @@ class Source:
             else:
                 parts += [tf.opacity_nodes, None if layer.colors else tf.color_map]
             parts.append(f"{layer.unit_distance:.6g}")
-        return digest(*parts)[:OPTICS]
+        return parts
 
     def kernels(self, names: tuple[str, ...]) -> tuple[str, ...]:
         """The kernels of a command, of the kind of scene and light that this is."""

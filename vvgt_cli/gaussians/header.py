@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.gaussians.certificate import WORD as CERTIFICATE
+from vvgt_cli.gaussians.certificate import Certificate
 from vvgt_cli.gaussians.frames import up_matrix
 from vvgt_cli.gaussians.legend import checked
 from vvgt_cli.gaussians.live_facts import WORD, LiveFacts, live_facts, one_comment
@@ -47,8 +49,9 @@ class FileFacts:
         live: of the values that the Gaussians carry; None where they have one look alone.
         length_unit: of the world, where that has no anatomical space (whose unit is mm).
         function: name of the transfer function.
+        certificate: what was measured when the Gaussians were made; None of Gaussians that were changed since.
         legend: of the look that the file has (`legend.legend_text`); of a live file ``live`` says it.
-        error: of the conversion, in words; ``date``: when it was written, YYYY-MM-DD. Pages alone say these two.
+        date: when it was written, YYYY-MM-DD, of pages alone.
     """
 
     frame: str = "unit"
@@ -66,8 +69,8 @@ class FileFacts:
     live: LiveFacts | None = None
     length_unit: str | None = None
     function: str | None = None
+    certificate: Certificate | None = None
     legend: str | None = None
-    error: str | None = None
     date: str | None = None
 
     def facts(self) -> dict[str, Any]:
@@ -206,6 +209,8 @@ def _provenance(comments: list[str], name: str, columns: list[str]) -> dict[str,
                     lives.append({})
                 live = lives[-1]
                 live |= more | {"labels": live.get("labels", ()) + more["labels"]} if "labels" in more else more
+            elif words[1] == CERTIFICATE:
+                found[CERTIFICATE] = Certificate.of(comment.split(None, 2)[2])
             else:
                 found |= _one_comment(words[1:])
         except (ValueError, IndexError, UsageError):
@@ -248,8 +253,8 @@ def _one_comment(words: list[str]) -> dict[str, Any]:
         return {"function": str(json.loads(" ".join(words[1:])))}
     if words[0] == "legend":
         return {"legend": checked(" ".join(words[1:]))}
-    if words[0] in ("error", "date"):
-        return {words[0]: " ".join(words[1:])}
+    if words[0] == "date":
+        return {"date": " ".join(words[1:])}
     if words[0] == "optics":
         return {"optics": words[1]}
     if words[0] == "affine":
@@ -275,7 +280,7 @@ def comment_lines(facts: FileFacts) -> list[str]:
         lines.append(f"comment vvgt length-unit {facts.length_unit}")
     if facts.function is not None:
         lines.append(f"comment vvgt function {json.dumps(facts.function)}")
-    for word, text in (("legend", None if facts.live else facts.legend), ("error", facts.error), ("date", facts.date)):
+    for word, text in (("legend", None if facts.live else facts.legend), ("date", facts.date)):
         if text is not None:
             lines.append(f"comment vvgt {word} {text}")
     if facts.unit_distance is not None:
@@ -289,6 +294,8 @@ def comment_lines(facts: FileFacts) -> list[str]:
         lines.append(f"comment vvgt optics {facts.optics}")
     if facts.live is not None:
         lines += facts.live.lines()
+    if facts.certificate is not None:
+        lines.append(f"comment {facts.certificate.line()}")
     if facts.rule == "compensated":
         lines.append(MIP)
     return lines

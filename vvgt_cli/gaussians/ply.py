@@ -327,6 +327,7 @@ def describe(gaussians: Gaussians, header: PlyHeader) -> dict[str, object]:
         "version": header.version,
         **{key: value for key in ("length_unit", "function") if (value := getattr(header, key)) is not None},
         **({} if header.light is None else {"light": header.light.text()}),
+        **({} if header.certificate is None else {"certificate": header.certificate.facts()}),
         **({} if header.live is None else live_summary(gaussians, header.live)),
     }
     if len(gaussians):

@@ -14,7 +14,7 @@ LEFT, RIGHT, TOP, BOTTOM = 46, 14, 14, 44
 MARK = 5.5
 LETTER = 6.5  # width of one
 HATCH = "background:repeating-linear-gradient(135deg,var(--line) 0 3px,var(--soft) 3px 4.5px)"
-SHAPES = ("circle", "diamond", "square", "triangle")
+SHAPES = ("circle", "diamond", "square", "triangle", "hexagon", "star")
 
 
 @dataclass(frozen=True)
@@ -70,22 +70,32 @@ class _Frame:
         return LEFT + fx * (WIDTH - LEFT - RIGHT), HEIGHT - BOTTOM - fy * (HEIGHT - TOP - BOTTOM)
 
 
-def _frame(points: Sequence[Point]) -> _Frame:
+def _frame(points: Sequence[Point], ceiling: float | None) -> _Frame:
     """Room of 12 % and a half on either side."""
-    xs, ys = [p.x for p in points], [p.y for p in points]
+    xs, ys = [p.x for p in points], [p.y for p in points] + ([] if ceiling is None else [ceiling])
     wide = max(math.log(max(xs) / min(xs)), math.log(2))
     high = max(max(ys) - min(ys), 1.0)
     spread = math.exp(0.09 * wide)
     return _Frame((min(xs) / spread, max(xs) * spread), (min(ys) - 0.08 * high, max(ys) + 0.08 * high))
 
 
-def scatter(points: Sequence[Point], x_label: str, y_label: str, lines: Sequence[Sequence[Point]] = ()) -> str:
-    """A chart of marks over a logarithmic axis; ``lines`` are drawn through points in order."""
-    frame = _frame(points)
+def scatter(
+    points: Sequence[Point],
+    x_label: str,
+    y_label: str,
+    lines: Sequence[Sequence[Point]] = (),
+    ceiling: float | None = None,
+) -> str:
+    """A chart of marks over a logarithmic axis; ``lines`` are drawn through points in order, VTK's at ``ceiling``."""
+    frame = _frame(points, ceiling)
     parts = [
         f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(y_label)} against {escape(x_label)}">'
     ]
     parts += _axes(frame, x_label, y_label)
+    if ceiling is not None:
+        _, y = frame.at(frame.x[0], ceiling)
+        parts.append(f'<line class="ceiling" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>')
+        parts.append(f'<text class="tick" x="{WIDTH - RIGHT}" y="{y - 4:.1f}" text-anchor="end">VTK</text>')
     for line in lines:
         path = " ".join("{:.1f},{:.1f}".format(*frame.at(p.x, p.y)) for p in line)
         parts.append(f'<polyline class="front {line[0].color}" points="{path}"/>')
@@ -108,6 +118,8 @@ def mark(shape: int, x: float, y: float) -> str:
         "diamond": ((0, -1.35), (1.35, 0), (0, 1.35), (-1.35, 0)),
         "square": ((-0.95, -0.95), (0.95, -0.95), (0.95, 0.95), (-0.95, 0.95)),
         "triangle": ((0, -1.25), (1.2, 0.95), (-1.2, 0.95)),
+        "hexagon": ((0, -1.2), (1.04, -0.6), (1.04, 0.6), (0, 1.2), (-1.04, 0.6), (-1.04, -0.6)),
+        "star": ((0, -1.5), (0.45, -0.45), (1.5, 0), (0.45, 0.45), (0, 1.5), (-0.45, 0.45), (-1.5, 0), (-0.45, -0.45)),
     }[SHAPES[shape]]
     path = " ".join(f"{x + r * dx:.1f},{y + r * dy:.1f}" for dx, dy in corners)
     return f'<polygon points="{path}"/>'

@@ -20,11 +20,11 @@ from vvgt_cli.errors import DataError
 Run = dict[str, Any]
 FORMATS = ("vvgt-report", "vvgt-conversion")
 SCORING = ("test views", "seats")  # stages that only measure
-KINDS = ("closed form", "network", "steps", "baseline")
+KINDS = ("closed form", "network", "steps", "baseline", "live", "peer")
 STAGES = {  # colours of the stages that are known, in order
     "read": "#8a949e", "scene": "#b4bbc2", "samples": "#8f7bbf", "closed form": "#2f7fbf", "check views": "#f2c76b",
     "views": "#e69f00", "cells by error": "#0f8f8f", "back-projection": "#56b4e9", "network": "#cc79a7",
-    "judge": "#e3b5cd", "refinement": "#009e73",
+    "judge": "#e3b5cd", "refinement": "#009e73", "training": "#6b7fd1", "values": "#c9b458", "live look": "#dddddd",
     "write": "#777c83", "test views": "#dddddd", "seats": "#e8e8e8",
 }  # fmt: skip
 OTHER = "#a05d3b"
@@ -108,7 +108,7 @@ def unit_costs(runs: Sequence[Run]) -> dict[str, float]:
                 note("refinement, a step", seconds, (run.get("refinement") or {}).get("steps") or 0)
             elif name == "write":
                 note("write, a megabyte", seconds, run["bytes"] / 1e6)
-            elif name not in SCORING and run["kind"] != "baseline":
+            elif name not in SCORING and run["kind"] not in ("baseline", "peer"):
                 note(f"{name}, a run", seconds, 1)
     return {key: statistics.median(values) for key, values in found.items()}
 

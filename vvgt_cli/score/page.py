@@ -62,7 +62,14 @@ def chart(series: Sequence[Series], axis: str, x_label: str) -> str:
     """One of `AXES`, with its front where it is time."""
     marks = points(series, axis)
     lines = [sorted((p for p in some if p.front), key=lambda p: p.x) for some in marks]
-    return scatter([p for some in marks for p in some], x_label, "PSNR, dB", [line for line in lines if len(line) > 1])
+    joined = [line for line in lines if len(line) > 1]
+    return scatter([p for some in marks for p in some], x_label, "PSNR, dB", joined, ceiling(series))
+
+
+def ceiling(series: Sequence[Series]) -> float | None:
+    """PSNR of VTK's own pictures of the scene, which no file needs to exceed; None of several scenes."""
+    found = series[0].document.get("vtk_psnr") if len(series) == 1 else None
+    return None if found is None else float(found)
 
 
 def page(series: Sequence[Series], title: str, pictures: Pictures | None = None) -> str:

@@ -10,10 +10,10 @@ from vvgt_cli.errors import UsageError
 from vvgt_cli.files import atomic_write
 from vvgt_cli.score.charts import log_ticks
 from vvgt_cli.score.curves import KINDS, OTHER, SCORING, STAGES, Series, short, stage_names
-from vvgt_cli.score.page import AXES, points
+from vvgt_cli.score.page import AXES, ceiling, points
 
-MARKS = ("o", "D", "s", "^")
-COLORS = ("#0072b2", "#a8527e", "#00845f", "#c05a00")
+MARKS = ("o", "D", "s", "^", "h", "*")
+COLORS = ("#0072b2", "#a8527e", "#00845f", "#c05a00", "#7a6a00", "#333333")
 FILES = ("psnr-seconds.png", "psnr-gaussians.png", "psnr-megabytes.png", "stages.png")
 
 
@@ -39,6 +39,8 @@ def write_plots(folder: Path, series: Sequence[Series], overwrite: bool) -> None
     for name, (axis, label, _) in zip(FILES, AXES, strict=False):
         figure, axes = _figure((6.4, 4.4))
         _scatter(axes, series, axis)
+        if (level := ceiling(series)) is not None:
+            axes.axhline(level, color="#888888", lw=1, ls="--", zorder=0, label="VTK")
         axes.set(xscale="log", xlabel=label, ylabel="PSNR, dB")
         places = log_ticks(*axes.get_xlim())
         axes.set_xticks(places, [short(place) for place in places])

@@ -16,6 +16,14 @@ function legendOf(text) {
   } catch { return null; }
 }
 
+// The error that the conversion measured, of the JSON of a certificate (docs/certificate.md); null where it is damaged
+function errorOf(text) {
+  try {
+    const { psnr, live_psnr: live, size } = JSON.parse(text), dB = live ?? psnr;
+    return Number.isFinite(dB) ? `${dB.toFixed(1)} dB ${live == null ? '' : 'live, '}on test views of ${Number(size)} px` : null;
+  } catch { return null; }
+}
+
 // {version, scale, centre, frame, up, space, 'length-unit', function, size, rule, 'unit-distance', label, light, unit, legend, error, date}: text and numbers
 export function factsOf(comments) {
   const facts = { up: 'none', space: 'none', frame: 'unit' };
@@ -29,6 +37,7 @@ export function factsOf(comments) {
     else if (key === 'size') [facts.size, facts.rule] = [Number(rest[0]), rest[2]];
     else if (key === 'function') facts.function = JSON.parse(text);
     else if (key === 'legend') facts.legend = legendOf(text);
+    else if (key === 'certificate') facts.error = errorOf(text);
     else if (key === 'live') { if (rest[0] === 'unit') facts.unit = rest.slice(1).join(' '); }
     else if (rest.length) facts[key] = text;
     else facts.version = key;

@@ -1,0 +1,231 @@
+"""What files say of their own error: written, read from every format, checked against the volume."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import vvgt_cli
+from vvgt_cli.conversion.certify import Verdict, first_views, position_error
+from vvgt_cli.errors import DataError
+from vvgt_cli.field.digests import values_digest
+from vvgt_cli.gaussians import PlyOptions, read_ply, write_ply
+from vvgt_cli.gaussians.certificate import Certificate
+from vvgt_cli.gaussians.formats import read_splats
+from vvgt_cli.gaussians.header import parse_header
+from vvgt_cli.volume import Volume
+
+DIMS = (20, 18, 22)  # x, y, z
+FULL = Certificate(
+    volume="head.nrrd", sha256="ab" * 32, look="0123456789ab", size=400, rule="inria", psnr=40.25, views=3,
+    seats=(("inria 400 px", 39.5), ("viser 800 px", 38.0)), position_error=1e-5, seconds=12.5,
+    command="vvgt convert head.nrrd --tf 'a b.json'",
+)  # fmt: skip
+SMALL = ("--size", "64", "--max-gaussians", "300", "--steps", "8")
+RAW = ("--dims", *map(str, DIMS), "--dtype", "uint8")
+
+
+def ball(shift=0.0):
+    x, y, z = np.meshgrid(*(np.arange(n) for n in DIMS), indexing="ij")
+    r = np.sqrt((x - 9.5 - shift) ** 2 + (y - 8.5) ** 2 + (z - 10.5) ** 2)
+    return np.clip(255 * (1.5 - r / 6), 0, 255).astype(np.uint8).transpose(2, 1, 0)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    made = tmp_path_factory.mktemp("certificate")
+    ball().tofile(made / "ball.raw")
+    ball(1.0).tofile(made / "moved.raw")
+    points = [{"x": 0, "opacity": 0, "rgb": [1, 0, 0]}, {"x": 1, "opacity": 0.8, "rgb": [1, 1, 0]}]
+    (made / "tf.json").write_text(json.dumps({"points": points}))
+    points[1]["opacity"] = 0.5
+    (made / "other.json").write_text(json.dumps({"points": points}))
+    return made
+
+
+@pytest.fixture
+def made(vvgt, folder, tmp_path):
+    """A converted file; the volume and the function were given by their whole paths."""
+    args = (folder / "ball.raw", *RAW, "--tf", folder / "tf.json", *SMALL, "-o", tmp_path / "out.ply")
+    assert vvgt("convert", *args).code == 0
+    return tmp_path / "out.ply"
+
+
+def evaluated(vvgt, folder, ply, volume="ball.raw", tf="tf.json", *more):
+    result = vvgt(
+        "evaluate", ply, "--volume", folder / volume, *RAW, "--tf", folder / tf, "--no-seats", "--json", *more
+    )
+    assert result.code == 0, result.err
+    return json.loads(result.out)["certificate"]
+
+
+def test_a_line_gives_the_certificate_back() -> None:
+    assert FULL.line().startswith("vvgt certificate {")
+    assert "\n" not in FULL.line()
+    assert Certificate.of(FULL.line().split(None, 2)[2]) == FULL
+    least = replace(FULL, sha256=None, seats=(), seconds=None, command=None)
+    assert Certificate.of(least.line().split(None, 2)[2]) == least
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "", "[]", "{}", "nonsense",
+        FULL.line().split(None, 2)[2].replace("40.25", "NaN"),
+        FULL.line().split(None, 2)[2].replace("40.25", '"40.25"'),
+        FULL.line().split(None, 2)[2].replace('"size": 400', '"size": true'),
+        FULL.line().split(None, 2)[2].replace('"volume"', '"volumes"'),
+        FULL.line().split(None, 2)[2].replace('"inria 400 px": 39.5', '"inria 400 px": Infinity'),
+        json.dumps(FULL.facts() | {"seats": [1]}),
+    ],
+)  # fmt: skip
+def test_a_certificate_that_is_none_is_one_line(text) -> None:
+    header = "\n".join(
+        ["ply", "format binary_little_endian 1.0", f"comment vvgt certificate {text}", "element vertex 0"]
+        + [f"property float {name}" for name in ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]]
+        + [f"property float {name}_{k}" for name, n in (("scale", 3), ("rot", 4)) for k in range(n)]
+        + ["end_header", ""]
+    )
+    with pytest.raises(DataError, match="is not one that vvgt writes"):
+        parse_header(header.encode(), "x.ply")
+
+
+def test_a_conversion_certifies_its_file(made) -> None:
+    found = read_ply(made)[1].certificate
+    assert found is not None
+    assert (found.volume, found.size, found.rule, found.views) == ("ball", 64, "inria", 3)
+    assert found.psnr > 20
+    assert len(found.seats) == 10
+    assert found.seats[0][1] == min(dB for _, dB in found.seats)
+    assert found.command is not None
+    assert found.command.startswith("vvgt convert ball.raw --")
+    assert "/" not in found.command
+    for words in ("--tf tf.json", "--size 64", "--max-gaussians 300", "--steps 8", "--dims 20 18 22"):
+        assert words in found.command
+    assert "out.ply" not in found.command
+    assert found.seconds is None  # SOURCE_DATE_EPOCH is set
+
+
+def test_seconds_are_said_unless_files_are_to_be_made_again(vvgt, folder, tmp_path, monkeypatch) -> None:
+    monkeypatch.delenv("SOURCE_DATE_EPOCH")
+    args = (folder / "ball.raw", *RAW, "--tf", folder / "tf.json", *SMALL)
+    assert vvgt("convert", *args, "-o", tmp_path / "timed.ply").code == 0
+    found = read_ply(tmp_path / "timed.ply")[1].certificate
+    assert found is not None
+    assert found.seconds is not None
+    assert 0 < found.seconds < 1000
+
+
+def test_no_comments_no_certificate(vvgt, folder, tmp_path) -> None:
+    args = (folder / "ball.raw", *RAW, "--tf", folder / "tf.json", *SMALL, "--no-comments")
+    assert vvgt("convert", *args, "-o", tmp_path / "out.ply").code == 0
+    assert read_ply(tmp_path / "out.ply")[1].certificate is None
+    assert b"sha256" not in (tmp_path / "out.ply").read_bytes()
+
+
+@pytest.mark.parametrize("suffix", [".compressed.ply", ".spz", ".sog", ".glb", ".usdc", ".html"])
+def test_every_format_carries_it(vvgt, folder, tmp_path, suffix) -> None:
+    if suffix == ".usdc":
+        pytest.importorskip("pxr")
+    if suffix == ".sog" and shutil.which("splat-transform") is None:
+        pytest.skip("needs splat-transform")
+    args = (folder / "ball.raw", *RAW, "--tf", folder / "tf.json", *SMALL)
+    assert vvgt("convert", *args, "-o", tmp_path / f"out{suffix}").code == 0
+    assert vvgt("convert", *args, "-o", tmp_path / "out.ply").code == 0
+    expected = read_ply(tmp_path / "out.ply")[1].certificate
+    assert expected is not None
+    assert read_splats(tmp_path / f"out{suffix}")[1].certificate == expected
+    told = vvgt("info", tmp_path / f"out{suffix}")
+    assert told.code == 0
+    assert expected.sha256 in told.out.decode()
+    assert f"psnr {expected.psnr:g}" in told.out.decode()
+    assert evaluated(vvgt, folder, tmp_path / f"out{suffix}")["same_volume"]
+
+
+def test_it_holds_for_the_volume_it_was_made_of(vvgt, folder, made) -> None:
+    found = evaluated(vvgt, folder, made)
+    assert found["holds"]
+    assert found["same_volume"]
+    assert found["same_look"]
+    assert found["psnr"] == found["recorded"]  # the same views, drawn the same way
+    blocks = evaluated(vvgt, folder, made, "ball.raw", "tf.json", "--blocks", "16")
+    assert blocks["holds"]
+    assert blocks["same_volume"]
+
+
+def test_it_does_not_hold_for_another_volume_function_or_damaged_gaussians(vvgt, folder, made, tmp_path) -> None:
+    moved = evaluated(vvgt, folder, made, "moved.raw")
+    assert not moved["holds"]
+    assert moved["same_volume"] is False
+    assert "values are not those" in moved["text"]
+    other = evaluated(vvgt, folder, made, "ball.raw", "other.json")
+    assert not other["holds"]
+    assert other["same_volume"]
+    assert not other["same_look"]
+    gaussians, header = read_ply(made)
+    faded = replace(gaussians, opacity_logits=gaussians.opacity_logits - 1)
+    write_ply(tmp_path / "faded.ply", faded, PlyOptions(**header.facts()))
+    found = evaluated(vvgt, folder, tmp_path / "faded.ply")
+    assert not found["holds"]
+    assert found["same_volume"]
+    assert found["same_look"]
+    assert found["psnr"] < found["recorded"] - 1
+
+
+def test_gaussians_that_change_lose_it(vvgt, folder, made, tmp_path) -> None:
+    views = tmp_path / "views"
+    args = (folder / "ball.raw", *RAW, "--tf", folder / "tf.json", "--size", "64", "--views", "4", "-o", views)
+    assert vvgt("render-views", *args).code == 0
+    assert vvgt("optimize", made, "--views", views, "--steps", "2", "-o", tmp_path / "more.ply").code == 0
+    assert read_ply(tmp_path / "more.ply")[1].certificate is None
+
+
+def test_a_live_file_keeps_its_own_and_a_recolored_one_has_none(vvgt, folder, tmp_path) -> None:
+    args = (folder / "ball.raw", *RAW, "--tf", folder / "tf.json", "--size", "64", "--max-gaussians", "300", "--live")
+    assert vvgt("convert", *args, "-o", tmp_path / "live.ply").code == 0
+    assert read_ply(tmp_path / "live.ply")[1].certificate is not None
+    recolor = ("recolor", tmp_path / "live.ply", "--tf", folder / "other.json", "-o", tmp_path / "other.ply")
+    assert vvgt(*recolor).code == 0
+    assert read_ply(tmp_path / "other.ply")[1].certificate is None
+
+
+def test_from_python(tmp_path) -> None:
+    result = vvgt_cli.convert(ball(), goal={"max_gaussians": 300, "size": 64, "steps": 0})
+    result.save(tmp_path / "a.ply")
+    found = read_ply(tmp_path / "a.ply")[1].certificate
+    assert found is not None
+    assert found.command is None
+    assert found.psnr == round(first_views(result.scores), 2)
+
+
+def test_the_digest_is_of_values_type_and_dims_not_of_how_they_lie() -> None:
+    data = np.random.default_rng(3).integers(0, 1000, (150, 20, 140)).astype(">u2")
+    first = values_digest([Volume(data)])
+    assert first == values_digest([Volume(np.asfortranarray(data.astype("<u2")))])
+    other = data.copy()
+    other[149, 19, 139] += 1
+    assert values_digest([Volume(other)]) != first
+    assert values_digest([Volume(data.astype(np.int32))]) != first
+    assert values_digest([Volume(data.reshape(75, 40, 140))]) != first
+    assert values_digest([Volume(data), Volume(data)]) != first
+
+
+def test_positions_far_from_the_origin_are_known_to_be_rounded(made) -> None:
+    gaussians, _ = read_ply(made)
+    near = PlyOptions(frame="world", scale=0.1, centre=(1.0, 2.0, 3.0))
+    far = replace(near, centre=(5e6, 2.0, 3.0))
+    assert position_error(gaussians, PlyOptions(scale=0.1, centre=(5e6, 0.0, 0.0))) == 0  # the unit frame
+    assert 0 < position_error(gaussians, near) < 2e-6
+    assert 0.1 < position_error(gaussians, far) <= 0.25 + 1e-6  # half a step of float32 at 5e6
+
+
+def test_a_verdict_says_what_does_not_hold() -> None:
+    assert Verdict(True, True, 40.0, 40.05).text() == "holds: the same volume and look, 40.00 dB (40.05 dB recorded)"
+    assert Verdict(None, True, 40.0, 40.0).text().startswith("holds: the volume was not compared (too large)")
+    assert Verdict(True, True, 39.8, 40.0).text() == "does not hold: 39.80 dB, 40.00 dB recorded"
+    assert not Verdict(True, True, math.nan, 40.0).holds

@@ -1,0 +1,46 @@
+"""What was typed on the command line."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Collection
+
+import click
+from click.core import ParameterSource
+
+ASIDE = {  # parameters that do not change what a file of Gaussians holds
+    *("output", "overwrite", "report", "preview", "checkpoint", "quiet"),
+    *("threads", "memory", "workers", "scheduler", "block_size"),
+}
+_FOLDERS = re.compile(r"[^,=]*/(?=[^/,])")  # before a name, in each part of a value
+
+
+def typed(ctx: click.Context) -> list[click.Parameter]:
+    """Parameters that were given on the command line."""
+    return [p for p in ctx.command.params if p.name and ctx.get_parameter_source(p.name) is ParameterSource.COMMANDLINE]
+
+
+def command_line(ctx: click.Context, without: Collection[str] = (), folders: bool = True) -> str:
+    """The call, arguments first; without ``--threads``, which reports record by themselves.
+
+    Args:
+        ctx: of the call.
+        without: names of parameters that are left out.
+        folders: paths as they were given; False: names alone.
+    """
+    words = ["vvgt", ctx.command.name or ""]
+    for parameter in typed(ctx):
+        value = ctx.params.get(parameter.name or "")
+        values = [
+            str(v) if folders else _FOLDERS.sub("", str(v)) for v in (value if isinstance(value, tuple) else [value])
+        ]
+        if parameter.name in without:
+            continue
+        if isinstance(parameter, click.Argument):
+            words += values
+        elif isinstance(parameter, click.Option) and parameter.name in ctx.params:
+            name = parameter.opts[-1]
+            repeated = [[name, v] for v in values] if parameter.multiple else [[name, *values]]
+            words += [name] if parameter.is_flag else [word for part in repeated for word in part]
+    return shlex.join(words)

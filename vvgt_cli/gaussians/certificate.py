@@ -1,0 +1,82 @@
+"""What a file says of its own error: the volume it was made of, how near it is to that, and how long it took."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from typing import Any
+
+WORD = "certificate"  # of the comment
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """What was measured when Gaussians were made; it holds for these Gaussians alone.
+
+    Attributes:
+        volume: the volume's name, without its folder.
+        sha256: digest of its values, hexadecimal; None of a volume too large to read once more.
+        look: digest of functions, label tables, opacity distances and light.
+        size, rule: pixels of the screen, and name of the rule of `vvgt_cli.gaussians.rules`, that they are scored by.
+        psnr: dB, mean of the first scored views against the volume.
+        views: number of these views.
+        live_psnr: dB of a live file as `vvgt recolor` shows it under its own function; None of others.
+        seats: name of a viewing condition and dB of each that was scored, worst first.
+        position_error: greatest distance of a centre in the file from where it was computed, in units of the world.
+        seconds: wall time until the scores; None where `SOURCE_DATE_EPOCH` asks for files that can be made again.
+        command: as it was given, without folders, outputs and what changes nothing; None from Python.
+    """
+
+    volume: str
+    sha256: str | None
+    look: str
+    size: int
+    rule: str
+    psnr: float
+    views: int
+    live_psnr: float | None = None
+    seats: tuple[tuple[str, float], ...] = ()
+    position_error: float = 0.0
+    seconds: float | None = None
+    command: str | None = None
+
+    def facts(self) -> dict[str, Any]:
+        """By name, without what is not known."""
+        found = vars(self) | {"seats": dict(self.seats)}
+        return {key: value for key, value in found.items() if value not in (None, {})}
+
+    def line(self) -> str:
+        """The comment, without the word before it: ASCII on one line."""
+        return f"vvgt {WORD} {json.dumps(self.facts())}"
+
+    @classmethod
+    def of(cls, text: str) -> Certificate:
+        """What `line` wrote behind its word.
+
+        Raises:
+            ValueError: anything else.
+        """
+        found = json.loads(text)
+        if not isinstance(found, dict) or not isinstance(found.get("seats", {}), dict):
+            raise ValueError(text)
+        seats = tuple((str(name), _number(value)) for name, value in found.pop("seats", {}).items())
+        kinds = {
+            "volume": str, "sha256": str, "look": str, "size": int, "rule": str, "psnr": float, "views": int,
+            "live_psnr": float, "position_error": float, "seconds": float, "command": str,
+        }  # fmt: skip
+        if not {"volume", "look", "size", "rule", "psnr", "views"} <= set(found) <= set(kinds):
+            raise ValueError(text)
+        known: dict[str, Any] = {"sha256": None}
+        for key, value in found.items():
+            kind = kinds[key]
+            found[key] = _number(value) if kind is float else value
+            if not isinstance(found[key], kind) or isinstance(value, bool):
+                raise ValueError(text)
+        return cls(**(known | found), seats=seats)
+
+
+def _number(value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise ValueError(value)
+    return float(value)
