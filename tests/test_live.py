@@ -365,7 +365,11 @@ def test_the_library_recolors_results_and_files(live_file) -> None:
     other = result.recolor("viridis")
     assert other.gaussians.live is None
     assert len(other.gaussians) <= 100
-    assert len(vvgt_library.recolor(live_file, "magma").gaussians) > 100
+    assert result.ply.legend != other.ply.legend
+    assert json.loads(other.ply.legend)["nodes"][0][2] == "440154"  # viridis begins with it
+    magma = vvgt_library.recolor(live_file, "magma")
+    assert len(magma.gaussians) > 100
+    assert json.loads(magma.ply.legend)["nodes"][-1][2] == "fcfdbf"
     with pytest.raises(vvgt_library.DataError, match="carry no values"):
         other.recolor("magma")
 

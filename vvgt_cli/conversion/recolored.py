@@ -13,6 +13,7 @@ from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions
 from vvgt_cli.gaussians.constants import MIN_ALPHA
 from vvgt_cli.gaussians.header import FileFacts
+from vvgt_cli.gaussians.legend import legend_text
 from vvgt_cli.gaussians.live import Looks, Palette, Several, Table, seen_under, shown_by
 from vvgt_cli.gaussians.live_facts import GRADIENT, LiveFacts
 from vvgt_cli.gaussians.ply import opacity
@@ -194,6 +195,7 @@ def _laid(
     return replace(
         old, live=None, certificate=None, unit_distance=distance, unit_distance_label=label, light=light,
         sh_degree=None, function=shown.name, optics=None,
+        legend=legend_text(shown, header.live.lo, header.live.hi, header.live.unit) if header.live else None,
     )  # fmt: skip
 
 
