@@ -14,6 +14,7 @@ ASIDE = {  # parameters that do not change what a file of Gaussians holds
     *("threads", "memory", "workers", "scheduler", "block_size"),
 }
 _FOLDERS = re.compile(r"[^,=]*/(?=[^/,])")  # before a name, in each part of a value
+_PART = re.compile(r"\d+/\d+")  # of a job array: no folder
 
 
 def typed(ctx: click.Context) -> list[click.Parameter]:
@@ -32,9 +33,7 @@ def command_line(ctx: click.Context, without: Collection[str] = (), folders: boo
     words = ["vvgt", ctx.command.name or ""]
     for parameter in typed(ctx):
         value = ctx.params.get(parameter.name or "")
-        values = [
-            str(v) if folders else _FOLDERS.sub("", str(v)) for v in (value if isinstance(value, tuple) else [value])
-        ]
+        values = [_told(str(v), folders) for v in (value if isinstance(value, tuple) else [value])]
         if parameter.name in without:
             continue
         if isinstance(parameter, click.Argument):
@@ -44,3 +43,7 @@ def command_line(ctx: click.Context, without: Collection[str] = (), folders: boo
             repeated = [[name, v] for v in values] if parameter.multiple else [[name, *values]]
             words += [name] if parameter.is_flag else [word for part in repeated for word in part]
     return shlex.join(words)
+
+
+def _told(value: str, folders: bool) -> str:
+    return value if folders or _PART.fullmatch(value) else _FOLDERS.sub("", value)
