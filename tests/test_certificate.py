@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -111,6 +110,18 @@ def test_a_conversion_certifies_its_file(made) -> None:
     assert found.seconds is None  # SOURCE_DATE_EPOCH is set
 
 
+def test_the_part_of_a_job_array_is_no_folder(vvgt, folder, tmp_path) -> None:
+    for k, name in enumerate(("ball", "moved")):
+        (tmp_path / f"t_{k}.raw").write_bytes((folder / f"{name}.raw").read_bytes())
+    args = (tmp_path / "t_*.raw", *RAW, "--tf", folder / "tf.json", *SMALL, "--shard", "2/2")
+    assert vvgt("convert", *args, "-o", tmp_path / "out_{}.ply").code == 0
+    found = read_ply(tmp_path / "out_1.ply")[1].certificate
+    assert found is not None
+    assert found.command is not None
+    assert found.command.startswith("vvgt convert 't_*.raw'")
+    assert "--shard 2/2" in found.command
+
+
 def test_seconds_are_said_unless_files_are_to_be_made_again(vvgt, folder, tmp_path, monkeypatch) -> None:
     monkeypatch.delenv("SOURCE_DATE_EPOCH")
     args = (folder / "ball.raw", *RAW, "--tf", folder / "tf.json", *SMALL)
@@ -132,8 +143,6 @@ def test_no_comments_no_certificate(vvgt, folder, tmp_path) -> None:
 def test_every_format_carries_it(vvgt, folder, tmp_path, suffix) -> None:
     if suffix == ".usdc":
         pytest.importorskip("pxr")
-    if suffix == ".sog" and shutil.which("splat-transform") is None:
-        pytest.skip("needs splat-transform")
     args = (folder / "ball.raw", *RAW, "--tf", folder / "tf.json", *SMALL)
     assert vvgt("convert", *args, "-o", tmp_path / f"out{suffix}").code == 0
     assert vvgt("convert", *args, "-o", tmp_path / "out.ply").code == 0
@@ -188,7 +197,12 @@ def test_gaussians_that_change_lose_it(vvgt, folder, made, tmp_path) -> None:
 def test_a_live_file_keeps_its_own_and_a_recolored_one_has_none(vvgt, folder, tmp_path) -> None:
     args = (folder / "ball.raw", *RAW, "--tf", folder / "tf.json", "--size", "64", "--max-gaussians", "300", "--live")
     assert vvgt("convert", *args, "-o", tmp_path / "live.ply").code == 0
-    assert read_ply(tmp_path / "live.ply")[1].certificate is not None
+    certificate = read_ply(tmp_path / "live.ply")[1].certificate
+    assert certificate is not None
+    assert certificate.live_psnr is not None
+    found = evaluated(vvgt, folder, tmp_path / "live.ply")  # with --tf: as recolor shows it
+    assert (found["holds"], found["recorded"]) == (True, certificate.live_psnr)
+    assert found["psnr"] == pytest.approx(found["recorded"], abs=0.02)
     recolor = ("recolor", tmp_path / "live.ply", "--tf", folder / "other.json", "-o", tmp_path / "other.ply")
     assert vvgt(*recolor).code == 0
     assert read_ply(tmp_path / "other.ply")[1].certificate is None

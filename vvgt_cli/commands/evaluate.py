@@ -248,7 +248,7 @@ def _scored(run: Run, request: EvaluateRequest, volume: Field, gaussians: Gaussi
         stage.note = f"{psnr_note(scores)}, {size} px"
     if header.certificate is not None:
         with run.stage("certificate") as stage:
-            verdict = checked(header.certificate, volume, gaussians)
+            verdict = checked(header.certificate, volume, gaussians, header.live is not None and gaussians.live is None)
             evaluation.certificate = asdict(verdict) | {"holds": verdict.holds, "text": verdict.text()}
             stage.note = verdict.text()
     if request.preview:

@@ -111,13 +111,14 @@ class Verdict:
         return f"holds: {volume} and look, {self.psnr:.2f} dB ({self.recorded:.2f} dB recorded)"
 
 
-def checked(certificate: Certificate, field: Field, gaussians: Gaussians) -> Verdict:
+def checked(certificate: Certificate, field: Field, gaussians: Gaussians, looked_up: bool = False) -> Verdict:
     """A file's certificate against the volume: its digests, and its views drawn and scored again.
 
     Args:
         certificate: the file's.
         field: the volume under its look.
         gaussians: the file's, box frame.
+        looked_up: of a live file, they are as `vvgt recolor` shows them, not as they are stored.
     """
     from vvgt_cli.dvr import RenderSettings
 
@@ -127,4 +128,5 @@ def checked(certificate: Certificate, field: Field, gaussians: Gaussians) -> Ver
     )  # fmt: skip
     digests = certificate.sha256, None if certificate.sha256 is None else values_digest(field.volumes())
     same = None if None in digests else digests[0] == digests[1]
-    return Verdict(same, certificate.look == field.source.shown_as(), round(scores.psnr, 2), certificate.psnr)
+    recorded = certificate.live_psnr if looked_up and certificate.live_psnr is not None else certificate.psnr
+    return Verdict(same, certificate.look == field.source.shown_as(), round(scores.psnr, 2), recorded)
