@@ -1,4 +1,4 @@
-"""Which cut of each node a level takes: what ever coarser cuts cost is measured; nodes have the same error."""
+"""Which cut of each node a level takes: what ever coarser cuts cost is measured, and weighed against Gaussians."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ RUNGS = 10
 STEP = 4.0  # times the score from a rung to the next: a cell's grows as the fourth power of its edge
 FEWER = 9  # times fewer Gaussians from a level to the next: three times the edge, on a surface
 MOST_LEVELS = 6
+LEAST_PRICE, HALVINGS = 1e-12, 60  # of a Gaussian, in squared error; steps of its bisection
 FEWEST = 4  # Gaussians a node, on average, below which no further level is made
 
 
@@ -44,20 +45,24 @@ class Ladder:
         found: np.ndarray = np.sqrt(self.squares / np.maximum(4 * self.pixels, 1)[:, None])
         return found
 
-    def within(self, error: float) -> np.ndarray:
-        """(N,) the coarsest rung of each node up to an error."""
-        found: np.ndarray = (self.errors <= error).sum(axis=1) - 1
+    def at_price(self, price: float) -> np.ndarray:
+        """(N,) the rung of each node whose squared error and ``price`` a Gaussian add up to the least."""
+        costs = (self.squares + price * self.counts)[:, ::-1]
+        found: np.ndarray = costs.shape[1] - 1 - costs.argmin(axis=1)
         return found
 
     def for_count(self, count: float) -> np.ndarray:
-        """(N,) rungs of the smallest error, the same for all, that takes at most ``count`` Gaussians."""
-        values = np.unique(self.errors)
-        low, high = 0, len(values) - 1  # what the last takes is the fewest there are
-        while low < high:
-            middle = (low + high) // 2
-            fits = self.total(self.within(values[middle])) <= count
-            low, high = (low, middle) if fits else (middle + 1, high)
-        return self.within(values[low])
+        """(N,) rungs of the least squared error in all that one price leaves, with at most ``count`` Gaussians.
+
+        One more Gaussian then lowers the error by as much in every node (Shoham and Gersho 1988).
+        """
+        low, high = LEAST_PRICE, float(self.squares.max(initial=0)) + 1.0  # at the latter the coarsest everywhere
+        if self.total(self.at_price(high)) > count or self.total(self.at_price(low)) <= count:
+            return self.at_price(high if self.total(self.at_price(high)) > count else low)
+        for _ in range(HALVINGS):
+            middle = math.sqrt(low * high)
+            low, high = (low, middle) if self.total(self.at_price(middle)) <= count else (middle, high)
+        return self.at_price(high)
 
     def total(self, rungs: np.ndarray) -> int:
         """Gaussians of a choice."""
@@ -69,7 +74,7 @@ class Ladder:
         return math.sqrt(squares / max(4 * self.pixels.sum(), 1))
 
     def levels(self) -> list[np.ndarray]:
-        """Rungs (N,) of each level: the finest, and errors that take a ninth of the Gaussians of the level before."""
+        """Rungs (N,) of each level: the finest, and the best with a ninth of the Gaussians of the level before."""
         found = [np.zeros(len(self.counts), np.int64)]
         before = self.total(found[0])
         while len(found) < MOST_LEVELS and before >= FEWEST * len(self.counts):

@@ -1,4 +1,4 @@
-"""Streamed SOG: nodes by place, each in levels of the same error, in files of SOG's images; and `lod-meta.json`.
+"""Streamed SOG: nodes by place, each in levels by measured error, in files of SOG's images; and `lod-meta.json`.
 
 As PlayCanvas 2.23.3 (`scene/gsplat-unified/gsplat-octree.js`, `gsplat-lod-table.js`) and splat-transform 3.7.0
 (`writers/write-lod.ts`) have it. A node is a tile of the pyramid (`vvgt_cli.field.forest`); what its levels are is
