@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -25,7 +25,7 @@ class Held(NamedTuple):
 
 def held_frames(clouds: Sequence[tuple[str, Splats]]) -> list[Held]:
     """Every frame (name, columns), those that share rows with the last whole one as what differs from it."""
-    found: list[Held] = []
+    clouds, found = _of_one_length(clouds), list[Held]()
     while len(found) < len(clouds):
         first = len(found)
         key = clouds[first][1]
@@ -39,11 +39,19 @@ def held_frames(clouds: Sequence[tuple[str, Splats]]) -> list[Held]:
         base = compressed_ply(splats, name, order)
         found.append(Held(base, None))
         for name, splats in clouds[first + 1 : first + 1 + count]:
-            content = compressed_ply(splats, name, order)
-            if len(content) != len(base):  # other comments
-                break
-            found.append(Held(patch(base, content), first))
+            found.append(Held(patch(base, compressed_ply(splats, name, order)), first))
     return found
+
+
+def _of_one_length(clouds: Sequence[tuple[str, Splats]]) -> list[tuple[str, Splats]]:
+    """The same with comments of one length: those of certificates, say, differ from frame to frame."""
+    sizes = [sum(len(f"comment {line}\n".encode()) for line in splats.comments) for _, splats in clouds]
+    if len(set(sizes)) < 2:
+        return list(clouds)
+    return [
+        (name, replace(splats, comments=(*splats.comments, " " * (max(sizes) - size))))
+        for (name, splats), size in zip(clouds, sizes, strict=True)
+    ]
 
 
 def _changed(key: Splats, splats: Splats) -> np.ndarray | None:
