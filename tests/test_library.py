@@ -18,6 +18,7 @@ import tifffile
 import xarray
 
 import vvgt_cli as vvgt
+from tests.headers import uncertified
 from vvgt_cli.gaussians.formats.page_file import read_html
 from vvgt_cli.library import functions
 
@@ -48,7 +49,7 @@ def converted(field) -> vvgt.Conversion:
 
 def saved(result: vvgt.Result, path: Path) -> bytes:
     result.save(path)
-    return path.read_bytes()
+    return uncertified(path)
 
 
 def test_commands_and_library_leave_the_same_bytes(field, converted, tmp_path):
@@ -59,7 +60,7 @@ def test_commands_and_library_leave_the_same_bytes(field, converted, tmp_path):
     read = ("--dims", "20", "16", "12", "--dtype", "float32", "--spacing", *map(str, SPACING))
     how = ("--max-gaussians", "300", "--size", "48", "--steps", "6", "--tf", str(tmp_path / "tf.json"), "-q")
     assert run(["convert", str(tmp_path / "a.raw"), *read, *how, "-o", str(tmp_path / "a.ply")]) == 0
-    written = (tmp_path / "a.ply").read_bytes()
+    written = uncertified(tmp_path / "a.ply")
     assert saved(converted, tmp_path / "b.ply") == written
     read = {"dims": (20, 16, 12), "dtype": "float32", "spacing": SPACING}
     path = vvgt.convert(tmp_path / "a.raw", tmp_path / "tf.json", HOW, **read)

@@ -129,7 +129,7 @@ def test_series(tmp_path: Path, suffix: str) -> None:
         by_time = read_volume(source, ReadOptions(time=step))
         np.testing.assert_array_equal(by_time.data, volume.data)
     for options, message in (
-        ({"time": 2}, "expected 0 to 1"),
+        ({"time": 2}, "expected a time step from 0 to 1"),
         ({"time": 0, "component": 1}, "leave out --component 1"),
         ({"component": "T1"}, "not component T1"),
     ):

@@ -53,7 +53,7 @@ def command(
     width = max(map(len, facts)) + 2
     for key, value in facts.items():
         rows = value if isinstance(value, list) and value and isinstance(value[0], dict) else [value]
-        if isinstance(value, dict):
+        if key == "certificate" and isinstance(value, dict):
             rows = [{name: item} for name, item in value.items()]
         for n, row in enumerate(rows):  # of tables a line an entry
             click.echo(f"{'' if n else key:<{width}}{_text(row)}")

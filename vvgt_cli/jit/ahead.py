@@ -53,7 +53,7 @@ SHARED = (REGRESS, MIX, MORTON)  # of runs of more than a few Gaussians
 DEPOSITS = ("vvgt_cli.splat.harmonics:deposit_squares", "vvgt_cli.splat.harmonics:deposit")
 BACK_PROJECT = ("vvgt_cli.splat.tiles:gather", "vvgt_cli.splat.tiles:reduce_pairs")
 
-VIEWS = (*RAYCAST, *CELLS)  # and points to start from
+VIEWS = (*RAYCAST, *CELLS, VOXEL_MOMENTS)  # and points to start from, of cells of voxels or wider ones
 INIT = (*CLOSED_FORM, BRICK_RANGES)
 MERGE = (*(name for name in CLOSED_FORM if name not in (BLOCK_MOMENTS, COMPACT)), *DRAW)
 COUNT_WHOLE = ("vvgt_cli.volume.count_kernel:count_values",)  # of types of which every number is counted

@@ -137,10 +137,8 @@ def _time(picture: Picture, wanted: int | None, source: str) -> int:
         raise SeveralSteps(source, picture.times)
     if (wanted or 0) >= picture.times:
         last = picture.times - 1
-        raise UsageError(
-            f"{source}: --time {wanted}: it has {picture.times} time step{'s' * (last > 0)}; "
-            + (f"expected 0 to {last}" if last else "leave out --time")
-        )
+        expected = f"expected a time step from 0 to {last}" if last else "it has 1 time step; leave out --time"
+        raise UsageError(f"{source}: --time {wanted}: {expected}")
     return wanted or 0
 
 

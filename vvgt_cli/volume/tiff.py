@@ -229,10 +229,10 @@ def _choose(
     if options.time is None and steps > 1:
         raise SeveralSteps(str(path), steps, "time steps" if layout.of("Z") else "time steps of one slice each")
     if (options.time or 0) >= steps:
-        raise UsageError(
-            f"{path}: --time {options.time}: it has {steps} time step{'s' * (steps > 1)}; "
-            + (f"expected 0 to {steps - 1}" if steps > 1 else "leave out --time")
+        expected = (
+            f"expected a time step from 0 to {steps - 1}" if steps > 1 else "it has 1 time step; leave out --time"
         )
+        raise UsageError(f"{path}: --time {options.time}: {expected}")
     for k in times:
         index[k] = options.time or 0
     return tuple(index), several

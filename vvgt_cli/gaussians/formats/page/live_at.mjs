@@ -21,7 +21,7 @@ const along = (gradient, arms) => {
 
 // the row of the label that a Gaussian belongs to
 const label = ({ bytes, count }, i) => bytes[6 * count + i] + 256 * bytes[7 * count + i];
-const beyond = ({ planes }, center) => planes.some(({ normal, place }) => dot(normal, center) > place);  // what is cut is not looked at
+const beyond = ({ planes = [] }, center) => planes.some(({ normal, place }) => dot(normal, center) > place);  // what is cut is not looked at
 
 // opacity whose dilogarithm is y, to 3e-4
 const alpha = (y) => {
