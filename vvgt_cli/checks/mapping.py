@@ -79,7 +79,7 @@ def cuts(tree: Tree) -> None:
 
 
 def levels(scene: Scene) -> Figure:
-    """Cells of two voxels hold the mass of cells of one, as far as they are summed, and no cut of the pyramid changes it."""
+    """Cells of two voxels have the mass of cells of one, as near as points tell; no cut of the pyramid changes it."""
     from vvgt_cli.closed_form.closed_form import closed_form
     from vvgt_cli.closed_form.moments import base_cells
     from vvgt_cli.closed_form.straight import BEND  # by a sixth of which its mean may be missed
