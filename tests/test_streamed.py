@@ -234,3 +234,9 @@ def test_manifests_that_cannot_be_are_one_line(
         read_manifest(tmp_path / "lod-meta.json")
     assert text in str(error.value)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("command", [("render", "-o", "p", "--orbit", "1"), ("evaluate", "--volume", "v.npy")])
+def test_commands_of_one_cloud_say_how_to_get_one(vvgt, folder: Path, command) -> None:
+    done = vvgt(command[0], folder / "lod-meta.json", *command[1:])
+    assert (done.code, "levels of detail; expected one cloud" in done.error) == (1, True), done.error
