@@ -220,6 +220,14 @@ def check_page(folder: Path) -> None:
     assert len(held[1]) < len(held[0])
 
 
+def test_no_more_steps_than_were_asked_for(vvgt, beat):
+    run = ("convert", beat / "v_[01].npy", "--tf", beat / "tf.json", *HOW[:-1], "3", "-o", beat / "f_{}.ply")
+    done = vvgt(*run, "--report", beat / "f_{}.json")
+    assert done.code == 0, done.err
+    assert "differences " in done.err
+    assert json.loads((beat / "f_1.json").read_text())["refinement"]["steps"] <= 3
+
+
 def test_a_frame_that_shows_something_else_is_converted_by_itself(vvgt, beat):
     np.save(beat / "v_1.npy", body(0.2)[:, :, ::-1])
     done = vvgt("convert", beat / "v_[01].npy", "--tf", beat / "tf.json", *HOW, "-o", beat / "f_{}.ply")

@@ -173,11 +173,24 @@ def test_what_has_no_levels_is_refused_in_a_line(vvgt, volume: Path, tmp_path: P
 
 
 def test_an_existing_folder_is_replaced_only_when_told(vvgt, volume: Path, folder: Path) -> None:
-    stale = folder / "3_7"
-    stale.mkdir()
+    manifest = json.loads((folder / "lod-meta.json").read_text())
+    manifest["filenames"].append("3_7/meta.json")
+    (folder / "lod-meta.json").write_text(json.dumps(manifest))
+    stale, other = folder / "3_7", folder / "2024_11"
+    for path in (stale / "meta.json", stale / "sh0.webp", other / "notes.txt"):
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(b"x")
     assert vvgt("convert", volume, *FIT, "-o", folder / "lod-meta.json").code == 2
     assert vvgt("convert", volume, *FIT, "--overwrite", "-o", folder / "lod-meta.json").code == 0
     assert not stale.exists()
+    assert (other / "notes.txt").is_file()  # not of the manifest
+
+
+def test_nothing_else_in_the_folder_is_touched(vvgt, volume: Path, tmp_path: Path) -> None:
+    (tmp_path / "2024_11").mkdir()
+    (tmp_path / "2024_11" / "notes.txt").write_text("of someone")
+    assert vvgt("convert", volume, *FIT, "-o", tmp_path / "lod-meta.json").code == 0
+    assert (tmp_path / "2024_11" / "notes.txt").read_text() == "of someone"
 
 
 def test_info_lists_levels_with_their_errors(vvgt, folder: Path) -> None:
@@ -234,3 +247,9 @@ def test_manifests_that_cannot_be_are_one_line(
         read_manifest(tmp_path / "lod-meta.json")
     assert text in str(error.value)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("command", [("render", "-o", "p", "--orbit", "1"), ("evaluate", "--volume", "v.npy")])
+def test_commands_of_one_cloud_say_how_to_get_one(vvgt, folder: Path, command) -> None:
+    done = vvgt(command[0], folder / "lod-meta.json", *command[1:])
+    assert (done.code, "levels of detail; expected one cloud" in done.error) == (1, True), done.error

@@ -10,10 +10,8 @@ from vvgt_cli.commands.live_site import HTML, JSON, SCRIPT
 from vvgt_cli.commands.server import Part
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians.formats.page_file import camera, page
-from vvgt_cli.gaussians.formats.sog_images import META
+from vvgt_cli.gaussians.formats.sog_images import IMAGES, META
 from vvgt_cli.gaussians.formats.streamed import MANIFEST, placed, read_manifest
-
-IMAGES = ("means_l", "means_u", "quats", "scales", "sh0", "shN_centroids", "shN_labels")
 
 
 def streamed_parts(file: str) -> dict[str, Part]:

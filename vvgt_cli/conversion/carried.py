@@ -129,17 +129,16 @@ class Carry:
             for camera, image, old in zip(cameras, images, before, strict=True):
                 _still(image, old, last, camera)
             stage.note = f"{len(cameras)} of {cameras[0].width} px to fit to, where they differ from the frame before"
-        options = OptimizeOptions.of(
-            "frame",
-            steps=STEPS,
-            rule=last.rule,
-            judge=work.rule,
-            seed=work.fit.seed,
-            check_every=STEPS,
-        )
         assert work.check is not None
         judged, psnr = _near(work.check, found), 0.0
-        for _ in range(ROUNDS):
+        asked = work.fit.steps
+        left = ROUNDS * STEPS if asked is None else min(asked, ROUNDS * STEPS)
+        while left > 0:
+            steps = min(STEPS, left)
+            left -= steps
+            options = OptimizeOptions.of(
+                "frame", steps=steps, rule=last.rule, judge=work.rule, seed=work.fit.seed, check_every=STEPS
+            )
             result = refine(work.run, work.made(), Views(cameras, images), judged, options, free=free)
             result = as_stored(widened_small(result, work.fit.size)[0])
             work.gaussians = _moved(last.gaussians, result, free)

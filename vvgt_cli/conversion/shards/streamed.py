@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vvgt_cli.conversion.shards.ladder import measured
-from vvgt_cli.conversion.shards.streamed_files import Files, Level
+from vvgt_cli.conversion.shards.streamed_files import Files, Level, files_of
 from vvgt_cli.errors import UsageError
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import Gaussians, PlyOptions
@@ -67,7 +67,7 @@ def write_streamed(run: Run, cut: Cut, output: str, overwrite: bool) -> None:
         choices = ladder.levels()
         levels = [Level(number) for number in range(len(choices))]
         stage.note = f"{len(levels)} levels of {len(forest.tiles)} nodes"
-    files, nodes = Files(Path(output).absolute().parent), []
+    files, nodes, before = Files(Path(output).absolute().parent), [], files_of(Path(output))
     with run.stage("write") as stage, atomic_write(Path(output), overwrite) as temporary:
         for row, (made, spreads) in enumerate(cut.nodes(ladder.thresholds[np.stack(choices, axis=1)])):
             rungs = [choice[row] for choice in choices]
@@ -83,7 +83,7 @@ def write_streamed(run: Run, cut: Cut, output: str, overwrite: bool) -> None:
         stage.note += ", ".join(f"{level.gaussians:,}" for level in levels)
         if levels[0].gaussians < cut.plan.budget // 2:
             stage.note += f", no more: {forest.base} cells that the screen, or {cut.plan.budget}, have use for"
-    files.remove_others()
+    files.remove_others(before)
     run.report.gaussians, run.report.bytes = levels[0].gaussians, total
 
 

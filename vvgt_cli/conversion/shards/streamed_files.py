@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import json
-import shutil
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from vvgt_cli.errors import DataError
 from vvgt_cli.files import atomic_write
-from vvgt_cli.gaussians.formats.sog_images import META, images_of, webp
+from vvgt_cli.gaussians.formats.sog_images import IMAGES, META, images_of, webp
 from vvgt_cli.gaussians.formats.splats import Splats, morton_order
+from vvgt_cli.gaussians.formats.streamed import read_manifest
 
 A_FILE = 1 << 17  # Gaussians of a file, or a node more
 
@@ -76,13 +79,22 @@ class Files:
         level.bytes += _put(target, json.dumps(meta, separators=(",", ":")).encode())
         level.waiting, level.rows, level.files = [], 0, level.files + 1
 
-    def remove_others(self) -> None:
-        """Remove what an earlier run of more files has left: folders that are named like ours."""
-        ours = {name.split("/")[0] for name in self.names}
-        for path in self._folder.iterdir():
-            level, _, number = path.name.partition("_")
-            if path.is_dir() and level.isdecimal() and number.isdecimal() and path.name not in ours:
-                shutil.rmtree(path)
+    def remove_others(self, before: Sequence[str]) -> None:
+        """Remove what a manifest that was there ``before`` names and this one does not; nothing else in the folder."""
+        for name in set(before) - set(self.names):
+            path = self._folder / name
+            for file in (path, *(path.with_name(f"{image}.webp") for image in IMAGES)):
+                file.unlink(missing_ok=True)
+            with suppress(OSError):  # it holds other files
+                path.parent.rmdir()
+
+
+def files_of(manifest: Path) -> list[str]:
+    """What a manifest names; nothing where there is none, or it is damaged."""
+    try:
+        return list(read_manifest(manifest)["filenames"])
+    except (DataError, OSError):
+        return []
 
 
 def _put(path: Path, content: bytes) -> int:

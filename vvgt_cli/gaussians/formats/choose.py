@@ -13,6 +13,7 @@ from vvgt_cli.files import seekable
 from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions, read_ply
 from vvgt_cli.gaussians.formats import gltf, gsply_files, page_file, page_live, sog, usd
 from vvgt_cli.gaussians.formats.splats import Splats, gaussians_of, splats_of
+from vvgt_cli.gaussians.formats.streamed import is_streamed
 
 _HEAD = 1024  # bytes that tell a .ply of another kind
 _LARGEST = 1 << 32  # bytes of a file that is read whole
@@ -104,6 +105,8 @@ def read_splats(path: str | Path) -> tuple[Gaussians, PlyHeader]:
         DataError: not a file of its format, or its library is not installed.
     """
     known, place = format_of(path) or _compressed(path), seekable(path)
+    if is_streamed(path):
+        raise DataError(f"{path}: levels of detail; expected one cloud: 'vvgt init -o OUT.ply' makes that of level 0")
     if known is None:
         return read_ply(path)
     if place.stat().st_size > _LARGEST:

@@ -29,6 +29,7 @@ from vvgt_cli.version import VERSION
 
 MOST = 1 << 26  # Gaussians of one set of images
 META = "meta.json"
+IMAGES = ("means_l", "means_u", "quats", "scales", "sh0", "shN_centroids", "shN_labels")
 _STEPS, _BYTE = 65535, 255
 _FIRST = 252  # alpha of a quaternion whose w is the largest
 _ROW = 64  # rows of the palette in a line of `shN_centroids`
