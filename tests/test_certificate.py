@@ -132,6 +132,18 @@ def test_seconds_are_said_unless_files_are_to_be_made_again(vvgt, folder, tmp_pa
     assert 0 < found.seconds < 1000
 
 
+def test_no_folder_is_named_whatever_its_name(vvgt, folder, tmp_path) -> None:
+    odd = tmp_path / "pa=tient, one"
+    odd.mkdir()
+    shutil.copy(folder / "ball.raw", odd / "ball.raw")
+    args = (odd / "ball.raw", *RAW, "--tf", folder / "tf.json", *SMALL, "-o", tmp_path / "odd.ply")
+    assert vvgt("convert", *args).code == 0
+    found = read_ply(tmp_path / "odd.ply")[1].certificate
+    assert found is not None
+    assert found.command is not None
+    assert found.command.startswith("vvgt convert ball.raw ")
+
+
 def test_no_comments_no_certificate(vvgt, folder, tmp_path) -> None:
     args = (folder / "ball.raw", *RAW, "--tf", folder / "tf.json", *SMALL, "--no-comments")
     assert vvgt("convert", *args, "-o", tmp_path / "out.ply").code == 0

@@ -13,7 +13,8 @@ ASIDE = {  # parameters that do not change what a file of Gaussians holds
     *("output", "overwrite", "report", "preview", "checkpoint", "quiet"),
     *("threads", "memory", "workers", "scheduler", "block_size"),
 }
-_FOLDERS = re.compile(r"[^,=]*/(?=[^/,])")  # before a name, in each part of a value
+_FOLDERS = re.compile(r".*/(?=[^/])", re.DOTALL)  # before a name
+_IN_PARTS = re.compile(r"[^,=]*/(?=[^/,])")  # before each name of a layer, FILE,tf=TF
 _PART = re.compile(r"\d+/\d+")  # of a job array: no folder
 
 
@@ -33,7 +34,8 @@ def command_line(ctx: click.Context, without: Collection[str] = (), folders: boo
     words = ["vvgt", ctx.command.name or ""]
     for parameter in typed(ctx):
         value = ctx.params.get(parameter.name or "")
-        values = [_told(str(v), folders) for v in (value if isinstance(value, tuple) else [value])]
+        before = None if folders else _IN_PARTS if parameter.name == "layers" else _FOLDERS
+        values = [_told(str(v), before) for v in (value if isinstance(value, tuple) else [value])]
         if parameter.name in without:
             continue
         if isinstance(parameter, click.Argument):
@@ -45,5 +47,5 @@ def command_line(ctx: click.Context, without: Collection[str] = (), folders: boo
     return shlex.join(words)
 
 
-def _told(value: str, folders: bool) -> str:
-    return value if folders or _PART.fullmatch(value) else _FOLDERS.sub("", value)
+def _told(value: str, folders: re.Pattern[str] | None) -> str:
+    return value if folders is None or _PART.fullmatch(value) else folders.sub("", value)
