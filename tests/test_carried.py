@@ -92,6 +92,14 @@ def test_a_change_beside_what_is_seen_counts(tmp_path):
     assert not changes(*sources(tmp_path, values, other)).blocks.any()
 
 
+def test_what_is_compared_at_once_changes_nothing(tmp_path, monkeypatch):
+    two = sources(tmp_path, body(0.2), body(0.3))
+    whole = changes(*two).blocks
+    assert 0 < whole.sum() < whole.size
+    monkeypatch.setattr("vvgt_cli.conversion.changes.AT_ONCE", N * N)
+    np.testing.assert_array_equal(changes(*two).blocks, whole)
+
+
 def some_changes() -> Changes:
     blocks = np.random.default_rng(5).random((7, 8, 9)) > 0.97
     return Changes(blocks, np.array([0.9, 0.8, 0.7]), 2 * np.array([0.9, 0.8, 0.7]) / [9, 8, 7])

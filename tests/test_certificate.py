@@ -15,10 +15,12 @@ from vvgt_cli.conversion.certify import Verdict, first_views, position_error
 from vvgt_cli.errors import DataError
 from vvgt_cli.field.digests import values_digest
 from vvgt_cli.gaussians import PlyOptions, read_ply, write_ply
-from vvgt_cli.gaussians.certificate import Certificate
+from vvgt_cli.gaussians.certificate import Certificate, epoch
 from vvgt_cli.gaussians.formats import read_splats
+from vvgt_cli.gaussians.formats.page_file import dated
 from vvgt_cli.gaussians.header import parse_header
 from vvgt_cli.volume import Volume
+from vvgt_cli.volume.stored import Stored
 
 DIMS = (20, 18, 22)  # x, y, z
 FULL = Certificate(
@@ -131,6 +133,22 @@ def test_seconds_are_said_unless_files_are_to_be_made_again(vvgt, folder, tmp_pa
     assert found is not None
     assert found.seconds is not None
     assert 0 < found.seconds < 1000
+
+
+def test_an_epoch_is_a_second_that_there_is(monkeypatch) -> None:
+    for text, seconds in (
+        ("0", 0),
+        ("1700000000", 1_700_000_000),
+        ("", None),
+        ("-1", None),
+        ("9" * 30, None),
+        ("x", None),
+    ):
+        monkeypatch.setenv("SOURCE_DATE_EPOCH", text)
+        assert epoch() == seconds
+        assert dated(PlyOptions()).date is not None
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")
+    assert dated(PlyOptions()).date == "2023-11-14"
 
 
 def test_no_folder_is_named_whatever_its_name(vvgt, folder, tmp_path) -> None:
@@ -256,3 +274,19 @@ def test_a_verdict_says_what_does_not_hold() -> None:
     assert Verdict(None, True, 40.0, 40.0).text().startswith("holds: the volume was not compared (too large)")
     assert Verdict(True, True, 39.8, 40.0).text() == "does not hold: 39.80 dB, 40.00 dB recorded"
     assert not Verdict(True, True, math.nan, 40.0).holds
+
+
+@pytest.mark.parametrize("chunks", [(7, 5, 11), (64, 64, 64), (1, 30, 1), (150, 2, 140)])
+def test_the_digest_reads_each_chunk_once_whatever_its_shape(chunks, monkeypatch) -> None:
+    data = np.random.default_rng(3).integers(0, 1000, (40, 30, 50)).astype(np.uint16)
+    read = np.zeros([-(-n // c) for n, c in zip(data.shape, chunks, strict=True)], int)
+
+    def part(slices):
+        touched = tuple(slice(k.start // c, -(-k.stop // c)) for k, c in zip(slices, chunks, strict=True))
+        read[touched] += 1
+        return data[slices]
+
+    monkeypatch.setattr("vvgt_cli.field.digests.AT_ONCE", 3000)
+    stored = Stored(part, data.dtype, data.shape, chunks, "x")
+    assert values_digest([Volume(stored)]) == values_digest([Volume(data)])
+    assert (read == 1).all()

@@ -126,17 +126,17 @@ def test_counting_reads_every_voxel_once_and_little_more(tmp_path, monkeypatch):
 
 
 def test_the_memory_of_a_block_is_that_of_its_worker(monkeypatch):
-    monkeypatch.setattr("vvgt_cli.field.settings.free_memory", lambda: 3 << 30)
+    monkeypatch.setattr("vvgt_cli.field.settings.free_memory", lambda: 800 << 20)
     volume = stored((1536, 1536, 1536), np.float32)
     edges = {
         (who, n): block_edge(volume, BlockOptions(workers=n, scheduler=who))
         for who in (None, "local", "slurm")
         for n in (1, 8)
     }
-    assert {edges[who, 1] for who in (None, "local", "slurm")} == {512}
-    assert edges["local", 8] == edges[None, 8] == 256  # processes of one machine share it
-    assert edges["slurm", 8] == 512  # each job has its own
-    assert block_edge(stored((1536, 1536, 1536), np.float64), BlockOptions()) == 256
+    assert {edges[who, 1] for who in (None, "local", "slurm")} == {256}
+    assert edges["local", 8] == edges[None, 8] == 128  # processes of one machine share it
+    assert edges["slurm", 8] == 256  # each job has its own
+    assert block_edge(stored((1536, 1536, 1536), np.float64), BlockOptions()) == 128
 
 
 def test_of_a_tiles_tree_nothing_but_its_top_stays_in_memory(vvgt, tmp_path, monkeypatch):

@@ -18,7 +18,7 @@ from vvgt_cli.volume import Volume
 from vvgt_cli.volume.stored import read_block
 
 EDGE = 4  # voxels along a block
-SLAB = 16 * EDGE  # slices that are compared at once
+AT_ONCE = 1 << 23  # voxels that are compared at once, or `EDGE` slices: about 80 bytes each
 SAME = 1e-5  # of the range of values: less than half a level of 255 after hundreds of frames
 BINS = 4096  # of the range of values, each visible or not
 REACH = 2.0  # standard deviations that a Gaussian meets a block within
@@ -93,8 +93,9 @@ def changes(before: Source, after: Source) -> Changes:
 def _slabs(before: Source, after: Source, reach: int) -> Iterator[tuple[int, int, np.ndarray]]:
     """First and last slice of each slab, and which of its voxels (z, y, x) are near a difference."""
     dims = after.volume.dims
-    for z0 in range(0, dims[2], SLAB):
-        z1 = min(z0 + SLAB, dims[2])
+    slab = max(AT_ONCE // (dims[0] * dims[1]) // EDGE, 1) * EDGE
+    for z0 in range(0, dims[2], slab):
+        z1 = min(z0 + slab, dims[2])
         low, high = max(z0 - reach - 1, 0), min(z1 + reach + 1, dims[2])
         changed = np.zeros((high - low, dims[1], dims[0]), bool)
         for old, new in zip(before.layers, after.layers, strict=True):

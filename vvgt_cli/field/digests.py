@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import fields, is_dataclass
 from typing import Any
 
@@ -12,9 +12,9 @@ import numpy as np
 from vvgt_cli.cameras import Camera
 from vvgt_cli.volume import Volume
 from vvgt_cli.volume.stats import slabs
-from vvgt_cli.volume.stored import read_block
+from vvgt_cli.volume.stored import chunks_of, read_block
 
-BOX = 128  # voxels along the edge of what is read at once
+AT_ONCE = 1 << 22  # voxels that are read at once, or a row of chunks
 LARGEST = 16 << 30  # bytes of values that are read once more
 
 
@@ -44,13 +44,26 @@ def values_digest(volumes: Sequence[Volume]) -> str | None:
         return None
     state = hashlib.sha256()
     for volume in volumes:
-        dims = np.array(volume.dims)
         _feed(state, volume.dims)
         _feed(state, (volume.data.dtype.newbyteorder("=").str, float(volume.slope), float(volume.intercept)))
-        for z, y, x in np.ndindex(*(-(-dims[::-1] // BOX))):
-            lo = np.array([x, y, z]) * BOX
-            state.update(read_block(volume, lo, np.minimum(lo + BOX, dims)).data)
+        for slices in _slice_digests(volume):
+            state.update(slices)
     return state.hexdigest()
+
+
+def _slice_digests(volume: Volume) -> Iterator[bytes]:
+    """sha256 of each slice; rows of chunks are read at once, and no chunk twice."""
+    nx, ny, nz = volume.dims
+    deep, wide, _ = chunks_of(volume)
+    wide *= max(AT_ONCE // (deep * wide * nx), 1)
+    deep *= max(AT_ONCE // (deep * min(wide, ny) * nx), 1)
+    for z in range(0, nz, deep):
+        states = [hashlib.sha256() for _ in range(z, min(z + deep, nz))]
+        for y in range(0, ny, wide):
+            rows = read_block(volume, np.array([0, y, z]), np.array([nx, min(y + wide, ny), z + len(states)]))
+            for state, row in zip(states, rows, strict=True):
+                state.update(row.data)
+        yield from (state.digest() for state in states)
 
 
 def volume_digest(volume: Volume) -> str:

@@ -13,7 +13,7 @@ from vvgt_cli.resources import free_memory
 from vvgt_cli.volume import Volume
 from vvgt_cli.volume.stored import Stored
 
-LARGEST, SMALLEST = 512, 16  # voxels along the edge of a block
+LARGEST, SMALLEST = 256, 16  # voxels along the edge of a block; larger ones are no quicker
 SHARED = 256  # of a shard, whatever the memory of its node: all shards must agree
 MAX_FIELD = 1 << 24  # cells of the field of opacity
 A_BLOCK = 0.3  # of the memory of a worker: what its voxels may take; as much again where they are converted
