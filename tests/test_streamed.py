@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import vvgt_cli
 from tests.test_formats_server import ask
 from tests.test_scale import bodies
 from vvgt_cli.commands.server import Site, served
@@ -18,7 +19,7 @@ from vvgt_cli.commands.streamed_site import streamed_parts
 from vvgt_cli.commands.view import named_files
 from vvgt_cli.conversion.shards.apart import errors_apart
 from vvgt_cli.conversion.shards.ladder import Ladder
-from vvgt_cli.errors import DataError
+from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import read_ply
 from vvgt_cli.gaussians.formats.sog_images import splats_in
 from vvgt_cli.gaussians.formats.splats import Splats, gaussians_of
@@ -112,12 +113,18 @@ def test_errors_are_those_of_what_is_in_the_files(folder: Path) -> None:
         assert node["errors"][0] == 0 < node["errors"][-1]
 
 
-def test_no_other_choice_of_as_many_gaussians_has_a_smaller_error() -> None:
+def ladder_of(nodes: int, rungs: int) -> Ladder:
+    """Rungs of half the Gaussians of the one before, each with a larger error."""
     rng = np.random.default_rng(6)
-    counts = 1000 * rng.integers(1, 9, (4, 1)) // 2 ** np.arange(5)
-    squares = np.cumsum(rng.uniform(0, 1, (4, 5)) * 3.0 ** np.arange(5), axis=1)
+    counts = 1000 * rng.integers(1, 9, (nodes, 1)) // 2 ** np.arange(rungs)
+    squares = np.cumsum(rng.uniform(0, 1, (nodes, rungs)) * 3.0 ** np.arange(rungs), axis=1)
     squares[:, 0] = 0
-    small = Ladder(np.arange(5.0), counts, squares, np.full(4, 1e4), np.full(4, 100))
+    return Ladder(np.arange(float(rungs)), counts, squares, np.full(nodes, 1e4), np.full(nodes, 100))
+
+
+def test_no_other_choice_of_as_many_gaussians_has_a_smaller_error() -> None:
+    small = ladder_of(4, 5)
+    counts = small.counts
     every = np.stack(np.meshgrid(*[np.arange(5)] * 4), axis=-1).reshape(-1, 4)
     totals = np.array([small.total(rungs) for rungs in every])
     errors = np.array([small.rms(rungs) for rungs in every])
@@ -130,11 +137,7 @@ def test_no_other_choice_of_as_many_gaussians_has_a_smaller_error() -> None:
 
 
 def test_levels_have_a_ninth_of_the_gaussians_each_and_are_never_finer_than_the_one_before() -> None:
-    rng = np.random.default_rng(6)
-    counts = 1000 * rng.integers(1, 9, (30, 1)) // 2 ** np.arange(10)
-    squares = np.cumsum(rng.uniform(0, 1, (30, 10)) * 3.0 ** np.arange(10), axis=1)
-    squares[:, 0] = 0
-    ladder = Ladder(np.arange(10.0), counts, squares, np.full(30, 1e4), np.full(30, 100))
+    ladder = ladder_of(30, 10)
     levels = ladder.levels()
     assert (levels[0] == 0).all()
     assert all((a <= b).all() for a, b in pairwise(levels))
@@ -253,3 +256,10 @@ def test_manifests_that_cannot_be_are_one_line(
 def test_commands_of_one_cloud_say_how_to_get_one(vvgt, folder: Path, command) -> None:
     done = vvgt(command[0], folder / "lod-meta.json", *command[1:])
     assert (done.code, "levels of detail; expected one cloud" in done.error) == (1, True), done.error
+
+
+def test_finished_gaussians_are_not_saved_as_levels(tmp_path: Path) -> None:
+    result = vvgt_cli.convert(np.arange(512, dtype=np.float32).reshape(8, 8, 8), goal={"max_gaussians": 20, "steps": 0})
+    with pytest.raises(UsageError, match="levels are made of a volume's closed form"):
+        result.save(tmp_path / "lod-meta.json")
+    assert not list(tmp_path.iterdir())

@@ -12,11 +12,12 @@ import numpy as np
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.cameras.sets import SIZE
 from vvgt_cli.conversion.place import AUTO, NONE, into_box, preview, upright, way_up
-from vvgt_cli.errors import DataError
+from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import Gaussians, PlyOptions, write_ply
 from vvgt_cli.gaussians.formats import encoded, format_of
 from vvgt_cli.gaussians.formats.page_file import framed
+from vvgt_cli.gaussians.formats.streamed import is_streamed
 from vvgt_cli.gaussians.rules import INRIA, rule_of
 from vvgt_cli.look.lighting import LightOptions
 from vvgt_cli.score.record import ConversionReport, StageRecord
@@ -84,9 +85,14 @@ class Result:
             Bytes written.
 
         Raises:
-            UsageError: the file exists, or a value that is none of these.
+            UsageError: the file exists, or a value that is none of these; streamed levels.
             DataError: a library that the format needs is not installed.
         """
+        if is_streamed(os.fspath(path)):
+            raise UsageError(
+                f"{os.fspath(path)}: levels are made of a volume's closed form, not of finished Gaussians; expected a "
+                ".ply or another format, or 'vvgt convert VOLUME -o FOLDER/lod-meta.json'"
+            )
         old, space = self.ply, None if self.ply.space == NONE else self.ply.space
         frame = frame or old.frame
         ply = replace(
