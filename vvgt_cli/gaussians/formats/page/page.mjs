@@ -84,25 +84,37 @@ function series(viewer, live) {
     return asset;
   }
 
-  async function show(k) {
+  // one frame after the other, whatever is asked for meanwhile; the promise is of the one asked for last
+  let shown = 0, busy = null;
+  function show(k) {
     wanted = k;
     slider.value = list.selectedIndex = k;
-    try {
-      const asset = await loaded(k);
-      if (wanted !== k) return;
-      if (live) await live.look.frame(k, asset.resource);
-      if (wanted !== k) return;
-      entity.gsplat.asset = asset.id;
-      app.renderNextFrame = true;
-      said.textContent = '';
-    } catch (error) {
-      assets.delete(k);
-      said.textContent = `${scene.frames[k].name} cannot be read: ${error}`;
-    }
-    while (assets.size > KEPT) {
-      const [old, gone] = assets.entries().next().value;
-      assets.delete(old);
-      gone.then((asset) => { app.assets.remove(asset); asset.unload(); }, () => {});
+    busy ??= turn().finally(() => { busy = null; });
+    return busy;
+  }
+
+  async function turn() {
+    while (shown !== wanted) {
+      const k = wanted;
+      try {
+        const asset = await loaded(k);
+        if (wanted !== k) continue;
+        if (live) await live.look.frame(k, asset.resource);
+        entity.gsplat.asset = asset.id;
+        app.renderNextFrame = true;
+        said.textContent = '';
+        shown = k;
+      } catch (error) {
+        assets.delete(k);
+        said.textContent = `${scene.frames[k].name} cannot be read: ${error}`;
+        shown = -1;  // asked for again, it is tried again
+        if (wanted === k) return;
+      }
+      while (assets.size > KEPT) {
+        const [old, gone] = assets.entries().next().value;
+        assets.delete(old);
+        gone.then((asset) => { app.assets.remove(asset); asset.unload(); }, () => {});
+      }
     }
   }
 
