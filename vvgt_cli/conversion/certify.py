@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import PurePath
@@ -14,12 +13,11 @@ from vvgt_cli.conversion.request import FitOptions
 from vvgt_cli.field.digests import values_digest
 from vvgt_cli.field.field import Field
 from vvgt_cli.gaussians import Gaussians, PlyOptions
-from vvgt_cli.gaussians.certificate import Certificate
+from vvgt_cli.gaussians.certificate import Certificate, epoch
 from vvgt_cli.score.record import Run
 from vvgt_cli.score.viewing import PREVIEW_VIEWS, ViewingCondition
 from vvgt_cli.score.views import score_test_views
 
-REPRODUCIBLE = "SOURCE_DATE_EPOCH"  # set: files that can be made again, byte by byte (reproducible-builds.org)
 WITHIN = 0.1  # dB that a file may have lost, by its format
 
 
@@ -51,7 +49,7 @@ def certified(
         live_psnr=None if live_psnr is None else round(live_psnr, 2),
         seats=tuple((seat.name(), round(seat.psnr, 2)) for seat in seats),
         position_error=position_error(gaussians, ply),
-        seconds=None if REPRODUCIBLE in os.environ else round(run.elapsed(), 1),
+        seconds=round(run.elapsed(), 1) if epoch() is None else None,
         command=command,
     )
     return replace(ply, certificate=found)

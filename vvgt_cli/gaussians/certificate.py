@@ -4,10 +4,19 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from dataclasses import dataclass
 from typing import Any
 
 WORD = "certificate"  # of the comment
+REPRODUCIBLE = "SOURCE_DATE_EPOCH"  # set: files that can be made again, byte by byte (reproducible-builds.org)
+_LAST = 253_402_300_799  # second of the year 9999
+
+
+def epoch() -> int | None:
+    """Seconds since 1970 at which files are to say they were made; None where nothing, or no such number, is given."""
+    text = os.environ.get(REPRODUCIBLE, "")
+    return int(text) if text.isascii() and text.isdecimal() and len(text) < 16 and int(text) <= _LAST else None
 
 
 @dataclass(frozen=True)

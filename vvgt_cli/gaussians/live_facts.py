@@ -22,11 +22,7 @@ from vvgt_cli.volume.stats import BINS, edges_of
 from vvgt_cli.volume.types import triple
 
 COLUMNS, NORMAL, LABEL, LAYER = ("value", "spread", "length"), ("nx", "ny", "nz"), "label", "layer"
-CARRIED, ROW, NUMBER = (
-    slice(0, 3),
-    6,
-    7,
-)  # of what Gaussians carry: own columns, row of a label, number of a layer
+CARRIED, ROW, NUMBER = slice(0, 3), 6, 7  # of what Gaussians carry: own columns, row of a label, number of a layer
 GRADIENT = slice(3, 6)  # of what Gaussians carry: in the columns of normals
 LONGEST_NAME = 80  # characters of a label's
 SAMPLED = 64  # nodes of a function that the header has no other way of holding

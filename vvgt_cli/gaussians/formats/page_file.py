@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import base64
 import json
-import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -23,6 +22,7 @@ import numpy as np
 from vvgt_cli.cameras import orbit_views
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import PlyOptions
+from vvgt_cli.gaussians.certificate import epoch
 from vvgt_cli.gaussians.formats.gsply_files import read_compressed_ply
 from vvgt_cli.gaussians.formats.page_frames import held_frames
 from vvgt_cli.gaussians.formats.splats import Splats
@@ -55,8 +55,8 @@ def dated(options: PlyOptions) -> PlyOptions:
     """With the day on which a page is written, or that of SOURCE_DATE_EPOCH (seconds), for the same bytes every day."""
     if not options.comments:
         return options
-    seconds = os.environ.get("SOURCE_DATE_EPOCH", "")
-    when = datetime.fromtimestamp(int(seconds), UTC) if seconds.isdecimal() else datetime.now()
+    seconds = epoch()
+    when = datetime.now() if seconds is None else datetime.fromtimestamp(seconds, UTC)
     return replace(options, date=f"{when:%Y-%m-%d}")
 
 
