@@ -160,8 +160,7 @@ def test_the_bytes_do_not_depend_on_how(vvgt, volume: Path, folder: Path, tmp_pa
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        (("--light", "headlight"), "unlit moments"),
-        (("--init", "wavelet"), "unlit moments"),
+        (("--init", "wavelet"), "made of moments"),
         (("--frame", "world"), "leave out --frame"),
         (("--steps", "50"), "levels of one closed form"),
         (("--live",), "levels of one closed form"),
