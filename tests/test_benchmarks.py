@@ -33,6 +33,7 @@ RUN = (
         "dvr_steps",
         "dvr_vtk",
         "grids",
+        "levels",
         "light_vtk",
         "live",
         "network",
@@ -331,6 +332,23 @@ def test_what_the_machine_does_at_best(bench):
     assert floors.seconds(lambda: None) < 1
     assert set(floors.alternate({"a": lambda: None, "b": lambda: np.zeros(3)}, 3)) == {"a", "b"}
     assert "threads" in floors.machine()
+
+
+def test_levels(bench, scenes, tmp_path):
+    module = bench("levels")
+    look = ["--tf", f"{scenes[1]}/shells.json", "--opacity-unit-distance", "mean-spacing"]
+    some = ["--max-gaussians", "2000", "--size", "64", "-q", "-o", str(tmp_path / "out" / "lod-meta.json")]
+    assert run(["init", f"{scenes[1]}/blob.nrrd", *look, *some]) == 0
+    options = ["--size", "64", "-o", tmp_path / "a.csv", "--plot", tmp_path / "a.png"]
+    told = call(module.main, tmp_path / "out", f"{scenes[1]}/blob.nrrd", *look, *options)
+    rows = rows_of(tmp_path / "a.csv")
+    assert len({row["level"] for row in rows}) + 1 == told.count("levels of 255")
+    assert all(float(row["rms"]) > 0 and float(row["spread"]) > 0 for row in rows)
+    assert (tmp_path / "a.png").stat().st_size > 5000
+    shown = np.zeros((30, 30), bool)
+    shown[10, 20] = True
+    assert np.argwhere(module.near(shown, 2)).min(axis=0).tolist() == [8, 18]
+    assert module.near(shown, 2).sum() == 25
 
 
 def test_share(bench, scenes, tmp_path):
