@@ -28,6 +28,7 @@ RUN = (
     *(
         "automatic",
         "closed_form",
+        "curve",
         "dvr",
         "dvr_pixels",
         "dvr_steps",
@@ -237,6 +238,20 @@ def test_parts(bench, scenes, tmp_path, monkeypatch):
     for part in ("colours not sharpened", "no floor of slopes", "no steps in common"):
         assert rows[part]["psnr"] != rows["all"]["psnr"]
     assert "| no cells by error |" in call(module.main, "--table", tmp_path / "a.csv")
+
+
+def test_curve(bench, scenes, tmp_path):
+    module, found = bench("curve"), tmp_path / "a.csv"
+    few = ("--", "--max-gaussians", 300, "--size", SIZE)
+    for label in ("before", "after"):
+        call(module.main, "measure", *scenes, "-o", found, "--label", label, "--steps", 4, "--steps", 24, *few)
+    rows = rows_of(found)
+    assert [row["label"] for row in rows] == ["before"] * 3 + ["after"] * 3
+    assert [row["steps"] for row in rows] == ["0", "4", "24"] * 2
+    assert float(rows[2]["psnr"]) > float(rows[0]["psnr"]) > 10
+    assert all(float(row["seconds"]) > 0 for row in rows if row["steps"] != "0")
+    call(module.main, "plot", found, "-o", tmp_path / "a.png")
+    assert read_png(tmp_path / "a.png").shape[2] in (3, 4)
 
 
 def test_plan(bench, scenes, tmp_path):
