@@ -28,6 +28,7 @@ RUN = (
     *(
         "automatic",
         "closed_form",
+        "curve",
         "dvr",
         "dvr_pixels",
         "dvr_steps",
@@ -43,7 +44,7 @@ RUN = (
         "readers",
         "refinement",
     ),
-    *("reports", "share", "splat", "training"),
+    *("reports", "share", "splat", "training", "damaged"),
 )
 SHARED = (
     "dvr_scenes",
@@ -240,6 +241,20 @@ def test_parts(bench, scenes, tmp_path, monkeypatch):
     assert "| no cells by error |" in call(module.main, "--table", tmp_path / "a.csv")
 
 
+def test_curve(bench, scenes, tmp_path):
+    module, found = bench("curve"), tmp_path / "a.csv"
+    few = ("--", "--max-gaussians", 300, "--size", SIZE)
+    for label in ("before", "after"):
+        call(module.main, "measure", *scenes, "-o", found, "--label", label, "--steps", 4, "--steps", 24, *few)
+    rows = rows_of(found)
+    assert [row["label"] for row in rows] == ["before"] * 3 + ["after"] * 3
+    assert [row["steps"] for row in rows] == ["0", "4", "24"] * 2
+    assert float(rows[2]["psnr"]) > float(rows[0]["psnr"]) > 10
+    assert all(float(row["seconds"]) > 0 for row in rows if row["steps"] != "0")
+    call(module.main, "plot", found, "-o", tmp_path / "a.png")
+    assert read_png(tmp_path / "a.png").shape[2] in (3, 4)
+
+
 def test_plan(bench, scenes, tmp_path):
     few = ("--max-gaussians", "40", "--size", str(SIZE), "--steps", "1")
     module = bench("plan", KINDS={"default": few})
@@ -364,3 +379,16 @@ def test_share(bench, scenes, tmp_path):
     assert float(rows[".spz"]["psnr"]) > 10
     assert (tmp_path / "pictures" / "blob.jpg").stat().st_size > 500
     assert "| .spz |" in call(module.main, "--table", tmp_path / "a.csv")
+
+
+def test_damaged(bench, scenes, tmp_path):
+    module = bench("damaged", ROWS=5)
+    look = ["--tf", f"{scenes[1]}/shells.json", "--opacity-unit-distance", "mean-spacing"]
+    target = ["--max-gaussians", "60", "--size", str(SIZE), "-q", "-o", str(tmp_path / "blob.ply")]
+    assert run(["init", f"{scenes[1]}/blob.nrrd", *look, *target]) == 0
+    call(module.main, tmp_path / "blob.ply", "--volume", f"{scenes[1]}/blob.nrrd", *look, "-o", tmp_path / "d.csv")
+    rows = [row for row in rows_of(tmp_path / "d.csv") if row["copy"] == "broken rows"]
+    assert {"file: centres that are not finite", "values: largest sigma"} <= {row["case"] for row in rows}
+    assert "| vvgt | broken rows | file: centres that are not finite: 5 rows of" in call(
+        module.main, "--table", tmp_path / "d.csv"
+    )
