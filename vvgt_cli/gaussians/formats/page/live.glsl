@@ -8,7 +8,7 @@ uniform vec4 vvgtCut[6];  // dot(xyz, centre) <= w of each stays; of none the no
 uniform vec4 vvgtLight;  // ambient, diffuse, specular, power; ambient < 0: unlit
 uniform vec4 vvgtToward;  // direction towards the light; with w = 1 it is at the eye
 uniform vec4 vvgtEye;  // its place, or with w = 1 the direction of parallel rays
-vec4 vvgtColor, vvgtRotation;
+vec4 vvgtColor, vvgtRotation, vvgtFace;  // vvgtFace: of what lies at a cut its direction, and how much of the light is that of the face
 vec3 vvgtScale;
 
 vec4 vvgtQuaternion(mat3 m) {  // (x, y, z, w), w >= 0
@@ -47,6 +47,8 @@ float vvgtCutBy(vec4 plane, inout vec3 center, inout mat3 axes) {  // mass's fac
   float at = (plane.w - dot(plane.xyz, center)) / sigma;
   if (at > 3.0) return 1.0;
   if (at < -2.0) return 0.0;
+  float near = clamp(0.5 * (3.0 - at), 0.0, 1.0);
+  if (near > vvgtFace.w) vvgtFace = vec4(plane.xyz, near);
   own /= sigma;
   float x = abs(at) * 0.70710678, t = 1.0 / (1.0 + 0.3275911 * x);  // Abramowitz and Stegun 7.1.26
   float tail = 0.5 * t * (0.254829592 + t * (-0.284496736 + t * (1.421413741 + t * (-1.453152027 + t * 1.061405429)))) * exp(-x * x);
@@ -60,17 +62,22 @@ float vvgtCutBy(vec4 plane, inout vec3 center, inout mat3 axes) {  // mass's fac
 
 float vvgtCutAll(inout vec3 center, inout mat3 axes) {
   float stays = 1.0;
+  vvgtFace = vec4(0.0);
   for (int i = 0; i < 6 && stays > 0.0; i++) stays *= vvgtCutBy(vvgtCut[i], center, axes);
   return stays;
 }
 
-vec3 vvgtLit(vec3 color, vec3 gradient, vec3 center) {  // Blinn and Phong's (docs/light.md)
-  if (vvgtLight.x < 0.0) return color;
-  float rises = length(gradient);
-  if (rises == 0.0) return color * vvgtLight.x;
-  vec3 n = gradient / rises, d = vvgtEye.w > 0.0 ? vvgtEye.xyz : normalize(center - vvgtEye.xyz), l = vvgtToward.w > 0.0 ? -d : vvgtToward.xyz, h = l - d;
+vec3 vvgtShaded(vec3 color, vec3 n, vec3 center) {  // Blinn and Phong's (docs/light.md)
+  vec3 d = vvgtEye.w > 0.0 ? vvgtEye.xyz : normalize(center - vvgtEye.xyz), l = vvgtToward.w > 0.0 ? -d : vvgtToward.xyz, h = l - d;
   float facing = min(abs(dot(n, h)) / max(length(h), 1e-9), 1.0);
   return min(color * (vvgtLight.x + vvgtLight.y * abs(dot(n, l))) + vvgtLight.z * pow(facing, vvgtLight.w), vec3(1.0));
+}
+
+vec3 vvgtLit(vec3 color, vec3 gradient, vec3 center) {
+  if (vvgtLight.x < 0.0) return color;
+  float rises = length(gradient);
+  vec3 own = rises == 0.0 ? color * vvgtLight.x : vvgtShaded(color, gradient / rises, center);
+  return vvgtFace.w > 0.0 ? mix(own, vvgtShaded(color, vvgtFace.xyz, center), vvgtFace.w) : own;
 }
 
 void modifySplatCenter(inout vec3 center) {
