@@ -105,7 +105,7 @@ def test_bytes_for_pages_hold_the_label() -> None:
     live = some.live.copy()  # type: ignore[union-attr]
     live[:, 6] = np.linspace(0, 299, len(live)).round()
     some = replace(some, live=live)
-    stream, known = live_bytes(some, facts(many)), live_json([some], facts(many), 0.05)
+    stream, known = live_bytes(some, facts(many)), live_json([some], facts(many), [0.05])
     np.testing.assert_array_equal(from_bytes(stream, known)[:, 6], live[:, 6])
     assert json.loads(json.dumps(known)) == known
 

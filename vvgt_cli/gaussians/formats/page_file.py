@@ -84,8 +84,9 @@ def outermost(clouds: Sequence[Splats]) -> list[list[float]]:
     """
     places = np.concatenate([splats.means[splats.logits > _SEEN] for splats in clouds]) * (-1.0, -1.0, 1.0)
     towards = np.array([d for d in product((-1, 0, 1), repeat=3) if any(d)]).T
-    farthest = np.unique((places @ towards).argmax(axis=0)) if len(places) else []
-    found: list[list[float]] = places[farthest].round(3).tolist()
+    if not len(places):
+        return []
+    found: list[list[float]] = places[np.unique((places @ towards).argmax(axis=0))].round(3).tolist()
     return found
 
 

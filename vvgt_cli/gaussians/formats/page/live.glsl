@@ -1,7 +1,7 @@
 // A Gaussian under the function: moved and thinned along the gradient, of the opacity of its mass (docs/live.md), and cut by planes. The engine calls
 // modifySplatCenter first. A cut Gaussian becomes one of the mass and mean of its part that stays, no wider than that and up to the plane.
 uniform highp sampler2D vvgtTable;
-uniform highp sampler2D vvgtLabels;  // of a label map a column a label: red, green, blue, extinction; else one column
+uniform highp sampler2D vvgtLabels;  // a column a row of looks: of a label red, green, blue, extinction; of a function its number in the table, and -1
 uniform vec4 vvgtFacts;  // shortest log length, how far it goes, thinnest, spreads
 uniform vec3 vvgtOpaque;  // of the variance of what is opaque along its shortest axis, and along the others; variance of the screen's dilation
 uniform vec4 vvgtCut[6];  // dot(xyz, centre) <= w of each stays; of none the normal is zero
@@ -86,12 +86,12 @@ void modifySplatCenter(inout vec3 center) {
   float column = float(a.y) * (vvgtFacts.w - 1.0) / 255.0;
   int j = min(int(column), spreads - 2);
   float f = column - float(j);
-  vec4 sums = mix(texelFetch(vvgtTable, ivec2(at, j), 0), texelFetch(vvgtTable, ivec2(at, j + 1), 0), f);
-  vec2 z = mix(texelFetch(vvgtTable, ivec2(at, j + spreads), 0).xy, texelFetch(vvgtTable, ivec2(at, j + 1 + spreads), 0).xy, f);
-  if (textureSize(vvgtLabels, 0).x > 1) {
-    vec4 label = texelFetch(vvgtLabels, ivec2(int(a.w) + 256 * int(b.w), 0), 0);
-    sums = vec4(label.rgb * label.a, label.a);
-    z = vec2(0.0, label.a);
+  vec4 look = texelFetch(vvgtLabels, ivec2(int(a.w) + 256 * int(b.w), 0), 0), sums = vec4(look.rgb * look.a, look.a);
+  vec2 z = vec2(0.0, look.a);
+  if (look.a < 0.0) {
+    int near = 2 * spreads * int(look.r) + j;
+    sums = mix(texelFetch(vvgtTable, ivec2(at, near), 0), texelFetch(vvgtTable, ivec2(at, near + 1), 0), f);
+    z = mix(texelFetch(vvgtTable, ivec2(at, near + spreads), 0).xy, texelFetch(vvgtTable, ivec2(at, near + 1 + spreads), 0).xy, f);
   }
   float tau = max(sums.a, 1e-12), first = z.x / tau, variance = max(z.y / tau - first * first, 0.0);
   mat3 turn = quatToMat3(getRotation());

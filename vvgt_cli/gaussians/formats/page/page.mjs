@@ -189,7 +189,7 @@ async function start() {
   }
   if (scene.frames.length === 1 && !scene.live) document.body.append(named('baked'));
   const live = scene.live ? panel(await liveLook(viewer, scene.live), viewer, scene.live) : null;
-  if (live) served(live, viewer, scene.live, scene.server);
+  if (live) served(live, viewer, scene.server);
   const show = scene.frames.length > 1 ? series(viewer, live) : null, here = where(viewer, scene, live, show);
   await here.restored;
   said.textContent = '';
