@@ -15,6 +15,7 @@ from test_live_layers import pair  # noqa: F401
 
 from vvgt_cli.cameras import orbit_views
 from vvgt_cli.cli.main import run
+from vvgt_cli.conversion.gaussian_files import open_gaussians
 from vvgt_cli.gaussians import read_ply
 from vvgt_cli.images import read_png
 from vvgt_cli.images.metrics import psnr
@@ -46,10 +47,10 @@ def after(
 
 
 def ours(file: Path, folder: Path, *look: str) -> np.ndarray:
-    """What `vvgt recolor` makes of a file, as `vvgt render --orbit` begins; the file is not turned."""
+    """What `vvgt recolor` makes of a file, as `vvgt render --orbit` begins."""
     out = folder / "ours.ply"
     assert run(["recolor", str(file), *look, "--quiet", "--overwrite", "-o", str(out)]) == 0
-    return render(read_ply(out)[0], orbit_views(1, size=SIZE)[0], rule="inria")[..., :3]
+    return render(open_gaussians(str(out))[0], orbit_views(1, size=SIZE)[0], rule="inria")[..., :3]
 
 
 @pytest.fixture(scope="module")
