@@ -163,7 +163,7 @@ def test_layers_are_changed_one_at_a_time(pair: Path, tmp_path: Path) -> None:
     shot = after(live, [], tmp_path, before=f"window.vvgt.live.layers[1].set({nodes})")
     print(f"another function of the second: {psnr(wanted, shot):.2f} dB, not {psnr(own, shot):.2f}")
     assert psnr(wanted, shot) > max(32, psnr(own, shot) + 5)
-    (tmp_path / "off.json").write_text(json.dumps({"3": {"name": "top", "color": [0, 0, 1], "opacity": 0}}))
+    (tmp_path / "off.json").write_text(json.dumps({"3": {"name": "top", "color": [0, 0, 1], "opacity": 1e-6}}))
     wanted = ours(live, tmp_path, "--layer", f"top,labels={tmp_path / 'off.json'}")
     for window in (DESK, PHONE):
         actions: Actions = [{"select": "#live .layer", "text": "top_label"}, {"click": "#live .organs li .eye"}]
