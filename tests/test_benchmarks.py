@@ -42,7 +42,7 @@ RUN = (
         "readers",
         "refinement",
     ),
-    *("reports", "share", "splat", "training"),
+    *("reports", "share", "splat", "training", "damaged"),
 )
 SHARED = (
     "dvr_scenes",
@@ -346,3 +346,16 @@ def test_share(bench, scenes, tmp_path):
     assert float(rows[".spz"]["psnr"]) > 10
     assert (tmp_path / "pictures" / "blob.jpg").stat().st_size > 500
     assert "| .spz |" in call(module.main, "--table", tmp_path / "a.csv")
+
+
+def test_damaged(bench, scenes, tmp_path):
+    module = bench("damaged", ROWS=5)
+    look = ["--tf", f"{scenes[1]}/shells.json", "--opacity-unit-distance", "mean-spacing"]
+    target = ["--max-gaussians", "60", "--size", str(SIZE), "-q", "-o", str(tmp_path / "blob.ply")]
+    assert run(["init", f"{scenes[1]}/blob.nrrd", *look, *target]) == 0
+    call(module.main, tmp_path / "blob.ply", "--volume", f"{scenes[1]}/blob.nrrd", *look, "-o", tmp_path / "d.csv")
+    rows = [row for row in rows_of(tmp_path / "d.csv") if row["copy"] == "broken rows"]
+    assert {"file: centres that are not finite", "values: largest sigma"} <= {row["case"] for row in rows}
+    assert "| vvgt | broken rows | file: centres that are not finite: 5 rows of" in call(
+        module.main, "--table", tmp_path / "d.csv"
+    )

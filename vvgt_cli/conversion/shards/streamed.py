@@ -91,7 +91,10 @@ def _node(
     cut: Cut, files: Files, levels: list[Level], made: list[Gaussians], spreads: list[np.ndarray]
 ) -> dict[str, Any]:
     """Put a node into the files; its entry in the manifest."""
-    axes, options = np.array(cut.plan.axes).reshape(3, 3), replace(upright(cut.plan.ply), sh_degree=0, comments=False)
+    axes, options = (
+        np.array(cut.plan.axes).reshape(3, 3),
+        replace(upright(cut.plan.ply), sh_degree=cut.plan.degree, comments=False),
+    )
     lods, low, high = {}, np.full(3, np.inf), np.full(3, -np.inf)
     for level, gaussians, spread in zip(levels, made, spreads, strict=True):
         splats = _scaled(gaussians, axes, options)

@@ -5,16 +5,15 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians.formats.sog_images import IMAGES, META, images_of, webp
-from vvgt_cli.gaussians.formats.splats import Splats, morton_order
+from vvgt_cli.gaussians.formats.splats import Splats, joined, morton_order
 from vvgt_cli.gaussians.formats.streamed import read_manifest
 
 A_FILE = 1 << 17  # Gaussians of a file, or a node more
@@ -67,11 +66,7 @@ class Files:
         """Write the file that is waiting, if there is one."""
         if not level.rows:
             return
-        columns = ("means", "log_scales", "quaternions", "logits", "f_dc", "f_rest")
-        joined: dict[str, Any] = {
-            name: np.concatenate([getattr(part, name) for part in level.waiting]) for name in columns
-        }
-        images, meta = images_of(replace(level.waiting[0], **joined))
+        images, meta = images_of(joined(level.waiting))
         target = self._folder / self.names[self._begun.pop(level.number)]
         target.parent.mkdir(exist_ok=True)
         for name, image in images.items():
