@@ -114,8 +114,8 @@ def test_names_of_labels_are_no_markup_in_the_page() -> None:
     some = baked(labels_cloud(), Palette.of_labels(LABELS, 0.05))
     content, scene = page_of(some, options(live=facts()))
     assert b"</script><b>x" not in content
-    assert [label["name"] for label in scene["live"]["labels"]] == [label.name for label in LABELS]
-    assert scene["live"]["nodes"] == []
+    assert [label["name"] for label in scene["live"]["layers"][0]["labels"]] == [label.name for label in LABELS]
+    assert scene["live"]["layers"][0]["nodes"] == []
 
 
 def test_labels_under_gaussians_and_the_way_they_end() -> None:

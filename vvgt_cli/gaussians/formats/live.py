@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.gaussians.live import BEND, FLAT, LENGTH, MEANS, NODES, SHARP, SPREAD, SPREADS, THINNEST, VALUE, WIDEST
+from vvgt_cli.gaussians.live import BEND, FLAT, LENGTH, MEANS, SHARP, SPREAD, SPREADS, THINNEST, VALUE, WIDEST
 from vvgt_cli.gaussians.live_facts import GRADIENT, NUMBER, ROW, LiveFacts
 from vvgt_cli.gaussians.types import Gaussians
 
@@ -75,7 +75,6 @@ def live_json(clouds: Sequence[Gaussians], facts: LiveFacts, unit_distances: Seq
         "widest": WIDEST,
         "bend": BEND,
         "table": [MEANS, SPREADS],
-        "nodes": NODES,
         "thinnest": THINNEST,
         "opaque": [SHARP, FLAT],
     }
