@@ -170,7 +170,7 @@ def test_no_comments_no_certificate(vvgt, folder, tmp_path) -> None:
     assert b"sha256" not in (tmp_path / "out.ply").read_bytes()
 
 
-@pytest.mark.parametrize("suffix", [".compressed.ply", ".spz", ".sog", ".glb", ".usdc", ".html"])
+@pytest.mark.parametrize("suffix", [".compressed.ply", ".spz", ".v4.spz", ".sog", ".glb", ".usdc", ".html"])
 def test_every_format_carries_it(vvgt, folder, tmp_path, suffix) -> None:
     if suffix == ".usdc":
         pytest.importorskip("pxr")

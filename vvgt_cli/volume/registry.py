@@ -16,7 +16,7 @@ from vvgt_cli.errors import DataError, SeveralSteps, UsageError, VvgtError
 from vvgt_cli.files import seekable
 from vvgt_cli.volume.cut import crop, masked, parse_crop
 from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.readers import HEAD_BYTES, READERS, SCHEMES, Reader, known_suffixes
+from vvgt_cli.volume.readers import HEAD_BYTES, READERS, SCHEMES, STEPPED, Reader, known_suffixes
 from vvgt_cli.volume.space import in_space
 from vvgt_cli.volume.types import Volume
 
@@ -39,7 +39,7 @@ def read_volume(source: str, options: ReadOptions | None = None) -> Volume:
         UsageError: options that the format does not take, or a choice (array, component, dims) that is missing.
     """
     options = options or ReadOptions()
-    if options.time is not None and (source == "-" or source.partition(":")[0] in SCHEMES):
+    if options.time is not None and (source == "-" or source.partition(":")[0] in SCHEMES.keys() - STEPPED):
         raise UsageError(f"{source}: one volume, no time steps; leave out --time {options.time}")
     if options.crop is not None or options.mask is not None:
         options = replace(options, packed=False)
