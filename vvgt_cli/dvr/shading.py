@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numba as nb
 import numpy as np
@@ -27,11 +28,11 @@ def _places(p: float, n: int) -> tuple[np.uint64, np.uint64, np.uint64, np.uint6
 
 
 @_jit
-def _line(values: np.ndarray, k: np.uint64, j: np.uint64, i: int) -> Quad:
+def _line(values: np.ndarray, k: Any, j: Any, i: int) -> Quad:
     """The voxels before, at, after and beyond voxel ``i`` of row (k, j), clamped to the edge voxels."""
     nx = values.shape[2]
     if 0 < i < nx - 2:
-        return four(values, U((k * U(values.shape[1]) + j) * U(nx) + U(i - 1)))
+        return four(values, (k * U(values.shape[1]) + j) * U(nx) + U(i - 1))
     row = values[k, j]
     return vector(
         float(row[U(max(i - 1, 0))]), float(row[U(i)]), float(row[U(min(i + 1, nx - 1))]),
