@@ -23,7 +23,7 @@ from vvgt_cli.conversion.shards.ladder import Ladder
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import read_ply
 from vvgt_cli.gaussians.formats.levels import Levels
-from vvgt_cli.gaussians.formats.sog_images import splats_in
+from vvgt_cli.gaussians.formats.sog_images import images_of, splats_in
 from vvgt_cli.gaussians.formats.splats import Splats, gaussians_of
 from vvgt_cli.gaussians.formats.streamed import nodes_of, read_manifest
 from vvgt_cli.gaussians.frames import transform, up_matrix
@@ -175,6 +175,46 @@ def test_what_has_no_levels_is_refused_in_a_line(vvgt, volume: Path, tmp_path: P
     assert found.code == 2, found.err
     assert text in found.error
     assert not list(tmp_path.iterdir())
+
+
+def test_an_interrupted_run_goes_on_with_the_same_bytes(
+    vvgt, volume: Path, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("vvgt_cli.conversion.shards.cut.BATCH", 3000)
+    monkeypatch.setattr("vvgt_cli.conversion.shards.streamed_files.A_FILE", 2500)
+    whole, out = tmp_path / "whole", tmp_path / "out"
+    line = ("convert", volume, *FIT, "--blocks", "32", "-o")
+    assert vvgt(*line, whole / "lod-meta.json").code == 0
+    calls = {"errors_apart": 0, "images_of": 0}
+    real = {"ladder.errors_apart": errors_apart, "streamed_files.images_of": images_of}
+    stop = {"errors_apart": 20, "images_of": 0}
+
+    def counted(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*args: Any) -> Any:
+            calls[name] += 1
+            if calls[name] == stop[name]:
+                raise KeyboardInterrupt
+            return function(*args)
+
+        return call
+
+    for place, function in real.items():
+        name = place.partition(".")[2]
+        monkeypatch.setattr(f"vvgt_cli.conversion.shards.{place}", counted(name, function))
+    assert vvgt(*line, out / "lod-meta.json").code == 130
+    nodes, files = len(nodes_of(read_manifest(whole / "lod-meta.json"), "")), len(list(whole.glob("*/meta.json")))
+    assert nodes > 20
+    assert files > 3
+    stop = {"errors_apart": 0, "images_of": 3}
+    assert vvgt(*line, out / "lod-meta.json").code == 130
+    assert calls["errors_apart"] < nodes + 20  # those of the batches that were whole are not drawn again
+    assert not (out / "lod-meta.json").exists()
+    calls, stop["images_of"] = {"errors_apart": 0, "images_of": 0}, 0
+    assert vvgt(*line, out / "lod-meta.json").code == 0
+    assert calls == {"errors_apart": 0, "images_of": files - 2}
+    found = [{p.relative_to(f): p.read_bytes() for p in f.rglob("*.*")} for f in (whole, out)]
+    assert found[0] == found[1]
+    assert not list(tmp_path.glob(".*"))
 
 
 def test_an_existing_folder_is_replaced_only_when_told(vvgt, volume: Path, folder: Path) -> None:

@@ -256,11 +256,16 @@ class Forest:
                 assert self.top is not None, "scores come of a top"
                 yield self._leaves(row, self.top, which + len(self.tiles))
 
-    def cuts(self, thresholds: np.ndarray) -> Iterator[list[Leaves]]:
-        """Of each tile the cells that each of its ``thresholds`` (tiles, n) leaves: at least the tile's own cell."""
+    def cuts(self, thresholds: np.ndarray, begin: int = 0) -> Iterator[list[Leaves]]:
+        """Of each tile from ``begin`` on the cells that each of its ``thresholds`` (tiles, n) leaves.
+
+        At least the tile's own cell.
+        """
         for row, scores in enumerate(self.scores()):
             if row == len(self.tiles):
                 return
+            if row < begin:
+                continue
             tree, above = self._tree(self.tiles[row]), scores.above.copy()
             above[-1] = np.inf
             kept = [(above > value) & ((scores.capped <= value) | ~scores.inner) for value in thresholds[row]]

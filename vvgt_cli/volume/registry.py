@@ -251,7 +251,10 @@ def _find(path: Path, head: bytes, options: ReadOptions) -> Reader:
 def _check_options(reader: Reader, source: str, options: ReadOptions) -> None:
     needless = [flag for flag in options.raw_flags if not (reader.resamples and flag == "--dims")]
     if not reader.raw_layout and needless:
-        raise UsageError(f"{source}: {reader.name}, which states its own layout; leave out {' '.join(needless)}")
+        raise UsageError(
+            f"{source}: {reader.name}, which states its own layout; leave out {' '.join(needless)} (--spacing is "
+            "taken; to read its bytes as raw values, pipe them in, with - as the source)"
+        )
     if options.time is not None and not reader.times:
         raise UsageError(
             f"{source}: a {reader.name} file, of which no time steps are known; leave out --time {options.time} (along "

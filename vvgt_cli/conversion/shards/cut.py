@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from vvgt_cli.gaussians import Gaussians
 
 BATCH = 1 << 16  # Gaussians that are made at once
+Node = tuple[list["Gaussians"], list[np.ndarray]]  # by level
 
 
 @dataclass(frozen=True)
@@ -44,24 +45,27 @@ class Cut:
             lit = self._lit(leaves)
             yield self.made(leaves), None if lit is None else directions(lit[:, MEAN])
 
-    def nodes(self, thresholds: np.ndarray) -> Iterator[tuple[list[Gaussians], list[np.ndarray]]]:
-        """Of each tile, for each of its ``thresholds`` (tiles, n): Gaussians, and `spread_of` their cells.
+    def nodes(self, thresholds: np.ndarray, begin: int = 0) -> Iterator[list[Node]]:
+        """Of each tile from ``begin`` on, for each of its ``thresholds`` (tiles, n): Gaussians, `spread_of` cells.
 
-        They are made some tiles at a time: the colours of neighbours matter to each other.
+        They are made some tiles at a time: the colours of neighbours matter to each other. So ``begin`` is 0, or where
+        some of an earlier call ended.
         """
         from vvgt_cli.closed_form.tree import spread_of
         from vvgt_cli.field.forest import joined
 
         waiting: list[list[Leaves]] = []
-        for row, leaves in enumerate(self.forest.cuts(thresholds)):
+        for row, leaves in enumerate(self.forest.cuts(thresholds, begin), begin):
             waiting.append(leaves)
             if sum(len(node[0]) for node in waiting) < BATCH and row + 1 < len(self.forest.tiles):
                 continue
             sizes = np.array([[len(part) for part in node] for node in waiting])
             whole = [self.made(joined([node[k] for node in waiting])) for k in range(sizes.shape[1])]
+            made = []
             for node, size, end in zip(waiting, sizes, np.cumsum(sizes, axis=0), strict=True):
                 parts = [each.take(np.arange(e - n, e)) for each, n, e in zip(whole, size, end, strict=True)]
-                yield parts, [spread_of(part) for part in node]
+                made.append((parts, [spread_of(part) for part in node]))
+            yield made
             waiting = []
 
     def made(self, leaves: Leaves) -> Gaussians:

@@ -58,7 +58,7 @@ def write_merged(run: Run, parts: Parts, output: str, overwrite: bool) -> None:
         forest, opaque = pyramid(parts, plan, light)
         stage.note = f"{forest.base} cells in {len(forest.tiles)} tiles"
     if is_streamed(output):
-        write_streamed(run, Cut(forest, opaque, plan, light), output, overwrite)
+        write_streamed(run, parts, Cut(forest, opaque, plan, light), output, overwrite)
         return
     _write_ply(run, parts, Cut(forest, opaque, plan, light), output, overwrite)
 
