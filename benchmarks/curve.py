@@ -97,7 +97,11 @@ def plot(path: str, output: str) -> None:
 
     rows = read_rows(path)
     scenes = list(dict.fromkeys(row["scene"] for row in rows))
-    figure, panels = pyplot.subplots(2, -(-len(scenes) // 2), figsize=(3 * -(-len(scenes) // 2), 5), squeeze=False)
+    wide = min(len(scenes), 4)
+    high = -(-len(scenes) // wide)
+    figure, panels = pyplot.subplots(high, wide, figsize=(max(3 * wide, 5), 2.5 * high + 0.5), squeeze=False)
+    for panel in panels.flat[len(scenes) :]:
+        panel.set_axis_off()
     for panel, scene in zip(panels.flat, scenes, strict=False):
         before = min(float(row["before"]) for row in rows if row["scene"] == scene)
         for label in dict.fromkeys(row["label"] for row in rows):

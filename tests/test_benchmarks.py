@@ -44,7 +44,7 @@ RUN = (
         "readers",
         "refinement",
     ),
-    *("reports", "share", "splat", "training", "damaged"),
+    *("reports", "share", "splat", "training", "damaged", "kept"),
 )
 SHARED = (
     "dvr_scenes",
@@ -392,3 +392,18 @@ def test_damaged(bench, scenes, tmp_path):
     assert "| vvgt | broken rows | file: centres that are not finite: 5 rows of" in call(
         module.main, "--table", tmp_path / "d.csv"
     )
+
+
+def test_kept(bench, tmp_path, monkeypatch):
+    module = bench("kept")
+    monkeypatch.setattr(module.shutil, "which", lambda name: None)
+    call(module.main, "-o", tmp_path / "kept.csv")
+    rows = {(row["format"], row["fact"]): row for row in rows_of(tmp_path / "kept.csv")}
+    assert all(rows[ending, fact]["read back by us"] == "yes" for ending in module.ENDINGS for fact in module.FACTS)
+    assert all(
+        rows[ending, "antialiased"]["read back by us"] == "yes" for ending in (".ply", ".spz", ".v4.spz", ".sog")
+    )
+    assert {row["splat-transform"] for row in rows.values()} == {"not run"}
+    assert rows[".usdc", "certificate"]["usd-core"] == "yes"
+    assert rows[".spz", "certificate"]["gsply"] == "no"
+    assert "| `.glb` | certificate; place" in call(module.main, "--table", tmp_path / "kept.csv")
