@@ -20,7 +20,9 @@ from vvgt_cli.commands.streamed_site import streamed_parts
 from vvgt_cli.commands.view import named_files
 from vvgt_cli.conversion.shards.apart import errors_apart
 from vvgt_cli.conversion.shards.ladder import Ladder
+from vvgt_cli.conversion.shards.streamed_files import Files, Level
 from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.field.parts import Parts
 from vvgt_cli.gaussians import read_ply
 from vvgt_cli.gaussians.formats.levels import Levels
 from vvgt_cli.gaussians.formats.sog_images import images_of, splats_in
@@ -215,6 +217,25 @@ def test_an_interrupted_run_goes_on_with_the_same_bytes(
     found = [{p.relative_to(f): p.read_bytes() for p in f.rglob("*.*")} for f in (whole, out)]
     assert found[0] == found[1]
     assert not list(tmp_path.glob(".*"))
+
+
+def test_what_another_run_has_put_in_the_folder_is_written_again(tmp_path: Path) -> None:
+    def written(seed: int, name: str) -> bytes:
+        random, level = np.random.default_rng(seed), Level(0)
+        columns = [random.normal(size=(50, n)).astype(np.float32) for n in (3, 3, 4, 3)]
+        logits, rest = columns[0][:, 0], np.zeros((50, 0, 3), np.float32)
+        files = Files(tmp_path, Parts(tmp_path / name), "written")
+        files.add(level, Splats(*columns[:3], logits, columns[3], rest))
+        files.write(level)
+        assert level.bytes == sum(path.stat().st_size for path in (tmp_path / "0_0").iterdir())
+        return (tmp_path / "0_0" / "means_l.webp").read_bytes()
+
+    first, other = written(1, "a"), written(2, "b")
+    assert first != other
+    assert written(1, "a") == first
+    before = (tmp_path / "0_0" / "meta.json").stat().st_mtime_ns
+    assert written(1, "a") == first
+    assert (tmp_path / "0_0" / "meta.json").stat().st_mtime_ns == before
 
 
 def test_an_existing_folder_is_replaced_only_when_told(vvgt, volume: Path, folder: Path) -> None:

@@ -45,7 +45,8 @@ class Level:
 class Files:
     """Those of all levels; ``names`` of their `meta.json`, as the manifest has them.
 
-    A part ``kind`` of ``parts`` says of each file that it is whole, and its bytes: it is not written again.
+    A part ``kind`` of ``parts`` says of each file that it is whole, its bytes and when it was written: it is not
+    written again, unless another run has written there since.
     """
 
     def __init__(self, folder: Path, parts: Parts, kind: str) -> None:
@@ -73,10 +74,20 @@ class Files:
             return
         number = self._begun.pop(level.number)
         target = self._folder / self.names[number]
-        if not target.is_file() or self._parts.missing(self._kind, [number]):
-            self._parts.save(self._kind, number, size=np.array(_written(target, joined(level.waiting))))
-        level.bytes += int(self._parts.load(self._kind, number)["size"])
+        level.bytes += self._kept(number, target) or self._made(number, target, joined(level.waiting))
         level.waiting, level.rows, level.files = [], 0, level.files + 1
+
+    def _kept(self, number: int, target: Path) -> int:
+        """Bytes of a file that is as this run, interrupted, has written it; else 0."""
+        if not target.is_file() or self._parts.missing(self._kind, [number]):
+            return 0
+        size, written = self._parts.load(self._kind, number)["size"].tolist()
+        return int(size) if written == target.stat().st_mtime_ns else 0
+
+    def _made(self, number: int, target: Path, splats: Splats) -> int:
+        size = _written(target, splats)
+        self._parts.save(self._kind, number, size=np.array([size, target.stat().st_mtime_ns]))
+        return size
 
     def remove_others(self, before: Sequence[str]) -> None:
         """Remove what a manifest that was there ``before`` names and this one does not; nothing else in the folder."""
