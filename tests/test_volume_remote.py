@@ -133,6 +133,21 @@ def test_other_codecs_than_were_checked_are_refused(
         read_volume(f"{address}/t.zarr", ReadOptions(time=0))
 
 
+def test_other_codecs_of_coordinates_are_refused(address: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    group = zarr.open_group(store=str(folder / "c.zarr"), mode="w", zarr_format=2)
+    values = group.create_array("v", shape=(8, 9, 10), dtype="uint8", compressors=None)
+    values.attrs["_ARRAY_DIMENSIONS"] = ["z", "y", "x"]
+    group.create_array("x", shape=(10,), dtype="float32")[:] = np.arange(10)
+    plain, real = (folder / "c.zarr" / "v" / ".zarray").read_text(), Remote.read_text
+    told = json.dumps(json.loads(plain) | {"shape": [10]})
+    told_of = lambda self, encoding: told if str(self).endswith("x/.zarray") else real(self, encoding)  # noqa: E731
+    assert read_volume(f"{address}/c.zarr:/v").dims == (10, 9, 8)
+    monkeypatch.setattr(Remote, "read_text", told_of)
+    monkeypatch.setattr("vvgt_cli.volume.zarr_store._CODECS", set[str]())  # the array itself has one
+    with pytest.raises(DataError, match="codec"):
+        read_volume(f"{address}/c.zarr:/v")
+
+
 def test_paths_stay_inside_the_store() -> None:
     store = Remote(None, "http://h/x.zarr")
     for name, inside in (("a/b", True), ("a/../b", True), ("../y.zarr", False), ("/etc", True), ("a/../../y", False)):

@@ -47,10 +47,7 @@ def read_zarr(path: Path, options: ReadOptions) -> Volume:
     with library_errors(str(path), "Zarr"):
         place, facts = _choose(path, options.array, options.level)
         _check_codecs(place, facts)
-        array = zarr.open_array(store=str(place), mode="r")
-        _check_codecs(place, array.metadata.to_dict())  # a server may have answered zarr otherwise
-        if int(np.prod(array.chunks, dtype=object)) * array.dtype.itemsize > MAX_CHUNK:
-            raise DataError(f"{place}: chunks of {array.chunks} values; expected at most 2 GiB each")
+        array = _array(zarr, place)
         attributes = dict(array.attrs)
         axes = _ome_axes(place, array.shape) or _axes(zarr, place, facts, attributes, array.shape)
         return labelled_volume(
@@ -63,6 +60,15 @@ def read_zarr(path: Path, options: ReadOptions) -> Volume:
             _name(path, place),
             array.chunks,
         )
+
+
+def _array(zarr: Any, place: Path) -> Any:
+    """An array whose codecs have been checked; they are once more, as a server may have answered zarr otherwise."""
+    array = zarr.open_array(store=str(place), mode="r")
+    _check_codecs(place, array.metadata.to_dict())
+    if int(np.prod(array.chunks, dtype=object)) * array.dtype.itemsize > MAX_CHUNK:
+        raise DataError(f"{place}: chunks of {array.chunks} values; expected at most 2 GiB each")
+    return array
 
 
 def _name(path: Path, place: Path) -> str:
@@ -191,7 +197,7 @@ def _axes(
             axes.append(axis(name, size))
             continue
         _check_codecs(beside, told)
-        centres = np.asarray(zarr.open_array(store=str(beside), mode="r")[:])
+        centres = np.asarray(_array(zarr, beside)[:size])
         numbers = centres.dtype.kind in "iuf"
         axes.append(axis(name, size, centres.astype(np.float64) if numbers else None, _attributes(beside)))
     return axes
