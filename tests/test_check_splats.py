@@ -77,6 +77,14 @@ def test_a_conversion_passes_with_and_without_its_volume(vvgt, made, scene):
     assert {o["stage"] for o in document["outcomes"]} == {"file", "values", "order"}
 
 
+def test_light_without_a_volume_is_refused(vvgt, made):
+    for line, text in ((("--light", "headlight"), "--light"), ((made, "--ambient-occlusion"), "--ambient-occlusion")):
+        found = vvgt("check", *line)
+        assert (found.code, found.error.startswith(f"vvgt: error: {text}: only with a volume")) == (2, True), (
+            found.error
+        )
+
+
 @pytest.mark.parametrize("ending", [".spz", ".glb", ".compressed.ply"])
 def test_other_formats_are_checked_like_a_ply(vvgt, made, scene, tmp_path, ending):
     from vvgt_cli.conversion.gaussian_files import layout_of, open_gaussians

@@ -57,7 +57,9 @@ def command(
             f"--volume {volume}: beside {file or 'nothing'}; expected a file of Gaussians to compare it with"
         )
     scene = volume if splats else file
-    given = [f"--{key.replace('_', '-')}" for key, value in (options["optics"] | options["read"]).items() if value]
+    asked = options["optics"] | options["read"] | options["light"]
+    flags = {"lights": "light", "occlusion": "ambient-occlusion"}
+    given = [f"--{flags.get(key, key).replace('_', '-')}" for key, value in asked.items() if value]
     given = [name for name in given if name != "--tf-range" or options["optics"]["tf_range"] != "data"]
     if scene is None and given:
         raise UsageError(f"{', '.join(given)}: only with a volume; expected {'--volume' if splats else 'VOLUME'} too")
