@@ -356,6 +356,18 @@ def test_records_of_spz_4(tmp_path):
         given(record, record[:4] + b"\xff\xff\0\0")
 
 
+def test_hostile_spz_are_one_line_before_memory_is_taken():
+    known, content = (
+        format_of("a.v4.spz"),
+        bytearray(struct.pack("<4sIIBBBBI12x", b"NGSP", 4, 4 * 10**9, 0, 12, 0, 5, 32)),
+    )
+    content += b"".join(struct.pack("<QQ", 0, width * 4 * 10**9) for width in (9, 1, 3, 3, 4))
+    with pytest.raises(DataError, match=r"4,000,000,000 Gaussians: needs .* of memory"):
+        known.read(bytes(content), "a.spz")
+    with pytest.raises(DataError, match=r"a\.spz: cannot be read as an \.spz"):
+        known.read(b"\x1f\x8b\x08\x10" + b"a" * 40, "a.spz")  # a comment without its end
+
+
 @pytest.mark.parametrize(("at", "value"), [(4, 5), (12, 4), (15, 1), (16, 200), (19, 255), (60, 255)])
 def test_damaged_headers_of_spz_4_are_one_line(at, value, tmp_path):
     known = format_of("a.v4.spz")

@@ -18,6 +18,7 @@ from vvgt_cli.gaussians.formats.levels import Levels, split_name
 from vvgt_cli.gaussians.formats.splats import Splats, columns_of, gaussians_of, splats_of
 from vvgt_cli.gaussians.header import parse_header
 from vvgt_cli.gaussians.ply import check_size
+from vvgt_cli.volume.blocks import check_memory
 
 _HEAD = 1024  # bytes that tell a .ply of another kind
 _LARGEST = 1 << 32  # bytes of a file that is read whole
@@ -117,9 +118,7 @@ def read_splats(path: str | Path) -> tuple[Gaussians, PlyHeader]:
     known, place = format_of(path) or _compressed(path), seekable(path)
     if known is None:
         return read_ply(path)
-    if place.stat().st_size > _LARGEST:
-        raise DataError(f"{path}: more than 4 GiB; expected less of this format, or a standard .ply")
-    return gaussians_of(known.read(place.read_bytes(), str(path)), str(path))
+    return gaussians_of(known.read(_content(place, path), str(path)), str(path))
 
 
 def read_columns(path: str | Path) -> Splats:
@@ -132,12 +131,21 @@ def read_columns(path: str | Path) -> Splats:
     if streamed is not None:
         return Levels(streamed[0]).level(streamed[1])
     known = format_of(path) or _compressed(path)
-    content, name = seekable(path).read_bytes(), str(path)
+    place, name = seekable(path), str(path)
     if known is not None:
-        return known.read(content, name)
+        return known.read(_content(place, path), name)
+    check_memory(2 * place.stat().st_size, name, "check a part of its Gaussians")
+    content = place.read_bytes()
     check_size(parse_header(content[: 1 << 18], name), len(content), name)
     with np.errstate(invalid="ignore"):
         return columns_of(content, name)
+
+
+def _content(place: Path, path: str | Path) -> bytes:
+    """Of the file at ``place``, whole."""
+    if place.stat().st_size > _LARGEST:
+        raise DataError(f"{path}: more than 4 GiB; expected less of this format, or a standard .ply")
+    return place.read_bytes()
 
 
 def _compressed(path: str | Path) -> Format | None:

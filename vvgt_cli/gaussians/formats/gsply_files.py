@@ -126,7 +126,7 @@ def _comments(content: bytes) -> list[str]:
     """Those that `_packed` left."""
     if len(content) < _FRONT.size or _FRONT.unpack_from(content)[2] != _COMMENT:
         return []
-    said = content[_FRONT.size : content.index(b"\0", _FRONT.size)]
+    said = content[_FRONT.size : max(content.find(b"\0", _FRONT.size), 0)]  # none where it has no end
     return said.decode("ascii", "replace").splitlines()
 
 

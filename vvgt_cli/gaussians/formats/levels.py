@@ -16,14 +16,13 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians.formats.sog_images import splats_in
-from vvgt_cli.gaussians.formats.splats import Splats, joined
+from vvgt_cli.gaussians.formats.splats import A_ROW, Splats, joined
 from vvgt_cli.gaussians.formats.streamed import MANIFEST, nodes_of, placed, read_manifest
 from vvgt_cli.resources import free_memory
 
 BASE, TIMES = 5.0, 3.0  # distance at which level 1 begins, and each further one: `lodBaseDistance`, `lodMultiplier`
 FIELD = 45.0  # degrees of view for which those are; others count as nearer or farther
 VIEW = "view"
-A_ROW = 400  # bytes that reading a Gaussian takes
 
 
 def split_name(name: str | Path) -> tuple[Path, str | None] | None:
@@ -92,9 +91,9 @@ class Levels:
     def _taken(self, levels: Sequence[int]) -> Splats:
         places = []
         for node, level in zip(self._nodes, levels, strict=True):
-            held = sorted(int(key) for key in node["lods"])
-            own = [key for key in held if key <= level] or held[:1]
-            places += [node["lods"][str(own[-1])]] if own else []
+            held = {int(key): place for key, place in node["lods"].items()}
+            own = [key for key in held if key <= level]
+            places += [held[max(own) if own else min(held)]] if held else []
         free, rows = free_memory(), sum(place["count"] for place in places)
         if free is not None and A_ROW * rows > free:
             need = A_ROW * rows / 2**30

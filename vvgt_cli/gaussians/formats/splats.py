@@ -15,6 +15,7 @@ from vvgt_cli.gaussians.header import parse_header
 from vvgt_cli.gaussians.ply import property_names
 
 HARMONICS = {0: 0, 1: 3, 2: 8, 3: 15}  # a channel, above degree 0
+A_ROW = 400  # bytes that reading a Gaussian takes
 COLUMNS = ("means", "log_scales", "quaternions", "logits", "f_dc", "f_rest")
 DEGREES = {count: degree for degree, count in HARMONICS.items()}
 

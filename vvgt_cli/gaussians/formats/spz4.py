@@ -12,7 +12,8 @@ from collections.abc import Iterator
 from typing import Any
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.gaussians.formats.splats import HARMONICS
+from vvgt_cli.gaussians.formats.splats import A_ROW, HARMONICS
+from vvgt_cli.volume.blocks import check_memory
 from vvgt_cli.volume.libraries import library_errors, need
 
 MAGIC = b"NGSP"
@@ -59,7 +60,7 @@ def to_version_3(content: bytes, name: str) -> tuple[bytes, list[str]]:
     """What a file of version 3 would hold, packed by gzip, and our comments.
 
     Raises:
-        DataError: not such a file, other axes than a `.ply`'s, or no Zstandard here.
+        DataError: not such a file, other axes than a `.ply`'s, no Zstandard here, or more than memory holds.
     """
     try:
         _, version, count, degree, fraction, flags, streams, table = _HEAD.unpack_from(content)
@@ -71,6 +72,7 @@ def to_version_3(content: bytes, name: str) -> tuple[bytes, list[str]]:
             f"{name}: version {version}, degree {degree}, {streams} streams, table at {table} of {len(content)} bytes; "
             "expected an .spz of version 4 with harmonics of degree 0 to 3"
         )
+    check_memory(A_ROW * count, f"{name}: {count:,} Gaussians", "a standard .ply, which is mapped, not loaded")
     zstd, start, body = library(name), table + streams * _SIZES.size, []
     for number, length in enumerate(lengths):
         size, whole = _SIZES.unpack_from(content, table + number * _SIZES.size)
@@ -91,9 +93,11 @@ def to_version_3(content: bytes, name: str) -> tuple[bytes, list[str]]:
 
 
 def _records(zone: bytes, name: str) -> Iterator[tuple[int, bytes]]:
-    while zone:
-        kind, length = _RECORD.unpack_from(zone) if len(zone) >= _RECORD.size else (0, len(zone))
-        if _RECORD.size + length > len(zone):
-            raise DataError(f"{name}: a record of {length} bytes where {len(zone)} are left; is the file whole?")
-        yield kind, zone[_RECORD.size : _RECORD.size + length]
-        zone = zone[_RECORD.size + length :]
+    start = 0
+    while start < len(zone):
+        left = len(zone) - start
+        kind, length = _RECORD.unpack_from(zone, start) if left >= _RECORD.size else (0, left)
+        if _RECORD.size + length > left:
+            raise DataError(f"{name}: a record of {length} bytes where {left} are left; is the file whole?")
+        start += _RECORD.size + length
+        yield kind, zone[start - length : start]
