@@ -30,7 +30,7 @@ from vvgt_cli.volume import ReadOptions, read_volume, vtk_child
 
 Make = Callable[[Path], Path]
 DIMS = (8, 6, 4)
-IDLE = 60  # s on the clock for an answer
+IDLE = 5  # s that it may sleep without any processor time: the program's child a minute
 EACH = 200  # requests to a fork: what readers lose of memory goes with it
 
 
@@ -49,6 +49,18 @@ class _Worker:
         os.close(inward)
         os.close(outward)
         self.to, self.back = os.fdopen(to, "wb"), os.fdopen(back, "rb")
+
+    def answers(self) -> bool:
+        """Whether it answers or ends, and does not sleep in a lock for `IDLE` seconds."""
+        slept, last = 0, ""
+        while slept < IDLE:
+            if select.select([self.back], [], [], 1)[0]:
+                return True
+            words = Path(f"/proc/{self.pid}/stat").read_text().rpartition(")")[2].split()
+            now = " ".join([words[0], *words[11:13]])  # its state, and its processor time
+            slept = slept + 1 if now == last and now[0] == "S" else 0
+            last = now
+        return False
 
     def end(self) -> int:
         """Its exit status, once it has none to answer."""
@@ -84,7 +96,7 @@ def run_fork(request: dict[str, Any]) -> tuple[tuple[dict[str, Any], np.ndarray]
     worker = _workers[0]
     worker.to.write(json.dumps(request).encode() + b"\n")
     worker.to.flush()
-    if not select.select([worker.back], [], [], IDLE)[0]:  # it sleeps: the program's child is killed for that, too
+    if not worker.answers():  # it sleeps: the program's child is killed for that, too
         os.kill(worker.pid, signal.SIGKILL)
     found = vtk_child.received(worker.back)
     worker.answered += 1

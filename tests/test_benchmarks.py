@@ -28,11 +28,13 @@ RUN = (
     *(
         "automatic",
         "closed_form",
+        "curve",
         "dvr",
         "dvr_pixels",
         "dvr_steps",
         "dvr_vtk",
         "grids",
+        "levels",
         "light_vtk",
         "live",
         "network",
@@ -42,7 +44,7 @@ RUN = (
         "readers",
         "refinement",
     ),
-    *("reports", "share", "splat", "training"),
+    *("reports", "share", "splat", "training", "damaged", "kept"),
 )
 SHARED = (
     "dvr_scenes",
@@ -239,6 +241,20 @@ def test_parts(bench, scenes, tmp_path, monkeypatch):
     assert "| no cells by error |" in call(module.main, "--table", tmp_path / "a.csv")
 
 
+def test_curve(bench, scenes, tmp_path):
+    module, found = bench("curve"), tmp_path / "a.csv"
+    few = ("--", "--max-gaussians", 300, "--size", SIZE)
+    for label in ("before", "after"):
+        call(module.main, "measure", *scenes, "-o", found, "--label", label, "--steps", 4, "--steps", 24, *few)
+    rows = rows_of(found)
+    assert [row["label"] for row in rows] == ["before"] * 3 + ["after"] * 3
+    assert [row["steps"] for row in rows] == ["0", "4", "24"] * 2
+    assert float(rows[2]["psnr"]) > float(rows[0]["psnr"]) > 10
+    assert all(float(row["seconds"]) > 0 for row in rows if row["steps"] != "0")
+    call(module.main, "plot", found, "-o", tmp_path / "a.png")
+    assert read_png(tmp_path / "a.png").shape[2] in (3, 4)
+
+
 def test_plan(bench, scenes, tmp_path):
     few = ("--max-gaussians", "40", "--size", str(SIZE), "--steps", "1")
     module = bench("plan", KINDS={"default": few})
@@ -333,6 +349,23 @@ def test_what_the_machine_does_at_best(bench):
     assert "threads" in floors.machine()
 
 
+def test_levels(bench, scenes, tmp_path):
+    module = bench("levels")
+    look = ["--tf", f"{scenes[1]}/shells.json", "--opacity-unit-distance", "mean-spacing"]
+    some = ["--max-gaussians", "2000", "--size", "64", "-q", "-o", str(tmp_path / "out" / "lod-meta.json")]
+    assert run(["init", f"{scenes[1]}/blob.nrrd", *look, *some]) == 0
+    options = ["--size", "64", "-o", tmp_path / "a.csv", "--plot", tmp_path / "a.png"]
+    told = call(module.main, tmp_path / "out", f"{scenes[1]}/blob.nrrd", *look, *options)
+    rows = rows_of(tmp_path / "a.csv")
+    assert len({row["level"] for row in rows}) + 1 == told.count("levels of 255")
+    assert all(float(row["rms"]) > 0 and float(row["spread"]) > 0 for row in rows)
+    assert (tmp_path / "a.png").stat().st_size > 5000
+    shown = np.zeros((30, 30), bool)
+    shown[10, 20] = True
+    assert np.argwhere(module.near(shown, 2)).min(axis=0).tolist() == [8, 18]
+    assert module.near(shown, 2).sum() == 25
+
+
 def test_share(bench, scenes, tmp_path):
     module = bench("share", EDGE=SIZE)
     options = ["--tf", f"{scenes[1]}/shells.json", "--opacity-unit-distance", "mean-spacing", "--max-gaussians", "60"]
@@ -346,3 +379,31 @@ def test_share(bench, scenes, tmp_path):
     assert float(rows[".spz"]["psnr"]) > 10
     assert (tmp_path / "pictures" / "blob.jpg").stat().st_size > 500
     assert "| .spz |" in call(module.main, "--table", tmp_path / "a.csv")
+
+
+def test_damaged(bench, scenes, tmp_path):
+    module = bench("damaged", ROWS=5)
+    look = ["--tf", f"{scenes[1]}/shells.json", "--opacity-unit-distance", "mean-spacing"]
+    target = ["--max-gaussians", "60", "--size", str(SIZE), "-q", "-o", str(tmp_path / "blob.ply")]
+    assert run(["init", f"{scenes[1]}/blob.nrrd", *look, *target]) == 0
+    call(module.main, tmp_path / "blob.ply", "--volume", f"{scenes[1]}/blob.nrrd", *look, "-o", tmp_path / "d.csv")
+    rows = [row for row in rows_of(tmp_path / "d.csv") if row["copy"] == "broken rows"]
+    assert {"file: centres that are not finite", "values: largest sigma"} <= {row["case"] for row in rows}
+    assert "| vvgt | broken rows | file: centres that are not finite: 5 rows of" in call(
+        module.main, "--table", tmp_path / "d.csv"
+    )
+
+
+def test_kept(bench, tmp_path, monkeypatch):
+    module = bench("kept")
+    monkeypatch.setattr(module.shutil, "which", lambda name: None)
+    call(module.main, "-o", tmp_path / "kept.csv")
+    rows = {(row["format"], row["fact"]): row for row in rows_of(tmp_path / "kept.csv")}
+    assert all(rows[ending, fact]["read back by us"] == "yes" for ending in module.ENDINGS for fact in module.FACTS)
+    assert all(
+        rows[ending, "antialiased"]["read back by us"] == "yes" for ending in (".ply", ".spz", ".v4.spz", ".sog")
+    )
+    assert {row["splat-transform"] for row in rows.values()} == {"not run"}
+    assert rows[".usdc", "certificate"]["usd-core"] == "yes"
+    assert rows[".spz", "certificate"]["gsply"] == "no"
+    assert "| `.glb` | certificate; place" in call(module.main, "--table", tmp_path / "kept.csv")

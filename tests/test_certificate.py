@@ -25,7 +25,7 @@ from vvgt_cli.volume.stored import Stored
 DIMS = (20, 18, 22)  # x, y, z
 FULL = Certificate(
     volume="head.nrrd", sha256="ab" * 32, look="0123456789ab", size=400, rule="inria", psnr=40.25, views=3,
-    seats=(("inria 400 px", 39.5), ("viser 800 px", 38.0)), position_error=1e-5, seconds=12.5,
+    seats=(("inria 400 px", 39.5), ("viser 800 px", 38.0)), texture=(0.61, 0.46), position_error=1e-5, seconds=12.5,
     command="vvgt convert head.nrrd --tf 'a b.json'",
 )  # fmt: skip
 SMALL = ("--size", "64", "--max-gaussians", "300", "--steps", "8")
@@ -70,7 +70,7 @@ def test_a_line_gives_the_certificate_back() -> None:
     assert FULL.line().startswith("vvgt certificate {")
     assert "\n" not in FULL.line()
     assert Certificate.of(FULL.line().split(None, 2)[2]) == FULL
-    least = replace(FULL, sha256=None, seats=(), seconds=None, command=None)
+    least = replace(FULL, sha256=None, seats=(), texture=None, seconds=None, command=None)
     assert Certificate.of(least.line().split(None, 2)[2]) == least
 
 
@@ -84,6 +84,9 @@ def test_a_line_gives_the_certificate_back() -> None:
         FULL.line().split(None, 2)[2].replace('"volume"', '"volumes"'),
         FULL.line().split(None, 2)[2].replace('"inria 400 px": 39.5', '"inria 400 px": Infinity'),
         json.dumps(FULL.facts() | {"seats": [1]}),
+        json.dumps(FULL.facts() | {"texture": [1]}),
+        json.dumps(FULL.facts() | {"texture": 1}),
+        json.dumps(FULL.facts() | {"texture": [1, "2"]}),
     ],
 )  # fmt: skip
 def test_a_certificate_that_is_none_is_one_line(text) -> None:
@@ -170,7 +173,7 @@ def test_no_comments_no_certificate(vvgt, folder, tmp_path) -> None:
     assert b"sha256" not in (tmp_path / "out.ply").read_bytes()
 
 
-@pytest.mark.parametrize("suffix", [".compressed.ply", ".spz", ".sog", ".glb", ".usdc", ".html"])
+@pytest.mark.parametrize("suffix", [".compressed.ply", ".spz", ".v4.spz", ".sog", ".glb", ".usdc", ".html"])
 def test_every_format_carries_it(vvgt, folder, tmp_path, suffix) -> None:
     if suffix == ".usdc":
         pytest.importorskip("pxr")
@@ -290,3 +293,35 @@ def test_the_digest_reads_each_chunk_once_whatever_its_shape(chunks, monkeypatch
     stored = Stored(part, data.dtype, data.shape, chunks, "x")
     assert values_digest([Volume(stored)]) == values_digest([Volume(data)])
     assert (read == 1).all()
+
+
+def test_texture_is_certified_as_it_is_measured_from_near(vvgt, folder, tmp_path) -> None:
+    from vvgt_cli.conversion.gaussian_files import open_gaussians
+    from vvgt_cli.conversion.place import into_box
+    from vvgt_cli.field.source import SourceRequest, load
+    from vvgt_cli.score.viewing import glance_cameras, score_texture
+    from vvgt_cli.volume import ReadOptions
+
+    points = [{"x": 0, "opacity": 0, "rgb": [1, 0, 0]}, {"x": 60, "opacity": 1, "rgb": [1, 0.9, 0.8]}]
+    (tmp_path / "solid.json").write_text(json.dumps({"points": points}))
+    solid = (folder / "ball.raw", *RAW, "--tf", tmp_path / "solid.json", "--max-gaussians", "3000", "--steps", "4")
+    assert (
+        vvgt("convert", *solid, "--size", "256", "-o", tmp_path / "out.ply", "--report", tmp_path / "r.json").code == 0
+    )
+    gaussians, header = open_gaussians(str(tmp_path / "out.ply"))
+    source = load(SourceRequest(str(folder / "ball.raw"), ReadOptions(dims=DIMS, dtype="uint8"),
+                                str(tmp_path / "solid.json")))  # fmt: skip
+    boxed, cameras = into_box(gaussians, source.volume), glance_cameras(256)
+    assert [(c.width, c.height) for c in cameras] == [(128, 128)]
+    found = score_texture(source.scene(), boxed, 256, header.rule, cameras=cameras)
+    assert found.blocks >= 4
+    assert header.certificate.texture == pytest.approx((found.ours, found.reference), abs=1e-3)
+    told = json.loads((tmp_path / "r.json").read_text())["texture"]
+    assert told["blocks"] == found.blocks
+    assert f"texture {header.certificate.texture[0]:g}" in vvgt("info", tmp_path / "out.ply").out.decode()
+    blocks = vvgt("convert", *solid, "--size", "256", "--blocks", "16", "-o", tmp_path / "blocks.ply")
+    assert blocks.code == 0
+    assert read_ply(tmp_path / "blocks.ply")[1].certificate.texture[1] == pytest.approx(found.reference, abs=0.01)
+    small = (folder / "ball.raw", *RAW, "--tf", folder / "tf.json", *SMALL)
+    assert vvgt("convert", *small, "--size", "48", "-o", tmp_path / "small.ply").code == 0
+    assert read_ply(tmp_path / "small.ply")[1].certificate.texture is None  # 24 px: no block of 32

@@ -50,9 +50,11 @@ def steps_of(found):
     return 0 if stage is None else stage.steps
 
 
-def ending(edge=48.0, judge=0.06, glance=0.06):
-    """Seconds of three test views, the seats and the file."""
-    return 3 * (judge + 0.03 * (edge / 400) ** 2) + 2 * glance + 0.15 + 0.155 + 0.1
+def ending(edge=48.0, judge=0.06, glance=0.06, size=48):
+    """Seconds of three test views, the seats, texture and the file."""
+    near = (size // 2) ** 2  # pixels
+    texture = judge * near / edge**2 + 0.05 * near / 400**2
+    return 3 * (judge + 0.03 * (edge / 400) ** 2) + 2 * glance + 0.15 + 0.155 + texture + 0.1
 
 
 def drawn(size, enough):
@@ -103,7 +105,7 @@ def test_views_are_small_where_gaussians_are_wide(size, edge):
         + DEFAULT_STEPS * step
         + 72 * (edge / whole) ** 2 * 0.05
         + 4 * glance
-        + ending(judged**0.5, judge, glance)
+        + ending(judged**0.5, judge, glance, size)
     )
     assert found.seconds == pytest.approx(seconds)
     bytes_ = 294e6 + 1240e5 + 32 * (72 * edge**2 + 4 * glanced + size**2)

@@ -29,6 +29,7 @@ ROUNDED = {
     ".compressed.ply": (2e-3, 4e-3, 1e-5, 2.1e-3, 3e-3),
     ".html": (2e-3, 4e-3, 1e-5, 2.1e-3, 3e-3),
     ".spz": (1e-6, 0.0313, 1e-5, 2.1e-3, 4e-3),
+    ".v4.spz": (1e-6, 0.0313, 1e-5, 2.1e-3, 4e-3),
     ".sog": (4e-5, 0.02, 3e-5, 2.1e-3, 4e-3),
     ".glb": (0, 1e-6, 1e-6, 1e-6, 1e-6),
     ".usdc": (0, 1e-6, 1e-6, 1e-6, 1e-6),
@@ -92,7 +93,7 @@ def test_harmonics_are_kept_each_in_its_place(known, degree):
     before = Splats(base.means, base.log_scales, base.quaternions, base.logits, base.f_dc, rest)
     after = known.read(known.write(before, "a"), "a")
     order = ((after.means[None] - before.means[:, None]) ** 2).sum(axis=2).argmin(axis=1)
-    step = {".glb": 0, ".usdc": 0, ".spz": 1 / 256 + 1e-6}.get(known.suffix, 1 / 31)
+    step = {".glb": 0, ".usdc": 0, ".spz": 1 / 256 + 1e-6, ".v4.spz": 1 / 256 + 1e-6}.get(known.suffix, 1 / 31)
     assert abs(after.f_rest[order] - rest).max() <= step
     assert columns_of(ply_bytes(before), "a").f_rest.tobytes() == rest.tobytes()
 
@@ -110,8 +111,12 @@ def test_damaged_files_are_one_line(known, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("ending", "module"), [(".spz", "gsply"), (".compressed.ply", "gsply"), (".html", "gsply"), (".usdc", "pxr")]
-)
+    ("ending", "module"),
+    [
+        (".spz", "gsply"), (".compressed.ply", "gsply"), (".html", "gsply"), (".usdc", "pxr"),
+        (".v4.spz", "numcodecs.zstd"),
+    ],
+)  # fmt: skip
 def test_a_library_that_is_missing_is_named_before_the_work(ending, module, tmp_path, vvgt, monkeypatch):
     monkeypatch.setitem(sys.modules, module, None)
     monkeypatch.setitem(sys.modules, f"{module}.Usd", None)
@@ -287,7 +292,7 @@ def transform() -> list[str]:
     return [found, "-q", "-g", "cpu", "-w"]
 
 
-@pytest.mark.parametrize("ending", [".compressed.ply", ".spz", ".sog"])
+@pytest.mark.parametrize("ending", [".compressed.ply", ".spz", ".v4.spz", ".sog"])
 def test_splat_transform_reads_what_is_written(ending, transform, tmp_path):
     path, middling = tmp_path / f"a{ending}", cloud()  # of 8-bit opacity 0 and 1 it makes infinite logits
     middling = replace(middling, opacity_logits=np.clip(middling.opacity_logits, -4, 4))
@@ -317,3 +322,46 @@ def test_glb_holds_what_splat_transform_writes(transform, tmp_path):
         ), before.opacity_logits, before.colors,
     )  # fmt: skip
     assert max(errors(half, theirs)) < 1e-5
+
+
+def test_spz_4_of_splat_transform_is_read(transform, tmp_path):
+    before = replace(cloud(), opacity_logits=np.linspace(-3, 3, 700))
+    write_ply(tmp_path / "a.ply", before, PlyOptions())
+    subprocess.run([*transform, tmp_path / "a.ply", tmp_path / "b.spz"], check=True, capture_output=True)
+    assert (tmp_path / "b.spz").read_bytes()[:8] == b"NGSP\4\0\0\0"
+    found = errors(before, read_splats(tmp_path / "b.spz")[0])
+    assert all(a <= b for a, b in zip(found, (2.5e-4, 0.0313, 1e-5, 2.1e-3, 4e-3), strict=True)), found
+
+
+def test_records_of_spz_4(tmp_path):
+    known = format_of("a.v4.spz")
+    content = known.write(splats_of(cloud(60), PlyOptions(up="x", rule="compensated", made_for=100)), "a")
+    assert content[14] & 1  # antialiased
+    assert gzip.decompress(encoded(format_of("a.spz"), cloud(60), PlyOptions(rule="compensated", made_for=9), "a"))[14]
+    axes = content.index(struct.pack("<II", 0xADBE0003, 4))
+    assert content[axes + 8] == 6  # right, down, front
+
+    def given(old, new):
+        table = struct.unpack_from("<I", content, 16)[0] + len(new) - len(old)
+        changed = content[:16] + struct.pack("<I", table) + content[20:].replace(old, new, 1)
+        return gaussians_of(known.read(changed, "a"), "a")[1].up
+
+    record = content[axes : axes + 12]
+    other = struct.pack("<II", 0x12340001, 3) + b"abc"
+    assert given(record, other + record) == "x"  # skipped
+    assert given(record, b"") == "x"
+    with pytest.raises(DataError, match="axes of kind 04"):
+        given(record, record[:8] + b"\4\0\0\0")
+    with pytest.raises(DataError, match="a record of"):
+        given(record, record[:4] + b"\xff\xff\0\0")
+
+
+@pytest.mark.parametrize(("at", "value"), [(4, 5), (12, 4), (15, 1), (16, 200), (19, 255), (60, 255)])
+def test_damaged_headers_of_spz_4_are_one_line(at, value, tmp_path):
+    known = format_of("a.v4.spz")
+    content = bytearray(known.write(splats_of(cloud(60), PlyOptions(comments=False)), "a"))
+    content[at] = value
+    with pytest.raises(DataError) as error:
+        known.read(bytes(content), "a.spz")
+    assert "a.spz" in str(error.value)
+    assert "\n" not in str(error.value)

@@ -269,6 +269,49 @@ def stepped(tmp_path_factory):
     return python("-c", STEP, folder=folder).stdout, folder
 
 
+def test_files_hold_machine_code_and_the_names_of_symbols():
+    import llvmlite.binding as llvm
+
+    from vvgt_cli.jit.cache import _unlinked
+
+    text = """
+    declare double @outside(double)
+    @"env.<1>" = global [3 x i8] c"abc"
+    define double @"f$2"(double %x) {
+      %y = call double @outside(double %x)
+      %z = fadd double %y, %x
+      ret double %z
+    }"""
+    whole = llvm.parse_assembly(text).as_bitcode()
+    name, kind, (code, kept) = _unlinked(("k", "object", (b"code", whole)))
+    assert (name, kind, code) == ("k", "object", b"code")
+    left = llvm.parse_bitcode(kept)
+    assert [f.name for f in left.functions if not f.is_declaration] == ["f$2"]
+    assert [v.name for v in left.global_variables if not v.is_declaration] == ["env.<1>"]
+    assert "fadd" not in str(left)
+    assert "abc" not in str(left)
+
+
+def test_no_kernel_calls_another():
+    """Their files hold nothing that one could link."""
+    import inspect
+    from importlib import import_module
+
+    from numba.core.dispatcher import Dispatcher
+
+    from vvgt_cli.jit.cache import KernelCache
+
+    waiting = [getattr(import_module(module), name).py_func for module, name in (n.split(":") for n in ahead.ALL)]
+    seen = set()
+    while waiting:
+        variables = inspect.getclosurevars(waiting.pop())
+        called = {v for v in (variables.globals | variables.nonlocals).values() if isinstance(v, Dispatcher)}
+        assert not [v for v in called if isinstance(v._cache, KernelCache)]
+        waiting += [v.py_func for v in called - seen]
+        seen |= called
+    assert len(seen) > 50
+
+
 def test_the_order_of_fields_is_part_of_what_a_kernel_is_kept_under():
     from numba import types
     from numba.core.registry import cpu_target

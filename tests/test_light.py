@@ -10,6 +10,7 @@ import pytest
 
 from tests.vtk_views import drawn_by_vtk
 from vvgt_cli.cameras.sets import look_at
+from vvgt_cli.closed_form.lit import point_normals
 from vvgt_cli.dvr import RenderSettings, Scene, render_view, render_view_reference
 from vvgt_cli.dvr import vtk as vtk_renderer
 from vvgt_cli.dvr.backends import view_renderer
@@ -51,7 +52,7 @@ def camera(size=24, eye=(2.2, -1.6, 1.1)):
 
 LIGHTS = {
     "headlight": Lighting(),
-    "above": Lighting(False, (ABOVE,), 0.2, 0.6, 0.4, 5.0),
+    "above": Lighting(False, (ABOVE,), 0.2, 0.6, 0.4, 4.5),
     "two and the headlight": Lighting(True, (SLANTED, (0.0, 1.0, 0.0)), 0.1, 0.4, 0.1, 30.0),
     "shadows": Lighting(False, (SLANTED,), shadows=True),
     "all": Lighting(True, (SLANTED, ABOVE), shadows=True, occlusion=0.3),
@@ -92,6 +93,24 @@ def test_the_normal_is_the_analytic_one_inside():
     exact = np.stack(slopes, axis=1)
     exact /= np.linalg.norm(exact, axis=1, keepdims=True)
     assert ((normals(scene, points) * exact).sum(axis=1) > 0.995).mean() > 0.95
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+@pytest.mark.parametrize("nx", [2, 3, 4, 9])
+def test_normals_are_the_twins_at_edges_too(dtype, nx):
+    rng = np.random.default_rng(nx)
+    data = (rng.integers(0, 200, (5, 4, nx)) * np.ones(1)).astype(dtype)
+    data[:2] = 7  # nothing differs there
+    if dtype == np.float32:
+        data[4, 3, 1] = np.nan
+    scene = Scene.build(Volume(data, (1.0, 1.0, 1.5)), function([0, 200], [0.1, 0.6]), 1.0)
+    voxels = rng.uniform(-0.5, np.array([nx, 4, 5]) - 0.5, (300, 3))
+    voxels[::3] = np.round(voxels[::3])
+    found, twin = np.empty((300, 4)), normals(scene, voxels)
+    point_normals(scene.voxels, scene.optics, scene.step, voxels, found)
+    assert 0.05 < (~twin.any(axis=1)).mean() < 0.9
+    np.testing.assert_array_equal(found[:, :3].any(axis=1), twin.any(axis=1))
+    np.testing.assert_allclose(found[:, :3], twin, atol=1e-6)
 
 
 def test_without_a_gradient_there_is_ambient_light_alone():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
@@ -21,10 +22,12 @@ from vvgt_cli.conversion.shards.apart import errors_apart
 from vvgt_cli.conversion.shards.ladder import Ladder
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import read_ply
-from vvgt_cli.gaussians.formats.sog_images import splats_in
+from vvgt_cli.gaussians.formats.levels import Levels
+from vvgt_cli.gaussians.formats.sog_images import images_of, splats_in
 from vvgt_cli.gaussians.formats.splats import Splats, gaussians_of
 from vvgt_cli.gaussians.formats.streamed import nodes_of, read_manifest
 from vvgt_cli.gaussians.frames import transform, up_matrix
+from vvgt_cli.images import read_png
 
 FIT = ("--max-gaussians", "9000", "--size", "150", "-q")
 
@@ -157,8 +160,7 @@ def test_the_bytes_do_not_depend_on_how(vvgt, volume: Path, folder: Path, tmp_pa
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        (("--light", "headlight"), "unlit moments"),
-        (("--init", "wavelet"), "unlit moments"),
+        (("--init", "wavelet"), "made of moments"),
         (("--frame", "world"), "leave out --frame"),
         (("--steps", "50"), "levels of one closed form"),
         (("--live",), "levels of one closed form"),
@@ -173,6 +175,46 @@ def test_what_has_no_levels_is_refused_in_a_line(vvgt, volume: Path, tmp_path: P
     assert found.code == 2, found.err
     assert text in found.error
     assert not list(tmp_path.iterdir())
+
+
+def test_an_interrupted_run_goes_on_with_the_same_bytes(
+    vvgt, volume: Path, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("vvgt_cli.conversion.shards.cut.BATCH", 3000)
+    monkeypatch.setattr("vvgt_cli.conversion.shards.streamed_files.A_FILE", 2500)
+    whole, out = tmp_path / "whole", tmp_path / "out"
+    line = ("convert", volume, *FIT, "--blocks", "32", "-o")
+    assert vvgt(*line, whole / "lod-meta.json").code == 0
+    calls = {"errors_apart": 0, "images_of": 0}
+    real = {"ladder.errors_apart": errors_apart, "streamed_files.images_of": images_of}
+    stop = {"errors_apart": 20, "images_of": 0}
+
+    def counted(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*args: Any) -> Any:
+            calls[name] += 1
+            if calls[name] == stop[name]:
+                raise KeyboardInterrupt
+            return function(*args)
+
+        return call
+
+    for place, function in real.items():
+        name = place.partition(".")[2]
+        monkeypatch.setattr(f"vvgt_cli.conversion.shards.{place}", counted(name, function))
+    assert vvgt(*line, out / "lod-meta.json").code == 130
+    nodes, files = len(nodes_of(read_manifest(whole / "lod-meta.json"), "")), len(list(whole.glob("*/meta.json")))
+    assert nodes > 20
+    assert files > 3
+    stop = {"errors_apart": 0, "images_of": 3}
+    assert vvgt(*line, out / "lod-meta.json").code == 130
+    assert calls["errors_apart"] < nodes + 20  # those of the batches that were whole are not drawn again
+    assert not (out / "lod-meta.json").exists()
+    calls, stop["images_of"] = {"errors_apart": 0, "images_of": 0}, 0
+    assert vvgt(*line, out / "lod-meta.json").code == 0
+    assert calls == {"errors_apart": 0, "images_of": files - 2}
+    found = [{p.relative_to(f): p.read_bytes() for p in f.rglob("*.*")} for f in (whole, out)]
+    assert found[0] == found[1]
+    assert not list(tmp_path.glob(".*"))
 
 
 def test_an_existing_folder_is_replaced_only_when_told(vvgt, volume: Path, folder: Path) -> None:
@@ -204,6 +246,9 @@ def test_info_lists_levels_with_their_errors(vvgt, folder: Path) -> None:
     rms = [level["rms"] for level in facts["levels"]]
     assert rms[0] == 0
     assert rms == sorted(rms)
+    assert json.loads(vvgt("info", folder, "--json").out) == facts
+    assert json.loads(vvgt("info", f"{folder}#1", "--json").out)["gaussians"] == manifest["counts"][1]
+    assert "cannot be read" in vvgt("info", folder / "none" / "lod-meta.json").error
 
 
 def test_the_page_and_its_files_are_served(folder: Path, tmp_path: Path) -> None:
@@ -221,7 +266,7 @@ def test_a_folder_with_a_file_missing_is_told(vvgt, folder: Path, tmp_path: Path
     (tmp_path / "lod-meta.json").write_bytes((folder / "lod-meta.json").read_bytes())
     found = vvgt("view", tmp_path, "--no-browser")
     assert (found.code, "is missing; expected the whole folder" in found.error) == (1, True)
-    found = vvgt("view", tmp_path, "-o", tmp_path / "a.html")
+    found = vvgt("view", tmp_path, folder, "-o", tmp_path / "a.html")
     assert (found.code, "is shown by itself" in found.error) == (2, True)
 
 
@@ -252,10 +297,65 @@ def test_manifests_that_cannot_be_are_one_line(
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("command", [("render", "-o", "p", "--orbit", "1"), ("evaluate", "--volume", "v.npy")])
-def test_commands_of_one_cloud_say_how_to_get_one(vvgt, folder: Path, command) -> None:
-    done = vvgt(command[0], folder / "lod-meta.json", *command[1:])
-    assert (done.code, "levels of detail; expected one cloud" in done.error) == (1, True), done.error
+def test_a_level_is_one_cloud_for_every_command(vvgt, volume: Path, folder: Path, tmp_path: Path) -> None:
+    assert vvgt("init", volume, *FIT, "--up", "z", "--blocks", "32", "-o", tmp_path / "a.ply").code == 0
+    alone = json.loads(vvgt("evaluate", tmp_path / "a.ply", "--volume", volume, "--no-seats", "--json").out)
+    found = []
+    for name in (f"{folder}", f"{folder / 'lod-meta.json'}#1", f"{folder}#2"):
+        line = ("evaluate", name, "--volume", volume, "--no-seats", "--json")
+        found.append(json.loads(vvgt(*line).out))
+    counts = json.loads((folder / "lod-meta.json").read_text())["counts"]
+    assert [scores["gaussians"] for scores in found] == counts[:3]
+    assert [scores["size"] for scores in found] == [150] * 3  # as the comments say
+    assert found[0]["scores"]["psnr"] == pytest.approx(alone["scores"]["psnr"], abs=0.3)
+    assert found[0]["scores"]["psnr"] > found[1]["scores"]["psnr"] > found[2]["scores"]["psnr"] > 15
+    assert vvgt("view", f"{folder}#1", "-o", tmp_path / "b.ply").code == 0
+    assert len(read_ply(tmp_path / "b.ply")[0]) == counts[1]
+    for name, command in ((f"{folder}#9", ()), (f"{folder}#view", ())):
+        wrong = vvgt("evaluate", name, "--volume", volume, *command)
+        assert (wrong.code, "expected a level from 0 to" in wrong.error) == (2, True), wrong.error
+
+
+def test_what_a_camera_is_shown_goes_by_distance(vvgt, folder: Path, tmp_path: Path) -> None:
+    levels = Levels(folder / "lod-meta.json")
+    counts, nodes = (
+        [len(levels.level(str(level))) for level in range(levels.count)],
+        nodes_of(read_manifest(levels.path), ""),
+    )
+    bounds = np.array([[node["bound"]["min"], node["bound"]["max"]] for node in nodes])
+    for distance in (0.9, 3.0, 4.5, 40.0):
+        eye = np.array([0, -distance, 0.4])
+        expected = 0
+        for node, (low, high) in zip(nodes, bounds, strict=True):
+            apart = float(np.linalg.norm(np.maximum(np.maximum(low - 4 * eye, 4 * eye - high), 0)))
+            level = sum(apart >= edge for edge in (5, 15, 45)[: levels.count - 1])  # of 45 degrees
+            expected += node["lods"][str(level)]["count"]
+        assert len(levels.seen_from(eye, 45.0)) == expected
+    assert len(levels.seen_from(np.zeros(3), 45.0)) == counts[0]
+    assert len(levels.seen_from(np.array([0, -2.6, 0]), 10.0)) == counts[0]  # narrow: as if it were near
+    assert len(levels.seen_from(np.array([0, -1e6, 0]), 45.0)) == counts[-1]
+    for name, where in (("view", f"{folder}#view"), ("one", f"{folder}#1")):
+        line = ("render", where, "--orbit", 2, "--size", 60, "-q", "-o", tmp_path / name)
+        assert vvgt(*line).code == 0
+    seen, one = (read_png(min((tmp_path / name).glob("*.png"))) for name in ("view", "one"))
+    np.testing.assert_array_equal(seen, one)  # at 3 in the unit frame
+
+
+def test_levels_that_cannot_be_read_are_told_in_a_line(vvgt, folder: Path, tmp_path: Path) -> None:
+    broken = tmp_path / "b"
+    shutil.copytree(folder, broken)
+    (broken / "1_0" / "sh0.webp").unlink()
+    line = ("render", f"{broken}#1", "--orbit", 1, "-o", tmp_path / "p")
+    found = vvgt(*line)
+    assert (found.code, "sh0.webp is missing; expected the whole folder" in found.error) == (1, True), found.error
+    (broken / "1_0" / "meta.json").write_text("{")
+    assert "damaged" in vvgt(*line).error
+    manifest = json.loads((broken / "lod-meta.json").read_text())
+    manifest["tree"]["children"][0]["lods"]["0"]["count"] += 1_000_000
+    (broken / "lod-meta.json").write_text(json.dumps(manifest))
+    assert "a node has rows to" in vvgt("render", broken, "--orbit", 1, "-o", tmp_path / "p").error
+    assert vvgt("render", broken, "--orbit", 1, "--memory", "1M", "-o", tmp_path / "p").code == 1
+    assert not (tmp_path / "p").exists()
 
 
 def test_finished_gaussians_are_not_saved_as_levels(tmp_path: Path) -> None:

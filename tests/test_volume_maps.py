@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bz2
 import gzip
+import tracemalloc
 import warnings
 from collections.abc import Callable
 from itertools import permutations
@@ -14,7 +15,7 @@ import numpy as np
 import pytest
 
 from vvgt_cli.errors import DataError, SeveralSteps, UsageError
-from vvgt_cli.volume import ReadOptions, Volume, read_volume
+from vvgt_cli.volume import ReadOptions, Volume, blocks, read_volume
 from vvgt_cli.volume.grid_text import BOHR
 
 VALUES = np.random.default_rng(5).integers(0, 100, (3, 4, 5))  # z, y, x
@@ -169,6 +170,23 @@ def test_cube(tmp_path: Path, sign: int, unit: float) -> None:
         expected = unit * np.array([-2 + 0.5 * i, 1 + 0.25 * j + 0.1 * k, 0.5 + k])
         np.testing.assert_allclose(place(volume, i, j, k), expected, atol=1e-6)
     assert volume.density
+
+
+def test_text_takes_the_memory_of_its_values(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither the text nor the numbers are held twice; what does not fit is refused, with a way out."""
+    n = 48
+    head = CUBE.format(atoms=0, nval="", n=[n] * 3)
+    path = tmp_path / "v.cube"
+    path.write_text(head + text(np.random.default_rng(1).random((n, n, n))))
+    monkeypatch.setattr(blocks, "_CHUNK", 1 << 13)
+    tracemalloc.start()
+    volume = read_volume(str(path))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert volume.data.nbytes == 4 * n**3 < peak < 1.5 * volume.data.nbytes
+    monkeypatch.setattr(blocks, "free_memory", lambda: 4 * n**3 - 1)
+    with pytest.raises(DataError, match=r"needs 442368 bytes of memory, .*convert it to a format of plain numbers"):
+        read_volume(str(path))
 
 
 @pytest.mark.parametrize("orbitals", [True, False])

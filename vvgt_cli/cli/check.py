@@ -6,23 +6,30 @@ from typing import Any
 
 import click
 
-from vvgt_cli.cli.options import common_options, read_options, tf_options
+from vvgt_cli.cli.options import common_options, light_options, read_options, tf_options
 from vvgt_cli.cli.sections import SectionedCommand
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.progress import Console
 
 
-@click.command("check", cls=SectionedCommand, short_help="Run the stability suite, or measure how stiff a scene is.")
-@click.argument("volume", required=False)
+@click.command(
+    "check", cls=SectionedCommand, short_help="Test the program, how stiff a scene is, or a file of Gaussians."
+)
+@click.argument("file", metavar="VOLUME|GAUSSIANS", required=False)
+@click.option("--volume", metavar="VOLUME", help="Volume that GAUSSIANS were made from, by whatever program.")
 @click.option(
-    "--tolerance", type=click.FloatRange(0, 1, min_open=True), default=0.002, show_default=True, metavar="RMS",
-    help="RMS error of VOLUME's views (RGBA) that the sampling step is chosen for.",
+    "--tolerance", type=click.FloatRange(0, 1, min_open=True), metavar="RMS",
+    help="RMS error of VOLUME's views (RGBA) that the sampling step is chosen for, default 0.002; or that the pictures "
+    "of GAUSSIANS may have, default 0.056 (25 dB).",
 )  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of a table.")
 @tf_options
+@light_options
 @read_options
 @common_options
-def command(volume: str | None, tolerance: float, as_json: bool, console: Console, **options: Any) -> None:
+def command(
+    file: str | None, volume: str | None, tolerance: float | None, as_json: bool, console: Console, **options: Any
+) -> None:
     """Run stiff and extreme cases through every stage and print a table; exit status 1 if a case fails.
 
     Kernels are compared with float64 twins, optical mass must be conserved, pictures must stay in range, files must
@@ -30,21 +37,32 @@ def command(volume: str | None, tolerance: float, as_json: bool, console: Consol
 
     With VOLUME, only that scene is examined: a few cases, its stiffness, and the sampling step that its views need.
 
+    With GAUSSIANS (.ply, .spz, .sog, .glb, ... of whatever program), that file: values, and with --volume and its look
+    place, orientation, errors of pictures, viewers' differences and texture.
+
     \b
     Examples:
       vvgt check
       vvgt check head.nrrd --tf bone.json --tolerance 0.001
+      vvgt check trained.ply --volume head.nrrd --tf bone.json
       vvgt check --json | jq '.outcomes[] | select(.passed | not)'
     """
     from vvgt_cli.cli.fit import source_request
     from vvgt_cli.commands.check import check
+    from vvgt_cli.gaussians.formats import is_splats
 
+    splats = file if file is not None and is_splats(file) else None
+    if volume is not None and splats is None:
+        raise UsageError(
+            f"--volume {volume}: beside {file or 'nothing'}; expected a file of Gaussians to compare it with"
+        )
+    scene = volume if splats else file
     given = [f"--{key.replace('_', '-')}" for key, value in (options["optics"] | options["read"]).items() if value]
     given = [name for name in given if name != "--tf-range" or options["optics"]["tf_range"] != "data"]
-    if volume is None and given:
-        raise UsageError(f"{', '.join(given)}: only with a volume; expected VOLUME too")
-    source = None if volume is None else source_request(volume, options["read"], options["optics"])
-    report = check(source, tolerance, console)
+    if scene is None and given:
+        raise UsageError(f"{', '.join(given)}: only with a volume; expected {'--volume' if splats else 'VOLUME'} too")
+    source = None if scene is None else source_request(scene, options["read"], options["optics"], options["light"])
+    report = check(source, tolerance, console, splats)
     click.echo(report.to_json() if as_json else report.table(), nl=False)
     if report.failed:
         names = "; ".join(f"{o.stage}: {o.name}" for o in report.failed[:3])

@@ -43,6 +43,8 @@ from vvgt_cli.progress import Console
 def command(ply: str, volume: str, as_json: bool, blocks: dict[str, Any], console: Console, **options: Any) -> None:
     """Score OUT.ply against the volume it was made from.
 
+    OUT.ply may be FOLDER of streamed levels: its finest, or FOLDER#1 for level 1.
+
     Scores are means over ten test views. A table lists the viewing conditions, worst first: how each viewer draws
     (docs/viewers.md), at 400, 800 and 2160 px and the file's own size, and close up, in three views each. Pictures
     above 565 px are scored on a sample of blocks. A .ply of 'vvgt convert --live' is scored as it is under --tf.

@@ -58,7 +58,7 @@ _READ = dict(
         help="Size of a raw file's header, which is skipped.",
     ),
     spacing=click.option(
-        "--spacing", nargs=3, type=float, metavar="X Y Z", help="Voxel spacing, overriding the file's."
+        "--spacing", nargs=3, type=float, metavar="X Y Z", help="Voxel spacing in the file's unit, overriding its own."
     ),
     array=click.option(
         "--array", "--grid", "--series", "array", metavar="NAME",

@@ -71,7 +71,8 @@ def command(
     """Render the Gaussians of OUT.ply as viewers do: one PNG per view and a transforms.json.
 
     Choose the views with --camera or --orbit. With -o turn.gif or turn.mp4 they become a movie at 25 frames per second,
-    which loops seamlessly for an orbit. The up axis is the one recorded in OUT.ply, else +z. OUT.ply may be "-".
+    which loops seamlessly for an orbit. The up axis is the one recorded in OUT.ply, else +z. OUT.ply may be "-",
+    or FOLDER of streamed levels: FOLDER#1 is its level 1, FOLDER#view what viewers show each camera.
     A .ply of 'vvgt convert --live' can be shown under any function (--tf) and light (--light).
 
     \b

@@ -51,7 +51,8 @@ def command(
     address is printed; Ctrl-C ends it. Several files, a glob or the index that convert writes beside several form a
     series with a slider.
 
-    A folder with a lod-meta.json is streamed: what is near is loaded finely, what is far coarsely.
+    A folder with a lod-meta.json is streamed: what is near is loaded finely, what is far coarsely. FOLDER#1
+    is level 1 alone.
 
     With -o, nothing is shown: OUT.html holds viewer and Gaussians and opens by double click; .spz, .compressed.ply,
     .sog, .glb and .usdc are for other programs. The loss due to the format is printed.

@@ -9,10 +9,9 @@ import numpy as np
 
 from vvgt_cli.closed_form.columns import BLUE, GREEN, MASS, RED
 from vvgt_cli.closed_form.quadrature import Between, between, deposit, shift_moments
-from vvgt_cli.dvr.grid import mix
 from vvgt_cli.dvr.kernel import FLAGS, U
 from vvgt_cli.dvr.layout import GRID, Texels
-from vvgt_cli.dvr.vectors import add, lane, texel, zeros4
+from vvgt_cli.dvr.vectors import add, lane, mix, texel, zeros4
 from vvgt_cli.dvr.vectors import row as row_of
 from vvgt_cli.jit.decorators import inlined, kernel
 

@@ -131,7 +131,7 @@ class Shading:
         """
         inside = leaves.node >= 0  # others lie below the tree's base: a row of their own
         sums = np.empty((len(leaves), ARRIVING + len(self.light.directions)))
-        sums[inside] = self.sums(tree.moments, base, *_base_rows(tree, leaves.node[inside]))
+        sums[inside] = self.sums(tree.moments, base, *base_rows(tree, leaves.node[inside]))
         below = leaves.moments[~inside]
         if len(below):
             sums[~inside] = self.sums(below, self.normals(centroids(below)))
@@ -149,19 +149,18 @@ class Shading:
         """`_shade` of each row, or of the rows from ``first`` to ``last``, over the weight: means (k, 16 + lights)."""
         if first is None or last is None:
             first, last = np.arange(len(rows)), np.arange(1, len(rows) + 1)
-        out = np.empty((len(first), ARRIVING + len(self.light.directions)))
-        _shade(
-            self.light,
-            np.ascontiguousarray(normals),
-            np.ascontiguousarray(rows),
-            first,
-            last,
-            self.half,
-            self.step,
-            out,
-        )
-        out /= np.maximum(out[:, :1], np.finfo(np.float64).tiny)
-        return out
+        return shaded(self.light, self.half, self.step, rows, normals, first, last)
+
+
+def shaded(
+    light: Light, half: np.ndarray, step: np.ndarray, rows: np.ndarray, normals: np.ndarray, first: np.ndarray,
+    last: np.ndarray,
+) -> np.ndarray:  # fmt: skip
+    """`_shade` from rows ``first`` (k,) to ``last``, over the weight: means (k, 16 + lights)."""
+    out = np.empty((len(first), ARRIVING + len(light.directions)))
+    _shade(light, np.ascontiguousarray(normals), np.ascontiguousarray(rows), first, last, half, step, out)
+    out /= np.maximum(out[:, :1], np.finfo(np.float64).tiny)
+    return out
 
 
 def centroids(moments: np.ndarray) -> np.ndarray:
@@ -200,6 +199,11 @@ def mean_normals(points: np.ndarray, found: np.ndarray, half: np.ndarray) -> np.
     weight = np.where(inside, found[:, 3], 0)
     weight[::7] = np.maximum(weight[::7], 1e-12)  # where there is nothing, the direction at the centre
     mean = (weight[:, None] * found[:, :3]).reshape(-1, 7, 3).sum(axis=1) / weight.reshape(-1, 7).sum(axis=1)[:, None]
+    return directions(mean)
+
+
+def directions(mean: np.ndarray) -> np.ndarray:
+    """(n, 3) unit vectors along means of normals; zeros where they cancel out."""
     length = np.linalg.norm(mean, axis=1, keepdims=True)
     result: np.ndarray = np.where(length > 1e-3, mean / np.where(length > 1e-3, length, 1), 0)
     return result
@@ -213,7 +217,7 @@ def _rows(points: np.ndarray) -> np.ndarray:
     return rows
 
 
-def _base_rows(tree: Tree, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def base_rows(tree: Tree, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """First and last + 1 of the base cells, in Morton order, within ``nodes`` (k,) of a tree."""
     first, last = nodes, nodes
     while (inner := tree.children[first] > 0).any():

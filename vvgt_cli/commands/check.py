@@ -1,4 +1,4 @@
-"""`check`: the stability suite, or one scene's share of it with its stiffness."""
+"""`check`: the stability suite, one scene's share of it with its stiffness, or what a file of Gaussians is like."""
 
 from __future__ import annotations
 
@@ -9,9 +9,12 @@ from typing import Any
 
 from vvgt_cli.checks import Case, Outcome, all_cases, run_case
 from vvgt_cli.checks.stiffness import Stiffness, scene_cases, stiffness
+from vvgt_cli.commands.check_splats import splats_opened
 from vvgt_cli.field.source import SourceRequest, describe_source, load, tf_record, volume_record
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import document
+
+TOLERANCE = 0.002  # RMS of RGBA
 
 
 @dataclass
@@ -21,12 +24,14 @@ class CheckReport:
     Attributes:
         outcomes: a case each.
         volume, transfer_function, stiffness: of the scene, where one was given.
+        splats: name, number, size and rule of the file of Gaussians that was looked at.
     """
 
     outcomes: list[Outcome] = field(default_factory=list)
     volume: dict[str, Any] | None = None
     transfer_function: dict[str, Any] | None = None
     stiffness: Stiffness | None = None
+    splats: dict[str, Any] | None = None
 
     @property
     def failed(self) -> list[Outcome]:
@@ -72,24 +77,32 @@ def _stiffness_lines(found: Stiffness) -> list[str]:
     return [f"{key:<{width}}  {value}" for key, value in rows.items()]
 
 
-def check(source: SourceRequest | None, tolerance: float, console: Console | None = None) -> CheckReport:
-    """Run the suite; with a source, its own cases and its stiffness instead.
+def check(
+    source: SourceRequest | None, tolerance: float | None, console: Console | None = None, splats: str | None = None
+) -> CheckReport:
+    """Run the suite; with a source, its own cases and its stiffness instead; with Gaussians, theirs.
 
     Args:
         source: volume and function to look at, None for the suite.
-        tolerance: root-mean-square error of RGBA that the scene's step is chosen for.
+        tolerance: root-mean-square error of pictures in [0, 1] that the scene's step is chosen for, or that Gaussians
+            may have; None: `TOLERANCE`, or that of `check_splats`.
         console: where progress goes.
+        splats: file of Gaussians to look at, beside the source if there is one.
 
     Raises:
         UsageError, DataError: a source that cannot be read.
     """
     console = console or Console()
+    if splats is not None:
+        with splats_opened(splats, source, tolerance, console) as looked:
+            outcomes = _run_cases(looked.cases, console)
+        return CheckReport(outcomes, looked.volume, looked.function, splats=looked.about)
     if source is None:
         return CheckReport(_run_cases(list(all_cases()), console))
     loaded = load(source)
     console.say(describe_source(loaded))
     scene = loaded.scene()
-    found = stiffness(scene, tolerance, console.bar("stiffness"))
+    found = stiffness(scene, tolerance or TOLERANCE, console.bar("stiffness"))
     outcomes = _run_cases(list(scene_cases(scene)), console)
     return CheckReport(outcomes, volume_record(loaded), tf_record(loaded, source), found)
 

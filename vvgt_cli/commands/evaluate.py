@@ -125,7 +125,7 @@ def _cell(value: Any) -> str:
 
 
 @contextmanager
-def _opened(run: Run, request: EvaluateRequest, gaussians: Gaussians, header: PlyHeader) -> Iterator[Field]:
+def opened(run: Run, request: EvaluateRequest, gaussians: Gaussians, header: PlyHeader) -> Iterator[Field]:
     """The volume, with the file's own anatomical space, light and unit distance where none is asked for."""
     size, asked = request.size or header.made_for or SIZE, request.source.light
     dark = replace(request.source, light=LightOptions())
@@ -172,7 +172,7 @@ def _together(field: Field, pictures: Sequence[Picture]) -> Iterator[None]:
         field.forget(picture)
 
 
-def _shown(gaussians: Gaussians, header: PlyHeader, source: Source, request: SourceRequest) -> Gaussians:
+def shown(gaussians: Gaussians, header: PlyHeader, source: Source, request: SourceRequest) -> Gaussians:
     """What carries values, under the function that is given; else the look of the file.
 
     Raises:
@@ -205,9 +205,9 @@ def evaluate(request: EvaluateRequest, console: Console | None = None) -> Evalua
     if request.preview:
         check_outputs([Output("--preview", request.preview, (".png",))], request.inputs(), request.overwrite)
     gaussians, header = open_gaussians(request.ply)
-    with _opened(run, request, gaussians, header) as volume:
+    with opened(run, request, gaussians, header) as volume:
         source = volume.source
-        gaussians = _shown(gaussians, header, source, request.source)
+        gaussians = shown(gaussians, header, source, request.source)
         gaussians = into_box(gaussians, source.volume)
         for remark in _doubts(request, header, source):
             run.console.say(f"{request.ply}: {remark}")

@@ -18,7 +18,8 @@ from vvgt_cli.errors import DataError, SeveralArrays, SeveralComponents, Several
 from vvgt_cli.files import seekable
 from vvgt_cli.gaussians import describe, read_ply, write_ply
 from vvgt_cli.gaussians.formats import format_of, read_splats
-from vvgt_cli.gaussians.formats.streamed import facts_of, is_streamed
+from vvgt_cli.gaussians.formats.levels import split_name
+from vvgt_cli.gaussians.formats.streamed import facts_of
 from vvgt_cli.look.label_files import holds_table, is_table, read_labels, segments_of
 from vvgt_cli.look.labels import LabelTable
 from vvgt_cli.look.readers import SUFFIXES
@@ -54,14 +55,16 @@ def inspect(file: str, read: ReadOptions, function: FunctionRequest | None = Non
         return _transfer_function(file)
     if not os.path.exists(file) and file in names():
         return _transfer_function(file)
-    path = seekable(file)
+    path, streamed = seekable(file), split_name(file)
+    if streamed is not None and streamed[1] is None:
+        return {"kind": "streamed gaussians", "name": streamed[0].name, **facts_of(streamed[0])}
+    if streamed is not None:
+        return {"kind": "gaussians", "name": file, **describe(*read_splats(file))}
     if not os.path.isfile(path):  # standard input, example:NAME, a folder, a glob, FILE:/array, or nothing
         return _volume(file, read)
     name = Path(file)
     with path.open("rb") as stream:
         head = stream.read(_HEAD)
-    if is_streamed(name):
-        return {"kind": "streamed gaussians", "name": name.name, **facts_of(path)}
     known = format_of(name)
     if head.startswith(_PLY) or known:
         facts = {"kind": "gaussians", "name": name.name, **describe(*read_splats(file))}

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,8 +16,10 @@ from vvgt_cli.cameras.sets import SIZE
 from vvgt_cli.conversion.gaussian_files import file_rule, open_gaussians
 from vvgt_cli.conversion.recolored import FunctionRequest, shown
 from vvgt_cli.errors import UsageError
-from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.frames import upright_matrix
+from vvgt_cli.gaussians import Gaussians, PlyHeader, in_unit_frame
+from vvgt_cli.gaussians.formats.levels import Levels, by_view
+from vvgt_cli.gaussians.formats.splats import gaussians_of
+from vvgt_cli.gaussians.frames import up_matrix, upright_matrix
 from vvgt_cli.gaussians.outputs import Output, check_outputs, write_text
 from vvgt_cli.gaussians.rules import Rule
 from vvgt_cli.images.compose import BLACK
@@ -26,6 +29,7 @@ from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
 
 VIEWS_FILE = "transforms.json"
+Seen = Callable[[Camera], Gaussians]  # what a camera is shown
 
 
 @dataclass(frozen=True)
@@ -33,7 +37,8 @@ class RenderRequest:
     """Pictures to make.
 
     Attributes:
-        ply: Gaussians, "-" for standard input.
+        ply: Gaussians, "-" for standard input; of levels those that a name asks for
+            (`vvgt_cli.gaussians.formats.levels`).
         output: directory for the images, or a movie by its name (`vvgt_cli.images.movies.SUFFIXES`).
         camera: view-set file, or None.
         orbit: number of views on a circle around the file's way up, or None; one of the two is given.
@@ -101,18 +106,35 @@ def render_file(request: RenderRequest, console: Console | None = None) -> int:
         names = [f"{c.name}.png" for c in cameras] + ([f"{c.name}.exr" for c in cameras] if request.exr else [])
         _check_directory(request, [*names, VIEWS_FILE])
     with run.stage("read") as stage:
-        gaussians, header = open_gaussians(request.ply)
-        gaussians = shown(request.ply, gaussians, header, request.function)
+        seen, gaussians, header = _opened(request)
         stage.note = f"{len(gaussians)} Gaussians, {header.frame} frame"
     cameras, rule = request.cameras(header.made_for, header.up), file_rule(header, request.rule)
     run.compile(for_degree(DRAW, gaussians.degree))
     with run.stage("render") as stage:
-        note = (_movie if request.movie else _pictures)(request, console, gaussians, cameras, rule)
+        note = (_movie if request.movie else _pictures)(request, console, seen, cameras, rule)
         stage.note = f"{len(cameras)} views of {cameras[0].width} x {cameras[0].height} px by {rule.name} in {note}"
     return len(cameras)
 
 
-def _pictures(request: RenderRequest, console: Console, gaussians: Gaussians, cameras: list[Camera], rule: Rule) -> str:
+def _opened(request: RenderRequest) -> tuple[Seen, Gaussians, PlyHeader]:
+    """What a camera is shown, what all are or the coarsest level of it, and the header."""
+    manifest = by_view(request.ply)
+    if manifest is None:
+        gaussians, header = open_gaussians(request.ply)
+        gaussians = shown(request.ply, gaussians, header, request.function)
+        return lambda camera: gaussians, gaussians, header
+    levels = Levels(manifest)
+    coarsest, header = gaussians_of(levels.level(str(levels.count - 1)), request.ply)
+    turned = up_matrix(header.up)
+
+    def seen(camera: Camera) -> Gaussians:
+        field = math.degrees(2 * math.atan(min(camera.width / camera.fx, camera.height / camera.fy) / 2))
+        return in_unit_frame(*gaussians_of(levels.seen_from(turned @ camera.position, field), request.ply))
+
+    return seen, shown(request.ply, coarsest, header, request.function), header
+
+
+def _pictures(request: RenderRequest, console: Console, seen: Seen, cameras: list[Camera], rule: Rule) -> str:
     """PNG, EXR and `transforms.json`; where they are."""
     from vvgt_cli.images import over, write_exr, write_png
     from vvgt_cli.splat import render
@@ -121,7 +143,7 @@ def _pictures(request: RenderRequest, console: Console, gaussians: Gaussians, ca
     directory.mkdir(exist_ok=True)
     bar = console.bar("render")
     for done, camera in enumerate(cameras, 1):
-        image = render(gaussians, camera, rule)
+        image = render(seen(camera), camera, rule)
         if request.exr:
             write_exr(directory / f"{camera.name}.exr", image, camera=camera, overwrite=request.overwrite)
         shown = image if request.background is None else over(image, request.background)
@@ -132,7 +154,7 @@ def _pictures(request: RenderRequest, console: Console, gaussians: Gaussians, ca
     return str(directory)
 
 
-def _movie(request: RenderRequest, console: Console, gaussians: Gaussians, cameras: list[Camera], rule: Rule) -> str:
+def _movie(request: RenderRequest, console: Console, seen: Seen, cameras: list[Camera], rule: Rule) -> str:
     """One file; its name and what it holds.
 
     Raises:
@@ -147,7 +169,7 @@ def _movie(request: RenderRequest, console: Console, gaussians: Gaussians, camer
 
     def pictures() -> Iterator[np.ndarray]:
         for done, camera in enumerate(cameras, 1):
-            yield over(render(gaussians, camera, rule), request.background or BLACK)
+            yield over(render(seen(camera), camera, rule), request.background or BLACK)
             if bar:
                 bar(done, len(cameras))
 

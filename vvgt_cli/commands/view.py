@@ -79,8 +79,6 @@ def view(request: ViewRequest, announce: Callable[[str], None], console: Console
         _join(run, request, clouds)
         return
     file = clouds[0][1]
-    if is_streamed(file):
-        _only_gaussians([file])
     with claimed([Output("-o", request.output, SUFFIXES, splats=True)], [file], request.overwrite):
         gaussians, options = _opened(run, request, file)
         write_gaussians(run, request.output, gaussians, options, request.overwrite)
@@ -116,7 +114,7 @@ def _refuse_reading(given: SourceRequest, name: str) -> None:
 def _only_gaussians(files: Sequence[str]) -> None:
     """Of several files."""
     if any(map(is_streamed, files)):
-        raise UsageError(f"{next(filter(is_streamed, files))}: is shown by itself; expected no other file, and no -o")
+        raise UsageError(f"{next(filter(is_streamed, files))}: is shown by itself; expected no other file")
     volumes = [name for name in files if name != STDIN and not is_splats(name)]
     if len(files) > 1 and (volumes or STDIN in files):
         raise UsageError(

@@ -48,11 +48,18 @@ def certified(
         views=len(PREVIEW_VIEWS),
         live_psnr=None if live_psnr is None else round(live_psnr, 2),
         seats=tuple((seat.name(), round(seat.psnr, 2)) for seat in seats),
+        texture=_texture(run.report.texture),
         position_error=position_error(gaussians, ply),
         seconds=round(run.elapsed(), 1) if epoch() is None else None,
         command=command,
     )
     return replace(ply, certificate=found)
+
+
+def _texture(found: dict[str, Any] | None) -> tuple[float, float] | None:
+    if found is None or found["ours"] is None:
+        return None
+    return round(found["ours"], 3), round(found["reference"], 3)
 
 
 def first_views(scores: dict[str, Any]) -> float:

@@ -15,18 +15,12 @@ from vvgt_cli.dvr.kernel import FLAGS, OPAQUE, PARTS, SUB_DEPTH, TILE, U, absorb
 from vvgt_cli.dvr.layout import GRID, LIT_GRID, Light, Texels, Voxels
 from vvgt_cli.dvr.runs import BORROWED
 from vvgt_cli.dvr.shading import shading
-from vvgt_cli.dvr.vectors import Quad, add, lane, scale, sub, texel, zeros4
+from vvgt_cli.dvr.vectors import Quad, add, lane, mix, scale, texel, zeros4
 from vvgt_cli.jit.decorators import inlined, kernel
 
 LEAP = 8  # samples between two looks at the empty-space map
 
 _jit = inlined(fastmath=FLAGS, error_model="numpy", **BORROWED)
-
-
-@_jit
-def mix(a: Quad, b: Quad, share: float) -> Quad:
-    """From a to b."""
-    return add(a, scale(share, sub(b, a)))
 
 
 @_jit

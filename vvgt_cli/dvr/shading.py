@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numba as nb
 import numpy as np
 
 from vvgt_cli.dvr.layout import Light
 from vvgt_cli.dvr.runs import BORROWED
+from vvgt_cli.dvr.vectors import Quad, four, lane, mix, sub, vector
 from vvgt_cli.jit.decorators import inlined
 
 FLAGS = {"contract", "nsz", "arcp", "afn"}  # no nnan/ninf: non-finite voxels are data
@@ -26,11 +28,16 @@ def _places(p: float, n: int) -> tuple[np.uint64, np.uint64, np.uint64, np.uint6
 
 
 @_jit
-def _difference(
-    values: np.ndarray, k: np.uint64, j: np.uint64, i: np.uint64, c: np.uint64, b: np.uint64, a: np.uint64
-) -> float:
-    """Difference of two voxels, exact for all types of values."""
-    return np.float64(values[k, j, i]) - np.float64(values[c, b, a])
+def _line(values: np.ndarray, k: Any, j: Any, i: int) -> Quad:
+    """The voxels before, at, after and beyond voxel ``i`` of row (k, j), clamped to the edge voxels."""
+    nx = values.shape[2]
+    if 0 < i < nx - 2:
+        return four(values, (k * U(values.shape[1]) + j) * U(nx) + U(i - 1))
+    row = values[k, j]
+    return vector(
+        float(row[U(max(i - 1, 0))]), float(row[U(i)]), float(row[U(min(i + 1, nx - 1))]),
+        float(row[U(min(i + 2, nx - 1))]),
+    )  # fmt: skip
 
 
 @_jit
@@ -41,22 +48,23 @@ def normal(values: np.ndarray, edge: np.ndarray, x: float, y: float, z: float) -
     `Light`. There is none where all differences are zero, or one is not finite.
     """
     nz, ny, nx = values.shape
-    i_, i0, i1, i2, fx = _places(x, nx)
+    x = min(max(x, 0.0), nx - 1.0)
+    i = int(x)
+    fx = x - i
     j_, j0, j1, j2, fy = _places(y, ny)
     k_, k0, k1, k2, fz = _places(z, nz)
-    gx = gy = gz = 0.0
-    for b in range(2):
-        for c in range(2):
-            i, wx = (i1, fx) if b else (i0, 1.0 - fx)
-            j, wy = (j1, fy) if c else (j0, 1.0 - fy)
-            before, after = _difference(values, k1, j, i, k_, j, i), _difference(values, k2, j, i, k0, j, i)
-            gz += wx * wy * ((1.0 - fz) * before + fz * after)
-            k, wz = (k1, fz) if c else (k0, 1.0 - fz)
-            before, after = _difference(values, k, j1, i, k, j_, i), _difference(values, k, j2, i, k, j0, i)
-            gy += wx * wz * ((1.0 - fy) * before + fy * after)
-            j, wy = (j1, fy) if b else (j0, 1.0 - fy)
-            before, after = _difference(values, k, j, i1, k, j, i_), _difference(values, k, j, i2, k, j, i0)
-            gx += wy * wz * ((1.0 - fx) * before + fx * after)
+    v00, v01 = _line(values, k0, j0, i), _line(values, k0, j1, i)
+    v10, v11 = _line(values, k1, j0, i), _line(values, k1, j1, i)
+    here = mix(mix(v00, v01, fy), mix(v10, v11, fy), fz)  # equal lanes stay equal
+    gx = (1.0 - fx) * (lane(here, 2) - lane(here, 0)) + fx * (lane(here, 3) - lane(here, 1))
+    above = mix(sub(v01, _line(values, k0, j_, i)), sub(_line(values, k0, j2, i), v00), fy)
+    below = mix(sub(v11, _line(values, k1, j_, i)), sub(_line(values, k1, j2, i), v10), fy)
+    along = mix(above, below, fz)
+    gy = (1.0 - fx) * lane(along, 1) + fx * lane(along, 2)
+    above = mix(sub(v10, _line(values, k_, j0, i)), sub(_line(values, k2, j0, i), v00), fz)
+    below = mix(sub(v11, _line(values, k_, j1, i)), sub(_line(values, k2, j1, i), v01), fz)
+    along = mix(above, below, fy)
+    gz = (1.0 - fx) * lane(along, 1) + fx * lane(along, 2)
     gx, gy, gz = gx / edge[0], gy / edge[1], gz / edge[2]
     squared = gx * gx + gy * gy + gz * gz
     if not (0.0 < squared < np.inf):
@@ -110,6 +118,21 @@ def fixed_diffuse(light: Light, n0: float, n1: float, n2: float, x: float, y: fl
 
 
 @_jit
+def _power(x: float, power: float) -> float:
+    """x^power, by squares where it is a whole number: the library's function takes as long as all else of a sample."""
+    left, result = int(power), 1.0
+    if left != power or power > 256.0:
+        result = x**power
+        left = 0
+    while left > 0:
+        if left & 1:
+            result *= x
+        x *= x
+        left >>= 1
+    return result
+
+
+@_jit
 def _fixed_highlights(
     light: Light, n0: float, n1: float, n2: float, d0: float, d1: float, d2: float, x: float, y: float, z: float
 ) -> float:
@@ -121,7 +144,7 @@ def _fixed_highlights(
         length = math.sqrt(h0 * h0 + h1 * h1 + h2 * h2)
         if length > 1e-9:  # not looking straight into the light
             cosine = min(abs(n0 * h0 + n1 * h1 + n2 * h2) / length, 1.0)
-            total += arrives(light, which, x, y, z) * cosine**light.power
+            total += arrives(light, which, x, y, z) * _power(cosine, light.power)
     return total
 
 
@@ -141,5 +164,5 @@ def shading(
     if light.specular > 0.0:
         white = _fixed_highlights(light, n0, n1, n2, d0, d1, d2, x, y, z)
         if light.head:
-            white += facing**light.power
+            white += _power(facing, light.power)
     return open_ * (light.ambient + light.diffuse * diffuse), light.specular * white

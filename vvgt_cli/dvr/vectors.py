@@ -13,7 +13,7 @@ from numba import types
 from numba.core.errors import TypingError
 from numba.extending import models, register_model
 
-from vvgt_cli.jit.decorators import intrinsic
+from vvgt_cli.jit.decorators import inlined, intrinsic
 
 DOUBLE = ir.DoubleType()
 QUAD = ir.VectorType(DOUBLE, 4)
@@ -75,6 +75,35 @@ def texel(typingctx: Any, grid: Any, index: Any) -> Any:
 
 
 @intrinsic
+def four(typingctx: Any, values: Any, index: Any) -> Any:
+    """Values ``index`` (unsigned) to ``index + 3``, all in range, of a C-contiguous array (nz, ny, nx) of numbers."""
+    if not (isinstance(values, types.Array) and (values.ndim, values.layout) == (3, "C")):
+        raise TypingError(f"values are taken from C-contiguous volumes, not from {values}")
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        array = context.make_array(signature.args[0])(context, builder, args[0])
+        kind = ir.VectorType(context.get_data_type(values.dtype), 4)
+        start = builder.gep(array.data, [args[1]])
+        found = builder.load(builder.bitcast(start, kind.as_pointer()), align=values.dtype.bitwidth // 8)
+        return (builder.fpext if isinstance(values.dtype, types.Float) else builder.uitofp)(found, QUAD)
+
+    return quad(values, index), codegen
+
+
+@intrinsic
+def vector(typingctx: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
+    """(a, b, c, d)."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        found = ir.Constant(QUAD, ir.Undefined)
+        for n, part in enumerate(args):
+            found = builder.insert_element(found, part, ir.Constant(ir.IntType(32), n))
+        return found
+
+    return quad(types.float64, types.float64, types.float64, types.float64), codegen
+
+
+@intrinsic
 def zeros4(typingctx: Any) -> Any:
     """(0, 0, 0, 0)."""
     return quad(), lambda context, builder, signature, args: ir.Constant(QUAD, [0.0] * 4)
@@ -110,3 +139,9 @@ def scale(typingctx: Any, a: Any, b: Any) -> Any:
         return builder.fmul(_splat(builder, args[0]), args[1], flags=FLAGS)
 
     return quad(types.float64, quad), codegen
+
+
+@inlined(error_model="numpy", _nrt=False)
+def mix(a: Quad, b: Quad, share: float) -> Quad:
+    """From a to b."""
+    return add(a, scale(share, sub(b, a)))

@@ -7,16 +7,28 @@ numbers a cell, so that a threshold is found without the moments.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from vvgt_cli.closed_form.columns import MASS, SEEN
 from vvgt_cli.closed_form.moments import Cells, morton
-from vvgt_cli.closed_form.tree import Leaves, Tree, build_tree, cap_by_ancestors, leaves_of, pyramid, split_score
+from vvgt_cli.closed_form.tree import (
+    Leaves,
+    Tree,
+    build_tree,
+    cap_by_ancestors,
+    leaves_of,
+    pyramid,
+    shown,
+    split_score,
+)
 from vvgt_cli.closed_form.visibility import Visibility
-from vvgt_cli.field.cells import read_rows
+from vvgt_cli.dvr.layout import Light
+from vvgt_cli.errors import DataError
+from vvgt_cli.field.cells import NORMALS, read_rows
 from vvgt_cli.field.grid import CellGrid
 from vvgt_cli.field.parts import CELLS, Parts
 
@@ -92,7 +104,7 @@ def _lay(grid: np.ndarray, part: np.ndarray, place: list[int]) -> None:
 
 
 class Forest:
-    """Trees of tiles; see the module.
+    """Trees of tiles; see the module. Where there is light, leaves have the means of `lit.shaded` after their moments.
 
     Attributes:
         top: the tree over the tiles' own cells, None where nothing is seen.
@@ -100,12 +112,15 @@ class Forest:
         cells: in all trees, the base cells among them.
     """
 
-    def __init__(self, parts: Parts, grid: CellGrid, seen: Visibility, coarse: Coarse, scratch: Path) -> None:
-        self._parts, self._grid, self._seen, self._scratch = parts, grid, seen, scratch
+    def __init__(
+        self, parts: Parts, grid: CellGrid, seen: Visibility, coarse: Coarse, scratch: Path, light: Light | None = None
+    ) -> None:
+        self._parts, self._grid, self._seen, self._scratch, self._light = parts, grid, seen, scratch, light
         self._levels = None if len(coarse.tiles) == 1 else grid.bits
         self.tiles: list[Tile] = []
         self._sizes: list[tuple[int, int]] = []  # cells and base cells of each tree
         moments, largest = [], []
+        self._shades: list[np.ndarray] = []  # of each tile's own cell, where there is light
         with open(scratch, "wb") as stream:
             for tile in coarse.tiles:
                 tree = self._tree(tile)
@@ -117,6 +132,8 @@ class Forest:
                 self._sizes.append((len(tree), int((tree.children == 0).sum())))
                 moments.append(tree.moments[-1].copy())  # a view would keep the tree
                 largest.append(tree.largest[-1])
+                if light is not None:
+                    self._shades.append(self._shaded(tile, tree, np.array([len(tree) - 1]))[0])
         self.cells = sum(size for size, _ in self._sizes)
         self.top: Tree | None = None
         if self.tiles:
@@ -137,10 +154,52 @@ class Forest:
         self._above[-1] = np.inf  # the root is there at any threshold
 
     def _tree(self, tile: Tile) -> Tree:
+        return build_tree(self._cells(tile), self._seen, np.array(self._grid.step), self._levels)
+
+    def _cells(self, tile: Tile) -> Cells:
         moments, local = read_rows(self._parts, tile.block, tile.offset, tile.cells)
         index = local + np.array(tile.place, np.int32) * self._grid.tile_cells
-        cells = Cells(index, moments, self._grid.cell_edge, np.array(self._grid.exponent, np.int64))
-        return build_tree(cells, self._seen, np.array(self._grid.step), self._levels)
+        return Cells(index, moments, self._grid.cell_edge, np.array(self._grid.exponent, np.int64))
+
+    def _normals(self, tile: Tile) -> np.ndarray:
+        """(n, 3) of the base cells of a tile's tree.
+
+        Raises:
+            DataError: the file is not whole.
+        """
+        path = self._parts.path(CELLS, tile.block, NORMALS)
+        try:
+            whole = np.load(path, mmap_mode="r")[tile.offset : tile.offset + tile.cells]
+        except (OSError, ValueError) as error:
+            raise DataError(f"{path}: damaged ({error}); remove it and its .npz, and run the same again") from error
+        found: np.ndarray = whole[shown(self._cells(tile), self._seen, np.array(self._grid.step))]
+        return found
+
+    def _shaded(self, tile: Tile, tree: Tree, nodes: np.ndarray) -> np.ndarray:
+        """`lit.shaded` (k, 16 + lights) of rows of a tile's tree."""
+        from vvgt_cli.closed_form.lit import base_rows, shaded
+
+        assert self._light is not None
+        half, step = np.array(self._grid.half), np.array(self._grid.step)
+        return shaded(self._light, half, step, tree.moments, self._normals(tile), *base_rows(tree, nodes))
+
+    def _leaves(self, row: int, tree: Tree, nodes: np.ndarray) -> Leaves:
+        """Rows of the tree of tile ``row``, or of the tree above all tiles."""
+        found = leaves_of(tree, nodes)
+        if self._light is None:
+            return found
+        more = self._shaded(self.tiles[row], tree, nodes) if row < len(self.tiles) else self._shaded_above(nodes)
+        return replace(found, moments=np.concatenate([found.moments, more], axis=1))
+
+    def _shaded_above(self, nodes: np.ndarray) -> np.ndarray:
+        """`_shaded` of rows of the tree above the tiles: means by what is seen of each tile."""
+        from vvgt_cli.closed_form.lit import SEEN_LITTLE, base_rows
+
+        assert self.top is not None, "rows come of a top"
+        moments, shades = self.top.moments, np.array(self._shades)
+        seen = np.maximum(moments[:, SEEN], SEEN_LITTLE * moments[:, MASS])
+        pairs = zip(*base_rows(self.top, nodes), strict=True)
+        return np.array([np.average(shades[a:b], axis=0, weights=seen[a:b]) for a, b in pairs])
 
     @property
     def base(self) -> int:
@@ -192,20 +251,25 @@ class Forest:
             if not len(which):
                 continue
             if row < len(self.tiles):
-                yield leaves_of(self._tree(self.tiles[row]), which)
+                yield self._leaves(row, self._tree(self.tiles[row]), which)
             else:
                 assert self.top is not None, "scores come of a top"
-                yield leaves_of(self.top, which + len(self.tiles))
+                yield self._leaves(row, self.top, which + len(self.tiles))
 
-    def cuts(self, thresholds: np.ndarray) -> Iterator[list[Leaves]]:
-        """Of each tile the cells that each of its ``thresholds`` (tiles, n) leaves: at least the tile's own cell."""
+    def cuts(self, thresholds: np.ndarray, begin: int = 0) -> Iterator[list[Leaves]]:
+        """Of each tile from ``begin`` on the cells that each of its ``thresholds`` (tiles, n) leaves.
+
+        At least the tile's own cell.
+        """
         for row, scores in enumerate(self.scores()):
             if row == len(self.tiles):
                 return
+            if row < begin:
+                continue
             tree, above = self._tree(self.tiles[row]), scores.above.copy()
             above[-1] = np.inf
             kept = [(above > value) & ((scores.capped <= value) | ~scores.inner) for value in thresholds[row]]
-            yield [leaves_of(tree, np.flatnonzero(which)) for which in kept]
+            yield [self._leaves(row, tree, np.flatnonzero(which)) for which in kept]
 
     def count(self, threshold: float) -> int:
         """How many cells a threshold leaves."""

@@ -30,7 +30,7 @@ from vvgt_cli.score.record import Run
 from vvgt_cli.version import VERSION
 from vvgt_cli.volume import ReadOptions, Volume
 from vvgt_cli.volume.label_maps import named_so
-from vvgt_cli.volume.readers import SCHEMES
+from vvgt_cli.volume.readers import SCHEMES, STEPPED
 from vvgt_cli.volume.stored import Stored, is_file_backed
 
 if TYPE_CHECKING:
@@ -255,7 +255,8 @@ def better_in_blocks(request: SourceRequest) -> bool:
     files = files_of(place)
     tiff = files and files[0].suffix.lower() in (".tif", ".tiff")
     index = os.path.isfile(place) and place.lower().endswith(INDEXES)
-    packed = zarr or h5 or tiff or index  # few bytes may hold many voxels
+    away = path.partition(":")[0] in STEPPED
+    packed = away or zarr or h5 or tiff or index  # few bytes may hold many voxels
     size = sum(file.stat().st_size for file in files)
     if not packed and size < HELD and (free is None or size <= LARGE * free):
         return False

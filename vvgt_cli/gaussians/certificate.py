@@ -32,6 +32,8 @@ class Certificate:
         views: number of these views.
         live_psnr: dB of a live file as `vvgt recolor` shows it under its own function; None of others.
         seats: name of a viewing condition and dB of each that was scored, worst first.
+        texture: on smooth areas from near, of the Gaussians and of the volume, levels of 255; None where nothing is
+            opaque and smooth.
         position_error: greatest distance of a centre in the file from where it was computed, in units of the world.
         seconds: wall time until the scores; None where `SOURCE_DATE_EPOCH` asks for files that can be made again.
         command: as it was given, without folders, outputs and what changes nothing; None from Python.
@@ -46,6 +48,7 @@ class Certificate:
     views: int
     live_psnr: float | None = None
     seats: tuple[tuple[str, float], ...] = ()
+    texture: tuple[float, float] | None = None
     position_error: float = 0.0
     seconds: float | None = None
     command: str | None = None
@@ -70,13 +73,17 @@ class Certificate:
         if not isinstance(found, dict) or not isinstance(found.get("seats", {}), dict):
             raise ValueError(text)
         seats = tuple((str(name), _number(value)) for name, value in found.pop("seats", {}).items())
+        woven = found.pop("texture", None)
+        if woven is not None and (not isinstance(woven, list) or len(woven) != 2):
+            raise ValueError(text)
+        texture = None if woven is None else (_number(woven[0]), _number(woven[1]))
         kinds = {
             "volume": str, "sha256": str, "look": str, "size": int, "rule": str, "psnr": float, "views": int,
             "live_psnr": float, "position_error": float, "seconds": float, "command": str,
         }  # fmt: skip
         if not {"volume", "look", "size", "rule", "psnr", "views"} <= set(found) <= set(kinds):
             raise ValueError(text)
-        known: dict[str, Any] = {"sha256": None}
+        known: dict[str, Any] = {"sha256": None, "texture": texture}
         for key, value in found.items():
             kind = kinds[key]
             found[key] = _number(value) if kind is float else value

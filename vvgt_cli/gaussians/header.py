@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -27,7 +28,7 @@ REQUIRED = (
 _BASIC = {"char": "i1", "uchar": "u1", "short": "<i2", "ushort": "<u2", "int": "<i4", "uint": "<u4"}
 _SIZED = {"int8": "i1", "uint8": "u1", "int16": "<i2", "uint16": "<u2", "int32": "<i4", "uint32": "<u4"}
 _TYPES = _BASIC | _SIZED | {"float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8"}
-MIP = "comment SplatRenderMode: mip"  # as Brush marks opacity that is to be compensated
+MIP = "SplatRenderMode: mip"  # as Brush marks opacity that is to be compensated
 _ADVICE = "expected a binary little-endian 3DGS .ply, as vvgt and SuperSplat write it"
 
 
@@ -191,11 +192,15 @@ def parse_header(content: bytes, name: str) -> PlyHeader:
         raise DataError(f"{name}: no element vertex; {_ADVICE}")
     degree = _sh_degree(fields, name)
     dtype = np.dtype(list(fields.items()))
-    return PlyHeader(size, count, dtype, degree, tuple(comments), **_provenance(comments, name, list(fields)))
+    return PlyHeader(size, count, dtype, degree, tuple(comments), **facts_in(comments, name, list(fields)))
 
 
-def _provenance(comments: list[str], name: str, columns: list[str]) -> dict[str, Any]:
-    """`FileFacts` and the version, from our own comments."""
+def facts_in(comments: list[str], name: str, columns: Sequence[str] = ()) -> dict[str, Any]:
+    """`FileFacts` and the version, from our own comments, for what they say; ``columns`` are the file's.
+
+    Raises:
+        DataError: a comment that begins as ours do and is not one.
+    """
     found: dict[str, Any] = {}
     lives: list[dict[str, Any]] = [{}]
     for comment in comments:
@@ -217,7 +222,7 @@ def _provenance(comments: list[str], name: str, columns: list[str]) -> dict[str,
             raise DataError(f"{name}: comment {comment[:80]!r} is not one that vvgt writes") from None
     if found.get("frame") == "world" and "scale" not in found:
         raise DataError(f"{name}: in world space, but its comments do not hold scale and centre")
-    return found | {"live": live_facts(lives, columns)}
+    return found | {"live": live_facts(lives, list(columns))}
 
 
 def _one_comment(words: list[str]) -> dict[str, Any]:
@@ -297,7 +302,7 @@ def comment_lines(facts: FileFacts) -> list[str]:
     if facts.certificate is not None:
         lines.append(f"comment {facts.certificate.line()}")
     if facts.rule == "compensated":
-        lines.append(MIP)
+        lines.append(f"comment {MIP}")
     return lines
 
 

@@ -185,18 +185,19 @@ def _rows(source: str | Path | BinaryIO, name: str) -> tuple[PlyHeader, np.ndarr
         with open(seekable(source), "rb") as stream:
             header = parse_header(stream.read(_HEADER_LIMIT), name)
             size = stream.seek(0, io.SEEK_END)
-            _check_size(header, size, name)
+            check_size(header, size, name)
             if not header.count:
                 return header, np.zeros(0, header.dtype)
             rows = np.memmap(stream, dtype=header.dtype, mode="r", offset=header.size, shape=(header.count,))
         return header, rows
     content = source.read()
     header = parse_header(content[:_HEADER_LIMIT], name)
-    _check_size(header, len(content), name)
+    check_size(header, len(content), name)
     return header, np.frombuffer(content, dtype=header.dtype, count=header.count, offset=header.size)
 
 
-def _check_size(header: PlyHeader, size: int, name: str) -> None:
+def check_size(header: PlyHeader, size: int, name: str) -> None:
+    """Raise DataError unless a file of ``size`` bytes is as long as its header says."""
     expected = header.size + header.count * header.dtype.itemsize
     if size != expected:
         what = "truncated" if size < expected else "followed by data that is not Gaussians"

@@ -47,6 +47,9 @@ DESCENT = (
     "vvgt_cli.splat.kernel:project_factors",
     "vvgt_cli.refine.loss:loss_gradient",
     "vvgt_cli.refine.ssim:blur",
+    "vvgt_cli.refine.texture:part_planes",
+    "vvgt_cli.refine.texture:weigh",
+    "vvgt_cli.refine.texture:add_fine",
 )
 REFINE = (FRAME_STEPS, *DESCENT)
 SHARED = (REGRESS, MIX, MORTON)  # of runs of more than a few Gaussians

@@ -18,7 +18,7 @@ from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
-import llvmlite
+import llvmlite.binding
 import numba
 from numba.core import caching, compiler, config
 from numba.core.dispatcher import Dispatcher
@@ -88,6 +88,18 @@ def _source(module: str) -> bytes:
         return hashlib.sha256(Path(file or "").read_bytes()).digest()
     except OSError:
         return b""
+
+
+def _unlinked(library: tuple[str, str, tuple[bytes, bytes]]) -> tuple[str, str, tuple[bytes, bytes]]:
+    """What numba keeps of a library, with bitcode of its symbols alone in place of all that others would link.
+
+    No kernel calls another, and reading all of it would take longer than reading the machine code.
+    """
+    name, kind, (code, bitcode) = library
+    whole = llvmlite.binding.parse_bitcode(bitcode)
+    symbols = [f'define void @"{f.name}"() {{ unreachable }}' for f in whole.functions if not f.is_declaration]
+    symbols += [f'@"{v.name}" = global i8 0' for v in whole.global_variables if not v.is_declaration]
+    return name, kind, (code, llvmlite.binding.parse_assembly("\n".join(symbols)).as_bitcode())
 
 
 def _digest(*parts: Any) -> str:
@@ -167,7 +179,8 @@ class KernelCache(caching._Cache):
     def save_overload(self, sig: Any, data: Any) -> None:
         """Write what a worker has compiled; what has been compiled for want of one stays in this process."""
         if store.WORKING:
-            store.write(store.WORKING, dumps(data._reduce()))
+            library, *rest = data._reduce()
+            store.write(store.WORKING, dumps((_unlinked(library), *rest)))
         elif self.enabled:
             store.warn_once(
                 "kernels compiled in this process, for want of another: last digits may differ from other runs'"

@@ -7,6 +7,7 @@ else is asked for. Two runs that want the same kernel at once share the work: wh
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import sys
 import traceback
@@ -15,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 MOST = 8  # kernels at once: 0.3 GB each
+PARALLEL = ("numba.np.ufunc.parallel", "numba.parfors.parfor_lowering")  # what parallel loops import, late
 
 
 @contextlib.contextmanager
@@ -75,12 +77,17 @@ def run(folder: Path, jobs: list[Any]) -> int:
     """Compile all; 0 where all went well."""
     import importlib
 
+    from numba.core.registry import cpu_target
+
     from vvgt_cli.jit.target import widen
     from vvgt_cli.resources import processors
 
     widen()
-    for module in sorted({job.module for job in jobs}):
+    for module in (*PARALLEL, *sorted({job.module for job in jobs})):
         importlib.import_module(module)
+    cpu_target.typing_context.refresh()  # once, rather than in every fork
+    cpu_target.target_context.refresh()
+    gc.disable()  # what a fork makes lives as long as it does
     failed = 0
     if not hasattr(os, "fork"):
         return sum(_attempt(folder, job) for job in jobs)

@@ -167,7 +167,7 @@ def read_volume(volume: VolumeLike, **reading: Unpack[Reading]) -> Volume:
 
 
 def read_ply(path: PathLike) -> tuple[Gaussians, PlyHeader]:
-    """Gaussians of a standard ``.ply`` in the unit frame, and what its header says.
+    """Gaussians of a standard ``.ply`` in the unit frame, and what its header says; other formats by their names.
 
     Raises:
         DataError: not a 3DGS ``.ply``, or one without Gaussians.

@@ -8,10 +8,15 @@ the same blur once more. SSIM does so too, and to the mean brightness, which cos
 
 from __future__ import annotations
 
+from typing import Any
+
+import numba as nb
 import numpy as np
 
+from vvgt_cli.jit.decorators import kernel
 from vvgt_cli.refine.ssim import KERNEL, blur
 
+f32: Any = np.float32
 SMOOTH = 4e-3  # C, variance of a channel: edges of an eighth of the range and more hardly count
 
 
@@ -26,16 +31,54 @@ def add_texture_gradient(image: np.ndarray, target: np.ndarray, weight: float, g
     r = KERNEL.size // 2
     padded = np.zeros((7, h + 2 * r, w + 2 * r), np.float32)
     planes, blurred = np.empty((7, h, w), np.float32), np.empty((7, h, w), np.float32)
-    seen = target[..., :3].transpose(2, 0, 1)
-    planes[:3] = image[..., :3].transpose(2, 0, 1) - seen
-    planes[3:6] = seen
-    planes[6] = np.square(seen).sum(axis=0)
+    part_planes(image, target, planes)
     blur(planes, KERNEL, padded, blurred)
-    variance = np.maximum(blurred[6] - np.square(blurred[3:6]).sum(axis=0), 0) / 3  # (h, w), mean of the channels
-    share = np.float32(SMOOTH) / (np.float32(SMOOTH) + variance)
-    errors = planes[:3] - blurred[:3]  # (3, h, w)
-    planes[:3] = share * errors
-    total = float((planes[:3] * errors).sum(dtype=np.float64))
+    total = weigh(blurred, planes)
     blur(planes[:3], KERNEL, padded[:3], blurred[:3])
-    grad[..., :3] += np.float32(2 * weight) * (planes[:3] - blurred[:3]).transpose(1, 2, 0)
+    add_fine(planes, blurred, weight, grad)
     return total
+
+
+@kernel("f4:3 f4:3 f4:3", parallel=True)
+def part_planes(image: np.ndarray, target: np.ndarray, planes: np.ndarray) -> None:
+    """Error of each channel, the view's channels and the sum of their squares into ``planes`` (7, h, w)."""
+    for y in nb.prange(image.shape[0]):
+        for x in range(image.shape[1]):
+            square = f32(0)
+            for c in range(3):
+                seen = target[y, x, c]
+                planes[c, y, x] = image[y, x, c] - seen
+                planes[3 + c, y, x] = seen
+                square += seen * seen
+            planes[6, y, x] = square
+
+
+@kernel("f4:3 f4:3", parallel=True, error_model="numpy")
+def weigh(blurred: np.ndarray, planes: np.ndarray) -> float:
+    """Errors less their blur, times C / (C + v), replace the first three ``planes`` (7, h, w); returns the term's sum.
+
+    ``blurred`` (7, h, w) is the blur of what `part_planes` gave.
+    """
+    smooth, third = f32(SMOOTH), f32(1 / 3)
+    sums = np.zeros(planes.shape[1])
+    for y in nb.prange(planes.shape[1]):
+        for x in range(planes.shape[2]):
+            b0, b1, b2 = blurred[3, y, x], blurred[4, y, x], blurred[5, y, x]
+            variance = max(blurred[6, y, x] - (b0 * b0 + b1 * b1 + b2 * b2), f32(0)) * third  # mean of the channels
+            share = smooth / (smooth + variance)
+            for c in range(3):
+                error = planes[c, y, x] - blurred[c, y, x]
+                planes[c, y, x] = share * error
+                sums[y] += np.float64(share * error * error)
+    total: float = sums.sum()
+    return total
+
+
+@kernel("f4:3 f4:3 f8 f4:3", parallel=True)
+def add_fine(planes: np.ndarray, blurred: np.ndarray, weight: float, grad: np.ndarray) -> None:
+    """``grad`` (h, w, 4) += 2 ``weight`` x the first three ``planes`` less their blur ``blurred``."""
+    factor = f32(2 * weight)
+    for y in nb.prange(grad.shape[0]):
+        for x in range(grad.shape[1]):
+            for c in range(3):
+                grad[y, x, c] += factor * (planes[c, y, x] - blurred[c, y, x])

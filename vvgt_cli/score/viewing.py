@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -131,8 +131,9 @@ def score_texture(
     rule: str | Rule = INRIA,
     settings: RenderSettings | None = None,
     progress: ProgressCallback | None = None,
+    cameras: Sequence[Camera] | None = None,
 ) -> Texture:
-    """Texture on smooth areas, in the `VIEWS` seen from near (`NEAR`), whole.
+    """Texture on smooth areas, in the `VIEWS` seen from near (`NEAR`), whole, or by other ``cameras``.
 
     Args:
         scene, gaussians: what is compared.
@@ -140,16 +141,18 @@ def score_texture(
         rule: by which Gaussians are drawn.
         settings: of the reference; the renderer's default without.
         progress: called after each view.
+        cameras: `near_cameras` without.
     """
     from vvgt_cli.dvr import render_view
     from vvgt_cli.images.metrics import texture
     from vvgt_cli.splat import render
 
     def pairs() -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        for done, camera in enumerate(near_cameras(size)):
+        places = near_cameras(size) if cameras is None else cameras
+        for done, camera in enumerate(places):
             yield render_view(scene, camera, settings), render(gaussians, camera, rule)
             if progress:
-                progress(done + 1, len(VIEWS))
+                progress(done + 1, len(places))
 
     return texture(pairs())
 
@@ -158,6 +161,17 @@ def near_cameras(size: int) -> list[Camera]:
     """Those of `score_texture`."""
     cameras = default_views("test", size=size)
     return [zoomed(cameras[i], NEAR) for i in VIEWS]
+
+
+def glance_cameras(size: int) -> list[Camera]:
+    """What a conversion measures texture in: the middle half of each edge of the near view from the side."""
+    found = []
+    for i in SIDE:
+        whole = zoomed(default_views("test", size=size)[i], NEAR)
+        edge = size // 2
+        offset = (size - edge) // 2
+        found.append(replace(whole, cx=whole.cx - offset, cy=whole.cy - offset, width=edge, height=edge))
+    return found
 
 
 def texture_note(found: Texture) -> str:

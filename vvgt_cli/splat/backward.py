@@ -15,6 +15,7 @@ import numpy as np
 
 from vvgt_cli.gaussians.constants import TILE
 from vvgt_cli.jit.decorators import inlined, kernel
+from vvgt_cli.jit.prefetch import prefetch
 from vvgt_cli.splat.buffer import (
     AREA,
     BLUE,
@@ -105,8 +106,13 @@ def _moments_tile(
     entries: np.ndarray, slots: np.ndarray, extent: np.ndarray, flat: np.ndarray, colors: np.ndarray, ox: int, oy: int,
     rule: tuple[float, ...], buf: np.ndarray, pairs: np.ndarray,
 ) -> None:  # fmt: skip
-    """The nine sums of each of the Gaussians ``entries``, in their order, into their rows of ``pairs``."""
+    """The nine sums of each of the Gaussians ``entries``, in their order, into their rows of ``pairs``.
+
+    Rows lie far apart in memory, and a store that waits for its line would hold up the next Gaussian's loads from the
+    stack: those of a chunk are written together.
+    """
     fetched, sums = np.empty(CHUNK * FIELDS, np.float32), np.empty(_END, np.float32)
+    found = np.empty((CHUNK, SUMS), np.float32)
     for begin in range(0, entries.shape[0], CHUNK):
         if begin > 0 and all_ended(buf):
             for index in range(begin, entries.shape[0]):
@@ -114,8 +120,11 @@ def _moments_tile(
             break
         count = fetch(entries, begin, extent, flat, ox, oy, fetched)
         fetch_colors(entries, begin, count, colors, fetched)
+        for index in range(begin, begin + count):
+            prefetch(pairs, slots[index], 0)
+            prefetch(pairs, slots[index], SUMS - 1)
         for index in range(count):
-            at, slot = U(index) * FIELDS, slots[begin + index]
+            at = U(index) * FIELDS
             u = fetched[at + U(3)]
             _sweep(fetched, at, rule, buf, sums)
             s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = s8 = ZERO
@@ -130,8 +139,11 @@ def _moments_tile(
                 s6 += sums[_A3 + i]
                 s7 += sums[_A4 + i]
                 s8 += sums[_A5 + i]
-            pairs[slot, 0], pairs[slot, 1], pairs[slot, 2], pairs[slot, 3], pairs[slot, 4] = s0, s1, s2, s3, s4
-            pairs[slot, 5], pairs[slot, 6], pairs[slot, 7], pairs[slot, 8] = s5, s6, s7, s8
+            found[index, 0], found[index, 1], found[index, 2], found[index, 3], found[index, 4] = s0, s1, s2, s3, s4
+            found[index, 5], found[index, 6], found[index, 7], found[index, 8] = s5, s6, s7, s8
+        for index in range(count):
+            for f in range(SUMS):
+                pairs[slots[begin + index], f] = found[index, f]
 
 
 @kernel(

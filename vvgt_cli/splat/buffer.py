@@ -4,7 +4,8 @@ A tile works in one flat float32 buffer of planes of TILE x TILE pixels, transmi
 fixed length, unsigned indices at constant distances and no branches: LLVM turns each into one or two vector
 instructions a line (a signed index or an early exit would undo that, and a sum over rows in the same array costs 50
 comparisons of addresses a Gaussian). Gaussians are fetched `CHUNK` at a time: in the order of depth they lie far apart
-in memory, and a loop that does nothing else waits for many of them at once.
+in memory, and a loop that does nothing else waits for many of them at once; those of the next chunk are asked for
+before the present one is worked on.
 
 ``buf`` (planes x TILE x TILE,) float32; ``rule`` is `Rule.blending` as a tuple of 6 float32. Pixels are counted from
 the tile's corner; in them -1/8 of a Gaussian's exponent is ``a dx^2 + b dx dy + c dy^2`` at (dx, dy) from its centre
@@ -20,6 +21,7 @@ import numpy as np
 
 from vvgt_cli.gaussians.constants import TILE
 from vvgt_cli.jit.decorators import inlined
+from vvgt_cli.jit.prefetch import prefetch
 
 f32: Any = np.float32  # its sums are float here: numba keeps them float32
 U: Any = nb.uint64
@@ -57,6 +59,11 @@ def fetch(
         fetched[at + U(5)] = flat[k, 5]
         fetched[at + FIRST_ROW] = f32(max(extent[k, 1] - oy, 0))
         fetched[at + END_ROW] = f32(min(extent[k, 3] - oy, TILE))
+    for index in range(begin + count, min(begin + 2 * CHUNK, entries.shape[0])):
+        k = entries[index]
+        prefetch(extent, k, 0)
+        prefetch(flat, k, 0)
+        prefetch(flat, k, 6)  # a row lies in one line or two
     return count
 
 
@@ -68,6 +75,8 @@ def fetch_colors(entries: np.ndarray, begin: int, count: int, colors: np.ndarray
         fetched[at + RED] = colors[k, 0]
         fetched[at + GREEN] = colors[k, 1]
         fetched[at + BLUE] = colors[k, 2]
+    for index in range(begin + count, min(begin + 2 * CHUNK, entries.shape[0])):
+        prefetch(colors, entries[index], 0)
 
 
 @tile_jit

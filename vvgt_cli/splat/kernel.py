@@ -16,6 +16,7 @@ import numpy as np
 
 from vvgt_cli.gaussians.constants import TILE
 from vvgt_cli.jit.decorators import inlined, kernel
+from vvgt_cli.jit.prefetch import prefetch
 from vvgt_cli.splat.lanes import (
     LANES,
     OPACITY,
@@ -31,6 +32,7 @@ from vvgt_cli.splat.lanes import (
 
 _jit = inlined()
 SHIFT = TILE.bit_length() - 1
+AHEAD = 16  # Gaussians whose boxes are asked for before they are read: in the order of depth they lie far apart
 
 
 @_jit
@@ -186,6 +188,7 @@ def tile_lists(
     for worker in nb.prange(workers):
         for index in range(worker * total // workers, (worker + 1) * total // workers):
             k = order[index]
+            prefetch(extent, order[min(index + AHEAD, total - 1)], 0)
             if extent[k, 2] <= extent[k, 0]:
                 continue
             x0, x1 = extent[k, 0] >> SHIFT, ((extent[k, 2] - 1) >> SHIFT) + 1
@@ -209,6 +212,7 @@ def tile_lists(
     for worker in nb.prange(workers):
         for index in range(worker * total // workers, (worker + 1) * total // workers):
             k = order[index]
+            prefetch(extent, order[min(index + AHEAD, total - 1)], 0)
             slot = first[k]
             if extent[k, 2] <= extent[k, 0]:
                 continue

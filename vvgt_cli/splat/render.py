@@ -39,15 +39,17 @@ class Projection:
     rule: Rule
 
 
-def project(gaussians: Gaussians, camera: Camera, rule: str | Rule = INRIA) -> Projection:
-    """EWA projection and depth-sorted tile lists by a rule, or the rule of that name.
+def project(gaussians: Gaussians, camera: Camera, rule: str | Rule = INRIA, *, by_distance: bool = False) -> Projection:
+    """EWA projection and tile lists, sorted by depth or ``by_distance``, by a rule, or the rule of that name.
 
     ``rule.at(w / W)`` gives, at a camera's size w, what viewers show at size W, at fewer points.
     """
     from vvgt_cli.splat import kernel
 
     g = gaussians
-    return _projected(kernel.project, (g.means, g.log_scales, g.quaternions, g.opacity_logits), camera, rule)
+    distance = np.linalg.norm(g.means - camera.position, axis=1).astype(np.float32) if by_distance else None
+    columns = g.means, g.log_scales, g.quaternions, g.opacity_logits
+    return _projected(kernel.project, columns, camera, rule, distance)
 
 
 def project_factors(
@@ -60,9 +62,13 @@ def project_factors(
 
 
 def _projected(
-    kernel_project: Callable[..., None], arrays: tuple[np.ndarray, ...], camera: Camera, rule: str | Rule
+    kernel_project: Callable[..., None],
+    arrays: tuple[np.ndarray, ...],
+    camera: Camera,
+    rule: str | Rule,
+    distance: np.ndarray | None = None,
 ) -> Projection:
-    """Run one of the projecting kernels, sort by depth, file into tiles."""
+    """Run one of the projecting kernels, sort by depth or by ``distance`` (K,) float32, file into tiles."""
     import numba
 
     from vvgt_cli.splat import kernel
@@ -73,7 +79,7 @@ def _projected(
     extent = np.empty((count, 4), np.int32)
     kernel_project(*arrays, *pose(camera), rule.projecting(), flat, depth, extent)
     tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
-    order = depth_order(depth)
+    order = depth_order(depth if distance is None else distance)
     start, members, slots, first = kernel.tile_lists(order, extent, tiles_x, tiles_y, numba.get_num_threads())
     return Projection(flat, extent, start, members, slots, first, tiles_x, balance(np.diff(start)), rule)
 

@@ -20,6 +20,7 @@ from vvgt_cli.volume import (  # noqa: F401  each registers its formats
     numpy_file,
     openvdb,
     raw,
+    remote,
     slc,
     slices,
     tiff,

@@ -35,6 +35,7 @@ def size_text(n_bytes: int) -> str:
 
 
 MAPPED = "store it uncompressed (raw and .nhdr files are mapped, not loaded)"
+AS_NUMBERS = "convert it to a format of plain numbers, such as .mrc, .vti or raw, which is mapped, not loaded"
 IN_BLOCKS = "use 'vvgt convert', 'init', 'evaluate', 'render-views' or 'report', which process it in blocks"
 
 
@@ -104,8 +105,8 @@ def load_block(
     if encoding == "text":
         if count(shape) > size:
             raise _too_short(path, size, shape, dtype, offset)
-        values = parse_numbers(path.read_bytes(), offset, count(shape), dtype, path.name)
-        return values.reshape(shape)
+        with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as text:
+            return parse_numbers(text, offset, count(shape), dtype, path.name).reshape(shape)
     return _unpack(path, dtype, shape, offset, encoding, skip)
 
 
@@ -204,6 +205,8 @@ def tokens(text: bytes | mmap.mmap, start: int, n: int, name: str) -> Iterator[t
         if position + len(window) < len(text):
             cut = max(window.rfind(c) for c in (b" ", b"\n", b"\t", b"\r"))
             window = window[: cut + 1] or window
+        if isinstance(text, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED"):
+            text.madvise(mmap.MADV_DONTNEED)  # its pages are not read again
         words = window.split(None, missing)
         position += len(window)
         if len(words) > missing:
@@ -216,16 +219,18 @@ def parse_numbers(text: bytes | mmap.mmap, start: int, n: int, dtype: np.dtype, 
     """``n`` numbers of white-space separated text from ``start`` on, (n,) in native byte order.
 
     Raises:
-        DataError: too few numbers, something that is no number, or one that the type cannot hold.
+        DataError: too few numbers, something that is no number, or one that the type cannot hold; too little memory.
     """
     native = dtype.newbyteorder("=")
-    parts = [np.empty(0, native)]
+    check_memory(n * native.itemsize, name, AS_NUMBERS)
+    values, filled = np.empty(n, native), 0
     for words, _ in tokens(text, start, n, name):
         try:
-            parts.append(np.array(words, dtype="S").astype(native))
+            values[filled : filled + len(words)] = np.array(words, dtype="S").astype(native)
         except (ValueError, OverflowError) as error:
             raise DataError(f"{name}: the text is not a list of {native.name} numbers ({error})") from error
-    return np.concatenate(parts)
+        filled += len(words)
+    return values
 
 
 def data_file(header: Path, named: str) -> Path:

@@ -92,8 +92,8 @@ def picture_volume(picture: Picture, options: ReadOptions, source: str, name: st
         if not field.flags.c_contiguous:
             check_memory(size * picture.dtype.itemsize, source, IN_BLOCKS)
         field = contiguous(field)
-    known = options.spacing is None and picture.spacing != (None, None, None)
-    return Volume(field, _spacing(picture, options), picture.origin, name=name, unit="um" if known else "")
+    unit = "" if picture.spacing == (None, None, None) else "um"
+    return Volume(field, _spacing(picture, options), picture.origin, name=name, unit=unit)
 
 
 def _box(slices: tuple[slice, ...]) -> Box:

@@ -277,18 +277,22 @@ def _placed(
         replace(a, centres=a.centres[::-1]) if flip and a.centres is not None else a
         for a, flip in zip(axes, flips, strict=True)
     ]
-    if options.spacing is not None:
-        _no_dims(options, source, "--spacing says where the values are")
-        return Volume(field, options.spacing, name=name, slope=scaling[0], intercept=scaling[1])
-    centres = _one_unit(axes, source)
-    if all(c is None or even(c) for c in centres):
-        _no_dims(options, source, "its axes are evenly spaced")
+    try:
+        centres, unit = _one_unit(axes, source), _length(axes)
+    except UsageError:
+        if options.spacing is None:
+            raise
+        centres, unit = [None] * 3, ""
+    origin = tuple(0.0 if c is None else float(c[0]) for c in reversed(centres))
+    if options.spacing or all(c is None or even(c) for c in centres):
+        if options.dims is not None:
+            why = "--spacing says where the values are" if options.spacing else "its axes are evenly spaced"
+            raise UsageError(f"{source}: {why}; leave out --dims")
         steps = [1.0 if c is None or c.size < 2 else float((c[-1] - c[0]) / (c.size - 1)) for c in centres]
         if field.shape[0] == 1 and (centres[0] is None or centres[0].size < 2):
             steps[0] = steps[2]  # a single slice is as thick as its pixels are wide
-        origin = tuple(0.0 if c is None else float(c[0]) for c in reversed(centres))
-        step = triple(steps[::-1])
-        return Volume(field, step, origin, name=name, slope=scaling[0], intercept=scaling[1], unit=_length(axes))
+        step = options.spacing or triple(steps[::-1])
+        return Volume(field, step, origin, name=name, slope=scaling[0], intercept=scaling[1], unit=unit)
     if options.dims is None:
         uneven = [a for a, c in zip(axes, centres, strict=True) if c is not None and not even(c)]
         steps_text = ", ".join(_steps(a) for a in uneven)
@@ -335,11 +339,6 @@ def _left(
 
     field: Any = Stored(read, final, tuple(axes[k].size for k in zyx), [chunks[k] for k in zyx], source)
     return _placed(field, [axes[k] for k in zyx], (1.0, 0.0) if wide else scale, options, source, name)
-
-
-def _no_dims(options: ReadOptions, source: str, why: str) -> None:
-    if options.dims is not None:
-        raise UsageError(f"{source}: {why}; leave out --dims")
 
 
 def _descends(a: Axis, source: str) -> bool:

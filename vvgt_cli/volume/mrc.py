@@ -174,8 +174,8 @@ def read_mrc(path: Path, options: ReadOptions) -> Volume:
         block = select_component(block[..., None], options.component, str(path), label="a map")[0]
     spacing, direction = unit_rows([header.steps[a].tolist() for a in header.axes])
     origin = tuple(header.origin.tolist())
-    unit = "angstrom" if options.spacing is None else ""
-    return Volume(block, options.spacing_or(spacing), origin, direction, volume_name(path), density=True, unit=unit)
+    spacing = options.spacing_or(spacing)
+    return Volume(block, spacing, origin, direction, volume_name(path), density=True, unit="angstrom")
 
 
 _SUFFIXES = (".mrc", ".map", ".ccp4", ".rec", ".st", ".mrc.gz", ".map.gz", ".mrc.bz2", ".map.bz2")

@@ -250,7 +250,7 @@ def _placed(header: Header, field: np.ndarray, path: Path, options: ReadOptions)
         header.slope,
         header.intercept,
         space,
-        unit="mm" if header.unit_known and options.spacing is None else "",
+        unit="mm" if header.unit_known else "",
     )
 
 

@@ -47,7 +47,8 @@ class ReadOptions:
         dtype: a name of `DTYPES` (or a C-like alias such as ``ushort``) for a raw file.
         byte_order: ``little`` or ``big`` for a raw file (default little).
         header_bytes: bytes to skip at the start of a raw file.
-        spacing: voxel edges (x, y, z) in world units; overrides the file's.
+        spacing: voxel edges (x, y, z) along the index axes, in the file's unit, in place of the file's; the first
+            voxel and the directions stay. Not of values that stand at points (meshes).
         array: name of the array (path of a dataset, series of a DICOM folder), for formats that hold several.
         component: index of a component or channel, the name of a channel, or ``magnitude``, for arrays that have
             several.

@@ -61,6 +61,7 @@ Scheme = Callable[[str, ReadOptions], Volume]
 
 READERS: list[Reader] = []
 SCHEMES: dict[str, Scheme] = {}
+STEPPED: set[str] = set()  # of these, what may have time steps
 
 
 def register(reader: Reader) -> Reader:
@@ -73,9 +74,11 @@ def register(reader: Reader) -> Reader:
     return reader
 
 
-def register_scheme(name: str, open_scheme: Scheme) -> None:
-    """Make ``NAME:rest`` a source: ``open_scheme(rest, options) -> Volume``."""
+def register_scheme(name: str, open_scheme: Scheme, times: bool = False) -> None:
+    """Make ``NAME:rest`` a source: ``open_scheme(rest, options) -> Volume``; ``times``: it may have time steps."""
     SCHEMES[name] = open_scheme
+    if times:
+        STEPPED.add(name)
 
 
 def known_suffixes() -> list[str]:

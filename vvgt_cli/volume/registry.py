@@ -16,7 +16,7 @@ from vvgt_cli.errors import DataError, SeveralSteps, UsageError, VvgtError
 from vvgt_cli.files import seekable
 from vvgt_cli.volume.cut import crop, masked, parse_crop
 from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.readers import HEAD_BYTES, READERS, SCHEMES, Reader, known_suffixes
+from vvgt_cli.volume.readers import HEAD_BYTES, READERS, SCHEMES, STEPPED, Reader, known_suffixes
 from vvgt_cli.volume.space import in_space
 from vvgt_cli.volume.types import Volume
 
@@ -39,7 +39,7 @@ def read_volume(source: str, options: ReadOptions | None = None) -> Volume:
         UsageError: options that the format does not take, or a choice (array, component, dims) that is missing.
     """
     options = options or ReadOptions()
-    if options.time is not None and (source == "-" or source.partition(":")[0] in SCHEMES):
+    if options.time is not None and (source == "-" or source.partition(":")[0] in SCHEMES.keys() - STEPPED):
         raise UsageError(f"{source}: one volume, no time steps; leave out --time {options.time}")
     if options.crop is not None or options.mask is not None:
         options = replace(options, packed=False)
@@ -251,7 +251,10 @@ def _find(path: Path, head: bytes, options: ReadOptions) -> Reader:
 def _check_options(reader: Reader, source: str, options: ReadOptions) -> None:
     needless = [flag for flag in options.raw_flags if not (reader.resamples and flag == "--dims")]
     if not reader.raw_layout and needless:
-        raise UsageError(f"{source}: {reader.name}, which states its own layout; leave out {' '.join(needless)}")
+        raise UsageError(
+            f"{source}: {reader.name}, which states its own layout; leave out {' '.join(needless)} (--spacing is "
+            "taken; to read its bytes as raw values, pipe them in, with - as the source)"
+        )
     if options.time is not None and not reader.times:
         raise UsageError(
             f"{source}: a {reader.name} file, of which no time steps are known; leave out --time {options.time} (along "

@@ -16,7 +16,7 @@ from vvgt_cli.volume.types import Volume
 SPACES = ("RAS", "LPS")
 _OPPOSITE = {"R": "L", "L": "R", "A": "P", "P": "A", "S": "I", "I": "S"}
 _WORDS = {"right": "R", "left": "L", "anterior": "A", "posterior": "P", "superior": "S", "inferior": "I"}
-_MILLIMETRES = {
+MILLIMETRES = {
     "m": 1e3, "meter": 1e3, "metre": 1e3, "cm": 10.0, "mm": 1.0, "millimeter": 1.0, "millimetre": 1.0,
     "um": 1e-3, "µm": 1e-3, "μm": 1e-3, "micron": 1e-3, "microns": 1e-3, "micrometer": 1e-3, "nm": 1e-6,
 }  # fmt: skip
@@ -50,7 +50,7 @@ def in_space(volume: Volume, wanted: str | None) -> Volume:
 
 def millimetres(unit: str) -> float:
     """Length of a unit in mm; 1 for an unknown one."""
-    return _MILLIMETRES.get(unit.strip().strip('"').lower(), 1.0)
+    return MILLIMETRES.get(unit.strip().strip('"').lower(), 1.0)
 
 
 def world_axis(name: str, space: str | None) -> str:

@@ -89,7 +89,7 @@ def read_tiff(path: Path, options: ReadOptions) -> Volume:
             f"{path}: no distance between its slices; taken as wide as its pixels (--spacing X Y Z sets it)",
             stacklevel=2,
         )
-    return Volume(field, spacing, name=volume_name(path), unit="" if options.spacing else facts.length)
+    return Volume(field, spacing, name=volume_name(path), unit=facts.length)
 
 
 def _paged(layout: SeriesAxes, index: tuple[int | slice, ...], several: bool) -> bool:

@@ -48,6 +48,7 @@ def read_zarr(path: Path, options: ReadOptions) -> Volume:
         place, facts = _choose(path, options.array, options.level)
         _check_codecs(place, facts)
         array = zarr.open_array(store=str(place), mode="r")
+        _check_codecs(place, array.metadata.to_dict())  # a server may have answered zarr otherwise
         if int(np.prod(array.chunks, dtype=object)) * array.dtype.itemsize > MAX_CHUNK:
             raise DataError(f"{place}: chunks of {array.chunks} values; expected at most 2 GiB each")
         attributes = dict(array.attrs)
@@ -88,7 +89,11 @@ def _metadata(folder: Path) -> dict[str, Any]:
 
 def level_shapes(source: str, options: ReadOptions) -> list[tuple[int, ...]]:
     """Shapes of the levels of an OME-Zarr image, finest first; none where a source is no such image."""
-    path = Path(source)
+    return level_shapes_in(Path(source), options)
+
+
+def level_shapes_in(path: Path, options: ReadOptions) -> list[tuple[int, ...]]:
+    """`level_shapes` of a store."""
     here = path / (options.array or "").strip("/")
     if not here.is_dir() or not holds_zarr(here) or not here.resolve().is_relative_to(path.resolve()):
         return []

@@ -9,16 +9,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vvgt_cli.cameras.sets import pixel_width
+from vvgt_cli.closed_form.columns import COLUMNS
 from vvgt_cli.conversion.shards.plan import Plan
 from vvgt_cli.gaussians.ply import as_stored
 
 if TYPE_CHECKING:
     from vvgt_cli.closed_form.inset import Opaque
     from vvgt_cli.closed_form.tree import Leaves
+    from vvgt_cli.dvr.layout import Light
     from vvgt_cli.field.forest import Forest
     from vvgt_cli.gaussians import Gaussians
 
 BATCH = 1 << 16  # Gaussians that are made at once
+Node = tuple[list["Gaussians"], list[np.ndarray]]  # by level
 
 
 @dataclass(frozen=True)
@@ -28,41 +31,58 @@ class Cut:
     forest: Forest
     opaque: Opaque
     plan: Plan
+    light: Light | None = None
 
-    def gaussians(self, threshold: float) -> Iterator[Gaussians]:
-        """Those of the cells that a threshold leaves, in the box frame, as a file holds them, in batches."""
+    def gaussians(self, threshold: float) -> Iterator[tuple[Gaussians, np.ndarray | None]]:
+        """Those of the cells that a threshold leaves, in the box frame, as a file holds them, in batches.
+
+        With their normals (n, 3), None where nothing is lit.
+        """
+        from vvgt_cli.closed_form.lit import MEAN, directions
         from vvgt_cli.field.forest import batches
 
         for leaves in batches(self.forest.leaves(threshold), BATCH):
-            yield self.made(leaves)
+            lit = self._lit(leaves)
+            yield self.made(leaves), None if lit is None else directions(lit[:, MEAN])
 
-    def nodes(self, thresholds: np.ndarray) -> Iterator[tuple[list[Gaussians], list[np.ndarray]]]:
-        """Of each tile, for each of its ``thresholds`` (tiles, n): Gaussians, and `spread_of` their cells.
+    def nodes(self, thresholds: np.ndarray, begin: int = 0) -> Iterator[list[Node]]:
+        """Of each tile from ``begin`` on, for each of its ``thresholds`` (tiles, n): Gaussians, `spread_of` cells.
 
-        They are made some tiles at a time: the colours of neighbours matter to each other.
+        They are made some tiles at a time: the colours of neighbours matter to each other. So ``begin`` is 0, or where
+        some of an earlier call ended.
         """
         from vvgt_cli.closed_form.tree import spread_of
         from vvgt_cli.field.forest import joined
 
         waiting: list[list[Leaves]] = []
-        for row, leaves in enumerate(self.forest.cuts(thresholds)):
+        for row, leaves in enumerate(self.forest.cuts(thresholds, begin), begin):
             waiting.append(leaves)
             if sum(len(node[0]) for node in waiting) < BATCH and row + 1 < len(self.forest.tiles):
                 continue
             sizes = np.array([[len(part) for part in node] for node in waiting])
             whole = [self.made(joined([node[k] for node in waiting])) for k in range(sizes.shape[1])]
+            made = []
             for node, size, end in zip(waiting, sizes, np.cumsum(sizes, axis=0), strict=True):
                 parts = [each.take(np.arange(e - n, e)) for each, n, e in zip(whole, size, end, strict=True)]
-                yield parts, [spread_of(part) for part in node]
+                made.append((parts, [spread_of(part) for part in node]))
+            yield made
             waiting = []
 
     def made(self, leaves: Leaves) -> Gaussians:
         """Those of some cells, one each, in their order."""
         from vvgt_cli.closed_form.columns import MASS, SEEN
+        from vvgt_cli.closed_form.lit import colored
         from vvgt_cli.closed_form.shape import ROUND, cell_gaussians
         from vvgt_cli.closed_form.sharpen import sharpened
 
+        lit = self._lit(leaves)
         made = cell_gaussians(leaves, min(self.plan.grid.step), pixel_width(self.plan.size), self.opaque, ROUND)
+        if lit is not None and self.light is not None:
+            made = colored(made, self.light, lit, self.plan.degree)
         if not self.plan.labels:
             made = sharpened(made, leaves.moments[:, SEEN] / leaves.moments[:, MASS], self.opaque.half)
         return as_stored(made)
+
+    def _lit(self, leaves: Leaves) -> np.ndarray | None:
+        """What `Forest` has put after their moments; None where nothing is lit."""
+        return None if self.light is None else leaves.moments[:, COLUMNS:]

@@ -12,12 +12,14 @@ from vvgt_cli.conversion.shards.apart import errors_apart
 
 if TYPE_CHECKING:
     from vvgt_cli.conversion.shards.cut import Cut
+    from vvgt_cli.field.parts import Parts
 
 RUNGS = 10
 STEP = 4.0  # times the score from a rung to the next: a cell's grows as the fourth power of its edge
 FEWER = 9  # times fewer Gaussians from a level to the next: three times the edge, on a surface
 MOST_LEVELS = 6
 LEAST_PRICE, HALVINGS = 1e-12, 60  # of a Gaussian, in squared error; steps of its bisection
+FIELDS = ("counts", "squares", "energies", "pixels")
 FEWEST = 4  # Gaussians a node, on average, below which no further level is made
 
 
@@ -93,18 +95,27 @@ class Ladder:
         return {"errors": relative, "rms": [float(self.errors[row, rung]) for rung in rungs]}
 
 
-def measured(cut: Cut) -> Ladder:
-    """Make and draw `RUNGS` cuts of every node."""
+def measured(cut: Cut, parts: Parts, kind: str) -> Ladder:
+    """Make and draw `RUNGS` cuts of every node; what an interrupted run has left in ``parts`` is taken as it is.
+
+    Raises:
+        DataError: a part is damaged.
+    """
     forest = cut.forest
     finest = forest.threshold(cut.plan.budget)
     second = max(forest.threshold(max(forest.count(finest) // 2, 1)), np.finfo(float).tiny)
     values = np.array([finest, *(second * STEP ** np.arange(RUNGS - 1))])
     values = np.minimum(values, np.finfo(float).max)
-    counts, squares, energies, pixels = [], [], [], []
-    for made, _ in cut.nodes(np.tile(values, (len(forest.tiles), 1))):
-        square, energy, covered = errors_apart(made)
-        counts.append([len(gaussians) for gaussians in made])
-        squares.append(square)
-        energies.append(energy)
-        pixels.append(covered)
-    return Ladder(values, np.array(counts), np.array(squares), np.array(energies), np.array(pixels))
+    found: list[dict[str, Any]] = []
+    parts.prepare(kind)
+    while not parts.missing(kind, [done := sum(len(some["pixels"]) for some in found)]):
+        found.append(parts.load(kind, done))
+    for nodes in cut.nodes(np.tile(values, (len(forest.tiles), 1)), done):
+        squares, energies, pixels = zip(*(errors_apart(made) for made, _ in nodes), strict=True)
+        counts = [[len(gaussians) for gaussians in made] for made, _ in nodes]
+        arrays = map(np.array, (counts, squares, energies, pixels))
+        some: dict[str, Any] = dict(zip(FIELDS, arrays, strict=True))
+        parts.save(kind, done, **some)
+        found.append(some)
+        done += len(nodes)
+    return Ladder(values, **{name: np.concatenate([some[name] for some in found]) for name in FIELDS})

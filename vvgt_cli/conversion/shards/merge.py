@@ -12,9 +12,9 @@ from typing import IO, TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from vvgt_cli.conversion.request import VERTEX_BYTES
+from vvgt_cli.conversion.request import HARMONIC_BYTES, VERTEX_BYTES
 from vvgt_cli.conversion.shards.cut import Cut
-from vvgt_cli.conversion.shards.plan import Plan
+from vvgt_cli.conversion.shards.plan import Plan, load_light
 from vvgt_cli.conversion.shards.score import drawing_bytes, score_gaussians, score_text
 from vvgt_cli.conversion.shards.streamed import write_streamed
 from vvgt_cli.conversion.stages.closed_form import FAINT_LOGIT, FEWEST, NEARLY
@@ -28,12 +28,13 @@ from vvgt_cli.gaussians.outputs import STDOUT
 from vvgt_cli.gaussians.ply import ply_header, ply_rows
 from vvgt_cli.gaussians.rules import INRIA
 from vvgt_cli.gaussians.types import together
-from vvgt_cli.jit.ahead import MERGE
+from vvgt_cli.jit.ahead import MERGE, SHADE, for_degree
 from vvgt_cli.resources import free_memory
 from vvgt_cli.score.record import Run
 
 if TYPE_CHECKING:
     from vvgt_cli.closed_form.inset import Opaque
+    from vvgt_cli.dvr.layout import Light
     from vvgt_cli.field.forest import Coarse, Forest
     from vvgt_cli.gaussians import Gaussians
 
@@ -51,14 +52,15 @@ def write_merged(run: Run, parts: Parts, output: str, overwrite: bool) -> None:
     report = run.report
     report.volume, report.transfer_function = plan.volume, plan.function
     report.options = {"max_gaussians": plan.budget, "size": plan.size, "frame": plan.ply.frame, "up": plan.ply.up}
-    run.compile(MERGE)
+    light = load_light(parts, plan)
+    run.compile(for_degree((*MERGE, *(SHADE if light else ())), plan.degree))
     with run.stage("pyramid") as stage:
-        forest, opaque = pyramid(parts, plan)
+        forest, opaque = pyramid(parts, plan, light)
         stage.note = f"{forest.base} cells in {len(forest.tiles)} tiles"
     if is_streamed(output):
-        write_streamed(run, Cut(forest, opaque, plan), output, overwrite)
+        write_streamed(run, parts, Cut(forest, opaque, plan, light), output, overwrite)
         return
-    _write_ply(run, parts, Cut(forest, opaque, plan), output, overwrite)
+    _write_ply(run, parts, Cut(forest, opaque, plan, light), output, overwrite)
 
 
 def _write_ply(run: Run, parts: Parts, cut: Cut, output: str, overwrite: bool) -> None:
@@ -83,7 +85,7 @@ def _write_ply(run: Run, parts: Parts, cut: Cut, output: str, overwrite: bool) -
             run.report.scores, stage.note = asdict(found), score_text(found, size)
 
 
-def pyramid(parts: Parts, plan: Plan) -> tuple[Forest, Opaque]:
+def pyramid(parts: Parts, plan: Plan, light: Light | None = None) -> tuple[Forest, Opaque]:
     """The pyramid over all parts, and where bodies are opaque.
 
     Raises:
@@ -100,7 +102,7 @@ def pyramid(parts: Parts, plan: Plan) -> tuple[Forest, Opaque]:
     box = Box(np.array(grid.half), np.array(grid.step))
     extinction = (coarse.mass / (wide * box.step).prod()).astype(np.float32)
     seen = march_views(extinction, wide, box, default_views("train", size=MARCH_SIZE))
-    forest = Forest(parts, grid, seen, coarse, parts.folder / SCRATCH)
+    forest = Forest(parts, grid, seen, coarse, parts.folder / SCRATCH, light)
     if forest.top is None:
         raise NothingVisible(plan.volume["name"], plan.function["name"])
     return forest, _opaque(coarse, plan)
@@ -123,21 +125,25 @@ class Made(NamedTuple):
 
 def _write(cut: Cut, sink: IO[bytes], output: str) -> tuple[Made, int]:
     """Write the file; what it has, and how many Gaussians are left out since they would be too faint."""
+    from vvgt_cli.closed_form.lit import directions
+
     plan, first, free = cut.plan, 0, free_memory()
-    axes = np.array(plan.axes).reshape(3, 3)
+    axes, turned = np.array(plan.axes).reshape(3, 3), np.linalg.inv(np.array(plan.axes).reshape(3, 3))
+    degree = plan.degree if plan.ply.sh_degree is None else plan.ply.sh_degree
     while True:
         threshold = cut.forest.threshold(plan.budget)
         count = cut.forest.count(threshold)
         first = first or count
         if output != STDOUT:
-            check_room(output, count * VERTEX_BYTES)
+            check_room(output, count * (VERTEX_BYTES + HARMONIC_BYTES[degree]))
         sink.seek(0)
         sink.truncate()
-        sink.write(ply_header(count, plan.ply.sh_degree or 0, plan.ply))
+        sink.write(ply_header(count, degree, plan.ply))
         kept: list[Gaussians] | None = [] if free is None or drawing_bytes(count, plan.size) < free else None
         faint = 0
-        for gaussians in cut.gaussians(threshold):
-            sink.write(ply_rows(transform(gaussians, axes), plan.ply).data)
+        for gaussians, normals in cut.gaussians(threshold):
+            normals = None if normals is None else directions(normals @ turned)
+            sink.write(ply_rows(transform(gaussians, axes), plan.ply, normals).data)
             faint += int((gaussians.opacity_logits < FAINT_LOGIT).sum())
             if kept is not None:
                 kept.append(gaussians)

@@ -8,16 +8,21 @@ import math
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from vvgt_cli.conversion.request import VERTEX_BYTES
+import numpy as np
+
+from vvgt_cli.conversion.request import HARMONIC_BYTES, VERTEX_BYTES
+from vvgt_cli.dvr.layout import Light
 from vvgt_cli.errors import DataError
 from vvgt_cli.field.grid import Boxes, CellGrid
 from vvgt_cli.field.parts import ROW, Parts
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import PlyOptions
+from vvgt_cli.look.lighting import Lighting
 from vvgt_cli.score.record import plain
 
-PLAN = "plan.json"
+PLAN, LIGHT = "plan.json", "light.npz"
 A_SCORE, A_RAY = 20, 20  # bytes: of a base cell's scores with those above it, of what a block shows of a ray
+A_NORMAL = 24  # bytes of a base cell, where there is light
 A_GAUSSIAN = 8  # base cells there may be a Gaussian, where the budget is so large that it decides
 
 
@@ -33,6 +38,7 @@ class Plan:
         volume, function: as reports show them.
         rays: name of the file of the rays that it is scored by.
         labels: it is one of labels alone.
+        degree: of the harmonics that colours have under a light.
     """
 
     grid: CellGrid
@@ -44,9 +50,13 @@ class Plan:
     function: dict[str, Any]
     rays: str
     labels: bool = False
+    degree: int = 0
 
-    def save(self, parts: Parts) -> None:
-        """Write it beside the parts."""
+    def save(self, parts: Parts, light: Light | None) -> None:
+        """Write it beside the parts, and before it what falls on the volume."""
+        if light is not None:
+            with atomic_write(parts.folder / LIGHT, overwrite=True) as temporary, open(temporary, "wb") as stream:
+                np.savez(stream, allow_pickle=False, **light._asdict())
         with atomic_write(parts.folder / PLAN, overwrite=True) as temporary:
             temporary.write_text(json.dumps(plain(asdict(self)), indent=1), "utf-8")
 
@@ -64,6 +74,9 @@ class Plan:
             boxes = Boxes(*(tuple(grid["blocks"][key]) for key in ("dims", "edge")))
             grid = CellGrid(**{**{key: _tupled(value) for key, value in grid.items()}, "blocks": boxes})
             options = PlyOptions(**{key: _tupled(value) for key, value in ply.items()})
+            if options.light is not None:
+                light = {key: _tupled(value) for key, value in ply["light"].items()}
+                options = replace(options, light=Lighting(**light))
             return replace(cls(**{**found, "grid": grid, "ply": options}), axes=tuple(found["axes"]))
         except FileNotFoundError:
             raise DataError(
@@ -73,8 +86,24 @@ class Plan:
             raise DataError(f"{path}: damaged ({error}); remove it and run a shard again") from error
 
 
+def load_light(parts: Parts, plan: Plan) -> Light | None:
+    """What falls on the volume, None for nothing.
+
+    Raises:
+        DataError: the file beside the plan is missing or damaged.
+    """
+    if plan.ply.light is None:
+        return None
+    path = parts.folder / LIGHT
+    try:
+        with np.load(path) as found:
+            return Light(**{key: found[key] if found[key].ndim else found[key].item() for key in Light._fields})
+    except (OSError, ValueError, KeyError) as error:
+        raise DataError(f"{path}: damaged ({error}); remove {PLAN} beside it and run a shard again") from error
+
+
 def _tupled(value: Any) -> Any:
-    return tuple(value) if isinstance(value, list) else value
+    return tuple(map(_tupled, value)) if isinstance(value, list) else value
 
 
 def most_cells(budget: int) -> int:
@@ -84,9 +113,13 @@ def most_cells(budget: int) -> int:
     return max(in_memory(budget), A_GAUSSIAN * budget)
 
 
-def disk_bytes(grid: CellGrid, voxels: float, budget: int, rays: int) -> int:
-    """What parts and output take on disk, about, where ``voxels`` are visible and ``rays`` are marched."""
+def disk_bytes(grid: CellGrid, voxels: float, budget: int, rays: int, lit: bool, degree: int) -> int:
+    """What parts and output take on disk, about, where ``voxels`` are visible and ``rays`` are marched.
+
+    ``lit``: cells have normals, ``degree``: of the Gaussians' harmonics.
+    """
     cells = voxels / float(grid.cell.prod())
     met = rays * max(grid.blocks.shape) / 2  # blocks along a ray, half of which show something of it
     coarse = math.prod(-(-grid.dims // grid.tile)) * grid.tile_cells**3 * (8 / 8**grid.march + 4 / 8**grid.field)
-    return int(cells * (ROW + A_SCORE) + coarse + met * A_RAY + min(budget, cells) * VERTEX_BYTES)
+    row, vertex = ROW + A_SCORE + A_NORMAL * lit, VERTEX_BYTES + HARMONIC_BYTES[degree]
+    return int(cells * row + coarse + met * A_RAY + min(budget, cells) * vertex)

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from vvgt_cli.conversion.convert import ply_options
+from vvgt_cli.conversion.convert import degree_of, ply_options
 from vvgt_cli.conversion.place import remarks
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.conversion.shards.merge import write_merged
@@ -20,45 +20,35 @@ from vvgt_cli.field.cells import CellBlocks
 from vvgt_cli.field.open import Wanted, beside, blocked
 from vvgt_cli.field.parts import CELLS, Parts
 from vvgt_cli.field.settings import BlockOptions
-from vvgt_cli.field.source import SourceRequest, tf_record, volume_record
+from vvgt_cli.field.source import tf_record, volume_record
 from vvgt_cli.files import check_room
 from vvgt_cli.gaussians.formats import format_of
 from vvgt_cli.gaussians.formats.streamed import is_streamed
 from vvgt_cli.gaussians.outputs import STDOUT, Output, claimed, write_text
-from vvgt_cli.jit.ahead import DRAW, INIT, RENDER, for_blocks
-from vvgt_cli.look import read_transfer_function
+from vvgt_cli.jit.ahead import DRAW, INIT, RENDER, for_blocks, for_degree
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
 
 
 def streams(request: ConvertRequest) -> bool:
     """Whether a closed form in blocks is written batch by batch, without its Gaussians in memory at once."""
-    options, lit = request.blocks, _lit(request.source)
+    options = request.blocks
     if is_streamed(request.output):
-        if lit or request.fit.init != "vbm" or (options is not None and options.shard):
+        if request.fit.init != "vbm" or (options is not None and options.shard):
             raise UsageError(
-                f"-o {request.output} is made of unlit moments: leave out --light (--light none turns off that of the "
-                "function's file), --init and --shard, whose blocks 'vvgt merge' takes (docs/scale.md)"
+                f"-o {request.output} is made of moments: leave out --init and --shard, whose blocks 'vvgt merge' "
+                "takes (docs/scale.md)"
             )
         return True
     other = request.fit.init != "vbm" or bool(request.output and options is not None and format_of(request.output))
     if options is not None and options.shard is not None:
-        if lit or other:
+        if other:
             raise UsageError(
-                "--shard writes blocks of unlit moments: leave out --light (--light none turns off "
-                "that of the function's file), --init and other formats, or convert it as a whole (docs/scale.md)"
+                "--shard writes blocks of moments: leave out --init and other formats, or convert it as a whole "
+                "(docs/scale.md)"
             )
         return True
-    return options is not None and not (lit or other)
-
-
-def _lit(source: SourceRequest) -> bool:
-    """Whether there is light: that is asked for, or the function's file has it."""
-    light = source.light
-    if light.lights or light.shadows or light.occlusion is not None:
-        return light.lights != ("none",)
-    tf = read_transfer_function(source.tf) if isinstance(source.tf, str) else source.tf
-    return tf is not None and tf.lighting is not None
+    return options is not None and not other
 
 
 def init_in_blocks(request: ConvertRequest, console: Console | None = None) -> ConversionReport:
@@ -151,22 +141,23 @@ def make_parts(run: Run, request: ConvertRequest, options: BlockOptions, parts: 
         source, ply = field.source, ply_options(request, field.source)
         for line in remarks(source.volume, ply):
             run.console.say(line)
-        run.compile(for_blocks(source.kernels((RENDER, *INIT, *DRAW))), source.kernel_type())
+        degree = degree_of(request, source)
+        run.compile(for_degree(for_blocks(source.kernels((RENDER, *INIT, *DRAW))), degree), source.kernel_type())
         field.expect(scored_views(size))
         cells = field.cells(size, budget, wanted.most)
         assert cells.rays is not None
         Plan(
             cells.grid, budget, size, source.volume.direction, ply, volume_record(source),
-            tf_record(source, request.source), cells.rays.kind, source.labels_alone,
-        ).save(parts)  # fmt: skip
-        _check_disk(run, field, cells, budget)
+            tf_record(source, request.source), cells.rays.kind, source.labels_alone, degree,
+        ).save(parts, cells.light)  # fmt: skip
+        _check_disk(run, field, cells, budget, degree)
         with run.stage("integrate") as stage:
             done = field.do(cells, "integrate")
             workers = field.do.runner.workers
             stage.note = f"{done} of {len(cells)} blocks" + (f", {workers} workers" if workers > 1 else "")
 
 
-def _check_disk(run: Run, field: Blocked, cells: CellBlocks, budget: int) -> None:
+def _check_disk(run: Run, field: Blocked, cells: CellBlocks, budget: int, degree: int) -> None:
     """Say what the blocks will take on disk.
 
     Raises:
@@ -175,7 +166,7 @@ def _check_disk(run: Run, field: Blocked, cells: CellBlocks, budget: int) -> Non
     assert cells.rays is not None
     rays = sum(len(cast.pixels) * len(cast.offsets) for cast in cells.rays.bundles())
     parts = cells.parts
-    need = disk_bytes(cells.grid, field.visible, budget, rays) - parts.bytes(CELLS)
+    need = disk_bytes(cells.grid, field.visible, budget, rays, cells.light is not None, degree) - parts.bytes(CELLS)
     if need > 0 and parts.missing(CELLS, range(len(cells))):
         run.console.say(f"on disk meanwhile: about {need / 1e6:.0f} MB in {parts.folder}")
         check_room(parts.folder, need)

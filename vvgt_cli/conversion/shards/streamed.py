@@ -18,8 +18,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vvgt_cli.conversion.shards.ladder import measured
+from vvgt_cli.conversion.shards.plan import PLAN
 from vvgt_cli.conversion.shards.streamed_files import Files, Level, files_of
 from vvgt_cli.errors import UsageError
+from vvgt_cli.field.digests import digest
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import Gaussians, PlyOptions
 from vvgt_cli.gaussians.formats.page_file import upright
@@ -31,6 +33,7 @@ from vvgt_cli.version import VERSION
 
 if TYPE_CHECKING:
     from vvgt_cli.conversion.shards.cut import Cut
+    from vvgt_cli.field.parts import Parts
 
 # Of the unit frame. The engine shows level 0 nearer than 5 (`lodBaseDistance`) and level 1 nearer than 15, so that the
 # whole is seen in level 1 from where `vvgt render --orbit` begins, at 3 in the unit frame.
@@ -53,8 +56,10 @@ def folder_of(output: str) -> Iterator[None]:
                 folder.rmdir()
 
 
-def write_streamed(run: Run, cut: Cut, output: str, overwrite: bool) -> None:
+def write_streamed(run: Run, parts: Parts, cut: Cut, output: str, overwrite: bool) -> None:
     """Write the files and, last of all, the manifest.
+
+    What is done of it is noted in ``parts``: errors by some nodes at a time, and files that are whole.
 
     Raises:
         UsageError: a frame in which distances are not the engine's.
@@ -63,15 +68,18 @@ def write_streamed(run: Run, cut: Cut, output: str, overwrite: bool) -> None:
         raise UsageError(f"-o {output}: levels go by distances in the unit frame; leave out --frame")
     forest = cut.forest
     with run.stage("errors") as stage:
-        ladder = measured(cut)
+        key = digest((parts.folder / PLAN).read_text("utf-8"))[:16]
+        ladder = measured(cut, parts, f"errors-{key}")
         choices = ladder.levels()
         levels = [Level(number) for number in range(len(choices))]
         stage.note = f"{len(levels)} levels of {len(forest.tiles)} nodes"
-    files, nodes, before = Files(Path(output).absolute().parent), [], files_of(Path(output))
+    before, nodes, folder = files_of(Path(output)), list[dict[str, Any]](), Path(output).absolute().parent
+    files = Files(folder, parts, f"written-{digest(key, str(folder))[:16]}")
     with run.stage("write") as stage, atomic_write(Path(output), overwrite) as temporary:
-        for row, (made, spreads) in enumerate(cut.nodes(ladder.thresholds[np.stack(choices, axis=1)])):
-            rungs = [choice[row] for choice in choices]
-            nodes.append(_node(cut, files, levels, made, spreads) | ladder.facts(row, rungs))
+        for some in cut.nodes(ladder.thresholds[np.stack(choices, axis=1)]):
+            for made, spreads in some:
+                rungs = [choice[len(nodes)] for choice in choices]
+                nodes.append(_node(cut, files, levels, made, spreads) | ladder.facts(len(nodes), rungs))
         for level in levels:
             files.write(level)
         facts = [ladder.rms(choice) for choice in choices]
@@ -91,7 +99,10 @@ def _node(
     cut: Cut, files: Files, levels: list[Level], made: list[Gaussians], spreads: list[np.ndarray]
 ) -> dict[str, Any]:
     """Put a node into the files; its entry in the manifest."""
-    axes, options = np.array(cut.plan.axes).reshape(3, 3), replace(upright(cut.plan.ply), sh_degree=0, comments=False)
+    axes, options = (
+        np.array(cut.plan.axes).reshape(3, 3),
+        replace(upright(cut.plan.ply), sh_degree=cut.plan.degree, comments=False),
+    )
     lods, low, high = {}, np.full(3, np.inf), np.full(3, -np.inf)
     for level, gaussians, spread in zip(levels, made, spreads, strict=True):
         splats = _scaled(gaussians, axes, options)

@@ -5,16 +5,16 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from vvgt_cli.errors import DataError
+from vvgt_cli.field.parts import Parts
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians.formats.sog_images import IMAGES, META, images_of, webp
-from vvgt_cli.gaussians.formats.splats import Splats, morton_order
+from vvgt_cli.gaussians.formats.splats import Splats, joined, morton_order
 from vvgt_cli.gaussians.formats.streamed import read_manifest
 
 A_FILE = 1 << 17  # Gaussians of a file, or a node more
@@ -43,10 +43,14 @@ class Level:
 
 
 class Files:
-    """Those of all levels; ``names`` of their `meta.json`, as the manifest has them."""
+    """Those of all levels; ``names`` of their `meta.json`, as the manifest has them.
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
+    A part ``kind`` of ``parts`` says of each file that it is whole, and its bytes: it is not written again.
+    """
+
+    def __init__(self, folder: Path, parts: Parts, kind: str) -> None:
+        self._folder, self._parts, self._kind = folder, parts, kind
+        parts.prepare(kind)
         self.names: list[str] = []
         self._begun: dict[int, int] = {}  # number of the name of each level's next file
 
@@ -67,16 +71,11 @@ class Files:
         """Write the file that is waiting, if there is one."""
         if not level.rows:
             return
-        columns = ("means", "log_scales", "quaternions", "logits", "f_dc", "f_rest")
-        joined: dict[str, Any] = {
-            name: np.concatenate([getattr(part, name) for part in level.waiting]) for name in columns
-        }
-        images, meta = images_of(replace(level.waiting[0], **joined))
-        target = self._folder / self.names[self._begun.pop(level.number)]
-        target.parent.mkdir(exist_ok=True)
-        for name, image in images.items():
-            level.bytes += _put(target.with_name(name), webp(image))
-        level.bytes += _put(target, json.dumps(meta, separators=(",", ":")).encode())
+        number = self._begun.pop(level.number)
+        target = self._folder / self.names[number]
+        if not target.is_file() or self._parts.missing(self._kind, [number]):
+            self._parts.save(self._kind, number, size=np.array(_written(target, joined(level.waiting))))
+        level.bytes += int(self._parts.load(self._kind, number)["size"])
         level.waiting, level.rows, level.files = [], 0, level.files + 1
 
     def remove_others(self, before: Sequence[str]) -> None:
@@ -95,6 +94,14 @@ def files_of(manifest: Path) -> list[str]:
         return list(read_manifest(manifest)["filenames"])
     except (DataError, OSError):
         return []
+
+
+def _written(target: Path, splats: Splats) -> int:
+    """Write `meta.json` and, before it, its images; their bytes."""
+    images, meta = images_of(splats)
+    target.parent.mkdir(exist_ok=True)
+    size = sum(_put(target.with_name(name), webp(image)) for name, image in images.items())
+    return size + _put(target, json.dumps(meta, separators=(",", ":")).encode())
 
 
 def _put(path: Path, content: bytes) -> int:

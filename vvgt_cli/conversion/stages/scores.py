@@ -10,10 +10,20 @@ from vvgt_cli.conversion.request import FitOptions
 from vvgt_cli.conversion.stage import Cost, Stage, Work
 from vvgt_cli.field.field import Picture
 from vvgt_cli.field.workload import Workload
-from vvgt_cli.score.viewing import PREVIEW_VIEWS, SIDE, condition_views, from_above, score_conditions, seat_pictures
+from vvgt_cli.score.viewing import (
+    PREVIEW_VIEWS,
+    SIDE,
+    condition_views,
+    from_above,
+    glance_cameras,
+    score_conditions,
+    score_texture,
+    seat_pictures,
+)
 from vvgt_cli.score.views import WHOLE, psnr_note, score_test_views, scored
 
 SCORE, SCORE_ALL = (3, 0, 0.03), (10, len(WHOLE), 0.1)  # views, whole ones of them, seconds beside per 400 x 400 px
+TEXTURE = 0.05  # seconds beside the reference per 400 x 400 px
 SEATS = 2, 0.15, 0.155  # check views, and seconds beside them: always, per 100,000 Gaussians
 
 
@@ -65,30 +75,38 @@ class TestViews(Stage):
 
 @dataclass(frozen=True)
 class ViewingConditions(Stage):
-    """Every rule at the size made for and above; left out where time is up."""
+    """Every rule at the size made for and above, and texture on smooth areas; left out where time is up."""
 
     name: ClassVar[str] = "seats"
     scores: ClassVar[bool] = True
 
     def cost(self, case: Workload) -> Cost:
         """By pixels and Gaussians."""
-        return Cost(SEATS[0] * case.glance + case.pace * (SEATS[1] + SEATS[2] * case.gaussians / 1e5))
+        near = (case.size // 2) ** 2
+        beside = SEATS[1] + SEATS[2] * case.gaussians / 1e5 + TEXTURE * near / 400**2
+        return Cost(SEATS[0] * case.glance + case.judging(near) + case.pace * beside)
 
     def views(self, fit: FitOptions) -> list[Picture]:
         """What is scored."""
         from vvgt_cli.dvr import RenderSettings
 
         wanted = seat_pictures(from_above(fit.size), SIDE, FEW)
-        return [Picture(camera, RenderSettings(), blocks) for _, camera, blocks in wanted]
+        seats = [Picture(camera, RenderSettings(), blocks) for _, camera, blocks in wanted]
+        return [*seats, *(Picture(camera, RenderSettings()) for camera in glance_cameras(fit.size))]
 
     def run(self, work: Work) -> None:
         """Score."""
-        run, budget = work.run, work.limits.time_budget
+        from vvgt_cli.dvr import RenderSettings
+
+        run, budget, fit = work.run, work.limits.time_budget, work.fit
         if budget is not None and run.elapsed() > budget:
             run.leave_out(self.name, "time is up")
             return
         with run.stage(self.name) as stage:
-            seen = condition_views(work.field, from_above(work.fit.size), views=SIDE, enough=FEW)
-            seats = score_conditions(work.made(), seen)
+            made, settings = work.made(), RenderSettings()
+            seen = condition_views(work.field, from_above(fit.size), settings, views=SIDE, enough=FEW)
+            seats = score_conditions(made, seen)
             run.report.seats = [asdict(seat) for seat in seats]
+            near = glance_cameras(fit.size)
+            run.report.texture = asdict(score_texture(work.field, made, fit.size, fit.rule, settings, cameras=near))
             stage.note = f"worst of {len(seats)}: {seats[0].name()}, {seats[0].psnr:.2f} dB"

@@ -8,12 +8,16 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from vvgt_cli.errors import DataError
 from vvgt_cli.files import seekable
 from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions, read_ply
 from vvgt_cli.gaussians.formats import gltf, gsply_files, page_file, page_live, sog, usd
-from vvgt_cli.gaussians.formats.splats import Splats, gaussians_of, splats_of
-from vvgt_cli.gaussians.formats.streamed import is_streamed
+from vvgt_cli.gaussians.formats.levels import Levels, split_name
+from vvgt_cli.gaussians.formats.splats import Splats, columns_of, gaussians_of, splats_of
+from vvgt_cli.gaussians.header import parse_header
+from vvgt_cli.gaussians.ply import check_size
 
 _HEAD = 1024  # bytes that tell a .ply of another kind
 _LARGEST = 1 << 32  # bytes of a file that is read whole
@@ -43,6 +47,7 @@ class Format:
 
 FORMATS = (
     Format(".compressed.ply", gsply_files.compressed_ply, gsply_files.read_compressed_ply, gsply_files.gsply),
+    Format(".v4.spz", gsply_files.spz_4, gsply_files.read_spz, gsply_files.zstandard),
     Format(".spz", gsply_files.spz, gsply_files.read_spz, gsply_files.gsply),
     Format(".sog", sog.sog, sog.read_sog, lambda name: None),
     Format(".glb", gltf.glb, gltf.read_glb, lambda name: None),
@@ -77,11 +82,10 @@ def encoded(known: Format, gaussians: Gaussians, options: PlyOptions, name: str)
     """
     if known.suffix == ".html":
         options = page_file.dated(options)
-    several = options.live is not None and bool(options.live.others)
-    if gaussians.live is not None and options.live is not None and known.live is not None and not several:
+    if gaussians.live is not None and options.live is not None and known.live is not None:
         return known.live(gaussians, options, name)
     if gaussians.live is not None:
-        why = "a page shows one layer live" if known.live else f"{known.suffix} has no columns for values"
+        why = f"{known.suffix} has no columns for values"
         warnings.warn(f"{name}: {why}: it has the one look that is baked in", stacklevel=2)
         gaussians, options = replace(gaussians, live=None), replace(options, live=None)
     return known.write(splats_of(gaussians, known.layout(options)), name)
@@ -89,7 +93,7 @@ def encoded(known: Format, gaussians: Gaussians, options: PlyOptions, name: str)
 
 def is_splats(path: str | Path) -> bool:
     """Whether a path is a file of Gaussians by its name, or by the `ply` that it begins with."""
-    if Path(path).name.lower().endswith(SUFFIXES):
+    if Path(path).name.lower().endswith(SUFFIXES) or split_name(path):
         return True
     try:
         with open(seekable(path), "rb") as stream:
@@ -101,17 +105,39 @@ def is_splats(path: str | Path) -> bool:
 def read_splats(path: str | Path) -> tuple[Gaussians, PlyHeader]:
     """Read a file of Gaussians of any format, in the frame that it is in; the header's comments are the file's.
 
+    Of streamed levels those that the name asks for (`vvgt_cli.gaussians.formats.levels`).
+
     Raises:
+        UsageError: no such level.
         DataError: not a file of its format, or its library is not installed.
     """
+    streamed = split_name(path)
+    if streamed is not None:
+        return gaussians_of(Levels(streamed[0]).level(streamed[1]), str(path))
     known, place = format_of(path) or _compressed(path), seekable(path)
-    if is_streamed(path):
-        raise DataError(f"{path}: levels of detail; expected one cloud: 'vvgt init -o OUT.ply' makes that of level 0")
     if known is None:
         return read_ply(path)
     if place.stat().st_size > _LARGEST:
         raise DataError(f"{path}: more than 4 GiB; expected less of this format, or a standard .ply")
     return gaussians_of(known.read(place.read_bytes(), str(path)), str(path))
+
+
+def read_columns(path: str | Path) -> Splats:
+    """The columns of a file of Gaussians of any format as they are, finite or not; rotations of length 0 are NaN.
+
+    Raises:
+        DataError: as `read_splats`, but for values.
+    """
+    streamed = split_name(path)
+    if streamed is not None:
+        return Levels(streamed[0]).level(streamed[1])
+    known = format_of(path) or _compressed(path)
+    content, name = seekable(path).read_bytes(), str(path)
+    if known is not None:
+        return known.read(content, name)
+    check_size(parse_header(content[: 1 << 18], name), len(content), name)
+    with np.errstate(invalid="ignore"):
+        return columns_of(content, name)
 
 
 def _compressed(path: str | Path) -> Format | None:

@@ -1,19 +1,21 @@
 """Binary glTF with KHR_gaussian_splatting: float32 attributes of a mesh of points, nothing rounded.
 
-The data are the `.ply`'s, in its axes; the node turns them by 180 degrees about z, to glTF's +y upwards.
+The data are the `.ply`'s, in its axes; the node turns them by 180 degrees about z, to glTF's +y upwards, and places
+them in the world in metres, where that is known.
 """
 
 from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from vvgt_cli.errors import DataError
+from vvgt_cli.gaussians.formats.metres import placed, same_place
 from vvgt_cli.gaussians.formats.splats import Splats, logits_of, opacities_of
+from vvgt_cli.gaussians.frames import rotations
 from vvgt_cli.version import VERSION
 
 EXTENSION = "KHR_gaussian_splatting"
@@ -48,13 +50,19 @@ def glb(splats: Splats, name: str) -> bytes:
         start += part.nbytes
     accessors[0] |= {"min": splats.means.min(axis=0).tolist(), "max": splats.means.max(axis=0).tolist()}
     attributes = {attribute: k for k, attribute in enumerate(columns)}
+    place = placed(splats.comments, name)
+    node: dict[str, Any] = {"mesh": 0, "rotation": _HALF_TURN}
+    if place.world is not None:
+        node |= {"translation": place.translation.tolist(), "scale": [place.scale] * 3}
+        told = {"space": place.space, "unit": place.unit, "worldFromScene": place.world.ravel().tolist()}
+        node["extras"] = told  # row by row
     primitive = {"attributes": attributes, "mode": _POINTS, "extensions": {EXTENSION: _KERNEL}}
     document = {
         "asset": {"version": "2.0", "generator": f"vvgt {VERSION}", "extras": {"comments": list(splats.comments)}},
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "rotation": _HALF_TURN}],
+        "nodes": [node],
         "meshes": [{"primitives": [primitive]}],
         "buffers": [{"byteLength": start}],
         "bufferViews": views,
@@ -108,13 +116,14 @@ def _read(content: bytes, name: str) -> Splats:
         values = np.frombuffer(binary, "<f4", accessor["count"] * width, start)
         return values.reshape(-1, width) if width > 1 else values
 
-    _only_the_half_turn(document["nodes"])
+    comments = tuple(str(line).replace("\n", " ") for line in document["asset"].get("extras", {}).get("comments", []))
+    (node,) = document["nodes"]
+    same_place(_matrix(node), comments, name)
     known = [m for m in range(15) if _harmonic(m) in attributes]
     means, count = column("POSITION", 3), len(column("POSITION", 3))
     f_rest = [column(_harmonic(m), 3) for m in known]
     with np.errstate(divide="ignore"):
         log_scales = np.log(column(f"{EXTENSION}:SCALE", 3).astype(np.float64))
-    comments = document["asset"].get("extras", {}).get("comments", [])
     return Splats(
         means,
         np.maximum(log_scales, -80).astype(np.float32),
@@ -122,14 +131,16 @@ def _read(content: bytes, name: str) -> Splats:
         logits_of(column(f"{EXTENSION}:OPACITY", 1)),
         column(f"{EXTENSION}:SH_DEGREE_0_COEF_0", 3),
         np.stack(f_rest, axis=1) if f_rest else np.zeros((count, 0, 3), np.float32),
-        tuple(str(line).replace("\n", " ") for line in comments),
+        comments,
     )
 
 
-def _only_the_half_turn(nodes: Sequence[dict[str, Any]]) -> None:
-    """Raise ValueError for nodes that place the mesh otherwise than `glb` does."""
-    placed = [
-        {key: node[key] for key in node if key in ("rotation", "translation", "scale", "matrix")} for node in nodes
-    ]
-    if placed != [{"rotation": _HALF_TURN}]:
-        raise ValueError("its nodes place the mesh otherwise")
+def _matrix(node: dict[str, Any]) -> np.ndarray:
+    """(4, 4) of a node, for columns of coordinates."""
+    if "matrix" in node:
+        return np.reshape(node["matrix"], (4, 4)).T.astype(np.float64)
+    x, y, z, w = node.get("rotation", [0.0, 0.0, 0.0, 1.0])
+    result = np.eye(4)
+    result[:3, :3] = rotations(np.array([[w, x, y, z]], np.float64))[0] * np.array(node.get("scale", [1.0] * 3))
+    result[:3, 3] = node.get("translation", [0.0] * 3)
+    return result

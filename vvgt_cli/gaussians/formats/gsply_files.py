@@ -1,4 +1,4 @@
-"""`.spz` (Niantic's, version 3) and `.compressed.ply` (PlayCanvas') through gsply."""
+"""`.spz` (Niantic's, versions 3 and 4) and `.compressed.ply` (PlayCanvas') through gsply."""
 
 from __future__ import annotations
 
@@ -12,12 +12,15 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
+from vvgt_cli.gaussians.formats import spz4
 from vvgt_cli.gaussians.formats.splats import Splats, morton_order
+from vvgt_cli.gaussians.header import MIP
 from vvgt_cli.volume.libraries import library_errors, need
 
 EXTRA = "share"
 _FRACTION = 20  # bits of a coordinate behind the point, where its 23 leave as many: 1e-6
 _COMMENT = 16  # gzip's flag for a comment in its header (RFC 1952)
+_FLAGS = 14  # byte of the header; 1: opacity is to be compensated ("antialiased")
 _FRONT = struct.Struct("<2sBBIBB")  # magic, method, flags, time, extra flags, system
 
 
@@ -59,6 +62,26 @@ def read_compressed_ply(content: bytes, name: str) -> Splats:
 
 def spz(splats: Splats, name: str) -> bytes:
     """An `.spz` of version 3, in the axes of the `.ply`; its gzip header's comment holds the `.ply`'s comments."""
+    return _packed(_version_3(splats, name), splats.comments)
+
+
+def spz_4(splats: Splats, name: str) -> bytes:
+    """An `.spz` of version 4, with records that hold the comments and say that the axes are the `.ply`'s."""
+    return spz4.from_version_3(_version_3(splats, name), splats.comments, name)
+
+
+def zstandard(source: str) -> None:
+    """What `spz_4` needs.
+
+    Raises:
+        DataError: gsply or numcodecs is not installed.
+    """
+    gsply(source)
+    spz4.library(source)
+
+
+def _version_3(splats: Splats, name: str) -> bytes:
+    """The content of an `.spz` of version 3, not packed, with the flag of Gaussians that are to be compensated."""
     library = gsply(name)
     largest = max(float(np.abs(splats.means).max()), 1e-6)
     bits = min(int(np.floor(np.log2((2**23 - 1) / largest))), _FRACTION)
@@ -70,7 +93,9 @@ def spz(splats: Splats, name: str) -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "out.spz"
         library.write_spz(path, data, version=3, fractional_bits=bits)
-        return _packed(gzip.decompress(path.read_bytes()), s.comments)
+        content = bytearray(gzip.decompress(path.read_bytes()))
+    content[_FLAGS] |= MIP in s.comments
+    return bytes(content)
 
 
 def _packed(content: bytes, comments: tuple[str, ...]) -> bytes:
@@ -82,16 +107,19 @@ def _packed(content: bytes, comments: tuple[str, ...]) -> bytes:
 
 
 def read_spz(content: bytes, name: str) -> Splats:
-    """The columns of an `.spz`.
+    """The columns of an `.spz` of version 1 to 4.
 
     Raises:
         DataError: gsply cannot read it, or is not installed.
     """
     library = gsply(name)
+    comments = _comments(content)
+    if content.startswith(spz4.MAGIC):
+        content, comments = spz4.to_version_3(content, name)
     with library_errors(name, "an .spz"), tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "in.spz"
         path.write_bytes(content)
-        return _columns(library.read_spz(path), _comments(content))
+        return _columns(library.read_spz(path), comments)
 
 
 def _comments(content: bytes) -> list[str]:

@@ -10,6 +10,7 @@ from dataclasses import replace
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians.formats.sog_images import META, MOST, images_of, splats_in, webp
 from vvgt_cli.gaussians.formats.splats import Splats, morton_order
+from vvgt_cli.gaussians.header import MIP
 from vvgt_cli.volume.libraries import library_errors
 
 COMMENTS = "vvgt.json"  # a member of the archive that others pass over
@@ -26,6 +27,7 @@ def sog(splats: Splats, name: str) -> bytes:
     if len(splats) > MOST:
         raise DataError(f"{name}: {len(splats):,} Gaussians; expected at most {MOST:,} in a .sog; try a .ply")
     images, meta = images_of(splats.take(morton_order(splats.means)))
+    meta |= {"model": "antialiased"} if MIP in splats.comments else {}
     members = {META: json.dumps(meta, separators=(",", ":")).encode()}
     members |= {file: webp(image) for file, image in images.items()}
     members[COMMENTS] = json.dumps(list(splats.comments)).encode()

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
+from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions, read_ply, write_ply
 from vvgt_cli.gaussians.header import parse_header
 from vvgt_cli.gaussians.ply import property_names
 
 HARMONICS = {0: 0, 1: 3, 2: 8, 3: 15}  # a channel, above degree 0
+COLUMNS = ("means", "log_scales", "quaternions", "logits", "f_dc", "f_rest")
 DEGREES = {count: degree for degree, count in HARMONICS.items()}
 
 
@@ -42,8 +46,20 @@ class Splats:
 
     def take(self, order: np.ndarray) -> Splats:
         """A permutation or a part of them."""
-        names = ("means", "log_scales", "quaternions", "logits", "f_dc", "f_rest")
-        return replace(self, **{name: getattr(self, name)[order] for name in names})
+        return replace(self, **{name: getattr(self, name)[order] for name in COLUMNS})
+
+
+def joined(parts: Sequence[Splats]) -> Splats:
+    """All of several, one after the other, with the comments of the first.
+
+    Raises:
+        DataError: of several degrees of harmonics.
+    """
+    degrees = sorted({DEGREES[part.f_rest.shape[1]] for part in parts})
+    if len(degrees) > 1:
+        raise DataError(f"Gaussians with harmonics of degrees {degrees}; expected one")
+    columns: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in COLUMNS}
+    return replace(parts[0], **columns)
 
 
 def splats_of(gaussians: Gaussians, options: PlyOptions) -> Splats:

@@ -30,10 +30,12 @@ def read_manifest(path: str | Path) -> dict[str, Any]:
         DataError: it is another file, or damaged.
     """
     path = Path(path)
-    if path.stat().st_size > _LARGEST:
-        raise DataError(f"{path}: more than {_LARGEST >> 20} MiB; expected a manifest of streamed SOG")
     try:
+        if path.stat().st_size > _LARGEST:
+            raise DataError(f"{path}: more than {_LARGEST >> 20} MiB; expected a manifest of streamed SOG")
         found = json.loads(path.read_bytes())
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror}); expected a manifest of streamed SOG") from None
     except (ValueError, RecursionError) as error:
         raise DataError(f"{path}: no JSON ({' '.join(str(error).split())[:200]}); expected streamed SOG") from None
     levels = found.get("lodLevels") if isinstance(found, dict) else None

@@ -1,6 +1,7 @@
 """OpenUSD's `ParticleField3DGaussianSplat` (OpenUSD 26.3 or newer) through usd-core: float32, nothing rounded.
 
-The data are the `.ply`'s, in its axes; the prim is turned by 180 degrees about z, to the stage's +y upwards.
+The data are the `.ply`'s, in its axes; the prim is turned by 180 degrees about z, to the stage's +y upwards, and placed
+in the world in metres, where that is known.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
+from vvgt_cli.gaussians.formats.metres import placed, same_place
 from vvgt_cli.gaussians.formats.splats import DEGREES, Splats, logits_of, opacities_of
 from vvgt_cli.volume.libraries import library_errors, need
 
@@ -37,7 +39,7 @@ def library(source: str) -> Any:
 def usdc(splats: Splats, name: str) -> bytes:
     """A `.usdc` of the columns: one prim, /Splats."""
     usd = library(name)
-    from pxr import Sdf, UsdGeom, UsdVol, Vt
+    from pxr import Gf, Sdf, UsdGeom, UsdVol, Vt
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "out.usdc"
@@ -48,7 +50,14 @@ def usdc(splats: Splats, name: str) -> bytes:
         prim = field.GetPrim()
         stage.SetDefaultPrim(prim)
         stage.GetRootLayer().customLayerData = {_COMMENTS: "\n".join(splats.comments)}
-        UsdGeom.Xformable(prim).AddRotateZOp().Set(180.0)
+        place, xform = placed(splats.comments, name), UsdGeom.Xformable(prim)
+        if place.world is not None:
+            xform.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*place.translation.tolist()))
+        xform.AddRotateZOp().Set(180.0)
+        if place.world is not None:
+            xform.AddScaleOp().Set(Gf.Vec3f(place.scale))
+            world = Gf.Matrix4d(*place.world.T.ravel().tolist())  # USD multiplies rows of coordinates
+            prim.SetCustomData({"space": place.space, "unit": place.unit, "worldFromScene": world})
         scales = np.exp(splats.log_scales.astype(np.float64)).astype(np.float32)
         harmonics = np.concatenate([splats.f_dc[:, None], splats.f_rest], axis=1)
         reach = _SEEN * scales.max(axis=1, keepdims=True)
@@ -93,18 +102,14 @@ def _read(stage: Any, name: str) -> Splats:
     if len(prims) != 1:
         raise DataError(f"{name}: {len(prims)} prims of type {KIND}; expected one")
     (prim,) = prims
-    turn = np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(0.0))
-    if not np.allclose(turn, np.diag([-1.0, -1.0, 1.0, 1.0]), atol=1e-6):
-        raise DataError(
-            f"{name}: {prim.GetPath()} is placed otherwise than vvgt places it: turned by 180 degrees about z"
-        )
+    comments = tuple(str(stage.GetRootLayer().customLayerData.get(_COMMENTS, "")).splitlines())
+    same_place(np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(0.0)).T, comments, name)
 
     def values(attribute: str) -> np.ndarray:
         return np.array(prim.GetAttribute(attribute).Get(), np.float32)
 
     means, scales = values("positions"), values("scales")
     harmonics = values("radiance:sphericalHarmonicsCoefficients").reshape(len(means), -1, 3)
-    said = str(stage.GetRootLayer().customLayerData.get(_COMMENTS, ""))
     with np.errstate(divide="ignore"):
         log_scales = np.maximum(np.log(scales.astype(np.float64)), -80)
     return Splats(
@@ -114,5 +119,5 @@ def _read(stage: Any, name: str) -> Splats:
         logits_of(values("opacities")),
         np.ascontiguousarray(harmonics[:, 0]),
         np.ascontiguousarray(harmonics[:, 1:]),
-        tuple(said.splitlines()),
+        comments,
     )

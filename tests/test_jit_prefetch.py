@@ -1,0 +1,37 @@
+"""Memory that is asked for ahead of time: an instruction, and no other effect."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import numba as nb
+import numpy as np
+
+from vvgt_cli.jit.prefetch import prefetch
+
+
+@nb.njit
+def total(rows, order):
+    found = 0.0
+    for i in range(order.shape[0]):
+        prefetch(rows, order[min(i + 2, order.shape[0] - 1)], 1)
+        found += rows[order[i], 1]
+    return found
+
+
+def test_a_line_is_asked_for_and_nothing_else_changes():
+    rows = np.arange(30, dtype=np.float32).reshape(10, 3)
+    order = np.array([9, 0, 4], np.int32)
+    assert total(rows, order) == 28 + 1 + 13
+    assert any("llvm.prefetch" in code for code in total.inspect_llvm().values())
+    assert np.array_equal(rows, np.arange(30).reshape(10, 3))
+
+
+def test_in_plain_python_nothing_is_asked_for():
+    call = "from vvgt_cli.jit.prefetch import prefetch; print(prefetch(None, 0, 0))"
+    done = subprocess.run(
+        [sys.executable, "-c", call], env=os.environ | {"NUMBA_DISABLE_JIT": "1"}, capture_output=True, text=True
+    )
+    assert (done.stdout.strip(), done.stderr) == ("None", "")

@@ -1,0 +1,108 @@
+"""Light on what is written batch by batch: streamed levels and merged shards, against the closed form in memory."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.test_scale import bodies
+from vvgt_cli.closed_form.columns import MASS, SEEN
+from vvgt_cli.closed_form.lit import base_rows
+from vvgt_cli.conversion.shards.merge import pyramid
+from vvgt_cli.conversion.shards.plan import Plan, load_light
+from vvgt_cli.field.parts import Parts
+from vvgt_cli.gaussians import Gaussians, read_ply
+from vvgt_cli.gaussians.formats import read_splats
+
+FIT = ("--max-gaussians", "9000", "--size", "150", "--up", "z", "-q")
+LIGHTS = {
+    "head": ("--light", "headlight"),
+    "shadows": ("--light", "1,0.3,2", "--shadows", "--ambient-occlusion", "0.3"),
+}
+
+
+@pytest.fixture(scope="module")
+def volume(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("lit") / "v_100x90x80_uint8.raw"
+    path.write_bytes(np.round(bodies() * 255).astype(np.uint8).tobytes())
+    return path
+
+
+def nearest(found: Gaussians, expected: Gaussians) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of ``found`` for every 20th that is expected, and those; of pairs that are at one place."""
+    rows = np.arange(0, len(expected), 20)
+    apart = [np.linalg.norm(found.means - expected.means[k], axis=1) for k in rows]
+    near = np.array([distance.argmin() for distance in apart])
+    same = np.array([distance.min() for distance in apart]) < 1e-3
+    assert same.mean() > 0.9
+    return near[same], rows[same]
+
+
+@pytest.mark.parametrize("light", LIGHTS)
+def test_levels_are_lit_as_the_closed_form_in_memory(vvgt, volume: Path, tmp_path: Path, light: str) -> None:
+    out = tmp_path / "out" / "lod-meta.json"
+    assert vvgt("convert", volume, *FIT, *LIGHTS[light], "--blocks", "32", "-o", out).code == 0
+    assert vvgt("init", volume, *FIT, *LIGHTS[light], "-o", tmp_path / "a.ply").code == 0
+    (found, header), (expected, told) = read_splats(out), read_ply(tmp_path / "a.ply")
+    assert header.light == told.light
+    assert found.degree == expected.degree == 2
+    ours, theirs = nearest(found, expected)
+    colors = np.abs(found.colors[ours] - expected.colors[theirs])
+    assert np.median(colors) < 0.01
+    assert np.quantile(colors, 0.95) < 0.06
+    assert found.harmonics is not None
+    assert expected.harmonics is not None
+    assert np.abs(expected.harmonics).mean() > 0.01
+    assert np.median(np.abs(found.harmonics[ours] - expected.harmonics[theirs])) < 0.01
+
+
+def test_merged_shards_have_the_bytes_of_one_run(vvgt, volume: Path, tmp_path: Path) -> None:
+    lit = LIGHTS["shadows"]
+    for blocks in ("32", "64"):
+        assert vvgt("init", volume, *FIT, *lit, "--blocks", blocks, "-o", tmp_path / f"{blocks}.ply").code == 0
+    for _ in range(2):
+        for shard in ("1/2", "2/2"):
+            line = ("init", volume, *FIT, *lit, "--blocks", "32", "--shard", shard, "-o", tmp_path / "parts")
+            assert vvgt(*line).code == 0
+    assert vvgt("merge", tmp_path / "parts", "-q", "-o", tmp_path / "merged.ply").code == 0
+    assert vvgt("merge", tmp_path / "parts", "-q", "-o", tmp_path / "m" / "lod-meta.json").code == 0
+    assert vvgt("convert", volume, *FIT, *lit, "-o", tmp_path / "c" / "lod-meta.json").code == 0
+    one, *others = ((tmp_path / name).read_bytes() for name in ("32.ply", "64.ply", "merged.ply"))
+    assert all(other == one for other in others)
+    files = [{p.relative_to(f): p.read_bytes() for p in f.rglob("*.*")} for f in (tmp_path / "m", tmp_path / "c")]
+    assert files[0] == files[1]
+    plan = Plan.load(parts := Parts(tmp_path / "parts"))
+    forest, _ = pyramid(parts, plan, load_light(parts, plan))
+    top = forest.top
+    assert top is not None
+    (root,) = forest.leaves(np.finfo(float).max)
+    first, last = base_rows(top, np.array([len(top) - 1]))
+    assert (first[0], last[0]) == (0, len(forest.tiles))
+    tiles = [cuts[0].moments[0] for cuts in forest.cuts(np.full((len(forest.tiles), 1), np.finfo(float).max))]
+    seen = np.array([row[SEEN] for row in tiles])
+    np.testing.assert_allclose(root.moments[0, : MASS + 1], np.sum([row[: MASS + 1] for row in tiles], axis=0))
+    np.testing.assert_allclose(root.moments[0, 17:], np.average([row[17:] for row in tiles], axis=0, weights=seen))
+
+
+def test_normals_of_a_merged_file_point_along_the_gradient(vvgt, volume: Path, tmp_path: Path) -> None:
+    assert vvgt("init", volume, *FIT, *LIGHTS["head"], "-o", tmp_path / "a.ply").code == 0
+    assert vvgt("init", volume, *FIT, *LIGHTS["head"], "--blocks", "32", "-o", tmp_path / "b.ply").code == 0
+    normals, clouds = [], []
+    for name in ("a.ply", "b.ply"):
+        content = (tmp_path / name).read_bytes()
+        clouds.append(read_ply(tmp_path / name)[0])
+        rows = np.frombuffer(content[-len(clouds[-1]) * (17 + 24) * 4 :], "<f4").reshape(len(clouds[-1]), -1)
+        normals.append(rows[:, 3:6])
+    ours, theirs = nearest(clouds[1], clouds[0])
+    cosines = (normals[1][ours] * normals[0][theirs]).sum(axis=1)
+    assert np.median(cosines) > 0.97
+
+
+def test_a_damaged_light_is_told(vvgt, volume: Path, tmp_path: Path) -> None:
+    line = ("init", volume, *FIT, *LIGHTS["head"], "--blocks", "64", "--shard", "1/1", "-o", tmp_path / "parts")
+    assert vvgt(*line).code == 0
+    (tmp_path / "parts" / "light.npz").write_bytes(b"PK")
+    found = vvgt("merge", tmp_path / "parts", "-o", tmp_path / "a.ply")
+    assert (found.code, "light.npz: damaged" in found.error) == (1, True), found.error

@@ -1,0 +1,142 @@
+"""Zarr behind an address: an OME-Zarr on a server of this machine, whole, in blocks, and lazily by xarray and Dask."""
+
+from __future__ import annotations
+
+import functools
+import json
+import sys
+import threading
+from collections.abc import Iterator
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import vvgt_cli
+from tests.test_scale import bodies
+from vvgt_cli.errors import DataError
+from vvgt_cli.volume import ReadOptions, read_volume
+from vvgt_cli.volume.levels import level_shapes
+from vvgt_cli.volume.remote import Remote
+
+zarr = pytest.importorskip("zarr")
+FIT = ("--max-gaussians", "2000", "--size", "100", "-q")
+
+
+class Handler(SimpleHTTPRequestHandler):
+    """Files of a folder; ``asked``: the paths."""
+
+    asked: list[str]
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+    def do_GET(self) -> None:
+        self.asked.append(self.path)
+        super().do_GET()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An OME-Zarr of two levels, 2 um voxels, and a plain array with steps."""
+    folder = tmp_path_factory.mktemp("remote")
+    values = np.round(bodies() * 255).astype(np.uint8)
+    group = zarr.open_group(store=str(folder / "x.ome.zarr"), mode="w", zarr_format=3)
+    levels = []
+    for number, some in enumerate((values, values[::2, ::2, ::2])):
+        array = group.create_array(str(number), shape=some.shape, chunks=(32, 32, 32), dtype="uint8")
+        array[:] = some
+        scale = {"type": "scale", "scale": [2.0 * 2**number] * 3}
+        levels.append({"path": str(number), "coordinateTransformations": [scale]})
+    axes = [{"name": name, "type": "space", "unit": "micrometer"} for name in "zyx"]
+    group.attrs["ome"] = {"version": "0.5", "multiscales": [{"axes": axes, "datasets": levels}]}
+    steps = zarr.open_array(store=str(folder / "t.zarr"), mode="w", zarr_format=2, shape=(2, 8, 9, 10), dtype="uint8")
+    steps[1] = 7
+    steps.attrs["_ARRAY_DIMENSIONS"] = ["time", "z", "y", "x"]
+    return folder
+
+
+@pytest.fixture
+def address(folder: Path) -> Iterator[str]:
+    pytest.importorskip("aiohttp")
+    Handler.asked = []
+    server = ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Handler, directory=str(folder)))
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    yield f"http://127.0.0.1:{server.server_address[1]}"
+    server.shutdown()
+    server.server_close()
+
+
+def test_an_address_is_read_as_the_folder(address: str, folder: Path) -> None:
+    here, there = (read_volume(f"{place}/x.ome.zarr") for place in (folder, address))
+    np.testing.assert_array_equal(np.asarray(there.data), np.asarray(here.data))
+    assert (there.spacing, there.origin, there.name) == (here.spacing, here.origin, here.name)
+    assert there.unit == here.unit
+    inner = read_volume(f"{address}/x.ome.zarr:/1")
+    assert inner.dims == (50, 45, 40)
+    assert level_shapes(f"{address}/x.ome.zarr", ReadOptions()) == [(80, 90, 100), (40, 45, 50)]
+    assert int(np.asarray(read_volume(f"{address}/t.zarr", ReadOptions(time=1)).data).min()) == 7
+
+
+def test_only_the_chunks_that_are_needed_are_asked_for(address: str) -> None:
+    volume = read_volume(f"{address}/x.ome.zarr", ReadOptions(stored=True))
+    assert not [path for path in Handler.asked if "/c/" in path]
+    some = np.asarray(volume.data[:20, :20, :20])
+    assert some.shape == (20, 20, 20)
+    assert len({path for path in Handler.asked if "/c/" in path}) == 1
+
+
+def test_converted_in_blocks_it_has_the_bytes_of_the_folder(vvgt, address: str, folder: Path, tmp_path: Path) -> None:
+    for name, place in (("a", folder), ("b", address)):
+        line = ("init", f"{place}/x.ome.zarr", *FIT, "--blocks", "32", "--workers", "2", "--no-comments")
+        assert vvgt(*line, "-o", tmp_path / f"{name}.ply").code == 0
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+    assert vvgt("convert", f"{address}/x.ome.zarr", *FIT, "--steps", 0, "-o", tmp_path / "c.ply").code == 0
+    facts = json.loads(vvgt("info", f"{address}/x.ome.zarr", "--json").out)
+    assert facts["dims"] == [100, 90, 80]
+
+
+def test_what_xarray_and_dask_have_of_an_address_stays_lazy(address: str) -> None:
+    dask, xarray = pytest.importorskip("dask.array"), pytest.importorskip("xarray")
+    array = dask.from_zarr(f"{address}/x.ome.zarr/0")
+    named = xarray.DataArray(array, dims=("z", "y", "x"), name="bodies")
+    assert not [path for path in Handler.asked if "/c/" in path]
+    goal = {"max_gaussians": 500, "size": 60, "steps": 0}
+    found = vvgt_cli.convert(named, None, goal, blocks=32)
+    assert len(found.gaussians) > 100
+    assert [path for path in Handler.asked if "/c/" in path]
+
+
+def test_what_cannot_be_is_a_line(vvgt, address: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    for place, text in (
+        (f"{address}/none.zarr", "no Zarr there"),
+        (f"{address}/x.ome.zarr:/7", "no array 7"),
+        ("http://127.0.0.1:9/x.zarr", "or no answer"),
+    ):
+        done = vvgt("convert", place, "-o", tmp_path / "a.ply")
+        assert (done.code in (1, 2), text in done.error, "\n" in done.error.strip()) == (True, True, False), done.error
+    monkeypatch.setitem(sys.modules, "aiohttp", None)
+    done = vvgt("info", f"{address}/x.ome.zarr")
+    assert (done.code, "pip install 'vvgt[remote]'" in done.error) == (1, True), done.error
+
+
+def test_other_codecs_than_were_checked_are_refused(
+    address: str, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told = json.loads((folder / "t.zarr" / ".zarray").read_text()) | {"compressor": {"id": "zlib", "level": 1}}
+    real = Remote.read_text
+    told_of = lambda self, encoding: json.dumps(told) if self.name == ".zarray" else real(self, encoding)  # noqa: E731
+    monkeypatch.setattr(Remote, "read_text", told_of)
+    monkeypatch.setattr("vvgt_cli.volume.zarr_store._CODECS", {"zlib"})  # the array itself has another one
+    with pytest.raises(DataError, match="codec"):
+        read_volume(f"{address}/t.zarr", ReadOptions(time=0))
+
+
+def test_paths_stay_inside_the_store() -> None:
+    store = Remote(None, "http://h/x.zarr")
+    for name, inside in (("a/b", True), ("a/../b", True), ("../y.zarr", False), ("/etc", True), ("a/../../y", False)):
+        assert (store / name).resolve().is_relative_to(store.resolve()) == inside
+    assert str(store / "/etc") == "http://h/x.zarr/etc"
+    assert str(store.parent) == "http://h"
+    assert (store / "a").relative_to(store).as_posix() == "a"

@@ -1,0 +1,166 @@
+"""Cases of a file of Gaussians, whatever wrote it: what can be seen without its volume, and where its Gaussians lie."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from itertools import permutations, product
+
+import numpy as np
+
+from vvgt_cli.cameras import Camera, default_views
+from vvgt_cli.checks import Case, Figure
+from vvgt_cli.gaussians import Gaussians
+from vvgt_cli.gaussians.constants import MIN_ALPHA
+from vvgt_cli.gaussians.formats.splats import Splats
+from vvgt_cli.gaussians.frames import transform
+from vvgt_cli.gaussians.ply import opacity
+from vvgt_cli.gaussians.rules import INRIA, Rule
+from vvgt_cli.splat import project, render
+
+COLUMNS = {
+    "centres": "means", "sizes": "log_scales", "rotations": "quaternions", "opacities": "logits", "colours": "f_dc",
+    "harmonics": "f_rest",
+}  # fmt: skip
+LOOKED_FROM = 3.0  # radius of the default views, unit frame
+OUTSIDE = 0.03  # of the box's edge: how far outside it a centre may lie, and still belong to its surface
+SMALL = 96  # pixels of the pictures that orientations are told by
+HALF = 2.0**-25  # of a number: how far float32 rounds it, at most
+
+
+def finite(columns: Splats) -> np.ndarray:
+    """(K,) bool: rows of nothing but finite numbers, whose rotation has a length."""
+    rows = [np.isfinite(getattr(columns, name)).reshape(len(columns), -1).all(axis=1) for name in COLUMNS.values()]
+    result: np.ndarray = np.logical_and.reduce(rows)
+    return result
+
+
+def row_cases(columns: Splats, good: np.ndarray) -> Iterator[Case]:
+    """Rows of the file that no program can draw, or that its numbers are too coarse for; ``good`` (K,) of `finite`."""
+
+    def broken(name: str) -> Figure:
+        rows = np.isfinite(getattr(columns, name)).reshape(len(columns), -1).all(axis=1)
+        return Figure(f"rows of {len(columns)}", int(np.count_nonzero(~rows)), 0)
+
+    for what, name in COLUMNS.items():
+        yield Case("file", f"{what} that are not finite", partial(broken, name))
+
+    def rounded() -> Figure:
+        far = np.abs(columns.means[good].astype(np.float64)).max(axis=1)
+        largest = np.exp(np.clip(columns.log_scales[good].astype(np.float64), -700, 700)).max(axis=1)
+        return Figure("share of Gaussians", float(np.mean(far * HALF > largest / 10)), 1e-3)
+
+    yield Case("file", "centres that float32 rounds by a tenth of sigma", rounded)
+
+
+def value_cases(gaussians: Gaussians, edge: float | None, size: int) -> Iterator[Case]:
+    """Extreme sizes, opacities and colours.
+
+    Args:
+        gaussians: unit frame, if they are of a volume.
+        edge: the volume's longest; None: where most of the centres lie.
+        size: pixels of the screen.
+    """
+    sigma = np.exp(np.clip(gaussians.log_scales.astype(np.float64), -700, 700))
+    length, alpha, largest = edge or _extent(gaussians, sigma), opacity(gaussians), sigma.max(axis=1)
+
+    def share(of: np.ndarray) -> float:
+        return float(np.average(of, weights=np.maximum(alpha, 1e-12)))
+
+    def faint() -> Figure:
+        return Figure("share of Gaussians", float(np.mean(alpha < MIN_ALPHA)), 0.5)
+
+    def tiny() -> Figure:
+        pixels = largest / (length / 2) * size / (2 * np.tan(np.radians(20)) * LOOKED_FROM)
+        return Figure("share of the opacity", share(pixels < 0.25), 0.5)
+
+    def gaudy() -> Figure:
+        return Figure("share of the opacity", share(np.abs(gaussians.colors - 0.5).max(axis=1) > 1.0), 0.01)
+
+    yield Case("values", "largest sigma", lambda: Figure("of the longest edge", float(largest.max() / length), 1.0))
+    yield Case("values", f"sigma below a quarter of a pixel at {size} px", tiny)
+    yield Case("values", "too faint for viewers to draw", faint)
+    yield Case("values", "colours outside -0.5 to 1.5", gaudy)
+
+
+def _extent(gaussians: Gaussians, sigma: np.ndarray) -> float:
+    low, high = np.percentile(gaussians.means.astype(np.float64), (1, 99), axis=0)
+    return float((high - low).max() + 6 * np.median(sigma))
+
+
+def place_cases(
+    gaussians: Gaussians, world: Gaussians, half: np.ndarray, seen: list[np.ndarray], rule: Rule = INRIA
+) -> Iterator[Case]:
+    """Where Gaussians lie in the volume's box, and which way round.
+
+    Args:
+        gaussians: box frame; ``world``: the same, if the numbers of the file are taken as world coordinates.
+        half: (3,) of the box's edges.
+        seen: what `small_views` show of the volume, (h, w, 4) float32 each.
+        rule: to draw by at that size.
+    """
+
+    def share(of: Gaussians) -> float:
+        beyond = (np.abs(of.means.astype(np.float64)) > half + 2 * OUTSIDE).any(axis=1)
+        return float(np.average(beyond, weights=opacity(of) + 1e-12))
+
+    def outside() -> Figure:
+        found, other = share(gaussians), share(world)
+        hint = f" ({other:.2g} of it, taken as world coordinates)" if other < found / 10 else ""
+        return Figure(f"share of the opacity{hint}", found, 0.002)
+
+    def turned() -> Figure:
+        error = {}
+        for name, matrix in orientations():
+            pictures = [render(transform(gaussians, matrix), camera, rule) for camera in small_views()]
+            error[name] = float(np.mean([np.square(a - b).mean() for a, b in zip(seen, pictures, strict=True)]))
+        own, best = error["x y z"], min(error, key=lambda name: error[name])
+        gain = 10 * np.log10((own + 1e-12) / (error[best] + 1e-12))
+        hint = "" if best == "x y z" else f" with axes {best}{', a mirror image' if mirrored(best) else ''}"
+        return Figure(f"dB that it looks more like the volume{hint}", float(gain), 1.0)
+
+    yield Case("place", "centres outside the volume's box", outside)
+    yield Case("place", "the other way round", turned)
+
+
+def small_views() -> list[Camera]:
+    """Views by which orientations are told apart."""
+    cameras = default_views("check", size=SMALL)
+    return [cameras[i] for i in (0, 1, 2)]
+
+
+def orientations() -> Iterator[tuple[str, np.ndarray]]:
+    """The 48 ways to lay the axes of a file: name, such as ``x -z y``, and matrix (3, 3)."""
+    for order in permutations(range(3)):
+        for signs in product((1, -1), repeat=3):
+            name = " ".join(f"{'-' if sign < 0 else ''}{'xyz'[axis]}" for axis, sign in zip(order, signs, strict=True))
+            yield name, np.eye(3)[list(order)] * np.array(signs)[:, None]
+
+
+def mirrored(name: str) -> bool:
+    """Whether an orientation shows a mirror image."""
+    return float(np.linalg.det(dict(orientations())[name])) < 0
+
+
+def order_cases(gaussians: Gaussians, camera: Camera) -> Iterator[Case]:
+    """What depends on the order that viewers draw in, and how much there is to draw.
+
+    Args:
+        gaussians: box frame; ``camera``: that looks at them.
+    """
+
+    def order() -> Figure:
+        far = project(gaussians, camera, by_distance=True)
+        a, b = render(gaussians, camera), render(gaussians, camera, projection=far)
+        return Figure("RMS of RGBA", float(np.sqrt(np.mean(np.square(a - b)))), 0.02)
+
+    def deepest() -> Figure:
+        tiles = np.diff(project(gaussians, camera).start)
+        return Figure("Gaussians over 16 x 16 pixels", int(tiles.max(initial=0)), 65536)
+
+    def bright() -> Figure:
+        return Figure("of a pixel's channel", float(render(gaussians, camera).max(initial=0)), 1.5)
+
+    yield Case("order", "sorted by distance, not by depth", order)
+    yield Case("order", "the deepest tile", deepest)
+    yield Case("order", "the brightest pixel", bright)

@@ -1,0 +1,151 @@
+"""Zarr and OME-Zarr on a server: ``http://HOST/x.ome.zarr``, ``https://HOST/x.zarr:/array``, by fsspec.
+
+Chunks are read as they are needed; every other format has to be a file of this machine.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cached_property, partial
+from pathlib import Path, PurePosixPath
+from typing import Any, NamedTuple, cast
+
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.volume.libraries import library_errors, need
+from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.readers import register_scheme
+from vvgt_cli.volume.types import Volume
+from vvgt_cli.volume.zarr_store import MAX_METADATA, holds_zarr, level_shapes_in, read_zarr
+
+SCHEMES = ("http", "https")
+
+
+class _Size(NamedTuple):
+    st_size: int
+
+
+class Remote:
+    """A place, with what `zarr_store` asks of a path; what has been read is kept."""
+
+    def __init__(self, system: Any, root: str, inner: str = "", kept: dict[str, bytes | None] | None = None) -> None:
+        self._system, self._root, self._inner = system, root, PurePosixPath(inner)
+        self._kept: dict[str, bytes | None] = {} if kept is None else kept
+
+    def __str__(self) -> str:
+        return self._root if self._inner == PurePosixPath() else f"{self._root}/{self._inner}"
+
+    def __truediv__(self, name: str) -> Remote:
+        return self._at(self._inner / name.lstrip("/"))
+
+    def _at(self, inner: PurePosixPath) -> Remote:
+        return Remote(self._system, self._root, str(inner), self._kept)
+
+    def __eq__(self, other: object) -> bool:
+        return str(self) == str(other)
+
+    def __hash__(self) -> int:
+        return hash(str(self))
+
+    def __lt__(self, other: Remote) -> bool:
+        return str(self) < str(other)
+
+    @property
+    def name(self) -> str:
+        return str(self).rpartition("/")[2]
+
+    @property
+    def parent(self) -> Remote:
+        if self._inner == PurePosixPath():
+            return Remote(self._system, self._root.rpartition("/")[0], "", self._kept)
+        return self._at(self._inner.parent)
+
+    def resolve(self) -> PurePosixPath:
+        """Without "..": as if the store were "/store"."""
+        parts = ["store"]
+        for part in self._inner.parts:
+            parts = parts[:-1] if part == ".." else [*parts, part]
+        return PurePosixPath("/", *parts)
+
+    def relative_to(self, other: Remote) -> PurePosixPath:
+        return self._inner.relative_to(other._inner)
+
+    @cached_property
+    def _content(self) -> bytes | None:
+        url = str(self)
+        if url not in self._kept:
+            try:
+                size = self._system.size(url)
+                if size is not None and size > MAX_METADATA:
+                    raise DataError(f"{url}: {size} bytes; expected metadata of at most 16 MiB")
+                self._kept[url] = self._system.cat_file(url)
+            except FileNotFoundError:
+                self._kept[url] = None
+        return self._kept[url]
+
+    def is_file(self) -> bool:
+        return self._content is not None
+
+    def is_symlink(self) -> bool:
+        return False
+
+    def is_dir(self) -> bool:
+        return True
+
+    def iterdir(self) -> list[Remote]:
+        return [self / Path(entry["name"].rstrip("/")).name for entry in self._system.ls(str(self))]
+
+    def stat(self) -> _Size:
+        return _Size(len(self._content or b""))
+
+    def read_text(self, encoding: str) -> str:
+        return (self._content or b"").decode(encoding)
+
+
+def _opened(url: str, options: ReadOptions) -> tuple[Path, ReadOptions]:
+    """The store of an address, as `zarr_store` takes paths, and the options with what is after ``:/`` as their array.
+
+    Raises:
+        DataError: a library is not installed, no answer, or no Zarr.
+        UsageError: two arrays.
+    """
+    head, _, inner = url.rpartition(":/")
+    if head in SCHEMES:
+        head, inner = url, ""
+    if inner and options.array is not None:
+        raise UsageError(f"{url}: --array {options.array} and :/{inner} choose both; leave out one")
+    for module in ("fsspec", "aiohttp"):
+        need(module, "remote", url, "an address")
+    with library_errors(url, "Zarr"):
+        system, root = need("fsspec", "remote", url, "an address").url_to_fs(head.rstrip("/"))
+        place = cast(Path, Remote(system, root))
+        if not holds_zarr(place):
+            raise DataError(
+                f"{url}: no Zarr there, or no answer (of another format download the file); expected .../x.ome.zarr"
+            )
+    return place, replace(options, array=inner or options.array)
+
+
+def read_remote(url: str, options: ReadOptions) -> Volume:
+    """Read one array, chunk by chunk where the options leave it stored.
+
+    Raises:
+        DataError, UsageError: as `read_zarr`, or an address with nothing behind it.
+    """
+    return read_zarr(*_opened(url, options))
+
+
+def level_shapes(url: str, options: ReadOptions) -> list[tuple[int, ...]]:
+    """Shapes of the levels of an OME-Zarr image, finest first; none where there is no such image.
+
+    Raises:
+        DataError, UsageError: as `read_remote`.
+    """
+    return level_shapes_in(*_opened(url, options))
+
+
+def _read(scheme: str, rest: str, options: ReadOptions) -> Volume:
+    return read_remote(f"{scheme}:{rest}", options)
+
+
+for _name in SCHEMES:
+    register_scheme(_name, partial(_read, _name), times=True)
