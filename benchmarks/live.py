@@ -82,7 +82,7 @@ def measured(name: str, field: Resident, gaussians: int, beside: bool) -> list[d
     live = wide_enough(carrying(run, foggy, placed_by(run, foggy, request)), SIZE)
     seconds = time.process_time() - start
     facts = LiveFacts.of(source.volume, source.statistics, source.tf)
-    packed = replace(live, live=from_bytes(live_bytes(live, facts), live_json([live], facts, 1.0)))
+    packed = replace(live, live=from_bytes(live_bytes(live, facts), live_json([live], facts, [1.0])))
     rows, pixel = [], pixel_width(SIZE)
     for title, tf in functions(source.statistics).items():
         spacing = float(np.mean(source.volume.spacing))

@@ -217,7 +217,7 @@ def test_what_the_fog_hides_is_there() -> None:
 def test_bytes_for_pages_lose_little() -> None:
     """About 0.1 dB at most, of a file that is 34 dB from its volume."""
     some = cloud(400, 3)
-    stream, known = live_bytes(some, facts()), live_json([some], facts(), 0.05)
+    stream, known = live_bytes(some, facts()), live_json([some], facts(), [0.05])
     assert stream.shape == (400, 8)
     assert json.loads(json.dumps(known)) == known
     back = replace(some, live=from_bytes(stream, known))

@@ -1,4 +1,5 @@
-"""Labels and light of live pages in a real browser, by clicking, dragging and typing."""
+# ruff: noqa: F811
+"""Labels, layers and light of live pages in a real browser, by clicking, dragging and typing."""
 
 from __future__ import annotations
 
@@ -10,9 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 from browser import PAGES, browser, packages
+from test_live_layers import pair  # noqa: F401
 
 from vvgt_cli.cameras import orbit_views
 from vvgt_cli.cli.main import run
+from vvgt_cli.conversion.gaussian_files import open_gaussians
 from vvgt_cli.gaussians import read_ply
 from vvgt_cli.images import read_png
 from vvgt_cli.images.metrics import psnr
@@ -24,13 +27,16 @@ Actions = list[dict[str, Any]]
 pytestmark = pytest.mark.long
 
 
-def after(file: Path, actions: Actions, folder: Path, window: tuple[int, int] = DESK) -> np.ndarray:
-    """Picture (SIZE, SIZE, 3) of the page of a file, after ``actions`` in a window."""
+def after(
+    file: Path, actions: Actions, folder: Path, window: tuple[int, int] = DESK, before: str | None = None
+) -> np.ndarray:
+    """Picture (SIZE, SIZE, 3) of the page of a file, after JavaScript and ``actions`` in a window."""
     page = file.with_suffix(".html")
     if not page.exists():
         assert run(["view", str(file), "-o", str(page), "--quiet"]) == 0
     job = {
         "browser": browser(), "url": page.as_uri(), "size": SIZE, "camera": None, "frame": None,
+        "before": before,
         "actions": actions, "window": window, "look": str(folder / "look.png"), "out": str(folder / "a.png"),
     }  # fmt: skip
     (folder / "job.json").write_text(json.dumps(job))
@@ -41,10 +47,10 @@ def after(file: Path, actions: Actions, folder: Path, window: tuple[int, int] = 
 
 
 def ours(file: Path, folder: Path, *look: str) -> np.ndarray:
-    """What `vvgt recolor` makes of a file, as `vvgt render --orbit` begins; the file is not turned."""
+    """What `vvgt recolor` makes of a file, as `vvgt render --orbit` begins."""
     out = folder / "ours.ply"
     assert run(["recolor", str(file), *look, "--quiet", "--overwrite", "-o", str(out)]) == 0
-    return render(read_ply(out)[0], orbit_views(1, size=SIZE)[0], rule="inria")[..., :3]
+    return render(open_gaussians(str(out))[0], orbit_views(1, size=SIZE)[0], rule="inria")[..., :3]
 
 
 @pytest.fixture(scope="module")
@@ -140,3 +146,27 @@ def test_a_frame_of_a_series_is_shown_under_the_function_of_the_page(tmp_path: P
     again = after(tmp_path / "all.ply", [{"select": "#series select", "text": "f1.npy"}, *ramp], tmp_path)
     assert psnr(other, again) > 40
     assert psnr(other, shot) < 30
+
+
+def test_layers_are_changed_one_at_a_time(pair: Path, tmp_path: Path) -> None:
+    """The function of the second one, chosen in the list, and then the label of the third one."""
+    magma = {"points": [{"x": 0.3, "rgb": [0, 0.4, 1], "opacity": 0}, {"x": 0.6, "rgb": [1, 1, 1], "opacity": 0.9}]}
+    (tmp_path / "other.json").write_text(json.dumps(magma))
+    live = pair / "live.ply"
+    begun = after(live, [], tmp_path)
+    own = ours(live, tmp_path)
+    print(f"layers as in the file: {psnr(own, begun):.2f} dB")
+    assert psnr(own, begun) > 32
+    nodes = json.dumps([{"x": p["x"], "y": p["opacity"], "rgb": p["rgb"]} for p in magma["points"]])
+    look = ("--layer", f"right,tf={tmp_path / 'other.json'},distance=paraview")
+    wanted = ours(live, tmp_path, *look)
+    shot = after(live, [], tmp_path, before=f"window.vvgt.live.layers[1].set({nodes})")
+    print(f"another function of the second: {psnr(wanted, shot):.2f} dB, not {psnr(own, shot):.2f}")
+    assert psnr(wanted, shot) > max(32, psnr(own, shot) + 5)
+    (tmp_path / "off.json").write_text(json.dumps({"3": {"name": "top", "color": [0, 0, 1], "opacity": 1e-6}}))
+    wanted = ours(live, tmp_path, "--layer", f"top,labels={tmp_path / 'off.json'}")
+    for window in (DESK, PHONE):
+        actions: Actions = [{"select": "#live .layer", "text": "top_label"}, {"click": "#live .organs li .eye"}]
+        shot = after(live, actions if window == DESK else [{"click": "#live .fold"}, *actions], tmp_path, window)
+        print(f"{window}: the label of the third off: {psnr(wanted, shot):.2f} dB, not {psnr(own, shot):.2f}")
+        assert psnr(wanted, shot) > max(32, psnr(own, shot) + 5)

@@ -105,7 +105,7 @@ def test_bytes_for_pages_hold_the_label() -> None:
     live = some.live.copy()  # type: ignore[union-attr]
     live[:, 6] = np.linspace(0, 299, len(live)).round()
     some = replace(some, live=live)
-    stream, known = live_bytes(some, facts(many)), live_json([some], facts(many), 0.05)
+    stream, known = live_bytes(some, facts(many)), live_json([some], facts(many), [0.05])
     np.testing.assert_array_equal(from_bytes(stream, known)[:, 6], live[:, 6])
     assert json.loads(json.dumps(known)) == known
 
@@ -114,8 +114,8 @@ def test_names_of_labels_are_no_markup_in_the_page() -> None:
     some = baked(labels_cloud(), Palette.of_labels(LABELS, 0.05))
     content, scene = page_of(some, options(live=facts()))
     assert b"</script><b>x" not in content
-    assert [label["name"] for label in scene["live"]["labels"]] == [label.name for label in LABELS]
-    assert scene["live"]["nodes"] == []
+    assert [label["name"] for label in scene["live"]["layers"][0]["labels"]] == [label.name for label in LABELS]
+    assert scene["live"]["layers"][0]["nodes"] == []
 
 
 def test_labels_under_gaussians_and_the_way_they_end() -> None:

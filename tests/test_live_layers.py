@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,14 +11,16 @@ import numpy as np
 import pytest
 
 import vvgt_cli as vvgt_library
-from tests.test_live import LO, RAMP, SMALL, WINDOW, cloud
+from tests.test_live import HI, LO, RAMP, SMALL, WINDOW, cloud
 from tests.test_live import facts as values
 from tests.test_live_labels import LABELS
 from tests.test_live_labels import facts as labels
+from tests.test_page_live import compare, options
+from vvgt_cli.commands.live_site import Cloud
 from vvgt_cli.conversion.place import in_frame_of
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
-from vvgt_cli.gaussians.live import Palette, Several, Table, shown_by
-from vvgt_cli.gaussians.live_facts import LiveFacts
+from vvgt_cli.gaussians.live import Palette, Several, Table, baked, shown_by
+from vvgt_cli.gaussians.live_facts import NUMBER, ROW, LiveFacts
 from vvgt_cli.volume import Volume
 
 TF = {"points": [{"x": 0.2, "rgb": [1, 0, 0], "opacity": 0}, {"x": 0.9, "rgb": [0, 1, 0], "opacity": 0.8}]}
@@ -46,6 +49,25 @@ def test_each_layer_is_looked_up_in_its_own_table() -> None:
         np.testing.assert_array_equal(alone.means, together.means[own])
         np.testing.assert_array_equal(alone.opacity_logits, together.opacity_logits[own])
         np.testing.assert_array_equal(alone.colors, together.colors[own])
+
+
+def test_the_pages_program_shows_several_layers_as_we_do(tmp_path: Path) -> None:
+    """Values over one range, values over another one, and labels."""
+    some, other = layered(60), replace(values(), lo=-5.0, hi=160.0, name="pet", distance=0.25)
+    assert some.live is not None
+    some.live[:, NUMBER] = np.arange(60) % 3
+    some.live[some.live[:, NUMBER] < 2, ROW] = 0
+    some.live[:, ROW] %= len(LABELS)
+    first, organs = replace(values(WINDOW), name="ct", distance=0.5), replace(labels(), name="organs", distance=0.2)
+    table = Several(
+        (
+            Table.of_function(WINDOW, LO, HI, 0.05),
+            Table.of_function(values().tf("pet"), -5, 160, 0.025),
+            Palette.of_labels(organs.labels, 0.02),
+        )
+    )
+    laid = options(live=replace(first, others=(other, organs)), up="none", made_for=300)
+    compare(baked(some, table), laid, table, tmp_path)
 
 
 def test_a_ply_keeps_the_layers(tmp_path: Path) -> None:
@@ -172,10 +194,37 @@ def test_layers_are_near_their_volume(vvgt, pair) -> None:
     assert (done.code, "the Gaussians carry values, values, labels" in done.error) == (2, True)
 
 
-def test_pages_of_several_layers_have_the_baked_look(vvgt, pair, tmp_path) -> None:
-    with pytest.warns(UserWarning, match="a page shows one layer live"):
-        assert vvgt("view", pair / "live.ply", "-o", tmp_path / "a.html").code == 0
-    assert b'"live"' not in (tmp_path / "a.html").read_bytes()
+def test_a_page_shows_several_layers_live(vvgt, pair, tmp_path) -> None:
+    assert vvgt("view", pair / "live.ply", "-o", tmp_path / "a.html").code == 0
+    found = re.search(rb'id="scene">(.*?)</script>', (tmp_path / "a.html").read_bytes(), re.S)
+    assert found is not None
+    layers = json.loads(found[1])["live"]["layers"]
+    assert [(layer["title"], layer["row"], len(layer["labels"])) for layer in layers] == [
+        ("left", 0, 0),
+        ("right", 1, 0),
+        ("top_label", 2, 1),
+    ]
+
+
+def test_a_page_of_layers_is_saved_as_it_shows_them(pair) -> None:
+    """As `recolor` shows the file under the same looks: what the page sends is of each layer."""
+    cloud = Cloud.of((pair / "live.ply").read_bytes(), "live")
+    other = TF | {"opacity_unit_distance": 2.0}
+    labels = {"labels": [{"number": 3, "color": [0, 1, 1], "opacity": 0.25}]}
+    sent = [{"function": other}, {"function": TF | {"opacity_unit_distance": 1.0}}, labels]
+    saved = cloud.layered(sent)
+    facts = saved.options.live
+    assert facts is not None
+    assert [layer.distance for layer in facts.layers][:2] == [2.0, 1.0]
+    assert facts.layers[2].labels[0].opacity == 0.25
+    assert facts.layers[2].labels[0].name == "top"
+    number = saved.gaussians.live[:, 7]  # type: ignore[index]
+    assert (np.abs(saved.gaussians.colors[number == 2] - (0, 1, 1)) < 1e-3).all()
+    thinner = saved.gaussians.opacity_logits[number == 0] < cloud.gaussians.opacity_logits[number == 0]
+    assert thinner.mean() > 0.4  # opacity is per twice the distance
+    for wrong in (sent[:2], [labels, *sent[1:]], [*sent[:2], {"function": other}], None):
+        with pytest.raises(vvgt_library.DataError):
+            cloud.layered(wrong)
 
 
 def test_channels_in_python(tmp_path) -> None:

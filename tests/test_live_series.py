@@ -49,8 +49,8 @@ def test_all_frames_of_a_page_carry_values_of_one_range(vvgt, frames, tmp_path) 
     for k in range(3):
         some, header = read_ply(tmp_path / f"f_{k}.ply")
         assert header.live is not None
-        assert [header.live.lo, header.live.hi] == live["values"]
-        assert list(header.live.histogram) == live["histogram"]
+        assert [header.live.lo, header.live.hi] == live["layers"][0]["values"]
+        assert list(header.live.histogram) == live["layers"][0]["histogram"]
         held = re.search(rb'id="values-%d">([^<]+)<' % k, content)
         assert held is not None
         planes = np.frombuffer(gzip.decompress(base64.b64decode(held[1])), np.uint8).reshape(len(PLANES), -1)
@@ -58,12 +58,12 @@ def test_all_frames_of_a_page_carry_values_of_one_range(vvgt, frames, tmp_path) 
         stream[:, PLANES] = planes.T
         back = from_bytes(stream, live)
         assert some.live is not None
-        span = live["values"][1] - live["values"][0]
+        span = live["layers"][0]["values"][1] - live["layers"][0]["values"][0]
         np.testing.assert_allclose(np.sort(back[:, 0]), np.sort(some.live[:, 0]), atol=span / 500)
         np.testing.assert_allclose(np.sort(back[:, 2]), np.sort(some.live[:, 2]), rtol=0.03)
         largest.append(some.live[:, 0].max())
     assert largest[0] < 0.5 * largest[2]
-    assert live["values"][1] == pytest.approx(max(np.load(path).max() for path in frames.glob("*.npy")))
+    assert live["layers"][0]["values"][1] == pytest.approx(max(np.load(path).max() for path in frames.glob("*.npy")))
 
 
 def test_a_page_of_many_frames_is_bounded(vvgt, frames, tmp_path, monkeypatch) -> None:
@@ -98,7 +98,7 @@ def test_a_page_of_label_frames_has_each_label_once(vvgt, tmp_path) -> None:
     assert vvgt(*source, "-o", tmp_path / "p.html").code == 0
     content = (tmp_path / "p.html").read_bytes()
     live = scene_of(content)["live"]
-    assert [label["number"] for label in live["labels"]] == [1, 7, 9]
+    assert [label["number"] for label in live["layers"][0]["labels"]] == [1, 7, 9]
     for k, rows in enumerate(({0, 1}, {0, 2})):
         held = re.search(rb'id="values-%d">([^<]+)<' % k, content)
         assert held is not None

@@ -16,7 +16,7 @@ HANDLES = (
     ".map((h) => [h.getAttribute('aria-label'), h.getAttribute('transform').match(/[-.0-9]+/g).map(Number)]))"
 )
 STATE = "window.vvgt.live.cut.state()"
-FREE, BOX = 4, 5
+ACROSS_Y, FREE, BOX = 2, 4, 5
 
 
 def choose(person: Person, kind: int) -> None:
@@ -65,6 +65,21 @@ def test_a_face_of_the_box_is_dragged_and_nothing_shows_beyond_it(
     drag(person, "face I", (0, -0.5 * unit))
     person("press", "Control+z")
     assert np.abs(person.picture(tmp_path, "undone.png") - both).mean() < 1e-3
+
+
+def test_a_face_is_lit_as_a_face(marked: str, person: Person, tmp_path: Path) -> None:
+    """Within the ball all values are the same: there no gradient says where the light comes from."""
+    person("open", marked)
+    person("press", "y")
+    choose(person, ACROSS_Y)
+    person("eval", "window.vvgt.live.cut.change({ at: 0.5, flipped: true })")
+    bare = person.picture(tmp_path, "unlit.png")
+    light = "window.vvgt.live.parts.find(({ key }) => key === 'light')"
+    person("eval", f"(({{ state, set }}) => set({{ ...state(), kind: 'headlight' }}))({light})")
+    lit, (x, y) = person.picture(tmp_path, "lit.png"), (edge // 2 for edge in person.size)
+    middle = np.s_[y - 20 : y + 20, x - 20 : x + 20]
+    print(f"{person.size}: light of a face {lit[middle].mean():.3f}, unlit {bare[middle].mean():.3f}")
+    assert lit[middle].mean() > 0.5 * bare[middle].mean() > 0.1
 
 
 def test_a_plane_is_moved_and_turned(marked: str, person: Person, tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from vvgt_cli.conversion.gaussian_files import layout_of
 from vvgt_cli.conversion.place import placed
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
 from vvgt_cli.gaussians.certificate import Certificate
-from vvgt_cli.gaussians.formats.page_file import upright
+from vvgt_cli.gaussians.formats.page_file import outermost, upright
 from vvgt_cli.gaussians.formats.splats import Splats, splats_of
 from vvgt_cli.gaussians.frames import UP_NAMES
 from vvgt_cli.gaussians.legend import checked, legend_text
@@ -35,6 +35,20 @@ NAME = 'a "b" <i>ü\nc'
 def one() -> Gaussians:
     ones = np.ones((1, 3), np.float32)
     return Gaussians(POINT[None], -4 * ones, np.array([[1, 0, 0, 0]], np.float32), ones[:, 0], ones)
+
+
+def test_a_page_says_how_far_what_is_seen_reaches() -> None:
+    """Of all of its clouds, in the viewer's axes; not what is too faint to be seen."""
+    rng = np.random.default_rng(3)
+    means = rng.uniform(-1, 1, (500, 3)).astype(np.float32)
+    some = replace(splats_of(one(), PlyOptions()), means=means, logits=np.full(500, -2.0, np.float32))
+    far = replace(some, means=means[:2] + 5, logits=np.array([3.0, -6.0], np.float32))
+    places = np.array(outermost([some, far]))
+    shown = np.concatenate([means, far.means[:1]]) * (-1, -1, 1)
+    np.testing.assert_allclose(
+        [places.min(axis=0), places.max(axis=0)], [shown.min(axis=0), shown.max(axis=0)], atol=1e-3
+    )
+    assert outermost([replace(far, logits=far.logits - 9)]) == []
 
 
 def node(text: str, folder: Path) -> Any:

@@ -21,10 +21,11 @@ from vvgt_cli.gaussians import Gaussians, PlyOptions
 from vvgt_cli.gaussians.formats import encoded, format_of
 from vvgt_cli.gaussians.formats.live import from_bytes
 from vvgt_cli.gaussians.formats.page_file import read_html
-from vvgt_cli.gaussians.formats.page_live import PLANES, nodes_of
+from vvgt_cli.gaussians.formats.page_live import PLANES, nodes_of, planes_of
 from vvgt_cli.gaussians.formats.splats import morton_order
 from vvgt_cli.gaussians.frames import rotations, turn, up_matrix
-from vvgt_cli.gaussians.live import Table, baked, shown_by
+from vvgt_cli.gaussians.live import Looks, Table, baked, shown_by
+from vvgt_cli.gaussians.live_facts import ROW
 from vvgt_cli.look.colormap import ColorMap
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.opacity import PiecewiseOpacity
@@ -52,6 +53,7 @@ def test_the_page_holds_what_the_gaussians_carry_in_the_order_of_its_file() -> N
     some = baked(cloud(600), Table.of_function(RAMP, LO, HI, 0.05))
     content, scene = page_of(some, options())
     live = scene["live"]
+    [layer] = live["layers"]
     held = re.search(rb'id="values-0">([^<]+)<', content)
     assert held is not None
     planes = np.frombuffer(gzip.decompress(base64.b64decode(held[1])), np.uint8).reshape(len(PLANES), -1)
@@ -68,8 +70,8 @@ def test_the_page_holds_what_the_gaussians_carry_in_the_order_of_its_file() -> N
     np.testing.assert_allclose(found[:, 0], carried[:, 0], atol=0.51 * (HI - LO) / 255)
     np.testing.assert_allclose(np.log(found[:, 2]), np.log(carried[:, 2]), atol=0.01)
     np.testing.assert_allclose(found[:, 3:], carried[:, 3:], atol=0.51 / 127)
-    assert live["unit_distance"] == pytest.approx(0.05)
-    assert (live["values"], live["unit"]) == ([LO, HI], "HU")
+    assert layer["unit_distance"] == pytest.approx(0.05)
+    assert (layer["values"], layer["unit"]) == ([LO, HI], "HU")
     np.testing.assert_allclose(live["box"], [some.means.min(axis=0), some.means.max(axis=0)], atol=1e-6)
     for axis in range(3):  # a plane across an axis of the volume, where the viewer has it
         there = (up_matrix("y") @ np.eye(3)[axis]) * (-1, -1, 1)
@@ -87,7 +89,7 @@ def test_no_name_is_markup() -> None:
     content, scene = page_of(some, options(live=known), "</title><script>alert(1)</script>.html")
     assert b"<script>alert" not in content
     assert b"</script><b>" not in content
-    assert scene["live"]["name"] == "</script><b>x"
+    assert scene["live"]["layers"][0]["name"] == "</script><b>x"
 
 
 def test_no_folder_is_in_the_page() -> None:
@@ -119,7 +121,8 @@ def test_the_pages_program_makes_our_table(tf: TransferFunction, tmp_path: Path)
     (tmp_path / "live.json").write_text(json.dumps(scene["live"]))
     (tmp_path / "run.mjs").write_text(
         f"import {{ sumsOf, texelsOf }} from {json.dumps(program.as_uri())};\nimport fs from 'node:fs';\n"
-        "const live = JSON.parse(fs.readFileSync('live.json')), sums = sumsOf(live.nodes, live);\n"
+        "const all = JSON.parse(fs.readFileSync('live.json')), live = { ...all, ...all.layers[0] };\n"
+        "const sums = sumsOf(live.nodes, live);\n"
         "fs.writeFileSync('sums', sums);\nfs.writeFileSync('texels', texelsOf(sums, live.table));\n"
     )
     subprocess.run(["node", "run.mjs"], cwd=tmp_path, check=True, timeout=120)
@@ -133,38 +136,50 @@ def test_the_pages_program_makes_our_table(tf: TransferFunction, tmp_path: Path)
 
 @pytest.mark.parametrize("tf", [RAMP, WINDOW, STEP])
 def test_the_pages_program_shows_gaussians_as_we_do(tf: TransferFunction, tmp_path: Path) -> None:
+    table = Table.of_function(tf, LO, HI, 0.05)
+    compare(baked(cloud(), table), options(live=facts(tf), up="none", made_for=300), table, tmp_path)
+
+
+def compare(some: Gaussians, laid: PlyOptions, table: Looks, folder: Path) -> None:
     """Place, shape and opacity of each, as live_at.mjs has them for what is picked; live.glsl has the same formulas."""
     if not shutil.which("node"):
         pytest.skip("node is not on the path")
-    some, laid = baked(cloud(), Table.of_function(tf, LO, HI, 0.05)), options(live=facts(tf), up="none", made_for=300)
     content, scene = page_of(some, laid)
     held = re.search(rb'id="values-0">([^<]+)<', content)
     assert held is not None
-    planes = gzip.decompress(base64.b64decode(held[1]))
+    assert laid.live is not None
+    planes, own = gzip.decompress(base64.b64decode(held[1])), planes_of(laid.live)
     wanted = turn(some, "z").take(morton_order(turn(some, "z").means))
     stream = np.zeros((len(some), 8), np.uint8)
-    stream[:, PLANES] = np.frombuffer(planes, np.uint8).reshape(len(PLANES), -1).T
+    stream[:, own] = np.frombuffer(planes, np.uint8).reshape(len(own), -1).T
+    carried = wanted.live
     wanted = replace(wanted, live=from_bytes(stream, scene["live"]))
+    assert carried is not None
+    assert wanted.live is not None
+    np.testing.assert_array_equal(wanted.live[:, ROW:], carried[:, ROW:])
     axes = rotations(wanted.quaternions.astype(float)) * np.exp(wanted.log_scales.astype(float))[:, None, :]
     flip = np.array([-1.0, -1, 1])  # the viewer has PLY (x, y, z) at (-x, -y, z)
     given = {"live": scene["live"], "bytes": list(planes), "centers": (wanted.means * flip).tolist()}
     given["arms"] = (axes * flip[:, None]).transpose(0, 2, 1).tolist()
     page = Path(__file__).parent.parent / "vvgt_cli" / "gaussians" / "formats" / "page"
-    (tmp_path / "given.json").write_text(json.dumps(given))
+    (folder / "given.json").write_text(json.dumps(given))
     for name in ("live_table.mjs", "live_at.mjs"):
-        shutil.copy(page / name, tmp_path / name)
-    (tmp_path / "cloud.mjs").write_text("export const around = () => [];\n")  # without the engine, which it is of
-    (tmp_path / "run.mjs").write_text(
-        "import { sumsOf } from './live_table.mjs';\nimport { looksOf } from './live_at.mjs';\n"
+        shutil.copy(page / name, folder / name)
+    (folder / "cloud.mjs").write_text("export const around = () => [];\n")  # without the engine, which it is of
+    (folder / "run.mjs").write_text(
+        "import { sumsOf } from './live_table.mjs';\nimport { layersOf, looksOf } from './live_at.mjs';\n"
         "import fs from 'node:fs';\n"
         "const { live, bytes, centers, arms } = JSON.parse(fs.readFileSync('given.json'));\n"
-        "const look = looksOf({ live, bytes, count: centers.length, sums: sumsOf(live.nodes, live), plane: null });\n"
+        "const layers = layersOf(live), count = centers.length;\n"
+        "const sums = layers.map((layer) => layer.nodes.length && sumsOf(layer.nodes, layer));\n"
+        "const rows = layers.flatMap(({ labels }) => (labels.length ? labels : [null]));\n"
+        "const look = looksOf({ live, layers, bytes, count, sums, rows });\n"
         "const found = centers.map((center, i) => look(i, { center, arms: arms[i] }));\n"
         "fs.writeFileSync('found.json', JSON.stringify(found));\n"
     )
-    subprocess.run(["node", "run.mjs"], cwd=tmp_path, check=True, timeout=120)
-    found = json.loads((tmp_path / "found.json").read_text())
-    ours = shown_by(wanted, Table.of_function(tf, LO, HI, 0.05), pixel_width(300))
+    subprocess.run(["node", "run.mjs"], cwd=folder, check=True, timeout=120)
+    found = json.loads((folder / "found.json").read_text())
+    ours = shown_by(wanted, table, pixel_width(300))
     alpha = 1 / (1 + np.exp(-ours.opacity_logits.astype(float)))
     axes = rotations(ours.quaternions.astype(float)) * np.exp(ours.log_scales.astype(float))[:, None, :]
     for k, one in enumerate(found):

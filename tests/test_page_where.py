@@ -132,6 +132,7 @@ VIEWS = {"A": "y", "P": "Shift+Y", "L": "x", "R": "Shift+X", "S": "z", "I": "Shi
 def test_the_mark_is_where_the_letters_say(marked: str, person: Person, tmp_path: Path) -> None:
     """From six sides, and after a drag, of a volume whose index axes are mirrored and oblique."""
     person("open", marked)
+    person("eval", "window.vvgt.where.lens.set({ ...window.vvgt.where.lens.pose(), target: [0, 0, 0] })")
     middle, gizmo = np.array(person.size) / 2, np.array([54, person.size[1] - 106])
     away: dict[str, np.ndarray] = {}
     for seen_from in [*VIEWS, *([] if person.touch else ["drag"])]:
@@ -153,6 +154,19 @@ def test_the_mark_is_where_the_letters_say(marked: str, person: Person, tmp_path
             assert np.linalg.norm(letters[seen_from]) < 2  # the side that is nearest
     for near, far in ("AP", "SI"):  # what is nearer looks larger; from the left, the ball hides a part
         assert np.linalg.norm(away[near]) > 1.05 * np.linalg.norm(away[far])
+
+
+def test_what_is_seen_fits_into_the_window_at_first_sight(marked: str, person: Person, tmp_path: Path) -> None:
+    person("open", marked)
+    light = person.picture(tmp_path, "first.png").max(axis=-1) > 0.05
+    shares = []
+    for edge, along in zip(person.size, (light.any(axis=0), light.any(axis=1)), strict=True):
+        first, *_, last = np.flatnonzero(along)
+        assert 0 < first < last < edge - 1
+        shares.append((last - first) / edge)
+        assert abs(first + last - edge) < 0.12 * edge  # in the middle
+    print(f"{person.size}: {shares[0]:.2f} of the width, {shares[1]:.2f} of the height")
+    assert 0.75 < max(shares) < 0.98
 
 
 def test_the_scale_bar_is_as_long_as_it_says(dots: str, person: Person, tmp_path: Path) -> None:

@@ -97,7 +97,7 @@ def test_a_volume_is_shown_live_and_converted_for_the_pages_function(tmp_path: P
         until(lambda: not scene_of(url).get("waits"))
         scene = scene_of(url)
         assert scene["server"] == {"converts": True, "name": "blob-12"}
-        assert scene["live"]["values"][1] == pytest.approx(0.9, abs=0.1)
+        assert scene["live"]["layers"][0]["values"][1] == pytest.approx(0.9, abs=0.1)
         path = urlsplit(url).path
         assert len(Cloud.of(send(url, "save", {"file": "ply"})[1], "x").gaussians) > 1000
         # a function: the next one ends the work for it
@@ -304,7 +304,7 @@ def test_a_live_file_is_shown_live_and_an_ordinary_one_as_it_is(tmp_path: Path) 
     with shown("live.ply", folder=tmp_path) as (_, url):
         scene = scene_of(url)
         assert scene["server"] == {"converts": False, "name": "live"}
-        assert scene["live"]["values"] == [LO, HI]
+        assert scene["live"]["layers"][0]["values"] == [LO, HI]
         assert ask(url, urlsplit(url).path + scene["frames"][0]["file"])[1].count(b"element chunk")
         assert send(url, "function", FUNCTION)[0] == 405  # there is no volume
         assert send(url, "save", {"file": "html"})[0] == 200

@@ -24,8 +24,8 @@ from vvgt_cli.gaussians.formats.gsply_files import compressed_ply
 from vvgt_cli.gaussians.formats.page_file import page, upright, waiting_page
 from vvgt_cli.gaussians.formats.page_live import light_sent, live_parts
 from vvgt_cli.gaussians.formats.splats import columns_of
-from vvgt_cli.gaussians.live import Palette, Table, baked
-from vvgt_cli.gaussians.live_facts import MOST_LABELS, function_text
+from vvgt_cli.gaussians.live import Looks, Palette, Several, Table, baked
+from vvgt_cli.gaussians.live_facts import MOST_LABELS, LiveFacts, function_text
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.labels import Label, LabelTable
 from vvgt_cli.look.readers.minimal import read
@@ -70,7 +70,7 @@ class Cloud:
     @property
     def live(self) -> bool:
         """Whether they can be shown under any function."""
-        return self.gaussians.live is not None and self.options.live is not None and not self.options.live.others
+        return self.gaussians.live is not None and self.options.live is not None
 
     def file(self, suffix: str) -> Part:
         """As it is saved."""
@@ -92,17 +92,36 @@ class Cloud:
         Raises:
             DataError, UsageError: it is no light, or the Gaussians carry labels.
         """
-        facts, scale, distance = self.options.live, self.options.scale or 1.0, tf.opacity_unit_distance
-        assert facts is not None
-        assert distance is not None
-        if facts.labels:
-            raise DataError("what is shown carries labels; expected no function")
-        table = Table.of_function(tf, facts.lo, facts.hi, distance * scale)
-        facts = replace(facts, function=function_text(tf, facts.lo, facts.hi))
+        facts = self._alone("a function")
+        table, facts = self._function(facts, tf)
+        distance = tf.opacity_unit_distance
         options = replace(
             self.options, live=facts, unit_distance=distance, unit_distance_label="file", function=tf.name
         )  # fmt: skip
         return self._shown(table, light, options)
+
+    def _alone(self, what: str) -> LiveFacts:
+        """What is said of the values, of one layer."""
+        facts = self.options.live
+        if facts is None or facts.others:
+            raise DataError(f"what is shown has several layers; expected a look of each in the place of {what}")
+        return facts
+
+    def _function(self, facts: LiveFacts, tf: TransferFunction, several: int = 1) -> tuple[Table, LiveFacts]:
+        """Of a layer its table and what is said of it, under a function."""
+        if facts.labels:
+            raise DataError("what is shown carries labels; expected no function")
+        assert tf.opacity_unit_distance is not None
+        table = Table.of_function(tf, facts.lo, facts.hi, tf.opacity_unit_distance * (self.options.scale or 1.0))
+        return table, replace(facts, function=function_text(tf, facts.lo, facts.hi, several))
+
+    def _labels(self, facts: LiveFacts, sent: Any, distance: float) -> tuple[Palette, LiveFacts]:
+        """Of a layer of labels the same, of what a page sends."""
+        entries = {label.number: label for label in labels_sent(sent).labels}
+        if sorted(entries) != sorted(label.number for label in facts.labels):
+            raise DataError("the page's labels: other ones than what is shown; expected all of it")
+        labels = tuple(replace(entries[label.number], name=label.name) for label in facts.labels)
+        return Palette.of_labels(labels, distance * (self.options.scale or 1.0)), replace(facts, labels=labels)
 
     def labelled(self, sent: Any, light: Any = None) -> Cloud:
         """The same with other colours and opacities of its labels; ``sent`` as `labels_sent`, ``light`` as of `under`.
@@ -110,14 +129,34 @@ class Cloud:
         Raises:
             DataError, UsageError: they are none, or not of these labels.
         """
-        facts, entries = self.options.live, {label.number: label for label in labels_sent(sent).labels}
-        if facts is None or sorted(entries) != sorted(label.number for label in facts.labels):
-            raise DataError("the page's labels: other ones than what is shown; expected all of it")
-        labels = tuple(replace(entries[label.number], name=label.name) for label in facts.labels)
-        palette = Palette.of_labels(labels, (self.options.unit_distance or 1.0) * (self.options.scale or 1.0))
-        return self._shown(palette, light, replace(self.options, live=replace(facts, labels=labels)))
+        palette, facts = self._labels(self._alone("labels"), sent, self.options.unit_distance or 1.0)
+        return self._shown(palette, light, replace(self.options, live=facts))
 
-    def _shown(self, table: Table | Palette, light: Any, options: PlyOptions) -> Cloud:
+    def layered(self, sent: Any, light: Any = None) -> Cloud:
+        """The same with other looks of its layers; ``sent``: of each a function or labels, ``light`` as of `under`.
+
+        Raises:
+            DataError, UsageError: they are none, or not of these layers.
+        """
+        layers = () if self.options.live is None else self.options.live.layers
+        if not isinstance(sent, list) or len(sent) != len(layers) or not all(isinstance(one, dict) for one in sent):
+            raise DataError(f"the page's layers: expected a list of {len(layers)} looks, each a function or labels")
+        tables, facts = list[Table | Palette](), list[LiveFacts]()
+        for layer, one in zip(layers, sent, strict=True):
+            if "labels" in one:
+                palette, own = self._labels(layer, one["labels"], layer.distance or 1.0)
+                tables.append(palette)
+                facts.append(own)
+                continue
+            tf = function_sent(one.get("function"))
+            table, own = self._function(layer, tf, len(layers))
+            tables.append(table)
+            facts.append(replace(own, distance=tf.opacity_unit_distance))
+        live = replace(facts[0], others=tuple(facts[1:]))
+        options = replace(self.options, live=live, unit_distance=live.distance, unit_distance_label="file")
+        return self._shown(Several(tuple(tables)), light, options)
+
+    def _shown(self, table: Looks, light: Any, options: PlyOptions) -> Cloud:
         """Baked under a light that the page sends, or the file's."""
         from vvgt_cli.conversion.live import lit
 
@@ -170,7 +209,7 @@ def page_of(cloud: Cloud, converts: bool) -> dict[str, bytes]:
 
     Args:
         cloud: what it shows, live where that can be.
-        converts: the volume is at hand, to be converted for a function.
+        converts: the volume is at hand, to be converted for a function, where it has one layer.
 
     Raises:
         DataError: a library is missing that pages of live Gaussians need.
@@ -183,6 +222,7 @@ def page_of(cloud: Cloud, converts: bool) -> dict[str, bytes]:
         file, name = compressed_ply(splats, cloud.name), "0.compressed.ply"
         held = base64.b64encode(planes).decode("ascii")
         elements = f'<script type="{BYTES}" id="{facts["held"][0]}">{held}</script>\n{SCRIPT}'
+        converts = converts and len(facts["layers"]) == 1
         more = {"live": facts, "server": {"converts": converts, "name": cloud.name}}
     text = page(cloud.name, splats, [{"name": cloud.name, "file": name}], elements, more)
     return {"": text.encode("utf-8"), name: file}
@@ -270,10 +310,10 @@ class Desk:
         Raises:
             DataError: something else is asked for, or what was shown is not there any more.
         """
-        keys = {"file", "number", "function", "labels", "light"}
+        keys = {"file", "number", "function", "labels", "layers", "light"}
         if not isinstance(sent, dict) or sent.get("file") not in ("ply", "html") or not set(sent) <= keys:
             raise DataError(
-                "what to save: expected file, ply or html, and a number, or a function or labels, and a light"
+                "what to save: expected file, ply or html, and a number, or a function, labels or layers, and a light"
             )
         better, number = self.better, sent.get("number")
         if number is not None and (better is None or number != self.state["number"]):
@@ -284,6 +324,8 @@ class Desk:
             cloud = cloud.under(function_sent(sent["function"]), sent.get("light"))
         if sent.get("labels") is not None and cloud.live:
             cloud = cloud.labelled(sent["labels"], sent.get("light"))
+        if sent.get("layers") is not None and cloud.live:
+            cloud = cloud.layered(sent["layers"], sent.get("light"))
         return cloud.file(sent["file"])
 
     def hear(self, number: int, message: Message) -> None:

@@ -30,7 +30,7 @@ def streamed_parts(file: str) -> dict[str, Part]:
             path = (folder / name).with_name(f"{image}.webp")
             parts[f"{name.removesuffix(META)}{path.name}"] = Part("image/webp", partial(path.read_bytes))
     splats, scale = placed(manifest)
-    more: dict[str, Any] = {"streamed": True, "camera": _larger(camera(splats), scale)}
+    more: dict[str, Any] = {"streamed": True, "camera": _larger(camera(splats), scale), "outermost": []}
     name = Path(file).absolute().parent.name
     text = page(f"{name} - vvgt", splats, [{"name": name, "file": MANIFEST}], SCRIPT, more)
     return parts | {"": Part(HTML, lambda: text.encode("utf-8"))}

@@ -82,11 +82,10 @@ def encoded(known: Format, gaussians: Gaussians, options: PlyOptions, name: str)
     """
     if known.suffix == ".html":
         options = page_file.dated(options)
-    several = options.live is not None and bool(options.live.others)
-    if gaussians.live is not None and options.live is not None and known.live is not None and not several:
+    if gaussians.live is not None and options.live is not None and known.live is not None:
         return known.live(gaussians, options, name)
     if gaussians.live is not None:
-        why = "a page shows one layer live" if known.live else f"{known.suffix} has no columns for values"
+        why = f"{known.suffix} has no columns for values"
         warnings.warn(f"{name}: {why}: it has the one look that is baked in", stacklevel=2)
         gaussians, options = replace(gaussians, live=None), replace(options, live=None)
     return known.write(splats_of(gaussians, known.layout(options)), name)

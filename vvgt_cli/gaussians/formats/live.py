@@ -8,18 +8,22 @@ Eight bytes a Gaussian, two textures of RGBA8U, in the order of the file:
 | 1 | spread s: (s / (hi - lo) / widest)^(1 / bend) * 255, a column of the table over 255 times its columns less one |
 | 2 | log L: (log L - l0) / (l1 - l0) * 255 |
 | 4, 5, 6 | direction in which values rise, as long as the share r that it explains: 128 + 127 times x, y, z |
-| 3, 7 | of a label map the row of the label, its low and its high byte; else 0 |
+| 3, 7 | the row of what it looks like, its low and its high byte |
+
+A row is a layer that carries values, or a label of one that carries labels; those of one layer lie after those of the
+layer before.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
 
-from vvgt_cli.gaussians.live import BEND, FLAT, LENGTH, MEANS, NODES, SHARP, SPREAD, SPREADS, THINNEST, VALUE, WIDEST
-from vvgt_cli.gaussians.live_facts import GRADIENT, ROW, LiveFacts
+from vvgt_cli.gaussians.live import BEND, FLAT, LENGTH, MEANS, SHARP, SPREAD, SPREADS, THINNEST, VALUE, WIDEST
+from vvgt_cli.gaussians.live_facts import GRADIENT, NUMBER, ROW, LiveFacts
 from vvgt_cli.gaussians.types import Gaussians
 
 BYTES = 8
@@ -31,56 +35,80 @@ def live_bytes(gaussians: Gaussians, facts: LiveFacts, logs: tuple[float, float]
     ``logs``: `log_lengths` of all that are in one page; None: their own.
     """
     assert gaussians.live is not None
-    live, width = gaussians.live.astype(np.float64), (facts.hi - facts.lo) or 1.0
+    live = gaussians.live.astype(np.float64)
     first, last = logs or log_lengths([gaussians])
+    number = live[:, NUMBER] if facts.others else np.zeros(len(live))
+    lo, width = (np.array(ends)[number.astype(np.int64)] for ends in _ranges(facts.layers))
     out = np.zeros((len(live), BYTES), np.uint8)
-    out[:, 0] = _byte((live[:, VALUE] - facts.lo) / width)
+    out[:, 0] = _byte((live[:, VALUE] - lo) / width)
     out[:, 1] = _byte((live[:, SPREAD] / width / WIDEST).clip(0, 1) ** (1 / BEND))
     out[:, 2] = _byte((np.log(live[:, LENGTH]) - first) / ((last - first) or 1.0))
     out[:, 4:7] = np.rint(128 + 127 * live[:, GRADIENT].clip(-1, 1))
-    if facts.labels:
-        row = live[:, ROW].astype(np.int64)
-        out[:, 3], out[:, 7] = row & 255, row >> 8
+    row = np.array(_first_rows(facts.layers))[number.astype(np.int64)]
+    row += live[:, ROW].astype(np.int64) if facts.most_labels else 0
+    out[:, 3], out[:, 7] = row & 255, row >> 8
     return out
 
 
-def live_json(clouds: Sequence[Gaussians], facts: LiveFacts, unit_distance: float) -> dict[str, Any]:
+def _ranges(layers: Sequence[LiveFacts]) -> tuple[list[float], list[float]]:
+    """Of each layer the least value, and how far its values go."""
+    return [layer.lo for layer in layers], [(layer.hi - layer.lo) or 1.0 for layer in layers]
+
+
+def _first_rows(layers: Sequence[LiveFacts]) -> list[int]:
+    """Of each layer the first row of its looks."""
+    return [0, *accumulate(max(len(layer.labels), 1) for layer in layers)][:-1]
+
+
+def live_json(clouds: Sequence[Gaussians], facts: LiveFacts, unit_distances: Sequence[float]) -> dict[str, Any]:
     """Facts beside the bytes, plain values.
 
     Args:
         clouds: that the bytes are of.
         facts: of their values.
-        unit_distance: unit-frame length that the opacity of the function in ``facts`` is per.
+        unit_distances: of each layer the unit-frame length that its opacity is per.
     """
-    labels = [{"number": e.number, "name": e.name, "rgb": list(e.color), "opacity": e.opacity} for e in facts.labels]
+    parts = zip(facts.layers, _first_rows(facts.layers), unit_distances, strict=True)
     return {
-        "labels": labels,
-        "values": [facts.lo, facts.hi],
-        "unit": facts.unit,
-        "histogram": list(facts.histogram),
-        "function": facts.baked(),
-        "unit_distance": unit_distance,
+        "layers": [_layer_json(*part) for part in parts],
         "log_lengths": list(log_lengths(clouds)),
         "widest": WIDEST,
         "bend": BEND,
         "table": [MEANS, SPREADS],
-        "nodes": NODES,
         "thinnest": THINNEST,
         "opaque": [SHARP, FLAT],
     }
 
 
+def _layer_json(layer: LiveFacts, row: int, unit_distance: float) -> dict[str, Any]:
+    labels = [{"number": e.number, "name": e.name, "rgb": list(e.color), "opacity": e.opacity} for e in layer.labels]
+    return {
+        "title": layer.name,
+        "row": row,
+        "labels": labels,
+        "values": [layer.lo, layer.hi],
+        "unit": layer.unit,
+        "histogram": list(layer.histogram),
+        "name": layer.baked().get("name", ""),
+        "unit_distance": unit_distance,
+    }
+
+
 def from_bytes(stream: np.ndarray, facts: dict[str, Any]) -> np.ndarray:
-    """(K, 6) or (K, 7) float32 of bytes and facts: what a page makes of them, and `Gaussians.live` holds."""
-    (lo, hi), (first, last) = facts["values"], facts["log_lengths"]
+    """(K, 6 to 8) float32 of bytes and facts: what a page makes of them, and `Gaussians.live` holds."""
+    layers, (first, last) = facts["layers"], facts["log_lengths"]
+    row = stream[:, 3] + 256 * stream[:, 7].astype(np.int64)
+    rows = np.array([layer["row"] for layer in layers])
+    number = np.searchsorted(rows, row, side="right") - 1
+    lo, hi = np.array([layer["values"] for layer in layers])[number].T
     share = stream.astype(np.float64) / 255
     value = lo + (hi - lo) * share[:, 0]
-    spread = ((hi - lo) or 1.0) * facts["widest"] * share[:, 1] ** facts["bend"]
+    spread = np.where(hi > lo, hi - lo, 1.0) * facts["widest"] * share[:, 1] ** facts["bend"]
     length = np.exp(first + (last - first) * share[:, 2])
     gradient = (stream[:, 4:7].astype(np.float64) - 128) / 127
-    row = stream[:, 3] + 256.0 * stream[:, 7]
-    carried = [value, spread, length, gradient, *([row] if facts["labels"] else [])]
-    found: np.ndarray = np.column_stack(carried).astype(np.float32)
+    labelled = any(layer["labels"] for layer in layers) or len(layers) > 1
+    carried = [value, spread, length, gradient, *([row - rows[number]] if labelled else [])]
+    found: np.ndarray = np.column_stack([*carried, *([number] if len(layers) > 1 else [])]).astype(np.float32)
     return found
 
 

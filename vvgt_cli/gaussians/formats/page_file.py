@@ -14,6 +14,7 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from html import escape
 from importlib.resources import files
+from itertools import product
 from types import MappingProxyType
 from typing import Any
 
@@ -33,6 +34,7 @@ _RULE = re.compile(r"vvgt size \d+ rule (\w+)$")
 _UNIT = re.compile(r"vvgt frame unit\b")
 _SPLATS = re.compile(rb'<script type="application/octet-stream" id="splats-\d+">([A-Za-z0-9+/=]+)</script>')
 _FAR = 99  # percentile of the distances from the middle that a camera stands back by
+_SEEN = -3.0  # logit of the opacity from which on a Gaussian is one that is seen
 _DISTANCE, _FIELD = 3.0, 40.0  # of the orbits' cameras, in half edges of the unit frame and in degrees
 
 
@@ -75,6 +77,19 @@ def camera(splats: Splats) -> dict[str, Any]:
     return {"position": (target + np.array([-x, z, y])).tolist(), "target": target.tolist(), "fov": _FIELD}
 
 
+def outermost(clouds: Sequence[Splats]) -> list[list[float]]:
+    """Places in the viewer's axes that a window has to hold for what is seen of all ``clouds`` to be whole in it.
+
+    Of 26 directions each one's farthest Gaussian; none where nothing is seen.
+    """
+    places = np.concatenate([splats.means[splats.logits > _SEEN] for splats in clouds]) * (-1.0, -1.0, 1.0)
+    towards = np.array([d for d in product((-1, 0, 1), repeat=3) if any(d)]).T
+    if not len(places):
+        return []
+    found: list[list[float]] = places[np.unique((places @ towards).argmax(axis=0))].round(3).tolist()
+    return found
+
+
 def drawing(splats: Splats) -> dict[str, Any]:
     """What the page's viewer changes to draw by the rule that the file names, or by the usual one."""
     said = (_RULE.match(line) for line in splats.comments)
@@ -102,7 +117,8 @@ def page(
         parts: elements that bring the viewer.
         more: of the scene, for the program.
     """
-    return _text(title, {"rule": drawing(splats), "camera": camera(splats), "frames": list(frames), **more}, parts)
+    seen = {"camera": camera(splats), "outermost": outermost([splats])}
+    return _text(title, {"rule": drawing(splats), **seen, "frames": list(frames), **more}, parts)
 
 
 def waiting_page(title: str, parts: str) -> str:
@@ -154,6 +170,7 @@ def html_of_several(
     ]
     for frame, (_, whole) in zip(frames, shown, strict=True):
         frame |= {} if whole is None else {"whole": whole}
+    more = {"outermost": outermost([splats for _, splats in clouds]), **more}
     return page(title_of(name), clouds[0][1], frames, "\n".join(elements), more).encode("utf-8")
 
 

@@ -25,7 +25,7 @@ from vvgt_cli.look.readers.minimal import read
 from vvgt_cli.volume.types import triple
 
 HELD = "values"  # of the elements that hold the bytes, with the number of the cloud
-PLANES = (0, 1, 2, 4, 5, 6)  # columns of `live_bytes` that are not 0; of labels all
+PLANES = (0, 1, 2, 4, 5, 6)  # columns of `live_bytes` that are not 0; of labels or several layers all
 SAMPLED = 96  # nodes of colours on other lines than straight ones in RGB
 _RAMP = {"points": [{"x": 0, "rgb": [1, 1, 1], "opacity": 0}, {"x": 1, "rgb": [1, 1, 1], "opacity": 0.1}]}
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0])  # the viewer has PLY (x, y, z) at (-x, -y, z)
@@ -77,7 +77,7 @@ def in_common(facts: Sequence[LiveFacts | None]) -> LiveFacts | None:
     if first is None or any(one is None or bool(one.labels) != bool(first.labels) for one in others):
         return None
     if any(one is not None and one.others for one in facts):
-        return None
+        return first if not others else None
     if first.labels:
         labels = {label.number: label for one in reversed(facts) if one is not None for label in one.labels}
         return replace(first, labels=tuple(labels[number] for number in sorted(labels)))
@@ -125,22 +125,22 @@ def renumbered(gaussians: Gaussians, own: LiveFacts, facts: LiveFacts) -> Gaussi
 
 def planes_of(facts: LiveFacts) -> tuple[int, ...]:
     """Columns of `live_bytes` that a page holds, one after the other."""
-    return (*PLANES, 3, 7) if facts.labels else PLANES
+    return (*PLANES, 3, 7) if facts.labels or facts.others else PLANES
 
 
 def _facts(clouds: Sequence[Gaussians], facts: LiveFacts, options: PlyOptions) -> dict[str, Any]:
     """What the page's program needs beside the bytes; ``options`` of the first cloud."""
-    said = live_json(clouds, facts, (options.unit_distance or 1.0) * (options.scale or 1.0))
-    said.pop("function")
+    distances = [layer.distance or options.unit_distance or 1.0 for layer in facts.layers]
+    said = live_json(clouds, facts, [distance * (options.scale or 1.0) for distance in distances])
+    for own, layer, distance in zip(said["layers"], facts.layers, distances, strict=True):
+        own |= {"nodes": [] if layer.labels else nodes_of(layer), "opacity_unit_distance": distance}
     axes = _axes(upright(options).up)
     return said | {
         "held": [f"{HELD}-{k}" for k in range(len(clouds))],
-        "opacity_unit_distance": options.unit_distance or 1.0,
+        "planes": len(planes_of(facts)),
         "light": _light(options.light, axes),
         "law": law_nodes().tolist(),
-        "name": facts.baked().get("name", ""),
         "dilation": DILATION * pixel_width(options.made_for or SIZE) ** 2,
-        "nodes": [] if facts.labels else nodes_of(facts),
         "axes": axes.tolist(),
         "box": [
             np.min([cloud.means.min(axis=0) for cloud in clouds], axis=0).tolist(),

@@ -3,11 +3,11 @@ import { shown } from './facts.mjs';
 
 export function rowsOf(name, { facts, world, count, live }) {
   const number = (n) => n.toLocaleString('en'), length = (n) => `${shown(n)}${world.unit && ` ${world.unit}`}`;
-  const function_ = live ? live.name : facts.function;
+  const kinds = new Set(live?.layers.map(({ labels }) => (labels.length ? 'labels' : 'function')));
   return [
     ['file', name],
-    ['look', !live ? 'baked' : live.labels.length ? 'live: labels and light can be changed' : 'live: function and light can be changed'],
-    ['function', function_],
+    ['look', live ? `live: ${[...kinds, 'light'].join(' and ')} can be changed` : 'baked'],
+    ['function', live ? live.layers.map(({ name }) => name).filter(Boolean).join('; ') : facts.function],
     ['opacity per', facts['unit-distance'] && `${length(facts['unit-distance'])} (${facts.label})`],
     ['light', live ? null : facts.light],
     ['error', facts.error],

@@ -1,7 +1,6 @@
-// A link that restores what is seen: #view=...&projection=...&frame=...&function=...&cut=...&light=...&labels=... Parts are {key, get, set} of text,
+// A link that restores what is seen: #view=...&projection=...&frame=...&function=...&cut=...&light=...&labels=..., of a second layer function-1 or labels-1. Parts are {key, get, set} of text,
 // which is '' for what the page begins with.
 const number = (x, digits = 6) => String(Number(x.toFixed(digits)));
-const hex = (rgb) => rgb.map((c) => Math.round(255 * Math.min(Math.max(c, 0), 1)).toString(16).padStart(2, '0')).join('');
 
 // the distance is of a square window, as the viewer's field of view is along the longer side
 const shape = () => Math.max(innerWidth, innerHeight, 1) / Math.max(Math.min(innerWidth, innerHeight), 1);
@@ -44,24 +43,7 @@ function stateOf({ key, state, set, text: own, read }) {
   };
 }
 
-export function liveParts(live, facts) {
-  const written = (nodes) => nodes.map(({ x, y, rgb }) => `${Number(x.toPrecision(7))}:${number(y, 5)}:${hex(rgb)}`).join(',');
-  return [
-    ...live.parts.map(stateOf),
-    ...live.labelled ? [] : [{
-      key: 'function',
-      get: () => (written(live.nodes()) === written(facts.nodes) ? '' : written(live.nodes())),
-      set: (text) => {
-        if (!text) return live.set(facts.nodes);
-        const nodes = text.split(',').map((node) => {
-          const [x, y, color = ''] = node.split(':');
-          return { x: Number(x), y: Number(y), rgb: [0, 2, 4].map((k) => parseInt(color.slice(k, k + 2), 16) / 255) };
-        });
-        if (nodes.length > 1 && nodes.every(({ x, y, rgb }, k) => [x, y, ...rgb].every(Number.isFinite) && (!k || x >= nodes[k - 1].x))) live.set(nodes);
-      },
-    }],
-  ];
-}
+export const liveParts = (live) => live.parts.map(stateOf);
 
 export function linkOf(parts) {
   const said = parts.map(({ key, get }) => [key, get()]).filter(([, text]) => text).map(([key, text]) => `${key}=${text}`);

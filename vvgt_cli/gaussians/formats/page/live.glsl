@@ -1,14 +1,14 @@
 // A Gaussian under the function: moved and thinned along the gradient, of the opacity of its mass (docs/live.md), and cut by planes. The engine calls
 // modifySplatCenter first. A cut Gaussian becomes one of the mass and mean of its part that stays, no wider than that and up to the plane.
 uniform highp sampler2D vvgtTable;
-uniform highp sampler2D vvgtLabels;  // of a label map a column a label: red, green, blue, extinction; else one column
+uniform highp sampler2D vvgtLabels;  // a column a row of looks: of a label red, green, blue, extinction; of a function its number in the table, and -1
 uniform vec4 vvgtFacts;  // shortest log length, how far it goes, thinnest, spreads
 uniform vec3 vvgtOpaque;  // of the variance of what is opaque along its shortest axis, and along the others; variance of the screen's dilation
 uniform vec4 vvgtCut[6];  // dot(xyz, centre) <= w of each stays; of none the normal is zero
 uniform vec4 vvgtLight;  // ambient, diffuse, specular, power; ambient < 0: unlit
 uniform vec4 vvgtToward;  // direction towards the light; with w = 1 it is at the eye
 uniform vec4 vvgtEye;  // its place, or with w = 1 the direction of parallel rays
-vec4 vvgtColor, vvgtRotation;
+vec4 vvgtColor, vvgtRotation, vvgtFace;  // vvgtFace: of what lies at a cut its direction, and how much of the light is that of the face
 vec3 vvgtScale;
 
 vec4 vvgtQuaternion(mat3 m) {  // (x, y, z, w), w >= 0
@@ -47,6 +47,8 @@ float vvgtCutBy(vec4 plane, inout vec3 center, inout mat3 axes) {  // mass's fac
   float at = (plane.w - dot(plane.xyz, center)) / sigma;
   if (at > 3.0) return 1.0;
   if (at < -2.0) return 0.0;
+  float near = clamp(0.5 * (3.0 - at), 0.0, 1.0);
+  if (near > vvgtFace.w) vvgtFace = vec4(plane.xyz, near);
   own /= sigma;
   float x = abs(at) * 0.70710678, t = 1.0 / (1.0 + 0.3275911 * x);  // Abramowitz and Stegun 7.1.26
   float tail = 0.5 * t * (0.254829592 + t * (-0.284496736 + t * (1.421413741 + t * (-1.453152027 + t * 1.061405429)))) * exp(-x * x);
@@ -60,17 +62,22 @@ float vvgtCutBy(vec4 plane, inout vec3 center, inout mat3 axes) {  // mass's fac
 
 float vvgtCutAll(inout vec3 center, inout mat3 axes) {
   float stays = 1.0;
+  vvgtFace = vec4(0.0);
   for (int i = 0; i < 6 && stays > 0.0; i++) stays *= vvgtCutBy(vvgtCut[i], center, axes);
   return stays;
 }
 
-vec3 vvgtLit(vec3 color, vec3 gradient, vec3 center) {  // Blinn and Phong's (docs/light.md)
-  if (vvgtLight.x < 0.0) return color;
-  float rises = length(gradient);
-  if (rises == 0.0) return color * vvgtLight.x;
-  vec3 n = gradient / rises, d = vvgtEye.w > 0.0 ? vvgtEye.xyz : normalize(center - vvgtEye.xyz), l = vvgtToward.w > 0.0 ? -d : vvgtToward.xyz, h = l - d;
+vec3 vvgtShaded(vec3 color, vec3 n, vec3 center) {  // Blinn and Phong's (docs/light.md)
+  vec3 d = vvgtEye.w > 0.0 ? vvgtEye.xyz : normalize(center - vvgtEye.xyz), l = vvgtToward.w > 0.0 ? -d : vvgtToward.xyz, h = l - d;
   float facing = min(abs(dot(n, h)) / max(length(h), 1e-9), 1.0);
   return min(color * (vvgtLight.x + vvgtLight.y * abs(dot(n, l))) + vvgtLight.z * pow(facing, vvgtLight.w), vec3(1.0));
+}
+
+vec3 vvgtLit(vec3 color, vec3 gradient, vec3 center) {
+  if (vvgtLight.x < 0.0) return color;
+  float rises = length(gradient);
+  vec3 own = rises == 0.0 ? color * vvgtLight.x : vvgtShaded(color, gradient / rises, center);
+  return vvgtFace.w > 0.0 ? mix(own, vvgtShaded(color, vvgtFace.xyz, center), vvgtFace.w) : own;
 }
 
 void modifySplatCenter(inout vec3 center) {
@@ -79,12 +86,12 @@ void modifySplatCenter(inout vec3 center) {
   float column = float(a.y) * (vvgtFacts.w - 1.0) / 255.0;
   int j = min(int(column), spreads - 2);
   float f = column - float(j);
-  vec4 sums = mix(texelFetch(vvgtTable, ivec2(at, j), 0), texelFetch(vvgtTable, ivec2(at, j + 1), 0), f);
-  vec2 z = mix(texelFetch(vvgtTable, ivec2(at, j + spreads), 0).xy, texelFetch(vvgtTable, ivec2(at, j + 1 + spreads), 0).xy, f);
-  if (textureSize(vvgtLabels, 0).x > 1) {
-    vec4 label = texelFetch(vvgtLabels, ivec2(int(a.w) + 256 * int(b.w), 0), 0);
-    sums = vec4(label.rgb * label.a, label.a);
-    z = vec2(0.0, label.a);
+  vec4 look = texelFetch(vvgtLabels, ivec2(int(a.w) + 256 * int(b.w), 0), 0), sums = vec4(look.rgb * look.a, look.a);
+  vec2 z = vec2(0.0, look.a);
+  if (look.a < 0.0) {
+    int near = 2 * spreads * int(look.r) + j;
+    sums = mix(texelFetch(vvgtTable, ivec2(at, near), 0), texelFetch(vvgtTable, ivec2(at, near + 1), 0), f);
+    z = mix(texelFetch(vvgtTable, ivec2(at, near + spreads), 0).xy, texelFetch(vvgtTable, ivec2(at, near + 1 + spreads), 0).xy, f);
   }
   float tau = max(sums.a, 1e-12), first = z.x / tau, variance = max(z.y / tau - first * first, 0.0);
   mat3 turn = quatToMat3(getRotation());

@@ -1,6 +1,7 @@
 // Gaussians that carry values, under any function: their bytes as streams of the engine, the function's table as a texture.
 import { FILTER_NEAREST, PIXELFORMAT_RGBA32F, PIXELFORMAT_RGBA8U, PROJECTION_ORTHOGRAPHIC, Texture } from 'playcanvas';
 import { Damaged } from './damage.mjs';
+import { layersOf } from './live_at.mjs';
 import modifier from './live.glsl';
 import { sumsOf, texelsOf } from './live_table.mjs';
 
@@ -19,10 +20,10 @@ async function unpacked(id, alone, size) {
   throw new Damaged('its values are not whole');
 }
 
-// {live, bytes, count, sums, rows, planes, apply(nodes), labels(list), cut(planes), light(of light.mjs), frame(k, resource)} of a viewer that has loaded its Gaussians, once they are shown so
+// {live, layers, bytes, count, sums, rows, planes, apply(nodes, k), labels(list, k), cut(planes), light(of light.mjs), frame(k, resource)} of a viewer that has loaded its Gaussians, once they are shown so
 export async function liveLook({ app }, live) {
   const entity = app.root.findByName('gsplat'), { gsplat } = entity, { resource } = app.assets.get(gsplat.asset);
-  const planes = live.labels.length ? 8 : 6, carried = new WeakMap();  // bytes of the resources that have them
+  const { planes } = live, layers = layersOf(live), carried = new WeakMap();  // bytes of the resources that have them
   async function carry(k, to) {
     if (carried.has(to)) return carried.get(to);
     const bytes = await unpacked(live.held[k], live.held.length === 1, planes * to.gsplatData.numSplats), count = bytes.length / planes;
@@ -37,8 +38,8 @@ export async function liveLook({ app }, live) {
   }
   const bytes = await carry(0, resource), count = bytes.length / planes;
   const [means, spreads] = live.table, nearest = { minFilter: FILTER_NEAREST, magFilter: FILTER_NEAREST };
-  const table = new Texture(app.graphicsDevice, { name: 'vvgtTable', width: means, height: 2 * spreads, format: PIXELFORMAT_RGBA32F, mipmaps: false, ...nearest });
-  const labels = new Texture(app.graphicsDevice, { name: 'vvgtLabels', width: Math.max(live.labels.length + 1, 1), height: 1, format: PIXELFORMAT_RGBA32F, mipmaps: false, ...nearest });
+  const table = new Texture(app.graphicsDevice, { name: 'vvgtTable', width: means, height: 2 * spreads * layers.length, format: PIXELFORMAT_RGBA32F, mipmaps: false, ...nearest });
+  const labels = new Texture(app.graphicsDevice, { name: 'vvgtLabels', width: layers.reduce((sum, layer) => sum + Math.max(layer.labels.length, 1), 0), height: 1, format: PIXELFORMAT_RGBA32F, mipmaps: false, ...nearest });
   const [first, last] = live.log_lengths;
   let again = 0, shown;
   const set = (name, value) => {
@@ -69,18 +70,21 @@ export async function liveLook({ app }, live) {
     if (!--again) shown();
   });
   const look = {
-    live, bytes, count, sums: null, rows: [], planes: [],  // what a place is found and read by
-    apply(nodes) {
-      look.sums = sumsOf(nodes, live);
-      table.lock().set(texelsOf(look.sums, live.table));
+    live, layers, bytes, count, sums: [], rows: [], planes: [],  // what a place is found and read by
+    // the function of a layer
+    apply(nodes, k) {
+      look.sums[k] = sumsOf(nodes, layers[k]);
+      table.lock().set(texelsOf(look.sums[k], live.table), k * means * 2 * spreads * 4);
       table.unlock();
       set('vvgtTable', table);
     },
-    // what each label looks like: [{rgb, opacity}], in the order of the file
-    labels(list) {
-      look.rows = list;
-      const texels = labels.lock();
-      list.forEach(({ rgb, opacity }, k) => texels.set([...rgb, -Math.log1p(-Math.min(Math.max(opacity, 0), MOST_OPAQUE)) / live.unit_distance], 4 * k));
+    // what each label of a layer looks like: [{rgb, opacity}], in the order of the file
+    labels(list, k) {
+      const texels = labels.lock(), { row, unit_distance } = layers[k];
+      list.forEach(({ rgb, opacity }, j) => {
+        look.rows[row + j] = { rgb, opacity };
+        texels.set([...rgb, -Math.log1p(-Math.min(Math.max(opacity, 0), MOST_OPAQUE)) / unit_distance], 4 * (row + j));
+      });
       labels.unlock();
       set('vvgtLabels', labels);
     },
@@ -109,9 +113,14 @@ export async function liveLook({ app }, live) {
   gsplat.setParameter('vvgtOpaque', [...live.opaque, live.dilation]);
   set('vvgtFacts', [first, last - first, live.thinnest, spreads]);
   look.cut([]);
-  if (live.labels.length) set('vvgtTable', table);
-  else look.apply(live.nodes);
-  look.labels(live.labels);
+  layers.forEach((layer, k) => {
+    if (layer.labels.length) return look.labels(layer.labels, k);
+    labels.lock().set([k, 0, 0, -1], 4 * layer.row);
+    labels.unlock();
+    look.apply(layer.nodes, k);
+  });
+  set('vvgtTable', table);
+  set('vvgtLabels', labels);
   gsplat.setWorkBufferModifier({ glsl: modifier });
   await new Promise((done) => { shown = done; });
   return look;

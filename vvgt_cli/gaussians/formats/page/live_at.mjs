@@ -4,8 +4,8 @@ import { around } from './cloud.mjs';
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 
 // what a Gaussian carries: value and spread, log of the length, direction in which values rise (viewer's axes) and its length r
-function carried({ bytes, count, live }, i) {
-  const byte = (plane) => bytes[plane * count + i], [lo, hi] = live.values, [first, last] = live.log_lengths;
+function carried({ bytes, count, live }, { values: [lo, hi] }, i) {
+  const byte = (plane) => bytes[plane * count + i], [first, last] = live.log_lengths;
   const g = [3, 4, 5].map((plane, k) => ((byte(plane) - 128) / 127) * (k < 2 ? -1 : 1));
   return {
     row: byte(0), column: (byte(1) * (live.table[1] - 1)) / 255, value: lo + ((hi - lo) * byte(0)) / 255, gradient: g, r: Math.min(Math.hypot(...g), 1),
@@ -19,8 +19,12 @@ const along = (gradient, arms) => {
   return a.map((x) => x / length);
 };
 
-// the row of the label that a Gaussian belongs to
-const label = ({ bytes, count }, i) => bytes[6 * count + i] + 256 * bytes[7 * count + i];
+// what is said of each layer, with what all have in common
+export const layersOf = (live) => live.layers.map((layer) => ({ ...live, ...layer }));
+
+// the row of a Gaussian's look, and its layer's number
+const rowOf = ({ bytes, count, live }, i) => (live.planes > 6 ? bytes[6 * count + i] + 256 * bytes[7 * count + i] : 0);
+const layerOf = ({ layers }, row) => layers.findLastIndex((layer) => layer.row <= row);
 const beyond = ({ planes = [] }, center) => planes.some(({ normal, place }) => dot(normal, center) > place);  // what is cut is not looked at
 
 // opacity whose dilogarithm is y, to 3e-4
@@ -49,20 +53,18 @@ function seen({ live }, center, arms, tau, length) {
   return { center, arms: axes.map((axis, k) => axis.map((x) => x * Math.sqrt(factors[k]))), opacity };
 }
 
-function labelled(look) {
-  return (i, { center, arms }) => {
-    const { opacity } = look.rows[label(look, i)];
-    if (opacity <= 0 || beyond(look, center)) return null;
-    return seen(look, center, arms, -Math.log1p(-Math.min(opacity, 0.99999)) / look.live.unit_distance, carried(look, i).length);
-  };
-}
-
+// How the page shows Gaussian i, null where it does not
 export function looksOf(look) {
-  const { live } = look, spreads = live.table[1];
-  if (live.labels.length) return labelled(look);
+  const { live, layers } = look, spreads = live.table[1];
   return (i, { center, arms }) => {
-    const { row, column, length, gradient, r } = carried(look, i), j = Math.min(Math.floor(column), spreads - 2), f = column - j;
-    const at = (c) => (1 - f) * look.sums[6 * (row * spreads + j) + c] + f * look.sums[6 * (row * spreads + j + 1) + c];
+    const number = rowOf(look, i), k = layerOf(look, number), layer = layers[k], { row, column, length, gradient, r } = carried(look, layer, i);
+    if (layer.labels.length) {
+      const { opacity } = look.rows[number];
+      if (opacity <= 0 || beyond(look, center)) return null;
+      return seen(look, center, arms, -Math.log1p(-Math.min(opacity, 0.99999)) / layer.unit_distance, length);
+    }
+    const j = Math.min(Math.floor(column), spreads - 2), f = column - j;
+    const at = (c) => (1 - f) * look.sums[k][6 * (row * spreads + j) + c] + f * look.sums[k][6 * (row * spreads + j + 1) + c];
     if (at(3) < 1e-12) return null;
     const tau = at(3), first = at(4) / tau, variance = Math.max(at(5) / tau - first * first, 0), unit = along(gradient, arms);
     const thin = Math.sqrt(Math.max(1 - r * r * (1 - variance), live.thinnest ** 2));
@@ -73,26 +75,18 @@ export function looksOf(look) {
   };
 }
 
-// The name of the label that most of the Gaussians around a place belong to, of those that are shown; null where there are none
-function labelAt(look, numbers, place) {
-  const weights = new Map();
-  for (const { i, q } of around(numbers, place)) {
-    const k = label(look, i);
-    if (look.rows[k].opacity > 0) weights.set(k, (weights.get(k) ?? 0) + Math.exp(-0.5 * dot(q, q)));
-  }
-  const [first] = [...weights].sort((a, b) => b[1] - a[1]);
-  return first ? look.live.labels[first[0]].name : null;
-}
-
-// The mean value of the Gaussians around a place, each rising along its gradient, or their label; null where there are none
+// {value, in: its unit} of the layer that is most at a place: the mean of its Gaussians there, each rising along its gradient, or the name of the
+// label that is most there. Of several layers, and of labels, what is not shown does not count; a value of null: nothing is there.
 export function valueAt(look, numbers, place) {
-  if (look.live.labels.length) return labelAt(look, numbers, place);
-  let sum = 0, weights = 0;
+  const looks = looksOf(look), found = new Map();  // by row
   for (const { i, gaussian, q } of around(numbers, place)) {
-    const { value, spread, gradient, r } = carried(look, i), z = dot(along(gradient, gaussian.arms), q), weight = Math.exp(-0.5 * dot(q, q));
-    sum += weight * (value + spread * r * Math.min(Math.max(z, -2), 2));
-    weights += weight;
+    const row = rowOf(look, i), layer = look.layers[layerOf(look, row)];
+    if ((look.layers.length > 1 || layer.labels.length) && !looks(i, gaussian)) continue;
+    const { value, spread, gradient, r } = carried(look, layer, i), z = dot(along(gradient, gaussian.arms), q), weight = Math.exp(-0.5 * dot(q, q));
+    const { sum, weights } = found.get(row) ?? { sum: 0, weights: 0 };
+    found.set(row, { sum: sum + weight * (value + spread * r * Math.min(Math.max(z, -2), 2)), weights: weights + weight });
   }
-  const [lo, hi] = look.live.values;
-  return weights ? Math.min(Math.max(sum / weights, lo), hi) : null;
+  const [[row, { sum, weights }] = [0, { weights: 0 }]] = [...found].sort((a, b) => b[1].weights - a[1].weights), { labels, row: first, values: [lo, hi], unit } = look.layers[layerOf(look, row)];
+  if (!weights) return { value: null, in: '' };
+  return labels.length ? { value: labels[row - first].name, in: '' } : { value: Math.min(Math.max(sum / weights, lo), hi), in: unit };
 }

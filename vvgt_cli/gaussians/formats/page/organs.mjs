@@ -16,11 +16,11 @@ function row({ name, number }, k) {
   return element;
 }
 
-// {root, rows(): of each label number, name, color, and the opacity that is seen}; `history` as light.mjs has it
-export function organs(look, labels, history) {
+// {root, rows(): of each label number, name, color, and the opacity that is seen}; apply(rows) shows them; `key` of links and `history` as light.mjs has it
+export function organs(apply, labels, key, history) {
   const root = document.createElement('div');
   root.className = 'organs';
-  root.innerHTML = `<div><input type="search" placeholder="${labels.length} labels" aria-label="search the labels"><button class="all" title="show all">all</button><button class="none" title="hide all">none</button></div><ul></ul>`;
+  root.innerHTML = `<div><button class="undo" aria-label="undo" title="undo (Ctrl+Z)">↶</button><input type="search" placeholder="${labels.length} labels" aria-label="search the labels"><button class="all" title="show all">all</button><button class="none" title="hide all">none</button></div><ul></ul>`;
   const find = (selector) => root.querySelector(selector), list = find('ul');
   find('[type=search]').hidden = labels.length <= SEARCHED;
   list.append(...labels.map(row));
@@ -43,7 +43,7 @@ export function organs(look, labels, history) {
     due = true;
     requestAnimationFrame(() => {
       due = false;
-      look.labels(seen());
+      apply(seen());
     });
   }
 
@@ -51,7 +51,7 @@ export function organs(look, labels, history) {
   const every = (on) => { now = { rows: now.rows.map((one) => ({ ...one, on })), solo: -1 }; };
   const rowOf = (target) => Number(target.closest('li').dataset.row);
   root.addEventListener('click', ({ target }) => {
-    if (target.tagName !== 'BUTTON') return;
+    if (target.tagName !== 'BUTTON' || target.className === 'undo') return;
     history.keep();
     if (target.className === 'all' || target.className === 'none') every(target.className === 'all');
     else if (target.className === 'eye') change(rowOf(target), { on: !now.rows[rowOf(target)].on });
@@ -69,7 +69,7 @@ export function organs(look, labels, history) {
     const wanted = target.value.trim().toLowerCase();
     labels.forEach(({ name, number }, k) => { list.children[k].hidden = !`${number} ${name}`.toLowerCase().includes(wanted); });
   });
-  history.add({ key: 'labels', state: () => now, set: (then) => { now = then; show(); } });
+  history.add({ key, state: () => now, set: (then) => { now = then; show(); } });
   show();
   const digits = (x, n) => Number(x.toFixed(n));
   const rows = () => seen().map(({ rgb, opacity }, k) => ({ number: labels[k].number, name: labels[k].name, color: rgb.map((c) => digits(c, 4)), opacity: digits(opacity, 6) }));

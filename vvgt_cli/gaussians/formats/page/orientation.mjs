@@ -3,7 +3,7 @@ import { dot } from './lens.mjs';
 import { element, label } from './svg.mjs';
 
 const RADIUS = 30, COLORS = ['#ff9d8a', '#9be08a', '#9ac4ff'];
-const HIDDEN = 0.3;  // projected length below which the end that looks away is covered by the other
+const HIDDEN = 0.45;  // projected length below which the end that looks away is covered by the other
 
 export function drawLetters(group, { lens, world, left, high }) {
   const { right, up, forward } = lens.basis(), middle = [left + RADIUS + 12, high - 76 - RADIUS], ends = [];
@@ -14,13 +14,10 @@ export function drawLetters(group, { lens, world, left, high }) {
     }
   });
   ends.sort((a, b) => b.far - a.far);
-  for (const { letter, x, y, far, color, seen } of ends) {
-    if (!seen) continue;
-    const [px, py] = [middle[0] + RADIUS * x, middle[1] - RADIUS * y], opacity = (0.75 - 0.25 * far).toFixed(2), short = 0.6;
-    group.append(element('line', { x1: middle[0], y1: middle[1], x2: middle[0] + short * RADIUS * x, y2: middle[1] - short * RADIUS * y, stroke: color, 'stroke-width': 2, opacity }));
-    group.append(label(letter, px, py + 5, { fill: color, opacity, 'text-anchor': 'middle', 'font-weight': 700, 'font-size': 14 }));
-  }
-  return ends.filter((end) => end.seen).map(({ letter, x, y }) => ({ letter, x, y }));
+  const seen = ends.filter((end) => end.seen), short = 0.6 * RADIUS, opacity = ({ far }) => (0.75 - 0.25 * far).toFixed(2);
+  group.append(...seen.map((end) => element('line', { x1: middle[0], y1: middle[1], x2: middle[0] + short * end.x, y2: middle[1] - short * end.y, stroke: end.color, 'stroke-width': 2, opacity: opacity(end) })));
+  group.append(...seen.map((end) => label(end.letter, middle[0] + RADIUS * end.x, middle[1] - RADIUS * end.y + 5, { fill: end.color, opacity: opacity(end), 'text-anchor': 'middle', 'font-weight': 700, 'font-size': 14 })));
+  return seen.map(({ letter, x, y }) => ({ letter, x, y }));
 }
 
 // Front, left and top, and the letter of the side that each is seen from: [name, axis, sign]

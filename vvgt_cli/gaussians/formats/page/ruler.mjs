@@ -17,9 +17,9 @@ export function rulerOf(viewer, lens, worldNow, dataNow, look, changed) {
     if (of !== data) [of, cloud] = [data, cloudOf(data)];
     const place = seen(cloud, lens.ray(x, y), look && looksOf(look), lens.flat);
     if (!place) return null;
-    const value = look ? valueAt(look, cloud, place) : null;
+    const read = look ? valueAt(look, cloud, place) : { value: null, in: '' };
     places = places.length > 1 ? [] : places;
-    places.push({ place, world: worldNow().place(place), value });
+    places.push({ place, world: worldNow().place(place), ...read });
     changed();
     return places.at(-1);
   }
@@ -49,10 +49,10 @@ export function rulerOf(viewer, lens, worldNow, dataNow, look, changed) {
 }
 
 // A place in words: letters of the side where the space is one of the body
-export function placeText({ world, value }, { letters, anatomical, unit }, live) {
+export function placeText({ world, value, in: of }, { letters, anatomical, unit }) {
   const digits = (x) => shown(x, Math.abs(x) < 100 ? 3 : 5);
   const along = world.map((x, k) => (anatomical ? `${letters[k][x < 0 ? 0 : 1]} ${digits(Math.abs(x))}` : `${letters[k][1]} ${digits(x)}`));
-  const read = value === null ? '' : `: ${typeof value === 'string' ? value : shown(value, 4)}${live.unit && ` ${live.unit}`}`;
+  const read = value === null ? '' : `: ${typeof value === 'string' ? value : shown(value, 4)}${of && ` ${of}`}`;
   return `${along.join(', ')}${unit && ` ${unit}`}${read}`;
 }
 

@@ -84,17 +84,17 @@ function substitute({ app }) {
   return { load, put, drop };
 }
 
-// panel: {root, nodes(), rows(): of labels,  changed(f), alone(): a cut or another light, which the live form alone has; lit(): the other light, or null}; server: {converts, name}, none of a page in a file
-export function served(panel, viewer, live, server) {
-  const { root, labelled } = panel, kind = root.querySelector('.named i'), name = server?.name ?? document.title;
+// panel: {root, layers, at(): the chosen one of them, changed(f), alone(): a cut or another light, which the live form alone has; lit(): the other light, or null}; server: {converts, name}, none of a page in a file
+export function served(panel, viewer, server) {
+  const { root, layers } = panel, kind = root.querySelector('.named i'), name = server?.name ?? document.title;
   const row = document.createElement('div'), text = document.createElement('p');
   row.className = 'save';
   row.textContent = 'Save';
   text.setAttribute('role', 'status');
   root.append(text, row);
   const better = substitute(viewer);
-  const json = labelled ? 'labels.json' : 'tf.json';
-  const shown = () => (labelled ? { labels: panel.rows().map(({ number, color, opacity }) => ({ number, color, opacity })) } : { function: functionFile(panel.nodes(), live) });
+  const look = ({ layer, rows, nodes }) => (rows ? { labels: rows().map(({ number, color, opacity }) => ({ number, color, opacity })) } : { function: functionFile(nodes(), layer) });
+  const shown = () => (layers.length > 1 ? { layers: layers.map(look) } : look(layers[0]));
   let number = null, told = '', busy = false, down = false, timer = 0, change = 0;  // number of the better form, and what it is
 
   const say = (line, failed) => {
@@ -120,7 +120,7 @@ export function served(panel, viewer, live, server) {
     const mine = change;
     busy = true;
     try {
-      const answer = await send('function', labelled ? shown() : shown().function);
+      const answer = await send('function', shown().function ?? shown());
       if (!answer.ok) throw new Error(await reason(answer));
       const job = (await answer.json()).number;
       while (mine === change) {
@@ -161,7 +161,10 @@ export function served(panel, viewer, live, server) {
   }
 
   async function save(file) {
-    if (file === 'json') return download(new Blob([`${JSON.stringify(labelled ? labelsFile(panel.rows()) : shown().function, null, 1)}\n`], { type: 'application/json' }), json);
+    if (file === 'json') {
+      const { layer, rows, nodes } = panel.at(), content = rows ? labelsFile(rows()) : functionFile(nodes(), layer);
+      return download(new Blob([`${JSON.stringify(content, null, 1)}\n`], { type: 'application/json' }), rows ? 'labels.json' : 'tf.json');
+    }
     try {
       const answer = await send('save', improved() ? { file, number } : { file, ...shown(), light: panel.lit() });
       if (!answer.ok) throw new Error(await reason(answer));
@@ -173,8 +176,12 @@ export function served(panel, viewer, live, server) {
 
   for (const file of server ? ['ply', 'html', 'json'] : ['json']) {
     const button = document.createElement('button');
-    button.textContent = file === 'json' ? json : `.${file}`;
-    button.title = `save ${file === 'json' && labelled ? 'the table of labels' : NAMES[file]}`;
+    const tell = () => {
+      const labelled = file === 'json' && Boolean(panel.at().rows);
+      [button.textContent, button.title] = [file !== 'json' ? `.${file}` : labelled ? 'labels.json' : 'tf.json', `save ${labelled ? 'the table of labels' : NAMES[file]}`];
+    };
+    tell();
+    root.addEventListener('change', tell);
     button.addEventListener('click', () => save(file));
     row.append(button);
   }

@@ -36,7 +36,7 @@ export function where(viewer, scene, live, show) {
   const frame = () => (show ? document.querySelector('#series select').selectedIndex : 0);
   const again = (text = '') => { told = text; stamp++; app.renderNextFrame = true; };
   const ruler = rulerOf(viewer, lens, () => world, dataNow, live?.look ?? null, again);
-  const parts = [...viewParts(lens), ...(show ? frameParts(show) : []), ...(live ? liveParts(live, scene.live) : [])];
+  const parts = [...viewParts(lens), ...(show ? frameParts(show) : []), ...(live ? liveParts(live) : [])];
 
   function take(now) {  // another frame is another file
     data = now;
@@ -93,7 +93,8 @@ export function where(viewer, scene, live, show) {
     const baked = live ? null : facts.legend, place = { right: wide - 12 - (high < 620 ? 44 : 0), bottom: high - 72 };
     if (baked?.labels) return drawLabels(group, { ...baked, ...place, high });
     if (baked) return drawLegend(group, { nodes: baked.nodes, live: baked, ...place });
-    return live && !live.labelled ? drawLegend(group, { nodes: live.nodes(), live: scene.live, ...place }) : null;
+    const { layer, nodes } = live?.at() ?? {};
+    return nodes ? drawLegend(group, { nodes: nodes(), live: layer, ...place }) : null;
   }
 
   function draw() {
@@ -107,7 +108,7 @@ export function where(viewer, scene, live, show) {
     handles?.draw(world);
     const facing = [...state.letters].map(({ letter }) => letter).join(' ');
     svg.setAttribute('aria-label', `axes ${facing}${state.scale ? `; scale bar ${state.scale.text}` : ''}`);
-    const lines = ruler.places.map((place, k) => `${k + 1}: ${placeText(place, world, scene.live)}`);
+    const lines = ruler.places.map((place, k) => `${k + 1}: ${placeText(place, world)}`);
     if (ruler.places.length > 1) lines.push(`distance ${shown(ruler.distance(), 4)}${world.unit && ` ${world.unit}`}`);
     else if (ruler.measuring && !lines.length) lines.push('click two points');
     if (told) lines.push(told);
@@ -119,7 +120,7 @@ export function where(viewer, scene, live, show) {
   app.on('update', () => {
     const now = dataNow();
     if (now !== data) { take(now); stamp++; }
-    const pose = lens.pose(), said = JSON.stringify([pose, lens.flat, svg.clientWidth, svg.clientHeight, stamp, live?.nodes(), live?.cut.state()]);
+    const pose = lens.pose(), said = JSON.stringify([pose, lens.flat, svg.clientWidth, svg.clientHeight, stamp, live?.at().nodes?.(), live?.at().layer.title, live?.cut.state()]);
     if (said === drawn) return;
     drawn = said;
     draw();
