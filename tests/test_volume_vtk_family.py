@@ -233,6 +233,16 @@ def test_info_shows_steps_and_then_the_step_that_is_chosen(tmp_path: Path, vvgt)
     assert one["range"] == [float(ramp(X, Y, Z).min()) + files.STEP, float(ramp(X, Y, Z).max()) + files.STEP]
 
 
+def test_a_missing_choice_of_an_array_is_usage(tmp_path: Path, vvgt) -> None:
+    """And `vvgt info` lists the arrays then, with the option for each."""
+    path = str(files.exodus(tmp_path))
+    with pytest.raises(UsageError, match="choose one with --array NAME"):
+        read_volume(path)
+    told = json.loads(vvgt("info", path, "--json").out)
+    assert told["kind"] == "several volumes"
+    assert [row["option"] for row in told["arrays"]] == ["--array ramp", "--array cells"]
+
+
 def test_a_series_is_converted_with_its_times(tmp_path: Path, vvgt) -> None:
     path = str(IMAGE_STEPS["vtk.series"](tmp_path))
     how = ("--max-gaussians", "50", "--size", "64", "--steps", "0")

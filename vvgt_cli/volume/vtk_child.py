@@ -185,8 +185,8 @@ def answer(request: dict[str, Any]) -> tuple[dict[str, Any], np.ndarray | None]:
             facts |= {"steps": error.steps, "times": [float(time) for time in error.times or ()]}
         if isinstance(error, SeveralComponents):
             facts |= {"count": error.count, "color": error.color}
-        if facts["error"] not in ("SeveralSteps", "SeveralComponents", "UsageError"):
-            facts["error"] = "DataError"
+        if facts["error"] not in ("SeveralSteps", "SeveralComponents"):
+            facts["error"] = "UsageError" if isinstance(error, UsageError) else "DataError"
     except MemoryError:
         facts, values = (
             {"error": "DataError", "text": f"{path}: not enough memory to read it; try a machine with more"},
