@@ -12,7 +12,7 @@ from tests.closed_form_scenes import Above, Ramp, Tent, scene_of
 from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.closed_form.closed_form import closed_form
-from vvgt_cli.closed_form.inset import inset, opaque_field
+from vvgt_cli.closed_form.inset import inset, opaque_field, pressed
 from vvgt_cli.closed_form.moments import base_cells
 from vvgt_cli.closed_form.pyramid import principal_axes
 from vvgt_cli.closed_form.shape import ROUND, make_gaussians, quaternions, widened
@@ -233,6 +233,31 @@ def test_inset_stops_in_the_middle_of_a_plate(voxels: int) -> None:
     assert after.min() > -0.3 * step  # the search goes by quarter cells
     assert after.max() < 0.5 * step
     np.testing.assert_allclose(shift[:, :2], 0, atol=1e-9)
+
+
+def test_covariances_are_pressed_along_the_normal_of_a_surface() -> None:
+    _, opaque = surfaces(analytic.sphere(40, 0.6))
+    ray = np.random.default_rng(0).standard_normal((400, 3))
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    cov = np.broadcast_to(np.eye(3), (400, 3, 3)).copy()
+    by = np.linspace(0.1, 0.9, 400)
+    taken = cov - pressed(opaque, 0.6 * ray, cov, by)
+    np.testing.assert_allclose(np.trace(taken, axis1=1, axis2=2), by)
+    np.testing.assert_allclose(np.einsum("ki,kij,kj->k", ray, taken, ray), by, rtol=0.01)
+    np.testing.assert_array_equal(pressed(opaque, 0.2 * ray, cov, by), cov)  # deep inside there is no surface
+
+
+def test_filled_cells_lie_flat_under_a_surface() -> None:
+    """The shortest axis is the normal of an opaque ball, whose filled cells have no axes of their own."""
+    form = closed_form(scene_of(analytic.sphere(40, 0.6), Above(1.0)), 6000, 400)
+    splats = form.gaussians()
+    scales = np.exp(splats.log_scales.astype(np.float64))
+    shortest = rotations(splats.quaternions)[np.arange(len(splats)), :, scales.argmin(axis=1)]
+    place = np.linalg.norm(splats.means, axis=1)
+    outer = place > 0.5
+    assert outer.sum() > 2000
+    facing = np.abs((shortest * splats.means).sum(axis=1) / place)[outer]
+    assert np.quantile(facing, 0.05) > 0.9
 
 
 def test_translucent_scenes_have_no_surfaces() -> None:

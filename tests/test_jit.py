@@ -162,7 +162,7 @@ def one_by_one(tmp_path, *args):
 
 
 def test_commands_need_what_is_compiled_ahead_and_nothing_else(tmp_path):
-    rare = {"vvgt_cli.closed_form.inset:_shift", "vvgt_cli.closed_form.inset:_blur"}  # of opaque scenes
+    rare = {f"vvgt_cli.closed_form.inset:{name}" for name in ("_shift", "_blur", "_press")}  # of opaque scenes
     fit = ("--max-gaussians", 200, "--size", 64, "-q")
     rare |= {ahead.REGRESS}  # and of more than a few Gaussians
     assert wanted(tmp_path, "convert", SOURCE, *fit, "--steps", 24, "-o", "a.ply") == set(ahead.CONVERT) - rare

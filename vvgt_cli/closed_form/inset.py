@@ -120,6 +120,44 @@ def _run(
     return limit
 
 
+@inlined()
+def _inwards(smooth: np.ndarray, x: float, y: float, z: float, edge: np.ndarray) -> tuple[float, float, float, float]:
+    """Unit vector up the gradient of ``smooth`` (nz, ny, nx) at (x, y, z), in its cells of ``edge`` (3,); its length.
+
+    The length is twice that of the gradient; where it is 0 the vector is, too.
+    """
+    gx = (sample(smooth, x + 1, y, z) - sample(smooth, x - 1, y, z)) / edge[0]
+    gy = (sample(smooth, x, y + 1, z) - sample(smooth, x, y - 1, z)) / edge[1]
+    gz = (sample(smooth, x, y, z + 1) - sample(smooth, x, y, z - 1)) / edge[2]
+    norm = math.sqrt(gx * gx + gy * gy + gz * gz)
+    scale = 1 / norm if norm > 0 else 0.0
+    return gx * scale, gy * scale, gz * scale, norm
+
+
+@kernel("f4:3 f8:2 f8:1 f8:1 f8:1 f8:3", parallel=True)
+def _press(
+    smooth: np.ndarray, means: np.ndarray, half: np.ndarray, edge: np.ndarray, by: np.ndarray, cov: np.ndarray
+) -> None:
+    """Take ``by`` (n,) times n n' off ``cov`` (n, 3, 3), n the normal of a surface at ``means`` (n, 3); else nothing.
+
+    ``smooth``, ``half`` (3,), ``edge`` (3,) of `Opaque`.
+    """
+    small = edge.min()
+    for k in nb.prange(means.shape[0]):
+        x, y, z = (
+            (means[k, 0] + half[0]) / edge[0] - 0.5,
+            (means[k, 1] + half[1]) / edge[1] - 0.5,
+            (means[k, 2] + half[2]) / edge[2] - 0.5,
+        )
+        normal = np.empty(3)
+        normal[0], normal[1], normal[2], norm = _inwards(smooth, x, y, z, edge)
+        if norm * small < FLAT:
+            continue
+        for i in range(3):
+            for j in range(3):
+                cov[k, i, j] -= by[k] * normal[i] * normal[j]
+
+
 @kernel("f4:3 f4:3 f8:2 f8:1 f8:1 f8:3 f8:1 f8 f8 f8:2", parallel=True)
 def _shift(
     field: np.ndarray, smooth: np.ndarray, means: np.ndarray, half: np.ndarray, edge: np.ndarray, cov: np.ndarray,
@@ -138,13 +176,9 @@ def _shift(
             (means[k, 1] + half[1]) / edge[1] - 0.5,
             (means[k, 2] + half[2]) / edge[2] - 0.5,
         )
-        gx = (sample(smooth, x + 1, y, z) - sample(smooth, x - 1, y, z)) / edge[0]
-        gy = (sample(smooth, x, y + 1, z) - sample(smooth, x, y - 1, z)) / edge[1]
-        gz = (sample(smooth, x, y, z + 1) - sample(smooth, x, y, z - 1)) / edge[2]
-        norm = math.sqrt(gx * gx + gy * gy + gz * gz)
+        gx, gy, gz, norm = _inwards(smooth, x, y, z, edge)
         if norm * small < FLAT:
             continue
-        gx, gy, gz = gx / norm, gy / norm, gz / norm  # inwards
         across = (
             gx * (cov[k, 0, 0] * gx + 2 * cov[k, 0, 1] * gy + 2 * cov[k, 0, 2] * gz)
             + gy * (cov[k, 1, 1] * gy + 2 * cov[k, 1, 2] * gz)
@@ -165,6 +199,17 @@ def _shift(
         move = min(missing, max(middle, 0.0))
         if move > 0:
             out[k, 0], out[k, 1], out[k, 2] = gx * move, gy * move, gz * move
+
+
+def pressed(opaque: Opaque, means: np.ndarray, cov: np.ndarray, by: np.ndarray) -> np.ndarray:
+    """Covariances (n, 3, 3) of cells at ``means`` (n, 3), each less ``by`` (n,) along the normal of a surface there.
+
+    Their axes are for telling which way a surface faces: what fills a cell evenly has axes of no meaning, and takes
+    the surface's; what is flat by itself keeps its own. They need not be positive.
+    """
+    out = cov.copy()
+    _press(opaque.smooth, means, opaque.half, opaque.edge, by, out)
+    return out
 
 
 def inset(

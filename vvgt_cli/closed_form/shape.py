@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vvgt_cli.closed_form.columns import COLOR, MASS, SEEN, SEEN_COLOR
-from vvgt_cli.closed_form.inset import Opaque, inset
+from vvgt_cli.closed_form.inset import Opaque, inset, pressed
 from vvgt_cli.closed_form.pyramid import principal_axes
 from vvgt_cli.closed_form.tree import Leaves, central
 from vvgt_cli.gaussians import Gaussians
@@ -17,6 +17,7 @@ from vvgt_cli.gaussians.opacity import opacity_when_reshaped, peak_opacity
 FLOOR = 0.05  # smallest standard deviation, in the smaller of voxel and cell edge
 TRANSLUCENT_SPREAD = 2.0  # what a cell that its mass fills adds to its second moment; nothing across a sheet
 OPAQUE_SPREAD = np.array([0.85, 2.6, 2.6])  # factors of the ascending principal moments of an opaque cell
+FACING = 0.5  # of a filled cell's variance: so much flatter it counts along a surface's normal where axes are chosen
 LEAST_ALPHA = 1e-4  # of what has some mass
 DEBLUR = 0.3  # px^2 that an opaque cell gives back: the renderer's dilation adds them
 
@@ -56,15 +57,20 @@ def cell_gaussians(leaves: Leaves, voxel: float, pixel: float, opaque: Opaque, s
 
     The centre is the centroid of the extinction, the covariance its second moment times a spread (1 + 2 min(1,
     12 w / H^2) where the cell is translucent, `OPAQUE_SPREAD` where it is not), the colour the seen mean, the opacity
-    that of the mass (`peak_opacity`).
+    that of the mass (`peak_opacity`). The shortest axis of an opaque cell is its own where it is flat, else the normal
+    of the surface near it.
     """
     moments = leaves.moments
     mass, mean, cov = central(moments)
     edge = np.cbrt(leaves.edge.prod(axis=1))
-    variances, axes = np.empty_like(mean), np.empty_like(cov)
-    principal_axes(cov, variances, axes)  # ascending
-    variances = np.maximum(variances, 1e-20)
     solid = -np.expm1(-2 * mass / edge**2)[:, None]
+    variances, axes = np.empty_like(mean), np.empty_like(cov)
+    if opaque.any:
+        principal_axes(pressed(opaque, mean, cov, FACING / 12 * solid[:, 0] * edge**2), variances, axes)
+        variances = ((cov @ axes) * axes).sum(axis=1)
+    else:
+        principal_axes(cov, variances, axes)  # ascending
+    variances = np.maximum(variances, 1e-20)
     thin = variances * (1 + TRANSLUCENT_SPREAD * np.minimum(1, 12 * variances / edge[:, None] ** 2))
     spread = (1 - solid) * thin + solid * (variances * OPAQUE_SPREAD - DEBLUR * pixel**2)
     spread = np.maximum(spread, (FLOOR * np.minimum(voxel, edge))[:, None] ** 2)

@@ -40,7 +40,7 @@ CELLS = (
     "vvgt_cli.closed_form.pyramid:principal_axes",
     MIX,
 )
-CLOSED_FORM = (*CELLS, "vvgt_cli.closed_form.inset:_shift", "vvgt_cli.closed_form.inset:_blur")
+CLOSED_FORM = (*CELLS, *(f"vvgt_cli.closed_form.inset:{name}" for name in ("_shift", "_blur", "_press")))
 DESCENT = (
     PAIR_SUMS,
     "vvgt_cli.splat.backward:own_frame",
