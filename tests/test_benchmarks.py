@@ -24,43 +24,13 @@ from vvgt_cli.volume.nrrd_write import write_nrrd
 ROOT = Path(__file__).parent.parent
 FOLDER = ROOT / "benchmarks"
 SIZE, MODEL = 24, "vvgt-small"
-RUN = (
-    *(
-        "automatic",
-        "closed_form",
-        "curve",
-        "dvr",
-        "dvr_pixels",
-        "dvr_steps",
-        "dvr_vtk",
-        "grids",
-        "levels",
-        "light_vtk",
-        "live",
-        "network",
-        "optimize",
-        "parts",
-        "plan",
-        "readers",
-        "refinement",
-    ),
-    *("reports", "share", "splat", "training", "damaged", "kept"),
-)
-SHARED = (
-    "dvr_scenes",
-    "floors",
-    "readers_layouts",
-    "readers_rows",
-    "readers_simulations",
-    "readers_vtk",
-    "scans",
-)  # what the others import
 
 
 def test_none_is_left_out():
-    assert {*RUN, *SHARED} == {path.stem for path in FOLDER.glob("*.py")}
     source = Path(__file__).read_text()
-    assert [name for name in RUN if f'bench("{name}"' not in source] == []
+    programs = [path.stem for path in FOLDER.glob("*.py") if "__main__" in path.read_text()]
+    assert len(programs) > 20
+    assert [name for name in programs if f'bench("{name}"' not in source] == []
 
 
 @pytest.fixture

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.test_light import ABOVE, SLANTED, function, smooth_ball
+from tests.test_light import ABOVE, SLANTED, function
+from tests.test_light_vtk import smooth_ball
 from vvgt_cli.closed_form import METHODS, VbmOptions, initialise
 from vvgt_cli.closed_form.lit import at_points, even, highlights, mean_normals, normal_points
 from vvgt_cli.dvr import Scene

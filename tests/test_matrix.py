@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import vvgt_cli
 from vvgt_cli.gaussians import read_ply
 from vvgt_cli.images import read_exr, read_png
 
@@ -248,10 +249,10 @@ class TestEitherWay:
         base = ("init", "scalars.nii", "--tf", "lit.json", "--size", "64", "--max-gaussians", "100", *blocks)
         assert vvgt(*base, "-o", tmp_path / "x.ply").code == 0
         assert read_ply(tmp_path / "x.ply")[1].light.ambient == 0.3
-        refused = vvgt(*base, "-o", tmp_path / "y" / "lod-meta.json")
-        assert refused.code == 2
-        assert "--light none turns off that of the function's file" in refused.error
-        assert vvgt(*base, "--light", "none", "-o", tmp_path / "y" / "lod-meta.json").code == 0
+        assert vvgt(*base, "-o", tmp_path / "y" / "lod-meta.json").code == 0
+        assert vvgt(*base, "--light", "none", "-o", tmp_path / "z" / "lod-meta.json").code == 0
+        lit, plain = (vvgt_cli.read_ply(tmp_path / name / "lod-meta.json")[0] for name in "yz")
+        assert np.abs(lit.colors.mean(axis=0) - plain.colors.mean(axis=0)).max() > 0.05
 
     @pytest.mark.parametrize("row", ["function", "shadows", "labels, lit", "colours"])
     def test_views_for_trainers(self, vvgt, at, tmp_path, blocks, row):

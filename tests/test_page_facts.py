@@ -142,7 +142,7 @@ def test_units_of_lengths_come_from_the_files(tmp_path: Path) -> None:
     def unit(name: str, **given: Any) -> str | None:
         return placed(PlyOptions(), read_volume(str(tmp_path / name), ReadOptions(**given))).length_unit
 
-    assert (unit("a.tif"), unit("plain.tif"), unit("a.tif", spacing=(1.0, 1, 1))) == ("um", None, None)
+    assert (unit("a.tif"), unit("plain.tif"), unit("a.tif", spacing=(1.0, 1, 1))) == ("um", None, "um")
     assert (unit("a.nii"), unit("ras.nii"), unit("a.nc")) == ("mm", None, "nm")
     assert placed(PlyOptions(), Volume(values, unit="um", space="RAS")).length_unit is None
 
