@@ -161,9 +161,8 @@ class Dask:
         cluster.scale(jobs=self.workers)
         over = threading.Event()
 
-        def again(names: Sequence[Any]) -> None:
-            for name in names:
-                cluster.worker_spec.pop(name, None)  # the cluster waits for its worker for ever
+        async def again(names: Sequence[Any]) -> None:
+            await cluster.scale_down(names)  # or it waits for their workers for ever, and gives one's name anew
             cluster.scale(jobs=self.workers)
 
         def watch() -> None:
@@ -181,9 +180,7 @@ class Dask:
                         f"output (slurm-{min(gone.values(), key=int)}.out, or where jobqueue.slurm in Dask's settings "
                         "puts it); the same command goes on with what is done"
                     )
-                    with suppress(
-                        Exception
-                    ):  # blocks of a pass that has just ended: the next look has those of the next
+                    with suppress(Exception):  # a pass that has just ended: the next look has the next one's blocks
                         self._client.cancel(self._futures, force=True)
                     continue
                 names = list(gone)[:left]
