@@ -86,7 +86,7 @@ def test_without_limits_the_default_steps_are_planned_and_back_projection_is_not
     assert [name for name, _ in found.left_out] == ["network", "back-projection"]
     assert found.seconds == pytest.approx(sum(seconds for _, seconds in found.costs()))
     step = 0.027 * (48 / 400) ** 2 + 0.0275
-    assert found.seconds == pytest.approx(1 + FORM + DEFAULT_STEPS * step + 96 * 0.05 + 4 * 0.06 + ending())
+    assert found.seconds == pytest.approx(1 + FORM + DEFAULT_STEPS * step + 120 * 0.05 + 4 * 0.06 + ending())
     assert found.bytes == 3600 + 1000 * 68
     assert f"{DEFAULT_STEPS} steps" in found.text()
 
@@ -103,12 +103,12 @@ def test_views_are_small_where_gaussians_are_wide(size, edge):
         1
         + FORM
         + DEFAULT_STEPS * step
-        + 72 * (edge / whole) ** 2 * 0.05
+        + 96 * (edge / whole) ** 2 * 0.05
         + 4 * glance
         + ending(judged**0.5, judge, glance, size)
     )
     assert found.seconds == pytest.approx(seconds)
-    bytes_ = 294e6 + 1240e5 + 32 * (72 * edge**2 + 4 * glanced + size**2)
+    bytes_ = 294e6 + 1240e5 + 32 * (96 * edge**2 + 4 * glanced + size**2)
     assert found.memory == pytest.approx(2e8 + bytes_, rel=1e-3)
     assert of(plan(size=size, time_budget=20.0), Refinement).small
     for other in (plan(size=size, wide=False), plan(size=size, steps=23)):
