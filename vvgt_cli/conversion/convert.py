@@ -288,7 +288,7 @@ def opened(run: Run, request: ConvertRequest) -> Iterator[Field]:
             field = Resident(source, source.scene())
         yield field
         return
-    wanted = Wanted(request.budget(), request.fit.size, request.ply.sh_degree)
+    wanted = Wanted(request.budget(), request.fit.size, request.ply.sh_degree, values=request.live)
     with beside(request.output) as parts, blocked(run, request.source, options, parts, wanted) as found:
         _tell(run, request, found.source)
         run.compile(for_blocks(_kernels(run, request, found.source)), found.source.kernel_type())
