@@ -48,11 +48,14 @@ class Stiff:
 
     def request(self, live: bool = False, light: LightOptions | None = None) -> ConvertRequest:
         """Of a conversion in memory, of a few steps."""
-        look = {"labels" if isinstance(self.tf, LabelTable) else "tf": self.tf}
         distance = f"{float(np.mean(self.edge))!r}"
         source = SourceRequest(Volume(self.data(), self.edge), unit_distance=distance, light=light or LightOptions())
         fit = FitOptions(BUDGET, SIZE, steps=None if live else STEPS)
-        return ConvertRequest(replace(source, **look), fit=fit, live=live)
+        if isinstance(self.tf, LabelTable):
+            source = replace(source, labels=self.tf)
+        else:
+            source = replace(source, tf=self.tf)
+        return ConvertRequest(source, fit=fit, live=live)
 
 
 def _corner() -> np.ndarray:
