@@ -51,10 +51,7 @@ class Stiff:
         distance = f"{float(np.mean(self.edge))!r}"
         source = SourceRequest(Volume(self.data(), self.edge), unit_distance=distance, light=light or LightOptions())
         fit = FitOptions(BUDGET, SIZE, steps=None if live else STEPS)
-        if isinstance(self.tf, LabelTable):
-            source = replace(source, labels=self.tf)
-        else:
-            source = replace(source, tf=self.tf)
+        source = replace(source, labels=self.tf) if isinstance(self.tf, LabelTable) else replace(source, tf=self.tf)
         return ConvertRequest(source, fit=fit, live=live)
 
 
@@ -73,7 +70,8 @@ def _holes() -> np.ndarray:
 
 def _stripes() -> np.ndarray:
     """Labels 0 to 3 in layers of one voxel."""
-    return (np.indices((EDGE,) * 3)[0] % 4).astype(np.uint8)
+    layers: np.ndarray = np.indices((EDGE,) * 3)[0] % 4
+    return layers.astype(np.uint8)
 
 
 TABLE = LabelTable(
@@ -97,7 +95,7 @@ LABELS = (Stiff("labels in layers of one voxel, opacity 1e-6 to 1", _stripes, TA
 def _pictures(gaussians: Gaussians, volume: Volume) -> np.ndarray:
     """Four views of what lies in the unit frame; finite."""
     box = into_box(gaussians, volume)
-    found = np.stack([render(box, view) for view in default_views("check", 4, size=SIZE)])
+    found: np.ndarray = np.stack([render(box, view) for view in default_views("check", 4, size=SIZE)])
     require(np.isfinite(found).all(), "a picture that is not finite")
     return found
 
