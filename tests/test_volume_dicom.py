@@ -76,8 +76,8 @@ def test_info_lists_stacks(tmp_path: Path, vvgt) -> None:
     write_scouts(tmp_path, 7)
     said = vvgt("info", tmp_path)
     assert said.code == 0
-    assert "--series 1/1, name 3 axial slices of 5 x 4, dims 5 4 3" in said.out
-    assert "--series 1/2, name 3 sagittal slices of 5 x 4" in said.out
+    assert "--series 1/1, name 3 axial slices of 5 x 4, dims 5 4 3" in said.out.decode()
+    assert "--series 1/2, name 3 sagittal slices of 5 x 4" in said.out.decode()
 
 
 def test_pixel_spacings_are_told_apart(tmp_path: Path) -> None:
