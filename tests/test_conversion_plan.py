@@ -314,7 +314,16 @@ def test_a_size_is_kept_to_the_byte_and_one_without_room_is_refused(degree, tmp_
 
 def test_a_target_that_the_closed_form_has_pays_for_nothing_else(tmp_path):
     report = done(tmp_path, limits=Limits(target_psnr=10.0))
-    assert names(report) == ["read", "scene", "closed form", "check views", "test views", "seats", "write"]
+    assert names(report) == [
+        "read",
+        "scene",
+        "closed form",
+        "check views",
+        "write",
+        "test views",
+        "seats",
+        "certificate",
+    ]
     assert report.gaussians <= 400 // 8
     assert [name for name, _ in report.left_out[:2]] == ["cells by error", "refinement"]
     assert "Gaussians" in report.left_out[2][0]
@@ -338,7 +347,7 @@ def test_a_hopeless_target_ends_and_writes_the_best(tmp_path):
 
 def test_no_time_leaves_the_closed_form(tmp_path):
     report = done(tmp_path, limits=Limits(time_budget=1e-3))
-    assert names(report) == ["read", "scene", "closed form", "test views", "write"]
+    assert names(report) == ["read", "scene", "closed form", "write", "test views", "certificate"]
     assert len(read_ply(tmp_path / "a.ply")[0]) == report.gaussians > 0
 
 
