@@ -103,9 +103,7 @@ def test_answers_without_an_end_are_a_line(
 
 def test_two_colons_are_part_of_a_name(address: str, folder: Path) -> None:
     """fsspec takes what is before them alone."""
-    array = zarr.open_array(
-        store=folder / "a::b.zarr", mode="w", shape=(8, 9, 10), dtype="uint8", chunks=(8, 9, 5)
-    )
+    array = zarr.open_array(store=folder / "a::b.zarr", mode="w", shape=(8, 9, 10), dtype="uint8", chunks=(8, 9, 5))
     array[:] = 3
     assert int(np.asarray(read_volume(f"{address}/a::b.zarr").data).min()) == 3
 
