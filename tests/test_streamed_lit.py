@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.test_scale import bodies
-from vvgt_cli.closed_form.columns import MASS, SEEN
+from vvgt_cli.closed_form.columns import COLUMNS, MASS, SEEN
 from vvgt_cli.closed_form.lit import base_rows
 from vvgt_cli.conversion.shards.merge import pyramid
 from vvgt_cli.conversion.shards.plan import Plan, load_light
@@ -83,7 +83,9 @@ def test_merged_shards_have_the_bytes_of_one_run(vvgt, volume: Path, tmp_path: P
     tiles = [cuts[0].moments[0] for cuts in forest.cuts(np.full((len(forest.tiles), 1), np.finfo(float).max))]
     seen = np.array([row[SEEN] for row in tiles])
     np.testing.assert_allclose(root.moments[0, : MASS + 1], np.sum([row[: MASS + 1] for row in tiles], axis=0))
-    np.testing.assert_allclose(root.moments[0, 17:], np.average([row[17:] for row in tiles], axis=0, weights=seen))
+    np.testing.assert_allclose(
+        root.moments[0, COLUMNS:], np.average([row[COLUMNS:] for row in tiles], axis=0, weights=seen)
+    )
 
 
 def test_normals_of_a_merged_file_point_along_the_gradient(vvgt, volume: Path, tmp_path: Path) -> None:
