@@ -13,6 +13,7 @@ from vvgt_cli.conversion.place import into_box, out_of_box
 from vvgt_cli.gaussians.ply import opacity
 
 GOAL = {"max_gaussians": 400, "size": 96, "steps": 24}
+SPACING = (1.0, 1.0, 1.5)
 SHELL = {
     "points": [
         {"x": 0.2, "rgb": [0.2, 0.4, 0.9], "opacity": 0.0},
@@ -43,10 +44,15 @@ def shell(**changes):
 
 
 @pytest.fixture(scope="module")
-def session():
+def values():
     z, y, x = np.mgrid[-1:1:24j, -1:1:28j, -1:1:32j]
     values = np.exp(-2 * (x**2 + 1.5 * (y - 0.1) ** 2 + z**2)) * (1 - 0.4 * np.exp(-9 * ((x - 0.3) ** 2 + y**2)))
-    return vvgt.Session(values.astype(np.float32), spacing=(1.0, 1.0, 1.5))
+    return values.astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def session(values):
+    return vvgt.Session(values, spacing=SPACING)
 
 
 @pytest.fixture(scope="module")
@@ -140,3 +146,20 @@ def test_depth_goes_with_extinction(session, earlier):
     assert ratio.min() >= 1 / MOST
     assert replace(found, means=before.means).degree == 0
     assert out_of_box(found, thin.field.source.volume).means.shape == before.means.shape
+
+
+def test_in_blocks_too(values):
+    first, second = (
+        vvgt.convert(values, SHELL, GOAL, spacing=SPACING, blocks=16),
+        vvgt.Session(values, spacing=SPACING).convert(SHELL, GOAL),
+    )
+    tf = shell(times=0.5)
+    blocked = vvgt.convert(values, tf, GOAL, after=first, spacing=SPACING, blocks=16)
+    assert went_on(blocked)
+    assert went_on(vvgt.convert(values, tf, GOAL, after=second, spacing=SPACING, blocks=16))
+    whole = vvgt.convert(values, tf, GOAL, after=second, spacing=SPACING)
+    assert blocked.scores["psnr"] == pytest.approx(whole.scores["psnr"], abs=0.1)
+    values = values.copy()
+    values[12, 12, 12] = 0
+    with pytest.raises(vvgt.UsageError, match="same volume"):
+        vvgt.convert(values, tf, GOAL, after=first, spacing=SPACING, blocks=16)

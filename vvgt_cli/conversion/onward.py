@@ -16,6 +16,7 @@ from vvgt_cli.conversion.stage import Work
 from vvgt_cli.conversion.stages import CheckViews, Refinement, TestViews, TrainingViews
 from vvgt_cli.conversion.stages.views import views_of, wide
 from vvgt_cli.errors import UsageError
+from vvgt_cli.field.digests import values_digest
 from vvgt_cli.field.field import Field
 from vvgt_cli.field.source import Source
 from vvgt_cli.field.workload import view_edge
@@ -71,7 +72,7 @@ class Onward:
     def _unfit(self, work: Work, request: ConvertRequest) -> str | None:
         """Why there is nothing to go on from, None where there is."""
         field, before = work.field, self.earlier.field
-        if field.source.volume is not before.source.volume and field.digest() != before.digest():
+        if not _same(field, before):
             raise UsageError(f"after: a conversion of {before.source.volume.name}; expected one of the same volume")
         sources, refinement = (before.source, field.source), self.earlier.report.refinement
         if any(source.gridded for source in sources):
@@ -148,3 +149,12 @@ def _seen(look: Source, source: Source, gaussians: Gaussians, under: np.ndarray)
     plain = replace(gaussians, colors=sums[:, :TAU] / np.maximum(tau, 1e-30)[:, None], harmonics=None)
     lighting = in_box(look)
     return (plain if lighting is None else relit(plain, under[:, GRADIENT], lighting)), tau
+
+
+def _same(field: Field, other: Field) -> bool:
+    """Whether two fields are of one volume, under whatever look."""
+    first, second = field.source.volume, other.source.volume
+    if first is second:
+        return True
+    there = first.dims == second.dims and np.array_equal(first.affine, second.affine)
+    return there and values_digest(field.volumes()) == values_digest(other.volumes())
