@@ -221,7 +221,7 @@ def test_what_labels_do_not_go_with(vvgt, label_file, tmp_path) -> None:
     for more, code, said in (
         (("--tf", "viridis"), 2, "leave out --tf (--labels gives"),
         (("--tf-range", "0,1"), 2, "leave out --tf-range (--labels gives"),
-        (("--labels", tmp_path / "t.json"), 1, "none of them visible"),
+        (("--labels", tmp_path / "t.json"), 1, "none of its labels is visible"),
         (("--labels", tmp_path / "one.json"), 1, "1 labels have no entry"),
         (("--labels", tmp_path / "missing.json"), 2, "no such file"),
     ):

@@ -166,6 +166,18 @@ def test_recolor_shows_one_of_several(vvgt, pair, tmp_path) -> None:
     assert 0.3 * len(own) < len(less) < 0.9 * len(own)
     again = vvgt_library.recolor(live, layers={0: str(tmp_path / "n.json")})
     assert len(again.gaussians) == len(less)
+    (tmp_path / "none.json").write_text(json.dumps({"3": {"color": [0, 0, 1], "opacity": 0}}))
+    (tmp_path / "dark.json").write_text(json.dumps({"points": [{"x": 0, "rgb": [1, 1, 1], "opacity": 0}]}))
+    hidden, dark = f"2,labels={tmp_path / 'none.json'}", f"tf={tmp_path / 'dark.json'}"
+    assert vvgt("recolor", live, "--layer", hidden, "-o", tmp_path / "h.ply").code == 0
+    assert vvgt("recolor", live, "--layer", f"0,{dark}", "-o", tmp_path / "d.ply").code == 0
+    without = [len(read_ply(tmp_path / f"{name}.ply")[0]) for name in "hd"]
+    seen = [int((read_ply(live)[0].live[:, 7] == number).sum()) for number in (2, 0)]  # type: ignore[index]
+    for left, gone in zip(without, seen, strict=True):
+        assert len(own) - gone <= left < len(own)
+    every = ("--layer", hidden, "--layer", f"0,{dark}", "--layer", f"1,{dark}")
+    done = vvgt("recolor", live, *every, "-o", tmp_path / "x.ply")
+    assert (done.code, "not one of" in done.error) == (1, True), done.error
     for more, said in (
         (("--tf", "viridis"), "3 layers, each with a look of its own"),
         (("--layer", "elsewhere,tf=viridis"), "no layers of that name; expected 0 (left)"),
