@@ -50,6 +50,7 @@ def halves() -> Volume:
 def test_a_gaussian_has_its_labels_color_and_extinction_where_it_is() -> None:
     some = labels_cloud()
     assert some.live is not None
+    some.live[:, 3:6] = 0  # in no surface
     shown = shown_by(some, Palette.of_labels(LABELS, 0.05))
     for row, label in enumerate(LABELS[:2]):
         own = some.live[:, 6] == row

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import vvgt_cli as vvgt_library
-from tests.test_live import HI, LO, RAMP, SMALL, WINDOW, cloud
+from tests.test_live import GRAIN, HI, LO, RAMP, SMALL, WINDOW, cloud
 from tests.test_live import facts as values
 from tests.test_live_labels import LABELS
 from tests.test_live_labels import facts as labels
@@ -41,7 +41,7 @@ def layered(count: int = 40) -> Gaussians:
 
 def test_each_layer_is_looked_up_in_its_own_table() -> None:
     some = layered()
-    tables = (Table.of_function(WINDOW, LO, 80, 0.05), Palette.of_labels(LABELS, 0.02))
+    tables = (Table.of_function(WINDOW, LO, 80, 0.05, GRAIN), Palette.of_labels(LABELS, 0.02))
     together = shown_by(some, Several(tables))
     for number, table in enumerate(tables):
         own = np.flatnonzero(some.live[:, 7] == number)  # type: ignore[index]
@@ -61,8 +61,8 @@ def test_the_pages_program_shows_several_layers_as_we_do(tmp_path: Path) -> None
     first, organs = replace(values(WINDOW), name="ct", distance=0.5), replace(labels(), name="organs", distance=0.2)
     table = Several(
         (
-            Table.of_function(WINDOW, LO, HI, 0.05),
-            Table.of_function(values().tf("pet"), -5, 160, 0.025),
+            Table.of_function(WINDOW, LO, HI, 0.05, GRAIN),
+            Table.of_function(values().tf("pet"), -5, 160, 0.025, GRAIN),
             Palette.of_labels(organs.labels, 0.02),
         )
     )

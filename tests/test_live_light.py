@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import vvgt_cli as vvgt_library
-from tests.test_live import HI, LO, RAMP, SMALL, cloud, facts
+from tests.test_live import GRAIN, HI, LO, RAMP, SMALL, cloud, facts
 from tests.test_page_live import options, page_of
 from vvgt_cli.closed_form.relit import relit
 from vvgt_cli.dvr.light import sphere
@@ -67,7 +67,7 @@ def test_where_there_is_no_gradient_there_is_ambient_light_alone() -> None:
 
 
 def test_a_light_turns_with_its_gaussians() -> None:
-    some, table, eye = cloud(), Table.of_function(RAMP, LO, HI, 0.05), np.array([2.0, -1.0, 0.7])
+    some, table, eye = cloud(), Table.of_function(RAMP, LO, HI, 0.05, GRAIN), np.array([2.0, -1.0, 0.7])
 
     def shade(gaussians: Gaussians, light: Lighting) -> Gaussians:
         assert gaussians.live is not None
@@ -128,7 +128,7 @@ def test_light_that_needs_the_volume_is_refused(vvgt, lit_file, tmp_path) -> Non
 
 
 def test_a_page_begins_with_the_files_light() -> None:
-    some = baked(cloud(), Table.of_function(RAMP, LO, HI, 0.05))
+    some = baked(cloud(), Table.of_function(RAMP, LO, HI, 0.05, GRAIN))
     for light, kind in ((None, "none"), (HEAD, "headlight"), (SIDE, "direction")):
         _, scene = page_of(some, options(live=facts(), light=light))
         assert scene["live"]["light"]["kind"] == kind

@@ -112,7 +112,8 @@ class Cloud:
         if facts.labels:
             raise DataError("what is shown carries labels; expected no function")
         assert tf.opacity_unit_distance is not None
-        table = Table.of_function(tf, facts.lo, facts.hi, tf.opacity_unit_distance * (self.options.scale or 1.0))
+        distance = tf.opacity_unit_distance * (self.options.scale or 1.0)
+        table = Table.of_function(tf, facts.lo, facts.hi, distance, facts.grain)
         return table, replace(facts, function=function_text(tf, facts.lo, facts.hi, several))
 
     def _labels(self, facts: LiveFacts, sent: Any, distance: float) -> tuple[Palette, LiveFacts]:

@@ -124,7 +124,7 @@ def looked_up(facts: LiveFacts, tf: Look, distance: float, scale: float) -> Look
         tables = [looked_up(one, part, own, scale) for one, (part, own) in zip(facts.layers, tf.parts, strict=True)]
         return Several(tuple(table for table in tables if not isinstance(table, Several)))
     if not isinstance(tf, LabelTable):
-        return Table.of_function(tf, facts.lo, facts.hi, distance * scale)
+        return Table.of_function(tf, facts.lo, facts.hi, distance * scale, facts.grain)
     entries = {label.number: label for label in tf.labels}
     return Palette.of_labels([entries[label.number] for label in facts.labels], distance * scale)
 
