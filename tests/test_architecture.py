@@ -17,8 +17,8 @@ ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "vvgt_cli"
 ROOMS = (
     *("version", "errors", "resources", "progress", "files", "jit", "volume", "look", "cameras", "images"),
-    *("gaussians", "synth", "dvr", "splat", "closed_form", "refine", "network", "checks", "score", "field"),
-    *("conversion", "commands", "library", "cli"),
+    *("gaussians", "synth", "dvr", "splat", "closed_form", "refine", "network", "score", "field"),
+    *("conversion", "checks", "commands", "library", "cli"),
 )
 HEAVY = {
     *("numba", "vtk", "vtkmodules", "pyvista", "onnxruntime", "torch", "matplotlib", "OpenImageIO", "OpenEXR"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import shutil
 from dataclasses import replace
 
@@ -12,6 +13,7 @@ import pytest
 
 import vvgt_cli
 from vvgt_cli.conversion.certify import Verdict, first_views, position_error
+from vvgt_cli.conversion.stages import TestViews, ViewingConditions
 from vvgt_cli.errors import DataError
 from vvgt_cli.field.digests import values_digest
 from vvgt_cli.gaussians import PlyOptions, read_ply, write_ply
@@ -325,3 +327,41 @@ def test_texture_is_certified_as_it_is_measured_from_near(vvgt, folder, tmp_path
     small = (folder / "ball.raw", *RAW, "--tf", folder / "tf.json", *SMALL)
     assert vvgt("convert", *small, "--size", "48", "-o", tmp_path / "small.ply").code == 0
     assert read_ply(tmp_path / "small.ply")[1].certificate.texture is None  # 24 px: no block of 32
+
+
+@pytest.mark.parametrize(("name", "more"), [("out.ply", ()), ("out.spz", ()), ("out.ply", ("--live",))])
+def test_a_run_that_ends_among_its_scores_leaves_the_whole_file(vvgt, folder, tmp_path, monkeypatch, name, more):
+    def end(*args):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(ViewingConditions, "run", end)
+    how = SMALL[: 4 if more else 6]
+    result = vvgt(
+        "convert", folder / "ball.raw", *RAW, "--tf", folder / "tf.json", *how, *more, "-o", tmp_path / name
+    )  # fmt: skip
+    assert result.code == 130
+    assert "whole, scores follow" in result.err
+    assert os.listdir(tmp_path) == [name]
+    gaussians, header = read_splats(tmp_path / name)
+    assert len(gaussians) > 100
+    assert header.version is not None
+    assert header.certificate is None
+    assert (header.live is not None) == bool(more)
+
+
+@pytest.mark.parametrize("once", ["stream", "checkpoint", "comments"])
+def test_what_cannot_be_written_twice_or_has_no_certificate_is_written_once(
+    vvgt, folder, tmp_path, monkeypatch, once
+):  # fmt: skip
+    there = []
+    monkeypatch.setattr(TestViews, "run", lambda *args: there.append((tmp_path / "out.ply").exists()))
+    options = {
+        "stream": ("-o", "-"),
+        "checkpoint": ("-o", tmp_path / "out.ply", "--checkpoint", tmp_path / "kept"),
+        "comments": ("-o", tmp_path / "out.ply", "--no-comments"),
+    }[once]
+    result = vvgt("convert", folder / "ball.raw", *RAW, "--tf", folder / "tf.json", *SMALL, *options)
+    assert result.code == 0
+    assert there == [once == "comments"]
+    assert "certificate " not in result.err
+    assert result.err.count("\nwrite ") == 1

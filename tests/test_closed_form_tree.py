@@ -12,9 +12,9 @@ from tests.closed_form_scenes import Above, Ramp, Tent, scene_of
 from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.closed_form import visibility as visibility_module
-from vvgt_cli.closed_form.columns import COLUMNS, MOMENTS, SEEN
+from vvgt_cli.closed_form.columns import COLOR, COLUMNS, MOMENTS, SEEN
 from vvgt_cli.closed_form.moments import base_cells, morton
-from vvgt_cli.closed_form.tree import Leaves, Tree, build_tree, central, leaves_of, select, split, split_score
+from vvgt_cli.closed_form.tree import PLAIN, Leaves, Tree, build_tree, central, leaves_of, select, split, split_score
 from vvgt_cli.closed_form.visibility import Visibility, march, visibility
 from vvgt_cli.dvr import Scene
 from vvgt_cli.synth import analytic
@@ -94,7 +94,22 @@ def test_split_scores_are_their_twins(tree: Tree) -> None:
     mass, _, cov = central(tree.moments)
     area = np.cbrt(tree.edge.prod(axis=1)) ** 2
     seen = np.sqrt(tree.largest * tree.moments[:, SEEN] / mass)
-    expected = -np.expm1(-mass / area) * area * seen * np.trace(cov, axis1=1, axis2=2)
+    spread = -np.expm1(-mass / area) * area * seen * np.trace(cov, axis1=1, axis2=2)
+    shades, shown = np.zeros((len(tree), 4)), np.zeros(len(tree))
+    at = np.flatnonzero(tree.children == 0)  # base cells, then what each is in, up to the root
+    colors, weights = tree.moments[at, COLOR] / mass[at, None], tree.moments[at, SEEN]
+    parts = np.concatenate([colors, (colors**2).sum(axis=1)[:, None]], axis=1) * weights[:, None]
+    for _ in range(len(tree.edges)):
+        np.add.at(shades, at, parts)
+        np.add.at(shown, at, weights)
+        if (tree.parent[at] == at).all():
+            break
+        at = tree.parent[at]
+    means = shades / shown[:, None]
+    variance = means[:, 3] - (means[:, :3] ** 2).sum(axis=1)
+    assert variance.max() > 2 * PLAIN
+    np.testing.assert_allclose(split_score(tree, np.inf), spread, rtol=1e-9, atol=1e-12 * spread.max())
+    expected = spread * (variance + PLAIN)
     scores = split_score(tree)
     assert (scores >= 0).all()
     assert scores.max() > 0
@@ -380,4 +395,4 @@ def test_detail_energy_reaches_up(tree: Tree) -> None:
 
 
 def test_columns() -> None:
-    assert (SEEN, COLUMNS) == (MOMENTS, MOMENTS + 4)
+    assert (SEEN, COLUMNS) == (MOMENTS, MOMENTS + 5)

@@ -86,7 +86,7 @@ def test_without_limits_the_default_steps_are_planned_and_back_projection_is_not
     assert [name for name, _ in found.left_out] == ["network", "back-projection"]
     assert found.seconds == pytest.approx(sum(seconds for _, seconds in found.costs()))
     step = 0.027 * (48 / 400) ** 2 + 0.0275
-    assert found.seconds == pytest.approx(1 + FORM + DEFAULT_STEPS * step + 96 * 0.05 + 4 * 0.06 + ending())
+    assert found.seconds == pytest.approx(1 + FORM + DEFAULT_STEPS * step + 120 * 0.05 + 4 * 0.06 + ending())
     assert found.bytes == 3600 + 1000 * 68
     assert f"{DEFAULT_STEPS} steps" in found.text()
 
@@ -103,12 +103,12 @@ def test_views_are_small_where_gaussians_are_wide(size, edge):
         1
         + FORM
         + DEFAULT_STEPS * step
-        + 72 * (edge / whole) ** 2 * 0.05
+        + 96 * (edge / whole) ** 2 * 0.05
         + 4 * glance
         + ending(judged**0.5, judge, glance, size)
     )
     assert found.seconds == pytest.approx(seconds)
-    bytes_ = 294e6 + 1240e5 + 32 * (72 * edge**2 + 4 * glanced + size**2)
+    bytes_ = 294e6 + 1240e5 + 32 * (96 * edge**2 + 4 * glanced + size**2)
     assert found.memory == pytest.approx(2e8 + bytes_, rel=1e-3)
     assert of(plan(size=size, time_budget=20.0), Refinement).small
     for other in (plan(size=size, wide=False), plan(size=size, steps=23)):
@@ -119,7 +119,7 @@ def test_views_are_small_where_gaussians_are_wide(size, edge):
 def test_refinement_on_small_views_gains_on_whole_ones(tmp_path):
     report = done(tmp_path, FitOptions(600, 128))
     stages = {stage.name: stage for stage in report.stages}
-    assert stages["views"].note.startswith("72 of 64 px to fit to")
+    assert stages["views"].note.startswith("96 of 64 px to fit to")
     assert stages["refinement"].kept
     assert stages["refinement"].psnr > stages["refinement"].psnr_before + 1
     assert chosen(report)["small"]
@@ -153,12 +153,12 @@ def test_narrow_gaussians_get_whole_views(tmp_path, monkeypatch):
 
 
 def test_views_that_do_not_fit_are_refused(monkeypatch):
-    found = plan(size=400)  # 72 of 200 px, blocks of 4 to check by, one of which is drawn whole
+    found = plan(size=400)  # 96 of 200 px, blocks of 4 to check by, one of which is drawn whole
     found.stages = found.stages[1:]  # the closed form is done
-    monkeypatch.setattr("vvgt_cli.conversion.plan.free_memory", lambda: 400**2 * 32 * 22)
+    monkeypatch.setattr("vvgt_cli.conversion.plan.free_memory", lambda: 400**2 * 32 * 28)
     check_memory(found)
-    monkeypatch.setattr("vvgt_cli.conversion.plan.free_memory", lambda: 400**2 * 32 * 20)
-    with pytest.raises(UsageError, match=r"--size 400.*--size 390 would fit"):
+    monkeypatch.setattr("vvgt_cli.conversion.plan.free_memory", lambda: 400**2 * 32 * 26)
+    with pytest.raises(UsageError, match=r"--size 400.*--size 392 would fit"):
         check_memory(found)
 
 
@@ -314,7 +314,16 @@ def test_a_size_is_kept_to_the_byte_and_one_without_room_is_refused(degree, tmp_
 
 def test_a_target_that_the_closed_form_has_pays_for_nothing_else(tmp_path):
     report = done(tmp_path, limits=Limits(target_psnr=10.0))
-    assert names(report) == ["read", "scene", "closed form", "check views", "test views", "seats", "write"]
+    assert names(report) == [
+        "read",
+        "scene",
+        "closed form",
+        "check views",
+        "write",
+        "test views",
+        "seats",
+        "certificate",
+    ]
     assert report.gaussians <= 400 // 8
     assert [name for name, _ in report.left_out[:2]] == ["cells by error", "refinement"]
     assert "Gaussians" in report.left_out[2][0]
@@ -338,7 +347,7 @@ def test_a_hopeless_target_ends_and_writes_the_best(tmp_path):
 
 def test_no_time_leaves_the_closed_form(tmp_path):
     report = done(tmp_path, limits=Limits(time_budget=1e-3))
-    assert names(report) == ["read", "scene", "closed form", "test views", "write"]
+    assert names(report) == ["read", "scene", "closed form", "write", "test views", "certificate"]
     assert len(read_ply(tmp_path / "a.ply")[0]) == report.gaussians > 0
 
 
@@ -350,7 +359,7 @@ def test_a_dry_run_plans_and_writes_nothing(tmp_path):
     assert found.memory > 1e8
     lines = found.text().splitlines()
     assert [line.split()[0] for line in lines[:3]] == ["so", "closed", "check"]
-    assert "96 views of 48 px" in found.text()
+    assert "120 views of 48 px" in found.text()
     done(tmp_path)
     with pytest.raises(UsageError, match="exists"):
         planned(request, Console(quiet=True))

@@ -368,6 +368,17 @@ def test_hostile_spz_are_one_line_before_memory_is_taken():
         known.read(b"\x1f\x8b\x08\x10" + b"a" * 40, "a.spz")  # a comment without its end
 
 
+def test_a_stream_of_spz_4_that_ends_early_is_one_line():
+    zstd, known = pytest.importorskip("numcodecs.zstd"), format_of("a.v4.spz")
+    content = known.write(splats_of(cloud(60), PlyOptions(comments=False)), "a")
+    table = struct.unpack_from("<I", content, 16)[0]
+    (size, whole), short = struct.unpack_from("<QQ", content, table), bytes(zstd.compress(bytes(200), 1))
+    end = len(content) - sum(struct.unpack_from("<Q", content, table + 16 * k)[0] for k in range(1, content[15]))
+    changed = content[:table] + struct.pack("<QQ", len(short), whole) + content[table + 16 : end - size] + short
+    with pytest.raises(DataError, match=r"stream 0: less than the 540 bytes"):
+        known.read(changed + content[end:], "a.spz")
+
+
 @pytest.mark.parametrize(("at", "value"), [(4, 5), (12, 4), (15, 1), (16, 200), (19, 255), (60, 255)])
 def test_damaged_headers_of_spz_4_are_one_line(at, value, tmp_path):
     known = format_of("a.v4.spz")

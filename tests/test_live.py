@@ -390,13 +390,15 @@ def test_blocks_have_the_same_values_to_the_byte(tmp_path) -> None:
 
 
 def test_a_conversion_in_blocks_is_as_near(vvgt, live_file, tmp_path) -> None:
-    tf, scores = live_file.parent / "tf.json", []
+    tf, scores, facts = live_file.parent / "tf.json", [], []
     for number, blocks in enumerate(((), ("--blocks", 16))):
         out, report = tmp_path / f"{number}.ply", tmp_path / f"{number}.json"
         source = ("example:marschner-lobb:20", "--live", "--tf", tf, *SMALL, *blocks)
         assert vvgt("convert", *source, "-o", out, "--report", report).code == 0
         scores.append(json.loads(report.read_text())["scores"]["psnr"])
-    assert scores[0] == pytest.approx(scores[1], abs=0.3)
+        facts.append(read_ply(out)[1].live)
+    assert scores[0] == pytest.approx(scores[1], abs=0.02)
+    assert facts[0] == facts[1]  # their histogram, too, of which the function needs none
     assert sorted(path.suffix for path in tmp_path.iterdir()) == [".json", ".json", ".ply", ".ply"]
 
 

@@ -362,6 +362,17 @@ def test_what_a_camera_is_shown_goes_by_distance(vvgt, folder: Path, tmp_path: P
     np.testing.assert_array_equal(seen, one)  # at 3 in the unit frame
 
 
+def test_only_what_a_camera_is_shown_is_read_and_kept(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    levels, read = Levels(folder / "lod-meta.json"), []
+    counted = lambda meta, image, name: read.append(name) or splats_in(meta, image, name)  # noqa: E731
+    monkeypatch.setattr("vvgt_cli.gaussians.formats.levels.splats_in", counted)
+    for distance, shown in ((1e6, {levels.count - 1}), (1e6, set()), (0.0, {0})):
+        read.clear()
+        seen = levels.seen_from(np.array([0, -distance, 0]), 45.0)
+        assert ({int(Path(name).parent.name.split("_")[0]) for name in read}, len(read)) == (shown, len(set(read)))
+        assert sum(map(len, levels._shown.values())) == len(seen)
+
+
 def test_levels_that_cannot_be_read_are_told_in_a_line(vvgt, folder: Path, tmp_path: Path) -> None:
     broken = tmp_path / "b"
     shutil.copytree(folder, broken)

@@ -71,6 +71,15 @@ def test_several_orientations_are_told_apart(tmp_path: Path) -> None:
         read_volume(str(tmp_path), ReadOptions(array="9/1"))
 
 
+def test_info_lists_stacks(tmp_path: Path, vvgt) -> None:
+    write_series(tmp_path)
+    write_scouts(tmp_path, 7)
+    said = vvgt("info", tmp_path)
+    assert said.code == 0
+    assert "--series 1/1, name 3 axial slices of 5 x 4, dims 5 4 3" in said.out.decode()
+    assert "--series 1/2, name 3 sagittal slices of 5 x 4" in said.out.decode()
+
+
 def test_pixel_spacings_are_told_apart(tmp_path: Path) -> None:
     write_series(tmp_path, PixelSpacing=lambda k: [1, 1 + k])
     with pytest.raises(UsageError, match=r"differ in size, orientation or pixel spacing: 1/1: 1 axial slice of 5 x 4"):

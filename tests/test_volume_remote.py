@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import json
 import sys
@@ -25,16 +26,24 @@ FIT = ("--max-gaussians", "2000", "--size", "100", "-q")
 
 
 class Handler(SimpleHTTPRequestHandler):
-    """Files of a folder; ``asked``: the paths."""
+    """Files of a folder; ``asked``: the paths; ``endless``: how paths end behind which zeros never do."""
 
     asked: list[str]
+    endless = ""
 
     def log_message(self, *_: object) -> None:
         pass
 
     def do_GET(self) -> None:
         self.asked.append(self.path)
-        super().do_GET()
+        if self.endless and self.path.endswith(self.endless):
+            self.send_response(200)
+            self.end_headers()
+            with contextlib.suppress(OSError):  # no longer asked for
+                for _ in range(1 << 12):  # 256 MiB, no length
+                    self.wfile.write(bytes(1 << 16))
+        else:
+            super().do_GET()
 
 
 @pytest.fixture(scope="module")
@@ -77,6 +86,26 @@ def test_an_address_is_read_as_the_folder(address: str, folder: Path) -> None:
     assert inner.dims == (50, 45, 40)
     assert level_shapes(f"{address}/x.ome.zarr", ReadOptions()) == [(80, 90, 100), (40, 45, 50)]
     assert int(np.asarray(read_volume(f"{address}/t.zarr", ReadOptions(time=1)).data).min()) == 7
+
+
+@pytest.mark.parametrize("end", [".zattrs", ".zarray", "/0.0.0.0", "g.zarr/"])
+def test_answers_without_an_end_are_a_line(
+    vvgt, address: str, folder: Path, monkeypatch: pytest.MonkeyPatch, end: str
+) -> None:
+    """Metadata, chunks, a folder's list: no more is read than can be needed."""
+    zarr.open_group(store=str(folder / "g.zarr"), mode="w", zarr_format=2)
+    monkeypatch.setattr(Handler, "endless", end)
+    place = ("g.zarr",) if end == "g.zarr/" else ("t.zarr", "--time", "0")
+    done = vvgt("info", f"{address}/{place[0]}", *place[1:])
+    assert (done.code, "\n" in done.error.strip()) == (1, False), done.error
+    assert f"{end}: more than the " in done.error
+
+
+def test_two_colons_are_part_of_a_name(address: str, folder: Path) -> None:
+    """fsspec takes what is before them alone."""
+    array = zarr.open_array(store=folder / "a::b.zarr", mode="w", shape=(8, 9, 10), dtype="uint8", chunks=(8, 9, 5))
+    array[:] = 3
+    assert int(np.asarray(read_volume(f"{address}/a::b.zarr").data).min()) == 3
 
 
 def test_only_the_chunks_that_are_needed_are_asked_for(address: str) -> None:

@@ -23,6 +23,7 @@ MODULES = (
     "files",
     "network",
     "whole",
+    "ways",
 )
 
 

@@ -59,7 +59,7 @@ def _shade(
     step: np.ndarray,
     out: np.ndarray,
 ) -> None:
-    """Sums over rows ``first[k]`` to ``last[k]`` of ``moments`` (n, 17) into ``out`` (k, 16 + lights).
+    """Sums over rows ``first[k]`` to ``last[k]`` of ``moments`` (n, 18) into ``out`` (k, 16 + lights).
 
     Weight (what is seen), times n n^T (xx, xy, xz, yy, yz, zz), colour where it is open, colour without what depends on
     the view, times n, and what arrives of each light. ``normals`` (n, 3) at the rows' centroids; ``half``, ``step``
@@ -210,7 +210,7 @@ def directions(mean: np.ndarray) -> np.ndarray:
 
 
 def _rows(points: np.ndarray) -> np.ndarray:
-    """Rows of moments (n, 17) of mass 1 at points (n, 3), black."""
+    """Rows of moments (n, 18) of mass 1 at points (n, 3), black."""
     rows = np.zeros((len(points), COLUMNS))
     rows[:, [MASS, SEEN]] = 1
     rows[:, FIRST] = points

@@ -7,10 +7,11 @@ import math
 import numba as nb
 import numpy as np
 
-from vvgt_cli.closed_form.columns import COLUMNS, MASS, MOMENTS, RED, SEEN, XX, YY, ZZ, X, Y, Z
+from vvgt_cli.closed_form.columns import COLUMNS, MASS, MOMENTS, RED, SEEN, SQUARE, XX, YY, ZZ, X, Y, Z
 from vvgt_cli.jit.decorators import inlined, kernel
 
 SWEEPS = 8  # of Jacobi rotations: each squares the error, three are enough for most
+TINY = 1e-300  # of what is divided by
 CONVERGED = 1e-30  # off-diagonal squares, of the trace's square
 
 
@@ -50,7 +51,7 @@ def look_up(index: np.ndarray, ratio: np.ndarray, mean: np.ndarray, largest: np.
 
 @kernel("f8:2 i8:1 f4:2 f8:2 f8:1", parallel=True)
 def take_base(moments: np.ndarray, keep: np.ndarray, seen: np.ndarray, out: np.ndarray, top: np.ndarray) -> None:
-    """Rows ``keep`` (n,) of ``moments`` (m, 13) as a pyramid's base ``out`` (n, 17), ``top`` (n,).
+    """Rows ``keep`` (n,) of ``moments`` (m, 13) as a pyramid's base ``out`` (n, 18), ``top`` (n,).
 
     ``seen`` (m, 2): mean and largest transmittance.
     """
@@ -60,13 +61,16 @@ def take_base(moments: np.ndarray, keep: np.ndarray, seen: np.ndarray, out: np.n
         for column in range(MOMENTS):
             out[n, column] = row[column]
         out[n, SEEN] = row[MASS] * mean
+        square = 0.0
         for band in range(3):
             out[n, SEEN + 1 + band] = row[RED + band] * mean
+            square += row[RED + band] ** 2
+        out[n, SQUARE] = square * mean / max(row[MASS], TINY)
 
 
 @kernel("f8:2 f8:1 i8:1 f8:2 f8:1", parallel=True)
 def sum_children(rows: np.ndarray, top: np.ndarray, start: np.ndarray, out: np.ndarray, out_top: np.ndarray) -> None:
-    """Sums ``out`` (m, 17) of the rows (n, 17) from one of ``start`` (m,) to the next; the largest of ``top`` (n,)."""
+    """Sums ``out`` (m, 18) of the rows (n, 18) from one of ``start`` (m,) to the next; the largest of ``top`` (n,)."""
     for m in nb.prange(len(start)):
         stop = start[m + 1] if m + 1 < len(start) else len(rows)
         for column in range(COLUMNS):
@@ -78,15 +82,24 @@ def sum_children(rows: np.ndarray, top: np.ndarray, start: np.ndarray, out: np.n
             out_top[m] = max(out_top[m], top[n])
 
 
-@kernel("f8:2 f8:1 f8:1 f8:1", parallel=True, error_model="numpy")
-def score_splits(moments: np.ndarray, top: np.ndarray, edge: np.ndarray, out: np.ndarray) -> None:
-    """`tree.split_score` ``out`` (n,) of rows of ``moments`` (n, 17), ``top`` (n,), of edges ``edge`` (3,)."""
+@kernel("f8:2 f8:1 f8:1 f8 f8:1", parallel=True, error_model="numpy")
+def score_splits(moments: np.ndarray, top: np.ndarray, edge: np.ndarray, plain: float, out: np.ndarray) -> None:
+    """`tree.split_score` ``out`` (n,) of rows of ``moments`` (n, 18), ``top`` (n,), of edges ``edge`` (3,).
+
+    ``plain``: variance added to that of the colours; infinite: colours do not count.
+    """
     area = (edge[0] * edge[1] * edge[2]) ** (2.0 / 3.0)
     for n in nb.prange(len(out)):
         row, mass = moments[n], moments[n, MASS]
         x, y, z = row[X] / mass, row[Y] / mass, row[Z] / mass
         variance = max((row[XX] + row[YY] + row[ZZ]) / mass - (x * x + y * y + z * z), 0.0)
-        out[n] = -math.expm1(-mass / area) * area * math.sqrt(top[n] * row[SEEN] / mass) * variance
+        seen, share = row[SEEN], 1.0
+        if plain < math.inf:
+            shade = row[SQUARE]
+            for band in range(1, 4):
+                shade -= row[SEEN + band] ** 2 / max(seen, TINY)
+            share = max(shade, 0.0) / max(seen, TINY) + plain
+        out[n] = -math.expm1(-mass / area) * area * math.sqrt(top[n] * seen / mass) * variance * share
 
 
 @inlined(error_model="numpy")

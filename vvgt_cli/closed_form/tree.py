@@ -7,13 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vvgt_cli.closed_form.columns import BLUE, COLUMNS, FIRST, GREEN, MASS, RED, SECOND
+from vvgt_cli.closed_form.columns import BLUE, COLOR, COLUMNS, FIRST, GREEN, MASS, RED, SECOND
 from vvgt_cli.closed_form.moments import CHILDREN, Cells, cell_moments, morton
 from vvgt_cli.closed_form.pyramid import score_splits, sum_children, take_base
 from vvgt_cli.closed_form.visibility import Visibility
 from vvgt_cli.dvr.scene import Scene
 
 LEAST_SPREAD = 0.01  # of the range of values, added to that in a cell: noise and places tell little apart
+PLAIN = 0.005  # beside the variance of colours: outlines, and what light makes of one colour, show too
 EMPTY = 0.5  # how far what is empty is from any label, of the range of their codes
 HIDDEN = 1e-3  # cells that no view sees with more transmittance are dropped
 
@@ -23,7 +24,7 @@ class Tree:
     """Every cell of every scale that holds extinction some view sees; base cells first, the root last.
 
     Attributes:
-        moments: (n, 17) float64 by `columns`: the 13 of `Cells`, then the same cells' seen mass and colour.
+        moments: (n, 18) float64 by `columns`: the 13 of `Cells`, then the same cells' seen mass, colour and its square.
         largest: (n,) float64 largest transmittance over the views.
         index: (n, 3) int32 cell indices (x, y, z) from the box's corner, in cells of the row's own size.
         level: (n,) int8 of each cell, 0 for base cells, ascending.
@@ -77,7 +78,7 @@ def pyramid(
 ) -> Tree:
     """The tree over cells ``base`` (n, 3) in Morton order, of edges ``base_edge`` (3,).
 
-    ``fill`` is given their moments (n, 17) and largest transmittance (n,) to write.
+    ``fill`` is given their moments (n, 18) and largest transmittance (n,) to write.
     """
     codes = [morton(base)]
     starts: list[np.ndarray] = []
@@ -119,22 +120,26 @@ def central(moments: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return mass, mean, cov
 
 
-def split_score(tree: Tree) -> np.ndarray:
-    """(n,) what a cell's spread costs the image: saturated mass x visibility x variance."""
+def split_score(tree: Tree, plain: float = PLAIN) -> np.ndarray:
+    """(n,) what a cell's spread costs the image: saturated mass x visibility x variance x (that of colours + plain).
+
+    The variance of the colours is that of its base cells, by what is seen of them; ``plain``: infinite where colours do
+    not count.
+    """
     score, ends = np.empty(len(tree)), np.searchsorted(tree.level, np.arange(len(tree.edges) + 1))
     for edge, first, last in zip(tree.edges, ends[:-1], ends[1:], strict=True):
-        score_splits(tree.moments[first:last], tree.largest[first:last], edge, score[first:last])
+        score_splits(tree.moments[first:last], tree.largest[first:last], edge, plain, score[first:last])
     return score
 
 
 def value_score(tree: Tree, filled: bool = False) -> np.ndarray:
-    """`split_score`, times the variance of the values in a cell: any function may tell apart what differs.
+    """`split_score` with the variance of values in place of that of colours: any function may tell apart what differs.
 
     Of a scene whose red is the value, as a share of its range, and green its square. ``filled``: all that is visible
     has the same extinction, what is empty counts as another value, and blue is how much a part counts.
     """
     mass = np.maximum(tree.moments[:, MASS], np.finfo(np.float64).tiny)
-    mean = tree.moments[:, RED] / mass
+    mean, spread = tree.moments[:, RED] / mass, split_score(tree, np.inf)
     result: np.ndarray
     variance = np.maximum(tree.moments[:, GREEN] / mass - mean**2, 0)
     if filled:
@@ -142,9 +147,9 @@ def value_score(tree: Tree, filled: bool = False) -> np.ndarray:
         share = tree.moments[:, MASS] / volume
         share = np.minimum(share / max(share.max(initial=0.0), np.finfo(np.float64).tiny), 1)
         weight = tree.moments[:, BLUE] / mass
-        result = split_score(tree) * weight * (share * (variance + (1 - share) * EMPTY**2) + LEAST_SPREAD**2)
+        result = spread * weight * (share * (variance + (1 - share) * EMPTY**2) + LEAST_SPREAD**2)
         return result
-    result = split_score(tree) * (variance + LEAST_SPREAD**2)
+    result = spread * (variance + LEAST_SPREAD**2)
     return result
 
 
@@ -206,7 +211,7 @@ class Leaves:
     """Cells that become Gaussians, one each: rows of a tree, or cells below its base.
 
     Attributes:
-        moments: (k, 17), as in `Tree`.
+        moments: (k, 18), as in `Tree`.
         index: (k, 3) int32, as in `Tree`.
         edge: (k, 3) float64, as in `Tree`.
         node: (k,) int64 row of the tree, -1 below its base.
@@ -294,5 +299,8 @@ def _children_below(leaves: Leaves, scene: Scene, seen: Visibility) -> tuple[np.
 
 
 def with_visible(moments: np.ndarray, mean: np.ndarray) -> np.ndarray:
-    """Moments (n, 13) and mean transmittance (n,) -> (n, 17) with the seen mass and colour."""
-    return np.concatenate([moments, moments[:, [MASS, RED, GREEN, BLUE]] * mean[:, None]], axis=1)
+    """Moments (n, 13) and mean transmittance (n,) -> (n, 18) with the seen mass, colour and its square."""
+    square = (moments[:, COLOR] ** 2).sum(axis=1) / np.maximum(moments[:, MASS], np.finfo(np.float64).tiny)
+    return np.concatenate(
+        [moments, moments[:, [MASS, RED, GREEN, BLUE]] * mean[:, None], (square * mean)[:, None]], axis=1
+    )

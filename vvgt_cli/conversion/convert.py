@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import weakref
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -12,6 +12,7 @@ from vvgt_cli.conversion.carried import Carry
 from vvgt_cli.conversion.certify import certified
 from vvgt_cli.conversion.gaussian_files import write_gaussians
 from vvgt_cli.conversion.live import check_live, live_conversion
+from vvgt_cli.conversion.onward import Onward
 from vvgt_cli.conversion.place import out_of_box, placed, remarks, way_up
 from vvgt_cli.conversion.plan import Plan, Planner, check_memory
 from vvgt_cli.conversion.readback import tell_cost
@@ -26,7 +27,7 @@ from vvgt_cli.field.field import Field, Picture, Resident
 from vvgt_cli.field.open import Wanted, automatic, beside, blocked
 from vvgt_cli.field.source import Source, describe_source, load, tf_record, volume_record
 from vvgt_cli.field.workload import expected_wide
-from vvgt_cli.files import check_room
+from vvgt_cli.files import check_room, is_stream
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored
 from vvgt_cli.gaussians.formats import format_of
 from vvgt_cli.gaussians.legend import legend_text
@@ -62,14 +63,14 @@ def convert(
         checkpoint_folder(request.checkpoint),
         opened(run, request) as field,
     ):
-        conversion = run_conversion(run, request, field, made, carry)
-        report = _write(run, request, conversion)
+        early = _early(run, request)
+        report = _write(run, request, run_conversion(run, request, field, made, carry, early), early is not None)
         if request.checkpoint is not None and not _interrupted(run):
             Checkpoint(Path(request.checkpoint)).finish()
         return report
 
 
-def without_files(request: ConvertRequest, console: Console | None = None) -> Conversion:
+def without_files(request: ConvertRequest, console: Console | None = None, onward: Onward | None = None) -> Conversion:
     """A conversion of which nothing is written.
 
     Raises:
@@ -77,7 +78,7 @@ def without_files(request: ConvertRequest, console: Console | None = None) -> Co
     """
     run = Run(console or Console(), ConversionReport("convert"))
     with ExitStack() as stack:
-        conversion = run_conversion(run, request, stack.enter_context(opened(run, request)))
+        conversion = run_conversion(run, request, stack.enter_context(opened(run, request)), carry=onward)
         weakref.finalize(conversion, stack.pop_all().close)  # what it draws is there as long as it is
     run.finish()
     return conversion
@@ -122,24 +123,25 @@ def fitted(run: Run, request: ConvertRequest) -> Gaussians:
 
 
 def run_conversion(
-    run: Run, request: ConvertRequest, field: Field, made: Gaussians | None = None, carry: Carry | None = None
-) -> Conversion:
+    run: Run, request: ConvertRequest, field: Field, made: Gaussians | None = None,
+    carry: Carry | Onward | None = None, unscored: Callable[[Conversion], None] | None = None,
+) -> Conversion:  # fmt: skip
     """Closed form, what views can improve of it, scores on the test views; only checkpoints are written.
 
     What of these is done, and with how many Gaussians, follows from the request's limits and what the stages cost
     (`vvgt_cli.conversion.plan`); the check views decide. What is left out is said, and costs nothing. Of Gaussians that
     are ``made`` already, box frame, there are scores alone. With a ``carry``, it goes on from the frame before where
-    that is as near.
+    that is as near. ``unscored`` is handed the conversion before there are scores, and so without a certificate.
 
     Returns:
-        The conversion; the run's report is still open.
+        The same conversion; the run's report is still open.
 
     Raises:
         DataError, UsageError: as `convert`.
     """
     if request.live:
         check_live(request)
-        return live_conversion(run, request, field, ply_options(request, field.source))
+        return live_conversion(run, request, field, ply_options(request, field.source), unscored=unscored)
     if carry is not None:
         field = carry.remembered(field)
     work, planner, plan = _planned(run, request, field, expected=carry is None)
@@ -162,10 +164,14 @@ def run_conversion(
         whole, plan = plan, _fit(work, request, planner, plan)
         if carry is not None:
             carry.keep(work, whole)
+    conversion = _conversion(request, work, work.made())
+    if unscored is not None:
+        unscored(conversion)
     for stage in plan.stages:
         if stage.scores:
             stage.run(work)
-    return _conversion(request, work, work.made())
+    conversion.ply = certified(conversion.ply, run, work.field, work.fit, conversion.gaussians, request.command)
+    return conversion
 
 
 def _pictures(plan: Plan, fit: FitOptions) -> list[Picture]:
@@ -258,9 +264,9 @@ def _interrupted(run: Run) -> bool:
 
 
 def _conversion(request: ConvertRequest, work: Work, gaussians: Gaussians) -> Conversion:
-    source, found = work.field.source, out_of_box(gaussians, work.field.source.volume)
-    ply = certified(ply_options(request, source), work.run, work.field, work.fit, found, request.command)
-    return Conversion(found, work.run.report, ply, work.field)
+    """Not scored."""
+    source = work.field.source
+    return Conversion(out_of_box(gaussians, source.volume), work.run.report, ply_options(request, source), work.field)
 
 
 @contextmanager
@@ -283,7 +289,7 @@ def opened(run: Run, request: ConvertRequest) -> Iterator[Field]:
             field = Resident(source, source.scene())
         yield field
         return
-    wanted = Wanted(request.budget(), request.fit.size, request.ply.sh_degree)
+    wanted = Wanted(request.budget(), request.fit.size, request.ply.sh_degree, values=request.live)
     with beside(request.output) as parts, blocked(run, request.source, options, parts, wanted) as found:
         _tell(run, request, found.source)
         run.compile(for_blocks(_kernels(run, request, found.source)), found.source.kernel_type())
@@ -355,13 +361,29 @@ def _legend(source: Source) -> str | None:
     return legend_text(source.tf, lo, hi, "HU" if volume.hounsfield else "")
 
 
-def _write(run: Run, request: ConvertRequest, conversion: Conversion) -> ConversionReport:
-    """Write the file, the preview and the report."""
+def _early(run: Run, request: ConvertRequest) -> Callable[[Conversion], None] | None:
+    """What writes the file before its scores are there; None where that can be done once only (a pipe), or a checkpoint
+    holds the Gaussians and the same command is to go on with them."""
+    output = request.output
+    if output is None or output == STDOUT or is_stream(output) or request.checkpoint is not None:
+        return None
+
+    def write(found: Conversion) -> None:
+        more = "; it is whole, scores follow"
+        write_gaussians(run, output, found.gaussians, found.ply, request.overwrite, found.normals(), more=more)
+
+    return write
+
+
+def _write(run: Run, request: ConvertRequest, conversion: Conversion, written: bool = False) -> ConversionReport:
+    """Write the file, the preview and the report; of a file that is ``written`` the certificate is missing."""
     from vvgt_cli.images import write_png
 
     report = run.report
     assert request.output is not None
-    write_gaussians(run, request.output, conversion.gaussians, conversion.ply, request.overwrite, conversion.normals())
+    if conversion.ply.certificate is not None or not written:
+        file, stage = (request.output, conversion.gaussians, conversion.ply), "certificate" if written else "write"
+        write_gaussians(run, *file, request.overwrite or written, conversion.normals(), stage)
     if format_of(request.output):
         source = conversion.field.source
         run.compile(source.kernels(EVALUATE), source.kernel_type())

@@ -61,20 +61,22 @@ def write_gaussians(
     options: PlyOptions,
     overwrite: bool,
     normals: np.ndarray | None = None,
+    stage: str = "write",
+    more: str = "",
 ) -> None:
     """The stage that writes Gaussians in the format of the name, to standard output as a `.ply`; records the size.
 
-    ``normals`` (K, 3) are of a `.ply`.
+    ``normals`` (K, 3) are of a `.ply`. The stage is called ``stage``, and there may be ``more`` to say of it.
     """
     report = run.report
-    with run.stage("write") as stage:
+    with run.stage(stage) as record:
         if output == STDOUT:
             report.bytes = write_ply(sys.stdout.buffer, gaussians, options, normals)
             sys.stdout.buffer.flush()
         else:
             report.bytes = _write_file(output, gaussians, options, overwrite, normals)
         report.gaussians = len(gaussians)
-        stage.note = f"{output}: {len(gaussians)} Gaussians, {report.bytes / 1e6:.1f} MB"
+        record.note = f"{output}: {len(gaussians)} Gaussians, {report.bytes / 1e6:.1f} MB{more}"
 
 
 def is_page(output: str | None) -> bool:

@@ -6,6 +6,7 @@ asked for is baked in, for programs that know nothing of values.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -77,9 +78,10 @@ def refusal(request: ConvertRequest, source: Source) -> str | None:
 
 
 def live_conversion(
-    run: Run, request: ConvertRequest, field: Field, ply: PlyOptions, scored: bool = True
+    run: Run, request: ConvertRequest, field: Field, ply: PlyOptions, scored: bool = True,
+    unscored: Callable[[Conversion], None] | None = None,
 ) -> Conversion:  # fmt: skip
-    """Place, look up, bake, score where asked to; ``ply`` as of an ordinary conversion.
+    """Place, look up, bake, score where asked to; ``ply`` as of an ordinary conversion, ``unscored`` as well.
 
     Raises:
         UsageError: colours, or a light that needs the volume.
@@ -96,10 +98,13 @@ def live_conversion(
         look = source.tf
     table = looked_up(facts, look, source.unit_distance, source.volume.unit_frame().scale)
     gaussians = as_stored(lit(baked(gaussians, table, pixel), lighting))
-    psnr = _score(run, request, field, gaussians, lit_by(gaussians, table, lighting, pixel)) if scored else None
-    found = out_of_box(gaussians, source.volume)
-    ply = certified(replace(ply, live=facts), run, field, fit, found, request.command, psnr)
-    return Conversion(found, run.report, ply, field)
+    found = Conversion(out_of_box(gaussians, source.volume), run.report, replace(ply, live=facts), field)
+    if unscored is not None:
+        unscored(found)
+    if scored:
+        psnr = _score(run, request, field, gaussians, lit_by(gaussians, table, lighting, pixel))
+        found.ply = certified(found.ply, run, field, fit, found.gaussians, request.command, psnr)
+    return found
 
 
 def _of_one(run: Run, request: ConvertRequest, field: Field, several: int = 1) -> tuple[Gaussians, LiveFacts]:

@@ -24,7 +24,7 @@ from vvgt_cli.errors import UsageError
 from vvgt_cli.field.workload import Workload, for_budget, view_edge
 from vvgt_cli.resources import free_memory
 
-DEFAULT_STEPS = 112  # of gradient descent: the knee of error against seconds (docs/plan.md)
+DEFAULT_STEPS = 152  # of gradient descent: the knee of error against seconds (docs/plan.md)
 MOST_STEPS = 400  # where a target or a time asks for as many as it takes
 FEWEST_STEPS = 8  # less is not worth the views
 ENOUGH_STEPS = 24  # as good as back-projection; fewer are taken after it

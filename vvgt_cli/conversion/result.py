@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -183,6 +184,10 @@ class Conversion(Result):
 
     def normals(self) -> np.ndarray | None:
         """Directions (K, 3) of the mean gradient around each Gaussian, unit frame; None where nothing is lit."""
+        return self._normals
+
+    @cached_property
+    def _normals(self) -> np.ndarray | None:
         volume = self.field.source.volume
         normals = self.field.normals(into_box(self.gaussians, volume))
         if normals is None:

@@ -66,12 +66,14 @@ class Wanted:
         gaussians, size: budget, and pixels of the screen.
         degree: of harmonics that are asked for.
         most: base cells, None: as many as memory holds.
+        values: it is to stand for any function, so the histogram of its values is needed, too.
     """
 
     gaussians: int
     size: int
     degree: int | None = None
     most: int | None = None
+    values: bool = False
 
 
 @contextmanager
@@ -113,7 +115,7 @@ def blocked(run: Run, request: SourceRequest, options: BlockOptions, parts: Part
         if parts.open({**settings, "blocks": edge}, ours=options.shard is None):
             run.console.say(f"going on with the blocks in {parts.folder}")
         run.compile(COUNT_WHOLE + COUNT_REAL)
-        access = Counted(parts, edge, lambda task: do(task, "count"), needs_histogram(request))
+        access = Counted(parts, edge, lambda task: do(task, "count"), wanted.values or needs_histogram(request))
         with run.stage("read") as stage:
             source = load(request, access)
             reader, visible = _reader(source, access)
@@ -309,7 +311,7 @@ def _settings(request: SourceRequest, wanted: Wanted) -> dict[str, Any]:
         "function": [text, request.tf_range, request.unit_distance],
         "look": [repr(request.light), _facts(request.labels), *(repr(layer) for layer in request.layers)],
         "series": digest(*request.statistics),
-        "gaussians": [wanted.gaussians, wanted.degree, wanted.most],
+        "gaussians": [wanted.gaussians, wanted.degree, wanted.most, wanted.values],
         "size": wanted.size,
     }
 

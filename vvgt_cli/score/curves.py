@@ -19,13 +19,13 @@ from vvgt_cli.errors import DataError
 
 Run = dict[str, Any]
 FORMATS = ("vvgt-report", "vvgt-conversion")
-SCORING = ("test views", "seats")  # stages that only measure
+SCORING = ("test views", "seats", "certificate")  # stages that only measure, or write what has been measured
 KINDS = ("closed form", "network", "steps", "baseline", "live", "peer")
 STAGES = {  # colours of the stages that are known, in order
     "read": "#8a949e", "scene": "#b4bbc2", "samples": "#8f7bbf", "closed form": "#2f7fbf", "check views": "#f2c76b",
     "views": "#e69f00", "cells by error": "#0f8f8f", "back-projection": "#56b4e9", "network": "#cc79a7",
     "judge": "#e3b5cd", "refinement": "#009e73", "training": "#6b7fd1", "values": "#c9b458", "live look": "#dddddd",
-    "write": "#777c83", "test views": "#dddddd", "seats": "#e8e8e8",
+    "write": "#777c83", "test views": "#dddddd", "seats": "#e8e8e8", "certificate": "#c4c4c4",
 }  # fmt: skip
 OTHER = "#a05d3b"
 SCORES = ("psnr", "psnr_foreground", "psnr_white", "psnr_alpha", "ssim", "flip")

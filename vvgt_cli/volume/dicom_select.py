@@ -126,7 +126,8 @@ def one_stack(
         path: for messages.
 
     Raises:
-        UsageError: several stacks, or no such one.
+        SeveralArrays: several stacks.
+        UsageError: no such one.
     """
     stacks: list[list[Any]] = []
     for s in slices:
@@ -147,10 +148,10 @@ def one_stack(
     real = [stack for stack in stacks if not all(_localiser(s.header) for s in stack)] or stacks
     large = [stack for stack in real if len(stack) > _FEW] if len(real) > 1 else real
     if len(large) != 1:
-        raise UsageError(
+        raise SeveralArrays(
             f"{path}: slices that differ in size, orientation or pixel spacing: {listing}; choose one with --series "
-            "SERIES/STACK"
-        )
+            "SERIES/STACK", "--series", [f"{name}/{k}" for k in range(1, len(stacks) + 1)], list(map(_of, stacks)),
+        )  # fmt: skip
     rest = "; ".join(f"{name}/{k}: {_of(stack)}" for k, stack in enumerate(stacks, 1) if stack is not large[0])
     warnings.warn(f"{path}: left out, of another size or orientation: {rest[:500]}", stacklevel=2)
     return large[0]

@@ -1,10 +1,13 @@
 """Zarr and OME-Zarr on a server: ``http://HOST/x.ome.zarr``, ``https://HOST/x.zarr:/array``, by fsspec.
 
-Chunks are read as they are needed; every other format has to be a file of this machine.
+Chunks are read as they are needed; every other format has to be a file of this machine. No answer is read beyond
+`MAX_METADATA`, or a chunk's size once an array is open.
 """
 
 from __future__ import annotations
 
+import asyncio
+import weakref
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path, PurePosixPath
@@ -24,11 +27,50 @@ class _Size(NamedTuple):
     st_size: int
 
 
+class _Server:
+    """Answers of bounded size, for us and (asynchronous) for zarr."""
+
+    def __init__(self, url: str) -> None:
+        aiohttp, http = (need(name, "remote", url, "an address") for name in ("aiohttp", "fsspec.implementations.http"))
+        self.failures = OSError, aiohttp.ClientError
+        self.most = most = [MAX_METADATA]  # bytes of an answer
+
+        class Bounded(aiohttp.ClientResponse):  # type: ignore[misc,name-defined]
+            _body: bytes | None
+
+            async def read(self) -> bytes:
+                if self._body is None:
+                    parts: list[bytes] = []
+                    left = most[0]
+                    async for part in self.content.iter_any():
+                        left -= len(part)
+                        if left < 0:
+                            self.close()
+                            raise DataError(
+                                f"{self.url}: more than the {most[0]} bytes expected; try a copy of the store"
+                            )
+                        parts.append(part)
+                    self._body = b"".join(parts)
+                return cast(bytes, await super().read())
+
+        class System(http.HTTPFileSystem):  # type: ignore[misc,name-defined]
+            async def set_session(self) -> Any:
+                opened, session = self._session is None, await super().set_session()
+                if opened and self.asynchronous:  # fsspec closes others only
+                    weakref.finalize(self, self.close_session, asyncio.get_running_loop(), session)
+                return session
+
+        how = {"client_kwargs": {"response_class": Bounded}, "skip_instance_cache": True}
+        self.ours, self.zarrs = (System(asynchronous=other, **how) for other in (False, True))
+
+
 class Remote:
     """A place, with what `zarr_store` asks of a path; what has been read is kept."""
 
-    def __init__(self, system: Any, root: str, inner: str = "", kept: dict[str, bytes | None] | None = None) -> None:
-        self._system, self._root, self._inner = system, root, PurePosixPath(inner)
+    def __init__(
+        self, server: _Server, root: str, inner: str = "", kept: dict[str, bytes | None] | None = None
+    ) -> None:
+        self._server, self._root, self._inner = server, root, PurePosixPath(inner)
         self._kept: dict[str, bytes | None] = {} if kept is None else kept
 
     def __str__(self) -> str:
@@ -38,7 +80,7 @@ class Remote:
         return self._at(self._inner / name.lstrip("/"))
 
     def _at(self, inner: PurePosixPath) -> Remote:
-        return Remote(self._system, self._root, str(inner), self._kept)
+        return Remote(self._server, self._root, str(inner), self._kept)
 
     def __eq__(self, other: object) -> bool:
         return str(self) == str(other)
@@ -56,7 +98,7 @@ class Remote:
     @property
     def parent(self) -> Remote:
         if self._inner == PurePosixPath():
-            return Remote(self._system, self._root.rpartition("/")[0], "", self._kept)
+            return Remote(self._server, self._root.rpartition("/")[0], "", self._kept)
         return self._at(self._inner.parent)
 
     def resolve(self) -> PurePosixPath:
@@ -74,11 +116,8 @@ class Remote:
         url = str(self)
         if url not in self._kept:
             try:
-                size = self._system.size(url)
-                if size is not None and size > MAX_METADATA:
-                    raise DataError(f"{url}: {size} bytes; expected metadata of at most 16 MiB")
-                self._kept[url] = self._system.cat_file(url)
-            except FileNotFoundError:
+                self._kept[url] = self._server.ours.cat_file(url)
+            except self._server.failures:
                 self._kept[url] = None
         return self._kept[url]
 
@@ -92,10 +131,18 @@ class Remote:
         return True
 
     def iterdir(self) -> list[Remote]:
-        return [self / Path(entry["name"].rstrip("/")).name for entry in self._system.ls(str(self))]
+        return [self / Path(entry["name"].rstrip("/")).name for entry in self._server.ours.ls(str(self))]
 
     def stat(self) -> _Size:
         return _Size(len(self._content or b""))
+
+    def store(self) -> Any:
+        """The same for zarr."""
+        return need("zarr.storage", "zarr", str(self), "Zarr").FsspecStore(self._server.zarrs, True, str(self))
+
+    def allow(self, size: int) -> None:
+        """Answers as long as a packed chunk of so many bytes."""
+        self._server.most[0] = max(self._server.most[0], MAX_METADATA + size + size // 8)
 
     def read_text(self, encoding: str) -> str:
         return (self._content or b"").decode(encoding)
@@ -113,11 +160,8 @@ def _opened(url: str, options: ReadOptions) -> tuple[Path, ReadOptions]:
         head, inner = url, ""
     if inner and options.array is not None:
         raise UsageError(f"{url}: --array {options.array} and :/{inner} choose both; leave out one")
-    for module in ("fsspec", "aiohttp"):
-        need(module, "remote", url, "an address")
     with library_errors(url, "Zarr"):
-        system, root = need("fsspec", "remote", url, "an address").url_to_fs(head.rstrip("/"))
-        place = cast(Path, Remote(system, root))
+        place = cast(Path, Remote(_Server(url), head.rstrip("/")))
         if not holds_zarr(place):
             raise DataError(
                 f"{url}: no Zarr there, or no answer (of another format download the file); expected .../x.ome.zarr"

@@ -64,10 +64,13 @@ def read_zarr(path: Path, options: ReadOptions) -> Volume:
 
 def _array(zarr: Any, place: Path) -> Any:
     """An array whose codecs have been checked; they are once more, as a server may have answered zarr otherwise."""
-    array = zarr.open_array(store=str(place), mode="r")
+    server: Any = None if isinstance(place, Path) else place  # `remote.Remote`
+    array = zarr.open_array(store=server.store() if server else place, mode="r")
     _check_codecs(place, array.metadata.to_dict())
     if int(np.prod(array.chunks, dtype=object)) * array.dtype.itemsize > MAX_CHUNK:
         raise DataError(f"{place}: chunks of {array.chunks} values; expected at most 2 GiB each")
+    if server:
+        server.allow(int(np.prod(array.shards or array.chunks, dtype=object)) * array.dtype.itemsize)
     return array
 
 

@@ -10,6 +10,7 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
@@ -60,7 +61,7 @@ class Levels:
         self.count = int(self._manifest["lodLevels"])
         about, self.scale = placed(self._manifest)
         self._comments = about.comments
-        self._files: dict[int, Splats] = {}
+        self._shown: dict[tuple[int, int, int], Splats] = {}  # by file, offset, count: of the last view
 
     def level(self, chosen: str | None) -> Splats:
         """The Gaussians of a level by its number, None for the finest; of nodes without it the next finer one.
@@ -98,10 +99,14 @@ class Levels:
         if free is not None and A_ROW * rows > free:
             need = A_ROW * rows / 2**30
             raise DataError(f"{self.path}: {rows:,} Gaussians take about {need:.1f} GiB; try a coarser level, as #1")
-        parts = [self._part(place["file"], place["offset"], place["count"]) for place in places]
-        if not parts:
+        if not places:
             raise DataError(f"{self.path}: its nodes have no Gaussians; expected streamed SOG")
-        whole, smaller = joined(parts), np.float32(self.scale)
+        keys = [(place["file"], place["offset"], place["count"]) for place in places]
+        self._shown = {key: self._shown[key] for key in keys if key in self._shown}
+        missing = sorted(set(keys) - self._shown.keys())
+        for file, some in groupby(missing, lambda key: key[0]):
+            self._read(file, list(some))
+        whole, smaller = joined([self._shown[key] for key in keys]), np.float32(self.scale)
         return replace(
             whole,
             means=whole.means / smaller,
@@ -109,20 +114,21 @@ class Levels:
             comments=self._comments,
         )
 
-    def _part(self, file: int, offset: int, count: int) -> Splats:
-        if file not in self._files:
-            name = self.path.parent / self._manifest["filenames"][file]
-            try:
-                meta = json.loads(name.read_bytes())
-                self._files[file] = splats_in(
-                    meta, lambda image: (name.parent / Path(image).name).read_bytes(), str(name)
+    def _read(self, file: int, keys: list[tuple[int, int, int]]) -> None:
+        """Keep what is asked for of a file."""
+        name = self.path.parent / self._manifest["filenames"][file]
+        try:
+            meta = json.loads(name.read_bytes())
+            found = splats_in(meta, lambda image: (name.parent / Path(image).name).read_bytes(), str(name))
+        except FileNotFoundError as error:
+            raise DataError(f"{self.path}: {error.filename} is missing; expected the whole folder") from None
+        except (OSError, ValueError) as error:
+            text = " ".join(str(error).split())[:200]
+            raise DataError(f"{name}: damaged ({text}); expected SOG's {name.name}") from None
+        for key in keys:
+            _, offset, count = key
+            if offset + count > len(found):
+                raise DataError(
+                    f"{self.path}: a node has rows to {offset + count} of file {file}, which has {len(found)}"
                 )
-            except FileNotFoundError as error:
-                raise DataError(f"{self.path}: {error.filename} is missing; expected the whole folder") from None
-            except (OSError, ValueError) as error:
-                text = " ".join(str(error).split())[:200]
-                raise DataError(f"{name}: damaged ({text}); expected SOG's {name.name}") from None
-        found = self._files[file]
-        if offset + count > len(found):
-            raise DataError(f"{self.path}: a node has rows to {offset + count} of file {file}, which has {len(found)}")
-        return found.take(np.arange(offset, offset + count))
+            self._shown[key] = found.take(np.arange(offset, offset + count))

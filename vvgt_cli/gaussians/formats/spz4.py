@@ -80,7 +80,7 @@ def to_version_3(content: bytes, name: str) -> tuple[bytes, list[str]]:
         if whole != length or len(part) != size:
             raise DataError(f"{name}: stream {number} of {whole} bytes in {len(part)}; expected {length} in {size}")
         with library_errors(name, "an .spz of version 4"):
-            body.append(bytes(zstd.decompress(part, bytearray(length))))
+            body.append(_unpacked(zstd, part, length, f"{name}: stream {number}"))
         start += size
     comments: list[str] = []
     for kind, payload in _records(content[_HEAD.size : table] if flags & _RECORDS else b"", name):
@@ -90,6 +90,19 @@ def to_version_3(content: bytes, name: str) -> tuple[bytes, list[str]]:
             raise DataError(f"{name}: axes of kind {payload[:1].hex()}; expected right, down, front as in a .ply (06)")
     front = _OLD.pack(MAGIC, 3, count, degree, fraction, flags & 1)
     return gzip.compress(front + b"".join(body), 1, mtime=0), comments
+
+
+def _unpacked(zstd: Any, part: bytes, length: int, name: str) -> bytes:
+    """What a stream holds.
+
+    Raises:
+        DataError: fewer bytes than ``length``, of which the last would stay as they were.
+    """
+    for before in (b"\0", b"\xff"):
+        found = bytes(zstd.decompress(part, bytearray(before * length)))
+        if found[-1:] != before:
+            return found
+    raise DataError(f"{name}: less than the {length} bytes that its table says; is the file whole?")
 
 
 def _records(zone: bytes, name: str) -> Iterator[tuple[int, bytes]]:
