@@ -2,25 +2,15 @@
 import { PROJECTION_ORTHOGRAPHIC, PROJECTION_PERSPECTIVE, Vec3 } from 'playcanvas';
 
 const DEGREES = Math.PI / 180;
-const FITS = 0.9, PANEL = 312;  // share of the window that is filled at first sight; px that the panel takes
 const of = (v) => [v.x, v.y, v.z], vec = (a) => new Vec3(...a);
 export const plus = (a, b, s = 1) => a.map((x, i) => x + s * b[i]), dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 
-// How far from `middle`, in a direction d, all `places` fit into the window; the viewer's field of view is along its longer side.
-// `yaw` (radians): of d, or of what is up in the picture where d is vertical; `panel`: whether one takes a part of the width.
-export function farEnough(places, middle, d, yaw, fov, panel) {
-  const [w, h] = [Math.max(innerWidth, 1), Math.max(innerHeight, 1)], free = panel && w >= 700 ? w - PANEL : w;
-  const right = [Math.cos(yaw), 0, -Math.sin(yaw)], up = [d[1] * right[2], d[2] * right[0] - d[0] * right[2], -d[1] * right[0]];
-  const t = (FITS * Math.tan((fov * DEGREES) / 2)) / Math.max(w, h);
-  return Math.max(...places.map((p) => plus(p, middle, -1)).map((q) => dot(q, d) + Math.max(Math.abs(dot(q, right)) / (t * free), Math.abs(dot(q, up)) / (t * h))));
-}
-
 // {pose, set, look, project, ray, perPixel, flat, change}; places are in the viewer's axes, pixels are of CSS
-export function lensOf(viewer, { outermost = [], live }) {
+export function lensOf(viewer) {
   const { app } = viewer, canvas = app.graphicsDevice.canvas, entity = app.root.findComponent('camera').entity, { camera } = entity;
   const rig = viewer.cameraManager();
   const focus = new Vec3();
-  let flat = false, whole = rig.camera.distance;  // from where all is seen
+  let flat = false;
   const tangent = () => {  // of half the vertical field of view
     const t = Math.tan((rig.camera.fov * DEGREES) / 2), { clientWidth: w, clientHeight: h } = canvas;
     return w > h ? (t * h) / w : t;
@@ -59,12 +49,11 @@ export function lensOf(viewer, { outermost = [], live }) {
       now.position.copy(vec(at)).sub(focus);
       rig.snap();
     },
-    // from a direction onto what is looked at, all of it unless one has zoomed; up is shown upwards where the direction is vertical
+    // from a direction onto what is looked at; up is shown upwards where the direction is vertical
     look(from, up) {
-      const { target: at, distance } = lens.pose(), level = Math.hypot(from[0], from[2]) > 1e-3, keeps = !outermost.length || Math.abs(distance / whole - 1) > 1e-3;
-      const [x, z] = level ? [from[0], from[2]] : from[1] > 0 ? [-up[0], -up[2]] : [up[0], up[2]], yaw = Math.atan2(x, z);
-      if (!keeps) whole = farEnough(outermost, at, from, yaw, rig.camera.fov, live);
-      lens.set({ target: at, pitch: -Math.asin(Math.max(-1, Math.min(1, from[1]))) / DEGREES, yaw: yaw / DEGREES, distance: keeps ? distance : whole });
+      const { target: at, distance } = lens.pose(), level = Math.hypot(from[0], from[2]) > 1e-3;
+      const [x, z] = level ? [from[0], from[2]] : from[1] > 0 ? [-up[0], -up[2]] : [up[0], up[2]];
+      lens.set({ target: at, pitch: -Math.asin(Math.max(-1, Math.min(1, from[1]))) / DEGREES, yaw: Math.atan2(x, z) / DEGREES, distance });
     },
     // [x, y] in pixels of a place, null behind the eye
     project(p) {

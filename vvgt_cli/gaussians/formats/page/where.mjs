@@ -20,7 +20,7 @@ const ICONS = {
 };
 
 export function where(viewer, scene, live, show) {
-  const lens = lensOf(viewer, scene), { app } = viewer, svg = element('svg', { id: 'where', role: 'img' });
+  const lens = lensOf(viewer), { app } = viewer, svg = element('svg', { id: 'where', role: 'img' });
   const handles = live && handlesOf(lens, live.cut);
   document.querySelector('#view .sse-sceneLayer').append(svg, ...(handles ? [handles.svg] : []));
   const box = document.createElement('div');
