@@ -23,16 +23,9 @@ from vvgt_cli.gaussians.frames import rotations, transform, turn
 from vvgt_cli.gaussians.live import (
     AMOUNT,
     AROUND,
-    FLAT,
-    MEANS,
-    SHARP,
-    SPREADS,
-    WIDEST,
     Table,
     baked,
-    directions,
     shown_by,
-    spreads,
 )
 from vvgt_cli.gaussians.live_facts import LiveFacts, function_text
 from vvgt_cli.gaussians.opacity import peak_opacity
@@ -94,24 +87,6 @@ def test_a_table_holds_means_over_normal_laws(tf: TransferFunction, spread: floa
     np.testing.assert_allclose((sums[:, 4:] / sums[:, [3]])[some], moments[some], atol=0.1)
     wanted = np.clip(own + AMOUNT * (own - under(AROUND * spread)[1]), 0, 1)
     np.testing.assert_allclose((sums[:, :3] / sums[:, [3]])[some], wanted[some], atol=0.02)
-
-
-def test_what_is_opaque_lies_flat_in_its_surface() -> None:
-    """A round one whose values rise along a direction: that becomes the shortest axis; without it one of them is."""
-    rises = np.array([0.48, 0.6, 0.64])
-    live = np.array([[70.0, 1.0, 1.0, *rises], [70.0, 1.0, 1.0, 0, 0, 0]])
-    some = Gaussians(
-        np.zeros((2, 3)), np.full((2, 3), np.log(0.1)), [[1, 0, 0, 0]] * 2, [0.0] * 2, COLORS([0, 0]), live=live
-    )
-    shown = shown_by(some, Table.of_function(RAMP, LO, HI, 0.05, GRAIN))
-    axes = rotations(shown.quaternions.astype(float)) * np.exp(shown.log_scales.astype(float))[:, None, :]
-    variances, turned = np.linalg.eigh(axes[0] @ axes[0].T)
-    wanted = 0.01 * np.array([SHARP, FLAT, FLAT])
-    np.testing.assert_allclose(variances, wanted, rtol=1e-3)
-    assert abs(turned[:, 0] @ rises) == pytest.approx(1, abs=1e-5)
-    np.testing.assert_allclose(
-        np.sort(np.exp(2 * shown.log_scales[1])), 0.01 * np.array([SHARP, FLAT, FLAT]), rtol=1e-3
-    )
 
 
 def test_without_spread_a_gaussian_has_the_functions_color_and_extinction() -> None:
@@ -415,11 +390,3 @@ def test_the_library_recolors_results_and_files(live_file) -> None:
     assert json.loads(magma.ply.legend)["nodes"][-1][2] == "fcfdbf"
     with pytest.raises(vvgt_library.DataError, match="carry no values"):
         other.recolor("magma")
-
-
-def test_directions_are_unit_vectors_of_own_axes() -> None:
-    along, share = directions(cloud())
-    np.testing.assert_allclose(np.linalg.norm(along, axis=1), 1, atol=1e-6)
-    assert (share <= 1).all()
-    assert spreads()[-1] == WIDEST
-    assert Table.of_function(RAMP, LO, HI, 1, GRAIN).sums.shape == (MEANS, SPREADS, 6)
