@@ -34,11 +34,11 @@ OUTSIDE = {
 
 
 def shell(**changes):
-    """The function with other opacities (``times``) or colours (``turned``), or at other values (``moved``)."""
+    """The function with other opacities (``times``), colours (so much ``turned``) or values (``moved``)."""
     points = [dict(p) for p in SHELL["points"]]
     for p in points:
         p["opacity"] *= changes.get("times", 1.0)
-        p["rgb"] = p["rgb"][::-1] if changes.get("turned") else p["rgb"]
+        p["rgb"] = [c + changes.get("turned", 0.0) * (d - c) for c, d in zip(p["rgb"], p["rgb"][::-1], strict=True)]
         p["x"] += changes.get("moved", 0.0)
     return {**SHELL, "points": points}
 
@@ -69,7 +69,7 @@ def names(result):
 
 
 @pytest.mark.parametrize(
-    ("changes", "less"), [({"times": 0.5}, 0), ({"turned": True}, 1.2), ({"moved": 0.02}, 0)]
+    ("changes", "less"), [({"times": 0.5}, 0), ({"turned": 0.4}, 0.8), ({"moved": 0.02}, 0)]
 )  # so few Gaussians are too wide for colours of their own
 def test_another_function_is_as_near_as_by_itself(session, earlier, changes, less):
     tf = shell(**changes)
