@@ -143,7 +143,8 @@ def _seen(look: Source, source: Source, gaussians: Gaussians, under: np.ndarray)
     from vvgt_cli.closed_form.relit import relit
 
     numbers, scale = source.statistics, source.volume.unit_frame().scale
-    table = Table.of_function(look.tf, numbers.lo, numbers.hi, look.unit_distance * scale)
+    grain = 2 / max(source.volume.dims)
+    table = Table.of_function(look.tf, numbers.lo, numbers.hi, look.unit_distance * scale, grain)
     sums = table.of(under)
     tau = sums[:, TAU]
     plain = replace(gaussians, colors=sums[:, :TAU] / np.maximum(tau, 1e-30)[:, None], harmonics=None)
