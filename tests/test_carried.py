@@ -162,6 +162,17 @@ def test_descent_moves_what_is_free():
     np.testing.assert_allclose(covariances(found)[~free], covariances(g)[~free], rtol=1e-4, atol=1e-9)
 
 
+def test_what_comes_back_moves_back(vvgt, beat, monkeypatch):
+    """The views of the third frame were last drawn of the first, which shows the same; the Gaussians do not."""
+    monkeypatch.setattr("vvgt_cli.conversion.carried.VIEWS", 12)
+    for k, radius in enumerate((0.2, 0.208, 0.2, 0.2)):
+        np.save(beat / f"v_{k}.npy", body(radius))
+    assert vvgt("convert", beat / "v_*.npy", "--tf", beat / "tf.json", *HOW, "-o", beat / "f_{}.ply").code == 0
+    index = json.loads((beat / "f_index.json").read_text())["files"]
+    assert [row.get("moved", 0) > 20 for row in index] == [False, True, True, False]
+    assert index[2]["psnr"] > index[0]["psnr"] - 0.1
+
+
 def test_patches():
     rng = np.random.default_rng(2)
     base = rng.integers(0, 256, 5000, np.uint8)

@@ -89,16 +89,19 @@ def test_descent_may_begin_elsewhere_but_never_ends_below_the_start():
     start = replace(truth, colors=np.clip(colors + 0.05, 0, 1))
     run, options = Run(Console(quiet=True), ConversionReport("convert")), OptimizeOptions(steps=12)
     wrecked = replace(start, colors=1 - colors)
-    kept = refine(run, start, views, views, options, wrecked)
+    before = views.psnr(start)
+    kept = refine(run, start, views, views, options, (wrecked, before))
     np.testing.assert_allclose(kept.colors, start.colors, atol=1e-6)
     stage = run.report.stages[-1]
     assert stage.kept is False
     assert stage.psnr_before == stage.psnr == pytest.approx(views.psnr(start), abs=1e-6)
     near = replace(start, colors=np.clip(colors + 0.02, 0, 1))
     still = OptimizeOptions(steps=0)
-    assert views.psnr(refine(run, start, views, views, still, near)) == pytest.approx(views.psnr(near), abs=1e-3)
+    assert views.psnr(refine(run, start, views, views, still, (near, before))) == pytest.approx(
+        views.psnr(near), abs=1e-3
+    )
     assert run.report.stages[-1].kept is True
-    result = refine(run, start, views, views, options, near)
+    result = refine(run, start, views, views, options, (near, before))
     assert views.psnr(result) > max(views.psnr(start), views.psnr(near))
     assert run.report.stages[-1].psnr_before == pytest.approx(views.psnr(start), abs=1e-6)
     assert run.report.refinement["psnr_before"] == run.report.stages[-1].psnr_before

@@ -80,7 +80,6 @@ def test_a_function_of_whole_numbers() -> None:
         ("", "a.ctbl", "no label"),
         ("1 a 1 2 3 4\n1 b 1 2 3 4\n", "a.ctbl", "label 1 twice"),
         ("1 a 300 2 3 4\n", "a.ctbl", r"in \[0, 1\]"),
-        ("1 a 0 2 3 0\n", "a.ctbl", "none of them visible"),
         ("[1]", "a.json", "no object"),
         ('{"liver": {}}', "a.json", "'liver'"),
         ('{"1": {"color": [0, 0, 1], "opacity": 2}}', "a.json", "opacity 2"),
@@ -156,6 +155,22 @@ def test_convert_evaluate_and_views(vvgt, tmp_path: Path, seg: Path) -> None:
     assert "another run" in again.error or "function" in again.error
     lit = vvgt("init", seg, "--labels", labels, "--light", "headlight", *SMALL[:4], "-o", tmp_path / "lit.ply")
     assert lit.code == 0, lit.err
+
+
+def test_of_several_layers_one_may_be_hidden(vvgt, tmp_path: Path, seg: Path) -> None:
+    """But not all of them, nor one that is alone."""
+    from vvgt_cli.field.source import SourceRequest, load
+
+    hidden = json.dumps({number: entry | {"opacity": 0} for number, entry in json.loads(JSON).items()})
+    none = str(table(tmp_path, hidden, "none.json"))
+    other = SourceRequest(str(seg), labels=str(table(tmp_path, JSON, "a.json")))
+    shown = load(SourceRequest(str(seg), labels=none, layers=(other,)))
+    grid = grid_of(shown.layers, shown.volume)
+    np.testing.assert_allclose(grid, grid_of(load(other).layers, shown.volume))
+    both = ("--layer", f"{seg},labels={none}", "-o", tmp_path / "x.ply")
+    for more in (("-o", tmp_path / "x.ply"), both, ("--split-labels", "-o", tmp_path / "x_{}.ply")):
+        done = vvgt("convert", seg, "--labels", none, *SMALL, *more)
+        assert (done.code, "none of its labels is visible" in done.error) == (1, True), done.error
 
 
 def test_a_recognised_label_map_is_said_and_none_takes_it_back(vvgt, tmp_path: Path, seg: Path) -> None:

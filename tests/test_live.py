@@ -20,7 +20,13 @@ from vvgt_cli.dvr.layout import Voxels
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
 from vvgt_cli.gaussians.formats.live import from_bytes, live_bytes, live_json
 from vvgt_cli.gaussians.frames import rotations, transform, turn
-from vvgt_cli.gaussians.live import MEANS, SPREADS, WIDEST, Table, baked, directions, shown_by, spreads
+from vvgt_cli.gaussians.live import (
+    AMOUNT,
+    AROUND,
+    Table,
+    baked,
+    shown_by,
+)
 from vvgt_cli.gaussians.live_facts import LiveFacts, function_text
 from vvgt_cli.gaussians.opacity import peak_opacity
 from vvgt_cli.images.metrics import psnr
@@ -32,7 +38,7 @@ from vvgt_cli.splat import render
 from vvgt_cli.volume import Volume
 from vvgt_cli.volume.stats import Statistics, edges_of
 
-LO, HI = -20.0, 80.0
+LO, HI, GRAIN = -20.0, 80.0, 2 / 9
 COLORS = ColorMap(np.array([LO, 20, HI]), np.array([[1, 0.2, 0], [0, 1, 0.3], [0.1, 0, 1]]))
 RAMP = TransferFunction("ramp", PiecewiseOpacity(np.array([0.0, HI]), np.array([0.0, 0.6])), COLORS)
 WINDOW = TransferFunction("window", PiecewiseOpacity(np.array([10.0, 20, 30]), np.array([0.0, 0.5, 0.0])), COLORS)
@@ -62,15 +68,25 @@ def facts(tf: TransferFunction = RAMP) -> LiveFacts:
 @pytest.mark.parametrize("tf", [RAMP, WINDOW])
 @pytest.mark.parametrize("spread", [0.5, 4.0, 15.0])
 def test_a_table_holds_means_over_normal_laws(tf: TransferFunction, spread: float) -> None:
-    """Against quadrature in float64."""
+    """Against quadrature in float64: what values cover together, and colours before their neighbours are mixed in."""
     distance, values = 0.05, np.array([-5.0, 12.3, 21.0, 55.0])
-    sums = Table.of_function(tf, LO, HI, distance).at(values, np.full(4, spread))
+    sums = Table.of_function(tf, LO, HI, distance, GRAIN).at(values, np.full(4, spread))
     z = np.array([NormalDist().inv_cdf((k + 0.5) / 20001) for k in range(20001)])
-    at = np.clip(values[:, None] + spread * z, LO, HI)
-    tau = -np.log1p(-tf.opacity(at)) / distance
-    color = tf.color(at.ravel()).reshape(4, -1, 3)
-    wanted = [(tau * color[..., c]).mean(axis=1) for c in range(3)] + [(tau * z**p).mean(axis=1) for p in range(3)]
-    assert np.abs(sums - np.stack(wanted, axis=1)).max() < 0.035 * tau.max()  # of 33 nodes
+
+    def under(width: float) -> tuple[np.ndarray, np.ndarray]:
+        at = np.clip(values[:, None] + width * z, LO, HI)
+        covers = 1 - (1 - tf.opacity(at)) ** (GRAIN / distance)
+        color = tf.color(at.ravel()).reshape(4, -1, 3)
+        return covers, (covers[..., None] * color).mean(axis=1) / np.maximum(covers.mean(axis=1), 1e-12)[:, None]
+
+    covers, own = under(spread)
+    tau = -np.log1p(-covers.mean(axis=1)) / GRAIN
+    some, most = covers.mean(axis=1) > 0.1, -np.log1p(-tf.opacity(np.linspace(LO, HI, 999)).max()) / distance
+    assert np.abs(sums[:, 3] - tau).max() < 0.035 * most  # of 33 nodes
+    moments = np.stack([(covers * z**p).mean(axis=1) / np.maximum(covers.mean(axis=1), 1e-12) for p in (1, 2)], axis=1)
+    np.testing.assert_allclose((sums[:, 4:] / sums[:, [3]])[some], moments[some], atol=0.1)
+    wanted = np.clip(own + AMOUNT * (own - under(AROUND * spread)[1]), 0, 1)
+    np.testing.assert_allclose((sums[:, :3] / sums[:, [3]])[some], wanted[some], atol=0.02)
 
 
 def test_without_spread_a_gaussian_has_the_functions_color_and_extinction() -> None:
@@ -78,7 +94,7 @@ def test_without_spread_a_gaussian_has_the_functions_color_and_extinction() -> N
     assert some.live is not None
     live = some.live.copy()
     live[:, 1] = 0
-    shown = baked(replace(some, live=live), Table.of_function(RAMP, LO, HI, 0.05))
+    shown = baked(replace(some, live=live), Table.of_function(RAMP, LO, HI, 0.05, GRAIN))
     tau = -np.log1p(-RAMP.opacity(live[:, 0].astype(float))) / 0.05
     opacity = 1 / (1 + np.exp(-shown.opacity_logits.astype(float)))
     wanted = peak_opacity(tau * live[:, 2] ** 3, np.exp(2 * some.log_scales.astype(float)), 0.0)
@@ -92,14 +108,14 @@ def test_a_gaussian_moves_to_where_the_values_are_seen_and_is_thinner_there() ->
     """One whose values rise along x from LO to HI: a window around 20 lies where 20 is."""
     live = np.array([[10.0, 20.0, 1e-5, 1.0, 0.0, 0.0]])
     one = Gaussians(np.zeros((1, 3)), np.full((1, 3), np.log(0.1)), [[1, 0, 0, 0]], [0.0], [[1, 1, 1]], live=live)
-    shown = shown_by(one, Table.of_function(WINDOW, LO, HI, 0.05))
+    shown = shown_by(one, Table.of_function(WINDOW, LO, HI, 0.05, GRAIN))
     np.testing.assert_allclose(shown.means, [[0.1 * (20 - 10) / 20, 0, 0]], atol=5e-3)
     axes = rotations(shown.quaternions.astype(float))[0] * np.exp(shown.log_scales.astype(float))
     covariance = axes @ axes.T
     within = np.array([NormalDist(10, 20).pdf(x) for x in np.linspace(10, 30, 401)])
     x = (np.linspace(10, 30, 401) - 10) / 20
-    tau = -np.log1p(-WINDOW.opacity(np.linspace(10, 30, 401))) * within
-    variance = (tau * x**2).sum() / tau.sum() - ((tau * x).sum() / tau.sum()) ** 2
+    covers = (1 - (1 - WINDOW.opacity(np.linspace(10, 30, 401))) ** (GRAIN / 0.05)) * within
+    variance = (covers * x**2).sum() / covers.sum() - ((covers * x).sum() / covers.sum()) ** 2
     assert covariance[0, 0] == pytest.approx(0.01 * variance, rel=0.05)
     assert covariance[1, 1] == pytest.approx(0.01, rel=1e-4)
     assert shown.live is None
@@ -107,7 +123,7 @@ def test_a_gaussian_moves_to_where_the_values_are_seen_and_is_thinner_there() ->
 
 def test_a_look_turns_with_its_gaussians() -> None:
     """Of maps that stretch too, where nothing is opaque: gradients are covectors."""
-    some, table = cloud(), Table.of_function(WINDOW, LO, HI, 0.05)
+    some, table = cloud(), Table.of_function(WINDOW, LO, HI, 0.05, GRAIN)
     assert some.live is not None
     fine = replace(some, live=np.where(np.arange(6) == 2, 1e-5, some.live))
     shear = np.array([[1.0, 0.3, 0.0], [0.0, 0.8, 0.1], [0.0, 0.0, 1.2]])
@@ -153,7 +169,7 @@ def test_samples_that_are_not_finite_do_not_count() -> None:
 
 
 def test_a_ply_keeps_values_in_columns_that_others_ignore(tmp_path: Path) -> None:
-    some = baked(cloud(), Table.of_function(RAMP, LO, HI, 0.05))
+    some = baked(cloud(), Table.of_function(RAMP, LO, HI, 0.05, GRAIN))
     options = PlyOptions(up="y", scale=0.1, centre=(1, 2, 3), frame="world", affine=tuple(range(12)), live=facts())
     options = replace(options, affine=(1.0, 0, 0, 0, 0, 2.0, 0, 0, 0, 0, 1.0, 0))
     write_ply(tmp_path / "a.ply", some, options)
@@ -223,7 +239,7 @@ def test_bytes_for_pages_lose_little() -> None:
     back = replace(some, live=from_bytes(stream, known))
     camera = default_views("test", size=200)[0]
     for tf in (RAMP, WINDOW):
-        table = Table.of_function(tf, LO, HI, 0.05)
+        table = Table.of_function(tf, LO, HI, 0.05, GRAIN)
         images = [render(shown_by(g, table), camera)[..., :3] for g in (some, back)]
         assert psnr(*images) > 50  # at 34 dB from the volume 10 log10(1 + 10^-1.6) = 0.1 dB
 
@@ -374,11 +390,3 @@ def test_the_library_recolors_results_and_files(live_file) -> None:
     assert json.loads(magma.ply.legend)["nodes"][-1][2] == "fcfdbf"
     with pytest.raises(vvgt_library.DataError, match="carry no values"):
         other.recolor("magma")
-
-
-def test_directions_are_unit_vectors_of_own_axes() -> None:
-    along, share = directions(cloud())
-    np.testing.assert_allclose(np.linalg.norm(along, axis=1), 1, atol=1e-6)
-    assert (share <= 1).all()
-    assert spreads()[-1] == WIDEST
-    assert Table.of_function(RAMP, LO, HI, 1).sums.shape == (MEANS, SPREADS, 6)

@@ -50,6 +50,7 @@ def halves() -> Volume:
 def test_a_gaussian_has_its_labels_color_and_extinction_where_it_is() -> None:
     some = labels_cloud()
     assert some.live is not None
+    some.live[:, 3:6] = 0  # in no surface
     shown = shown_by(some, Palette.of_labels(LABELS, 0.05))
     for row, label in enumerate(LABELS[:2]):
         own = some.live[:, 6] == row
@@ -221,7 +222,7 @@ def test_what_labels_do_not_go_with(vvgt, label_file, tmp_path) -> None:
     for more, code, said in (
         (("--tf", "viridis"), 2, "leave out --tf (--labels gives"),
         (("--tf-range", "0,1"), 2, "leave out --tf-range (--labels gives"),
-        (("--labels", tmp_path / "t.json"), 1, "none of them visible"),
+        (("--labels", tmp_path / "t.json"), 1, "none of its labels is visible"),
         (("--labels", tmp_path / "one.json"), 1, "1 labels have no entry"),
         (("--labels", tmp_path / "missing.json"), 2, "no such file"),
     ):

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import vvgt_cli as vvgt_library
-from tests.test_live import HI, LO, RAMP, SMALL, WINDOW, cloud
+from tests.test_live import GRAIN, HI, LO, RAMP, SMALL, WINDOW, cloud
 from tests.test_live import facts as values
 from tests.test_live_labels import LABELS
 from tests.test_live_labels import facts as labels
@@ -41,7 +41,7 @@ def layered(count: int = 40) -> Gaussians:
 
 def test_each_layer_is_looked_up_in_its_own_table() -> None:
     some = layered()
-    tables = (Table.of_function(WINDOW, LO, 80, 0.05), Palette.of_labels(LABELS, 0.02))
+    tables = (Table.of_function(WINDOW, LO, 80, 0.05, GRAIN), Palette.of_labels(LABELS, 0.02))
     together = shown_by(some, Several(tables))
     for number, table in enumerate(tables):
         own = np.flatnonzero(some.live[:, 7] == number)  # type: ignore[index]
@@ -61,8 +61,8 @@ def test_the_pages_program_shows_several_layers_as_we_do(tmp_path: Path) -> None
     first, organs = replace(values(WINDOW), name="ct", distance=0.5), replace(labels(), name="organs", distance=0.2)
     table = Several(
         (
-            Table.of_function(WINDOW, LO, HI, 0.05),
-            Table.of_function(values().tf("pet"), -5, 160, 0.025),
+            Table.of_function(WINDOW, LO, HI, 0.05, GRAIN),
+            Table.of_function(values().tf("pet"), -5, 160, 0.025, GRAIN),
             Palette.of_labels(organs.labels, 0.02),
         )
     )
@@ -166,6 +166,18 @@ def test_recolor_shows_one_of_several(vvgt, pair, tmp_path) -> None:
     assert 0.3 * len(own) < len(less) < 0.9 * len(own)
     again = vvgt_library.recolor(live, layers={0: str(tmp_path / "n.json")})
     assert len(again.gaussians) == len(less)
+    (tmp_path / "none.json").write_text(json.dumps({"3": {"color": [0, 0, 1], "opacity": 0}}))
+    (tmp_path / "dark.json").write_text(json.dumps({"points": [{"x": 0, "rgb": [1, 1, 1], "opacity": 0}]}))
+    hidden, dark = f"2,labels={tmp_path / 'none.json'}", f"tf={tmp_path / 'dark.json'}"
+    assert vvgt("recolor", live, "--layer", hidden, "-o", tmp_path / "h.ply").code == 0
+    assert vvgt("recolor", live, "--layer", f"0,{dark}", "-o", tmp_path / "d.ply").code == 0
+    without = [len(read_ply(tmp_path / f"{name}.ply")[0]) for name in "hd"]
+    seen = [int((read_ply(live)[0].live[:, 7] == number).sum()) for number in (2, 0)]  # type: ignore[index]
+    for left, gone in zip(without, seen, strict=True):
+        assert len(own) - gone <= left < len(own)
+    every = ("--layer", hidden, "--layer", f"0,{dark}", "--layer", f"1,{dark}")
+    done = vvgt("recolor", live, *every, "-o", tmp_path / "x.ply")
+    assert (done.code, "not one of" in done.error) == (1, True), done.error
     for more, said in (
         (("--tf", "viridis"), "3 layers, each with a look of its own"),
         (("--layer", "elsewhere,tf=viridis"), "no layers of that name; expected 0 (left)"),

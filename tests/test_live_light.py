@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 import vvgt_cli as vvgt_library
-from tests.test_live import HI, LO, RAMP, SMALL, cloud, facts
+from tests.test_live import GRAIN, HI, LO, RAMP, SMALL, cloud, facts
 from tests.test_page_live import options, page_of
 from vvgt_cli.closed_form.relit import relit
 from vvgt_cli.dvr.light import sphere
 from vvgt_cli.gaussians import Gaussians, read_ply
-from vvgt_cli.gaussians.frames import turn, up_matrix
+from vvgt_cli.gaussians.frames import rotations, turn, up_matrix
 from vvgt_cli.gaussians.harmonics import basis, view_colors
-from vvgt_cli.gaussians.live import Table, baked, shown_by
+from vvgt_cli.gaussians.live import FLAT, MEANS, SHARP, SPREADS, WIDEST, Table, baked, directions, shown_by, spreads
 from vvgt_cli.look.lighting import Lighting, LightOptions
 
 SIDE = Lighting(False, ((0.6, 0.0, 0.8),), 0.2, 0.6, 0.3, 4.0)
@@ -67,7 +67,7 @@ def test_where_there_is_no_gradient_there_is_ambient_light_alone() -> None:
 
 
 def test_a_light_turns_with_its_gaussians() -> None:
-    some, table, eye = cloud(), Table.of_function(RAMP, LO, HI, 0.05), np.array([2.0, -1.0, 0.7])
+    some, table, eye = cloud(), Table.of_function(RAMP, LO, HI, 0.05, GRAIN), np.array([2.0, -1.0, 0.7])
 
     def shade(gaussians: Gaussians, light: Lighting) -> Gaussians:
         assert gaussians.live is not None
@@ -128,10 +128,36 @@ def test_light_that_needs_the_volume_is_refused(vvgt, lit_file, tmp_path) -> Non
 
 
 def test_a_page_begins_with_the_files_light() -> None:
-    some = baked(cloud(), Table.of_function(RAMP, LO, HI, 0.05))
+    some = baked(cloud(), Table.of_function(RAMP, LO, HI, 0.05, GRAIN))
     for light, kind in ((None, "none"), (HEAD, "headlight"), (SIDE, "direction")):
         _, scene = page_of(some, options(live=facts(), light=light))
         assert scene["live"]["light"]["kind"] == kind
     there = (up_matrix("y") @ np.array(SIDE.directions[0])) * (-1, -1, 1)
     np.testing.assert_allclose(scene["live"]["light"]["from"], there, atol=1e-12)
     assert scene["live"]["light"]["power"] == 4.0
+
+
+def test_what_is_opaque_lies_flat_in_its_surface() -> None:
+    """A round one whose values rise along a direction: that becomes the shortest axis; without it one of them is."""
+    rises = np.array([0.48, 0.6, 0.64])
+    live = np.array([[70.0, 1.0, 1.0, *rises], [70.0, 1.0, 1.0, 0, 0, 0]])
+    some = Gaussians(
+        np.zeros((2, 3)), np.full((2, 3), np.log(0.1)), [[1, 0, 0, 0]] * 2, [0.0] * 2, [[1, 1, 1]] * 2, live=live
+    )
+    shown = shown_by(some, Table.of_function(RAMP, LO, HI, 0.05, GRAIN))
+    axes = rotations(shown.quaternions.astype(float)) * np.exp(shown.log_scales.astype(float))[:, None, :]
+    variances, turned = np.linalg.eigh(axes[0] @ axes[0].T)
+    wanted = 0.01 * np.array([SHARP, FLAT, FLAT])
+    np.testing.assert_allclose(variances, wanted, rtol=1e-3)
+    assert abs(turned[:, 0] @ rises) == pytest.approx(1, abs=1e-5)
+    np.testing.assert_allclose(
+        np.sort(np.exp(2 * shown.log_scales[1])), 0.01 * np.array([SHARP, FLAT, FLAT]), rtol=1e-3
+    )
+
+
+def test_directions_are_unit_vectors_of_own_axes() -> None:
+    along, share = directions(cloud())
+    np.testing.assert_allclose(np.linalg.norm(along, axis=1), 1, atol=1e-6)
+    assert (share <= 1).all()
+    assert spreads()[-1] == WIDEST
+    assert Table.of_function(RAMP, LO, HI, 1, GRAIN).sums.shape == (MEANS, SPREADS, 6)

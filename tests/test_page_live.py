@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.test_live import COLORS, HI, LO, RAMP, WINDOW, cloud, facts
+from tests.test_live import COLORS, GRAIN, HI, LO, RAMP, WINDOW, cloud, facts
 from vvgt_cli.cameras.sets import pixel_width
 from vvgt_cli.gaussians import Gaussians, PlyOptions
 from vvgt_cli.gaussians.formats import encoded, format_of
@@ -50,7 +50,7 @@ def options(**given: Any) -> PlyOptions:
 
 
 def test_the_page_holds_what_the_gaussians_carry_in_the_order_of_its_file() -> None:
-    some = baked(cloud(600), Table.of_function(RAMP, LO, HI, 0.05))
+    some = baked(cloud(600), Table.of_function(RAMP, LO, HI, 0.05, GRAIN))
     content, scene = page_of(some, options())
     live = scene["live"]
     [layer] = live["layers"]
@@ -84,7 +84,7 @@ def test_a_page_without_values_has_none() -> None:
 
 
 def test_no_name_is_markup() -> None:
-    some = baked(cloud(), Table.of_function(RAMP, LO, HI, 0.05))
+    some = baked(cloud(), Table.of_function(RAMP, LO, HI, 0.05, GRAIN))
     known = facts(replace(RAMP, name="</script><b>x"))
     content, scene = page_of(some, options(live=known), "</title><script>alert(1)</script>.html")
     assert b"<script>alert" not in content
@@ -93,7 +93,7 @@ def test_no_name_is_markup() -> None:
 
 
 def test_no_folder_is_in_the_page() -> None:
-    some = baked(cloud(), Table.of_function(RAMP, LO, HI, 0.05))
+    some = baked(cloud(), Table.of_function(RAMP, LO, HI, 0.05, GRAIN))
     content, scene = page_of(some, options(), "/home/someone/a.html")
     assert scene["frames"][0]["name"] == "a"
     assert b"someone" not in content
@@ -116,7 +116,7 @@ def test_nodes_are_those_of_the_function(tf: TransferFunction) -> None:
 def test_the_pages_program_makes_our_table(tf: TransferFunction, tmp_path: Path) -> None:
     if not shutil.which("node"):
         pytest.skip("node is not on the path")
-    _, scene = page_of(baked(cloud(), Table.of_function(tf, LO, HI, 0.05)), options(live=facts(tf)))
+    _, scene = page_of(baked(cloud(), Table.of_function(tf, LO, HI, 0.05, GRAIN)), options(live=facts(tf)))
     program = Path(__file__).parent.parent / "vvgt_cli" / "gaussians" / "formats" / "page" / "live_table.mjs"
     (tmp_path / "live.json").write_text(json.dumps(scene["live"]))
     (tmp_path / "run.mjs").write_text(
@@ -126,7 +126,7 @@ def test_the_pages_program_makes_our_table(tf: TransferFunction, tmp_path: Path)
         "fs.writeFileSync('sums', sums);\nfs.writeFileSync('texels', texelsOf(sums, live.table));\n"
     )
     subprocess.run(["node", "run.mjs"], cwd=tmp_path, check=True, timeout=120)
-    wanted = Table.of_function(tf, LO, HI, 0.05).sums
+    wanted = Table.of_function(tf, LO, HI, 0.05, GRAIN).sums
     sums = np.fromfile(tmp_path / "sums").reshape(wanted.shape)
     np.testing.assert_allclose(sums, wanted, atol=2e-4 * wanted[..., 3].max())
     texels = np.fromfile(tmp_path / "texels", np.float32).reshape(2, *wanted.shape[1::-1], 4)
@@ -136,7 +136,7 @@ def test_the_pages_program_makes_our_table(tf: TransferFunction, tmp_path: Path)
 
 @pytest.mark.parametrize("tf", [RAMP, WINDOW, STEP])
 def test_the_pages_program_shows_gaussians_as_we_do(tf: TransferFunction, tmp_path: Path) -> None:
-    table = Table.of_function(tf, LO, HI, 0.05)
+    table = Table.of_function(tf, LO, HI, 0.05, GRAIN)
     compare(baked(cloud(), table), options(live=facts(tf), up="none", made_for=300), table, tmp_path)
 
 

@@ -172,6 +172,8 @@ def test_what_is_seen_fits_into_the_window_at_first_sight(marked: str, person: P
 def test_the_scale_bar_is_as_long_as_it_says(dots: str, person: Person, tmp_path: Path) -> None:
     person("open", dots)
     apart = float(np.linalg.norm(DOTS[1] - DOTS[0])) / SCALE  # mm
+    away = 2 * max(person.size) / min(person.size)  # both are in the window, whichever way
+    person("eval", f"window.vvgt.where.lens.set({{ ...window.vvgt.where.lens.pose(), distance: {away} }})")
     person("press", "y")
     for flat in (False, True):
         if flat:
@@ -190,7 +192,9 @@ def test_the_scale_bar_is_as_long_as_it_says(dots: str, person: Person, tmp_path
 def test_the_ruler_measures_what_is_known(dots: str, person: Person, tmp_path: Path) -> None:
     apart = float(np.linalg.norm(DOTS[1] - DOTS[0])) / SCALE  # mm
     person("open", dots)
-    person("eval", "window.vvgt.where.lens.set({ ...window.vvgt.where.lens.pose(), yaw: 37, pitch: -22 })")
+    away = 2 * max(person.size) / min(person.size)
+    pose = f"{{ ...window.vvgt.where.lens.pose(), yaw: 37, pitch: -22, distance: {away} }}"
+    person("eval", f"window.vvgt.where.lens.set({pose})")
     for flat in (False, True):
         if flat:
             person("press", "o")

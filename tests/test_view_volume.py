@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from tests.test_formats_server import ask, cloud, shown
-from tests.test_live import HI, LO, RAMP, facts
+from tests.test_live import GRAIN, HI, LO, RAMP, facts
 from tests.test_live import cloud as live_cloud
 from vvgt_cli.cameras.sets import SIZE, pixel_width
 from vvgt_cli.commands.converter import Converter, Failed, Made
@@ -177,7 +177,7 @@ def desk(tmp_path: Path) -> Iterator[tuple[str, Desk]]:
 
     site = Site({}, print)
     found = Desk(site.parts, site.posts, "x", Console(quiet=True))
-    some = baked(live_cloud(), Table.of_function(RAMP, LO, HI, 0.05))
+    some = baked(live_cloud(), Table.of_function(RAMP, LO, HI, 0.05, GRAIN))
     found.converter = Still(SourceRequest("none"), "x", found.hear)
     found.parts["state"] = Part("application/json", found._told)
     found.show(Cloud(some, PlyOptions(up="y", scale=0.1, unit_distance=0.5, live=facts()), "x"))
@@ -255,7 +255,7 @@ def test_a_saved_live_file_has_the_colours_of_the_function(desk: tuple[str, Desk
         "opacity_unit_distance": 0.5,
     }
     saved = Cloud.of(send(desk[0], "save", {"file": "ply", "function": function})[1], "x")
-    wanted = baked(live_cloud(), Table.of_function(function_sent(function), LO, HI, 0.05), pixel_width(SIZE))
+    wanted = baked(live_cloud(), Table.of_function(function_sent(function), LO, HI, 0.05, GRAIN), pixel_width(SIZE))
     np.testing.assert_allclose(saved.gaussians.colors, wanted.colors, atol=1e-5)
     np.testing.assert_allclose(saved.gaussians.opacity_logits, wanted.opacity_logits, atol=1e-4)
     plain = Cloud.of(send(desk[0], "save", {"file": "ply"})[1], "x")
@@ -273,7 +273,7 @@ def test_a_saved_file_has_the_light_of_the_file_or_of_the_page(desk: tuple[str, 
     plain, side = of.first(), Lighting(False, ((0.6, 0.0, 0.8),), 0.2, 0.6, 0.3, 4.0)
     lit_file = replace(plain, options=replace(plain.options, light=side))
     of.first = lambda: lit_file
-    table = Table.of_function(function_sent(FUNCTION), LO, HI, 0.1 * 0.1)
+    table = Table.of_function(function_sent(FUNCTION), LO, HI, 0.1 * 0.1, GRAIN)
     dark = baked(live_cloud(), table, pixel_width(SIZE))
 
     def saved(**more: Any) -> Cloud:
@@ -298,7 +298,7 @@ def test_a_saved_file_has_the_light_of_the_file_or_of_the_page(desk: tuple[str, 
 
 
 def test_a_live_file_is_shown_live_and_an_ordinary_one_as_it_is(tmp_path: Path) -> None:
-    some = baked(live_cloud(), Table.of_function(RAMP, LO, HI, 0.05))
+    some = baked(live_cloud(), Table.of_function(RAMP, LO, HI, 0.05, GRAIN))
     write_ply(tmp_path / "live.ply", some, PlyOptions(scale=0.1, unit_distance=0.5, live=facts()))
     write_ply(tmp_path / "plain.ply", cloud())
     with shown("live.ply", folder=tmp_path) as (_, url):

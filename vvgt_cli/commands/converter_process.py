@@ -17,6 +17,7 @@ from vvgt_cli.commands.converter import Failed, Job, Made, Message, Progress, Sa
 from vvgt_cli.commands.live_site import Cloud, page_of, stored
 from vvgt_cli.conversion.convert import opened, ply_options, without_files
 from vvgt_cli.conversion.live import live_conversion, refusal
+from vvgt_cli.conversion.onward import Onward
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.conversion.result import Conversion
 from vvgt_cli.errors import DataError, VvgtError
@@ -67,6 +68,7 @@ class Volume:
         self.source, self.name = source, name
         self.lighting: Lighting | None = None  # of the function to begin with
         self.table: LabelTable | None = None  # the labels to begin with
+        self.last: Onward | None = None  # what the next conversion goes on from
         if automatic(source, Console(quiet=True)) is None:  # `opened` says it
             console.bar("reading")
             content = open_parts(source.path, source.read)
@@ -93,7 +95,8 @@ class Volume:
         else:
             lit = replace(job, lighting=self.lighting)
             source = replace(self.source, tf=lit, tf_range="data", unit_distance=None)
-        conversion = without_files(ConvertRequest(source), console)
+        conversion = without_files(ConvertRequest(source), console, self.last)
+        self.last = Onward(conversion)
         shown = stored(conversion.gaussians, conversion.ply)
         psnr = None if conversion.scores is None else conversion.scores["psnr"]
         return Made(_file(conversion), {"ply": shown}, psnr=psnr)

@@ -27,7 +27,7 @@ from vvgt_cli.gaussians.formats.splats import columns_of
 from vvgt_cli.gaussians.live import Looks, Palette, Several, Table, baked
 from vvgt_cli.gaussians.live_facts import MOST_LABELS, LiveFacts, function_text
 from vvgt_cli.look.function import TransferFunction
-from vvgt_cli.look.labels import Label, LabelTable
+from vvgt_cli.look.labels import Label, LabelTable, check_labels
 from vvgt_cli.look.readers.minimal import read
 from vvgt_cli.progress import Console
 from vvgt_cli.volume.readers import volume_name
@@ -112,7 +112,8 @@ class Cloud:
         if facts.labels:
             raise DataError("what is shown carries labels; expected no function")
         assert tf.opacity_unit_distance is not None
-        table = Table.of_function(tf, facts.lo, facts.hi, tf.opacity_unit_distance * (self.options.scale or 1.0))
+        distance = tf.opacity_unit_distance * (self.options.scale or 1.0)
+        table = Table.of_function(tf, facts.lo, facts.hi, distance, facts.grain)
         return table, replace(facts, function=function_text(tf, facts.lo, facts.hi, several))
 
     def _labels(self, facts: LiveFacts, sent: Any, distance: float) -> tuple[Palette, LiveFacts]:
@@ -130,6 +131,7 @@ class Cloud:
             DataError, UsageError: they are none, or not of these labels.
         """
         palette, facts = self._labels(self._alone("labels"), sent, self.options.unit_distance or 1.0)
+        check_labels([LabelTable("the page's labels", facts.labels)])
         return self._shown(palette, light, replace(self.options, live=facts))
 
     def layered(self, sent: Any, light: Any = None) -> Cloud:
@@ -292,6 +294,7 @@ class Desk:
         tf: Job = None
         if sent is not None:
             tf = labels_sent(sent["labels"]) if isinstance(sent, dict) and "labels" in sent else function_sent(sent)
+            check_labels([tf])
         with self.converter.lock:
             self.parts.pop(f"{self.state['number']}.ply", None)
             self.better = None

@@ -27,10 +27,10 @@ from vvgt_cli.score.checks import Views
 if TYPE_CHECKING:
     from vvgt_cli.dvr import RenderSettings
 
-STEPS = 25  # of gradient descent on a frame that goes on from another
-ROUNDS = 3  # of so many steps at most
+STEPS = 50  # of gradient descent on a frame that goes on from another
+ROUNDS = 2  # of so many steps at most
 LEVEL = 0.25 / 255  # of a pixel, that is no change
-VIEWS = 24  # of the training views for them, others in every frame
+VIEWS = 18  # of the training views for them, others in every frame
 WORSE = 0.2  # dB on the check views below the last frame that was converted by itself: then the next is, too
 FAR = 6.0  # dB below it before any step
 
@@ -44,6 +44,7 @@ class _Frame:
         gaussians: box frame, as its file holds them.
         psnr: on the check views, of the last frame that was converted by itself.
         cameras, rule, settings: of the training views.
+        shown: of each turn of the views, what was there when they were drawn last.
     """
 
     source: Source
@@ -52,6 +53,7 @@ class _Frame:
     cameras: list[Camera]
     rule: Rule
     settings: RenderSettings
+    shown: tuple[Gaussians, ...]
 
 
 def carries(request: ConvertRequest, parts: int = 1) -> Carry | None:
@@ -94,7 +96,10 @@ class Carry:
         if found.blocks.any() and not self._fitted(work, last, found, free):
             work.gaussians = work.check = work.train = work.train_rule = None
             return False
-        self._last = replace(last, source=work.field.source, gaussians=work.made())
+        turn = self._turn % len(last.shown)
+        shown = (*last.shown[:turn], work.made(), *last.shown[turn + 1 :])
+        self._turn += bool(found.blocks.any())
+        self._last = replace(last, source=work.field.source, gaussians=work.made(), shown=shown)
         self._moved = _differing(last.gaussians, work.made())
         plan.stages = [s for s in plan.stages if isinstance(s, TestViews) or (s.scores and request.scored_whole)]
         return True
@@ -105,17 +110,18 @@ class Carry:
             return
         if work.train is not None and work.train_rule is not None and work.train_settings is not None:
             made = work.made()
+            cameras = work.train.cameras
+            shown = (made,) * max(len(cameras) // VIEWS, 1)
             self._last = _Frame(
-                work.field.source, made, work.psnr(made), work.train.cameras, work.train_rule, work.train_settings
+                work.field.source, made, work.psnr(made), cameras, work.train_rule, work.train_settings, shown
             )
 
     def _fitted(self, work: Work, last: _Frame, found: Changes, free: np.ndarray) -> bool:
         """Gradient descent of what is ``free`` (K,) bool; whether the frame is near enough then."""
         from vvgt_cli.dvr import render_views
 
-        turns = max(len(last.cameras) // VIEWS, 1)
-        cameras = last.cameras[self._turn % turns :: turns]
-        self._turn += 1
+        turn, turns = self._turn % len(last.shown), len(last.shown)
+        cameras = last.cameras[turn::turns]
         work.train_rule = last.rule
         judge = CheckViews()
         work.field.expect([*judge.views(work.fit), *(Picture(camera, last.settings) for camera in cameras)])
@@ -127,7 +133,7 @@ class Carry:
             before = [self._pictures.last(Picture(camera, last.settings)) for camera in cameras]
             images = render_views(work.field, cameras, last.settings)
             for camera, image, old in zip(cameras, images, before, strict=True):
-                _still(image, old, last, camera)
+                _still(image, old, last.shown[turn], camera, last.rule)
             stage.note = f"{len(cameras)} of {cameras[0].width} px to fit to, where they differ from the frame before"
         assert work.check is not None
         judged, psnr = _near(work.check, found), 0.0
@@ -150,13 +156,13 @@ class Carry:
         return False
 
 
-def _still(image: np.ndarray, old: np.ndarray | None, last: _Frame, camera: Camera) -> None:
-    """Where a view (h, w, 4) shows what it has shown, fit to what the Gaussians show there: it is to stay."""
+def _still(image: np.ndarray, old: np.ndarray | None, shown: Gaussians, camera: Camera, rule: Rule) -> None:
+    """Where a view (h, w, 4) shows what it has shown, fit to what the Gaussians showed then: it is to stay."""
     from vvgt_cli.splat import render
 
     if old is not None:
         same = (np.abs(image - old) <= LEVEL).all(axis=2)
-        image[same] = render(last.gaussians, camera, last.rule)[same]
+        image[same] = render(shown, camera, rule)[same]
 
 
 def _moved(start: Gaussians, result: Gaussians, free: np.ndarray) -> Gaussians:

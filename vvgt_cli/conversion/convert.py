@@ -12,6 +12,7 @@ from vvgt_cli.conversion.carried import Carry
 from vvgt_cli.conversion.certify import certified
 from vvgt_cli.conversion.gaussian_files import write_gaussians
 from vvgt_cli.conversion.live import check_live, live_conversion
+from vvgt_cli.conversion.onward import Onward
 from vvgt_cli.conversion.place import out_of_box, placed, remarks, way_up
 from vvgt_cli.conversion.plan import Plan, Planner, check_memory
 from vvgt_cli.conversion.readback import tell_cost
@@ -69,7 +70,7 @@ def convert(
         return report
 
 
-def without_files(request: ConvertRequest, console: Console | None = None) -> Conversion:
+def without_files(request: ConvertRequest, console: Console | None = None, onward: Onward | None = None) -> Conversion:
     """A conversion of which nothing is written.
 
     Raises:
@@ -77,7 +78,7 @@ def without_files(request: ConvertRequest, console: Console | None = None) -> Co
     """
     run = Run(console or Console(), ConversionReport("convert"))
     with ExitStack() as stack:
-        conversion = run_conversion(run, request, stack.enter_context(opened(run, request)))
+        conversion = run_conversion(run, request, stack.enter_context(opened(run, request)), carry=onward)
         weakref.finalize(conversion, stack.pop_all().close)  # what it draws is there as long as it is
     run.finish()
     return conversion
@@ -122,8 +123,8 @@ def fitted(run: Run, request: ConvertRequest) -> Gaussians:
 
 
 def run_conversion(
-    run: Run, request: ConvertRequest, field: Field, made: Gaussians | None = None, carry: Carry | None = None,
-    unscored: Callable[[Conversion], None] | None = None,
+    run: Run, request: ConvertRequest, field: Field, made: Gaussians | None = None,
+    carry: Carry | Onward | None = None, unscored: Callable[[Conversion], None] | None = None,
 ) -> Conversion:  # fmt: skip
     """Closed form, what views can improve of it, scores on the test views; only checkpoints are written.
 

@@ -26,7 +26,7 @@ from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.outputs import check_outputs
 from vvgt_cli.gaussians.types import together
-from vvgt_cli.look.labels import Label, LabelTable
+from vvgt_cli.look.labels import Label, LabelTable, check_labels
 from vvgt_cli.look.lighting import LightOptions
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
@@ -124,6 +124,7 @@ def split(run: Run, request: ConvertRequest) -> Split:
         request = replace(request, blocks=blocks)
         content = _content(source, blocks is not None)
         maps = layers_of(content, None, source.labels or AUTO)
+        check_labels([layer.tf for layer in maps])
         parts = _parts(request, content, maps)
         tables = " + ".join(layer.tf.name for layer in maps)
         stage.note = f"{maps[0].volume.name}, {len(parts)} labels of {tables}"

@@ -199,7 +199,9 @@ def table_of(source: Source) -> Table:
     """Of a source's function, lengths in the unit frame."""
     numbers, tf = source.overall, source.tf
     assert isinstance(tf, TransferFunction)
-    return Table.of_function(tf, numbers.lo, numbers.hi, source.unit_distance * source.volume.unit_frame().scale)
+    facts = LiveFacts.of(source.volume, numbers, tf)
+    distance = source.unit_distance * source.volume.unit_frame().scale
+    return Table.of_function(tf, facts.lo, facts.hi, distance, facts.grain)
 
 
 def placed_by(run: Run, field: Field, request: ConvertRequest) -> Start:

@@ -18,7 +18,7 @@ from vvgt_cli.gaussians.live import Looks, Palette, Several, Table, seen_under, 
 from vvgt_cli.gaussians.live_facts import GRADIENT, LiveFacts
 from vvgt_cli.gaussians.ply import opacity
 from vvgt_cli.look.function import TransferFunction
-from vvgt_cli.look.labels import LabelTable, distinct
+from vvgt_cli.look.labels import LabelTable, check_labels, distinct
 from vvgt_cli.look.lighting import Lighting, LightOptions
 from vvgt_cli.volume import Volume
 
@@ -124,7 +124,7 @@ def looked_up(facts: LiveFacts, tf: Look, distance: float, scale: float) -> Look
         tables = [looked_up(one, part, own, scale) for one, (part, own) in zip(facts.layers, tf.parts, strict=True)]
         return Several(tuple(table for table in tables if not isinstance(table, Several)))
     if not isinstance(tf, LabelTable):
-        return Table.of_function(tf, facts.lo, facts.hi, distance * scale)
+        return Table.of_function(tf, facts.lo, facts.hi, distance * scale, facts.grain)
     entries = {label.number: label for label in tf.labels}
     return Palette.of_labels([entries[label.number] for label in facts.labels], distance * scale)
 
@@ -154,6 +154,8 @@ def placed_function(name: str, header: PlyHeader | PlyOptions, function: Functio
         DataError: a file without values, a function that is none, or shows nothing of the range of values.
         UsageError: a range or a distance that is none; a function of labels, or a table of values.
     """
+    from vvgt_cli.look import check_visible
+
     if header.live is None:
         raise DataError(
             f"{name}: its Gaussians carry no values, so that they have one look alone; expected a .ply of 'vvgt "
@@ -165,6 +167,10 @@ def placed_function(name: str, header: PlyHeader | PlyOptions, function: Functio
         first = function.layers[0].layer
         raise UsageError(f"{name}: one layer; expected --tf or --labels in the place of --layer {first}")
     tf, shown, distance, label = _placed(name, header, header.live, function, header.unit_distance)
+    if isinstance(shown, LabelTable):
+        check_labels([shown])
+    else:
+        check_visible(shown, header.live.statistics())
     light = light_of(function.light, tf.lighting or header.light, header.space)
     return shown, _laid(header, shown, distance, label, light)
 
@@ -258,7 +264,7 @@ def _listed(layers: Sequence[LiveFacts]) -> str:
 
 def _function(name: str, facts: LiveFacts, function: FunctionRequest) -> tuple[TransferFunction, TransferFunction]:
     """A function as it was given, and on the data values of a file."""
-    from vvgt_cli.look import check_visible, read_transfer_function, resolve
+    from vvgt_cli.look import read_transfer_function, resolve
     from vvgt_cli.look.resolve import parse_tf_range
 
     if function.labels is not None:
@@ -266,9 +272,7 @@ def _function(name: str, facts: LiveFacts, function: FunctionRequest) -> tuple[T
     tf_range = parse_tf_range(function.tf_range)
     given = read_transfer_function(function.tf) if isinstance(function.tf, str) else function.tf
     tf = given or facts.tf(name)
-    shown = resolve(tf, facts.statistics(), tf_range)
-    check_visible(shown, facts.statistics())
-    return tf, shown
+    return tf, resolve(tf, facts.statistics(), tf_range)
 
 
 def _table(name: str, facts: LiveFacts, function: FunctionRequest) -> tuple[LabelTable, LabelTable]:

@@ -43,6 +43,7 @@ class Work:
         gaussians: so far, in the box frame.
         check: views to judge by, once they are there; ``train``: views to fit to.
         train_rule: by which training views are drawn; ``train_settings``: what the volume's were rendered with.
+        judged: of which Gaussians the PSNR on which check views is known, and it.
     """
 
     run: Run
@@ -58,6 +59,7 @@ class Work:
     train: Views | None = None
     train_rule: Rule | None = None
     train_settings: RenderSettings | None = None
+    judged: tuple[Gaussians, Views, float] | None = None
 
     @property
     def rule(self) -> Rule:
@@ -70,11 +72,11 @@ class Work:
         return self.gaussians
 
     def psnr(self, gaussians: Gaussians) -> float:
-        """On the check views."""
-        from vvgt_cli.images.metrics import score_views
-
+        """On the check views; of the Gaussians that were asked for last it is known."""
         assert self.check is not None, "a stage that judges stands before the check views"
-        return score_views(self.check.images, self.check.pictures(gaussians, self.rule), perceptual=False).psnr
+        if self.judged is None or self.judged[0] is not gaussians or self.judged[1] is not self.check:
+            self.judged = gaussians, self.check, self.check.psnr(gaussians, self.rule)
+        return self.judged[2]
 
     def target_reached(self) -> bool:
         """Whether the target is reached."""

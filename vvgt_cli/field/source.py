@@ -15,7 +15,7 @@ from vvgt_cli.field.layered import AUTO, IN_MEMORY, NONE, Access, Content, conte
 from vvgt_cli.jit.ahead import for_grid, for_light
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.histogram import UNIT_SHARE
-from vvgt_cli.look.labels import LabelTable
+from vvgt_cli.look.labels import LabelTable, check_labels
 from vvgt_cli.look.lighting import Lighting, LightOptions
 from vvgt_cli.volume import ReadOptions, Statistics, Volume
 
@@ -317,6 +317,7 @@ def _layered(
     for other in request.layers:
         inner = access.open(other.volume, other.read)
         layers += layers_of(inner, other.tf, other.labels, other.tf_range, other.unit_distance, access=access)
+    check_labels([layer.tf for layer in layers])
     grid = common_grid(layers, content.stored)
     numbers = access.statistics(layers[0].volume)
     return Source(tuple(layers), grid, numbers, lighting, series=tuple(request.statistics))

@@ -2,11 +2,13 @@
 
 Of each Gaussian the field's mean value m and standard deviation s under it, the edge L of a cube as large as what it
 stands for, and the direction of the mean gradient, as long as the share r of s that the gradient explains. Under a
-function of extinction e and colour c the values under it are taken as a normal law N(m, s): its extinction E is the
-mean of e over it, its colour the mean of c weighted by e. Where the value z = (v - m) / s lies along the gradient,
-there lies the Gaussian: weighted by e, z has a mean and a variance, by which the Gaussian moves along the gradient and
-becomes thinner there. What is opaque, 1 - exp(-E L), is smaller than fog, which overlaps. The opacity is that of the
-optical mass E L^3 (`vvgt_cli.gaussians.opacity`). The means are a table over m and s.
+function of extinction e and colour c the values under it are taken as a normal law N(m, s), of which each covers
+w = 1 - exp(-e g) of what is behind a voxel, g, of it: E is the extinction that covers as much as they do together, the
+colour is the mean of c weighted by w, less what neighbours, whose values are spread wider, will mix in. Where the value
+z = (v - m) / s lies along the gradient, there lies the Gaussian: weighted by w, z has a mean and a variance, by which
+the Gaussian moves along the gradient and becomes thinner there. What is opaque, 1 - exp(-E L), is smaller than fog,
+which overlaps, and flat in the surface that the gradient is the normal of. The opacity is that of the optical mass
+E L^3 (`vvgt_cli.gaussians.opacity`). The means are a table over m and s.
 """
 
 from __future__ import annotations
@@ -33,7 +35,9 @@ NODES = 33  # of the normal law, of equal weight
 FINE = 1 << 14  # values over the range that a function is tabulated at
 SHORTEST, LONGEST = 1e-5, 2.0  # unit-frame lengths that L is kept within
 CLEAR = MIN_ALPHA / 8  # depth below which nothing is seen, however thin
-SHARP, FLAT = 0.4, 0.6  # of the variance along the shortest axis, and along the others, of what is opaque
+SHARP, FLAT = 0.3, 0.8  # of the variance across the surface, and along the others, of what is opaque
+AROUND = 1.6  # spread of the values of a Gaussian and its neighbours, which pictures mix with it, in its own
+AMOUNT = 0.45  # of what they change of its colour, which is put in before (as `closed_form.sharpen` does)
 OPAQUE = 1 - 1e-6  # largest opacity that a look has, and one less the smallest: logits are finite
 THINNEST = 0.15  # times as wide as before, at least, along the gradient
 TAU, FIRST, SECOND = 3, 4, 5  # of a table's channels, after r, g and b
@@ -54,16 +58,25 @@ class Table:
     sums: np.ndarray
 
     @classmethod
-    def of_function(cls, tf: TransferFunctionLike, lo: float, hi: float, unit_distance: float) -> Table:
-        """Of a function on data values whose opacity is per ``unit_distance``, a unit-frame length."""
+    def of_function(cls, tf: TransferFunctionLike, lo: float, hi: float, unit_distance: float, grain: float) -> Table:
+        """Of a function on data values whose opacity is per ``unit_distance``; that and ``grain``: unit-frame lengths.
+
+        ``grain``: a voxel's edge (`LiveFacts.grain`), over which values beside each other cover what is behind them.
+        """
         x = lo + (hi - lo) * np.linspace(0, 1, FINE)
         tau = extinction(tf.opacity(x), unit_distance)
-        fine = np.concatenate([tf.color(x) * tau[:, None], tau[:, None]], axis=1)
+        covers = -np.expm1(-tau * grain)
+        fine = np.concatenate([tf.color(x) * covers[:, None], covers[:, None]], axis=1)
         nodes = law_nodes()
-        at = np.linspace(0, 1, MEANS)[:, None, None] + spreads()[:, None] * nodes
-        found = fine[np.rint(at.clip(0, 1) * (FINE - 1)).astype(np.int64)]  # (MEANS, SPREADS, NODES, 4)
+        found, near = _under(fine, nodes), _under(fine, AROUND * nodes).mean(axis=2)
         moments = found[..., TAU, None] * np.stack([nodes, nodes**2], axis=1)
-        return cls(lo, hi, np.concatenate([found.mean(axis=2), moments.mean(axis=2)], axis=2))
+        sums = np.concatenate([found.mean(axis=2), moments.mean(axis=2)], axis=2)
+        covered = np.maximum(sums[..., [TAU]], 1e-30)
+        own = sums[..., :TAU] / covered
+        mixed = np.where(near[..., [TAU]] > 0, near[..., :TAU] / np.maximum(near[..., [TAU]], 1e-30), own)
+        sums[..., :TAU] = (own + AMOUNT * (own - mixed)).clip(0, 1) * sums[..., [TAU]]
+        sums *= np.minimum(-np.log1p(-np.minimum(covered, OPAQUE)) / grain, tau.max()) / covered
+        return cls(lo, hi, sums)
 
     def places(self, values: np.ndarray, spread: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Row and column, not whole, (K,) float64 of values and spreads (K,)."""
@@ -141,6 +154,13 @@ def spreads() -> np.ndarray:
     return found
 
 
+def _under(fine: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+    """(MEANS, SPREADS, NODES, 4) rows of ``fine`` (FINE, 4) at the values of each law, of ``nodes`` (NODES,)."""
+    at = np.linspace(0, 1, MEANS)[:, None, None] + spreads()[:, None] * nodes
+    found: np.ndarray = fine[np.rint(at.clip(0, 1) * (FINE - 1)).astype(np.int64)]
+    return found
+
+
 def lengths(mass: np.ndarray, tau: np.ndarray, most: np.ndarray) -> np.ndarray:
     """L (K,) of Gaussians of optical ``mass`` (K,) where the mean extinction is ``tau`` (K,), unit-frame lengths.
 
@@ -184,15 +204,16 @@ def shown_by(gaussians: Gaussians, table: Looks, pixel: float = 0.0) -> Gaussian
     first = sums[:, FIRST] / tau
     variance = np.maximum(sums[:, SECOND] / tau - first**2, 0)
     along, explained = directions(gaussians)
-    thin = np.sqrt(np.maximum(1 - explained**2 * (1 - variance), THINNEST**2))
+    opaque, facing = -np.expm1(-tau * gaussians.live[:, LENGTH]), explained**2
+    thin = np.sqrt(np.maximum(1 - facing * (1 - variance), THINNEST**2) * (1 - opaque * facing * (1 - SHARP / FLAT)))
     axes = rotations(gaussians.quaternions.astype(np.float64))
     axes *= np.exp(gaussians.log_scales.astype(np.float64))[:, None, :]
     arm = np.einsum("kij,kj->ki", axes, along)
     quaternions, log_scales = factored(axes + (arm * (thin - 1)[:, None])[:, :, None] * along[:, None, :])
     variances = np.exp(2 * log_scales)
-    opaque = -np.expm1(-tau * gaussians.live[:, LENGTH])[:, None]
     shortest = np.arange(3) == variances.argmin(axis=1)[:, None]
-    variances *= 1 - opaque * (1 - np.where(shortest, SHARP, FLAT))
+    kept = np.where(shortest, (SHARP + (FLAT - SHARP) * facing)[:, None], FLAT)
+    variances *= 1 - opaque[:, None] * (1 - kept)
     return Gaussians(
         gaussians.means + arm * (explained * first)[:, None],
         0.5 * np.log(variances),

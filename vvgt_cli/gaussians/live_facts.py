@@ -64,6 +64,11 @@ class LiveFacts:
         return (replace(self, others=()), *self.others)
 
     @property
+    def grain(self) -> float:
+        """A voxel's edge, unit-frame length, were the box a cube."""
+        return 2 / max(self.dims)
+
+    @property
     def most_labels(self) -> int:
         """Labels of the layer that has most, 0 where all carry values."""
         return max(len(layer.labels) for layer in self.layers)

@@ -54,6 +54,7 @@ def convert(
     *,
     split_labels: bool = False,
     live: bool = False,
+    after: Conversion | None = None,
     blocks: int | str | None = None,
     progress: bool = False,
     **reading: Unpack[Reading],
@@ -74,6 +75,8 @@ def convert(
         goal: budget, screen, limits: a `Goal`, or a mapping of some of its attributes.
         split_labels: of a label map, a result a label.
         live: the Gaussians carry the values under them: `Result.recolor` shows them under any function (docs/live.md).
+        after: an earlier conversion of the same volume to go on from, a few times as fast where that is about as near:
+            its Gaussians, under the new look, refined by some steps (docs/python.md).
         blocks: voxels along the edge of blocks, or "auto"; None: blocks where the file is large.
         progress: lines and bars on standard error.
         **reading: how to read the volume: see `Reading`.
@@ -91,6 +94,8 @@ def convert(
     console, looks = console_of(progress), looks_of(look)
     if live and (looks is not None or split_labels):
         raise UsageError("live: one result of one volume, which `recolor` shows under other looks; expected one look")
+    if after is not None and (looks is not None or split_labels or live):
+        raise UsageError("after: one conversion goes on from one; expected one look, without split_labels and live")
     if looks is not None:
         if split_labels:
             raise UsageError(f"split_labels with {len(looks)} looks; expected one")
@@ -98,21 +103,22 @@ def convert(
         return looks_in_memory(requests, name, console)
     one: Any = look
     request = replace(_request(source_of(volume, one, reading), goal, blocks), live=live)
-    return labels_in_memory(request, console) if split_labels else _one_or_frames(request, console)
+    return labels_in_memory(request, console) if split_labels else _one_or_frames(request, console, after)
 
 
-def _one_or_frames(request: ConvertRequest, console: Console) -> Conversion | Clouds:
+def _one_or_frames(request: ConvertRequest, console: Console, after: Conversion | None) -> Conversion | Clouds:
     from vvgt_cli.conversion.clouds import frames_in_memory
     from vvgt_cli.conversion.convert import without_files
+    from vvgt_cli.conversion.onward import Onward
     from vvgt_cli.conversion.pages import is_glob_of_volumes
 
     path = request.source.volume
-    if isinstance(path, str) and is_glob_of_volumes(path):
+    if isinstance(path, str) and after is None and is_glob_of_volumes(path):
         return frames_in_memory(request, console)
     try:
-        return without_files(request, console)
+        return without_files(request, console, None if after is None else Onward(after))
     except SeveralSteps:
-        if not isinstance(path, str):
+        if not isinstance(path, str) or after is not None:
             raise
         return frames_in_memory(request, console)
 

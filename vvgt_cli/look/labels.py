@@ -10,6 +10,7 @@ from itertools import pairwise
 import numpy as np
 
 from vvgt_cli.errors import DataError
+from vvgt_cli.look.types import Named
 from vvgt_cli.volume.types import triple
 
 PALETTES = ("tab10", "tab20b", "tab20c", "Set2", "Dark2", "Set3")  # matplotlib's qualitative ones: 78 colours
@@ -43,7 +44,7 @@ class LabelTable:
         labels: by ascending numbers, each once.
 
     Raises:
-        DataError: no labels, a number twice, or all of them transparent.
+        DataError: a number twice.
     """
 
     name: str
@@ -57,8 +58,6 @@ class LabelTable:
         if sorted(set(numbers)) != numbers:
             twice = next((a for a, b in pairwise(sorted(numbers)) if a == b), None)
             raise DataError(f"{self.name}: label {twice} twice; expected each label once")
-        if not any(label.opacity > 0 for label in self.labels):
-            raise DataError(f"{self.name}: {len(numbers)} labels, none of them visible; expected an opacity above 0")
 
     @cached_property
     def _numbers(self) -> np.ndarray:
@@ -114,6 +113,16 @@ class LabelTable:
         """The table with one label, the others transparent."""
         kept = tuple(e if e.number == number else replace(e, opacity=0.0) for e in self.labels)
         return replace(self, name=f"{self.name}, label {number}", labels=kept)
+
+
+def check_labels(looks: Sequence[Named]) -> None:
+    """Refuse looks that hide everything: of several layers one may hide all its labels, but not alone.
+
+    Raises:
+        DataError: they are transparent.
+    """
+    if all(isinstance(look, LabelTable) and not any(e.opacity > 0 for e in look.labels) for look in looks):
+        raise DataError(f"{looks[0].name}: none of its labels is visible; expected an opacity above 0")
 
 
 def distinct(numbers: Sequence[int]) -> LabelTable:

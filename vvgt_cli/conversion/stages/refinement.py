@@ -78,7 +78,7 @@ class Refinement(Stage):
             check_every=LOOK if target is not None else max(LOOK, self.most // 2),
         )  # fmt: skip
         start = work.made()
-        begin = widened(start, WIDER, pixel_width(work.fit.size)) if self.overlap else None
+        begin = (widened(start, WIDER, pixel_width(work.fit.size)), work.psnr(start)) if self.overlap else None
         work.gaussians = _seen(work, refine(work.run, start, work.train, work.check, options, begin))
 
 
@@ -91,16 +91,17 @@ def _seen(work: Work, gaussians: Gaussians) -> Gaussians:
 
 
 def refine(
-    run: Run, start: Gaussians, train: Views, check: Views, options: OptimizeOptions, begin: Gaussians | None = None,
-    free: np.ndarray | None = None,
+    run: Run, start: Gaussians, train: Views, check: Views, options: OptimizeOptions,
+    begin: tuple[Gaussians, float] | None = None, free: np.ndarray | None = None,
 ) -> Gaussians:  # fmt: skip
     """The stage: the best that the check views have seen, as a file holds it; ``start`` where nothing was better.
 
-    Descent begins with ``begin``, where that is given; of ``free`` (K,) bool only those move.
+    Descent begins with the Gaussians of ``begin``, where they are given, with the dB of ``start`` on the check views;
+    of ``free`` (K,) bool only those move.
     """
     with run.stage("refinement") as stage, run.console.interruption(run.console.say) as stop:
         result, record = optimize(
-            start if begin is None else begin,
+            start if begin is None else begin[0],
             train.cameras,
             train.images,
             options,
@@ -110,7 +111,7 @@ def refine(
             free=free,
         )
         if begin is not None:
-            record.psnr_before = check.psnr(start, options.judge)
+            record.psnr_before = begin[1]
             if (record.psnr_after or 0.0) <= record.psnr_before:
                 result, record.kept, record.psnr_after = start, 0, record.psnr_before
         stage.kept = result is not start

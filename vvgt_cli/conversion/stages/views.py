@@ -66,10 +66,12 @@ class CheckViews(Stage):
         return [Picture(camera, settings, part) for camera, part in judged(default_views("check", size=fit.size))]
 
     def run(self, work: Work) -> None:
-        """Render them."""
+        """Render them, unless they are there."""
         from vvgt_cli.dvr import RenderSettings
         from vvgt_cli.dvr.render import FIT_VIEWS
 
+        if work.check is not None:
+            return
         size = work.fit.size
         cameras = default_views("check", size=size)
         with work.run.stage(self.name) as stage:

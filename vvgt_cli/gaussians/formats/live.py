@@ -22,7 +22,20 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.gaussians.live import BEND, FLAT, LENGTH, MEANS, SHARP, SPREAD, SPREADS, THINNEST, VALUE, WIDEST
+from vvgt_cli.gaussians.live import (
+    AMOUNT,
+    AROUND,
+    BEND,
+    FLAT,
+    LENGTH,
+    MEANS,
+    SHARP,
+    SPREAD,
+    SPREADS,
+    THINNEST,
+    VALUE,
+    WIDEST,
+)
 from vvgt_cli.gaussians.live_facts import GRADIENT, NUMBER, ROW, LiveFacts
 from vvgt_cli.gaussians.types import Gaussians
 
@@ -77,6 +90,7 @@ def live_json(clouds: Sequence[Gaussians], facts: LiveFacts, unit_distances: Seq
         "table": [MEANS, SPREADS],
         "thinnest": THINNEST,
         "opaque": [SHARP, FLAT],
+        "around": [AROUND, AMOUNT],
     }
 
 
@@ -91,6 +105,7 @@ def _layer_json(layer: LiveFacts, row: int, unit_distance: float) -> dict[str, A
         "histogram": list(layer.histogram),
         "name": layer.baked().get("name", ""),
         "unit_distance": unit_distance,
+        "grain": layer.grain,
     }
 
 

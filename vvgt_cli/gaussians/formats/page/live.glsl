@@ -3,7 +3,7 @@
 uniform highp sampler2D vvgtTable;
 uniform highp sampler2D vvgtLabels;  // a column a row of looks: of a label red, green, blue, extinction; of a function its number in the table, and -1
 uniform vec4 vvgtFacts;  // shortest log length, how far it goes, thinnest, spreads
-uniform vec3 vvgtOpaque;  // of the variance of what is opaque along its shortest axis, and along the others; variance of the screen's dilation
+uniform vec3 vvgtOpaque;  // of the variance of what is opaque across its surface, and along the others; variance of the screen's dilation
 uniform vec4 vvgtCut[6];  // dot(xyz, centre) <= w of each stays; of none the normal is zero
 uniform vec4 vvgtLight;  // ambient, diffuse, specular, power; ambient < 0: unlit
 uniform vec4 vvgtToward;  // direction towards the light; with w = 1 it is at the eye
@@ -97,13 +97,14 @@ void modifySplatCenter(inout vec3 center) {
   mat3 turn = quatToMat3(getRotation());
   vec3 scale = getScale(), gradient = (vec3(b.xyz) - 128.0) / 127.0, along = gradient * turn * scale;
   along /= max(length(along), 1e-30);
-  float r = min(length(gradient), 1.0), thin = sqrt(max(1.0 - r * r * (1.0 - variance), vvgtFacts.z * vvgtFacts.z));
+  float edge = exp(vvgtFacts.x + vvgtFacts.y * float(a.z) / 255.0), fog = exp(-tau * edge), r = min(length(gradient), 1.0), facing = r * r;
+  float thin = sqrt(max(1.0 - facing * (1.0 - variance), vvgtFacts.z * vvgtFacts.z) * (1.0 - (1.0 - fog) * facing * (1.0 - vvgtOpaque.x / vvgtOpaque.y)));
   mat3 axes = mat3(matrix_model) * mat3(turn[0] * scale.x, turn[1] * scale.y, turn[2] * scale.z);
   vec3 arm = axes * along;
   center += arm * (r * first);
   axes += outerProduct(arm * (thin - 1.0), along);
   vec3 place = center;
-  float edge = exp(vvgtFacts.x + vvgtFacts.y * float(a.z) / 255.0), mass = tau * edge * edge * edge * vvgtCutAll(center, axes);
+  float mass = tau * edge * edge * edge * vvgtCutAll(center, axes);
   vec3 color = vvgtLit(sums.rgb / tau, mat3(matrix_model) * gradient, place);
   for (int sweep = 0; sweep < 6; sweep++) {
     vvgtTurn(axes[0], axes[1]);
@@ -115,8 +116,8 @@ void modifySplatCenter(inout vec3 center) {
   if (determinant(unit) < 0.0) unit[2] = -unit[2];
   vvgtRotation = vvgtQuaternion(unit);
   float shortest = min(vvgtScale.x, min(vvgtScale.y, vvgtScale.z));
-  vec3 opaque = mix(vec3(vvgtOpaque.y), vec3(vvgtOpaque.x), vec3(lessThanEqual(vvgtScale, vec3(shortest))));
-  vec3 squares = vvgtScale * vvgtScale * mix(opaque, vec3(1.0), exp(-tau * edge));
+  vec3 opaque = mix(vec3(vvgtOpaque.y), vec3(mix(vvgtOpaque.x, vvgtOpaque.y, facing)), vec3(lessThanEqual(vvgtScale, vec3(shortest))));
+  vec3 squares = vvgtScale * vvgtScale * mix(opaque, vec3(1.0), fog);
   vvgtScale = sqrt(squares);
   vvgtColor = sums.a < 1e-12 ? vec4(0.0) : vec4(color, vvgtPeak(mass, squares));
 }

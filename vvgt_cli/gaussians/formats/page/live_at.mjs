@@ -34,7 +34,7 @@ const alpha = (y) => {
 };
 
 // {center, arms, opacity} of what has an extinction tau, as live.glsl has it; arms are made orthogonal
-function seen({ live }, center, arms, tau, length) {
+function seen({ live }, center, arms, tau, length, facing) {
   const axes = arms.map((arm) => [...arm]);
   for (let sweep = 0; sweep < 6; sweep++) {
     for (const [i, j] of [[0, 1], [0, 2], [1, 2]]) {
@@ -46,7 +46,7 @@ function seen({ live }, center, arms, tau, length) {
     }
   }
   const squares = axes.map((axis) => dot(axis, axis)), shortest = squares.indexOf(Math.min(...squares)), fog = Math.exp(-tau * length);
-  const factors = squares.map((_, k) => fog + (1 - fog) * live.opaque[k === shortest ? 0 : 1]);
+  const [sharp, flat] = live.opaque, factors = squares.map((_, k) => fog + (1 - fog) * (k === shortest ? sharp + (flat - sharp) * facing : flat));
   const wide = squares.map((v, k) => v * factors[k] + live.dilation), areas = [0, 1, 2].map((k) => 2 * Math.PI * Math.sqrt(wide[(k + 1) % 3] * wide[(k + 2) % 3]));
   const total = areas.reduce((sum, area) => sum + area), mass = tau * length ** 3;
   const opacity = areas.reduce((sum, area) => sum + area * alpha(mass / area + Math.min(mass / area, 1 / 255)), 0) / total;
@@ -58,20 +58,24 @@ export function looksOf(look) {
   const { live, layers } = look, spreads = live.table[1];
   return (i, { center, arms }) => {
     const number = rowOf(look, i), k = layerOf(look, number), layer = layers[k], { row, column, length, gradient, r } = carried(look, layer, i);
+    let tau, first = 0, variance = 1;
     if (layer.labels.length) {
       const { opacity } = look.rows[number];
-      if (opacity <= 0 || beyond(look, center)) return null;
-      return seen(look, center, arms, -Math.log1p(-Math.min(opacity, 0.99999)) / layer.unit_distance, length);
+      tau = -Math.log1p(-Math.min(opacity, 0.99999)) / layer.unit_distance;
+    } else {
+      const j = Math.min(Math.floor(column), spreads - 2), f = column - j;
+      const at = (c) => (1 - f) * look.sums[k][6 * (row * spreads + j) + c] + f * look.sums[k][6 * (row * spreads + j + 1) + c];
+      tau = at(3);
+      first = at(4) / tau;
+      variance = Math.max(at(5) / tau - first * first, 0);
     }
-    const j = Math.min(Math.floor(column), spreads - 2), f = column - j;
-    const at = (c) => (1 - f) * look.sums[k][6 * (row * spreads + j) + c] + f * look.sums[k][6 * (row * spreads + j + 1) + c];
-    if (at(3) < 1e-12) return null;
-    const tau = at(3), first = at(4) / tau, variance = Math.max(at(5) / tau - first * first, 0), unit = along(gradient, arms);
-    const thin = Math.sqrt(Math.max(1 - r * r * (1 - variance), live.thinnest ** 2));
+    if (tau < 1e-12) return null;
+    const unit = along(gradient, arms), facing = r * r, opaque = 1 - Math.exp(-tau * length), [sharp, flat] = live.opaque;
+    const thin = Math.sqrt(Math.max(1 - facing * (1 - variance), live.thinnest ** 2) * (1 - opaque * facing * (1 - sharp / flat)));
     const arm = [0, 1, 2].map((c) => arms[0][c] * unit[0] + arms[1][c] * unit[1] + arms[2][c] * unit[2]);
     const moved = center.map((x, c) => x + arm[c] * r * first);
     if (beyond(look, moved)) return null;
-    return seen(look, moved, arms.map((one, k) => one.map((x, c) => x + arm[c] * (thin - 1) * unit[k])), tau, length);
+    return seen(look, moved, arms.map((one, k) => one.map((x, c) => x + arm[c] * (thin - 1) * unit[k])), tau, length, facing);
   };
 }
 

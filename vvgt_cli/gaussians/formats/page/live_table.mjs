@@ -1,6 +1,6 @@
 // A transfer function and its means over normal laws of values, as vvgt_cli/gaussians/live.py has them (its float64 twin).
 const FINE = 1 << 14;  // values over the range that a function is tabulated at
-const MAX_OPACITY = 1 - 1e-5;
+const MAX_OPACITY = 1 - 1e-5, MOST_COVERED = 1 - 1e-6;
 
 // Opacity and colour at x of nodes {x, y, rgb} in ascending order: at an x of several nodes the last one's opacity and the
 // first one's colour, as in VTK.
@@ -24,25 +24,39 @@ function rint(x) {
 
 // (means, spreads, 6) float64: extinction times r, g, b, 1, z and z^2; `live` as live_json of formats/live.py says it
 export function sumsOf(nodes, live) {
-  const [lo, hi] = live.values, [means, spreads] = live.table, { law } = live;
-  const fine = new Float64Array(4 * FINE);
+  const [lo, hi] = live.values, [means, spreads] = live.table, { law, grain } = live, [wider, amount] = live.around;
+  const fine = new Float64Array(4 * FINE);  // of each value what it covers times r, g, b and 1
+  let most = 0;
   for (let i = 0; i < FINE; i++) {
     const { y, rgb } = functionAt(nodes, lo + (hi - lo) * (i * (1 / (FINE - 1))));
-    const tau = -Math.log1p(-Math.min(Math.max(y, 0), MAX_OPACITY)) / live.unit_distance;
-    fine.set([rgb[0] * tau, rgb[1] * tau, rgb[2] * tau, tau], 4 * i);
+    const tau = -Math.log1p(-Math.min(Math.max(y, 0), MAX_OPACITY)) / live.unit_distance, covers = -Math.expm1(-tau * grain);
+    most = Math.max(most, tau);
+    fine.set([rgb[0] * covers, rgb[1] * covers, rgb[2] * covers, covers], 4 * i);
   }
-  const sums = new Float64Array(means * spreads * 6);
+  const sums = new Float64Array(means * spreads * 6), own = new Float64Array(6), near = new Float64Array(6);
+  const under = (mean, spread, out) => {
+    out.fill(0);
+    for (const z of law) {
+      const k = 4 * rint(Math.min(Math.max(mean + spread * z, 0), 1) * (FINE - 1)), covers = fine[k + 3];
+      for (let c = 0; c < 4; c++) out[c] += fine[k + c];
+      out[4] += covers * z;
+      out[5] += covers * z * z;
+    }
+  };
   for (let j = 0; j < spreads; j++) {
     const spread = live.widest * (j / (spreads - 1)) ** live.bend;
     for (let i = 0; i < means; i++) {
-      const to = 6 * (i * spreads + j);
-      for (const z of law) {
-        const at = Math.min(Math.max(i * (1 / (means - 1)) + spread * z, 0), 1), k = 4 * rint(at * (FINE - 1)), tau = fine[k + 3];
-        for (let c = 0; c < 4; c++) sums[to + c] += fine[k + c];
-        sums[to + 4] += tau * z;
-        sums[to + 5] += tau * z * z;
+      const to = 6 * (i * spreads + j), mean = i * (1 / (means - 1));
+      under(mean, spread, own);
+      if (!own[3]) continue;
+      under(mean, wider * spread, near);
+      const tau = Math.min(-Math.log1p(-Math.min(own[3] / law.length, MOST_COVERED)) / grain, most);
+      for (let c = 0; c < 3; c++) {
+        const color = own[c] / own[3], mixed = near[3] ? near[c] / near[3] : color;
+        sums[to + c] = tau * Math.min(Math.max(color + amount * (color - mixed), 0), 1);
       }
-      for (let c = 0; c < 6; c++) sums[to + c] /= law.length;
+      sums[to + 3] = tau;
+      for (let c = 4; c < 6; c++) sums[to + c] = (tau * own[c]) / own[3];
     }
   }
   return sums;

@@ -1,0 +1,165 @@
+"""Conversions that go on from an earlier one of the same volume: when, how near, and what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import vvgt_cli as vvgt
+from vvgt_cli.conversion.onward import GOING_ON, MOST, OPAQUE, recoloured
+from vvgt_cli.conversion.place import into_box, out_of_box
+from vvgt_cli.gaussians.ply import opacity
+
+GOAL = {"max_gaussians": 400, "size": 96, "steps": 24}
+SPACING = (1.0, 1.0, 1.5)
+SHELL = {
+    "points": [
+        {"x": 0.2, "rgb": [0.2, 0.4, 0.9], "opacity": 0.0},
+        {"x": 0.5, "rgb": [0.9, 0.8, 0.3], "opacity": 0.4},
+        {"x": 0.9, "rgb": [0.9, 0.3, 0.1], "opacity": 0.1},
+    ],
+    "opacity_unit_distance": 2.0,
+}
+
+OUTSIDE = {
+    "points": [
+        {"x": 0.01, "rgb": [1, 1, 1], "opacity": 0.0},
+        {"x": 0.04, "rgb": [1, 1, 1], "opacity": 0.8},
+        {"x": 0.08, "rgb": [1, 1, 1], "opacity": 0.0},
+    ],
+    "opacity_unit_distance": 1.0,
+}  # where the shell has no Gaussians
+
+
+def shell(**changes):
+    """The function with other opacities (``times``), colours (so much ``turned``) or values (``moved``)."""
+    points = [dict(p) for p in SHELL["points"]]
+    for p in points:
+        p["opacity"] *= changes.get("times", 1.0)
+        p["rgb"] = [c + changes.get("turned", 0.0) * (d - c) for c, d in zip(p["rgb"], p["rgb"][::-1], strict=True)]
+        p["x"] += changes.get("moved", 0.0)
+    return {**SHELL, "points": points}
+
+
+@pytest.fixture(scope="module")
+def values():
+    z, y, x = np.mgrid[-1:1:24j, -1:1:28j, -1:1:32j]
+    values = np.exp(-2 * (x**2 + 1.5 * (y - 0.1) ** 2 + z**2)) * (1 - 0.4 * np.exp(-9 * ((x - 0.3) ** 2 + y**2)))
+    return values.astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def session(values):
+    return vvgt.Session(values, spacing=SPACING)
+
+
+@pytest.fixture(scope="module")
+def earlier(session):
+    return session.convert(SHELL, GOAL)
+
+
+def went_on(result):
+    return not [why for name, why in result.report.left_out if name == GOING_ON]
+
+
+def names(result):
+    return [stage.name for stage in result.stages]
+
+
+@pytest.mark.parametrize(
+    ("changes", "less"), [({"times": 0.5}, 0), ({"turned": 0.4}, 0.8), ({"moved": 0.02}, 0)]
+)  # so few Gaussians are too wide for colours of their own
+def test_another_function_is_as_near_as_by_itself(session, earlier, changes, less):
+    tf = shell(**changes)
+    alone, onward = session.convert(tf, GOAL), session.convert(tf, GOAL, after=earlier)
+    assert went_on(onward)
+    assert onward.scores["psnr"] > alone.scores["psnr"] - less
+    assert "closed form" in names(alone)
+    assert names(onward)[-5:] == ["earlier", "check views", "views", "refinement", "test views"]
+    assert onward.report.refinement["steps"] == 24
+    assert onward.report.refinement["standard"] == earlier.report.refinement["psnr_after"]
+    again = session.convert(tf, GOAL, after=earlier)
+    assert np.array_equal(again.gaussians.means, onward.gaussians.means)
+
+
+def test_another_light_and_another_size(session, earlier):
+    lit = vvgt.Look(SHELL, light="headlight")
+    alone, onward = session.convert(lit, GOAL), session.convert(lit, GOAL, after=earlier)
+    assert went_on(onward)
+    assert onward.gaussians.degree == 2
+    assert onward.scores["psnr"] > alone.scores["psnr"] - 0.5
+    unlit = session.convert(SHELL, GOAL, after=onward)
+    assert went_on(unlit)
+    assert unlit.gaussians.degree == 0
+    assert unlit.report.refinement["standard"] == earlier.report.refinement["psnr_after"]  # by itself, not the last
+    small = {**GOAL, "size": 64}
+    assert went_on(other := session.convert(SHELL, small, after=earlier))
+    assert other.ply.made_for == 64
+
+
+@pytest.mark.parametrize(
+    ("look", "goal", "why"),
+    [
+        (OUTSIDE, {}, "something else"),
+        (SHELL, {"max_gaussians": 300}, "Gaussians"),
+        (SHELL, {"steps": 0}, "no steps"),
+        (vvgt.Look(SHELL, light=vvgt.LightOptions(("above",), shadows=True)), {}, "shadows"),
+    ],
+)
+def test_what_is_too_far_is_converted_by_itself(session, earlier, look, goal, why):
+    asked = {**GOAL, **goal}
+    onward, alone = session.convert(look, asked, after=earlier), session.convert(look, asked)
+    assert why in dict(onward.report.left_out)[GOING_ON]
+    assert np.array_equal(onward.gaussians.means, alone.gaussians.means)
+    assert np.array_equal(onward.gaussians.colors, alone.gaussians.colors)
+    assert names(onward)[-1] == "seats"
+
+
+def test_refused(session, earlier):
+    with pytest.raises(vvgt.UsageError, match="same volume"):
+        vvgt.convert("example:blob:16", "viridis", GOAL, after=earlier)
+    for more in ({"live": True}, {"split_labels": True}):
+        with pytest.raises(vvgt.UsageError, match="one look"):
+            session.convert(SHELL, GOAL, after=earlier, **more)
+    with pytest.raises(vvgt.UsageError, match="one look"):
+        session.convert([SHELL, "gray"], GOAL, after=earlier)
+
+
+def test_the_same_look_changes_nothing(session, earlier):
+    field = earlier.field
+    same, before = recoloured(earlier, field), into_box(earlier.gaussians, field.source.volume)
+    clipped = opacity(before).clip(*OPAQUE)
+    assert np.allclose(opacity(same), clipped, atol=1e-6)
+    assert np.allclose(same.colors, np.maximum(before.colors, 0), atol=1e-6)
+    assert np.array_equal(same.means, before.means)
+
+
+def test_depth_goes_with_extinction(session, earlier):
+    thin = session.convert(shell(times=0.5), {**GOAL, "steps": 0})
+    found = recoloured(earlier, thin.field)
+    before = into_box(earlier.gaussians, earlier.field.source.volume)
+    seen = (opacity(before) > 0.05) & (opacity(before) < 0.9)
+    ratio = np.log1p(-opacity(found)[seen]) / np.log1p(-opacity(before)[seen])
+    assert np.median(ratio) == pytest.approx(np.log1p(-0.2) / np.log1p(-0.4), rel=0.15)
+    assert ratio.min() >= 1 / MOST
+    assert replace(found, means=before.means).degree == 0
+    assert out_of_box(found, thin.field.source.volume).means.shape == before.means.shape
+
+
+def test_in_blocks_too(values):
+    first, second = (
+        vvgt.convert(values, SHELL, GOAL, spacing=SPACING, blocks=16),
+        vvgt.Session(values, spacing=SPACING).convert(SHELL, GOAL),
+    )
+    tf = shell(times=0.5)
+    blocked = vvgt.convert(values, tf, GOAL, after=first, spacing=SPACING, blocks=16)
+    assert went_on(blocked)
+    assert went_on(vvgt.convert(values, tf, GOAL, after=second, spacing=SPACING, blocks=16))
+    whole = vvgt.convert(values, tf, GOAL, after=second, spacing=SPACING)
+    assert blocked.scores["psnr"] == pytest.approx(whole.scores["psnr"], abs=0.1)
+    values = values.copy()
+    values[12, 12, 12] = 0
+    with pytest.raises(vvgt.UsageError, match="same volume"):
+        vvgt.convert(values, tf, GOAL, after=first, spacing=SPACING, blocks=16)

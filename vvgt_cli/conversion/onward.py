@@ -1,0 +1,161 @@
+"""A conversion that goes on from an earlier one of the same volume, for another function, light or screen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from vvgt_cli.conversion.live import in_box
+from vvgt_cli.conversion.place import into_box
+from vvgt_cli.conversion.plan import Plan
+from vvgt_cli.conversion.request import ConvertRequest
+from vvgt_cli.conversion.result import Conversion
+from vvgt_cli.conversion.stage import Work
+from vvgt_cli.conversion.stages import CheckViews, Refinement, TestViews, TrainingViews
+from vvgt_cli.conversion.stages.views import views_of, wide
+from vvgt_cli.errors import UsageError
+from vvgt_cli.field.digests import values_digest
+from vvgt_cli.field.field import Field
+from vvgt_cli.field.source import Source
+from vvgt_cli.field.workload import view_edge
+from vvgt_cli.gaussians import Gaussians, as_stored
+from vvgt_cli.gaussians.live import TAU, Table
+from vvgt_cli.gaussians.ply import opacity
+from vvgt_cli.jit.ahead import LIVE
+
+STEPS = 50  # of gradient descent on what goes on from an earlier conversion
+FAR = 7.5  # dB on the check views below what the last conversion by itself had: before the steps
+WORSE = 2.0  # the same after them: of other looks, other errors are what is possible
+FAINT = 1e-3  # of the mean extinction: less says nothing of a colour
+MOST = 50.0  # times the extinction, or a part of it: more says nothing of an opacity
+OTHER = 0.5  # from colour to colour: what descent has found out of the one is not so of the other
+OPAQUE = 1e-5, 0.9999  # least and largest opacity
+GOING_ON = "going on from the earlier conversion"
+GRADIENT = slice(2, 5)  # of what is under Gaussians
+
+
+@dataclass(frozen=True)
+class Onward:
+    """What a conversion goes on from, as `vvgt_cli.conversion.carried.Carry` is of frames."""
+
+    earlier: Conversion
+
+    def remembered(self, field: Field) -> Field:
+        """The field itself: under another look its pictures are others."""
+        return field
+
+    def keep(self, work: Work, plan: Plan) -> None:
+        """Nothing of a conversion by itself."""
+
+    def goes_on(self, work: Work, plan: Plan, request: ConvertRequest) -> bool:
+        """Make the Gaussians from the earlier ones, if they show the new look about as well; whether it was.
+
+        Raises:
+            UsageError: the earlier conversion is of another volume.
+        """
+        why = self._unfit(work, request)
+        if why is None:
+            work.run.compile(LIVE, work.field.source.kernel_type())
+            with work.run.stage("earlier") as stage:
+                work.gaussians = as_stored(recoloured(self.earlier, work.field))
+                stage.note = f"{len(work.gaussians)} Gaussians of {self.earlier.field.source.name} under the new look"
+            why = self._fitted(work, plan)
+        if why is None:
+            plan.stages = [s for s in plan.stages if isinstance(s, TestViews) or (s.scores and request.scored_whole)]
+        else:
+            work.gaussians = work.train = work.train_rule = None
+            work.run.leave_out(GOING_ON, why)
+        return why is None
+
+    def _unfit(self, work: Work, request: ConvertRequest) -> str | None:
+        """Why there is nothing to go on from, None where there is."""
+        field, before = work.field, self.earlier.field
+        if not _same(field, before):
+            raise UsageError(f"after: a conversion of {before.source.volume.name}; expected one of the same volume")
+        sources, refinement = (before.source, field.source), self.earlier.report.refinement
+        if any(source.gridded for source in sources):
+            return "labels, channels or layers"
+        if any(source.lighting is not None and source.lighting.attenuated for source in sources):
+            return "shadows or occlusion"
+        if {work.degree, self.earlier.gaussians.degree} - {0, 2}:
+            return "harmonics of another degree than 2"
+        if refinement is None or request.fit.steps == 0 or request.fit.model is not None:
+            return "no steps, or a network"
+        if len(self.earlier.gaussians) > work.fit.max_gaussians:
+            return f"it has {len(self.earlier.gaussians)} Gaussians"
+        return None
+
+    def _fitted(self, work: Work, plan: Plan) -> str | None:
+        """Gradient descent; why the result is not near enough, None where it is."""
+        record: dict[str, Any] = self.earlier.report.refinement or {}
+        standard = record.get("standard", record["psnr_after"])
+        steps, small = min(work.fit.steps or STEPS, STEPS), wide(work.made(), work.fit.size)
+        stages = TrainingViews(views_of(steps, small), view_edge(work.fit.size, small)), Refinement(steps, steps, small)
+        judge = CheckViews()
+        work.field.expect([view for stage in (judge, *stages) for view in stage.views(work.fit)])
+        judge.run(work)
+        if work.psnr(work.made()) < standard - FAR:
+            return "it shows something else"
+        work.ending = plan.seconds_of([stage for stage in plan.stages if isinstance(stage, TestViews)])
+        for stage in stages:
+            stage.run(work)
+        made = work.run.report.refinement
+        assert made is not None
+        made["standard"] = standard
+        if made["reason"] == "steps" and made["psnr_after"] < standard - WORSE:
+            return f"{standard - made['psnr_after']:.1f} dB worse on the check views than the last one without"
+        return None
+
+
+def recoloured(earlier: Conversion, field: Field) -> Gaussians:
+    """Gaussians of an earlier conversion under the look of a field of the same volume, where they are; box frame.
+
+    Under each lies a mean value and a spread. By what the two functions, and lights, make of these, optical depths
+    change by the ratio, colours and harmonics by the difference; of what descent has found out of these the less stays,
+    the more the colours differ.
+    """
+    before, source = earlier.field.source, field.source
+    gaussians = into_box(earlier.gaussians, source.volume)
+    under = field.under(gaussians)
+    there = np.isfinite(under).all(axis=1)
+    under[~there] = 0
+    old, a = _seen(before, source, gaussians, under)
+    new, b = _seen(source, source, gaussians, under)
+    least = FAINT * float(a.mean())
+    ratio = np.where(there, ((b + least) / (a + least)).clip(1 / MOST, MOST), 1)
+    depth = -np.log1p(-np.minimum(opacity(gaussians).astype(np.float64), OPAQUE[1])) * ratio
+    peak = (-np.expm1(-depth)).clip(*OPAQUE)
+    alike = 1 - np.linalg.norm(new.colors - old.colors, axis=1) / OTHER
+    kept = np.where(there & (a > least), alike.clip(0, 1), 0)[:, None]
+    colors = new.colors + kept * (gaussians.colors - old.colors)
+    harmonics = new.harmonics
+    if harmonics is not None and old.harmonics is not None and gaussians.harmonics is not None:
+        harmonics = harmonics + kept[:, None] * (gaussians.harmonics - old.harmonics)
+    if harmonics is None:
+        colors = np.maximum(colors, 0)
+    return replace(gaussians, opacity_logits=np.log(peak / (1 - peak)), colors=colors, harmonics=harmonics)
+
+
+def _seen(look: Source, source: Source, gaussians: Gaussians, under: np.ndarray) -> tuple[Gaussians, np.ndarray]:
+    """Gaussians as a look alone has them, of ``under`` (K, 5), and (K,) extinctions, per unit-frame length."""
+    from vvgt_cli.closed_form.relit import relit
+
+    numbers, scale = source.statistics, source.volume.unit_frame().scale
+    grain = 2 / max(source.volume.dims)
+    table = Table.of_function(look.tf, numbers.lo, numbers.hi, look.unit_distance * scale, grain)
+    sums = table.of(under)
+    tau = sums[:, TAU]
+    plain = replace(gaussians, colors=sums[:, :TAU] / np.maximum(tau, 1e-30)[:, None], harmonics=None)
+    lighting = in_box(look)
+    return (plain if lighting is None else relit(plain, under[:, GRADIENT], lighting)), tau
+
+
+def _same(field: Field, other: Field) -> bool:
+    """Whether two fields are of one volume, under whatever look."""
+    first, second = field.source.volume, other.source.volume
+    if first is second:
+        return True
+    there = first.dims == second.dims and np.array_equal(first.affine, second.affine)
+    return there and values_digest(field.volumes()) == values_digest(other.volumes())
