@@ -163,14 +163,16 @@ def test_descent_moves_what_is_free():
 
 
 def test_what_comes_back_moves_back(vvgt, beat, monkeypatch):
-    """The views of the third frame were last drawn of the first, which shows the same; the Gaussians do not."""
+    """The views of the third frame were last drawn of the first, which shows the same, and those of the fifth of the
+    second, as none is drawn of the fourth; the Gaussians do not."""
     monkeypatch.setattr("vvgt_cli.conversion.carried.VIEWS", 12)
-    for k, radius in enumerate((0.2, 0.208, 0.2, 0.2)):
+    for k, radius in enumerate((0.2, 0.208, 0.2, 0.2, 0.208)):
         np.save(beat / f"v_{k}.npy", body(radius))
     assert vvgt("convert", beat / "v_*.npy", "--tf", beat / "tf.json", *HOW, "-o", beat / "f_{}.ply").code == 0
     index = json.loads((beat / "f_index.json").read_text())["files"]
-    assert [row.get("moved", 0) > 20 for row in index] == [False, True, True, False]
+    assert [row.get("moved", 0) > 20 for row in index] == [False, True, True, False, True]
     assert index[2]["psnr"] > index[0]["psnr"] - 0.1
+    assert index[4]["psnr"] > index[1]["psnr"] - 0.1
 
 
 def test_patches():

@@ -257,7 +257,7 @@ def test_views_are_fitted_to_at_their_size_and_judged_at_the_screens(tmp_path, m
     rule = RULES["playcanvas"]
     assert asked[0][:3] == (rule.at(0.5), rule, TEXTURE)
     start, begin = asked[0][3:]
-    wider = np.sort(np.exp(begin.log_scales - start.log_scales), axis=1)
+    wider = np.sort(np.exp(begin[0].log_scales - start.log_scales), axis=1)
     np.testing.assert_allclose(wider, np.tile([1, WIDER, WIDER], (len(start), 1)), rtol=1e-4)
     done(tmp_path, FitOptions(100, 128, steps=30, init="uniform"), overwrite=True)  # which stand on no lattice
     done(tmp_path, FitOptions(100, 128, steps=10), overwrite=True)  # too few to make it sharp again

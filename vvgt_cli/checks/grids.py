@@ -17,7 +17,7 @@ from vvgt_cli.closed_form import VbmOptions, initialise
 from vvgt_cli.dvr import Scene
 from vvgt_cli.dvr.layers import Layer, common_grid, grid_of
 from vvgt_cli.errors import DataError
-from vvgt_cli.look.labels import Label, LabelTable, distinct
+from vvgt_cli.look.labels import Label, LabelTable, check_labels, distinct
 from vvgt_cli.volume import Volume
 
 STAGE = "optics grid"
@@ -162,7 +162,7 @@ def _refused(number: int) -> Figure:
     """Tables that are none: no label, one twice, none visible."""
     entries = ((), (Label(1, "a", RED), Label(1, "b", RED)), (Label(1, "a", RED, 0.0),))[number]
     try:
-        LabelTable("check", entries)
+        check_labels([LabelTable("check", entries)])
     except DataError as error:
         require("\n" not in str(error), "an error of several lines")
         return Figure("accepted", 0, 0)

@@ -154,6 +154,8 @@ class Cloud:
             table, own = self._function(layer, tf, len(layers))
             tables.append(table)
             facts.append(replace(own, distance=tf.opacity_unit_distance))
+        if all(one.labels for one in facts):
+            check_labels([LabelTable("the page's labels", one.labels) for one in facts])
         live = replace(facts[0], others=tuple(facts[1:]))
         options = replace(self.options, live=live, unit_distance=live.distance, unit_distance_label="file")
         return self._shown(Several(tuple(tables)), light, options)

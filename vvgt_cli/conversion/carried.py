@@ -96,9 +96,11 @@ class Carry:
         if found.blocks.any() and not self._fitted(work, last, found, free):
             work.gaussians = work.check = work.train = work.train_rule = None
             return False
-        turn = self._turn % len(last.shown)
-        shown = (*last.shown[:turn], work.made(), *last.shown[turn + 1 :])
-        self._turn += bool(found.blocks.any())
+        shown = last.shown
+        if found.blocks.any():  # else no view was drawn
+            turn = self._turn % len(shown)
+            shown = (*shown[:turn], work.made(), *shown[turn + 1 :])
+            self._turn += 1
         self._last = replace(last, source=work.field.source, gaussians=work.made(), shown=shown)
         self._moved = _differing(last.gaussians, work.made())
         plan.stages = [s for s in plan.stages if isinstance(s, TestViews) or (s.scores and request.scored_whole)]

@@ -205,7 +205,7 @@ def _fit(work: Work, request: ConvertRequest, planner: Planner, plan: Plan) -> P
     first.run(work)
     degree = work.made().degree if request.ply.sh_degree is None else request.ply.sh_degree
     if request.output is not None and request.output != STDOUT:
-        check_room(request.output, file_bytes(len(work.made()), degree))
+        check_room(request.output, 2 * file_bytes(len(work.made()), degree))  # with its certificate once more
     # halfway between its pace and that of drawing: steps follow neither alone on every machine
     pace = max(work.run.report.stages[-1].seconds / first.cost(plan.case).seconds, QUICKEST) ** 0.5
     planner = replace(planner, wide=wide(work.made(), work.fit.size), sh_degree=degree)
@@ -362,8 +362,8 @@ def _legend(source: Source) -> str | None:
 
 
 def _early(run: Run, request: ConvertRequest) -> Callable[[Conversion], None] | None:
-    """What writes the file before its scores are there; None where that can be done once only (a pipe), or a checkpoint
-    holds the Gaussians and the same command is to go on with them."""
+    """What writes the file before its scores are there; None where that can be done once only (a pipe), or the same
+    command is to go on with a checkpoint."""
     output = request.output
     if output is None or output == STDOUT or is_stream(output) or request.checkpoint is not None:
         return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -65,15 +66,13 @@ class Onward:
         if why is None:
             plan.stages = [s for s in plan.stages if isinstance(s, TestViews) or (s.scores and request.scored_whole)]
         else:
-            work.gaussians = work.train = work.train_rule = None
+            work.gaussians = work.train = work.train_rule = work.run.report.refinement = None
             work.run.leave_out(GOING_ON, why)
         return why is None
 
     def _unfit(self, work: Work, request: ConvertRequest) -> str | None:
         """Why there is nothing to go on from, None where there is."""
         field, before = work.field, self.earlier.field
-        if not _same(field, before):
-            raise UsageError(f"after: a conversion of {before.source.volume.name}; expected one of the same volume")
         sources, refinement = (before.source, field.source), self.earlier.report.refinement
         if any(source.gridded for source in sources):
             return "labels, channels or layers"
@@ -83,8 +82,11 @@ class Onward:
             return "harmonics of another degree than 2"
         if refinement is None or request.fit.steps == 0 or request.fit.model is not None:
             return "no steps, or a network"
-        if len(self.earlier.gaussians) > work.fit.max_gaussians:
-            return f"it has {len(self.earlier.gaussians)} Gaussians"
+        budget = self.earlier.report.options["max_gaussians"]
+        if not len(self.earlier.gaussians) <= work.fit.max_gaussians <= budget:
+            return f"it has {len(self.earlier.gaussians)} Gaussians, of at most {budget}"
+        if not _same(field, before):
+            raise UsageError(f"after: a conversion of {before.source.volume.name}; expected one of the same volume")
         return None
 
     def _fitted(self, work: Work, plan: Plan) -> str | None:
@@ -104,6 +106,8 @@ class Onward:
         made = work.run.report.refinement
         assert made is not None
         made["standard"] = standard
+        if made["reason"] == "steps" and made["psnr_after"] < (work.limits.target_psnr or -math.inf):
+            return "more steps for --target-psnr"
         if made["reason"] == "steps" and made["psnr_after"] < standard - WORSE:
             return f"{standard - made['psnr_after']:.1f} dB worse on the check views than the last one without"
         return None
@@ -123,7 +127,7 @@ def recoloured(earlier: Conversion, field: Field) -> Gaussians:
     under[~there] = 0
     old, a = _seen(before, source, gaussians, under)
     new, b = _seen(source, source, gaussians, under)
-    least = FAINT * float(a.mean())
+    least = max(FAINT * float(a.mean()), 1e-30)  # of a function that showed nothing under any
     ratio = np.where(there, ((b + least) / (a + least)).clip(1 / MOST, MOST), 1)
     depth = -np.log1p(-np.minimum(opacity(gaussians).astype(np.float64), OPAQUE[1])) * ratio
     peak = (-np.expm1(-depth)).clip(*OPAQUE)
@@ -158,4 +162,5 @@ def _same(field: Field, other: Field) -> bool:
     if first is second:
         return True
     there = first.dims == second.dims and np.array_equal(first.affine, second.affine)
-    return there and values_digest(field.volumes()) == values_digest(other.volumes())
+    found = values_digest(field.volumes()) if there else None
+    return found is not None and found == values_digest(other.volumes())

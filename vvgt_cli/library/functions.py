@@ -96,6 +96,8 @@ def convert(
         raise UsageError("live: one result of one volume, which `recolor` shows under other looks; expected one look")
     if after is not None and (looks is not None or split_labels or live):
         raise UsageError("after: one conversion goes on from one; expected one look, without split_labels and live")
+    if not isinstance(after, Conversion | None):
+        raise UsageError("after: expected what convert returns for one volume and look")
     if looks is not None:
         if split_labels:
             raise UsageError(f"split_labels with {len(looks)} looks; expected one")

@@ -44,7 +44,7 @@ class LabelTable:
         labels: by ascending numbers, each once.
 
     Raises:
-        DataError: a number twice.
+        DataError: no labels, or a number twice.
     """
 
     name: str
@@ -54,6 +54,8 @@ class LabelTable:
     opacity_unit_share = None
 
     def __post_init__(self) -> None:
+        if not self.labels:
+            raise DataError(f"{self.name}: no labels; expected one")
         numbers = [label.number for label in self.labels]
         if sorted(set(numbers)) != numbers:
             twice = next((a for a, b in pairwise(sorted(numbers)) if a == b), None)

@@ -46,11 +46,18 @@ class Views:
             yield image if blocks is None else blocks.pick(image)
 
     def psnr(self, gaussians: Gaussians, rule: Rule = INRIA) -> float:
-        """Mean dB of RGB over black of Gaussians drawn as the views are."""
+        """Mean dB of RGB over black of Gaussians drawn as the views are, of views that show something if any does.
+
+        Raises:
+            DataError: a picture that is not finite.
+        """
         from vvgt_cli.images.metrics import psnr
+        from vvgt_cli.images.metrics.scores import FOREGROUND
 
         pairs = zip(self.images, self.pictures(gaussians, rule), strict=True)
-        return float(np.mean([psnr(view[..., :3], image[..., :3]) for view, image in pairs]))
+        found = np.array([psnr(view[..., :3], image[..., :3]) for view, image in pairs])
+        seen = np.array([view[..., 3].max() > FOREGROUND for view in self.images])
+        return float(found[seen | ~seen.any()].mean())
 
 
 def judged(cameras: Sequence[Camera]) -> list[tuple[Camera, Blocks | None]]:

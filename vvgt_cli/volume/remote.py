@@ -117,7 +117,9 @@ class Remote:
         if url not in self._kept:
             try:
                 self._kept[url] = self._server.ours.cat_file(url)
-            except self._server.failures:
+            except self._server.failures as error:
+                if getattr(error, "status", 404) >= 500:  # it may be there
+                    raise
                 self._kept[url] = None
         return self._kept[url]
 

@@ -70,7 +70,7 @@ def _array(zarr: Any, place: Path) -> Any:
     if int(np.prod(array.chunks, dtype=object)) * array.dtype.itemsize > MAX_CHUNK:
         raise DataError(f"{place}: chunks of {array.chunks} values; expected at most 2 GiB each")
     if server:
-        server.allow(int(np.prod(array.shards or array.chunks, dtype=object)) * array.dtype.itemsize)
+        server.allow(min(int(np.prod(array.shards or array.chunks, dtype=object)) * array.dtype.itemsize, MAX_CHUNK))
     return array
 
 

@@ -19,7 +19,7 @@ def psnr(reference: np.ndarray, ours: np.ndarray, mask: np.ndarray | None = None
         mask: (h, w) bool, the pixels to count; default all.
 
     Raises:
-        DataError: shapes that differ, no pixel to count.
+        DataError: shapes that differ, no pixel to count, values that are not finite.
     """
     reference, ours = np.asarray(reference), np.asarray(ours)
     if reference.shape != ours.shape:
@@ -30,4 +30,6 @@ def psnr(reference: np.ndarray, ours: np.ndarray, mask: np.ndarray | None = None
         raise DataError("PSNR over no pixels; expected some")
     difference = np.clip(reference, 0, 1) - np.clip(ours, 0, 1)
     error = float(np.mean(np.square(difference, dtype=np.float64)))
+    if not math.isfinite(error):
+        raise DataError("PSNR of images that are not finite")
     return min(CAP, -10 * math.log10(error)) if error > 0 else CAP
