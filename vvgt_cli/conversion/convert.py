@@ -27,7 +27,7 @@ from vvgt_cli.field.field import Field, Picture, Resident
 from vvgt_cli.field.open import Wanted, automatic, beside, blocked
 from vvgt_cli.field.source import Source, describe_source, load, tf_record, volume_record
 from vvgt_cli.field.workload import expected_wide
-from vvgt_cli.files import check_room, is_stream
+from vvgt_cli.files import check_room
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored
 from vvgt_cli.gaussians.formats import format_of
 from vvgt_cli.gaussians.legend import legend_text
@@ -70,15 +70,20 @@ def convert(
         return report
 
 
-def without_files(request: ConvertRequest, console: Console | None = None, onward: Onward | None = None) -> Conversion:
-    """A conversion of which nothing is written.
+def without_files(
+    request: ConvertRequest, console: Console | None = None, onward: Onward | None = None,
+    unscored: Callable[[Conversion], None] | None = None,
+) -> Conversion:  # fmt: skip
+    """A conversion of which nothing is written; ``unscored`` as of `run_conversion`.
 
     Raises:
         DataError, UsageError: as `convert`.
     """
     run = Run(console or Console(), ConversionReport("convert"))
     with ExitStack() as stack:
-        conversion = run_conversion(run, request, stack.enter_context(opened(run, request)), carry=onward)
+        conversion = run_conversion(
+            run, request, stack.enter_context(opened(run, request)), carry=onward, unscored=unscored
+        )
         weakref.finalize(conversion, stack.pop_all().close)  # what it draws is there as long as it is
     run.finish()
     return conversion
@@ -190,7 +195,7 @@ def _planned(run: Run, request: ConvertRequest, field: Field, expected: bool = T
     guess = expected_wide(fit.max_gaussians, fit.size)
     planner = Planner(
         request.limits, fit.max_gaussians, fit.steps, request.ply.sh_degree or degree, fit.size, guess, fit.model,
-        request.scored_whole, fit.init == "vbm", fit.init == "vbm",
+        request.scored_whole, fit.init == "vbm", fit.init == "vbm", request.writes,
     )  # fmt: skip
     plan = planner.plan(case, run.elapsed())
     run.report.plan = plan.record()
@@ -362,10 +367,9 @@ def _legend(source: Source) -> str | None:
 
 
 def _early(run: Run, request: ConvertRequest) -> Callable[[Conversion], None] | None:
-    """What writes the file before its scores are there; None where that can be done once only (a pipe), or the same
-    command is to go on with a checkpoint."""
+    """What writes the file before its scores are there, where it is written twice."""
     output = request.output
-    if output is None or output == STDOUT or is_stream(output) or request.checkpoint is not None:
+    if output is None or request.writes < 2:
         return None
 
     def write(found: Conversion) -> None:

@@ -29,7 +29,7 @@ MOST_STEPS = 400  # where a target or a time asks for as many as it takes
 FEWEST_STEPS = 8  # less is not worth the views
 ENOUGH_STEPS = 24  # as good as back-projection; fewer are taken after it
 SMALLEST = 64  # pixels along the edge of a training view that is small: four tiles
-WRITE = 0.1  # seconds of the file
+WRITE = 0.1  # seconds of the file, each time
 SURE = 0.8  # of an estimate of memory: as little has been enough
 
 
@@ -44,6 +44,7 @@ class Plan:
         spent: seconds before the first of them.
         bytes: of the file.
         left_out: (stage, why) of what is not done.
+        writes: how often the file is written.
     """
 
     case: Workload
@@ -52,10 +53,16 @@ class Plan:
     spent: float = 0.0
     bytes: int = 0
     left_out: list[tuple[str, str]] = field(default_factory=list)
+    writes: int = 1
+
+    @property
+    def writing(self) -> float:
+        """Seconds of writing the file."""
+        return self.case.pace * WRITE * self.writes
 
     def seconds_of(self, stages: Sequence[Stage]) -> float:
         """That they should take, and writing the file."""
-        return sum(stage.cost(self.case).seconds for stage in stages) + self.case.pace * WRITE
+        return sum(stage.cost(self.case).seconds for stage in stages) + self.writing
 
     @property
     def seconds(self) -> float:
@@ -79,7 +86,7 @@ class Plan:
     def costs(self) -> list[tuple[str, float]]:
         """(label, seconds) of every stage."""
         stages = [(stage.label(), stage.cost(self.case).seconds) for stage in self.stages]
-        return [("so far", self.spent), *stages, ("write", self.case.pace * WRITE)]
+        return [("so far", self.spent), *stages, ("write", self.writing)]
 
     def record(self) -> dict[str, Any]:
         """Plain values for the report."""
@@ -123,6 +130,7 @@ class Planner:
         whole: all ten test views are scored.
         cuts: there will be a pyramid to cut once more.
         cells: the closed form is of cells, a Gaussian each.
+        writes: how often the file is written.
     """
 
     limits: Limits
@@ -135,10 +143,11 @@ class Planner:
     whole: bool = False
     cuts: bool = False
     cells: bool = True
+    writes: int = 1
 
     def plan(self, case: Workload, spent: float, begun: bool = False) -> Plan:
         """Which stages fit, after ``spent`` seconds; ``begun``: the closed form is done."""
-        plan = Plan(case, self.gaussians, [], spent, file_bytes(self.gaussians, self.sh_degree))
+        plan = Plan(case, self.gaussians, [], spent, file_bytes(self.gaussians, self.sh_degree), writes=self.writes)
         first: list[Stage] = [ClosedFormStage()]
         last: list[Stage] = [TestViews(self.whole), ViewingConditions()]
         left = None

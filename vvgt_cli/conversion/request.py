@@ -9,9 +9,10 @@ from vvgt_cli.conversion.place import AUTO
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.settings import BlockOptions
 from vvgt_cli.field.source import SourceRequest
+from vvgt_cli.files import is_stream
 from vvgt_cli.gaussians import PlyOptions
 from vvgt_cli.gaussians.formats import SUFFIXES, format_of
-from vvgt_cli.gaussians.outputs import Output
+from vvgt_cli.gaussians.outputs import STDOUT, Output
 
 VERTEX_BYTES = 68  # x y z, normals, three colours, opacity, three scales, four of rotation: float32
 HARMONIC_BYTES = {0: 0, 1: 36, 2: 96, 3: 180}  # up to a degree
@@ -138,6 +139,14 @@ class ConvertRequest:
     def scored_whole(self) -> bool:
         """Whether on all ten test views."""
         return self.all_views or self.report is not None
+
+    @property
+    def writes(self) -> int:
+        """How often the output is written: before there are scores, and with them; once only where it is a pipe, or the
+        same command is to go on with a checkpoint."""
+        if self.output is None:
+            return 0
+        return 1 if self.output == STDOUT or is_stream(self.output) or self.checkpoint is not None else 2
 
     def outputs(self) -> list[Output]:
         """Everything that will be written."""
