@@ -11,11 +11,12 @@ import pytest
 
 from tests.test_view_volume import desk, send  # noqa: F401
 from vvgt_cli.cli.main import run
+from vvgt_cli.commands.converter import Made, Message, Scored
+from vvgt_cli.commands.converter_process import Telling
 from vvgt_cli.commands.converter_process import Volume as ConvertedVolume
 from vvgt_cli.commands.live_site import Cloud, Desk, labels_sent
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians.formats.page_file import read_html
-from vvgt_cli.progress import Console
 
 Z, Y, X = np.mgrid[:12, :12, :12] // 6
 CUBES = (1 + X + 2 * Y + 4 * Z).astype(np.uint8)
@@ -62,10 +63,16 @@ def test_saved_labels_have_the_colours_of_the_page(desk: tuple[str, Desk], eight
 def test_a_volume_is_converted_for_the_labels_of_the_page(tmp_path: Path) -> None:
     np.save(tmp_path / "eight.npy", CUBES)
     source = SourceRequest(str(tmp_path / "eight.npy"), labels="auto")
-    volume = ConvertedVolume(source, "eight", Console(quiet=True))
-    volume.live(Console(quiet=True))
-    made = volume.under(labels_sent(rows({2: 1.0})), Console(quiet=True))
+    told: list[Message] = []
+    console = Telling(told.append)
+    volume = ConvertedVolume(source, "eight", console)
+    volume.live(console)
+    volume.under(labels_sent(rows({2: 1.0})), console)
+    _, made, scored = [one for one in told if isinstance(one, Made | Scored)]
+    assert isinstance(made, Made)
     gaussians = Cloud.of(made.ply, "x").gaussians
     assert (gaussians.means[:, 0] > -0.2).all()  # one of the eight, to the right
-    assert made.psnr is not None
+    assert isinstance(scored, Scored)
+    assert Cloud.of(made.ply, "x").options.certificate is None
+    assert Cloud.of(scored.ply, "x").options.certificate is not None
     np.testing.assert_allclose(np.median(gaussians.colors, axis=0), (0.25, 0, 1), atol=0.05)

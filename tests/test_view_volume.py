@@ -13,6 +13,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -23,7 +24,7 @@ from tests.test_formats_server import ask, cloud, shown
 from tests.test_live import GRAIN, HI, LO, RAMP, facts
 from tests.test_live import cloud as live_cloud
 from vvgt_cli.cameras.sets import SIZE, pixel_width
-from vvgt_cli.commands.converter import Converter, Failed, Made
+from vvgt_cli.commands.converter import Converter, Failed, Made, Message, Said, Scored
 from vvgt_cli.commands.live_site import Cloud, Desk, function_sent, plain_name
 from vvgt_cli.commands.server import Part, Site, served
 from vvgt_cli.conversion.live import lit, refusal
@@ -108,16 +109,24 @@ def test_a_volume_is_shown_live_and_converted_for_the_pages_function(tmp_path: P
         until(lambda: state_of(url)["state"] != "working")
         state = state_of(url)
         assert (state["number"], state["state"]) == (3, "done")
+        # the next function ends no scores, and goes on from what they are of
+        second = set(workers(child.pid))
+        assert send(url, "function", FUNCTION) == (200, b'{"number": 4}')
+        assert set(workers(child.pid)) == second
+        until(lambda: state_of(url).get("scored", False))
+        state = state_of(url)
+        assert (state["number"], state["state"]) == (4, "done")
         assert re.fullmatch(r"converted, [3-9]\d\.\d dB", state["said"])
         shown_now, header = read_ply(io.BytesIO(ask(url, path + state["file"])[1]))
         assert header.live is None
         assert header.up == "z"
-        status, saved = send(url, "save", {"file": "ply", "number": 3})
+        status, saved = send(url, "save", {"file": "ply", "number": 4})
         kept = Cloud.of(saved, "x")
         assert status == 200
         assert (kept.options.up, kept.options.unit_distance) == ("none", 0.1)
         assert len(kept.gaussians) == len(shown_now) > 10
-        assert len(read_html(send(url, "save", {"file": "html", "number": 3})[1], "x")) == len(shown_now)
+        assert kept.options.certificate is not None
+        assert len(read_html(send(url, "save", {"file": "html", "number": 4})[1], "x")) == len(shown_now)
         # the live form under the function, as a file that is live
         status, saved = send(url, "save", {"file": "ply", "function": FUNCTION})
         live = Cloud.of(saved, "x")
@@ -128,7 +137,7 @@ def test_a_volume_is_shown_live_and_converted_for_the_pages_function(tmp_path: P
         # no function: nothing is at work, and what was made is gone
         assert send(url, "function", None)[0] == 200
         assert ask(url, path + state["file"])[0] == 404
-        assert send(url, "save", {"file": "ply", "number": 3})[0] == 400
+        assert send(url, "save", {"file": "ply", "number": 4})[0] == 400
         child.send_signal(signal.SIGINT)
         _, said = child.communicate(timeout=60)
         assert child.returncode == 0
@@ -249,6 +258,19 @@ def test_the_page_hears_why_a_conversion_failed(desk: tuple[str, Desk]) -> None:
     assert "live" in scene_of(url)
 
 
+def test_a_page_shows_what_is_converted_before_its_scores(desk: tuple[str, Desk]) -> None:
+    url, of = desk
+    send(url, "function", FUNCTION)
+    of.hear(1, Made(b"unscored", {"ply": b"shown"}))
+    told = {"number": 1, "state": "done", "said": "converted", "file": "1.ply", "scored": False}
+    assert state_of(url) == told
+    assert ask(url, urlsplit(url).path + "1.ply")[1] == b"shown"
+    of.hear(1, Scored(b"certified", 41.23))
+    assert state_of(url) == {**told, "said": "converted, 41.2 dB", "scored": True}
+    assert ask(url, urlsplit(url).path + "1.ply")[1] == b"shown"
+    assert of.better == b"certified"
+
+
 def test_a_saved_live_file_has_the_colours_of_the_function(desk: tuple[str, Desk]) -> None:
     function = {
         "points": [{"x": LO, "rgb": [1, 0, 0], "opacity": 0.1}, {"x": HI, "rgb": [0, 0, 1], "opacity": 0.4}],
@@ -336,20 +358,21 @@ def test_what_is_never_live_is_converted(monkeypatch: pytest.MonkeyPatch) -> Non
         assert refusal(ConvertRequest(other, live=True), load(other)) is None
     asked = []
 
-    def conversion(request: ConvertRequest, console: Console) -> str:
+    def conversion(request: ConvertRequest, console: Console, after: Any, unscored: Any) -> Any:
         asked.append(request.live)
-        return "conversion"
+        unscored("conversion")
+        return SimpleNamespace(scores={"psnr": 40.0})
 
     monkeypatch.setattr(converter_process, "without_files", conversion)
+    monkeypatch.setattr(converter_process, "_file", lambda found: b"scored")
     monkeypatch.setattr(converter_process.Volume, "_paged", lambda volume, found: Made(b"", {}))
-    said: list[str] = []
-    console = Console(quiet=True)
-    console.say = said.append  # type: ignore[method-assign]
+    told: list[Message] = []
     volume = converter_process.Volume.__new__(converter_process.Volume)
-    volume.source = request
-    assert volume.live(console) == Made(b"", {})
+    volume.source, volume.last = request, None
+    volume.live(converter_process.Telling(told.append))
+    assert [one for one in told if isinstance(one, Made | Scored)] == [Made(b"", {}), Scored(b"scored", 40.0)]
     assert asked == [False]
-    assert f"not live, but converted: {why}" in said
+    assert Said(f"not live, but converted: {why}") in told
 
 
 @pytest.mark.parametrize(

@@ -82,7 +82,7 @@ await page.mouse.up();
 await until('document.querySelector("#live p").textContent.startsWith("converting")');
 noted.live = await shown();
 await page.screenshot({ path: path.join(job.folder, 'page-live.png') });
-await until('document.querySelector("#live .named i").textContent.startsWith("converted")');
+await until('document.querySelector("#live .named i").textContent.startsWith("converted, ")');
 await page.waitForTimeout(2000);
 noted.better = await shown();
 noted.moved = (await place()).map((v, i) => Math.abs(v - before[i]));

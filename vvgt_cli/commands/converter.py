@@ -44,19 +44,30 @@ class Progress:
 
 @dataclass(frozen=True)
 class Made:
-    """What became of a job.
+    """What became of a job; of what is converted `Scored` follows.
 
     Attributes:
-        ply: the file that `vvgt convert` would write.
+        ply: the file that `vvgt convert` would write, without a certificate.
         parts: of the first job the page's text, named "", and what it asks for; of others the `.ply` that it shows.
         live: it can be shown under any function.
-        psnr: dB on the test views; None where it was not scored.
     """
 
     ply: bytes
     parts: dict[str, bytes]
     live: bool = False
-    psnr: float | None = None
+
+
+@dataclass(frozen=True)
+class Scored:
+    """What is known of what was made last.
+
+    Attributes:
+        ply: the file with its certificate.
+        psnr: dB on the test views.
+    """
+
+    ply: bytes
+    psnr: float
 
 
 @dataclass(frozen=True)
@@ -66,7 +77,7 @@ class Failed:
     error: VvgtError
 
 
-Message = Said | Progress | Made | Failed
+Message = Said | Progress | Made | Scored | Failed
 
 
 @dataclass(frozen=True)
@@ -126,7 +137,10 @@ class Converter:
             atexit.unregister(self._close)
 
     def ask(self, job: Job) -> int:
-        """Begin a job in place of the one that is being done, if any; returns its number."""
+        """Begin a job in place of the one that is being done, if any; returns its number.
+
+        What only scores are missing of is not ended, for the next job may go on from it.
+        """
         with self.lock:
             if self._folder is None:
                 return self._number  # it is over
@@ -141,10 +155,10 @@ class Converter:
             return self._number
 
     def cancel(self) -> None:
-        """End the job that is being done, if any."""
+        """End the job that is being done, if any; nothing more is heard of it."""
         with self.lock:
+            self._number += 1
             if self._busy:
-                self._number += 1
                 self._end()
 
     @property

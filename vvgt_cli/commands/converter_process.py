@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import IO, Any
 
-from vvgt_cli.commands.converter import Failed, Job, Made, Message, Progress, Said, Start
+from vvgt_cli.commands.converter import Failed, Job, Made, Message, Progress, Said, Scored, Start
 from vvgt_cli.commands.live_site import Cloud, page_of, stored
 from vvgt_cli.conversion.convert import opened, ply_options, without_files
 from vvgt_cli.conversion.live import live_conversion, refusal
@@ -74,8 +74,8 @@ class Volume:
             content = open_parts(source.path, source.read)
             self.source = replace(source, volume=content, read=ReadOptions())
 
-    def live(self, console: Console) -> Made:
-        """The live form, or of what has none an ordinary conversion."""
+    def live(self, console: Telling) -> None:
+        """Tell the live form, or of what has none an ordinary conversion."""
         run = Run(console, ConversionReport("init"))
         request = ConvertRequest(self.source, live=True)
         with opened(run, request) as field:
@@ -83,23 +83,27 @@ class Volume:
             if why is None:
                 ply, self.lighting = ply_options(request, field.source), field.source.tf.lighting
                 self.table = field.source.tf if isinstance(field.source.tf, LabelTable) else None
-                return self._paged(live_conversion(run, request, field, ply, scored=False))
+                console.tell(self._paged(live_conversion(run, request, field, ply, scored=False)))
+                return
         console.say(f"not live, but converted: {why}")
-        return self._paged(without_files(replace(request, live=False), console))
+        self._converted(replace(request, live=False), console, self._paged)
 
-    def under(self, job: Job, console: Console) -> Made:
-        """A conversion for a function, on data values, that says the distance its opacity is per; or for labels."""
+    def under(self, job: Job, console: Telling) -> None:
+        """Tell a conversion for labels, or a function, on data values, that says the distance its opacity is per."""
         assert job is not None
         if isinstance(job, LabelTable):
             source = replace(self.source, labels=self._labels(job))
         else:
             lit = replace(job, lighting=self.lighting)
             source = replace(self.source, tf=lit, tf_range="data", unit_distance=None)
-        conversion = without_files(ConvertRequest(source), console, self.last)
-        self.last = Onward(conversion)
-        shown = stored(conversion.gaussians, conversion.ply)
-        psnr = None if conversion.scores is None else conversion.scores["psnr"]
-        return Made(_file(conversion), {"ply": shown}, psnr=psnr)
+        self.last = Onward(self._converted(ConvertRequest(source), console, _plain_file))
+
+    def _converted(self, request: ConvertRequest, console: Telling, made: Callable[[Conversion], Made]) -> Conversion:
+        """Tell what is ``made`` of a conversion as soon as it is there, and its scores when they are."""
+        conversion = without_files(request, console, self.last, lambda unscored: console.tell(made(unscored)))
+        assert conversion.scores is not None
+        console.tell(Scored(_file(conversion), conversion.scores["psnr"]))
+        return conversion
 
     def _labels(self, sent: LabelTable) -> LabelTable:
         """The labels to begin with, in the colours and opacities of those that are sent."""
@@ -122,6 +126,11 @@ def _missing() -> str | None:
     except DataError as error:
         return str(error)
     return None
+
+
+def _plain_file(conversion: Conversion) -> Made:
+    """With the `.ply` that a page swaps in."""
+    return Made(_file(conversion), {"ply": stored(conversion.gaussians, conversion.ply)})
 
 
 def _file(conversion: Conversion) -> bytes:
@@ -152,7 +161,10 @@ def main() -> None:
         console = Telling(tell)
         try:
             volume = volume or Volume(start.source, start.name, console)
-            tell(volume.live(console) if job is None else volume.under(job, console))
+            if job is None:
+                volume.live(console)
+            else:
+                volume.under(job, console)
         except VvgtError as error:
             tell(Failed(_plain(error)))
         except MemoryError:

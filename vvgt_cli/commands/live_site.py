@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from vvgt_cli.cameras.sets import SIZE, pixel_width
-from vvgt_cli.commands.converter import Converter, Failed, Job, Made, Message, Progress, Said
+from vvgt_cli.commands.converter import Converter, Failed, Job, Made, Message, Progress, Said, Scored
 from vvgt_cli.commands.server import Part
 from vvgt_cli.conversion.gaussian_files import layout_of, open_gaussians
 from vvgt_cli.errors import DataError, VvgtError
@@ -348,6 +348,8 @@ class Desk:
             self.state = {"number": number, "state": "failed", "said": str(message.error)}
             self.there.set()
             self.begun.set()
+        elif isinstance(message, Scored):
+            self._scored(message)
         elif first:
             self._first(message)
         else:
@@ -361,9 +363,16 @@ class Desk:
     def _better(self, number: int, made: Made) -> None:
         self.better = made.ply
         self.parts[f"{number}.ply"] = _part(made.parts["ply"], BYTES)
-        told = "converted" if made.psnr is None else f"converted, {made.psnr:.1f} dB"
-        self.state = {"number": number, "state": "done", "said": told, "file": f"{number}.ply"}
-        self.console.say(f"{told}, for the function of the page")
+        self.state = {"number": number, "state": "done", "said": "converted", "file": f"{number}.ply", "scored": False}
+        self.console.say("converted for the function of the page")
+
+    def _scored(self, scored: Scored) -> None:
+        if self.better is None:  # what has no live form
+            self.first = cache(lambda: Cloud.of(scored.ply, self.name))
+        else:
+            self.better = scored.ply
+            self.state = {**self.state, "said": f"converted, {scored.psnr:.1f} dB", "scored": True}
+        self.console.say(f"{scored.psnr:.1f} dB on the test views")
 
 
 def _part(content: bytes, kind: str) -> Part:

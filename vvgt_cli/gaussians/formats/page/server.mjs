@@ -129,15 +129,15 @@ export function served(panel, viewer, server) {
         if (state.number !== job) break;  // of another page
         if (state.state === 'failed') throw new Error(state.said);
         if (state.state === 'done') {
-          await better.load(state.file, () => mine === change);
+          if (number !== job) await better.load(state.file, () => mine === change);
           if (mine !== change) return;
           [number, told, busy] = [job, state.said, false];
-          return put();
-        }
-        say(`converting for this function: ${state.said}`);
+          put();
+          if (state.scored) return;
+        } else say(`converting for this function: ${state.said}`);
         await pause(ASK);
       }
-      if (mine === change) end();
+      if (mine === change && busy) end();
     } catch (error) {
       if (mine === change) end(error instanceof TypeError ? 'vvgt view has ended' : error.message, true);
     }
