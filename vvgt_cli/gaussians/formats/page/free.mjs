@@ -3,6 +3,7 @@ import { dot, plus } from './lens.mjs';
 
 const FITS = 0.9;  // share of that part that is filled
 const FARTHEST = 3;  // times that the eye may stand back for it; where the rest is smaller yet, the whole window
+const ALIKE = 1.1;  // times the least distance: of those parts the one nearest the middle of the window
 const OVER = '#live, #named, #series, #tools, #where .over';
 
 // {position, target, fov} of a part of some pixels; the viewer's field of view is along the longer side of the window
@@ -18,20 +19,18 @@ export function firstView({ camera: { position, target, fov }, outermost = [] },
 
 const distance = ({ position, target }) => Math.hypot(...plus(position, target, -1));
 
-// {x, y: its middle, far} of the part in which the first view is nearest, of those the largest
+// {x, y: its middle, far: how far the eye stands back} of that part
 function freePart(scene) {
   const over = [...document.querySelectorAll(OVER)].map((element) => element.getBoundingClientRect()).filter(({ width, height }) => width && height);
-  const far = (wide, high) => distance(firstView(scene, wide, high));
-  const whole = { x: innerWidth / 2, y: innerHeight / 2, far: far(innerWidth, innerHeight), size: 0 };
-  let best = { ...whole, far: FARTHEST * whole.far };
+  const [x, y] = [innerWidth / 2, innerHeight / 2], far = (wide, high) => distance(firstView(scene, wide, high)), most = FARTHEST * far(innerWidth, innerHeight), found = [];
   const edges = (side, end) => [end, ...over.map((r) => r[side])];
   for (const left of edges('right', 0)) for (const right of edges('left', innerWidth)) for (const top of edges('bottom', 0)) for (const bottom of edges('top', innerHeight)) {
-    const wide = right - left, high = bottom - top;
-    if (wide <= 0 || high <= 0 || over.some((r) => r.left < right && r.right > left && r.top < bottom && r.bottom > top)) continue;
-    const one = { x: (left + right) / 2, y: (top + bottom) / 2, far: far(wide, high), size: wide * high }, nearer = one.far / best.far - 1;
-    if (nearer < -1e-6 || (nearer < 1e-6 && one.size > best.size)) best = one;
+    if (left >= right || top >= bottom || over.some((r) => r.left < right && r.right > left && r.top < bottom && r.bottom > top)) continue;
+    found.push({ x: (left + right) / 2, y: (top + bottom) / 2, far: far(right - left, bottom - top) });
   }
-  return best.size ? best : whole;
+  const least = Math.min(...found.map((part) => part.far)), aside = (part) => Math.hypot(part.x - x, part.y - y);
+  if (!(least < most)) return { x, y, far: most / FARTHEST };
+  return found.filter((part) => part.far <= ALIKE * least).sort((a, b) => aside(a) - aside(b) || a.far - b.far)[0];
 }
 
 // Keeps the middle of the view in the middle of that part when the panel is folded and the window changes; until somebody moves the view, all fits.
