@@ -15,8 +15,11 @@ from tests.headers import uncertified
 from tests.random_clouds import random_cloud
 from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.blocks import BLOCK
+from vvgt_cli.conversion.carried import Carry
 from vvgt_cli.conversion.changes import EDGE, REACH, Changes, changes
+from vvgt_cli.conversion.convert import convert
 from vvgt_cli.conversion.pictures import Pictures
+from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.dvr import RenderSettings
 from vvgt_cli.field.field import Resident
 from vvgt_cli.field.source import SourceRequest, load
@@ -240,6 +243,29 @@ def check_page(folder: Path) -> None:
         assert np.abs(1 / (1 + np.exp(-found)) - 1 / (1 + np.exp(-own))).max() < 1 / 200
     assert whole[2].split(b"end_header\n")[1] == whole[3].split(b"end_header\n")[1]  # certificates differ
     assert len(held[1]) < len(held[0])
+
+
+def test_what_frames_leave_to_later_ones_is_in_the_memory_that_is_asked_for(beat, monkeypatch):
+    asked = []
+
+    def check(plan, beside=None):
+        if beside is not None:  # not after the closed form
+            asked.append(beside(plan.case))
+
+    monkeypatch.setattr("vvgt_cli.conversion.convert.check_memory", check)
+    carry = Carry(96)
+    for k in (0, 1, 2, 0):
+        source = SourceRequest(str(beat / f"v_{k}.npy"), tf=str(beat / "tf.json"))
+        request = ConvertRequest(source=source, fit=FitOptions(400, 96, steps=100), output=str(beat / f"{k}.ply"))
+        convert(replace(request, overwrite=True), carry=carry)
+    turns = len(carry._last.shown)
+    assert turns > 3
+    pictures = sum(picture.nbytes for _, picture, _ in carry._pictures._kept.values())
+    a_set = sum(array.nbytes for array in carry._last.gaussians.arrays().values())
+    assert len(carry._last.gaussians) == 400
+    assert 1 <= asked[0] / (pictures + (turns + 1) * a_set) < 1.1
+    assert asked[1] < asked[0] - pictures
+    assert asked[1] - asked[3] == 2 * a_set  # those of frames 1 and 2 are there by then
 
 
 def test_no_more_steps_than_were_asked_for(vvgt, beat):

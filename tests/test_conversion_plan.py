@@ -172,6 +172,8 @@ def test_gaussians_that_do_not_fit_are_refused_with_the_number_that_would(monkey
     monkeypatch.setattr("vvgt_cli.conversion.plan.free_memory", lambda: each * 3e5 + views)
     with pytest.raises(UsageError, match="--max-gaussians 250000 would fit"):
         check_memory(found)
+    with pytest.raises(UsageError, match="--max-gaussians 125000 would fit"):  # a series keeps more
+        check_memory(found, lambda case: 0.5 * each * case.gaussians)
 
 
 def test_no_steps_leave_back_projection():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -12,13 +13,14 @@ from vvgt_cli.cameras.blocks import BLOCK, Blocks
 from vvgt_cli.conversion.changes import Changes, changes
 from vvgt_cli.conversion.pictures import Pictures
 from vvgt_cli.conversion.plan import Plan
-from vvgt_cli.conversion.request import ConvertRequest
+from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.conversion.stage import Work
-from vvgt_cli.conversion.stages import CheckViews
+from vvgt_cli.conversion.stages import CheckViews, TrainingViews
 from vvgt_cli.conversion.stages.refinement import Refinement, refine, widened_small
 from vvgt_cli.conversion.stages.scores import TestViews
 from vvgt_cli.field.field import Field, Picture
 from vvgt_cli.field.source import Source
+from vvgt_cli.field.workload import Workload
 from vvgt_cli.gaussians import Gaussians, as_stored
 from vvgt_cli.gaussians.rules import Rule
 from vvgt_cli.refine import OptimizeOptions
@@ -33,6 +35,7 @@ LEVEL = 0.25 / 255  # of a pixel, that is no change
 VIEWS = 18  # of the training views for them, others in every frame
 WORSE = 0.2  # dB on the check views below the last frame that was converted by itself: then the next is, too
 FAR = 6.0  # dB below it before any step
+A_SET = 14 * 4  # bytes of a Gaussian without harmonics, which are 12 each
 
 
 @dataclass(frozen=True)
@@ -78,6 +81,14 @@ class Carry:
     def facts(self) -> dict[str, int]:
         """Of the frame that was made last, as an index has them."""
         return {} if self._moved is None else {"moved": self._moved}
+
+    def beside(self, plan: Plan, fit: FitOptions) -> Callable[[Workload], float]:
+        """Bytes that frames will leave to later ones and that are not there yet, for a workload of such a plan."""
+        turns = max((max(s.count // VIEWS, 1) for s in plan.stages if isinstance(s, TrainingViews)), default=-1)
+        there = {id(one) for one in (self._last.gaussians, *self._last.shown)} if self._last else ()
+        sets = max(turns + 1 - len(there), 0)
+        pictures = self._pictures.room([view for stage in plan.stages for view in stage.views(fit)]) if sets else 0
+        return lambda case: sets * case.gaussians * (A_SET + 12 * ((case.degree + 1) ** 2 - 1)) + pictures
 
     def goes_on(self, work: Work, plan: Plan, request: ConvertRequest) -> bool:
         """Make the frame from the one before, if that is as near as a conversion by itself; whether it was."""

@@ -43,6 +43,11 @@ class Pictures:
         found = self._kept.get(_key(view))
         return None if found is None else found[1].copy()
 
+    def room(self, views: Sequence[Picture]) -> int:
+        """Bytes that will be kept of them beside what is kept."""
+        sizes = {_key(view): (view.camera.width, view.camera.height) for view in views}
+        return sum(16 * w * h for key, (w, h) in sizes.items() if key not in self._kept and max(w, h) <= self.largest)
+
     def missing(self, view: Picture) -> Blocks | None:
         """What of a picture has to be drawn; None: all of it."""
         found = self._kept.get(_key(view))

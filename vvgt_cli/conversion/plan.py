@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -230,11 +230,12 @@ def _room(left: float | None) -> str:
     return f"{max(left or 0.0, 0.0):.1f} s are left"
 
 
-def check_memory(plan: Plan) -> None:
+def check_memory(plan: Plan, beside: Callable[[Workload], float] = lambda _: 0.0) -> None:
     """Refuse what would not fit, rather than have the system end it.
 
     Args:
         plan: of the stages that are left.
+        beside: bytes that are kept beside what they take, for such a workload.
 
     Raises:
         UsageError: with the size or the Gaussians that would fit.
@@ -248,11 +249,14 @@ def check_memory(plan: Plan) -> None:
             f"--size {size}: views need {views / 2**30:.1f} GiB of memory, {free / 2**30:.1f} GiB are free; --size "
             f"{max(int(size * (free / views) ** 0.5), 1)} would fit, or 'vvgt init', which renders none"
         )
-    need = SURE * plan.working_memory
+    need = SURE * plan.working_memory + beside(plan.case)
     form, fewer = plan.stages[0], plan.gaussians
     if not isinstance(form, ClosedFormStage) or need <= free:
         return
-    while fewer > 1 and SURE * (form.cost(for_budget(plan.case, fewer)).memory + views) > free:
+    while fewer > 1:
+        case = for_budget(plan.case, fewer)
+        if SURE * (form.cost(case).memory + views) + beside(case) <= free:
+            break
         fewer //= 2
     raise UsageError(
         f"{plan.gaussians} Gaussians need about {need / 2**30:.2f} GiB of memory more, {free / 2**30:.2f} GiB are "
