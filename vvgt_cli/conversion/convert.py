@@ -81,9 +81,8 @@ def without_files(
     """
     run = Run(console or Console(), ConversionReport("convert"))
     with ExitStack() as stack:
-        conversion = run_conversion(
-            run, request, stack.enter_context(opened(run, request)), carry=onward, unscored=unscored
-        )
+        field = stack.enter_context(opened(run, request))
+        conversion = run_conversion(run, request, field, carry=onward, unscored=unscored)
         weakref.finalize(conversion, stack.pop_all().close)  # what it draws is there as long as it is
     run.finish()
     return conversion
