@@ -1,9 +1,11 @@
 """How near live files are to their volumes under functions that nothing was made for, beside conversions for these.
 
 python benchmarks/live.py SCENES.tsv DATA FUNCTIONS -o docs/live.csv [--scene NAME] [--gaussians N] [--direct]
+python benchmarks/live.py SCENES.tsv DATA FUNCTIONS --lit [-o FILE.csv] [--scene NAME] [--gaussians N]
 python benchmarks/live.py --table docs/live.csv
 
-A file is made for the scene's function, and shown under a band, a step and a ramp that follow from the histogram.
+A file is made for the scene's function, and shown under a band, a step and a ramp that follow from the histogram. With
+--lit the scene's own function is shown instead, under lights, beside the closed form that is made for each.
 """
 
 from __future__ import annotations
@@ -17,9 +19,12 @@ import numpy as np
 from dvr_scenes import print_table, read_scenes, write_rows
 
 from vvgt_cli.cameras.sets import pixel_width
-from vvgt_cli.conversion.convert import fitted
-from vvgt_cli.conversion.live import carrying, placed_by, table_of, wide_enough
+from vvgt_cli.conversion.convert import degree_of, fitted
+from vvgt_cli.conversion.live import carrying, in_box, placed_by, table_of, wide_enough
+from vvgt_cli.conversion.recolored import lit_by
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
+from vvgt_cli.conversion.stage import Work
+from vvgt_cli.conversion.stages import ClosedFormStage
 from vvgt_cli.dvr import RenderSettings
 from vvgt_cli.field.field import Resident
 from vvgt_cli.field.layered import Content
@@ -31,6 +36,7 @@ from vvgt_cli.gaussians.live_facts import LiveFacts
 from vvgt_cli.look import ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.fog import fog
 from vvgt_cli.look.histogram import background_bins
+from vvgt_cli.look.lighting import LightOptions
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
 from vvgt_cli.score.viewing import PREVIEW_VIEWS
@@ -71,16 +77,44 @@ def direct(field: Resident, tf: TransferFunction, gaussians: int) -> Gaussians:
     return fitted(Run(Console(quiet=True), ConversionReport("convert")), request)
 
 
-def measured(name: str, field: Resident, gaussians: int, beside: bool) -> list[dict[str, Any]]:
-    """A row a function."""
+def placed(field: Resident, gaussians: int) -> Gaussians:
+    """Of a live file, box frame."""
     source = field.source
     run = Run(Console(quiet=True), ConversionReport("convert"))
     request = ConvertRequest(SourceRequest("-"), None, FitOptions(max_gaussians=gaussians, size=SIZE), live=True)
-    start = time.process_time()
     assert isinstance(source.tf, TransferFunction)
     foggy = field.shown_by(fog(source.statistics, source.tf))
-    live = wide_enough(carrying(run, foggy, placed_by(run, foggy, request)), SIZE)
+    return wide_enough(carrying(run, foggy, placed_by(run, foggy, request)), SIZE)
+
+
+def score(field: Resident, gaussians: Gaussians) -> float:
+    """dB on three test views."""
+    return score_test_views(field, gaussians, SIZE, RenderSettings(), perceptual=False, only=PREVIEW_VIEWS).psnr
+
+
+def measured_lit(name: str, field: Resident, gaussians: int) -> list[dict[str, Any]]:
+    """A row a light."""
+    live, table, rows = placed(field, gaussians), table_of(field.source), []
+    for title, lights in {"none": (), "headlight": ("headlight",), "0.3,-0.8,0.5": ("0.3,-0.8,0.5",)}.items():
+        source = replace(field.source, lighting=LightOptions(lights).lighting(None, None) if lights else None)
+        lit = Resident(source, source.scene())
+        run = Run(Console(quiet=True), ConversionReport("init"))
+        fit = FitOptions(max_gaussians=gaussians, size=SIZE)
+        work = Work(run, lit, fit, degree=degree_of(ConvertRequest(SourceRequest("-"), None, fit), source))
+        ClosedFormStage().run(work)
+        shown = lit_by(live, table, in_box(source), pixel_width(SIZE))
+        scores = {"live": score(lit, shown), "closed form": score(lit, work.made())}
+        rows.append({"scene": name, "gaussians": gaussians, "light": title, **scores})
+        print(rows[-1], flush=True)
+    return rows
+
+
+def measured(name: str, field: Resident, gaussians: int, beside: bool) -> list[dict[str, Any]]:
+    """A row a function."""
+    source, start = field.source, time.process_time()
+    live = placed(field, gaussians)
     seconds = time.process_time() - start
+    assert isinstance(source.tf, TransferFunction)
     facts = LiveFacts.of(source.volume, source.statistics, source.tf)
     packed = replace(live, live=from_bytes(live_bytes(live, facts), live_json([live], facts, [1.0])))
     rows, pixel = [], pixel_width(SIZE)
@@ -94,10 +128,7 @@ def measured(name: str, field: Resident, gaussians: int, beside: bool) -> list[d
         }  # fmt: skip
         if beside:
             looks["converted for it"] = direct(field, tf, gaussians)
-        scores = {
-            look: score_test_views(shown, some, SIZE, RenderSettings(), perceptual=False, only=PREVIEW_VIEWS).psnr
-            for look, some in looks.items()
-        }
+        scores = {look: score(shown, some) for look, some in looks.items()}
         rows.append({"scene": name, "gaussians": gaussians, "function": title, **scores, "seconds": seconds})
         print(rows[-1], flush=True)
     return rows
@@ -109,10 +140,11 @@ def measured(name: str, field: Resident, gaussians: int, beside: bool) -> list[d
 @click.option("--scene", "names", multiple=True)
 @click.option("--gaussians", multiple=True, type=int, default=(100_000, 300_000))
 @click.option("--direct", "beside", is_flag=True)
+@click.option("--lit", is_flag=True)
 @click.option("--table", "table")
 def main(
     paths: tuple[str, ...], output: str | None, names: tuple[str, ...], gaussians: tuple[int, ...], beside: bool,
-    table: str | None,
+    lit: bool, table: str | None,
 ) -> None:  # fmt: skip
     """See the module."""
     if table:
@@ -122,7 +154,7 @@ def main(
     for name, source in read_scenes(*paths, names or None):  # type: ignore[misc]
         field = Resident(source, source.scene())
         for count in gaussians:
-            rows += measured(name, field, count, beside)
+            rows += measured_lit(name, field, count) if lit else measured(name, field, count, beside)
     write_rows(output, rows)
 
 

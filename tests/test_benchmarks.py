@@ -179,6 +179,19 @@ def test_live(bench, scenes, tmp_path):
     assert [row["function"] for row in rows] == ["band", "step", "ramp"]
     assert min(float(row[look]) for row in rows for look in ("live", "converted for it")) > 15
     assert "| band |" in call(module.main, "--table", tmp_path / "a.csv")
+    call(module.main, *scenes, "-o", tmp_path / "b.csv", "--gaussians", 200, "--lit")
+    rows = rows_of(tmp_path / "b.csv")
+    assert [row["light"] for row in rows] == ["none", "headlight", "0.3,-0.8,0.5"]
+    assert min(float(row[look]) for row in rows for look in ("live", "closed form")) > 15
+
+
+def test_live_page(bench, scenes, tmp_path):
+    module = bench("live_page")
+    call(module.main, *scenes, "-o", tmp_path / "a.csv", "--scene", "blob", "--gaussians", 200, "--rounds", 1)
+    rows = rows_of(tmp_path / "a.csv")
+    assert [row["light"] for row in rows] == ["none", "headlight"]
+    assert all(0.5 < float(row["MB"]) < 2 and 0 < float(row["first page"]) < 60 for row in rows)
+    assert "| headlight |" in call(module.main, "--table", tmp_path / "a.csv")
 
 
 def test_network(bench, tmp_path):

@@ -148,6 +148,30 @@ def test_a_frame_of_a_series_is_shown_under_the_function_of_the_page(tmp_path: P
     assert psnr(other, shot) < 30
 
 
+def test_a_frame_of_several_layers_is_shown_in_its_page(tmp_path: Path) -> None:
+    """A label map over frames, hidden in the list before another frame is chosen."""
+    z, y, x = np.mgrid[:24, :24, :24] - 11.5
+    for k in range(2):
+        np.save(tmp_path / f"f{k}.npy", np.exp(-(((x - 5 * k) / 6) ** 2 + (y / 4) ** 2 + (z / 7) ** 2)))
+    np.save(tmp_path / "map.npy", ((z > 7) & (np.abs(x) < 6) & (np.abs(y) < 6)).astype(np.uint8))
+    source = ["convert", str(tmp_path / "f?.npy"), "--tf", "viridis", "--layer", f"{tmp_path / 'map.npy'},labels=auto"]
+    source += ["--live", "--max-gaussians", "6000", "--size", "300", "--quiet"]
+    assert run([*source, "-o", str(tmp_path / "all.html")]) == 0
+    assert run([*source, "-o", str(tmp_path / "f_{}.ply")]) == 0
+    (tmp_path / "off.json").write_text(json.dumps({"1": {"color": [0, 0, 1], "opacity": 0}}))
+    off = ("--layer", f"map,labels={tmp_path / 'off.json'}")
+    wanted = [ours(tmp_path / f"f_{k}.ply", tmp_path) for k in range(2)]
+    hidden = ours(tmp_path / "f_1.ply", tmp_path, *off)
+    second: Actions = [{"select": "#series select", "text": "f1.npy"}]
+    shot = after(tmp_path / "all.ply", second, tmp_path)
+    print(f"the second frame: {psnr(wanted[1], shot):.2f} dB, not {psnr(wanted[0], shot):.2f}")
+    assert psnr(wanted[1], shot) > max(32, psnr(wanted[0], shot) + 5)
+    hide: Actions = [{"select": "#live .layer", "text": "map"}, {"click": "#live .organs li .eye"}]
+    shot = after(tmp_path / "all.ply", [*hide, *second], tmp_path)
+    print(f"its label hidden: {psnr(hidden, shot):.2f} dB, not {psnr(wanted[1], shot):.2f}")
+    assert psnr(hidden, shot) > max(32, psnr(wanted[1], shot) + 5)
+
+
 def test_layers_are_changed_one_at_a_time(pair: Path, tmp_path: Path) -> None:
     """The function of the second one, chosen in the list, and then the label of the third one."""
     magma = {"points": [{"x": 0.3, "rgb": [0, 0.4, 1], "opacity": 0}, {"x": 0.6, "rgb": [1, 1, 1], "opacity": 0.9}]}

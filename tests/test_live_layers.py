@@ -206,6 +206,31 @@ def test_layers_are_near_their_volume(vvgt, pair) -> None:
     assert (done.code, "the Gaussians carry values, values, labels" in done.error) == (2, True)
 
 
+def test_a_layer_that_shows_nothing_is_scored_as_recolor_shows_it(vvgt, pair, tmp_path) -> None:
+    """In memory and in blocks, and made so; only layers that show nothing at all are refused."""
+    (tmp_path / "dark.json").write_text(json.dumps({"points": [{"x": 0, "rgb": [1, 1, 1], "opacity": 0}]}))
+    (tmp_path / "none.json").write_text(json.dumps({"3": {"color": [0, 0, 1], "opacity": 0}}))
+    dark, hidden = f"tf={tmp_path / 'dark.json'}", f"labels={tmp_path / 'none.json'}"
+    source = (pair / "left.nii", "--tf", pair / "tf.json", "--layer", f"{pair / 'right.nii'},{dark}")
+    one = (*source, "--layer", f"{pair / 'top_label.nii'},{hidden}")
+    looks = ("--layer", f"1,{dark}", "--layer", f"2,{hidden}")
+    assert vvgt("recolor", pair / "live.ply", *looks, "-o", tmp_path / "r.ply").code == 0
+    for blocks in ((), ("--blocks", "16")):
+        scores = []
+        for file in (pair / "live.ply", tmp_path / "r.ply"):
+            done = vvgt("evaluate", file, "--volume", *one, "--json", "--no-seats", *blocks)
+            assert done.code == 0, done.err
+            scores.append(json.loads(done.out)["scores"]["psnr"])
+        assert scores[0] == pytest.approx(scores[1], abs=0.01)
+        assert scores[0] > 22
+        assert vvgt("convert", *one, "--live", *blocks, *SMALL, "-o", tmp_path / "l.ply", "--overwrite").code == 0
+        number = read_ply(tmp_path / "l.ply")[0].live[:, 7]  # type: ignore[index]
+        assert (np.bincount(number.astype(int)) > 40).all()
+    every = (pair / "left.nii", "--tf", tmp_path / "dark.json", *one[3:])
+    done = vvgt("evaluate", pair / "live.ply", "--volume", *every)
+    assert (done.code, "nothing is visible" in done.error) == (1, True), done.error
+
+
 def test_a_page_shows_several_layers_live(vvgt, pair, tmp_path) -> None:
     assert vvgt("view", pair / "live.ply", "-o", tmp_path / "a.html").code == 0
     found = re.search(rb'id="scene">(.*?)</script>', (tmp_path / "a.html").read_bytes(), re.S)

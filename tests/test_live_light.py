@@ -135,6 +135,8 @@ def test_a_page_begins_with_the_files_light() -> None:
     there = (up_matrix("y") @ np.array(SIDE.directions[0])) * (-1, -1, 1)
     np.testing.assert_allclose(scene["live"]["light"]["from"], there, atol=1e-12)
     assert scene["live"]["light"]["power"] == 4.0
+    with pytest.warns(UserWarning, match="one light at a time"):
+        page_of(some, options(live=facts(), light=replace(SIDE, headlight=True)))
 
 
 def test_what_is_opaque_lies_flat_in_its_surface() -> None:

@@ -6,16 +6,20 @@ import base64
 import gzip
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import vvgt_cli as vvgt_library
+from tests.test_live_labels import LABELS
+from tests.test_live_layers import TF, layered, several
 from tests.test_page_live import PLANES
 from vvgt_cli.conversion import pages
 from vvgt_cli.gaussians import read_ply
 from vvgt_cli.gaussians.formats.live import from_bytes
+from vvgt_cli.gaussians.formats.page_live import in_common, renumbered
 
 SMALL = ("--max-gaussians", 90, "--size", 48)
 
@@ -104,3 +108,66 @@ def test_a_page_of_label_frames_has_each_label_once(vvgt, tmp_path) -> None:
         assert held is not None
         planes = np.frombuffer(gzip.decompress(base64.b64decode(held[1])), np.uint8).reshape(8, -1)
         assert set(planes[6].tolist()) == rows
+
+
+def test_a_page_of_frames_of_several_layers_is_live(vvgt, frames, tmp_path) -> None:
+    """A label map that stands still over frames that do not."""
+    map_ = np.zeros((12, 12, 12), np.uint8)
+    map_[2:5] = 4
+    map_[7:10] = 9
+    np.save(tmp_path / "map.npy", map_)
+    layer = ("--layer", f"{tmp_path / 'map.npy'},labels=auto")
+    source = ("convert", frames / "f?.npy", "--tf", "viridis", *layer, "--live", *SMALL)
+    assert vvgt(*source, "-o", tmp_path / "p.html").code == 0
+    assert vvgt(*source, "-o", tmp_path / "f_{}.ply").code == 0
+    content = (tmp_path / "p.html").read_bytes()
+    live = scene_of(content)["live"]
+    assert [(one["row"], [label["number"] for label in one["labels"]]) for one in live["layers"]] == [
+        (0, []),
+        (1, [4, 9]),
+    ]
+    for k, held in enumerate(re.findall(rb'id="values-\d">([^<]+)<', content)):
+        some, header = read_ply(tmp_path / f"f_{k}.ply")
+        assert (some.live is not None, header.live is not None) == (True, True)
+        planes = np.frombuffer(gzip.decompress(base64.b64decode(held)), np.uint8).reshape(8, -1)
+        stream = np.zeros((len(some), 8), np.uint8)
+        stream[:, (0, 1, 2, 4, 5, 6, 3, 7)] = planes.T
+        back = from_bytes(stream, live)
+        for column in (6, 7):
+            counted = np.unique(some.live[:, column], return_counts=True)  # type: ignore[index]
+            np.testing.assert_array_equal(np.unique(back[:, column], return_counts=True), counted)
+
+
+def test_a_layer_that_is_empty_in_a_frame_is_left_out_of_it(vvgt, tmp_path) -> None:
+    z, y, x = np.meshgrid(*[np.linspace(-1, 1, 12)] * 3, indexing="ij")
+    ball, low = np.exp(-4 * (x**2 + y**2 + z**2)).astype(np.float32), (z < -0.5).astype(np.uint8)
+    for k in range(3):
+        np.save(tmp_path / f"f{k}.npy", ball * (k != 1))
+    np.save(tmp_path / "low.npy", low)
+    (tmp_path / "tf.json").write_text(json.dumps(TF))
+    source = (
+        "convert",
+        tmp_path / "f?.npy",
+        "--tf",
+        tmp_path / "tf.json",
+        "--layer",
+        f"{tmp_path / 'low.npy'},labels=auto",
+    )
+    done = vvgt(*source, "--live", *SMALL, "-o", tmp_path / "f_{}.ply")
+    assert (done.code, "left out: f1 (nothing but background)" in done.err) == (0, True), done.err
+    for k, numbers in enumerate(([0, 1], [1], [0, 1])):
+        live = read_ply(tmp_path / f"f_{k}.ply")[0].live
+        assert np.unique(live[:, 7]).tolist() == numbers  # type: ignore[index]
+
+
+def test_layers_have_in_common_what_each_has_of_all() -> None:
+    """Labels of each frame are renumbered in their own layer alone."""
+    value, named = several().layers
+    first, second = (replace(value, others=(replace(named, labels=some),)) for some in (LABELS[:2], LABELS[1:]))
+    both = in_common([first, second])
+    assert both is not None
+    assert both.layers == (value, replace(named, labels=LABELS))
+    for other in (replace(second, lo=-1e9), value, replace(second, others=(value,)), None):
+        assert in_common([first, other]) is None
+    assert renumbered(layered(4), first, both).live[:, 6].tolist() == [0, 0, 0, 1]  # type: ignore[index]
+    assert renumbered(layered(4), second, both).live[:, 6].tolist() == [0, 1, 0, 2]  # type: ignore[index]

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_page_where import AXIS, Person, marked, person  # noqa: F401
+from test_page_where import AXIS, MIDDLE, Person, marked, person  # noqa: F401
 
 pytestmark = pytest.mark.long
 HANDLES = (
@@ -61,7 +61,6 @@ def test_a_face_of_the_box_is_dragged_and_nothing_shows_beyond_it(
     assert "cut=box," in link
     person("open", link)
     assert np.abs(person.picture(tmp_path, "linked.png") - both).mean() < 1e-3
-    person("eval", "document.querySelector('#live.folded .fold')?.click()")
     drag(person, "face I", (0, -0.5 * unit))
     person("press", "Control+z")
     assert np.abs(person.picture(tmp_path, "undone.png") - both).mean() < 1e-3
@@ -76,7 +75,7 @@ def test_a_face_is_lit_as_a_face(marked: str, person: Person, tmp_path: Path) ->
     bare = person.picture(tmp_path, "unlit.png")
     light = "window.vvgt.live.parts.find(({ key }) => key === 'light')"
     person("eval", f"(({{ state, set }}) => set({{ ...state(), kind: 'headlight' }}))({light})")
-    lit, (x, y) = person.picture(tmp_path, "lit.png"), (edge // 2 for edge in person.size)
+    lit, (x, y) = person.picture(tmp_path, "lit.png"), map(round, person("eval", MIDDLE))
     middle = np.s_[y - 20 : y + 20, x - 20 : x + 20]
     print(f"{person.size}: light of a face {lit[middle].mean():.3f}, unlit {bare[middle].mean():.3f}")
     assert lit[middle].mean() > 0.5 * bare[middle].mean() > 0.1

@@ -27,6 +27,12 @@ SCALE = 0.04  # unit-frame lengths per mm of the two dots
 DOTS = np.array([[-0.7, 0.0, 0.2], [0.6, 0.0, -0.35]])  # red, blue
 TEXT = "[t.textContent, +t.getAttribute('x'), +t.getAttribute('y')]"
 LETTERS = f"[...document.querySelectorAll('#where text')].map((t) => {TEXT})"
+MIDDLE = "window.vvgt.where.lens.middle"  # pixel that the view turns about
+OVER = (  # what lies over the picture
+    "[...document.querySelectorAll('#live, #named, #series, #tools, #where .over')].map((element) => element"
+    ".getBoundingClientRect()).map(({ left, top, right, bottom }) => [left, top, right, bottom].map(Math.round))"
+)
+FOLD = "document.querySelector('#live .fold').click()"
 BAR = "(({ scale, lens }) => [scale.length, scale.across, scale.text, lens.flat])(window.vvgt.where)"
 
 
@@ -133,7 +139,7 @@ def test_the_mark_is_where_the_letters_say(marked: str, person: Person, tmp_path
     """From six sides, and after a drag, of a volume whose index axes are mirrored and oblique."""
     person("open", marked)
     person("eval", "window.vvgt.where.lens.set({ ...window.vvgt.where.lens.pose(), target: [0, 0, 0] })")
-    middle, gizmo = np.array(person.size) / 2, np.array([54, person.size[1] - 106])
+    middle, gizmo = np.array(person("eval", MIDDLE)), np.array([54, person.size[1] - 106])
     away: dict[str, np.ndarray] = {}
     for seen_from in [*VIEWS, *([] if person.touch else ["drag"])]:
         if seen_from == "drag":
@@ -156,23 +162,53 @@ def test_the_mark_is_where_the_letters_say(marked: str, person: Person, tmp_path
         assert np.linalg.norm(away[near]) > 1.05 * np.linalg.norm(away[far])
 
 
-def test_what_is_seen_fits_into_the_window_at_first_sight(marked: str, person: Person, tmp_path: Path) -> None:
-    person("open", marked)
-    light = person.picture(tmp_path, "first.png").max(axis=-1) > 0.05
-    shares = []
-    for edge, along in zip(person.size, (light.any(axis=0), light.any(axis=1)), strict=True):
+def uncovered(person: Person, picture: np.ndarray) -> float:
+    """What is seen is whole, in the middle, and uncovered; its longer side as a share of the window's shorter."""
+    light, middle = picture.max(axis=-1) > 0.05, person("eval", MIDDLE)
+    for left, top, right, bottom in person("eval", OVER):
+        assert not light[max(top, 0) : bottom, max(left, 0) : right].any(), (left, top, right, bottom)
+    spans = []
+    for place, edge, along in zip(middle, person.size, (light.any(axis=0), light.any(axis=1)), strict=True):
         first, *_, last = np.flatnonzero(along)
         assert 0 < first < last < edge - 1
-        shares.append((last - first) / edge)
-        assert abs(first + last - edge) < 0.12 * edge  # in the middle
-    print(f"{person.size}: {shares[0]:.2f} of the width, {shares[1]:.2f} of the height")
-    assert 0.75 < max(shares) < 0.98
+        assert abs((first + last) / 2 - place) < 0.12 * (last - first)
+        spans.append(last - first)
+    return float(max(spans) / min(person.size))
+
+
+def test_what_is_seen_is_whole_and_uncovered_at_first_sight(marked: str, person: Person, tmp_path: Path) -> None:
+    """And again when the panel is folded or unfolded, until the view is moved; then it keeps its size."""
+    person("open", marked)
+    shares = [uncovered(person, person.picture(tmp_path, "first.png"))]
+    for name in ("once", "twice"):
+        person("eval", FOLD)
+        shares.append(uncovered(person, person.picture(tmp_path, f"{name}.png")))
+    print(f"{person.size}: {', '.join(f'{share:.2f}' for share in shares)} of the shorter side")
+    assert shares[0] > 0.6
+    assert shares[2] == pytest.approx(shares[0], abs=0.01)
+    person("press", "x")
+    away = "window.vvgt.where.lens.pose().distance"
+    far, before = person("eval", away), person("eval", MIDDLE)
+    person("eval", FOLD)
+    assert person("eval", away) == pytest.approx(far)
+    assert np.abs(np.subtract(person("eval", MIDDLE), before)).max() > 20
+
+
+def test_a_baked_page_is_uncovered_too(person: Person, tmp_path: Path) -> None:
+    z, y, x = np.mgrid[:24, :24, :24] - 11.5
+    for k in (0, 1):
+        np.save(tmp_path / f"ball{k}.npy", (np.hypot(x, np.hypot(y, z)) < 8 + k).astype(np.float32) * 100)
+    how = ["--tf", "viridis", "--max-gaussians", "3000", "--size", "100", "--steps", "0", "--quiet"]
+    for name, source in (("one", "ball0.npy"), ("two", "ball*.npy")):
+        assert run(["convert", str(tmp_path / source), *how, "-o", str(tmp_path / f"{name}.html")]) == 0
+        person("open", (tmp_path / f"{name}.html").as_uri())
+        uncovered(person, person.picture(tmp_path, f"{name}.png"))
 
 
 def test_the_scale_bar_is_as_long_as_it_says(dots: str, person: Person, tmp_path: Path) -> None:
     person("open", dots)
     apart = float(np.linalg.norm(DOTS[1] - DOTS[0])) / SCALE  # mm
-    away = 2 * max(person.size) / min(person.size)  # both are in the window, whichever way
+    away = 3 * max(person.size) / min(person.size)  # both are in the window, whichever way
     person("eval", f"window.vvgt.where.lens.set({{ ...window.vvgt.where.lens.pose(), distance: {away} }})")
     person("press", "y")
     for flat in (False, True):
@@ -192,7 +228,7 @@ def test_the_scale_bar_is_as_long_as_it_says(dots: str, person: Person, tmp_path
 def test_the_ruler_measures_what_is_known(dots: str, person: Person, tmp_path: Path) -> None:
     apart = float(np.linalg.norm(DOTS[1] - DOTS[0])) / SCALE  # mm
     person("open", dots)
-    away = 2 * max(person.size) / min(person.size)
+    away = 3 * max(person.size) / min(person.size)
     pose = f"{{ ...window.vvgt.where.lens.pose(), yaw: 37, pitch: -22, distance: {away} }}"
     person("eval", f"window.vvgt.where.lens.set({pose})")
     for flat in (False, True):
@@ -230,7 +266,8 @@ def test_a_place_has_the_value_of_the_volume(marked: str, person: Person, tmp_pa
     assert mark is not None
     person("click", "#tools .measure")
     person("click", *mark.tolist())
-    person("click", 0.6 * person.size[0], person.size[1] / 2 + 0.12 * person.size[0])
+    across, down = person("eval", MIDDLE)
+    person("click", across + 0.1 * person.size[0], down + 0.12 * person.size[0])
     on_mark, on_ball = person("eval", "window.vvgt.where.ruler.places")
     print(f"{person.size}: {on_mark}, {on_ball}")
     person.picture(tmp_path, "places.png", bare=False)
@@ -262,7 +299,9 @@ def test_a_link_restores_the_picture(marked: str, person: Person, tmp_path: Path
         person("eval", change)
     person("press", "x")
     person("press", "o")
-    if not person.touch:
+    if person.touch:
+        person("eval", FOLD)  # as the page opens there
+    else:
         person("drag", 600, 600, 700, 560)
     before = person.picture(tmp_path, "before.png")
     person("click", "#tools .link")

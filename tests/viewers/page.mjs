@@ -64,6 +64,7 @@ const shoot = async ({ camera, frame }) => {
     entity.setPosition(...position);
     entity.lookAt(...target, ...up);
     entity.camera.fov = fov;
+    entity.camera.projectionOffset = { x: 0, y: 0 };
     entity.translateLocal(shift, 0, 0);
   });
   if (frame !== null) await show(frame);

@@ -44,6 +44,7 @@ const shoot = async (name) => {
       camera.setPosition(...scene.position.map((x, i) => scene.target[i] + back * (x - scene.target[i])));
       camera.lookAt(...scene.target, 0, 1, 0);
       camera.camera.fov = scene.fov;
+      camera.camera.projectionOffset = { x: 0, y: 0 };
       camera.translateLocal(shift, 0, 0);
     };
     app.on('update', put);

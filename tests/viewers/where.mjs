@@ -38,7 +38,7 @@ async function settled() {
   throw new Error('the picture does not come to rest');
 }
 
-const HIDE = '#cut, #tools, #live, #named, #where, #places, #about, .sse-ui { visibility: hidden !important }';
+const HIDE = '#cut, #tools, #live, #named, #series, #where, #places, #about, .sse-ui { visibility: hidden !important }';
 const steps = {
   open, settled,
   refused: async (url) => {

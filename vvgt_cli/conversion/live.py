@@ -94,8 +94,7 @@ def live_conversion(
         gaussians, facts = _of_layers(run, request, field)
         look: Look = SeveralLooks(tuple((layer.tf, layer.unit_distance) for layer in source.layers))
     else:
-        gaussians, facts = _of_one(run, request, field)
-        look = source.tf
+        gaussians, facts, look = _of_one(run, request, field), _facts(source), source.tf
     table = looked_up(facts, look, source.unit_distance, source.volume.unit_frame().scale)
     gaussians = as_stored(lit(baked(gaussians, table, pixel), lighting))
     found = Conversion(out_of_box(gaussians, source.volume), run.report, replace(ply, live=facts), field)
@@ -107,20 +106,26 @@ def live_conversion(
     return found
 
 
-def _of_one(run: Run, request: ConvertRequest, field: Field, several: int = 1) -> tuple[Gaussians, LiveFacts]:
-    """Gaussians of one layer, box frame, that carry what is under them; ``several``: layers that share a header."""
+def _facts(source: Source, several: int = 1) -> LiveFacts:
+    """What a file says of the values or labels of one layer; ``several``: layers that share a header."""
+    if isinstance(source.tf, LabelTable):
+        return label_facts(source, labels_of(source))
+    return LiveFacts.of(source.volume, source.overall, source.tf, several)
+
+
+def _of_one(run: Run, request: ConvertRequest, field: Field) -> Gaussians:
+    """Gaussians of one layer, box frame, that carry what is under them."""
     from vvgt_cli.look.fog import fog
 
     source = field.source
     if isinstance(source.tf, LabelTable):
         labels = labels_of(source)
-        foggy, facts = fog_of_labels(field, labels), label_facts(source, labels)
+        foggy = fog_of_labels(field, labels)
         found = carrying_labels(run, foggy, placed_by(run, foggy, request), labels)
     else:
         foggy = field.shown_by(fog(source.overall, source.tf))
-        facts = LiveFacts.of(source.volume, source.overall, source.tf, several)
         found = carrying(run, foggy, placed_by(run, foggy, request))
-    return wide_enough(found, request.fit.size), facts
+    return wide_enough(found, request.fit.size)
 
 
 def _of_layers(run: Run, request: ConvertRequest, field: Field) -> tuple[Gaussians, LiveFacts]:
@@ -130,7 +135,14 @@ def _of_layers(run: Run, request: ConvertRequest, field: Field) -> tuple[Gaussia
     for number, layer in enumerate(source.layers):
         share = replace(request, fit=replace(request.fit, max_gaussians=max(left // (count - number), 1)))
         run.console.say(f"layer {number} of {count}: {layer.name}")
-        some, said = _of_one(run, share, field.alone(number), count)
+        alone = field.alone(number)
+        said = replace(_facts(alone.source, count), name=layer.volume.name, distance=layer.unit_distance)
+        facts.append(replace(said, dims=source.volume.dims))
+        try:
+            some = _of_one(run, share, alone)
+        except NothingVisible:  # a frame of a series in which it is empty
+            run.leave_out(layer.volume.name, "nothing but background")
+            continue
         some = into_box(in_frame_of(out_of_box(some, layer.volume), layer.volume, source.volume), source.volume)
         some = some.take(np.flatnonzero((np.abs(some.means) <= half + 1e-6).all(axis=1)))
         assert some.live is not None
@@ -138,8 +150,9 @@ def _of_layers(run: Run, request: ConvertRequest, field: Field) -> tuple[Gaussia
         live[:, : some.live.shape[1]] = some.live
         live[:, NUMBER] = number
         parts.append(replace(some, live=live))
-        facts.append(replace(said, name=layer.volume.name, distance=layer.unit_distance, dims=source.volume.dims))
         left -= len(some)
+    if not parts:
+        raise NothingVisible(source.volume.name, source.name)
     first, *others = facts
     return together(parts), replace(first, others=tuple(others))
 

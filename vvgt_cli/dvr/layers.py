@@ -36,6 +36,7 @@ class Layer:
         unit_distance, unit_label: world length that opacity refers to, and how it was chosen.
         colors: red, green and blue on the same grid; None: ``tf`` gives the colour.
         white: data value of ``colors`` that is 1.
+        shows: something of it is visible, as far as the range of its values tells.
     """
 
     volume: Volume
@@ -44,6 +45,7 @@ class Layer:
     unit_label: str = "given"
     colors: tuple[Volume, Volume, Volume] | None = None
     white: float = 1.0
+    shows: bool = True
 
     @property
     def name(self) -> str:

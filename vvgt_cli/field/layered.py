@@ -16,7 +16,6 @@ from vvgt_cli.look import (
     ColorMap,
     PiecewiseOpacity,
     TransferFunction,
-    check_visible,
     from_histogram,
     read_transfer_function,
     resolve,
@@ -208,7 +207,7 @@ def layers_of(
         access: to the values.
 
     Raises:
-        DataError: labels that do not fit the table, nothing that is visible.
+        DataError: labels that do not fit the table.
         UsageError: a table and a function at once.
     """
     labels = _asked(opened, tf, labels, access)
@@ -228,10 +227,9 @@ def layers_of(
     colors = (opened.volumes[0], opened.volumes[1], opened.volumes[2]) if opened.color else None
     layers = []
     for volume, one, its in zip(sources, shown, numbers, strict=True):
-        if opened.one_field or opened.color:
-            check_visible(one, its)
         given = function if function is not None and opened.one_field else one
-        layers.append(Layer(volume, one, *unit_distance(distance, volume, given), colors, _white(opened)))
+        there = bool(one.support(its.lo, its.hi))
+        layers.append(Layer(volume, one, *unit_distance(distance, volume, given), colors, _white(opened), there))
     return layers
 
 
@@ -337,7 +335,8 @@ def _labelled(volume: Volume, labels: str | LabelTable | None, distance: str | N
         table = distinct(numbers)
     else:
         raise DataError(f"{volume.name}: no label but 0; expected some to show")
-    return Layer(volume, table, *unit_distance(distance, volume))
+    shows = any(label.opacity > 0 for label in table.labels)
+    return Layer(volume, table, *unit_distance(distance, volume), shows=shows)
 
 
 def _luminance(stored: bool, *bands: Volume) -> Volume:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from vvgt_cli.dvr.layers import Layer, common_grid, grid_of
-from vvgt_cli.errors import UsageError
+from vvgt_cli.errors import DataError, SeveralSteps, UsageError
 from vvgt_cli.field.digests import digest, volume_digest
 from vvgt_cli.field.layered import AUTO, IN_MEMORY, NONE, Access, Content, content_of, is_plain, layers_of
 from vvgt_cli.jit.ahead import for_grid, for_light
@@ -315,12 +315,37 @@ def _layered(
     lighting = request.light.lighting(None if tf is None else tf.lighting, content.volumes[0].space)
     layers = layers_of(content, tf, request.labels, tf_range, request.unit_distance, request.statistics, access)
     for other in request.layers:
-        inner = access.open(other.volume, other.read)
+        try:
+            inner = access.open(other.volume, other.read)
+        except SeveralSteps as error:  # of a page, they are not its frames
+            which = f"--layer FILE,time=N (0 to {error.steps - 1})"
+            raise UsageError(f"{other.volume}: {error.steps} time steps; expected one of a layer: {which}") from None
         layers += layers_of(inner, other.tf, other.labels, other.tf_range, other.unit_distance, access=access)
-    check_labels([layer.tf for layer in layers])
-    grid = common_grid(layers, content.stored)
     numbers = access.statistics(layers[0].volume)
+    _check_seen(layers, access)
+    grid = common_grid(layers, content.stored)
     return Source(tuple(layers), grid, numbers, lighting, series=tuple(request.statistics))
+
+
+def _check_seen(layers: Sequence[Layer], access: Access) -> None:
+    """Refuse layers of which nothing is visible; of several one may be hidden, which is said of functions.
+
+    Raises:
+        DataError: each is transparent wherever it has values.
+    """
+    from vvgt_cli.look import check_visible
+
+    seen = any(layer.shows for layer in layers)
+    for layer in layers:
+        if layer.shows or isinstance(layer.tf, LabelTable):
+            continue
+        try:
+            check_visible(layer.tf, access.statistics(layer.volume))
+        except DataError as error:
+            if not seen:
+                raise
+            warnings.warn(f"{layer.volume.name}, {error}", stacklevel=4)
+    check_labels([layer.tf for layer in layers])
 
 
 def describe_source(source: Source) -> str:

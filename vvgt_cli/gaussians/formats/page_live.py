@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -18,7 +19,7 @@ from vvgt_cli.gaussians.formats.page_file import html_of_several, title_of, upri
 from vvgt_cli.gaussians.formats.splats import Splats, morton_order, splats_of
 from vvgt_cli.gaussians.frames import turn, up_matrix
 from vvgt_cli.gaussians.live import law_nodes
-from vvgt_cli.gaussians.live_facts import ROW, LiveFacts
+from vvgt_cli.gaussians.live_facts import NUMBER, ROW, LiveFacts
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.lighting import MOST, Lighting
 from vvgt_cli.look.readers.minimal import read
@@ -47,6 +48,9 @@ def live_html_of_several(clouds: Sequence[tuple[str, Gaussians, PlyOptions]], na
         DataError, UsageError: as `live_html`.
     """
     shown, planes, facts = live_parts([(gaussians, options) for _, gaussians, options in clouds])
+    light = clouds[0][2].light
+    if light is not None and light.headlight + len(light.directions) > 1:
+        warnings.warn(f"{name}: its page has one light at a time; it begins with the first", stacklevel=2)
     held = dict(zip(facts["held"], planes, strict=True))
     return html_of_several(
         [(one[0], splats) for one, splats in zip(clouds, shown, strict=True)], name, held, {"live": facts}
@@ -71,18 +75,26 @@ def page_of_several(clouds: Sequence[tuple[str, Gaussians, PlyOptions]], name: s
 def in_common(facts: Sequence[LiveFacts | None]) -> LiveFacts | None:
     """What files say of the values that their Gaussians carry, as one page has it; None where none can show all.
 
-    Values are of one range under one function; of label maps, each label of any of them is there once.
+    Of as many layers each, whose values are of one range under one function; of label maps, each label of any is there
+    once.
     """
-    first, *others = facts
-    if first is None or any(one is None or bool(one.labels) != bool(first.labels) for one in others):
+    known = [one.layers for one in facts if one is not None]
+    if len(known) < len(facts) or len({len(layers) for layers in known}) > 1:
         return None
-    if any(one is not None and one.others for one in facts):
-        return first if not others else None
-    if first.labels:
-        labels = {label.number: label for one in reversed(facts) if one is not None for label in one.labels}
+    first, *others = [_layer_in_common(same) for same in zip(*known, strict=True)]
+    if first is None or None in others:
+        return None
+    return replace(first, others=tuple(one for one in others if one is not None))
+
+
+def _layer_in_common(facts: Sequence[LiveFacts]) -> LiveFacts | None:
+    """The same of one layer."""
+    first = facts[0]
+    if all(one.labels for one in facts):
+        labels = {label.number: label for one in reversed(facts) for label in one.labels}
         return replace(first, labels=tuple(labels[number] for number in sorted(labels)))
-    alike = all(one and (one.lo, one.hi, one.function) == (first.lo, first.hi, first.function) for one in others)
-    return first if alike else None
+    looks = {(bool(one.labels), one.lo, one.hi, one.function) for one in facts}
+    return first if len(looks) == 1 else None
 
 
 def live_parts(
@@ -115,11 +127,14 @@ def live_parts(
 
 def renumbered(gaussians: Gaussians, own: LiveFacts, facts: LiveFacts) -> Gaussians:
     """Gaussians with the rows that ``facts`` have in the place of their ``own``, of labels."""
-    if own.labels == facts.labels or gaussians.live is None:
-        return gaussians
-    rows = {label.number: row for row, label in enumerate(facts.labels)}
-    live, to = gaussians.live.copy(), np.array([rows[label.number] for label in own.labels])
-    live[:, ROW] = to[live[:, ROW].astype(np.int64)]
+    assert gaussians.live is not None
+    live = gaussians.live.copy()
+    for number, (one, all_) in enumerate(zip(own.layers, facts.layers, strict=True)):
+        if one.labels != all_.labels:
+            rows = {label.number: row for row, label in enumerate(all_.labels)}
+            mine = live[:, NUMBER] == number if facts.others else np.full(len(live), True)
+            to = np.array([rows[label.number] for label in one.labels])
+            live[mine, ROW] = to[live[mine, ROW].astype(np.int64)]
     return replace(gaussians, live=live)
 
 

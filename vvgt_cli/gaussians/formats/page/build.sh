@@ -15,6 +15,8 @@ fi
 handle=$cache/node_modules/@playcanvas/supersplat-viewer/dist/viewer.js
 grep -q 'cameraManager: ()' "$handle" || sed -i 's/^        seek: (time) => viewer.seek(time),$/        cameraManager: () => viewer.cameraManager,\n&/' "$handle"
 grep -q 'cameraManager: ()' "$handle" || { echo "the viewer's handle is another one: see build.sh" >&2; exit 1; }
+grep -q 'this.resetCamera = resetCamera' "$handle" || sed -i 's/^        this.camera.copy(resetCamera);$/        this.resetCamera = resetCamera;\n&/' "$handle"
+grep -q 'this.resetCamera = resetCamera' "$handle" || { echo "the viewer's camera is another one: see build.sh" >&2; exit 1; }
 NODE_PATH="$cache/node_modules" "$cache/node_modules/.bin/esbuild" "$here/page.mjs" --bundle --minify --format=iife \
   --target=es2022 --charset=utf8 --loader:.css=text --loader:.glsl=text --legal-comments=none --log-level=error --outfile="$cache/viewer.js"
 python3 - "$cache/viewer.js" "$out/viewer.js.gz" <<'PY'

@@ -1,11 +1,11 @@
 // The camera of the page: where it is, what a pixel sees, perspective or orthographic, and set to a pose at once.
-import { PROJECTION_ORTHOGRAPHIC, PROJECTION_PERSPECTIVE, Vec3 } from 'playcanvas';
+import { PROJECTION_ORTHOGRAPHIC, PROJECTION_PERSPECTIVE, Vec2, Vec3 } from 'playcanvas';
 
 const DEGREES = Math.PI / 180;
 const of = (v) => [v.x, v.y, v.z], vec = (a) => new Vec3(...a);
 export const plus = (a, b, s = 1) => a.map((x, i) => x + s * b[i]), dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 
-// {pose, set, look, project, ray, perPixel, flat, change}; places are in the viewer's axes, pixels are of CSS
+// {pose, set, begin, look, project, ray, perPixel, flat, middle}; places are in the viewer's axes, pixels are of CSS
 export function lensOf(viewer) {
   const { app } = viewer, canvas = app.graphicsDevice.canvas, entity = app.root.findComponent('camera').entity, { camera } = entity;
   const rig = viewer.cameraManager();
@@ -38,6 +38,15 @@ export function lensOf(viewer) {
       app.scene.gsplat.radialSorting = !now;
       app.renderNextFrame = true;
     },
+    // the pixel at which what the view turns about is seen
+    get middle() {
+      const { projectionOffset: { x, y } } = camera, { clientWidth: w, clientHeight: h } = canvas;
+      return [((1 - x) * w) / 2, ((1 + y) * h) / 2];
+    },
+    set middle([x, y]) {
+      camera.projectionOffset = new Vec2(1 - (2 * x) / Math.max(canvas.clientWidth, 1), (2 * y) / Math.max(canvas.clientHeight, 1) - 1);
+      app.renderNextFrame = true;
+    },
     pose: () => ({ target: target(), pitch: rig.camera.angles.x, yaw: rig.camera.angles.y, distance: rig.camera.distance }),
     set({ target: at, pitch, yaw, distance }) {
       viewer.state.cameraMode = 'orbit';
@@ -49,6 +58,8 @@ export function lensOf(viewer) {
       now.position.copy(vec(at)).sub(focus);
       rig.snap();
     },
+    // the pose is the one that the viewer's reset goes back to
+    begin: () => rig.resetCamera.copy(rig.camera),
     // from a direction onto what is looked at; up is shown upwards where the direction is vertical
     look(from, up) {
       const { target: at, distance } = lens.pose(), level = Math.hypot(from[0], from[2]) > 1e-3;
@@ -57,14 +68,14 @@ export function lensOf(viewer) {
     },
     // [x, y] in pixels of a place, null behind the eye
     project(p) {
-      const { right, up, forward } = basis(), d = plus(p, eye(), -1), depth = dot(d, forward), { clientWidth: w, clientHeight: h } = canvas;
+      const { right, up, forward } = basis(), d = plus(p, eye(), -1), depth = dot(d, forward), [x, y] = lens.middle, h = canvas.clientHeight;
       if (!flat && depth <= 0) return null;
       const half = flat ? camera.orthoHeight : depth * tangent();
-      return [w / 2 + (dot(d, right) / half) * (h / 2), h / 2 - (dot(d, up) / half) * (h / 2)];
+      return [x + (dot(d, right) / half) * (h / 2), y - (dot(d, up) / half) * (h / 2)];
     },
     ray(x, y) {
-      const { right, up, forward } = basis(), { clientWidth: w, clientHeight: h } = canvas, half = flat ? camera.orthoHeight : tangent();
-      const [a, b] = [(2 * x - w) / h, (h - 2 * y) / h], aside = plus(plus([0, 0, 0], right, a * half), up, b * half);
+      const { right, up, forward } = basis(), [left, top] = lens.middle, h = canvas.clientHeight, half = flat ? camera.orthoHeight : tangent();
+      const [a, b] = [(2 * (x - left)) / h, (2 * (top - y)) / h], aside = plus(plus([0, 0, 0], right, a * half), up, b * half);
       return flat ? { origin: plus(eye(), aside), direction: forward } : { origin: eye(), direction: plus(forward, aside) };
     },
     // how long a pixel is where the view turns about

@@ -13,6 +13,7 @@ export function drawLetters(group, { lens, world, left, high }) {
       ends.push({ letter: world.letters[k][sign < 0 ? 0 : 1], x, y, far, color: COLORS[k], seen: far < 0 || Math.hypot(x, y) > HIDDEN });
     }
   });
+  group.append(element('rect', { x: left, y: high - 148, width: 84, height: 84, fill: 'none' }));  // as large from every side
   ends.sort((a, b) => b.far - a.far);
   const seen = ends.filter((end) => end.seen), short = 0.6 * RADIUS, opacity = ({ far }) => (0.75 - 0.25 * far).toFixed(2);
   group.append(...seen.map((end) => element('line', { x1: middle[0], y1: middle[1], x2: middle[0] + short * end.x, y2: middle[1] - short * end.y, stroke: end.color, 'stroke-width': 2, opacity: opacity(end) })));

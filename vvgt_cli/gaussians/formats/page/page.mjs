@@ -4,7 +4,7 @@ import css from '@playcanvas/supersplat-viewer/viewer.css';
 import { createViewer } from '@playcanvas/supersplat-viewer/viewer';
 import { Asset, GSPLAT_BUDGET_LIMIT, SHADERLANGUAGE_GLSL, ShaderChunks } from 'playcanvas';
 import { Damaged, unlessFailing, wholePly } from './damage.mjs';
-import { dot, plus } from './lens.mjs';
+import { firstView } from './free.mjs';
 import { liveLook } from './live.mjs';
 import panelCss from './panel.css';
 import { panel, named } from './panel.mjs';
@@ -14,7 +14,6 @@ import whereCss from './where.css';
 import { where } from './where.mjs';
 
 const KEPT = 16;  // frames of a series that stay in memory
-const FITS = 0.9, PANEL = 312;  // share of the window that is filled at first sight; px that the panel takes
 const PAUSE = 200;  // milliseconds from one frame of a series to the next
 const said = document.getElementById('said');
 const scene = JSON.parse(document.getElementById('scene').textContent);
@@ -27,7 +26,7 @@ const settings = {
     grading: { ...off, brightness: 1, contrast: 1, saturation: 1, tint: [1, 1, 1] },
     vignette: { ...off, intensity: 0.5, inner: 0.3, outer: 0.75, curvature: 1 }, fringing: { ...off, intensity: 0.5 },
   },
-  animTracks: [], annotations: [], startMode: 'default', cameras: [{ initial: fitted(scene.camera, scene.outermost ?? []) }],
+  animTracks: [], annotations: [], startMode: 'default', cameras: [{ initial: firstView(scene) }],
 };
 
 // what the file itself holds (base64), or the server's answer
@@ -139,18 +138,6 @@ function series(viewer, live) {
   return show;
 }
 
-// From the same direction, so near that the outermost of what is seen fits into the window. The viewer's field of view is along its longer side.
-function fitted({ position, target, fov }, outermost) {
-  const [w, h] = [Math.max(innerWidth, 1), Math.max(innerHeight, 1)], away = plus(position, target, -1), far = Math.hypot(...away);
-  const free = scene.live && w >= 700 ? w - PANEL : w;
-  if (!outermost.length) return { position: plus(target, away, Math.max(w, h) / Math.min(w, h)), target, fov };
-  const d = away.map((x) => x / far), level = Math.hypot(d[0], d[2]), right = [d[2] / level, 0, -d[0] / level];
-  const up = [d[1] * right[2], d[2] * right[0] - d[0] * right[2], -d[1] * right[0]], t = (FITS * Math.tan((fov * Math.PI) / 360)) / Math.max(w, h);
-  const middle = [0, 1, 2].map((k) => (Math.min(...outermost.map((p) => p[k])) + Math.max(...outermost.map((p) => p[k]))) / 2);
-  const back = Math.max(...outermost.map((p) => plus(p, middle, -1)).map((q) => dot(q, d) + Math.max(Math.abs(dot(q, right)) / (t * free), Math.abs(dot(q, up)) / (t * h))));
-  return { position: plus(middle, d, back), target: middle, fov };
-}
-
 // At first sight without the viewer's list of keys over the picture; its button shows it.
 function hideKeys() {
   try {
@@ -165,6 +152,7 @@ async function start() {
   style.textContent = css + panelCss + whereCss;
   document.head.append(style);
   if (scene.waits) return waiting(said);
+  document.body.className = scene.streamed ? '' : 'begins';  // what is shown before its place is known
   const { file } = scene.frames[0];
   const response = scene.streamed ? null : await content(scene.frames[0]);  // what is streamed the engine fetches itself
   if (response && !response.ok) throw new Error(`${scene.frames[0].name} cannot be read`);
@@ -192,6 +180,7 @@ async function start() {
   if (live) served(live, viewer, scene.server);
   const show = scene.frames.length > 1 ? series(viewer, live) : null, here = where(viewer, scene, live, show);
   await here.restored;
+  document.body.className = '';
   said.textContent = '';
   window.vvgt = { viewer, live, show, where: here };
 }

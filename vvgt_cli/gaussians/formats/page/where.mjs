@@ -1,6 +1,7 @@
 // Where one is: the drawing over the picture (letters, scale bar, legend, ruler), its buttons and keys.
 import { fill, rowsOf } from './about.mjs';
 import { factsOf, shown, worldOf } from './facts.mjs';
+import { stayFree } from './free.mjs';
 import { drawLabels, drawLegend } from './legend.mjs';
 import { handlesOf } from './handles.mjs';
 import { lensOf } from './lens.mjs';
@@ -99,12 +100,12 @@ export function where(viewer, scene, live, show) {
 
   function draw() {
     const wide = svg.clientWidth, high = svg.clientHeight, all = { lens, world, wide, high, ruler, left: LEFT };
-    const group = element('g');
-    state.letters = drawLetters(group, all);
-    state.scale = drawScale(group, { ...all, left: LEFT + 96 });
-    state.legend = legend(group, wide, high);
-    drawRuler(group, all);
-    svg.replaceChildren(group);
+    const [letters, rest, colors] = ['over', '', 'over'].map((name) => element('g', { class: name }));
+    state.letters = drawLetters(letters, all);
+    state.scale = drawScale(rest, { ...all, left: LEFT + 96 });
+    state.legend = legend(colors, wide, high);
+    drawRuler(rest, all);
+    svg.replaceChildren(letters, colors, rest);
     handles?.draw(world);
     const facing = [...state.letters].map(({ letter }) => letter).join(' ');
     svg.setAttribute('aria-label', `axes ${facing}${state.scale ? `; scale bar ${state.scale.text}` : ''}`);
@@ -120,12 +121,14 @@ export function where(viewer, scene, live, show) {
   app.on('update', () => {
     const now = dataNow();
     if (now !== data) { take(now); stamp++; }
-    const pose = lens.pose(), said = JSON.stringify([pose, lens.flat, svg.clientWidth, svg.clientHeight, stamp, live?.at().nodes?.(), live?.at().layer.title, live?.cut.state()]);
+    const pose = lens.pose(), said = JSON.stringify([pose, lens.flat, lens.middle, svg.clientWidth, svg.clientHeight, stamp, live?.at().nodes?.(), live?.at().layer.title, live?.cut.state()]);
     if (said === drawn) return;
     drawn = said;
     draw();
   });
   take(dataNow());
+  draw();
+  stayFree(lens, scene);
   Object.assign(state, { lens, ruler, restored: restore(parts), link: () => linkOf(parts), picture: () => pictureOf(viewer, svg), get world() { return world; }, get facts() { return facts; } });
   return state;
 }
