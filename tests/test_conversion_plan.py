@@ -12,7 +12,7 @@ from test_cli_infer import DARKER
 
 from vvgt_cli.cameras.blocks import BLOCK, ENOUGH, FEW, spread_blocks
 from vvgt_cli.conversion.convert import convert, initialise_only, planned
-from vvgt_cli.conversion.plan import DEFAULT_STEPS, MOST_STEPS, WRITE, Planner, check_memory
+from vvgt_cli.conversion.plan import DEFAULT_STEPS, MOST_STEPS, Planner, check_memory
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions, Limits
 from vvgt_cli.conversion.stage import Work
 from vvgt_cli.conversion.stages import BackProjection, Network, Refinement, TrainingViews
@@ -365,16 +365,6 @@ def test_a_dry_run_plans_and_writes_nothing(tmp_path):
     done(tmp_path)
     with pytest.raises(UsageError, match="exists"):
         planned(request, Console(quiet=True))
-
-
-@pytest.mark.parametrize(
-    ("output", "options", "times"), [("a.ply", {}, 2), ("-", {}, 1), ("a.ply", {"checkpoint": "c"}, 1), (None, {}, 0)]
-)
-def test_the_plan_counts_how_often_the_file_is_written(tmp_path, output, options, times):
-    output = output if output in (None, "-") else str(tmp_path / output)
-    found = planned(ConvertRequest(SOURCE, output, SMALL, **options), Console(quiet=True))
-    assert found.costs()[-1] == ("write", pytest.approx(times * WRITE * found.case.pace))
-    assert found.seconds == pytest.approx(sum(seconds for _, seconds in found.costs()))
 
 
 def test_a_stage_that_is_not_ready_is_a_bug_that_says_so():
