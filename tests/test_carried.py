@@ -165,6 +165,17 @@ def test_descent_moves_what_is_free():
     np.testing.assert_allclose(covariances(found)[~free], covariances(g)[~free], rtol=1e-4, atol=1e-9)
 
 
+def test_what_is_right_already_is_not_moved_with_what_is_wrong():
+    g = random_cloud(600, 0, 0.02, 0.1, (0.3, 0.9))
+    wrong = np.arange(600) % 30 == 0
+    other = replace(g, colors=np.where(wrong[:, None], 1 - g.colors, g.colors))
+    cameras = default_views("train", 6, size=48)
+    images = np.stack([render(other, camera) for camera in cameras])
+    found, _ = optimize(g, cameras, images, OptimizeOptions(steps=30), free=np.ones(600, bool))
+    moved = np.abs(found.colors - g.colors).mean(axis=1)
+    assert np.median(moved[~wrong]) < 0.1 * np.median(moved[wrong])
+
+
 def test_what_comes_back_moves_back(vvgt, beat, monkeypatch):
     """The views of the third frame were last drawn of the first, which shows the same, and those of the fifth of the
     second, as none is drawn of the fourth; the Gaussians do not."""

@@ -21,6 +21,7 @@ WARM_UP = 3  # steps
 SMALLEST = 1e-7  # standard deviation, unit frame
 WEAKEST = 0.1  # of the mean size of slopes, added to one's own: what is hardly seen goes less far than the rest
 MEDIAN = 7  # one of so many of the sample is in the median
+GOING_ON = 1.0  # the same where some are free and all have been descended on before: only what is wrong now goes far
 OUTLIER = 100.0  # times the median that a slope counts in that mean
 GIVEN = 0.3  # of the rate of harmonics, where the start has some (docs/log/light.md)
 
@@ -75,7 +76,9 @@ class OwnFrame:
         pixel = float(np.median([np.linalg.norm(camera.position) / camera.fx for camera in cameras]))
         self.spread = rule.dilation * pixel**2
         self.step = 0
-        self.shared = shared_steps(*self.arrays[:4])
+        # what has been descended on before is not wrong alike any more
+        self.shared = shared_steps(*self.arrays[:4]) if free is None else None
+        self.weakest = 0.0 if free is None and self.shared is None else WEAKEST if free is None else GOING_ON
         self.fixed = np.empty(0, np.int64) if free is None else np.flatnonzero(~free)
         self.there = tuple(array[self.fixed] for array in self.arrays)
 
@@ -105,7 +108,7 @@ class OwnFrame:
         self.step += 1
         pace = speed * min(1.0, 2 * (1 - share))
         pace *= min(self.LARGEST, math.sqrt(error / self.ERROR)) * min(1.0, self.step / WARM_UP)
-        rates = self.RATES * pace if self.shared is None else self.RATES * self.OWN * pace
+        rates = self.RATES * self.OWN * pace if self.weakest else self.RATES * pace
         steps.own_frame(
             slopes.rows, rates, self.CLIPS, self.spread,
             *self.BETAS, self.step, means, factors, logits, colors, self.darkest, self.first, self.second,
@@ -122,7 +125,7 @@ class OwnFrame:
 
     def common(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """What is added to Adam's divisors, features and weights of what is shared; from slopes ``rows`` (COUNT, K)."""
-        if self.shared is None:
+        if not self.weakest:
             return np.full(len(rows), EPSILON, np.float32), *NONE
         some, first, second = (sampled(array) for array in (rows, self.first, self.second))
         beta1, beta2 = self.BETAS
@@ -131,7 +134,9 @@ class OwnFrame:
             sizes = np.sqrt((beta2 * second + (1 - beta2) * some * some) / (1 - beta2**self.step))
             middle = np.array([np.median(row[row > 0]) if (row > 0).any() else 0.0 for row in sizes[:, ::MEDIAN]])
             usual = np.fmin(sizes, (OUTLIER * middle)[:, None].astype(np.float32))
-            floors = (WEAKEST * usual.mean(axis=1) + EPSILON).astype(np.float32)
+            floors = (self.weakest * usual.mean(axis=1) + EPSILON).astype(np.float32)
+            if self.shared is None:
+                return floors, *NONE
             directions = first / (1 - beta1**self.step) / (sizes + floors[:, None])
         return floors, self.shared.features, self.shared.weights(directions)
 
