@@ -13,7 +13,6 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -24,20 +23,18 @@ from tests.test_formats_server import ask, cloud, shown
 from tests.test_live import GRAIN, HI, LO, RAMP, facts
 from tests.test_live import cloud as live_cloud
 from vvgt_cli.cameras.sets import SIZE, pixel_width
-from vvgt_cli.commands.converter import Converter, Failed, Made, Message, Said, Scored
-from vvgt_cli.commands.live_site import Cloud, Desk, function_sent, plain_name
+from vvgt_cli.commands.converter import Converter, Failed, Made, Scored
+from vvgt_cli.commands.live_site import Cloud, Desk, function_sent
 from vvgt_cli.commands.server import Part, Site, served
-from vvgt_cli.conversion.live import lit, refusal
-from vvgt_cli.conversion.request import ConvertRequest
+from vvgt_cli.conversion.live import lit
 from vvgt_cli.errors import DataError
-from vvgt_cli.field.source import SourceRequest, load
+from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import PlyOptions, read_ply, write_ply
 from vvgt_cli.gaussians.formats.page_file import read_html
 from vvgt_cli.gaussians.formats.page_live import live_parts
 from vvgt_cli.gaussians.live import Table, baked
-from vvgt_cli.look.lighting import Lighting, LightOptions
+from vvgt_cli.look.lighting import Lighting
 from vvgt_cli.progress import Console
-from vvgt_cli.volume import Volume
 
 FUNCTION = {
     "name": "mine",
@@ -345,64 +342,3 @@ def test_a_page_that_waits_hears_how_far_it_is_and_why_nothing_comes(tmp_path: P
         assert "no such file" in state_of(url)["said"]
         assert desk.error is not None
         assert desk.error.exit_code == 1
-
-
-def test_what_is_never_live_is_converted(monkeypatch: pytest.MonkeyPatch) -> None:
-    from vvgt_cli.commands import converter_process
-
-    labels = Volume(np.arange(8, dtype=np.uint8).reshape(2, 2, 2), name="labels")
-    request = SourceRequest(labels, tf="viridis", light=LightOptions(lights=("0,0,1",), shadows=True))
-    why = refusal(ConvertRequest(request, live=True), load(request))
-    assert why is not None
-    for other in (SourceRequest(labels, tf="viridis"), SourceRequest(labels, labels="auto")):
-        assert refusal(ConvertRequest(other, live=True), load(other)) is None
-    asked = []
-
-    def conversion(request: ConvertRequest, console: Console, after: Any, unscored: Any) -> Any:
-        asked.append(request.live)
-        unscored("conversion")
-        return SimpleNamespace(scores={"psnr": 40.0})
-
-    monkeypatch.setattr(converter_process, "without_files", conversion)
-    monkeypatch.setattr(converter_process, "_file", lambda found: b"scored")
-    monkeypatch.setattr(converter_process.Volume, "_paged", lambda volume, found: Made(b"", {}))
-    told: list[Message] = []
-    volume = converter_process.Volume.__new__(converter_process.Volume)
-    volume.source, volume.last = request, None
-    volume.live(converter_process.Telling(told.append))
-    assert [one for one in told if isinstance(one, Made | Scored)] == [Made(b"", {}), Scored(b"scored", 40.0)]
-    assert asked == [False]
-    assert Said(f"not live, but converted: {why}") in told
-
-
-@pytest.mark.parametrize(
-    ("args", "code", "said"),
-    [
-        (["none.nrrd"], 1, "no such file"),
-        (["bad.nrrd"], 1, "check that the file is whole"),
-        (["one.npy", "--tf", "hidden.json"], 1, "nothing is visible"),
-        (["example:nope"], 2, "no such example"),
-    ],
-)
-def test_what_cannot_be_shown_is_one_line(
-    args: list[str], code: int, said: str, tmp_path: Path, vvgt: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    np.save("one.npy", np.full((4, 4, 4), 5, np.uint8))
-    head = b"NRRD0004\ntype: uchar\ndimension: 3\nsizes: 8 8 8\nencoding: raw\n\nxx"
-    Path("bad.nrrd").write_bytes(head)
-    Path("hidden.json").write_text(json.dumps({"points": [
-        {"x": 6, "rgb": [1, 1, 1], "opacity": 0}, {"x": 7, "rgb": [1, 1, 1], "opacity": 0.5}]}))  # fmt: skip
-    result = vvgt("view", *args, "--no-browser")
-    assert result.code == code
-    assert said in result.error
-    assert result.error.count("vvgt: error:") == 1
-    assert "Traceback" not in result.error
-
-
-def test_names_to_save_under() -> None:
-    assert plain_name("a/b/head_64x64x93_uint16.raw") == "head"
-    assert plain_name("example:blob:12") == "blob-12"
-    assert plain_name("/x/</b>.nii.gz") == "b"
-    assert plain_name("..") == "volume"
-    assert plain_name("a/head.compressed.ply") == plain_name("head.ply") == plain_name("head.spz") == "head"
