@@ -24,7 +24,7 @@ from tests.test_live import GRAIN, HI, LO, RAMP, facts
 from tests.test_live import cloud as live_cloud
 from vvgt_cli.cameras.sets import SIZE, pixel_width
 from vvgt_cli.commands.converter import Converter, Failed, Made, Scored
-from vvgt_cli.commands.live_site import Cloud, Desk, function_sent
+from vvgt_cli.commands.live_site import Cloud, Desk, function_sent, plain_name
 from vvgt_cli.commands.server import Part, Site, served
 from vvgt_cli.conversion.live import lit
 from vvgt_cli.errors import DataError
@@ -342,3 +342,36 @@ def test_a_page_that_waits_hears_how_far_it_is_and_why_nothing_comes(tmp_path: P
         assert "no such file" in state_of(url)["said"]
         assert desk.error is not None
         assert desk.error.exit_code == 1
+
+
+@pytest.mark.parametrize(
+    ("args", "code", "said"),
+    [
+        (["none.nrrd"], 1, "no such file"),
+        (["bad.nrrd"], 1, "check that the file is whole"),
+        (["one.npy", "--tf", "hidden.json"], 1, "nothing is visible"),
+        (["example:nope"], 2, "no such example"),
+    ],
+)
+def test_what_cannot_be_shown_is_one_line(
+    args: list[str], code: int, said: str, tmp_path: Path, vvgt: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    np.save("one.npy", np.full((4, 4, 4), 5, np.uint8))
+    head = b"NRRD0004\ntype: uchar\ndimension: 3\nsizes: 8 8 8\nencoding: raw\n\nxx"
+    Path("bad.nrrd").write_bytes(head)
+    Path("hidden.json").write_text(json.dumps({"points": [
+        {"x": 6, "rgb": [1, 1, 1], "opacity": 0}, {"x": 7, "rgb": [1, 1, 1], "opacity": 0.5}]}))  # fmt: skip
+    result = vvgt("view", *args, "--no-browser")
+    assert result.code == code
+    assert said in result.error
+    assert result.error.count("vvgt: error:") == 1
+    assert "Traceback" not in result.error
+
+
+def test_names_to_save_under() -> None:
+    assert plain_name("a/b/head_64x64x93_uint16.raw") == "head"
+    assert plain_name("example:blob:12") == "blob-12"
+    assert plain_name("/x/</b>.nii.gz") == "b"
+    assert plain_name("..") == "volume"
+    assert plain_name("a/head.compressed.ply") == plain_name("head.ply") == plain_name("head.spz") == "head"
