@@ -259,9 +259,9 @@ def check_page(folder: Path) -> None:
 def test_what_frames_leave_to_later_ones_is_in_the_memory_that_is_asked_for(beat, monkeypatch):
     asked = []
 
-    def check(plan, beside=None):
+    def check(plan, pictures=0, beside=None):
         if beside is not None:  # not after the closed form
-            asked.append(beside(plan.case))
+            asked.append(pictures + beside(plan.case))
 
     monkeypatch.setattr("vvgt_cli.conversion.convert.check_memory", check)
     carry = Carry(96)

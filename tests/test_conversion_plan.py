@@ -173,7 +173,9 @@ def test_gaussians_that_do_not_fit_are_refused_with_the_number_that_would(monkey
     with pytest.raises(UsageError, match="--max-gaussians 250000 would fit"):
         check_memory(found)
     with pytest.raises(UsageError, match="--max-gaussians 125000 would fit"):  # a series keeps more
-        check_memory(found, lambda case: 0.5 * each * case.gaussians)
+        check_memory(found, beside=lambda case: 0.5 * each * case.gaussians)
+    with pytest.raises(UsageError, match=r"--size 48: views need .* --size 33 would fit"):  # of any number
+        check_memory(found, pictures=2 * each * 3e5)
 
 
 def test_no_steps_leave_back_projection():

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import gzip
+import multiprocessing
 import os
 import resource
 import struct
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -102,9 +104,12 @@ def test_limits_of_the_process(limit, left, machine, monkeypatch):
     assert free_memory() == left * GIB
 
 
-def test_what_was_asked_for_less_what_is_held(machine):
+def test_what_was_asked_for_less_what_is_held(machine, monkeypatch):
     set_memory(parse_size("4G"))
     assert free_memory() == 3 * GIB
+    machine("proc/7/status", f"VmRSS: {2 << 20} kB\nRssAnon: {1 << 20} kB\n")
+    monkeypatch.setattr(multiprocessing, "active_children", lambda: [SimpleNamespace(pid=7)])
+    assert free_memory() == 2 * GIB  # what the worker shares with the process is counted once
     set_memory(1)
     assert free_memory() == 0
 

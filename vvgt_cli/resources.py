@@ -44,11 +44,15 @@ def free_memory() -> int | None:
     """Bytes of memory that this process can still have, or None where the system does not say.
 
     The least of what the machine has free, what every cgroup (v1 and v2) above the process leaves, the process's own
-    limits (RLIMIT_AS, RLIMIT_DATA) less what it has of them, and `set_memory` less what it holds.
+    limits (RLIMIT_AS, RLIMIT_DATA) less what it has of them, and `set_memory` less what it and its workers
+    hold.
     """
     found = [*_machine(), *(room for room in map(_room, _groups("memory")) if room is not None), *_own_limits()]
     if _asked is not None:
-        found.append(_asked - _status().get("VmRSS", 0))
+        from multiprocessing import active_children
+
+        others = (_table(PROC / str(child.pid) / "status") for child in active_children())  # workers in wait
+        found.append(_asked - _status().get("VmRSS", 0) - sum(other.get("RssAnon", 0) for other in others))
     return max(min(found), 0) if found else None
 
 

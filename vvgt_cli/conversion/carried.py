@@ -82,13 +82,13 @@ class Carry:
         """Of the frame that was made last, as an index has them."""
         return {} if self._moved is None else {"moved": self._moved}
 
-    def beside(self, plan: Plan, fit: FitOptions) -> Callable[[Workload], float]:
-        """Bytes that frames will leave to later ones and that are not there yet, for a workload of such a plan."""
+    def beside(self, plan: Plan, fit: FitOptions) -> tuple[int, Callable[[Workload], float]]:
+        """Bytes that frames will leave to later ones and that are not there yet: of pictures; of a workload's sets."""
         turns = max((max(s.count // VIEWS, 1) for s in plan.stages if isinstance(s, TrainingViews)), default=-1)
         there = {id(one) for one in (self._last.gaussians, *self._last.shown)} if self._last else ()
         sets = max(turns + 1 - len(there), 0)
         pictures = self._pictures.room([view for stage in plan.stages for view in stage.views(fit)]) if sets else 0
-        return lambda case: sets * case.gaussians * (A_SET + 12 * ((case.degree + 1) ** 2 - 1)) + pictures
+        return pictures, lambda case: sets * case.gaussians * (A_SET + 12 * ((case.degree + 1) ** 2 - 1))
 
     def goes_on(self, work: Work, plan: Plan, request: ConvertRequest) -> bool:
         """Make the frame from the one before, if that is as near as a conversion by itself; whether it was."""

@@ -154,7 +154,7 @@ def run_conversion(
         plan.gaussians, plan.case = len(made), replace(plan.case, gaussians=len(made))
         plan.bytes = file_bytes(len(made), planner.sh_degree)
         run.report.plan = plan.record()
-    check_memory(plan, *([carry.beside(plan, work.fit)] if isinstance(carry, Carry) else []))
+    check_memory(plan, *(carry.beside(plan, work.fit) if isinstance(carry, Carry) else ()))
     work.checkpoint = checkpoint_of(request.checkpoint, work.field, work.fit, request.limits)
     kept = work.checkpoint.load(FITTED)
     if made is not None:

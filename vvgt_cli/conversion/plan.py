@@ -230,12 +230,13 @@ def _room(left: float | None) -> str:
     return f"{max(left or 0.0, 0.0):.1f} s are left"
 
 
-def check_memory(plan: Plan, beside: Callable[[Workload], float] = lambda _: 0.0) -> None:
+def check_memory(plan: Plan, pictures: float = 0.0, beside: Callable[[Workload], float] = lambda _: 0.0) -> None:
     """Refuse what would not fit, rather than have the system end it.
 
     Args:
         plan: of the stages that are left.
-        beside: bytes that are kept beside what they take, for such a workload.
+        pictures: bytes of them that are kept beside what the stages take.
+        beside: bytes that are kept of such a workload's Gaussians.
 
     Raises:
         UsageError: with the size or the Gaussians that would fit.
@@ -244,18 +245,18 @@ def check_memory(plan: Plan, beside: Callable[[Workload], float] = lambda _: 0.0
     if free is None:
         return
     views = sum(stage.cost(plan.case).memory for stage in plan.stages if isinstance(stage, CheckViews | TrainingViews))
-    if views > free:
+    if (drawn := views + pictures) > free:
         raise UsageError(
-            f"--size {size}: views need {views / 2**30:.1f} GiB of memory, {free / 2**30:.1f} GiB are free; --size "
-            f"{max(int(size * (free / views) ** 0.5), 1)} would fit, or 'vvgt init', which renders none"
+            f"--size {size}: views need {drawn / 2**30:.1f} GiB of memory, {free / 2**30:.1f} GiB are free; --size "
+            f"{max(int(size * (free / drawn) ** 0.5), 1)} would fit, or 'vvgt init', which renders none"
         )
-    need = SURE * plan.working_memory + beside(plan.case)
+    need = SURE * plan.working_memory + pictures + beside(plan.case)
     form, fewer = plan.stages[0], plan.gaussians
     if not isinstance(form, ClosedFormStage) or need <= free:
         return
     while fewer > 1:
         case = for_budget(plan.case, fewer)
-        if SURE * (form.cost(case).memory + views) + beside(case) <= free:
+        if SURE * (form.cost(case).memory + views) + pictures + beside(case) <= free:
             break
         fewer //= 2
     raise UsageError(

@@ -21,7 +21,7 @@ WARM_UP = 3  # steps
 SMALLEST = 1e-7  # standard deviation, unit frame
 WEAKEST = 0.1  # of the mean size of slopes, added to one's own: what is hardly seen goes less far than the rest
 MEDIAN = 7  # one of so many of the sample is in the median
-GOING_ON = 1.0  # the same where some are free and all have been descended on before: only what is wrong now goes far
+GOING_ON = 1.0  # in place of `WEAKEST` where some are free: descended on before, so only what is wrong now goes far
 OUTLIER = 100.0  # times the median that a slope counts in that mean
 GIVEN = 0.3  # of the rate of harmonics, where the start has some (docs/log/light.md)
 
@@ -43,9 +43,9 @@ class OwnFrame:
     """Covariance ``M M^T``; steps ``mu += M d``, ``M <- M (I + E + E^2 / 2)``, of opacity logits, colours, harmonics.
 
     Rates go with the root of the running error of the pictures: the nearer, the smaller; and from the middle of the
-    run on in a straight line to zero. Where Gaussians share what their steps have in common (`shared_steps`), what is
-    their own counts `OWN` times, and slopes that are small beside the others' count less. Harmonics up to a degree that
-    the start has change by `GIVEN` of the rate of those that begin at zero.
+    run on in a straight line to zero. Where Gaussians share what their steps have in common (`shared_steps`), or only
+    some are free, of however many, rates count `OWN` times, and slopes that are small beside the others' count less.
+    Harmonics up to a degree that the start has change by `GIVEN` of the rate of those that begin at zero.
     """
 
     # d, E on and off the diagonal, logit, colour, and what harmonics together change it (RMS over directions)
