@@ -1,7 +1,7 @@
 """What live pages cost: bytes of the file; processor seconds of the first page and of the better form, in pairs.
 
-python benchmarks/live_page.py SCENES.tsv DATA FUNCTIONS -o docs/live-page.csv [--scene NAME] [--rounds N] [--better]
-python benchmarks/live_page.py --table docs/live-page.csv
+python benchmarks/live_page.py SCENES.tsv DATA FUNCTIONS -o live-page.csv [--scene NAME] [--rounds N] [--better]
+python benchmarks/live_page.py --table live-page.csv
 
 "closed form" is what `vvgt init` does, "first page" what `vvgt view VOLUME` does until there is a live page; with
 --better "convert", and "better form", what `vvgt view VOLUME` then does for that function. All without the start of a
@@ -21,7 +21,7 @@ import click
 from closed_form import read_options, scene_rows
 from dvr_scenes import print_table, write_rows
 
-from vvgt_cli.commands.converter_process import Volume
+from vvgt_cli.commands.converter_process import Telling, Volume
 from vvgt_cli.conversion.convert import convert, initialise_only, opened, ply_options
 from vvgt_cli.conversion.live import live_conversion
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
@@ -33,6 +33,7 @@ from vvgt_cli.score.record import ConversionReport, Run
 
 FROG = SourceRequest("example:frog", labels="auto")
 QUIET = Console(quiet=True)
+UNHEARD = Telling(lambda message: None)
 
 
 def megabytes(source: SourceRequest, gaussians: int) -> float:
@@ -72,18 +73,18 @@ def measured(
             times |= seconds(
                 {
                     "closed form": lambda: initialise_only(file, QUIET),
-                    "first page": lambda: Volume(source, name, QUIET).live(QUIET),
+                    "first page": lambda: Volume(source, name, UNHEARD).live(UNHEARD),
                 },
                 rounds,
             )
         if rounds and better:
             tf = load(source).tf
-            viewed = Volume(source, name, QUIET)
-            viewed.live(QUIET)
+            viewed = Volume(source, name, UNHEARD)
+            viewed.live(UNHEARD)
 
             def under() -> None:
                 viewed.last = None  # not going on from the round before
-                viewed.under(tf, QUIET)
+                viewed.under(tf, UNHEARD)
 
             times |= seconds({"convert": lambda: convert(file, QUIET), "better form": under}, rounds)
     return [row | {key: value or None for key, value in times.items()} for row in rows]

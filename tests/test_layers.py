@@ -323,7 +323,7 @@ def test_layers_that_do_not_meet_or_fit_are_refused(vvgt, tmp_path: Path) -> Non
     nibabel.save(nibabel.Nifti1Image(np.zeros((8, 8, 8, 3), np.float32), np.eye(4)), tmp_path / "four.nii")
     for out in ("a.ply", "a.html", "a_{}.ply"):
         steps = vvgt("convert", "example:blob:8", "--layer", tmp_path / "four.nii", "-o", tmp_path / out)
-        assert (steps.code, "3 time steps; expected one of a layer: --layer FILE,time=N (0 to 2)" in steps.error) == (
+        assert (steps.code, "3 time steps; expected one for a layer: --layer FILE,time=N (0 to 2)" in steps.error) == (
             2, True,
         ), steps.error  # fmt: skip
 

@@ -318,8 +318,10 @@ def _layered(
         try:
             inner = access.open(other.volume, other.read)
         except SeveralSteps as error:  # of a page, they are not its frames
-            which = f"--layer FILE,time=N (0 to {error.steps - 1})"
-            raise UsageError(f"{other.volume}: {error.steps} time steps; expected one of a layer: {which}") from None
+            name, last = getattr(other.volume, "name", other.volume), error.steps - 1
+            raise UsageError(
+                f"{name}: {error.steps} time steps; expected one for a layer: --layer FILE,time=N (0 to {last})"
+            ) from None
         layers += layers_of(inner, other.tf, other.labels, other.tf_range, other.unit_distance, access=access)
     numbers = access.statistics(layers[0].volume)
     _check_seen(layers, access)
