@@ -12,10 +12,12 @@ from pathlib import Path
 
 import pytest
 
-from vvgt_cli.field.runners import Processes
+from vvgt_cli.errors import DataError
+from vvgt_cli.field.runners import IDLE, Processes
 
 ROOT = Path(__file__).parent.parent
 MINUTE = 60.0
+posix = pytest.mark.skipif(sys.platform == "win32", reason="needs signals of POSIX")
 
 
 @dataclass(frozen=True)
@@ -25,6 +27,8 @@ class Sign:
     folder: Path
     wrong: bool = False
     kind: str = "signs"
+    deadly: bool = False
+    seconds: float = 0.0
 
     def __len__(self) -> int:
         return 6
@@ -33,6 +37,9 @@ class Sign:
         if self.wrong:
             raise ValueError("as asked for")
         (self.folder / f"{os.getpid()}_{number}").touch()
+        time.sleep(self.seconds)
+        if self.deadly:
+            os.kill(os.getpid(), signal.SIGKILL)
 
 
 def signed(folder: Path) -> set[int]:
@@ -40,12 +47,14 @@ def signed(folder: Path) -> set[int]:
 
 
 def ended(pid: int) -> bool:
-    """Whether a process ends within a minute."""
-    until = time.monotonic() + MINUTE
+    """Whether a process ends within a minute; on Linux also if nobody asks for its status, so that it stays as Z."""
+    until, stat = time.monotonic() + MINUTE, Path(f"/proc/{pid}/stat")
     while time.monotonic() < until:
         try:
             os.kill(pid, 0)
-        except ProcessLookupError:
+            if sys.platform == "linux" and stat.read_text().rpartition(")")[2].split()[0] == "Z":
+                return True
+        except (ProcessLookupError, FileNotFoundError):
             return True
         time.sleep(0.05)
     return False
@@ -69,25 +78,75 @@ def test_others_follow_those_that_an_error_has_ended(tmp_path):
     assert len(list(tmp_path.iterdir())) == 6
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="needs SIGKILL")
-def test_processes_end_with_one_that_is_killed(tmp_path):
-    program = (
-        "import time\nfrom pathlib import Path\nfrom tests.test_field_runners import Sign\n"
-        "from vvgt_cli.field.runners import Processes\n"
-        "if __name__ == '__main__':\n"
-        "    with Processes(2, 2) as runner:\n"
-        f"        runner.run(Sign(Path({str(tmp_path)!r})), range(6), None)\n"
-        f"        Path({str(tmp_path.with_suffix('.done'))!r}).touch()\n"
-        "        time.sleep(600)\n"
+@posix
+def test_one_that_is_killed_between_two_passes_is_none_of_those_that_do_no_block(tmp_path):
+    with Processes(1, 1) as runner:
+        runner.run(Sign(tmp_path), range(6), None)
+        (idle,) = signed(tmp_path)
+        os.kill(idle, signal.SIGKILL)
+        assert ended(idle)
+        with pytest.raises(DataError, match=f"ended {IDLE} times without a block done"):
+            runner.run(Sign(tmp_path, deadly=True), range(6), None)
+    assert len(signed(tmp_path) - {idle}) == IDLE
+
+
+def started(folder: Path, within: str) -> subprocess.Popen[str]:
+    """A program, first of its group, that does ``within`` with a ``runner`` and a ``folder``."""
+    lines = "import time\nfrom pathlib import Path\nfrom tests.test_field_runners import Sign, signed\n"
+    lines += "from vvgt_cli.field.runners import Processes\n"
+    lines += f"if __name__ == '__main__':\n    folder = Path({str(folder)!r})\n    with Processes(2, 2) as runner:\n"
+    file = folder.with_suffix(".py")
+    file.write_text(lines + "".join(f"        {line}\n" for line in within.splitlines()))
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    return subprocess.Popen(
+        [sys.executable, str(file)], env=environment, stderr=subprocess.PIPE, text=True, start_new_session=True
     )
-    file = tmp_path.with_suffix(".py")
-    file.write_text(program)
-    run = subprocess.Popen([sys.executable, str(file)], env={**os.environ, "PYTHONPATH": str(ROOT)})
+
+
+def there(file: Path) -> None:
+    """Wait until a file is, a minute at most."""
     until = time.monotonic() + MINUTE
-    while not tmp_path.with_suffix(".done").exists() and time.monotonic() < until:
+    while not file.exists() and time.monotonic() < until:
         time.sleep(0.05)
-    run.send_signal(signal.SIGKILL)
+    assert file.exists()
+
+
+@posix
+def test_processes_end_with_one_that_is_killed(tmp_path):
+    run = started(
+        tmp_path, "runner.run(Sign(folder), range(6), None)\nfolder.with_suffix('.done').touch()\ntime.sleep(600)"
+    )
+    there(tmp_path.with_suffix(".done"))
+    run.kill()
     run.wait()
     pids = signed(tmp_path)
     assert pids
     assert all(map(ended, pids))
+
+
+@posix
+def test_an_interrupt_of_all_between_two_passes_leaves_the_processes_silent_and_there(tmp_path):
+    run = started(
+        tmp_path,
+        "runner.run(Sign(folder), range(6), None)\nbefore = signed(folder)\n"
+        "try:\n    folder.with_suffix('.done').touch()\n    time.sleep(600)\n"
+        "except KeyboardInterrupt:\n    time.sleep(1)\n"
+        "runner.run(Sign(folder), range(6), None)\nassert before & signed(folder) == before\n"
+        "alive = [Path(f'/proc/{pid}').exists() for pid in before]\nassert all(alive) or not Path('/proc').exists()",
+    )
+    there(tmp_path.with_suffix(".done"))
+    os.killpg(run.pid, signal.SIGINT)
+    assert run.communicate(timeout=MINUTE)[1] == ""
+    assert run.returncode == 0
+
+
+@posix
+def test_an_interrupt_within_a_pass_does_not_wait_for_its_blocks(tmp_path):
+    run = started(tmp_path, "runner.run(Sign(folder, seconds=600.0), range(6), None)")
+    until = time.monotonic() + MINUTE
+    while not signed(tmp_path) and time.monotonic() < until:
+        time.sleep(0.05)
+    os.killpg(run.pid, signal.SIGINT)
+    said = run.communicate(timeout=MINUTE)[1]
+    assert said.count("Traceback") == 1  # of the program itself
+    assert all(map(ended, signed(tmp_path)))

@@ -168,24 +168,27 @@ def uncovered(person: Person, picture: np.ndarray) -> float:
     for left, top, right, bottom in person("eval", OVER):
         assert not light[max(top, 0) : bottom, max(left, 0) : right].any(), (left, top, right, bottom)
     spans = []
-    for place, edge, along in zip(middle, person.size, (light.any(axis=0), light.any(axis=1)), strict=True):
+    for place, edge, along in zip(middle, light.shape[::-1], (light.any(axis=0), light.any(axis=1)), strict=True):
         first, *_, last = np.flatnonzero(along)
         assert 0 < first < last < edge - 1
         assert abs((first + last) / 2 - place) < 0.12 * (last - first)
         spans.append(last - first)
-    return float(max(spans) / min(person.size))
+    return float(max(spans) / min(light.shape))
 
 
 def test_what_is_seen_is_whole_and_uncovered_at_first_sight(marked: str, person: Person, tmp_path: Path) -> None:
-    """And again when the panel is folded or unfolded, until the view is moved; then it keeps its size."""
+    """And again when the panel is folded and the window turned, until the view is moved; then it keeps its size."""
     person("open", marked)
     shares = [uncovered(person, person.picture(tmp_path, "first.png"))]
-    for name in ("once", "twice"):
-        person("eval", FOLD)
+    turned, back = ("resize", *person.size[::-1]), ("resize", *person.size)
+    for name, step in (("once", ("eval", FOLD)), ("twice", ("eval", FOLD)), ("turned", turned), ("back", back)):
+        person(*step)
         shares.append(uncovered(person, person.picture(tmp_path, f"{name}.png")))
     print(f"{person.size}: {', '.join(f'{share:.2f}' for share in shares)} of the shorter side")
     assert shares[0] > 0.6
     assert shares[2] == pytest.approx(shares[0], abs=0.01)
+    assert shares[3] > 0.6
+    assert shares[4] == pytest.approx(shares[0], abs=0.01)
     person("press", "x")
     away = "window.vvgt.where.lens.pose().distance"
     far, before = person("eval", away), person("eval", MIDDLE)

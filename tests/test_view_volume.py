@@ -23,7 +23,7 @@ from tests.test_formats_server import ask, cloud, shown
 from tests.test_live import GRAIN, HI, LO, RAMP, facts
 from tests.test_live import cloud as live_cloud
 from vvgt_cli.cameras.sets import SIZE, pixel_width
-from vvgt_cli.commands.converter import Converter, Failed, Made, Scored
+from vvgt_cli.commands.converter import Converter, Failed
 from vvgt_cli.commands.live_site import Cloud, Desk, function_sent, plain_name
 from vvgt_cli.commands.server import Part, Site, served
 from vvgt_cli.conversion.live import lit
@@ -253,19 +253,6 @@ def test_the_page_hears_why_a_conversion_failed(desk: tuple[str, Desk]) -> None:
     assert state_of(url) == {"number": 1, "state": "failed", "said": "mine: nothing is visible"}
     assert of.error is None
     assert "live" in scene_of(url)
-
-
-def test_a_page_shows_what_is_converted_before_its_scores(desk: tuple[str, Desk]) -> None:
-    url, of = desk
-    send(url, "function", FUNCTION)
-    of.hear(1, Made(b"unscored", {"ply": b"shown"}))
-    told = {"number": 1, "state": "done", "said": "converted", "file": "1.ply", "scored": False}
-    assert state_of(url) == told
-    assert ask(url, urlsplit(url).path + "1.ply")[1] == b"shown"
-    of.hear(1, Scored(b"certified", 41.23))
-    assert state_of(url) == {**told, "said": "converted, 41.2 dB", "scored": True}
-    assert ask(url, urlsplit(url).path + "1.ply")[1] == b"shown"
-    assert of.better == b"certified"
 
 
 def test_a_saved_live_file_has_the_colours_of_the_function(desk: tuple[str, Desk]) -> None:

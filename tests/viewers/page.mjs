@@ -60,6 +60,9 @@ const shoot = async ({ camera, frame }) => {
   app.systems.gsplat.on('frame:ready', (c, layer, isReady, loading) => { ready = isReady && loading === 0; });
   const { position, target, up, fov } =
     camera ?? { ...JSON.parse(document.getElementById('scene').textContent).camera, up: [0, 1, 0] };
+  const { lens } = window.vvgt.where ?? {}, away = position.map((x, k) => x - target[k]), distance = Math.hypot(...away);
+  lens?.set({ ...lens.pose(), target, distance });  // a light at the eye is where the page's own camera is
+  lens?.look(away.map((x) => x / distance), up);
   app.on('update', () => {  // after the viewer's own, which may still be on its way
     entity.setPosition(...position);
     entity.lookAt(...target, ...up);

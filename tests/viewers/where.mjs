@@ -1,6 +1,6 @@
 // where.mjs JOB MODULES: pages in headless Chromium, used as a person uses them. JOB: JSON {"browser", "size": [w, h], "touch", "args"}.
 // Reads steps [what, ...], a JSON list a line, and answers each with a line {"answer", "asked", "broken"} or {"error"}.
-// Steps: open URL; refused URL (what a page says that cannot be shown); press KEY; click SELECTOR, or X Y; drag X Y X Y; eval JS; settled (until two pictures are the same); shot FILE
+// Steps: open URL; refused URL (what a page says that cannot be shown); press KEY; click SELECTOR, or X Y; drag X Y X Y; resize W H; eval JS; settled (until two pictures are the same); shot FILE
 // (the page), bare FILE (without what lies over the picture); save SELECTOR FILE (what a click downloads).
 import path from 'node:path';
 import readline from 'node:readline';
@@ -38,7 +38,7 @@ async function settled() {
   throw new Error('the picture does not come to rest');
 }
 
-const HIDE = '#cut, #tools, #live, #named, #series, #where, #places, #about, .sse-ui { visibility: hidden !important }';
+const HIDE = '#cut, #tools, #live, #named, #series, #where, #places, #about, .sse-ui { opacity: 0 !important; transition: none !important }';
 const steps = {
   open, settled,
   refused: async (url) => {
@@ -64,6 +64,7 @@ const steps = {
     await page.mouse.move(toX, toY, { steps: 8 });
     await page.mouse.up();
   },
+  resize: (width, height) => page.setViewportSize({ width, height }),
   eval: (text) => page.evaluate(text),
   shot: async (file) => { await page.screenshot({ path: file }); },
   bare: async (file) => {

@@ -113,7 +113,7 @@ class Converter:
         self._source, self._name, self._heard = source, name, heard
         self.lock = threading.RLock()
         self._process: subprocess.Popen[bytes] | None = None
-        self._number, self._busy = 0, False
+        self._number, self._busy, self._scoring = 0, False, False
         self._folder: str | None = None
 
     def __enter__(self) -> Converter:
@@ -139,7 +139,7 @@ class Converter:
     def ask(self, job: Job) -> int:
         """Begin a job in place of the one that is being done, if any; returns its number.
 
-        What only scores are missing of is not ended, for the next job may go on from it.
+        A job that only lacks its scores is not ended, for the next one may go on from it.
         """
         with self.lock:
             if self._folder is None:
@@ -151,13 +151,14 @@ class Converter:
             with suppress(OSError):  # it has ended: `_listen` says so
                 pickle.dump((self._number, job), cast(IO[bytes], process.stdin))
                 cast(IO[bytes], process.stdin).flush()
-            self._busy = True
+            self._busy, self._scoring = True, False
             return self._number
 
     def cancel(self) -> None:
         """End the job that is being done, if any; nothing more is heard of it."""
         with self.lock:
             self._number += 1
+            self._scoring = False
             if self._busy:
                 self._end()
 
@@ -181,7 +182,7 @@ class Converter:
 
     def _end(self) -> None:
         """At once, with all that it has started, and what it was writing."""
-        process, self._process, self._busy = self._process, None, False
+        process, self._process, self._busy, self._scoring = self._process, None, False, False
         if process is None:
             return
         with suppress(OSError):
@@ -205,13 +206,14 @@ class Converter:
                 if self._process is not process:
                     return
                 if message is None:  # it has ended by itself
-                    busy = self._busy
+                    awaited = self._busy or self._scoring
                     self._end()
                     message = Failed(DataError("the conversion was ended by the system (out of memory?)"))
-                    if busy:
+                    if awaited:
                         self._heard(number, message)
                     return
                 if number != self._number:
                     continue
-                self._busy = self._busy and not isinstance(message, Made | Failed)
+                if isinstance(message, Made | Scored | Failed):
+                    self._busy, self._scoring = False, isinstance(message, Made) and not message.live
                 self._heard(number, message)

@@ -341,13 +341,10 @@ class Desk:
                 self.console.say(message.line)
                 self.begun.set()
         elif isinstance(message, Progress):
-            self.state = {**self.state, "said": message.text}
+            if self.state["state"] in ("first", "working"):
+                self.state = {**self.state, "said": message.text}
         elif isinstance(message, Failed):
-            if first:
-                self.error = message.error
-            self.state = {"number": number, "state": "failed", "said": str(message.error)}
-            self.there.set()
-            self.begun.set()
+            self._failed(number, message.error)
         elif isinstance(message, Scored):
             self._scored(message)
         elif first:
@@ -366,10 +363,20 @@ class Desk:
         self.state = {"number": number, "state": "done", "said": "converted", "file": f"{number}.ply", "scored": False}
         self.console.say("converted for the function of the page")
 
+    def _failed(self, number: int, error: VvgtError) -> None:
+        if self.state["state"] in ("first", "working"):
+            if not self.there.is_set():
+                self.error = error
+            self.state = {"number": number, "state": "failed", "said": str(error)}
+            self.there.set()
+            self.begun.set()
+            return
+        if self.state["state"] == "done":
+            self.state = {**self.state, "said": f"converted, not scored: {error}", "scored": True}
+        self.console.say(f"not scored: {error}")
+
     def _scored(self, scored: Scored) -> None:
-        if self.better is None:  # what has no live form
-            self.first = cache(lambda: Cloud.of(scored.ply, self.name))
-        else:
+        if self.better is not None:
             self.better = scored.ply
             self.state = {**self.state, "said": f"converted, {scored.psnr:.1f} dB", "scored": True}
         self.console.say(f"{scored.psnr:.1f} dB on the test views")

@@ -21,7 +21,9 @@ const distance = ({ position, target }) => Math.hypot(...plus(position, target, 
 
 // {x, y: its middle, far: how far the eye stands back} of that part
 function freePart(scene) {
-  const over = [...document.querySelectorAll(OVER)].map((element) => element.getBoundingClientRect()).filter(({ width, height }) => width && height);
+  const over = [...document.querySelectorAll(OVER)].map((element) => element.getBoundingClientRect())
+    .map((r) => ({ left: Math.max(r.left, 0), right: Math.min(r.right, innerWidth), top: Math.max(r.top, 0), bottom: Math.min(r.bottom, innerHeight) }))
+    .filter(({ left, right, top, bottom }) => left < right && top < bottom);
   const [x, y] = [innerWidth / 2, innerHeight / 2], far = (wide, high) => distance(firstView(scene, wide, high)), most = FARTHEST * far(innerWidth, innerHeight), found = [];
   const edges = (side, end) => [end, ...over.map((r) => r[side])];
   for (const left of edges('right', 0)) for (const right of edges('left', innerWidth)) for (const top of edges('bottom', 0)) for (const bottom of edges('top', innerHeight)) {
@@ -33,12 +35,13 @@ function freePart(scene) {
   return found.filter((part) => part.far <= ALIKE * least).sort((a, b) => aside(a) - aside(b) || a.far - b.far)[0];
 }
 
-// Keeps the middle of the view in the middle of that part when the panel is folded and the window changes; until somebody moves the view, all fits.
-export function stayFree(lens, scene) {
+// Keeps the middle of the view in the middle of that part when the panel is folded and the window changes; until somebody moves the view, all fits. draw(): letters and legend where they belong in the window as it is.
+export function stayFree(lens, scene, draw) {
   let begun = null;
   const numbers = ({ target, pitch, yaw, distance: away }) => [...target, pitch, yaw, away];
   const moved = () => begun && numbers(lens.pose()).some((x, k) => Math.abs(x - begun[k]) > 1e-3);
   const place = () => {
+    draw();
     const { x, y, far } = freePart(scene);
     if (!moved()) {
       lens.set({ ...lens.pose(), target: firstView(scene).target, distance: far });

@@ -105,9 +105,9 @@ export function served(panel, viewer, server) {
   const improved = () => number !== null && !panel.alone();
   function put() {
     better.put(improved());
-    const [what, ...rest] = (improved() ? told : 'live').split(/(?=, )/);
+    const [what, ...rest] = (improved() ? told : 'live').split(/(?=, |: )/);
     kind.textContent = what;
-    kind.append(Object.assign(document.createElement('span'), { textContent: rest.join('') }));  // where there is room
+    kind.append(Object.assign(document.createElement('span'), { textContent: rest[0] ?? '' }));  // where there is room
     if (!busy) say(rest.length ? told : '');
   }
 
@@ -131,8 +131,10 @@ export function served(panel, viewer, server) {
         if (state.state === 'done') {
           if (number !== job) await better.load(state.file, () => mine === change);
           if (mine !== change) return;
-          [number, told, busy] = [job, state.said, false];
-          put();
+          if (number !== job || told !== state.said) {
+            [number, told, busy] = [job, state.said, false];
+            put();
+          }
           if (state.scored) return;
         } else say(`converting for this function: ${state.said}`);
         await pause(ASK);

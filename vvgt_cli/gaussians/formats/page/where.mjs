@@ -127,8 +127,7 @@ export function where(viewer, scene, live, show) {
     draw();
   });
   take(dataNow());
-  draw();
-  stayFree(lens, scene);
+  stayFree(lens, scene, draw);
   Object.assign(state, { lens, ruler, restored: restore(parts), link: () => linkOf(parts), picture: () => pictureOf(viewer, svg), get world() { return world; }, get facts() { return facts; } });
   return state;
 }
