@@ -92,8 +92,9 @@ def test_one_that_is_killed_between_two_passes_is_none_of_those_that_do_no_block
 
 def started(folder: Path, within: str) -> subprocess.Popen[str]:
     """A program, first of its group, that does ``within`` with a ``runner`` and a ``folder``."""
-    lines = "import time\nfrom pathlib import Path\nfrom tests.test_field_runners import Sign, signed\n"
+    lines = "import signal\nimport time\nfrom pathlib import Path\nfrom tests.test_field_runners import Sign, signed\n"
     lines += "from vvgt_cli.field.runners import Processes\n"
+    lines += "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # a test in the background ignores it
     lines += f"if __name__ == '__main__':\n    folder = Path({str(folder)!r})\n    with Processes(2, 2) as runner:\n"
     file = folder.with_suffix(".py")
     file.write_text(lines + "".join(f"        {line}\n" for line in within.splitlines()))
