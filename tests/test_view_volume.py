@@ -6,9 +6,11 @@ import http.client
 import io
 import json
 import os
+import pickle
 import re
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -23,7 +25,7 @@ from tests.test_formats_server import ask, cloud, shown
 from tests.test_live import GRAIN, HI, LO, RAMP, facts
 from tests.test_live import cloud as live_cloud
 from vvgt_cli.cameras.sets import SIZE, pixel_width
-from vvgt_cli.commands.converter import Converter, Failed
+from vvgt_cli.commands.converter import Converter, Failed, Start
 from vvgt_cli.commands.live_site import Cloud, Desk, function_sent, plain_name
 from vvgt_cli.commands.server import Part, Site, served
 from vvgt_cli.conversion.live import lit
@@ -170,6 +172,27 @@ def test_a_conversion_ends_with_a_server_that_is_killed(tmp_path: Path, temporar
         child.kill()
         until(lambda: not os.path.exists(f"/proc/{pid}"), AT_ONCE)
     assert list(temporary.iterdir()) == []
+
+
+@pytest.mark.parametrize("begun", [False, True], ids=["before it begins", "while it speaks"])
+def test_the_process_of_a_server_that_has_ended_removes_its_folder(tmp_path: Path, begun: bool) -> None:
+    folder = tmp_path / "temporary"
+    folder.mkdir()
+    code = "from vvgt_cli.commands.converter_process import main; main()"
+    with subprocess.Popen(
+        [sys.executable, "-c", code, str(folder)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        if begun:  # the input stays open: it is the answers that nobody hears
+            process.stdout.close()
+            pickle.dump(Start(SourceRequest("example:blob:12"), "blob", None), process.stdin)
+            pickle.dump((1, None), process.stdin)
+            process.stdin.flush()
+        else:
+            process.stdin.close()
+        assert process.wait(120) == 0
+    assert not folder.exists()
 
 
 @pytest.fixture

@@ -88,13 +88,11 @@ class Start:
         source: the volume, and the function to begin with.
         name: of what is shown, without ending.
         memory: bytes that it may take (`--memory`).
-        folder: for what is temporary; the process removes it where it is left alone.
     """
 
     source: SourceRequest
     name: str
     memory: int | None
-    folder: str
 
 
 Job = TransferFunction | LabelTable | None  # the look to convert for; None: the live form
@@ -171,12 +169,12 @@ class Converter:
         folder = cast(str, self._folder)
         paths = os.pathsep.join(filter(None, [str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")]))
         self._process = subprocess.Popen(
-            [sys.executable, "-c", f"from {__package__}.converter_process import main; main()"],
+            [sys.executable, "-c", f"from {__package__}.converter_process import main; main()", folder],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True,
             env={**os.environ, "PYTHONPATH": paths, "TMPDIR": folder, "TEMP": folder, "TMP": folder},
         )  # fmt: skip
         with suppress(OSError):
-            pickle.dump(Start(self._source, self._name, asked_memory(), folder), cast(IO[bytes], self._process.stdin))
+            pickle.dump(Start(self._source, self._name, asked_memory()), cast(IO[bytes], self._process.stdin))
         threading.Thread(target=self._listen, args=(self._process,), daemon=True).start()
         return self._process
 

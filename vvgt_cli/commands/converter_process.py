@@ -6,12 +6,13 @@ import io
 import os
 import pickle
 import shutil
+import sys
 import threading
 import time
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
-from typing import IO, Any
+from typing import IO, Any, NoReturn
 
 from vvgt_cli.commands.converter import Failed, Job, Made, Message, Progress, Said, Scored, Start
 from vvgt_cli.commands.live_site import Cloud, page_of, stored
@@ -140,21 +141,25 @@ def _file(conversion: Conversion) -> bytes:
 
 
 def main() -> None:
-    """Do one job after the other until the input ends."""
+    """Do one job after the other until the input ends; the folder for what is temporary then goes (first argument)."""
+    folder = sys.argv[1]
     orders, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what libraries print
-    start: Start = pickle.load(orders)
+    try:
+        start: Start = pickle.load(orders)
+    except Exception:
+        _alone(folder)
     set_memory(start.memory)
     jobs: list[tuple[int, Job]] = []
     there = threading.Semaphore(0)
-    threading.Thread(target=_receive, args=(orders, start.folder, jobs, there), daemon=True).start()
+    threading.Thread(target=_receive, args=(orders, folder, jobs, there), daemon=True).start()
     volume: Volume | None = None
     while True:
         there.acquire()
         number, job = jobs.pop(0)
 
         def tell(message: Message, number: int = number) -> None:
-            _send(answers, (number, message))
+            _send(answers, folder, (number, message))
 
         note: Any = _note(tell)
         warnings.showwarning = note
@@ -187,20 +192,28 @@ def _plain(error: VvgtError) -> VvgtError:
     return found
 
 
-def _send(stream: IO[bytes], message: tuple[int, Message]) -> None:
+def _send(stream: IO[bytes], folder: str, message: tuple[int, Message]) -> None:
     try:
         pickle.dump(message, stream)
         stream.flush()
-    except OSError:  # nobody is there any more
-        os._exit(0)
+    except OSError:
+        _alone(folder)
 
 
 def _receive(stream: IO[bytes], folder: str, jobs: list[tuple[int, Job]], there: threading.Semaphore) -> None:
-    """Take jobs; where the other side has ended, end, with what lies in the temporary folder."""
+    """Take jobs."""
     while True:
         try:
             jobs.append(pickle.load(stream))
         except Exception:  # the end of the input, in the middle of a job too
-            shutil.rmtree(folder, ignore_errors=True)
-            os._exit(0)
+            _alone(folder)
         there.release()
+
+
+def _alone(folder: str) -> NoReturn:
+    """End where the other side has ended, with what lies in the temporary folder."""
+    for _ in range(10):  # for a job still writes into it
+        shutil.rmtree(folder, ignore_errors=True)
+        if not os.path.exists(folder):
+            break
+    os._exit(0)
