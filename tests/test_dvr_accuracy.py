@@ -130,7 +130,7 @@ def test_stiff_functions_stay_bounded_whatever_comes_together(per_voxel, edge, f
 
 
 # u is the stored value
-IDENTITY = Optics(0.0, 1.0, np.zeros((65537, 4)), np.zeros((65537, 4)), np.zeros(65537))
+IDENTITY = Optics(0.0, 1.0, np.zeros((65537, 4)), np.zeros((65537, 4)), np.zeros(65537), np.zeros(65537))
 
 
 @nb.njit

@@ -22,6 +22,9 @@ from vvgt_cli.jit.decorators import inlined, kernel
 OPAQUE = 1e-3  # times step^2, as the error of integration goes: the transmittance at which a ray ends
 SUB_DEPTH = 1.0  # optical depth of a sub-segment: colour is constant within one; 0.3 is no more accurate
 PARTS = 32  # the most sub-segments; at the largest extinctions what lies behind the first few is not seen
+FINER = 8  # parts of a segment along which extinction is not flat
+BEND = 0.5  # times the second difference of samples: by how much the scalar leaves the line between two of them
+AROUND = 0.5  # times the range of a run: how near to something visible it is looked at
 TILE = 16  # pixels along the edge of a tile: its rays share what they read
 FLAGS = {"contract", "nsz", "arcp", "afn"}  # no nnan/ninf: non-finite voxels are data
 
@@ -29,6 +32,7 @@ _x = 0.5 + 0.5 * np.cos((np.arange(8) + 0.5) * math.pi / 8)  # Chebyshev's point
 ABSORBED: tuple[float, ...] = tuple(np.linalg.solve(np.vander(_x, increasing=True), -np.expm1(-_x) / _x).tolist())
 
 U = nb.uint64
+Vector = tuple[float, float, float]
 Cast = Callable[..., tuple[float, float, float, float]]
 
 _jit = inlined(fastmath=FLAGS, error_model="numpy", **BORROWED)
@@ -147,6 +151,44 @@ def composite(u0: float, u1: float, dt: float, optics: Optics, light: Quad, tran
 
 
 @_jit
+def values_met(before: float, u0: float, u1: float) -> tuple[float, float]:
+    """Table coordinates that a segment from u0 to u1 meets, about; (-1, -1) where an end is not finite.
+
+    The scalar is no line between samples. Its bend follows from the sample ``before`` (-1: none).
+    """
+    low, high = min(u0, u1), max(u0, u1)
+    if low < 0.0:
+        return -1.0, -1.0
+    bend = BEND * abs(u1 - 2.0 * u0 + before) if before >= 0.0 else 0.0
+    return max(low - bend, 0.0), high + bend
+
+
+@_jit
+def pass_segment(
+    voxels: Voxels, optics: Optics, p: Vector, d: Vector, t: float, dt: float, u0: float, u1: float,
+    met: tuple[float, float], light: Quad, trans: float,
+) -> tuple[Quad, float]:  # fmt: skip
+    """`composite` of the segment from t to t + dt of the ray p + t d; in `FINER` parts if extinction is not flat.
+
+    ``met``: `values_met`.
+    """
+    low, high = met
+    if high <= optics.flat[U(int(low))]:
+        return composite(u0, u1, dt, optics, light, trans)
+    (px, py, pz), (dx, dy, dz), part = p, d, dt / FINER
+    a = u0
+    for n in range(1, FINER + 1):
+        s = t + n * part
+        b = u1
+        if n < FINER:
+            b = table_coordinate(sample(voxels.values, px + s * dx, py + s * dy, pz + s * dz), optics)
+        if min(a, b) >= 0.0 and max(a, b) > optics.dark[U(int(min(a, b)))]:
+            light, trans = composite(a, b, part, optics, light, trans)
+        a = b
+    return light, trans
+
+
+@_jit
 def inverse(d: float) -> float:
     """1 / d, or so large for d = 0 that a face across that axis is never reached."""
     return 1.0 / d if d != 0.0 else 1e300
@@ -212,13 +254,14 @@ def skip(
 
 @_jit
 def any_light(run: Run, u0: float, dark: np.ndarray) -> bool:
-    """Whether some segment of a run (RUN,) that comes from u0 (-1: none) may have extinction."""
+    """Whether some segment of a run (RUN,) that comes from u0 (-1: none) may have extinction, or nearly so."""
     lowest: float
     highest: float
     lowest, highest = run_range(run)
     if u0 >= 0.0:
         lowest, highest = min(lowest, u0), max(highest, u0)
-    return lowest < 0.0 or highest > dark[U(int(lowest))]
+    around = AROUND * (highest - lowest)
+    return lowest < 0.0 or highest + around > dark[U(int(max(lowest - around, 0.0)))]
 
 
 @_jit
@@ -237,7 +280,8 @@ def cast(
     dt = (t1 - t0) / count
     opaque = OPAQUE * min(step * step, 1.0)
     ix, iy, iz, per_step = inverse(dx), inverse(dy), inverse(dz), 1.0 / dt
-    u0 = -1.0  # -1: no sample there, or not finite
+    p, d = (px, py, pz), (dx, dy, dz)
+    before = u0 = -1.0  # -1: no sample there, or not finite
     i = 0
     while True:
         at = i - 1 if u0 >= 0.0 else i  # the segment that comes from there is still to be seen
@@ -245,19 +289,19 @@ def cast(
         if start > count:
             return lane(seen, 0), lane(seen, 1), lane(seen, 2), 1.0 - trans
         if start > at:
-            u0, i = -1.0, start
+            before, u0, i = -1.0, -1.0, start
         t = t0 + i * dt
         sample_run(voxels, px + t * dx, py + t * dy, pz + t * dz, dx * dt, dy * dt, dz * dt, optics, run)
         if any_light(run, u0, optics.dark):
             for n in range(min(RUN, count + 1 - i)):
                 u1 = run[n]
-                first = min(u0, u1)
-                if first >= 0.0 and max(u0, u1) > optics.dark[U(int(first))]:
-                    seen, trans = composite(u0, u1, dt, optics, seen, trans)
+                met = values_met(before, u0, u1)
+                if met[0] >= 0.0 and met[1] > optics.dark[U(int(met[0]))]:
+                    seen, trans = pass_segment(voxels, optics, p, d, t + (n - 1) * dt, dt, u0, u1, met, seen, trans)
                     if trans < opaque:
                         return lane(seen, 0), lane(seen, 1), lane(seen, 2), 1.0 - trans
-                u0 = u1
-        u0 = run[RUN - 1]
+                before, u0 = u0, u1
+        before, u0 = run[RUN - 2], run[RUN - 1]
         i += RUN
         if i > count:
             return lane(seen, 0), lane(seen, 1), lane(seen, 2), 1.0 - trans

@@ -103,7 +103,7 @@ class Light(NamedTuple):
 
 
 # Types of the fields, for `jit.decorators.kernel`.
-TUPLES: dict[type, str] = {Voxels: "V", Optics: "f8 f8 f8:2 f8:2 f8:1"}
+TUPLES: dict[type, str] = {Voxels: "V", Optics: "f8 f8 f8:2 f8:2 f8:1 f8:1"}
 LIT: dict[type, str] = {**TUPLES, Light: "f8 f8 f8 f8 i8 f8:2 f4:4 i8 i8 f8 f8:1 f8:1"}
 GRID: dict[type, str] = {Texels: "f4:4"}
 LIT_GRID: dict[type, str] = {**LIT, **GRID}

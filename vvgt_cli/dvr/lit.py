@@ -7,7 +7,19 @@ import math
 import numba as nb
 import numpy as np
 
-from vvgt_cli.dvr.kernel import FLAGS, OPAQUE, TILE, U, any_light, box_span, composite, inverse, skip, tiles_of
+from vvgt_cli.dvr.kernel import (
+    FLAGS,
+    OPAQUE,
+    TILE,
+    U,
+    any_light,
+    box_span,
+    inverse,
+    pass_segment,
+    skip,
+    tiles_of,
+    values_met,
+)
 from vvgt_cli.dvr.layout import LIT, Light, Optics, Voxels
 from vvgt_cli.dvr.runs import BORROWED, RUN, sample_run, stack_run
 from vvgt_cli.dvr.shading import shading
@@ -43,8 +55,9 @@ def cast(
     dt = (t1 - t0) / count
     opaque = OPAQUE * min(step * step, 1.0)
     ix, iy, iz, per_step = inverse(dx), inverse(dy), inverse(dz), 1.0 / dt
+    p, d = (px, py, pz), (dx, dy, dz)
     ux, uy, uz = dx * light.edge[0], dy * light.edge[1], dz * light.edge[2]
-    u0 = -1.0  # -1: no sample there, or not finite
+    before = u0 = -1.0  # -1: no sample there, or not finite
     i = 0
     while True:
         at = i - 1 if u0 >= 0.0 else i  # the segment that comes from there is still to be seen
@@ -52,15 +65,15 @@ def cast(
         if start > count:
             return red, green, blue, 1.0 - trans
         if start > at:
-            u0, i = -1.0, start
+            before, u0, i = -1.0, -1.0, start
         t = t0 + i * dt
         sample_run(voxels, px + t * dx, py + t * dy, pz + t * dz, dx * dt, dy * dt, dz * dt, optics, run)
         if any_light(run, u0, optics.dark):
             for n in range(min(RUN, count + 1 - i)):
                 u1 = run[n]
-                first = min(u0, u1)
-                if first >= 0.0 and max(u0, u1) > optics.dark[U(int(first))]:
-                    seen, trans = composite(u0, u1, dt, optics, zeros4(), trans)
+                met = values_met(before, u0, u1)
+                if met[0] >= 0.0 and met[1] > optics.dark[U(int(met[0]))]:
+                    seen, trans = pass_segment(voxels, optics, p, d, t + (n - 1) * dt, dt, u0, u1, met, zeros4(), trans)
                     s = t + (n - 0.5) * dt
                     factor, white = shading(
                         voxels.values, light, px + s * dx, py + s * dy, pz + s * dz, ux, uy, uz
@@ -72,8 +85,8 @@ def cast(
                     blue += min(factor * lane(seen, 2) + white, most)
                     if trans < opaque:
                         return red, green, blue, 1.0 - trans
-                u0 = u1
-        u0 = run[RUN - 1]
+                before, u0 = u0, u1
+        before, u0 = run[RUN - 2], run[RUN - 1]
         i += RUN
         if i > count:
             return red, green, blue, 1.0 - trans

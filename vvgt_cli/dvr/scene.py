@@ -111,6 +111,7 @@ class Scene:
             intercept=intercept,
             unit_distance=unit_distance,
             world_per_unit=1 / frame.scale,
+            voxel=float(np.mean(frame.step)),
             bins=bins,
         )
         empty = bricks.empty_distance(ranges, optics)

@@ -15,7 +15,7 @@ import numpy as np
 
 from vvgt_cli.dvr.grid import composite as mixed
 from vvgt_cli.dvr.grid import texel_at
-from vvgt_cli.dvr.kernel import FLAGS, OPAQUE, U, any_light, box_span, composite, inverse, skip
+from vvgt_cli.dvr.kernel import FLAGS, OPAQUE, U, any_light, box_span, inverse, pass_segment, skip, values_met
 from vvgt_cli.dvr.layout import GRID, LIT, LIT_GRID, TUPLES, Light, Optics, Texels, Voxels
 from vvgt_cli.dvr.runs import BORROWED, RUN, sample_run, stack_run
 from vvgt_cli.dvr.shading import shading
@@ -65,7 +65,7 @@ def _classified(
     trans, red, green, blue = 1.0, 0.0, 0.0, 0.0
     opaque = OPAQUE * min(step * step, 1.0)
     ix, iy, iz, per_step = inverse(dx), inverse(dy), inverse(dz), 1.0 / dt
-    u0 = -1.0  # -1: no sample there, or not finite
+    before = u0 = -1.0  # -1: no sample there, or not finite
     i = first
     while i <= last and trans >= opaque:
         at = i - 1 if u0 >= 0.0 else i  # the segment that comes from there is still to be seen
@@ -73,24 +73,25 @@ def _classified(
         if start >= last:
             break
         if start > at:
-            u0, i = -1.0, start
+            before, u0, i = -1.0, -1.0, start
         t = t0 + i * dt
         sample_run(voxels, px + t * dx, py + t * dy, pz + t * dz, dx * dt, dy * dt, dz * dt, optics, run)
         if any_light(run, u0, optics.dark):
             for n in range(min(RUN, last + 1 - i)):
                 u1 = run[n]
-                low = min(u0, u1)
-                if low >= 0.0 and max(u0, u1) > optics.dark[U(int(low))]:
+                met = values_met(before, u0, u1)
+                if met[0] >= 0.0 and met[1] > optics.dark[U(int(met[0]))]:
+                    here = t + (n - 1) * dt
                     if light is None:
-                        seen, trans = composite(u0, u1, dt, optics, seen, trans)
+                        seen, trans = pass_segment(voxels, optics, p, d, here, dt, u0, u1, met, seen, trans)
                     else:
-                        own, trans = composite(u0, u1, dt, optics, zeros4(), trans)
+                        own, trans = pass_segment(voxels, optics, p, d, here, dt, u0, u1, met, zeros4(), trans)
                         r, g, b_ = _lit(own, light, voxels.values, p, d, t + (n - 0.5) * dt)
                         red, green, blue = red + r, green + g, blue + b_
                     if trans < opaque:
                         break
-                u0 = u1
-        u0 = run[RUN - 1]
+                before, u0 = u0, u1
+        before, u0 = run[RUN - 2], run[RUN - 1]
         i += RUN
     if light is None:
         red, green, blue = lane(seen, 0), lane(seen, 1), lane(seen, 2)

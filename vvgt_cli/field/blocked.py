@@ -314,6 +314,7 @@ class Blocked:
         optics = build_tables(
             tf, (numbers.lo, numbers.hi), slope=rule.slope, intercept=rule.intercept,
             unit_distance=source.unit_distance, world_per_unit=1 / frame.scale,
+            voxel=float(np.mean(frame.step)),
         )  # fmt: skip
         middles = (numbers.edges[1:] + numbers.edges[:-1]) / 2
         visible = float(numbers.histogram[tf.opacity(middles) > 0].sum())

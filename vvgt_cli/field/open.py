@@ -181,6 +181,7 @@ def _reader(source: Source, access: Counted) -> tuple[Reader, float]:
         optics = build_tables(
             source.tf, (numbers.lo, numbers.hi), slope=rule.slope, intercept=rule.intercept,
             unit_distance=source.unit_distance, world_per_unit=1 / frame.scale,
+            voxel=float(np.mean(frame.step)),
         )  # fmt: skip
         bricks, weights = task.samples()
         visible = estimate(visible_share(optics, rule.apply(bricks)), weights, volume.data.size)

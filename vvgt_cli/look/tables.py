@@ -12,6 +12,7 @@ from vvgt_cli.look.types import TransferFunctionLike
 MAX_OPACITY = 1 - 1e-5  # conventions: every integral has a limit
 MIN_BINS, MAX_BINS = 2048, 65536
 BESIDE = 4.0  # times the nodes' range that is tabulated on each side: a segment that enters it there begins outside
+FLAT = 0.4  # optical depth of a voxel's edge by which extinction may differ where a segment is no finer sampled
 BINS_PER_GAP = 8  # bins inside the narrowest gap between two nodes, where MAX_BINS allows
 
 
@@ -33,6 +34,7 @@ class Optics(NamedTuple):
         cumulative: (n + 1, 4) float64, integral over u of the same (trapezoid: exact for linear tau within a bin).
         dark: (n + 1,) float64, the u up to which extinction is zero from bin i on: [u0, u1] is transparent if and only
             if u1 <= dark[floor(u0)].
+        flat: (n + 1,) float64, the u up to which nodes differ by at most `FLAT` a voxel from bin i on.
     """
 
     lo: float
@@ -40,14 +42,15 @@ class Optics(NamedTuple):
     nodes: np.ndarray
     cumulative: np.ndarray
     dark: np.ndarray
+    flat: np.ndarray
 
     @classmethod
-    def of(cls, lo: float, inv_width: float, nodes: np.ndarray, cumulative: np.ndarray) -> Optics:
-        """Of everything but ``dark``, which follows from the nodes."""
+    def of(cls, lo: float, inv_width: float, nodes: np.ndarray, cumulative: np.ndarray, voxel: float = 1.0) -> Optics:
+        """Of everything but what follows from the nodes; ``voxel``: mean edge, unit-frame lengths."""
         count = len(nodes)
         positive = np.where(nodes[:, 3] > 0, np.arange(count), count + 1)
         dark = np.minimum.accumulate(positive[::-1])[::-1] - 1.0
-        return cls(lo, inv_width, nodes, cumulative, np.ascontiguousarray(dark))
+        return cls(lo, inv_width, nodes, cumulative, np.ascontiguousarray(dark), _flat_until(nodes, FLAT / voxel))
 
     @classmethod
     def linear(cls, top: float) -> Optics:
@@ -68,6 +71,23 @@ class Optics(NamedTuple):
         return float(self.nodes[:, 3].max())
 
 
+def _flat_until(nodes: np.ndarray, most: float) -> np.ndarray:
+    """The last node (n + 1,) float64 up to which, from each one on, no column differs by more than ``most``."""
+    count = len(nodes)
+    levels = [(nodes.T, nodes.T)]  # smallest and largest of windows of 1, 2, 4, ... nodes
+    while 2 << (len(levels) - 1) <= count:
+        (low, high), half = levels[-1], 1 << (len(levels) - 1)
+        levels.append((np.minimum(low[:, :-half], low[:, half:]), np.maximum(high[:, :-half], high[:, half:])))
+    at, least, largest = np.arange(count), nodes.T, nodes.T
+    for k, (low, high) in reversed(list(enumerate(levels))):
+        first = np.minimum(at + 1, low.shape[1] - 1)
+        below, above = np.minimum(least, low[:, first]), np.maximum(largest, high[:, first])
+        further = (at + 1 < low.shape[1]) & ((above - below).max(axis=0) <= most)
+        least, largest = np.where(further, below, least), np.where(further, above, largest)
+        at = np.where(further, at + (1 << k), at)
+    return at.astype(np.float64)
+
+
 def _bin_count(tf: TransferFunctionLike, lo: float, hi: float) -> int:
     nodes = np.asarray(getattr(tf, "breakpoints", tf.node_range)(), np.float64)
     gaps = np.diff(np.unique(np.clip(nodes, lo, hi)))
@@ -84,11 +104,13 @@ def build_tables(
     intercept: float = 0.0,
     unit_distance: float,
     world_per_unit: float,
+    voxel: float = 1.0,
     bins: int | None = None,
 ) -> Optics:
     """Tabulate ``tf`` over the part of ``value_range`` (data values) in which it is not constant, and `BESIDE`.
 
-    ``unit_distance`` is in world units, ``world_per_unit`` the world length of one unit-frame length.
+    ``unit_distance`` is in world units, ``world_per_unit`` the world length of one unit-frame length,
+    ``voxel`` a voxel's mean edge in the latter.
     """
     first, last = tf.node_range()
     lo, hi = max(value_range[0], first), min(value_range[1], last)
@@ -105,4 +127,4 @@ def build_tables(
     nodes = np.concatenate([tf.color(x) * tau[:, None], tau[:, None]], axis=1)
     cumulative = np.zeros_like(nodes)
     np.cumsum(0.5 * (nodes[1:] + nodes[:-1]), axis=0, out=cumulative[1:])
-    return Optics.of((lo - intercept) / slope, slope * count / (hi - lo), nodes, cumulative)
+    return Optics.of((lo - intercept) / slope, slope * count / (hi - lo), nodes, cumulative, voxel)
