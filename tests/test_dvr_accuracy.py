@@ -15,6 +15,7 @@ from vvgt_cli.dvr.reference import march, trilinear
 from vvgt_cli.dvr.runs import RUN, sample_run, stack_run
 from vvgt_cli.look.colormap import ColorMap
 from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.look.lighting import Lighting
 from vvgt_cli.look.opacity import PiecewiseOpacity
 from vvgt_cli.volume import Volume
 
@@ -127,6 +128,22 @@ def test_stiff_functions_stay_bounded_whatever_comes_together(per_voxel, edge, f
     fine = render_view(scene, camera, RenderSettings(step=1 / 64, samples=1))
     # Noise between neighbouring voxels under a step function: surfaces shift by up to step^2 / 8 of the curvature.
     assert np.abs(image - fine).mean() < 0.01 * max(fine.max(), 1e-12)
+
+
+@pytest.mark.parametrize("light", [None, Lighting()], ids=["unlit", "lit"])
+@pytest.mark.parametrize("name", ["surface", "shell"])
+def test_surfaces_between_samples_are_found(name, light):
+    """Those of a step, which rays graze, and of a shell that is thinner than a step."""
+    x, opacity = {
+        "surface": ([0, 0.4, 0.401, 1], [0, 0, 1, 1]),
+        "shell": ([0, 0.4, 0.405, 0.41, 1], [0, 0, 0.9, 0, 0]),
+    }[name]
+    scene = Scene.build(Volume(smooth(24)), function(x, opacity), 0.3)
+    scene = scene if light is None else scene.lit(light)
+    camera = look_at((2.2, -1.4, 1.3), target=(0, 0, 0), width=160, height=160)
+    fine = render_view(scene, camera, RenderSettings(step=1 / 64, samples=1))
+    image = render_view(scene, camera, RenderSettings(samples=1))
+    assert -10 * math.log10(((image - fine) ** 2).mean()) > 55  # 39 to 50 by what lies at the ends of a step alone
 
 
 # u is the stored value

@@ -13,7 +13,7 @@ from vvgt_cli.dvr import RenderSettings, Scene, render_view
 from vvgt_cli.dvr.layout import BRICK, Voxels
 from vvgt_cli.dvr.runs import sample_run, stack_run
 from vvgt_cli.dvr.scene import kernel_type, kernel_values
-from vvgt_cli.look.tables import MAX_OPACITY, build_tables, extinction
+from vvgt_cli.look.tables import FLAT, MAX_OPACITY, build_tables, extinction
 from vvgt_cli.volume import Volume
 
 TYPES = ["b1", "u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f2", "f4", "f8"]
@@ -195,6 +195,21 @@ def test_dark_spans_are_where_extinction_vanishes():
     for first in range(80):
         for last in range(first + 1, 81):
             assert (tau[first : last + 1] > 0).any() == (last > tables.dark[first])
+
+
+def test_spans_are_flat_up_to_a_difference_of_extinction_or_colour():
+    class Bumps(Ramp):
+        def opacity(self, x):
+            return np.interp(x, [0, 2, 2.1, 3, 4, 6, 8, 10], [0, 0, 0.3, 0.34, 0.9, 0.9, 0.6, 0.6])
+
+    for voxel in (0.5, 2.0, 8.0):
+        tables = build_tables(Bumps(0, 10), (0, 10), unit_distance=1, world_per_unit=1, bins=80, voxel=voxel)
+        ends = []
+        for first in range(81):
+            spans = [np.ptp(tables.nodes[first : last + 1], axis=0).max() for last in range(first, 81)]
+            ends.append(first + sum(span * voxel <= FLAT for span in spans) - 1)
+        assert tables.flat.tolist() == ends
+        assert len(set(ends)) > 3
 
 
 def test_extinction_is_capped_where_opacity_is_one():

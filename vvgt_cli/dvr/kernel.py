@@ -24,7 +24,7 @@ SUB_DEPTH = 1.0  # optical depth of a sub-segment: colour is constant within one
 PARTS = 32  # the most sub-segments; at the largest extinctions what lies behind the first few is not seen
 FINER = 8  # parts of a segment along which extinction is not flat
 BEND = 0.5  # times the second difference of samples: by how much the scalar leaves the line between two of them
-AROUND = 0.5  # times the range of a run: how near to something visible it is looked at
+AROUND = 1.0  # times the range of a run: how near to something visible it is looked at
 TILE = 16  # pixels along the edge of a tile: its rays share what they read
 FLAGS = {"contract", "nsz", "arcp", "afn"}  # no nnan/ninf: non-finite voxels are data
 
@@ -167,25 +167,28 @@ def values_met(before: float, u0: float, u1: float) -> tuple[float, float]:
 def pass_segment(
     voxels: Voxels, optics: Optics, p: Vector, d: Vector, t: float, dt: float, u0: float, u1: float,
     met: tuple[float, float], light: Quad, trans: float,
-) -> tuple[Quad, float]:  # fmt: skip
+) -> tuple[Quad, float, float]:  # fmt: skip
     """`composite` of the segment from t to t + dt of the ray p + t d; in `FINER` parts if extinction is not flat.
 
-    ``met``: `values_met`.
+    ``met``: `values_met`. Last is the t at which, on average, the segment absorbs.
     """
     low, high = met
     if high <= optics.flat[U(int(low))]:
-        return composite(u0, u1, dt, optics, light, trans)
+        light, trans = composite(u0, u1, dt, optics, light, trans)
+        return light, trans, t + 0.5 * dt
     (px, py, pz), (dx, dy, dz), part = p, d, dt / FINER
-    a = u0
+    a, whole, place = u0, trans, 0.0
     for n in range(1, FINER + 1):
         s = t + n * part
         b = u1
         if n < FINER:
             b = table_coordinate(sample(voxels.values, px + s * dx, py + s * dy, pz + s * dz), optics)
         if min(a, b) >= 0.0 and max(a, b) > optics.dark[U(int(min(a, b)))]:
+            ahead = trans
             light, trans = composite(a, b, part, optics, light, trans)
+            place += (ahead - trans) * (n - 0.5)
         a = b
-    return light, trans
+    return light, trans, t + part * place / (whole - trans) if whole > trans else t + 0.5 * dt
 
 
 @_jit
@@ -289,7 +292,7 @@ def cast(
         if start > count:
             return lane(seen, 0), lane(seen, 1), lane(seen, 2), 1.0 - trans
         if start > at:
-            before, u0, i = -1.0, -1.0, start
+            before, u0, i = -1.0, -1.0, max(start - 1, 0)  # one earlier, for what bends the next
         t = t0 + i * dt
         sample_run(voxels, px + t * dx, py + t * dy, pz + t * dz, dx * dt, dy * dt, dz * dt, optics, run)
         if any_light(run, u0, optics.dark):
@@ -297,7 +300,7 @@ def cast(
                 u1 = run[n]
                 met = values_met(before, u0, u1)
                 if met[0] >= 0.0 and met[1] > optics.dark[U(int(met[0]))]:
-                    seen, trans = pass_segment(voxels, optics, p, d, t + (n - 1) * dt, dt, u0, u1, met, seen, trans)
+                    seen, trans, _ = pass_segment(voxels, optics, p, d, t + (n - 1) * dt, dt, u0, u1, met, seen, trans)
                     if trans < opaque:
                         return lane(seen, 0), lane(seen, 1), lane(seen, 2), 1.0 - trans
                 before, u0 = u0, u1

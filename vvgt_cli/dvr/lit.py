@@ -1,4 +1,4 @@
-"""The numba ray caster under light: `kernel.cast` with every visible segment shaded at its middle (docs/light.md)."""
+"""The numba ray caster under light: `kernel.cast` with every visible segment shaded where it absorbs (docs/light.md)."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def cast(
         if start > count:
             return red, green, blue, 1.0 - trans
         if start > at:
-            before, u0, i = -1.0, -1.0, start
+            before, u0, i = -1.0, -1.0, max(start - 1, 0)  # one earlier, for what bends the next
         t = t0 + i * dt
         sample_run(voxels, px + t * dx, py + t * dy, pz + t * dz, dx * dt, dy * dt, dz * dt, optics, run)
         if any_light(run, u0, optics.dark):
@@ -73,8 +73,9 @@ def cast(
                 u1 = run[n]
                 met = values_met(before, u0, u1)
                 if met[0] >= 0.0 and met[1] > optics.dark[U(int(met[0]))]:
-                    seen, trans = pass_segment(voxels, optics, p, d, t + (n - 1) * dt, dt, u0, u1, met, zeros4(), trans)
-                    s = t + (n - 0.5) * dt
+                    seen, trans, s = pass_segment(
+                        voxels, optics, p, d, t + (n - 1) * dt, dt, u0, u1, met, zeros4(), trans
+                    )
                     factor, white = shading(
                         voxels.values, light, px + s * dx, py + s * dy, pz + s * dz, ux, uy, uz
                     )  # fmt: skip

@@ -66,27 +66,27 @@ def _classified(
     opaque = OPAQUE * min(step * step, 1.0)
     ix, iy, iz, per_step = inverse(dx), inverse(dy), inverse(dz), 1.0 / dt
     before = u0 = -1.0  # -1: no sample there, or not finite
-    i = first
+    i = max(first - 1, 0)
     while i <= last and trans >= opaque:
         at = i - 1 if u0 >= 0.0 else i  # the segment that comes from there is still to be seen
         start = skip(voxels.values.shape, empty, px, py, pz, dx, dy, dz, ix, iy, iz, t0, dt, per_step, last, at)
         if start >= last:
             break
         if start > at:
-            before, u0, i = -1.0, -1.0, start
+            before, u0, i = -1.0, -1.0, max(start - 1, 0)  # one earlier, for what bends the next
         t = t0 + i * dt
         sample_run(voxels, px + t * dx, py + t * dy, pz + t * dz, dx * dt, dy * dt, dz * dt, optics, run)
         if any_light(run, u0, optics.dark):
             for n in range(min(RUN, last + 1 - i)):
                 u1 = run[n]
                 met = values_met(before, u0, u1)
-                if met[0] >= 0.0 and met[1] > optics.dark[U(int(met[0]))]:
+                if i + n > first and met[0] >= 0.0 and met[1] > optics.dark[U(int(met[0]))]:
                     here = t + (n - 1) * dt
                     if light is None:
-                        seen, trans = pass_segment(voxels, optics, p, d, here, dt, u0, u1, met, seen, trans)
+                        seen, trans, _ = pass_segment(voxels, optics, p, d, here, dt, u0, u1, met, seen, trans)
                     else:
-                        own, trans = pass_segment(voxels, optics, p, d, here, dt, u0, u1, met, zeros4(), trans)
-                        r, g, b_ = _lit(own, light, voxels.values, p, d, t + (n - 0.5) * dt)
+                        own, trans, s = pass_segment(voxels, optics, p, d, here, dt, u0, u1, met, zeros4(), trans)
+                        r, g, b_ = _lit(own, light, voxels.values, p, d, s)
                         red, green, blue = red + r, green + g, blue + b_
                     if trans < opaque:
                         break
