@@ -1,4 +1,4 @@
-"""The numba ray caster under light: `kernel.cast` with every visible segment shaded where it absorbs (docs/light.md)."""
+"""The numba ray caster under light: `kernel.cast`, each visible segment shaded where it absorbs (docs/light.md)."""
 
 from __future__ import annotations
 
@@ -76,14 +76,15 @@ def cast(
                     seen, trans, s = pass_segment(
                         voxels, optics, p, d, t + (n - 1) * dt, dt, u0, u1, met, zeros4(), trans
                     )
-                    factor, white = shading(
-                        voxels.values, light, px + s * dx, py + s * dy, pz + s * dz, ux, uy, uz
-                    )  # fmt: skip
                     most = lane(seen, 3)
-                    white *= most
-                    red += min(factor * lane(seen, 0) + white, most)
-                    green += min(factor * lane(seen, 1) + white, most)
-                    blue += min(factor * lane(seen, 2) + white, most)
+                    if most > 0.0:
+                        factor, white = shading(
+                            voxels.values, light, px + s * dx, py + s * dy, pz + s * dz, ux, uy, uz
+                        )  # fmt: skip
+                        white *= most
+                        red += min(factor * lane(seen, 0) + white, most)
+                        green += min(factor * lane(seen, 1) + white, most)
+                        blue += min(factor * lane(seen, 2) + white, most)
                     if trans < opaque:
                         return red, green, blue, 1.0 - trans
                 before, u0 = u0, u1

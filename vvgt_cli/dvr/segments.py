@@ -86,8 +86,9 @@ def _classified(
                         seen, trans, _ = pass_segment(voxels, optics, p, d, here, dt, u0, u1, met, seen, trans)
                     else:
                         own, trans, s = pass_segment(voxels, optics, p, d, here, dt, u0, u1, met, zeros4(), trans)
-                        r, g, b_ = _lit(own, light, voxels.values, p, d, s)
-                        red, green, blue = red + r, green + g, blue + b_
+                        if lane(own, 3) > 0.0:
+                            r, g, b_ = _lit(own, light, voxels.values, p, d, s)
+                            red, green, blue = red + r, green + g, blue + b_
                     if trans < opaque:
                         break
                 before, u0 = u0, u1
