@@ -31,18 +31,9 @@ _jit = inlined(fastmath=FLAGS, error_model="numpy", **BORROWED)
 
 @_jit
 def cast(
-    voxels: Voxels,
-    optics: Optics,
-    empty: np.ndarray,
-    light: Light,
-    px: float,
-    py: float,
-    pz: float,
-    dx: float,
-    dy: float,
-    dz: float,
-    step: float,
-) -> tuple[float, float, float, float]:
+    voxels: Voxels, optics: Optics, empty: np.ndarray, light: Light, px: float, py: float, pz: float, dx: float,
+    dy: float, dz: float, step: float,
+) -> tuple[float, float, float, float]:  # fmt: skip
     """`kernel.cast` under ``light`` (`Light`); no colour of a sample exceeds 1."""
     nz, ny, nx = voxels.values.shape
     run = stack_run()
