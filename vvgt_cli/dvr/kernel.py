@@ -24,7 +24,7 @@ SUB_DEPTH = 1.0  # optical depth of a sub-segment: colour is constant within one
 PARTS = 32  # the most sub-segments; at the largest extinctions what lies behind the first few is not seen
 FINER = 8  # parts of a segment along which extinction is not flat
 BEND = 0.5  # times the second difference of samples: by how much the scalar leaves the line between two of them
-AROUND = 1.0  # times the range of a run: how near to something visible it is looked at
+AROUND = 0.25  # times the range of a run: how near to something visible it is looked at
 TILE = 16  # pixels along the edge of a tile: its rays share what they read
 FLAGS = {"contract", "nsz", "arcp", "afn"}  # no nnan/ninf: non-finite voxels are data
 

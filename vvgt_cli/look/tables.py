@@ -12,7 +12,7 @@ from vvgt_cli.look.types import TransferFunctionLike
 MAX_OPACITY = 1 - 1e-5  # conventions: every integral has a limit
 MIN_BINS, MAX_BINS = 2048, 65536
 BESIDE = 4.0  # times the nodes' range that is tabulated on each side: a segment that enters it there begins outside
-FLAT = 0.6  # optical depth of a voxel's edge by which extinction may differ where a segment is no finer sampled
+FLAT = 2.0  # optical depth of a voxel's edge by which extinction may differ where a segment is no finer sampled
 BINS_PER_GAP = 8  # bins inside the narrowest gap between two nodes, where MAX_BINS allows
 
 
