@@ -23,6 +23,7 @@ OPAQUE = 1e-3  # times step^2, as the error of integration goes: the transmittan
 SUB_DEPTH = 1.0  # optical depth of a sub-segment: colour is constant within one; 0.3 is no more accurate
 PARTS = 32  # the most sub-segments; at the largest extinctions what lies behind the first few is not seen
 FINER = 8  # parts of a segment along which extinction is not flat
+FAINT = 0.05  # transmittance behind which no segment is sampled finer
 BEND = 0.5  # times the second difference of samples: by how much the scalar leaves the line between two of them
 AROUND = 0.25  # times the range of a run: how near to something visible it is looked at
 TILE = 16  # pixels along the edge of a tile: its rays share what they read
@@ -151,14 +152,22 @@ def composite(u0: float, u1: float, dt: float, optics: Optics, light: Quad, tran
 
 
 @_jit
-def values_met(before: float, u0: float, u1: float) -> tuple[float, float]:
-    """Table coordinates that a segment from u0 to u1 meets, about; (-1, -1) where an end is not finite.
+def is_flat(optics: Optics) -> bool:
+    """Whether no segment needs finer samples: the whole function is flat."""
+    end: float = optics.flat[0]
+    return end >= optics.flat.shape[0] - 1
 
-    The scalar is no line between samples. Its bend follows from the sample ``before`` (-1: none).
+
+@_jit
+def values_met(before: float, u0: float, u1: float, flat: bool) -> tuple[float, float]:
+    """Table coordinates that a segment from u0 to u1 meets, about; below 0 where an end is not finite.
+
+    The scalar is no line between samples, which matters unless the function is ``flat``. Its bend follows from the
+    sample ``before`` (-1: none).
     """
     low, high = min(u0, u1), max(u0, u1)
-    if low < 0.0:
-        return -1.0, -1.0
+    if flat or low < 0.0:
+        return low, high
     bend = BEND * abs(u1 - 2.0 * u0 + before) if before >= 0.0 else 0.0
     return max(low - bend, 0.0), high + bend
 
@@ -172,8 +181,7 @@ def pass_segment(
 
     ``met``: `values_met`. Last is the t at which, on average, the segment absorbs.
     """
-    low, high = met
-    if high <= optics.flat[U(int(low))]:
+    if trans < FAINT or is_flat(optics) or met[1] <= optics.flat[U(int(met[0]))]:
         light, trans = composite(u0, u1, dt, optics, light, trans)
         return light, trans, t + 0.5 * dt
     (px, py, pz), (dx, dy, dz), part = p, d, dt / FINER
@@ -256,14 +264,14 @@ def skip(
 
 
 @_jit
-def any_light(run: Run, u0: float, dark: np.ndarray) -> bool:
+def any_light(run: Run, u0: float, dark: np.ndarray, flat: bool) -> bool:
     """Whether some segment of a run (RUN,) that comes from u0 (-1: none) may have extinction, or nearly so."""
     lowest: float
     highest: float
     lowest, highest = run_range(run)
     if u0 >= 0.0:
         lowest, highest = min(lowest, u0), max(highest, u0)
-    around = AROUND * (highest - lowest)
+    around = 0.0 if flat else AROUND * (highest - lowest)
     return lowest < 0.0 or highest + around > dark[U(int(max(lowest - around, 0.0)))]
 
 
@@ -283,7 +291,7 @@ def cast(
     dt = (t1 - t0) / count
     opaque = OPAQUE * min(step * step, 1.0)
     ix, iy, iz, per_step = inverse(dx), inverse(dy), inverse(dz), 1.0 / dt
-    p, d = (px, py, pz), (dx, dy, dz)
+    p, d, flat = (px, py, pz), (dx, dy, dz), is_flat(optics)
     before = u0 = -1.0  # -1: no sample there, or not finite
     i = 0
     while True:
@@ -295,10 +303,10 @@ def cast(
             before, u0, i = -1.0, -1.0, max(start - 1, 0)  # one earlier, for what bends the next
         t = t0 + i * dt
         sample_run(voxels, px + t * dx, py + t * dy, pz + t * dz, dx * dt, dy * dt, dz * dt, optics, run)
-        if any_light(run, u0, optics.dark):
+        if any_light(run, u0, optics.dark, flat):
             for n in range(min(RUN, count + 1 - i)):
                 u1 = run[n]
-                met = values_met(before, u0, u1)
+                met = values_met(before, u0, u1, flat)
                 if met[0] >= 0.0 and met[1] > optics.dark[U(int(met[0]))]:
                     seen, trans, _ = pass_segment(voxels, optics, p, d, t + (n - 1) * dt, dt, u0, u1, met, seen, trans)
                     if trans < opaque:

@@ -46,7 +46,7 @@ def cast(
     dt = (t1 - t0) / count
     opaque = OPAQUE * min(step * step, 1.0)
     ix, iy, iz, per_step = inverse(dx), inverse(dy), inverse(dz), 1.0 / dt
-    p, d = (px, py, pz), (dx, dy, dz)
+    p, d, flat = (px, py, pz), (dx, dy, dz), is_flat(optics)
     ux, uy, uz = dx * light.edge[0], dy * light.edge[1], dz * light.edge[2]
     before = u0 = -1.0  # -1: no sample there, or not finite
     i = 0
@@ -59,10 +59,10 @@ def cast(
             before, u0, i = -1.0, -1.0, max(start - 1, 0)  # one earlier, for what bends the next
         t = t0 + i * dt
         sample_run(voxels, px + t * dx, py + t * dy, pz + t * dz, dx * dt, dy * dt, dz * dt, optics, run)
-        if any_light(run, u0, optics.dark):
+        if any_light(run, u0, optics.dark, flat):
             for n in range(min(RUN, count + 1 - i)):
                 u1 = run[n]
-                met = values_met(before, u0, u1)
+                met = values_met(before, u0, u1, flat)
                 if met[0] >= 0.0 and met[1] > optics.dark[U(int(met[0]))]:
                     seen, trans, s = pass_segment(
                         voxels, optics, p, d, t + (n - 1) * dt, dt, u0, u1, met, zeros4(), trans

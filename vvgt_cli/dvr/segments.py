@@ -15,7 +15,18 @@ import numpy as np
 
 from vvgt_cli.dvr.grid import composite as mixed
 from vvgt_cli.dvr.grid import texel_at
-from vvgt_cli.dvr.kernel import FLAGS, OPAQUE, U, any_light, box_span, inverse, pass_segment, skip, values_met
+from vvgt_cli.dvr.kernel import (
+    FLAGS,
+    OPAQUE,
+    U,
+    any_light,
+    box_span,
+    inverse,
+    is_flat,
+    pass_segment,
+    skip,
+    values_met,
+)
 from vvgt_cli.dvr.layout import GRID, LIT, LIT_GRID, TUPLES, Light, Optics, Texels, Voxels
 from vvgt_cli.dvr.runs import BORROWED, RUN, sample_run, stack_run
 from vvgt_cli.dvr.shading import shading
@@ -61,7 +72,7 @@ def _classified(
     ``p`` in voxels of the block; segment i goes from t0 + i dt on. ``light`` (`Light`) or None.
     """
     (px, py, pz), (dx, dy, dz) = p, d
-    run, seen = stack_run(), zeros4()
+    run, seen, flat = stack_run(), zeros4(), is_flat(optics)
     trans, red, green, blue = 1.0, 0.0, 0.0, 0.0
     opaque = OPAQUE * min(step * step, 1.0)
     ix, iy, iz, per_step = inverse(dx), inverse(dy), inverse(dz), 1.0 / dt
@@ -76,10 +87,10 @@ def _classified(
             before, u0, i = -1.0, -1.0, max(start - 1, 0)  # one earlier, for what bends the next
         t = t0 + i * dt
         sample_run(voxels, px + t * dx, py + t * dy, pz + t * dz, dx * dt, dy * dt, dz * dt, optics, run)
-        if any_light(run, u0, optics.dark):
+        if any_light(run, u0, optics.dark, flat):
             for n in range(min(RUN, last + 1 - i)):
                 u1 = run[n]
-                met = values_met(before, u0, u1)
+                met = values_met(before, u0, u1, flat)
                 if i + n > first and met[0] >= 0.0 and met[1] > optics.dark[U(int(met[0]))]:
                     here = t + (n - 1) * dt
                     if light is None:
