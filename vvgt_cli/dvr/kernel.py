@@ -154,8 +154,8 @@ def composite(u0: float, u1: float, dt: float, optics: Optics, light: Quad, tran
 @_jit
 def is_flat(optics: Optics) -> bool:
     """Whether no segment needs finer samples: the whole function is flat."""
-    end: float = optics.flat[0]
-    return end >= optics.flat.shape[0] - 1
+    found: bool = optics.flat[0] >= optics.flat.shape[0] - 1
+    return found
 
 
 @_jit

@@ -15,6 +15,7 @@ from vvgt_cli.dvr.kernel import (
     any_light,
     box_span,
     inverse,
+    is_flat,
     pass_segment,
     skip,
     tiles_of,
