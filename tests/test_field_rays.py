@@ -25,12 +25,17 @@ from vvgt_cli.field.settings import BlockOptions
 from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.gaussians import read_ply
 from vvgt_cli.images.metrics import score_views
+from vvgt_cli.look.colormap import ColorMap
+from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.lighting import LightOptions
+from vvgt_cli.look.opacity import PiecewiseOpacity
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
 from vvgt_cli.splat import render
 from vvgt_cli.volume import Volume
 
+ENDS = np.array([0.0, 120.0, 121.0, 255.0])
+STEEP = TransferFunction("step", PiecewiseOpacity(ENDS, np.array([0.0, 0, 1, 1])), ColorMap(ENDS, np.ones((4, 3))))
 LIT = LightOptions(lights=("1,1,2", "headlight"), shadows=True, occlusion=0.2)
 
 
@@ -65,7 +70,9 @@ def views():
 KINDS = {
     "scalars": (SourceRequest(volume_of((70, 61, 50))), 3e-3),
     "anisotropic": (SourceRequest(volume_of((70, 61, 50), (0.6, 1.0, 2.1))), 3e-3),
+    "steep": (SourceRequest(volume_of((70, 61, 50)), tf=STEEP), 3e-3),
     "lit": (SourceRequest(volume_of((50, 61, 40)), light=LIT), 3e-3),
+    "steep, lit": (SourceRequest(volume_of((50, 61, 40)), tf=STEEP, light=LIT), 3e-3),
     "labels": (SourceRequest(labels_of((50, 61, 40)), labels="auto"), 3e-3),
     "labels, lit": (SourceRequest(labels_of((50, 61, 40)), labels="auto", light=LIT), 3e-3),
 }

@@ -74,6 +74,8 @@ class Optics(NamedTuple):
 def _flat_until(nodes: np.ndarray, most: float) -> np.ndarray:
     """The last node (n + 1,) float64 up to which, from each one on, no column differs by more than ``most``."""
     count = len(nodes)
+    if (np.ptp(nodes, axis=0) <= most).all():
+        return np.full(count, count - 1.0)
     levels = [(nodes.T, nodes.T)]  # smallest and largest of windows of 1, 2, 4, ... nodes
     while 2 << (len(levels) - 1) <= count:
         (low, high), half = levels[-1], 1 << (len(levels) - 1)
