@@ -38,7 +38,7 @@ from vvgt_cli.gaussians.rules import INRIA, Rule
 from vvgt_cli.splat import render
 
 MAX_BASE_CELLS = 5_000_000  # an upper bound: half of them are there, as a rule; 104 bytes each, twice for the pyramid
-CELLS_A_GAUSSIAN, FEW_CELLS = 256, 500_000  # more are of no use to a small budget, but so many cost nothing
+CELLS_A_GAUSSIAN, FEW_CELLS = 40, 500_000  # at most: more gain less than steps do in their time
 OF_VALUES = 20  # cells a Gaussian that stands for any function, which is seldom small (5: -1 dB)
 FINEST = -2  # cells of a quarter voxel at most
 MIN_CELL = 1.2  # pixels: a smaller base cell cannot be told from its neighbours
