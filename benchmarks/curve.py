@@ -1,59 +1,41 @@
-r"""Error against seconds of refinement, of one state of the code beside another: CSV and plot.
+r"""Error against seconds of conversions with more and more steps, of one state of the code beside another: CSV, plot.
 
-    PYTHONPATH=. NUMBA_NUM_THREADS=1 python benchmarks/curve.py measure SCENES.tsv DATA_DIR TF_DIR \
-        --label after -o docs/curve.csv
+    PYTHONPATH=. NUMBA_NUM_THREADS=1 python benchmarks/curve.py measure SCENES.tsv DATA_DIR TF_DIR FOLDER --label after
+    PYTHONPATH=. python benchmarks/curve.py score SCENES.tsv DATA_DIR TF_DIR FOLDER -o docs/curve.csv
     PYTHONPATH=. python benchmarks/curve.py plot docs/curve.csv -o docs/curve.png
 
-`measure` converts each scene up to its views and cells, then refines from there with each number of steps in turn. For
-the other state, run the same program with `PYTHONPATH` at its checkout and another `--label`: rows are added to the
-file. Seconds are those of the processor: before the steps, and of them with their looks at the check views, whose mean
-dB is given. `--only SCENE` measures one scene; what follows `--` are options of `vvgt convert`.
+`measure` runs `vvgt convert --steps N` for each scene and number of steps, and leaves the files in FOLDER with the
+processor's seconds of the command but for its start; its scores, 1 to 2 s, are in them. For the other state, run the
+same program with `PYTHONPATH` at its checkout and another `--label`. `score` judges the files of all states alike: dB
+of ten test views, cast at 1/8 voxel. `--only SCENE` measures one scene.
 """
 
 from __future__ import annotations
 
 import csv
 import shlex
-import tempfile
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import click
 from closed_form import scene_rows
-from dvr_scenes import write_rows
+from dvr_scenes import read_scenes, write_rows
 
 from vvgt_cli.cli.main import run
-from vvgt_cli.conversion.stage import Work
-from vvgt_cli.conversion.stages import refinement
 
-STEPS = (28, 56, 112, 240)
-TITLE = "dB on check views against processor seconds, one thread"
+STEPS, SIZE = (28, 56, 112, 240), 1080
+TITLE = "dB on test views against processor seconds of a conversion, one thread"
 
 
-def curve(call: list[str], counts: tuple[int, ...]) -> list[dict[str, Any]]:
-    """Rows of the conversion ``vvgt convert CALL``, refined with each of ``counts`` steps."""
-    rows: list[dict[str, Any]] = []
-    began = time.process_time()
-    usual = refinement.Refinement.run
-
-    def each(stage: refinement.Refinement, work: Work) -> None:
-        start, before = work.made(), time.process_time() - began
-        rows.append({"steps": 0, "before": before, "seconds": 0.0, "psnr": work.psnr(start)})
-        usual(replace(stage, most=1), work)  # loads kernels
-        for count in counts:
-            work.gaussians = start
-            since = time.process_time()
-            usual(replace(stage, most=count), work)
-            seconds = time.process_time() - since
-            rows.append({"steps": count, "before": before, "seconds": seconds, "psnr": work.psnr(work.made())})
-
-    with tempfile.TemporaryDirectory() as folder, mock.patch.object(refinement.Refinement, "run", each):
-        if run(["convert", *call, "-o", str(Path(folder) / "a.ply"), "-q"]):
-            raise SystemExit(1)
-    return rows
+def calls(paths: tuple[str, ...], only: tuple[str, ...] = ()) -> dict[str, list[str]]:
+    """Volume and options of each scene."""
+    found = {}
+    for name, volume, reading, function in scene_rows(Path(paths[0])):
+        if not only or name in only:
+            look = ["--tf", str(Path(paths[2]) / function), "--opacity-unit-distance", "mean-spacing"]
+            found[name] = [str(Path(paths[1]) / volume), *shlex.split(reading), *look]
+    return found
 
 
 def read_rows(path: str) -> list[dict[str, Any]]:
@@ -67,29 +49,68 @@ def main() -> None:
 
 
 @main.command()
-@click.argument("paths", nargs=-1)
-@click.option("-o", "--output", required=True)
+@click.argument("paths", nargs=3)
+@click.argument("folder")
 @click.option("--label", required=True)
 @click.option("--only", multiple=True)
-@click.option("--steps", multiple=True, type=int, default=STEPS)
-def measure(paths: tuple[str, ...], output: str, label: str, only: tuple[str, ...], steps: tuple[int, ...]) -> None:
-    """Add rows of one state of the code."""
-    listing, data, functions = map(Path, paths[:3])
-    rows = read_rows(output)
-    for name, volume, reading, function in scene_rows(listing):
-        if only and name not in only:
-            continue
-        call = [str(data / volume), *shlex.split(reading), "--tf", str(functions / function)]
-        call += ["--opacity-unit-distance", "mean-spacing", *paths[3:]]
-        rows += [{"scene": name, "label": label, **row} for row in curve(call, steps)]
-        write_rows(output, rows)
+@click.option("--steps", "counts", multiple=True, type=int, default=STEPS)
+def measure(paths: tuple[str, ...], folder: str, label: str, only: tuple[str, ...], counts: tuple[int, ...]) -> None:
+    """Files and seconds of one state of the code."""
+    Path(folder).mkdir(parents=True, exist_ok=True)
+    for name, call in calls(paths, only).items():
+        for count in (0, *counts):  # the first loads kernels
+            file = Path(folder) / f"{name}.{label}.{count}.ply"
+            began = time.process_time()
+            steps = ["--steps", str(count or 24), "--up", "none", "--threads", "1"]
+            if run(["convert", *call, *steps, "-o", str(file), "--overwrite", "-q"]):
+                raise SystemExit(1)
+            seconds = time.process_time() - began
+            file.with_suffix(".txt").write_text(f"{seconds:.4g}") if count else file.unlink()
+
+
+@main.command()
+@click.argument("paths", nargs=3)
+@click.argument("folder")
+@click.option("-o", "--output", required=True)
+def score(paths: tuple[str, ...], folder: str, output: str) -> None:
+    """The CSV of all that was measured."""
+    from vvgt_cli.dvr import RenderSettings, render_view
+    from vvgt_cli.gaussians import read_ply
+    from vvgt_cli.gaussians.rules import INRIA
+    from vvgt_cli.images.metrics import mean_scores
+    from vvgt_cli.score.views import score_seen, scored
+    from vvgt_cli.splat import render
+
+    fine = RenderSettings(step=1 / 8)
+    rows: list[dict[str, Any]] = []
+    for name, source in read_scenes(paths[0], paths[1], paths[2]):
+        scene = source.scene()
+        seen = [
+            (camera, part, render_view(scene, camera, fine, part)) for _, camera, part in scored(SIZE, perceptual=False)
+        ]
+        files = sorted(Path(folder).glob(f"{name}.*.ply"), key=lambda file: int(file.suffixes[-2][1:]))
+        for file in sorted(files, key=lambda file: file.suffixes[-3]):
+            made, _ = read_ply(file)
+            views = [
+                score_seen(there, render(made, camera, INRIA, blocks=part), part, whole=False, perceptual=False)
+                for camera, part, there in seen
+            ]
+            label, steps = (suffix[1:] for suffix in file.suffixes[-3:-1])
+            row = {
+                "scene": name,
+                "label": label,
+                "steps": steps,
+                "seconds": float(file.with_suffix(".txt").read_text()),
+            }
+            rows.append(row | {"psnr": mean_scores(views).psnr})
+            write_rows(output, rows)
 
 
 @main.command()
 @click.argument("path")
 @click.option("-o", "--output", required=True)
 def plot(path: str, output: str) -> None:
-    """A panel a scene, a line a label; seconds include those before the steps, the same for both."""
+    """A panel a scene, a line a label."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -103,11 +124,10 @@ def plot(path: str, output: str) -> None:
     for panel in panels.flat[len(scenes) :]:
         panel.set_axis_off()
     for panel, scene in zip(panels.flat, scenes, strict=False):
-        before = min(float(row["before"]) for row in rows if row["scene"] == scene)
         for label in dict.fromkeys(row["label"] for row in rows):
             own = [row for row in rows if (row["scene"], row["label"]) == (scene, label)]
-            seconds = [before + float(row["seconds"]) for row in own]
-            panel.plot(seconds, [float(row["psnr"]) for row in own], "o-", ms=3, label=label)
+            values = [float(row["psnr"]) for row in own]
+            panel.plot([float(row["seconds"]) for row in own], values, "o-", ms=3, label=label)
         panel.set_title(scene, fontsize=9)
     panels[0, 0].legend()
     figure.suptitle(TITLE, fontsize=10)

@@ -15,6 +15,7 @@ from vvgt_cli.gaussians.rules import INRIA
 from vvgt_cli.images.metrics import psnr
 from vvgt_cli.refine import OptimizeOptions, OptimizeRecord, optimize
 from vvgt_cli.refine.judge import FALLEN, Judge
+from vvgt_cli.refine.loop import spread_views
 from vvgt_cli.refine.shared import NONE
 from vvgt_cli.refine.states import Fields, OwnFrame
 from vvgt_cli.splat import render
@@ -195,6 +196,34 @@ def test_it_stops_when_told(scene):
     assert record.reason == "target"
     assert record.steps < 200
     assert record.psnr_after >= goal
+
+
+def test_views_in_a_row_are_far_apart_and_each_is_seen_once_a_round():
+    cameras = default_views("train", 96, size=32)
+    places = np.array([camera.position for camera in cameras])
+    places /= np.linalg.norm(places, axis=1, keepdims=True)
+    order = spread_views(cameras, 0)
+    found = [next(order) for _ in range(4 * 96)]
+    for start in range(0, len(found), 96):
+        assert sorted(found[start : start + 96]) == list(range(96))
+
+    def nearest(views):
+        """The smallest angle within eight views in a row, on average, radians."""
+        angles = np.arccos(np.clip(places[views] @ places[views].T, -1, 1)) + 9 * np.eye(len(views))
+        return np.mean([angles[k : k + 8, k : k + 8].min() for k in range(len(views) - 7)])
+
+    rng = np.random.default_rng(0)
+    assert nearest(found) > 1.6 * nearest(np.concatenate([rng.permutation(96) for _ in range(4)]))
+    other = spread_views(cameras, 1)
+    assert [next(other) for _ in range(8)] != found[:8]
+    again = spread_views(cameras, 0)
+    assert [next(again) for _ in range(len(found))] == found
+
+
+def test_views_from_one_place_are_taken_in_turn():
+    cameras = [replace(default_views("train", 1, size=32)[0], name=str(k)) for k in range(5)]
+    order = spread_views(cameras, 3)
+    assert sorted(next(order) for _ in range(5)) == list(range(5))
 
 
 def test_the_same_run_gives_the_same_bytes(scene):

@@ -160,6 +160,7 @@ def test_what_slopes_tell_of_all_is_that_of_the_twin(count):
     for n in (1, 2, 3):
         slopes = (rng.normal(size=(13, count)) * size).astype(np.float32)
         state.first[:], state.second[:], state.step = m, v, n
+        factor = state.shared.factor
         floors, _, weights = state.common(slopes)
         m, v = 0.6 * m + 0.4 * slopes, 0.999 * v + 0.001 * slopes.astype(np.float64) ** 2
     sizes = shared.sampled(np.sqrt(v / (1 - 0.999**3)))
@@ -170,8 +171,37 @@ def test_what_slopes_tell_of_all_is_that_of_the_twin(count):
     u = shared.sampled(m / (1 - 0.6**3)) / (sizes + exact[:, None])
     phi = shared.sampled(features(state.shared)[:count].T)
     square = phi @ phi.T
-    wanted = 7 * np.linalg.solve(square + 1e-3 * np.diag(np.diag(square)), phi @ u[[0, 1, 2, 3, 4, 5, 9, 10, 11, 12]].T)
+    wanted = factor * np.linalg.solve(
+        square + 1e-3 * np.diag(np.diag(square)), phi @ u[[0, 1, 2, 3, 4, 5, 9, 10, 11, 12]].T
+    )
     np.testing.assert_allclose(weights, wanted.T, atol=2e-4 * np.abs(wanted).max())
+
+
+def test_the_factor_grows_while_what_is_foretold_agrees_and_falls_where_it_turns():
+    """By the running cosine, float64, within bounds; where nothing is foretold it stays."""
+    g = many()
+    rng = np.random.default_rng(5)
+    way, noise = rng.normal(size=(2, 13, MANY)).astype(np.float32)
+    ends = {}
+    for name, turn, own in (("agrees", 1, 0.0), ("turns", -1, 0.0), ("half", 1, 0.7)):
+        found = shared.SharedSteps(shared.aligned(*parts(g)))
+        factors, plain = [found.factor], []
+        for n in range(60):
+            weights = found.weights(turn**n * (way + own * n * noise))
+            plain.append(weights.astype(np.float64) / factors[-1])
+            factors.append(found.factor)
+        mean, wanted = 0.52, 7.0
+        for before, now, factor in zip(plain[:-1], plain[1:], factors[2:], strict=True):
+            cosine = (before * now).sum() / np.sqrt((before**2).sum() * (now**2).sum())
+            mean = 0.8 * mean + 0.2 * cosine
+            wanted = min(max(wanted * np.exp(0.3 * (mean - 0.52)), 2.0), 14.0)
+            assert factor == pytest.approx(wanted, rel=1e-5)
+        ends[name] = found.factor
+    assert ends["agrees"] == 14
+    assert ends["turns"] == 2
+    still = shared.SharedSteps(shared.aligned(*parts(g)))
+    assert not still.weights(np.zeros((13, MANY), np.float32)).any()
+    assert still.factor == 7
 
 
 def test_weights_are_the_same_bytes_for_any_number_of_threads():

@@ -29,7 +29,7 @@ _FAULTS = (
     *(zipfile.BadZipFile, struct.error),
 )
 
-STEPPED = 2  # raised when the same start and options step otherwise
+STEPPED = 3  # raised when the same start and options step otherwise
 
 
 def fingerprint(gaussians: Gaussians, options: OptimizeOptions, *views: Any) -> str:

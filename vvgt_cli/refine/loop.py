@@ -24,6 +24,7 @@ SLOWER = 0.5  # rates after a fall
 LOOKS = 8  # at the check views in a run, where that leaves enough steps between two
 SETTLING = 0.5  # share of the run from which on looks without gain count: rates fall only then
 MEMORY = 0.9  # of the running error, a step
+NEAR, FORGOTTEN, LITTLE = 0.3, 0.9, 1e-3  # 1 - cosine between views that are near; what was seen, a step; among equals
 KEEP = 30.0  # seconds after which a run is kept, looks or not
 
 
@@ -45,7 +46,7 @@ def run(
     state = begin(gaussians, cameras, options, free)
     judge = Judge(state, check, record, options.judge)
     keep, course = _checkpoint(options, gaussians, (cameras, images), check, state, judge)
-    entered, order = time.perf_counter(), shuffled_views(len(cameras), options.seed)
+    entered, order = time.perf_counter(), spread_views(cameras, options.seed)
     if not record.checks:
         judge.measure(0.0)
         record.psnr_before = judge.best
@@ -147,11 +148,23 @@ def step(
     return error
 
 
-def shuffled_views(count: int, seed: int) -> Iterator[int]:
-    """All views in random order, then again in another."""
-    rng = np.random.default_rng(seed)
+def spread_views(cameras: Sequence[Camera], seed: int) -> Iterator[int]:
+    """All views, then all again, each from where fewest of the last ones were seen from.
+
+    A step follows one view's slopes; those of views side by side are alike, so that views far apart in a row make a
+    better mean of all. ``seed`` decides which is first, and between equals.
+    """
+    places = np.array([camera.position for camera in cameras])
+    places /= np.maximum(np.linalg.norm(places, axis=1), 1e-12)[:, None]
+    near = np.exp((places @ places.T - 1) / NEAR)
+    seen = np.random.default_rng(seed).random(len(cameras)) * LITTLE
     while True:
-        yield from map(int, rng.permutation(count))
+        left = np.ones(len(cameras), bool)
+        while left.any():
+            view = int(np.argmin(np.where(left, seen, np.inf)))
+            left[view] = False
+            seen = FORGOTTEN * seen + near[view]
+            yield view
 
 
 def _share(options: OptimizeOptions, steps: int, elapsed: float) -> float:

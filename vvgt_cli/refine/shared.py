@@ -3,12 +3,15 @@
 A Gaussian's step is Adam's: of its own slopes, view by view, most of which is noise. But what the closed form gets
 wrong it gets wrong alike in Gaussians that are alike: too wide where the opacity is high, too pale beside what is dark.
 So the directions of all are regressed, each step anew, on what is known of each Gaussian at the start, and what the
-regression foretells is added to each one's step, `GAIN` times over: a mean over thousands has hardly any noise, and may
-go further. That is descent on the parameters ``theta_i + A phi_i`` of Gaussian i, in which A is shared by all. phi
-are the numbers known and random features of them (Rahimi and Recht 2007), so that A phi may bend.
+regression foretells is added to each one's step, several times over: a mean over thousands has hardly any noise, and
+may go further, as long as what is foretold from step to step agrees. That is descent on the parameters
+``theta_i + A phi_i`` of Gaussian i, in which A is shared by all. phi are the numbers known and random features of them
+(Rahimi and Recht 2007), so that A phi may bend.
 """
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 
@@ -17,7 +20,10 @@ from vvgt_cli.refine import steps
 from vvgt_cli.refine.steps import FEATURES, KNOWN
 from vvgt_cli.splat.lanes import LANES
 
-GAIN = 7.0  # factor on the predicted steps (docs/log/refinement.md)
+GAIN = 7.0  # factor on the predicted steps at first (docs/log/refinement.md)
+BOUNDS = 2.0, 14.0  # least and largest factor
+AGREEING, PACE = 0.52, 0.3  # cosine between predictions in a row at which the factor stays; how fast it changes else
+RECALL = 0.8  # of the running cosine, a step
 LEAST = 500  # Gaussians: of fewer, noise is foretold too
 SAMPLE = 12_000  # Gaussians that are regressed on, or up to twice as many
 RUN = 16  # of them that lie side by side in memory
@@ -86,6 +92,9 @@ class SharedSteps:
             the last block is filled up with 0.
         solver: (FEATURES, n) float32, ridge regression on the n Gaussians of the sample: their directions (n,) to the
             features' weights.
+        factor: on what is foretold: grows while predictions agree with the ones before, and falls where they turn.
+        agreement: running mean of the cosine between two in a row.
+        before: (KNOWN, FEATURES) the last ones, zero at first.
     """
 
     def __init__(self, known: np.ndarray) -> None:
@@ -108,6 +117,7 @@ class SharedSteps:
         square[np.diag_indices(FEATURES)] *= 1 + RIDGE
         square[np.diag_indices(FEATURES)] += 1e-9  # of a feature that none has
         self.solver = np.linalg.solve(square, numbers.T).astype(np.float32)
+        self.factor, self.agreement, self.before = GAIN, AGREEING, np.zeros((KNOWN, FEATURES))
         self.features = np.zeros((-(-count // LANES), FEATURES, LANES), np.int8)
         for begin in range(0, count, BATCH):
             part = np.zeros((-(-min(BATCH, count - begin) // LANES) * LANES, FEATURES), np.int8)
@@ -116,13 +126,29 @@ class SharedSteps:
             self.features[begin // LANES : begin // LANES + len(blocks)] = blocks.transpose(0, 2, 1)
 
     def weights(self, directions: np.ndarray) -> np.ndarray:
-        """(KNOWN, FEATURES) float32, `GAIN` times what foretells ``directions`` (COUNT, n) of the sample.
+        """(KNOWN, FEATURES) float32, `factor` times what foretells ``directions`` (COUNT, n) of the sample.
 
         Not of what turns the axes: it has no sign that means the same for all.
         """
         found = np.empty((KNOWN, FEATURES), np.float32)
-        steps.regress(self.solver, np.nan_to_num(directions, posinf=0, neginf=0), GAIN, found)
+        steps.regress(self.solver, np.nan_to_num(directions, posinf=0, neginf=0), self.factor, found)
+        plain = found.astype(np.float64) / self.factor
+        size = math.sqrt(float(np.square(plain).sum()) * float(np.square(self.before).sum()))
+        if size > 0:
+            cosine = float((plain * self.before).sum()) / size
+            self.agreement = RECALL * self.agreement + (1 - RECALL) * cosine
+            self.factor = min(max(self.factor * math.exp(PACE * (self.agreement - AGREEING)), BOUNDS[0]), BOUNDS[1])
+        self.before = plain
         return found
+
+    def saved(self) -> dict[str, np.ndarray]:
+        """What the next steps depend on."""
+        return {"last": np.append(self.before, (self.factor, self.agreement))}
+
+    def restore(self, saved: dict[str, np.ndarray]) -> None:
+        """Put back what `saved` gave."""
+        self.before = saved["last"][:-2].reshape(KNOWN, FEATURES)
+        self.factor, self.agreement = map(float, saved["last"][-2:])
 
 
 def shared_steps(means: np.ndarray, factors: np.ndarray, logits: np.ndarray, colors: np.ndarray) -> SharedSteps | None:

@@ -144,6 +144,7 @@ class OwnFrame:
         """All that the next steps depend on, beside what is made of the start again."""
         named = {f"array_{i}": array for i, array in enumerate(self.arrays)}
         named |= {f"running_{i}": array for i, array in enumerate(self.running)}
+        named |= self.shared.saved() if self.shared is not None else {}
         return named | {"first": self.first.T, "second": self.second.T, "step": np.array(self.step)}
 
     def restore(self, saved: dict[str, np.ndarray]) -> None:
@@ -152,6 +153,8 @@ class OwnFrame:
         self.running = [saved[f"running_{i}"] for i in range(len(self.running))]
         self.first, self.second = (np.ascontiguousarray(saved[name].T) for name in ("first", "second"))
         self.step = int(saved["step"])
+        if self.shared is not None:
+            self.shared.restore(saved)
 
     def gaussians(self) -> Gaussians:
         """As a file has them: principal axes of ``M M^T``."""
