@@ -1,19 +1,22 @@
-r"""Error against seconds of conversions with more and more steps, of one state of the code beside another: CSV, plot.
+r"""Error against seconds of conversions with more and more steps, of states of the code in turn: CSV and plot.
 
-    PYTHONPATH=. NUMBA_NUM_THREADS=1 python benchmarks/curve.py measure SCENES.tsv DATA_DIR TF_DIR FOLDER --label after
+    PYTHONPATH=. python benchmarks/curve.py measure SCENES.tsv DATA_DIR TF_DIR FOLDER --state before=CHECKOUT
     PYTHONPATH=. python benchmarks/curve.py score SCENES.tsv DATA_DIR TF_DIR FOLDER -o docs/curve.csv
     PYTHONPATH=. python benchmarks/curve.py plot docs/curve.csv -o docs/curve.png
 
-`measure` runs `vvgt convert --steps N` for each scene and number of steps, and leaves the files in FOLDER with the
-processor's seconds of the command but for its start; its scores, 1 to 2 s, are in them. For the other state, run the
-same program with `PYTHONPATH` at its checkout and another `--label`. `score` judges the files of all states alike: dB
-of ten test views, cast at 1/8 voxel. `--only SCENE` measures one scene.
+`measure` runs `vvgt convert --steps N` for each scene and number of steps, with one thread, by this checkout (`after`)
+and the others in turn, and leaves the files in FOLDER with the processor's seconds of each process; its scores, 1 to
+2 s, are in them. `score` judges the files of all states alike: dB of ten test views, cast at 1/8 voxel. `--only SCENE`
+measures one scene.
 """
 
 from __future__ import annotations
 
 import csv
+import os
 import shlex
+import subprocess
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -22,9 +25,7 @@ import click
 from closed_form import scene_rows
 from dvr_scenes import read_scenes, write_rows
 
-from vvgt_cli.cli.main import run
-
-STEPS, SIZE = (28, 56, 112, 240), 1080
+STEPS, SIZE = (28, 56, 112, 152, 240), 1080
 TITLE = "dB on test views against processor seconds of a conversion, one thread"
 
 
@@ -33,8 +34,8 @@ def calls(paths: tuple[str, ...], only: tuple[str, ...] = ()) -> dict[str, list[
     found = {}
     for name, volume, reading, function in scene_rows(Path(paths[0])):
         if not only or name in only:
-            look = ["--tf", str(Path(paths[2]) / function), "--opacity-unit-distance", "mean-spacing"]
-            found[name] = [str(Path(paths[1]) / volume), *shlex.split(reading), *look]
+            look = ["--tf", str(Path(paths[2]).resolve() / function), "--opacity-unit-distance", "mean-spacing"]
+            found[name] = [str(Path(paths[1]).resolve() / volume), *shlex.split(reading), *look]
     return found
 
 
@@ -48,24 +49,37 @@ def main() -> None:
     pass
 
 
+def timed(call: list[str], checkout: str, threads: int) -> dict[str, float]:
+    """Wall and processor seconds of a Python process that imports from a checkout."""
+    counts = {name: str(threads) for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS")}
+    before, began = os.times(), time.perf_counter()
+    subprocess.run(
+        [sys.executable, *call], cwd=checkout, env=os.environ | counts | {"PYTHONPATH": checkout}, check=True,
+        stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    wall, after = time.perf_counter() - began, os.times()
+    used = after.children_user + after.children_system - before.children_user - before.children_system
+    return {"wall": round(wall, 3), "processor": round(used, 3)}
+
+
 @main.command()
 @click.argument("paths", nargs=3)
 @click.argument("folder")
-@click.option("--label", required=True)
+@click.option("--state", "states", multiple=True, metavar="LABEL=CHECKOUT")
 @click.option("--only", multiple=True)
 @click.option("--steps", "counts", multiple=True, type=int, default=STEPS)
-def measure(paths: tuple[str, ...], folder: str, label: str, only: tuple[str, ...], counts: tuple[int, ...]) -> None:
-    """Files and seconds of one state of the code."""
+def measure(
+    paths: tuple[str, ...], folder: str, states: tuple[str, ...], only: tuple[str, ...], counts: tuple[int, ...]
+) -> None:
+    """Files and seconds."""
     Path(folder).mkdir(parents=True, exist_ok=True)
     for name, call in calls(paths, only).items():
-        for count in (0, *counts):  # the first loads kernels
-            file = Path(folder) / f"{name}.{label}.{count}.ply"
-            began = time.process_time()
-            steps = ["--steps", str(count or 24), "--up", "none", "--threads", "1"]
-            if run(["convert", *call, *steps, "-o", str(file), "--overwrite", "-q"]):
-                raise SystemExit(1)
-            seconds = time.process_time() - began
-            file.with_suffix(".txt").write_text(f"{seconds:.4g}") if count else file.unlink()
+        for count in counts:
+            for label, checkout in [("after", str(Path.cwd())), *(state.split("=", 1) for state in states)]:
+                file = (Path(folder) / f"{name}.{label}.{count}.ply").resolve()
+                options = ["--steps", str(count), "--up", "none", "--threads", "1", "--overwrite", "-q"]
+                convert = ["-m", "vvgt_cli.cli.main", "convert", *call, *options, "-o", str(file)]
+                file.with_suffix(".txt").write_text(f"{timed(convert, checkout, 1)['processor']:.4g}")
 
 
 @main.command()

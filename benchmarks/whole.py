@@ -12,16 +12,13 @@ draws these views with VTK's CPU mapper, one ray a pixel, half-voxel steps, and 
 from __future__ import annotations
 
 import math
-import os
 import statistics
-import subprocess
-import sys
 import tempfile
-import time
 from pathlib import Path
 from typing import Any
 
 import click
+from curve import calls, read_rows, timed
 from dvr_scenes import read_scenes, write_rows
 
 STEP = {"bonsai-tree": 1.5, "embryo-shells": 2.0, "headsq-bone-skin": 1.0, "spm152-tissue": 2.0}  # voxels
@@ -60,19 +57,6 @@ def vtk(paths: tuple[str, ...], name: str, folder: str, threads: int) -> None:
         Image.fromarray((255 * pixels).astype(np.uint8)).save(f"{folder}/{i}.png")
 
 
-def timed(call: list[str], checkout: str, threads: int) -> dict[str, float]:
-    """Wall and processor seconds of a process that imports from a checkout."""
-    counts = {name: str(threads) for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS")}
-    before, began = os.times(), time.perf_counter()
-    subprocess.run(
-        [sys.executable, *call], cwd=checkout, env=os.environ | counts | {"PYTHONPATH": checkout}, check=True,
-        stderr=subprocess.DEVNULL,
-    )  # fmt: skip
-    wall, after = time.perf_counter() - began, os.times()
-    used = after.children_user + after.children_system - before.children_user - before.children_system
-    return {"wall": round(wall, 3), "processor": round(used, 3)}
-
-
 @main.command()
 @click.argument("paths", nargs=3)
 @click.option("-o", "--output", required=True)
@@ -85,7 +69,6 @@ def measure(
     paths: tuple[str, ...], output: str, rounds: int, threads: int, other: str | None, lit: bool, only: tuple[str, ...]
 ) -> None:
     """Add rows, a scene and a round at a time."""
-    from curve import calls, read_rows
 
     rows, paths = read_rows(output), tuple(str(Path(path).resolve()) for path in paths)
     for turn in range(rounds):
@@ -121,8 +104,6 @@ def commands(
 @click.argument("path")
 def table(path: str) -> None:
     """Medians of wall seconds, and in how many times VTK's."""
-    from curve import read_rows
-
     taken: dict[tuple[str, str, str], list[float]] = {}
     for row in read_rows(path):
         taken.setdefault((row["scene"], row["threads"], row["what"]), []).append(float(row["wall"]))
