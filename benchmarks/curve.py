@@ -7,7 +7,7 @@ r"""Error against seconds of conversions with more and more steps, of states of 
 `measure` runs `vvgt convert --steps N` for each scene and number of steps, with one thread, by this checkout (`after`)
 and the others in turn, and leaves the files in FOLDER with the processor's seconds of each process; its scores, 1 to
 2 s, are in them. `score` judges the files of all states alike: dB of ten test views, cast at 1/8 voxel. `--only SCENE`
-measures one scene.
+measures one scene; what follows `--` are options of `vvgt convert`.
 """
 
 from __future__ import annotations
@@ -65,11 +65,17 @@ def timed(call: list[str], checkout: str, threads: int) -> dict[str, float]:
 @main.command()
 @click.argument("paths", nargs=3)
 @click.argument("folder")
+@click.argument("more", nargs=-1)
 @click.option("--state", "states", multiple=True, metavar="LABEL=CHECKOUT")
 @click.option("--only", multiple=True)
 @click.option("--steps", "counts", multiple=True, type=int, default=STEPS)
 def measure(
-    paths: tuple[str, ...], folder: str, states: tuple[str, ...], only: tuple[str, ...], counts: tuple[int, ...]
+    paths: tuple[str, ...],
+    folder: str,
+    more: tuple[str, ...],
+    states: tuple[str, ...],
+    only: tuple[str, ...],
+    counts: tuple[int, ...],
 ) -> None:
     """Files and seconds."""
     Path(folder).mkdir(parents=True, exist_ok=True)
@@ -77,7 +83,7 @@ def measure(
         for count in counts:
             for label, checkout in [("after", str(Path.cwd())), *(state.split("=", 1) for state in states)]:
                 file = (Path(folder) / f"{name}.{label}.{count}.ply").resolve()
-                options = ["--steps", str(count), "--up", "none", "--threads", "1", "--overwrite", "-q"]
+                options = ["--steps", str(count), "--up", "none", "--threads", "1", "--overwrite", "-q", *more]
                 convert = ["-m", "vvgt_cli.cli.main", "convert", *call, *options, "-o", str(file)]
                 file.with_suffix(".txt").write_text(f"{timed(convert, checkout, 1)['processor']:.4g}")
 

@@ -225,26 +225,34 @@ def test_parts(bench, scenes, tmp_path, monkeypatch):
 
 
 def test_curve(bench, scenes, tmp_path):
-    module, found = bench("curve"), tmp_path / "a.csv"
-    few = ("--", "--max-gaussians", 300, "--size", SIZE)
-    for label in ("before", "after"):
-        call(module.main, "measure", *scenes, "-o", found, "--label", label, "--steps", 4, "--steps", 24, *few)
+    module, found = bench("curve", SIZE=SIZE), tmp_path / "a.csv"
+    steps, few = ("--steps", 1, "--steps", 24), ("--", "--max-gaussians", 300, "--size", SIZE)
+    call(module.main, "measure", *scenes, tmp_path / "files", "--state", f"before={ROOT}", *steps, *few)
+    call(module.main, "score", *scenes, tmp_path / "files", "-o", found)
     rows = rows_of(found)
-    assert [row["label"] for row in rows] == ["before"] * 3 + ["after"] * 3
-    assert [row["steps"] for row in rows] == ["0", "4", "24"] * 2
-    assert float(rows[2]["psnr"]) > float(rows[0]["psnr"]) > 10
-    assert all(float(row["seconds"]) > 0 for row in rows if row["steps"] != "0")
+    assert [row["label"] + row["steps"] for row in rows] == ["after1", "after24", "before1", "before24"]
+    assert float(rows[1]["psnr"]) > float(rows[0]["psnr"]) > 10
+    assert rows[1]["psnr"] == rows[3]["psnr"]
     call(module.main, "plot", found, "-o", tmp_path / "a.png")
     assert read_png(tmp_path / "a.png").shape[2] in (3, 4)
+
+
+def test_whole(bench, scenes, tmp_path):
+    from vvgt_cli.dvr.vtk import require_opengl
+
+    require_opengl()
+    module, found = bench("whole", STEP={"blob": 1.0}, VIEWS=2), tmp_path / "a.csv"
+    call(module.main, "measure", *scenes, "-o", found, "--rounds", 1, "--threads", 1, "--lit", "--other", ROOT)
+    rows = rows_of(found)
+    assert len({row["what"] for row in rows if float(row["wall"]) > 0}) == len(rows) == 6
+    assert "1.00" in call(module.main, "table", found).splitlines()[-1]
 
 
 def test_plan(bench, scenes, tmp_path):
     few = ("--max-gaussians", "40", "--size", str(SIZE), "--steps", "1")
     module = bench("plan", KINDS={"default": few})
     call(module.main, *scenes, "-o", tmp_path / "a.csv")
-    (row,) = rows_of(tmp_path / "a.csv")
-    assert (row["scene"], row["steps"]) == ("blob", "1")
-    assert float(row["predicted_s"]) > 0
+    assert [float(row["predicted_s"]) > 0 for row in rows_of(tmp_path / "a.csv") if row["steps"] == "1"] == [True]
 
 
 def test_refinement(bench, scenes, tmp_path):

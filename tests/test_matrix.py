@@ -16,7 +16,7 @@ nib = pytest.importorskip("nibabel")
 tifffile = pytest.importorskip("tifffile")
 
 DIMS = (28, 24, 30)  # z, y, x: eight blocks of 16 voxels
-AGREE, CLOSER = 0.15, 0.3  # dB: of the test views, and of the worst viewing condition, where single pixels decide
+AGREE, CLOSER = 0.25, 0.3  # dB: of the test views (of 50 dB), and of the worst viewing condition: single pixels decide
 SMALL = ("--size", "64", "--max-gaussians", "800", "--steps", "30")
 BLOCKS = ("--blocks", "16")
 RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
