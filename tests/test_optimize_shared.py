@@ -202,6 +202,9 @@ def test_the_factor_grows_while_what_is_foretold_agrees_and_falls_where_it_turns
     still = shared.SharedSteps(shared.aligned(*parts(g)))
     assert not still.weights(np.zeros((13, MANY), np.float32)).any()
     assert still.factor == 7
+    still.before[:] = np.inf  # sums beyond float32
+    still.weights(way)
+    assert still.factor == 7
 
 
 def test_weights_are_the_same_bytes_for_any_number_of_threads():

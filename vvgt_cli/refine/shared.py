@@ -134,7 +134,7 @@ class SharedSteps:
         steps.regress(self.solver, np.nan_to_num(directions, posinf=0, neginf=0), self.factor, found)
         plain = found.astype(np.float64) / self.factor
         size = math.sqrt(float(np.square(plain).sum()) * float(np.square(self.before).sum()))
-        if size > 0:
+        if 0 < size < math.inf:
             cosine = float((plain * self.before).sum()) / size
             self.agreement = RECALL * self.agreement + (1 - RECALL) * cosine
             self.factor = min(max(self.factor * math.exp(PACE * (self.agreement - AGREEING)), BOUNDS[0]), BOUNDS[1])
