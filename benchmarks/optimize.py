@@ -44,7 +44,8 @@ def part_calls(gaussians: Gaussians, target: np.ndarray) -> dict[str, Callable[[
     image = blend(p, colors, camera.height, camera.width)
     grad = np.empty_like(image)
     weights = np.float32(0), np.float32(1), np.float32(0.5)
-    loss_gradient(image, target, *weights, grad)
+    squares = np.empty(camera.height)
+    loss_gradient(image, target, *weights, grad, squares)
     pairs = moments(p, colors, image, grad)
     slopes = own_frame_backward(means, factors, colors, camera, p, pairs)
     state.step = 1
@@ -55,7 +56,7 @@ def part_calls(gaussians: Gaussians, target: np.ndarray) -> dict[str, Callable[[
         "sort": lambda: depth_order(depth),
         "file into tiles": lambda: tile_lists(order, p.extent, p.tiles_x, tiles_y, numba.get_num_threads()),
         "blend": lambda: blend(p, colors, camera.height, camera.width),
-        "loss": lambda: loss_gradient(image, target, *weights, grad),
+        "loss": lambda: loss_gradient(image, target, *weights, grad, squares),
         "(ssim)": lambda: add_ssim_gradient(image, target, 0.2, np.zeros_like(grad)),
         "moments": lambda: moments(p, colors, image, grad),
         "gradients": lambda: own_frame_backward(means, factors, colors, camera, p, pairs),

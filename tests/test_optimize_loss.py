@@ -117,8 +117,9 @@ def test_pixel_losses_by_hand():
     image[0, 0] = 0.5, 0.0, 0.25, 0.5
     target[0, 1, 1] = 1.0
     grad = np.empty_like(image)
-    squares = loss_gradient(image, target, np.float32(1), np.float32(2), np.float32(0.5), grad)
-    assert squares == pytest.approx(0.25 + 0.0625 + 1.0 + 0.5 * 0.25)
+    squares = np.empty(1)
+    loss_gradient(image, target, np.float32(1), np.float32(2), np.float32(0.5), grad, squares)
+    assert squares[0] == pytest.approx(0.25 + 0.0625 + 1.0 + 0.5 * 0.25)
     np.testing.assert_allclose(grad[0], [[3, 0, 2, 1.5], [0, -5, 0, 0]])
 
 

@@ -126,7 +126,7 @@ def _loss(weights: tuple[float, float, float]) -> Figure:
     image, target = (rng.random((9, 7, 4)).astype(np.float32) * 1e3 for _ in range(2))
     grad = np.empty_like(image)
     l1, l2, alpha = (np.float32(w) for w in weights)
-    loss_gradient(image, target, l1, l2, alpha, grad)
+    loss_gradient(image, target, l1, l2, alpha, grad, np.empty(9))
     r = image.astype(np.float64) - target
     exact = (l1 * np.sign(r) + 2 * l2 * r) * np.array([1, 1, 1, alpha])
     return Figure("off the formula, relative", float(np.abs(grad - exact).max() / np.abs(exact).max()), 1e-6)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-import numba as nb
 import numpy as np
 
 from vvgt_cli.closed_form.columns import BLUE, GREEN, MASS, RED
@@ -13,7 +12,8 @@ from vvgt_cli.dvr.kernel import FLAGS, U
 from vvgt_cli.dvr.layout import GRID, Texels
 from vvgt_cli.dvr.vectors import add, lane, mix, texel, zeros4
 from vvgt_cli.dvr.vectors import row as row_of
-from vvgt_cli.jit.decorators import inlined, kernel
+from vvgt_cli.jit.decorators import inlined, parallel_kernel
+from vvgt_cli.jit.parts import Part, turns_of
 
 _jit = inlined(fastmath=FLAGS, error_model="numpy")
 
@@ -61,8 +61,9 @@ def _gather(
             cell[BLUE] += lane(total, 2)
 
 
-@kernel("Texels f8:2 i8:1 f8:1 f8:1 f8:1 f8:1 f8:5", GRID, parallel=True, fastmath=FLAGS, error_model="numpy")
+@parallel_kernel("Texels f8:2 i8:1 f8:1 f8:1 f8:1 f8:1 f8:5", GRID, fastmath=FLAGS, error_model="numpy")
 def grid_moments(
+    part: Part,
     texels: Texels, blocks: np.ndarray, points: np.ndarray, cell: np.ndarray, half: np.ndarray, step: np.ndarray,
     begin: np.ndarray, out: np.ndarray,
 ) -> None:  # fmt: skip
@@ -71,7 +72,7 @@ def grid_moments(
     nz, ny, nx, _ = values.shape
     dx, dy, dz = cell[0] / points[0], cell[1] / points[1], cell[2] / points[2]
     box = dx * step[0], dy * step[1], dz * step[2]
-    for b in nb.prange(blocks.shape[0]):
+    for b in turns_of(part, blocks.shape[0]):
         out[b] = 0.0
         x0, y0, z0 = blocks[b]
         first = math.floor(x0 - 0.5)

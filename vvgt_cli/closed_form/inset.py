@@ -10,14 +10,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numba as nb
 import numpy as np
 
 from vvgt_cli.closed_form.columns import MASS
 from vvgt_cli.closed_form.moments import Cells
 from vvgt_cli.closed_form.visibility import summed
 from vvgt_cli.dvr.kernel import sample
-from vvgt_cli.jit.decorators import inlined, kernel
+from vvgt_cli.jit.decorators import inlined, parallel_kernel
+from vvgt_cli.jit.parts import Part, turns_of
 
 OPAQUE_DEPTH = 5.0  # optical depth a voxel at which a cell counts as wholly opaque; half of it is the surface
 SURFACE = 0.5  # of that
@@ -93,11 +93,11 @@ def smoothed(field: np.ndarray, edge: np.ndarray, half: np.ndarray) -> Opaque:
     return Opaque(field, smooth, edge, half)
 
 
-@kernel("f4:3 i8 i8 i8 f4:3", parallel=True)
-def _blur(field: np.ndarray, dz: int, dy: int, dx: int, out: np.ndarray) -> None:
+@parallel_kernel("f4:3 i8 i8 i8 f4:3")
+def _blur(part: Part, field: np.ndarray, dz: int, dy: int, dx: int, out: np.ndarray) -> None:
     """[1, 2, 1] / 4 along the axis of which d is 1, edges clamped; ``field`` and ``out`` (nz, ny, nx)."""
     nz, ny, nx = field.shape
-    for k in nb.prange(nz):
+    for k in turns_of(part, nz):
         for j in range(ny):
             before = field[max(k - dz, 0), max(j - dy, 0)]
             after = field[min(k + dz, nz - 1), min(j + dy, ny - 1)]
@@ -134,16 +134,22 @@ def _inwards(smooth: np.ndarray, x: float, y: float, z: float, edge: np.ndarray)
     return gx * scale, gy * scale, gz * scale, norm
 
 
-@kernel("f4:3 f8:2 f8:1 f8:1 f8:1 f8:3", parallel=True)
+@parallel_kernel("f4:3 f8:2 f8:1 f8:1 f8:1 f8:3")
 def _press(
-    smooth: np.ndarray, means: np.ndarray, half: np.ndarray, edge: np.ndarray, by: np.ndarray, cov: np.ndarray
+    part: Part,
+    smooth: np.ndarray,
+    means: np.ndarray,
+    half: np.ndarray,
+    edge: np.ndarray,
+    by: np.ndarray,
+    cov: np.ndarray,
 ) -> None:
     """Take ``by`` (n,) times n n' off ``cov`` (n, 3, 3), n the normal of a surface at ``means`` (n, 3); else nothing.
 
     ``smooth``, ``half`` (3,), ``edge`` (3,) of `Opaque`.
     """
-    small = edge.min()
-    for k in nb.prange(means.shape[0]):
+    small = min(edge[0], edge[1], edge[2])
+    for k in turns_of(part, means.shape[0]):
         x, y, z = (
             (means[k, 0] + half[0]) / edge[0] - 0.5,
             (means[k, 1] + half[1]) / edge[1] - 0.5,
@@ -158,8 +164,9 @@ def _press(
                 cov[k, i, j] -= by[k] * normal[i] * normal[j]
 
 
-@kernel("f4:3 f4:3 f8:2 f8:1 f8:1 f8:3 f8:1 f8 f8 f8:2", parallel=True)
+@parallel_kernel("f4:3 f4:3 f8:2 f8:1 f8:1 f8:3 f8:1 f8 f8 f8:2")
 def _shift(
+    part: Part,
     field: np.ndarray, smooth: np.ndarray, means: np.ndarray, half: np.ndarray, edge: np.ndarray, cov: np.ndarray,
     reach: np.ndarray, dilation: float, far: float, out: np.ndarray,
 ) -> None:  # fmt: skip
@@ -167,10 +174,10 @@ def _shift(
 
     ``means`` (n, 3), ``cov`` (n, 3, 3), ``reach`` (n,) standard deviations, ``dilation``, ``far``: unit frame.
     """
-    small = edge.min()
+    small = min(edge[0], edge[1], edge[2])
     stride = 0.25 * small
     limit = int(far / stride)
-    for k in nb.prange(means.shape[0]):
+    for k in turns_of(part, means.shape[0]):
         x, y, z = (
             (means[k, 0] + half[0]) / edge[0] - 0.5,
             (means[k, 1] + half[1]) / edge[1] - 0.5,

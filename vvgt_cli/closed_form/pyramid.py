@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 
-import numba as nb
 import numpy as np
 
 from vvgt_cli.closed_form.columns import COLUMNS, MASS, MOMENTS, RED, SEEN, SQUARE, XX, YY, ZZ, X, Y, Z
-from vvgt_cli.jit.decorators import inlined, kernel
+from vvgt_cli.jit.decorators import inlined, parallel_kernel
+from vvgt_cli.jit.parts import Part, turns_of
 
 SWEEPS = 8  # of Jacobi rotations: each squares the error, three are enough for most
 TINY = 1e-300  # of what is divided by
@@ -27,35 +27,39 @@ def _spread_bits(number: int) -> np.uint64:
     return v  # noqa: RET504 - one expression would be of another type
 
 
-@kernel("i4:2 u8:1", parallel=True)
-def morton_codes(index: np.ndarray, out: np.ndarray) -> None:
+@parallel_kernel("i4:2 u8:1")
+def morton_codes(part: Part, index: np.ndarray, out: np.ndarray) -> None:
     """Morton codes ``out`` (n,) uint64, x lowest, of ``index`` (n, 3) int32 below 2^21."""
-    for n in nb.prange(len(index)):
+    for n in turns_of(part, len(index)):
         x, y, z = _spread_bits(index[n, 0]), _spread_bits(index[n, 1]), _spread_bits(index[n, 2])
         out[n] = x | (y << np.uint64(1)) | (z << np.uint64(2))
 
 
-@kernel("i4:2 f8:1 f4:3 f4:3 f4:2", parallel=True)
-def look_up(index: np.ndarray, ratio: np.ndarray, mean: np.ndarray, largest: np.ndarray, out: np.ndarray) -> None:
+@parallel_kernel("i4:2 f8:1 f4:3 f4:3 f4:2")
+def look_up(
+    part: Part, index: np.ndarray, ratio: np.ndarray, mean: np.ndarray, largest: np.ndarray, out: np.ndarray
+) -> None:
     """``out`` (n, 2) of ``mean`` and ``largest`` (nz, ny, nx) at the middles of cells, clamped to the grid.
 
     ``index`` (n, 3) int32 cell indices; ``ratio`` (3,) a cell's edges in those of the grid's cells.
     """
     nz, ny, nx = mean.shape
-    for n in nb.prange(len(index)):
+    for n in turns_of(part, len(index)):
         i = min(max(math.floor((index[n, 0] + 0.5) * ratio[0]), 0), nx - 1)
         j = min(max(math.floor((index[n, 1] + 0.5) * ratio[1]), 0), ny - 1)
         k = min(max(math.floor((index[n, 2] + 0.5) * ratio[2]), 0), nz - 1)
         out[n, 0], out[n, 1] = mean[k, j, i], largest[k, j, i]
 
 
-@kernel("f8:2 i8:1 f4:2 f8:2 f8:1", parallel=True)
-def take_base(moments: np.ndarray, keep: np.ndarray, seen: np.ndarray, out: np.ndarray, top: np.ndarray) -> None:
+@parallel_kernel("f8:2 i8:1 f4:2 f8:2 f8:1")
+def take_base(
+    part: Part, moments: np.ndarray, keep: np.ndarray, seen: np.ndarray, out: np.ndarray, top: np.ndarray
+) -> None:
     """Rows ``keep`` (n,) of ``moments`` (m, 13) as a pyramid's base ``out`` (n, 18), ``top`` (n,).
 
     ``seen`` (m, 2): mean and largest transmittance.
     """
-    for n in nb.prange(len(keep)):
+    for n in turns_of(part, len(keep)):
         row, mean = moments[keep[n]], np.float64(seen[keep[n], 0])
         top[n] = seen[keep[n], 1]
         for column in range(MOMENTS):
@@ -68,10 +72,12 @@ def take_base(moments: np.ndarray, keep: np.ndarray, seen: np.ndarray, out: np.n
         out[n, SQUARE] = square * mean / max(row[MASS], TINY)
 
 
-@kernel("f8:2 f8:1 i8:1 f8:2 f8:1", parallel=True)
-def sum_children(rows: np.ndarray, top: np.ndarray, start: np.ndarray, out: np.ndarray, out_top: np.ndarray) -> None:
+@parallel_kernel("f8:2 f8:1 i8:1 f8:2 f8:1")
+def sum_children(
+    part: Part, rows: np.ndarray, top: np.ndarray, start: np.ndarray, out: np.ndarray, out_top: np.ndarray
+) -> None:
     """Sums ``out`` (m, 18) of the rows (n, 18) from one of ``start`` (m,) to the next; the largest of ``top`` (n,)."""
-    for m in nb.prange(len(start)):
+    for m in turns_of(part, len(start)):
         stop = start[m + 1] if m + 1 < len(start) else len(rows)
         for column in range(COLUMNS):
             out[m, column] = rows[start[m], column]
@@ -82,14 +88,16 @@ def sum_children(rows: np.ndarray, top: np.ndarray, start: np.ndarray, out: np.n
             out_top[m] = max(out_top[m], top[n])
 
 
-@kernel("f8:2 f8:1 f8:1 f8 f8:1", parallel=True, error_model="numpy")
-def score_splits(moments: np.ndarray, top: np.ndarray, edge: np.ndarray, plain: float, out: np.ndarray) -> None:
+@parallel_kernel("f8:2 f8:1 f8:1 f8 f8:1", error_model="numpy")
+def score_splits(
+    part: Part, moments: np.ndarray, top: np.ndarray, edge: np.ndarray, plain: float, out: np.ndarray
+) -> None:
     """`tree.split_score` ``out`` (n,) of rows of ``moments`` (n, 18), ``top`` (n,), of edges ``edge`` (3,).
 
     ``plain``: variance added to that of the colours; infinite: colours do not count.
     """
     area = (edge[0] * edge[1] * edge[2]) ** (2.0 / 3.0)
-    for n in nb.prange(len(out)):
+    for n in turns_of(part, len(out)):
         row, mass = moments[n], moments[n, MASS]
         x, y, z = row[X] / mass, row[Y] / mass, row[Z] / mass
         variance = max((row[XX] + row[YY] + row[ZZ]) / mass - (x * x + y * y + z * z), 0.0)
@@ -119,11 +127,15 @@ def _rotate(a: np.ndarray, v: np.ndarray, p: int, q: int) -> None:
         v[k, p], v[k, q] = c * v[k, p] - s * v[k, q], s * v[k, p] + c * v[k, q]
 
 
-@kernel("f8:3 f8:2 f8:3", parallel=True, error_model="numpy")
-def principal_axes(cov: np.ndarray, values: np.ndarray, vectors: np.ndarray) -> None:
+@parallel_kernel("f8:3 f8:2 f8:3", error_model="numpy")
+def principal_axes(part: Part, cov: np.ndarray, values: np.ndarray, vectors: np.ndarray) -> None:
     """Eigenvalues (n, 3), ascending, and eigenvectors (n, 3, 3; columns) of symmetric ``cov`` (n, 3, 3), by Jacobi."""
-    for n in nb.prange(len(cov)):
-        a, v = cov[n].copy(), np.eye(3)
+    for n in turns_of(part, len(cov)):
+        a, v = np.empty((3, 3)), np.zeros((3, 3))
+        for row in range(3):
+            v[row, row] = 1.0
+            for column in range(3):
+                a[row, column] = cov[n, row, column]
         scale = abs(a[0, 0]) + abs(a[1, 1]) + abs(a[2, 2])
         for _ in range(SWEEPS):
             off = a[0, 1] * a[0, 1] + a[0, 2] * a[0, 2] + a[1, 2] * a[1, 2]
@@ -132,8 +144,14 @@ def principal_axes(cov: np.ndarray, values: np.ndarray, vectors: np.ndarray) -> 
             _rotate(a, v, 0, 1)
             _rotate(a, v, 0, 2)
             _rotate(a, v, 1, 2)
-        order = np.argsort(np.array([a[0, 0], a[1, 1], a[2, 2]]))
-        for column in range(3):
-            values[n, column] = a[order[column], order[column]]
+        least, middle, most = 0, 1, 2  # `np.argsort` takes 1 s to compile
+        if a[least, least] > a[middle, middle]:
+            least, middle = middle, least
+        if a[middle, middle] > a[most, most]:
+            middle, most = most, middle
+        if a[least, least] > a[middle, middle]:
+            least, middle = middle, least
+        for column, order in enumerate((least, middle, most)):
+            values[n, column] = a[order, order]
             for row in range(3):
-                vectors[n, row, column] = v[row, order[column]]
+                vectors[n, row, column] = v[row, order]

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import math
 
-import numba as nb
 import numpy as np
 
 from vvgt_cli.closed_form.columns import BLUE, GREEN, MASS, MOMENTS, RED, XX, XY, XZ, YY, YZ, ZZ, X, Y, Z
 from vvgt_cli.dvr.kernel import FLAGS, mean_optics, table_coordinate
 from vvgt_cli.dvr.layout import TUPLES, Optics, Voxels
-from vvgt_cli.jit.decorators import inlined, kernel
+from vvgt_cli.jit.decorators import inlined, parallel_kernel
+from vvgt_cli.jit.parts import Part, turns_of
 
 Between = tuple[int, int, float, float]  # of `between`
 Rows = tuple[np.ndarray, np.ndarray, np.ndarray]  # of `_rows`
@@ -162,8 +162,9 @@ def shift_moments(row: np.ndarray, x: float, y: float, z: float, d: tuple[float,
         row[column] *= d[0] * d[1] * d[2]
 
 
-@kernel("Voxels Optics f8:2 i8:1 f8:1 f8:1 f8:1 f8:1 f8:5", TUPLES, parallel=True, fastmath=FLAGS, error_model="numpy")
+@parallel_kernel("Voxels Optics f8:2 i8:1 f8:1 f8:1 f8:1 f8:1 f8:5", TUPLES, fastmath=FLAGS, error_model="numpy")
 def block_moments(
+    part: Part,
     voxels: Voxels,
     optics: Optics,
     blocks: np.ndarray,
@@ -183,7 +184,7 @@ def block_moments(
     nz, ny, nx = voxels.values.shape
     dx, dy, dz = cell[0] / points[0], cell[1] / points[1], cell[2] / points[2]
     box = dx * step[0], dy * step[1], dz * step[2]
-    for b in nb.prange(blocks.shape[0]):
+    for b in turns_of(part, blocks.shape[0]):
         out[b] = 0.0
         x0, y0, z0 = blocks[b]
         first = math.floor(x0 - 0.5)
@@ -217,19 +218,22 @@ def block_moments(
                 shift_moments(out[b, cz, cy, cx], x, y, z, box)
 
 
-@kernel("f8:5 i8:1 i8:1 f8:2 i4:2", parallel=True)
-def compact(dense: np.ndarray, order: np.ndarray, start: np.ndarray, moments: np.ndarray, cells: np.ndarray) -> None:
+@parallel_kernel("f8:5 i8:1 i8:1 f8:2 i4:2")
+def compact(
+    part: Part, dense: np.ndarray, order: np.ndarray, start: np.ndarray, moments: np.ndarray, cells: np.ndarray
+) -> None:
     """Rows with mass of ``dense`` (n, cells z, cells y, cells x, 13), block by block, by ``order`` within a block.
 
     ``order`` (cells,) numbers of a block's cells, x fastest; ``start`` (n,) where a block's rows begin in ``moments``
     (rows, 13) and ``cells`` (rows, 3), which get the cells' (x, y, z) in their block.
     """
     cy, cx = dense.shape[2], dense.shape[3]
-    for b in nb.prange(dense.shape[0]):
+    for b in turns_of(part, dense.shape[0]):
         to = start[b]
         for cell in order:
             x, y, z = cell % cx, cell // cx % cy, cell // (cx * cy)
             if dense[b, z, y, x, MASS] > 0.0:
-                moments[to] = dense[b, z, y, x]
+                for column in range(MOMENTS):  # an assignment of slices takes 2 s to compile
+                    moments[to, column] = dense[b, z, y, x, column]
                 cells[to, 0], cells[to, 1], cells[to, 2] = x, y, z
                 to += 1

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import numba as nb
 import numpy as np
 
-from vvgt_cli.jit.decorators import kernel
+from vvgt_cli.jit.decorators import parallel_kernel
+from vvgt_cli.jit.parts import Part, turns_of
 from vvgt_cli.look.tables import Optics
 
 
-@kernel("V i8:1 i8:1 f8 f8 f8:4", parallel=True)
+@parallel_kernel("V i8:1 i8:1 f8 f8 f8:4")
 def block_ranges(
-    values: np.ndarray, first: np.ndarray, edge: np.ndarray, least: float, most: float, out: np.ndarray
+    part: Part, values: np.ndarray, first: np.ndarray, edge: np.ndarray, least: float, most: float, out: np.ndarray
 ) -> None:
     """Finite range over each block and the voxel on either side of it; ``out`` (bz, by, bx, 2): low > high for none.
 
@@ -21,7 +21,7 @@ def block_ranges(
     nz, ny, nx = values.shape
     bz, by, bx = out.shape[:3]
     xa, xb = max(first[0] - 1, 0), min(first[0] + bx * edge[0] + 1, nx)
-    for block in nb.prange(bz * by):
+    for block in turns_of(part, bz * by):
         k, j = block // by, block % by
         z0, y0 = first[2] + k * edge[2], first[1] + j * edge[1]
         low, high = np.empty(xb - xa, values.dtype), np.empty(xb - xa, values.dtype)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from statistics import NormalDist
 
-import numba as nb
 import numpy as np
 
 from vvgt_cli.dvr.kernel import FLAGS, sample
 from vvgt_cli.dvr.layout import TUPLES, Voxels
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.frames import rotations
-from vvgt_cli.jit.decorators import kernel
+from vvgt_cli.jit.decorators import parallel_kernel
+from vvgt_cli.jit.parts import Part, turns_of
 
 POINTS = 48  # a Gaussian
 NARROW = 0.7  # standard deviations of the points: where Gaussians overlap the values are the neighbours' too
@@ -43,8 +43,9 @@ def _radical(k: int, base: int) -> float:
     return found
 
 
-@kernel("Voxels f8:2 f8:3 f8:2 i8:1 i8:1 i8:1 f4:2", TUPLES, parallel=True, fastmath=FLAGS, error_model="numpy")
+@parallel_kernel("Voxels f8:2 f8:3 f8:2 i8:1 i8:1 i8:1 f4:2", TUPLES, fastmath=FLAGS, error_model="numpy")
 def sample_points(
+    part: Part,
     voxels: Voxels, centres: np.ndarray, arms: np.ndarray, points: np.ndarray, begin: np.ndarray, lo: np.ndarray,
     hi: np.ndarray, out: np.ndarray,
 ) -> None:  # fmt: skip
@@ -53,7 +54,7 @@ def sample_points(
     All in voxel coordinates of the volume, of which ``begin`` (3,) is the first of ``voxels``. Written are values of
     points within the voxels ``lo`` to ``hi`` (3,), each half an edge to either side of its centre.
     """
-    for k in nb.prange(len(centres)):
+    for k in turns_of(part, len(centres)):
         for m in range(len(points)):
             p0, p1, p2 = points[m, 0], points[m, 1], points[m, 2]
             x = centres[k, 0] + (arms[k, 0, 0] * p0 + arms[k, 0, 1] * p1 + arms[k, 0, 2] * p2)

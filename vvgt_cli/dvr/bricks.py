@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-import numba as nb
 import numpy as np
 
 from vvgt_cli.dvr.layout import BRICK
-from vvgt_cli.jit.decorators import kernel
+from vvgt_cli.jit.decorators import parallel_kernel
+from vvgt_cli.jit.parts import Part, turns_of
 from vvgt_cli.look.tables import Optics
 
 MAX_DISTANCE = 15  # bricks; a longer leap saves nothing measurable
 
 
-@kernel("V f8 f8 f8:4", parallel=True)
-def _ranges(values: np.ndarray, least: float, most: float, out: np.ndarray) -> None:
+@parallel_kernel("V f8 f8 f8:4")
+def _ranges(part: Part, values: np.ndarray, least: float, most: float, out: np.ndarray) -> None:
     """Finite range over each brick of ``values`` (nz, ny, nx) and its upper neighbours; ``out`` (bz, by, bx, 2).
 
     The values' type goes from ``least`` to ``most``.
     """
     nz, ny, nx = values.shape
     bz, by, bx = out.shape[:3]
-    for flat in nb.prange(bz * by):
+    for flat in turns_of(part, bz * by):
         z0, y0 = (flat // by) * BRICK, (flat % by) * BRICK
         low, high, ends = np.empty(nx, values.dtype), np.empty(nx, values.dtype), np.empty(2, values.dtype)
         ends[0], ends[1] = least, most

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import numba as nb
 import numpy as np
 
-from vvgt_cli.jit.decorators import inlined, kernel
+from vvgt_cli.jit.decorators import inlined, parallel_kernel
+from vvgt_cli.jit.parts import Part, turns_of
 
 
 @inlined()
@@ -17,11 +17,11 @@ def _apart(image: np.ndarray, row: int, col: int, i: int, j: int) -> float:
     return most
 
 
-@kernel("f4:3 b1:2 f4:2", parallel=True)
-def _contrast(image: np.ndarray, known: np.ndarray, out: np.ndarray) -> None:
+@parallel_kernel("f4:3 b1:2 f4:2")
+def _contrast(part: Part, image: np.ndarray, known: np.ndarray, out: np.ndarray) -> None:
     """`contrast` of ``image`` (h, w, c) into ``out`` (h, w); ``known`` (h, w) bool."""
     height, width = out.shape
-    for row in nb.prange(height):
+    for row in turns_of(part, height):
         for col in range(width):
             most = 0.0
             if not known[row, col]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numba as nb
 import numpy as np
 
 from vvgt_cli.dvr.kernel import FLAGS, OPAQUE, PARTS, SUB_DEPTH, TILE, U, absorbed, box_span, inverse, skip, tiles_of
@@ -16,7 +15,8 @@ from vvgt_cli.dvr.layout import GRID, LIT_GRID, Light, Texels, Voxels
 from vvgt_cli.dvr.runs import BORROWED
 from vvgt_cli.dvr.shading import shading
 from vvgt_cli.dvr.vectors import Quad, add, lane, mix, scale, texel, zeros4
-from vvgt_cli.jit.decorators import inlined, kernel
+from vvgt_cli.jit.decorators import inlined, parallel_kernel
+from vvgt_cli.jit.parts import Part, turns_of
 
 LEAP = 8  # samples between two looks at the empty-space map
 
@@ -113,34 +113,31 @@ def cast(
 _tile = tiles_of(cast)
 
 
-@kernel(
-    "Texels u1:3 f8:1 f8:2 f8:1 f8 i8:1 f8:2 b1:2 i8 f4:3", GRID, parallel=True, fastmath=FLAGS, error_model="numpy"
-)
+@parallel_kernel("Texels u1:3 f8:1 f8:2 f8:1 f8 i8:1 f8:2 b1:2 i8 f4:3", GRID, fastmath=FLAGS, error_model="numpy")
 def render_grid_tiles(
-    texels: Texels, empty: np.ndarray, eye: np.ndarray, basis: np.ndarray, lens: np.ndarray, step: float,
+    part: Part, texels: Texels, empty: np.ndarray, eye: np.ndarray, basis: np.ndarray, lens: np.ndarray, step: float,
     order: np.ndarray, offsets: np.ndarray, mask: np.ndarray, known: int, out: np.ndarray,
 ) -> None:  # fmt: skip
     """`kernel.render_tiles` of a grid."""
     across = (out.shape[1] + TILE - 1) // TILE
-    for index in nb.prange(len(order)):
+    for index in turns_of(part, len(order)):
         top, left = order[index] // across * TILE, order[index] % across * TILE
         _tile(texels, None, empty, None, eye, basis, lens, step, top, left, offsets, mask, known, out)
 
 
-@kernel(
+@parallel_kernel(
     "Texels Voxels u1:3 Light f8:1 f8:2 f8:1 f8 i8:1 f8:2 b1:2 i8 f4:3",
     LIT_GRID,
-    parallel=True,
     fastmath=FLAGS,
     error_model="numpy",
 )
 def render_lit_grid_tiles(
-    texels: Texels, voxels: Voxels, empty: np.ndarray, light: Light, eye: np.ndarray, basis: np.ndarray,
+    part: Part, texels: Texels, voxels: Voxels, empty: np.ndarray, light: Light, eye: np.ndarray, basis: np.ndarray,
     lens: np.ndarray, step: float, order: np.ndarray, offsets: np.ndarray, mask: np.ndarray, known: int,
     out: np.ndarray,
 ) -> None:  # fmt: skip
     """The same under ``light`` (`Light`): normals are the gradient of the extinction ``voxels``."""
     across = (out.shape[1] + TILE - 1) // TILE
-    for index in nb.prange(len(order)):
+    for index in turns_of(part, len(order)):
         top, left = order[index] // across * TILE, order[index] % across * TILE
         _tile(texels, voxels, empty, light, eye, basis, lens, step, top, left, offsets, mask, known, out)

@@ -17,7 +17,8 @@ import numpy as np
 from vvgt_cli.dvr.layout import BRICK, BRICK_BITS, TUPLES, Optics, Voxels
 from vvgt_cli.dvr.runs import BORROWED, RUN, Run, run_range, sample_run, stack_run
 from vvgt_cli.dvr.vectors import Quad, add, lane, row, scale, sub, zeros4
-from vvgt_cli.jit.decorators import inlined, kernel
+from vvgt_cli.jit.decorators import inlined, parallel_kernel
+from vvgt_cli.jit.parts import Part, turns_of
 
 OPAQUE = 1e-3  # times step^2, as the error of integration goes: the transmittance at which a ray ends
 SUB_DEPTH = 1.0  # optical depth of a sub-segment: colour is constant within one; 0.3 is no more accurate
@@ -370,15 +371,14 @@ def tiles_of(cast: Cast) -> Callable[..., None]:
 _tile = tiles_of(cast)
 
 
-@kernel(
+@parallel_kernel(
     "Voxels Optics u1:3 f8:1 f8:2 f8:1 f8 i8:1 f8:2 b1:2 i8 f4:3",
     TUPLES,
-    parallel=True,
     fastmath=FLAGS,
     error_model="numpy",
 )
 def render_tiles(
-    voxels: Voxels, optics: Optics, empty: np.ndarray, eye: np.ndarray, basis: np.ndarray, lens: np.ndarray,
+    part: Part, voxels: Voxels, optics: Optics, empty: np.ndarray, eye: np.ndarray, basis: np.ndarray, lens: np.ndarray,
     step: float, order: np.ndarray, offsets: np.ndarray, mask: np.ndarray, known: int, out: np.ndarray,
 ) -> None:  # fmt: skip
     """Render one view into ``out`` (h, w, 4) float32, rays at ``offsets`` (n, 2) in pixels where ``mask`` is set.
@@ -389,6 +389,6 @@ def render_tiles(
     whose mean ``out`` holds already.
     """
     across = (out.shape[1] + TILE - 1) // TILE
-    for index in nb.prange(len(order)):
+    for index in turns_of(part, len(order)):
         top, left = order[index] // across * TILE, order[index] % across * TILE
         _tile(voxels, optics, empty, None, eye, basis, lens, step, top, left, offsets, mask, known, out)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-import numba as nb
 import numpy as np
 
 from vvgt_cli.dvr.kernel import (
@@ -25,7 +24,8 @@ from vvgt_cli.dvr.layout import LIT, Light, Optics, Voxels
 from vvgt_cli.dvr.runs import BORROWED, RUN, sample_run, stack_run
 from vvgt_cli.dvr.shading import shading
 from vvgt_cli.dvr.vectors import lane, zeros4
-from vvgt_cli.jit.decorators import inlined, kernel
+from vvgt_cli.jit.decorators import inlined, parallel_kernel
+from vvgt_cli.jit.parts import Part, turns_of
 
 _jit = inlined(fastmath=FLAGS, error_model="numpy", **BORROWED)
 
@@ -89,14 +89,14 @@ def cast(
 _tile = tiles_of(cast)
 
 
-@kernel(
+@parallel_kernel(
     "Voxels Optics u1:3 Light f8:1 f8:2 f8:1 f8 i8:1 f8:2 b1:2 i8 f4:3",
     LIT,
-    parallel=True,
     fastmath=FLAGS,
     error_model="numpy",
 )
 def render_lit_tiles(
+    part: Part,
     voxels: Voxels,
     optics: Optics,
     empty: np.ndarray,
@@ -113,6 +113,6 @@ def render_lit_tiles(
 ) -> None:
     """`kernel.render_tiles` under ``light`` (`Light`)."""
     across = (out.shape[1] + TILE - 1) // TILE
-    for index in nb.prange(len(order)):
+    for index in turns_of(part, len(order)):
         top, left = order[index] // across * TILE, order[index] % across * TILE
         _tile(voxels, optics, empty, light, eye, basis, lens, step, top, left, offsets, mask, known, out)

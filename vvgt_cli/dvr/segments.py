@@ -10,7 +10,6 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-import numba as nb
 import numpy as np
 
 from vvgt_cli.dvr.grid import composite as mixed
@@ -31,7 +30,8 @@ from vvgt_cli.dvr.layout import GRID, LIT, LIT_GRID, TUPLES, Light, Optics, Texe
 from vvgt_cli.dvr.runs import BORROWED, RUN, sample_run, stack_run
 from vvgt_cli.dvr.shading import shading
 from vvgt_cli.dvr.vectors import Quad, lane, zeros4
-from vvgt_cli.jit.decorators import inlined, kernel
+from vvgt_cli.jit.decorators import inlined, parallel_kernel
+from vvgt_cli.jit.parts import Part, turns_of
 
 Vector = tuple[float, float, float]
 LEAP = 8  # samples between two looks at the empty-space map
@@ -200,8 +200,9 @@ _classified_pixel, _interpolated_pixel = _pixel_of(_classified), _pixel_of(_inte
 ARGUMENTS = "f8:2 f8:1 f8:1 f8:2 f8:1 f8 i8:2 f8:2 f4:3"
 
 
-@kernel(f"Voxels Optics u1:3 {ARGUMENTS}", TUPLES, parallel=True, fastmath=FLAGS, error_model="numpy")
+@parallel_kernel(f"Voxels Optics u1:3 {ARGUMENTS}", TUPLES, fastmath=FLAGS, error_model="numpy")
 def cast_segments(
+    part: Part,
     voxels: Voxels, optics: Optics, empty: np.ndarray, faces: np.ndarray, begin: np.ndarray, eye: np.ndarray,
     basis: np.ndarray, lens: np.ndarray, step: float, pixels: np.ndarray, offsets: np.ndarray, out: np.ndarray,
 ) -> None:  # fmt: skip
@@ -212,45 +213,45 @@ def cast_segments(
     (x, y, z); ``pixels`` (n, 2: column, row), ``offsets`` (m, 2) as `render_tiles` has them, ``step`` at most 1, and
     ``eye``, ``basis``, ``lens`` too, in voxels of the whole volume.
     """
-    for n in nb.prange(len(pixels)):
+    for n in turns_of(part, len(pixels)):
         _classified_pixel(
             voxels, optics, empty, None, faces, begin, eye, basis, lens, step, pixels[n], offsets, out[n]
         )  # fmt: skip
 
 
-@kernel(f"Voxels Optics u1:3 Light {ARGUMENTS}", LIT, parallel=True, fastmath=FLAGS, error_model="numpy")
+@parallel_kernel(f"Voxels Optics u1:3 Light {ARGUMENTS}", LIT, fastmath=FLAGS, error_model="numpy")
 def cast_lit_segments(
-    voxels: Voxels, optics: Optics, empty: np.ndarray, light: Light, faces: np.ndarray, begin: np.ndarray,
+    part: Part, voxels: Voxels, optics: Optics, empty: np.ndarray, light: Light, faces: np.ndarray, begin: np.ndarray,
     eye: np.ndarray, basis: np.ndarray, lens: np.ndarray, step: float, pixels: np.ndarray, offsets: np.ndarray,
     out: np.ndarray,
 ) -> None:  # fmt: skip
     """`cast_segments` under ``light`` (`Light`) of the block, which has two voxels around it."""
-    for n in nb.prange(len(pixels)):
+    for n in turns_of(part, len(pixels)):
         _classified_pixel(
             voxels, optics, empty, light, faces, begin, eye, basis, lens, step, pixels[n], offsets, out[n]
         )  # fmt: skip
 
 
-@kernel(f"Texels u1:3 {ARGUMENTS}", GRID, parallel=True, fastmath=FLAGS, error_model="numpy")
+@parallel_kernel(f"Texels u1:3 {ARGUMENTS}", GRID, fastmath=FLAGS, error_model="numpy")
 def cast_grid_segments(
-    texels: Texels, empty: np.ndarray, faces: np.ndarray, begin: np.ndarray, eye: np.ndarray,
+    part: Part, texels: Texels, empty: np.ndarray, faces: np.ndarray, begin: np.ndarray, eye: np.ndarray,
     basis: np.ndarray, lens: np.ndarray, step: float, pixels: np.ndarray, offsets: np.ndarray, out: np.ndarray,
 ) -> None:  # fmt: skip
     """`cast_segments` of an optics grid."""
-    for n in nb.prange(len(pixels)):
+    for n in turns_of(part, len(pixels)):
         _interpolated_pixel(
             texels, None, empty, None, faces, begin, eye, basis, lens, step, pixels[n], offsets, out[n]
         )  # fmt: skip
 
 
-@kernel(f"Texels Voxels u1:3 Light {ARGUMENTS}", LIT_GRID, parallel=True, fastmath=FLAGS, error_model="numpy")
+@parallel_kernel(f"Texels Voxels u1:3 Light {ARGUMENTS}", LIT_GRID, fastmath=FLAGS, error_model="numpy")
 def cast_lit_grid_segments(
-    texels: Texels, voxels: Voxels, empty: np.ndarray, light: Light, faces: np.ndarray, begin: np.ndarray,
+    part: Part, texels: Texels, voxels: Voxels, empty: np.ndarray, light: Light, faces: np.ndarray, begin: np.ndarray,
     eye: np.ndarray, basis: np.ndarray, lens: np.ndarray, step: float, pixels: np.ndarray, offsets: np.ndarray,
     out: np.ndarray,
 ) -> None:  # fmt: skip
     """`cast_lit_segments` of an optics grid: normals are the gradient of the extinction ``voxels``."""
-    for n in nb.prange(len(pixels)):
+    for n in turns_of(part, len(pixels)):
         _interpolated_pixel(
             texels, voxels, empty, light, faces, begin, eye, basis, lens, step, pixels[n], offsets, out[n]
         )  # fmt: skip

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 
-import numba as nb
 import numpy as np
 
 from vvgt_cli.dvr.kernel import FLAGS, box_span, leap, mean_optics, sample, table_coordinate
 from vvgt_cli.dvr.layout import BRICK_BITS, TUPLES, Optics, Voxels
 from vvgt_cli.dvr.runs import BORROWED
-from vvgt_cli.jit.decorators import inlined, kernel
+from vvgt_cli.jit.decorators import inlined, parallel_kernel
+from vvgt_cli.jit.parts import Part, turns_of
 
 BLACK = 1e-3  # transmittance at which a ray ends, as none
 
@@ -67,8 +67,9 @@ def _transmittance(
     return math.exp(-depth)
 
 
-@kernel("Voxels Optics u1:3 f8:2 b1:3 f8 f8 f8 f8 f4:3", TUPLES, parallel=True, fastmath=FLAGS, error_model="numpy")
+@parallel_kernel("Voxels Optics u1:3 f8:2 b1:3 f8 f8 f8 f8 f4:3", TUPLES, fastmath=FLAGS, error_model="numpy")
 def mean_transmittance(
+    part: Part,
     voxels: Voxels,
     optics: Optics,
     empty: np.ndarray,
@@ -87,7 +88,7 @@ def mean_transmittance(
     """
     nz, ny, nx = voxels.values.shape
     cz, cy, cx = out.shape
-    for flat in nb.prange(cz * cy):
+    for flat in turns_of(part, cz * cy):
         k, j = flat // cy, flat % cy
         z, y = min((k + 0.5) * cell, nz - 0.5) - 0.5, min((j + 0.5) * cell, ny - 0.5) - 0.5
         for i in range(cx):
@@ -104,12 +105,12 @@ def mean_transmittance(
             out[k, j, i] = total / directions.shape[0]
 
 
-@kernel("Voxels Optics u1:3 i8 f4:3", TUPLES, parallel=True, fastmath=FLAGS, error_model="numpy")
-def cell_extinction(voxels: Voxels, optics: Optics, empty: np.ndarray, cell: int, out: np.ndarray) -> None:
+@parallel_kernel("Voxels Optics u1:3 i8 f4:3", TUPLES, fastmath=FLAGS, error_model="numpy")
+def cell_extinction(part: Part, voxels: Voxels, optics: Optics, empty: np.ndarray, cell: int, out: np.ndarray) -> None:
     """Mean extinction of the voxels in each cube of ``cell`` of them along an edge, into ``out`` (cz, cy, cx)."""
     nz, ny, nx = voxels.values.shape
     cz, cy, cx = out.shape
-    for flat in nb.prange(cz * cy):
+    for flat in turns_of(part, cz * cy):
         k, j = flat // cy, flat % cy
         z0, z1, y0, y1 = k * cell, min((k + 1) * cell, nz), j * cell, min((j + 1) * cell, ny)
         for i in range(cx):

@@ -23,7 +23,7 @@ GRID = {
     BLOCK_MOMENTS: "vvgt_cli.closed_form.grid:grid_moments",
 }
 DRAW = (
-    "vvgt_cli.splat.kernel:tile_lists",
+    *(f"vvgt_cli.splat.kernel:{name}" for name in ("count_pairs", "sum_pairs", "file_pairs")),
     "vvgt_cli.splat.tiles:blend",
     "vvgt_cli.splat.kernel:project",
     "vvgt_cli.splat.kernel:stable_order",

@@ -6,17 +6,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, TypeVar, cast
+from functools import partial
+from typing import Any, Concatenate, ParamSpec, TypeVar, cast
 
 import numba as nb
 from numba import extending
 
 from vvgt_cli.errors import UsageError
 from vvgt_cli.jit.cache import KernelCache
+from vvgt_cli.jit.parts import NO_C_ENTRY, NO_ENTRY, WHOLE, Part, shared
 from vvgt_cli.jit.target import config
 
+P = ParamSpec("P")
 F = TypeVar("F", bound=Callable[..., Any])  # a kernel is called as the function that it is made of
-NO_ENTRY: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
 
 def kernel(usual: str = "", tuples: Mapping[type, str] | None = None, **options: Any) -> Callable[[F], F]:
@@ -33,11 +35,29 @@ def kernel(usual: str = "", tuples: Mapping[type, str] | None = None, **options:
     """
 
     def wrap(function: F) -> F:
-        made: Any = nb.njit(nogil=True, **options)(function)
+        made: Any = nb.njit(nogil=True, **NO_C_ENTRY, **options)(function)
         if hasattr(made, "py_func"):  # with NUMBA_DISABLE_JIT it is the function
             made._cache = KernelCache(made)
             made.usual, made.tuples = usual, tuples or {}
         return cast(F, made)
+
+    return wrap
+
+
+def parallel_kernel(
+    usual: str = "", tuples: Mapping[type, str] | None = None, **options: Any
+) -> Callable[[Callable[Concatenate[Part, P], None]], Callable[P, None]]:
+    """`kernel` for functions without a result, run at once on all threads of numba's.
+
+    The first argument of each call, `vvgt_cli.jit.parts.Part`, says which turns of a loop are its own; Python does not
+    pass it.
+    """
+
+    def wrap(function: Callable[Concatenate[Part, P], None]) -> Callable[P, None]:
+        if config.DISABLE_JIT:
+            return partial(function, WHOLE)
+        body = nb.njit(**NO_ENTRY, **options)(function)
+        return kernel(usual, tuples)(shared(body, function.__name__))
 
     return wrap
 

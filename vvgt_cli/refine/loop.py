@@ -137,12 +137,13 @@ def step(
     image = blend(projection, np.maximum(state.colors_from(camera), 0), camera.height, camera.width)
     grad = np.empty_like(image)
     l1, l2, alpha = np.float32(options.l1), np.float32(options.l2), np.float32(options.alpha)
-    squares = loss_gradient(image, target, l1, l2, alpha, grad)
+    squares = np.empty(camera.height)
+    loss_gradient(image, target, l1, l2, alpha, grad, squares)
     if options.ssim > 0:
         add_ssim_gradient(image, target, options.ssim, grad)
     if options.texture > 0:
         add_texture_gradient(image, target, options.texture, grad)
-    now = math.sqrt(squares / ((3 + options.alpha) * camera.height * camera.width))
+    now = math.sqrt(squares.sum() / ((3 + options.alpha) * camera.height * camera.width))
     error = now if error is None else MEMORY * error + (1 - MEMORY) * now
     state.descend(camera, projection, image, grad, error, share, speed)
     return error

@@ -14,57 +14,54 @@ import numba as nb
 import numpy as np
 
 from vvgt_cli.images.metrics.ssim import C1, C2, RADIUS, SIGMA
-from vvgt_cli.jit.decorators import kernel
+from vvgt_cli.jit.decorators import parallel_kernel
+from vvgt_cli.jit.parts import Part, turns_of
 
 KERNEL = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / SIGMA) ** 2)
 KERNEL = (KERNEL / KERNEL.sum()).astype(np.float32)
 f32: Any = np.float32
+U = nb.uint64  # an index that cannot be negative needs no test
 
 
-@kernel("f4:3 f4:1 f4:3 f4:3", parallel=True, fastmath=True, error_model="numpy")
-def blur(planes: np.ndarray, kernel: np.ndarray, padded: np.ndarray, out: np.ndarray) -> None:
-    """Correlate ``planes`` (n, h, w) with the outer square of ``kernel`` (2 r + 1,), zeros beyond the border.
-
-    ``padded`` (n, h + 2 r, w + 2 r) is scratch whose rim is zero.
-    """
+@parallel_kernel("f4:3 f4:1 f4:3", fastmath=True, error_model="numpy")
+def blur(part: Part, planes: np.ndarray, kernel: np.ndarray, out: np.ndarray) -> None:
+    """Correlate ``planes`` (n, h, w) with the outer square of ``kernel`` (2 r + 1,), zeros beyond the border."""
     n, h, w = planes.shape
     r = kernel.shape[0] // 2
-    for job in nb.prange(n * h):
-        p, y = job // h, job % h
-        padded[p, y + r, r : r + w] = planes[p, y]
-    for job in nb.prange(n * h):
+    for job in turns_of(part, n * h):
         p, y = job // h, job % h
         line = np.zeros(w + 2 * r, np.float32)
-        for i in range(2 * r + 1):
+        for i in range(max(r - y, 0), min(2 * r + 1, h + r - y)):
             weight = kernel[i]
-            for x in range(w + 2 * r):
-                line[x] += weight * padded[p, y + i, x]
+            row = planes[p, y + i - r]
+            for x in range(w):
+                line[U(r + x)] += weight * row[x]
         for x in range(w):
             out[p, y, x] = f32(0)
         for i in range(2 * r + 1):
             weight = kernel[i]
             for x in range(w):
-                out[p, y, x] += weight * line[x + i]
+                out[p, y, x] += weight * line[U(x + i)]
 
 
-@kernel(parallel=True, fastmath=True, error_model="numpy")
-def products(x: np.ndarray, y: np.ndarray, out: np.ndarray) -> None:
+@parallel_kernel(fastmath=True, error_model="numpy")
+def products(part: Part, x: np.ndarray, y: np.ndarray, out: np.ndarray) -> None:
     """``out`` (5, h, w): x, y, x^2, y^2, x y of one channel (h, w)."""
-    for row in nb.prange(x.shape[0]):
+    for row in turns_of(part, x.shape[0]):
         for col in range(x.shape[1]):
             a, b = x[row, col], y[row, col]
             out[0, row, col], out[1, row, col] = a, b
             out[2, row, col], out[3, row, col], out[4, row, col] = a * a, b * b, a * b
 
 
-@kernel(parallel=True, fastmath=True, error_model="numpy")
-def slopes(blurred: np.ndarray, out: np.ndarray, score: np.ndarray) -> None:
+@parallel_kernel(fastmath=True, error_model="numpy")
+def slopes(part: Part, blurred: np.ndarray, out: np.ndarray, score: np.ndarray) -> None:
     """SSIM's derivatives by blur(x), blur(x^2), blur(x y) into ``out`` (3, h, w), its sums a row into ``score`` (h,).
 
     ``blurred`` (5, h, w): the blurs of `products`.
     """
     c1, c2 = f32(C1), f32(C2)
-    for row in nb.prange(blurred.shape[1]):
+    for row in turns_of(part, blurred.shape[1]):
         total = f32(0)
         for col in range(blurred.shape[2]):
             m, n = blurred[0, row, col], blurred[1, row, col]
@@ -81,15 +78,15 @@ def slopes(blurred: np.ndarray, out: np.ndarray, score: np.ndarray) -> None:
         score[row] = total
 
 
-@kernel(parallel=True, fastmath=True, error_model="numpy")
+@parallel_kernel(fastmath=True, error_model="numpy")
 def add_gradient(
-    blurred: np.ndarray, x: np.ndarray, y: np.ndarray, scale: np.float32, channel: int, grad: np.ndarray
+    part: Part, blurred: np.ndarray, x: np.ndarray, y: np.ndarray, scale: np.float32, channel: int, grad: np.ndarray
 ) -> None:
     """``grad`` (h, w, 4), one channel, += ``scale`` x gradient of the sum of SSIM.
 
     ``blurred`` (3, h, w): the blurs of `slopes`; ``x``, ``y`` (h, w) the channel of picture and target.
     """
-    for row in nb.prange(x.shape[0]):
+    for row in turns_of(part, x.shape[0]):
         for col in range(x.shape[1]):
             slope = blurred[0, row, col] + f32(2) * x[row, col] * blurred[1, row, col]
             grad[row, col, channel] += scale * (slope + y[row, col] * blurred[2, row, col])
@@ -103,17 +100,15 @@ def add_ssim_gradient(image: np.ndarray, target: np.ndarray, weight: float, grad
         grad: (h, w, 4) float32.
     """
     h, w = image.shape[:2]
-    r = KERNEL.size // 2
-    padded = np.zeros((5, h + 2 * r, w + 2 * r), np.float32)
     fields, blurred = np.empty((5, h, w), np.float32), np.empty((5, h, w), np.float32)
     score = np.empty(h, np.float32)
     total = 0.0
     for channel in range(3):
         x, y = image[..., channel], target[..., channel]
         products(x, y, fields)
-        blur(fields, KERNEL, padded, blurred)
+        blur(fields, KERNEL, blurred)
         slopes(blurred, fields[:3], score)
-        blur(fields[:3], KERNEL, padded[:3], blurred[:3])
+        blur(fields[:3], KERNEL, blurred[:3])
         add_gradient(blurred[:3], x, y, np.float32(-weight), channel, grad)
         total += float(score.sum(dtype=np.float64))
     return float(total / (3 * h * w))

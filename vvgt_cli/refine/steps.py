@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numba as nb
 import numpy as np
 
-from vvgt_cli.jit.decorators import inlined, kernel
+from vvgt_cli.jit.decorators import inlined, parallel_kernel
+from vvgt_cli.jit.parts import Part, turns_of
 from vvgt_cli.splat.lanes import LANES, U
 
 f32: Any = np.float32
@@ -111,8 +111,9 @@ def _move(buf: np.ndarray, rates: tuple[float, ...], clips: tuple[float, ...], s
             buf[here + U(2) * _P1] = m2 - s2 + HALF * (s0 * e02 + s1 * e12 + s2 * e22)
 
 
-@kernel("f4:2 f8:1 f8:1 f8 f8 f8 i8 f4:2 f4:3 f4:1 f4:2 f8 f4:2 f4:2 f4:1 i1:3 f4:2", parallel=True)
+@parallel_kernel("f4:2 f8:1 f8:1 f8 f8 f8 i8 f4:2 f4:3 f4:1 f4:2 f8 f4:2 f4:2 f4:1 i1:3 f4:2")
 def own_frame(
+    part: Part,
     slopes: np.ndarray, rates: np.ndarray, clips: np.ndarray, spread: float, beta1: float, beta2: float, step: int,
     means: np.ndarray, factors: np.ndarray, logits: np.ndarray, colors: np.ndarray, darkest: float, first: np.ndarray,
     second: np.ndarray, floors: np.ndarray, features: np.ndarray, weights: np.ndarray,
@@ -130,7 +131,7 @@ def own_frame(
     paces, bounds = (f32(rates[0]), f32(rates[1]), f32(rates[2])), (f32(clips[0]), f32(clips[2]))
     by_logit, by_color, farthest = f32(rates[3]), f32(rates[4]), f32(clips[1])
     hidden, least, total = f32(spread), f32(darkest), means.shape[0]
-    for chunk in nb.prange((total + LANES - 1) // LANES):
+    for chunk in turns_of(part, (total + LANES - 1) // LANES):
         begin = chunk * LANES
         count = min(LANES, total - begin)
         buf = np.ones((COUNT + 9) * LANES, np.float32)
@@ -152,14 +153,14 @@ def own_frame(
             logits[k] -= _clip(buf[at + U(9) * _P1] * by_logit, farthest)
 
 
-@kernel("f4:2 f4:2 f8 f4:2", parallel=True)
-def regress(solver: np.ndarray, directions: np.ndarray, gain: float, weights: np.ndarray) -> None:
+@parallel_kernel("f4:2 f4:2 f8 f4:2")
+def regress(part: Part, solver: np.ndarray, directions: np.ndarray, gain: float, weights: np.ndarray) -> None:
     """``weights`` (KNOWN, FEATURES) = ``gain`` times ``directions`` (COUNT, n) by ``solver`` (FEATURES, n), float32.
 
     Of the directions those that are shared, all finite. Sums have one order for any number of threads, unlike BLAS'.
     """
     whole = directions.shape[1] // LANES * LANES
-    for f in nb.prange(FEATURES):
+    for f in turns_of(part, FEATURES):
         sums = np.empty(LANES, np.float32)
         for row in range(KNOWN):
             field = row if row < 6 else row + 3
@@ -176,8 +177,9 @@ def regress(solver: np.ndarray, directions: np.ndarray, gain: float, weights: np
             weights[row, f] = f32(gain) * total
 
 
-@kernel("f4:1 f4:1 f8 f8 f8 i8 f4:1 f4:1", parallel=True, error_model="numpy")
+@parallel_kernel("f4:1 f4:1 f8 f8 f8 i8 f4:1 f4:1", error_model="numpy")
 def adam(
+    part: Part,
     values: np.ndarray, slopes: np.ndarray, rate: float, beta1: float, beta2: float, step: int, first: np.ndarray,
     second: np.ndarray,
 ) -> None:  # fmt: skip
@@ -187,7 +189,7 @@ def adam(
     """
     fix1, fix2 = f32(1 / (1 - beta1**step)), f32(1 / (1 - beta2**step))
     b1, b2, pace = f32(beta1), f32(beta2), f32(rate)
-    for i in nb.prange(values.shape[0]):
+    for i in turns_of(part, values.shape[0]):
         m = b1 * first[i] + (ONE - b1) * slopes[i]
         v = b2 * second[i] + (ONE - b2) * slopes[i] * slopes[i]
         first[i], second[i] = m, v

@@ -10,10 +10,10 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba as nb
 import numpy as np
 
-from vvgt_cli.jit.decorators import kernel
+from vvgt_cli.jit.decorators import parallel_kernel
+from vvgt_cli.jit.parts import Part, turns_of
 from vvgt_cli.refine.ssim import KERNEL, blur
 
 f32: Any = np.float32
@@ -28,21 +28,20 @@ def add_texture_gradient(image: np.ndarray, target: np.ndarray, weight: float, g
         grad: (h, w, 4) float32; alpha is left alone.
     """
     h, w = image.shape[:2]
-    r = KERNEL.size // 2
-    padded = np.zeros((7, h + 2 * r, w + 2 * r), np.float32)
     planes, blurred = np.empty((7, h, w), np.float32), np.empty((7, h, w), np.float32)
     part_planes(image, target, planes)
-    blur(planes, KERNEL, padded, blurred)
-    total = weigh(blurred, planes)
-    blur(planes[:3], KERNEL, padded[:3], blurred[:3])
+    blur(planes, KERNEL, blurred)
+    sums = np.empty(h)
+    weigh(blurred, planes, sums)
+    blur(planes[:3], KERNEL, blurred[:3])
     add_fine(planes, blurred, weight, grad)
-    return total
+    return float(sums.sum())
 
 
-@kernel("f4:3 f4:3 f4:3", parallel=True)
-def part_planes(image: np.ndarray, target: np.ndarray, planes: np.ndarray) -> None:
+@parallel_kernel("f4:3 f4:3 f4:3")
+def part_planes(part: Part, image: np.ndarray, target: np.ndarray, planes: np.ndarray) -> None:
     """Error of each channel, the view's channels and the sum of their squares into ``planes`` (7, h, w)."""
-    for y in nb.prange(image.shape[0]):
+    for y in turns_of(part, image.shape[0]):
         for x in range(image.shape[1]):
             square = f32(0)
             for c in range(3):
@@ -53,15 +52,15 @@ def part_planes(image: np.ndarray, target: np.ndarray, planes: np.ndarray) -> No
             planes[6, y, x] = square
 
 
-@kernel("f4:3 f4:3", parallel=True, error_model="numpy")
-def weigh(blurred: np.ndarray, planes: np.ndarray) -> float:
-    """Errors less their blur, times C / (C + v), replace the first three ``planes`` (7, h, w); returns the term's sum.
+@parallel_kernel("f4:3 f4:3 f8:1", error_model="numpy")
+def weigh(part: Part, blurred: np.ndarray, planes: np.ndarray, sums: np.ndarray) -> None:
+    """Errors less their blur, times C / (C + v), replace the first three ``planes`` (7, h, w).
 
-    ``blurred`` (7, h, w) is the blur of what `part_planes` gave.
+    ``blurred`` (7, h, w) is the blur of what `part_planes` gave; ``sums`` (h,) gets the term's sum of each row.
     """
     smooth, third = f32(SMOOTH), f32(1 / 3)
-    sums = np.zeros(planes.shape[1])
-    for y in nb.prange(planes.shape[1]):
+    for y in turns_of(part, planes.shape[1]):
+        total = 0.0
         for x in range(planes.shape[2]):
             b0, b1, b2 = blurred[3, y, x], blurred[4, y, x], blurred[5, y, x]
             variance = max(blurred[6, y, x] - (b0 * b0 + b1 * b1 + b2 * b2), f32(0)) * third  # mean of the channels
@@ -69,16 +68,15 @@ def weigh(blurred: np.ndarray, planes: np.ndarray) -> float:
             for c in range(3):
                 error = planes[c, y, x] - blurred[c, y, x]
                 planes[c, y, x] = share * error
-                sums[y] += np.float64(share * error * error)
-    total: float = sums.sum()
-    return total
+                total += np.float64(share * error * error)
+        sums[y] = total
 
 
-@kernel("f4:3 f4:3 f8 f4:3", parallel=True)
-def add_fine(planes: np.ndarray, blurred: np.ndarray, weight: float, grad: np.ndarray) -> None:
+@parallel_kernel("f4:3 f4:3 f8 f4:3")
+def add_fine(part: Part, planes: np.ndarray, blurred: np.ndarray, weight: float, grad: np.ndarray) -> None:
     """``grad`` (h, w, 4) += 2 ``weight`` x the first three ``planes`` less their blur ``blurred``."""
     factor = f32(2 * weight)
-    for y in nb.prange(grad.shape[0]):
+    for y in turns_of(part, grad.shape[0]):
         for x in range(grad.shape[1]):
             for c in range(3):
                 grad[y, x, c] += factor * (planes[c, y, x] - blurred[c, y, x])

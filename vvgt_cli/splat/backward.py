@@ -10,11 +10,11 @@ Gaussian) pair, Gaussian by Gaussian; ``total`` is a Gaussian's sum of them, 9 f
 
 from __future__ import annotations
 
-import numba as nb
 import numpy as np
 
 from vvgt_cli.gaussians.constants import TILE
-from vvgt_cli.jit.decorators import inlined, kernel
+from vvgt_cli.jit.decorators import inlined, parallel_kernel
+from vvgt_cli.jit.parts import Part, turns_of
 from vvgt_cli.jit.prefetch import prefetch
 from vvgt_cli.splat.buffer import (
     AREA,
@@ -146,13 +146,13 @@ def _moments_tile(
                 pairs[slots[begin + index], f] = found[index, f]
 
 
-@kernel(
+@parallel_kernel(
     "i8:1 i8:1 i4:1 i8:1 i4:2 f4:2 f4:2 i8 f4:1 f4:3 f4:3 f4:2",
-    parallel=True,
     fastmath=True,
     error_model="numpy",
 )
 def moments(
+    part: Part,
     tiles: np.ndarray, start: np.ndarray, members: np.ndarray, slots: np.ndarray, extent: np.ndarray, flat: np.ndarray,
     colors: np.ndarray, tiles_x: int, rule: np.ndarray, image: np.ndarray, grad: np.ndarray, pairs: np.ndarray,
 ) -> None:  # fmt: skip
@@ -163,7 +163,7 @@ def moments(
     """
     height, width = image.shape[:2]
     way = rule[0], rule[1], rule[2], rule[3], rule[4], rule[5]
-    for index in nb.prange(tiles.shape[0]):
+    for index in turns_of(part, tiles.shape[0]):
         tile = tiles[index]
         ox, oy = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
         w, h = min(TILE, width - ox), min(TILE, height - oy)
@@ -203,10 +203,10 @@ def _screen(
     )  # fmt: skip
 
 
-@kernel(parallel=True)
-def screen(first: np.ndarray, pairs: np.ndarray, flat: np.ndarray, out: np.ndarray) -> None:
+@parallel_kernel()
+def screen(part: Part, first: np.ndarray, pairs: np.ndarray, flat: np.ndarray, out: np.ndarray) -> None:
     """Length of the gradient with respect to each projected centre (px) into ``out`` (K,) float64; 0 where unseen."""
-    for k in nb.prange(flat.shape[0]):
+    for k in turns_of(part, flat.shape[0]):
         out[k] = 0.0
         if first[k + 1] > first[k]:
             total = _total(first, pairs, k)
@@ -238,8 +238,9 @@ def _load_slope(
         buf[U((TOTALS + f) * LANES + i)] = total[f]
 
 
-@kernel("i8:1 f4:2 i4:2 f4:2 f4:2 f4:3 f4:2 f8:2 f8:1 f8:1 f8:1 f4:2", parallel=True)
+@parallel_kernel("i8:1 f4:2 i4:2 f4:2 f4:2 f4:3 f4:2 f8:2 f8:1 f8:1 f8:1 f4:2")
 def own_frame(
+    part: Part,
     first: np.ndarray, pairs: np.ndarray, extent: np.ndarray, flat: np.ndarray, means: np.ndarray, factors: np.ndarray,
     colors: np.ndarray, rot: np.ndarray, trans: np.ndarray, lens: np.ndarray, rule: np.ndarray, out: np.ndarray,
 ) -> None:  # fmt: skip
@@ -249,7 +250,7 @@ def own_frame(
     both), opacity logit, colour (3). Every row is written.
     """
     count, pose, way = means.shape[0], pose_of(rot, trans), (lens[0], lens[1])
-    for chunk in nb.prange((count + LANES - 1) // LANES):
+    for chunk in turns_of(part, (count + LANES - 1) // LANES):
         begin, end = chunk * LANES, min((chunk + 1) * LANES, count)
         buf, seen = np.ones(SLOPED * LANES), np.zeros(LANES, np.bool_)
         for k in range(begin, end):
@@ -311,16 +312,16 @@ def _quaternion(
     )
 
 
-@kernel("i8:1 f4:2 i4:2 f4:2 f4:2 f4:2 f4:2 f4:2 f8:2 f8:1 f8:1 f8:1 f4:2 f4:2 f4:2 f4:1 f4:2", parallel=True)
+@parallel_kernel("i8:1 f4:2 i4:2 f4:2 f4:2 f4:2 f4:2 f4:2 f8:2 f8:1 f8:1 f8:1 f4:2 f4:2 f4:2 f4:1 f4:2")
 def standard(
-    first: np.ndarray, pairs: np.ndarray, extent: np.ndarray, flat: np.ndarray, means: np.ndarray,
+    part: Part, first: np.ndarray, pairs: np.ndarray, extent: np.ndarray, flat: np.ndarray, means: np.ndarray,
     log_scales: np.ndarray, quats: np.ndarray, colors: np.ndarray, rot: np.ndarray, trans: np.ndarray, lens: np.ndarray,
     rule: np.ndarray, out_means: np.ndarray, out_scales: np.ndarray, out_quats: np.ndarray, out_logits: np.ndarray,
     out_colors: np.ndarray,
 ) -> None:  # fmt: skip
     """Gradients with respect to the fields of `Gaussians`, float32 arrays of their shapes."""
     fx, fy = lens[0], lens[1]
-    for k in nb.prange(means.shape[0]):
+    for k in turns_of(part, means.shape[0]):
         out_means[k] = 0.0
         out_scales[k] = 0.0
         out_quats[k] = 0.0

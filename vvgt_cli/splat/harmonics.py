@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import math
 
-import numba as nb
 import numpy as np
 
 from vvgt_cli.gaussians.harmonics import term_slopes, terms
-from vvgt_cli.jit.decorators import inlined, kernel
+from vvgt_cli.jit.decorators import inlined, parallel_kernel
+from vvgt_cli.jit.parts import Part, turns_of
 
 _LARGEST = float(np.finfo(np.float32).max)
 _jit = inlined()
@@ -28,10 +28,12 @@ def _toward(means: np.ndarray, k: int, eye: np.ndarray) -> tuple[float, float, f
     return x * inverse, y * inverse, z * inverse, inverse
 
 
-@kernel("f4:2 f4:2 f4:3 f8:1 f4:2", parallel=True)
-def view_colors(means: np.ndarray, colors: np.ndarray, harmonics: np.ndarray, eye: np.ndarray, out: np.ndarray) -> None:
+@parallel_kernel("f4:2 f4:2 f4:3 f8:1 f4:2")
+def view_colors(
+    part: Part, means: np.ndarray, colors: np.ndarray, harmonics: np.ndarray, eye: np.ndarray, out: np.ndarray
+) -> None:
     """Colours (K, 3) float32 as they are seen from the eye into ``out``; not more than float32 holds."""
-    for k in nb.prange(means.shape[0]):
+    for k in turns_of(part, means.shape[0]):
         x, y, z, _ = _toward(means, k, eye)
         found = _terms(x, y, z)
         for c in range(3):
@@ -41,8 +43,9 @@ def view_colors(means: np.ndarray, colors: np.ndarray, harmonics: np.ndarray, ey
             out[k, c] = min(max(total, -_LARGEST), _LARGEST)
 
 
-@kernel("f4:2 f4:3 f8:1 f4:2 f4:3 f4:2", parallel=True)
+@parallel_kernel("f4:2 f4:3 f8:1 f4:2 f4:3 f4:2")
 def view_slopes(
+    part: Part,
     means: np.ndarray,
     harmonics: np.ndarray,
     eye: np.ndarray,
@@ -54,7 +57,7 @@ def view_slopes(
 
     ``slopes`` (K, 3) float32 is the gradient with respect to the colours that are seen.
     """
-    for k in nb.prange(means.shape[0]):
+    for k in turns_of(part, means.shape[0]):
         if slopes[k, 0] == 0.0 and slopes[k, 1] == 0.0 and slopes[k, 2] == 0.0:
             out_harmonics[k] = 0.0
             out_means[k] = 0.0
@@ -75,13 +78,13 @@ def view_slopes(
         out_means[k, 2] = (g2 - along * z) * inverse
 
 
-@kernel("f4:2 f8:1 f8:2 f8:3", parallel=True)
-def deposit(means: np.ndarray, eye: np.ndarray, values: np.ndarray, out: np.ndarray) -> None:
+@parallel_kernel("f4:2 f8:1 f8:2 f8:3")
+def deposit(part: Part, means: np.ndarray, eye: np.ndarray, values: np.ndarray, out: np.ndarray) -> None:
     """Adjoint of `view_colors`: ``out`` (K, 1 + M, 3) float64 += each term of a colour, 1 first, times ``values``.
 
     ``values`` (K, 3) float64.
     """
-    for k in nb.prange(means.shape[0]):
+    for k in turns_of(part, means.shape[0]):
         if values[k, 0] == 0.0 and values[k, 1] == 0.0 and values[k, 2] == 0.0:
             continue
         x, y, z, _ = _toward(means, k, eye)
@@ -92,10 +95,10 @@ def deposit(means: np.ndarray, eye: np.ndarray, values: np.ndarray, out: np.ndar
                 out[k, 1 + m, c] += found[m] * values[k, c]
 
 
-@kernel("f4:2 f8:1 f8:1 f4:3", parallel=True)
-def deposit_squares(means: np.ndarray, eye: np.ndarray, weights: np.ndarray, out: np.ndarray) -> None:
+@parallel_kernel("f4:2 f8:1 f8:1 f4:3")
+def deposit_squares(part: Part, means: np.ndarray, eye: np.ndarray, weights: np.ndarray, out: np.ndarray) -> None:
     """``out`` (K, 1 + M, 1 + M) float32 += ``weights`` (K,) float64 times the products of two terms of a colour."""
-    for k in nb.prange(means.shape[0]):
+    for k in turns_of(part, means.shape[0]):
         if weights[k] == 0.0:
             continue
         x, y, z, _ = _toward(means, k, eye)

@@ -11,11 +11,11 @@ from __future__ import annotations
 
 import math
 
-import numba as nb
 import numpy as np
 
 from vvgt_cli.gaussians.constants import TILE
-from vvgt_cli.jit.decorators import inlined, kernel
+from vvgt_cli.jit.decorators import inlined, kernel, parallel_kernel
+from vvgt_cli.jit.parts import Part, turns_of
 from vvgt_cli.jit.prefetch import prefetch
 from vvgt_cli.splat.lanes import (
     LANES,
@@ -95,17 +95,16 @@ def _opacity(logits: np.ndarray, k: int) -> float:
     return opacity
 
 
-@kernel(
+@parallel_kernel(
     "f4:2 f4:2 f4:2 f4:1 f8:2 f8:1 f8:1 f8:1 f4:2 f4:1 i4:2",
-    parallel=True,
 )
 def project(
-    means: np.ndarray, log_scales: np.ndarray, quats: np.ndarray, logits: np.ndarray, rot: np.ndarray,
+    part: Part, means: np.ndarray, log_scales: np.ndarray, quats: np.ndarray, logits: np.ndarray, rot: np.ndarray,
     trans: np.ndarray, lens: np.ndarray, rule: np.ndarray, flat: np.ndarray, depth: np.ndarray, extent: np.ndarray,
 ) -> None:  # fmt: skip
     """EWA projection of every Gaussian, into ``flat``, ``depth`` and ``extent``: every row is written."""
     total, pose = means.shape[0], pose_of(rot, trans)
-    for chunk in nb.prange((total + LANES - 1) // LANES):
+    for chunk in turns_of(part, (total + LANES - 1) // LANES):
         begin = chunk * LANES
         count = min(LANES, total - begin)
         buf = np.zeros(PROJECTED * LANES)
@@ -120,17 +119,17 @@ def project(
         _finish(buf, begin, count, pose, lens, rule, flat, depth, extent)
 
 
-@kernel(
+@parallel_kernel(
     "f4:2 f4:3 f4:1 f8:2 f8:1 f8:1 f8:1 f4:2 f4:1 i4:2",
-    parallel=True,
 )
 def project_factors(
+    part: Part,
     means: np.ndarray, factors: np.ndarray, logits: np.ndarray, rot: np.ndarray, trans: np.ndarray, lens: np.ndarray,
     rule: np.ndarray, flat: np.ndarray, depth: np.ndarray, extent: np.ndarray,
 ) -> None:  # fmt: skip
     """`project` for covariances ``M M^T`` given by ``factors`` (K, 3, 3) M."""
     total, pose = means.shape[0], pose_of(rot, trans)
-    for chunk in nb.prange((total + LANES - 1) // LANES):
+    for chunk in turns_of(part, (total + LANES - 1) // LANES):
         begin = chunk * LANES
         count = min(LANES, total - begin)
         buf = np.zeros(PROJECTED * LANES)
@@ -171,21 +170,17 @@ def stable_order(keys: np.ndarray) -> np.ndarray:
     return order
 
 
-@kernel("i8:1 i4:2 i8 i8 i8", parallel=True)
-def tile_lists(
-    order: np.ndarray, extent: np.ndarray, tiles_x: int, tiles_y: int, workers: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Gaussians of each tile in the given (depth) order, ``order`` (K,) int64.
+@parallel_kernel("i8:1 i4:2 i8 i8:2 i8:1")
+def count_pairs(
+    part: Part, order: np.ndarray, extent: np.ndarray, tiles_x: int, fill: np.ndarray, first: np.ndarray
+) -> None:
+    """How many Gaussians of each of the stretches of ``order`` lie in each tile: ``fill`` (stretches, tiles), zeros.
 
-    Each of ``workers`` counts, then files, a stretch of ``order``; the result does not depend on how many there are.
-
-    Returns ``start`` (tiles + 1,), ``members`` (pairs,) Gaussian of each entry, ``slots`` (pairs,) place of the
-    entry's pair in a list grouped by Gaussian, ``first`` (K + 1,) where each Gaussian's group begins there.
+    ``first`` (K + 1,), zeros, gets in how many tiles each Gaussian lies, at the place behind its own.
     """
-    tiles, total = tiles_x * tiles_y, order.shape[0]
-    fill = np.zeros((workers, tiles), np.int64)
-    first = np.zeros(extent.shape[0] + 1, np.int64)
-    for worker in nb.prange(workers):
+    workers, total = fill.shape[0], order.shape[0]
+    for worker in turns_of(part, workers):
+        mine = fill[worker]
         for index in range(worker * total // workers, (worker + 1) * total // workers):
             k = order[index]
             prefetch(extent, order[min(index + AHEAD, total - 1)], 0)
@@ -196,20 +191,18 @@ def tile_lists(
             first[k + 1] = (x1 - x0) * (y1 - y0)
             for ty in range(y0, y1):
                 for tx in range(x0, x1):
-                    fill[worker, ty * tiles_x + tx] += 1
-    start = np.zeros(tiles + 1, np.int64)
-    pairs = 0
-    for tile in range(tiles):  # counts become each worker's first place in the tile's list
-        for worker in range(workers):
-            count = fill[worker, tile]
-            fill[worker, tile] = pairs
-            pairs += count
-        start[tile + 1] = pairs
-    for k in range(extent.shape[0]):
-        first[k + 1] += first[k]
-    members = np.empty(pairs, np.int32)
-    slots = np.empty(pairs, np.int64)
-    for worker in nb.prange(workers):
+                    mine[U(ty * tiles_x + tx)] += 1
+
+
+@parallel_kernel("i8:1 i4:2 i8 i8:2 i8:1 i4:1 i8:1")
+def file_pairs(
+    part: Part, order: np.ndarray, extent: np.ndarray, tiles_x: int, fill: np.ndarray, first: np.ndarray,
+    members: np.ndarray, slots: np.ndarray,
+) -> None:  # fmt: skip
+    """Fill ``members`` and ``slots`` of `tile_lists` from each stretch's first place in each tile, ``fill``."""
+    workers, total = fill.shape[0], order.shape[0]
+    for worker in turns_of(part, workers):
+        mine = fill[worker]
         for index in range(worker * total // workers, (worker + 1) * total // workers):
             k = order[index]
             prefetch(extent, order[min(index + AHEAD, total - 1)], 0)
@@ -218,9 +211,42 @@ def tile_lists(
                 continue
             for ty in range(extent[k, 1] >> SHIFT, ((extent[k, 3] - 1) >> SHIFT) + 1):
                 for tx in range(extent[k, 0] >> SHIFT, ((extent[k, 2] - 1) >> SHIFT) + 1):
-                    place = fill[worker, ty * tiles_x + tx]
-                    members[place] = k
-                    slots[place] = slot
-                    fill[worker, ty * tiles_x + tx] = place + 1
+                    place = mine[U(ty * tiles_x + tx)]
+                    members[U(place)], slots[U(place)] = k, slot
+                    mine[U(ty * tiles_x + tx)] = place + 1
                     slot += 1
+
+
+@kernel("i8:2 i8:1 i8:1")
+def sum_pairs(fill: np.ndarray, first: np.ndarray, start: np.ndarray) -> None:
+    """Counts of `count_pairs` become places: ``fill`` and ``first`` in place, ``start`` (tiles + 1,) is filled."""
+    pairs = 0
+    for tile in range(fill.shape[1]):
+        start[tile] = pairs
+        for worker in range(fill.shape[0]):
+            count = fill[worker, tile]
+            fill[worker, tile] = pairs
+            pairs += count
+    start[fill.shape[1]] = pairs
+    for k in range(first.shape[0] - 1):
+        first[k + 1] += first[k]
+
+
+def tile_lists(
+    order: np.ndarray, extent: np.ndarray, tiles_x: int, tiles_y: int, workers: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Gaussians of each tile in the given (depth) order, ``order`` (K,) int64.
+
+    Each of ``workers`` counts, then files, a stretch of ``order``; the result does not depend on how many there are.
+
+    Returns ``start`` (tiles + 1,), ``members`` (pairs,) Gaussian of each entry, ``slots`` (pairs,) place of the
+    entry's pair in a list grouped by Gaussian, ``first`` (K + 1,) where each Gaussian's group begins there.
+    """
+    tiles = tiles_x * tiles_y
+    fill, first = np.zeros((workers, tiles), np.int64), np.zeros(len(extent) + 1, np.int64)
+    start = np.empty(tiles + 1, np.int64)
+    count_pairs(order, extent, tiles_x, fill, first)
+    sum_pairs(fill, first, start)
+    members, slots = np.empty(start[-1], np.int32), np.empty(start[-1], np.int64)
+    file_pairs(order, extent, tiles_x, fill, first, members, slots)
     return start, members, slots, first

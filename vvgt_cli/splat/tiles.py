@@ -9,11 +9,11 @@ buffer, ``fetched`` what `buffer.fetch` fills.
 
 from __future__ import annotations
 
-import numba as nb
 import numpy as np
 
 from vvgt_cli.gaussians.constants import TILE
-from vvgt_cli.jit.decorators import kernel
+from vvgt_cli.jit.decorators import parallel_kernel
+from vvgt_cli.jit.parts import Part, turns_of
 from vvgt_cli.splat.buffer import (
     AREA,
     BLUE,
@@ -86,20 +86,20 @@ def _blend_tile(
                     buf[j + PLANE_3] += weight * blue
 
 
-@kernel(
+@parallel_kernel(
     "i8:1 i8:1 i4:1 i4:2 f4:2 f4:2 i8 f4:1 f4:3",
-    parallel=True,
     fastmath=True,
     error_model="numpy",
 )
 def blend(
+    part: Part,
     tiles: np.ndarray, start: np.ndarray, members: np.ndarray, extent: np.ndarray, flat: np.ndarray, colors: np.ndarray,
     tiles_x: int, rule: np.ndarray, image: np.ndarray,
 ) -> None:  # fmt: skip
     """Front-to-back blending into ``image`` (height, width, 4) float32, linear in ``colors``."""
     height, width = image.shape[:2]
     way = rule[0], rule[1], rule[2], rule[3], rule[4], rule[5]
-    for index in nb.prange(tiles.shape[0]):
+    for index in turns_of(part, tiles.shape[0]):
         tile = tiles[index]
         ox, oy = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
         w, h = min(TILE, width - ox), min(TILE, height - oy)
@@ -148,13 +148,13 @@ def _gather_tile(
             pairs[slot, 0], pairs[slot, 1], pairs[slot, 2], pairs[slot, 3], pairs[slot, 4] = s0, s1, s2, s3, s4
 
 
-@kernel(
+@parallel_kernel(
     "i8:1 i8:1 i4:1 i8:1 i4:2 f4:2 i8 f4:1 f4:3 f4:2",
-    parallel=True,
     fastmath=True,
     error_model="numpy",
 )
 def gather(
+    part: Part,
     tiles: np.ndarray, start: np.ndarray, members: np.ndarray, slots: np.ndarray, extent: np.ndarray, flat: np.ndarray,
     tiles_x: int, rule: np.ndarray, fields: np.ndarray, pairs: np.ndarray,
 ) -> None:  # fmt: skip
@@ -165,7 +165,7 @@ def gather(
     """
     height, width = fields.shape[1:]
     way = rule[0], rule[1], rule[2], rule[3], rule[4], rule[5]
-    for index in nb.prange(tiles.shape[0]):
+    for index in turns_of(part, tiles.shape[0]):
         tile = tiles[index]
         ox, oy = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
         w, h = min(TILE, width - ox), min(TILE, height - oy)
@@ -179,10 +179,10 @@ def gather(
         _gather_tile(members[span], slots[span], extent, flat, ox, oy, way, buf, pairs)
 
 
-@kernel("i8:1 f4:2 f8:2", parallel=True)
-def reduce_pairs(first: np.ndarray, pairs: np.ndarray, out: np.ndarray) -> None:
+@parallel_kernel("i8:1 f4:2 f8:2")
+def reduce_pairs(part: Part, first: np.ndarray, pairs: np.ndarray, out: np.ndarray) -> None:
     """Add each Gaussian's pairs, in a fixed order: ``out`` (K, 5) float64 += sums of rows of ``pairs`` (pairs, 5)."""
-    for k in nb.prange(first.shape[0] - 1):
+    for k in turns_of(part, first.shape[0] - 1):
         for p in range(first[k], first[k + 1]):
             for c in range(5):
                 out[k, c] += pairs[p, c]

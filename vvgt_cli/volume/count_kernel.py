@@ -5,7 +5,8 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
-from vvgt_cli.jit.decorators import inlined, kernel
+from vvgt_cli.jit.decorators import inlined, parallel_kernel
+from vvgt_cli.jit.parts import Part, turns_of
 
 LANES = 4  # tables that neighbours are counted in: equal ones need not wait for each other
 LOW, HIGH, STORED_LOW, STORED_HIGH = range(4)  # of a part's ends
@@ -13,16 +14,16 @@ NAN, FINITE = range(2)  # of its numbers
 U = nb.uint64  # an index that cannot be negative needs no test
 
 
-@kernel("V i8:3", parallel=True)
-def count_values(values: np.ndarray, out: np.ndarray) -> None:
+@parallel_kernel("V i8:3")
+def count_values(part: Part, values: np.ndarray, out: np.ndarray) -> None:
     """Counts of each number in ``values`` (nz, ny, nx) uint8 or uint16; ``out`` (parts, LANES, 256 or 65536), zeros."""
     parts = out.shape[0]
-    for part in nb.prange(parts):
-        for z in range(part, values.shape[0], parts):
+    for table in turns_of(part, parts):
+        for z in range(table, values.shape[0], parts):
             for y in range(values.shape[1]):
                 row = values[z, y]
                 for x in range(values.shape[2]):
-                    out[part, x % LANES, int(row[x])] += 1
+                    out[table, x % LANES, int(row[x])] += 1
 
 
 @inlined()
@@ -52,9 +53,9 @@ def _row_range(
     numbers[FINITE] += finite
 
 
-@kernel("V f8 f8 b1 f8:2 i8:2", parallel=True)
+@parallel_kernel("V f8 f8 b1 f8:2 i8:2")
 def range_values(
-    values: np.ndarray, slope: float, intercept: float, whole: bool, ends: np.ndarray, numbers: np.ndarray
+    part: Part, values: np.ndarray, slope: float, intercept: float, whole: bool, ends: np.ndarray, numbers: np.ndarray
 ) -> None:
     """Range of data values ``slope * stored + intercept`` and of stored ones, and how many of them are finite.
 
@@ -63,18 +64,18 @@ def range_values(
     zeros.
     """
     parts = ends.shape[0]
-    for part in nb.prange(parts):
+    for table in turns_of(part, parts):
         lows, highs = np.full((2, values.shape[2]), np.inf), np.full((2, values.shape[2]), -np.inf)
-        for z in range(part, values.shape[0], parts):
+        for z in range(table, values.shape[0], parts):
             for y in range(values.shape[1]):
-                _row_range(values[z, y], slope, intercept, whole, lows, highs, numbers[part])
-        ends[part, LOW], ends[part, HIGH] = lows[0].min(), highs[0].max()
-        ends[part, STORED_LOW], ends[part, STORED_HIGH] = lows[1].min(), highs[1].max()
+                _row_range(values[z, y], slope, intercept, whole, lows, highs, numbers[table])
+        ends[table, LOW], ends[table, HIGH] = lows[0].min(), highs[0].max()
+        ends[table, STORED_LOW], ends[table, STORED_HIGH] = lows[1].min(), highs[1].max()
 
 
-@kernel("V f8 f8 f8 f8 f8 i8:3", parallel=True)
+@parallel_kernel("V f8 f8 f8 f8 f8 i8:3")
 def bin_values(
-    values: np.ndarray, slope: float, intercept: float, lo: float, hi: float, half: float, out: np.ndarray
+    part: Part, values: np.ndarray, slope: float, intercept: float, lo: float, hi: float, half: float, out: np.ndarray
 ) -> None:
     """Histogram of the finite data values ``slope * stored + intercept`` by the bins of `stats.bins_of`, to the bit.
 
@@ -83,9 +84,9 @@ def bin_values(
     """
     parts, bins = out.shape[0], out.shape[2] - 1
     first, width = lo * half, hi * half - lo * half
-    for part in nb.prange(parts):
+    for table in turns_of(part, parts):
         number = np.empty(values.shape[2], np.int32)
-        for z in range(part, values.shape[0], parts):
+        for z in range(table, values.shape[0], parts):
             for y in range(values.shape[1]):
                 row = values[z, y]
                 for x in range(len(row)):  # apart from the counting: so many at once as the processor can
@@ -94,4 +95,4 @@ def bin_values(
                     t = ((v if fits else lo) * half - first) / width * bins
                     number[x] = max(min(np.int32(t), bins - 1), 0) if fits else bins  # within, whatever has changed
                 for x in range(len(row)):
-                    out[part, x % LANES, U(number[x])] += 1
+                    out[table, x % LANES, U(number[x])] += 1

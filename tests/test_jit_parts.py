@@ -1,0 +1,72 @@
+"""Loops that threads share: every turn once, the same numbers on any number of threads, failures said."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from vvgt_cli.jit.decorators import parallel_kernel
+from vvgt_cli.jit.parts import Part, turns_of
+from vvgt_cli.refine.steps import adam
+
+
+@parallel_kernel("f8:1 f8:1")
+def roots(part: Part, values: np.ndarray, out: np.ndarray) -> None:
+    """Square roots; of a negative number there is none."""
+    for i in turns_of(part, values.shape[0]):
+        if values[i] < 0.0:
+            raise ValueError("negative")
+        out[i] += np.sqrt(values[i])
+
+
+@given(st.integers(1, 70), st.integers(0, 200))
+def test_parts_take_every_turn_once(parts, count):
+    taken = [i for part in range(parts) for i in turns_of.py_func((part, parts), count)]
+    assert taken == list(range(count))
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 1001])
+@pytest.mark.parametrize("threads", [1, 2, 3])
+def test_each_turn_is_run_once(threads, count):
+    most = numba.get_num_threads()
+    values, out = np.arange(count, dtype=float), np.zeros(count)
+    try:
+        numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
+        roots(values=values, out=out)
+    finally:
+        numba.set_num_threads(most)
+    np.testing.assert_array_equal(out, np.sqrt(values))
+
+
+def test_one_thread_and_all_give_the_same_bytes():
+    def step(threads):
+        most, rng = numba.get_num_threads(), np.random.default_rng(0)
+        arrays = [rng.random(10_007).astype(np.float32) for _ in range(4)]
+        try:
+            numba.set_num_threads(threads)
+            adam(arrays[0], arrays[1], 1e-2, 0.9, 0.99, 3, arrays[2], arrays[3])
+        finally:
+            numba.set_num_threads(most)
+        return b"".join(array.tobytes() for array in arrays)
+
+    assert step(1) == step(numba.config.NUMBA_NUM_THREADS)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_part_that_fails_is_an_error(threads):
+    most = numba.get_num_threads()
+    try:
+        numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
+        with pytest.raises(RuntimeError, match="a part of a kernel failed"):
+            roots(np.array([1.0, 4.0, -1.0]), np.zeros(3))
+    finally:
+        numba.set_num_threads(most)
+
+
+def test_it_takes_its_arguments_by_name_and_place_and_keeps_its_words():
+    assert roots.__name__ == "roots" and roots.__doc__ == "Square roots; of a negative number there is none."
+    with pytest.raises(TypeError, match="not enough arguments"):
+        roots(np.ones(2))
