@@ -4,9 +4,10 @@ r"""Whole commands beside VTK's CPU mapper, in turn, each a process of its own: 
     PYTHONPATH=. python benchmarks/whole.py table docs/whole.csv
 
 Of each scene: `vvgt convert` with its default, the same of another state of the code (`--other CHECKOUT`, run with this
-Python) and under a head-light (`--lit`); `vvgt render-views` of 24 views of 400 px with its default, and with one ray a
-pixel at the longest step that has no more error than VTK's (`dvr_vtk.py`); and `vtk`, a process that reads the volume,
-draws these views with VTK's CPU mapper, one ray a pixel, half-voxel steps, and writes PNGs. Wall and processor seconds.
+Python) and under a head-light (`--lit`); `vvgt render-views` of 24 views of 400 px as PNGs without a cloud, with its
+default rays, and with one ray a pixel at the longest step that has no more error than VTK's (`dvr_vtk.py`); and `vtk`,
+a process that reads the volume, draws these views with VTK's CPU mapper, one ray a pixel, half-voxel steps, and writes
+PNGs. Wall and processor seconds.
 """
 
 from __future__ import annotations
@@ -89,7 +90,8 @@ def commands(
     vvgt = ["-m", "vvgt_cli.cli.main"]
     end = ["--threads", str(threads), "-q"]
     convert = [*vvgt, "convert", *call, *end, "-o"]
-    views = [*vvgt, "render-views", *call, "--views", str(VIEWS), "--test-views", "0", "--size", str(SIZE), *end, "-o"]
+    many = ["--views", str(VIEWS), "--test-views", "0", "--size", str(SIZE), "--format", "png", "--no-points"]
+    views = [*vvgt, "render-views", *call, *many, *end, "-o"]
     coarse = ["--samples", "1", "--step", str(STEP[name])]
     found = [("convert", here, [*convert, f"{folder}/a.ply"])]
     if other:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from tests.closed_form_scenes import Tent, scene_of
 from vvgt_cli.cameras import default_views
-from vvgt_cli.closed_form.visibility import DEPTH, WORKERS, march
+from vvgt_cli.closed_form.visibility import DEPTH, WORKERS, march, summed
 from vvgt_cli.dvr.render import camera_arrays
 from vvgt_cli.volume import Volume
 
@@ -42,3 +43,12 @@ def test_rays_go_through_the_cells_that_they_meet():
         expected = lengths(scene, camera)
         assert expected.max() > 2 * expected[expected > 0].min()  # no two cells are alike
         np.testing.assert_allclose(sums[..., DEPTH].sum(axis=0) / 1e-3, expected, atol=0.004 * expected.max())
+
+
+@pytest.mark.parametrize("wider", [0, 1, 3])
+def test_sums_by_wider_cells_are_those_of_numpy(wider):
+    rng, shape = np.random.default_rng(0), np.array([9, 5, 12])
+    index, values = rng.integers(0, shape << wider, (4000, 3)), rng.random((4000, 2))[:, 1]
+    exact = np.zeros(shape[::-1])
+    np.add.at(exact, tuple((index >> wider).T[::-1]), values)
+    np.testing.assert_array_equal(summed(index, values, wider, shape), exact)

@@ -67,6 +67,6 @@ def test_a_part_that_fails_is_an_error(threads):
 
 
 def test_it_takes_its_arguments_by_name_and_place_and_keeps_its_words():
-    assert roots.__name__ == "roots" and roots.__doc__ == "Square roots; of a negative number there is none."
+    assert (roots.__name__, roots.__doc__) == ("roots", "Square roots; of a negative number there is none.")
     with pytest.raises(TypeError, match="not enough arguments"):
         roots(np.ones(2))

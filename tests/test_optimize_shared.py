@@ -89,7 +89,7 @@ def test_what_is_linear_in_the_features_is_foretold(count):
     truth = rng.normal(size=(steps.FEATURES, 13)) / 8
     exact = phi @ truth
     noisy = (exact + 3 * exact.std() * rng.normal(size=exact.shape)).astype(np.float32)
-    weights = found.weights(shared.sampled(noisy.T)) / 7
+    weights = found.weights(np.ascontiguousarray(shared.sampled(noisy).T)) / 7
     foretold = phi * shared.ONE @ weights.T
     kept = [0, 1, 2, 3, 4, 5, 9, 10, 11, 12]
     off = np.square(foretold - exact[:, kept]).mean(axis=0) / exact[:, kept].var(axis=0)
@@ -163,13 +163,13 @@ def test_what_slopes_tell_of_all_is_that_of_the_twin(count):
         factor = state.shared.factor
         floors, _, weights = state.common(slopes)
         m, v = 0.6 * m + 0.4 * slopes, 0.999 * v + 0.001 * slopes.astype(np.float64) ** 2
-    sizes = shared.sampled(np.sqrt(v / (1 - 0.999**3)))
-    middle = np.median(sizes[:, ::7], axis=1, keepdims=True)
+    sizes = shared.sampled(np.sqrt(v / (1 - 0.999**3)).T).T
+    middle = np.median(sizes[:, :: max(sizes.shape[1] // 512, 1)], axis=1, keepdims=True)
     exact = 0.1 * np.minimum(sizes, 100 * middle).mean(axis=1)
     np.testing.assert_allclose(floors, exact, rtol=1e-4)
     assert (floors < 10 * middle[:, 0]).all()
-    u = shared.sampled(m / (1 - 0.6**3)) / (sizes + exact[:, None])
-    phi = shared.sampled(features(state.shared)[:count].T)
+    u = shared.sampled(m.T / (1 - 0.6**3)).T / (sizes + exact[:, None])
+    phi = shared.sampled(features(state.shared)[:count]).T
     square = phi @ phi.T
     wanted = factor * np.linalg.solve(
         square + 1e-3 * np.diag(np.diag(square)), phi @ u[[0, 1, 2, 3, 4, 5, 9, 10, 11, 12]].T

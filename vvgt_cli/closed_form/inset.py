@@ -59,7 +59,7 @@ def opaque_field(cells: Cells, step: np.ndarray, half: np.ndarray, labels: bool 
     wider = field_coarsening(cells.edge, half, MAX_FIELD)
     edge = cells.edge * 2.0**wider
     shape = np.ceil(2 * half / edge - 1e-6).astype(np.int64)
-    field = summed(cells.index >> wider, np.minimum(depth, 1) / 8.0**wider, shape).astype(np.float32)
+    field = summed(cells.index, np.minimum(depth, 1) / 8.0**wider, wider, shape).astype(np.float32)
     return smoothed(field, edge, half)
 
 

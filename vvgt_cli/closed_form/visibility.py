@@ -15,7 +15,7 @@ from vvgt_cli.closed_form.moments import Cells
 from vvgt_cli.closed_form.pyramid import look_up
 from vvgt_cli.dvr.kernel import FLAGS, absorbed
 from vvgt_cli.dvr.render import BoxGeometry, camera_arrays
-from vvgt_cli.jit.decorators import inlined, parallel_kernel
+from vvgt_cli.jit.decorators import inlined, kernel, parallel_kernel
 from vvgt_cli.jit.parts import Part, turns_of
 
 MAX_CELLS = 1 << 21
@@ -162,7 +162,7 @@ def _mean_extinction(cells: Cells, scene: BoxGeometry, wider: int) -> np.ndarray
     """(nz, ny, nx) float32 mean extinction of cells ``2^wider`` times as wide as ``cells`` along each axis."""
     edge = 2.0 ** (cells.exponent + wider)
     shape = np.ceil(voxels_of(scene) / edge).astype(np.int64)
-    mass = summed(cells.index >> wider, cells.moments[:, MASS], shape)
+    mass = summed(cells.index, cells.moments[:, MASS], wider, shape)
     result: np.ndarray = (mass / (edge * scene.step).prod()).astype(np.float32)
     return result
 
@@ -173,11 +173,21 @@ def voxels_of(box: BoxGeometry) -> np.ndarray:
     return result
 
 
-def summed(index: np.ndarray, values: np.ndarray, shape: np.ndarray) -> np.ndarray:
-    """Sums (nz, ny, nx) of ``values`` (n,), in order, by cell: ``index`` (n, 3) and ``shape`` (3,) are x first."""
-    nx, ny, nz = shape
-    x, y, z = index.T.astype(np.int64)
-    return np.bincount((z * ny + y) * nx + x, values, int(shape.prod())).reshape(nz, ny, nx)
+@kernel("i4:2 f8:1 i8 f8:3")
+def add_cells(index: np.ndarray, values: np.ndarray, wider: int, out: np.ndarray) -> None:
+    """``out`` (nz, ny, nx) += ``values`` (n,), each at ``index`` (n, 3), x first, in cells 2^``wider`` as wide."""
+    for i in range(len(values)):
+        out[index[i, 2] >> wider, index[i, 1] >> wider, index[i, 0] >> wider] += values[i]
+
+
+def summed(index: np.ndarray, values: np.ndarray, wider: int, shape: np.ndarray) -> np.ndarray:
+    """Sums (nz, ny, nx) of ``values`` (n,), in order, by cell 2^``wider`` times as wide as those of ``index`` (n, 3).
+
+    ``index`` and ``shape`` (3,) of the wider ones are x first.
+    """
+    out = np.zeros(shape[::-1])
+    add_cells(np.ascontiguousarray(index, np.int32), np.ascontiguousarray(values, np.float64), wider, out)
+    return out
 
 
 def visibility(

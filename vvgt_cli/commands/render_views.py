@@ -16,7 +16,7 @@ from vvgt_cli.cameras import Camera, default_views, orbit_views
 from vvgt_cli.cameras.boxed import render_in_box
 from vvgt_cli.cameras.files import read_frames
 from vvgt_cli.cameras.sets import FIELD_OF_VIEW, RADIUS, SET_VIEWS, SIZE
-from vvgt_cli.commands.view_files import CONTACT, Layout, View, field_points, start_points, thumbnails
+from vvgt_cli.commands.view_files import CONTACT, Layout, View, field_points, start_points, thumbnail, thumbnails
 from vvgt_cli.commands.views_in_blocks import draw_in_blocks, fields_of
 from vvgt_cli.conversion.manifest import Manifest, Shard
 from vvgt_cli.errors import DataError, NothingVisible, UsageError
@@ -171,6 +171,7 @@ class _Job:
     manifest: Manifest
     pending: list[View]  # this part's
     files: list[str]  # of the descriptions and models that this part writes
+    small: dict[str, np.ndarray] = field(default_factory=dict)  # thumbnails of views that were rendered
     field: Blocked | None = None  # where the volume is not in memory
 
     @property
@@ -264,7 +265,7 @@ def _plan(
         mine = [view for j, view in enumerate(views) if request.shard.holds(i * len(views) + j)]
         pending = [view for view in mine if not all(map(manifest.complete, layout.files(view)))]
         missing = [name for name in files if first and not manifest.complete(name)]
-        jobs.append(_Job(source, manifest, pending, missing, None if fields is None else fields[i]))
+        jobs.append(_Job(source, manifest, pending, missing, field=None if fields is None else fields[i]))
     return jobs
 
 
@@ -323,13 +324,20 @@ def _render(run: Run, request: ViewsRequest, job: _Job, draw: Draw) -> None:
                 for done, view in enumerate(job.pending, 1):
                     image = draw(view.camera)
                     job.manifest.record(written.result())
-                    written = writer.submit(request.layout.write, job.folder, view, image)
+                    written = writer.submit(_keep, job, request.layout, view, image)
                     if bar:
                         bar(done, len(job.pending))
             finally:
                 job.manifest.record(written.result())
         camera = job.pending[0].camera
         stage.note = f"{len(job.pending)} views of {camera.width} x {camera.height} px in {job.folder}"
+
+
+def _keep(job: _Job, layout: Layout, view: View, image: np.ndarray) -> list[str]:
+    """Write a view's images; their relative paths."""
+    if layout.exact:  # as they would be read again for the contact sheet
+        job.small[view.stem] = thumbnail(image, view.camera)
+    return layout.write(job.folder, view, image)
 
 
 def _remove_leftovers(job: _Job, layout: Layout) -> None:
@@ -349,7 +357,7 @@ def _contact(run: Run, job: _Job, layout: Layout, views: list[View]) -> None:
         return
     if job.pending or not manifest.complete(CONTACT):
         with run.stage("contact sheet"):
-            write_png(job.folder / CONTACT, thumbnails(job.folder, views, layout.background), overwrite=True)
+            write_png(job.folder / CONTACT, thumbnails(job.folder, views, layout.background, job.small), overwrite=True)
             manifest.record([CONTACT])
 
 

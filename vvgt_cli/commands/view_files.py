@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
@@ -63,6 +63,11 @@ class Layout:
     def suffix(self) -> str:
         """Of the images that `transforms.json` names."""
         return ".exr" if self.format == "exr" else ".png"
+
+    @property
+    def exact(self) -> bool:
+        """Whether a view's pixels are on disk as they were rendered."""
+        return self.format != "png" and not self.half
 
     def files(self, view: View) -> list[str]:
         """Relative paths of a view's images."""
@@ -178,16 +183,29 @@ def _thinned(scene: Scene, every: np.ndarray) -> Scene:
     return type(scene).build(volume, tf, scene.unit_distance, lighting=scene.lighting)
 
 
-def thumbnails(folder: Path, views: Sequence[View], background: Sequence[float]) -> np.ndarray:
-    """The contact sheet of the views on disk: (H, W, 3) float32 in [0, 1], training views first."""
+def thumbnail(image: np.ndarray, camera: Camera) -> np.ndarray:
+    """A camera's ``image`` (h, w, 4) float32, at most `THUMBNAIL` pixels wide and high."""
+    factor = _factor(camera)
+    h, w = image.shape[0] // factor, image.shape[1] // factor
+    small: np.ndarray = image[: h * factor, : w * factor].reshape(h, factor, w, factor, 4).mean(axis=(1, 3))
+    return small
+
+
+def thumbnails(
+    folder: Path, views: Sequence[View], background: Sequence[float], known: Mapping[str, np.ndarray]
+) -> np.ndarray:
+    """The contact sheet of the views on disk: (H, W, 3) float32 in [0, 1], training views first.
+
+    ``known``: some views' thumbnails, by stem.
+    """
     height = max(_shrunk(view.camera.height, view.camera) for view in views)
     width = max(_shrunk(view.camera.width, view.camera) for view in views)
     tiles = []
     for view in views:
-        factor = _factor(view.camera)
-        image = read_view(folder / view.stem)
-        h, w = image.shape[0] // factor, image.shape[1] // factor
-        small = image[: h * factor, : w * factor].reshape(h, factor, w, factor, 4).mean(axis=(1, 3))
+        small = known.get(view.stem)
+        if small is None:
+            small = thumbnail(read_view(folder / view.stem), view.camera)
+        h, w = small.shape[:2]
         tile = np.zeros((height, width, 4), np.float32)
         top, left = (height - h) // 2, (width - w) // 2
         tile[top : top + h, left : left + w] = small

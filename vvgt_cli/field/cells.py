@@ -126,8 +126,8 @@ class CellBlocks(Blockwise):
         grid = self.grid
         depth = opaque_depth(mass, grid.cell_edge, np.array(grid.step))
         march, wide = np.full(3, grid.tile_cells >> grid.march), np.full(3, grid.tile_cells >> grid.field)
-        field = summed(local >> grid.field, np.minimum(depth, 1) / 8.0**grid.field, wide)
-        return summed(local >> grid.march, mass, march), field.astype(np.float32), float(depth.max())
+        field = summed(local, np.minimum(depth, 1) / 8.0**grid.field, grid.field, wide)
+        return summed(local, mass, grid.march, march), field.astype(np.float32), float(depth.max())
 
 
 def normals_in(box: Box, points: np.ndarray, step: np.ndarray) -> np.ndarray:

@@ -6,11 +6,12 @@ RENDER, RENDER_LIT = "vvgt_cli.dvr.kernel:render_tiles", "vvgt_cli.dvr.lit:rende
 BRICK_RANGES = "vvgt_cli.dvr.bricks:_ranges"
 SHADE = ("vvgt_cli.closed_form.lit:_shade", "vvgt_cli.closed_form.lit:point_normals")
 SHADOWS = ("vvgt_cli.dvr.shadows:mean_transmittance", "vvgt_cli.dvr.shadows:cell_extinction")
-MARCH = "vvgt_cli.closed_form.visibility:march"
+MARCH, ADD_CELLS = "vvgt_cli.closed_form.visibility:march", "vvgt_cli.closed_form.visibility:add_cells"
 BLOCK_MOMENTS, COMPACT = "vvgt_cli.closed_form.quadrature:block_moments", "vvgt_cli.closed_form.quadrature:compact"
 VOXEL_MOMENTS = "vvgt_cli.closed_form.voxelwise:voxel_moments"  # of cells wider than voxels
 MORTON, MIX = "vvgt_cli.closed_form.pyramid:morton_codes", "vvgt_cli.closed_form.sharpen:mix_neighbours"
-FRAME_STEPS, REGRESS = "vvgt_cli.refine.steps:own_frame", "vvgt_cli.refine.steps:regress"
+FRAME_STEPS = "vvgt_cli.refine.steps:own_frame"
+REGRESS = tuple(f"vvgt_cli.refine.steps:{name}" for name in ("adam_sizes", "adam_directions", "regress"))
 PAIR_SUMS, STANDARD = "vvgt_cli.splat.backward:moments", "vvgt_cli.splat.backward:standard"
 VIEW_SLOPES, VIEW_COLORS = "vvgt_cli.splat.harmonics:view_slopes", "vvgt_cli.splat.harmonics:view_colors"
 FIELD_STEPS = "vvgt_cli.refine.steps:adam"  # harmonics take them even where all else steps in the own frame
@@ -30,6 +31,7 @@ DRAW = (
 )
 CELLS = (
     MARCH,
+    ADD_CELLS,
     BLOCK_MOMENTS,
     COMPACT,
     "vvgt_cli.closed_form.pyramid:look_up",
@@ -52,7 +54,7 @@ DESCENT = (
     "vvgt_cli.refine.texture:add_fine",
 )
 REFINE = (FRAME_STEPS, *DESCENT)
-SHARED = (REGRESS, MIX, MORTON)  # of runs of more than a few Gaussians
+SHARED = (*REGRESS, MIX, MORTON)  # of runs of more than a few Gaussians
 DEPOSITS = ("vvgt_cli.splat.harmonics:deposit_squares", "vvgt_cli.splat.harmonics:deposit")
 BACK_PROJECT = ("vvgt_cli.splat.tiles:gather", "vvgt_cli.splat.tiles:reduce_pairs")
 
@@ -68,7 +70,7 @@ SEGMENTS = {
     GRID[RENDER_LIT]: "vvgt_cli.dvr.segments:cast_lit_grid_segments",
 }
 BLOCK_RANGES = "vvgt_cli.closed_form.ranges:block_ranges"  # of blocks of which not all is read
-CONVERT = (RENDER, FRAME_STEPS, *CLOSED_FORM, *DRAW, *DESCENT, REGRESS, *RAYCAST_REST, *BACK_PROJECT)
+CONVERT = (RENDER, FRAME_STEPS, *CLOSED_FORM, *DRAW, *DESCENT, *REGRESS, *RAYCAST_REST, *BACK_PROJECT)
 LIVE = ("vvgt_cli.closed_form.under:sample_points",)
 OPTIMIZE = (*REFINE, *DRAW, "vvgt_cli.closed_form.pyramid:principal_axes", *SHARED)
 EVALUATE = (*RAYCAST, *DRAW)

@@ -17,7 +17,7 @@ import numpy as np
 
 from vvgt_cli.closed_form.sharpen import curves, mix_neighbours
 from vvgt_cli.refine import steps
-from vvgt_cli.refine.steps import FEATURES, KNOWN
+from vvgt_cli.refine.steps import FEATURES, KNOWN, RUN
 from vvgt_cli.splat.lanes import LANES
 
 GAIN = 7.0  # factor on the predicted steps at first (docs/log/refinement.md)
@@ -26,7 +26,6 @@ AGREEING, PACE = 0.52, 0.3  # cosine between predictions in a row at which the f
 RECALL = 0.8  # of the running cosine, a step
 LEAST = 500  # Gaussians: of fewer, noise is foretold too
 SAMPLE = 12_000  # Gaussians that are regressed on, or up to twice as many
-RUN = 16  # of them that lie side by side in memory
 RIDGE = 1e-3  # of a feature's squares
 FARTHEST = 3.0  # standard deviations that a number counts
 BENT = 1.5  # length of the random directions
@@ -66,13 +65,22 @@ def aligned(means: np.ndarray, factors: np.ndarray, logits: np.ndarray, colors: 
     return _standard(known)
 
 
+def sample_of(count: int) -> tuple[int, int]:
+    """Of ``count`` Gaussians one run of `RUN` in how many is regressed on, and how many Gaussians that makes.
+
+    All up to `SAMPLE`, else as many to twice as many.
+    """
+    every = max(count // SAMPLE, 1)
+    return (1, count) if every == 1 else (every, -(-(count // RUN) // every) * RUN)
+
+
 def sampled(numbers: np.ndarray) -> np.ndarray:
-    """(m, n) of ``numbers`` (m, K): all up to `SAMPLE`, else as many to twice as many, in runs of `RUN`."""
-    rows, count = numbers.shape
-    if count <= SAMPLE:
+    """(n, m) of ``numbers`` (K, m): those of `sample_of`."""
+    every, count = sample_of(len(numbers))
+    if every == 1:
         return numbers
-    runs = numbers[:, : count - count % RUN].reshape(rows, -1, RUN)
-    some: np.ndarray = runs[:, :: count // SAMPLE].reshape(rows, -1)
+    runs = numbers[: len(numbers) - len(numbers) % RUN].reshape(-1, RUN, numbers.shape[1])
+    some: np.ndarray = runs[::every].reshape(count, -1)
     return some
 
 
@@ -103,7 +111,7 @@ class SharedSteps:
         rng = np.random.default_rng(0)  # the same features in each run
         ways = (rng.normal(size=(inputs, FEATURES - inputs - 1)) * (BENT / np.sqrt(inputs))).astype(np.float32)
         offsets = rng.normal(size=ways.shape[1]).astype(np.float32)
-        some = sampled(known.T).T
+        some = sampled(known)
         middle = np.maximum(some @ ways + offsets, 0).mean(axis=0)
 
         def rows(part: np.ndarray) -> np.ndarray:
@@ -126,12 +134,12 @@ class SharedSteps:
             self.features[begin // LANES : begin // LANES + len(blocks)] = blocks.transpose(0, 2, 1)
 
     def weights(self, directions: np.ndarray) -> np.ndarray:
-        """(KNOWN, FEATURES) float32, `factor` times what foretells ``directions`` (COUNT, n) of the sample.
+        """(KNOWN, FEATURES) float32, `factor` times what foretells ``directions`` (COUNT, n) of the sample, all finite.
 
         Not of what turns the axes: it has no sign that means the same for all.
         """
         found = np.empty((KNOWN, FEATURES), np.float32)
-        steps.regress(self.solver, np.nan_to_num(directions, posinf=0, neginf=0), self.factor, found)
+        steps.regress(self.solver, directions, self.factor, found)
         plain = found.astype(np.float64) / self.factor
         size = math.sqrt(float(np.square(plain).sum()) * float(np.square(self.before).sum()))
         if 0 < size < math.inf:

@@ -11,7 +11,7 @@ from vvgt_cli.cameras import Camera
 from vvgt_cli.gaussians import SH_C0, Gaussians
 from vvgt_cli.gaussians.rules import INRIA, Rule
 from vvgt_cli.refine import steps
-from vvgt_cli.refine.shared import NONE, sampled, shared_steps
+from vvgt_cli.refine.shared import NONE, sample_of, shared_steps
 from vvgt_cli.refine.steps import EPSILON
 from vvgt_cli.splat import Projection, project
 from vvgt_cli.splat.reference import rotations
@@ -20,7 +20,7 @@ from vvgt_cli.splat.render import fields_backward, moments, own_frame_backward, 
 WARM_UP = 3  # steps
 SMALLEST = 1e-7  # standard deviation, unit frame
 WEAKEST = 0.1  # of the mean size of slopes, added to one's own: what is hardly seen goes less far than the rest
-MEDIAN = 7  # one of so many of the sample is in the median
+MEDIAN = 512  # of the sample that the median is of, or up to twice as many
 GOING_ON = 1.0  # in place of `WEAKEST` where some are free: descended on before, so only what is wrong now goes far
 OUTLIER = 100.0  # times the median that a slope counts in that mean
 GIVEN = 0.3  # of the rate of harmonics, where the start has some (docs/log/light.md)
@@ -127,17 +127,15 @@ class OwnFrame:
         """What is added to Adam's divisors, features and weights of what is shared; from slopes ``rows`` (COUNT, K)."""
         if not self.weakest:
             return np.full(len(rows), EPSILON, np.float32), *NONE
-        some, first, second = (sampled(array) for array in (rows, self.first, self.second))
-        beta1, beta2 = self.BETAS
-        with np.errstate(over="ignore", invalid="ignore"):  # of a Gaussian whose slopes are beyond float32
-            first = beta1 * first + (1 - beta1) * some
-            sizes = np.sqrt((beta2 * second + (1 - beta2) * some * some) / (1 - beta2**self.step))
-            middle = np.array([np.median(row[row > 0]) if (row > 0).any() else 0.0 for row in sizes[:, ::MEDIAN]])
-            usual = np.fmin(sizes, (OUTLIER * middle)[:, None].astype(np.float32))
-            floors = (self.weakest * usual.mean(axis=1) + EPSILON).astype(np.float32)
-            if self.shared is None:
-                return floors, *NONE
-            directions = first / (1 - beta1**self.step) / (sizes + floors[:, None])
+        every, count = sample_of(rows.shape[1])
+        directions, sizes = np.empty((2, len(rows), count), np.float32)
+        steps.adam_sizes(rows, self.first, self.second, *self.BETAS, self.step, every, directions, sizes)
+        few = sizes[:, :: max(count // MEDIAN, 1)]
+        most = np.array([OUTLIER * np.median(row[row > 0]) if (row > 0).any() else 0.0 for row in few])
+        floors = np.empty(len(rows), np.float32)
+        steps.adam_directions(sizes, most, self.weakest, directions, floors)
+        if self.shared is None:
+            return floors, *NONE
         return floors, self.shared.features, self.shared.weights(directions)
 
     def saved(self) -> dict[str, np.ndarray]:

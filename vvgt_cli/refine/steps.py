@@ -16,6 +16,7 @@ ONE, HALF, FOUR, NINE, EPSILON = f32(1), f32(0.5), f32(4), f32(9), f32(1e-15)
 COUNT = 13  # own frame: d (3), E (6), opacity logit, colour (3)
 KNOWN = 10  # of them that Gaussians share: not E off the diagonal
 FEATURES = 64  # that these are linear in
+RUN = 16  # Gaussians of a sample that lie side by side in memory
 _P1, _P2, _P3, _P4 = U(LANES), U(2 * LANES), U(3 * LANES), U(4 * LANES)  # of a buffer, from plane to plane
 PLACE = U(COUNT * LANES)  # where the nine of M begin
 _jit = inlined(error_model="numpy")  # a division that could raise is none of vectors
@@ -151,6 +152,45 @@ def own_frame(
             for entry in range(9):
                 factors[k, entry // 3, entry % 3] = buf[at + PLACE + U(entry) * _P1]
             logits[k] -= _clip(buf[at + U(9) * _P1] * by_logit, farthest)
+
+
+@parallel_kernel("f4:2 f4:2 f4:2 f8 f8 i8 i8 f4:2 f4:2", error_model="numpy")
+def adam_sizes(
+    part: Part, slopes: np.ndarray, first: np.ndarray, second: np.ndarray, beta1: float, beta2: float, step: int,
+    every: int, towards: np.ndarray, sizes: np.ndarray,
+) -> None:  # fmt: skip
+    """Numerators ``towards`` (COUNT, n) and divisors ``sizes`` (COUNT, n) of Adam's directions after ``step`` steps.
+
+    Of one in ``every`` runs of `RUN` Gaussians, in that order; ``slopes`` (COUNT, K) are new, ``first``, ``second``
+    (COUNT, K) the running moments without them.
+    """
+    b1, b2, fix1, fix2 = f32(beta1), f32(beta2), f32(1 / (1 - beta1**step)), f32(1 / (1 - beta2**step))
+    for row in turns_of(part, COUNT):
+        for begin in range(0, sizes.shape[1], RUN):
+            for i in range(U(begin), U(min(begin + RUN, sizes.shape[1]))):
+                k = i + U(begin * (every - 1))
+                g = slopes[row, k]
+                towards[row, i] = (b1 * first[row, k] + (ONE - b1) * g) * fix1
+                sizes[row, i] = math.sqrt((b2 * second[row, k] + (ONE - b2) * g * g) * fix2)
+
+
+@parallel_kernel("f4:2 f8:1 f8 f4:2 f4:1", error_model="numpy")
+def adam_directions(
+    part: Part, sizes: np.ndarray, most: np.ndarray, weakest: float, towards: np.ndarray, floors: np.ndarray
+) -> None:
+    """``towards`` divided by ``sizes`` (COUNT, n) and ``floors``, in place; 0 where that is not finite.
+
+    ``floors`` (COUNT,): ``weakest`` times the mean of sizes, of which none counts for more than ``most`` (COUNT,).
+    """
+    for row in turns_of(part, COUNT):
+        bound, total = f32(most[row]), 0.0
+        for i in range(sizes.shape[1]):
+            size = sizes[row, i]
+            total += np.float64(size if size < bound else bound)
+        floors[row] = weakest * total / sizes.shape[1] + EPSILON
+        for i in range(sizes.shape[1]):
+            way = towards[row, i] / (sizes[row, i] + floors[row])
+            towards[row, i] = way if abs(way) < f32(math.inf) else f32(0)
 
 
 @parallel_kernel("f4:2 f4:2 f8 f4:2")

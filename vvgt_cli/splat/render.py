@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -106,17 +105,6 @@ def balance(work: np.ndarray) -> np.ndarray:
     return np.concatenate([order[thread::threads] for thread in range(threads)])
 
 
-def tile_by_tile() -> AbstractContextManager[None]:
-    """Threads take one tile after the other where numba has TBB: what a tile costs is not known before.
-
-    Its other threading layers deal the tiles out in equal chunks, which `balance` balances by the lengths of the lists.
-    """
-    import numba
-
-    result: AbstractContextManager[None] = numba.parallel_chunksize(1)
-    return result
-
-
 def blend(
     projection: Projection, colors: np.ndarray, height: int, width: int, blocks: Blocks | None = None
 ) -> np.ndarray:
@@ -129,9 +117,8 @@ def blend(
     p = projection
     image = np.zeros((height, width, 4), np.float32)
     colors = np.ascontiguousarray(colors, np.float32)
-    with tile_by_tile():
-        chosen = p.tiles if blocks is None else p.tiles[np.isin(p.tiles, blocks.numbers)]
-        tiles.blend(chosen, p.start, p.members, p.extent, p.flat, colors, p.tiles_x, p.rule.blending(), image)
+    chosen = p.tiles if blocks is None else p.tiles[np.isin(p.tiles, blocks.numbers)]
+    tiles.blend(chosen, p.start, p.members, p.extent, p.flat, colors, p.tiles_x, p.rule.blending(), image)
     return image
 
 
@@ -181,10 +168,7 @@ def gather(projection: Projection, fields: np.ndarray, out: np.ndarray) -> None:
     p = projection
     pairs = np.zeros((len(p.members), 5), np.float32)
     fields = np.ascontiguousarray(fields, np.float32)
-    with tile_by_tile():
-        tiles.gather(
-            p.tiles, p.start, p.members, p.slots, p.extent, p.flat, p.tiles_x, p.rule.blending(), fields, pairs
-        )
+    tiles.gather(p.tiles, p.start, p.members, p.slots, p.extent, p.flat, p.tiles_x, p.rule.blending(), fields, pairs)
     tiles.reduce_pairs(p.first, pairs, out)
 
 
@@ -254,11 +238,9 @@ def moments(projection: Projection, colors: np.ndarray, image: np.ndarray, grad:
     p = projection
     pairs = np.empty((len(p.members), backward.SUMS), np.float32)
     grad = np.ascontiguousarray(grad, np.float32)
-    with tile_by_tile():
-        backward.moments(
-            p.tiles, p.start, p.members, p.slots, p.extent, p.flat, colors, p.tiles_x, p.rule.blending(), image, grad,
-            pairs,
-        )  # fmt: skip
+    backward.moments(
+        p.tiles, p.start, p.members, p.slots, p.extent, p.flat, colors, p.tiles_x, p.rule.blending(), image, grad, pairs
+    )
     return pairs
 
 
