@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+
 import numba
 import numpy as np
 import pytest
@@ -9,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vvgt_cli.jit.decorators import parallel_kernel
-from vvgt_cli.jit.parts import Part, turns_of
+from vvgt_cli.jit.parts import Part, take_turn, turns_of
 from vvgt_cli.refine.steps import adam
 
 
@@ -22,20 +26,32 @@ def roots(part: Part, values: np.ndarray, out: np.ndarray) -> None:
         out[i] += np.sqrt(values[i])
 
 
+@parallel_kernel("f8:1 f8:1")
+def roots_one_by_one(part: Part, values: np.ndarray, out: np.ndarray) -> None:
+    """Square roots, as whoever is free takes them."""
+    i = take_turn(part)
+    while i < values.shape[0]:
+        if values[i] < 0.0:
+            raise ValueError("negative")
+        out[i] += np.sqrt(values[i])
+        i = take_turn(part)
+
+
 @given(st.integers(1, 70), st.integers(0, 200))
 def test_parts_take_every_turn_once(parts, count):
-    taken = [i for part in range(parts) for i in turns_of.py_func((part, parts), count)]
+    taken = [i for part in range(parts) for i in turns_of.py_func((part, parts, None), count)]
     assert taken == list(range(count))
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 1001])
 @pytest.mark.parametrize("threads", [1, 2, 3])
-def test_each_turn_is_run_once(threads, count):
+@pytest.mark.parametrize("kernel", [roots, roots_one_by_one])
+def test_each_turn_is_run_once(kernel, threads, count):
     most = numba.get_num_threads()
     values, out = np.arange(count, dtype=float), np.zeros(count)
     try:
         numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
-        roots(values=values, out=out)
+        kernel(values=values, out=out)
     finally:
         numba.set_num_threads(most)
     np.testing.assert_array_equal(out, np.sqrt(values))
@@ -56,12 +72,13 @@ def test_one_thread_and_all_give_the_same_bytes():
 
 
 @pytest.mark.parametrize("threads", [1, 2])
-def test_a_part_that_fails_is_an_error(threads):
+@pytest.mark.parametrize("kernel", [roots, roots_one_by_one])
+def test_what_a_part_raises_is_raised(kernel, threads):
     most = numba.get_num_threads()
     try:
         numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
-        with pytest.raises(RuntimeError, match="a part of a kernel failed"):
-            roots(np.array([1.0, 4.0, -1.0]), np.zeros(3))
+        with pytest.raises(ValueError, match="negative"):
+            kernel(np.array([1.0, 4.0, -1.0]), np.zeros(3))
     finally:
         numba.set_num_threads(most)
 
@@ -70,3 +87,17 @@ def test_it_takes_its_arguments_by_name_and_place_and_keeps_its_words():
     assert (roots.__name__, roots.__doc__) == ("roots", "Square roots; of a negative number there is none.")
     with pytest.raises(TypeError, match="not enough arguments"):
         roots(np.ones(2))
+
+
+@pytest.mark.parametrize("layer", ["omp", "workqueue"])
+def test_numbers_do_not_depend_on_the_threading_layer(layer):
+    code = (
+        "import numba, numpy as np; from tests.test_jit_parts import roots, roots_one_by_one\n"
+        "for kernel in (roots, roots_one_by_one):\n"
+        "    values, out = np.arange(1001.0), np.zeros(1001); kernel(values, out)\n"
+        "    assert (out == np.sqrt(values)).all()\n"
+        "print(numba.threading_layer())"
+    )
+    env = os.environ | {"NUMBA_THREADING_LAYER": layer, "NUMBA_NUM_THREADS": "3"}
+    done = subprocess.run([sys.executable, "-W", "ignore", "-c", code], env=env, capture_output=True, text=True)
+    assert (done.stdout.strip(), done.returncode) == (layer, 0), done.stderr

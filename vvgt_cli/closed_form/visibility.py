@@ -185,6 +185,8 @@ def summed(index: np.ndarray, values: np.ndarray, wider: int, shape: np.ndarray)
 
     ``index`` and ``shape`` (3,) of the wider ones are x first.
     """
+    if (index.max(axis=0, initial=0) >> wider >= shape).any():
+        raise ValueError(f"cells up to {index.max(axis=0) >> wider} in a grid of {shape}")
     out = np.zeros(shape[::-1])
     add_cells(np.ascontiguousarray(index, np.int32), np.ascontiguousarray(values, np.float64), wider, out)
     return out

@@ -334,8 +334,8 @@ def _render(run: Run, request: ViewsRequest, job: _Job, draw: Draw) -> None:
 
 
 def _keep(job: _Job, layout: Layout, view: View, image: np.ndarray) -> list[str]:
-    """Write a view's images; their relative paths."""
-    if layout.exact:  # as they would be read again for the contact sheet
+    """Write a view's images, and keep its thumbnail where it is that of what was written; their relative paths."""
+    if layout.exact:
         job.small[view.stem] = thumbnail(image, view.camera)
     return layout.write(job.folder, view, image)
 
@@ -359,6 +359,7 @@ def _contact(run: Run, job: _Job, layout: Layout, views: list[View]) -> None:
         with run.stage("contact sheet"):
             write_png(job.folder / CONTACT, thumbnails(job.folder, views, layout.background, job.small), overwrite=True)
             manifest.record([CONTACT])
+    job.small.clear()
 
 
 def _write(manifest: Manifest, files: dict[str, bytes]) -> None:

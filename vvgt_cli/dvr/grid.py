@@ -16,7 +16,7 @@ from vvgt_cli.dvr.runs import BORROWED
 from vvgt_cli.dvr.shading import shading
 from vvgt_cli.dvr.vectors import Quad, add, lane, mix, scale, texel, zeros4
 from vvgt_cli.jit.decorators import inlined, parallel_kernel
-from vvgt_cli.jit.parts import Part, turns_of
+from vvgt_cli.jit.parts import Part, take_turn
 
 LEAP = 8  # samples between two looks at the empty-space map
 
@@ -120,9 +120,11 @@ def render_grid_tiles(
 ) -> None:  # fmt: skip
     """`kernel.render_tiles` of a grid."""
     across = (out.shape[1] + TILE - 1) // TILE
-    for index in turns_of(part, len(order)):
+    index = take_turn(part)
+    while index < len(order):
         top, left = order[index] // across * TILE, order[index] % across * TILE
         _tile(texels, None, empty, None, eye, basis, lens, step, top, left, offsets, mask, known, out)
+        index = take_turn(part)
 
 
 @parallel_kernel(
@@ -138,6 +140,8 @@ def render_lit_grid_tiles(
 ) -> None:  # fmt: skip
     """The same under ``light`` (`Light`): normals are the gradient of the extinction ``voxels``."""
     across = (out.shape[1] + TILE - 1) // TILE
-    for index in turns_of(part, len(order)):
+    index = take_turn(part)
+    while index < len(order):
         top, left = order[index] // across * TILE, order[index] % across * TILE
         _tile(texels, voxels, empty, light, eye, basis, lens, step, top, left, offsets, mask, known, out)
+        index = take_turn(part)

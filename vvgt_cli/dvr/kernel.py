@@ -18,7 +18,7 @@ from vvgt_cli.dvr.layout import BRICK, BRICK_BITS, TUPLES, Optics, Voxels
 from vvgt_cli.dvr.runs import BORROWED, RUN, Run, run_range, sample_run, stack_run
 from vvgt_cli.dvr.vectors import Quad, add, lane, row, scale, sub, zeros4
 from vvgt_cli.jit.decorators import inlined, parallel_kernel
-from vvgt_cli.jit.parts import Part, turns_of
+from vvgt_cli.jit.parts import Part, take_turn
 
 OPAQUE = 1e-3  # times step^2, as the error of integration goes: the transmittance at which a ray ends
 SUB_DEPTH = 1.0  # optical depth of a sub-segment: colour is constant within one; 0.3 is no more accurate
@@ -384,11 +384,12 @@ def render_tiles(
     """Render one view into ``out`` (h, w, 4) float32, rays at ``offsets`` (n, 2) in pixels where ``mask`` is set.
 
     ``eye`` (3,) voxels and ``basis`` (3, 3: rows right, down, forward) in voxels per unit-frame length;
-    ``lens`` is (1/fx, 1/fy, cx, cy), pixels; ``order`` (tiles,) permutes the tiles (row-major) so that contiguous
-    chunks of threads are balanced; ``mask`` (h, w) bool; ``step`` in voxels along a ray; ``known``: number of rays
-    whose mean ``out`` holds already.
+    ``lens`` is (1/fx, 1/fy, cx, cy), pixels; ``order`` (tiles,) of the tiles (row-major); ``mask`` (h, w) bool;
+    ``step`` in voxels along a ray; ``known``: number of rays whose mean ``out`` holds already.
     """
     across = (out.shape[1] + TILE - 1) // TILE
-    for index in turns_of(part, len(order)):
+    index = take_turn(part)
+    while index < len(order):
         top, left = order[index] // across * TILE, order[index] % across * TILE
         _tile(voxels, optics, empty, None, eye, basis, lens, step, top, left, offsets, mask, known, out)
+        index = take_turn(part)

@@ -25,7 +25,7 @@ from vvgt_cli.dvr.runs import BORROWED, RUN, sample_run, stack_run
 from vvgt_cli.dvr.shading import shading
 from vvgt_cli.dvr.vectors import lane, zeros4
 from vvgt_cli.jit.decorators import inlined, parallel_kernel
-from vvgt_cli.jit.parts import Part, turns_of
+from vvgt_cli.jit.parts import Part, take_turn
 
 _jit = inlined(fastmath=FLAGS, error_model="numpy", **BORROWED)
 
@@ -113,6 +113,8 @@ def render_lit_tiles(
 ) -> None:
     """`kernel.render_tiles` under ``light`` (`Light`)."""
     across = (out.shape[1] + TILE - 1) // TILE
-    for index in turns_of(part, len(order)):
+    index = take_turn(part)
+    while index < len(order):
         top, left = order[index] // across * TILE, order[index] % across * TILE
         _tile(voxels, optics, empty, light, eye, basis, lens, step, top, left, offsets, mask, known, out)
+        index = take_turn(part)

@@ -92,14 +92,10 @@ def camera_arrays(scene: BoxGeometry, camera: Camera) -> tuple[np.ndarray, np.nd
 
 
 def tile_order(height: int, width: int, blocks: Blocks | None = None) -> np.ndarray:
-    """Tiles, or ``blocks``, dealt out over the threads like cards, so that equal chunks have equal work."""
-    import numba
-
+    """Numbers of the tiles of a picture, or of its ``blocks``, in the order in which they are begun."""
     from vvgt_cli.dvr.kernel import TILE
 
-    tiles = np.arange(-(-height // TILE) * -(-width // TILE)) if blocks is None else blocks.numbers
-    threads = numba.get_num_threads()
-    return np.concatenate([tiles[first::threads] for first in range(threads)])
+    return np.arange(-(-height // TILE) * -(-width // TILE)) if blocks is None else blocks.numbers
 
 
 class Rays(NamedTuple):

@@ -47,11 +47,17 @@ def _unwrapped(value: Any) -> Any:
     return getattr(value, "_defn", value) if type(value).__name__ == "_Intrinsic" else value
 
 
+def _options(dispatcher: Any) -> list[tuple[str, str]]:
+    """What a function is compiled with."""
+    return sorted((k, repr(sorted(v) if isinstance(v, set) else v)) for k, v in dispatcher.targetoptions.items())
+
+
 def reached(function: FunctionType) -> tuple[set[str], set[str]]:
     """What ``function`` is compiled from.
 
     Returns:
-        Modules of this package whose functions or classes it reaches, its own among them, and the constants it reads.
+        Modules of this package whose functions or classes it reaches, its own among them; the constants it reads, with
+        what the functions are compiled with.
     """
     modules: set[str] = set()
     constants: set[str] = set()
@@ -66,6 +72,8 @@ def reached(function: FunctionType) -> tuple[set[str], set[str]]:
         reads = {name: value.__globals__[name] for name in _names(value.__code__) if name in value.__globals__}
         reads |= {k: v for k, v in inspect.getclosurevars(value).nonlocals.items()} if value.__closure__ else {}
         for name, read in reads.items():
+            if isinstance(read, Dispatcher):
+                constants.add(f"{name} with {_options(read)!r}")
             read = _unwrapped(read)
             if isinstance(read, ModuleType):
                 if read.__name__.startswith("vvgt_cli"):
@@ -111,7 +119,7 @@ class KernelCache(caching._Cache):
 
     On a miss it has the kernel compiled by another process and loads what that has left on disk: no process runs what
     it has compiled itself, so that a first run computes what later ones do. (Code compiled here and the same code
-    loaded are linked with other copies of the bodies of parallel loops, whose sums may be rounded differently.)
+    loaded are linked with other copies of what kernels call, whose sums may be rounded differently.)
     """
 
     def __init__(self, dispatcher: Any) -> None:
@@ -129,10 +137,7 @@ class KernelCache(caching._Cache):
         """Digest of everything that is compiled, and of what compiles it."""
         modules, constants = reached(self.function)
         sources = [(module, _source(module)) for module in sorted(modules)]
-        options = sorted(
-            (k, repr(sorted(v) if isinstance(v, set) else v)) for k, v in self.dispatcher.targetoptions.items()
-        )
-        return _digest(VERSIONS, sources, sorted(constants), options)
+        return _digest(VERSIONS, sources, sorted(constants), _options(self.dispatcher))
 
     def file(self, types: tuple[Any, ...], codegen: Any) -> str:
         """Name of the file of a signature on a target."""

@@ -1,12 +1,12 @@
 """Typed decorators of compiled functions.
 
-`kernel` marks what Python calls, `inlined` what kernels call, `intrinsic` what writes LLVM instructions itself.
+`kernel` marks what Python calls, `parallel_kernel` what all threads run at once, `inlined` what kernels call,
+`intrinsic` what writes LLVM instructions itself.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import partial
 from typing import Any, Concatenate, ParamSpec, TypeVar, cast
 
 import numba as nb
@@ -14,7 +14,7 @@ from numba import extending
 
 from vvgt_cli.errors import UsageError
 from vvgt_cli.jit.cache import KernelCache
-from vvgt_cli.jit.parts import NO_C_ENTRY, NO_ENTRY, WHOLE, Part, shared
+from vvgt_cli.jit.parts import NO_C_ENTRY, NO_ENTRY, Part, shared, whole
 from vvgt_cli.jit.target import config
 
 P = ParamSpec("P")
@@ -47,7 +47,7 @@ def kernel(usual: str = "", tuples: Mapping[type, str] | None = None, **options:
 def parallel_kernel(
     usual: str = "", tuples: Mapping[type, str] | None = None, **options: Any
 ) -> Callable[[Callable[Concatenate[Part, P], None]], Callable[P, None]]:
-    """`kernel` for functions without a result, run at once on all threads of numba's.
+    """`kernel` for functions without a result, run at once on all of numba's threads.
 
     The first argument of each call, `vvgt_cli.jit.parts.Part`, says which turns of a loop are its own; Python does not
     pass it.
@@ -55,7 +55,11 @@ def parallel_kernel(
 
     def wrap(function: Callable[Concatenate[Part, P], None]) -> Callable[P, None]:
         if config.DISABLE_JIT:
-            return partial(function, WHOLE)
+
+            def alone(*args: P.args, **keywords: P.kwargs) -> None:
+                function(whole(), *args, **keywords)
+
+            return alone
         body = nb.njit(**NO_ENTRY, **options)(function)
         return kernel(usual, tuples)(shared(body, function.__name__))
 

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 MOST = 8  # kernels at once: 0.3 GB each
-PARALLEL = ("numba.np.ufunc.parallel", "numba.parfors.parfor_lowering")  # what parallel loops import, late
 
 
 @contextlib.contextmanager
@@ -83,7 +82,7 @@ def run(folder: Path, jobs: list[Any]) -> int:
     from vvgt_cli.resources import processors
 
     widen()
-    for module in (*PARALLEL, *sorted({job.module for job in jobs})):
+    for module in sorted({job.module for job in jobs}):
         importlib.import_module(module)
     cpu_target.typing_context.refresh()  # once, rather than in every fork
     cpu_target.target_context.refresh()

@@ -25,7 +25,7 @@ BOUNDS = 2.0, 14.0  # least and largest factor
 AGREEING, PACE = 0.52, 0.3  # cosine between predictions in a row at which the factor stays; how fast it changes else
 RECALL = 0.8  # of the running cosine, a step
 LEAST = 500  # Gaussians: of fewer, noise is foretold too
-SAMPLE = 12_000  # Gaussians that are regressed on, or up to twice as many
+SAMPLE = 12_000  # Gaussians that are regressed on, or less than twice as many
 RIDGE = 1e-3  # of a feature's squares
 FARTHEST = 3.0  # standard deviations that a number counts
 BENT = 1.5  # length of the random directions
@@ -68,7 +68,7 @@ def aligned(means: np.ndarray, factors: np.ndarray, logits: np.ndarray, colors: 
 def sample_of(count: int) -> tuple[int, int]:
     """Of ``count`` Gaussians one run of `RUN` in how many is regressed on, and how many Gaussians that makes.
 
-    All up to `SAMPLE`, else as many to twice as many.
+    All below twice `SAMPLE`, else at least `SAMPLE` and less than twice as many.
     """
     every = max(count // SAMPLE, 1)
     return (1, count) if every == 1 else (every, -(-(count // RUN) // every) * RUN)

@@ -10,17 +10,15 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba as nb
 import numpy as np
 
 from vvgt_cli.images.metrics.ssim import C1, C2, RADIUS, SIGMA
 from vvgt_cli.jit.decorators import parallel_kernel
-from vvgt_cli.jit.parts import Part, turns_of
+from vvgt_cli.jit.parts import Part, U, turns_of
 
 KERNEL = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / SIGMA) ** 2)
 KERNEL = (KERNEL / KERNEL.sum()).astype(np.float32)
 f32: Any = np.float32
-U = nb.uint64  # an index that cannot be negative needs no test
 
 
 @parallel_kernel("f4:3 f4:1 f4:3", fastmath=True, error_model="numpy")

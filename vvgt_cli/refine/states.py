@@ -20,7 +20,7 @@ from vvgt_cli.splat.render import fields_backward, moments, own_frame_backward, 
 WARM_UP = 3  # steps
 SMALLEST = 1e-7  # standard deviation, unit frame
 WEAKEST = 0.1  # of the mean size of slopes, added to one's own: what is hardly seen goes less far than the rest
-MEDIAN = 512  # of the sample that the median is of, or up to twice as many
+MEDIAN = 512  # of the sample that the median is of, or less than twice as many; all, where there are fewer
 GOING_ON = 1.0  # in place of `WEAKEST` where some are free: descended on before, so only what is wrong now goes far
 OUTLIER = 100.0  # times the median that a slope counts in that mean
 GIVEN = 0.3  # of the rate of harmonics, where the start has some (docs/log/light.md)

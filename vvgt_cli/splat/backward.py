@@ -14,7 +14,7 @@ import numpy as np
 
 from vvgt_cli.gaussians.constants import TILE
 from vvgt_cli.jit.decorators import inlined, parallel_kernel
-from vvgt_cli.jit.parts import Part, turns_of
+from vvgt_cli.jit.parts import Part, take_turn, turns_of
 from vvgt_cli.jit.prefetch import prefetch
 from vvgt_cli.splat.buffer import (
     AREA,
@@ -163,7 +163,8 @@ def moments(
     """
     height, width = image.shape[:2]
     way = rule[0], rule[1], rule[2], rule[3], rule[4], rule[5]
-    for index in turns_of(part, tiles.shape[0]):
+    index = take_turn(part)
+    while index < tiles.shape[0]:
         tile = tiles[index]
         ox, oy = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
         w, h = min(TILE, width - ox), min(TILE, height - oy)
@@ -179,6 +180,7 @@ def moments(
                 buf[U(AREA + y * TILE + x)] = behind
         span = slice(start[tile], start[tile + 1])
         _moments_tile(members[span], slots[span], extent, flat, colors, ox, oy, way, buf, pairs)
+        index = take_turn(part)
 
 
 @_exact

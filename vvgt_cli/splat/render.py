@@ -80,7 +80,8 @@ def _projected(
     tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
     order = depth_order(depth if distance is None else distance)
     start, members, slots, first = kernel.tile_lists(order, extent, tiles_x, tiles_y, numba.get_num_threads())
-    return Projection(flat, extent, start, members, slots, first, tiles_x, balance(np.diff(start)), rule)
+    tiles = np.argsort(-np.diff(start), kind="stable")
+    return Projection(flat, extent, start, members, slots, first, tiles_x, tiles, rule)
 
 
 def pose(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -94,15 +95,6 @@ def depth_order(depth: np.ndarray) -> np.ndarray:
     from vvgt_cli.splat import kernel
 
     return kernel.stable_order(depth.view(np.uint32))
-
-
-def balance(work: np.ndarray) -> np.ndarray:
-    """Order (n,) of tasks that gives contiguous chunks, one a thread, near equal shares of ``work`` (n,)."""
-    import numba
-
-    threads = numba.get_num_threads()
-    order = np.argsort(-work, kind="stable")
-    return np.concatenate([order[thread::threads] for thread in range(threads)])
 
 
 def blend(

@@ -13,7 +13,7 @@ import numpy as np
 
 from vvgt_cli.gaussians.constants import TILE
 from vvgt_cli.jit.decorators import parallel_kernel
-from vvgt_cli.jit.parts import Part, turns_of
+from vvgt_cli.jit.parts import Part, take_turn, turns_of
 from vvgt_cli.splat.buffer import (
     AREA,
     BLUE,
@@ -99,7 +99,8 @@ def blend(
     """Front-to-back blending into ``image`` (height, width, 4) float32, linear in ``colors``."""
     height, width = image.shape[:2]
     way = rule[0], rule[1], rule[2], rule[3], rule[4], rule[5]
-    for index in turns_of(part, tiles.shape[0]):
+    index = take_turn(part)
+    while index < tiles.shape[0]:
         tile = tiles[index]
         ox, oy = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
         w, h = min(TILE, width - ox), min(TILE, height - oy)
@@ -113,6 +114,7 @@ def blend(
                 image[oy + y, ox + x, 1] = buf[j + PLANE_2]
                 image[oy + y, ox + x, 2] = buf[j + PLANE_3]
                 image[oy + y, ox + x, 3] = f32(1) - abs(buf[j])
+        index = take_turn(part)
 
 
 @tile_jit
@@ -165,7 +167,8 @@ def gather(
     """
     height, width = fields.shape[1:]
     way = rule[0], rule[1], rule[2], rule[3], rule[4], rule[5]
-    for index in turns_of(part, tiles.shape[0]):
+    index = take_turn(part)
+    while index < tiles.shape[0]:
         tile = tiles[index]
         ox, oy = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
         w, h = min(TILE, width - ox), min(TILE, height - oy)
@@ -177,6 +180,7 @@ def gather(
                     buf[U((f + 2) * AREA + y * TILE + x)] = fields[f, oy + y, ox + x]
         span = slice(start[tile], start[tile + 1])
         _gather_tile(members[span], slots[span], extent, flat, ox, oy, way, buf, pairs)
+        index = take_turn(part)
 
 
 @parallel_kernel("i8:1 f4:2 f8:2")
