@@ -16,8 +16,8 @@ nib = pytest.importorskip("nibabel")
 tifffile = pytest.importorskip("tifffile")
 
 DIMS = (28, 24, 30)  # z, y, x: eight blocks of 16 voxels
-AGREE, CLOSER = 0.4, 0.4  # dB, of 50: descents that part at a rounding end up to 0.3 apart, most of these within 0.01
-SMALL = ("--size", "64", "--max-gaussians", "800", "--steps", "30")
+AGREE, CLOSER = 0.15, 0.3  # dB: of the test views (of 50 dB), and of the worst viewing condition: single pixels decide
+SMALL = ("--size", "64", "--max-gaussians", "800", "--steps", "60")  # after 30 they may still be 0.4 dB apart
 BLOCKS = ("--blocks", "16")
 RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
