@@ -89,6 +89,15 @@ def test_it_takes_its_arguments_by_name_and_place_and_keeps_its_words():
         roots(np.ones(2))
 
 
+def test_code_is_kept_under_the_options_of_a_body():
+    def twice(part: Part, out: np.ndarray) -> None:
+        for i in turns_of(part, out.shape[0]):
+            out[i] *= 2.0
+
+    keys = [parallel_kernel("f8:1", fastmath=fast)(twice)._cache.key for fast in (False, True, False)]
+    assert keys[0] == keys[2] != keys[1]
+
+
 @pytest.mark.parametrize("layer", ["omp", "workqueue"])
 def test_numbers_do_not_depend_on_the_threading_layer(layer):
     code = (

@@ -37,7 +37,7 @@ def turns_of(part: Part, count: int) -> range:
 
 
 def _take(context: Any, part: Any) -> Any:
-    """The next turn of a loop that no part has taken yet; of turns whose times differ."""
+    """The next turn of a loop that no part has taken yet: for turns that take unlike times."""
 
     def build(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         taken = builder.inttoptr(builder.extract_value(args[0], 2), SIZE.as_pointer())
