@@ -204,7 +204,7 @@ def _work(program: str, path: Path, options: ReadOptions, task: str) -> tuple[di
 
     if task == "contents":
         return contents_of(program, path, options), None
-    leaves, _ = datasets(program, path, options.time)
+    leaves, _ = datasets(program, path, options.time, options.array)
     volume = volume_of(leaves, replace(options, time=None), str(path), volume_name(path))
     values = np.ascontiguousarray(volume.data)
     place = {key: [float(v) for v in getattr(volume, key)] for key in ("spacing", "origin", "direction")}

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import re
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +18,7 @@ from xml.parsers import expat
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import data_file
 from vvgt_cli.volume.vtk_index import MAX_BYTES, chosen_time
-from vvgt_cli.volume.vtk_leaves import Leaf, leaves_of
+from vvgt_cli.volume.vtk_leaves import Leaf, arrays_in, leaves_of
 from vvgt_cli.volume.vtk_messages import quiet_vtk
 
 HDF5 = b"\x89HDF\r\n\x1a\n"
@@ -35,6 +36,7 @@ class Program:
         reader: what makes VTK's reader of a file, all arrays enabled.
         within: formats that its files may be taken for by their content.
         by_name: its files have no beginning of their own: the name decides. They may be empty.
+        skips: its reader goes on without the fields that it cannot read.
     """
 
     name: str
@@ -43,13 +45,16 @@ class Program:
     reader: Callable[[Path], Any]
     within: tuple[str, ...] = ()
     by_name: bool = False
+    skips: bool = False
 
 
-def read_program(program: Program, path: Path, time: int | None) -> tuple[list[Leaf], list[float]]:
+def read_program(
+    program: Program, path: Path, time: int | None, array: str | None = None
+) -> tuple[list[Leaf], list[float]]:
     """The datasets of a time step, and the times of all steps.
 
     Raises:
-        DataError: damaged, or a file that it names is missing or lies elsewhere.
+        DataError: damaged, or a file that it names is missing or lies elsewhere, or VTK cannot read field ``array``.
         UsageError: several time steps and none chosen, or one that there is not.
     """
     from vtkmodules.vtkCommonExecutionModel import vtkStreamingDemandDrivenPipeline
@@ -68,10 +73,27 @@ def read_program(program: Program, path: Path, time: int | None) -> tuple[list[L
         found = reader.GetOutputDataObject(0)
         leaves = [leaf for leaf in leaves_of(found) if leaf.data.GetNumberOfPoints() > 0]
         error = message(errors=True) or told
+    if program.skips and leaves and error and not told and _mesh_is_sound(program, path, chosen):
+        held = {info.name for info in arrays_in(leaves)}
+        lost = [name for k in range(reader.GetNumberOfCellArrays()) if (name := reader.GetCellArrayName(k)) not in held]
+        if array in lost:
+            raise DataError(f"{path}: VTK cannot read field {array} ({error}); expected plain values in its file")
+        warnings.warn(f"{path}: without {', '.join(lost) or 'some values'}, which VTK cannot read ({error})", stacklevel=2)
+        return leaves, times
     if error or not leaves:
         fault = f"cannot read it ({error})" if leaves else f"finds no dataset in it ({error or 'no message'})"
         raise DataError(f"{path}: VTK {fault}; is the {program.name} file whole?")
     return leaves, times
+
+
+def _mesh_is_sound(program: Program, path: Path, time: float | None) -> bool:
+    """Return whether VTK reads a time step without an error when all fields are switched off."""
+    with quiet_vtk() as message:
+        reader = program.reader(path)
+        reader.DisableAllCellArrays()
+        reader.DisableAllPointArrays()
+        reader.UpdateTimeStep(0.0 if time is None else time)
+        return not message(errors=True)
 
 
 def _check_name(path: Path, named: str) -> None:
@@ -130,21 +152,45 @@ def _exodus(path: Path) -> Any:
     return reader
 
 
+def _times(folder: Path) -> set[float]:
+    """Return the times that the folders of an OpenFOAM case are named by."""
+    number = re.compile(r"\d*\.?\d+(?:e[+-]?\d+)?", re.I)
+    return {float(p.name) for p in folder.glob("*") if number.fullmatch(p.name) and p.is_dir()}
+
+
 def _openfoam(path: Path) -> Any:
+    """Make the reader of a case: of its decomposed parts where they have times that the whole case lacks."""
     from vtkmodules.vtkIOParallel import vtkPOpenFOAMReader
 
-    whole, parts = (path.parent / "constant" / "polyMesh").is_dir(), (path.parent / "processor0").is_dir()
-    if not whole and not parts:
+    case, asked = path.parent, path.stem.lower()
+    whole = any(p.is_dir() for pattern in ("polyMesh", "*/polyMesh") for p in (case / "constant").glob(pattern))
+    mine, parts = _times(case), _times(case / "processor0")
+    collated = next((p for p in case.glob("processors*") if p.is_dir() and _times(p) - mine - parts), None)
+    if collated is not None:
+        text = f"{path}: {collated.name} holds times in OpenFOAM's collated format, which VTK does not read; try"
+        text += " reconstructPar, or mpirun -np N foamFormatConvert -parallel -fileHandler uncollated"
+        if not whole and not parts:
+            raise DataError(text)
+        warnings.warn(text, stacklevel=2)
+    if not whole and not (case / "processor0").is_dir():
         raise DataError(f"{path}: no case beside it; expected a folder with constant/polyMesh or processor0 in it")
+    decomposed = not whole or bool(parts and asked == "decomposed" or parts - mine and asked != "reconstructed")
+    if whole and parts - mine:
+        here, there = ("decomposed", "reconstructed") if decomposed else ("reconstructed", "decomposed")
+        warnings.warn(
+            f"{path}: the {here} case is read; decomposed it has {len(parts)} times up to {max(parts):g}, reconstructed "
+            f"{len(mine)} up to {max(mine, default=0):g}; for the other one read an empty file {there}.foam beside it",
+            stacklevel=2,
+        )
     reader = vtkPOpenFOAMReader()
     reader.SetFileName(str(path))
-    reader.SetCaseType(1 if whole else 0)  # reconstructed, or decomposed
+    reader.SetCaseType(0 if decomposed else 1)
     reader.CreateCellToPointOff()  # values as they are stored
     reader.UpdateInformation()
     reader.EnableAllCellArrays()
     reader.EnableAllPointArrays()
-    reader.DisableAllPatchArrays()
-    reader.SetPatchArrayStatus("internalMesh", 1)
+    for name in [reader.GetPatchArrayName(k) for k in range(reader.GetNumberOfPatchArrays())]:
+        reader.SetPatchArrayStatus(name, name.endswith("internalMesh"))  # of each region
     return reader
 
 
@@ -282,7 +328,7 @@ PROGRAMS = {
             _exodus,
             within=("NetCDF", "HDF5"),
         ),
-        Program("OpenFOAM", (".foam",), lambda head: False, _openfoam, by_name=True),
+        Program("OpenFOAM", (".foam",), lambda head: False, _openfoam, by_name=True, skips=True),
         Program("XDMF", (".xdmf", ".xmf", ".xdmf2", ".xdmf3"), _is_xdmf, _xdmf),
         Program(
             "CGNS",
