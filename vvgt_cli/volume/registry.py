@@ -15,6 +15,7 @@ from typing import Any
 from vvgt_cli.errors import DataError, SeveralSteps, UsageError, VvgtError
 from vvgt_cli.files import seekable
 from vvgt_cli.volume.cut import crop, masked, parse_crop
+from vvgt_cli.volume.headers import MARK
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import HEAD_BYTES, READERS, SCHEMES, STEPPED, Reader, known_suffixes
 from vvgt_cli.volume.space import in_space
@@ -194,7 +195,7 @@ def _head(path: Path, source: str) -> bytes:
     named = _by_name(path)
     if not head and not (named and named.empty):
         raise DataError(f"{source}: the file is empty; expected a volume")
-    return head
+    return head.removeprefix(MARK)
 
 
 def _by_content(path: Path, head: bytes) -> tuple[Reader | None, bool]:

@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from vvgt_cli.volume.headers import MARK
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import HEAD_BYTES, Reader, register
 from vvgt_cli.volume.types import Volume
@@ -22,7 +23,7 @@ SUFFIXES = (".pvtu", ".pvtr", ".pvts", ".vtm", ".vtmb", ".vtpd", ".vtpc", ".vth"
 
 def is_index(head: bytes) -> bool:
     """Whether a file begins as an index of datasets (one of the pieces of an image is none)."""
-    if head.lstrip().startswith(b"{"):
+    if head.removeprefix(MARK).lstrip().startswith(b"{"):
         return b'"file-series-version"' in head
     kind = xml_kind(head)
     return kind in INDEXES and kind != "PImageData"

@@ -17,6 +17,7 @@ from xml.parsers import expat
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import data_file
+from vvgt_cli.volume.headers import MARK
 from vvgt_cli.volume.vtk_index import MAX_BYTES, chosen_time
 from vvgt_cli.volume.vtk_leaves import Leaf, arrays_in, leaves_of
 from vvgt_cli.volume.vtk_messages import quiet_vtk
@@ -115,13 +116,15 @@ def _small(path: Path) -> str:
     """The text of a file that describes others."""
     if path.stat().st_size > MAX_BYTES:
         raise DataError(f"{path}: {path.stat().st_size} bytes; expected at most {MAX_BYTES >> 20} MiB of text")
-    return path.read_text("utf-8", "replace")
+    return path.read_text("utf-8-sig", "replace")
 
 
 def _ensight(path: Path) -> Any:
     from vtkmodules.vtkIOEnSight import vtkGenericEnSightReader
 
     section, names = "", []
+    if path.read_bytes().startswith(MARK):
+        raise DataError(f"{path}: begins with a byte order mark, which VTK's reader stops at; save it as plain text")
     for line in _small(path).splitlines():
         line = line.partition("#")[0].strip()
         if re.fullmatch(r"[A-Z]+", line):

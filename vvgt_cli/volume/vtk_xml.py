@@ -385,7 +385,7 @@ def _by_vtk(path: Path, info: ArrayInfo, shape: tuple[int, ...]) -> np.ndarray:
 
 def xml_kind(head: bytes) -> str | None:
     """Type of dataset that a VTK XML file begins with ("" where it says none), None of any other file."""
-    if re.search(rb"^\s*(?:<\?xml[^>]*>\s*)?(?:<!--.*?-->\s*)*<VTKFile\s", head, re.DOTALL) is None:
+    if re.search(rb"^(?:\xef\xbb\xbf)?\s*(?:<\?xml[^>]*>\s*)?(?:<!--.*?-->\s*)*<VTKFile\s", head, re.DOTALL) is None:
         return None
     kind = re.search(rb'<VTKFile\s[^>]*?type\s*=\s*["\'](\w+)["\']', head)
     return "" if kind is None else kind[1].decode()
