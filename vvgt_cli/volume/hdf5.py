@@ -115,7 +115,7 @@ def _check_links(h5py: Any, file: Any, wanted: str, path: Path) -> None:
     for part in wanted.strip("/").split("/"):
         link = place.get(part, getlink=True) if isinstance(place, h5py.Group) else None
         if isinstance(link, h5py.ExternalLink):
-            data_file(path, link.filename)
+            data_file(path, link.filename, exact=True)
         place = place.get(part) if link is not None else None
 
 
@@ -126,7 +126,7 @@ def check_storage(h5py: Any, dataset: Any, path: Path, source: str) -> None:
     if dataset.is_virtual:
         for part in dataset.virtual_sources():
             if part.file_name != ".":
-                data_file(path, part.file_name)
+                data_file(path, part.file_name, exact=True)
     if dataset.chunks and int(np.prod(dataset.chunks, dtype=object)) * dataset.dtype.itemsize > MAX_CHUNK:
         raise DataError(f"{source}: chunks of {dataset.chunks} values; expected at most {size_text(MAX_CHUNK)} each")
     plan = dataset.id.get_create_plist()

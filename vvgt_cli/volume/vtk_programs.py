@@ -16,7 +16,7 @@ from typing import Any
 from xml.parsers import expat
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.blocks import data_file
+from vvgt_cli.volume.blocks import any_case, data_file
 from vvgt_cli.volume.headers import MARK
 from vvgt_cli.volume.vtk_index import MAX_BYTES, chosen_time
 from vvgt_cli.volume.vtk_leaves import Leaf, arrays_in, leaves_of
@@ -100,7 +100,7 @@ def _mesh_is_sound(program: Program, path: Path, time: float | None) -> bool:
 def _check_name(path: Path, named: str) -> None:
     """Refuse a file named by another that does not lie in its folder, or is not there; a pattern stands for several."""
     if not re.search(r"[*%]", named):
-        data_file(path, named)
+        data_file(path, named, exact=True)  # VTK opens it
     elif Path(named).is_absolute() or ".." in Path(named).parts:
         raise DataError(f"{path.name}: it names {named!r}; expected files in its own folder")
 
@@ -273,8 +273,8 @@ def _plot3d(path: Path) -> Any:
             )
     else:
         for key, suffix in (("q", ".q"), ("function", ".f")):
-            if path.with_suffix(suffix).is_file():
-                files[key] = path.with_suffix(suffix).name
+            if (found := any_case(path.with_suffix(suffix))).is_file():
+                files[key] = found.name
     if len(files) < 2:
         raise DataError(f"{path}: coordinates alone; expected values beside them, in {path.stem}.q or {path.stem}.f")
     _check_names(path, list(files.values()))
