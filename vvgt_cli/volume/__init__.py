@@ -14,6 +14,7 @@ from vvgt_cli.volume import (  # noqa: F401  each registers its formats
     mrc,
     n5,
     netcdf,
+    nibabel_pairs,
     nifti,
     nikon,
     nrrd,
