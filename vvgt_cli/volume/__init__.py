@@ -1,6 +1,7 @@
 """Volumes and their readers."""
 
 from vvgt_cli.volume import (  # noqa: F401  each registers its formats
+    amira,
     analyze,
     dicom,
     examples,

@@ -24,9 +24,7 @@ HEAD = 4096
 LISTED = 50  # blocks and steps
 
 
-def datasets(
-    program: str, path: Path, time: int | None, array: str | None = None
-) -> tuple[list[Leaf], list[float]]:
+def datasets(program: str, path: Path, time: int | None, array: str | None = None) -> tuple[list[Leaf], list[float]]:
     """The datasets of a time step, and the times of all steps.
 
     Raises:

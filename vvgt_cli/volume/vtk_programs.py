@@ -79,7 +79,9 @@ def read_program(
         lost = [name for k in range(reader.GetNumberOfCellArrays()) if (name := reader.GetCellArrayName(k)) not in held]
         if array in lost:
             raise DataError(f"{path}: VTK cannot read field {array} ({error}); expected plain values in its file")
-        warnings.warn(f"{path}: without {', '.join(lost) or 'some values'}, which VTK cannot read ({error})", stacklevel=2)
+        warnings.warn(
+            f"{path}: without {', '.join(lost) or 'some values'}, which VTK cannot read ({error})", stacklevel=2
+        )
         return leaves, times
     if error or not leaves:
         fault = f"cannot read it ({error})" if leaves else f"finds no dataset in it ({error or 'no message'})"
