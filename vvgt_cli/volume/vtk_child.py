@@ -20,7 +20,7 @@ from typing import IO, Any, cast
 
 import numpy as np
 
-from vvgt_cli.errors import DataError, SeveralComponents, SeveralSteps, UsageError, VvgtError
+from vvgt_cli.errors import DataError, SeveralArrays, SeveralComponents, SeveralSteps, UsageError, VvgtError
 from vvgt_cli.resources import free_memory
 from vvgt_cli.volume.blocks import check_memory, count
 from vvgt_cli.volume.options import ReadOptions
@@ -32,6 +32,7 @@ from vvgt_cli.volume.vtk_index import INDEX, SINGLE
 SECONDS, A_BYTE, A_VOXEL = 60, 1e-6, 4e-6  # processor time: at least, of a byte of the files, of a sample
 START = f"from {__name__} import main; main()"
 IDLE, LOOK = 60.0, 2.0  # s without any processor time after which it counts as hung, and between looks
+GRIB = "GRIB"  # in the place of a program: read by `grib`
 KEYS = ("dims", "spacing", "array", "component", "time")
 LARGEST = 1 << 20  # bytes of the line of an answer
 
@@ -141,16 +142,13 @@ def received(stream: IO[bytes]) -> tuple[dict[str, Any], np.ndarray] | None:
 
 
 def _ended(path: Path, program: str, status: int, seconds: int) -> DataError:
-    kind = "VTK" if program in (INDEX, SINGLE) else program
+    who = "ecCodes" if program == GRIB else f"VTK's reader of {'VTK' if program in (INDEX, SINGLE) else program} files"
     if status in (-signal.SIGXCPU, -signal.SIGKILL):
         return DataError(
-            f"{path}: VTK's reader of {kind} files was stopped (after {seconds} s, a minute of standstill, "
-            "or for its memory); is it whole?"
+            f"{path}: {who} was stopped (after {seconds} s, a minute of standstill, or for its memory); is it whole?"
         )
     what = signal.Signals(-status).name if status < 0 else f"status {status}"
-    return DataError(
-        f"{path}: VTK's reader of {kind} files broke down ({what}), or had too little memory; is the file whole?"
-    )
+    return DataError(f"{path}: {who} broke down ({what}), or had too little memory; is the file whole?")
 
 
 def _error(facts: dict[str, Any]) -> VvgtError:
@@ -158,9 +156,11 @@ def _error(facts: dict[str, Any]) -> VvgtError:
     text, kind = facts["text"], facts["error"]
     made: VvgtError
     if kind == "SeveralSteps":
-        made = SeveralSteps("", facts["steps"], times=facts["times"])
+        made = SeveralSteps("", facts["steps"], times=facts["times"], unit=facts["unit"])
         made.args = (text,)
         return made
+    if kind == "SeveralArrays":
+        return SeveralArrays(text, "--array", facts["choices"])
     if kind == "SeveralComponents":
         return SeveralComponents(text, facts["count"], facts["color"])
     return UsageError(text) if kind == "UsageError" else DataError(text)
@@ -182,7 +182,9 @@ def answer(request: dict[str, Any]) -> tuple[dict[str, Any], np.ndarray | None]:
     except VvgtError as error:
         facts, values = {"error": type(error).__name__, "text": str(error)}, None
         if isinstance(error, SeveralSteps):
-            facts |= {"steps": error.steps, "times": [float(time) for time in error.times or ()]}
+            facts |= {"steps": error.steps, "times": [float(time) for time in error.times or ()], "unit": error.unit}
+        if isinstance(error, SeveralArrays) and request["program"] == GRIB:
+            return facts | {"choices": error.choices, "notes": []}, None
         if isinstance(error, SeveralComponents):
             facts |= {"count": error.count, "color": error.color}
         if facts["error"] not in ("SeveralSteps", "SeveralComponents"):
@@ -204,8 +206,13 @@ def _work(program: str, path: Path, options: ReadOptions, task: str) -> tuple[di
 
     if task == "contents":
         return contents_of(program, path, options), None
-    leaves, _ = datasets(program, path, options.time, options.array)
-    volume = volume_of(leaves, replace(options, time=None), str(path), volume_name(path))
+    if program == GRIB:
+        from vvgt_cli.volume.grib import grib_volume
+
+        volume = grib_volume(path, options)
+    else:
+        leaves, _ = datasets(program, path, options.time, options.array)
+        volume = volume_of(leaves, replace(options, time=None), str(path), volume_name(path))
     values = np.ascontiguousarray(volume.data)
     place = {key: [float(v) for v in getattr(volume, key)] for key in ("spacing", "origin", "direction")}
     return {"name": volume.name, "dtype": values.dtype.str, "shape": values.shape, **place}, values

@@ -179,7 +179,7 @@ def _openfoam(path: Path) -> Any:
         warnings.warn(text, stacklevel=2)
     if not whole and not (case / "processor0").is_dir():
         raise DataError(f"{path}: no case beside it; expected a folder with constant/polyMesh or processor0 in it")
-    decomposed = not whole or bool(parts and asked == "decomposed" or parts - mine and asked != "reconstructed")
+    decomposed = not whole or bool((parts and asked == "decomposed") or (parts - mine and asked != "reconstructed"))
     if whole and parts - mine:
         here, there = ("decomposed", "reconstructed") if decomposed else ("reconstructed", "decomposed")
         warnings.warn(
