@@ -1,4 +1,4 @@
-"""GRIB 1 and 2, one variable at one time, read by ecCodes in a process of its own (`vtk_child`): it trusts its files."""
+"""GRIB 1 and 2, one variable at one time, read by ecCodes, which trusts its files, in a process of its own."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def grib_volume(path: Path, options: ReadOptions) -> Volume:
             values = np.asarray(codes.codes_get_values(message)).reshape([a.size for a in here])
             planes.append(np.where(values == MISSING, np.nan, values).astype(np.float32))
             codes.codes_release(message)
-            if planes[1:] and any((a.centres != b.centres).any() for a, b in zip(axes, here, strict=True)):
+            if planes[1:] and any(np.any(a.centres != b.centres) for a, b in zip(axes, here, strict=True)):
                 raise DataError(f"{source}: {name} has levels on different grids; expected one")
             axes = here
         unit = _UNITS.get(name.split("/")[1], "m" if "height" in name else "level")
@@ -103,15 +103,15 @@ def _grid(codes: Any, message: Any, source: str) -> list[Axis]:
             ]
     kind = codes.codes_get(message, "gridType")
     raise DataError(
-        f"{source}: values on a grid of type {kind}; expected latitudes by longitudes: try 'cdo -f nc4 remapbil,r360x180 "
-        "IN OUT.nc' (setgridtype,regular for a reduced Gaussian grid, sp2gpl for a spectral one)"
+        f"{source}: values on a grid of type {kind}; expected latitudes by longitudes: try 'cdo -f nc4 "
+        "remapbil,r360x180 IN OUT.nc' (setgridtype,regular for a reduced Gaussian grid, sp2gpl for a spectral one)"
     )
 
 
 _SUFFIXES = (".grib", ".grib1", ".grib2", ".grb", ".grb1", ".grb2")
 register(
     Reader(
-        "GRIB", _SUFFIXES, lambda head: head.startswith(b"GRIB"), partial(volume_by_child, GRIB), named_arrays=True,
-        times=True, resamples=True, by_name=True,
+        "GRIB", _SUFFIXES, lambda head: b"GRIB" in head[:64], partial(volume_by_child, GRIB), named_arrays=True,
+        times=True, resamples=True,
     )
 )  # fmt: skip

@@ -1,8 +1,8 @@
 """Densities as text: Gaussian's ``.cube``, OpenDX's ``.dx`` (APBS, VMD) and VASP's, on grids that may be skewed.
 
 Formats: https://gaussian.com/cubegen, "Object File Format" of IBM's OpenDX user guide, appendix B.1, and CHGCAR in
-https://www.vasp.at/wiki. The first two store z fastest, so that a volume's first index runs along the grid's third axis. Parsed here: a header is some lines, and sizes
-are compared with the file before anything is allocated.
+https://www.vasp.at/wiki. The first two store z fastest, so that a volume's first index runs along the grid's third
+axis. Parsed here: a header is some lines, and sizes are compared with the file before anything is allocated.
 """
 
 from __future__ import annotations

@@ -185,7 +185,7 @@ def _rotation(header: Header) -> tuple[float, ...]:
 
 
 def other_of_pair(path: Path, suffix: str) -> Path | None:
-    """Return the ``.img`` of a ``.hdr`` or the reverse, packed by gzip or not, in any case; None where there is none."""
+    """Return the ``.img`` of a ``.hdr``, or the reverse, gzip-compressed or not, in any case; None without one."""
     stem = re.sub(r"\.\w+(\.gz)?$", "", path.name, flags=re.IGNORECASE)
     files = [any_case(path.with_name(stem + suffix + packed)) for packed in ("", ".gz")]
     return next((file for file in files if file.is_file()), None)

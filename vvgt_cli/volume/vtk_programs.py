@@ -183,8 +183,8 @@ def _openfoam(path: Path) -> Any:
     if whole and parts - mine:
         here, there = ("decomposed", "reconstructed") if decomposed else ("reconstructed", "decomposed")
         warnings.warn(
-            f"{path}: the {here} case is read; decomposed it has {len(parts)} times up to {max(parts):g}, reconstructed "
-            f"{len(mine)} up to {max(mine, default=0):g}; for the other one read an empty file {there}.foam beside it",
+            f"{path}: the {here} case is read; decomposed it has {len(parts)} times up to {max(parts):g}, "
+            f"reconstructed {len(mine)} up to {max(mine, default=0):g}; an empty file {there}.foam reads that",
             stacklevel=2,
         )
     reader = vtkPOpenFOAMReader()
