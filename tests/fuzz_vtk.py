@@ -15,11 +15,13 @@ import signal
 import sys
 import tempfile
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from fuzz import SECONDS, Seed
+from fuzz_seeds import volume_reader
 from vtkmodules import vtkIOXML
 from vtkmodules.vtkIOLegacy import vtkDataSetWriter
 
@@ -190,7 +192,26 @@ def programs() -> list[Seed]:
     ]  # fmt: skip
 
 
+def grib() -> list[Seed]:
+    """Levels and times, GRIB 1 and 2; nothing without ecCodes."""
+    import test_volume_grib as written
+
+    read = volume_reader(time=1, spacing=(1, 1, 1))
+    return [
+        Seed(
+            f"v{edition}.grib",
+            b"".join(
+                written.message(written.field(p, h), edition, shortName="t", level=p, stepRange=h)
+                for h in (0, 6) for p in (900, 1000)
+            ),
+            read,
+        )
+        for edition in (1, 2)
+    ]  # fmt: skip
+
+
 def readers() -> dict[str, list[Seed]]:
     """Seeds by reader."""
     vtk_child.run = run_fork
-    return {"VTK mesh": meshes(), "VTK index": indexes(), "programs by VTK": programs()}
+    found = {"VTK mesh": meshes(), "VTK index": indexes(), "programs by VTK": programs()}
+    return found | ({"GRIB": grib()} if find_spec("eccodes") else {})

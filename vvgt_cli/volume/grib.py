@@ -10,14 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.errors import DataError, SeveralArrays, SeveralSteps, UsageError
+from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import check_memory
+from vvgt_cli.volume.components import ArrayInfo, choose_array
 from vvgt_cli.volume.labelled import Axis, labelled_volume
 from vvgt_cli.volume.libraries import library_errors, need
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import Reader, register, volume_name
 from vvgt_cli.volume.types import Volume
 from vvgt_cli.volume.vtk_child import GRIB, volume_by_child
+from vvgt_cli.volume.vtk_index import chosen_time
 
 MISSING = -1e100
 _TIME = ("validityDate", "validityTime", "dataDate", "dataTime", "stepRange")
@@ -40,12 +42,15 @@ def grib_volume(path: Path, options: ReadOptions) -> Volume:
             when = tuple(codes.codes_get(message, key) for key in _TIME)
             levels = found.setdefault("/".join(names), {}).setdefault(when, {})
             level = codes.codes_get(message, "level", float)
-            if level in levels:
-                raise DataError(f"{source}: {'/'.join(names)} has two messages of level {level:g} at one time")
-            levels[level] = int(codes.codes_get(message, "offset"))
+            if levels.setdefault(level, at := int(codes.codes_get(message, "offset"))) != at:
+                raise DataError(f"{source}: two messages of {'/'.join(names)} have level {level:g} at one time")
             codes.codes_release(message)
-        name, times = _choose(found, options, source)
-        levels = times[sorted(times)[options.time or 0]]
+        infos = [ArrayInfo(name, "point", 1, "float32") for name in found]
+        name = infos[choose_array(infos, options.array, source)].name
+        whens = sorted(found[name])
+        dates = [datetime.strptime(f"{when[0]:08d}{when[1]:04d}", "%Y%m%d%H%M") for when in whens]
+        chosen_time([(date - dates[0]).total_seconds() / 3600 for date in dates], options.time, source)
+        levels = found[name][whens[options.time or 0]]
         down = not name.split("/")[1].startswith(("height", "theta", "potential"))
         planes, axes = [], [Axis("", 0)]
         for level in sorted(levels):
@@ -63,30 +68,8 @@ def grib_volume(path: Path, options: ReadOptions) -> Volume:
         unit = _UNITS.get(name.split("/")[1], "m" if "height" in name else "level")
         heights = np.array(sorted(levels)) * (-1.0 if down else 1.0)
         axes = [Axis("level", len(planes), heights, unit, "z"), *axes]
-        plain = replace(options, time=None, array=None)
-        called = f"{volume_name(path)}:{name}"
-        return labelled_volume(np.stack(planes), np.dtype(np.float32), axes, {}, plain, f"{source}:{name}", called)
-
-
-def _choose(found: dict[str, Any], options: ReadOptions, source: str) -> tuple[str, dict[tuple[Any, ...], Any]]:
-    """Return the name of the variable asked for and what it has for each time; a beginning of the name will do.
-
-    Raises:
-        UsageError: several variables or times and none chosen, or one that there is not.
-    """
-    wanted = options.array
-    names = [name for name in found if wanted is None or (name + "/").startswith(wanted.strip("/") + "/")]
-    if len(names) != 1:
-        listing = ", ".join(list(found)[:40]) or "none"
-        text = f"{source}: {len(names)} variables {wanted or ''} among {listing}; choose one with --array NAME"
-        raise SeveralArrays(text, "--array", names) if names else UsageError(text)
-    times = sorted(found[names[0]])
-    if options.time is None and len(times) > 1:
-        dates = [datetime.strptime(f"{when[0]:08d}{when[1]:04d}", "%Y%m%d%H%M") for when in times]
-        raise SeveralSteps(source, len(times), times=[(d - dates[0]).total_seconds() / 3600 for d in dates], unit="h")
-    if (options.time or 0) >= len(times):
-        raise UsageError(f"{source}: --time {options.time}: expected a time step from 0 to {len(times) - 1}")
-    return names[0], found[names[0]]
+        plain, block = replace(options, time=None), np.stack(planes)
+        return labelled_volume(block, block.dtype, axes, {}, plain, f"{source}:{name}", f"{volume_name(path)}:{name}")
 
 
 def _grid(codes: Any, message: Any, source: str) -> list[Axis]:

@@ -156,7 +156,7 @@ def _error(facts: dict[str, Any]) -> VvgtError:
     text, kind = facts["text"], facts["error"]
     made: VvgtError
     if kind == "SeveralSteps":
-        made = SeveralSteps("", facts["steps"], times=facts["times"], unit=facts["unit"])
+        made = SeveralSteps("", facts["steps"], times=facts["times"])
         made.args = (text,)
         return made
     if kind == "SeveralArrays":
@@ -182,7 +182,7 @@ def answer(request: dict[str, Any]) -> tuple[dict[str, Any], np.ndarray | None]:
     except VvgtError as error:
         facts, values = {"error": type(error).__name__, "text": str(error)}, None
         if isinstance(error, SeveralSteps):
-            facts |= {"steps": error.steps, "times": [float(time) for time in error.times or ()], "unit": error.unit}
+            facts |= {"steps": error.steps, "times": [float(time) for time in error.times or ()]}
         if isinstance(error, SeveralArrays) and request["program"] == GRIB:
             return facts | {"choices": error.choices, "notes": []}, None
         if isinstance(error, SeveralComponents):

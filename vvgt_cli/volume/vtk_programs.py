@@ -170,9 +170,8 @@ def _openfoam(path: Path) -> Any:
     case, asked = path.parent, path.stem.lower()
     whole = any(p.is_dir() for pattern in ("polyMesh", "*/polyMesh") for p in (case / "constant").glob(pattern))
     mine, parts = _times(case), _times(case / "processor0")
-    collated = next((p for p in case.glob("processors*") if p.is_dir() and _times(p) - mine - parts), None)
-    if collated is not None:
-        text = f"{path}: {collated.name} holds times in OpenFOAM's collated format, which VTK does not read; try"
+    if any(_times(p) - mine - parts for p in case.glob("processors*")):
+        text = f"{path}: its processors folder (OpenFOAM's collated format) holds times, which VTK does not read; try"
         text += " reconstructPar, or mpirun -np N foamFormatConvert -parallel -fileHandler uncollated"
         if not whole and not parts:
             raise DataError(text)
