@@ -194,20 +194,19 @@ def programs() -> list[Seed]:
 
 def grib() -> list[Seed]:
     """Levels and times, GRIB 1 and 2; nothing without ecCodes."""
-    import test_volume_grib as written
+    import grib_files as written
 
-    read = volume_reader(time=1, spacing=(1, 1, 1))
-    return [
-        Seed(
-            f"v{edition}.grib",
-            b"".join(
-                written.message(written.field(p, h), edition, shortName="t", level=p, stepRange=h)
-                for h in (0, 6) for p in (900, 1000)
-            ),
-            read,
-        )
-        for edition in (1, 2)
-    ]  # fmt: skip
+    seeds = []
+    for edition in (1, 2):
+        pairs = [(p, h) for h in (0, 6) for p in (900, 1000)]
+        messages = [
+            written.message(written.field(p, h), edition, shortName="t", level=p, stepRange=h) for p, h in pairs
+        ]
+        with tempfile.TemporaryDirectory() as folder:
+            written.write(Path(folder) / "v.grib", *messages)
+            data = (Path(folder) / "v.grib").read_bytes()
+        seeds.append(Seed(f"v{edition}.grib", data, volume_reader(time=1, spacing=(1, 1, 1))))
+    return seeds
 
 
 def readers() -> dict[str, list[Seed]]:

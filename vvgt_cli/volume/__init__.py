@@ -32,6 +32,7 @@ from vvgt_cli.volume import (  # noqa: F401  each registers its formats
     vtk_pieces,
     vtk_xml,
     zarr_store,
+    zarr_zip,
     zeiss,
 )
 from vvgt_cli.volume.options import ReadOptions

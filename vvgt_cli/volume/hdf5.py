@@ -178,7 +178,7 @@ register(
     Reader(
         "HDF5",
         (".h5", ".hdf5", ".he5", ".hdf", ".ims"),
-        lambda head: head.startswith(MAGIC) and not any(other in head for other in _OTHERS),
+        lambda head: MAGIC in (head[:8], head[512:520]) and not any(other in head for other in _OTHERS),
         read_hdf5,
         named_arrays=True,
         resamples=True,

@@ -183,7 +183,7 @@ def _openfoam(path: Path) -> Any:
         here, there = ("decomposed", "reconstructed") if decomposed else ("reconstructed", "decomposed")
         warnings.warn(
             f"{path}: the {here} case is read; decomposed it has {len(parts)} times up to {max(parts):g}, "
-            f"reconstructed {len(mine)} up to {max(mine, default=0):g}; an empty file {there}.foam reads that",
+            f"reconstructed {len(mine)} up to {max(mine, default=0):g}; read {there}.foam, an empty file, for that",
             stacklevel=2,
         )
     reader = vtkPOpenFOAMReader()
