@@ -173,12 +173,11 @@ def answer(request: dict[str, Any]) -> tuple[dict[str, Any], np.ndarray | None]:
         key: tuple(value) if isinstance(value, list) else value for key, value in request["options"].items()
     }
     options = ReadOptions(**given)
-    notes: list[str] = []
+    caught: list[Any] = []
     try:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             facts, values = _work(request["program"], path, options, request["task"])
-        notes = [str(one.message) for one in caught if one.category is UserWarning]
     except VvgtError as error:
         facts, values = {"error": type(error).__name__, "text": str(error)}, None
         if isinstance(error, SeveralSteps):
@@ -197,7 +196,9 @@ def answer(request: dict[str, Any]) -> tuple[dict[str, Any], np.ndarray | None]:
     except Exception as error:  # of readers that were given anything
         text = " ".join(str(error).split())[:300] or type(error).__name__
         facts, values = {"error": "DataError", "text": f"{path}: damaged ({text}); check that it is whole"}, None
-    return {**facts, "notes": notes}, values
+    again = facts.get("error") in ("SeveralSteps", "SeveralComponents")  # those who choose are told then
+    told = [str(one.message) for one in caught if one.category is UserWarning and not again]
+    return {**facts, "notes": told}, values
 
 
 def _work(program: str, path: Path, options: ReadOptions, task: str) -> tuple[dict[str, Any], np.ndarray | None]:
