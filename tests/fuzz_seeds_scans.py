@@ -149,6 +149,15 @@ def pairs() -> dict[str, list[Seed]]:
     }
 
 
+def zipped_zarr() -> list[Seed]:
+    from test_volume_zarr_zip import zipped
+
+    read = volume_reader(time=1)
+    with tempfile.TemporaryDirectory() as folder:
+        names = [zipped(Path(folder) / str(v), v, "v.zarr.zip", "", packed=v == 3) for v in (2, 3)]
+        return [Seed(f"{k}.zarr.zip", Path(name).read_bytes(), read) for k, name in enumerate(names)]
+
+
 def scans() -> dict[str, list[Seed]]:
     """Seeds by reader."""
     return {
@@ -160,5 +169,6 @@ def scans() -> dict[str, list[Seed]]:
         "VASP": vasp(),
         "AmiraMesh": amira_files(),
         **pairs(),
+        "zipped Zarr": zipped_zarr(),
         "MINC": minc(),
     }

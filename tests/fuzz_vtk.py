@@ -174,6 +174,14 @@ def meshes() -> list[Seed]:
     return seeds
 
 
+def parts_of_openfoam(folder: Path) -> Path:
+    """A case whose second time lies in its processor folders."""
+    from tests.test_volume_openfoam import case, decomposed
+
+    decomposed(folder, {"0.5": 0.0, "2": 1.0})
+    return case(folder, {"0.5": 0.0})
+
+
 def programs() -> list[Seed]:
     return [
         *seeds_of(files.hdf_image, ("v.vtkhdf",), array="ramp"),
@@ -189,6 +197,7 @@ def programs() -> list[Seed]:
             files.openfoam, ("system/controlDict", "constant/polyMesh/owner", "constant/polyMesh/faces", "0.5/cells"),
             time=0, dims=DIMS,
         ),
+        *seeds_of(parts_of_openfoam, ("processor0/2/cells", "processor1/constant/polyMesh/owner"), time=1, dims=DIMS),
     ]  # fmt: skip
 
 

@@ -31,6 +31,7 @@ def write(store, version: int) -> None:
 
 
 def zipped(folder: Path, version: int, name: str, inside: str, packed: bool = False) -> str:
+    folder.mkdir(exist_ok=True)
     write(folder / "v.ome.zarr", version)
     with zipfile.ZipFile(folder / name, "w", zipfile.ZIP_DEFLATED if packed else zipfile.ZIP_STORED) as file:
         for path in sorted((folder / "v.ome.zarr").rglob("*")):

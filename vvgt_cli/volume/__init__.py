@@ -5,7 +5,6 @@ from vvgt_cli.volume import (  # noqa: F401  each registers its formats
     analyze,
     dicom,
     examples,
-    grib,
     grid_text,
     hdf5,
     inviwo,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from datetime import datetime
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +15,11 @@ from vvgt_cli.volume.components import ArrayInfo, choose_array
 from vvgt_cli.volume.labelled import Axis, labelled_volume
 from vvgt_cli.volume.libraries import library_errors, need
 from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.readers import Reader, register, volume_name
+from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.types import Volume
-from vvgt_cli.volume.vtk_child import GRIB, volume_by_child
 from vvgt_cli.volume.vtk_index import chosen_time
 
+GRIB = "GRIB"  # in the place of a program of `vtk_child`
 MISSING = -1e100
 _TIME = ("validityDate", "validityTime", "dataDate", "dataTime", "stepRange")
 _UNITS = {"isobaricInhPa": "hPa", "isobaricInPa": "Pa", "hybrid": "level"}
@@ -80,21 +79,11 @@ def _grid(codes: Any, message: Any, source: str) -> list[Axis]:
         outer, inner = (place.reshape(shape) for place in places[::order])
         if (outer == outer[:, :1]).all() and (inner == inner[:1]).all():
             y, x = (outer[:, 0], inner[0])[::order]
-            x = np.unwrap(x, period=360)
-            return [Axis("latitude", ny, y, "degrees_north", "y"), Axis("longitude", nx, x, "degrees_east", "x")][
-                ::order
-            ]
+            axes = [Axis("latitude", ny, y, "degrees_north", "y")]
+            axes += [Axis("longitude", nx, np.unwrap(x, period=360), "degrees_east", "x")]
+            return axes[::order]
     kind = codes.codes_get(message, "gridType")
     raise DataError(
         f"{source}: values on a grid of type {kind}; expected latitudes by longitudes: try 'cdo -f nc4 "
         "remapbil,r360x180 IN OUT.nc' (setgridtype,regular for a reduced Gaussian grid, sp2gpl for a spectral one)"
     )
-
-
-_SUFFIXES = (".grib", ".grib1", ".grib2", ".grb", ".grb1", ".grb2")
-register(
-    Reader(
-        "GRIB", _SUFFIXES, lambda head: b"GRIB" in head[:64], partial(volume_by_child, GRIB), named_arrays=True,
-        times=True, resamples=True,
-    )
-)  # fmt: skip

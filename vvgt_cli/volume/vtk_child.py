@@ -23,6 +23,7 @@ import numpy as np
 from vvgt_cli.errors import DataError, SeveralArrays, SeveralComponents, SeveralSteps, UsageError, VvgtError
 from vvgt_cli.resources import free_memory
 from vvgt_cli.volume.blocks import check_memory, count
+from vvgt_cli.volume.grib import GRIB, grib_volume
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.resample import MOST
@@ -32,7 +33,6 @@ from vvgt_cli.volume.vtk_index import INDEX, SINGLE
 SECONDS, A_BYTE, A_VOXEL = 60, 1e-6, 4e-6  # processor time: at least, of a byte of the files, of a sample
 START = f"from {__name__} import main; main()"
 IDLE, LOOK = 60.0, 2.0  # s without any processor time after which it counts as hung, and between looks
-GRIB = "GRIB"  # in the place of a program: read by `grib`
 KEYS = ("dims", "spacing", "array", "component", "time")
 LARGEST = 1 << 20  # bytes of the line of an answer
 
@@ -208,8 +208,6 @@ def _work(program: str, path: Path, options: ReadOptions, task: str) -> tuple[di
     if task == "contents":
         return contents_of(program, path, options), None
     if program == GRIB:
-        from vvgt_cli.volume.grib import grib_volume
-
         volume = grib_volume(path, options)
     else:
         leaves, _ = datasets(program, path, options.time, options.array)
