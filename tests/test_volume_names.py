@@ -44,6 +44,19 @@ def test_marked_images_of_vtk_are_as_vtk_reads_them(tmp_path: Path, mode: int, p
         assert [data[0, 0, 0], data[-1, -1, -1]] == want
 
 
+@pytest.mark.parametrize(("old", "new"), [(b"\n   _", b"\n ol_"), (b"_\1\0\0\0", b"_\0\0\0\0")])
+def test_appended_data_that_vtk_would_break_down_at(tmp_path: Path, old: bytes, new: bytes) -> None:
+    path = tmp_path / "v.vti"
+    writer = vtkXMLImageDataWriter()
+    writer.EncodeAppendedDataOff()
+    writer.SetHeaderTypeToUInt32()
+    data = files.write(writer, files.image(), path).read_bytes()
+    assert old in data
+    path.write_bytes(data.replace(old, new))
+    with pytest.raises(DataError, match=r"do not begin with _|no whole table"):
+        read_volume(str(path), ReadOptions(array="ramp"))
+
+
 @pytest.mark.parametrize(
     ("make", "marked", "options"),
     [
@@ -73,6 +86,8 @@ def test_marked_headers_as_text(tmp_path: Path, name: str) -> None:
         path.write_text("RawFile: v.raw\nResolution: 5 4 3\nFormat: INT16\n")
     else:
         sitk.WriteImage(sitk.GetImageFromArray(VALUES), str(path))
+        if ".mh" in name:  # the first field is one that is needed
+            path.write_bytes(b"DimSize = 5 4 3\n" + path.read_bytes().replace(b"DimSize = 5 4 3\n", b""))
     mark(path)
     np.testing.assert_array_equal(read_volume(str(path)).data, VALUES)
 

@@ -52,8 +52,7 @@ def read_zipped(path: Path, options: ReadOptions) -> Volume:
     Raises:
         DataError, UsageError: as `read_zarr`, or no Zarr in it.
     """
-    with library_errors(str(path), "Zarr"):
-        file = ZipFile(path)
+    with library_errors(str(path), "Zarr"), ZipFile(path) as file:
         if any(entry.file_size > MAX_CHUNK for entry in file.infolist()):
             raise DataError(f"{path}: entries of more than 2 GiB; expected the chunks of a Zarr store")
         top = _Zipped(cast(Any, file), str(path))
