@@ -54,5 +54,5 @@ def way_out(path: Path, head: bytes, by_name: bool) -> str | None:
     for begins, ends, what, way in ROWS:
         if not re.match(begins, head) or not (begins or by_name) or not re.search(f"(?:{ends})$", path.name, re.I):
             continue
-        return f"{what}, which is not read; {way.format(name=path.name, stem=path.stem)}"
+        return f"{what}; expected a format that is read: {way.format(name=path.name, stem=path.stem)}"
     return None

@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Any, cast
-from zipfile import ZipFile
+from zipfile import ZipFile, is_zipfile
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.hdf5 import MAX_CHUNK
@@ -52,6 +52,8 @@ def read_zipped(path: Path, options: ReadOptions) -> Volume:
     Raises:
         DataError, UsageError: as `read_zarr`, or no Zarr in it.
     """
+    if not is_zipfile(path):
+        raise DataError(f"{path}: no zip file; expected a Zarr store in one")
     with library_errors(str(path), "Zarr"), ZipFile(path) as file:
         if any(entry.file_size > MAX_CHUNK for entry in file.infolist()):
             raise DataError(f"{path}: entries of more than 2 GiB; expected the chunks of a Zarr store")
