@@ -254,6 +254,7 @@ def _one(file: str, read: ReadOptions) -> dict[str, Any]:
         "origin": volume.origin,
         "direction": volume.direction,
         "space": volume.space or "none",
+        "length_unit": "mm" if volume.space else volume.unit or "none",
         **axis_facts(volume.affine, volume.space),
         "extent": volume.extent,
         "scaling": [volume.slope, volume.intercept],

@@ -13,8 +13,8 @@ from typing import Any
 from xml.etree import ElementTree
 
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.volume.labelled import METRES
 from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.space import metres
 from vvgt_cli.volume.tiff_pages import MAX_PAGES, check_pages
 from vvgt_cli.volume.types import triple
 
@@ -172,14 +172,14 @@ def _positive(value: Any) -> float | None:
 def _micrometres(numbers: list[float | None], units: list[str]) -> Facts:
     """Spacing in micrometres; as it is where its one unit is none of length."""
     plain = [_unit(unit) for unit in units]
-    metres = [METRES.get(unit, METRES.get(unit.lower())) for unit in plain]
-    told = {u: m for u, m, n in zip(plain, metres, numbers, strict=True) if n is not None}
+    lengths = [metres(unit) for unit in plain]
+    told = {u: m for u, m, n in zip(plain, lengths, numbers, strict=True) if n is not None}
     if None in told.values():
         return Facts(triple(numbers), units=", ".join(told) if len(told) > 1 else "")
     return Facts(
         triple(
             None if n is None else float(f"{n * float(m or 1) / MICROMETRE:.15g}")
-            for n, m in zip(numbers, metres, strict=True)
+            for n, m in zip(numbers, lengths, strict=True)
         ),
         length="um" if told else "",
     )
