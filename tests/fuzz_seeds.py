@@ -353,6 +353,7 @@ def manifest() -> list[Seed]:
 
 def readers() -> dict[str, list[Seed]]:
     """Seeds by reader."""
+    from fuzz_seeds_hospital import hospital
     from fuzz_seeds_scans import scans
 
     return {
@@ -361,6 +362,7 @@ def readers() -> dict[str, list[Seed]]:
         "MetaImage": metaimage(),
         "Inviwo": inviwo(),
         **scans(),
+        **hospital(),
         "SLC": slc(),
         "TIFF": tiff(),
         "VTK legacy": vtk_legacy(),

@@ -222,7 +222,8 @@ def _find(path: Path, head: bytes, options: ReadOptions) -> Reader:
     found, zipped = _by_content(path, head)
     if found is not None and named is not None and found.name in named.within:
         found = named
-    if found is not None and found is not named and not found.resamples and (options.dims or raw.parse_name(path.name)):
+    raw_layout = options.dtype or raw.parse_name(path.name) or (options.dims and not (found and found.resamples))
+    if found is not None and found is not named and raw_layout:
         return raw.READER  # a raw volume may begin with any bytes; where its layout is stated, believe that
     if found is not None:
         if zipped and not found.unzips:
