@@ -19,7 +19,7 @@ import numpy as np
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.blocks import check_memory
 from vvgt_cli.volume.components import select_component
-from vvgt_cli.volume.dicom_files import MOSAIC_COUNT, Source, headers_in, holds_dicom, is_dicom, read_file
+from vvgt_cli.volume.dicom_files import Source, headers_in, holds_dicom, is_dicom, read_file
 from vvgt_cli.volume.dicom_seg import is_segmentation, names_of, read_segmentation
 from vvgt_cli.volume.dicom_select import Files, choose_series, one_stack
 from vvgt_cli.volume.dicom_volumes import ATTRIBUTES, one_volume
@@ -147,7 +147,7 @@ def _mosaic(source: Source) -> tuple[int, np.ndarray | None]:
         DataError: the number is not stated.
     """
     header = read_file(source)
-    count, normal = header.get(MOSAIC_COUNT), None
+    count, normal = header.get((0x0019, 0x100A)), None
     if any("CSA HEADER" in str(header.get((0x0029, element), "")) for element in range(0x10, 0x20)):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # nibabel's, of readers that are not used here

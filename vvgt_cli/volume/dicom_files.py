@@ -6,7 +6,7 @@ A file begins with a preamble and ``DICM`` (PS3.10, 7.1), or, as older programs 
 from __future__ import annotations
 
 import os
-import struct
+import re
 import warnings
 import zipfile
 from collections.abc import Iterator
@@ -19,38 +19,24 @@ from typing import Any
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import check_memory
 from vvgt_cli.volume.channels import Bounded
+from vvgt_cli.volume.dicom_volumes import ATTRIBUTES
 
 Source = Path | zipfile.Path
 
 HEAD = 1024  # bytes that tell DICOM from other formats
 MOST = 100_000  # files
 TRIED = 1000  # files of a folder that are looked at to see whether it holds DICOM
-_LONG = {
-    b"OB",
-    b"OW",
-    b"OD",
-    b"OF",
-    b"OL",
-    b"OV",
-    b"SQ",
-    b"UC",
-    b"UR",
-    b"UT",
-    b"UN",
-}  # lengths of 4 bytes (PS3.5, 7.1.2)
-TAGS = (  # all that is read of a header but its pixels: those of scanners hold up to a megabyte of other things
-    *("SOPClassUID", "SOPInstanceUID", "Modality", "Manufacturer", "SeriesDescription", "SeriesInstanceUID"),
-    *("SeriesNumber", "InstanceNumber", "ImageType", "ImagePositionPatient", "ImageOrientationPatient", "PixelSpacing"),
-    *("FrameOfReferenceUID", "Rows", "Columns", "SamplesPerPixel", "NumberOfFrames", "PhotometricInterpretation"),
-    *("SliceThickness", "SpacingBetweenSlices", "RescaleSlope", "RescaleIntercept", "RescaleType", "DoseGridScaling"),
+_EXPLICIT = re.compile(rb"(?:[\2\x08]\0[\0-\x18]\0|\0[\2\x08]\0[\0-\x18])(?:UL|OB|UI|CS|SH|DA|TM|LO)")
+_IMPLICIT = re.compile(rb"\x08\0[\0-\x18]\0([\0-\x7f])\0\0\0")
+TAGS = [  # all that is read of a header but its pixels: those of scanners hold up to a megabyte of other things
+    *ATTRIBUTES,
+    *("SOPClassUID", "SOPInstanceUID", "Modality", "SeriesDescription", "SeriesInstanceUID", "SeriesNumber"),
+    *("InstanceNumber", "ImagePositionPatient", "ImageOrientationPatient", "PixelSpacing", "FrameOfReferenceUID"),
+    *("Rows", "Columns", "SamplesPerPixel", "NumberOfFrames", "PhotometricInterpretation", "SliceThickness"),
+    *("SpacingBetweenSlices", "RescaleSlope", "RescaleIntercept", "RescaleType", "DoseGridScaling", "SliceVector"),
     *("GridFrameOffsetVector", "ModalityLUTSequence", "PixelRepresentation", "SharedFunctionalGroupsSequence"),
-    *("PerFrameFunctionalGroupsSequence", "DetectorInformationSequence", "FrameIncrementPointer", "SliceVector"),
-    *("TimeSlotVector", "TimeSliceVector", "PhaseVector", "RRIntervalVector", "EnergyWindowVector", "DetectorVector"),
-    *("EchoTime", "TemporalPositionIdentifier", "AcquisitionNumber", "DiffusionBValue", "TriggerTime", "KVP"),
-    *("NominalPercentageOfCardiacPhase", "InversionTime", "FrameReferenceTime", "AcquisitionTime", "ContentTime"),
-    *("SegmentSequence", "BitsAllocated", "BitsStored", "HighBit"),
-)
-MOSAIC_COUNT = 0x0019100A  # Siemens' number of slices in a mosaic
+    *("PerFrameFunctionalGroupsSequence", "DetectorInformationSequence", "FrameIncrementPointer", "SegmentSequence"),
+]
 
 
 def is_dicom(head: bytes) -> bool:
@@ -59,26 +45,10 @@ def is_dicom(head: bytes) -> bool:
 
 
 def _is_bare(head: bytes) -> bool:
-    """Tell whether three elements in a row, of groups 2 or 8 at first, are a data set without a preamble."""
-    for order in "<>":
-        at, last, found = 0, (0, 0), 0
-        while at + 12 <= len(head) and found < 3:
-            tag = struct.unpack_from(order + "HH", head, at)
-            kind = head[at + 4 : at + 6]
-            if tag <= last or tag[0] not in ((2, 8) if not found else range(2, 0x21)):
-                break
-            if kind in _LONG:
-                size, length = 12, struct.unpack_from(order + "I", head, at + 8)[0]
-            elif kind.isalpha() and kind.isupper():
-                size, length = 8, struct.unpack_from(order + "H", head, at + 6)[0]
-            else:
-                size, length = 8, struct.unpack_from("<I", head, at + 4)[0]
-            if length % 2:
-                break
-            at, last, found = at + size + length, tag, found + 1
-        if found == 3 or (found == 2 and at > len(head)):
-            return True
-    return False
+    """Tell whether ``head`` is that of a data set without a preamble: elements of group 2 or 8 (PS3.5, 7.1)."""
+    first = _IMPLICIT.match(head)
+    after = 8 + first[1][0] if first else 0
+    return _EXPLICIT.match(head) is not None or (after % 2 == 0 < after and head[after : after + 2] == b"\x08\0")
 
 
 def is_zip(path: Path) -> bool:
@@ -120,7 +90,7 @@ def read_file(source: Source, pixels: bool = True) -> Any:
     import pydicom
     from pydicom.uid import ExplicitVRBigEndian, ExplicitVRLittleEndian, ImplicitVRLittleEndian
 
-    tags: Any = None if pixels else [*TAGS, MOSAIC_COUNT]
+    tags: Any = None if pixels else TAGS
     with Bounded(source) if isinstance(source, Path) else BytesIO(source.read_bytes()) as stream:
         found = pydicom.dcmread(stream, force=True, stop_before_pixels=not pixels, specific_tags=tags)
     if "TransferSyntaxUID" not in found.file_meta:  # nothing says how it is coded: as it was found to be
@@ -140,20 +110,15 @@ def headers_in(path: Path) -> list[tuple[Source, Any]]:
         DataError: too many files, or a damaged archive.
     """
     path = path.parent if path.name == "DICOMDIR" else path
-    if path.is_dir():
-        files = [Path(root, name) for root, _, names in os.walk(path) for name in names]
-        states = [file.stat() for file in islice(files, MOST + 1) if file.is_file()]
-        stamp = (len(states), sum(s.st_size for s in states), max((s.st_mtime_ns for s in states), default=0))
-    else:
-        state = path.stat()
-        stamp = (1, state.st_size, state.st_mtime_ns)
-    return _headers(path, stamp)
+    files = [os.path.join(root, name) for root, _, names in os.walk(path) for name in names] or [str(path)]
+    if len(files) > MOST:
+        raise DataError(f"{path}: more than {MOST} files; expected the folder of one series")
+    states = (os.lstat(file) for file in files)
+    return _headers(path, tuple((state.st_size, state.st_mtime_ns) for state in states))
 
 
 @lru_cache(maxsize=1)
-def _headers(path: Path, stamp: tuple[int, ...]) -> list[tuple[Source, Any]]:
-    if stamp[0] > MOST:
-        raise DataError(f"{path}: more than {MOST} files; expected the folder of one series")
+def _headers(path: Path, _states: tuple[tuple[int, int], ...]) -> list[tuple[Source, Any]]:
     files = (
         [path]
         if path.is_file() and not is_zip(path)
