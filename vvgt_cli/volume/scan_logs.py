@@ -5,58 +5,48 @@ from __future__ import annotations
 import warnings
 from pathlib import Path
 
-from vvgt_cli.errors import DataError
 from vvgt_cli.volume.headers import MAX_HEADER, Fields
 
 _SUFFIXES = (".log", ".xtekct", ".xtekvolume")
-_KEYS = {  # sizes along x, y and z, by what names them
-    "xtekct/voxelsizex": ("xtekct/voxelsizex", "xtekct/voxelsizey", "xtekct/voxelsizez"),
-    "reconstruction/pixel size (um)": ("reconstruction/pixel size (um)",) * 3,
-    "acquisition/image pixel size (um)": ("acquisition/image pixel size (um)",) * 3,
-}
-_PIXELS = {
-    "xtekct": ("xtekct/voxelsx", "xtekct/voxelsy"),
-    "reconstruction": ("reconstruction/result image width (pixels)", "reconstruction/result image height (pixels)"),
+_SIZES = {  # field of the size along x: of those along y and z, of the pixels along x and y, and the unit
+    "xtekct/voxelsizex": ("xtekct/voxelsizey", "xtekct/voxelsizez", "xtekct/voxels{}", "xy", "mm"),
+    "reconstruction/pixel size (um)": ("", "", "reconstruction/result image {} (pixels)", ("width", "height"), "um"),
+    "acquisition/image pixel size (um)": ("", "", "", "xy", "um"),
 }
 Spacing = tuple[float, float, float]
 
 
-def log_spacing(first: Path, size: tuple[int, int], step: int, stated: Spacing | None) -> tuple[Spacing, str] | None:
-    """Return voxel sizes (x, y, z) and their unit by the log beside a stack of slices; None where none counts.
+def log_spacing(first: Path, size: tuple[int, int], step: int, given: Spacing | None) -> tuple[Spacing, str] | None:
+    """Return voxel sizes (x, y, z) and their unit by the log beside a stack of slices; None, and a warning, if unsure.
 
-    Args:
-        first: the first slice. Of several logs those count whose names its name begins with, the longest most.
-        size: (x, y) pixels of the slices, which must be those of the log.
-        step: of the numbers in the slices' names.
-        stated: sizes that replace those of the log.
+    Slices must have the ``size`` (x, y) in pixels that the log states. Their distance goes by the ``step`` of their
+    numbers, or the log's. Sizes that are ``given`` replace the log's. Of several logs that one counts whose name is the
+    longest that the name of the ``first`` slice begins with.
 
     Raises:
-        DataError: a size in the log that is no number above 0.
+        DataError: a size in the log is no number.
     """
-    paths = [p for p in sorted(first.parent.iterdir()) if p.suffix.lower() in _SUFFIXES and p.is_file()]
-    logs = [log for path in paths if (log := _fields(path)).keys() & _KEYS.keys()]
+    paths = [path for path in sorted(first.parent.iterdir()) if path.suffix.lower() in _SUFFIXES and path.is_file()]
+    logs = [log for path in paths if (log := _fields(path)).keys() & _SIZES.keys()]
     own = [log for log in logs if first.name.startswith(Path(log.name).stem)]
     if not logs:
         return None
-    log = max(own or logs, key=lambda log: (len(Path(log.name).stem), Path(log.name).suffix.lower()))
-    key = next(key for key in _KEYS if key in log)
-    unit = log.get("xtekct/units", "mm") if key.startswith("xtekct") else "um"
-    if stated is not None:
-        return stated, unit
-    x, y, z = (_number(log, k) for k in _KEYS[key])
-    between = max(step, int(_number(log, "reconstruction/section to section step", 1)))
-    text = f"{log.name}: voxel sizes {x:g} {y:g} {z * between:g} {unit}"
-    pixels = [int(_number(log, k, n)) for k, n in zip(_PIXELS.get(key.partition("/")[0], ()), size, strict=False)]
-    if not own and len({tuple(log.get(k) for k in _KEYS) for log in logs}) > 1:
-        text += f" are not used: {len(logs)} logs lie there, none named as the slices; try --spacing X Y Z"
-    elif pixels and tuple(pixels) != size:
-        text += f" are of {pixels[0]} x {pixels[1]} pixels and not used: the slices have {size[0]} x {size[1]}; try "
-        text += "--spacing with these sizes if they are cut out, or with a multiple if they are binned"
+    log = max(own or logs, key=lambda log: len(Path(log.name).stem))
+    along_x = next(key for key in _SIZES if key in log)
+    along_y, along_z, pixels, axes, unit = _SIZES[along_x]
+    if given is not None:
+        return given, unit
+    x, y, z = (log.floats(key, log.need(key), 1)[0] for key in (along_x, along_y or along_x, along_z or along_x))
+    stated = [log[key] for axis in axes if (key := pixels.format(axis)) in log]
+    between = "reconstruction/section to section step"
+    z *= max(step, log.floats(between, log.get(between, "1"), 1)[0])
+    if not own and len({tuple(map(log.get, _SIZES)) for log in logs}) > 1:
+        problem = f"one of {len(logs)} logs, none named as the slices"
+    elif stated and stated != [*map(str, size)]:
+        problem = f"for {' x '.join(stated)} pixels, not for {size[0]} x {size[1]} (binned or cut out?)"
     else:
-        if step > 1:
-            warnings.warn(f"{text}: numbers of slices go in steps of {step}", stacklevel=2)
-        return (x, y, z * between), unit
-    warnings.warn(text, stacklevel=2)
+        return (x, y, z), unit
+    warnings.warn(f"{log.name}: voxel sizes {x:g} {y:g} {z:g} {unit} not used: {problem}; try --spacing", stacklevel=2)
     return None
 
 
@@ -67,13 +57,5 @@ def _fields(path: Path) -> Fields:
         for line in file.read(MAX_HEADER).splitlines():
             key, equals, value = line.partition("=")
             section = line.strip().strip("[]").lower() if line.startswith("[") else section
-            if equals:
-                fields.setdefault(f"{section}/{key.strip().lower()}", value.strip())
+            fields.update({f"{section}/{key.strip().lower()}": value.strip()} if equals else {})
     return fields
-
-
-def _number(log: Fields, key: str, default: float = 0.0) -> float:
-    values = log.floats(key, log[key]) if key in log else [default]
-    if len(values) != 1 or values[0] <= 0:
-        raise DataError(f"{log.name}: {key} is {log.get(key)!r}; expected a number above 0; try --spacing X Y Z")
-    return values[0]

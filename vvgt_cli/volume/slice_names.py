@@ -1,4 +1,4 @@
-"""Slices by the numbers in their file names: their order, gaps, and names that are of several stacks."""
+"""Slices by the numbers in their file names: order, gaps, and names that are of several stacks."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ from pathlib import Path
 
 from vvgt_cli.errors import DataError
 
-_SLICE = ("z", "slice", "section", "plane")
-_SHOWN = 3  # missing numbers and skipped files that a message names
+_SHOWN = 3  # numbers or files that a message names
 
 
 def by_number(path: Path) -> list[tuple[int, str]]:
@@ -22,14 +21,10 @@ def by_number(path: Path) -> list[tuple[int, str]]:
 
 
 def in_order(files: list[Path], source: str) -> tuple[list[Path], int]:
-    """Return the files of a numbered series, in order, and the step of their numbers.
+    """Return the files of a numbered series, sorted by the number that differs in every name, and its step.
 
-    The number that differs in every name counts. Names without numbers in common are left in their order. Warnings
-    name files that are skipped, numbers that are missing, and numbers that vary without counting (clock times).
-
-    Args:
-        files: sorted by `by_number`.
-        source: for messages.
+    Files that are sorted by `by_number` but have no numbers in common stay in that order. Warnings name files that are
+    skipped and numbers that are missing.
 
     Raises:
         DataError: several numbers vary independently (channels, times, positions), or several series count alike.
@@ -39,53 +34,49 @@ def in_order(files: list[Path], source: str) -> tuple[list[Path], int]:
         groups.setdefault(tuple(re.split(r"\d+", path.name.lower())), []).append(path)
     main = max(groups.values(), key=len)
     alone = [group[0] for group in groups.values() if len(group) == 1]
-    if len(main) == 1 or len(alone) >= len(main):
-        return files, 1
-    if alone:
-        warnings.warn(f"{source}: {listed(alone)} skipped: not numbered as the other slices", stacklevel=2)
-    series = [path for path in files if path not in alone]
+    series = [path for group in groups.values() if len(group) > 1 for path in group]
     texts = [re.findall(r"\d+", path.name) for path in series]
     columns = [tuple(map(int, column)) for column in zip(*texts, strict=False)]
+    if len(alone) >= len(main) or not columns:
+        return files, 1
+    if alone:
+        warnings.warn(f"{source}: skipped {listed(alone)}: not numbered as the other slices", stacklevel=2)
     parts = re.split(r"(\d+)", main[0].name)
-    for k in (k for k in range(len(columns) - 1) if parts[2 * k + 2] == "."):
+    for k in (k for k in range(len(columns) - 1) if parts[2 * k + 2] == "."):  # decimals: 0.5, 1.0, 1.5
         places = [float(f"{text[k]}.{text[k + 1]}") for text in texts]
         if len(_steps(places)) == 1:
-            return [series[i] for i in sorted(range(len(series)), key=places.__getitem__)], 1
+            return [path for _, path in sorted(zip(places, series, strict=True))], 1
     counting = [column for column in columns if len(set(column)) == len(series)]
     if not counting:
-        _refuse(main[0], parts, columns, source, len(series))
-        return series, 1
+        _refuse(main[0], parts, columns, source)
+        return sorted(series, key=by_number), 1
     numbers = min(counting, key=lambda column: (len(_steps(column)) > 1, max(column) - min(column)))
     step = int(min(_steps(numbers)))
-    gaps = [n for a, b in pairwise(sorted(numbers)) for n in range(a + step, min(b, a + (_SHOWN + 1) * step), step)]
+    gaps = [n for a, b in pairwise(sorted(numbers)) for n in range(a + step, min(b, a + 5 * step), step)]
     if gaps:
-        shown = ", ".join(map(str, gaps[:_SHOWN])) + (", ..." if len(gaps) > _SHOWN else "")
-        warnings.warn(f"{source}: no slices numbered {shown}; the others are taken as evenly spaced", stacklevel=2)
+        warnings.warn(f"{source}: no slices numbered {listed(gaps)}; read as if evenly spaced", stacklevel=2)
     return [path for _, path in sorted(zip(numbers, series, strict=True))], step
 
 
-def listed(files: list[Path]) -> str:
-    """Return the names of the first files, for a message."""
-    return ", ".join(path.name for path in files[:_SHOWN]) + (
-        f" and {len(files) - _SHOWN} more" * (len(files) > _SHOWN)
-    )
+def listed(items: Sequence[Path | int]) -> str:
+    """Return the first few numbers, or names of files, and that there are more."""
+    return ", ".join(str(getattr(i, "name", i)) for i in items[:_SHOWN]) + (", ..." if len(items) > _SHOWN else "")
 
 
 def _steps(numbers: Sequence[float]) -> set[float]:
     return {round(b - a, 9) for a, b in pairwise(sorted(numbers))}
 
 
-def _refuse(first: Path, parts: list[str], columns: list[tuple[int, ...]], source: str, n: int) -> None:
-    """Raise `DataError` where the numbers in names make a grid that is filled by more than half, else warn."""
-    labels = [(re.findall(r"([A-Za-z]+)[-_= ]?$", text) or [f"number {k + 1}"])[0] for k, text in enumerate(parts[::2])]
+def _refuse(first: Path, parts: list[str], columns: list[tuple[int, ...]], source: str) -> None:
+    """Raise `DataError` if the numbers in names fill more than half of a grid; warn if not: clock times do not."""
+    labels = [(re.findall(r"([A-Za-z]+)[-_= ]?$", part) or ["number"])[0] for part in parts[::2]]
     sizes = {k: len(set(column)) for k, column in enumerate(columns) if len(set(column)) > 1}
     ranges = ", ".join(f"{labels[k]} {min(columns[k])} to {max(columns[k])}" for k in sizes)
-    text = f"{source}: no one number counts the slices in the names of its {n} files ({ranges or 'equal numbers'})"
-    if 2 * n <= math.prod(sizes.values()):
-        warnings.warn(f"{text}; they are in the order of the first of them", stacklevel=3)
+    text = f"{source}: no one number counts the slices in the names of its {len(columns[0])} files ({ranges})"
+    if 2 * len(columns[0]) <= math.prod(sizes.values()):
+        warnings.warn(f"{text}; they are in the order of the first", stacklevel=3)
         return
-    counter = max(sizes, key=lambda k: (labels[k].lower() in _SLICE, sizes[k]), default=0)
+    counter = max(sizes, key=lambda k: (labels[k].lower() in ("z", "slice", "section"), sizes[k]), default=0)
     pattern = "".join("*" if k == 2 * counter + 1 else glob.escape(part) for k, part in enumerate(parts))
-    raise DataError(
-        f"{text}, so they look like several stacks; give one, as '{Path(glob.escape(str(first.parent))) / pattern}'"
-    )
+    way_out = Path(glob.escape(str(first.parent))) / pattern
+    raise DataError(f"{text}, so they look like several stacks; give one, as '{way_out}'")

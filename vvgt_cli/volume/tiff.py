@@ -26,7 +26,6 @@ from vvgt_cli.volume.components import contiguous, magnitude
 from vvgt_cli.volume.libraries import library_errors
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import Reader, register, volume_name
-from vvgt_cli.volume.stored import Stored
 from vvgt_cli.volume.tiff_decode import Pages
 from vvgt_cli.volume.tiff_facts import Facts, count_planes, imagej_facts, ome_facts, ome_root
 from vvgt_cli.volume.tiff_pages import check_pages
@@ -86,10 +85,12 @@ def read_tiff(path: Path, options: ReadOptions, slices: int = 1) -> Volume:
         mapped = _mappable(series)
         if options.stored and _paged(layout, index, several) and not mapped:
             _whole(series, path)
-            field: Any = _left(path, number, layout, index, series.dtype)
+            lead, inner = layout.shape[: layout.lead], layout.shape[layout.lead :]
+            turned = layout.axes.index("X") < layout.axes.index("Y")
+            field: Any = lazy_pages(path, number, lead, inner, index, np.dtype(series.dtype), turned)
         else:
             values = _values(file, series, layout, index, path)
-            field = _arranged_field(values, layout, index, several, path, options.stored and mapped)
+            field = _arranged(values, layout, index, several, path, options.stored and mapped)
     spacing, doubts = facts.voxel(options, max(slices, field.shape[0]), str(path))
     if doubts:
         warnings.warn(f"{path}: {'; '.join(doubts)} (--spacing X Y Z sets it)", stacklevel=2)
@@ -103,26 +104,20 @@ def _paged(layout: SeriesAxes, index: tuple[int | slice, ...], several: bool) ->
     return not several and ahead == ["Z"] and sorted(kept) == ["X", "Y", "Z"]
 
 
-def _left(path: Path, number: int, layout: SeriesAxes, index: tuple[int | slice, ...], dtype: np.dtype) -> Stored:
-    """The slices of a series whose pages stay in the file."""
-    turned = layout.axes.index("X") < layout.axes.index("Y")
-    return lazy_pages(
-        path, number, layout.shape[: layout.lead], layout.shape[layout.lead :], index, np.dtype(dtype), turned
-    )
-
-
-def _arranged_field(
-    values: np.ndarray, layout: SeriesAxes, index: tuple[int | slice, ...], several: bool, path: Path, left: bool
+def _arranged(
+    values: np.ndarray, layout: SeriesAxes, index: tuple[int | slice, ...], several: bool, path: Path, view: bool
 ) -> np.ndarray:
-    """Return (z, y, x) of what was read, the magnitude of several channels; ``left``: a view of the file may do."""
-    order = [*(_kept(layout, index, a) for a in "ZYX"), *([_kept(layout, index, c) for c in "CS"] if several else [])]
-    field = _arranged(values, order, layout, index)
+    """Return (z, y, x) of what was read, the magnitude of several channels; ``view``: one of the file will do."""
+    kept = [a for a, i in zip(layout.axes, index, strict=True) if isinstance(i, slice)]
+    field = values.transpose([kept.index(a) for a in "ZYXCS" if a in kept])
+    field = field[tuple(slice(None) if a in kept else None for a in "ZYX")]
     if several:
         check_memory(field[..., 0].size * 4, str(path))
-        field = magnitude(field)
-    elif not (left or field.flags.c_contiguous):
-        check_memory(field.nbytes, str(path))
-    return field if left and not several else contiguous(field)
+        return magnitude(field.reshape(*field.shape[:3], -1))
+    if view or field.flags.c_contiguous:
+        return field
+    check_memory(field.nbytes, str(path))
+    return contiguous(field)
 
 
 @contextmanager
@@ -168,12 +163,10 @@ def _facts(file: Any, root: Any, series: Any, number: int, path: Path) -> Facts:
         told = imagej_facts(file.imagej_metadata or {}, (x, y), int(first.tags.valueof(296, default=1)))
         facts = replace(told, channels=facts.channels)
         if facts.images > 1 and series.kind != "imagej" and root is None:
-            need = first.dataoffsets[0] + facts.images * first.nbytes if first.is_final else 0
-            short = need - path.stat().st_size
-            missing = f": {size_text(short)} are missing" if short > 0 else ""
-            raise DataError(
-                f"{path}: ImageJ's description tells of {facts.images} images that are not there{missing}; is it whole?"
-            )
+            short = first.dataoffsets[0] + facts.images * first.nbytes - path.stat().st_size if first.is_final else 0
+            missing = f" ({size_text(short)} are missing)" if short > 0 else ""
+            text = f"{path}: ImageJ's description tells of {facts.images} images that are not there{missing}"
+            raise DataError(f"{text}; is it whole?")
     return facts
 
 
@@ -272,34 +265,13 @@ def _channel(
     raise SeveralComponents(text, n, color and n in (3, 4), colors, channels, names)
 
 
-def _kept(layout: SeriesAxes, index: tuple[int | slice, ...], letter: str) -> int | None:
-    """Position of a letter's axis among those that an index keeps."""
-    kept = [k for k, i in enumerate(index) if isinstance(i, slice)]
-    return next((kept.index(k) for k in kept if layout.axes[k] == letter), None)
-
-
-def _arranged(
-    values: np.ndarray, order: list[int | None], layout: SeriesAxes, index: tuple[int | slice, ...]
-) -> np.ndarray:
-    """The values with axes z, y, x, and one of channels where there are several."""
-    there = [k for k in order if k is not None]
-    field = np.transpose(values, there)
-    for at, k in enumerate(order[:3]):
-        if k is None:
-            field = np.expand_dims(field, at)
-    return field if len(order) == 3 else field.reshape(*field.shape[:3], -1)
-
-
 def _values(file: Any, series: Any, layout: SeriesAxes, index: tuple[int | slice, ...], path: Path) -> np.ndarray:
     """The values at an index of a series: mapped where they lie together plainly, else decoded page by page."""
     if _mappable(series):
         offset, need = int(series.dataoffset), math.prod(layout.shape) * series.dtype.itemsize
         size = path.stat().st_size
         if offset + need > size:
-            raise DataError(
-                f"{path}: {size_text(size)}; its pixels need {size_text(offset + need)}, {offset + need - size} bytes are "
-                "missing; is it whole?"
-            )
+            raise DataError(f"{path}: {size_text(offset + need - size)} of its pixels are missing; is it whole?")
         dtype = series.dtype.newbyteorder(file.byteorder)
         return np.memmap(path, dtype, "r", offset, layout.shape)[index]
     _whole(series, path)

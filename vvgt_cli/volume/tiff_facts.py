@@ -58,12 +58,9 @@ class Facts:
             return options.spacing_or((1.0, 1.0, 1.0)), []
         x, y, z = self.spacing
         across = x or y or z or 1.0
-        assumed = [*self.assumed]
-        if x is None or y is None:
-            assumed.append(f"no width or no height of its pixels; taken as {across:g}")
-        if z is None and slices > 1:
-            assumed.append("no distance between its slices; taken as wide as its pixels")
-        return (x or across, y or across, z or across), assumed
+        width = [] if x and y else [f"no width or no height of its pixels; taken as {across:g}"]
+        depth = [] if z or slices == 1 else ["no distance between its slices; taken as wide as its pixels"]
+        return (x or across, y or across, z or across), [*self.assumed, *width, *depth]
 
 
 def ome_root(xml: str, path: Path) -> ElementTree.Element:
@@ -160,20 +157,22 @@ def imagej_facts(told: dict[str, Any], resolution: tuple[float | None, float | N
         resolution: pixels per unit along x and y (tags 282 and 283); None where the file has none.
         tag: ResolutionUnit (tag 296); 1 where the file has none.
     """
+    if "scales" in told:  # SCIFIO's lists, in parallel
+        scales = dict(zip(*(str(told.get(key, "")).split(",") for key in ("axes", "scales")), strict=False))
+        x, y, z = (_positive(scales.get(axis)) for axis in "XYZ")
+        resolution, tag, told = (x and 1 / x, y and 1 / y), 1, {"spacing": z, **told}
     channels, slices, frames = (int(told.get(key, 1)) for key in ("channels", "slices", "frames"))
-    images, assumed = channels * slices * frames, []
-    name = str(told.get("unit", "")).strip()
+    images, assumed, name = channels * slices * frames, [], str(told.get("unit", "")).strip()
     unit, per = _unit(name), _PER.get(tag, "")
-    length = _metres(unit)
     across = [1 / n if n else None for n in map(_positive, resolution)]
-    if per and (not unit or (across[0] == 1 / 72 and per != unit)):
+    if per and (unit in ("", "pixel") or (per == "inch" != unit and across[0] == 1 / 72)):
         across = [None, None]  # dots of a printer
-    elif per and length not in (None, _metres(per)):
-        scale = 1e4 if (per, length) == ("cm", MICROMETRE) else 1.0
-        across = [n and n * scale for n in across]
-        if scale == 1 or unit != "um":
-            taken = f"resolution per {per} by its tag, in {name} by ImageJ's description"
-            assumed.append(f"{taken}; taken per {name if scale == 1 else per}")
+    elif per and _metres(unit) not in (None, _metres(per)):
+        metric = per == "cm" and _metres(unit) == MICROMETRE
+        across = [n and n * (1e4 if metric else 1) for n in across]
+        if unit != "um" or not metric:
+            assumed.append(f"resolution per {per} by its tag, in {name} by ImageJ's description; "
+                           f"taken per {per if metric else name}")  # fmt: skip
     depth = told.get("spacing") or None
     if unit in ("", "pixel") and depth is None and not set(across) - {None, 1.0}:
         return Facts(images=images)
@@ -182,7 +181,11 @@ def imagej_facts(told: dict[str, Any], resolution: tuple[float | None, float | N
     if depth is None and max(images, int(told.get("images", 1))) > channels * frames:
         depth = 1.0
         assumed.append("no distance between its slices; taken as 1, as ImageJ takes it")
-    sizes = {"x": across[0] or 1.0, "y": across[1] or 1.0, "spacing": depth if isinstance(depth, str) else abs(depth or 0)}
+    sizes = {
+        "x": across[0] or 1,
+        "y": across[1] or 1,
+        "spacing": abs(depth) if isinstance(depth, float | int) else depth,
+    }
     facts = _micrometres(sizes, [name, str(told.get("yunit", name)), str(told.get("zunit", name))])
     return replace(facts, images=images, assumed=tuple(assumed))
 
