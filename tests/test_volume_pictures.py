@@ -192,6 +192,7 @@ def ordered(names: list[str]) -> tuple[list[str], int, list[str]]:
         ([f"z_{k / 10:.1f}mm.tif" for k in range(12)], 1),
         ([f"z_{k / 4:.2f}.tif" for k in range(9)], 1),
         (["A.png", "B.png", "C.png"], 1),
+        (["a1.png", "a2.png", "b.png", "c.png"], 1),
         (["A.png", "a.png"], 1),
         (["a.png"], 1),
     ],
