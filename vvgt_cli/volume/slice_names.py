@@ -48,7 +48,7 @@ def in_order(files: list[Path], source: str) -> tuple[list[Path], int]:
             return [path for _, path in sorted(zip(places, series, strict=True))], 1
     counting = [column for column in columns if len(set(column)) == len(series)]
     if not counting:
-        _refuse(main[0], parts, columns, source)
+        _refuse(main[0], series, columns, source)
         return sorted(series, key=by_number), 1
     numbers = min(counting, key=lambda column: (len(_steps(column)) > 1, max(column) - min(column)))
     step = int(min(_steps(numbers)))
@@ -67,16 +67,19 @@ def _steps(numbers: Sequence[float]) -> set[float]:
     return {round(b - a, 9) for a, b in pairwise(sorted(numbers))}
 
 
-def _refuse(first: Path, parts: list[str], columns: list[tuple[int, ...]], source: str) -> None:
+def _refuse(first: Path, series: list[Path], columns: list[tuple[int, ...]], source: str) -> None:
     """Raise `DataError` if the numbers in names fill more than half of a grid; warn if not: clock times do not."""
+    parts = re.split(r"(\d+)", first.name)
     labels = [(re.findall(r"([A-Za-z]+)[-_= ]?$", part) or ["number"])[0] for part in parts[::2]]
     sizes = {k: len(set(column)) for k, column in enumerate(columns) if len(set(column)) > 1}
     ranges = ", ".join(f"{labels[k]} {min(columns[k])} to {max(columns[k])}" for k in sizes)
-    text = f"{source}: no one number counts the slices in the names of its {len(columns[0])} files ({ranges})"
-    if 2 * len(columns[0]) <= math.prod(sizes.values()):
+    text = f"{source}: no one number counts the slices in the names of its {len(series)} files ({ranges})"
+    if 2 * len(series) <= math.prod(sizes.values()):
         warnings.warn(f"{text}; they are in the order of the first", stacklevel=3)
         return
-    counter = max(sizes, key=lambda k: (labels[k].lower() in ("z", "slice", "section"), sizes[k]), default=0)
-    pattern = "".join("*" if k == 2 * counter + 1 else glob.escape(part) for k, part in enumerate(parts))
-    way_out = Path(glob.escape(str(first.parent))) / pattern
+    at = 1 + 2 * max(sizes, key=lambda k: (labels[k].lower() in ("z", "slice", "section"), sizes[k]), default=0)
+    before, after = (glob.escape("".join(some)) for some in (parts[:at], parts[at + 1 :]))
+    wide, narrow = (f"{before}{digits}{after}" for digits in ("*", "[0-9]" * len(parts[at])))
+    matched = {tuple(re.split(r"\d+", path.name)) for path in series if path.match(wide)}
+    way_out = Path(glob.escape(str(first.parent))) / (wide if len(matched) == 1 else narrow)
     raise DataError(f"{text}, so they look like several stacks; give one, as '{way_out}'")
