@@ -167,7 +167,10 @@ def test_previews_do_not_make_a_folder_one_of_slices(tmp_path: Path) -> None:
     Image.fromarray(GREY[0]).save(tmp_path / "one" / "a.png")
     with pytest.raises(DataError, match=r"found 1 picture \(a.png\): give one of the files"):
         read_volume(str(tmp_path / "one"))
-    assert read_volume(str(tmp_path / "one" / "a.png")).dims == (7, 5, 1)
+    for name in ("a.png", "A", "a.dat"):
+        (tmp_path / "one" / "a.png").rename(tmp_path / "one" / name)
+        assert read_volume(str(tmp_path / "one" / name)).dims == (7, 5, 1)
+        (tmp_path / "one" / name).rename(tmp_path / "one" / "a.png")
 
 
 def ordered(names: list[str]) -> tuple[list[str], int, list[str]]:
@@ -284,6 +287,7 @@ def skyscan(step: int = 1, width: int = 7, size: str = "1.65905") -> str:
         ({"x.log": skyscan()}, "x{:03d}0", (1.65905, 1.65905, 16.5905), "um"),
         ({"x.xtekct": NIKON}, "x_{:04d}", (0.025, 0.025, 0.03), "mm"),
         ({"x_01.xtekVolume": NIKON}, "x_{:04d}", (0.025, 0.025, 0.03), "mm"),
+        ({"x.xtekct": NIKON.replace("mm", "um")}, "x_{:04d}", (0.025, 0.025, 0.03), "um"),
         ({"notes.log": "Pixel Size = large\n[\n="}, "x{:04d}", (1.0,) * 3, ""),
     ],
 )

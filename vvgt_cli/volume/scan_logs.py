@@ -34,6 +34,7 @@ def log_spacing(first: Path, size: tuple[int, int], step: int, given: Spacing | 
     log = max(own or logs, key=lambda log: len(Path(log.name).stem))
     along_x = next(key for key in _SIZES if key in log)
     along_y, along_z, pixels, axes, unit = _SIZES[along_x]
+    unit = log.get("xtekct/units") or unit
     if given is not None:
         return given, unit
     x, y, z = (log.floats(key, log.need(key), 1)[0] for key in (along_x, along_y or along_x, along_z or along_x))

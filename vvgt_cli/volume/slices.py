@@ -42,7 +42,8 @@ def slices_of(folder: Path) -> list[Path]:
 
 def _of_one_format(files: list[Path]) -> tuple[list[Path], list[Path]]:
     """Return the slices of the format that most of some files have (TIFF if equal), and the other slices, sorted."""
-    files = sorted((path for path in files if path.name[0] != "." and path.is_file()), key=by_number)
+    ours = (p for p in files if p.suffix.lower() in SUFFIXES and p.name[0] != "." and p.is_file())
+    files = sorted(ours, key=by_number)
     formats = [[path for path in files if path.suffix.lower() in ends] for ends in (TIFF, *KINDS.values())]
     slices = max(formats, key=len)
     return slices, [p for kind in formats if kind is not slices for p in kind]
@@ -56,7 +57,7 @@ def read_slices(files: list[Path], options: ReadOptions, source: str, name: str)
             `MOST`.
         UsageError: colour slices and no component chosen.
     """
-    files, others = _of_one_format(files)
+    files, others = _of_one_format(files) if len(files) > 1 else (files, [])
     if len(files) > MOST:
         raise DataError(f"{source}: {len(files)} files; expected at most {MOST} slices")
     if not files:

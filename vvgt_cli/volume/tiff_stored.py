@@ -62,7 +62,7 @@ def lazy_pages(
 
 
 def lazy_files(files: list[Path], plane: np.ndarray, of: Callable[[Path], np.ndarray], source: str) -> Stored:
-    """Slice z is file z, read by ``of`` as (1, y, x) of the size and type of ``plane``, the first of them."""
+    """Return slices that stay in their files; ``of`` reads one as (1, y, x), all as ``plane``, the first of them."""
 
     def read(slices: Slices) -> np.ndarray:
         z, y, x = slices
