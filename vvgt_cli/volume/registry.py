@@ -21,6 +21,7 @@ from vvgt_cli.volume.space import in_space
 from vvgt_cli.volume.types import Volume
 
 LOOKED_AT = 2000  # files of a folder
+PREVIEWS = 10  # pictures for each volume beside them, up to which they do not make a folder one of slices
 
 
 def read_volume(source: str, options: ReadOptions | None = None) -> Volume:
@@ -151,8 +152,10 @@ def _folder(path: Path, source: str) -> Reader:
     lying = _volumes_in(path)
     for reader in READERS:
         if reader.holds is not None and reader.holds(path):
-            own = len(lying.get(reader.name.removesuffix(" slices"), []))
-            if reader.by_whole or 2 * own >= sum(map(len, lying.values())):
+            mine = (reader.name, *reader.within)
+            own = sum(len(lying.get(kind, [])) / (PREVIEWS if kind == "picture" else 1) for kind in mine)
+            others = sum(len(names) for kind, names in lying.items() if kind not in (*mine, "picture"))
+            if reader.by_whole or own >= others:
                 return reader
     if lying:
         listing = "; ".join(f"{len(names)} {kind} ({', '.join(names[:3])}{', ...' if len(names) > 3 else ''})"
