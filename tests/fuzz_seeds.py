@@ -153,7 +153,7 @@ def _tiff_images() -> list[Seed]:
     values = np.random.default_rng(9).integers(0, 200, (2, 2, 3, 4, 5)).astype(np.uint16)
     ome = {"axes": "TCZYX", "PhysicalSizeX": 0.2, "PhysicalSizeZ": 1.5, "Channel": {"Name": ["a", "b"]}}
     imagej = {"axes": "TZCYX", "spacing": 2.5, "unit": "um"}
-    chosen = volume_reader(component=1, time=1)
+    chosen, stored = volume_reader(component=1, time=1), volume_reader(component=1, time=1, stored=True)
     seeds = []
     for name, axes, read, how in (
         ("d.ome.tif", (0, 1, 2, 3, 4), volume_reader(component="b", time=1), {"ome": True, "metadata": ome}),
@@ -161,6 +161,14 @@ def _tiff_images() -> list[Seed]:
         ("f.tif", (0, 2, 1, 3, 4), chosen, {"imagej": True, "metadata": imagej, "resolution": (5, 4)}),
         ("g.tif", (0, 2, 1, 3, 4), chosen, {"imagej": True, "metadata": imagej, "compression": "lzma"}),
         ("h.tif", (0, 1, 2, 3, 4), chosen, {"metadata": {"axes": "TCZYX"}, "byteorder": ">"}),
+        ("i.tif", (0, 2, 1, 3, 4), chosen, {"imagej": True, "metadata": imagej, "truncate": True, "byteorder": ">"}),
+        (
+            "j.tif",
+            (0, 2, 1, 3, 4),
+            stored,
+            {"imagej": True, "metadata": imagej, "truncate": True, "resolution": (72, 72)},
+        ),
+        ("k.tif", (0, 1, 2, 3, 4), chosen, {"metadata": {"axes": "TCZYX"}, "truncate": True}),
     ):
         out = io.BytesIO()
         tifffile.imwrite(out, values.transpose(axes), **{"byteorder": "<", **how})  # type: ignore[arg-type]
@@ -353,6 +361,7 @@ def manifest() -> list[Seed]:
 
 def readers() -> dict[str, list[Seed]]:
     """Seeds by reader."""
+    from fuzz_seeds_hospital import hospital
     from fuzz_seeds_scans import scans
 
     return {
@@ -361,6 +370,7 @@ def readers() -> dict[str, list[Seed]]:
         "MetaImage": metaimage(),
         "Inviwo": inviwo(),
         **scans(),
+        **hospital(),
         "SLC": slc(),
         "TIFF": tiff(),
         "VTK legacy": vtk_legacy(),

@@ -6,6 +6,7 @@ import bz2
 import gzip
 import io
 import tempfile
+import warnings
 import zlib
 from pathlib import Path
 from typing import Any
@@ -158,6 +159,38 @@ def zipped_zarr() -> list[Seed]:
         return [Seed(f"{k}.zarr.zip", Path(name).read_bytes(), read) for k, name in enumerate(names)]
 
 
+def pictures() -> list[Seed]:
+    """PNG, BMP and JPEG, alone and as a slice between two others, and a log beside slices."""
+    from PIL import Image
+    from test_volume_pictures import NIKON, skyscan
+
+    def content(image: Any, kind: str) -> bytes:
+        out = io.BytesIO()
+        image.save(out, kind)
+        return out.getvalue()
+
+    def folder(path: Path) -> None:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            READ(path.parent)
+            volume_reader(stored=True)(path.parent)
+
+    planes = VALUES.astype(np.uint8)
+    grey = [content(Image.fromarray(plane), "png") for plane in planes]
+    palette = Image.fromarray(planes[1]).convert("P")
+    beside = {"x1.png": grey[0], "x3.png": grey[2]}
+    return [
+        Seed("a.png", grey[0], READ),
+        Seed("b.png", content(Image.fromarray(VALUES[0].astype(np.uint16)), "png"), READ),
+        Seed("c.png", content(Image.fromarray(np.dstack([*planes])), "png"), volume_reader(component=1)),
+        Seed("d.bmp", content(palette, "bmp"), READ),
+        Seed("e.jpg", content(Image.fromarray(planes[1]), "jpeg"), READ),
+        Seed("x2.png", grey[1], folder, beside),
+        Seed("x.log", skyscan(width=5).replace("Height (pixels)=5", "Height (pixels)=4").encode(), folder, beside),
+        Seed("x.xtekct", NIKON.replace("X=7", "X=5").replace("Y=5", "Y=4").encode(), folder, beside),
+    ]
+
+
 def scans() -> dict[str, list[Seed]]:
     """Seeds by reader."""
     return {
@@ -171,4 +204,5 @@ def scans() -> dict[str, list[Seed]]:
         **pairs(),
         "zipped Zarr": zipped_zarr(),
         "MINC": minc(),
+        "pictures": pictures(),
     }

@@ -163,7 +163,7 @@ def test_calls_that_are_wrong(vvgt, series: Path) -> None:
         ((frames, "-o", series / "{:02d}.ply", "--shard", "3/2"), "--shard 3/2"),
         ((frames, "-o", series / "a.ply", "--shard", "1/2"), "is of a series"),
         ((frames, "-o", series / "{}.ply", "--shard", "1/2", "--overwrite"), "would remove each other's files"),
-        ((frames, "-o", series / "a.ply"), "run_8.npy is no TIFF slice.*out_{:04d}.ply"),
+        ((frames, "-o", series / "a.ply"), "run_8.npy is no slice.*out_{:04d}.ply"),
         ((frames, "-o", series / "{:02d}.ply", "--tf", tf, "--tf-range", "50,60"), "shows nothing in any of 4 frames"),
     ):
         with pytest.MonkeyPatch.context() as patch:

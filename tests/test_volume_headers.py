@@ -137,7 +137,7 @@ def test_nrrd_components(tmp_path: Path, fields: dict, axis: int) -> None:
         ({"endian": "middle"}, "expected little or big"),
         ({"encoding": "hex"}, "encoding 'hex'"),
         ({"byte skip": -2}, "byte skip -2"),
-        ({"space directions": "(1,0,0) (0,1,0)"}, "expected 3 axes"),
+        ({"space directions": "(1,0,0) (0,1,0)"}, "expected 3 vectors"),
         ({"data file": "/etc/passwd"}, "header's own folder"),
         ({"data file": "../v.raw"}, "header's own folder"),
         ({"data file": "none.raw"}, "does not exist beside it"),

@@ -151,7 +151,7 @@ def test_files_that_vtk_opens_itself_need_their_own_case(tmp_path: Path) -> None
         ("v.cas.gz", b"\x1f\x8b", ("simulation", "ParaView")),
         ("v.oib", b"\xd0\xcf\x11\xe0", ("microscope", "bfconvert 'v.oib' 'v.ome.tiff'")),
         ("2dseq", b"\0\1", ("Bruker", "brkraw")),
-        ("v.zip", b"PK\3\4", ("archive", "unpack")),
+        ("v.7z", b"7z\xbc\xaf", ("archive", "unpack")),
         ("v.vol", b"\0\1", ("raw values", "--dims X Y Z --dtype TYPE")),
     ],
 )

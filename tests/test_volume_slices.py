@@ -145,7 +145,7 @@ def test_dicom_compressed(tmp_path: Path) -> None:
     ("changes", "message"),
     [
         ({"ImagePositionPatient": lambda k: [0, 0, (0, 1, 3)[k]]}, "1 to 2 mm apart .*is a slice missing"),
-        ({"ImagePositionPatient": lambda k: [0, 0, (0, 1, 1)[k]]}, "several in one place"),
+        ({"ImagePositionPatient": lambda k: [0, 0, (0, 1, 1)[k]]}, "3 images in 2 places, 1 to 2 in each"),
         ({"ImagePositionPatient": lambda k: [k % 2, 0, k]}, "shift sideways unevenly"),
         ({"ImagePositionPatient": None}, "no ImagePositionPatient"),
         ({"ImageOrientationPatient": [1, 0, 0, 1, 0, 0]}, "right angles"),
@@ -199,7 +199,7 @@ def test_tiff_slices_refusals(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="leave out --dims"):
         read_volume(str(tmp_path / "stack" / "*.tif"), ReadOptions(dims=(1, 1, 1)))
     (tmp_path / "stack" / "notes.txt").write_text("x")
-    with pytest.raises(DataError, match=r"notes.txt is no TIFF slice"):
+    with pytest.raises(DataError, match=r"notes.txt is no slice"):
         read_volume(str(tmp_path / "stack" / "*"))
     spec = oiio.ImageSpec(2, 2, 1, "float")
     output = oiio.ImageOutput.create(str(tmp_path / "stack" / "slice_9.tif"))

@@ -44,6 +44,7 @@ class SeveralSteps(UsageError):
     Attributes:
         steps: how many there are.
         times: of each, in ``unit`` (which may be ""), None where the file does not say.
+        names: of each, where the file has any.
     """
 
     def __init__(
@@ -53,12 +54,13 @@ class SeveralSteps(UsageError):
         what: str = "time steps",
         times: Sequence[float] | None = None,
         unit: str = "",
+        names: Sequence[str] = (),
     ) -> None:
         super().__init__(
             f"{source}: {steps} {what}; expected one: try --time N (0 to {steps - 1}), or a number in the output of "
             "vvgt convert, as -o 'p_{:02d}.ply', which makes a series of them, or -o p.html, a page of them all"
         )
-        self.steps, self.times, self.unit = steps, times, unit
+        self.steps, self.times, self.unit, self.names = steps, times, unit, list(names)
 
 
 class SeveralArrays(UsageError):

@@ -64,9 +64,9 @@ def command(
 ) -> None:  # fmt: skip
     """Convert VOLUME to a standard 3D Gaussian Splatting .ply.
 
-    VOLUME is a file (NRRD, NIfTI, MetaImage, DICOM, TIFF, VTK, raw, ...), "example:NAME" for one of the volumes
-    that come with the program, or "-" for raw values on standard input. Without --tf, a transfer function is
-    made from the data.
+    VOLUME is a file (NRRD, NIfTI, MetaImage, DICOM, TIFF, VTK, raw, ...), a folder of slices (DICOM, TIFF, PNG, BMP,
+    JPEG), "example:NAME" for one of the volumes that come with the program, or "-" for raw values on standard input.
+    Without --tf, a transfer function is made from the data.
 
     The result is scored on test views that it was not fitted to, and the error is printed. --target-psnr,
     --time-budget and --max-size decide which stages run. Ctrl-C ends gradient descent early and writes the result.

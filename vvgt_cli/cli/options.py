@@ -70,7 +70,9 @@ _READ = dict(
         help="Vector component or channel to read, by number (from 0) or name; 'color' reads the components as RGB or "
         "RGBA, 'all' shows every channel in its own colour.",
     ),
-    time=click.option("--time", type=click.IntRange(0), metavar="N", help="Time step to read, counted from 0."),
+    time=click.option(
+        "--time", type=click.IntRange(0), metavar="N", help="Time step, or volume of a DICOM series, to read, from 0."
+    ),
     crop=click.option(
         "--crop", metavar="X0:X1,Y0:Y1,Z0:Z1",
         help="Range of voxels to keep, as Python slices: counted from 0, end excluded, either bound optional.",

@@ -149,7 +149,9 @@ def _volume(file: str, read: ReadOptions) -> dict[str, Any]:
     except SeveralSteps as error:
         facts = _one(file, replace(read, time=0))
         head = {"kind": facts.pop("kind"), "name": facts.pop("name")}
-        return {**head, "time_steps": error.steps, "shown": "time step 0 (--time N chooses)", **facts}
+        rows = [{"step": k, "name": name, "option": f"--time {k}"} for k, name in enumerate(error.names[:LISTED])]
+        steps = {"time_steps": error.steps, "shown": "time step 0 (--time N chooses)"}
+        return {**head, **steps, **({"steps": rows} if rows else {}), **facts}
     except SeveralArrays as error:
         outer = file.rpartition(":/")[0] if not os.path.exists(file) else file
         pairs = list(zip(error.choices, error.names, strict=True))
@@ -254,6 +256,7 @@ def _one(file: str, read: ReadOptions) -> dict[str, Any]:
         "origin": volume.origin,
         "direction": volume.direction,
         "space": volume.space or "none",
+        "length_unit": "mm" if volume.space else volume.unit or "none",
         **axis_facts(volume.affine, volume.space),
         "extent": volume.extent,
         "scaling": [volume.slope, volume.intercept],

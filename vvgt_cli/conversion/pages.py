@@ -20,8 +20,7 @@ from vvgt_cli.files import temporary_folder
 from vvgt_cli.gaussians.outputs import claimed
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
-from vvgt_cli.volume.slices import matching
-from vvgt_cli.volume.tiff import SUFFIXES
+from vvgt_cli.volume.slices import SUFFIXES, matching
 
 MOST = 3_000_000  # Gaussians of all frames of a live page: 90 MB of it
 
@@ -90,7 +89,7 @@ def _page(request: ConvertRequest, make: Callable[[ConvertRequest], dict[str, An
 
 
 def is_glob_of_volumes(path: str) -> bool:
-    """Whether a path is a glob of files that are volumes of their own, and not TIFF slices of one."""
+    """Whether a path is a glob of files that are volumes of their own, and not slices of one."""
     if os.path.exists(path) or not set(path) & set("*?["):
         return False
     files = matching(path)

@@ -15,25 +15,31 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError, SeveralArrays, UsageError
+from vvgt_cli.volume.dicom_files import Source
 from vvgt_cli.volume.dicom_seg import is_segmentation
+from vvgt_cli.volume.headers import printable
 
 _FEW = 2  # slices: fewer than make a stack, beside one that has more
 _LISTED = 12
 _SPACE = ("sagittal", "coronal", "axial")
 
-Files = list[tuple[Path, Any]]
+_PLACES = ("ImagePositionPatient", "PerFrameFunctionalGroupsSequence", "DetectorInformationSequence")
+
+Files = list[tuple[Source, Any]]
 
 
-def choose_series(headers: Sequence[tuple[Path, Any]], wanted: str | None, path: Path) -> tuple[str, Files, int | None]:
-    """The series asked for, or the only one.
+def choose_series(headers: Sequence[tuple[Source, Any]], wanted: str | None, path: Path) -> tuple[str, Files, str]:
+    """Choose the series asked for, or the only one.
 
     Args:
         headers: files and their headers.
-        wanted: number, UID or description of a series; ``/K`` after it is the number of a stack in it, from 1.
+        wanted: number, UID or description of a series; after it, or alone where there is one series, ``/K``, the number
+            of a stack in it from 1, and the name of one of its volumes.
         path: for messages.
 
     Returns:
-        What to add to the volume's name, the files of the series, and the stack's number or None.
+        What to add to the volume's name, the files of the series, and the part of ``wanted`` that names a stack or a
+        volume, "" where there is none.
 
     Raises:
         DataError: no images.
@@ -44,24 +50,21 @@ def choose_series(headers: Sequence[tuple[Path, Any]], wanted: str | None, path:
         if "Rows" in header and "Columns" in header:
             found.setdefault(str(header.get("SeriesInstanceUID", "")), []).append((file, header))
     if not found:
-        kinds = Counter(str(header.get("Modality", "?")) for _, header in headers)
+        kinds = Counter(printable(str(header.get("Modality", "?")))[:16] for _, header in headers)
         listing = ", ".join(f"{n} {kind}" for kind, n in kinds.items()) or "no DICOM files"
         structures = kinds["RTSTRUCT"] == kinds.total() > 0
         hint = "; of contours (RTSTRUCT) nothing is filled: export them as a label map or SEG" if structures else ""
         raise DataError(f"{path}: no DICOM images ({listing}); expected files with rows and columns of pixels{hint}")
-    stack = None
     if wanted is None:
-        title, chosen = "", _only(found, path)
-    else:
-        wanted = wanted.strip("/")
-        chosen = _named(found, wanted)
-        head, _, number = wanted.rpartition("/")
-        if not chosen and number.isdecimal() and head:
-            chosen, stack = _named(found, head), int(number)
-        if not chosen:
-            raise UsageError(f"{path}: no one series {wanted!r}; it has {_listed(found)}; choose with --series SERIES")
-        title = f":{wanted}"
-    return title, chosen, stack
+        return "", _only(found, path), ""
+    wanted = wanted.strip("/")
+    ends = [len(wanted), *(k for k in range(len(wanted) - 1, 0, -1) if wanted[k] == "/")]
+    for end in ends:
+        if chosen := _named(found, wanted[:end]):
+            return f":{wanted}", chosen, wanted[end:].strip("/")
+    if len(found) == 1 and not wanted.partition("/")[0].isdecimal():
+        return f":{wanted}", next(iter(found.values())), wanted
+    raise UsageError(f"{path}: no one series {wanted!r}; it has {_listed(found)}; choose with --series SERIES")
 
 
 def _only(found: dict[str, Files], path: Path) -> Files:
@@ -99,7 +102,7 @@ def _listed(found: dict[str, Files]) -> str:
         header = files[0][1]
         slices = sum(int(h.get("NumberOfFrames", 1) or 1) for _, h in files)
         parts.append(
-            f"{header.get('SeriesNumber', '?')} {str(header.get('SeriesDescription', '')).strip()!r} "
+            f"{header.get('SeriesNumber', '?')} {str(header.get('SeriesDescription', '')).strip()[:64]!r} "
             f"({header.get('Modality', '?')}, {slices} slice{'s' * (slices != 1)}, {uid})"
         )
     return "; ".join(parts) + ("; ..." if len(found) > _LISTED else "")
@@ -110,7 +113,7 @@ def _localiser(header: Any) -> bool:
 
 
 def _unplaced(header: Any) -> bool:
-    return not any(key in header for key in ("ImagePositionPatient", "PerFrameFunctionalGroupsSequence"))
+    return not any(key in header for key in _PLACES)
 
 
 def one_stack(

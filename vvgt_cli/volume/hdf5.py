@@ -1,7 +1,7 @@
 """HDF5 (``.h5``, ``.hdf5``): one dataset, ``FILE:/path/to/dataset``; a contiguous one is memory-mapped. Read by h5py.
 
-Axes come from dimension scales where there are any (https://docs.hdfgroup.org, "HDF5 Dimension Scales"), and CF
-attributes of scaling and missing values are applied: a NetCDF-4 file is such a file.
+Axes come from dimension scales where there are any (https://docs.hdfgroup.org, "HDF5 Dimension Scales"), else from the
+conventions of `hdf5_axes`; CF attributes of scaling and missing values are applied: a NetCDF-4 file is such a file.
 """
 
 from __future__ import annotations
@@ -14,9 +14,19 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, SeveralArrays, UsageError
 from vvgt_cli.volume.blocks import data_file, load_block, size_text
+from vvgt_cli.volume.hdf5_axes import conventional_axes, text_of
 from vvgt_cli.volume.headers import printable
 from vvgt_cli.volume.imaris import is_imaris, read_imaris
-from vvgt_cli.volume.labelled import AXIS_ATTRIBUTES, CF_ATTRIBUTES, Axis, axis, labelled_volume
+from vvgt_cli.volume.labelled import (
+    AXIS_ATTRIBUTES,
+    CF_ATTRIBUTES,
+    DESCRIBES,
+    GEOMETRY,
+    Axis,
+    axis,
+    described_by,
+    labelled_volume,
+)
 from vvgt_cli.volume.libraries import library_errors, need
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import Reader, register, volume_name
@@ -48,11 +58,15 @@ def read_hdf5(path: Path, options: ReadOptions) -> Volume:
         mapped = _mapped(dataset, path)
         stored = mapped if mapped is not None else lambda index: dataset[index]
         name = f"{volume_name(path)}:{dataset.name.strip('/')}"
-        attributes = {key: dataset.attrs[key] for key in CF_ATTRIBUTES if key in dataset.attrs}
+        attributes = {key: dataset.attrs[key] for key in (*CF_ATTRIBUTES, *GEOMETRY) if key in dataset.attrs}
+        axes = _axes(dataset)
+        if not any(a.name or a.centres is not None for a in axes):
+            axes, more = conventional_axes(file, dataset, source) or (axes, {})
+            attributes |= more
         chunks = dataset.chunks or dataset.shape
         if mapped is None and options.stored:
             stored = partial(_part, path, dataset.name)
-        return labelled_volume(stored, dataset.dtype, _axes(dataset), attributes, options, source, name, chunks)
+        return labelled_volume(stored, dataset.dtype, axes, attributes, options, source, name, chunks)
 
 
 def checked_dataset(h5py: Any, file: Any, path: Path, name: str) -> Any:
@@ -93,20 +107,25 @@ def _choose(h5py: Any, file: Any, wanted: str | None, path: Path) -> Any:
 
 
 def _datasets(h5py: Any, group: Any) -> list[Any]:
-    """Datasets of numbers with 2 to 4 axes, those with three or more alone if there are any."""
+    """Return the datasets of numbers with 2 to 5 axes; only those with three or more if there are any.
+
+    Datasets that describe others, such as bounds of cells, are skipped.
+    """
     found: list[Any] = []
+    described: set[str] = set()
     seen = 0
 
     def visit(name: str, item: Any) -> bool | None:
         nonlocal seen
         seen += 1
+        described.update(described_by({key: text_of(item.attrs[key]) for key in DESCRIBES if key in item.attrs}))
         if isinstance(item, h5py.Dataset) and item.dtype.kind in "iufb" and item.shape and 2 <= len(item.shape) <= 5:
             found.append(item)
         return True if seen >= MOST_VISITED else None
 
     group.visititems(visit)
-    deep = [d for d in found if sum(n > 1 for n in d.shape) >= 3]
-    return deep or found
+    data = [d for d in found if d.name.rpartition("/")[2] not in described] or found
+    return [d for d in data if sum(n > 1 for n in d.shape) >= 3] or data
 
 
 def _check_links(h5py: Any, file: Any, wanted: str, path: Path) -> None:
@@ -163,15 +182,11 @@ def _axes(dataset: Any) -> list[Axis]:
             axes.append(axis(dimension.label or (names[0] if names else ""), size))
             continue
         scale = scales[0]
-        attributes = {key: _text(scale.attrs[key]) for key in AXIS_ATTRIBUTES if key in scale.attrs}
-        bare = _text(scale.attrs.get("NAME", "")).startswith("This is a netCDF dimension")
+        attributes = {key: text_of(scale.attrs[key]) for key in AXIS_ATTRIBUTES if key in scale.attrs}
+        bare = text_of(scale.attrs.get("NAME", "")).startswith("This is a netCDF dimension")
         centres = None if bare else np.asarray(scale[()], np.float64)
         axes.append(axis(scale.name.rpartition("/")[2], size, centres, attributes))
     return axes
-
-
-def _text(value: Any) -> str:
-    return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
 
 
 register(

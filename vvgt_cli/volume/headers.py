@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Sequence
 
 from vvgt_cli.errors import DataError
@@ -30,19 +29,25 @@ class Fields(dict[str, str]):
                 return self[key]
         raise DataError(f"{self.name}: its header has no field {keys[0]!r}; check that the file is whole")
 
-    def floats(self, key: str, text: str, n: int | None = None) -> list[float]:
-        """Numbers of a field, separated by spaces or commas; ``n`` of them if given.
+    def floats(self, key: str, text: str, n: int) -> list[float]:
+        """Return the first ``n`` numbers of a field.
+
+        White space separates them, a comma before it may; commas alone separate exactly ``n``. Any other comma is a
+        decimal comma, which must not pass for two numbers.
 
         Raises:
-            DataError: not numbers, not finite, or another count.
+            DataError: not numbers, not finite, too few, or decimal commas.
         """
+        words = text.split()
+        alone = len(words) == 1
         try:
-            values = [float(t) for t in re.split(r"[\s,]+", text.strip()) if t]
+            values = [float(w) for w in (text.split(",") if alone else [word.removesuffix(",") for word in words])]
         except ValueError:
             values = []
-        if not values or (n is not None and len(values) < n) or not all(math.isfinite(v) for v in values):
-            raise DataError(f"{self.name}: {key} is {text.strip()!r}; expected {n or 'some'} finite numbers")
-        return values if n is None else values[:n]
+        if len(values) < n or (alone and len(values) != n) or not all(math.isfinite(v) for v in values):
+            comma = " with decimal points" if "," in text else ""
+            raise DataError(f"{self.name}: {key} is {text.strip()!r}; expected {n} finite numbers{comma}")
+        return values[:n]
 
     def sizes(self, key: str, text: str) -> list[int]:
         """Positive whole numbers of a field.

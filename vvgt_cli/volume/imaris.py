@@ -14,9 +14,9 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.channels import Box, Color, Picture, picture_volume
-from vvgt_cli.volume.labelled import METRES
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
+from vvgt_cli.volume.space import metres
 from vvgt_cli.volume.types import Volume
 
 MICROMETRE = 1e-6
@@ -118,20 +118,13 @@ def _text(value: Any) -> str:
     return "".join(map(str, found.ravel()[:4096])).strip()
 
 
-def _numbers(text: str) -> list[float]:
-    try:
-        return [float(word) for word in text.split()]
-    except ValueError:
-        return []
-
-
 def _placed(image: Any, shape: tuple[int, int, int]) -> tuple[Any, Any]:
     """Spacing and origin (x, y, z) in micrometres by the extent of the image."""
-    unit = METRES.get(_text(image.get("Unit", "um")) or "um", MICROMETRE) / MICROMETRE
+    unit = (metres(_text(image.get("Unit", "um"))) or MICROMETRE) / MICROMETRE
     spacing: list[float | None] = []
     origin = []
     for axis, size in enumerate(reversed(shape)):
-        ends = [_numbers(_text(image.get(f"Ext{end}{axis}", ""))) for end in ("Min", "Max")]
+        ends = [[float(word) for word in _text(image.get(f"Ext{end}{axis}", "")).split()] for end in ("Min", "Max")]
         width = (ends[1][0] - ends[0][0]) * unit / size if all(len(e) == 1 for e in ends) else 0.0
         known = np.isfinite(width) and width > 0
         spacing.append(width if known else None)
@@ -144,7 +137,7 @@ def _channel(file: Any, number: int) -> tuple[str, Color]:
     group = file.get(f"DataSetInfo/Channel {number}")
     if group is None:
         return "", None
-    rgb = _numbers(_text(group.attrs.get("Color", "")))
+    rgb = [float(word) for word in _text(group.attrs.get("Color", "")).split()]
     good = len(rgb) == 3 and all(0 <= v <= 1 for v in rgb) and any(rgb)
     name = _text(group.attrs.get("Name", ""))[:80]
     return "" if name == "(name not specified)" else name, (rgb[0], rgb[1], rgb[2]) if good else None

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import re
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -18,27 +19,31 @@ from vvgt_cli.volume.blocks import IN_BLOCKS, check_memory, count
 from vvgt_cli.volume.components import contiguous, select_component
 from vvgt_cli.volume.headers import printable
 from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.space import metres, unit_name
 from vvgt_cli.volume.stored import Stored
 from vvgt_cli.volume.types import Volume, triple
 
 EVEN = 0.01  # of a step that a coordinate may be off and still count as evenly spaced (float32 longitudes are)
-AXIS_ATTRIBUTES = ("axis", "standard_name", "units")
+AXIS_ATTRIBUTES = ("axis", "standard_name", "units", "positive", "_CoordinateZisPositive")
 MARKS = ("_FillValue", "missing_value", "valid_min", "valid_max", "valid_range")
 CF_ATTRIBUTES = (
     *("scale_factor", "add_offset", "_FillValue", "missing_value"),
     *("valid_min", "valid_max", "valid_range", "_Unsigned"),
 )
-METRES = {
-    "km": 1e3, "kilometer": 1e3, "kilometre": 1e3, "m": 1.0, "meter": 1.0, "metre": 1.0, "cm": 1e-2, "centimeter": 1e-2,
-    "mm": 1e-3, "millimeter": 1e-3, "millimetre": 1e-3, "um": 1e-6, "µm": 1e-6, "micron": 1e-6, "micrometer": 1e-6,
-    "micrometre": 1e-6, "nm": 1e-9, "nanometer": 1e-9, "nanometre": 1e-9, "angstrom": 1e-10, "pm": 1e-12,
-}  # fmt: skip
-_NAMES = {1e3: "km", 1.0: "m", 1e-2: "cm", 1e-3: "mm", 1e-6: "um", 1e-9: "nm", 1e-10: "angstrom", 1e-12: "pm"}
+DESCRIBES = ("bounds", "climatology", "cell_measures", "formula_terms", "ancillary_variables", "grid_mapping")
+GEOMETRY = (  # attributes that look like a place in space, in forms that no convention defines
+    *("spacing", "voxel_size", "voxelSize", "pixel_size", "pixelSize", "resolution", "origin", "offset", "affine"),
+    *("direction", "transform"),
+)
 _ROLES = {
     "x": {"x", "lon", "longitude", "rlon", "easting", "projection_x_coordinate", "grid_longitude"},
     "y": {"y", "lat", "latitude", "rlat", "northing", "projection_y_coordinate", "grid_latitude"},
     "z": {"z", "lev", "level", "plev", "depth", "height", "altitude", "elevation", "pressure", "air_pressure"},
     "t": {"t", "time"},
+}
+_PRESSURES = {
+    *("pa", "hpa", "kpa", "dbar", "bar", "mbar", "pascal", "pascals", "millibar", "millibars", "decibar", "decibars"),
+    *("atm", "atmosphere"),
 }
 
 
@@ -68,20 +73,51 @@ class Axis:
 
 
 def axis(name: str, size: int, centres: np.ndarray | None = None, attributes: Mapping[str, Any] | None = None) -> Axis:
-    """An axis with its role from the attributes ``axis``, ``standard_name`` and ``units``, else from its name."""
-    told = {key: str(value).strip() for key, value in (attributes or {}).items() if key in AXIS_ATTRIBUTES}
-    units = told.get("units", "")
-    role = told.get("axis", "").lower()
+    """Make an axis, with its role from the attributes ``axis``, ``standard_name`` and ``units``, else from its name.
+
+    Coordinates of a vertical axis that point down become their negatives, so that z always points up.
+    """
+    stated = {key: str(value).strip() for key, value in (attributes or {}).items() if key in AXIS_ATTRIBUTES}
+    units = stated.get("units", "")
+    role = stated.get("axis", "").lower()
+    words = [stated.get("standard_name", "").lower(), name.lower()]
     if role not in ("x", "y", "z", "t"):
-        role = ""
-        for word in (told.get("standard_name", "").lower(), name.lower()):
-            role = role or next((key for key, names in _ROLES.items() if word in names), "")
+        role = next((key for word in words for key, names in _ROLES.items() if word in names), "")
         bearing = re.fullmatch(r"degrees?_?(east|north|e|n)", units.lower())  # CF, 4.1 and 4.2
         if bearing is not None:
             role = "x" if bearing[1].startswith("e") else "y"
         if " since " in units:
             role = "t"
+        vertical = "positive" in stated or units.lower() in _PRESSURES or any(w.startswith("depth") for w in words)
+        role = role or ("z" if vertical else "")  # CF, 4.3
+    if role == "z" and centres is not None and _points_down(stated, words, centres):
+        centres = -np.asarray(centres, np.float64) + 0.0
     return Axis(name, size, centres, units, role)
+
+
+def _points_down(stated: Mapping[str, str], words: Sequence[str], centres: np.ndarray) -> bool:
+    """Tell whether the coordinates of a vertical axis grow downwards (CF, 4.3; ``_CoordinateZisPositive``: Unidata).
+
+    Without an attribute that says so, pressure and a depth that is not negative grow downwards.
+    """
+    positive = (stated.get("positive") or stated.get("_CoordinateZisPositive", "")).lower()
+    if positive in ("up", "down"):
+        return positive == "down"
+    if positive:
+        warnings.warn(f"axis {words[1]}: positive is {positive!r}, neither up nor down; taken as up", stacklevel=4)
+        return False
+    if stated.get("units", "").lower() in _PRESSURES:
+        return True
+    depth = any(word.startswith("depth") for word in words) and bool((centres >= 0).all())
+    if depth:
+        warnings.warn(f"axis {words[1]}: taken as pointing down, as depths do (no attribute positive)", stacklevel=4)
+    return depth
+
+
+def described_by(attributes: Mapping[str, Any]) -> list[str]:
+    """Return the names of variables that describe one of these attributes, and are no data of their own (CF, 7)."""
+    words = (word for key in DESCRIBES for word in str(attributes.get(key, "")).split())
+    return [word for word in words if not word.endswith(":")]
 
 
 def labelled_volume(
@@ -116,6 +152,7 @@ def labelled_volume(
     """
     if dtype.kind not in "iufb":
         raise DataError(f"{source}: values of type {dtype}; expected integers or floats")
+    _warn_of_unread(axes, attributes, options, source)
     space, extra, step = _split_axes(list(axes), options := _numbered(axes, options), source)
     chosen = None if options.component == "magnitude" else options.component
     index: list[Any] = [slice(None) if k in space else 0 for k in range(len(axes))]
@@ -133,17 +170,23 @@ def labelled_volume(
     else:
         values = stored[tuple(index)]
     values, slope, intercept = decode(values, attributes, source)
-    kept = [k for k in range(len(axes)) if index[k] == slice(None)]
+    kept, spatial = [k for k in range(len(axes)) if index[k] == slice(None)], [axes[k] for k in _zyx(space, axes)]
     order = [kept.index(k) for k in _zyx(space, axes)]
     if extra is not None and chosen is None:  # the magnitude over an axis of components
         values = np.transpose(values, [*order, kept.index(extra)])
         field, (slope, intercept) = select_component(values, "magnitude", source, scaling=(slope, intercept))
     else:
         field = np.transpose(values, order)
-    spatial = [axes[k] for k in _zyx(space, axes)]
     if field.ndim == 2:
         field, spatial = field[None], [Axis("", 1), *spatial]
     return _placed(field, spatial, (slope, intercept), options, source, name)
+
+
+def _warn_of_unread(axes: Sequence[Axis], attributes: Mapping[str, Any], options: ReadOptions, source: str) -> None:
+    """Warn of attributes that look like a geometry, where axes have none."""
+    unread = [key for key in GEOMETRY if key in attributes]
+    if unread and options.spacing is None and all(a.centres is None for a in axes):
+        warnings.warn(f"{source}: attributes {', '.join(unread)} are not read; --spacing X Y Z sets it", stacklevel=4)
 
 
 def _numbered(axes: Sequence[Axis], options: ReadOptions) -> ReadOptions:
@@ -283,6 +326,9 @@ def _placed(
         if options.spacing is None:
             raise
         centres, unit = [None] * 3, ""
+    bare = [a.name or "unnamed" for a, c in zip(axes, centres, strict=True) if c is None and a.size > 1]
+    if options.spacing is None and bare and any(c is not None and c.size > 1 for c in centres):
+        warnings.warn(f"{source}: no coordinates along {', '.join(bare)}; its step is taken as 1", stacklevel=4)
     origin = tuple(0.0 if c is None else float(c[0]) for c in reversed(centres))
     if options.spacing or all(c is None or even(c) for c in centres):
         if options.dims is not None:
@@ -369,7 +415,7 @@ def _steps(a: Axis) -> str:
 
 
 def _one_unit(axes: Sequence[Axis], source: str) -> list[np.ndarray | None]:
-    """The coordinates, lengths in the unit of the last axis.
+    """Return the coordinates of the axes, lengths in the unit of the last axis.
 
     Raises:
         UsageError: units that do not compare.
@@ -377,22 +423,19 @@ def _one_unit(axes: Sequence[Axis], source: str) -> list[np.ndarray | None]:
     units = [_unit(a) for a in axes if a.size > 1]
     if len(set(units)) <= 1:
         return [a.centres for a in axes]
-    if all(u in METRES for u in units):
-        base = METRES[units[-1]]
-        return [None if a.centres is None else a.centres * (METRES.get(_unit(a), base) / base) for a in axes]
-    told = ", ".join(f"{a.name or 'unnamed'} in {_unit(a) or 'no unit'}" for a in reversed(axes) if a.size > 1)
-    raise UsageError(f"{source}: axes {told}; expected one unit of length: try --spacing X Y Z")
+    if all(metres(u) for u in units):
+        base = metres(units[-1]) or 1.0
+        return [None if a.centres is None else a.centres * ((metres(_unit(a)) or base) / base) for a in axes]
+    stated = ", ".join(f"{a.name or 'unnamed'} in {_unit(a) or 'no unit'}" for a in reversed(axes) if a.size > 1)
+    raise UsageError(f"{source}: axes {stated}; expected one unit of length: try --spacing X Y Z")
 
 
 def _length(axes: Sequence[Axis]) -> str:
-    """The unit that `_one_unit` leads to, "" where it is none of length."""
-    return _NAMES.get(METRES.get(next((_unit(a) for a in reversed(axes) if a.size > 1), ""), 0.0), "")
+    """Return the name of the unit that `_one_unit` leads to, "" where it is not a length."""
+    return unit_name(metres(next((_unit(a) for a in reversed(axes) if a.size > 1), "")))
 
 
 def _unit(a: Axis) -> str:
+    """Return the unit of an axis by the name that all its spellings share."""
     unit = a.units.strip()
-    if unit.lower().startswith("degree"):
-        return "degrees"
-    if unit in METRES:
-        return unit
-    return unit.lower().rstrip("s") if unit.lower().rstrip("s") in METRES else unit.lower()
+    return "degrees" if unit.lower().startswith("degree") else unit_name(metres(unit)) or unit.lower()

@@ -19,9 +19,10 @@ from vvgt_cli.volume.channels import EXTRA, Bounded, Box, Color, Picture, choose
 from vvgt_cli.volume.libraries import library_errors, need
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import Reader, register, volume_name
+from vvgt_cli.volume.space import metres
 from vvgt_cli.volume.types import Volume
 
-MICROMETRES = {"m": 1e6, "mm": 1e3, "um": 1.0, "µm": 1.0, "nm": 1e-3}
+MICROMETRE = 1e-6  # metres
 LUTS: dict[str, Color] = {
     "red": (1, 0, 0), "green": (0, 1, 0), "blue": (0, 0, 1), "cyan": (0, 1, 1), "magenta": (1, 0, 1),
     "yellow": (1, 1, 0), "gray": (1, 1, 1), "grey": (1, 1, 1),
@@ -120,7 +121,7 @@ def _placed(image: Any) -> tuple[Any, Any]:
     origin: dict[str, float] = {}
     for axis in image.xml_element.findall("./Data/Image/ImageDescription/Dimensions/DimensionDescription"):
         name = {"1": "x", "2": "y", "3": "z"}.get(axis.get("DimID", ""))
-        unit = MICROMETRES.get(axis.get("Unit", ""))
+        unit = (metres(axis.get("Unit", "")) or 0.0) / MICROMETRE
         size = int(axis.get("NumberOfElements", 1))
         if name and unit:
             first, length = float(axis.get("Origin", 0)) * unit, float(axis.get("Length", 0)) * unit

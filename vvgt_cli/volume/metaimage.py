@@ -6,7 +6,9 @@ Format: https://itk.org/Wiki/ITK/MetaIO/Documentation
 from __future__ import annotations
 
 import re
+import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,6 +18,7 @@ from vvgt_cli.volume.components import select_component
 from vvgt_cli.volume.headers import MAX_HEADER, Fields, unit_rows
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import Reader, register, volume_name
+from vvgt_cli.volume.space import MILLIMETRE, metres, one_unit
 from vvgt_cli.volume.types import Volume
 
 # MET_LONG has 4 bytes whatever the machine (MetaIO, metaTypes.h).
@@ -33,6 +36,7 @@ _TYPES = {
     "float": "f4",
     "double": "f8",
 }
+_SCALING = (("slope", 1), ("offset", 0))
 _START = re.compile(rb"\s*(?:Comment|ObjectType|ObjectSubType|NDims|DimSize|BinaryData)\s*=", re.IGNORECASE)
 
 
@@ -69,10 +73,11 @@ def _dtype(fields: Fields) -> np.dtype:
     return np.dtype(_TYPES[name]).newbyteorder(">" if big else "<")
 
 
-def _geometry(fields: Fields, n: int) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...], str | None]:
-    """Spacing (x, y, z), direction (row-major; TransformMatrix lists the axes one after the other), origin and space.
+def _place(fields: Fields, n: int, options: ReadOptions) -> dict[str, Any]:
+    """Return spacing, direction, origin, space and unit, as keywords of `Volume`.
 
-    The space is LPS where the header names an orientation or gives axes, as ITK has it whatever the letters are.
+    TransformMatrix lists the axes one after the other. The space is LPS, in mm, where the header names an orientation
+    or gives axes, as ITK has it whatever the letters are.
     """
     spacing: tuple[float, ...] = (1.0,) * 3
     for key in ("elementspacing", "elementsize"):
@@ -95,7 +100,13 @@ def _geometry(fields: Fields, n: int) -> tuple[tuple[float, ...], tuple[float, .
             origin = (*fields.floats(key, fields[key], min(n, 3)), 0.0)[:3]
             break
     lengths, direction = unit_rows((rows * np.where(np.array(spacing) < 0, -1.0, 1.0)[:, None]).tolist())
-    return tuple(abs(s) * length for s, length in zip(spacing, lengths, strict=True)), direction, origin, space
+    _, unit = one_unit([fields.get("distanceunits", "").strip("? ")], fields.name, options.spacing is not None)
+    factor = 1.0
+    if space is not None:
+        factor, unit = (metres(unit) or MILLIMETRE) / MILLIMETRE, ""
+    edges = options.spacing_or(tuple(factor * s * length for s, length in zip(spacing, lengths, strict=True)))
+    first = tuple(factor * o for o in origin)
+    return {"spacing": edges, "direction": direction, "origin": first, "space": space, "unit": unit}
 
 
 def read_metaimage(path: Path, options: ReadOptions) -> Volume:
@@ -129,8 +140,9 @@ def read_metaimage(path: Path, options: ReadOptions) -> Volume:
     elif len(sizes) == 2:
         block = block[None]
     field, _ = select_component(block, options.component, str(path))
-    spacing, direction, origin, space = _geometry(fields, len(sizes))
-    return Volume(field, options.spacing_or(spacing), origin, direction, volume_name(path), space=space)
+    if any(fields.get(f"elementtointensityfunction{key}", f"{n}") not in (f"{n}", f"{n}.0") for key, n in _SCALING):
+        warnings.warn(f"{path}: ElementToIntensityFunction is not applied to its values, as in ITK", stacklevel=2)
+    return Volume(field, name=volume_name(path), **_place(fields, len(sizes), options))
 
 
 def _load(fields: Fields, source: Path, dtype: np.dtype, shape: tuple[int, ...], start: int) -> np.ndarray:

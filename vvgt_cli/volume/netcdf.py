@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from functools import partial
 from pathlib import Path
 from threading import Lock
@@ -12,7 +13,7 @@ import numpy as np
 from vvgt_cli.errors import DataError, SeveralArrays, UsageError
 from vvgt_cli.volume.hdf5 import MAGIC, MOST_LISTED
 from vvgt_cli.volume.headers import printable
-from vvgt_cli.volume.labelled import Axis, axis, labelled_volume
+from vvgt_cli.volume.labelled import DESCRIBES, Axis, axis, described_by, labelled_volume
 from vvgt_cli.volume.libraries import library_errors, need
 from vvgt_cli.volume.minc import is_minc
 from vvgt_cli.volume.netcdf3 import check_header
@@ -45,12 +46,25 @@ def read_netcdf(path: Path, options: ReadOptions) -> Volume:
             attributes["_FillValue"] = library.default_fillvals[kind]  # what the library fills unwritten values with
         source = f"{path}:{variable.name}"
         axes = [_axis(variable, name, size) for name, size in zip(variable.dimensions, variable.shape, strict=True)]
+        _say_curvilinear(variable, attributes, source)
         name = f"{volume_name(path)}:{variable.name}"
         where = f"{variable.group().path.rstrip('/')}/{variable.name}"
         by_box = options.stored and options.dims is None and options.component != "magnitude"
         read = partial(_part, path, where) if by_box else lambda index: variable[index]
         chunks = _chunks(variable) if by_box else None
         return labelled_volume(read, np.dtype(variable.dtype), axes, attributes, options, source, name, chunks)
+
+
+def _say_curvilinear(variable: Any, attributes: dict[str, Any], source: str) -> None:
+    """Warn where places are coordinates of two or more axes (CF, 5.2), which are not read."""
+    names = str(attributes.get("coordinates", "")).split()
+    group = variable.group()
+    odd = [n for n in names if n in group.variables and len(set(group[n].dimensions) & set(variable.dimensions)) > 1]
+    if odd:
+        warnings.warn(
+            f"{source}: its places are curvilinear ({', '.join(odd)}), which is not read: voxels lie on an even grid "
+            "of its axes (cdo remapbil or Resample in ParaView makes a regular one)", stacklevel=2,
+        )  # fmt: skip
 
 
 def _part(path: Path, where: str, index: tuple[Any, ...]) -> np.ndarray:
@@ -78,12 +92,16 @@ def _choose(file: Any, wanted: str | None, path: Path) -> Any:
         prefix, group = groups.pop(0)
         found |= {prefix + name: variable for name, variable in group.variables.items()}
         groups += [(f"{prefix}{name}/", inner) for name, inner in group.groups.items()]
-    bounds = {variable.getncattr("bounds") for variable in found.values() if "bounds" in variable.ncattrs()}
+    described = {
+        name
+        for variable in found.values()
+        for name in described_by({key: variable.getncattr(key) for key in DESCRIBES if key in variable.ncattrs()})
+    }
     fits = {
         name: variable
         for name, variable in found.items()
         if isinstance(variable.dtype, np.dtype) and variable.dtype.kind in "iuf" and len(variable.shape) >= 2
-        and name not in bounds
+        and name.rpartition("/")[2] not in described
     }  # fmt: skip
     if wanted is not None and wanted.strip("/") in found:
         return found[wanted.strip("/")]
@@ -119,4 +137,9 @@ def _sniff(head: bytes) -> bool:
     return classic or (head.startswith(MAGIC) and b"_NCProperties" in head)
 
 
-register(Reader("NetCDF", (".nc", ".nc4", ".cdf"), _sniff, read_netcdf, named_arrays=True, resamples=True, times=True))
+register(
+    Reader(
+        "NetCDF", (".nc", ".nc4", ".cdf"), _sniff, read_netcdf,
+        named_arrays=True, resamples=True, times=True, within=("HDF5",),
+    )
+)  # fmt: skip

@@ -8,8 +8,10 @@ Format: https://teem.sourceforge.net/nrrd/format.html
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -21,7 +23,7 @@ from vvgt_cli.volume.nrrd_files import data_names, load_files
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.packed import Packed, packed
 from vvgt_cli.volume.readers import Reader, register, volume_name
-from vvgt_cli.volume.space import millimetres
+from vvgt_cli.volume.space import MILLIMETRE, metres, one_unit
 from vvgt_cli.volume.types import Volume
 
 _TYPES = {
@@ -69,7 +71,8 @@ def read_header(path: Path) -> tuple[Fields, int]:
                 break
             key, colon, value = text.partition(":")
             if not text.startswith("#") and colon and not value.startswith("="):
-                fields[key.strip().lower().replace("centerings", "centers")] = value.strip()
+                name = key.strip().lower().replace(" ", "")  # teem takes most names with and without blanks
+                fields[{"centerings": "centers"}.get(name, name)] = value.strip()
         return fields, file.tell()
 
 
@@ -86,28 +89,30 @@ def _dtype(fields: Fields, encoding: str) -> np.dtype:
     return dtype
 
 
-def _vectors(fields: Fields, n: int) -> list[list[float] | None]:
-    """Space directions of the n axes: a vector of three, or None for an axis that is not spatial."""
-    tokens = fields["space directions"].replace("(", " (").replace(")", ") ").split()
-    joined, inside = [], ""
-    for token in tokens:
-        inside += token
-        if inside.startswith("(") and not inside.endswith(")"):
-            continue
-        joined.append(inside)
-        inside = ""
-    if len(joined) != n:
-        raise DataError(f"{fields.name}: space directions {fields['space directions']!r}; expected {n} axes")
-    out: list[list[float] | None] = []
-    for token in joined:
-        vector = None if token == "none" else fields.floats("space directions", token.strip("()"))
-        out.append(vector and [*vector, 0.0, 0.0][:3])
-    return out
+def _vectors(fields: Fields, n: int) -> list[list[float] | None] | None:
+    """Return the space directions of the n axes: a vector of three, or None for an axis that is not spatial.
+
+    Returns None where the header has no space directions.
+
+    Raises:
+        DataError: vectors of another number, or of another length than the space has dimensions.
+    """
+    if "spacedirections" not in fields:
+        return None
+    tokens = re.findall(r"none|\([^)]*\)", fields["spacedirections"])
+    if len(tokens) != n or "".join(tokens).replace(" ", "") != "".join(fields["spacedirections"].split()):
+        raise DataError(f"{fields.name}: space directions {fields['spacedirections']!r}; expected {n} vectors or none")
+    return [None if token == "none" else _vector(fields, "space directions", token) for token in tokens]
 
 
-def _directions(fields: Fields, axes: int) -> list[list[float] | None] | None:
-    """Space directions of the axes, None where the header has none."""
-    return _vectors(fields, axes) if "space directions" in fields else None
+def _vector(fields: Fields, key: str, text: str) -> list[float]:
+    """Return a vector ``(x,y,z)`` of the header's space; the third of two dimensions is 0, a fourth is time's."""
+    space = fields.get("space", "").lower()
+    edge = fields.integer("spacedimension", 4 if space.endswith("-time") else 3 if space else text.count(",") + 1)
+    inner = text.strip("() ")
+    if inner.count(",") + 1 != edge:
+        raise DataError(f"{fields.name}: {key} has {text!r}; expected {edge} numbers with decimal points")
+    return [*fields.floats(key, inner, edge), 0.0, 0.0][:3]
 
 
 def _component_axis(fields: Fields, sizes: list[int], vectors: list[list[float] | None] | None) -> int | None:
@@ -155,30 +160,70 @@ def _step(block: np.ndarray, options: ReadOptions, source: str) -> int | str | N
     return options.time if times > 1 else None
 
 
-def _geometry(
-    fields: Fields, vectors: list[list[float] | None] | None, axis: int | None
-) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...], str | None]:
-    """Spacing (x, y, z), direction (row-major), origin and space.
+def _place(
+    fields: Fields, vectors: list[list[float] | None] | None, axis: int | None, sizes: list[int], options: ReadOptions
+) -> dict[str, Any]:
+    """Return spacing, direction, origin, space and unit, as keywords of `Volume`.
 
     Coordinates of left-handed spaces (left-anterior-superior, 3D-left-handed) are made right-handed ones.
+
+    Raises:
+        DataError: numbers that do not fit the axes.
+        UsageError: units that do not compare, and no spacing given.
     """
-    axes = np.eye(3)  # rows: world vectors of a step along x, y, z
-    if vectors is not None:
+    space = None
+    if vectors is None:
+        steps, origin = _along_axes(fields, axis, sizes)
+        axes = np.diag(steps)
+        units = [unit for k, unit in enumerate(_words(fields, "units")) if k != axis]
+    else:
         spatial = [v for k, v in enumerate(vectors) if k != axis and v is not None]
-        axes = np.array(spatial if len(spatial) == 3 else [*spatial, _third(spatial)])
-    elif "spacings" in fields:
-        words = [w for k, w in enumerate(fields["spacings"].split()) if k != axis]
-        values = fields.floats("spacings", " ".join("1" if w.lower() == "nan" else w for w in words))
-        axes = np.diag((*values, 1.0, 1.0)[:3])
-    origin = np.zeros(3)
-    if "space origin" in fields and "none" not in fields["space origin"]:
-        origin = np.array((*fields.floats("space origin", fields["space origin"].strip("() ")), 0.0, 0.0)[:3])
-    signs, space = _space(fields) if vectors is not None else (np.ones(3), None)  # space directions say where axes run
-    if space is not None:
-        units = [word.strip('"') for word in fields.get("space units", "").split()]
-        signs = signs * ([millimetres(unit) for unit in units] if len(units) == 3 else 1.0)
-    lengths, direction = unit_rows((axes * signs).tolist())
-    return lengths, direction, tuple((origin * signs + 0.0).tolist()), space
+        axes, origin = np.array(spatial if len(spatial) == 3 else [*spatial, _third(spatial)]), np.zeros(3)
+        units = _words(fields, "spaceunits")[:3]
+    if "spaceorigin" in fields and "none" not in fields["spaceorigin"]:
+        origin = np.array(_vector(fields, "space origin", fields["spaceorigin"]))
+    known, unit = one_unit(units, fields.name, options.spacing is not None)
+    factors = np.array([*known, 1.0, 1.0, 1.0])[:3]
+    if vectors is not None:  # which say where axes run
+        signs, space = _space(fields)
+        factors *= signs
+    if space is not None:  # in mm
+        factors, unit = factors * (metres(unit) or MILLIMETRE) / MILLIMETRE, ""
+    lengths, direction = unit_rows((axes * factors).tolist())
+    spacing, first = options.spacing_or(lengths), tuple((origin * factors + 0.0).tolist())
+    return {"spacing": spacing, "direction": direction, "origin": first, "space": space, "unit": unit}
+
+
+def _along_axes(fields: Fields, axis: int | None, sizes: list[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Return step and first position (3,) along each axis, by ``spacings``, ``axis mins`` and ``axis maxs``.
+
+    As teem has it: where values are cells, as they are unless ``centers`` says ``node``, they begin half a step behind
+    the minimum.
+    """
+
+    def numbers(key: str) -> list[float]:
+        words = fields.get(key, "").replace(", ", " ").split() or ["nan"] * len(sizes)
+        if len(words) != len(sizes):
+            raise DataError(f"{fields.name}: {key} is {fields[key]!r}; expected {len(sizes)} numbers")
+        kept = [word for k, word in enumerate(words) if k != axis]
+        return [math.nan if word.lower() == "nan" else fields.floats(key, word, 1)[0] for word in kept]
+
+    centers = (fields.get("centers", "").lower().split() + ["cell"] * len(sizes))[: len(sizes)]
+    nodes = [center == "node" for k, center in enumerate(centers) if k != axis]
+    counts = [size for k, size in enumerate(sizes) if k != axis]
+    steps, first = np.ones(3), np.zeros(3)
+    for k, (step, low, high) in enumerate(zip(*map(numbers, ("spacings", "axismins", "axismaxs")), strict=True)):
+        parts = max(counts[k] - nodes[k], 1)
+        if math.isnan(step) and not math.isnan(low + high):
+            step = (high - low) / parts
+        steps[k] = 1.0 if math.isnan(step) else step
+        first[k] = 0.0 if math.isnan(low) else low + (0.0 if nodes[k] else steps[k] / 2)
+    return steps, first
+
+
+def _words(fields: Fields, key: str) -> list[str]:
+    """Return the words of a field, each in quotes or, as some writers have it, without."""
+    return [a or b for a, b in re.findall(r'"([^"]*)"|(\S+)', fields.get(key, ""))]
 
 
 def _third(axes: list[list[float]]) -> np.ndarray:
@@ -225,23 +270,23 @@ def read_nrrd(path: Path, options: ReadOptions) -> Volume:
     sizes = fields.sizes("sizes", fields.need("sizes"))
     if len(sizes) != fields.integer("dimension", len(sizes)):
         raise DataError(f"{path}: dimension {fields['dimension']} but sizes {fields['sizes']!r}")
-    skip = fields.integer("byte skip", 0)
+    skip = fields.integer("byteskip", 0)
     if skip < -1 or (skip == -1 and encoding != "raw"):
         raise DataError(f"{path}: byte skip {skip} with encoding {encoding}; expected 0 or more (-1 with raw only)")
 
     slabs = options.packed and encoding in ("gzip", "bzip2") and len(sizes) == 3 and options.component is None
-    slabs = slabs and _component_axis(fields, sizes, _directions(fields, len(sizes))) is None
+    slabs = slabs and _component_axis(fields, sizes, _vectors(fields, len(sizes))) is None
 
     def load(source: Path, start: int, shape: tuple[int, ...]) -> np.ndarray:
         if skip == -1:
             return load_block(source, dtype, shape, offset=-1)
-        start = _line_skip(source, start, fields.integer("line skip", 0))
+        start = _line_skip(source, start, fields.integer("lineskip", 0))
         if slabs and shape == tuple(reversed(sizes)):
             return packed(source, dtype, shape, encoding, offset=start, skip=skip)
         return load_block(source, dtype, shape, offset=start, encoding=encoding, skip=skip)
 
     shape = tuple(reversed(sizes))
-    named = fields.get("data file") or fields.get("datafile")
+    named = fields.get("datafile")
     several = data_names(path, named, len(sizes)) if named is not None else None
     if named is None:
         block = load(path, offset, shape)
@@ -253,11 +298,11 @@ def read_nrrd(path: Path, options: ReadOptions) -> Volume:
 
 
 def _volume(path: Path, fields: Fields, block: np.ndarray, sizes: list[int], options: ReadOptions) -> Volume:
-    vectors = _directions(fields, len(sizes))
+    vectors = _vectors(fields, len(sizes))
     axis = _component_axis(fields, sizes, vectors)
-    spacing, direction, origin, space = _geometry(fields, vectors, axis)
+    place = _place(fields, vectors, axis, sizes, options) | {"name": volume_name(path)}
     if isinstance(block, Packed):
-        return Volume(block, options.spacing_or(spacing), origin, direction, volume_name(path), space=space)
+        return Volume(block, **place)
     block = block[..., None] if axis is None else np.moveaxis(block, len(sizes) - 1 - axis, -1)
     if block.ndim == 3:
         block = block[None]
@@ -271,7 +316,7 @@ def _volume(path: Path, fields: Fields, block: np.ndarray, sizes: list[int], opt
             f"{path}: no axis of time (of kind time, or list in a .seq.nrrd); leave out --time {options.time}"
         )
     field, _ = select_component(block, component, str(path), label=label, color=color)
-    return Volume(field, options.spacing_or(spacing), origin, direction, volume_name(path), space=space)
+    return Volume(field, **place)
 
 
 register(Reader("NRRD", (".nrrd", ".nhdr"), lambda head: head.startswith(b"NRRD000"), read_nrrd, times=True))

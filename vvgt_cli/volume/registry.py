@@ -24,6 +24,7 @@ from vvgt_cli.volume.unread import way_out
 
 LOOKED_AT = 2000  # files of a folder
 LISTED = "NIfTI, NRRD, DICOM, TIFF, VTK, HDF5 or another format of docs/formats.md"
+PREVIEWS = 10  # pictures for each volume beside them, up to which they do not make a folder one of slices
 
 
 def read_volume(source: str, options: ReadOptions | None = None) -> Volume:
@@ -154,8 +155,10 @@ def _folder(path: Path, source: str) -> Reader:
     lying = _volumes_in(path)
     for reader in READERS:
         if reader.holds is not None and reader.holds(path):
-            own = len(lying.get(reader.name.removesuffix(" slices"), []))
-            if reader.by_whole or 2 * own >= sum(map(len, lying.values())):
+            mine = (reader.name, *reader.within)
+            own = sum(len(lying.get(kind, [])) / (PREVIEWS if kind == "picture" else 1) for kind in mine)
+            others = sum(len(names) for kind, names in lying.items() if kind not in (*mine, "picture"))
+            if reader.by_whole or own >= others:
                 return reader
     if lying:
         listing = "; ".join(f"{len(names)} {kind} ({', '.join(names[:3])}{', ...' if len(names) > 3 else ''})"
@@ -223,7 +226,8 @@ def _find(path: Path, head: bytes, options: ReadOptions) -> Reader:
     found, zipped = _by_content(path, head)
     if found is not None and named is not None and found.name in named.within:
         found = named
-    if found is not None and found is not named and not found.resamples and (options.dims or raw.parse_name(path.name)):
+    raw_layout = options.dtype or raw.parse_name(path.name) or (options.dims and not (found and found.resamples))
+    if found is not None and found is not named and raw_layout:
         return raw.READER  # a raw volume may begin with any bytes; where its layout is stated, believe that
     if found is not None:
         if zipped and not found.unzips:

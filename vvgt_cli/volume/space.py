@@ -6,6 +6,8 @@ DICOM and ITK). The two differ by half a turn about the third axis.
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,10 +18,13 @@ from vvgt_cli.volume.types import Volume
 SPACES = ("RAS", "LPS")
 _OPPOSITE = {"R": "L", "L": "R", "A": "P", "P": "A", "S": "I", "I": "S"}
 _WORDS = {"right": "R", "left": "L", "anterior": "A", "posterior": "P", "superior": "S", "inferior": "I"}
-MILLIMETRES = {
-    "m": 1e3, "meter": 1e3, "metre": 1e3, "cm": 10.0, "mm": 1.0, "millimeter": 1.0, "millimetre": 1.0,
-    "um": 1e-3, "µm": 1e-3, "μm": 1e-3, "micron": 1e-3, "microns": 1e-3, "micrometer": 1e-3, "nm": 1e-6,
+METRES = {  # of a unit's name, its long names, and what the page and files call it
+    1e3: ("km", "kilometer", "kilometre"), 1.0: ("m", "meter", "metre"), 1e-2: ("cm", "centimeter", "centimetre"),
+    1e-3: ("mm", "millimeter", "millimetre"), 1e-6: ("um", "µm", "micron", "micrometer", "micrometre"),
+    1e-9: ("nm", "nanometer", "nanometre"), 1e-10: ("angstrom", "Å"), 1e-12: ("pm", "picometer", "picometre"),
 }  # fmt: skip
+MILLIMETRE = 1e-3
+_LENGTHS = {name: metres for metres, names in METRES.items() for name in names}
 
 
 def in_space(volume: Volume, wanted: str | None) -> Volume:
@@ -48,9 +53,42 @@ def in_space(volume: Volume, wanted: str | None) -> Volume:
     return replace(volume, direction=direction, origin=origin, space=wanted)
 
 
-def millimetres(unit: str) -> float:
-    """Length of a unit in mm; 1 for an unknown one."""
-    return MILLIMETRES.get(unit.strip().strip('"').lower(), 1.0)
+def metres(unit: str) -> float | None:
+    """Return the length of a unit in metres, None for a name that is not a unit of length."""
+    word = unit.strip().replace("\u03bc", "µ")
+    return next((_LENGTHS[w] for w in (word, word.lower(), word.lower().rstrip("s")) if w in _LENGTHS), None)
+
+
+def unit_name(length: float | None) -> str:
+    """Return the short name of the unit of a length in metres, "" where there is no such unit."""
+    return METRES[length][0] if length in METRES else ""
+
+
+def one_unit(units: Sequence[str], source: str, spacing_given: bool) -> tuple[np.ndarray, str]:
+    """Find the factors that bring lengths along several axes to one unit.
+
+    Args:
+        units: unit of each axis, as the file writes it; "" where it states none.
+        source: for messages.
+        spacing_given: the caller replaces the file's spacing, so that its units need not compare.
+
+    Returns:
+        Factors (n,) float64, and the short name of the unit of the first axis that states one, "" if none does or it is
+        not a length, which a warning says.
+
+    Raises:
+        UsageError: units that do not compare.
+    """
+    stated = [unit for unit in units if unit.strip()]
+    lengths = [metres(unit) for unit in stated]
+    if len(set(lengths)) > 1 and None in lengths and not spacing_given:
+        raise UsageError(f"{source}: lengths in {', '.join(stated)}; expected one unit of length: try --spacing X Y Z")
+    if not stated or None in lengths:
+        if stated:
+            warnings.warn(f"{source}: unit {stated[0]!r} is not a known unit of length; numbers are kept", stacklevel=3)
+        return np.ones(len(units)), ""
+    base = lengths[0] or 1.0
+    return np.array([(metres(unit) or base) / base for unit in units]), unit_name(base)
 
 
 def world_axis(name: str, space: str | None) -> str:

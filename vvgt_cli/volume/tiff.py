@@ -26,9 +26,8 @@ from vvgt_cli.volume.components import contiguous, magnitude
 from vvgt_cli.volume.libraries import library_errors
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import Reader, register, volume_name
-from vvgt_cli.volume.stored import Stored
 from vvgt_cli.volume.tiff_decode import Pages
-from vvgt_cli.volume.tiff_facts import Facts, imagej_facts, ome_facts, ome_root
+from vvgt_cli.volume.tiff_facts import Facts, count_planes, imagej_facts, ome_facts, ome_root
 from vvgt_cli.volume.tiff_pages import check_pages
 from vvgt_cli.volume.tiff_stored import lazy_pages
 from vvgt_cli.volume.types import Volume
@@ -59,10 +58,15 @@ class SeriesAxes:
         return [k for k, a in enumerate(self.axes) if a in letters and self.shape[k] > 1]
 
 
-def read_tiff(path: Path, options: ReadOptions) -> Volume:
+def read_tiff(path: Path, options: ReadOptions, slices: int = 1) -> Volume:
     """Read a volume from a TIFF file; rows from the top are y. Resolution tags alone are not spacing.
 
     Spacing is in micrometres where OME-XML or ImageJ's description has one, else 1.
+
+    Args:
+        path: the file.
+        options: see `ReadOptions`.
+        slices: how many slices a volume has, if the file is one of them.
 
     Raises:
         DataError: directories or OME-XML that cannot be, damaged or missing pages, pixels of an unknown coding.
@@ -73,22 +77,23 @@ def read_tiff(path: Path, options: ReadOptions) -> Volume:
     check_pages(path)
     with library_errors(str(path), "TIFF"), _silent(), tifffile.TiffFile(path) as file:
         root = ome_root(file.ome_metadata, path) if file.is_ome and file.ome_metadata else None
+        count_planes(file)
         series, number = _series(file, options.array, path)
         facts = _facts(file, root, series, number, path)
         layout = _layout(series, path)
         index, several = _choose(layout, facts, options, path, series.dtype)
-        mapped = _mappable(series) and _together(layout, index)
+        mapped = _mappable(series)
         if options.stored and _paged(layout, index, several) and not mapped:
             _whole(series, path)
-            field: Any = _left(path, number, layout, index, series.dtype)
+            lead, inner = layout.shape[: layout.lead], layout.shape[layout.lead :]
+            turned = layout.axes.index("X") < layout.axes.index("Y")
+            field: Any = lazy_pages(path, number, lead, inner, index, np.dtype(series.dtype), turned)
         else:
-            field = _in_memory(_values(file, series, layout, index, path), layout, index, several, path)
-    spacing, guessed = facts.voxel(options, field.shape[0], str(path))
-    if guessed:
-        warnings.warn(
-            f"{path}: no distance between its slices; taken as wide as its pixels (--spacing X Y Z sets it)",
-            stacklevel=2,
-        )
+            values = _values(file, series, layout, index, path)
+            field = _arranged(values, layout, index, several, path, options.stored and mapped)
+    spacing, doubts = facts.voxel(options, max(slices, field.shape[0]), str(path))
+    if doubts:
+        warnings.warn(f"{path}: {'; '.join(doubts)} (--spacing X Y Z sets it)", stacklevel=2)
     return Volume(field, spacing, name=volume_name(path), unit=facts.length)
 
 
@@ -99,34 +104,19 @@ def _paged(layout: SeriesAxes, index: tuple[int | slice, ...], several: bool) ->
     return not several and ahead == ["Z"] and sorted(kept) == ["X", "Y", "Z"]
 
 
-def _together(layout: SeriesAxes, index: tuple[int | slice, ...]) -> bool:
-    """Whether what is kept lies in the file as (z, y, x), without anything between."""
-    rest = [
-        (a, i, n) for a, i, n in zip(layout.axes, index, layout.shape, strict=True) if n > 1 or isinstance(i, slice)
-    ]
-    kept = [isinstance(i, slice) for _, i, _ in rest]
-    return all(kept[kept.index(True) :]) and [a for a, i, _ in rest if isinstance(i, slice)] == ["Z", "Y", "X"]
-
-
-def _left(path: Path, number: int, layout: SeriesAxes, index: tuple[int | slice, ...], dtype: np.dtype) -> Stored:
-    """The slices of a series whose pages stay in the file."""
-    turned = layout.axes.index("X") < layout.axes.index("Y")
-    return lazy_pages(
-        path, number, layout.shape[: layout.lead], layout.shape[layout.lead :], index, np.dtype(dtype), turned
-    )
-
-
-def _in_memory(
-    values: np.ndarray, layout: SeriesAxes, index: tuple[int | slice, ...], several: bool, path: Path
+def _arranged(
+    values: np.ndarray, layout: SeriesAxes, index: tuple[int | slice, ...], several: bool, path: Path, view: bool
 ) -> np.ndarray:
-    """(z, y, x) of what was read, the magnitude of several channels."""
-    order = [*(_kept(layout, index, a) for a in "ZYX"), *([_kept(layout, index, c) for c in "CS"] if several else [])]
-    field = _arranged(values, order, layout, index)
+    """Return (z, y, x) of what was read, the magnitude of several channels; ``view``: one of the file will do."""
+    kept = [a for a, i in zip(layout.axes, index, strict=True) if isinstance(i, slice)]
+    field = values.transpose([kept.index(a) for a in "ZYXCS" if a in kept])
+    field = field[tuple(slice(None) if a in kept else None for a in "ZYX")]
     if several:
         check_memory(field[..., 0].size * 4, str(path))
-        field = magnitude(field)
-    elif not field.flags.c_contiguous:
-        check_memory(field.nbytes, str(path))
+        return magnitude(field.reshape(*field.shape[:3], -1))
+    if view or field.flags.c_contiguous:
+        return field
+    check_memory(field.nbytes, str(path))
     return contiguous(field)
 
 
@@ -169,13 +159,14 @@ def _facts(file: Any, root: Any, series: Any, number: int, path: Path) -> Facts:
             raise DataError(f"{path}: its OME-XML does not fit its pages; check that the file is whole")
     if facts.spacing == (None, None, None) and file.is_imagej and not file.is_shaped:
         first = file.pages.first
-        x, y = first.get_resolution()
-        told = imagej_facts(file.imagej_metadata or {}, (float(x), float(y)), int(first.resolutionunit))
+        x, y = (r if code in first.tags else None for code, r in zip((282, 283), first.get_resolution(), strict=True))
+        told = imagej_facts(file.imagej_metadata or {}, (x, y), int(first.tags.valueof(296, default=1)))
         facts = replace(told, channels=facts.channels)
         if facts.images > 1 and series.kind != "imagej" and root is None:
-            raise DataError(
-                f"{path}: ImageJ's description tells of {facts.images} images that are not there; is it whole?"
-            )
+            short = first.dataoffsets[0] + facts.images * first.nbytes - path.stat().st_size if first.is_final else 0
+            missing = f" ({size_text(short)} are missing)" if short > 0 else ""
+            text = f"{path}: ImageJ's description tells of {facts.images} images that are not there{missing}"
+            raise DataError(f"{text}; is it whole?")
     return facts
 
 
@@ -196,7 +187,8 @@ def _layout(series: Any, path: Path) -> SeriesAxes:
             "write the others as files of their own"
         )
     lead = next((k for k in range(len(shape), -1, -1) if math.prod(shape[k:]) == keyframe.size), None)
-    if lead is None or math.prod(shape[:lead]) != len(series):
+    one = bool(series.is_truncated) and _mappable(series)  # one directory, whose planes lie behind each other
+    if lead is None or (math.prod(shape[:lead]) != len(series) and not one):
         raise DataError(
             f"{path}: {len(series)} pages of {keyframe.size} values; expected {' x '.join(map(str, shape))}; check "
             "that the file is whole"
@@ -273,31 +265,13 @@ def _channel(
     raise SeveralComponents(text, n, color and n in (3, 4), colors, channels, names)
 
 
-def _kept(layout: SeriesAxes, index: tuple[int | slice, ...], letter: str) -> int | None:
-    """Position of a letter's axis among those that an index keeps."""
-    kept = [k for k, i in enumerate(index) if isinstance(i, slice)]
-    return next((kept.index(k) for k in kept if layout.axes[k] == letter), None)
-
-
-def _arranged(
-    values: np.ndarray, order: list[int | None], layout: SeriesAxes, index: tuple[int | slice, ...]
-) -> np.ndarray:
-    """The values with axes z, y, x, and one of channels where there are several."""
-    there = [k for k in order if k is not None]
-    field = np.transpose(values, there)
-    for at, k in enumerate(order[:3]):
-        if k is None:
-            field = np.expand_dims(field, at)
-    return field if len(order) == 3 else field.reshape(*field.shape[:3], -1)
-
-
 def _values(file: Any, series: Any, layout: SeriesAxes, index: tuple[int | slice, ...], path: Path) -> np.ndarray:
     """The values at an index of a series: mapped where they lie together plainly, else decoded page by page."""
     if _mappable(series):
         offset, need = int(series.dataoffset), math.prod(layout.shape) * series.dtype.itemsize
         size = path.stat().st_size
         if offset + need > size:
-            raise DataError(f"{path}: {size_text(size)}; its pixels need {size_text(offset + need)}: is it whole?")
+            raise DataError(f"{path}: {size_text(offset + need - size)} of its pixels are missing; is it whole?")
         dtype = series.dtype.newbyteorder(file.byteorder)
         return np.memmap(path, dtype, "r", offset, layout.shape)[index]
     _whole(series, path)
@@ -318,8 +292,9 @@ def _values(file: Any, series: Any, layout: SeriesAxes, index: tuple[int | slice
 
 
 def _mappable(series: Any) -> bool:
-    """Whether the values of a series lie together plainly."""
-    return series.dataoffset is not None and not series.is_multifile and bool(series.keyframe.is_memmappable)
+    """Return whether the values of a series lie together plainly; those of one directory may begin anywhere."""
+    aligned = bool(series.keyframe.is_memmappable) or bool(series.is_truncated)
+    return series.dataoffset is not None and not series.is_multifile and aligned
 
 
 def _whole(series: Any, path: Path) -> None:

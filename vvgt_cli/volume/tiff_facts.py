@@ -13,14 +13,15 @@ from typing import Any
 from xml.etree import ElementTree
 
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.volume.labelled import METRES
 from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.space import metres
 from vvgt_cli.volume.tiff_pages import MAX_PAGES, check_pages
 from vvgt_cli.volume.types import triple
 
 MICROMETRE = 1e-6  # metres
 _MOST_FILES = 10_000
-_OTHER_NAMES = {"Å": "angstrom", "in": "inch", "microns": "um"}
+_OTHER_NAMES = {"A": "angstrom", "in": "inch", "inches": "inch", "pixels": "pixel"}
+_PER = {2: "inch", 3: "cm"}  # ResolutionUnit, tag 296
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,8 @@ class Facts:
         channels: names of the channels, where they have any.
         colors: RGB in [0, 1] of the channels, where they have any.
         images: images that must be there for the description to hold; 0 where it does not say.
-        units: of the spacing, where they do not compare.
+        trouble: why the spacing cannot be used: units that do not compare, a size that is no number.
+        assumed: what was assumed for the spacing.
         length: unit of the spacing, "um" or unknown.
     """
 
@@ -40,22 +42,25 @@ class Facts:
     channels: list[str] = field(default_factory=list)
     colors: list[tuple[float, float, float] | None] = field(default_factory=list)
     images: int = 0
-    units: str = ""
+    trouble: str = ""
+    assumed: tuple[str, ...] = ()
     length: str = ""
 
-    def voxel(self, options: ReadOptions, slices: int, source: str) -> tuple[tuple[float, float, float], bool]:
-        """The spacing to take, and whether the distance of several slices is a guess.
+    def voxel(self, options: ReadOptions, slices: int, source: str) -> tuple[tuple[float, float, float], list[str]]:
+        """Return the spacing (x, y, z) to use, and what was assumed for it.
 
         Raises:
-            UsageError: units that do not compare, and no spacing given.
+            UsageError: sizes that cannot be used, and no spacing given.
         """
-        if self.units and options.spacing is None:
-            raise UsageError(f"{source}: voxel sizes in {self.units}; expected one unit: try --spacing X Y Z")
+        if self.trouble and options.spacing is None:
+            raise UsageError(f"{source}: {self.trouble}; try --spacing X Y Z")
         if options.spacing is not None or self.spacing == (None, None, None):
-            return options.spacing_or((1.0, 1.0, 1.0)), False
+            return options.spacing_or((1.0, 1.0, 1.0)), []
         x, y, z = self.spacing
         across = x or y or z or 1.0
-        return options.spacing_or((x or across, y or across, z or across)), z is None and slices > 1
+        width = [] if x and y else [f"no width or no height of its pixels; taken as {across:g}"]
+        depth = [] if z or slices == 1 else ["no distance between its slices; taken as wide as its pixels"]
+        return (x or across, y or across, z or across), [*self.assumed, *width, *depth]
 
 
 def ome_root(xml: str, path: Path) -> ElementTree.Element:
@@ -122,14 +127,14 @@ def ome_facts(root: ElementTree.Element, series: int, count: int) -> Facts:
     if len(images) != count:
         return Facts()
     pixels = images[series]
-    numbers = [_positive(pixels.get(f"PhysicalSize{axis}")) for axis in "XYZ"]
+    sizes = {f"PhysicalSize{axis}": pixels.get(f"PhysicalSize{axis}") for axis in "XYZ"}
     units = [pixels.get(f"PhysicalSize{axis}Unit", "µm") for axis in "XYZ"]
     names, colors = [], []
     for channel in (c for c in pixels if _tag(c) == "Channel"):
         name, samples = channel.get("Name", ""), int(channel.get("SamplesPerPixel", 1))
         names += [name] if samples == 1 else [f"{name}:{k}" for k in range(min(samples, 1000))]
         colors += [_color(channel.get("Color"))] * min(samples, 1000)
-    return replace(_micrometres(numbers, units), channels=names if any(names) else [], colors=colors)
+    return replace(_micrometres(sizes, units), channels=names if any(names) else [], colors=colors)
 
 
 def _color(text: str | None) -> tuple[float, float, float] | None:
@@ -141,50 +146,90 @@ def _color(text: str | None) -> tuple[float, float, float] | None:
     return (red / 255, green / 255, blue / 255) if red + green + blue else None
 
 
-def imagej_facts(told: dict[str, Any], resolution: tuple[float, float], unit: int) -> Facts:
-    """Facts of ImageJ's description.
+def imagej_facts(told: dict[str, Any], resolution: tuple[float | None, float | None], tag: int) -> Facts:
+    """Return what ImageJ's description says, as ImageJ reads it (ij.io.TiffDecoder and FileOpener, 1.54).
+
+    ImageJ counts the resolution in the description's unit (micrometres per centimetre excepted), takes 72 dots per
+    inch for no size, and leaves out a distance between slices that is 1.
 
     Args:
         told: its entries.
-        resolution: pixels per unit along x and y (tags 282 and 283).
-        unit: tag 296; 1 where the resolution is in the description's own unit.
+        resolution: pixels per unit along x and y (tags 282 and 283); None where the file has none.
+        tag: ResolutionUnit (tag 296); 1 where the file has none.
     """
-    images = math.prod(int(told.get(key, 1)) for key in ("channels", "slices", "frames"))
-    name = str(told.get("unit", "")).strip()
-    units = [name, str(told.get("yunit", name)), str(told.get("zunit", name))]
-    depth = _positive(told.get("spacing"))
-    if not name and unit != 1:  # dots per inch of a printer
-        return Facts((None, None, depth), images=images)
-    across = [1 / n if _positive(n) else None for n in resolution]
-    if not name and depth is None and across == [1.0, 1.0]:
+    if "scales" in told:  # SCIFIO's lists, in parallel
+        scales = dict(zip(*(str(told.get(key, "")).split(",") for key in ("axes", "scales")), strict=False))
+        x, y, z = (_positive(scales.get(axis)) for axis in "XYZ")
+        resolution, tag, told = (x and 1 / x, y and 1 / y), 1, {"spacing": z, **told}
+    channels, slices, frames = (int(told.get(key, 1)) for key in ("channels", "slices", "frames"))
+    images, assumed, name = channels * slices * frames, [], str(told.get("unit", "")).strip()
+    unit, per = _unit(name), _PER.get(tag, "")
+    across = [1 / n if n else None for n in map(_positive, resolution)]
+    if per and (unit in ("", "pixel") or (per == "inch" != unit and across[0] == 1 / 72)):
+        across = [None, None]  # dots of a printer
+    elif per and _metres(unit) not in (None, _metres(per)):
+        metric = per == "cm" and _metres(unit) == MICROMETRE
+        across = [n and n * (1e4 if metric else 1) for n in across]
+        if unit != "um" or not metric:
+            assumed.append(f"resolution per {per} by its tag, in {name} by ImageJ's description; "
+                           f"taken per {per if metric else name}")  # fmt: skip
+    depth = told.get("spacing") or None
+    if unit in ("", "pixel") and depth is None and not set(across) - {None, 1.0}:
         return Facts(images=images)
-    return replace(_micrometres([*across, depth], units), images=images)
+    if None in across:
+        assumed.append("no size of its pixels; taken as 1")
+    if depth is None and max(images, int(told.get("images", 1))) > channels * frames:
+        depth = 1.0
+        assumed.append("no distance between its slices; taken as 1, as ImageJ takes it")
+    sizes = {
+        "x": across[0] or 1,
+        "y": across[1] or 1,
+        "spacing": abs(depth) if isinstance(depth, float | int) else depth,
+    }
+    facts = _micrometres(sizes, [name, str(told.get("yunit", name)), str(told.get("zunit", name))])
+    return replace(facts, images=images, assumed=tuple(assumed))
+
+
+def count_planes(file: Any) -> None:
+    """Make the planes of one directory slices if ImageJ's description counts more of them than it gives axes."""
+    told = file.imagej_metadata if file.is_imagej and not file.pages.is_multipage else None
+    images = int(told.get("images", 1)) if told else 1
+    if told and images > math.prod(int(told.get(key, 1)) for key in ("channels", "slices", "frames")):
+        told.update(channels=1, slices=images, frames=1)
 
 
 def _positive(value: Any) -> float | None:
+    """Return a size as a number above 0, None where there is none, NaN where it is text but no number."""
     try:
-        number = float(value)
+        number = float(value or 0)
     except (TypeError, ValueError):
-        return None
+        return math.nan
     return number if math.isfinite(number) and number > 0 else None
 
 
-def _micrometres(numbers: list[float | None], units: list[str]) -> Facts:
-    """Spacing in micrometres; as it is where its one unit is none of length."""
+def _micrometres(sizes: dict[str, Any], units: list[str]) -> Facts:
+    """Return the spacing in micrometres, or as stated if its one unit is none of length, from sizes along x, y, z."""
+    numbers = [_positive(size) for size in sizes.values()]
+    odd = [key for key, n in zip(sizes, numbers, strict=True) if n is not None and math.isnan(n)]
     plain = [_unit(unit) for unit in units]
-    metres = [METRES.get(unit, METRES.get(unit.lower())) for unit in plain]
-    told = {u: m for u, m, n in zip(plain, metres, numbers, strict=True) if n is not None}
-    if None in told.values():
-        return Facts(triple(numbers), units=", ".join(told) if len(told) > 1 else "")
+    lengths = [_metres(unit) for unit in plain]
+    told = {u: m for u, m, n in zip(plain, lengths, numbers, strict=True) if n is not None}
+    if odd or None in told.values():
+        mixed = f"voxel sizes in {', '.join(told)}; expected one unit" if len(told) > 1 else ""
+        return Facts(triple(numbers), trouble=f"{odd[0]} is {sizes[odd[0]]!r}; expected a number" if odd else mixed)
     return Facts(
         triple(
             None if n is None else float(f"{n * float(m or 1) / MICROMETRE:.15g}")
-            for n, m in zip(numbers, metres, strict=True)
+            for n, m in zip(numbers, lengths, strict=True)
         ),
         length="um" if told else "",
     )
 
 
 def _unit(text: str) -> str:
-    text = re.sub(r"\\u00b5", "µ", text.strip(), flags=re.I).replace("\u03bc", "µ")
+    text = re.sub(r"\\u([0-9a-f]{4})", lambda code: chr(int(code[1], 16)), text.strip(), flags=re.I)
     return _OTHER_NAMES.get(text, text)
+
+
+def _metres(unit: str) -> float | None:
+    return 0.0254 if unit == "inch" else metres(unit)

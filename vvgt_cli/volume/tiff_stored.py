@@ -62,27 +62,19 @@ def lazy_pages(
 
 
 def lazy_files(files: list[Path], plane: np.ndarray, of: Callable[[Path], np.ndarray], source: str) -> Stored:
-    """Slice z is file z, read by ``of`` as (1, y, x) as ``plane`` is, the first of them."""
+    """Return slices that stay in their files; ``of`` reads one as (1, y, x), all as ``plane``, the first of them."""
 
     def read(slices: Slices) -> np.ndarray:
         z, y, x = slices
         out = np.empty((z.stop - z.start, y.stop - y.start, x.stop - x.start), plane.dtype)
         for k in range(z.start, z.stop):
-            out[k - z.start] = checked(of(files[k]), plane, files[k], files[0])[0, y, x]
+            values = of(files[k])
+            if values.shape != plane.shape or values.dtype != plane.dtype:
+                raise DataError(
+                    f"{files[k]}: {values.shape[2]} x {values.shape[1]} {values.dtype}; expected {plane.shape[2]} x "
+                    f"{plane.shape[1]} {plane.dtype} as in {files[0].name}"
+                )
+            out[k - z.start] = values[0, y, x]
         return out
 
     return Stored(read, plane.dtype, (len(files), *plane.shape[1:]), (1, *plane.shape[1:]), source)
-
-
-def checked(values: np.ndarray, plane: np.ndarray, path: Path, first: Path) -> np.ndarray:
-    """``values`` (1, y, x) of a file that must be as ``plane``, that of the first one.
-
-    Raises:
-        DataError: they are of another size or type.
-    """
-    if values.shape != plane.shape or values.dtype != plane.dtype:
-        raise DataError(
-            f"{path}: {values.shape[2]} x {values.shape[1]} {values.dtype}; expected {plane.shape[2]} x "
-            f"{plane.shape[1]} {plane.dtype} as in {first.name}"
-        )
-    return values

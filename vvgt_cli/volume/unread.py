@@ -16,8 +16,7 @@ ROWS = (
     (rb"ply\r?\n", "", "a .ply (Gaussians, points or a mesh)", "give the volume that it was made from (see also "
      "'vvgt info', 'vvgt render' and 'vvgt evaluate {name} --volume VOLUME')"),
     (rb"NanoVDB", "", "NanoVDB, which is laid out for GPUs", "nanovdb_convert {name} {stem}.vdb (comes with OpenVDB)"),
-    (rb"PK\x03\x04|7z\xbc\xaf|\xfd7zXZ|\x28\xb5\x2f\xfd|Rar!", r"(?<!zarr)\.(?!ozx$)\w+", "an archive or packed",
-     "unpack it first"),
+    (rb"7z\xbc\xaf|\xfd7zXZ|\x28\xb5\x2f\xfd|Rar!", "", "an archive or packed", "unpack it first"),
     (rb"SIMPLE  =", "", "FITS", "in Python: numpy.save('{stem}.npy', astropy.io.fits.getdata('{name}'))"),
     (rb"MATLAB 5", "", "a MATLAB file before version 7.3", _MAT),
     (rb"\x0e\x03\x13\x01", "", "HDF4", "h4toh5convert '{name}' '{stem}.h5' (HDF Group's h4h5tools)"),

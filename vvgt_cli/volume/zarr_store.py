@@ -217,12 +217,23 @@ def _multiscale(group: Path) -> dict[str, Any]:
 
 
 def _ome_axes(place: Path, shape: tuple[int, ...]) -> list[Axis]:
-    """Axes of an OME-Zarr image's level; empty where the array is none."""
+    """Return the axes of a level of an OME-Zarr image; none where the array is not one.
+
+    Images of versions before 0.3 state no axes: they are t, c, z, y, x.
+
+    Raises:
+        DataError: axes that do not fit the array.
+    """
     image = _multiscale(place.parent)
     level = next((d for d in image.get("datasets", []) if str(d.get("path")) == place.name), None)
-    described = image.get("axes", [])
-    if level is None or len(described) != len(shape):
+    if level is None:
         return []
+    described = image.get("axes") or list("tczyx")
+    if len(described) != len(shape):
+        raise DataError(
+            f"{place}: OME-Zarr {image.get('version', 'of no version')} with {len(shape)} axes of values; expected "
+            f"{len(described)} ({'as its metadata list' if image.get('axes') else 't, c, z, y, x'})"
+        )
     scale, shift = np.ones(len(shape)), np.zeros(len(shape))
     for step in [*level.get("coordinateTransformations", []), *image.get("coordinateTransformations", [])]:
         factor = np.asarray(step.get("scale", np.ones(len(shape))), np.float64)

@@ -134,11 +134,8 @@ def _metadata(xml: str, channels: int, path: Path) -> tuple[Any, list[str], list
 
 
 def _micrometres(text: str | None) -> float | None:
-    """Of a length in metres."""
-    try:
-        value = float(text or "nan") / MICROMETRE
-    except ValueError:
-        return None
+    """Convert a length in metres, as text, to micrometres; None where there is none or it is not positive."""
+    value = float(text or "nan") / MICROMETRE
     return float(f"{value:.12g}") if math.isfinite(value) and value > 0 else None
 
 

@@ -9,8 +9,9 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians.frames import up_matrix
 from vvgt_cli.gaussians.header import facts_in
-from vvgt_cli.volume.space import MILLIMETRES
+from vvgt_cli.volume.space import metres
 
+SMALLEST = 1e-9  # metres: molecules, in angstroms, would be too small for any viewer
 HALF_TURN = np.diag([-1.0, -1.0, 1.0])  # about z: from up as 3DGS viewers have it, -y, to +y
 
 
@@ -47,9 +48,10 @@ def placed(comments: tuple[str, ...], name: str) -> Placed:
     facts = facts_in(list(comments), name)
     space = facts.get("space") or "none"
     unit = "mm" if space != "none" else facts.get("length_unit") or ""
-    if unit not in MILLIMETRES or "scale" not in facts:
+    metre = metres(unit)
+    if metre is None or metre < SMALLEST or "scale" not in facts:
         return Placed(1.0, np.zeros(3))
-    turn, metre = HALF_TURN @ up_matrix(facts["up"]), MILLIMETRES[unit] / 1000
+    turn = HALF_TURN @ up_matrix(facts["up"])
     world = np.eye(4)
     world[:3, :3] = turn.T / metre
     if facts["frame"] == "world":
