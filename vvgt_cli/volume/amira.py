@@ -16,10 +16,10 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import check_memory, count, load_block
 from vvgt_cli.volume.components import ArrayInfo, choose_array, select_component
-from vvgt_cli.volume.headers import MAX_HEADER, Fields, printable, unit_rows
-from vvgt_cli.volume.labelled import METRES
+from vvgt_cli.volume.headers import MAX_HEADER, Fields, unit_rows
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import Reader, register, volume_name
+from vvgt_cli.volume.space import one_unit
 from vvgt_cli.volume.types import Volume
 
 _TYPES = {"byte": "u1", "short": "i2", "ushort": "u2", "int": "i4", "float": "f4", "double": "f8"}
@@ -28,7 +28,6 @@ _STREAM = re.compile(  # place, type, components, name, number, encoding, length
     r"(?:\(\s*(\w+)\s*,\s*(\d*)\s*\))?",
     re.MULTILINE,
 )
-_UNITS = {"µm": "um", "μm": "um", "micron": "um", "A": "angstrom", "Å": "angstrom"}
 
 
 def read_amira(path: Path, options: ReadOptions) -> Volume:
@@ -81,10 +80,7 @@ def _placed(field: np.ndarray, fields: Fields, text: str, path: Path, options: R
         matrix = np.reshape(fields.floats("TransformationMatrix", fields["TransformationMatrix"], 16), (4, 4))
     lengths, direction = unit_rows((step[:, None] * matrix[:3, :3]).tolist())
     stated = re.search(r'\bUnits\s*\{[^}]*?\bCoordinates\s+"([^"\n]*)"', text)
-    unit = "" if stated is None else _UNITS.get(stated[1], stated[1])
-    if unit and unit not in METRES:
-        warnings.warn(f"{path}: its unit of length {printable(unit)[:40]!r} is not known; it is not used", stacklevel=2)
-        unit = ""
+    _, unit = one_unit(["" if stated is None else stated[1]], str(path), options.spacing is not None)
     origin = tuple((np.append(low, 1.0) @ matrix)[:3].tolist())
     return Volume(field, options.spacing_or(lengths), origin, direction, volume_name(path), unit=unit)
 
