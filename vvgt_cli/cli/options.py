@@ -100,7 +100,8 @@ LABELS = dict(
     labels=click.option(
         "--labels", metavar="TABLE|auto|none",
         help="Treat VOLUME as a label map coloured by TABLE (3D Slicer, ITK-SNAP, FreeSurfer, CSV, TSV, .seg.nrrd, "
-        "DICOM SEG, JSON); 'auto' assigns distinct colours, 'none' treats it as scalars. Default: detected from name and type.",
+        "DICOM SEG, JSON); 'auto' assigns distinct colours, 'none' treats it as scalars. Default: detected from name "
+        "and type.",
     ),
     layers=click.option(
         "--layer", "layers", multiple=True, metavar="FILE[,tf=TF][,labels=TABLE]...",

@@ -252,11 +252,11 @@ def _drawable(rows: np.ndarray, header: PlyHeader, name: str) -> np.ndarray:
     kept = np.logical_and.reduce([*map(np.isfinite, values), rotated, opaque | np.isfinite(rows["opacity"])])
     if kept.all() and not opaque.any():
         return rows
-    rows, skipped = rows[kept], int(np.count_nonzero(~kept))
+    told = {"skipped (a value not finite, or rotation 0)": ~kept, "taken as opaque (opacity inf)": opaque & kept}
+    counts = [f"{count} {what}" for what, these in told.items() if (count := np.count_nonzero(these))]
+    warnings.warn(f"{name}: of {len(kept)} Gaussians {', '.join(counts)}", stacklevel=3)
+    rows = rows[kept]
     rows["opacity"][opaque[kept]] = OPAQUE
-    what = f"{skipped} of {len(kept)} Gaussians skipped (a value is not finite, or the rotation 0)"
-    more = f"{np.count_nonzero(opaque & kept)} of infinite opacity taken as opaque"
-    warnings.warn(f"{name}: {what}, {more}", stacklevel=3)
     return rows
 
 
