@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 from fuzz import Seed
-from fuzz_splats import ply, sog
+from fuzz_splats import others, ply, sog
 
 from vvgt_cli.volume import ReadOptions, read_volume
 
@@ -283,8 +283,21 @@ def transfer() -> list[Seed]:
     ]
 
 
+def colormaps() -> list[Seed]:
+    from test_look_colormaps import CLUT, COLORS, NIIVUE, nih
+
+    from vvgt_cli.look import read_transfer_function
+
+    read = lambda path: read_transfer_function(str(path)).color(np.array([0.0, 0.5, 1.0, np.nan]))  # noqa: E731
+    text = "\n".join(" ".join(map(str, row)) for row in COLORS.tolist())
+    files = {"a.json": json.dumps(NIIVUE).encode(), "b.clut": CLUT.format(lo=0, hi=9).encode(), "c.lut": text.encode()}
+    files |= {"d.lut": nih(COLORS[:9]), "e.lut": COLORS.T.tobytes()}
+    return [Seed(name, content, read) for name, content in files.items()]
+
+
 def label_tables() -> list[Seed]:
     from test_labels import FREESURFER, JSON, SEGMENTS, SLICER, SNAP
+    from test_look_tables import BIDS, FASTSURFER, ROWS, SLICER_CSV
 
     from vvgt_cli.look.label_files import read_labels
 
@@ -296,6 +309,11 @@ def label_tables() -> list[Seed]:
         Seed("a.label", SNAP.encode(), read),
         Seed("a.json", JSON.encode(), read),
         Seed("a.seg.nrrd", SEGMENTS.encode() + bytes(8), read),
+        Seed("b.txt", ROWS.format(a=255, b=128, c=0).encode(), read),
+        Seed("a.csv", SLICER_CSV.encode(), read),
+        Seed("b.csv", SLICER_CSV.replace("lung,", "lung").replace(",", ";").encode("utf-8-sig"), read),
+        Seed("dseg.tsv", BIDS.encode(), read),
+        Seed("f.tsv", FASTSURFER.encode(), read),
     ]
 
 
@@ -378,8 +396,10 @@ def readers() -> dict[str, list[Seed]]:
         "OpenVDB": vdb(),
         "NumPy": numpy_files(),
         "transfer function": transfer(),
+        "colour map": colormaps(),
         "label table": label_tables(),
         "Gaussians": ply(),
+        "Gaussians of others": others(),
         "SOG": sog(),
         "view set": cameras(),
         "model card": model_card(),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import zipfile
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 from fuzz import Seed
@@ -26,6 +27,27 @@ def ply() -> list[Seed]:
         write_ply(stream, gaussians, options)
         seeds.append(Seed(name, stream.getvalue(), lambda path: describe(*read_ply(path))))
     return seeds
+
+
+def others() -> list[Seed]:
+    """Files of other programs: compressed ones, without and with a range of colours and harmonics, and `.splat`."""
+    from gsply import reader
+    from test_gaussians_others import COLORS, GOOD, RANGES, compressed, damaged, splat
+    from test_gaussians_others import ply as plain
+
+    from vvgt_cli.gaussians.formats import read_columns, read_splats
+
+    for name in ("_unpack_all_jit", "_unpack_sh_jit"):  # in Python: threads of OpenMP do not survive the fuzzer's forks
+        setattr(reader, name, getattr(getattr(reader, name), "py_func", getattr(reader, name)))
+
+    def read(path: Path) -> None:
+        read_columns(path)
+        read_splats(path)
+
+    shaded = compressed(RANGES + COLORS, elements="sh chunk vertex", sh=9, count=9, chunks=1)
+    files = {"a.compressed.ply": compressed(RANGES, count=9, chunks=1), "b.compressed.ply": shaded}
+    files |= {"c.splat": splat(GOOD[:9]), "d.ply": plain(damaged())}
+    return [Seed(name, content, read) for name, content in files.items()]
 
 
 def sog() -> list[Seed]:

@@ -152,6 +152,57 @@ def test_info_names_a_function_that_fits(tmp_path: Path, vvgt: Callable) -> None
     assert b"nodes_in" in vvgt("info", "mr-head").out
 
 
+def phantom(part: str, *, rest: float = -930, noise: float = 12) -> np.ndarray:
+    """Hounsfield units on a grid of 4 mm, with blurred edges: a head in its rest, a chest, an abdomen, a bottle."""
+    rng = np.random.default_rng(1)
+    z, y, x = (4.0 * (np.indices((60, 70, 90)).T - [29.5, 34.5, 44.5])).T
+    values = np.full(x.shape, -1000.0)
+
+    def fill(value: float, centre: tuple[float, float, float], radii: tuple[float, float, float]) -> None:
+        inside = sum(((a - c) / r) ** 2 for a, c, r in zip((z, y, x), centre, radii, strict=True)) < 1
+        values[inside] = value
+
+    if part == "head":
+        fill(rest, (0, 20, 0), (400, 115, 105))
+        fill(-1000, (0, 20, 0), (400, 100, 90))
+        values[(y < 0) & (values == rest)] = -1000
+        for value, smaller in ((-90, 0), (20, 4), (1000, 6), (35, 13)):
+            fill(value, (0, 0, 0), (100 - smaller, 95 - smaller, 75 - smaller))
+        for side in (-35, 0, 35):
+            fill(-1000, (-30, -55, side), (25, 22, 14))
+    elif part == "water":
+        fill(0, (0, 0, 0), (900, 25, 25))
+    else:
+        for value, radii in ((-95, (900, 115, 165)), (45, (900, 95, 145))):
+            fill(value, (0, 0, 0), radii)
+        for side in (-72, 72) if part == "chest" else ():
+            fill(-840, (0, 5, side), (100, 80, 55))
+        for _ in range(12 if part == "abdomen" else 0):
+            fill(-1000, tuple(rng.uniform(-60, 60, 3)), (20, 20, 20))
+        fill(500, (0, 75, 0), (900, 18, 18))
+    for axis in range(3):
+        values = (np.roll(values, 1, axis) + 2 * values + np.roll(values, -1, axis)) / 4
+    return (values + rng.normal(0, noise, values.shape)).clip(-1024, 3071).astype(np.int16)
+
+
+@pytest.mark.parametrize(
+    ("part", "options", "name"),
+    [
+        ("head", {}, "ct-bone"),
+        ("head", {"rest": -880}, "ct-bone"),
+        ("head", {"noise": 60}, "ct-bone"),
+        ("chest", {}, "ct-lung"),
+        ("chest", {"noise": 60}, "ct-lung"),
+        ("abdomen", {}, "ct-bone"),
+        ("water", {}, "ct-soft-tissue"),
+    ],
+)
+def test_lungs_are_those_of_a_chest(part: str, options: dict[str, float], name: str) -> None:
+    """Not the surfaces and the rest of a head, whose voxels lie between air and tissue too."""
+    volume = Volume(phantom(part, **options), hounsfield=True)
+    assert fitting(statistics(volume), volume) == name
+
+
 @pytest.mark.parametrize("name", ["density-contour", "ct-bone", "mr-head"])
 def test_blocks_count_for_functions_of_the_histogram(name: str) -> None:
     assert needs_histogram(SourceRequest("v.mrc", tf=name))

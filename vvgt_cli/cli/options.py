@@ -101,8 +101,9 @@ unit_distance_option = click.option(
 LABELS = dict(
     labels=click.option(
         "--labels", metavar="TABLE|auto|none",
-        help="Treat VOLUME as a label map coloured by TABLE (3D Slicer, ITK-SNAP, FreeSurfer, .seg.nrrd, DICOM SEG, "
-        "JSON); 'auto' assigns distinct colours, 'none' treats it as scalars. Default: detected from name and type.",
+        help="Treat VOLUME as a label map coloured by TABLE (3D Slicer, ITK-SNAP, FreeSurfer, CSV, TSV, .seg.nrrd, "
+        "DICOM SEG, JSON); 'auto' assigns distinct colours, 'none' treats it as scalars. Default: detected from name "
+        "and type.",
     ),
     layers=click.option(
         "--layer", "layers", multiple=True, metavar="FILE[,tf=TF][,labels=TABLE]...",

@@ -20,6 +20,7 @@ from vvgt_cli.gaussians import describe, read_ply, write_ply
 from vvgt_cli.gaussians.formats import format_of, read_splats
 from vvgt_cli.gaussians.formats.levels import split_name
 from vvgt_cli.gaussians.formats.streamed import facts_of
+from vvgt_cli.look.function import PER_VOXEL
 from vvgt_cli.look.label_files import holds_table, is_table, read_labels, segments_of
 from vvgt_cli.look.labels import LabelTable
 from vvgt_cli.look.readers import SUFFIXES
@@ -128,6 +129,8 @@ def _transfer_function(file: str) -> dict[str, Any]:
         facts["opacity_per"] = f"{tf.opacity_unit_share:g} of the longest edge"
     if tf.opacity_unit_distance is not None:
         facts["opacity_per"] = f"{tf.opacity_unit_distance:g} ({tf.opacity_unit_label})"
+    if tf.opacity_unit_label == PER_VOXEL:
+        facts["opacity_per"] = "mean edge of a voxel"
     if tf.lighting is not None:
         facts["light"] = tf.lighting.text()
     return facts

@@ -25,6 +25,7 @@ def convert_transfer_function(
     """
     from vvgt_cli.look import read_transfer_function
     from vvgt_cli.look.convert import placed, to_text
+    from vvgt_cli.look.function import PER_VOXEL
     from vvgt_cli.look.resolve import parse_tf_range
 
     check_outputs([Output("OUT", output, (".json",), binary=False)], [tf.partition("#")[0]], overwrite)
@@ -33,8 +34,8 @@ def convert_transfer_function(
         raise UsageError("--tf-range rescale needs the data, and this command reads none; give --tf-range LO,HI")
     function = placed(read_transfer_function(tf), None if isinstance(limits, str) else limits)
     text = to_text(function, form)
-    if form == "paraview" and function.opacity_unit_distance is not None:
-        distance = f"{function.opacity_unit_distance:g}"
+    distance = PER_VOXEL if function.opacity_unit_label == PER_VOXEL else f"{function.opacity_unit_distance or 0:g}"
+    if form == "paraview" and distance != "0":
         (console or Console()).say(
             f"{output}: a ParaView preset holds no unit distance: set it to {distance} there, or give "
             f"--opacity-unit-distance {distance} here"

@@ -262,7 +262,7 @@ def _functions(
 def _table(labels: str | LabelTable | None, found: Sequence[int]) -> LabelTable:
     """Of a series of label maps; colours that are made depend on a label's number alone."""
     if isinstance(labels, str) and labels != AUTO:
-        return read_labels(labels)
+        return read_labels(labels).warned(found, "the series")
     return labels if isinstance(labels, LabelTable) else distinct(found)
 
 

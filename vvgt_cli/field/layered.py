@@ -328,7 +328,7 @@ def _overlapping(
 def _labelled(volume: Volume, labels: str | LabelTable | None, distance: str | None, access: Access) -> Layer:
     numbers = access.labels(volume)
     if isinstance(labels, str) and labels != AUTO:
-        table = read_labels(labels).of(numbers, volume.name)
+        table = read_labels(labels).warned(numbers, volume.name).of(numbers, volume.name)
     elif isinstance(labels, LabelTable):
         table = labels.of(numbers, volume.name)
     elif any(numbers):

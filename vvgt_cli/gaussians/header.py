@@ -27,7 +27,7 @@ REQUIRED = (
 )
 _BASIC = {"char": "i1", "uchar": "u1", "short": "<i2", "ushort": "<u2", "int": "<i4", "uint": "<u4"}
 _SIZED = {"int8": "i1", "uint8": "u1", "int16": "<i2", "uint16": "<u2", "int32": "<i4", "uint32": "<u4"}
-_TYPES = _BASIC | _SIZED | {"float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8"}
+TYPES = _BASIC | _SIZED | {"float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8"}
 MIP = "SplatRenderMode: mip"  # as Brush marks opacity that is to be compensated
 _ADVICE = "expected a binary little-endian 3DGS .ply, as vvgt and SuperSplat write it"
 
@@ -100,7 +100,7 @@ class PlyHeader(FileFacts):
     version: str | None = None
 
 
-def _split(content: bytes, name: str) -> tuple[list[str], int]:
+def header_lines(content: bytes, name: str) -> tuple[list[str], int]:
     """Header lines and the header's size in bytes."""
     if not content.startswith((b"ply\n", b"ply\r\n")):
         raise DataError(f"{name}: starts with {content[:8]!r}, not with 'ply'; {_ADVICE}")
@@ -132,13 +132,13 @@ def _vertex_count(words: list[str], name: str) -> int:
 
 
 def _property(words: list[str], fields: dict[str, str], name: str) -> None:
-    if len(words) != 3 or words[1] not in _TYPES:
+    if len(words) != 3 or words[1] not in TYPES:
         raise DataError(f"{name}: property {' '.join(words[1:])!r}; expected a scalar type and a name")
     if words[2] in fields:
         raise DataError(f"{name}: property {words[2]!r} stands twice in the header")
-    if (words[2] in REQUIRED or words[2].startswith("f_rest_")) and _TYPES[words[1]] != "<f4":
+    if (words[2] in REQUIRED or words[2].startswith("f_rest_")) and TYPES[words[1]] != "<f4":
         raise DataError(f"{name}: property {words[2]} is {words[1]}; expected float")
-    fields[words[2]] = _TYPES[words[1]]
+    fields[words[2]] = TYPES[words[1]]
 
 
 def _sh_degree(fields: dict[str, str], name: str) -> int:
@@ -169,7 +169,7 @@ def parse_header(content: bytes, name: str) -> PlyHeader:
     Raises:
         DataError: another magic, format, element, property or type than a 3DGS `.ply` has.
     """
-    lines, size = _split(content, name)
+    lines, size = header_lines(content, name)
     formats, count, comments = [], None, []
     fields: dict[str, str] = {}
     for line in lines[1:]:

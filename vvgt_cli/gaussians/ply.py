@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,12 +14,13 @@ import numpy as np
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import seekable
 from vvgt_cli.gaussians.frames import rescale, turn, up_matrix
-from vvgt_cli.gaussians.header import FileFacts, PlyHeader, comment_lines, parse_header, rest_names
+from vvgt_cli.gaussians.header import REQUIRED, FileFacts, PlyHeader, comment_lines, parse_header, rest_names
 from vvgt_cli.gaussians.live_facts import CARRIED, COLUMNS, GRADIENT, LABEL, LAYER, NORMAL, NUMBER, ROW, LiveFacts
 from vvgt_cli.gaussians.types import HARMONICS, SH_C0, Gaussians
 from vvgt_cli.volume.space import axis_facts
 
 FRAMES = ("unit", "world")
+OPAQUE = 16.0  # logit of an opacity of 1 - 1e-7
 _HEADER_LIMIT = 1 << 18  # bytes; a header longer than this is not one
 
 
@@ -211,14 +213,17 @@ def read_ply(source: str | Path | BinaryIO) -> tuple[Gaussians, PlyHeader]:
     """Read a 3DGS `.ply` from a path or a binary stream, in the frame that the file is in.
 
     Properties are found by name, so files of other programs in another order are read too. Harmonics that are all 0
-    are none, but padding: ``header.sh_degree`` tells how far it goes.
+    are none, but padding: ``header.sh_degree`` tells how far it goes. In other programs' files rows that cannot be
+    drawn are skipped, with a warning (`_drawable`).
 
     Raises:
-        DataError: not a binary little-endian 3DGS `.ply`, of another size than its header says, or with
+        DataError: not a binary little-endian 3DGS `.ply`, of another size than its header says, or a file of vvgt with
             values that are not finite.
     """
     name = str(source) if isinstance(source, str | Path) else getattr(source, "name", "stream")
     header, rows = _rows(source, str(name))
+    if header.version is None:
+        rows = _drawable(rows, header, str(name))
 
     def columns(*names: str) -> np.ndarray:
         return np.stack([rows[n] for n in names], axis=-1).astype(np.float32)
@@ -237,6 +242,22 @@ def read_ply(source: str | Path | BinaryIO) -> tuple[Gaussians, PlyHeader]:
         raise DataError(f"{name}: {error}") from None
     _check_rotations(gaussians, str(name))
     return gaussians, header
+
+
+def _drawable(rows: np.ndarray, header: PlyHeader, name: str) -> np.ndarray:
+    """Return rows of finite values and rotation other than 0, opacity +inf as `OPAQUE`; a warning counts the rest."""
+    opaque = rows["opacity"] == np.inf
+    rotated = np.any([rows[f"rot_{k}"] for k in range(4)], axis=0)
+    values = [rows[key] for key in (*REQUIRED, *rest_names(header.sh_degree)) if key != "opacity"]
+    kept = np.logical_and.reduce([*map(np.isfinite, values), rotated, opaque | np.isfinite(rows["opacity"])])
+    if kept.all() and not opaque.any():
+        return rows
+    told = {"skipped (a value not finite, or rotation 0)": ~kept, "taken as opaque (opacity inf)": opaque & kept}
+    counts = [f"{count} {what}" for what, these in told.items() if (count := np.count_nonzero(these))]
+    warnings.warn(f"{name}: of {len(kept)} Gaussians {', '.join(counts)}", stacklevel=3)
+    rows = rows[kept]
+    rows["opacity"][opaque[kept]] = OPAQUE
+    return rows
 
 
 def _harmonics(rest: np.ndarray) -> np.ndarray | None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.look.colormap import ColorMap
-from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.look.function import PER_VOXEL, TransferFunction
 from vvgt_cli.look.lighting import COEFFICIENTS
 from vvgt_cli.look.opacity import PiecewiseOpacity
 from vvgt_cli.look.resolve import BY
@@ -61,19 +61,19 @@ def _refuse(tf: TransferFunction, what: str, form: str, hint: str) -> DataError:
 
 
 def _minimal(tf: TransferFunction) -> dict[str, Any]:
-    hint = "try --format paraview"
     if not _linear(tf.opacity_nodes) or not _linear(tf.color_map):
-        raise _refuse(tf, "midpoints, sharpness or a logarithmic scale", "the minimal format", hint)
-    if tf.color_map.space == "HSV" and not tf.color_map.hsv_wrap:
-        raise _refuse(tf, "HSV the long way round", "the minimal format", hint)
+        what = "midpoints, sharpness or a logarithmic scale"
+        raise _refuse(tf, what, "the minimal format", "try --format paraview")
     body: dict[str, Any] = {"name": tf.name}
     if tf.domain in BY:
         body["range"] = tf.domain
     body["points"] = _points(tf)
     if tf.color_map.space != "RGB":
         body["color_space"] = tf.color_map.space
-    if tf.opacity_unit_distance is not None:
-        body["opacity_unit_distance"] = tf.opacity_unit_distance
+    if tf.color_map.space == "HSV" and not tf.color_map.hsv_wrap:
+        body["hsv_wrap"] = False
+    if tf.opacity_unit_distance is not None or tf.opacity_unit_label == PER_VOXEL:
+        body["opacity_unit_distance"] = tf.opacity_unit_distance or PER_VOXEL
     if tf.opacity_unit_share is not None:
         body["opacity_unit_share"] = tf.opacity_unit_share
     if tf.otherwise is not None:

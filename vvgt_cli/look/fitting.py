@@ -9,15 +9,17 @@ from vvgt_cli.look.recognise import foreground, in_hounsfield
 from vvgt_cli.look.resolve import StatisticsLike
 from vvgt_cli.volume.types import Volume
 
-LUNG, BODY, BONE = (-950.0, -600.0), -500.0, 300.0  # HU
-MUCH_LUNG, SOME_BONE = 0.15, 0.005  # of the voxels of the body, and of lungs
+LUNG, EDGE, BODY, BONE = (-900.0, -600.0), (-500.0, -200.0), (-500.0, np.inf), (300.0, np.inf)  # HU
+MUCH_LUNG, SOME_BONE = 0.12, 0.005  # of the voxels of the body, and of lungs
+OVER_BONE = 2.5  # times as many voxels as bone has are lungs in a chest; a skull has more bone than that
 
 
 def fitting(statistics: StatisticsLike, volume: Volume) -> str | None:
     """Name of a function that shows something of a volume, None where none is made for such data.
 
     Densities get contours. In Hounsfield units it is the lungs where they are large, else bone where there is any, else
-    soft tissue. Other volumes in an anatomical space, with a background, are taken for MR of a head.
+    soft tissue. Voxels on a surface to air have any value in between, `EDGE`'s as often as `LUNG`'s; foam of head rests
+    lies below. Other volumes in an anatomical space, with a background, are taken for MR of a head.
     """
     counts, edges = (np.asarray(a, dtype=np.float64) for a in (statistics.histogram, statistics.edges))
     if not counts.any() or statistics.lo == statistics.hi:
@@ -25,8 +27,9 @@ def fitting(statistics: StatisticsLike, volume: Volume) -> str | None:
     if volume.density:
         return contours(counts, edges)
     if volume.hounsfield or in_hounsfield(counts, edges):
-        lung, body, bone = (_share(counts, edges, *span) for span in (LUNG, (BODY, np.inf), (BONE, np.inf)))
-        if lung > MUCH_LUNG * (lung + body):
+        lung, edge, body, bone = (_share(counts, edges, *span) for span in (LUNG, EDGE, BODY, BONE))
+        lung -= edge
+        if lung > max(MUCH_LUNG * (lung + body), OVER_BONE * bone):
             return "ct-lung"
         return "ct-bone" if bone > SOME_BONE * body else "ct-soft-tissue"
     return "mr-head" if volume.space is not None and foreground(counts) is not counts else None

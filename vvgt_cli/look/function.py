@@ -13,6 +13,7 @@ from vvgt_cli.look.lighting import Lighting
 from vvgt_cli.look.opacity import PiecewiseOpacity
 
 DOMAINS = ("data", "fraction", "percentile", "foreground", "sigma")
+PER_VOXEL = "mean-spacing"  # as --opacity-unit-distance calls it
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,8 @@ class TransferFunction:
         opacity_nodes: opacity per unit distance over the scalar.
         color_map: colour over the scalar.
         opacity_unit_distance: world length that the opacities are per, when the source says one.
-        opacity_unit_label: where ``opacity_unit_distance`` is from: the ``file``, or a default of its program.
+        opacity_unit_label: where ``opacity_unit_distance`` is from: the ``file``, or a default of its program;
+            `PER_VOXEL` without a distance: opacities are per mean edge of a voxel.
         opacity_unit_share: the same as a share of the longest edge of the volume's box (Inviwo); not both.
         domain: what the node positions are: ``data`` values; a ``fraction`` in [0, 1] of the data range;
             a ``percentile`` / 100 of the voxels, or of those in the ``foreground``; or ``sigma``, standard deviations

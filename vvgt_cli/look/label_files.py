@@ -1,7 +1,8 @@
-"""Tables of labels: 3D Slicer's .ctbl, ITK-SNAP's .label, FreeSurfer's LUT, .seg.nrrd, DICOM SEG, and JSON.
+"""Tables of labels: 3D Slicer's, ITK-SNAP's .label, FreeSurfer's LUT, CSV and TSV, .seg.nrrd, DICOM SEG, and JSON.
 
-- 3D Slicer, `number name R G B A` with 0 to 255 each.
-- FreeSurfer (FreeSurferColorLUT.txt): the same, but A is transparency; 0 is opaque.
+- 3D Slicer (.ctbl, .txt), `number name R G B A` with 0 to 255 each.
+- FreeSurfer (FreeSurferColorLUT.txt): the same, but A is transparency; 0 is opaque. `_is_opacity` tells them apart.
+- CSV and TSV: a row of names of columns (`COLUMNS`), as 3D Slicer 5.9, FastSurfer and BIDS (dseg.tsv) write them.
 - ITK-SNAP: `number R G B A VIS MSH "name"`, colours 0 to 255, A in [0, 1], VIS 0 or 1.
 - .seg.nrrd: `Segment0_LabelValue:=1`, `Segment0_Name:=`, `Segment0_Color:=0.5 0.4 0.1`.
 - DICOM SEG: segment numbers, labels and recommended CIELab colours, else distinct ones.
@@ -10,7 +11,9 @@
 
 from __future__ import annotations
 
+import csv
 import re
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -23,14 +26,27 @@ from vvgt_cli.volume.dicom_seg import is_segmentation_file
 from vvgt_cli.volume.dicom_seg import segments as dicom_segments
 
 SEGMENTATION = ".seg.nrrd"  # a label map whose header is its table
-TABLES, TEXTS = (".ctbl", ".label"), (".txt", ".lut", ".json")  # endings of tables, and of what may be one
+SEPARATED = (".csv", ".tsv")
+TABLES, TEXTS = (".ctbl", ".label", *SEPARATED), (".txt", ".lut", ".json")  # endings of tables, and of possible ones
+COLUMNS = {  # names of columns in lower case; the first whose cell is not empty is used
+    "number": ("labelvalue", "index", "id", "value", "no.", "label"),
+    "name": ("name", "labelname", "label", "label name"),
+    "r": ("color_r", "r", "red"),
+    "g": ("color_g", "g", "green"),
+    "b": ("color_b", "b", "blue"),
+    "a": ("color_a", "a", "alpha"),
+    "color": ("color", "colour"),
+}
+NAMELESS = ("index", "name", "r", "g", "b", "a")
 MOST = 2**31  # of a label's number
 HEADER = 2**20  # bytes of a .seg.nrrd that are looked at
 EXPECTED = (
-    "expected a table of labels: 3D Slicer (.ctbl), ITK-SNAP (.label), FreeSurfer (number name R G B A), .seg.nrrd, "
+    "expected a table of labels: 3D Slicer (.ctbl), ITK-SNAP (.label), FreeSurfer (number name R G B A), .csv or .tsv "
+    "(index, name, R, G, B or color), .seg.nrrd, "
     'DICOM SEG, or JSON {"1": {"name": ..., "color": [r, g, b], "opacity": a}}'
 )
-_WHOLE = re.compile(r"-?[0-9]{1,10}")
+_WHOLE, _PART = re.compile(r"-?[0-9]{1,10}"), re.compile(r"-?[0-9]{1,10}(\.[0-9]{1,20})?")
+Row = tuple[str, int, str, Any, float | None]  # place for errors, label, name, colour in [0, 1], A / 255 or None
 _SNAP = re.compile(
     r'(-?[0-9]{1,10})\s+([0-9]{1,3})\s+([0-9]{1,3})\s+([0-9]{1,3})\s+([0-9]{1,3}(?:\.[0-9]*)?)\s+([01])\s+([01])\s+"(.*)"'
 )
@@ -77,7 +93,7 @@ def read_labels(source: str) -> LabelTable:
     if head.startswith(b"NRRD"):
         found = _segments(head.partition(b"\n\n")[0].decode("utf-8", "replace"), str(path))
     else:
-        found = _lines(text, path)
+        found = (_separated if path.suffix.lower() in SEPARATED else _lines)(text, path)
     return _table(found, str(path))
 
 
@@ -105,22 +121,91 @@ def _table(found: list[Label], what: str) -> LabelTable:
 
 
 def _lines(text: str, path: Path) -> list[Label]:
-    """Of a table of lines; those that begin with # are left out."""
-    found = []
+    """Read labels from a table of lines; those that begin with # are skipped."""
+    rows: list[Row] = []
+    opacity = path.suffix.lower() == ".ctbl"
     for n, line in enumerate(map(str.strip, text.splitlines()), 1):
         if not line or line.startswith("#"):
             continue
-        color: Sequence[str]
+        here = f"{path}: line {n}"
         if snap := _SNAP.fullmatch(line):
-            value, color, name, alpha = snap[1], snap.groups()[1:4], snap[8], float(snap[5]) * int(snap[6])
+            color, opacity = [int(v) / 255 for v in snap.groups()[1:4]], True
+            rows.append((here, int(snap[1]), snap[8], color, float(snap[5]) * int(snap[6])))
         elif plain := _plain(line):
-            value, name, color, last = plain
-            alpha = 1.0 if last is None else last if path.suffix.lower() == ".ctbl" else 1 - last
+            value, name, numbers, last = plain
+            rows.append((here, int(value), name, [float(v) / 255 for v in numbers], last))
         else:
-            raise DataError(f"{path}: line {n}: {line[:60]!r}; {EXPECTED}")
-        alpha = alpha if int(value) else 0.0
-        found.append(_label(f"{path}: line {n}", int(value), name, [int(v) / 255 for v in color], alpha))
+            raise DataError(f"{here}: {line[:60]!r}; {EXPECTED}")
+    return _labels(rows, path, text, opacity)
+
+
+def _separated(text: str, path: Path) -> list[Label]:
+    """Read labels from a CSV or TSV table; without a row of names its columns are `NAMELESS`.
+
+    Raises:
+        DataError: a row without a label, or a colour that is not of numbers.
+    """
+    lines = [line for line in text.splitlines(keepends=True) if line.strip() and not line.startswith("#")] or [""]
+    comma, rows, head = max("\t,;", key=lines[0].count), list[Row](), list[str]()
+    try:
+        head = [cell.strip().lower() for cell in next(csv.reader(lines, delimiter=comma), [])]
+        names, body = (NAMELESS, lines) if _WHOLE.fullmatch("".join(head[:1])) else (head, lines[1:])
+        for n, cells in enumerate(csv.DictReader(body, names, delimiter=comma), 1):
+            texts = {key: " ".join(cell.splitlines()).strip() for key, cell in cells.items() if isinstance(cell, str)}
+            found = {key: next((texts[k] for k in keys if texts.get(k)), "") for key, keys in COLUMNS.items()}
+            value, color = found["number"].removesuffix(".0"), [found[key] for key in "rgb" if found[key]]
+            numbers = all(_PART.fullmatch(found[key] or "0") for key in "rgba")
+            if not _WHOLE.fullmatch(value) or len(color) in (1, 2) or not numbers:
+                raise DataError(f"{path}: row {n}: label {value[:20]!r}, colour {', '.join(color)[:40]}; {EXPECTED}")
+            shown = [float(v) / 255 for v in color] or _hex(found["color"])
+            last = float(found["a"]) / 255 if found["a"] else None
+            rows.append((f"{path}: row {n}", int(value), found["name"], shown, last))
+    except csv.Error as error:
+        raise DataError(f"{path}: {error}; {EXPECTED}") from None
+    return _labels(rows, path, text, "color_a" in head)
+
+
+def _labels(rows: list[Row], path: Path, text: str, opacity: bool) -> list[Label]:
+    """Make labels of rows, in distinct colours where they have none; ``opacity``: column A is known to be that."""
+    opacity = opacity or _is_opacity([row[4] for row in rows if row[1] and row[4] is not None], path, text)
+    parts = [v * 255 for row in rows for v in row[3] or ()]
+    if parts and max(parts) <= 1 and any(v % 1 for v in parts):
+        raise DataError(f"{path}: no colour above 1; expected red, green and blue from 0 to 255")
+    colors: dict[int, Any] = {}
+    if blank := [row[1] for row in rows if row[3] is None]:
+        warnings.warn(f"{path.name}: {len(blank)} labels have no colour; shown in distinct ones", stacklevel=2)
+        colors = {label.number: list(label.color) for label in distinct(sorted(set(blank))).labels}
+    found = []
+    for here, value, name, color, last in rows:
+        alpha = 0.0 if not value else SOLID if last is None else last if opacity else 1 - last
+        found.append(_label(here, value, name or f"label {value}", color or colors[value], alpha))
     return found
+
+
+def _is_opacity(given: list[float], path: Path, text: str) -> bool:
+    """Tell whether column A of a table is opacity (3D Slicer), not transparency (FreeSurfer).
+
+    FreeSurfer's tables have 0 throughout and 3D Slicer's 255, or comments that name the program. ``given`` is A / 255
+    of every label but 0.
+    """
+    comments = " ".join(line for line in text.splitlines() if line.startswith("#")).lower()
+    if not any(given):
+        return False
+    if min(given) >= 1 or "color table file" in comments or "slicer" in comments:
+        return True
+    if "freesurfer" in comments or "label name" in comments:
+        return False
+    opacity = 2 * sum(a > 0.5 for a in given) > len(given)
+    slicer = "opacity, as in 3D Slicer; for transparency begin the table with '#No. Label Name: R G B A'"
+    freesurfer = "transparency, as in FreeSurfer; for opacity let its name end in .ctbl (or call A Color_A in a .csv)"
+    warnings.warn(f"{path.name}: column A is read as {slicer if opacity else freesurfer}", stacklevel=2)
+    return opacity
+
+
+def _hex(text: str) -> list[float] | None:
+    """Parse a colour, ``#rrggbb``; None for other texts."""
+    digits = text.removeprefix("#")
+    return [int(digits[k : k + 2], 16) / 255 for k in (0, 2, 4)] if re.fullmatch("[0-9a-fA-F]{6}", digits) else None
 
 
 def _plain(line: str) -> tuple[str, str, Sequence[str], float | None] | None:
@@ -130,12 +215,12 @@ def _plain(line: str) -> tuple[str, str, Sequence[str], float | None] | None:
     take the third power of its length.
     """
     words = line.split()
-    last = next((k for k, word in enumerate(reversed(words)) if not _WHOLE.fullmatch(word)), len(words))
+    last = next((k for k, word in enumerate(reversed(words)) if not _PART.fullmatch(word)), len(words))
     many = min(last, len(words) - 2, 4)  # of the numbers at the end; label and name come before
     if many < 3 or not _WHOLE.fullmatch(words[0]):
         return None
     name = line.split(None, 1)[1].rsplit(None, many)[0].strip('"')
-    return words[0], name, words[-many:][:3], int(words[-1]) / 255 if many == 4 else None
+    return words[0], name, words[-many:][:3], float(words[-1]) / 255 if many == 4 else None
 
 
 def _segments(header: str, what: str, layer: int | None = None) -> list[Label]:
@@ -175,8 +260,7 @@ def table_of(parsed: Any, what: str) -> LabelTable:
         if not re.fullmatch(r"-?\d{1,10}", key) or not isinstance(entry, dict):
             raise DataError(f"{what}: {key[:40]!r}; {EXPECTED}")
         color = entry.get("color")
-        if isinstance(color, str) and re.fullmatch(r"#[0-9a-fA-F]{6}", color):
-            color = [int(color[k : k + 2], 16) / 255 for k in (1, 3, 5)]
+        color = _hex(color) or color if isinstance(color, str) else color
         opacity = number(f"{what}: label {key}: opacity", entry.get("opacity", SOLID if int(key) else 0.0))
         name = str(entry.get("name", f"label {key}"))
         found.append(_label(f"{what}: label {key}", int(key), name, color, opacity))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -111,6 +112,14 @@ class LabelTable:
             )
         return replace(self, labels=tuple(known[n] for n in numbers if n in known))
 
+    def warned(self, numbers: Sequence[int], where: str) -> LabelTable:
+        """Return the table; a warning names those of a volume's labels, ``numbers``, that it hides, 0 aside."""
+        there = {*numbers} - {0}
+        if hidden := [f"{e.number} ({e.name})" for e in self.labels if e.number in there and not e.opacity]:
+            shown = ", ".join(hidden[:LISTED]) + (", ..." if len(hidden) > LISTED else "")
+            warnings.warn(f"{where}: {self.name} hides {len(hidden)} of its labels (opacity 0): {shown}", stacklevel=2)
+        return self
+
     def only(self, number: int) -> LabelTable:
         """The table with one label, the others transparent."""
         kept = tuple(e if e.number == number else replace(e, opacity=0.0) for e in self.labels)
@@ -124,7 +133,7 @@ def check_labels(looks: Sequence[Named]) -> None:
         DataError: they are transparent.
     """
     if all(isinstance(look, LabelTable) and not any(e.opacity > 0 for e in look.labels) for look in looks):
-        raise DataError(f"{looks[0].name}: none of its labels is visible; expected an opacity above 0")
+        raise DataError(f"{looks[0].name}: none of its labels is visible; expected opacity above 0: try --labels auto")
 
 
 def distinct(numbers: Sequence[int]) -> LabelTable:

@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.look.function import PER_VOXEL, TransferFunction
 from vvgt_cli.look.recognise import foreground, in_hounsfield, moments
 from vvgt_cli.volume.types import Volume
 
@@ -158,10 +158,10 @@ def unit_distance(spec: str | float | None, volume: Volume, tf: TransferFunction
             return tf.opacity_unit_distance, tf.opacity_unit_label
         if tf is not None and tf.opacity_unit_share is not None:
             return tf.opacity_unit_share * max(volume.extent), tf.opacity_unit_label
-        spec = "paraview"
+        spec = PER_VOXEL if tf is not None and tf.opacity_unit_label == PER_VOXEL else "paraview"
     mean = sum(volume.spacing) / 3
-    if spec == "mean-spacing":
-        return mean, "mean-spacing"
+    if spec == PER_VOXEL:
+        return mean, PER_VOXEL
     if spec == "paraview":
         axes = [(n - 1, s) for n, s in zip(volume.dims, volume.spacing, strict=True) if n > 1]
         if not axes:

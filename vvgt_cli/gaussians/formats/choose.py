@@ -13,7 +13,7 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.files import seekable
 from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions, read_ply
-from vvgt_cli.gaussians.formats import gltf, gsply_files, page_file, page_live, sog, usd
+from vvgt_cli.gaussians.formats import gltf, gsply_files, page_file, page_live, sog, splat, usd
 from vvgt_cli.gaussians.formats.levels import Levels, split_name
 from vvgt_cli.gaussians.formats.splats import Splats, columns_of, gaussians_of, splats_of
 from vvgt_cli.gaussians.header import parse_header
@@ -56,12 +56,16 @@ FORMATS = (
     Format(".html", page_file.html, page_file.read_html, gsply_files.gsply, page_file.upright, page_live.live_html),
 )
 SUFFIXES = (".ply", *(known.suffix for known in FORMATS))
+READ_ONLY = (
+    Format(".splat", splat.refuse, splat.read_splat, lambda name: None),
+    Format(".ksplat", splat.refuse, splat.refuse, lambda name: None),
+)
 
 
 def format_of(path: str | os.PathLike[str]) -> Format | None:
     """The format that a name stands for; None for the standard `.ply`, and for names that say nothing."""
     name = Path(path).name.lower()
-    return next((known for known in FORMATS if name.endswith(known.suffix)), None)
+    return next((known for known in (*FORMATS, *READ_ONLY) if name.endswith(known.suffix)), None)
 
 
 def ready(path: str | Path) -> None:
@@ -94,7 +98,7 @@ def encoded(known: Format, gaussians: Gaussians, options: PlyOptions, name: str)
 
 def is_splats(path: str | Path) -> bool:
     """Whether a path is a file of Gaussians by its name, or by the `ply` that it begins with."""
-    if Path(path).name.lower().endswith(SUFFIXES) or split_name(path):
+    if format_of(path) or Path(path).name.lower().endswith(".ply") or split_name(path):
         return True
     try:
         with open(seekable(path), "rb") as stream:
@@ -112,13 +116,9 @@ def read_splats(path: str | Path) -> tuple[Gaussians, PlyHeader]:
         UsageError: no such level.
         DataError: not a file of its format, or its library is not installed.
     """
-    streamed = split_name(path)
-    if streamed is not None:
-        return gaussians_of(Levels(streamed[0]).level(streamed[1]), str(path))
-    known, place = format_of(path) or _compressed(path), seekable(path)
-    if known is None:
+    if split_name(path) is None and (format_of(path) or _compressed(path)) is None:
         return read_ply(path)
-    return gaussians_of(known.read(_content(place, path), str(path)), str(path))
+    return gaussians_of(read_columns(path), str(path))
 
 
 def read_columns(path: str | Path) -> Splats:

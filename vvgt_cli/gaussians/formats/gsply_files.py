@@ -14,10 +14,15 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.gaussians.formats import spz4
 from vvgt_cli.gaussians.formats.splats import Splats, morton_order
-from vvgt_cli.gaussians.header import MIP
+from vvgt_cli.gaussians.header import MIP, TYPES, header_lines
 from vvgt_cli.volume.libraries import library_errors, need
 
 EXTRA = "share"
+_RANGES = [f"{end}_{of}{axis}" for of in ("", "scale_") for end in ("min", "max") for axis in "xyz"]
+_RANGES += [f"{end}_{channel}" for end in ("min", "max") for channel in "rgb"]
+_FORMAT = "format binary_little_endian 1.0"
+_WHOLE = (0, 0, 0, 1, 1, 1)  # range of colours of SuperSplat 1, whose chunks have none
+_PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
 _FRACTION = 20  # bits of a coordinate behind the point, where its 23 leave as many: 1e-6
 _COMMENT = 16  # gzip's flag for a comment in its header (RFC 1952)
 _FLAGS = 14  # byte of the header; 1: opacity is to be compensated ("antialiased")
@@ -54,10 +59,36 @@ def read_compressed_ply(content: bytes, name: str) -> Splats:
         DataError: gsply cannot read it, or is not installed.
     """
     library = gsply(name)
+    lines, size = header_lines(content[: 1 << 18], name)
     with library_errors(name, "a compressed .ply"):
-        head = content[: content.index(b"end_header")].decode("utf-8")
-        data = library.decompress_from_bytes(content)
-        return _columns(data, [line[8:] for line in head.splitlines() if line.startswith("comment ")])
+        data = library.decompress_from_bytes(_in_order(content, lines, size))
+        return _columns(data, [line[8:] for line in lines if line.startswith("comment ")])
+
+
+def _in_order(content: bytes, lines: list[str], at: int) -> bytes:
+    """Put the file's columns in the order that gsply expects, and a range of colours in every chunk."""
+    elements: dict[str, tuple[int, list[tuple[str, str]]]] = {}
+    for words in map(str.split, lines):
+        if words[:1] == ["element"]:
+            elements[words[1]] = int(words[2]), []
+        elif words[:1] == ["property"]:
+            elements[list(elements)[-1]][1].append((words[2], TYPES[words[1]]))
+    tables = {}
+    for element, (count, fields) in elements.items():
+        tables[element] = np.frombuffer(content, fields, count, at)
+        at += tables[element].nbytes
+    rest = [f"f_rest_{k}" for k in range(len(elements["sh"][1]))] if "sh" in elements else []
+    chunks, count = len(tables["chunk"]), len(tables["vertex"])
+    if _FORMAT not in lines or len(tables.get("sh", tables["vertex"])) != count or count > 256 * chunks:
+        raise ValueError(f"not {_FORMAT}, or {chunks} chunks of 256 for {count} vertices")
+    ends = {} if "min_r" in (tables["chunk"].dtype.names or ()) else dict(zip(_RANGES[12:], _WHOLE, strict=True))
+    head, body = ["ply", _FORMAT], b""
+    for element, names, kind in (("chunk", _RANGES, "float"), ("vertex", _PACKED, "uint"), ("sh", rest, "uchar")):
+        if names:
+            columns = [tables[element][key] if key not in ends else [ends[key]] * chunks for key in names]
+            head += [f"element {element} {len(columns[0])}", *(f"property {kind} {key}" for key in names)]
+            body += np.stack(columns, axis=1).astype(TYPES[kind]).tobytes()
+    return "\n".join([*head, "end_header", ""]).encode() + body
 
 
 def spz(splats: Splats, name: str) -> bytes:

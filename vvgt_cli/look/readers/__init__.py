@@ -9,13 +9,12 @@ from typing import Any
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.look.function import TransferFunction
-from vvgt_cli.look.readers import colormap_name, inviwo, minimal, named, paraview, paraview_xml, slicer, vtkjs
+from vvgt_cli.look.readers import colormap_name, inviwo, lut, minimal, named, paraview, paraview_xml, slicer
 from vvgt_cli.look.readers.fields import load
 
-# vtkjs before paraview: its presets are ParaView's with opacity under another name
 # each: matches(parsed) -> bool, read(parsed, what, pick) -> TransferFunction
-FORMATS = (vtkjs, paraview, minimal, slicer, paraview_xml, inviwo)
-SUFFIXES = (".json", ".xml", ".itf", ".vp")
+FORMATS = (paraview, minimal, slicer, paraview_xml, inviwo, lut)
+SUFFIXES = (".json", ".xml", ".itf", ".vp", *lut.SUFFIXES)
 __all__ = ["read_transfer_function"]
 
 
@@ -51,7 +50,7 @@ def read_transfer_function(source: str | os.PathLike[str] | Mapping[str, Any]) -
             raise UsageError(f"{path}: no such file; expected a transfer function ({', '.join(SUFFIXES)})")
         return named.named_function(source) if source in named.names() else colormap_name.read(source)
     try:
-        return _read(load(path), str(path), pick)
+        return _read((lut.load if path.suffix.lower() in lut.SUFFIXES else load)(path), str(path), pick)
     except DataError:
         from vvgt_cli.look.label_files import is_table
 
@@ -71,5 +70,5 @@ def _read(parsed: Any, what: str, pick: str) -> TransferFunction:
             return result
     raise DataError(
         f"{what}: not a transfer function; expected a preset of ParaView or vtk.js (RGBPoints), an object with points, "
-        "a volume property of 3D Slicer, XML of ParaView (ColorMap) or of Inviwo (Points)"
+        "a volume property of 3D Slicer, a colour map of niivue (R, G, B), XML of ParaView or Inviwo"
     )

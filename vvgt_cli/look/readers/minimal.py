@@ -7,7 +7,8 @@ An object with these keys, and no others::
       "range": [0, 4095],                    optional: see below
       "points": [{"x": 0.2, "rgb": [1, 1, 1], "opacity": 0.5}, ...],
       "color_space": "RGB",                  optional: a ParaView ColorSpace
-      "opacity_unit_distance": 1.5,          optional: world length that the opacities are per
+      "hsv_wrap": true,                      optional: false: HSV does not go the short way round the hue circle
+      "opacity_unit_distance": 1.5,          optional: world length that the opacities are per, or "mean-spacing"
       "opacity_unit_share": 0.004,           optional: the same as a share of the box's longest edge; not both
       "otherwise": {"range": ..., "points"}  optional: for data that are not in Hounsfield units
       "lighting": {"ambient": 0.1, "diffuse": 0.7, "specular": 0.2, "specular_power": 10}
@@ -28,21 +29,13 @@ import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.look.colormap import ColorMap
-from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.look.function import PER_VOXEL, TransferFunction
 from vvgt_cli.look.lighting import COEFFICIENTS, Lighting, preset_lighting
 from vvgt_cli.look.opacity import PiecewiseOpacity
 from vvgt_cli.look.readers.fields import named, number, rgb
 
-KEYS = {
-    "name",
-    "range",
-    "points",
-    "color_space",
-    "opacity_unit_distance",
-    "opacity_unit_share",
-    "lighting",
-    "otherwise",
-}
+KEYS = {"name", "range", "points", "color_space", "hsv_wrap", "opacity_unit_distance", "opacity_unit_share"}
+KEYS |= {"lighting", "otherwise"}
 DOMAINS = ("percentile", "foreground", "sigma")
 POINT_KEYS = {"x", "rgb", "opacity"}
 
@@ -66,7 +59,9 @@ def read(parsed: dict[str, Any], what: str, pick: str = "") -> TransferFunction:
     opacities, colors = _points(parsed["points"], what)
     domain, lo, hi = _range(parsed.get("range"), what)
     distance = parsed.get("opacity_unit_distance")
-    if distance is not None:
+    label = PER_VOXEL if distance == PER_VOXEL else "file"
+    space = str(parsed.get("color_space", "RGB"))
+    if distance is not None and label == "file":
         distance = number(f"{what}: opacity_unit_distance", distance)
     share = parsed.get("opacity_unit_share")
     if share is not None and (distance is not None or not 0 < number(f"{what}: opacity_unit_share", share) <= 1):
@@ -81,10 +76,11 @@ def read(parsed: dict[str, Any], what: str, pick: str = "") -> TransferFunction:
         return TransferFunction(
             str(parsed.get("name", "")).strip() or "transfer function",
             PiecewiseOpacity(np.array(xo), np.array(y)),
-            ColorMap(np.array(xc), np.array(c), space=str(parsed.get("color_space", "RGB"))),
-            distance,
+            ColorMap(np.array(xc), np.array(c), space=space, hsv_wrap=bool(parsed.get("hsv_wrap", True))),
+            distance if label == "file" else None,
             domain,
             share,
+            label,
             lighting=_lighting(parsed.get("lighting"), what),
             otherwise=otherwise,
         )

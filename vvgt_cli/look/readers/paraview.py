@@ -1,7 +1,8 @@
-"""ParaView preset JSON: an array of presets, as "Export" in the preset dialogue writes it."""
+"""Preset JSON of ParaView, as "Export" in the preset dialogue writes it, and of vtk.js (ParaView Glance, VolView)."""
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import numpy as np
@@ -13,8 +14,12 @@ from vvgt_cli.look.opacity import PiecewiseOpacity
 from vvgt_cli.look.readers.fields import named, rgb, table
 
 PRESET_KEYS = ("RGBPoints", "IndexedColors", "ColorSpace")
+RAMP = " (opacity not in the file: linear ramp)"  # behind the name of a function
+UNUSED = ("IndexedColors", "UseAboveRangeColor", "UseBelowRangeColor")
 LISTED, LONGEST = 60, 1000  # names, characters of them, in an error
-SPACE_OF = {name.lower().replace("-", ""): name for name in SPACES} | {"ciede2000": "Lab/CIEDE2000"}
+# other names in files: of VTK, of older ParaViews' presets and XML
+OTHER_NAMES = {"ciede2000": "Lab/CIEDE2000", "cielab": "Lab", "wrapped": "HSV", "wrapped hsv": "HSV", "hsvwrap": "HSV"}
+SPACE_OF = {name.lower(): name for name in SPACES} | OTHER_NAMES
 
 
 def matches(parsed: Any) -> bool:
@@ -26,8 +31,9 @@ def matches(parsed: Any) -> bool:
 def read(parsed: Any, what: str, pick: str = "") -> TransferFunction:
     """One preset as a `TransferFunction` on data values.
 
-    ``RGBPoints`` is flat (x, r, g, b), ``Points`` flat (x, opacity, midpoint, sharpness). A preset without
-    ``Points`` (opacity was not exported) gets a linear ramp from 0 to 1 over its range, and its name says so.
+    ``RGBPoints`` is flat (x, r, g, b), ``Points`` flat (x, opacity, midpoint, sharpness), ``OpacityPoints`` of vtk.js
+    flat (x, opacity). Without either (opacity was not exported) it is a linear ramp from 0 to 1 over the range, and the
+    name says so. HSV goes the short way round only with ``HSVWrap``: ParaView writes it where it is not 0.
 
     Raises:
         DataError: several presets and no ``pick``, a categorical preset, a field that is not what it must be.
@@ -38,17 +44,19 @@ def read(parsed: Any, what: str, pick: str = "") -> TransferFunction:
             f"{what}: a categorical preset (IndexedColors, no RGBPoints); expected one over a range of values"
         )
     colors = table(f"{what}: RGBPoints", preset["RGBPoints"], 4, "x, r, g, b")
-    space = SPACE_OF.get(str(preset.get("ColorSpace", "RGB")).lower())
-    if space is None:
+    stated = str(preset.get("ColorSpace", "RGB")).lower()
+    if stated not in SPACE_OF:
         raise DataError(f"{what}: ColorSpace {preset['ColorSpace']!r}; expected one of {', '.join(SPACES)}")
+    if unused := [key for key in UNUSED if preset.get(key)]:
+        warnings.warn(f"{what}: {', '.join(unused)} not used; expected colours from RGBPoints alone", stacklevel=2)
     name = str(preset.get("Name", "")).strip() or "ParaView preset"
-    points = preset.get("Points")
-    if points is None:
-        ends = np.array([colors[:, 0].min(), colors[:, 0].max()])
-        opacity_nodes = np.column_stack([ends, [0.0, 1.0], [0.5, 0.5], [0.0, 0.0]])
-        name += " (opacity not in the file: linear ramp)"
+    if "OpacityPoints" in preset:
+        opacity_nodes = table(f"{what}: OpacityPoints", preset["OpacityPoints"], 2, "x, opacity")
+    elif preset.get("Points") is not None:
+        opacity_nodes = table(f"{what}: Points", preset["Points"], 4, "x, opacity, midpoint, sharpness")
     else:
-        opacity_nodes = table(f"{what}: Points", points, 4, "x, opacity, midpoint, sharpness")
+        opacity_nodes = np.array([[colors[:, 0].min(), 0.0], [colors[:, 0].max(), 1.0]])
+        name += RAMP
     nan_color = rgb(f"{what}: NanColor", preset["NanColor"]) if "NanColor" in preset else (0.5, 0.0, 0.0)
     try:
         return TransferFunction(
@@ -57,8 +65,8 @@ def read(parsed: Any, what: str, pick: str = "") -> TransferFunction:
             ColorMap(
                 colors[:, 0],
                 colors[:, 1:],
-                space=space,
-                hsv_wrap=bool(preset.get("HSVWrap", space == "HSV")),
+                space=SPACE_OF[stated],
+                hsv_wrap=bool(preset.get("HSVWrap", "wrap" in stated)),
                 log_scale=bool(preset.get("UseLogScale", False)),
                 nan_color=nan_color,
             ),

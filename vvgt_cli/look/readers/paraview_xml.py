@@ -14,9 +14,6 @@ from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.readers import paraview
 from vvgt_cli.look.readers.fields import Elements, attribute
 
-# what the files say in place of the names of today's presets
-_SPACES = {"cielab": "Lab", "wrapped hsv": "HSV", "hsvwrap": "HSV"}
-
 
 def matches(parsed: Any) -> bool:
     """Whether it is XML with a ColorMap."""
@@ -30,10 +27,15 @@ def read(parsed: Elements, what: str, pick: str = "") -> TransferFunction:
         DataError: several maps and no ``pick``, an indexed map, a field that is not what it must be.
     """
     presets: list[dict[str, Any]] = []
-    for tag, attributes in parsed.items:
+    for tag, cased in parsed.items:
+        attributes = {key.lower(): value for key, value in cased.items()}
         if tag == "colormap":
-            presets.append(_preset(attributes))
-        elif presets and tag in ("point", "nan"):
+            indexed = attributes.get("indexedlookup", "false").lower() in ("true", "1")
+            about = {"Name": attributes.get("name", ""), "ColorSpace": attributes.get("space", "RGB")}
+            presets.append({**about, "RGBPoints": [], "Points": [], "indexed": indexed})
+        elif presets and tag in ("above", "below"):
+            presets[-1][f"Use{tag.title()}RangeColor"] = 1
+        elif presets and (tag == "nan" or (tag == "point" and not presets[-1]["indexed"])):
             here = f"{what}: {presets[-1]['Name'] or 'ColorMap'}: {tag}"
             color = [attribute(here, attributes, key) for key in "rgb"]
             if tag == "nan":
@@ -48,15 +50,3 @@ def read(parsed: Elements, what: str, pick: str = "") -> TransferFunction:
     if len(set(preset["Points"][1::4])) < 2:
         del preset["Points"]
     return paraview.read(preset, what)
-
-
-def _preset(attributes: dict[str, str]) -> dict[str, Any]:
-    space = attributes.get("space", "RGB")
-    return {
-        "Name": attributes.get("name", ""),
-        "ColorSpace": _SPACES.get(space.lower(), space),
-        "HSVWrap": space.lower() in ("wrapped hsv", "hsvwrap"),
-        "RGBPoints": [],
-        "Points": [],
-        "indexed": attributes.get("indexedLookup", "false").lower() in ("true", "1"),
-    }
