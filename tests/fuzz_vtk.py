@@ -47,7 +47,10 @@ class _Worker:
         if not self.pid:
             os.close(to)
             os.close(back)
-            _answer_all(inward, outward)
+            try:
+                _answer_all(inward, outward)
+            finally:  # whatever happens, it does not go on as a second fuzzer
+                os._exit(1)
         os.close(inward)
         os.close(outward)
         self.to, self.back = os.fdopen(to, "wb"), os.fdopen(back, "rb")

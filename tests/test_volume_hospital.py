@@ -188,7 +188,7 @@ def test_several_volumes_of_a_series(tmp_path: Path, volumes: list, names: list[
         np.testing.assert_array_equal(read_volume(source, ReadOptions(array=wanted)).data, STACK + 1000)
     with pytest.raises(UsageError, match="no volume 'other'; it has "):
         read_volume(source, ReadOptions(array="4/other"))
-    with pytest.raises(UsageError, match=rf"--time 9: expected a volume from 0 to {len(volumes) - 1}"):
+    with pytest.raises(UsageError, match=rf"--time 9: expected a time step from 0 to {len(volumes) - 1}"):
         read_volume(source, ReadOptions(time=9))
 
 

@@ -15,7 +15,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from vvgt_cli.errors import DataError, SeveralArrays, SeveralComponents, SeveralSteps, UsageError
+from vvgt_cli.errors import DataError, SeveralArrays, SeveralComponents, UsageError
 from vvgt_cli.volume.blocks import IN_BLOCKS, check_memory
 from vvgt_cli.volume.components import contiguous, magnitude
 from vvgt_cli.volume.options import ReadOptions
@@ -70,7 +70,7 @@ def picture_volume(picture: Picture, options: ReadOptions, source: str, name: st
     if min(picture.times, picture.channels, *picture.shape) < 1 or picture.dtype.kind not in "iuf":
         raise DataError(f"{source}: {picture.shape} values of type {picture.dtype}; expected integers or floats, z y x")
     channel = _channel(picture, options.component, source)
-    time = _time(picture, options.time, source)
+    time = options.step(picture.times, source)
     box = (slice(0, picture.shape[0]), slice(0, picture.shape[1]), slice(0, picture.shape[2]))
     size = math.prod(picture.shape)
     field: Any
@@ -109,9 +109,32 @@ def _spacing(picture: Picture, options: ReadOptions) -> tuple[float, float, floa
 
 
 def _channel(picture: Picture, wanted: int | str | None, source: str) -> int | None:
-    """Number of the channel asked for, or of the only one; None for the magnitude of all."""
-    n, names = picture.channels, [*picture.names]
-    names = names if len(names) == n and any(names) else []
+    """Return the number of the channel asked for, or of the only one; None for the magnitude of all."""
+    colors, own = picture.colors, not picture.rgb
+    return choose_channel(picture.channels, picture.names, picture.dtype, wanted, source, colors, picture.rgb, own)
+
+
+def choose_channel(
+    n: int, names: Sequence[str], dtype: np.dtype, wanted: int | str | None, source: str,
+    colors: Sequence[Color] = (), rgb: bool = False, own: bool = True,
+) -> int | None:  # fmt: skip
+    """Return the number of the channel asked for, or of the only one; None for the magnitude of all.
+
+    Args:
+        n: how many there are.
+        names: of the channels, where they have any.
+        dtype: of their values.
+        wanted: number, name, ``magnitude``, or None.
+        source: for messages.
+        colors: RGB in [0, 1] of the channels, where they have any.
+        rgb: they are red, green, blue and perhaps opacity.
+        own: they are channels of their own, not samples of pixels.
+
+    Raises:
+        SeveralComponents: several and none chosen.
+        UsageError: none such.
+    """
+    names = [*names] if len(names) == n and any(names) else []
     if wanted == "magnitude" and n > 1:
         return None
     if isinstance(wanted, str) and names.count(wanted) == 1:
@@ -122,24 +145,15 @@ def _channel(picture: Picture, wanted: int | str | None, source: str) -> int | N
         return wanted
     listing = ", ".join(f"{k} {name[:40]!r}" for k, name in enumerate(names[:LISTED]))
     listing += ", ..." if len(names) > LISTED else ""
-    what = f"{source}: {n} channel{'s' * (n > 1)}{f' ({listing})' if listing else ''} of type {picture.dtype}"
+    what = f"{source}: {n} channel{'s' * (n > 1)}{f' ({listing})' if listing else ''} of type {dtype}"
     if n == 1:
         raise UsageError(f"{what}; leave out --channel {wanted}")
-    text = f"{what}; expected one: try --channel 0 to {n - 1}, a name, all, or --component magnitude"
+    expected = f"expected one: try --channel 0 to {n - 1}, a name, all, or --component magnitude"
     if wanted is not None:
-        raise UsageError(text.replace("; expected one", f", not {wanted!r}; expected one"))
-    colors = picture.colors if len(picture.colors) == n else ()
-    raise SeveralComponents(text, n, picture.rgb and n in (3, 4), colors, not picture.rgb, names)
-
-
-def _time(picture: Picture, wanted: int | None, source: str) -> int:
-    if wanted is None and picture.times > 1:
-        raise SeveralSteps(source, picture.times)
-    if (wanted or 0) >= picture.times:
-        last = picture.times - 1
-        expected = f"expected a time step from 0 to {last}" if last else "it has 1 time step; leave out --time"
-        raise UsageError(f"{source}: --time {wanted}: {expected}")
-    return wanted or 0
+        raise UsageError(f"{what}, not {wanted!r}; {expected}")
+    raise SeveralComponents(
+        f"{what}; {expected}", n, rgb and n in (3, 4), colors if len(colors) == n else (), own, names
+    )
 
 
 def only(deep: Sequence[bool], text: str, option: str, choices: Sequence[str], names: Sequence[str]) -> int:

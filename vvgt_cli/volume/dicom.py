@@ -97,7 +97,7 @@ def read_dicom(path: Path, options: ReadOptions) -> Volume:
         name, stack = (name, int(number)) if number.isdecimal() else (rest, None)
         mosaic = next((_mosaic(file) for file, header in chosen if _is_mosaic(header)), None)
         slices = [s for file, header in chosen for s in _frames(file, header, mosaic, options)]
-        slices = one_volume(one_stack(slices, _alike, stack, title, path), options.time, name, path)
+        slices = one_volume(one_stack(slices, _alike, stack, title, path), options, name, path)
         slices = _ordered(slices)
         spacing, direction, heights = _geometry(slices, path, options)
         values, (slope, intercept) = _pixels(slices, path)

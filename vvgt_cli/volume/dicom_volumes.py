@@ -15,8 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.errors import DataError, SeveralSteps, UsageError
+from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.headers import printable
+from vvgt_cli.volume.options import ReadOptions
 
 FEW = 2  # slices: fewer than make a volume, beside one that has more
 NEAR = 0.01  # share of the largest distance of neighbouring slices within which two are in one place
@@ -44,13 +45,13 @@ ATTRIBUTES = {  # by which volumes of a series differ: unit, and where functiona
 _PARTS = {"M": "magnitude", "P": "phase", "R": "real", "I": "imaginary", "MAGNITUDE": "magnitude", "PHASE": "phase"}
 
 
-def one_volume(slices: list[Any], time: int | None, name: str, path: Path) -> list[Any]:
+def one_volume(slices: list[Any], options: ReadOptions, name: str, path: Path) -> list[Any]:
     """Return the slices of the volume asked for, or of the only one.
 
     Args:
         slices: of one size and orientation; each with ``position`` (3,), ``rows`` (2, 3), ``facts`` (the values of
             `ATTRIBUTES`), ``source`` and ``instance``.
-        time: number of the volume, from 0; None for the only one.
+        options: ``time`` is the number of the volume.
         name: of the volume, "" for none.
         path: for messages.
 
@@ -71,12 +72,8 @@ def one_volume(slices: list[Any], time: int | None, name: str, path: Path) -> li
         if names.count(name) != 1:
             raise UsageError(f"{path}: no volume {name!r}; it has {listing or 'one'}; choose with --series SERIES/NAME")
         return volumes[name]
-    if time is None and n > 1:
-        raise SeveralSteps(f"{path} ({listing})", n, "volumes in one series", names=names)
-    if (time or 0) >= n:
-        expected = f"expected a volume from 0 to {n - 1}" if n > 1 else "it has one volume; leave out --time"
-        raise UsageError(f"{path}: --time {time}: {expected}")
-    return volumes[names[time or 0]]
+    source = f"{path} ({listing})" if listing else str(path)
+    return volumes[names[options.step(n, source, "volumes in one series", names=names)]]
 
 
 def _volumes(slices: list[Any], path: Path) -> dict[str, list[Any]]:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vvgt_cli.errors import DataError, SeveralSteps, UsageError
+from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import load_block
 from vvgt_cli.volume.components import select_component
 from vvgt_cli.volume.options import ReadOptions
@@ -92,12 +92,9 @@ def load_frames(frames: Frames, options: ReadOptions, source: str) -> tuple[np.n
 def _times(frames: Frames, options: ReadOptions, source: str) -> tuple[int, int]:
     """Time steps and components; a lone fourth axis counts as components where a component is asked for."""
     times, rest = math.prod(frames.dims[3:4]), math.prod(frames.dims[4:])
-    if options.time is None and times > 1:
-        if rest > 1 or options.component is None:
-            known = frames.unit and math.isfinite(frames.step) and frames.step > 0 and math.isfinite(frames.start)
-            at = [frames.start + k * frames.step for k in range(times)] if known else None
-            raise SeveralSteps(source, times, times=at, unit=frames.unit)
+    if options.time is None and options.component is not None and times > 1 == rest:
         return 1, times
-    if (options.time or 0) >= times:
-        raise UsageError(f"{source}: --time {options.time}: expected a time step from 0 to {times - 1}")
+    known = frames.unit and math.isfinite(frames.step) and frames.step > 0 and math.isfinite(frames.start)
+    at = [frames.start + k * frames.step for k in range(times)] if known else None
+    options.step(times, source, times=at, unit=frames.unit)
     return times, rest

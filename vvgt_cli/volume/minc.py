@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.errors import DataError, SeveralSteps, UsageError
+from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.blocks import IN_BLOCKS, check_memory
 from vvgt_cli.volume.hdf5 import MAGIC, checked_dataset
 from vvgt_cli.volume.headers import unit_rows
@@ -160,14 +160,10 @@ def _volume(image: _Image, path: Path, options: ReadOptions) -> Volume:
             f"{path}: axes {', '.join(image.names)} of {shape} values of type {image.dtype}; expected three in space, "
             "and time before them"
         )
-    times = shape[0] if len(shape) == 4 else 1
-    if times > 1 and options.time is None:
-        raise SeveralSteps(str(path), times)
-    if (options.time or 0) >= times:
-        raise UsageError(f"{path}: --time {options.time}: expected a time step from 0 to {times - 1}")
+    step = options.step(shape[0] if len(shape) == 4 else 1, str(path))
     if options.component not in (None, 0):
         raise UsageError(f"{path}: a scalar volume; leave out --component {options.component}")
-    lead = (options.time or 0,) if len(shape) == 4 else ()
+    lead = (step,) if len(shape) == 4 else ()
     lazy: Any = Stored(_scaled(image, lead, path), np.dtype(np.float32), shape[-3:], (1, *shape[-2:]), str(path))
     if not options.stored:
         check_memory(4 * math.prod(shape[-3:]), path.name, IN_BLOCKS)

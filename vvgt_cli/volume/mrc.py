@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vvgt_cli.errors import DataError, SeveralSteps, UsageError
+from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import load_block, open_packed
 from vvgt_cli.volume.components import select_component
 from vvgt_cli.volume.headers import unit_rows
@@ -157,11 +157,7 @@ def read_mrc(path: Path, options: ReadOptions) -> Volume:
     if path.suffix.lower() == ".rec" and not _sniff(head) and other_of_pair(path, ".PAR"):
         return read_pair(path, options)
     header = parse_header(head, str(path))
-    if header.volumes > 1 and options.time is None:
-        raise SeveralSteps(str(path), header.volumes)
-    step = options.time or 0
-    if step >= header.volumes:
-        raise UsageError(f"{path}: --time {step}: it has {header.volumes} volumes; expected 0 to {header.volumes - 1}")
+    step = options.step(header.volumes, str(path))
     if not header.stated and options.spacing is None:
         warnings.warn(
             f"{path}: its header states no cell; its voxels are taken as 1 angstrom wide (--spacing X Y Z: otherwise)",

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.errors import DataError, SeveralSteps, UsageError
+from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.blocks import data_file, load_block
 from vvgt_cli.volume.components import select_component
 from vvgt_cli.volume.headers import MARK, MAX_HEADER, Fields, unit_rows
@@ -148,16 +148,12 @@ def _step(block: np.ndarray, options: ReadOptions, source: str) -> int | str | N
     Raises:
         UsageError: none is (`SeveralSteps`), both are, or one that does not exist.
     """
-    times = block.shape[-1]
-    if options.time is None:
-        if options.component is None and times > 1:
-            raise SeveralSteps(source, times)
-        return options.component
     if options.component is not None:
-        raise UsageError(f"{source}: --time and --component both choose along its one axis of time; leave out one")
-    if options.time >= times:
-        raise UsageError(f"{source}: --time {options.time}: expected a time step from 0 to {times - 1}")
-    return options.time if times > 1 else None
+        if options.time is not None:
+            raise UsageError(f"{source}: --time and --component both choose along its one axis of time; leave out one")
+        return options.component
+    step = options.step(block.shape[-1], source)
+    return step if block.shape[-1] > 1 else None
 
 
 def _place(

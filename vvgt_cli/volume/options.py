@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from vvgt_cli.errors import UsageError
+from vvgt_cli.errors import SeveralSteps, UsageError
 from vvgt_cli.volume.cut import parse_crop
 from vvgt_cli.volume.types import Volume
 
@@ -115,6 +116,27 @@ class ReadOptions:
             "--header-bytes": self.header_bytes != 0,
         }
         return [flag for flag, used in given.items() if used]
+
+    def step(self, steps: int, source: str, what: str = "time steps", **facts: Any) -> int:
+        """Return the time step asked for, or the only one of ``steps``.
+
+        Args:
+            steps: how many there are.
+            source: for messages.
+            what: they are called.
+            **facts: ``times``, ``unit`` and ``names``, as of `SeveralSteps`.
+
+        Raises:
+            SeveralSteps: several and none chosen.
+            UsageError: none such.
+        """
+        if self.time is None and steps > 1:
+            raise SeveralSteps(source, steps, what, **facts)
+        if (self.time or 0) >= steps:
+            one = "it has 1 time step; leave out --time"
+            expected = f"expected a time step from 0 to {steps - 1}" if steps > 1 else one
+            raise UsageError(f"{source}: --time {self.time}: {expected}")
+        return self.time or 0
 
     def spacing_or(self, declared: tuple[float, ...]) -> tuple[float, float, float]:
         """The spacing asked for, else the file's (x, y, z): signs are orientation and dropped."""

@@ -19,9 +19,9 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.errors import DataError, SeveralComponents, SeveralSteps, UsageError
+from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.blocks import check_memory, size_text
-from vvgt_cli.volume.channels import only
+from vvgt_cli.volume.channels import choose_channel, only
 from vvgt_cli.volume.components import contiguous, magnitude
 from vvgt_cli.volume.libraries import library_errors
 from vvgt_cli.volume.options import ReadOptions
@@ -212,57 +212,19 @@ def _choose(
     channels = layout.of("CS")
     several = options.component == "magnitude" and bool(channels)
     sizes, own = [layout.shape[k] for k in channels], not layout.of("S")
-    number = _channel(sizes, facts, options.component, path, dtype, layout.color, own)
+    n = math.prod(sizes)
+    number = (
+        choose_channel(n, facts.channels, dtype, options.component, str(path), facts.colors, layout.color, own) or 0
+    )
     for k in reversed(channels):  # the samples of a pixel count faster than the channels
         index[k] = slice(None) if several else number % layout.shape[k]
         number //= layout.shape[k]
     times = layout.of("T")
-    steps = layout.shape[times[0]] if times else 1
-    if options.time is None and steps > 1:
-        raise SeveralSteps(str(path), steps, "time steps" if layout.of("Z") else "time steps of one slice each")
-    if (options.time or 0) >= steps:
-        expected = (
-            f"expected a time step from 0 to {steps - 1}" if steps > 1 else "it has 1 time step; leave out --time"
-        )
-        raise UsageError(f"{path}: --time {options.time}: {expected}")
+    what = "time steps" if layout.of("Z") else "time steps of one slice each"
+    step = options.step(layout.shape[times[0]] if times else 1, str(path), what)
     for k in times:
-        index[k] = options.time or 0
+        index[k] = step
     return tuple(index), several
-
-
-def _channel(
-    sizes: list[int],
-    facts: Facts,
-    wanted: int | str | None,
-    path: Path,
-    dtype: np.dtype,
-    color: bool,
-    channels: bool,
-) -> int:
-    """Number of the channel asked for, or of the only one; 0 for the magnitude of all.
-
-    ``color``: they are colours; ``channels``: they are channels of their own, not samples of pixels.
-    """
-    n = math.prod(sizes)
-    names = facts.channels if len(facts.channels) == n else []
-    if wanted == "magnitude" and n > 1:
-        return 0
-    if isinstance(wanted, str) and names.count(wanted) == 1:
-        return names.index(wanted)
-    if isinstance(wanted, int) and wanted < n:
-        return wanted
-    if wanted is None and n == 1:
-        return 0
-    shown = ", ".join(f"{k} {name!r}" for k, name in enumerate(names[:_LISTED])) + (", ..." if n > _LISTED else "")
-    what = f"{path}: {n} channel{'s' * (n > 1)}{f' ({shown})' if names else ''} of type {dtype}"
-    if n == 1:
-        raise UsageError(f"{what}; leave out --channel {wanted}")
-    found = "" if wanted is None else f", not {wanted!r}"
-    text = f"{what}{found}; expected one: try --channel 0 to {n - 1}, a name, all, or --component magnitude"
-    if wanted is not None:
-        raise UsageError(text)
-    colors = facts.colors if len(facts.colors) == n else ()
-    raise SeveralComponents(text, n, color and n in (3, 4), colors, channels, names)
 
 
 def _values(file: Any, series: Any, layout: SeriesAxes, index: tuple[int | slice, ...], path: Path) -> np.ndarray:

@@ -14,9 +14,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from xml.parsers import expat
 
-from vvgt_cli.errors import DataError, SeveralSteps, UsageError
+from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import data_file
 from vvgt_cli.volume.headers import MARK
+from vvgt_cli.volume.options import ReadOptions
 
 INDEX, SINGLE = "index", "single"  # in the place of a program: an index of VTK's own files, or one of these
 MOST = 100_000  # files that an index may name
@@ -78,12 +79,8 @@ def chosen_time(times: list[float], time: int | None, source: str) -> float | No
     Raises:
         UsageError: several and none chosen (`SeveralSteps`), or one that there is not.
     """
-    if time is None and len(times) > 1:
-        raise SeveralSteps(source, len(times), times=times)
-    steps = max(len(times), 1)
-    if time is not None and time >= steps:
-        raise UsageError(f"{source}: --time {time}: expected a time step from 0 to {steps - 1}")
-    return times[time or 0] if times else None
+    step = ReadOptions(time=time).step(max(len(times), 1), source, times=times)
+    return times[step] if times else None
 
 
 def read_index(path: Path) -> Index:
