@@ -17,7 +17,6 @@ from vvgt_cli.volume.libraries import library_errors, need
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.types import Volume
-from vvgt_cli.volume.vtk_index import chosen_time
 
 GRIB = "GRIB"  # in the place of a program of `vtk_child`
 MISSING = -1e100
@@ -48,8 +47,8 @@ def grib_volume(path: Path, options: ReadOptions) -> Volume:
         name = infos[choose_array(infos, options.array, source)].name
         whens = sorted(found[name])
         dates = [datetime.strptime(f"{when[0]:08d}{when[1]:04d}", "%Y%m%d%H%M") for when in whens]
-        chosen_time([(date - dates[0]).total_seconds() / 3600 for date in dates], options.time, source)
-        levels = found[name][whens[options.time or 0]]
+        hours = [(date - dates[0]).total_seconds() / 3600 for date in dates]
+        levels = found[name][whens[options.step(len(whens), source, times=hours)]]
         down = not name.split("/")[1].startswith(("height", "theta", "potential"))
         planes, axes = [], [Axis("", 0)]
         for level in sorted(levels):
