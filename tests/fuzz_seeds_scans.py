@@ -7,6 +7,7 @@ import gzip
 import io
 import tempfile
 import warnings
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -100,6 +101,64 @@ def text_grids() -> list[Seed]:
     ]
 
 
+def vasp() -> list[Seed]:
+    from test_volume_vasp import chgcar
+
+    values = np.arange(24, dtype=float).reshape(4, 3, 2)
+    return [
+        Seed("CHGCAR", chgcar([values]).encode(), READ),
+        Seed("CHGCAR_spin", chgcar([values, -values], scale="-30").encode(), volume_reader(component=1)),
+        Seed("LOCPOT", chgcar([values], elements="").encode(), READ),
+    ]
+
+
+def amira_files() -> list[Seed]:
+    from test_volume_amira import BOX, amira, run_lengths
+
+    data, moved = VALUES.tobytes(), f"TransformationMatrix 0 1 0 0 -1 0 0 0 0 0 1 0 100 0 7 1\n{BOX}"
+    little, chosen = "AmiraMesh BINARY-LITTLE-ENDIAN 2.1", volume_reader(array="V")
+    text = " ".join(map(str, VALUES.ravel())).encode()
+    return [
+        Seed("a.am", amira(little, [("byte M", "", bytes(60)), ("short V", "", data)]), chosen),
+        Seed("b.am", amira(little, [("short V", "HxZip", zlib.compress(data))], moved), READ),
+        Seed("c.am", amira("Avizo BINARY 2.1", [("short V", "HxByteRLE", run_lengths(data))]), READ),
+        Seed(
+            "d.am",
+            amira("AmiraMesh 3D ASCII 2.0", [("short[2] V", "", text + b" " + text)]),
+            volume_reader(component=1),
+        ),
+    ]
+
+
+def pairs() -> dict[str, list[Seed]]:
+    """AFNI's and Philips' pairs, by the headers that come with nibabel."""
+    from test_volume_nibabel import head_of, par_of
+
+    par, rec = par_of("variant_v4_2_header.PAR"), np.arange(27 * 64, dtype="<u2").tobytes()
+    head, brik = head_of("scaled+tlrc.HEAD", "47 54 43", "5 4 3"), VALUES.astype("<i2").tobytes()
+    times = head_of("example4d+orig.HEAD", "33 41 25", "5 4 3")
+    return {
+        "Philips PAR/REC": [
+            Seed("a.PAR", par, volume_reader(time=1), {"a.REC": rec}),
+            Seed("b.REC", rec, volume_reader(time=0, stored=True), {"b.PAR": par}),
+        ],
+        "AFNI": [
+            Seed("a+tlrc.HEAD", head, READ, {"a+tlrc.BRIK": brik}),
+            Seed("b+orig.HEAD", times, volume_reader(time=2, stored=True), {"b+orig.BRIK": brik * 3}),
+            Seed("c+tlrc.BRIK.gz", brik, READ, {"c+tlrc.HEAD": head}, pack=gzip.compress),
+        ],
+    }
+
+
+def zipped_zarr() -> list[Seed]:
+    from test_volume_zarr_zip import zipped
+
+    read = volume_reader(time=1)
+    with tempfile.TemporaryDirectory() as folder:
+        names = [zipped(Path(folder) / str(v), v, "v.zarr.zip", "", packed=v == 3) for v in (2, 3)]
+        return [Seed(f"{k}.zarr.zip", Path(name).read_bytes(), read) for k, name in enumerate(names)]
+
+
 def pictures() -> list[Seed]:
     """PNG, BMP and JPEG, alone and as a slice between two others, and a log beside slices."""
     from PIL import Image
@@ -140,6 +199,10 @@ def scans() -> dict[str, list[Seed]]:
         "MGH": mgh(),
         "MRC": mrc(),
         "cube and OpenDX": text_grids(),
+        "VASP": vasp(),
+        "AmiraMesh": amira_files(),
+        **pairs(),
+        "zipped Zarr": zipped_zarr(),
         "MINC": minc(),
         "pictures": pictures(),
     }

@@ -15,11 +15,13 @@ import signal
 import sys
 import tempfile
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from fuzz import SECONDS, Seed
+from fuzz_seeds import volume_reader
 from vtkmodules import vtkIOXML
 from vtkmodules.vtkIOLegacy import vtkDataSetWriter
 
@@ -45,7 +47,10 @@ class _Worker:
         if not self.pid:
             os.close(to)
             os.close(back)
-            _answer_all(inward, outward)
+            try:
+                _answer_all(inward, outward)
+            finally:  # whatever happens, it does not go on as a second fuzzer
+                os._exit(1)
         os.close(inward)
         os.close(outward)
         self.to, self.back = os.fdopen(to, "wb"), os.fdopen(back, "rb")
@@ -172,6 +177,14 @@ def meshes() -> list[Seed]:
     return seeds
 
 
+def parts_of_openfoam(folder: Path) -> Path:
+    """A case whose second time lies in its processor folders."""
+    from tests.test_volume_openfoam import case, decomposed
+
+    decomposed(folder, {"0.5": 0.0, "2": 1.0})
+    return case(folder, {"0.5": 0.0})
+
+
 def programs() -> list[Seed]:
     return [
         *seeds_of(files.hdf_image, ("v.vtkhdf",), array="ramp"),
@@ -187,10 +200,29 @@ def programs() -> list[Seed]:
             files.openfoam, ("system/controlDict", "constant/polyMesh/owner", "constant/polyMesh/faces", "0.5/cells"),
             time=0, dims=DIMS,
         ),
+        *seeds_of(parts_of_openfoam, ("processor0/2/cells", "processor1/constant/polyMesh/owner"), time=1, dims=DIMS),
     ]  # fmt: skip
+
+
+def grib() -> list[Seed]:
+    """Levels and times, GRIB 1 and 2; nothing without ecCodes."""
+    import grib_files as written
+
+    seeds = []
+    for edition in (1, 2):
+        pairs = [(p, h) for h in (0, 6) for p in (900, 1000)]
+        messages = [
+            written.message(written.field(p, h), edition, shortName="t", level=p, stepRange=h) for p, h in pairs
+        ]
+        with tempfile.TemporaryDirectory() as folder:
+            written.write(Path(folder) / "v.grib", *messages)
+            data = (Path(folder) / "v.grib").read_bytes()
+        seeds.append(Seed(f"v{edition}.grib", data, volume_reader(time=1, spacing=(1, 1, 1))))
+    return seeds
 
 
 def readers() -> dict[str, list[Seed]]:
     """Seeds by reader."""
     vtk_child.run = run_fork
-    return {"VTK mesh": meshes(), "VTK index": indexes(), "programs by VTK": programs()}
+    found = {"VTK mesh": meshes(), "VTK index": indexes(), "programs by VTK": programs()}
+    return found | ({"GRIB": grib()} if find_spec("eccodes") else {})

@@ -23,7 +23,7 @@ ROOMS = (
 HEAVY = {
     *("numba", "vtk", "vtkmodules", "pyvista", "onnxruntime", "torch", "matplotlib", "OpenImageIO", "OpenEXR"),
     *("scipy", "nibabel", "gsplat", "lpips", "tifffile", "h5py", "netCDF4", "zarr", "numcodecs", "pydicom"),
-    *("highdicom", "gsply", "pxr", "PIL", "imageio_ffmpeg", "dask", "distributed"),
+    *("highdicom", "gsply", "pxr", "eccodes", "PIL", "imageio_ffmpeg", "dask", "distributed"),
 }
 # Modules that hold numba kernels or torch networks: their importers import them inside the functions that call them.
 KERNELS = {"numba", "torch"}

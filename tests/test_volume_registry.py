@@ -107,7 +107,9 @@ def test_what_cannot_be_opened(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="the file is empty"):
         read_volume(str(tmp_path / "empty.nii"))
     (tmp_path / "v.abc").write_bytes(b"what is this")
-    with pytest.raises(DataError, match=r"not a format that is known.*\.nrrd.*--dims X Y Z --dtype TYPE"):
+    with pytest.raises(
+        DataError, match=r"of no known format; expected .*NRRD.* of docs/formats.md, .*--dims X Y Z --dtype TYPE"
+    ):
         read_volume(str(tmp_path / "v.abc"))
     (tmp_path / "v.nrrd.gz").write_bytes(gzip.compress(NRRD))
     with pytest.raises(DataError, match="gzip-compressed NRRD file; unpack it first"):

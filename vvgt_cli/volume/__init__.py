@@ -1,6 +1,7 @@
 """Volumes and their readers."""
 
 from vvgt_cli.volume import (  # noqa: F401  each registers its formats
+    amira,
     analyze,
     dicom,
     examples,
@@ -14,6 +15,7 @@ from vvgt_cli.volume import (  # noqa: F401  each registers its formats
     mrc,
     n5,
     netcdf,
+    nibabel_pairs,
     nifti,
     nikon,
     nrrd,
@@ -29,6 +31,7 @@ from vvgt_cli.volume import (  # noqa: F401  each registers its formats
     vtk_pieces,
     vtk_xml,
     zarr_store,
+    zarr_zip,
     zeiss,
 )
 from vvgt_cli.volume.options import ReadOptions

@@ -15,7 +15,7 @@ import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.frames import read_head
-from vvgt_cli.volume.nifti import DTYPES, MAGIC, Header, byte_order, read_parsed, scaling
+from vvgt_cli.volume.nifti import DTYPES, MAGIC, Header, byte_order, other_of_pair, read_parsed, scaling
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import Reader, register
 from vvgt_cli.volume.types import Volume
@@ -42,8 +42,8 @@ def read_analyze(path: Path, options: ReadOptions) -> Volume:
         DataError: a header that is damaged or does not fit the data, or values that are no real numbers.
         UsageError: time steps (`SeveralSteps`), or several components, and none chosen.
     """
-    if path.suffix.lower() == ".img":
-        header = next((h for h in (path.with_suffix(s) for s in (".hdr", ".HDR")) if h.is_file()), None)
+    if path.name.lower().endswith((".img", ".img.gz")):
+        header = other_of_pair(path, ".hdr")
         if header is None:
             raise DataError(f"{path}: an image without its .hdr beside it; expected a pair, or raw values with --dims")
         from vvgt_cli.volume.registry import read_volume
@@ -83,4 +83,4 @@ def _parse(head: bytes, name: str) -> tuple[Header, tuple[int, ...]]:
     return header, struct.unpack_from(order + "3h", head, 253)
 
 
-register(Reader("Analyze", (".img",), _sniff, read_analyze, times=True, by_name=True))
+register(Reader("Analyze", (".img", ".img.gz"), _sniff, read_analyze, unzips=True, times=True, by_name=True))

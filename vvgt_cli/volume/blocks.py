@@ -9,6 +9,7 @@ import bz2
 import gzip
 import math
 import mmap
+import warnings
 import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -233,8 +234,22 @@ def parse_numbers(text: bytes | mmap.mmap, start: int, n: int, dtype: np.dtype, 
     return values
 
 
-def data_file(header: Path, named: str) -> Path:
+def any_case(path: Path) -> Path:
+    """Return a file, or the one beside it whose name differs in upper and lower case alone; where none does, the path.
+
+    Of several, the one with the same stem is taken.
+    """
+    if path.is_file() or not path.parent.is_dir():
+        return path
+    found = [p for p in path.parent.iterdir() if p.name.lower() == path.name.lower() and p.is_file()]
+    found = found if len(found) < 2 else [p for p in found if p.name.partition(".")[0] == path.name.partition(".")[0]]
+    return found[0] if len(found) == 1 else path
+
+
+def data_file(header: Path, named: str, exact: bool = False) -> Path:
     """The data file that a detached header names; it must lie in the header's folder.
+
+    A file whose name differs in upper and lower case alone is taken with a message, unless ``exact``.
 
     Raises:
         DataError: a path that leaves the folder, or a file that does not exist.
@@ -248,6 +263,10 @@ def data_file(header: Path, named: str) -> Path:
             f"{header.name}: its data file is {named!r}; expected a file in the header's own folder (copy or move "
             "it there and name it without a path)"
         )
-    if not target.is_file():
-        raise DataError(f"{header.name}: its data file {named!r} does not exist beside it; expected {target}")
-    return target
+    found = any_case(target)
+    if not found.is_file() or (exact and found != target):
+        hint = "" if found == target else f" (rename {found.name})"
+        raise DataError(f"{header.name}: its data file {named!r} does not exist beside it; expected {target}{hint}")
+    if found != target:
+        warnings.warn(f"{header.name}: its data file {named!r} does not exist, {found.name} is read", stacklevel=2)
+    return found

@@ -1,14 +1,17 @@
-"""Densities as text: Gaussian's ``.cube`` and OpenDX's ``.dx`` (APBS, VMD), on grids that may be skewed.
+"""Densities as text: Gaussian's ``.cube``, OpenDX's ``.dx`` (APBS, VMD) and VASP's, on grids that may be skewed.
 
-Formats: https://gaussian.com/cubegen and "Object File Format" of IBM's OpenDX user guide, appendix B.1. Both store z
-fastest, so that a volume's first index runs along the grid's third axis. Parsed here: a header is some lines, and sizes
-are compared with the file before anything is allocated.
+Formats: https://gaussian.com/cubegen, "Object File Format" of IBM's OpenDX user guide, appendix B.1, and CHGCAR in
+https://www.vasp.at/wiki. The first two store z fastest, so that a volume's first index runs along the grid's third
+axis. Parsed here: a header is some lines, and sizes are compared with the file before anything is allocated.
 """
 
 from __future__ import annotations
 
 import math
+import mmap
 import re
+import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import IO
 
@@ -182,5 +185,68 @@ def _dx_values(keys: list[str], counts: list[int], path: Path, start: int) -> np
     return load_block(path, kinds, shape, offset=start, encoding="text")
 
 
+_NUMBER = rb"[-+.\d][-+.\deE]*"
+_ROW = rb"[ \t]*" + _NUMBER + rb"(?:[ \t]+" + _NUMBER + rb"){2}[ \t]*\r?\n"
+_VASP = re.compile(  # comment, scale, lattice, elements, their counts, kind of coordinates
+    rb"[^\n]*\n[ \t]*" + _NUMBER + rb"(?:[ \t]+" + _NUMBER + rb"){0,2}[ \t]*\r?\n" + _ROW * 3
+    + rb"(?:[ \t]*[A-Z][^\n]*\n)?[ \t]*\d[\d \t]*\r?\n[ \t]*[SsDdCcKk]"
+)  # fmt: skip
+
+
+def read_vasp(path: Path, options: ReadOptions) -> Volume:
+    """Read a grid of VASP (CHGCAR, CHG, AECCAR, PARCHG, LOCPOT, ELFCAR) on its periodic cell, lengths in angstroms.
+
+    Densities, which the file has multiplied by the cell's volume, are divided by it. Blocks of spin are components.
+
+    Raises:
+        DataError: a structure without a grid, or a damaged file.
+        UsageError: several blocks and none chosen.
+    """
+    with open(path, "rb") as file:
+        cell = _vasp_cell(file, path)
+        while not (words := _words(file, path, "the size of a grid")):
+            pass
+        sizes = [_whole([word], path, "the size of the grid") for word in words]
+        volume = abs(float(np.linalg.det(cell)))
+        if len(sizes) != 3 or min(sizes) < 1 or not 0 < volume < math.inf:
+            raise DataError(
+                f"{path}: a grid of {words[:9]} on the cell {cell.tolist()}; expected three sizes, a volume"
+            )
+        starts = [file.tell()]
+        with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as text:
+            again = rb"\n[ \t]*%d[ \t]+%d[ \t]+%d[ \t]*\r?\n" % tuple(sizes)
+            starts += [found.end() for found in re.finditer(again, text) if found.end() > starts[0]]
+    blocks = [load_block(path, np.dtype("f4"), tuple(sizes[::-1]), offset=at, encoding="text") for at in starts]
+    label = "its grid (total, then magnetization, or spin up and down)" if len(starts) > 1 else "its grid"
+    field, _ = select_component(np.stack(blocks, axis=-1), options.component, str(path), label=label)
+    placed = _placed(field, (cell / np.reshape(sizes, (3, 1)))[::-1].tolist(), [0.0] * 3, path, options)
+    name = path.name.upper()
+    if "LOCPOT" in name or "ELFCAR" in name:
+        return replace(placed, unit="angstrom")
+    if not any(word in name for word in ("CHG", "AECCAR")):
+        warnings.warn(f"{path}: taken as a density times the cell's volume, as CHGCAR, not as LOCPOT", stacklevel=2)
+    return replace(placed, unit="angstrom", slope=1 / volume)
+
+
+def _vasp_cell(file: IO[bytes], path: Path) -> np.ndarray:
+    """Return the lattice vectors (3, 3), in rows, and leave the file behind the atoms."""
+    _words(file, path, "its comment")
+    words = _words(file, path, "the scale")
+    scale = np.array(_floats(words, 3 if len(words) == 3 else 1, path, "the scale"))
+    cell = np.array([_floats(_words(file, path, "the lattice"), 3, path, "a lattice vector") for _ in range(3)])
+    volume = abs(np.linalg.det(cell))
+    if scale[0] < 0 < volume:  # it is the volume
+        scale = np.cbrt(-scale[:1] / volume)
+    words = _words(file, path, "the elements")
+    words = words if words and words[0].isdecimal() else _words(file, path, "the numbers of atoms")
+    atoms = sum(_whole([word], path, "a number of atoms") for word in words)
+    selective = "".join(_words(file, path, "the kind of coordinates")).lower().startswith("s")
+    for _ in range(min(atoms, MOST_ATOMS) + selective):
+        _words(file, path, "an atom")
+    result: np.ndarray = cell * scale
+    return result
+
+
 register(Reader("Gaussian cube", (".cube", ".cub"), lambda head: False, read_cube, by_name=True))
 register(Reader("OpenDX", (".dx",), lambda head: _DX.match(head) is not None, read_dx, by_name=True))
+register(Reader("VASP", (".vasp",), lambda head: _VASP.match(head) is not None, read_vasp))

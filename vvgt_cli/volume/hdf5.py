@@ -134,7 +134,7 @@ def _check_links(h5py: Any, file: Any, wanted: str, path: Path) -> None:
     for part in wanted.strip("/").split("/"):
         link = place.get(part, getlink=True) if isinstance(place, h5py.Group) else None
         if isinstance(link, h5py.ExternalLink):
-            data_file(path, link.filename)
+            data_file(path, link.filename, exact=True)
         place = place.get(part) if link is not None else None
 
 
@@ -145,7 +145,7 @@ def check_storage(h5py: Any, dataset: Any, path: Path, source: str) -> None:
     if dataset.is_virtual:
         for part in dataset.virtual_sources():
             if part.file_name != ".":
-                data_file(path, part.file_name)
+                data_file(path, part.file_name, exact=True)
     if dataset.chunks and int(np.prod(dataset.chunks, dtype=object)) * dataset.dtype.itemsize > MAX_CHUNK:
         raise DataError(f"{source}: chunks of {dataset.chunks} values; expected at most {size_text(MAX_CHUNK)} each")
     plan = dataset.id.get_create_plist()
@@ -193,7 +193,7 @@ register(
     Reader(
         "HDF5",
         (".h5", ".hdf5", ".he5", ".hdf", ".ims"),
-        lambda head: head.startswith(MAGIC) and not any(other in head for other in _OTHERS),
+        lambda head: MAGIC in (head[:8], head[512:520]) and not any(other in head for other in _OTHERS),
         read_hdf5,
         named_arrays=True,
         resamples=True,

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from vvgt_cli.errors import DataError
 
 MAX_HEADER = 1 << 20
+MARK = b"\xef\xbb\xbf"  # byte order mark that programs of Windows put before text
 
 
 class Fields(dict[str, str]):

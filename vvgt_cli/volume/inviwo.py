@@ -36,7 +36,7 @@ _ALIASES = {
 
 def _fields(path: Path) -> Fields:
     with open(path, "rb") as file:
-        text = file.read(MAX_HEADER).decode("utf-8", "replace")
+        text = file.read(MAX_HEADER).decode("utf-8-sig", "replace")
     fields = Fields(path.name)
     for line in text.splitlines():
         key, colon, value = line.split("#")[0].partition(":")

@@ -49,7 +49,7 @@ def read_header(path: Path) -> tuple[Fields, int]:
     fields = Fields(path.name)
     with open(path, "rb") as file:
         while (line := file.readline(MAX_HEADER)) and file.tell() <= MAX_HEADER:
-            key, equals, value = line.decode("utf-8", "replace").partition("=")
+            key, equals, value = line.decode("utf-8-sig", "replace").partition("=")
             if equals:
                 fields[key.strip().lower()] = value.strip()
             if key.strip().lower() == "elementdatafile":

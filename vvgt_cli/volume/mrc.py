@@ -19,6 +19,8 @@ from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import load_block, open_packed
 from vvgt_cli.volume.components import select_component
 from vvgt_cli.volume.headers import unit_rows
+from vvgt_cli.volume.nibabel_pairs import read_pair
+from vvgt_cli.volume.nifti import other_of_pair
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.packed import packed
 from vvgt_cli.volume.readers import Reader, register, volume_name
@@ -152,6 +154,8 @@ def read_mrc(path: Path, options: ReadOptions) -> Volume:
         UsageError: several volumes (`SeveralSteps`) and none chosen, or a choice that does not exist.
     """
     head, encoding = _read_head(path)
+    if path.suffix.lower() == ".rec" and not _sniff(head) and other_of_pair(path, ".PAR"):
+        return read_pair(path, options)
     header = parse_header(head, str(path))
     step = options.step(header.volumes, str(path))
     if not header.stated and options.spacing is None:

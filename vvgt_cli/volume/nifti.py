@@ -7,6 +7,7 @@ Format: nifti1.h and nifti2.h (NIMH); scaling as section "DATA SCALING" has it: 
 from __future__ import annotations
 
 import math
+import re
 import struct
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.blocks import load_block
+from vvgt_cli.volume.blocks import any_case, load_block
 from vvgt_cli.volume.components import select_component
 from vvgt_cli.volume.frames import Frames, load_frames, read_head
 from vvgt_cli.volume.headers import unit_rows
@@ -183,14 +184,11 @@ def _rotation(header: Header) -> tuple[float, ...]:
     return tuple(v for row in rows for v in row)
 
 
-def _image_file(path: Path) -> tuple[Path, bool]:
-    """The ``.img`` (or ``.img.gz``) of a pair's header."""
-    stem = path.name[:-3] if path.name.endswith(".gz") else path.name
-    for suffix in (".img", ".img.gz"):
-        image = path.with_name(stem.rsplit(".", 1)[0] + suffix)
-        if image.is_file():
-            return image, suffix.endswith(".gz")
-    raise DataError(f"{path}: the header of a pair, without its .img file beside it")
+def other_of_pair(path: Path, suffix: str) -> Path | None:
+    """Return the ``.img`` of a ``.hdr``, or the reverse, gzip-compressed or not, in any case; None without one."""
+    stem = re.sub(r"\.\w+(\.gz)?$", "", path.name, flags=re.IGNORECASE)
+    files = [any_case(path.with_name(stem + suffix + packed)) for packed in ("", ".gz")]
+    return next((file for file in files if file.is_file()), None)
 
 
 def read_nifti(path: Path, options: ReadOptions) -> Volume:
@@ -212,7 +210,10 @@ def read_parsed(header: Header, path: Path, zipped: bool, options: ReadOptions) 
     """The volume of the header in ``path``, a file that may be ``zipped``; arguments and errors as `read_nifti`."""
     source = path
     if not header.single:
-        source, zipped = _image_file(path)
+        image = other_of_pair(path, ".img")
+        if image is None:
+            raise DataError(f"{path}: the header of a pair, without its .img file beside it")
+        source, zipped = image, image.suffix.lower() == ".gz"
     if header.samples:
         spatial = (*header.dims, 1, 1)[:3]
         return _placed(header, _colors(header, source, zipped, spatial, path, options), path, options)
@@ -254,4 +255,4 @@ def _placed(header: Header, field: np.ndarray, path: Path, options: ReadOptions)
     )
 
 
-register(Reader("NIfTI", (".nii", ".nii.gz", ".hdr"), _sniff, read_nifti, unzips=True, times=True))
+register(Reader("NIfTI", (".nii", ".nii.gz", ".hdr", ".hdr.gz"), _sniff, read_nifti, unzips=True, times=True))

@@ -18,7 +18,7 @@ import numpy as np
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.blocks import data_file, load_block
 from vvgt_cli.volume.components import select_component
-from vvgt_cli.volume.headers import MAX_HEADER, Fields, unit_rows
+from vvgt_cli.volume.headers import MARK, MAX_HEADER, Fields, unit_rows
 from vvgt_cli.volume.nrrd_files import data_names, load_files
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.packed import Packed, packed
@@ -60,7 +60,7 @@ def read_header(path: Path) -> tuple[Fields, int]:
         DataError: not a NRRD file, or a header without an end.
     """
     with open(path, "rb") as file:
-        if not file.readline(MAX_HEADER).startswith(b"NRRD000"):
+        if not file.readline(MAX_HEADER).removeprefix(MARK).startswith(b"NRRD000"):
             raise DataError(f"{path}: does not begin with NRRD000; expected a NRRD file")
         fields = Fields(path.name)
         while line := file.readline(MAX_HEADER):

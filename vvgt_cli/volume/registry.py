@@ -15,12 +15,15 @@ from typing import Any
 from vvgt_cli.errors import DataError, SeveralSteps, UsageError, VvgtError
 from vvgt_cli.files import seekable
 from vvgt_cli.volume.cut import crop, masked, parse_crop
+from vvgt_cli.volume.headers import MARK
 from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.readers import HEAD_BYTES, READERS, SCHEMES, STEPPED, Reader, known_suffixes
+from vvgt_cli.volume.readers import HEAD_BYTES, READERS, SCHEMES, STEPPED, Reader
 from vvgt_cli.volume.space import in_space
 from vvgt_cli.volume.types import Volume
+from vvgt_cli.volume.unread import way_out
 
 LOOKED_AT = 2000  # files of a folder
+LISTED = "NIfTI, NRRD, DICOM, TIFF, VTK, HDF5 or another format of docs/formats.md"
 PREVIEWS = 10  # pictures for each volume beside them, up to which they do not make a folder one of slices
 
 
@@ -162,9 +165,7 @@ def _folder(path: Path, source: str) -> Reader:
                             for kind, names in lying.items())  # fmt: skip
         raise DataError(f"{source}: a folder; expected one volume, found {listing}: give one of the files")
     kinds = ", ".join(reader.name for reader in READERS if reader.holds is not None)
-    raise DataError(
-        f"{source}: a folder; expected a volume file ({', '.join(known_suffixes())}) or a folder of {kinds}"
-    )
+    raise DataError(f"{source}: a folder; expected a volume file ({LISTED}) or a folder of {kinds}")
 
 
 def _volumes_in(path: Path) -> dict[str, list[str]]:
@@ -197,7 +198,7 @@ def _head(path: Path, source: str) -> bytes:
     named = _by_name(path)
     if not head and not (named and named.empty):
         raise DataError(f"{source}: the file is empty; expected a volume")
-    return head
+    return head.removeprefix(MARK)
 
 
 def _by_content(path: Path, head: bytes) -> tuple[Reader | None, bool]:
@@ -234,11 +235,8 @@ def _find(path: Path, head: bytes, options: ReadOptions) -> Reader:
         return found
     if options.dims and (options.dtype or named is None or not named.resamples):
         return raw.READER
-    if head.startswith((b"ply\n", b"ply\r\n")):
-        raise DataError(
-            f"{path}: a .ply (Gaussians, points or a mesh); expected the volume that it was made from (try "
-            f"'vvgt info', 'vvgt render' or 'vvgt evaluate {path.name} --volume VOLUME')"
-        )
+    if known := way_out(path, head, by_name=named is None):
+        raise DataError(f"{path}: {known}")
     if named is not None and named.by_name:
         return named
     if named is not None:
@@ -246,10 +244,7 @@ def _find(path: Path, head: bytes, options: ReadOptions) -> Reader:
             f"{path}: named like a {named.name} file, but its content is of no known format; expected a whole "
             f"{named.name} file, or raw values with --dims X Y Z --dtype TYPE"
         )
-    raise DataError(
-        f"{path}: not a format that is known by content or name; expected {', '.join(known_suffixes())}, or a raw "
-        "file with --dims X Y Z --dtype TYPE"
-    )
+    raise DataError(f"{path}: of no known format; expected {LISTED}, or raw values with --dims X Y Z --dtype TYPE")
 
 
 def _check_options(reader: Reader, source: str, options: ReadOptions) -> None:

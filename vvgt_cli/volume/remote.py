@@ -138,9 +138,10 @@ class Remote:
     def stat(self) -> _Size:
         return _Size(len(self._content or b""))
 
-    def store(self) -> Any:
+    def store(self) -> dict[str, Any]:
         """The same for zarr."""
-        return need("zarr.storage", "zarr", str(self), "Zarr").FsspecStore(self._server.zarrs, True, str(self))
+        storage = need("zarr.storage", "zarr", str(self), "Zarr")
+        return {"store": storage.FsspecStore(self._server.zarrs, True, str(self))}
 
     def allow(self, size: int) -> None:
         """Answers as long as a packed chunk of so many bytes."""

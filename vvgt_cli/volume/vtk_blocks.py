@@ -140,10 +140,10 @@ def block_table(path: Path, start: int, word: np.dtype, coded: bool) -> np.ndarr
 
 def _check(path: Path, name: str, words: list[int], room: int) -> None:
     """Sizes of an array's blocks: count, bytes, bytes of the last, packed bytes of each."""
-    if words[:1] == [0]:
+    if words[:1] == [0] and not any(words[2:3]):
         return  # no block, nothing to read
     packed = words[3:]
-    if len(words) < 3 or len(packed) != words[0]:
+    if len(words) < 3 or len(packed) != words[0] or not words[0]:
         raise DataError(f"{path}: array {name!r} has no whole table of its compressed blocks; check that it is whole")
     count, block, last = words[:3]
     if max(count * block, last) > room or sum(packed) > path.stat().st_size:

@@ -20,9 +20,10 @@ from typing import IO, Any, cast
 
 import numpy as np
 
-from vvgt_cli.errors import DataError, SeveralComponents, SeveralSteps, UsageError, VvgtError
+from vvgt_cli.errors import DataError, SeveralArrays, SeveralComponents, SeveralSteps, UsageError, VvgtError
 from vvgt_cli.resources import free_memory
 from vvgt_cli.volume.blocks import check_memory, count
+from vvgt_cli.volume.grib import GRIB, grib_volume
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.resample import MOST
@@ -141,16 +142,13 @@ def received(stream: IO[bytes]) -> tuple[dict[str, Any], np.ndarray] | None:
 
 
 def _ended(path: Path, program: str, status: int, seconds: int) -> DataError:
-    kind = "VTK" if program in (INDEX, SINGLE) else program
+    who = "ecCodes" if program == GRIB else f"VTK's reader of {'VTK' if program in (INDEX, SINGLE) else program} files"
     if status in (-signal.SIGXCPU, -signal.SIGKILL):
         return DataError(
-            f"{path}: VTK's reader of {kind} files was stopped (after {seconds} s, a minute of standstill, "
-            "or for its memory); is it whole?"
+            f"{path}: {who} was stopped (after {seconds} s, a minute of standstill, or for its memory); is it whole?"
         )
     what = signal.Signals(-status).name if status < 0 else f"status {status}"
-    return DataError(
-        f"{path}: VTK's reader of {kind} files broke down ({what}), or had too little memory; is the file whole?"
-    )
+    return DataError(f"{path}: {who} broke down ({what}), or had too little memory; is the file whole?")
 
 
 def _error(facts: dict[str, Any]) -> VvgtError:
@@ -161,6 +159,8 @@ def _error(facts: dict[str, Any]) -> VvgtError:
         made = SeveralSteps("", facts["steps"], times=facts["times"])
         made.args = (text,)
         return made
+    if kind == "SeveralArrays":
+        return SeveralArrays(text, "--array", facts["choices"])
     if kind == "SeveralComponents":
         return SeveralComponents(text, facts["count"], facts["color"])
     return UsageError(text) if kind == "UsageError" else DataError(text)
@@ -173,16 +173,17 @@ def answer(request: dict[str, Any]) -> tuple[dict[str, Any], np.ndarray | None]:
         key: tuple(value) if isinstance(value, list) else value for key, value in request["options"].items()
     }
     options = ReadOptions(**given)
-    notes: list[str] = []
+    caught: list[Any] = []
     try:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             facts, values = _work(request["program"], path, options, request["task"])
-        notes = [str(one.message) for one in caught if one.category is UserWarning]
     except VvgtError as error:
         facts, values = {"error": type(error).__name__, "text": str(error)}, None
         if isinstance(error, SeveralSteps):
             facts |= {"steps": error.steps, "times": [float(time) for time in error.times or ()]}
+        if isinstance(error, SeveralArrays) and request["program"] == GRIB:
+            return facts | {"choices": error.choices, "notes": []}, None
         if isinstance(error, SeveralComponents):
             facts |= {"count": error.count, "color": error.color}
         if facts["error"] not in ("SeveralSteps", "SeveralComponents"):
@@ -195,7 +196,9 @@ def answer(request: dict[str, Any]) -> tuple[dict[str, Any], np.ndarray | None]:
     except Exception as error:  # of readers that were given anything
         text = " ".join(str(error).split())[:300] or type(error).__name__
         facts, values = {"error": "DataError", "text": f"{path}: damaged ({text}); check that it is whole"}, None
-    return {**facts, "notes": notes}, values
+    again = facts.get("error") in ("SeveralSteps", "SeveralComponents")  # those who choose are told then
+    told = [str(one.message) for one in caught if one.category is UserWarning and not again]
+    return {**facts, "notes": told}, values
 
 
 def _work(program: str, path: Path, options: ReadOptions, task: str) -> tuple[dict[str, Any], np.ndarray | None]:
@@ -204,8 +207,11 @@ def _work(program: str, path: Path, options: ReadOptions, task: str) -> tuple[di
 
     if task == "contents":
         return contents_of(program, path, options), None
-    leaves, _ = datasets(program, path, options.time)
-    volume = volume_of(leaves, replace(options, time=None), str(path), volume_name(path))
+    if program == GRIB:
+        volume = grib_volume(path, options)
+    else:
+        leaves, _ = datasets(program, path, options.time, options.array)
+        volume = volume_of(leaves, replace(options, time=None), str(path), volume_name(path))
     values = np.ascontiguousarray(volume.data)
     place = {key: [float(v) for v in getattr(volume, key)] for key in ("spacing", "origin", "direction")}
     return {"name": volume.name, "dtype": values.dtype.str, "shape": values.shape, **place}, values

@@ -24,7 +24,7 @@ HEAD = 4096
 LISTED = 50  # blocks and steps
 
 
-def datasets(program: str, path: Path, time: int | None) -> tuple[list[Leaf], list[float]]:
+def datasets(program: str, path: Path, time: int | None, array: str | None = None) -> tuple[list[Leaf], list[float]]:
     """The datasets of a time step, and the times of all steps.
 
     Raises:
@@ -34,7 +34,7 @@ def datasets(program: str, path: Path, time: int | None) -> tuple[list[Leaf], li
     if program == SINGLE:
         return list(_dataset(path, ())), []
     if program != INDEX:
-        return read_program(PROGRAMS[program], path, time)
+        return read_program(PROGRAMS[program], path, time, array)
     index = read_index(path)
     return list(_indexed(index, time, ())), index.times
 

@@ -7,6 +7,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from vvgt_cli.volume.grib import GRIB
+from vvgt_cli.volume.headers import MARK
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import HEAD_BYTES, Reader, register
 from vvgt_cli.volume.types import Volume
@@ -22,7 +24,7 @@ SUFFIXES = (".pvtu", ".pvtr", ".pvts", ".vtm", ".vtmb", ".vtpd", ".vtpc", ".vth"
 
 def is_index(head: bytes) -> bool:
     """Whether a file begins as an index of datasets (one of the pieces of an image is none)."""
-    if head.lstrip().startswith(b"{"):
+    if head.removeprefix(MARK).lstrip().startswith(b"{"):
         return b'"file-series-version"' in head
     kind = xml_kind(head)
     return kind in INDEXES and kind != "PImageData"
@@ -76,6 +78,12 @@ for _program in PROGRAMS.values():
             within=_program.within, contents=partial(_contents, _program.name),
         )
     )  # fmt: skip
+register(
+    Reader(
+        "GRIB", (".grib", ".grib1", ".grib2", ".grb", ".grb1", ".grb2"), lambda head: b"GRIB" in head[:64],
+        partial(volume_by_child, GRIB), named_arrays=True, times=True, resamples=True,
+    )
+)  # fmt: skip
 for _name, _suffixes, _sniff in (
     ("VTK grid", (".vtu", ".vtr", ".vts"), lambda head: xml_kind(head) in GRIDS),
     ("legacy VTK grid", (), lambda head: is_legacy(head, grid=True)),

@@ -16,6 +16,7 @@ from xml.parsers import expat
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import data_file
+from vvgt_cli.volume.headers import MARK
 from vvgt_cli.volume.options import ReadOptions
 
 INDEX, SINGLE = "index", "single"  # in the place of a program: an index of VTK's own files, or one of these
@@ -92,7 +93,7 @@ def read_index(path: Path) -> Index:
     if size > MAX_BYTES:
         raise DataError(f"{path}: {size} bytes; expected an index of at most {MAX_BYTES >> 20} MiB")
     with open(path, "rb") as file:
-        head = file.read(4096).lstrip()
+        head = file.read(4096).removeprefix(MARK).lstrip()
     found = _series(path) if head.startswith(b"{") else _parse(path)
     if not found.entries:
         raise DataError(f"{path}: an index that names no files; expected those of a dataset")
@@ -103,7 +104,7 @@ def _series(path: Path) -> Index:
     """ParaView's ``{"file-series-version": "1.0", "files": [{"name": ..., "time": ...}]}``."""
     found = Index(path, "series")
     try:
-        rows = json.loads(path.read_text("utf-8"))["files"]
+        rows = json.loads(path.read_text("utf-8-sig"))["files"]
         for k, row in enumerate(rows):
             time = float(row.get("time", k))
             _add(found, Entry(str(row["name"]), time if math.isfinite(time) else float(k)))

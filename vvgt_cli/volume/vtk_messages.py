@@ -10,7 +10,7 @@ from typing import Any
 
 @contextmanager
 def quiet_vtk() -> Iterator[Any]:
-    """Keep VTK's messages from the terminal; yields a function that returns the first, or the first error."""
+    """Keep VTK's messages from the terminal; yields a function that returns the first, or every one."""
     from vtkmodules.vtkCommonCore import vtkLogger, vtkOutputWindow, vtkStringOutputWindow
 
     window, before = vtkStringOutputWindow(), vtkOutputWindow.GetInstance()
@@ -18,14 +18,14 @@ def quiet_vtk() -> Iterator[Any]:
     vtkOutputWindow.SetInstance(window)
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
 
-    def message(errors: bool = False) -> str:
+    def message(errors: bool = False, every: bool = False) -> str:
         # "ERROR: In file, line n\nclass (0x..): text"
         output = window.GetOutput() or ""
         if isinstance(output, bytes):  # with something in it that is no text
             output = output.decode("utf-8", "replace")
         head = r"ERROR: In [^\n]*\n[^\n]*" if errors else ""
         texts = re.findall(head + r"\((?:0x[0-9a-f]+|nullptr)\): ([^\n]+)", output)
-        return re.sub(r" \(0x[0-9a-f]+\)", "", texts[0]).strip() if texts else ""
+        return re.sub(r" \(0x[0-9a-f]+\)", "", "\n".join(texts if every else texts[:1])).strip()
 
     try:
         yield message

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import re
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,9 +16,10 @@ from typing import Any
 from xml.parsers import expat
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.blocks import data_file
+from vvgt_cli.volume.blocks import any_case, data_file
+from vvgt_cli.volume.headers import MARK
 from vvgt_cli.volume.vtk_index import MAX_BYTES, chosen_time
-from vvgt_cli.volume.vtk_leaves import Leaf, leaves_of
+from vvgt_cli.volume.vtk_leaves import Leaf, arrays_in, leaves_of
 from vvgt_cli.volume.vtk_messages import quiet_vtk
 
 HDF5 = b"\x89HDF\r\n\x1a\n"
@@ -35,6 +37,7 @@ class Program:
         reader: what makes VTK's reader of a file, all arrays enabled.
         within: formats that its files may be taken for by their content.
         by_name: its files have no beginning of their own: the name decides. They may be empty.
+        skips: its reader goes on without the fields that it cannot read.
     """
 
     name: str
@@ -43,13 +46,16 @@ class Program:
     reader: Callable[[Path], Any]
     within: tuple[str, ...] = ()
     by_name: bool = False
+    skips: bool = False
 
 
-def read_program(program: Program, path: Path, time: int | None) -> tuple[list[Leaf], list[float]]:
+def read_program(
+    program: Program, path: Path, time: int | None, array: str | None = None
+) -> tuple[list[Leaf], list[float]]:
     """The datasets of a time step, and the times of all steps.
 
     Raises:
-        DataError: damaged, or a file that it names is missing or lies elsewhere.
+        DataError: damaged, or a file that it names is missing or lies elsewhere, or VTK cannot read field ``array``.
         UsageError: several time steps and none chosen, or one that there is not.
     """
     from vtkmodules.vtkCommonExecutionModel import vtkStreamingDemandDrivenPipeline
@@ -67,17 +73,39 @@ def read_program(program: Program, path: Path, time: int | None) -> tuple[list[L
             reader.UpdateTimeStep(chosen)
         found = reader.GetOutputDataObject(0)
         leaves = [leaf for leaf in leaves_of(found) if leaf.data.GetNumberOfPoints() > 0]
-        error = message(errors=True) or told
+        error, errors = message(errors=True) or told, message(errors=True, every=True)
+    if program.skips and leaves and error and not told and _mesh_is_sound(program, path, chosen):
+        held = {info.name for info in arrays_in(leaves)}
+        lost = [name for k in range(reader.GetNumberOfCellArrays()) if (name := reader.GetCellArrayName(k)) not in held]
+        lost = [
+            name for name in lost if re.search(rf"\b{re.escape(name)}\b", errors)
+        ] or lost  # others have other times
+        if array in lost:
+            raise DataError(f"{path}: VTK cannot read field {array} ({error}); expected plain values in its file")
+        warnings.warn(
+            f"{path}: without {', '.join(lost) or 'some values'}, which VTK cannot read ({error})", stacklevel=2
+        )
+        return leaves, times
     if error or not leaves:
         fault = f"cannot read it ({error})" if leaves else f"finds no dataset in it ({error or 'no message'})"
         raise DataError(f"{path}: VTK {fault}; is the {program.name} file whole?")
     return leaves, times
 
 
+def _mesh_is_sound(program: Program, path: Path, time: float | None) -> bool:
+    """Return whether VTK reads a time step without an error when all fields are switched off."""
+    with quiet_vtk() as message:
+        reader = program.reader(path)
+        reader.DisableAllCellArrays()
+        reader.DisableAllPointArrays()
+        reader.UpdateTimeStep(0.0 if time is None else time)
+        return not message(errors=True)
+
+
 def _check_name(path: Path, named: str) -> None:
     """Refuse a file named by another that does not lie in its folder, or is not there; a pattern stands for several."""
     if not re.search(r"[*%]", named):
-        data_file(path, named)
+        data_file(path, named, exact=True)  # VTK opens it
     elif Path(named).is_absolute() or ".." in Path(named).parts:
         raise DataError(f"{path.name}: it names {named!r}; expected files in its own folder")
 
@@ -93,13 +121,15 @@ def _small(path: Path) -> str:
     """The text of a file that describes others."""
     if path.stat().st_size > MAX_BYTES:
         raise DataError(f"{path}: {path.stat().st_size} bytes; expected at most {MAX_BYTES >> 20} MiB of text")
-    return path.read_text("utf-8", "replace")
+    return path.read_text("utf-8-sig", "replace")
 
 
 def _ensight(path: Path) -> Any:
     from vtkmodules.vtkIOEnSight import vtkGenericEnSightReader
 
     section, names = "", []
+    if path.read_bytes().startswith(MARK):
+        raise DataError(f"{path}: begins with a byte order mark, which VTK's reader stops at; save it as plain text")
     for line in _small(path).splitlines():
         line = line.partition("#")[0].strip()
         if re.fullmatch(r"[A-Z]+", line):
@@ -130,21 +160,44 @@ def _exodus(path: Path) -> Any:
     return reader
 
 
+def _times(folder: Path) -> set[float]:
+    """Return the times that the folders of an OpenFOAM case are named by."""
+    number = re.compile(r"\d*\.?\d+(?:e[+-]?\d+)?", re.I)
+    return {float(p.name) for p in folder.glob("*") if number.fullmatch(p.name) and p.is_dir()}
+
+
 def _openfoam(path: Path) -> Any:
+    """Make the reader of a case: of its decomposed parts where they have times that the whole case lacks."""
     from vtkmodules.vtkIOParallel import vtkPOpenFOAMReader
 
-    whole, parts = (path.parent / "constant" / "polyMesh").is_dir(), (path.parent / "processor0").is_dir()
-    if not whole and not parts:
+    case, asked = path.parent, path.stem.lower()
+    whole = any(p.is_dir() for pattern in ("polyMesh", "*/polyMesh") for p in (case / "constant").glob(pattern))
+    mine, parts = _times(case), _times(case / "processor0")
+    if any(_times(p) - mine - parts for p in case.glob("processors*")):
+        text = f"{path}: its processors folder (OpenFOAM's collated format) holds times, which VTK does not read; try"
+        text += " reconstructPar, or mpirun -np N foamFormatConvert -parallel -fileHandler uncollated"
+        if not whole and not parts:
+            raise DataError(text)
+        warnings.warn(text, stacklevel=2)
+    if not whole and not (case / "processor0").is_dir():
         raise DataError(f"{path}: no case beside it; expected a folder with constant/polyMesh or processor0 in it")
+    decomposed = not whole or bool((parts and asked == "decomposed") or (parts - mine and asked != "reconstructed"))
+    if whole and parts - mine:
+        here, there = ("decomposed", "reconstructed") if decomposed else ("reconstructed", "decomposed")
+        warnings.warn(
+            f"{path}: the {here} case is read; decomposed it has {len(parts)} times up to {max(parts):g}, "
+            f"reconstructed {len(mine)} up to {max(mine, default=0):g}; read {there}.foam, an empty file, for that",
+            stacklevel=2,
+        )
     reader = vtkPOpenFOAMReader()
     reader.SetFileName(str(path))
-    reader.SetCaseType(1 if whole else 0)  # reconstructed, or decomposed
+    reader.SetCaseType(0 if decomposed else 1)
     reader.CreateCellToPointOff()  # values as they are stored
     reader.UpdateInformation()
     reader.EnableAllCellArrays()
     reader.EnableAllPointArrays()
-    reader.DisableAllPatchArrays()
-    reader.SetPatchArrayStatus("internalMesh", 1)
+    for name in [reader.GetPatchArrayName(k) for k in range(reader.GetNumberOfPatchArrays())]:
+        reader.SetPatchArrayStatus(name, name.endswith("internalMesh"))  # of each region
     return reader
 
 
@@ -224,8 +277,8 @@ def _plot3d(path: Path) -> Any:
             )
     else:
         for key, suffix in (("q", ".q"), ("function", ".f")):
-            if path.with_suffix(suffix).is_file():
-                files[key] = path.with_suffix(suffix).name
+            if (found := any_case(path.with_suffix(suffix))).is_file():
+                files[key] = found.name
     if len(files) < 2:
         raise DataError(f"{path}: coordinates alone; expected values beside them, in {path.stem}.q or {path.stem}.f")
     _check_names(path, list(files.values()))
@@ -282,7 +335,7 @@ PROGRAMS = {
             _exodus,
             within=("NetCDF", "HDF5"),
         ),
-        Program("OpenFOAM", (".foam",), lambda head: False, _openfoam, by_name=True),
+        Program("OpenFOAM", (".foam",), lambda head: False, _openfoam, by_name=True, skips=True),
         Program("XDMF", (".xdmf", ".xmf", ".xdmf2", ".xdmf3"), _is_xdmf, _xdmf),
         Program(
             "CGNS",

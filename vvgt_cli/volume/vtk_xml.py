@@ -125,8 +125,10 @@ def scan(path: Path) -> Scan:
                 raise DataError(f"{path}: its XML is damaged ({error}); check that the file is whole") from error
         if found.data_start >= 0:
             file.seek(found.data_start)
-            mark = file.read(4096).find(b"_")
-            found.data_start = found.data_start + mark + 1 if mark >= 0 else -1
+            mark = re.match(rb"[^>]*>\s*_", file.read(4096))
+            if mark is None:  # VTK's reader would begin elsewhere
+                raise DataError(f"{path}: its appended data do not begin with _; check that the file is whole")
+            found.data_start += mark.end()
     return found
 
 
@@ -139,8 +141,7 @@ def _note_array(found: Scan, attributes: dict[str, str], path: Path) -> None:
         raise DataError(f"{path}: array {attributes.get('Name')!r} has {components} components")
     name = attributes.get("Name", "")
     active = bool(name) and name == found.active.get(found.where)
-    info = ArrayInfo(name, found.where, components, np.dtype(dtype).name, active)
-    found.arrays.append((info, attributes))
+    found.arrays.append((ArrayInfo(name, found.where, components, np.dtype(dtype).name, active), attributes))
 
 
 def _numbers(text: str, n: int, path: Path, what: str) -> list[float]:
@@ -252,9 +253,8 @@ def image_values(found: Scan, info: ArrayInfo, grid: Grid, options: ReadOptions,
     if packed is not None:
         return packed
     values = _stored(found, info, grid, path)
-    component, _ = select_component(
-        values, options.component, str(path), label=f"array {info.name!r}", color=values.dtype == np.uint8
-    )
+    label, color = f"array {info.name!r}", values.dtype == np.uint8
+    component, _ = select_component(values, options.component, str(path), label=label, color=color)
     for where in ("point", "cell"):
         row = found.find(GHOSTS, where)
         if row is None or (where == "point" and info.where == "cell") or row[0].components != 1:
@@ -385,7 +385,7 @@ def _by_vtk(path: Path, info: ArrayInfo, shape: tuple[int, ...]) -> np.ndarray:
 
 def xml_kind(head: bytes) -> str | None:
     """Type of dataset that a VTK XML file begins with ("" where it says none), None of any other file."""
-    if re.search(rb"^\s*(?:<\?xml[^>]*>\s*)?(?:<!--.*?-->\s*)*<VTKFile\s", head, re.DOTALL) is None:
+    if re.search(rb"^(?:\xef\xbb\xbf)?\s*(?:<\?xml[^>]*>\s*)?(?:<!--.*?-->\s*)*<VTKFile\s", head, re.DOTALL) is None:
         return None
     kind = re.search(rb'<VTKFile\s[^>]*?type\s*=\s*["\'](\w+)["\']', head)
     return "" if kind is None else kind[1].decode()

@@ -65,7 +65,7 @@ def read_zarr(path: Path, options: ReadOptions) -> Volume:
 def _array(zarr: Any, place: Path) -> Any:
     """An array whose codecs have been checked; they are once more, as a server may have answered zarr otherwise."""
     server: Any = None if isinstance(place, Path) else place  # `remote.Remote`
-    array = zarr.open_array(store=server.store() if server else place, mode="r")
+    array = zarr.open_array(**(server.store() if server else {"store": place}), mode="r")
     _check_codecs(place, array.metadata.to_dict())
     if int(np.prod(array.chunks, dtype=object)) * array.dtype.itemsize > MAX_CHUNK:
         raise DataError(f"{place}: chunks of {array.chunks} values; expected at most 2 GiB each")
@@ -75,7 +75,7 @@ def _array(zarr: Any, place: Path) -> Any:
 
 
 def _name(path: Path, place: Path) -> str:
-    stem = path.name.removesuffix(".zarr").removesuffix(".ome") or path.name
+    stem = path.name.removesuffix(".zip").removesuffix(".ozx").removesuffix(".zarr").removesuffix(".ome") or path.name
     inner = place.relative_to(path).as_posix()
     return stem if inner == "." else f"{stem}:{inner}"
 

@@ -91,17 +91,4 @@ def read_vdb(path: Path, options: ReadOptions) -> Volume:
     )
 
 
-def refuse_nanovdb(path: Path, options: ReadOptions) -> Volume:
-    """Say what to do with a NanoVDB file: no light library gives its values as an array on a CPU.
-
-    Raises:
-        DataError: always.
-    """
-    raise DataError(
-        f"{path}: a NanoVDB file, which is laid out for GPUs; expected OpenVDB: try 'nanovdb_convert {path.name} "
-        f"{path.stem}.vdb' (a tool that comes with OpenVDB)"
-    )
-
-
 register(Reader("OpenVDB", (".vdb",), lambda head: head.startswith(MAGIC), read_vdb, named_arrays=True))
-register(Reader("NanoVDB", (".nvdb",), lambda head: head.startswith(b"NanoVDB"), refuse_nanovdb, named_arrays=True))
