@@ -87,6 +87,18 @@ def ome_zarr() -> list[Seed]:
     return [Seed("v.zarr/.zattrs", json.dumps(attributes).encode(), in_folder(time=1), files)]
 
 
+def vtkjs() -> list[Seed]:
+    import tempfile
+
+    from tests.test_volume_vtkjs import write
+
+    with tempfile.TemporaryDirectory() as folder:
+        write(Path(folder) / "v")
+        files = {f"v/{p.relative_to(f'{folder}/v')}": p.read_bytes() for p in Path(folder).rglob("*") if p.is_file()}
+    index = files.pop("v/index.json")
+    return [Seed("v/index.json", index, in_folder(array="v"), files)]
+
+
 def hospital() -> dict[str, list[Seed]]:
     """Seeds by reader."""
-    return {"DICOM": dicom(), "HDF5 conventions": hdf5_conventions(), "OME-Zarr": ome_zarr()}
+    return {"DICOM": dicom(), "HDF5 conventions": hdf5_conventions(), "OME-Zarr": ome_zarr(), "vtk.js": vtkjs()}

@@ -30,6 +30,7 @@ from vvgt_cli.volume import (  # noqa: F401  each registers its formats
     vtk_legacy,
     vtk_pieces,
     vtk_xml,
+    vtkjs,
     zarr_store,
     zarr_zip,
     zeiss,
