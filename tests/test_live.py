@@ -357,8 +357,8 @@ def test_blocks_have_the_same_values_to_the_byte(tmp_path) -> None:
         request = replace(request, fit=FitOptions(max_gaussians=300, size=64), live=True)
         with opened(Run(Console(quiet=True), ConversionReport("convert")), request) as field:
             wide = replace(cloud(200), log_scales=cloud(200).log_scales + 1)
-            foggy = field.shown_by(fog(field.source.statistics))
-            found.append((field.under(wide), foggy.view(default_views("test", size=32)[0], RenderSettings())))
+            foggy = field.with_look(field.source.shown_by(fog(field.source.statistics)))
+            found.append((field.sample(wide), foggy.view(default_views("test", size=32)[0], RenderSettings())))
     np.testing.assert_array_equal(found[0][0], found[1][0])
     assert np.isfinite(found[0][0]).all(axis=1).mean() > 0.9
     np.testing.assert_allclose(found[0][1], found[1][1], atol=2e-3)

@@ -16,7 +16,7 @@ import vvgt_cli as vvgt_library
 from tests.test_live_labels import LABELS
 from tests.test_live_layers import TF, layered, several
 from tests.test_page_live import PLANES
-from vvgt_cli.conversion import pages
+from vvgt_cli.conversion import frames as series
 from vvgt_cli.gaussians import read_ply
 from vvgt_cli.gaussians.formats.live import from_bytes
 from vvgt_cli.gaussians.formats.page_live import in_common, renumbered
@@ -71,9 +71,9 @@ def test_all_frames_of_a_page_carry_values_of_one_range(vvgt, frames, tmp_path) 
 
 
 def test_a_page_of_many_frames_is_bounded(vvgt, frames, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(pages, "MOST", 100)
+    monkeypatch.setattr(series, "MOST_LIVE", 100)
     done = vvgt("convert", frames / "f?.npy", "--live", "-o", tmp_path / "p.html", *SMALL)
-    assert (done.code, "33 Gaussians each in the place of 90" in done.err) == (0, True)
+    assert (done.code, "3 frames on one page: 33 Gaussians each, fewer than --max-gaussians" in done.err) == (0, True)
     assert len(scene_of((tmp_path / "p.html").read_bytes())["live"]["held"]) == 3
 
 

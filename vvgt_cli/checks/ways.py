@@ -13,7 +13,7 @@ import numpy as np
 from vvgt_cli.cameras import default_views
 from vvgt_cli.checks import Case, Figure, require
 from vvgt_cli.checks.scenes import function, ramp, rough, smooth, step
-from vvgt_cli.conversion.convert import initialise_only, without_files
+from vvgt_cli.conversion.convert import convert_in_memory, initialise_only
 from vvgt_cli.conversion.gaussian_files import open_gaussians
 from vvgt_cli.conversion.place import into_box
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
@@ -109,7 +109,7 @@ def _apart(one: np.ndarray, other: np.ndarray, limit: float) -> Figure:
 def _in_blocks(row: Stiff, live: bool, light: LightOptions | None) -> Figure:
     """A conversion in blocks shows what one in memory does."""
     request, console = row.request(live, light), Console(quiet=True)
-    whole, parts = (without_files(replace(request, blocks=blocks), console) for blocks in (None, BLOCKS))
+    whole, parts = (convert_in_memory(replace(request, blocks=blocks), console) for blocks in (None, BLOCKS))
     volume = whole.field.source.volume
     if live:
         kept = [found.gaussians.live for found in (whole, parts)]

@@ -105,20 +105,20 @@ def _against(field: Field, unit: Gaussians, header: PlyHeader, size: int, tolera
     frame, gaussians = volume.unit_frame(), into_box(unit, volume)
     world = into_box(rescale(unit, frame.scale, -np.array(frame.centre), np.zeros(3)), volume)
     pictures = [Picture(camera, settings) for camera in small_views()]
-    field.expect(pictures)
-    seen = [field.view(*picture) for picture in pictures]
+    field.views.expect(pictures)
+    seen = [field.views.view(*picture) for picture in pictures]
     for picture in pictures:
-        field.forget(picture)
+        field.views.forget(picture)
     yield from place_cases(gaussians, world, np.array(frame.half), seen, rule.at(SMALL / size))
 
     @cache
     def scores() -> Any:
-        return score_test_views(field, gaussians, size, settings, rule=rule, perceptual=False, only=PREVIEW_VIEWS)
+        return score_test_views(field.views, gaussians, size, settings, rule=rule, perceptual=False, only=PREVIEW_VIEWS)
 
     @cache
     def seats() -> Any:
         places = [*from_above(size), (size, CLOSE)]
-        return score_conditions(gaussians, condition_views(field, places, settings))
+        return score_conditions(gaussians, condition_views(field.views, places, settings))
 
     def error(name: str) -> Figure:
         psnr = getattr(scores(), name)
@@ -133,7 +133,7 @@ def _against(field: Field, unit: Gaussians, header: PlyHeader, size: int, tolera
         return _rms(worst.psnr, tolerance, f", {worst.rule}")
 
     def woven() -> Figure:
-        texture = score_texture(field, gaussians, size, rule, settings)
+        texture = score_texture(field.views, gaussians, size, rule, settings)
         if texture.ours is None or texture.reference is None:
             return Figure("levels of 255 (nothing is opaque and smooth)", 0, VISIBLE)
         return Figure("levels of 255 more than the volume", texture.ours - texture.reference, VISIBLE)

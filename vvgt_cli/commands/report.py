@@ -21,6 +21,7 @@ from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.source import SourceRequest, tf_record, volume_record
 from vvgt_cli.gaussians.outputs import STDOUT, Output, check_outputs, write_text
+from vvgt_cli.jit.ahead import INIT
 from vvgt_cli.network.card import find_model
 from vvgt_cli.progress import Console
 from vvgt_cli.score.curves import Series, cost, front, knee, psnr, read_series, table, unit_costs, worst_seat
@@ -70,7 +71,7 @@ def report(request: ReportRequest, console: Console | None = None) -> dict[str, 
     check_memory(VIEWS * size**2 * VIEW_BYTES, f"--size {size}: test views and ours", "try a smaller --size")
     fit = FitOptions(request.ladder.max_gaussians, size)
     whole = ConvertRequest(request.source, fit=fit, blocks=request.ladder.blocks)
-    with opened(Run(console, ConversionReport("report")), whole) as volume:
+    with opened(Run(console, ConversionReport("report")), whole, INIT) as volume:
         source = volume.source
         live = replace(whole, live=True, fit=FitOptions(fit.max_gaussians, size))
         request = replace(request, ladder=replace(request.ladder, live=refusal(live, source) is None))

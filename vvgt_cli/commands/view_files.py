@@ -162,7 +162,7 @@ def field_points(field: Field, size: int) -> tuple[np.ndarray, np.ndarray]:
     """`start_points` of a volume in blocks."""
     from vvgt_cli.closed_form import VbmOptions
 
-    found = field.start(VbmOptions(POINTS, size)).gaussians
+    found = field.pyramid(VbmOptions(POINTS, size)).gaussians
     half = np.array(field.source.volume.unit_frame().half)
     points = np.clip(found.means.astype(np.float64), -half, half)
     return points @ field.source.volume.axes.T, np.clip(found.colors, 0, 1)

@@ -48,7 +48,8 @@ def fog_of_labels(field: Field, labels: tuple[Label, ...]) -> Field:
     layer = field.source.layers[0]
     assert isinstance(layer.tf, LabelTable)
     voxels = counts_of(layer.volume)
-    return field.labelled_by([label_fog(layer.tf, {e.number: voxels.get(float(e.number), 0) for e in labels})])
+    table = label_fog(layer.tf, {e.number: voxels.get(float(e.number), 0) for e in labels})
+    return field.with_look(field.source.labelled_by([table]))
 
 
 def carrying_labels(run: Run, field: Field, start: Start, labels: tuple[Label, ...]) -> Gaussians:
