@@ -11,11 +11,9 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.look.colormap import ColorMap
 from vvgt_cli.look.convert import to_text
-from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.look.function import ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.labels import Label
-from vvgt_cli.look.opacity import PiecewiseOpacity
 from vvgt_cli.look.readers.minimal import read
 from vvgt_cli.volume import Statistics, Volume
 from vvgt_cli.volume.stats import BINS, edges_of

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from vvgt_cli.look.colormap import ColorMap
-from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.look.function import ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.histogram import UNIT_SHARE, worth_showing
-from vvgt_cli.look.opacity import PiecewiseOpacity
 from vvgt_cli.look.recognise import background_bins
 from vvgt_cli.look.resolve import StatisticsLike
 

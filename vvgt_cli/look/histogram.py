@@ -8,9 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.look.colormap import ColorMap
-from vvgt_cli.look.function import TransferFunction
-from vvgt_cli.look.opacity import PiecewiseOpacity
+from vvgt_cli.look.function import ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.readers.named import named_function
 from vvgt_cli.look.recognise import SIDE, background_bins, in_hounsfield, moments
 from vvgt_cli.look.resolve import StatisticsLike, resolve

@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.look.types import Named
+from vvgt_cli.look.function import Named
 from vvgt_cli.volume.types import triple
 
 PALETTES = ("tab10", "tab20b", "tab20c", "Set2", "Dark2", "Set3")  # matplotlib's qualitative ones: 78 colours

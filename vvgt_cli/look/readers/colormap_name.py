@@ -12,9 +12,7 @@ import difflib
 import numpy as np
 
 from vvgt_cli.errors import UsageError
-from vvgt_cli.look.colormap import ColorMap
-from vvgt_cli.look.function import TransferFunction
-from vvgt_cli.look.opacity import PiecewiseOpacity
+from vvgt_cli.look.function import ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.readers.named import names
 
 FORM = "NAME[:LO,HI[:MAX]] with LO, HI and MAX in [0, 1], such as viridis:0.2,0.8:0.5"

@@ -8,9 +8,7 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.look.colormap import SPACES, ColorMap
-from vvgt_cli.look.function import TransferFunction
-from vvgt_cli.look.opacity import PiecewiseOpacity
+from vvgt_cli.look.function import SPACES, ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.readers.fields import named, rgb, table
 
 PRESET_KEYS = ("RGBPoints", "IndexedColors", "ColorSpace")
