@@ -23,9 +23,9 @@ from vvgt_cli.field.source import SourceRequest, tf_record, volume_record
 from vvgt_cli.gaussians.outputs import STDOUT, Output, check_outputs, write_text
 from vvgt_cli.network.card import find_model
 from vvgt_cli.progress import Console
+from vvgt_cli.score.charts import FILES, draw, write_plots
 from vvgt_cli.score.curves import Series, cost, front, knee, psnr, read_series, table, unit_costs, worst_seat
 from vvgt_cli.score.page import Pictures, page
-from vvgt_cli.score.plots import FILES, write_plots
 from vvgt_cli.score.record import ConversionReport, Run, document
 from vvgt_cli.volume.blocks import check_memory
 
@@ -191,8 +191,9 @@ def _pngs(images: Sequence[np.ndarray]) -> list[bytes]:
 
 def _write(folder: Path, series: list[Series], title: str, rows: str, shown: Pictures | None, overwrite: bool) -> None:
     write_text(str(folder / TABLE), rows, overwrite)
-    write_plots(folder, series, overwrite)
-    write_text(str(folder / PAGE), page(series, title, shown), overwrite)
+    charts = draw(series)
+    write_plots(folder, charts, overwrite)
+    write_text(str(folder / PAGE), page(series, charts, title, shown), overwrite)
 
 
 __all__ = ["LadderOptions", "Peer", "ReportRequest", "compare", "report"]

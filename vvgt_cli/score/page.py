@@ -8,15 +8,10 @@ from dataclasses import dataclass
 from html import escape
 from typing import Any
 
-from vvgt_cli.score.charts import Point, legend, mark, scatter, stage_bars
-from vvgt_cli.score.curves import KINDS, Run, Series, cost, front, knee, psnr, short, worst_seat
+from vvgt_cli.score.charts import Chart
+from vvgt_cli.score.curves import Run, Series, cost, front, knee, psnr, short, worst_seat
 from vvgt_cli.score.style import CSS, SCRIPT
 
-AXES = (
-    ("seconds", "seconds to the file", "Error against time"),
-    ("gaussians", "Gaussians", "Error against Gaussians"),
-    ("megabytes", "megabytes", "Error against file size"),
-)
 GAIN = 8  # of the difference at first
 
 
@@ -35,58 +30,21 @@ class Pictures:
     ours: list[list[bytes]]
 
 
-def _x(run: Run, axis: str) -> float:
-    if axis == "seconds":
-        return cost(run)
-    return float(run["gaussians"]) if axis == "gaussians" else run["bytes"] / 1e6
+def page(series: Sequence[Series], charts: Sequence[Chart], title: str, pictures: Pictures | None = None) -> str:
+    """Return the page of one report, or of several over each other.
 
-
-def points(series: Sequence[Series], axis: str) -> list[list[Point]]:
-    """Marks of each series: coloured by kind where there is one series, by series where there are several."""
-    found = []
-    for n, one in enumerate(series):
-        best = {id(run) for run in front(one.scored())} if axis == "seconds" else set()
-        marks = []
-        for run in one.scored():
-            kind = KINDS.index(run["kind"])
-            name = run["name"] if len(series) == 1 else f"{one.name}: {run['name']}"
-            title = f"{name}: {psnr(run):.2f} dB, {cost(run):.2f} s, {run['gaussians']} Gaussians"
-            color = f"c{n % 4}" if len(series) > 1 else f"k{kind}"
-            x, y = _x(run, axis), float(psnr(run) or 0)
-            marks.append(Point(x, y, run.get("label") or run["name"], kind, color, id(run) in best, title))
-        found.append([p for p in marks if p.x > 0])
-    return found
-
-
-def chart(series: Sequence[Series], axis: str, x_label: str) -> str:
-    """One of `AXES`, with its front where it is time."""
-    marks = points(series, axis)
-    lines = [sorted((p for p in some if p.front), key=lambda p: p.x) for some in marks]
-    joined = [line for line in lines if len(line) > 1]
-    return scatter([p for some in marks for p in some], x_label, "PSNR, dB", joined, ceiling(series))
-
-
-def ceiling(series: Sequence[Series]) -> float | None:
-    """PSNR of VTK's own pictures of the scene, which no file needs to exceed; None of several scenes."""
-    found = series[0].document.get("vtk_psnr") if len(series) == 1 else None
-    return None if found is None else float(found)
-
-
-def page(series: Sequence[Series], title: str, pictures: Pictures | None = None) -> str:
-    """The page of one report, or of several over each other."""
-    parts = [_head(series, title), _facts(series)]
-    charts = [
-        f"<section><h2>{head}</h2>{_keys(series)}{chart(series, axis, label)}{note}</section>"
-        for (axis, label, head), note in zip(AXES, (FRONT_NOTE, "", ""), strict=True)
-    ]
-    charts.append(_unit_costs(series))
-    parts.append(f'<div class="grid2">{"".join(charts)}</div>')
+    Args:
+        series: the reports.
+        charts: of their runs.
+        title: the heading.
+        pictures: to compare, of the runs of one report.
+    """
+    notes = dict.fromkeys([chart.title for chart in charts], "") | {charts[0].title: FRONT_NOTE}
+    drawn = [f"<section><h2>{one.title}</h2>{one.svg()}{notes[one.title]}</section>" for one in charts]
+    parts = [_head(series, title), _facts(series), f'<div class="grid2">{"".join(drawn)}{_unit_costs(series)}</div>']
     if pictures:
         parts.append(_compare(series[0].runs, pictures))
-    longest = max(sum(stage["seconds"] for stage in run["stages"]) for one in series for run in one.runs)
-    parts += [f"<section><h2>{_title(s, series)}</h2>{stage_bars(s.runs, longest)}</section>" for s in series]
-    parts.append(_table(series))
-    parts += [_machine(s, len(series) > 1) for s in series]
+    parts += [_table(series), *(_machine(one, len(series) > 1) for one in series)]
     script = f"<script>{SCRIPT}</script>" if pictures else ""
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
@@ -99,10 +57,6 @@ FRONT_NOTE = (
     "<p><small>Ringed and joined: no run is both faster and nearer. Seconds are those to the file: reading, views, "
     "every stage, writing; not the scoring. PSNR: ten test views, whole frame over black.</small></p>"
 )
-
-
-def _title(one: Series, series: Sequence[Series]) -> str:
-    return "Where the time goes" + (f": {escape(one.name)}" if len(series) > 1 else "")
 
 
 def _head(series: Sequence[Series], title: str) -> str:
@@ -132,17 +86,6 @@ def _facts(series: Sequence[Series]) -> str:
                     f"<small>{escape(run['name'])}<br>{size}</small></div>"
                 )
     return f'<div class="facts">{"".join(cells)}</div>'
-
-
-def _keys(series: Sequence[Series]) -> str:
-    kinds = sorted({KINDS.index(run["kind"]) for one in series for run in one.scored()})
-    colors = [f"k{kind}" if len(series) == 1 else "" for kind in kinds]
-    several = "".join(
-        f'<span><svg viewBox="0 0 18 18" class="key c{n % 4}">{mark(0, 9, 9)}</svg>{escape(one.name)}</span>'
-        for n, one in enumerate(series)
-        if len(series) > 1
-    )
-    return f'<div class="keys">{several}{legend(kinds, colors)}</div>'
 
 
 def _unit_costs(series: Sequence[Series]) -> str:
