@@ -18,8 +18,8 @@ from vvgt_cli.gaussians.formats.live import from_bytes, live_bytes, live_json
 from vvgt_cli.gaussians.legend import legend_text
 from vvgt_cli.gaussians.live import FLAT, SHARP, Palette, baked, opacities, seen_under, shown_by
 from vvgt_cli.gaussians.live_facts import LiveFacts
+from vvgt_cli.look.fog import label_fog
 from vvgt_cli.look.label_files import read_labels
-from vvgt_cli.look.label_fog import label_fog
 from vvgt_cli.look.labels import Label, LabelTable
 from vvgt_cli.volume import Volume
 

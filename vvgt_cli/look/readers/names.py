@@ -1,30 +1,59 @@
-"""A matplotlib colour-map name with an opacity ramp: ``NAME[:LO,HI[:MAX]]``.
+"""Transfer functions by name: ours, such as ``ct-bone``, and matplotlib's colour maps with an opacity ramp.
 
-The colours spread over the data range. Opacity is 0 up to the fraction LO of the range, rises linearly to
-MAX at HI and stays there; LO, HI and MAX are in [0, 1] and default to 0, 1 and 1.
-``viridis``, ``magma:0.2,0.8`` and ``bone:0.3,0.35:0.9`` are examples.
+``named.json`` has a list of ours, each in the minimal form. Those for CT are over Hounsfield units, and otherwise over
+percentiles of the voxels in front of the background.
+
+``NAME[:LO,HI[:MAX]]`` is a colour map of matplotlib: the colours spread over the data range, opacity is 0 up to the
+fraction LO of the range, rises linearly to MAX at HI and stays there; LO, HI and MAX are in [0, 1] and default to 0, 1
+and 1. ``viridis``, ``magma:0.2,0.8`` and ``bone:0.3,0.35:0.9`` are examples.
 """
 
 from __future__ import annotations
 
 import difflib
+import json
+from functools import cache
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from vvgt_cli.errors import UsageError
 from vvgt_cli.look.function import ColorMap, PiecewiseOpacity, TransferFunction
-from vvgt_cli.look.readers.named import names
+from vvgt_cli.look.readers import minimal
 
+FILE = Path(__file__).with_name("named.json")
 FORM = "NAME[:LO,HI[:MAX]] with LO, HI and MAX in [0, 1], such as viridis:0.2,0.8:0.5"
 MAX_NODES = 256
 
 
-def read(source: str) -> TransferFunction:
-    """The function of a name, on fractions of the data range.
+@cache
+def _entries() -> dict[str, dict[str, Any]]:
+    return {entry["function"]["name"]: entry for entry in json.loads(FILE.read_text("utf-8"))}
+
+
+def names() -> dict[str, str]:
+    """Return what each named function shows, by name."""
+    return {name: str(entry["shows"]) for name, entry in _entries().items()}
+
+
+def named_function(name: str) -> TransferFunction:
+    """Return one of our functions; its opacity is per a share of the box's longest edge.
 
     Raises:
-        UsageError: not a colour map of matplotlib's, or a ramp that is none.
+        KeyError: none has that name.
     """
+    return minimal.read(_entries()[name]["function"], name)
+
+
+def read(source: str) -> TransferFunction:
+    """Return the function of a name: one of ours, or a colour map on fractions of the data range.
+
+    Raises:
+        UsageError: not a colour map of matplotlib's, or not a ramp.
+    """
+    if source in names():
+        return named_function(source)
     name, *rest = source.split(":")
     lo, hi, top = _ramp(source, rest)
     colors = _colors(name)
@@ -50,14 +79,9 @@ def _ramp(source: str, rest: list[str]) -> tuple[float, float, float]:
 
 
 def _colors(name: str) -> np.ndarray:
-    """RGB samples (n, 3) of a matplotlib colour map, from its first colour to its last."""
-    try:
-        from matplotlib import colormaps
-    except ImportError:  # pyvista brings it
-        raise UsageError(
-            f"transfer function {name!r}: no such file, and matplotlib, which knows colour maps, is not installed; "
-            "try: pip install matplotlib"
-        ) from None
+    """Return RGB samples (n, 3) of a matplotlib colour map, from its first colour to its last."""
+    from matplotlib import colormaps
+
     if name not in colormaps:
         close = difflib.get_close_matches(name, [*names(), *colormaps], n=3)
         hint = f"; did you mean {', '.join(close)}?" if close else ", such as viridis"
