@@ -112,10 +112,6 @@ def log_ticks(lo: float, hi: float) -> list[float]:
     return ticks
 
 
-def _named(one: Series, series: Sequence[Series], name: str) -> str:
-    return name if len(series) == 1 else f"{one.name}: {name}"
-
-
 def _scatter(axes: Any, series: Sequence[Series], value: Callable[[Run], float]) -> None:
     """Draw a mark for each run; what no run beats in seconds is ringed and joined."""
     several, used, labels = len(series) > 1, set(), []
@@ -131,7 +127,7 @@ def _scatter(axes: Any, series: Sequence[Series], value: Callable[[Run], float])
             color, name = (COLORS[n % 4], one.name) if several else (COLORS[kind], run["kind"])
             title = f"{y:.2f} dB, {cost(run):.2f} s, {run['gaussians']} Gaussians"
             mark = axes.plot([x], [y], MARKS[kind], color=color, label="" if name in used else name)[0]
-            mark.set_gid(TITLE + _named(one, series, f"{run['name']}: {title}"))
+            mark.set_gid(f"{TITLE}{run['name']}: {title}")
             if run in best:
                 axes.plot([x], [y], "o", markersize=12, markerfacecolor="none", markeredgecolor=color)
             used.add(name)
@@ -173,19 +169,19 @@ def _label(axes: Any, labels: Sequence[tuple[Any, float, float, str, str]]) -> N
 
 def _stages(axes: Any, series: Sequence[Series]) -> None:
     """Draw a bar for each run, a segment for each stage; scoring, which makes no file, is hatched."""
-    rows = [(_named(one, series, run["name"]), run) for one in series for run in one.runs]
+    rows = [run for one in series for run in one.runs]
     ends = [0.0] * len(rows)
-    for stage in stage_names([run for _, run in rows]):
-        widths = [float(sum(s["seconds"] for s in run["stages"] if s["name"] == stage)) for _, run in rows]
+    for stage in stage_names(rows):
+        widths = [float(sum(s["seconds"] for s in run["stages"] if s["name"] == stage)) for run in rows]
         hatched = {"label": f"{stage} (not counted)", "hatch": "////", "edgecolor": SOFT, "linewidth": 0}
         style = hatched if stage in SCORING else {"label": stage}
         bars = axes.barh(range(len(rows)), widths, left=ends, color=STAGES.get(stage, OTHER), **style)
         for bar, width in zip(bars, widths, strict=True):
             bar.set_gid(f"{TITLE}{stage}: {width:.2f} s")
         ends = [end + width for end, width in zip(ends, widths, strict=True)]
-    for place, (end, (_, run)) in enumerate(zip(ends, rows, strict=True)):
+    for place, (end, run) in enumerate(zip(ends, rows, strict=True)):
         axes.text(end, place, f" {cost(run):.2f} s", verticalalignment="center", fontsize=8.5, in_layout=False)
-    axes.set_yticks(range(len(rows)), [name for name, _ in rows], fontsize=8.5)
+    axes.set_yticks(range(len(rows)), [run["name"] for run in rows], fontsize=8.5)
     axes.margins(x=0.2, y=0.01)
     axes.set_xlim(left=0)
     axes.invert_yaxis()

@@ -73,18 +73,16 @@ def _head(series: Sequence[Series], title: str) -> str:
 
 
 def _facts(series: Sequence[Series]) -> str:
-    cells = []
-    for one in series:
-        runs = one.scored()
-        best, quick = max(runs, key=lambda r: psnr(r) or 0), min(runs, key=cost)
-        for what, run in (("quickest", quick), ("knee of the curve", knee(runs)), ("nearest", best)):
-            if run is not None and (len(series) == 1 or what == "nearest"):
-                head = what if len(series) == 1 else f"{one.name}: {what}"
-                size = f"{cost(run):.1f} s, {short(run['gaussians'])} Gaussians"
-                cells.append(
-                    f"<div><small>{escape(head)}</small><b>{psnr(run):.1f} dB</b>"
-                    f"<small>{escape(run['name'])}<br>{size}</small></div>"
-                )
+    """Return the best run of each report; of one report alone also the quickest and the knee."""
+    chosen = [("nearest", max(one.scored(), key=lambda run: psnr(run) or 0)) for one in series]
+    if len(series) == 1:
+        runs = series[0].scored()
+        chosen = [("quickest", min(runs, key=cost)), ("knee of the curve", knee(runs) or runs[0]), *chosen]
+    cells = [
+        f"<div><small>{what}</small><b>{psnr(run):.1f} dB</b><small>{escape(run['name'])}<br>{cost(run):.1f} s, "
+        f"{short(run['gaussians'])} Gaussians</small></div>"
+        for what, run in chosen
+    ]
     return f'<div class="facts">{"".join(cells)}</div>'
 
 
@@ -156,7 +154,6 @@ def _table(series: Sequence[Series]) -> str:
         best = {id(run) for run in front(one.scored())}
         for run in one.runs:
             scores = run.get("scores") or {}
-            name = run["name"] if len(series) == 1 else f"{one.name}: {run['name']}"
             cells = [
                 f"{cost(run):.2f}", _cell(scores.get("psnr"), 2), _cell(scores.get("psnr_foreground"), 2),
                 _cell(worst_seat(run), 2), _cell(scores.get("ssim"), 4), _cell(scores.get("flip"), 4),
@@ -164,7 +161,7 @@ def _table(series: Sequence[Series]) -> str:
                 f"{run['bytes'] / 1e6:.2f}",
             ]  # fmt: skip
             mark = ' class="best"' if id(run) in best else ""
-            rows.append(f"<tr{mark}><td>{escape(name)}</td>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>")
+            rows.append(f"<tr{mark}><td>{escape(run['name'])}</td>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>")
     head = "".join(f"<th>{name}</th>" for name in heads)
     return (
         f'<section><h2>All runs</h2><div class="scroll"><table><tr>{head}</tr>{"".join(rows)}</table></div>'
