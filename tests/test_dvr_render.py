@@ -14,9 +14,8 @@ from vvgt_cli.dvr.layout import BRICK
 from vvgt_cli.dvr.render import ray_offsets
 from vvgt_cli.dvr.runs import NEAR
 from vvgt_cli.errors import UsageError
-from vvgt_cli.look.colormap import ColorMap
+from vvgt_cli.look.function import ColorMap, PiecewiseOpacity
 from vvgt_cli.look.lighting import Lighting
-from vvgt_cli.look.opacity import PiecewiseOpacity
 from vvgt_cli.look.tables import extinction
 from vvgt_cli.volume import Volume
 

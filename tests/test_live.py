@@ -30,10 +30,8 @@ from vvgt_cli.gaussians.live import (
 from vvgt_cli.gaussians.live_facts import LiveFacts, function_text
 from vvgt_cli.gaussians.opacity import peak_opacity
 from vvgt_cli.images.metrics import psnr
-from vvgt_cli.look.colormap import ColorMap
 from vvgt_cli.look.fog import fog
-from vvgt_cli.look.function import TransferFunction
-from vvgt_cli.look.opacity import PiecewiseOpacity
+from vvgt_cli.look.function import ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.splat import render
 from vvgt_cli.volume import Volume
 from vvgt_cli.volume.stats import Statistics, edges_of

@@ -171,3 +171,10 @@ def test_layers_have_in_common_what_each_has_of_all() -> None:
         assert in_common([first, other]) is None
     assert renumbered(layered(4), first, both).live[:, 6].tolist() == [0, 0, 0, 1]  # type: ignore[index]
     assert renumbered(layered(4), second, both).live[:, 6].tolist() == [0, 1, 0, 2]  # type: ignore[index]
+    other = replace(named, labels=(replace(LABELS[0], name="left  liver"), LABELS[1]))
+    both = in_common([first, replace(value, others=(other,))])
+    assert both is not None
+    assert [(label.number, label.name) for label in both.others[0].labels] == [
+        (3, "left  liver"), (3, "liver"), (7, LABELS[1].name),
+    ]  # fmt: skip
+    assert renumbered(layered(4), first, both).live[:, 6].tolist() == [0, 1, 0, 2]  # type: ignore[index]

@@ -23,7 +23,7 @@ from vvgt_cli.field.source import Source, SourceRequest, describe_source, load, 
 from vvgt_cli.gaussians import Gaussians, PlyHeader
 from vvgt_cli.gaussians.outputs import Output, check_outputs
 from vvgt_cli.gaussians.rules import Rule
-from vvgt_cli.images.metrics.texture import Texture
+from vvgt_cli.images.metrics import Texture
 from vvgt_cli.jit.ahead import EVALUATE, for_blocks, for_degree
 from vvgt_cli.look.labels import LabelTable
 from vvgt_cli.look.lighting import LightOptions

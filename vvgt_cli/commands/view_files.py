@@ -14,7 +14,7 @@ from vvgt_cli.cameras.colmap import colmap_model, point_cloud_ply
 from vvgt_cli.cameras.files import blender_json, transforms_json
 from vvgt_cli.images import contact_sheet, over, write_exr, write_png
 from vvgt_cli.images.viewset import read_view
-from vvgt_cli.look.types import TransferFunctionLike
+from vvgt_cli.look.function import TransferFunctionLike
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene

@@ -14,9 +14,8 @@ from vvgt_cli.field.source import Source
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.live import lengths
 from vvgt_cli.gaussians.live_facts import MOST_LABELS, LiveFacts
-from vvgt_cli.look.fog import THIN
+from vvgt_cli.look.fog import THIN, label_fog
 from vvgt_cli.look.histogram import UNIT_SHARE
-from vvgt_cli.look.label_fog import label_fog
 from vvgt_cli.look.labels import Label, LabelTable
 from vvgt_cli.look.tables import extinction
 from vvgt_cli.score.record import Run
