@@ -140,7 +140,7 @@ def test_options_are_checked(options: dict, message: str) -> None:
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("budget", [1, 2, 3, 50])
+@pytest.mark.parametrize("budget", [1, 2, 3, 50, 100_000])
 def test_budget(method: str, budget: int) -> None:
     cameras = default_views("train", 3, size=32)
     scene = scene_of(noise((12, 9, 10)), Tent())

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from tests.closed_form_scenes import Ramp, Tent, scene_of, score
+from tests.stiff_scenes import camera, quadrature
 from vvgt_cli.cameras import default_views
-from vvgt_cli.checks.mapping import cuts, quadrature
-from vvgt_cli.checks.scenes import camera
+from vvgt_cli.checks.scene import require_cuts_keep_mass
 from vvgt_cli.closed_form import VbmOptions, backproject, initialise
 from vvgt_cli.closed_form import closed_form as closed_form_module
 from vvgt_cli.closed_form.closed_form import closed_form
@@ -151,7 +151,7 @@ def test_first_moments_converge_to_quadrature() -> None:
 
 def test_cuts_keep_the_mass() -> None:
     form = closed_form(grid_scene(random_grid((20, 20, 20), share=0.8)), 300, 64)
-    cuts(form.tree)
+    require_cuts_keep_mass(form.tree)
 
 
 def test_the_same_bytes_twice_and_turned_volumes_are_as_good() -> None:
