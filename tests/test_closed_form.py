@@ -37,13 +37,6 @@ def noise(size=(28, 20, 24), seed: int = 2) -> Volume:
     return analytic.random_field(size, cycles=4, seed=seed)
 
 
-@pytest.fixture(autouse=True)
-def small_march(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Volumes of 30 voxels need no rays at 200 px to see all their cells."""
-    if "quality" not in request.node.name:
-        monkeypatch.setattr(closed_form_module, "MARCH_SIZE", 64)
-
-
 # ---- invariants
 
 
