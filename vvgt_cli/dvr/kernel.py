@@ -319,8 +319,8 @@ def cast(
             return lane(seen, 0), lane(seen, 1), lane(seen, 2), 1.0 - trans
 
 
-def tiles_of(cast: Cast) -> Callable[..., None]:
-    """The loop over the pixels of a tile whose rays ``cast`` follows, `cast` or one with its arguments."""
+def pixels_of(cast: Cast) -> Callable[..., tuple[float, float, float, float]]:
+    """Return the function that sums the rays of a pixel, which ``cast`` follows: `cast` or one with its arguments."""
 
     @_jit
     def pixel_sum(
@@ -342,6 +342,13 @@ def tiles_of(cast: Cast) -> Callable[..., None]:
             red, green, blue, alpha = cast(voxels, optics, empty, light, eye[0], eye[1], eye[2], dx, dy, dz, step)
             acc0, acc1, acc2, acc3 = acc0 + red, acc1 + green, acc2 + blue, acc3 + alpha
         return acc0, acc1, acc2, acc3
+
+    return pixel_sum
+
+
+def tiles_of(cast: Cast) -> Callable[..., None]:
+    """Return the loop over the pixels of a tile; ``cast`` as of `pixels_of`."""
+    pixel_sum = pixels_of(cast)
 
     @_jit
     def tile(

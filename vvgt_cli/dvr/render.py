@@ -144,8 +144,8 @@ def for_thin(settings: RenderSettings, box: BoxGeometry, camera: Camera) -> Rend
     return replace(settings, tiers=((-1.0, settings.tiers[-1][1]),))  # a first ray a pixel may show nothing
 
 
-def _rays(scene: Scene) -> Callable[..., None]:
-    """The kernel of a scene's kind, with what it reads of it."""
+def host_rays(scene: Scene) -> Callable[..., None]:
+    """Return the CPU's kernel for a scene's kind, with what it reads of it."""
     if scene.grid is None:
         if scene.light is None:
             from vvgt_cli.dvr import kernel
@@ -174,7 +174,7 @@ def render_view(
     settings = settings or RenderSettings()
     if not isinstance(scene, Scene):
         return scene.view(camera, settings, blocks)
-    draw = _rays(scene)
+    draw = scene.rays or host_rays(scene)
     eye, basis, lens = camera_arrays(scene, camera)
     out = np.zeros((camera.height, camera.width, 4), np.float32)
     order = tile_order(camera.height, camera.width, blocks)

@@ -114,6 +114,13 @@ def _digest(*parts: Any) -> str:
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
 
 
+def source_digest(function: Any, *more: Any) -> str:
+    """Return the digest, 16 hexadecimal digits, of what a function is compiled from, of ``more`` and versions."""
+    modules, constants = reached(_unwrapped(function))
+    sources = [(module, _source(module)) for module in sorted(modules)]
+    return _digest(VERSIONS, sources, sorted(constants), *more)
+
+
 class KernelCache(caching._Cache):
     """What a numba dispatcher asks for the compiled form of a signature.
 
@@ -135,9 +142,7 @@ class KernelCache(caching._Cache):
     @cached_property
     def key(self) -> str:
         """Digest of everything that is compiled, and of what compiles it."""
-        modules, constants = reached(self.function)
-        sources = [(module, _source(module)) for module in sorted(modules)]
-        return _digest(VERSIONS, sources, sorted(constants), _options(self.dispatcher))
+        return source_digest(self.function, _options(self.dispatcher))
 
     def file(self, types: tuple[Any, ...], codegen: Any) -> str:
         """Name of the file of a signature on a target."""

@@ -113,7 +113,11 @@ def begin(
         return Densified(gaussians, cameras, options)
     if options.method == "adam":
         return Fields(gaussians, cameras)
-    return OwnFrame(gaussians, cameras, options.rule, free)
+    if options.device == "cpu":
+        return OwnFrame(gaussians, cameras, options.rule, free)
+    from vvgt_cli.refine.on_device import DeviceFrame
+
+    return DeviceFrame(gaussians, cameras, options, free, options.device)
 
 
 def step(
@@ -129,6 +133,8 @@ def step(
 
     ``share`` in [0, 1] of the run lies behind; rates are multiplied by ``speed``.
     """
+    if options.device != "cpu":
+        return state.step_on(camera, target, options, error, share, speed)
     from vvgt_cli.refine.loss import loss_gradient
     from vvgt_cli.refine.ssim import add_ssim_gradient
     from vvgt_cli.refine.texture import add_texture_gradient

@@ -105,23 +105,27 @@ class OwnFrame:
         harmonics, seen = _last(self.arrays, 4), self.colors_from(camera)
         pairs = moments(projection, seen, image, grad)
         slopes = own_frame_backward(means, factors, seen, camera, projection, pairs, harmonics)
-        self.step += 1
-        pace = speed * min(1.0, 2 * (1 - share))
-        pace *= min(self.LARGEST, math.sqrt(error / self.ERROR)) * min(1.0, self.step / WARM_UP)
-        rates = self.RATES * self.OWN * pace if self.weakest else self.RATES * pace
+        rates, pace = self.rates(error, share, speed)
         steps.own_frame(
             slopes.rows, rates, self.CLIPS, self.spread,
             *self.BETAS, self.step, means, factors, logits, colors, self.darkest, self.first, self.second,
             *self.common(slopes.rows),
         )  # fmt: skip
         if harmonics is not None and slopes.harmonics is not None:
-            rate = self.harmonic_rate * math.sqrt(4 * math.pi / harmonics.shape[1])
+            rate = self.harmonic_rate * math.sqrt(4 * math.pi / harmonics.shape[1]) * pace
             first, second = (array.reshape(-1) for array in self.running)
             values, slope = harmonics.reshape(-1), slopes.harmonics.reshape(-1)
-            steps.adam(values, slope, rate * pace, *self.BETAS, self.step, first, second)
+            steps.adam(values, slope, rate, *self.BETAS, self.step, first, second)
         if len(self.fixed):
             for array, there in zip(self.arrays, self.there, strict=True):
                 array[self.fixed] = there
+
+    def rates(self, error: float, share: float, speed: float) -> tuple[np.ndarray, float]:
+        """Count a step, and return the rates of its fields as of `RATES`, and the factor that they share."""
+        self.step += 1
+        pace = speed * min(1.0, 2 * (1 - share))
+        pace *= min(self.LARGEST, math.sqrt(error / self.ERROR)) * min(1.0, self.step / WARM_UP)
+        return self.RATES * self.OWN * pace if self.weakest else self.RATES * pace, pace
 
     def common(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """What is added to Adam's divisors, features and weights of what is shared; from slopes ``rows`` (COUNT, K)."""
