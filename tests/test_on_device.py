@@ -10,6 +10,7 @@ import pytest
 
 from tests.test_dvr_backends import scene, view
 from vvgt_cli.cameras import default_views
+from vvgt_cli.device import on_device
 from vvgt_cli.dvr import RenderSettings, cuda, render_view, render_views
 from vvgt_cli.dvr.render import camera_arrays
 from vvgt_cli.errors import DeviceFailed
@@ -58,7 +59,7 @@ def test_a_device_that_fails_is_said_once_and_the_cpu_draws(monkeypatch):
 
     monkeypatch.setattr(cuda.DeviceRays, "_cast", fail)
     said, made = [], scene()
-    drawn = cuda.drawn_on_device(made, said.append)
+    drawn = on_device(made, "cuda", said.append)
     for _ in range(2):
         image = render_view(drawn, view())
     assert said == ["the GPU failed (out of memory somewhere); views are drawn on the CPU"]
@@ -97,20 +98,20 @@ def dense(means, logits, colors, camera, rule, covars):
 
 
 @pytest.fixture
-def on_cpu(monkeypatch):
+def descent(monkeypatch):
     pytest.importorskip("torch")
-    from vvgt_cli.refine import on_device
+    from vvgt_cli.refine import on_device as module
 
     def made(start, cameras, options, free=None, device="cpu"):
         return frame(start, cameras, options, free, "cpu", dense)
 
-    frame = on_device.DeviceFrame
-    monkeypatch.setattr(on_device, "DeviceFrame", made)
-    return on_device
+    frame = module.DeviceFrame
+    monkeypatch.setattr(module, "DeviceFrame", made)
+    return module
 
 
 @pytest.mark.parametrize(("count", "degree", "some"), [(600, 0, False), (300, 2, False), (600, 0, True)])
-def test_steps_are_those_of_the_cpu(on_cpu, count, degree, some):
+def test_steps_are_those_of_the_cpu(descent, count, degree, some):
     start, cameras = gaussians(count, degree), default_views("train", 4, size=40)
     images = [render(gaussians(count, degree, 1), camera) for camera in cameras]
     free = np.arange(count) % 3 > 0 if some else None
@@ -132,7 +133,7 @@ def test_steps_are_those_of_the_cpu(on_cpu, count, degree, some):
     np.testing.assert_array_equal(again.arrays[0], pair[1][1].arrays[0])
 
 
-def test_the_loss_is_that_of_the_cpu(on_cpu):
+def test_the_loss_is_that_of_the_cpu(descent):
     import torch
 
     from vvgt_cli.refine.loss import loss_gradient
@@ -143,20 +144,20 @@ def test_the_loss_is_that_of_the_cpu(on_cpu):
     grad, squares = np.empty_like(image), np.empty(30)
     loss_gradient(image, target, *map(np.float32, (options.l1, options.l2, options.alpha)), grad, squares)
     add_texture_gradient(image, target, options.texture, grad)
-    found, error = on_cpu.loss_slope(torch.from_numpy(image), torch.from_numpy(target), options)
+    found, error = descent.loss_slope(torch.from_numpy(image), torch.from_numpy(target), options)
     np.testing.assert_allclose(found.numpy(), grad, atol=2e-4)
     np.testing.assert_allclose(float(error), np.sqrt(squares.sum() / (3.5 * 30 * 44)), rtol=1e-5)
 
 
-def test_what_a_device_does_not_do_is_named(on_cpu):
-    assert on_cpu.unfit(OPTIONS) is None
-    assert on_cpu.unfit(replace(OPTIONS, rule=RULES["compensated"].at(0.37))) is None
-    assert on_cpu.unfit(OptimizeOptions.of("3dgs")) == "the method 3dgs"
-    assert on_cpu.unfit(replace(OPTIONS, ssim=0.1)) == "SSIM in the loss"
-    assert on_cpu.unfit(replace(OPTIONS, rule=RULES["viser"])) == "the rule viser, by which gsplat does not draw"
+def test_what_a_device_does_not_do_is_named(descent):
+    assert descent.unfit(OPTIONS) is None
+    assert descent.unfit(replace(OPTIONS, rule=RULES["compensated"].at(0.37))) is None
+    assert descent.unfit(OptimizeOptions.of("3dgs")) == "the method 3dgs"
+    assert descent.unfit(replace(OPTIONS, ssim=0.1)) == "SSIM in the loss"
+    assert descent.unfit(replace(OPTIONS, rule=RULES["viser"])) == "the rule viser, by which gsplat does not draw"
 
 
-def test_a_device_that_fails_in_a_step_says_so(on_cpu, monkeypatch):
+def test_a_device_that_fails_in_a_step_says_so(descent, monkeypatch):
     state = begin(gaussians(), default_views("train", 2, size=40), replace(OPTIONS, device="torch"))
     monkeypatch.setattr(state, "draw", lambda *_, **__: (_ for _ in ()).throw(RuntimeError("CUDA error:\nlost")))
     with pytest.raises(DeviceFailed, match="CUDA error: lost"):
@@ -174,7 +175,7 @@ def gpu():
 @pytest.mark.parametrize("lit", [False, True])
 def test_a_gpu_draws_the_kernels_views(gpu, lit):
     made, said = scene().lit(Lighting()) if lit else scene(), []
-    drawn = cuda.drawn_on_device(made, said.append)
+    drawn = on_device(made, "cuda", said.append)
     for settings in (RenderSettings(), RenderSettings(1.0, 1)):
         np.testing.assert_allclose(render_view(drawn, view(), settings), render_view(made, view(), settings), atol=1e-3)
     assert not said
@@ -192,4 +193,4 @@ def test_gsplat_draws_and_steps_as_the_kernels_do(gpu, rule):
             error = step(state, cameras[n % 4], images[n % 4], options, error, n / 12, 1.0)
         found.append(error)
     np.testing.assert_allclose(found[1], found[0], rtol=0.01)
-    assert DILATION == rule.dilation
+    assert rule.dilation == DILATION

@@ -9,7 +9,14 @@ import click
 
 from vvgt_cli.cli.blocks import block_options, chosen
 from vvgt_cli.cli.fit import fit_options, limit_options, ply_options, rule_option
-from vvgt_cli.cli.options import common_options, light_options, overwrite_option, placed_read_options, tfs_options
+from vvgt_cli.cli.options import (
+    common_options,
+    device_option,
+    light_options,
+    overwrite_option,
+    placed_read_options,
+    tfs_options,
+)
 from vvgt_cli.cli.sections import SectionedCommand
 from vvgt_cli.cli.typed import ASIDE, command_line
 from vvgt_cli.defaults import RULE
@@ -52,6 +59,7 @@ from vvgt_cli.progress import Console
     "--split-labels", is_flag=True,
     help="Write one file per label of a label map, named by {} in OUT.ply, and an index.",
 )  # fmt: skip
+@device_option("views are drawn and steps are taken")
 @block_options
 @click.option("--shard", metavar="I/N", help="Convert part I of N of a time series, for job arrays; I starts at 1.")
 @common_options

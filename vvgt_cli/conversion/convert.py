@@ -21,6 +21,7 @@ from vvgt_cli.conversion.stage import Work
 from vvgt_cli.conversion.stages import CheckViews, ClosedFormStage
 from vvgt_cli.conversion.stages.views import wide
 from vvgt_cli.conversion.warm_start import WarmStart
+from vvgt_cli.device import load_ahead
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.field import Field, Picture, Resident
 from vvgt_cli.field.open import Wanted, automatic, beside, blocked
@@ -279,6 +280,8 @@ def opened(run: Run, request: ConvertRequest, kernels: tuple[str, ...] = CONVERT
     Raises:
         DataError, UsageError: as `vvgt_cli.field.source.load`.
     """
+    if request.fit.device != "cpu":
+        load_ahead()
     options = request.blocks or automatic(request.source, run.console)
     if options is None:
         with run.stage("read") as stage:
@@ -287,7 +290,7 @@ def opened(run: Run, request: ConvertRequest, kernels: tuple[str, ...] = CONVERT
         _tell(run, request, source)
         run.compile(_kernels(kernels, request, source), source.kernel_type())
         with run.stage("scene"):
-            field = Resident.of(source)
+            field = Resident.of(source, request.fit.device, run.console.say)
         yield field
         return
     wanted = Wanted(request.budget(), request.fit.size, request.ply.sh_degree, values=request.live)

@@ -32,6 +32,7 @@ class FitOptions:
         seed: of whatever draws random numbers.
         model: network that runs before the steps: a folder or the name of a shipped one, None for none.
         steps: of gradient descent after the closed form, at most; None: what the plan finds worth its time.
+        device: "cpu", or "cuda" for views and steps.
     """
 
     max_gaussians: int = MAX_GAUSSIANS
@@ -41,6 +42,7 @@ class FitOptions:
     seed: int = 0
     steps: int | None = None
     model: str | None = None
+    device: str = "cpu"
 
 
 @dataclass(frozen=True)

@@ -107,8 +107,10 @@ def _kernels(key: int) -> dict[tuple[bool, bool], Any]:
 
     numba-cuda keeps them on disk by their own code and the numbers around it: ``key`` stands for what they call.
     """
-    from numba import config, cuda
+    import numba.cuda
 
+    cuda: Any = numba.cuda  # which numba-cuda replaces
+    config: Any = numba.config
     config.CUDA_LOW_OCCUPANCY_WARNINGS = False
 
     def made(pixel: Any, lit: bool) -> Any:
@@ -221,8 +223,3 @@ def _sent(value: Any) -> Any:
 def _bytes(value: Any) -> int:
     """Return the bytes of arrays, or tuples of them."""
     return sum(map(_bytes, value)) if isinstance(value, tuple) else getattr(value, "nbytes", 0)
-
-
-def drawn_on_device(scene: Scene, say: Callable[[str], None]) -> Scene:
-    """Return the scene with its rays cast on the CUDA device; ``say`` is told in a line where that fails."""
-    return replace(scene, rays=DeviceRays(scene, say))

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -134,7 +135,8 @@ def step(
     ``share`` in [0, 1] of the run lies behind; rates are multiplied by ``speed``.
     """
     if options.device != "cpu":
-        return state.step_on(camera, target, options, error, share, speed)
+        there: Any = state  # a `DeviceFrame`
+        return float(there.step_on(camera, target, options, error, share, speed))
     from vvgt_cli.refine.loss import loss_gradient
     from vvgt_cli.refine.ssim import add_ssim_gradient
     from vvgt_cli.refine.texture import add_texture_gradient

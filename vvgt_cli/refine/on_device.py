@@ -75,7 +75,7 @@ class DeviceFrame(OwnFrame):
                 raise DeviceFailed(f"steps need {needed / 1e9:.1f} GB, of which {available / 1e9:.1f} are free")
         self._send()
 
-    @property  # type: ignore[override]
+    @property
     def arrays(self) -> tuple[np.ndarray, ...]:
         """The tensors as arrays; what is assigned goes to the device."""
         if self._host is None:
@@ -146,10 +146,10 @@ class DeviceFrame(OwnFrame):
             grad, now = loss_slope(image.detach(), target, options)
         image.backward(grad)
         turned = factors.detach().transpose(1, 2)
-        d = (turned @ means.grad[:, :, None])[..., 0]  # type: ignore[index]
+        d = (turned @ means.grad[:, :, None])[..., 0]
         e = turned @ factors.grad
         pairs = [e[:, i, i] for i in range(3)] + [e[:, i, j] + e[:, j, i] for i, j in ((0, 1), (0, 2), (1, 2))]
-        rows = torch.stack([*d.unbind(1), *pairs, logits.grad, *colors.grad.unbind(1)])  # type: ignore[union-attr, list-item]
+        rows = torch.stack([*d.unbind(1), *pairs, logits.grad, *colors.grad.unbind(1)])
         return rows, harmonics[0].grad if harmonics else None, float(now)
 
     def move(self, rows: Tensor, harmonics: Tensor | None, error: float, share: float, speed: float) -> None:
@@ -158,7 +158,7 @@ class DeviceFrame(OwnFrame):
 
         rates, pace = self.rates(error, share, speed)
         floors, predicted = self.common_on(rows)
-        way = self._adam(rows, *self.moments, floors[:, None])
+        way = self._adam(rows, self.moments, floors[:, None])
         if predicted is not None:
             way[SHARED] += predicted
         means, factors, logits, colors = self.tensors[:4]
@@ -175,17 +175,18 @@ class DeviceFrame(OwnFrame):
         ]
         if harmonics is not None:
             rate = self.harmonic_rate * math.sqrt(4 * math.pi / harmonics.shape[1]) * pace
-            self.tensors[4] = self.tensors[4] - rate * self._adam(harmonics, *self.more, EPSILON)
+            self.tensors[4] = self.tensors[4] - rate * self._adam(harmonics, self.more, float(EPSILON))
         for tensor, there in zip(self.tensors, self.there_sent, strict=True):
             tensor[self.fixed_sent] = there
         self._host = None
 
-    def _adam(self, slopes: Tensor, first: Tensor, second: Tensor, floor: Any) -> Tensor:
+    def _adam(self, slopes: Tensor, moments: list[Tensor], floor: Any) -> Tensor:
         """Return Adam's directions, about 1 in size, and update its moments in place."""
-        b1, b2 = self.BETAS
+        (first, second), (b1, b2) = moments, self.BETAS
         first.mul_(b1).add_(slopes, alpha=1 - b1)
         second.mul_(b2).addcmul_(slopes, slopes, value=1 - b2)
-        return first / (1 - b1**self.step) / ((second / (1 - b2**self.step)).sqrt() + floor)
+        way: Tensor = first / (1 - b1**self.step) / ((second / (1 - b2**self.step)).sqrt() + floor)
+        return way
 
     def common_on(self, rows: Tensor) -> tuple[Tensor, Tensor | None]:
         """Return what `OwnFrame.common` does: the divisors' floors (COUNT,), and what is predicted (KNOWN, K)."""
@@ -263,5 +264,7 @@ def _band(size: int, device: str) -> Tensor:
     import torch
 
     reach = len(KERNEL) // 2
-    found = sum(np.diag(np.full(size - abs(n), KERNEL[n + reach]), n) for n in range(-reach, reach + 1) if abs(n) < size)
+    found = sum(
+        np.diag(np.full(size - abs(n), KERNEL[n + reach]), n) for n in range(-reach, reach + 1) if abs(n) < size
+    )
     return torch.from_numpy(np.asarray(found, np.float32)).to(device)
