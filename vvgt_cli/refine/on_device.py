@@ -68,6 +68,10 @@ class DeviceFrame(OwnFrame):
         super().__init__(gaussians, cameras, options.rule, free)
         self.cameras = list(cameras)  # by whose identity targets are known
         if device == "cuda":
+            from gsplat.cuda._backend import _C
+
+            if _C is None:
+                raise DeviceFailed("gsplat has no kernels: it builds them with CUDA's compiler, which is not there")
             pixels = max(camera.width * camera.height for camera in cameras)
             views = sum(16 * camera.width * camera.height for camera in cameras)
             needed, available = A_GAUSSIAN * len(gaussians) + A_PIXEL * pixels + views, torch.cuda.mem_get_info()[0]
