@@ -26,31 +26,28 @@ OPTIONS = OptimizeOptions.of("frame")
 
 
 @nb.njit
-def plain_pixels(data, eye, basis, lens, step, offsets, out):
-    for row in range(out.shape[0]):
-        for col in range(out.shape[1]):
-            out[row, col] = cuda._field_pixel(
-                data[0], data[1], data[2], None, eye, basis, lens, step, col, row, offsets
-            )
+def plain_pixels(data, camera, step, width, places, offsets, out):
+    for n in range(len(out)):
+        cuda._store(cuda._field_pixel, data, None, camera, step, width, places, offsets, out, n)
 
 
 @nb.njit
-def lit_pixels(data, eye, basis, lens, step, offsets, out):
-    for row in range(out.shape[0]):
-        for col in range(out.shape[1]):
-            out[row, col] = cuda._field_pixel(
-                data[0], data[1], data[2], data[3], eye, basis, lens, step, col, row, offsets
-            )
+def lit_pixels(data, camera, step, width, places, offsets, out):
+    for n in range(len(out)):
+        cuda._store(cuda._field_pixel, data, data[3], camera, step, width, places, offsets, out, n)
 
 
 @pytest.mark.parametrize("lit", [False, True])
 def test_the_devices_rays_are_the_kernels(lit):
     made, camera = scene().lit(Lighting()) if lit else scene(), view()
-    out = np.zeros((camera.height, camera.width, 4))
+    packed, out = np.zeros((5, 4)), np.zeros((camera.height * camera.width, 4))
+    packed[0, :3], packed[1:4, :3], packed[4] = camera_arrays(made, camera)
+    every = np.arange(len(out), dtype=np.int32)
     (lit_pixels if lit else plain_pixels)(
-        cuda.scene_arrays(made), *camera_arrays(made, camera), 0.5, np.zeros((1, 2)), out
+        cuda.scene_arrays(made), packed, 0.5, camera.width, every, np.zeros((1, 2)), out
     )
-    np.testing.assert_allclose(out, render_views(made, [camera], RenderSettings(0.5, 1))[0], atol=1e-5)
+    kernel = render_views(made, [camera], RenderSettings(0.5, 1))[0]
+    np.testing.assert_allclose(out.reshape(kernel.shape), kernel, atol=1e-5)
 
 
 def test_a_device_that_fails_is_said_once_and_the_cpu_draws(monkeypatch):
@@ -75,7 +72,7 @@ def gaussians(count=600, degree=0, seed=0):
     )  # fmt: skip
 
 
-def dense(means, logits, colors, camera, rule, covars):
+def dense(means, opacities, colors, camera, rule, covars):
     """A picture as gsplat makes it, every Gaussian in every pixel."""
     torch = pytest.importorskip("torch")
     turn, shift = (torch.as_tensor(a, dtype=torch.float32) for a in (camera.rotation, camera.translation))
@@ -83,18 +80,19 @@ def dense(means, logits, colors, camera, rule, covars):
     zero = torch.zeros_like(z)
     slope = torch.stack([camera.fx / z, zero, -camera.fx * x / z**2, zero, camera.fy / z, -camera.fy * y / z**2], 1)
     slope = slope.reshape(-1, 2, 3) @ turn
-    spread = slope @ covars @ slope.transpose(1, 2) + rule.dilation * torch.eye(2)
+    spread = slope @ covars[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3) @ slope.transpose(
+        1, 2
+    ) + rule.dilation * torch.eye(2)
     order = z.argsort()
     place = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], 1)[order]
     rows, cols = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
     off = torch.stack([cols, rows], -1)[:, :, None] - place
     power = 0.5 * torch.einsum("hwki,kij,hwkj->hwk", off, torch.linalg.inv(spread[order]), off)
-    alpha = (logits.sigmoid()[order] * torch.exp(-power)).clamp(max=MAX_ALPHA)
+    alpha = (opacities[order] * torch.exp(-power)).clamp(max=MAX_ALPHA)
     alpha = torch.where((alpha >= MIN_ALPHA) & (power <= 6), alpha, 0)
     behind = torch.cumprod(1 - alpha, dim=2)
     weight = alpha * torch.cat([torch.ones_like(alpha[..., :1]), behind[..., :-1]], 2)
-    rgb = weight @ colors.clamp(min=0)[order]
-    return torch.cat([rgb, 1 - behind[..., -1:]], -1)
+    return weight @ colors[order], 1 - behind[..., -1:]
 
 
 @pytest.fixture

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 
 LEAP = 8  # samples between two looks at the empty-space map
 THREADS = 128  # of a block
+REGISTERS = 96  # of a thread: rays wait for memory, so that many of them beat few that keep all in registers
 Draw = Callable[..., None]  # arguments as of `kernel.render_tiles` from ``eye`` on
 
 _jit = inlined(fastmath=FLAGS, error_model="numpy", **BORROWED)
@@ -62,7 +63,8 @@ def cast(
     ix, iy, iz, per_step = inverse(dx), inverse(dy), inverse(dz), 1.0 / dt
     flat = is_flat(optics)
     before = u0 = -1.0  # -1: no sample there, or not finite
-    i, stop = 0, 0
+    i, stop, known = 0, 0, -1
+    ahead = 0.0  # sample ``known``, asked for before the one ahead of it is used: memory is slow
     while i <= count and trans >= opaque:
         if i >= stop:
             at = i - 1 if u0 >= 0.0 else i  # the segment that comes from there is still to be seen
@@ -73,7 +75,10 @@ def cast(
                 before, u0, i = -1.0, -1.0, max(start - 1, 0)  # one earlier, for what bends the next
             stop = i + LEAP
         t = t0 + i * dt
-        u1 = table_coordinate(sample(voxels.values, px + t * dx, py + t * dy, pz + t * dz), optics)
+        value = ahead if known == i else sample(voxels.values, px + t * dx, py + t * dy, pz + t * dz)
+        s, known = t + dt, i + 1
+        ahead = sample(voxels.values, px + s * dx, py + s * dy, pz + s * dz)
+        u1 = table_coordinate(value, optics)
         met = values_met(before, u0, u1, flat)
         if met[0] >= 0.0 and met[1] > optics.dark[U(int(met[0]))]:
             own, trans, s = pass_segment(
@@ -101,6 +106,27 @@ def cast(
 _field_pixel, _grid_pixel = pixels_of(cast), pixels_of(grid.cast)
 
 
+@_jit
+def _store(
+    pixel: Any, data: Any, light: Any, camera: np.ndarray, step: float, width: int, places: np.ndarray,
+    offsets: np.ndarray, out: np.ndarray, n: int,
+) -> None:  # fmt: skip
+    """Store the mean of the rays of pixel ``places[n]``, counted row by row, into row ``n`` of ``out`` (m, 4).
+
+    ``camera`` (5, 4): eye, the rows of the basis, lens, as of `kernel.render_tiles`; ``data``: `scene_arrays`.
+    """
+    row, col = places[n] // width, places[n] % width
+    sums = pixel(data[0], data[1], data[2], light, camera[0], camera[1:4], camera[4], step, col, row, offsets)
+    out[n, 0], out[n, 1] = sums[0] / offsets.shape[0], sums[1] / offsets.shape[0]
+    out[n, 2], out[n, 3] = sums[2] / offsets.shape[0], sums[3] / offsets.shape[0]
+
+
+@cache
+def _key() -> int:
+    """Return a number other than 0 that stands for all that the kernels are made of."""
+    return 1 + (int(source_digest(_kernels.__wrapped__), 16) >> 4)  # of 16 hexadecimal digits: within int64
+
+
 @cache
 def _kernels(key: int) -> dict[tuple[bool, bool], Any]:
     """Return the device's kernels by whether they draw an optics grid, and whether there is a light.
@@ -113,32 +139,36 @@ def _kernels(key: int) -> dict[tuple[bool, bool], Any]:
     config: Any = numba.config
     config.CUDA_LOW_OCCUPANCY_WARNINGS = False
 
-    def made(pixel: Any, lit: bool) -> Any:
-        @cuda.jit(cache=True, fastmath=FLAGS)
-        def unlit_pixels(data, eye, basis, lens, step, places, offsets, out):  # type: ignore[no-untyped-def]
-            n = cuda.grid(1)
-            if n < out.shape[0] and key != 0:
-                sums = pixel(
-                    data[0], data[1], data[2], None, eye, basis, lens, step, places[1, n], places[0, n], offsets
-                )
-                for f in range(4):
-                    out[n, f] = sums[f] / offsets.shape[0]
+    kernel = cuda.jit(cache=True, fastmath=FLAGS, max_registers=REGISTERS)
 
-        @cuda.jit(cache=True, fastmath=FLAGS)
-        def lit_pixels(data, eye, basis, lens, step, places, offsets, out):  # type: ignore[no-untyped-def]
-            n = cuda.grid(1)
-            if n < out.shape[0] and key != 0:
-                sums = pixel(
-                    data[0], data[1], data[2], data[3], eye, basis, lens, step, places[1, n], places[0, n], offsets
-                )
-                for f in range(4):
-                    out[n, f] = sums[f] / offsets.shape[0]
+    @kernel
+    def field_pixels(data, camera, step, width, places, offsets, out):  # type: ignore[no-untyped-def]
+        n = cuda.grid(1)
+        if n < out.shape[0] and key != 0:
+            _store(_field_pixel, data, None, camera, step, width, places, offsets, out, n)
 
-        return lit_pixels if lit else unlit_pixels
+    @kernel
+    def lit_field_pixels(data, camera, step, width, places, offsets, out):  # type: ignore[no-untyped-def]
+        n = cuda.grid(1)
+        if n < out.shape[0] and key != 0:
+            _store(_field_pixel, data, data[3], camera, step, width, places, offsets, out, n)
 
-    return {(False, lit): made(_field_pixel, lit) for lit in (False, True)} | {
-        (True, lit): made(_grid_pixel, lit) for lit in (False, True)
-    }
+    @kernel
+    def grid_pixels(data, camera, step, width, places, offsets, out):  # type: ignore[no-untyped-def]
+        n = cuda.grid(1)
+        if n < out.shape[0] and key != 0:
+            _store(_grid_pixel, data, None, camera, step, width, places, offsets, out, n)
+
+    @kernel
+    def lit_grid_pixels(data, camera, step, width, places, offsets, out):  # type: ignore[no-untyped-def]
+        n = cuda.grid(1)
+        if n < out.shape[0] and key != 0:
+            _store(_grid_pixel, data, data[3], camera, step, width, places, offsets, out, n)
+
+    return {
+        (False, False): field_pixels, (False, True): lit_field_pixels,
+        (True, False): grid_pixels, (True, True): lit_grid_pixels,
+    }  # fmt: skip
 
 
 def scene_arrays(scene: Scene) -> tuple[Any, ...]:
@@ -196,16 +226,16 @@ class DeviceRays:
     ) -> None:  # fmt: skip
         from numba import cuda
 
-        places = np.ascontiguousarray(np.nonzero(mask), np.int64)
-        if not places.shape[1]:
+        places = np.flatnonzero(mask)
+        if not len(places):
             return
-        data = self.on_device
-        pixels = cuda.device_array((places.shape[1], 4), np.float32)
-        rest = map(cuda.to_device, (places, np.ascontiguousarray(offsets, np.float64)))
-        key = int(source_digest(_kernels.__wrapped__), 16) >> 4  # of 16 hexadecimal digits: within int64
-        render = _kernels(key or 1)[self.scene.grid is not None, self.scene.light is not None]
-        camera = map(cuda.to_device, (eye, basis, lens))
-        render[-(-places.shape[1] // THREADS), THREADS](data, *camera, step, *rest, pixels)
+        data, pixels = self.on_device, cuda.device_array((len(places), 4), np.float32)
+        camera = np.zeros((5, 4))
+        camera[0, :3], camera[1:4, :3], camera[4] = eye, basis, lens
+        sent = map(cuda.to_device, (places.astype(np.int32), np.ascontiguousarray(offsets, np.float64)))
+        render = _kernels(_key())[self.scene.grid is not None, self.scene.light is not None]
+        blocks = -(-len(places) // THREADS)
+        render[blocks, THREADS](data, cuda.to_device(camera), step, mask.shape[1], *sent, pixels)
         share = len(offsets) / (known + len(offsets))
         out[mask] = (1 - share) * out[mask] + share * pixels.copy_to_host()
 

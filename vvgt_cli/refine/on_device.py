@@ -22,7 +22,7 @@ from vvgt_cli.refine.ssim import KERNEL
 from vvgt_cli.refine.states import MEDIAN, OUTLIER, OwnFrame
 from vvgt_cli.refine.steps import COUNT, EPSILON, FEATURES, RUN
 from vvgt_cli.refine.texture import SMOOTH
-from vvgt_cli.splat.by_gsplat import draws, picture
+from vvgt_cli.splat.by_gsplat import capped, draws, picture
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
 A_GAUSSIAN, A_PIXEL = 2400, 400  # bytes: with moments, features, slopes and lists of pairs; with the blurs of the loss
 ENTRIES = [0, 3, 4, 3, 1, 5, 4, 5, 2]  # of E, row by row, among xx, yy, zz, xy, xz, yz
+SYMMETRIC = [0, 1, 2, 1, 3, 4, 2, 4, 5]  # of a matrix, row by row, among xx, xy, xz, yy, yz, zz
 SHARED = [*range(6), 9, 10, 11, 12]  # of the fields, those that `steps.KNOWN` counts
 
 
@@ -54,7 +55,7 @@ class DeviceFrame(OwnFrame):
 
     def __init__(
         self, gaussians: Gaussians, cameras: Sequence[Camera], options: OptimizeOptions, free: np.ndarray | None = None,
-        device: str = "cuda", draw: Callable[..., Tensor] = picture,
+        device: str = "cuda", draw: Callable[..., tuple[Tensor, Tensor]] = picture,
     ) -> None:  # fmt: skip
         """Put the start on ``device``; ``free`` as of `OwnFrame`, ``draw`` as `picture`.
 
@@ -142,19 +143,30 @@ class DeviceFrame(OwnFrame):
         """Return slopes as `FrameGradients.rows` and of the harmonics, and the RMS error of the picture."""
         import torch
 
-        leaves = [tensor.detach().requires_grad_() for tensor in self.tensors]
-        means, factors, logits, colors, *harmonics = leaves
+        means, factors, logits, colors, *harmonics = self.tensors
         seen = colors if not harmonics else colors + view_terms(means, camera, harmonics[0])
-        image = self.draw(means, logits, seen, camera, options.rule, covars=factors @ factors.transpose(1, 2))
-        with torch.no_grad():
-            grad, now = loss_slope(image.detach(), target, options)
-        image.backward(grad)
-        turned = factors.detach().transpose(1, 2)
-        d = (turned @ means.grad[:, :, None])[..., 0]
-        e = turned @ factors.grad
-        pairs = [e[:, i, i] for i in range(3)] + [e[:, i, j] + e[:, j, i] for i, j in ((0, 1), (0, 2), (1, 2))]
-        rows = torch.stack([*d.unbind(1), *pairs, logits.grad, *colors.grad.unbind(1)])
-        return rows, harmonics[0].grad if harmonics else None, float(now)
+        opacity = logits.sigmoid()
+        covars = products(factors, factors.transpose(1, 2)).reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
+        leaves = [tensor.detach().requires_grad_() for tensor in (means, capped(opacity), seen.clamp(min=0), covars)]
+        rgb, alpha = self.draw(*leaves[:3], camera, options.rule, covars=leaves[3])
+        slope, error = loss_slope(torch.cat([rgb, alpha], dim=2).detach(), target, options)
+        # a sum, for `backward` with slopes loads an algebra system for seconds
+        ((rgb * slope[..., :3]).sum() + (alpha * slope[..., 3:]).sum()).backward()
+        by_means, by_opacity, by_seen, by_covars = (leaf.grad for leaf in leaves)
+        by_seen = torch.where(seen >= 0, by_seen, 0)
+        by_harmonics = None
+        if harmonics:
+            leaves = [means.detach().requires_grad_(), harmonics[0].detach().requires_grad_()]
+            (view_terms(leaves[0], camera, leaves[1]) * by_seen).sum().backward()
+            by_means, by_harmonics = by_means + leaves[0].grad, leaves[1].grad
+        # of the covariance M (I + E) (I + E) M^T: an entry off the diagonal stands for both
+        full = (by_covars * by_covars.new_tensor([2, 1, 1, 2, 1, 2]))[:, SYMMETRIC].reshape(-1, 3, 3)
+        turned = factors.transpose(1, 2)
+        e = products(products(turned, full), factors).reshape(-1, 9)[:, [0, 4, 8, 1, 2, 5]]
+        e = e * e.new_tensor([1, 1, 1, 2, 2, 2])
+        d = (turned * by_means[:, None, :]).sum(dim=2)
+        by_logit = by_opacity * opacity * (1 - opacity)
+        return torch.cat([d, e, by_logit[:, None], by_seen], dim=1).T, by_harmonics, float(error)
 
     def move(self, rows: Tensor, harmonics: Tensor | None, error: float, share: float, speed: float) -> None:
         """Step down ``rows`` (COUNT, K) and ``harmonics`` (K, M, 3), as `OwnFrame.descend` does."""
@@ -170,10 +182,10 @@ class DeviceFrame(OwnFrame):
         d = (way[:3].T * rates[0] * gain).clamp(-self.CLIPS[0], self.CLIPS[0])
         scaled = torch.cat([way[3:6] * rates[1], way[6:9] * rates[2]])[ENTRIES].T.reshape(-1, 3, 3)
         e = (scaled * (gain[:, :, None] * gain[:, None, :]).clamp(max=4)).clamp(-self.CLIPS[2], self.CLIPS[2])
-        turned = factors @ e
+        turned = products(factors, e)
         self.tensors[:4] = [
-            means - (factors @ d[:, :, None])[..., 0],
-            factors - turned + 0.5 * turned @ e,
+            means - (factors * d[:, None, :]).sum(dim=2),
+            factors - turned + 0.5 * products(turned, e),
             logits - (way[9] * rates[3]).clamp(-self.CLIPS[1], self.CLIPS[1]),
             (colors - way[10:].T * rates[4]).clamp(min=self.darkest),
         ]
@@ -211,6 +223,11 @@ class DeviceFrame(OwnFrame):
         plain, factor = directions[SHARED] @ self.solver.T, self.shared.factor
         self.shared.remember(plain.double().cpu().numpy())
         return floors, (factor * plain) @ self.features
+
+
+def products(a: Tensor, b: Tensor) -> Tensor:
+    """Return the products of matrices (K, 3, 3), which are too small for the library's."""
+    return (a[:, :, :, None] * b[:, None, :, :]).sum(dim=2)
 
 
 def _sampled(numbers: Tensor, every: int, count: int) -> Tensor:

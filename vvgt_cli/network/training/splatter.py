@@ -12,7 +12,7 @@ from torch import Tensor
 from vvgt_cli.cameras import Camera
 from vvgt_cli.network.prepare import unpack
 from vvgt_cli.splat import project, render, render_backward
-from vvgt_cli.splat.by_gsplat import picture
+from vvgt_cli.splat.by_gsplat import capped, picture
 
 
 class Splat(torch.autograd.Function):
@@ -48,5 +48,6 @@ def splat(rows: Tensor, camera: Camera) -> Tensor:
 def gsplat_picture(rows: Tensor, camera: Camera) -> Tensor:
     """`splat` by gsplat, differentiable; see `vvgt_cli.splat.by_gsplat.picture` for where pictures differ."""
     means, log_scales, quaternions, logits, colors = rows.float().split([3, 3, 4, 1, 3], dim=1)
-    drawn: Tensor = picture(means, logits[:, 0], colors, camera, quats=quaternions, scales=log_scales.exp())
-    return drawn
+    opacity = capped(logits[:, 0].sigmoid())
+    drawn = picture(means, opacity, colors.clamp(min=0), camera, quats=quaternions, scales=log_scales.exp())
+    return torch.cat(drawn, dim=-1)
