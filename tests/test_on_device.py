@@ -28,13 +28,13 @@ OPTIONS = OptimizeOptions.of("frame")
 @nb.njit
 def plain_pixels(data, camera, step, width, places, offsets, out):
     for n in range(len(out)):
-        cuda._store(cuda._field_pixel, data, None, camera, step, width, places, offsets, out, n)
+        cuda._store(data, None, camera, step, width, places, offsets, out, n)
 
 
 @nb.njit
 def lit_pixels(data, camera, step, width, places, offsets, out):
     for n in range(len(out)):
-        cuda._store(cuda._field_pixel, data, data[3], camera, step, width, places, offsets, out, n)
+        cuda._store(data, data[3], camera, step, width, places, offsets, out, n)
 
 
 @pytest.mark.parametrize("lit", [False, True])
@@ -63,12 +63,11 @@ def test_a_device_that_fails_is_said_once_and_the_cpu_draws(monkeypatch):
     np.testing.assert_array_equal(image, render_view(made, view()))
 
 
-def gaussians(count=600, degree=0, seed=0):
+def gaussians(count=600, seed=0):
     rng = np.random.default_rng(seed)
     return Gaussians(
         rng.uniform(-0.6, 0.6, (count, 3)), rng.uniform(-3.5, -2, (count, 3)), rng.normal(size=(count, 4)),
         rng.uniform(-2, 3, count), rng.uniform(0, 1, (count, 3)),
-        rng.normal(0, 0.1, (count, (degree + 1) ** 2 - 1, 3)) if degree else None,
     )  # fmt: skip
 
 
@@ -108,10 +107,10 @@ def descent(monkeypatch):
     return module
 
 
-@pytest.mark.parametrize(("count", "degree", "some"), [(600, 0, False), (300, 2, False), (600, 0, True)])
-def test_steps_are_those_of_the_cpu(descent, count, degree, some):
-    start, cameras = gaussians(count, degree), default_views("train", 4, size=40)
-    images = [render(gaussians(count, degree, 1), camera) for camera in cameras]
+@pytest.mark.parametrize(("count", "some"), [(600, False), (300, False), (600, True)])
+def test_steps_are_those_of_the_cpu(descent, count, some):
+    start, cameras = gaussians(count), default_views("train", 4, size=40)
+    images = [render(gaussians(count, 1), camera) for camera in cameras]
     free = np.arange(count) % 3 > 0 if some else None
     there, here = replace(OPTIONS, device="torch"), OPTIONS
     pair = [(options, begin(start, cameras, options, free)) for options in (here, there)]
@@ -148,11 +147,14 @@ def test_the_loss_is_that_of_the_cpu(descent):
 
 
 def test_what_a_device_does_not_do_is_named(descent):
-    assert descent.unfit(OPTIONS) is None
-    assert descent.unfit(replace(OPTIONS, rule=RULES["compensated"].at(0.37))) is None
-    assert descent.unfit(OptimizeOptions.of("3dgs")) == "the method 3dgs"
-    assert descent.unfit(replace(OPTIONS, ssim=0.1)) == "SSIM in the loss"
-    assert descent.unfit(replace(OPTIONS, rule=RULES["viser"])) == "the rule viser, by which gsplat does not draw"
+    assert descent.unfit(gaussians(), OPTIONS) is None
+    assert descent.unfit(gaussians(), replace(OPTIONS, rule=RULES["compensated"].at(0.37))) is None
+    assert descent.unfit(gaussians(), OptimizeOptions.of("3dgs")) == "the method 3dgs"
+    assert descent.unfit(gaussians(), replace(OPTIONS, ssim=0.1)) == "SSIM in the loss"
+    assert (
+        descent.unfit(gaussians(), replace(OPTIONS, rule=RULES["viser"]))
+        == "the rule viser, by which gsplat does not draw"
+    )
 
 
 def test_a_device_that_fails_in_a_step_says_so(descent, monkeypatch):
@@ -182,7 +184,7 @@ def test_a_gpu_draws_the_kernels_views(gpu, lit):
 @pytest.mark.parametrize("rule", [INRIA, RULES["compensated"]])
 def test_gsplat_draws_and_steps_as_the_kernels_do(gpu, rule):
     start, cameras = gaussians(2000), default_views("train", 4, size=120)
-    images = [render(gaussians(2000, 0, 1), camera, rule) for camera in cameras]
+    images = [render(gaussians(2000, 1), camera, rule) for camera in cameras]
     found = []
     for device in ("cpu", "cuda"):
         options = replace(OPTIONS, rule=rule, device=device)

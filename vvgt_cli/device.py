@@ -81,6 +81,9 @@ def on_device(scene: Scene, device: str, say: Callable[[str], None]) -> Scene:
     """Return the scene with its rays cast on ``device``, "cpu" or "cuda"; ``say`` is told where that fails."""
     if device == "cpu":
         return scene
+    if scene.grid is not None:
+        say("labels and layers are drawn on the CPU; a GPU draws one volume under a function")
+        return scene
     from vvgt_cli.dvr.cuda import DeviceRays
 
     return replace(scene, rays=DeviceRays(scene, say))

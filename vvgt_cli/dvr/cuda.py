@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vvgt_cli.dvr import grid, shading
+from vvgt_cli.dvr import shading
 from vvgt_cli.dvr.kernel import (
     FLAGS,
     OPAQUE,
@@ -103,12 +103,12 @@ def cast(
     return red, green, blue, 1.0 - trans
 
 
-_field_pixel, _grid_pixel = pixels_of(cast), pixels_of(grid.cast)
+_pixel = pixels_of(cast)
 
 
 @_jit
 def _store(
-    pixel: Any, data: Any, light: Any, camera: np.ndarray, step: float, width: int, places: np.ndarray,
+    data: Any, light: Any, camera: np.ndarray, step: float, width: int, places: np.ndarray,
     offsets: np.ndarray, out: np.ndarray, n: int,
 ) -> None:  # fmt: skip
     """Store the mean of the rays of pixel ``places[n]``, counted row by row, into row ``n`` of ``out`` (m, 4).
@@ -116,7 +116,7 @@ def _store(
     ``camera`` (5, 4): eye, the rows of the basis, lens, as of `kernel.render_tiles`; ``data``: `scene_arrays`.
     """
     row, col = places[n] // width, places[n] % width
-    sums = pixel(data[0], data[1], data[2], light, camera[0], camera[1:4], camera[4], step, col, row, offsets)
+    sums = _pixel(data[0], data[1], data[2], light, camera[0], camera[1:4], camera[4], step, col, row, offsets)
     out[n, 0], out[n, 1] = sums[0] / offsets.shape[0], sums[1] / offsets.shape[0]
     out[n, 2], out[n, 3] = sums[2] / offsets.shape[0], sums[3] / offsets.shape[0]
 
@@ -128,8 +128,8 @@ def _key() -> int:
 
 
 @cache
-def _kernels(key: int) -> dict[tuple[bool, bool], Any]:
-    """Return the device's kernels by whether they draw an optics grid, and whether there is a light.
+def _kernels(key: int) -> tuple[Any, Any]:
+    """Return the device's kernels, without a light and with one.
 
     numba-cuda keeps them on disk by their own code and the numbers around it: ``key`` stands for what they call.
     """
@@ -142,41 +142,23 @@ def _kernels(key: int) -> dict[tuple[bool, bool], Any]:
     kernel = cuda.jit(cache=True, fastmath=FLAGS, max_registers=REGISTERS)
 
     @kernel
-    def field_pixels(data, camera, step, width, places, offsets, out):  # type: ignore[no-untyped-def]
+    def plain_pixels(data, camera, step, width, places, offsets, out):  # type: ignore[no-untyped-def]
         n = cuda.grid(1)
         if n < out.shape[0] and key != 0:
-            _store(_field_pixel, data, None, camera, step, width, places, offsets, out, n)
+            _store(data, None, camera, step, width, places, offsets, out, n)
 
     @kernel
-    def lit_field_pixels(data, camera, step, width, places, offsets, out):  # type: ignore[no-untyped-def]
+    def lit_pixels(data, camera, step, width, places, offsets, out):  # type: ignore[no-untyped-def]
         n = cuda.grid(1)
         if n < out.shape[0] and key != 0:
-            _store(_field_pixel, data, data[3], camera, step, width, places, offsets, out, n)
+            _store(data, data[3], camera, step, width, places, offsets, out, n)
 
-    @kernel
-    def grid_pixels(data, camera, step, width, places, offsets, out):  # type: ignore[no-untyped-def]
-        n = cuda.grid(1)
-        if n < out.shape[0] and key != 0:
-            _store(_grid_pixel, data, None, camera, step, width, places, offsets, out, n)
-
-    @kernel
-    def lit_grid_pixels(data, camera, step, width, places, offsets, out):  # type: ignore[no-untyped-def]
-        n = cuda.grid(1)
-        if n < out.shape[0] and key != 0:
-            _store(_grid_pixel, data, data[3], camera, step, width, places, offsets, out, n)
-
-    return {
-        (False, False): field_pixels, (False, True): lit_field_pixels,
-        (True, False): grid_pixels, (True, True): lit_grid_pixels,
-    }  # fmt: skip
+    return plain_pixels, lit_pixels
 
 
 def scene_arrays(scene: Scene) -> tuple[Any, ...]:
-    """Return what a ray of a scene reads, as the arguments of `cast` or `grid.cast` in front of the ray."""
-    light = () if scene.light is None else (scene.light,)
-    if scene.grid is None:
-        return scene.voxels, scene.optics, scene.empty, *light
-    return scene.texels, scene.voxels if light else scene.texels, scene.empty, *light
+    """Return what a ray of a scene reads, as the arguments of `cast` in front of the ray."""
+    return scene.voxels, scene.optics, scene.empty, *(() if scene.light is None else (scene.light,))
 
 
 class DeviceRays:
@@ -233,7 +215,7 @@ class DeviceRays:
         camera = np.zeros((5, 4))
         camera[0, :3], camera[1:4, :3], camera[4] = eye, basis, lens
         sent = map(cuda.to_device, (places.astype(np.int32), np.ascontiguousarray(offsets, np.float64)))
-        render = _kernels(_key())[self.scene.grid is not None, self.scene.light is not None]
+        render = _kernels(_key())[self.scene.light is not None]
         blocks = -(-len(places) // THREADS)
         render[blocks, THREADS](data, cuda.to_device(camera), step, mask.shape[1], *sent, pixels)
         share = len(offsets) / (known + len(offsets))

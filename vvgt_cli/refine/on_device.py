@@ -7,7 +7,6 @@ at the check views, so that figures mean the same on both.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from functools import cache
 from typing import TYPE_CHECKING, Any
@@ -15,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vvgt_cli.errors import DeviceFailed
-from vvgt_cli.gaussians.harmonics import terms
 from vvgt_cli.refine.loop import MEMORY
 from vvgt_cli.refine.shared import sample_of
 from vvgt_cli.refine.ssim import KERNEL
@@ -37,10 +35,12 @@ SYMMETRIC = [0, 1, 2, 1, 3, 4, 2, 4, 5]  # of a matrix, row by row, among xx, xy
 SHARED = [*range(6), 9, 10, 11, 12]  # of the fields, those that `steps.KNOWN` counts
 
 
-def unfit(options: OptimizeOptions) -> str | None:
-    """Return why these options are descended by on the CPU alone; None where a device does."""
+def unfit(gaussians: Gaussians, options: OptimizeOptions) -> str | None:
+    """Return why descent from Gaussians by such options is the CPU's; None where a device does it."""
     if options.method != "frame":
         return f"the method {options.method}"
+    if gaussians.harmonics is not None:
+        return "colours that depend on the view"
     if options.ssim > 0:
         return "SSIM in the loss"
     return None if draws(options.rule) else f"the rule {options.rule.name}, by which gsplat does not draw"
@@ -50,7 +50,7 @@ class DeviceFrame(OwnFrame):
     """`OwnFrame` whose arrays lie on a device, and on the CPU when they are asked for there.
 
     Attributes:
-        tensors: means, factors M, opacity logits, colours, harmonics if any.
+        tensors: means, factors M, opacity logits, colours.
     """
 
     def __init__(
@@ -99,8 +99,7 @@ class DeviceFrame(OwnFrame):
         import torch
 
         self.arrays = self.arrays  # axes have been put in order in place
-        sent = [torch.from_numpy(np.array(a)).to(self.device) for a in (self.first, self.second, *self.running)]
-        self.moments, self.more = sent[:2], sent[2:]
+        self.moments = [torch.from_numpy(np.array(a)).to(self.device) for a in (self.first, self.second)]
         self.there_sent = [torch.from_numpy(array).to(self.device) for array in self.there]
         self.fixed_sent = torch.from_numpy(self.fixed).to(self.device)
         if self.shared is not None:
@@ -110,7 +109,7 @@ class DeviceFrame(OwnFrame):
 
     def saved(self) -> dict[str, np.ndarray]:
         """Return all that the next steps depend on."""
-        self.first, self.second, *self.running = (tensor.cpu().numpy() for tensor in (*self.moments, *self.more))
+        self.first, self.second = (tensor.cpu().numpy() for tensor in self.moments)
         return super().saved()
 
     def restore(self, saved: dict[str, np.ndarray]) -> None:
@@ -132,33 +131,27 @@ class DeviceFrame(OwnFrame):
         try:
             if id(camera) not in self.targets:
                 self.targets[id(camera)] = torch.from_numpy(np.array(target)).to(self.device)
-            rows, harmonics, now = self.slopes(camera, self.targets[id(camera)], options)
+            rows, now = self.slopes(camera, self.targets[id(camera)], options)
             error = now if error is None else MEMORY * error + (1 - MEMORY) * now
-            self.move(rows, harmonics, error, share, speed)
+            self.move(rows, error, share, speed)
         except RuntimeError as fault:
             raise DeviceFailed(" ".join(str(fault).split())[:200]) from None
         return error
 
-    def slopes(self, camera: Camera, target: Tensor, options: OptimizeOptions) -> tuple[Tensor, Tensor | None, float]:
-        """Return slopes as `FrameGradients.rows` and of the harmonics, and the RMS error of the picture."""
+    def slopes(self, camera: Camera, target: Tensor, options: OptimizeOptions) -> tuple[Tensor, float]:
+        """Return slopes as `FrameGradients.rows`, and the RMS error of the picture."""
         import torch
 
-        means, factors, logits, colors, *harmonics = self.tensors
-        seen = colors if not harmonics else colors + view_terms(means, camera, harmonics[0])
+        means, factors, logits, colors = self.tensors
         opacity = logits.sigmoid()
         covars = products(factors, factors.transpose(1, 2)).reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
-        leaves = [tensor.detach().requires_grad_() for tensor in (means, capped(opacity), seen.clamp(min=0), covars)]
+        leaves = [tensor.detach().requires_grad_() for tensor in (means, capped(opacity), colors.clamp(min=0), covars)]
         rgb, alpha = self.draw(*leaves[:3], camera, options.rule, covars=leaves[3])
         slope, error = loss_slope(torch.cat([rgb, alpha], dim=2).detach(), target, options)
         # a sum, for `backward` with slopes loads an algebra system for seconds
         ((rgb * slope[..., :3]).sum() + (alpha * slope[..., 3:]).sum()).backward()
-        by_means, by_opacity, by_seen, by_covars = (leaf.grad for leaf in leaves)
-        by_seen = torch.where(seen >= 0, by_seen, 0)
-        by_harmonics = None
-        if harmonics:
-            leaves = [means.detach().requires_grad_(), harmonics[0].detach().requires_grad_()]
-            (view_terms(leaves[0], camera, leaves[1]) * by_seen).sum().backward()
-            by_means, by_harmonics = by_means + leaves[0].grad, leaves[1].grad
+        by_means, by_opacity, by_color, by_covars = (leaf.grad for leaf in leaves)
+        by_color = torch.where(colors >= 0, by_color, 0)
         # of the covariance M (I + E) (I + E) M^T: an entry off the diagonal stands for both
         full = (by_covars * by_covars.new_tensor([2, 1, 1, 2, 1, 2]))[:, SYMMETRIC].reshape(-1, 3, 3)
         turned = factors.transpose(1, 2)
@@ -166,32 +159,29 @@ class DeviceFrame(OwnFrame):
         e = e * e.new_tensor([1, 1, 1, 2, 2, 2])
         d = (turned * by_means[:, None, :]).sum(dim=2)
         by_logit = by_opacity * opacity * (1 - opacity)
-        return torch.cat([d, e, by_logit[:, None], by_seen], dim=1).T, by_harmonics, float(error)
+        return torch.cat([d, e, by_logit[:, None], by_color], dim=1).T, float(error)
 
-    def move(self, rows: Tensor, harmonics: Tensor | None, error: float, share: float, speed: float) -> None:
-        """Step down ``rows`` (COUNT, K) and ``harmonics`` (K, M, 3), as `OwnFrame.descend` does."""
+    def move(self, rows: Tensor, error: float, share: float, speed: float) -> None:
+        """Step down ``rows`` (COUNT, K), as `OwnFrame.descend` does."""
         import torch
 
-        rates, pace = self.rates(error, share, speed)
+        rates, _ = self.rates(error, share, speed)
         floors, predicted = self.common_on(rows)
         way = self._adam(rows, self.moments, floors[:, None])
         if predicted is not None:
             way[SHARED] += predicted
-        means, factors, logits, colors = self.tensors[:4]
+        means, factors, logits, colors = self.tensors
         gain = (1 + self.spread / factors.square().sum(dim=1).clamp(min=1e-30)).clamp(max=9).sqrt()
         d = (way[:3].T * rates[0] * gain).clamp(-self.CLIPS[0], self.CLIPS[0])
         scaled = torch.cat([way[3:6] * rates[1], way[6:9] * rates[2]])[ENTRIES].T.reshape(-1, 3, 3)
         e = (scaled * (gain[:, :, None] * gain[:, None, :]).clamp(max=4)).clamp(-self.CLIPS[2], self.CLIPS[2])
         turned = products(factors, e)
-        self.tensors[:4] = [
+        self.tensors = [
             means - (factors * d[:, None, :]).sum(dim=2),
             factors - turned + 0.5 * products(turned, e),
             logits - (way[9] * rates[3]).clamp(-self.CLIPS[1], self.CLIPS[1]),
             (colors - way[10:].T * rates[4]).clamp(min=self.darkest),
         ]
-        if harmonics is not None:
-            rate = self.harmonic_rate * math.sqrt(4 * math.pi / harmonics.shape[1]) * pace
-            self.tensors[4] = self.tensors[4] - rate * self._adam(harmonics, self.more, float(EPSILON))
         for tensor, there in zip(self.tensors, self.there_sent, strict=True):
             tensor[self.fixed_sent] = there
         self._host = None
@@ -236,16 +226,6 @@ def _sampled(numbers: Tensor, every: int, count: int) -> Tensor:
         return numbers
     runs = numbers[:, : numbers.shape[1] // RUN * RUN].reshape(len(numbers), -1, RUN)
     return runs[:, ::every].reshape(len(numbers), count)
-
-
-def view_terms(means: Tensor, camera: Camera, harmonics: Tensor) -> Tensor:
-    """Return what harmonics (K, M, 3) add to the colours of Gaussians at ``means`` (K, 3), seen by a camera."""
-    import torch
-
-    eye = torch.as_tensor(camera.position, dtype=torch.float32, device=means.device)
-    toward = torch.nn.functional.normalize(means - eye, dim=1)
-    found = torch.stack(terms(*toward.unbind(1))[: harmonics.shape[1]], dim=1)
-    return (found[:, :, None] * harmonics).sum(dim=1)
 
 
 def loss_slope(image: Tensor, target: Tensor, options: OptimizeOptions) -> tuple[Tensor, Tensor]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import ClassVar
@@ -127,14 +126,14 @@ def refine(
 
 
 def _on_its_device(
-    run: Run, options: OptimizeOptions, descend: Callable[..., tuple[Gaussians, OptimizeRecord]]
+    run: Run, options: OptimizeOptions, descend: partial[tuple[Gaussians, OptimizeRecord]]
 ) -> tuple[Gaussians, OptimizeRecord]:
     """Descend on the device of the options, or on the CPU where that does not or fails, which is said."""
     if options.device != "cpu":
         from vvgt_cli.refine.on_device import unfit
 
         try:
-            if (reason := unfit(options)) is None:
+            if (reason := unfit(descend.args[0], options)) is None:
                 return descend(options=options)
             run.console.say(f"{reason}: steps are taken on the CPU")
         except DeviceFailed as failed:
