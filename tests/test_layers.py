@@ -15,7 +15,7 @@ import vvgt_cli as library
 from tests.test_labels import SMALL, balls
 from vvgt_cli.dvr.layers import Layer, common_grid, grid_of, same_grid
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.field.layered import ALL, open_parts
+from vvgt_cli.field.layered import ALL, open_content
 from vvgt_cli.field.source import SourceRequest, load, parse_layer
 from vvgt_cli.gaussians import read_ply
 from vvgt_cli.look import ColorMap, PiecewiseOpacity, TransferFunction
@@ -153,7 +153,7 @@ def write_vti(path: Path, values: np.ndarray) -> None:
 def test_colours_of_every_format(tmp_path: Path, write, name: str, samples: int) -> None:
     values = colors(samples=samples)
     write(tmp_path / name, values)
-    content = open_parts(str(tmp_path / name), ReadOptions())
+    content = open_content(str(tmp_path / name), ReadOptions())
     assert content.color
     np.testing.assert_array_equal(np.stack([v.data for v in content.volumes], axis=-1), values)
     np.testing.assert_array_equal(read_volume(str(tmp_path / name), ReadOptions(component=1)).data, values[..., 1])
@@ -220,7 +220,7 @@ def write_ome(path: Path) -> np.ndarray:
 
 def test_channels_in_their_own_colours_add_up(vvgt, tmp_path: Path) -> None:
     values = write_ome(tmp_path / "a.ome.tif")
-    content = open_parts(str(tmp_path / "a.ome.tif"), ReadOptions(component=ALL))
+    content = open_content(str(tmp_path / "a.ome.tif"), ReadOptions(component=ALL))
     assert list(content.colors) == [(1.0, 0.0, 0.0), (0.0, 1.0, 1.0)]
     source = load(SourceRequest(str(tmp_path / "a.ome.tif"), ReadOptions(component=ALL)))
     grid = grid_of(source.layers, source.volume)

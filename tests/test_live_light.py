@@ -17,7 +17,7 @@ from vvgt_cli.dvr.light import sphere
 from vvgt_cli.gaussians import Gaussians, read_ply
 from vvgt_cli.gaussians.frames import rotations, turn, up_matrix
 from vvgt_cli.gaussians.harmonics import basis, view_colors
-from vvgt_cli.gaussians.live import FLAT, MEANS, SHARP, SPREADS, WIDEST, Table, baked, directions, shown_by, spreads
+from vvgt_cli.gaussians.live import FLAT, MEANS, SHARP, SPREADS, WIDEST, Table, apply_look, baked, directions, spreads
 from vvgt_cli.look.lighting import Lighting, LightOptions
 
 SIDE = Lighting(False, ((0.6, 0.0, 0.8),), 0.2, 0.6, 0.3, 4.0)
@@ -71,7 +71,7 @@ def test_a_light_turns_with_its_gaussians() -> None:
 
     def shade(gaussians: Gaussians, light: Lighting) -> Gaussians:
         assert gaussians.live is not None
-        return relit(shown_by(gaussians, table), gaussians.live[:, 3:], light)
+        return relit(apply_look(gaussians, table), gaussians.live[:, 3:], light)
 
     turned = replace(SIDE, directions=(tuple((up_matrix("x") @ np.array(SIDE.directions[0])).tolist()),))
     for light, other in ((SIDE, turned), (HEAD, HEAD)):
@@ -146,7 +146,7 @@ def test_what_is_opaque_lies_flat_in_its_surface() -> None:
     some = Gaussians(
         np.zeros((2, 3)), np.full((2, 3), np.log(0.1)), [[1, 0, 0, 0]] * 2, [0.0] * 2, [[1, 1, 1]] * 2, live=live
     )
-    shown = shown_by(some, Table.of_function(RAMP, LO, HI, 0.05, GRAIN))
+    shown = apply_look(some, Table.of_function(RAMP, LO, HI, 0.05, GRAIN))
     axes = rotations(shown.quaternions.astype(float)) * np.exp(shown.log_scales.astype(float))[:, None, :]
     variances, turned = np.linalg.eigh(axes[0] @ axes[0].T)
     wanted = 0.01 * np.array([SHARP, FLAT, FLAT])

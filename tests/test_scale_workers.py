@@ -335,7 +335,7 @@ def jobs(slurm, monkeypatch):
     monkeypatch.setattr(dask_runner, "asked_memory", lambda: 1e9)
     for name, value in slurm[1].items():
         monkeypatch.setenv(name, value)
-    return lambda: dask_runner.Dask("slurm", 2, 1)
+    return lambda: dask_runner.DaskRunner("slurm", 2, 1)
 
 
 def test_slurm_jobs_that_all_end_before_they_work_are_said(slurm, jobs, monkeypatch):

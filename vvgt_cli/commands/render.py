@@ -17,7 +17,7 @@ from vvgt_cli.conversion.gaussian_files import file_rule, open_gaussians
 from vvgt_cli.conversion.recolored import FunctionRequest, shown
 from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians import Gaussians, PlyHeader, in_unit_frame
-from vvgt_cli.gaussians.formats.levels import Levels, by_view
+from vvgt_cli.gaussians.formats.levels import StreamedLevels, by_view
 from vvgt_cli.gaussians.formats.splats import gaussians_of
 from vvgt_cli.gaussians.frames import up_matrix, upright_matrix
 from vvgt_cli.gaussians.outputs import Output, check_outputs, write_text
@@ -123,7 +123,7 @@ def _opened(request: RenderRequest) -> tuple[Seen, Gaussians, PlyHeader]:
         gaussians, header = open_gaussians(request.ply)
         gaussians = shown(request.ply, gaussians, header, request.function)
         return lambda camera: gaussians, gaussians, header
-    levels = Levels(manifest)
+    levels = StreamedLevels(manifest)
     coarsest, header = gaussians_of(levels.level(str(levels.count - 1)), request.ply)
     turned = up_matrix(header.up)
 

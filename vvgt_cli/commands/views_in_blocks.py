@@ -16,7 +16,7 @@ from vvgt_cli.commands.view_files import POINTS
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.blocked import Blocked
 from vvgt_cli.field.field import Picture
-from vvgt_cli.field.open import Wanted, automatic, beside, blocked
+from vvgt_cli.field.open import FieldNeeds, automatic, blocked, store_beside
 from vvgt_cli.score.record import Run
 
 if TYPE_CHECKING:
@@ -57,8 +57,10 @@ def fields_of(
         raise UsageError(f"--renderer {renderer}: needs the whole volume in memory; in blocks: cpu")
     fields = []
     for folder, tf in functions.items():
-        parts = stack.enter_context(beside(str(folder)))
-        fields.append(stack.enter_context(blocked(run, replace(source, tf=tf), options, parts, Wanted(POINTS, size))))
+        store = stack.enter_context(store_beside(str(folder)))
+        fields.append(
+            stack.enter_context(blocked(run, replace(source, tf=tf), options, store, FieldNeeds(POINTS, size)))
+        )
     return fields
 
 

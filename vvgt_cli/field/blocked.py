@@ -15,12 +15,12 @@ from vvgt_cli.cameras.sets import pixel_width
 from vvgt_cli.dvr.layout import Light
 from vvgt_cli.dvr.render import Box as Frame
 from vvgt_cli.dvr.render import Rays, RenderSettings, for_thin
+from vvgt_cli.field.block_store import CELLS, BlockStore
 from vvgt_cli.field.cells import NORMALS, CellBlocks, ExtinctionBlocks, PointBlocks, RayBlocks, ValueBlocks, read_rows
 from vvgt_cli.field.digests import digest, values_digest
 from vvgt_cli.field.drawing import Drawing
 from vvgt_cli.field.field import Picture, ViewRenderer
 from vvgt_cli.field.grid import CellGrid
-from vvgt_cli.field.parts import CELLS, Parts
 from vvgt_cli.field.rays import Bundle, RayFile, composed
 from vvgt_cli.field.reader import Scalars
 from vvgt_cli.field.runners import Runner, Task
@@ -52,7 +52,7 @@ class Pass:
     """
 
     runner: Runner
-    parts: Parts
+    store: BlockStore
     bar: Callable[[str], Progress | None]
     shard: tuple[int, int] | None = None
 
@@ -60,22 +60,22 @@ class Pass:
         """Do them; how many there were to do.
 
         Raises:
-            Later: others are missing, of other shards.
+            MissingBlocks: others are missing, of other shards.
             DataError: as the task.
         """
-        self.parts.prepare(task.kind)
+        self.store.prepare(task.kind)
         everything = range(len(task)) if numbers is None else numbers
         index, count = self.shard or (1, 1)
-        own = self.parts.missing(task.kind, (n for n in everything if n % count == index - 1))
+        own = self.store.missing(task.kind, (n for n in everything if n % count == index - 1))
         if own:
             self.runner.run(task, own, self.bar(name))
-        missing = self.parts.missing(task.kind, everything)
+        missing = self.store.missing(task.kind, everything)
         if missing:
-            raise Later(name, len(missing))
+            raise MissingBlocks(name, len(missing))
         return len(own)
 
 
-class Later(Exception):
+class MissingBlocks(Exception):
     """Parts of other shards are missing: nothing more can be done now."""
 
     def __init__(self, what: str, missing: int) -> None:
@@ -102,7 +102,7 @@ class Blocked:
 
     source: Source
     reader: Reader
-    do: Pass
+    run_pass: Pass
     edge: int
     visible: float
     key: str
@@ -129,8 +129,8 @@ class Blocked:
         from vvgt_cli.dvr.light import scene_light
 
         def extinction(cell: int) -> np.ndarray:
-            task = ExtinctionBlocks(self.reader, self._grid(np.zeros(3, np.int64), cell), self.do.parts, cell)
-            self.do(task, "light")
+            task = ExtinctionBlocks(self.reader, self._grid(np.zeros(3, np.int64), cell), self.run_pass.store, cell)
+            self.run_pass(task, "light")
             return task.gathered()
 
         return scene_light(lighting, volume.axes, self.frame.step, volume.data.shape, extinction)
@@ -149,11 +149,11 @@ class Blocked:
         x, y, z = (float(edge) for edge in self.frame.step)
         share = (self.visible / self.source.volume.data.size) ** (1 / 3)
         steps = view_edge(size, small=False) ** 2 * WAY / min(x, y, z) * max(share, 0.1)
-        case = Workload(
+        workload = Workload(
             gaussians=gaussians, cells=0.0, voxels=self.visible, size=size, view=VIEW * RAY_STEP * steps, pace=pace(),
-            there=PROGRAM + self.edge**3 * self.reader.voxel_bytes, visible=self.visible, step=(x, y, z),
+            base_bytes=PROGRAM + self.edge**3 * self.reader.voxel_bytes, visible=self.visible, step=(x, y, z),
         )  # fmt: skip
-        return for_budget(case, gaussians)
+        return for_budget(workload, gaussians)
 
     def cells(self, size: int, budget: int, most: int | None = None) -> CellBlocks:
         """The pass over base cells for images of ``size`` px; at most ``most`` cells, None: as many as memory holds."""
@@ -169,8 +169,8 @@ class Blocked:
         grid, todo = self._grid(exponents(step, level)), self._todo()
         rays = self._file([(one, one.first()) for one in todo], grid) if todo else None
         if rays is not None:
-            self.do.parts.prepare(rays.kind)
-        return CellBlocks(self.reader, grid, self.do.parts, rays, self.light)
+            self.run_pass.store.prepare(rays.kind)
+        return CellBlocks(self.reader, grid, self.run_pass.store, rays, self.light)
 
     def pyramid(self, options: VbmOptions, progress: Progress | None = None) -> Start:
         """See `Field.pyramid`."""
@@ -180,7 +180,7 @@ class Blocked:
 
         most = most_cells(options.max_gaussians, options.values)
         task = self.cells(options.size, options.max_gaussians, most)
-        self.do(task, "integrate")
+        self.run_pass(task, "integrate")
         self.grid, half, step = task.grid, *self.frame
         shading = None if self.light is None else Shading(self.light, half, step, self._normals_at)
         form = form_of(  # which alone holds the cells: their tree takes twice as much
@@ -227,7 +227,7 @@ class Blocked:
             for one, rays in wanted
             for offsets, mask, _ in rays
         ]
-        return RayFile.of(bundles, self.frame, grid.blocks, self.do.parts)
+        return RayFile.of(bundles, self.frame, grid.blocks, self.run_pass.store)
 
     def _march(self) -> None:
         """Make every picture that is expected, all of them together: at most two passes."""
@@ -238,9 +238,9 @@ class Blocked:
                 continue
             file = self._file(wanted, grid)
             numbers = self._shown()
-            task = RayBlocks(self.reader, grid, self.do.parts, file, self.light)
-            self.do(task, "views", numbers)  # those that the pass over the cells has cast are there
-            seen = composed(file, self.do.parts, numbers, self.source.volume.dims)
+            task = RayBlocks(self.reader, grid, self.run_pass.store, file, self.light)
+            self.run_pass(task, "views", numbers)  # those that the pass over the cells has cast are there
+            seen = composed(file, self.run_pass.store, numbers, self.source.volume.dims)
             for one, rays in wanted:
                 for part in rays:
                     one.add(part, next(seen))
@@ -253,8 +253,8 @@ class Blocked:
         """Blocks that hold anything visible, as far as the pass over the cells has found it out."""
         if self.grid is None:
             return list(range(len(self._grid(np.zeros(3, np.int64)).blocks)))
-        parts = self.do.parts
-        return [n for n in range(len(self.grid.blocks)) if len(parts.load(CELLS, n, names=("counts",))["counts"])]
+        store = self.run_pass.store
+        return [n for n in range(len(self.grid.blocks)) if len(store.load(CELLS, n, names=("counts",))["counts"])]
 
     def normals(self, gaussians: Gaussians) -> np.ndarray | None:
         """See `Field.normals`."""
@@ -272,15 +272,15 @@ class Blocked:
         """Normals and extinction (n, 4) at points (n, 3) of the box frame."""
         grid = self.grid or self._grid(np.zeros(3, np.int64))
         at = (points + self.frame.half) / self.frame.step - 0.5
-        parts, kind = self.do.parts, f"points-{digest(at)[:16]}"
-        path = parts.folder / f"{kind}.npy"
+        store, kind = self.run_pass.store, f"points-{digest(at)[:16]}"
+        path = store.folder / f"{kind}.npy"
         with atomic_write(path, overwrite=True) as temporary, open(temporary, "wb") as stream:
             np.save(stream, at)
-        task = PointBlocks(self.reader, grid, parts, str(path), kind)
-        self.do(task, "normals")
+        task = PointBlocks(self.reader, grid, store, str(path), kind)
+        self.run_pass(task, "normals")
         out = np.zeros((len(at), 4))
         for number in range(len(task)):
-            part = parts.load(kind, number)
+            part = store.load(kind, number)
             out[part["which"]] = part["found"]
         return out
 
@@ -288,20 +288,20 @@ class Blocked:
         """See `Field.sample`."""
         from vvgt_cli.closed_form.under import POINTS, in_voxels, values_of
 
-        self.source.one_field()
+        self.source.require_scalar_field()
         assert isinstance(self.reader, Scalars)
-        grid, parts = self.grid or self._grid(np.zeros(3, np.int64)), self.do.parts
+        grid, store = self.grid or self._grid(np.zeros(3, np.int64)), self.run_pass.store
         centres, arms = in_voxels(gaussians, *self.frame)
         rows = np.concatenate([centres, arms.reshape(-1, 9)], axis=1)
         kind = f"values-{digest(rows)[:16]}"
-        path = parts.folder / f"{kind}.npy"
+        path = store.folder / f"{kind}.npy"
         with atomic_write(path, overwrite=True) as temporary, open(temporary, "wb") as stream:
             np.save(stream, rows)
-        task = ValueBlocks(self.reader, grid, parts, str(path), kind)
-        self.do(task, "values")
+        task = ValueBlocks(self.reader, grid, store, str(path), kind)
+        self.run_pass(task, "values")
         samples = np.full(len(gaussians) * POINTS, np.nan, np.float32)
         for number in range(len(task)):
-            part = parts.load(kind, number)
+            part = store.load(kind, number)
             samples[part["numbers"]] = part["found"]
         rule = self.reader.rule
         return values_of(samples.reshape(-1, POINTS), gaussians, rule.slope, rule.intercept)
@@ -312,9 +312,9 @@ class Blocked:
         volumes = [id(volume) for volume in self.source.volumes]
         shown = [volumes.index(id(volume)) for volume in source.volumes]
         key = digest(self.key, source.shown_as(), [layer.tf for layer in source.layers], shown)
-        parts = Parts(self.do.parts.folder / f"shown-{key[:16]}")
-        parts.open({"shown": key}, ours=True)
-        return Blocked(source, reader, replace(self.do, parts=parts), self.edge, visible, key, self.look)
+        store = BlockStore(self.run_pass.store.folder / f"shown-{key[:16]}")
+        store.open({"shown": key}, ours=True)
+        return Blocked(source, reader, replace(self.run_pass, store=store), self.edge, visible, key, self.look)
 
     @cached_property
     def _digest(self) -> str | None:
@@ -338,15 +338,15 @@ def _gathered(task: CellBlocks) -> Cells:
 
     index, moments, normals = [np.empty((0, 3), np.int32)], [], []
     for number in range(len(task)):
-        part = task.parts.load(CELLS, number, names=("tiles", "counts"))
+        part = task.store.load(CELLS, number, names=("tiles", "counts"))
         offset = 0
         for tile, count in zip(part["tiles"], part["counts"].tolist(), strict=True):
-            rows, local = read_rows(task.parts, number, offset, count)
+            rows, local = read_rows(task.store, number, offset, count)
             index.append(local + (tile * task.grid.tile_cells).astype(np.int32))
             moments.append(rows)
             offset += count
         if task.light is not None:
-            normals.append(np.load(task.parts.path(CELLS, number, NORMALS)))
+            normals.append(np.load(task.store.path(CELLS, number, NORMALS)))
     whole = np.concatenate(index)
     lit = None
     if task.light is not None:

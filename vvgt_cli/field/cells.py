@@ -9,9 +9,9 @@ import numpy as np
 from vvgt_cli.closed_form.columns import FIRST, MASS, MOMENTS
 from vvgt_cli.dvr.layout import Light
 from vvgt_cli.errors import DataError
+from vvgt_cli.field.block_store import CELLS, ROW, BlockStore
 from vvgt_cli.field.grid import CellGrid
-from vvgt_cli.field.parts import CELLS, ROW, Parts
-from vvgt_cli.field.rays import HALO, LIT_HALO, RayFile, leave_rays
+from vvgt_cli.field.rays import HALO, LIT_HALO, RayFile, save_rays
 from vvgt_cli.field.reader import Box, Layers, Scalars
 from vvgt_cli.files import atomic_write
 
@@ -30,7 +30,7 @@ class Blockwise:
 
     reader: Reader
     grid: CellGrid
-    parts: Parts
+    store: BlockStore
 
     def __len__(self) -> int:
         return len(self.grid.blocks)
@@ -56,12 +56,12 @@ class CellBlocks(Blockwise):
 
     def __call__(self, number: int) -> None:
         """Leave the part of block ``number``: rows of cells, what it shows of rays, and what there is of each tile."""
-        grid, parts = self.grid, self.parts
+        grid, store = self.grid, self.store
         box = self.box(number, HALO if self.light is None else LIT_HALO)
         tiles, counts, coarse, field, deepest = [], [], [], [], 0.0
         normals = [np.empty((0, 3))]
         with (
-            atomic_write(parts.path(CELLS, number, ".rows"), overwrite=True) as temporary,
+            atomic_write(store.path(CELLS, number, ".rows"), overwrite=True) as temporary,
             open(temporary, "wb") as stream,
         ):
             for tile in grid.tiles(number):
@@ -79,13 +79,13 @@ class CellBlocks(Blockwise):
                 field.append(summary[1])
                 deepest = max(deepest, summary[2])
         if self.rays is not None:
-            leave_rays(self.rays, box, number, grid.blocks, self.light, parts)
+            save_rays(self.rays, box, number, grid.blocks, self.light, store)
         if self.light is not None:
-            path = parts.path(CELLS, number, NORMALS)
+            path = store.path(CELLS, number, NORMALS)
             with atomic_write(path, overwrite=True) as temporary, open(temporary, "wb") as stream:
                 np.save(stream, np.concatenate(normals))
         edges = [grid.tile_cells >> grid.march] * 3, [grid.tile_cells >> grid.field] * 3
-        parts.save(
+        store.save(
             CELLS,
             number,
             tiles=np.array(tiles, np.int64).reshape(-1, 3),
@@ -153,7 +153,7 @@ class RayBlocks(Blockwise):
     def __call__(self, number: int) -> None:
         """Leave what block ``number`` shows of them."""
         box = self.box(number, HALO if self.light is None else LIT_HALO)
-        leave_rays(self.rays, box, number, self.grid.blocks, self.light, self.parts)
+        save_rays(self.rays, box, number, self.grid.blocks, self.light, self.store)
 
 
 @dataclass(frozen=True)
@@ -172,7 +172,7 @@ class PointBlocks(Blockwise):
         found = np.empty((0, 4))
         if len(which):
             found = normals_in(self.box(number, LIT_HALO), points[which], np.array(self.grid.step))
-        self.parts.save(self.kind, number, which=which, found=found)
+        self.store.save(self.kind, number, which=which, found=found)
 
 
 @dataclass(frozen=True)
@@ -207,7 +207,7 @@ class ValueBlocks(Blockwise):
             )  # fmt: skip
             row, column = np.nonzero(np.isfinite(samples))
             found, numbers = samples[row, column], which[row] * POINTS + column
-        self.parts.save(self.kind, number, numbers=numbers, found=found)
+        self.store.save(self.kind, number, numbers=numbers, found=found)
 
 
 @dataclass(frozen=True)
@@ -229,7 +229,7 @@ class ExtinctionBlocks(Blockwise):
         out = np.empty(tuple(-(-n // self.cell) for n in box.values.shape), np.float32)
         empty = empty_distance(brick_ranges(box.values), box.optics)
         cell_extinction(box.voxels, box.optics, empty, self.cell, out)
-        self.parts.save(self.kind, number, extinction=out)
+        self.store.save(self.kind, number, extinction=out)
 
     def gathered(self) -> np.ndarray:
         """(cz, cy, cx) float32 of the whole volume.
@@ -240,12 +240,12 @@ class ExtinctionBlocks(Blockwise):
         out = np.empty(tuple(-(-int(n) // self.cell) for n in self.grid.dims[::-1]), np.float32)
         for number in range(len(self)):
             x, y, z = (int(n) // self.cell for n in self.grid.blocks.at(number)[0])
-            part = self.parts.load(self.kind, number)["extinction"]
+            part = self.store.load(self.kind, number)["extinction"]
             out[z : z + part.shape[0], y : y + part.shape[1], x : x + part.shape[2]] = part
         return out
 
 
-def read_rows(parts: Parts, number: int, offset: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+def read_rows(store: BlockStore, number: int, offset: int, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Moments (count, 13) and places in their tile (count, 3) int32 of a tile's cells.
 
     ``offset`` counts the cells of the block before them.
@@ -253,7 +253,7 @@ def read_rows(parts: Parts, number: int, offset: int, count: int) -> tuple[np.nd
     Raises:
         DataError: the file is not whole.
     """
-    path = parts.path(CELLS, number, ".rows")
+    path = store.path(CELLS, number, ".rows")
     try:
         with open(path, "rb") as stream:
             stream.seek(offset * ROW)

@@ -9,9 +9,9 @@ import numpy as np
 
 from vvgt_cli.closed_form.samples import SAMPLE, sample_spacing, samples_in
 from vvgt_cli.errors import Unsuitable, UsageError
+from vvgt_cli.field.block_store import COUNTS, HISTOGRAM, LABELS, BlockStore
 from vvgt_cli.field.grid import Boxes
-from vvgt_cli.field.layered import Content, content_of, open_parts
-from vvgt_cli.field.parts import COUNTS, HISTOGRAM, LABELS, Parts
+from vvgt_cli.field.layered import Content, content_of, open_content
 from vvgt_cli.field.reader import CLASSIFIED, Place
 from vvgt_cli.field.settings import counted_boxes, slices_at_once
 from vvgt_cli.volume import ReadOptions, Statistics, Volume
@@ -36,7 +36,7 @@ class CountBlocks:
     place: Place
     boxes: Boxes
     slices: int
-    parts: Parts
+    store: BlockStore
     kind: str
     limits: tuple[float, float] | None = None
     labels: bool = False
@@ -66,7 +66,7 @@ class CountBlocks:
                     bricks[n] = _brick(volume, values, begin, end, places[n], size)
             del values  # before the next slices are read
         assert found is not None, "a box has a slice"
-        self.parts.save(
+        self.store.save(
             self.kind,
             number,
             counts=found.counts,
@@ -86,7 +86,7 @@ class CountBlocks:
         """
         whole: Tally | None = None
         for number in range(len(self)):
-            part = self.parts.load(self.kind, number, names=("counts", "ends", "numbers", "histogram"))
+            part = self.store.load(self.kind, number, names=("counts", "ends", "numbers", "histogram"))
             lo, hi, low, high = part["ends"].tolist()
             nan, finite = part["numbers"].tolist()
             one = Tally(part["counts"], lo, hi, (low, high), nan, finite, part["histogram"])
@@ -96,12 +96,12 @@ class CountBlocks:
 
     def samples(self) -> tuple[np.ndarray, np.ndarray]:
         """Bricks (n, z, y, x) of stored values, and the voxels (n,) that each stands for."""
-        found = [self.parts.load(self.kind, number, names=("samples", "weights")) for number in range(len(self))]
+        found = [self.store.load(self.kind, number, names=("samples", "weights")) for number in range(len(self))]
         return np.concatenate([part["samples"] for part in found]), np.concatenate([part["weights"] for part in found])
 
     def unique(self) -> np.ndarray:
         """The different finite values (n,), ascending."""
-        found = [self.parts.load(self.kind, number, names=("unique",))["unique"] for number in range(len(self))]
+        found = [self.store.load(self.kind, number, names=("unique",))["unique"] for number in range(len(self))]
         return np.unique(np.concatenate(found))
 
 
@@ -115,11 +115,11 @@ def _brick(
     return values[z : z + k, y : y + j, x : x + i]
 
 
-class Counted:
+class BlockAccess:
     """`vvgt_cli.field.layered.Access` block by block: every volume is counted once, when it is asked for."""
 
     def __init__(
-        self, parts: Parts, edge: int, run: Callable[[CountBlocks], object], histogram: bool
+        self, store: BlockStore, edge: int, run: Callable[[CountBlocks], object], histogram: bool
     ) -> None:  # fmt: skip
         """Take what does the tasks.
 
@@ -129,7 +129,7 @@ class Counted:
             run: does the blocks of a task that are missing.
             histogram: is needed, also of types that are not counted value by value.
         """
-        self._parts, self._edge, self._run, self._histogram = parts, edge, run, histogram
+        self._store, self._edge, self._run, self._histogram = store, edge, run, histogram
         self._places: dict[int, tuple[Volume, Place]] = {}
         self._done: dict[int, tuple[CountBlocks, Tally, Statistics]] = {}
         self._count = 0
@@ -142,7 +142,7 @@ class Counted:
                 self._places[id(volume)] = volume, Place(volume, read)
             return content
         read = replace(read, stored=True, packed=True)
-        content = open_parts(source, read)
+        content = open_content(source, read)
         for number, volume in enumerate(content.volumes):
             self._places[id(volume)] = volume, Place(source, read, number)
         if content.color:
@@ -176,7 +176,7 @@ class Counted:
         boxes = counted_boxes(volume, edge, sample_spacing(volume.dims))
         labels = not counted(volume) and volume.data.dtype.kind in "iu"
         first = CountBlocks(
-            self.place(volume), boxes, slices_at_once(volume, edge, boxes), self._parts, COUNTS + suffix, labels=labels
+            self.place(volume), boxes, slices_at_once(volume, edge, boxes), self._store, COUNTS + suffix, labels=labels
         )
         self._run(first)
         whole = with_limits(first.merged(), volume)

@@ -36,7 +36,7 @@ def _need(name: str) -> Any:
         raise DataError(f"--scheduler: {name} is not installed; try: pip install 'vvgt[cluster]'") from None
 
 
-class Dask:
+class DaskRunner:
     """See the module. A context: workers that are started for it stay from pass to pass, and end with it.
 
     Attributes:
@@ -65,7 +65,7 @@ class Dask:
             if asked_memory() is None:
                 raise UsageError("--scheduler slurm: give --memory, which every job asks for, as --memory 16G")
 
-    def __enter__(self) -> Dask:
+    def __enter__(self) -> DaskRunner:
         return self
 
     def __exit__(self, *error: object) -> None:

@@ -150,7 +150,7 @@ class Resident:
         """See `Field.sample`."""
         from vvgt_cli.closed_form.under import POINTS, in_voxels, offsets, sample_points, values_of
 
-        self.source.one_field()
+        self.source.require_scalar_field()
         scene, values = self.scene, np.empty((len(gaussians), 5), np.float32)
         nothing, dims = np.zeros(3, np.int64), np.array(self.source.volume.dims)
         for k in range(0, len(gaussians), AT_ONCE):

@@ -67,7 +67,7 @@ class Content:
     unasked: str | None = None
 
     @property
-    def one_field(self) -> bool:
+    def single_volume(self) -> bool:
         """Whether it is scalars or labels alone."""
         return not self.color and len(self.volumes) == 1
 
@@ -100,7 +100,7 @@ class Content:
 
     def prepare(self) -> None:
         """Count and lay out a scalar field now, and not under every function."""
-        if self.one_field:
+        if self.single_volume:
             _ = self.statistics, self.layout  # both are kept
 
 
@@ -120,8 +120,8 @@ class InMemory:
     """`Access` to volumes that are read as a whole."""
 
     def open(self, source: str | Volume | Content, read: ReadOptions) -> Content:
-        """See `open_parts`."""
-        return open_parts(source, read) if isinstance(source, str) else content_of(source).held()
+        """See `open_content`."""
+        return open_content(source, read) if isinstance(source, str) else content_of(source).held()
 
     def statistics(self, volume: Volume) -> Statistics:
         """See `vvgt_cli.volume.statistics`."""
@@ -140,7 +140,7 @@ def content_of(source: Volume | Content) -> Content:
     return source if isinstance(source, Content) else Content((source,))
 
 
-def open_parts(source: str, read: ReadOptions) -> Content:
+def open_content(source: str, read: ReadOptions) -> Content:
     """A volume; where ``read.component`` is "color" or "all", or the file says that it holds colours, its components.
 
     Up to `MOST_CHANNELS` channels of a microscope are "all" where none is asked for.
@@ -178,7 +178,7 @@ def is_plain(
     opened: Content, tf: object, labels: str | LabelTable | None, layers: Sequence[object], access: Access
 ) -> bool:
     """Whether it is one scalar field under a function; a label map that is recognised is not."""
-    if not opened.one_field or layers or labels not in (None, NONE):
+    if not opened.single_volume or layers or labels not in (None, NONE):
         return False
     return (
         tf is not None
@@ -227,7 +227,7 @@ def layers_of(
     colors = (opened.volumes[0], opened.volumes[1], opened.volumes[2]) if opened.color else None
     layers = []
     for volume, one, its in zip(sources, shown, numbers, strict=True):
-        given = function if function is not None and opened.one_field else one
+        given = function if function is not None and opened.single_volume else one
         there = bool(one.support(its.lo, its.hi))
         layers.append(Layer(volume, one, *unit_distance(distance, volume, given), colors, _white(opened), there))
     return layers
@@ -245,11 +245,11 @@ def _asked(
                 "--tf and --labels none, or take one layer with --component N"
             )
         return labels or AUTO
-    if labels not in (None, NONE) and not opened.one_field:
+    if labels not in (None, NONE) and not opened.single_volume:
         raise UsageError(f"{volume.name}: several components; expected one of labels: choose it with --component N")
     if labels not in (None, NONE) and tf is not None:
         raise UsageError(f"{volume.name}: both a function and a table of labels; expected one of --tf and --labels")
-    if labels is None and tf is None and opened.one_field:
+    if labels is None and tf is None and opened.single_volume:
         own = holds_table(opened.path)
         if own or recognised(volume, access.labels):
             reason = "its segments" if own else "its name and its few integers"
@@ -268,7 +268,7 @@ def functions_of(
     if opened.color:
         kind = "opacity of the file" if len(opened.volumes) > 3 else "opacity by luminance"
         return [resolve(tf, numbers[0], tf_range) if tf else _function(kind, 0.0, _white(opened), (1, 1, 1))]
-    if opened.one_field:
+    if opened.single_volume:
         one = opened.volumes[0]
         if tf is None:
             return [from_histogram(numbers[0], one.hounsfield, one.density)]

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vvgt_cli.errors import SeveralComponents, Unsuitable, UsageError
+from vvgt_cli.field.block_store import BlockStore
 from vvgt_cli.field.blocked import Blocked, Pass
-from vvgt_cli.field.counting import Counted
+from vvgt_cli.field.counting import BlockAccess
 from vvgt_cli.field.digests import digest
-from vvgt_cli.field.layered import NONE, Content, content_of, open_parts
-from vvgt_cli.field.parts import Parts
-from vvgt_cli.field.runners import Here, Processes, Runner
+from vvgt_cli.field.layered import NONE, Content, content_of, open_content
+from vvgt_cli.field.runners import InProcess, Processes, Runner
 from vvgt_cli.field.settings import BlockOptions, block_edge
 from vvgt_cli.field.source import Source, SourceRequest, describe_source, load
 from vvgt_cli.gaussians.outputs import STDOUT
@@ -59,7 +59,7 @@ LAYERED_BYTES = 60  # of a voxel of an optics grid while a block of it is there
 
 
 @dataclass(frozen=True)
-class Wanted:
+class FieldNeeds:
     """What a field is opened for.
 
     Attributes:
@@ -77,45 +77,49 @@ class Wanted:
 
 
 @contextmanager
-def beside(output: str | None) -> Iterator[Parts]:
+def store_beside(output: str | None) -> Iterator[BlockStore]:
     """Where blocks are kept: beside the output, so that the same command goes on there after it was ended.
 
     They are removed where the same command would end the same way.
     """
     if output is None or output == STDOUT:
         with tempfile.TemporaryDirectory(prefix="vvgt-") as folder:
-            yield Parts(Path(folder) / "blocks")
+            yield BlockStore(Path(folder) / "blocks")
         return
     target = Path(output).absolute()
-    parts = Parts(target.with_name(f".{target.name[:80]}.blocks"))
+    store = BlockStore(target.with_name(f".{target.name[:80]}.blocks"))
     try:
-        yield parts
+        yield store
     except (UsageError, Unsuitable):
-        parts.remove()
+        store.remove()
         raise
 
 
 @contextmanager
-def blocked(run: Run, request: SourceRequest, options: BlockOptions, parts: Parts, wanted: Wanted) -> Iterator[Blocked]:
+def blocked(
+    run: Run, request: SourceRequest, options: BlockOptions, store: BlockStore, wanted: FieldNeeds
+) -> Iterator[Blocked]:
     """A field in blocks; its workers end with the context, its parts stay.
 
     Raises:
         DataError, UsageError: as `vvgt_cli.field.source.load`; a pipe, or compressed values that can be read front to
             back only.
-        Later: other shards' blocks are missing.
+        MissingBlocks: other shards' blocks are missing.
     """
     request, told = _settled(request, options, wanted.size)
     if told:
         run.console.say(told)
     settings = _settings(request, wanted)
-    edge = parts.kept_edge(settings) if options.size is None else options.size
+    edge = store.kept_edge(settings) if options.size is None else options.size
     edge = edge or _edge(request, options)
     with _runner(options) as runner:
-        do = Pass(runner, parts, run.console.bar, options.shard)
-        if parts.open({**settings, "blocks": edge}, ours=options.shard is None):
-            run.console.say(f"going on with the blocks in {parts.folder}")
+        run_pass = Pass(runner, store, run.console.bar, options.shard)
+        if store.open({**settings, "blocks": edge}, ours=options.shard is None):
+            run.console.say(f"going on with the blocks in {store.folder}")
         run.compile(COUNT_WHOLE + COUNT_REAL)
-        access = Counted(parts, edge, lambda task: do(task, "count"), wanted.values or needs_histogram(request))
+        access = BlockAccess(
+            store, edge, lambda task: run_pass(task, "count"), wanted.values or needs_histogram(request)
+        )
         with run.stage("read") as stage:
             source = load(request, access)
             reader, visible = _reader(source, access)
@@ -128,7 +132,7 @@ def blocked(run: Run, request: SourceRequest, options: BlockOptions, parts: Part
                 other = replace(other, statistics=access.statistics(other.volume))
             return other, *_reader(other, access)
 
-        yield Blocked(source, reader, do, edge, visible, key, look)
+        yield Blocked(source, reader, run_pass, edge, visible, key, look)
 
 
 def _edge(request: SourceRequest, options: BlockOptions) -> int:
@@ -136,8 +140,8 @@ def _edge(request: SourceRequest, options: BlockOptions) -> int:
     given, layered = request.volume, request.labels not in (None, NONE) or bool(request.layers)
     if isinstance(given, str):
         read = replace(request.read, stored=True, packed=True)
-        content = open_parts(given, read)
-        volume, layered = content.volumes[0], layered or not content.one_field
+        content = open_content(given, read)
+        volume, layered = content.volumes[0], layered or not content.single_volume
         layered |= request.tf is None and (holds_table(content.path) or named_so(volume))
     else:
         volume = content_of(given).volumes[0]
@@ -168,7 +172,7 @@ def _absolute(path: str) -> str:
     return path if scheme else str(Path(path).absolute())
 
 
-def _reader(source: Source, access: Counted) -> tuple[Reader, float]:
+def _reader(source: Source, access: BlockAccess) -> tuple[Reader, float]:
     """What reads boxes of a source, and about how many of its voxels are visible."""
     from vvgt_cli.closed_form.samples import estimate, visible_share
     from vvgt_cli.dvr.scene import kernel_rule
@@ -265,7 +269,7 @@ def better_in_blocks(request: SourceRequest) -> bool:
     if not packed and size < HELD and (free is None or size <= LARGE * free):
         return False
     try:
-        content = open_parts(path, replace(request.read, stored=True, packed=True))
+        content = open_content(path, replace(request.read, stored=True, packed=True))
     except SeveralComponents:  # to be chosen: said where it is read
         return False
     volumes = content.volumes
@@ -295,13 +299,13 @@ def needs_histogram(request: SourceRequest) -> bool:
 def _runner(options: BlockOptions) -> Runner:
     threads = int(os.environ.get("NUMBA_NUM_THREADS", "1"))
     if options.scheduler is not None:
-        from vvgt_cli.field.dask_runner import Dask
+        from vvgt_cli.field.dask_runner import DaskRunner
 
-        return Dask(options.scheduler, options.workers, threads)
-    return Processes(options.workers, threads) if options.workers > 1 else Here()
+        return DaskRunner(options.scheduler, options.workers, threads)
+    return Processes(options.workers, threads) if options.workers > 1 else InProcess()
 
 
-def _settings(request: SourceRequest, wanted: Wanted) -> dict[str, Any]:
+def _settings(request: SourceRequest, wanted: FieldNeeds) -> dict[str, Any]:
     """All that parts depend on."""
     tf = request.tf
     text = Path(tf).read_text("utf-8", "replace") if isinstance(tf, str) and os.path.isfile(tf) else repr(tf)

@@ -20,9 +20,9 @@ from vvgt_cli.dvr.layout import Light
 from vvgt_cli.dvr.render import Box as Frame
 from vvgt_cli.dvr.render import camera_arrays
 from vvgt_cli.errors import DataError
+from vvgt_cli.field.block_store import BlockStore
 from vvgt_cli.field.digests import digest
 from vvgt_cli.field.grid import Boxes, piece_edge
-from vvgt_cli.field.parts import Parts
 from vvgt_cli.field.reader import Box
 from vvgt_cli.files import atomic_write
 from vvgt_cli.volume.stored import give_back
@@ -65,7 +65,7 @@ class RayFile:
     kind: str
 
     @classmethod
-    def of(cls, bundles: Sequence[Bundle], frame: Frame, blocks: Boxes, parts: Parts) -> RayFile:
+    def of(cls, bundles: Sequence[Bundle], frame: Frame, blocks: Boxes, store: BlockStore) -> RayFile:
         """Write them; ``frame`` is the volume's, which is cut into ``blocks``.
 
         Raises:
@@ -79,13 +79,13 @@ class RayFile:
             arrays[f"pixels{k}"] = bundle.pixels.astype(np.int32)
             arrays[f"offsets{k}"] = bundle.offsets
         name = f"rays-{digest(blocks, *arrays.values())[:16]}"
-        path = parts.folder / f"{name}.npz"
+        path = store.folder / f"{name}.npz"
         if not path.is_file():
             with atomic_write(path, overwrite=True) as temporary, open(temporary, "wb") as stream:
                 np.savez(stream, allow_pickle=False, **arrays)
         return cls(str(path), name)
 
-    def bundles(self) -> list[Cast]:
+    def bundles(self) -> list[KernelBundle]:
         """As kernels take them, read once a process.
 
         Raises:
@@ -94,7 +94,7 @@ class RayFile:
         return _read(self.path)
 
 
-class Cast(NamedTuple):
+class KernelBundle(NamedTuple):
     """A `Bundle` as kernels take it."""
 
     eye: np.ndarray
@@ -106,7 +106,7 @@ class Cast(NamedTuple):
 
 
 @lru_cache(maxsize=2)
-def _read(path: str) -> list[Cast]:
+def _read(path: str) -> list[KernelBundle]:
     try:
         with np.load(path) as found:
             out = []
@@ -114,7 +114,9 @@ def _read(path: str) -> list[Cast]:
                 numbers = found[f"camera{k}"]
                 pixels = np.ascontiguousarray(found[f"pixels{k}"], np.int64)
                 basis = np.ascontiguousarray(numbers[3:12].reshape(3, 3))
-                out.append(Cast(numbers[:3], basis, numbers[12:16], float(numbers[16]), pixels, found[f"offsets{k}"]))
+                out.append(
+                    KernelBundle(numbers[:3], basis, numbers[12:16], float(numbers[16]), pixels, found[f"offsets{k}"])
+                )
             return out
     except Exception as error:  # whatever zipfile and numpy raise
         raise DataError(f"{path}: cannot be read ({error}); run the same command again") from error
@@ -126,7 +128,7 @@ def pieces_of(dims: tuple[int, int, int]) -> Boxes:
     return Boxes(dims, (edge, edge, edge))
 
 
-def leave_rays(rays: RayFile, block: Box, number: int, blocks: Boxes, light: Light | None, parts: Parts) -> None:
+def save_rays(rays: RayFile, block: Box, number: int, blocks: Boxes, light: Light | None, store: BlockStore) -> None:
     """Cast all rays through the pieces of block ``number``, and leave what they show.
 
     Args:
@@ -145,9 +147,9 @@ def leave_rays(rays: RayFile, block: Box, number: int, blocks: Boxes, light: Lig
         for k, seen in _piece_rays(rays, block.part(first - halo, last + halo), first, last, blocks.dims, light):
             table.append((piece, k, len(seen)))
             found.append(seen)
-    with atomic_write(parts.path(kind, number, SUFFIX), overwrite=True) as temporary, open(temporary, "wb") as stream:
+    with atomic_write(store.path(kind, number, SUFFIX), overwrite=True) as temporary, open(temporary, "wb") as stream:
         np.save(stream, np.concatenate(found) if found else np.empty(0, RAY))
-    parts.save(kind, number, table=np.array(table, np.int64).reshape(-1, 3))
+    store.save(kind, number, table=np.array(table, np.int64).reshape(-1, 3))
 
 
 def _within(boxes: Boxes, lo: np.ndarray, hi: np.ndarray) -> Iterator[int]:
@@ -203,7 +205,7 @@ def _caster(box: Box, empty: np.ndarray, light: Light | None) -> Callable[..., N
     return partial(segments.cast_lit_grid_segments, texels, box.voxels, empty, light)
 
 
-def meeting(cast: Cast, lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
+def meeting(cast: KernelBundle, lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
     """Places (n,) int64, ascending, of the pixels of a bundle that may meet the box from ``lo`` to ``hi`` (3,), voxels.
 
     Those within the rectangle around the picture of the box's corners; all, where a corner is not in front of the eye.
@@ -220,7 +222,9 @@ def meeting(cast: Cast, lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
     return result
 
 
-def composed(rays: RayFile, parts: Parts, numbers: Sequence[int], dims: tuple[int, int, int]) -> Generator[np.ndarray]:
+def composed(
+    rays: RayFile, store: BlockStore, numbers: Sequence[int], dims: tuple[int, int, int]
+) -> Generator[np.ndarray]:
     """What whole rays see, (n, m, 4) float64 premultiplied, bundle by bundle, from what blocks ``numbers`` have left.
 
     Raises:
@@ -230,9 +234,9 @@ def composed(rays: RayFile, parts: Parts, numbers: Sequence[int], dims: tuple[in
     shown: list[dict[int, tuple[int, slice]]] = [{} for _ in bundles]
     held: dict[int, np.ndarray] = {}
     for number in numbers:
-        path = parts.path(kind, number, SUFFIX)
+        path = store.path(kind, number, SUFFIX)
         offset = 0
-        for piece, k, count in parts.load(kind, number)["table"].tolist():
+        for piece, k, count in store.load(kind, number)["table"].tolist():
             shown[k][piece] = number, slice(offset, offset + count)
             offset += count
         if offset:

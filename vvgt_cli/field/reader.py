@@ -12,7 +12,7 @@ import numpy as np
 from vvgt_cli.dvr.layers import Layer, grid_box
 from vvgt_cli.dvr.layout import Texels, Voxels
 from vvgt_cli.dvr.scene import KernelRule
-from vvgt_cli.field.layered import Content, content_of, open_parts
+from vvgt_cli.field.layered import Content, content_of, open_content
 from vvgt_cli.look.tables import Optics
 from vvgt_cli.volume import ReadOptions, Volume
 from vvgt_cli.volume.stored import read_block
@@ -28,7 +28,7 @@ class Place:
     """Where a volume comes from.
 
     Attributes:
-        source, read: as `open_parts` takes them; or a volume that is in memory.
+        source, read: as `open_content` takes them; or a volume that is in memory.
         component: number of it in the file's content, or `CLASSIFIED`.
     """
 
@@ -44,7 +44,7 @@ class Place:
 
 @lru_cache(maxsize=OPEN)
 def _opened(source: str, read: ReadOptions) -> Content:
-    return open_parts(source, read)
+    return open_content(source, read)
 
 
 @dataclass(frozen=True)

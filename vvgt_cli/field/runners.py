@@ -55,7 +55,7 @@ class Alone:
     def __exit__(self, *error: object) -> None: ...
 
 
-class Here(Alone):
+class InProcess(Alone):
     """One block after the other, in this process."""
 
     workers = 1

@@ -162,7 +162,7 @@ class Source:
         """Whether all of it is labels."""
         return all(isinstance(layer.tf, LabelTable) for layer in self.layers)
 
-    def one_field(self) -> None:
+    def require_scalar_field(self) -> None:
         """Refuse an optics grid.
 
         Raises:
@@ -174,7 +174,7 @@ class Source:
                 "field (--labels none takes numbers as values)"
             )
 
-    def shown_by(self, tf: TransferFunction) -> Source:
+    def with_function(self, tf: TransferFunction) -> Source:
         """The same volume under another function on data values, unlit.
 
         Raises:
@@ -182,12 +182,12 @@ class Source:
         """
         from vvgt_cli.look import unit_distance
 
-        self.one_field()
+        self.require_scalar_field()
         distance, label = unit_distance(None, self.volume, tf)
         layer = replace(self.layers[0], tf=tf, unit_distance=distance, unit_label=label)
         return replace(self, layers=(layer,), lighting=None)
 
-    def labelled_by(self, tables: Sequence[LabelTable]) -> Source:
+    def with_tables(self, tables: Sequence[LabelTable]) -> Source:
         """The same label maps under other tables, one a layer, opacity per `UNIT_SHARE` of the longest edge; unlit.
 
         Raises:

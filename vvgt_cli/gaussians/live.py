@@ -21,7 +21,7 @@ import numpy as np
 
 from vvgt_cli.gaussians.constants import MIN_ALPHA
 from vvgt_cli.gaussians.frames import factored, rotations
-from vvgt_cli.gaussians.live_facts import GRADIENT, NUMBER, ROW
+from vvgt_cli.gaussians.live_facts import GRADIENT, LABEL_ROW, LAYER_NUMBER
 from vvgt_cli.gaussians.opacity import mean_opacity, projected_areas
 from vvgt_cli.gaussians.types import Gaussians
 from vvgt_cli.look.function import TransferFunctionLike
@@ -118,12 +118,12 @@ class Palette:
 
     def of(self, live: np.ndarray) -> np.ndarray:
         """(K, 6) `sums` of what Gaussians carry."""
-        found: np.ndarray = self.sums[live[:, ROW].astype(np.int64)]
+        found: np.ndarray = self.sums[live[:, LABEL_ROW].astype(np.int64)]
         return found
 
 
 @dataclass(frozen=True)
-class Several:
+class LayerTables:
     """Of several layers the table of each, by its number."""
 
     tables: tuple[Table | Palette, ...]
@@ -132,12 +132,12 @@ class Several:
         """(K, 6) `sums` of what Gaussians carry."""
         found = np.zeros((len(live), 6))
         for number, table in enumerate(self.tables):
-            own = np.flatnonzero(live[:, NUMBER] == number)
+            own = np.flatnonzero(live[:, LAYER_NUMBER] == number)
             found[own] = table.of(live[own])
         return found
 
 
-Looks = Table | Palette | Several
+Looks = Table | Palette | LayerTables
 
 
 def law_nodes() -> np.ndarray:
@@ -173,7 +173,7 @@ def lengths(mass: np.ndarray, tau: np.ndarray, most: np.ndarray) -> np.ndarray:
 def baked(gaussians: Gaussians, table: Looks, pixel: float = 0.0) -> Gaussians:
     """Gaussians that carry values, with the colours and opacities of a function, where they are: for other viewers.
 
-    ``pixel``: as for `shown_by`.
+    ``pixel``: as for `apply_look`.
     """
     assert gaussians.live is not None
     sums = table.of(gaussians.live)
@@ -183,7 +183,7 @@ def baked(gaussians: Gaussians, table: Looks, pixel: float = 0.0) -> Gaussians:
     return replace(gaussians, opacity_logits=logits, colors=colors, harmonics=None)
 
 
-def seen_under(gaussians: Gaussians, table: Looks, pixel: float = 0.0) -> np.ndarray:
+def visible_under(gaussians: Gaussians, table: Looks, pixel: float = 0.0) -> np.ndarray:
     """Numbers of those that a function may show, ascending: all but some that nobody sees."""
     assert gaussians.live is not None
     least = np.exp(2 * gaussians.log_scales.astype(np.float64)) * THINNEST**2 * SHARP
@@ -191,7 +191,7 @@ def seen_under(gaussians: Gaussians, table: Looks, pixel: float = 0.0) -> np.nda
     return np.flatnonzero(mass > CLEAR * projected_areas(least, pixel).min(axis=1))
 
 
-def shown_by(gaussians: Gaussians, table: Looks, pixel: float = 0.0) -> Gaussians:
+def apply_look(gaussians: Gaussians, table: Looks, pixel: float = 0.0) -> Gaussians:
     """An ordinary cloud, unlit: what Gaussians that carry values are under a function, all of them.
 
     ``pixel``: a pixel's width at the volume's centre, unit frame, of the screen that they are made for.

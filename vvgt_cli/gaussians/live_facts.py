@@ -19,7 +19,11 @@ from vvgt_cli.volume import Statistics, Volume
 from vvgt_cli.volume.stats import BINS, edges_of
 
 COLUMNS, NORMAL, LABEL, LAYER = ("value", "spread", "length"), ("nx", "ny", "nz"), "label", "layer"
-CARRIED, ROW, NUMBER = slice(0, 3), 6, 7  # of what Gaussians carry: own columns, row of a label, number of a layer
+VALUE_COLUMNS, LABEL_ROW, LAYER_NUMBER = (
+    slice(0, 3),
+    6,
+    7,
+)  # of what Gaussians carry: own columns, row of a label, number of a layer
 GRADIENT = slice(3, 6)  # of what Gaussians carry: in the columns of normals
 SAMPLED = 64  # nodes of a function that the header has no other way of holding
 MOST_LABELS = 500  # that a header has room for

@@ -15,7 +15,17 @@ from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import seekable
 from vvgt_cli.gaussians.frames import rescale, turn, up_matrix
 from vvgt_cli.gaussians.header import REQUIRED, FileFacts, PlyHeader, comment_lines, parse_header, rest_names
-from vvgt_cli.gaussians.live_facts import CARRIED, COLUMNS, GRADIENT, LABEL, LAYER, NORMAL, NUMBER, ROW, LiveFacts
+from vvgt_cli.gaussians.live_facts import (
+    COLUMNS,
+    GRADIENT,
+    LABEL,
+    LABEL_ROW,
+    LAYER,
+    LAYER_NUMBER,
+    NORMAL,
+    VALUE_COLUMNS,
+    LiveFacts,
+)
 from vvgt_cli.gaussians.types import HARMONICS, SH_C0, Gaussians
 from vvgt_cli.volume.space import axis_facts
 
@@ -140,7 +150,7 @@ def ply_rows(gaussians: Gaussians, options: PlyOptions, normals: np.ndarray | No
     rows[:, end - 7 : end - 4] = placed.log_scales
     rows[:, end - 4 : end] = placed.quaternions
     if placed.live is not None:
-        rows[:, 3:6], rows[:, end:] = placed.live[:, GRADIENT], placed.live[:, CARRIED]
+        rows[:, 3:6], rows[:, end:] = placed.live[:, GRADIENT], placed.live[:, VALUE_COLUMNS]
         if options.live is not None:
             return _with_numbers(rows, placed.live, options.live)
     return rows
@@ -165,9 +175,9 @@ def _numbers(facts: LiveFacts) -> list[tuple[str, str, str, int]]:
     """
     labels, found = facts.most_labels, []
     if labels:
-        found.append((LABEL, *(("uchar", "u1") if labels <= 256 else ("ushort", "<u2")), ROW))
+        found.append((LABEL, *(("uchar", "u1") if labels <= 256 else ("ushort", "<u2")), LABEL_ROW))
     if facts.others:
-        found.append((LAYER, "uchar", "u1", NUMBER))
+        found.append((LAYER, "uchar", "u1", LAYER_NUMBER))
     return found
 
 
@@ -277,15 +287,15 @@ def _values(header: PlyHeader, columns: Callable[..., np.ndarray]) -> np.ndarray
     facts, numbers = header.live, _numbers(header.live)
     found = columns(*COLUMNS, *NORMAL, *(name for name, *_ in numbers))
     if facts.others and not facts.most_labels:
-        found = np.insert(found, ROW, 0, axis=1)
-    layer = found[:, NUMBER].astype(np.int64) if facts.others else np.zeros(len(found), np.int64)
+        found = np.insert(found, LABEL_ROW, 0, axis=1)
+    layer = found[:, LAYER_NUMBER].astype(np.int64) if facts.others else np.zeros(len(found), np.int64)
     if layer.max(initial=0) >= len(facts.layers):
         raise DataError(f"a layer of number {layer.max()}; expected fewer than {len(facts.layers)}")
     if facts.most_labels:
         most = np.array([len(one.labels) or 1 for one in facts.layers])[layer]
-        wrong = np.flatnonzero(found[:, ROW] >= most)
+        wrong = np.flatnonzero(found[:, LABEL_ROW] >= most)
         if len(wrong):
-            raise DataError(f"a label of row {found[wrong[0], ROW]:g}; expected fewer than {most[wrong[0]]}")
+            raise DataError(f"a label of row {found[wrong[0], LABEL_ROW]:g}; expected fewer than {most[wrong[0]]}")
     if (found[:, 1] < 0).any() or (found[:, 2] <= 0).any():
         raise DataError("spreads below 0, or lengths that are not above it; expected the columns that vvgt writes")
     return found
@@ -317,14 +327,14 @@ def live_summary(gaussians: Gaussians, facts: LiveFacts) -> dict[str, object]:
     if facts.others:
         told_of: list[dict[str, object]] = []
         for k, layer in enumerate(facts.layers):
-            own = gaussians.take(np.flatnonzero(gaussians.live[:, NUMBER] == k))
+            own = gaussians.take(np.flatnonzero(gaussians.live[:, LAYER_NUMBER] == k))
             told = {"labels": len(layer.labels)} if layer.labels else {
                 "values": [layer.lo, layer.hi], "function": layer.baked().get("name", ""),
             }  # fmt: skip
             told_of.append({"layer": k, "name": layer.name, "gaussians": len(own), **told})
         return {"live_layers": told_of}
     if facts.labels:
-        counts = np.bincount(gaussians.live[:, ROW].astype(np.int64), minlength=len(facts.labels)).tolist()
+        counts = np.bincount(gaussians.live[:, LABEL_ROW].astype(np.int64), minlength=len(facts.labels)).tolist()
         rows = zip(facts.labels, counts, strict=True)
         return {"live_labels": [{"label": e.number, "name": e.name, "gaussians": n} for e, n in rows]}
     found: dict[str, object] = {"live_values": [facts.lo, facts.hi], "live_unit": facts.unit or "none"}

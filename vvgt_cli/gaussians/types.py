@@ -87,7 +87,7 @@ class Gaussians:
         return replace(self, harmonics=terms if degree else None)
 
 
-def together(parts: list[Gaussians]) -> Gaussians:
+def concatenate(parts: list[Gaussians]) -> Gaussians:
     """One set of several, of one degree, in their order."""
     fields = parts[0].arrays()
     return Gaussians(**{field: np.concatenate([getattr(part, field) for part in parts]) for field in fields})

@@ -14,7 +14,7 @@ from vvgt_cli.errors import DataError
 from vvgt_cli.files import seekable
 from vvgt_cli.gaussians import Gaussians, PlyHeader, PlyOptions, read_ply
 from vvgt_cli.gaussians.formats import gltf, gsply_files, page_file, page_live, sog, splat, usd
-from vvgt_cli.gaussians.formats.levels import Levels, split_name
+from vvgt_cli.gaussians.formats.levels import StreamedLevels, split_name
 from vvgt_cli.gaussians.formats.splats import Splats, columns_of, gaussians_of, splats_of
 from vvgt_cli.gaussians.header import parse_header
 from vvgt_cli.gaussians.ply import check_size
@@ -129,7 +129,7 @@ def read_columns(path: str | Path) -> Splats:
     """
     streamed = split_name(path)
     if streamed is not None:
-        return Levels(streamed[0]).level(streamed[1])
+        return StreamedLevels(streamed[0]).level(streamed[1])
     known = format_of(path) or _compressed(path)
     place, name = seekable(path), str(path)
     if known is not None:

@@ -44,7 +44,7 @@ def by_view(name: str | Path) -> Path | None:
 
 
 @dataclass
-class Levels:
+class StreamedLevels:
     """What a manifest has.
 
     Attributes:

@@ -36,7 +36,7 @@ from vvgt_cli.gaussians.live import (
     VALUE,
     WIDEST,
 )
-from vvgt_cli.gaussians.live_facts import GRADIENT, NUMBER, ROW, LiveFacts
+from vvgt_cli.gaussians.live_facts import GRADIENT, LABEL_ROW, LAYER_NUMBER, LiveFacts
 from vvgt_cli.gaussians.types import Gaussians
 
 BYTES = 8
@@ -50,7 +50,7 @@ def live_bytes(gaussians: Gaussians, facts: LiveFacts, logs: tuple[float, float]
     assert gaussians.live is not None
     live = gaussians.live.astype(np.float64)
     first, last = logs or log_lengths([gaussians])
-    number = live[:, NUMBER] if facts.others else np.zeros(len(live))
+    number = live[:, LAYER_NUMBER] if facts.others else np.zeros(len(live))
     lo, width = (np.array(ends)[number.astype(np.int64)] for ends in _ranges(facts.layers))
     out = np.zeros((len(live), BYTES), np.uint8)
     out[:, 0] = _byte((live[:, VALUE] - lo) / width)
@@ -58,7 +58,7 @@ def live_bytes(gaussians: Gaussians, facts: LiveFacts, logs: tuple[float, float]
     out[:, 2] = _byte((np.log(live[:, LENGTH]) - first) / ((last - first) or 1.0))
     out[:, 4:7] = np.rint(128 + 127 * live[:, GRADIENT].clip(-1, 1))
     row = np.array(_first_rows(facts.layers))[number.astype(np.int64)]
-    row += live[:, ROW].astype(np.int64) if facts.most_labels else 0
+    row += live[:, LABEL_ROW].astype(np.int64) if facts.most_labels else 0
     out[:, 3], out[:, 7] = row & 255, row >> 8
     return out
 

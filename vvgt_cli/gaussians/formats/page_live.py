@@ -19,7 +19,7 @@ from vvgt_cli.gaussians.formats.page_file import html_of_several, title_of, upri
 from vvgt_cli.gaussians.formats.splats import Splats, morton_order, splats_of
 from vvgt_cli.gaussians.frames import turn, up_matrix
 from vvgt_cli.gaussians.live import law_nodes
-from vvgt_cli.gaussians.live_facts import NUMBER, ROW, LiveFacts
+from vvgt_cli.gaussians.live_facts import LABEL_ROW, LAYER_NUMBER, LiveFacts
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.lighting import MOST, Lighting
 from vvgt_cli.look.readers.minimal import read
@@ -42,12 +42,12 @@ def live_html(gaussians: Gaussians, options: PlyOptions, name: str) -> bytes:
 
 
 def live_html_of_several(clouds: Sequence[tuple[str, Gaussians, PlyOptions]], name: str) -> bytes:
-    """The page of several that are shown under one function, each by its name; `in_common` says whether they can be.
+    """The page of several that are shown under one function, each by its name; `shared_facts` says whether they can be.
 
     Raises:
         DataError, UsageError: as `live_html`.
     """
-    shown, planes, facts = live_parts([(gaussians, options) for _, gaussians, options in clouds])
+    shown, planes, facts = live_page_data([(gaussians, options) for _, gaussians, options in clouds])
     light = clouds[0][2].light
     if light is not None and light.headlight + len(light.directions) > 1:
         warnings.warn(f"{name}: its page has one light at a time; it begins with the first", stacklevel=2)
@@ -63,7 +63,7 @@ def page_of_several(clouds: Sequence[tuple[str, Gaussians, PlyOptions]], name: s
     Raises:
         DataError, UsageError: as `live_html`.
     """
-    if in_common([None if gaussians.live is None else options.live for _, gaussians, options in clouds]):
+    if shared_facts([None if gaussians.live is None else options.live for _, gaussians, options in clouds]):
         return live_html_of_several(clouds, name)
     baked = [
         (cloud, splats_of(replace(gaussians, live=None), replace(upright(options), live=None)))
@@ -72,7 +72,7 @@ def page_of_several(clouds: Sequence[tuple[str, Gaussians, PlyOptions]], name: s
     return html_of_several(baked, name)
 
 
-def in_common(facts: Sequence[LiveFacts | None]) -> LiveFacts | None:
+def shared_facts(facts: Sequence[LiveFacts | None]) -> LiveFacts | None:
     """What files say of the values that their Gaussians carry, as one page has it; None where none can show all.
 
     They have as many layers each, whose values are of one range under one function. Label maps have the labels of all:
@@ -81,13 +81,13 @@ def in_common(facts: Sequence[LiveFacts | None]) -> LiveFacts | None:
     known = [one.layers for one in facts if one is not None]
     if len(known) < len(facts) or len({len(layers) for layers in known}) > 1:
         return None
-    first, *others = [_layer_in_common(same) for same in zip(*known, strict=True)]
+    first, *others = [_shared_layer(same) for same in zip(*known, strict=True)]
     if first is None or None in others:
         return None
     return replace(first, others=tuple(one for one in others if one is not None))
 
 
-def _layer_in_common(facts: Sequence[LiveFacts]) -> LiveFacts | None:
+def _shared_layer(facts: Sequence[LiveFacts]) -> LiveFacts | None:
     """The same of one layer."""
     first = facts[0]
     if all(one.labels for one in facts):
@@ -97,7 +97,7 @@ def _layer_in_common(facts: Sequence[LiveFacts]) -> LiveFacts | None:
     return first if len(looks) == 1 else None
 
 
-def live_parts(
+def live_page_data(
     clouds: Sequence[tuple[Gaussians, PlyOptions]],
 ) -> tuple[list[Splats], list[bytes], dict[str, Any]]:
     """What a page of Gaussians (unit frame) that carry values is made of, of one cloud or several.
@@ -109,7 +109,7 @@ def live_parts(
     Raises:
         DataError, UsageError: as `live_html`.
     """
-    facts = in_common([options.live for _, options in clouds])
+    facts = shared_facts([options.live for _, options in clouds])
     assert facts is not None
     ordered, splats = [], []
     for gaussians, options in clouds:
@@ -132,9 +132,9 @@ def renumbered(gaussians: Gaussians, own: LiveFacts, facts: LiveFacts) -> Gaussi
     for number, (one, all_) in enumerate(zip(own.layers, facts.layers, strict=True)):
         if one.labels != all_.labels:
             rows = {(label.number, label.name): row for row, label in enumerate(all_.labels)}
-            mine = live[:, NUMBER] == number if facts.others else np.full(len(live), True)
+            mine = live[:, LAYER_NUMBER] == number if facts.others else np.full(len(live), True)
             to = np.array([rows[label.number, label.name] for label in one.labels])
-            live[mine, ROW] = to[live[mine, ROW].astype(np.int64)]
+            live[mine, LABEL_ROW] = to[live[mine, LABEL_ROW].astype(np.int64)]
     return replace(gaussians, live=live)
 
 
@@ -175,7 +175,7 @@ def _light(lighting: Lighting | None, axes: np.ndarray) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def light_sent(sent: Any, options: PlyOptions) -> Lighting | None:
+def parse_light(sent: Any, options: PlyOptions) -> Lighting | None:
     """The light that a page of a file laid out so sends: what `_light` says, changed.
 
     Raises:

@@ -21,7 +21,7 @@ ROW = MOMENTS * 8 + 3  # bytes a cell: moments float64, place in its tile uint8
 
 
 @dataclass(frozen=True)
-class Parts:
+class BlockStore:
     """A folder of parts.
 
     Attributes:

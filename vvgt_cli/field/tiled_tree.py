@@ -28,9 +28,9 @@ from vvgt_cli.closed_form.tree import (
 from vvgt_cli.closed_form.visibility import Visibility
 from vvgt_cli.dvr.layout import Light
 from vvgt_cli.errors import DataError
+from vvgt_cli.field.block_store import CELLS, BlockStore
 from vvgt_cli.field.cells import NORMALS, read_rows
 from vvgt_cli.field.grid import CellGrid
-from vvgt_cli.field.parts import CELLS, Parts
 
 FRACTION_BITS = 9  # of a score that a bin of the histogram tells apart, below its exponent
 BINS = 1 << 16
@@ -72,7 +72,7 @@ class Coarse:
     tiles: list[Tile]
 
 
-def gather(parts: Parts, grid: CellGrid) -> Coarse:
+def gather(store: BlockStore, grid: CellGrid) -> Coarse:
     """Put the summaries of all blocks together.
 
     Raises:
@@ -82,7 +82,7 @@ def gather(parts: Parts, grid: CellGrid) -> Coarse:
     mass, field, deepest = np.zeros(march[::-1]), np.zeros(fine[::-1], np.float32), 0.0
     tiles = []
     for number in range(len(grid.blocks)):
-        part = parts.load(CELLS, number)
+        part = store.load(CELLS, number)
         deepest = max(deepest, float(part["deepest"]))
         offset = 0
         for place, count, one, other in zip(
@@ -103,7 +103,7 @@ def _lay(grid: np.ndarray, part: np.ndarray, place: list[int]) -> None:
     target[:] = part[: target.shape[0], : target.shape[1], : target.shape[2]]
 
 
-class Forest:
+class TiledTree:
     """Trees of tiles; see the module. Where there is light, leaves have the means of `lit.shaded` after their moments.
 
     Attributes:
@@ -113,9 +113,15 @@ class Forest:
     """
 
     def __init__(
-        self, parts: Parts, grid: CellGrid, seen: Visibility, coarse: Coarse, scratch: Path, light: Light | None = None
+        self,
+        store: BlockStore,
+        grid: CellGrid,
+        seen: Visibility,
+        coarse: Coarse,
+        scratch: Path,
+        light: Light | None = None,
     ) -> None:
-        self._parts, self._grid, self._seen, self._scratch, self._light = parts, grid, seen, scratch, light
+        self._store, self._grid, self._seen, self._scratch, self._light = store, grid, seen, scratch, light
         self._levels = None if len(coarse.tiles) == 1 else grid.bits
         self.tiles: list[Tile] = []
         self._sizes: list[tuple[int, int]] = []  # cells and base cells of each tree
@@ -157,7 +163,7 @@ class Forest:
         return build_tree(self._cells(tile), self._seen, np.array(self._grid.step), self._levels)
 
     def _cells(self, tile: Tile) -> Cells:
-        moments, local = read_rows(self._parts, tile.block, tile.offset, tile.cells)
+        moments, local = read_rows(self._store, tile.block, tile.offset, tile.cells)
         index = local + np.array(tile.place, np.int32) * self._grid.tile_cells
         return Cells(index, moments, self._grid.cell_edge, np.array(self._grid.exponent, np.int64))
 
@@ -167,7 +173,7 @@ class Forest:
         Raises:
             DataError: the file is not whole.
         """
-        path = self._parts.path(CELLS, tile.block, NORMALS)
+        path = self._store.path(CELLS, tile.block, NORMALS)
         try:
             whole = np.load(path, mmap_mode="r")[tile.offset : tile.offset + tile.cells]
         except (OSError, ValueError) as error:
@@ -288,9 +294,9 @@ def batches(leaves: Iterator[Leaves], size: int) -> Iterator[Leaves]:
         yield joined(waiting)
 
 
-def joined(parts: Sequence[Leaves]) -> Leaves:
+def joined(store: Sequence[Leaves]) -> Leaves:
     """The cells of all parts."""
-    return Leaves(*(np.concatenate([getattr(part, field) for part in parts]) for field in FIELDS))
+    return Leaves(*(np.concatenate([getattr(part, field) for part in store]) for field in FIELDS))
 
 
 def _bins(scores: np.ndarray) -> np.ndarray:
