@@ -41,7 +41,7 @@ def test_opacity_is_per_a_share_of_the_longest_edge(tmp_path: Path) -> None:
 
 def test_a_volume_of_one_value_is_a_box_and_that_is_said(tmp_path: Path) -> None:
     np.save(tmp_path / "zero.npy", np.zeros((4, 4, 4), np.uint8))
-    with pytest.warns(UserWarning, match=r"zero: every voxel is 0, so that only the box is seen; check --dtype"):
+    with pytest.warns(UserWarning, match=r"zero: every voxel is 0, so only the box is visible; check --dtype"):
         source = load(SourceRequest(str(tmp_path / "zero.npy")))
     assert 0 < source.tf.opacity(np.zeros(1))[0] < 0.05
 

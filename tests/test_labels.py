@@ -174,7 +174,7 @@ def test_of_several_layers_one_may_be_hidden(vvgt, tmp_path: Path, seg: Path) ->
 
 
 def test_a_recognised_label_map_is_said_and_none_takes_it_back(vvgt, tmp_path: Path, seg: Path) -> None:
-    with pytest.warns(UserWarning, match="balls_seg: taken as a label map, by its name"):
+    with pytest.warns(UserWarning, match="balls_seg: read as a label map because of its name"):
         done = vvgt("init", seg, *SMALL[:4], "-o", tmp_path / "a.ply")
     assert "distinct colours" in done.err
     plain = vvgt("init", seg, "--labels", "none", *SMALL[:4], "-o", tmp_path / "b.ply")
@@ -236,7 +236,7 @@ def test_extinctions_of_labels_add_up_to_the_whole() -> None:
         (balls(), SLICER.replace("3 inner_core", "4 other"), "have no entry in t.ctbl: 3; add them"),
         (balls(), "9 other 1 2 3 255\n", "none of its labels (1, 3) is in t.ctbl, which has 9"),
         (balls() * 0, SLICER, "none of its labels (only 0)"),
-        (balls() / 2, SLICER, "expected a label map, of whole numbers"),
+        (balls() / 2, SLICER, "expected integers, as in a label map"),
     ],
 )
 def test_labels_that_do_not_fit_are_one_line(vvgt, tmp_path: Path, values, text: str, said: str) -> None:
@@ -260,7 +260,8 @@ def test_calls_that_contradict(vvgt, tmp_path: Path, seg: Path) -> None:
         assert said in done.error
     np.save(tmp_path / "empty_seg.npy", balls() * 0)
     assert (
-        "no label but 0" in vvgt("init", tmp_path / "empty_seg.npy", "--labels", "auto", "-o", tmp_path / "a.ply").error
+        "no label other than 0"
+        in vvgt("init", tmp_path / "empty_seg.npy", "--labels", "auto", "-o", tmp_path / "a.ply").error
     )
 
 

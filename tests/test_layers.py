@@ -183,7 +183,7 @@ def test_colours_by_command(vvgt, tmp_path: Path) -> None:
     one = vvgt("init", tmp_path / "a.nrrd", "--component", 0, "-o", tmp_path / "c.ply")
     assert one.code == 0, one.err
     asked = vvgt("init", "example:blob:8", "--component", "color", "-o", tmp_path / "d.ply")
-    assert "one component; leave out --component color" in asked.error
+    assert "one component; expected several: omit --component color" in asked.error
     table = vvgt("init", tmp_path / "a.nrrd", "--labels", "auto", "-o", tmp_path / "e.ply")
     assert "several components" in table.error
 
@@ -323,7 +323,7 @@ def test_layers_that_do_not_meet_or_fit_are_refused(vvgt, tmp_path: Path) -> Non
     nibabel.save(nibabel.Nifti1Image(np.zeros((8, 8, 8, 3), np.float32), np.eye(4)), tmp_path / "four.nii")
     for out in ("a.ply", "a.html", "a_{}.ply"):
         steps = vvgt("convert", "example:blob:8", "--layer", tmp_path / "four.nii", "-o", tmp_path / out)
-        assert (steps.code, "3 time steps; expected one for a layer: --layer FILE,time=N (0 to 2)" in steps.error) == (
+        assert (steps.code, "3 time steps; expected one per layer: --layer FILE,time=N (0 to 2)" in steps.error) == (
             2, True,
         ), steps.error  # fmt: skip
 

@@ -228,7 +228,7 @@ def test_a_level_of_an_image_is_chosen_by_the_screen(vvgt, tmp_path):
     assert "expected full, or 0 to 2" in run.err
     run = vvgt("init", "example:blob:20", "-o", tmp_path / "a.ply", *options, "--level", "1")
     assert run.code == 2
-    assert "no OME-Zarr, N5 or Imaris image" in run.err
+    assert "has no resolution levels; expected OME-Zarr, N5 or Imaris" in run.err
 
 
 def test_memory_decides_by_itself(vvgt, tmp_path, monkeypatch):

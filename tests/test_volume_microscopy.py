@@ -313,7 +313,7 @@ def test_all_channels_in_the_colours_of_the_file(vvgt, tmp_path: Path, write: Ca
         assert done.code == 0, done.err
         told = {str(note.message) for note in notes if "all shown" in str(note.message)}
         assert told == {
-            f"{(tmp_path / name)}: 2 channels, all shown: 0 'DAPI' #ff0000, 1 'GFP' #00ffff (--channel N: one of them)"
+            f"{(tmp_path / name)}: 2 channels, all shown: 0 'DAPI' #ff0000, 1 'GFP' #00ffff (try --channel N for one)"
         }
         made[blocks] = read_ply(str(out))[0]
     for gaussians in made.values():

@@ -1,4 +1,4 @@
-"""`Blocked`: a field of which only blocks are in memory at a time."""
+"""`Blocked`: a field that holds only some blocks of its volume in memory."""
 
 from __future__ import annotations
 
@@ -36,19 +36,19 @@ if TYPE_CHECKING:
     from vvgt_cli.field.cells import Reader
 
 Progress = Callable[[int, int], None]
-RAY_STEP = 2e-8  # seconds of a step of a ray through what is not empty: bonsai-tree in blocks of 128, two threads
-WAY = 1.5  # unit-frame lengths of a ray through the box, about
+RAY_STEP = 2e-8  # seconds per step of a ray outside empty space: bonsai-tree in blocks of 128, two threads
+PATH_LENGTH = 1.5  # of a typical ray through the box, unit-frame lengths
 
 
 @dataclass
 class Pass:
-    """What does the blocks of a task that are missing.
+    """A pass over blocks, which computes only those that the store lacks.
 
     Attributes:
-        runner: of the workers.
-        parts: where what they leave is.
-        bar: a progress bar by its name, None for none.
-        shard: part (from 1) and count of the blocks that are this run's; None: all.
+        runner: runner of the workers.
+        store: destination of their results.
+        bar: returns a progress bar for a name, or None.
+        shard: index (from 1) and count of the shards that the blocks are divided among; None for all blocks.
     """
 
     runner: Runner
@@ -57,11 +57,11 @@ class Pass:
     shard: tuple[int, int] | None = None
 
     def __call__(self, task: Task, name: str, numbers: Sequence[int] | None = None) -> int:
-        """Do them; how many there were to do.
+        """Compute a task's missing blocks and return how many there were.
 
         Raises:
-            MissingBlocks: others are missing, of other shards.
-            DataError: as the task.
+            MissingBlocks: blocks of other shards are missing.
+            DataError: see the task.
         """
         self.store.prepare(task.kind)
         everything = range(len(task)) if numbers is None else numbers
@@ -76,28 +76,29 @@ class Pass:
 
 
 class MissingBlocks(Exception):
-    """Parts of other shards are missing: nothing more can be done now."""
+    """The state in which blocks of other shards are missing, so that the run cannot continue yet."""
 
     def __init__(self, what: str, missing: int) -> None:
+        """Name the pass, and how many of its blocks are missing."""
         super().__init__(what)
         self.what, self.missing = what, missing
 
 
 @dataclass
 class Blocked:
-    """A field (`vvgt_cli.field.field.Field`) that reads its volume block by block, and draws its own pictures.
+    """A field (`vvgt_cli.field.field.Field`) that reads its volume block by block, and renders its own pictures.
 
     Attributes:
-        source: what was opened, and its look.
-        reader: reads boxes of it.
-        do: runs passes over the blocks.
-        edge: voxels along the edge of blocks, about.
-        visible: voxels that have extinction, about.
-        key: digest of all that it depends on.
-        look: given a source of the same volumes, that with its statistics, its reader and visible voxels.
-        pictures: drawn or expected, by what they show.
-        grid: of its cells, once they are there.
-        views: its pictures; None makes it draw them itself.
+        source: the opened volume and its look.
+        reader: reader of its boxes.
+        run_pass: runs passes over the blocks.
+        edge: approximate edge of a block in voxels.
+        visible: approximate number of voxels with extinction.
+        key: digest of everything that the field depends on.
+        look: maps a source of the same volumes to that source with statistics, its reader and its visible voxels.
+        pictures: rendered or expected pictures, by digest.
+        grid: the grid of base cells, once they are integrated.
+        views: renderer of its pictures; None selects the field itself.
     """
 
     source: Source
@@ -112,17 +113,18 @@ class Blocked:
     views: ViewRenderer = field(default=None)  # type: ignore[assignment] # set below
 
     def __post_init__(self) -> None:
+        """Use the field itself as the renderer if none is given."""
         self.views = self.views or self
 
     @cached_property
     def frame(self) -> Frame:
-        """Half extents and voxel edges, unit frame."""
+        """Half extents and voxel edges in the unit frame."""
         frame = self.source.volume.unit_frame()
         return Frame(np.array(frame.half), np.array(frame.step))
 
     @cached_property
     def light(self) -> Light | None:
-        """What falls on it; shadows and occlusion take a pass."""
+        """Lighting for the kernels; shadows and occlusion take a pass over the blocks."""
         lighting, volume = self.source.lighting, self.source.volume
         if lighting is None:
             return None
@@ -136,7 +138,7 @@ class Blocked:
         return scene_light(lighting, volume.axes, self.frame.step, volume.data.shape, extinction)
 
     def _grid(self, exponent: np.ndarray, least: int = 1) -> CellGrid:
-        """Cells of 2^``exponent`` voxels, in blocks of whole cubes of ``least`` voxels."""
+        """Return a grid of cells of 2^``exponent`` voxels, in blocks made of whole cubes of ``least`` voxels."""
         from vvgt_cli.closed_form.closed_form import MARCH_SIZE
         from vvgt_cli.closed_form.visibility import widening
 
@@ -145,10 +147,10 @@ class Blocked:
         return cell_grid(self.source.volume, exponent, self.edge, march, least)
 
     def workload(self, size: int, gaussians: int) -> Workload:
-        """See `Field.workload`: a view's time is estimated from the steps of its rays; nothing is timed."""
+        """Implement `Field.workload`, with a view's time estimated from its ray steps instead of measured."""
         x, y, z = (float(edge) for edge in self.frame.step)
         share = (self.visible / self.source.volume.data.size) ** (1 / 3)
-        steps = view_edge(size, small=False) ** 2 * WAY / min(x, y, z) * max(share, 0.1)
+        steps = view_edge(size, small=False) ** 2 * PATH_LENGTH / min(x, y, z) * max(share, 0.1)
         workload = Workload(
             gaussians=gaussians, cells=0.0, voxels=self.visible, size=size, view=VIEW * RAY_STEP * steps, pace=pace(),
             base_bytes=PROGRAM + self.edge**3 * self.reader.voxel_bytes, visible=self.visible, step=(x, y, z),
@@ -156,7 +158,10 @@ class Blocked:
         return for_budget(workload, gaussians)
 
     def cells(self, size: int, budget: int, most: int | None = None) -> CellBlocks:
-        """The pass over base cells for images of ``size`` px; at most ``most`` cells, None: as many as memory holds."""
+        """Return the task that integrates base cells for ``size`` px images.
+
+        There are at most ``most`` cells, by default as many as fit in memory.
+        """
         from vvgt_cli.closed_form.closed_form import finest_level, level_within, most_cells
         from vvgt_cli.closed_form.moments import blocks, exponents
         from vvgt_cli.field.grid import TILE_BITS
@@ -165,15 +170,15 @@ class Blocked:
         finest = finest_level(step, pixel_width(size))
         level = level_within(step, self.visible, most or most_cells(budget), finest)
         while blocks(exponents(step, level))[1].max() > 1 << TILE_BITS:
-            level += 1  # of voxels so thin that a block of them is many cells
-        grid, todo = self._grid(exponents(step, level)), self._todo()
+            level += 1  # voxels so thin that a block has too many cells
+        grid, todo = self._grid(exponents(step, level)), self._pending()
         rays = self._file([(one, one.first()) for one in todo], grid) if todo else None
         if rays is not None:
             self.run_pass.store.prepare(rays.kind)
         return CellBlocks(self.reader, grid, self.run_pass.store, rays, self.light)
 
     def pyramid(self, options: VbmOptions, progress: Progress | None = None) -> Start:
-        """See `Field.pyramid`."""
+        """Implement `Field.pyramid`."""
         from vvgt_cli.closed_form import start_of
         from vvgt_cli.closed_form.closed_form import form_of, most_cells
         from vvgt_cli.closed_form.lit import Shading
@@ -183,23 +188,23 @@ class Blocked:
         self.run_pass(task, "integrate")
         self.grid, half, step = task.grid, *self.frame
         shading = None if self.light is None else Shading(self.light, half, step, self._normals_at)
-        form = form_of(  # which alone holds the cells: their tree takes twice as much
+        form = form_of(  # pass the cells on without keeping them: their tree takes twice as much memory
             _gathered(task), half, step, options.max_gaussians, options.size, None, None, self.source.labels_alone,
             shading, options.degree, values=options.values,
         )  # fmt: skip
         return start_of(form, options)
 
     def expect(self, pictures: Sequence[Picture]) -> None:
-        """See `ViewRenderer.expect`."""
+        """Implement `ViewRenderer.expect`."""
         for picture in pictures:
             self.pictures.setdefault(_key(picture), (picture, None))
 
     def view(self, camera: Camera, settings: RenderSettings, blocks: Blocks | None = None) -> np.ndarray:
-        """See `ViewRenderer.view`: all expected pictures are drawn with the first that is asked for."""
+        """Implement `ViewRenderer.view`; the first request renders all expected pictures."""
         view = Picture(camera, settings, blocks)
         self.expect([view])
         if self.pictures[_key(view)][1] is None:
-            self._march()
+            self._render_pending()
         picked = self.pictures[_key(view)][1]
         assert picked is not None
         if blocks is None:
@@ -209,11 +214,11 @@ class Blocked:
         return image
 
     def forget(self, picture: Picture) -> None:
-        """See `ViewRenderer.forget`."""
+        """Implement `ViewRenderer.forget`."""
         self.pictures.pop(_key(picture), None)
 
-    def _todo(self) -> list[Drawing]:
-        """All that are expected."""
+    def _pending(self) -> list[Drawing]:
+        """Return the pictures that are expected but not rendered."""
         return [
             Drawing(key, view.camera, for_thin(view.settings, self.frame, view.camera), view.blocks)
             for key, (view, made) in self.pictures.items()
@@ -221,7 +226,7 @@ class Blocked:
         ]
 
     def _file(self, wanted: Sequence[tuple[Drawing, list[Rays]]], grid: CellGrid) -> RayFile:
-        """The rays that pictures ask for next, in a file."""
+        """Write the rays that pictures need next to a file."""
         bundles = [
             Bundle(one.camera, one.settings.step, np.argwhere(mask)[:, ::-1], offsets)
             for one, rays in wanted
@@ -229,47 +234,47 @@ class Blocked:
         ]
         return RayFile.of(bundles, self.frame, grid.blocks, self.run_pass.store)
 
-    def _march(self) -> None:
-        """Make every picture that is expected, all of them together: at most two passes."""
-        todo, grid = self._todo(), self.grid or self._grid(np.zeros(3, np.int64))
+    def _render_pending(self) -> None:
+        """Render all expected pictures together, in at most two passes."""
+        todo, grid = self._pending(), self.grid or self._grid(np.zeros(3, np.int64))
         for asked in (Drawing.first, Drawing.more):
             wanted = [(one, rays) for one in todo if (rays := asked(one))]
             if not wanted:
                 continue
             file = self._file(wanted, grid)
-            numbers = self._shown()
+            numbers = self._visible_blocks()
             task = RayBlocks(self.reader, grid, self.run_pass.store, file, self.light)
-            self.run_pass(task, "views", numbers)  # those that the pass over the cells has cast are there
+            self.run_pass(task, "views", numbers)  # the pass over the cells may have cast some already
             seen = composed(file, self.run_pass.store, numbers, self.source.volume.dims)
             for one, rays in wanted:
                 for part in rays:
                     one.add(part, next(seen))
-            seen.close()  # and with it the files that are mapped
+            seen.close()  # closes the mapped files, too
         for one in todo:
             image = one.seen if one.blocks is not None else one.image()
             self.pictures[one.key] = self.pictures[one.key][0], image
 
-    def _shown(self) -> list[int]:
-        """Blocks that hold anything visible, as far as the pass over the cells has found it out."""
+    def _visible_blocks(self) -> list[int]:
+        """Return the blocks with visible cells, or all blocks before the cells are integrated."""
         if self.grid is None:
             return list(range(len(self._grid(np.zeros(3, np.int64)).blocks)))
         store = self.run_pass.store
         return [n for n in range(len(self.grid.blocks)) if len(store.load(CELLS, n, names=("counts",))["counts"])]
 
     def normals(self, gaussians: Gaussians) -> np.ndarray | None:
-        """See `Field.normals`."""
+        """Implement `Field.normals`."""
         if self.light is None:
             return None
         from vvgt_cli.closed_form.lit import mean_normals, normal_points
 
         points = normal_points(gaussians)
-        return mean_normals(points, self._at(points), self.frame.half)
+        return mean_normals(points, self._normals_and_extinction(points), self.frame.half)
 
     def _normals_at(self, points: np.ndarray) -> np.ndarray:
-        return self._at(points)[:, :3]
+        return self._normals_and_extinction(points)[:, :3]
 
-    def _at(self, points: np.ndarray) -> np.ndarray:
-        """Normals and extinction (n, 4) at points (n, 3) of the box frame."""
+    def _normals_and_extinction(self, points: np.ndarray) -> np.ndarray:
+        """Return normals and extinction (n, 4) at points (n, 3) of the box frame."""
         grid = self.grid or self._grid(np.zeros(3, np.int64))
         at = (points + self.frame.half) / self.frame.step - 0.5
         store, kind = self.run_pass.store, f"points-{digest(at)[:16]}"
@@ -285,7 +290,7 @@ class Blocked:
         return out
 
     def sample(self, gaussians: Gaussians) -> np.ndarray:
-        """See `Field.sample`."""
+        """Implement `Field.sample`."""
         from vvgt_cli.closed_form.under import POINTS, in_voxels, values_of
 
         self.source.require_scalar_field()
@@ -307,7 +312,7 @@ class Blocked:
         return values_of(samples.reshape(-1, POINTS), gaussians, rule.slope, rule.intercept)
 
     def with_look(self, source: Source) -> Blocked:
-        """See `Field.with_look`: its blocks lie in a folder of their own, within this field's."""
+        """Implement `Field.with_look`; the new field's blocks go to a subfolder of this field's store."""
         source, reader, visible = self.look(source)
         volumes = [id(volume) for volume in self.source.volumes]
         shown = [volumes.index(id(volume)) for volume in source.volumes]
@@ -321,7 +326,7 @@ class Blocked:
         return values_digest([place.volume() for place in self.reader.all_places])
 
     def digest(self) -> str | None:
-        """See `Field.digest`."""
+        """Implement `Field.digest`."""
         return self._digest
 
 
@@ -333,7 +338,7 @@ def _key(view: Picture) -> str:
 
 
 def _gathered(task: CellBlocks) -> Cells:
-    """All cells, with their normals where something is lit."""
+    """Return all cells, with normals under light."""
     from vvgt_cli.closed_form.moments import Cells, in_order, morton
 
     index, moments, normals = [np.empty((0, 3), np.int32)], [], []

@@ -1,4 +1,4 @@
-"""Base cells of blocks: the moments of each, its normal where it is lit, and what of the block rays see."""
+"""Tasks over blocks: moments and normals of base cells, rays, and values and normals at points."""
 
 from __future__ import annotations
 
@@ -21,11 +21,12 @@ Reader = Scalars | Layers
 
 @dataclass(frozen=True)
 class Blockwise:
-    """A task for every block of cells.
+    """A task with one step per block of cells.
 
     Attributes:
-        reader, grid: what is read, and how it is cut.
-        parts: where what comes of it goes.
+        reader: reader of boxes.
+        grid: division of the volume into blocks and cells.
+        store: destination of the results.
     """
 
     reader: Reader
@@ -33,21 +34,22 @@ class Blockwise:
     store: BlockStore
 
     def __len__(self) -> int:
+        """Return the number of blocks."""
         return len(self.grid.blocks)
 
     def box(self, number: int, halo: int) -> Box:
-        """Block ``number`` with ``halo`` voxels around it."""
+        """Read block ``number`` with ``halo`` voxels around it."""
         lo, hi = self.grid.blocks.at(number)
         return self.reader.box(np.maximum(lo - halo, 0), np.minimum(hi + halo, self.grid.dims))
 
 
 @dataclass(frozen=True)
 class CellBlocks(Blockwise):
-    """Integrate the base cells of blocks.
+    """The integration of base cells.
 
     Attributes:
-        rays: that are cast on the way, None for none.
-        light: that falls on the volume: cells then have normals.
+        rays: rays to cast while a block is in memory, None for none.
+        light: lighting; with it cells get normals.
     """
 
     rays: RayFile | None = None
@@ -55,7 +57,7 @@ class CellBlocks(Blockwise):
     kind: str = CELLS
 
     def __call__(self, number: int) -> None:
-        """Leave the part of block ``number``: rows of cells, what it shows of rays, and what there is of each tile."""
+        """Save the cells of block ``number``, what its rays see, and a summary of each tile."""
         grid, store = self.grid, self.store
         box = self.box(number, HALO if self.light is None else LIT_HALO)
         tiles, counts, coarse, field, deepest = [], [], [], [], 0.0
@@ -96,7 +98,7 @@ class CellBlocks(Blockwise):
         )
 
     def _cells(self, box: Box, tile: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Cells with extinction of a tile (x, y, z) in a box."""
+        """Return the indices and moments of the cells with extinction in a tile (x, y, z) of a box."""
         from vvgt_cli.closed_form.moments import Region, blocks, region_cells
         from vvgt_cli.closed_form.ranges import visible_blocks
 
@@ -113,13 +115,18 @@ class CellBlocks(Blockwise):
         return region_cells(region, lo + which * edge, exponent)
 
     def _normals(self, box: Box, moments: np.ndarray) -> np.ndarray:
-        """(n, 3) at the centroids of cells."""
+        """Return normals (n, 3) at the centroids of cells."""
         half, step = np.array(self.grid.half), np.array(self.grid.step)
         points = (moments[:, FIRST] / moments[:, [MASS]] + half) / step - 0.5
         return normals_in(box, points, step)[:, :3]
 
     def _summary(self, local: np.ndarray, mass: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        """Of a tile's cells ``local`` (n, 3): mass in cells of the march, opacity of the field, largest of a cell."""
+        """Return a tile's mass in cells of the visibility march, its opacity field, and the largest opacity of a cell.
+
+        Args:
+            local: (n, 3) indices of its cells within the tile.
+            mass: (n,) optical masses of these.
+        """
         from vvgt_cli.closed_form.inset import opaque_depth
         from vvgt_cli.closed_form.visibility import summed
 
@@ -131,7 +138,7 @@ class CellBlocks(Blockwise):
 
 
 def normals_in(box: Box, points: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Normals and extinction (n, 4) at voxel coordinates ``points`` (n, 3) of the volume that lie in a box."""
+    """Return normals and extinction (n, 4) at the volume's voxel coordinates ``points`` (n, 3), all inside a box."""
     from vvgt_cli.closed_form.lit import point_normals
 
     out = np.empty((len(points), 4))
@@ -141,30 +148,41 @@ def normals_in(box: Box, points: np.ndarray, step: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class RayBlocks(Blockwise):
-    """Cast rays through blocks: a pass for pictures that were not known before. Attributes: as of `CellBlocks`."""
+    """The casting of rays, for pictures requested after the cells were integrated.
+
+    Attributes:
+        rays: rays to cast.
+        light: lighting, None for none.
+    """
 
     rays: RayFile
     light: Light | None = None
 
     @property
     def kind(self) -> str:
+        """Kind of the results."""
         return self.rays.kind
 
     def __call__(self, number: int) -> None:
-        """Leave what block ``number`` shows of them."""
+        """Save what the rays see of block ``number``."""
         box = self.box(number, HALO if self.light is None else LIT_HALO)
         save_rays(self.rays, box, number, self.grid.blocks, self.light, self.store)
 
 
 @dataclass(frozen=True)
 class PointBlocks(Blockwise):
-    """Normals and extinction at ``points``, a file of voxel coordinates (n, 3)."""
+    """Normals and extinction at points.
+
+    Attributes:
+        points: file of voxel coordinates (n, 3).
+        kind: kind of the results.
+    """
 
     points: str
     kind: str
 
     def __call__(self, number: int) -> None:
-        """Leave those of the points that lie in block ``number``."""
+        """Save those at points in block ``number``."""
         lo, hi = self.grid.blocks.at(number)
         points = np.load(self.points, mmap_mode="r")
         low, high = np.where(lo == 0, -np.inf, lo - 0.5), np.where(hi == self.grid.dims, np.inf, hi - 0.5)
@@ -177,23 +195,23 @@ class PointBlocks(Blockwise):
 
 @dataclass(frozen=True)
 class ValueBlocks(Blockwise):
-    """Values at the points of Gaussians.
+    """Values at the sample points of Gaussians.
 
     Attributes:
         gaussians: file of centres and axes (n, 12) in voxels.
-        kind: of the parts.
+        kind: kind of the results.
     """
 
     gaussians: str
     kind: str
 
     def __call__(self, number: int) -> None:
-        """Leave the values of those points that lie in block ``number``: numbers of them, over all Gaussians."""
+        """Save the values at points in block ``number``, with the points' numbers over all Gaussians."""
         from vvgt_cli.closed_form.under import POINTS, offsets, reach, sample_points
 
         lo, hi = self.grid.blocks.at(number)
         rows = np.load(self.gaussians, mmap_mode="r")
-        far = np.linalg.norm(rows[:, 3:].reshape(-1, 3, 3), axis=2) * reach()  # of points along each axis, at most
+        far = np.linalg.norm(rows[:, 3:].reshape(-1, 3, 3), axis=2) * reach()  # largest distance along each axis
         near = (rows[:, :3] + far >= lo - 0.5) & (rows[:, :3] - far < hi - 0.5)
         which = np.flatnonzero(near.all(axis=1))
         found, numbers = np.empty(0, np.float32), np.empty(0, np.int64)
@@ -212,16 +230,18 @@ class ValueBlocks(Blockwise):
 
 @dataclass(frozen=True)
 class ExtinctionBlocks(Blockwise):
-    """Mean extinction of the cells that shadows and occlusion are marched through.
+    """Mean extinction of the cells in which shadows and occlusion are computed.
 
-    ``cell``: voxels along their edge, of which blocks hold whole ones.
+    Attributes:
+        cell: edge of a cell in voxels, which divides that of a block.
+        kind: kind of the results.
     """
 
     cell: int
     kind: str = "extinction"
 
     def __call__(self, number: int) -> None:
-        """Leave those of block ``number``."""
+        """Save the cells of block ``number``."""
         from vvgt_cli.dvr.bricks import brick_ranges, empty_distance
         from vvgt_cli.dvr.shadows import cell_extinction
 
@@ -232,10 +252,10 @@ class ExtinctionBlocks(Blockwise):
         self.store.save(self.kind, number, extinction=out)
 
     def gathered(self) -> np.ndarray:
-        """(cz, cy, cx) float32 of the whole volume.
+        """Return the cells of the whole volume, (cz, cy, cx) float32.
 
         Raises:
-            DataError: a part is missing or damaged.
+            DataError: a result is missing or damaged.
         """
         out = np.empty(tuple(-(-int(n) // self.cell) for n in self.grid.dims[::-1]), np.float32)
         for number in range(len(self)):
@@ -246,12 +266,16 @@ class ExtinctionBlocks(Blockwise):
 
 
 def read_rows(store: BlockStore, number: int, offset: int, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Moments (count, 13) and places in their tile (count, 3) int32 of a tile's cells.
+    """Read moments (count, 13) and indices within the tile (count, 3) int32 of a tile's cells.
 
-    ``offset`` counts the cells of the block before them.
+    Args:
+        store: store of the blocks.
+        number: number of the block.
+        offset: cells of the block before these.
+        count: number of cells.
 
     Raises:
-        DataError: the file is not whole.
+        DataError: the file is truncated.
     """
     path = store.path(CELLS, number, ".rows")
     try:
@@ -261,7 +285,7 @@ def read_rows(store: BlockStore, number: int, offset: int, count: int) -> tuple[
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror or error})") from error
     if len(content) < count * ROW:
-        raise DataError(f"{path}: not whole; remove {path.with_suffix('.npz')} and run the same command again")
+        raise DataError(f"{path}: truncated; remove {path.with_suffix('.npz')} and run the same command again")
     split = count * MOMENTS * 8
     moments = np.frombuffer(content, np.float64, count * MOMENTS).reshape(count, MOMENTS)
     return moments, np.frombuffer(content, np.uint8, offset=split).reshape(count, 3).astype(np.int32)

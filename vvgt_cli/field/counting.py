@@ -1,4 +1,4 @@
-"""What the values of a volume are, counted block by block: `Access` to volumes that are never in memory as a whole."""
+"""Statistics of values, counted block by block: `Access` to volumes that are never whole in memory."""
 
 from __future__ import annotations
 
@@ -22,15 +22,16 @@ from vvgt_cli.volume.tallies import Tally, counted, statistics_of, tally, with_l
 
 @dataclass(frozen=True)
 class CountBlocks:
-    """Count the values of blocks, and take samples of them.
+    """The counting of values, with samples of them.
 
     Attributes:
-        place, boxes: what is read, and how it is cut.
-        slices: of a box that are in memory at once.
-        parts: where what is counted goes.
-        kind: of the parts.
-        limits: data values, of a second pass: their histogram.
-        labels: the different values are kept, whose type is too wide to be counted.
+        place: origin of the volume.
+        boxes: its division.
+        slices: slices of a box that are in memory at a time.
+        store: destination of the results.
+        kind: kind of the results.
+        limits: range of the histogram, in a second pass.
+        labels: collect the distinct values of a type that is too wide to be counted.
     """
 
     place: Place
@@ -42,10 +43,11 @@ class CountBlocks:
     labels: bool = False
 
     def __len__(self) -> int:
+        """Return the number of boxes."""
         return len(self.boxes)
 
     def __call__(self, number: int) -> None:
-        """Leave the part of block ``number``."""
+        """Count box ``number``."""
         volume = self.place.volume()
         lo, hi = self.boxes.at(number)
         size = np.minimum(SAMPLE, self.boxes.dims)
@@ -64,7 +66,7 @@ class CountBlocks:
             for n in range(wanted):
                 if z <= places[n, 2] < end[2]:
                     bricks[n] = _brick(volume, values, begin, end, places[n], size)
-            del values  # before the next slices are read
+            del values  # free them before the next slices are read
         assert found is not None, "a box has a slice"
         self.store.save(
             self.kind,
@@ -79,10 +81,10 @@ class CountBlocks:
         )
 
     def merged(self) -> Tally:
-        """The sum over all blocks.
+        """Return the sum over all boxes.
 
         Raises:
-            DataError: a part is missing or damaged.
+            DataError: a result is missing or damaged.
         """
         whole: Tally | None = None
         for number in range(len(self)):
@@ -95,12 +97,12 @@ class CountBlocks:
         return whole
 
     def samples(self) -> tuple[np.ndarray, np.ndarray]:
-        """Bricks (n, z, y, x) of stored values, and the voxels (n,) that each stands for."""
+        """Return sampled bricks (n, z, y, x) of stored values, and how many voxels (n,) each stands for."""
         found = [self.store.load(self.kind, number, names=("samples", "weights")) for number in range(len(self))]
         return np.concatenate([part["samples"] for part in found]), np.concatenate([part["weights"] for part in found])
 
     def unique(self) -> np.ndarray:
-        """The different finite values (n,), ascending."""
+        """Return the distinct finite values (n,), ascending."""
         found = [self.store.load(self.kind, number, names=("unique",))["unique"] for number in range(len(self))]
         return np.unique(np.concatenate(found))
 
@@ -108,7 +110,7 @@ class CountBlocks:
 def _brick(
     volume: Volume, values: np.ndarray, begin: np.ndarray, end: np.ndarray, first: np.ndarray, size: np.ndarray
 ) -> np.ndarray:
-    """``size`` voxels from ``first`` on (3,), of the ``values`` from ``begin`` to ``end`` where they hold them."""
+    """Return ``size`` voxels from ``first`` (3,), from the loaded ``values`` if they lie in ``begin`` to ``end``."""
     if (first + size > end).any():
         return read_block(volume, first, first + size)
     (x, y, z), (i, j, k) = first - begin, size
@@ -116,18 +118,18 @@ def _brick(
 
 
 class BlockAccess:
-    """`vvgt_cli.field.layered.Access` block by block: every volume is counted once, when it is asked for."""
+    """`vvgt_cli.field.layered.Access` block by block; each volume is counted once, on first use."""
 
     def __init__(
         self, store: BlockStore, edge: int, run: Callable[[CountBlocks], object], histogram: bool
     ) -> None:  # fmt: skip
-        """Take what does the tasks.
+        """Prepare for counting.
 
         Args:
-            parts: where what is counted goes.
-            edge: voxels along the edge of blocks.
-            run: does the blocks of a task that are missing.
-            histogram: is needed, also of types that are not counted value by value.
+            store: destination of the results.
+            edge: edge of blocks in voxels.
+            run: runs the missing blocks of a task.
+            histogram: whether a histogram is needed even for types that are not counted value by value.
         """
         self._store, self._edge, self._run, self._histogram = store, edge, run, histogram
         self._places: dict[int, tuple[Volume, Place]] = {}
@@ -135,7 +137,7 @@ class BlockAccess:
         self._count = 0
 
     def open(self, source: str | Volume | Content, read: ReadOptions) -> Content:
-        """A file, of which nothing is read yet, or what is in memory."""
+        """Open a file without reading its values, or accept content in memory."""
         if not isinstance(source, str):
             content = content_of(source)
             for volume in (*content.volumes, *content.classified):
@@ -151,11 +153,11 @@ class BlockAccess:
         return content
 
     def place(self, volume: Volume) -> Place:
-        """Where a volume comes from that was opened here."""
+        """Return the origin of a volume that was opened here."""
         return self._places[id(volume)][1]
 
     def counts(self, volume: Volume) -> tuple[CountBlocks, Tally, Statistics]:
-        """What did it, and what came of it.
+        """Return the counting task of a volume, its counts and its statistics.
 
         Raises:
             DataError: no voxel has a finite value.
@@ -169,8 +171,8 @@ class BlockAccess:
         self._count += 1
         if not readable_in_blocks(volume):
             raise UsageError(
-                f"{volume.name}: compressed in one piece, which is read front to back; unpack it (raw, .nhdr and .nii "
-                "files are mapped), or store it in chunks (Zarr, HDF5)"
+                f"{volume.name}: compressed as one stream, which cannot be read in blocks; decompress it (raw, .nhdr "
+                "and .nii files are mapped), or store it in chunks (Zarr, HDF5)"
             )
         edge = self._edge
         boxes = counted_boxes(volume, edge, sample_spacing(volume.dims))
@@ -188,14 +190,14 @@ class BlockAccess:
         return first, whole, statistics_of(whole, volume, histogram)
 
     def statistics(self, volume: Volume) -> Statistics:
-        """Of its data values."""
+        """Return the statistics of a volume's data values."""
         return self.counts(volume)[2]
 
     def labels(self, volume: Volume) -> list[int]:
-        """Those that it holds, ascending.
+        """Return the labels that a volume holds, ascending.
 
         Raises:
-            DataError: data values that are no whole numbers, or too many of them.
+            DataError: data values are not integers, or there are too many distinct ones.
         """
         task, whole, _ = self.counts(volume)
         if counted(volume):
@@ -208,12 +210,12 @@ class BlockAccess:
                 self._run(task)
             stored = task.unique()
         if len(stored) > MOST:
-            raise Unsuitable(f"{volume.name}: more than {MOST} different values; expected a label map")
+            raise Unsuitable(f"{volume.name}: more than {MOST} distinct values; expected a label map")
         values = np.unique(volume.slope * stored + volume.intercept)
         if (values != np.round(values)).any():
             odd = values[values != np.round(values)][0]
             raise Unsuitable(
-                f"{volume.name}: {volume.data.dtype} values such as {odd:g}; expected a label map, of whole numbers: "
-                "of scalars leave out --labels"
+                f"{volume.name}: {volume.data.dtype} values such as {odd:g}; expected integers, as in a label map: "
+                "omit --labels for scalars"
             )
         return [int(value) for value in values]
