@@ -98,7 +98,7 @@ def test_a_certificate_that_is_none_is_one_line(text) -> None:
         + [f"property float {name}_{k}" for name, n in (("scale", 3), ("rot", 4)) for k in range(n)]
         + ["end_header", ""]
     )
-    with pytest.raises(DataError, match="is not one that vvgt writes"):
+    with pytest.raises(DataError, match="expected one that vvgt writes"):
         parse_header(header.encode(), "x.ply")
 
 

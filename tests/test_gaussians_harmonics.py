@@ -267,7 +267,10 @@ def test_files_of_other_frames_come_back(frame, up):
 GOOD = written(cloud(3, 1))
 LIES = {
     "nan": (GOOD[: -4 * 9] + np.float32(np.nan).tobytes() + GOOD[-4 * 8 :], "harmonics: 1 of 3 rows are not finite"),
-    "names": (GOOD.replace(b"f_rest_8", b"f_rest_9"), "f_rest_9 among 9 f_rest properties; expected f_rest_0 and on"),
+    "names": (
+        GOOD.replace(b"f_rest_8", b"f_rest_9"),
+        "f_rest_9 among 9 f_rest properties; expected them from f_rest_0",
+    ),
     "double": (GOOD.replace(b"float f_rest_8", b"double f_rest_8"), "f_rest_8 is double; expected float"),
     "count": (GOOD.replace(b"f_rest_8", b"rest"), "8 f_rest properties"),
 }

@@ -210,7 +210,7 @@ LIES = {
     "double": (GOOD.replace(b"float opacity", b"double opacity"), "expected float"),
     "list": (GOOD.replace(b"property float nx", b"property list uchar int nx"), "scalar type"),
     "rest": (GOOD.replace(b"float nx", b"float f_rest_0"), "1 f_rest properties"),
-    "comment": (GOOD.replace(b"vvgt up none", b"vvgt up wide"), "not one that vvgt writes"),
+    "comment": (GOOD.replace(b"vvgt up none", b"vvgt up wide"), "expected one that vvgt writes"),
     "world": (GOOD.replace(b"frame unit", b"frame world"), "scale and centre"),
     "binary": (GOOD.replace(b"vvgt up", b"vvgt \xff\xfe"), "not text"),
     "nan": (GOOD[:-4] + np.float32(math.nan).tobytes(), "not finite"),

@@ -189,13 +189,13 @@ def test_a_segmentation_is_its_own_table(tmp_path: Path) -> None:
 
     values = np.array([0, 1, 3, 1, 0, 3, 1, 0], np.uint8)
     (tmp_path / "x.seg.nrrd").write_bytes(SEGMENTS.encode() + values.tobytes())
-    with pytest.warns(UserWarning, match="taken as a label map"):
+    with pytest.warns(UserWarning, match="read as a label map"):
         table = load(SourceRequest(str(tmp_path / "x.seg.nrrd"))).tf
     assert isinstance(table, LabelTable)
     assert [(e.number, e.name) for e in table.labels] == [(1, "skin"), (3, "inner_core")]
 
 
-@pytest.mark.filterwarnings("ignore:.*taken as a label map")
+@pytest.mark.filterwarnings("ignore:.*read as a label map")
 def test_a_session_of_a_file_keeps_its_segments(tmp_path: Path) -> None:
     path = tmp_path / "x.seg.nrrd"
     path.write_bytes(SEGMENTS.replace("sizes: 2 2 2", "sizes: 24 24 24").encode() + balls().tobytes())
@@ -236,7 +236,7 @@ def test_extinctions_of_labels_add_up_to_the_whole() -> None:
         (balls(), SLICER.replace("3 inner_core", "4 other"), "have no entry in t.ctbl: 3; add them"),
         (balls(), "9 other 1 2 3 255\n", "none of its labels (1, 3) is in t.ctbl, which has 9"),
         (balls() * 0, SLICER, "none of its labels (only 0)"),
-        (balls() / 2, SLICER, "expected integers, as in a label map"),
+        (balls() / 2, SLICER, "expected a label map, of whole numbers"),
     ],
 )
 def test_labels_that_do_not_fit_are_one_line(vvgt, tmp_path: Path, values, text: str, said: str) -> None:
@@ -251,7 +251,7 @@ def test_calls_that_contradict(vvgt, tmp_path: Path, seg: Path) -> None:
     for options, said in (
         (("--labels", "auto", "--tf", "gray"), "expected one of --tf and --labels"),
         (("--labels", tmp_path / "no.ctbl"), "no such file"),
-        (("--split-labels", "--tf", "gray"), "leave out --tf"),
+        (("--split-labels", "--tf", "gray"), "the colours of labels come from --labels"),
         (("--split-labels", "--dry-run"), "--dry-run"),
         (("--split-labels", "-o", tmp_path / "a.ply"), "label's name"),
     ):

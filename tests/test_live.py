@@ -180,7 +180,7 @@ def test_a_ply_keeps_values_in_columns_that_others_ignore(tmp_path: Path) -> Non
     assert b"vvgt live" not in (tmp_path / "b.ply").read_bytes()
     whole = (tmp_path / "a.ply").read_bytes()
     (tmp_path / "c.ply").write_bytes(whole.replace(b"live values", b"live valuez", 1))
-    with pytest.raises(vvgt_library.DataError, match="not one that vvgt writes"):
+    with pytest.raises(vvgt_library.DataError, match="expected one that vvgt writes"):
         read_ply(tmp_path / "c.ply")
 
 
@@ -291,7 +291,7 @@ def test_render_info_and_other_formats(vvgt, live_file, tmp_path) -> None:
         vvgt("render", live_file, "--tf-range", "0.1,0.3", "--orbit", 1, "--size", 32, "-o", tmp_path / "c").code == 0
     )
     assert next((tmp_path / "c").glob("*.png")).read_bytes() not in pictures  # of its own function
-    with pytest.warns(UserWarning, match="no columns for values"):
+    with pytest.warns(UserWarning, match="cannot store values for other functions"):
         assert vvgt("view", live_file, "-o", tmp_path / "one.spz").code == 0
 
 

@@ -84,7 +84,7 @@ def test_a_ply_keeps_labels_in_a_byte_and_names_in_its_header(tmp_path: Path) ->
     assert read_ply(tmp_path / "b.ply")[0].live[0, 6] == 299  # type: ignore[index]
     whole = (tmp_path / "a.ply").read_bytes()
     (tmp_path / "c.ply").write_bytes(whole.replace(b"live label 300", b"live labex 300", 1))
-    with pytest.raises(vvgt_library.DataError, match="not one that vvgt writes"):
+    with pytest.raises(vvgt_library.DataError, match="expected one that vvgt writes"):
         read_ply(tmp_path / "c.ply")
     (tmp_path / "d.ply").write_bytes(whole[:-1] + b"\x09")
     with pytest.raises(vvgt_library.DataError, match="row 9"):

@@ -106,9 +106,9 @@ def test_views_are_read_one_at_a_time():
 
 def test_views_that_do_not_fit_are_refused():
     reference = views(2)
-    with pytest.raises(DataError, match="more views in the reference"):
+    with pytest.raises(DataError, match="more reference views"):
         score_views(reference, reference[:1])
-    with pytest.raises(DataError, match="fewer views in the reference"):
+    with pytest.raises(DataError, match="fewer reference views"):
         score_views(reference[:1], reference)
     with pytest.raises(DataError, match="same"):
         score_views(reference, reference[..., :3])

@@ -371,7 +371,7 @@ def test_only_what_a_camera_is_shown_is_read_and_kept(folder: Path, monkeypatch:
         read.clear()
         seen = levels.seen_from(np.array([0, -distance, 0]), 45.0)
         assert ({int(Path(name).parent.name.split("_")[0]) for name in read}, len(read)) == (shown, len(set(read)))
-        assert sum(map(len, levels._shown.values())) == len(seen)
+        assert sum(map(len, levels._cached.values())) == len(seen)
 
 
 def test_levels_that_cannot_be_read_are_told_in_a_line(vvgt, folder: Path, tmp_path: Path) -> None:
