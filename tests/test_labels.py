@@ -174,7 +174,7 @@ def test_of_several_layers_one_may_be_hidden(vvgt, tmp_path: Path, seg: Path) ->
 
 
 def test_a_recognised_label_map_is_said_and_none_takes_it_back(vvgt, tmp_path: Path, seg: Path) -> None:
-    with pytest.warns(UserWarning, match="balls_seg: read as a label map because of its name"):
+    with pytest.warns(UserWarning, match="balls_seg: read as a label map by its name"):
         done = vvgt("init", seg, *SMALL[:4], "-o", tmp_path / "a.ply")
     assert "distinct colours" in done.err
     plain = vvgt("init", seg, "--labels", "none", *SMALL[:4], "-o", tmp_path / "b.ply")

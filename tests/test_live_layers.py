@@ -20,7 +20,7 @@ from vvgt_cli.commands.live_site import Cloud
 from vvgt_cli.conversion.place import in_frame_of
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
 from vvgt_cli.gaussians.live import LayerTables, Palette, Table, apply_look, baked
-from vvgt_cli.gaussians.live_facts import LABEL_ROW, LAYER_NUMBER, LiveFacts
+from vvgt_cli.gaussians.live_facts import LABEL_ROW, LAYER_ID, LiveFacts
 from vvgt_cli.volume import Volume
 
 TF = {"points": [{"x": 0.2, "rgb": [1, 0, 0], "opacity": 0}, {"x": 0.9, "rgb": [0, 1, 0], "opacity": 0.8}]}
@@ -55,8 +55,8 @@ def test_the_pages_program_shows_several_layers_as_we_do(tmp_path: Path) -> None
     """Values over one range, values over another one, and labels."""
     some, other = layered(60), replace(values(), lo=-5.0, hi=160.0, name="pet", distance=0.25)
     assert some.live is not None
-    some.live[:, LAYER_NUMBER] = np.arange(60) % 3
-    some.live[some.live[:, LAYER_NUMBER] < 2, LABEL_ROW] = 0
+    some.live[:, LAYER_ID] = np.arange(60) % 3
+    some.live[some.live[:, LAYER_ID] < 2, LABEL_ROW] = 0
     some.live[:, LABEL_ROW] %= len(LABELS)
     first, organs = replace(values(WINDOW), name="ct", distance=0.5), replace(labels(), name="organs", distance=0.2)
     table = LayerTables(

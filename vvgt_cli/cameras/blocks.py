@@ -46,13 +46,7 @@ def spread_blocks(width: int, height: int, shift: int = 0, enough: int = ENOUGH)
     """Return about ``enough`` blocks on a lattice over a picture, None if that is nearly all of it.
 
     The lattice has every s-th block of a row, shifted from row to row by the golden section of s so that it covers all
-    rows and columns.
-
-    Args:
-        width: width of the picture in pixels.
-        height: height of the picture in pixels.
-        shift: selects one of s disjoint sets of blocks, for example another one per view.
-        enough: number of blocks.
+    rows and columns; ``shift`` selects one of s disjoint lattices, for example another one per view.
     """
     rows, across = height // BLOCK, width // BLOCK
     every = round(rows * across / enough)

@@ -27,7 +27,7 @@ from vvgt_cli.errors import NothingVisible, UsageError
 from vvgt_cli.field.field import Field
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored
 from vvgt_cli.gaussians.live import LENGTH, Table, baked, lengths
-from vvgt_cli.gaussians.live_facts import GRADIENT, LAYER_NUMBER, LiveFacts
+from vvgt_cli.gaussians.live_facts import GRADIENT, LAYER_ID, LiveFacts
 from vvgt_cli.gaussians.types import concatenate
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.labels import LabelTable
@@ -146,9 +146,9 @@ def _of_layers(run: Run, request: ConvertRequest, field: Field) -> tuple[Gaussia
         some = into_box(in_frame_of(out_of_box(some, layer.volume), layer.volume, source.volume), source.volume)
         some = some.take(np.flatnonzero((np.abs(some.means) <= half + 1e-6).all(axis=1)))
         assert some.live is not None
-        live = np.zeros((len(some), LAYER_NUMBER + 1), np.float32)
+        live = np.zeros((len(some), LAYER_ID + 1), np.float32)
         live[:, : some.live.shape[1]] = some.live
-        live[:, LAYER_NUMBER] = number
+        live[:, LAYER_ID] = number
         parts.append(replace(some, live=live))
         left -= len(some)
     if not parts:

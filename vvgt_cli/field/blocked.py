@@ -158,10 +158,7 @@ class Blocked:
         return for_budget(workload, gaussians)
 
     def cells(self, size: int, budget: int, most: int | None = None) -> CellBlocks:
-        """Return the task that integrates base cells for ``size`` px images.
-
-        There are at most ``most`` cells, by default as many as fit in memory.
-        """
+        """Return the task for base cells for ``size`` px images, ``most`` at most, by default as many as fit."""
         from vvgt_cli.closed_form.closed_form import finest_level, level_within, most_cells
         from vvgt_cli.closed_form.moments import blocks, exponents
         from vvgt_cli.field.grid import TILE_BITS

@@ -121,12 +121,7 @@ class CellBlocks(Blockwise):
         return normals_in(box, points, step)[:, :3]
 
     def _summary(self, local: np.ndarray, mass: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        """Return a tile's mass in cells of the visibility march, its opacity field, and the largest opacity of a cell.
-
-        Args:
-            local: (n, 3) indices of its cells within the tile.
-            mass: (n,) optical masses of these.
-        """
+        """Return a tile's mass in cells of the visibility march, its opacity field, and its largest opacity."""
         from vvgt_cli.closed_form.inset import opaque_depth
         from vvgt_cli.closed_form.visibility import summed
 
@@ -148,12 +143,7 @@ def normals_in(box: Box, points: np.ndarray, step: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class RayBlocks(Blockwise):
-    """The casting of rays, for pictures requested after the cells were integrated.
-
-    Attributes:
-        rays: rays to cast.
-        light: lighting, None for none.
-    """
+    """The casting of rays, for pictures requested after the cells were integrated; attributes as in `CellBlocks`."""
 
     rays: RayFile
     light: Light | None = None
@@ -171,12 +161,7 @@ class RayBlocks(Blockwise):
 
 @dataclass(frozen=True)
 class PointBlocks(Blockwise):
-    """Normals and extinction at points.
-
-    Attributes:
-        points: file of voxel coordinates (n, 3).
-        kind: kind of the results.
-    """
+    """Normals and extinction at ``points``, a file of voxel coordinates (n, 3)."""
 
     points: str
     kind: str
@@ -232,9 +217,7 @@ class ValueBlocks(Blockwise):
 class ExtinctionBlocks(Blockwise):
     """Mean extinction of the cells in which shadows and occlusion are computed.
 
-    Attributes:
-        cell: edge of a cell in voxels, which divides that of a block.
-        kind: kind of the results.
+    Their edge is ``cell`` voxels, which divides that of a block.
     """
 
     cell: int
@@ -268,11 +251,7 @@ class ExtinctionBlocks(Blockwise):
 def read_rows(store: BlockStore, number: int, offset: int, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Read moments (count, 13) and indices within the tile (count, 3) int32 of a tile's cells.
 
-    Args:
-        store: store of the blocks.
-        number: number of the block.
-        offset: cells of the block before these.
-        count: number of cells.
+    ``offset`` is the number of cells of the block before these.
 
     Raises:
         DataError: the file is truncated.

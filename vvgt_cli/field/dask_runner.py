@@ -44,12 +44,7 @@ class DaskRunner:
     """
 
     def __init__(self, scheduler: str, workers: int, threads: int) -> None:
-        """Check that the scheduler can be used.
-
-        Args:
-            scheduler: "local", "slurm" or an address.
-            workers: number of workers.
-            threads: threads of all local workers together, or of each job.
+        """Check the scheduler: "local", "slurm" or an address; ``threads`` are shared by local workers, or per job.
 
         Raises:
             DataError: Dask or SLURM is not installed.

@@ -19,10 +19,7 @@ LARGEST = 16 << 30  # bytes of values that are read a second time
 
 
 def digest(*parts: Any) -> str:
-    """Return the hexadecimal SHA-256 of values.
-
-    Arrays count by type, shape and bytes, dataclasses by their fields, anything else by its repr.
-    """
+    """Return the SHA-256 of values: of arrays by type, shape and bytes, of dataclasses by fields, else by repr."""
     state = hashlib.sha256()
     for part in parts:
         _feed(state, part)
@@ -42,10 +39,7 @@ def _feed(state: Any, part: Any) -> None:
 
 
 def values_digest(volumes: Sequence[Volume]) -> str | None:
-    """Return the hexadecimal SHA-256 of the values of volumes, None above `LARGEST` bytes.
-
-    It is the same for volumes in memory and in blocks.
-    """
+    """Return the SHA-256 of volumes' values, the same in memory and in blocks; None above `LARGEST` bytes."""
     if sum(volume.data.nbytes for volume in volumes) > LARGEST:
         return None
     state = hashlib.sha256()

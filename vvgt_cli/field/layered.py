@@ -254,9 +254,7 @@ def _chosen_labels(
         own = holds_table(opened.path)
         if own or recognised(volume, access.labels):
             reason = "its segments" if own else "its name and its few integers"
-            warnings.warn(
-                f"{volume.name}: read as a label map because of {reason} (try --labels none for scalars)", stacklevel=3
-            )
+            warnings.warn(f"{volume.name}: read as a label map by {reason} (try --labels none: scalars)", stacklevel=3)
             return AUTO
     return labels
 
@@ -267,14 +265,7 @@ def functions_of(
     tf: TransferFunction | None,
     tf_range: str | tuple[float, float] = "data",
 ) -> list[TransferFunction]:
-    """Return a function on data values for each volume of `Content.classified`.
-
-    Args:
-        opened: the content.
-        numbers: statistics of each volume.
-        tf: function, None for an automatic one.
-        tf_range: range option of the functions.
-    """
+    """Return a function on data values per volume of `Content.classified`; ``numbers`` are the volumes' statistics."""
     if opened.color:
         kind = "opacity of the file" if len(opened.volumes) > 3 else "opacity by luminance"
         return [resolve(tf, numbers[0], tf_range) if tf else _function(kind, 0.0, _white(opened), (1, 1, 1))]

@@ -79,10 +79,7 @@ class FieldNeeds:
 
 @contextmanager
 def store_beside(output: str | None) -> Iterator[BlockStore]:
-    """Provide a block store next to the output, so that the same command can resume after an interruption.
-
-    It is removed after errors that the same command would repeat.
-    """
+    """Provide a block store next to the output to resume from, removed after errors that would only repeat."""
     if output is None or output == STDOUT:
         with tempfile.TemporaryDirectory(prefix="vvgt-") as folder:
             yield BlockStore(Path(folder) / "blocks")

@@ -67,13 +67,7 @@ class RayFile:
 
     @classmethod
     def of(cls, bundles: Sequence[Bundle], frame: Frame, blocks: Boxes, store: BlockStore) -> RayFile:
-        """Write bundles of rays through a volume.
-
-        Args:
-            bundles: the rays.
-            frame: frame of the volume.
-            blocks: division of the volume.
-            store: block store for the file.
+        """Write bundles of rays through a volume with this ``frame``, divided into ``blocks``.
 
         Raises:
             DataError: the file cannot be written.

@@ -48,10 +48,7 @@ class BlockOptions:
 def block_edge(volume: Volume, options: BlockOptions, voxel: int | None = None) -> int:
     """Return the edge of a block in voxels; in mapped files it is that across rows, which are read whole.
 
-    Args:
-        volume: the volume.
-        options: options with the size, if it was given.
-        voxel: bytes per voxel, by default those of the volume's type.
+    ``voxel`` is the number of bytes per voxel, by default that of the volume's type.
 
     Raises:
         UsageError: not even the smallest block fits in memory.

@@ -113,14 +113,9 @@ class TiledTree:
     """
 
     def __init__(
-        self,
-        store: BlockStore,
-        grid: CellGrid,
-        seen: Visibility,
-        coarse: Coarse,
-        scratch: Path,
+        self, store: BlockStore, grid: CellGrid, seen: Visibility, coarse: Coarse, scratch: Path,
         light: Light | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Build each tile's tree in turn and write its scores to ``scratch``."""
         self._store, self._grid, self._seen, self._scratch, self._light = store, grid, seen, scratch, light
         self._levels = None if len(coarse.tiles) == 1 else grid.bits
@@ -228,10 +223,7 @@ class TiledTree:
         yield Scores(self._above[over], self._capped[over], np.ones(len(self.top) - len(self.tiles), bool))
 
     def threshold(self, budget: int) -> float:
-        """Return the score above which cells are split to get at most ``budget`` leaves.
-
-        It equals that of `vvgt_cli.closed_form.tree.select`.
-        """
+        """Return the score above which `vvgt_cli.closed_form.tree.select` would split cells for ``budget`` leaves."""
         if self.base <= budget:
             return -np.inf
         counts = np.zeros(BINS, np.int64)  # cells that appear, less those that are split

@@ -74,14 +74,7 @@ def turn(gaussians: Gaussians, up: str, *, inverse: bool = False) -> Gaussians:
 
 
 def rescale(gaussians: Gaussians, factor: float, before: np.ndarray, after: np.ndarray) -> Gaussians:
-    """Scale and shift Gaussians: means become ``factor * (mean + before) + after``, in float64.
-
-    Args:
-        gaussians: the Gaussians.
-        factor: scale > 0.
-        before: (3,) shift before scaling.
-        after: (3,) shift after scaling.
-    """
+    """Scale by ``factor`` > 0 and shift by (3,): means become ``factor * (mean + before) + after``, in float64."""
     means = (gaussians.means.astype(np.float64) + before) * factor + after
     log_scales = gaussians.log_scales.astype(np.float64) + math.log(factor)
     return replace(gaussians, means=means.astype(np.float32), log_scales=log_scales.astype(np.float32))

@@ -197,15 +197,7 @@ def parse_header(content: bytes, name: str) -> PlyHeader:
 
 
 def facts_in(comments: list[str], name: str, columns: Sequence[str] = ()) -> dict[str, Any]:
-    """Parse the comments that vvgt writes.
-
-    Args:
-        comments: all comment lines.
-        name: name of the file for errors.
-        columns: names of the file's columns.
-
-    Returns:
-        the `FileFacts` and the version that they state, by name.
+    """Return the `FileFacts` and the version that a file's comments state, by name; ``columns`` are the file's.
 
     Raises:
         DataError: a comment begins with "vvgt" and is not valid.

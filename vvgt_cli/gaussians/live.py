@@ -21,7 +21,7 @@ import numpy as np
 
 from vvgt_cli.gaussians.constants import MIN_ALPHA
 from vvgt_cli.gaussians.frames import factored, rotations
-from vvgt_cli.gaussians.live_facts import GRADIENT, LABEL_ROW, LAYER_NUMBER
+from vvgt_cli.gaussians.live_facts import GRADIENT, LABEL_ROW, LAYER_ID
 from vvgt_cli.gaussians.opacity import mean_opacity, projected_areas
 from vvgt_cli.gaussians.types import Gaussians
 from vvgt_cli.look.function import TransferFunctionLike
@@ -59,14 +59,10 @@ class Table:
 
     @classmethod
     def of_function(cls, tf: TransferFunctionLike, lo: float, hi: float, unit_distance: float, grain: float) -> Table:
-        """Return the table of a function.
+        """Return the table of a function on data values, whose opacity is per ``unit_distance``.
 
-        Args:
-            tf: function on data values.
-            lo: smallest value.
-            hi: largest value.
-            unit_distance: unit-frame length that its opacity refers to.
-            grain: a voxel's edge (`LiveFacts.grain`), unit-frame length, over which a value covers the background.
+        ``grain`` is a voxel's edge (`LiveFacts.grain`), over which a value covers the background; both are unit-frame
+        lengths.
         """
         x = lo + (hi - lo) * np.linspace(0, 1, FINE)
         tau = extinction(tf.opacity(x), unit_distance)
@@ -137,7 +133,7 @@ class LayerTables:
         """Return the `sums` (K, 6) for rows of `Gaussians.live`."""
         found = np.zeros((len(live), 6))
         for number, table in enumerate(self.tables):
-            own = np.flatnonzero(live[:, LAYER_NUMBER] == number)
+            own = np.flatnonzero(live[:, LAYER_ID] == number)
             found[own] = table.of(live[own])
         return found
 
@@ -167,25 +163,13 @@ def _under(fine: np.ndarray, nodes: np.ndarray) -> np.ndarray:
 
 
 def lengths(mass: np.ndarray, tau: np.ndarray, most: np.ndarray) -> np.ndarray:
-    """Return L (K,), unit-frame lengths, of Gaussians.
-
-    Args:
-        mass: (K,) optical masses.
-        tau: (K,) mean extinctions.
-        most: (K,) largest volumes that they can represent.
-    """
+    """Return L (K,), unit-frame lengths, from optical masses, mean extinctions and largest volumes, each (K,)."""
     found: np.ndarray = np.cbrt(np.minimum(mass / np.maximum(tau, 1e-30), most)).clip(SHORTEST, LONGEST)
     return found
 
 
 def baked(gaussians: Gaussians, table: Looks, pixel: float = 0.0) -> Gaussians:
-    """Give Gaussians that carry values the colours and opacities of a look for other viewers, without moving them.
-
-    Args:
-        gaussians: the Gaussians.
-        table: the look.
-        pixel: see `apply_look`.
-    """
+    """Give Gaussians the colours and opacities of a look for other viewers, without moving them; see `apply_look`."""
     assert gaussians.live is not None
     sums = table.of(gaussians.live)
     colors = sums[:, :TAU] / np.maximum(sums[:, TAU, None], 1e-30)
@@ -205,10 +189,7 @@ def visible_under(gaussians: Gaussians, table: Looks, pixel: float = 0.0) -> np.
 def apply_look(gaussians: Gaussians, table: Looks, pixel: float = 0.0) -> Gaussians:
     """Return Gaussians that carry values as ordinary, unlit Gaussians under a look.
 
-    Args:
-        gaussians: the Gaussians.
-        table: the look.
-        pixel: width of a pixel of the target screen at the volume's centre, unit frame.
+    ``pixel`` is the width of a pixel of the target screen at the volume's centre, unit frame.
     """
     assert gaussians.live is not None
     if not len(gaussians):

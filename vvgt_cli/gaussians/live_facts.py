@@ -18,8 +18,8 @@ from vvgt_cli.look.readers.minimal import read
 from vvgt_cli.volume import Statistics, Volume
 from vvgt_cli.volume.stats import BINS, edges_of
 
-COLUMNS, NORMAL, LABEL, LAYER = ("value", "spread", "length"), ("nx", "ny", "nz"), "label", "layer"
-VALUE_COLUMNS, LABEL_ROW, LAYER_NUMBER = slice(0, 3), 6, 7  # columns of `Gaussians.live`
+COLUMNS, NXYZ, LABEL, LAYER = ("value", "spread", "length"), ("nx", "ny", "nz"), "label", "layer"
+VALUES, LABEL_ROW, LAYER_ID = slice(0, 3), 6, 7  # columns of `Gaussians.live`
 GRADIENT = slice(3, 6)  # columns of `Gaussians.live`, stored as normals in a file
 SAMPLED = 64  # nodes of a function that cannot be stored exactly
 MOST_LABELS = 500  # labels that fit in a header
@@ -119,11 +119,7 @@ class LiveFacts:
 def function_text(tf: TransferFunction, lo: float, hi: float, several: int = 1) -> str:
     """Return a function on data values as one line of minimal JSON, resampled to `SAMPLED` nodes if necessary.
 
-    Args:
-        tf: the function.
-        lo: smallest value.
-        hi: largest value.
-        several: number of functions that must fit in a header.
+    ``several`` is the number of functions that must fit in a header.
     """
     try:
         text = json.dumps(json.loads(to_text(tf, "minimal")))
@@ -192,15 +188,7 @@ def _quoted(text: str) -> str:
 
 
 def live_facts(found: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> LiveFacts | None:
-    """Return the facts of a file.
-
-    Args:
-        found: the facts of the comments, one mapping per layer.
-        columns: the file's columns.
-
-    Returns:
-        the facts, None if comments or columns are missing.
-    """
+    """Merge the facts of comments, one mapping per layer; None if some, or some of the file's columns, are missing."""
     whole = set(COLUMNS) <= set(columns) and all("lo" in one for one in found)
     whole = whole and all(LABEL in columns if "labels" in one else "histogram" in one for one in found)
     if not whole or (len(found) > 1 and LAYER not in columns):

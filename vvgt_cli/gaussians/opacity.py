@@ -37,28 +37,19 @@ def inverse_dilogarithm(y: np.ndarray) -> np.ndarray:
 
 
 def peak_opacity(mass: np.ndarray, variances: np.ndarray, pixel: float) -> np.ndarray:
-    """Return the peak alpha (n,) in [0, 0.99] of Gaussians.
+    """Return the peak alpha (n,) in [0, 0.99] for optical masses (n,) and principal variances (n, 3).
 
     3DGS has one opacity for all views: this is the mean over the views along the three principal axes, weighted by
-    projected area.
-
-    Args:
-        mass: (n,) optical masses.
-        variances: (n, 3) principal variances.
-        pixel: width of a pixel at the Gaussian, unit-frame lengths, for the renderer's dilation.
+    projected area. ``pixel`` is the width of a pixel at the Gaussian, unit-frame lengths, for the renderer's dilation.
     """
     areas = projected_areas(variances, pixel)
     return mean_opacity(mass[:, None] / areas + MIN_ALPHA, areas)
 
 
 def opacity_when_reshaped(opacity: np.ndarray, before: np.ndarray, after: np.ndarray, pixel: float) -> np.ndarray:
-    """Return the peak alpha (n,) that preserves the optical mass of Gaussians when their shape changes.
+    """Return the peak alpha (n,) that preserves the optical mass of Gaussians of ``opacity`` (n,) in another shape.
 
-    Args:
-        opacity: (n,) peak alpha before.
-        before: (n, 3) principal variances before.
-        after: (n, 3) principal variances after, in the same order of axes.
-        pixel: see `peak_opacity`.
+    Principal variances ``before`` and ``after`` (n, 3) are in the same order of axes; see `peak_opacity` for ``pixel``.
     """
     areas = projected_areas(after, pixel)
     depths = np.maximum(dilogarithm(opacity) - MIN_ALPHA, 0)[:, None] * (projected_areas(before, pixel) / areas)

@@ -15,17 +15,7 @@ from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import seekable
 from vvgt_cli.gaussians.frames import rescale, turn, up_matrix
 from vvgt_cli.gaussians.header import REQUIRED, FileFacts, PlyHeader, comment_lines, parse_header, rest_names
-from vvgt_cli.gaussians.live_facts import (
-    COLUMNS,
-    GRADIENT,
-    LABEL,
-    LABEL_ROW,
-    LAYER,
-    LAYER_NUMBER,
-    NORMAL,
-    VALUE_COLUMNS,
-    LiveFacts,
-)
+from vvgt_cli.gaussians.live_facts import COLUMNS, GRADIENT, LABEL, LABEL_ROW, LAYER, LAYER_ID, NXYZ, VALUES, LiveFacts
 from vvgt_cli.gaussians.types import HARMONICS, SH_C0, Gaussians
 from vvgt_cli.volume.space import axis_facts
 
@@ -93,16 +83,11 @@ def write_ply(
     options: PlyOptions | None = None,
     normals: np.ndarray | None = None,
 ) -> int:
-    """Write Gaussians to a path or a binary stream, and return the number of bytes.
+    """Write Gaussians (unit frame) to a path or a binary stream, and return the number of bytes.
 
     A path is written directly: callers that must not leave a partial file pass the temporary name of
-    `vvgt_cli.files.atomic_write`. The bytes depend only on the arguments and the version.
-
-    Args:
-        target: path or binary stream.
-        gaussians: Gaussians in the unit frame.
-        options: layout and facts of the file.
-        normals: (K, 3) normals in the unit frame, by default zeros.
+    `vvgt_cli.files.atomic_write`. The bytes depend only on the arguments and the version. ``normals`` (K, 3), unit
+    frame, are zeros by default.
 
     Raises:
         DataError: there are no Gaussians, or a value does not fit in float32 in the chosen frame.
@@ -155,7 +140,7 @@ def ply_rows(gaussians: Gaussians, options: PlyOptions, normals: np.ndarray | No
     rows[:, end - 7 : end - 4] = placed.log_scales
     rows[:, end - 4 : end] = placed.quaternions
     if placed.live is not None:
-        rows[:, 3:6], rows[:, end:] = placed.live[:, GRADIENT], placed.live[:, VALUE_COLUMNS]
+        rows[:, 3:6], rows[:, end:] = placed.live[:, GRADIENT], placed.live[:, VALUES]
         if options.live is not None:
             return _with_numbers(rows, placed.live, options.live)
     return rows
@@ -182,7 +167,7 @@ def _numbers(facts: LiveFacts) -> list[tuple[str, str, str, int]]:
     if labels:
         found.append((LABEL, *(("uchar", "u1") if labels <= 256 else ("ushort", "<u2")), LABEL_ROW))
     if facts.others:
-        found.append((LAYER, "uchar", "u1", LAYER_NUMBER))
+        found.append((LAYER, "uchar", "u1", LAYER_ID))
     return found
 
 
@@ -290,10 +275,10 @@ def _values(header: PlyHeader, columns: Callable[..., np.ndarray]) -> np.ndarray
     if header.live is None:
         return None
     facts, numbers = header.live, _numbers(header.live)
-    found = columns(*COLUMNS, *NORMAL, *(name for name, *_ in numbers))
+    found = columns(*COLUMNS, *NXYZ, *(name for name, *_ in numbers))
     if facts.others and not facts.most_labels:
         found = np.insert(found, LABEL_ROW, 0, axis=1)
-    layer = found[:, LAYER_NUMBER].astype(np.int64) if facts.others else np.zeros(len(found), np.int64)
+    layer = found[:, LAYER_ID].astype(np.int64) if facts.others else np.zeros(len(found), np.int64)
     if layer.max(initial=0) >= len(facts.layers):
         raise DataError(f"layer number {layer.max()}; expected less than {len(facts.layers)}")
     if facts.most_labels:
@@ -332,7 +317,7 @@ def live_summary(gaussians: Gaussians, facts: LiveFacts) -> dict[str, object]:
     if facts.others:
         rows_of_layers: list[dict[str, object]] = []
         for k, layer in enumerate(facts.layers):
-            own = gaussians.take(np.flatnonzero(gaussians.live[:, LAYER_NUMBER] == k))
+            own = gaussians.take(np.flatnonzero(gaussians.live[:, LAYER_ID] == k))
             look = {"labels": len(layer.labels)} if layer.labels else {
                 "values": [layer.lo, layer.hi], "function": layer.baked().get("name", ""),
             }  # fmt: skip

@@ -55,10 +55,7 @@ class Rule:
         return np.array([self.dilation, self.compensate, self.min_alpha, reach, self.min_variance], np.float64)
 
     def blending(self) -> np.ndarray:
-        """Return the parameters of `tiles.blend`, (6,) float32.
-
-        These are min_alpha, max_alpha, -reach / 8, the falloff's factor and offset, and min_transmittance.
-        """
+        """Return `tiles.blend`'s (6,): min_alpha, max_alpha, -reach / 8, falloff scale and shift, min_transmittance."""
         reach = min(self.reach, FARTHEST)
         rest = math.exp(-self.reach) if self.shifted else 0.0
         falloff = 1 / (1 - rest), rest / (1 - rest)

@@ -96,7 +96,7 @@ def _stamp(out: np.ndarray, place: np.ndarray, radius: float, value: float) -> N
 
 
 def plates(size: int, seed: int) -> np.ndarray:
-    """Return metal parts: thin plates, bars and blocks at any angle, some drilled, with sharp edges and a value each."""
+    """Return metal parts: thin plates, bars and blocks at any angle, some drilled, each with a value."""
     rng = np.random.default_rng(seed)
     grid = _grid(size)
     out = np.zeros((size,) * 3)

@@ -41,10 +41,7 @@ def gsply(source: str) -> Any:
 def compressed_ply(splats: Splats, name: str, order: np.ndarray | None = None) -> bytes:
     """Encode columns as a `.compressed.ply`: 16 bytes per Gaussian, and 72 per chunk of 256 neighbours.
 
-    Args:
-        splats: the columns.
-        name: name of the file for errors.
-        order: (K,) order of the Gaussians, by default along the Morton curve.
+    ``order`` (K,) of the Gaussians is by default along the Morton curve.
     """
     library = gsply(name)
     s = splats.take(morton_order(splats.means) if order is None else order)

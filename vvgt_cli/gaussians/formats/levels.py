@@ -76,11 +76,7 @@ class StreamedLevels:
         return self._at_levels([int(chosen or 0)] * len(self._nodes))
 
     def seen_from(self, eye: np.ndarray, field: float) -> Splats:
-        """Read the Gaussians that the engine shows from a position.
-
-        Args:
-            eye: (3,) position in the frame of a `.ply`.
-            field: field of view in degrees.
+        """Read the Gaussians that the engine shows from ``eye`` (3,), in the frame of a `.ply`, with ``field`` degrees.
 
         Raises:
             DataError: nodes have no bounds; see also `level`.

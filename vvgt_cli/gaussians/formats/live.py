@@ -36,7 +36,7 @@ from vvgt_cli.gaussians.live import (
     VALUE,
     WIDEST,
 )
-from vvgt_cli.gaussians.live_facts import GRADIENT, LABEL_ROW, LAYER_NUMBER, LiveFacts
+from vvgt_cli.gaussians.live_facts import GRADIENT, LABEL_ROW, LAYER_ID, LiveFacts
 from vvgt_cli.gaussians.types import Gaussians
 
 BYTES = 8
@@ -45,15 +45,12 @@ BYTES = 8
 def live_bytes(gaussians: Gaussians, facts: LiveFacts, logs: tuple[float, float] | None = None) -> np.ndarray:
     """Return the bytes (K, 8) uint8 of Gaussians that carry values, with directions in the Gaussians' frame.
 
-    Args:
-        gaussians: the Gaussians.
-        facts: facts about their values.
-        logs: `log_lengths` of all Gaussians in the page, by default of these.
+    ``logs`` are the `log_lengths` of all Gaussians in the page, by default of these.
     """
     assert gaussians.live is not None
     live = gaussians.live.astype(np.float64)
     first, last = logs or log_lengths([gaussians])
-    number = live[:, LAYER_NUMBER] if facts.others else np.zeros(len(live))
+    number = live[:, LAYER_ID] if facts.others else np.zeros(len(live))
     lo, width = (np.array(ends)[number.astype(np.int64)] for ends in _ranges(facts.layers))
     out = np.zeros((len(live), BYTES), np.uint8)
     out[:, 0] = _byte((live[:, VALUE] - lo) / width)

@@ -19,7 +19,7 @@ from vvgt_cli.gaussians.formats.page_file import html_of_several, title_of, upri
 from vvgt_cli.gaussians.formats.splats import Splats, morton_order, splats_of
 from vvgt_cli.gaussians.frames import turn, up_matrix
 from vvgt_cli.gaussians.live import law_nodes
-from vvgt_cli.gaussians.live_facts import LABEL_ROW, LAYER_NUMBER, LiveFacts
+from vvgt_cli.gaussians.live_facts import LABEL_ROW, LAYER_ID, LiveFacts
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.lighting import MOST, Lighting
 from vvgt_cli.look.readers.minimal import read
@@ -132,7 +132,7 @@ def renumbered(gaussians: Gaussians, own: LiveFacts, facts: LiveFacts) -> Gaussi
     for number, (one, all_) in enumerate(zip(own.layers, facts.layers, strict=True)):
         if one.labels != all_.labels:
             rows = {(label.number, label.name): row for row, label in enumerate(all_.labels)}
-            mine = live[:, LAYER_NUMBER] == number if facts.others else np.full(len(live), True)
+            mine = live[:, LAYER_ID] == number if facts.others else np.full(len(live), True)
             to = np.array([rows[label.number, label.name] for label in one.labels])
             live[mine, LABEL_ROW] = to[live[mine, LABEL_ROW].astype(np.int64)]
     return replace(gaussians, live=live)
@@ -176,11 +176,7 @@ def _light(lighting: Lighting | None, axes: np.ndarray) -> dict[str, Any]:
 
 
 def parse_light(sent: Any, options: PlyOptions) -> Lighting | None:
-    """Parse a light sent by the page, in the format of `_light`.
-
-    Args:
-        sent: the parsed JSON.
-        options: options of the page's file.
+    """Parse the JSON of a light sent by the page of a file with these options, in the format of `_light`.
 
     Raises:
         DataError, UsageError: the light is not valid.

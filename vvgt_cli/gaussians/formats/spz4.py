@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.gaussians.formats.splats import ROW_BYTES, HARMONICS
+from vvgt_cli.gaussians.formats.splats import HARMONICS, ROW_BYTES
 from vvgt_cli.volume.blocks import check_memory
 from vvgt_cli.volume.libraries import library_errors, need
 
@@ -60,8 +60,7 @@ def to_version_3(content: bytes, name: str) -> tuple[bytes, list[str]]:
     """Convert a file of version 4 to version 3, compressed by gzip, and return it with our comments.
 
     Raises:
-        DataError: the file is not valid, has axes other than a `.ply`'s or does not fit in memory, or numcodecs is not
-            installed.
+        DataError: the file is not valid, has other axes than a `.ply` or exceeds memory, or numcodecs is missing.
     """
     try:
         _, version, count, degree, fraction, flags, streams, table = _HEAD.unpack_from(content)
@@ -79,9 +78,7 @@ def to_version_3(content: bytes, name: str) -> tuple[bytes, list[str]]:
         size, whole = _SIZES.unpack_from(content, table + number * _SIZES.size)
         part = content[start : start + size]
         if whole != length or len(part) != size:
-            raise DataError(
-                f"{name}: stream {number} has {whole} bytes compressed to {len(part)}; expected {length} to {size}"
-            )
+            raise DataError(f"{name}: stream {number} is {whole} bytes in {len(part)}; expected {length} in {size}")
         with library_errors(name, "an .spz of version 4"):
             body.append(_unpacked(zstd, part, length, f"{name}: stream {number}"))
         start += size
