@@ -179,7 +179,7 @@ def test_pieces_follow_from_the_volume_and_come_front_to_back():
     assert len(set(met)) > 3
 
 
-def test_init_in_blocks_says_its_error_against_the_volume(vvgt, tmp_path):
+def test_init_in_blocks_reports_its_error_against_the_volume(vvgt, tmp_path):
     path = tmp_path / "v_100x90x80_uint8.raw"
     path.write_bytes(np.round(bodies() * 255).astype(np.uint8).tobytes())
     notes = []

@@ -127,7 +127,7 @@ def test_a_library_that_is_missing_is_named_before_the_work(ending, module, tmp_
     assert not list(tmp_path.iterdir())
 
 
-def test_an_old_openusd_is_told(monkeypatch):
+def test_an_old_openusd_is_reported(monkeypatch):
     usd = pytest.importorskip("pxr.Usd")
     monkeypatch.setattr(usd, "GetVersion", lambda: (0, 25, 11))
     with pytest.raises(
@@ -223,7 +223,7 @@ def test_a_usd_stage_is_turned_upright():
         assert tuple(round(v, 6) for v in up) == (0, 1, 0)  # PLY -y is up
 
 
-def test_convert_says_what_the_format_costs(tmp_path, vvgt):
+def test_convert_reports_the_error_of_the_format(tmp_path, vvgt):
     little = ("--max-gaussians", 300, "--size", 64, "--steps", 24, "--tf", "viridis", "--report", tmp_path / "r.json")
     result = vvgt("convert", "example:marschner-lobb:16", *little, "-o", tmp_path / "a.spz")
     assert result.code == 0, result.err
@@ -239,7 +239,7 @@ def test_convert_says_what_the_format_costs(tmp_path, vvgt):
     assert json.loads(scored.out)["size"] == 64
 
 
-def test_view_writes_formats_and_says_how_near_they_are(tmp_path, vvgt):
+def test_view_writes_formats_and_reports_their_error(tmp_path, vvgt):
     write_ply(tmp_path / "a.ply", cloud(), PlyOptions(made_for=64))
     for ending, least in ((".html", 35), (".spz", 30), (".glb", 80), (".usdc", 80), (".ply", None)):
         result = vvgt("view", tmp_path / "a.ply", "-o", tmp_path / f"b{ending}")

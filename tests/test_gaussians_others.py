@@ -224,7 +224,7 @@ def test_faulty_compressed_files(tmp_path: Path, content: bytes, said: str) -> N
         read(tmp_path, content)
 
 
-def test_our_own_compressed_files_keep_what_they_say(tmp_path: Path) -> None:
+def test_our_own_compressed_files_keep_their_comments(tmp_path: Path) -> None:
     stream = io.BytesIO()
     gaussians = read_ply(io.BytesIO(ply(GOOD)))[0]
     write_ply(stream, gaussians, PlyOptions())

@@ -112,7 +112,7 @@ def test_layout_is_the_one_that_loaders_count_on():
 
 
 @pytest.mark.parametrize(("degree", "size"), [(0, 68), (1, 104), (2, 164), (3, 248)])
-def test_sh_padding_is_zero_and_comments_can_be_left_out(degree, size):
+def test_sh_padding_is_zero_and_comments_are_optional(degree, size):
     content = written(random_gaussians(3), sh_degree=degree, comments=False)
     assert b"comment" not in content
     rows = np.frombuffer(content.split(b"end_header\n", 1)[1], "<f4").reshape(3, size // 4)

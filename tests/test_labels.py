@@ -173,7 +173,7 @@ def test_of_several_layers_one_may_be_hidden(vvgt, tmp_path: Path, seg: Path) ->
         assert (done.code, "none of its labels is visible" in done.error) == (1, True), done.error
 
 
-def test_a_recognised_label_map_is_said_and_none_takes_it_back(vvgt, tmp_path: Path, seg: Path) -> None:
+def test_a_recognised_label_map_is_reported_and_none_reads_scalars(vvgt, tmp_path: Path, seg: Path) -> None:
     with pytest.warns(UserWarning, match="balls_seg: read as a label map by its name"):
         done = vvgt("init", seg, *SMALL[:4], "-o", tmp_path / "a.ply")
     assert "distinct colours" in done.err
@@ -354,7 +354,7 @@ def test_labels_of_a_series_are_those_that_there_are(vvgt, tmp_path: Path) -> No
     assert np.median(near) < 0.1
 
 
-def test_tables_are_listed_and_told_from_functions(vvgt, tmp_path: Path) -> None:
+def test_tables_are_listed_and_distinguished_from_functions(vvgt, tmp_path: Path) -> None:
     for text, name in ((SLICER, "a.ctbl"), (FREESURFER, "LUT.txt"), (SNAP, "a.label"), (JSON, "a.json")):
         path = table(tmp_path, text, name)
         facts = json.loads(vvgt("info", path, "--json").out)
@@ -373,7 +373,7 @@ def test_tables_are_listed_and_told_from_functions(vvgt, tmp_path: Path) -> None
     assert "notes.txt" in vvgt("info", tmp_path / "notes.txt").error
 
 
-def test_evaluate_says_where_the_labels_are_others(vvgt, tmp_path: Path, seg: Path) -> None:
+def test_evaluate_reports_different_labels(vvgt, tmp_path: Path, seg: Path) -> None:
     ply, labels = tmp_path / "a.ply", table(tmp_path, JSON, "a.json")
     assert vvgt("init", seg, "--labels", labels, *SMALL[:4], "-o", ply).code == 0
     again = table(

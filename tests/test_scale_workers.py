@@ -338,7 +338,7 @@ def jobs(slurm, monkeypatch):
     return lambda: dask_runner.DaskRunner("slurm", 2, 1)
 
 
-def test_slurm_jobs_that_all_end_before_they_work_are_said(slurm, jobs, monkeypatch):
+def test_slurm_jobs_that_all_end_early_are_reported(slurm, jobs, monkeypatch):
     monkeypatch.setenv("SLURM_FIRST", "echo no python here; exit 3")
     with (
         jobs() as runner,
@@ -368,7 +368,7 @@ def test_slurm_jobs_that_are_long_in_coming_are_waited_for(jobs, monkeypatch):
     assert told == [(1, 3), (2, 3), (3, 3)]
 
 
-def test_a_disk_without_room_for_the_blocks_is_said_before_they_are_made(vvgt, raw, tmp_path, monkeypatch):
+def test_a_full_disk_is_reported_before_blocks_are_written(vvgt, raw, tmp_path, monkeypatch):
     disk = SimpleNamespace(f_frsize=512, f_blocks=100000, f_bavail=2000)
     monkeypatch.setattr(os, "statvfs", lambda folder: disk)
     run = vvgt("init", raw, "-o", tmp_path / "a.ply", *FIT, *SIZE)

@@ -79,7 +79,7 @@ def decoded(files: dict[str, bytes], i: int) -> tuple[list[float], ...]:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_every_pixel_says_what_the_engine_takes_it_for(degree: int) -> None:
+def test_every_pixel_decodes_as_in_the_engine(degree: int) -> None:
     before = some(70, degree)
     content = sog(before, "a")
     files, after = members(content), read_sog(content, "a")

@@ -239,7 +239,7 @@ def test_what_another_run_has_put_in_the_folder_is_written_again(tmp_path: Path)
     assert (tmp_path / "0_0" / "meta.json").stat().st_mtime_ns == before
 
 
-def test_an_existing_folder_is_replaced_only_when_told(vvgt, volume: Path, folder: Path) -> None:
+def test_an_existing_folder_is_replaced_only_on_request(vvgt, volume: Path, folder: Path) -> None:
     manifest = json.loads((folder / "lod-meta.json").read_text())
     manifest["filenames"].append("3_7/meta.json")
     (folder / "lod-meta.json").write_text(json.dumps(manifest))
@@ -284,7 +284,7 @@ def test_the_page_and_its_files_are_served(folder: Path, tmp_path: Path) -> None
         assert ask(url, f"{path}../secret")[0] == 404
 
 
-def test_a_folder_with_a_file_missing_is_told(vvgt, folder: Path, tmp_path: Path) -> None:
+def test_a_folder_with_a_missing_file_is_reported(vvgt, folder: Path, tmp_path: Path) -> None:
     (tmp_path / "lod-meta.json").write_bytes((folder / "lod-meta.json").read_bytes())
     found = vvgt("view", tmp_path, "--no-browser")
     assert (found.code, "is missing; expected the whole folder" in found.error) == (1, True)
@@ -374,7 +374,7 @@ def test_only_what_a_camera_is_shown_is_read_and_kept(folder: Path, monkeypatch:
         assert sum(map(len, levels._cached.values())) == len(seen)
 
 
-def test_levels_that_cannot_be_read_are_told_in_a_line(vvgt, folder: Path, tmp_path: Path) -> None:
+def test_levels_that_cannot_be_read_are_reported_in_one_line(vvgt, folder: Path, tmp_path: Path) -> None:
     broken = tmp_path / "b"
     shutil.copytree(folder, broken)
     (broken / "1_0" / "sh0.webp").unlink()
