@@ -16,7 +16,7 @@ from vvgt_cli.cli.main import COMMANDS
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "vvgt_cli"
 ROOMS = (
-    *("version", "errors", "resources", "progress", "files", "jit", "volume", "look", "cameras", "images"),
+    *("version", "errors", "defaults", "resources", "progress", "files", "jit", "volume", "look", "cameras", "images"),
     *("gaussians", "synth", "dvr", "splat", "closed_form", "refine", "network", "score", "field"),
     *("conversion", "checks", "commands", "library", "cli"),
 )
