@@ -11,8 +11,8 @@ from tests.closed_form_scenes import Above, Ramp, Tent, scene_of
 from vvgt_cli.closed_form import moments as moments_module
 from vvgt_cli.closed_form import straight as straight_module
 from vvgt_cli.closed_form.moments import Cells, base_cells, exponents
-from vvgt_cli.closed_form.ranges import ranges_of
 from vvgt_cli.dvr import Scene
+from vvgt_cli.dvr.bricks import ranges_of
 from vvgt_cli.dvr.layout import BRICK, Voxels
 from vvgt_cli.look.tables import Optics, extinction
 from vvgt_cli.synth import analytic

@@ -272,7 +272,7 @@ def stepped(tmp_path_factory):
 def test_files_hold_machine_code_and_the_names_of_symbols():
     import llvmlite.binding as llvm
 
-    from vvgt_cli.jit.cache import _unlinked
+    from vvgt_cli.jit.numba_internals import symbols_of
 
     text = """
     declare double @outside(double)
@@ -283,9 +283,7 @@ def test_files_hold_machine_code_and_the_names_of_symbols():
       ret double %z
     }"""
     whole = llvm.parse_assembly(text).as_bitcode()
-    name, kind, (code, kept) = _unlinked(("k", "object", (b"code", whole)))
-    assert (name, kind, code) == ("k", "object", b"code")
-    left = llvm.parse_bitcode(kept)
+    left = llvm.parse_bitcode(symbols_of(whole))
     assert [f.name for f in left.functions if not f.is_declaration] == ["f$2"]
     assert [v.name for v in left.global_variables if not v.is_declaration] == ["env.<1>"]
     assert "fadd" not in str(left)
@@ -314,14 +312,12 @@ def test_no_kernel_calls_another():
 
 def test_the_order_of_fields_is_part_of_what_a_kernel_is_kept_under():
     from numba import types
-    from numba.core.registry import cpu_target
 
     from vvgt_cli.splat.tiles import reduce_pairs
 
     pairs = [types.BaseTuple.from_types((types.f8, types.f8), namedtuple("Pair", fields)) for fields in ("a b", "b a")]
-    codegen = cpu_target.target_context.codegen()
     assert len({repr(pair) for pair in pairs}) == 1
-    assert len({reduce_pairs._cache.file((pair,), codegen) for pair in pairs}) == 2
+    assert len({reduce_pairs.kernel_cache.file((pair,)) for pair in pairs}) == 2
 
 
 @pytest.mark.parametrize(

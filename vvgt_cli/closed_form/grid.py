@@ -13,7 +13,7 @@ from vvgt_cli.dvr.layout import GRID, Texels
 from vvgt_cli.dvr.vectors import add, lane, mix, texel, zeros4
 from vvgt_cli.dvr.vectors import row as row_of
 from vvgt_cli.jit.decorators import inlined, parallel_kernel
-from vvgt_cli.jit.parts import Part, turns_of
+from vvgt_cli.jit.threads import ThreadSlice, iterations
 
 _jit = inlined(fastmath=FLAGS, error_model="numpy")
 
@@ -63,7 +63,7 @@ def _gather(
 
 @parallel_kernel("Texels f8:2 i8:1 f8:1 f8:1 f8:1 f8:1 f8:5", GRID, fastmath=FLAGS, error_model="numpy")
 def grid_moments(
-    part: Part,
+    thread: ThreadSlice,
     texels: Texels, blocks: np.ndarray, points: np.ndarray, cell: np.ndarray, half: np.ndarray, step: np.ndarray,
     begin: np.ndarray, out: np.ndarray,
 ) -> None:  # fmt: skip
@@ -72,7 +72,7 @@ def grid_moments(
     nz, ny, nx, _ = values.shape
     dx, dy, dz = cell[0] / points[0], cell[1] / points[1], cell[2] / points[2]
     box = dx * step[0], dy * step[1], dz * step[2]
-    for b in turns_of(part, blocks.shape[0]):
+    for b in iterations(thread, blocks.shape[0]):
         out[b] = 0.0
         x0, y0, z0 = blocks[b]
         first = math.floor(x0 - 0.5)

@@ -17,7 +17,7 @@ from vvgt_cli.closed_form.moments import Cells
 from vvgt_cli.closed_form.visibility import summed
 from vvgt_cli.dvr.kernel import sample
 from vvgt_cli.jit.decorators import inlined, parallel_kernel
-from vvgt_cli.jit.parts import Part, turns_of
+from vvgt_cli.jit.threads import ThreadSlice, iterations
 
 OPAQUE_DEPTH = 5.0  # optical depth a voxel at which a cell counts as wholly opaque; half of it is the surface
 SURFACE = 0.5  # of that
@@ -94,10 +94,10 @@ def smoothed(field: np.ndarray, edge: np.ndarray, half: np.ndarray) -> Opaque:
 
 
 @parallel_kernel("f4:3 i8 i8 i8 f4:3")
-def _blur(part: Part, field: np.ndarray, dz: int, dy: int, dx: int, out: np.ndarray) -> None:
+def _blur(thread: ThreadSlice, field: np.ndarray, dz: int, dy: int, dx: int, out: np.ndarray) -> None:
     """[1, 2, 1] / 4 along the axis of which d is 1, edges clamped; ``field`` and ``out`` (nz, ny, nx)."""
     nz, ny, nx = field.shape
-    for k in turns_of(part, nz):
+    for k in iterations(thread, nz):
         for j in range(ny):
             before = field[max(k - dz, 0), max(j - dy, 0)]
             after = field[min(k + dz, nz - 1), min(j + dy, ny - 1)]
@@ -136,7 +136,7 @@ def _inwards(smooth: np.ndarray, x: float, y: float, z: float, edge: np.ndarray)
 
 @parallel_kernel("f4:3 f8:2 f8:1 f8:1 f8:1 f8:3")
 def _press(
-    part: Part,
+    thread: ThreadSlice,
     smooth: np.ndarray,
     means: np.ndarray,
     half: np.ndarray,
@@ -149,7 +149,7 @@ def _press(
     ``smooth``, ``half`` (3,), ``edge`` (3,) of `Opaque`.
     """
     small = min(edge[0], edge[1], edge[2])
-    for k in turns_of(part, means.shape[0]):
+    for k in iterations(thread, means.shape[0]):
         x, y, z = (
             (means[k, 0] + half[0]) / edge[0] - 0.5,
             (means[k, 1] + half[1]) / edge[1] - 0.5,
@@ -166,7 +166,7 @@ def _press(
 
 @parallel_kernel("f4:3 f4:3 f8:2 f8:1 f8:1 f8:3 f8:1 f8 f8 f8:2")
 def _shift(
-    part: Part,
+    thread: ThreadSlice,
     field: np.ndarray, smooth: np.ndarray, means: np.ndarray, half: np.ndarray, edge: np.ndarray, cov: np.ndarray,
     reach: np.ndarray, dilation: float, far: float, out: np.ndarray,
 ) -> None:  # fmt: skip
@@ -177,7 +177,7 @@ def _shift(
     small = min(edge[0], edge[1], edge[2])
     stride = 0.25 * small
     limit = int(far / stride)
-    for k in turns_of(part, means.shape[0]):
+    for k in iterations(thread, means.shape[0]):
         x, y, z = (
             (means[k, 0] + half[0]) / edge[0] - 0.5,
             (means[k, 1] + half[1]) / edge[1] - 0.5,

@@ -26,7 +26,7 @@ from vvgt_cli.gaussians.frames import rotations
 from vvgt_cli.gaussians.harmonics import C2, basis
 from vvgt_cli.gaussians.types import HARMONICS, SH_C0
 from vvgt_cli.jit.decorators import parallel_kernel
-from vvgt_cli.jit.parts import Part, turns_of
+from vvgt_cli.jit.threads import ThreadSlice, iterations
 
 NORMALS, TINT, FIXED, MEAN, ARRIVING = slice(1, 7), slice(7, 10), slice(10, 13), slice(13, 16), 16
 SEEN_LITTLE = 1e-12  # of the mass: all of it counts where the cameras see no more
@@ -37,13 +37,13 @@ BRIGHTEST = 2.0  # as `vvgt_cli.closed_form.fit` has it
 
 @parallel_kernel("Voxels Optics f8:1 f8:2 f8:2", LIT, fastmath=FLAGS, error_model="numpy")
 def point_normals(
-    part: Part, voxels: Voxels, optics: Optics, edge: np.ndarray, points: np.ndarray, out: np.ndarray
+    thread: ThreadSlice, voxels: Voxels, optics: Optics, edge: np.ndarray, points: np.ndarray, out: np.ndarray
 ) -> None:
     """Normal (x, y, z) and extinction at voxel coordinates ``points`` (n, 3), into ``out`` (n, 4).
 
     ``edge`` (3,) of `Light`; extinction per unit-frame length, the edge voxels' beyond the box.
     """
-    for k in turns_of(part, len(points)):
+    for k in iterations(thread, len(points)):
         x, y, z = points[k, 0], points[k, 1], points[k, 2]
         out[k, 0], out[k, 1], out[k, 2] = normal(voxels.values, edge, x, y, z)
         u = table_coordinate(sample(voxels.values, x, y, z), optics)
@@ -52,7 +52,7 @@ def point_normals(
 
 @parallel_kernel("Light f8:2 f8:2 i8:1 i8:1 f8:1 f8:1 f8:2", LIT, fastmath=FLAGS, error_model="numpy")
 def _shade(
-    part: Part,
+    thread: ThreadSlice,
     light: Light,
     normals: np.ndarray,
     moments: np.ndarray,
@@ -68,7 +68,7 @@ def _shade(
     the view, times n, and what arrives of each light. ``normals`` (n, 3) at the rows' centroids; ``half``, ``step``
     (3,) of `Scene`.
     """
-    for k in turns_of(part, len(first)):
+    for k in iterations(thread, len(first)):
         row = out[k]
         row[:] = 0.0
         mass = seen = 0.0

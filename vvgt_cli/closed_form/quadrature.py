@@ -14,7 +14,7 @@ from vvgt_cli.closed_form.columns import BLUE, GREEN, MASS, MOMENTS, RED, XX, XY
 from vvgt_cli.dvr.kernel import FLAGS, mean_optics, table_coordinate
 from vvgt_cli.dvr.layout import TUPLES, Optics, Voxels
 from vvgt_cli.jit.decorators import inlined, parallel_kernel
-from vvgt_cli.jit.parts import Part, turns_of
+from vvgt_cli.jit.threads import ThreadSlice, iterations
 
 Between = tuple[int, int, float, float]  # of `between`
 Rows = tuple[np.ndarray, np.ndarray, np.ndarray]  # of `_rows`
@@ -164,7 +164,7 @@ def shift_moments(row: np.ndarray, x: float, y: float, z: float, d: tuple[float,
 
 @parallel_kernel("Voxels Optics f8:2 i8:1 f8:1 f8:1 f8:1 f8:1 f8:5", TUPLES, fastmath=FLAGS, error_model="numpy")
 def block_moments(
-    part: Part,
+    thread: ThreadSlice,
     voxels: Voxels,
     optics: Optics,
     blocks: np.ndarray,
@@ -184,7 +184,7 @@ def block_moments(
     nz, ny, nx = voxels.values.shape
     dx, dy, dz = cell[0] / points[0], cell[1] / points[1], cell[2] / points[2]
     box = dx * step[0], dy * step[1], dz * step[2]
-    for b in turns_of(part, blocks.shape[0]):
+    for b in iterations(thread, blocks.shape[0]):
         out[b] = 0.0
         x0, y0, z0 = blocks[b]
         first = math.floor(x0 - 0.5)
@@ -220,7 +220,7 @@ def block_moments(
 
 @parallel_kernel("f8:5 i8:1 i8:1 f8:2 i4:2")
 def compact(
-    part: Part, dense: np.ndarray, order: np.ndarray, start: np.ndarray, moments: np.ndarray, cells: np.ndarray
+    thread: ThreadSlice, dense: np.ndarray, order: np.ndarray, start: np.ndarray, moments: np.ndarray, cells: np.ndarray
 ) -> None:
     """Rows with mass of ``dense`` (n, cells z, cells y, cells x, 13), block by block, by ``order`` within a block.
 
@@ -228,7 +228,7 @@ def compact(
     (rows, 13) and ``cells`` (rows, 3), which get the cells' (x, y, z) in their block.
     """
     cy, cx = dense.shape[2], dense.shape[3]
-    for b in turns_of(part, dense.shape[0]):
+    for b in iterations(thread, dense.shape[0]):
         to = start[b]
         for cell in order:
             x, y, z = cell % cx, cell // cx % cy, cell // (cx * cy)

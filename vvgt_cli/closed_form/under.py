@@ -11,7 +11,7 @@ from vvgt_cli.dvr.layout import TUPLES, Voxels
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.frames import rotations
 from vvgt_cli.jit.decorators import parallel_kernel
-from vvgt_cli.jit.parts import Part, turns_of
+from vvgt_cli.jit.threads import ThreadSlice, iterations
 
 POINTS = 48  # a Gaussian
 NARROW = 0.7  # standard deviations of the points: where Gaussians overlap the values are the neighbours' too
@@ -45,7 +45,7 @@ def _radical(k: int, base: int) -> float:
 
 @parallel_kernel("Voxels f8:2 f8:3 f8:2 i8:1 i8:1 i8:1 f4:2", TUPLES, fastmath=FLAGS, error_model="numpy")
 def sample_points(
-    part: Part,
+    thread: ThreadSlice,
     voxels: Voxels, centres: np.ndarray, arms: np.ndarray, points: np.ndarray, begin: np.ndarray, lo: np.ndarray,
     hi: np.ndarray, out: np.ndarray,
 ) -> None:  # fmt: skip
@@ -54,7 +54,7 @@ def sample_points(
     All in voxel coordinates of the volume, of which ``begin`` (3,) is the first of ``voxels``. Written are values of
     points within the voxels ``lo`` to ``hi`` (3,), each half an edge to either side of its centre.
     """
-    for k in turns_of(part, len(centres)):
+    for k in iterations(thread, len(centres)):
         for m in range(len(points)):
             p0, p1, p2 = points[m, 0], points[m, 1], points[m, 2]
             x = centres[k, 0] + (arms[k, 0, 0] * p0 + arms[k, 0, 1] * p1 + arms[k, 0, 2] * p2)

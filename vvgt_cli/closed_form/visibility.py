@@ -16,7 +16,7 @@ from vvgt_cli.closed_form.pyramid import look_up
 from vvgt_cli.dvr.kernel import FLAGS, absorbed
 from vvgt_cli.dvr.render import BoxGeometry, camera_arrays
 from vvgt_cli.jit.decorators import inlined, kernel, parallel_kernel
-from vvgt_cli.jit.parts import Part, turns_of
+from vvgt_cli.jit.threads import ThreadSlice, iterations
 
 MAX_CELLS = 1 << 21
 MIN_RAYS = 8  # that meet a cell: with fewer, some cells are met by none and count as hidden
@@ -118,7 +118,7 @@ def _deposit(extinction: np.ndarray, p: Vector, d: Vector, sums: np.ndarray) -> 
 
 @parallel_kernel("f4:3 f8:2 f8:3 f8:2 i8 f8:1 f4:5", fastmath=FLAGS, error_model="numpy")
 def march(
-    part: Part,
+    thread: ThreadSlice,
     extinction: np.ndarray,
     eyes: np.ndarray,
     bases: np.ndarray,
@@ -133,7 +133,7 @@ def march(
     a cell in voxels.
     """
     workers = sums.shape[0]
-    for worker in turns_of(part, workers):
+    for worker in iterations(thread, workers):
         for job in range(worker, eyes.shape[0] * size, workers):
             view, row = job // size, job % size
             eye, basis, lens = eyes[view], bases[view], lenses[view]

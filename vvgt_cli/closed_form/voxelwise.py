@@ -17,7 +17,7 @@ from vvgt_cli.dvr.kernel import FLAGS, U, mean_optics
 from vvgt_cli.dvr.layout import BRICK, TUPLES, Optics, Voxels
 from vvgt_cli.dvr.vectors import add, lane, row, scale, sub
 from vvgt_cli.jit.decorators import inlined, parallel_kernel
-from vvgt_cli.jit.parts import Part, turns_of
+from vvgt_cli.jit.threads import ThreadSlice, iterations
 
 EDGE = BRICK + 2  # of a brick with a voxel around it
 PLANE = EDGE * EDGE
@@ -205,7 +205,7 @@ def _add_row(
 
 @parallel_kernel("Voxels Optics f8:1 f8:2 i8:1 f8:1 f8:1 f8:1 f8:5", TUPLES, fastmath=FLAGS, error_model="numpy")
 def voxel_moments(
-    part: Part,
+    thread: ThreadSlice,
     voxels: Voxels, optics: Optics, straight: np.ndarray, blocks: np.ndarray, exponent: np.ndarray, half: np.ndarray,
     step: np.ndarray, begin: np.ndarray, out: np.ndarray,
 ) -> None:  # fmt: skip
@@ -215,7 +215,7 @@ def voxel_moments(
     """
     nz, ny, nx = voxels.values.shape
     ex, ey, ez = exponent
-    for b in turns_of(part, blocks.shape[0]):
+    for b in iterations(thread, blocks.shape[0]):
         out[b] = 0.0
         x0, y0, z0 = int(blocks[b, 0]), int(blocks[b, 1]), int(blocks[b, 2])
         last_x, last_y = min(out.shape[3] << ex, nx - x0), min(out.shape[2] << ey, ny - y0)

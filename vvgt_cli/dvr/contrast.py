@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from vvgt_cli.jit.decorators import inlined, parallel_kernel
-from vvgt_cli.jit.parts import Part, turns_of
+from vvgt_cli.jit.threads import ThreadSlice, iterations
 
 
 @inlined()
@@ -18,10 +18,10 @@ def _apart(image: np.ndarray, row: int, col: int, i: int, j: int) -> float:
 
 
 @parallel_kernel("f4:3 b1:2 f4:2")
-def _contrast(part: Part, image: np.ndarray, known: np.ndarray, out: np.ndarray) -> None:
+def _contrast(thread: ThreadSlice, image: np.ndarray, known: np.ndarray, out: np.ndarray) -> None:
     """`contrast` of ``image`` (h, w, c) into ``out`` (h, w); ``known`` (h, w) bool."""
     height, width = out.shape
-    for row in turns_of(part, height):
+    for row in iterations(thread, height):
         for col in range(width):
             most = 0.0
             if not known[row, col]:

@@ -8,17 +8,14 @@ are vectors (r, g, b, alpha or tau); ``empty`` (bz, by, bx) uint8 is `Scene.empt
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any
 
 import numba as nb
 import numpy as np
 
-from vvgt_cli.dvr.layout import BRICK, BRICK_BITS, TUPLES, Optics, Voxels
-from vvgt_cli.dvr.runs import BORROWED, RUN, Run, run_range, sample_run, stack_run
-from vvgt_cli.dvr.vectors import Quad, add, lane, row, scale, sub, zeros4
-from vvgt_cli.jit.decorators import inlined, parallel_kernel
-from vvgt_cli.jit.parts import Part, take_turn
+from vvgt_cli.dvr.layout import BRICK, BRICK_BITS, Optics, Voxels
+from vvgt_cli.dvr.runs import Run, run_range
+from vvgt_cli.dvr.vectors import Quad, add, lane, mix, row, scale, sub, texel
+from vvgt_cli.jit.decorators import inlined
 
 OPAQUE = 1e-3  # times step^2, as the error of integration goes: the transmittance at which a ray ends
 SUB_DEPTH = 1.0  # optical depth of a sub-segment: colour is constant within one; 0.3 is no more accurate
@@ -35,9 +32,8 @@ ABSORBED: tuple[float, ...] = tuple(np.linalg.solve(np.vander(_x, increasing=Tru
 
 U = nb.uint64
 Vector = tuple[float, float, float]
-Cast = Callable[..., tuple[float, float, float, float]]
 
-_jit = inlined(fastmath=FLAGS, error_model="numpy", **BORROWED)
+_jit = inlined(fastmath=FLAGS, error_model="numpy", borrowed=True)
 
 
 @_jit
@@ -277,119 +273,35 @@ def any_light(run: Run, u0: float, dark: np.ndarray, flat: bool) -> bool:
 
 
 @_jit
-def cast(
-    voxels: Voxels, optics: Optics, empty: np.ndarray, light: None, px: float, py: float, pz: float, dx: float,
-    dy: float, dz: float, step: float,
-) -> tuple[float, float, float, float]:  # fmt: skip
-    """Premultiplied (r, g, b, alpha) along a ray; ``step`` is the sampling distance in voxels, ``light`` None."""
-    nz, ny, nx = voxels.values.shape
-    run = stack_run()
-    seen, trans = zeros4(), 1.0
-    t0, t1 = box_span(px, py, pz, dx, dy, dz, nx, ny, nz)
-    if not t1 > t0:
-        return 0.0, 0.0, 0.0, 0.0
-    count = max(math.ceil((t1 - t0) * math.sqrt(dx * dx + dy * dy + dz * dz) / step), 1)
-    dt = (t1 - t0) / count
-    opaque = OPAQUE * min(step * step, 1.0)
-    ix, iy, iz, per_step = inverse(dx), inverse(dy), inverse(dz), 1.0 / dt
-    p, d, flat = (px, py, pz), (dx, dy, dz), is_flat(optics)
-    before = u0 = -1.0  # -1: no sample there, or not finite
-    i = 0
-    while True:
-        at = i - 1 if u0 >= 0.0 else i  # the segment that comes from there is still to be seen
-        start = skip(voxels.values.shape, empty, px, py, pz, dx, dy, dz, ix, iy, iz, t0, dt, per_step, count, at)
-        if start > count:
-            return lane(seen, 0), lane(seen, 1), lane(seen, 2), 1.0 - trans
-        if start > at:
-            before, u0, i = -1.0, -1.0, max(start - 1, 0)  # one earlier, for what bends the next
-        t = t0 + i * dt
-        sample_run(voxels, px + t * dx, py + t * dy, pz + t * dz, dx * dt, dy * dt, dz * dt, optics, run)
-        if any_light(run, u0, optics.dark, flat):
-            for n in range(min(RUN, count + 1 - i)):
-                u1 = run[n]
-                met = values_met(before, u0, u1, flat)
-                if met[0] >= 0.0 and met[1] > optics.dark[U(int(met[0]))]:
-                    seen, trans, _ = pass_segment(voxels, optics, p, d, t + (n - 1) * dt, dt, u0, u1, met, seen, trans)
-                    if trans < opaque:
-                        return lane(seen, 0), lane(seen, 1), lane(seen, 2), 1.0 - trans
-                before, u0 = u0, u1
-        before, u0 = run[RUN - 2], run[RUN - 1]
-        i += RUN
-        if i > count:
-            return lane(seen, 0), lane(seen, 1), lane(seen, 2), 1.0 - trans
+def texel_at(values: np.ndarray, x: float, y: float, z: float) -> Quad:
+    """Trilinear voxel of ``values`` (nz, ny, nx, 4) at voxel coordinates, clamped to the edge voxels."""
+    nz, ny, nx, _ = values.shape
+    x = min(max(x, 0.0), nx - 1.0)
+    y = min(max(y, 0.0), ny - 1.0)
+    z = min(max(z, 0.0), nz - 1.0)
+    i, j, k = int(x), int(y), int(z)
+    right, down, back = min(i + 1, nx - 1) - i, (min(j + 1, ny - 1) - j) * nx, (min(k + 1, nz - 1) - k) * nx * ny
+    n = (k * ny + j) * nx + i
+    c00 = mix(texel(values, U(n)), texel(values, U(n + right)), x - i)
+    c01 = mix(texel(values, U(n + down)), texel(values, U(n + down + right)), x - i)
+    n += back
+    c10 = mix(texel(values, U(n)), texel(values, U(n + right)), x - i)
+    c11 = mix(texel(values, U(n + down)), texel(values, U(n + down + right)), x - i)
+    return mix(mix(c00, c01, y - j), mix(c10, c11, y - j), z - k)
 
 
-def tiles_of(cast: Cast) -> Callable[..., None]:
-    """The loop over the pixels of a tile whose rays ``cast`` follows, `cast` or one with its arguments."""
-
-    @_jit
-    def pixel_sum(
-        voxels: Voxels, optics: Optics, empty: np.ndarray, light: Any, eye: np.ndarray, basis: np.ndarray,
-        lens: np.ndarray, step: float, col: int, row: int, offsets: np.ndarray,
-    ) -> tuple[float, float, float, float]:  # fmt: skip
-        """Sums (r, g, b, alpha) over the rays through the points ``offsets`` (n, 2: right, down) from a pixel's centre.
-
-        Arguments as of `render_tiles`; the pixel is (``col``, ``row``).
-        """
-        acc0 = acc1 = acc2 = acc3 = 0.0
-        for ray in range(len(offsets)):
-            a = (col + 0.5 + offsets[U(ray), 0] - lens[2]) * lens[0]
-            b = (row + 0.5 + offsets[U(ray), 1] - lens[3]) * lens[1]
-            norm = 1.0 / math.sqrt(a * a + b * b + 1.0)
-            dx = (basis[0, 0] * a + basis[1, 0] * b + basis[2, 0]) * norm
-            dy = (basis[0, 1] * a + basis[1, 1] * b + basis[2, 1]) * norm
-            dz = (basis[0, 2] * a + basis[1, 2] * b + basis[2, 2]) * norm
-            red, green, blue, alpha = cast(voxels, optics, empty, light, eye[0], eye[1], eye[2], dx, dy, dz, step)
-            acc0, acc1, acc2, acc3 = acc0 + red, acc1 + green, acc2 + blue, acc3 + alpha
-        return acc0, acc1, acc2, acc3
-
-    @_jit
-    def tile(
-        voxels: Voxels, optics: Optics, empty: np.ndarray, light: Any, eye: np.ndarray, basis: np.ndarray,
-        lens: np.ndarray, step: float, top: int, left: int, offsets: np.ndarray, mask: np.ndarray, known: int,
-        out: np.ndarray,
-    ) -> None:  # fmt: skip
-        """Pixels of the tile from (``left``, ``top``) on; arguments as of `render_tiles`."""
-        height, width = out.shape[:2]
-        share = 1.0 / (known + len(offsets))
-        for line in range(top, min(top + TILE, height)):
-            for col in range(left, min(left + TILE, width)):
-                if not mask[line, col]:
-                    continue
-                red, green, blue, alpha = pixel_sum(
-                    voxels, optics, empty, light, eye, basis, lens, step, col, line, offsets
-                )  # fmt: skip
-                pixel = out[line, col]
-                if known > 0:
-                    red, green, blue = red + known * pixel[0], green + known * pixel[1], blue + known * pixel[2]
-                    alpha += known * pixel[3]
-                pixel[0], pixel[1], pixel[2], pixel[3] = red * share, green * share, blue * share, alpha * share
-
-    return tile
-
-
-_tile = tiles_of(cast)
-
-
-@parallel_kernel(
-    "Voxels Optics u1:3 f8:1 f8:2 f8:1 f8 i8:1 f8:2 b1:2 i8 f4:3",
-    TUPLES,
-    fastmath=FLAGS,
-    error_model="numpy",
-)
-def render_tiles(
-    part: Part, voxels: Voxels, optics: Optics, empty: np.ndarray, eye: np.ndarray, basis: np.ndarray, lens: np.ndarray,
-    step: float, order: np.ndarray, offsets: np.ndarray, mask: np.ndarray, known: int, out: np.ndarray,
-) -> None:  # fmt: skip
-    """Render one view into ``out`` (h, w, 4) float32, rays at ``offsets`` (n, 2) in pixels where ``mask`` is set.
-
-    ``eye`` (3,) voxels and ``basis`` (3, 3: rows right, down, forward) in voxels per unit-frame length;
-    ``lens`` is (1/fx, 1/fy, cx, cy), pixels; ``order`` (tiles,) of the tiles (row-major); ``mask`` (h, w) bool;
-    ``step`` in voxels along a ray; ``known``: number of rays whose mean ``out`` holds already.
-    """
-    across = (out.shape[1] + TILE - 1) // TILE
-    index = take_turn(part)
-    while index < len(order):
-        top, left = order[index] // across * TILE, order[index] % across * TILE
-        _tile(voxels, optics, empty, None, eye, basis, lens, step, top, left, offsets, mask, known, out)
-        index = take_turn(part)
+@_jit
+def blend_texels(a: Quad, b: Quad, dt: float, seen: Quad, trans: float) -> tuple[Quad, float]:
+    """``seen`` (r, g, b, alpha) and ``trans`` behind a segment of length dt; the optics go linearly from a to b."""
+    segment = scale(0.5 * dt, add(a, b))
+    depth = lane(segment, 3)
+    if depth <= SUB_DEPTH:
+        f = absorbed(depth) * trans
+        return add(seen, scale(f, segment)), trans - f * depth
+    parts = min(int(depth / SUB_DEPTH) + 1, PARTS)
+    for part in range(parts):
+        segment = scale(dt / parts, mix(a, b, (part + 0.5) / parts))
+        depth = lane(segment, 3)
+        f = absorbed(depth) * trans
+        seen, trans = add(seen, scale(f, segment)), trans - f * depth
+    return seen, max(trans, 0.0)

@@ -146,19 +146,13 @@ def for_thin(settings: RenderSettings, box: BoxGeometry, camera: Camera) -> Rend
 
 def _rays(scene: Scene) -> Callable[..., None]:
     """The kernel of a scene's kind, with what it reads of it."""
+    from vvgt_cli.dvr import march
+
     if scene.grid is None:
-        if scene.light is None:
-            from vvgt_cli.dvr import kernel
-
-            return partial(kernel.render_tiles, scene.voxels, scene.optics, scene.empty)
-        from vvgt_cli.dvr import lit
-
-        return partial(lit.render_lit_tiles, scene.voxels, scene.optics, scene.empty, scene.light)
-    from vvgt_cli.dvr import grid
-
-    if scene.light is None:
-        return partial(grid.render_grid_tiles, scene.texels, scene.empty)
-    return partial(grid.render_lit_grid_tiles, scene.texels, scene.voxels, scene.empty, scene.light)
+        kernel = march.render_tiles if scene.light is None else march.render_lit_tiles
+        return partial(kernel, scene.voxels, scene.optics, None, scene.empty, scene.light)
+    kernel = march.render_grid_tiles if scene.light is None else march.render_lit_grid_tiles
+    return partial(kernel, scene.voxels, scene.optics, scene.texels, scene.empty, scene.light)
 
 
 class Viewed(Protocol):

@@ -9,19 +9,15 @@ from typing import Any, TypeAlias
 import numba as nb
 import numpy as np
 from llvmlite import ir
-from numba import types
-from numba.core import cgutils
-from numba.core.errors import TypingError
+from numba import TypingError, types
 
 from vvgt_cli.dvr.layout import Optics, Voxels
 from vvgt_cli.jit.decorators import inlined, intrinsic
+from vvgt_cli.jit.numba_internals import alloca_once, get_or_insert_function
 
 RUN = 32  # samples of a run: two vectors of AVX-512 float32, four of AVX2
 MOST = (1 << 31) - 1
 NEAR = MOST // (4 * RUN + 3)  # voxels of a slab up to which the offsets within a run of steps to 4 voxels fit 32 bits
-
-# Arrays are not reference-counted within these functions: counting cost 100 ns a ray.
-BORROWED = {"_nrt": False}
 
 F: Any = nb.float32  # Any: mypy knows what they make outside of kernels
 N: Any = nb.int32
@@ -38,7 +34,7 @@ def stack_run(typingctx: Any) -> Any:
     """
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        array = cgutils.alloca_once(builder, ir.ArrayType(ir.FloatType(), RUN))
+        array = alloca_once(builder, ir.ArrayType(ir.FloatType(), RUN))
         return builder.bitcast(array, ir.FloatType().as_pointer())
 
     return types.CPointer(types.float32)(), codegen
@@ -54,7 +50,7 @@ def run_range(typingctx: Any, run: Any) -> Any:
         kind = ir.FunctionType(ir.FloatType(), [vector])
         ends = []
         for name in ("fmin", "fmax"):
-            reduce = cgutils.get_or_insert_function(builder.module, kind, f"llvm.vector.reduce.{name}.v{RUN}f32")
+            reduce = get_or_insert_function(builder.module, kind, f"llvm.vector.reduce.{name}.v{RUN}f32")
             ends.append(builder.call(reduce, [values], fastmath=("nnan", "nsz")))
         return context.make_tuple(builder, signature.return_type, ends)
 
@@ -108,7 +104,7 @@ def _pair(typingctx: Any, values: Any, index: Any, edge: Any, last: Any) -> Any:
     return types.UniTuple(types.float32, 2)(values, index, edge, last), codegen
 
 
-@inlined(error_model="numpy", **BORROWED)
+@inlined(error_model="numpy", borrowed=True)
 def _base(p: float, v: float, n: int) -> tuple[int, float, float]:
     """Lowest voxel of a run along an axis of ``n``, and from there its start and the end of the axis, float32.
 
@@ -137,7 +133,7 @@ def _sampler(index: Callable[[int], int]) -> Callable[..., None]:
     bins); ``out`` (RUN,) float32.
     """
 
-    @inlined(fastmath={"contract", "nsz", "arcp", "afn"}, error_model="numpy", **BORROWED)
+    @inlined(fastmath={"contract", "nsz", "arcp", "afn"}, error_model="numpy", borrowed=True)
     def samples(
         here: Pointer, row: int, slab: int, last: int, start: tuple[float, float, float],
         step: tuple[float, float, float], top: tuple[float, float, float], last_voxel: tuple[int, int, int],
@@ -177,7 +173,7 @@ def _sampler(index: Callable[[int], int]) -> Callable[..., None]:
 _near_samples, _far_samples = _sampler(N), _sampler(L)
 
 
-@inlined(fastmath={"contract", "nsz", "arcp", "afn"}, error_model="numpy", **BORROWED)
+@inlined(fastmath={"contract", "nsz", "arcp", "afn"}, error_model="numpy", borrowed=True)
 def sample_run(
     voxels: Voxels, px: float, py: float, pz: float, vx: float, vy: float, vz: float, optics: Optics, out: Run
 ) -> None:

@@ -9,14 +9,13 @@ import numba as nb
 import numpy as np
 
 from vvgt_cli.dvr.layout import Light
-from vvgt_cli.dvr.runs import BORROWED
 from vvgt_cli.dvr.vectors import Quad, four, lane, mix, sub, vector
 from vvgt_cli.jit.decorators import inlined
 
 FLAGS = {"contract", "nsz", "arcp", "afn"}  # no nnan/ninf: non-finite voxels are data
 U = nb.uint64
 
-_jit = inlined(fastmath=FLAGS, error_model="numpy", **BORROWED)
+_jit = inlined(fastmath=FLAGS, error_model="numpy", borrowed=True)
 
 
 @_jit

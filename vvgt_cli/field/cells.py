@@ -98,7 +98,7 @@ class CellBlocks(Blockwise):
     def _cells(self, box: Box, tile: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Cells with extinction of a tile (x, y, z) in a box."""
         from vvgt_cli.closed_form.moments import Region, blocks, region_cells
-        from vvgt_cli.closed_form.ranges import visible_blocks
+        from vvgt_cli.dvr.bricks import visible_blocks
 
         grid = self.grid
         exponent = np.array(grid.exponent, np.int64)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-RENDER, RENDER_LIT = "vvgt_cli.dvr.kernel:render_tiles", "vvgt_cli.dvr.lit:render_lit_tiles"
-BRICK_RANGES = "vvgt_cli.dvr.bricks:_ranges"
+RENDER, RENDER_LIT = "vvgt_cli.dvr.march:render_tiles", "vvgt_cli.dvr.march:render_lit_tiles"
+BLOCK_RANGES = "vvgt_cli.dvr.bricks:block_ranges"
 SHADE = ("vvgt_cli.closed_form.lit:_shade", "vvgt_cli.closed_form.lit:point_normals")
 SHADOWS = ("vvgt_cli.dvr.shadows:mean_transmittance", "vvgt_cli.dvr.shadows:cell_extinction")
 MARCH, ADD_CELLS = "vvgt_cli.closed_form.visibility:march", "vvgt_cli.closed_form.visibility:add_cells"
@@ -16,11 +16,11 @@ PAIR_SUMS, STANDARD = "vvgt_cli.splat.backward:moments", "vvgt_cli.splat.backwar
 VIEW_SLOPES, VIEW_COLORS = "vvgt_cli.splat.harmonics:view_slopes", "vvgt_cli.splat.harmonics:view_colors"
 FIELD_STEPS = "vvgt_cli.refine.steps:adam"  # harmonics take them even where all else steps in the own frame
 
-RAYCAST_REST = (BRICK_RANGES, "vvgt_cli.dvr.contrast:_contrast")
+RAYCAST_REST = (BLOCK_RANGES, "vvgt_cli.dvr.contrast:_contrast")
 RAYCAST = (RENDER, *RAYCAST_REST)
 GRID = {
-    RENDER: "vvgt_cli.dvr.grid:render_grid_tiles",
-    RENDER_LIT: "vvgt_cli.dvr.grid:render_lit_grid_tiles",
+    RENDER: "vvgt_cli.dvr.march:render_grid_tiles",
+    RENDER_LIT: "vvgt_cli.dvr.march:render_lit_grid_tiles",
     BLOCK_MOMENTS: "vvgt_cli.closed_form.grid:grid_moments",
 }
 DRAW = (
@@ -59,17 +59,16 @@ DEPOSITS = ("vvgt_cli.splat.harmonics:deposit_squares", "vvgt_cli.splat.harmonic
 BACK_PROJECT = ("vvgt_cli.splat.tiles:gather", "vvgt_cli.splat.tiles:reduce_pairs")
 
 VIEWS = (*RAYCAST, *CELLS, VOXEL_MOMENTS)  # and points to start from, of cells of voxels or wider ones
-INIT = (*CLOSED_FORM, BRICK_RANGES)
+INIT = (*CLOSED_FORM, BLOCK_RANGES)
 MERGE = (*(name for name in CLOSED_FORM if name not in (BLOCK_MOMENTS, COMPACT)), *DRAW)
 COUNT_WHOLE = ("vvgt_cli.volume.count_kernel:count_values",)  # of types of which every number is counted
 COUNT_REAL = ("vvgt_cli.volume.count_kernel:range_values", "vvgt_cli.volume.count_kernel:bin_values")  # of others
 SEGMENTS = {
-    RENDER: "vvgt_cli.dvr.segments:cast_segments",
-    RENDER_LIT: "vvgt_cli.dvr.segments:cast_lit_segments",
-    GRID[RENDER]: "vvgt_cli.dvr.segments:cast_grid_segments",
-    GRID[RENDER_LIT]: "vvgt_cli.dvr.segments:cast_lit_grid_segments",
+    RENDER: "vvgt_cli.dvr.march:cast_segments",
+    RENDER_LIT: "vvgt_cli.dvr.march:cast_lit_segments",
+    GRID[RENDER]: "vvgt_cli.dvr.march:cast_grid_segments",
+    GRID[RENDER_LIT]: "vvgt_cli.dvr.march:cast_lit_grid_segments",
 }
-BLOCK_RANGES = "vvgt_cli.closed_form.ranges:block_ranges"  # of blocks of which not all is read
 CONVERT = (RENDER, FRAME_STEPS, *CLOSED_FORM, *DRAW, *DESCENT, *REGRESS, *RAYCAST_REST, *BACK_PROJECT)
 LIVE = ("vvgt_cli.closed_form.under:sample_points",)
 OPTIMIZE = (*REFINE, *DRAW, "vvgt_cli.closed_form.pyramid:principal_axes", *SHARED)
@@ -89,7 +88,6 @@ ALL = (
     *DEPOSITS,
     *SEGMENTS.values(),
     *LIVE,
-    BLOCK_RANGES,
     VOXEL_MOMENTS,
     *COUNT_WHOLE,
     *COUNT_REAL,

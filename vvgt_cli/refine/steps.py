@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.jit.decorators import inlined, parallel_kernel
-from vvgt_cli.jit.parts import Part, turns_of
+from vvgt_cli.jit.threads import ThreadSlice, iterations
 from vvgt_cli.splat.lanes import LANES, U
 
 f32: Any = np.float32
@@ -114,7 +114,7 @@ def _move(buf: np.ndarray, rates: tuple[float, ...], clips: tuple[float, ...], s
 
 @parallel_kernel("f4:2 f8:1 f8:1 f8 f8 f8 i8 f4:2 f4:3 f4:1 f4:2 f8 f4:2 f4:2 f4:1 i1:3 f4:2")
 def own_frame(
-    part: Part,
+    thread: ThreadSlice,
     slopes: np.ndarray, rates: np.ndarray, clips: np.ndarray, spread: float, beta1: float, beta2: float, step: int,
     means: np.ndarray, factors: np.ndarray, logits: np.ndarray, colors: np.ndarray, darkest: float, first: np.ndarray,
     second: np.ndarray, floors: np.ndarray, features: np.ndarray, weights: np.ndarray,
@@ -132,7 +132,7 @@ def own_frame(
     paces, bounds = (f32(rates[0]), f32(rates[1]), f32(rates[2])), (f32(clips[0]), f32(clips[2]))
     by_logit, by_color, farthest = f32(rates[3]), f32(rates[4]), f32(clips[1])
     hidden, least, total = f32(spread), f32(darkest), means.shape[0]
-    for chunk in turns_of(part, (total + LANES - 1) // LANES):
+    for chunk in iterations(thread, (total + LANES - 1) // LANES):
         begin = chunk * LANES
         count = min(LANES, total - begin)
         buf = np.ones((COUNT + 9) * LANES, np.float32)
@@ -156,8 +156,8 @@ def own_frame(
 
 @parallel_kernel("f4:2 f4:2 f4:2 f8 f8 i8 i8 f4:2 f4:2", error_model="numpy")
 def adam_sizes(
-    part: Part, slopes: np.ndarray, first: np.ndarray, second: np.ndarray, beta1: float, beta2: float, step: int,
-    every: int, towards: np.ndarray, sizes: np.ndarray,
+    thread: ThreadSlice, slopes: np.ndarray, first: np.ndarray, second: np.ndarray, beta1: float, beta2: float,
+    step: int, every: int, towards: np.ndarray, sizes: np.ndarray,
 ) -> None:  # fmt: skip
     """Numerators ``towards`` (COUNT, n) and divisors ``sizes`` (COUNT, n) of Adam's directions after ``step`` steps.
 
@@ -165,7 +165,7 @@ def adam_sizes(
     (COUNT, K) the running moments without them.
     """
     b1, b2, fix1, fix2 = f32(beta1), f32(beta2), f32(1 / (1 - beta1**step)), f32(1 / (1 - beta2**step))
-    for row in turns_of(part, COUNT):
+    for row in iterations(thread, COUNT):
         for begin in range(0, sizes.shape[1], RUN):
             for i in range(U(begin), U(min(begin + RUN, sizes.shape[1]))):
                 k = i + U(begin * (every - 1))
@@ -176,13 +176,13 @@ def adam_sizes(
 
 @parallel_kernel("f4:2 f8:1 f8 f4:2 f4:1", error_model="numpy")
 def adam_directions(
-    part: Part, sizes: np.ndarray, most: np.ndarray, weakest: float, towards: np.ndarray, floors: np.ndarray
+    thread: ThreadSlice, sizes: np.ndarray, most: np.ndarray, weakest: float, towards: np.ndarray, floors: np.ndarray
 ) -> None:
     """``towards`` divided by ``sizes`` (COUNT, n) and ``floors``, in place; 0 where that is not finite.
 
     ``floors`` (COUNT,): ``weakest`` times the mean of sizes, of which none counts for more than ``most`` (COUNT,).
     """
-    for row in turns_of(part, COUNT):
+    for row in iterations(thread, COUNT):
         bound, total = f32(most[row]), 0.0
         for i in range(sizes.shape[1]):
             size = sizes[row, i]
@@ -194,13 +194,13 @@ def adam_directions(
 
 
 @parallel_kernel("f4:2 f4:2 f8 f4:2")
-def regress(part: Part, solver: np.ndarray, directions: np.ndarray, gain: float, weights: np.ndarray) -> None:
+def regress(thread: ThreadSlice, solver: np.ndarray, directions: np.ndarray, gain: float, weights: np.ndarray) -> None:
     """``weights`` (KNOWN, FEATURES) = ``gain`` times ``directions`` (COUNT, n) by ``solver`` (FEATURES, n), float32.
 
     Of the directions those that are shared, all finite. Sums have one order for any number of threads, unlike BLAS'.
     """
     whole = directions.shape[1] // LANES * LANES
-    for f in turns_of(part, FEATURES):
+    for f in iterations(thread, FEATURES):
         sums = np.empty(LANES, np.float32)
         for row in range(KNOWN):
             field = row if row < 6 else row + 3
@@ -219,7 +219,7 @@ def regress(part: Part, solver: np.ndarray, directions: np.ndarray, gain: float,
 
 @parallel_kernel("f4:1 f4:1 f8 f8 f8 i8 f4:1 f4:1", error_model="numpy")
 def adam(
-    part: Part,
+    thread: ThreadSlice,
     values: np.ndarray, slopes: np.ndarray, rate: float, beta1: float, beta2: float, step: int, first: np.ndarray,
     second: np.ndarray,
 ) -> None:  # fmt: skip
@@ -229,7 +229,7 @@ def adam(
     """
     fix1, fix2 = f32(1 / (1 - beta1**step)), f32(1 / (1 - beta2**step))
     b1, b2, pace = f32(beta1), f32(beta2), f32(rate)
-    for i in turns_of(part, values.shape[0]):
+    for i in iterations(thread, values.shape[0]):
         m = b1 * first[i] + (ONE - b1) * slopes[i]
         v = b2 * second[i] + (ONE - b2) * slopes[i] * slopes[i]
         first[i], second[i] = m, v

@@ -14,8 +14,7 @@ import numpy as np
 
 from vvgt_cli.gaussians.constants import TILE
 from vvgt_cli.jit.decorators import inlined, parallel_kernel
-from vvgt_cli.jit.parts import Part, take_turn, turns_of
-from vvgt_cli.jit.prefetch import prefetch
+from vvgt_cli.jit.threads import ThreadSlice, iterations, next_iteration
 from vvgt_cli.splat.buffer import (
     AREA,
     BLUE,
@@ -39,6 +38,7 @@ from vvgt_cli.splat.buffer import (
     fetch,
     fetch_colors,
     open_tile,
+    prefetch,
     tile_jit,
 )
 from vvgt_cli.splat.kernel import rotate, rotation_column, to_camera, unit_quaternion
@@ -152,7 +152,7 @@ def _moments_tile(
     error_model="numpy",
 )
 def moments(
-    part: Part,
+    thread: ThreadSlice,
     tiles: np.ndarray, start: np.ndarray, members: np.ndarray, slots: np.ndarray, extent: np.ndarray, flat: np.ndarray,
     colors: np.ndarray, tiles_x: int, rule: np.ndarray, image: np.ndarray, grad: np.ndarray, pairs: np.ndarray,
 ) -> None:  # fmt: skip
@@ -163,7 +163,7 @@ def moments(
     """
     height, width = image.shape[:2]
     way = rule[0], rule[1], rule[2], rule[3], rule[4], rule[5]
-    index = take_turn(part)
+    index = next_iteration(thread)
     while index < tiles.shape[0]:
         tile = tiles[index]
         ox, oy = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
@@ -180,7 +180,7 @@ def moments(
                 buf[U(AREA + y * TILE + x)] = behind
         span = slice(start[tile], start[tile + 1])
         _moments_tile(members[span], slots[span], extent, flat, colors, ox, oy, way, buf, pairs)
-        index = take_turn(part)
+        index = next_iteration(thread)
 
 
 @_exact
@@ -206,9 +206,9 @@ def _screen(
 
 
 @parallel_kernel()
-def screen(part: Part, first: np.ndarray, pairs: np.ndarray, flat: np.ndarray, out: np.ndarray) -> None:
+def screen(thread: ThreadSlice, first: np.ndarray, pairs: np.ndarray, flat: np.ndarray, out: np.ndarray) -> None:
     """Length of the gradient with respect to each projected centre (px) into ``out`` (K,) float64; 0 where unseen."""
-    for k in turns_of(part, flat.shape[0]):
+    for k in iterations(thread, flat.shape[0]):
         out[k] = 0.0
         if first[k + 1] > first[k]:
             total = _total(first, pairs, k)
@@ -242,7 +242,7 @@ def _load_slope(
 
 @parallel_kernel("i8:1 f4:2 i4:2 f4:2 f4:2 f4:3 f4:2 f8:2 f8:1 f8:1 f8:1 f4:2")
 def own_frame(
-    part: Part,
+    thread: ThreadSlice,
     first: np.ndarray, pairs: np.ndarray, extent: np.ndarray, flat: np.ndarray, means: np.ndarray, factors: np.ndarray,
     colors: np.ndarray, rot: np.ndarray, trans: np.ndarray, lens: np.ndarray, rule: np.ndarray, out: np.ndarray,
 ) -> None:  # fmt: skip
@@ -252,7 +252,7 @@ def own_frame(
     both), opacity logit, colour (3). Every row is written.
     """
     count, pose, way = means.shape[0], pose_of(rot, trans), (lens[0], lens[1])
-    for chunk in turns_of(part, (count + LANES - 1) // LANES):
+    for chunk in iterations(thread, (count + LANES - 1) // LANES):
         begin, end = chunk * LANES, min((chunk + 1) * LANES, count)
         buf, seen = np.ones(SLOPED * LANES), np.zeros(LANES, np.bool_)
         for k in range(begin, end):
@@ -316,14 +316,14 @@ def _quaternion(
 
 @parallel_kernel("i8:1 f4:2 i4:2 f4:2 f4:2 f4:2 f4:2 f4:2 f8:2 f8:1 f8:1 f8:1 f4:2 f4:2 f4:2 f4:1 f4:2")
 def standard(
-    part: Part, first: np.ndarray, pairs: np.ndarray, extent: np.ndarray, flat: np.ndarray, means: np.ndarray,
+    thread: ThreadSlice, first: np.ndarray, pairs: np.ndarray, extent: np.ndarray, flat: np.ndarray, means: np.ndarray,
     log_scales: np.ndarray, quats: np.ndarray, colors: np.ndarray, rot: np.ndarray, trans: np.ndarray, lens: np.ndarray,
     rule: np.ndarray, out_means: np.ndarray, out_scales: np.ndarray, out_quats: np.ndarray, out_logits: np.ndarray,
     out_colors: np.ndarray,
 ) -> None:  # fmt: skip
     """Gradients with respect to the fields of `Gaussians`, float32 arrays of their shapes."""
     fx, fy = lens[0], lens[1]
-    for k in turns_of(part, means.shape[0]):
+    for k in iterations(thread, means.shape[0]):
         out_means[k] = 0.0
         out_scales[k] = 0.0
         out_quats[k] = 0.0

@@ -18,10 +18,12 @@ from typing import Any
 
 import numba as nb
 import numpy as np
+from llvmlite import ir
+from numba import types
 
 from vvgt_cli.gaussians.constants import TILE
-from vvgt_cli.jit.decorators import inlined
-from vvgt_cli.jit.prefetch import prefetch
+from vvgt_cli.jit.decorators import inlined, intrinsic
+from vvgt_cli.jit.numba_internals import BYTE, CODE, config, get_or_insert_function
 
 f32: Any = np.float32  # its sums are float here: numba keeps them float32
 U: Any = nb.uint64
@@ -40,6 +42,24 @@ _EXP: tuple[float, ...] = tuple(
 )
 
 tile_jit = inlined(fastmath=True, error_model="numpy")
+
+
+def _prefetch(typingctx: Any, rows: Any, index: Any, column: Any) -> Any:
+    """Ask for the cache line of ``rows[index, column]``, a C-contiguous array (n, m); both in range, not negative."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        array = context.make_array(signature.args[0])(context, builder, args[0])
+        width = builder.extract_value(array.shape, 1)
+        at = builder.gep(array.data, [builder.add(builder.mul(args[1], width), args[2])])
+        kind = ir.FunctionType(ir.VoidType(), [BYTE, CODE, CODE, CODE])
+        ask = get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
+        builder.call(ask, [builder.bitcast(at, BYTE), CODE(0), CODE(3), CODE(1)])  # for reading, to be kept, data
+        return context.get_dummy_value()
+
+    return types.void(rows, types.int64, types.int64), codegen
+
+
+prefetch: Any = (lambda rows, index, column: None) if config.DISABLE_JIT else intrinsic(_prefetch)
 
 
 @tile_jit

@@ -12,7 +12,7 @@ import numpy as np
 
 from vvgt_cli.gaussians.harmonics import term_slopes, terms
 from vvgt_cli.jit.decorators import inlined, parallel_kernel
-from vvgt_cli.jit.parts import Part, turns_of
+from vvgt_cli.jit.threads import ThreadSlice, iterations
 
 _LARGEST = float(np.finfo(np.float32).max)
 _jit = inlined()
@@ -30,10 +30,10 @@ def _toward(means: np.ndarray, k: int, eye: np.ndarray) -> tuple[float, float, f
 
 @parallel_kernel("f4:2 f4:2 f4:3 f8:1 f4:2")
 def view_colors(
-    part: Part, means: np.ndarray, colors: np.ndarray, harmonics: np.ndarray, eye: np.ndarray, out: np.ndarray
+    thread: ThreadSlice, means: np.ndarray, colors: np.ndarray, harmonics: np.ndarray, eye: np.ndarray, out: np.ndarray
 ) -> None:
     """Colours (K, 3) float32 as they are seen from the eye into ``out``; not more than float32 holds."""
-    for k in turns_of(part, means.shape[0]):
+    for k in iterations(thread, means.shape[0]):
         x, y, z, _ = _toward(means, k, eye)
         found = _terms(x, y, z)
         for c in range(3):
@@ -45,7 +45,7 @@ def view_colors(
 
 @parallel_kernel("f4:2 f4:3 f8:1 f4:2 f4:3 f4:2")
 def view_slopes(
-    part: Part,
+    thread: ThreadSlice,
     means: np.ndarray,
     harmonics: np.ndarray,
     eye: np.ndarray,
@@ -57,7 +57,7 @@ def view_slopes(
 
     ``slopes`` (K, 3) float32 is the gradient with respect to the colours that are seen.
     """
-    for k in turns_of(part, means.shape[0]):
+    for k in iterations(thread, means.shape[0]):
         if slopes[k, 0] == 0.0 and slopes[k, 1] == 0.0 and slopes[k, 2] == 0.0:
             out_harmonics[k] = 0.0
             out_means[k] = 0.0
@@ -79,12 +79,12 @@ def view_slopes(
 
 
 @parallel_kernel("f4:2 f8:1 f8:2 f8:3")
-def deposit(part: Part, means: np.ndarray, eye: np.ndarray, values: np.ndarray, out: np.ndarray) -> None:
+def deposit(thread: ThreadSlice, means: np.ndarray, eye: np.ndarray, values: np.ndarray, out: np.ndarray) -> None:
     """Adjoint of `view_colors`: ``out`` (K, 1 + M, 3) float64 += each term of a colour, 1 first, times ``values``.
 
     ``values`` (K, 3) float64.
     """
-    for k in turns_of(part, means.shape[0]):
+    for k in iterations(thread, means.shape[0]):
         if values[k, 0] == 0.0 and values[k, 1] == 0.0 and values[k, 2] == 0.0:
             continue
         x, y, z, _ = _toward(means, k, eye)
@@ -96,9 +96,11 @@ def deposit(part: Part, means: np.ndarray, eye: np.ndarray, values: np.ndarray, 
 
 
 @parallel_kernel("f4:2 f8:1 f8:1 f4:3")
-def deposit_squares(part: Part, means: np.ndarray, eye: np.ndarray, weights: np.ndarray, out: np.ndarray) -> None:
+def deposit_squares(
+    thread: ThreadSlice, means: np.ndarray, eye: np.ndarray, weights: np.ndarray, out: np.ndarray
+) -> None:
     """``out`` (K, 1 + M, 1 + M) float32 += ``weights`` (K,) float64 times the products of two terms of a colour."""
-    for k in turns_of(part, means.shape[0]):
+    for k in iterations(thread, means.shape[0]):
         if weights[k] == 0.0:
             continue
         x, y, z, _ = _toward(means, k, eye)

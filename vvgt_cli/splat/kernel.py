@@ -15,8 +15,8 @@ import numpy as np
 
 from vvgt_cli.gaussians.constants import TILE
 from vvgt_cli.jit.decorators import inlined, kernel, parallel_kernel
-from vvgt_cli.jit.parts import Part, turns_of
-from vvgt_cli.jit.prefetch import prefetch
+from vvgt_cli.jit.threads import ThreadSlice, iterations
+from vvgt_cli.splat.buffer import prefetch
 from vvgt_cli.splat.lanes import (
     LANES,
     OPACITY,
@@ -99,12 +99,13 @@ def _opacity(logits: np.ndarray, k: int) -> float:
     "f4:2 f4:2 f4:2 f4:1 f8:2 f8:1 f8:1 f8:1 f4:2 f4:1 i4:2",
 )
 def project(
-    part: Part, means: np.ndarray, log_scales: np.ndarray, quats: np.ndarray, logits: np.ndarray, rot: np.ndarray,
-    trans: np.ndarray, lens: np.ndarray, rule: np.ndarray, flat: np.ndarray, depth: np.ndarray, extent: np.ndarray,
+    thread: ThreadSlice, means: np.ndarray, log_scales: np.ndarray, quats: np.ndarray, logits: np.ndarray,
+    rot: np.ndarray, trans: np.ndarray, lens: np.ndarray, rule: np.ndarray, flat: np.ndarray,
+    depth: np.ndarray, extent: np.ndarray,
 ) -> None:  # fmt: skip
     """EWA projection of every Gaussian, into ``flat``, ``depth`` and ``extent``: every row is written."""
     total, pose = means.shape[0], pose_of(rot, trans)
-    for chunk in turns_of(part, (total + LANES - 1) // LANES):
+    for chunk in iterations(thread, (total + LANES - 1) // LANES):
         begin = chunk * LANES
         count = min(LANES, total - begin)
         buf = np.zeros(PROJECTED * LANES)
@@ -123,13 +124,13 @@ def project(
     "f4:2 f4:3 f4:1 f8:2 f8:1 f8:1 f8:1 f4:2 f4:1 i4:2",
 )
 def project_factors(
-    part: Part,
+    thread: ThreadSlice,
     means: np.ndarray, factors: np.ndarray, logits: np.ndarray, rot: np.ndarray, trans: np.ndarray, lens: np.ndarray,
     rule: np.ndarray, flat: np.ndarray, depth: np.ndarray, extent: np.ndarray,
 ) -> None:  # fmt: skip
     """`project` for covariances ``M M^T`` given by ``factors`` (K, 3, 3) M."""
     total, pose = means.shape[0], pose_of(rot, trans)
-    for chunk in turns_of(part, (total + LANES - 1) // LANES):
+    for chunk in iterations(thread, (total + LANES - 1) // LANES):
         begin = chunk * LANES
         count = min(LANES, total - begin)
         buf = np.zeros(PROJECTED * LANES)
@@ -172,14 +173,14 @@ def stable_order(keys: np.ndarray) -> np.ndarray:
 
 @parallel_kernel("i8:1 i4:2 i8 i8:2 i8:1")
 def count_pairs(
-    part: Part, order: np.ndarray, extent: np.ndarray, tiles_x: int, fill: np.ndarray, first: np.ndarray
+    thread: ThreadSlice, order: np.ndarray, extent: np.ndarray, tiles_x: int, fill: np.ndarray, first: np.ndarray
 ) -> None:
     """How many Gaussians of each of the stretches of ``order`` lie in each tile: ``fill`` (stretches, tiles), zeros.
 
     ``first`` (K + 1,), zeros, gets in how many tiles each Gaussian lies, at the place behind its own.
     """
     workers, total = fill.shape[0], order.shape[0]
-    for worker in turns_of(part, workers):
+    for worker in iterations(thread, workers):
         mine = fill[worker]
         for index in range(worker * total // workers, (worker + 1) * total // workers):
             k = order[index]
@@ -196,12 +197,12 @@ def count_pairs(
 
 @parallel_kernel("i8:1 i4:2 i8 i8:2 i8:1 i4:1 i8:1")
 def file_pairs(
-    part: Part, order: np.ndarray, extent: np.ndarray, tiles_x: int, fill: np.ndarray, first: np.ndarray,
+    thread: ThreadSlice, order: np.ndarray, extent: np.ndarray, tiles_x: int, fill: np.ndarray, first: np.ndarray,
     members: np.ndarray, slots: np.ndarray,
 ) -> None:  # fmt: skip
     """Fill ``members`` and ``slots`` of `tile_lists` from each stretch's first place in each tile, ``fill``."""
     workers, total = fill.shape[0], order.shape[0]
-    for worker in turns_of(part, workers):
+    for worker in iterations(thread, workers):
         mine = fill[worker]
         for index in range(worker * total // workers, (worker + 1) * total // workers):
             k = order[index]
