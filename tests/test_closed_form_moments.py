@@ -23,7 +23,7 @@ def test_ranges_of_blocks_are_those_of_their_voxels_and_the_next() -> None:
     values = np.random.default_rng(0).permutation(7 * 9 * 21).reshape(7, 9, 21).astype(np.float32)
     values[3, 4, 5] = np.nan
     first, edge, shape = np.array([4, 0, 2]), np.array([4, 3, 2]), np.array([4, 2, 2])
-    found = ranges_of(values, first, edge, shape)
+    found = ranges_of(values, first, edge, shape, 1)
     for x, y, z in np.ndindex(*shape):
         lo = first + edge * (x, y, z)
         a, b = np.maximum(lo - 1, 0), lo + edge + 1

@@ -14,7 +14,7 @@ SHARED = 1.0  # mean scores that the cells above count for: an error of few pixe
 
 
 def scores_by_error(tree: Tree, ids: np.ndarray, errors: np.ndarray, score: np.ndarray) -> np.ndarray:
-    """Scores of splits, times what the pictures' errors are of what the scores foretold.
+    """Scale scores of splits by the ratio of the pictures' errors to those that the scores predicted.
 
     Args:
         tree: the pyramid.
@@ -46,14 +46,14 @@ def scores_by_error(tree: Tree, ids: np.ndarray, errors: np.ndarray, score: np.n
 
 
 def unseen(weights: np.ndarray, most: int) -> np.ndarray:
-    """(n,) bool: whose blending ``weights`` (n,) are below `UNSEEN`, or not among the ``most`` largest."""
+    """Return (n,) bool: whose blending ``weights`` (n,) are below `UNSEEN`, or not among the ``most`` largest."""
     found: np.ndarray = weights < UNSEEN * weights.mean() if len(weights) else np.zeros(0, bool)
     found[np.argsort(weights, kind="stable")[: max(len(weights) - most, 0)]] = True
     return found
 
 
 def _levels(tree: Tree) -> Iterator[np.ndarray]:
-    """The rows of each level, which lie together, from the root down."""
+    """Yield the rows of each level, which lie together, from the root down."""
     level = np.array([len(tree) - 1])
     while True:
         yield level

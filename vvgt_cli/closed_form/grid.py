@@ -20,7 +20,7 @@ _jit = inlined(fastmath=FLAGS, error_model="numpy")
 
 @_jit
 def _row(values: np.ndarray, y: Between, z: Between, first: int, out: np.ndarray) -> bool:
-    """Voxels from ``first`` on, between rows, into ``out`` (n, 4); whether any has extinction.
+    """Write voxels from ``first`` on, between rows, into ``out`` (n, 4); return whether any has extinction.
 
     ``y``, ``z`` of `between`; the row holds the edge voxels where it leaves ``values`` (nz, ny, nx, 4).
     """
@@ -43,7 +43,7 @@ def _row(values: np.ndarray, y: Between, z: Between, first: int, out: np.ndarray
 def _gather(
     row: np.ndarray, at: np.ndarray, share: np.ndarray, points: int, d: float, y: float, z: float, out: np.ndarray
 ) -> None:
-    """`quadrature._gather` of points at ``at + share`` (n,) of a ``row`` of `_row`."""
+    """Apply `quadrature._gather` to points at ``at + share`` (n,) of a ``row`` of `_row`."""
     for m0 in range(0, at.shape[0], points):
         first = second = 0.0
         total = zeros4()
@@ -67,7 +67,7 @@ def grid_moments(
     texels: Texels, blocks: np.ndarray, points: np.ndarray, cell: np.ndarray, half: np.ndarray, step: np.ndarray,
     begin: np.ndarray, out: np.ndarray,
 ) -> None:  # fmt: skip
-    """`quadrature.block_moments` of a grid, arguments as there."""
+    """Compute `quadrature.block_moments` of a grid, arguments as there."""
     values = texels.values
     nz, ny, nx, _ = values.shape
     dx, dy, dz = cell[0] / points[0], cell[1] / points[1], cell[2] / points[2]

@@ -19,12 +19,13 @@ CHUNK = 1 << 14  # Gaussians whose points are looked up at once
 def labelled(
     gaussians: Gaussians, maps: Sequence[tuple[Volume, Sequence[int]]], half: np.ndarray, step: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rows (K,) int64 of the labels that most points of each Gaussian lie in, -1 for none, and gradients (K, 3).
+    """Return rows (K,) int64 of the labels that most points of each Gaussian lie in, -1 for none, and gradients (K, 3).
 
     Args:
         gaussians: box frame.
         maps: label maps on one grid, each with the numbers of its labels, ascending; rows count through all of them.
-        half, step: (3,) of the grid, unit frame.
+        half: (3,) half extents of the grid, unit frame.
+        step: (3,) voxel edges of the grid, unit frame.
 
     Returns:
         Rows; and unit vectors of the box frame along which the share of the label rises, by least squares; zeros
@@ -42,7 +43,7 @@ def labelled(
 def _rows(
     gaussians: Gaussians, maps: Sequence[tuple[Volume, Sequence[int]]], half: np.ndarray, step: np.ndarray, wide: float
 ) -> np.ndarray:
-    """(maps, K, points) int64 rows of the labels at points of ``wide`` standard deviations, -1 for none."""
+    """Return (maps, K, points) int64 rows of the labels at points of ``wide`` standard deviations, -1 for none."""
     centres, arms = in_voxels(gaussians, half, step)
     points = centres[:, None, :] + np.einsum("kij,mj->kmi", arms, offsets() * (wide / NARROW))
     index = np.rint(points).astype(np.int64)
@@ -57,7 +58,7 @@ def _rows(
 
 
 def _owners(rows: np.ndarray) -> np.ndarray:
-    """(K,) the row that comes most often among (maps, K, points), -1 where there is none."""
+    """Return (K,) the row that comes most often among (maps, K, points), -1 where there is none."""
     every = np.sort(rows.transpose(1, 0, 2).reshape(rows.shape[1], -1), axis=1)
     best, most = np.full(len(every), -1, np.int64), np.zeros(len(every), np.int64)
     run = np.zeros(len(every), np.int64)
@@ -70,7 +71,7 @@ def _owners(rows: np.ndarray) -> np.ndarray:
 
 
 def _gradients(gaussians: Gaussians, own: np.ndarray) -> np.ndarray:
-    """(K, 3) unit vectors along which the values ``own`` (K, points) of `offsets` rise; zeros where they do not."""
+    """Return (K, 3) unit vectors along which values ``own`` (K, points) of `offsets` rise; zeros where they do not."""
     points = offsets()
     rise = (own - own.mean(axis=1, keepdims=True)) @ points @ np.linalg.inv(points.T @ points)
     axes = rotations(gaussians.quaternions.astype(np.float64))

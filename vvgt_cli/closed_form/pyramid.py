@@ -17,7 +17,7 @@ CONVERGED = 1e-30  # off-diagonal squares, of the trace's square
 
 @inlined()
 def _spread_bits(number: int) -> np.uint64:
-    """The 21 lowest bits of ``number``, two zeros between them."""
+    """Return the 21 lowest bits of ``number`` with two zeros between them."""
     v = np.uint64(number)
     v = (v | (v << np.uint64(32))) & np.uint64(0x1F00000000FFFF)
     v = (v | (v << np.uint64(16))) & np.uint64(0x1F0000FF0000FF)
@@ -29,7 +29,7 @@ def _spread_bits(number: int) -> np.uint64:
 
 @parallel_kernel("i4:2 u8:1")
 def morton_codes(thread: ThreadSlice, index: np.ndarray, out: np.ndarray) -> None:
-    """Morton codes ``out`` (n,) uint64, x lowest, of ``index`` (n, 3) int32 below 2^21."""
+    """Write Morton codes ``out`` (n,) uint64, x lowest, of ``index`` (n, 3) int32 below 2^21."""
     for n in iterations(thread, len(index)):
         x, y, z = _spread_bits(index[n, 0]), _spread_bits(index[n, 1]), _spread_bits(index[n, 2])
         out[n] = x | (y << np.uint64(1)) | (z << np.uint64(2))
@@ -39,7 +39,7 @@ def morton_codes(thread: ThreadSlice, index: np.ndarray, out: np.ndarray) -> Non
 def look_up(
     thread: ThreadSlice, index: np.ndarray, ratio: np.ndarray, mean: np.ndarray, largest: np.ndarray, out: np.ndarray
 ) -> None:
-    """``out`` (n, 2) of ``mean`` and ``largest`` (nz, ny, nx) at the middles of cells, clamped to the grid.
+    """Write ``mean`` and ``largest`` (nz, ny, nx) at the middles of cells, clamped to the grid, into ``out`` (n, 2).
 
     ``index`` (n, 3) int32 cell indices; ``ratio`` (3,) a cell's edges in those of the grid's cells.
     """
@@ -55,7 +55,7 @@ def look_up(
 def take_base(
     thread: ThreadSlice, moments: np.ndarray, keep: np.ndarray, seen: np.ndarray, out: np.ndarray, top: np.ndarray
 ) -> None:
-    """Rows ``keep`` (n,) of ``moments`` (m, 13) as a pyramid's base ``out`` (n, 18), ``top`` (n,).
+    """Copy rows ``keep`` (n,) of ``moments`` (m, 13) into a pyramid's base ``out`` (n, 18), ``top`` (n,).
 
     ``seen`` (m, 2): mean and largest transmittance.
     """
@@ -76,7 +76,7 @@ def take_base(
 def sum_children(
     thread: ThreadSlice, rows: np.ndarray, top: np.ndarray, start: np.ndarray, out: np.ndarray, out_top: np.ndarray
 ) -> None:
-    """Sums ``out`` (m, 18) of the rows (n, 18) from one of ``start`` (m,) to the next; the largest of ``top`` (n,)."""
+    """Sum rows (n, 18) from one ``start`` (m,) to the next into ``out`` (m, 18), with the largest of ``top`` (n,)."""
     for m in iterations(thread, len(start)):
         stop = start[m + 1] if m + 1 < len(start) else len(rows)
         for column in range(COLUMNS):
@@ -92,7 +92,7 @@ def sum_children(
 def score_splits(
     thread: ThreadSlice, moments: np.ndarray, top: np.ndarray, edge: np.ndarray, plain: float, out: np.ndarray
 ) -> None:
-    """`tree.split_score` ``out`` (n,) of rows of ``moments`` (n, 18), ``top`` (n,), of edges ``edge`` (3,).
+    """Write `tree.split_score` of rows of ``moments`` (n, 18), ``top`` (n,), edges ``edge`` (3,), into ``out`` (n,).
 
     ``plain``: variance added to that of the colours; infinite: colours do not count.
     """
@@ -112,7 +112,7 @@ def score_splits(
 
 @inlined(error_model="numpy")
 def _rotate(a: np.ndarray, v: np.ndarray, p: int, q: int) -> None:
-    """One Jacobi rotation of the symmetric ``a`` (3, 3) that makes a[p, q] zero; ``v`` (3, 3) gathers them."""
+    """Apply one Jacobi rotation to symmetric ``a`` (3, 3) that makes a[p, q] zero; ``v`` (3, 3) gathers them."""
     if a[p, q] == 0.0:
         return
     theta = (a[q, q] - a[p, p]) / (2 * a[p, q])
@@ -129,7 +129,7 @@ def _rotate(a: np.ndarray, v: np.ndarray, p: int, q: int) -> None:
 
 @parallel_kernel("f8:3 f8:2 f8:3", error_model="numpy")
 def principal_axes(thread: ThreadSlice, cov: np.ndarray, values: np.ndarray, vectors: np.ndarray) -> None:
-    """Eigenvalues (n, 3), ascending, and eigenvectors (n, 3, 3; columns) of symmetric ``cov`` (n, 3, 3), by Jacobi."""
+    """Compute eigenvalues (n, 3), ascending, and eigenvectors (n, 3, 3; columns) of symmetric ``cov`` by Jacobi."""
     for n in iterations(thread, len(cov)):
         a, v = np.empty((3, 3)), np.zeros((3, 3))
         for row in range(3):

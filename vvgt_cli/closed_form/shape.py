@@ -46,7 +46,7 @@ STYLES = {"round": ROUND, "middle": MIDDLE, "sharp": SHARP}
 
 
 def cell_gaussians(leaves: Leaves, voxel: float, pixel: float, opaque: Opaque, style: SurfaceStyle) -> Gaussians:
-    """One Gaussian a cell.
+    """Return one Gaussian a cell.
 
     Args:
         leaves: the cells.
@@ -85,7 +85,7 @@ def cell_gaussians(leaves: Leaves, voxel: float, pixel: float, opaque: Opaque, s
 
 
 def widened(gaussians: Gaussians, factor: float, pixel: float) -> Gaussians:
-    """Of the same mass, wider by ``factor`` along all axes but the shortest: neighbours on a surface overlap more.
+    """Widen by ``factor`` along all axes but the shortest, of the same mass: neighbours on a surface overlap more.
 
     Cells stand on a lattice: Gaussians of standard deviation s at distances a ripple by ``2 exp(-2 pi^2 s^2 / a^2)`` of
     their mean. ``pixel``: as for `peak_opacity`.
@@ -98,7 +98,7 @@ def widened(gaussians: Gaussians, factor: float, pixel: float) -> Gaussians:
 
 
 def visible_color(moments: np.ndarray) -> np.ndarray:
-    """(n, 3) mean colour as the views see it; of all the extinction where they see none."""
+    """Return (n, 3) mean colour as the views see it; of all the extinction where they see none."""
     mass, seen = moments[:, [MASS]], moments[:, [SEEN]]  # (n, 1)
     hidden = seen <= 1e-12 * mass
     return np.where(hidden, moments[:, COLOR] / mass, moments[:, SEEN_COLOR] / np.where(hidden, 1, seen))
@@ -113,7 +113,7 @@ def make_gaussians(
 
 
 def quaternions(axes: np.ndarray) -> np.ndarray:
-    """Rotations (n, 3, 3) (a reflection is undone on the first column) -> unit quaternions (w, x, y, z) (n, 4)."""
+    """Return unit quaternions (w, x, y, z) (n, 4) of rotations (n, 3, 3); a reflection flips the first column."""
     m = axes.copy()
     m[np.linalg.det(axes) < 0, :, 0] *= -1
     xx, yy, zz = m[:, 0, 0], m[:, 1, 1], m[:, 2, 2]

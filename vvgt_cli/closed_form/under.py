@@ -19,7 +19,7 @@ PRIMES = 2, 3, 5
 
 
 def offsets() -> np.ndarray:
-    """(POINTS, 3) points of a Gaussian in its standard deviations: a Halton sequence and its mirror image.
+    """Return (POINTS, 3) points of a Gaussian in its standard deviations: a Halton sequence and its mirror image.
 
     They have the covariance of the law, so that the spread of a linear field is exact.
     """
@@ -30,12 +30,12 @@ def offsets() -> np.ndarray:
 
 
 def reach() -> float:
-    """Standard deviations within which all `offsets` lie."""
+    """Return the standard deviations within which all `offsets` lie."""
     return float(np.linalg.norm(offsets(), axis=1).max())
 
 
 def _radical(k: int, base: int) -> float:
-    """Digits of k after the point, in reverse (van der Corput)."""
+    """Return the digits of k after the point, in reverse (van der Corput)."""
     found, share = 0.0, 1.0 / base
     while k:
         k, digit = divmod(k, base)
@@ -49,7 +49,7 @@ def sample_points(
     voxels: Voxels, centres: np.ndarray, arms: np.ndarray, points: np.ndarray, begin: np.ndarray, lo: np.ndarray,
     hi: np.ndarray, out: np.ndarray,
 ) -> None:  # fmt: skip
-    """Values of ``voxels`` at ``centres`` (n, 3) + ``arms`` (n, 3, 3) ``points`` (m, 3) into ``out`` (n, m).
+    """Write ``voxels`` at ``centres`` (n, 3) + ``arms`` (n, 3, 3) ``points`` (m, 3) into ``out`` (n, m).
 
     All in voxel coordinates of the volume, of which ``begin`` (3,) is the first of ``voxels``. Written are values of
     points within the voxels ``lo`` to ``hi`` (3,), each half an edge to either side of its centre.
@@ -66,22 +66,23 @@ def sample_points(
 
 
 def in_voxels(gaussians: Gaussians, half: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Centres (K, 3) and axes of a standard deviation (K, 3, 3), its columns, of box-frame Gaussians, in voxels."""
+    """Return centres (K, 3) and axes of a standard deviation (K, 3, 3), columns, of box-frame Gaussians, in voxels."""
     axes = rotations(gaussians.quaternions.astype(np.float64))
     arms = axes * np.exp(gaussians.log_scales.astype(np.float64))[:, None, :] / step[:, None]
     return (gaussians.means.astype(np.float64) + half) / step - 0.5, np.ascontiguousarray(arms)
 
 
 def values_of(samples: np.ndarray, gaussians: Gaussians, slope: float, intercept: float) -> np.ndarray:
-    """(K, 5) float32 of ``samples`` (K, POINTS) at the points of Gaussians: mean, spread and direction of data values.
+    """Return (K, 5) float32 of ``samples`` (K, POINTS) at points of Gaussians: mean, spread and direction of values.
 
     The direction is that of the gradient, fitted by least squares, as long as the share of the spread that it explains.
     Samples that are not finite do not count; a row without any has NaN.
 
     Args:
-        samples: as kernels read them, of which the data value is ``slope * sample + intercept``.
+        samples: (K, POINTS) as kernels read them.
         gaussians: in the box frame, as is the direction.
-        slope, intercept: see above.
+        slope: of the data value ``slope * sample + intercept``.
+        intercept: of the data value.
     """
     known = np.isfinite(samples)
     count = known.sum(axis=1)

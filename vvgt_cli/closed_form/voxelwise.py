@@ -35,7 +35,7 @@ _jit = inlined(fastmath=FLAGS, error_model="numpy")
 
 @_jit
 def _smooth(source: np.ndarray, to: np.ndarray, stride: int) -> None:
-    """Means of linear values over the boxes of voxels, along the axis of ``stride``."""
+    """Write means of linear values over the boxes of voxels, along the axis of ``stride``."""
     n = ALL - 2 * stride
     before, here, after, out = source[:n], source[stride : stride + n], source[2 * stride :], to[stride : stride + n]
     for i in range(n):
@@ -44,7 +44,7 @@ def _smooth(source: np.ndarray, to: np.ndarray, stride: int) -> None:
 
 @_jit
 def _slopes(source: np.ndarray, to: np.ndarray, stride: int) -> None:
-    """Mean slopes over the boxes of voxels."""
+    """Write mean slopes over the boxes of voxels."""
     n = ALL - 2 * stride
     before, after, out = source[:n], source[2 * stride :], to[stride : stride + n]
     for i in range(n):
@@ -53,7 +53,7 @@ def _slopes(source: np.ndarray, to: np.ndarray, stride: int) -> None:
 
 @_jit
 def _least(source: np.ndarray, to: np.ndarray, stride: int) -> None:
-    """The smallest of each voxel and the middles between it and both neighbours."""
+    """Write the smallest of each voxel and the middles between it and both neighbours."""
     n = ALL - 2 * stride
     before, here, after, out = source[:n], source[stride : stride + n], source[2 * stride :], to[stride : stride + n]
     for i in range(n):
@@ -63,7 +63,7 @@ def _least(source: np.ndarray, to: np.ndarray, stride: int) -> None:
 
 @_jit
 def _most(source: np.ndarray, to: np.ndarray, stride: int) -> None:
-    """The largest of them."""
+    """Write the largest of each voxel and the middles between it and both neighbours."""
     n = ALL - 2 * stride
     before, here, after, out = source[:n], source[stride : stride + n], source[2 * stride :], to[stride : stride + n]
     for i in range(n):
@@ -73,7 +73,7 @@ def _most(source: np.ndarray, to: np.ndarray, stride: int) -> None:
 
 @_jit
 def _lay_out(values: np.ndarray, x0: int, y0: int, z0: int, optics: Optics, to: np.ndarray) -> None:
-    """Table coordinates, beyond the table too, of the brick from voxel (x0, y0, z0) on and of the voxels around it."""
+    """Write table coordinates, beyond the table too, of the brick from voxel (x0, y0, z0) on and its surroundings."""
     nz, ny, nx = values.shape
     start, stop = min(max(1 - x0, 0), EDGE), min(EDGE, nx + 1 - x0)
     for k in range(EDGE):
@@ -90,7 +90,7 @@ def _lay_out(values: np.ndarray, x0: int, y0: int, z0: int, optics: Optics, to: 
 
 @_jit
 def _means(s: np.ndarray) -> None:
-    """Rows MEAN to ALONG_Z of the scratch from row VALUE."""
+    """Fill rows MEAN to ALONG_Z of the scratch from row VALUE."""
     _smooth(s[VALUE], s[MEAN], PLANE)
     _slopes(s[VALUE], s[ALONG_Z], PLANE)
     _slopes(s[MEAN], s[ALONG_Y], EDGE)
@@ -104,7 +104,7 @@ def _means(s: np.ndarray) -> None:
 
 @_jit
 def _straight(s: np.ndarray, p: int, optics: Optics) -> Sums:
-    """Sums over the eight points of voxel ``p`` of a brick, where the function is a line."""
+    """Sum over the eight points of voxel ``p`` of a brick, where the function is linear."""
     top = optics.nodes.shape[0] - 1
     u = min(max(np.float64(s[MEAN, p]), 0.0), float(top))
     index = min(int(u), top - 1)
@@ -116,7 +116,7 @@ def _straight(s: np.ndarray, p: int, optics: Optics) -> Sums:
 
 @_jit
 def _bent(v: np.ndarray, p: int, optics: Optics) -> Sums:
-    """The same where it is none: each point averaged over the spread of its own box."""
+    """Sum over the same points where it is not linear, each averaged over the spread of its own box."""
     bins = float(optics.nodes.shape[0] - 1)
     red = green = blue = mass = fx = fy = fz = xy = xz = yz = 0.0
     for octant in range(8):
@@ -209,7 +209,7 @@ def voxel_moments(
     voxels: Voxels, optics: Optics, straight: np.ndarray, blocks: np.ndarray, exponent: np.ndarray, half: np.ndarray,
     step: np.ndarray, begin: np.ndarray, out: np.ndarray,
 ) -> None:  # fmt: skip
-    """`quadrature.block_moments` of cells of 2^``exponent`` (3,) whole voxels, two points a voxel and axis.
+    """Integrate `quadrature.block_moments` of cells of 2^``exponent`` (3,) voxels, two points a voxel and axis.
 
     ``straight`` (bins + 1,) of `straight_until`; other arguments as there.
     """

@@ -72,7 +72,8 @@ def visible_blocks(
 
     Args:
         values: (nz, ny, nx) as kernels read them.
-        first, edge: as of `block_ranges`.
+        first: (3,) first voxel of the first block, (x, y, z).
+        edge: (3,) voxels along the edges of a block.
         shape: (3,) blocks along (x, y, z).
         tables: optics over the stored values.
     """

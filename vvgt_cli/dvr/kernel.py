@@ -38,7 +38,7 @@ _jit = inlined(fastmath=FLAGS, error_model="numpy", borrowed=True)
 
 @_jit
 def sample(values: np.ndarray, x: float, y: float, z: float) -> float:
-    """Trilinear value of ``values`` (nz, ny, nx) at voxel coordinates, clamped to the edge voxels.
+    """Interpolate ``values`` (nz, ny, nx) trilinearly at voxel coordinates, clamped to the edge voxels.
 
     NaN where a corner is not finite.
     """
@@ -61,7 +61,7 @@ def sample(values: np.ndarray, x: float, y: float, z: float) -> float:
 
 @_jit
 def table_coordinate(value: float, optics: Optics) -> float:
-    """Table coordinate in [0, bins], or -1 for a value that is not finite."""
+    """Return a value's table coordinate in [0, bins], or -1 for a value that is not finite."""
     if not (abs(value) < np.inf):
         return -1.0
     return min(max((value - optics.lo) * optics.inv_width, 0.0), float(optics.nodes.shape[0] - 1))
@@ -69,7 +69,7 @@ def table_coordinate(value: float, optics: Optics) -> float:
 
 @_jit
 def _integrals(u: float, optics: Optics) -> Quad:
-    """Integrals over [0, u] of (tau r, tau g, tau b, tau): trapezoid, exact where tau is linear within a bin."""
+    """Integrate (tau r, tau g, tau b, tau) over [0, u]: trapezoid, exact where tau is linear within a bin."""
     index = min(int(u), optics.nodes.shape[0] - 2)
     f = u - index
     h = 0.5 * f * f
@@ -79,7 +79,7 @@ def _integrals(u: float, optics: Optics) -> Quad:
 
 @_jit
 def _point(u: float, optics: Optics) -> Quad:
-    """(tau r, tau g, tau b, tau) at one table coordinate."""
+    """Return (tau r, tau g, tau b, tau) at one table coordinate."""
     index = min(int(u), optics.nodes.shape[0] - 2)
     f = u - index
     return add(scale(1.0 - f, row(optics.nodes, U(index))), scale(f, row(optics.nodes, U(index + 1))))
@@ -87,7 +87,7 @@ def _point(u: float, optics: Optics) -> Quad:
 
 @_jit
 def _mean(u0: float, u1: float, optics: Optics) -> Quad:
-    """Mean of (tau r, tau g, tau b, tau) while the table coordinate goes linearly from u0 to u1."""
+    """Average (tau r, tau g, tau b, tau) while the table coordinate goes linearly from u0 to u1."""
     width = u1 - u0
     if abs(width) < 0.5:
         return _point(0.5 * (u0 + u1), optics)
@@ -96,7 +96,7 @@ def _mean(u0: float, u1: float, optics: Optics) -> Quad:
 
 @_jit
 def mean_optics(u0: float, u1: float, optics: Optics) -> tuple[float, float, float, float]:
-    """`_mean` as a tuple."""
+    """Return `_mean` as a tuple."""
     mean = _mean(u0, u1, optics)
     return lane(mean, 0), lane(mean, 1), lane(mean, 2), lane(mean, 3)
 
@@ -105,7 +105,7 @@ def mean_optics(u0: float, u1: float, optics: Optics) -> tuple[float, float, flo
 def box_span(
     px: float, py: float, pz: float, dx: float, dy: float, dz: float, nx: int, ny: int, nz: int
 ) -> tuple[float, float]:
-    """Entry and exit t >= 0 of a ray through the box [-1/2, n - 1/2]^3; entry >= exit: missed."""
+    """Return entry and exit t >= 0 of a ray through the box [-1/2, n - 1/2]^3; entry >= exit: missed."""
     t0, t1 = 0.0, np.inf
     for p, d, n in ((px, dx, nx), (py, dy, ny), (pz, dz, nz)):
         if d == 0.0:
@@ -119,7 +119,7 @@ def box_span(
 
 @_jit
 def absorbed(depth: float) -> float:
-    """(1 - exp(-x)) / x for x >= 0, to 2e-10."""
+    """Return (1 - exp(-x)) / x for x >= 0, to 2e-10."""
     if depth > 1.0:
         return (1.0 - math.exp(-depth)) / depth
     c0, c1, c2, c3, c4, c5, c6, c7 = ABSORBED
@@ -131,7 +131,7 @@ def absorbed(depth: float) -> float:
 
 @_jit
 def composite(u0: float, u1: float, dt: float, optics: Optics, light: Quad, trans: float) -> tuple[Quad, float]:
-    """``light`` (r, g, b, alpha) and ``trans`` behind a segment of length dt; the coordinate goes from u0 to u1."""
+    """Return ``light`` (r, g, b, alpha) and ``trans`` behind a segment of length dt, along which u0 goes to u1."""
     segment = scale(dt, _mean(u0, u1, optics))
     depth = max(lane(segment, 3), 0.0)
     if depth <= SUB_DEPTH or abs(u1 - u0) < 0.5:
@@ -150,14 +150,14 @@ def composite(u0: float, u1: float, dt: float, optics: Optics, light: Quad, tran
 
 @_jit
 def is_flat(optics: Optics) -> bool:
-    """Whether no segment needs finer samples: the whole function is flat."""
+    """Return whether no segment needs finer samples: the whole function is flat."""
     found: bool = optics.flat[0] >= optics.flat.shape[0] - 1
     return found
 
 
 @_jit
 def values_met(before: float, u0: float, u1: float, flat: bool) -> tuple[float, float]:
-    """Table coordinates that a segment from u0 to u1 meets, about; below 0 where an end is not finite.
+    """Return roughly the table coordinates that a segment from u0 to u1 meets; below 0 where an end is not finite.
 
     The scalar is no line between samples, which matters unless the function is ``flat``. Its bend follows from the
     sample ``before`` (-1: none).
@@ -174,7 +174,7 @@ def pass_segment(
     voxels: Voxels, optics: Optics, p: Vector, d: Vector, t: float, dt: float, u0: float, u1: float,
     met: tuple[float, float], light: Quad, trans: float,
 ) -> tuple[Quad, float, float]:  # fmt: skip
-    """`composite` of the segment from t to t + dt of the ray p + t d; in `FINER` parts if extinction is not flat.
+    """Apply `composite` from t to t + dt of the ray p + t d; in `FINER` parts if extinction is not flat.
 
     ``met``: `values_met`. Last is the t at which, on average, the segment absorbs.
     """
@@ -198,7 +198,7 @@ def pass_segment(
 
 @_jit
 def inverse(d: float) -> float:
-    """1 / d, or so large for d = 0 that a face across that axis is never reached."""
+    """Return 1 / d, or so large for d = 0 that a face across that axis is never reached."""
     return 1.0 / d if d != 0.0 else 1e300
 
 
@@ -206,7 +206,7 @@ def inverse(d: float) -> float:
 def _exit(
     px: float, py: float, pz: float, ix: float, iy: float, iz: float, reach: int, bi: int, bj: int, bk: int
 ) -> float:
-    """Ray parameter at which the cube of bricks within ``reach`` of (bi, bj, bk) ends; ix, iy, iz: `inverse`."""
+    """Return the t at which the cube of bricks within ``reach`` of (bi, bj, bk) ends; ix, iy, iz: `inverse`."""
     x = (bi + reach if ix > 0.0 else bi - reach + 1) * BRICK
     y = (bj + reach if iy > 0.0 else bj - reach + 1) * BRICK
     z = (bk + reach if iz > 0.0 else bk - reach + 1) * BRICK
@@ -217,13 +217,13 @@ def _exit(
 def leap(
     px: float, py: float, pz: float, dx: float, dy: float, dz: float, reach: int, bi: int, bj: int, bk: int
 ) -> float:
-    """Ray parameter at which the empty cube of bricks around (bi, bj, bk) ends, from the ray's origin p."""
+    """Return the ray parameter at which the empty cube of bricks around (bi, bj, bk) ends, from the ray's origin p."""
     return _exit(px, py, pz, inverse(dx), inverse(dy), inverse(dz), reach, bi, bj, bk)
 
 
 @_jit
 def _brick(p: float, d: float, t: float, n: int) -> int:
-    """Brick along one axis in which the ray p + t d is, clamped to the volume."""
+    """Return the brick along one axis in which the ray p + t d is, clamped to the volume."""
     return min(max(int(p + t * d), 0), n - 1) >> BRICK_BITS
 
 
@@ -232,7 +232,7 @@ def skip(
     shape: tuple[int, int, int], empty: np.ndarray, px: float, py: float, pz: float, dx: float, dy: float, dz: float,
     ix: float, iy: float, iz: float, t0: float, dt: float, per_step: float, count: int, i: int,
 ) -> int:  # fmt: skip
-    """The sample from which on, after sample i, the ray may meet something visible; > count: none.
+    """Return the sample after sample i from which on the ray may meet something visible; > count: none.
 
     Leaps from one empty cube of bricks to the next while what lies between is empty too: bricks that share a face make
     a box, and a cube of more than one brick holds the brick that the ray comes from. The last sample in empty space is
@@ -262,7 +262,7 @@ def skip(
 
 @_jit
 def any_light(run: Run, u0: float, dark: np.ndarray, flat: bool) -> bool:
-    """Whether some segment of a run (RUN,) that comes from u0 (-1: none) may have extinction, or nearly so."""
+    """Return whether a segment of a run (RUN,) that comes from u0 (-1: none) may have extinction, or nearly so."""
     lowest: float
     highest: float
     lowest, highest = run_range(run)
@@ -274,7 +274,7 @@ def any_light(run: Run, u0: float, dark: np.ndarray, flat: bool) -> bool:
 
 @_jit
 def texel_at(values: np.ndarray, x: float, y: float, z: float) -> Quad:
-    """Trilinear voxel of ``values`` (nz, ny, nx, 4) at voxel coordinates, clamped to the edge voxels."""
+    """Interpolate ``values`` (nz, ny, nx, 4) trilinearly at voxel coordinates, clamped to the edge voxels."""
     nz, ny, nx, _ = values.shape
     x = min(max(x, 0.0), nx - 1.0)
     y = min(max(y, 0.0), ny - 1.0)
@@ -292,7 +292,7 @@ def texel_at(values: np.ndarray, x: float, y: float, z: float) -> Quad:
 
 @_jit
 def blend_texels(a: Quad, b: Quad, dt: float, seen: Quad, trans: float) -> tuple[Quad, float]:
-    """``seen`` (r, g, b, alpha) and ``trans`` behind a segment of length dt; the optics go linearly from a to b."""
+    """Return ``seen`` (r, g, b, alpha) and ``trans`` behind a segment of length dt; optics go linearly from a to b."""
     segment = scale(0.5 * dt, add(a, b))
     depth = lane(segment, 3)
     if depth <= SUB_DEPTH:

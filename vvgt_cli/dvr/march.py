@@ -114,7 +114,7 @@ def _through_texels(
     texels: Texels, voxels: Voxels, empty: np.ndarray, light: Any, p: Vector, d: Vector,
     t0: float, dt: float, first: int, last: int, step: float,
 ) -> tuple[float, float, float, float]:  # fmt: skip
-    """`_through_values` of an optics grid: along a segment extinction times (r, g, b, 1) is linear."""
+    """Return `_through_values` of an optics grid: along a segment extinction times (r, g, b, 1) is linear."""
     (px, py, pz), (dx, dy, dz) = p, d
     nz, ny, nx, _ = texels.values.shape
     seen: Quad = zeros4()
@@ -228,7 +228,7 @@ def _tiles(
 
 @_exact
 def _owned(p: float, d: float, lo: float, hi: float, t0: float, dt: float, count: int) -> tuple[int, int]:
-    """First segment, and that behind the last, with its middle from face ``lo`` to face ``hi`` along one axis."""
+    """Return the first segment with its middle from face ``lo`` to ``hi`` along one axis, and that after the last."""
     if d == 0.0:
         return (0, count) if lo <= p < hi else (0, 0)
     a, b = ((lo - p) / d - t0) / dt - 0.5, ((hi - p) / d - t0) / dt - 0.5
@@ -240,7 +240,7 @@ def _owned(p: float, d: float, lo: float, hi: float, t0: float, dt: float, count
 def _ray(
     faces: np.ndarray, p: Vector, basis: np.ndarray, lens: np.ndarray, step: float, column: float, row: float
 ) -> tuple[Vector, float, float, int, int]:
-    """Direction of the ray through a place of the picture, where its segments begin, their length, the first and last.
+    """Return a ray's direction, where its segments begin, their length, the first and last.
 
     The latter two are the block's own, as ``faces`` (3, 3) of `cast_segments` say; none where they are the same.
     """

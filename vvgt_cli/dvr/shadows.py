@@ -29,7 +29,7 @@ def _transmittance(
     last: float,
     step: float,
 ) -> float:
-    """From p along d (voxels a unit-frame length), from ``first`` voxels to the length ``last``; ``step`` in voxels."""
+    """Return transmittance from p along d (voxels a unit length), from ``first`` voxels to the length ``last``."""
     values, dark = voxels.values, optics.dark
     nz, ny, nx = values.shape
     t0, t1 = box_span(px, py, pz, dx, dy, dz, nx, ny, nz)
@@ -80,7 +80,7 @@ def mean_transmittance(
     step: float,
     out: np.ndarray,
 ) -> None:
-    """Mean over ``directions`` (n, 3), voxels a unit-frame length, at the centres of cubes of ``cell`` voxels.
+    """Average over ``directions`` (n, 3), voxels a unit-frame length, at the centres of cubes of ``cell`` voxels.
 
     ``out`` (cz, cy, cx) float32; cells that are not ``wanted`` (cz, cy, cx) get 1.
     Rays begin ``first`` voxels from there and end at the unit-frame length ``last``; ``step`` in voxels.
@@ -108,7 +108,7 @@ def mean_transmittance(
 def cell_extinction(
     thread: ThreadSlice, voxels: Voxels, optics: Optics, empty: np.ndarray, cell: int, out: np.ndarray
 ) -> None:
-    """Mean extinction of the voxels in each cube of ``cell`` of them along an edge, into ``out`` (cz, cy, cx)."""
+    """Write the mean extinction of each cube of ``cell`` voxels along an edge into ``out`` (cz, cy, cx)."""
     nz, ny, nx = voxels.values.shape
     cz, cy, cx = out.shape
     for flat in iterations(thread, cz * cy):

@@ -98,13 +98,13 @@ ALL = (
 
 
 def for_light(names: tuple[str, ...], attenuated: bool) -> tuple[str, ...]:
-    """Kernels of a command whose scene is lit, ``attenuated`` by shadows or occlusion."""
+    """Return the kernels of a command whose scene is lit, ``attenuated`` by shadows or occlusion."""
     rays = tuple(RENDER_LIT if name == RENDER else name for name in names)
     return (*rays, *(SHADE if MARCH in names else ()), *(SHADOWS if attenuated else ()))
 
 
 def for_degree(names: tuple[str, ...], degree: int) -> tuple[str, ...]:
-    """Kernels of a command that meets Gaussians with harmonics of a degree: more, where that is above 0."""
+    """Return the kernels of a command for Gaussians with harmonics of ``degree``: above 0 it needs more."""
     if not degree:
         return names
     slopes = [VIEW_SLOPES] if PAIR_SUMS in names else []
@@ -112,10 +112,10 @@ def for_degree(names: tuple[str, ...], degree: int) -> tuple[str, ...]:
 
 
 def for_grid(names: tuple[str, ...]) -> tuple[str, ...]:
-    """Kernels of a command whose scene is an optics grid."""
+    """Return the kernels of a command whose scene is an optics grid."""
     return tuple(GRID.get(name, name) for name in names)
 
 
 def for_blocks(names: tuple[str, ...]) -> tuple[str, ...]:
-    """Kernels of a command whose volume is gone through in blocks."""
+    """Return the kernels of a command that reads its volume in blocks."""
     return (*(SEGMENTS.get(name, name) for name in names), BLOCK_RANGES)

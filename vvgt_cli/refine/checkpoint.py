@@ -33,7 +33,7 @@ STEPPED = 3  # raised when the same start and options step otherwise
 
 
 def fingerprint(gaussians: Gaussians, options: OptimizeOptions, *views: Any) -> str:
-    """Hash of all that a run depends on; ``views``: `Train`, `Check` or None."""
+    """Hash all that a run depends on; ``views``: `Train`, `Check` or None."""
     found = hashlib.sha256(f"{STEPPED} {replace(options, checkpoint=None)!r}".encode())
     for array in gaussians.arrays().values():
         found.update(array.tobytes())
@@ -92,7 +92,7 @@ def resume(path: str, key: str, state: State, judge: Judge, record: OptimizeReco
 
 
 def load_archive(path: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """What was said about the run, and the arrays; all as it lies in the file, so that nothing grows in memory."""
+    """Return the run's description and the arrays, all as it lies in the file, so that nothing grows in memory."""
     with zipfile.ZipFile(path) as archive:
         entries = archive.infolist()
         if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
@@ -105,7 +105,7 @@ def load_archive(path: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
 
 
 def _check_like(saved: dict[str, np.ndarray], own: dict[str, np.ndarray]) -> None:
-    """See that arrays are those of a state of any number of Gaussians: kernels do not check.
+    """Check that arrays are those of a state of any number of Gaussians: kernels do not check.
 
     Raises:
         ValueError: other names, types or shapes.

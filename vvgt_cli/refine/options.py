@@ -68,6 +68,11 @@ class OptimizeOptions:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        """Check the options.
+
+        Raises:
+            UsageError: an unknown method, or a number out of its range.
+        """
         if self.method not in METHODS:
             raise UsageError(f"method {self.method!r}; expected one of {', '.join(METHODS)}")
         if self.steps is None and self.time_budget is None:
@@ -85,7 +90,7 @@ class OptimizeOptions:
 
     @classmethod
     def of(cls, method: str, **options: Any) -> OptimizeOptions:
-        """Options with the loss that belongs to a method: squares, of texture too, or 3DGS' 0.8 L1 + 0.2 (1 - SSIM)."""
+        """Return options with the method's loss: squares, of texture too, or 3DGS' 0.8 L1 + 0.2 (1 - SSIM)."""
         return cls(method=method, **(LOSSES.get(method, {}) | options))
 
 

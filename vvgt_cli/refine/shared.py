@@ -35,7 +35,7 @@ NONE = np.zeros((0, FEATURES, LANES), np.int8), np.zeros((KNOWN, FEATURES), np.f
 
 
 def aligned(means: np.ndarray, factors: np.ndarray, logits: np.ndarray, colors: np.ndarray) -> np.ndarray:
-    """Numbers known of each Gaussian; and its axes in an order and with signs that mean the same for all.
+    """Return numbers known of each Gaussian, and its axes in an order and with signs that mean the same for all.
 
     Args:
         means: (K, 3) float32.
@@ -66,7 +66,7 @@ def aligned(means: np.ndarray, factors: np.ndarray, logits: np.ndarray, colors: 
 
 
 def sample_of(count: int) -> tuple[int, int]:
-    """Of ``count`` Gaussians one run of `RUN` in how many is regressed on, and how many Gaussians that makes.
+    """Return every how many runs of `RUN` of ``count`` Gaussians are regressed on, and how many Gaussians that makes.
 
     All below twice `SAMPLE`, else at least `SAMPLE` and less than twice as many.
     """
@@ -75,7 +75,7 @@ def sample_of(count: int) -> tuple[int, int]:
 
 
 def sampled(numbers: np.ndarray) -> np.ndarray:
-    """(n, m) of ``numbers`` (K, m): those of `sample_of`."""
+    """Return rows of ``numbers`` (K, m) that `sample_of` chooses: (n, m)."""
     every, count = sample_of(len(numbers))
     if every == 1:
         return numbers
@@ -85,7 +85,7 @@ def sampled(numbers: np.ndarray) -> np.ndarray:
 
 
 def _standard(numbers: np.ndarray) -> np.ndarray:
-    """Of mean 0 and variance 1 over the first axis, within `FARTHEST`; 0 where all are the same."""
+    """Scale to mean 0 and variance 1 over the first axis, within `FARTHEST`; 0 where all are the same."""
     spread = numbers.std(axis=0, dtype=np.float64)
     found = (numbers - numbers.mean(axis=0, dtype=np.float64)) / np.where(spread > 1e-9, spread, np.inf)
     standard: np.ndarray = np.clip(found, -FARTHEST, FARTHEST).astype(np.float32)
@@ -106,7 +106,7 @@ class SharedSteps:
     """
 
     def __init__(self, known: np.ndarray) -> None:
-        """Of ``known`` (K, 17), as `aligned` returns it."""
+        """Prepare from ``known`` (K, 17), as `aligned` returns it."""
         count, inputs = known.shape
         rng = np.random.default_rng(0)  # the same features in each run
         ways = (rng.normal(size=(inputs, FEATURES - inputs - 1)) * (BENT / np.sqrt(inputs))).astype(np.float32)
@@ -134,7 +134,7 @@ class SharedSteps:
             self.features[begin // LANES : begin // LANES + len(blocks)] = blocks.transpose(0, 2, 1)
 
     def weights(self, directions: np.ndarray) -> np.ndarray:
-        """(KNOWN, FEATURES) float32, `factor` times what foretells ``directions`` (COUNT, n) of the sample, all finite.
+        """Return (KNOWN, FEATURES) float32: `factor` x the regression of finite ``directions`` (COUNT, n).
 
         Not of what turns the axes: it has no sign that means the same for all.
         """
@@ -150,7 +150,7 @@ class SharedSteps:
         return found
 
     def saved(self) -> dict[str, np.ndarray]:
-        """What the next steps depend on."""
+        """Return what the next steps depend on."""
         return {"last": np.append(self.before, (self.factor, self.agreement))}
 
     def restore(self, saved: dict[str, np.ndarray]) -> None:
@@ -160,7 +160,7 @@ class SharedSteps:
 
 
 def shared_steps(means: np.ndarray, factors: np.ndarray, logits: np.ndarray, colors: np.ndarray) -> SharedSteps | None:
-    """Of a start, whose axes are put in order in place; None where there are too few Gaussians for it."""
+    """Prepare from a start, whose axes are put in order in place; None with too few Gaussians for it."""
     if len(means) < LEAST:
         return None
     return SharedSteps(aligned(means, factors, logits, colors))

@@ -44,7 +44,7 @@ def blur(thread: ThreadSlice, planes: np.ndarray, kernel: np.ndarray, out: np.nd
 
 @parallel_kernel(fastmath=True, error_model="numpy")
 def products(thread: ThreadSlice, x: np.ndarray, y: np.ndarray, out: np.ndarray) -> None:
-    """``out`` (5, h, w): x, y, x^2, y^2, x y of one channel (h, w)."""
+    """Write x, y, x^2, y^2 and x y of one channel (h, w) into ``out`` (5, h, w)."""
     for row in iterations(thread, x.shape[0]):
         for col in range(x.shape[1]):
             a, b = x[row, col], y[row, col]
@@ -54,7 +54,7 @@ def products(thread: ThreadSlice, x: np.ndarray, y: np.ndarray, out: np.ndarray)
 
 @parallel_kernel(fastmath=True, error_model="numpy")
 def slopes(thread: ThreadSlice, blurred: np.ndarray, out: np.ndarray, score: np.ndarray) -> None:
-    """SSIM's derivatives by blur(x), blur(x^2), blur(x y) into ``out`` (3, h, w), its sums a row into ``score`` (h,).
+    """Write SSIM's derivatives by blur(x), blur(x^2), blur(x y) into ``out`` (3, h, w), its row sums into ``score``.
 
     ``blurred`` (5, h, w): the blurs of `products`.
     """
@@ -86,7 +86,7 @@ def add_gradient(
     channel: int,
     grad: np.ndarray,
 ) -> None:
-    """``grad`` (h, w, 4), one channel, += ``scale`` x gradient of the sum of SSIM.
+    """Add ``scale`` times the gradient of the sum of SSIM to one channel of ``grad`` (h, w, 4).
 
     ``blurred`` (3, h, w): the blurs of `slopes`; ``x``, ``y`` (h, w) the channel of picture and target.
     """
@@ -97,10 +97,12 @@ def add_gradient(
 
 
 def add_ssim_gradient(image: np.ndarray, target: np.ndarray, weight: float, grad: np.ndarray) -> float:
-    """``grad`` += gradient of ``weight`` x sum over pixels and RGB of (1 - SSIM); returns the mean SSIM.
+    """Add the gradient of ``weight`` x the sum over pixels and RGB of (1 - SSIM) to ``grad``; return the mean SSIM.
 
     Args:
-        image, target: (h, w, 4) float32.
+        image: (h, w, 4) float32 premultiplied, as drawn.
+        target: (h, w, 4) float32.
+        weight: of the term in the loss.
         grad: (h, w, 4) float32.
     """
     h, w = image.shape[:2]

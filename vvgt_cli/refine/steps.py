@@ -24,7 +24,7 @@ _jit = inlined(error_model="numpy")  # a division that could raise is none of ve
 
 @_jit
 def _clip(value: float, bound: float) -> float:
-    """``value`` within +-``bound``."""
+    """Limit ``value`` to +-``bound``."""
     return min(max(value, -bound), bound)
 
 
@@ -33,7 +33,7 @@ def _turn(
     slopes: np.ndarray, begin: int, count: int, first: np.ndarray, second: np.ndarray, ways: tuple[float, ...],
     floors: np.ndarray, buf: np.ndarray,
 ) -> None:  # fmt: skip
-    """Adam's directions, about 1 in size, of ``count`` Gaussians from ``begin`` on into planes 0 to 12.
+    """Write Adam's directions, about 1 in size, of ``count`` Gaussians from ``begin`` on into planes 0 to 12.
 
     ``slopes`` and the running moments ``first`` and ``second``, which are updated, (COUNT, K); ``ways`` beta1, beta2
     and what undoes their start from zero; ``floors`` (COUNT,) are added to the divisors.
@@ -75,7 +75,7 @@ def _share(features: np.ndarray, chunk: int, weights: np.ndarray, known: np.ndar
 
 @_jit
 def _gain(buf: np.ndarray, at: int, spread: float) -> float:
-    """How much further an axis may go than a long one: a column of M, from ``at`` on.
+    """Return how much further an axis may go than a long one: a column of M, from ``at`` on.
 
     The dilation, of variance ``spread``, hides part of its step.
     """
@@ -85,7 +85,7 @@ def _gain(buf: np.ndarray, at: int, spread: float) -> float:
 
 @_jit
 def _move(buf: np.ndarray, rates: tuple[float, ...], clips: tuple[float, ...], spread: float) -> None:
-    """What is subtracted from means, and M after the step, into planes 0 to 2 and from `PLACE` on."""
+    """Write what is subtracted from means, and M after the step, into planes 0 to 2 and from `PLACE` on."""
     r0, r1, r2 = rates
     c0, c1 = clips
     for i in range(U(LANES)):
@@ -119,7 +119,7 @@ def own_frame(
     means: np.ndarray, factors: np.ndarray, logits: np.ndarray, colors: np.ndarray, darkest: float, first: np.ndarray,
     second: np.ndarray, floors: np.ndarray, features: np.ndarray, weights: np.ndarray,
 ) -> None:  # fmt: skip
-    """mu += M d, M <- M (I + E + E^2 / 2): d, E, logit and colour by Adam; ``step`` counts from 1.
+    """Step mu += M d, M <- M (I + E + E^2 / 2): d, E, logit and colour by Adam; ``step`` counts from 1.
 
     Gradients ``slopes`` (COUNT, K) as `FrameGradients.rows` and what they are of, ``means`` (K, 3), ``factors``
     (K, 3, 3), ``logits`` (K,), ``colors`` (K, 3), are float32, as are Adam's moments ``first`` and ``second``
@@ -159,7 +159,7 @@ def adam_sizes(
     thread: ThreadSlice, slopes: np.ndarray, first: np.ndarray, second: np.ndarray, beta1: float, beta2: float,
     step: int, every: int, towards: np.ndarray, sizes: np.ndarray,
 ) -> None:  # fmt: skip
-    """Numerators ``towards`` (COUNT, n) and divisors ``sizes`` (COUNT, n) of Adam's directions after ``step`` steps.
+    """Write numerators ``towards`` and divisors ``sizes`` (COUNT, n) of Adam's directions after ``step`` steps.
 
     Of one in ``every`` runs of `RUN` Gaussians, in that order; ``slopes`` (COUNT, K) are new, ``first``, ``second``
     (COUNT, K) the running moments without them.
@@ -178,7 +178,7 @@ def adam_sizes(
 def adam_directions(
     thread: ThreadSlice, sizes: np.ndarray, most: np.ndarray, weakest: float, towards: np.ndarray, floors: np.ndarray
 ) -> None:
-    """``towards`` divided by ``sizes`` (COUNT, n) and ``floors``, in place; 0 where that is not finite.
+    """Divide ``towards`` by ``sizes`` (COUNT, n) and ``floors``, in place; 0 where that is not finite.
 
     ``floors`` (COUNT,): ``weakest`` times the mean of sizes, of which none counts for more than ``most`` (COUNT,).
     """
@@ -195,7 +195,7 @@ def adam_directions(
 
 @parallel_kernel("f4:2 f4:2 f8 f4:2")
 def regress(thread: ThreadSlice, solver: np.ndarray, directions: np.ndarray, gain: float, weights: np.ndarray) -> None:
-    """``weights`` (KNOWN, FEATURES) = ``gain`` times ``directions`` (COUNT, n) by ``solver`` (FEATURES, n), float32.
+    """Write ``weights`` (KNOWN, FEATURES): ``gain`` x ``directions`` (COUNT, n) by ``solver`` (FEATURES, n), float32.
 
     Of the directions those that are shared, all finite. Sums have one order for any number of threads, unlike BLAS'.
     """
@@ -223,7 +223,7 @@ def adam(
     values: np.ndarray, slopes: np.ndarray, rate: float, beta1: float, beta2: float, step: int, first: np.ndarray,
     second: np.ndarray,
 ) -> None:  # fmt: skip
-    """Adam (Kingma and Ba 2015) on ``values`` (n,) in place; ``step`` counts from 1.
+    """Apply Adam (Kingma and Ba 2015) to ``values`` (n,) in place; ``step`` counts from 1.
 
     ``slopes`` (n,) gradient, ``first``, ``second`` (n,) its running moments.
     """

@@ -21,10 +21,12 @@ SMOOTH = 4e-3  # C, variance of a channel: edges of an eighth of the range and m
 
 
 def add_texture_gradient(image: np.ndarray, target: np.ndarray, weight: float, grad: np.ndarray) -> float:
-    """``grad`` += gradient of ``weight`` x the term over pixels and RGB; returns the term's sum, unweighted.
+    """Add the gradient of ``weight`` x the term over pixels and RGB to ``grad``; return the term's unweighted sum.
 
     Args:
-        image, target: (h, w, 4) float32 premultiplied.
+        image: (h, w, 4) float32 premultiplied, as drawn.
+        target: (h, w, 4) float32 premultiplied.
+        weight: of the term in the loss.
         grad: (h, w, 4) float32; alpha is left alone.
     """
     h, w = image.shape[:2]
@@ -40,7 +42,7 @@ def add_texture_gradient(image: np.ndarray, target: np.ndarray, weight: float, g
 
 @parallel_kernel("f4:3 f4:3 f4:3")
 def part_planes(thread: ThreadSlice, image: np.ndarray, target: np.ndarray, planes: np.ndarray) -> None:
-    """Error of each channel, the view's channels and the sum of their squares into ``planes`` (7, h, w)."""
+    """Write each channel's error, the view's channels and the sum of their squares into ``planes`` (7, h, w)."""
     for y in iterations(thread, image.shape[0]):
         for x in range(image.shape[1]):
             square = f32(0)
@@ -54,7 +56,7 @@ def part_planes(thread: ThreadSlice, image: np.ndarray, target: np.ndarray, plan
 
 @parallel_kernel("f4:3 f4:3 f8:1", error_model="numpy")
 def weigh(thread: ThreadSlice, blurred: np.ndarray, planes: np.ndarray, sums: np.ndarray) -> None:
-    """Errors less their blur, times C / (C + v), replace the first three ``planes`` (7, h, w).
+    """Replace the first three ``planes`` (7, h, w) by the errors less their blur, times C / (C + v).
 
     ``blurred`` (7, h, w) is the blur of what `part_planes` gave; ``sums`` (h,) gets the term's sum of each row.
     """
@@ -74,7 +76,7 @@ def weigh(thread: ThreadSlice, blurred: np.ndarray, planes: np.ndarray, sums: np
 
 @parallel_kernel("f4:3 f4:3 f8 f4:3")
 def add_fine(thread: ThreadSlice, planes: np.ndarray, blurred: np.ndarray, weight: float, grad: np.ndarray) -> None:
-    """``grad`` (h, w, 4) += 2 ``weight`` x the first three ``planes`` less their blur ``blurred``."""
+    """Add 2 ``weight`` x the first three ``planes`` less their blur ``blurred`` to ``grad`` (h, w, 4)."""
     factor = f32(2 * weight)
     for y in iterations(thread, grad.shape[0]):
         for x in range(grad.shape[1]):

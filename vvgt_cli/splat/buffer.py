@@ -66,7 +66,7 @@ prefetch: Any = (lambda rows, index, column: None) if config.DISABLE_JIT else in
 def fetch(
     entries: np.ndarray, begin: int, extent: np.ndarray, flat: np.ndarray, ox: int, oy: int, fetched: np.ndarray
 ) -> int:
-    """Entries from ``begin`` on, at most `CHUNK`, into ``fetched`` (CHUNK x FIELDS,), without colours; their number."""
+    """Copy up to `CHUNK` entries from ``begin`` into ``fetched`` (CHUNK x FIELDS,), no colours; return their number."""
     count: int = min(CHUNK, entries.shape[0] - begin)
     s, left, top = f32(-0.125), f32(ox), f32(oy)
     for i in range(count):
@@ -89,7 +89,7 @@ def fetch(
 
 @tile_jit
 def fetch_colors(entries: np.ndarray, begin: int, count: int, colors: np.ndarray, fetched: np.ndarray) -> None:
-    """The colours of ``count`` entries from ``begin`` on into their places of ``fetched``."""
+    """Copy the colours of ``count`` entries from ``begin`` on into their places of ``fetched``."""
     for i in range(count):
         k, at = entries[begin + i], U(i) * FIELDS
         fetched[at + RED] = colors[k, 0]
@@ -103,7 +103,7 @@ def fetch_colors(entries: np.ndarray, begin: int, count: int, colors: np.ndarray
 def alpha_at(
     dx: float, a: float, h: float, q: float, opacity: float, floor: float, factor: float, offset: float
 ) -> float:
-    """Opacity of a pixel at dx, neither clamped nor cut; 0 beyond the rule's reach.
+    """Return a pixel's opacity at dx, neither clamped nor cut; 0 beyond the rule's reach.
 
     ``h`` = b dy and ``q`` = c dy^2 of its row; ``floor``, ``factor``, ``offset`` of the rule.
     """
@@ -118,14 +118,14 @@ def alpha_at(
 
 @tile_jit
 def open_tile(buf: np.ndarray, width: int, height: int) -> None:
-    """Transmittance 1 where the tile lies inside the image; pixels outside have ended from the start."""
+    """Set transmittance 1 where the tile lies inside the image; pixels outside have ended from the start."""
     for j in range(PLANE_1):
         buf[j] = f32(1) if j % U(TILE) < width and j // U(TILE) < height else f32(-1)
 
 
 @tile_jit
 def all_ended(buf: np.ndarray) -> bool:
-    """Whether no pixel of the tile is open."""
+    """Return whether no pixel of the tile is open."""
     top: float = f32(-1)
     for j in range(PLANE_1):
         top = max(top, buf[j])

@@ -45,7 +45,7 @@ from vvgt_cli.splat.buffer import (
 def _pixel(
     t: float, dx: float, a: float, h: float, q: float, opacity: float, rule: tuple[float, ...]
 ) -> tuple[float, float]:
-    """Weight T alpha of a pixel and its transmittance afterwards; a pixel that has ended keeps T with a minus.
+    """Return a pixel's weight T alpha and its transmittance afterwards; one that has ended keeps T with a minus.
 
     ``t`` is T before; other arguments as of `alpha_at`.
     """
@@ -96,7 +96,7 @@ def blend(
     tiles: np.ndarray, start: np.ndarray, members: np.ndarray, extent: np.ndarray, flat: np.ndarray, colors: np.ndarray,
     tiles_x: int, rule: np.ndarray, image: np.ndarray,
 ) -> None:  # fmt: skip
-    """Front-to-back blending into ``image`` (height, width, 4) float32, linear in ``colors``."""
+    """Blend front to back into ``image`` (height, width, 4) float32, linear in ``colors``."""
     height, width = image.shape[:2]
     way = rule[0], rule[1], rule[2], rule[3], rule[4], rule[5]
     index = next_iteration(thread)
@@ -122,7 +122,7 @@ def _gather_tile(
     entries: np.ndarray, slots: np.ndarray, extent: np.ndarray, flat: np.ndarray, ox: int, oy: int,
     rule: tuple[float, ...], buf: np.ndarray, pairs: np.ndarray,
 ) -> None:  # fmt: skip
-    """Weights of each Gaussian into plane 1, then their sum and their products with planes 2 to 5 into ``pairs``."""
+    """Write each Gaussian's weights into plane 1, then their sum and products with planes 2 to 5 into ``pairs``."""
     fetched = np.empty(CHUNK * FIELDS, np.float32)
     for begin in range(0, entries.shape[0], CHUNK):
         if begin > 0 and all_ended(buf):
@@ -160,7 +160,7 @@ def gather(
     tiles: np.ndarray, start: np.ndarray, members: np.ndarray, slots: np.ndarray, extent: np.ndarray, flat: np.ndarray,
     tiles_x: int, rule: np.ndarray, fields: np.ndarray, pairs: np.ndarray,
 ) -> None:  # fmt: skip
-    """For each (tile, Gaussian) pair: sums over its pixels of w and of w x 4 ``fields`` (4, h, w), w = T alpha.
+    """Sum w and w x 4 ``fields`` (4, h, w) over the pixels of each (tile, Gaussian) pair, w = T alpha.
 
     ``fields`` and ``pairs`` (pairs, 5) float32; these must be zero on entry: entries that no open pixel reaches stay
     zero.
