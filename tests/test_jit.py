@@ -105,7 +105,7 @@ def test_a_run_that_compiles_leaves_the_bytes_of_one_that_loads(tmp_path, cache)
 
 
 def test_warmup_says_where_and_compiles_what_is_missing(tmp_path, cache):
-    some = ("vvgt_cli.closed_form.inset._shift", "vvgt_cli.splat.kernel.project-")
+    some = ("vvgt_cli.closed_form.surface_offset._shift", "vvgt_cli.splat.kernel.project-")
     gone = {name for name in kernels(cache) if name.startswith(some)}
     for name in gone:
         (cache / name).unlink()
@@ -162,7 +162,9 @@ def one_by_one(tmp_path, *args):
 
 
 def test_commands_need_what_is_compiled_ahead_and_nothing_else(tmp_path):
-    rare = {f"vvgt_cli.closed_form.inset:{name}" for name in ("_shift", "_blur", "_press")}  # of opaque scenes
+    rare = {
+        f"vvgt_cli.closed_form.surface_offset:{name}" for name in ("_shift", "_blur", "_flatten")
+    }  # of opaque scenes
     fit = ("--max-gaussians", 200, "--size", 64, "-q")
     rare |= set(ahead.REGRESS)  # and of more than a few Gaussians
     assert wanted(tmp_path, "convert", SOURCE, *fit, "--steps", 24, "-o", "a.ply") == set(ahead.CONVERT) - rare

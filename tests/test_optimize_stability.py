@@ -11,7 +11,7 @@ from vvgt_cli.dvr import RenderSettings, Scene, render_views
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.look import ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.refine import OptimizeOptions, optimize
-from vvgt_cli.refine.states import Fields, OwnFrame
+from vvgt_cli.refine.states import Fields, OwnAxes
 from vvgt_cli.splat import render
 from vvgt_cli.synth import open_volume
 from vvgt_cli.volume import statistics
@@ -59,7 +59,7 @@ def assert_sound(gaussians, cameras):
 @pytest.mark.parametrize("method", ["frame", "adam", "3dgs"])
 def test_stiff_scenes_stay_finite(stiff, method, rates, count, monkeypatch):
     start, cameras, views = stiff
-    monkeypatch.setattr(OwnFrame, "RATES", OwnFrame.RATES * rates)
+    monkeypatch.setattr(OwnAxes, "RATES", OwnAxes.RATES * rates)
     monkeypatch.setattr(Fields, "RATES", tuple(rates * rate for rate in Fields.RATES))
     options = OptimizeOptions.of(method, steps=count, max_gaussians=300)
     result, record = optimize(start, cameras, views, options)
@@ -71,7 +71,7 @@ def test_stiff_scenes_stay_finite(stiff, method, rates, count, monkeypatch):
 @pytest.mark.parametrize("method", ["frame", "adam"])
 def test_extreme_gaussians_stay_finite(stiff, method, count, monkeypatch):
     _, cameras, views = stiff
-    monkeypatch.setattr(OwnFrame, "RATES", OwnFrame.RATES * 100)
+    monkeypatch.setattr(OwnAxes, "RATES", OwnAxes.RATES * 100)
     result, _ = optimize(extremes(), cameras, views, OptimizeOptions(steps=count, method=method))
     assert_sound(result, cameras)
 
@@ -80,7 +80,7 @@ def test_extreme_gaussians_stay_finite(stiff, method, count, monkeypatch):
 def test_what_decides_never_gets_worse(stiff, count, monkeypatch):
     """Rates 100 times too large, and check views: the run ends by itself, with no less than it began with."""
     start, cameras, views = stiff
-    monkeypatch.setattr(OwnFrame, "RATES", OwnFrame.RATES * 100)
+    monkeypatch.setattr(OwnAxes, "RATES", OwnAxes.RATES * 100)
     judges = default_views("check", 2, size=SIZE)
     check = judges, np.stack([render(start, camera) for camera in judges])
     result, record = optimize(start, cameras, views, OptimizeOptions(steps=count, check_every=5), check)

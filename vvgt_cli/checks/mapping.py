@@ -81,8 +81,8 @@ def cuts(tree: Tree) -> None:
 def levels(scene: Scene) -> Figure:
     """Cells of two voxels have the mass of cells of one, as near as points tell; no cut of the pyramid changes it."""
     from vvgt_cli.closed_form.closed_form import closed_form
+    from vvgt_cli.closed_form.linear_ranges import BEND  # by a sixth of which its mean may be missed
     from vvgt_cli.closed_form.moments import base_cells
-    from vvgt_cli.closed_form.straight import BEND  # by a sixth of which its mean may be missed
 
     fine, coarse = (base_cells(scene, np.full(3, level)).moments[:, 0].sum() for level in (0, 1))
     form = closed_form(scene, 1000, SIZE)

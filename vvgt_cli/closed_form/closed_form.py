@@ -13,12 +13,12 @@ from vvgt_cli.cameras.sets import pixel_width
 from vvgt_cli.closed_form.columns import MASS, SEEN
 from vvgt_cli.closed_form.error import scores_by_error, unseen
 from vvgt_cli.closed_form.fit import blending_weights, image_errors, solve_colors, weights_and_errors
-from vvgt_cli.closed_form.inset import Opaque, opaque_field
 from vvgt_cli.closed_form.lit import Shading, centroids
 from vvgt_cli.closed_form.moments import Cells, base_cells, exponents
 from vvgt_cli.closed_form.samples import visible_voxels
 from vvgt_cli.closed_form.shape import ROUND, STYLES, SurfaceStyle, cell_gaussians
 from vvgt_cli.closed_form.sharpen import sharpened
+from vvgt_cli.closed_form.surface_offset import Opaque, opaque_field
 from vvgt_cli.closed_form.tree import (
     Leaves,
     Tree,
@@ -112,7 +112,7 @@ class ClosedForm:
     def cut_by_error(self, drawn: Gaussians, cameras: Sequence[Camera], views: np.ndarray, rule: Rule) -> Gaussians:
         """Return `gaussians` of cells chosen by the errors of ``drawn`` that views (n, h, w, 4) show, by ``rule``.
 
-        Where some of those drawn are hidden in all views, more are cut than the budget has, and the hidden left out.
+        Where some of those drawn are hidden in all views, more are cut than the budget has, and the hidden skipped.
         """
         score = split_score(self.tree)
         ids = select(self.tree, self.budget, score)
@@ -192,22 +192,22 @@ def form_of(
 ) -> ClosedForm:
     """Return the closed form over base cells, wherever the values are; arguments and result as of `closed_form`.
 
-    ``progress`` is told the share that is done.
+    ``progress`` is called with the completed share.
     """
-    tell = progress or (lambda share: None)
+    report = progress or (lambda share: None)
     box = Box(half, step)
     cameras = cameras or default_views("train", size=MARCH_SIZE)
-    seen = visibility(box, cells, cameras, progress=lambda share: tell(0.5 * share))
+    seen = visibility(box, cells, cameras, progress=lambda share: report(0.5 * share))
     if values:
         seen = seen.at_least(INSIDE)
     opaque = opaque_field(cells, step, half, labels)
-    tell(0.6)
+    report(0.6)
     normals = None if cells.normals is None else cells.normals[shown(cells, seen, step)]
     tree = build_tree(cells, seen, step)
     if shading is not None and normals is None:
         base = int((tree.children == 0).sum())
         normals = shading.normals(centroids(tree.moments[:base]))
-    tell(1)
+    report(1)
     return ClosedForm(
         seen, tree, opaque, half, step, pixel_width(size), budget, labels, shading, normals, degree, scene
     )  # fmt: skip

@@ -27,20 +27,22 @@ def scores_by_error(tree: Tree, ids: np.ndarray, errors: np.ndarray, score: np.n
         within it, drawn towards its parent's; cells below one that was drawn have its factor. Errors in proportion to
         the scores change nothing.
     """
-    wrong, told = np.zeros(len(tree)), np.zeros(len(tree))
-    wrong[ids], told[ids] = errors, score[ids]
+    wrong, predicted = np.zeros(len(tree)), np.zeros(len(tree))
+    wrong[ids], predicted[ids] = errors, score[ids]
     levels = list(_levels(tree))
     for level in levels[:0:-1]:
         parents = tree.parent[level]
-        for sums in (wrong, told):
+        for sums in (wrong, predicted):
             sums[parents[0] : parents[-1] + 1] += np.bincount(parents - parents[0], sums[level])
-    if not (wrong[-1] > 0 and told[-1] > 0):
+    if not (wrong[-1] > 0 and predicted[-1] > 0):
         return score
-    factor, mean = np.ones(len(tree)), wrong[-1] / told[-1]
-    prior = SHARED * told[-1] / len(ids)
+    factor, mean = np.ones(len(tree)), wrong[-1] / predicted[-1]
+    prior = SHARED * predicted[-1] / len(ids)
     for level in levels[1:]:
         above = factor[tree.parent[level]]
-        factor[level] = np.where(told[level] > 0, (wrong[level] / mean + prior * above) / (told[level] + prior), above)
+        factor[level] = np.where(
+            predicted[level] > 0, (wrong[level] / mean + prior * above) / (predicted[level] + prior), above
+        )
     result: np.ndarray = score * np.clip(factor, LEAST, MOST)
     return result
 

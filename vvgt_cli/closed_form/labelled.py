@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vvgt_cli.closed_form.under import NARROW, in_voxels, offsets
+from vvgt_cli.closed_form.gaussian_samples import NARROW, in_voxels, offsets
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.frames import rotations
 from vvgt_cli.volume import Volume
@@ -16,7 +16,7 @@ WIDE = 1.5  # standard deviations of the points that say where a label ends
 CHUNK = 1 << 14  # Gaussians whose points are looked up at once
 
 
-def labelled(
+def assign_labels(
     gaussians: Gaussians, maps: Sequence[tuple[Volume, Sequence[int]]], half: np.ndarray, step: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return rows (K,) int64 of the labels that most points of each Gaussian lie in, -1 for none, and gradients (K, 3).
@@ -31,13 +31,13 @@ def labelled(
         Rows; and unit vectors of the box frame along which the share of the label rises, by least squares; zeros
         within a label.
     """
-    owner, gradient = np.empty(len(gaussians), np.int64), np.zeros((len(gaussians), 3))
+    assigned, gradient = np.empty(len(gaussians), np.int64), np.zeros((len(gaussians), 3))
     for k in range(0, len(gaussians), CHUNK):
         part = gaussians.take(np.arange(k, min(k + CHUNK, len(gaussians))))
-        owner[k : k + CHUNK] = _owners(_rows(part, maps, half, step, NARROW))
-        own = _rows(part, maps, half, step, WIDE) == owner[None, k : k + CHUNK, None]
+        assigned[k : k + CHUNK] = _label_assignment(_rows(part, maps, half, step, NARROW))
+        own = _rows(part, maps, half, step, WIDE) == assigned[None, k : k + CHUNK, None]
         gradient[k : k + CHUNK] = _gradients(part, own.any(axis=0).astype(np.float64))
-    return owner, gradient
+    return assigned, gradient
 
 
 def _rows(
@@ -57,7 +57,7 @@ def _rows(
     return found
 
 
-def _owners(rows: np.ndarray) -> np.ndarray:
+def _label_assignment(rows: np.ndarray) -> np.ndarray:
     """Return (K,) the row that comes most often among (maps, K, points), -1 where there is none."""
     every = np.sort(rows.transpose(1, 0, 2).reshape(rows.shape[1], -1), axis=1)
     best, most = np.full(len(every), -1, np.int64), np.zeros(len(every), np.int64)

@@ -69,7 +69,7 @@ def base_cells(
 ) -> Cells:
     """Integrate the moments of every base cell with extinction (see `Cells`) in a fixed scratch beside the result.
 
-    ``progress`` is told the share that is done.
+    ``progress`` is called with the completed share.
     """
     block, _ = blocks(exponent)
     origins = _active_blocks(scene, block)
@@ -155,12 +155,12 @@ def _integrate(region: Region, at: np.ndarray, points: np.ndarray, cell: np.ndar
 
 def _integrate_voxels(region: Region, at: np.ndarray, exponent: np.ndarray, out: np.ndarray) -> None:
     """Compute `block_moments` of cells of whole voxels, two points a voxel and axis or the equivalent."""
-    from vvgt_cli.closed_form.straight import straight_until
+    from vvgt_cli.closed_form.linear_ranges import linear_ranges
     from vvgt_cli.closed_form.voxelwise import voxel_moments
 
-    straight = straight_until(region.optics)
+    linear_until = linear_ranges(region.optics)
     voxel_moments(
-        region.voxels, region.optics, straight, at, exponent, region.half, region.step, region.begin, out
+        region.voxels, region.optics, linear_until, at, exponent, region.half, region.step, region.begin, out
     )  # fmt: skip
 
 

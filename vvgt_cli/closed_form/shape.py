@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vvgt_cli.closed_form.columns import COLOR, MASS, SEEN, SEEN_COLOR
-from vvgt_cli.closed_form.inset import Opaque, inset, pressed
 from vvgt_cli.closed_form.pyramid import principal_axes
+from vvgt_cli.closed_form.surface_offset import Opaque, flattened, surface_offset
 from vvgt_cli.closed_form.tree import Leaves, central
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.constants import MAX_ALPHA
@@ -30,7 +30,7 @@ class SurfaceStyle:
         tangent: smallest standard deviation along the surface, in cell edges.
         normal: smallest standard deviation across it, in pixels.
         chord: length in pixels of a grazing ray inside the body: how many splats it meets.
-        dilation: px^2 that the inset allows for: 0.3 is right at the size aimed for, 0.075 at twice that.
+        dilation: px^2 that the offset allows for: 0.3 is right at the size aimed for, 0.075 at twice that.
     """
 
     tangent: float
@@ -66,7 +66,7 @@ def cell_gaussians(leaves: Leaves, voxel: float, pixel: float, opaque: Opaque, s
     solid = -np.expm1(-2 * mass / edge**2)[:, None]
     variances, axes = np.empty_like(mean), np.empty_like(cov)
     if opaque.any:
-        principal_axes(pressed(opaque, mean, cov, FACING / 12 * solid[:, 0] * edge**2), variances, axes)
+        principal_axes(flattened(opaque, mean, cov, FACING / 12 * solid[:, 0] * edge**2), variances, axes)
         variances = ((cov @ axes) * axes).sum(axis=1)
     else:
         principal_axes(cov, variances, axes)  # ascending
@@ -78,7 +78,9 @@ def cell_gaussians(leaves: Leaves, voxel: float, pixel: float, opaque: Opaque, s
         floor = np.stack([np.full_like(edge, style.normal * pixel), style.tangent * edge, style.tangent * edge], 1)
         spread = np.maximum(spread, solid * floor**2)
         reach = np.sqrt(2 * np.log(np.clip(1.43 * style.chord * pixel / edge, 1.5, 90)))  # at most 3
-        mean = mean + inset(opaque, mean, spread, axes, solid[:, 0] * reach, style.dilation * pixel**2, 6 * pixel)
+        mean = mean + surface_offset(
+            opaque, mean, spread, axes, solid[:, 0] * reach, style.dilation * pixel**2, 6 * pixel
+        )
         mean = np.clip(mean, -opaque.half, opaque.half)  # where the box cuts a body
     opacity = peak_opacity(mass, spread, pixel)
     return make_gaussians(mean, spread, axes, opacity, visible_color(moments))

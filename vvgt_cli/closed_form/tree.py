@@ -259,15 +259,15 @@ def split(tree: Tree, leaves: Leaves, order: np.ndarray, room: int, scene: Scene
     if len(below) and scene is not None:
         # integrate no more than can be used: most have at least three visible children
         below = below[: np.searchsorted(np.cumsum(np.where(inside, counts - 1, 2)), room, "right") + 1]
-        owner, grown = _children_below(leaves.take(order[below]), scene, seen)
-        counts[below] = np.bincount(owner, minlength=len(below))
+        parent, grown = _children_below(leaves.take(order[below]), scene, seen)
+        counts[below] = np.bincount(parent, minlength=len(below))
     else:
         below = below[:0]
     splits = np.flatnonzero(counts > 0)
     splits = splits[: np.searchsorted(np.cumsum(counts[splits] - 1), room, "right")]
     parts = []
     if len(below):
-        parts.append(grown.take(np.flatnonzero(np.isin(below[owner], splits))))
+        parts.append(grown.take(np.flatnonzero(np.isin(below[parent], splits))))
     nodes = leaves.node[order[splits[inside[splits]]]]
     many = tree.children[nodes]
     offsets = np.arange(many.sum()) - np.repeat(np.cumsum(many) - many, many)
@@ -282,7 +282,7 @@ def split(tree: Tree, leaves: Leaves, order: np.ndarray, room: int, scene: Scene
 def _children_below(leaves: Leaves, scene: Scene, seen: Visibility) -> tuple[np.ndarray, Leaves]:
     """Return visible children of cells at or below a tree's base: their parents (n,), ascending, and themselves."""
     step = np.asarray(scene.step)
-    owners, found = [], []
+    parents, found = [], []
     for edge in np.unique(leaves.edge, axis=0):
         chosen = np.flatnonzero((leaves.edge == edge).all(axis=1))
         moments = cell_moments(scene, leaves.index[chosen] * (edge / step), edge / step)  # (n, 8, 13)
@@ -290,15 +290,15 @@ def _children_below(leaves: Leaves, scene: Scene, seen: Visibility) -> tuple[np.
         through = seen.at(index.reshape(-1, 3), edge / 2 / step).reshape(-1, 8, 2)
         keep = (moments[..., MASS] > 0) & (through[..., 1] > HIDDEN)
         rows = with_visible(moments[keep], through[keep, 0])
-        owners.append(np.repeat(chosen, keep.sum(axis=1)))
+        parents.append(np.repeat(chosen, keep.sum(axis=1)))
         found.append(
             Leaves(rows, index[keep], np.broadcast_to(edge / 2, (len(rows), 3)), np.full(len(rows), -1, np.int64))
         )
-    owner = np.concatenate(owners)
+    parent = np.concatenate(parents)
     fields = ("moments", "index", "edge", "node")
     together = Leaves(*(np.concatenate([getattr(part, field) for part in found]) for field in fields))
-    order = np.argsort(owner, kind="stable")
-    return owner[order], together.take(order)
+    order = np.argsort(parent, kind="stable")
+    return parent[order], together.take(order)
 
 
 def with_visible(moments: np.ndarray, mean: np.ndarray) -> np.ndarray:

@@ -198,7 +198,7 @@ def visibility(
     """March every camera (square images of one size) through the mean extinction of cells: what is seen of each.
 
     The cells are ``cells``, or wider by a power of two where these are too many or meet too few rays. ``progress`` is
-    told the share that is done.
+    called with the completed share.
     """
     wider = widening(voxels_of(scene), cells.exponent, scene.step, cameras)
     extinction = _mean_extinction(cells, scene, wider)

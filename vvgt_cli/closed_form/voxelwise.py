@@ -1,4 +1,4 @@
-"""Moments of cells of whole voxels: one point a voxel where the function is straight, else eight.
+"""Moments of cells of whole voxels: one point a voxel where the function is linear_until, else eight.
 
 Bricks of 8^3 voxels with their neighbours are laid out as table coordinates. Range, mean and mean slopes of the
 trilinear values over each voxel's box follow from the 27 voxels around, for all of a brick at once, axis by axis.
@@ -103,7 +103,7 @@ def _means(s: np.ndarray) -> None:
 
 
 @_jit
-def _straight(s: np.ndarray, p: int, optics: Optics) -> Sums:
+def _linear(s: np.ndarray, p: int, optics: Optics) -> Sums:
     """Sum over the eight points of voxel ``p`` of a brick, where the function is linear."""
     top = optics.nodes.shape[0] - 1
     u = min(max(np.float64(s[MEAN, p]), 0.0), float(top))
@@ -115,7 +115,7 @@ def _straight(s: np.ndarray, p: int, optics: Optics) -> Sums:
 
 
 @_jit
-def _bent(v: np.ndarray, p: int, optics: Optics) -> Sums:
+def _curved(v: np.ndarray, p: int, optics: Optics) -> Sums:
     """Sum over the same points where it is not linear, each averaged over the spread of its own box."""
     bins = float(optics.nodes.shape[0] - 1)
     red = green = blue = mass = fx = fy = fz = xy = xz = yz = 0.0
@@ -182,7 +182,7 @@ def _brick(values: np.ndarray, optics: Optics, x0: int, y0: int, z0: int, s: np.
 
 @_jit
 def _add_row(
-    s: np.ndarray, p: int, x0: int, x1: int, optics: Optics, straight: np.ndarray, shift: int, y: float, z: float,
+    s: np.ndarray, p: int, x0: int, x1: int, optics: Optics, linear_until: np.ndarray, shift: int, y: float, z: float,
     step: np.ndarray, out: np.ndarray,
 ) -> None:  # fmt: skip
     """Add the voxels ``x0`` to ``x1`` of a row, at ``p + x`` of a brick, to cells ``out`` (n, 13) of 2^``shift`` each.
@@ -197,21 +197,21 @@ def _add_row(
         if finite and u1 <= optics.dark[first]:
             continue
         at = (x & mask) * step[0] + d[0], y, z
-        if finite and u1 <= straight[first] and low >= -ROUNDING and high <= bins + ROUNDING:
-            _deposit(out[U(x >> shift)], at, d, _straight(s, p + x, optics))
+        if finite and u1 <= linear_until[first] and low >= -ROUNDING and high <= bins + ROUNDING:
+            _deposit(out[U(x >> shift)], at, d, _linear(s, p + x, optics))
         else:
-            _deposit(out[U(x >> shift)], at, d, _bent(s[VALUE], p + x, optics))
+            _deposit(out[U(x >> shift)], at, d, _curved(s[VALUE], p + x, optics))
 
 
 @parallel_kernel("Voxels Optics f8:1 f8:2 i8:1 f8:1 f8:1 f8:1 f8:5", TUPLES, fastmath=FLAGS, error_model="numpy")
 def voxel_moments(
     thread: ThreadSlice,
-    voxels: Voxels, optics: Optics, straight: np.ndarray, blocks: np.ndarray, exponent: np.ndarray, half: np.ndarray,
-    step: np.ndarray, begin: np.ndarray, out: np.ndarray,
+    voxels: Voxels, optics: Optics, linear_until: np.ndarray, blocks: np.ndarray, exponent: np.ndarray,
+    half: np.ndarray, step: np.ndarray, begin: np.ndarray, out: np.ndarray,
 ) -> None:  # fmt: skip
     """Integrate `quadrature.block_moments` of cells of 2^``exponent`` (3,) voxels, two points a voxel and axis.
 
-    ``straight`` (bins + 1,) of `straight_until`; other arguments as there.
+    ``linear_until`` (bins + 1,) of `linear_ranges`; other arguments as there.
     """
     nz, ny, nx = voxels.values.shape
     ex, ey, ez = exponent
@@ -231,7 +231,7 @@ def voxel_moments(
                             dy = ((y & ((1 << ey) - 1)) + 0.5) * step[1]
                             dz = ((z & ((1 << ez) - 1)) + 0.5) * step[2]
                             stop = min(kx + BRICK, last_x)
-                            _add_row(s, p, kx, stop, optics, straight, ex, dy, dz, step, out[b, z >> ez, y >> ey])
+                            _add_row(s, p, kx, stop, optics, linear_until, ex, dy, dz, step, out[b, z >> ez, y >> ey])
         for k, j, i in np.ndindex(out.shape[1:4]):
             if out[b, k, j, i, MASS] > 0.0:
                 x = (begin[0] + x0 + (i << ex)) * step[0] - half[0]

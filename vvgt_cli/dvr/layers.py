@@ -23,7 +23,7 @@ from vvgt_cli.volume.types import triple
 SAME = 1e-3  # voxels up to which two grids are one
 SLAB = 16  # slices that are laid out at once
 MOST_FINER = 8  # times along an axis that a layer's voxels may refine the first volume's
-VOXEL_BYTES = 20  # of a scene: four float32, and extinction once more
+VOXEL_BYTES = 20  # of a scene: four float32, and extinction again
 
 
 @dataclass(frozen=True)

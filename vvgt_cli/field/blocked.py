@@ -284,7 +284,7 @@ class Blocked:
 
     def under(self, gaussians: Gaussians) -> np.ndarray:
         """See `Field`."""
-        from vvgt_cli.closed_form.under import POINTS, in_voxels, values_of
+        from vvgt_cli.closed_form.gaussian_samples import POINTS, in_voxels, values_of
 
         self.source.one_field()
         assert isinstance(self.reader, Scalars)

@@ -65,7 +65,7 @@ class Field(Protocol):
         """Directions (K, 3) of the mean gradient around Gaussians, all in the box frame; None where nothing is lit."""
 
     def under(self, gaussians: Gaussians) -> np.ndarray:
-        """(K, 5) float32 of `vvgt_cli.closed_form.under.values_of` under Gaussians of the box frame.
+        """(K, 5) float32 of `vvgt_cli.closed_form.gaussian_samples.values_of` under Gaussians of the box frame.
 
         Raises:
             UsageError: an optics grid, which has no values.
@@ -150,7 +150,7 @@ class Resident:
 
     def under(self, gaussians: Gaussians) -> np.ndarray:
         """See `Field`."""
-        from vvgt_cli.closed_form.under import POINTS, in_voxels, offsets, sample_points, values_of
+        from vvgt_cli.closed_form.gaussian_samples import POINTS, in_voxels, offsets, sample_points, values_of
 
         self.source.one_field()
         scene, values = self.scene, np.empty((len(gaussians), 5), np.float32)

@@ -10,11 +10,11 @@ MARCH, ADD_CELLS = "vvgt_cli.closed_form.visibility:march", "vvgt_cli.closed_for
 BLOCK_MOMENTS, COMPACT = "vvgt_cli.closed_form.quadrature:block_moments", "vvgt_cli.closed_form.quadrature:compact"
 VOXEL_MOMENTS = "vvgt_cli.closed_form.voxelwise:voxel_moments"  # of cells wider than voxels
 MORTON, MIX = "vvgt_cli.closed_form.pyramid:morton_codes", "vvgt_cli.closed_form.sharpen:mix_neighbours"
-FRAME_STEPS = "vvgt_cli.refine.steps:own_frame"
+AXES_STEPS = "vvgt_cli.refine.steps:own_axes"
 REGRESS = tuple(f"vvgt_cli.refine.steps:{name}" for name in ("adam_sizes", "adam_directions", "regress"))
 PAIR_SUMS, STANDARD = "vvgt_cli.splat.backward:moments", "vvgt_cli.splat.backward:standard"
 VIEW_SLOPES, VIEW_COLORS = "vvgt_cli.splat.harmonics:view_slopes", "vvgt_cli.splat.harmonics:view_colors"
-FIELD_STEPS = "vvgt_cli.refine.steps:adam"  # harmonics take them even where all else steps in the own frame
+FIELD_STEPS = "vvgt_cli.refine.steps:adam"  # harmonics take them even where all else steps along own axes
 
 RAYCAST_REST = (BLOCK_RANGES, "vvgt_cli.dvr.contrast:_contrast")
 RAYCAST = (RENDER, *RAYCAST_REST)
@@ -42,10 +42,10 @@ CELLS = (
     "vvgt_cli.closed_form.pyramid:principal_axes",
     MIX,
 )
-CLOSED_FORM = (*CELLS, *(f"vvgt_cli.closed_form.inset:{name}" for name in ("_shift", "_blur", "_press")))
+CLOSED_FORM = (*CELLS, *(f"vvgt_cli.closed_form.surface_offset:{name}" for name in ("_shift", "_blur", "_flatten")))
 DESCENT = (
     PAIR_SUMS,
-    "vvgt_cli.splat.backward:own_frame",
+    "vvgt_cli.splat.backward:own_axes",
     "vvgt_cli.splat.kernel:project_factors",
     "vvgt_cli.refine.loss:loss_gradient",
     "vvgt_cli.refine.ssim:blur",
@@ -53,7 +53,7 @@ DESCENT = (
     "vvgt_cli.refine.texture:weigh",
     "vvgt_cli.refine.texture:add_fine",
 )
-REFINE = (FRAME_STEPS, *DESCENT)
+REFINE = (AXES_STEPS, *DESCENT)
 SHARED = (*REGRESS, MIX, MORTON)  # of runs of more than a few Gaussians
 DEPOSITS = ("vvgt_cli.splat.harmonics:deposit_squares", "vvgt_cli.splat.harmonics:deposit")
 BACK_PROJECT = ("vvgt_cli.splat.tiles:gather", "vvgt_cli.splat.tiles:reduce_pairs")
@@ -69,8 +69,8 @@ SEGMENTS = {
     GRID[RENDER]: "vvgt_cli.dvr.march:cast_grid_segments",
     GRID[RENDER_LIT]: "vvgt_cli.dvr.march:cast_lit_grid_segments",
 }
-CONVERT = (RENDER, FRAME_STEPS, *CLOSED_FORM, *DRAW, *DESCENT, *REGRESS, *RAYCAST_REST, *BACK_PROJECT)
-LIVE = ("vvgt_cli.closed_form.under:sample_points",)
+CONVERT = (RENDER, AXES_STEPS, *CLOSED_FORM, *DRAW, *DESCENT, *REGRESS, *RAYCAST_REST, *BACK_PROJECT)
+LIVE = ("vvgt_cli.closed_form.gaussian_samples:sample_points",)
 OPTIMIZE = (*REFINE, *DRAW, "vvgt_cli.closed_form.pyramid:principal_axes", *SHARED)
 EVALUATE = (*RAYCAST, *DRAW)
 INFER = (*DRAW, PAIR_SUMS, STANDARD, *BACK_PROJECT)
@@ -108,7 +108,7 @@ def for_degree(names: tuple[str, ...], degree: int) -> tuple[str, ...]:
     if not degree:
         return names
     slopes = [VIEW_SLOPES] if PAIR_SUMS in names else []
-    return (*names, *slopes, VIEW_COLORS, *([FIELD_STEPS] if FRAME_STEPS in names else []))
+    return (*names, *slopes, VIEW_COLORS, *([FIELD_STEPS] if AXES_STEPS in names else []))
 
 
 def for_grid(names: tuple[str, ...]) -> tuple[str, ...]:

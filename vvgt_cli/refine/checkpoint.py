@@ -80,13 +80,13 @@ def resume(path: str, key: str, state: State, judge: Judge, record: OptimizeReco
             _check_like({f"array_{i}": array for i, array in enumerate(kept)}, own)
         state.restore(saved)
         best, idle, walk = about["best"], int(about["idle"]), dict(about["walk"])
-        told = {field: about["record"][field] for field in asdict(record)}
-        told["checks"] = [tuple(look) for look in told["checks"]]
+        described = {field: about["record"][field] for field in asdict(record)}
+        described["checks"] = [tuple(look) for look in described["checks"]]
     except _FAULTS as error:
         text = " ".join(str(error).split())[:200]
         raise DataError(f"{path}: not a checkpoint of 'vvgt optimize' ({text}); remove it to start afresh") from None
     judge.best, judge.idle, judge.kept = best, idle, tuple(kept) or None
-    for field, value in told.items():
+    for field, value in described.items():
         setattr(record, field, value)
     return walk
 

@@ -17,7 +17,7 @@ from vvgt_cli.refine.checkpoint import fingerprint, resume, save
 from vvgt_cli.refine.densify import Densified
 from vvgt_cli.refine.judge import Judge
 from vvgt_cli.refine.options import Check, OptimizeOptions, OptimizeRecord, Progress, Train
-from vvgt_cli.refine.states import Fields, OwnFrame, State
+from vvgt_cli.refine.states import Fields, OwnAxes, State
 from vvgt_cli.splat import blend
 
 SLOWER = 0.5  # rates after a fall
@@ -113,7 +113,7 @@ def begin(
         return Densified(gaussians, cameras, options)
     if options.method == "adam":
         return Fields(gaussians, cameras)
-    return OwnFrame(gaussians, cameras, options.rule, free)
+    return OwnAxes(gaussians, cameras, options.rule, free)
 
 
 def step(

@@ -31,7 +31,7 @@ class OptimizeOptions:
 
     Attributes:
         steps: of one view each, at most; rates fall to zero over them. None: as many as the time budget allows.
-        method: "frame" steps in each Gaussian's own frame, "adam" on the file's fields with the rates of 3DGS, "3dgs"
+        method: "frame" steps along each Gaussian's own axes, "adam" on the file's fields with the rates of 3DGS, "3dgs"
             as that, and the number of Gaussians grows and shrinks as in 3DGS.
         max_gaussians: that "3dgs" may grow to; None: as many as it begins with.
         time_budget: seconds from the first step on after which no other is begun; rates fall to zero over it if it

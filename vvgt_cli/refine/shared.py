@@ -2,7 +2,7 @@
 
 A Gaussian's step is Adam's: of its own slopes, view by view, most of which is noise. But what the closed form gets
 wrong it gets wrong alike in Gaussians that are alike: too wide where the opacity is high, too pale beside what is dark.
-So the directions of all are regressed, each step anew, on what is known of each Gaussian at the start, and what the
+So the directions of all are regressed, again at each step, on what is known of each Gaussian at the start, and what the
 regression foretells is added to each one's step, several times over: a mean over thousands has hardly any noise, and
 may go further, as long as what is foretold from step to step agrees. That is descent on the parameters
 ``theta_i + A phi_i`` of Gaussian i, in which A is shared by all. phi are the numbers known and random features of them
@@ -109,13 +109,13 @@ class SharedSteps:
         """Prepare from ``known`` (K, 17), as `aligned` returns it."""
         count, inputs = known.shape
         rng = np.random.default_rng(0)  # the same features in each run
-        ways = (rng.normal(size=(inputs, FEATURES - inputs - 1)) * (BENT / np.sqrt(inputs))).astype(np.float32)
-        offsets = rng.normal(size=ways.shape[1]).astype(np.float32)
+        mixing = (rng.normal(size=(inputs, FEATURES - inputs - 1)) * (BENT / np.sqrt(inputs))).astype(np.float32)
+        offsets = rng.normal(size=mixing.shape[1]).astype(np.float32)
         some = sampled(known)
-        middle = np.maximum(some @ ways + offsets, 0).mean(axis=0)
+        middle = np.maximum(some @ mixing + offsets, 0).mean(axis=0)
 
         def rows(part: np.ndarray) -> np.ndarray:
-            bent = np.maximum(part @ ways + offsets, 0) - middle
+            bent = np.maximum(part @ mixing + offsets, 0) - middle
             found = np.concatenate([np.ones((len(part), 1), np.float32), part, bent], axis=1)
             rounded: np.ndarray = np.clip(np.rint(found * ONE), -MOST, MOST)
             return rounded

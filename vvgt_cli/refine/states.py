@@ -15,7 +15,7 @@ from vvgt_cli.refine.shared import NONE, sample_of, shared_steps
 from vvgt_cli.refine.steps import EPSILON
 from vvgt_cli.splat import Projection, project
 from vvgt_cli.splat.reference import rotations
-from vvgt_cli.splat.render import fields_backward, moments, own_frame_backward, project_factors, seen_colors
+from vvgt_cli.splat.render import fields_backward, moments, own_axes_backward, project_factors, seen_colors
 
 WARM_UP = 3  # steps
 SMALLEST = 1e-7  # standard deviation, unit frame
@@ -39,7 +39,7 @@ def _has_harmonics(harmonics: np.ndarray | None) -> bool:
     return bool(harmonics[:, degree**2 - 1 :].any())
 
 
-class OwnFrame:
+class OwnAxes:
     """Covariance ``M M^T``; steps ``mu += M d``, ``M <- M (I + E + E^2 / 2)``, of opacity logits, colours, harmonics.
 
     Rates go with the root of the running error of the pictures: the nearer, the smaller; and from the middle of the
@@ -105,12 +105,12 @@ class OwnFrame:
         means, factors, logits, colors = self.arrays[:4]
         harmonics, seen = _last(self.arrays, 4), self.colors_from(camera)
         pairs = moments(projection, seen, image, grad)
-        slopes = own_frame_backward(means, factors, seen, camera, projection, pairs, harmonics)
+        slopes = own_axes_backward(means, factors, seen, camera, projection, pairs, harmonics)
         self.step += 1
         pace = speed * min(1.0, 2 * (1 - share))
         pace *= min(self.LARGEST, math.sqrt(error / self.ERROR)) * min(1.0, self.step / WARM_UP)
         rates = self.RATES * self.OWN * pace if self.weakest else self.RATES * pace
-        steps.own_frame(
+        steps.own_axes(
             slopes.rows, rates, self.CLIPS, self.spread,
             *self.BETAS, self.step, means, factors, logits, colors, self.darkest, self.first, self.second,
             *self.common(slopes.rows),
@@ -234,4 +234,4 @@ class Fields:
         return Gaussians(*self.arrays)
 
 
-State = OwnFrame | Fields
+State = OwnAxes | Fields

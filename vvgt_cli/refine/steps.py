@@ -1,4 +1,4 @@
-"""Numba kernels of the steps: Adam in each Gaussian's own frame, and Adam on the fields of `Gaussians`."""
+"""Numba kernels of the steps: Adam along each Gaussian's own axes, and Adam on the fields of `Gaussians`."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ def _clip(value: float, bound: float) -> float:
 
 @_jit
 def _turn(
-    slopes: np.ndarray, begin: int, count: int, first: np.ndarray, second: np.ndarray, ways: tuple[float, ...],
+    slopes: np.ndarray, begin: int, count: int, first: np.ndarray, second: np.ndarray, betas: tuple[float, ...],
     floors: np.ndarray, buf: np.ndarray,
 ) -> None:  # fmt: skip
     """Write Adam's directions, about 1 in size, of ``count`` Gaussians from ``begin`` on into planes 0 to 12.
 
-    ``slopes`` and the running moments ``first`` and ``second``, which are updated, (COUNT, K); ``ways`` beta1, beta2
+    ``slopes`` and the running moments ``first`` and ``second``, which are updated, (COUNT, K); ``betas`` beta1, beta2
     and what undoes their start from zero; ``floors`` (COUNT,) are added to the divisors.
     """
-    beta1, beta2, fix1, fix2 = ways
+    beta1, beta2, fix1, fix2 = betas
     start, lanes = U(begin), U(count)
     for field in range(U(COUNT)):
         for i in range(lanes):
@@ -113,7 +113,7 @@ def _move(buf: np.ndarray, rates: tuple[float, ...], clips: tuple[float, ...], s
 
 
 @parallel_kernel("f4:2 f8:1 f8:1 f8 f8 f8 i8 f4:2 f4:3 f4:1 f4:2 f8 f4:2 f4:2 f4:1 i1:3 f4:2")
-def own_frame(
+def own_axes(
     thread: ThreadSlice,
     slopes: np.ndarray, rates: np.ndarray, clips: np.ndarray, spread: float, beta1: float, beta2: float, step: int,
     means: np.ndarray, factors: np.ndarray, logits: np.ndarray, colors: np.ndarray, darkest: float, first: np.ndarray,
@@ -128,7 +128,7 @@ def own_frame(
     least that a colour becomes. ``floors`` (COUNT,) are added to Adam's divisors, and to its directions those of
     ``weights`` (KNOWN, FEATURES) for the ``features`` (blocks or none, FEATURES, LANES) of each Gaussian.
     """
-    ways = f32(beta1), f32(beta2), f32(1 / (1 - beta1**step)), f32(1 / (1 - beta2**step))
+    betas = f32(beta1), f32(beta2), f32(1 / (1 - beta1**step)), f32(1 / (1 - beta2**step))
     paces, bounds = (f32(rates[0]), f32(rates[1]), f32(rates[2])), (f32(clips[0]), f32(clips[2]))
     by_logit, by_color, farthest = f32(rates[3]), f32(rates[4]), f32(clips[1])
     hidden, least, total = f32(spread), f32(darkest), means.shape[0]
@@ -136,7 +136,7 @@ def own_frame(
         begin = chunk * LANES
         count = min(LANES, total - begin)
         buf = np.ones((COUNT + 9) * LANES, np.float32)
-        _turn(slopes, begin, count, first, second, ways, floors, buf)
+        _turn(slopes, begin, count, first, second, betas, floors, buf)
         if chunk < features.shape[0]:
             _share(features, chunk, weights, np.empty(FEATURES * LANES, np.float32), buf)
         for i in range(count):

@@ -3,7 +3,7 @@
 Cells of the pyramid stand on a lattice, and on a smooth face the eye sees its weave long before squared errors do.
 With e the error less its blur, and v the view's variance under the same window, the term is ``sum e^2 C / (C + v)``:
 all of it where the view is smooth, next to nothing of it at edges. It is linear in the error, so that its gradient is
-the same blur once more. SSIM does so too, and to the mean brightness, which costs edges (docs/log/closed-form.md).
+the same blur again. SSIM does so too, and to the mean brightness, which costs edges (docs/log/closed-form.md).
 """
 
 from __future__ import annotations

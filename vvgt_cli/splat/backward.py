@@ -241,7 +241,7 @@ def _load_slope(
 
 
 @parallel_kernel("i8:1 f4:2 i4:2 f4:2 f4:2 f4:3 f4:2 f8:2 f8:1 f8:1 f8:1 f4:2")
-def own_frame(
+def own_axes(
     thread: ThreadSlice,
     first: np.ndarray, pairs: np.ndarray, extent: np.ndarray, flat: np.ndarray, means: np.ndarray, factors: np.ndarray,
     colors: np.ndarray, rot: np.ndarray, trans: np.ndarray, lens: np.ndarray, rule: np.ndarray, out: np.ndarray,

@@ -28,7 +28,7 @@ _P7, _P8, _P9, _P10, _P11 = U(7 * LANES), U(8 * LANES), U(9 * LANES), U(10 * LAN
 OPACITY = U(12 * LANES)
 PROJECTED = 17  # planes that a projection uses
 TOTALS, CONIC, SLOPED = 12, 21, 24  # first plane of the pairs' sums and of the conic; planes that a gradient uses
-SINGULAR = 1e-9  # det S of det S' below which the gradient of the compensation is left out
+SINGULAR = 1e-9  # det S of det S' below which the gradient of the compensation is skipped
 _lane_jit = inlined(error_model="numpy")  # no fastmath, no order of sums of its own
 
 
@@ -212,10 +212,10 @@ def screen_slope(
     det = 1.0 / (a * c - b * b)
     sxx, sxy, syy = c * det - dilation, -b * det, a * det - dilation
     own = sxx * syy - sxy * sxy
-    told = (compensate > 0.0) & (own > SINGULAR * det)
-    h00 += 0.5 * t0 * (syy / own - a) if told else 0.0
-    h01 -= 0.5 * t0 * (sxy / own + b) if told else 0.0
-    h11 += 0.5 * t0 * (sxx / own - c) if told else 0.0
+    valid = (compensate > 0.0) & (own > SINGULAR * det)
+    h00 += 0.5 * t0 * (syy / own - a) if valid else 0.0
+    h01 -= 0.5 * t0 * (sxy / own + b) if valid else 0.0
+    h11 += 0.5 * t0 * (sxx / own - c) if valid else 0.0
     return du, dv, h00, h01, h11
 
 

@@ -240,7 +240,7 @@ def moments(projection: Projection, colors: np.ndarray, image: np.ndarray, grad:
 
 @dataclass(frozen=True)
 class FrameGradients:
-    """Gradients for steps in each Gaussian's own frame, ``mu += M d``, ``M <- M (I + E)``, E symmetric.
+    """Gradients for steps along each Gaussian's own axes, ``mu += M d``, ``M <- M (I + E)``, E symmetric.
 
     Attributes:
         rows: (13, K) float32, a row a field: d (3), then E: xx, yy, zz, xy, xz, yz, one off the diagonal for both
@@ -252,7 +252,7 @@ class FrameGradients:
     harmonics: np.ndarray | None = None
 
 
-def own_frame_backward(
+def own_axes_backward(
     means: np.ndarray,
     factors: np.ndarray,
     colors: np.ndarray,
@@ -269,7 +269,7 @@ def own_frame_backward(
     from vvgt_cli.splat import backward
 
     p, rows = projection, np.empty((13, len(means)), np.float32)
-    backward.own_frame(
+    backward.own_axes(
         p.first, pairs, p.extent, p.flat, means, factors, colors, *pose(camera), p.rule.projecting(), rows
     )
     if harmonics is None:

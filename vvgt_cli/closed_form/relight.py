@@ -12,7 +12,7 @@ from vvgt_cli.look.lighting import Lighting
 DEGREE = 2  # of harmonics under a light that depends on the view
 
 
-def relit(gaussians: Gaussians, gradient: np.ndarray, lighting: Lighting) -> Gaussians:
+def relight(gaussians: Gaussians, gradient: np.ndarray, lighting: Lighting) -> Gaussians:
     """Colour Gaussians under a light, without shadows or occlusion.
 
     Args:

@@ -135,7 +135,7 @@ def _inwards(smooth: np.ndarray, x: float, y: float, z: float, edge: np.ndarray)
 
 
 @parallel_kernel("f4:3 f8:2 f8:1 f8:1 f8:1 f8:3")
-def _press(
+def _flatten(
     thread: ThreadSlice,
     smooth: np.ndarray,
     means: np.ndarray,
@@ -208,18 +208,18 @@ def _shift(
             out[k, 0], out[k, 1], out[k, 2] = gx * move, gy * move, gz * move
 
 
-def pressed(opaque: Opaque, means: np.ndarray, cov: np.ndarray, by: np.ndarray) -> np.ndarray:
+def flattened(opaque: Opaque, means: np.ndarray, cov: np.ndarray, by: np.ndarray) -> np.ndarray:
     """Reduce covariances (n, 3, 3) of cells at ``means`` (n, 3) by ``by`` (n,) along the normal of a surface there.
 
     Their axes are for telling which way a surface faces: what fills a cell evenly has axes of no meaning, and takes
     the surface's; what is flat by itself keeps its own. They need not be positive.
     """
     out = cov.copy()
-    _press(opaque.smooth, means, opaque.half, opaque.edge, by, out)
+    _flatten(opaque.smooth, means, opaque.half, opaque.edge, by, out)
     return out
 
 
-def inset(
+def surface_offset(
     opaque: Opaque,
     means: np.ndarray,
     variances: np.ndarray,

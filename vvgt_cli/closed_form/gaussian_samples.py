@@ -89,10 +89,12 @@ def values_of(samples: np.ndarray, gaussians: Gaussians, slope: float, intercept
     values = np.where(known, samples, 0).astype(np.float64)
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = values.sum(axis=1) / count
-        apart = np.where(known, values - mean[:, None], 0)
-        spread = np.sqrt((apart**2).sum(axis=1) / count)
+        differences = np.where(known, values - mean[:, None], 0)
+        spread = np.sqrt((differences**2).sum(axis=1) / count)
     points = offsets()
-    rise = apart @ points @ np.linalg.inv(points.T @ points) * np.sign(slope)  # a standard deviation along each axis
+    rise = (
+        differences @ points @ np.linalg.inv(points.T @ points) * np.sign(slope)
+    )  # a standard deviation along each axis
     explained = np.sqrt(((rise @ points.T) ** 2).mean(axis=1)) / np.maximum(spread, 1e-30)
     axes = rotations(gaussians.quaternions.astype(np.float64))
     gradient = np.einsum("kij,kj->ki", axes, rise / np.exp(gaussians.log_scales.astype(np.float64)))
