@@ -25,7 +25,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class VbmOptions:
-    """What the Gaussians are made for.
+    """Options of the closed form.
 
     Attributes:
         max_gaussians: budget.

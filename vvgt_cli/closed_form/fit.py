@@ -1,4 +1,4 @@
-"""What views can mend in closed-form Gaussians without moving them: cells split by error, colours by least squares."""
+"""Fit closed-form Gaussians to views without moving them: cells split by error, colours by least squares."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a volume's values are under Gaussians: samples at the points of each."""
+"""A volume's values under Gaussians: samples at the points of each."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whose a Gaussian of a label map is, and which way it is bounded: samples at its points."""
+"""Assign each Gaussian to a label, and find which way the label ends, by samples at its points."""
 
 from __future__ import annotations
 

@@ -107,7 +107,7 @@ def _shade(
 
 @dataclass(frozen=True)
 class Shading:
-    """What the colours of cells under light follow from, wherever the volume's values are.
+    """Inputs of the colours of cells under light, wherever the volume's values are.
 
     Attributes:
         light: as kernels take it.

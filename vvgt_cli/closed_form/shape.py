@@ -24,7 +24,7 @@ DEBLUR = 0.3  # px^2 that an opaque cell gives back: the renderer's dilation add
 
 @dataclass(frozen=True)
 class SurfaceStyle:
-    """How Gaussians of opaque bodies are laid, in cell edges or pixels.
+    """Style in which Gaussians are laid on opaque bodies, in cell edges or pixels.
 
     Attributes:
         tangent: smallest standard deviation along the surface, in cell edges.

@@ -1,4 +1,4 @@
-"""What the cameras see of each cell: a march through the cells' extinction that adds up what is seen."""
+"""Visibility of each cell from the cameras: a march through the cells' extinction that adds up what is seen."""
 
 from __future__ import annotations
 

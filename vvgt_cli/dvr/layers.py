@@ -49,7 +49,7 @@ class Layer:
 
     @property
     def name(self) -> str:
-        """Of the volume and what colours it."""
+        """Name of the volume and of the function that colours it."""
         return f"{self.volume.name} ({self.tf.name})"
 
     @property

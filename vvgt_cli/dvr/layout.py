@@ -1,4 +1,4 @@
-"""What the ray caster's kernels read: a volume's values, the optics, the light, the bricks of the empty-space map."""
+"""Data of the ray caster's kernels: a volume's values, the optics, the light, the bricks of the empty-space map."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class Texels(_Grid):
 
 
 class Light(NamedTuple):
-    """What falls on a scene, in its box frame (docs/light.md).
+    """Light on a scene, in its box frame (docs/light.md).
 
     Attributes:
         ambient, diffuse, specular, power: coefficients; ``power`` is of the highlight.

@@ -79,7 +79,7 @@ def mean_extinction(scene: Absorbing, cell: int) -> np.ndarray:
 
 
 class Absorbing(Protocol):
-    """What rays are attenuated in, as kernels take it, and its voxels' edges (3,) in the unit frame."""
+    """Medium that attenuates rays, as kernels take it, and its voxels' edges (3,) in the unit frame."""
 
     @property
     def voxels(self) -> Voxels:

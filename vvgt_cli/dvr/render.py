@@ -22,7 +22,7 @@ LATTICE = {5: 2, 13: 5}  # point i of n at (i, k i mod n) / n: all columns and r
 
 @dataclass(frozen=True)
 class RenderSettings:
-    """How a view is integrated.
+    """Settings of the integration along rays.
 
     Attributes:
         step: sampling distance in voxels; scalars are linear between samples (pre-integration).
@@ -164,7 +164,7 @@ def _rays(scene: Scene) -> Callable[..., None]:
 
 
 class Viewed(Protocol):
-    """What draws its own pictures, as a volume does of which only blocks are in memory."""
+    """Source of its own pictures, such as a volume of which only blocks are in memory."""
 
     def view(self, camera: Camera, settings: RenderSettings, blocks: Blocks | None = None) -> np.ndarray:
         """Render one view, as `render_view` does."""

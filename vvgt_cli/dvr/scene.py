@@ -17,7 +17,7 @@ from vvgt_cli.volume import Volume
 
 @dataclass(frozen=True)
 class PreparedVolume:
-    """What of a scene does not depend on the function.
+    """Part of a scene that does not depend on the function.
 
     Attributes:
         values, slope, intercept: of `kernel_values`.
@@ -40,7 +40,7 @@ class PreparedVolume:
 
 @dataclass(frozen=True)
 class Scene:
-    """What every later stage reads.
+    """Volume under a transfer function, as every later stage reads it.
 
     Attributes:
         volume: the source.
@@ -165,7 +165,7 @@ def kernel_values(volume: Volume) -> tuple[np.ndarray, float, float]:
 
 @dataclass(frozen=True)
 class KernelRule:
-    """How stored values become those that kernels read, of which the data value is ``slope * value + intercept``.
+    """Rule that turns stored values into those of kernels; the data value is ``slope * value + intercept``.
 
     Attributes:
         dtype: uint8, uint16 or float32.

@@ -86,7 +86,7 @@ def _digest(*parts: Any) -> str:
 
 
 class KernelCache:
-    """What a numba dispatcher asks for the compiled form of a signature.
+    """Cache of a numba dispatcher: the compiled forms of its signatures.
 
     On a miss, another process compiles the kernel, and this one loads what that has left on disk: no process runs code
     that it has compiled itself, so that a first run computes what later ones do. (Code compiled here and the same code

@@ -84,7 +84,7 @@ def run(
 
 @dataclass
 class _Course:
-    """What changes from step to step beside the state."""
+    """Values that change from step to step beside the state."""
 
     error: float | None = None
     speed: float = 1.0

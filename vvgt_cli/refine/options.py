@@ -1,4 +1,4 @@
-"""What a descent is asked for, and what it says that it did."""
+"""Options of a descent, and the record of what it did."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Check: TypeAlias = "Train | tuple[Sequence[Camera], np.ndarray, Sequence[Blocks]
 
 @dataclass(frozen=True)
 class OptimizeOptions:
-    """How to descend, and when to stop.
+    """Options of gradient descent: the method, and when to stop.
 
     Attributes:
         steps: of one view each, at most; rates fall to zero over them. None: as many as the time budget allows.
@@ -97,7 +97,7 @@ class OptimizeOptions:
 
 @dataclass
 class OptimizeRecord:
-    """What a run did.
+    """Record of a run.
 
     Attributes:
         steps: taken, and ``kept``: the step whose Gaussians were returned (0: the input).

@@ -1,4 +1,4 @@
-"""What the steps of Gaussians that are alike have in common, which one Gaussian's own slopes tell too noisily.
+"""Steps that similar Gaussians share, estimated together: one Gaussian's own slopes are too noisy.
 
 A Gaussian's step is Adam's: of its own slopes, view by view, most of which is noise. But what the closed form gets
 wrong it gets wrong alike in Gaussians that are alike: too wide where the opacity is high, too pale beside what is dark.

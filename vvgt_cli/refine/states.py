@@ -1,4 +1,4 @@
-"""What is descended on: a state renders itself, takes steps, and can be put back to where it was."""
+"""States of gradient descent: a state renders itself, takes steps, and can be put back to where it was."""
 
 from __future__ import annotations
 

@@ -121,7 +121,7 @@ def own_axes(
 ) -> None:  # fmt: skip
     """Step mu += M d, M <- M (I + E + E^2 / 2): d, E, logit and colour by Adam; ``step`` counts from 1.
 
-    Gradients ``slopes`` (COUNT, K) as `FrameGradients.rows` and what they are of, ``means`` (K, 3), ``factors``
+    Gradients ``slopes`` (COUNT, K) as `AxesGradients.rows` and what they are of, ``means`` (K, 3), ``factors``
     (K, 3, 3), ``logits`` (K,), ``colors`` (K, 3), are float32, as are Adam's moments ``first`` and ``second``
     (COUNT, K) and what is computed, `LANES` Gaussians at a time. ``rates`` (5 or more,): d, E on and off the diagonal,
     logit, colour. ``clips`` (3,): d, logit, E. ``spread`` is the dilation's variance at the scene, ``darkest`` the

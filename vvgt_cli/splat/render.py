@@ -239,7 +239,7 @@ def moments(projection: Projection, colors: np.ndarray, image: np.ndarray, grad:
 
 
 @dataclass(frozen=True)
-class FrameGradients:
+class AxesGradients:
     """Gradients for steps along each Gaussian's own axes, ``mu += M d``, ``M <- M (I + E)``, E symmetric.
 
     Attributes:
@@ -260,7 +260,7 @@ def own_axes_backward(
     projection: Projection,
     pairs: np.ndarray,
     harmonics: np.ndarray | None = None,
-) -> FrameGradients:
+) -> AxesGradients:
     """Return the gradient for covariances ``M M^T``: means (K, 3), factors (K, 3, 3) M, all float32.
 
     ``projection`` from `project_factors`, ``pairs`` from `moments` with ``colors`` (K, 3): those of `seen_colors` where
@@ -273,7 +273,7 @@ def own_axes_backward(
         p.first, pairs, p.extent, p.flat, means, factors, colors, *pose(camera), p.rule.projecting(), rows
     )
     if harmonics is None:
-        return FrameGradients(rows)
+        return AxesGradients(rows)
     by_harmonics, by_means = seen_slopes(means, harmonics, camera.position, np.ascontiguousarray(rows[10:].T))
     rows[:3] += np.einsum("kji,kj->ik", factors, by_means)
-    return FrameGradients(rows, by_harmonics)
+    return AxesGradients(rows, by_harmonics)
