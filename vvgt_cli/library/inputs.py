@@ -120,7 +120,7 @@ def _name_of(function: FunctionLike | None) -> str:
 
 
 @dataclass(frozen=True)
-class Goal(FitOptions, Limits):
+class Goal(Limits, FitOptions):
     """What a conversion is for: the attributes of `FitOptions` and `Limits`.
 
     Attributes:
