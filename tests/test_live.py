@@ -14,7 +14,7 @@ import vvgt_cli as vvgt_library
 from tests.closed_form_scenes import scene_of
 from vvgt_cli.cameras import default_views
 from vvgt_cli.closed_form import VbmOptions, initialise
-from vvgt_cli.closed_form.under import POINTS, in_voxels, offsets, sample_points, values_of
+from vvgt_cli.closed_form.gaussian_samples import POINTS, in_voxels, offsets, sample_points, values_of
 from vvgt_cli.dvr import RenderSettings
 from vvgt_cli.dvr.layout import Voxels
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply

@@ -6,7 +6,7 @@ import numba as nb
 import numpy as np
 
 from vvgt_cli.jit.decorators import inlined, parallel_kernel
-from vvgt_cli.jit.parts import Part, turns_of
+from vvgt_cli.jit.threads import ThreadSlice, iterations
 
 LANES = 4  # tables that neighbours are counted in: equal ones need not wait for each other
 LOW, HIGH, STORED_LOW, STORED_HIGH = range(4)  # of a part's ends
@@ -15,10 +15,10 @@ U = nb.uint64  # an index that cannot be negative needs no test
 
 
 @parallel_kernel("V i8:3")
-def count_values(part: Part, values: np.ndarray, out: np.ndarray) -> None:
+def count_values(thread: ThreadSlice, values: np.ndarray, out: np.ndarray) -> None:
     """Counts of each number in ``values`` (nz, ny, nx) uint8 or uint16; ``out`` (parts, LANES, 256 or 65536), zeros."""
     parts = out.shape[0]
-    for table in turns_of(part, parts):
+    for table in iterations(thread, parts):
         for z in range(table, values.shape[0], parts):
             for y in range(values.shape[1]):
                 row = values[z, y]
@@ -55,7 +55,13 @@ def _row_range(
 
 @parallel_kernel("V f8 f8 b1 f8:2 i8:2")
 def range_values(
-    part: Part, values: np.ndarray, slope: float, intercept: float, whole: bool, ends: np.ndarray, numbers: np.ndarray
+    thread: ThreadSlice,
+    values: np.ndarray,
+    slope: float,
+    intercept: float,
+    whole: bool,
+    ends: np.ndarray,
+    numbers: np.ndarray,
 ) -> None:
     """Range of data values ``slope * stored + intercept`` and of stored ones, and how many of them are finite.
 
@@ -64,7 +70,7 @@ def range_values(
     zeros.
     """
     parts = ends.shape[0]
-    for table in turns_of(part, parts):
+    for table in iterations(thread, parts):
         lows, highs = np.full((2, values.shape[2]), np.inf), np.full((2, values.shape[2]), -np.inf)
         for z in range(table, values.shape[0], parts):
             for y in range(values.shape[1]):
@@ -75,7 +81,14 @@ def range_values(
 
 @parallel_kernel("V f8 f8 f8 f8 f8 i8:3")
 def bin_values(
-    part: Part, values: np.ndarray, slope: float, intercept: float, lo: float, hi: float, half: float, out: np.ndarray
+    thread: ThreadSlice,
+    values: np.ndarray,
+    slope: float,
+    intercept: float,
+    lo: float,
+    hi: float,
+    half: float,
+    out: np.ndarray,
 ) -> None:
     """Histogram of the finite data values ``slope * stored + intercept`` by the bins of `stats.bins_of`, to the bit.
 
@@ -84,7 +97,7 @@ def bin_values(
     """
     parts, bins = out.shape[0], out.shape[2] - 1
     first, width = lo * half, hi * half - lo * half
-    for table in turns_of(part, parts):
+    for table in iterations(thread, parts):
         number = np.empty(values.shape[2], np.int32)
         for z in range(table, values.shape[0], parts):
             for y in range(values.shape[1]):

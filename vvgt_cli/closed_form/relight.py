@@ -12,8 +12,8 @@ from vvgt_cli.look.lighting import Lighting
 DEGREE = 2  # of harmonics under a light that depends on the view
 
 
-def relit(gaussians: Gaussians, gradient: np.ndarray, lighting: Lighting) -> Gaussians:
-    """Gaussians with their own colours under a light, without shadows or occlusion.
+def relight(gaussians: Gaussians, gradient: np.ndarray, lighting: Lighting) -> Gaussians:
+    """Colour Gaussians under a light, without shadows or occlusion.
 
     Args:
         gaussians: of one colour each.

@@ -17,7 +17,7 @@ from vvgt_cli.closed_form.moments import Cells
 from vvgt_cli.closed_form.visibility import summed
 from vvgt_cli.dvr.kernel import sample
 from vvgt_cli.jit.decorators import inlined, parallel_kernel
-from vvgt_cli.jit.parts import Part, turns_of
+from vvgt_cli.jit.threads import ThreadSlice, iterations
 
 OPAQUE_DEPTH = 5.0  # optical depth a voxel at which a cell counts as wholly opaque; half of it is the surface
 SURFACE = 0.5  # of that
@@ -50,7 +50,7 @@ class Opaque:
 
 
 def opaque_field(cells: Cells, step: np.ndarray, half: np.ndarray, labels: bool = False) -> Opaque:
-    """Where the scene, perhaps one of ``labels``, is opaque: empty fields where it is nowhere."""
+    """Find where the scene, perhaps one of ``labels``, is opaque: empty fields where it is nowhere."""
     depth = opaque_depth(cells.moments[:, MASS], cells.edge, step)
     if not len(depth) or depth.max() < SURFACE:
         return nowhere(cells.edge, half)
@@ -64,19 +64,19 @@ def opaque_field(cells: Cells, step: np.ndarray, half: np.ndarray, labels: bool 
 
 
 def nowhere(edge: np.ndarray, half: np.ndarray) -> Opaque:
-    """`Opaque` of a scene without opaque bodies."""
+    """Return the `Opaque` of a scene without opaque bodies."""
     none = np.empty((0, 0, 0), np.float32)
     return Opaque(none, none, edge, half)
 
 
 def opaque_depth(mass: np.ndarray, edge: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """(n,) opacity of cells of ``mass`` (n,), 1 and more where they are opaque; edges of cell and voxel (3,)."""
+    """Return (n,) opacity of cells of ``mass`` (n,), 1 and more where opaque; edges of cell and voxel (3,)."""
     result: np.ndarray = mass / edge.prod() * (float(step.mean()) / OPAQUE_DEPTH)
     return result
 
 
 def field_coarsening(edge: np.ndarray, half: np.ndarray, most: int) -> int:
-    """By how many powers of two the field's cells are wider than ``edge`` (3,), for no more than ``most`` of them."""
+    """Return the power of two by which the field's cells are wider than ``edge`` (3,), for at most ``most``."""
     wider = 0
     while math.prod(np.ceil(2 * half / (edge * 2.0**wider) - 1e-6)) > most:
         wider += 1
@@ -84,7 +84,7 @@ def field_coarsening(edge: np.ndarray, half: np.ndarray, most: int) -> int:
 
 
 def smoothed(field: np.ndarray, edge: np.ndarray, half: np.ndarray) -> Opaque:
-    """`Opaque` of a ``field`` (nz, ny, nx) float32 of cells of ``edge`` (3,)."""
+    """Return the `Opaque` of a ``field`` (nz, ny, nx) float32 of cells of ``edge`` (3,)."""
     smooth, other = field, np.empty_like(field)
     for dz, dy, dx in 2 * ((1, 0, 0), (0, 1, 0), (0, 0, 1)):
         target = np.empty_like(field) if smooth is field else other
@@ -94,10 +94,10 @@ def smoothed(field: np.ndarray, edge: np.ndarray, half: np.ndarray) -> Opaque:
 
 
 @parallel_kernel("f4:3 i8 i8 i8 f4:3")
-def _blur(part: Part, field: np.ndarray, dz: int, dy: int, dx: int, out: np.ndarray) -> None:
-    """[1, 2, 1] / 4 along the axis of which d is 1, edges clamped; ``field`` and ``out`` (nz, ny, nx)."""
+def _blur(thread: ThreadSlice, field: np.ndarray, dz: int, dy: int, dx: int, out: np.ndarray) -> None:
+    """Blur by [1, 2, 1] / 4 along the axis of which d is 1, edges clamped; ``field`` and ``out`` (nz, ny, nx)."""
     nz, ny, nx = field.shape
-    for k in turns_of(part, nz):
+    for k in iterations(thread, nz):
         for j in range(ny):
             before = field[max(k - dz, 0), max(j - dy, 0)]
             after = field[min(k + dz, nz - 1), min(j + dy, ny - 1)]
@@ -110,7 +110,7 @@ def _blur(part: Part, field: np.ndarray, dz: int, dy: int, dx: int, out: np.ndar
 def _run(
     field: np.ndarray, x: float, y: float, z: float, dx: float, dy: float, dz: float, limit: int, inside: bool
 ) -> int:
-    """Steps along d, from 1 to ``limit``, before the field leaves (``inside``) or enters the body; limit if never.
+    """Count steps along d, from 1 to ``limit``, until the field leaves (``inside``) or enters the body; limit if never.
 
     ``field`` (nz, ny, nx); the point and d in its cells, (x, y, z).
     """
@@ -122,7 +122,7 @@ def _run(
 
 @inlined()
 def _inwards(smooth: np.ndarray, x: float, y: float, z: float, edge: np.ndarray) -> tuple[float, float, float, float]:
-    """Unit vector up the gradient of ``smooth`` (nz, ny, nx) at (x, y, z), in its cells of ``edge`` (3,); its length.
+    """Return the unit vector up the gradient of ``smooth`` (nz, ny, nx) at (x, y, z), in its cells, and its length.
 
     The length is twice that of the gradient; where it is 0 the vector is, too.
     """
@@ -135,8 +135,8 @@ def _inwards(smooth: np.ndarray, x: float, y: float, z: float, edge: np.ndarray)
 
 
 @parallel_kernel("f4:3 f8:2 f8:1 f8:1 f8:1 f8:3")
-def _press(
-    part: Part,
+def _flatten(
+    thread: ThreadSlice,
     smooth: np.ndarray,
     means: np.ndarray,
     half: np.ndarray,
@@ -149,7 +149,7 @@ def _press(
     ``smooth``, ``half`` (3,), ``edge`` (3,) of `Opaque`.
     """
     small = min(edge[0], edge[1], edge[2])
-    for k in turns_of(part, means.shape[0]):
+    for k in iterations(thread, means.shape[0]):
         x, y, z = (
             (means[k, 0] + half[0]) / edge[0] - 0.5,
             (means[k, 1] + half[1]) / edge[1] - 0.5,
@@ -166,18 +166,18 @@ def _press(
 
 @parallel_kernel("f4:3 f4:3 f8:2 f8:1 f8:1 f8:3 f8:1 f8 f8 f8:2")
 def _shift(
-    part: Part,
+    thread: ThreadSlice,
     field: np.ndarray, smooth: np.ndarray, means: np.ndarray, half: np.ndarray, edge: np.ndarray, cov: np.ndarray,
     reach: np.ndarray, dilation: float, far: float, out: np.ndarray,
 ) -> None:  # fmt: skip
-    """`inset` into ``out`` (n, 3): ``field``, ``smooth``, ``half`` (3,), ``edge`` (3,) of `Opaque`.
+    """Write `surface_offset` into ``out`` (n, 3): ``field``, ``smooth``, ``half`` (3,), ``edge`` (3,) of `Opaque`.
 
     ``means`` (n, 3), ``cov`` (n, 3, 3), ``reach`` (n,) standard deviations, ``dilation``, ``far``: unit frame.
     """
     small = min(edge[0], edge[1], edge[2])
     stride = 0.25 * small
     limit = int(far / stride)
-    for k in turns_of(part, means.shape[0]):
+    for k in iterations(thread, means.shape[0]):
         x, y, z = (
             (means[k, 0] + half[0]) / edge[0] - 0.5,
             (means[k, 1] + half[1]) / edge[1] - 0.5,
@@ -208,18 +208,18 @@ def _shift(
             out[k, 0], out[k, 1], out[k, 2] = gx * move, gy * move, gz * move
 
 
-def pressed(opaque: Opaque, means: np.ndarray, cov: np.ndarray, by: np.ndarray) -> np.ndarray:
-    """Covariances (n, 3, 3) of cells at ``means`` (n, 3), each less ``by`` (n,) along the normal of a surface there.
+def flattened(opaque: Opaque, means: np.ndarray, cov: np.ndarray, by: np.ndarray) -> np.ndarray:
+    """Reduce covariances (n, 3, 3) of cells at ``means`` (n, 3) by ``by`` (n,) along the normal of a surface there.
 
     Their axes are for telling which way a surface faces: what fills a cell evenly has axes of no meaning, and takes
     the surface's; what is flat by itself keeps its own. They need not be positive.
     """
     out = cov.copy()
-    _press(opaque.smooth, means, opaque.half, opaque.edge, by, out)
+    _flatten(opaque.smooth, means, opaque.half, opaque.edge, by, out)
     return out
 
 
-def inset(
+def surface_offset(
     opaque: Opaque,
     means: np.ndarray,
     variances: np.ndarray,
@@ -228,10 +228,13 @@ def inset(
     dilation: float,
     far: float,
 ) -> np.ndarray:
-    """Displacements (n, 3), unit frame, of Gaussians near the surface of an opaque body.
+    """Return displacements (n, 3), unit frame, of Gaussians near the surface of an opaque body.
 
     Args:
-        means, variances, axes: (n, 3), (n, 3), (n, 3, 3; columns) of the Gaussians.
+        opaque: where the scene is opaque.
+        means: (n, 3) of the Gaussians.
+        variances: (n, 3), principal ones.
+        axes: (n, 3, 3), principal axes as columns.
         reach: (n,) how many standard deviations outside its centre a Gaussian's silhouette lies.
         dilation: the renderer's, in unit-frame lengths squared.
         far: length over which a surface is looked for.
