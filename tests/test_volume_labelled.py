@@ -16,8 +16,8 @@ import zarr
 from tests.ramps import X, Y, Z, check_grid, check_ramp, ramp
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume import ReadOptions, read_volume
+from vvgt_cli.volume.arrays.netcdf3 import check_header
 from vvgt_cli.volume.labelled import even
-from vvgt_cli.volume.netcdf3 import check_header
 
 VALUES = ramp(X, Y, Z)
 AXES = {"x": X, "y": Y, "z": Z}

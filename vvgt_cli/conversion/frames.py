@@ -273,7 +273,7 @@ def steps_of(source: SourceRequest) -> list[Step]:
         UsageError: a glob that matches nothing.
         DataError: a file that cannot be read.
     """
-    from vvgt_cli.volume.slices import matching
+    from vvgt_cli.volume.tiff.slices import matching
 
     files = [] if os.path.exists(source.path) else matching(source.path)
     if not files and set(source.path) & set("*?[") and not os.path.exists(source.path):

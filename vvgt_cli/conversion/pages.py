@@ -20,7 +20,8 @@ from vvgt_cli.files import temporary_folder
 from vvgt_cli.gaussians.outputs import claimed
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
-from vvgt_cli.volume.slices import SUFFIXES, matching
+from vvgt_cli.volume.tiff import SUFFIXES
+from vvgt_cli.volume.tiff.slices import matching
 
 MOST = 3_000_000  # Gaussians of all frames of a live page: 90 MB of it
 

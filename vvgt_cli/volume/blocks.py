@@ -147,6 +147,24 @@ def open_packed(encoding: str, file: IO[bytes]) -> Any:
     return _OPENERS[encoding](file)
 
 
+def read_head(path: Path, size: int) -> tuple[bytes, str]:
+    """Read the first bytes of a file, decompressed, and how it is compressed: ``raw``, ``gzip`` or ``bzip2``.
+
+    Raises:
+        DataError: damaged compressed data.
+    """
+    with open(path, "rb") as file:
+        head = file.read(size)
+        encoding = "gzip" if head[:2] == b"\x1f\x8b" else "bzip2" if head[:3] == b"BZh" else "raw"
+        if encoding == "raw":
+            return head, encoding
+        file.seek(0)
+        try:
+            return open_packed(encoding, file).read(size), encoding
+        except (OSError, EOFError, zlib.error) as error:
+            raise damaged(path, encoding, error) from error
+
+
 def damaged(path: Path, encoding: str, error: Exception) -> DataError:
     """The error of compressed data that cannot be unpacked."""
     return DataError(f"{path.name}: damaged {encoding} data ({error}); try to fetch the file again")

@@ -55,8 +55,8 @@ def volume_in_memory(
 
 
 def dataset_volume(data: Any, options: ReadOptions, name: str) -> Volume:
-    """As `vvgt_cli.volume.vtk_grids.dataset_volume`; VTK is imported by then."""
-    from vvgt_cli.volume import vtk_grids
+    """As `vvgt_cli.volume.vtk.grids.dataset_volume`; VTK is imported by then."""
+    from vvgt_cli.volume.vtk import grids as vtk_grids
 
     return vtk_grids.dataset_volume(data, options, name, name)
 

@@ -16,7 +16,6 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, VvgtError
 from vvgt_cli.volume.blocks import IN_BLOCKS, check_memory
-from vvgt_cli.volume.bricks import BrickArray
 from vvgt_cli.volume.packed import Packed
 from vvgt_cli.volume.types import Volume
 
@@ -151,7 +150,7 @@ def put_block(data: Any, lo: np.ndarray, out: np.ndarray) -> None:
     (x0, y0, z0), (z1, y1, x1) = lo, np.asarray(lo)[::-1] + out.shape
     under = _map_under(data)
     if under is None or not hasattr(mmap, "MADV_DONTNEED"):
-        out[...] = data[z0:z1][:, y0:y1, x0:x1] if isinstance(data, BrickArray) else data[z0:z1, y0:y1, x0:x1]
+        out[...] = data[z0:z1][:, y0:y1, x0:x1]  # bricks are laid out slab by slab
         return
     slab = max(MAPPED // max(out[0].nbytes, 1), 1)
     for z in range(0, len(out), slab):

@@ -12,11 +12,11 @@ import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.headers import printable, unit_rows
+from vvgt_cli.volume.openvdb import MAGIC
 from vvgt_cli.volume.openvdb.codec import ACTIVE_MASK, BLOSC, ZIP
 from vvgt_cli.volume.openvdb.cursor import Cursor
 from vvgt_cli.volume.types import FLAT
 
-MAGIC = b" BDV\0\0\0\0"
 VERSIONS = range(222, 225)
 _UUID = 36
 _HALF = "_HalfFloat"

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.bricks import EDGE, BrickArray, brick_grid
 from vvgt_cli.volume.components import select_component
+from vvgt_cli.volume.openvdb.bricks import EDGE, BrickArray, brick_grid
 from vvgt_cli.volume.openvdb.tree import Node, Tree
 
 
