@@ -121,7 +121,7 @@ def test_netcdf_scaling_and_missing_values(tmp_path: Path) -> None:
     np.testing.assert_allclose(volume.data[1:], VALUES[1:], rtol=1e-6)
     with pytest.raises(UsageError, match=r"several variables: packed \(z, y, x: 3 x 4 x 5\); holed"):
         read_volume(str(path))
-    with pytest.raises(UsageError, match="no variable none; it has packed"):
+    with pytest.raises(UsageError, match="no variable 'none'; it has packed"):
         read_volume(str(path), ReadOptions(array="none"))
 
 
@@ -182,7 +182,7 @@ def test_hdf5_choices(tmp_path: Path) -> None:
         file["a/one"], file["b/two"] = VALUES, VALUES + 1
     with pytest.raises(UsageError, match=r"several datasets: /a/one \(3, 4, 5\) float64; /b/two .*choose one as"):
         read_volume(str(path))
-    with pytest.raises(UsageError, match=r"no dataset /c; it has /a/one"):
+    with pytest.raises(UsageError, match=r"no dataset '/c'; it has /a/one"):
         read_volume(f"{path}:/c")
     with pytest.raises(UsageError, match="choose both"):
         read_volume(f"{path}:/a/one", ReadOptions(array="/a/one"))

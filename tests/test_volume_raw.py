@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume import ReadOptions, read_volume
-from vvgt_cli.volume.options import DTYPES, parse_dtype
+from vvgt_cli.volume.headers import DTYPES
+from vvgt_cli.volume.options import parse_dtype
 from vvgt_cli.volume.plain import raw as raw_module
 
 

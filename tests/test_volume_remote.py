@@ -140,7 +140,7 @@ def test_what_xarray_and_dask_have_of_an_address_stays_lazy(address: str) -> Non
 def test_what_cannot_be_is_a_line(vvgt, address: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     for place, text in (
         (f"{address}/none.zarr", "no Zarr there"),
-        (f"{address}/x.ome.zarr:/7", "no array 7"),
+        (f"{address}/x.ome.zarr:/7", "no array '7'"),
         ("http://127.0.0.1:9/x.zarr", "or no answer"),
     ):
         done = vvgt("convert", place, "-o", tmp_path / "a.ply")

@@ -13,7 +13,8 @@ import numpy as np
 from vvgt_cli.checks import Case, Figure, require
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume import ReadOptions, Volume, read_volume, statistics
-from vvgt_cli.volume.options import DTYPES, parse_dtype
+from vvgt_cli.volume.headers import DTYPES
+from vvgt_cli.volume.options import parse_dtype
 
 STAGE = "reading"
 

@@ -11,10 +11,9 @@ import numpy as np
 from vvgt_cli.errors import UsageError
 from vvgt_cli.volume.components import contiguous
 from vvgt_cli.volume.dask_arrays import Chunks, is_dask, lazy
-from vvgt_cli.volume.headers import unit_rows
 from vvgt_cli.volume.labelled import axis, labelled_volume
 from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.space import SPACES
+from vvgt_cli.volume.space import SPACES, unit_rows
 from vvgt_cli.volume.types import Volume
 
 

@@ -1,7 +1,7 @@
 """HDF5 (``.h5``, ``.hdf5``): one dataset, ``FILE:/path/to/dataset``; a contiguous one is memory-mapped. Read by h5py.
 
 Axes come from dimension scales where there are any (https://docs.hdfgroup.org, "HDF5 Dimension Scales"), else from the
-conventions of `hdf5_axes`; CF attributes of scaling and missing values are applied: a NetCDF-4 file is such a file.
+conventions of `conventions`; CF attributes of scaling and missing values are applied.
 """
 
 from __future__ import annotations
@@ -12,28 +12,19 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.errors import DataError, SeveralArrays, UsageError
+from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.arrays import MAX_CHUNK
-from vvgt_cli.volume.arrays.hdf5_axes import conventional_axes, text_of
+from vvgt_cli.volume.arrays.conventions import conventional_axes, coordinates_of, text_of
 from vvgt_cli.volume.blocks import data_file, load_block, size_text
+from vvgt_cli.volume.components import choose
 from vvgt_cli.volume.headers import printable
-from vvgt_cli.volume.labelled import (
-    AXIS_ATTRIBUTES,
-    CF_ATTRIBUTES,
-    DESCRIBES,
-    GEOMETRY,
-    Axis,
-    axis,
-    described_by,
-    labelled_volume,
-)
+from vvgt_cli.volume.labelled import CF_ATTRIBUTES, DESCRIBES, GEOMETRY, Axis, axis, described_by, labelled_volume
 from vvgt_cli.volume.libraries import library_errors, need
 from vvgt_cli.volume.microscopy.imaris import is_imaris, read_imaris
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.types import Volume
 
-MOST_LISTED = 12
 MOST_VISITED = 100_000
 
 
@@ -57,18 +48,18 @@ def read_hdf5(path: Path, options: ReadOptions) -> Volume:
         stored = mapped if mapped is not None else lambda index: dataset[index]
         name = f"{volume_name(path)}:{dataset.name.strip('/')}"
         attributes = {key: dataset.attrs[key] for key in (*CF_ATTRIBUTES, *GEOMETRY) if key in dataset.attrs}
-        axes = _axes(dataset)
+        axes = scaled_axes(dataset)
         if not any(a.name or a.centres is not None for a in axes):
             axes, more = conventional_axes(file, dataset, source) or (axes, {})
             attributes |= more
         chunks = dataset.chunks or dataset.shape
         if mapped is None and options.stored:
-            stored = partial(_part, path, dataset.name)
+            stored = partial(read_part, path, dataset.name)
         return labelled_volume(stored, dataset.dtype, axes, attributes, options, source, name, chunks)
 
 
 def checked_dataset(h5py: Any, file: Any, path: Path, name: str) -> Any:
-    """The dataset of a path that leads into no file elsewhere, whose values can be read."""
+    """Return a dataset whose values can be read, by a path that leads into no file elsewhere."""
     _check_links(h5py, file, name, path)
     if not isinstance(file.get(name), h5py.Dataset):
         raise DataError(f"{path}:/{name}: no dataset; check that the file is whole")
@@ -76,8 +67,8 @@ def checked_dataset(h5py: Any, file: Any, path: Path, name: str) -> Any:
     return file[name]
 
 
-def _part(path: Path, name: str, index: tuple[Any, ...]) -> np.ndarray:
-    """A part of a dataset, of a file that is open no longer than that."""
+def read_part(path: Path, name: str, index: tuple[Any, ...]) -> np.ndarray:
+    """Read a part of a dataset from a file that is open no longer than that."""
     import h5py
 
     with h5py.File(path, "r") as file:
@@ -90,22 +81,16 @@ def _choose(h5py: Any, file: Any, wanted: str | None, path: Path) -> Any:
         found = file.get(wanted)
         if isinstance(found, h5py.Dataset):
             return found
-        file = found if isinstance(found, h5py.Group) else file
-    fits = _datasets(h5py, file)
-    listing = printable("; ".join(f"{d.name} {d.shape} {d.dtype}" for d in fits[:MOST_LISTED])) or "none"
-    listing += "; ..." if len(fits) > MOST_LISTED else ""
-    if wanted is not None and (file.name == "/" or not fits):
-        raise UsageError(f"{path}: no dataset {wanted}; it has {listing}; choose one as {path.name}:/path")
-    if not fits:
-        raise DataError(f"{path}: no dataset of numbers with two axes or more; expected a volume")
-    if len(fits) > 1:
-        text = f"{path}: several datasets: {listing}; choose one as {path}:{printable(fits[0].name)} (or with --array)"
-        raise SeveralArrays(text, "--array", [d.name for d in fits])
-    return fits[0]
+        file, wanted = (found, None) if isinstance(found, h5py.Group) else (file, wanted)
+    fits = datasets(h5py, file)
+    rows = [f"{d.name} {d.shape} {d.dtype}" for d in fits]
+    first = printable(fits[0].name) if fits else "/path"
+    how = f"choose one as {path}:{first} (or with --array)"
+    return fits[choose([d.name for d in fits], rows, wanted, str(path), "dataset", how)]
 
 
-def _datasets(h5py: Any, group: Any) -> list[Any]:
-    """Return the datasets of numbers with 2 to 5 axes; only those with three or more if there are any.
+def datasets(h5py: Any, group: Any) -> list[Any]:
+    """List the datasets of numbers with 2 to 5 axes; only those with three or more if there are any.
 
     Datasets that describe others, such as bounds of cells, are skipped.
     """
@@ -149,29 +134,27 @@ def check_storage(h5py: Any, dataset: Any, path: Path, source: str) -> None:
     plan = dataset.id.get_create_plist()
     for k in range(plan.get_nfilters()):
         code, _, _, label = plan.get_filter(k)
-        if not h5py.h5z.filter_avail(code):
-            _plugins(source, code, label.decode("utf-8", "replace"))
-
-
-def _plugins(source: str, code: int, label: str) -> None:
-    try:
-        import hdf5plugin  # noqa: F401  registers its filters
-    except ImportError:
-        raise DataError(
-            f"{source}: packed with filter {code} ({label or 'unnamed'}), which h5py does not have; "
-            "try: pip install hdf5plugin"
-        ) from None
+        if h5py.h5z.filter_avail(code):
+            continue
+        try:
+            import hdf5plugin  # noqa: F401  registers its filters
+        except ImportError:
+            name = label.decode("utf-8", "replace") or "unnamed"
+            raise DataError(
+                f"{source}: packed with filter {code} ({name}), which h5py does not have; try: pip install hdf5plugin"
+            ) from None
 
 
 def _mapped(dataset: Any, path: Path) -> np.ndarray | None:
-    """The values memory-mapped, where they lie in the file in one piece as they are."""
+    """Return the values memory-mapped, where they lie in the file in one piece as they are."""
     offset = None if dataset.chunks or dataset.is_virtual else dataset.id.get_offset()
     if offset is None or dataset.dtype.kind not in "iuf" or not dataset.size:
         return None
     return load_block(path, dataset.dtype, dataset.shape, offset=offset)
 
 
-def _axes(dataset: Any) -> list[Axis]:
+def scaled_axes(dataset: Any) -> list[Axis]:
+    """Return the axes of a dataset by its dimension scales, slowest first; without any they have no name."""
     axes = []
     for size, dimension in zip(dataset.shape, dataset.dims, strict=True):
         scales = [scale for scale in dimension.values() if scale.shape == (size,) and scale.dtype.kind in "iuf"]
@@ -180,8 +163,6 @@ def _axes(dataset: Any) -> list[Axis]:
             axes.append(axis(dimension.label or (names[0] if names else ""), size))
             continue
         scale = scales[0]
-        attributes = {key: text_of(scale.attrs[key]) for key in AXIS_ATTRIBUTES if key in scale.attrs}
         bare = text_of(scale.attrs.get("NAME", "")).startswith("This is a netCDF dimension")
-        centres = None if bare else np.asarray(scale[()], np.float64)
-        axes.append(axis(scale.name.rpartition("/")[2], size, centres, attributes))
+        axes.append(axis(scale.name.rpartition("/")[2], size, *((None, {}) if bare else coordinates_of(scale))))
     return axes

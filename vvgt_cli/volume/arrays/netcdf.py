@@ -10,10 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.errors import DataError, SeveralArrays, UsageError
-from vvgt_cli.volume.arrays.hdf5 import MOST_LISTED
 from vvgt_cli.volume.arrays.netcdf3 import check_header
-from vvgt_cli.volume.headers import printable
+from vvgt_cli.volume.components import choose
 from vvgt_cli.volume.labelled import DESCRIBES, Axis, axis, described_by, labelled_volume
 from vvgt_cli.volume.libraries import library_errors, need
 from vvgt_cli.volume.options import ReadOptions
@@ -45,7 +43,7 @@ def read_netcdf(path: Path, options: ReadOptions) -> Volume:
             attributes["_FillValue"] = library.default_fillvals[kind]  # what the library fills unwritten values with
         source = f"{path}:{variable.name}"
         axes = [_axis(variable, name, size) for name, size in zip(variable.dimensions, variable.shape, strict=True)]
-        _say_curvilinear(variable, attributes, source)
+        _warn_of_curvilinear(variable, attributes, source)
         name = f"{volume_name(path)}:{variable.name}"
         where = f"{variable.group().path.rstrip('/')}/{variable.name}"
         by_box = options.stored and options.dims is None and options.component != "magnitude"
@@ -54,7 +52,7 @@ def read_netcdf(path: Path, options: ReadOptions) -> Volume:
         return labelled_volume(read, np.dtype(variable.dtype), axes, attributes, options, source, name, chunks)
 
 
-def _say_curvilinear(variable: Any, attributes: dict[str, Any], source: str) -> None:
+def _warn_of_curvilinear(variable: Any, attributes: dict[str, Any], source: str) -> None:
     """Warn where places are coordinates of two or more axes (CF, 5.2), which are not read."""
     names = str(attributes.get("coordinates", "")).split()
     group = variable.group()
@@ -67,7 +65,7 @@ def _say_curvilinear(variable: Any, attributes: dict[str, Any], source: str) -> 
 
 
 def _part(path: Path, where: str, index: tuple[Any, ...]) -> np.ndarray:
-    """A part of a variable, of a file that is open no longer than that."""
+    """Read a part of a variable from a file that is open no longer than that."""
     import netCDF4
 
     with _TURN, netCDF4.Dataset(str(path), "r") as file:
@@ -76,7 +74,7 @@ def _part(path: Path, where: str, index: tuple[Any, ...]) -> np.ndarray:
 
 
 def _chunks(variable: Any) -> list[int]:
-    """Values along each axis of what the file packs together; of plain values a slice."""
+    """Return the values along each axis that the file packs together; a slice of plain values."""
     found = variable.chunking()
     if isinstance(found, list | tuple):
         return [int(n) for n in found]
@@ -84,7 +82,7 @@ def _chunks(variable: Any) -> list[int]:
 
 
 def _choose(file: Any, wanted: str | None, path: Path) -> Any:
-    """The variable asked for, else the only one of three axes or more (of two, if there is none)."""
+    """Return the variable asked for, else the only one of three axes or more (of two, if there is none)."""
     found: dict[str, Any] = {}
     groups = [("", file)]
     while groups:
@@ -105,26 +103,18 @@ def _choose(file: Any, wanted: str | None, path: Path) -> Any:
     if wanted is not None and wanted.strip("/") in found:
         return found[wanted.strip("/")]
     deep = {name: variable for name, variable in fits.items() if sum(n > 1 for n in variable.shape) >= 3} or fits
-    parts = [f"{name} ({', '.join(v.dimensions)}: {' x '.join(map(str, v.shape))})" for name, v in deep.items()]
-    listing = printable("; ".join(parts[:MOST_LISTED])) + ("; ..." if len(parts) > MOST_LISTED else "") or "none"
-    if wanted is not None:
-        raise UsageError(f"{path}: no variable {wanted}; it has {listing}; choose one with --array NAME")
-    if not deep:
-        raise DataError(f"{path}: no variable of numbers with two axes or more; expected a volume")
-    if len(deep) > 1:
-        text = f"{path}: several variables: {listing}; choose one with --array NAME"
-        raise SeveralArrays(text, "--array", list(deep))
-    return next(iter(deep.values()))
+    rows = [f"{name} ({', '.join(v.dimensions)}: {' x '.join(map(str, v.shape))})" for name, v in deep.items()]
+    return list(deep.values())[choose(list(deep), rows, wanted, str(path), "variable")]
 
 
 def _axis(variable: Any, name: str, size: int) -> Axis:
-    """An axis with its coordinate variable: that of its own name, in the variable's group or one above."""
+    """Return an axis with its coordinate variable: that of its own name, in the variable's group or one above."""
     group = variable.group()
     while group is not None:
         found = group.variables.get(name)
         if found is not None and found.shape == (size,) and np.dtype(found.dtype).kind in "iuf":
-            told = {key: found.getncattr(key) for key in found.ncattrs()}
-            scale, offset = float(told.get("scale_factor", 1.0)), float(told.get("add_offset", 0.0))
-            return axis(name, size, np.asarray(found[:], np.float64) * scale + offset, told)
+            stated = {key: found.getncattr(key) for key in found.ncattrs()}
+            scale, offset = float(stated.get("scale_factor", 1.0)), float(stated.get("add_offset", 0.0))
+            return axis(name, size, np.asarray(found[:], np.float64) * scale + offset, stated)
         group = group.parent
     return axis(name, size)

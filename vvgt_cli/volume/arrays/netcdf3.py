@@ -1,4 +1,4 @@
-"""The header of a classic NetCDF file walked and compared with the file, before the library sees it.
+"""The header of a classic NetCDF file: walked and compared with the file before the library sees it.
 
 The C library follows counts and offsets of a damaged header out of its memory. Format: "NetCDF Classic Format
 Specification" (https://docs.unidata.ucar.edu/netcdf-c/current/file_format_specifications.html), CDF-1, -2 and -5.
@@ -27,8 +27,8 @@ class Variable:
 
     Attributes:
         dims: names of its dimensions, slowest first.
-        shape: values along them; of one without an end, the records that there are.
-        dtype: of the values.
+        shape: values along them; along one without an end, the number of records.
+        dtype: of the values, as stored.
         begin: byte of the first.
         endless: whether the first dimension has no end: its records lie `step` bytes apart.
         attributes: numbers as arrays, text.
@@ -44,7 +44,7 @@ class Variable:
     step: int = 0
 
     def mapped(self, path: Path) -> np.ndarray:
-        """The values, mapped."""
+        """Map the values."""
         if not self.endless:
             return load_block(path, self.dtype, self.shape, offset=self.begin)
         inner = np.empty(self.shape[1:], np.uint8).strides  # of bytes: a record is in one piece
@@ -72,14 +72,14 @@ class _Header:
         return value
 
     def count(self) -> int:
-        """A number of things that each take a byte of the file or more."""
+        """Read the number of things that each take a byte of the file or more."""
         value = self.number(self.wide)
         if not 0 <= value <= len(self.data) - self.at:
             raise self.bad(f"declares {value} things")
         return value
 
     def skip(self, n: int) -> None:
-        """Move behind ``n`` bytes and their padding to four."""
+        """Skip ``n`` bytes and their padding to four."""
         self.at += (n + 3) // 4 * 4
         if self.at > len(self.data):
             raise self.bad("is cut short")
@@ -93,14 +93,14 @@ class _Header:
         return text
 
     def items(self, tag: int) -> int:
-        """How many things a list of ``tag`` has."""
+        """Read how many things a list of ``tag`` has."""
         found, n = self.number(4), self.count()
         if found != tag and (found, n) != (0, 0):
             raise self.bad(f"has the tag {found} where {tag} was expected")
         return n
 
     def kind(self) -> np.dtype:
-        """The type that follows."""
+        """Read the type of values."""
         found = self.number(4)
         if found not in _TYPES:
             raise self.bad(f"has values of type {found}")
@@ -122,7 +122,7 @@ def _plain(data: bytes) -> str:
 
 
 def check_header(path: Path) -> dict[str, Variable]:
-    """See that a classic file's header and the values it declares lie in the file; its variables by name.
+    """Check that a classic file's header and the values it declares lie in the file; return its variables by name.
 
     Raises:
         DataError: they do not.
@@ -164,7 +164,7 @@ def _variable(header: _Header, sizes: list[tuple[str, int]], records: int) -> Va
 
 
 def _with_steps(found: dict[str, Variable]) -> dict[str, Variable]:
-    """Variables with the bytes between their records, each padded to four where there are several."""
+    """Add to variables the bytes between their records, each padded to four where there are several."""
     sizes = [v.dtype.itemsize * math.prod(v.shape[1:]) for v in found.values() if v.endless]
     step = sizes[0] if len(sizes) == 1 else sum(-(-n // 4) * 4 for n in sizes)
     return {name: replace(v, step=step) if v.endless else v for name, v in found.items()}

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.errors import DataError, SeveralArrays, UsageError
+from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.arrays import MAX_CHUNK
-from vvgt_cli.volume.arrays.hdf5 import MOST_LISTED
+from vvgt_cli.volume.components import choose
 from vvgt_cli.volume.labelled import Axis, axis, labelled_volume
 from vvgt_cli.volume.libraries import library_errors, need
 from vvgt_cli.volume.microscopy.image import hex_color
@@ -131,16 +131,10 @@ def _choose(path: Path, wanted: str | None, number: int | None) -> tuple[Path, d
         if place.resolve().is_relative_to(path.resolve()):
             return place, _metadata(place)
     fits = _arrays(here if facts else path)
-    listing = "; ".join(f"{p.relative_to(path).as_posix()} {f['shape']}" for p, f in fits[:MOST_LISTED]) or "none"
-    listing += "; ..." if len(fits) > MOST_LISTED else ""
-    if wanted is not None and not facts:
-        raise UsageError(f"{path}: no array {wanted}; it has {listing}; choose one as {path}:/PATH")
-    if not fits:
-        raise DataError(f"{path}: no array of two axes or more; expected a volume")
-    if len(fits) > 1:
-        text = f"{path}: several arrays: {listing}; choose one as {path}:/PATH (or with --array)"
-        raise SeveralArrays(text, "--array", [p.relative_to(path).as_posix() for p, _ in fits])
-    return fits[0]
+    names = [p.relative_to(path).as_posix() for p, _ in fits]
+    rows = [f"{name} {facts['shape']}" for name, (_, facts) in zip(names, fits, strict=True)]
+    how = f"choose one as {path}:/PATH (or with --array)"
+    return fits[choose(names, rows, None if facts else wanted, str(path), how=how)]
 
 
 def _arrays(root: Path) -> list[tuple[Path, dict[str, Any]]]:

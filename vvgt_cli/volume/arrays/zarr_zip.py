@@ -17,7 +17,7 @@ from vvgt_cli.volume.types import Volume
 
 
 class _Zipped(Remote):
-    """A place in a zip file, with what `zarr_store` asks of a path."""
+    """A place in a zip file, with the methods that `zarr` calls on a path."""
 
     def _at(self, inner: PurePosixPath) -> Remote:
         return _Zipped(self._server, self._root, str(inner), self._kept)

@@ -9,22 +9,20 @@ from __future__ import annotations
 import math
 import struct
 import warnings
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.blocks import load_block, open_packed
+from vvgt_cli.volume.blocks import load_block, read_head
 from vvgt_cli.volume.components import select_component
-from vvgt_cli.volume.headers import unit_rows
 from vvgt_cli.volume.maps import MRC_HEADER, MRC_STAMPS, is_mrc
 from vvgt_cli.volume.medical.nifti import other_of_pair
 from vvgt_cli.volume.medical.pairs import read_pair
 from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.packed import packed
 from vvgt_cli.volume.readers import volume_name
+from vvgt_cli.volume.space import placed
 from vvgt_cli.volume.types import FLAT, Volume
 
 _DTYPES = {0: "i1", 1: "i2", 2: "f4", 6: "u2", 12: "f2"}
@@ -36,10 +34,17 @@ MOST_EXTRA = 1 << 30  # bytes of the extended header
 
 @dataclass(frozen=True)
 class Header:
-    """What a header says: ``sizes`` (columns, rows, sections), ``axes`` (of these three: 0 is x, 1 y, 2 z).
+    """The header of a map.
 
-    ``steps`` are the (x, y, z) vectors of a step along cell axes x, y and z, ``origin`` the centre of the first voxel,
-    both in angstroms; ``stated``: the header says how long the steps are.
+    Attributes:
+        sizes: columns, rows and sections of a volume.
+        dtype: of the values.
+        offset: byte of the first value.
+        volumes: how many there are, one behind the other.
+        axes: axis of the cell that columns, rows and sections run along: 0 is x, 1 y, 2 z.
+        steps: (3, 3) rows: vectors of a step along x, y and z of the cell, in angstroms.
+        origin: (3,) centre of the first voxel in angstroms.
+        stated: the header states the lengths of the steps.
     """
 
     sizes: tuple[int, int, int]
@@ -53,7 +58,7 @@ class Header:
 
 
 def _order(head: bytes) -> str:
-    """Byte order: of the machine stamp, unless only the other one gives a mode and axes that exist."""
+    """Return the byte order of the machine stamp, unless only the other one gives a mode and axes that exist."""
     first = MRC_STAMPS.get(head[212], "<")
     for order in (first, "<>".replace(first, "")):
         mode, axis = struct.unpack_from(order + "i", head, 12)[0], struct.unpack_from(order + "i", head, 64)[0]
@@ -107,7 +112,7 @@ def parse_header(head: bytes, name: str) -> Header:
 
 
 def _steps(intervals: tuple[int, ...], cell: tuple[float, ...], angles: tuple[float, ...]) -> np.ndarray:
-    """Rows: the vectors of a step along cell axes x, y, z; 1 angstrom where the header states none.
+    """Return the vectors of a step along cell axes x, y, z, one a row; 1 angstrom long where the header states none.
 
     The cell's a lies along x and its b in the plane of x and y (International Tables for Crystallography B, 3.3.1).
     """
@@ -124,20 +129,6 @@ def _steps(intervals: tuple[int, ...], cell: tuple[float, ...], angles: tuple[fl
     return result
 
 
-def _read_head(path: Path) -> tuple[bytes, str]:
-    """The header, and how the file is packed."""
-    with open(path, "rb") as file:
-        head = file.read(MRC_HEADER)
-    encoding = "gzip" if head[:2] == b"\x1f\x8b" else "bzip2" if head[:3] == b"BZh" else "raw"
-    if encoding == "raw":
-        return head, encoding
-    try:
-        with open(path, "rb") as file:
-            return open_packed(encoding, file).read(MRC_HEADER), encoding
-    except (OSError, EOFError, zlib.error) as error:
-        raise DataError(f"{path}: damaged {encoding} data ({error}); try to fetch the file again") from error
-
-
 def read_mrc(path: Path, options: ReadOptions) -> Volume:
     """Read an MRC or CCP4 map; one that is not compressed is memory-mapped. Volumes of a stack are time steps.
 
@@ -148,7 +139,7 @@ def read_mrc(path: Path, options: ReadOptions) -> Volume:
         DataError: a header that is damaged or does not fit the data, or complex values.
         UsageError: several volumes (`SeveralSteps`) and none chosen, or a choice that does not exist.
     """
-    head, encoding = _read_head(path)
+    head, encoding = read_head(path, MRC_HEADER)
     if path.suffix.lower() == ".rec" and not is_mrc(head) and other_of_pair(path, ".PAR"):
         return read_pair(path, options)
     header = parse_header(head, str(path))
@@ -160,14 +151,8 @@ def read_mrc(path: Path, options: ReadOptions) -> Volume:
         )
     shape, dtype = header.sizes[::-1], header.dtype
     offset = header.offset + step * math.prod(shape) * dtype.itemsize
-    if encoding == "raw":
-        block = load_block(path, dtype, shape, offset=offset)
-    else:
-        unpack = packed if options.packed else load_block
-        block = unpack(path, dtype, shape, encoding=encoding, skip=offset)
+    block = load_block(path, dtype, shape, encoding=encoding, skip=offset, packed=options.packed)
     if options.component is not None:
         block = select_component(block[..., None], options.component, str(path), label="a map")[0]
-    spacing, direction = unit_rows([header.steps[a].tolist() for a in header.axes])
-    origin = tuple(header.origin.tolist())
-    spacing = options.spacing_or(spacing)
-    return Volume(block, spacing, origin, direction, volume_name(path), density=True, unit="angstrom")
+    steps = [header.steps[a] for a in header.axes]
+    return placed(block, steps, header.origin, options, volume_name(path), density=True, unit="angstrom")

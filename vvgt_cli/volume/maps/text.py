@@ -11,7 +11,6 @@ import math
 import mmap
 import re
 import warnings
-from dataclasses import replace
 from pathlib import Path
 from typing import IO
 
@@ -20,15 +19,16 @@ import numpy as np
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.blocks import load_block
 from vvgt_cli.volume.components import select_component
-from vvgt_cli.volume.headers import unit_rows
+from vvgt_cli.volume.headers import type_of
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
+from vvgt_cli.volume.space import placed
 from vvgt_cli.volume.types import Volume
 
 BOHR = 0.529177210903  # angstroms (CODATA 2018)
 LINE, LINES = 4096, 100_000  # bytes of a line of a header, and lines
 MOST_ATOMS, MOST_ORBITALS = 1_000_000, 10_000
-_DX_TYPES = {"float": "f4", "double": "f8", "int": "i4", "short": "i2", "byte": "i1"}
+_DX_TYPES = ("float", "double", "int", "short", "byte")
 
 
 def _words(file: IO[bytes], path: Path, what: str) -> list[str]:
@@ -39,7 +39,7 @@ def _words(file: IO[bytes], path: Path, what: str) -> list[str]:
 
 
 def _floats(words: list[str], n: int, path: Path, what: str) -> list[float]:
-    """``n`` finite numbers of a line; more are not looked at.
+    """Parse the first ``n`` finite numbers of a line.
 
     Raises:
         DataError: others.
@@ -58,14 +58,6 @@ def _whole(words: list[str], path: Path, what: str) -> int:
         return int(words[0])
     except (ValueError, IndexError):
         raise DataError(f"{path}: {what} is {' '.join(words)[:80]!r}; expected a whole number") from None
-
-
-def _placed(
-    field: np.ndarray, steps: list[list[float]], origin: list[float], path: Path, options: ReadOptions
-) -> Volume:
-    """The volume of a field (n1, n2, n3) whose axes run along the three ``steps``."""
-    spacing, direction = unit_rows(steps[::-1])
-    return Volume(field, options.spacing_or(spacing), tuple(origin), direction, volume_name(path), density=True)
 
 
 def read_cube(path: Path, options: ReadOptions) -> Volume:
@@ -105,11 +97,13 @@ def read_cube(path: Path, options: ReadOptions) -> Volume:
         label = f"the cube of orbitals {listing}"
     field, _ = select_component(block, options.component, str(path), label=label)
     unit = 1.0 if min(sizes) < 0 else BOHR
-    return _placed(field, [[unit * s for s in step] for step in steps], [unit * o for o in origin], path, options)
+    return placed(
+        field, unit * np.array(steps[::-1]), unit * np.array(origin), options, volume_name(path), density=True
+    )
 
 
 def _orbitals(file: IO[bytes], path: Path) -> list[str]:
-    """Numbers of the orbitals: how many there are, then each, over as many lines as it takes."""
+    """Read the numbers of the orbitals: how many there are, then each, over as many lines as it takes."""
     words = _words(file, path, "the orbitals")
     n = _whole(words, path, "the number of orbitals")
     found = words[1:]
@@ -154,11 +148,11 @@ def read_dx(path: Path, options: ReadOptions) -> Volume:
         )
     block = _dx_values(keys, counts, path, start)
     field, _ = select_component(block, options.component, str(path))
-    return _placed(field, steps, origin, path, options)
+    return placed(field, steps[::-1], origin, options, volume_name(path), density=True)
 
 
 def _dx_values(keys: list[str], counts: list[int], path: Path, start: int) -> np.ndarray:
-    """(n1, n2, n3, c) values of the array that a line of words declares and that begins at ``start``."""
+    """Load the values (n1, n2, n3, c) of the array that a line of words declares and that begins at ``start``."""
 
     def after(key: str, default: str) -> str:
         return keys[keys.index(key) + 1] if key in keys[:-1] else default
@@ -175,7 +169,7 @@ def _dx_values(keys: list[str], counts: list[int], path: Path, start: int) -> np
         raise DataError(f"{path}: values of type {kind[:40]!r}; expected one of {', '.join(_DX_TYPES)}")
     if "unsigned" in keys or (kind == "byte" and "signed" not in keys):
         raise UsageError(f"{path}: unsigned integers in an OpenDX file; expected floats: convert it to type float")
-    shape, kinds = (*counts, components), np.dtype(_DX_TYPES[kind])
+    shape, kinds = (*counts, components), np.dtype(type_of(kind, {"byte": "i1"}))
     if {"lsb", "msb", "binary", "ieee"} & set(keys):
         kinds = kinds.newbyteorder("<") if "lsb" in keys else kinds.newbyteorder(">") if "msb" in keys else kinds
         return load_block(path, kinds, shape, offset=start)
@@ -210,13 +204,13 @@ def read_vasp(path: Path, options: ReadOptions) -> Volume:
     blocks = [load_block(path, np.dtype("f4"), tuple(sizes[::-1]), offset=at, encoding="text") for at in starts]
     label = "its grid (total, then magnetization, or spin up and down)" if len(starts) > 1 else "its grid"
     field, _ = select_component(np.stack(blocks, axis=-1), options.component, str(path), label=label)
-    placed = _placed(field, (cell / np.reshape(sizes, (3, 1)))[::-1].tolist(), [0.0] * 3, path, options)
-    name = path.name.upper()
+    name, slope = path.name.upper(), 1 / volume
     if "LOCPOT" in name or "ELFCAR" in name:
-        return replace(placed, unit="angstrom")
-    if not any(word in name for word in ("CHG", "AECCAR")):
+        slope = 1.0
+    elif not any(word in name for word in ("CHG", "AECCAR")):
         warnings.warn(f"{path}: taken as a density times the cell's volume, as CHGCAR, not as LOCPOT", stacklevel=2)
-    return replace(placed, unit="angstrom", slope=1 / volume)
+    steps, facts = cell / np.reshape(sizes, (3, 1)), {"density": True, "unit": "angstrom", "slope": slope}
+    return placed(field, steps, np.zeros(3), options, volume_name(path), **facts)
 
 
 def _vasp_cell(file: IO[bytes], path: Path) -> np.ndarray:

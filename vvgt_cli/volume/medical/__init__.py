@@ -54,7 +54,7 @@ def is_minc(head: bytes) -> bool:
 
 FORMATS = (
     Reader("NIfTI", (".nii", ".nii.gz", ".hdr", ".hdr.gz"), lazy("medical.nifti.read_nifti"), is_nifti, ("time",)),
-    Reader("Analyze", (".img", ".img.gz"), lazy("medical.analyze.read_analyze"), is_analyze, ("time",), by_name=True),
+    Reader("Analyze", (".img", ".img.gz"), lazy("medical.nifti.read_analyze"), is_analyze, ("time",), by_name=True),
     Reader("MGH", (".mgh", ".mgz", ".mgh.gz"), lazy("medical.mgh.read_mgh"), is_mgh, ("time",)),
     Reader("MINC", (".mnc",), lazy("medical.minc.read_minc"), is_minc, ("time",)),
     Reader(

@@ -14,32 +14,17 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import data_file, load_block
 from vvgt_cli.volume.components import select_component
-from vvgt_cli.volume.headers import MAX_HEADER, Fields, unit_rows
+from vvgt_cli.volume.headers import MAX_HEADER, Fields
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
-from vvgt_cli.volume.space import MILLIMETRE, metres, one_unit
+from vvgt_cli.volume.space import MILLIMETRE, metres, one_unit, unit_rows
 from vvgt_cli.volume.types import Volume
 
-# MET_LONG has 4 bytes whatever the machine (MetaIO, metaTypes.h).
-_TYPES = {
-    "char": "i1",
-    "uchar": "u1",
-    "short": "i2",
-    "ushort": "u2",
-    "int": "i4",
-    "uint": "u4",
-    "long": "i4",
-    "ulong": "u4",
-    "long_long": "i8",
-    "ulong_long": "u8",
-    "float": "f4",
-    "double": "f8",
-}
 _SCALING = (("slope", 1), ("offset", 0))
 
 
 def read_header(path: Path) -> tuple[Fields, int]:
-    """The fields of a MetaImage header, and the position behind ElementDataFile (its last line).
+    """Read the fields of a MetaImage header, and the position behind ElementDataFile (its last line).
 
     Raises:
         DataError: no ElementDataFile.
@@ -63,12 +48,18 @@ def _flag(fields: Fields, *keys: str) -> bool:
 
 
 def _dtype(fields: Fields) -> np.dtype:
-    name = fields.need("elementtype").lower().removeprefix("met_").removesuffix("_array")
-    if name not in _TYPES:
-        known = ", ".join("MET_" + t.upper() for t in _TYPES)
-        raise DataError(f"{fields.name}: ElementType {fields['elementtype']}; expected one of {known}")
+    name = fields.need("elementtype")
+    own = {"long": "i4"}  # MET_LONG has 4 bytes whatever the machine (MetaIO, metaTypes.h)
+    plain = name.lower().removeprefix("met_").removesuffix("_array")
     big = _flag(fields, "binarydatabyteordermsb", "elementbyteordermsb")
-    return np.dtype(_TYPES[name]).newbyteorder(">" if big else "<")
+    return fields.dtype(f"ElementType {name} of kind", plain, own).newbyteorder(">" if big else "<")
+
+
+def _first(fields: Fields, keys: tuple[str, ...], n: int, default: float) -> np.ndarray:
+    """Return the numbers (3,) of the first of these fields that is there, of which ``n`` are stated."""
+    key = next((key for key in keys if key in fields), None)
+    stated = [] if key is None else fields.floats(key, fields[key], min(n, 3))
+    return np.array([*stated, default, default, default][:3])
 
 
 def _place(fields: Fields, n: int, options: ReadOptions) -> dict[str, Any]:
@@ -77,33 +68,23 @@ def _place(fields: Fields, n: int, options: ReadOptions) -> dict[str, Any]:
     TransformMatrix lists the axes one after the other. The space is LPS, in mm, where the header names an orientation
     or gives axes, as ITK has it whatever the letters are.
     """
-    spacing: tuple[float, ...] = (1.0,) * 3
-    for key in ("elementspacing", "elementsize"):
-        if key in fields:
-            spacing = (*fields.floats(key, fields[key], min(n, 3)), 1.0)[:3]
-            break
+    spacing = _first(fields, ("elementspacing", "elementsize"), n, 1.0)
+    origin = _first(fields, ("offset", "position", "origin"), n, 0.0)
     rows = np.eye(3)  # directions of the axes, one after the other
     space = "LPS" if fields.get("anatomicalorientation", "?").strip("? ") else None
-    for key in ("transformmatrix", "rotation", "orientation"):
-        if key in fields:
-            edge = 3 if n == 4 and len(fields[key].split()) == 9 else n  # a matrix of space alone
-            matrix = np.reshape(fields.floats(key, fields[key], edge * edge), (edge, edge))
-            rows[: min(n, 3), : min(n, 3)] = matrix[:3, :3]
-            if fields.get("anatomicalorientation", "LPS").strip("? "):
-                space = "LPS"
-            break
-    origin: tuple[float, ...] = (0.0,) * 3
-    for key in ("offset", "position", "origin"):
-        if key in fields:
-            origin = (*fields.floats(key, fields[key], min(n, 3)), 0.0)[:3]
-            break
-    lengths, direction = unit_rows((rows * np.where(np.array(spacing) < 0, -1.0, 1.0)[:, None]).tolist())
+    key = next((key for key in ("transformmatrix", "rotation", "orientation") if key in fields), None)
+    if key is not None:
+        edge = 3 if n == 4 and len(fields[key].split()) == 9 else n  # a matrix of space alone
+        matrix = np.reshape(fields.floats(key, fields[key], edge * edge), (edge, edge))
+        rows[: min(n, 3), : min(n, 3)] = matrix[:3, :3]
+        if fields.get("anatomicalorientation", "LPS").strip("? "):
+            space = "LPS"
     _, unit = one_unit([fields.get("distanceunits", "").strip("? ")], fields.name, options.spacing is not None)
     factor = 1.0
     if space is not None:
         factor, unit = (metres(unit) or MILLIMETRE) / MILLIMETRE, ""
-    edges = options.spacing_or(tuple(factor * s * length for s, length in zip(spacing, lengths, strict=True)))
-    first = tuple(factor * o for o in origin)
+    lengths, direction = unit_rows(rows * np.where(spacing < 0, -1.0, 1.0)[:, None])
+    edges, first = options.spacing_or(tuple(factor * spacing * lengths)), tuple((factor * origin).tolist())
     return {"spacing": edges, "direction": direction, "origin": first, "space": space, "unit": unit}
 
 
@@ -126,7 +107,7 @@ def read_metaimage(path: Path, options: ReadOptions) -> Volume:
     source, start = (path, offset) if named.upper() == "LOCAL" else (path, 0)
     if named.upper() != "LOCAL":
         if named.upper().startswith("LIST") or "%" in named:
-            raise DataError(f"{path}: its data lie in several files; expected one (write it anew as .mha)")
+            raise DataError(f"{path}: its data lie in several files; expected one (write it again as .mha)")
         source = data_file(path, named)
     shape = (*reversed(sizes), channels)
     block = _load(fields, source, dtype, shape, start)

@@ -12,11 +12,12 @@ from pathlib import Path
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.headers import unit_rows
+from vvgt_cli.volume.blocks import read_head
 from vvgt_cli.volume.medical import MGH_HEADER, MGH_TYPES, is_mgh
-from vvgt_cli.volume.medical.frames import Frames, load_frames, read_head
+from vvgt_cli.volume.medical.frames import Frames, load_frames
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
+from vvgt_cli.volume.space import placed
 from vvgt_cli.volume.types import FLAT, Volume
 
 DATA = 284  # where values begin
@@ -31,7 +32,7 @@ def read_mgh(path: Path, options: ReadOptions) -> Volume:
         DataError: a header that is damaged or does not fit the data.
         UsageError: several frames (`SeveralSteps`) and none chosen.
     """
-    head, zipped = read_head(path, MGH_HEADER)
+    head, encoding = read_head(path, MGH_HEADER)
     if not is_mgh(head):
         raise DataError(f"{path}: no header of an MGH file (version 1, sizes above 0, a type that is known)")
     _, *sizes, kind = struct.unpack_from(">6i", head)
@@ -41,8 +42,7 @@ def read_mgh(path: Path, options: ReadOptions) -> Volume:
         rows = np.reshape(numbers[3:12], (3, 3))  # where x, y and z run
         if abs(np.linalg.det(rows)) > FLAT:
             axes, centre = rows * np.reshape(numbers[:3], (3, 1)), np.array(numbers[12:])
-    spacing, direction = unit_rows(axes.tolist())
     origin = centre - np.array(sizes[:3]) / 2 @ axes
-    frames = Frames(path, np.dtype(">" + MGH_TYPES[kind]), tuple(sizes), DATA, zipped)
+    frames = Frames(path, np.dtype(">" + MGH_TYPES[kind]), tuple(sizes), DATA, encoding)
     field, _ = load_frames(frames, options, str(path))
-    return Volume(field, options.spacing_or(spacing), tuple(origin.tolist()), direction, volume_name(path), space="RAS")
+    return placed(field, axes, origin, options, volume_name(path), space="RAS")

@@ -5,7 +5,6 @@ The values of a slice run from image-min to image-max. Format: https://en.wikibo
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -16,14 +15,15 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.arrays import MAGIC
-from vvgt_cli.volume.arrays.hdf5 import checked_dataset
+from vvgt_cli.volume.arrays.conventions import text_of
+from vvgt_cli.volume.arrays.hdf5 import checked_dataset, read_part
 from vvgt_cli.volume.arrays.netcdf3 import check_header
-from vvgt_cli.volume.blocks import IN_BLOCKS, check_memory
-from vvgt_cli.volume.headers import unit_rows
+from vvgt_cli.volume.blocks import check_memory
 from vvgt_cli.volume.libraries import library_errors, need
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
-from vvgt_cli.volume.stored import Slices, Stored, give_back
+from vvgt_cli.volume.space import placed
+from vvgt_cli.volume.stored import Slices, give_back, stored_or_held
 from vvgt_cli.volume.types import Volume
 
 IMAGE, DIMENSIONS = "minc-2.0/image/0/", "minc-2.0/dimensions/"
@@ -33,14 +33,15 @@ AXES = ("xspace", "yspace", "zspace")
 
 @dataclass(frozen=True)
 class _Image:
-    """What a file says.
+    """The image of a file.
 
     Attributes:
-        names: of the image's axes, slowest first.
-        shape, dtype: of the stored values.
-        read: the stored values of an index of all axes.
+        names: of its axes, slowest first.
+        shape: of the stored values.
+        dtype: of the stored values.
+        read: reads the stored values at an index of all axes.
         attributes: of the image.
-        ends: image-min and image-max, along the first axes of the image; None where values are as they are stored.
+        ends: image-min and image-max, along the first axes of the image; None where values are not scaled.
         axes: attributes of each axis.
     """
 
@@ -80,16 +81,16 @@ def _minc1(path: Path) -> _Image:
     if min(values.shape, default=0) > 0 and dtype.kind in "iu":
         values = values.view(dtype.newbyteorder(">"))
     ends = [variables[name] for name in ("image-min", "image-max") if name in variables]
-    told = [(v.dims, v.mapped(path).reshape(v.shape)) for v in ends]
+    limits = [(v.dims, v.mapped(path).reshape(v.shape)) for v in ends]
     axes = {name: variables[name].attributes for name in image.dims if name in variables}
     return _Image(
         image.dims, image.shape, dtype, partial(_mapped_part, values), image.attributes,
-        _ends(told, image.dims, image.shape, path), axes,
+        _ends(limits, image.dims, image.shape, path), axes,
     )  # fmt: skip
 
 
 def _mapped_part(values: np.ndarray, index: tuple[Any, ...]) -> np.ndarray:
-    """A copy of a part of a map, whose pages are given back."""
+    """Copy a part of a map, and give its pages back."""
     part = np.array(values[index])
     give_back(values)
     return part
@@ -100,50 +101,38 @@ def _minc2(path: Path) -> _Image:
     with h5py.File(path, "r") as file:
         data = checked_dataset(h5py, file, path, IMAGE + "image")
         names = _order(data)
-        told = []
+        limits = []
         for name in ("image-min", "image-max"):
             if IMAGE + name in file:
                 one = checked_dataset(h5py, file, path, IMAGE + name)
                 check_memory(one.size * one.dtype.itemsize, path.name)
-                told.append((_order(one), np.asarray(one[()])))
+                limits.append((_order(one), np.asarray(one[()])))
         axes = {name: dict(file[DIMENSIONS + name].attrs) for name in names if DIMENSIONS + name in file}
         return _Image(
-            names, data.shape, data.dtype, partial(_part, path), dict(data.attrs),
-            _ends(told, names, data.shape, path), axes,
+            names, data.shape, data.dtype, partial(read_part, path, IMAGE + "image"), dict(data.attrs),
+            _ends(limits, names, data.shape, path), axes,
         )  # fmt: skip
 
 
-def _part(path: Path, index: tuple[Any, ...]) -> np.ndarray:
-    """Stored values of a file that is open no longer than that."""
-    import h5py
-
-    with h5py.File(path, "r") as file:
-        return np.asarray(file[IMAGE + "image"][index])
-
-
 def _order(dataset: Any) -> tuple[str, ...]:
-    """Names of a dataset's axes; its attribute may name more of them."""
-    names = _text(dataset.attrs.get("dimorder", ""))
+    """Return the names of a dataset's axes; its attribute may name more of them."""
+    names = text_of(dataset.attrs.get("dimorder", ""))
     return tuple(names.split(",")[: len(dataset.shape)]) if names else ()
 
 
-def _text(value: Any) -> str:
-    return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
-
-
 def _ends(
-    told: list[tuple[tuple[str, ...], np.ndarray]], names: tuple[str, ...], shape: tuple[int, ...], path: Path
+    limits: list[tuple[tuple[str, ...], np.ndarray]], names: tuple[str, ...], shape: tuple[int, ...], path: Path
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """image-min and image-max in float64."""
-    if not told:
+    """Return image-min and image-max in float64."""
+    if not limits:
         return None
-    n = len(told[0][0])
-    if len(told) != 2 or any(dims != names[:n] or values.shape != shape[:n] for dims, values in told):
-        dims = " and ".join(", ".join(dims) or "none" for dims, _ in told)
+    n = len(limits[0][0])
+    if len(limits) != 2 or any(dims != names[:n] or values.shape != shape[:n] for dims, values in limits):
+        dims = " and ".join(", ".join(dims) or "none" for dims, _ in limits)
         raise DataError(
             f"{path}: image-min and image-max along axes {dims}; expected both along the first of the image"
         )
-    low, high = (np.asarray(values, np.float64) for _, values in told)
+    low, high = (np.asarray(values, np.float64) for _, values in limits)
     return low, high
 
 
@@ -159,16 +148,13 @@ def _volume(image: _Image, path: Path, options: ReadOptions) -> Volume:
     if options.component not in (None, 0):
         raise UsageError(f"{path}: a scalar volume; leave out --component {options.component}")
     lead = (step,) if len(shape) == 4 else ()
-    lazy: Any = Stored(_scaled(image, lead, path), np.dtype(np.float32), shape[-3:], (1, *shape[-2:]), str(path))
-    if not options.stored:
-        check_memory(4 * math.prod(shape[-3:]), path.name, IN_BLOCKS)
-        lazy = lazy[:]
-    spacing, direction, origin = _place(image.axes, spatial, path)
-    return Volume(lazy, options.spacing_or(spacing), origin, direction, volume_name(path), space="RAS")
+    read, chunk = _scaled(image, lead, path), (1, *shape[-2:])
+    field = stored_or_held(read, np.dtype(np.float32), shape[-3:], chunk, str(path), options.stored)
+    return placed(field, *_place(image.axes, spatial, path), options, volume_name(path), space="RAS")
 
 
 def _scaled(image: _Image, lead: tuple[int, ...], path: Path) -> Callable[[Slices], np.ndarray]:
-    """Reads the values of a box, scaled."""
+    """Make a function that reads the values of a box, scaled."""
     low, high = _valid(image, path)
 
     def part(slices: Slices) -> np.ndarray:
@@ -189,19 +175,19 @@ def _scaled(image: _Image, lead: tuple[int, ...], path: Path) -> Callable[[Slice
 
 
 def _along(end: np.ndarray, index: tuple[Any, ...]) -> np.ndarray:
-    """image-min or image-max of a part of the image, with the axes of the part."""
+    """Return image-min or image-max of a part of the image, with the axes of the part."""
     found = end[index[: end.ndim]]
     rest = sum(isinstance(i, slice) for i in index[end.ndim :])
     return np.reshape(found, (*np.shape(found), *[1] * rest))
 
 
 def _valid(image: _Image, path: Path) -> tuple[float, float]:
-    """Stored values that stand for image-min and image-max."""
+    """Return the stored values that stand for image-min and image-max."""
     if image.dtype.kind == "f":
         return 0.0, 1.0
-    told, info = image.attributes, np.iinfo(image.dtype)
-    found = np.ravel(told["valid_range"]) if "valid_range" in told else [
-        _number(told, key, end) for key, end in (("valid_min", info.min), ("valid_max", info.max))
+    stated, info = image.attributes, np.iinfo(image.dtype)
+    found = np.ravel(stated["valid_range"]) if "valid_range" in stated else [
+        _number(stated, key, end) for key, end in (("valid_min", info.min), ("valid_max", info.max))
     ]  # fmt: skip
     low, high = (float(v) for v in found)
     if not info.min <= low < high <= info.max:
@@ -213,17 +199,17 @@ def _number(attributes: dict[str, Any], key: str, default: float) -> float:
     return float(np.ravel(attributes[key])[0]) if key in attributes else default
 
 
-def _place(axes: dict[str, dict[str, Any]], names: tuple[str, ...], path: Path) -> tuple[Any, Any, Any]:
-    """Spacing, direction and origin by start, step and direction cosines of the axes."""
+def _place(axes: dict[str, dict[str, Any]], names: tuple[str, ...], path: Path) -> tuple[list[list[float]], np.ndarray]:
+    """Return the vectors of a step along x, y and z, one a row, and the first position: steps, starts and cosines."""
     rows, origin = [], np.zeros(3)
     for name in names[::-1]:  # fastest first
-        told = axes.get(name, {})
-        if _text(told.get("spacing", "")).strip("_") == "irregular":
+        stated = axes.get(name, {})
+        if text_of(stated.get("spacing", "")).strip("_") == "irregular":
             raise DataError(f"{path}: axis {name} has irregular steps; expected regular ones: try mincresample")
         unit = np.eye(3)[AXES.index(name)]
-        cosines = np.asarray(told["direction_cosines"], np.float64).reshape(3) if "direction_cosines" in told else unit
-        rows.append((cosines * _number(told, "step", 1.0)).tolist())
-        origin += cosines * _number(told, "start", 0.0)
+        cosines = np.asarray(stated.get("direction_cosines", unit), np.float64).reshape(3)
+        rows.append((cosines * _number(stated, "step", 1.0)).tolist())
+        origin += cosines * _number(stated, "start", 0.0)
     if not np.isfinite(rows).all() or not np.isfinite(origin).all():
         raise DataError(f"{path}: its steps or starts are not finite; check that the file is whole")
-    return *unit_rows(rows), tuple(origin.tolist())
+    return rows, origin

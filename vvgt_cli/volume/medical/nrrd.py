@@ -1,7 +1,8 @@
 """NRRD, attached (``.nrrd``) and detached (``.nhdr``, with one data file or several).
 
-Encodings: raw (memory-mapped where it is one file), gzip, bzip2 and text. Along an axis of
-kind ``time``, and of kind ``list`` in sequences of 3D Slicer (``.seq.nrrd``), time runs.
+Encodings: raw (memory-mapped where it is one file), gzip, bzip2 and text. Several data files are named by
+``data file: LIST [n]`` or ``data file: FORMAT MIN MAX STEP [n]``. Time runs along an axis of kind ``time``, and of kind
+``list`` in sequences of 3D Slicer (``.seq.nrrd``).
 
 Format: https://teem.sourceforge.net/nrrd/format.html
 """
@@ -9,52 +10,35 @@ Format: https://teem.sourceforge.net/nrrd/format.html
 from __future__ import annotations
 
 import math
+import os
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.volume.blocks import data_file, load_block
+from vvgt_cli.files import atomic_write
+from vvgt_cli.volume.blocks import Packed, check_memory, count, data_file, load_block
 from vvgt_cli.volume.components import select_component
-from vvgt_cli.volume.headers import MARK, MAX_HEADER, Fields, unit_rows
-from vvgt_cli.volume.medical.nrrd_files import data_names, load_files
+from vvgt_cli.volume.headers import MARK, MAX_HEADER, Fields
 from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.packed import Packed, packed
 from vvgt_cli.volume.readers import volume_name
-from vvgt_cli.volume.space import MILLIMETRE, metres, one_unit
+from vvgt_cli.volume.space import MILLIMETRE, metres, one_unit, placed, unit_rows
 from vvgt_cli.volume.types import Volume
 
-_TYPES = {
-    "i1": "signed char, int8, int8_t",
-    "u1": "uchar, unsigned char, uint8, uint8_t",
-    "i2": "short, short int, signed short, signed short int, int16, int16_t",
-    "u2": "ushort, unsigned short, unsigned short int, uint16, uint16_t",
-    "i4": "int, signed int, int32, int32_t",
-    "u4": "uint, unsigned int, uint32, uint32_t",
-    "i8": "longlong, long long, long long int, signed long long, signed long long int, int64, int64_t",
-    "u8": "ulonglong, unsigned long long, unsigned long long int, uint64, uint64_t",
-    "f4": "float",
-    "f8": "double",
-}
-_DTYPE = {name: code for code, names in _TYPES.items() for name in names.split(", ")}
 _ENCODINGS = {
-    "raw": "raw",
-    "gzip": "gzip",
-    "gz": "gzip",
-    "bzip2": "bzip2",
-    "bz2": "bzip2",
-    "text": "text",
-    "txt": "text",
+    "raw": "raw", "gzip": "gzip", "gz": "gzip", "bzip2": "bzip2", "bz2": "bzip2", "text": "text", "txt": "text",
     "ascii": "text",
-}
+}  # fmt: skip
 _SPATIAL_KINDS = {"domain", "space", "???", "none"}
+MOST_FILES = 100_000
 _SEQUENCE = re.compile(r"\.seq\.n(rrd|hdr)$", re.I)  # how 3D Slicer names them
 
 
 def read_header(path: Path) -> tuple[Fields, int]:
-    """The fields of a NRRD header, and the position behind its blank line (the file's end if detached).
+    """Read the fields of a NRRD header, and the position behind its blank line (the file's end if detached).
 
     Raises:
         DataError: not a NRRD file, or a header without an end.
@@ -77,10 +61,7 @@ def read_header(path: Path) -> tuple[Fields, int]:
 
 
 def _dtype(fields: Fields, encoding: str) -> np.dtype:
-    name = " ".join(fields.need("type").lower().split())
-    if name not in _DTYPE:
-        raise DataError(f"{fields.name}: values of type {name!r}; expected one of int8 ... uint64, float, double")
-    dtype = np.dtype(_DTYPE[name])
+    dtype = fields.dtype("type", fields.need("type"))
     if dtype.itemsize > 1 and encoding != "text":
         endian = fields.need("endian").lower()
         if endian not in ("little", "big"):
@@ -116,7 +97,7 @@ def _vector(fields: Fields, key: str, text: str) -> list[float]:
 
 
 def _component_axis(fields: Fields, sizes: list[int], vectors: list[list[float] | None] | None) -> int | None:
-    """Index (fastest first) of the axis that holds components, or None.
+    """Find the axis (fastest first) that holds components; None without one.
 
     Raises:
         DataError: more axes than three in space and one of components.
@@ -136,17 +117,17 @@ def _component_axis(fields: Fields, sizes: list[int], vectors: list[list[float] 
 
 
 def _time_axis(path: Path, fields: Fields, axis: int | None) -> bool:
-    """Whether the axis beyond space is one of time."""
+    """Tell whether the axis beyond space is one of time."""
     kinds = fields.get("kinds", "").lower().split()
     kind = kinds[axis] if axis is not None and axis < len(kinds) else ""
     return kind == "time" or (kind == "list" and _SEQUENCE.search(path.name) is not None)
 
 
 def _step(block: np.ndarray, options: ReadOptions, source: str) -> int | str | None:
-    """What is chosen of time steps along a block's last axis: by ``time``, or by ``component``.
+    """Choose along a block's last axis, which is one of time: by ``time``, or by ``component``.
 
     Raises:
-        UsageError: none is (`SeveralSteps`), both are, or one that does not exist.
+        UsageError: neither is given (`SeveralSteps`), both are, or a step that does not exist.
     """
     if options.component is not None:
         if options.time is not None:
@@ -159,7 +140,7 @@ def _step(block: np.ndarray, options: ReadOptions, source: str) -> int | str | N
 def _place(
     fields: Fields, vectors: list[list[float] | None] | None, axis: int | None, sizes: list[int], options: ReadOptions
 ) -> dict[str, Any]:
-    """Return spacing, direction, origin, space and unit, as keywords of `Volume`.
+    """Return the arguments ``steps``, ``origin``, ``space`` and ``unit`` of `placed`.
 
     Coordinates of left-handed spaces (left-anterior-superior, 3D-left-handed) are made right-handed ones.
 
@@ -185,16 +166,13 @@ def _place(
         factors *= signs
     if space is not None:  # in mm
         factors, unit = factors * (metres(unit) or MILLIMETRE) / MILLIMETRE, ""
-    lengths, direction = unit_rows((axes * factors).tolist())
-    spacing, first = options.spacing_or(lengths), tuple((origin * factors + 0.0).tolist())
-    return {"spacing": spacing, "direction": direction, "origin": first, "space": space, "unit": unit}
+    return {"steps": axes * factors, "origin": origin * factors + 0.0, "space": space, "unit": unit}
 
 
 def _along_axes(fields: Fields, axis: int | None, sizes: list[int]) -> tuple[np.ndarray, np.ndarray]:
     """Return step and first position (3,) along each axis, by ``spacings``, ``axis mins`` and ``axis maxs``.
 
-    As teem has it: where values are cells, as they are unless ``centers`` says ``node``, they begin half a step behind
-    the minimum.
+    Where values are cells, as in teem unless ``centers`` says ``node``, they begin half a step behind the minimum.
     """
 
     def numbers(key: str) -> list[float]:
@@ -223,7 +201,7 @@ def _words(fields: Fields, key: str) -> list[str]:
 
 
 def _third(axes: list[list[float]]) -> np.ndarray:
-    """A unit vector at right angles to the first two axes, for a volume of two."""
+    """Return a unit vector at right angles to the two axes of a flat volume."""
     unit = np.reshape(unit_rows([*axes, [0.0, 0.0, 1.0]])[1], (3, 3)).T
     normal = np.cross(unit[0], unit[1])
     length = np.linalg.norm(normal)
@@ -232,7 +210,7 @@ def _third(axes: list[list[float]]) -> np.ndarray:
 
 
 def _space(fields: Fields) -> tuple[np.ndarray, str | None]:
-    """Signs that make the file's coordinates right-handed, and the anatomical space that they then are in."""
+    """Return signs that make the file's coordinates right-handed, and the anatomical space that they then are in."""
     name = fields.get("space", "").lower().removesuffix("-time")
     letters = "".join(word[:1] for word in name.split("-")) if name.count("-") == 2 else name
     if letters in ("ras", "lps"):
@@ -270,35 +248,33 @@ def read_nrrd(path: Path, options: ReadOptions) -> Volume:
     if skip < -1 or (skip == -1 and encoding != "raw"):
         raise DataError(f"{path}: byte skip {skip} with encoding {encoding}; expected 0 or more (-1 with raw only)")
 
-    slabs = options.packed and encoding in ("gzip", "bzip2") and len(sizes) == 3 and options.component is None
-    slabs = slabs and _component_axis(fields, sizes, _vectors(fields, len(sizes))) is None
-
-    def load(source: Path, start: int, shape: tuple[int, ...]) -> np.ndarray:
-        if skip == -1:
-            return load_block(source, dtype, shape, offset=-1)
-        start = _line_skip(source, start, fields.integer("lineskip", 0))
-        if slabs and shape == tuple(reversed(sizes)):
-            return packed(source, dtype, shape, encoding, offset=start, skip=skip)
-        return load_block(source, dtype, shape, offset=start, encoding=encoding, skip=skip)
-
     shape = tuple(reversed(sizes))
+    packed = options.packed and len(sizes) == 3 and options.component is None
+    packed = packed and _component_axis(fields, sizes, _vectors(fields, len(sizes))) is None
+
+    def load(source: Path, start: int, part: tuple[int, ...]) -> np.ndarray:
+        if skip == -1:
+            return load_block(source, dtype, part, offset=-1)
+        start, whole = _line_skip(source, start, fields.integer("lineskip", 0)), packed and part == shape
+        return load_block(source, dtype, part, offset=start, encoding=encoding, skip=skip, packed=whole)
+
     named = fields.get("datafile")
-    several = data_names(path, named, len(sizes)) if named is not None else None
+    several = _data_names(path, named, len(sizes)) if named is not None else None
     if named is None:
         block = load(path, offset, shape)
     elif several is None:
         block = load(data_file(path, named), 0, shape)
     else:
-        block = load_files(path, *several, shape, dtype, lambda name, part: load(data_file(path, name), 0, part))
+        block = _load_files(path, *several, shape, dtype, lambda name, part: load(data_file(path, name), 0, part))
     return _volume(path, fields, block, sizes, options)
 
 
 def _volume(path: Path, fields: Fields, block: np.ndarray, sizes: list[int], options: ReadOptions) -> Volume:
     vectors = _vectors(fields, len(sizes))
     axis = _component_axis(fields, sizes, vectors)
-    place = _place(fields, vectors, axis, sizes, options) | {"name": volume_name(path)}
+    place = _place(fields, vectors, axis, sizes, options) | {"options": options, "name": volume_name(path)}
     if isinstance(block, Packed):
-        return Volume(block, **place)
+        return placed(block, **place)
     block = block[..., None] if axis is None else np.moveaxis(block, len(sizes) - 1 - axis, -1)
     if block.ndim == 3:
         block = block[None]
@@ -312,4 +288,106 @@ def _volume(path: Path, fields: Fields, block: np.ndarray, sizes: list[int], opt
             f"{path}: no axis of time (of kind time, or list in a .seq.nrrd); leave out --time {options.time}"
         )
     field, _ = select_component(block, component, str(path), label=label, color=color)
-    return Volume(field, **place)
+    return placed(field, **place)
+
+
+def _data_names(path: Path, named: str, n: int) -> tuple[list[str], int] | None:
+    """Return file names and how many axes each file holds; None where ``named`` is one file's name.
+
+    Args:
+        path: the header, whose lines behind ``LIST`` are names.
+        named: value of the field.
+        n: axes of the array.
+
+    Raises:
+        DataError: a list without names, a pattern that is none, or axes that do not fit.
+    """
+    words = named.split()
+    if words and words[0] == "LIST":
+        lines = path.read_bytes()[:MAX_HEADER].decode("utf-8", "replace").splitlines()
+        start = next(k for k, line in enumerate(lines) if re.match(r"data ?file:\s*LIST", line, re.IGNORECASE))
+        names, rest = [line.strip() for line in lines[start + 1 :] if line.strip()], words[1:]
+    elif re.search(r"%0?\d*d", named) and len(words) >= 4:
+        try:
+            lo, hi, step = (int(w) for w in words[1:4])
+            number = re.fullmatch(r"([^%]*)%(0?)(\d*)d([^%]*)", words[0])
+            if number is None or step == 0 or not 0 <= (hi - lo) // step < MOST_FILES:
+                raise ValueError
+        except ValueError:
+            raise DataError(
+                f"{path}: data file {named!r}; expected NAME%03d MIN MAX STEP, as slice%03d.raw 1 99 1"
+            ) from None
+        before, zero, width, after = number.groups()
+        form = f"{{:{zero}{width}d}}" if len(width) < 3 else "{:d}"
+        names = [before + form.format(k) + after for k in range(lo, hi + (1 if step > 0 else -1), step)]
+        rest = words[4:]
+    else:
+        return None
+    axes = int(rest[0]) if rest and rest[0].isdecimal() else n - 1
+    if not names or len(names) > MOST_FILES or not 1 <= axes <= n:
+        raise DataError(f"{path}: data file {named!r} with {len(names)} names of {axes} axes each; expected slices")
+    return names, axes
+
+
+def _load_files(
+    path: Path,
+    names: list[str],
+    axes: int,
+    shape: tuple[int, ...],
+    dtype: np.dtype,
+    load: Callable[[str, tuple[int, ...]], np.ndarray],
+) -> np.ndarray:
+    """Load the blocks of several files, one behind the other along the slowest axes.
+
+    Args:
+        path: the header, for messages.
+        names: in the order of the array.
+        axes: that each file holds (the fastest ones; all: slabs of the slowest axis).
+        shape: of the whole, slowest first.
+        dtype: of the values.
+        load: name and shape to block.
+
+    Raises:
+        DataError: files and sizes that do not fit.
+    """
+    n = len(shape)
+    part = shape[n - axes :]
+    if axes == n and shape[0] % len(names) == 0:
+        part = (shape[0] // len(names), *shape[1:])
+    if count(part) * len(names) != count(shape):
+        raise DataError(
+            f"{path}: {len(names)} data files of {' x '.join(map(str, reversed(part)))} values; expected "
+            f"{' x '.join(map(str, reversed(shape)))} in all"
+        )
+    check_memory(count(shape) * dtype.itemsize, str(path))
+    out = np.empty((len(names), *part), dtype)
+    for k, name in enumerate(names):
+        out[k] = load(name, part)
+    return out.reshape(shape)
+
+
+def write_nrrd(path: str | os.PathLike[str], volume: Volume, overwrite: bool = False) -> int:
+    """Write the volume's data values as float32 into one attached raw file; return its size in bytes.
+
+    Raises:
+        UsageError, DataError: as `vvgt_cli.files.atomic_write`.
+    """
+    values = np.ascontiguousarray(volume.data, "<f4") * np.float32(volume.slope) + np.float32(volume.intercept)
+    vectors = " ".join(
+        f"({','.join(repr(v) if v else '0' for v in axis)})" for axis in volume.affine[:3, :3].T.tolist()
+    )
+    space = {"RAS": "right-anterior-superior", "LPS": "left-posterior-superior"}.get(volume.space or "")
+    header = [
+        "NRRD0004",
+        "type: float",
+        "dimension: 3",
+        f"space: {space}" if space else "space dimension: 3",
+        f"sizes: {' '.join(map(str, volume.dims))}",
+        f"space directions: {vectors}",
+        f"space origin: ({','.join(repr(float(o)) for o in volume.origin)})",
+        "endian: little",
+        "encoding: raw",
+    ]
+    with atomic_write(path, overwrite) as temporary:
+        temporary.write_bytes(("\n".join(header) + "\n\n").encode() + values.astype("<f4", copy=False).tobytes())
+    return Path(path).stat().st_size

@@ -11,10 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.volume.headers import printable, unit_rows
+from vvgt_cli.volume.headers import printable
 from vvgt_cli.volume.openvdb import MAGIC
 from vvgt_cli.volume.openvdb.codec import ACTIVE_MASK, BLOSC, ZIP
 from vvgt_cli.volume.openvdb.cursor import Cursor
+from vvgt_cli.volume.space import unit_rows
 from vvgt_cli.volume.types import FLAT
 
 VERSIONS = range(222, 225)

@@ -16,13 +16,13 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import check_memory, count, load_block
 from vvgt_cli.volume.components import ArrayInfo, choose_array, select_component
-from vvgt_cli.volume.headers import MAX_HEADER, Fields, unit_rows
+from vvgt_cli.volume.headers import MAX_HEADER, Fields, type_of
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
-from vvgt_cli.volume.space import one_unit
+from vvgt_cli.volume.space import one_unit, placed
 from vvgt_cli.volume.types import Volume
 
-_TYPES = {"byte": "u1", "short": "i2", "ushort": "u2", "int": "i4", "float": "f4", "double": "f8"}
+_TYPES = ("byte", "short", "ushort", "int", "float", "double")
 _STREAM = re.compile(  # place, type, components, name, number, encoding, length
     r'^[ \t]*(\w+)\s*\{\s*(\w+)\s*(?:\[(\d{1,6})\])?\s+"?([^\s"}]+)"?\s*\}\s*=?\s*@(\d+)'
     r"(?:\(\s*(\w+)\s*,\s*(\d*)\s*\))?",
@@ -57,7 +57,7 @@ def read_amira(path: Path, options: ReadOptions) -> Volume:
             f"{', '.join(f'{row[0]} ({row[1]})' for row in streams[:9]) or 'none'}; expected Lattice data of type "
             f"{', '.join(_TYPES)} on uniform coordinates (in Amira, Resample makes them)"
         )
-    infos = [ArrayInfo(row[3], "point", int(row[2] or 1), np.dtype(_TYPES[row[1]]).name) for row in own]
+    infos = [ArrayInfo(row[3], "point", int(row[2] or 1), str(type_of(row[1]))) for row in own]
     row = own[choose_array(infos, options.array, str(path))]
     shape = (*reversed(fields.sizes("define Lattice", fields.need("Lattice"))), int(row[2] or 1))
     if len(shape) != 4 or shape[3] < 1:
@@ -78,11 +78,10 @@ def _placed(field: np.ndarray, fields: Fields, text: str, path: Path, options: R
         warnings.warn(f"{path}: it has no BoundingBox; voxels are taken as 1 wide", stacklevel=2)
     if "TransformationMatrix" in fields:
         matrix = np.reshape(fields.floats("TransformationMatrix", fields["TransformationMatrix"], 16), (4, 4))
-    lengths, direction = unit_rows((step[:, None] * matrix[:3, :3]).tolist())
     stated = re.search(r'\bUnits\s*\{[^}]*?\bCoordinates\s+"([^"\n]*)"', text)
     _, unit = one_unit(["" if stated is None else stated[1]], str(path), options.spacing is not None)
-    origin = tuple((np.append(low, 1.0) @ matrix)[:3].tolist())
-    return Volume(field, options.spacing_or(lengths), origin, direction, volume_name(path), unit=unit)
+    origin = (np.append(low, 1.0) @ matrix)[:3]
+    return placed(field, step[:, None] * matrix[:3, :3], origin, options, volume_name(path), unit=unit)
 
 
 def _values(
@@ -90,7 +89,7 @@ def _values(
 ) -> np.ndarray:
     """Return the values (nz, ny, nx, c) of the data stream ``row``; the first one's mark is at byte ``start``."""
     binary, coding = b"BINARY" in form, row[5]
-    dtype = np.dtype(("<" if b"LITTLE" in form else ">") + _TYPES[row[1]])
+    dtype = np.dtype(type_of(row[1])).newbyteorder("<" if b"LITTLE" in form else ">")
     with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         for one in streams:
             if not binary:
@@ -101,7 +100,9 @@ def _values(
             start += mark.end()
             if one is row:
                 break
-            plain = count(shape[:3]) * int(one[2] or 1) * np.dtype(_TYPES.get(one[1], "V1")).itemsize
+            plain = (
+                count(shape[:3]) * int(one[2] or 1) * (np.dtype(type_of(one[1])).itemsize if one[1] in _TYPES else 1)
+            )
             start += int(one[6]) if one[6] else plain if binary else 0
     if coding == "HxByteRLE":
         size, packed = count(shape) * dtype.itemsize, int(row[6] or path.stat().st_size - start)
@@ -109,10 +110,10 @@ def _values(
         if size > 64 * packed:
             raise DataError(f"{path}: {packed} bytes of run lengths cannot hold {size}; is the file whole?")
         check_memory(size, str(path))
-        from vvgt_cli.volume.plain.run_lengths import decode_plane
+        from vvgt_cli.volume.plain.run_lengths import decode_runs
 
         out = np.zeros(size, np.uint8)
-        if decode_plane(runs, out) != size:
+        if decode_runs(runs, out) != size:
             raise DataError(f"{path}: its run lengths do not make {size} bytes; is the file whole?")
         return out.view(dtype).reshape(shape)
     if coding not in ("", "HxZip"):

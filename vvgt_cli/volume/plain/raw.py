@@ -8,25 +8,27 @@ from __future__ import annotations
 import re
 import sys
 import warnings
+from itertools import permutations
 from pathlib import Path
 from typing import IO
 
 import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.volume.blocks import check_memory, fill, load_block, size_text
+from vvgt_cli.volume.blocks import Packed, check_memory, fill, load_block, size_text
 from vvgt_cli.volume.components import select_component
 from vvgt_cli.volume.options import ReadOptions, parse_dtype
-from vvgt_cli.volume.packed import packed
-from vvgt_cli.volume.plain.order import guess_dims
 from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.types import Volume
 
 _NAME = re.compile(r"(?:^|_)(\d+)x(\d+)x(\d+)_(u?int(?:8|16|32|64)|float(?:16|32|64))\.raw(?:\.gz)?$", re.IGNORECASE)
+RUNS, LENGTH = 64, 512  # runs of neighbouring values that are sampled for the order of axes, and values in each
+LESS = 0.5  # ratio of neighbours' differences, in another order of axes to the given one, below which it is suggested
+LEAST = 4  # voxels along an axis below which the order cannot be told
 
 
 def parse_name(name: str) -> tuple[tuple[int, int, int], str] | None:
-    """(x, y, z) dims and dtype of an open-scivis name, or None."""
+    """Parse (x, y, z) dims and dtype of an open-scivis name; None for other names."""
     match = _NAME.search(name)
     if match is None:
         return None
@@ -34,7 +36,7 @@ def parse_name(name: str) -> tuple[tuple[int, int, int], str] | None:
 
 
 def layout(name: str, options: ReadOptions) -> tuple[tuple[int, int, int], np.dtype]:
-    """Dims (x, y, z) and dtype: the options', else the name's.
+    """Return dims (x, y, z) and dtype: the options', else the name's.
 
     Raises:
         UsageError: neither says.
@@ -60,6 +62,35 @@ def _mismatch(name: str, size: str, dims: tuple[int, int, int], dtype: np.dtype,
     )
 
 
+def guess_dims(data: np.ndarray) -> tuple[int, int, int] | None:
+    """Guess dimensions (x, y, z) in another order, in which neighbouring values differ by less than half as much.
+
+    Neighbouring rows and slices of a volume are alike; read in another order than they were written they are not.
+
+    Args:
+        data: (nz, ny, nx), contiguous; memory-mapped data are read in a few places only.
+
+    Returns:
+        The order in which neighbours differ least, or None where that given is no worse, or nothing can be told.
+    """
+    given = data.shape[::-1]
+    orders = sorted(set(permutations(given)), key=lambda order: order != given)  # the given one first: it wins ties
+    if len(orders) == 1 or min(given) < LEAST or not data.flags.c_contiguous:
+        return None
+    flat, reach = data.reshape(-1), LENGTH + max(x * y for x, y, _ in orders)
+    if reach >= flat.size:
+        return None
+    index = np.linspace(0, flat.size - reach, RUNS).astype(np.int64)[:, None] + np.arange(LENGTH)
+    lags = sorted({lag for x, y, _ in orders for lag in (x, x * y)})
+    with np.errstate(invalid="ignore", over="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # numpy's, of a mean of nothing but NaN
+        here = flat[index].astype(np.float64)
+        differs = {lag: float(np.nanmean(np.abs(flat[index + lag].astype(np.float64) - here))) for lag in lags}
+    unlike = [differs[x] + differs[x * y] for x, y, _ in orders]
+    best = int(np.argmin(unlike))
+    return orders[best] if np.isfinite(unlike).all() and unlike[best] < LESS * unlike[0] else None
+
+
 def _volume(data: np.ndarray, name: str, source: str, options: ReadOptions) -> Volume:
     field, _ = select_component(data[..., None], options.component, source)
     likelier = guess_dims(field)
@@ -73,7 +104,7 @@ def _volume(data: np.ndarray, name: str, source: str, options: ReadOptions) -> V
 
 
 def read_raw(path: Path, options: ReadOptions) -> Volume:
-    """Read a raw file; plain files are memory-mapped, ``.gz`` ones unpacked.
+    """Read a raw file; plain files are memory-mapped, ``.gz`` ones decompressed.
 
     Raises:
         UsageError: layout unknown.
@@ -81,16 +112,13 @@ def read_raw(path: Path, options: ReadOptions) -> Volume:
     """
     dims, dtype = layout(path.name, options)
     need = dims[0] * dims[1] * dims[2] * dtype.itemsize + options.header_bytes
-    if path.name.lower().endswith(".gz") and options.packed and options.component is None:
-        field = packed(path, dtype, dims[::-1], "gzip", skip=options.header_bytes)
-        return Volume(field, spacing=options.spacing_or((1.0, 1.0, 1.0)), name=volume_name(path))
-    if path.name.lower().endswith(".gz"):
-        data = load_block(path, dtype, dims[::-1], encoding="gzip", skip=options.header_bytes)
-        return _volume(data, volume_name(path), str(path), options)
-    size = path.stat().st_size
-    if size != need:
+    encoding, size = "gzip" if path.name.lower().endswith(".gz") else "raw", path.stat().st_size
+    if encoding == "raw" and size != need:
         raise _mismatch(str(path), f"the file has {size_text(size)}", dims, dtype, options.header_bytes)
-    data = load_block(path, dtype, dims[::-1], offset=options.header_bytes)
+    packed = options.packed and options.component is None
+    data = load_block(path, dtype, dims[::-1], encoding=encoding, skip=options.header_bytes, packed=packed)
+    if isinstance(data, Packed):
+        return Volume(data, spacing=options.spacing_or((1.0, 1.0, 1.0)), name=volume_name(path))
     return _volume(data, volume_name(path), str(path), options)
 
 

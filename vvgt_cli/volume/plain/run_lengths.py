@@ -1,4 +1,4 @@
-"""Run-length decoder of SLC planes (numba; imported only when a compressed SLC file is read)."""
+"""Run-length decoder of SLC planes and AmiraMesh (numba; imported only when such values are read)."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from vvgt_cli.jit.decorators import kernel
 
 
 @kernel("u1:1 u1:1")
-def decode_plane(packed: np.ndarray, out: np.ndarray) -> int:
-    """Decode one plane, never past either end.
+def decode_runs(packed: np.ndarray, out: np.ndarray) -> int:
+    """Decode run lengths, never past either end.
 
-    Each run is a byte: 7 bits of count (0 ends the plane), and the top bit set if that many literal bytes follow,
+    Each run is a byte: 7 bits of count (0 ends the runs), and the top bit set if that many literal bytes follow,
     else one byte follows that repeats.
 
     Args:

@@ -56,7 +56,7 @@ def _decode(path: Path, shape: tuple[int, int, int], start: int) -> np.ndarray:
     if nz * ny * nx > 64 * max(size - start, 0):
         raise DataError(f"{path}: {size} bytes cannot hold {nx} x {ny} x {nz} run-length coded voxels")
     check_memory(nz * ny * nx + size, str(path))
-    from vvgt_cli.volume.plain.run_lengths import decode_plane
+    from vvgt_cli.volume.plain.run_lengths import decode_runs
 
     packed = np.fromfile(path, np.uint8)
     out = np.zeros((nz, ny * nx), np.uint8)
@@ -66,7 +66,7 @@ def _decode(path: Path, shape: tuple[int, int, int], start: int) -> np.ndarray:
             raise DataError(f"{path}: plane {z} of {nz} has no size where one is expected; check that it is whole")
         begin = start + match.end()
         start = begin + int(match[1])
-        filled = decode_plane(packed[begin:start], out[z]) if start <= size else -1
+        filled = decode_runs(packed[begin:start], out[z]) if start <= size else -1
         # Some writers leave the last voxel of every plane out; it stays 0.
         if filled < ny * nx - 1:
             raise DataError(f"{path}: plane {z} of {nz} is damaged or cut short; expected {nx} x {ny} voxels")

@@ -14,8 +14,8 @@ import numpy as np
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.blocks import check_memory, count, size_text
 from vvgt_cli.volume.components import ArrayInfo, choose_array, select_component
-from vvgt_cli.volume.headers import unit_rows
 from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.space import unit_rows
 from vvgt_cli.volume.types import Volume
 from vvgt_cli.volume.vtk import LEGACY_GRIDS
 from vvgt_cli.volume.vtk.blocks import check_blocks

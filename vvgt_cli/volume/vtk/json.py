@@ -11,9 +11,10 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import data_file, load_block
 from vvgt_cli.volume.components import ArrayInfo, choose_array, select_component
-from vvgt_cli.volume.headers import MAX_HEADER, unit_rows
+from vvgt_cli.volume.headers import MAX_HEADER
 from vvgt_cli.volume.libraries import library_errors
 from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.space import unit_rows
 from vvgt_cli.volume.types import IDENTITY, Volume
 
 INDEX, MARK = "index.json", b'"vtkClass"'

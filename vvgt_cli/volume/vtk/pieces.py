@@ -16,10 +16,9 @@ import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.resources import free_memory
-from vvgt_cli.volume.blocks import check_memory, data_file
+from vvgt_cli.volume.blocks import SHARE, check_memory, data_file
 from vvgt_cli.volume.components import ArrayInfo, choose_array, select_component
 from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.packed import SHARE
 from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.stored import Slices, Stored, is_file_backed, put_block, read_block
 from vvgt_cli.volume.types import Volume, triple

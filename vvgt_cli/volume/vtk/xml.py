@@ -17,9 +17,9 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import check_memory, count, load_block, size_text
 from vvgt_cli.volume.components import ArrayInfo, choose_array, select_component
-from vvgt_cli.volume.headers import unit_rows
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
+from vvgt_cli.volume.space import unit_rows
 from vvgt_cli.volume.types import IDENTITY, Volume
 from vvgt_cli.volume.vtk.blocks import check_blocks
 from vvgt_cli.volume.vtk.messages import quiet_vtk

@@ -22,6 +22,15 @@ def text_of(value: Any) -> str:
     return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
 
 
+def coordinates_of(dataset: Any) -> tuple[np.ndarray, dict[str, str]]:
+    """Read a dataset of coordinates along an axis, float64, and the attributes that describe the axis."""
+    stated = {key: text_of(dataset.attrs[key]) for key in AXIS_ATTRIBUTES if key in dataset.attrs}
+    scale, offset = (
+        float(np.ravel(dataset.attrs.get(key, plain))[0]) for key, plain in (("scale_factor", 1), ("add_offset", 0))
+    )
+    return np.asarray(dataset[()], np.float64) * scale + offset, stated
+
+
 def conventional_axes(file: Any, dataset: Any, source: str) -> tuple[list[Axis], dict[str, Any]] | None:
     """Find the axes of a dataset without dimension scales.
 
@@ -34,7 +43,7 @@ def conventional_axes(file: Any, dataset: Any, source: str) -> tuple[list[Axis],
         Its axes, slowest first, and CF attributes for the scaling of its values; None where no convention is followed.
 
     Raises:
-        DataError: a geometry that is stated and not read.
+        DataError: a geometry that is stated and cannot be read.
     """
     group, sizes = dataset.parent, dataset.attrs.get("element_size_um", ())  # z, y, x
     if "openPMD" in file.attrs and ("axisLabels" in dataset.attrs or "axisLabels" in group.attrs):
@@ -100,8 +109,7 @@ def _nexus(group: Any, dataset: Any) -> list[Axis]:
         if beside is None or getattr(beside, "shape", None) != (size,) or beside.dtype.kind not in "iuf":
             axes.append(axis("" if name == "." else name, size))
             continue
-        stated = {key: text_of(beside.attrs[key]) for key in AXIS_ATTRIBUTES if key in beside.attrs}
-        axes.append(axis(name, size, np.asarray(beside[()], np.float64), stated))
+        axes.append(axis(name, size, *coordinates_of(beside)))
     return axes
 
 
