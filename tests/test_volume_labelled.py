@@ -313,7 +313,7 @@ def test_npz(tmp_path: Path, save) -> None:
     assert volume.name == "v:field"
     np.testing.assert_array_equal(volume.data, VALUES)
     save(path, field=VALUES, other=VALUES + 1)
-    with pytest.raises(UsageError, match="several arrays: field, other; choose one with --array"):
+    with pytest.raises(UsageError, match="several arrays: field; other; choose one with --array"):
         read_volume(str(path))
     np.testing.assert_array_equal(read_volume(str(path), ReadOptions(array="other")).data, VALUES + 1)
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, VvgtError
 from vvgt_cli.resources import free_memory
-from vvgt_cli.volume.stored import Stored
+from vvgt_cli.volume.stored import Stored, put_overlap
 
 AT_ONCE = 64 << 20  # bytes of chunks that are computed at once, and are kept at the least; one chunk in any case
 KEPT = 0.125  # of the free memory: computed chunks that are kept, as blocks need the voxels around them too
@@ -112,12 +112,8 @@ class Chunks:
 
     def _put(self, out: np.ndarray, spans: list[tuple[int, int]], number: Number, chunk: np.ndarray) -> None:
         """Copy the part of a chunk that lies in the box of ``spans``."""
-        there, here = [], []
-        for ends, k, (a, b) in zip(self._ends, number, spans, strict=True):
-            lo, hi = max(ends[k], a), min(ends[k + 1], b)
-            there.append(slice(lo - a, hi - a))
-            here.append(slice(lo - ends[k], hi - ends[k]))
-        out[tuple(there)] = chunk[tuple(here)]
+        at = [ends[k] for ends, k in zip(self._ends, number, strict=True)]
+        put_overlap(out, [a for a, _ in spans], chunk, at)
 
     def _keep(self, number: Number, chunk: np.ndarray) -> None:
         """Keep a chunk, and let go of those that were used longest ago."""

@@ -21,13 +21,15 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.errors import DataError, SeveralArrays, UsageError
+from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.arrays import MAX_CHUNK
 from vvgt_cli.volume.arrays.zarr import MAX_METADATA
+from vvgt_cli.volume.components import choose
 from vvgt_cli.volume.labelled import Axis, labelled_volume
 from vvgt_cli.volume.libraries import library_errors, need
-from vvgt_cli.volume.microscopy.image import EXTRA, LISTED
+from vvgt_cli.volume.microscopy.image import EXTRA
 from vvgt_cli.volume.options import ReadOptions
+from vvgt_cli.volume.stored import put_overlap
 from vvgt_cli.volume.types import Volume
 
 METADATA = "attributes.json"
@@ -62,15 +64,8 @@ class N5Array:
         out = np.zeros([b - a for a, b in spans], self.dtype.newbyteorder("="))
         grid = [range(a // c, -(-b // c)) for (a, b), c in zip(spans, self.blocks, strict=True)]
         for at in itertools.product(*grid):
-            block = self._block(at)
-            if block is None:
-                continue
-            into, of = [], []
-            for (a, b), k, c, n in zip(spans, at, self.blocks, block.shape, strict=True):
-                lo, hi = max(a, k * c), min(b, k * c + n)
-                into.append(slice(lo - a, max(hi - a, lo - a)))
-                of.append(slice(lo - k * c, max(hi - k * c, lo - k * c)))
-            out[tuple(into)] = block[tuple(of)]
+            if (block := self._block(at)) is not None:
+                put_overlap(out, [a for a, _ in spans], block, [k * c for k, c in zip(at, self.blocks, strict=True)])
         return out[tuple(0 if isinstance(k, int) else slice(None) for k in index)]
 
     def _block(self, at: Sequence[int]) -> np.ndarray | None:
@@ -213,22 +208,13 @@ def _choose(path: Path, options: ReadOptions) -> Path:
             raise UsageError(f"{path}: an array without levels; leave out --level {options.level}")
         return here
     fits = _arrays(here) if here.is_dir() else []
-    if len(fits) != 1:
-        names = [place.relative_to(path).as_posix() for place in fits]
-        listing = "; ".join(names[:LISTED]) + ("; ..." if len(names) > LISTED else "")
-        if options.array is not None and not fits:
-            known = [place.relative_to(path).as_posix() for place in _arrays(path)]
-            listing = "; ".join(known[:LISTED]) or "none"
-            raise UsageError(f"{path}: no array {options.array}; it has {listing}; choose one as {path}:/PATH")
-        if not fits:
-            raise DataError(f"{path}: no array of two axes or more; expected a volume")
-        raise SeveralArrays(
-            f"{path}: several arrays: {listing}; choose one as {path}:/PATH (or with --array)", "--array", names
-        )
-    levels = _levels(fits[0])
+    wanted, known = (None, fits) if fits else (options.array, _arrays(path))
+    names = [place.relative_to(path).as_posix() for place in known]
+    chosen = known[choose(names, names, wanted, str(path), how=f"choose one as {path}:/PATH (or with --array)")]
+    levels = _levels(chosen)
     if (options.level or 0) >= max(len(levels), 1):
         raise UsageError(f"{path}: --level {options.level}: expected full, or 0 to {max(len(levels), 1) - 1}")
-    return levels[options.level or 0] if levels else fits[0]
+    return levels[options.level or 0] if levels else chosen
 
 
 def _arrays(root: Path) -> list[Path]:

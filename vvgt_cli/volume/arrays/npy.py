@@ -14,8 +14,9 @@ from typing import IO
 
 import numpy as np
 
-from vvgt_cli.errors import DataError, SeveralArrays, UsageError
+from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import MAX_RATIO, check_memory, count, fill, load_block, size_text
+from vvgt_cli.volume.components import choose
 from vvgt_cli.volume.labelled import Axis, labelled_volume
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
@@ -85,11 +86,8 @@ def _choose(archive: zipfile.ZipFile, members: dict[str, zipfile.ZipInfo], wante
     if not members:
         raise DataError(f"{path}: a zip file without .npy arrays; expected a .npz file")
     if wanted is not None:
-        wanted = wanted.strip("/")
-        if wanted not in members:
-            listing = " ".join(", ".join(members).split())
-            raise UsageError(f"{path}: no array {wanted}; it has {listing}; choose one with --array NAME")
-        return wanted
+        names = list(members)
+        return names[choose(names, names, wanted.strip("/"), str(path))]
     shapes = {}
     for name, info in members.items():
         with archive.open(info) as stream:
@@ -99,10 +97,7 @@ def _choose(archive: zipfile.ZipFile, members: dict[str, zipfile.ZipInfo], wante
         except (DataError, ValueError):
             continue
     deep = [name for name, shape in shapes.items() if sum(n > 1 for n in shape) >= 3] or list(members)
-    if len(deep) > 1:
-        listing = " ".join(", ".join(deep).split())
-        raise SeveralArrays(f"{path}: several arrays: {listing}; choose one with --array NAME", "--array", deep)
-    return deep[0]
+    return deep[choose(deep, deep, None, str(path))]
 
 
 def _member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, path: Path) -> tuple[np.ndarray, tuple[int, ...], bool]:

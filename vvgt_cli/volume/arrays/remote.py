@@ -14,7 +14,8 @@ from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple, cast
 
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.volume.arrays.zarr import MAX_METADATA, holds_zarr, level_shapes_in, read_zarr
+from vvgt_cli.volume.arrays.zarr import MAX_METADATA, holds_zarr, read_zarr
+from vvgt_cli.volume.arrays.zarr import level_shapes as zarr_levels
 from vvgt_cli.volume.libraries import library_errors, need
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.types import Volume
@@ -171,23 +172,19 @@ def _opened(url: str, options: ReadOptions) -> tuple[Path, ReadOptions]:
     return place, replace(options, array=inner or options.array)
 
 
-def read_remote(url: str, options: ReadOptions) -> Volume:
-    """Read one array, chunk by chunk where the options leave it stored.
+def read_scheme(scheme: str, rest: str, options: ReadOptions) -> Volume:
+    """Read one array at the address ``scheme:rest``, chunk by chunk where the options leave it stored.
 
     Raises:
         DataError, UsageError: as `read_zarr`, or an address with nothing behind it.
     """
-    return read_zarr(*_opened(url, options))
+    return read_zarr(*_opened(f"{scheme}:{rest}", options))
 
 
 def level_shapes(url: str, options: ReadOptions) -> list[tuple[int, ...]]:
     """Shapes of the levels of an OME-Zarr image, finest first; none where there is no such image.
 
     Raises:
-        DataError, UsageError: as `read_remote`.
+        DataError, UsageError: as `read_scheme`.
     """
-    return level_shapes_in(*_opened(url, options))
-
-
-def read_scheme(scheme: str, rest: str, options: ReadOptions) -> Volume:
-    return read_remote(f"{scheme}:{rest}", options)
+    return zarr_levels(*_opened(url, options))

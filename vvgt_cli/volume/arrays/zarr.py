@@ -96,13 +96,8 @@ def _metadata(folder: Path) -> dict[str, Any]:
     return {}
 
 
-def level_shapes(source: str, options: ReadOptions) -> list[tuple[int, ...]]:
-    """Shapes of the levels of an OME-Zarr image, finest first; none where a source is no such image."""
-    return level_shapes_in(Path(source), options)
-
-
-def level_shapes_in(path: Path, options: ReadOptions) -> list[tuple[int, ...]]:
-    """`level_shapes` of a store."""
+def level_shapes(path: Path, options: ReadOptions) -> list[tuple[int, ...]]:
+    """List the shapes of the levels of an OME-Zarr image, finest first; none where a store is no such image."""
     here = path / (options.array or "").strip("/")
     if not here.is_dir() or not holds_zarr(here) or not here.resolve().is_relative_to(path.resolve()):
         return []

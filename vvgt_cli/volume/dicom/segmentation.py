@@ -15,13 +15,13 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, SeveralComponents, UsageError
 from vvgt_cli.volume.blocks import check_memory
+from vvgt_cli.volume.components import listed
 from vvgt_cli.volume.libraries import library_errors, need
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.types import Volume
 
 CLASSES = ("1.2.840.10008.5.1.4.1.1.66.4", "1.2.840.10008.5.1.4.1.1.66.7")  # Segmentation, Label Map Segmentation
 EXTRA, WHAT = "dicom-seg", "a DICOM segmentation"
-LISTED = 12
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def is_segmentation_file(source: str) -> bool:
 def names_of(header: Any) -> str:
     """The segments of a header, for a message."""
     names = [str(segment.get("SegmentLabel", "?")) for segment in header.get("SegmentSequence", [])]
-    return f"{len(names)} segments ({', '.join(names[:LISTED])}{', ...' * (len(names) > LISTED)})"
+    return f"{len(names)} segments ({listed(names, ', ')})"
 
 
 def segments(source: str) -> list[Segment]:

@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError, SeveralArrays, UsageError
+from vvgt_cli.volume.components import listed
 from vvgt_cli.volume.dicom.files import Source
 from vvgt_cli.volume.dicom.segmentation import is_segmentation
 from vvgt_cli.volume.headers import printable
 
 _FEW = 2  # slices: fewer than make a stack, beside one that has more
-_LISTED = 12
 _SPACE = ("sagittal", "coronal", "axial")
 
 _PLACES = ("ImagePositionPatient", "PerFrameFunctionalGroupsSequence", "DetectorInformationSequence")
@@ -98,14 +98,14 @@ def _named(found: dict[str, Files], wanted: str) -> Files:
 def _listed(found: dict[str, Files]) -> str:
     """Series for an error: number, description, modality, slices, UID."""
     parts = []
-    for uid, files in list(found.items())[:_LISTED]:
+    for uid, files in found.items():
         header = files[0][1]
         slices = sum(int(h.get("NumberOfFrames", 1) or 1) for _, h in files)
         parts.append(
             f"{header.get('SeriesNumber', '?')} {str(header.get('SeriesDescription', '')).strip()[:64]!r} "
             f"({header.get('Modality', '?')}, {slices} slice{'s' * (slices != 1)}, {uid})"
         )
-    return "; ".join(parts) + ("; ..." if len(found) > _LISTED else "")
+    return listed(parts)
 
 
 def _localiser(header: Any) -> bool:
@@ -141,7 +141,7 @@ def one_stack(
             home.append(s)
     name = title.removeprefix(":").rpartition("/")[0] if number is not None else title.removeprefix(":")
     name = name or str(slices[0].header.get("SeriesNumber") or slices[0].header.get("SeriesInstanceUID") or "?")
-    listing = "; ".join(f"{name}/{k}: {_of(stack)}" for k, stack in enumerate(stacks[:_LISTED], 1))
+    listing = listed([f"{name}/{k}: {_of(stack)}" for k, stack in enumerate(stacks, 1)])
     if number is not None:
         if not 1 <= number <= len(stacks):
             raise UsageError(f"{path}: no stack {name}/{number}; it has {listing}; choose with --series SERIES/STACK")

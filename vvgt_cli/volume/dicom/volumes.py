@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.volume.components import listed
 from vvgt_cli.volume.headers import printable
 from vvgt_cli.volume.options import ReadOptions
 
 FEW = 2  # slices: fewer than make a volume, beside one that has more
 NEAR = 0.01  # share of the largest distance of neighbouring slices within which two are in one place
-LISTED = 12
 ATTRIBUTES = {  # by which volumes of a series differ: unit, and where functional groups have it
     "EchoTime": ("ms", "MREchoSequence", "EffectiveEchoTime"),
     "TemporalPositionIdentifier": ("", "FrameContentSequence", "TemporalPositionIndex"),
@@ -67,7 +67,7 @@ def one_volume(slices: list[Any], options: ReadOptions, name: str, path: Path) -
         warnings.warn(f"{path}: skipped {rest} images in places of others", stacklevel=2)
         volumes = large
     names, n = list(volumes), len(volumes)
-    listing = ", ".join(names[:LISTED]) + (", ..." if n > LISTED else "")
+    listing = listed(names, ", ") if names != [""] else ""
     if name:
         if names.count(name) != 1:
             raise UsageError(f"{path}: no volume {name!r}; it has {listing or 'one'}; choose with --series SERIES/NAME")

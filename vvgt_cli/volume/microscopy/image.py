@@ -9,6 +9,7 @@ import re
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -17,16 +18,15 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, SeveralArrays, SeveralComponents, UsageError
 from vvgt_cli.volume.blocks import IN_BLOCKS, check_memory
-from vvgt_cli.volume.components import contiguous, magnitude
+from vvgt_cli.volume.components import contiguous, listed, magnitude
 from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.stored import Stored
+from vvgt_cli.volume.stored import Slices, stored_or_held
 from vvgt_cli.volume.types import Volume
 
 EXTRA = "microscopy"
 MAX_XML = 64 << 20
-LISTED = 12  # channels or images that an error lists
 Color = tuple[float, float, float] | None
-Box = tuple[slice, slice, slice]
+Box = Slices
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def picture_volume(picture: Picture, options: ReadOptions, source: str, name: st
         raise DataError(f"{source}: {picture.shape} values of type {picture.dtype}; expected integers or floats, z y x")
     channel = _channel(picture, options.component, source)
     time = options.step(picture.times, source)
-    box = (slice(0, picture.shape[0]), slice(0, picture.shape[1]), slice(0, picture.shape[2]))
+    box = tuple(slice(0, n) for n in picture.shape)
     size = math.prod(picture.shape)
     field: Any
     if channel is None:
@@ -80,25 +80,16 @@ def picture_volume(picture: Picture, options: ReadOptions, source: str, name: st
         check_memory((picture.dtype.itemsize * picture.channels + 4) * size, source, IN_BLOCKS)
         bands = [picture.read(time, c, box) for c in range(picture.channels)]
         field = magnitude(np.stack(bands, axis=-1))
-    elif options.stored and not picture.mapped:
-        number = channel
-        field = Stored(
-            lambda s: picture.read(time, number, _box(s)), picture.dtype, picture.shape, picture.chunks, source
-        )
+    elif not picture.mapped:
+        read = partial(picture.read, time, channel)
+        field = stored_or_held(read, picture.dtype, picture.shape, picture.chunks, source, options.stored)
     else:
-        if not picture.mapped:
-            check_memory(size * picture.dtype.itemsize, source, IN_BLOCKS)
         field = picture.read(time, channel, box)
         if not field.flags.c_contiguous:
             check_memory(size * picture.dtype.itemsize, source, IN_BLOCKS)
         field = contiguous(field)
     unit = "" if picture.spacing == (None, None, None) else "um"
     return Volume(field, _spacing(picture, options), picture.origin, name=name, unit=unit)
-
-
-def _box(slices: tuple[slice, ...]) -> Box:
-    z, y, x = slices
-    return z, y, x
 
 
 def _spacing(picture: Picture, options: ReadOptions) -> tuple[float, float, float]:
@@ -143,8 +134,7 @@ def choose_channel(
         return 0
     if isinstance(wanted, int) and wanted < n:
         return wanted
-    listing = ", ".join(f"{k} {name[:40]!r}" for k, name in enumerate(names[:LISTED]))
-    listing += ", ..." if len(names) > LISTED else ""
+    listing = listed([f"{k} {name[:40]!r}" for k, name in enumerate(names)], ", ") if names else ""
     what = f"{source}: {n} channel{'s' * (n > 1)}{f' ({listing})' if listing else ''} of type {dtype}"
     if n == 1:
         raise UsageError(f"{what}; leave out --channel {wanted}")
@@ -156,34 +146,22 @@ def choose_channel(
     )
 
 
-def only(deep: Sequence[bool], text: str, option: str, choices: Sequence[str], names: Sequence[str]) -> int:
-    """Index of the only image, else of the only one of several slices, which a note says.
-
-    Args:
-        deep: which ones have several slices.
-        text, option, choices, names: as of `SeveralArrays`, which is raised where there is no only one.
-    """
-    if len(deep) > 1 and sum(deep) != 1:
-        raise SeveralArrays(text, option, choices, names)
-    number = deep.index(True) if len(deep) > 1 else 0
-    if len(deep) > 1:
-        told = (
-            f"{text.partition(': ')[0]}: {names[number]!r} taken, of {len(deep)} images the only one of several slices"
-        )
-        warnings.warn(f"{told} ({option} chooses another)", stacklevel=3)
-    return number
-
-
 def choose_image(
-    names: Sequence[str], facts: Sequence[str], wanted: str | None, what: str, source: str, deep: Sequence[bool] = ()
-) -> int:
-    """Number of the image, scene or position asked for by number or name, or of the only one.
+    names: Sequence[str], facts: Sequence[str], wanted: str | None, what: str, source: str, deep: Sequence[bool] = (),
+    keys: Sequence[str] = (),
+) -> int:  # fmt: skip
+    """Return the index of the image, scene or position asked for by number or name, or of the only one.
+
+    The only one of several slices is taken where none is asked for, with a warning.
 
     Args:
         names: of all of them.
-        facts: what an error says of each.
-        what: they are called, in the plural.
+        facts: description of each, for messages.
+        wanted: number or name; None for the only one.
+        what: word for them, in the plural, for messages.
+        source: for messages.
         deep: which ones have several slices, where they differ.
+        keys: their numbers; from 0 on where they are not given.
 
     Raises:
         DataError: there are none.
@@ -191,17 +169,24 @@ def choose_image(
     """
     if not names:
         raise DataError(f"{source}: no {what}; expected at least one")
-    listing = "; ".join(
-        f"{k} {n[:60]!r} ({f})" for k, (n, f) in enumerate(zip(names, facts, strict=True)) if k < LISTED
-    )
-    listing += "; ..." if len(names) > LISTED else ""
-    if wanted is None:
+    keys = keys or [str(k) for k in range(len(names))]
+    listing = listed([f"{k} {n[:60]!r} ({f})" for k, n, f in zip(keys, names, facts, strict=True)])
+    if wanted is not None:
+        found = [k for k, name in enumerate(names) if wanted.strip("/") in (keys[k], name)]
+        if len(found) != 1:
+            raise UsageError(f"{source}: {len(found)} {what} {wanted!r}; it has {listing}; choose with --series NAME")
+        return found[0]
+    if len(names) == 1:
+        return 0
+    if sum(deep) != 1:
         text = f"{source}: {len(names)} {what}: {listing}; choose one by number or name with --series NAME"
-        return only(deep or [False] * len(names), text, "--series", [str(k) for k in range(len(names))], names)
-    found = [k for k, name in enumerate(names) if wanted.strip("/") in (str(k), name)]
-    if len(found) != 1:
-        raise UsageError(f"{source}: {len(found)} {what} {wanted!r}; it has {listing}; choose with --series NAME")
-    return found[0]
+        raise SeveralArrays(text, "--series", keys, names)
+    number = [*deep].index(True)
+    warnings.warn(
+        f"{source}: {names[number]!r} taken, of {len(names)} images the only one of several slices (--series chooses "
+        "another)", stacklevel=3,
+    )  # fmt: skip
+    return number
 
 
 def hex_color(text: Any) -> Color:

@@ -8,7 +8,8 @@ from __future__ import annotations
 import mmap
 from pathlib import Path
 
-from vvgt_cli.errors import DataError, SeveralArrays, UsageError
+from vvgt_cli.errors import DataError
+from vvgt_cli.volume.components import choose
 from vvgt_cli.volume.openvdb.archive import TYPES, Grid, read_grid_head, read_header
 from vvgt_cli.volume.openvdb.cursor import Cursor
 from vvgt_cli.volume.openvdb.layout import bounding_box, brick_array
@@ -25,23 +26,19 @@ def choose_grid(grids: list[Grid], wanted: str | None, source: str) -> Grid:
         UsageError: no such grid, or several and no choice.
         DataError: a grid that cannot be read.
     """
-    listing = "; ".join(map(str, grids))
+    how = "choose one with --grid NAME"
     if wanted is None:
-        scalar = [g for g in grids if g.readable and g.components == 1]
-        found = scalar or grids
-        if len(found) > 1:
-            text = f"{source}: several grids: {listing}; choose one with --grid NAME"
-            raise SeveralArrays(text, "--grid", [g.label for g in found])
+        found = [g for g in grids if g.readable and g.components == 1] or grids
+        names = [g.label for g in found]
     else:
-        found = [g for g in grids if g.label == wanted] or [g for g in grids if g.name == wanted]
-        if not found:
-            raise UsageError(f"{source}: no grid {wanted!r}; it has {listing}; choose one with --grid NAME")
-        if len(found) > 1:
-            raise UsageError(f"{source}: {len(found)} grids {wanted!r}; it has {listing}; name one with its number")
-    if not found[0].readable:
+        found, names = grids, [g.label for g in grids]
+        if wanted not in names:
+            names, how = [g.name for g in grids], how + " (name one with its number, NAME[0], where several share it)"
+    grid = found[choose(names, list(map(str, grids)), wanted, source, "grid", how, "--grid")]
+    if not grid.readable:
         kinds = ", ".join(TYPES)
-        raise DataError(f"{source}: grid {found[0]}; expected values of type {kinds} in a tree 5-4-3")
-    return found[0]
+        raise DataError(f"{source}: grid {grid}; expected values of type {kinds} in a tree 5-4-3")
+    return grid
 
 
 def read_tree(cursor: Cursor, grids: list[Grid], grid: Grid) -> Tree:

@@ -19,11 +19,11 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import check_memory, size_text
 from vvgt_cli.volume.components import contiguous, magnitude
 from vvgt_cli.volume.libraries import library_errors
-from vvgt_cli.volume.microscopy.image import choose_channel, only
+from vvgt_cli.volume.microscopy.image import choose_channel, choose_image
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.tiff.decode import Pages
@@ -32,7 +32,6 @@ from vvgt_cli.volume.tiff.pages import check_pages
 from vvgt_cli.volume.tiff.stored import lazy_pages
 from vvgt_cli.volume.types import Volume
 
-_LISTED = 12  # series or channels that an error lists
 _AXES = {"X": "columns", "Y": "rows", "Z": "slices", "T": "time steps", "C": "channels", "S": "samples"}
 
 
@@ -135,18 +134,11 @@ def _series(file: Any, wanted: str | None, path: Path) -> tuple[Any, int]:
     found = [(k, s) for k, s in enumerate(file.series) if not (s.keyframe.is_reduced or s.keyframe.is_mask)]
     if not found:
         raise DataError(f"{path}: no pages but thumbnails and masks; expected slices")
-    listing = "; ".join(
-        f"{k} {s.name!r} ({' x '.join(map(str, s.shape))}, axes {s.axes}, {s.dtype})" for k, s in found[:_LISTED]
-    ) + ("; ..." if len(found) > _LISTED else "")
-    if wanted is None:
-        text = f"{path}: {len(found)} series: {listing}; choose one by number or name with --series NAME"
-        deep = [s.kind == "ome" and "Z" in s.axes for _, s in found]  # of plain pages sizes differ by damage, too
-        number, series = found[only(deep, text, "--series", [str(k) for k, _ in found], [s.name for _, s in found])]
-        return series, number
-    fits = [(k, s) for k, s in found if wanted.strip("/") in (str(k), s.name)]
-    if len(fits) != 1:
-        raise UsageError(f"{path}: {len(fits)} series {wanted!r}; it has {listing}; choose with --series NAME")
-    return fits[0][1], fits[0][0]
+    facts = [f"{' x '.join(map(str, s.shape))}, axes {s.axes}, {s.dtype}" for _, s in found]
+    deep = [s.kind == "ome" and "Z" in s.axes for _, s in found]  # of plain pages sizes differ by damage, too
+    names, keys = [s.name for _, s in found], [str(k) for k, _ in found]
+    number, series = found[choose_image(names, facts, wanted, "series", str(path), deep, keys)]
+    return series, number
 
 
 def _facts(file: Any, root: Any, series: Any, number: int, path: Path) -> Facts:

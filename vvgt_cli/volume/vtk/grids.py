@@ -13,9 +13,9 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.blocks import check_memory, count, size_text
-from vvgt_cli.volume.components import ArrayInfo, choose_array, select_component
+from vvgt_cli.volume.components import ArrayInfo, choose_array, select_from_array
 from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.space import unit_rows
+from vvgt_cli.volume.space import placed
 from vvgt_cli.volume.types import Volume
 from vvgt_cli.volume.vtk import LEGACY_GRIDS
 from vvgt_cli.volume.vtk.blocks import check_blocks
@@ -124,9 +124,7 @@ def dataset_volume(mesh: Any, options: ReadOptions, source: str, name: str) -> V
     check_cells(mesh, source)
     mesh = shown(mesh)
     values = values_of(mesh, info).reshape(1, 1, -1, info.components)
-    field, _ = select_component(
-        values, options.component, source, label=f"array {info.name!r}", color=values.dtype == np.uint8
-    )
+    field = select_from_array(values, info, options.component, source)
     return resample(mesh, field.ravel(), info.where, options.dims, source, name)
 
 
@@ -238,9 +236,5 @@ def _image(image: Any, info: ArrayInfo, options: ReadOptions, source: str, name:
         raise UsageError(f"{source}: an image, which is a regular grid already; leave out --dims")
     dims, spacing, origin = image_place(image, info.where)
     values = values_of(image, info).reshape(*dims[::-1], info.components)
-    field, _ = select_component(
-        values, options.component, source, label=f"array {info.name!r}", color=values.dtype == np.uint8
-    )
-    lengths, turned = unit_rows((_direction(image) * spacing).T.tolist())
-    field = visible(image, field, info.where)
-    return Volume(field, options.spacing_or(lengths), tuple(origin.tolist()), turned, name)
+    field = visible(image, select_from_array(values, info, options.component, source), info.where)
+    return placed(field, (_direction(image) * spacing).T, origin, options, name)

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.volume.arrays.conventions import text_of
 from vvgt_cli.volume.arrays.hdf5 import checked_dataset
-from vvgt_cli.volume.blocks import check_memory, count
-from vvgt_cli.volume.components import ArrayInfo, choose_array, select_component
+from vvgt_cli.volume.components import ArrayInfo, choose_array, selected_dtype
 from vvgt_cli.volume.libraries import library_errors
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
-from vvgt_cli.volume.stored import Slices, Stored
+from vvgt_cli.volume.stored import Slices, stored_or_held
 from vvgt_cli.volume.types import Volume
 from vvgt_cli.volume.vtk.child import volume_by_child
 from vvgt_cli.volume.vtk.index import chosen_time
@@ -48,9 +48,8 @@ def read_vtkhdf(path: Path, options: ReadOptions) -> Volume:
 
 def _is_image(root: Any) -> bool:
     """Whether it is an image of which nothing is hidden."""
-    kind = root.attrs.get("Type", b"")
     hidden = any(f"{group}/{GHOSTS}" in root for group in GROUPS.values())
-    return (kind.decode("utf-8", "replace") if isinstance(kind, bytes) else str(kind)) == "ImageData" and not hidden
+    return text_of(root.attrs.get("Type", "")) == "ImageData" and not hidden
 
 
 def _image(h5py: Any, file: Any, path: Path, options: ReadOptions) -> Volume:
@@ -75,16 +74,11 @@ def _image(h5py: Any, file: Any, path: Path, options: ReadOptions) -> Volume:
     if dataset.shape[len(before) :] != expected or (before and not 0 <= before[0] < dataset.shape[0]):
         raise DataError(f"{source}: array {info.name!r} is of shape {dataset.shape}; expected {expected} values a step")
     dtype = dataset.dtype.newbyteorder("=")
-    one = np.zeros((1, 1, 1, info.components), dtype)  # its choice of component alone is of interest
-    select_component(one, options.component, source, label=f"array {info.name!r}", color=dtype == np.uint8)
+    selected_dtype(info, options.component, source)  # raises where a component must be chosen
     behind = (int(options.component or 0),) if len(dataset.shape) > len(before) + 3 else ()
     read = partial(_read, path, name, before, behind, dtype)
     chunks = dataset.chunks[len(before) : len(before) + 3] if dataset.chunks else (1, *shape[1:])
-    stored = Stored(read, dtype, shape, chunks, source)
-    values: Any = stored
-    if not options.stored:
-        check_memory(count(shape) * dtype.itemsize, source)
-        values = stored[:]
+    values = stored_or_held(read, dtype, shape, chunks, source, options.stored)
     return Volume(values, options.spacing_or(grid.spacing), grid.origin, grid.direction, volume_name(path))
 
 
@@ -118,8 +112,7 @@ def _arrays(h5py: Any, root: Any, timed: bool) -> list[ArrayInfo]:
         group = root.get(name)
         if not isinstance(group, h5py.Group):
             continue
-        active = group.attrs.get("Scalars", b"")
-        active = active.decode("utf-8", "replace") if isinstance(active, bytes) else str(active)
+        active = text_of(group.attrs.get("Scalars", ""))
         for key, data in group.items():
             if isinstance(data, h5py.Dataset) and data.dtype.kind in "iuf" and len(data.shape) - timed in (3, 4):
                 components = 1 if len(data.shape) - timed == 3 else int(data.shape[-1])

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from xml.parsers import expat
@@ -23,7 +23,6 @@ MOST = 100_000  # files that an index may name
 DEEPEST = 8  # indexes that name indexes
 MAX_BYTES = 64 << 20  # of an index
 PIECES = {"PUnstructuredGrid", "PRectilinearGrid", "PStructuredGrid", "PImageData"}
-_CHUNK = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -124,7 +123,6 @@ def _add(found: Index, entry: Entry) -> None:
 def _parse(path: Path) -> Index:
     found = Index(path, "")
     blocks: list[tuple[str, str, int]] = []  # tag, name, level
-    parser = expat.ParserCreate()
 
     def start(tag: str, attributes: dict[str, str]) -> None:
         if tag == "VTKFile":
@@ -145,22 +143,36 @@ def _parse(path: Path) -> Index:
         if blocks and blocks[-1][0] == tag:
             blocks.pop()
 
-    def entity(*_: object) -> None:
-        raise DataError(f"{path}: its XML declares entities; expected none in an index")
-
-    parser.StartElementHandler, parser.EndElementHandler, parser.EntityDeclHandler = start, end, entity
-    with open(path, "rb") as file:
-        try:
-            while chunk := file.read(_CHUNK):
-                parser.Parse(chunk)
-            parser.Parse(b"", True)
-        except expat.ExpatError as error:
-            raise DataError(f"{path}: its XML is damaged ({error}); check that the file is whole") from error
-        except ValueError as error:
-            raise DataError(f"{path}: a number in it is none ({error}); check that the file is whole") from error
+    try:
+        walk_xml(path, start, end)
+    except ValueError as error:
+        raise DataError(f"{path}: a number in it is none ({error}); check that the file is whole") from error
     if found.kind == "Collection" and any(math.isinf(entry.time) for entry in found.entries):
         raise DataError(f"{path}: a time step that is not finite; expected numbers")
     return found
+
+
+def walk_xml(
+    path: Path, start: Callable[[str, dict[str, str]], None], end: Callable[[str], None],
+    text: Callable[[str], None] | None = None,
+) -> None:  # fmt: skip
+    """Call ``start``, ``end`` and ``text`` for the elements of an XML file.
+
+    Raises:
+        DataError: damaged, or it declares entities.
+    """
+
+    def entity(*_: object) -> None:
+        raise DataError(f"{path}: its XML declares entities; expected none")
+
+    parser = expat.ParserCreate()
+    parser.StartElementHandler, parser.EndElementHandler, parser.CharacterDataHandler = start, end, text
+    parser.EntityDeclHandler = entity
+    try:
+        with open(path, "rb") as file:
+            parser.ParseFile(file)
+    except expat.ExpatError as error:
+        raise DataError(f"{path}: its XML is damaged ({error}); check that the file is whole") from error
 
 
 def files_of(index: Index, entries: list[Entry], above: tuple[Path, ...] = ()) -> Iterator[tuple[Path, Entry]]:

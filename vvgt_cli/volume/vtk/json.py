@@ -14,7 +14,7 @@ from vvgt_cli.volume.components import ArrayInfo, choose_array, select_component
 from vvgt_cli.volume.headers import MAX_HEADER
 from vvgt_cli.volume.libraries import library_errors
 from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.space import unit_rows
+from vvgt_cli.volume.space import placed
 from vvgt_cli.volume.types import IDENTITY, Volume
 
 INDEX, MARK = "index.json", b'"vtkClass"'
@@ -60,7 +60,6 @@ def read_vtkjs(folder: Path, options: ReadOptions) -> Volume:
         block = load_block(place, dtype, shape, encoding="gzip" if packed else "raw")
         axes = np.array(found.get("direction", IDENTITY), np.float64).reshape(3, 3)  # one axis after the other
         steps = axes * np.reshape(np.array(found["spacing"], np.float64), (3, 1))
-        spacing, direction = unit_rows(steps.tolist())
-        origin = tuple((np.array(found["origin"], np.float64) + extent[:, 0] @ steps).tolist())
+        origin = np.array(found["origin"], np.float64) + extent[:, 0] @ steps
     field, _ = select_component(block, options.component, source, label=f"array {info.name!r}")
-    return Volume(field, options.spacing_or(spacing), origin, direction, folder.resolve().name)
+    return placed(field, steps, origin, options, folder.resolve().name)

@@ -13,7 +13,7 @@ import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.blocks import check_memory, count
-from vvgt_cli.volume.components import ArrayInfo, choose_array, select_component
+from vvgt_cli.volume.components import ArrayInfo, choose_array, select_from_array
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.types import Volume, triple
 from vvgt_cli.volume.vtk.grids import arrays_of, check_cells, dataset_volume, image_place, shown, values_of
@@ -133,10 +133,7 @@ def _field(leaf: Leaf, info: ArrayInfo, options: ReadOptions, source: str) -> tu
     if own.components != info.components:
         raise DataError(f"{source}: array {info.name!r} has {own.components} components in block {leaf.name}")
     values = values_of(data, own).reshape(1, 1, -1, own.components)
-    field, _ = select_component(
-        values, options.component, source, label=f"array {info.name!r}", color=values.dtype == np.uint8
-    )
-    return replace(leaf, data=data), field.ravel()
+    return replace(leaf, data=data), select_from_array(values, info, options.component, source).ravel()
 
 
 def _lattice(images: Sequence[Any], where: str) -> Samples | None:

@@ -15,11 +15,11 @@ import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import load_block, parse_numbers, tokens
-from vvgt_cli.volume.components import ArrayInfo, choose_array, select_component
+from vvgt_cli.volume.components import ArrayInfo, choose_array, select_from_array
 from vvgt_cli.volume.headers import printable
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
-from vvgt_cli.volume.space import unit_rows
+from vvgt_cli.volume.space import placed
 from vvgt_cli.volume.types import Volume
 
 # vtkIdType is stored as int; long is that of a 64-bit machine; colour is our name for COLOR_SCALARS in text, 0 to 1.
@@ -243,7 +243,5 @@ def read_legacy(path: Path, options: ReadOptions) -> Volume:
                 f"{' x '.join(map(str, dims))} were expected"
             )
         values = _values(parser, array, (dims[2], dims[1], dims[0]))
-    label, color = str(array.info.name), values.dtype == np.uint8
-    field, _ = select_component(values, options.component, str(path), label=label, color=color)
-    lengths, direction = unit_rows(np.diag(spacing).tolist())
-    return Volume(field, options.spacing_or(lengths), tuple(origin), direction, volume_name(path))
+    field = select_from_array(values, array.info, options.component, str(path))
+    return placed(field, np.diag(spacing), origin, options, volume_name(path))

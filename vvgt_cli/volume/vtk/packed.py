@@ -16,7 +16,7 @@ import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import count
-from vvgt_cli.volume.components import select_component
+from vvgt_cli.volume.components import ArrayInfo, selected_dtype
 from vvgt_cli.volume.stored import Slices, Stored
 from vvgt_cli.volume.vtk.blocks import block_table, table_bytes
 
@@ -25,7 +25,7 @@ LZMA_MEMORY = 1 << 28  # bytes of its dictionary
 
 def packed_array(
     path: Path, compressor: str, word: np.dtype, coded: bool, start: int, dtype: np.dtype, shape: tuple[int, ...],
-    component: int | None, what: str,
+    component: int | None, info: ArrayInfo,
 ) -> Stored:  # fmt: skip
     """A component of an array that stays in its file.
 
@@ -35,22 +35,24 @@ def packed_array(
         word: type of the words before the blocks.
         coded: in base64.
         start: byte of the first word.
-        dtype, shape: of the values, (nz, ny, nx, components).
+        dtype: of the values, as stored.
+        shape: (nz, ny, nx, components).
         component: of them.
-        what: the array, for messages.
+        info: the array.
 
     Raises:
         DataError: no whole table of blocks, or one of other sizes.
         UsageError: several components and none chosen.
     """
-    one = np.zeros((1, 1, 1, shape[3]), dtype)  # its choice of component alone is of interest
-    select_component(one, component, str(path), label=what, color=dtype == np.uint8)
+    selected_dtype(info, component, str(path))  # raises where a component must be chosen
     words = block_table(path, start, word, coded)
     sizes = np.array(words[3:], np.int64)
     need, blocks = count(shape) * dtype.itemsize, len(sizes)
     each, last = (int(words[1]), int(words[2])) if len(words) > 3 else (0, 0)
     if len(words) < 4 or int(words[0]) != blocks or each < 1 or (blocks - 1) * each + (last or each) != need:
-        raise DataError(f"{path}: {what} has no table of {need} bytes in blocks; check that the file is whole")
+        raise DataError(
+            f"{path}: array {info.name!r} has no table of {need} bytes in blocks; check that the file is whole"
+        )
     begins = np.concatenate([[0], np.cumsum(sizes)])
     place = start + table_bytes(len(words), word, coded)
     packed = _Blocks(path, compressor, coded, place, begins, each, need)

@@ -17,7 +17,7 @@ import numpy as np
 from vvgt_cli.errors import DataError
 from vvgt_cli.resources import free_memory
 from vvgt_cli.volume.blocks import SHARE, check_memory, data_file
-from vvgt_cli.volume.components import ArrayInfo, choose_array, select_component
+from vvgt_cli.volume.components import ArrayInfo, choose_array, selected_dtype
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.stored import Slices, Stored, is_file_backed, put_block, read_block
@@ -116,14 +116,11 @@ class _Pieces:
 
     def _dtype(self, found: Scan) -> np.dtype:
         """Of the values: that of the index, or what NaN and magnitudes need."""
-        one = np.zeros((1, 1, 1, self.info.components), self.info.dtype)
-        field, _ = select_component(
-            one, self.options.component, str(self.path), label=f"array {self.info.name!r}", color=one.dtype == np.uint8
-        )
+        dtype = selected_dtype(self.info, self.options.component, str(self.path))
         self.hiding = any(found.find(GHOSTS, where) for where in HIDDEN) and not all(
             map(self._shown, range(len(self.names)))
         )
-        return kind_of(field.dtype) if self.hiding else field.dtype
+        return kind_of(dtype) if self.hiding else dtype
 
     def _shown(self, k: int) -> bool:
         """Whether the header of piece ``k`` says that its ghost marks hide nothing: they only tell who else has it."""

@@ -13,12 +13,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from xml.parsers import expat
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import any_case, data_file
 from vvgt_cli.volume.headers import MARK
-from vvgt_cli.volume.vtk.index import MAX_BYTES, chosen_time
+from vvgt_cli.volume.vtk.index import MAX_BYTES, chosen_time, walk_xml
 from vvgt_cli.volume.vtk.leaves import Leaf, arrays_in, leaves_of
 from vvgt_cli.volume.vtk.messages import quiet_vtk
 
@@ -198,7 +197,6 @@ def _xdmf(path: Path) -> Any:
     names: list[str] = []
     texts: list[str] = []
     coded = False
-    parser = expat.ParserCreate()
 
     def start(tag: str, attributes: dict[str, str]) -> None:
         nonlocal coded
@@ -219,16 +217,7 @@ def _xdmf(path: Path) -> Any:
         coded = False
         texts.clear()
 
-    def entity(*_: object) -> None:
-        raise DataError(f"{path}: its XML declares entities; expected none")
-
-    parser.StartElementHandler, parser.CharacterDataHandler, parser.EndElementHandler = start, text, end
-    parser.EntityDeclHandler = entity
-    try:
-        with open(path, "rb") as file:
-            parser.ParseFile(file)
-    except expat.ExpatError as error:
-        raise DataError(f"{path}: its XML is damaged ({error}); check that the file is whole") from error
+    walk_xml(path, start, end, text)
     _check_names(path, names)
     reader = vtkXdmfReader()
     reader.SetFileName(str(path))

@@ -16,7 +16,8 @@ import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import check_memory, count, load_block, size_text
-from vvgt_cli.volume.components import ArrayInfo, choose_array, select_component
+from vvgt_cli.volume.components import ArrayInfo, choose_array, select_from_array
+from vvgt_cli.volume.headers import type_of
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.space import unit_rows
@@ -26,19 +27,6 @@ from vvgt_cli.volume.vtk.messages import quiet_vtk
 from vvgt_cli.volume.vtk.packed import packed_array
 from vvgt_cli.volume.vtk.resample import kind_of
 
-_DTYPES = {
-    "int8": "i1",
-    "uint8": "u1",
-    "int16": "i2",
-    "uint16": "u2",
-    "int32": "i4",
-    "uint32": "u4",
-    "int64": "i8",
-    "uint64": "u8",
-    "float32": "f4",
-    "float64": "f8",
-    "bit": "u1",
-}
 # Most that a byte of the file can stand for: deflate 1032, LZ4 255, LZMA some 7000; "0 " for a double in text.
 _RATIO = {"": 4, "vtkZLibDataCompressor": 1040, "vtkLZ4DataCompressor": 256, "vtkLZMADataCompressor": 10000}
 _CHUNK = 1 << 16
@@ -127,7 +115,7 @@ def scan(path: Path) -> Scan:
 
 
 def _note_array(found: Scan, attributes: dict[str, str], path: Path) -> None:
-    dtype = _DTYPES.get(attributes.get("type", "").lower())
+    dtype = type_of(attributes.get("type", ""), {"bit": "u1"})
     if dtype is None:
         return
     components = int(attributes.get("NumberOfComponents", "1"))
@@ -135,7 +123,7 @@ def _note_array(found: Scan, attributes: dict[str, str], path: Path) -> None:
         raise DataError(f"{path}: array {attributes.get('Name')!r} has {components} components")
     name = attributes.get("Name", "")
     active = bool(name) and name == found.active.get(found.where)
-    found.arrays.append((ArrayInfo(name, found.where, components, np.dtype(dtype).name, active), attributes))
+    found.arrays.append((ArrayInfo(name, found.where, components, dtype.name, active), attributes))
 
 
 def _numbers(text: str, n: int, path: Path, what: str) -> list[float]:
@@ -246,9 +234,7 @@ def image_values(found: Scan, info: ArrayInfo, grid: Grid, options: ReadOptions,
     packed: np.ndarray | None = _packed(found, info, grid, options, path) if options.stored else None
     if packed is not None:
         return packed
-    values = _stored(found, info, grid, path)
-    label, color = f"array {info.name!r}", values.dtype == np.uint8
-    component, _ = select_component(values, options.component, str(path), label=label, color=color)
+    component = select_from_array(_stored(found, info, grid, path), info, options.component, str(path))
     for where in ("point", "cell"):
         row = found.find(GHOSTS, where)
         if row is None or (where == "point" and info.where == "cell") or row[0].components != 1:
@@ -263,7 +249,8 @@ def _stored(found: Scan, info: ArrayInfo, grid: Grid, path: Path) -> np.ndarray:
     """(nz, ny, nx, c) values of an array, mapped or by VTK."""
     row = found.find(info.name, info.where)
     shape = (*reversed(grid.dims), info.components)
-    _check_size(found, info, count(shape), path)
+    _check_declared(found, info, count(shape), path)
+    check_memory(count(shape) * np.dtype(info.dtype).itemsize, str(path))
     values = None if row is None else _mapped(found, row[1], info, shape, path)
     return _by_vtk(path, info, shape) if values is None else values
 
@@ -282,11 +269,6 @@ def around(cells: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
             ones = np.ones_like(np.take(cells, [0], axis))
             cells = np.concatenate([ones, cells], axis) & np.concatenate([cells, ones], axis)
     return cells
-
-
-def _check_size(found: Scan, info: ArrayInfo, n_values: int, path: Path) -> None:
-    _check_declared(found, info, n_values, path)
-    check_memory(n_values * np.dtype(info.dtype).itemsize, str(path))
 
 
 def _check_declared(found: Scan, info: ArrayInfo, n_values: int, path: Path) -> None:
@@ -342,8 +324,7 @@ def _packed(found: Scan, info: ArrayInfo, grid: Grid, options: ReadOptions, path
     component = None if options.component is None else int(options.component)
     word, dtype = _order(found, info)
     return packed_array(
-        path, found.root["compressor"], word, found.appended == "base64", start, dtype, shape, component,
-        f"array {info.name!r}",
+        path, found.root["compressor"], word, found.appended == "base64", start, dtype, shape, component, info
     )  # fmt: skip
 
 
