@@ -306,7 +306,7 @@ def parse_numbers(text: bytes | mmap.mmap, start: int, n: int, dtype: np.dtype, 
 def any_case(path: Path) -> Path:
     """Return a file, or the one beside it whose name differs in upper and lower case alone; the path where none does.
 
-    Of several, the one with the same stem is returned.
+    Among several, only one with the same stem is returned.
     """
     if path.is_file() or not path.parent.is_dir():
         return path

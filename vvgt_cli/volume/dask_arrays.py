@@ -21,12 +21,12 @@ Number = tuple[int, ...]
 
 
 def is_dask(data: Any) -> bool:
-    """Whether an object is a Dask array; Dask is imported by then."""
+    """Tell whether an object is a Dask array; Dask is imported by then."""
     return hasattr(data, "__dask_graph__") and hasattr(data, "chunks") and hasattr(data, "blocks")
 
 
 def lazy(data: Any, name: str) -> Stored:
-    """A Dask array (nz, ny, nx), of which blocks are computed where they are read.
+    """Wrap a Dask array (nz, ny, nx) whose blocks are computed when they are read.
 
     Raises:
         DataError: another number of axes, or chunks of unknown size.
@@ -45,7 +45,7 @@ class Chunks:
     """
 
     def __init__(self, array: Any, name: str) -> None:
-        """``name`` is for messages.
+        """Take a Dask array; ``name`` is for messages.
 
         Raises:
             DataError: chunks of unknown size.
@@ -61,7 +61,7 @@ class Chunks:
         self._room = max(int(KEPT * (free_memory() or 0)), AT_ONCE)
 
     def __call__(self, index: tuple[Any, ...]) -> np.ndarray:
-        """The values of a slice (step 1) or a number an axis; the caller's own.
+        """Read the values at a slice (step 1) or a number for each axis; the array belongs to the caller.
 
         Raises:
             DataError: a chunk that cannot be computed, or that is not what the array says of it.
@@ -89,7 +89,7 @@ class Chunks:
         return out[tuple(slice(None) if isinstance(i, slice) else 0 for i in index)]
 
     def _computed(self, numbers: list[Number]) -> list[tuple[Number, np.ndarray]]:
-        """Chunks, each with its number."""
+        """Compute chunks; return each with its number."""
         dask: Any = importlib.import_module("dask")
         try:  # delayed: a chunk as it is, where an array's compute() copies it
             found = dask.compute(*[self._array.blocks[number].to_delayed().item() for number in numbers])

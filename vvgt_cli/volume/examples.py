@@ -23,7 +23,7 @@ def register_example(name: str, make: Maker) -> None:
 
 
 def example_names() -> list[str]:
-    """Names of all examples."""
+    """List the names of all examples."""
     return sorted(_EXAMPLES)
 
 

@@ -21,7 +21,7 @@ from vvgt_cli.volume.headers import printable
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.space import metres, unit_name
 from vvgt_cli.volume.stored import Stored
-from vvgt_cli.volume.types import Volume, triple
+from vvgt_cli.volume.types import Volume, float_dtype, triple
 
 EVEN = 0.01  # of a step that a coordinate may be off and still count as evenly spaced (float32 longitudes are)
 AXIS_ATTRIBUTES = ("axis", "standard_name", "units", "positive", "_CoordinateZisPositive")
@@ -57,7 +57,8 @@ class Axis:
         centres: (size,) coordinates of the values, or None.
         units: of the coordinates, or "".
         role: ``x``, ``y``, ``z``, ``t``, ``c`` (channels), or "" where nothing says.
-        labels, colors: names and RGB of channels, where there are any.
+        labels: names of channels, where there are any.
+        colors: RGB of channels, where there are any.
     """
 
     name: str
@@ -69,6 +70,7 @@ class Axis:
     colors: tuple[tuple[float, float, float] | None, ...] = ()
 
     def __str__(self) -> str:
+        """Describe the axis in a message."""
         return f"{printable(self.name) or 'unnamed'} ({self.size})"
 
 
@@ -130,10 +132,11 @@ def labelled_volume(
     name: str,
     chunks: Sequence[int] | None = None,
 ) -> Volume:
-    """The volume of an array with named axes.
+    """Make a volume of an array with named axes.
 
     Args:
-        stored, dtype: the stored values (mapped, perhaps), or what reads a part: from a slice or a number an axis.
+        stored: stored values (mapped, perhaps), or a function that reads a part, by a slice or a number for each axis.
+        dtype: of the stored values.
         axes: of the array, slowest first.
         attributes: of the array: ``scale_factor``, ``add_offset``, ``_FillValue``, ``missing_value``, ``valid_*``.
         options: ``time`` is the index along the axis of time, ``component`` that along another that is not of space; of
@@ -190,7 +193,7 @@ def _warn_of_unread(axes: Sequence[Axis], attributes: Mapping[str, Any], options
 
 
 def _numbered(axes: Sequence[Axis], options: ReadOptions) -> ReadOptions:
-    """The options with the number of a channel in place of its name."""
+    """Replace the name of a channel in the options by its number."""
     for one in axes:
         if isinstance(options.component, str) and one.labels.count(options.component) == 1:
             return replace(options, component=one.labels.index(options.component))
@@ -198,7 +201,7 @@ def _numbered(axes: Sequence[Axis], options: ReadOptions) -> ReadOptions:
 
 
 def _split_axes(axes: list[Axis], options: ReadOptions, source: str) -> tuple[list[int], int | None, int | None]:
-    """Indices of the axes of space, of the one that a component is chosen along, and of the one that a time is."""
+    """Return the indices of the spatial axes, of the axis of components and of the axis of time."""
     left = list(range(len(axes)))
     for k in [k for k in left if axes[k].size == 1]:  # of time steps and the like there may be one
         if len(left) > 3 or (len(left) == 3 and axes[k].role in ("t", "c")):
@@ -240,7 +243,7 @@ def _split_axes(axes: list[Axis], options: ReadOptions, source: str) -> tuple[li
 
 
 def _zyx(space: Sequence[int], axes: Sequence[Axis]) -> list[int]:
-    """The axes of space in the order z, y, x: by role, those without one in the order of the file."""
+    """Order the spatial axes as z, y, x: by role; those without one stay in file order."""
     slots: dict[str, int] = {}
     for k in space:
         if axes[k].role in "xyz" and axes[k].role not in ("", *slots):
@@ -267,8 +270,7 @@ def decode(values: np.ndarray, attributes: Mapping[str, Any], source: str) -> tu
         return values, slope, intercept
     check_memory(values.size * max(values.itemsize, 4), source)
     if values.dtype.kind != "f":
-        wide = np.float32 if values.dtype.itemsize <= 2 else np.float64
-        values = (values * slope + intercept).astype(wide)
+        values = (values * slope + intercept).astype(float_dtype(values.dtype))
         slope, intercept = 1.0, 0.0
     elif not values.flags.writeable:
         values = np.array(values)
@@ -289,7 +291,7 @@ def _number(attributes: Mapping[str, Any], key: str, default: float, source: str
 
 
 def _missing(values: np.ndarray, attributes: Mapping[str, Any]) -> np.ndarray | None:
-    """Mask of the stored values that the attributes call missing, or None."""
+    """Return a mask of the stored values that the attributes call missing, or None."""
     mask: np.ndarray | None = None
     marks = [m for key in ("_FillValue", "missing_value") if key in attributes for m in _stored(attributes[key])]
     tests: list[np.ndarray] = [values == mark for mark in marks if mark == mark]
@@ -304,7 +306,7 @@ def _missing(values: np.ndarray, attributes: Mapping[str, Any]) -> np.ndarray | 
 
 
 def _stored(value: Any) -> list[Any]:
-    """Numbers of an attribute; nothing where it is text."""
+    """Return the numbers of an attribute; nothing where it is text."""
     found = np.asarray(value).reshape(-1)
     return [] if found.dtype.kind not in "iuf" else found.tolist()
 
@@ -312,7 +314,7 @@ def _stored(value: Any) -> list[Any]:
 def _placed(
     field: np.ndarray, axes: list[Axis], scaling: tuple[float, float], options: ReadOptions, source: str, name: str
 ) -> Volume:
-    """The volume with spacing and origin from the coordinates of its axes (z, y, x), which are made ascending."""
+    """Make the volume, with spacing and origin from the coordinates of its axes (z, y, x), made ascending."""
     flips = [_descends(a, source) for a in axes]
     if not isinstance(field, Stored):  # it turns its blocks itself
         field = contiguous(field[tuple(slice(None, None, -1 if flip else 1) for flip in flips)])
@@ -357,7 +359,7 @@ def _left(
     stored: Callable[[tuple[Any, ...]], np.ndarray], dtype: np.dtype, axes: Sequence[Axis], index: list[Any],
     zyx: list[int], attributes: Mapping[str, Any], options: ReadOptions, source: str, name: str, chunks: Sequence[int],
 ) -> Volume:  # fmt: skip
-    """The volume of an array that stays in its file; values that may be missing make every block floats.
+    """Make the volume of an array that stays in its file; values that may be missing make every block floats.
 
     ``index`` chooses along the axes that are not of space; ``zyx`` are those that are.
     """
@@ -368,7 +370,7 @@ def _left(
     unsigned = dtype.kind == "i" and str(attributes.get("_Unsigned", "")).lower() == "true"
     kind = np.dtype(dtype.str.replace("i", "u")) if unsigned else dtype
     wide = marked and kind.kind != "f"
-    final = np.dtype(np.float32 if dtype.itemsize <= 2 else np.float64) if wide else kind
+    final = float_dtype(kind) if wide else kind
     scale = _number(attributes, "scale_factor", 1.0, source), _number(attributes, "add_offset", 0.0, source)
     inner = [sorted(zyx).index(k) for k in zyx]
 
@@ -388,7 +390,7 @@ def _left(
 
 
 def _descends(a: Axis, source: str) -> bool:
-    """Whether an axis runs downwards.
+    """Tell whether an axis runs downwards.
 
     Raises:
         DataError: it does neither run up nor down.
@@ -402,7 +404,7 @@ def _descends(a: Axis, source: str) -> bool:
 
 
 def even(centres: np.ndarray) -> bool:
-    """Whether coordinates lie within `EVEN` steps of equal distances."""
+    """Tell whether coordinates lie within `EVEN` steps of equal distances."""
     if centres.size < 3:
         return True
     line = np.linspace(centres[0], centres[-1], centres.size)

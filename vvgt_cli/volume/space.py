@@ -1,4 +1,4 @@
-"""Where volumes lie: their index axes, anatomical spaces and units of length.
+"""Positions of volumes: index axes, anatomical spaces and units of length.
 
 A space is named by where its axes point: RAS+ (right, anterior, superior; NIfTI) or LPS+ (left, posterior, superior;
 DICOM and ITK). The two differ by half a turn about the third axis.

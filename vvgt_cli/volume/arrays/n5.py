@@ -59,7 +59,7 @@ class N5Array:
     attributes: dict[str, Any]
 
     def read(self, index: tuple[Any, ...]) -> np.ndarray:
-        """A part, of a number or a slice with step 1 an axis; blocks that are not there are 0."""
+        """Read a part, by a number or a slice with step 1 for each axis; missing blocks are 0."""
         spans = [(k, k + 1) if isinstance(k, int) else k.indices(n)[:2] for k, n in zip(index, self.shape, strict=True)]
         out = np.zeros([b - a for a, b in spans], self.dtype.newbyteorder("="))
         grid = [range(a // c, -(-b // c)) for (a, b), c in zip(spans, self.blocks, strict=True)]
@@ -90,7 +90,7 @@ class N5Array:
 
 
 def unpack(compression: dict[str, Any], data: bytes, size: int, source: str) -> bytes:
-    """``data`` unpacked to at most ``size`` bytes.
+    """Unpack ``data`` to at most ``size`` bytes.
 
     Raises:
         DataError: a compression that is not known, numcodecs missing, data that would be longer.
@@ -108,9 +108,9 @@ def unpack(compression: dict[str, Any], data: bytes, size: int, source: str) -> 
         return _lz4(data, size)
     if kind in ("blosc", "zstd"):
         codecs = need(f"numcodecs.{kind}", EXTRA, source, f"N5 with {kind}")
-        told = struct.unpack_from("<I", data, 4)[0] if kind == "blosc" else size
-        if told != size or (kind == "zstd" and len(data) < 4):
-            raise DataError(f"{source}: a block of {told} bytes; expected {size}; fetch the block again")
+        stated = struct.unpack_from("<I", data, 4)[0] if kind == "blosc" else size
+        if stated != size or (kind == "zstd" and len(data) < 4):
+            raise DataError(f"{source}: a block of {stated} bytes; expected {size}; fetch the block again")
         out = bytearray(size)
         codecs.decompress(data, out)
         return bytes(out)
@@ -133,7 +133,7 @@ def _lz4(data: bytes, size: int) -> bytes:
 
 
 def holds_n5(path: Path) -> bool:
-    """Whether a folder is an N5 store, or an array of one."""
+    """Tell whether a folder is an N5 store, or an array in one."""
     if not (path / METADATA).is_file():
         return path.suffix == ".n5"
     try:
@@ -174,7 +174,7 @@ def read_n5(path: Path, options: ReadOptions) -> Volume:
 
 
 def level_shapes(path: Path, options: ReadOptions) -> list[tuple[int, ...]]:
-    """Shapes of the levels of a pyramid, finest first; none where there is none."""
+    """List the shapes of the levels of a pyramid, finest first; none where there is none."""
     if not path.is_dir() or not holds_n5(path):
         return []
     try:
@@ -191,7 +191,7 @@ def _inside(path: Path, wanted: str | None) -> Path:
 
 
 def _levels(group: Path) -> list[Path]:
-    """Folders ``s0``, ``s1``, ... of arrays in a group that is none itself."""
+    """List the folders ``s0``, ``s1``, ... of arrays in a group that is no array itself."""
     if "dimensions" in _metadata(group):
         return []
     found: list[Path] = []
@@ -201,7 +201,7 @@ def _levels(group: Path) -> list[Path]:
 
 
 def _choose(path: Path, options: ReadOptions) -> Path:
-    """Folder of the array asked for, else of the only one; of a pyramid the level."""
+    """Return the folder of the array asked for, or of the only one; for a pyramid, that of the level."""
     here = _inside(path, options.array)
     if "dimensions" in _metadata(here):
         if options.level is not None:
@@ -218,7 +218,7 @@ def _choose(path: Path, options: ReadOptions) -> Path:
 
 
 def _arrays(root: Path) -> list[Path]:
-    """Arrays and pyramids in a group or those in it."""
+    """List the arrays and pyramids in a group and the groups below it."""
     found: list[Path] = []
     groups, seen = [root], 0
     while groups and seen < MOST_VISITED:
@@ -252,7 +252,7 @@ def _array(place: Path) -> N5Array:
 
 
 def _axes(array: N5Array) -> list[Axis]:
-    """Axes, slowest first; the first three of the file are x, y and z, unless it names them."""
+    """Return the axes, slowest first; the first three in the file are x, y and z unless it names them."""
     n = len(array.shape)
     names, units, scale, shift = _transform(array, n)
     axes = []
@@ -264,19 +264,19 @@ def _axes(array: N5Array) -> list[Axis]:
 
 
 def _transform(array: N5Array, n: int) -> tuple[list[str], list[str], list[float], list[float]]:
-    """Names, units, spacing and first position of the axes, slowest first."""
+    """Return names, units, spacing and first position of the axes, slowest first."""
     facts = array.attributes
-    told = facts.get("transform")  # COSEM: in numpy's order
-    if isinstance(told, dict) and all(len(_list(told.get(k), n)) == n for k in ("axes", "scale")):
-        units = [str(u) for u in _list(told.get("units"), n)] or [""] * n
-        shift = _floats(told.get("translate"), n) or [0.0] * n
-        return [str(a) for a in told["axes"]], units, _floats(told["scale"], n) or [1.0] * n, shift
+    stated = facts.get("transform")  # COSEM: in numpy's order
+    if isinstance(stated, dict) and all(len(_list(stated.get(k), n)) == n for k in ("axes", "scale")):
+        units = [str(u) for u in _list(stated.get("units"), n)] or [""] * n
+        shift = _floats(stated.get("translate"), n) or [0.0] * n
+        return [str(a) for a in stated["axes"]], units, _floats(stated["scale"], n) or [1.0] * n, shift
     above = _metadata(array.place.parent) if array.place.name.startswith("s") else {}
     size: Any = next((f[k] for f in (facts, above) for k in ("pixelResolution", "resolution") if k in f), None)
     unit = next((f["units"] for f in (facts, above) if isinstance(f.get("units"), list)), None)
     if isinstance(size, dict):
-        told_unit = size.get("unit")
-        size, unit = size.get("dimensions"), [told_unit] * 3
+        stated_unit = size.get("unit")
+        size, unit = size.get("dimensions"), [stated_unit] * 3
     spatial = min(n, 3)
     steps = _floats(size, spatial) or [1.0] * spatial
     factors = _floats(facts.get("downsamplingFactors"), spatial) or [1.0] * spatial
@@ -292,12 +292,12 @@ def _transform(array: N5Array, n: int) -> tuple[list[str], list[str], list[float
 
 
 def _list(value: Any, n: int) -> list[Any]:
-    """The first ``n`` of a list of as many; else nothing."""
+    """Return the first ``n`` items of a list that has as many, else nothing."""
     return value[:n] if isinstance(value, list) and len(value) >= n else []
 
 
 def _floats(value: Any, n: int) -> list[float]:
-    """``n`` finite numbers; else nothing."""
+    """Return ``n`` finite numbers, else nothing."""
     some = _list(value, n)
     good = all(isinstance(v, int | float) and math.isfinite(v) and abs(v) < 1e30 for v in some)
     return [float(v) for v in some] if good else []

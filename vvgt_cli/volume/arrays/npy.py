@@ -26,7 +26,7 @@ _HEADER = 1 << 16
 
 
 def _header(stream: IO[bytes], source: str) -> tuple[tuple[int, ...], bool, np.dtype]:
-    """Shape, whether the first axis is the fastest, and type; the stream is left at the values."""
+    """Read shape, whether the first axis is the fastest, and type; leave the stream at the values."""
     version = np.lib.format.read_magic(stream)
     if version not in ((1, 0), (2, 0), (3, 0)):
         raise DataError(f"{source}: .npy version {version}; expected 1.0 to 3.0")
@@ -44,7 +44,7 @@ def _header(stream: IO[bytes], source: str) -> tuple[tuple[int, ...], bool, np.d
 def _volume(
     values: np.ndarray, shape: tuple[int, ...], fortran: bool, options: ReadOptions, source: str, name: str
 ) -> Volume:
-    """A volume of values in the order of the file; axes are z, y, x, and at most one of components at either end."""
+    """Make a volume of values in file order; axes are z, y, x, and at most one of components at either end."""
     array = values.reshape(shape[::-1]).T if fortran else values.reshape(shape)
     axes = [Axis("", size) for size in shape]
     return labelled_volume(array, array.dtype, axes, {}, options, source, name)

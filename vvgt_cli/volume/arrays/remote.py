@@ -65,50 +65,59 @@ class _Server:
 
 
 class Remote:
-    """A place, with what `zarr_store` asks of a path; what has been read is kept."""
+    """A place, with the methods that `zarr` calls on a path; it keeps what has been read."""
 
     def __init__(
         self, server: _Server, root: str, inner: str = "", kept: dict[str, bytes | None] | None = None
     ) -> None:
+        """Take the server, the address of the store, the path in it, and what has been read so far."""
         self._server, self._root, self._inner = server, root, PurePosixPath(inner)
         self._kept: dict[str, bytes | None] = {} if kept is None else kept
 
     def __str__(self) -> str:
+        """Return the address."""
         return self._root if self._inner == PurePosixPath() else f"{self._root}/{self._inner}"
 
     def __truediv__(self, name: str) -> Remote:
+        """Return the place ``name`` below this one."""
         return self._at(self._inner / name.lstrip("/"))
 
     def _at(self, inner: PurePosixPath) -> Remote:
         return Remote(self._server, self._root, str(inner), self._kept)
 
     def __eq__(self, other: object) -> bool:
+        """Compare addresses."""
         return str(self) == str(other)
 
     def __hash__(self) -> int:
+        """Hash the address."""
         return hash(str(self))
 
     def __lt__(self, other: Remote) -> bool:
+        """Order by address."""
         return str(self) < str(other)
 
     @property
     def name(self) -> str:
+        """Return the last part of the address."""
         return str(self).rpartition("/")[2]
 
     @property
     def parent(self) -> Remote:
+        """Return the place above, which may lie above the store."""
         if self._inner == PurePosixPath():
             return Remote(self._server, self._root.rpartition("/")[0], "", self._kept)
         return self._at(self._inner.parent)
 
     def resolve(self) -> PurePosixPath:
-        """Without "..": as if the store were "/store"."""
+        """Resolve "..", as if the store were "/store"."""
         parts = ["store"]
         for part in self._inner.parts:
             parts = parts[:-1] if part == ".." else [*parts, part]
         return PurePosixPath("/", *parts)
 
     def relative_to(self, other: Remote) -> PurePosixPath:
+        """Return the path from ``other`` to this place."""
         return self._inner.relative_to(other._inner)
 
     @cached_property
@@ -124,35 +133,41 @@ class Remote:
         return self._kept[url]
 
     def is_file(self) -> bool:
+        """Tell whether the server has a file here."""
         return self._content is not None
 
     def is_symlink(self) -> bool:
+        """Return False: a server has no links."""
         return False
 
     def is_dir(self) -> bool:
+        """Return True: a server does not say what is a folder."""
         return True
 
     def iterdir(self) -> list[Remote]:
+        """List the places that the server lists below this one."""
         return [self / Path(entry["name"].rstrip("/")).name for entry in self._server.ours.ls(str(self))]
 
     def stat(self) -> _Size:
+        """Return the size of the file here."""
         return _Size(len(self._content or b""))
 
     def store(self) -> dict[str, Any]:
-        """The same for zarr."""
+        """Return the arguments by which zarr opens the same place."""
         storage = need("zarr.storage", "zarr", str(self), "Zarr")
         return {"store": storage.FsspecStore(self._server.zarrs, True, str(self))}
 
     def allow(self, size: int) -> None:
-        """Answers as long as a packed chunk of so many bytes."""
+        """Allow answers as long as a packed chunk of so many bytes."""
         self._server.most[0] = max(self._server.most[0], MAX_METADATA + size + size // 8)
 
     def read_text(self, encoding: str) -> str:
+        """Read the file here as text; "" where there is none."""
         return (self._content or b"").decode(encoding)
 
 
 def _opened(url: str, options: ReadOptions) -> tuple[Path, ReadOptions]:
-    """The store of an address, as `zarr_store` takes paths, and the options with what is after ``:/`` as their array.
+    """Return the store at an address, as `read_zarr` takes paths, and the options with the part after ``:/`` as array.
 
     Raises:
         DataError: a library is not installed, no answer, or no Zarr.
@@ -182,7 +197,7 @@ def read_scheme(scheme: str, rest: str, options: ReadOptions) -> Volume:
 
 
 def level_shapes(url: str, options: ReadOptions) -> list[tuple[int, ...]]:
-    """Shapes of the levels of an OME-Zarr image, finest first; none where there is no such image.
+    """List the shapes of the levels of an OME-Zarr image, finest first; none where there is no such image.
 
     Raises:
         DataError, UsageError: as `read_scheme`.

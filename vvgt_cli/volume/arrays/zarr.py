@@ -32,7 +32,7 @@ MAX_METADATA = 16 << 20
 
 
 def holds_zarr(path: Path) -> bool:
-    """Whether a folder is a Zarr array or group."""
+    """Tell whether a folder is a Zarr array or group."""
     return any((path / name).is_file() for name in _METADATA)
 
 
@@ -63,7 +63,7 @@ def read_zarr(path: Path, options: ReadOptions) -> Volume:
 
 
 def _array(zarr: Any, place: Path) -> Any:
-    """An array whose codecs have been checked; they are once more, as a server may have answered zarr otherwise."""
+    """Open an array and check its codecs again, as a server may have sent zarr other metadata."""
     server: Any = None if isinstance(place, Path) else place  # `remote.Remote`
     array = zarr.open_array(**(server.store() if server else {"store": place}), mode="r")
     _check_codecs(place, array.metadata.to_dict())
@@ -81,7 +81,7 @@ def _name(path: Path, place: Path) -> str:
 
 
 def _metadata(folder: Path) -> dict[str, Any]:
-    """The metadata of an array or a group; empty where there are none."""
+    """Read the metadata of an array or a group; empty where there are none."""
     for name in _METADATA:
         file = folder / name
         if file.is_file():
@@ -107,7 +107,7 @@ def level_shapes(path: Path, options: ReadOptions) -> list[tuple[int, ...]]:
 
 
 def _choose(path: Path, wanted: str | None, number: int | None) -> tuple[Path, dict[str, Any]]:
-    """Folder and metadata of the array asked for, else of the image's level ``number``, else of the only one."""
+    """Return folder and metadata of the array asked for, else of the image's level ``number``, else of the only one."""
     here = path
     if wanted is not None:
         here = path / wanted.strip("/")
@@ -133,7 +133,7 @@ def _choose(path: Path, wanted: str | None, number: int | None) -> tuple[Path, d
 
 
 def _arrays(root: Path) -> list[tuple[Path, dict[str, Any]]]:
-    """Arrays below a group with three axes or more (with two, if there is none of three)."""
+    """List the arrays below a group with three axes or more (with two where none has three)."""
     found: list[tuple[Path, dict[str, Any]]] = []
     groups = [root]
     while groups:
@@ -167,7 +167,7 @@ def _check_codecs(place: Path, facts: dict[str, Any]) -> None:
 
 
 def _attributes(folder: Path) -> dict[str, Any]:
-    """Attributes of a node of either version."""
+    """Read the attributes of a node of either version."""
     old = folder / ".zattrs"
     if old.is_file() and old.stat().st_size <= MAX_METADATA:
         found = json.loads(old.read_text("utf-8"))
@@ -184,11 +184,11 @@ def _axes(
     for label, size in zip(names, shape, strict=True):
         name = str(label or "")
         beside = place.parent / name
-        told = _metadata(beside) if name and "/" not in name and name not in (".", "..") else {}
-        if told.get("node_type") != "array" or list(told.get("shape", [])) != [size] or beside == place:
+        coordinate = _metadata(beside) if name and "/" not in name and name not in (".", "..") else {}
+        if coordinate.get("node_type") != "array" or list(coordinate.get("shape", [])) != [size] or beside == place:
             axes.append(axis(name, size))
             continue
-        _check_codecs(beside, told)
+        _check_codecs(beside, coordinate)
         centres = np.asarray(_array(zarr, beside)[:size])
         numbers = centres.dtype.kind in "iuf"
         axes.append(axis(name, size, centres.astype(np.float64) if numbers else None, _attributes(beside)))
@@ -196,7 +196,7 @@ def _axes(
 
 
 def _multiscale(group: Path) -> dict[str, Any]:
-    """The first image of an OME-Zarr group; empty where it is none."""
+    """Return the first image of an OME-Zarr group; empty where it has none."""
     attributes = _attributes(group)
     inner = attributes.get("ome")
     images = (inner if isinstance(inner, dict) else attributes).get("multiscales")
@@ -240,7 +240,7 @@ def _ome_axes(place: Path, shape: tuple[int, ...]) -> list[Axis]:
 
 
 def _rendering(group: Path, count: int) -> tuple[tuple[str, ...], tuple[tuple[float, float, float] | None, ...]]:
-    """Names and RGB of the channels by the rendering settings (``omero``); none where they are of another number."""
+    """Return names and RGB of the channels by the rendering settings (``omero``); none where their number differs."""
     attributes = _attributes(group)
     inner = attributes.get("ome")
     omero = (inner if isinstance(inner, dict) else attributes).get("omero")

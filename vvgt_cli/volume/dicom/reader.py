@@ -79,7 +79,7 @@ class _Slice:
 def read_dicom(path: Path, options: ReadOptions) -> Volume:
     """Read one series of a folder or zip archive, or the frames of one file.
 
-    Of several volumes in a series (times, echoes, phases, b-values) ``options.time`` chooses one. Slices at uneven
+    ``options.time`` chooses one of several volumes in a series (times, echoes, phases, b-values). Slices at uneven
     distances are resampled to ``options.dims``, or taken as even with ``options.spacing``.
 
     Raises:

@@ -26,7 +26,7 @@ EXTRA, WHAT = "dicom-seg", "a DICOM segmentation"
 
 @dataclass(frozen=True)
 class Segment:
-    """What a header says of a segment.
+    """A segment as a header describes it.
 
     Attributes:
         number: its voxels' value.
@@ -40,12 +40,12 @@ class Segment:
 
 
 def is_segmentation(header: Any) -> bool:
-    """Whether a DICOM header is that of a segmentation."""
+    """Tell whether a DICOM header is that of a segmentation."""
     return str(header.get("SOPClassUID", "")) in CLASSES
 
 
 def is_segmentation_file(source: str) -> bool:
-    """Whether a path is that of a file that holds one; not so where pydicom is not installed."""
+    """Tell whether a path is a file with a segmentation; False where pydicom is not installed."""
     path = Path(source)
     try:
         if not path.is_file():
@@ -61,13 +61,13 @@ def is_segmentation_file(source: str) -> bool:
 
 
 def names_of(header: Any) -> str:
-    """The segments of a header, for a message."""
+    """List the segments of a header, for a message."""
     names = [str(segment.get("SegmentLabel", "?")) for segment in header.get("SegmentSequence", [])]
     return f"{len(names)} segments ({listed(names, ', ')})"
 
 
 def segments(source: str) -> list[Segment]:
-    """Number, label and colour of every segment: the recommended CIELab colour, or the palette's.
+    """Read number, label and colour of every segment: the recommended CIELab colour, or the palette's.
 
     Raises:
         DataError: pydicom or highdicom is not installed, no segmentation, or a damaged one.
@@ -91,7 +91,7 @@ def segments(source: str) -> list[Segment]:
 
 
 def _palette_color(header: Any, number: int) -> tuple[float, float, float] | None:
-    """Of a label map with a palette (PS3.3, C.7.6.3.1.5 and 6); None without."""
+    """Return the RGB of a segment by the palette (PS3.3, C.7.6.3.1.5 and 6); None without one."""
     if header.get("PhotometricInterpretation") != "PALETTE COLOR":
         return None
     found = []
@@ -104,7 +104,7 @@ def _palette_color(header: Any, number: int) -> tuple[float, float, float] | Non
 
 
 def read_segmentation(path: Path, options: ReadOptions) -> Volume:
-    """The label map of a file, (slices, rows, columns) numbers of segments, where its planes are; LPS.
+    """Read a file as a label map, (slices, rows, columns) numbers of segments; positions are LPS.
 
     Raises:
         DataError: highdicom is not installed, fractions in place of segments, planes that make no even stack.

@@ -1,4 +1,4 @@
-"""Which images of a DICOM folder make the volume: one series, and in it one stack of slices.
+"""The choice of the images in a DICOM folder that make the volume: one series, and in it one stack of slices.
 
 Localisers (scouts), segmentations and single images of another orientation are left out where one stack remains, and a
 warning says so; where several remain, the error lists them.
@@ -38,7 +38,7 @@ def choose_series(headers: Sequence[tuple[Source, Any]], wanted: str | None, pat
         path: for messages.
 
     Returns:
-        What to add to the volume's name, the files of the series, and the part of ``wanted`` that names a stack or a
+        The suffix of the volume's name, the files of the series, and the part of ``wanted`` that names a stack or a
         volume, "" where there is none.
 
     Raises:
@@ -68,7 +68,7 @@ def choose_series(headers: Sequence[tuple[Source, Any]], wanted: str | None, pat
 
 
 def _only(found: dict[str, Files], path: Path) -> Files:
-    """The only series of images that are placed, no scouts, no segmentation."""
+    """Return the single series of spatially located images, ignoring scouts and segmentations."""
     aside = {
         uid: f for uid, f in found.items() if all(_localiser(h) or is_segmentation(h) or _unplaced(h) for _, h in f)
     }
@@ -87,7 +87,7 @@ def _only(found: dict[str, Files], path: Path) -> Files:
 
 
 def _named(found: dict[str, Files], wanted: str) -> Files:
-    """The one series with this number, UID or description, else nothing."""
+    """Return the one series with this number, UID or description, else nothing."""
     fits = []
     for uid, files in found.items():
         keys = (str(files[0][1].get(key, "")).strip() for key in ("SeriesNumber", "SeriesDescription"))
@@ -96,7 +96,7 @@ def _named(found: dict[str, Files], wanted: str) -> Files:
 
 
 def _listed(found: dict[str, Files]) -> str:
-    """Series for an error: number, description, modality, slices, UID."""
+    """List series for an error: number, description, modality, slices, UID."""
     parts = []
     for uid, files in found.items():
         header = files[0][1]
@@ -119,7 +119,7 @@ def _unplaced(header: Any) -> bool:
 def one_stack(
     slices: list[Any], alike: Callable[[Any, Any], bool], number: int | None, title: str, path: Path
 ) -> list[Any]:
-    """The slices of one size and orientation: the stack asked for, or the only one of more than `_FEW` slices.
+    """Return the slices of one size and orientation: the stack asked for, or the only one of more than `_FEW` slices.
 
     Args:
         slices: of a series; each with a ``header`` and ``rows`` (2, 3).

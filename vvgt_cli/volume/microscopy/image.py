@@ -34,14 +34,16 @@ class Picture:
     """An image of a microscope.
 
     Attributes:
-        times, channels: how many there are.
+        times: number of time steps.
+        channels: number of channels.
         shape: (nz, ny, nx) of each.
         dtype: of the values.
         read: (time, channel, slices along z, y, x, step 1) to that box, (z, y, x).
         chunks: (z, y, x) voxels that are read together.
         spacing: (x, y, z) in micrometres; None of an axis where the file has none.
         origin: world position of the centre of voxel (0, 0, 0), (x, y, z), micrometres.
-        names, colors: of the channels, where the file has any.
+        names: of the channels, where the file has any.
+        colors: RGB in [0, 1] of the channels, where the file has any.
         rgb: the channels are red, green, blue and perhaps opacity.
         mapped: ``read`` gives views of the file, which take no memory.
     """
@@ -61,7 +63,7 @@ class Picture:
 
 
 def picture_volume(picture: Picture, options: ReadOptions, source: str, name: str) -> Volume:
-    """One channel of one time step, in micrometres; with ``options.stored`` it stays in its file.
+    """Make a volume of one channel of one time step, in micrometres; with ``options.stored`` it stays in its file.
 
     Raises:
         DataError: sizes or values that are none, or more than the memory holds.
@@ -93,7 +95,7 @@ def picture_volume(picture: Picture, options: ReadOptions, source: str, name: st
 
 
 def _spacing(picture: Picture, options: ReadOptions) -> tuple[float, float, float]:
-    """As `Facts.voxel` of TIFF: an axis without a size is as wide as the others."""
+    """Return the spacing (x, y, z); an axis without a size is as wide as the others, as in `Facts.voxel` of TIFF."""
     x, y, z = (s if s is not None and math.isfinite(s) and s > 0 else None for s in picture.spacing)
     across = x or y or z or 1.0
     return options.spacing_or((x or across, y or across, z or across))
@@ -190,7 +192,7 @@ def choose_image(
 
 
 def hex_color(text: Any) -> Color:
-    """RGB in [0, 1] of ``RRGGBB`` or ``AARRGGBB``, with or without a number sign; None for others, and for black."""
+    """Parse RGB in [0, 1] of ``RRGGBB`` or ``AARRGGBB``, after "#" or not; None for others, and for black."""
     found = re.fullmatch(r"#?(?:[0-9a-fA-F]{2})?([0-9a-fA-F]{6})", text.strip()) if isinstance(text, str) else None
     if found is None or found[1] == "000000":
         return None
@@ -199,7 +201,7 @@ def hex_color(text: Any) -> Color:
 
 
 def safe_xml(text: str, source: str) -> ElementTree.Element:
-    """The root of a file's metadata.
+    """Parse a file's metadata and return the root.
 
     Raises:
         DataError: entities, more than `MAX_XML` characters, or damage.
@@ -213,13 +215,14 @@ def safe_xml(text: str, source: str) -> ElementTree.Element:
 
 
 class Bounded(io.BufferedReader):
-    """A file of which never more is asked for than it has: lengths in it may lie, and memory is set aside first."""
+    """A file that is never asked for more bytes than it has: lengths in it may lie, and memory is allocated first."""
 
     def __init__(self, path: Path) -> None:
+        """Open a file."""
         super().__init__(io.FileIO(path))
         self._size = os.fstat(self.fileno()).st_size
 
     def read(self, size: int | None = -1, /) -> bytes:
-        """As of any file."""
+        """Read as any file does, but never ask for more bytes than are left."""
         rest = max(self._size - self.tell(), 0)
         return super().read(rest if size is None or size < 0 else min(size, rest))

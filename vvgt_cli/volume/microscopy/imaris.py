@@ -24,12 +24,12 @@ MOST = 1_000_000  # time steps or channels
 
 
 def is_imaris(file: Any) -> bool:
-    """Whether an open HDF5 file is one of Imaris."""
+    """Tell whether an open HDF5 file is one of Imaris."""
     return "DataSet/ResolutionLevel 0/TimePoint 0/Channel 0/Data" in file and "DataSetInfo" in file
 
 
 def level_shapes(path: Path, options: ReadOptions) -> list[tuple[int, ...]]:
-    """Shapes (z, y, x) of the levels, finest first; none where a file is not of Imaris, or h5py is not there."""
+    """List the shapes (z, y, x) of the levels, finest first; none for another file, or without h5py."""
     try:
         import h5py
     except ImportError:
@@ -71,10 +71,10 @@ def read_imaris(file: Any, path: Path, options: ReadOptions, checked: Callable[[
                 raise DataError(f"{path}:/{name}: {dataset.shape}; expected at least the image's {shape}")
     image = file["DataSetInfo/Image"].attrs if "DataSetInfo/Image" in file else {}
     spacing, origin = _placed(image, shape)
-    told = [_channel(file, c) for c in range(channels)]
+    channel_facts = [_channel(file, c) for c in range(channels)]
     picture = Picture(
         times, channels, shape, first.dtype, partial(_read, path, level), first.chunks or (1, *shape[1:]), spacing,
-        origin, [name for name, _ in told], [color for _, color in told],
+        origin, [name for name, _ in channel_facts], [color for _, color in channel_facts],
     )  # fmt: skip
     return picture_volume(picture, options, str(path), volume_name(path))
 
@@ -84,7 +84,7 @@ def _place(level: int, time: int, channel: int) -> str:
 
 
 def _read(path: Path, level: int, time: int, channel: int, box: Box) -> np.ndarray:
-    """A box of a file that is open no longer than that; datasets are padded to whole chunks."""
+    """Read a box from a file that is open no longer than that; datasets are padded to whole chunks."""
     import h5py
 
     with h5py.File(path, "r") as file:
@@ -92,13 +92,13 @@ def _read(path: Path, level: int, time: int, channel: int, box: Box) -> np.ndarr
 
 
 def _count(group: Any, what: str, inside: str = "DataSet") -> int:
-    """Groups ``what 0``, ``what 1``, ... in a row."""
+    """Count the groups ``what 0``, ``what 1``, ... in a row."""
     group = group[inside] if inside else group
     return next(k for k in range(MOST) if f"{what} {k}" not in group)
 
 
 def _shape(file: Any, level: int) -> tuple[int, int, int]:
-    """(nz, ny, nx) of a level, without the padding."""
+    """Return (nz, ny, nx) of a level, without the padding."""
     group = file[f"DataSet/ResolutionLevel {level}/TimePoint 0/Channel 0"]
     padded = group["Data"].shape
     sizes = [_text(group.attrs.get(f"ImageSize{axis}", "")) for axis in "ZYX"]
@@ -111,7 +111,7 @@ def _shape(file: Any, level: int) -> tuple[int, int, int]:
 
 
 def _text(value: Any) -> str:
-    """Attributes are arrays of single characters."""
+    """Join an attribute, an array of single characters, to text."""
     found = np.asarray(value)
     if found.dtype.kind == "S":
         return found.tobytes().replace(b"\0", b"").decode("utf-8", "replace").strip()
@@ -119,7 +119,7 @@ def _text(value: Any) -> str:
 
 
 def _placed(image: Any, shape: tuple[int, int, int]) -> tuple[Any, Any]:
-    """Spacing and origin (x, y, z) in micrometres by the extent of the image."""
+    """Return spacing and origin (x, y, z) in micrometres by the extent of the image."""
     unit = (metres(_text(image.get("Unit", "um"))) or MICROMETRE) / MICROMETRE
     spacing: list[float | None] = []
     origin = []
@@ -133,7 +133,7 @@ def _placed(image: Any, shape: tuple[int, int, int]) -> tuple[Any, Any]:
 
 
 def _channel(file: Any, number: int) -> tuple[str, Color]:
-    """Name and colour of a channel."""
+    """Return name and colour of a channel."""
     group = file.get(f"DataSetInfo/Channel {number}")
     if group is None:
         return "", None

@@ -72,7 +72,7 @@ def _check_header(path: Path) -> None:
 
 
 def _facts(image: Any) -> str:
-    """Of an image, for an error."""
+    """Describe an image, for an error."""
     try:
         return " x ".join(f"{n} {a}" for a, n in image.sizes.items() if n > 1) + f" {image.dtype}"
     except (ValueError, KeyError, AssertionError, OverflowError):
@@ -80,7 +80,7 @@ def _facts(image: Any) -> str:
 
 
 def _deep(image: Any) -> bool:
-    """Whether it has several slices."""
+    """Tell whether an image has several slices."""
     try:
         return bool(image.sizes.get("Z", 1) > 1)
     except (ValueError, KeyError, AssertionError, OverflowError):
@@ -116,7 +116,7 @@ def _picture(image: Any, path: Path) -> Picture:
 
 
 def _placed(image: Any) -> tuple[Any, Any]:
-    """Spacing and origin (x, y, z) in micrometres by the lengths of the axes, from the first to the last voxel."""
+    """Return spacing and origin (x, y, z) in micrometres by the lengths of the axes, from first to last voxel."""
     spacing: dict[str, float] = {}
     origin: dict[str, float] = {}
     for axis in image.xml_element.findall("./Data/Image/ImageDescription/Dimensions/DimensionDescription"):
@@ -132,10 +132,12 @@ def _placed(image: Any) -> tuple[Any, Any]:
 
 
 def _channels(image: Any) -> tuple[list[str], list[Color]]:
-    """Names and colours of the channels: of the look-up tables where dyes are not named."""
+    """Return names and colours of the channels: those of the look-up tables where dyes are not named."""
     names, colors = [], []
     for channel in image.xml_element.findall("./Data/Image/ImageDescription/Channels/ChannelDescription"):
-        told = {p.findtext("Key"): p.findtext("Value") for p in channel.findall("ChannelProperty")}
-        names.append(str(told.get("DyeName") or channel.get("NameOfMeasuredQuantity") or channel.get("LUTName") or ""))
+        properties = {p.findtext("Key"): p.findtext("Value") for p in channel.findall("ChannelProperty")}
+        names.append(
+            str(properties.get("DyeName") or channel.get("NameOfMeasuredQuantity") or channel.get("LUTName") or "")
+        )
         colors.append(LUTS.get(channel.get("LUTName", "").lower()))
     return names if len(set(names)) == len(names) else [], colors

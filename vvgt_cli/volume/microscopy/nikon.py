@@ -48,8 +48,12 @@ def read_nd2(path: Path, options: ReadOptions) -> Volume:
         if found < frames:
             raise DataError(f"{path}: of {frames} frames {found} are there; check that the file is whole")
         names, colors = _channels(file)
-        told = file.attributes
-        packed = (there, told.heightPx * (told.widthBytes or 0)) if told.compressionType == "lossless" else None
+        attributes = file.attributes
+        packed = (
+            (there, attributes.heightPx * (attributes.widthBytes or 0))
+            if attributes.compressionType == "lossless"
+            else None
+        )
         x, y, z = (float(v) for v in file.voxel_size())
         several = sizes.get("C", 1) > 1
         read = _reader(path, sizes, loops, place, np.dtype(file.dtype), packed)
@@ -70,7 +74,7 @@ def _opened(nd2: Any, path: Path) -> Iterator[Any]:
 
 
 def _frames(path: Path) -> dict[int, int]:
-    """Where the frames lie in the file by its map of chunks, by number: nd2 reads zeros for others.
+    """Return the position of each frame in the file, by number, from its map of chunks: nd2 reads zeros for others.
 
     Raises:
         DataError: no map of chunks at the file's end.
@@ -99,7 +103,7 @@ def _frames(path: Path) -> dict[int, int]:
 
 
 def _position(file: Any, sizes: dict[str, int], options: ReadOptions, path: Path) -> int:
-    """Number of the position asked for."""
+    """Return the number of the position asked for."""
     count = sizes.get("P", 1)
     names = [f"position {k}" for k in range(count)]
     for loop in file.experiment:
@@ -110,7 +114,7 @@ def _position(file: Any, sizes: dict[str, int], options: ReadOptions, path: Path
 
 
 def _channels(file: Any) -> tuple[list[str], list[Color]]:
-    """Names and colours of the channels."""
+    """Return names and colours of the channels."""
     names: list[str] = []
     colors: list[Color] = []
     for one in file.metadata.channels or ():
@@ -124,7 +128,10 @@ def _reader(
     path: Path, sizes: dict[str, int], loops: list[str], place: int, dtype: np.dtype,
     packed: tuple[dict[int, int], int] | None,
 ) -> Any:  # fmt: skip
-    """Reads boxes, frame by frame; ``packed`` is where compressed frames lie, and the bytes of one unpacked."""
+    """Make a function that reads boxes frame by frame.
+
+    ``packed`` holds the positions of compressed frames and the bytes of an unpacked one.
+    """
     turn = Lock()  # one file, one reader: workers may have threads
 
     @cache
@@ -134,7 +141,7 @@ def _reader(
         return nd2.ND2File(Bounded(path))
 
     def unpacked(number: int) -> np.ndarray:
-        """(c, y, x, s) of a frame of zlib data, unpacked to its size and no further, as nd2 would not."""
+        """Unpack a frame (c, y, x, s) of zlib data to its size and no further, as nd2 would not."""
         where, size = packed or ({}, 0)
         with Bounded(path) as file:
             file.seek(where[number])

@@ -65,7 +65,7 @@ def read_czi(path: Path, options: ReadOptions) -> Volume:
 
 
 def _scene(tiles: list[Tile], options: ReadOptions, path: Path) -> tuple[int | None, list[Tile]]:
-    """Number of the scene asked for, None where there is one, and its tiles."""
+    """Return the number of the scene asked for, None where there is one, and its tiles."""
     found: dict[int, list[Tile]] = {}
     for tile in tiles:
         found.setdefault(tile.at.get("S", 0), []).append(tile)
@@ -83,7 +83,7 @@ Planes = dict[tuple[int, ...], list[Tile]]
 
 
 def _by_plane(tiles: list[Tile], first: dict[str, int]) -> Planes:
-    """The tiles of each (time, channel, slice), those that lie above others last."""
+    """Group the tiles by (time, channel, slice), those that lie above others last."""
     planes: Planes = {}
     for tile in sorted(tiles, key=lambda t: t.at.get("M", 0)):
         key = tuple(tile.at.get(a, 0) - first.get(a, 0) for a in "TCZ")
@@ -101,7 +101,7 @@ def _read(
     channel: int,
     box: Box,
 ) -> np.ndarray:
-    """A box; where no tile is it is 0. Samples of colours are blue first in the file."""
+    """Read a box, 0 where no tile is. Samples of colours are blue first in the file."""
     z, y, x = box
     number, sample = divmod(channel, samples)
     sample = 2 - sample if sample < 3 and samples > 1 else sample
@@ -118,7 +118,7 @@ def _read(
 
 
 def _metadata(xml: str, channels: int, path: Path) -> tuple[Any, list[str], list[Color]]:
-    """Spacing (x, y, z) in micrometres, and names and colours of the channels."""
+    """Return spacing (x, y, z) in micrometres, and names and colours of the channels."""
     root = safe_xml(xml, str(path)) if xml.strip() else None
     if root is None:
         return (None, None, None), [], []

@@ -57,7 +57,7 @@ class Tile:
 
 
 def tiles_of(path: Path) -> tuple[list[Tile], str]:
-    """The tiles and the metadata, XML.
+    """Read the tiles and the metadata, XML.
 
     Raises:
         DataError: segments that reach beyond the file, or numbers that cannot be.
@@ -90,13 +90,13 @@ def tiles_of(path: Path) -> tuple[list[Tile], str]:
             _, pixel, start, part, compression, _, _, axes = take(ENTRY, place, "an entry of the directory")
             place += ENTRY.size
             _fits(path, size, place, axes * DIMENSION.size, "an entry of the directory")
-            told = [take(DIMENSION, place + k * DIMENSION.size, "an axis of a tile") for k in range(axes)]
+            dimensions = [take(DIMENSION, place + k * DIMENSION.size, "an axis of a tile") for k in range(axes)]
             place += axes * DIMENSION.size
             if part:
                 raise DataError(f"{path}: tiles in other files (part {part}); expected one file: export it as one")
             spans = {
                 a.rstrip(b"\0").decode("ascii", "replace"): (first, n, n if kept == 0 else kept)
-                for a, first, n, _, kept in told
+                for a, first, n, _, kept in dimensions
             }
             if any(n != kept for _, n, kept in spans.values()):
                 continue  # of a coarser level
@@ -124,7 +124,7 @@ def _fits(path: Path, size: int, place: int, length: int, what: str) -> None:
 
 
 def pixels_of(tile: Tile, path: Path) -> np.ndarray:
-    """(height, width, samples) of a tile; samples of colours are blue first.
+    """Read a tile, (height, width, samples); samples of colours are blue first.
 
     Raises:
         DataError: a compression that is not known, a library that is missing, damage.
@@ -153,7 +153,7 @@ def pixels_of(tile: Tile, path: Path) -> np.ndarray:
 
 
 def _zstd(data: bytes, size: int, headed: bool, path: Path) -> bytes:
-    """Zstandard; with a head that may say that high bytes follow all low ones."""
+    """Decompress Zstandard data, behind a header that may say that high bytes follow all low ones."""
     codec = need("numcodecs.zstd", EXTRA, str(path), "CZI with Zstandard")
     split = False
     if headed:

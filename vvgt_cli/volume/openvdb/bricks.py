@@ -20,7 +20,7 @@ MAX_VOXELS = 1 << 36  # 4096^3: the box alone, not what is in it, decides how lo
 
 
 class BrickArray:
-    """See the module. Attributes that are not the ones below are those of the whole array, laid out for them.
+    """An array of bricks; attributes that are not listed below are those of the whole array, laid out for them.
 
     Attributes:
         shape: (nz, ny, nx).
@@ -50,9 +50,11 @@ class BrickArray:
         self._whole: np.ndarray | None = None
 
     def __len__(self) -> int:
+        """Return the number of slices."""
         return self.shape[0]
 
     def __getitem__(self, key: Any) -> np.ndarray:
+        """Return a slice, a range of slices, or any other part of the array laid out."""
         if isinstance(key, int | np.integer):
             z = int(key) + (len(self) if key < 0 else 0)
             if not 0 <= z < len(self):
@@ -66,15 +68,17 @@ class BrickArray:
         return picked
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        """Return the array laid out."""
         return np.array(self.whole(), dtype, copy=copy) if copy else np.asarray(self.whole(), dtype)
 
     def __getattr__(self, name: str) -> Any:
+        """Return an attribute of the array laid out."""
         if name.startswith("_"):  # protocols that numpy and copy ask for
             raise AttributeError(name)
         return getattr(self.whole(), name)
 
     def whole(self) -> np.ndarray:
-        """The array in memory, C-contiguous; pages are taken only where something differs from zero.
+        """Return the array in memory, C-contiguous; pages are taken only where something differs from zero.
 
         Raises:
             DataError: more than the free memory.
@@ -93,7 +97,7 @@ class BrickArray:
         return self._whole
 
     def _slices(self, start: int, stop: int) -> np.ndarray:
-        """Slices start to stop, (stop - start, ny, nx), C-contiguous."""
+        """Return slices start to stop, (stop - start, ny, nx), C-contiguous."""
         if self._whole is not None:
             return self._whole[start:stop]
         out = np.empty((stop - start, *self.shape[1:]), self.dtype)
@@ -108,7 +112,7 @@ class BrickArray:
         return out
 
     def _brick_layer(self, at: int) -> np.ndarray:
-        """(8, 8 by, 8 bx) values of one layer of bricks; the last one is kept, as slabs are thinner than bricks."""
+        """Return the values (8, 8 by, 8 bx) of one layer of bricks, and keep it, as slabs are thinner than bricks."""
         if self._layer is None or self._layer[0] != at:
             by, bx = self._which.shape[1:]
             out = np.empty((EDGE, by, EDGE, bx, EDGE), self.dtype)
@@ -121,7 +125,7 @@ class BrickArray:
 
 
 def brick_grid(lo: np.ndarray, hi: np.ndarray, itemsize: int, source: str) -> tuple[np.ndarray, np.ndarray]:
-    """First brick and number of bricks, (3,) each, that hold the voxels ``lo`` to ``hi`` (3,), both in it.
+    """Return first brick and number of bricks, (3,) each, that hold the voxels ``lo`` to ``hi`` (3,), both included.
 
     Raises:
         DataError: a box that is too large to be walked through, or tables beyond the free memory.
@@ -141,7 +145,7 @@ def brick_grid(lo: np.ndarray, hi: np.ndarray, itemsize: int, source: str) -> tu
 
 
 def _blank(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
-    """Zeros in private anonymous memory of small pages: one row that is written must not take 2 MiB."""
+    """Make zeros in private anonymous memory of small pages: one row that is written must not take 2 MiB."""
     if not (hasattr(mmap, "MAP_PRIVATE") and hasattr(mmap, "MADV_NOHUGEPAGE")):
         return np.zeros(shape, dtype)
     flags = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | getattr(mmap, "MAP_NORESERVE", 0)

@@ -20,7 +20,7 @@ from vvgt_cli.volume.types import Volume
 
 
 def choose_grid(grids: list[Grid], wanted: str | None, source: str) -> Grid:
-    """The grid of that name; without one the only grid of scalars, else the only grid.
+    """Choose the grid of a name; without one the only grid of scalars, else the only grid.
 
     Raises:
         UsageError: no such grid, or several and no choice.
@@ -42,7 +42,7 @@ def choose_grid(grids: list[Grid], wanted: str | None, source: str) -> Grid:
 
 
 def read_tree(cursor: Cursor, grids: list[Grid], grid: Grid) -> Tree:
-    """The tree of a grid, or of the one that it shares it with; the cursor stands behind the grid's transform.
+    """Read the tree of a grid, or of the grid that it shares it with; the cursor stands behind the grid's transform.
 
     Raises:
         DataError: damage, or no such other grid.

@@ -24,7 +24,7 @@ from vvgt_cli.volume.types import Volume
 _NAME = re.compile(r"(?:^|_)(\d+)x(\d+)x(\d+)_(u?int(?:8|16|32|64)|float(?:16|32|64))\.raw(?:\.gz)?$", re.IGNORECASE)
 RUNS, LENGTH = 64, 512  # runs of neighbouring values that are sampled for the order of axes, and values in each
 LESS = 0.5  # ratio of neighbours' differences, in another order of axes to the given one, below which it is suggested
-LEAST = 4  # voxels along an axis below which the order cannot be told
+LEAST = 4  # voxels along an axis below which the order cannot be inferred
 
 
 def parse_name(name: str) -> tuple[tuple[int, int, int], str] | None:
@@ -71,7 +71,7 @@ def guess_dims(data: np.ndarray) -> tuple[int, int, int] | None:
         data: (nz, ny, nx), contiguous; memory-mapped data are read in a few places only.
 
     Returns:
-        The order in which neighbours differ least, or None where that given is no worse, or nothing can be told.
+        The order in which neighbours differ least, or None where that given is no worse, or nothing can be inferred.
     """
     given = data.shape[::-1]
     orders = sorted(set(permutations(given)), key=lambda order: order != given)  # the given one first: it wins ties

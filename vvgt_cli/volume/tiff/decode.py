@@ -33,12 +33,13 @@ class Pages(ExitStack):
     """
 
     def __init__(self, path: Path) -> None:
+        """Take the file that pages are decoded from."""
         super().__init__()
         self._path = path
         self._images: dict[str, Any] = {}
 
     def decoded(self, page: Any, series: Any) -> np.ndarray:
-        """The stored numbers of a page, in the type of its series and the order of tifffile's axes.
+        """Decode a page to its stored numbers, in the type of its series and the order of tifffile's axes.
 
         Raises:
             DataError: a damaged page, one that differs from the series, or a coding without a decoder.
@@ -58,7 +59,7 @@ class Pages(ExitStack):
         return np.moveaxis(pixels, -1, 0) if keyframe.planarconfig == 2 else pixels
 
     def _image(self, name: str) -> Any:
-        """A file as OpenImageIO's, or None where it cannot open it."""
+        """Open a file with OpenImageIO; None where it cannot."""
         import OpenImageIO as oiio
 
         if name not in self._images:
@@ -73,7 +74,7 @@ class Pages(ExitStack):
         return self._images[name]
 
     def _by_oiio(self, image: Any, page: Any, keyframe: Any) -> np.ndarray | None:
-        """(rows, columns, samples) in the file's type; None of a coding that OpenImageIO does not have."""
+        """Decode (rows, columns, samples) in the file's type; None for a coding that OpenImageIO lacks."""
         spec = image.spec() if image.seek_subimage(page.index, 0) else None
         if spec is not None:
             found, expected = (
@@ -139,7 +140,7 @@ class Pages(ExitStack):
 
 
 def _as_stored(pixels: np.ndarray, keyframe: Any, dtype: np.dtype) -> np.ndarray:
-    """The stored numbers: OpenImageIO inverts bytes where 0 is white, and stretches odd numbers of bits."""
+    """Restore the stored numbers: OpenImageIO inverts bytes where 0 is white, and stretches odd numbers of bits."""
     if pixels.dtype.kind != "u":
         return pixels
     if keyframe.photometric == _WHITE_IS_ZERO and pixels.dtype == np.uint8:

@@ -1,4 +1,4 @@
-"""What OME-XML and ImageJ's description say of a TIFF's images: voxel sizes in micrometres, names of channels.
+"""Facts of a TIFF's images by OME-XML and ImageJ's description: voxel sizes in micrometres, names of channels.
 
 Formats: OME model 2016-06 (https://docs.openmicroscopy.org/ome-model); ImageJ's description as its encoder has it.
 """
@@ -26,7 +26,7 @@ _PER = {2: "inch", 3: "cm"}  # ResolutionUnit, tag 296
 
 @dataclass(frozen=True)
 class Facts:
-    """What is said of an image.
+    """The facts that are stated of an image.
 
     Attributes:
         spacing: voxel edges (x, y, z) in micrometres (in the file's numbers where its unit is no length); None unsaid.
@@ -64,7 +64,7 @@ class Facts:
 
 
 def ome_root(xml: str, path: Path) -> ElementTree.Element:
-    """The root of OME-XML that is safe to be read by a library.
+    """Parse OME-XML that is safe to be read by a library, and return its root.
 
     Raises:
         DataError: XML that declares entities, is damaged, or names sizes, ranges or files that cannot be.
@@ -122,7 +122,7 @@ def _tag(element: ElementTree.Element) -> str:
 
 
 def ome_facts(root: ElementTree.Element, series: int, count: int) -> Facts:
-    """Facts of image number ``series`` of ``count``; none where the XML has another number of images."""
+    """Return the facts of image ``series`` of ``count``; none where the XML has another number of images."""
     images = [p for image in root if _tag(image) == "Image" for p in image if _tag(p) == "Pixels"]
     if len(images) != count:
         return Facts()
@@ -138,7 +138,7 @@ def ome_facts(root: ElementTree.Element, series: int, count: int) -> Facts:
 
 
 def _color(text: str | None) -> tuple[float, float, float] | None:
-    """RGB of OME's signed 32-bit RGBA; None for none, and for black, which shows nothing."""
+    """Convert OME's signed 32-bit RGBA to RGB; None for none, and for black, which shows nothing."""
     if text is None or not re.fullmatch(r"-?\d{1,10}", text):
         return None
     value = int(text) & 0xFFFFFFFF
@@ -146,23 +146,23 @@ def _color(text: str | None) -> tuple[float, float, float] | None:
     return (red / 255, green / 255, blue / 255) if red + green + blue else None
 
 
-def imagej_facts(told: dict[str, Any], resolution: tuple[float | None, float | None], tag: int) -> Facts:
+def imagej_facts(stated: dict[str, Any], resolution: tuple[float | None, float | None], tag: int) -> Facts:
     """Return what ImageJ's description says, as ImageJ reads it (ij.io.TiffDecoder and FileOpener, 1.54).
 
     ImageJ counts the resolution in the description's unit (micrometres per centimetre excepted), takes 72 dots per
     inch for no size, and leaves out a distance between slices that is 1.
 
     Args:
-        told: its entries.
+        stated: its entries.
         resolution: pixels per unit along x and y (tags 282 and 283); None where the file has none.
         tag: ResolutionUnit (tag 296); 1 where the file has none.
     """
-    if "scales" in told:  # SCIFIO's lists, in parallel
-        scales = dict(zip(*(str(told.get(key, "")).split(",") for key in ("axes", "scales")), strict=False))
+    if "scales" in stated:  # SCIFIO's lists, in parallel
+        scales = dict(zip(*(str(stated.get(key, "")).split(",") for key in ("axes", "scales")), strict=False))
         x, y, z = (_positive(scales.get(axis)) for axis in "XYZ")
-        resolution, tag, told = (x and 1 / x, y and 1 / y), 1, {"spacing": z, **told}
-    channels, slices, frames = (int(told.get(key, 1)) for key in ("channels", "slices", "frames"))
-    images, assumed, name = channels * slices * frames, [], str(told.get("unit", "")).strip()
+        resolution, tag, stated = (x and 1 / x, y and 1 / y), 1, {"spacing": z, **stated}
+    channels, slices, frames = (int(stated.get(key, 1)) for key in ("channels", "slices", "frames"))
+    images, assumed, name = channels * slices * frames, [], str(stated.get("unit", "")).strip()
     unit, per = _unit(name), _PER.get(tag, "")
     across = [1 / n if n else None for n in map(_positive, resolution)]
     if per and (unit in ("", "pixel") or (per == "inch" != unit and across[0] == 1 / 72)):
@@ -173,12 +173,12 @@ def imagej_facts(told: dict[str, Any], resolution: tuple[float | None, float | N
         if unit != "um" or not metric:
             assumed.append(f"resolution per {per} by its tag, in {name} by ImageJ's description; "
                            f"taken per {per if metric else name}")  # fmt: skip
-    depth = told.get("spacing") or None
+    depth = stated.get("spacing") or None
     if unit in ("", "pixel") and depth is None and not set(across) - {None, 1.0}:
         return Facts(images=images)
     if None in across:
         assumed.append("no size of its pixels; taken as 1")
-    if depth is None and max(images, int(told.get("images", 1))) > channels * frames:
+    if depth is None and max(images, int(stated.get("images", 1))) > channels * frames:
         depth = 1.0
         assumed.append("no distance between its slices; taken as 1, as ImageJ takes it")
     sizes = {
@@ -186,16 +186,16 @@ def imagej_facts(told: dict[str, Any], resolution: tuple[float | None, float | N
         "y": across[1] or 1,
         "spacing": abs(depth) if isinstance(depth, float | int) else depth,
     }
-    facts = _micrometres(sizes, [name, str(told.get("yunit", name)), str(told.get("zunit", name))])
+    facts = _micrometres(sizes, [name, str(stated.get("yunit", name)), str(stated.get("zunit", name))])
     return replace(facts, images=images, assumed=tuple(assumed))
 
 
 def count_planes(file: Any) -> None:
     """Make the planes of one directory slices if ImageJ's description counts more of them than it gives axes."""
-    told = file.imagej_metadata if file.is_imagej and not file.pages.is_multipage else None
-    images = int(told.get("images", 1)) if told else 1
-    if told and images > math.prod(int(told.get(key, 1)) for key in ("channels", "slices", "frames")):
-        told.update(channels=1, slices=images, frames=1)
+    stated = file.imagej_metadata if file.is_imagej and not file.pages.is_multipage else None
+    images = int(stated.get("images", 1)) if stated else 1
+    if stated and images > math.prod(int(stated.get(key, 1)) for key in ("channels", "slices", "frames")):
+        stated.update(channels=1, slices=images, frames=1)
 
 
 def _positive(value: Any) -> float | None:
@@ -213,16 +213,16 @@ def _micrometres(sizes: dict[str, Any], units: list[str]) -> Facts:
     odd = [key for key, n in zip(sizes, numbers, strict=True) if n is not None and math.isnan(n)]
     plain = [_unit(unit) for unit in units]
     lengths = [_metres(unit) for unit in plain]
-    told = {u: m for u, m, n in zip(plain, lengths, numbers, strict=True) if n is not None}
-    if odd or None in told.values():
-        mixed = f"voxel sizes in {', '.join(told)}; expected one unit" if len(told) > 1 else ""
+    stated = {u: m for u, m, n in zip(plain, lengths, numbers, strict=True) if n is not None}
+    if odd or None in stated.values():
+        mixed = f"voxel sizes in {', '.join(stated)}; expected one unit" if len(stated) > 1 else ""
         return Facts(triple(numbers), trouble=f"{odd[0]} is {sizes[odd[0]]!r}; expected a number" if odd else mixed)
     return Facts(
         triple(
             None if n is None else float(f"{n * float(m or 1) / MICROMETRE:.15g}")
             for n, m in zip(numbers, lengths, strict=True)
         ),
-        length="um" if told else "",
+        length="um" if stated else "",
     )
 
 

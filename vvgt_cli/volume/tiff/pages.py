@@ -30,7 +30,7 @@ class _Layout:
 
 
 def check_pages(path: Path) -> int:
-    """The number of pages of a file whose directories lie in it.
+    """Count the pages of a file and check that its directories lie in it.
 
     Raises:
         DataError: a directory outside the file or in a circle, a tag or pixels that the file cannot hold.
@@ -70,7 +70,7 @@ def _walk(file: BinaryIO, path: Path) -> int:
 
 
 def _page_bytes(table: bytes, layout: _Layout, page: int) -> int:
-    """The least bytes that the pixels of a page come to."""
+    """Return the least number of bytes that the pixels of a page take."""
     tags: dict[int, int] = {}
     step = struct.calcsize("<" + layout.entry)
     for at in range(0, len(table) - step + 1, step):

@@ -37,7 +37,7 @@ _AXES = {"X": "columns", "Y": "rows", "Z": "slices", "T": "time steps", "C": "ch
 
 @dataclass(frozen=True)
 class SeriesAxes:
-    """Where the voxels are in the axes of a series.
+    """The positions of voxels along the axes of a series.
 
     Attributes:
         axes: letters as tifffile has them, unknown ones that stand for slices made Z.
@@ -52,7 +52,7 @@ class SeriesAxes:
     color: bool = False
 
     def of(self, letters: str) -> list[int]:
-        """Positions of axes of more than one value."""
+        """Return the positions of axes of more than one value."""
         return [k for k, a in enumerate(self.axes) if a in letters and self.shape[k] > 1]
 
 
@@ -96,7 +96,7 @@ def read_tiff(path: Path, options: ReadOptions, slices: int = 1) -> Volume:
 
 
 def _paged(layout: SeriesAxes, index: tuple[int | slice, ...], several: bool) -> bool:
-    """Whether slices are pages, and nothing but rows and columns is kept of one."""
+    """Tell whether slices are pages of which nothing but rows and columns is kept."""
     kept = [a for a, i in zip(layout.axes, index, strict=True) if isinstance(i, slice)]
     ahead = [a for a, i in zip(layout.axes[: layout.lead], index, strict=False) if isinstance(i, slice)]
     return not several and ahead == ["Z"] and sorted(kept) == ["X", "Y", "Z"]
@@ -130,7 +130,7 @@ def _silent() -> Iterator[None]:
 
 
 def _series(file: Any, wanted: str | None, path: Path) -> tuple[Any, int]:
-    """The series asked for, or the only one that is an image of its own; and its number."""
+    """Return the series asked for, or the only one that is an image of its own, and its number."""
     found = [(k, s) for k, s in enumerate(file.series) if not (s.keyframe.is_reduced or s.keyframe.is_mask)]
     if not found:
         raise DataError(f"{path}: no pages but thumbnails and masks; expected slices")
@@ -142,7 +142,7 @@ def _series(file: Any, wanted: str | None, path: Path) -> tuple[Any, int]:
 
 
 def _facts(file: Any, root: Any, series: Any, number: int, path: Path) -> Facts:
-    """What the file says of a series; its pages must be what was told of them."""
+    """Return the facts of a series; check that its pages are those that they describe."""
     facts = Facts()
     if root is not None:
         facts = ome_facts(root, number, len(file.series))
@@ -151,8 +151,8 @@ def _facts(file: Any, root: Any, series: Any, number: int, path: Path) -> Facts:
     if facts.spacing == (None, None, None) and file.is_imagej and not file.is_shaped:
         first = file.pages.first
         x, y = (r if code in first.tags else None for code, r in zip((282, 283), first.get_resolution(), strict=True))
-        told = imagej_facts(file.imagej_metadata or {}, (x, y), int(first.tags.valueof(296, default=1)))
-        facts = replace(told, channels=facts.channels)
+        description = imagej_facts(file.imagej_metadata or {}, (x, y), int(first.tags.valueof(296, default=1)))
+        facts = replace(description, channels=facts.channels)
         if facts.images > 1 and series.kind != "imagej" and root is None:
             short = first.dataoffsets[0] + facts.images * first.nbytes - path.stat().st_size if first.is_final else 0
             missing = f" ({size_text(short)} are missing)" if short > 0 else ""
@@ -162,7 +162,7 @@ def _facts(file: Any, root: Any, series: Any, number: int, path: Path) -> Facts:
 
 
 def _layout(series: Any, path: Path) -> SeriesAxes:
-    """The axes of a series, and how they lie in its pages."""
+    """Return the axes of a series, and how they lie in its pages."""
     axes, shape = series.get_axes(False), tuple(map(int, series.get_shape(False)))
     keyframe = series.keyframe
     if keyframe.photometric == 3 and not (keyframe.is_imagej or series.kind in ("ome", "imagej")):
@@ -197,7 +197,7 @@ def _described(axes: str, shape: tuple[int, ...]) -> str:
 def _choose(
     layout: SeriesAxes, facts: Facts, options: ReadOptions, path: Path, dtype: np.dtype
 ) -> tuple[tuple[int | slice, ...], bool]:
-    """An index along every axis of a series (whole along those of space), and whether all channels are wanted."""
+    """Return an index along every axis of a series (whole along spatial ones), and whether all channels are wanted."""
     space = layout.of("XYZ")
     index: list[int | slice] = [slice(None) if k in space else 0 for k in range(len(layout.shape))]
     channels = layout.of("CS")
@@ -219,7 +219,7 @@ def _choose(
 
 
 def _values(file: Any, series: Any, layout: SeriesAxes, index: tuple[int | slice, ...], path: Path) -> np.ndarray:
-    """The values at an index of a series: mapped where they lie together plainly, else decoded page by page."""
+    """Read the values at an index of a series: mapped where they lie together plainly, else decoded page by page."""
     if _mappable(series):
         offset, need = int(series.dataoffset), math.prod(layout.shape) * series.dtype.itemsize
         size = path.stat().st_size

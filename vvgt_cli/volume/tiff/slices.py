@@ -28,7 +28,7 @@ MOST = 100_000  # files
 
 
 def matching(pattern: str) -> list[Path]:
-    """The files of a glob, sorted by the numbers in their names."""
+    """List the files of a glob, sorted by the numbers in their names."""
     return sorted((path for path in map(Path, glob.glob(pattern)) if path.is_file()), key=by_number)
 
 

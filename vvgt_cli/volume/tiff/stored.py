@@ -24,10 +24,13 @@ def lazy_pages(
     dtype: np.dtype,
     turned: bool,
 ) -> Stored:
-    """The slices of series ``number``, which are pages, as (z, y, x).
+    """Wrap the slices of a series that are pages, as (z, y, x).
 
     Args:
-        lead, inner: sizes of the axes that count pages, and of those within a page.
+        path: the file.
+        number: of the series.
+        lead: sizes of the axes that count pages.
+        inner: sizes of the axes within a page.
         index: along all of them: slices along that of z in ``lead``, and x and y in ``inner``.
         dtype: of the values.
         turned: x comes before y in a page.

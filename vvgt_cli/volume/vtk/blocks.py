@@ -39,7 +39,7 @@ class _Array:
 
 
 def check_blocks(path: Path, root: dict[str, str], encoding: str, data_start: int, ratio: int) -> None:
-    """See that no array's block sizes, nor its number of tuples, ask for more than the file can hold.
+    """Check that no array's block sizes, nor its number of tuples, ask for more than the file can hold.
 
     Args:
         path: the file.
@@ -71,7 +71,7 @@ def check_blocks(path: Path, root: dict[str, str], encoding: str, data_start: in
 
 
 def _characters(head: np.ndarray, word: np.dtype) -> int:
-    """Characters of base64 that hold the words before the blocks, told by the first three of them."""
+    """Count the characters of base64 that hold the words before the blocks, by the first three of them."""
     return 4 * -(-(3 + int(head[0])) * word.itemsize // 3)
 
 
@@ -107,7 +107,7 @@ def _arrays(path: Path, data_start: int, word: np.dtype, compressed: bool) -> li
 
 
 def _decode(text: bytes, word: np.dtype) -> np.ndarray:
-    """Words of base64; none where it is damaged."""
+    """Decode words from base64; none where it is damaged."""
     try:
         return _words(base64.b64decode(text, validate=True), word)
     except (binascii.Error, ValueError):
@@ -119,12 +119,12 @@ def _words(data: bytes, word: np.dtype) -> np.ndarray:
 
 
 def table_bytes(words: int, word: np.dtype, coded: bool) -> int:
-    """Bytes of the file that so many words before the blocks take."""
+    """Return the bytes of the file that so many words before the blocks take."""
     return 4 * -(-words * word.itemsize // 3) if coded else words * word.itemsize
 
 
 def block_table(path: Path, start: int, word: np.dtype, coded: bool) -> np.ndarray:
-    """The words before the blocks of an array in the appended data, those that are there."""
+    """Read the words before the blocks of an array in the appended data, those that are there."""
     size = path.stat().st_size
     with open(path, "rb") as file:
         file.seek(start)
@@ -139,7 +139,7 @@ def block_table(path: Path, start: int, word: np.dtype, coded: bool) -> np.ndarr
 
 
 def _check(path: Path, name: str, words: list[int], room: int) -> None:
-    """Sizes of an array's blocks: count, bytes, bytes of the last, packed bytes of each."""
+    """Check the sizes of an array's blocks: count, bytes, bytes of the last, packed bytes of each."""
     if words[:1] == [0] and not any(words[2:3]):
         return  # no block, nothing to read
     packed = words[3:]

@@ -39,7 +39,7 @@ LARGEST = 1 << 20  # bytes of the line of an answer
 
 
 def volume_by_child(program: str, path: Path, options: ReadOptions) -> Volume:
-    """The volume of a file of `vtk_programs.PROGRAMS`, of an index, or of a mesh or grid.
+    """Read a file of `vtk.programs.PROGRAMS`, of an index, or of a mesh or grid as a volume.
 
     Raises:
         DataError: damaged, or VTK's reader did not come to an end.
@@ -67,7 +67,7 @@ def read_indexed(path: Path, options: ReadOptions) -> Volume:
 
 
 def _single(index: Index, time: int | None, above: tuple[Path, ...] = ()) -> tuple[Path, int | None] | None:
-    """The only file that an index leads to, and the step to read of it; None where there are several."""
+    """Return the only file that an index leads to, and the step to read of it; None where there are several."""
     timed = bool(index.times)
     entries = index.at(time) if timed else index.entries
     if len(entries) != 1 or index.kind in PIECES:
@@ -80,7 +80,7 @@ def _single(index: Index, time: int | None, above: tuple[Path, ...] = ()) -> tup
 
 
 def contents_by_child(program: str, path: Path, options: ReadOptions) -> dict[str, Any]:
-    """Steps, arrays and blocks, each a list of rows with the option that chooses it.
+    """List steps, arrays and blocks, each a row with the option that chooses it.
 
     Raises:
         DataError: as `volume_by_child`.
@@ -108,7 +108,7 @@ def _asked(program: str, path: Path, options: ReadOptions, task: str) -> tuple[d
 
 
 def run(request: dict[str, Any]) -> tuple[tuple[dict[str, Any], np.ndarray] | None, int]:
-    """The answer of a process to a request, None where it gives none, and its exit status."""
+    """Run a request in a process; return its answer, None where it gives none, and its exit status."""
     paths = os.pathsep.join(filter(None, [str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")]))
     with subprocess.Popen(
         [sys.executable, "-c", START], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
@@ -144,7 +144,7 @@ def _watch(child: subprocess.Popen[bytes], ended: Event) -> None:
 
 
 def _bytes_near(path: Path) -> int:
-    """Bytes of the files in a file's folder: those that it may name."""
+    """Count the bytes of the files in a file's folder: those that it may name."""
     total = 0
     for n, (folder, _, names) in enumerate(os.walk(path.parent)):
         total += sum(os.stat(file).st_size for name in names if os.path.isfile(file := os.path.join(folder, name)))
@@ -154,7 +154,7 @@ def _bytes_near(path: Path) -> int:
 
 
 def received(stream: IO[bytes]) -> tuple[dict[str, Any], np.ndarray] | None:
-    """Facts and values, None where they end early."""
+    """Read facts and values, None where they end early."""
     line = stream.readline(LARGEST)
     if not line.endswith(b"\n"):
         return None
@@ -182,7 +182,7 @@ def _ended(path: Path, program: str, status: int, seconds: int) -> DataError:
 
 
 def _error(facts: dict[str, Any]) -> VvgtError:
-    """The error that an answer tells of."""
+    """Make the error that an answer reports."""
     text, kind = facts["text"], facts["error"]
     made: VvgtError
     if kind == "SeveralSteps":
@@ -197,7 +197,7 @@ def _error(facts: dict[str, Any]) -> VvgtError:
 
 
 def answer(request: dict[str, Any]) -> tuple[dict[str, Any], np.ndarray | None]:
-    """What a request asks for: facts, and values. In the child."""
+    """Answer a request with facts and values. Runs in the child."""
     path = Path(request["path"])
     given: dict[str, Any] = {
         key: tuple(value) if isinstance(value, list) else value for key, value in request["options"].items()
@@ -226,9 +226,9 @@ def answer(request: dict[str, Any]) -> tuple[dict[str, Any], np.ndarray | None]:
     except Exception as error:  # of readers that were given anything
         text = " ".join(str(error).split())[:300] or type(error).__name__
         facts, values = {"error": "DataError", "text": f"{path}: damaged ({text}); check that it is whole"}, None
-    again = facts.get("error") in ("SeveralSteps", "SeveralComponents")  # those who choose are told then
-    told = [str(one.message) for one in caught if one.category is UserWarning and not again]
-    return {**facts, "notes": told}, values
+    again = facts.get("error") in ("SeveralSteps", "SeveralComponents")  # the question repeats them
+    notes = [str(one.message) for one in caught if one.category is UserWarning and not again]
+    return {**facts, "notes": notes}, values
 
 
 def _work(program: str, path: Path, options: ReadOptions, task: str) -> tuple[dict[str, Any], np.ndarray | None]:

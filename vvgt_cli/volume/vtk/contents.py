@@ -1,4 +1,4 @@
-"""What the files of VTK's family hold: datasets of a step, and lists of steps, arrays and blocks for `vvgt info`."""
+"""Contents of the files of VTK's family: datasets of a step, and lists of steps, arrays and blocks for `vvgt info`."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ LISTED = 50  # blocks and steps
 
 
 def datasets(program: str, path: Path, time: int | None, array: str | None = None) -> tuple[list[Leaf], list[float]]:
-    """The datasets of a time step, and the times of all steps.
+    """Read the datasets of a time step, and the times of all steps.
 
     Raises:
         DataError: damaged, or a file that is named is missing or lies elsewhere.
@@ -48,7 +48,7 @@ def _indexed(index: Index, time: int | None, above: tuple[Path, ...]) -> Iterato
 
 
 def _dataset(path: Path, above: tuple[Path, ...]) -> Iterator[Leaf]:
-    """The datasets in a file that an index names."""
+    """Read the datasets in a file that an index names."""
     with open(path, "rb") as file:
         head = file.read(HEAD)
     kind = xml_kind(head)
@@ -87,7 +87,7 @@ def _reader(path: Path, kind: str | None, head: bytes) -> Any:
 
 
 def contents_of(program: str, path: Path, options: ReadOptions) -> dict[str, Any]:
-    """Steps, arrays and blocks, each a list of rows with the option that chooses it; of the first step, if of none.
+    """List steps, arrays and blocks, each a row with the option that chooses it; by default those of the first step.
 
     Raises:
         DataError: as `datasets`.
@@ -104,7 +104,7 @@ def _short(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _array(info: ArrayInfo, leaves: Sequence[Leaf]) -> dict[str, Any]:
-    """A row of an array: of vectors the range is of their lengths."""
+    """Make the row of an array: the range of vectors is that of their lengths."""
     lo, hi, holders = np.inf, -np.inf, 0
     for leaf in leaves:
         if not any(
@@ -125,7 +125,7 @@ def _array(info: ArrayInfo, leaves: Sequence[Leaf]) -> dict[str, Any]:
 
 
 def _blocks(leaves: Sequence[Leaf]) -> list[dict[str, Any]]:
-    """A row of each dataset, where there are several."""
+    """Make a row of each dataset, where there are several."""
     rows = []
     for leaf in leaves if len(leaves) > 1 else ():
         data = leaf.data

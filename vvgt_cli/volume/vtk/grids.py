@@ -33,7 +33,7 @@ from vvgt_cli.volume.vtk.xml import (
 
 
 def check_xml_grid(path: Path) -> str:
-    """See that a ``.vtu``, ``.vtr`` or ``.vts`` can hold what it declares; returns its type of dataset.
+    """Check that a ``.vtu``, ``.vtr`` or ``.vts`` can hold what it declares, and return its type of dataset.
 
     Raises:
         DataError: damaged, or it cannot.
@@ -74,7 +74,7 @@ class _Sections(Parser):
             super().section(key, words)
 
     def cells(self, first: int, second: int) -> None:
-        """Cells as numbers in a row (version 4), or as offsets and connectivity (5.1)."""
+        """Skip cells, stored as numbers in a row (version 4) or as offsets and connectivity (5.1)."""
         back = self.position
         line = self.text[back : back + 64].split(None, 2)
         if not line or line[0] != b"OFFSETS":
@@ -88,7 +88,7 @@ class _Sections(Parser):
 
 
 def check_legacy_grid(path: Path) -> None:
-    """See that a legacy ``.vtk`` mesh or grid holds what its sections declare.
+    """Check that a legacy ``.vtk`` mesh or grid holds what its sections declare.
 
     Raises:
         DataError: it does not.
@@ -98,12 +98,13 @@ def check_legacy_grid(path: Path) -> None:
 
 
 def dataset_volume(mesh: Any, options: ReadOptions, source: str, name: str) -> Volume:
-    """A vtkDataSet in memory: an image as it is, any other grid or mesh of cells resampled.
+    """Make a volume of a vtkDataSet: an image as it is, any other grid or mesh of cells resampled.
 
     Args:
         mesh: vtkDataSet (pyvista's are).
         options: ``array``, ``component``, ``spacing``, and ``dims`` of what is resampled.
-        source: for messages; ``name``: of the volume.
+        source: for messages.
+        name: of the volume.
 
     Raises:
         DataError: a surface, or damaged cells.
@@ -129,7 +130,7 @@ def dataset_volume(mesh: Any, options: ReadOptions, source: str, name: str) -> V
 
 
 def values_of(mesh: Any, info: ArrayInfo) -> np.ndarray:
-    """The numbers of an array: (n,), or (n, c) with components."""
+    """Return the numbers of an array: (n,), or (n, c) with components."""
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
     data = mesh.GetPointData() if info.where == "point" else mesh.GetCellData()
@@ -138,7 +139,7 @@ def values_of(mesh: Any, info: ArrayInfo) -> np.ndarray:
 
 
 def arrays_of(mesh: Any) -> list[ArrayInfo]:
-    """The arrays of numbers; ghost marks left out."""
+    """List the arrays of numbers, without ghost marks."""
     from vtkmodules.util.numpy_support import get_vtk_to_numpy_typemap
 
     types = get_vtk_to_numpy_typemap()
@@ -171,7 +172,7 @@ def check_cells(mesh: Any, source: str) -> None:
 
 
 def shown(mesh: Any) -> Any:
-    """A grid or mesh without its hidden cells, those with a hidden point among them; itself where it has none."""
+    """Remove hidden cells, and cells with a hidden point, from a grid or mesh; return it as it is where none are."""
     from vtkmodules.vtkCommonCore import vtkIdList
     from vtkmodules.vtkFiltersCore import vtkExtractCells
 
@@ -196,7 +197,7 @@ def shown(mesh: Any) -> Any:
 
 
 def _hidden(mesh: Any, where: str) -> np.ndarray | None:
-    """Mask of the points or cells that ghost marks hide; None where they hide none."""
+    """Return a mask of the points or cells that ghost marks hide; None where they hide none."""
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
     array = (mesh.GetPointData() if where == "point" else mesh.GetCellData()).GetArray(GHOSTS)
@@ -207,7 +208,7 @@ def _hidden(mesh: Any, where: str) -> np.ndarray | None:
 
 
 def visible(image: Any, field: np.ndarray, where: str) -> np.ndarray:
-    """The values (nz, ny, nx) of an image, NaN where they are hidden."""
+    """Set the values (nz, ny, nx) of an image to NaN where they are hidden."""
     for kind in ("point", "cell"):
         hidden = None if (kind, where) == ("point", "cell") else _hidden(image, kind)
         if hidden is not None:
@@ -217,7 +218,7 @@ def visible(image: Any, field: np.ndarray, where: str) -> np.ndarray:
 
 
 def image_place(image: Any, where: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Dims, spacing and first position (x, y, z) of the points of a vtkImageData, or of its cell centres."""
+    """Return dims, spacing and first position (x, y, z) of the points of a vtkImageData, or of its cell centres."""
     low = np.array(image.GetExtent()[::2], float)
     dims, spacing = np.array(image.GetDimensions()), np.array(image.GetSpacing())
     if where == "cell":
@@ -231,7 +232,7 @@ def _direction(image: Any) -> np.ndarray:
 
 
 def _image(image: Any, info: ArrayInfo, options: ReadOptions, source: str, name: str) -> Volume:
-    """A vtkImageData as it is: point data, or cell data on the grid of cell centres."""
+    """Make a volume of a vtkImageData: point data, or cell data on the grid of cell centres."""
     if options.dims is not None:
         raise UsageError(f"{source}: an image, which is a regular grid already; leave out --dims")
     dims, spacing, origin = image_place(image, info.where)

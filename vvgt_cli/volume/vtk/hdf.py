@@ -47,7 +47,7 @@ def read_vtkhdf(path: Path, options: ReadOptions) -> Volume:
 
 
 def _is_image(root: Any) -> bool:
-    """Whether it is an image of which nothing is hidden."""
+    """Tell whether the file is an image in which nothing is hidden."""
     hidden = any(f"{group}/{GHOSTS}" in root for group in GROUPS.values())
     return text_of(root.attrs.get("Type", "")) == "ImageData" and not hidden
 
@@ -85,7 +85,7 @@ def _image(h5py: Any, file: Any, path: Path, options: ReadOptions) -> Volume:
 def _read(
     path: Path, name: str, before: tuple[int, ...], behind: tuple[int, ...], dtype: np.dtype, box: Slices
 ) -> np.ndarray:
-    """A box of a file that is open no longer than that."""
+    """Read a box from a file that is open no longer than that."""
     import h5py
 
     with h5py.File(path, "r") as file:
@@ -93,7 +93,7 @@ def _read(
 
 
 def _times(h5py: Any, file: Any, path: Path) -> list[float]:
-    """Of the steps; none where there are none."""
+    """Return the times of the steps; none where there are none."""
     if "VTKHDF/Steps" not in file:
         return []
     values = checked_dataset(h5py, file, path, "VTKHDF/Steps/Values")
@@ -101,7 +101,7 @@ def _times(h5py: Any, file: Any, path: Path) -> list[float]:
 
 
 def _offset(h5py: Any, file: Any, path: Path, info: ArrayInfo, time: int) -> int:
-    """Where a step of an array begins, along its first axis."""
+    """Return where a step of an array begins, along its first axis."""
     name = f"VTKHDF/Steps/{GROUPS[info.where]}Offsets/{info.name}"
     return int(checked_dataset(h5py, file, path, name)[time]) if name in file else time
 

@@ -44,7 +44,7 @@ class Entry:
 
 @dataclass
 class Index:
-    """What an index says.
+    """The contents of an index file.
 
     Attributes:
         path: of it.
@@ -62,7 +62,7 @@ class Index:
         return sorted({entry.time for entry in self.entries if not math.isnan(entry.time)})
 
     def at(self, time: int | None) -> list[Entry]:
-        """The entries of a time step.
+        """Return the entries of a time step.
 
         Raises:
             UsageError: several and none chosen (`SeveralSteps`), or one that there is not.
@@ -72,7 +72,7 @@ class Index:
 
 
 def chosen_time(times: list[float], time: int | None, source: str) -> float | None:
-    """The time of step ``time``; of a single one, it; None where there are none.
+    """Return the time of step ``time``, or of the single one; None where there are none.
 
     Raises:
         UsageError: several and none chosen (`SeveralSteps`), or one that there is not.
@@ -99,7 +99,7 @@ def read_index(path: Path) -> Index:
 
 
 def _series(path: Path) -> Index:
-    """ParaView's ``{"file-series-version": "1.0", "files": [{"name": ..., "time": ...}]}``."""
+    """Read ParaView's ``{"file-series-version": "1.0", "files": [{"name": ..., "time": ...}]}``."""
     found = Index(path, "series")
     try:
         rows = json.loads(path.read_text("utf-8-sig"))["files"]
@@ -176,7 +176,7 @@ def walk_xml(
 
 
 def files_of(index: Index, entries: list[Entry], above: tuple[Path, ...] = ()) -> Iterator[tuple[Path, Entry]]:
-    """The files of entries, in the folder of the index.
+    """Yield the files of entries, in the folder of the index.
 
     Raises:
         DataError: a file that is not there, lies elsewhere, or is one of the indexes ``above``.

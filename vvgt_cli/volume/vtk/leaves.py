@@ -15,9 +15,9 @@ from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.volume.blocks import check_memory, count
 from vvgt_cli.volume.components import ArrayInfo, choose_array, select_from_array
 from vvgt_cli.volume.options import ReadOptions
-from vvgt_cli.volume.types import Volume, triple
+from vvgt_cli.volume.types import Volume, float_dtype, triple
 from vvgt_cli.volume.vtk.grids import arrays_of, check_cells, dataset_volume, image_place, shown, values_of
-from vvgt_cli.volume.vtk.resample import MOST, Samples, grid_of, kind_of, probe, sampled_volume
+from vvgt_cli.volume.vtk.resample import MOST, Samples, grid_of, probe, sampled_volume
 
 ALIGNED = 1e-3  # voxels that images of one lattice may lie off
 EDGE = 1e-6  # of a cell: samples that lie on the face of a block are in it
@@ -39,7 +39,7 @@ class Leaf:
 
 
 def leaves_of(found: Any, name: str = "") -> Iterator[Leaf]:
-    """The datasets in a vtkDataObject: itself, or those of its blocks that are there, with their levels."""
+    """Yield the datasets in a vtkDataObject: itself, or those of its blocks that are there, with their levels."""
     from vtkmodules.vtkCommonDataModel import vtkCompositeDataSet
 
     if found is None or found.IsA("vtkDataSet"):
@@ -63,7 +63,7 @@ def leaves_of(found: Any, name: str = "") -> Iterator[Leaf]:
 
 
 def arrays_in(leaves: Sequence[Leaf]) -> list[ArrayInfo]:
-    """The arrays of all datasets, each once."""
+    """List the arrays of all datasets, each once."""
     found: dict[tuple[str, str], ArrayInfo] = {}
     for leaf in leaves:
         for info in arrays_of(leaf.data):
@@ -75,7 +75,7 @@ def arrays_in(leaves: Sequence[Leaf]) -> list[ArrayInfo]:
 
 
 def volume_of(leaves: Sequence[Leaf], options: ReadOptions, source: str, name: str) -> Volume:
-    """The volume of the array that is asked for, of all datasets that hold it.
+    """Make a volume of the array that is asked for, from all datasets that hold it.
 
     Raises:
         DataError: surfaces alone, damaged cells, or memory that does not suffice.
@@ -103,8 +103,8 @@ def volume_of(leaves: Sequence[Leaf], options: ReadOptions, source: str, name: s
     dtype = np.result_type(*(values.dtype for _, values in fields))
     lattice = _lattice([leaf.data for leaf, _ in fields], info.where) if options.dims is None else None
     grid = lattice or _samples([leaf for leaf, _ in fields], options.dims, source)
-    check_memory(count(grid.dims) * (kind_of(dtype).itemsize + 1), source)
-    out = np.full(grid.dims[::-1], np.nan, kind_of(dtype))
+    check_memory(count(grid.dims) * (float_dtype(dtype).itemsize + 1), source)
+    out = np.full(grid.dims[::-1], np.nan, float_dtype(dtype))
     for leaf, values in sorted(fields, key=_coarseness):
         _paint(leaf.data, values, info.where, grid, out)
     inside = ~np.isnan(out)
@@ -115,18 +115,18 @@ def volume_of(leaves: Sequence[Leaf], options: ReadOptions, source: str, name: s
 
 
 def _coarseness(row: tuple[Leaf, np.ndarray]) -> tuple[int, float]:
-    """Sorting key that puts coarse blocks first: by level, images of one level by their cells."""
+    """Return a sorting key that puts coarse blocks first: by level, images of one level by their cells."""
     data = row[0].data
     return row[0].level, -float(np.prod(data.GetSpacing())) if data.IsA("vtkImageData") else 0.0
 
 
 def _fills(data: Any) -> bool:
-    """Whether a dataset has cells that fill a volume."""
+    """Tell whether a dataset has cells that fill a volume."""
     return data.GetNumberOfCells() > 0 and not data.IsA("vtkPolyData") and data.GetMaxSpatialDimension() == 3
 
 
 def _field(leaf: Leaf, info: ArrayInfo, options: ReadOptions, source: str) -> tuple[Leaf, np.ndarray]:
-    """A dataset whose hidden cells are gone, and the scalars (n,) of its points or cells."""
+    """Return a dataset without its hidden cells, and the scalars (n,) of its points or cells."""
     image = leaf.data.IsA("vtkImageData")
     data = leaf.data if image else shown(leaf.data)
     own = next((a for a in arrays_of(data) if (a.name, a.where) == (info.name, info.where)), info)
@@ -137,7 +137,7 @@ def _field(leaf: Leaf, info: ArrayInfo, options: ReadOptions, source: str) -> tu
 
 
 def _lattice(images: Sequence[Any], where: str) -> Samples | None:
-    """The one grid that images are boxes of; None where they are not, or it is larger than they are."""
+    """Find the one grid that images are boxes of; None where they are not, or it is larger than they are."""
     if not all(image.IsA("vtkImageData") and _upright(image) for image in images):
         return None
     places = [image_place(image, where) for image in images]
@@ -156,13 +156,13 @@ def _lattice(images: Sequence[Any], where: str) -> Samples | None:
 
 
 def _upright(image: Any) -> bool:
-    """Whether an image's axes are x, y and z."""
+    """Tell whether an image's axes are x, y and z."""
     matrix = image.GetDirectionMatrix()
     return all(matrix.GetElement(r, c) == (r == c) for r in range(3) for c in range(3))
 
 
 def _samples(leaves: Sequence[Leaf], dims: tuple[int, int, int] | None, source: str) -> Samples:
-    """Samples that fill all datasets: as fine as the finest level of images, else about as many as cells."""
+    """Choose samples that fill all datasets: as fine as the finest level of images, else about as many as cells."""
     bounds = np.array([leaf.data.GetBounds() for leaf in leaves]).reshape(-1, 3, 2)
     box = np.stack([bounds[..., 0].min(axis=0), bounds[..., 1].max(axis=0)], axis=1)
     cells = sum(leaf.data.GetNumberOfCells() for leaf in leaves)
@@ -193,7 +193,7 @@ def _paint(data: Any, values: np.ndarray, where: str, grid: Samples, out: np.nda
 
 
 def _of_image(image: Any, values: np.ndarray, where: str, grid: Samples) -> tuple[np.ndarray, np.ndarray]:
-    """Samples of an upright image, and a mask of those in it: cells are constant, points interpolated linearly."""
+    """Sample an upright image, and mask the samples in it: cells are constant, points interpolated linearly."""
     from vvgt_cli.volume.vtk.grids import visible
 
     dims, spacing, first = image_place(image, where)

@@ -60,13 +60,14 @@ class Parser:
     KINDS: tuple[str, ...] = ("STRUCTURED_POINTS", "IMAGE_DATA")
 
     def __init__(self, text: mmap.mmap, path: Path) -> None:
+        """Begin at the start of ``text``."""
         self.text, self.path, self.position = text, path, 0
         self.arrays: list[_Array] = []
         self.geometry: dict[str, list[float]] = {}
         self.where, self.tuples = "", 0
 
     def line(self) -> str | None:
-        """The next line, or None at the end."""
+        """Read the next line; None at the end."""
         if self.position >= len(self.text):
             return None
         end = self.text.find(b"\n", self.position, self.position + 4096)
@@ -77,13 +78,14 @@ class Parser:
         return raw.decode("utf-8", "replace").strip()
 
     def words(self) -> list[str] | None:
-        """The words of the next line that is not blank."""
+        """Read the words of the next line that is not blank."""
         while (line := self.line()) is not None:
             if line:
                 return line.split()
         return None
 
     def bad(self, what: str) -> DataError:
+        """Make the error for what was found here."""
         return DataError(f"{self.path}: {what} (near byte {self.position}); check that the file is whole")
 
     def parse(self) -> None:
@@ -105,7 +107,7 @@ class Parser:
             self.section(words[0].upper(), words)
 
     def section(self, key: str, words: list[str]) -> None:
-        """One line that is a keyword, with the values that belong to it."""
+        """Read one line that is a keyword, with the values that belong to it."""
         if key in ("DIMENSIONS", "ORIGIN", "SPACING", "ASPECT_RATIO", "EXTENT", "DIRECTION"):
             self.geometry["SPACING" if key == "ASPECT_RATIO" else key] = [float(w) for w in words[1:]]
         elif key in ("POINT_DATA", "CELL_DATA"):
@@ -129,6 +131,7 @@ class Parser:
             raise self.bad(f"unknown section {key[:40]!r}")
 
     def scalars(self, words: list[str]) -> None:
+        """Note the array of a SCALARS section, whose lookup table may follow."""
         back = self.position
         table = self.words()
         if table is None or table[0].upper() != "LOOKUP_TABLE":
@@ -136,7 +139,7 @@ class Parser:
         self.array(words[1], words[2], int(words[3]) if len(words) > 3 else 1, self.tuples, active=True)
 
     def field(self, n: int) -> None:
-        """``n`` arrays of a FIELD section, each with a line of its own."""
+        """Note the ``n`` arrays of a FIELD section, each with a line of its own."""
         for _ in range(n):
             words = self.words()
             if words and words[0].upper() == "METADATA":
@@ -148,6 +151,7 @@ class Parser:
             self.array(words[0], words[3], int(words[1]), int(words[2]), active=False)
 
     def array(self, name: str, kind: str, components: int, tuples: int, *, active: bool) -> None:
+        """Note an array whose values begin here, and skip them."""
         kind = kind.lower()
         if components < 1 or tuples < 0:
             raise self.bad(f"array {name[:40]!r} of {tuples} x {components} values")
@@ -177,7 +181,7 @@ class Parser:
                 self.position = position
 
     def skip_strings(self, n: int) -> None:
-        """Strings are lines in text; in binary each has a length in 1, 2, 4 or 8 bytes, as its first two bits say."""
+        """Skip strings: lines in text; in binary each has a length in 1, 2, 4 or 8 bytes, as its first two bits say."""
         for _ in range(n):
             if not self.binary:
                 self.line()
@@ -190,7 +194,7 @@ class Parser:
 
 
 def _values(parser: Parser, array: _Array, shape: tuple[int, int, int]) -> np.ndarray:
-    """(nz, ny, nx, c) stored values of an array."""
+    """Read the stored values (nz, ny, nx, c) of an array."""
     full = (*shape, array.info.components)
     n = array.tuples * array.info.components
     if not parser.binary:
@@ -207,7 +211,7 @@ def _values(parser: Parser, array: _Array, shape: tuple[int, int, int]) -> np.nd
 
 
 def _grid(parser: Parser, where: str) -> tuple[tuple[int, ...], list[float], list[float]]:
-    """Dims, spacing and origin (x, y, z) of point or cell centres."""
+    """Return dims, spacing and origin (x, y, z) of point or cell centres."""
     geometry = parser.geometry
     dims = [int(d) for d in geometry.get("DIMENSIONS", [])]
     spacing, origin = geometry.get("SPACING", [1.0] * 3), list(geometry.get("ORIGIN", [0.0] * 3))

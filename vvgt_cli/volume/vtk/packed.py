@@ -27,7 +27,7 @@ def packed_array(
     path: Path, compressor: str, word: np.dtype, coded: bool, start: int, dtype: np.dtype, shape: tuple[int, ...],
     component: int | None, info: ArrayInfo,
 ) -> Stored:  # fmt: skip
-    """A component of an array that stays in its file.
+    """Wrap a component of an array that stays in its file.
 
     Args:
         path: the file.
@@ -77,10 +77,12 @@ def packed_array(
 
 @dataclass(frozen=True)
 class _Blocks:
-    """Where the blocks of an array lie.
+    """The positions of an array's blocks.
 
     Attributes:
-        path, compressor, coded: as of `packed_array`.
+        path: the file.
+        compressor: as VTKFile names it.
+        coded: in base64.
         place: byte of the file where they begin.
         begins: (n + 1) packed bytes before each, and in all.
         each: bytes of one, unpacked.
@@ -96,7 +98,7 @@ class _Blocks:
     size: int
 
     def read(self, lo: int, hi: int, kept: dict[int, bytes]) -> bytes:
-        """Bytes ``lo`` to ``hi`` of the values; ``kept`` holds the block that was unpacked last."""
+        """Read bytes ``lo`` to ``hi`` of the values; ``kept`` holds the block that was unpacked last."""
         first, last = lo // self.each, (hi - 1) // self.each
         begin = int(self.begins[first])
         packed = self._bytes(begin, int(self.begins[last + 1]))
@@ -110,7 +112,7 @@ class _Blocks:
         return b"".join(parts)[lo - first * self.each : hi - first * self.each]
 
     def _bytes(self, lo: int, hi: int) -> bytes:
-        """Packed bytes ``lo`` to ``hi``."""
+        """Read packed bytes ``lo`` to ``hi``."""
         with open(self.path, "rb") as file:
             if not self.coded:
                 file.seek(self.place + lo)

@@ -21,8 +21,7 @@ from vvgt_cli.volume.components import ArrayInfo, choose_array, selected_dtype
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.stored import Slices, Stored, is_file_backed, put_block, read_block
-from vvgt_cli.volume.types import Volume, triple
-from vvgt_cli.volume.vtk.resample import kind_of
+from vvgt_cli.volume.types import Volume, float_dtype, triple
 from vvgt_cli.volume.vtk.xml import (
     GHOSTS,
     HIDDEN,
@@ -107,7 +106,7 @@ class _Pieces:
         self.chunks = (min(z, DEPTH), y, x)
 
     def _scan(self, k: int) -> Scan:
-        """What the file of piece ``k`` says; it lies in the folder of the index."""
+        """Scan the file of piece ``k``, which lies in the folder of the index."""
         file = data_file(self.path, self.names[k])
         found = scan(file)
         if found.kind != "ImageData" or not found.image:
@@ -115,20 +114,20 @@ class _Pieces:
         return found
 
     def _dtype(self, found: Scan) -> np.dtype:
-        """Of the values: that of the index, or what NaN and magnitudes need."""
+        """Return the type of the values: that of the index, or what NaN and magnitudes need."""
         dtype = selected_dtype(self.info, self.options.component, str(self.path))
         self.hiding = any(found.find(GHOSTS, where) for where in HIDDEN) and not all(
             map(self._shown, range(len(self.names)))
         )
-        return kind_of(dtype) if self.hiding else dtype
+        return float_dtype(dtype) if self.hiding else dtype
 
     def _shown(self, k: int) -> bool:
-        """Whether the header of piece ``k`` says that its ghost marks hide nothing: they only tell who else has it."""
+        """Tell whether the ghost marks of piece ``k`` hide nothing, by its header: they may only mark shared values."""
         rows = [row for where in HIDDEN if (row := self._scan(k).find(GHOSTS, where))]
         return all(row[1].get("RangeMax", "") in ("0", "1") for row in rows)
 
     def read(self, slices: Slices) -> np.ndarray:
-        """The values of a box, (z, y, x)."""
+        """Read the values of a box, (z, y, x)."""
         lo = np.array([s.start for s in slices[::-1]])
         hi = np.array([s.stop for s in slices[::-1]])
         out = np.full((hi - lo)[::-1], np.nan, self.dtype) if self.hiding else np.empty((hi - lo)[::-1], self.dtype)
@@ -158,7 +157,7 @@ class _Pieces:
             )
 
     def _piece(self, k: int) -> tuple[Volume, np.ndarray]:
-        """Piece ``k`` and its first voxel in the whole; what was used last is kept."""
+        """Return piece ``k`` and its first voxel in the whole; the ones used last are kept."""
         with self._lock:
             if k in self._kept:
                 self._kept.move_to_end(k)
@@ -196,14 +195,14 @@ class _Pieces:
 
 
 def _overlapping(lo: np.ndarray, hi: np.ndarray) -> bool:
-    """Whether boxes (n, 3) from ``lo`` to ``hi`` overlap; of more than `FEW` nobody looks, and they count as if."""
+    """Tell whether boxes (n, 3) from ``lo`` to ``hi`` overlap; more than `FEW` are not compared and count as if."""
     if len(lo) > FEW:
         return True
     return any(((lo[k + 1 :] < hi[k]) & (lo[k] < hi[k + 1 :])).all(axis=1).any() for k in range(len(lo)))
 
 
 def contents_of(path: Path, options: ReadOptions) -> dict[str, Any]:
-    """The arrays of a ``.pvti``, a row each with the range that the headers of its pieces tell, and its pieces.
+    """List the arrays of a ``.pvti``, each with the range that the headers of its pieces state, and its pieces.
 
     Raises:
         DataError: damaged.
@@ -212,15 +211,15 @@ def contents_of(path: Path, options: ReadOptions) -> dict[str, Any]:
     pieces = [scan(data_file(path, name)) for name, _ in index.sources[:LISTED]]
     rows = []
     for info in index.infos:
-        told = [found[1] for piece in pieces if (found := piece.find(info.name, info.where))]
+        stated = [found[1] for piece in pieces if (found := piece.find(info.name, info.where))]
         row: dict[str, Any] = {
             "array": info.name,
             "data": info.where,
             "dtype": info.dtype,
             "components": info.components,
         }
-        if len(told) == len(index.sources) and all({"RangeMin", "RangeMax"} <= set(a) for a in told):
-            ends = [float(a[key]) for a in told for key in ("RangeMin", "RangeMax")]
+        if len(stated) == len(index.sources) and all({"RangeMin", "RangeMax"} <= set(a) for a in stated):
+            ends = [float(a[key]) for a in stated for key in ("RangeMin", "RangeMax")]
             row["range"] = [min(ends), max(ends)]
         rows.append({**row, "option": f"--array {info.name}"})
     blocks = [{"pieces": len(index.sources), "first": index.sources[0][0]}] if index.sources else []

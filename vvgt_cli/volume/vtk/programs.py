@@ -42,7 +42,7 @@ class Program:
 def read_program(
     program: Program, path: Path, time: int | None, array: str | None = None
 ) -> tuple[list[Leaf], list[float]]:
-    """The datasets of a time step, and the times of all steps.
+    """Read the datasets of a time step, and the times of all steps.
 
     Raises:
         DataError: damaged, or a file that it names is missing or lies elsewhere, or VTK cannot read field ``array``.
@@ -55,7 +55,7 @@ def read_program(
         reader.UpdateInformation()
         facts = reader.GetOutputInformation(0)
         times = list(facts.Get(vtkStreamingDemandDrivenPipeline.TIME_STEPS()) or ())
-        told = message(errors=True)
+        first_error = message(errors=True)
         chosen = chosen_time(times, time, str(path))
         if chosen is None:
             reader.Update()
@@ -63,8 +63,8 @@ def read_program(
             reader.UpdateTimeStep(chosen)
         found = reader.GetOutputDataObject(0)
         leaves = [leaf for leaf in leaves_of(found) if leaf.data.GetNumberOfPoints() > 0]
-        error, errors = message(errors=True) or told, message(errors=True, every=True)
-    if program.skips and leaves and error and not told and _mesh_is_sound(program, path, chosen):
+        error, errors = message(errors=True) or first_error, message(errors=True, every=True)
+    if program.skips and leaves and error and not first_error and _mesh_is_sound(program, path, chosen):
         held = {info.name for info in arrays_in(leaves)}
         lost = [name for k in range(reader.GetNumberOfCellArrays()) if (name := reader.GetCellArrayName(k)) not in held]
         lost = [
@@ -108,7 +108,7 @@ def _check_names(path: Path, names: Sequence[str]) -> None:
 
 
 def _small(path: Path) -> str:
-    """The text of a file that describes others."""
+    """Read the text of a file that describes others."""
     if path.stat().st_size > MAX_BYTES:
         raise DataError(f"{path}: {path.stat().st_size} bytes; expected at most {MAX_BYTES >> 20} MiB of text")
     return path.read_text("utf-8-sig", "replace")
@@ -237,7 +237,7 @@ def _cgns(path: Path) -> Any:
 
 
 def _plot3d(path: Path) -> Any:
-    """``NAME.xyz`` with ``NAME.q`` or ``NAME.f`` beside it, or ParaView's ``.p3d``, JSON that names them."""
+    """Make the reader of ``NAME.xyz`` with ``NAME.q`` or ``.f`` beside it, or of ParaView's ``.p3d`` (JSON)."""
     from vtkmodules.vtkIOParallel import vtkMultiBlockPLOT3DReader
 
     stated: dict[str, Any] = {"auto-detect-format": True}

@@ -11,13 +11,13 @@ import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.volume.blocks import check_memory, count
-from vvgt_cli.volume.types import Volume, triple
+from vvgt_cli.volume.types import Volume, float_dtype, triple
 
 MOST = 512  # voxels along an axis, where nobody said how many
 
 
 def rectilinear(coordinates: Sequence[np.ndarray]) -> Any:
-    """A vtkRectilinearGrid of points at ascending coordinates along x, y and z."""
+    """Make a vtkRectilinearGrid of points at ascending coordinates along x, y and z."""
     from vtkmodules.util.numpy_support import numpy_to_vtk
     from vtkmodules.vtkCommonDataModel import vtkRectilinearGrid
 
@@ -57,7 +57,7 @@ def resample(
 
 @dataclass(frozen=True)
 class Samples:
-    """Where values are sampled: dims, spacing, and the first sample, (x, y, z)."""
+    """A regular grid of samples: dims, spacing, and the first sample, (x, y, z)."""
 
     dims: tuple[int, int, int]
     spacing: tuple[float, float, float]
@@ -65,7 +65,7 @@ class Samples:
 
 
 def grid_of(bounds: np.ndarray, dims: tuple[int, int, int] | None, cells: int, source: str) -> Samples:
-    """Samples at the centres of voxels that fill ``bounds`` (3, 2).
+    """Choose samples at the centres of voxels that fill ``bounds`` (3, 2).
 
     Raises:
         DataError: bounds that are not finite.
@@ -78,7 +78,7 @@ def grid_of(bounds: np.ndarray, dims: tuple[int, int, int] | None, cells: int, s
 
 
 def probe(mesh: Any, values: np.ndarray, where: str, grid: Samples) -> tuple[np.ndarray, np.ndarray]:
-    """Values on a vtkDataSet at samples, by vtkProbeFilter.
+    """Sample the values on a vtkDataSet, by vtkProbeFilter.
 
     Args:
         mesh: a vtkDataSet.
@@ -112,18 +112,14 @@ def probe(mesh: Any, values: np.ndarray, where: str, grid: Samples) -> tuple[np.
     return vtk_to_numpy(found.GetArray("values")).reshape(shape), inside.reshape(shape)
 
 
-def kind_of(dtype: np.dtype) -> np.dtype:
-    """The floats that hold values of a type, and NaN."""
-    return np.dtype(np.float32 if dtype.itemsize <= (4 if dtype.kind == "f" else 2) else np.float64)
-
-
 def sampled_volume(
     values: np.ndarray, inside: np.ndarray, dtype: np.dtype, grid: Samples, dims: object, source: str, name: str
 ) -> Volume:
-    """The volume of samples; a message says how many they are where nobody did.
+    """Make the volume of samples; warn of their number where ``dims`` is None.
 
     Args:
         values: (nz, ny, nx), NaN where not ``inside``.
+        inside: mask of the samples in a cell.
         dtype: of the values before.
         grid: the samples.
         dims: what was asked for, None: nothing.
@@ -142,7 +138,7 @@ def sampled_volume(
             stacklevel=2,
         )
     label = f"{name} (resampled to {_text(grid.dims)})"
-    return Volume(values.astype(kind_of(dtype)), grid.spacing, grid.origin, name=label)
+    return Volume(values.astype(float_dtype(dtype)), grid.spacing, grid.origin, name=label)
 
 
 def _text(size: Sequence[int]) -> str:
@@ -152,7 +148,7 @@ def _text(size: Sequence[int]) -> str:
 def _grid(
     bounds: np.ndarray, dims: tuple[int, int, int] | None, cells: int
 ) -> tuple[tuple[int, int, int], tuple[float, float, float]]:
-    """Voxels and their edges along x, y, z."""
+    """Return voxels and their edges along x, y, z."""
     extent = bounds[:, 1] - bounds[:, 0]
     thick = extent > 0
     if dims is None:

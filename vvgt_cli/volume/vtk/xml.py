@@ -1,7 +1,7 @@
-"""VTK XML images (``.vti``), read by VTK; a plain (raw, appended) array is memory-mapped instead, a packed one of which
-boxes are wanted unpacked box by box (`vtk_packed`).
+"""VTK XML images (``.vti``), read by VTK.
 
-The XML is scanned first: sizes are checked against the file before VTK allocates. VTK's messages become one error.
+A plain (raw, appended) array is memory-mapped instead; a compressed one may be unpacked box by box (`packed`). The
+XML is scanned first: sizes are checked against the file before VTK allocates. VTK's messages become one error.
 """
 
 from __future__ import annotations
@@ -21,11 +21,10 @@ from vvgt_cli.volume.headers import type_of
 from vvgt_cli.volume.options import ReadOptions
 from vvgt_cli.volume.readers import volume_name
 from vvgt_cli.volume.space import unit_rows
-from vvgt_cli.volume.types import IDENTITY, Volume
+from vvgt_cli.volume.types import IDENTITY, Volume, float_dtype
 from vvgt_cli.volume.vtk.blocks import check_blocks
 from vvgt_cli.volume.vtk.messages import quiet_vtk
 from vvgt_cli.volume.vtk.packed import packed_array
-from vvgt_cli.volume.vtk.resample import kind_of
 
 # Most that a byte of the file can stand for: deflate 1032, LZ4 255, LZMA some 7000; "0 " for a double in text.
 _RATIO = {"": 4, "vtkZLibDataCompressor": 1040, "vtkLZ4DataCompressor": 256, "vtkLZMADataCompressor": 10000}
@@ -37,9 +36,9 @@ HIDDEN = {"point": 2, "cell": 32}
 
 @dataclass
 class Scan:
-    """What the XML says; arrays are those of the first piece, points and cells of all.
+    """The contents of the XML; arrays are those of the first piece, points and cells of all.
 
-    Of an index of pieces, ``sources`` are the files that it names, with their extents.
+    In an index of pieces, ``sources`` are the files that it names, with their extents.
     """
 
     kind: str = ""
@@ -61,7 +60,7 @@ class Scan:
         return [info for info, _ in self.arrays if info.name != GHOSTS]
 
     def find(self, name: str, where: str) -> tuple[ArrayInfo, dict[str, str]] | None:
-        """An array and its attributes, None where there is none of the name."""
+        """Return an array and its attributes, None where there is none of the name."""
         return next((row for row in self.arrays if (row[0].name, row[0].where) == (name, where)), None)
 
 
@@ -147,7 +146,7 @@ class Grid:
 
 
 def extent_of(text: str, path: Path, what: str = "WholeExtent") -> list[int]:
-    """The six numbers of an extent.
+    """Parse the six numbers of an extent.
 
     Raises:
         DataError: they are not.
@@ -156,7 +155,7 @@ def extent_of(text: str, path: Path, what: str = "WholeExtent") -> list[int]:
 
 
 def extent_dims(image: dict[str, str], path: Path) -> list[int]:
-    """Points along (x, y, z) of an image or a structured grid, by its attributes.
+    """Return the points along (x, y, z) of an image or a structured grid, by its attributes.
 
     Raises:
         DataError: none along an axis.
@@ -169,7 +168,7 @@ def extent_dims(image: dict[str, str], path: Path) -> list[int]:
 
 
 def stored_ratio(found: Scan, path: Path) -> int:
-    """Most bytes of values that a byte of the file can stand for.
+    """Return the most bytes of values that a byte of the file can stand for.
 
     Raises:
         DataError: an unknown compressor.
@@ -181,7 +180,7 @@ def stored_ratio(found: Scan, path: Path) -> int:
 
 
 def image_grid(image: dict[str, str], where: str, path: Path) -> Grid:
-    """The grid of points, or of cell centres (half a voxel further, one fewer along each axis), by its attributes.
+    """Return the grid of points, or of cell centres (half a voxel further, one fewer along each axis), by attributes.
 
     Raises:
         DataError: numbers that are none.
@@ -223,7 +222,7 @@ def read_vti(path: Path, options: ReadOptions) -> Volume:
 
 
 def image_values(found: Scan, info: ArrayInfo, grid: Grid, options: ReadOptions, path: Path) -> np.ndarray:
-    """The values (nz, ny, nx) of an image's array, mapped where they are stored plainly; NaN where they are hidden.
+    """Read an image's array (nz, ny, nx), mapped where it is stored plainly; NaN where it is hidden.
 
     With ``options.stored``, compressed ones stay in the file where they are appended and nothing is hidden.
 
@@ -246,7 +245,7 @@ def image_values(found: Scan, info: ArrayInfo, grid: Grid, options: ReadOptions,
 
 
 def _stored(found: Scan, info: ArrayInfo, grid: Grid, path: Path) -> np.ndarray:
-    """(nz, ny, nx, c) values of an array, mapped or by VTK."""
+    """Read the values (nz, ny, nx, c) of an array, mapped or by VTK."""
     row = found.find(info.name, info.where)
     shape = (*reversed(grid.dims), info.components)
     _check_declared(found, info, count(shape), path)
@@ -256,14 +255,14 @@ def _stored(found: Scan, info: ArrayInfo, grid: Grid, path: Path) -> np.ndarray:
 
 
 def without(values: np.ndarray, hidden: np.ndarray) -> np.ndarray:
-    """``values`` with NaN where ``hidden``; themselves where nothing is."""
+    """Set ``values`` to NaN where ``hidden``; return them as they are where nothing is."""
     if not hidden.any():
         return values
-    return np.where(hidden, np.nan, values).astype(kind_of(values.dtype))
+    return np.where(hidden, np.nan, values).astype(float_dtype(values.dtype))
 
 
 def around(cells: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Points (nz, ny, nx) of which every cell around is in ``cells``, a mask."""
+    """Mask the points (nz, ny, nx) whose surrounding cells are all in ``cells``, a mask."""
     for axis, n in enumerate(shape):
         if n > cells.shape[axis]:
             ones = np.ones_like(np.take(cells, [0], axis))
@@ -286,7 +285,7 @@ def _check_declared(found: Scan, info: ArrayInfo, n_values: int, path: Path) -> 
 def _mapped(
     found: Scan, attributes: dict[str, str], info: ArrayInfo, shape: tuple[int, ...], path: Path
 ) -> np.ndarray | None:
-    """The array memory-mapped, if it is stored plainly, in one piece."""
+    """Map an array that is stored plainly, in one piece; None for others."""
     plain = found.appended == "raw" and not found.root.get("compressor") and found.data_start >= 0
     if not plain or found.pieces != 1 or attributes.get("format") != "appended" or attributes["type"] == "Bit":
         return None
@@ -301,14 +300,14 @@ def _mapped(
 
 
 def _order(found: Scan, info: ArrayInfo) -> tuple[np.dtype, np.dtype]:
-    """Types of the words before an array's values, and of the values, as the file has them."""
+    """Return the types of the words before an array's values and of the values, as stored."""
     order = ">" if found.root.get("byte_order") == "BigEndian" else "<"
     word = np.dtype(order + ("u8" if found.root.get("header_type") == "UInt64" else "u4"))
     return word, np.dtype(order + np.dtype(info.dtype).str[1:])
 
 
 def _packed(found: Scan, info: ArrayInfo, grid: Grid, options: ReadOptions, path: Path) -> Any:
-    """The array in its file, if it is appended and compressed, in one piece, and no value of it is hidden."""
+    """Wrap an array that is appended and compressed, in one piece, with no hidden value; None for others."""
     row = found.find(info.name, info.where)
     hidden = any(found.find(GHOSTS, where) for where in HIDDEN)
     plain = not found.root.get("compressor") or found.appended not in ("raw", "base64") or found.data_start < 0
@@ -329,7 +328,7 @@ def _packed(found: Scan, info: ArrayInfo, grid: Grid, options: ReadOptions, path
 
 
 def _by_vtk(path: Path, info: ArrayInfo, shape: tuple[int, ...]) -> np.ndarray:
-    """(nz, ny, nx, c) values by vtkXMLImageDataReader, without a copy."""
+    """Read values (nz, ny, nx, c) by vtkXMLImageDataReader, without a copy."""
     from vtkmodules.util.numpy_support import vtk_to_numpy
     from vtkmodules.vtkIOXML import vtkXMLImageDataReader
 
