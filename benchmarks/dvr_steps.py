@@ -25,9 +25,7 @@ from vvgt_cli.dvr import RenderSettings, Scene, render_view
 from vvgt_cli.dvr.kernel import FLAGS, OPAQUE, absorbed, box_span, leap, mean_optics, sample, table_coordinate
 from vvgt_cli.dvr.layout import BRICK_BITS
 from vvgt_cli.dvr.reference import rays
-from vvgt_cli.look.colormap import ColorMap
-from vvgt_cli.look.function import TransferFunction
-from vvgt_cli.look.opacity import PiecewiseOpacity
+from vvgt_cli.look.function import ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.synth import open_volume
 
 NAMES = ("ironprot-density", "bonsai-tree", "embryo-opaque", "headsq-step")

@@ -26,7 +26,7 @@ from vvgt_cli.dvr import Scene, render_view
 from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.formats.streamed import MANIFEST, nodes_of, read_manifest
-from vvgt_cli.images.metrics.texture import OPAQUE, SMOOTH, band
+from vvgt_cli.images.metrics import OPAQUE, SMOOTH, band
 from vvgt_cli.score.viewing import VIEWS, near_cameras
 from vvgt_cli.splat import render
 

@@ -83,13 +83,13 @@ def placed(field: Resident, gaussians: int) -> Gaussians:
     run = Run(Console(quiet=True), ConversionReport("convert"))
     request = ConvertRequest(SourceRequest("-"), None, FitOptions(max_gaussians=gaussians, size=SIZE), live=True)
     assert isinstance(source.tf, TransferFunction)
-    foggy = field.shown_by(fog(source.statistics, source.tf))
+    foggy = field.with_look(source.shown_by(fog(source.statistics, source.tf)))
     return wide_enough(carrying(run, foggy, placed_by(run, foggy, request)), SIZE)
 
 
 def score(field: Resident, gaussians: Gaussians) -> float:
     """dB on three test views."""
-    return score_test_views(field, gaussians, SIZE, RenderSettings(), perceptual=False, only=PREVIEW_VIEWS).psnr
+    return score_test_views(field.views, gaussians, SIZE, RenderSettings(), perceptual=False, only=PREVIEW_VIEWS).psnr
 
 
 def measured_lit(name: str, field: Resident, gaussians: int) -> list[dict[str, Any]]:
@@ -97,7 +97,7 @@ def measured_lit(name: str, field: Resident, gaussians: int) -> list[dict[str, A
     live, table, rows = placed(field, gaussians), table_of(field.source), []
     for title, lights in {"none": (), "headlight": ("headlight",), "0.3,-0.8,0.5": ("0.3,-0.8,0.5",)}.items():
         source = replace(field.source, lighting=LightOptions(lights).lighting(None, None) if lights else None)
-        lit = Resident(source, source.scene())
+        lit = Resident.of(source)
         run = Run(Console(quiet=True), ConversionReport("init"))
         fit = FitOptions(max_gaussians=gaussians, size=SIZE)
         work = Work(run, lit, fit, degree=degree_of(ConvertRequest(SourceRequest("-"), None, fit), source))
@@ -120,7 +120,7 @@ def measured(name: str, field: Resident, gaussians: int, beside: bool) -> list[d
     rows, pixel = [], pixel_width(SIZE)
     for title, tf in functions(source.statistics).items():
         spacing = float(np.mean(source.volume.spacing))
-        shown = field.shown_by(replace(tf, opacity_unit_distance=spacing))
+        shown = field.with_look(source.shown_by(replace(tf, opacity_unit_distance=spacing)))
         table = table_of(shown.source)
         looks = {
             "live": shown_by(live, table, pixel), "bytes": shown_by(packed, table, pixel),
@@ -152,7 +152,7 @@ def main(
         return
     rows = []
     for name, source in read_scenes(*paths, names or None):  # type: ignore[misc]
-        field = Resident(source, source.scene())
+        field = Resident.of(source)
         for count in gaussians:
             rows += measured_lit(name, field, count) if lit else measured(name, field, count, beside)
     write_rows(output, rows)

@@ -58,14 +58,16 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 @pytest.fixture(scope="session", autouse=True)
-def small_seats() -> Iterator[None]:
-    """Conversions and reports in this process are scored at their size and twice that, not for a 4K screen.
+def small_conversions() -> Iterator[None]:
+    """Spare conversions and reports in this process what takes most of a small one's time.
 
-    That would be half the time of a small one; `vvgt` in processes of its own has 4K.
+    They are scored at their size and twice that, not for a 4K screen, and visibility is marched through 64 x 64 pixels,
+    which meet every cell of 30 voxels. `vvgt` in a process of its own does as users have it.
     """
     with pytest.MonkeyPatch.context() as patch:
         for module in ("conversion.stages.scores", "commands.ladder"):
             patch.setattr(f"vvgt_cli.{module}.from_above", lambda size: [(size, 40.0), (2 * size, 40.0)])
+        patch.setattr("vvgt_cli.closed_form.closed_form.MARCH_SIZE", 64)
         yield
 
 

@@ -256,7 +256,7 @@ def transfer() -> list[Seed]:
     from test_look_formats import ITF, XML, mrml, vp, vp_json
 
     from vvgt_cli.look import read_transfer_function
-    from vvgt_cli.look.readers.named import FILE as NAMED
+    from vvgt_cli.look.readers.names import FILE as NAMED
 
     def read(path: Path) -> None:
         tf = read_transfer_function(str(path))

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tests.random_clouds import random_cloud
 from vvgt_cli.cameras.blocks import BLOCK, ENOUGH, spread_blocks
 from vvgt_cli.cameras.sets import look_at
-from vvgt_cli.checks.clouds import cloud
 from vvgt_cli.dvr import RenderSettings, Scene, render_view
 from vvgt_cli.errors import UsageError
 from vvgt_cli.look.readers import minimal
@@ -52,7 +52,7 @@ def test_what_is_picked_is_what_is_there(width, height):
 
 
 def test_splats_on_blocks_are_the_whole_pictures_and_nothing_elsewhere():
-    camera, gaussians = look_at((2.0, -1.7, 1.1), width=600, height=600), cloud(500, 3)
+    camera, gaussians = look_at((2.0, -1.7, 1.1), width=600, height=600), random_cloud(500, 3)
     blocks = spread_blocks(600, 600, 1)
     whole, part = render(gaussians, camera), render(gaussians, camera, blocks=blocks)
     assert np.array_equal(whole[blocks.mask()], part[blocks.mask()])

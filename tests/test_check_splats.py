@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.random_clouds import random_cloud
 from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.checks import run_case
-from vvgt_cli.checks.clouds import cloud
-from vvgt_cli.checks.splats import mirrored, order_cases, orientations, place_cases, small_views, value_cases
+from vvgt_cli.checks.splats import is_mirror, order_cases, orientation_cameras, orientations, place_cases, value_cases
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.formats import read_columns
 from vvgt_cli.gaussians.formats.splats import ply_bytes
@@ -132,13 +132,13 @@ def lopsided() -> Gaussians:
 @pytest.mark.parametrize("name", ["-x y z", "y x z", "z -y -x", "x y -z"])
 def test_another_orientation_is_named(name):
     good = lopsided()
-    seen = [render(good, camera) for camera in small_views()]
+    seen = [render(good, camera) for camera in orientation_cameras()]
     matrix = dict(orientations())[name]
     laid = transform(good, np.linalg.inv(matrix))
     turned = run_case(list(place_cases(laid, laid, np.ones(3), seen))[1])
     assert not turned.passed
     assert f"with axes {name}" in turned.what
-    assert ("mirror image" in turned.what) == mirrored(name) == (np.linalg.det(matrix) < 0)
+    assert ("mirror image" in turned.what) == is_mirror(name) == (np.linalg.det(matrix) < 0)
     assert run_case(list(place_cases(good, good, np.ones(3), seen))[1]).value == 0
 
 
@@ -161,8 +161,7 @@ def values(gaussians, edge=2.0):
 
 
 def test_extreme_values_are_found_one_by_one():
-    good = cloud(200, scale=0.02)
-    plain = replace(good, colors=np.clip(good.colors, 0, 1))
+    plain = random_cloud(200, size=0.02)
     assert all(outcome.passed for outcome in values(plain).values())
     tiny = values(replace(plain, log_scales=np.full((200, 3), -12.0)))
     assert not tiny["sigma below a quarter of a pixel at 1000 px"].passed

@@ -37,13 +37,6 @@ def noise(size=(28, 20, 24), seed: int = 2) -> Volume:
     return analytic.random_field(size, cycles=4, seed=seed)
 
 
-@pytest.fixture(autouse=True)
-def small_march(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Volumes of 30 voxels need no rays at 200 px to see all their cells."""
-    if "quality" not in request.node.name:
-        monkeypatch.setattr(closed_form_module, "MARCH_SIZE", 64)
-
-
 # ---- invariants
 
 
@@ -140,7 +133,7 @@ def test_options_are_checked(options: dict, message: str) -> None:
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("budget", [1, 2, 3, 50])
+@pytest.mark.parametrize("budget", [1, 2, 3, 50, 100_000])
 def test_budget(method: str, budget: int) -> None:
     cameras = default_views("train", 3, size=32)
     scene = scene_of(noise((12, 9, 10)), Tent())

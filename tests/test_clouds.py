@@ -106,7 +106,7 @@ def test_what_several_cannot_is_said_before_anything_is_written(at):  # noqa: F8
     for path, how, words in (
         ("x.ply", {"overwrite": False}, "x_skin.ply"),
         ("{}{}.ply", {}, "expected one place"),
-        ("x_{:03d}.ply", {}, "expected one place for the name"),
+        ("x_{:03d}.ply", {}, "expected one place for the function's name"),
         ("x.html", {"frame": "world"}, "leave out frame"),
         ("x.obj", {}, "expected a name ending in"),
         ("none/x.ply", {}, "does not exist"),
@@ -118,7 +118,7 @@ def test_what_several_cannot_is_said_before_anything_is_written(at):  # noqa: F8
         result["bones"]
     with pytest.raises(vvgt.UsageError, match="pass a mapping of names"):
         vvgt.convert("ball.npy", ["bone.json", "bone.json"])
-    with pytest.raises(vvgt.UsageError, match="split_labels with 2 looks"):
+    with pytest.raises(vvgt.UsageError, match="--split-labels with functions"):
         vvgt.convert("ball.npy", ["bone.json", "skin.json"], split_labels=True)
     with pytest.raises(vvgt.UsageError, match="3 time steps"):
         vvgt.convert("four.nii", ["bone.json", "skin.json"])

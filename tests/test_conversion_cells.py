@@ -51,11 +51,11 @@ def test_cells_are_chosen_by_views_from_all_sides(tmp_path, monkeypatch):
 
 
 def test_cells_are_cut_by_error_where_there_is_a_pyramid_and_steps_follow():
-    def cut(steps, cuts=True, model=None, **limits):
-        found = Planner(Limits(**limits), 1000, steps, 0, 400, model=model, cuts=cuts).plan(CASE, 1.0)
+    def cut(steps, init="vbm", model=None, **limits):
+        found = Planner(Limits(**limits), FitOptions(1000, 400, init, steps=steps, model=model)).plan(CASE, 1.0)
         return of(found, CellsByError)
 
     assert cut(24) is not None
     assert cut(None).keep
     assert not cut(None, target_psnr=40.0).keep  # fewer Gaussians may be enough: the pyramid is needed again
-    assert cut(None, cuts=False) is cut(23) is cut(0) is cut(24, model="some") is None
+    assert cut(None, "wavelet") is cut(23) is cut(0) is cut(24, model="some") is None

@@ -12,12 +12,13 @@ from test_cli_infer import DARKER
 
 from vvgt_cli.cameras.blocks import BLOCK, ENOUGH, FEW, spread_blocks
 from vvgt_cli.conversion.convert import convert, initialise_only, planned
-from vvgt_cli.conversion.plan import DEFAULT_STEPS, MOST_STEPS, Planner, check_memory
+from vvgt_cli.conversion.plan import MOST_STEPS, Planner, check_memory
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions, Limits
 from vvgt_cli.conversion.stage import Work
 from vvgt_cli.conversion.stages import BackProjection, Network, Refinement, TrainingViews
 from vvgt_cli.conversion.stages.refinement import WIDER
 from vvgt_cli.conversion.stages.views import views_of
+from vvgt_cli.defaults import STEPS
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.field.workload import Workload, expected_wide
@@ -36,8 +37,9 @@ POINTS = [{"x": x, "rgb": [x, 0.5, 1 - x], "opacity": 0.6 * x} for x in (0.0, 0.
 
 
 def plan(steps=None, spent=1.0, begun=False, case=CASE, size=48, wide=True, **limits):
+    """The plan of a method without cells that could be cut again."""
     case = replace(case, size=size)
-    return Planner(Limits(**limits), 1000, steps, 0, size, wide).plan(case, spent, begun)
+    return Planner(Limits(**limits), FitOptions(1000, size, "wavelet", steps=steps), wide=wide).plan(case, spent, begun)
 
 
 def of(found, kind):
@@ -82,27 +84,27 @@ def test_without_limits_the_default_steps_are_planned_and_back_projection_is_not
     assert [stage.name for stage in found.stages] == [
         "closed form", "check views", "views", "refinement", "test views", "seats"
     ]  # fmt: skip
-    assert steps_of(found) == DEFAULT_STEPS
+    assert steps_of(found) == STEPS
     assert [name for name, _ in found.left_out] == ["network", "back-projection"]
     assert found.seconds == pytest.approx(sum(seconds for _, seconds in found.costs()))
     step = 0.027 * (48 / 400) ** 2 + 0.0275
-    assert found.seconds == pytest.approx(1 + FORM + DEFAULT_STEPS * step + 120 * 0.05 + 4 * 0.06 + ending())
+    assert found.seconds == pytest.approx(1 + FORM + STEPS * step + 120 * 0.05 + 4 * 0.06 + ending())
     assert found.bytes == 3600 + 1000 * 68
-    assert f"{DEFAULT_STEPS} steps" in found.text()
+    assert f"{STEPS} steps" in found.text()
 
 
 @pytest.mark.parametrize(("size", "edge"), [(400, 200), (1080, 200), (300, 150)])
 def test_views_are_small_where_gaussians_are_wide(size, edge):
     found = plan(size=size)
     descent, views = of(found, Refinement), of(found, TrainingViews)
-    assert (descent.small, descent.steps, views.edge) == (True, DEFAULT_STEPS, edge)
+    assert (descent.small, descent.steps, views.edge) == (True, STEPS, edge)
     judged, glanced, whole = drawn(size, ENOUGH), drawn(size, FEW), min(size, 300)
     judge, glance = (1.2 * 0.05 * pixels / whole**2 for pixels in (judged, glanced))
     step = 0.027 * (edge / 400) ** 2 + 0.0275
     seconds = (
         1
         + FORM
-        + DEFAULT_STEPS * step
+        + STEPS * step
         + 96 * (edge / whole) ** 2 * 0.05
         + 4 * glance
         + ending(judged**0.5, judge, glance, size)
@@ -166,7 +168,7 @@ def test_views_that_do_not_fit_are_refused(monkeypatch):
 def test_gaussians_that_do_not_fit_are_refused_with_the_number_that_would(monkeypatch):
     monkeypatch.setattr("vvgt_cli.closed_form.closed_form.expected_cells", lambda *sizes: 2.0 * sizes[3])
     case = replace(CASE, gaussians=1_000_000, cells=2e6)
-    found = Planner(Limits(), 1_000_000, 0, 0, 48).plan(case, 1.0)
+    found = Planner(Limits(), FitOptions(1_000_000, 48, steps=0)).plan(case, 1.0)
     each, views = 0.8 * (2 * 294 + 1240), 0.8 * 32 * 48**2 * 29
     monkeypatch.setattr("vvgt_cli.conversion.plan.free_memory", lambda: each * 1e6 + views + 1)
     check_memory(found)
@@ -231,18 +233,18 @@ def test_more_time_is_more_steps_and_never_more_than_the_time():
 
 
 def test_a_network_runs_where_there_is_time_for_it():
-    planner = Planner(Limits(), 1000, None, 0, 400, model="some")
+    planner = Planner(Limits(), FitOptions(1000, 400, model="some"))
     case = replace(CASE, size=400)
     assert of(planner.plan(case, 1.0), Network).model == "some"
     assert not of(planner.plan(case, 1.0), Refinement).small  # it was trained on whole views
-    short = Planner(Limits(time_budget=7.0), 1000, None, 0, 400, model="some").plan(case, 1.0)
+    short = Planner(Limits(time_budget=7.0), FitOptions(1000, 400, model="some")).plan(case, 1.0)
     assert of(short, Network) is None
     assert "network" in {name for name, _ in short.left_out}
 
 
 def test_the_seconds_of_a_network_are_not_spent_on_steps_too():
     limits = Limits(time_budget=16.0)
-    alone, after = (Planner(limits, 1000, None, 0, 48, model=model).plan(CASE, 1.0) for model in (None, "some"))
+    alone, after = (Planner(limits, FitOptions(1000, 48, model=model)).plan(CASE, 1.0) for model in (None, "some"))
     assert of(after, Network).model == "some"
     assert 0 < steps_of(after) < steps_of(alone)
     assert after.seconds <= 16
@@ -375,7 +377,7 @@ def test_a_stage_that_is_not_ready_is_a_bug_that_says_so():
 
 def test_the_default_refines_and_says_what_it_left_out(tmp_path):
     report = done(tmp_path)
-    assert report.refinement["steps"] == DEFAULT_STEPS
+    assert report.refinement["steps"] == STEPS
     assert "back-projection" not in names(report)
     assert [name for name, _ in report.left_out] == ["network", "back-projection"]
     assert np.isfinite(report.scores["psnr"])

@@ -109,7 +109,7 @@ def test_what_is_kept_of_another_conversion_or_is_damaged(folder, vvgt, monkeypa
     [
         (("--time-budget", "9"), "give one of both"),
         (("--checkpoint", "no/where"), "cannot be made (No such file or directory)"),
-        (("-o", "a_{}.ply"), "a series goes on by its manifest"),
+        (("-o", "a_{}.ply"), "a series resumes from its manifest"),
     ],
 )
 def test_what_cannot_go_on_is_said(more, told, tmp_path, vvgt, monkeypatch):

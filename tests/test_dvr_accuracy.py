@@ -13,10 +13,8 @@ from vvgt_cli.dvr import RenderSettings, Scene, render_view, render_view_referen
 from vvgt_cli.dvr.layout import Optics, Voxels
 from vvgt_cli.dvr.reference import march, trilinear
 from vvgt_cli.dvr.runs import RUN, sample_run, stack_run
-from vvgt_cli.look.colormap import ColorMap
-from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.look.function import ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.lighting import Lighting
-from vvgt_cli.look.opacity import PiecewiseOpacity
 from vvgt_cli.volume import Volume
 
 WHITE = np.ones((2, 3))

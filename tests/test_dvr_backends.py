@@ -14,9 +14,7 @@ from vvgt_cli.dvr import RenderSettings, Scene, render_view_reference, render_vi
 from vvgt_cli.dvr import vtk as vtk_renderer
 from vvgt_cli.dvr.backends import view_renderer
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.look.colormap import ColorMap
-from vvgt_cli.look.function import TransferFunction
-from vvgt_cli.look.opacity import PiecewiseOpacity
+from vvgt_cli.look.function import ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.volume import Volume
 
 FINE = RenderSettings(step=0.25, samples=1)

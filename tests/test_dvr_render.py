@@ -14,9 +14,8 @@ from vvgt_cli.dvr.layout import BRICK
 from vvgt_cli.dvr.render import ray_offsets
 from vvgt_cli.dvr.runs import NEAR
 from vvgt_cli.errors import UsageError
-from vvgt_cli.look.colormap import ColorMap
+from vvgt_cli.look.function import ColorMap, PiecewiseOpacity
 from vvgt_cli.look.lighting import Lighting
-from vvgt_cli.look.opacity import PiecewiseOpacity
 from vvgt_cli.look.tables import extinction
 from vvgt_cli.volume import Volume
 
@@ -149,38 +148,12 @@ def test_the_order_of_convergence_in_the_step_is_two():
     assert abs(order - 2) < 0.2
 
 
-@pytest.mark.parametrize("per_voxel", 10.0 ** np.arange(-6, 7, 2))
-def test_a_step_function_of_any_optical_depth_is_stable_and_accurate(per_voxel):
-    opacity = min(-math.expm1(-per_voxel), 1.0)
-    step = Function([0, 0.5, np.nextafter(0.5, 1), 1], [0, 0, opacity, opacity], np.ones((4, 3)))
-    scene = Scene.build(Volume(smooth(10)), step, 1.0, bins=65536)
-    half, fine = render_view(scene, camera(), ONE_RAY), render_view(scene, camera(), FINE)
-    assert_sane(half)
-    reference = render_view_reference(scene, camera(), step=1 / 32)
-    scale = max(1 - math.exp(-min(per_voxel, 11.5) * 5), 1e-12)
-    assert np.abs(half - reference).mean() < 0.01 * scale
-    assert np.abs(fine - reference).mean() < 0.003 * scale
-
-
 def test_opacity_one_is_capped_so_that_it_has_a_limit():
     scene = Scene.build(Volume(np.ones((6, 6, 6))), Function([0, 1], [1, 1], np.ones((2, 3))), 1.0)
     image = render_view(scene, camera(9, 9), ONE_RAY)
     assert_sane(image)
     np.testing.assert_allclose(image[4, 4], 1, atol=2e-5)
     assert scene.optics.largest_extinction() == pytest.approx(extinction(np.array([1.0]), 1.0)[0] * 3)
-
-
-@pytest.mark.parametrize(
-    ("shape", "spacing"),
-    [((1, 1, 1), (1, 1, 1)), ((1, 7, 9), (1, 1, 1)), ((7, 1, 9), (1, 1, 1)), ((2, 2, 2), (1, 1000, 1)),
-     ((5, 6, 4), (1000, 1, 1)), ((5, 6, 4), (1e-30, 1e-30, 1e-30)), ((5, 6, 4), (1e30, 1e30, 1e30))],
-)  # fmt: skip
-def test_odd_shapes_and_spacings_match_the_twin(shape, spacing):
-    scene = Scene.build(Volume(field(shape, 3), spacing), RAINBOW, float(np.mean(spacing)))
-    image = render_view(scene, camera(12, 12), FINE)
-    assert_sane(image)
-    reference = render_view_reference(scene, camera(12, 12), step=1 / 16 if max(spacing) != 1000 else 1 / 2)
-    assert np.abs(image - reference).mean() < 2e-3
 
 
 @pytest.mark.parametrize("factor", [1e-30, 1.0, 1e30, 1e300])
@@ -207,17 +180,14 @@ def test_rays_along_the_axes_match_the_twin(eye):
     np.testing.assert_allclose(render_view(scene, c, FINE), render_view_reference(scene, c, step=1 / 32), atol=5e-3)
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_voxels_that_are_not_finite_are_transparent(bad):
-    data = field((8, 8, 8), 7)
-    data[2:4, 3:5, 2:6] = bad
-    scene = Scene.build(Volume(data), Function([0, 1], [0.2, 0.4]), 1.0)
-    image = render_view(scene, camera(), FINE)
-    assert_sane(image)
-    reference = render_view_reference(scene, camera(), step=1 / 32)
-    assert np.abs(image - reference).mean() < 0.01  # a segment that ends in such a cell is dropped whole
-    whole = Scene.build(Volume(field((8, 8, 8), 7)), Function([0, 1], [0.2, 0.4]), 1.0)
-    assert render_view(whole, camera(), FINE)[..., 3].sum() > image[..., 3].sum() + 1
+def test_a_view_from_far_away_that_misses_or_is_very_wide():
+    scene = Scene.build(Volume(field((8, 8, 8), 5)), RAINBOW, 1.0)
+    far = camera(16, 16, (1800.0, -1300.0, 900.0), 0.06)
+    assert np.abs(render_view(scene, far, FINE) - render_view_reference(scene, far, step=1 / 32)).mean() < 2e-3
+    assert not render_view(scene, look_at((3.0, 0, 0), target=(9.0, 0, 0), width=8, height=8), FINE).any()
+    wide, narrow = (render_view(scene, camera(width, 16), FINE) for width in (4096, 16))
+    assert_sane(wide)
+    np.testing.assert_allclose(wide[:, 2040:2056], narrow, atol=1e-6)
 
 
 def test_nothing_but_nan_is_nothing():

@@ -25,10 +25,8 @@ from vvgt_cli.field.settings import BlockOptions
 from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.gaussians import read_ply
 from vvgt_cli.images.metrics import score_views
-from vvgt_cli.look.colormap import ColorMap
-from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.look.function import ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.lighting import LightOptions
-from vvgt_cli.look.opacity import PiecewiseOpacity
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
 from vvgt_cli.splat import render
@@ -100,11 +98,11 @@ def test_pictures_that_were_not_expected_are_made_when_they_are_asked_for(tmp_pa
     request = SourceRequest(volume_of((40, 36, 44)))
     camera, settings = default_views("test", size=48)[3], RenderSettings()
     with in_blocks(request, 16, tmp_path / "a") as field:
-        field.start(VbmOptions(400, 64))
+        field.pyramid(VbmOptions(400, 64))
         late = field.view(camera, settings)
     with in_blocks(request, 16, tmp_path / "b") as field:
         field.expect([Picture(camera, settings), Picture(camera, FIT_VIEWS)])
-        field.start(VbmOptions(400, 64))
+        field.pyramid(VbmOptions(400, 64))
         assert np.array_equal(field.view(camera, settings), late)
     assert late[..., 3].max() > 0.5
 
@@ -120,7 +118,7 @@ def test_the_closed_form_of_blocks_is_that_of_memory(tmp_path, light, method):
     memory = Resident(source, source.scene())
     ours = memory.start(options).gaussians
     with in_blocks(request, 16, tmp_path / "parts") as field:
-        theirs = field.start(options).gaussians
+        theirs = field.pyramid(options).gaussians
         assert len(ours) == len(theirs)
         for name, array in ours.arrays().items():
             np.testing.assert_allclose(theirs.arrays()[name], array, atol=1e-5, err_msg=name)

@@ -50,9 +50,9 @@ def test_reports_and_previews_have_the_name_too(vvgt, tmp_path, functions):
         (("-o", "one.ply"), "-o one.ply: expected one place for the function's name"),
         (("-o", "{:04d}.ply"), "expected one place for the function's name"),
         (("-o", "{}.ply", "--preview", "p.png"), "--preview p.png: expected one place"),
-        (("-o", "{}.ply", "--dry-run"), "2 functions; expected one with --dry-run"),
-        (("-o", "{}.ply", "--shard", "1/2"), "2 functions; expected one with"),
-        (("-o", "{}.ply", "--checkpoint", "c"), "2 functions; expected one with"),
+        (("-o", "{}.ply", "--dry-run"), "--dry-run with functions: a plan is for one function"),
+        (("-o", "{}.ply", "--shard", "1/2"), "--shard with functions: shards are for series"),
+        (("-o", "{}.ply", "--checkpoint", "c"), "--checkpoint with functions: it is for one conversion"),
     ],
 )
 def test_what_several_functions_ask_for(vvgt, tmp_path, functions, monkeypatch, extra, told):
@@ -67,4 +67,4 @@ def test_functions_of_one_name_are_refused(vvgt, tmp_path, functions):
     twin = tmp_path / "other" / "bone.json"
     twin.write_text((tmp_path / "bone.json").read_text())
     done = vvgt("convert", "example:blob:16", "--tf", functions[0], "--tf", str(twin), "-o", str(tmp_path / "{}.ply"))
-    assert (done.code, "would have the same name" in done.err) == (2, True)
+    assert (done.code, "files would have one name" in done.err) == (2, True)

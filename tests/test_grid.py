@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from tests.closed_form_scenes import Ramp, Tent, scene_of, score
+from tests.stiff_scenes import camera, quadrature
 from vvgt_cli.cameras import default_views
-from vvgt_cli.checks.mapping import cuts, quadrature
-from vvgt_cli.checks.scenes import camera
+from vvgt_cli.checks.scene import require_cuts_keep_mass
 from vvgt_cli.closed_form import VbmOptions, backproject, initialise
-from vvgt_cli.closed_form import closed_form as closed_form_module
 from vvgt_cli.closed_form.closed_form import closed_form
 from vvgt_cli.closed_form.moments import base_cells
 from vvgt_cli.dvr import RenderSettings, Scene, render_view, render_view_reference, render_views
@@ -30,11 +29,6 @@ LIT = Lighting(headlight=True, directions=((0.6, -0.48, 0.64),), shadows=True, o
 @dataclass(frozen=True)
 class Named:
     name: str = "grid"
-
-
-@pytest.fixture(autouse=True)
-def small_march(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(closed_form_module, "MARCH_SIZE", 64)
 
 
 def random_grid(shape=(9, 10, 11), top: float = 3.0, share: float = 0.5, seed: int = 0) -> np.ndarray:
@@ -71,7 +65,7 @@ def classified(volume: Volume, tf: object, finer: int = 1) -> Scene:
 @pytest.mark.parametrize("lighting", [None, LIT], ids=["unlit", "lit"])
 def test_pictures_are_the_twins(top: float, lighting: Lighting | None) -> None:
     scene = grid_scene(random_grid(top=top), (1.0, 1.3, 0.7), lighting)
-    view = camera(24, 24) if top < 10 else camera(12, 12)  # the twin takes eight times as many steps then
+    view = camera(12, 12) if top < 10 else camera(6, 6)  # the twin takes eight times as many steps then
     ours, twin = render_view(scene, view, FINE), render_view_reference(scene, view, step=1 / (256 if top > 10 else 32))
     assert twin.max() > min(top / 1e3, 0.9)
     stiff = lighting is not None and top > 10  # shading is constant along a segment
@@ -151,7 +145,7 @@ def test_first_moments_converge_to_quadrature() -> None:
 
 def test_cuts_keep_the_mass() -> None:
     form = closed_form(grid_scene(random_grid((20, 20, 20), share=0.8)), 300, 64)
-    cuts(form.tree)
+    require_cuts_keep_mass(form.tree)
 
 
 def test_the_same_bytes_twice_and_turned_volumes_are_as_good() -> None:

@@ -190,8 +190,8 @@ def test_colours_by_command(vvgt, tmp_path: Path) -> None:
 
 def test_rgb_looks_as_vtk_draws_dependent_components() -> None:
     """vtkGPUVolumeRayCastMapper's picture of RGBA, independent components off, at the same steps."""
+    from tests.stiff_scenes import camera
     from tests.vtk_colors import dependent
-    from vvgt_cli.checks.scenes import camera
     from vvgt_cli.dvr import RenderSettings, Scene, render_view
     from vvgt_cli.images.metrics import psnr
 

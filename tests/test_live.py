@@ -30,10 +30,8 @@ from vvgt_cli.gaussians.live import (
 from vvgt_cli.gaussians.live_facts import LiveFacts, function_text
 from vvgt_cli.gaussians.opacity import peak_opacity
 from vvgt_cli.images.metrics import psnr
-from vvgt_cli.look.colormap import ColorMap
 from vvgt_cli.look.fog import fog
-from vvgt_cli.look.function import TransferFunction
-from vvgt_cli.look.opacity import PiecewiseOpacity
+from vvgt_cli.look.function import ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.splat import render
 from vvgt_cli.volume import Volume
 from vvgt_cli.volume.stats import Statistics, edges_of
@@ -357,8 +355,8 @@ def test_blocks_have_the_same_values_to_the_byte(tmp_path) -> None:
         request = replace(request, fit=FitOptions(max_gaussians=300, size=64), live=True)
         with opened(Run(Console(quiet=True), ConversionReport("convert")), request) as field:
             wide = replace(cloud(200), log_scales=cloud(200).log_scales + 1)
-            foggy = field.shown_by(fog(field.source.statistics))
-            found.append((field.under(wide), foggy.view(default_views("test", size=32)[0], RenderSettings())))
+            foggy = field.with_look(field.source.shown_by(fog(field.source.statistics)))
+            found.append((field.sample(wide), foggy.view(default_views("test", size=32)[0], RenderSettings())))
     np.testing.assert_array_equal(found[0][0], found[1][0])
     assert np.isfinite(found[0][0]).all(axis=1).mean() > 0.9
     np.testing.assert_allclose(found[0][1], found[1][1], atol=2e-3)

@@ -15,9 +15,11 @@ from tests.test_page_live import options, page_of
 from vvgt_cli.closed_form.labelled import labelled
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
 from vvgt_cli.gaussians.formats.live import from_bytes, live_bytes, live_json
+from vvgt_cli.gaussians.legend import legend_text
 from vvgt_cli.gaussians.live import FLAT, SHARP, Palette, baked, opacities, seen_under, shown_by
 from vvgt_cli.gaussians.live_facts import LiveFacts
-from vvgt_cli.look.label_fog import label_fog
+from vvgt_cli.look.fog import label_fog
+from vvgt_cli.look.label_files import read_labels
 from vvgt_cli.look.labels import Label, LabelTable
 from vvgt_cli.volume import Volume
 
@@ -98,6 +100,36 @@ def test_labels_in_the_header_of_a_file_without_their_column_are_let_be(tmp_path
     gaussians, header = read_ply(tmp_path / "b.ply")
     assert header.live is None
     assert gaussians.live is None
+
+
+NAMES = ("left  kidney", ' "upper"  lobe\\ ', "\u80be\u810f \U0001f9e0  \u00e9", "a\nb\tc", "0 1 1 1", "x" * 200, "")
+
+
+def test_names_of_labels_are_kept_whole(tmp_path: Path) -> None:
+    labels = tuple(Label(n, name, (0.5, 0.5, 0.5)) for n, name in enumerate(NAMES))
+    known = replace(facts(labels), name="a  layer")
+    two = replace(known, distance=0.5, others=(replace(known, distance=0.5, name='b "2"'),))
+    some = baked(labels_cloud(labels), Palette.of_labels(labels, 0.05))
+    both = replace(some, live=np.column_stack([some.live, np.arange(len(some)) % 2]))  # type: ignore[arg-type]
+    for gaussians, given in ((some, known), (both, two)):
+        (tmp_path / "a.ply").unlink(missing_ok=True)
+        write_ply(tmp_path / "a.ply", gaussians, PlyOptions(live=given, function="a  b"))
+        header = read_ply(tmp_path / "a.ply")[1]
+        assert header.live is not None
+        assert header.function == "a  b"
+        for layer, own in zip(header.live.layers, given.layers, strict=True):
+            assert [label.name for label in layer.labels] == list(NAMES)
+            assert given is known or layer.name == own.name
+    text = legend_text(LabelTable("t", labels), 0.0, 0.0, "") or ""
+    assert [name for name, _ in json.loads(text)["labels"]] == list(NAMES)
+    scene = page_of(some, options(live=known))[1]
+    assert [label["name"] for label in scene["live"]["layers"][0]["labels"]] == list(NAMES)
+
+
+def test_a_name_that_is_too_long_is_cut_with_a_word(tmp_path: Path) -> None:
+    (tmp_path / "t.json").write_text(json.dumps({"1": {"name": "n" * 201, "color": "#ffffff"}}))
+    with pytest.warns(UserWarning, match=r"label 1: name of 201 characters, cut to 200: 'nnn"):
+        assert read_labels(str(tmp_path / "t.json")).labels[0].name == "n" * 200
 
 
 def test_bytes_for_pages_hold_the_label() -> None:

@@ -16,7 +16,7 @@ import vvgt_cli as vvgt_library
 from tests.test_live_labels import LABELS
 from tests.test_live_layers import TF, layered, several
 from tests.test_page_live import PLANES
-from vvgt_cli.conversion import pages
+from vvgt_cli.conversion import frames as series
 from vvgt_cli.gaussians import read_ply
 from vvgt_cli.gaussians.formats.live import from_bytes
 from vvgt_cli.gaussians.formats.page_live import in_common, renumbered
@@ -71,9 +71,9 @@ def test_all_frames_of_a_page_carry_values_of_one_range(vvgt, frames, tmp_path) 
 
 
 def test_a_page_of_many_frames_is_bounded(vvgt, frames, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(pages, "MOST", 100)
+    monkeypatch.setattr(series, "MOST_LIVE", 100)
     done = vvgt("convert", frames / "f?.npy", "--live", "-o", tmp_path / "p.html", *SMALL)
-    assert (done.code, "33 Gaussians each in the place of 90" in done.err) == (0, True)
+    assert (done.code, "3 frames on one page: 33 Gaussians each, fewer than --max-gaussians" in done.err) == (0, True)
     assert len(scene_of((tmp_path / "p.html").read_bytes())["live"]["held"]) == 3
 
 
@@ -171,3 +171,10 @@ def test_layers_have_in_common_what_each_has_of_all() -> None:
         assert in_common([first, other]) is None
     assert renumbered(layered(4), first, both).live[:, 6].tolist() == [0, 0, 0, 1]  # type: ignore[index]
     assert renumbered(layered(4), second, both).live[:, 6].tolist() == [0, 1, 0, 2]  # type: ignore[index]
+    other = replace(named, labels=(replace(LABELS[0], name="left  liver"), LABELS[1]))
+    both = in_common([first, replace(value, others=(other,))])
+    assert both is not None
+    assert [(label.number, label.name) for label in both.others[0].labels] == [
+        (3, "left  liver"), (3, "liver"), (7, LABELS[1].name),
+    ]  # fmt: skip
+    assert renumbered(layered(4), first, both).live[:, 6].tolist() == [0, 1, 0, 2]  # type: ignore[index]

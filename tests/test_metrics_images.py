@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.images.metrics import flip, flip_map, psnr, ssim
-from vvgt_cli.images.metrics.filters import separable
-from vvgt_cli.images.metrics.psnr import CAP
+from vvgt_cli.images.filters import separable
+from vvgt_cli.images.flip import flip_map
+from vvgt_cli.images.metrics import CAP, flip, psnr, ssim
 
 
 def picture(height=70, width=90, seed=0):

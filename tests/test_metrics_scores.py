@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.images.metrics import score_view, score_views
-from vvgt_cli.images.metrics.psnr import CAP
+from vvgt_cli.images.metrics import CAP, score_view, score_views
 
 
 def views(count=3, size=24, seed=0):

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.images.metrics import texture
-from vvgt_cli.images.metrics.texture import BLOCK, COARSE, FINE, band
+from vvgt_cli.images.metrics import BLOCK, COARSE, FINE, band, texture
 
 SIZE = 160
 X = np.arange(SIZE, dtype=np.float64)

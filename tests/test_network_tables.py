@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.random_clouds import extreme_cloud, random_cloud
 from vvgt_cli.cameras import default_views, farthest_cameras
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import Gaussians
@@ -190,6 +191,22 @@ def test_scene_arrays_hold_what_the_switches_ask_for():
     assert np.abs(prepared.gradients[:, :13]).max() <= 1 + 1e-6
     restored = prepared.restore(prepared.rows)
     assert np.array_equal(restored.means, gaussians.means)
+
+
+ONE_PLACE = replace(random_cloud(500), means=np.zeros((500, 3)))
+
+
+@pytest.mark.parametrize(
+    ("gaussians", "size"),
+    [(random_cloud(1), 32), (random_cloud(3000), 32), (extreme_cloud(), 32), (ONE_PLACE, 32), (random_cloud(50), 1)],
+    ids=["one", "3000", "extreme", "in one place", "views of one pixel"],
+)
+def test_an_output_that_changes_nothing_gives_the_gaussians_back_in_their_order(gaussians, size):
+    cameras = default_views("train", 2, size=size)
+    prepared = prepare(gaussians, cameras, np.random.default_rng(0).random((2, size, size, 4), np.float32), SMALL)
+    for name, array in prepared.arrays().items():
+        assert array.dtype.kind != "f" or np.isfinite(array).all(), name
+    np.testing.assert_allclose(pack(prepared.restore(prepared.rows)), pack(gaussians), atol=1e-6)
 
 
 def test_configs_survive_the_way_through_plain_values():

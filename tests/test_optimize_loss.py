@@ -9,8 +9,7 @@ import pytest
 
 from vvgt_cli.cameras import default_views
 from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.images.metrics import ssim
-from vvgt_cli.images.metrics.ssim import C1, C2
+from vvgt_cli.images.metrics import C1, C2, ssim
 from vvgt_cli.refine import OptimizeOptions
 from vvgt_cli.refine.loop import begin, step
 from vvgt_cli.refine.loss import loss_gradient

@@ -26,9 +26,7 @@ from vvgt_cli.gaussians.formats.splats import morton_order
 from vvgt_cli.gaussians.frames import rotations, turn, up_matrix
 from vvgt_cli.gaussians.live import Looks, Table, baked, shown_by
 from vvgt_cli.gaussians.live_facts import ROW
-from vvgt_cli.look.colormap import ColorMap
-from vvgt_cli.look.function import TransferFunction
-from vvgt_cli.look.opacity import PiecewiseOpacity
+from vvgt_cli.look.function import ColorMap, PiecewiseOpacity, TransferFunction
 
 STEP = TransferFunction("step", PiecewiseOpacity(np.array([0.0, 20, 20, 60]), np.array([0.0, 0.1, 0.8, 0.3])), COLORS)
 LAB = TransferFunction("lab", RAMP.opacity_nodes, ColorMap(COLORS.x, COLORS.rgb, space="Lab"))

@@ -11,8 +11,8 @@ import pytest
 from tests.report_runs import document, run, runs
 from vvgt_cli.commands.peers import Peer
 from vvgt_cli.errors import UsageError
+from vvgt_cli.score.charts import draw
 from vvgt_cli.score.curves import Series, psnr
-from vvgt_cli.score.page import ceiling, page
 
 SMALL = ("--tf", "viridis", "--size", 24, "--max-gaussians", 60, "--steps", 2)
 MAKE = """
@@ -86,11 +86,10 @@ def test_places_are_filled_in_within_words() -> None:
 def test_a_page_marks_peers_and_vtks_own_picture() -> None:
     every = [*runs(), run("Brush", "Brush", "peer", 90_000, 300.0, 35.0, 0), run("live", "live", "live", 9, 4, 30.0, 0)]
     one = Series("x", every, document(runs=every, vtk_psnr=48.0))
-    text = page([one], "x")
-    assert ceiling([one]) == 48.0
-    assert text.count('class="ceiling"') == 3
-    assert "<span>" in text
-    assert "peer</span>" in text
-    assert 'class="ceiling"' not in page([Series("x", runs(), document())], "x")
-    assert ceiling([one, one]) is None
+    other = Series("y", runs(), document())
+    for series, there in (([one], {"peer", "live", "VTK"}), ([other], {"steps"}), ([one, other], {"x", "y", "peer"})):
+        for chart in draw(series)[:3]:
+            legend = {text.get_text() for text in chart.figure.axes[0].get_legend().get_texts()}
+            assert there <= legend
+            assert ("VTK" in legend) == ("VTK" in there)
     assert psnr(every[-2]) == 35.0

@@ -13,7 +13,7 @@ import tifffile
 
 from tests.headers import uncertified
 from vvgt_cli.conversion.frames import merge_statistics
-from vvgt_cli.conversion.index import frame_names, is_pattern
+from vvgt_cli.conversion.index import FRAMES, FUNCTIONS, is_pattern, put_name
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.source import load
 from vvgt_cli.score.record import ConversionReport
@@ -40,7 +40,7 @@ def stand_in(monkeypatch: pytest.MonkeyPatch) -> list:
     """Write what a frame's function and values come to in place of converting it; returns the calls."""
     calls: list = []
 
-    def write(request, console, carry=None) -> ConversionReport:
+    def write(request, console, made=None, start=None) -> ConversionReport:
         calls.append(request)
         source = load(request.source)
         text = f"{source.tf.node_range()} {source.statistics.hi:g} {request.fit}"
@@ -48,7 +48,7 @@ def stand_in(monkeypatch: pytest.MonkeyPatch) -> list:
             Path(name).write_text(text)
         return ConversionReport("convert")
 
-    monkeypatch.setattr("vvgt_cli.conversion.series.convert", write)
+    monkeypatch.setattr("vvgt_cli.conversion.batch.convert", write)
     return calls
 
 
@@ -123,16 +123,16 @@ def test_a_dry_run_of_a_series_is_refused_before_anything_is_written(vvgt, serie
     out = series / "out" / "{:02d}.ply"
     done = vvgt("convert", series / "run_*.npy", "--tf", series / "tf.json", "-o", out, *SMALL, "--dry-run")
     assert done.code == 2
-    assert "--dry-run of a series" in done.err
+    assert "--dry-run with frames: a plan is for one volume" in done.err
     assert not list((series / "out").iterdir())
 
 
 def test_an_interrupted_frame_is_not_recorded(vvgt, series: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupted(request, console, carry=None) -> ConversionReport:
+    def interrupted(request, console, made=None, start=None) -> ConversionReport:
         Path(request.output).write_text("short")
         return ConversionReport("convert", refinement={"reason": "interrupted"})
 
-    monkeypatch.setattr("vvgt_cli.conversion.series.convert", interrupted)
+    monkeypatch.setattr("vvgt_cli.conversion.batch.convert", interrupted)
     run = ("convert", series / "run_*.npy", "--tf", series / "tf.json", "-o", series / "out" / "{:02d}.ply", *SMALL)
     assert vvgt(*run).code == 130
     assert "01.ply" not in (series / "out" / "manifest.json").read_text().split('"files"')[1]
@@ -161,7 +161,7 @@ def test_calls_that_are_wrong(vvgt, series: Path) -> None:
         ((frames, "-o", series / "{:02d}.obj"), "expected a name ending in .ply"),
         ((frames, "-o", series / "none" / "{:02d}.ply"), "does not exist"),
         ((frames, "-o", series / "{:02d}.ply", "--shard", "3/2"), "--shard 3/2"),
-        ((frames, "-o", series / "a.ply", "--shard", "1/2"), "is of a series"),
+        ((frames, "-o", series / "a.ply", "--shard", "1/2"), "--shard with one volume: .*a place for the number"),
         ((frames, "-o", series / "{}.ply", "--shard", "1/2", "--overwrite"), "would remove each other's files"),
         ((frames, "-o", series / "a.ply"), "run_8.npy is no slice.*out_{:04d}.ply"),
         ((frames, "-o", series / "{:02d}.ply", "--tf", tf, "--tf-range", "50,60"), "shows nothing in any of 4 frames"),
@@ -178,12 +178,14 @@ def test_calls_that_are_wrong(vvgt, series: Path) -> None:
 
 
 def test_names_of_frames() -> None:
-    assert frame_names("-o", "a_{:04d}.ply", 2) == ["a_0000.ply", "a_0001.ply"]
+    assert put_name("-o", "a_{:04d}.ply", FRAMES, "7") == "a_0007.ply"
+    assert put_name("-o", "a_{}.ply", FUNCTIONS, "7") == "a_7.ply"
     assert [is_pattern(name) for name in ("a.ply", "{}.ply", "{:3d}.ply", "{x}.ply", "{0.__class__}.ply")] == [
         False, True, True, False, False
     ]  # fmt: skip
-    with pytest.raises(UsageError):
-        frame_names("-o", "{}/{:d}.ply", 2)
+    for pattern, kind in (("{}/{:d}.ply", FRAMES), ("a{x}_{}.ply", FUNCTIONS), ("{:d}.ply", FUNCTIONS)):
+        with pytest.raises(UsageError, match="expected one place for the"):
+            put_name("-o", pattern, kind, "1")
 
 
 def test_statistics_together() -> None:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from tests.random_clouds import extreme_cloud, random_cloud
 from vvgt_cli.cameras.sets import look_at
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.constants import MAX_ALPHA
@@ -22,14 +25,8 @@ def camera(width=24, height=20, eye=EYE, fov=40.0):
 
 
 def cloud(count, seed=0, scale=0.1, spread=0.4, logit=0.0, box=0.6):
-    rng = np.random.default_rng(seed)
-    return Gaussians(
-        rng.uniform(-box, box, (count, 3)),
-        np.log(scale) + rng.normal(0, spread, (count, 3)),
-        rng.normal(size=(count, 4)) * 10 ** rng.uniform(-2, 2, (count, 1)),
-        logit + rng.normal(0, 2, count),
-        rng.uniform(-0.3, 1.2, (count, 3)),
-    )
+    g = random_cloud(count, seed, scale, spread, (logit, 2.0), box, (-0.3, 1.2))
+    return replace(g, quaternions=g.quaternions * 10 ** np.random.default_rng(seed).uniform(-2, 2, (count, 1)))
 
 
 def moved(g, steps, sign):
@@ -160,6 +157,29 @@ def test_nothing_and_what_is_not_drawn():
         p = project(g, c)
         out = render_backward(g, c, p, render(g, c, projection=p), np.ones((c.height, c.width, 4), np.float32))
         assert not any(getattr(out, field).any() for field in FIELDS)
+
+
+@pytest.mark.parametrize("size", [1e-30, 1.0, 1e10])
+def test_gradients_of_extreme_gaussians_are_finite_whatever_the_slope(size):
+    g, c = extreme_cloud(), camera(48, 48)
+    grad = np.random.default_rng(0).normal(size=(48, 48, 4)).astype(np.float32) * np.float32(size)
+    p = project(g, c)
+    found = render_backward(g, c, p, render(g, c, projection=p), grad)
+    behind = (g.means @ c.rotation.T + c.translation)[:, 2] <= 0.01
+    assert behind.any()
+    for field in FIELDS:
+        assert np.isfinite(getattr(found, field)).all()
+        assert not getattr(found, field)[behind].any()
+
+
+def test_colour_gradients_of_a_million_add_up_to_the_alpha_of_the_picture():
+    g, c = cloud(1_000_000, 8, scale=0.004), camera(64, 64)
+    white = Gaussians(g.means, g.log_scales, g.quaternions, g.opacity_logits, np.ones_like(g.colors))
+    p = project(white, c)
+    image = render(white, c, projection=p)
+    found = render_backward(white, c, p, image, np.ones((64, 64, 4), np.float32))
+    assert all(np.isfinite(getattr(found, field)).all() for field in FIELDS)
+    assert found.colors.sum(dtype=np.float64) == pytest.approx(3 * image[..., 3].sum(dtype=np.float64), rel=1e-4)
 
 
 def test_the_same_call_gives_the_same_bytes():

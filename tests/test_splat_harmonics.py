@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.random_clouds import random_cloud
 from vvgt_cli.cameras.sets import look_at
-from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.harmonics import view_colors, view_slopes
 from vvgt_cli.gaussians.types import HARMONICS
 from vvgt_cli.splat import project, render, render_backward, render_backward_reference, render_reference
@@ -24,15 +24,8 @@ def camera(width=24, height=20, eye=EYE):
 
 
 def cloud(count, degree, seed=0, scale=0.1, size=0.4):
-    rng = np.random.default_rng(seed)
-    return Gaussians(
-        rng.uniform(-0.6, 0.6, (count, 3)),
-        np.log(scale) + rng.normal(0, 0.4, (count, 3)),
-        rng.normal(size=(count, 4)),
-        rng.normal(0, 2, count),
-        rng.uniform(-0.2, 1, (count, 3)),
-        rng.normal(0, size, (count, HARMONICS[degree], 3)),
-    )
+    g = random_cloud(count, seed, scale, 0.4, colors=(-0.2, 1.0))
+    return replace(g, harmonics=np.random.default_rng(seed).normal(0, size, (count, HARMONICS[degree], 3)))
 
 
 @pytest.mark.parametrize("degree", DEGREES)

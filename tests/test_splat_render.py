@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tests.random_clouds import extreme_cloud, random_cloud
 from vvgt_cli.cameras.sets import look_at
-from vvgt_cli.checks.clouds import cloud
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.constants import MIN_ALPHA
 from vvgt_cli.gaussians.rules import INRIA, RULES
@@ -23,9 +23,8 @@ def camera(width=64, height=64, eye=EYE, fov=40.0):
     return look_at(eye, width=width, height=height, fov=fov)
 
 
-def taken(gaussians, order):
-    fields = ("means", "log_scales", "quaternions", "opacity_logits", "colors")
-    return Gaussians(*(getattr(gaussians, field)[order] for field in fields))
+def cloud(count, seed=0, scale=0.05, logit=0.0, box=0.6):
+    return random_cloud(count, seed, scale, 0.3, (logit, 2.0), box, (-0.3, 1.2))
 
 
 def assert_close(image, reference, tight=TIGHT):
@@ -85,6 +84,11 @@ def test_a_rule_at_a_ratio_shows_what_the_whole_size_does_at_fewer_points():
     assert np.abs(render(g, c) - large).mean() > 1e-3
 
 
+def test_gaussians_in_one_place_match_the_twin():
+    g, c = cloud(100, 6, 0.1, box=0.0), camera(48, 48)
+    assert_close(render(g, c), render_reference(g, c), tight=1e-3)
+
+
 @pytest.mark.parametrize("axes", [(0.8, 1e-4, 1e-4), (0.8, 0.8, 1e-4), (1e-6, 1e-6, 1e-6), (3.0, 3.0, 3.0)])
 def test_needles_pancakes_points_and_giants_match_the_twin(axes):
     g = cloud(60, 1)
@@ -99,7 +103,7 @@ def test_an_eye_inside_the_cloud_sees_what_is_ahead():
     assert_close(image, render_reference(g, c))
     behind = (g.means @ c.rotation.T + c.translation)[:, 2] <= 0.01
     assert 50 < behind.sum() < 350
-    assert np.array_equal(image, render(taken(g, ~behind), c))
+    assert np.array_equal(image, render(g.take(np.flatnonzero(~behind)), c))
 
 
 def test_alpha_is_clamped_at_99_percent():
@@ -144,7 +148,7 @@ def test_no_gaussians_and_one():
 def test_the_order_in_the_file_does_not_matter():
     g, c = cloud(500, 6), camera()
     order = np.random.default_rng(0).permutation(500)
-    assert np.array_equal(render(g, c), render(taken(g, order), c))
+    assert np.array_equal(render(g, c), render(g.take(order), c))
 
 
 def test_the_same_call_gives_the_same_bytes():
@@ -162,7 +166,7 @@ def test_unusable_gaussians_are_left_out():
     log_scales = g.log_scales.copy()
     log_scales[1] = 400.0  # the covariance overflows
     odd = Gaussians(g.means, log_scales, g.quaternions, g.opacity_logits, g.colors)
-    assert np.array_equal(render(odd, c), render(taken(g, [0, 2, 3]), c))
+    assert np.array_equal(render(odd, c), render(g.take(np.array([0, 2, 3])), c))
     log_scales[1] = 40.0  # it does not, but its inverse is 0 in float32: alpha is the same in every pixel
     assert np.isfinite(render(Gaussians(g.means, log_scales, g.quaternions, g.opacity_logits, g.colors), c)).all()
 
@@ -196,6 +200,25 @@ def test_gather_matches_the_twin_and_is_the_adjoint_of_blend(size):
     scale = np.abs(image[..., :3] * field[:3].transpose(1, 2, 0)).sum()
     assert abs(left - right) < 1e-6 * scale  # the same float32 weights in both
     np.testing.assert_allclose(image[..., 3].sum(), (out[:, 0] - 1).sum(), rtol=1e-5)
+
+
+def test_a_million_white_gaussians_are_as_bright_as_they_are_opaque():
+    g, c = cloud(1_000_000, 8, 0.004), camera(128, 128)
+    white = Gaussians(g.means, g.log_scales, g.quaternions, g.opacity_logits, np.ones_like(g.colors))
+    image = render(white, c)
+    assert image[..., 3].max() <= 1 - 1e-4 + 1e-6
+    np.testing.assert_allclose(image[..., :3], np.repeat(image[..., 3:], 3, axis=-1), atol=1e-6)
+
+
+def test_extreme_gaussians_stay_finite_and_a_wide_picture_has_the_middle_of_a_narrow_one():
+    image = render(extreme_cloud(), camera(48, 48))
+    assert np.isfinite(image).all()
+    assert image.min() >= 0
+    assert (image[..., :3] <= 40 * image[..., 3:] + 1e-4).all()  # the brightest colour
+    g = cloud(300, 9)
+    wide, narrow = render(g, camera(4096, 16)), render(g, camera(16, 16))
+    np.testing.assert_allclose(wide[:, 2040:2056], narrow, atol=1e-3)  # float32 at pixel 2048
+    assert np.isfinite(wide).all()
 
 
 def test_depths_sort_stably():

@@ -10,8 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from vvgt_cli.closed_form import VbmOptions
+from vvgt_cli.closed_form.tree import HIDDEN
 from vvgt_cli.conversion import labels as split
-from vvgt_cli.conversion.owners import Hidden, hidden_in, owners
+from vvgt_cli.conversion.label_assignment import Hidden, assign_labels, hidden_in
 from vvgt_cli.conversion.request import file_bytes
 from vvgt_cli.conversion.stages import ViewingConditions
 from vvgt_cli.dvr import RenderSettings
@@ -92,11 +94,11 @@ def test_a_single_label_and_one_that_is_nowhere(vvgt, tmp_path: Path) -> None:
     assert list(converted(vvgt, tmp_path, np.where(values == 3, 3, 0))) == [3]
     line = ("convert", tmp_path / "v.npy", "--labels", "auto", "--split-labels", "-o", "p_{}.ply")
     size = vvgt(*line, "--max-size", 1)
-    assert "--max-size is of one file" in size.error
+    assert "--max-size with labels: the limit is for one file" in size.error
     time = vvgt(
         "convert", tmp_path / "v.npy", "--labels", "auto", "--split-labels", "--time-budget", 9, "-o", "p_{}.ply"
     )
-    assert (time.code, "--time-budget is of one file" in time.error) == (2, True)
+    assert (time.code, "--time-budget with labels: several conversions share the work" in time.error) == (2, True)
 
 
 def test_standard_input_is_read_once(tmp_path: Path) -> None:
@@ -136,16 +138,17 @@ def test_whose_a_gaussian_is() -> None:
     turned = np.tile([1.0, 0, 0, 0], (4, 1))
     colors = np.array([table.labels[k].color for k in (1, 0, 0, 1)])  # as it should not be told
     gaussians = Gaussians(means, wide, turned, np.zeros(4), colors)
-    np.testing.assert_array_equal(owners(gaussians, shown), [0, 1, 1, 1])  # the last is near none: by its colour
+    np.testing.assert_array_equal(assign_labels(gaussians, shown), [0, 1, 1, 1])  # the last is near none: by its colour
     along_y = Gaussians(means, wide, np.tile([np.sqrt(0.5), 0, 0, np.sqrt(0.5)], (4, 1)), np.zeros(4), colors)
-    np.testing.assert_array_equal(owners(along_y, shown)[:3], [0, 1, 1])
+    np.testing.assert_array_equal(assign_labels(along_y, shown)[:3], [0, 1, 1])
     faint = [(volume, table, label) for label in (shown[0][2], split.replace(shown[1][2], opacity=0.01))]
-    assert owners(gaussians, faint)[2] == 0  # most of its extinction, not of its voxels
+    assert assign_labels(gaussians, faint)[2] == 0  # most of its extinction, not of its voxels
 
 
 def hidden_of(source):
     field = Resident(source, source.scene())
-    return hidden_in(*field.hidden(600, 64), field.scene.half, field.scene.step)
+    form = field.pyramid(VbmOptions(600, 64)).form
+    return hidden_in(form.seen.largest > HIDDEN, form.seen.edge, form.half, form.step)
 
 
 @pytest.mark.parametrize("cut", [False, True])

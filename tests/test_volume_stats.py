@@ -79,6 +79,25 @@ def test_values_at_the_limits_of_float64() -> None:
     assert np.isfinite(found.edges).all()
 
 
+@pytest.mark.parametrize(
+    "data",
+    [
+        np.array([[[3.0]]]), np.arange(12.0).reshape(1, 3, 4), np.linspace(0, 1e-30, 60).reshape(3, 4, 5),
+        np.linspace(-1e30, 1e30, 60).reshape(3, 4, 5), np.arange(65536, dtype=np.uint16).reshape(16, 64, 64),
+    ],
+    ids=["one voxel", "one slice", "range 1e-30", "range 1e30", "all 16-bit values"],
+)  # fmt: skip
+def test_odd_grids_and_ranges(data: np.ndarray) -> None:
+    found = statistics(Volume(data))
+    assert (found.lo, found.hi, found.finite_count) == (data.min(), data.max(), data.size)
+    assert (np.diff(found.edges) > 0).all()
+
+
+@pytest.mark.parametrize("spacing", [(1.0, 1000.0, 1.0), (1e-30, 1e-30, 1e-27), (1e30, 1.0, 1.0)])
+def test_the_longest_edge_of_the_unit_frame_is_2(spacing: tuple[float, float, float]) -> None:
+    assert max(Volume(np.zeros((3, 4, 5), np.uint8), spacing).unit_frame().half) == pytest.approx(1, rel=1e-12)
+
+
 @pytest.mark.parametrize("dtype", ["uint8", "int32"])
 def test_scaling_beyond_float64_is_an_error(dtype: str) -> None:
     with pytest.raises(DataError, match="check the scaling"):

@@ -1,39 +1,21 @@
-"""The stability suite: stiff and extreme cases through every stage, for `vvgt check` and for the tests alike."""
+"""Cases of `vvgt check`: what is measured, the limit that it must keep, and what came of running it."""
 
 from __future__ import annotations
 
-import importlib
 import math
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 
-MODULES = (
-    "reading",
-    "functions",
-    "raycast",
-    "light",
-    "mapping",
-    "grids",
-    "forward",
-    "backward",
-    "descent",
-    "harmonics",
-    "files",
-    "network",
-    "whole",
-    "ways",
-)
 
-
-class BrokenError(Exception):
-    """What was expected of a case did not come true."""
+class CheckError(Exception):
+    """A requirement of a case that does not hold."""
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A number that a case measured, and the largest that passes."""
+    """A measured number and the largest that passes."""
 
     what: str
     value: float
@@ -45,9 +27,9 @@ class Case:
     """One case.
 
     Attributes:
-        stage: which part of the program it goes through.
-        name: what is extreme about it, one line.
-        run: does it; raises where something other than the figure is wrong.
+        stage: part of the program, or of a file, that it is about.
+        name: the case in one line.
+        run: measures its figure; raises where something other than the figure is wrong.
     """
 
     stage: str
@@ -57,13 +39,13 @@ class Case:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a case.
+    """Result of running a case.
 
     Attributes:
         stage, name: of the case.
         passed: the figure is within its limit and nothing was raised.
-        what, value, limit: the figure; empty and None where none was reached.
-        problem: one line; empty where it passed.
+        what, value, limit: the figure; empty and None if there is none.
+        problem: one line; empty if the case passed.
         seconds: wall time.
     """
 
@@ -78,26 +60,20 @@ class Outcome:
 
 
 def require(condition: object, text: str) -> None:
-    """Raise `BrokenError` unless ``condition`` holds."""
+    """Raise `CheckError` with ``text`` unless ``condition`` holds."""
     if not condition:
-        raise BrokenError(text)
-
-
-def all_cases() -> Iterator[Case]:
-    """Every case, stage by stage, always in the same order."""
-    for name in MODULES:
-        yield from importlib.import_module(f"vvgt_cli.checks.{name}").cases()
+        raise CheckError(text)
 
 
 def run_case(case: Case) -> Outcome:
-    """Run a case; whatever it raises is its problem."""
+    """Run a case and return its outcome; any exception becomes its problem."""
     begin = time.perf_counter()
     figure, problem = None, ""
     try:
         figure = case.run()
-        if not figure.value <= figure.limit:  # NaN is no pass either
+        if not figure.value <= figure.limit:  # NaN fails too
             problem = f"{figure.what} {figure.value:.3g}, at most {figure.limit:.3g} expected"
-    except BrokenError as error:
+    except CheckError as error:
         problem = str(error)
     except Exception as error:
         place = traceback.extract_tb(error.__traceback__)[-1]
@@ -109,4 +85,4 @@ def run_case(case: Case) -> Outcome:
     return Outcome(case.stage, case.name, not problem, figure.what, value, figure.limit, problem, seconds)
 
 
-__all__ = ["BrokenError", "Case", "Figure", "Outcome", "all_cases", "require", "run_case"]
+__all__ = ["Case", "CheckError", "Figure", "Outcome", "require", "run_case"]

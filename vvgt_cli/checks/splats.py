@@ -1,4 +1,4 @@
-"""Cases of a file of Gaussians, whatever wrote it: what can be seen without its volume, and where its Gaussians lie."""
+"""Cases of a file of Gaussians by any program: its rows and values, its place in the volume, and the drawing order."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ COLUMNS = {
     "centres": "means", "sizes": "log_scales", "rotations": "quaternions", "opacities": "logits", "colours": "f_dc",
     "harmonics": "f_rest",
 }  # fmt: skip
-LOOKED_FROM = 3.0  # radius of the default views, unit frame
-OUTSIDE = 0.03  # of the box's edge: how far outside it a centre may lie, and still belong to its surface
-SMALL = 96  # pixels of the pictures that orientations are told by
-HALF = 2.0**-25  # of a number: how far float32 rounds it, at most
+EYE_RADIUS = 3.0  # of the default views, unit frame
+MARGIN = 0.03  # of the box's edge, within which a centre outside may still belong to its surface
+ORIENTATION_SIZE = 96  # pixels of the pictures that orientations are compared by
+ROUNDING = 2.0**-25  # largest relative rounding of float32
 
 
-def finite(columns: Splats) -> np.ndarray:
-    """(K,) bool: rows of nothing but finite numbers, whose rotation has a length."""
+def finite_rows(columns: Splats) -> np.ndarray:
+    """Return which rows have only finite numbers and a rotation that is not 0, (K,) bool."""
     rows = [np.isfinite(getattr(columns, name)).reshape(len(columns), -1).all(axis=1) for name in COLUMNS.values()]
     result: np.ndarray = np.logical_and.reduce(rows)
     return result
 
 
 def row_cases(columns: Splats, good: np.ndarray) -> Iterator[Case]:
-    """Rows of the file that no program can draw, or that its numbers are too coarse for; ``good`` (K,) of `finite`."""
+    """Yield cases of rows that no program can draw or that float32 is too coarse for; ``good`` is of `finite_rows`."""
 
     def broken(name: str) -> Figure:
         rows = np.isfinite(getattr(columns, name)).reshape(len(columns), -1).all(axis=1)
@@ -48,17 +48,17 @@ def row_cases(columns: Splats, good: np.ndarray) -> Iterator[Case]:
     def rounded() -> Figure:
         far = np.abs(columns.means[good].astype(np.float64)).max(axis=1)
         largest = np.exp(np.clip(columns.log_scales[good].astype(np.float64), -700, 700)).max(axis=1)
-        return Figure("share of Gaussians", float(np.mean(far * HALF > largest / 10)), 1e-3)
+        return Figure("share of Gaussians", float(np.mean(far * ROUNDING > largest / 10)), 1e-3)
 
     yield Case("file", "centres that float32 rounds by a tenth of sigma", rounded)
 
 
 def value_cases(gaussians: Gaussians, edge: float | None, size: int) -> Iterator[Case]:
-    """Extreme sizes, opacities and colours.
+    """Yield cases of extreme sizes, opacities and colours.
 
     Args:
-        gaussians: unit frame, if they are of a volume.
-        edge: the volume's longest; None: where most of the centres lie.
+        gaussians: in the unit frame if a volume is given.
+        edge: longest edge of the volume; None: that of most of the centres.
         size: pixels of the screen.
     """
     sigma = np.exp(np.clip(gaussians.log_scales.astype(np.float64), -700, 700))
@@ -71,7 +71,7 @@ def value_cases(gaussians: Gaussians, edge: float | None, size: int) -> Iterator
         return Figure("share of Gaussians", float(np.mean(alpha < MIN_ALPHA)), 0.5)
 
     def tiny() -> Figure:
-        pixels = largest / (length / 2) * size / (2 * np.tan(np.radians(20)) * LOOKED_FROM)
+        pixels = largest / (length / 2) * size / (2 * np.tan(np.radians(20)) * EYE_RADIUS)
         return Figure("share of the opacity", share(pixels < 0.25), 0.5)
 
     def gaudy() -> Figure:
@@ -91,17 +91,18 @@ def _extent(gaussians: Gaussians, sigma: np.ndarray) -> float:
 def place_cases(
     gaussians: Gaussians, world: Gaussians, half: np.ndarray, seen: list[np.ndarray], rule: Rule = INRIA
 ) -> Iterator[Case]:
-    """Where Gaussians lie in the volume's box, and which way round.
+    """Yield cases of the place and the orientation of Gaussians in the volume's box.
 
     Args:
-        gaussians: box frame; ``world``: the same, if the numbers of the file are taken as world coordinates.
-        half: (3,) of the box's edges.
-        seen: what `small_views` show of the volume, (h, w, 4) float32 each.
+        gaussians: in the box frame.
+        world: the same if the numbers of the file are taken as world coordinates.
+        half: half edges of the box, (3,).
+        seen: views of the volume by `orientation_cameras`, (h, w, 4) float32 each.
         rule: to draw by at that size.
     """
 
     def share(of: Gaussians) -> float:
-        beyond = (np.abs(of.means.astype(np.float64)) > half + 2 * OUTSIDE).any(axis=1)
+        beyond = (np.abs(of.means.astype(np.float64)) > half + 2 * MARGIN).any(axis=1)
         return float(np.average(beyond, weights=opacity(of) + 1e-12))
 
     def outside() -> Figure:
@@ -112,42 +113,38 @@ def place_cases(
     def turned() -> Figure:
         error = {}
         for name, matrix in orientations():
-            pictures = [render(transform(gaussians, matrix), camera, rule) for camera in small_views()]
+            pictures = [render(transform(gaussians, matrix), camera, rule) for camera in orientation_cameras()]
             error[name] = float(np.mean([np.square(a - b).mean() for a, b in zip(seen, pictures, strict=True)]))
         own, best = error["x y z"], min(error, key=lambda name: error[name])
         gain = 10 * np.log10((own + 1e-12) / (error[best] + 1e-12))
-        hint = "" if best == "x y z" else f" with axes {best}{', a mirror image' if mirrored(best) else ''}"
+        hint = "" if best == "x y z" else f" with axes {best}{', a mirror image' if is_mirror(best) else ''}"
         return Figure(f"dB that it looks more like the volume{hint}", float(gain), 1.0)
 
     yield Case("place", "centres outside the volume's box", outside)
     yield Case("place", "the other way round", turned)
 
 
-def small_views() -> list[Camera]:
-    """Views by which orientations are told apart."""
-    cameras = default_views("check", size=SMALL)
+def orientation_cameras() -> list[Camera]:
+    """Return the cameras by whose views orientations are compared."""
+    cameras = default_views("check", size=ORIENTATION_SIZE)
     return [cameras[i] for i in (0, 1, 2)]
 
 
 def orientations() -> Iterator[tuple[str, np.ndarray]]:
-    """The 48 ways to lay the axes of a file: name, such as ``x -z y``, and matrix (3, 3)."""
+    """Yield the 48 ways to lay the axes of a file: name, such as ``x -z y``, and matrix (3, 3)."""
     for order in permutations(range(3)):
         for signs in product((1, -1), repeat=3):
             name = " ".join(f"{'-' if sign < 0 else ''}{'xyz'[axis]}" for axis, sign in zip(order, signs, strict=True))
             yield name, np.eye(3)[list(order)] * np.array(signs)[:, None]
 
 
-def mirrored(name: str) -> bool:
-    """Whether an orientation shows a mirror image."""
+def is_mirror(name: str) -> bool:
+    """Return whether an orientation shows a mirror image."""
     return float(np.linalg.det(dict(orientations())[name])) < 0
 
 
 def order_cases(gaussians: Gaussians, camera: Camera) -> Iterator[Case]:
-    """What depends on the order that viewers draw in, and how much there is to draw.
-
-    Args:
-        gaussians: box frame; ``camera``: that looks at them.
-    """
+    """Yield cases of the drawing order and of how much there is to draw; ``gaussians`` are in the box frame."""
 
     def order() -> Figure:
         far = project(gaussians, camera, by_distance=True)

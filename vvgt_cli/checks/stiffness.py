@@ -1,37 +1,34 @@
-"""How stiff a volume is under its function, and the step that views of it need; cases of one scene."""
+"""Stiffness of a volume under its transfer function, and the sampling step that views of it need."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
 from vvgt_cli.cameras import default_views
-from vvgt_cli.checks import Case, mapping, raycast
-from vvgt_cli.checks.whole import whole
 from vvgt_cli.dvr import RenderSettings, Scene, render_view
 
 STEPS = (4.0, 2.0, 1.0, 0.5, 0.25, 0.125, 0.0625)  # voxels
 FINEST = 1 / 64
 SIZE, VIEWS = 128, 2
-SLAB = 1 << 21  # voxels looked at together
+SLAB = 1 << 21  # voxels that are compared at a time
 
 
 @dataclass(frozen=True)
 class Stiffness:
-    """Figures of a scene.
+    """Stiffness of a scene.
 
     Attributes:
-        depth_per_step: largest optical depth of half the shortest voxel edge, the step that views are made with.
-        change_per_voxel: largest change of extinction between two neighbouring voxels, every value between theirs
-            included, over the largest extinction: 1 where all of it comes within a voxel.
-        abrupt: share of the neighbours that show anything whose change is above a half.
-        explicit_step: voxels (shortest edge) above which explicit Euler steps overshoot: depth 1.
-        tolerance: root-mean-square error of RGBA that was asked for.
-        errors: root-mean-square error of RGBA of two views of 128 px by step in voxels, against 1/64.
-        needed_step: largest of these steps from which on no error exceeds the tolerance; None: none of them.
+        depth_per_step: largest optical depth of half the shortest voxel edge, the default step of views.
+        change_per_voxel: largest change of extinction between neighbouring voxels, including all values between theirs,
+            relative to the largest extinction; 1 for a step function.
+        abrupt: share of the visible pairs of neighbours whose change is above one half.
+        explicit_step: step in voxels (shortest edge) above which explicit Euler integration overshoots (depth 1).
+        tolerance: the requested RMS error of RGBA.
+        errors: RMS error of RGBA of two views of 128 px by step in voxels, against steps of 1/64.
+        needed_step: largest step for which this and all smaller steps are within the tolerance; None if there is none.
     """
 
     depth_per_step: float
@@ -44,7 +41,7 @@ class Stiffness:
 
 
 class _Ranges:
-    """Least and greatest extinction of any interval of the table, by doubling intervals."""
+    """Minimum and maximum extinction over any interval of the table, from intervals of doubling length."""
 
     def __init__(self, tau: np.ndarray) -> None:
         self.low, self.high = [tau], [tau]
@@ -55,7 +52,7 @@ class _Ranges:
             width *= 2
 
     def change(self, first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(greatest - least, greatest) over nodes ``first`` to ``last``, inclusive, of one shape."""
+        """Return (maximum - minimum, maximum) over nodes ``first`` to ``last``, inclusive, arrays of one shape."""
         level = np.frexp(last - first + 1)[1] - 1  # floor of log2
         low, high = np.empty(first.shape), np.empty(first.shape)
         for n in np.unique(level):
@@ -66,9 +63,9 @@ class _Ranges:
         return high - low, high
 
 
-def changes(scene: Scene, progress: Callable[[int, int], None] | None = None) -> tuple[float, float]:
-    """`Stiffness.change_per_voxel` and `Stiffness.abrupt`; neighbours that are not finite are left out."""
-    ranges = None if scene.grid is not None else _Ranges(scene.optics.nodes[:, 3])  # a grid holds extinction itself
+def measure_changes(scene: Scene, progress: Callable[[int, int], None] | None = None) -> tuple[float, float]:
+    """Measure `Stiffness.change_per_voxel` and `Stiffness.abrupt`, skipping neighbours that are not finite."""
+    ranges = None if scene.grid is not None else _Ranges(scene.optics.nodes[:, 3])  # a grid stores extinction
     top = scene.optics.largest_extinction()
     nz, ny, nx = scene.values.shape
     thick = max(1, SLAB // (ny * nx))
@@ -79,7 +76,7 @@ def changes(scene: Scene, progress: Callable[[int, int], None] | None = None) ->
         for axis in range(3):
             count = u.shape[axis]
             a, b = np.take(u, range(count - 1), axis), np.take(u, range(1, count), axis)
-            if axis:  # the slice that the next slab begins with counts there
+            if axis:  # the last slice is counted with the next slab
                 a, b = a[:thick], b[:thick]
             known = np.isfinite(a) & np.isfinite(b)
             a, b = a[known], b[known]
@@ -98,8 +95,8 @@ def changes(scene: Scene, progress: Callable[[int, int], None] | None = None) ->
     return (largest / top if top > 0 else 0.0), abrupt / max(visible, 1)
 
 
-def step_errors(scene: Scene) -> dict[float, float]:
-    """`Stiffness.errors`."""
+def measure_step_errors(scene: Scene) -> dict[float, float]:
+    """Measure `Stiffness.errors`, by step in voxels."""
     cameras = default_views("check", VIEWS, size=SIZE)
     fine = [render_view(scene, camera, RenderSettings(step=FINEST, samples=1)) for camera in cameras]
     errors = {}
@@ -109,32 +106,22 @@ def step_errors(scene: Scene) -> dict[float, float]:
     return errors
 
 
-def stiffness(scene: Scene, tolerance: float, progress: Callable[[int, int], None] | None = None) -> Stiffness:
-    """Measure a scene; ``tolerance`` is the root-mean-square error of RGBA that views may have."""
-    change, abrupt = changes(scene, progress)
-    depth = scene.optics.largest_extinction() * float(scene.step.min())  # of one voxel
-    errors = step_errors(scene)
+def measure_stiffness(scene: Scene, tolerance: float, progress: Callable[[int, int], None] | None = None) -> Stiffness:
+    """Measure the stiffness of a scene; ``tolerance`` is the RMS error of RGBA that views may have."""
+    change, abrupt = measure_changes(scene, progress)
+    depth_per_voxel = scene.optics.largest_extinction() * float(scene.step.min())
+    errors = measure_step_errors(scene)
     needed = None
-    for step in reversed(STEPS):  # from the finest on
+    for step in reversed(STEPS):  # finest first
         if errors[step] > tolerance:
             break
         needed = step
     return Stiffness(
-        depth_per_step=depth * RenderSettings().step,
+        depth_per_step=depth_per_voxel * RenderSettings().step,
         change_per_voxel=change,
         abrupt=abrupt,
-        explicit_step=1 / depth if depth > 0 else float("inf"),
+        explicit_step=1 / depth_per_voxel if depth_per_voxel > 0 else float("inf"),
         tolerance=tolerance,
         errors={f"{step:g}": error for step, error in errors.items()},
         needed_step=needed,
     )
-
-
-def scene_cases(scene: Scene) -> Iterator[Case]:
-    """Cases of one scene, as `all_cases` has them of the hard ones."""
-    view = default_views("check", size=16)[0]
-    twin = partial(raycast.difference, scene, view, 1 / 8, 2e-2, empty=True)
-    yield Case(raycast.STAGE, "16 x 16 pixels against the twin", twin)
-    yield Case(raycast.STAGE, "steps of four voxels", partial(raycast.bounded, scene, view))
-    yield Case(mapping.STAGE, "optical mass, K = 1,000", partial(mapping.levels, scene))
-    yield Case("whole way", "K = 200, 48 px, 25 steps", partial(whole, scene))

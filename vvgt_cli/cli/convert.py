@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
@@ -13,10 +12,8 @@ from vvgt_cli.cli.fit import fit_options, limit_options, ply_options, rule_optio
 from vvgt_cli.cli.options import common_options, light_options, overwrite_option, placed_read_options, tfs_options
 from vvgt_cli.cli.sections import SectionedCommand
 from vvgt_cli.cli.typed import ASIDE, command_line
+from vvgt_cli.defaults import RULE
 from vvgt_cli.progress import Console
-
-if TYPE_CHECKING:
-    from vvgt_cli.conversion.request import ConvertRequest
 
 
 @click.command("convert", cls=SectionedCommand, short_help="Convert a volume to a .ply of Gaussians.")
@@ -34,7 +31,7 @@ if TYPE_CHECKING:
 )
 @click.option("--dry-run", is_flag=True, help="Print the plan with estimated time, memory and size; write nothing.")
 @overwrite_option
-@rule_option("Viewer to optimise for, by how it draws a Gaussian.", "inria")
+@rule_option("Viewer to optimise for, by how it draws a Gaussian.", RULE)
 @click.option(
     "--steps", type=click.IntRange(0, 10_000_000), metavar="N",
     help="Maximum number of gradient descent steps; 0 for none. Default: chosen by the plan.",
@@ -94,101 +91,14 @@ def command(
       vvgt convert ct.nrrd --tf bone.json --layer organs.seg.nrrd -o both.ply
     """
     from vvgt_cli.cli.fit import convert_request
+    from vvgt_cli.conversion.batch import convert_files
 
     functions = options["optics"].pop("tf")
     options["optics"]["tf"] = functions[0] if functions else None
     said = command_line(click.get_current_context(), ASIDE, folders=False)
     request = replace(convert_request(volume, **options), blocks=chosen(blocks), live=live, command=said)
-    if live:
-        _check_live(functions, split_labels or dry_run)
-    if split_labels:
-        _split(request, functions, dry_run or shard is not None, console)
-    else:
-        _convert(request, functions, shard, dry_run, console)
-
-
-def _check_live(functions: Sequence[str], other: bool) -> None:
-    """One look to begin with; ``other``: options that go with several files or none are given."""
-    from vvgt_cli.errors import UsageError
-
-    if other or len(functions) > 1:
-        raise UsageError(
-            "--live makes one file of one volume, which 'vvgt recolor' shows under other functions; expected one --tf, "
-            "and no --dry-run or --split-labels"
-        )
-
-
-def _split(request: ConvertRequest, functions: Sequence[str], other: bool, console: Console) -> None:
-    """One file a label; ``other``: options that go with one file are given."""
-    from vvgt_cli.conversion.gaussian_files import is_page
-    from vvgt_cli.conversion.index import is_pattern
-    from vvgt_cli.conversion.labels import convert_labels
-    from vvgt_cli.conversion.pages import page_of_labels
-    from vvgt_cli.errors import UsageError
-
-    if functions or other or request.checkpoint is not None:
-        raise UsageError("--split-labels converts one label map; leave out --tf, --dry-run, --shard and --checkpoint")
-    if is_page(request.output) and not is_pattern(request.output or ""):
-        page_of_labels(request, console)
-    else:
-        convert_labels(request, console)
-
-
-def _streamed(request: ConvertRequest, functions: Sequence[str], other: bool, console: Console) -> None:
-    """Levels of the closed form; ``other``: options that go with one file are given."""
-    from vvgt_cli.conversion.request import Limits
-    from vvgt_cli.conversion.shards.run import init_in_blocks, streams
-    from vvgt_cli.errors import UsageError
-    from vvgt_cli.field.open import automatic
-
-    fit = request.fit
-    refined = fit.steps or fit.model is not None or request.limits != Limits() or fit.rule != "inria"
-    if other or len(functions) > 1 or refined or request.live or request.checkpoint or request.preview:
-        raise UsageError(
-            f"-o {request.output} has levels of one closed form: leave out --steps, --model, --rule, --target-psnr, "
-            "--time-budget, --max-size, --live, --checkpoint, --preview, --dry-run, --shard and all but one --tf"
-        )
-    request = replace(request, blocks=request.blocks or automatic(request.source, console))
-    if streams(request):
-        init_in_blocks(request, console)
-
-
-def _convert(
-    request: ConvertRequest, functions: Sequence[str], shard: str | None, dry_run: bool, console: Console
-) -> None:
-    """One volume, a series, or several functions; of a page, several clouds in one file."""
-    from vvgt_cli.conversion.convert import convert, planned
-    from vvgt_cli.conversion.functions import convert_functions
-    from vvgt_cli.conversion.gaussian_files import is_page
-    from vvgt_cli.conversion.index import is_pattern
-    from vvgt_cli.conversion.pages import page_of_functions, page_of_volume
-    from vvgt_cli.conversion.series import convert_series
-    from vvgt_cli.errors import UsageError
-    from vvgt_cli.gaussians.formats.streamed import is_streamed
-
-    if is_streamed(request.output):
-        _streamed(request, functions, shard is not None or dry_run, console)
-        return
-    several = len(functions) > 1
-    numbered = is_pattern(request.output or "")
-    if several and (dry_run or shard is not None or request.checkpoint is not None):
-        raise UsageError(f"{len(functions)} functions; expected one with --dry-run, --shard or --checkpoint")
-    series, joined = numbered and not several, is_page(request.output) and not numbered
-    if series and request.checkpoint is not None:
-        raise UsageError("--checkpoint is of one volume; a series goes on by its manifest: leave the option out")
-    if series and dry_run:
-        raise UsageError("--dry-run of a series: expected one volume; try it on one of the frames")
-    if several:
-        (page_of_functions if joined else convert_functions)(request, functions, console)
-    elif series:
-        from vvgt_cli.commands.render_views import parse_shard
-
-        convert_series(request, parse_shard(shard or "1/1"), console)
-    elif shard is not None:
-        raise UsageError(f"--shard {shard} is of a series; give -o a place for the frame's number, as out_{{:04d}}.ply")
-    elif dry_run:
-        click.echo(planned(request, console).text())
-    elif joined:
-        page_of_volume(request, lambda: convert(request, console), console)
-    else:
-        convert(request, console)
+    plan = convert_files(
+        request, functions, split_labels=split_labels, dry_run=dry_run, shard=shard, console=console
+    )  # fmt: skip
+    if plan is not None:
+        click.echo(plan)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from vvgt_cli.cli.options import group
+from vvgt_cli.defaults import INIT, MAX_GAUSSIANS, RULE, SIZE
 
 if TYPE_CHECKING:
     from vvgt_cli.conversion.request import ConvertRequest
@@ -16,15 +17,15 @@ if TYPE_CHECKING:
 fit_options = group(
     "fit",
     max_gaussians=click.option(
-        "--max-gaussians", type=click.IntRange(1, 100_000_000), default=100_000, show_default=True, metavar="K",
+        "--max-gaussians", type=click.IntRange(1, 100_000_000), default=MAX_GAUSSIANS, show_default=True, metavar="K",
         help="Maximum number of Gaussians.",
     ),
     size=click.option(
-        "--size", type=click.IntRange(16, 8192), default=1080, show_default=True, metavar="PX",
+        "--size", type=click.IntRange(16, 8192), default=SIZE, show_default=True, metavar="PX",
         help="Screen size that the file is optimised for and scored at, in pixels along an edge.",
     ),
     init=click.option(
-        "--init", type=click.Choice(["vbm", "wavelet", "uniform"]), default="vbm", show_default=True,
+        "--init", type=click.Choice(["vbm", "wavelet", "uniform"]), default=INIT, show_default=True,
         help="Closed form: multi-resolution moments, one isotropic Gaussian per wavelet atom, or random samples.",
     ),
     seed=click.option(
@@ -110,7 +111,7 @@ def convert_request(
     overwrite: bool,
     report: str | None = None,
     preview: str | None = None,
-    rule: str = "inria",
+    rule: str = RULE,
     steps: int | None = None,
     model: str | None = None,
     limits: dict[str, Any] | None = None,

@@ -138,8 +138,9 @@ def command(
       vvgt render-views head.nrrd --tf bone.json --tf skin.json -o views --views 36 --size 800
       vvgt render-views head.nrrd --tf bone.json -o views --shard $SLURM_ARRAY_TASK_ID/8
     """
-    from vvgt_cli.commands.render_views import CameraRequest, ViewsRequest, parse_shard, render_view_sets
+    from vvgt_cli.commands.render_views import CameraRequest, ViewsRequest, render_view_sets
     from vvgt_cli.commands.view_files import Layout
+    from vvgt_cli.conversion.manifest import parse_shard
     from vvgt_cli.errors import UsageError
 
     if layout["half"] and layout["format"] == "png":

@@ -10,6 +10,7 @@ from vvgt_cli.cli.blocks import block_options, chosen
 from vvgt_cli.cli.options import common_options, light_options, overwrite_option, read_options, tf_options
 from vvgt_cli.cli.sections import SectionedCommand
 from vvgt_cli.cli.typed import command_line, typed
+from vvgt_cli.defaults import MAX_GAUSSIANS, REPORT_STEPS, SIZE
 from vvgt_cli.errors import UsageError
 from vvgt_cli.progress import Console
 
@@ -23,15 +24,15 @@ OF_BOTH = {"paths", "compare", "output", "overwrite", "threads", "quiet"}  # par
     "--compare", is_flag=True, help="Overlay existing reports: report.json files, or JSON of 'vvgt convert --report'."
 )
 @click.option(
-    "--max-gaussians", type=click.IntRange(1, 100_000_000), default=100_000, show_default=True, metavar="K",
+    "--max-gaussians", type=click.IntRange(1, 100_000_000), default=MAX_GAUSSIANS, show_default=True, metavar="K",
     help="Maximum number of Gaussians; the closed form also runs with 1/64, 1/16 and 1/4 of it.",
 )  # fmt: skip
 @click.option(
-    "--size", type=click.IntRange(16, 2048), default=1080, show_default=True, metavar="PX",
+    "--size", type=click.IntRange(16, 2048), default=SIZE, show_default=True, metavar="PX",
     help="Screen size that files are optimised for and scored at.",
 )  # fmt: skip
 @click.option(
-    "--steps", type=click.IntRange(1, 10_000_000), multiple=True, default=(25, 120, 200, 400), show_default=True,
+    "--steps", type=click.IntRange(1, 10_000_000), multiple=True, default=REPORT_STEPS, show_default=True,
     metavar="N", help="Number of gradient descent steps. Repeatable, one run each; the baselines use the largest.",
 )  # fmt: skip
 @click.option(

@@ -73,7 +73,7 @@ def list_named(console: Console) -> None:
       vvgt tf list
       vvgt tf convert ct-bone mine.json
     """
-    from vvgt_cli.look.readers.named import names
+    from vvgt_cli.look.readers.names import names
 
     found = names()
     for name, shows in found.items():

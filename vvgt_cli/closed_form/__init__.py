@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from vvgt_cli.defaults import MAX_GAUSSIANS, SIZE
 from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians.rules import INRIA, Rule
 
@@ -35,8 +36,8 @@ class VbmOptions:
         values: cells are split where values differ, of which red is the value and green its square, shares of a range.
     """
 
-    max_gaussians: int = 100_000
-    size: int = 400
+    max_gaussians: int = MAX_GAUSSIANS
+    size: int = SIZE
     method: str = "vbm"
     seed: int = 0
     degree: int = 0

@@ -1,15 +1,17 @@
-"""`check`: the stability suite, one scene's share of it with its stiffness, or what a file of Gaussians is like."""
+"""`check`: the self-test of an installation, the cases and stiffness of one scene, or those of a file of Gaussians."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
+from itertools import groupby
 from typing import Any
 
-from vvgt_cli.checks import Case, Outcome, all_cases, run_case
-from vvgt_cli.checks.stiffness import Stiffness, scene_cases, stiffness
-from vvgt_cli.commands.check_splats import splats_opened
+from vvgt_cli.checks import Case, Outcome, run_case
+from vvgt_cli.checks.scene import scene_cases
+from vvgt_cli.checks.self_test import self_test_cases
+from vvgt_cli.checks.stiffness import Stiffness, measure_stiffness
+from vvgt_cli.commands.check_splats import open_splats
 from vvgt_cli.field.source import SourceRequest, describe_source, load, tf_record, volume_record
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import document
@@ -19,12 +21,13 @@ TOLERANCE = 0.002  # RMS of RGBA
 
 @dataclass
 class CheckReport:
-    """What the suite found; `to_json` is documented in docs/report.md.
+    """Outcomes of a check; docs/report.md describes `to_json`.
 
     Attributes:
-        outcomes: a case each.
-        volume, transfer_function, stiffness: of the scene, where one was given.
-        splats: name, number, size and rule of the file of Gaussians that was looked at.
+        outcomes: one for each case.
+        volume, transfer_function: records of the scene, if one was given.
+        stiffness: of the scene; None for a file of Gaussians.
+        splats: name, number, size and rule of the file of Gaussians, if one was given.
     """
 
     outcomes: list[Outcome] = field(default_factory=list)
@@ -35,16 +38,16 @@ class CheckReport:
 
     @property
     def failed(self) -> list[Outcome]:
-        """Cases that did not pass."""
+        """Return the outcomes that did not pass."""
         return [outcome for outcome in self.outcomes if not outcome.passed]
 
     def to_json(self) -> str:
-        """JSON with machine and versions."""
+        """Return JSON with machine and versions."""
         counts = {"cases": len(self.outcomes), "failed": len(self.failed)}
         return document("vvgt-check", counts | asdict(self))
 
     def table(self) -> str:
-        """A row a case, a row a stage, and the scene's stiffness."""
+        """Return a table: a row for each case and each stage, and the scene's stiffness."""
         stage, name = (max(len(getattr(o, key)) for o in self.outcomes) for key in ("stage", "name"))
         lines = [f"{'':<6}{'stage':<{stage}}  {'case':<{name}}  {'measured':>9} {'limit':>9}  of what"]
         for o in self.outcomes:
@@ -80,47 +83,44 @@ def _stiffness_lines(found: Stiffness) -> list[str]:
 def check(
     source: SourceRequest | None, tolerance: float | None, console: Console | None = None, splats: str | None = None
 ) -> CheckReport:
-    """Run the suite; with a source, its own cases and its stiffness instead; with Gaussians, theirs.
+    """Check the installation; with a source that scene, with a file of Gaussians that file.
 
     Args:
-        source: volume and function to look at, None for the suite.
-        tolerance: root-mean-square error of pictures in [0, 1] that the scene's step is chosen for, or that Gaussians
-            may have; None: `TOLERANCE`, or that of `check_splats`.
-        console: where progress goes.
-        splats: file of Gaussians to look at, beside the source if there is one.
+        source: volume and transfer function, None for the self-test or a file of Gaussians alone.
+        tolerance: RMS error in [0, 1] that a scene's views or the pictures of Gaussians may have; None: `TOLERANCE`, or
+            that of `check_splats`.
+        console: for messages.
+        splats: file of Gaussians, compared with the source if there is one.
 
     Raises:
         UsageError, DataError: a source that cannot be read.
     """
     console = console or Console()
     if splats is not None:
-        with splats_opened(splats, source, tolerance, console) as looked:
-            outcomes = _run_cases(looked.cases, console)
-        return CheckReport(outcomes, looked.volume, looked.function, splats=looked.about)
+        with open_splats(splats, source, tolerance, console) as opened:
+            outcomes = _run_cases(opened.cases, console)
+        return CheckReport(outcomes, opened.volume, opened.function, splats=opened.about)
     if source is None:
-        return CheckReport(_run_cases(list(all_cases()), console))
+        return CheckReport(_run_cases(list(self_test_cases()), console))
     loaded = load(source)
     console.say(describe_source(loaded))
     scene = loaded.scene()
-    found = stiffness(scene, tolerance or TOLERANCE, console.bar("stiffness"))
+    found = measure_stiffness(scene, tolerance or TOLERANCE, console.bar("stiffness"))
     outcomes = _run_cases(list(scene_cases(scene)), console)
     return CheckReport(outcomes, volume_record(loaded), tf_record(loaded, source), found)
 
 
 def _run_cases(cases: list[Case], console: Console) -> list[Outcome]:
+    """Run cases, with a line on the console for each stage."""
     outcomes: list[Outcome] = []
     bar = console.bar("check")
-    for case in cases:
-        if outcomes and case.stage != outcomes[-1].stage:
-            _say(console, outcomes, outcomes[-1].stage)
-        outcomes.append(run_case(case))
-        if bar:
-            bar(len(outcomes), len(cases))
-    _say(console, outcomes, outcomes[-1].stage)
+    for stage, group in groupby(cases, lambda case: case.stage):
+        begin = len(outcomes)
+        for case in group:
+            outcomes.append(run_case(case))
+            if bar:
+                bar(len(outcomes), len(cases))
+        found = outcomes[begin:]
+        failed = sum(not o.passed for o in found)
+        console.stage(stage, sum(o.seconds for o in found), f"{len(found)} cases, {failed or 'none'} failed")
     return outcomes
-
-
-def _say(console: Console, outcomes: Iterable[Outcome], stage: str) -> None:
-    own = [o for o in outcomes if o.stage == stage]
-    failed = sum(not o.passed for o in own)
-    console.stage(stage, sum(o.seconds for o in own), f"{len(own)} cases, {failed or 'none'} failed")

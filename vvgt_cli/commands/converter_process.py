@@ -16,9 +16,9 @@ from typing import IO, Any, NoReturn
 
 from vvgt_cli.commands.converter import Failed, Job, Made, Message, Progress, Said, Scored, Start
 from vvgt_cli.commands.live_site import Cloud, page_of, stored
-from vvgt_cli.conversion.convert import opened, ply_options, without_files
+from vvgt_cli.conversion.convert import convert_in_memory, opened, ply_options
 from vvgt_cli.conversion.live import live_conversion, refusal
-from vvgt_cli.conversion.onward import Onward
+from vvgt_cli.conversion.previous_look import PreviousLook
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.conversion.result import Conversion
 from vvgt_cli.errors import DataError, VvgtError
@@ -27,6 +27,7 @@ from vvgt_cli.field.open import automatic
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import write_ply
 from vvgt_cli.gaussians.formats import ready
+from vvgt_cli.jit.ahead import INIT
 from vvgt_cli.look.labels import LabelTable
 from vvgt_cli.look.lighting import Lighting
 from vvgt_cli.progress import Console, ProgressCallback
@@ -69,7 +70,7 @@ class Volume:
         self.source, self.name = source, name
         self.lighting: Lighting | None = None  # of the function to begin with
         self.table: LabelTable | None = None  # the labels to begin with
-        self.last: Onward | None = None  # what the next conversion goes on from
+        self.last: PreviousLook | None = None  # what the next conversion goes on from
         if automatic(source, Console(quiet=True)) is None:  # `opened` says it
             console.bar("reading")
             content = open_parts(source.path, source.read)
@@ -79,7 +80,7 @@ class Volume:
         """Tell the live form, or of what has none an ordinary conversion."""
         run = Run(console, ConversionReport("init"))
         request = ConvertRequest(self.source, live=True)
-        with opened(run, request) as field:
+        with opened(run, request, INIT) as field:
             why = refusal(request, field.source) or _missing()
             if why is None:
                 ply, self.lighting = ply_options(request, field.source), field.source.tf.lighting
@@ -97,11 +98,11 @@ class Volume:
         else:
             lit = replace(job, lighting=self.lighting)
             source = replace(self.source, tf=lit, tf_range="data", unit_distance=None)
-        self.last = Onward(self._converted(ConvertRequest(source), console, _plain_file))
+        self.last = PreviousLook(self._converted(ConvertRequest(source), console, _plain_file))
 
     def _converted(self, request: ConvertRequest, console: Telling, made: Callable[[Conversion], Made]) -> Conversion:
         """Tell what is ``made`` of a conversion as soon as it is there, and its scores when they are."""
-        conversion = without_files(request, console, self.last, lambda unscored: console.tell(made(unscored)))
+        conversion = convert_in_memory(request, console, self.last, lambda unscored: console.tell(made(unscored)))
         assert conversion.scores is not None
         console.tell(Scored(_file(conversion), conversion.scores["psnr"]))
         return conversion

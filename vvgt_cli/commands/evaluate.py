@@ -23,7 +23,7 @@ from vvgt_cli.field.source import Source, SourceRequest, describe_source, load, 
 from vvgt_cli.gaussians import Gaussians, PlyHeader
 from vvgt_cli.gaussians.outputs import Output, check_outputs
 from vvgt_cli.gaussians.rules import Rule
-from vvgt_cli.images.metrics.texture import Texture
+from vvgt_cli.images.metrics import Texture
 from vvgt_cli.jit.ahead import EVALUATE, for_blocks, for_degree
 from vvgt_cli.look.labels import LabelTable
 from vvgt_cli.look.lighting import LightOptions
@@ -154,7 +154,7 @@ def opened(run: Run, request: EvaluateRequest, gaussians: Gaussians, header: Ply
             stage.note = describe_source(source)
         run.compile(source.kernels(kernels), source.kernel_type())
         with run.stage("scene"):
-            resident = Resident(source, source.scene())
+            resident = Resident.of(source)
         yield resident
         return
     with beside(None) as parts, blocked(run, dark, options, parts, Wanted(len(gaussians), size)) as found:
@@ -166,10 +166,10 @@ def opened(run: Run, request: EvaluateRequest, gaussians: Gaussians, header: Ply
 @contextmanager
 def _together(field: Field, pictures: Sequence[Picture]) -> Iterator[None]:
     """Pictures that are asked for within: those of a volume in blocks are made together, and let go of."""
-    field.expect(pictures)
+    field.views.expect(pictures)
     yield
     for picture in pictures:
-        field.forget(picture)
+        field.views.forget(picture)
 
 
 def shown(gaussians: Gaussians, header: PlyHeader, source: Source, request: SourceRequest) -> Gaussians:
@@ -243,7 +243,7 @@ def _scored(run: Run, request: EvaluateRequest, volume: Field, gaussians: Gaussi
     wanted = [Picture(camera, settings, part) for _, camera, part in scored(size, perceptual=True)]
     with run.stage("test views") as stage, _together(volume, wanted):
         bar = run.console.bar("test views")
-        scores = score_test_views(volume, gaussians, size, settings, rule=rule, progress=bar)
+        scores = score_test_views(volume.views, gaussians, size, settings, rule=rule, progress=bar)
         evaluation.scores = asdict(scores)
         stage.note = f"{psnr_note(scores)}, {size} px"
     if header.certificate is not None:
@@ -254,7 +254,7 @@ def _scored(run: Run, request: EvaluateRequest, volume: Field, gaussians: Gaussi
     if request.preview:
         camera, axes = default_views("test", size=size)[PICTURED], upright(source.volume, header.up)
         with run.stage("preview"):
-            sheet = preview(volume, gaussians, [camera, zoomed(camera, CLOSE)], axes, rule)
+            sheet = preview(volume.views, gaussians, [camera, zoomed(camera, CLOSE)], axes, rule)
             write_png(request.preview, sheet, request.overwrite)
     if request.seats:
         _look_around(run, evaluation, volume, gaussians, rule)
@@ -271,13 +271,13 @@ def _look_around(run: Run, evaluation: Evaluation, volume: Field, gaussians: Gau
     places = viewing_conditions(size)
     wanted = [Picture(camera, settings, blocks) for _, camera, blocks in seat_pictures(places)]
     with run.stage("seats") as stage, _together(volume, wanted):
-        seen = condition_views(volume, places, settings, progress=run.console.bar("seats"))
+        seen = condition_views(volume.views, places, settings, progress=run.console.bar("seats"))
         seats = score_conditions(gaussians, seen)
         evaluation.seats = [asdict(seat) for seat in seats]
         stage.note = f"worst: {seats[0].name()}, {seats[0].psnr:.2f} dB"
     near = [Picture(camera, settings) for camera in near_cameras(size)]
     with run.stage("texture") as stage, _together(volume, near):
-        found = score_texture(volume, gaussians, size, rule, settings, progress=run.console.bar("texture"))
+        found = score_texture(volume.views, gaussians, size, rule, settings, progress=run.console.bar("texture"))
         evaluation.texture = asdict(found)
         stage.note = texture_note(found)
 
@@ -297,5 +297,5 @@ def _reference_psnr(volume: Field, size: int, step: float) -> float:
     settings = replace(REFERENCE, step=step)
     finer = replace(settings, step=settings.step / 2, tiers=tuple((edge, 4 * rays) for edge, rays in settings.tiers))
     with _together(volume, [Picture(middle, finer), Picture(middle, settings)]):
-        images = [render_view(volume, middle, s) for s in (finer, settings)]
+        images = [render_view(volume.views, middle, s) for s in (finer, settings)]
     return score_view(images[0], images[1], perceptual=False).psnr

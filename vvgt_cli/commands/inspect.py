@@ -24,7 +24,7 @@ from vvgt_cli.look.function import PER_VOXEL
 from vvgt_cli.look.label_files import holds_table, is_table, read_labels, segments_of
 from vvgt_cli.look.labels import LabelTable
 from vvgt_cli.look.readers import SUFFIXES
-from vvgt_cli.look.readers.named import names
+from vvgt_cli.look.readers.names import names
 from vvgt_cli.volume import ReadOptions
 from vvgt_cli.volume.blocks import Packed
 from vvgt_cli.volume.registry import contents
@@ -218,7 +218,7 @@ def _channels(content: Content) -> list[dict[str, Any]]:
 def _one(file: str, read: ReadOptions) -> dict[str, Any]:
     from vvgt_cli.field.layered import open_parts
     from vvgt_cli.look import unit_distance
-    from vvgt_cli.look.fitting import fitting
+    from vvgt_cli.look.histogram import fitting
     from vvgt_cli.volume import statistics
     from vvgt_cli.volume.label_maps import recognised
 

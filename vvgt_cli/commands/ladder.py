@@ -17,10 +17,10 @@ from vvgt_cli.cameras.blocks import Blocks, spread_blocks
 from vvgt_cli.cameras.boxed import render_in_box
 from vvgt_cli.commands.peers import Peer, PeerViews, train
 from vvgt_cli.conversion.convert import convert, opened
-from vvgt_cli.conversion.plan import DEFAULT_STEPS
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.conversion.stages.refinement import refine
 from vvgt_cli.conversion.stages.views import CheckViews, TrainingViews, views_of
+from vvgt_cli.defaults import MAX_GAUSSIANS, REPORT_STEPS, SIZE
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.field.field import Field, Picture, Resident
 from vvgt_cli.field.settings import BlockOptions
@@ -29,6 +29,7 @@ from vvgt_cli.field.workload import view_edge
 from vvgt_cli.gaussians import Gaussians, as_stored, read_ply, write_ply
 from vvgt_cli.gaussians.frames import transform
 from vvgt_cli.gaussians.rules import INRIA
+from vvgt_cli.jit.ahead import INIT
 from vvgt_cli.progress import Console
 from vvgt_cli.refine import OptimizeOptions
 from vvgt_cli.score.checks import Views, judging_views
@@ -62,9 +63,9 @@ class LadderOptions:
         peers: other trainers, a rung each.
     """
 
-    max_gaussians: int = 100_000
-    size: int = 1080
-    steps: tuple[int, ...] = (25, DEFAULT_STEPS, 200, 400)
+    max_gaussians: int = MAX_GAUSSIANS
+    size: int = SIZE
+    steps: tuple[int, ...] = REPORT_STEPS
     model: str | None = None
     seed: int = 0
     blocks: BlockOptions | None = None
@@ -146,15 +147,15 @@ class Reference:
         cameras, axes = default_views("test", size=size), volume.source.volume.axes
         blocks = [spread_blocks(size, size, i) for i in range(len(cameras))]
         around = seat_pictures(from_above(size), SIDE)
-        volume.expect([Picture(camera, REFERENCE, _drawn(blocks, i)) for i, camera in enumerate(cameras)])
-        volume.expect([Picture(camera, REFERENCE, part) for _, camera, part in around])
+        volume.views.expect([Picture(camera, REFERENCE, _drawn(blocks, i)) for i, camera in enumerate(cameras)])
+        volume.views.expect([Picture(camera, REFERENCE, part) for _, camera, part in around])
         images, bar = [], console.bar("reference")
         for i, camera in enumerate(cameras):
-            images.append(volume.view(camera, REFERENCE, _drawn(blocks, i)))
+            images.append(volume.views.view(camera, REFERENCE, _drawn(blocks, i)))
             if bar:
                 bar(i + 1, len(cameras))
-        shown = upright(images, cameras, axes, lambda camera: volume.view(camera, REFERENCE))
-        seats = list(condition_views(volume, from_above(size), REFERENCE, views=SIDE))
+        shown = upright(images, cameras, axes, lambda camera: volume.views.view(camera, REFERENCE))
+        seats = list(condition_views(volume.views, from_above(size), REFERENCE, views=SIDE))
         rays = max(rays for _, rays in REFERENCE.tiers)
         return cls(cameras, blocks, images, REFERENCE.step, rays, axes, shown, seats)
 
@@ -273,11 +274,11 @@ def _views(run: Run, volume: Field, fit: FitOptions) -> tuple[Views, Views]:
     from vvgt_cli.dvr import RenderSettings, render_views
 
     train = default_views("train", views_of(fit.steps or 0, small=False), size=view_edge(fit.size, small=False))
-    volume.expect([*CheckViews().views(fit), *(Picture(camera, RenderSettings()) for camera in train)])
+    volume.views.expect([*CheckViews().views(fit), *(Picture(camera, RenderSettings()) for camera in train)])
     with run.stage("check views"):
-        judges = judging_views(volume, default_views("check", size=fit.size), RenderSettings())
+        judges = judging_views(volume.views, default_views("check", size=fit.size), RenderSettings())
     with run.stage("views"):
-        return Views(train, render_views(volume, train)), judges
+        return Views(train, render_views(volume.views, train)), judges
 
 
 def _finish(run: Run, gaussians: Gaussians) -> tuple[ConversionReport, Gaussians]:
@@ -294,13 +295,13 @@ def _baseline(source: SourceRequest, rung: Rung, blocks: BlockOptions | None) ->
 
     run, fit = Run(Console(quiet=True), ConversionReport("report")), rung.fit
     count = max(fit.max_gaussians // STARTS, 1)
-    with opened(run, ConvertRequest(source, fit=fit, blocks=blocks)) as volume:
+    with opened(run, ConvertRequest(source, fit=fit, blocks=blocks), INIT) as volume:
         with run.stage("samples"):
             if rung.start == "points":
                 half = np.array(volume.source.volume.unit_frame().half)
                 start = random_points(half, count, fit.seed)
             else:
-                start = volume.start(VbmOptions(count, fit.size, "uniform", fit.seed)).gaussians
+                start = volume.pyramid(VbmOptions(count, fit.size, "uniform", fit.seed)).gaussians
         train, check = _views(run, volume, fit)
     options = OptimizeOptions.of(
         "3dgs", steps=fit.steps, max_gaussians=fit.max_gaussians, seed=fit.seed,

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,7 +35,7 @@ from vvgt_cli.volume.space import shear_text
 from vvgt_cli.volume.types import IDENTITY
 
 if TYPE_CHECKING:
-    from vvgt_cli.dvr import Scene
+    pass
 
 Draw = Callable[[Camera], np.ndarray]
 NO_POINTS = np.zeros((0, 3))
@@ -279,16 +280,24 @@ def _work(run: Run, request: ViewsRequest, job: _Job, views: list[View]) -> None
     models = any(name not in built for name in job.files)
     settings = RenderSettings(request.step, request.samples)
     draw: Draw | None = None
+    points: Callable[[int], tuple[np.ndarray, np.ndarray]]
     if job.field is not None:
         draw = draw_in_blocks(job.field, settings, [view.camera for view in job.pending])
+        points = partial(field_points, job.field)
     elif job.pending or models:
         with run.stage("scene") as stage:
             scene = job.source.scene()
             stage.note = f"{job.source.name}, opacity per {job.source.unit_distance:g} ({job.source.unit_label})"
         inside = view_renderer(request.renderer, scene, settings) if job.pending else None
         draw = None if inside is None else render_in_box(inside, scene.volume.axes)
+        points = partial(start_points, scene)
     if models and layout.points:
-        built |= layout.models(views, *_points(run, job.field or scene, views))
+        with run.stage("points") as stage:
+            found = points(views[0].camera.height)
+            if not len(found[0]):
+                raise NothingVisible(job.source.volume.name, job.source.tf.name)
+            stage.note = f"{len(found[0])} points to start from"
+        built |= layout.models(views, *found)
     elif models:
         built |= layout.models(views, NO_POINTS, NO_POINTS)
     for name in ("", *layout.folders(views)):
@@ -300,18 +309,6 @@ def _work(run: Run, request: ViewsRequest, job: _Job, views: list[View]) -> None
         if job.pending and draw is not None:
             _render(run, request, job, draw)
         _contact(run, job, layout, views)
-
-
-def _points(run: Run, scene: Scene | Blocked, views: list[View]) -> tuple[np.ndarray, np.ndarray]:
-    """The cloud to start from: centres and colours, (n, 3) each."""
-    with run.stage("points") as stage:
-        size = views[0].camera.height
-        points, colors = field_points(scene, size) if isinstance(scene, Blocked) else start_points(scene, size)
-        if not len(points):
-            source = scene.source if isinstance(scene, Blocked) else scene
-            raise NothingVisible(source.volume.name, source.tf.name)
-        stage.note = f"{len(points)} points to start from"
-    return points, colors
 
 
 def _render(run: Run, request: ViewsRequest, job: _Job, draw: Draw) -> None:
@@ -367,15 +364,3 @@ def _write(manifest: Manifest, files: dict[str, bytes]) -> None:
         with atomic_write(manifest.folder / name, overwrite=True) as temporary:
             temporary.write_bytes(data)
     manifest.record(files)
-
-
-def parse_shard(text: str) -> Shard:
-    """``I/N``, I from 1 to N.
-
-    Raises:
-        UsageError: anything else.
-    """
-    match = re.fullmatch(r"(\d{1,6})/(\d{1,6})", text)
-    if match is None or not 1 <= int(match[1]) <= int(match[2]):
-        raise UsageError(f"--shard {text}: expected I/N with I from 1 to N, as 3/8")
-    return Shard(int(match[1]), int(match[2]))

@@ -21,11 +21,12 @@ from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.source import SourceRequest, tf_record, volume_record
 from vvgt_cli.gaussians.outputs import STDOUT, Output, check_outputs, write_text
+from vvgt_cli.jit.ahead import INIT
 from vvgt_cli.network.card import find_model
 from vvgt_cli.progress import Console
+from vvgt_cli.score.charts import FILES, draw, write_plots
 from vvgt_cli.score.curves import Series, cost, front, knee, psnr, read_series, table, unit_costs, worst_seat
 from vvgt_cli.score.page import Pictures, page
-from vvgt_cli.score.plots import FILES, write_plots
 from vvgt_cli.score.record import ConversionReport, Run, document
 from vvgt_cli.volume.blocks import check_memory
 
@@ -70,7 +71,7 @@ def report(request: ReportRequest, console: Console | None = None) -> dict[str, 
     check_memory(VIEWS * size**2 * VIEW_BYTES, f"--size {size}: test views and ours", "try a smaller --size")
     fit = FitOptions(request.ladder.max_gaussians, size)
     whole = ConvertRequest(request.source, fit=fit, blocks=request.ladder.blocks)
-    with opened(Run(console, ConversionReport("report")), whole) as volume:
+    with opened(Run(console, ConversionReport("report")), whole, INIT) as volume:
         source = volume.source
         live = replace(whole, live=True, fit=FitOptions(fit.max_gaussians, size))
         request = replace(request, ladder=replace(request.ladder, live=refusal(live, source) is None))
@@ -92,7 +93,7 @@ def report(request: ReportRequest, console: Console | None = None) -> dict[str, 
     folder.mkdir(exist_ok=True)
     write_text(str(folder / DATA), text, request.overwrite)
     title = f"Error against run time: {source.volume.name}"
-    _write(folder, series, title, table(runs), Pictures(list(PICTURED), shown, ours), request.overwrite)
+    _write(folder, series, title, Pictures(list(PICTURED), shown, ours), request.overwrite)
     console.say(f"{folder / PAGE}")
     return found
 
@@ -142,9 +143,8 @@ def compare(paths: Sequence[str], output: str, overwrite: bool, console: Console
         raise UsageError(f"--compare: {len(paths)} report; expected two or more, as --compare A.json B.json")
     folder = _folder(output, (TABLE, PAGE, *FILES), overwrite, paths)
     series = _distinct([read_series(path) for path in paths])
-    rows = [run | {"name": f"{one.name}: {run['name']}"} for one in series for run in one.runs]
     folder.mkdir(exist_ok=True)
-    _write(folder, series, "Error against run time, compared", table(rows), None, overwrite)
+    _write(folder, series, "Error against run time, compared", None, overwrite)
     for one in series:
         best = max(one.scored(), key=lambda run: psnr(run) or 0)
         console.say(f"{one.name}: {len(one.runs)} runs, nearest {best['name']} with {psnr(best):.2f} dB")
@@ -152,12 +152,13 @@ def compare(paths: Sequence[str], output: str, overwrite: bool, console: Console
 
 
 def _distinct(series: list[Series]) -> list[Series]:
-    """Reports of one name get a number."""
-    names = [one.name for one in series]
-    return [
-        Series(one.name if names.count(one.name) == 1 else f"{one.name} ({n + 1})", one.runs, one.document)
-        for n, one in enumerate(series)
-    ]
+    """Give reports of one name a number, and their runs the report's name."""
+    names, found = [one.name for one in series], []
+    for n, one in enumerate(series):
+        name = one.name if names.count(one.name) == 1 else f"{one.name} ({n + 1})"
+        runs = [{"label": run["name"], **run, "name": f"{name}: {run['name']}"} for run in one.runs]
+        found.append(Series(name, runs, one.document))
+    return found
 
 
 def _folder(output: str, names: Sequence[str], overwrite: bool, inputs: Sequence[str] = ()) -> Path:
@@ -189,10 +190,11 @@ def _pngs(images: Sequence[np.ndarray]) -> list[bytes]:
     return found
 
 
-def _write(folder: Path, series: list[Series], title: str, rows: str, shown: Pictures | None, overwrite: bool) -> None:
-    write_text(str(folder / TABLE), rows, overwrite)
-    write_plots(folder, series, overwrite)
-    write_text(str(folder / PAGE), page(series, title, shown), overwrite)
+def _write(folder: Path, series: list[Series], title: str, shown: Pictures | None, overwrite: bool) -> None:
+    write_text(str(folder / TABLE), table([run for one in series for run in one.runs]), overwrite)
+    charts = draw(series)
+    write_plots(folder, charts, overwrite)
+    write_text(str(folder / PAGE), page(series, charts, title, shown), overwrite)
 
 
 __all__ = ["LadderOptions", "Peer", "ReportRequest", "compare", "report"]

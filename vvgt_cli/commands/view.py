@@ -158,10 +158,10 @@ def _opened(run: Run, request: ViewRequest, name: str) -> tuple[Gaussians, PlyOp
         _refuse_reading(given, name)
         gaussians, header = open_gaussians(name)
         return gaussians, layout_of(header)
-    from vvgt_cli.conversion.convert import without_files
+    from vvgt_cli.conversion.convert import convert_in_memory
     from vvgt_cli.conversion.request import ConvertRequest
 
-    conversion = without_files(ConvertRequest(replace(given, volume=name)), run.console)
+    conversion = convert_in_memory(ConvertRequest(replace(given, volume=name)), run.console)
     return conversion.gaussians, conversion.ply
 
 

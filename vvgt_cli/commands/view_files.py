@@ -14,7 +14,7 @@ from vvgt_cli.cameras.colmap import colmap_model, point_cloud_ply
 from vvgt_cli.cameras.files import blender_json, transforms_json
 from vvgt_cli.images import contact_sheet, over, write_exr, write_png
 from vvgt_cli.images.viewset import read_view
-from vvgt_cli.look.types import TransferFunctionLike
+from vvgt_cli.look.function import TransferFunctionLike
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import Scene
@@ -162,7 +162,7 @@ def field_points(field: Field, size: int) -> tuple[np.ndarray, np.ndarray]:
     """`start_points` of a volume in blocks."""
     from vvgt_cli.closed_form import VbmOptions
 
-    found = field.start(VbmOptions(POINTS, size)).gaussians
+    found = field.pyramid(VbmOptions(POINTS, size)).gaussians
     half = np.array(field.source.volume.unit_frame().half)
     points = np.clip(found.means.astype(np.float64), -half, half)
     return points @ field.source.volume.axes.T, np.clip(found.colors, 0, 1)

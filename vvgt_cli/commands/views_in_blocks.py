@@ -72,10 +72,10 @@ def draw_in_blocks(
     def inside(camera: Camera) -> np.ndarray:
         if not field.pictures:
             many = max(TOGETHER // (camera.width * camera.height), 1)
-            field.expect([Picture(boxed(other, axes)[0], settings) for other in left[:many]])
+            field.views.expect([Picture(boxed(other, axes)[0], settings) for other in left[:many]])
             del left[:many]
-        image = field.view(camera, settings)
-        field.forget(Picture(camera, settings))
+        image = field.views.view(camera, settings)
+        field.views.forget(Picture(camera, settings))
         return image
 
     return render_in_box(inside, axes)

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.conversion.request import FitOptions
-from vvgt_cli.field.digests import values_digest
 from vvgt_cli.field.field import Field
 from vvgt_cli.gaussians import Gaussians, PlyOptions
 from vvgt_cli.gaussians.certificate import Certificate, epoch
@@ -40,7 +39,7 @@ def certified(
         return ply
     found = Certificate(
         volume=PurePath(field.source.volume.name).name,
-        sha256=values_digest(field.volumes()),
+        sha256=field.digest(),
         look=field.source.shown_as(),
         size=fit.size,
         rule=fit.rule,
@@ -128,10 +127,10 @@ def checked(certificate: Certificate, field: Field, gaussians: Gaussians, looked
     from vvgt_cli.dvr import RenderSettings
 
     scores = score_test_views(
-        field, gaussians, certificate.size, RenderSettings(), rule=certificate.rule, perceptual=False,
+        field.views, gaussians, certificate.size, RenderSettings(), rule=certificate.rule, perceptual=False,
         only=PREVIEW_VIEWS,
     )  # fmt: skip
-    digests = certificate.sha256, None if certificate.sha256 is None else values_digest(field.volumes())
+    digests = certificate.sha256, None if certificate.sha256 is None else field.digest()
     same = None if None in digests else digests[0] == digests[1]
     recorded = certificate.live_psnr if looked_up and certificate.live_psnr is not None else certificate.psnr
     return Verdict(same, certificate.look == field.source.shown_as(), round(scores.psnr, 2), recorded)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,33 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vvgt_cli.conversion.carried import Carry, carries
-from vvgt_cli.conversion.convert import opened, run_conversion
-from vvgt_cli.conversion.frames import common, interrupted, steps_of, with_blocks
-from vvgt_cli.conversion.functions import beside
 from vvgt_cli.conversion.gaussian_files import is_page
-from vvgt_cli.conversion.index import (
-    FIELD,
-    FRAMES,
-    FUNCTIONS,
-    LABELS,
-    entry,
-    index_of,
-    index_output,
-    is_pattern,
-    psnr_of,
-    write_index,
-)  # fmt: skip
-from vvgt_cli.conversion.labels import shared_out, split
-from vvgt_cli.conversion.request import ConvertRequest
-from vvgt_cli.conversion.result import Conversion, Result
+from vvgt_cli.conversion.index import entry, index_of, index_output, is_pattern, psnr_of, put_name, write_index
+from vvgt_cli.conversion.result import Result
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import atomic_write
-from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.formats import SUFFIXES, format_of
 from vvgt_cli.gaussians.outputs import Output, check_outputs
-from vvgt_cli.progress import Console
-from vvgt_cli.score.record import ConversionReport, Run
 
 if TYPE_CHECKING:
     from vvgt_cli.look.function import TransferFunction
@@ -118,14 +97,14 @@ class Clouds(Mapping[str, Result]):
             known = format_of(name)
             suffix = known.suffix if known else Path(name).suffix
             name = f"{name[: len(name) - len(suffix)]}_{{}}{suffix}"
-        files = [self._named(name, cloud) for cloud in self.clouds]
+        files = [put_name("save", name, self.kind, cloud.stem) for cloud in self.clouds]
         index = index_output(name)
         check_outputs([*(Output("save", file, SUFFIXES, splats=True) for file in files), index], [], overwrite)
-        rows, total = [], 0
+        rows, total, folder = [], 0, Path(index.path).parent
         for cloud, file in zip(self.clouds, files, strict=True):
             size = cloud.save(file, overwrite=overwrite, **how)
             row = entry(cloud.name, len(cloud.gaussians), size, psnr_of(cloud.report), **cloud.facts)
-            rows.append({**row, "file": beside(file, Path(index.path).parent)})
+            rows.append({**row, "file": Path(os.path.relpath(file, folder)).as_posix()})
             total += size
         write_index(index.path, index_of(self.kind, self.volume, rows, **self.facts), overwrite)
         return total
@@ -145,15 +124,6 @@ class Clouds(Mapping[str, Result]):
             other = cloud.recolor(look, **how)
             found.append(replace(cloud, gaussians=other.gaussians, report=other.report, ply=other.ply, directions=None))
         return replace(self, clouds=found)
-
-    def _named(self, pattern: str, cloud: Cloud) -> str:
-        """The file of a cloud."""
-        places = FIELD.findall(pattern)
-        if len(places) != 1 or (places[0] != "{}" and self.kind != FRAMES):
-            what = "the frame's number, as out_{:04d}.ply" if self.kind == FRAMES else "the name, as out_{}.ply"
-            raise UsageError(f"{pattern}: expected one place for {what}")
-        told = places[0].format(int(cloud.stem) if self.kind == FRAMES else cloud.stem)
-        return pattern.replace(places[0], told)
 
     def _page(self, path: str, overwrite: bool, how: dict[str, Any]) -> int:
         """All in one file."""
@@ -176,72 +146,3 @@ class Clouds(Mapping[str, Result]):
             return framed(self._html(self.volume), self.volume)
         except DataError:
             return None
-
-
-def frames_in_memory(request: ConvertRequest, console: Console) -> Clouds:
-    """The frames of a series (`vvgt_cli.conversion.series`), without files.
-
-    Raises:
-        DataError, UsageError: as `convert_series`.
-    """
-    steps = steps_of(request.source)
-    request = with_blocks(request, steps, console)
-    series = common(Run(console, ConversionReport("convert")), request, steps)
-    clouds, carry = [], carries(request)
-    for k, step in enumerate(steps):
-        if series.dark[k]:
-            console.say(f"{step.name}: nothing of it is visible; it is left out")
-            continue
-        one = replace(request, source=series.source_of(step))
-        clouds.append(_cloud(one, console, step.name, str(k), {"frame": k, **step.facts()}, carry=carry))
-    return Clouds(FRAMES, Path(request.source.path).name, clouds)
-
-
-def looks_in_memory(requests: Mapping[str, ConvertRequest], volume: str, console: Console) -> Clouds:
-    """One volume under several looks.
-
-    Args:
-        requests: by name.
-        volume: its name.
-        console: for messages.
-
-    Raises:
-        DataError, UsageError: as `convert`.
-    """
-    clouds = []
-    for name, request in requests.items():
-        stem = re.sub(r"[^0-9A-Za-z.]+", "-", name).strip("-.") or "function"
-        clouds.append(_cloud(request, console, name, stem, {"function": name}))
-    return Clouds(FUNCTIONS, volume, clouds)
-
-
-def labels_in_memory(request: ConvertRequest, console: Console) -> Clouds:
-    """The labels of a map (`vvgt_cli.conversion.labels`), without files.
-
-    Raises:
-        DataError, UsageError: as `convert_labels`.
-    """
-    run = Run(console, ConversionReport("convert"))
-    whole = split(run, request)
-    names = [part.label.name for part in whole.parts]
-    clouds = []
-    for part, gaussians in shared_out(run, whole):
-        name = part.label.name if names.count(part.label.name) == 1 else part.stem
-        clouds.append(_cloud(part.request, console, name, part.stem, part.facts(), gaussians))
-    return Clouds(LABELS, whole.volume, clouds, {"table": whole.table})
-
-
-def _cloud(
-    request: ConvertRequest, console: Console, name: str, stem: str, facts: dict[str, Any],
-    made: Gaussians | None = None, carry: Carry | None = None,
-) -> Cloud:  # fmt: skip
-    """A conversion of which the volume is let go of."""
-    run = Run(console, ConversionReport("convert"))
-    with opened(run, request) as volume:
-        found: Conversion = run_conversion(run, request, volume, made, carry)
-        normals = found.normals()
-    run.finish()
-    if interrupted(found.report):
-        raise KeyboardInterrupt
-    facts = facts | (carry.facts() if carry else {})
-    return Cloud(found.gaussians, found.report, found.ply, name, stem, facts, normals)

@@ -1,4 +1,4 @@
-"""`convert` and `init`: volume and transfer function in, `.ply` out, stage by stage."""
+"""Convert one volume under a transfer function, stage by stage: `convert` to a file, `convert_in_memory` without."""
 
 from __future__ import annotations
 
@@ -8,11 +8,9 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 
-from vvgt_cli.conversion.carried import Carry
 from vvgt_cli.conversion.certify import certified
 from vvgt_cli.conversion.gaussian_files import write_gaussians
 from vvgt_cli.conversion.live import check_live, live_conversion
-from vvgt_cli.conversion.onward import Onward
 from vvgt_cli.conversion.place import out_of_box, placed, remarks, way_up
 from vvgt_cli.conversion.plan import Plan, Planner, check_memory
 from vvgt_cli.conversion.readback import tell_cost
@@ -22,6 +20,7 @@ from vvgt_cli.conversion.resume import FITTED, Checkpoint, checkpoint_folder, ch
 from vvgt_cli.conversion.stage import Work
 from vvgt_cli.conversion.stages import CheckViews, ClosedFormStage
 from vvgt_cli.conversion.stages.views import wide
+from vvgt_cli.conversion.warm_start import WarmStart
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.field import Field, Picture, Resident
 from vvgt_cli.field.open import Wanted, automatic, beside, blocked
@@ -44,13 +43,14 @@ SMALLER = (8, 4, 2)  # parts of the budget that a target is tried with first
 
 
 def convert(
-    request: ConvertRequest, console: Console | None = None, made: Gaussians | None = None, carry: Carry | None = None
-) -> ConversionReport:
-    """Volume to `.ply`: `run_conversion`, and its outputs written.
+    request: ConvertRequest, console: Console | None = None, made: Gaussians | None = None,
+    start: WarmStart | None = None,
+) -> ConversionReport:  # fmt: skip
+    """Convert a volume to a file, and return the report; arguments as of `run_conversion`.
 
     Raises:
         UsageError: an output that may not be written; found before anything is read.
-        DataError: input that is not what it must be, or a scene that shows nothing.
+        DataError: invalid input, or a scene that shows nothing.
     """
     request.budget()
     if request.live:
@@ -64,17 +64,17 @@ def convert(
         opened(run, request) as field,
     ):
         early = _early(run, request)
-        report = _write(run, request, run_conversion(run, request, field, made, carry, early), early is not None)
-        if request.checkpoint is not None and not _interrupted(run):
+        report = _write(run, request, run_conversion(run, request, field, made, start, early), early is not None)
+        if request.checkpoint is not None and not report.interrupted:
             Checkpoint(Path(request.checkpoint)).finish()
         return report
 
 
-def without_files(
-    request: ConvertRequest, console: Console | None = None, onward: Onward | None = None,
+def convert_in_memory(
+    request: ConvertRequest, console: Console | None = None, start: WarmStart | None = None,
     unscored: Callable[[Conversion], None] | None = None,
 ) -> Conversion:  # fmt: skip
-    """A conversion of which nothing is written; ``unscored`` as of `run_conversion`.
+    """Convert a volume without writing anything; arguments as of `run_conversion`.
 
     Raises:
         DataError, UsageError: as `convert`.
@@ -82,27 +82,27 @@ def without_files(
     run = Run(console or Console(), ConversionReport("convert"))
     with ExitStack() as stack:
         field = stack.enter_context(opened(run, request))
-        conversion = run_conversion(run, request, field, carry=onward, unscored=unscored)
-        weakref.finalize(conversion, stack.pop_all().close)  # what it draws is there as long as it is
+        conversion = run_conversion(run, request, field, start=start, unscored=unscored)
+        weakref.finalize(conversion, stack.pop_all().close)  # the conversion draws the field's blocks
     run.finish()
     return conversion
 
 
 def initialise_only(request: ConvertRequest, console: Console | None = None) -> ConversionReport:
-    """Volume to `.ply` by the closed form alone: no image is rendered.
+    """Convert a volume to a file by the closed form alone, without rendering anything.
 
     Raises:
         UsageError, DataError: as `convert`.
     """
     run = Run(console or Console(), ConversionReport("init"))
-    with claimed(request.outputs(), request.inputs(), request.overwrite), opened(run, request) as field:
+    with claimed(request.outputs(), request.inputs(), request.overwrite), opened(run, request, INIT) as field:
         work = Work(run, field, request.fit, degree=degree_of(request, field.source))
         ClosedFormStage().run(work)
         return _write(run, request, _conversion(request, work, as_stored(work.made())))
 
 
 def planned(request: ConvertRequest, console: Console | None = None) -> Plan:
-    """What `convert` would do: the volume is read and laid out, a small view is timed, nothing is written.
+    """Return the plan of `convert`: the volume is read and laid out, and a small view is timed.
 
     Raises:
         DataError, UsageError: as `convert`.
@@ -114,7 +114,7 @@ def planned(request: ConvertRequest, console: Console | None = None) -> Plan:
 
 
 def fitted(run: Run, request: ConvertRequest) -> Gaussians:
-    """The Gaussians of a conversion, box frame, not scored and not written.
+    """Return the Gaussians of a conversion in the box frame, neither scored nor written.
 
     Raises:
         DataError, UsageError: as `convert`.
@@ -128,17 +128,19 @@ def fitted(run: Run, request: ConvertRequest) -> Gaussians:
 
 def run_conversion(
     run: Run, request: ConvertRequest, field: Field, made: Gaussians | None = None,
-    carry: Carry | Onward | None = None, unscored: Callable[[Conversion], None] | None = None,
+    start: WarmStart | None = None, unscored: Callable[[Conversion], None] | None = None,
 ) -> Conversion:  # fmt: skip
-    """Closed form, what views can improve of it, scores on the test views; only checkpoints are written.
+    """Convert a field: closed form, refinement as planned (`vvgt_cli.conversion.plan`), scores on the test views.
 
-    What of these is done, and with how many Gaussians, follows from the request's limits and what the stages cost
-    (`vvgt_cli.conversion.plan`); the check views decide. What is left out is said, and costs nothing. Of Gaussians that
-    are ``made`` already, box frame, there are scores alone. With a ``carry``, it goes on from the frame before where
-    that is as near. ``unscored`` is handed the conversion before there are scores, and so without a certificate.
+    Only checkpoints are written, and the run's report stays open.
 
-    Returns:
-        The same conversion; the run's report is still open.
+    Args:
+        run: times the stages.
+        request: what is asked for.
+        field: the volume under its look.
+        made: Gaussians in the box frame that only need scores.
+        start: an earlier conversion that is tried before the closed form.
+        unscored: called with the conversion before it has scores and a certificate.
 
     Raises:
         DataError, UsageError: as `convert`.
@@ -146,15 +148,15 @@ def run_conversion(
     if request.live:
         check_live(request)
         return live_conversion(run, request, field, ply_options(request, field.source), unscored=unscored)
-    if carry is not None:
-        field = carry.remembered(field)
-    work, planner, plan = _planned(run, request, field, expected=carry is None)
+    if start is not None:
+        field.views = start.views(field.views)
+    work, planner, plan = _planned(run, request, field, expected=start is None)
     if made is not None:
         plan.stages, plan.left_out = [stage for stage in plan.stages if stage.scores], []
         plan.gaussians, plan.case = len(made), replace(plan.case, gaussians=len(made))
         plan.bytes = file_bytes(len(made), planner.sh_degree)
         run.report.plan = plan.record()
-    check_memory(plan, *(carry.beside(plan, work.fit) if isinstance(carry, Carry) else ()))
+    check_memory(plan, *(() if start is None else start.memory(plan, work.fit)))
     work.checkpoint = checkpoint_of(request.checkpoint, work.field, work.fit, request.limits)
     kept = work.checkpoint.load(FITTED)
     if made is not None:
@@ -162,12 +164,12 @@ def run_conversion(
     elif kept:
         work.gaussians = kept[0]
         run.console.say(f"{request.checkpoint} holds the fitted Gaussians: only the scores are left")
-    elif carry is None or not carry.goes_on(work, plan, request):
-        if carry is not None:
-            field.expect(_pictures(plan, work.fit))
+    elif start is None or not start.try_start(work, plan, request):
+        if start is not None:
+            field.views.expect(_pictures(plan, work.fit))
         whole, plan = plan, _fit(work, request, planner, plan)
-        if carry is not None:
-            carry.keep(work, whole)
+        if start is not None:
+            start.keep(work, whole)
     conversion = _conversion(request, work, work.made())
     if unscored is not None:
         unscored(conversion)
@@ -179,32 +181,32 @@ def run_conversion(
 
 
 def _pictures(plan: Plan, fit: FitOptions) -> list[Picture]:
-    """That its stages will ask for."""
+    """Return the pictures that a plan's stages will ask for."""
     return [view for stage in plan.stages for view in stage.views(fit)]
 
 
 def _planned(run: Run, request: ConvertRequest, field: Field, expected: bool = True) -> tuple[Work, Planner, Plan]:
-    """All that comes before the first stage; the pictures that it needs are ``expected``."""
+    """Return all that the first stage needs; with ``expected`` the field is told which pictures it will draw."""
     fit = replace(request.fit, max_gaussians=request.budget())
     if fit.model is not None:
         read_card(find_model(fit.model))  # fails before the work, not after
     degree = degree_of(request, field.source)
     fit = replace(fit, max_gaussians=request.limits.gaussians(fit.max_gaussians, degree))
-    case = replace(field.case(fit.size, fit.max_gaussians), degree=degree)
+    case = replace(field.workload(fit.size, fit.max_gaussians), degree=degree)
     guess = expected_wide(fit.max_gaussians, fit.size)
     planner = Planner(
-        request.limits, fit.max_gaussians, fit.steps, request.ply.sh_degree or degree, fit.size, guess, fit.model,
-        request.scored_whole, fit.init == "vbm", fit.init == "vbm", request.writes,
+        request.limits, fit, sh_degree=request.ply.sh_degree or degree, wide=guess, whole=request.scored_whole,
+        writes=request.writes,
     )  # fmt: skip
     plan = planner.plan(case, run.elapsed())
     run.report.plan = plan.record()
     if expected:
-        field.expect(_pictures(plan, fit))
+        field.views.expect(_pictures(plan, fit))
     return Work(run, field, fit, request.limits, degree), planner, plan
 
 
 def _fit(work: Work, request: ConvertRequest, planner: Planner, plan: Plan) -> Plan:
-    """The closed form, and what views improve; returns the plan, made anew by what the closed form took and showed."""
+    """Run the closed form and the stages that improve it; return the plan, revised by the closed form's time."""
     first = plan.stages[0]
     first.run(work)
     degree = work.made().degree if request.ply.sh_degree is None else request.ply.sh_degree
@@ -218,13 +220,13 @@ def _fit(work: Work, request: ConvertRequest, planner: Planner, plan: Plan) -> P
     check_memory(plan)
     improve(work, plan)
     work.gaussians = as_stored(work.made())  # what is scored is what the file holds
-    if not _interrupted(work.run):
+    if not work.run.report.interrupted:
         work.checkpoint.save(FITTED, work.gaussians)
     return plan
 
 
 def improve(work: Work, plan: Plan) -> None:
-    """The stages that views pay for; from where a target is reached on, none.
+    """Run the planned stages before the scores, until a target is reached.
 
     Raises:
         DataError, UsageError: as the stages.
@@ -249,7 +251,7 @@ def improve(work: Work, plan: Plan) -> None:
 
 
 def _fewer(work: Work) -> None:
-    """The fewest Gaussians that reach the target: a part of the budget, or all."""
+    """Take the fewest Gaussians that reach the target: a part of the budget, or all of it."""
     start = work.start
     if start is None or start.form is None:
         return
@@ -262,22 +264,17 @@ def _fewer(work: Work) -> None:
     work.gaussians = start.gaussians
 
 
-def _interrupted(run: Run) -> bool:
-    """Whether Ctrl-C ended gradient descent: the same command then goes on with it."""
-    return run.report.refinement is not None and run.report.refinement["reason"] == "interrupted"
-
-
 def _conversion(request: ConvertRequest, work: Work, gaussians: Gaussians) -> Conversion:
-    """Not scored."""
+    """Return a conversion without scores."""
     source = work.field.source
     return Conversion(out_of_box(gaussians, source.volume), work.run.report, ply_options(request, source), work.field)
 
 
 @contextmanager
-def opened(run: Run, request: ConvertRequest) -> Iterator[Field]:
-    """The volume of a request under all that it is shown by, in memory or in blocks; kernels are compiled.
+def opened(run: Run, request: ConvertRequest, kernels: tuple[str, ...] = CONVERT) -> Iterator[Field]:
+    """Open a request's volume under its look, in memory or in blocks, and compile ``kernels``.
 
-    Blocks lie beside the output until it is written: the same command goes on with those that an ended one has left.
+    Blocks lie beside the output until it is written: after an interruption the same command reads those that are there.
 
     Raises:
         DataError, UsageError: as `vvgt_cli.field.source.load`.
@@ -288,21 +285,21 @@ def opened(run: Run, request: ConvertRequest) -> Iterator[Field]:
             source = load(request.source)
             stage.note = describe_source(source)
         _tell(run, request, source)
-        run.compile(_kernels(run, request, source), source.kernel_type())
+        run.compile(_kernels(kernels, request, source), source.kernel_type())
         with run.stage("scene"):
-            field = Resident(source, source.scene())
+            field = Resident.of(source)
         yield field
         return
     wanted = Wanted(request.budget(), request.fit.size, request.ply.sh_degree, values=request.live)
     with beside(request.output) as parts, blocked(run, request.source, options, parts, wanted) as found:
         _tell(run, request, found.source)
-        run.compile(for_blocks(_kernels(run, request, found.source)), found.source.kernel_type())
+        run.compile(for_blocks(_kernels(kernels, request, found.source)), found.source.kernel_type())
         yield found
         parts.remove()
 
 
 def _tell(run: Run, request: ConvertRequest, source: Source) -> None:
-    """Say and record what was read."""
+    """Report what was read."""
     ply = ply_options(request, source)
     flattened = _flattened(degree_of(request, source), source)
     for remark in [*remarks(source.volume, ply), *([flattened] if flattened else [])]:
@@ -314,22 +311,21 @@ def _tell(run: Run, request: ConvertRequest, source: Source) -> None:
     }  # fmt: skip
 
 
-def _kernels(run: Run, request: ConvertRequest, source: Source) -> tuple[str, ...]:
-    """That a run will need."""
-    names: tuple[str, ...] = CONVERT if run.report.command == "convert" else INIT
+def _kernels(names: tuple[str, ...], request: ConvertRequest, source: Source) -> tuple[str, ...]:
+    """Return the kernels that a source needs of ``names``."""
     names += LIVE if request.live else ()
     return for_degree(source.kernels(names), degree_of(request, source))
 
 
 def degree_of(request: ConvertRequest, source: Source) -> int:
-    """Of the harmonics that colours get: 0 where the light does not depend on the view, else as asked for, or 2."""
+    """Return the degree of spherical harmonics: 0 where the light does not depend on the view, else as asked, or 2."""
     if source.lighting is None or not source.lighting.depends_on_view:
         return 0
     return VIEW_DEGREE if request.ply.sh_degree is None else request.ply.sh_degree
 
 
 def _flattened(degree: int, source: Source) -> str | None:
-    """What there is to say of a light that the harmonics asked for cannot hold."""
+    """Return a message where the degree asked for cannot hold the light."""
     if degree >= VIEW_DEGREE or source.lighting is None or not source.lighting.depends_on_view:
         return None
     return (
@@ -339,7 +335,7 @@ def _flattened(degree: int, source: Source) -> str | None:
 
 
 def ply_options(request: ConvertRequest, source: Source) -> PlyOptions:
-    """How the file is written, with all that follows from the source."""
+    """Return how the file is written, with all that follows from the source."""
     ply = replace(
         request.ply,
         up=way_up(request.up, request.ply.frame, source.volume.space),
@@ -356,7 +352,7 @@ def ply_options(request: ConvertRequest, source: Source) -> PlyOptions:
 
 
 def _legend(source: Source) -> str | None:
-    """Of one function or one table of labels."""
+    """Return the legend of one function or label table."""
     if len(source.layers) > 1:
         return None
     labelled, volume = isinstance(source.tf, LabelTable), source.volume
@@ -366,7 +362,7 @@ def _legend(source: Source) -> str | None:
 
 
 def _early(run: Run, request: ConvertRequest) -> Callable[[Conversion], None] | None:
-    """What writes the file before its scores are there, where it is written twice."""
+    """Return what writes the file before its scores are known, where it is written twice."""
     output = request.output
     if output is None or request.writes < 2:
         return None
@@ -379,7 +375,7 @@ def _early(run: Run, request: ConvertRequest) -> Callable[[Conversion], None] | 
 
 
 def _write(run: Run, request: ConvertRequest, conversion: Conversion, written: bool = False) -> ConversionReport:
-    """Write the file, the preview and the report; of a file that is ``written`` the certificate is missing."""
+    """Write the file, the preview and the report; where the file is ``written``, only its certificate is missing."""
     from vvgt_cli.images import write_png
 
     report = run.report
@@ -390,7 +386,7 @@ def _write(run: Run, request: ConvertRequest, conversion: Conversion, written: b
     if format_of(request.output):
         source = conversion.field.source
         run.compile(source.kernels(EVALUATE), source.kernel_type())
-        tell_cost(run, request.output, conversion.gaussians, conversion.ply, conversion.field, source.volume)
+        tell_cost(run, request.output, conversion.gaussians, conversion.ply, conversion.field.views, source.volume)
     if request.preview:
         with run.stage("preview"):
             write_png(request.preview, conversion.preview(), request.overwrite)

@@ -1,30 +1,42 @@
-"""The frames of a time series: which there are, and what all of them share: grid, range, function."""
+"""The frames of a time series as a batch: which there are, and the grid, range and function that all of them share."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vvgt_cli.conversion.batch import Batch, Item
+from vvgt_cli.conversion.index import FRAMES
+from vvgt_cli.conversion.manifest import Shard
+from vvgt_cli.conversion.place import way_up
+from vvgt_cli.conversion.previous_frame import previous_frame
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import DataError, SeveralComponents, UsageError
 from vvgt_cli.field.digests import digest, volume_digest
 from vvgt_cli.field.layered import ALL, AUTO, COLOR, NONE, Content, functions_of, open_parts
 from vvgt_cli.field.open import automatic
 from vvgt_cli.field.source import SourceRequest
+from vvgt_cli.files import read_text
 from vvgt_cli.look.label_files import holds_table, read_labels
 from vvgt_cli.look.labels import LabelTable, distinct
+from vvgt_cli.network.card import CARD, find_model
 from vvgt_cli.progress import Console
-from vvgt_cli.score.record import ConversionReport, Run
+from vvgt_cli.score.record import Run
+from vvgt_cli.version import VERSION
 from vvgt_cli.volume import ReadOptions, Statistics, Volume, statistics
 from vvgt_cli.volume.label_maps import labels_in, recognised
+from vvgt_cli.volume.tiff import SUFFIXES
+from vvgt_cli.volume.tiff.slices import matching
 
 if TYPE_CHECKING:
     from vvgt_cli.look import TransferFunction
+
+MOST_LIVE = 3_000_000  # Gaussians of all frames of a live page: 90 MB
 
 
 @dataclass(frozen=True)
@@ -32,10 +44,10 @@ class Step:
     """A frame of a series: a file, or a time step of one.
 
     Attributes:
-        name: for messages.
+        name: for messages and the index.
         volume: as `SourceRequest.volume`.
         read: how to read it.
-        time: of a step of a file that says it, with its unit, which may be "".
+        time: of a step of a file that states it, with its unit, which may be "".
     """
 
     name: str
@@ -43,14 +55,14 @@ class Step:
     read: ReadOptions
     time: tuple[float, str] | None = None
 
-    def told(self) -> str:
-        """Name and time."""
-        return (
-            self.name if self.time is None else f"{self.name} ({' '.join([f'{self.time[0]:g}', self.time[1]]).strip()})"
-        )
+    def label(self) -> str:
+        """Return name and time for a message."""
+        if self.time is None:
+            return self.name
+        return f"{self.name} ({' '.join([f'{self.time[0]:g}', self.time[1]]).strip()})"
 
     def facts(self) -> dict[str, Any]:
-        """Its time as an index has it."""
+        """Return its time as an index has it."""
         if self.time is None:
             return {}
         value, unit = self.time
@@ -58,14 +70,14 @@ class Step:
 
 
 @dataclass(frozen=True)
-class Frames:
-    """What the first pass over a series found.
+class Survey:
+    """Findings of the first pass over a series.
 
     Attributes:
-        count: how many there are.
+        count: number of frames.
         own: range (lo, hi) of each frame's components, as `Content.classified` has them.
         whole: statistics of all frames together, of each component.
-        first: the first frame without its values; the grid of all of them is its.
+        first: the first frame without its values; all frames share its grid.
         content: digest of all frames' values.
         labels: of all frames, where they are label maps.
     """
@@ -79,80 +91,134 @@ class Frames:
 
     @property
     def grid(self) -> Volume:
-        """That all frames share."""
+        """The volume whose grid all frames share."""
         return self.first.volumes[0]
 
 
-@dataclass(frozen=True)
-class Series:
-    """Frames under what is common to them.
+class Series(Batch):
+    """The frames of a glob of files, or the time steps of one file, under what all of them share.
 
-    Attributes:
-        steps: the frames.
-        source: of all of them, but for volume and read.
-        frames: what the first pass found.
-        shown: the function of each component, on data values.
-        distance: world length that opacity is per.
-        dark: of each frame, whether nothing of it is visible.
-    """
-
-    steps: Sequence[Step]
-    source: SourceRequest
-    frames: Frames
-    shown: Sequence[TransferFunction | LabelTable]
-    distance: float
-    dark: Sequence[bool]
-
-    def source_of(self, step: Step) -> SourceRequest:
-        """Of one frame."""
-        return replace(self.source, volume=step.volume, read=step.read)
-
-
-def with_blocks(request: ConvertRequest, steps: Sequence[Step], console: Console) -> ConvertRequest:
-    """The request of all frames, in blocks where the first one is large."""
-    if request.blocks is not None:
-        return request
-    first = replace(request.source, volume=steps[0].volume, read=steps[0].read)
-    return replace(request, blocks=automatic(first, console))
-
-
-def common(run: Run, request: ConvertRequest, steps: Sequence[Step]) -> Series:
-    """Read all frames once: what they share.
+    Nodes of the function that follow from the data (``--tf-range rescale``, percentiles, the histogram) follow from all
+    frames together. Frames in which the function shows nothing are skipped, with a message.
 
     Raises:
-        DataError: as `survey`; a function that shows nothing in any frame.
-        UsageError: as `survey`.
+        UsageError: no such files.
+        DataError: a file that cannot be read.
     """
-    source = request.source
-    with run.stage("frames") as stage:
-        frames = survey(steps, source.labels, source.tf, run.console, request.blocks is not None)
-        source = replace(source, statistics=frames.whole)
-        if frames.first.unasked:  # said once, not for every frame
-            steps = [replace(step, read=replace(step.read, component=ALL)) for step in steps]
-        if source.labels is None and frames.labels is not None:
-            source = replace(source, labels=AUTO)
-        shown, distance = _functions(source, frames)
-        dark = [not source.layers and _dark(shown, own) for own in frames.own]
-        lo, hi = min(n.lo for n in frames.whole), max(n.hi for n in frames.whole)
-        stage.note = (
-            f"{len(steps)} of {' x '.join(map(str, frames.grid.dims))}, values {lo:g} to {hi:g}; "
-            f"{' + '.join(tf.name for tf in shown)}: opacity per {distance[0]:g} ({distance[1]})"
-        )
-    if all(dark):
-        raise DataError(
-            f"{source.volume}: {shown[0].name} shows nothing in any of {len(steps)} frames; try another function"
-        )
-    return Series(steps, source, frames, shown, distance[0], dark)
+
+    kind, resumes = FRAMES, True
+
+    def __init__(self, request: ConvertRequest, shard: Shard, page: bool) -> None:
+        self._steps: Sequence[Step] = steps_of(request.source)
+        volume, count = Path(request.source.path).name, len(self._steps)
+        super().__init__(request, volume, [str(k) for k in range(count)])
+        self._shard = shard
+        self.previous = previous_frame(request, shard.count)
+        self._most = max(MOST_LIVE // count, 1) if page and request.live else request.fit.max_gaussians
+
+    def prepare(self, run: Run) -> None:
+        """Read all frames once, for what they share.
+
+        Raises:
+            DataError: as `survey`; a function that shows nothing in any frame.
+            UsageError: as `survey`.
+        """
+        request, steps, console = self.request, self._steps, run.console
+        if self._most < request.fit.max_gaussians:
+            console.say(f"{len(steps)} frames on one page: {self._most} Gaussians each, fewer than --max-gaussians")
+            request = replace(request, fit=replace(request.fit, max_gaussians=self._most))
+        if request.blocks is None:
+            first = replace(request.source, volume=steps[0].volume, read=steps[0].read)
+            request = replace(request, blocks=automatic(first, console))
+        source = request.source
+        with run.stage("frames") as stage:
+            found = survey(steps, source.labels, source.tf, console, request.blocks is not None)
+            source = replace(source, statistics=found.whole)
+            if found.first.unasked:  # said once, not for every frame
+                steps = [replace(step, read=replace(step.read, component=ALL)) for step in steps]
+            if source.labels is None and found.labels is not None:
+                source = replace(source, labels=AUTO)
+            shown, distance = _functions(source, found)
+            self._dark = [not source.layers and _dark(shown, own) for own in found.own]
+            lo, hi = min(n.lo for n in found.whole), max(n.hi for n in found.whole)
+            stage.note = (
+                f"{len(steps)} of {' x '.join(map(str, found.grid.dims))}, values {lo:g} to {hi:g}; "
+                f"{' + '.join(tf.name for tf in shown)}: opacity per {distance[0]:g} ({distance[1]})"
+            )
+        if all(self._dark):
+            raise DataError(
+                f"{source.volume}: {shown[0].name} shows nothing in any of {len(steps)} frames; try another function"
+            )
+        self._steps, self._survey, self._shown, self._distance = steps, found, shown, distance[0]
+        self.request = replace(request, source=source)
+
+    def items(self, run: Run, wanted: Callable[[str], bool]) -> Iterator[Item]:
+        """Yield an item for each frame that shows something."""
+        console, done, mine = run.console, 0, 0
+        for k, (step, stem) in enumerate(zip(self._steps, self.stems, strict=True)):
+            mine += self._shard.holds(k) and not self._dark[k]
+            if not wanted(stem):
+                continue
+            if self._dark[k]:
+                console.say(f"{step.name}: nothing of it is visible; it is skipped")
+                continue
+            console.say(f"{step.label()}: frame {k + 1} of {len(self._steps)}")
+            source = replace(self.request.source, volume=step.volume, read=step.read)
+            yield Item(step.name, stem, replace(self.request, source=source), {"frame": k, **step.facts()})
+            done += 1
+        console.say(f"{done} frames converted, {mine - done} were done before")
+
+    def settings(self) -> dict[str, Any]:
+        """Return everything that the files depend on, named as the command line names it."""
+        request, survey = self.request, self._survey
+        ply, grid = asdict(request.ply), survey.grid
+        lighting = request.source.light.lighting(self._shown[0].lighting, grid.space)
+        looks: list[Any] = []
+        for tf in self._shown:
+            looks += tf.labels if isinstance(tf, LabelTable) else (tf.opacity_nodes, tf.color_map)
+        return {
+            "version": VERSION,
+            "volume": survey.content,
+            "frames": survey.count,
+            "function": digest(*looks),
+            **({"layers": [repr(layer) for layer in request.source.layers]} if request.source.layers else {}),
+            "opacity_unit_distance": self._distance,
+            **({} if lighting is None else {"light": lighting.text()}),
+            **({"live": True} if request.live else {}),
+            **asdict(request.fit),
+            **asdict(request.limits),
+            "model": read_text(find_model(request.fit.model) / CARD) if request.fit.model else None,
+            **{key: ply[key] for key in ("frame", "sh_degree", "comments")},
+            "up": way_up(request.up, request.ply.frame, grid.space),
+            "place": [grid.space, *grid.affine[:3].ravel().tolist()],
+            "outputs": [Path(p).name for p in (request.output, request.report, request.preview) if p],
+        }
 
 
-def interrupted(report: ConversionReport) -> bool:
-    """Whether Ctrl-C ended gradient descent."""
-    return report.refinement is not None and report.refinement["reason"] == "interrupted"
+def is_glob_of_volumes(path: str) -> bool:
+    """Tell whether a path is a glob of files that are volumes of their own, and not slices of one."""
+    if os.path.exists(path) or not set(path) & set("*?["):
+        return False
+    files = matching(path)
+    if any(file.suffix.lower() not in SUFFIXES for file in files):
+        return True
+    return bool(files) and _pages(files[0]) > 1
+
+
+def _pages(path: Path) -> int:
+    """Return the number of pages of a TIFF; 1 where it cannot be read, which reading it reports."""
+    import tifffile
+
+    try:
+        with tifffile.TiffFile(path) as file:
+            return len(file.pages)
+    except Exception:  # whatever a damaged file makes of it
+        return 1
 
 
 def survey(
     steps: Sequence[Step], labels: str | LabelTable | None, tf: object, console: Console, stored: bool = False
-) -> Frames:
+) -> Survey:
     """Read every frame once, for the range and the digest of all.
 
     Args:
@@ -187,7 +253,7 @@ def survey(
         raise UsageError("a series without frames")
     whole = tuple(merge_statistics(parts) for parts in zip(*numbers, strict=True))
     own = [[(n.lo, n.hi) for n in parts] for parts in numbers]
-    return Frames(len(steps), own, whole, first, digest(*digests), tuple(sorted(found)) if mapped else None)
+    return Survey(len(steps), own, whole, first, digest(*digests), tuple(sorted(found)) if mapped else None)
 
 
 def _hollow(volume: Volume) -> Volume:
@@ -242,7 +308,7 @@ def _dark(shown: Sequence[TransferFunction | LabelTable], own: Sequence[tuple[fl
 
 
 def _functions(
-    source: SourceRequest, frames: Frames
+    source: SourceRequest, frames: Survey
 ) -> tuple[Sequence[TransferFunction | LabelTable], tuple[float, str]]:
     """The function of each component, on data values, and the first one's unit distance with how it was chosen.
 
@@ -273,8 +339,6 @@ def steps_of(source: SourceRequest) -> list[Step]:
         UsageError: a glob that matches nothing.
         DataError: a file that cannot be read.
     """
-    from vvgt_cli.volume.tiff.slices import matching
-
     files = [] if os.path.exists(source.path) else matching(source.path)
     if not files and set(source.path) & set("*?[") and not os.path.exists(source.path):
         raise UsageError(

@@ -26,15 +26,28 @@ def is_pattern(output: str) -> bool:
     return FIELD.search(output) is not None
 
 
-def frame_names(option: str, pattern: str, count: int) -> list[str]:
-    """The names of ``count`` frames, numbered from 0.
+def function_name(tf: str) -> str:
+    """Return the name of a function: its file's without folder and endings; of FILE#NAME the latter."""
+    return tf.rpartition("#")[2] if "#" in tf else Path(tf).name.partition(".")[0]
+
+
+def put_name(option: str, pattern: str, kind: str, stem: str) -> str:
+    """Return a pattern with a frame's number, or the name of a function or label, in its place.
+
+    Args:
+        option: whose value the pattern is, for the message.
+        pattern: such as ``out_{:04d}.ply`` or ``out_{}.ply``; a format of numbers is for `FRAMES` alone.
+        kind: `FRAMES`, `FUNCTIONS` or `LABELS`.
+        stem: the number or name; `INDEX` too.
 
     Raises:
-        UsageError: not one place for a number.
+        UsageError: not one such place.
     """
-    if len(FIELD.findall(pattern)) != 1 or set(FIELD.sub("", pattern)) & set("{}"):
-        raise UsageError(f"{option} {pattern}: expected one place for the frame's number, as out_{{:04d}}.ply")
-    return [pattern.format(k) for k in range(count)]
+    places = FIELD.findall(pattern)
+    if len(places) != 1 or set(FIELD.sub("", pattern)) & set("{}") or (places[0] != "{}" and kind != FRAMES):
+        what = "frame's number, as out_{:04d}.ply" if kind == FRAMES else f"{kind[:-1]}'s name, as out_{{}}.ply"
+        raise UsageError(f"{option} {pattern}: expected one place for the {what}")
+    return pattern.replace(places[0], places[0].format(int(stem)) if stem.isdecimal() and kind == FRAMES else stem)
 
 
 def index_path(pattern: str) -> str:
@@ -57,11 +70,6 @@ def entry(name: str, gaussians: int | None, size: int, psnr: float | None, **fac
     """A cloud in an index, without its file."""
     scored = {} if psnr is None else {"psnr": psnr}
     return {"name": name, "gaussians": gaussians, "bytes": size, **scored, **facts}
-
-
-def entry_of(name: str, report: ConversionReport, **facts: Any) -> dict[str, Any]:
-    """`entry` of a conversion."""
-    return entry(name, report.gaussians, report.bytes, psnr_of(report), **facts)
 
 
 def psnr_of(report: ConversionReport) -> float | None:

@@ -1,4 +1,4 @@
-"""`vvgt convert --split-labels`: one `.ply` a label of a label map, and an index; together they are the whole.
+"""The labels of a label map as a batch (`vvgt convert --split-labels`): together they are the whole.
 
 What some view sees of the whole is converted as one scene, and each Gaussian goes to the label that owns most of it;
 what the whole hides is converted label by label, and of that the hidden Gaussians are added.
@@ -7,24 +7,24 @@ what the whole hides is converted label by label, and of that the hidden Gaussia
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vvgt_cli.conversion.convert import convert, fitted, opened
-from vvgt_cli.conversion.functions import beside, named
-from vvgt_cli.conversion.index import INDEX, LABELS, entry_of, index_of, index_output, write_index
-from vvgt_cli.conversion.owners import hidden_in, owners
+from vvgt_cli.closed_form import VbmOptions
+from vvgt_cli.closed_form.tree import HIDDEN
+from vvgt_cli.conversion.batch import Batch, Item
+from vvgt_cli.conversion.convert import fitted, opened
+from vvgt_cli.conversion.index import LABELS
+from vvgt_cli.conversion.label_assignment import assign_labels, hidden_in
 from vvgt_cli.conversion.request import ConvertRequest
-from vvgt_cli.errors import NothingVisible, UsageError
-from vvgt_cli.field.layered import AUTO, NONE, Content, content_of, layers_of, open_parts
+from vvgt_cli.errors import NothingVisible
+from vvgt_cli.field.layered import AUTO, Content, content_of, layers_of, open_parts
 from vvgt_cli.field.open import automatic
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import Gaussians
-from vvgt_cli.gaussians.outputs import check_outputs
 from vvgt_cli.gaussians.types import together
 from vvgt_cli.look.labels import Label, LabelTable, check_labels
 from vvgt_cli.look.lighting import LightOptions
@@ -40,108 +40,62 @@ LONGEST = 80  # characters of a label's name in a file's
 
 
 @dataclass(frozen=True)
-class Part:
-    """A label of a map: what makes its file."""
+class MapLabel:
+    """A visible label of a map, and the request that would convert it alone."""
 
     volume: Volume
     table: LabelTable
     label: Label
     request: ConvertRequest
-    stem: str  # in the place of a name
+    stem: str
 
-    def facts(self) -> dict[str, Any]:
-        """What an index says of it."""
-        return {"label": self.label.number, "color": self.label.color, "opacity": self.label.opacity}
+    def text(self) -> str:
+        """Return number and name for a message."""
+        return f"label {self.label.number}, {self.label.name}"
 
 
-@dataclass(frozen=True)
-class Split:
-    """A label map in its parts.
+class Labels(Batch):
+    """The visible labels of a label map, converted as a whole and divided.
 
-    Attributes:
-        request: of the whole, in blocks where it is large.
-        parts: the visible labels.
-        volume, table: names.
+    Their Gaussians are at most ``max_gaussians`` together. Those that the whole hides get a share by the labels'
+    surfaces (voxels to the power of 2/3), the rest is for what is seen.
     """
 
-    request: ConvertRequest
-    parts: Sequence[Part]
-    volume: str
-    table: str
+    kind = LABELS
 
+    def __init__(self, request: ConvertRequest) -> None:
+        super().__init__(request, "")
+        self._labels: list[MapLabel] = []
 
-def convert_labels(request: ConvertRequest, console: Console | None = None) -> dict[str, Any]:
-    """Convert a label map as a whole, file every Gaussian under its label, add what is hidden, and write the index.
+    def prepare(self, run: Run) -> None:
+        """Read the map and its table.
 
-    The files hold at most ``max_gaussians`` together. What the whole hides gets its share by the labels' surfaces
-    (voxels to the power of 2/3), the rest is for what is seen.
+        Raises:
+            DataError: as `convert`; no label is visible.
+        """
+        source = self.request.source
+        with run.stage("volume") as stage:
+            self.request = request = replace(self.request, blocks=self.request.blocks or automatic(source, run.console))
+            content = _content(source, request.blocks is not None)
+            maps = layers_of(content, None, source.labels or AUTO)
+            check_labels([layer.tf for layer in maps])
+            self._labels = _visible(request, content, maps)
+            self.volume, self.facts = maps[0].volume.name, {"table": " + ".join(layer.tf.name for layer in maps)}
+            self.stems = [one.stem for one in self._labels]
+            stage.note = f"{self.volume}, {len(self._labels)} labels of {self.facts['table']}"
 
-    Returns:
-        The index, as its JSON has it.
-
-    Raises:
-        UsageError: outputs without a place for the name, a function or layers beside the labels, a size or time.
-        DataError: as `convert`.
-    """
-    console = console or Console()
-    named(request, INDEX, "label")  # its errors come before the volume
-    index, inputs = index_output(str(request.output)), request.source.paths()
-    check_outputs([index], inputs, request.overwrite)
-    run = Run(console, ConversionReport("convert"))
-    whole = split(run, request)
-    outputs = [output for part in whole.parts for output in part.request.outputs()]
-    check_outputs([*outputs, index], inputs, request.overwrite)
-    rows = []
-    for part, gaussians in shared_out(run, whole):
-        console.say(f"label {part.label.number}, {part.label.name}: to {part.request.output}")
-        report = convert(part.request, console, gaussians)
-        row = entry_of(part.label.name, report, **part.facts())
-        rows.append({**row, "file": beside(str(part.request.output), Path(index.path).parent)})
-    found = index_of(LABELS, whole.volume, rows, table=whole.table)
-    write_index(index.path, found, request.overwrite)
-    console.say(f"{index.path}: {len(rows)} labels")
-    return found
-
-
-def split(run: Run, request: ConvertRequest) -> Split:
-    """Read a label map: its visible labels, each with a request of its own.
-
-    Raises:
-        UsageError: a function or layers beside the labels, a size or time.
-        DataError: as `convert`.
-    """
-    source = request.source
-    if source.tf is not None or source.layers or source.labels == NONE:
-        raise UsageError("--split-labels is of one label map: leave out --tf, --layer and --labels none")
-    if request.limits.max_megabytes is not None:
-        raise UsageError("--max-size is of one file; --split-labels makes several: give --max-gaussians for all")
-    if request.limits.time_budget is not None:
-        raise UsageError(
-            "--time-budget is of one file; --split-labels fits several times: give --steps or leave it out"
-        )
-    with run.stage("volume") as stage:
-        blocks = request.blocks or automatic(source, run.console)
-        request = replace(request, blocks=blocks)
-        content = _content(source, blocks is not None)
-        maps = layers_of(content, None, source.labels or AUTO)
-        check_labels([layer.tf for layer in maps])
-        parts = _parts(request, content, maps)
-        tables = " + ".join(layer.tf.name for layer in maps)
-        stage.note = f"{maps[0].volume.name}, {len(parts)} labels of {tables}"
-    return Split(request, parts, maps[0].volume.name, tables)
-
-
-def shared_out(run: Run, whole: Split) -> Iterator[tuple[Part, Gaussians]]:
-    """The Gaussians of each label, box frame; of one that shows nothing a line is said.
-
-    Raises:
-        DataError, UsageError: as `convert`.
-    """
-    for part, gaussians in zip(whole.parts, _gaussians(whole.request, whole.parts, run), strict=True):
-        if gaussians is None:
-            run.console.say(f"label {part.label.number}, {part.label.name}: nothing visible; it gets no file")
-        else:
-            yield part, gaussians
+    def items(self, run: Run, wanted: Callable[[str], bool]) -> Iterator[Item]:
+        """Yield an item with its Gaussians for each label of which something is visible."""
+        names = [one.label.name for one in self._labels]
+        for one, gaussians in zip(self._labels, _gaussians(self.request, self._labels, run), strict=True):
+            if gaussians is None:
+                run.console.say(f"{one.text()}: nothing visible; it is skipped")
+                continue
+            run.console.say(f"{one.text()}: {len(gaussians)} Gaussians")
+            label = one.label
+            facts = {"label": label.number, "color": label.color, "opacity": label.opacity}
+            name = label.name if names.count(label.name) == 1 else one.stem
+            yield Item(name, one.stem, one.request, facts, gaussians)
 
 
 def _content(source: SourceRequest, stored: bool) -> Content:
@@ -152,8 +106,8 @@ def _content(source: SourceRequest, stored: bool) -> Content:
     return open_parts(source.path, read)
 
 
-def _parts(request: ConvertRequest, content: Content, maps: Sequence[Layer]) -> list[Part]:
-    """The visible labels, each with a request of its own; the budget is that of its share."""
+def _visible(request: ConvertRequest, content: Content, maps: Sequence[Layer]) -> list[MapLabel]:
+    """Return the visible labels, each with a request of its own, whose budget is that of its share."""
     shown = [
         (layer.volume, layer.tf, label)
         for layer in maps
@@ -162,14 +116,14 @@ def _parts(request: ConvertRequest, content: Content, maps: Sequence[Layer]) -> 
         if label.opacity > 0
     ]
     numbers = [label.number for *_, label in shown]
-    parts = []
+    found = []
     for (volume, table, label), share in zip(shown, shares(shown, request.fit.max_gaussians), strict=True):
         source = replace(_source(request, content, volume), labels=table.only(label.number))
         alone = replace(request, source=source, fit=replace(request.fit, max_gaussians=share))
         again = numbers.count(label.number) > 1  # of segments that overlap
-        name = f"{volume.name.rpartition(' ')[2]}-{file_name(label)}" if again else file_name(label)
-        parts.append(Part(volume, table, label, named(alone, name, "label"), name))
-    return parts
+        stem = f"{volume.name.rpartition(' ')[2]}-{file_name(label)}" if again else file_name(label)
+        found.append(MapLabel(volume, table, label, alone, stem))
+    return found
 
 
 def _source(request: ConvertRequest, content: Content, volume: Volume) -> SourceRequest:
@@ -183,7 +137,7 @@ def _source(request: ConvertRequest, content: Content, volume: Volume) -> Source
     return replace(source, read=replace(source.read, component=number))
 
 
-def _gaussians(request: ConvertRequest, parts: Sequence[Part], run: Run) -> list[Gaussians | None]:
+def _gaussians(request: ConvertRequest, parts: Sequence[MapLabel], run: Run) -> list[Gaussians | None]:
     """Of every part, box frame: what the whole hides of it, and its share of the whole; None where nothing is seen."""
     console = run.console
     if len(parts) == 1 or len({id(part.volume) for part in parts}) > 1:
@@ -191,27 +145,27 @@ def _gaussians(request: ConvertRequest, parts: Sequence[Part], run: Run) -> list
     whole = replace(request, source=replace(parts[0].request.source, labels=parts[0].table))
     plain = replace(whole, source=replace(whole.source, light=LightOptions()))
     with opened(run, plain) as field, run.stage("hidden"):
-        near, edge = field.hidden(request.fit.max_gaussians, request.fit.size)
-        frame = field.source.volume.unit_frame()
-        hides = hidden_in(near, edge, np.array(frame.half), np.array(frame.step))
+        form = field.pyramid(VbmOptions(request.fit.max_gaussians, request.fit.size)).form
+        assert form is not None
+        hides = hidden_in(form.seen.largest > HIDDEN, form.seen.edge, form.half, form.step)
     hidden: list[list[Gaussians]] = []
     for part in parts:
         hidden.append([])
         if not hides.any_of(part.volume, part.label.number):
             continue
-        console.say(f"label {part.label.number}, {part.label.name}: what the others hide of it")
+        console.say(f"{part.text()}: what the others hide of it")
         alone = _alone(part, console)
         if alone is not None:
             hidden[-1].append(alone.take(hides.whether(alone)))
     console.say("all labels together: what is seen of them")
     left = max(request.fit.max_gaussians - sum(len(one) for mine in hidden for one in mine), 1)
     seen = _fitted(replace(whole, fit=replace(request.fit, max_gaussians=left)), console)
-    owner = owners(seen, [(part.volume, part.table, part.label) for part in parts])
+    owner = assign_labels(seen, [(part.volume, part.table, part.label) for part in parts])
     both = [together([*mine, seen.take(owner == k)]) for k, mine in enumerate(hidden)]
     return [one if len(one) else None for one in both]
 
 
-def _alone(part: Part, console: Console) -> Gaussians | None:
+def _alone(part: MapLabel, console: Console) -> Gaussians | None:
     """A label as though there were no other; None where nothing of it is seen."""
     try:
         return _fitted(part.request, console)
@@ -223,7 +177,7 @@ def _fitted(request: ConvertRequest, console: Console) -> Gaussians:
     """Gaussians of a request, box frame; Ctrl-C ends the whole."""
     run = Run(console, ConversionReport("convert"))
     found = fitted(run, request)
-    if run.report.refinement and run.report.refinement["reason"] == "interrupted":
+    if run.report.interrupted:
         raise KeyboardInterrupt
     return found
 

@@ -123,7 +123,7 @@ def _of_one(run: Run, request: ConvertRequest, field: Field) -> Gaussians:
         foggy = fog_of_labels(field, labels)
         found = carrying_labels(run, foggy, placed_by(run, foggy, request), labels)
     else:
-        foggy = field.shown_by(fog(source.overall, source.tf))
+        foggy = field.with_look(source.shown_by(fog(source.overall, source.tf)))
         found = carrying(run, foggy, placed_by(run, foggy, request))
     return wide_enough(found, request.fit.size)
 
@@ -135,7 +135,7 @@ def _of_layers(run: Run, request: ConvertRequest, field: Field) -> tuple[Gaussia
     for number, layer in enumerate(source.layers):
         share = replace(request, fit=replace(request.fit, max_gaussians=max(left // (count - number), 1)))
         run.console.say(f"layer {number} of {count}: {layer.name}")
-        alone = field.alone(number)
+        alone = field.with_look(source.alone(number))
         said = replace(_facts(alone.source, count), name=layer.volume.name, distance=layer.unit_distance)
         facts.append(replace(said, dims=source.volume.dims))
         try:
@@ -178,7 +178,7 @@ def _score(run: Run, request: ConvertRequest, field: Field, gaussians: Gaussians
     name = source.name if len(source.layers) > 1 else source.tf.name
     with run.stage("live look") as stage:
         live = score_test_views(
-            field, shown, fit.size, RenderSettings(), rule=fit.rule, perceptual=False, only=PREVIEW_VIEWS
+            field.views, shown, fit.size, RenderSettings(), rule=fit.rule, perceptual=False, only=PREVIEW_VIEWS
         )
         stage.note = f"{psnr_note(live)} under {name} as 'vvgt recolor' shows it; next as other viewers show the file"
     work = Work(run, field, fit, gaussians=gaussians)
@@ -227,7 +227,7 @@ def placed_by(run: Run, field: Field, request: ConvertRequest) -> Start:
 
     with run.stage("closed form") as stage:
         options = VbmOptions(max_gaussians=request.fit.max_gaussians, size=request.fit.size, values=True)
-        start = field.start(options, run.console.bar("closed form"))
+        start = field.pyramid(options, run.console.bar("closed form"))
         if not len(start.gaussians):
             raise NothingVisible(field.source.volume.name, field.source.name)
         stage.note = f"{len(start.gaussians)} Gaussians of what may be shown"
@@ -238,7 +238,7 @@ def carrying(run: Run, field: Field, start: Start) -> Gaussians:
     """Gaussians of a field's look with the values under them, without those that have none."""
     assert start.leaves is not None
     with run.stage("values") as stage:
-        values = field.under(start.gaussians)
+        values = field.sample(start.gaussians)
         known = np.flatnonzero(np.isfinite(values).all(axis=1))
         gaussians, values, leaves = start.gaussians.take(known), values[known], start.leaves.take(known)
         tau = table_of(field.source).at(values[:, 0], values[:, 1])[:, 3]

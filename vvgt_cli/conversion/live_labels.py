@@ -14,9 +14,8 @@ from vvgt_cli.field.source import Source
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.live import lengths
 from vvgt_cli.gaussians.live_facts import MOST_LABELS, LiveFacts
-from vvgt_cli.look.fog import THIN
+from vvgt_cli.look.fog import THIN, label_fog
 from vvgt_cli.look.histogram import UNIT_SHARE
-from vvgt_cli.look.label_fog import label_fog
 from vvgt_cli.look.labels import Label, LabelTable
 from vvgt_cli.look.tables import extinction
 from vvgt_cli.score.record import Run
@@ -48,7 +47,8 @@ def fog_of_labels(field: Field, labels: tuple[Label, ...]) -> Field:
     layer = field.source.layers[0]
     assert isinstance(layer.tf, LabelTable)
     voxels = counts_of(layer.volume)
-    return field.labelled_by([label_fog(layer.tf, {e.number: voxels.get(float(e.number), 0) for e in labels})])
+    table = label_fog(layer.tf, {e.number: voxels.get(float(e.number), 0) for e in labels})
+    return field.with_look(field.source.labelled_by([table]))
 
 
 def carrying_labels(run: Run, field: Field, start: Start, labels: tuple[Label, ...]) -> Gaussians:

@@ -39,6 +39,18 @@ class Shard:
         return "manifest.json" if self.count == 1 else f"manifest-{self.index}-of-{self.count}.json"
 
 
+def parse_shard(text: str) -> Shard:
+    """Parse ``I/N``, I from 1 to N.
+
+    Raises:
+        UsageError: anything else.
+    """
+    match = re.fullmatch(r"(\d{1,6})/(\d{1,6})", text)
+    if match is None or not 1 <= int(match[1]) <= int(match[2]):
+        raise UsageError(f"--shard {text}: expected I/N with I from 1 to N, as 3/8")
+    return Shard(int(match[1]), int(match[2]))
+
+
 def file_digest(path: Path) -> str:
     """sha256 of a file, hexadecimal."""
     with path.open("rb") as file:

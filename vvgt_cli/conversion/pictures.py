@@ -1,35 +1,52 @@
-"""Pictures of a series' volumes: of a frame, only what differs from the frame before is drawn anew."""
+"""Pictures of a series: only the parts of a frame that differ from the frame before are drawn again."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vvgt_cli.cameras import Camera
 from vvgt_cli.cameras.blocks import BLOCK, Blocks
 from vvgt_cli.conversion.changes import Changes
-from vvgt_cli.field.field import Field, Picture
+from vvgt_cli.field.field import Picture, ViewRenderer
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import RenderSettings
 
 
-class Pictures:
-    """Pictures of the last frame, and which of their blocks still hold.
+class RememberedViews:
+    """The views of a frame, which take from the frame before what has not changed.
 
     Attributes:
         largest: pixels along an edge; larger pictures are not kept.
+        views: of the frame that is being converted.
     """
 
-    def __init__(self, largest: int) -> None:
-        self.largest = largest
+    def __init__(self, largest: int, views: ViewRenderer | None = None) -> None:
+        self.largest, self.views = largest, views
         self._kept: dict[bytes, tuple[Camera, np.ndarray, np.ndarray]] = {}  # camera, picture, (rows, columns) bool
 
-    def of(self, field: Field) -> Field:
-        """The field with these pictures."""
-        return cast(Field, _Remembered(field, self))
+    def expect(self, pictures: Sequence[Picture]) -> None:
+        """See `ViewRenderer.expect`."""
+        parts = [picture._replace(blocks=self.missing(picture)) for picture in pictures]
+        assert self.views is not None
+        self.views.expect([part for part in parts if part.blocks is None or len(part.blocks.numbers)])
+
+    def view(self, camera: Camera, settings: RenderSettings, blocks: Blocks | None = None) -> np.ndarray:
+        """See `ViewRenderer.view`."""
+        picture = Picture(camera, settings, blocks)
+        part = self.missing(picture)
+        if part is not None and not len(part.numbers):
+            image = np.zeros((camera.height, camera.width, 4), np.float32)
+        else:
+            assert self.views is not None
+            image = self.views.view(camera, settings, part)
+        return self.put(picture, part, image)
+
+    def forget(self, picture: Picture) -> None:
+        """See `ViewRenderer.forget`: pictures are kept for the next frame."""
 
     def outdate(self, changes: Changes | None) -> None:
         """Let go of what shows something else now; None: of all."""
@@ -71,31 +88,6 @@ class Pictures:
         if view.blocks is None:
             return whole.copy()
         return np.where(view.blocks.mask()[..., None], whole, np.float32(0))
-
-
-class _Remembered:
-    """A field whose pictures are those of `Pictures` where they hold."""
-
-    def __init__(self, field: Field, pictures: Pictures) -> None:
-        self._field, self._pictures = field, pictures
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._field, name)
-
-    def expect(self, views: Sequence[Picture]) -> None:
-        """See `Field`."""
-        parts = [view._replace(blocks=self._pictures.missing(view)) for view in views]
-        self._field.expect([part for part in parts if part.blocks is None or len(part.blocks.numbers)])
-
-    def view(self, camera: Camera, settings: RenderSettings, blocks: Blocks | None = None) -> np.ndarray:
-        """See `Field`."""
-        view = Picture(camera, settings, blocks)
-        part = self._pictures.missing(view)
-        if part is not None and not len(part.numbers):
-            image = np.zeros((camera.height, camera.width, 4), np.float32)
-        else:
-            image = self._field.view(camera, settings, part)
-        return self._pictures.put(view, part, image)
 
 
 def _key(view: Picture) -> bytes:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-from vvgt_cli.conversion.request import Limits, file_bytes
+from vvgt_cli.conversion.request import FitOptions, Limits, file_bytes
 from vvgt_cli.conversion.stage import Stage
 from vvgt_cli.conversion.stages import (
     BackProjection,
@@ -20,11 +20,11 @@ from vvgt_cli.conversion.stages import (
     ViewingConditions,
 )
 from vvgt_cli.conversion.stages.views import views_of
+from vvgt_cli.defaults import STEPS
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.workload import Workload, for_budget, view_edge
 from vvgt_cli.resources import free_memory
 
-DEFAULT_STEPS = 152  # of gradient descent: the knee of error against seconds (docs/plan.md)
 MOST_STEPS = 400  # where a target or a time asks for as many as it takes
 FEWEST_STEPS = 8  # less is not worth the views
 ENOUGH_STEPS = 24  # as good as back-projection; fewer are taken after it
@@ -120,34 +120,29 @@ class Planner:
     """What decides.
 
     Attributes:
-        limits: what the user allows.
-        gaussians: budget.
-        steps: of gradient descent that the user asks for; None: the plan's choice.
-        sh_degree: harmonics in the file.
-        size: pixels along the edge of images that the file is made for.
+        limits, fit: what the user asks for; ``fit.max_gaussians`` within the limits.
+        sh_degree: degree of the spherical harmonics in the file.
         wide: Gaussians are wide enough to be seen in small views.
-        model: network that the user asks for.
         whole: all ten test views are scored.
-        cuts: there will be a pyramid to cut once more.
-        cells: the closed form is of cells, a Gaussian each.
         writes: how often the file is written.
     """
 
     limits: Limits
-    gaussians: int
-    steps: int | None
-    sh_degree: int
-    size: int
+    fit: FitOptions
+    sh_degree: int = 0
     wide: bool = True
-    model: str | None = None
     whole: bool = False
-    cuts: bool = False
-    cells: bool = True
     writes: int = 1
+
+    @property
+    def vbm(self) -> bool:
+        """Whether the closed form has cells, of which a tree can be cut again."""
+        return self.fit.init == "vbm"
 
     def plan(self, case: Workload, spent: float, begun: bool = False) -> Plan:
         """Which stages fit, after ``spent`` seconds; ``begun``: the closed form is done."""
-        plan = Plan(case, self.gaussians, [], spent, file_bytes(self.gaussians, self.sh_degree), writes=self.writes)
+        count = self.fit.max_gaussians
+        plan = Plan(case, count, [], spent, file_bytes(count, self.sh_degree), writes=self.writes)
         first: list[Stage] = [ClosedFormStage()]
         last: list[Stage] = [TestViews(self.whole), ViewingConditions()]
         left = None
@@ -167,15 +162,15 @@ class Planner:
         case = plan.case
         open_end = self.limits.target_psnr is not None or left is not None
         network, left = self._network(plan, left)
-        few = self.steps is not None and self.steps < ENOUGH_STEPS and left is None
-        small = self.wide and not few and not network and self.size >= 2 * SMALLEST
-        steps = wanted = self.steps if self.steps is not None else MOST_STEPS if open_end else DEFAULT_STEPS
+        few = self.fit.steps is not None and self.fit.steps < ENOUGH_STEPS and left is None
+        small = self.wide and not few and not network and self.fit.size >= 2 * SMALLEST
+        steps = wanted = self.fit.steps if self.fit.steps is not None else MOST_STEPS if open_end else STEPS
         while left is not None and steps > 0 and self._seconds(case, steps, small) > left:
             steps = min(steps - 1, int(steps * 0.9))
         if not wanted or steps < min(FEWEST_STEPS, wanted):
             plan.left_out.append(("refinement", _room(left) if wanted else "no steps are asked for"))
             return self._without_steps(plan, network, left)
-        if self.model is None:
+        if self.fit.model is None:
             plan.left_out.append(("network", "gradient descent gains more in its time; --model runs it"))
         if not few:
             plan.left_out.append(("back-projection", "gradient descent gains more in its time"))
@@ -187,9 +182,9 @@ class Planner:
         enough = steps >= ENOUGH_STEPS
         return [
             CheckViews(),
-            TrainingViews(views_of(steps, small), view_edge(self.size, small)),
-            *([CellsByError(small, keep=not self._anew())] if enough and self.cuts and self.model is None else []),
-            Refinement(steps, most, small, overlap=enough and self.cells),
+            TrainingViews(views_of(steps, small), view_edge(self.fit.size, small)),
+            *([CellsByError(small, keep=not self._anew())] if enough and self.vbm and self.fit.model is None else []),
+            Refinement(steps, most, small, overlap=enough and self.vbm),
         ]
 
     def _anew(self) -> bool:
@@ -208,7 +203,7 @@ class Planner:
         if not projected:
             plan.left_out.append(("back-projection", f"about {whole:.1f} s with its views, {_room(left)}"))
         check = CheckViews(fine=bool(network) or self.limits.target_psnr is not None)
-        train = TrainingViews(views_of(0, small=False), view_edge(self.size, small=False), fitted=bool(network))
+        train = TrainingViews(views_of(0, small=False), view_edge(self.fit.size, small=False), fitted=bool(network))
         if projected or network:
             return [check, train, *([BackProjection()] if projected else []), *network]
         judge = self.limits.target_psnr is not None and (left is None or left >= views)
@@ -216,9 +211,9 @@ class Planner:
 
     def _network(self, plan: Plan, left: float | None) -> tuple[list[Stage], float | None]:
         """The network, where one is asked for and there is time; and what is left."""
-        if self.model is None:
+        if self.fit.model is None:
             return [], left
-        stage = Network(self.model)
+        stage = Network(self.fit.model)
         seconds = stage.cost(plan.case).seconds
         if left is not None and left < seconds + self._seconds(plan.case, 0, False):
             plan.left_out.append(("network", f"about {seconds:.1f} s, {_room(left)}"))

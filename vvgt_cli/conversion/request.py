@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, field
 
 from vvgt_cli.conversion.place import AUTO
+from vvgt_cli.defaults import INIT, MAX_GAUSSIANS, RULE, SIZE
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.settings import BlockOptions
 from vvgt_cli.field.source import SourceRequest
@@ -33,10 +34,10 @@ class FitOptions:
         steps: of gradient descent after the closed form, at most; None: what the plan finds worth its time.
     """
 
-    max_gaussians: int = 100_000
-    size: int = 1080
-    init: str = "vbm"
-    rule: str = "inria"
+    max_gaussians: int = MAX_GAUSSIANS
+    size: int = SIZE
+    init: str = INIT
+    rule: str = RULE
     seed: int = 0
     steps: int | None = None
     model: str | None = None

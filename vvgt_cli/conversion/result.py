@@ -209,7 +209,7 @@ class Conversion(Result):
         cameras = default_views("test", size=size or self.ply.made_for or SIZE)
         volume = self.field.source.volume
         axes, inside = upright(volume, self.ply.up), into_box(self.gaussians, volume)
-        return preview(self.field, inside, [cameras[n] for n in views], axes, self.ply.rule or INRIA)
+        return preview(self.field.views, inside, [cameras[n] for n in views], axes, self.ply.rule or INRIA)
 
     def _repr_png_(self) -> bytes:
         """What stands for it where a notebook is not shown by a browser."""

@@ -78,6 +78,11 @@ class Work:
             self.judged = gaussians, self.check, self.check.psnr(gaussians, self.rule)
         return self.judged[2]
 
+    def reset(self) -> None:
+        """Forget all that stages have made."""
+        self.gaussians = self.check = self.train = self.train_rule = self.train_settings = self.judged = None
+        self.run.report.refinement = None
+
     def target_reached(self) -> bool:
         """Whether the target is reached."""
         target = self.limits.target_psnr

@@ -12,8 +12,8 @@ import numpy as np
 
 from vvgt_cli.cameras import Camera
 from vvgt_cli.dvr.scene import Scene
+from vvgt_cli.look.function import TransferFunctionLike
 from vvgt_cli.look.tables import extinction
-from vvgt_cli.look.types import TransferFunctionLike
 from vvgt_cli.volume import Volume
 
 RAYS = 4096  # marched at a time: bounds the memory

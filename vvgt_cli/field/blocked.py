@@ -1,4 +1,4 @@
-"""`Blocked`: a field of which only blocks are ever in memory."""
+"""`Blocked`: a field of which only blocks are in memory at a time."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from vvgt_cli.dvr.layout import Light
 from vvgt_cli.dvr.render import Box as Frame
 from vvgt_cli.dvr.render import Rays, RenderSettings, for_thin
 from vvgt_cli.field.cells import NORMALS, CellBlocks, ExtinctionBlocks, PointBlocks, RayBlocks, ValueBlocks, read_rows
-from vvgt_cli.field.digests import digest
+from vvgt_cli.field.digests import digest, values_digest
 from vvgt_cli.field.drawing import Drawing
-from vvgt_cli.field.field import Picture
+from vvgt_cli.field.field import Picture, ViewRenderer
 from vvgt_cli.field.grid import CellGrid
 from vvgt_cli.field.parts import CELLS, Parts
 from vvgt_cli.field.rays import Bundle, RayFile, composed
-from vvgt_cli.field.reader import Layers, Scalars
+from vvgt_cli.field.reader import Scalars
 from vvgt_cli.field.runners import Runner, Task
 from vvgt_cli.field.settings import cell_grid
 from vvgt_cli.field.source import Source
@@ -34,9 +34,6 @@ if TYPE_CHECKING:
     from vvgt_cli.closed_form import Start, VbmOptions
     from vvgt_cli.closed_form.moments import Cells
     from vvgt_cli.field.cells import Reader
-    from vvgt_cli.look.function import TransferFunction
-    from vvgt_cli.look.labels import LabelTable
-    from vvgt_cli.volume import Volume
 
 Progress = Callable[[int, int], None]
 RAY_STEP = 2e-8  # seconds of a step of a ray through what is not empty: bonsai-tree in blocks of 128, two threads
@@ -88,18 +85,19 @@ class Later(Exception):
 
 @dataclass
 class Blocked:
-    """See the module, and `vvgt_cli.field.field.Field` for what it does.
+    """A field (`vvgt_cli.field.field.Field`) that reads its volume block by block, and draws its own pictures.
 
     Attributes:
-        source: what was opened, and what it is shown by.
-        reader: of boxes of it.
-        do: what does passes.
+        source: what was opened, and its look.
+        reader: reads boxes of it.
+        do: runs passes over the blocks.
         edge: voxels along the edge of blocks, about.
         visible: voxels that have extinction, about.
         key: digest of all that it depends on.
-        pictures: that are there, or are expected; by what they show.
+        look: given a source of the same volumes, that with its statistics, its reader and visible voxels.
+        pictures: drawn or expected, by what they show.
         grid: of its cells, once they are there.
-        single: one of several layers: its source, what reads it, and about how many of its voxels are visible.
+        views: its pictures; None makes it draw them itself.
     """
 
     source: Source
@@ -108,9 +106,13 @@ class Blocked:
     edge: int
     visible: float
     key: str
+    look: Callable[[Source], tuple[Source, Reader, float]]
     pictures: dict[str, tuple[Picture, np.ndarray | None]] = field(default_factory=dict)
     grid: CellGrid | None = None
-    single: Callable[[int], tuple[Source, Reader, float]] | None = None
+    views: ViewRenderer = field(default=None)  # type: ignore[assignment] # set below
+
+    def __post_init__(self) -> None:
+        self.views = self.views or self
 
     @cached_property
     def frame(self) -> Frame:
@@ -142,8 +144,8 @@ class Blocked:
         march = widening(dims, exponent, step, default_views("train", size=MARCH_SIZE))
         return cell_grid(self.source.volume, exponent, self.edge, march, least)
 
-    def case(self, size: int, gaussians: int) -> Workload:
-        """See `Field`: a view's time follows from the steps of its rays, nothing is timed."""
+    def workload(self, size: int, gaussians: int) -> Workload:
+        """See `Field.workload`: a view's time is estimated from the steps of its rays; nothing is timed."""
         x, y, z = (float(edge) for edge in self.frame.step)
         share = (self.visible / self.source.volume.data.size) ** (1 / 3)
         steps = view_edge(size, small=False) ** 2 * WAY / min(x, y, z) * max(share, 0.1)
@@ -170,8 +172,8 @@ class Blocked:
             self.do.parts.prepare(rays.kind)
         return CellBlocks(self.reader, grid, self.do.parts, rays, self.light)
 
-    def start(self, options: VbmOptions, progress: Progress | None = None) -> Start:
-        """See `Field`."""
+    def pyramid(self, options: VbmOptions, progress: Progress | None = None) -> Start:
+        """See `Field.pyramid`."""
         from vvgt_cli.closed_form import start_of
         from vvgt_cli.closed_form.closed_form import form_of, most_cells
         from vvgt_cli.closed_form.lit import Shading
@@ -187,13 +189,13 @@ class Blocked:
         )  # fmt: skip
         return start_of(form, options)
 
-    def expect(self, views: Sequence[Picture]) -> None:
-        """See `Field`."""
-        for view in views:
-            self.pictures.setdefault(_key(view), (view, None))
+    def expect(self, pictures: Sequence[Picture]) -> None:
+        """See `ViewRenderer.expect`."""
+        for picture in pictures:
+            self.pictures.setdefault(_key(picture), (picture, None))
 
     def view(self, camera: Camera, settings: RenderSettings, blocks: Blocks | None = None) -> np.ndarray:
-        """See `Field`: all pictures that are expected are made with the first that is asked for."""
+        """See `ViewRenderer.view`: all expected pictures are drawn with the first that is asked for."""
         view = Picture(camera, settings, blocks)
         self.expect([view])
         if self.pictures[_key(view)][1] is None:
@@ -206,9 +208,9 @@ class Blocked:
         image[blocks.mask()] = picked
         return image
 
-    def forget(self, view: Picture) -> None:
-        """Let go of a picture."""
-        self.pictures.pop(_key(view), None)
+    def forget(self, picture: Picture) -> None:
+        """See `ViewRenderer.forget`."""
+        self.pictures.pop(_key(picture), None)
 
     def _todo(self) -> list[Drawing]:
         """All that are expected."""
@@ -255,18 +257,18 @@ class Blocked:
         return [n for n in range(len(self.grid.blocks)) if len(parts.load(CELLS, n, names=("counts",))["counts"])]
 
     def normals(self, gaussians: Gaussians) -> np.ndarray | None:
-        """See `Field`."""
+        """See `Field.normals`."""
         if self.light is None:
             return None
         from vvgt_cli.closed_form.lit import mean_normals, normal_points
 
         points = normal_points(gaussians)
-        return mean_normals(points, self._under(points), self.frame.half)
+        return mean_normals(points, self._at(points), self.frame.half)
 
     def _normals_at(self, points: np.ndarray) -> np.ndarray:
-        return self._under(points)[:, :3]
+        return self._at(points)[:, :3]
 
-    def _under(self, points: np.ndarray) -> np.ndarray:
+    def _at(self, points: np.ndarray) -> np.ndarray:
         """Normals and extinction (n, 4) at points (n, 3) of the box frame."""
         grid = self.grid or self._grid(np.zeros(3, np.int64))
         at = (points + self.frame.half) / self.frame.step - 0.5
@@ -282,8 +284,8 @@ class Blocked:
             out[part["which"]] = part["found"]
         return out
 
-    def under(self, gaussians: Gaussians) -> np.ndarray:
-        """See `Field`."""
+    def sample(self, gaussians: Gaussians) -> np.ndarray:
+        """See `Field.sample`."""
         from vvgt_cli.closed_form.under import POINTS, in_voxels, values_of
 
         self.source.one_field()
@@ -304,63 +306,23 @@ class Blocked:
         rule = self.reader.rule
         return values_of(samples.reshape(-1, POINTS), gaussians, rule.slope, rule.intercept)
 
-    def shown_by(self, tf: TransferFunction) -> Blocked:
-        """See `Field`: its blocks lie in a folder of their own, within that of this one."""
-        from vvgt_cli.look.tables import build_tables
-
-        source, numbers = self.source.shown_by(tf), self.source.statistics
-        assert isinstance(self.reader, Scalars)
-        rule, frame = self.reader.rule, self.source.volume.unit_frame()
-        optics = build_tables(
-            tf, (numbers.lo, numbers.hi), slope=rule.slope, intercept=rule.intercept,
-            unit_distance=source.unit_distance, world_per_unit=1 / frame.scale,
-            voxel=float(np.mean(frame.step)),
-        )  # fmt: skip
-        middles = (numbers.edges[1:] + numbers.edges[:-1]) / 2
-        visible = float(numbers.histogram[tf.opacity(middles) > 0].sum())
-        key = digest(self.key, source.look(), source.unit_distance)
-        return self._beside(source, replace(self.reader, optics=optics), visible, key)
-
-    def labelled_by(self, tables: Sequence[LabelTable]) -> Blocked:
-        """See `Field`: as `shown_by`."""
-        from vvgt_cli.look.tables import Optics
-
-        source = self.source.labelled_by(tables)
-        assert isinstance(self.reader, Layers)
-        hollow = zip(self.reader.layers, source.layers, strict=True)
-        layers = tuple(replace(old, tf=new.tf, unit_distance=new.unit_distance) for old, new in hollow)
-        top = sum(layer.largest for layer in layers) / self.reader.scale
-        reader = replace(self.reader, layers=layers, optics=Optics.linear(top))
-        own = [(e.number, e.color, e.opacity) for table in tables for e in table.labels]
-        return self._beside(source, reader, reader.visible(), digest(self.key, own, source.unit_distance))
-
-    def alone(self, number: int) -> Blocked:
-        """See `Field`: as `shown_by`."""
-        assert self.single is not None
-        return self._beside(*self.single(number), digest(self.key, number))
-
-    def _beside(self, source: Source, reader: Reader, visible: float, key: str) -> Blocked:
-        """The field of another look, whose parts lie in a folder of their own, within that of this one."""
+    def with_look(self, source: Source) -> Blocked:
+        """See `Field.with_look`: its blocks lie in a folder of their own, within this field's."""
+        source, reader, visible = self.look(source)
+        volumes = [id(volume) for volume in self.source.volumes]
+        shown = [volumes.index(id(volume)) for volume in source.volumes]
+        key = digest(self.key, source.shown_as(), [layer.tf for layer in source.layers], shown)
         parts = Parts(self.do.parts.folder / f"shown-{key[:16]}")
         parts.open({"shown": key}, ours=True)
-        return Blocked(source, reader, replace(self.do, parts=parts), self.edge, visible, key)
+        return Blocked(source, reader, replace(self.do, parts=parts), self.edge, visible, key, self.look)
 
-    def digest(self) -> str:
-        """See `Field`."""
-        return self.key
+    @cached_property
+    def _digest(self) -> str | None:
+        return values_digest([place.volume() for place in self.reader.all_places])
 
-    def volumes(self) -> list[Volume]:
-        """See `Field`."""
-        return [place.volume() for place in self.reader.all_places]
-
-    def hidden(self, budget: int, size: int) -> tuple[np.ndarray, np.ndarray]:
-        """See `Field`."""
-        from vvgt_cli.closed_form import VbmOptions
-        from vvgt_cli.closed_form.tree import HIDDEN
-
-        form = self.start(VbmOptions(budget, size)).form
-        assert form is not None
-        return form.seen.largest > HIDDEN, form.seen.edge
+    def digest(self) -> str | None:
+        """See `Field.digest`."""
+        return self._digest
 
 
 def _key(view: Picture) -> str:

@@ -1,9 +1,9 @@
-"""`Field`: a volume under its function, labels, layers and light, wherever its values are; and one in memory."""
+"""`Field`: a volume under its function, labels, layers and light, in memory (`Resident`) or in blocks."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from vvgt_cli.cameras import Camera
 from vvgt_cli.cameras.blocks import Blocks
-from vvgt_cli.field.digests import volume_digest
+from vvgt_cli.field.digests import values_digest
 from vvgt_cli.field.source import Source
 from vvgt_cli.field.workload import Workload, measure
 from vvgt_cli.gaussians import Gaussians
@@ -20,10 +20,6 @@ if TYPE_CHECKING:
     from vvgt_cli.closed_form import Start, VbmOptions
     from vvgt_cli.dvr import RenderSettings, Scene
     from vvgt_cli.dvr.scene import PreparedVolume
-    from vvgt_cli.look.function import TransferFunction
-    from vvgt_cli.look.labels import LabelTable
-    from vvgt_cli.volume import Volume
-
 
 AT_ONCE = 1 << 17  # Gaussians whose samples are in memory
 
@@ -36,111 +32,113 @@ class Picture(NamedTuple):
     blocks: Blocks | None = None
 
 
+class ViewRenderer(Protocol):
+    """Renders pictures of a volume."""
+
+    def expect(self, pictures: Sequence[Picture]) -> None:
+        """Announce pictures: a volume in blocks draws all that it knows of in one pass."""
+
+    def view(self, camera: Camera, settings: RenderSettings, blocks: Blocks | None = None) -> np.ndarray:
+        """Return a picture (h, w, 4) float32, premultiplied RGBA; with ``blocks`` zero elsewhere."""
+
+    def forget(self, picture: Picture) -> None:
+        """Release a picture that is not asked for again."""
+
+
 class Field(Protocol):
     """What a conversion asks of a volume.
 
     Attributes:
-        source: the volume, whose values may lie in its file, and all that it is shown by.
+        source: the volume, whose values may lie in its file, and its look.
+        views: its pictures.
     """
+
+    views: ViewRenderer
 
     @property
     def source(self) -> Source: ...
 
-    def case(self, size: int, gaussians: int) -> Workload:
-        """What the costs of stages follow from, for images of ``size`` px and a budget of Gaussians."""
+    def workload(self, size: int, gaussians: int) -> Workload:
+        """Return what the costs of stages depend on, for images of ``size`` px and a budget of Gaussians."""
 
-    def start(self, options: VbmOptions, progress: Callable[[int, int], None] | None = None) -> Start:
-        """The closed form."""
+    def pyramid(self, options: VbmOptions, progress: Callable[[int, int], None] | None = None) -> Start:
+        """Return the closed form: the pyramid of cells, and Gaussians of those that fit the budget."""
 
-    def expect(self, views: Sequence[Picture]) -> None:
-        """Pictures that will be asked for: those of a volume in blocks are made together."""
+    def sample(self, gaussians: Gaussians) -> np.ndarray:
+        """Return mean value, spread and gradient under Gaussians of the box frame, (K, 5) float32.
 
-    def view(self, camera: Camera, settings: RenderSettings, blocks: Blocks | None = None) -> np.ndarray:
-        """A picture (h, w, 4) float32, premultiplied RGBA; with ``blocks`` zero elsewhere."""
-
-    def forget(self, view: Picture) -> None:
-        """A picture that is not asked for again."""
-
-    def normals(self, gaussians: Gaussians) -> np.ndarray | None:
-        """Directions (K, 3) of the mean gradient around Gaussians, all in the box frame; None where nothing is lit."""
-
-    def under(self, gaussians: Gaussians) -> np.ndarray:
-        """(K, 5) float32 of `vvgt_cli.closed_form.under.values_of` under Gaussians of the box frame.
+        See `vvgt_cli.closed_form.under.values_of`.
 
         Raises:
             UsageError: an optics grid, which has no values.
         """
 
-    def shown_by(self, tf: TransferFunction) -> Field:
-        """The same volume under another function on data values, unlit.
+    def with_look(self, source: Source) -> Field:
+        """Return the volume under another look: a `Source` that ``self.source`` made of itself.
 
-        Raises:
-            UsageError: an optics grid, which has no function.
+        The statistics of a layer on its own are found here.
         """
 
-    def labelled_by(self, tables: Sequence[LabelTable]) -> Field:
-        """The same label maps under other tables, as `Source.labelled_by`.
+    def normals(self, gaussians: Gaussians) -> np.ndarray | None:
+        """Return the directions (K, 3) of the mean gradient around Gaussians of the box frame; None without light."""
 
-        Raises:
-            UsageError: not labels alone.
-        """
-
-    def alone(self, number: int) -> Field:
-        """One of several layers as a field of its own, on its own grid, unlit."""
-
-    def digest(self) -> str:
-        """Of the volume's content."""
-
-    def volumes(self) -> list[Volume]:
-        """Every volume that is read for it: that of each layer, and its colours."""
-
-    def hidden(self, budget: int, size: int) -> tuple[np.ndarray, np.ndarray]:
-        """Cells (nz, ny, nx) bool that some training view sees, and their edges (3,) in voxels."""
+    def digest(self) -> str | None:
+        """Return the SHA-256 of the values of all volumes; None where there are more than `LARGEST` bytes of them."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class Resident:
-    """A field whose values are in memory.
+    """A field whose values are in memory, and which draws its own pictures.
 
     Attributes:
         source: what was read.
-        scene: the same laid out for the kernels.
+        scene: its values laid out for the kernels.
+        views: its pictures; None makes it draw them itself.
     """
 
     source: Source
     scene: Scene
+    views: ViewRenderer = field(default=None)  # type: ignore[assignment] # set below
+
+    def __post_init__(self) -> None:
+        self.views = self.views or self
+
+    @classmethod
+    def of(cls, source: Source) -> Resident:
+        """Return the field of a source, laid out for the kernels."""
+        return cls(source, source.scene())
 
     @cached_property
     def layout(self) -> PreparedVolume:
-        """Of one field, for the kernels."""
+        """The one scalar field for the kernels."""
         from vvgt_cli.dvr.scene import PreparedVolume
 
         return self.source.layout or PreparedVolume.of(self.source.volume)
 
-    def case(self, size: int, gaussians: int) -> Workload:
-        """See `Field`."""
+    def workload(self, size: int, gaussians: int) -> Workload:
+        """See `Field.workload`."""
         return measure(self.scene, size, gaussians)
 
-    def start(self, options: VbmOptions, progress: Callable[[int, int], None] | None = None) -> Start:
-        """See `Field`."""
+    def pyramid(self, options: VbmOptions, progress: Callable[[int, int], None] | None = None) -> Start:
+        """See `Field.pyramid`."""
         from vvgt_cli.closed_form import initialise
 
         return initialise(self.scene, options, progress)
 
-    def expect(self, views: Sequence[Picture]) -> None:
-        """Nothing: each is drawn when it is asked for."""
+    def expect(self, pictures: Sequence[Picture]) -> None:
+        """Do nothing: each picture is drawn when it is asked for."""
 
     def view(self, camera: Camera, settings: RenderSettings, blocks: Blocks | None = None) -> np.ndarray:
-        """See `Field`."""
+        """See `ViewRenderer.view`."""
         from vvgt_cli.dvr import render_view
 
         return render_view(self.scene, camera, settings, blocks)
 
-    def forget(self, view: Picture) -> None:
-        """Nothing: none is kept."""
+    def forget(self, picture: Picture) -> None:
+        """Do nothing: no picture is kept."""
 
     def normals(self, gaussians: Gaussians) -> np.ndarray | None:
-        """See `Field`."""
+        """See `Field.normals`."""
         if self.scene.light is None:
             return None
         from vvgt_cli.closed_form.lit import at_points, mean_normals, normal_points
@@ -148,8 +146,8 @@ class Resident:
         points = normal_points(gaussians)
         return mean_normals(points, at_points(self.scene, points), self.scene.half)
 
-    def under(self, gaussians: Gaussians) -> np.ndarray:
-        """See `Field`."""
+    def sample(self, gaussians: Gaussians) -> np.ndarray:
+        """See `Field.sample`."""
         from vvgt_cli.closed_form.under import POINTS, in_voxels, offsets, sample_points, values_of
 
         self.source.one_field()
@@ -163,35 +161,18 @@ class Resident:
             values[k : k + len(part)] = values_of(samples, part, self.layout.slope, self.layout.intercept)
         return values
 
-    def shown_by(self, tf: TransferFunction) -> Resident:
-        """See `Field`."""
-        source = replace(self.source.shown_by(tf), layout=self.layout)
-        return Resident(source, source.scene())
-
-    def labelled_by(self, tables: Sequence[LabelTable]) -> Resident:
-        """See `Field`."""
-        source = self.source.labelled_by(tables)
-        return Resident(source, source.scene())
-
-    def alone(self, number: int) -> Resident:
-        """See `Field`."""
+    def with_look(self, source: Source) -> Resident:
+        """See `Field.with_look`."""
         from vvgt_cli.volume import statistics
 
-        source = self.source.alone(number, statistics(self.source.layers[number].volume))
-        return Resident(source, source.scene())
+        if source.layers[0].volume is not self.source.layers[0].volume:
+            source = replace(source, statistics=statistics(source.volume))
+        return Resident.of(source if source.gridded or self.source.gridded else replace(source, layout=self.layout))
 
-    def digest(self) -> str:
-        """See `Field`."""
-        return volume_digest(self.source.volume)
+    @cached_property
+    def _digest(self) -> str | None:
+        return values_digest(self.source.volumes)
 
-    def volumes(self) -> list[Volume]:
-        """See `Field`."""
-        return [volume for layer in self.source.layers for volume in (layer.volume, *(layer.colors or ()))]
-
-    def hidden(self, budget: int, size: int) -> tuple[np.ndarray, np.ndarray]:
-        """See `Field`."""
-        from vvgt_cli.closed_form.closed_form import closed_form
-        from vvgt_cli.closed_form.tree import HIDDEN
-
-        seen = closed_form(self.scene, budget, size).seen
-        return seen.largest > HIDDEN, seen.edge
+    def digest(self) -> str | None:
+        """See `Field.digest`."""
+        return self._digest

@@ -123,11 +123,12 @@ def blocked(run: Run, request: SourceRequest, options: BlockOptions, parts: Part
             stage.note = f"{describe_source(source)}; in blocks of {edge}{shared}"
         key = digest(str(sorted(settings.items())))
 
-        def single(number: int) -> tuple[Source, Reader, float]:
-            one = source.alone(number, access.statistics(source.layers[number].volume))
-            return one, *_reader(one, access)
+        def look(other: Source) -> tuple[Source, Reader, float]:
+            if other.layers[0].volume is not source.layers[0].volume:
+                other = replace(other, statistics=access.statistics(other.volume))
+            return other, *_reader(other, access)
 
-        yield Blocked(source, reader, do, edge, visible, key, single=single)
+        yield Blocked(source, reader, do, edge, visible, key, look)
 
 
 def _edge(request: SourceRequest, options: BlockOptions) -> int:

@@ -122,10 +122,15 @@ class Source:
         """What frames of a series share: of all of them, else its own."""
         return self.series[0] if self.series else self.statistics
 
-    def alone(self, number: int, statistics: Statistics) -> Source:
-        """One of the layers as a source of its own, unlit; ``statistics`` are its volume's."""
+    def alone(self, number: int) -> Source:
+        """Return one of the layers as a source of its own, unlit, with the statistics of the first layer."""
         layer = self.layers[number]
-        return Source((layer,), layer.volume, statistics, series=self.series[number : number + 1])
+        return Source((layer,), layer.volume, self.statistics, series=self.series[number : number + 1])
+
+    @property
+    def volumes(self) -> list[Volume]:
+        """Every volume that is read: that of each layer, and its colours."""
+        return [volume for layer in self.layers for volume in (layer.volume, *(layer.colors or ()))]
 
     @property
     def gridded(self) -> bool:

@@ -204,20 +204,20 @@ def facts_in(comments: list[str], name: str, columns: Sequence[str] = ()) -> dic
     found: dict[str, Any] = {}
     lives: list[dict[str, Any]] = [{}]
     for comment in comments:
-        words = comment.split()
-        if len(words) < 2 or words[0] != "vvgt":
+        ours, word, text = [*comment.split(None, 2), "", "", ""][:3]
+        if ours != "vvgt" or not word:
             continue
         try:
-            if words[1] == WORD:
-                more = one_comment(words[2:])
+            if word == WORD:
+                more = one_comment(text)
                 if "name" in more and lives[-1]:
                     lives.append({})
                 live = lives[-1]
                 live |= more | {"labels": live.get("labels", ()) + more["labels"]} if "labels" in more else more
-            elif words[1] == CERTIFICATE:
-                found[CERTIFICATE] = Certificate.of(comment.split(None, 2)[2])
+            elif word == CERTIFICATE:
+                found[CERTIFICATE] = Certificate.of(text)
             else:
-                found |= _one_comment(words[1:])
+                found |= _one_comment(word, text)
         except (ValueError, IndexError, UsageError):
             raise DataError(f"{name}: comment {comment[:80]!r} is not one that vvgt writes") from None
     if found.get("frame") == "world" and "scale" not in found:
@@ -225,50 +225,52 @@ def facts_in(comments: list[str], name: str, columns: Sequence[str] = ()) -> dic
     return found | {"live": live_facts(lives, list(columns))}
 
 
-def _one_comment(words: list[str]) -> dict[str, Any]:
-    if words[0] == "frame":
-        if words[1] not in ("unit", "world"):
-            raise ValueError(words[1])
-        if len(words) == 2:
-            return {"frame": words[1]}
-        if (words[2], words[4]) != ("scale", "centre") or len(words) != 8:
-            raise ValueError(words)
-        scale, *centre = _finite([words[3], *words[5:8]])
+def _one_comment(word: str, text: str) -> dict[str, Any]:
+    """Return the facts of a comment ``vvgt WORD TEXT``.
+
+    Raises:
+        ValueError, IndexError, UsageError: not a comment that `comment_lines` writes.
+    """
+    words = text.split()
+    if word == "frame":
+        if words[0] not in ("unit", "world"):
+            raise ValueError(text)
+        if len(words) == 1:
+            return {"frame": words[0]}
+        if (words[1], words[3]) != ("scale", "centre") or len(words) != 7:
+            raise ValueError(text)
+        scale, *centre = _finite([words[2], *words[4:]])
         if scale <= 0:
             raise ValueError(scale)
-        return {"frame": words[1], "scale": scale, "centre": tuple(centre)}
-    if words[0] == "up":
-        up_matrix(words[1])
-        return {"up": words[1]}
-    if words[0] == "unit-distance":
-        return {"unit_distance": _finite([words[1]])[0], "unit_distance_label": " ".join(words[2:])}
-    if words[0] == "size":
-        if words[2] != "rule" or len(words) != 4 or not words[1].isdecimal() or not 0 < int(words[1]) <= 2**20:
-            raise ValueError(words)
-        return {"made_for": int(words[1]), "rule": words[3]}
-    if words[0] == "space":
-        if words[1:] not in (["RAS"], ["LPS"], ["none"]):
-            raise ValueError(words)
-        return {"space": words[1]}
-    if words[0] == "light":
-        return {"light": parse_lighting(" ".join(words[1:]))}
-    if words[0] == "length-unit":
-        return {"length_unit": words[1]}
-    if words[0] == "function":
-        return {"function": str(json.loads(" ".join(words[1:])))}
-    if words[0] == "legend":
-        return {"legend": checked(" ".join(words[1:]))}
-    if words[0] == "date":
-        return {"date": " ".join(words[1:])}
-    if words[0] == "optics":
-        return {"optics": words[1]}
-    if words[0] == "affine":
-        affine = _finite(words[1:])
+        return {"frame": words[0], "scale": scale, "centre": tuple(centre)}
+    if word == "up":
+        up_matrix(words[0])
+        return {"up": words[0]}
+    if word == "unit-distance":
+        return {"unit_distance": _finite(words[:1])[0], "unit_distance_label": text[len(words[0]) :].strip()}
+    if word == "size":
+        if words[1] != "rule" or len(words) != 3 or not words[0].isdecimal() or not 0 < int(words[0]) <= 2**20:
+            raise ValueError(text)
+        return {"made_for": int(words[0]), "rule": words[2]}
+    if word == "space":
+        if text not in ("RAS", "LPS", "none"):
+            raise ValueError(text)
+        return {"space": text}
+    if word == "light":
+        return {"light": parse_lighting(text)}
+    if word == "function":
+        return {"function": str(json.loads(text))}
+    if word == "legend":
+        return {"legend": checked(text)}
+    if word == "affine":
+        affine = _finite(words)
         axes = np.reshape(affine, (3, 4))[:, :3]  # another count: ValueError
         if not axes.any() or np.linalg.det(axes / np.abs(axes).max()) == 0:
-            raise ValueError(words)
+            raise ValueError(text)
         return {"affine": tuple(affine)}
-    return {"version": words[0]}
+    if word in ("length-unit", "optics", "date"):
+        return {word.replace("-", "_"): text if word == "date" else words[0]}
+    return {"version": word}
 
 
 def comment_lines(facts: FileFacts) -> list[str]:

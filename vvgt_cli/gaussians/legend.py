@@ -11,7 +11,6 @@ from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.labels import LabelTable
 
 MOST_NODES, MOST_LABELS, LONGEST = 32, 24, 2500  # nodes, labels, characters: a header has little room
-LONGEST_NAME = 40  # characters of a label's
 
 
 def legend_text(tf: object, lo: float, hi: float, unit: str) -> str | None:
@@ -24,7 +23,7 @@ def legend_text(tf: object, lo: float, hi: float, unit: str) -> str | None:
     """
     if isinstance(tf, LabelTable):
         shown = [label for label in tf.labels if label.opacity > 0]
-        rows = [[label.name[:LONGEST_NAME], _hex(label.color)] for label in shown[:MOST_LABELS]]
+        rows = [[label.name, _hex(label.color)] for label in shown[:MOST_LABELS]]
         while len(text := json.dumps({"labels": rows, "of": len(shown)})) > LONGEST:
             rows.pop()
         return text

@@ -24,9 +24,9 @@ from vvgt_cli.gaussians.frames import factored, rotations
 from vvgt_cli.gaussians.live_facts import GRADIENT, NUMBER, ROW
 from vvgt_cli.gaussians.opacity import mean_opacity, projected_areas
 from vvgt_cli.gaussians.types import Gaussians
+from vvgt_cli.look.function import TransferFunctionLike
 from vvgt_cli.look.labels import Label
 from vvgt_cli.look.tables import extinction
-from vvgt_cli.look.types import TransferFunctionLike
 
 MEANS, SPREADS = 256, 32  # rows and columns of a table
 WIDEST = 0.25  # share of the range of values: the largest spread of a table

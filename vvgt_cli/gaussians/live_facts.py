@@ -11,20 +11,16 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.look.colormap import ColorMap
 from vvgt_cli.look.convert import to_text
-from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.look.function import ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.labels import Label
-from vvgt_cli.look.opacity import PiecewiseOpacity
 from vvgt_cli.look.readers.minimal import read
 from vvgt_cli.volume import Statistics, Volume
 from vvgt_cli.volume.stats import BINS, edges_of
-from vvgt_cli.volume.types import triple
 
 COLUMNS, NORMAL, LABEL, LAYER = ("value", "spread", "length"), ("nx", "ny", "nz"), "label", "layer"
 CARRIED, ROW, NUMBER = slice(0, 3), 6, 7  # of what Gaussians carry: own columns, row of a label, number of a layer
 GRADIENT = slice(3, 6)  # of what Gaussians carry: in the columns of normals
-LONGEST_NAME = 80  # characters of a label's
 SAMPLED = 64  # nodes of a function that the header has no other way of holding
 MOST_LABELS = 500  # that a header has room for
 LONGEST = 12_000  # characters of a function: some loaders read no more than the first 10 KB of a header, ours 64
@@ -117,7 +113,7 @@ class LiveFacts:
 
     def title(self) -> str:
         """The comment that begins what a header says of one of several layers."""
-        return f"comment vvgt live layer {self.distance!r} {json.dumps(self.name[:LONGEST_NAME])}"
+        return f"comment vvgt live layer {self.distance!r} {json.dumps(self.name)}"
 
 
 def function_text(tf: TransferFunction, lo: float, hi: float, several: int = 1) -> str:
@@ -137,47 +133,58 @@ def function_text(tf: TransferFunction, lo: float, hi: float, several: int = 1) 
 
 
 def label_text(label: Label) -> str:
-    """Number, colour, opacity and name; of the name what is not ASCII is escaped."""
+    """Return number, colour, opacity and name; characters of the name that are not ASCII are escaped."""
     color = " ".join(f"{channel:.4g}" for channel in label.color)
-    return f"{label.number} {color} {label.opacity:.6g} {json.dumps(label.name[:LONGEST_NAME])}"
+    return f"{label.number} {color} {label.opacity:.6g} {json.dumps(label.name)}"
 
 
-def one_comment(words: Sequence[str]) -> dict[str, Any]:
-    """Facts of a comment's words after ``vvgt live``.
+def one_comment(text: str) -> dict[str, Any]:
+    """Return the facts of a comment, given the text after ``vvgt live``.
 
     Raises:
         ValueError, IndexError: not one that `LiveFacts.lines` writes.
     """
-    if words[0] == "values":
-        lo, hi = float(words[1]), float(words[2])
-        dims = tuple(int(word) for word in words[4:])
-        if words[3] != "dims" or len(dims) != 3 or min(dims) < 1 or not -math.inf < lo <= hi < math.inf:
-            raise ValueError(words)
-        return {"lo": lo, "hi": hi, "dims": dims}
-    if words[0] == "layer":
-        name, distance = json.loads(" ".join(words[2:])), float(words[1])
-        if not isinstance(name, str) or not 0 < distance < math.inf:
-            raise ValueError(words)
-        return {"name": name, "distance": distance}
-    if words[0] == "unit":
-        return {"unit": " ".join(words[1:])}
-    if words[0] == "histogram":
-        counts = tuple(int(word) for word in words[1:])
-        if len(counts) != BINS or min(counts) < 0:
-            raise ValueError(words)
-        return {"histogram": counts}
-    if words[0] == "label":
-        number, rgb, opacity = int(words[1]), [float(word) for word in words[2:5]], float(words[5])
-        name = json.loads(" ".join(words[6:]))
-        if not isinstance(name, str) or not all(0 <= x <= 1 for x in (*rgb, opacity)):
-            raise ValueError(words)
-        return {"labels": (Label(number, name, triple(rgb), opacity),)}
-    if words[0] == "function":
-        text = " ".join(words[1:])
-        if not isinstance(json.loads(text), dict):
+    word, text = text.split(None, 1)
+    words = text.split()
+    if word == "values":
+        lo, hi = float(words[0]), float(words[1])
+        dims = tuple(int(size) for size in words[3:])
+        if words[2] != "dims" or len(dims) != 3 or min(dims) < 1 or not -math.inf < lo <= hi < math.inf:
             raise ValueError(text)
+        return {"lo": lo, "hi": hi, "dims": dims}
+    if word == "layer":
+        distance, name = text.split(None, 1)
+        if not 0 < float(distance) < math.inf:
+            raise ValueError(text)
+        return {"name": _quoted(name), "distance": float(distance)}
+    if word == "unit":
+        return {"unit": text}
+    if word == "histogram":
+        counts = tuple(int(count) for count in words)
+        if len(counts) != BINS or min(counts) < 0:
+            raise ValueError(text)
+        return {"histogram": counts}
+    if word == "label":
+        number, *optics, name = text.split(None, 5)
+        red, green, blue, opacity = (float(x) for x in optics)
+        if not all(0 <= x <= 1 for x in (red, green, blue, opacity)):
+            raise ValueError(text)
+        return {"labels": (Label(int(number), _quoted(name), (red, green, blue), opacity),)}
+    if word == "function" and isinstance(json.loads(text), dict):
         return {"function": text}
-    raise ValueError(words)
+    raise ValueError(text)
+
+
+def _quoted(text: str) -> str:
+    """Return the text that a JSON string holds.
+
+    Raises:
+        ValueError: no JSON, or of another type.
+    """
+    found = json.loads(text)
+    if not isinstance(found, str):
+        raise ValueError(text)
+    return found
 
 
 def live_facts(found: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> LiveFacts | None:

@@ -21,7 +21,7 @@ from vvgt_cli.volume.space import axis_facts
 
 FRAMES = ("unit", "world")
 OPAQUE = 16.0  # logit of an opacity of 1 - 1e-7
-_HEADER_LIMIT = 1 << 18  # bytes; a header longer than this is not one
+_HEADER_LIMIT = 1 << 20  # bytes; a header longer than this is not one
 
 
 @dataclass(frozen=True)

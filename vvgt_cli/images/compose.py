@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -12,7 +13,18 @@ BLACK = (0.0, 0.0, 0.0)
 
 
 def over(rgba: np.ndarray, background: float | Sequence[float] | np.ndarray = BLACK) -> np.ndarray:
-    """Premultiplied (..., 4) over a colour, a grey or an image (..., 3) -> (..., 3) float32, not clipped."""
+    """Composite premultiplied RGBA over a background.
+
+    Args:
+        rgba: (..., 4).
+        background: a colour, a grey or an image (..., 3).
+
+    Returns:
+        (..., 3) float32, not clipped.
+
+    Raises:
+        DataError: not four channels.
+    """
     rgba = np.asarray(rgba, dtype=np.float32)
     if rgba.shape[-1:] != (4,):
         raise DataError(f"image of shape {rgba.shape}; expected four channels, premultiplied RGBA")
@@ -21,7 +33,7 @@ def over(rgba: np.ndarray, background: float | Sequence[float] | np.ndarray = BL
 
 
 def _rgb(image: np.ndarray, background: Sequence[float]) -> np.ndarray:
-    """(h, w, 3) float32 in [0, 1] of an RGB or premultiplied RGBA image."""
+    """Return (h, w, 3) float32 in [0, 1] of an RGB or premultiplied RGBA image."""
     image = np.asarray(image, dtype=np.float32)
     if image.ndim != 3 or image.shape[2] not in (3, 4):
         raise DataError(f"image of shape {image.shape}; expected (height, width, 3) or (height, width, 4)")
@@ -30,14 +42,15 @@ def _rgb(image: np.ndarray, background: Sequence[float]) -> np.ndarray:
 
 
 def side_by_side(reference: np.ndarray, ours: np.ndarray, gain: float = 8.0) -> np.ndarray:
-    """reference | ours | gain x absolute difference, (h, 3 w, 3) float32 in [0, 1].
+    """Join reference, ours and their absolute difference times ``gain``, (h, 3 w, 3) float32 in [0, 1].
 
     Args:
-        reference, ours: (h, w, 3) RGB or (h, w, 4) premultiplied RGBA over black, of one size.
+        reference: (h, w, 3) RGB, or (h, w, 4) premultiplied RGBA, which is shown over black.
+        ours: of the same size.
         gain: factor of the difference.
 
     Raises:
-        DataError: shapes that differ or are no images.
+        DataError: sizes that differ, or not images.
     """
     left, right = _rgb(reference, BLACK), _rgb(ours, BLACK)
     if left.shape != right.shape:
@@ -48,12 +61,13 @@ def side_by_side(reference: np.ndarray, ours: np.ndarray, gain: float = 8.0) -> 
 def contact_sheet(
     images: Sequence[np.ndarray], columns: int | None = None, gap: int = 4, background: Sequence[float] = BLACK
 ) -> np.ndarray:
-    """Images of one size in rows, ``gap`` pixels apart, (rows, columns) -> (H, W, 3) float32 in [0, 1].
+    """Lay images of one size out in rows, ``gap`` pixels apart, (H, W, 3) float32 in [0, 1].
 
     Args:
         images: (h, w, 3) RGB or (h, w, 4) premultiplied RGBA each; at least one.
         columns: images a row; default: the square root of their number, rounded up.
-        background: behind RGBA images, in the gaps and in places left over.
+        gap: pixels between images.
+        background: behind RGBA images, in the gaps and in empty places.
 
     Raises:
         DataError: no images, sizes that differ, ``columns`` below 1.
@@ -61,15 +75,15 @@ def contact_sheet(
     tiles = [_rgb(image, background) for image in images]
     if not tiles or len({tile.shape for tile in tiles}) != 1:
         raise DataError(f"{len(tiles)} images of {len({t.shape for t in tiles})} sizes; expected some, of one size")
-    columns = int(np.ceil(np.sqrt(len(tiles)))) if columns is None else columns
+    columns = math.ceil(math.sqrt(len(tiles))) if columns is None else columns
     if columns < 1:
         raise DataError(f"{columns} columns; expected at least one")
     columns = min(columns, len(tiles))
-    rows = -(-len(tiles) // columns)
     height, width, _ = tiles[0].shape
-    sheet = np.empty((rows * (height + gap) - gap, columns * (width + gap) - gap, 3), dtype=np.float32)
+    rows = -(-len(tiles) // columns)
+    sheet = np.empty((rows * (height + gap), columns * (width + gap), 3), dtype=np.float32)
     sheet[:] = background
     for i, tile in enumerate(tiles):
         y, x = i // columns * (height + gap), i % columns * (width + gap)
         sheet[y : y + height, x : x + width] = tile
-    return sheet
+    return sheet[: sheet.shape[0] - gap, : sheet.shape[1] - gap]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -52,7 +53,7 @@ def write_exr(
                 f"camera {camera.name} is {camera.width} x {camera.height} px, the image "
                 f"{pixels.shape[1]} x {pixels.shape[0]}; expected the same"
             )
-        header[CAMERA_ATTRIBUTE] = json.dumps(_camera_record(camera))
+        header[CAMERA_ATTRIBUTE] = json.dumps(asdict(camera), default=lambda array: array.tolist())
     with atomic_write(path, overwrite) as temporary:
         try:
             OpenEXR.File(header, {"RGBA": pixels}).write(str(temporary))
@@ -94,27 +95,11 @@ def read_exr(path: str | PathLike[str]) -> tuple[np.ndarray, Camera | None]:
     return rgba, _camera_of(header.get(CAMERA_ATTRIBUTE), path)
 
 
-def _camera_record(camera: Camera) -> dict[str, Any]:
-    return {
-        "rotation": camera.rotation.tolist(),
-        "translation": camera.translation.tolist(),
-        "fx": float(camera.fx),
-        "fy": float(camera.fy),
-        "cx": float(camera.cx),
-        "cy": float(camera.cy),
-        "width": int(camera.width),
-        "height": int(camera.height),
-        "name": camera.name,
-    }
-
-
 def _camera_of(text: Any, path: str | PathLike[str]) -> Camera | None:
+    """Return the camera that a header attribute holds, None without one."""
     if text is None:
         return None
     try:
-        record = json.loads(text)
-        record["rotation"] = np.array(record["rotation"], dtype=np.float64)
-        record["translation"] = np.array(record["translation"], dtype=np.float64)
-        return Camera(**record)
+        return Camera(**json.loads(text))
     except (TypeError, ValueError, KeyError, RecursionError) as error:
         raise DataError(f"{path}: header attribute {CAMERA_ATTRIBUTE} is not a camera ({error})") from error

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any, Unpack
 
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.conversion.result import Conversion, Result
-from vvgt_cli.errors import SeveralSteps, UsageError
-from vvgt_cli.field.layered import Content
+from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians import Gaussians, PlyHeader
 from vvgt_cli.library.inputs import (
     FunctionLike,
@@ -18,20 +17,19 @@ from vvgt_cli.library.inputs import (
     GoalLike,
     LabelsLike,
     LightLike,
-    Look,
     LookLike,
     LooksLike,
     PathLike,
     Reading,
     VolumeLike,
     console_of,
-    content_of,
     function_of,
     labels_of,
     light_of,
     looks_of,
     ply_of,
     source_of,
+    under,
     volume_of,
 )
 from vvgt_cli.volume import Volume
@@ -41,10 +39,7 @@ if TYPE_CHECKING:
 
     from vvgt_cli.commands.evaluate import Evaluation
     from vvgt_cli.conversion.clouds import Clouds
-    from vvgt_cli.conversion.request import ConvertRequest
     from vvgt_cli.field.settings import BlockOptions
-    from vvgt_cli.field.source import SourceRequest
-    from vvgt_cli.progress import Console
 
 
 def convert(
@@ -89,67 +84,17 @@ def convert(
         DataError: input that is not what it must be, or a scene that shows nothing.
         UsageError: options that do not fit.
     """
-    from vvgt_cli.conversion.clouds import labels_in_memory, looks_in_memory
+    from vvgt_cli.conversion.batch import convert_to_memory
 
-    console, looks = console_of(progress), looks_of(look)
-    if live and (looks is not None or split_labels):
-        raise UsageError("live: one result of one volume, which `recolor` shows under other looks; expected one look")
-    if after is not None and (looks is not None or split_labels or live):
-        raise UsageError("after: one conversion goes on from one; expected one look, without split_labels and live")
     if not isinstance(after, Conversion | None):
         raise UsageError("after: expected what convert returns for one volume and look")
-    if looks is not None:
-        if split_labels:
-            raise UsageError(f"split_labels with {len(looks)} looks; expected one")
-        requests, name = _under(looks, volume, reading, goal, blocks, console)
-        return looks_in_memory(requests, name, console)
-    one: Any = look
-    request = replace(_request(source_of(volume, one, reading), goal, blocks), live=live)
-    return labels_in_memory(request, console) if split_labels else _one_or_frames(request, console, after)
-
-
-def _one_or_frames(request: ConvertRequest, console: Console, after: Conversion | None) -> Conversion | Clouds:
-    from vvgt_cli.conversion.clouds import frames_in_memory
-    from vvgt_cli.conversion.convert import without_files
-    from vvgt_cli.conversion.onward import Onward
-    from vvgt_cli.conversion.pages import is_glob_of_volumes
-
-    path = request.source.volume
-    if isinstance(path, str) and after is None and is_glob_of_volumes(path):
-        return frames_in_memory(request, console)
-    try:
-        return without_files(request, console, None if after is None else Onward(after))
-    except SeveralSteps:
-        if not isinstance(path, str) or after is not None:
-            raise
-        return frames_in_memory(request, console)
-
-
-def _request(source: SourceRequest, goal: GoalLike, blocks: int | str | None) -> ConvertRequest:
-    from vvgt_cli.conversion.request import ConvertRequest, FitOptions, Limits
-
-    want = Goal.of(goal)
-    fit = FitOptions(want.max_gaussians, want.size, want.init, want.rule, want.seed, want.steps, want.model)
-    limits = Limits(want.target_psnr, want.time_budget, want.max_megabytes)
-    return ConvertRequest(source, None, fit, limits, all_views=want.all_views, blocks=_blocks(blocks))
-
-
-def _under(
-    looks: Mapping[str, Look], volume: VolumeLike, reading: Reading, goal: GoalLike, blocks: int | str | None,
-    console: Console,
-) -> tuple[dict[str, ConvertRequest], str]:  # fmt: skip
-    """A request a look, and the volume's name: in memory it is read and laid out once."""
-    from vvgt_cli.field.open import automatic
-
-    sources = {name: source_of(volume, look, reading) for name, look in looks.items()}
-    first = next(iter(sources.values()))
-    if blocks is None and automatic(first, console) is None:
-        content = first.volume if isinstance(first.volume, Content) else content_of(volume, reading)
-        content.prepare()
-        sources = {name: source_of(content, look, {}) for name, look in looks.items()}
-    given = first.volume
-    name = os.path.basename(given) if isinstance(given, str) else content_of(given, {}).volumes[0].name
-    return {name: _request(source, goal, blocks) for name, source in sources.items()}, name
+    looks, several = looks_of(look)
+    source = source_of(volume, None, reading)
+    request = replace(Goal.of(goal).request(source), blocks=_blocks(blocks), live=live)
+    requests = {name: replace(request, source=under(source, one)) for name, one in looks.items()}
+    return convert_to_memory(
+        requests, several=several, split_labels=split_labels, after=after, console=console_of(progress)
+    )
 
 
 def _blocks(blocks: int | str | None) -> BlockOptions | None:

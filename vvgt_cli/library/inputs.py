@@ -7,9 +7,10 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from numbers import Real
-from typing import Any, BinaryIO, TypedDict
+from typing import TYPE_CHECKING, Any, BinaryIO, Protocol, TypeAlias, TypedDict
 
-from vvgt_cli.conversion.functions import function_name
+from vvgt_cli.conversion.index import function_name
+from vvgt_cli.conversion.request import ConvertRequest, FitOptions, Limits
 from vvgt_cli.conversion.result import Result
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.layered import Content, open_parts
@@ -23,12 +24,31 @@ from vvgt_cli.volume import ReadOptions, Volume
 from vvgt_cli.volume.dask_arrays import is_dask, lazy
 from vvgt_cli.volume.stored import Stored
 
+if TYPE_CHECKING:
+    from vvgt_cli.library.session import Session
+
 PathLike = str | os.PathLike[str]
-VolumeLike = Any  # a path, a Volume, a Session, an array (of Dask, too), an xarray.DataArray, a pyvista (VTK) dataset
+VolumeLike: TypeAlias = "PathLike | Volume | Content | Session | ArrayLike | VtkImage"
 LightLike = LightOptions | str | Sequence[float] | Sequence[str | Sequence[float]] | None
 LabelsLike = PathLike | Mapping[Any, Mapping[str, Any]] | LabelTable
 LayerLike = PathLike | SourceRequest
 FunctionLike = PathLike | Mapping[str, Any] | TransferFunction
+
+
+class ArrayLike(Protocol):
+    """An array of NumPy, Dask or xarray."""
+
+    @property
+    def shape(self) -> tuple[Any, ...]: ...
+
+    @property
+    def dtype(self) -> Any: ...
+
+
+class VtkImage(Protocol):
+    """A vtkImageData, pyvista's too."""
+
+    def GetDimensions(self) -> Any: ...
 
 
 @dataclass(frozen=True)
@@ -63,8 +83,8 @@ LookLike = Look | FunctionLike | None
 LooksLike = LookLike | Sequence[LookLike] | Mapping[str, LookLike]
 
 
-def looks_of(look: LooksLike) -> dict[str, Look] | None:
-    """Several looks by name, None where it is one.
+def looks_of(look: LooksLike) -> tuple[dict[str, Look], bool]:
+    """Return looks by name, and whether several were asked for.
 
     A mapping is of several looks where all its values are functions or looks; a function's own holds lists of numbers.
 
@@ -73,19 +93,19 @@ def looks_of(look: LooksLike) -> dict[str, Look] | None:
         DataError: a mapping that is no function.
     """
     if isinstance(look, Mapping):
-        if not look or not all(
-            isinstance(v, Look | str | os.PathLike | Mapping | TransferFunction) for v in look.values()
-        ):
-            return None
-        return {str(name): Look.of(one) for name, one in look.items()}
+        kinds = (Look, str, os.PathLike, Mapping, TransferFunction)
+        if not look or not all(isinstance(one, kinds) for one in look.values()):
+            return {"": Look.of(look)}, False
+        return {str(name): Look.of(one) for name, one in look.items()}, True
     if not isinstance(look, list | tuple):
-        return None
+        alone: Any = look  # mypy takes a str for a sequence
+        return {"": Look.of(alone)}, False
     looks = [Look.of(one) for one in look]
     names = [_name_of(one.function) for one in looks]
     if not names or len(set(names)) < len(names):
         told = ", ".join(dict.fromkeys(names)) or "none"
         raise UsageError(f"{len(looks)} looks, named {told}; expected one name each: pass a mapping of names to looks")
-    return dict(zip(names, looks, strict=True))
+    return dict(zip(names, looks, strict=True)), True
 
 
 def _name_of(function: FunctionLike | None) -> str:
@@ -100,36 +120,18 @@ def _name_of(function: FunctionLike | None) -> str:
 
 
 @dataclass(frozen=True)
-class Goal:
-    """What a conversion is for; `vvgt_cli.conversion.request` has the same in two parts.
+class Goal(Limits, FitOptions):
+    """What a conversion is for: the attributes of `FitOptions` and `Limits`.
 
     Attributes:
-        max_gaussians: budget.
-        size: pixels along the edge of the screen.
-        rule: viewer that is fitted to (`vvgt_cli.gaussians.rules`).
-        init: "vbm", "wavelet" or "uniform".
-        steps: of gradient descent at most; None: chosen by the plan.
-        model: trained network that runs before the steps.
-        seed: of whatever draws random numbers.
-        target_psnr, time_budget, max_megabytes: dB that are enough, seconds of the run, 10^6 bytes of the file.
         all_views: score on all ten test views, by SSIM and FLIP too, as ``--report`` does.
     """
 
-    max_gaussians: int = 100_000
-    size: int = 1080
-    rule: str = "inria"
-    init: str = "vbm"
-    steps: int | None = None
-    model: str | None = None
-    seed: int = 0
-    target_psnr: float | None = None
-    time_budget: float | None = None
-    max_megabytes: float | None = None
     all_views: bool = False
 
     @classmethod
     def of(cls, goal: GoalLike) -> Goal:
-        """A goal, or one of a mapping of its attributes.
+        """Return a goal as it is, or made of a mapping of its attributes.
 
         Raises:
             UsageError: an attribute that there is not.
@@ -140,6 +142,13 @@ class Goal:
         if unknown := sorted(set(goal) - set(known)):
             raise UsageError(f"goal: {unknown[0]}; expected any of {', '.join(known)}")
         return cls(**goal)
+
+    def request(self, source: SourceRequest) -> ConvertRequest:
+        """Return the conversion of a source that it asks for."""
+        given = {field.name: getattr(self, field.name) for field in fields(self)}
+        fit = FitOptions(**{field.name: given[field.name] for field in fields(FitOptions)})
+        limits = Limits(**{field.name: given[field.name] for field in fields(Limits)})
+        return ConvertRequest(source, fit=fit, limits=limits, all_views=self.all_views)
 
 
 GoalLike = Goal | Mapping[str, Any] | None
@@ -250,23 +259,33 @@ def function_of(tf: FunctionLike | None) -> str | TransferFunction | None:
 
 
 def source_of(volume: VolumeLike, look: LookLike, reading: Reading) -> SourceRequest:
-    """The volume, read, under a look.
+    """Return the request for a volume under a look.
 
     Raises:
         DataError, UsageError: as `volume_of` and `function_of`.
     """
-    look = Look.of(look)
-    span = look.range if isinstance(look.range, str) else ",".join(repr(float(v)) for v in look.range)
-    distance = None if look.unit_distance is None else str(look.unit_distance)
-    if isinstance(volume, str | os.PathLike):  # colours and channels are several volumes: the source opens them
-        options = _options(reading)
-        given: Any = os.fspath(volume)
+    if isinstance(volume, str | os.PathLike):  # the source opens it: colours and channels are several volumes
+        source = SourceRequest(os.fspath(volume), _options(reading))
     else:
-        options, given = ReadOptions(), content_of(volume, reading)
-    return SourceRequest(
-        given, options, function_of(look.function), span, distance, light=light_of(look.light),
-        labels=labels_of(look.labels), layers=tuple(layer_of(layer) for layer in look.layers),
-    )  # fmt: skip
+        source = SourceRequest(content_of(volume, reading))
+    return under(source, Look.of(look))
+
+
+def under(source: SourceRequest, look: Look) -> SourceRequest:
+    """Return the request for a source's volume under a look.
+
+    Raises:
+        DataError, UsageError: as `function_of`.
+    """
+    return replace(
+        source,
+        tf=function_of(look.function),
+        tf_range=look.range if isinstance(look.range, str) else ",".join(repr(float(v)) for v in look.range),
+        unit_distance=None if look.unit_distance is None else str(look.unit_distance),
+        light=light_of(look.light),
+        labels=labels_of(look.labels),
+        layers=tuple(layer_of(layer) for layer in look.layers),
+    )
 
 
 def labels_of(labels: LabelsLike | None) -> str | LabelTable | None:

@@ -1,9 +1,7 @@
 """Transfer functions: read, put on the data, drawn, or chosen from the histogram."""
 
-from vvgt_cli.look.colormap import ColorMap
-from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.look.function import ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.histogram import from_histogram
-from vvgt_cli.look.opacity import PiecewiseOpacity
 from vvgt_cli.look.readers import read_transfer_function
 from vvgt_cli.look.resolve import check_visible, resolve, unit_distance
 from vvgt_cli.look.show import draw

@@ -8,10 +8,8 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.look.colormap import ColorMap
-from vvgt_cli.look.function import PER_VOXEL, TransferFunction
+from vvgt_cli.look.function import PER_VOXEL, ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.lighting import COEFFICIENTS
-from vvgt_cli.look.opacity import PiecewiseOpacity
 from vvgt_cli.look.resolve import BY
 
 
@@ -53,7 +51,7 @@ def _linear(function: PiecewiseOpacity | ColorMap) -> bool:
     """Whether values between nodes are on straight lines, in their colour space."""
     inner = slice(0, -1)  # the last node's are of no segment
     straight = (function.midpoint[inner] == 0.5) & (function.sharpness[inner] == 0)
-    return bool(straight.all()) and not function.log_scale
+    return bool(straight.all())
 
 
 def _refuse(tf: TransferFunction, what: str, form: str, hint: str) -> DataError:
@@ -61,7 +59,7 @@ def _refuse(tf: TransferFunction, what: str, form: str, hint: str) -> DataError:
 
 
 def _minimal(tf: TransferFunction) -> dict[str, Any]:
-    if not _linear(tf.opacity_nodes) or not _linear(tf.color_map):
+    if not _linear(tf.opacity_nodes) or not _linear(tf.color_map) or tf.color_map.log_scale:
         what = "midpoints, sharpness or a logarithmic scale"
         raise _refuse(tf, what, "the minimal format", "try --format paraview")
     body: dict[str, Any] = {"name": tf.name}
@@ -108,8 +106,6 @@ def _paraview(tf: TransferFunction) -> list[dict[str, Any]]:
     inner = slice(0, -1)
     if (color.midpoint[inner] != 0.5).any() or (color.sharpness[inner] != 0).any():
         raise _refuse(tf, "midpoints or sharpness of colours", "a ParaView preset", "use the file as it is")
-    if opacity.log_scale:
-        raise _refuse(tf, "opacity on a logarithmic scale", "a ParaView preset", "use the file as it is")
     preset = {
         "Name": tf.name,
         "ColorSpace": color.space,

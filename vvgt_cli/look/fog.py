@@ -1,13 +1,15 @@
-"""The look that splats which can be shown under any function are placed by: all values but the background's."""
+"""The look that live splats are placed by: all values but the background's, or all labels alike."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
+
 import numpy as np
 
-from vvgt_cli.look.colormap import ColorMap
-from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.look.function import ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.histogram import UNIT_SHARE, worth_showing
-from vvgt_cli.look.opacity import PiecewiseOpacity
+from vvgt_cli.look.labels import LabelTable
 from vvgt_cli.look.recognise import background_bins
 from vvgt_cli.look.resolve import StatisticsLike
 
@@ -15,6 +17,9 @@ NAME = "fog"
 THIN, THICK = 0.02, 0.3  # opacity per `UNIT_SHARE` of the box's edge, right beside the background and farthest from it
 BETWEEN = 9  # places around a node where the function that is given may show something
 NODES = 129  # of a function over 256 bins
+HIDDEN = 0.25  # how much a label of opacity 0 counts, which another table may show
+SMALL = 2 / 3  # power of a label's voxels that its cells count less by: small ones are to keep their shape
+GOLDEN = 0.6180339887498949  # labels of neighbouring numbers get codes far from each other
 
 
 def fog(statistics: StatisticsLike, shown: TransferFunction | None = None) -> TransferFunction:
@@ -51,3 +56,17 @@ def fog(statistics: StatisticsLike, shown: TransferFunction | None = None) -> Tr
     return TransferFunction(
         NAME, PiecewiseOpacity(x, opacity), ColorMap(x, colors), opacity_unit_share=UNIT_SHARE, opacity_unit_label=NAME
     )
+
+
+def label_fog(table: LabelTable, voxels: Mapping[int, int]) -> LabelTable:
+    """A table in which the labels of ``voxels`` have the opacity `THIN`, and a code each of its own.
+
+    Red is the code in [0, 1] and green its square: their means over a cell say whether it holds several labels. Blue is
+    how much the label counts, by its ``voxels``.
+    """
+    least, labels = max(min(voxels.values(), default=1), 1), []
+    for number, label in enumerate(table.labels):
+        code, weight = (number * GOLDEN) % 1, (least / max(voxels.get(label.number, least), least)) ** SMALL
+        weight *= 1 if label.opacity > 0 else HIDDEN
+        labels.append(replace(label, color=(code, code**2, weight), opacity=THIN if label.number in voxels else 0.0))
+    return LabelTable(NAME, tuple(labels))

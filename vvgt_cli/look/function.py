@@ -1,19 +1,225 @@
-"""`TransferFunction`: what a file, a colour-map name or the histogram becomes."""
+"""Transfer functions: `TransferFunction`, made of a `PiecewiseOpacity` and a `ColorMap`, whose values VTK computes."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from itertools import pairwise
+from typing import Any, Protocol
 
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.look.colormap import ColorMap
 from vvgt_cli.look.lighting import Lighting
-from vvgt_cli.look.opacity import PiecewiseOpacity
+from vvgt_cli.volume.types import triple
 
 DOMAINS = ("data", "fraction", "percentile", "foreground", "sigma")
 PER_VOXEL = "mean-spacing"  # as --opacity-unit-distance calls it
+SPACES = ("RGB", "HSV", "Lab", "Prolab", "Diverging", "Lab/CIEDE2000", "Step")  # ParaView's ColorSpace
+PATH_SAMPLES = 1025  # colours, of 8 bits a channel, by which a CIEDE2000 path between two nodes is kept
+
+
+class Named(Protocol):
+    """Anything that gives a scene its colours."""
+
+    @property
+    def name(self) -> str:
+        """Return the name that reports use."""
+        ...
+
+
+class TransferFunctionLike(Named, Protocol):
+    """The interface that the renderers need; `TransferFunction` is the one implementation."""
+
+    def opacity(self, x: np.ndarray) -> np.ndarray:
+        """Return the opacity in [0, 1] per unit distance at data values x (n,), float64 -> (n,)."""
+        ...
+
+    def color(self, x: np.ndarray) -> np.ndarray:
+        """Return RGB in [0, 1] at data values x (n,), float64 -> (n, 3)."""
+        ...
+
+    def node_range(self) -> tuple[float, float]:
+        """Return the smallest and largest node position; beyond them the function is constant."""
+        ...
+
+
+@dataclass(frozen=True)
+class PiecewiseOpacity:
+    """Opacity over the scalar: a vtkPiecewiseFunction with clamping, which may have several nodes at one position.
+
+    Nodes are sorted by x on construction. The value at an x that several nodes share is the last one's.
+
+    Attributes:
+        x: (n,) node positions, data values.
+        y: (n,) opacity per unit distance, in [0, 1].
+        midpoint, sharpness: (n,) in [0, 1], of the segment to the right of each node; default 0.5 and 0.
+
+    Raises:
+        DataError: no nodes, lengths that differ, values not finite or outside [0, 1].
+    """
+
+    x: np.ndarray
+    y: np.ndarray
+    midpoint: np.ndarray = field(default_factory=lambda: np.empty(0))
+    sharpness: np.ndarray = field(default_factory=lambda: np.empty(0))
+
+    def __post_init__(self) -> None:
+        _settle(self, "opacity function", "y", "opacity")
+
+    def __call__(self, x: np.ndarray) -> np.ndarray:
+        """Return the opacity at x of any shape, float64; 0 at NaN."""
+        from vtkmodules.vtkCommonDataModel import vtkPiecewiseFunction
+
+        function = vtkPiecewiseFunction()
+        function.AllowDuplicateScalarsOn()
+        for node in np.column_stack([self.x, self.y, self.midpoint, self.sharpness]).tolist():
+            function.AddPoint(*node)
+        return np.where(np.isnan(x), 0.0, _each(function.GetValue, x, np.float64))
+
+    def support(self, lo: float, hi: float) -> list[tuple[float, float]]:
+        """Return the intervals of [lo, hi] where the opacity is above 0, ascending and disjoint.
+
+        A segment counts as a whole when either of its ends is above 0. ``lo == hi`` gives one empty
+        interval at that value when it is visible.
+        """
+        if lo == hi:
+            return [(lo, hi)] if self(np.array([lo]))[0] > 0 else []
+        ends = np.concatenate([[-np.inf], self.x, [np.inf]])
+        y = np.concatenate([self.y[:1], self.y, self.y[-1:]])
+        intervals: list[tuple[float, float]] = []
+        for (a, b), highest in zip(pairwise(ends.clip(lo, hi).tolist()), np.maximum(y[:-1], y[1:]), strict=True):
+            if a == b or highest <= 0:
+                continue
+            if intervals and intervals[-1][1] == a:
+                intervals[-1] = (intervals[-1][0], b)
+            else:
+                intervals.append((a, b))
+        return intervals
+
+
+@dataclass(frozen=True)
+class ColorMap:
+    """Colour over the scalar: a vtkColorTransferFunction with clamping, which may have several nodes at one position.
+
+    Nodes are sorted by x on construction. The colour at an x that several nodes share is the first one's.
+
+    Attributes:
+        x: (n,) node positions, data values.
+        rgb: (n, 3) in [0, 1].
+        midpoint, sharpness: (n,) in [0, 1], of the segment to the right of each node; default 0.5 and 0.
+        space: one of `SPACES` (ParaView's ColorSpace).
+        hsv_wrap: in HSV go the short way round the hue circle.
+        log_scale: interpolate in log10(x); without effect unless all nodes are above 0.
+        nan_color: (3,) colour of NaN.
+
+    Raises:
+        DataError: no nodes, lengths that differ, values not finite or outside [0, 1], unknown space.
+    """
+
+    x: np.ndarray
+    rgb: np.ndarray
+    midpoint: np.ndarray = field(default_factory=lambda: np.empty(0))
+    sharpness: np.ndarray = field(default_factory=lambda: np.empty(0))
+    space: str = "RGB"
+    hsv_wrap: bool = True
+    log_scale: bool = False
+    nan_color: tuple[float, float, float] = (0.5, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if self.space not in SPACES:
+            raise DataError(f"colour function: colour space {self.space!r}; expected one of {', '.join(SPACES)}")
+        count = np.shape(self.x)[0] if np.ndim(self.x) else 0
+        if np.shape(self.rgb) != (count, 3):
+            raise DataError(f"colour function: {count} nodes, colours of shape {np.shape(self.rgb)}; expected (n, 3)")
+        _settle(self, "colour function", "rgb", "colour")
+
+    def __call__(self, x: np.ndarray) -> np.ndarray:
+        """Return RGB at data values x of any shape, float64, one axis of 3 behind it; ``nan_color`` at NaN."""
+        nodes = self.x
+        if self.log_scale and nodes[0] > 0:  # VTK's own logarithmic scale rounds x, which may cross a node
+            x, nodes = np.log10(np.clip(x, nodes[0], nodes[-1])), np.log10(nodes)
+        if self.space == "Lab/CIEDE2000" and nodes.size > 1:
+            return self._along_paths(np.asarray(x), nodes)
+        function = _vtk_colors(self.space, self.hsv_wrap, nodes, self.rgb, self.midpoint, self.sharpness)
+        function.SetNanColor(*self.nan_color)
+        return _each(function.GetColor, x, np.dtype((np.float64, 3)))
+
+    def _along_paths(self, x: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+        """Return RGB at x between nodes (n,), straight between the samples of `_ciede2000_path`."""
+        bends = zip(self.midpoint.tolist(), self.sharpness.tolist(), strict=True)
+        pairs = pairwise(triple(map(float, rgb)) for rgb in self.rgb)
+        colors = np.concatenate([_ciede2000_path(a, b, *bend) for (a, b), bend in zip(pairs, bends, strict=False)])
+        places = np.concatenate([np.linspace(a, b, PATH_SAMPLES) for a, b in pairwise(nodes)])
+        # from right to left: of samples at one position `interp` takes the last
+        found = np.stack([np.interp(-x, -places[::-1], channel[::-1]) for channel in colors.T], axis=-1)
+        ends = ((x <= nodes[0], self.rgb[0]), (x > nodes[-1], self.rgb[-1]), (np.isnan(x), self.nan_color))
+        for there, color in ends:
+            found[there] = color
+        return found
+
+
+def _settle(nodes: PiecewiseOpacity | ColorMap, what: str, column: str, called: str) -> None:
+    """Check the arrays of a function and sort them as VTK does (equal positions keep their order), float64.
+
+    Args:
+        nodes: whose empty midpoints and sharpness become 0.5 and 0.
+        what: the function, for messages.
+        column: name of the attribute with the values.
+        called: what messages call these.
+
+    Raises:
+        DataError: no node, lengths that differ, a value that is not finite, or not in [0, 1] beside positions.
+    """
+    arrays = {name: np.asarray(getattr(nodes, name), np.float64) for name in ("x", column, "midpoint", "sharpness")}
+    x = arrays["x"]
+    if x.ndim != 1 or not x.size:
+        raise DataError(f"{what}: no nodes; expected at least one")
+    for name, default in (("midpoint", 0.5), ("sharpness", 0.0)):
+        arrays[name] = arrays[name] if arrays[name].size else np.full(x.size, default)
+    for name, values in arrays.items():
+        if len(values) != x.size:
+            raise DataError(f"{what}: {x.size} node positions but {len(values)} values; expected as many")
+        if not np.isfinite(values).all():
+            raise DataError(f"{what}: a node is not finite; expected numbers")
+        if name != "x" and (bad := values[(values < 0) | (values > 1)]).size:
+            raise DataError(f"{what}: {called if name == column else name} {bad[0]:g}; expected a number in [0, 1]")
+        object.__setattr__(nodes, name, values[np.argsort(x, kind="stable")])
+
+
+def _each(function: Callable[[float], Any], x: np.ndarray, kind: Any) -> np.ndarray:
+    """Return what ``function`` gives at each of x, any shape, as an array of dtype ``kind``."""
+    values, places = np.unique(np.asarray(x, np.float64), return_inverse=True)
+    found = np.fromiter(map(function, values.tolist()), kind, values.size)
+    return found[places.reshape(np.shape(x))]
+
+
+def _vtk_colors(space: str, hsv_wrap: bool, *columns: np.ndarray) -> Any:
+    """Return the vtkColorTransferFunction of nodes: x, RGB, midpoints and sharpness."""
+    from vtkmodules.vtkRenderingCore import vtkColorTransferFunction
+
+    function = vtkColorTransferFunction()
+    function.AllowDuplicateScalarsOn()
+    getattr(function, f"SetColorSpaceTo{space.replace('/', '')}")()
+    function.SetHSVWrap(hsv_wrap)
+    for node in np.column_stack(columns).tolist():
+        function.AddRGBPoint(*node)
+    return function
+
+
+@lru_cache(maxsize=256)
+def _ciede2000_path(
+    start: tuple[float, float, float], end: tuple[float, float, float], midpoint: float, sharpness: float
+) -> np.ndarray:
+    """Return RGB (`PATH_SAMPLES`, 3) at even steps between two nodes; VTK searches the path in each call (70 ms)."""
+    # with a node more on either side: only between nodes does a path begin and end on VTK's grid of colours
+    nodes = [[-1.0, *start, 0.5, 0], [0.0, *start, midpoint, sharpness], [1.0, *end, 0.5, 0], [2.0, *end, 0.5, 0]]
+    function = _vtk_colors("Lab/CIEDE2000", False, np.array(nodes))
+    table = np.empty(3 * PATH_SAMPLES)
+    function.GetTable(0.0, 1.0, PATH_SAMPLES, table)
+    return table.reshape(-1, 3)
 
 
 @dataclass(frozen=True)
@@ -60,39 +266,42 @@ class TransferFunction:
 
     @property
     def of_histogram(self) -> bool:
-        """Whether nodes follow from the histogram of the data, not from their range alone."""
+        """Tell whether nodes follow from the histogram of the data, not from their range alone."""
         return self.domain in ("percentile", "foreground", "sigma") or self.otherwise is not None
 
     def opacity(self, x: np.ndarray) -> np.ndarray:
-        """Opacity in [0, 1] per unit distance at data values x (n,), float64 -> (n,); 0 at NaN."""
+        """Return the opacity in [0, 1] per unit distance at data values x (n,), float64 -> (n,); 0 at NaN."""
         return self.opacity_nodes(x)
 
     def color(self, x: np.ndarray) -> np.ndarray:
-        """RGB in [0, 1] at data values x (n,), float64 -> (n, 3)."""
+        """Return RGB in [0, 1] at data values x (n,), float64 -> (n, 3)."""
         return self.color_map(x)
 
     def node_range(self) -> tuple[float, float]:
-        """Smallest and largest node position; beyond it the function is constant."""
+        """Return the smallest and largest node position; beyond them the function is constant."""
         points = self.breakpoints()
         return float(points[0]), float(points[-1])
 
     def breakpoints(self) -> np.ndarray:
-        """Positions of all nodes of opacity and colour, ascending, without repeats, (m,) float64."""
+        """Return the positions of all nodes of opacity and colour, ascending, without repeats, (m,) float64."""
         return np.unique(np.concatenate([self.opacity_nodes.x, self.color_map.x]))
 
     def support(self, lo: float, hi: float) -> list[tuple[float, float]]:
-        """Intervals of [lo, hi] where opacity is above 0, ascending and disjoint."""
+        """Return the intervals of [lo, hi] where opacity is above 0, ascending and disjoint."""
         return self.opacity_nodes.support(lo, hi)
 
     def moved(self, positions: np.ndarray, domain: str = "data") -> TransferFunction:
-        """The same function with the `breakpoints` (m,) moved to ``positions`` (m,), non-decreasing."""
-        points = self.breakpoints()
-        opacity = self.opacity_nodes.moved(positions[np.searchsorted(points, self.opacity_nodes.x)])
-        color = self.color_map.moved(positions[np.searchsorted(points, self.color_map.x)])
-        return replace(self, opacity_nodes=opacity, color_map=color, domain=domain)
+        """Return the same function with the `breakpoints` (m,) moved to ``positions`` (m,), non-decreasing."""
+        points, opacity, colors = self.breakpoints(), self.opacity_nodes, self.color_map
+        return replace(
+            self,
+            opacity_nodes=replace(opacity, x=positions[np.searchsorted(points, opacity.x)]),
+            color_map=replace(colors, x=positions[np.searchsorted(points, colors.x)]),
+            domain=domain,
+        )
 
     def rescaled(self, lo: float, hi: float) -> TransferFunction:
-        """All nodes stretched linearly so that `node_range` becomes [lo, hi], as ParaView does on applying a preset.
+        """Return the function stretched linearly so that `node_range` becomes [lo, hi], as ParaView applies a preset.
 
         Raises:
             DataError: [lo, hi] not finite or not ascending, or a function of one single position.

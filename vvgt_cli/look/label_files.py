@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.look.labels import SOLID, Label, LabelTable, distinct
+from vvgt_cli.look.labels import LONGEST_NAME, SOLID, Label, LabelTable, distinct
 from vvgt_cli.look.readers.fields import json_of, number, rgb, text_of
 from vvgt_cli.volume.dicom.segmentation import is_segmentation_file
 from vvgt_cli.volume.dicom.segmentation import segments as dicom_segments
@@ -241,10 +241,13 @@ def _segments(header: str, what: str, layer: int | None = None) -> list[Label]:
 
 
 def _dicom(source: str) -> list[Label]:
-    """Of a DICOM segmentation; 0 is the background."""
+    """Read the segments of a DICOM segmentation; 0 is the background."""
     found = dicom_segments(source)
     colors = {label.number: label.color for label in distinct(sorted({one.number for one in found})).labels}
-    return [Label(one.number, one.name, one.color or colors[one.number], SOLID if one.number else 0.0) for one in found]
+    return [
+        _label(source, one.number, one.name, list(one.color or colors[one.number]), SOLID if one.number else 0.0)
+        for one in found
+    ]
 
 
 def table_of(parsed: Any, what: str) -> LabelTable:
@@ -272,9 +275,11 @@ def _is_number(text: str) -> bool:
 
 
 def _label(what: str, value: int, name: str, color: Any, opacity: float) -> Label:
-    """A label of checked parts."""
+    """Make a label of checked parts; a warning says where its name is cut to `LONGEST_NAME` characters."""
     if not 0 <= opacity <= 1:
         raise DataError(f"{what}: opacity {opacity:g}; expected 0 to 1")
     if abs(value) > MOST:
         raise DataError(f"{what}: label {value}; expected a 32-bit number")
-    return Label(value, name, rgb(f"{what}: colour", color), opacity)
+    if len(name) > LONGEST_NAME:
+        warnings.warn(f"{what}: name of {len(name)} characters, cut to {LONGEST_NAME}: {name[:40]!r}...", stacklevel=2)
+    return Label(value, name[:LONGEST_NAME], rgb(f"{what}: colour", color), opacity)

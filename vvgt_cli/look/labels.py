@@ -11,11 +11,12 @@ from itertools import pairwise
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.look.types import Named
+from vvgt_cli.look.function import Named
 from vvgt_cli.volume.types import triple
 
 PALETTES = ("tab10", "tab20b", "tab20c", "Set2", "Dark2", "Set3")  # matplotlib's qualitative ones: 78 colours
 LISTED = 8  # labels that a message names
+LONGEST_NAME = 200  # characters of a label's name: files of Gaussians keep it in their headers
 SOLID = 1.0  # opacity of a label whose table says none
 
 

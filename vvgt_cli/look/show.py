@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.errors import UsageError
 from vvgt_cli.files import atomic_write
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.resolve import StatisticsLike
@@ -34,15 +33,11 @@ def draw(
         overwrite: replace an existing file.
 
     Raises:
-        UsageError: the file exists, or matplotlib is missing.
+        UsageError: the file exists and ``overwrite`` is not set.
     """
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError:  # pyvista brings it
-        raise UsageError("drawing needs matplotlib; try: pip install matplotlib") from None
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(9, 4.5), dpi=120, layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     lo, hi = _limits(tf, statistics)
     if statistics is not None:

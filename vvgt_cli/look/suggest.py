@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.look.colorspace import lab_to_rgb
 from vvgt_cli.look.recognise import background_bins
 from vvgt_cli.look.resolve import StatisticsLike
 
@@ -136,7 +135,17 @@ def _suggestion(
     peak = min(max(-math.expm1(-OPTICAL_DEPTH / (share * voxels)), PEAK[0]), PEAK[1])
     hue = math.radians(FIRST_HUE - HUES * (k / (count - 1) if count > 1 else 0.5))
     lab = np.array([[v, c * math.cos(hue), c * math.sin(hue)] for v, c in zip(LIGHTNESS, CHROMA, strict=True)])
-    colors = lab_to_rgb(np.array([lab[0], 0.5 * (lab[0] + lab[1]), 0.5 * (lab[1] + lab[2]), lab[2]]))
+    colors = _rgb(np.array([lab[0], 0.5 * (lab[0] + lab[1]), 0.5 * (lab[1] + lab[2]), lab[2]]))
     name = f"band {k + 1} of {count}: {low:g} to {high:g}"
     inside = float(counts[first:last].sum() / counts.sum())
-    return Suggestion(name, x, peak * shape, np.clip(colors, 0, 1), spacing, inside)
+    return Suggestion(name, x, peak * shape, colors, spacing, inside)
+
+
+def _rgb(lab: np.ndarray) -> np.ndarray:
+    """Return sRGB (n, 3) in [0, 1] of CIE L*a*b* colours (n, 3)."""
+    from vtkmodules.vtkCommonCore import vtkMath
+
+    found = np.empty_like(lab)
+    for row, out in zip(lab, found, strict=True):
+        vtkMath.LabToRGB(row, out)
+    return found.clip(0, 1)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vvgt_cli.look.types import TransferFunctionLike
+from vvgt_cli.look.function import TransferFunctionLike
 
 MAX_OPACITY = 1 - 1e-5  # conventions: every integral has a limit
 MIN_BINS, MAX_BINS = 2048, 65536

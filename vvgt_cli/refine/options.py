@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+from vvgt_cli.defaults import STEPS
 from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians.rules import INRIA, Rule
 
@@ -50,7 +51,7 @@ class OptimizeOptions:
         seed: of the order of views, and of what "3dgs" draws.
     """
 
-    steps: int | None = 200
+    steps: int | None = STEPS
     method: str = "frame"
     max_gaussians: int | None = None
     time_budget: float | None = None

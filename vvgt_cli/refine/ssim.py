@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.images.metrics.ssim import C1, C2, RADIUS, SIGMA
+from vvgt_cli.images.metrics import C1, C2, RADIUS, SIGMA
 from vvgt_cli.jit.decorators import parallel_kernel
 from vvgt_cli.jit.parts import Part, U, turns_of
 

@@ -1,46 +1,109 @@
-"""Charts as inline SVG and HTML: crisp at any size, coloured by the page's style sheet, nothing to load."""
+"""Charts of runs, drawn by matplotlib: PNG files for papers, and SVG for the page, which follows its light or dark."""
 
 from __future__ import annotations
 
+import io
 import math
-from collections.abc import Sequence
+import re
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from vvgt_cli.score.curves import KINDS, OTHER, SCORING, STAGES, Run, cost, short, stage_names
+from vvgt_cli.files import atomic_write
+from vvgt_cli.score.curves import KINDS, OTHER, SCORING, STAGES, Run, Series, cost, front, psnr, short, stage_names
 
-WIDTH, HEIGHT = 440, 340  # of the drawing; fonts are 12.5 units, 9 px on a phone
-LEFT, RIGHT, TOP, BOTTOM = 46, 14, 14, 44
-MARK = 5.5
-LETTER = 6.5  # width of one
-HATCH = "background:repeating-linear-gradient(135deg,var(--line) 0 3px,var(--soft) 3px 4.5px)"
-SHAPES = ("circle", "diamond", "square", "triangle", "hexagon", "star")
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+FILES = ("psnr-seconds.png", "psnr-gaussians.png", "psnr-megabytes.png", "stages.png")
+AXES: tuple[tuple[str, str, Callable[[Run], float]], ...] = (  # title, label and value of the x axis
+    ("Error against time", "seconds to the file", cost),
+    ("Error against Gaussians", "Gaussians", lambda run: float(run["gaussians"])),
+    ("Error against file size", "megabytes", lambda run: run["bytes"] / 1e6),
+)
+WIDTH, HEIGHT, ROW = 4.8, 3.7, 0.24  # inches, of a chart and of a bar: the page stretches them to its columns
+MARKS = ("o", "D", "s", "^", "h", "*")  # of `KINDS`
+COLORS = ("#0072b2", "#a8527e", "#00845f", "#c05a00", "#7a6a00", "#333333")  # of `KINDS`, or of several series
+INK, SOFT, GRID = "#1c1f23", "#5d656f", "#e3e5e8"
+VARIABLES = {color: f"var(--k{n})" for n, color in enumerate(COLORS)}  # of the page's style sheet
+VARIABLES |= {INK: "var(--ink)", SOFT: "var(--soft)", GRID: "var(--line)"}
+TITLE = "title: "  # begins the name of what a pointer that rests on it is told about
+STYLE: dict[Any, Any] = {
+    "font.size": 9.5, "xtick.labelsize": 9, "ytick.labelsize": 9, "legend.fontsize": 8.5, "text.parse_math": False,
+    "text.color": INK, "axes.labelcolor": INK, "axes.edgecolor": SOFT, "xtick.color": SOFT, "ytick.color": SOFT,
+    "grid.color": GRID, "axes.axisbelow": True, "axes.spines.top": False, "axes.spines.right": False,
+    "legend.frameon": False, "font.sans-serif": ["DejaVu Sans"], "svg.fonttype": "none", "svg.hashsalt": "vvgt",
+}  # fmt: skip
+PLACES = ((8, 0, "left", "center"), (-8, 0, "right", "center"), (0, 8, "center", "bottom"), (0, -8, "center", "top"))
 
 
 @dataclass(frozen=True)
-class Point:
-    """A run in a chart.
+class Chart:
+    """A drawing of runs.
 
     Attributes:
-        x, y: data values.
-        label: beside the mark.
-        shape: number of its kind in `KINDS`.
-        color: class of its colour, "k0" or "c1", say.
-        front: nothing beats it.
-        title: shown by a pointer that rests on it.
+        file: the name of its PNG.
+        title: its heading on the page.
+        figure: the drawing.
     """
 
-    x: float
-    y: float
-    label: str
-    shape: int
-    color: str
-    front: bool
+    file: str
     title: str
+    figure: Figure
+
+    def svg(self) -> str:
+        """Return the chart as an SVG element in the colours of the page, with a tooltip for each mark and bar."""
+        import matplotlib
+
+        stream, none = io.StringIO(), dict.fromkeys(("Creator", "Date", "Format", "Type"))
+        with matplotlib.rc_context(STYLE):
+            self.figure.savefig(stream, format="svg", transparent=True, metadata=none)
+        _, _, text = stream.getvalue().partition("<svg")
+        head, _, body = text.partition(">")
+        body = re.sub(f'<g id="{TITLE}(.*?)">', r"<g><title>\1</title>", body)
+        body = re.sub(r' id="\w[^"]*_\d+"', "", body)  # which nothing refers to, and other charts have too
+        for color, variable in VARIABLES.items():
+            body = body.replace(color, variable)
+        (box,) = re.findall('viewBox="[^"]*"', head)
+        return f'<svg {box} role="img" aria-label="{escape(self.title)}">{body}'
+
+
+def draw(series: Sequence[Series]) -> list[Chart]:
+    """Draw the charts of one report, or of several over each other; deterministic.
+
+    Returns:
+        PSNR over each of `AXES`, coloured by kind of run or by series, and the seconds of each stage: one of `FILES`
+        each.
+    """
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    charts = []
+    with matplotlib.rc_context(STYLE):
+        for file, (title, label, value) in zip(FILES, AXES, strict=False):
+            figure = Figure(figsize=(WIDTH, HEIGHT), layout="constrained")
+            _scatter(figure.add_subplot(xscale="log", xlabel=label, ylabel="PSNR, dB"), series, value)
+            charts.append(Chart(file, title, figure))
+        figure = Figure(figsize=(WIDTH, 1.5 + ROW * sum(len(one.runs) for one in series)), layout="constrained")
+        _stages(figure.add_subplot(xlabel="seconds"), series)
+    return [*charts, Chart(FILES[-1], "Where the time goes", figure)]
+
+
+def write_plots(folder: Path, charts: Sequence[Chart], overwrite: bool) -> None:
+    """Write the charts as PNG.
+
+    Raises:
+        UsageError: a file exists and ``overwrite`` is not set.
+    """
+    for chart in charts:
+        with atomic_write(folder / chart.file, overwrite) as temporary:
+            chart.figure.savefig(temporary, format="png", dpi=200, metadata={"Software": None})
 
 
 def log_ticks(lo: float, hi: float) -> list[float]:
-    """1, 2 and 5 of each decade within [lo, hi]; only the decades' own where that leaves enough, more where too few."""
+    """Return the powers of ten in [lo, hi], or 1, 3; 1, 2, 5; 1, 2, 3, ... times them where these are fewer than 3."""
     exponents = range(math.floor(math.log10(lo)), math.ceil(math.log10(hi)) + 1)
     for digits in ((1,), (1, 3), (1, 2, 5), tuple(range(1, 10))):
         ticks = [d * 10.0**e for e in exponents for d in digits if lo <= d * 10.0**e <= hi]
@@ -49,148 +112,78 @@ def log_ticks(lo: float, hi: float) -> list[float]:
     return ticks
 
 
-def ticks(lo: float, hi: float, count: int = 6) -> list[float]:
-    """About ``count`` round values within [lo, hi]."""
-    rough = (hi - lo) / count
-    power = 10.0 ** math.floor(math.log10(rough))
-    size = next(m * power for m in (1, 2, 5, 10) if m * power >= rough)
-    return [i * size for i in range(math.ceil(lo / size - 1e-9), math.floor(hi / size + 1e-9) + 1)]
-
-
-@dataclass(frozen=True)
-class _Frame:
-    """Where data values lie in the drawing; x is logarithmic."""
-
-    x: tuple[float, float]
-    y: tuple[float, float]
-
-    def at(self, x: float, y: float) -> tuple[float, float]:
-        lo, hi = map(math.log, self.x)
-        fx, fy = (math.log(x) - lo) / (hi - lo), (y - self.y[0]) / (self.y[1] - self.y[0])
-        return LEFT + fx * (WIDTH - LEFT - RIGHT), HEIGHT - BOTTOM - fy * (HEIGHT - TOP - BOTTOM)
-
-
-def _frame(points: Sequence[Point], ceiling: float | None) -> _Frame:
-    """Room of 12 % and a half on either side."""
-    xs, ys = [p.x for p in points], [p.y for p in points] + ([] if ceiling is None else [ceiling])
-    wide = max(math.log(max(xs) / min(xs)), math.log(2))
-    high = max(max(ys) - min(ys), 1.0)
-    spread = math.exp(0.09 * wide)
-    return _Frame((min(xs) / spread, max(xs) * spread), (min(ys) - 0.08 * high, max(ys) + 0.08 * high))
-
-
-def scatter(
-    points: Sequence[Point],
-    x_label: str,
-    y_label: str,
-    lines: Sequence[Sequence[Point]] = (),
-    ceiling: float | None = None,
-) -> str:
-    """A chart of marks over a logarithmic axis; ``lines`` are drawn through points in order, VTK's at ``ceiling``."""
-    frame = _frame(points, ceiling)
-    parts = [
-        f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(y_label)} against {escape(x_label)}">'
-    ]
-    parts += _axes(frame, x_label, y_label)
-    if ceiling is not None:
-        _, y = frame.at(frame.x[0], ceiling)
-        parts.append(f'<line class="ceiling" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>')
-        parts.append(f'<text class="tick" x="{WIDTH - RIGHT}" y="{y - 4:.1f}" text-anchor="end">VTK</text>')
-    for line in lines:
-        path = " ".join("{:.1f},{:.1f}".format(*frame.at(p.x, p.y)) for p in line)
-        parts.append(f'<polyline class="front {line[0].color}" points="{path}"/>')
-    spots = [frame.at(p.x, p.y) for p in points]
-    for point, (x, y) in zip(points, spots, strict=True):
-        ring = f'<circle class="ring" cx="{x:.1f}" cy="{y:.1f}" r="{MARK + 4}"/>' if point.front else ""
-        parts.append(
-            f'<g class="{point.color}">{ring}{mark(point.shape, x, y)}<title>{escape(point.title)}</title></g>'
+def _scatter(axes: Any, series: Sequence[Series], value: Callable[[Run], float]) -> None:
+    """Draw a mark for each run; what no run beats in seconds is ringed and joined."""
+    several, used, labels = len(series) > 1, set(), []
+    for n, one in enumerate(series):
+        runs = [run for run in one.scored() if value(run) > 0]
+        best = front(runs) if value is cost else []
+        color = COLORS[n % 4] if several else INK
+        axes.plot(
+            [cost(run) for run in best], [float(psnr(run) or 0) for run in best], color=color, alpha=0.6, zorder=1
         )
-    parts += _labels(points, spots)
-    return "".join(parts) + "</svg>"
+        for run in runs:
+            x, y, kind = value(run), float(psnr(run) or 0), KINDS.index(run["kind"])
+            color, name = (COLORS[n % 4], one.name) if several else (COLORS[kind], run["kind"])
+            title = f"{y:.2f} dB, {cost(run):.2f} s, {run['gaussians']} Gaussians"
+            mark = axes.plot([x], [y], MARKS[kind], color=color, label="" if name in used else name)[0]
+            mark.set_gid(f"{TITLE}{run['name']}: {title}")
+            if run in best:
+                axes.plot([x], [y], "o", markersize=12, markerfacecolor="none", markeredgecolor=color)
+            used.add(name)
+            labels.append((run not in best, x, y, str(run.get("label") or run["name"]), color if several else INK))
+    if several:
+        for kind in sorted({KINDS.index(run["kind"]) for one in series for run in one.scored()}):
+            axes.plot([], [], MARKS[kind], color=SOFT, label=KINDS[kind])
+    elif (vtk := series[0].document.get("vtk_psnr")) is not None:  # no file needs to exceed it
+        axes.axhline(vtk, color=SOFT, linewidth=1, linestyle="--", zorder=0, label="VTK")
+    axes.margins(0.08)
+    ticks = log_ticks(*axes.get_xlim())
+    axes.set_xticks(ticks, [short(tick) for tick in ticks])
+    axes.set_xticks([], minor=True)
+    axes.grid()
+    axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=4, handletextpad=0.2, columnspacing=1.2)
+    _label(axes, sorted(labels, key=lambda label: label[0]))
 
 
-def mark(shape: int, x: float, y: float) -> str:
-    """A mark of a kind, filled by its parent's colour."""
-    r = MARK
-    if SHAPES[shape] == "circle":
-        return f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{r}"/>'
-    corners = {
-        "diamond": ((0, -1.35), (1.35, 0), (0, 1.35), (-1.35, 0)),
-        "square": ((-0.95, -0.95), (0.95, -0.95), (0.95, 0.95), (-0.95, 0.95)),
-        "triangle": ((0, -1.25), (1.2, 0.95), (-1.2, 0.95)),
-        "hexagon": ((0, -1.2), (1.04, -0.6), (1.04, 0.6), (0, 1.2), (-1.04, 0.6), (-1.04, -0.6)),
-        "star": ((0, -1.5), (0.45, -0.45), (1.5, 0), (0.45, 0.45), (0, 1.5), (-0.45, 0.45), (-1.5, 0), (-0.45, -0.45)),
-    }[SHAPES[shape]]
-    path = " ".join(f"{x + r * dx:.1f},{y + r * dy:.1f}" for dx, dy in corners)
-    return f'<polygon points="{path}"/>'
+def _label(axes: Any, labels: Sequence[tuple[Any, float, float, str, str]]) -> None:
+    """Write texts (order, x, y, text, colour) beside their marks where nothing lies yet, else nowhere."""
+    from matplotlib.transforms import Bbox
 
-
-def _axes(frame: _Frame, x_label: str, y_label: str) -> list[str]:
-    parts, bottom, right = [], HEIGHT - BOTTOM, WIDTH - RIGHT
-    for value in log_ticks(*frame.x):
-        x, _ = frame.at(value, frame.y[0])
-        parts.append(f'<line class="grid" x1="{x:.1f}" x2="{x:.1f}" y1="{TOP}" y2="{bottom}"/>')
-        parts.append(f'<text class="tick" x="{x:.1f}" y="{bottom + 17}" text-anchor="middle">{short(value)}</text>')
-    for value in ticks(*frame.y):
-        _, y = frame.at(frame.x[0], value)
-        parts.append(f'<line class="grid" x1="{LEFT}" x2="{right}" y1="{y:.1f}" y2="{y:.1f}"/>')
-        parts.append(f'<text class="tick" x="{LEFT - 7}" y="{y + 4:.1f}" text-anchor="end">{value:g}</text>')
-    parts.append(f'<text class="axis" x="{right}" y="{HEIGHT - 8}" text-anchor="end">{escape(x_label)}</text>')
-    parts.append(f'<text class="axis" x="{LEFT + 6}" y="{TOP + 12}">{escape(y_label)}</text>')
-    return parts
-
-
-Box = tuple[float, float, float, float]
-
-
-def _labels(points: Sequence[Point], spots: Sequence[tuple[float, float]]) -> list[str]:
-    """Labels where nothing lies yet: right, left, above or below the mark; left out where no place is free."""
-    taken: list[Box] = [(x - 9, y - 9, x + 9, y + 9) for x, y in spots]
-    taken.append((LEFT, TOP, LEFT + 130, TOP + 18))  # the axis' name
-    parts = []
-    for n in sorted(range(len(points)), key=lambda n: not points[n].front):  # those of the front first
-        (x, y), text = spots[n], points[n].label
-        wide = LETTER * len(text)
-        for dx, dy, anchor in ((12, 4, "start"), (-12, 4, "end"), (0, -12, "middle"), (0, 21, "middle")):
-            left = x + dx - {"start": 0, "end": wide, "middle": wide / 2}[anchor]
-            box = (left, y + dy - 11, left + wide, y + dy + 3)
-            inside = box[0] > LEFT and box[2] < WIDTH and box[1] > TOP and box[3] < HEIGHT - BOTTOM
-            if inside and not any(_overlap(box, other) for other in (*taken[:n], *taken[n + 1 :])):
+    axes.figure.draw_without_rendering()  # the layout
+    reach = 6 * axes.figure.dpi / 72
+    spots = axes.transData.transform([(x, y) for _, x, y, _, _ in labels])
+    taken = [Bbox([spot - reach, spot + reach]) for spot in spots]
+    for _, x, y, text, color in labels:
+        for dx, dy, across, along in PLACES:
+            note = axes.annotate(
+                text, (x, y), (dx, dy), textcoords="offset points", ha=across, va=along, fontsize=8.5, color=color
+            )
+            box = note.get_window_extent()
+            inside = (box.min > axes.bbox.min).all() and (box.max < axes.bbox.max).all()
+            if inside and not box.count_overlaps(taken):
                 taken.append(box)
-                place = f'x="{x + dx:.1f}" y="{y + dy:.1f}" text-anchor="{anchor}"'
-                parts.append(f'<text class="name {points[n].color}" {place}>{escape(text)}</text>')
                 break
-    return parts
+            note.remove()
 
 
-def _overlap(a: Box, b: Box) -> bool:
-    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
-
-
-def legend(shapes: Sequence[int], colors: Sequence[str]) -> str:
-    """Names of kinds beside their marks."""
-    items = []
-    for shape, color in zip(shapes, colors, strict=True):
-        icon = f'<svg viewBox="0 0 18 18" class="key {color}">{mark(shape, 9, 9)}</svg>'
-        items.append(f"<span>{icon}{escape(KINDS[shape])}</span>")
-    return "".join(items)
-
-
-def stage_bars(runs: Sequence[Run], longest: float) -> str:
-    """A bar a run, a segment a stage; ``longest`` seconds fill the width. Scoring is hatched: it makes no file."""
-    names = stage_names(runs)
-    paint = {name: HATCH if name in SCORING else f"background:{STAGES.get(name, OTHER)}" for name in names}
-    rows = []
-    for run in runs:
-        seconds = {name: sum(s["seconds"] for s in run["stages"] if s["name"] == name) for name in names}
-        segments = "".join(
-            f'<i style="width:{100 * value / longest:.3f}%;{paint[name]}" title="{escape(name)}: {value:.2f} s"></i>'
-            for name, value in seconds.items()
-            if value > 0
-        )
-        rows.append(
-            f'<div class="bar"><b>{escape(run["name"])}</b><div>{segments}</div><em>{cost(run):.2f} s</em></div>'
-        )
-    shown = {name: f"{name} (not counted)" if name in SCORING else name for name in names}
-    keys = "".join(f'<span><i style="{paint[name]}"></i>{escape(shown[name])}</span>' for name in names)
-    return f'<div class="keys">{keys}</div><div class="bars">{"".join(rows)}</div>'
+def _stages(axes: Any, series: Sequence[Series]) -> None:
+    """Draw a bar for each run, a segment for each stage; scoring, which makes no file, is hatched."""
+    rows = [run for one in series for run in one.runs]
+    ends = [0.0] * len(rows)
+    for stage in stage_names(rows):
+        widths = [float(sum(s["seconds"] for s in run["stages"] if s["name"] == stage)) for run in rows]
+        hatched = {"label": f"{stage} (not counted)", "hatch": "////", "edgecolor": SOFT, "linewidth": 0}
+        style = hatched if stage in SCORING else {"label": stage}
+        bars = axes.barh(range(len(rows)), widths, left=ends, color=STAGES.get(stage, OTHER), **style)
+        for bar, width in zip(bars, widths, strict=True):
+            bar.set_gid(f"{TITLE}{stage}: {width:.2f} s")
+        ends = [end + width for end, width in zip(ends, widths, strict=True)]
+    for place, (end, run) in enumerate(zip(ends, rows, strict=True)):
+        axes.text(end, place, f" {cost(run):.2f} s", verticalalignment="center", fontsize=8.5, in_layout=False)
+    axes.set_yticks(range(len(rows)), [run["name"] for run in rows], fontsize=8.5)
+    axes.margins(x=0.2, y=0.01)
+    axes.set_xlim(left=0)
+    axes.invert_yaxis()
+    axes.tick_params(axis="y", length=0)
+    axes.figure.legend(loc="outside upper left", ncols=3, handlelength=1.2, columnspacing=1.2)

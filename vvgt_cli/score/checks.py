@@ -51,8 +51,7 @@ class Views:
         Raises:
             DataError: a picture that is not finite.
         """
-        from vvgt_cli.images.metrics import psnr
-        from vvgt_cli.images.metrics.scores import FOREGROUND
+        from vvgt_cli.images.metrics import FOREGROUND, psnr
 
         pairs = zip(self.images, self.pictures(gaussians, rule), strict=True)
         found = np.array([psnr(view[..., :3], image[..., :3]) for view, image in pairs])

@@ -8,15 +8,10 @@ from dataclasses import dataclass
 from html import escape
 from typing import Any
 
-from vvgt_cli.score.charts import Point, legend, mark, scatter, stage_bars
-from vvgt_cli.score.curves import KINDS, Run, Series, cost, front, knee, psnr, short, worst_seat
+from vvgt_cli.score.charts import Chart
+from vvgt_cli.score.curves import Run, Series, cost, front, knee, psnr, short, worst_seat
 from vvgt_cli.score.style import CSS, SCRIPT
 
-AXES = (
-    ("seconds", "seconds to the file", "Error against time"),
-    ("gaussians", "Gaussians", "Error against Gaussians"),
-    ("megabytes", "megabytes", "Error against file size"),
-)
 GAIN = 8  # of the difference at first
 
 
@@ -35,58 +30,21 @@ class Pictures:
     ours: list[list[bytes]]
 
 
-def _x(run: Run, axis: str) -> float:
-    if axis == "seconds":
-        return cost(run)
-    return float(run["gaussians"]) if axis == "gaussians" else run["bytes"] / 1e6
+def page(series: Sequence[Series], charts: Sequence[Chart], title: str, pictures: Pictures | None = None) -> str:
+    """Return the page of one report, or of several over each other.
 
-
-def points(series: Sequence[Series], axis: str) -> list[list[Point]]:
-    """Marks of each series: coloured by kind where there is one series, by series where there are several."""
-    found = []
-    for n, one in enumerate(series):
-        best = {id(run) for run in front(one.scored())} if axis == "seconds" else set()
-        marks = []
-        for run in one.scored():
-            kind = KINDS.index(run["kind"])
-            name = run["name"] if len(series) == 1 else f"{one.name}: {run['name']}"
-            title = f"{name}: {psnr(run):.2f} dB, {cost(run):.2f} s, {run['gaussians']} Gaussians"
-            color = f"c{n % 4}" if len(series) > 1 else f"k{kind}"
-            x, y = _x(run, axis), float(psnr(run) or 0)
-            marks.append(Point(x, y, run.get("label") or run["name"], kind, color, id(run) in best, title))
-        found.append([p for p in marks if p.x > 0])
-    return found
-
-
-def chart(series: Sequence[Series], axis: str, x_label: str) -> str:
-    """One of `AXES`, with its front where it is time."""
-    marks = points(series, axis)
-    lines = [sorted((p for p in some if p.front), key=lambda p: p.x) for some in marks]
-    joined = [line for line in lines if len(line) > 1]
-    return scatter([p for some in marks for p in some], x_label, "PSNR, dB", joined, ceiling(series))
-
-
-def ceiling(series: Sequence[Series]) -> float | None:
-    """PSNR of VTK's own pictures of the scene, which no file needs to exceed; None of several scenes."""
-    found = series[0].document.get("vtk_psnr") if len(series) == 1 else None
-    return None if found is None else float(found)
-
-
-def page(series: Sequence[Series], title: str, pictures: Pictures | None = None) -> str:
-    """The page of one report, or of several over each other."""
-    parts = [_head(series, title), _facts(series)]
-    charts = [
-        f"<section><h2>{head}</h2>{_keys(series)}{chart(series, axis, label)}{note}</section>"
-        for (axis, label, head), note in zip(AXES, (FRONT_NOTE, "", ""), strict=True)
-    ]
-    charts.append(_unit_costs(series))
-    parts.append(f'<div class="grid2">{"".join(charts)}</div>')
+    Args:
+        series: the reports.
+        charts: of their runs.
+        title: the heading.
+        pictures: to compare, of the runs of one report.
+    """
+    notes = dict.fromkeys([chart.title for chart in charts], "") | {charts[0].title: FRONT_NOTE}
+    drawn = [f"<section><h2>{one.title}</h2>{one.svg()}{notes[one.title]}</section>" for one in charts]
+    parts = [_head(series, title), _facts(series), f'<div class="grid2">{"".join(drawn)}{_unit_costs(series)}</div>']
     if pictures:
         parts.append(_compare(series[0].runs, pictures))
-    longest = max(sum(stage["seconds"] for stage in run["stages"]) for one in series for run in one.runs)
-    parts += [f"<section><h2>{_title(s, series)}</h2>{stage_bars(s.runs, longest)}</section>" for s in series]
-    parts.append(_table(series))
-    parts += [_machine(s, len(series) > 1) for s in series]
+    parts += [_table(series), *(_machine(one, len(series) > 1) for one in series)]
     script = f"<script>{SCRIPT}</script>" if pictures else ""
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
@@ -99,10 +57,6 @@ FRONT_NOTE = (
     "<p><small>Ringed and joined: no run is both faster and nearer. Seconds are those to the file: reading, views, "
     "every stage, writing; not the scoring. PSNR: ten test views, whole frame over black.</small></p>"
 )
-
-
-def _title(one: Series, series: Sequence[Series]) -> str:
-    return "Where the time goes" + (f": {escape(one.name)}" if len(series) > 1 else "")
 
 
 def _head(series: Sequence[Series], title: str) -> str:
@@ -119,30 +73,17 @@ def _head(series: Sequence[Series], title: str) -> str:
 
 
 def _facts(series: Sequence[Series]) -> str:
-    cells = []
-    for one in series:
-        runs = one.scored()
-        best, quick = max(runs, key=lambda r: psnr(r) or 0), min(runs, key=cost)
-        for what, run in (("quickest", quick), ("knee of the curve", knee(runs)), ("nearest", best)):
-            if run is not None and (len(series) == 1 or what == "nearest"):
-                head = what if len(series) == 1 else f"{one.name}: {what}"
-                size = f"{cost(run):.1f} s, {short(run['gaussians'])} Gaussians"
-                cells.append(
-                    f"<div><small>{escape(head)}</small><b>{psnr(run):.1f} dB</b>"
-                    f"<small>{escape(run['name'])}<br>{size}</small></div>"
-                )
+    """Return the best run of each report; of one report alone also the quickest and the knee."""
+    chosen = [("nearest", max(one.scored(), key=lambda run: psnr(run) or 0)) for one in series]
+    if len(series) == 1:
+        runs = series[0].scored()
+        chosen = [("quickest", min(runs, key=cost)), ("knee of the curve", knee(runs) or runs[0]), *chosen]
+    cells = [
+        f"<div><small>{what}</small><b>{psnr(run):.1f} dB</b><small>{escape(run['name'])}<br>{cost(run):.1f} s, "
+        f"{short(run['gaussians'])} Gaussians</small></div>"
+        for what, run in chosen
+    ]
     return f'<div class="facts">{"".join(cells)}</div>'
-
-
-def _keys(series: Sequence[Series]) -> str:
-    kinds = sorted({KINDS.index(run["kind"]) for one in series for run in one.scored()})
-    colors = [f"k{kind}" if len(series) == 1 else "" for kind in kinds]
-    several = "".join(
-        f'<span><svg viewBox="0 0 18 18" class="key c{n % 4}">{mark(0, 9, 9)}</svg>{escape(one.name)}</span>'
-        for n, one in enumerate(series)
-        if len(series) > 1
-    )
-    return f'<div class="keys">{several}{legend(kinds, colors)}</div>'
 
 
 def _unit_costs(series: Sequence[Series]) -> str:
@@ -213,7 +154,6 @@ def _table(series: Sequence[Series]) -> str:
         best = {id(run) for run in front(one.scored())}
         for run in one.runs:
             scores = run.get("scores") or {}
-            name = run["name"] if len(series) == 1 else f"{one.name}: {run['name']}"
             cells = [
                 f"{cost(run):.2f}", _cell(scores.get("psnr"), 2), _cell(scores.get("psnr_foreground"), 2),
                 _cell(worst_seat(run), 2), _cell(scores.get("ssim"), 4), _cell(scores.get("flip"), 4),
@@ -221,7 +161,7 @@ def _table(series: Sequence[Series]) -> str:
                 f"{run['bytes'] / 1e6:.2f}",
             ]  # fmt: skip
             mark = ' class="best"' if id(run) in best else ""
-            rows.append(f"<tr{mark}><td>{escape(name)}</td>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>")
+            rows.append(f"<tr{mark}><td>{escape(run['name'])}</td>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>")
     head = "".join(f"<th>{name}</th>" for name in heads)
     return (
         f'<section><h2>All runs</h2><div class="scroll"><table><tr>{head}</tr>{"".join(rows)}</table></div>'

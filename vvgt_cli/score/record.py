@@ -81,6 +81,11 @@ class ConversionReport:
     left_out: list[tuple[str, str]] = field(default_factory=list)
     seconds: float = 0.0
 
+    @property
+    def interrupted(self) -> bool:
+        """Whether Ctrl-C ended gradient descent early."""
+        return self.refinement is not None and self.refinement["reason"] == "interrupted"
+
     def to_json(self) -> str:
         """JSON with the machine and the versions beside the numbers; see docs/report.md."""
         return document("vvgt-conversion", asdict(self))

@@ -1,10 +1,10 @@
 """Style sheet and script of the page: no font, no library, nothing fetched."""
 
 CSS = """
-:root{color-scheme:light dark;--paper:#fbfbfa;--card:#fff;--ink:#1c1f23;--soft:#5d656f;--line:#e3e5e8;--grid:#eceef0;
---k0:#0072b2;--k1:#a8527e;--k2:#00845f;--k3:#c05a00;--k4:#7a6a00;--k5:#333;--c0:#0072b2;--c1:#c05a00;--c2:#00845f;--c3:#a8527e}
+:root{color-scheme:light dark;--paper:#fbfbfa;--card:#fff;--ink:#1c1f23;--soft:#5d656f;--line:#e3e5e8;
+--k0:#0072b2;--k1:#a8527e;--k2:#00845f;--k3:#c05a00;--k4:#7a6a00;--k5:#333}
 @media(prefers-color-scheme:dark){:root{--paper:#14171a;--card:#1c2024;--ink:#e8eaec;--soft:#9aa3ad;--line:#2e343a;
---grid:#282d33;--k0:#56b4e9;--k1:#d995ba;--k2:#2fc79b;--k3:#f0954a;--k4:#d3c04a;--k5:#ddd;--c0:#56b4e9;--c1:#f0954a;--c2:#2fc79b;--c3:#d995ba}}
+--k0:#56b4e9;--k1:#d995ba;--k2:#2fc79b;--k3:#f0954a;--k4:#d3c04a;--k5:#ddd}}
 *{box-sizing:border-box}
 body{margin:0;background:var(--paper);color:var(--ink);
 font:16px/1.5 system-ui,-apple-system,"Segoe UI",Roboto,sans-serif}
@@ -18,26 +18,7 @@ section{background:var(--card);border:1px solid var(--line);border-radius:10px;p
 .facts b{display:block;font-size:1.35rem;line-height:1.3;font-variant-numeric:tabular-nums}
 .grid2{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(100%,440px),1fr));gap:18px}
 .grid2 section{margin-top:0}.grid2{margin-top:18px}
-svg{display:block;width:100%;height:auto;overflow:visible;font-family:inherit}
-svg text{font-size:12.5px;fill:var(--ink)}svg .tick{fill:var(--soft)}svg .axis{font-weight:600}
-svg .name{font-size:12px;paint-order:stroke;stroke:var(--card);stroke-width:3px;stroke-linejoin:round}
-svg .grid{stroke:var(--grid);stroke-width:1}svg .ceiling{stroke:var(--soft);stroke-width:1.2;stroke-dasharray:5 4}
-.front{fill:none;stroke-width:2;opacity:.65;stroke:var(--ink)}
-svg .name.c0{fill:var(--c0)}svg .name.c1{fill:var(--c1)}svg .name.c2{fill:var(--c2)}svg .name.c3{fill:var(--c3)}
-.key{fill:var(--ink)}
-.ring{fill:none;stroke:currentColor;stroke-width:1.6;opacity:.75}
-.k0{color:var(--k0);fill:var(--k0)}.k1{color:var(--k1);fill:var(--k1)}.k2{color:var(--k2);fill:var(--k2)}
-.k3{color:var(--k3);fill:var(--k3)}.k4{color:var(--k4);fill:var(--k4)}.k5{color:var(--k5);fill:var(--k5)}
-.c0{color:var(--c0);fill:var(--c0)}.c1{color:var(--c1);fill:var(--c1)}
-.c2{color:var(--c2);fill:var(--c2)}.c3{color:var(--c3);fill:var(--c3)}
-polyline.front{fill:none}polyline.c0,polyline.c1,polyline.c2,polyline.c3{stroke:currentColor}
-.keys{display:flex;flex-wrap:wrap;gap:4px 16px;font-size:.875rem;color:var(--soft);margin:0 0 10px}
-.keys span{display:inline-flex;align-items:center;gap:6px}.key{width:18px;height:18px;flex:none}
-.keys i{width:14px;height:14px;border-radius:3px;flex:none}
-.bar{display:grid;grid-template-columns:minmax(90px,170px) 1fr 76px;gap:10px;align-items:center;margin:5px 0;
-font-size:.875rem}
-.bar b{font-weight:500;line-height:1.2}.bar div{display:flex;height:18px;min-width:0}
-.bar i{display:block;min-width:1px}.bar em{font-style:normal;text-align:right;font-variant-numeric:tabular-nums}
+svg{display:block;width:100%;height:auto}svg text{font-family:inherit!important}
 .scroll{overflow-x:auto}table{border-collapse:collapse;width:100%;font-size:.875rem;font-variant-numeric:tabular-nums}
 th,td{padding:6px 10px;text-align:right;border-bottom:1px solid var(--line);white-space:nowrap}
 th{color:var(--soft);font-weight:600}th:first-child,td:first-child{text-align:left}
@@ -63,7 +44,7 @@ mix-blend-mode:difference}
 .gap{isolation:isolate}.gap .ours{mix-blend-mode:difference}
 input[type=range]{accent-color:var(--k0)}
 @media(max-width:560px){main{padding:18px 12px 40px}section{padding:14px 12px}h1{font-size:1.35rem}
-.bar{grid-template-columns:1fr 66px;gap:0 8px;margin:8px 0}.bar b{grid-column:1/-1}.facts{grid-template-columns:1fr}
+.facts{grid-template-columns:1fr}
 .facts b{font-size:1.1rem}dl{grid-template-columns:1fr;gap:0}dd{margin-bottom:6px}}
 """
 

@@ -143,7 +143,7 @@ def make_parts(run: Run, request: ConvertRequest, options: BlockOptions, parts: 
             run.console.say(line)
         degree = degree_of(request, source)
         run.compile(for_degree(for_blocks(source.kernels((RENDER, *INIT, *DRAW))), degree), source.kernel_type())
-        field.expect(scored_views(size))
+        field.views.expect(scored_views(size))
         cells = field.cells(size, budget, wanted.most)
         assert cells.rays is not None
         Plan(

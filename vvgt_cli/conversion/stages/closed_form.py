@@ -64,7 +64,7 @@ class ClosedFormStage(Stage):
             max_gaussians=fit.max_gaussians, size=fit.size, method=fit.init, seed=fit.seed, degree=work.degree
         )
         with run.stage(self.name) as stage:
-            start = work.field.start(options, run.console.bar(self.name))
+            start = work.field.pyramid(options, run.console.bar(self.name))
             if not len(start.gaussians):
                 raise NothingVisible(source.volume.name, source.name)
             found = len(start.gaussians)

@@ -60,7 +60,7 @@ class TestViews(Stage):
         fit, run = work.fit, work.run
         with run.stage(self.name) as stage:
             scores = score_test_views(
-                work.field,
+                work.field.views,
                 work.made(),
                 fit.size,
                 RenderSettings(),
@@ -104,9 +104,9 @@ class ViewingConditions(Stage):
             return
         with run.stage(self.name) as stage:
             made, settings = work.made(), RenderSettings()
-            seen = condition_views(work.field, from_above(fit.size), settings, views=SIDE, enough=FEW)
+            seen = condition_views(work.field.views, from_above(fit.size), settings, views=SIDE, enough=FEW)
             seats = score_conditions(made, seen)
             run.report.seats = [asdict(seat) for seat in seats]
-            near = glance_cameras(fit.size)
-            run.report.texture = asdict(score_texture(work.field, made, fit.size, fit.rule, settings, cameras=near))
+            near, views = glance_cameras(fit.size), work.field.views
+            run.report.texture = asdict(score_texture(views, made, fit.size, fit.rule, settings, cameras=near))
             stage.note = f"worst of {len(seats)}: {seats[0].name()}, {seats[0].psnr:.2f} dB"

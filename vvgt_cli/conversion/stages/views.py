@@ -75,7 +75,7 @@ class CheckViews(Stage):
         size = work.fit.size
         cameras = default_views("check", size=size)
         with work.run.stage(self.name) as stage:
-            work.check = judging_views(work.field, cameras, RenderSettings() if self.fine else FIT_VIEWS)
+            work.check = judging_views(work.field.views, cameras, RenderSettings() if self.fine else FIT_VIEWS)
             stage.note = f"{len(cameras)} of {size} px" + (", blocks of them" if work.check.blocks else "")
 
 
@@ -121,10 +121,10 @@ class TrainingViews(Stage):
         work.train_rule = work.rule.at(footprint)
         settings = FIT_VIEWS
         if self.fitted:
-            settings = fine_enough(work.field, work.made(), self.edge, work.train_rule, _spread(footprint))
+            settings = fine_enough(work.field.views, work.made(), self.edge, work.train_rule, _spread(footprint))
         cameras = default_views("train", self.count, size=self.edge)
         with work.run.stage(self.name) as stage:
-            images = render_views(work.field, cameras, settings, progress=work.run.console.bar(self.name))
+            images = render_views(work.field.views, cameras, settings, progress=work.run.console.bar(self.name))
             rays = "one ray" if settings.samples == 1 else "adaptive rays"
             stage.note = f"{self.count} of {self.edge} px to fit to, {rays} a pixel, steps of {settings.step:g}"
         work.train, work.train_settings = Views(cameras, images), settings

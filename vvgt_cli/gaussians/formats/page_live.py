@@ -75,8 +75,8 @@ def page_of_several(clouds: Sequence[tuple[str, Gaussians, PlyOptions]], name: s
 def in_common(facts: Sequence[LiveFacts | None]) -> LiveFacts | None:
     """What files say of the values that their Gaussians carry, as one page has it; None where none can show all.
 
-    Of as many layers each, whose values are of one range under one function; of label maps, each label of any is there
-    once.
+    They have as many layers each, whose values are of one range under one function. Label maps have the labels of all:
+    one number may have several names, each of which has the look that it has in the first file.
     """
     known = [one.layers for one in facts if one is not None]
     if len(known) < len(facts) or len({len(layers) for layers in known}) > 1:
@@ -91,8 +91,8 @@ def _layer_in_common(facts: Sequence[LiveFacts]) -> LiveFacts | None:
     """The same of one layer."""
     first = facts[0]
     if all(one.labels for one in facts):
-        labels = {label.number: label for one in reversed(facts) for label in one.labels}
-        return replace(first, labels=tuple(labels[number] for number in sorted(labels)))
+        labels = {(label.number, label.name): label for one in reversed(facts) for label in one.labels}
+        return replace(first, labels=tuple(labels[key] for key in sorted(labels)))
     looks = {(bool(one.labels), one.lo, one.hi, one.function) for one in facts}
     return first if len(looks) == 1 else None
 
@@ -131,9 +131,9 @@ def renumbered(gaussians: Gaussians, own: LiveFacts, facts: LiveFacts) -> Gaussi
     live = gaussians.live.copy()
     for number, (one, all_) in enumerate(zip(own.layers, facts.layers, strict=True)):
         if one.labels != all_.labels:
-            rows = {label.number: row for row, label in enumerate(all_.labels)}
+            rows = {(label.number, label.name): row for row, label in enumerate(all_.labels)}
             mine = live[:, NUMBER] == number if facts.others else np.full(len(live), True)
-            to = np.array([rows[label.number] for label in one.labels])
+            to = np.array([rows[label.number, label.name] for label in one.labels])
             live[mine, ROW] = to[live[mine, ROW].astype(np.int64)]
     return replace(gaussians, live=live)
 

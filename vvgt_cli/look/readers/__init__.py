@@ -9,11 +9,11 @@ from typing import Any
 
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.look.function import TransferFunction
-from vvgt_cli.look.readers import colormap_name, inviwo, lut, minimal, named, paraview, paraview_xml, slicer
+from vvgt_cli.look.readers import inviwo, lut, minimal, names, paraview, slicer
 from vvgt_cli.look.readers.fields import load
 
 # each: matches(parsed) -> bool, read(parsed, what, pick) -> TransferFunction
-FORMATS = (paraview, minimal, slicer, paraview_xml, inviwo, lut)
+FORMATS = (paraview, minimal, slicer, inviwo, lut)
 SUFFIXES = (".json", ".xml", ".itf", ".vp", *lut.SUFFIXES)
 __all__ = ["read_transfer_function"]
 
@@ -23,9 +23,8 @@ def read_transfer_function(source: str | os.PathLike[str] | Mapping[str, Any]) -
 
     Args:
         source: path of a file (``presets.json#Name`` picks one of several functions; the modules of this room say of
-            which formats), the name of one of ours (`vvgt_cli.look.readers.named`), or a matplotlib colour-map name
-            with an opacity ramp, ``NAME[:LO,HI[:MAX]]`` (`vvgt_cli.look.readers.colormap_name`); or what such a JSON
-            file holds, parsed.
+            which formats), or a name (`vvgt_cli.look.readers.names`): one of ours, or a matplotlib colour map with an
+            opacity ramp, ``NAME[:LO,HI[:MAX]]``; or the parsed content of such a JSON file.
 
     Returns:
         The function; `vvgt_cli.look.resolve.resolve` puts it on the data.
@@ -48,7 +47,7 @@ def read_transfer_function(source: str | os.PathLike[str] | Mapping[str, Any]) -
     if not path.exists():
         if pick or "/" in source or "\\" in source or Path(source).suffix.lower() in SUFFIXES:
             raise UsageError(f"{path}: no such file; expected a transfer function ({', '.join(SUFFIXES)})")
-        return named.named_function(source) if source in named.names() else colormap_name.read(source)
+        return names.read(source)
     try:
         return _read((lut.load if path.suffix.lower() in lut.SUFFIXES else load)(path), str(path), pick)
     except DataError:

@@ -18,9 +18,7 @@ import numpy as np
 
 from vvgt_cli.errors import DataError
 from vvgt_cli.files import seekable
-from vvgt_cli.look.colormap import ColorMap
-from vvgt_cli.look.function import PER_VOXEL, TransferFunction
-from vvgt_cli.look.opacity import PiecewiseOpacity
+from vvgt_cli.look.function import PER_VOXEL, ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.readers.fields import floats, number, text_of
 from vvgt_cli.look.readers.paraview import RAMP
 

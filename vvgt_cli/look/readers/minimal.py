@@ -28,10 +28,8 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.look.colormap import ColorMap
-from vvgt_cli.look.function import PER_VOXEL, TransferFunction
+from vvgt_cli.look.function import PER_VOXEL, ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.lighting import COEFFICIENTS, Lighting, preset_lighting
-from vvgt_cli.look.opacity import PiecewiseOpacity
 from vvgt_cli.look.readers.fields import named, number, rgb
 
 KEYS = {"name", "range", "points", "color_space", "hsv_wrap", "opacity_unit_distance", "opacity_unit_share"}

@@ -1,4 +1,9 @@
-"""Preset JSON of ParaView, as "Export" in the preset dialogue writes it, and of vtk.js (ParaView Glance, VolView)."""
+"""Presets of ParaView: JSON, as "Export" in the preset dialogue writes it and vtk.js has it, and colour-map XML.
+
+vtk.js: ParaView Glance, VolView. XML, which older ParaViews exported and colour-map sites still offer:
+``<ColorMaps><ColorMap name space indexedLookup><Point x o r g b/> ... <NaN r g b/>``. ``o`` is opacity; a map whose
+points all have the same one says nothing of opacity and gets a linear ramp, as a preset without opacity does.
+"""
 
 from __future__ import annotations
 
@@ -8,10 +13,8 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.look.colormap import SPACES, ColorMap
-from vvgt_cli.look.function import TransferFunction
-from vvgt_cli.look.opacity import PiecewiseOpacity
-from vvgt_cli.look.readers.fields import named, rgb, table
+from vvgt_cli.look.function import SPACES, ColorMap, PiecewiseOpacity, TransferFunction
+from vvgt_cli.look.readers.fields import Elements, attribute, named, rgb, table
 
 PRESET_KEYS = ("RGBPoints", "IndexedColors", "ColorSpace")
 RAMP = " (opacity not in the file: linear ramp)"  # behind the name of a function
@@ -23,22 +26,28 @@ SPACE_OF = {name.lower(): name for name in SPACES} | OTHER_NAMES
 
 
 def matches(parsed: Any) -> bool:
-    """Whether parsed JSON is a preset or an array of presets."""
+    """Tell whether it is a preset, an array of presets, or XML with a ColorMap."""
+    if isinstance(parsed, Elements):
+        return any(tag == "colormap" for tag, _ in parsed.items)
     presets = parsed if isinstance(parsed, list) else [parsed]
     return bool(presets) and all(isinstance(p, dict) and any(k in p for k in PRESET_KEYS) for p in presets)
 
 
 def read(parsed: Any, what: str, pick: str = "") -> TransferFunction:
-    """One preset as a `TransferFunction` on data values.
+    """Return one preset as a `TransferFunction` on data values.
 
     ``RGBPoints`` is flat (x, r, g, b), ``Points`` flat (x, opacity, midpoint, sharpness), ``OpacityPoints`` of vtk.js
     flat (x, opacity). Without either (opacity was not exported) it is a linear ramp from 0 to 1 over the range, and the
     name says so. HSV goes the short way round only with ``HSVWrap``: ParaView writes it where it is not 0.
 
     Raises:
-        DataError: several presets and no ``pick``, a categorical preset, a field that is not what it must be.
+        DataError: several presets and no ``pick``, a categorical preset, an indexed map, a field that is not what it
+            must be.
     """
-    preset = choose(parsed if isinstance(parsed, list) else [parsed], what, pick)
+    presets = _of_xml(parsed, what) if isinstance(parsed, Elements) else parsed
+    preset = choose(presets if isinstance(presets, list) else [presets], what, pick)
+    if preset.get("indexed"):
+        raise DataError(f"{what}: an indexed colour map (indexedLookup); expected one over a range of values")
     if "RGBPoints" not in preset:
         raise DataError(
             f"{what}: a categorical preset (IndexedColors, no RGBPoints); expected one over a range of values"
@@ -73,6 +82,32 @@ def read(parsed: Any, what: str, pick: str = "") -> TransferFunction:
         )
     except DataError as error:
         raise named(what, error) from error
+
+
+def _of_xml(parsed: Elements, what: str) -> list[dict[str, Any]]:
+    """Return the colour maps of an XML file as presets; ``indexed`` says which are."""
+    presets: list[dict[str, Any]] = []
+    for tag, cased in parsed.items:
+        attributes = {key.lower(): value for key, value in cased.items()}
+        if tag == "colormap":
+            indexed = attributes.get("indexedlookup", "false").lower() in ("true", "1")
+            about = {"Name": attributes.get("name", ""), "ColorSpace": attributes.get("space", "RGB")}
+            presets.append({**about, "RGBPoints": [], "Points": [], "indexed": indexed})
+        elif presets and tag in ("above", "below"):
+            presets[-1][f"Use{tag.title()}RangeColor"] = 1
+        elif presets and (tag == "nan" or (tag == "point" and not presets[-1]["indexed"])):
+            here = f"{what}: {presets[-1]['Name'] or 'ColorMap'}: {tag}"
+            color = [attribute(here, attributes, key) for key in "rgb"]
+            if tag == "nan":
+                presets[-1]["NanColor"] = color
+                continue
+            x, opacity = attribute(here, attributes, "x"), attribute(here, {"o": "1", **attributes}, "o")
+            presets[-1]["RGBPoints"] += [x, *color]
+            presets[-1]["Points"] += [x, opacity, 0.5, 0.0]
+    for preset in presets:
+        if len(set(preset["Points"][1::4])) < 2:
+            del preset["Points"]
+    return presets
 
 
 def choose(presets: list[dict[str, Any]], what: str, pick: str) -> dict[str, Any]:

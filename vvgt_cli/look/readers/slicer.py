@@ -19,10 +19,8 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.look.colormap import ColorMap
-from vvgt_cli.look.function import TransferFunction
+from vvgt_cli.look.function import ColorMap, PiecewiseOpacity, TransferFunction
 from vvgt_cli.look.lighting import Lighting, preset_lighting
-from vvgt_cli.look.opacity import PiecewiseOpacity
 from vvgt_cli.look.readers import paraview
 from vvgt_cli.look.readers.fields import Elements, Lines, floats, named, number, rgb
 

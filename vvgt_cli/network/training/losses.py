@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from vvgt_cli.images.metrics.ssim import C1, C2, RADIUS, SIGMA
+from vvgt_cli.images.metrics import C1, C2, RADIUS, SIGMA
 from vvgt_cli.network.training.config import LossConfig
 from vvgt_cli.network.training.lpips import Lpips
 

@@ -28,18 +28,18 @@ function errorOf(text) {
 export function factsOf(comments) {
   const facts = { up: 'none', space: 'none', frame: 'unit' };
   for (const comment of comments ?? []) {
-    const [ours, key, ...rest] = comment.trim().split(/\s+/), text = rest.join(' ');
-    if (ours !== 'vvgt' || !key) continue;
+    const [, key, text = ''] = /^vvgt\s+(\S+)\s*(.*)$/.exec(comment.trim()) ?? [], rest = text.split(/\s+/);
+    if (!key) continue;
     if (key === 'frame') {
       facts.frame = rest[0];
       if (rest[1] === 'scale') [facts.scale, facts.centre] = [Number(rest[2]), rest.slice(4, 7).map(Number)];
-    } else if (key === 'unit-distance') [facts[key], facts.label] = [Number(rest[0]), rest.slice(1).join(' ')];
+    } else if (key === 'unit-distance') [facts[key], facts.label] = [Number(rest[0]), text.slice(rest[0].length).trim()];
     else if (key === 'size') [facts.size, facts.rule] = [Number(rest[0]), rest[2]];
     else if (key === 'function') facts.function = JSON.parse(text);
     else if (key === 'legend') facts.legend = legendOf(text);
     else if (key === 'certificate') facts.error = errorOf(text);
     else if (key === 'live') { if (rest[0] === 'unit') facts.unit = rest.slice(1).join(' '); }
-    else if (rest.length) facts[key] = text;
+    else if (text) facts[key] = text;
     else facts.version = key;
   }
   if (!(facts.up in UP)) facts.up = 'none';

@@ -6,7 +6,7 @@ import { round } from './scale.mjs';
 import { element, label } from './svg.mjs';
 
 const HIGH = 130, WIDE = 18;
-const ROW = 18, LONGEST = 24, MOST = 12;  // px of a label, characters of its name, labels at most
+const ROW = 18, LETTER = 7, MOST = 12;  // px of a label, of a letter of its name, labels at most
 
 // Round values between two
 export function ticks(lo, hi, many = 4) {
@@ -36,12 +36,12 @@ export function drawLegend(group, { nodes, live, right, bottom }) {
   return values;
 }
 
-// Of labels the first ones, from the bottom up
+// The first labels, from the bottom up; a name that is wider than half the picture is cut
 export function drawLabels(group, { labels, of, right, bottom, high }) {
   const many = Math.min(labels.length, MOST, Math.max(Math.floor(high / 3 / ROW), 1)), rest = of - many;
-  const lines = [...labels.slice(0, many), ...(rest > 0 ? [{ name: `and ${rest} more` }] : [])];
+  const longest = Math.floor(right / 2 / LETTER), lines = [...labels.slice(0, many), ...(rest > 0 ? [{ name: `and ${rest} more` }] : [])];
   lines.forEach(({ name, rgb }, k) => {
-    const y = bottom - (lines.length - 1 - k) * ROW, text = name.length > LONGEST ? `${name.slice(0, LONGEST - 1)}…` : name;
+    const y = bottom - (lines.length - 1 - k) * ROW, text = name.length > longest ? `${name.slice(0, longest - 1)}…` : name;
     if (rgb) group.append(element('rect', { x: right - 12, y: y - 11, width: 12, height: 12, rx: 2, fill: hex(rgb), stroke: '#000', 'stroke-opacity': 0.6 }));
     group.append(label(text, right - 18, y, { 'text-anchor': 'end', 'font-size': 12 }));
   });

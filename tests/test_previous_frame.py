@@ -15,10 +15,10 @@ from tests.headers import uncertified
 from tests.random_clouds import random_cloud
 from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.blocks import BLOCK
-from vvgt_cli.conversion.carried import Carry
 from vvgt_cli.conversion.changes import EDGE, REACH, Changes, changes
 from vvgt_cli.conversion.convert import convert
-from vvgt_cli.conversion.pictures import Pictures
+from vvgt_cli.conversion.pictures import RememberedViews
+from vvgt_cli.conversion.previous_frame import PreviousFrame
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.dvr import RenderSettings
 from vvgt_cli.field.field import Resident
@@ -134,10 +134,10 @@ def test_pixels_that_show_them():
 
 
 def test_pictures_of_the_next_frame_are_as_drawn_anew(tmp_path):
-    first, second = (Resident(one, one.scene()) for one in sources(tmp_path, body(0.2), body(0.26)))
-    kept = Pictures(200)
+    first, second = (Resident.of(one) for one in sources(tmp_path, body(0.2), body(0.26)))
+    kept = RememberedViews(200, first)
     camera, how = default_views("test", 5, size=190)[3], RenderSettings(samples=1)
-    kept.of(first).view(camera, how)
+    kept.view(camera, how)
     found = changes(first.source, second.source)
     assert 0.02 < found.blocks.mean() < 0.2
     kept.outdate(found)
@@ -148,9 +148,10 @@ def test_pictures_of_the_next_frame_are_as_drawn_anew(tmp_path):
             drawn.append(blocks)
             return second.view(camera, settings, blocks)
 
-    np.testing.assert_array_equal(kept.of(Counted()).view(camera, how), second.view(camera, how))
+    kept.views = Counted()
+    np.testing.assert_array_equal(kept.view(camera, how), second.view(camera, how))
     assert 0 < len(drawn[0].numbers) < 0.8 * 144
-    kept.of(Counted()).view(camera, how)
+    kept.view(camera, how)
     assert len(drawn) == 1
 
 
@@ -179,7 +180,7 @@ def test_what_is_right_already_is_not_moved_with_what_is_wrong():
 def test_what_comes_back_moves_back(vvgt, beat, monkeypatch):
     """The views of the third frame were last drawn of the first, which shows the same, and those of the fifth of the
     second, as none is drawn of the fourth; the Gaussians do not."""
-    monkeypatch.setattr("vvgt_cli.conversion.carried.VIEWS", 12)
+    monkeypatch.setattr("vvgt_cli.conversion.previous_frame.VIEWS", 12)
     for k, radius in enumerate((0.2, 0.208, 0.2, 0.2, 0.208)):
         np.save(beat / f"v_{k}.npy", body(radius))
     assert vvgt("convert", beat / "v_*.npy", "--tf", beat / "tf.json", *HOW, "-o", beat / "f_{}.ply").code == 0
@@ -264,16 +265,16 @@ def test_what_frames_leave_to_later_ones_is_in_the_memory_that_is_asked_for(beat
             asked.append(pictures + beside(plan.case))
 
     monkeypatch.setattr("vvgt_cli.conversion.convert.check_memory", check)
-    carry = Carry(96)
+    start = PreviousFrame(96)
     for k in (0, 1, 2, 0):
         source = SourceRequest(str(beat / f"v_{k}.npy"), tf=str(beat / "tf.json"))
         request = ConvertRequest(source=source, fit=FitOptions(400, 96, steps=100), output=str(beat / f"{k}.ply"))
-        convert(replace(request, overwrite=True), carry=carry)
-    turns = len(carry._last.shown)
+        convert(replace(request, overwrite=True), start=start)
+    turns = len(start._last.shown)
     assert turns > 3
-    pictures = sum(picture.nbytes for _, picture, _ in carry._pictures._kept.values())
-    a_set = sum(array.nbytes for array in carry._last.gaussians.arrays().values())
-    assert len(carry._last.gaussians) == 400
+    pictures = sum(picture.nbytes for _, picture, _ in start._pictures._kept.values())
+    a_set = sum(array.nbytes for array in start._last.gaussians.arrays().values())
+    assert len(start._last.gaussians) == 400
     assert 1 <= asked[0] / (pictures + (turns + 1) * a_set) < 1.1
     assert asked[1] < asked[0] - pictures
     assert asked[1] - asked[3] == 2 * a_set  # those of frames 1 and 2 are there by then
@@ -291,7 +292,7 @@ def test_a_frame_that_shows_something_else_is_converted_by_itself(vvgt, beat):
     np.save(beat / "v_1.npy", body(0.2)[:, :, ::-1])
     done = vvgt("convert", beat / "v_[01].npy", "--tf", beat / "tf.json", *HOW, "-o", beat / "f_{}.ply")
     assert done.code == 0, done.err
-    assert "left out: going on from the frame before" in done.err
+    assert "left out: starting from the frame before" in done.err
     assert vvgt("convert", beat / "v_1.npy", "--tf", beat / "tf.json", *HOW, "-o", beat / "a.ply").code == 0
     assert uncertified(beat / "a.ply") == uncertified(beat / "f_1.ply")
 

@@ -1,4 +1,4 @@
-"""A frame of a series from the one before: its Gaussians, of which those move that are where the frames differ."""
+"""Start a frame of a series from the one before: only Gaussians where the two frames differ move."""
 
 from __future__ import annotations
 
@@ -11,14 +11,15 @@ import numpy as np
 from vvgt_cli.cameras import Camera
 from vvgt_cli.cameras.blocks import BLOCK, Blocks
 from vvgt_cli.conversion.changes import Changes, changes
-from vvgt_cli.conversion.pictures import Pictures
+from vvgt_cli.conversion.pictures import RememberedViews
 from vvgt_cli.conversion.plan import Plan
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.conversion.stage import Work
 from vvgt_cli.conversion.stages import CheckViews, TrainingViews
 from vvgt_cli.conversion.stages.refinement import Refinement, refine, widened_small
 from vvgt_cli.conversion.stages.scores import TestViews
-from vvgt_cli.field.field import Field, Picture
+from vvgt_cli.conversion.warm_start import WarmStart
+from vvgt_cli.field.field import Picture, ViewRenderer
 from vvgt_cli.field.source import Source
 from vvgt_cli.field.workload import Workload
 from vvgt_cli.gaussians import Gaussians, as_stored
@@ -29,7 +30,8 @@ from vvgt_cli.score.checks import Views
 if TYPE_CHECKING:
     from vvgt_cli.dvr import RenderSettings
 
-STEPS = 50  # of gradient descent on a frame that goes on from another
+WARM_START = "starting from the frame before"
+STEPS = 50  # of gradient descent at a time
 ROUNDS = 2  # of so many steps at most
 LEVEL = 0.25 / 255  # of a pixel, that is no change
 VIEWS = 18  # of the training views for them, others in every frame
@@ -59,39 +61,40 @@ class _Frame:
     shown: tuple[Gaussians, ...]
 
 
-def carries(request: ConvertRequest, parts: int = 1) -> Carry | None:
-    """What frames of a series are carried on by; None where each is converted by itself (docs/commands/convert.md)."""
+def previous_frame(request: ConvertRequest, parts: int = 1) -> PreviousFrame | None:
+    """Return the warm start of a series in ``parts`` shards; None where each frame is converted from scratch."""
     limited = request.limits.target_psnr is not None or request.limits.time_budget is not None
-    return None if request.live or request.checkpoint or limited or parts > 1 else Carry(request.fit.size)
+    return None if request.live or request.checkpoint or limited or parts > 1 else PreviousFrame(request.fit.size)
 
 
-class Carry:
-    """What is carried from frame to frame of one run."""
+class PreviousFrame(WarmStart):
+    """The Gaussians of the frame before, and pictures of it at ``size`` pixels along an edge."""
 
     def __init__(self, size: int) -> None:
         self._last: _Frame | None = None
-        self._pictures = Pictures(size)
+        self._pictures = RememberedViews(size)
         self._turn = 0
         self._moved: int | None = None  # Gaussians that are not those of the frame before
 
-    def remembered(self, field: Field) -> Field:
-        """The frame's field, of which only those pictures are drawn that are not the last frame's."""
-        return self._pictures.of(field)
+    def views(self, views: ViewRenderer) -> ViewRenderer:
+        """See `WarmStart.views`."""
+        self._pictures.views = views
+        return self._pictures
 
     def facts(self) -> dict[str, int]:
-        """Of the frame that was made last, as an index has them."""
+        """Return how many Gaussians of the last frame are not those of the frame before."""
         return {} if self._moved is None else {"moved": self._moved}
 
-    def beside(self, plan: Plan, fit: FitOptions) -> tuple[int, Callable[[Workload], float]]:
-        """Bytes that frames will leave to later ones and that are not there yet: of pictures; of a workload's sets."""
+    def memory(self, plan: Plan, fit: FitOptions) -> tuple[int, Callable[[Workload], float]]:
+        """See `WarmStart.memory`."""
         turns = max((max(s.count // VIEWS, 1) for s in plan.stages if isinstance(s, TrainingViews)), default=-1)
         there = {id(one) for one in (self._last.gaussians, *self._last.shown)} if self._last else ()
         sets = max(turns + 1 - len(there), 0)
         pictures = self._pictures.room([view for stage in plan.stages for view in stage.views(fit)]) if sets else 0
         return pictures, lambda case: sets * case.gaussians * (A_SET + 12 * ((case.degree + 1) ** 2 - 1))
 
-    def goes_on(self, work: Work, plan: Plan, request: ConvertRequest) -> bool:
-        """Make the frame from the one before, if that is as near as a conversion by itself; whether it was."""
+    def try_start(self, work: Work, plan: Plan, request: ConvertRequest) -> bool:
+        """See `WarmStart.try_start`."""
         self._moved = None
         last, self._last = self._last, None
         lighting = work.field.source.lighting
@@ -105,7 +108,7 @@ class Carry:
             stage.note = f"{found.blocks.mean():.1%} of the volume, {int(free.sum())} of {len(free)} Gaussians"
         work.gaussians = last.gaussians
         if found.blocks.any() and not self._fitted(work, last, found, free):
-            work.gaussians = work.check = work.train = work.train_rule = None
+            work.reset()
             return False
         shown = last.shown
         if found.blocks.any():  # else no view was drawn
@@ -137,14 +140,14 @@ class Carry:
         cameras = last.cameras[turn::turns]
         work.train_rule = last.rule
         judge = CheckViews()
-        work.field.expect([*judge.views(work.fit), *(Picture(camera, last.settings) for camera in cameras)])
+        work.field.views.expect([*judge.views(work.fit), *(Picture(camera, last.settings) for camera in cameras)])
         judge.run(work)
         if work.psnr(last.gaussians) < last.psnr - FAR:
-            work.run.leave_out("going on from the frame before", "it shows something else")
+            work.run.leave_out(WARM_START, "it shows something else")
             return False
         with work.run.stage("views") as stage:
             before = [self._pictures.last(Picture(camera, last.settings)) for camera in cameras]
-            images = render_views(work.field, cameras, last.settings)
+            images = render_views(work.field.views, cameras, last.settings)
             for camera, image, old in zip(cameras, images, before, strict=True):
                 _still(image, old, last.shown[turn], camera, last.rule)
             stage.note = f"{len(cameras)} of {cameras[0].width} px to fit to, where they differ from the frame before"
@@ -162,10 +165,10 @@ class Carry:
             result = as_stored(widened_small(result, work.fit.size)[0])
             work.gaussians = _moved(last.gaussians, result, free)
             psnr = work.psnr(work.gaussians)
-            if psnr >= last.psnr - WORSE:
+            if psnr >= last.psnr - WORSE or work.run.report.interrupted:
                 return True
         told = f"{last.psnr - psnr:.1f} dB worse on the check views than the last frame without"
-        work.run.leave_out("going on from the frame before", told)
+        work.run.leave_out(WARM_START, told)
         return False
 
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import vvgt_cli as vvgt
-from vvgt_cli.conversion.onward import GOING_ON, MOST, OPAQUE, recoloured
 from vvgt_cli.conversion.place import into_box, out_of_box
+from vvgt_cli.conversion.previous_look import MOST, OPAQUE, WARM_START, recoloured
 from vvgt_cli.gaussians.ply import opacity
 
 GOAL = {"max_gaussians": 400, "size": 96, "steps": 24}
@@ -61,7 +61,7 @@ def earlier(session):
 
 
 def went_on(result):
-    return not [why for name, why in result.report.left_out if name == GOING_ON]
+    return not [why for name, why in result.report.left_out if name == WARM_START]
 
 
 def names(result):
@@ -111,7 +111,7 @@ def test_another_light_and_another_size(session, earlier):
 def test_what_is_too_far_is_converted_by_itself(session, earlier, look, goal, why):
     asked = {**GOAL, **goal}
     onward, alone = session.convert(look, asked, after=earlier), session.convert(look, asked)
-    assert why in dict(onward.report.left_out)[GOING_ON]
+    assert why in dict(onward.report.left_out)[WARM_START]
     assert np.array_equal(onward.gaussians.means, alone.gaussians.means)
     assert np.array_equal(onward.gaussians.colors, alone.gaussians.colors)
     assert names(onward)[-1] == "seats"
@@ -120,10 +120,10 @@ def test_what_is_too_far_is_converted_by_itself(session, earlier, look, goal, wh
 def test_refused(session, earlier):
     with pytest.raises(vvgt.UsageError, match="same volume"):
         vvgt.convert("example:blob:16", "viridis", GOAL, after=earlier)
-    for more in ({"live": True}, {"split_labels": True}):
-        with pytest.raises(vvgt.UsageError, match="one look"):
-            session.convert(SHELL, GOAL, after=earlier, **more)
-    with pytest.raises(vvgt.UsageError, match="one look"):
+    for kind in ("live", "split_labels"):
+        with pytest.raises(vvgt.UsageError, match=r"after with .*leave it out"):
+            session.convert(SHELL, GOAL, after=earlier, **{kind: True})
+    with pytest.raises(vvgt.UsageError, match=r"after with .*give one function"):
         session.convert([SHELL, "gray"], GOAL, after=earlier)
 
 

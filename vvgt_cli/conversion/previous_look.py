@@ -1,9 +1,9 @@
-"""A conversion that goes on from an earlier one of the same volume, for another function, light or screen."""
+"""Start a conversion from an earlier one of the same volume under another function, light or screen."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,8 +16,8 @@ from vvgt_cli.conversion.result import Conversion
 from vvgt_cli.conversion.stage import Work
 from vvgt_cli.conversion.stages import CheckViews, Refinement, TestViews, TrainingViews
 from vvgt_cli.conversion.stages.views import views_of, wide
+from vvgt_cli.conversion.warm_start import WarmStart
 from vvgt_cli.errors import UsageError
-from vvgt_cli.field.digests import values_digest
 from vvgt_cli.field.field import Field
 from vvgt_cli.field.source import Source
 from vvgt_cli.field.workload import view_edge
@@ -26,32 +26,25 @@ from vvgt_cli.gaussians.live import TAU, Table
 from vvgt_cli.gaussians.ply import opacity
 from vvgt_cli.jit.ahead import LIVE
 
-STEPS = 50  # of gradient descent on what goes on from an earlier conversion
+STEPS = 50  # of gradient descent at most
 FAR = 7.5  # dB on the check views below what the last conversion by itself had: before the steps
 WORSE = 2.0  # the same after them: of other looks, other errors are what is possible
 FAINT = 1e-3  # of the mean extinction: less says nothing of a colour
 MOST = 50.0  # times the extinction, or a part of it: more says nothing of an opacity
 OTHER = 0.5  # from colour to colour: what descent has found out of the one is not so of the other
 OPAQUE = 1e-5, 0.9999  # least and largest opacity
-GOING_ON = "going on from the earlier conversion"
+WARM_START = "starting from the earlier conversion"
 GRADIENT = slice(2, 5)  # of what is under Gaussians
 
 
-@dataclass(frozen=True)
-class Onward:
-    """What a conversion goes on from, as `vvgt_cli.conversion.carried.Carry` is of frames."""
+class PreviousLook(WarmStart):
+    """The Gaussians of an earlier conversion of the same volume, recoloured and refined by a few steps."""
 
-    earlier: Conversion
+    def __init__(self, earlier: Conversion) -> None:
+        self.earlier = earlier
 
-    def remembered(self, field: Field) -> Field:
-        """The field itself: under another look its pictures are others."""
-        return field
-
-    def keep(self, work: Work, plan: Plan) -> None:
-        """Nothing of a conversion by itself."""
-
-    def goes_on(self, work: Work, plan: Plan, request: ConvertRequest) -> bool:
-        """Make the Gaussians from the earlier ones, if they show the new look about as well; whether it was.
+    def try_start(self, work: Work, plan: Plan, request: ConvertRequest) -> bool:
+        """See `WarmStart.try_start`.
 
         Raises:
             UsageError: the earlier conversion is of another volume.
@@ -66,8 +59,8 @@ class Onward:
         if why is None:
             plan.stages = [s for s in plan.stages if isinstance(s, TestViews) or (s.scores and request.scored_whole)]
         else:
-            work.gaussians = work.train = work.train_rule = work.run.report.refinement = None
-            work.run.leave_out(GOING_ON, why)
+            work.reset()
+            work.run.leave_out(WARM_START, why)
         return why is None
 
     def _unfit(self, work: Work, request: ConvertRequest) -> str | None:
@@ -96,7 +89,7 @@ class Onward:
         steps, small = min(work.fit.steps or STEPS, STEPS), wide(work.made(), work.fit.size)
         stages = TrainingViews(views_of(steps, small), view_edge(work.fit.size, small)), Refinement(steps, steps, small)
         judge = CheckViews()
-        work.field.expect([view for stage in (judge, *stages) for view in stage.views(work.fit)])
+        work.field.views.expect([view for stage in (judge, *stages) for view in stage.views(work.fit)])
         judge.run(work)
         if work.psnr(work.made()) < standard - FAR:
             return "it shows something else"
@@ -122,7 +115,7 @@ def recoloured(earlier: Conversion, field: Field) -> Gaussians:
     """
     before, source = earlier.field.source, field.source
     gaussians = into_box(earlier.gaussians, source.volume)
-    under = field.under(gaussians)
+    under = field.sample(gaussians)
     there = np.isfinite(under).all(axis=1)
     under[~there] = 0
     old, a = _seen(before, source, gaussians, under)
@@ -162,5 +155,4 @@ def _same(field: Field, other: Field) -> bool:
     if first is second:
         return True
     there = first.dims == second.dims and np.array_equal(first.affine, second.affine)
-    found = values_digest(field.volumes()) if there else None
-    return found is not None and found == values_digest(other.volumes())
+    return there and field.digest() is not None and field.digest() == other.digest()

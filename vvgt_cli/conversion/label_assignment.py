@@ -1,4 +1,4 @@
-"""Whose a Gaussian of a label map is, and what of a label the others hide; all in the box frame."""
+"""Assign each Gaussian of a label map to a label, and find what the others hide of a label; all in the box frame."""
 
 from __future__ import annotations
 
@@ -83,8 +83,8 @@ def hidden_in(near: np.ndarray, edge: np.ndarray, half: np.ndarray, step: np.nda
     return Hidden(~near, edge, half, step)
 
 
-def owners(gaussians: Gaussians, shown: Sequence[tuple[Volume, LabelTable, Label]]) -> np.ndarray:
-    """(K,) int64 index of the label that owns most of each Gaussian's extinction; where none is near, by colour.
+def assign_labels(gaussians: Gaussians, shown: Sequence[tuple[Volume, LabelTable, Label]]) -> np.ndarray:
+    """Return (K,) int64, the index of the label with most of each Gaussian's extinction; where none is near, by colour.
 
     Args:
         gaussians: box frame.

@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from vvgt_cli.errors import DataError
-from vvgt_cli.images.metrics.filters import correlate, separable
+from vvgt_cli.images.filters import correlate, separable
 
 PIXELS_PER_DEGREE = 67.0206  # 0.7 m from a 0.7 m wide display of 3840 pixels
 Q_C, P_C, P_T = 0.7, 0.4, 0.95  # colour: exponent, and the knee of the error redistribution
@@ -32,7 +32,7 @@ WHITE = RGB_TO_XYZ.sum(axis=1)
 
 
 def flip(reference: np.ndarray, ours: np.ndarray, pixels_per_degree: float = PIXELS_PER_DEGREE) -> float:
-    """Mean LDR-FLIP error in [0, 1] of sRGB images in [0, 1], (h, w, 3) each (clipped).
+    """Return the mean LDR-FLIP error in [0, 1] of sRGB images in [0, 1], (h, w, 3) each (clipped).
 
     Raises:
         DataError: shapes that differ or are not (h, w, 3).
@@ -41,7 +41,7 @@ def flip(reference: np.ndarray, ours: np.ndarray, pixels_per_degree: float = PIX
 
 
 def flip_map(reference: np.ndarray, ours: np.ndarray, pixels_per_degree: float = PIXELS_PER_DEGREE) -> np.ndarray:
-    """Per-pixel LDR-FLIP, (h, w) float32 in [0, 1]; arguments and errors as `flip`."""
+    """Return LDR-FLIP of each pixel, (h, w) float32 in [0, 1]; arguments and errors as `flip`."""
     reference, ours = np.asarray(reference), np.asarray(ours)
     if reference.shape != ours.shape or reference.ndim != 3 or reference.shape[2] != 3 or 0 in reference.shape:
         raise DataError(f"FLIP of images {reference.shape} and {ours.shape}; expected the same (h, w, 3)")
@@ -56,7 +56,7 @@ def flip_map(reference: np.ndarray, ours: np.ndarray, pixels_per_degree: float =
 
 
 def _opponent(srgb: np.ndarray) -> np.ndarray:
-    """sRGB (h, w, 3) to planes (Y, Cx, Cz) (3, h, w) float32 of the linearised opponent space."""
+    """Convert sRGB (h, w, 3) to planes (Y, Cx, Cz) (3, h, w) float32 of the linearised opponent space."""
     planes = np.ascontiguousarray(np.moveaxis(srgb, -1, 0), dtype=np.float32)
     linear = np.where(
         planes > 0.04045,
@@ -70,17 +70,13 @@ def _opponent(srgb: np.ndarray) -> np.ndarray:
 
 
 def _mix(matrix: np.ndarray, planes: np.ndarray) -> np.ndarray:
-    """3 x 3 matrix times planes (3, h, w), float32."""
+    """Multiply planes (3, h, w) by a 3 x 3 matrix, float32."""
     result: np.ndarray = (matrix.astype(np.float32) @ planes.reshape(3, -1)).reshape(planes.shape)
     return result
 
 
-def _padded(plane: np.ndarray, radius: int) -> np.ndarray:
-    return np.pad(plane, radius, mode="edge")
-
-
 def _perceived(opponent: np.ndarray, ppd: float) -> np.ndarray:
-    """Planes filtered by the contrast sensitivity, as Hunt-adjusted L*a*b* (3, h, w) (section 4.1)."""
+    """Return planes filtered by the contrast sensitivity, as Hunt-adjusted L*a*b* (3, h, w) (section 4.1)."""
     radius = math.ceil(3 * math.sqrt(CSF_WIDEST / (2 * math.pi**2)) * ppd)
     x = np.arange(-radius, radius + 1) / ppd
     filtered = np.empty_like(opponent)
@@ -88,7 +84,7 @@ def _perceived(opponent: np.ndarray, ppd: float) -> np.ndarray:
         kernels = [np.exp(-(math.pi**2) * x**2 / b) for _, b in terms]
         weights = [a * math.sqrt(math.pi / b) for a, b in terms]
         total = sum(w * k.sum() ** 2 for w, k in zip(weights, kernels, strict=True))
-        padded = _padded(plane, radius)
+        padded = np.pad(plane, radius, mode="edge")
         out[:] = sum(separable(padded, k, k * (w / total)) for w, k in zip(weights, kernels, strict=True))
     filtered[0] += 16
     to_xyz = np.array([[1 / 116, 1 / 500, 0], [1 / 116, 0, 0], [1 / 116, 0, -1 / 200]])  # relative to white
@@ -97,7 +93,7 @@ def _perceived(opponent: np.ndarray, ppd: float) -> np.ndarray:
 
 
 def _hunt_lab(linear: np.ndarray) -> np.ndarray:
-    """Linear RGB planes (3, h, w) to L*a*b* with a* and b* scaled by lightness (equation 4)."""
+    """Convert linear RGB planes (3, h, w) to L*a*b* with a* and b* scaled by lightness (equation 4)."""
     t = _mix(RGB_TO_XYZ / WHITE[:, None], linear)
     delta = 6 / 29
     x, y, z = np.where(t > delta**3, np.cbrt(t), t / np.float32(3 * delta**2) + np.float32(4 / 29))
@@ -107,14 +103,14 @@ def _hunt_lab(linear: np.ndarray) -> np.ndarray:
 
 
 def _hyab(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """HyAB distance of L*a*b* planes (3, h, w) -> (h, w) (equation 5)."""
+    """Return the HyAB distance of L*a*b* planes (3, h, w) -> (h, w) (equation 5)."""
     difference = a - b
     result: np.ndarray = np.abs(difference[0]) + np.hypot(difference[1], difference[2])
     return result
 
 
 def _redistributed(distance: np.ndarray) -> np.ndarray:
-    """Colour distance to an error in [0, 1], most of it for small distances (section 4.1.4)."""
+    """Turn a colour distance into an error in [0, 1], most of it for small distances (section 4.1.4)."""
     green, blue = (_hunt_lab(np.eye(3, dtype=np.float32)[i].reshape(3, 1, 1)) for i in (1, 2))
     largest = float(_hyab(green, blue)[0, 0]) ** Q_C
     power = distance ** np.float32(Q_C)
@@ -124,14 +120,14 @@ def _redistributed(distance: np.ndarray) -> np.ndarray:
 
 
 def _features(y: np.ndarray, ppd: float) -> tuple[np.ndarray, np.ndarray]:
-    """Edge and point strength of the luminance plane (h, w), (h, w) each (section 4.2)."""
+    """Return edge and point strength of the luminance plane (h, w), (h, w) each (section 4.2)."""
     sigma = 0.5 * FEATURE_WIDTH * ppd
     radius = math.ceil(3 * sigma)
     x = np.arange(-radius, radius + 1)
     gauss = np.exp(-(x**2) / (2 * sigma**2))
     gauss /= gauss.sum()
     edge, point = _balanced(-x * gauss), _balanced((x**2 / sigma**2 - 1) * gauss)
-    padded = _padded((y + 16) / 116, radius)
+    padded = np.pad((y + 16) / 116, radius, mode="edge")
     smooth_x = correlate(padded, gauss, 1)
     strengths = []
     for kernel in (edge, point):
@@ -142,6 +138,6 @@ def _features(y: np.ndarray, ppd: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _balanced(kernel: np.ndarray) -> np.ndarray:
-    """Positive weights scaled to a sum of 1, negative ones to -1."""
+    """Scale positive weights to a sum of 1, negative ones to -1."""
     result: np.ndarray = np.where(kernel < 0, kernel / -kernel[kernel < 0].sum(), kernel / kernel[kernel > 0].sum())
     return result

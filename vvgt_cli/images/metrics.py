@@ -1,0 +1,273 @@
+"""PSNR, SSIM, FLIP and texture as the conventions define them ("Units of a report")."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+from itertools import zip_longest
+from typing import Any
+
+import numpy as np
+
+from vvgt_cli.errors import DataError
+from vvgt_cli.images.compose import over
+from vvgt_cli.images.filters import separable
+from vvgt_cli.images.flip import flip
+
+CAP = 150.0  # dB: a root-mean-square error of 3e-8, half a float32 step at 1; identical images have this value
+RADIUS, SIGMA = 5, 1.5  # of SSIM's window, 11 x 11
+C1, C2 = 0.01**2, 0.03**2  # of SSIM
+FOREGROUND = 0.01  # reference alpha above which a pixel is foreground
+FINE, COARSE = 1.2, 5.0  # standard deviations in pixels of the blurs whose difference is texture
+REACH = 3.0  # standard deviations at which a blur ends
+BLOCK = 32  # pixels along an edge of the blocks in which texture is measured
+OPAQUE, SMOOTH = 0.97, 1.0  # alpha, and the reference's own texture in levels of 255, of blocks that are measured
+WORST = 0.1  # share of the blocks that count as the worst
+
+
+def psnr(reference: np.ndarray, ours: np.ndarray, mask: np.ndarray | None = None) -> float:
+    """Return ``-10 log10(mean squared error)`` in dB of images in [0, 1] (clipped), at most `CAP`.
+
+    Args:
+        reference: (h, w) or (h, w, c).
+        ours: of the same shape.
+        mask: (h, w) bool, the pixels to count; default all.
+
+    Raises:
+        DataError: shapes that differ, no pixel to count, values that are not finite.
+    """
+    reference, ours = np.asarray(reference), np.asarray(ours)
+    if reference.shape != ours.shape:
+        raise DataError(f"PSNR of images {reference.shape} and {ours.shape}; expected the same shape")
+    if mask is not None:
+        reference, ours = reference[mask], ours[mask]
+    if reference.size == 0:
+        raise DataError("PSNR over no pixels; expected some")
+    difference = np.clip(reference, 0, 1) - np.clip(ours, 0, 1)
+    error = float(np.mean(np.square(difference, dtype=np.float64)))
+    if not math.isfinite(error):
+        raise DataError("PSNR of images that are not finite")
+    return min(CAP, -10 * math.log10(error)) if error > 0 else CAP
+
+
+def ssim(reference: np.ndarray, ours: np.ndarray) -> float:
+    """Return the mean SSIM of RGB images in [0, 1]: 11 x 11 Gaussian window, sigma 1.5, data range 1.
+
+    The mean is over channels and over the pixels whose window lies inside the image: what scikit-image's
+    ``structural_similarity(gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1)`` gives.
+    Structural similarity: Wang, Bovik, Sheikh, Simoncelli 2004.
+
+    Args:
+        reference: (h, w, c), h and w at least 11.
+        ours: of the same shape.
+
+    Raises:
+        DataError: shapes that differ, or an image smaller than the window.
+    """
+    reference, ours = np.asarray(reference), np.asarray(ours)
+    if reference.shape != ours.shape or reference.ndim != 3:
+        raise DataError(f"SSIM of images {reference.shape} and {ours.shape}; expected the same (h, w, c)")
+    if min(reference.shape[:2]) < 2 * RADIUS + 1:
+        raise DataError(f"SSIM of an image of {reference.shape[:2]} pixels; expected at least 11 x 11")
+    return float(np.mean([_ssim(reference[..., c], ours[..., c]) for c in range(reference.shape[2])]))
+
+
+def _ssim(a: np.ndarray, b: np.ndarray) -> float:
+    """Return the mean SSIM of a channel (h, w)."""
+    kernel = _gaussian(RADIUS, SIGMA)
+    # differences from mid-grey keep the cancellation in the variances small in float32
+    a = np.ascontiguousarray(a, dtype=np.float32) - np.float32(0.5)
+    b = np.ascontiguousarray(b, dtype=np.float32) - np.float32(0.5)
+    mean_a, mean_b, aa, bb, ab = (separable(image, kernel, kernel) for image in (a, b, a * a, b * b, a * b))
+    variances = (aa - mean_a * mean_a) + (bb - mean_b * mean_b)
+    covariance = ab - mean_a * mean_b
+    mean_a += np.float32(0.5)
+    mean_b += np.float32(0.5)
+    structure = (2 * covariance + np.float32(C2)) / (variances + np.float32(C2))
+    luminance = (2 * mean_a * mean_b + np.float32(C1)) / (mean_a * mean_a + mean_b * mean_b + np.float32(C1))
+    return float((structure * luminance).mean(dtype=np.float64))
+
+
+def _gaussian(radius: int, sigma: float) -> np.ndarray:
+    """Return the kernel (2 radius + 1,) of a blur, float64; its sum is 1."""
+    kernel = np.exp(-0.5 * (np.arange(-radius, radius + 1) / sigma) ** 2)
+    result: np.ndarray = kernel / kernel.sum()
+    return result
+
+
+@dataclass(frozen=True)
+class ViewScore:
+    """Scores of one view; None where a number has no meaning for it.
+
+    Attributes:
+        psnr: dB, RGB over black, whole frame; at most 150 (identical images).
+        psnr_white, psnr_alpha: the same over white, and of alpha.
+        psnr_foreground, psnr_white_foreground, psnr_alpha_foreground: over the pixels whose reference alpha
+            is above 0.01; None without any.
+        ssim: over black, whole frame; None for images smaller than 11 x 11, or not asked for.
+        flip: LDR-FLIP over black at 67 pixels per degree, 0 is best; None if not asked for.
+    """
+
+    psnr: float
+    psnr_white: float
+    psnr_alpha: float
+    psnr_foreground: float | None
+    psnr_white_foreground: float | None
+    psnr_alpha_foreground: float | None
+    ssim: float | None
+    flip: float | None
+
+
+@dataclass(frozen=True)
+class Scores(ViewScore):
+    """Means over views of the numbers of `ViewScore`; ``dataclasses.asdict`` gives what JSON can hold.
+
+    Views without foreground are counted and skipped in every mean (in the whole-frame ones only while
+    some view has a foreground).
+
+    Attributes:
+        views: views compared.
+        views_without_foreground: of them, those with no reference alpha above 0.01.
+        per_view: the numbers of each view, in order.
+    """
+
+    views: int
+    views_without_foreground: int
+    per_view: list[ViewScore]
+
+
+def score_view(reference: np.ndarray, ours: np.ndarray, *, perceptual: bool = True) -> ViewScore:
+    """Score one view.
+
+    Args:
+        reference: (h, w, 4) premultiplied RGBA, display-referred.
+        ours: of the same shape.
+        perceptual: compute SSIM and FLIP too (about 0.2 s a view of 800 x 800).
+
+    Raises:
+        DataError: shapes that differ or are not (h, w, 4), a value that is not finite.
+    """
+    reference = np.asarray(reference, dtype=np.float32)
+    ours = np.asarray(ours, dtype=np.float32)
+    if reference.shape != ours.shape or reference.ndim != 3 or reference.shape[2] != 4 or 0 in reference.shape:
+        raise DataError(f"views of shape {reference.shape} and {ours.shape}; expected the same (h, w, 4)")
+    for name, image in (("reference", reference), ("our view", ours)):
+        if not np.isfinite(image).all():
+            raise DataError(f"{name}: {np.count_nonzero(~np.isfinite(image))} values are not finite; expected none")
+    pairs = {
+        "": (np.clip(reference[..., :3], 0, 1), np.clip(ours[..., :3], 0, 1)),
+        "_white": (np.clip(over(reference, 1.0), 0, 1), np.clip(over(ours, 1.0), 0, 1)),
+        "_alpha": (reference[..., 3], ours[..., 3]),
+    }
+    seen = reference[..., 3] > FOREGROUND
+    found: dict[str, Any] = {}
+    for name, pair in pairs.items():
+        found |= {f"psnr{name}": psnr(*pair), f"psnr{name}_foreground": psnr(*pair, seen) if seen.any() else None}
+    return ViewScore(
+        **found,
+        ssim=ssim(*pairs[""]) if perceptual and min(seen.shape) > 2 * RADIUS else None,
+        flip=flip(*pairs[""]) if perceptual else None,
+    )
+
+
+def score_views(reference: Iterable[np.ndarray], ours: Iterable[np.ndarray], *, perceptual: bool = True) -> Scores:
+    """Score our views against the reference's.
+
+    Args:
+        reference: (n, h, w, 4) premultiplied RGBA, or an iterable of (h, w, 4) that is read one view at a time.
+        ours: the same.
+        perceptual: compute SSIM and FLIP too.
+
+    Raises:
+        DataError: no views, numbers of views or shapes that differ, a value that is not finite.
+    """
+    views = []
+    for a, b in zip_longest(reference, ours):
+        if a is None or b is None:
+            raise DataError(f"{'more' if b is None else 'fewer'} views in the reference than of ours; expected as many")
+        views.append(score_view(a, b, perceptual=perceptual))
+    return mean_scores(views)
+
+
+def mean_scores(views: list[ViewScore]) -> Scores:
+    """Average scores over views, by the rule of `Scores`.
+
+    Raises:
+        DataError: no views.
+    """
+    if not views:
+        raise DataError("no views to score; expected at least one")
+    seen = [view for view in views if view.psnr_foreground is not None]
+    means: dict[str, Any] = {}
+    for entry in fields(ViewScore):
+        known = [number for view in seen or views if (number := getattr(view, entry.name)) is not None]
+        means[entry.name] = float(np.mean(known)) if known else None
+    return Scores(**means, views=len(views), views_without_foreground=len(views) - len(seen), per_view=views)
+
+
+@dataclass(frozen=True)
+class Texture:
+    """Texture on smooth areas: the root mean square of `band` over a block and its channels, in levels of 255.
+
+    The eye sees a lattice of Gaussians long before squared errors do: where the volume's picture is opaque and smooth,
+    a picture of its Gaussians should be smooth as well.
+
+    Attributes:
+        blocks: that are opaque and smooth in the reference; without any the numbers are None.
+        ours, reference: mean of the blocks.
+        ours_worst, reference_worst: mean of the tenth of the blocks that have most of it, each picture's own tenth.
+    """
+
+    blocks: int
+    ours: float | None
+    reference: float | None
+    ours_worst: float | None
+    reference_worst: float | None
+
+
+def texture(pairs: Iterable[tuple[np.ndarray, np.ndarray]]) -> Texture:
+    """Measure the texture of pictures in the blocks in which their references are opaque and smooth.
+
+    Args:
+        pairs: (reference, ours) of each view, (h, w, 4) premultiplied, display-referred.
+
+    Raises:
+        DataError: shapes that differ or are not (h, w, 4).
+    """
+    found = [np.empty((2, 0))]
+    for reference, ours in pairs:
+        if reference.shape != ours.shape or reference.ndim != 3 or reference.shape[2] != 4:
+            raise DataError(f"views of shape {reference.shape} and {ours.shape}; expected the same (h, w, 4)")
+        if min(reference.shape[:2]) >= BLOCK:
+            both = np.stack([_blocks(np.square(band(i))).mean(axis=(1, 3, 4)) ** 0.5 for i in (reference, ours)])
+            found.append(both[:, (_blocks(reference[..., 3]).min(axis=(1, 3)) > OPAQUE) & (both[0] < SMOOTH)])
+    theirs, own = np.concatenate([both.astype(np.float32) for both in found], axis=1)
+    if not len(own):
+        return Texture(0, None, None, None, None)
+    worst = max(round(WORST * len(own)), 1)
+    tenths = (float(np.sort(numbers)[-worst:].mean()) for numbers in (own, theirs))
+    return Texture(len(own), float(own.mean()), float(theirs.mean()), *tenths)
+
+
+def band(image: np.ndarray) -> np.ndarray:
+    """Return RGB in levels of 255 blurred by `FINE` less blurred by `COARSE` pixels, (h, w, 3); edges are continued."""
+    levels = np.clip(np.asarray(image[..., :3], np.float32), 0, 1) * 255  # as a screen shows them
+    result: np.ndarray = _blurred(levels, FINE) - _blurred(levels, COARSE)
+    return result
+
+
+def _blurred(image: np.ndarray, sigma: float) -> np.ndarray:
+    """Return (h, w, 3) float32 blurred."""
+    reach = math.ceil(REACH * sigma)
+    kernel = _gaussian(reach, sigma).astype(np.float32)
+    padded = np.pad(image, ((reach, reach), (reach, reach), (0, 0)), mode="edge")
+    planes = [separable(np.ascontiguousarray(padded[..., c]), kernel, kernel) for c in range(3)]
+    return np.stack(planes, axis=2)
+
+
+def _blocks(image: np.ndarray) -> np.ndarray:
+    """Return (h, w, ...) as (rows, BLOCK, columns, BLOCK, ...), without the remainder at the lower and right edge."""
+    rows, columns = image.shape[0] // BLOCK, image.shape[1] // BLOCK
+    whole = image[: rows * BLOCK, : columns * BLOCK]
+    return whole.reshape(rows, BLOCK, columns, BLOCK, *image.shape[2:])
