@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.errors import DataError, SeveralComponents, SeveralSteps, UsageError
-from vvgt_cli.volume.blocks import IN_BLOCKS, check_memory, count
+from vvgt_cli.volume.blocks import IN_BLOCKS, check_memory
 from vvgt_cli.volume.components import contiguous, select_component
 from vvgt_cli.volume.headers import printable
 from vvgt_cli.volume.options import ReadOptions
@@ -123,21 +123,15 @@ def described_by(attributes: Mapping[str, Any]) -> list[str]:
 
 
 def labelled_volume(
-    stored: np.ndarray | Callable[[tuple[Any, ...]], np.ndarray],
-    dtype: np.dtype,
-    axes: Sequence[Axis],
-    attributes: Mapping[str, Any],
-    options: ReadOptions,
-    source: str,
-    name: str,
-    chunks: Sequence[int] | None = None,
-) -> Volume:
+    stored: np.ndarray | Callable[[tuple[Any, ...]], np.ndarray], dtype: np.dtype, axes: Sequence[Axis],
+    attributes: Mapping[str, Any], options: ReadOptions, source: str, name: str, chunks: Sequence[int] | None = None,
+) -> Volume:  # fmt: skip
     """Make a volume of an array with named axes.
 
     Args:
         stored: stored values (mapped, perhaps), or a function that reads a part, by a slice or a number for each axis.
         dtype: of the stored values.
-        axes: of the array, slowest first.
+        axes: slowest first.
         attributes: of the array: ``scale_factor``, ``add_offset``, ``_FillValue``, ``missing_value``, ``valid_*``.
         options: ``time`` is the index along the axis of time, ``component`` that along another that is not of space; of
             a single such axis, either.
@@ -157,6 +151,7 @@ def labelled_volume(
         raise DataError(f"{source}: values of type {dtype}; expected integers or floats")
     _warn_of_unread(axes, attributes, options, source)
     space, extra, step = _split_axes(list(axes), options := _numbered(axes, options), source)
+    zyx = _zyx(space, axes)
     chosen = None if options.component == "magnitude" else options.component
     index: list[Any] = [slice(None) if k in space else 0 for k in range(len(axes))]
     for k, flag, value in ((extra, "--component", chosen), (step, "--time", options.time)):
@@ -165,16 +160,16 @@ def labelled_volume(
                 raise UsageError(f"{source}: {flag} {value}: axis {axes[k]}; expected 0 to {axes[k].size - 1}")
             index[k] = slice(None) if value is None else value
     if callable(stored) and options.stored and chunks is not None and len(space) == 3:
-        return _left(stored, dtype, axes, index, _zyx(space, axes), attributes, options, source, name, chunks)
+        return _left(stored, dtype, axes, index, zyx, attributes, options, source, name, chunks)
     if callable(stored):
-        sizes = [n.size if i == slice(None) else 1 for n, i in zip(axes, index, strict=True)]
-        check_memory(count(tuple(sizes)) * dtype.itemsize, source, IN_BLOCKS)
+        size = math.prod(n.size for n, i in zip(axes, index, strict=True) if i == slice(None))
+        check_memory(size * dtype.itemsize, source, IN_BLOCKS)
         values = np.asarray(stored(tuple(index)))
     else:
         values = stored[tuple(index)]
     values, slope, intercept = decode(values, attributes, source)
-    kept, spatial = [k for k in range(len(axes)) if index[k] == slice(None)], [axes[k] for k in _zyx(space, axes)]
-    order = [kept.index(k) for k in _zyx(space, axes)]
+    kept = [k for k in range(len(axes)) if index[k] == slice(None)]
+    order, spatial = [kept.index(k) for k in zyx], [axes[k] for k in zyx]
     if extra is not None and chosen is None:  # the magnitude over an axis of components
         values = np.transpose(values, [*order, kept.index(extra)])
         field, (slope, intercept) = select_component(values, "magnitude", source, scaling=(slope, intercept))
