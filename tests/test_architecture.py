@@ -193,7 +193,7 @@ PROGRAMS = {
     "field/runners.py": {"os._exit", "signal.signal"},
     "jit/worker.py": {"print", "sys.exit", "os._exit"},
     "progress.py": {"print"},
-    "volume/vtk_child.py": {"os._exit"},
+    "volume/vtk/child.py": {"os._exit"},
 }
 ENDINGS = {"print", "sys.exit", "os._exit", "exit", "quit", "signal.signal", "click.echo"}
 

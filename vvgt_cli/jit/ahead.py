@@ -91,7 +91,7 @@ ALL = (
     VOXEL_MOMENTS,
     *COUNT_WHOLE,
     *COUNT_REAL,
-    "vvgt_cli.volume.slc_kernel:decode_plane",
+    "vvgt_cli.volume.plain.run_lengths:decode_runs",
     "vvgt_cli.gaussians.formats.codebook_kernels:cut_clusters",
     "vvgt_cli.gaussians.formats.codebook_kernels:divide",
 )

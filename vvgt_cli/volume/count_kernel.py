@@ -16,7 +16,7 @@ U = nb.uint64  # an index that cannot be negative needs no test
 
 @parallel_kernel("V i8:3")
 def count_values(thread: ThreadSlice, values: np.ndarray, out: np.ndarray) -> None:
-    """Counts of each number in ``values`` (nz, ny, nx) uint8 or uint16; ``out`` (parts, LANES, 256 or 65536), zeros."""
+    """Count each number in ``values`` (nz, ny, nx) uint8 or uint16; ``out`` (parts, LANES, 256 or 65536), zeros."""
     parts = out.shape[0]
     for table in iterations(thread, parts):
         for z in range(table, values.shape[0], parts):
@@ -63,7 +63,7 @@ def range_values(
     ends: np.ndarray,
     numbers: np.ndarray,
 ) -> None:
-    """Range of data values ``slope * stored + intercept`` and of stored ones, and how many of them are finite.
+    """Find the range of data values ``slope * stored + intercept`` and of stored ones; count the finite ones.
 
     ``values`` (nz, ny, nx) float32 or float64; ``whole``: they stand for whole numbers, which all count. ``ends``
     (parts, 4) by `LOW` to `STORED_HIGH`, infinite where there is none; ``numbers`` (parts, 2) by `NAN` and `FINITE`,
@@ -90,7 +90,7 @@ def bin_values(
     half: float,
     out: np.ndarray,
 ) -> None:
-    """Histogram of the finite data values ``slope * stored + intercept`` by the bins of `stats.bins_of`, to the bit.
+    """Count the finite data values ``slope * stored + intercept`` in the bins of `stats.bins_of`, to the bit.
 
     ``values`` (nz, ny, nx) float32 or float64; ``lo``, ``hi`` ends of the bins; ``half`` 1, or 0.5 where the
     difference of the ends is infinite. ``out`` (parts, LANES, bins + 1), zeros; the last column counts the rest.
