@@ -100,7 +100,7 @@ class CellBlocks(Blockwise):
     def _cells(self, box: Box, tile: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the indices and moments of the cells with extinction in a tile (x, y, z) of a box."""
         from vvgt_cli.closed_form.moments import Region, blocks, region_cells
-        from vvgt_cli.closed_form.ranges import visible_blocks
+        from vvgt_cli.dvr.bricks import visible_blocks
 
         grid = self.grid
         exponent = np.array(grid.exponent, np.int64)
@@ -122,7 +122,7 @@ class CellBlocks(Blockwise):
 
     def _summary(self, local: np.ndarray, mass: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
         """Return a tile's mass in cells of the visibility march, its opacity field, and its largest opacity."""
-        from vvgt_cli.closed_form.inset import opaque_depth
+        from vvgt_cli.closed_form.surface_offset import opaque_depth
         from vvgt_cli.closed_form.visibility import summed
 
         grid = self.grid
@@ -192,7 +192,7 @@ class ValueBlocks(Blockwise):
 
     def __call__(self, number: int) -> None:
         """Save the values at points in block ``number``, with the points' numbers over all Gaussians."""
-        from vvgt_cli.closed_form.under import POINTS, offsets, reach, sample_points
+        from vvgt_cli.closed_form.gaussian_samples import POINTS, offsets, reach, sample_points
 
         lo, hi = self.grid.blocks.at(number)
         rows = np.load(self.gaussians, mmap_mode="r")

@@ -149,7 +149,7 @@ class Resident:
 
     def sample(self, gaussians: Gaussians) -> np.ndarray:
         """Implement `Field.sample`."""
-        from vvgt_cli.closed_form.under import POINTS, in_voxels, offsets, sample_points, values_of
+        from vvgt_cli.closed_form.gaussian_samples import POINTS, in_voxels, offsets, sample_points, values_of
 
         self.source.require_scalar_field()
         scene, values = self.scene, np.empty((len(gaussians), 5), np.float32)

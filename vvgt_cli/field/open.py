@@ -201,7 +201,7 @@ def _at_level(read: ReadOptions, path: str, options: BlockOptions, size: int) ->
     """Select a resolution level: the requested one, else the coarsest that is fine enough for the screen."""
     from vvgt_cli.cameras.sets import pixel_width
     from vvgt_cli.closed_form.closed_form import MIN_CELL
-    from vvgt_cli.volume.levels import level_shapes
+    from vvgt_cli.volume.registry import level_shapes
 
     shapes = level_shapes(path, read)
     if not shapes:
@@ -220,7 +220,7 @@ def _at_level(read: ReadOptions, path: str, options: BlockOptions, size: int) ->
 
 def files_of(path: str) -> list[Path]:
     """Return the slices of a folder or glob, or the file or other folder itself; an empty list if nothing exists."""
-    from vvgt_cli.volume.slices import matching, slices_of
+    from vvgt_cli.volume.tiff.slices import matching, slices_of
 
     if not os.path.exists(path):
         return matching(path)
