@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from vvgt_cli.cameras import Camera, orbit_views
-from vvgt_cli.cameras.boxed import boxed
+from vvgt_cli.cameras.boxed import to_box_frame
 from vvgt_cli.cameras.files import read_cameras, transforms_json
 from vvgt_cli.cameras.sets import SIZE
 from vvgt_cli.conversion.gaussian_files import file_rule, open_gaussians
@@ -71,7 +71,7 @@ class RenderRequest:
         if self.camera is not None:
             return read_cameras(self.camera, self.size)
         cameras = orbit_views(self.orbit or 0, size=self.size or size or SIZE)
-        return [boxed(camera, upright_matrix(up))[0] for camera in cameras]
+        return [to_box_frame(camera, upright_matrix(up))[0] for camera in cameras]
 
 
 def _check_directory(request: RenderRequest, names: list[str]) -> None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vvgt_cli.cameras import Camera
-from vvgt_cli.cameras.boxed import boxed, render_in_box
+from vvgt_cli.cameras.boxed import render_in_box, to_box_frame
 from vvgt_cli.commands.view_files import POINTS
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.blocked import Blocked
@@ -74,7 +74,7 @@ def draw_in_blocks(
     def inside(camera: Camera) -> np.ndarray:
         if not field.pictures:
             many = max(TOGETHER // (camera.width * camera.height), 1)
-            field.views.expect([Picture(boxed(other, axes)[0], settings) for other in left[:many]])
+            field.views.expect([Picture(to_box_frame(other, axes)[0], settings) for other in left[:many]])
             del left[:many]
         image = field.views.view(camera, settings)
         field.views.forget(Picture(camera, settings))

@@ -134,7 +134,7 @@ class Series(Batch):
         with run.stage("frames") as stage:
             found = survey(steps, source.labels, source.tf, console, request.blocks is not None)
             source = replace(source, statistics=found.whole)
-            if found.first.unasked:  # said once, not for every frame
+            if found.first.components_message:  # said once, not for every frame
                 steps = [replace(step, read=replace(step.read, component=ALL)) for step in steps]
             if source.labels is None and found.labels is not None:
                 source = replace(source, labels=AUTO)

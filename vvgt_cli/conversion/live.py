@@ -135,7 +135,7 @@ def _of_layers(run: Run, request: ConvertRequest, field: Field) -> tuple[Gaussia
     for number, layer in enumerate(source.layers):
         share = replace(request, fit=replace(request.fit, max_gaussians=max(left // (count - number), 1)))
         run.console.say(f"layer {number} of {count}: {layer.name}")
-        alone = field.with_look(source.alone(number))
+        alone = field.with_look(source.single_layer(number))
         said = replace(_facts(alone.source, count), name=layer.volume.name, distance=layer.unit_distance)
         facts.append(replace(said, dims=source.volume.dims))
         try:

@@ -95,7 +95,7 @@ class Blocked:
         edge: approximate edge of a block in voxels.
         visible: approximate number of voxels with extinction.
         key: digest of everything that the field depends on.
-        look: maps a source of the same volumes to that source with statistics, its reader and its visible voxels.
+        prepare_look: maps a source of the same volumes to that source with statistics, reader and visible voxels.
         pictures: rendered or expected pictures, by digest.
         grid: the grid of base cells, once they are integrated.
         views: renderer of its pictures; None selects the field itself.
@@ -107,7 +107,7 @@ class Blocked:
     edge: int
     visible: float
     key: str
-    look: Callable[[Source], tuple[Source, Reader, float]]
+    prepare_look: Callable[[Source], tuple[Source, Reader, float]]
     pictures: dict[str, tuple[Picture, np.ndarray | None]] = field(default_factory=dict)
     grid: CellGrid | None = None
     views: ViewRenderer = field(default=None)  # type: ignore[assignment] # set below
@@ -169,7 +169,7 @@ class Blocked:
         while blocks(exponents(step, level))[1].max() > 1 << TILE_BITS:
             level += 1  # voxels so thin that a block has too many cells
         grid, todo = self._grid(exponents(step, level)), self._pending()
-        rays = self._file([(one, one.first()) for one in todo], grid) if todo else None
+        rays = self._file([(one, one.first_pass()) for one in todo], grid) if todo else None
         if rays is not None:
             self.run_pass.store.prepare(rays.kind)
         return CellBlocks(self.reader, grid, self.run_pass.store, rays, self.light)
@@ -234,7 +234,7 @@ class Blocked:
     def _render_pending(self) -> None:
         """Render all expected pictures together, in at most two passes."""
         todo, grid = self._pending(), self.grid or self._grid(np.zeros(3, np.int64))
-        for asked in (Drawing.first, Drawing.more):
+        for asked in (Drawing.first_pass, Drawing.second_pass):
             wanted = [(one, rays) for one in todo if (rays := asked(one))]
             if not wanted:
                 continue
@@ -248,7 +248,7 @@ class Blocked:
                     one.add(part, next(seen))
             seen.close()  # closes the mapped files, too
         for one in todo:
-            image = one.seen if one.blocks is not None else one.image()
+            image = one.colors if one.blocks is not None else one.image()
             self.pictures[one.key] = self.pictures[one.key][0], image
 
     def _visible_blocks(self) -> list[int]:
@@ -310,13 +310,13 @@ class Blocked:
 
     def with_look(self, source: Source) -> Blocked:
         """Implement `Field.with_look`; the new field's blocks go to a subfolder of this field's store."""
-        source, reader, visible = self.look(source)
+        source, reader, visible = self.prepare_look(source)
         volumes = [id(volume) for volume in self.source.volumes]
         shown = [volumes.index(id(volume)) for volume in source.volumes]
         key = digest(self.key, source.shown_as(), [layer.tf for layer in source.layers], shown)
         store = BlockStore(self.run_pass.store.folder / f"shown-{key[:16]}")
         store.open({"shown": key}, ours=True)
-        return Blocked(source, reader, replace(self.run_pass, store=store), self.edge, visible, key, self.look)
+        return Blocked(source, reader, replace(self.run_pass, store=store), self.edge, visible, key, self.prepare_look)
 
     @cached_property
     def _digest(self) -> str | None:

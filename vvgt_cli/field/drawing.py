@@ -27,11 +27,11 @@ class Drawing:
     blocks: Blocks | None
 
     @cached_property
-    def seen(self) -> np.ndarray:
-        """Colours (n, 4) float32 of the pixels of `everywhere`, row by row."""
-        return np.zeros((int(self.everywhere().sum()), 4), np.float32)
+    def colors(self) -> np.ndarray:
+        """Colours (n, 4) float32 of the pixels of `pixel_mask`, row by row."""
+        return np.zeros((int(self.pixel_mask().sum()), 4), np.float32)
 
-    def everywhere(self) -> np.ndarray:
+    def pixel_mask(self) -> np.ndarray:
         """Return the mask (h, w) of the pixels to render."""
         shape = self.camera.height, self.camera.width
         return np.ones(shape, bool) if self.blocks is None else self.blocks.mask()
@@ -39,19 +39,19 @@ class Drawing:
     def image(self) -> np.ndarray:
         """Return the picture (h, w, 4), zero outside the blocks."""
         whole = np.zeros((self.camera.height, self.camera.width, 4), np.float32)
-        whole[self.everywhere()] = self.seen
+        whole[self.pixel_mask()] = self.colors
         return whole
 
-    def first(self) -> list[Rays]:
+    def first_pass(self) -> list[Rays]:
         """Return the rays of the first pass."""
-        return first_rays(self.settings, self.everywhere())
+        return first_rays(self.settings, self.pixel_mask())
 
-    def more(self) -> list[Rays]:
+    def second_pass(self) -> list[Rays]:
         """Return the rays of the second pass."""
-        return more_rays(self.settings, self.image(), self.everywhere())
+        return more_rays(self.settings, self.image(), self.pixel_mask())
 
     def add(self, rays: Rays, shown: np.ndarray) -> None:
         """Average in the colours that ``rays`` see, (pixels, rays, 4) float64."""
         offsets, mask, known = rays
-        at = mask[self.everywhere()]
-        self.seen[at] = (known * self.seen[at] + shown.sum(axis=1)) / (known + len(offsets))
+        at = mask[self.pixel_mask()]
+        self.colors[at] = (known * self.colors[at] + shown.sum(axis=1)) / (known + len(offsets))

@@ -53,7 +53,7 @@ class Content:
         layer: number of the requested component, None for all.
         stored: values stay in the file, and derived volumes are computed block by block.
         names: names of the channels, where they have any.
-        unasked: the reader's message about several components if all channels are shown by default, else None.
+        components_message: the reader's message about several components if all are shown by default, else None.
     """
 
     volumes: tuple[Volume, ...]
@@ -64,7 +64,7 @@ class Content:
     layer: int | None = None
     stored: bool = False
     names: Sequence[str] = ()
-    unasked: str | None = None
+    components_message: str | None = None
 
     @property
     def single_volume(self) -> bool:
@@ -144,8 +144,8 @@ def content_of(source: Volume | Content) -> Content:
 def open_content(source: str, read: ReadOptions) -> Content:
     """Open a file as one volume, or as its components if ``read.component`` or the file asks for that.
 
-    That is the case for "color" and "all", for a file of colours, and by default for up to `MOST_CHANNELS` channels of
-    a microscope.
+    Components are returned for "color" and "all", for a file of colours, and by default for up to `MOST_CHANNELS`
+    channels of a microscope.
 
     Raises:
         DataError, UsageError: see `open_volume`; also for components that are not colours.
@@ -155,8 +155,8 @@ def open_content(source: str, read: ReadOptions) -> Content:
         volume = open_volume(source, replace(read, component=None) if asked else read)
     except SeveralComponents as error:
         overlapping = not asked and holds_table(source)
-        unasked = not (asked or error.color or overlapping)
-        if unasked and not (error.channels and error.count <= MOST_CHANNELS):
+        by_default = not (asked or error.color or overlapping)
+        if by_default and not (error.channels and error.count <= MOST_CHANNELS):
             raise
         if asked == COLOR and error.count not in (3, 4):
             raise UsageError(f"{source}: {error.count} components; expected 3 or 4 for --component color") from None
@@ -166,7 +166,15 @@ def open_content(source: str, read: ReadOptions) -> Content:
         colors = error.colors or [None] * error.count
         named = tuple(replace(v, name=f"{v.name} {k}") for k, v in enumerate(parts))
         return Content(
-            named, False, colors, source, overlapping, None, read.stored, error.names, str(error) if unasked else None
+            named,
+            False,
+            colors,
+            source,
+            overlapping,
+            None,
+            read.stored,
+            error.names,
+            str(error) if by_default else None,
         )
     if asked:
         raise UsageError(f"{source}: one component; expected several: omit --component {asked}")
@@ -274,7 +282,7 @@ def functions_of(
         if tf is None:
             return [from_histogram(numbers[0], one.hounsfield, one.density)]
         return [resolve(tf, numbers[0], tf_range, one.hounsfield)]
-    if opened.unasked:
+    if opened.components_message:
         _warn_all_channels(opened, tf)
     names = opened.names or [""] * len(numbers)
     return [_channel(k, names[k], opened.colors[k], its, tf, tf_range) for k, its in enumerate(numbers)]
@@ -283,7 +291,7 @@ def functions_of(
 def _warn_all_channels(opened: Content, tf: TransferFunction | None) -> None:
     """Warn that all channels are shown; refuse a function, which could belong to any of them."""
     if tf is not None:
-        raise UsageError(f"{opened.unasked} (--tf is for one channel; with all, each is shown with its opacity)")
+        raise UsageError(f"{opened.components_message} (--tf is for one channel; with all, each has its own opacity)")
     known = opened.names or [""] * len(opened.volumes)
     shown = [
         f"{k}{f' {name!r}' if name else ''} {_hex(channel_color(k, color))}"

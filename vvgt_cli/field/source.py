@@ -122,7 +122,7 @@ class Source:
         """Statistics over the whole series, or of the volume if it is not part of one."""
         return self.series[0] if self.series else self.statistics
 
-    def alone(self, number: int) -> Source:
+    def single_layer(self, number: int) -> Source:
         """Return one of the layers as a source of its own, unlit, with the statistics of the first layer."""
         layer = self.layers[number]
         return Source((layer,), layer.volume, self.statistics, series=self.series[number : number + 1])

@@ -153,7 +153,7 @@ class TiledTree:
         self.top = pyramid(places, edge, fill)
         self._capped = cap_by_ancestors(self.top, split_score(self.top))
         self._above = self._capped[self.top.parent]
-        self._above[-1] = np.inf  # the root is there at any threshold
+        self._above[-1] = np.inf  # the root appears at any threshold
 
     def _tree(self, tile: Tile) -> Tree:
         return build_tree(self._cells(tile), self._seen, np.array(self._grid.step), self._levels)

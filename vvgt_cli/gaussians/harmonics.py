@@ -131,7 +131,7 @@ def turned(gaussians: Gaussians, matrix: np.ndarray) -> np.ndarray | None:
 def mixing(matrix: np.ndarray, degree: int) -> np.ndarray:
     """Return the matrix (M, M) that applies an orthogonal ``matrix`` (3, 3) to coefficients; degrees do not mix.
 
-    It is solved on directions all over the sphere. That is exact up to rounding, because a rotated harmonic is a sum of
+    It is solved on directions all over the sphere, which is exact up to rounding: a rotated harmonic is a sum of
     harmonics of the same degree.
     """
     points, inverses = _solver()

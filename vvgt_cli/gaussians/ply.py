@@ -199,7 +199,7 @@ def _rows(source: str | Path | BinaryIO, name: str) -> tuple[PlyHeader, np.ndarr
 
 
 def check_size(header: PlyHeader, size: int, name: str) -> None:
-    """Raise DataError unless a file of ``size`` bytes is as long as its header says."""
+    """Raise DataError unless a file of ``size`` bytes has the size that its header states."""
     expected = header.size + header.count * header.dtype.itemsize
     if size != expected:
         what = "truncated" if size < expected else "followed by data that is not Gaussians"

@@ -90,7 +90,7 @@ def outermost(clouds: Sequence[Splats]) -> list[list[float]]:
     return found
 
 
-def drawing(splats: Splats) -> dict[str, Any]:
+def rule_parameters(splats: Splats) -> dict[str, Any]:
     """Return the viewer's parameters for the rendering rule that the file names, or for the default one."""
     matches = (_RULE.match(line) for line in splats.comments)
     rule = RULES.get(next((found[1] for found in matches if found), ""), INRIA)
@@ -118,7 +118,7 @@ def page(
         more: further entries of the scene for the viewer.
     """
     seen = {"camera": camera(splats), "outermost": outermost([splats])}
-    return _text(title, {"rule": drawing(splats), **seen, "frames": list(frames), **more}, elements)
+    return _text(title, {"rule": rule_parameters(splats), **seen, "frames": list(frames), **more}, elements)
 
 
 def waiting_page(title: str, elements: str) -> str:
@@ -174,7 +174,7 @@ def html_of_several(
     return page(title_of(name), clouds[0][1], frames, "\n".join(elements), more).encode("utf-8")
 
 
-def framed(content: bytes, name: str) -> str:
+def iframe(content: bytes, name: str) -> str:
     """Return an iframe for notebooks that shows a page without access to the enclosing page or the network."""
     text = escape(content.decode("utf-8"))
     style = "width: 100%; height: 540px; border: 0; background: #000"
