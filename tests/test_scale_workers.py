@@ -319,7 +319,7 @@ def test_slurm_that_is_not_there_or_refuses_is_a_line(vvgt, raw, tmp_path, slurm
         monkeypatch.setenv(name, value)
     run = vvgt(*call)
     assert run.code == 2
-    assert "give --memory" in run.err
+    assert "expected --memory" in run.err
     run = start(*call, "--memory", "3G", **variables, SBATCH_REFUSES="1")
     said = run.communicate(timeout=300)[1]
     assert (run.returncode, said.count("\n")) == (1, 1), said
