@@ -33,6 +33,7 @@ exclude_patterns = [".*", "benchmarks", "build", "node_modules", "out", "tests",
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 myst_heading_anchors = 4
 autodoc_typehints = "description"
+smartquotes = False
 html_theme = "furo"
 html_copy_source = False
 
@@ -78,12 +79,12 @@ def options(match: re.Match[str]) -> str:
 
 def combinations(match: re.Match[str]) -> str:
     """Return the table of options that a batch or an output does not take, and what to do instead."""
-    rows = [
-        f"| {kind} | {escaped(option)} | {escaped(reason)} |"
-        for kind, refused in CANNOT.items()
-        for option, reason in refused.items()
-    ]
-    return "\n".join(["| converted | refused | why, and what to do |", "| --- | --- | --- |", *rows])
+    rows = ["| converted | refused | why, and what to do |", "| --- | --- | --- |"]
+    for kind, refused in CANNOT.items():
+        for reason in dict.fromkeys(refused.values()):
+            names = ", ".join(f"`{option}`" for option, why in refused.items() if why == reason)
+            rows.append(f"| {kind} | {names} | {escaped(reason)} |")
+    return "\n".join(rows)
 
 
 def complete(app: Sphinx, page: str, source: list[str]) -> None:
