@@ -1,4 +1,4 @@
-"""`Workload`: the counts and timings that stage costs depend on (docs/plan.md says how these were fitted)."""
+"""`Workload`: the counts and timings that stage costs depend on (fit: docs/optimize.md, "The plan")."""
 
 from __future__ import annotations
 

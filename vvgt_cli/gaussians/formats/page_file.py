@@ -1,7 +1,7 @@
 """The HTML page that shows Gaussians, and its single-file form, which opens without a server.
 
 `page/` holds the template and `viewer.js.gz`, which `make page` builds from `page.mjs`, SuperSplat's viewer and the
-PlayCanvas engine (docs/dependencies.md).
+PlayCanvas engine (CONTRIBUTING.md, "Dependencies").
 """
 
 from __future__ import annotations
