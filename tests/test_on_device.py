@@ -102,8 +102,8 @@ def descent(monkeypatch):
     def made(start, cameras, options, free=None, device="cpu"):
         return frame(start, cameras, options, free, "cpu", dense)
 
-    frame = module.DeviceFrame
-    monkeypatch.setattr(module, "DeviceFrame", made)
+    frame = module.OwnAxesOnDevice
+    monkeypatch.setattr(module, "OwnAxesOnDevice", made)
     return module
 
 

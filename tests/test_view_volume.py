@@ -33,7 +33,7 @@ from vvgt_cli.errors import DataError
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import PlyOptions, read_ply, write_ply
 from vvgt_cli.gaussians.formats.page_file import read_html
-from vvgt_cli.gaussians.formats.page_live import live_parts
+from vvgt_cli.gaussians.formats.page_live import live_page_data
 from vvgt_cli.gaussians.live import Table, baked
 from vvgt_cli.look.lighting import Lighting
 from vvgt_cli.progress import Console
@@ -312,7 +312,7 @@ def test_a_saved_file_has_the_light_of_the_file_or_of_the_page(desk: tuple[str, 
     assert kept.options.light == side
     assert kept.options.function == "mine"
     np.testing.assert_allclose(kept.gaussians.colors, lit(dark, side).colors, atol=1e-5)
-    begun = live_parts([(lit_file.gaussians, lit_file.options)])[2]["light"]
+    begun = live_page_data([(lit_file.gaussians, lit_file.options)])[2]["light"]
     again = saved(light=begun).options.light
     assert again is not None
     np.testing.assert_allclose(again.directions, side.directions, atol=1e-12)

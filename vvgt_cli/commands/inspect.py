@@ -26,10 +26,10 @@ from vvgt_cli.look.labels import LabelTable
 from vvgt_cli.look.readers import SUFFIXES
 from vvgt_cli.look.readers.names import names
 from vvgt_cli.volume import ReadOptions
-from vvgt_cli.volume.packed import Packed
+from vvgt_cli.volume.blocks import Packed
 from vvgt_cli.volume.registry import contents
 from vvgt_cli.volume.space import axis_facts
-from vvgt_cli.volume.vtk_family import is_index as is_vtk_index
+from vvgt_cli.volume.vtk import is_index as is_vtk_index
 
 if TYPE_CHECKING:
     from vvgt_cli.field.layered import Content
@@ -173,20 +173,20 @@ def _volume(file: str, read: ReadOptions) -> dict[str, Any]:
 
 def _choice(file: str, read: ReadOptions, option: str, name: str) -> dict[str, Any]:
     """One of several volumes of a file: size, type, range where few values have to be read for it."""
-    from vvgt_cli.field.layered import open_parts
+    from vvgt_cli.field.layered import open_content
     from vvgt_cli.volume import statistics
 
     facts: dict[str, Any] = {"choice": option, **({"name": name} if name not in ("", option.partition(" ")[2]) else {})}
     read = replace(read, stored=True, packed=True)
     try:
         try:
-            content = open_parts(file, read)
+            content = open_content(file, read)
         except SeveralSteps as error:
             facts["time_steps"] = error.steps
-            content = open_parts(file, replace(read, time=0))
+            content = open_content(file, replace(read, time=0))
         except SeveralComponents as error:
             facts["components"] = error.count
-            content = open_parts(file, replace(read, component=0))
+            content = open_content(file, replace(read, component=0))
         volume = content.volumes[0]
         facts |= {"dims": volume.dims, "dtype": volume.data.dtype.name}
         if len(content.volumes) > 1:
@@ -216,7 +216,7 @@ def _channels(content: Content) -> list[dict[str, Any]]:
 
 
 def _one(file: str, read: ReadOptions) -> dict[str, Any]:
-    from vvgt_cli.field.layered import open_parts
+    from vvgt_cli.field.layered import open_content
     from vvgt_cli.look import unit_distance
     from vvgt_cli.look.histogram import fitting
     from vvgt_cli.volume import statistics
@@ -224,7 +224,7 @@ def _one(file: str, read: ReadOptions) -> dict[str, Any]:
 
     listed = contents(file, read)
     try:
-        content = open_parts(file, replace(read, packed=True))
+        content = open_content(file, replace(read, packed=True))
     except UsageError as error:  # a choice that is missing: the lists say how to make it
         if not listed or (read.array, read.component, read.time) != (None, None, None):
             raise

@@ -48,18 +48,18 @@ def fog_of_labels(field: Field, labels: tuple[Label, ...]) -> Field:
     assert isinstance(layer.tf, LabelTable)
     voxels = counts_of(layer.volume)
     table = label_fog(layer.tf, {e.number: voxels.get(float(e.number), 0) for e in labels})
-    return field.with_look(field.source.labelled_by([table]))
+    return field.with_look(field.source.with_tables([table]))
 
 
 def carrying_labels(run: Run, field: Field, start: Start, labels: tuple[Label, ...]) -> Gaussians:
     """Gaussians of the fog with the rows of their labels, without those that lie in none."""
-    from vvgt_cli.closed_form.labelled import labelled
+    from vvgt_cli.closed_form.labelled import assign_labels
 
     assert start.leaves is not None
     frame, source = field.source.volume.unit_frame(), field.source
     with run.stage("labels") as stage:
         maps = [(source.layers[0].volume, [label.number for label in labels])]
-        owner, gradient = labelled(start.gaussians, maps, np.array(frame.half), np.array(frame.step))
+        owner, gradient = assign_labels(start.gaussians, maps, np.array(frame.half), np.array(frame.step))
         known = np.flatnonzero(owner >= 0)
         gaussians, leaves = start.gaussians.take(known), start.leaves.take(known)
         owner, gradient = owner[known], gradient[known]

@@ -10,23 +10,22 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vvgt_cli.dvr import shading
 from vvgt_cli.dvr.kernel import (
     FLAGS,
     OPAQUE,
     U,
+    Vector,
     box_span,
     inverse,
     is_flat,
     pass_segment,
-    pixels_of,
     sample,
     skip,
     table_coordinate,
     values_met,
 )
 from vvgt_cli.dvr.layout import Optics, Voxels
-from vvgt_cli.dvr.runs import BORROWED
+from vvgt_cli.dvr.march import LEAP, direction, shade_segment
 from vvgt_cli.dvr.vectors import add, lane, zeros4
 from vvgt_cli.jit.cache import source_digest
 from vvgt_cli.jit.decorators import inlined
@@ -34,34 +33,34 @@ from vvgt_cli.jit.decorators import inlined
 if TYPE_CHECKING:
     from vvgt_cli.dvr.scene import Scene
 
-LEAP = 8  # samples between two looks at the empty-space map
 THREADS = 128  # of a block
 REGISTERS = 96  # of a thread: rays wait for memory, so that many of them beat few that keep all in registers
-Draw = Callable[..., None]  # arguments as of `kernel.render_tiles` from ``eye`` on
+Draw = Callable[..., None]  # arguments as of `march.render_tiles` from ``eye`` on
 
-_jit = inlined(fastmath=FLAGS, error_model="numpy", **BORROWED)
+_jit = inlined(fastmath=FLAGS, error_model="numpy", borrowed=True)
 
 
 @_jit
 def cast(
-    voxels: Voxels, optics: Optics, empty: np.ndarray, light: Any, px: float, py: float, pz: float, dx: float,
-    dy: float, dz: float, step: float,
-) -> tuple[float, float, float, float]:  # fmt: skip
-    """Follow a ray as `kernel.cast` does, or `lit.cast` where there is a ``light``, in float64 and sample by sample.
+    voxels: Voxels, optics: Optics, empty: np.ndarray, light: Any, p: Vector, d: Vector, step: float
+) -> tuple[float, float, float, float]:
+    """Return premultiplied (r, g, b, alpha) along a ray, as `march` does, in float64 and sample by sample.
 
-    Runs of samples are for vector instructions, which a thread of a GPU does not have.
+    Runs of samples are for vector instructions, which a thread of a GPU does not have. Arguments as of `march`.
     """
+    (px, py, pz), (dx, dy, dz) = p, d
     nz, ny, nx = voxels.values.shape
-    seen, trans = zeros4(), 1.0
-    red = green = blue = 0.0
+    seen, flat = zeros4(), is_flat(optics)
+    trans, red, green, blue = 1.0, 0.0, 0.0, 0.0
     t0, t1 = box_span(px, py, pz, dx, dy, dz, nx, ny, nz)
     if not t1 > t0:
         return 0.0, 0.0, 0.0, 0.0
-    count = max(int(math.ceil((t1 - t0) * math.sqrt(dx * dx + dy * dy + dz * dz) / step)), 1)  # noqa: RUF046 # a float on the device
+    steps = math.ceil((t1 - t0) * math.sqrt(dx * dx + dy * dy + dz * dz) / step)
+    count = max(int(steps), 1)  # a float on the device
     dt = (t1 - t0) / count
     opaque = OPAQUE * min(step * step, 1.0)
     ix, iy, iz, per_step = inverse(dx), inverse(dy), inverse(dz), 1.0 / dt
-    flat = is_flat(optics)
+    look = d if light is None else (dx * light.edge[0], dy * light.edge[1], dz * light.edge[2])
     before = u0 = -1.0  # -1: no sample there, or not finite
     i, stop, known = 0, 0, -1
     ahead = 0.0  # sample ``known``, asked for before the one ahead of it is used: memory is slow
@@ -69,7 +68,7 @@ def cast(
         if i >= stop:
             at = i - 1 if u0 >= 0.0 else i  # the segment that comes from there is still to be seen
             start = skip((nz, ny, nx), empty, px, py, pz, dx, dy, dz, ix, iy, iz, t0, dt, per_step, count, at)
-            if start > count:
+            if start >= count:
                 break
             if start > at:
                 before, u0, i = -1.0, -1.0, max(start - 1, 0)  # one earlier, for what bends the next
@@ -81,29 +80,17 @@ def cast(
         u1 = table_coordinate(value, optics)
         met = values_met(before, u0, u1, flat)
         if met[0] >= 0.0 and met[1] > optics.dark[U(int(met[0]))]:
-            own, trans, s = pass_segment(
-                voxels, optics, (px, py, pz), (dx, dy, dz), t - dt, dt, u0, u1, met, zeros4(), trans
-            )
+            own, trans, s = pass_segment(voxels, optics, p, d, t - dt, dt, u0, u1, met, zeros4(), trans)
             if light is None:
                 seen = add(seen, own)
-            else:
-                factor, white = shading.shading(
-                    voxels.values, light, px + s * dx, py + s * dy, pz + s * dz,
-                    dx * light.edge[0], dy * light.edge[1], dz * light.edge[2],
-                )  # fmt: skip
-                most = lane(own, 3)
-                white *= most
-                red += min(factor * lane(own, 0) + white, most)
-                green += min(factor * lane(own, 1) + white, most)
-                blue += min(factor * lane(own, 2) + white, most)
+            elif lane(own, 3) > 0.0:
+                r, g, b = shade_segment(own, light, voxels.values, p, d, look, s)
+                red, green, blue = red + r, green + g, blue + b
         before, u0 = u0, u1
         i += 1
     if light is None:
         red, green, blue = lane(seen, 0), lane(seen, 1), lane(seen, 2)
     return red, green, blue, 1.0 - trans
-
-
-_pixel = pixels_of(cast)
 
 
 @_jit
@@ -113,12 +100,16 @@ def _store(
 ) -> None:  # fmt: skip
     """Store the mean of the rays of pixel ``places[n]``, counted row by row, into row ``n`` of ``out`` (m, 4).
 
-    ``camera`` (5, 4): eye, the rows of the basis, lens, as of `kernel.render_tiles`; ``data``: `scene_arrays`.
+    ``camera`` (5, 4): eye, the rows of the basis, lens, as of `march.render_tiles`; ``data``: `scene_arrays`.
     """
-    row, col = places[n] // width, places[n] % width
-    sums = _pixel(data[0], data[1], data[2], light, camera[0], camera[1:4], camera[4], step, col, row, offsets)
-    out[n, 0], out[n, 1] = sums[0] / offsets.shape[0], sums[1] / offsets.shape[0]
-    out[n, 2], out[n, 3] = sums[2] / offsets.shape[0], sums[3] / offsets.shape[0]
+    row, col, rays = places[n] // width, places[n] % width, offsets.shape[0]
+    p = camera[0, 0], camera[0, 1], camera[0, 2]
+    red = green = blue = alpha = 0.0
+    for ray in range(rays):
+        d = direction(camera[1:4], camera[4], col + 0.5 + offsets[ray, 0], row + 0.5 + offsets[ray, 1])
+        r, g, b, a = cast(data[0], data[1], data[2], light, p, d, step)
+        red, green, blue, alpha = red + r, green + g, blue + b, alpha + a
+    out[n, 0], out[n, 1], out[n, 2], out[n, 3] = red / rays, green / rays, blue / rays, alpha / rays
 
 
 @cache
@@ -189,7 +180,7 @@ class DeviceRays:
         return found
 
     def __call__(self, *args: Any) -> None:
-        """Draw pixels; arguments as of `kernel.render_tiles` from ``eye`` on."""
+        """Draw pixels; arguments as of `march.render_tiles` from ``eye`` on."""
         from vvgt_cli.dvr.render import host_rays
 
         if not self.failed:

@@ -7,13 +7,13 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from numbers import Real
-from typing import TYPE_CHECKING, Any, BinaryIO, Protocol, TypeAlias, TypedDict
+from typing import Any, BinaryIO, Protocol, TypeAlias, TypedDict
 
 from vvgt_cli.conversion.index import function_name
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions, Limits
 from vvgt_cli.conversion.result import Result
 from vvgt_cli.errors import UsageError
-from vvgt_cli.field.layered import Content, open_parts
+from vvgt_cli.field.layered import Content, open_content
 from vvgt_cli.field.source import SourceRequest, parse_layer
 from vvgt_cli.look import TransferFunction
 from vvgt_cli.look.label_files import table_of
@@ -24,11 +24,8 @@ from vvgt_cli.volume import ReadOptions, Volume
 from vvgt_cli.volume.dask_arrays import is_dask, lazy
 from vvgt_cli.volume.stored import Stored
 
-if TYPE_CHECKING:
-    from vvgt_cli.library.session import Session
-
 PathLike = str | os.PathLike[str]
-VolumeLike: TypeAlias = "PathLike | Volume | Content | Session | ArrayLike | VtkImage"
+VolumeLike: TypeAlias = "PathLike | Volume | Content | ReadAlready | ArrayLike | VtkImage"
 LightLike = LightOptions | str | Sequence[float] | Sequence[str | Sequence[float]] | None
 LabelsLike = PathLike | Mapping[Any, Mapping[str, Any]] | LabelTable
 LayerLike = PathLike | SourceRequest
@@ -43,6 +40,13 @@ class ArrayLike(Protocol):
 
     @property
     def dtype(self) -> Any: ...
+
+
+class ReadAlready(Protocol):
+    """A `Session`."""
+
+    @property
+    def content(self) -> Content: ...
 
 
 class VtkImage(Protocol):
@@ -120,7 +124,7 @@ def _name_of(function: FunctionLike | None) -> str:
 
 
 @dataclass(frozen=True)
-class Goal(FitOptions, Limits):
+class Goal(Limits, FitOptions):
     """What a conversion is for: the attributes of `FitOptions` and `Limits`.
 
     Attributes:
@@ -210,7 +214,7 @@ def content_of(volume: VolumeLike, reading: Reading) -> Content:
         DataError, UsageError: as `volume_of`.
     """
     if isinstance(volume, str | os.PathLike):
-        return open_parts(os.fspath(volume), _options(reading))
+        return open_content(os.fspath(volume), _options(reading))
     content = getattr(volume, "content", volume)
     if not isinstance(content, Content):
         return Content((volume_of(volume, reading),))

@@ -1,5 +1,5 @@
 """Descent on a CUDA device: gsplat draws and differentiates, torch steps; the loss, the steps and the schedule of
-`OwnFrame`.
+`OwnAxes`.
 
 What is computed from the start (the numbers that Gaussians share, the axes' order) is made on the CPU, and so are looks
 at the check views, so that figures mean the same on both.
@@ -17,7 +17,7 @@ from vvgt_cli.errors import DeviceFailed
 from vvgt_cli.refine.loop import MEMORY
 from vvgt_cli.refine.shared import sample_of
 from vvgt_cli.refine.ssim import KERNEL
-from vvgt_cli.refine.states import MEDIAN, OUTLIER, OwnFrame
+from vvgt_cli.refine.states import MEDIAN, OUTLIER, OwnAxes
 from vvgt_cli.refine.steps import COUNT, EPSILON, FEATURES, RUN
 from vvgt_cli.refine.texture import SMOOTH
 from vvgt_cli.splat.by_gsplat import capped, draws, picture
@@ -46,8 +46,8 @@ def unfit(gaussians: Gaussians, options: OptimizeOptions) -> str | None:
     return None if draws(options.rule) else f"the rule {options.rule.name}, by which gsplat does not draw"
 
 
-class DeviceFrame(OwnFrame):
-    """`OwnFrame` whose arrays lie on a device, and on the CPU when they are asked for there.
+class OwnAxesOnDevice(OwnAxes):
+    """`OwnAxes` whose arrays lie on a device, and on the CPU when they are asked for there.
 
     Attributes:
         tensors: means, factors M, opacity logits, colours.
@@ -57,7 +57,7 @@ class DeviceFrame(OwnFrame):
         self, gaussians: Gaussians, cameras: Sequence[Camera], options: OptimizeOptions, free: np.ndarray | None = None,
         device: str = "cuda", draw: Callable[..., tuple[Tensor, Tensor]] = picture,
     ) -> None:  # fmt: skip
-        """Put the start on ``device``; ``free`` as of `OwnFrame`, ``draw`` as `picture`.
+        """Put the start on ``device``; ``free`` as of `OwnAxes`, ``draw`` as `picture`.
 
         Raises:
             DeviceFailed: less memory is free there than is needed.
@@ -139,7 +139,7 @@ class DeviceFrame(OwnFrame):
         return error
 
     def slopes(self, camera: Camera, target: Tensor, options: OptimizeOptions) -> tuple[Tensor, float]:
-        """Return slopes as `FrameGradients.rows`, and the RMS error of the picture."""
+        """Return slopes as `AxesGradients.rows`, and the RMS error of the picture."""
         import torch
 
         means, factors, logits, colors = self.tensors
@@ -162,7 +162,7 @@ class DeviceFrame(OwnFrame):
         return torch.cat([d, e, by_logit[:, None], by_color], dim=1).T, float(error)
 
     def move(self, rows: Tensor, error: float, share: float, speed: float) -> None:
-        """Step down ``rows`` (COUNT, K), as `OwnFrame.descend` does."""
+        """Step down ``rows`` (COUNT, K), as `OwnAxes.descend` does."""
         import torch
 
         rates, _ = self.rates(error, share, speed)
@@ -195,7 +195,7 @@ class DeviceFrame(OwnFrame):
         return way
 
     def common_on(self, rows: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Return what `OwnFrame.common` does: the divisors' floors (COUNT,), and what is predicted (KNOWN, K)."""
+        """Return what `OwnAxes.common` does: the divisors' floors (COUNT,), and what is predicted (KNOWN, K)."""
         import torch
 
         if not self.weakest:

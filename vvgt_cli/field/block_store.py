@@ -1,0 +1,173 @@
+"""The folder that holds the results of blocks: one file per block and pass, complete or absent."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vvgt_cli.closed_form.columns import MOMENTS
+from vvgt_cli.errors import DataError, UsageError
+from vvgt_cli.files import atomic_write
+
+RUN = "run.json"
+COUNTS, HISTOGRAM, LABELS, CELLS = "counts", "histogram", "labels", "cells"
+ROW = MOMENTS * 8 + 3  # bytes per cell: moments float64, position in its tile uint8
+
+
+@dataclass(frozen=True)
+class BlockStore:
+    """A folder of block results, each of a kind (the pass) and a block number.
+
+    Attributes:
+        folder: path of the folder.
+    """
+
+    folder: Path
+
+    def open(self, settings: dict[str, Any], ours: bool) -> bool:
+        """Create the folder, or reuse it after a run with the same settings; return whether it existed.
+
+        Args:
+            settings: everything that the results depend on, plain values.
+            ours: the folder belongs to this program, which removes another run's results.
+
+        Raises:
+            UsageError: the folder holds another run's results, or something else.
+            DataError: the folder cannot be written.
+        """
+        text = json.dumps(settings, sort_keys=True, indent=1)
+        place = self.folder / RUN
+        if self.folder.exists() and not (place.is_file() and place.read_text("utf-8") == text):
+            if not ours and any(self.folder.iterdir()) and not place.is_file():
+                raise UsageError(f"{self.folder}: exists and holds no blocks of vvgt; choose another name")
+            if not ours and place.is_file():
+                raise UsageError(
+                    f"{self.folder}: holds the blocks of another run ({differences(place, settings)}); choose another "
+                    "name, or remove the folder"
+                )
+            if ours:
+                shutil.rmtree(self.folder, ignore_errors=True)
+        there = place.is_file()
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise DataError(f"{self.folder}: cannot be created ({error.strerror or error})") from error
+        if not there:
+            with atomic_write(place, overwrite=True) as temporary:
+                temporary.write_text(text, "utf-8")
+        return there
+
+    def kept_edge(self, settings: dict[str, Any]) -> int | None:
+        """Return the block edge of an earlier run with the same settings, None if there was none."""
+        try:
+            found = dict(self.settings())
+        except UsageError:
+            return None
+        edge = found.pop("blocks", None)
+        return edge if found == json.loads(json.dumps(settings)) else None
+
+    def settings(self) -> dict[str, Any]:
+        """Return the settings given to `open`.
+
+        Raises:
+            UsageError: this is not a folder of blocks.
+        """
+        try:
+            found = json.loads((self.folder / RUN).read_text("utf-8"))
+        except (OSError, ValueError):
+            raise UsageError(
+                f"{self.folder}: not a folder of blocks; expected what 'vvgt init --shard' wrote"
+            ) from None
+        return dict(found)
+
+    def path(self, kind: str, number: int, suffix: str = ".npz") -> Path:
+        """Return the path of a block's result."""
+        return self.folder / kind / f"{number:06d}{suffix}"
+
+    def prepare(self, kind: str) -> None:
+        """Create the folder of a pass.
+
+        Raises:
+            DataError: the folder cannot be written.
+        """
+        try:
+            (self.folder / kind).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise DataError(f"{self.folder}: cannot be written ({error.strerror or error})") from error
+
+    def missing(self, kind: str, numbers: Iterable[int]) -> list[int]:
+        """Return those of ``numbers`` that have no result yet."""
+        return [number for number in numbers if not self.path(kind, number).is_file()]
+
+    def save(self, kind: str, number: int, suffix: str = ".npz", **arrays: np.ndarray) -> None:
+        """Write a result atomically; the one with the default suffix comes last and marks the block as done.
+
+        Raises:
+            DataError: the file cannot be written (a full disk).
+        """
+        with (
+            atomic_write(self.path(kind, number, suffix), overwrite=True) as temporary,
+            open(temporary, "wb") as stream,
+        ):
+            np.savez(stream, allow_pickle=False, **arrays)
+
+    def load(
+        self, kind: str, number: int, suffix: str = ".npz", names: Collection[str] | None = None
+    ) -> dict[str, np.ndarray]:
+        """Return the arrays of a result, by default all.
+
+        Raises:
+            DataError: the file is missing or damaged.
+        """
+        path = self.path(kind, number, suffix)
+        try:
+            with np.load(path) as found:
+                return {name: found[name] for name in (found.files if names is None else names)}
+        except Exception as error:
+            raise _unreadable(path, number, error) from error
+
+    def names(self, kind: str, number: int, suffix: str = ".npz") -> frozenset[str]:
+        """Return the names of a result's arrays.
+
+        Raises:
+            DataError: the file is missing or damaged.
+        """
+        path = self.path(kind, number, suffix)
+        try:
+            with np.load(path) as found:
+                return frozenset(found.files)
+        except Exception as error:
+            raise _unreadable(path, number, error) from error
+
+    def bytes(self, kind: str) -> int:
+        """Return the size of all complete files of a pass."""
+        folder = self.folder / kind
+        whole = (path for path in (folder.iterdir() if folder.is_dir() else ()) if not path.name.startswith("."))
+        return sum(path.stat().st_size for path in whole)
+
+    def remove(self) -> None:
+        """Remove the folder."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def _unreadable(path: Path, number: int, error: Exception) -> DataError:
+    """Return the error for a result that cannot be read (zipfile, zlib and numpy raise many types)."""
+    if isinstance(error, FileNotFoundError):
+        return DataError(f"{path}: block {number} is missing; remove its other files and run its shard again")
+    return DataError(f"{path}: damaged ({error}); remove the block's files and run the same command again")
+
+
+def differences(place: Path, settings: dict[str, Any]) -> str:
+    """Return the names of the settings in which another run differs."""
+    try:
+        other = json.loads(place.read_text("utf-8"))
+    except ValueError:
+        return "damaged"
+    names = sorted(key for key in {*other, *settings} if other.get(key) != settings.get(key))
+    return "other " + ", ".join(names)
