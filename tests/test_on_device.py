@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from tests.test_dvr_backends import scene, view
+from vvgt_cli import device
 from vvgt_cli.cameras import default_views
 from vvgt_cli.device import on_device
 from vvgt_cli.dvr import RenderSettings, cuda, render_view, render_views
@@ -164,6 +165,27 @@ def test_a_device_that_fails_in_a_step_says_so(descent, monkeypatch):
         step(state, state.cameras[0], np.zeros((40, 40, 4), np.float32), replace(OPTIONS, device="torch"), None, 0, 1)
 
 
+def test_a_machine_without_a_gpu_is_told_what_is_missing(vvgt, monkeypatch, tmp_path):
+    monkeypatch.setattr(device, "missing", lambda: ["numba-cuda"])
+    convert = "convert", "example:frog", "-o", tmp_path / "f.ply", "--device"
+    assert "--device cuda needs numba-cuda: pip install 'vvgt[cuda]'" in vvgt(*convert, "cuda").error
+    assert device.chosen("auto") == "cpu"
+    assert "none that could be used: numba-cuda not installed" in vvgt("info", "--machine").out.decode()
+    assert "expected a file, or --machine" in vvgt("info").error
+    monkeypatch.setattr(device, "missing", list)
+    monkeypatch.setattr(device, "first_gpu", lambda: None)
+    assert "no CUDA device found; check the driver" in vvgt(*convert, "cuda").error
+    monkeypatch.setattr(device, "first_gpu", lambda: device.Gpu("GPU", 4 * 10**9, 10**10))
+    assert [device.chosen(name) for name in ("auto", "cuda")] == ["cpu", "cuda"]
+    assert "GPU, 4.0 of 10.0 GB free" in vvgt("info", "--machine").out.decode()
+
+
+def test_labels_and_layers_stay_on_the_cpu():
+    said, made = [], replace(scene(), grid=np.zeros((2, 2, 2, 4), np.float32))
+    assert on_device(made, "cuda", said.append) is made
+    assert len(said) == 1
+
+
 @pytest.fixture
 def gpu():
     torch = pytest.importorskip("torch")
@@ -186,8 +208,8 @@ def test_gsplat_draws_and_steps_as_the_kernels_do(gpu, rule):
     start, cameras = gaussians(2000), default_views("train", 4, size=120)
     images = [render(gaussians(2000, 1), camera, rule) for camera in cameras]
     found = []
-    for device in ("cpu", "cuda"):
-        options = replace(OPTIONS, rule=rule, device=device)
+    for where in ("cpu", "cuda"):
+        options = replace(OPTIONS, rule=rule, device=where)
         state, error = begin(start, cameras, options), None
         for n in range(12):
             error = step(state, cameras[n % 4], images[n % 4], options, error, n / 12, 1.0)

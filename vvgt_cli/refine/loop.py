@@ -18,13 +18,12 @@ from vvgt_cli.refine.checkpoint import fingerprint, resume, save
 from vvgt_cli.refine.densify import Densified
 from vvgt_cli.refine.judge import Judge
 from vvgt_cli.refine.options import Check, OptimizeOptions, OptimizeRecord, Progress, Train
-from vvgt_cli.refine.states import Fields, OwnAxes, State
+from vvgt_cli.refine.states import MEMORY, Fields, OwnAxes, State
 from vvgt_cli.splat import blend
 
 SLOWER = 0.5  # rates after a fall
 LOOKS = 8  # at the check views in a run, where that leaves enough steps between two
 SETTLING = 0.5  # share of the run from which on looks without gain count: rates fall only then
-MEMORY = 0.9  # of the running error, a step
 NEAR, FORGOTTEN, LITTLE = 0.3, 0.9, 1e-3  # 1 - cosine between views that are near; what was seen, a step; among equals
 KEEP = 30.0  # seconds after which a run is kept, looks or not
 

@@ -14,10 +14,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vvgt_cli.errors import DeviceFailed
-from vvgt_cli.refine.loop import MEMORY
 from vvgt_cli.refine.shared import sample_of
 from vvgt_cli.refine.ssim import KERNEL
-from vvgt_cli.refine.states import MEDIAN, OUTLIER, OwnAxes
+from vvgt_cli.refine.states import MEDIAN, MEMORY, OUTLIER, OwnAxes
 from vvgt_cli.refine.steps import COUNT, EPSILON, FEATURES, RUN
 from vvgt_cli.refine.texture import SMOOTH
 from vvgt_cli.splat.by_gsplat import capped, draws, picture

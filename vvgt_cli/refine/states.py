@@ -17,6 +17,7 @@ from vvgt_cli.splat import Projection, project
 from vvgt_cli.splat.reference import rotations
 from vvgt_cli.splat.render import fields_backward, moments, own_axes_backward, project_factors, seen_colors
 
+MEMORY = 0.9  # share of the running error that a step keeps
 WARM_UP = 3  # steps
 SMALLEST = 1e-7  # standard deviation, unit frame
 WEAKEST = 0.1  # of the mean size of slopes, added to one's own: what is hardly seen goes less far than the rest
