@@ -54,7 +54,7 @@ def test_no_bars_where_nothing_is_to_be_said():
 def test_quiet_says_nothing():
     stream = Terminal()
     console = Console(quiet=True, stream=stream)
-    console.say("a")
+    console.message("a")
     console.stage("b", 1.0)
     assert stream.getvalue() == ""
 

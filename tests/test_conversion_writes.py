@@ -20,5 +20,5 @@ def test_the_plan_counts_how_often_the_file_is_written(tmp_path, output, options
         ConvertRequest(SourceRequest("example:marschner-lobb:24"), output, FitOptions(400, 48), **options),
         Console(quiet=True),
     )
-    assert found.costs()[-1] == ("write", pytest.approx(times * WRITE * found.case.pace))
+    assert found.costs()[-1] == ("write", pytest.approx(times * WRITE * found.workload.pace))
     assert found.seconds == pytest.approx(sum(seconds for _, seconds in found.costs()))

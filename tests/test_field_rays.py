@@ -207,7 +207,7 @@ def test_a_file_that_no_memory_draws_is_written_without_a_score(vvgt, tmp_path, 
     monkeypatch.setattr("vvgt_cli.conversion.shards.score.A_GAUSSIAN", 1 << 40)
     run = vvgt("init", path, "-o", tmp_path / "b.ply", *FIT[:-1], "--blocks", "64")
     assert run.code == 0
-    assert "left out: test views" in run.err
+    assert "skipped: test views" in run.err
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
 
 

@@ -61,7 +61,7 @@ def earlier(session):
 
 
 def went_on(result):
-    return not [why for name, why in result.report.left_out if name == WARM_START]
+    return not [why for name, why in result.report.skipped if name == WARM_START]
 
 
 def names(result):
@@ -111,10 +111,10 @@ def test_another_light_and_another_size(session, earlier):
 def test_what_is_too_far_is_converted_by_itself(session, earlier, look, goal, why):
     asked = {**GOAL, **goal}
     onward, alone = session.convert(look, asked, after=earlier), session.convert(look, asked)
-    assert why in dict(onward.report.left_out)[WARM_START]
+    assert why in dict(onward.report.skipped)[WARM_START]
     assert np.array_equal(onward.gaussians.means, alone.gaussians.means)
     assert np.array_equal(onward.gaussians.colors, alone.gaussians.colors)
-    assert names(onward)[-1] == "seats"
+    assert names(onward)[-1] == "conditions"
 
 
 def test_refused(session, earlier):

@@ -103,7 +103,7 @@ def test_the_ladder_in_blocks_has_the_same_scores(ladder, vvgt, tmp_path):
     assert [rung["name"] for rung in blocks["runs"]] == [rung["name"] for rung in found["runs"]]
     for one, other in zip(found["runs"], blocks["runs"], strict=True):
         assert one["scores"]["psnr"] == pytest.approx(other["scores"]["psnr"], abs=0.1)
-        assert one["seats"][0]["psnr"] == pytest.approx(other["seats"][0]["psnr"], abs=0.3)
+        assert one["conditions"][0]["psnr"] == pytest.approx(other["conditions"][0]["psnr"], abs=0.3)
 
 
 def test_the_ladders_page_opens_offline_and_shows_its_pictures(ladder):

@@ -71,14 +71,14 @@ def test_what_others_hide_is_there_when_they_are_switched_off(vvgt, tmp_path: Pa
     assert len(core) > 50
     scores = json.loads((tmp_path / "r_3-label-3.json").read_text())
     assert scores["scores"]["psnr"] > 25
-    assert [stage["name"] for stage in scores["plan"]["stages"]] == ["test views", "seats"]
+    assert [stage["name"] for stage in scores["plan"]["stages"]] == ["test views", "conditions"]
     assert scores["gaussians"] == len(core)
 
 
 def test_the_plan_of_a_part_is_of_the_gaussians_that_it_got(vvgt, tmp_path: Path, monkeypatch) -> None:
     counts, cost = [], ViewingConditions.cost
     monkeypatch.setattr(
-        ViewingConditions, "cost", lambda stage, case: counts.append(case.gaussians) or cost(stage, case)
+        ViewingConditions, "cost", lambda stage, workload: counts.append(workload.gaussians) or cost(stage, workload)
     )
     files = converted(vvgt, tmp_path, nested(cut=True), "--report", tmp_path / "r_{}.json")
     names = {1: "r_1-label-1.json", 3: "r_3-label-3.json"}

@@ -58,14 +58,14 @@ class Console:
     stream: TextIO = field(default_factory=lambda: sys.stderr)
     interruption: Interruption = uninterrupted
 
-    def say(self, line: str) -> None:
+    def message(self, line: str) -> None:
         """Print one line: what separates lines in it (in the name of a file, say) becomes a blank."""
         if not self.quiet:
             print(" ".join(line.splitlines()), file=self.stream, flush=True)
 
     def stage(self, name: str, seconds: float, detail: str = "") -> None:
         """Print a stage's line: name, wall seconds, and what there is to say about it."""
-        self.say(f"{name:<16}{seconds:8.2f} s  {detail}".rstrip())
+        self.message(f"{name:<16}{seconds:8.2f} s  {detail}".rstrip())
 
     def bar(self, label: str) -> ProgressCallback | None:
         """A callback ``(done, total)`` that draws a bar, or where no terminal is says a line every half minute."""
@@ -80,7 +80,7 @@ class Console:
             if not terminal:
                 if done < total and now - last >= _LINES:
                     last = now
-                    self.say(f"{label:<16}{now - start:8.2f} s  {100 * done / total:.0f} %")
+                    self.message(f"{label:<16}{now - start:8.2f} s  {100 * done / total:.0f} %")
                 return
             if done >= total:
                 self.stream.write("\r\x1b[K")  # the stage's line follows

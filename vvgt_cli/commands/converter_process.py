@@ -45,7 +45,7 @@ class Telling(Console):
         super().__init__()
         self.tell = tell
 
-    def say(self, line: str) -> None:
+    def message(self, line: str) -> None:
         """A line."""
         self.tell(Said(line))
 
@@ -87,7 +87,7 @@ class Volume:
                 self.table = field.source.tf if isinstance(field.source.tf, LabelTable) else None
                 console.tell(self._paged(live_conversion(run, request, field, ply, scored=False)))
                 return
-        console.say(f"not live, but converted: {why}")
+        console.message(f"not live, but converted: {why}")
         self._converted(replace(request, live=False), console, self._paged)
 
     def under(self, job: Job, console: Telling) -> None:

@@ -35,7 +35,14 @@ from vvgt_cli.refine import OptimizeOptions
 from vvgt_cli.score.checks import Views, judging_views
 from vvgt_cli.score.curves import short
 from vvgt_cli.score.record import ConversionReport, Run
-from vvgt_cli.score.viewing import SIDE, ConditionView, condition_views, from_above, score_conditions, seat_pictures
+from vvgt_cli.score.viewing import (
+    SIDE,
+    ConditionView,
+    condition_pictures,
+    condition_views,
+    from_above,
+    score_conditions,
+)
 from vvgt_cli.score.views import WHOLE, score_seen
 
 if TYPE_CHECKING:
@@ -127,7 +134,7 @@ class Reference:
         step: voxels; ``rays`` a pixel, at most.
         axes: (3, 3) `Volume.axes`: from the box frame, in which the views are, to the unit frame.
         shown: images as `upright` makes them.
-        seats: what is seen from the size made for, and from the next larger.
+        conditions: what is seen from the size made for, and from the next larger.
     """
 
     cameras: list[Camera]
@@ -137,7 +144,7 @@ class Reference:
     rays: int
     axes: np.ndarray
     shown: list[np.ndarray]
-    seats: list[ConditionView]
+    conditions: list[ConditionView]
 
     @classmethod
     def render(cls, volume: Field, size: int, console: Console) -> Reference:
@@ -146,7 +153,7 @@ class Reference:
 
         cameras, axes = default_views("test", size=size), volume.source.volume.axes
         blocks = [spread_blocks(size, size, i) for i in range(len(cameras))]
-        around = seat_pictures(from_above(size), SIDE)
+        around = condition_pictures(from_above(size), SIDE)
         volume.views.expect([Picture(camera, REFERENCE, _drawn(blocks, i)) for i, camera in enumerate(cameras)])
         volume.views.expect([Picture(camera, REFERENCE, part) for _, camera, part in around])
         images, bar = [], console.bar("reference")
@@ -155,9 +162,9 @@ class Reference:
             if bar:
                 bar(i + 1, len(cameras))
         shown = upright(images, cameras, axes, lambda camera: volume.views.view(camera, REFERENCE))
-        seats = list(condition_views(volume.views, from_above(size), REFERENCE, views=SIDE))
+        conditions = list(condition_views(volume.views, from_above(size), REFERENCE, views=SIDE))
         rays = max(rays for _, rays in REFERENCE.tiers)
-        return cls(cameras, blocks, images, REFERENCE.step, rays, axes, shown, seats)
+        return cls(cameras, blocks, images, REFERENCE.step, rays, axes, shown, conditions)
 
     def psnr_of(self, renderer: str, field: Field) -> float | None:
         """Mean PSNR of another renderer's own pictures of the views that are drawn whole; None where it cannot."""
@@ -224,8 +231,8 @@ def run_rungs(
             if report.refinement and report.refinement["reason"] == "interrupted":
                 raise KeyboardInterrupt
             scores, images = reference.score(gaussians)
-            seats = score_conditions(gaussians, reference.seats)
-            report.scores, report.seats = asdict(scores), [asdict(seat) for seat in seats]
+            conditions = score_conditions(gaussians, reference.conditions)
+            report.scores, report.conditions = asdict(scores), [asdict(condition) for condition in conditions]
             count = views.count if views is not None and rung.peer is not None else _views_of(report, rung.fit)
             run = {"name": rung.name, "label": rung.label, "kind": rung.kind, "views": count}
             run |= asdict(report)

@@ -25,7 +25,7 @@ from vvgt_cli.jit.ahead import INIT
 from vvgt_cli.network.card import find_model
 from vvgt_cli.progress import Console
 from vvgt_cli.score.charts import FILES, draw, write_plots
-from vvgt_cli.score.curves import Series, cost, front, knee, psnr, read_series, table, unit_costs, worst_seat
+from vvgt_cli.score.curves import Series, cost, front, knee, psnr, read_series, table, unit_costs, worst_condition
 from vvgt_cli.score.page import Pictures, page
 from vvgt_cli.score.record import ConversionReport, Run, document
 from vvgt_cli.volume.blocks import check_memory
@@ -83,7 +83,7 @@ def report(request: ReportRequest, console: Console | None = None) -> dict[str, 
     for run, images in run_rungs(request.source, request.ladder, reference, console):
         runs.append(run)
         ours.append(_pngs(pictures(images, PICTURED, request.picture_size)))
-        score = f"PSNR {psnr(run):.2f} dB, worst seat {worst_seat(run):.2f} dB"
+        score = f"PSNR {psnr(run):.2f} dB, worst condition {worst_condition(run):.2f} dB"
         megabytes = f"{run['gaussians']} Gaussians, {run['bytes'] / 1e6:.1f} MB"
         console.stage(f"{len(runs)}/{total}", cost(run), f"{run['name']}: {score}, {megabytes}")
     text = document("vvgt-report", _document(request, source, reference, runs) | {"vtk_psnr": ceiling})
@@ -94,7 +94,7 @@ def report(request: ReportRequest, console: Console | None = None) -> dict[str, 
     write_text(str(folder / DATA), text, request.overwrite)
     title = f"Error against run time: {source.volume.name}"
     _write(folder, series, title, Pictures(list(PICTURED), shown, ours), request.overwrite)
-    console.say(f"{folder / PAGE}")
+    console.message(f"{folder / PAGE}")
     return found
 
 
@@ -147,8 +147,8 @@ def compare(paths: Sequence[str], output: str, overwrite: bool, console: Console
     _write(folder, series, "Error against run time, compared", None, overwrite)
     for one in series:
         best = max(one.scored(), key=lambda run: psnr(run) or 0)
-        console.say(f"{one.name}: {len(one.runs)} runs, nearest {best['name']} with {psnr(best):.2f} dB")
-    console.say(f"{folder / PAGE}")
+        console.message(f"{one.name}: {len(one.runs)} runs, nearest {best['name']} with {psnr(best):.2f} dB")
+    console.message(f"{folder / PAGE}")
 
 
 def _distinct(series: list[Series]) -> list[Series]:

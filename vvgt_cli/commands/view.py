@@ -172,7 +172,7 @@ def _serve(
     if len(files) > 1:
         _only_gaussians(files)
     parts = {"viewer.js": Part("text/javascript; charset=utf-8", lambda: asset(PROGRAM), packed=True)}
-    site = Site(parts, run.console.say)
+    site = Site(parts, run.console.message)
     desk = Desk(site.parts, site.posts, plain_name(files[0]), run.console)
     with ExitStack() as stack:
         stack.enter_context(suppress(KeyboardInterrupt))
@@ -194,7 +194,7 @@ def _serve(
         if desk.error is None:
             announce(url)
             opened = request.browser and display() and webbrowser.open(url)
-            run.console.say(f"{'shown in a browser' if opened else 'open this address in a browser'}; Ctrl-C ends")
+            run.console.message(f"{'shown in a browser' if opened else 'open this address in a browser'}; Ctrl-C ends")
         while desk.error is None:
             time.sleep(TICK)  # a signal may reach another thread, which wakes nobody here
         if desk.waited_for:

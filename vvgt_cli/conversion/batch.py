@@ -187,7 +187,7 @@ class Functions(Batch):
         """Yield an item for each function."""
         for number, ((name, request, fact), stem) in enumerate(zip(self._requests, self.stems, strict=True), 1):
             if wanted(stem):
-                run.console.say(f"{fact}: function {number} of {len(self._requests)}")
+                run.console.message(f"{fact}: function {number} of {len(self._requests)}")
                 yield Item(name, stem, request, {"function": fact})
 
 
@@ -294,7 +294,7 @@ class Files:
             if manifest is None:
                 break
             manifest.refresh()  # another part may have recorded its last item meanwhile
-        console.say(f"{path}: {len(rows)} {batch.kind}, {len(self._rows)} of them converted now")
+        console.message(f"{path}: {len(rows)} {batch.kind}, {len(self._rows)} of them converted now")
         return found
 
 

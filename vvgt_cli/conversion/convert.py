@@ -152,8 +152,8 @@ def run_conversion(
         field.views = start.views(field.views)
     work, planner, plan = _planned(run, request, field, expected=start is None)
     if made is not None:
-        plan.stages, plan.left_out = [stage for stage in plan.stages if stage.scores], []
-        plan.gaussians, plan.case = len(made), replace(plan.case, gaussians=len(made))
+        plan.stages, plan.skipped = [stage for stage in plan.stages if stage.scores], []
+        plan.gaussians, plan.workload = len(made), replace(plan.workload, gaussians=len(made))
         plan.bytes = file_bytes(len(made), planner.sh_degree)
         run.report.plan = plan.record()
     check_memory(plan, *(() if start is None else start.memory(plan, work.fit)))
@@ -163,7 +163,7 @@ def run_conversion(
         work.gaussians = as_stored(made)
     elif kept:
         work.gaussians = kept[0]
-        run.console.say(f"{request.checkpoint} holds the fitted Gaussians: only the scores are left")
+        run.console.message(f"{request.checkpoint} holds the fitted Gaussians: only the scores are left")
     elif start is None or not start.try_start(work, plan, request):
         if start is not None:
             field.views.expect(_pictures(plan, work.fit))
@@ -192,13 +192,13 @@ def _planned(run: Run, request: ConvertRequest, field: Field, expected: bool = T
         read_card(find_model(fit.model))  # fails before the work, not after
     degree = degree_of(request, field.source)
     fit = replace(fit, max_gaussians=request.limits.gaussians(fit.max_gaussians, degree))
-    case = replace(field.workload(fit.size, fit.max_gaussians), degree=degree)
+    workload = replace(field.workload(fit.size, fit.max_gaussians), degree=degree)
     guess = expected_wide(fit.max_gaussians, fit.size)
     planner = Planner(
         request.limits, fit, sh_degree=request.ply.sh_degree or degree, wide=guess, whole=request.scored_whole,
         writes=request.writes,
     )  # fmt: skip
-    plan = planner.plan(case, run.elapsed())
+    plan = planner.plan(workload, run.elapsed())
     run.report.plan = plan.record()
     if expected:
         field.views.expect(_pictures(plan, fit))
@@ -213,10 +213,10 @@ def _fit(work: Work, request: ConvertRequest, planner: Planner, plan: Plan) -> P
     if request.output is not None and request.output != STDOUT:
         check_room(request.output, 2 * file_bytes(len(work.made()), degree))  # with its certificate once more
     # halfway between its pace and that of drawing: steps follow neither alone on every machine
-    pace = max(work.run.report.stages[-1].seconds / first.cost(plan.case).seconds, QUICKEST) ** 0.5
+    pace = max(work.run.report.stages[-1].seconds / first.cost(plan.workload).seconds, QUICKEST) ** 0.5
     planner = replace(planner, wide=wide(work.made(), work.fit.size), sh_degree=degree)
-    case = replace(plan.case.at(pace), gaussians=len(work.made()), degree=work.made().degree)
-    plan = planner.plan(case, work.run.elapsed(), begun=True)
+    workload = replace(plan.workload.at(pace), gaussians=len(work.made()), degree=work.made().degree)
+    plan = planner.plan(workload, work.run.elapsed(), begun=True)
     check_memory(plan)
     improve(work, plan)
     work.gaussians = as_stored(work.made())  # what is scored is what the file holds
@@ -236,14 +236,14 @@ def improve(work: Work, plan: Plan) -> None:
     for n, stage in enumerate([*ahead, None]):
         if not (stage is None and improved) and work.target_reached():
             for name in (other.name for other in ahead[n:] if other.improves):
-                work.run.leave_out(name, f"the check views have {work.limits.target_psnr:g} dB without it")
+                work.run.skip(name, f"the check views have {work.limits.target_psnr:g} dB without it")
             if not improved:
                 _fewer(work)
             return
         if not told and not isinstance(stage, CheckViews):
             told = True
-            for name, why in plan.left_out:
-                work.run.leave_out(name, why)
+            for name, why in plan.skipped:
+                work.run.skip(name, why)
         if stage is not None:
             work.ending = plan.after(stage)
             stage.run(work)
@@ -259,7 +259,7 @@ def _fewer(work: Work) -> None:
     for part in SMALLER:
         work.gaussians = replace(start.form, budget=max(count // part, 1)).gaussians()
         if len(work.gaussians) < count and work.target_reached():
-            work.run.leave_out(f"{count - len(work.gaussians)} Gaussians", "the target is reached without")
+            work.run.skip(f"{count - len(work.gaussians)} Gaussians", "the target is reached without")
             return
     work.gaussians = start.gaussians
 
@@ -303,7 +303,7 @@ def _tell(run: Run, request: ConvertRequest, source: Source) -> None:
     ply = ply_options(request, source)
     flattened = _flattened(degree_of(request, source), source)
     for remark in [*remarks(source.volume, ply), *([flattened] if flattened else [])]:
-        run.console.say(remark)
+        run.console.message(remark)
     run.report.volume = volume_record(source)
     run.report.transfer_function = tf_record(source, request.source)
     run.report.options = asdict(request.fit) | asdict(request.limits) | {
@@ -368,7 +368,7 @@ def _early(run: Run, request: ConvertRequest) -> Callable[[Conversion], None] | 
         return None
 
     def write(found: Conversion) -> None:
-        more = "; it is whole, scores follow"
+        more = "; complete; scoring next"
         write_gaussians(run, output, found.gaussians, found.ply, request.overwrite, found.normals(), more=more)
 
     return write

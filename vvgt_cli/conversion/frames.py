@@ -124,7 +124,7 @@ class Series(Batch):
         """
         request, steps, console = self.request, self._steps, run.console
         if self._most < request.fit.max_gaussians:
-            console.say(f"{len(steps)} frames on one page: {self._most} Gaussians each, fewer than --max-gaussians")
+            console.message(f"{len(steps)} frames on one page: {self._most} Gaussians each, fewer than --max-gaussians")
             request = replace(request, fit=replace(request.fit, max_gaussians=self._most))
         if request.blocks is None:
             first = replace(request.source, volume=steps[0].volume, read=steps[0].read)
@@ -159,13 +159,13 @@ class Series(Batch):
             if not wanted(stem):
                 continue
             if self._dark[k]:
-                console.say(f"{step.name}: nothing of it is visible; it is skipped")
+                console.message(f"{step.name}: nothing of it is visible; it is skipped")
                 continue
-            console.say(f"{step.label()}: frame {k + 1} of {len(self._steps)}")
+            console.message(f"{step.label()}: frame {k + 1} of {len(self._steps)}")
             source = replace(self.request.source, volume=step.volume, read=step.read)
             yield Item(step.name, stem, replace(self.request, source=source), {"frame": k, **step.facts()})
             done += 1
-        console.say(f"{done} frames converted, {mine - done} were done before")
+        console.message(f"{done} frames converted, {mine - done} were done before")
 
     def settings(self) -> dict[str, Any]:
         """Return everything that the files depend on, named as the command line names it."""

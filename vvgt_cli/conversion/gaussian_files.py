@@ -110,7 +110,9 @@ def write_page(run: Run, output: str, clouds: Sequence[tuple[str, str]], overwri
         with atomic_write(output, overwrite) as temporary:
             run.report.bytes = temporary.write_bytes(page_of_several(shown, output))
         if len(rules) > 1:
-            run.console.say(f"{output}: made for {', '.join(sorted(rules))}; the page draws all as it draws the first")
+            run.console.message(
+                f"{output}: made for {', '.join(sorted(rules))}; the page draws all as it draws the first"
+            )
         stage.note = (
             f"{output}: {len(clouds)} clouds, {run.report.gaussians} Gaussians, {run.report.bytes / 1e6:.1f} MB"
         )

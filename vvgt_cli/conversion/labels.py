@@ -89,9 +89,9 @@ class Labels(Batch):
         names = [one.label.name for one in self._labels]
         for one, gaussians in zip(self._labels, _gaussians(self.request, self._labels, run), strict=True):
             if gaussians is None:
-                run.console.say(f"{one.text()}: nothing visible; it is skipped")
+                run.console.message(f"{one.text()}: nothing visible; it is skipped")
                 continue
-            run.console.say(f"{one.text()}: {len(gaussians)} Gaussians")
+            run.console.message(f"{one.text()}: {len(gaussians)} Gaussians")
             label = one.label
             facts = {"label": label.number, "color": label.color, "opacity": label.opacity}
             name = label.name if names.count(label.name) == 1 else one.stem
@@ -153,11 +153,11 @@ def _gaussians(request: ConvertRequest, parts: Sequence[MapLabel], run: Run) -> 
         hidden.append([])
         if not hides.any_of(part.volume, part.label.number):
             continue
-        console.say(f"{part.text()}: what the others hide of it")
+        console.message(f"{part.text()}: what the others hide of it")
         alone = _alone(part, console)
         if alone is not None:
             hidden[-1].append(alone.take(hides.whether(alone)))
-    console.say("all labels together: what is seen of them")
+    console.message("all labels together: what is seen of them")
     left = max(request.fit.max_gaussians - sum(len(one) for mine in hidden for one in mine), 1)
     seen = _fitted(replace(whole, fit=replace(request.fit, max_gaussians=left)), console)
     owner = assign_labels(seen, [(part.volume, part.table, part.label) for part in parts])

@@ -134,14 +134,14 @@ def _of_layers(run: Run, request: ConvertRequest, field: Field) -> tuple[Gaussia
     count, left, half = len(source.layers), request.fit.max_gaussians, np.array(source.volume.unit_frame().half)
     for number, layer in enumerate(source.layers):
         share = replace(request, fit=replace(request.fit, max_gaussians=max(left // (count - number), 1)))
-        run.console.say(f"layer {number} of {count}: {layer.name}")
+        run.console.message(f"layer {number} of {count}: {layer.name}")
         alone = field.with_look(source.alone(number))
         said = replace(_facts(alone.source, count), name=layer.volume.name, distance=layer.unit_distance)
         facts.append(replace(said, dims=source.volume.dims))
         try:
             some = _of_one(run, share, alone)
         except NothingVisible:  # a frame of a series in which it is empty
-            run.leave_out(layer.volume.name, "nothing but background")
+            run.skip(layer.volume.name, "nothing but background")
             continue
         some = into_box(in_frame_of(out_of_box(some, layer.volume), layer.volume, source.volume), source.volume)
         some = some.take(np.flatnonzero((np.abs(some.means) <= half + 1e-6).all(axis=1)))

@@ -38,31 +38,31 @@ class Plan:
     """What is going to be done.
 
     Attributes:
-        case: what costs follow from.
+        workload: what costs follow from.
         gaussians: budget.
         stages: in order.
         spent: seconds before the first of them.
         bytes: of the file.
-        left_out: (stage, why) of what is not done.
+        skipped: (stage, why) of what is not done.
         writes: how often the file is written.
     """
 
-    case: Workload
+    workload: Workload
     gaussians: int
     stages: list[Stage]
     spent: float = 0.0
     bytes: int = 0
-    left_out: list[tuple[str, str]] = field(default_factory=list)
+    skipped: list[tuple[str, str]] = field(default_factory=list)
     writes: int = 1
 
     @property
     def writing(self) -> float:
         """Seconds of writing the file."""
-        return self.case.pace * WRITE * self.writes
+        return self.workload.pace * WRITE * self.writes
 
     def seconds_of(self, stages: Sequence[Stage]) -> float:
         """That they should take, and writing the file."""
-        return sum(stage.cost(self.case).seconds for stage in stages) + self.writing
+        return sum(stage.cost(self.workload).seconds for stage in stages) + self.writing
 
     @property
     def seconds(self) -> float:
@@ -72,12 +72,12 @@ class Plan:
     @property
     def working_memory(self) -> float:
         """Bytes that stages take beside the program and the volume."""
-        return sum(stage.cost(self.case).memory for stage in self.stages)
+        return sum(stage.cost(self.workload).memory for stage in self.stages)
 
     @property
     def memory(self) -> float:
         """Bytes of the whole process at its most."""
-        return self.case.there + self.working_memory
+        return self.workload.base_memory + self.working_memory
 
     def after(self, stage: Stage) -> float:
         """Seconds of what follows a stage."""
@@ -85,7 +85,7 @@ class Plan:
 
     def costs(self) -> list[tuple[str, float]]:
         """(label, seconds) of every stage."""
-        stages = [(stage.label(), stage.cost(self.case).seconds) for stage in self.stages]
+        stages = [(stage.label(), stage.cost(self.workload).seconds) for stage in self.stages]
         return [("so far", self.spent), *stages, ("write", self.writing)]
 
     def record(self) -> dict[str, Any]:
@@ -96,18 +96,18 @@ class Plan:
             "memory": self.memory,
             "bytes": self.bytes,
             "stages": [self._record(stage) for stage in self.stages],
-            "left_out": self.left_out,
+            "skipped": self.skipped,
         }
 
     def _record(self, stage: Stage) -> dict[str, Any]:
-        seconds, memory = stage.cost(self.case)
+        seconds, memory = stage.cost(self.workload)
         chosen = {entry.name: getattr(stage, entry.name) for entry in fields(stage)}
         return {"name": stage.name, "seconds": seconds, "memory": memory, **chosen}
 
     def text(self) -> str:
         """The plan as `--dry-run` prints it."""
         lines = [f"{name:<24}{seconds:8.1f} s" for name, seconds in self.costs()]
-        lines += [f"{name:<24}{'-':>8}    {why}" for name, why in self.left_out]
+        lines += [f"{name:<24}{'-':>8}    {why}" for name, why in self.skipped]
         lines.append(
             f"{'whole':<24}{self.seconds:8.1f} s, {self.memory / 2**30:.1f} GiB of memory, "
             f"{self.bytes / 1e6:.1f} MB with {self.gaussians} Gaussians"
@@ -139,10 +139,10 @@ class Planner:
         """Whether the closed form has cells, of which a tree can be cut again."""
         return self.fit.init == "vbm"
 
-    def plan(self, case: Workload, spent: float, begun: bool = False) -> Plan:
+    def plan(self, workload: Workload, spent: float, begun: bool = False) -> Plan:
         """Which stages fit, after ``spent`` seconds; ``begun``: the closed form is done."""
         count = self.fit.max_gaussians
-        plan = Plan(case, count, [], spent, file_bytes(count, self.sh_degree), writes=self.writes)
+        plan = Plan(workload, count, [], spent, file_bytes(count, self.sh_degree), writes=self.writes)
         first: list[Stage] = [ClosedFormStage()]
         last: list[Stage] = [TestViews(self.whole), ViewingConditions()]
         left = None
@@ -159,21 +159,21 @@ class Planner:
 
     def _improvements(self, plan: Plan, left: float | None) -> list[Stage]:
         """What needs views: gradient descent, as asked for, as long as there is time, or as much as pays."""
-        case = plan.case
+        workload = plan.workload
         open_end = self.limits.target_psnr is not None or left is not None
         network, left = self._network(plan, left)
         few = self.fit.steps is not None and self.fit.steps < ENOUGH_STEPS and left is None
         small = self.wide and not few and not network and self.fit.size >= 2 * SMALLEST
         steps = wanted = self.fit.steps if self.fit.steps is not None else MOST_STEPS if open_end else STEPS
-        while left is not None and steps > 0 and self._seconds(case, steps, small) > left:
+        while left is not None and steps > 0 and self._seconds(workload, steps, small) > left:
             steps = min(steps - 1, int(steps * 0.9))
         if not wanted or steps < min(FEWEST_STEPS, wanted):
-            plan.left_out.append(("refinement", _room(left) if wanted else "no steps are asked for"))
+            plan.skipped.append(("refinement", _room(left) if wanted else "no steps are asked for"))
             return self._without_steps(plan, network, left)
         if self.fit.model is None:
-            plan.left_out.append(("network", "gradient descent gains more in its time; --model runs it"))
+            plan.skipped.append(("network", "gradient descent gains more in the same time; --model runs it"))
         if not few:
-            plan.left_out.append(("back-projection", "gradient descent gains more in its time"))
+            plan.skipped.append(("back-projection", "gradient descent gains more in the same time"))
         *before, descent = self._descent(steps, small, wanted)
         return [*before, *([BackProjection()] if few else []), *network, descent]
 
@@ -191,17 +191,17 @@ class Planner:
         """Whether the cells may be cut for fewer Gaussians in the end."""
         return self.limits.target_psnr is not None
 
-    def _seconds(self, case: Workload, steps: int, small: bool) -> float:
+    def _seconds(self, workload: Workload, steps: int, small: bool) -> float:
         """Of so many steps, with their views, ``small`` ones or not, and the check views."""
-        return sum(stage.cost(case).seconds for stage in self._descent(steps, small, steps))
+        return sum(stage.cost(workload).seconds for stage in self._descent(steps, small, steps))
 
     def _without_steps(self, plan: Plan, network: list[Stage], left: float | None) -> list[Stage]:
         """Back-projection instead, if there is time; check views where there is a target and time for them."""
-        views = self._seconds(plan.case, 0, False)
-        whole = views + BackProjection().cost(plan.case).seconds
+        views = self._seconds(plan.workload, 0, False)
+        whole = views + BackProjection().cost(plan.workload).seconds
         projected = left is None or left >= whole
         if not projected:
-            plan.left_out.append(("back-projection", f"about {whole:.1f} s with its views, {_room(left)}"))
+            plan.skipped.append(("back-projection", f"about {whole:.1f} s with its views, {_room(left)}"))
         check = CheckViews(fine=bool(network) or self.limits.target_psnr is not None)
         train = TrainingViews(views_of(0, small=False), view_edge(self.fit.size, small=False), fitted=bool(network))
         if projected or network:
@@ -214,9 +214,9 @@ class Planner:
         if self.fit.model is None:
             return [], left
         stage = Network(self.fit.model)
-        seconds = stage.cost(plan.case).seconds
-        if left is not None and left < seconds + self._seconds(plan.case, 0, False):
-            plan.left_out.append(("network", f"about {seconds:.1f} s, {_room(left)}"))
+        seconds = stage.cost(plan.workload).seconds
+        if left is not None and left < seconds + self._seconds(plan.workload, 0, False):
+            plan.skipped.append(("network", f"about {seconds:.1f} s, {_room(left)}"))
             return [], left
         return [stage], None if left is None else left - seconds
 
@@ -236,22 +236,24 @@ def check_memory(plan: Plan, pictures: float = 0.0, beside: Callable[[Workload],
     Raises:
         UsageError: with the size or the Gaussians that would fit.
     """
-    free, size = free_memory(), plan.case.size
+    free, size = free_memory(), plan.workload.size
     if free is None:
         return
-    views = sum(stage.cost(plan.case).memory for stage in plan.stages if isinstance(stage, CheckViews | TrainingViews))
+    views = sum(
+        stage.cost(plan.workload).memory for stage in plan.stages if isinstance(stage, CheckViews | TrainingViews)
+    )
     if (drawn := views + pictures) > free:
         raise UsageError(
             f"--size {size}: views need {drawn / 2**30:.1f} GiB of memory, {free / 2**30:.1f} GiB are free; --size "
             f"{max(int(size * (free / drawn) ** 0.5), 1)} would fit, or 'vvgt init', which renders none"
         )
-    need = SURE * plan.working_memory + pictures + beside(plan.case)
+    need = SURE * plan.working_memory + pictures + beside(plan.workload)
     form, fewer = plan.stages[0], plan.gaussians
     if not isinstance(form, ClosedFormStage) or need <= free:
         return
     while fewer > 1:
-        case = for_budget(plan.case, fewer)
-        if SURE * (form.cost(case).memory + views) + pictures + beside(case) <= free:
+        workload = for_budget(plan.workload, fewer)
+        if SURE * (form.cost(workload).memory + views) + pictures + beside(workload) <= free:
             break
         fewer //= 2
     raise UsageError(

@@ -91,7 +91,7 @@ class PreviousFrame(WarmStart):
         there = {id(one) for one in (self._last.gaussians, *self._last.shown)} if self._last else ()
         sets = max(turns + 1 - len(there), 0)
         pictures = self._pictures.room([view for stage in plan.stages for view in stage.views(fit)]) if sets else 0
-        return pictures, lambda case: sets * case.gaussians * (A_SET + 12 * ((case.degree + 1) ** 2 - 1))
+        return pictures, lambda workload: sets * workload.gaussians * (A_SET + 12 * ((workload.degree + 1) ** 2 - 1))
 
     def try_start(self, work: Work, plan: Plan, request: ConvertRequest) -> bool:
         """See `WarmStart.try_start`."""
@@ -143,7 +143,7 @@ class PreviousFrame(WarmStart):
         work.field.views.expect([*judge.views(work.fit), *(Picture(camera, last.settings) for camera in cameras)])
         judge.run(work)
         if work.psnr(last.gaussians) < last.psnr - FAR:
-            work.run.leave_out(WARM_START, "it shows something else")
+            work.run.skip(WARM_START, "it shows something else")
             return False
         with work.run.stage("views") as stage:
             before = [self._pictures.last(Picture(camera, last.settings)) for camera in cameras]
@@ -168,7 +168,7 @@ class PreviousFrame(WarmStart):
             if psnr >= last.psnr - WORSE or work.run.report.interrupted:
                 return True
         told = f"{last.psnr - psnr:.1f} dB worse on the check views than the last frame without"
-        work.run.leave_out(WARM_START, told)
+        work.run.skip(WARM_START, told)
         return False
 
 

@@ -60,7 +60,7 @@ class PreviousLook(WarmStart):
             plan.stages = [s for s in plan.stages if isinstance(s, TestViews) or (s.scores and request.scored_whole)]
         else:
             work.reset()
-            work.run.leave_out(WARM_START, why)
+            work.run.skip(WARM_START, why)
         return why is None
 
     def _unfit(self, work: Work, request: ConvertRequest) -> str | None:

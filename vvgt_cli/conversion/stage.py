@@ -110,7 +110,7 @@ class Stage(ABC):
     scores: ClassVar[bool] = False
 
     @abstractmethod
-    def cost(self, case: Workload) -> Cost:
+    def cost(self, workload: Workload) -> Cost:
         """What it should cost."""
 
     @abstractmethod

@@ -149,11 +149,11 @@ class Blocked:
         x, y, z = (float(edge) for edge in self.frame.step)
         share = (self.visible / self.source.volume.data.size) ** (1 / 3)
         steps = view_edge(size, small=False) ** 2 * WAY / min(x, y, z) * max(share, 0.1)
-        case = Workload(
+        workload = Workload(
             gaussians=gaussians, cells=0.0, voxels=self.visible, size=size, view=VIEW * RAY_STEP * steps, pace=pace(),
-            there=PROGRAM + self.edge**3 * self.reader.voxel_bytes, visible=self.visible, step=(x, y, z),
+            base_memory=PROGRAM + self.edge**3 * self.reader.voxel_bytes, visible=self.visible, step=(x, y, z),
         )  # fmt: skip
-        return for_budget(case, gaussians)
+        return for_budget(workload, gaussians)
 
     def cells(self, size: int, budget: int, most: int | None = None) -> CellBlocks:
         """The pass over base cells for images of ``size`` px; at most ``most`` cells, None: as many as memory holds."""

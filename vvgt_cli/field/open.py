@@ -106,14 +106,14 @@ def blocked(run: Run, request: SourceRequest, options: BlockOptions, parts: Part
     """
     request, told = _settled(request, options, wanted.size)
     if told:
-        run.console.say(told)
+        run.console.message(told)
     settings = _settings(request, wanted)
     edge = parts.kept_edge(settings) if options.size is None else options.size
     edge = edge or _edge(request, options)
     with _runner(options) as runner:
         do = Pass(runner, parts, run.console.bar, options.shard)
         if parts.open({**settings, "blocks": edge}, ours=options.shard is None):
-            run.console.say(f"going on with the blocks in {parts.folder}")
+            run.console.message(f"going on with the blocks in {parts.folder}")
         run.compile(COUNT_WHOLE + COUNT_REAL)
         access = Counted(parts, edge, lambda task: do(task, "count"), wanted.values or needs_histogram(request))
         with run.stage("read") as stage:
@@ -233,11 +233,11 @@ def automatic(request: SourceRequest, console: Console) -> BlockOptions | None:
     """
     given = request.volume
     if not isinstance(given, str) and any(isinstance(one.data, Stored) for one in content_of(given).volumes):
-        console.say("a Dask array: processed in blocks (docs/scale.md)")
+        console.message("a Dask array: processed in blocks (docs/scale.md)")
         return BlockOptions()
     if not better_in_blocks(request):
         return None
-    console.say("large: processed in blocks (docs/scale.md)")
+    console.message("large: processed in blocks (docs/scale.md)")
     return BlockOptions()
 
 

@@ -34,7 +34,7 @@ class Workload:
         size: pixels along the edge of the screen that the file is made for.
         view: seconds of a training view of ``edge`` px, one ray a pixel.
         pace: how many times as long as the machine of the fit this one takes.
-        there: bytes that the program and the volume have taken when the plan is made.
+        base_memory: bytes that the program and the volume have taken when the plan is made.
         degree: of the Gaussians' harmonics.
         visible: voxels that have extinction, about.
         step: (3,) voxel edges, unit frame.
@@ -46,7 +46,7 @@ class Workload:
     size: int
     view: float
     pace: float = 1.0
-    there: float = PROGRAM
+    base_memory: float = PROGRAM
     degree: int = 0
     visible: float = 0.0
     step: tuple[float, float, float] = (1.0, 1.0, 1.0)
@@ -57,12 +57,12 @@ class Workload:
         return view_edge(self.size, small=False)
 
     @cached_property
-    def judged(self) -> int:
+    def test_view_pixels(self) -> int:
         """Pixels of a test view that are drawn: all, or blocks."""
         return self._pixels(ENOUGH)
 
     @cached_property
-    def glanced(self) -> int:
+    def check_view_pixels(self) -> int:
         """Pixels of a check view that are drawn: all, or blocks."""
         return self._pixels(FEW)
 
@@ -70,14 +70,14 @@ class Workload:
         blocks = spread_blocks(self.size, self.size, enough=enough)
         return self.size**2 if blocks is None else blocks.numbers.size * BLOCK**2
 
-    def judging(self, pixels: int) -> float:
+    def reference_seconds(self, pixels: int) -> float:
         """Seconds of a reference of so many pixels."""
         return FINER * self.view * pixels / self.edge**2
 
     @property
-    def glance(self) -> float:
+    def check_view_seconds(self) -> float:
         """Seconds of a check view's reference."""
-        return self.judging(self.glanced)
+        return self.reference_seconds(self.check_view_pixels)
 
     def at(self, pace: float) -> Workload:
         """The same on a machine that takes ``pace`` times as long; what was timed stays."""
@@ -95,31 +95,31 @@ def expected_wide(gaussians: int, size: int) -> bool:
 
 
 def measure(scene: Scene, size: int, gaussians: int) -> Workload:
-    """The case of a scene: counted, a small view timed, the machine's pace by a picture of Gaussians."""
+    """Measure the workload of a scene: counted, a small view timed, the machine's pace by a picture of Gaussians."""
     from vvgt_cli.closed_form.samples import visible_voxels
     from vvgt_cli.dvr.layout import BRICK
 
     x, y, z = (float(edge) for edge in scene.step)
-    case = Workload(
+    workload = Workload(
         gaussians=gaussians,
         cells=0.0,
         voxels=float(np.count_nonzero(scene.empty == 0)) * BRICK**3,
         size=size,
         view=VIEW * _view_seconds(scene, view_edge(size, small=False)),
         pace=pace(),
-        there=PROGRAM + _volume_bytes(scene),
+        base_memory=PROGRAM + _volume_bytes(scene),
         visible=visible_voxels(scene),
         step=(x, y, z),
     )
-    return for_budget(case, gaussians)
+    return for_budget(workload, gaussians)
 
 
-def for_budget(case: Workload, gaussians: int) -> Workload:
-    """The same case with another budget; nothing is timed again."""
+def for_budget(workload: Workload, gaussians: int) -> Workload:
+    """The same workload with another budget; nothing is timed again."""
     from vvgt_cli.closed_form.closed_form import expected_cells
 
-    cells = expected_cells(case.visible, np.array(case.step), case.size, gaussians)
-    return replace(case, cells=cells, gaussians=int(min(gaussians, cells)))
+    cells = expected_cells(workload.visible, np.array(workload.step), workload.size, gaussians)
+    return replace(workload, cells=cells, gaussians=int(min(gaussians, cells)))
 
 
 def _volume_bytes(scene: Scene) -> int:

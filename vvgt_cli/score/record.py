@@ -58,10 +58,10 @@ class ConversionReport:
         stages: in the order they ran.
         gaussians, bytes: of the file written.
         scores: on the test views, None for `init`.
-        seats: `convert`'s scores by every rule at the size made for and above (`vvgt_cli.score.viewing`), worst first.
-        texture: of `convert`, on smooth areas of its `glance_cameras`.
+        conditions: `convert`'s scores under each viewing condition (`vvgt_cli.score.viewing`), worst first.
+        texture: of `convert`, on smooth areas of its `texture_cameras`.
         plan: estimates of `convert` (`vvgt_cli.conversion.plan.Plan`): stages, seconds, bytes, memory.
-        left_out: (stage, why) of what was not done.
+        skipped: (stage, why) of what was not done.
         refinement: what gradient descent did (`vvgt_cli.refine.OptimizeRecord`), None without it.
         seconds: wall time of the whole run, without the interpreter's start.
     """
@@ -74,11 +74,11 @@ class ConversionReport:
     gaussians: int = 0
     bytes: int = 0
     scores: dict[str, Any] | None = None
-    seats: list[dict[str, Any]] | None = None
+    conditions: list[dict[str, Any]] | None = None
     texture: dict[str, Any] | None = None
     refinement: dict[str, Any] | None = None
     plan: dict[str, Any] | None = None
-    left_out: list[tuple[str, str]] = field(default_factory=list)
+    skipped: list[tuple[str, str]] = field(default_factory=list)
     seconds: float = 0.0
 
     @property
@@ -196,10 +196,10 @@ class Run:
         """Wall seconds since the run began."""
         return time.perf_counter() - self.start
 
-    def leave_out(self, stage: str, why: str) -> None:
+    def skip(self, stage: str, why: str) -> None:
         """Say and record that a stage is not done."""
-        self.report.left_out.append((stage, why))
-        self.console.say(f"left out: {stage} ({why})")
+        self.report.skipped.append((stage, why))
+        self.console.message(f"skipped: {stage} ({why})")
 
     def finish(self) -> ConversionReport:
         """Close the report with the whole run's time."""

@@ -74,11 +74,11 @@ def _write_ply(run: Run, parts: Parts, cut: Cut, output: str, overwrite: bool) -
             base = cut.forest.base
             stage.note += f", no more: {base} cells that the screen, or {plan.budget} Gaussians, have use for"
     if spared:
-        run.leave_out(f"{spared} Gaussians", "so faint that viewers differ on what they draw of them")
+        run.skip(f"{spared} Gaussians", "so faint that viewers differ on what they draw of them")
     run.report.gaussians, run.report.bytes = count, written
     if made.batches is None:
         need = drawing_bytes(count, size)
-        run.leave_out("test views", f"{count} Gaussians at once need about {need / 2**30:.1f} GiB of memory")
+        run.skip("test views", f"{count} Gaussians at once need about {need / 2**30:.1f} GiB of memory")
     else:
         with run.stage("test views") as stage:
             found = score_gaussians(together(made.batches), parts, plan, plan.ply.rule or INRIA)

@@ -121,12 +121,12 @@ def _shard(run: Run, request: ConvertRequest, options: BlockOptions, parts: Part
     try:
         make_parts(run, request, options, parts)
     except Later as later:
-        run.console.say(
+        run.console.message(
             f"{later.what}: this shard's share is done, {later.missing} blocks are other shards'; run the same array "
             "again when they are"
         )
     else:
-        run.console.say(f"all blocks are there; next: vvgt merge {request.output} -o OUT.ply")
+        run.console.message(f"all blocks are there; next: vvgt merge {request.output} -o OUT.ply")
 
 
 def make_parts(run: Run, request: ConvertRequest, options: BlockOptions, parts: Parts) -> None:
@@ -140,7 +140,7 @@ def make_parts(run: Run, request: ConvertRequest, options: BlockOptions, parts: 
     with blocked(run, request.source, options, parts, wanted) as field:
         source, ply = field.source, ply_options(request, field.source)
         for line in remarks(source.volume, ply):
-            run.console.say(line)
+            run.console.message(line)
         degree = degree_of(request, source)
         run.compile(for_degree(for_blocks(source.kernels((RENDER, *INIT, *DRAW))), degree), source.kernel_type())
         field.views.expect(scored_views(size))
@@ -168,5 +168,5 @@ def _check_disk(run: Run, field: Blocked, cells: CellBlocks, budget: int, degree
     parts = cells.parts
     need = disk_bytes(cells.grid, field.visible, budget, rays, cells.light is not None, degree) - parts.bytes(CELLS)
     if need > 0 and parts.missing(CELLS, range(len(cells))):
-        run.console.say(f"on disk meanwhile: about {need / 1e6:.0f} MB in {parts.folder}")
+        run.console.message(f"on disk meanwhile: about {need / 1e6:.0f} MB in {parts.folder}")
         check_room(parts.folder, need)

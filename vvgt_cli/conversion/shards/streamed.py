@@ -2,7 +2,7 @@
 
 As PlayCanvas 2.23.3 (`scene/gsplat-unified/gsplat-octree.js`, `gsplat-lod-table.js`) and splat-transform 3.7.0
 (`writers/write-lod.ts`) have it. A node is a tile of the pyramid (`vvgt_cli.field.forest`); what its levels are is
-measured (`ladder`).
+measured (`level_selection`).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vvgt_cli.conversion.shards.ladder import measured
+from vvgt_cli.conversion.shards.level_selection import measure_cuts
 from vvgt_cli.conversion.shards.plan import PLAN
 from vvgt_cli.conversion.shards.streamed_files import Files, Level, files_of
 from vvgt_cli.errors import UsageError
@@ -69,20 +69,20 @@ def write_streamed(run: Run, parts: Parts, cut: Cut, output: str, overwrite: boo
     forest = cut.forest
     with run.stage("errors") as stage:
         key = digest((parts.folder / PLAN).read_text("utf-8"))[:16]
-        ladder = measured(cut, parts, f"errors-{key}")
-        choices = ladder.levels()
+        errors = measure_cuts(cut, parts, f"errors-{key}")
+        choices = errors.levels()
         levels = [Level(number) for number in range(len(choices))]
         stage.note = f"{len(levels)} levels of {len(forest.tiles)} nodes"
     before, nodes, folder = files_of(Path(output)), list[dict[str, Any]](), Path(output).absolute().parent
     files = Files(folder, parts, f"written-{digest(key, str(folder))[:16]}")
     with run.stage("write") as stage, atomic_write(Path(output), overwrite) as temporary:
-        for some in cut.nodes(ladder.thresholds[np.stack(choices, axis=1)]):
+        for some in cut.nodes(errors.thresholds[np.stack(choices, axis=1)]):
             for made, spreads in some:
-                rungs = [choice[len(nodes)] for choice in choices]
-                nodes.append(_node(cut, files, levels, made, spreads) | ladder.facts(len(nodes), rungs))
+                own = [choice[len(nodes)] for choice in choices]
+                nodes.append(_node(cut, files, levels, made, spreads) | errors.facts(len(nodes), own))
         for level in levels:
             files.write(level)
-        facts = [ladder.rms(choice) for choice in choices]
+        facts = [errors.rms(choice) for choice in choices]
         temporary.write_text(
             json.dumps(plain(_manifest(cut, levels, files.names, nodes, facts)), separators=(",", ":"))
         )

@@ -20,9 +20,9 @@ class BackProjection(Stage):
     name: ClassVar[str] = "back-projection"
     improves: ClassVar[bool] = True
 
-    def cost(self, case: Workload) -> Cost:
+    def cost(self, workload: Workload) -> Cost:
         """As so many steps."""
-        return Cost(STEPS * step_seconds(case, small=False))
+        return Cost(STEPS * step_seconds(workload, small=False))
 
     def run(self, work: Work) -> None:
         """Split and solve."""

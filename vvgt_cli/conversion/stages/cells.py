@@ -29,9 +29,9 @@ class CellsByError(Stage):
     small: bool = False
     keep: bool = True
 
-    def cost(self, case: Workload) -> Cost:
+    def cost(self, workload: Workload) -> Cost:
         """As so many steps."""
-        return Cost((VIEWS * A_VIEW + ALWAYS) * step_seconds(case, self.small))
+        return Cost((VIEWS * A_VIEW + ALWAYS) * step_seconds(workload, self.small))
 
     def run(self, work: Work) -> None:
         """Cut, or take what is kept of it."""

@@ -37,11 +37,11 @@ class ClosedFormStage(Stage):
     anew: bool = False
     cut: bool = False
 
-    def cost(self, case: Workload) -> Cost:
+    def cost(self, workload: Workload) -> Cost:
         """By cells, voxels and Gaussians."""
-        counts = 1e6, case.cells, case.voxels, case.gaussians
+        counts = 1e6, workload.cells, workload.voxels, workload.gaussians
         seconds = sum(each * count for each, count in zip(SECONDS, counts, strict=True)) / 1e6
-        return Cost(case.pace * seconds, MEMORY[0] * case.cells + MEMORY[1] * case.gaussians)
+        return Cost(workload.pace * seconds, MEMORY[0] * workload.cells + MEMORY[1] * workload.gaussians)
 
     def run(self, work: Work) -> None:
         """Make the Gaussians, or take what is kept of them: without the pyramid.
@@ -73,7 +73,7 @@ class ClosedFormStage(Stage):
             if start.form is not None and not spared and found < NEARLY * fit.max_gaussians:
                 stage.note += f", no more: {bound(start.form)}"
         if spared:
-            run.leave_out(f"{spared} Gaussians", "so faint that viewers differ on what they draw of them")
+            run.skip(f"{spared} Gaussians", "so faint that viewers differ on what they draw of them")
         if not self.anew:
             work.checkpoint.save(CLOSED_FORM, start.gaussians)
         work.start, work.gaussians = start, start.gaussians

@@ -23,9 +23,9 @@ class Network(Stage):
     improves: ClassVar[bool] = True
     model: str = ""
 
-    def cost(self, case: Workload) -> Cost:
+    def cost(self, workload: Workload) -> Cost:
         """By Gaussians."""
-        return Cost(case.pace * (SECONDS[0] + SECONDS[1] * case.gaussians / 1e5))
+        return Cost(workload.pace * (SECONDS[0] + SECONDS[1] * workload.gaussians / 1e5))
 
     def run(self, work: Work) -> None:
         """Let it improve the Gaussians.

@@ -29,10 +29,10 @@ REASONS = {
 }  # fmt: skip
 
 
-def step_seconds(case: Workload, small: bool) -> float:
+def step_seconds(workload: Workload, small: bool) -> float:
     """Of a step with its share of the looks at check views."""
-    one = case.pace * (STEP[0] * (view_edge(case.size, small) / 400) ** 2 + STEP[1] * case.gaussians / 1e5)
-    return HARMONICS[case.degree] * one
+    one = workload.pace * (STEP[0] * (view_edge(workload.size, small) / 400) ** 2 + STEP[1] * workload.gaussians / 1e5)
+    return HARMONICS[workload.degree] * one
 
 
 @dataclass(frozen=True)
@@ -53,9 +53,9 @@ class Refinement(Stage):
     small: bool = False
     overlap: bool = False
 
-    def cost(self, case: Workload) -> Cost:
+    def cost(self, workload: Workload) -> Cost:
         """By steps."""
-        return Cost(self.steps * step_seconds(case, self.small))
+        return Cost(self.steps * step_seconds(workload, self.small))
 
     def label(self) -> str:
         """With the number of steps."""
@@ -99,7 +99,7 @@ def refine(
     Descent begins with the Gaussians of ``begin``, where they are given, with the dB of ``start`` on the check views;
     of ``free`` (K,) bool only those move.
     """
-    with run.stage("refinement") as stage, run.console.interruption(run.console.say) as stop:
+    with run.stage("refinement") as stage, run.console.interruption(run.console.message) as stop:
         result, record = optimize(
             start if begin is None else begin[0],
             train.cameras,

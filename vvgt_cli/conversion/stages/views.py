@@ -52,10 +52,12 @@ class CheckViews(Stage):
     name: ClassVar[str] = "check views"
     fine: bool = True
 
-    def cost(self, case: Workload) -> Cost:
+    def cost(self, workload: Workload) -> Cost:
         """One of them is drawn whole, of which blocks are kept."""
         count = SET_VIEWS["check"]
-        return Cost(count * case.glance, (count * case.glanced + case.size**2) * VIEW_BYTES)
+        return Cost(
+            count * workload.check_view_seconds, (count * workload.check_view_pixels + workload.size**2) * VIEW_BYTES
+        )
 
     def views(self, fit: FitOptions) -> list[Picture]:
         """They."""
@@ -94,9 +96,11 @@ class TrainingViews(Stage):
     edge: int = 200
     fitted: bool = True
 
-    def cost(self, case: Workload) -> Cost:
+    def cost(self, workload: Workload) -> Cost:
         """By pixels."""
-        return Cost(self.count * case.view * (self.edge / case.edge) ** 2, self.count * self.edge**2 * VIEW_BYTES)
+        return Cost(
+            self.count * workload.view * (self.edge / workload.edge) ** 2, self.count * self.edge**2 * VIEW_BYTES
+        )
 
     def label(self) -> str:
         """With their number and size."""

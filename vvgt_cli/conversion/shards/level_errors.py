@@ -15,7 +15,7 @@ SIZE = 96  # pixels along an edge: more than a tile has cells
 AWAY, MARGIN = 30.0, 1.1  # the camera's distance, and what its picture holds, in radii of the node
 
 
-def errors_apart(cuts: Sequence[Gaussians]) -> tuple[np.ndarray, float, int]:
+def level_errors(cuts: Sequence[Gaussians]) -> tuple[np.ndarray, float, int]:
     """How far each cut of a node, coarser ones later, is from the first, in RGBA over nothing.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Which cut of each node a level takes: what ever coarser cuts cost is measured, and weighed against Gaussians."""
+"""Which cut of each node a level takes: what ever coarser cuts cost is measure_cuts, and weighed against Gaussians."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vvgt_cli.conversion.shards.apart import errors_apart
+from vvgt_cli.conversion.shards.level_errors import level_errors
 
 if TYPE_CHECKING:
     from vvgt_cli.conversion.shards.cut import Cut
     from vvgt_cli.field.parts import Parts
 
-RUNGS = 10
-STEP = 4.0  # times the score from a rung to the next: a cell's grows as the fourth power of its edge
+CUTS = 10
+STEP = 4.0  # times the score from a index to the next: a cell's grows as the fourth power of its edge
 FEWER = 9  # times fewer Gaussians from a level to the next: three times the edge, on a surface
 MOST_LEVELS = 6
 LEAST_PRICE, HALVINGS = 1e-12, 60  # of a Gaussian, in squared error; steps of its bisection
@@ -24,13 +24,13 @@ FEWEST = 4  # Gaussians a node, on average, below which no further level is made
 
 
 @dataclass(frozen=True)
-class Ladder:
+class CutErrors:
     """What cuts of N nodes cost; the first of each node is the finest.
 
     Attributes:
-        thresholds: (RUNGS,) of scores.
-        counts: (N, RUNGS) Gaussians.
-        squares: (N, RUNGS) squared differences from the finest, RGBA.
+        thresholds: (CUTS,) of scores.
+        counts: (N, CUTS) Gaussians.
+        squares: (N, CUTS) squared differences from the finest, RGBA.
         energies: (N,) squares of the finest.
         pixels: (N,) that it covers.
     """
@@ -43,18 +43,18 @@ class Ladder:
 
     @property
     def errors(self) -> np.ndarray:
-        """(N, RUNGS) root mean square of a channel over the pixels that a node covers."""
+        """(N, CUTS) root mean square of a channel over the pixels that a node covers."""
         found: np.ndarray = np.sqrt(self.squares / np.maximum(4 * self.pixels, 1)[:, None])
         return found
 
     def at_price(self, price: float) -> np.ndarray:
-        """(N,) the rung of each node whose squared error and ``price`` a Gaussian add up to the least."""
+        """(N,) the index of each node whose squared error and ``price`` a Gaussian add up to the least."""
         costs = (self.squares + price * self.counts)[:, ::-1]
         found: np.ndarray = costs.shape[1] - 1 - costs.argmin(axis=1)
         return found
 
     def for_count(self, count: float) -> np.ndarray:
-        """(N,) rungs of the least squared error in all that one price leaves, with at most ``count`` Gaussians.
+        """(N,) choice of the least squared error in all that one price leaves, with at most ``count`` Gaussians.
 
         One more Gaussian then lowers the error by as much in every node (Shoham and Gersho 1988).
         """
@@ -66,13 +66,13 @@ class Ladder:
             low, high = (low, middle) if self.total(self.at_price(middle)) <= count else (middle, high)
         return self.at_price(high)
 
-    def total(self, rungs: np.ndarray) -> int:
+    def total(self, choice: np.ndarray) -> int:
         """Gaussians of a choice."""
-        return int(self.counts[np.arange(len(rungs)), rungs].sum())
+        return int(self.counts[np.arange(len(choice)), choice].sum())
 
-    def rms(self, rungs: np.ndarray) -> float:
+    def rms(self, choice: np.ndarray) -> float:
         """Root mean square error of a choice over all nodes."""
-        squares = self.squares[np.arange(len(rungs)), rungs].sum()
+        squares = self.squares[np.arange(len(choice)), choice].sum()
         return math.sqrt(squares / max(4 * self.pixels.sum(), 1))
 
     def levels(self) -> list[np.ndarray]:
@@ -88,15 +88,15 @@ class Ladder:
             before = count
         return found
 
-    def facts(self, row: int, rungs: list[int]) -> dict[str, Any]:
+    def facts(self, row: int, choice: list[int]) -> dict[str, Any]:
         """Of a node's levels: the squared error of the squares, as splat-transform's `errors`; and our `errors`."""
         energy = max(float(self.energies[row]), 1e-30)
-        relative = [float(self.squares[row, rung] / energy) for rung in rungs]
-        return {"errors": relative, "rms": [float(self.errors[row, rung]) for rung in rungs]}
+        relative = [float(self.squares[row, index] / energy) for index in choice]
+        return {"errors": relative, "rms": [float(self.errors[row, index]) for index in choice]}
 
 
-def measured(cut: Cut, parts: Parts, kind: str) -> Ladder:
-    """Make and draw `RUNGS` cuts of every node; what an interrupted run has left in ``parts`` is taken as it is.
+def measure_cuts(cut: Cut, parts: Parts, kind: str) -> CutErrors:
+    """Make and draw `CUTS` cuts of every node; what an interrupted run has left in ``parts`` is taken as it is.
 
     Raises:
         DataError: a part is damaged.
@@ -104,18 +104,18 @@ def measured(cut: Cut, parts: Parts, kind: str) -> Ladder:
     forest = cut.forest
     finest = forest.threshold(cut.plan.budget)
     second = max(forest.threshold(max(forest.count(finest) // 2, 1)), np.finfo(float).tiny)
-    values = np.array([finest, *(second * STEP ** np.arange(RUNGS - 1))])
+    values = np.array([finest, *(second * STEP ** np.arange(CUTS - 1))])
     values = np.minimum(values, np.finfo(float).max)
     found: list[dict[str, Any]] = []
     parts.prepare(kind)
     while not parts.missing(kind, [done := sum(len(some["pixels"]) for some in found)]):
         found.append(parts.load(kind, done))
     for nodes in cut.nodes(np.tile(values, (len(forest.tiles), 1)), done):
-        squares, energies, pixels = zip(*(errors_apart(made) for made, _ in nodes), strict=True)
+        squares, energies, pixels = zip(*(level_errors(made) for made, _ in nodes), strict=True)
         counts = [[len(gaussians) for gaussians in made] for made, _ in nodes]
         arrays = map(np.array, (counts, squares, energies, pixels))
         some: dict[str, Any] = dict(zip(FIELDS, arrays, strict=True))
         parts.save(kind, done, **some)
         found.append(some)
         done += len(nodes)
-    return Ladder(values, **{name: np.concatenate([some[name] for some in found]) for name in FIELDS})
+    return CutErrors(values, **{name: np.concatenate([some[name] for some in found]) for name in FIELDS})
