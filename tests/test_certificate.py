@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import vvgt_cli
-from vvgt_cli.conversion.certify import Verdict, first_views, position_error
+from vvgt_cli.conversion.certify import Verdict, position_error, preview_psnr
 from vvgt_cli.conversion.stages import TestViews, ViewingConditions
 from vvgt_cli.errors import DataError
 from vvgt_cli.field.digests import values_digest
@@ -250,7 +250,7 @@ def test_from_python(tmp_path) -> None:
     found = read_ply(tmp_path / "a.ply")[1].certificate
     assert found is not None
     assert found.command is None
-    assert found.psnr == round(first_views(result.scores), 2)
+    assert found.psnr == round(preview_psnr(result.scores), 2)
 
 
 def test_the_digest_is_of_values_type_and_dims_not_of_how_they_lie() -> None:
@@ -299,7 +299,7 @@ def test_the_digest_reads_each_chunk_once_whatever_its_shape(chunks, monkeypatch
 
 def test_texture_is_certified_as_it_is_measured_from_near(vvgt, folder, tmp_path) -> None:
     from vvgt_cli.conversion.gaussian_files import open_gaussians
-    from vvgt_cli.conversion.place import into_box
+    from vvgt_cli.conversion.place import to_box_frame
     from vvgt_cli.field.source import SourceRequest, load
     from vvgt_cli.score.viewing import score_texture, texture_cameras
     from vvgt_cli.volume import ReadOptions
@@ -313,7 +313,7 @@ def test_texture_is_certified_as_it_is_measured_from_near(vvgt, folder, tmp_path
     gaussians, header = open_gaussians(str(tmp_path / "out.ply"))
     source = load(SourceRequest(str(folder / "ball.raw"), ReadOptions(dims=DIMS, dtype="uint8"),
                                 str(tmp_path / "solid.json")))  # fmt: skip
-    boxed, cameras = into_box(gaussians, source.volume), texture_cameras(256)
+    boxed, cameras = to_box_frame(gaussians, source.volume), texture_cameras(256)
     assert [(c.width, c.height) for c in cameras] == [(128, 128)]
     found = score_texture(source.scene(), boxed, 256, header.rule, cameras=cameras)
     assert found.blocks >= 4

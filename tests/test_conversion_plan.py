@@ -11,13 +11,13 @@ from onnx_models import write_model
 from test_cli_infer import DARKER
 
 from vvgt_cli.cameras.blocks import BLOCK, ENOUGH, FEW, spread_blocks
-from vvgt_cli.conversion.convert import convert, initialise_only, planned
+from vvgt_cli.conversion.convert import convert, initialise_only, plan_conversion
 from vvgt_cli.conversion.plan import MOST_STEPS, Planner, check_memory
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions, Limits
 from vvgt_cli.conversion.stage import Work
 from vvgt_cli.conversion.stages import BackProjection, Network, Refinement, TrainingViews
 from vvgt_cli.conversion.stages.refinement import WIDER
-from vvgt_cli.conversion.stages.views import views_of
+from vvgt_cli.conversion.stages.views import view_count
 from vvgt_cli.defaults import STEPS
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.source import SourceRequest
@@ -144,7 +144,7 @@ def test_a_large_screen_is_fitted_to_by_its_dilation_on_small_views(tmp_path):
 
 
 def test_narrow_gaussians_get_whole_views(tmp_path, monkeypatch):
-    monkeypatch.setattr("vvgt_cli.conversion.convert.wide", lambda *_: False)
+    monkeypatch.setattr("vvgt_cli.conversion.convert.suits_small_views", lambda *_: False)
     report = done(tmp_path, FitOptions(600, 128, steps=30))
     assert chosen(report)["small"]  # what was foreseen
     assert next(stage for stage in report.stages if stage.name == "views").note.startswith("24 of 128 px")
@@ -289,8 +289,8 @@ def test_steps_are_planned_for_the_gaussians_that_there_are(tmp_path, monkeypatc
 
 
 def test_views_come_in_sets():
-    assert [views_of(steps, True) for steps in (0, 1, 48, 80, 112, 144, 10_000)] == [24, 24, 24, 48, 72, 96, 120]
-    assert [views_of(steps, False) for steps in (0, 24, 60, 112, 10_000)] == [24, 24, 48, 96, 120]
+    assert [view_count(steps, True) for steps in (0, 1, 48, 80, 112, 144, 10_000)] == [24, 24, 24, 48, 72, 96, 120]
+    assert [view_count(steps, False) for steps in (0, 24, 60, 112, 10_000)] == [24, 24, 48, 96, 120]
 
 
 @pytest.mark.parametrize(
@@ -359,7 +359,7 @@ def test_no_time_leaves_the_closed_form(tmp_path):
 
 def test_a_dry_run_plans_and_writes_nothing(tmp_path):
     request = ConvertRequest(SOURCE, str(tmp_path / "a.ply"), SMALL)
-    found = planned(request, Console(quiet=True))
+    found = plan_conversion(request, Console(quiet=True))
     assert not list(tmp_path.iterdir())
     assert found.seconds > 0
     assert found.memory > 1e8
@@ -368,7 +368,7 @@ def test_a_dry_run_plans_and_writes_nothing(tmp_path):
     assert "120 views of 48 px" in found.text()
     done(tmp_path)
     with pytest.raises(UsageError, match="exists"):
-        planned(request, Console(quiet=True))
+        plan_conversion(request, Console(quiet=True))
 
 
 def test_a_stage_that_is_not_ready_is_a_bug_that_says_so():

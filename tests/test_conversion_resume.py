@@ -19,7 +19,7 @@ LINE = ("convert", "example:blob:8", "--max-gaussians", "200", "--size", "32", "
 def folder(tmp_path: Path, vvgt, monkeypatch) -> Path:
     """The working folder, with what a run that is not ended writes."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(views, "fine_enough", by_start)
+    monkeypatch.setattr(views, "ray_settings", by_start)
     assert vvgt(*LINE, "-o", "whole.ply").code == 0
     return tmp_path
 

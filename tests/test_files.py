@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import pytest
 
 from vvgt_cli.errors import DataError, UsageError
-from vvgt_cli.files import atomic_write, check_room, claim, discard_leftovers, temporary_folder
+from vvgt_cli.files import atomic_write, check_disk_space, claim, discard_leftovers, temporary_folder
 from vvgt_cli.gaussians import read_ply
 
 ROOT = Path(__file__).parent.parent
@@ -94,7 +94,7 @@ def test_a_full_disk_is_said_before_the_work(tmp_path, vvgt, monkeypatch):
     assert "closed form" in result.err
     assert "test views" not in result.err
     disk["f_blocks"] = 0  # a file system that does not tell
-    check_room(tmp_path / "a", 1 << 40)
+    check_disk_space(tmp_path / "a", 1 << 40)
 
 
 def test_what_the_disk_does_not_take_is_put_elsewhere(tmp_path, vvgt, monkeypatch):

@@ -17,7 +17,7 @@ from tests.test_live_labels import LABELS
 from tests.test_live_labels import facts as labels
 from tests.test_page_live import compare, options
 from vvgt_cli.commands.live_site import Cloud
-from vvgt_cli.conversion.place import in_frame_of
+from vvgt_cli.conversion.place import to_frame_of
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
 from vvgt_cli.gaussians.live import Palette, Several, Table, baked, shown_by
 from vvgt_cli.gaussians.live_facts import NUMBER, ROW, LiveFacts
@@ -100,7 +100,7 @@ def test_gaussians_of_one_grid_in_the_frame_of_another() -> None:
     one = Volume(empty, (1.0, 2.0, 0.5), (3.0, 1.0, 0.0))
     other = Volume(empty, (2.0, 1.0, 1.5), (-4.0, 0.0, 2.0))
     some = cloud()
-    moved = in_frame_of(some, one, other)
+    moved = to_frame_of(some, one, other)
     worlds = [
         (g.means / v.unit_frame().scale + np.array(v.unit_frame().centre), np.exp(g.log_scales) / v.unit_frame().scale,
          g.live[:, 2] / v.unit_frame().scale)  # type: ignore[index]

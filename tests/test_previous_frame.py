@@ -140,7 +140,7 @@ def test_pictures_of_the_next_frame_are_as_drawn_anew(tmp_path):
     kept.view(camera, how)
     found = changes(first.source, second.source)
     assert 0.02 < found.blocks.mean() < 0.2
-    kept.outdate(found)
+    kept.invalidate(found)
     drawn = []
 
     class Counted:

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import vvgt_cli as vvgt
-from vvgt_cli.conversion.place import into_box, out_of_box
-from vvgt_cli.conversion.previous_look import MOST, OPAQUE, WARM_START, recoloured
+from vvgt_cli.conversion.place import to_box_frame, to_unit_frame
+from vvgt_cli.conversion.previous_look import MOST, OPAQUE, WARM_START, recolor_earlier
 from vvgt_cli.gaussians.ply import opacity
 
 GOAL = {"max_gaussians": 400, "size": 96, "steps": 24}
@@ -129,7 +129,7 @@ def test_refused(session, earlier):
 
 def test_the_same_look_changes_nothing(session, earlier):
     field = earlier.field
-    same, before = recoloured(earlier, field), into_box(earlier.gaussians, field.source.volume)
+    same, before = recolor_earlier(earlier, field), to_box_frame(earlier.gaussians, field.source.volume)
     clipped = opacity(before).clip(*OPAQUE)
     assert np.allclose(opacity(same), clipped, atol=1e-6)
     assert np.allclose(same.colors, np.maximum(before.colors, 0), atol=1e-6)
@@ -138,14 +138,14 @@ def test_the_same_look_changes_nothing(session, earlier):
 
 def test_depth_goes_with_extinction(session, earlier):
     thin = session.convert(shell(times=0.5), {**GOAL, "steps": 0})
-    found = recoloured(earlier, thin.field)
-    before = into_box(earlier.gaussians, earlier.field.source.volume)
+    found = recolor_earlier(earlier, thin.field)
+    before = to_box_frame(earlier.gaussians, earlier.field.source.volume)
     seen = (opacity(before) > 0.05) & (opacity(before) < 0.9)
     ratio = np.log1p(-opacity(found)[seen]) / np.log1p(-opacity(before)[seen])
     assert np.median(ratio) == pytest.approx(np.log1p(-0.2) / np.log1p(-0.4), rel=0.15)
     assert ratio.min() >= 1 / MOST
     assert replace(found, means=before.means).degree == 0
-    assert out_of_box(found, thin.field.source.volume).means.shape == before.means.shape
+    assert to_unit_frame(found, thin.field.source.volume).means.shape == before.means.shape
 
 
 def test_in_blocks_too(values):

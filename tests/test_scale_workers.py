@@ -332,7 +332,7 @@ def jobs(slurm, monkeypatch):
     from vvgt_cli.field import dask_runner
 
     monkeypatch.setattr(dask_runner, "AGAIN", 0.5)
-    monkeypatch.setattr(dask_runner, "asked_memory", lambda: 1e9)
+    monkeypatch.setattr(dask_runner, "memory_limit", lambda: 1e9)
     for name, value in slurm[1].items():
         monkeypatch.setenv(name, value)
     return lambda: dask_runner.Dask("slurm", 2, 1)

@@ -14,14 +14,14 @@ from vvgt_cli.images.metrics import psnr, score_view, ssim, texture
 from vvgt_cli.score.viewing import (
     ViewingCondition,
     condition_views,
-    from_above,
+    larger_screens,
     score_conditions,
     score_texture,
     texture_note,
     viewing_conditions,
     zoomed,
 )
-from vvgt_cli.score.views import score_seen, score_test_views
+from vvgt_cli.score.views import score_drawn_view, score_test_views
 from vvgt_cli.splat import render
 from vvgt_cli.synth import open_volume
 
@@ -56,9 +56,9 @@ def test_conditions_are_what_they_say_worst_first(pair):
         expected = np.mean([psnr(theirs[..., :3], np.clip(ours[..., :3], 0, 1)) for theirs, ours in pictures])
         assert condition.psnr == pytest.approx(expected, abs=1e-6)
     assert ViewingCondition("inria", 400, 10.0, 30.0).name() == "inria 400 px close up"
-    assert from_above(1080) == [(1080, 40), (2160, 40)]
-    assert from_above(2160) == [(2160, 40), (4320, 40)]
-    assert from_above(2159) == [(2159, 40), (2160, 40)]
+    assert larger_screens(1080) == [(1080, 40), (2160, 40)]
+    assert larger_screens(2160) == [(2160, 40), (4320, 40)]
+    assert larger_screens(2159) == [(2159, 40), (2160, 40)]
     assert viewing_conditions(1080) == [(400, 40), (800, 40), (1080, 40), (2160, 40), (1080, 10)]
 
 
@@ -80,7 +80,7 @@ def test_errors_are_of_the_blocks_and_perception_is_of_the_whole():
     rng = np.random.default_rng(0)
     reference, ours = (rng.random((48, 64, 4)).astype(np.float32) for _ in range(2))
     blocks = Blocks(64, 48, np.array([1, 6]))
-    seen, alone = score_seen(reference, ours, blocks), score_seen(reference, ours, blocks, whole=False)
+    seen, alone = score_drawn_view(reference, ours, blocks), score_drawn_view(reference, ours, blocks, whole=False)
     mask = blocks.mask()
     assert mask.sum() == 2 * 256
     assert seen.psnr == alone.psnr == pytest.approx(psnr(reference[..., :3], ours[..., :3], mask))
@@ -88,7 +88,7 @@ def test_errors_are_of_the_blocks_and_perception_is_of_the_whole():
     assert seen.ssim == pytest.approx(ssim(reference[..., :3], ours[..., :3]))
     assert seen.flip == score_view(reference, ours).flip
     assert (alone.ssim, alone.flip) == (None, None)
-    assert score_seen(reference, ours, None) == score_view(reference, ours)
+    assert score_drawn_view(reference, ours, None) == score_view(reference, ours)
 
 
 def test_scores_are_by_the_rule_of_the_views_asked_for(pair):

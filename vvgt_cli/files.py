@@ -22,7 +22,7 @@ _CHUNK = 1 << 20
 _SPARE = 64 << 20  # bytes that what comes through a pipe leaves free
 _OPEN = ("/dev", "/dev/fd", "/proc/self/fd")  # folders of names for what is open already, as /dev/stdout
 _leftovers: set[Path] = set()  # temporary names and locks of this process
-_taken_in: dict[tuple[int, int], IO[bytes]] = {}  # by device and inode of the pipe: what came out of it
+_spooled: dict[tuple[int, int], IO[bytes]] = {}  # by device and inode of the pipe: what came out of it
 
 
 def read_text(path: str | os.PathLike[str]) -> str:
@@ -66,14 +66,14 @@ def seekable(path: str | os.PathLike[str]) -> Path:
         return Path(path)
     try:
         key = about.st_dev, about.st_ino
-        if key not in _taken_in:
-            _taken_in[key] = _taken(path)
+        if key not in _spooled:
+            _spooled[key] = _spool(path)
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror or error})") from error
-    return Path(f"/proc/self/fd/{_taken_in[key].fileno()}")
+    return Path(f"/proc/self/fd/{_spooled[key].fileno()}")
 
 
-def _taken(path: str | os.PathLike[str]) -> IO[bytes]:
+def _spool(path: str | os.PathLike[str]) -> IO[bytes]:
     """What comes through a pipe, in a file in memory."""
     if not hasattr(os, "memfd_create") or not os.path.isdir("/proc/self/fd"):
         raise DataError(f"{path}: is a pipe; expected a file: write what comes through it to one first")
@@ -112,7 +112,7 @@ def check_target(path: str | os.PathLike[str], overwrite: bool = False) -> Path:
     return target
 
 
-def check_room(path: str | os.PathLike[str], need: int) -> None:
+def check_disk_space(path: str | os.PathLike[str], need: int) -> None:
     """See that the disk of ``path`` has room for ``need`` bytes.
 
     Raises:
@@ -177,7 +177,7 @@ def claim(path: str | os.PathLike[str]) -> Iterator[None]:
     """
     target = Path(path)
     lock = target.with_name(f".{target.name[:200]}.lock")
-    held = None if is_stream(target) else _locked(lock, target)
+    held = None if is_stream(target) else _lock(lock, target)
     try:
         yield
     finally:
@@ -188,7 +188,7 @@ def claim(path: str | os.PathLike[str]) -> Iterator[None]:
             held.close()
 
 
-def _locked(lock: Path, target: Path) -> IO[bytes] | None:
+def _lock(lock: Path, target: Path) -> IO[bytes] | None:
     """The open lock file, locked; None where there are no locks."""
     try:
         import fcntl

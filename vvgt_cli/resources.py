@@ -35,7 +35,7 @@ def set_memory(limit: int | None) -> None:
     _asked = limit
 
 
-def asked_memory() -> int | None:
+def memory_limit() -> int | None:
     """What `set_memory` was told."""
     return _asked
 
@@ -47,7 +47,11 @@ def free_memory() -> int | None:
     limits (RLIMIT_AS, RLIMIT_DATA) less what it has of them, and `set_memory` less what it and its workers
     hold.
     """
-    found = [*_machine(), *(room for room in map(_room, _groups("memory")) if room is not None), *_own_limits()]
+    found = [
+        *_machine(),
+        *(room for room in map(_left_by_group, _groups("memory")) if room is not None),
+        *_own_limits(),
+    ]
     if _asked is not None:
         from multiprocessing import active_children
 
@@ -125,7 +129,7 @@ class Group:
         return next((int(value) for key, value in zip(words[::2], words[1::2], strict=False) if key == name), 0)
 
 
-def _room(group: Group) -> int | None:
+def _left_by_group(group: Group) -> int | None:
     """Bytes that a cgroup leaves, None where it sets no limit; pages of files are given back when memory is short."""
     limits = [group.number(name) for name in ("memory.max", "memory.high", "memory.limit_in_bytes")]
     known = [limit for limit in limits if limit is not None and limit < UNLIMITED]

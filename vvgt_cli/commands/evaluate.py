@@ -11,10 +11,10 @@ import numpy as np
 
 from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.sets import SIZE
-from vvgt_cli.conversion.certify import checked
+from vvgt_cli.conversion.certify import verify
 from vvgt_cli.conversion.gaussian_files import STDIN, file_rule, layout_of, open_gaussians
-from vvgt_cli.conversion.place import into_box, preview, upright
-from vvgt_cli.conversion.recolored import SeveralLooks, light_of, under_function
+from vvgt_cli.conversion.place import preview, to_box_frame, upright_axes
+from vvgt_cli.conversion.recolored import SeveralLooks, apply_look, light_of
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.field import Field, Picture, Resident
 from vvgt_cli.field.open import Wanted, automatic, beside, blocked
@@ -41,7 +41,7 @@ from vvgt_cli.score.viewing import (
     viewing_conditions,
     zoomed,
 )
-from vvgt_cli.score.views import psnr_note, score_test_views, scored
+from vvgt_cli.score.views import psnr_note, score_test_views, scored_views
 
 PICTURED = 4  # test view of the preview: from the side
 MIDDLE = 200  # pixels along the edge of what the reference's own error is measured on
@@ -192,7 +192,7 @@ def shown(gaussians: Gaussians, header: PlyHeader, source: Source, request: Sour
     looks = SeveralLooks(tuple((layer.tf, layer.unit_distance) for layer in source.layers))
     light = light_of(request.light, source.lighting, source.volume.space)
     options = replace(layout_of(header), unit_distance=source.unit_distance, light=light)
-    return under_function(gaussians, header, looks if header.live.others else source.tf, options)
+    return apply_look(gaussians, header, looks if header.live.others else source.tf, options)
 
 
 def evaluate(request: EvaluateRequest, console: Console | None = None) -> Evaluation:
@@ -210,7 +210,7 @@ def evaluate(request: EvaluateRequest, console: Console | None = None) -> Evalua
     with opened(run, request, gaussians, header) as volume:
         source = volume.source
         gaussians = shown(gaussians, header, source, request.source)
-        gaussians = into_box(gaussians, source.volume)
+        gaussians = to_box_frame(gaussians, source.volume)
         for remark in _doubts(request, header, source):
             run.console.message(f"{request.ply}: {remark}")
         return _scored(run, request, volume, gaussians, header)
@@ -242,7 +242,7 @@ def _scored(run: Run, request: EvaluateRequest, volume: Field, gaussians: Gaussi
         tf_record(source, request.source), own,
     )  # fmt: skip
     settings = replace(REFERENCE, step=request.step)
-    wanted = [Picture(camera, settings, part) for _, camera, part in scored(size, perceptual=True)]
+    wanted = [Picture(camera, settings, part) for _, camera, part in scored_views(size, perceptual=True)]
     with run.stage("test views") as stage, _together(volume, wanted):
         bar = run.console.bar("test views")
         scores = score_test_views(volume.views, gaussians, size, settings, rule=rule, progress=bar)
@@ -250,11 +250,11 @@ def _scored(run: Run, request: EvaluateRequest, volume: Field, gaussians: Gaussi
         stage.note = f"{psnr_note(scores)}, {size} px"
     if header.certificate is not None:
         with run.stage("certificate") as stage:
-            verdict = checked(header.certificate, volume, gaussians, header.live is not None and gaussians.live is None)
+            verdict = verify(header.certificate, volume, gaussians, header.live is not None and gaussians.live is None)
             evaluation.certificate = asdict(verdict) | {"holds": verdict.holds, "text": verdict.text()}
             stage.note = verdict.text()
     if request.preview:
-        camera, axes = default_views("test", size=size)[PICTURED], upright(source.volume, header.up)
+        camera, axes = default_views("test", size=size)[PICTURED], upright_axes(source.volume, header.up)
         with run.stage("preview"):
             sheet = preview(volume.views, gaussians, [camera, zoomed(camera, CLOSE)], axes, rule)
             write_png(request.preview, sheet, request.overwrite)

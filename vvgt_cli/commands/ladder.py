@@ -16,10 +16,10 @@ from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.cameras.blocks import Blocks, spread_blocks
 from vvgt_cli.cameras.boxed import render_in_box
 from vvgt_cli.commands.peers import Peer, PeerViews, train
-from vvgt_cli.conversion.convert import convert, opened
+from vvgt_cli.conversion.convert import convert, open_field
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.conversion.stages.refinement import refine
-from vvgt_cli.conversion.stages.views import CheckViews, TrainingViews, views_of
+from vvgt_cli.conversion.stages.views import CheckViews, TrainingViews, view_count
 from vvgt_cli.defaults import MAX_GAUSSIANS, REPORT_STEPS, SIZE
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.field.field import Field, Picture, Resident
@@ -32,18 +32,18 @@ from vvgt_cli.gaussians.rules import INRIA
 from vvgt_cli.jit.ahead import INIT
 from vvgt_cli.progress import Console
 from vvgt_cli.refine import OptimizeOptions
-from vvgt_cli.score.checks import Views, judging_views
-from vvgt_cli.score.curves import short
+from vvgt_cli.score.checks import Views, render_check_views
+from vvgt_cli.score.curves import short_number
 from vvgt_cli.score.record import ConversionReport, Run
 from vvgt_cli.score.viewing import (
     SIDE,
     ConditionView,
     condition_pictures,
     condition_views,
-    from_above,
+    larger_screens,
     score_conditions,
 )
-from vvgt_cli.score.views import WHOLE, score_seen
+from vvgt_cli.score.views import WHOLE, score_drawn_view
 
 if TYPE_CHECKING:
     from vvgt_cli.images.metrics import Scores
@@ -105,11 +105,16 @@ def rungs(options: LadderOptions) -> list[Rung]:
     most, size, seed = options.max_gaussians, options.size, options.seed
     budgets = sorted({max(most // share, 1) for share in SHARES} | {most})
     found = [
-        Rung(f"closed form, K = {short(k)}", short(k), "closed form", FitOptions(k, size, seed=seed, steps=0))
+        Rung(
+            f"closed form, K = {short_number(k)}",
+            short_number(k),
+            "closed form",
+            FitOptions(k, size, seed=seed, steps=0),
+        )
         for k in budgets
     ]
     if options.live:
-        found.append(Rung(f"live form, K = {short(most)}", "live", "live", FitOptions(most, size, seed=seed)))
+        found.append(Rung(f"live form, K = {short_number(most)}", "live", "live", FitOptions(most, size, seed=seed)))
     if options.model:
         fit = FitOptions(most, size, seed=seed, steps=0, model=options.model)
         found.append(Rung(f"network {Path(options.model).name}", "network", "network", fit))
@@ -153,7 +158,7 @@ class Reference:
 
         cameras, axes = default_views("test", size=size), volume.source.volume.axes
         blocks = [spread_blocks(size, size, i) for i in range(len(cameras))]
-        around = condition_pictures(from_above(size), SIDE)
+        around = condition_pictures(larger_screens(size), SIDE)
         volume.views.expect([Picture(camera, REFERENCE, _drawn(blocks, i)) for i, camera in enumerate(cameras)])
         volume.views.expect([Picture(camera, REFERENCE, part) for _, camera, part in around])
         images, bar = [], console.bar("reference")
@@ -162,7 +167,7 @@ class Reference:
             if bar:
                 bar(i + 1, len(cameras))
         shown = upright(images, cameras, axes, lambda camera: volume.views.view(camera, REFERENCE))
-        conditions = list(condition_views(volume.views, from_above(size), REFERENCE, views=SIDE))
+        conditions = list(condition_views(volume.views, larger_screens(size), REFERENCE, views=SIDE))
         rays = max(rays for _, rays in REFERENCE.tiers)
         return cls(cameras, blocks, images, REFERENCE.step, rays, axes, shown, conditions)
 
@@ -191,7 +196,7 @@ class Reference:
         for i, camera in enumerate(self.cameras):
             drawn = _drawn(self.blocks, i)
             ours.append(render(gaussians, camera, blocks=drawn))
-            scores.append(score_seen(self.images[i], ours[i], self.blocks[i], drawn is None))
+            scores.append(score_drawn_view(self.images[i], ours[i], self.blocks[i], drawn is None))
         return mean_scores(scores), ours
 
 
@@ -241,7 +246,7 @@ def run_rungs(
 
 def peer_views(source: SourceRequest, options: LadderOptions, folder: Path) -> PeerViews:
     """What other trainers read: as many views as our longest run has, of the screen's size."""
-    count = views_of(max(options.steps, default=0), small=False)
+    count = view_count(max(options.steps, default=0), small=False)
     return PeerViews.render(source, folder / "views", count, options.size, options.blocks)
 
 
@@ -273,17 +278,17 @@ def _views_of(report: ConversionReport, fit: FitOptions) -> int:
     if report.refinement:
         return int(report.refinement["views"])
     if report.plan is None:
-        return views_of(fit.steps or 0, small=False)
+        return view_count(fit.steps or 0, small=False)
     return sum(stage["count"] for stage in report.plan["stages"] if stage["name"] == TrainingViews.name)
 
 
 def _views(run: Run, volume: Field, fit: FitOptions) -> tuple[Views, Views]:
     from vvgt_cli.dvr import RenderSettings, render_views
 
-    train = default_views("train", views_of(fit.steps or 0, small=False), size=view_edge(fit.size, small=False))
+    train = default_views("train", view_count(fit.steps or 0, small=False), size=view_edge(fit.size, small=False))
     volume.views.expect([*CheckViews().views(fit), *(Picture(camera, RenderSettings()) for camera in train)])
     with run.stage("check views"):
-        judges = judging_views(volume.views, default_views("check", size=fit.size), RenderSettings())
+        judges = render_check_views(volume.views, default_views("check", size=fit.size), RenderSettings())
     with run.stage("views"):
         return Views(train, render_views(volume.views, train)), judges
 
@@ -302,7 +307,7 @@ def _baseline(source: SourceRequest, rung: Rung, blocks: BlockOptions | None) ->
 
     run, fit = Run(Console(quiet=True), ConversionReport("report")), rung.fit
     count = max(fit.max_gaussians // STARTS, 1)
-    with opened(run, ConvertRequest(source, fit=fit, blocks=blocks), INIT) as volume:
+    with open_field(run, ConvertRequest(source, fit=fit, blocks=blocks), INIT) as volume:
         with run.stage("samples"):
             if rung.start == "points":
                 half = np.array(volume.source.volume.unit_frame().half)

@@ -15,8 +15,8 @@ import numpy as np
 from vvgt_cli.commands.infer import SHIPPED
 from vvgt_cli.commands.ladder import PICTURED, LadderOptions, Reference, pictures, run_rungs, rungs, warm_up
 from vvgt_cli.commands.peers import Peer
-from vvgt_cli.conversion.convert import opened
-from vvgt_cli.conversion.live import refusal
+from vvgt_cli.conversion.convert import open_field
+from vvgt_cli.conversion.live import live_refusal
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.source import SourceRequest, tf_record, volume_record
@@ -25,7 +25,17 @@ from vvgt_cli.jit.ahead import INIT
 from vvgt_cli.network.card import find_model
 from vvgt_cli.progress import Console
 from vvgt_cli.score.charts import FILES, draw, write_plots
-from vvgt_cli.score.curves import Series, cost, front, knee, psnr, read_series, table, unit_costs, worst_condition
+from vvgt_cli.score.curves import (
+    Series,
+    cost,
+    knee,
+    pareto_front,
+    psnr,
+    read_series,
+    table,
+    unit_costs,
+    worst_condition,
+)
 from vvgt_cli.score.page import Pictures, page
 from vvgt_cli.score.record import ConversionReport, Run, document
 from vvgt_cli.volume.blocks import check_memory
@@ -71,10 +81,10 @@ def report(request: ReportRequest, console: Console | None = None) -> dict[str, 
     check_memory(VIEWS * size**2 * VIEW_BYTES, f"--size {size}: test views and ours", "try a smaller --size")
     fit = FitOptions(request.ladder.max_gaussians, size)
     whole = ConvertRequest(request.source, fit=fit, blocks=request.ladder.blocks)
-    with opened(Run(console, ConversionReport("report")), whole, INIT) as volume:
+    with open_field(Run(console, ConversionReport("report")), whole, INIT) as volume:
         source = volume.source
         live = replace(whole, live=True, fit=FitOptions(fit.max_gaussians, size))
-        request = replace(request, ladder=replace(request.ladder, live=refusal(live, source) is None))
+        request = replace(request, ladder=replace(request.ladder, live=live_refusal(live, source) is None))
         warm_up(request.source, request.ladder)
         reference = Reference.render(volume, size, console)
         ceiling = reference.psnr_of("vtk", volume)
@@ -110,7 +120,7 @@ def _with_model(ladder: LadderOptions) -> LadderOptions:
 
 
 def _document(request: ReportRequest, source: Any, reference: Reference, runs: list[dict[str, Any]]) -> dict[str, Any]:
-    best, bend = [run["name"] for run in front(runs)], knee(runs)
+    best, bend = [run["name"] for run in pareto_front(runs)], knee(runs)
     return {
         "command_line": request.command_line,
         "volume": volume_record(source),

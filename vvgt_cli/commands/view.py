@@ -18,7 +18,7 @@ from vvgt_cli.commands.server import Part, Site, served
 from vvgt_cli.commands.streamed_site import streamed_parts
 from vvgt_cli.conversion.gaussian_files import STDIN, is_page, layout_of, open_gaussians, write_gaussians, write_page
 from vvgt_cli.conversion.index import files_of, is_index
-from vvgt_cli.conversion.readback import tell_agreement
+from vvgt_cli.conversion.readback import report_agreement
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import Gaussians, PlyOptions
@@ -83,7 +83,7 @@ def view(request: ViewRequest, announce: Callable[[str], None], console: Console
         gaussians, options = _opened(run, request, file)
         write_gaussians(run, request.output, gaussians, options, request.overwrite)
         run.compile(for_degree(DRAW, gaussians.degree))
-        tell_agreement(run, request.output, gaussians, options)
+        report_agreement(run, request.output, gaussians, options)
 
 
 def _join(run: Run, request: ViewRequest, clouds: Sequence[tuple[str, str]]) -> None:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vvgt_cli.conversion.clouds import Cloud, Clouds
-from vvgt_cli.conversion.convert import convert, convert_in_memory, opened, planned, run_conversion
+from vvgt_cli.conversion.convert import convert, convert_in_memory, open_field, plan_conversion, run_conversion
 from vvgt_cli.conversion.gaussian_files import is_page
 from vvgt_cli.conversion.index import (
     FRAMES,
@@ -316,7 +316,7 @@ class Memory:
     def convert(self, batch: Batch, item: Item, console: Console) -> ConversionReport:
         """Convert an item, whose volume is let go of."""
         run = Run(console, ConversionReport("convert"))
-        with opened(run, item.request) as volume:
+        with open_field(run, item.request) as volume:
             found = run_conversion(run, item.request, volume, item.gaussians, batch.previous)
             normals = found.normals()
         run.finish()
@@ -411,14 +411,14 @@ def convert_files(
     for one in [*kinds, *([PAGE] if page else [])]:
         check_options(one, used)
     if is_streamed(output):
-        from vvgt_cli.conversion.shards.run import init_in_blocks, streams
+        from vvgt_cli.conversion.shards.run import init_in_blocks, writes_streaming
 
         request = replace(request, blocks=request.blocks or automatic(request.source, console))
-        if streams(request):
+        if writes_streaming(request):
             init_in_blocks(request, console)
         return None
     if dry_run:
-        return planned(request, console).text()
+        return plan_conversion(request, console).text()
     if kind == ONE and not (is_page(output) and is_glob_of_volumes(request.source.path)):
         try:
             convert(request, console)

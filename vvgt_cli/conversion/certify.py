@@ -20,7 +20,7 @@ from vvgt_cli.score.views import score_test_views
 WITHIN = 0.1  # dB that a file may have lost, by its format
 
 
-def certified(
+def with_certificate(
     ply: PlyOptions, run: Run, field: Field, fit: FitOptions, gaussians: Gaussians, command: str | None,
     live_psnr: float | None = None,
 ) -> PlyOptions:  # fmt: skip
@@ -43,11 +43,11 @@ def certified(
         look=field.source.shown_as(),
         size=fit.size,
         rule=fit.rule,
-        psnr=round(first_views(scores), 2),
+        psnr=round(preview_psnr(scores), 2),
         views=len(PREVIEW_VIEWS),
         live_psnr=None if live_psnr is None else round(live_psnr, 2),
         conditions=tuple((condition.name(), round(condition.psnr, 2)) for condition in conditions),
-        texture=_texture(run.report.texture),
+        texture=_rounded_texture(run.report.texture),
         position_error=position_error(gaussians, ply),
         seconds=round(run.elapsed(), 1) if epoch() is None else None,
         command=command,
@@ -55,13 +55,13 @@ def certified(
     return replace(ply, certificate=found)
 
 
-def _texture(found: dict[str, Any] | None) -> tuple[float, float] | None:
+def _rounded_texture(found: dict[str, Any] | None) -> tuple[float, float] | None:
     if found is None or found["ours"] is None:
         return None
     return round(found["ours"], 3), round(found["reference"], 3)
 
 
-def first_views(scores: dict[str, Any]) -> float:
+def preview_psnr(scores: dict[str, Any]) -> float:
     """PSNR, dB, of the test views that every conversion draws, whether others were drawn or not."""
     views = scores["per_view"]
     seen = views if len(views) <= len(PREVIEW_VIEWS) else [views[n] for n in PREVIEW_VIEWS]
@@ -115,7 +115,7 @@ class Verdict:
         return f"holds: {volume} and look, {self.psnr:.2f} dB ({self.recorded:.2f} dB recorded)"
 
 
-def checked(certificate: Certificate, field: Field, gaussians: Gaussians, looked_up: bool = False) -> Verdict:
+def verify(certificate: Certificate, field: Field, gaussians: Gaussians, looked_up: bool = False) -> Verdict:
     """A file's certificate against the volume: its digests, and its views drawn and scored again.
 
     Args:

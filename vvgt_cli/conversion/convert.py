@@ -8,25 +8,25 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 
-from vvgt_cli.conversion.certify import certified
+from vvgt_cli.conversion.certify import with_certificate
 from vvgt_cli.conversion.gaussian_files import write_gaussians
-from vvgt_cli.conversion.live import check_live, live_conversion
-from vvgt_cli.conversion.place import out_of_box, placed, remarks, way_up
+from vvgt_cli.conversion.live import check_live, convert_live
+from vvgt_cli.conversion.place import placement_warnings, to_unit_frame, up_axis, with_place
 from vvgt_cli.conversion.plan import Plan, Planner, check_memory
-from vvgt_cli.conversion.readback import tell_cost
+from vvgt_cli.conversion.readback import report_format_cost
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions, file_bytes
 from vvgt_cli.conversion.result import Conversion
 from vvgt_cli.conversion.resume import FITTED, Checkpoint, checkpoint_folder, checkpoint_of
 from vvgt_cli.conversion.stage import Work
 from vvgt_cli.conversion.stages import CheckViews, ClosedFormStage
-from vvgt_cli.conversion.stages.views import wide
+from vvgt_cli.conversion.stages.views import suits_small_views
 from vvgt_cli.conversion.warm_start import WarmStart
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.field import Field, Picture, Resident
 from vvgt_cli.field.open import Wanted, automatic, beside, blocked
 from vvgt_cli.field.source import Source, describe_source, load, tf_record, volume_record
 from vvgt_cli.field.workload import expected_wide
-from vvgt_cli.files import check_room
+from vvgt_cli.files import check_disk_space
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored
 from vvgt_cli.gaussians.formats import format_of
 from vvgt_cli.gaussians.legend import legend_text
@@ -61,9 +61,9 @@ def convert(
     with (
         claimed(request.outputs(), request.inputs(), request.overwrite),
         checkpoint_folder(request.checkpoint),
-        opened(run, request) as field,
+        open_field(run, request) as field,
     ):
-        early = _early(run, request)
+        early = _early_writer(run, request)
         report = _write(run, request, run_conversion(run, request, field, made, start, early), early is not None)
         if request.checkpoint is not None and not report.interrupted:
             Checkpoint(Path(request.checkpoint)).finish()
@@ -81,7 +81,7 @@ def convert_in_memory(
     """
     run = Run(console or Console(), ConversionReport("convert"))
     with ExitStack() as stack:
-        field = stack.enter_context(opened(run, request))
+        field = stack.enter_context(open_field(run, request))
         conversion = run_conversion(run, request, field, start=start, unscored=unscored)
         weakref.finalize(conversion, stack.pop_all().close)  # the conversion draws the field's blocks
     run.finish()
@@ -95,13 +95,13 @@ def initialise_only(request: ConvertRequest, console: Console | None = None) -> 
         UsageError, DataError: as `convert`.
     """
     run = Run(console or Console(), ConversionReport("init"))
-    with claimed(request.outputs(), request.inputs(), request.overwrite), opened(run, request, INIT) as field:
+    with claimed(request.outputs(), request.inputs(), request.overwrite), open_field(run, request, INIT) as field:
         work = Work(run, field, request.fit, degree=degree_of(request, field.source))
         ClosedFormStage().run(work)
         return _write(run, request, _conversion(request, work, as_stored(work.made())))
 
 
-def planned(request: ConvertRequest, console: Console | None = None) -> Plan:
+def plan_conversion(request: ConvertRequest, console: Console | None = None) -> Plan:
     """Return the plan of `convert`: the volume is read and laid out, and a small view is timed.
 
     Raises:
@@ -109,17 +109,17 @@ def planned(request: ConvertRequest, console: Console | None = None) -> Plan:
     """
     run = Run(console or Console(), ConversionReport("convert"))
     check_outputs(request.outputs(), request.inputs(), request.overwrite)
-    with opened(run, replace(request, output=None)) as field:
+    with open_field(run, replace(request, output=None)) as field:
         return _planned(run, request, field)[-1]
 
 
-def fitted(run: Run, request: ConvertRequest) -> Gaussians:
+def fit_gaussians(run: Run, request: ConvertRequest) -> Gaussians:
     """Return the Gaussians of a conversion in the box frame, neither scored nor written.
 
     Raises:
         DataError, UsageError: as `convert`.
     """
-    with opened(run, request) as field:
+    with open_field(run, request) as field:
         work, planner, plan = _planned(run, request, field)
         check_memory(plan)
         _fit(work, request, planner, plan)
@@ -147,7 +147,7 @@ def run_conversion(
     """
     if request.live:
         check_live(request)
-        return live_conversion(run, request, field, ply_options(request, field.source), unscored=unscored)
+        return convert_live(run, request, field, ply_options(request, field.source), unscored=unscored)
     if start is not None:
         field.views = start.views(field.views)
     work, planner, plan = _planned(run, request, field, expected=start is None)
@@ -176,7 +176,7 @@ def run_conversion(
     for stage in plan.stages:
         if stage.scores:
             stage.run(work)
-    conversion.ply = certified(conversion.ply, run, work.field, work.fit, conversion.gaussians, request.command)
+    conversion.ply = with_certificate(conversion.ply, run, work.field, work.fit, conversion.gaussians, request.command)
     return conversion
 
 
@@ -211,10 +211,10 @@ def _fit(work: Work, request: ConvertRequest, planner: Planner, plan: Plan) -> P
     first.run(work)
     degree = work.made().degree if request.ply.sh_degree is None else request.ply.sh_degree
     if request.output is not None and request.output != STDOUT:
-        check_room(request.output, 2 * file_bytes(len(work.made()), degree))  # with its certificate once more
+        check_disk_space(request.output, 2 * file_bytes(len(work.made()), degree))  # with its certificate once more
     # halfway between its pace and that of drawing: steps follow neither alone on every machine
     pace = max(work.run.report.stages[-1].seconds / first.cost(plan.workload).seconds, QUICKEST) ** 0.5
-    planner = replace(planner, wide=wide(work.made(), work.fit.size), sh_degree=degree)
+    planner = replace(planner, wide=suits_small_views(work.made(), work.fit.size), sh_degree=degree)
     workload = replace(plan.workload.at(pace), gaussians=len(work.made()), degree=work.made().degree)
     plan = planner.plan(workload, work.run.elapsed(), begun=True)
     check_memory(plan)
@@ -238,7 +238,7 @@ def improve(work: Work, plan: Plan) -> None:
             for name in (other.name for other in ahead[n:] if other.improves):
                 work.run.skip(name, f"the check views have {work.limits.target_psnr:g} dB without it")
             if not improved:
-                _fewer(work)
+                _take_fewest(work)
             return
         if not told and not isinstance(stage, CheckViews):
             told = True
@@ -250,7 +250,7 @@ def improve(work: Work, plan: Plan) -> None:
             improved = improved or stage.improves
 
 
-def _fewer(work: Work) -> None:
+def _take_fewest(work: Work) -> None:
     """Take the fewest Gaussians that reach the target: a part of the budget, or all of it."""
     start = work.start
     if start is None or start.form is None:
@@ -267,11 +267,13 @@ def _fewer(work: Work) -> None:
 def _conversion(request: ConvertRequest, work: Work, gaussians: Gaussians) -> Conversion:
     """Return a conversion without scores."""
     source = work.field.source
-    return Conversion(out_of_box(gaussians, source.volume), work.run.report, ply_options(request, source), work.field)
+    return Conversion(
+        to_unit_frame(gaussians, source.volume), work.run.report, ply_options(request, source), work.field
+    )
 
 
 @contextmanager
-def opened(run: Run, request: ConvertRequest, kernels: tuple[str, ...] = CONVERT) -> Iterator[Field]:
+def open_field(run: Run, request: ConvertRequest, kernels: tuple[str, ...] = CONVERT) -> Iterator[Field]:
     """Open a request's volume under its look, in memory or in blocks, and compile ``kernels``.
 
     Blocks lie beside the output until it is written: after an interruption the same command reads those that are there.
@@ -284,7 +286,7 @@ def opened(run: Run, request: ConvertRequest, kernels: tuple[str, ...] = CONVERT
         with run.stage("read") as stage:
             source = load(request.source)
             stage.note = describe_source(source)
-        _tell(run, request, source)
+        _report_source(run, request, source)
         run.compile(_kernels(kernels, request, source), source.kernel_type())
         with run.stage("scene"):
             field = Resident.of(source)
@@ -292,17 +294,17 @@ def opened(run: Run, request: ConvertRequest, kernels: tuple[str, ...] = CONVERT
         return
     wanted = Wanted(request.budget(), request.fit.size, request.ply.sh_degree, values=request.live)
     with beside(request.output) as parts, blocked(run, request.source, options, parts, wanted) as found:
-        _tell(run, request, found.source)
+        _report_source(run, request, found.source)
         run.compile(for_blocks(_kernels(kernels, request, found.source)), found.source.kernel_type())
         yield found
         parts.remove()
 
 
-def _tell(run: Run, request: ConvertRequest, source: Source) -> None:
+def _report_source(run: Run, request: ConvertRequest, source: Source) -> None:
     """Report what was read."""
     ply = ply_options(request, source)
-    flattened = _flattened(degree_of(request, source), source)
-    for remark in [*remarks(source.volume, ply), *([flattened] if flattened else [])]:
+    flattened = _harmonics_warning(degree_of(request, source), source)
+    for remark in [*placement_warnings(source.volume, ply), *([flattened] if flattened else [])]:
         run.console.message(remark)
     run.report.volume = volume_record(source)
     run.report.transfer_function = tf_record(source, request.source)
@@ -324,7 +326,7 @@ def degree_of(request: ConvertRequest, source: Source) -> int:
     return VIEW_DEGREE if request.ply.sh_degree is None else request.ply.sh_degree
 
 
-def _flattened(degree: int, source: Source) -> str | None:
+def _harmonics_warning(degree: int, source: Source) -> str | None:
     """Return a message where the degree asked for cannot hold the light."""
     if degree >= VIEW_DEGREE or source.lighting is None or not source.lighting.depends_on_view:
         return None
@@ -338,7 +340,7 @@ def ply_options(request: ConvertRequest, source: Source) -> PlyOptions:
     """Return how the file is written, with all that follows from the source."""
     ply = replace(
         request.ply,
-        up=way_up(request.up, request.ply.frame, source.volume.space),
+        up=up_axis(request.up, request.ply.frame, source.volume.space),
         unit_distance=source.unit_distance,
         unit_distance_label=source.unit_label,
         made_for=request.fit.size,
@@ -348,7 +350,7 @@ def ply_options(request: ConvertRequest, source: Source) -> PlyOptions:
         optics=source.optics(),
         legend=_legend(source),
     )
-    return placed(ply, source.volume)
+    return with_place(ply, source.volume)
 
 
 def _legend(source: Source) -> str | None:
@@ -361,7 +363,7 @@ def _legend(source: Source) -> str | None:
     return legend_text(source.tf, lo, hi, "HU" if volume.hounsfield else "")
 
 
-def _early(run: Run, request: ConvertRequest) -> Callable[[Conversion], None] | None:
+def _early_writer(run: Run, request: ConvertRequest) -> Callable[[Conversion], None] | None:
     """Return what writes the file before its scores are known, where it is written twice."""
     output = request.output
     if output is None or request.writes < 2:
@@ -386,7 +388,9 @@ def _write(run: Run, request: ConvertRequest, conversion: Conversion, written: b
     if format_of(request.output):
         source = conversion.field.source
         run.compile(source.kernels(EVALUATE), source.kernel_type())
-        tell_cost(run, request.output, conversion.gaussians, conversion.ply, conversion.field.views, source.volume)
+        report_format_cost(
+            run, request.output, conversion.gaussians, conversion.ply, conversion.field.views, source.volume
+        )
     if request.preview:
         with run.stage("preview"):
             write_png(request.preview, conversion.preview(), request.overwrite)

@@ -13,7 +13,7 @@ import numpy as np
 from vvgt_cli.conversion.batch import Batch, Item
 from vvgt_cli.conversion.index import FRAMES
 from vvgt_cli.conversion.manifest import Shard
-from vvgt_cli.conversion.place import way_up
+from vvgt_cli.conversion.place import up_axis
 from vvgt_cli.conversion.previous_frame import previous_frame
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import DataError, SeveralComponents, UsageError
@@ -108,7 +108,7 @@ class Series(Batch):
     kind, resumes = FRAMES, True
 
     def __init__(self, request: ConvertRequest, shard: Shard, page: bool) -> None:
-        self._steps: Sequence[Step] = steps_of(request.source)
+        self._steps: Sequence[Step] = list_steps(request.source)
         volume, count = Path(request.source.path).name, len(self._steps)
         super().__init__(request, volume, [str(k) for k in range(count)])
         self._shard = shard
@@ -138,7 +138,7 @@ class Series(Batch):
             if source.labels is None and found.labels is not None:
                 source = replace(source, labels=AUTO)
             shown, distance = _functions(source, found)
-            self._dark = [not source.layers and _dark(shown, own) for own in found.own]
+            self._dark = [not source.layers and _invisible(shown, own) for own in found.own]
             lo, hi = min(n.lo for n in found.whole), max(n.hi for n in found.whole)
             stage.note = (
                 f"{len(steps)} of {' x '.join(map(str, found.grid.dims))}, values {lo:g} to {hi:g}; "
@@ -188,7 +188,7 @@ class Series(Batch):
             **asdict(request.limits),
             "model": read_text(find_model(request.fit.model) / CARD) if request.fit.model else None,
             **{key: ply[key] for key in ("frame", "sh_degree", "comments")},
-            "up": way_up(request.up, request.ply.frame, grid.space),
+            "up": up_axis(request.up, request.ply.frame, grid.space),
             "place": [grid.space, *grid.affine[:3].ravel().tolist()],
             "outputs": [Path(p).name for p in (request.output, request.report, request.preview) if p],
         }
@@ -238,7 +238,7 @@ def survey(
         content = open_parts(step.volume, replace(step.read, stored=True, packed=True) if stored else step.read)
         if content.overlapping:
             raise UsageError(f"{step.name}: segments that overlap, in several layers; convert such frames one by one")
-        first = first or replace(content, volumes=tuple(map(_hollow, content.volumes)))
+        first = first or replace(content, volumes=tuple(map(_without_values, content.volumes)))
         _check_frame(step, steps[0], content, first)
         if k == 0 and labels is None and tf is None and content.one_field:
             mapped = holds_table(content.path) or recognised(content.volumes[0])
@@ -255,7 +255,7 @@ def survey(
     return Survey(len(steps), own, whole, first, digest(*digests), tuple(sorted(found)) if mapped else None)
 
 
-def _hollow(volume: Volume) -> Volume:
+def _without_values(volume: Volume) -> Volume:
     """The same without its values."""
     return replace(volume, data=np.broadcast_to(volume.data.dtype.type(0), volume.data.shape))
 
@@ -301,7 +301,7 @@ def merge_statistics(parts: Sequence[Statistics]) -> Statistics:
     return Statistics(lo, hi, sum(p.nan_count for p in parts), sum(p.inf_count for p in parts), histogram, edges)
 
 
-def _dark(shown: Sequence[TransferFunction | LabelTable], own: Sequence[tuple[float, float]]) -> bool:
+def _invisible(shown: Sequence[TransferFunction | LabelTable], own: Sequence[tuple[float, float]]) -> bool:
     """Whether nothing of a frame is visible."""
     return not any(tf.support(*limits) for tf, limits in zip(shown, own, strict=True))
 
@@ -331,7 +331,7 @@ def _table(labels: str | LabelTable | None, found: Sequence[int]) -> LabelTable:
     return labels if isinstance(labels, LabelTable) else distinct(found)
 
 
-def steps_of(source: SourceRequest) -> list[Step]:
+def list_steps(source: SourceRequest) -> list[Step]:
     """The files of a glob, or the time steps of the one file that is named.
 
     Raises:

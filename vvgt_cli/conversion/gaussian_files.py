@@ -134,13 +134,13 @@ def _write_file(
     except VvgtError as error:
         if known is None and isinstance(error, DataError) and not isinstance(error.__cause__, OSError):
             raise  # these Gaussians cannot be written anywhere
-        place = _elsewhere(Path(output), gaussians, options, normals)
+        place = _rescue(Path(output), gaussians, options, normals)
         if place is None:
             raise
         raise type(error)(f"{error}; what was computed lies in {place}") from error
 
 
-def _elsewhere(output: Path, gaussians: Gaussians, options: PlyOptions, normals: np.ndarray | None) -> Path | None:
+def _rescue(output: Path, gaussians: Gaussians, options: PlyOptions, normals: np.ndarray | None) -> Path | None:
     """Write a `.ply` to the temporary folder, else to the working folder; where it is, None where neither takes it."""
     name = f"{output.stem[:80]}.{secrets.token_hex(4)}.ply"
     for find in (tempfile.gettempdir, os.getcwd):

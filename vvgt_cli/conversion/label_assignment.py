@@ -18,7 +18,7 @@ OFFSETS = (-2.0, -1.0, 0.0, 1.0, 2.0)  # standard deviations along each axis, wh
 
 
 @dataclass(frozen=True)
-class Hidden:
+class HiddenCells:
     """Where no view sees anything, nor one cell around.
 
     Attributes:
@@ -32,14 +32,14 @@ class Hidden:
     half: np.ndarray
     step: np.ndarray
 
-    def whether(self, gaussians: Gaussians) -> np.ndarray:
+    def contain(self, gaussians: Gaussians) -> np.ndarray:
         """(K,) whether the centre of each is hidden."""
         voxels = (gaussians.means.astype(np.float64) + self.half) / self.step
         i, j, k = (self._along(axis, voxels[:, axis]) for axis in range(3))
         found: np.ndarray = self.cells[k, j, i]
         return found
 
-    def any_of(self, volume: Volume, number: int) -> bool:
+    def meet_label(self, volume: Volume, number: int) -> bool:
         """Whether some of a label's surface, where it touches another label or the box's end, is hidden."""
         middles = [np.arange(n) + 0.5 for n in volume.dims]
         x, y, z = (self._along(axis, middles[axis]) for axis in range(3))
@@ -66,7 +66,7 @@ class Hidden:
         return found
 
 
-def hidden_in(near: np.ndarray, edge: np.ndarray, half: np.ndarray, step: np.ndarray) -> Hidden:
+def hidden_cells(near: np.ndarray, edge: np.ndarray, half: np.ndarray, step: np.ndarray) -> HiddenCells:
     """What no training view sees.
 
     Args:
@@ -80,7 +80,7 @@ def hidden_in(near: np.ndarray, edge: np.ndarray, half: np.ndarray, step: np.nda
         wider[tuple(ahead)] |= near[tuple(behind)]
         wider[tuple(behind)] |= near[tuple(ahead)]
         near = wider
-    return Hidden(~near, edge, half, step)
+    return HiddenCells(~near, edge, half, step)
 
 
 def assign_labels(gaussians: Gaussians, shown: Sequence[tuple[Volume, LabelTable, Label]]) -> np.ndarray:

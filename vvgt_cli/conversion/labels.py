@@ -16,9 +16,9 @@ import numpy as np
 from vvgt_cli.closed_form import VbmOptions
 from vvgt_cli.closed_form.tree import HIDDEN
 from vvgt_cli.conversion.batch import Batch, Item
-from vvgt_cli.conversion.convert import fitted, opened
+from vvgt_cli.conversion.convert import fit_gaussians, open_field
 from vvgt_cli.conversion.index import LABELS
-from vvgt_cli.conversion.label_assignment import assign_labels, hidden_in
+from vvgt_cli.conversion.label_assignment import assign_labels, hidden_cells
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import NothingVisible
 from vvgt_cli.field.layered import AUTO, Content, content_of, layers_of, open_parts
@@ -144,22 +144,22 @@ def _gaussians(request: ConvertRequest, parts: Sequence[MapLabel], run: Run) -> 
         return [_alone(part, console) for part in parts]  # of segments that overlap colours would mix in a Gaussian
     whole = replace(request, source=replace(parts[0].request.source, labels=parts[0].table))
     plain = replace(whole, source=replace(whole.source, light=LightOptions()))
-    with opened(run, plain) as field, run.stage("hidden"):
+    with open_field(run, plain) as field, run.stage("hidden"):
         form = field.pyramid(VbmOptions(request.fit.max_gaussians, request.fit.size)).form
         assert form is not None
-        hides = hidden_in(form.seen.largest > HIDDEN, form.seen.edge, form.half, form.step)
+        hides = hidden_cells(form.seen.largest > HIDDEN, form.seen.edge, form.half, form.step)
     hidden: list[list[Gaussians]] = []
     for part in parts:
         hidden.append([])
-        if not hides.any_of(part.volume, part.label.number):
+        if not hides.meet_label(part.volume, part.label.number):
             continue
         console.message(f"{part.text()}: what the others hide of it")
         alone = _alone(part, console)
         if alone is not None:
-            hidden[-1].append(alone.take(hides.whether(alone)))
+            hidden[-1].append(alone.take(hides.contain(alone)))
     console.message("all labels together: what is seen of them")
     left = max(request.fit.max_gaussians - sum(len(one) for mine in hidden for one in mine), 1)
-    seen = _fitted(replace(whole, fit=replace(request.fit, max_gaussians=left)), console)
+    seen = _fit(replace(whole, fit=replace(request.fit, max_gaussians=left)), console)
     owner = assign_labels(seen, [(part.volume, part.table, part.label) for part in parts])
     both = [together([*mine, seen.take(owner == k)]) for k, mine in enumerate(hidden)]
     return [one if len(one) else None for one in both]
@@ -168,15 +168,15 @@ def _gaussians(request: ConvertRequest, parts: Sequence[MapLabel], run: Run) -> 
 def _alone(part: MapLabel, console: Console) -> Gaussians | None:
     """A label as though there were no other; None where nothing of it is seen."""
     try:
-        return _fitted(part.request, console)
+        return _fit(part.request, console)
     except NothingVisible:
         return None
 
 
-def _fitted(request: ConvertRequest, console: Console) -> Gaussians:
+def _fit(request: ConvertRequest, console: Console) -> Gaussians:
     """Gaussians of a request, box frame; Ctrl-C ends the whole."""
     run = Run(console, ConversionReport("convert"))
-    found = fitted(run, request)
+    found = fit_gaussians(run, request)
     if run.report.interrupted:
         raise KeyboardInterrupt
     return found

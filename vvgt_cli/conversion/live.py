@@ -14,10 +14,10 @@ import numpy as np
 
 from vvgt_cli.cameras.sets import pixel_width
 from vvgt_cli.closed_form.columns import MASS
-from vvgt_cli.conversion.certify import certified
-from vvgt_cli.conversion.live_labels import carrying_labels, fog_of_labels, label_facts, labels_of
-from vvgt_cli.conversion.place import in_frame_of, into_box, out_of_box
-from vvgt_cli.conversion.recolored import Look, SeveralLooks, lit_by, looked_up
+from vvgt_cli.conversion.certify import with_certificate
+from vvgt_cli.conversion.live_labels import label_facts, label_fog_field, live_labels, with_labels
+from vvgt_cli.conversion.place import to_box_frame, to_frame_of, to_unit_frame
+from vvgt_cli.conversion.recolored import Look, SeveralLooks, lookup_table, visible_cloud
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.conversion.result import Conversion
 from vvgt_cli.conversion.stage import Work
@@ -66,18 +66,18 @@ def check_live(request: ConvertRequest) -> None:
         raise UsageError(f"--live: a file for every function, made in one way; leave out {', '.join(names)}")
 
 
-def refusal(request: ConvertRequest, source: Source) -> str | None:
+def live_refusal(request: ConvertRequest, source: Source) -> str | None:
     """Why there is no live file of a source; None where there is one."""
     try:
         check_live(request)
         check_layers(source)
-        in_box(source)
+        box_lighting(source)
     except UsageError as error:
         return str(error)
     return None
 
 
-def live_conversion(
+def convert_live(
     run: Run, request: ConvertRequest, field: Field, ply: PlyOptions, scored: bool = True,
     unscored: Callable[[Conversion], None] | None = None,
 ) -> Conversion:  # fmt: skip
@@ -88,47 +88,47 @@ def live_conversion(
         DataError: nothing is visible.
     """
     source, fit = field.source, request.fit
-    lighting, pixel = in_box(source), pixel_width(fit.size)
+    lighting, pixel = box_lighting(source), pixel_width(fit.size)
     check_layers(source)
     if len(source.layers) > 1:
-        gaussians, facts = _of_layers(run, request, field)
+        gaussians, facts = _several_layers(run, request, field)
         look: Look = SeveralLooks(tuple((layer.tf, layer.unit_distance) for layer in source.layers))
     else:
-        gaussians, facts, look = _of_one(run, request, field), _facts(source), source.tf
-    table = looked_up(facts, look, source.unit_distance, source.volume.unit_frame().scale)
-    gaussians = as_stored(lit(baked(gaussians, table, pixel), lighting))
-    found = Conversion(out_of_box(gaussians, source.volume), run.report, replace(ply, live=facts), field)
+        gaussians, facts, look = _one_layer(run, request, field), _facts(source), source.tf
+    table = lookup_table(facts, look, source.unit_distance, source.volume.unit_frame().scale)
+    gaussians = as_stored(relight(baked(gaussians, table, pixel), lighting))
+    found = Conversion(to_unit_frame(gaussians, source.volume), run.report, replace(ply, live=facts), field)
     if unscored is not None:
         unscored(found)
     if scored:
-        psnr = _score(run, request, field, gaussians, lit_by(gaussians, table, lighting, pixel))
-        found.ply = certified(found.ply, run, field, fit, found.gaussians, request.command, psnr)
+        psnr = _score(run, request, field, gaussians, visible_cloud(gaussians, table, lighting, pixel))
+        found.ply = with_certificate(found.ply, run, field, fit, found.gaussians, request.command, psnr)
     return found
 
 
 def _facts(source: Source, several: int = 1) -> LiveFacts:
     """What a file says of the values or labels of one layer; ``several``: layers that share a header."""
     if isinstance(source.tf, LabelTable):
-        return label_facts(source, labels_of(source))
+        return label_facts(source, live_labels(source))
     return LiveFacts.of(source.volume, source.overall, source.tf, several)
 
 
-def _of_one(run: Run, request: ConvertRequest, field: Field) -> Gaussians:
+def _one_layer(run: Run, request: ConvertRequest, field: Field) -> Gaussians:
     """Gaussians of one layer, box frame, that carry what is under them."""
     from vvgt_cli.look.fog import fog
 
     source = field.source
     if isinstance(source.tf, LabelTable):
-        labels = labels_of(source)
-        foggy = fog_of_labels(field, labels)
-        found = carrying_labels(run, foggy, placed_by(run, foggy, request), labels)
+        labels = live_labels(source)
+        foggy = label_fog_field(field, labels)
+        found = with_labels(run, foggy, fog_start(run, foggy, request), labels)
     else:
         foggy = field.with_look(source.shown_by(fog(source.overall, source.tf)))
-        found = carrying(run, foggy, placed_by(run, foggy, request))
-    return wide_enough(found, request.fit.size)
+        found = with_values(run, foggy, fog_start(run, foggy, request))
+    return widen_narrow(found, request.fit.size)
 
 
-def _of_layers(run: Run, request: ConvertRequest, field: Field) -> tuple[Gaussians, LiveFacts]:
+def _several_layers(run: Run, request: ConvertRequest, field: Field) -> tuple[Gaussians, LiveFacts]:
     """Gaussians of each layer, in the box frame of the first; they share the budget evenly."""
     source, parts, facts = field.source, [], []
     count, left, half = len(source.layers), request.fit.max_gaussians, np.array(source.volume.unit_frame().half)
@@ -139,11 +139,11 @@ def _of_layers(run: Run, request: ConvertRequest, field: Field) -> tuple[Gaussia
         said = replace(_facts(alone.source, count), name=layer.volume.name, distance=layer.unit_distance)
         facts.append(replace(said, dims=source.volume.dims))
         try:
-            some = _of_one(run, share, alone)
+            some = _one_layer(run, share, alone)
         except NothingVisible:  # a frame of a series in which it is empty
             run.skip(layer.volume.name, "nothing but background")
             continue
-        some = into_box(in_frame_of(out_of_box(some, layer.volume), layer.volume, source.volume), source.volume)
+        some = to_box_frame(to_frame_of(to_unit_frame(some, layer.volume), layer.volume, source.volume), source.volume)
         some = some.take(np.flatnonzero((np.abs(some.means) <= half + 1e-6).all(axis=1)))
         assert some.live is not None
         live = np.zeros((len(some), NUMBER + 1), np.float32)
@@ -187,7 +187,7 @@ def _score(run: Run, request: ConvertRequest, field: Field, gaussians: Gaussians
     return live.psnr
 
 
-def in_box(source: Source) -> Lighting | None:
+def box_lighting(source: Source) -> Lighting | None:
     """A source's light, its directions in the box frame.
 
     Raises:
@@ -200,7 +200,7 @@ def in_box(source: Source) -> Lighting | None:
     return replace(source.lighting, directions=tuple(turned))
 
 
-def lit(gaussians: Gaussians, lighting: Lighting | None) -> Gaussians:
+def relight(gaussians: Gaussians, lighting: Lighting | None) -> Gaussians:
     """Gaussians that carry values with their colours under a light in their frame."""
     from vvgt_cli.closed_form.relit import relit
 
@@ -208,7 +208,7 @@ def lit(gaussians: Gaussians, lighting: Lighting | None) -> Gaussians:
     return gaussians if lighting is None else relit(gaussians, gaussians.live[:, GRADIENT], lighting)
 
 
-def table_of(source: Source) -> Table:
+def function_table(source: Source) -> Table:
     """Of a source's function, lengths in the unit frame."""
     numbers, tf = source.overall, source.tf
     assert isinstance(tf, TransferFunction)
@@ -217,7 +217,7 @@ def table_of(source: Source) -> Table:
     return Table.of_function(tf, facts.lo, facts.hi, distance, facts.grain)
 
 
-def placed_by(run: Run, field: Field, request: ConvertRequest) -> Start:
+def fog_start(run: Run, field: Field, request: ConvertRequest) -> Start:
     """The closed form of the fog.
 
     Raises:
@@ -234,14 +234,14 @@ def placed_by(run: Run, field: Field, request: ConvertRequest) -> Start:
     return start
 
 
-def carrying(run: Run, field: Field, start: Start) -> Gaussians:
+def with_values(run: Run, field: Field, start: Start) -> Gaussians:
     """Gaussians of a field's look with the values under them, without those that have none."""
     assert start.leaves is not None
     with run.stage("values") as stage:
         values = field.sample(start.gaussians)
         known = np.flatnonzero(np.isfinite(values).all(axis=1))
         gaussians, values, leaves = start.gaussians.take(known), values[known], start.leaves.take(known)
-        tau = table_of(field.source).at(values[:, 0], values[:, 1])[:, 3]
+        tau = function_table(field.source).at(values[:, 0], values[:, 1])[:, 3]
         length = lengths(leaves.moments[:, MASS], tau, leaves.edge.prod(axis=1))
         live = np.insert(values, LENGTH, length, axis=1)
         span = field.source.overall.hi - field.source.overall.lo
@@ -249,7 +249,7 @@ def carrying(run: Run, field: Field, start: Start) -> Gaussians:
     return replace(gaussians, live=live, harmonics=None)
 
 
-def wide_enough(gaussians: Gaussians, size: int) -> Gaussians:
+def widen_narrow(gaussians: Gaussians, size: int) -> Gaussians:
     """None narrower than `SMALLEST` px of the screen: viewers leave such out. Their mass stays."""
     least = np.log(SMALLEST * pixel_width(size))
     widening = np.maximum(least - gaussians.log_scales.max(axis=1).astype(np.float64), 0)

@@ -22,7 +22,7 @@ from vvgt_cli.score.record import Run
 from vvgt_cli.volume.label_maps import counts_of
 
 
-def labels_of(source: Source) -> tuple[Label, ...]:
+def live_labels(source: Source) -> tuple[Label, ...]:
     """The labels of a source that Gaussians can belong to: hidden ones too, which other tables may show.
 
     Raises:
@@ -42,7 +42,7 @@ def label_facts(source: Source, labels: tuple[Label, ...]) -> LiveFacts:
     return LiveFacts(min(numbers), max(numbers), source.volume.dims, labels=labels)
 
 
-def fog_of_labels(field: Field, labels: tuple[Label, ...]) -> Field:
+def label_fog_field(field: Field, labels: tuple[Label, ...]) -> Field:
     """The label map with these labels as one thin fog, told apart by their colours."""
     layer = field.source.layers[0]
     assert isinstance(layer.tf, LabelTable)
@@ -51,7 +51,7 @@ def fog_of_labels(field: Field, labels: tuple[Label, ...]) -> Field:
     return field.with_look(field.source.labelled_by([table]))
 
 
-def carrying_labels(run: Run, field: Field, start: Start, labels: tuple[Label, ...]) -> Gaussians:
+def with_labels(run: Run, field: Field, start: Start, labels: tuple[Label, ...]) -> Gaussians:
     """Gaussians of the fog with the rows of their labels, without those that lie in none."""
     from vvgt_cli.closed_form.labelled import labelled
 

@@ -48,7 +48,7 @@ class RememberedViews:
     def forget(self, picture: Picture) -> None:
         """See `ViewRenderer.forget`: pictures are kept for the next frame."""
 
-    def outdate(self, changes: Changes | None) -> None:
+    def invalidate(self, changes: Changes | None) -> None:
         """Let go of what shows something else now; None: of all."""
         if changes is None:
             self._kept.clear()
@@ -60,7 +60,7 @@ class RememberedViews:
         found = self._kept.get(_key(view))
         return None if found is None else found[1].copy()
 
-    def room(self, views: Sequence[Picture]) -> int:
+    def new_bytes(self, views: Sequence[Picture]) -> int:
         """Bytes that will be kept of them beside what is kept."""
         sizes = {_key(view): (view.camera.width, view.camera.height) for view in views}
         return sum(16 * w * h for key, (w, h) in sizes.items() if key not in self._kept and max(w, h) <= self.largest)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 AUTO, NONE = "auto", "none"
 
 
-def way_up(up: str, frame: str, space: str | None) -> str:
+def up_axis(up: str, frame: str, space: str | None) -> str:
     """World axis that viewers show upwards: superior for `AUTO` in the unit frame of an anatomical space, else `NONE`.
 
     Args:
@@ -40,19 +40,19 @@ def way_up(up: str, frame: str, space: str | None) -> str:
     return world_axis(up, space)
 
 
-def out_of_box(gaussians: Gaussians, volume: Volume) -> Gaussians:
+def to_unit_frame(gaussians: Gaussians, volume: Volume) -> Gaussians:
     """Gaussians of the volume's box frame in its unit frame."""
     return transform(gaussians, volume.axes)
 
 
-def into_box(gaussians: Gaussians, volume: Volume) -> Gaussians:
+def to_box_frame(gaussians: Gaussians, volume: Volume) -> Gaussians:
     """Gaussians of the volume's unit frame in its box frame."""
     axes = volume.axes
     straight = np.array_equal(axes, np.eye(3))
     return gaussians if straight else transform(gaussians, np.linalg.inv(axes))
 
 
-def in_frame_of(gaussians: Gaussians, volume: Volume, other: Volume) -> Gaussians:
+def to_frame_of(gaussians: Gaussians, volume: Volume, other: Volume) -> Gaussians:
     """Gaussians of a volume's unit frame in that of another; the lengths that they carry, too."""
     own, its = volume.unit_frame(), other.unit_frame()
     before, factor = own.scale * (np.array(own.centre) - np.array(its.centre)), its.scale / own.scale
@@ -64,7 +64,7 @@ def in_frame_of(gaussians: Gaussians, volume: Volume, other: Volume) -> Gaussian
     return replace(moved, live=live)
 
 
-def placed(ply: PlyOptions, volume: Volume) -> PlyOptions:
+def with_place(ply: PlyOptions, volume: Volume) -> PlyOptions:
     """The layout of a file, with the records of where the volume is."""
     frame = volume.unit_frame()
     return replace(
@@ -77,7 +77,7 @@ def placed(ply: PlyOptions, volume: Volume) -> PlyOptions:
     )
 
 
-def remarks(volume: Volume, ply: PlyOptions) -> list[str]:
+def placement_warnings(volume: Volume, ply: PlyOptions) -> list[str]:
     """What there is to say of a volume's place before the work: sheared axes, a turn that the file will not record."""
     said = []
     if volume.sheared:
@@ -93,7 +93,7 @@ def remarks(volume: Volume, ply: PlyOptions) -> list[str]:
     return said
 
 
-def upright(volume: Volume, up: str) -> np.ndarray:
+def upright_axes(volume: Volume, up: str) -> np.ndarray:
     """(3, 3): box frame to a frame with world directions in which ``up`` is +z; what previews are seen in."""
     result: np.ndarray = upright_matrix(up) @ volume.axes
     return result
@@ -102,7 +102,7 @@ def upright(volume: Volume, up: str) -> np.ndarray:
 def preview(
     scene: Scene | Viewed, gaussians: Gaussians, cameras: Sequence[Camera], axes: np.ndarray, rule: str | Rule = INRIA
 ) -> np.ndarray:
-    """Reference, ours and their difference, a row a camera of the frame that ``axes`` (`upright`) leads to."""
+    """Reference, ours and their difference, a row a camera of the frame that ``axes`` (`upright_axes`) leads to."""
     from vvgt_cli.dvr import RenderSettings, render_view
     from vvgt_cli.images import side_by_side
     from vvgt_cli.splat import render

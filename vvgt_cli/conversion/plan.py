@@ -19,7 +19,7 @@ from vvgt_cli.conversion.stages import (
     TrainingViews,
     ViewingConditions,
 )
-from vvgt_cli.conversion.stages.views import views_of
+from vvgt_cli.conversion.stages.views import view_count
 from vvgt_cli.defaults import STEPS
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.workload import Workload, for_budget, view_edge
@@ -150,7 +150,7 @@ class Planner:
             left = self.limits.time_budget - spent - plan.seconds_of([*([] if begun else first), *last])
         between = self._improvements(plan, left)
         cut = any(isinstance(stage, CellsByError) for stage in between)
-        if self._anew() or any(isinstance(stage, BackProjection) for stage in between):
+        if self._recuts() or any(isinstance(stage, BackProjection) for stage in between):
             first = [ClosedFormStage(anew=True)]
         elif cut:
             first = [ClosedFormStage(cut=True)]
@@ -168,7 +168,7 @@ class Planner:
         while left is not None and steps > 0 and self._seconds(workload, steps, small) > left:
             steps = min(steps - 1, int(steps * 0.9))
         if not wanted or steps < min(FEWEST_STEPS, wanted):
-            plan.skipped.append(("refinement", _room(left) if wanted else "no steps are asked for"))
+            plan.skipped.append(("refinement", _time_left(left) if wanted else "no steps are asked for"))
             return self._without_steps(plan, network, left)
         if self.fit.model is None:
             plan.skipped.append(("network", "gradient descent gains more in the same time; --model runs it"))
@@ -182,12 +182,12 @@ class Planner:
         enough = steps >= ENOUGH_STEPS
         return [
             CheckViews(),
-            TrainingViews(views_of(steps, small), view_edge(self.fit.size, small)),
-            *([CellsByError(small, keep=not self._anew())] if enough and self.vbm and self.fit.model is None else []),
+            TrainingViews(view_count(steps, small), view_edge(self.fit.size, small)),
+            *([CellsByError(small, keep=not self._recuts())] if enough and self.vbm and self.fit.model is None else []),
             Refinement(steps, most, small, overlap=enough and self.vbm),
         ]
 
-    def _anew(self) -> bool:
+    def _recuts(self) -> bool:
         """Whether the cells may be cut for fewer Gaussians in the end."""
         return self.limits.target_psnr is not None
 
@@ -201,9 +201,9 @@ class Planner:
         whole = views + BackProjection().cost(plan.workload).seconds
         projected = left is None or left >= whole
         if not projected:
-            plan.skipped.append(("back-projection", f"about {whole:.1f} s with its views, {_room(left)}"))
+            plan.skipped.append(("back-projection", f"about {whole:.1f} s with its views, {_time_left(left)}"))
         check = CheckViews(fine=bool(network) or self.limits.target_psnr is not None)
-        train = TrainingViews(views_of(0, small=False), view_edge(self.fit.size, small=False), fitted=bool(network))
+        train = TrainingViews(view_count(0, small=False), view_edge(self.fit.size, small=False), fitted=bool(network))
         if projected or network:
             return [check, train, *([BackProjection()] if projected else []), *network]
         judge = self.limits.target_psnr is not None and (left is None or left >= views)
@@ -216,12 +216,12 @@ class Planner:
         stage = Network(self.fit.model)
         seconds = stage.cost(plan.workload).seconds
         if left is not None and left < seconds + self._seconds(plan.workload, 0, False):
-            plan.skipped.append(("network", f"about {seconds:.1f} s, {_room(left)}"))
+            plan.skipped.append(("network", f"about {seconds:.1f} s, {_time_left(left)}"))
             return [], left
         return [stage], None if left is None else left - seconds
 
 
-def _room(left: float | None) -> str:
+def _time_left(left: float | None) -> str:
     return f"{max(left or 0.0, 0.0):.1f} s are left"
 
 

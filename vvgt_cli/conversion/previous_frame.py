@@ -16,7 +16,7 @@ from vvgt_cli.conversion.plan import Plan
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.conversion.stage import Work
 from vvgt_cli.conversion.stages import CheckViews, TrainingViews
-from vvgt_cli.conversion.stages.refinement import Refinement, refine, widened_small
+from vvgt_cli.conversion.stages.refinement import Refinement, refine, widen_small
 from vvgt_cli.conversion.stages.scores import TestViews
 from vvgt_cli.conversion.warm_start import WarmStart
 from vvgt_cli.field.field import Picture, ViewRenderer
@@ -90,7 +90,7 @@ class PreviousFrame(WarmStart):
         turns = max((max(s.count // VIEWS, 1) for s in plan.stages if isinstance(s, TrainingViews)), default=-1)
         there = {id(one) for one in (self._last.gaussians, *self._last.shown)} if self._last else ()
         sets = max(turns + 1 - len(there), 0)
-        pictures = self._pictures.room([view for stage in plan.stages for view in stage.views(fit)]) if sets else 0
+        pictures = self._pictures.new_bytes([view for stage in plan.stages for view in stage.views(fit)]) if sets else 0
         return pictures, lambda workload: sets * workload.gaussians * (A_SET + 12 * ((workload.degree + 1) ** 2 - 1))
 
     def try_start(self, work: Work, plan: Plan, request: ConvertRequest) -> bool:
@@ -99,12 +99,12 @@ class PreviousFrame(WarmStart):
         last, self._last = self._last, None
         lighting = work.field.source.lighting
         if last is None or (lighting is not None and lighting.attenuated):  # shadows reach far
-            self._pictures.outdate(None)
+            self._pictures.invalidate(None)
             return False
         with work.run.stage("differences") as stage:
             found = changes(last.source, work.field.source)
             free = found.meet(last.gaussians)
-            self._pictures.outdate(found)
+            self._pictures.invalidate(found)
             stage.note = f"{found.blocks.mean():.1%} of the volume, {int(free.sum())} of {len(free)} Gaussians"
         work.gaussians = last.gaussians
         if found.blocks.any() and not self._fitted(work, last, found, free):
@@ -116,7 +116,7 @@ class PreviousFrame(WarmStart):
             shown = (*shown[:turn], work.made(), *shown[turn + 1 :])
             self._turn += 1
         self._last = replace(last, source=work.field.source, gaussians=work.made(), shown=shown)
-        self._moved = _differing(last.gaussians, work.made())
+        self._moved = _count_differing(last.gaussians, work.made())
         plan.stages = [s for s in plan.stages if isinstance(s, TestViews) or (s.scores and request.scored_whole)]
         return True
 
@@ -149,10 +149,10 @@ class PreviousFrame(WarmStart):
             before = [self._pictures.last(Picture(camera, last.settings)) for camera in cameras]
             images = render_views(work.field.views, cameras, last.settings)
             for camera, image, old in zip(cameras, images, before, strict=True):
-                _still(image, old, last.shown[turn], camera, last.rule)
+                _keep_unchanged(image, old, last.shown[turn], camera, last.rule)
             stage.note = f"{len(cameras)} of {cameras[0].width} px to fit to, where they differ from the frame before"
         assert work.check is not None
-        judged, psnr = _near(work.check, found), 0.0
+        judged, psnr = _changed_blocks(work.check, found), 0.0
         asked = work.fit.steps
         left = ROUNDS * STEPS if asked is None else min(asked, ROUNDS * STEPS)
         while left > 0:
@@ -162,7 +162,7 @@ class PreviousFrame(WarmStart):
                 "frame", steps=steps, rule=last.rule, judge=work.rule, seed=work.fit.seed, check_every=STEPS
             )
             result = refine(work.run, work.made(), Views(cameras, images), judged, options, free=free)
-            result = as_stored(widened_small(result, work.fit.size)[0])
+            result = as_stored(widen_small(result, work.fit.size)[0])
             work.gaussians = _moved(last.gaussians, result, free)
             psnr = work.psnr(work.gaussians)
             if psnr >= last.psnr - WORSE or work.run.report.interrupted:
@@ -172,7 +172,7 @@ class PreviousFrame(WarmStart):
         return False
 
 
-def _still(image: np.ndarray, old: np.ndarray | None, shown: Gaussians, camera: Camera, rule: Rule) -> None:
+def _keep_unchanged(image: np.ndarray, old: np.ndarray | None, shown: Gaussians, camera: Camera, rule: Rule) -> None:
     """Where a view (h, w, 4) shows what it has shown, fit to what the Gaussians showed then: it is to stay."""
     from vvgt_cli.splat import render
 
@@ -190,13 +190,13 @@ def _moved(start: Gaussians, result: Gaussians, free: np.ndarray) -> Gaussians:
     return Gaussians(**arrays)
 
 
-def _differing(first: Gaussians, second: Gaussians) -> int:
+def _count_differing(first: Gaussians, second: Gaussians) -> int:
     """How many rows are not the same."""
     pairs = zip(first.arrays().values(), second.arrays().values(), strict=True)
     return int(np.any([(a != b).reshape(len(first), -1).any(axis=1) for a, b in pairs], axis=0).sum())
 
 
-def _near(views: Views, found: Changes) -> Views:
+def _changed_blocks(views: Views, found: Changes) -> Views:
     """The blocks of views that show what differs, to judge by; all of them where none does."""
     cameras, images, parts = [], [], []
     for k, camera in enumerate(views.cameras):

@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from vvgt_cli.conversion.live import in_box
-from vvgt_cli.conversion.place import into_box
+from vvgt_cli.conversion.live import box_lighting
+from vvgt_cli.conversion.place import to_box_frame
 from vvgt_cli.conversion.plan import Plan
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.conversion.result import Conversion
 from vvgt_cli.conversion.stage import Work
 from vvgt_cli.conversion.stages import CheckViews, Refinement, TestViews, TrainingViews
-from vvgt_cli.conversion.stages.views import views_of, wide
+from vvgt_cli.conversion.stages.views import suits_small_views, view_count
 from vvgt_cli.conversion.warm_start import WarmStart
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.field import Field
@@ -49,11 +49,11 @@ class PreviousLook(WarmStart):
         Raises:
             UsageError: the earlier conversion is of another volume.
         """
-        why = self._unfit(work, request)
+        why = self._obstacle(work, request)
         if why is None:
             work.run.compile(LIVE, work.field.source.kernel_type())
             with work.run.stage("earlier") as stage:
-                work.gaussians = as_stored(recoloured(self.earlier, work.field))
+                work.gaussians = as_stored(recolor_earlier(self.earlier, work.field))
                 stage.note = f"{len(work.gaussians)} Gaussians of {self.earlier.field.source.name} under the new look"
             why = self._fitted(work, plan)
         if why is None:
@@ -63,7 +63,7 @@ class PreviousLook(WarmStart):
             work.run.skip(WARM_START, why)
         return why is None
 
-    def _unfit(self, work: Work, request: ConvertRequest) -> str | None:
+    def _obstacle(self, work: Work, request: ConvertRequest) -> str | None:
         """Why there is nothing to go on from, None where there is."""
         field, before = work.field, self.earlier.field
         sources, refinement = (before.source, field.source), self.earlier.report.refinement
@@ -78,7 +78,7 @@ class PreviousLook(WarmStart):
         budget = self.earlier.report.options["max_gaussians"]
         if not len(self.earlier.gaussians) <= work.fit.max_gaussians <= budget:
             return f"it has {len(self.earlier.gaussians)} Gaussians, of at most {budget}"
-        if not _same(field, before):
+        if not _same_volume(field, before):
             raise UsageError(f"after: a conversion of {before.source.volume.name}; expected one of the same volume")
         return None
 
@@ -86,8 +86,11 @@ class PreviousLook(WarmStart):
         """Gradient descent; why the result is not near enough, None where it is."""
         record: dict[str, Any] = self.earlier.report.refinement or {}
         standard = record.get("standard", record["psnr_after"])
-        steps, small = min(work.fit.steps or STEPS, STEPS), wide(work.made(), work.fit.size)
-        stages = TrainingViews(views_of(steps, small), view_edge(work.fit.size, small)), Refinement(steps, steps, small)
+        steps, small = min(work.fit.steps or STEPS, STEPS), suits_small_views(work.made(), work.fit.size)
+        stages = (
+            TrainingViews(view_count(steps, small), view_edge(work.fit.size, small)),
+            Refinement(steps, steps, small),
+        )
         judge = CheckViews()
         work.field.views.expect([view for stage in (judge, *stages) for view in stage.views(work.fit)])
         judge.run(work)
@@ -106,7 +109,7 @@ class PreviousLook(WarmStart):
         return None
 
 
-def recoloured(earlier: Conversion, field: Field) -> Gaussians:
+def recolor_earlier(earlier: Conversion, field: Field) -> Gaussians:
     """Gaussians of an earlier conversion under the look of a field of the same volume, where they are; box frame.
 
     Under each lies a mean value and a spread. By what the two functions, and lights, make of these, optical depths
@@ -114,12 +117,12 @@ def recoloured(earlier: Conversion, field: Field) -> Gaussians:
     the more the colours differ.
     """
     before, source = earlier.field.source, field.source
-    gaussians = into_box(earlier.gaussians, source.volume)
+    gaussians = to_box_frame(earlier.gaussians, source.volume)
     under = field.sample(gaussians)
     there = np.isfinite(under).all(axis=1)
     under[~there] = 0
-    old, a = _seen(before, source, gaussians, under)
-    new, b = _seen(source, source, gaussians, under)
+    old, a = _look_alone(before, source, gaussians, under)
+    new, b = _look_alone(source, source, gaussians, under)
     least = max(FAINT * float(a.mean()), 1e-30)  # of a function that showed nothing under any
     ratio = np.where(there, ((b + least) / (a + least)).clip(1 / MOST, MOST), 1)
     depth = -np.log1p(-np.minimum(opacity(gaussians).astype(np.float64), OPAQUE[1])) * ratio
@@ -135,7 +138,7 @@ def recoloured(earlier: Conversion, field: Field) -> Gaussians:
     return replace(gaussians, opacity_logits=np.log(peak / (1 - peak)), colors=colors, harmonics=harmonics)
 
 
-def _seen(look: Source, source: Source, gaussians: Gaussians, under: np.ndarray) -> tuple[Gaussians, np.ndarray]:
+def _look_alone(look: Source, source: Source, gaussians: Gaussians, under: np.ndarray) -> tuple[Gaussians, np.ndarray]:
     """Gaussians as a look alone has them, of ``under`` (K, 5), and (K,) extinctions, per unit-frame length."""
     from vvgt_cli.closed_form.relit import relit
 
@@ -145,11 +148,11 @@ def _seen(look: Source, source: Source, gaussians: Gaussians, under: np.ndarray)
     sums = table.of(under)
     tau = sums[:, TAU]
     plain = replace(gaussians, colors=sums[:, :TAU] / np.maximum(tau, 1e-30)[:, None], harmonics=None)
-    lighting = in_box(look)
+    lighting = box_lighting(look)
     return (plain if lighting is None else relit(plain, under[:, GRADIENT], lighting)), tau
 
 
-def _same(field: Field, other: Field) -> bool:
+def _same_volume(field: Field, other: Field) -> bool:
     """Whether two fields are of one volume, under whatever look."""
     first, second = field.source.volume, other.source.volume
     if first is second:

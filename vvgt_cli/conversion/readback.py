@@ -9,7 +9,7 @@ import numpy as np
 from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.blocks import spread_blocks
 from vvgt_cli.cameras.sets import SIZE
-from vvgt_cli.conversion.place import into_box
+from vvgt_cli.conversion.place import to_box_frame
 from vvgt_cli.gaussians import Gaussians, PlyOptions, in_unit_frame
 from vvgt_cli.gaussians.formats import format_of, read_splats
 from vvgt_cli.gaussians.rules import INRIA, rule_of
@@ -23,13 +23,13 @@ if TYPE_CHECKING:
     from vvgt_cli.volume import Volume
 
 
-def _is_drawn(output: str, options: PlyOptions) -> bool:
+def _stores_pictures(output: str, options: PlyOptions) -> bool:
     """Whether viewers draw the columns of a file of another format. A live page computes its look and light anew."""
     found = format_of(output)
     return found is not None and (found.suffix != ".html" or options.live is None)
 
 
-def tell_agreement(run: Run, output: str, gaussians: Gaussians, options: PlyOptions) -> None:
+def report_agreement(run: Run, output: str, gaussians: Gaussians, options: PlyOptions) -> None:
     """Say how near pictures of a file just written are to those of the Gaussians; of a `.ply` nothing.
 
     Args:
@@ -41,7 +41,7 @@ def tell_agreement(run: Run, output: str, gaussians: Gaussians, options: PlyOpti
     from vvgt_cli.images.metrics import psnr
     from vvgt_cli.splat import render
 
-    if not _is_drawn(output, options):
+    if not _stores_pictures(output, options):
         return
     with run.stage("read back") as stage:
         back = in_unit_frame(*read_splats(output))
@@ -55,7 +55,7 @@ def tell_agreement(run: Run, output: str, gaussians: Gaussians, options: PlyOpti
         stage.note = f"{np.mean(found):.2f} dB from the Gaussians as they were, {len(found)} views of {size} px"
 
 
-def tell_cost(
+def report_format_cost(
     run: Run, output: str, gaussians: Gaussians, options: PlyOptions, scene: Scene | Viewed, volume: Volume
 ) -> None:
     """Say how much further from its volume a file just written is than the Gaussians were; of a `.ply` nothing.
@@ -69,13 +69,13 @@ def tell_cost(
     """
     from vvgt_cli.dvr import RenderSettings
 
-    if not _is_drawn(output, options):
+    if not _stores_pictures(output, options):
         return
     with run.stage("read back") as stage:
         size, rule = options.made_for or SIZE, options.rule or INRIA
         before, after = (
             score_test_views(
-                scene, into_box(g, volume), size, RenderSettings(), rule=rule, perceptual=False, only=PREVIEW_VIEWS
+                scene, to_box_frame(g, volume), size, RenderSettings(), rule=rule, perceptual=False, only=PREVIEW_VIEWS
             ).psnr
             for g in (gaussians, in_unit_frame(*read_splats(output)))
         )

@@ -91,7 +91,7 @@ def parse_layer_look(text: str) -> LayerLook:
     return LayerLook(name, given.get("tf"), given.get("labels"), given.get("distance"))
 
 
-def under_function(gaussians: Gaussians, facts: FileFacts, tf: Look, options: PlyOptions) -> Gaussians:
+def apply_look(gaussians: Gaussians, facts: FileFacts, tf: Look, options: PlyOptions) -> Gaussians:
     """What Gaussians that carry values are under a function on data values (or labels under a table) and the light of
     ``options``, unit frame.
 
@@ -101,14 +101,14 @@ def under_function(gaussians: Gaussians, facts: FileFacts, tf: Look, options: Pl
     assert facts.live is not None
     assert facts.scale is not None
     assert options.unit_distance is not None
-    table = looked_up(facts.live, tf, options.unit_distance, facts.scale)
-    found = lit_by(gaussians, table, options.light, pixel_width(options.made_for or SIZE))
+    table = lookup_table(facts.live, tf, options.unit_distance, facts.scale)
+    found = visible_cloud(gaussians, table, options.light, pixel_width(options.made_for or SIZE))
     if not len(found):
         raise DataError(f"{tf.name}: not one of {len(gaussians)} Gaussians is visible; try another function")
     return found
 
 
-def looked_up(facts: LiveFacts, tf: Look, distance: float, scale: float) -> Looks:
+def lookup_table(facts: LiveFacts, tf: Look, distance: float, scale: float) -> Looks:
     """A function, or a table of labels, as Gaussians look it up.
 
     Args:
@@ -121,7 +121,7 @@ def looked_up(facts: LiveFacts, tf: Look, distance: float, scale: float) -> Look
         DataError: a label without an entry.
     """
     if isinstance(tf, SeveralLooks):
-        tables = [looked_up(one, part, own, scale) for one, (part, own) in zip(facts.layers, tf.parts, strict=True)]
+        tables = [lookup_table(one, part, own, scale) for one, (part, own) in zip(facts.layers, tf.parts, strict=True)]
         return Several(tuple(table for table in tables if not isinstance(table, Several)))
     if not isinstance(tf, LabelTable):
         return Table.of_function(tf, facts.lo, facts.hi, distance * scale, facts.grain)
@@ -129,7 +129,7 @@ def looked_up(facts: LiveFacts, tf: Look, distance: float, scale: float) -> Look
     return Palette.of_labels([entries[label.number] for label in facts.labels], distance * scale)
 
 
-def lit_by(gaussians: Gaussians, table: Looks, lighting: Lighting | None, pixel: float) -> Gaussians:
+def visible_cloud(gaussians: Gaussians, table: Looks, lighting: Lighting | None, pixel: float) -> Gaussians:
     """An ordinary cloud: what is visible of Gaussians that carry values, under a light in their frame.
 
     ``pixel``: as for `shown_by`.
@@ -146,7 +146,7 @@ def lit_by(gaussians: Gaussians, table: Looks, lighting: Lighting | None, pixel:
     return relit(found, gradient, lighting)
 
 
-def placed_function(name: str, header: PlyHeader | PlyOptions, function: FunctionRequest) -> tuple[Look, PlyOptions]:
+def resolve_look(name: str, header: PlyHeader | PlyOptions, function: FunctionRequest) -> tuple[Look, PlyOptions]:
     """A function on the data values of a file, a table of its labels, or of several layers a look each; and how a file
     of that look is laid out.
 
@@ -166,16 +166,16 @@ def placed_function(name: str, header: PlyHeader | PlyOptions, function: Functio
     if function.layers:
         first = function.layers[0].layer
         raise UsageError(f"{name}: one layer; expected --tf or --labels in the place of --layer {first}")
-    tf, shown, distance, label = _placed(name, header, header.live, function, header.unit_distance)
+    tf, shown, distance, label = _layer_look(name, header, header.live, function, header.unit_distance)
     if isinstance(shown, LabelTable):
         check_labels([shown])
     else:
         check_visible(shown, header.live.statistics())
     light = light_of(function.light, tf.lighting or header.light, header.space)
-    return shown, _laid(header, shown, distance, label, light)
+    return shown, _options(header, shown, distance, label, light)
 
 
-def _placed(
+def _layer_look(
     name: str, header: PlyHeader | PlyOptions, facts: LiveFacts, function: FunctionRequest, recorded: float | None
 ) -> tuple[TransferFunction | LabelTable, TransferFunction | LabelTable, float, str]:
     """The look of one layer as it was given, and on its values; what opacity is per, and how that was chosen.
@@ -188,10 +188,10 @@ def _placed(
     given, asked = function.labels if facts.labels else function.tf, function.unit_distance
     if given is None and asked is None and recorded is not None:
         asked = repr(recorded)
-    return tf, shown, *unit_distance(asked, volume_of(name, header), tf if isinstance(tf, TransferFunction) else None)
+    return tf, shown, *unit_distance(asked, grid_of(name, header), tf if isinstance(tf, TransferFunction) else None)
 
 
-def _laid(
+def _options(
     header: PlyHeader | PlyOptions, shown: Look, distance: float, label: str, light: Lighting | None
 ) -> PlyOptions:
     """How a file of a look is laid out."""
@@ -216,19 +216,19 @@ def _several(name: str, header: PlyHeader | PlyOptions, function: FunctionReques
             f"{name}: {len(layers)} layers, each with a look of its own, as --layer LAYER,tf=TF; leave out "
             f"{' and '.join(given)}; {_listed(layers)}"
         )
-    asked = {number_of(name, layers, one.layer): one for one in function.layers}
+    asked = {layer_number(name, layers, one.layer): one for one in function.layers}
     placed = []
     for k, layer in enumerate(layers):
         one = asked.get(k, LayerLook(""))
         request = FunctionRequest(one.tf, "data", one.unit_distance, one.labels)
-        placed.append(_placed(f"{name}, layer {k}", header, layer, request, layer.distance))
+        placed.append(_layer_look(f"{name}, layer {k}", header, layer, request, layer.distance))
     presets = [tf.lighting for tf, *_ in placed if tf.lighting is not None]
     light = light_of(function.light, presets[0] if presets else header.light, header.space)
     looks = SeveralLooks(tuple((shown, distance) for _, shown, distance, _ in placed))
-    return looks, _laid(header, looks, *placed[0][2:], light)
+    return looks, _options(header, looks, *placed[0][2:], light)
 
 
-def number_of(name: str, layers: Sequence[LiveFacts], asked: str) -> int:
+def layer_number(name: str, layers: Sequence[LiveFacts], asked: str) -> int:
     """Of the layer that is asked for by number, name, or a part of its name.
 
     Raises:
@@ -252,7 +252,7 @@ def layer_look(
         UsageError: no such layer.
     """
     layers = () if header.live is None else header.live.layers
-    labels = bool(layers) and bool(layers[number_of("result", layers, str(key))].labels)
+    labels = bool(layers) and bool(layers[layer_number("result", layers, str(key))].labels)
     if isinstance(look, TransferFunction) or (isinstance(look, str) and not labels):
         return LayerLook(str(key), tf=look)
     return LayerLook(str(key), labels=look)
@@ -310,7 +310,7 @@ def light_of(asked: LightOptions, preset: Lighting | None, space: str | None) ->
     return lighting
 
 
-def volume_of(name: str, header: FileFacts) -> Volume:
+def grid_of(name: str, header: FileFacts) -> Volume:
     """The grid that a file is of, without values.
 
     Raises:
@@ -326,13 +326,13 @@ def volume_of(name: str, header: FileFacts) -> Volume:
     return Volume(data, (x, y, z), tuple(affine[:, 3].tolist()), direction, name)
 
 
-def shown(name: str, gaussians: Gaussians, header: PlyHeader, function: FunctionRequest | None) -> Gaussians:
+def recolored(name: str, gaussians: Gaussians, header: PlyHeader, function: FunctionRequest | None) -> Gaussians:
     """The Gaussians of a file under a function that is given, as they are without.
 
     Raises:
-        DataError, UsageError: as `placed_function` and `under_function`; a range or a distance without a function.
+        DataError, UsageError: as `resolve_look` and `apply_look`; a range or a distance without a function.
     """
     if function is None:
         return gaussians
-    tf, options = placed_function(name, header, function)
-    return under_function(gaussians, header, tf, options)
+    tf, options = resolve_look(name, header, function)
+    return apply_look(gaussians, header, tf, options)

@@ -12,7 +12,7 @@ import numpy as np
 
 from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.cameras.sets import SIZE
-from vvgt_cli.conversion.place import AUTO, NONE, into_box, preview, upright, way_up
+from vvgt_cli.conversion.place import AUTO, NONE, preview, to_box_frame, up_axis, upright_axes
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.files import atomic_write
 from vvgt_cli.gaussians import Gaussians, PlyOptions, write_ply
@@ -99,7 +99,7 @@ class Result:
         ply = replace(
             old,
             frame=frame,
-            up=old.up if up is None and frame == old.frame else way_up(up or AUTO, frame, space),
+            up=old.up if up is None and frame == old.frame else up_axis(up or AUTO, frame, space),
             sh_degree=old.sh_degree if sh_degree is None else sh_degree,
             comments=old.comments if comments is None else comments,
         )
@@ -129,12 +129,12 @@ class Result:
             DataError: they carry none, or the function shows nothing of them.
             UsageError: a range, a distance or a light that is none.
         """
-        from vvgt_cli.conversion.recolored import FunctionRequest, layer_look, placed_function, under_function
+        from vvgt_cli.conversion.recolored import FunctionRequest, apply_look, layer_look, resolve_look
 
         others = tuple(layer_look(self.ply, key, one) for key, one in (layers or {}).items())
         asked = FunctionRequest(look, range, unit_distance, labels, light or LightOptions(), others)
-        tf, options = placed_function("result", self.ply, asked)
-        found = under_function(self.gaussians, self.ply, tf, options)
+        tf, options = resolve_look("result", self.ply, asked)
+        found = apply_look(self.gaussians, self.ply, tf, options)
         return Result(found, ConversionReport("recolor"), options)
 
     def normals(self) -> np.ndarray | None:
@@ -189,7 +189,7 @@ class Conversion(Result):
     @cached_property
     def _normals(self) -> np.ndarray | None:
         volume = self.field.source.volume
-        normals = self.field.normals(into_box(self.gaussians, volume))
+        normals = self.field.normals(to_box_frame(self.gaussians, volume))
         if normals is None:
             return None
         turned = normals @ np.linalg.inv(volume.axes)
@@ -208,7 +208,7 @@ class Conversion(Result):
         """
         cameras = default_views("test", size=size or self.ply.made_for or SIZE)
         volume = self.field.source.volume
-        axes, inside = upright(volume, self.ply.up), into_box(self.gaussians, volume)
+        axes, inside = upright_axes(volume, self.ply.up), to_box_frame(self.gaussians, volume)
         return preview(self.field.views, inside, [cameras[n] for n in views], axes, self.ply.rule or INRIA)
 
     def _repr_png_(self) -> bytes:

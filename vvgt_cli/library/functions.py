@@ -29,8 +29,8 @@ from vvgt_cli.library.inputs import (
     looks_of,
     ply_of,
     source_of,
-    under,
     volume_of,
+    with_look,
 )
 from vvgt_cli.volume import Volume
 
@@ -91,7 +91,7 @@ def convert(
     looks, several = looks_of(look)
     source = source_of(volume, None, reading)
     request = replace(Goal.of(goal).request(source), blocks=_blocks(blocks), live=live)
-    requests = {name: replace(request, source=under(source, one)) for name, one in looks.items()}
+    requests = {name: replace(request, source=with_look(source, one)) for name, one in looks.items()}
     return convert_to_memory(
         requests, several=several, split_labels=split_labels, after=after, console=console_of(progress)
     )

@@ -268,10 +268,10 @@ def source_of(volume: VolumeLike, look: LookLike, reading: Reading) -> SourceReq
         source = SourceRequest(os.fspath(volume), _options(reading))
     else:
         source = SourceRequest(content_of(volume, reading))
-    return under(source, Look.of(look))
+    return with_look(source, Look.of(look))
 
 
-def under(source: SourceRequest, look: Look) -> SourceRequest:
+def with_look(source: SourceRequest, look: Look) -> SourceRequest:
     """Return the request for a source's volume under a look.
 
     Raises:

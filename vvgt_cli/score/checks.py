@@ -59,17 +59,17 @@ class Views:
         return float(found[seen | ~seen.any()].mean())
 
 
-def judged(cameras: Sequence[Camera]) -> list[tuple[Camera, Blocks | None]]:
+def check_blocks(cameras: Sequence[Camera]) -> list[tuple[Camera, Blocks | None]]:
     """Cameras, each with the blocks of its picture that are judged by, None for all of it."""
     return [(camera, spread_blocks(camera.width, camera.height, i, FEW)) for i, camera in enumerate(cameras)]
 
 
-def judging_views(scene: Scene | Viewed, cameras: Sequence[Camera], settings: RenderSettings) -> Views:
+def render_check_views(scene: Scene | Viewed, cameras: Sequence[Camera], settings: RenderSettings) -> Views:
     """Views to judge by, of `FEW` blocks where they have more."""
     from vvgt_cli.dvr import render_view
 
     images, known = [], []
-    for camera, part in judged(cameras):
+    for camera, part in check_blocks(cameras):
         image = render_view(scene, camera, settings, part)
         images.append(image if part is None else part.pick(image))
         known += [] if part is None else [part]

@@ -54,7 +54,7 @@ def viewing_conditions(size: int) -> list[tuple[int, float]]:
     return [(edge, FIELD_OF_VIEW) for edge in sorted({*SIZES, size})] + [(size, CLOSE)]
 
 
-def from_above(size: int) -> list[tuple[int, float]]:
+def larger_screens(size: int) -> list[tuple[int, float]]:
     """The size made for, and the next larger screen."""
     return [(size, FIELD_OF_VIEW), (2160 if size < 2160 else 2 * size, FIELD_OF_VIEW)]
 

@@ -22,7 +22,9 @@ if TYPE_CHECKING:
 WHOLE = (0, 4, 9)  # test views of which large ones are drawn whole, for what blocks cannot tell
 
 
-def scored(size: int, perceptual: bool, only: Collection[int] | None = None) -> list[tuple[int, Camera, Blocks | None]]:
+def scored_views(
+    size: int, perceptual: bool, only: Collection[int] | None = None
+) -> list[tuple[int, Camera, Blocks | None]]:
     """Number and camera of each test view that is scored, with the blocks of it that are drawn, None for all of it."""
     cameras = default_views("test", size=size)
     found = []
@@ -58,17 +60,17 @@ def score_test_views(
     from vvgt_cli.images.metrics import mean_scores
     from vvgt_cli.splat import render
 
-    views, wanted = [], scored(size, perceptual, only)
+    views, wanted = [], scored_views(size, perceptual, only)
     for done, (i, camera, part) in enumerate(wanted):
         reference, ours = render_view(scene, camera, settings, part), render(gaussians, camera, rule, blocks=part)
         blocks = spread_blocks(camera.width, camera.height, i)
-        views.append(score_seen(reference, ours, blocks, part is None, perceptual))
+        views.append(score_drawn_view(reference, ours, blocks, part is None, perceptual))
         if progress:
             progress(done + 1, len(wanted))
     return mean_scores(views)
 
 
-def score_seen(
+def score_drawn_view(
     reference: np.ndarray, ours: np.ndarray, blocks: Blocks | None, whole: bool = True, perceptual: bool = True
 ) -> ViewScore:
     """One view: errors of its blocks, where it has such; SSIM and FLIP of the whole, where it was drawn.

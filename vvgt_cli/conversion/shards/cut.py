@@ -43,7 +43,7 @@ class Cut:
 
         for leaves in batches(self.forest.leaves(threshold), BATCH):
             lit = self._lit(leaves)
-            yield self.made(leaves), None if lit is None else directions(lit[:, MEAN])
+            yield self.make(leaves), None if lit is None else directions(lit[:, MEAN])
 
     def nodes(self, thresholds: np.ndarray, begin: int = 0) -> Iterator[list[Node]]:
         """Of each tile from ``begin`` on, for each of its ``thresholds`` (tiles, n): Gaussians, `spread_of` cells.
@@ -60,7 +60,7 @@ class Cut:
             if sum(len(node[0]) for node in waiting) < BATCH and row + 1 < len(self.forest.tiles):
                 continue
             sizes = np.array([[len(part) for part in node] for node in waiting])
-            whole = [self.made(joined([node[k] for node in waiting])) for k in range(sizes.shape[1])]
+            whole = [self.make(joined([node[k] for node in waiting])) for k in range(sizes.shape[1])]
             made = []
             for node, size, end in zip(waiting, sizes, np.cumsum(sizes, axis=0), strict=True):
                 parts = [each.take(np.arange(e - n, e)) for each, n, e in zip(whole, size, end, strict=True)]
@@ -68,7 +68,7 @@ class Cut:
             yield made
             waiting = []
 
-    def made(self, leaves: Leaves) -> Gaussians:
+    def make(self, leaves: Leaves) -> Gaussians:
         """Those of some cells, one each, in their order."""
         from vvgt_cli.closed_form.columns import MASS, SEEN
         from vvgt_cli.closed_form.lit import colored

@@ -21,7 +21,7 @@ from vvgt_cli.conversion.stages.closed_form import FAINT_LOGIT, FEWEST, NEARLY
 from vvgt_cli.dvr.render import Box
 from vvgt_cli.errors import NothingVisible
 from vvgt_cli.field.parts import Parts
-from vvgt_cli.files import atomic_write, check_room, is_stream
+from vvgt_cli.files import atomic_write, check_disk_space, is_stream
 from vvgt_cli.gaussians.formats.streamed import is_streamed
 from vvgt_cli.gaussians.frames import transform
 from vvgt_cli.gaussians.outputs import STDOUT
@@ -135,7 +135,7 @@ def _write(cut: Cut, sink: IO[bytes], output: str) -> tuple[Made, int]:
         count = cut.forest.count(threshold)
         first = first or count
         if output != STDOUT:
-            check_room(output, count * (VERTEX_BYTES + HARMONIC_BYTES[degree]))
+            check_disk_space(output, count * (VERTEX_BYTES + HARMONIC_BYTES[degree]))
         sink.seek(0)
         sink.truncate()
         sink.write(ply_header(count, degree, plan.ply))

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from vvgt_cli.conversion.convert import degree_of, ply_options
-from vvgt_cli.conversion.place import remarks
+from vvgt_cli.conversion.place import placement_warnings
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.conversion.shards.merge import write_merged
 from vvgt_cli.conversion.shards.plan import Plan, disk_bytes, most_cells
@@ -21,7 +21,7 @@ from vvgt_cli.field.open import Wanted, beside, blocked
 from vvgt_cli.field.parts import CELLS, Parts
 from vvgt_cli.field.settings import BlockOptions
 from vvgt_cli.field.source import tf_record, volume_record
-from vvgt_cli.files import check_room
+from vvgt_cli.files import check_disk_space
 from vvgt_cli.gaussians.formats import format_of
 from vvgt_cli.gaussians.formats.streamed import is_streamed
 from vvgt_cli.gaussians.outputs import STDOUT, Output, claimed, write_text
@@ -30,7 +30,7 @@ from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
 
 
-def streams(request: ConvertRequest) -> bool:
+def writes_streaming(request: ConvertRequest) -> bool:
     """Whether a closed form in blocks is written batch by batch, without its Gaussians in memory at once."""
     options = request.blocks
     if is_streamed(request.output):
@@ -60,7 +60,7 @@ def init_in_blocks(request: ConvertRequest, console: Console | None = None) -> C
         UsageError, DataError: as `vvgt_cli.conversion.convert.initialise_only`; shards that do not fit the rest.
     """
     options = request.blocks or BlockOptions()
-    _refuse(request, options)
+    _check_options(request, options)
     run = Run(console or Console(), ConversionReport("init"))
     if options.shard is not None:
         assert request.output is not None
@@ -71,7 +71,7 @@ def init_in_blocks(request: ConvertRequest, console: Console | None = None) -> C
         claimed(outputs, request.inputs(), request.overwrite),
         beside(request.output) as parts,
     ):
-        make_parts(run, request, options, parts)
+        make_blocks(run, request, options, parts)
         write_merged(run, parts, request.output or STDOUT, request.overwrite)
         run.finish()
         if request.report:
@@ -108,7 +108,7 @@ def _written(output: str | None, request: ConvertRequest | None = None) -> Itera
         yield [Output("-o", output or STDOUT, (".ply",), splats=True)]
 
 
-def _refuse(request: ConvertRequest, options: BlockOptions) -> None:
+def _check_options(request: ConvertRequest, options: BlockOptions) -> None:
     """What does not go together."""
     if options.shard is not None and options.scheduler is not None:
         raise UsageError("--shard and --scheduler both share the blocks out; give one of them")
@@ -119,7 +119,7 @@ def _refuse(request: ConvertRequest, options: BlockOptions) -> None:
 def _shard(run: Run, request: ConvertRequest, options: BlockOptions, parts: Parts) -> None:
     """Do a shard's share of what can be done now, and say what is left."""
     try:
-        make_parts(run, request, options, parts)
+        make_blocks(run, request, options, parts)
     except Later as later:
         run.console.message(
             f"{later.what}: this shard's share is done, {later.missing} blocks are other shards'; run the same array "
@@ -129,7 +129,7 @@ def _shard(run: Run, request: ConvertRequest, options: BlockOptions, parts: Part
         run.console.message(f"all blocks are there; next: vvgt merge {request.output} -o OUT.ply")
 
 
-def make_parts(run: Run, request: ConvertRequest, options: BlockOptions, parts: Parts) -> None:
+def make_blocks(run: Run, request: ConvertRequest, options: BlockOptions, parts: Parts) -> None:
     """Every block's part, those that are there taken as they are; and the plan of the file.
 
     Raises:
@@ -139,7 +139,7 @@ def make_parts(run: Run, request: ConvertRequest, options: BlockOptions, parts: 
     wanted = Wanted(budget, size, request.ply.sh_degree, most_cells(budget))
     with blocked(run, request.source, options, parts, wanted) as field:
         source, ply = field.source, ply_options(request, field.source)
-        for line in remarks(source.volume, ply):
+        for line in placement_warnings(source.volume, ply):
             run.console.message(line)
         degree = degree_of(request, source)
         run.compile(for_degree(for_blocks(source.kernels((RENDER, *INIT, *DRAW))), degree), source.kernel_type())
@@ -169,4 +169,4 @@ def _check_disk(run: Run, field: Blocked, cells: CellBlocks, budget: int, degree
     need = disk_bytes(cells.grid, field.visible, budget, rays, cells.light is not None, degree) - parts.bytes(CELLS)
     if need > 0 and parts.missing(CELLS, range(len(cells))):
         run.console.message(f"on disk meanwhile: about {need / 1e6:.0f} MB in {parts.folder}")
-        check_room(parts.folder, need)
+        check_disk_space(parts.folder, need)

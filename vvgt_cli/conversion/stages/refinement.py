@@ -79,15 +79,15 @@ class Refinement(Stage):
         )  # fmt: skip
         start = work.made()
         begin = (widened(start, WIDER, pixel_width(work.fit.size)), work.psnr(start)) if self.overlap else None
-        work.gaussians = _seen(work, refine(work.run, start, work.train, work.check, options, begin))
+        work.gaussians = _drop_undrawn(work, refine(work.run, start, work.train, work.check, options, begin))
 
 
-def _seen(work: Work, gaussians: Gaussians) -> Gaussians:
-    """`drawn_by_all`; where that leaves out many, the mass is counted as the check views agree."""
-    kept = drawn_by_all(gaussians, work.fit.size)
+def _drop_undrawn(work: Work, gaussians: Gaussians) -> Gaussians:
+    """`without_undrawn`; where that leaves out many, the mass is counted as the check views agree."""
+    kept = without_undrawn(gaussians, work.fit.size)
     if len(kept) >= MOST * len(gaussians):
         return kept
-    return max(kept, drawn_by_all(gaussians, work.fit.size, work.rule.dilation), key=work.psnr)
+    return max(kept, without_undrawn(gaussians, work.fit.size, work.rule.dilation), key=work.psnr)
 
 
 def refine(
@@ -131,16 +131,16 @@ def _note(record: OptimizeRecord, options: OptimizeOptions) -> str:
     return ", ".join(parts) + f"; from {record.psnr_before:.2f} dB on the check views"
 
 
-def drawn_by_all(gaussians: Gaussians, size: int, dilation: float = 0.0) -> Gaussians:
+def without_undrawn(gaussians: Gaussians, size: int, dilation: float = 0.0) -> Gaussians:
     """Without what viewers leave out: splats that never reach 1/255, and, widened with their mass kept, small ones.
 
-    Arguments as of `widened_small`.
+    Arguments as of `widen_small`.
     """
-    found, kept = widened_small(gaussians, size, dilation)
+    found, kept = widen_small(gaussians, size, dilation)
     return found.take(kept) if kept.any() else gaussians
 
 
-def widened_small(gaussians: Gaussians, size: int, dilation: float = 0.0) -> tuple[Gaussians, np.ndarray]:
+def widen_small(gaussians: Gaussians, size: int, dilation: float = 0.0) -> tuple[Gaussians, np.ndarray]:
     """Gaussians of which small ones are widened with their mass kept, and (K,) bool whether they reach 1/255.
 
     Args:

@@ -15,12 +15,12 @@ from vvgt_cli.score.viewing import (
     SIDE,
     condition_pictures,
     condition_views,
-    from_above,
+    larger_screens,
     score_conditions,
     score_texture,
     texture_cameras,
 )
-from vvgt_cli.score.views import WHOLE, psnr_note, score_test_views, scored
+from vvgt_cli.score.views import WHOLE, psnr_note, score_test_views, scored_views
 
 SCORE, SCORE_ALL = (3, 0, 0.03), (10, len(WHOLE), 0.1)  # views, whole ones of them, seconds beside per 400 x 400 px
 TEXTURE = 0.05  # seconds beside the reference per 400 x 400 px
@@ -51,7 +51,7 @@ class TestViews(Stage):
         from vvgt_cli.dvr import RenderSettings
 
         only = None if self.whole else PREVIEW_VIEWS
-        return [Picture(camera, RenderSettings(), part) for _, camera, part in scored(fit.size, self.whole, only)]
+        return [Picture(camera, RenderSettings(), part) for _, camera, part in scored_views(fit.size, self.whole, only)]
 
     def run(self, work: Work) -> None:
         """Score."""
@@ -92,7 +92,7 @@ class ViewingConditions(Stage):
         """What is scored."""
         from vvgt_cli.dvr import RenderSettings
 
-        wanted = condition_pictures(from_above(fit.size), SIDE, FEW)
+        wanted = condition_pictures(larger_screens(fit.size), SIDE, FEW)
         conditions = [Picture(camera, RenderSettings(), blocks) for _, camera, blocks in wanted]
         return [*conditions, *(Picture(camera, RenderSettings()) for camera in texture_cameras(fit.size))]
 
@@ -106,7 +106,7 @@ class ViewingConditions(Stage):
             return
         with run.stage(self.name) as stage:
             made, settings = work.made(), RenderSettings()
-            seen = condition_views(work.field.views, from_above(fit.size), settings, views=SIDE, enough=FEW)
+            seen = condition_views(work.field.views, larger_screens(fit.size), settings, views=SIDE, enough=FEW)
             conditions = score_conditions(made, seen)
             run.report.conditions = [asdict(condition) for condition in conditions]
             near, views = texture_cameras(fit.size), work.field.views

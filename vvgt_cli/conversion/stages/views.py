@@ -16,7 +16,7 @@ from vvgt_cli.field.field import Picture
 from vvgt_cli.field.workload import Workload, view_edge
 from vvgt_cli.gaussians import Gaussians
 from vvgt_cli.gaussians.rules import Rule
-from vvgt_cli.score.checks import VIEW_BYTES, Views, judged, judging_views
+from vvgt_cli.score.checks import VIEW_BYTES, Views, check_blocks, render_check_views
 
 if TYPE_CHECKING:
     from vvgt_cli.dvr import RenderSettings, Scene
@@ -35,7 +35,7 @@ WIDE = 0.9  # standard deviation in pixels
 SOLID = 0.9  # median opacity of opaque bodies
 
 
-def views_of(steps: int, small: bool) -> int:
+def view_count(steps: int, small: bool) -> int:
     """Training views of so many steps, in whole sets."""
     fewest, each = SET_VIEWS["train"], VIEWS_A_STEP[0] if small else VIEWS_A_STEP[1]
     return fewest * min(max(round(each * steps / fewest), 1), MOST_VIEWS // fewest)
@@ -65,7 +65,7 @@ class CheckViews(Stage):
         from vvgt_cli.dvr.render import FIT_VIEWS
 
         settings = RenderSettings() if self.fine else FIT_VIEWS
-        return [Picture(camera, settings, part) for camera, part in judged(default_views("check", size=fit.size))]
+        return [Picture(camera, settings, part) for camera, part in check_blocks(default_views("check", size=fit.size))]
 
     def run(self, work: Work) -> None:
         """Render them, unless they are there."""
@@ -77,7 +77,7 @@ class CheckViews(Stage):
         size = work.fit.size
         cameras = default_views("check", size=size)
         with work.run.stage(self.name) as stage:
-            work.check = judging_views(work.field.views, cameras, RenderSettings() if self.fine else FIT_VIEWS)
+            work.check = render_check_views(work.field.views, cameras, RenderSettings() if self.fine else FIT_VIEWS)
             stage.note = f"{len(cameras)} of {size} px" + (", blocks of them" if work.check.blocks else "")
 
 
@@ -113,7 +113,7 @@ class TrainingViews(Stage):
         found = [Picture(camera, FIT_VIEWS) for camera in default_views("train", self.count, size=self.edge)]
         if self.fitted:
             camera, blocks = _probe(self.edge)
-            found += [Picture(camera, settings, blocks) for settings in _tried(_spread(self.edge / fit.size))]
+            found += [Picture(camera, settings, blocks) for settings in _candidates(_spread(self.edge / fit.size))]
         return found
 
     def run(self, work: Work) -> None:
@@ -125,7 +125,7 @@ class TrainingViews(Stage):
         work.train_rule = work.rule.at(footprint)
         settings = FIT_VIEWS
         if self.fitted:
-            settings = fine_enough(work.field.views, work.made(), self.edge, work.train_rule, _spread(footprint))
+            settings = ray_settings(work.field.views, work.made(), self.edge, work.train_rule, _spread(footprint))
         cameras = default_views("train", self.count, size=self.edge)
         with work.run.stage(self.name) as stage:
             images = render_views(work.field.views, cameras, settings, progress=work.run.console.bar(self.name))
@@ -144,7 +144,7 @@ def _probe(size: int) -> tuple[Camera, Blocks | None]:
     return default_views("check", size=size)[0], spread_blocks(size, size, enough=PROBED)
 
 
-def _tried(footprint: float) -> tuple[RenderSettings, RenderSettings, RenderSettings]:
+def _candidates(footprint: float) -> tuple[RenderSettings, RenderSettings, RenderSettings]:
     """Adaptive rays, and one a pixel with longer and shorter steps."""
     from vvgt_cli.dvr import RenderSettings
     from vvgt_cli.dvr.render import FIT_VIEWS
@@ -152,7 +152,7 @@ def _tried(footprint: float) -> tuple[RenderSettings, RenderSettings, RenderSett
     return RenderSettings(footprint=footprint), FIT_VIEWS, RenderSettings(samples=1)
 
 
-def fine_enough(
+def ray_settings(
     scene: Scene | Viewed, start: Gaussians, size: int, rule: Rule, footprint: float = 1.0
 ) -> RenderSettings:
     """One ray a pixel where its error is `MARGIN` or `SAMPLES` below that of ``start``, else adaptive rays.
@@ -171,7 +171,7 @@ def fine_enough(
     def picked(image: np.ndarray) -> np.ndarray:
         return (image if blocks is None else blocks.pick(image))[..., :3]
 
-    many, longer, shorter = _tried(footprint)
+    many, longer, shorter = _candidates(footprint)
     fine = picked(render_view(scene, camera, many, blocks))
     wanted = psnr(fine, picked(render(start, camera, rule, blocks=blocks)))
     wanted += MARGIN if footprint == 1 else SAMPLES
@@ -181,7 +181,7 @@ def fine_enough(
     return many
 
 
-def wide(gaussians: Gaussians, size: int) -> bool:
+def suits_small_views(gaussians: Gaussians, size: int) -> bool:
     """Whether small training views still show Gaussians.
 
     That is so where the median of middle standard deviations is above `WIDE` px of a view twice as large, and bodies
