@@ -107,7 +107,7 @@ def test_what_several_cannot_is_said_before_anything_is_written(at):  # noqa: F8
         ("x.ply", {"overwrite": False}, "x_skin.ply"),
         ("{}{}.ply", {}, "expected one place"),
         ("x_{:03d}.ply", {}, "expected one place for the function's name"),
-        ("x.html", {"frame": "world"}, "leave out frame"),
+        ("x.html", {"frame": "world"}, "remove frame"),
         ("x.obj", {}, "expected a name ending in"),
         ("none/x.ply", {}, "does not exist"),
     ):

@@ -180,7 +180,7 @@ def test_no_steps_leave_back_projection():
     found = plan(steps=0)
     assert steps_of(found) == 0
     assert of(found, BackProjection) is not None
-    assert found.stages[0].anew  # its cells are cut once more
+    assert found.stages[0].recut
     assert [name for name, _ in found.skipped] == ["refinement"]
 
 

@@ -125,8 +125,8 @@ def test_what_the_disk_does_not_take_is_put_elsewhere(tmp_path, vvgt, monkeypatc
     _, told = done.communicate()
     assert done.returncode == 1
     line = told.splitlines()[-1]
-    assert line.startswith("vvgt: error: a.ply: cannot be written (File too large); what was computed lies in ")
-    place = Path(line.rpartition(" lies in ")[2])
+    assert line.startswith("vvgt: error: a.ply: cannot be written (File too large); the Gaussians were saved to ")
+    place = Path(line.rpartition(" saved to ")[2])
     assert place.parent == elsewhere
     assert 0 < len(read_ply(place)[0]) <= 20
     assert [path.name for path in tmp_path.iterdir()] == ["elsewhere"]

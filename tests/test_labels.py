@@ -251,7 +251,7 @@ def test_calls_that_contradict(vvgt, tmp_path: Path, seg: Path) -> None:
     for options, said in (
         (("--labels", "auto", "--tf", "gray"), "expected one of --tf and --labels"),
         (("--labels", tmp_path / "no.ctbl"), "no such file"),
-        (("--split-labels", "--tf", "gray"), "leave out --tf"),
+        (("--split-labels", "--tf", "gray"), "remove it"),
         (("--split-labels", "--dry-run"), "--dry-run"),
         (("--split-labels", "-o", tmp_path / "a.ply"), "label's name"),
     ):

@@ -103,7 +103,7 @@ def test_a_session_reads_once_and_leaves_the_same_bytes(field, tmp_path, monkeyp
     _, images = vvgt.render_views(session, "gray", 1, size=32)
     assert images[..., 3].max() > 0
     assert session.volume.spacing == SPACING
-    with pytest.raises(vvgt.UsageError, match="spacing: a session's volume has been read"):
+    with pytest.raises(vvgt.UsageError, match="spacing: the session's volume is read already"):
         vvgt.convert(session, "gray", spacing=SPACING)
 
 
@@ -182,9 +182,9 @@ def test_a_result_is_refined_and_read_again(field, converted, tmp_path):
         (np.zeros((4, 4, 4)), {"affine": np.eye(3)}, r"expected \(4, 4\)"),
         (np.zeros((4, 4, 4)), {"affine": np.eye(4), "spacing": (1, 1, 1)}, "leave out"),
         (np.zeros((4, 4, 4)), {"component": 1}, "an array is one volume"),
-        (np.zeros((4, 4, 4)), {"max_gaussian": 5}, "max_gaussian: no such option; of reading expected dims, "),
+        (np.zeros((4, 4, 4)), {"max_gaussian": 5}, "max_gaussian: unknown option; expected one of dims, "),
         (np.zeros((4, 4, 4)), {"space": "RAS"}, "give affine too"),
-        ("example:blob:8", {"affine": np.eye(4)}, "a file says itself"),
+        ("example:blob:8", {"affine": np.eye(4)}, "affine and origin are for arrays"),
         ("nothing.nrrd", {}, "no such file"),
         (pyvista.Sphere(), {}, "surface"),
         (pyvista.ImageData(dimensions=(3, 3, 3)), {}, "array"),

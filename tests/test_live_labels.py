@@ -252,8 +252,8 @@ def test_what_labels_do_not_go_with(vvgt, label_file, tmp_path) -> None:
     (tmp_path / "t.json").write_text(json.dumps(table | {"9": {"name": "nine", "color": "#ffffff"}}))
     (tmp_path / "one.json").write_text(json.dumps({"1": {"name": "one", "color": "#ffffff"}}))
     for more, code, said in (
-        (("--tf", "viridis"), 2, "leave out --tf (--labels gives"),
-        (("--tf-range", "0,1"), 2, "leave out --tf-range (--labels gives"),
+        (("--tf", "viridis"), 2, "replace --tf by --labels"),
+        (("--tf-range", "0,1"), 2, "replace --tf-range by --labels"),
         (("--labels", tmp_path / "t.json"), 1, "none of its labels is visible"),
         (("--labels", tmp_path / "one.json"), 1, "1 labels have no entry"),
         (("--labels", tmp_path / "missing.json"), 2, "no such file"),
@@ -261,7 +261,7 @@ def test_what_labels_do_not_go_with(vvgt, label_file, tmp_path) -> None:
         done = vvgt("recolor", label_file, *more, "-o", tmp_path / "a.ply")
         assert (done.code, said in done.error) == (code, True), done.error
     done = vvgt("render", label_file, "--tf-range", "0,1", "--orbit", 1, "-o", tmp_path / "r")
-    assert (done.code, "leave out --tf-range" in done.error) == (2, True), done.error
+    assert (done.code, "replace --tf-range" in done.error) == (2, True), done.error
     assert sorted(path.name for path in tmp_path.iterdir()) == ["one.json", "t.json"]
 
 

@@ -154,7 +154,7 @@ def test_a_layer_that_is_empty_in_a_frame_is_left_out_of_it(vvgt, tmp_path) -> N
         f"{tmp_path / 'low.npy'},labels=auto",
     )
     done = vvgt(*source, "--live", *SMALL, "-o", tmp_path / "f_{}.ply")
-    assert (done.code, "skipped: f1 (nothing but background)" in done.err) == (0, True), done.err
+    assert (done.code, "skipped: f1 (only background)" in done.err) == (0, True), done.err
     for k, numbers in enumerate(([0, 1], [1], [0, 1])):
         live = read_ply(tmp_path / f"f_{k}.ply")[0].live
         assert np.unique(live[:, 7]).tolist() == numbers  # type: ignore[index]

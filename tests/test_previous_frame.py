@@ -292,7 +292,7 @@ def test_a_frame_that_shows_something_else_is_converted_by_itself(vvgt, beat):
     np.save(beat / "v_1.npy", body(0.2)[:, :, ::-1])
     done = vvgt("convert", beat / "v_[01].npy", "--tf", beat / "tf.json", *HOW, "-o", beat / "f_{}.ply")
     assert done.code == 0, done.err
-    assert "skipped: starting from the frame before" in done.err
+    assert "skipped: starting from the previous frame" in done.err
     assert vvgt("convert", beat / "v_1.npy", "--tf", beat / "tf.json", *HOW, "-o", beat / "a.ply").code == 0
     assert uncertified(beat / "a.ply") == uncertified(beat / "f_1.ply")
 

@@ -121,7 +121,7 @@ def test_refused(session, earlier):
     with pytest.raises(vvgt.UsageError, match="same volume"):
         vvgt.convert("example:blob:16", "viridis", GOAL, after=earlier)
     for kind in ("live", "split_labels"):
-        with pytest.raises(vvgt.UsageError, match=r"after with .*leave it out"):
+        with pytest.raises(vvgt.UsageError, match=r"after with .*remove it"):
             session.convert(SHELL, GOAL, after=earlier, **{kind: True})
     with pytest.raises(vvgt.UsageError, match=r"after with .*give one function"):
         session.convert([SHELL, "gray"], GOAL, after=earlier)

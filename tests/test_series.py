@@ -94,7 +94,7 @@ def test_resumed_and_in_parts_it_leaves_the_same_bytes(vvgt, series: Path, stand
     before = (series / "out" / "03.ply").stat().st_mtime_ns
     again = vvgt(*[part for part in whole if part != "-q"])
     assert again.code == 0
-    assert "1 frames converted, 2 were done before" in again.err
+    assert "1 frames converted, 2 were complete before" in again.err
     assert contents(series / "out") == made
     assert (series / "out" / "03.ply").stat().st_mtime_ns == before
 

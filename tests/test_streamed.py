@@ -163,7 +163,7 @@ def test_the_bytes_do_not_depend_on_how(vvgt, volume: Path, folder: Path, tmp_pa
     ("options", "text"),
     [
         (("--init", "wavelet"), "made of moments"),
-        (("--frame", "world"), "leave out --frame"),
+        (("--frame", "world"), "remove --frame"),
         (("--steps", "50"), "levels of one closed form"),
         (("--live",), "levels of one closed form"),
         (("--tf", "a.json", "--tf", "b.json"), "levels of one closed form"),

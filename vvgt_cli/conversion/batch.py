@@ -1,8 +1,8 @@
-"""A batch: several clouds of one run, as files with an index, as one page, or in memory.
+"""Batches: several clouds of one run, as files with an index, as one page, or in memory.
 
 A batch is the frames of a series, several functions, or the labels of a map: it yields an `Item` for each cloud. One
 loop (`_run`) converts them, one after the other, into a sink: `Files` or `Memory`; a page is saved from memory.
-`CANNOT` says which options do not go with which kind.
+`CANNOT` lists the options that each kind of batch does not take.
 """
 
 from __future__ import annotations
@@ -54,45 +54,45 @@ ONE, LIVE, LEVELS, PAGE = "one volume", "--live", "streamed levels", "a page of 
 WHOLE_RUN = Shard()
 UNSAFE = re.compile(r"[^\w.-]+")  # characters that are not put into file names
 WHOLE = "the limit is for one file, and there are several; try --max-gaussians"
-CANNOT: dict[str, dict[str, str]] = {  # by kind of batch or output: options that it does not take, and what to do
-    ONE: {"--shard": "a volume is not divided; for a series give -o a place for the number, as out_{:04d}.ply"},
+CANNOT: dict[str, dict[str, str]] = {  # by kind of batch or output: options that it does not take, and a remedy
+    ONE: {"--shard": "one volume is not divided; for a series put the number into -o, as out_{:04d}.ply"},
     FRAMES: {
-        "--checkpoint": "a series resumes from its manifest; leave it out",
+        "--checkpoint": "a series resumes from its manifest; remove it",
         "--dry-run": "a plan is for one volume; try it on one of the frames",
-        "after": "a series starts from its own frames; leave it out",
+        "after": "a series starts from its own frames; remove it",
     },
     FUNCTIONS: {
         "--checkpoint": "it is for one conversion; run the functions one by one",
         "--dry-run": "a plan is for one function; try it on one of them",
         "--shard": "shards are for series; run the functions one by one",
-        "--live": "one live file can be shown under any function ('vvgt recolor'); give one --tf",
+        "--live": "one live file can be shown under any function by 'vvgt recolor'; give one --tf",
         "--split-labels": "labels have a table of their own; give one or the other",
-        "after": "one conversion starts from one; give one function",
+        "after": "only one conversion can start from another; give one function",
     },
     LABELS: {
-        "--tf": "the colours of labels come from --labels; leave it out",
-        "--layer": "only the label map is divided; leave it out",
-        "--labels none": "there are no labels then; leave it out",
-        "--dry-run": "a plan is for one file; leave it out",
-        "--shard": "shards are for series; leave it out",
-        "--checkpoint": "it is for one conversion; leave it out",
+        "--tf": "the colours of labels come from --labels; remove it",
+        "--layer": "only the label map is divided; remove it",
+        "--labels none": "it needs labels; remove it",
+        "--dry-run": "a plan is for one file; remove it",
+        "--shard": "shards are for series; remove it",
+        "--checkpoint": "it is for one conversion; remove it",
         "--max-size": WHOLE,
-        "--time-budget": "several conversions share the work; try --steps",
-        "--live": "a live file of the whole map can show each label alone; leave one of them out",
-        "after": "one conversion starts from one; leave it out",
+        "--time-budget": "it is for one conversion, and there are several; try --steps",
+        "--live": "a live file of the whole map can show each label alone; remove one of them",
+        "after": "only one conversion can start from another; remove it",
     },
-    LIVE: {"--dry-run": "live files are made in one way; leave it out", "after": "live files are quick; leave it out"},
+    LIVE: {"--dry-run": "live files need no plan; remove it", "after": "live files need no earlier one; remove it"},
     LEVELS: dict.fromkeys(
         (
             *("several --tf", "--steps", "--model", "--rule", "--target-psnr", "--time-budget", "--max-size", "--live"),
             *("--checkpoint", "--preview", "--dry-run", "--shard", "--split-labels"),
         ),
-        "levels are those of one closed form; leave it out",
+        "levels are made by one closed form alone; remove it",
     ),
     PAGE: {
-        "--report": "reports are for one cloud each; give -o a place for the name, as out_{}.ply",
-        "--preview": "previews are of one cloud each; give -o a place for the name, as out_{}.ply",
-        "--checkpoint": "it is for one conversion; give -o a place for the name, as out_{}.ply",
+        "--report": "a report is of one cloud; write a file each, as -o out_{}.ply",
+        "--preview": "a preview is of one cloud; write a file each, as -o out_{}.ply",
+        "--checkpoint": "it is for one conversion; write a file each, as -o out_{}.ply",
         "--max-size": WHOLE,
     },
 }
@@ -103,11 +103,11 @@ class Item:
     """One cloud of a batch.
 
     Attributes:
-        name: in the index, on pages and as a key.
-        stem: in file names: a frame's number, a function's name, a label's number and name.
-        request: of its conversion, without outputs.
-        facts: for the index.
-        gaussians: box frame, where they are made already and need only scores.
+        name: name in the index, on pages and as a key.
+        stem: part of file names: a frame's number, a function's name, a label's number and name.
+        request: request of its conversion, without outputs.
+        facts: further entries of its row in the index.
+        gaussians: finished Gaussians, box frame, that only need scores; None where they are yet to be made.
     """
 
     name: str
@@ -122,12 +122,12 @@ class Batch(ABC):
 
     Attributes:
         kind: `FRAMES`, `FUNCTIONS` or `LABELS`.
-        request: what all share; its outputs have a place for the name.
+        request: request that all share; its outputs have a place for the name.
         volume: name of the source.
-        stems: of all items; `prepare` may have to find them out first.
-        facts: for the index as a whole.
-        resumes: a later run of the same command takes up where this one ends, by a manifest of `settings`.
-        previous: what each item starts from, where items resemble each other.
+        stems: stems of all items; `prepare` may have to find them first.
+        facts: entries of the index as a whole.
+        resumes: whether a later run of the same command continues where this one ends, by a manifest of `settings`.
+        previous: warm start of each item, where items resemble each other.
     """
 
     kind: str
@@ -135,6 +135,7 @@ class Batch(ABC):
     previous: WarmStart | None = None
 
     def __init__(self, request: ConvertRequest, volume: str, stems: Sequence[str] = ()) -> None:
+        """Store what all items share."""
         self.request, self.volume, self.stems = request, volume, list(stems)
         self.facts: dict[str, Any] = {}
 
@@ -144,15 +145,15 @@ class Batch(ABC):
 
     @abstractmethod
     def items(self, run: Run, wanted: Callable[[str], bool]) -> Iterator[Item]:
-        """Yield the items whose stems are ``wanted``, those that show nothing skipped with a message."""
+        """Yield the items with a stem that is ``wanted``; skip those that show nothing, with a message."""
 
     def settings(self) -> dict[str, Any]:
-        """Return all that the files of a batch that ``resumes`` depend on, once it is prepared."""
+        """Return everything that the files depend on, for a batch that ``resumes`` and is prepared."""
         return {}
 
 
 class Functions(Batch):
-    """One volume under several functions or looks; it is read and laid out once.
+    """One volume under several functions or looks, read and laid out once.
 
     Args:
         requests: name, conversion and, for the index, source of each function.
@@ -161,6 +162,7 @@ class Functions(Batch):
     kind = FUNCTIONS
 
     def __init__(self, requests: Sequence[tuple[str, ConvertRequest, str]]) -> None:
+        """Store the requests, with file names made of their names."""
         request = requests[0][1]
         given = request.source.volume
         volume = Path(given).name if isinstance(given, str) else content_of(given).volumes[0].name
@@ -195,13 +197,14 @@ class Files:
     """The sink that writes a file for each item, and their index; a series keeps a manifest, by which it resumes."""
 
     def __init__(self, request: ConvertRequest, shard: Shard) -> None:
+        """Take the output names of ``request``."""
         self._request, self._shard = request, shard
         self._manifest: Manifest | None = None
         self._rows: dict[str, dict[str, Any]] = {}
         self._stack = ExitStack()
 
     def names(self, kind: str, stem: str) -> list[str]:
-        """Return output, report and preview of an item.
+        """Return the names of output, report and preview of an item.
 
         Raises:
             UsageError: a pattern without one place for the name.
@@ -227,7 +230,7 @@ class Files:
         """
         request, overwrite = self._request, self._request.overwrite
         if request.overwrite and self._shard.count > 1:
-            raise UsageError("--overwrite with --shard: parts would remove each other's files; remove them instead")
+            raise UsageError("--overwrite with --shard: shards would remove each other's files; remove the files first")
         first = self.names(batch.kind, batch.stems[0] if batch.stems else INDEX)
         index = index_output(str(request.output))
         check_outputs([*self._named(request, first).outputs(), index], request.inputs(), overwrite or batch.resumes)
@@ -241,37 +244,37 @@ class Files:
             return
         folders = {str(Path(name).parent) for name in first}
         if len(folders) > 1:
-            raise UsageError(f"the frames, reports and previews of a series go to one folder; got {', '.join(folders)}")
+            raise UsageError(f"-o, --report and --preview of a series: expected one folder; got {', '.join(folders)}")
         self._manifest = Manifest(Path(folders.pop()), batch.settings(), self._shard, what="frames")
         self._stack.enter_context(claim(self._manifest.folder / self._shard.manifest))
         self._manifest.open([Path(name).name for name in (*(n for row in rows for n in row), index.path)], overwrite)
         self._manifest.record()
 
     def close(self) -> None:
-        """Let go of the folder."""
+        """Release the folder."""
         self._stack.close()
 
     @staticmethod
     def _check_stems(batch: Batch) -> None:
         if len(set(batch.stems)) < len(batch.stems):
             stated = ", ".join(dict.fromkeys(batch.stems))
-            raise UsageError(f"{len(batch.stems)} {batch.kind}, named {stated}: files would have one name; rename one")
+            raise UsageError(f"{len(batch.stems)} {batch.kind}, named {stated}: files would share a name; rename one")
 
     def wants(self, batch: Batch, stem: str) -> bool:
-        """Tell whether an item is this part's, and not there yet."""
+        """Return whether an item belongs to this shard and is not complete yet."""
         if self._manifest is None:
             return True
         own = [Path(name).name for name in self.names(batch.kind, stem)]
         return self._shard.holds(batch.stems.index(stem)) and not all(map(self._manifest.complete, own))
 
     def convert(self, batch: Batch, item: Item, console: Console) -> ConversionReport:
-        """Convert an item to its files."""
+        """Convert an item to its files, and return the report."""
         return convert(
             self._named(item.request, self.names(batch.kind, item.stem)), console, item.gaussians, batch.previous
         )
 
     def take(self, batch: Batch, item: Item, report: ConversionReport, facts: Mapping[str, Any]) -> None:
-        """Record an item that is whole."""
+        """Record a complete item."""
         names = [Path(name) for name in self.names(batch.kind, item.stem)]
         row = entry(item.name, report.gaussians, report.bytes, psnr_of(report), **item.facts, **facts)
         folder = Path(index_output(str(self._request.output)).path).parent
@@ -281,7 +284,7 @@ class Files:
             self._manifest.record([name.name for name in names], {names[0].name: {"row": row}})
 
     def finish(self, batch: Batch, console: Console) -> dict[str, Any]:
-        """Write the index: of a series in parts, what all parts have recorded; the part that ends last finds all."""
+        """Write and return the index; for shards, of the items recorded so far, so that the last shard lists all."""
         path, manifest, known = index_output(str(self._request.output)).path, self._manifest, -1
         rows = list(self._rows.values())
         while manifest is None or len(manifest.files) > known:
@@ -293,8 +296,8 @@ class Files:
             write_index(path, found, self._request.overwrite or manifest is not None)
             if manifest is None:
                 break
-            manifest.refresh()  # another part may have recorded its last item meanwhile
-        console.message(f"{path}: {len(rows)} {batch.kind}, {len(self._rows)} of them converted now")
+            manifest.refresh()  # another shard may have recorded its last item meanwhile
+        console.message(f"{path}: {len(rows)} {batch.kind}, {len(self._rows)} of them converted in this run")
         return found
 
 
@@ -302,6 +305,7 @@ class Memory:
     """The sink that keeps Gaussians, scores and layouts."""
 
     def __init__(self) -> None:
+        """Start without clouds."""
         self._clouds: list[Cloud] = []
         self._made: Cloud | None = None
 
@@ -310,11 +314,11 @@ class Memory:
         batch.prepare(run)
 
     def wants(self, batch: Batch, stem: str) -> bool:
-        """Take every item."""
+        """Return True: every item is kept."""
         return True
 
     def convert(self, batch: Batch, item: Item, console: Console) -> ConversionReport:
-        """Convert an item, whose volume is let go of."""
+        """Convert an item, release its volume, and return the report."""
         run = Run(console, ConversionReport("convert"))
         with open_field(run, item.request) as volume:
             found = run_conversion(run, item.request, volume, item.gaussians, batch.previous)
@@ -329,18 +333,18 @@ class Memory:
         self._clouds.append(replace(self._made, facts={**self._made.facts, **facts}))
 
     def finish(self, batch: Batch, console: Console) -> Clouds:
-        """Return all items."""
+        """Return all items as clouds."""
         return Clouds(batch.kind, batch.volume, self._clouds, batch.facts)
 
     def close(self) -> None:
-        """Do nothing: what is kept is the caller's."""
+        """Do nothing."""
 
 
 def _run(batch: Batch, sink: Files | Memory, console: Console) -> Any:
-    """Convert what a sink wants of a batch, one item after the other, and finish the sink.
+    """Convert the items of a batch that a sink wants, one after the other, and finish the sink.
 
     Raises:
-        KeyboardInterrupt: Ctrl-C ended an item early; it is not recorded, so that the same command makes it again.
+        KeyboardInterrupt: Ctrl-C ended an item early; it is not recorded, so that the same command converts it again.
     """
     run = Run(console, ConversionReport("convert"))
     try:
@@ -368,10 +372,10 @@ def options_in(request: ConvertRequest) -> set[str]:
 
 
 def check_options(kind: str, used: Iterable[str]) -> None:
-    """Refuse options that a kind of batch or output does not take.
+    """Check that a kind of batch or output takes all options.
 
     Raises:
-        UsageError: the first of them, and what to do.
+        UsageError: names the first of them, and a remedy.
     """
     for option, why in CANNOT[kind].items():
         if option in used:
@@ -385,19 +389,19 @@ def convert_files(
     """Convert one volume, the frames of a series, several functions or the labels of a map to files or a page.
 
     Args:
-        request: of all of it; ``output`` says by a place for a number or name (``{}``) that there are several files.
-        functions: of ``--tf``; one of them is the request's own.
-        split_labels: a cloud for each label.
+        request: the request; an ``output`` with a place for a number or name (``{}``) asks for several files.
+        functions: all values of ``--tf``, the request's own included.
+        split_labels: make a cloud of each label.
         dry_run: plan one volume, and write nothing.
-        shard: ``I/N``, the part of a series to convert.
-        console: for messages.
+        shard: ``I/N``, the share of a series to convert.
+        console: destination of messages.
 
     Returns:
         The plan of a dry run.
 
     Raises:
-        UsageError: options that do not go together, found before anything is read.
-        DataError: as `convert`; files that are whole stay.
+        UsageError: contradictory options; raised before anything is read.
+        DataError: see `convert`; complete files stay.
     """
     from vvgt_cli.conversion.frames import is_glob_of_volumes
 
@@ -429,17 +433,17 @@ def convert_files(
     if kind == ONE:
         kind, page = FRAMES, True
         check_options(PAGE, used)
-    part = WHOLE_RUN if shard is None else parse_shard(shard)
-    under = [(function_name(tf), replace(request, source=replace(request.source, tf=tf)), tf) for tf in functions]
-    batch = _batch(kind, request, under, part, page)
+    share = WHOLE_RUN if shard is None else parse_shard(shard)
+    looks = [(function_name(tf), replace(request, source=replace(request.source, tf=tf)), tf) for tf in functions]
+    batch = _batch(kind, request, looks, share, page)
     if not page:
-        _run(batch, Files(request, part), console)
+        _run(batch, Files(request, share), console)
         return None
     run = Run(console, ConversionReport("convert"))
     with claimed(request.outputs(), request.inputs(), request.overwrite):
         clouds = _run(batch, Memory(), console)
         if not clouds:
-            raise DataError(f"{output}: nothing is visible in any of what it was to show; try another function")
+            raise DataError(f"{output}: nothing is visible in any of its clouds; try another function")
         with run.stage("write") as stage:
             size, total = clouds.save(output, overwrite=request.overwrite), sum(len(c.gaussians) for c in clouds.clouds)
             stage.note = f"{output}: {len(clouds)} clouds, {total} Gaussians, {size / 1e6:.1f} MB"
@@ -454,14 +458,14 @@ def convert_to_memory(
     """Convert one volume, the frames of a series, several looks or the labels of a map, without files.
 
     Args:
-        requests: by the names of looks.
-        several: a cloud for each look, even where there is one.
-        split_labels: a cloud for each label.
+        requests: request of each look, by name.
+        several: return `Clouds` even for a single look.
+        split_labels: make a cloud of each label.
         after: an earlier conversion of the same volume to start from.
-        console: for messages.
+        console: destination of messages.
 
     Raises:
-        UsageError, DataError: as `convert_files`.
+        UsageError, DataError: see `convert_files`.
     """
     from vvgt_cli.conversion.frames import is_glob_of_volumes
     from vvgt_cli.conversion.previous_look import PreviousLook

@@ -1,4 +1,4 @@
-"""Convert one volume under a transfer function, stage by stage: `convert` to a file, `convert_in_memory` without."""
+"""The conversion of one volume under a transfer function, stage by stage, to a file or in memory."""
 
 from __future__ import annotations
 
@@ -37,26 +37,26 @@ from vvgt_cli.network.card import find_model, read_card
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
 
-QUICKEST = 0.5  # of the estimate, where the closed form took less: the rest then takes less too
-VIEW_DEGREE = 2  # of harmonics by default where the light depends on the view: abs(n . v) is even
-SMALLER = (8, 4, 2)  # parts of the budget that a target is tried with first
+QUICKEST = 0.5  # least pace, where the closed form took less time than estimated
+VIEW_DEGREE = 2  # default degree of harmonics where the light depends on the view: abs(n . v) is even
+SMALLER = (8, 4, 2)  # divisors of the budget that a target is tried with first
 
 
 def convert(
     request: ConvertRequest, console: Console | None = None, made: Gaussians | None = None,
     start: WarmStart | None = None,
 ) -> ConversionReport:  # fmt: skip
-    """Convert a volume to a file, and return the report; arguments as of `run_conversion`.
+    """Convert a volume to a file, and return the report; see `run_conversion` for the arguments.
 
     Raises:
-        UsageError: an output that may not be written; found before anything is read.
-        DataError: invalid input, or a scene that shows nothing.
+        UsageError: an output may not be written; raised before anything is read.
+        DataError: the input is invalid, or nothing is visible.
     """
     request.budget()
     if request.live:
         check_live(request)  # before anything is read
     if request.checkpoint is not None and request.limits.time_budget is not None:
-        raise UsageError("--checkpoint is of runs that repeat to the byte, --time-budget of others; give one of both")
+        raise UsageError("--checkpoint needs runs that are repeatable, which --time-budget prevents; give one of them")
     run = Run(console or Console(), ConversionReport("convert"))
     with (
         claimed(request.outputs(), request.inputs(), request.overwrite),
@@ -74,10 +74,10 @@ def convert_in_memory(
     request: ConvertRequest, console: Console | None = None, start: WarmStart | None = None,
     unscored: Callable[[Conversion], None] | None = None,
 ) -> Conversion:  # fmt: skip
-    """Convert a volume without writing anything; arguments as of `run_conversion`.
+    """Convert a volume without writing anything; see `run_conversion` for the arguments.
 
     Raises:
-        DataError, UsageError: as `convert`.
+        DataError, UsageError: see `convert`.
     """
     run = Run(console or Console(), ConversionReport("convert"))
     with ExitStack() as stack:
@@ -92,7 +92,7 @@ def initialise_only(request: ConvertRequest, console: Console | None = None) -> 
     """Convert a volume to a file by the closed form alone, without rendering anything.
 
     Raises:
-        UsageError, DataError: as `convert`.
+        UsageError, DataError: see `convert`.
     """
     run = Run(console or Console(), ConversionReport("init"))
     with claimed(request.outputs(), request.inputs(), request.overwrite), open_field(run, request, INIT) as field:
@@ -105,7 +105,7 @@ def plan_conversion(request: ConvertRequest, console: Console | None = None) -> 
     """Return the plan of `convert`: the volume is read and laid out, and a small view is timed.
 
     Raises:
-        DataError, UsageError: as `convert`.
+        DataError, UsageError: see `convert`.
     """
     run = Run(console or Console(), ConversionReport("convert"))
     check_outputs(request.outputs(), request.inputs(), request.overwrite)
@@ -117,7 +117,7 @@ def fit_gaussians(run: Run, request: ConvertRequest) -> Gaussians:
     """Return the Gaussians of a conversion in the box frame, neither scored nor written.
 
     Raises:
-        DataError, UsageError: as `convert`.
+        DataError, UsageError: see `convert`.
     """
     with open_field(run, request) as field:
         work, planner, plan = _planned(run, request, field)
@@ -136,14 +136,14 @@ def run_conversion(
 
     Args:
         run: times the stages.
-        request: what is asked for.
+        request: the request.
         field: the volume under its look.
-        made: Gaussians in the box frame that only need scores.
-        start: an earlier conversion that is tried before the closed form.
+        made: finished Gaussians, box frame, that only need scores.
+        start: warm start that is tried before the closed form.
         unscored: called with the conversion before it has scores and a certificate.
 
     Raises:
-        DataError, UsageError: as `convert`.
+        DataError, UsageError: see `convert`.
     """
     if request.live:
         check_live(request)
@@ -163,7 +163,7 @@ def run_conversion(
         work.gaussians = as_stored(made)
     elif kept:
         work.gaussians = kept[0]
-        run.console.message(f"{request.checkpoint} holds the fitted Gaussians: only the scores are left")
+        run.console.message(f"{request.checkpoint} holds the fitted Gaussians: only scoring remains")
     elif start is None or not start.try_start(work, plan, request):
         if start is not None:
             field.views.expect(_pictures(plan, work.fit))
@@ -181,12 +181,12 @@ def run_conversion(
 
 
 def _pictures(plan: Plan, fit: FitOptions) -> list[Picture]:
-    """Return the pictures that a plan's stages will ask for."""
+    """List the pictures that the stages of a plan will request."""
     return [view for stage in plan.stages for view in stage.views(fit)]
 
 
 def _planned(run: Run, request: ConvertRequest, field: Field, expected: bool = True) -> tuple[Work, Planner, Plan]:
-    """Return all that the first stage needs; with ``expected`` the field is told which pictures it will draw."""
+    """Return work, planner and plan before the first stage; ``expected`` announces the plan's pictures to the field."""
     fit = replace(request.fit, max_gaussians=request.budget())
     if fit.model is not None:
         read_card(find_model(fit.model))  # fails before the work, not after
@@ -211,8 +211,8 @@ def _fit(work: Work, request: ConvertRequest, planner: Planner, plan: Plan) -> P
     first.run(work)
     degree = work.made().degree if request.ply.sh_degree is None else request.ply.sh_degree
     if request.output is not None and request.output != STDOUT:
-        check_disk_space(request.output, 2 * file_bytes(len(work.made()), degree))  # with its certificate once more
-    # halfway between its pace and that of drawing: steps follow neither alone on every machine
+        check_disk_space(request.output, 2 * file_bytes(len(work.made()), degree))  # a second time with its certificate
+    # the mean of its pace and that of drawing, since steps follow neither alone on every machine
     pace = max(work.run.report.stages[-1].seconds / first.cost(plan.workload).seconds, QUICKEST) ** 0.5
     planner = replace(planner, wide=suits_small_views(work.made(), work.fit.size), sh_degree=degree)
     workload = replace(plan.workload.at(pace), gaussians=len(work.made()), degree=work.made().degree)
@@ -232,7 +232,7 @@ def improve(work: Work, plan: Plan) -> None:
         DataError, UsageError: as the stages.
     """
     ahead = [stage for stage in plan.stages if not stage.scores]
-    told = improved = False
+    listed = improved = False
     for n, stage in enumerate([*ahead, None]):
         if not (stage is None and improved) and work.target_reached():
             for name in (other.name for other in ahead[n:] if other.improves):
@@ -240,8 +240,8 @@ def improve(work: Work, plan: Plan) -> None:
             if not improved:
                 _take_fewest(work)
             return
-        if not told and not isinstance(stage, CheckViews):
-            told = True
+        if not listed and not isinstance(stage, CheckViews):
+            listed = True
             for name, why in plan.skipped:
                 work.run.skip(name, why)
         if stage is not None:
@@ -251,13 +251,13 @@ def improve(work: Work, plan: Plan) -> None:
 
 
 def _take_fewest(work: Work) -> None:
-    """Take the fewest Gaussians that reach the target: a part of the budget, or all of it."""
+    """Take the fewest Gaussians that reach the target, among fractions of the budget."""
     start = work.start
     if start is None or start.form is None:
         return
     count = len(start.gaussians)
-    for part in SMALLER:
-        work.gaussians = replace(start.form, budget=max(count // part, 1)).gaussians()
+    for divisor in SMALLER:
+        work.gaussians = replace(start.form, budget=max(count // divisor, 1)).gaussians()
         if len(work.gaussians) < count and work.target_reached():
             work.run.skip(f"{count - len(work.gaussians)} Gaussians", "the target is reached without")
             return
@@ -276,10 +276,10 @@ def _conversion(request: ConvertRequest, work: Work, gaussians: Gaussians) -> Co
 def open_field(run: Run, request: ConvertRequest, kernels: tuple[str, ...] = CONVERT) -> Iterator[Field]:
     """Open a request's volume under its look, in memory or in blocks, and compile ``kernels``.
 
-    Blocks lie beside the output until it is written: after an interruption the same command reads those that are there.
+    Blocks are stored beside the output until it is written: after an interruption the same command reuses them.
 
     Raises:
-        DataError, UsageError: as `vvgt_cli.field.source.load`.
+        DataError, UsageError: see `vvgt_cli.field.source.load`.
     """
     options = request.blocks or automatic(request.source, run.console)
     if options is None:
@@ -304,8 +304,8 @@ def _report_source(run: Run, request: ConvertRequest, source: Source) -> None:
     """Report what was read."""
     ply = ply_options(request, source)
     flattened = _harmonics_warning(degree_of(request, source), source)
-    for remark in [*placement_warnings(source.volume, ply), *([flattened] if flattened else [])]:
-        run.console.message(remark)
+    for warning in [*placement_warnings(source.volume, ply), *([flattened] if flattened else [])]:
+        run.console.message(warning)
     run.report.volume = volume_record(source)
     run.report.transfer_function = tf_record(source, request.source)
     run.report.options = asdict(request.fit) | asdict(request.limits) | {
@@ -320,24 +320,24 @@ def _kernels(names: tuple[str, ...], request: ConvertRequest, source: Source) ->
 
 
 def degree_of(request: ConvertRequest, source: Source) -> int:
-    """Return the degree of spherical harmonics: 0 where the light does not depend on the view, else as asked, or 2."""
+    """Return the degree of harmonics: 0 where the light does not depend on the view, else as requested or 2."""
     if source.lighting is None or not source.lighting.depends_on_view:
         return 0
     return VIEW_DEGREE if request.ply.sh_degree is None else request.ply.sh_degree
 
 
 def _harmonics_warning(degree: int, source: Source) -> str | None:
-    """Return a message where the degree asked for cannot hold the light."""
+    """Return a message where the requested degree cannot represent the light."""
     if degree >= VIEW_DEGREE or source.lighting is None or not source.lighting.depends_on_view:
         return None
     return (
-        f"--sh-degree {degree}: what the headlight and highlights show changes with the view; the file has their mean "
-        f"over directions (--sh-degree {VIEW_DEGREE} holds them)"
+        f"--sh-degree {degree}: headlight and highlights change with the view; the file has their mean "
+        f"over directions (--sh-degree {VIEW_DEGREE} represents them)"
     )
 
 
 def ply_options(request: ConvertRequest, source: Source) -> PlyOptions:
-    """Return how the file is written, with all that follows from the source."""
+    """Return the layout of the file, with everything that follows from the source."""
     ply = replace(
         request.ply,
         up=up_axis(request.up, request.ply.frame, source.volume.space),
@@ -364,7 +364,7 @@ def _legend(source: Source) -> str | None:
 
 
 def _early_writer(run: Run, request: ConvertRequest) -> Callable[[Conversion], None] | None:
-    """Return what writes the file before its scores are known, where it is written twice."""
+    """Return a function that writes the file before its scores are known; None where it is written once."""
     output = request.output
     if output is None or request.writes < 2:
         return None

@@ -1,4 +1,4 @@
-"""The frames of a time series as a batch: which there are, and the grid, range and function that all of them share."""
+"""The frames of a time series as a batch, with the grid, range and function that all of them share."""
 
 from __future__ import annotations
 
@@ -43,10 +43,10 @@ class Step:
     """A frame of a series: a file, or a time step of one.
 
     Attributes:
-        name: for messages and the index.
-        volume: as `SourceRequest.volume`.
+        name: name in messages and the index.
+        volume: see `SourceRequest.volume`.
         read: how to read it.
-        time: of a step of a file that states it, with its unit, which may be "".
+        time: time of the step and its unit, which may be ""; None where the file has none.
     """
 
     name: str
@@ -61,7 +61,7 @@ class Step:
         return f"{self.name} ({' '.join([f'{self.time[0]:g}', self.time[1]]).strip()})"
 
     def facts(self) -> dict[str, Any]:
-        """Return its time as an index has it."""
+        """Return its time as entries of an index."""
         if self.time is None:
             return {}
         value, unit = self.time
@@ -70,15 +70,15 @@ class Step:
 
 @dataclass(frozen=True)
 class Survey:
-    """Findings of the first pass over a series.
+    """The result of the first pass over a series.
 
     Attributes:
         count: number of frames.
-        own: range (lo, hi) of each frame's components, as `Content.classified` has them.
-        whole: statistics of all frames together, of each component.
+        own: range (lo, hi) of each component of each frame, in the order of `Content.classified`.
+        whole: statistics of each component over all frames.
         first: the first frame without its values; all frames share its grid.
         content: digest of all frames' values.
-        labels: of all frames, where they are label maps.
+        labels: labels of all frames, where they are label maps.
     """
 
     count: int
@@ -90,7 +90,7 @@ class Survey:
 
     @property
     def grid(self) -> Volume:
-        """The volume whose grid all frames share."""
+        """Return the volume whose grid all frames share."""
         return self.first.volumes[0]
 
 
@@ -101,13 +101,14 @@ class Series(Batch):
     frames together. Frames in which the function shows nothing are skipped, with a message.
 
     Raises:
-        UsageError: no such files.
-        DataError: a file that cannot be read.
+        UsageError: no file matches.
+        DataError: a file cannot be read.
     """
 
     kind, resumes = FRAMES, True
 
     def __init__(self, request: ConvertRequest, shard: Shard, page: bool) -> None:
+        """List the frames; ``page`` limits the Gaussians of live frames."""
         self._steps: Sequence[Step] = list_steps(request.source)
         volume, count = Path(request.source.path).name, len(self._steps)
         super().__init__(request, volume, [str(k) for k in range(count)])
@@ -119,8 +120,8 @@ class Series(Batch):
         """Read all frames once, for what they share.
 
         Raises:
-            DataError: as `survey`; a function that shows nothing in any frame.
-            UsageError: as `survey`.
+            DataError: see `survey`; the function shows nothing in any frame.
+            UsageError: see `survey`.
         """
         request, steps, console = self.request, self._steps, run.console
         if self._most < request.fit.max_gaussians:
@@ -133,7 +134,7 @@ class Series(Batch):
         with run.stage("frames") as stage:
             found = survey(steps, source.labels, source.tf, console, request.blocks is not None)
             source = replace(source, statistics=found.whole)
-            if found.first.unasked:  # said once, not for every frame
+            if found.first.unasked:  # reported once, not for every frame
                 steps = [replace(step, read=replace(step.read, component=ALL)) for step in steps]
             if source.labels is None and found.labels is not None:
                 source = replace(source, labels=AUTO)
@@ -159,13 +160,13 @@ class Series(Batch):
             if not wanted(stem):
                 continue
             if self._dark[k]:
-                console.message(f"{step.name}: nothing of it is visible; it is skipped")
+                console.message(f"skipped: {step.name} (nothing of it is visible)")
                 continue
             console.message(f"{step.label()}: frame {k + 1} of {len(self._steps)}")
             source = replace(self.request.source, volume=step.volume, read=step.read)
             yield Item(step.name, stem, replace(self.request, source=source), {"frame": k, **step.facts()})
             done += 1
-        console.message(f"{done} frames converted, {mine - done} were done before")
+        console.message(f"{done} frames converted, {mine - done} were complete before")
 
     def settings(self) -> dict[str, Any]:
         """Return everything that the files depend on, named as the command line names it."""
@@ -195,7 +196,7 @@ class Series(Batch):
 
 
 def is_glob_of_volumes(path: str) -> bool:
-    """Tell whether a path is a glob of files that are volumes of their own, and not slices of one."""
+    """Return whether a path is a glob of files that each hold a volume, and not the slices of one."""
     if os.path.exists(path) or not set(path) & set("*?["):
         return False
     files = matching(path)
@@ -205,7 +206,7 @@ def is_glob_of_volumes(path: str) -> bool:
 
 
 def _pages(path: Path) -> int:
-    """Return the number of pages of a TIFF; 1 where it cannot be read, which reading it reports."""
+    """Return the number of pages of a TIFF; 1 where it cannot be read, which is reported later."""
     import tifffile
 
     try:
@@ -222,13 +223,14 @@ def survey(
 
     Args:
         steps: the frames.
-        labels, tf: as they are asked for.
-        console: for progress.
-        stored: values stay in their files, of which slabs are read.
+        labels: requested label table.
+        tf: requested function.
+        console: draws progress.
+        stored: read values from their files slab by slab.
 
     Raises:
-        DataError: a frame that cannot be read, or on another grid than the first.
-        UsageError: frames of segments that overlap.
+        DataError: a frame cannot be read, or is on another grid than the first.
+        UsageError: the segments of a frame overlap.
     """
     first: Content | None = None
     numbers, digests = [], []
@@ -237,7 +239,7 @@ def survey(
     for k, step in enumerate(steps):
         content = open_parts(step.volume, replace(step.read, stored=True, packed=True) if stored else step.read)
         if content.overlapping:
-            raise UsageError(f"{step.name}: segments that overlap, in several layers; convert such frames one by one")
+            raise UsageError(f"{step.name}: its segments overlap; convert such frames one by one")
         first = first or replace(content, volumes=tuple(map(_without_values, content.volumes)))
         _check_frame(step, steps[0], content, first)
         if k == 0 and labels is None and tf is None and content.one_field:
@@ -249,19 +251,19 @@ def survey(
         if bar:
             bar(k + 1, len(steps))
     if first is None:
-        raise UsageError("a series without frames")
-    whole = tuple(merge_statistics(parts) for parts in zip(*numbers, strict=True))
-    own = [[(n.lo, n.hi) for n in parts] for parts in numbers]
+        raise UsageError("the series has no frames; expected one or more")
+    whole = tuple(merge_statistics(rows) for rows in zip(*numbers, strict=True))
+    own = [[(n.lo, n.hi) for n in rows] for rows in numbers]
     return Survey(len(steps), own, whole, first, digest(*digests), tuple(sorted(found)) if mapped else None)
 
 
 def _without_values(volume: Volume) -> Volume:
-    """The same without its values."""
+    """Return the volume with zeros that take no memory as its values."""
     return replace(volume, data=np.broadcast_to(volume.data.dtype.type(0), volume.data.shape))
 
 
 def _check_frame(step: Step, begin: Step, content: Content, first: Content) -> None:
-    """Refuse frames of another grid, or of other components."""
+    """Check that a frame has the grid and the components of the first."""
     volume, grid = content.volumes[0], first.volumes[0]
     if _grid(volume) != _grid(grid):
         raise DataError(
@@ -280,36 +282,36 @@ def _grid(volume: Volume) -> tuple[Any, ...]:
 
 
 def _grid_text(volume: Volume) -> str:
-    parts = (volume.spacing, volume.origin, volume.direction)
-    numbers = (" ".join(f"{value:g}" for value in values) for values in parts)
+    vectors = (volume.spacing, volume.origin, volume.direction)
+    numbers = (" ".join(f"{value:g}" for value in values) for values in vectors)
     return " x ".join(map(str, volume.dims)) + " voxels of {} from {} along {}".format(*numbers)
 
 
-def merge_statistics(parts: Sequence[Statistics]) -> Statistics:
-    """The statistics of several volumes as one; counts are spread evenly within each one's bins."""
-    lo, hi = min(p.lo for p in parts), max(p.hi for p in parts)
-    widest = max(parts, key=lambda p: p.edges[-1] - p.edges[0])
+def merge_statistics(volumes: Sequence[Statistics]) -> Statistics:
+    """Merge the statistics of several volumes; counts are spread evenly within the bins of each."""
+    lo, hi = min(p.lo for p in volumes), max(p.hi for p in volumes)
+    widest = max(volumes, key=lambda p: p.edges[-1] - p.edges[0])
     ends = (lo, hi) if lo < hi else (widest.edges[0], widest.edges[-1])
     steps = np.arange(len(widest.edges)) / (len(widest.edges) - 1)
     edges = ends[0] * (1 - steps) + ends[1] * steps
     edges[0], edges[-1] = ends
     below = np.zeros(len(edges))
-    for part in parts:
-        below += np.interp(edges, part.edges, np.concatenate([[0], np.cumsum(part.histogram)]))
-    below[0], below[-1] = 0, sum(int(p.histogram.sum()) for p in parts)
+    for one in volumes:
+        below += np.interp(edges, one.edges, np.concatenate([[0], np.cumsum(one.histogram)]))
+    below[0], below[-1] = 0, sum(int(p.histogram.sum()) for p in volumes)
     histogram = np.diff(np.round(below)).astype(np.int64)
-    return Statistics(lo, hi, sum(p.nan_count for p in parts), sum(p.inf_count for p in parts), histogram, edges)
+    return Statistics(lo, hi, sum(p.nan_count for p in volumes), sum(p.inf_count for p in volumes), histogram, edges)
 
 
 def _invisible(shown: Sequence[TransferFunction | LabelTable], own: Sequence[tuple[float, float]]) -> bool:
-    """Whether nothing of a frame is visible."""
+    """Return whether nothing of a frame is visible."""
     return not any(tf.support(*limits) for tf, limits in zip(shown, own, strict=True))
 
 
 def _functions(
     source: SourceRequest, frames: Survey
 ) -> tuple[Sequence[TransferFunction | LabelTable], tuple[float, str]]:
-    """The function of each component, on data values, and the first one's unit distance with how it was chosen.
+    """Return the functions of all components on data values, and the unit distance with how it was chosen.
 
     They are the same for every frame.
     """
@@ -325,24 +327,24 @@ def _functions(
 
 
 def _table(labels: str | LabelTable | None, found: Sequence[int]) -> LabelTable:
-    """Of a series of label maps; colours that are made depend on a label's number alone."""
+    """Return the table of a series of label maps; automatic colours depend on the label's number alone."""
     if isinstance(labels, str) and labels != AUTO:
         return read_labels(labels).warned(found, "the series")
     return labels if isinstance(labels, LabelTable) else distinct(found)
 
 
 def list_steps(source: SourceRequest) -> list[Step]:
-    """The files of a glob, or the time steps of the one file that is named.
+    """List the files of a glob, or the time steps of a single file.
 
     Raises:
-        UsageError: a glob that matches nothing.
-        DataError: a file that cannot be read.
+        UsageError: the glob matches nothing.
+        DataError: a file cannot be read.
     """
     files = [] if os.path.exists(source.path) else matching(source.path)
     if not files and set(source.path) & set("*?[") and not os.path.exists(source.path):
         raise UsageError(
-            f"{source.path}: no such files; with a number in -o expected the frames of a series, as 'run_*.vti', or "
-            "a file of several time steps"
+            f"{source.path}: no file matches; with a number in -o expected the frames of a series, as 'run_*.vti', or "
+            "a file with several time steps"
         )
     if len(files) > 1:
         return [Step(file.name, str(file), source.read) for file in files]
@@ -355,7 +357,7 @@ def list_steps(source: SourceRequest) -> list[Step]:
 
 
 def _times(volume: str, read: ReadOptions) -> list[tuple[float, str] | None]:
-    """Time of each step of a file, None where it says none, whatever its components are."""
+    """List the time of each step of a file, None where it has none, whatever its components are."""
     from vvgt_cli.volume.registry import time_steps
 
     if read.component in (COLOR, ALL):

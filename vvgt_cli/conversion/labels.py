@@ -1,7 +1,7 @@
-"""The labels of a label map as a batch (`vvgt convert --split-labels`): together they are the whole.
+"""The labels of a label map as a batch (`vvgt convert --split-labels`), whose clouds add up to the whole.
 
-What some view sees of the whole is converted as one scene, and each Gaussian goes to the label that owns most of it;
-what the whole hides is converted label by label, and of that the hidden Gaussians are added.
+The whole map is converted as one scene, and each Gaussian is assigned to the label with most of it. Labels that others
+hide are also converted alone, and their hidden Gaussians added.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from vvgt_cli.volume.label_maps import counts_of
 if TYPE_CHECKING:
     from vvgt_cli.dvr.layers import Layer
 
-LONGEST = 80  # characters of a label's name in a file's
+LONGEST = 80  # characters of a label's name in a file name
 
 
 @dataclass(frozen=True)
@@ -57,13 +57,14 @@ class MapLabel:
 class Labels(Batch):
     """The visible labels of a label map, converted as a whole and divided.
 
-    Their Gaussians are at most ``max_gaussians`` together. Those that the whole hides get a share by the labels'
-    surfaces (voxels to the power of 2/3), the rest is for what is seen.
+    They have at most ``max_gaussians`` Gaussians together. Hidden ones get a share by the labels' surfaces
+    (voxels to the power of 2/3), visible ones the rest.
     """
 
     kind = LABELS
 
     def __init__(self, request: ConvertRequest) -> None:
+        """Start without labels; `prepare` finds them."""
         super().__init__(request, "")
         self._labels: list[MapLabel] = []
 
@@ -71,7 +72,7 @@ class Labels(Batch):
         """Read the map and its table.
 
         Raises:
-            DataError: as `convert`; no label is visible.
+            DataError: see `convert`; no label is visible.
         """
         source = self.request.source
         with run.stage("volume") as stage:
@@ -85,11 +86,11 @@ class Labels(Batch):
             stage.note = f"{self.volume}, {len(self._labels)} labels of {self.facts['table']}"
 
     def items(self, run: Run, wanted: Callable[[str], bool]) -> Iterator[Item]:
-        """Yield an item with its Gaussians for each label of which something is visible."""
+        """Yield an item with its Gaussians for each label that is visible."""
         names = [one.label.name for one in self._labels]
         for one, gaussians in zip(self._labels, _gaussians(self.request, self._labels, run), strict=True):
             if gaussians is None:
-                run.console.message(f"{one.text()}: nothing visible; it is skipped")
+                run.console.message(f"skipped: {one.text()} (nothing of it is visible)")
                 continue
             run.console.message(f"{one.text()}: {len(gaussians)} Gaussians")
             label = one.label
@@ -99,7 +100,7 @@ class Labels(Batch):
 
 
 def _content(source: SourceRequest, stored: bool) -> Content:
-    """What the map's file holds, or the map itself."""
+    """Return the content of the map's file, or the map itself."""
     if not isinstance(source.volume, str):
         return content_of(source.volume)
     read = replace(source.read, stored=True, packed=True) if stored else source.read
@@ -107,7 +108,7 @@ def _content(source: SourceRequest, stored: bool) -> Content:
 
 
 def _visible(request: ConvertRequest, content: Content, maps: Sequence[Layer]) -> list[MapLabel]:
-    """Return the visible labels, each with a request of its own, whose budget is that of its share."""
+    """Return the visible labels, each with its own request and its share of the budget."""
     shown = [
         (layer.volume, layer.tf, label)
         for layer in maps
@@ -127,7 +128,7 @@ def _visible(request: ConvertRequest, content: Content, maps: Sequence[Layer]) -
 
 
 def _source(request: ConvertRequest, content: Content, volume: Volume) -> SourceRequest:
-    """One label map of the file: as it was read, or in blocks where it is."""
+    """Return the source of one label map of the file, in memory or in blocks."""
     source = request.source
     if request.blocks is None:
         return replace(source, volume=volume)
@@ -137,44 +138,44 @@ def _source(request: ConvertRequest, content: Content, volume: Volume) -> Source
     return replace(source, read=replace(source.read, component=number))
 
 
-def _gaussians(request: ConvertRequest, parts: Sequence[MapLabel], run: Run) -> list[Gaussians | None]:
-    """Of every part, box frame: what the whole hides of it, and its share of the whole; None where nothing is seen."""
+def _gaussians(request: ConvertRequest, labels: Sequence[MapLabel], run: Run) -> list[Gaussians | None]:
+    """Return the Gaussians of each label, visible and hidden ones, box frame; None where there are none."""
     console = run.console
-    if len(parts) == 1 or len({id(part.volume) for part in parts}) > 1:
-        return [_alone(part, console) for part in parts]  # of segments that overlap colours would mix in a Gaussian
-    whole = replace(request, source=replace(parts[0].request.source, labels=parts[0].table))
+    if len(labels) == 1 or len({id(label.volume) for label in labels}) > 1:
+        return [_alone(label, console) for label in labels]  # a Gaussian would mix colours of overlapping segments
+    whole = replace(request, source=replace(labels[0].request.source, labels=labels[0].table))
     plain = replace(whole, source=replace(whole.source, light=LightOptions()))
     with open_field(run, plain) as field, run.stage("hidden"):
         form = field.pyramid(VbmOptions(request.fit.max_gaussians, request.fit.size)).form
         assert form is not None
         hides = hidden_cells(form.seen.largest > HIDDEN, form.seen.edge, form.half, form.step)
     hidden: list[list[Gaussians]] = []
-    for part in parts:
+    for label in labels:
         hidden.append([])
-        if not hides.meet_label(part.volume, part.label.number):
+        if not hides.meet_label(label.volume, label.label.number):
             continue
-        console.message(f"{part.text()}: what the others hide of it")
-        alone = _alone(part, console)
+        console.message(f"{label.text()}: converting what others hide of it")
+        alone = _alone(label, console)
         if alone is not None:
             hidden[-1].append(alone.take(hides.contain(alone)))
-    console.message("all labels together: what is seen of them")
-    left = max(request.fit.max_gaussians - sum(len(one) for mine in hidden for one in mine), 1)
-    seen = _fit(replace(whole, fit=replace(request.fit, max_gaussians=left)), console)
-    owner = assign_labels(seen, [(part.volume, part.table, part.label) for part in parts])
+    console.message("all labels: converting what is visible")
+    remaining = max(request.fit.max_gaussians - sum(len(one) for mine in hidden for one in mine), 1)
+    seen = _fit(replace(whole, fit=replace(request.fit, max_gaussians=remaining)), console)
+    owner = assign_labels(seen, [(label.volume, label.table, label.label) for label in labels])
     both = [together([*mine, seen.take(owner == k)]) for k, mine in enumerate(hidden)]
     return [one if len(one) else None for one in both]
 
 
-def _alone(part: MapLabel, console: Console) -> Gaussians | None:
-    """A label as though there were no other; None where nothing of it is seen."""
+def _alone(label: MapLabel, console: Console) -> Gaussians | None:
+    """Convert a label as if it were the only one; return None where nothing is visible."""
     try:
-        return _fit(part.request, console)
+        return _fit(label.request, console)
     except NothingVisible:
         return None
 
 
 def _fit(request: ConvertRequest, console: Console) -> Gaussians:
-    """Gaussians of a request, box frame; Ctrl-C ends the whole."""
+    """Return the fitted Gaussians of a request, box frame; Ctrl-C ends the batch."""
     run = Run(console, ConversionReport("convert"))
     found = fit_gaussians(run, request)
     if run.report.interrupted:
@@ -183,14 +184,14 @@ def _fit(request: ConvertRequest, console: Console) -> Gaussians:
 
 
 def shares(shown: Sequence[tuple[Volume, LabelTable, Label]], budget: int) -> list[int]:
-    """Gaussians of each label, at most ``budget`` in all but for one a label."""
+    """Return the number of Gaussians of each label, at least one, and otherwise at most ``budget`` together."""
     weight = np.array([max(count, 1) for count in _voxels(shown)], np.float64) ** (2 / 3)
     weight = np.maximum(weight / weight.sum(), 0.01)
     return [max(int(budget * share), 1) for share in weight / weight.sum()]
 
 
 def _voxels(shown: Sequence[tuple[Volume, LabelTable, Label]]) -> list[int]:
-    """Voxels of each label in its map; every map is counted once."""
+    """Return the number of voxels of each label; every map is counted once."""
     counts: dict[int, dict[float, int]] = {}
     for volume, *_ in shown:
         if id(volume) not in counts:
@@ -199,5 +200,5 @@ def _voxels(shown: Sequence[tuple[Volume, LabelTable, Label]]) -> list[int]:
 
 
 def file_name(label: Label) -> str:
-    """Its number, which no other has, and its name in plain characters."""
+    """Return the unique number of a label and its name in plain characters."""
     return f"{label.number}-{re.sub(r'[^0-9A-Za-z]+', '-', label.name)[:LONGEST].strip('-')}".strip("-")

@@ -1,4 +1,4 @@
-"""`vvgt convert --live` of a label map: each Gaussian belongs to one label, whose look can be changed afterwards."""
+"""`vvgt convert --live` of a label map: each Gaussian belongs to one label, whose look can be changed later."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from vvgt_cli.volume.label_maps import counts_of
 
 
 def live_labels(source: Source) -> tuple[Label, ...]:
-    """The labels of a source that Gaussians can belong to: hidden ones too, which other tables may show.
+    """Return the labels that Gaussians can belong to, invisible ones included, which other tables may show.
 
     Raises:
-        DataError: too many.
+        DataError: there are more than `MOST_LABELS`.
     """
     table = source.tf
     assert isinstance(table, LabelTable)
@@ -37,13 +37,13 @@ def live_labels(source: Source) -> tuple[Label, ...]:
 
 
 def label_facts(source: Source, labels: tuple[Label, ...]) -> LiveFacts:
-    """What a file of these labels says."""
+    """Return the header of live Gaussians with these labels."""
     numbers = [float(label.number) for label in labels]
     return LiveFacts(min(numbers), max(numbers), source.volume.dims, labels=labels)
 
 
 def label_fog_field(field: Field, labels: tuple[Label, ...]) -> Field:
-    """The label map with these labels as one thin fog, told apart by their colours."""
+    """Return the field of a label map as one thin fog, whose labels differ in colour."""
     layer = field.source.layers[0]
     assert isinstance(layer.tf, LabelTable)
     voxels = counts_of(layer.volume)
@@ -52,7 +52,7 @@ def label_fog_field(field: Field, labels: tuple[Label, ...]) -> Field:
 
 
 def with_labels(run: Run, field: Field, start: Start, labels: tuple[Label, ...]) -> Gaussians:
-    """Gaussians of the fog with the rows of their labels, without those that lie in none."""
+    """Return the Gaussians of the fog with the rows of their labels, without those outside all labels."""
     from vvgt_cli.closed_form.labelled import labelled
 
     assert start.leaves is not None

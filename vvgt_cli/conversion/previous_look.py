@@ -1,4 +1,4 @@
-"""Start a conversion from an earlier one of the same volume under another function, light or screen."""
+"""The warm start of a conversion from an earlier one of the same volume under another function, light or screen."""
 
 from __future__ import annotations
 
@@ -27,24 +27,25 @@ from vvgt_cli.gaussians.ply import opacity
 from vvgt_cli.jit.ahead import LIVE
 
 STEPS = 50  # of gradient descent at most
-FAR = 7.5  # dB on the check views below what the last conversion by itself had: before the steps
-WORSE = 2.0  # the same after them: of other looks, other errors are what is possible
-FAINT = 1e-3  # of the mean extinction: less says nothing of a colour
-MOST = 50.0  # times the extinction, or a part of it: more says nothing of an opacity
-OTHER = 0.5  # from colour to colour: what descent has found out of the one is not so of the other
+FAR = 7.5  # dB on the check views below the last cold conversion, before the steps
+WORSE = 2.0  # the same after the steps, since other looks allow other errors
+FAINT = 1e-3  # share of the mean extinction below which a colour means nothing
+MOST = 50.0  # greatest ratio of extinctions
+OTHER = 0.5  # distance of colours from which nothing of the earlier descent is kept
 OPAQUE = 1e-5, 0.9999  # least and largest opacity
 WARM_START = "starting from the earlier conversion"
-GRADIENT = slice(2, 5)  # of what is under Gaussians
+GRADIENT = slice(2, 5)  # columns of samples
 
 
 class PreviousLook(WarmStart):
     """The Gaussians of an earlier conversion of the same volume, recoloured and refined by a few steps."""
 
     def __init__(self, earlier: Conversion) -> None:
+        """Start from ``earlier``."""
         self.earlier = earlier
 
     def try_start(self, work: Work, plan: Plan, request: ConvertRequest) -> bool:
-        """See `WarmStart.try_start`.
+        """Implement `WarmStart.try_start`.
 
         Raises:
             UsageError: the earlier conversion is of another volume.
@@ -64,7 +65,7 @@ class PreviousLook(WarmStart):
         return why is None
 
     def _obstacle(self, work: Work, request: ConvertRequest) -> str | None:
-        """Why there is nothing to go on from, None where there is."""
+        """Return the reason against a warm start; None for none."""
         field, before = work.field, self.earlier.field
         sources, refinement = (before.source, field.source), self.earlier.report.refinement
         if any(source.gridded for source in sources):
@@ -83,7 +84,7 @@ class PreviousLook(WarmStart):
         return None
 
     def _fitted(self, work: Work, plan: Plan) -> str | None:
-        """Gradient descent; why the result is not near enough, None where it is."""
+        """Refine the recoloured Gaussians; return the reason why they are not good enough, None if they are."""
         record: dict[str, Any] = self.earlier.report.refinement or {}
         standard = record.get("standard", record["psnr_after"])
         steps, small = min(work.fit.steps or STEPS, STEPS), suits_small_views(work.made(), work.fit.size)
@@ -95,7 +96,7 @@ class PreviousLook(WarmStart):
         work.field.views.expect([view for stage in (judge, *stages) for view in stage.views(work.fit)])
         judge.run(work)
         if work.psnr(work.made()) < standard - FAR:
-            return "it shows something else"
+            return "the look differs too much"
         work.ending = plan.seconds_of([stage for stage in plan.stages if isinstance(stage, TestViews)])
         for stage in stages:
             stage.run(work)
@@ -105,25 +106,25 @@ class PreviousLook(WarmStart):
         if made["reason"] == "steps" and made["psnr_after"] < (work.limits.target_psnr or -math.inf):
             return "more steps for --target-psnr"
         if made["reason"] == "steps" and made["psnr_after"] < standard - WORSE:
-            return f"{standard - made['psnr_after']:.1f} dB worse on the check views than the last one without"
+            return f"{standard - made['psnr_after']:.1f} dB worse on the check views than the last conversion without"
         return None
 
 
 def recolor_earlier(earlier: Conversion, field: Field) -> Gaussians:
-    """Gaussians of an earlier conversion under the look of a field of the same volume, where they are; box frame.
+    """Return the Gaussians of an earlier conversion, in place, under the look of a field of the same volume; box frame.
 
-    Under each lies a mean value and a spread. By what the two functions, and lights, make of these, optical depths
-    change by the ratio, colours and harmonics by the difference; of what descent has found out of these the less stays,
-    the more the colours differ.
+    Each Gaussian covers a mean value and a spread, to which both looks assign an extinction and a colour. Optical
+    depths are scaled by the ratio of extinctions. Colours and harmonics are those of the new look, plus the deviation
+    that descent found under the old one, weighted by how similar the two colours are.
     """
     before, source = earlier.field.source, field.source
     gaussians = to_box_frame(earlier.gaussians, source.volume)
-    under = field.sample(gaussians)
-    there = np.isfinite(under).all(axis=1)
-    under[~there] = 0
-    old, a = _look_alone(before, source, gaussians, under)
-    new, b = _look_alone(source, source, gaussians, under)
-    least = max(FAINT * float(a.mean()), 1e-30)  # of a function that showed nothing under any
+    samples = field.sample(gaussians)
+    there = np.isfinite(samples).all(axis=1)
+    samples[~there] = 0
+    old, a = _look_alone(before, source, gaussians, samples)
+    new, b = _look_alone(source, source, gaussians, samples)
+    least = max(FAINT * float(a.mean()), 1e-30)  # where the earlier look showed nothing
     ratio = np.where(there, ((b + least) / (a + least)).clip(1 / MOST, MOST), 1)
     depth = -np.log1p(-np.minimum(opacity(gaussians).astype(np.float64), OPAQUE[1])) * ratio
     peak = (-np.expm1(-depth)).clip(*OPAQUE)
@@ -138,22 +139,24 @@ def recolor_earlier(earlier: Conversion, field: Field) -> Gaussians:
     return replace(gaussians, opacity_logits=np.log(peak / (1 - peak)), colors=colors, harmonics=harmonics)
 
 
-def _look_alone(look: Source, source: Source, gaussians: Gaussians, under: np.ndarray) -> tuple[Gaussians, np.ndarray]:
-    """Gaussians as a look alone has them, of ``under`` (K, 5), and (K,) extinctions, per unit-frame length."""
+def _look_alone(
+    look: Source, source: Source, gaussians: Gaussians, samples: np.ndarray
+) -> tuple[Gaussians, np.ndarray]:
+    """Return Gaussians with the colours of a look at ``samples`` (K, 5), and (K,) extinctions."""
     from vvgt_cli.closed_form.relit import relit
 
     numbers, scale = source.statistics, source.volume.unit_frame().scale
     grain = 2 / max(source.volume.dims)
     table = Table.of_function(look.tf, numbers.lo, numbers.hi, look.unit_distance * scale, grain)
-    sums = table.of(under)
+    sums = table.of(samples)
     tau = sums[:, TAU]
     plain = replace(gaussians, colors=sums[:, :TAU] / np.maximum(tau, 1e-30)[:, None], harmonics=None)
     lighting = box_lighting(look)
-    return (plain if lighting is None else relit(plain, under[:, GRADIENT], lighting)), tau
+    return (plain if lighting is None else relit(plain, samples[:, GRADIENT], lighting)), tau
 
 
 def _same_volume(field: Field, other: Field) -> bool:
-    """Whether two fields are of one volume, under whatever look."""
+    """Return whether two fields are of one volume, under any look."""
     first, second = field.source.volume, other.source.volume
     if first is second:
         return True

@@ -1,8 +1,8 @@
-"""Streamed SOG: nodes by place, each in levels by measured error, in files of SOG's images; and `lod-meta.json`.
+"""Streamed SOG: spatial nodes in levels by measured error, in files of SOG images, with `lod-meta.json`.
 
-As PlayCanvas 2.23.3 (`scene/gsplat-unified/gsplat-octree.js`, `gsplat-lod-table.js`) and splat-transform 3.7.0
-(`writers/write-lod.ts`) have it. A node is a tile of the pyramid (`vvgt_cli.field.forest`); what its levels are is
-measured (`level_selection`).
+The format is that of PlayCanvas 2.23.3 (`scene/gsplat-unified/gsplat-octree.js`, `gsplat-lod-table.js`) and
+splat-transform 3.7.0 (`writers/write-lod.ts`). A node is a tile of the pyramid (`vvgt_cli.field.forest`), with levels
+by `level_selection`.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ if TYPE_CHECKING:
     from vvgt_cli.conversion.shards.cut import Cut
     from vvgt_cli.field.parts import Parts
 
-# Of the unit frame. The engine shows level 0 nearer than 5 (`lodBaseDistance`) and level 1 nearer than 15, so that the
+# Scale of the unit frame. The engine shows level 0 within 5 (`lodBaseDistance`) and level 1 within 15, so that the
 # whole is seen in level 1 from where `vvgt render --orbit` begins, at 3 in the unit frame.
 SCALE = 4.0
-REACH = 2.0  # standard deviations that a node's bounds lie beyond its centres
+REACH = 2.0  # standard deviations from the centres to the bounds of a node
 
 
 @contextmanager
 def folder_of(output: str) -> Iterator[None]:
-    """Make the folder of a manifest; it goes again where nothing was left in it."""
+    """Make the folder of a manifest, and remove it after the block if it is empty."""
     folder = Path(output).absolute().parent
     made = not folder.exists() and folder.parent.is_dir()
     if made:
@@ -57,15 +57,15 @@ def folder_of(output: str) -> Iterator[None]:
 
 
 def write_streamed(run: Run, parts: Parts, cut: Cut, output: str, overwrite: bool) -> None:
-    """Write the files and, last of all, the manifest.
+    """Write the files and, last, the manifest.
 
-    What is done of it is noted in ``parts``: errors by some nodes at a time, and files that are whole.
+    Progress is recorded in ``parts``: errors of groups of nodes, and complete files.
 
     Raises:
-        UsageError: a frame in which distances are not the engine's.
+        UsageError: the frame is not the unit frame.
     """
     if cut.plan.ply.frame != "unit":
-        raise UsageError(f"-o {output}: levels go by distances in the unit frame; leave out --frame")
+        raise UsageError(f"-o {output}: levels need distances in the unit frame; remove --frame")
     forest = cut.forest
     with run.stage("errors") as stage:
         key = digest((parts.folder / PLAN).read_text("utf-8"))[:16]
@@ -90,7 +90,7 @@ def write_streamed(run: Run, parts: Parts, cut: Cut, output: str, overwrite: boo
         stage.note = f"{output}: {len(nodes)} nodes, {len(files.names)} files, {total / 1e6:.1f} MB; Gaussians "
         stage.note += ", ".join(f"{level.gaussians:,}" for level in levels)
         if levels[0].gaussians < cut.plan.budget // 2:
-            stage.note += f", no more: {forest.base} cells that the screen, or {cut.plan.budget}, have use for"
+            stage.note += f", no more: {forest.base} cells suffice for the screen and {cut.plan.budget} Gaussians"
     files.remove_others(before)
     run.report.gaussians, run.report.bytes = levels[0].gaussians, total
 
@@ -98,7 +98,7 @@ def write_streamed(run: Run, parts: Parts, cut: Cut, output: str, overwrite: boo
 def _node(
     cut: Cut, files: Files, levels: list[Level], made: list[Gaussians], spreads: list[np.ndarray]
 ) -> dict[str, Any]:
-    """Put a node into the files; its entry in the manifest."""
+    """Add a node to the files, and return its entry in the manifest."""
     axes, options = (
         np.array(cut.plan.axes).reshape(3, 3),
         replace(upright(cut.plan.ply), sh_degree=cut.plan.degree, comments=False),

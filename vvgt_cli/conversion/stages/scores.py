@@ -1,4 +1,4 @@
-"""How near the result is: on the test views, and from the conditions."""
+"""The scoring stages: test views and viewing conditions."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from vvgt_cli.score.viewing import (
 )
 from vvgt_cli.score.views import WHOLE, psnr_note, score_test_views, scored_views
 
-SCORE, SCORE_ALL = (3, 0, 0.03), (10, len(WHOLE), 0.1)  # views, whole ones of them, seconds beside per 400 x 400 px
-TEXTURE = 0.05  # seconds beside the reference per 400 x 400 px
-CONDITIONS = 2, 0.15, 0.155  # check views, and seconds beside them: always, per 100,000 Gaussians
+SCORE, SCORE_ALL = (3, 0, 0.03), (10, len(WHOLE), 0.1)  # views, whole ones, extra seconds per 400 x 400 px
+TEXTURE = 0.05  # extra seconds per 400 x 400 px
+CONDITIONS = 2, 0.15, 0.155  # check views, and extra seconds: fixed, per 100,000 Gaussians
 
 
 @dataclass(frozen=True)
 class TestViews(Stage):
-    """Views that nothing was fitted to.
+    """Scores on views that nothing was fitted to.
 
     Attributes:
-        whole: all ten, by SSIM and FLIP too.
+        whole: whether to score all ten views, by SSIM and FLIP too.
     """
 
     __test__ = False  # not pytest's
@@ -41,20 +41,22 @@ class TestViews(Stage):
     whole: bool = False
 
     def cost(self, workload: Workload) -> Cost:
-        """By pixels."""
+        """Return the cost by pixels."""
         views, whole, beside = SCORE_ALL if self.whole else SCORE
         pixels = whole * workload.size**2 + (views - whole) * workload.test_view_pixels
         return Cost(workload.reference_seconds(pixels) + workload.pace * beside * pixels / 400**2)
 
     def views(self, fit: FitOptions) -> list[Picture]:
-        """What is scored."""
+        """List the pictures that are scored."""
         from vvgt_cli.dvr import RenderSettings
 
         only = None if self.whole else PREVIEW_VIEWS
-        return [Picture(camera, RenderSettings(), part) for _, camera, part in scored_views(fit.size, self.whole, only)]
+        return [
+            Picture(camera, RenderSettings(), blocks) for _, camera, blocks in scored_views(fit.size, self.whole, only)
+        ]
 
     def run(self, work: Work) -> None:
-        """Score."""
+        """Score the Gaussians."""
         from vvgt_cli.dvr import RenderSettings
 
         fit, run = work.fit, work.run
@@ -75,13 +77,13 @@ class TestViews(Stage):
 
 @dataclass(frozen=True)
 class ViewingConditions(Stage):
-    """Every rule at the size made for and above, and texture on smooth areas; left out where time is up."""
+    """Scores by every rule at the target size and above, and of texture on smooth areas; skipped where time is up."""
 
     name: ClassVar[str] = "conditions"
     scores: ClassVar[bool] = True
 
     def cost(self, workload: Workload) -> Cost:
-        """By pixels and Gaussians."""
+        """Return the cost by pixels and Gaussians."""
         near = (workload.size // 2) ** 2
         beside = CONDITIONS[1] + CONDITIONS[2] * workload.gaussians / 1e5 + TEXTURE * near / 400**2
         return Cost(
@@ -89,7 +91,7 @@ class ViewingConditions(Stage):
         )
 
     def views(self, fit: FitOptions) -> list[Picture]:
-        """What is scored."""
+        """List the pictures that are scored."""
         from vvgt_cli.dvr import RenderSettings
 
         wanted = condition_pictures(larger_screens(fit.size), SIDE, FEW)
@@ -97,7 +99,7 @@ class ViewingConditions(Stage):
         return [*conditions, *(Picture(camera, RenderSettings()) for camera in texture_cameras(fit.size))]
 
     def run(self, work: Work) -> None:
-        """Score."""
+        """Score the Gaussians."""
         from vvgt_cli.dvr import RenderSettings
 
         run, budget, fit = work.run, work.limits.time_budget, work.fit

@@ -1,4 +1,4 @@
-"""Views of the volume: those that judge, and those that are fitted to."""
+"""The stages that render views of the volume: check views to judge by, and training views to fit to."""
 
 from __future__ import annotations
 
@@ -22,21 +22,18 @@ if TYPE_CHECKING:
     from vvgt_cli.dvr import RenderSettings, Scene
     from vvgt_cli.dvr.render import Viewed
 
-MOST_VIEWS = 120  # training views of gradient descent at most, in whole sets
-VIEWS_A_STEP = (
-    0.65,
-    0.85,
-)  # views a step, small and large: fewer overfit, more cost steps (docs/log/refinement.md)
-MARGIN, SAMPLES = 4.0, 12.0  # dB, where views are means over their pixels, and where they are samples of a screen's
-LONGER = 6.0  # dB more, for longer steps: their errors are the same from all sides
-PROBED = 72  # blocks of a view that rays are tried on
-LARGE = 0.5  # of the screen: views as large are means over their own pixels
+MOST_VIEWS = 120  # maximal number of training views of gradient descent, in whole sets
+VIEWS_A_STEP = 0.65, 0.85  # small and large views per step: fewer overfit, more cost steps (docs/log/refinement.md)
+MARGIN, SAMPLES = 4.0, 12.0  # dB, for views that are means over their pixels, and for samples of screen pixels
+LONGER = 6.0  # extra dB for longer steps, whose errors are the same from all sides
+PROBED = 72  # blocks of a view on which ray settings are tried
+LARGE = 0.5  # share of the screen size from which views are means over their own pixels
 WIDE = 0.9  # standard deviation in pixels
 SOLID = 0.9  # median opacity of opaque bodies
 
 
 def view_count(steps: int, small: bool) -> int:
-    """Training views of so many steps, in whole sets."""
+    """Return the number of training views for a number of steps, in whole sets."""
     fewest, each = SET_VIEWS["train"], VIEWS_A_STEP[0] if small else VIEWS_A_STEP[1]
     return fewest * min(max(round(each * steps / fewest), 1), MOST_VIEWS // fewest)
 
@@ -46,29 +43,31 @@ class CheckViews(Stage):
     """Views that decide what is kept.
 
     Attributes:
-        fine: integrated over pixels, as what is judged by them is worth it.
+        fine: whether they are integrated over pixels.
     """
 
     name: ClassVar[str] = "check views"
     fine: bool = True
 
     def cost(self, workload: Workload) -> Cost:
-        """One of them is drawn whole, of which blocks are kept."""
+        """Return the cost by pixels; memory includes one whole view, of which blocks are kept."""
         count = SET_VIEWS["check"]
         return Cost(
             count * workload.check_view_seconds, (count * workload.check_view_pixels + workload.size**2) * VIEW_BYTES
         )
 
     def views(self, fit: FitOptions) -> list[Picture]:
-        """They."""
+        """List the check views."""
         from vvgt_cli.dvr import RenderSettings
         from vvgt_cli.dvr.render import FIT_VIEWS
 
         settings = RenderSettings() if self.fine else FIT_VIEWS
-        return [Picture(camera, settings, part) for camera, part in check_blocks(default_views("check", size=fit.size))]
+        return [
+            Picture(camera, settings, blocks) for camera, blocks in check_blocks(default_views("check", size=fit.size))
+        ]
 
     def run(self, work: Work) -> None:
-        """Render them, unless they are there."""
+        """Render the check views, unless that is done."""
         from vvgt_cli.dvr import RenderSettings
         from vvgt_cli.dvr.render import FIT_VIEWS
 
@@ -86,9 +85,9 @@ class TrainingViews(Stage):
     """Views to fit to.
 
     Attributes:
-        count: how many.
+        count: number of views.
         edge: pixels along their edge.
-        fitted: they are fitted to by descent, and as finely integrated as that asks for.
+        fitted: whether descent fits to them, which needs finer integration.
     """
 
     name: ClassVar[str] = "views"
@@ -97,17 +96,17 @@ class TrainingViews(Stage):
     fitted: bool = True
 
     def cost(self, workload: Workload) -> Cost:
-        """By pixels."""
+        """Return the cost by pixels."""
         return Cost(
             self.count * workload.view * (self.edge / workload.edge) ** 2, self.count * self.edge**2 * VIEW_BYTES
         )
 
     def label(self) -> str:
-        """With their number and size."""
+        """Return their number and size."""
         return f"{self.count} views of {self.edge} px"
 
     def views(self, fit: FitOptions) -> list[Picture]:
-        """They, with one ray a pixel, and what says whether that is enough."""
+        """List the views, with one ray per pixel, and the pictures that decide whether that is enough."""
         from vvgt_cli.dvr.render import FIT_VIEWS
 
         found = [Picture(camera, FIT_VIEWS) for camera in default_views("train", self.count, size=self.edge)]
@@ -117,7 +116,7 @@ class TrainingViews(Stage):
         return found
 
     def run(self, work: Work) -> None:
-        """Render them, as finely as the Gaussians ask for."""
+        """Render the views, as finely as the Gaussians need."""
         from vvgt_cli.dvr import render_views
         from vvgt_cli.dvr.render import FIT_VIEWS
 
@@ -135,17 +134,17 @@ class TrainingViews(Stage):
 
 
 def _spread(footprint: float) -> float:
-    """Part of a pixel's edge that the rays of a training view cover, which is ``footprint`` of the screen's size."""
+    """Return the share of a pixel's edge over which rays are spread, for a view of ``footprint`` times the screen."""
     return 1.0 if footprint >= LARGE else footprint
 
 
 def _probe(size: int) -> tuple[Camera, Blocks | None]:
-    """The check view, and the blocks of it, that settings are tried on."""
+    """Return the check view, and its blocks, on which ray settings are tried."""
     return default_views("check", size=size)[0], spread_blocks(size, size, enough=PROBED)
 
 
 def _candidates(footprint: float) -> tuple[RenderSettings, RenderSettings, RenderSettings]:
-    """Adaptive rays, and one a pixel with longer and shorter steps."""
+    """Return settings of adaptive rays, and of one ray per pixel with longer and shorter steps."""
     from vvgt_cli.dvr import RenderSettings
     from vvgt_cli.dvr.render import FIT_VIEWS
 
@@ -155,12 +154,12 @@ def _candidates(footprint: float) -> tuple[RenderSettings, RenderSettings, Rende
 def ray_settings(
     scene: Scene | Viewed, start: Gaussians, size: int, rule: Rule, footprint: float = 1.0
 ) -> RenderSettings:
-    """One ray a pixel where its error is `MARGIN` or `SAMPLES` below that of ``start``, else adaptive rays.
+    """Choose one ray per pixel where its error is `MARGIN` or `SAMPLES` dB below that of ``start``, else adaptive rays.
 
-    The error is that of a check view of ``size`` px drawn by ``rule``, against the same finely rendered. Gradient
-    descent follows the jags of single rays at hard edges, and those of longer steps everywhere: where the error is
-    `LONGER` below that too with steps of a voxel, these are taken. Rays are spread over ``footprint`` of a pixel's
-    edge: views are samples of the screen's pixels, not means over their own.
+    The error is that of a check view of ``size`` px drawn by ``rule``, against adaptive rays. Gradient descent fits
+    the aliasing of single rays at hard edges, and that of longer steps everywhere: these are taken only where their
+    error is another `LONGER` dB lower. Rays are spread over ``footprint`` of a pixel's edge, so that views are samples
+    of the screen's pixels.
     """
     from vvgt_cli.dvr import render_view
     from vvgt_cli.images.metrics import psnr
@@ -182,10 +181,10 @@ def ray_settings(
 
 
 def suits_small_views(gaussians: Gaussians, size: int) -> bool:
-    """Whether small training views still show Gaussians.
+    """Return whether the Gaussians are wide enough for small training views.
 
-    That is so where the median of middle standard deviations is above `WIDE` px of a view twice as large, and bodies
-    are not opaque: of these the edges are all there is.
+    They are where the median of the middle standard deviations is above `WIDE` px of a view twice as large, and bodies
+    are not opaque, since only the edges of opaque ones are seen.
     """
     camera = default_views("check", 1, size=2 * view_edge(size, small=True))[0]
     pixel = float(np.linalg.norm(camera.position)) / camera.fx
