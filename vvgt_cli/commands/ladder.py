@@ -175,7 +175,7 @@ class Reference:
         """Mean PSNR of another renderer's own pictures of the views that are drawn whole; None where it cannot."""
         from vvgt_cli.dvr.backends import view_renderer
         from vvgt_cli.images.metrics import score_view
-        from vvgt_cli.volume.vtk_messages import quiet_vtk
+        from vvgt_cli.volume.vtk.messages import quiet_vtk
 
         if not isinstance(field, Resident):
             return None

@@ -162,11 +162,11 @@ class Cloud:
 
     def _shown(self, table: Looks, light: Any, options: PlyOptions) -> Cloud:
         """Baked under a light that the page sends, or the file's."""
-        from vvgt_cli.conversion.live import relight
+        from vvgt_cli.conversion.live import apply_light
 
         lighting = self.options.light if light is None else light_sent(light, self.options)
         pixel = pixel_width(self.options.made_for or SIZE)
-        found = as_stored(relight(baked(self.gaussians, table, pixel), lighting))
+        found = as_stored(apply_light(baked(self.gaussians, table, pixel), lighting))
         options = replace(options, light=lighting, sh_degree=None, certificate=None)
         return replace(self, gaussians=found, options=options, ply=None)
 

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vvgt_cli.closed_form import VbmOptions
-from vvgt_cli.closed_form.tree import HIDDEN
 from vvgt_cli.conversion.batch import Batch, Item
 from vvgt_cli.conversion.convert import fit_gaussians, open_field
 from vvgt_cli.conversion.index import LABELS
@@ -148,6 +147,8 @@ def _gaussians(request: ConvertRequest, labels: Sequence[MapLabel], run: Run) ->
     with open_field(run, plain) as field, run.stage("hidden"):
         form = field.pyramid(VbmOptions(request.fit.max_gaussians, request.fit.size)).form
         assert form is not None
+        from vvgt_cli.closed_form.tree import HIDDEN
+
         hides = hidden_cells(form.seen.largest > HIDDEN, form.seen.edge, form.half, form.step)
     hidden: list[list[Gaussians]] = []
     for label in labels:

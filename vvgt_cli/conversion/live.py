@@ -96,7 +96,7 @@ def convert_live(
     else:
         gaussians, facts, look = _one_layer(run, request, field), _facts(source), source.tf
     table = lookup_table(facts, look, source.unit_distance, source.volume.unit_frame().scale)
-    gaussians = as_stored(relight(baked(gaussians, table, pixel), lighting))
+    gaussians = as_stored(apply_light(baked(gaussians, table, pixel), lighting))
     found = Conversion(to_unit_frame(gaussians, source.volume), run.report, replace(ply, live=facts), field)
     if unscored is not None:
         unscored(found)
@@ -200,12 +200,12 @@ def box_lighting(source: Source) -> Lighting | None:
     return replace(source.lighting, directions=tuple(turned))
 
 
-def relight(gaussians: Gaussians, lighting: Lighting | None) -> Gaussians:
+def apply_light(gaussians: Gaussians, lighting: Lighting | None) -> Gaussians:
     """Return live Gaussians with their colours under a light in their frame."""
-    from vvgt_cli.closed_form.relit import relit
+    from vvgt_cli.closed_form.relight import relight
 
     assert gaussians.live is not None
-    return gaussians if lighting is None else relit(gaussians, gaussians.live[:, GRADIENT], lighting)
+    return gaussians if lighting is None else relight(gaussians, gaussians.live[:, GRADIENT], lighting)
 
 
 def function_table(source: Source) -> Table:

@@ -143,7 +143,7 @@ def _look_alone(
     look: Source, source: Source, gaussians: Gaussians, samples: np.ndarray
 ) -> tuple[Gaussians, np.ndarray]:
     """Return Gaussians with the colours of a look at ``samples`` (K, 5), and (K,) extinctions."""
-    from vvgt_cli.closed_form.relit import relit
+    from vvgt_cli.closed_form.relight import relight
 
     numbers, scale = source.statistics, source.volume.unit_frame().scale
     grain = 2 / max(source.volume.dims)
@@ -152,7 +152,7 @@ def _look_alone(
     tau = sums[:, TAU]
     plain = replace(gaussians, colors=sums[:, :TAU] / np.maximum(tau, 1e-30)[:, None], harmonics=None)
     lighting = box_lighting(look)
-    return (plain if lighting is None else relit(plain, samples[:, GRADIENT], lighting)), tau
+    return (plain if lighting is None else relight(plain, samples[:, GRADIENT], lighting)), tau
 
 
 def _same_volume(field: Field, other: Field) -> bool:

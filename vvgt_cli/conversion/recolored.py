@@ -146,9 +146,9 @@ def visible_cloud(gaussians: Gaussians, table: Looks, lighting: Lighting | None,
     found, gradient = found.take(there), seen.live[there, GRADIENT]
     if lighting is None:
         return found
-    from vvgt_cli.closed_form.relit import relit
+    from vvgt_cli.closed_form.relight import relight
 
-    return relit(found, gradient, lighting)
+    return relight(found, gradient, lighting)
 
 
 def resolve_look(name: str, header: PlyHeader | PlyOptions, function: FunctionRequest) -> tuple[Look, PlyOptions]:

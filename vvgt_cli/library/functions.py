@@ -84,7 +84,7 @@ def convert(
         DataError: the input is invalid, or nothing is visible.
         UsageError: options contradict each other.
     """
-    from vvgt_cli.conversion.batch import convert_to_memory
+    from vvgt_cli.conversion.convert_batch import convert_to_memory
 
     if not isinstance(after, Conversion | None):
         raise UsageError("after: expected the result of convert for one volume and look")
