@@ -130,7 +130,7 @@ def test_the_part_of_a_job_array_is_no_folder(vvgt, folder, tmp_path) -> None:
     assert "--shard 2/2" in found.command
 
 
-def test_seconds_are_said_unless_files_are_to_be_made_again(vvgt, folder, tmp_path, monkeypatch) -> None:
+def test_seconds_are_written_unless_files_are_to_be_reproducible(vvgt, folder, tmp_path, monkeypatch) -> None:
     monkeypatch.delenv("SOURCE_DATE_EPOCH")
     args = (folder / "ball.raw", *RAW, "--tf", folder / "tf.json", *SMALL)
     assert vvgt("convert", *args, "-o", tmp_path / "timed.ply").code == 0

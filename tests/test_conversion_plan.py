@@ -376,7 +376,7 @@ def test_a_stage_that_is_not_ready_is_a_bug_that_says_so():
         Work(Run(Console(quiet=True), ConversionReport("convert")), None, SMALL).made()
 
 
-def test_the_default_refines_and_says_what_it_left_out(tmp_path):
+def test_the_default_refines_and_reports_what_it_skipped(tmp_path):
     report = done(tmp_path)
     assert report.refinement["steps"] == STEPS
     assert "back-projection" not in names(report)

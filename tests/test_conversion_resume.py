@@ -54,7 +54,7 @@ def by_start(scene, start, *_):
         ("convert.write_gaussians", 0, {"closed-form.npz", "cells.npz", "refinement.npz", "fitted.npz"}),
     ],
 )
-def test_a_conversion_goes_on_where_it_was_ended(target, calls, left, folder, vvgt, monkeypatch):
+def test_a_conversion_resumes_where_it_was_ended(target, calls, left, folder, vvgt, monkeypatch):
     line = (*LINE, "-o", "a.ply", "--checkpoint", "kept")
     with monkeypatch.context() as patch:
         patch.setattr(loop, "KEEP", 0.0)
@@ -75,7 +75,7 @@ def test_a_conversion_goes_on_where_it_was_ended(target, calls, left, folder, vv
 
 
 @pytest.mark.parametrize("more", [("--steps", "0"), ("--steps", "4"), ("--target-psnr", "60")])
-def test_stages_that_cut_the_pyramid_anew_have_it(more, folder, vvgt, monkeypatch):
+def test_stages_that_cut_the_pyramid_again_have_it(more, folder, vvgt, monkeypatch):
     line = (*LINE, *more, "--overwrite", "-o")
     assert vvgt(*line, "whole.ply").code == 0
     with monkeypatch.context() as patch:
@@ -112,7 +112,7 @@ def test_what_is_kept_of_another_conversion_or_is_damaged(folder, vvgt, monkeypa
         (("-o", "a_{}.ply"), "a series resumes from its manifest"),
     ],
 )
-def test_what_cannot_go_on_is_said(more, told, tmp_path, vvgt, monkeypatch):
+def test_a_conversion_that_cannot_resume_is_reported(more, told, tmp_path, vvgt, monkeypatch):
     monkeypatch.chdir(tmp_path)
     result = vvgt(*LINE, "-o", "a.ply", "--checkpoint", "kept", *more)
     assert (result.code, told in result.error) == (2, True)

@@ -23,7 +23,7 @@ from vvgt_cli.splat import render
 from vvgt_cli.volume import Volume
 
 
-def test_wide_is_told_by_the_middle_axis():
+def test_gaussians_are_wide_by_their_middle_axis():
     camera = default_views("check", 1, size=400)[0]
     pixel = np.linalg.norm(camera.position) / camera.fx
     scales = np.log(np.float32([[0.1, 1.0, 5.0]]) * pixel)
@@ -38,7 +38,7 @@ def test_wide_is_told_by_the_middle_axis():
     assert not suits_small_views(one(1.0), 200)
 
 
-def test_blocks_tell_what_the_whole_picture_does(tmp_path):
+def test_blocks_score_like_the_whole_picture(tmp_path):
     line = np.linspace(-1, 1, 24, dtype=np.float32)
     ball = Volume(1 - np.sqrt(sum(np.square(np.meshgrid(line, line, line)))))
     points = [{"x": x, "rgb": [1, abs(x), 0.2], "opacity": o} for x, o in ((-1, 0), (0.2, 0), (0.5, 0.5), (1, 0.9))]
@@ -52,7 +52,7 @@ def test_blocks_tell_what_the_whole_picture_does(tmp_path):
         assert np.abs(blocks.pick(render_view(scene, camera)) - picked).mean() < 1e-4
 
 
-def test_what_viewers_leave_out_is_not_written():
+def test_gaussians_that_viewers_discard_are_not_written():
     camera = default_views("check", 1, size=1000)[0]
     pixel = np.linalg.norm(camera.position) / camera.fx
     sizes = np.log(np.float32([0.1, 0.5, 2.0, 2.0])[:, None] * pixel * np.float32([1, 0.5, 0.1]))

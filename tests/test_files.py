@@ -32,7 +32,7 @@ def process(code: str, folder: Path, *args: object) -> subprocess.Popen[str]:
 HOLD = "from vvgt_cli.files import claim\nwith claim('a.ply'):\n    print('held', flush=True)\n    input()\n"
 
 
-def test_the_second_of_two_runs_to_one_name_is_told_at_once(tmp_path, vvgt, monkeypatch):
+def test_the_second_of_two_runs_to_one_name_fails_at_once(tmp_path, vvgt, monkeypatch):
     monkeypatch.chdir(tmp_path)
     holder = process(HOLD, tmp_path)
     assert holder.stdout.readline() == "held\n"
@@ -82,7 +82,7 @@ def test_where_there_are_no_locks_everyone_may_write(tmp_path, monkeypatch):
         assert list(tmp_path.iterdir()) == []
 
 
-def test_a_full_disk_is_said_before_the_work(tmp_path, vvgt, monkeypatch):
+def test_a_full_disk_is_reported_before_the_work(tmp_path, vvgt, monkeypatch):
     monkeypatch.chdir(tmp_path)
     disk = {"f_frsize": 512, "f_blocks": 1000, "f_bavail": 4}
     monkeypatch.setattr(os, "statvfs", lambda folder: SimpleNamespace(**disk))

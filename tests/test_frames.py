@@ -112,7 +112,7 @@ def test_slices_in_reversed_order_are_where_they_were(vvgt) -> None:
     np.testing.assert_allclose(clouds(cloud), anatomy.CENTRES, atol=0.5)
 
 
-def test_a_sheared_volume_is_said_and_its_balls_are_in_place(vvgt) -> None:
+def test_a_sheared_volume_is_reported_and_its_balls_are_in_place(vvgt) -> None:
     affine = anatomy.place(anatomy.OBLIQUE)
     affine[:3, 2] += 0.8 * affine[:3, 1] / 2
     path = anatomy.nifti(Path("v"), anatomy.balls(affine), affine)

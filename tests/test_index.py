@@ -80,7 +80,7 @@ def test_what_an_index_says(vvgt, at, kind, blocks):
 
 
 @pytest.mark.parametrize("kind", LINES)
-def test_an_index_that_is_there_is_said_before_the_work(vvgt, at, kind):
+def test_an_existing_index_is_reported_before_the_work(vvgt, at, kind):
     Path("x_index.json").write_text("mine")
     done = vvgt("convert", *LINES[kind], "-o", "x_{}.ply", *HOW)
     assert (done.code, "x_index.json" in done.error) == (2, True), done.err

@@ -195,7 +195,7 @@ def test_bad_input_is_an_exception_that_says_what(volume, reading, words):
         vvgt.read_volume(volume, **reading)
 
 
-def test_saving_again_replaces_the_file_unless_it_is_told_not_to(converted, tmp_path):
+def test_saving_again_replaces_the_file_unless_forbidden(converted, tmp_path):
     small = converted.save(tmp_path / "a.ply")
     assert converted.save(tmp_path / "a.ply", sh_degree=1) > max(300 * 26 * 4, small)
     with pytest.raises(vvgt.UsageError, match="exists"):

@@ -168,7 +168,7 @@ def test_labels_under_gaussians_and_the_way_they_end() -> None:
     assert gradient[0, 0] < 0 < gradient[1, 0]
 
 
-def test_a_fog_of_labels_tells_them_apart() -> None:
+def test_labels_of_a_fog_differ_in_colour() -> None:
     table = label_fog(LabelTable("t", LABELS), {3: 1000, 7: 8})
     assert len({label.color[0] for label in table.labels}) == 3
     assert [label.opacity > 0 for label in table.labels] == [True, True, False]

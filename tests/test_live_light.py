@@ -91,7 +91,7 @@ def lit_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_recolor_lights_as_it_is_told_and_else_as_the_file_is_lit(vvgt, lit_file, tmp_path) -> None:
+def test_recolor_uses_the_given_light_or_that_of_the_file(vvgt, lit_file, tmp_path) -> None:
     _, header = read_ply(lit_file)
     assert (header.light, header.sh_degree) == (Lighting(), 2)
     found = {}

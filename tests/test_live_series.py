@@ -138,7 +138,7 @@ def test_a_page_of_frames_of_several_layers_is_live(vvgt, frames, tmp_path) -> N
             np.testing.assert_array_equal(np.unique(back[:, column], return_counts=True), counted)
 
 
-def test_a_layer_that_is_empty_in_a_frame_is_left_out_of_it(vvgt, tmp_path) -> None:
+def test_a_layer_that_is_empty_in_a_frame_is_skipped(vvgt, tmp_path) -> None:
     z, y, x = np.meshgrid(*[np.linspace(-1, 1, 12)] * 3, indexing="ij")
     ball, low = np.exp(-4 * (x**2 + y**2 + z**2)).astype(np.float32), (z < -0.5).astype(np.uint8)
     for k in range(3):

@@ -133,7 +133,7 @@ def test_pixels_that_show_them():
         assert shown[(v[inside] // BLOCK).astype(int), (u[inside] // BLOCK).astype(int)].all()
 
 
-def test_pictures_of_the_next_frame_are_as_drawn_anew(tmp_path):
+def test_pictures_of_the_next_frame_are_as_drawn_again(tmp_path):
     first, second = (Resident.of(one) for one in sources(tmp_path, body(0.2), body(0.26)))
     kept = RememberedViews(200, first)
     camera, how = default_views("test", 5, size=190)[3], RenderSettings(samples=1)

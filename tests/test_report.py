@@ -73,7 +73,7 @@ def ladder(tmp_path_factory):
     return folder / "out", json.loads((folder / "out" / "report.json").read_text())
 
 
-def test_the_ladder_writes_every_file_and_scores_every_rung(ladder):
+def test_a_report_has_every_file_and_scores_every_run(ladder):
     folder, found = ladder
     assert sorted(path.name for path in folder.iterdir()) == sorted(
         ["report.json", "report.csv", "report.html", *FILES]
@@ -104,7 +104,7 @@ def test_the_ladder_writes_every_file_and_scores_every_rung(ladder):
     assert found["machine"]["cpu"]
 
 
-def test_the_ladder_in_blocks_has_the_same_scores(ladder, vvgt, tmp_path):
+def test_a_report_in_blocks_has_the_same_scores(ladder, vvgt, tmp_path):
     folder, found = ladder
     args = ("example:blob:10", *SMALL, "--model", folder.parent / "worse", "--blocks", 16)
     result = vvgt("report", *args, "-o", tmp_path / "out")
@@ -118,7 +118,7 @@ def test_the_ladder_in_blocks_has_the_same_scores(ladder, vvgt, tmp_path):
         assert one["conditions"][0]["psnr"] == pytest.approx(other["conditions"][0]["psnr"], abs=0.3)
 
 
-def test_the_ladders_page_opens_offline_and_shows_its_pictures(ladder):
+def test_the_page_of_a_report_opens_offline_and_shows_its_pictures(ladder):
     folder, found = ladder
     text = (folder / "report.html").read_text("utf-8")
     reader = Reader(text)
@@ -143,7 +143,7 @@ def test_the_ladders_page_opens_offline_and_shows_its_pictures(ladder):
     assert off == pytest.approx(found["runs"][best]["scores"]["per_view"][0]["psnr"], abs=0.3)  # 8 bits
 
 
-def test_csv_and_plots_of_the_ladder(ladder):
+def test_a_report_has_csv_and_plots(ladder):
     folder, found = ladder
     rows = list(csv.DictReader(io.StringIO((folder / "report.csv").read_text())))
     assert [row["name"] for row in rows] == [rung["name"] for rung in found["runs"]]
@@ -283,7 +283,7 @@ def test_charts_name_every_run_and_follow_the_page():
     assert [chart.svg() for chart in charts] == [chart.svg() for chart in again]
 
 
-def test_labels_in_charts_lie_apart_and_inside():
+def test_labels_in_charts_are_separate_and_inside():
     for chart in draw([Series("s", runs())])[:3]:
         axes = chart.figure.axes[0]
         boxes = [note.get_window_extent() for note in axes.texts]
@@ -305,7 +305,7 @@ def test_names_cannot_break_out_of_the_page():
     assert "u" not in reader.tags
 
 
-def test_several_reports_are_told_apart(tmp_path, vvgt):
+def test_several_reports_have_different_names(tmp_path, vvgt):
     other = copy.deepcopy(document())
     for one in other["runs"]:
         one["scores"]["psnr"] -= 1

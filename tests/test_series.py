@@ -56,7 +56,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted(folder.glob("*.ply"))}
 
 
-def test_frames_are_those_of_single_conversions_and_dark_ones_are_left_out(vvgt, series: Path) -> None:
+def test_frames_are_those_of_single_conversions_and_dark_ones_are_skipped(vvgt, series: Path) -> None:
     out, tf = series / "out" / "f_{:03d}.ply", series / "tf.json"
     done = vvgt("convert", series / "run_*.npy", "--tf", tf, "-o", out, *[a for a in SMALL if a != "-q"])
     assert done.code == 0, done.err

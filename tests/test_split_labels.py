@@ -125,7 +125,7 @@ def test_the_surface_of_labels_is_where_a_grazing_ray_is_half_covered(monkeypatc
     assert ours > score() + 1
 
 
-def test_whose_a_gaussian_is() -> None:
+def test_gaussians_are_assigned_to_the_label_with_most_of_them() -> None:
     """A box of label 1 beside one of label 2 along x, which is faint."""
     values = np.zeros((8, 8, 16), np.uint8)
     values[:, :, 2:8], values[:, :, 8:14] = 1, 2
@@ -152,7 +152,7 @@ def hidden_of(source):
 
 
 @pytest.mark.parametrize("cut", [False, True])
-def test_what_is_hidden(cut: bool) -> None:
+def test_hidden_cells_are_those_that_no_view_sees(cut: bool) -> None:
     values = nested(cut=cut)
     source = load(SourceRequest(Volume(values), labels="auto"))
     hides = hidden_of(source)
@@ -167,7 +167,7 @@ def test_what_is_hidden(cut: bool) -> None:
     np.testing.assert_array_equal(hides.contain(points), [True, False])
 
 
-def test_of_a_hidden_label_its_surface_counts():
+def test_a_label_is_hidden_where_its_surface_is():
     """Each voxel hidden alone: its label is hidden somewhere where a neighbour is of another, or the box ends."""
     numbers = np.ones((5, 6, 7), np.uint8)
     numbers[1, 4, 3] = numbers[3, 2, 2] = numbers[4, 0, 6] = 2

@@ -179,7 +179,7 @@ def test_what_has_no_levels_is_refused_in_a_line(vvgt, volume: Path, tmp_path: P
     assert not list(tmp_path.iterdir())
 
 
-def test_an_interrupted_run_goes_on_with_the_same_bytes(
+def test_an_interrupted_run_resumes_with_the_same_bytes(
     vvgt, volume: Path, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("vvgt_cli.conversion.shards.cut.BATCH", 3000)
@@ -239,7 +239,7 @@ def test_what_another_run_has_put_in_the_folder_is_written_again(tmp_path: Path)
     assert (tmp_path / "0_0" / "meta.json").stat().st_mtime_ns == before
 
 
-def test_an_existing_folder_is_replaced_only_when_told(vvgt, volume: Path, folder: Path) -> None:
+def test_an_existing_folder_is_replaced_only_with_overwrite(vvgt, volume: Path, folder: Path) -> None:
     manifest = json.loads((folder / "lod-meta.json").read_text())
     manifest["filenames"].append("3_7/meta.json")
     (folder / "lod-meta.json").write_text(json.dumps(manifest))
@@ -284,7 +284,7 @@ def test_the_page_and_its_files_are_served(folder: Path, tmp_path: Path) -> None
         assert ask(url, f"{path}../secret")[0] == 404
 
 
-def test_a_folder_with_a_file_missing_is_told(vvgt, folder: Path, tmp_path: Path) -> None:
+def test_a_missing_file_of_a_folder_is_reported(vvgt, folder: Path, tmp_path: Path) -> None:
     (tmp_path / "lod-meta.json").write_bytes((folder / "lod-meta.json").read_bytes())
     found = vvgt("view", tmp_path, "--no-browser")
     assert (found.code, "is missing; expected the whole folder" in found.error) == (1, True)
@@ -374,7 +374,7 @@ def test_only_what_a_camera_is_shown_is_read_and_kept(folder: Path, monkeypatch:
         assert sum(map(len, levels._shown.values())) == len(seen)
 
 
-def test_levels_that_cannot_be_read_are_told_in_a_line(vvgt, folder: Path, tmp_path: Path) -> None:
+def test_unreadable_levels_are_reported_in_a_line(vvgt, folder: Path, tmp_path: Path) -> None:
     broken = tmp_path / "b"
     shutil.copytree(folder, broken)
     (broken / "1_0" / "sh0.webp").unlink()

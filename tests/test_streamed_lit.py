@@ -102,7 +102,7 @@ def test_normals_of_a_merged_file_point_along_the_gradient(vvgt, volume: Path, t
     assert np.median(cosines) > 0.97
 
 
-def test_a_damaged_light_is_told(vvgt, volume: Path, tmp_path: Path) -> None:
+def test_a_damaged_light_is_reported(vvgt, volume: Path, tmp_path: Path) -> None:
     line = ("init", volume, *FIT, *LIGHTS["head"], "--blocks", "64", "--shard", "1/1", "-o", tmp_path / "parts")
     assert vvgt(*line).code == 0
     (tmp_path / "parts" / "light.npz").write_bytes(b"PK")

@@ -44,7 +44,7 @@ def test_a_condition_close_up_is_the_same_place_with_a_narrower_field():
     assert zoomed(camera, 40.0).fy == pytest.approx(camera.fy)
 
 
-def test_conditions_are_what_they_say_worst_first(pair):
+def test_conditions_are_scored_by_their_rule_size_and_field_worst_first(pair):
     scene, gaussians = pair
     rules, views = ("inria", "playcanvas"), (4, 9)
     found = score_conditions(gaussians, condition_views(scene, [(24, 40.0), (40, 10.0)], ONE_RAY, views=views), rules)
@@ -62,7 +62,7 @@ def test_conditions_are_what_they_say_worst_first(pair):
     assert viewing_conditions(1080) == [(400, 40), (800, 40), (1080, 40), (2160, 40), (1080, 10)]
 
 
-def test_texture_is_of_the_conditions_views_from_near(pair):
+def test_texture_is_measured_in_close_views(pair):
     _, gaussians = pair
     scene = scene_of(open_volume("example:blob:12"), Tent(width=0.45, top=0.9999))  # opaque inside
     ticks = []

@@ -39,7 +39,7 @@ class MessageStream:
 
 
 @contextmanager
-def uninterrupted(say: Callable[[str], None]) -> Iterator[Callable[[], bool]]:
+def uninterrupted(message: Callable[[str], None]) -> Iterator[Callable[[], bool]]:
     """Leave interrupts as they are within the block; the yielded function returns False."""
     yield lambda: False
 
