@@ -207,7 +207,7 @@ def test_it_does_not_hold_for_another_volume_function_or_damaged_gaussians(vvgt,
     moved = evaluated(vvgt, folder, made, "moved.raw")
     assert not moved["holds"]
     assert moved["same_volume"] is False
-    assert "values are not those" in moved["text"]
+    assert "values differ from those" in moved["text"]
     other = evaluated(vvgt, folder, made, "ball.raw", "other.json")
     assert not other["holds"]
     assert other["same_volume"]

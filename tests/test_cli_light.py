@@ -99,7 +99,7 @@ def test_a_degree_that_cannot_hold_it_is_said(folder, vvgt):
             "--overwrite",
         )
         assert read_ply(out)[1].sh_degree == degree
-        assert ("changes with the view" in again.err) == (degree == 1)
+        assert ("change with the view" in again.err) == (degree == 1)
 
 
 def test_a_preset_decides_unless_it_is_overruled(folder, vvgt):

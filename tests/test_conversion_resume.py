@@ -101,7 +101,7 @@ def test_what_is_kept_of_another_conversion_or_is_damaged(folder, vvgt, monkeypa
     for content in (b"", whole[: len(whole) // 2], whole.replace(b"means", b"moons")):
         kept.write_bytes(content)
         damaged = vvgt(*line)
-        assert (damaged.code, "not what a stage of 'vvgt convert' keeps" in damaged.error) == (1, True)
+        assert (damaged.code, "not a checkpoint of 'vvgt convert'" in damaged.error) == (1, True)
 
 
 @pytest.mark.parametrize(

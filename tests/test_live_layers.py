@@ -279,5 +279,5 @@ def test_channels_in_python(tmp_path) -> None:
     assert "magma" in other.ply.function
     rgb = np.random.default_rng(0).integers(0, 255, (8, 9, 10, 3)).astype(np.uint8)
     tifffile.imwrite(tmp_path / "rgb.tif", rgb, photometric="rgb")
-    with pytest.raises(vvgt_library.UsageError, match="colours, of which"):
+    with pytest.raises(vvgt_library.UsageError, match="has colours, which Gaussians cannot carry"):
         vvgt_library.convert(str(tmp_path / "rgb.tif"), None, {"max_gaussians": 90, "size": 48}, live=True)

@@ -102,7 +102,7 @@ def test_another_light_and_another_size(session, earlier):
 @pytest.mark.parametrize(
     ("look", "goal", "why"),
     [
-        (OUTSIDE, {}, "something else"),
+        (OUTSIDE, {}, "differs too much"),
         (SHELL, {"max_gaussians": 300}, "Gaussians"),
         (SHELL, {"steps": 0}, "no steps"),
         (vvgt.Look(SHELL, light=vvgt.LightOptions(("above",), shadows=True)), {}, "shadows"),

@@ -24,10 +24,10 @@ from vvgt_cli.score.curves import (
     Series,
     cost,
     knee,
-    pareto_front,
+    pareto,
     psnr,
     read_series,
-    short_number,
+    short,
     table,
     unit_costs,
 )
@@ -219,16 +219,16 @@ def test_files_that_are_no_reports(content, tmp_path):
 
 def test_the_front_is_what_nothing_beats():
     found = runs()
-    best = pareto_front(found)
+    best = pareto(found)
     assert [r["name"] for r in best] == [r["name"] for r in found if r["kind"] in ("closed form", "steps")]
     for r in found:
         beaten = any(cost(o) <= cost(r) and psnr(o) >= psnr(r) and o is not r for o in found)
         assert beaten == (r not in best)
-    assert pareto_front([]) == []
+    assert pareto([]) == []
     assert knee(found)["name"] == "closed form, K = 25k"
     assert knee(found[:1]) is found[0]
     twins = [run("a", "a", "steps", 10, 1.0, 30.0, 5), run("b", "b", "steps", 10, 1.0, 30.0, 5)]
-    assert [r["name"] for r in pareto_front(twins)] == ["a"]
+    assert [r["name"] for r in pareto(twins)] == ["a"]
 
 
 def test_the_scoring_costs_nothing_and_units_are_medians():
@@ -259,7 +259,7 @@ def test_ticks_lie_within_and_are_some():
         found = log_ticks(lo, hi)
         assert all(lo <= tick <= hi for tick in found)
         assert len(found) >= 1
-    assert [short_number(n) for n in (7, 1536, 1e5, 2.5e6)] == ["7", "1.54k", "100k", "2.5M"]
+    assert [short(n) for n in (7, 1536, 1e5, 2.5e6)] == ["7", "1.54k", "100k", "2.5M"]
 
 
 def test_charts_name_every_run_and_follow_the_page():

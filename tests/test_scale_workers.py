@@ -61,7 +61,7 @@ def test_shards_in_any_order_and_a_merge_leave_the_same_bytes(vvgt, raw, alone, 
     assert early.code == 1
     assert "is missing; run the shard" in early.err
     last = vvgt("init", raw, "-o", folder, *FIT[:-1], *SIZE, "--shard", "2/3")
-    assert "all blocks are there" in last.err
+    assert "all blocks are complete" in last.err
     raw.unlink()  # is not needed any more
     assert vvgt("merge", folder, "-o", out).code == 0
     assert out.read_bytes() == alone

@@ -162,7 +162,7 @@ def test_the_bytes_do_not_depend_on_how(vvgt, volume: Path, folder: Path, tmp_pa
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        (("--init", "wavelet"), "made of moments"),
+        (("--init", "wavelet"), "needs moments"),
         (("--frame", "world"), "remove --frame"),
         (("--steps", "50"), "levels of one closed form"),
         (("--live",), "levels of one closed form"),
@@ -393,6 +393,6 @@ def test_unreadable_levels_are_reported_in_a_line(vvgt, folder: Path, tmp_path: 
 
 def test_finished_gaussians_are_not_saved_as_levels(tmp_path: Path) -> None:
     result = vvgt_cli.convert(np.arange(512, dtype=np.float32).reshape(8, 8, 8), goal={"max_gaussians": 20, "steps": 0})
-    with pytest.raises(UsageError, match="levels are made of a volume's closed form"):
+    with pytest.raises(UsageError, match="streamed levels need the volume"):
         result.save(tmp_path / "lod-meta.json")
     assert not list(tmp_path.iterdir())

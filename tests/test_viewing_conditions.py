@@ -14,9 +14,9 @@ from vvgt_cli.images.metrics import psnr, score_view, ssim, texture
 from vvgt_cli.score.viewing import (
     ViewingCondition,
     condition_views,
-    larger_screens,
     score_conditions,
     score_texture,
+    screens,
     texture_note,
     viewing_conditions,
     zoomed,
@@ -56,9 +56,9 @@ def test_conditions_are_scored_by_their_rule_size_and_field_worst_first(pair):
         expected = np.mean([psnr(theirs[..., :3], np.clip(ours[..., :3], 0, 1)) for theirs, ours in pictures])
         assert condition.psnr == pytest.approx(expected, abs=1e-6)
     assert ViewingCondition("inria", 400, 10.0, 30.0).name() == "inria 400 px close up"
-    assert larger_screens(1080) == [(1080, 40), (2160, 40)]
-    assert larger_screens(2160) == [(2160, 40), (4320, 40)]
-    assert larger_screens(2159) == [(2159, 40), (2160, 40)]
+    assert screens(1080) == [(1080, 40), (2160, 40)]
+    assert screens(2160) == [(2160, 40), (4320, 40)]
+    assert screens(2159) == [(2159, 40), (2160, 40)]
     assert viewing_conditions(1080) == [(400, 40), (800, 40), (1080, 40), (2160, 40), (1080, 10)]
 
 

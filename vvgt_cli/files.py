@@ -84,7 +84,7 @@ def _spool(path: str | os.PathLike[str]) -> IO[bytes]:
             if free is not None and free < _SPARE:
                 kept.close()
                 raise DataError(
-                    f"{path}: the free memory is used up after {count} bytes of this pipe; write its content to a file "
+                    f"{path}: the free memory is used up after {count} bytes of this pipe; write them to a file "
                     "first: large files are read in blocks"
                 )
             kept.write(chunk)

@@ -35,14 +35,7 @@ from vvgt_cli.gaussians.frames import rescale
 from vvgt_cli.gaussians.live_facts import WORD as LIVE
 from vvgt_cli.progress import Console
 from vvgt_cli.score.record import ConversionReport, Run
-from vvgt_cli.score.viewing import (
-    CLOSE,
-    PREVIEW_VIEWS,
-    condition_views,
-    larger_screens,
-    score_conditions,
-    score_texture,
-)
+from vvgt_cli.score.viewing import CLOSE, PREVIEW_VIEWS, condition_views, score_conditions, score_texture, screens
 from vvgt_cli.score.views import score_test_views
 
 SIZE = 1080  # pixels, for files without a recorded size
@@ -133,7 +126,7 @@ def _against(field: Field, unit: Gaussians, header: PlyHeader, size: int, tolera
 
     @cache
     def conditions() -> Any:
-        places = [*larger_screens(size), (size, CLOSE)]
+        places = [*screens(size), (size, CLOSE)]
         return score_conditions(gaussians, condition_views(field.views, places, settings))
 
     def error(name: str) -> Figure:
@@ -157,7 +150,7 @@ def _against(field: Field, unit: Gaussians, header: PlyHeader, size: int, tolera
     for name, what in (("psnr", "over black"), ("psnr_white", "over white"), ("psnr_alpha", "alpha")):
         yield Case("pictures", f"{what}, {size} px", partial(error, name))
     yield Case("pictures", "over black, close up", near)
-    for edge, _ in larger_screens(size):
+    for edge, _ in screens(size):
         yield Case("pictures", f"worst viewer, {edge} px", partial(viewers, edge))
     yield Case("pictures", "texture on smooth faces, near", woven)
     yield from _order(gaussians, size)

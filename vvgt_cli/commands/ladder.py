@@ -33,16 +33,9 @@ from vvgt_cli.jit.ahead import INIT
 from vvgt_cli.progress import Console
 from vvgt_cli.refine import OptimizeOptions
 from vvgt_cli.score.checks import Views, render_check_views
-from vvgt_cli.score.curves import short_number
+from vvgt_cli.score.curves import short
 from vvgt_cli.score.record import ConversionReport, Run
-from vvgt_cli.score.viewing import (
-    SIDE,
-    ConditionView,
-    condition_pictures,
-    condition_views,
-    larger_screens,
-    score_conditions,
-)
+from vvgt_cli.score.viewing import SIDE, ConditionView, condition_pictures, condition_views, score_conditions, screens
 from vvgt_cli.score.views import WHOLE, score_drawn_view
 
 if TYPE_CHECKING:
@@ -105,16 +98,11 @@ def rungs(options: LadderOptions) -> list[Rung]:
     most, size, seed = options.max_gaussians, options.size, options.seed
     budgets = sorted({max(most // share, 1) for share in SHARES} | {most})
     found = [
-        Rung(
-            f"closed form, K = {short_number(k)}",
-            short_number(k),
-            "closed form",
-            FitOptions(k, size, seed=seed, steps=0),
-        )
+        Rung(f"closed form, K = {short(k)}", short(k), "closed form", FitOptions(k, size, seed=seed, steps=0))
         for k in budgets
     ]
     if options.live:
-        found.append(Rung(f"live form, K = {short_number(most)}", "live", "live", FitOptions(most, size, seed=seed)))
+        found.append(Rung(f"live form, K = {short(most)}", "live", "live", FitOptions(most, size, seed=seed)))
     if options.model:
         fit = FitOptions(most, size, seed=seed, steps=0, model=options.model)
         found.append(Rung(f"network {Path(options.model).name}", "network", "network", fit))
@@ -158,7 +146,7 @@ class Reference:
 
         cameras, axes = default_views("test", size=size), volume.source.volume.axes
         blocks = [spread_blocks(size, size, i) for i in range(len(cameras))]
-        around = condition_pictures(larger_screens(size), SIDE)
+        around = condition_pictures(screens(size), SIDE)
         volume.views.expect([Picture(camera, REFERENCE, _drawn(blocks, i)) for i, camera in enumerate(cameras)])
         volume.views.expect([Picture(camera, REFERENCE, part) for _, camera, part in around])
         images, bar = [], console.bar("reference")
@@ -167,7 +155,7 @@ class Reference:
             if bar:
                 bar(i + 1, len(cameras))
         shown = upright(images, cameras, axes, lambda camera: volume.views.view(camera, REFERENCE))
-        conditions = list(condition_views(volume.views, larger_screens(size), REFERENCE, views=SIDE))
+        conditions = list(condition_views(volume.views, screens(size), REFERENCE, views=SIDE))
         rays = max(rays for _, rays in REFERENCE.tiers)
         return cls(cameras, blocks, images, REFERENCE.step, rays, axes, shown, conditions)
 

@@ -25,17 +25,7 @@ from vvgt_cli.jit.ahead import INIT
 from vvgt_cli.network.card import find_model
 from vvgt_cli.progress import Console
 from vvgt_cli.score.charts import FILES, draw, write_plots
-from vvgt_cli.score.curves import (
-    Series,
-    cost,
-    knee,
-    pareto_front,
-    psnr,
-    read_series,
-    table,
-    unit_costs,
-    worst_condition,
-)
+from vvgt_cli.score.curves import Series, cost, knee, pareto, psnr, read_series, table, unit_costs, worst_condition
 from vvgt_cli.score.page import Pictures, page
 from vvgt_cli.score.record import ConversionReport, Run, document
 from vvgt_cli.volume.blocks import check_memory
@@ -120,7 +110,7 @@ def _with_model(ladder: LadderOptions) -> LadderOptions:
 
 
 def _document(request: ReportRequest, source: Any, reference: Reference, runs: list[dict[str, Any]]) -> dict[str, Any]:
-    best, bend = [run["name"] for run in pareto_front(runs)], knee(runs)
+    best, bend = [run["name"] for run in pareto(runs)], knee(runs)
     return {
         "command_line": request.command_line,
         "volume": volume_record(source),

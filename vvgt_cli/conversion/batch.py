@@ -13,11 +13,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vvgt_cli.conversion.index import (
-    FRAMES,
-    FUNCTIONS,
-    LABELS,
-)
+from vvgt_cli.conversion.index import FRAMES, FUNCTIONS, LABELS
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.layered import NONE, content_of, open_parts

@@ -9,17 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vvgt_cli.conversion.batch import (
-    LEVELS,
-    LIVE,
-    ONE,
-    PAGE,
-    Batch,
-    Functions,
-    Item,
-    check_options,
-    options_in,
-)
+from vvgt_cli.conversion.batch import LEVELS, LIVE, ONE, PAGE, Batch, Functions, Item, check_options, options_in
 from vvgt_cli.conversion.clouds import Cloud, Clouds
 from vvgt_cli.conversion.convert import convert, convert_in_memory, open_field, plan_conversion, run_conversion
 from vvgt_cli.conversion.frames import Series, is_glob_of_volumes

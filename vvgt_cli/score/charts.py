@@ -12,19 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vvgt_cli.files import atomic_write
-from vvgt_cli.score.curves import (
-    KINDS,
-    OTHER,
-    SCORING,
-    STAGES,
-    Run,
-    Series,
-    cost,
-    pareto_front,
-    psnr,
-    short_number,
-    stage_names,
-)
+from vvgt_cli.score.curves import KINDS, OTHER, SCORING, STAGES, Run, Series, cost, pareto, psnr, short, stage_names
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -129,7 +117,7 @@ def _scatter(axes: Any, series: Sequence[Series], value: Callable[[Run], float])
     several, used, labels = len(series) > 1, set(), []
     for n, one in enumerate(series):
         runs = [run for run in one.scored() if value(run) > 0]
-        best = pareto_front(runs) if value is cost else []
+        best = pareto(runs) if value is cost else []
         color = COLORS[n % 4] if several else INK
         axes.plot(
             [cost(run) for run in best], [float(psnr(run) or 0) for run in best], color=color, alpha=0.6, zorder=1
@@ -151,7 +139,7 @@ def _scatter(axes: Any, series: Sequence[Series], value: Callable[[Run], float])
         axes.axhline(vtk, color=SOFT, linewidth=1, linestyle="--", zorder=0, label="VTK")
     axes.margins(0.08)
     ticks = log_ticks(*axes.get_xlim())
-    axes.set_xticks(ticks, [short_number(tick) for tick in ticks])
+    axes.set_xticks(ticks, [short(tick) for tick in ticks])
     axes.set_xticks([], minor=True)
     axes.grid()
     axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=4, handletextpad=0.2, columnspacing=1.2)

@@ -65,7 +65,7 @@ def worst_condition(run: Run) -> float | None:
     return min((condition["psnr"] for condition in run.get("conditions") or ()), default=None)
 
 
-def pareto_front(runs: Sequence[Run]) -> list[Run]:
+def pareto(runs: Sequence[Run]) -> list[Run]:
     """Return the Pareto front by time: runs that no other beats in both time and PSNR."""
     best, kept = -math.inf, []
     for run in sorted(runs, key=lambda run: (cost(run), -(psnr(run) or 0))):
@@ -78,7 +78,7 @@ def pareto_front(runs: Sequence[Run]) -> list[Run]:
 
 def knee(runs: Sequence[Run]) -> Run | None:
     """Return the run farthest above the line from the first to the last of the front, over the logarithm of seconds."""
-    ends = pareto_front(runs)
+    ends = pareto(runs)
     if len(ends) < 3:
         return ends[-1] if ends else None
     x = [math.log(cost(run)) for run in ends]
@@ -130,7 +130,7 @@ def table(runs: Sequence[Run]) -> str:
         *(f"seconds: {s}" for s in stages),
     ]
     writer.writerow(heads)
-    best = {id(run) for run in pareto_front(runs)}
+    best = {id(run) for run in pareto(runs)}
     for run in runs:
         scores = run.get("scores") or {}
         row = [run["name"], run["kind"], f"{cost(run):.4f}", run["gaussians"], run["bytes"]]
@@ -192,7 +192,7 @@ def _named(document: dict[str, Any]) -> Run:
     options = document["options"]
     steps = options.get("steps") or 0
     budget = options.get("max_gaussians") or document["gaussians"]
-    name = f"{document['command']}, K {short_number(budget)}" + (f", {steps} steps" if steps else "")
+    name = f"{document['command']}, K {short(budget)}" + (f", {steps} steps" if steps else "")
     return document | {"name": name, "kind": "steps" if steps else "closed form"}
 
 
@@ -202,7 +202,7 @@ def _title(path: str, document: dict[str, Any]) -> str:
     return own.resolve().parent.name if own.name == "report.json" else own.stem
 
 
-def short_number(number: float) -> str:
+def short(number: float) -> str:
     """Abbreviate a number: 1536 to 1.54k, 100000 to 100k, 2500000 to 2.5M."""
     for size, suffix in ((1e6, "M"), (1e3, "k")):
         if number >= size:

@@ -9,7 +9,7 @@ from html import escape
 from typing import Any
 
 from vvgt_cli.score.charts import Chart
-from vvgt_cli.score.curves import Run, Series, cost, knee, pareto_front, psnr, short_number, worst_condition
+from vvgt_cli.score.curves import Run, Series, cost, knee, pareto, psnr, short, worst_condition
 from vvgt_cli.score.style import CSS, SCRIPT
 
 GAIN = 8  # initial gain of the difference
@@ -80,7 +80,7 @@ def _facts(series: Sequence[Series]) -> str:
         chosen = [("quickest", min(runs, key=cost)), ("knee of the curve", knee(runs) or runs[0]), *chosen]
     cells = [
         f"<div><small>{what}</small><b>{psnr(run):.1f} dB</b><small>{escape(run['name'])}<br>{cost(run):.1f} s, "
-        f"{short_number(run['gaussians'])} Gaussians</small></div>"
+        f"{short(run['gaussians'])} Gaussians</small></div>"
         for what, run in chosen
     ]
     return f'<div class="facts">{"".join(cells)}</div>'
@@ -151,7 +151,7 @@ def _table(series: Sequence[Series]) -> str:
     heads = ("run", "seconds", "PSNR", "foreground", "worst condition", "SSIM", "FLIP", "Gaussians", "MB")
     rows = []
     for one in series:
-        best = {id(run) for run in pareto_front(one.scored())}
+        best = {id(run) for run in pareto(one.scored())}
         for run in one.runs:
             scores = run.get("scores") or {}
             cells = [

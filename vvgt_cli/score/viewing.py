@@ -54,7 +54,7 @@ def viewing_conditions(size: int) -> list[tuple[int, float]]:
     return [(edge, FIELD_OF_VIEW) for edge in sorted({*SIZES, size})] + [(size, CLOSE)]
 
 
-def larger_screens(size: int) -> list[tuple[int, float]]:
+def screens(size: int) -> list[tuple[int, float]]:
     """List (size, field of view) of the target size and of the next larger screen."""
     return [(size, FIELD_OF_VIEW), (2160 if size < 2160 else 2 * size, FIELD_OF_VIEW)]
 

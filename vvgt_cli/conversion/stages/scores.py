@@ -15,9 +15,9 @@ from vvgt_cli.score.viewing import (
     SIDE,
     condition_pictures,
     condition_views,
-    larger_screens,
     score_conditions,
     score_texture,
+    screens,
     texture_cameras,
 )
 from vvgt_cli.score.views import WHOLE, psnr_note, score_test_views, scored_views
@@ -94,7 +94,7 @@ class ViewingConditions(Stage):
         """List the pictures that are scored."""
         from vvgt_cli.dvr import RenderSettings
 
-        wanted = condition_pictures(larger_screens(fit.size), SIDE, FEW)
+        wanted = condition_pictures(screens(fit.size), SIDE, FEW)
         conditions = [Picture(camera, RenderSettings(), blocks) for _, camera, blocks in wanted]
         return [*conditions, *(Picture(camera, RenderSettings()) for camera in texture_cameras(fit.size))]
 
@@ -108,7 +108,7 @@ class ViewingConditions(Stage):
             return
         with run.stage(self.name) as stage:
             made, settings = work.made(), RenderSettings()
-            seen = condition_views(work.field.views, larger_screens(fit.size), settings, views=SIDE, enough=FEW)
+            seen = condition_views(work.field.views, screens(fit.size), settings, views=SIDE, enough=FEW)
             conditions = score_conditions(made, seen)
             run.report.conditions = [asdict(condition) for condition in conditions]
             near, views = texture_cameras(fit.size), work.field.views
