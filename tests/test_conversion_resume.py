@@ -92,10 +92,7 @@ def test_what_is_kept_of_another_conversion_or_is_damaged(folder, vvgt, monkeypa
         ended(patch, "scores.score_test_views", 0)
         assert vvgt(*line).code == 130
     other = vvgt(*line, "--max-gaussians", "100")
-    assert (other.code, "fitted.npz: of a conversion of another volume, or with other options" in other.error) == (
-        2,
-        True,
-    )
+    assert (other.code, "fitted.npz: belongs to another volume or other options" in other.error) == (2, True)
     kept = folder / "kept" / "fitted.npz"
     whole = kept.read_bytes()
     for content in (b"", whole[: len(whole) // 2], whole.replace(b"means", b"moons")):
@@ -107,7 +104,7 @@ def test_what_is_kept_of_another_conversion_or_is_damaged(folder, vvgt, monkeypa
 @pytest.mark.parametrize(
     ("more", "told"),
     [
-        (("--time-budget", "9"), "give one of both"),
+        (("--time-budget", "9"), "give one of them"),
         (("--checkpoint", "no/where"), "cannot be made (No such file or directory)"),
         (("-o", "a_{}.ply"), "a series resumes from its manifest"),
     ],

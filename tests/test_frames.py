@@ -296,7 +296,7 @@ def test_no_comments_says_what_will_not_be_known(vvgt) -> None:
     affine = anatomy.place(anatomy.AXIAL)
     anatomy.nifti(Path("v"), anatomy.balls(affine), affine)
     result = vvgt("init", "v.nii", "--tf", "tf.json", "-o", "a.ply", *SMALL[:-1], "--no-comments")
-    assert "--no-comments: nothing in the file will say that it is in the unit frame with up z" in result.err
+    assert "--no-comments: the file will not record that it is in the unit frame with up z" in result.err
 
 
 def test_refined_by_views_of_a_left_handed_volume(vvgt) -> None:

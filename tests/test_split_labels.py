@@ -98,7 +98,7 @@ def test_a_single_label_and_one_that_is_nowhere(vvgt, tmp_path: Path) -> None:
     time = vvgt(
         "convert", tmp_path / "v.npy", "--labels", "auto", "--split-labels", "--time-budget", 9, "-o", "p_{}.ply"
     )
-    assert (time.code, "--time-budget with labels: several conversions share the work" in time.error) == (2, True)
+    assert (time.code, "--time-budget with labels: it is for one conversion" in time.error) == (2, True)
 
 
 def test_standard_input_is_read_once(tmp_path: Path) -> None:

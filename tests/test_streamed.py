@@ -164,12 +164,12 @@ def test_the_bytes_do_not_depend_on_how(vvgt, volume: Path, folder: Path, tmp_pa
     [
         (("--init", "wavelet"), "needs moments"),
         (("--frame", "world"), "remove --frame"),
-        (("--steps", "50"), "levels of one closed form"),
-        (("--live",), "levels of one closed form"),
-        (("--tf", "a.json", "--tf", "b.json"), "levels of one closed form"),
-        (("--target-psnr", "30"), "levels of one closed form"),
-        (("--dry-run",), "levels of one closed form"),
-        (("--preview", "p.png"), "levels of one closed form"),
+        (("--steps", "50"), "made by one closed form"),
+        (("--live",), "made by one closed form"),
+        (("--tf", "a.json", "--tf", "b.json"), "made by one closed form"),
+        (("--target-psnr", "30"), "made by one closed form"),
+        (("--dry-run",), "made by one closed form"),
+        (("--preview", "p.png"), "made by one closed form"),
     ],
 )
 def test_what_has_no_levels_is_refused_in_a_line(vvgt, volume: Path, tmp_path: Path, options, text) -> None:
