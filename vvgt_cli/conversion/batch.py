@@ -29,7 +29,7 @@ ONE, LIVE, LEVELS, PAGE = "one volume", "--live", "streamed levels", "a page of 
 UNSAFE = re.compile(r"[^\w.-]+")  # characters that are not put into file names
 WHOLE = "the limit is for one file, and there are several; try --max-gaussians"
 CANNOT: dict[str, dict[str, str]] = {  # by kind of batch or output: options that it does not take, and a remedy
-    ONE: {"--shard": "one volume is not divided; for a series put the number into -o, as out_{:04d}.ply"},
+    ONE: {"--shard": "one volume is not divided; for a series give -o a place for the number, as out_{:04d}.ply"},
     FRAMES: {
         "--checkpoint": "a series resumes from its manifest; remove it",
         "--dry-run": "a plan is for one volume; try it on one of the frames",
