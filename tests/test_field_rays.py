@@ -116,7 +116,7 @@ def test_the_closed_form_of_blocks_is_that_of_memory(tmp_path, light, method):
     from vvgt_cli.field.field import Resident
 
     memory = Resident(source, source.scene())
-    ours = memory.start(options).gaussians
+    ours = memory.pyramid(options).gaussians
     with in_blocks(request, 16, tmp_path / "parts") as field:
         theirs = field.pyramid(options).gaussians
         assert len(ours) == len(theirs)
