@@ -66,7 +66,7 @@ def small_conversions() -> Iterator[None]:
     """
     with pytest.MonkeyPatch.context() as patch:
         for module in ("conversion.stages.scores", "commands.ladder"):
-            patch.setattr(f"vvgt_cli.{module}.from_above", lambda size: [(size, 40.0), (2 * size, 40.0)])
+            patch.setattr(f"vvgt_cli.{module}.screens", lambda size: [(size, 40.0), (2 * size, 40.0)])
         patch.setattr("vvgt_cli.closed_form.closed_form.MARCH_SIZE", 64)
         yield
 

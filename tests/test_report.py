@@ -18,7 +18,19 @@ from vvgt_cli.commands.ladder import LadderOptions, random_points, rungs
 from vvgt_cli.errors import DataError
 from vvgt_cli.images import read_png
 from vvgt_cli.score.charts import FILES, draw, log_ticks
-from vvgt_cli.score.curves import OTHER, STAGES, Series, cost, front, knee, psnr, read_series, short, table, unit_costs
+from vvgt_cli.score.curves import (
+    OTHER,
+    STAGES,
+    Series,
+    cost,
+    knee,
+    pareto,
+    psnr,
+    read_series,
+    short,
+    table,
+    unit_costs,
+)
 from vvgt_cli.score.page import Pictures, page
 
 SMALL = ("--tf", "viridis", "--size", 24, "--max-gaussians", 60, "--steps", 2)
@@ -61,7 +73,7 @@ def ladder(tmp_path_factory):
     return folder / "out", json.loads((folder / "out" / "report.json").read_text())
 
 
-def test_the_ladder_writes_every_file_and_scores_every_rung(ladder):
+def test_a_report_has_every_file_and_scores_every_run(ladder):
     folder, found = ladder
     assert sorted(path.name for path in folder.iterdir()) == sorted(
         ["report.json", "report.csv", "report.html", *FILES]
@@ -92,7 +104,7 @@ def test_the_ladder_writes_every_file_and_scores_every_rung(ladder):
     assert found["machine"]["cpu"]
 
 
-def test_the_ladder_in_blocks_has_the_same_scores(ladder, vvgt, tmp_path):
+def test_a_report_in_blocks_has_the_same_scores(ladder, vvgt, tmp_path):
     folder, found = ladder
     args = ("example:blob:10", *SMALL, "--model", folder.parent / "worse", "--blocks", 16)
     result = vvgt("report", *args, "-o", tmp_path / "out")
@@ -103,10 +115,10 @@ def test_the_ladder_in_blocks_has_the_same_scores(ladder, vvgt, tmp_path):
     assert [rung["name"] for rung in blocks["runs"]] == [rung["name"] for rung in found["runs"]]
     for one, other in zip(found["runs"], blocks["runs"], strict=True):
         assert one["scores"]["psnr"] == pytest.approx(other["scores"]["psnr"], abs=0.1)
-        assert one["seats"][0]["psnr"] == pytest.approx(other["seats"][0]["psnr"], abs=0.3)
+        assert one["conditions"][0]["psnr"] == pytest.approx(other["conditions"][0]["psnr"], abs=0.3)
 
 
-def test_the_ladders_page_opens_offline_and_shows_its_pictures(ladder):
+def test_the_page_of_a_report_opens_offline_and_shows_its_pictures(ladder):
     folder, found = ladder
     text = (folder / "report.html").read_text("utf-8")
     reader = Reader(text)
@@ -131,7 +143,7 @@ def test_the_ladders_page_opens_offline_and_shows_its_pictures(ladder):
     assert off == pytest.approx(found["runs"][best]["scores"]["per_view"][0]["psnr"], abs=0.3)  # 8 bits
 
 
-def test_csv_and_plots_of_the_ladder(ladder):
+def test_a_report_has_csv_and_plots(ladder):
     folder, found = ladder
     rows = list(csv.DictReader(io.StringIO((folder / "report.csv").read_text())))
     assert [row["name"] for row in rows] == [rung["name"] for rung in found["runs"]]
@@ -207,16 +219,16 @@ def test_files_that_are_no_reports(content, tmp_path):
 
 def test_the_front_is_what_nothing_beats():
     found = runs()
-    best = front(found)
+    best = pareto(found)
     assert [r["name"] for r in best] == [r["name"] for r in found if r["kind"] in ("closed form", "steps")]
     for r in found:
         beaten = any(cost(o) <= cost(r) and psnr(o) >= psnr(r) and o is not r for o in found)
         assert beaten == (r not in best)
-    assert front([]) == []
+    assert pareto([]) == []
     assert knee(found)["name"] == "closed form, K = 25k"
     assert knee(found[:1]) is found[0]
     twins = [run("a", "a", "steps", 10, 1.0, 30.0, 5), run("b", "b", "steps", 10, 1.0, 30.0, 5)]
-    assert [r["name"] for r in front(twins)] == ["a"]
+    assert [r["name"] for r in pareto(twins)] == ["a"]
 
 
 def test_the_scoring_costs_nothing_and_units_are_medians():
@@ -271,7 +283,7 @@ def test_charts_name_every_run_and_follow_the_page():
     assert [chart.svg() for chart in charts] == [chart.svg() for chart in again]
 
 
-def test_labels_in_charts_lie_apart_and_inside():
+def test_labels_in_charts_are_separate_and_inside():
     for chart in draw([Series("s", runs())])[:3]:
         axes = chart.figure.axes[0]
         boxes = [note.get_window_extent() for note in axes.texts]
@@ -293,7 +305,7 @@ def test_names_cannot_break_out_of_the_page():
     assert "u" not in reader.tags
 
 
-def test_several_reports_are_told_apart(tmp_path, vvgt):
+def test_several_reports_have_different_names(tmp_path, vvgt):
     other = copy.deepcopy(document())
     for one in other["runs"]:
         one["scores"]["psnr"] -= 1

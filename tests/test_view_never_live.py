@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from vvgt_cli.commands.converter import Made, Message, Said, Scored
-from vvgt_cli.conversion.live import refusal
+from vvgt_cli.conversion.live import live_refusal
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.field.source import SourceRequest, load
 from vvgt_cli.look.lighting import LightOptions
@@ -22,10 +22,10 @@ def test_what_is_never_live_is_converted(monkeypatch: pytest.MonkeyPatch) -> Non
 
     labels = Volume(np.arange(8, dtype=np.uint8).reshape(2, 2, 2), name="labels")
     request = SourceRequest(labels, tf="viridis", light=LightOptions(lights=("0,0,1",), shadows=True))
-    why = refusal(ConvertRequest(request, live=True), load(request))
+    why = live_refusal(ConvertRequest(request, live=True), load(request))
     assert why is not None
     for other in (SourceRequest(labels, tf="viridis"), SourceRequest(labels, labels="auto")):
-        assert refusal(ConvertRequest(other, live=True), load(other)) is None
+        assert live_refusal(ConvertRequest(other, live=True), load(other)) is None
     asked = []
 
     def conversion(request: ConvertRequest, console: Console, after: Any, unscored: Any) -> Any:

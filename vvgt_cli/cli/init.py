@@ -45,9 +45,9 @@ def command(volume: str, console: Console, blocks: dict[str, Any], **options: An
     from vvgt_cli.cli.blocks import chosen
     from vvgt_cli.cli.fit import convert_request
     from vvgt_cli.conversion.convert import initialise_only
-    from vvgt_cli.conversion.shards.run import init_in_blocks, streams
+    from vvgt_cli.conversion.shards.run import init_in_blocks, writes_streaming
     from vvgt_cli.field.open import automatic
 
     request = convert_request(volume, **options)
     request = replace(request, blocks=chosen(blocks) or automatic(request.source, console))
-    (init_in_blocks if streams(request) else initialise_only)(request, console)
+    (init_in_blocks if writes_streaming(request) else initialise_only)(request, console)

@@ -64,7 +64,7 @@ def ended_by(status: int) -> str | None:
 
 
 @contextmanager
-def interruption(say: Callable[[str], None]) -> Iterator[Callable[[], bool]]:
+def interruption(message: Callable[[str], None]) -> Iterator[Callable[[], bool]]:
     """Within the block a first interrupt (Ctrl-C) only makes the given function return True; a second one ends all."""
     stopped = threading.Event()
     if threading.current_thread() is not threading.main_thread():
@@ -74,7 +74,7 @@ def interruption(say: Callable[[str], None]) -> Iterator[Callable[[], bool]]:
     def note(number: int, frame: object) -> None:
         stopped.set()
         signal.signal(signal.SIGINT, before)
-        say("interrupted: what there is will be written; once more to leave without")
+        message("interrupted: the result so far will be written; press Ctrl-C again to quit without saving")
 
     before = signal.signal(signal.SIGINT, note)
     try:

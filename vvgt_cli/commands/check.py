@@ -103,7 +103,7 @@ def check(
     if source is None:
         return CheckReport(_run_cases(list(self_test_cases()), console))
     loaded = load(source)
-    console.say(describe_source(loaded))
+    console.message(describe_source(loaded))
     scene = loaded.scene()
     found = measure_stiffness(scene, tolerance or TOLERANCE, console.bar("stiffness"))
     outcomes = _run_cases(list(scene_cases(scene)), console)

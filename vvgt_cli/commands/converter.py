@@ -25,7 +25,7 @@ from vvgt_cli.errors import DataError, VvgtError
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.look.function import TransferFunction
 from vvgt_cli.look.labels import LabelTable
-from vvgt_cli.resources import asked_memory
+from vvgt_cli.resources import memory_limit
 
 
 @dataclass(frozen=True)
@@ -174,7 +174,7 @@ class Converter:
             env={**os.environ, "PYTHONPATH": paths, "TMPDIR": folder, "TEMP": folder, "TMP": folder},
         )  # fmt: skip
         with suppress(OSError):
-            pickle.dump(Start(self._source, self._name, asked_memory()), cast(IO[bytes], self._process.stdin))
+            pickle.dump(Start(self._source, self._name, memory_limit()), cast(IO[bytes], self._process.stdin))
         threading.Thread(target=self._listen, args=(self._process,), daemon=True).start()
         return self._process
 

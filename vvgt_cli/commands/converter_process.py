@@ -16,8 +16,8 @@ from typing import IO, Any, NoReturn
 
 from vvgt_cli.commands.converter import Failed, Job, Made, Message, Progress, Said, Scored, Start
 from vvgt_cli.commands.live_site import Cloud, page_of, stored
-from vvgt_cli.conversion.convert import convert_in_memory, opened, ply_options
-from vvgt_cli.conversion.live import live_conversion, refusal
+from vvgt_cli.conversion.convert import convert_in_memory, open_field, ply_options
+from vvgt_cli.conversion.live import convert_live, live_refusal
 from vvgt_cli.conversion.previous_look import PreviousLook
 from vvgt_cli.conversion.request import ConvertRequest
 from vvgt_cli.conversion.result import Conversion
@@ -45,7 +45,7 @@ class Telling(Console):
         super().__init__()
         self.tell = tell
 
-    def say(self, line: str) -> None:
+    def message(self, line: str) -> None:
         """A line."""
         self.tell(Said(line))
 
@@ -71,7 +71,7 @@ class Volume:
         self.lighting: Lighting | None = None  # of the function to begin with
         self.table: LabelTable | None = None  # the labels to begin with
         self.last: PreviousLook | None = None  # what the next conversion goes on from
-        if automatic(source, Console(quiet=True)) is None:  # `opened` says it
+        if automatic(source, Console(quiet=True)) is None:  # `open_field` reports it
             console.bar("reading")
             content = open_content(source.path, source.read)
             self.source = replace(source, volume=content, read=ReadOptions())
@@ -80,14 +80,14 @@ class Volume:
         """Tell the live form, or of what has none an ordinary conversion."""
         run = Run(console, ConversionReport("init"))
         request = ConvertRequest(self.source, live=True)
-        with opened(run, request, INIT) as field:
-            why = refusal(request, field.source) or _missing()
+        with open_field(run, request, INIT) as field:
+            why = live_refusal(request, field.source) or _missing()
             if why is None:
                 ply, self.lighting = ply_options(request, field.source), field.source.tf.lighting
                 self.table = field.source.tf if isinstance(field.source.tf, LabelTable) else None
-                console.tell(self._paged(live_conversion(run, request, field, ply, scored=False)))
+                console.tell(self._paged(convert_live(run, request, field, ply, scored=False)))
                 return
-        console.say(f"not live, but converted: {why}")
+        console.message(f"not live, but converted: {why}")
         self._converted(replace(request, live=False), console, self._paged)
 
     def under(self, job: Job, console: Telling) -> None:

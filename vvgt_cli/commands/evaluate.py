@@ -1,4 +1,4 @@
-"""`evaluate`: a `.ply` against the volume it was made from, on the test views, and from every seat."""
+"""`evaluate`: a `.ply` against the volume it was made from, on the test views, and from every condition."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import numpy as np
 
 from vvgt_cli.cameras import default_views
 from vvgt_cli.cameras.sets import SIZE
-from vvgt_cli.conversion.certify import checked
+from vvgt_cli.conversion.certify import verify
 from vvgt_cli.conversion.gaussian_files import STDIN, file_rule, layout_of, open_gaussians
-from vvgt_cli.conversion.place import into_box, preview, upright
-from vvgt_cli.conversion.recolored import SeveralLooks, light_of, under_function
+from vvgt_cli.conversion.place import preview, to_box_frame, upright_axes
+from vvgt_cli.conversion.recolored import SeveralLooks, apply_function, light_of
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.field import Field, Picture, Resident
 from vvgt_cli.field.open import FieldNeeds, automatic, blocked, store_beside
@@ -32,16 +32,16 @@ from vvgt_cli.score.record import ConversionReport, Run, StageRecord, document
 from vvgt_cli.score.viewing import (
     CLOSE,
     ViewingCondition,
+    condition_pictures,
     condition_views,
     near_cameras,
     score_conditions,
     score_texture,
-    seat_pictures,
     texture_note,
     viewing_conditions,
     zoomed,
 )
-from vvgt_cli.score.views import psnr_note, score_test_views, scored
+from vvgt_cli.score.views import psnr_note, score_test_views, scored_views
 
 PICTURED = 4  # test view of the preview: from the side
 MIDDLE = 200  # pixels along the edge of what the reference's own error is measured on
@@ -57,7 +57,7 @@ class EvaluateRequest:
         size: pixels along an image's edge; None: what the file is made for.
         rule: of `vvgt_cli.gaussians.rules` to draw by; None: the file's.
         step: of the reference, in voxels.
-        seats: score every rule at several sizes and close up as well, and texture on smooth areas.
+        conditions: score every rule at several sizes and close up as well, and texture on smooth areas.
         blocks: how the volume is processed in blocks; None: in memory, or in blocks where it is large.
         preview: PNG to write (reference, ours, difference of a test view and of a close-up), None for none.
         overwrite: replace it if it exists.
@@ -68,7 +68,7 @@ class EvaluateRequest:
     size: int | None = None
     rule: str | None = None
     step: float = 0.125
-    seats: bool = True
+    conditions: bool = True
     blocks: BlockOptions | None = None
     preview: str | None = None
     overwrite: bool = False
@@ -80,7 +80,7 @@ class EvaluateRequest:
 
 @dataclass
 class Evaluation:
-    """Scores and seats, with what they were measured on, and whether the file's certificate holds (docs/report.md)."""
+    """Scores, the measurements they rest on, and whether the certificate of the file holds (docs/report.md)."""
 
     gaussians: int
     size: int
@@ -91,7 +91,7 @@ class Evaluation:
     transfer_function: dict[str, Any]
     reference_psnr: float
     scores: dict[str, Any] = field(default_factory=dict)
-    seats: list[dict[str, Any]] = field(default_factory=list)
+    conditions: list[dict[str, Any]] = field(default_factory=list)
     texture: dict[str, Any] | None = None
     certificate: dict[str, Any] | None = None
     stages: list[StageRecord] = field(default_factory=list)
@@ -102,7 +102,7 @@ class Evaluation:
         return document("vvgt-evaluation", asdict(self))
 
     def table(self) -> str:
-        """The scores, a row a number, then the seats by PSNR, worst first."""
+        """The scores, a row a number, then the conditions by PSNR, worst first."""
         lines = [f"made for {self.size} px, drawn as {self.rule}"]
         for key, value in self.scores.items():
             if key != "per_view":
@@ -112,9 +112,11 @@ class Evaluation:
             lines.append(f"texture on smooth areas, near: {texture_note(Texture(**self.texture))}")
         if self.certificate is not None:
             lines.append(f"certificate {self.certificate['text']}")
-        if self.seats:
-            lines.append(f"\n{'seat':<32}{'psnr':>10}")
-        lines += [f"{ViewingCondition(**seat).name():<32}{seat['psnr']:>10.2f}" for seat in self.seats]
+        if self.conditions:
+            lines.append(f"\n{'condition':<32}{'psnr':>10}")
+        lines += [
+            f"{ViewingCondition(**condition).name():<32}{condition['psnr']:>10.2f}" for condition in self.conditions
+        ]
         return "\n".join(lines) + "\n"
 
 
@@ -190,7 +192,7 @@ def shown(gaussians: Gaussians, header: PlyHeader, source: Source, request: Sour
     looks = SeveralLooks(tuple((layer.tf, layer.unit_distance) for layer in source.layers))
     light = light_of(request.light, source.lighting, source.volume.space)
     options = replace(layout_of(header), unit_distance=source.unit_distance, light=light)
-    return under_function(gaussians, header, looks if header.live.others else source.tf, options)
+    return apply_function(gaussians, header, looks if header.live.others else source.tf, options)
 
 
 def evaluate(request: EvaluateRequest, console: Console | None = None) -> Evaluation:
@@ -208,9 +210,9 @@ def evaluate(request: EvaluateRequest, console: Console | None = None) -> Evalua
     with opened(run, request, gaussians, header) as volume:
         source = volume.source
         gaussians = shown(gaussians, header, source, request.source)
-        gaussians = into_box(gaussians, source.volume)
+        gaussians = to_box_frame(gaussians, source.volume)
         for remark in _doubts(request, header, source):
-            run.console.say(f"{request.ply}: {remark}")
+            run.console.message(f"{request.ply}: {remark}")
         return _scored(run, request, volume, gaussians, header)
 
 
@@ -240,7 +242,7 @@ def _scored(run: Run, request: EvaluateRequest, volume: Field, gaussians: Gaussi
         tf_record(source, request.source), own,
     )  # fmt: skip
     settings = replace(REFERENCE, step=request.step)
-    wanted = [Picture(camera, settings, part) for _, camera, part in scored(size, perceptual=True)]
+    wanted = [Picture(camera, settings, part) for _, camera, part in scored_views(size, perceptual=True)]
     with run.stage("test views") as stage, _together(volume, wanted):
         bar = run.console.bar("test views")
         scores = score_test_views(volume.views, gaussians, size, settings, rule=rule, progress=bar)
@@ -248,15 +250,15 @@ def _scored(run: Run, request: EvaluateRequest, volume: Field, gaussians: Gaussi
         stage.note = f"{psnr_note(scores)}, {size} px"
     if header.certificate is not None:
         with run.stage("certificate") as stage:
-            verdict = checked(header.certificate, volume, gaussians, header.live is not None and gaussians.live is None)
+            verdict = verify(header.certificate, volume, gaussians, header.live is not None and gaussians.live is None)
             evaluation.certificate = asdict(verdict) | {"holds": verdict.holds, "text": verdict.text()}
             stage.note = verdict.text()
     if request.preview:
-        camera, axes = default_views("test", size=size)[PICTURED], upright(source.volume, header.up)
+        camera, axes = default_views("test", size=size)[PICTURED], upright_axes(source.volume, header.up)
         with run.stage("preview"):
             sheet = preview(volume.views, gaussians, [camera, zoomed(camera, CLOSE)], axes, rule)
             write_png(request.preview, sheet, request.overwrite)
-    if request.seats:
+    if request.conditions:
         _look_around(run, evaluation, volume, gaussians, rule)
     evaluation.stages = run.report.stages
     evaluation.seconds = run.finish().seconds
@@ -269,12 +271,12 @@ def _look_around(run: Run, evaluation: Evaluation, volume: Field, gaussians: Gau
 
     size, settings = evaluation.size, RenderSettings()
     places = viewing_conditions(size)
-    wanted = [Picture(camera, settings, blocks) for _, camera, blocks in seat_pictures(places)]
-    with run.stage("seats") as stage, _together(volume, wanted):
-        seen = condition_views(volume.views, places, settings, progress=run.console.bar("seats"))
-        seats = score_conditions(gaussians, seen)
-        evaluation.seats = [asdict(seat) for seat in seats]
-        stage.note = f"worst: {seats[0].name()}, {seats[0].psnr:.2f} dB"
+    wanted = [Picture(camera, settings, blocks) for _, camera, blocks in condition_pictures(places)]
+    with run.stage("conditions") as stage, _together(volume, wanted):
+        seen = condition_views(volume.views, places, settings, progress=run.console.bar("conditions"))
+        conditions = score_conditions(gaussians, seen)
+        evaluation.conditions = [asdict(condition) for condition in conditions]
+        stage.note = f"worst: {conditions[0].name()}, {conditions[0].psnr:.2f} dB"
     near = [Picture(camera, settings) for camera in near_cameras(size)]
     with run.stage("texture") as stage, _together(volume, near):
         found = score_texture(volume.views, gaussians, size, rule, settings, progress=run.console.bar("texture"))

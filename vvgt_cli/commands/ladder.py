@@ -16,10 +16,10 @@ from vvgt_cli.cameras import Camera, default_views
 from vvgt_cli.cameras.blocks import Blocks, spread_blocks
 from vvgt_cli.cameras.boxed import render_in_box
 from vvgt_cli.commands.peers import Peer, PeerViews, train
-from vvgt_cli.conversion.convert import convert, opened
+from vvgt_cli.conversion.convert import convert, open_field
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.conversion.stages.refinement import refine
-from vvgt_cli.conversion.stages.views import CheckViews, TrainingViews, views_of
+from vvgt_cli.conversion.stages.views import CheckViews, TrainingViews, view_count
 from vvgt_cli.defaults import MAX_GAUSSIANS, REPORT_STEPS, SIZE
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.field.field import Field, Picture, Resident
@@ -32,11 +32,11 @@ from vvgt_cli.gaussians.rules import INRIA
 from vvgt_cli.jit.ahead import INIT
 from vvgt_cli.progress import Console
 from vvgt_cli.refine import OptimizeOptions
-from vvgt_cli.score.checks import Views, judging_views
+from vvgt_cli.score.checks import Views, render_check_views
 from vvgt_cli.score.curves import short
 from vvgt_cli.score.record import ConversionReport, Run
-from vvgt_cli.score.viewing import SIDE, ConditionView, condition_views, from_above, score_conditions, seat_pictures
-from vvgt_cli.score.views import WHOLE, score_seen
+from vvgt_cli.score.viewing import SIDE, ConditionView, condition_pictures, condition_views, score_conditions, screens
+from vvgt_cli.score.views import WHOLE, score_drawn_view
 
 if TYPE_CHECKING:
     from vvgt_cli.images.metrics import Scores
@@ -127,7 +127,7 @@ class Reference:
         step: voxels; ``rays`` a pixel, at most.
         axes: (3, 3) `Volume.axes`: from the box frame, in which the views are, to the unit frame.
         shown: images as `upright` makes them.
-        seats: what is seen from the size made for, and from the next larger.
+        conditions: what is seen from the size made for, and from the next larger.
     """
 
     cameras: list[Camera]
@@ -137,7 +137,7 @@ class Reference:
     rays: int
     axes: np.ndarray
     shown: list[np.ndarray]
-    seats: list[ConditionView]
+    conditions: list[ConditionView]
 
     @classmethod
     def render(cls, volume: Field, size: int, console: Console) -> Reference:
@@ -146,7 +146,7 @@ class Reference:
 
         cameras, axes = default_views("test", size=size), volume.source.volume.axes
         blocks = [spread_blocks(size, size, i) for i in range(len(cameras))]
-        around = seat_pictures(from_above(size), SIDE)
+        around = condition_pictures(screens(size), SIDE)
         volume.views.expect([Picture(camera, REFERENCE, _drawn(blocks, i)) for i, camera in enumerate(cameras)])
         volume.views.expect([Picture(camera, REFERENCE, part) for _, camera, part in around])
         images, bar = [], console.bar("reference")
@@ -155,9 +155,9 @@ class Reference:
             if bar:
                 bar(i + 1, len(cameras))
         shown = upright(images, cameras, axes, lambda camera: volume.views.view(camera, REFERENCE))
-        seats = list(condition_views(volume.views, from_above(size), REFERENCE, views=SIDE))
+        conditions = list(condition_views(volume.views, screens(size), REFERENCE, views=SIDE))
         rays = max(rays for _, rays in REFERENCE.tiers)
-        return cls(cameras, blocks, images, REFERENCE.step, rays, axes, shown, seats)
+        return cls(cameras, blocks, images, REFERENCE.step, rays, axes, shown, conditions)
 
     def psnr_of(self, renderer: str, field: Field) -> float | None:
         """Mean PSNR of another renderer's own pictures of the views that are drawn whole; None where it cannot."""
@@ -184,7 +184,7 @@ class Reference:
         for i, camera in enumerate(self.cameras):
             drawn = _drawn(self.blocks, i)
             ours.append(render(gaussians, camera, blocks=drawn))
-            scores.append(score_seen(self.images[i], ours[i], self.blocks[i], drawn is None))
+            scores.append(score_drawn_view(self.images[i], ours[i], self.blocks[i], drawn is None))
         return mean_scores(scores), ours
 
 
@@ -224,8 +224,8 @@ def run_rungs(
             if report.refinement and report.refinement["reason"] == "interrupted":
                 raise KeyboardInterrupt
             scores, images = reference.score(gaussians)
-            seats = score_conditions(gaussians, reference.seats)
-            report.scores, report.seats = asdict(scores), [asdict(seat) for seat in seats]
+            conditions = score_conditions(gaussians, reference.conditions)
+            report.scores, report.conditions = asdict(scores), [asdict(condition) for condition in conditions]
             count = views.count if views is not None and rung.peer is not None else _views_of(report, rung.fit)
             run = {"name": rung.name, "label": rung.label, "kind": rung.kind, "views": count}
             run |= asdict(report)
@@ -234,7 +234,7 @@ def run_rungs(
 
 def peer_views(source: SourceRequest, options: LadderOptions, folder: Path) -> PeerViews:
     """What other trainers read: as many views as our longest run has, of the screen's size."""
-    count = views_of(max(options.steps, default=0), small=False)
+    count = view_count(max(options.steps, default=0), small=False)
     return PeerViews.render(source, folder / "views", count, options.size, options.blocks)
 
 
@@ -266,17 +266,17 @@ def _views_of(report: ConversionReport, fit: FitOptions) -> int:
     if report.refinement:
         return int(report.refinement["views"])
     if report.plan is None:
-        return views_of(fit.steps or 0, small=False)
+        return view_count(fit.steps or 0, small=False)
     return sum(stage["count"] for stage in report.plan["stages"] if stage["name"] == TrainingViews.name)
 
 
 def _views(run: Run, volume: Field, fit: FitOptions) -> tuple[Views, Views]:
     from vvgt_cli.dvr import RenderSettings, render_views
 
-    train = default_views("train", views_of(fit.steps or 0, small=False), size=view_edge(fit.size, small=False))
+    train = default_views("train", view_count(fit.steps or 0, small=False), size=view_edge(fit.size, small=False))
     volume.views.expect([*CheckViews().views(fit), *(Picture(camera, RenderSettings()) for camera in train)])
     with run.stage("check views"):
-        judges = judging_views(volume.views, default_views("check", size=fit.size), RenderSettings())
+        judges = render_check_views(volume.views, default_views("check", size=fit.size), RenderSettings())
     with run.stage("views"):
         return Views(train, render_views(volume.views, train)), judges
 
@@ -295,7 +295,7 @@ def _baseline(source: SourceRequest, rung: Rung, blocks: BlockOptions | None) ->
 
     run, fit = Run(Console(quiet=True), ConversionReport("report")), rung.fit
     count = max(fit.max_gaussians // STARTS, 1)
-    with opened(run, ConvertRequest(source, fit=fit, blocks=blocks), INIT) as volume:
+    with open_field(run, ConvertRequest(source, fit=fit, blocks=blocks), INIT) as volume:
         with run.stage("samples"):
             if rung.start == "points":
                 half = np.array(volume.source.volume.unit_frame().half)

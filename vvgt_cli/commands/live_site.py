@@ -162,11 +162,11 @@ class Cloud:
 
     def _shown(self, table: Looks, light: Any, options: PlyOptions) -> Cloud:
         """Baked under a light that the page sends, or the file's."""
-        from vvgt_cli.conversion.live import lit
+        from vvgt_cli.conversion.live import apply_light
 
         lighting = self.options.light if light is None else parse_light(light, self.options)
         pixel = pixel_width(self.options.made_for or SIZE)
-        found = as_stored(lit(baked(self.gaussians, table, pixel), lighting))
+        found = as_stored(apply_light(baked(self.gaussians, table, pixel), lighting))
         options = replace(options, light=lighting, sh_degree=None, certificate=None)
         return replace(self, gaussians=found, options=options, ply=None)
 
@@ -269,7 +269,7 @@ class Desk:
         try:
             parts = page_of(cloud, converts=False)
         except DataError as error:
-            self.console.say(f"{error}; shown under the file's own function")
+            self.console.message(f"{error}; shown under the file's own function")
             parts = page_of(replace(cloud, gaussians=replace(cloud.gaussians, live=None)), converts=False)
         self._show(parts, cloud.live)
 
@@ -338,7 +338,7 @@ class Desk:
         first = not self.there.is_set()
         if isinstance(message, Said):
             if first:
-                self.console.say(message.line)
+                self.console.message(message.line)
                 self.begun.set()
         elif isinstance(message, Progress):
             if self.state["state"] in ("first", "working"):
@@ -361,7 +361,7 @@ class Desk:
         self.better = made.ply
         self.parts[f"{number}.ply"] = _part(made.parts["ply"], BYTES)
         self.state = {"number": number, "state": "done", "said": "converted", "file": f"{number}.ply", "scored": False}
-        self.console.say("converted for the function of the page")
+        self.console.message("converted for the function of the page")
 
     def _failed(self, number: int, error: VvgtError) -> None:
         if self.state["state"] in ("first", "working"):
@@ -373,13 +373,13 @@ class Desk:
             return
         if self.state["state"] == "done":
             self.state = {**self.state, "said": f"converted, not scored: {error}", "scored": True}
-        self.console.say(f"not scored: {error}")
+        self.console.message(f"not scored: {error}")
 
     def _scored(self, scored: Scored) -> None:
         if self.better is not None:
             self.better = scored.ply
             self.state = {**self.state, "said": f"converted, {scored.psnr:.1f} dB", "scored": True}
-        self.console.say(f"{scored.psnr:.1f} dB on the test views")
+        self.console.message(f"{scored.psnr:.1f} dB on the test views")
 
 
 def _part(content: bytes, kind: str) -> Part:

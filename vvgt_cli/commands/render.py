@@ -14,7 +14,7 @@ from vvgt_cli.cameras.boxed import to_box_frame
 from vvgt_cli.cameras.files import read_cameras, transforms_json
 from vvgt_cli.cameras.sets import SIZE
 from vvgt_cli.conversion.gaussian_files import file_rule, open_gaussians
-from vvgt_cli.conversion.recolored import FunctionRequest, shown
+from vvgt_cli.conversion.recolored import FunctionRequest, recolored
 from vvgt_cli.errors import UsageError
 from vvgt_cli.gaussians import Gaussians, PlyHeader, in_unit_frame
 from vvgt_cli.gaussians.formats.levels import StreamedLevels, by_view
@@ -121,7 +121,7 @@ def _opened(request: RenderRequest) -> tuple[Seen, Gaussians, PlyHeader]:
     manifest = by_view(request.ply)
     if manifest is None:
         gaussians, header = open_gaussians(request.ply)
-        gaussians = shown(request.ply, gaussians, header, request.function)
+        gaussians = recolored(request.ply, gaussians, header, request.function)
         return lambda camera: gaussians, gaussians, header
     levels = StreamedLevels(manifest)
     coarsest, header = gaussians_of(levels.level(str(levels.count - 1)), request.ply)
@@ -131,7 +131,7 @@ def _opened(request: RenderRequest) -> tuple[Seen, Gaussians, PlyHeader]:
         field = math.degrees(2 * math.atan(min(camera.width / camera.fx, camera.height / camera.fy) / 2))
         return in_unit_frame(*gaussians_of(levels.seen_from(turned @ camera.position, field), request.ply))
 
-    return seen, shown(request.ply, coarsest, header, request.function), header
+    return seen, recolored(request.ply, coarsest, header, request.function), header
 
 
 def _pictures(request: RenderRequest, console: Console, seen: Seen, cameras: list[Camera], rule: Rule) -> str:

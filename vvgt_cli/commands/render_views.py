@@ -350,7 +350,9 @@ def _contact(run: Run, job: _Job, layout: Layout, views: list[View]) -> None:
     manifest.refresh()
     names = [name for view in views for name in layout.files(view)]
     if not all(manifest.complete(name, content=False) for name in names):
-        run.console.say(f"{job.folder}: other parts' views are missing; the part that completes them writes {CONTACT}")
+        run.console.message(
+            f"{job.folder}: other parts' views are missing; the part that completes them writes {CONTACT}"
+        )
         return
     if job.pending or not manifest.complete(CONTACT):
         with run.stage("contact sheet"):

@@ -15,8 +15,8 @@ import numpy as np
 from vvgt_cli.commands.infer import SHIPPED
 from vvgt_cli.commands.ladder import PICTURED, LadderOptions, Reference, pictures, run_rungs, rungs, warm_up
 from vvgt_cli.commands.peers import Peer
-from vvgt_cli.conversion.convert import opened
-from vvgt_cli.conversion.live import refusal
+from vvgt_cli.conversion.convert import open_field
+from vvgt_cli.conversion.live import live_refusal
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.source import SourceRequest, tf_record, volume_record
@@ -25,7 +25,7 @@ from vvgt_cli.jit.ahead import INIT
 from vvgt_cli.network.card import find_model
 from vvgt_cli.progress import Console
 from vvgt_cli.score.charts import FILES, draw, write_plots
-from vvgt_cli.score.curves import Series, cost, front, knee, psnr, read_series, table, unit_costs, worst_seat
+from vvgt_cli.score.curves import Series, cost, knee, pareto, psnr, read_series, table, unit_costs, worst_condition
 from vvgt_cli.score.page import Pictures, page
 from vvgt_cli.score.record import ConversionReport, Run, document
 from vvgt_cli.volume.blocks import check_memory
@@ -71,10 +71,10 @@ def report(request: ReportRequest, console: Console | None = None) -> dict[str, 
     check_memory(VIEWS * size**2 * VIEW_BYTES, f"--size {size}: test views and ours", "try a smaller --size")
     fit = FitOptions(request.ladder.max_gaussians, size)
     whole = ConvertRequest(request.source, fit=fit, blocks=request.ladder.blocks)
-    with opened(Run(console, ConversionReport("report")), whole, INIT) as volume:
+    with open_field(Run(console, ConversionReport("report")), whole, INIT) as volume:
         source = volume.source
         live = replace(whole, live=True, fit=FitOptions(fit.max_gaussians, size))
-        request = replace(request, ladder=replace(request.ladder, live=refusal(live, source) is None))
+        request = replace(request, ladder=replace(request.ladder, live=live_refusal(live, source) is None))
         warm_up(request.source, request.ladder)
         reference = Reference.render(volume, size, console)
         ceiling = reference.psnr_of("vtk", volume)
@@ -83,7 +83,7 @@ def report(request: ReportRequest, console: Console | None = None) -> dict[str, 
     for run, images in run_rungs(request.source, request.ladder, reference, console):
         runs.append(run)
         ours.append(_pngs(pictures(images, PICTURED, request.picture_size)))
-        score = f"PSNR {psnr(run):.2f} dB, worst seat {worst_seat(run):.2f} dB"
+        score = f"PSNR {psnr(run):.2f} dB, worst condition {worst_condition(run):.2f} dB"
         megabytes = f"{run['gaussians']} Gaussians, {run['bytes'] / 1e6:.1f} MB"
         console.stage(f"{len(runs)}/{total}", cost(run), f"{run['name']}: {score}, {megabytes}")
     text = document("vvgt-report", _document(request, source, reference, runs) | {"vtk_psnr": ceiling})
@@ -94,7 +94,7 @@ def report(request: ReportRequest, console: Console | None = None) -> dict[str, 
     write_text(str(folder / DATA), text, request.overwrite)
     title = f"Error against run time: {source.volume.name}"
     _write(folder, series, title, Pictures(list(PICTURED), shown, ours), request.overwrite)
-    console.say(f"{folder / PAGE}")
+    console.message(f"{folder / PAGE}")
     return found
 
 
@@ -110,7 +110,7 @@ def _with_model(ladder: LadderOptions) -> LadderOptions:
 
 
 def _document(request: ReportRequest, source: Any, reference: Reference, runs: list[dict[str, Any]]) -> dict[str, Any]:
-    best, bend = [run["name"] for run in front(runs)], knee(runs)
+    best, bend = [run["name"] for run in pareto(runs)], knee(runs)
     return {
         "command_line": request.command_line,
         "volume": volume_record(source),
@@ -147,8 +147,8 @@ def compare(paths: Sequence[str], output: str, overwrite: bool, console: Console
     _write(folder, series, "Error against run time, compared", None, overwrite)
     for one in series:
         best = max(one.scored(), key=lambda run: psnr(run) or 0)
-        console.say(f"{one.name}: {len(one.runs)} runs, nearest {best['name']} with {psnr(best):.2f} dB")
-    console.say(f"{folder / PAGE}")
+        console.message(f"{one.name}: {len(one.runs)} runs, nearest {best['name']} with {psnr(best):.2f} dB")
+    console.message(f"{folder / PAGE}")
 
 
 def _distinct(series: list[Series]) -> list[Series]:

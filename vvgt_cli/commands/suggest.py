@@ -45,5 +45,5 @@ def suggest_transfer_functions(
             write_text(str(path), suggestion.to_json(), overwrite)
         stage.note = f"{count} functions in {folder}"
     for path, suggestion in zip(paths, suggestions, strict=True):
-        run.console.say(f"{path}: {suggestion.name}, {100 * suggestion.share:.3g} % of the voxels")
+        run.console.message(f"{path}: {suggestion.name}, {100 * suggestion.share:.3g} % of the voxels")
     return paths

@@ -36,10 +36,12 @@ def convert_transfer_function(
     text = to_text(function, form)
     distance = PER_VOXEL if function.opacity_unit_label == PER_VOXEL else f"{function.opacity_unit_distance or 0:g}"
     if form == "paraview" and distance != "0":
-        (console or Console()).say(
+        (console or Console()).message(
             f"{output}: a ParaView preset holds no unit distance: set it to {distance} there, or give "
             f"--opacity-unit-distance {distance} here"
         )
     if form == "paraview" and function.lighting is not None:
-        (console or Console()).say(f"{output}: a ParaView preset holds no shading: it is left out (--light headlight)")
+        (console or Console()).message(
+            f"{output}: a ParaView preset holds no shading: it is left out (--light headlight)"
+        )
     write_text(output, text, overwrite)

@@ -18,7 +18,7 @@ from vvgt_cli.commands.server import Part, Site, served
 from vvgt_cli.commands.streamed_site import streamed_parts
 from vvgt_cli.conversion.gaussian_files import STDIN, is_page, layout_of, open_gaussians, write_gaussians, write_page
 from vvgt_cli.conversion.index import files_of, is_index
-from vvgt_cli.conversion.readback import tell_agreement
+from vvgt_cli.conversion.readback import report_agreement
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import Gaussians, PlyOptions
@@ -83,7 +83,7 @@ def view(request: ViewRequest, announce: Callable[[str], None], console: Console
         gaussians, options = _opened(run, request, file)
         write_gaussians(run, request.output, gaussians, options, request.overwrite)
         run.compile(for_degree(DRAW, gaussians.degree))
-        tell_agreement(run, request.output, gaussians, options)
+        report_agreement(run, request.output, gaussians, options)
 
 
 def _join(run: Run, request: ViewRequest, clouds: Sequence[tuple[str, str]]) -> None:
@@ -172,7 +172,7 @@ def _serve(
     if len(files) > 1:
         _only_gaussians(files)
     parts = {"viewer.js": Part("text/javascript; charset=utf-8", lambda: asset(PROGRAM), packed=True)}
-    site = Site(parts, run.console.say)
+    site = Site(parts, run.console.message)
     desk = Desk(site.parts, site.posts, plain_name(files[0]), run.console)
     with ExitStack() as stack:
         stack.enter_context(suppress(KeyboardInterrupt))
@@ -194,7 +194,7 @@ def _serve(
         if desk.error is None:
             announce(url)
             opened = request.browser and display() and webbrowser.open(url)
-            run.console.say(f"{'shown in a browser' if opened else 'open this address in a browser'}; Ctrl-C ends")
+            run.console.message(f"{'shown in a browser' if opened else 'open this address in a browser'}; Ctrl-C ends")
         while desk.error is None:
             time.sleep(TICK)  # a signal may reach another thread, which wakes nobody here
         if desk.waited_for:

@@ -122,7 +122,7 @@ class _Run:
         self.progress = Progress()
         if (folder / LAST).exists():
             self._resume()
-            console.say(f"goes on from step {self.progress.step} of {config.steps}")
+            console.message(f"goes on from step {self.progress.step} of {config.steps}")
         self.recorder = Recorder(folder, self.progress.step, config.steps, console) if here.first else None
         self.console = console
 
@@ -141,7 +141,7 @@ class _Run:
         if self.recorder is not None:
             self.recorder.close()
         if stop:
-            self.console.say(f"ended by signal {stop} after step {state.step}; the same command goes on from there")
+            self.console.message(f"ended by signal {stop} after step {state.step}; the same command goes on from there")
         return 128 + stop if stop else 0
 
     def _step(self, ended: Sequence[int]) -> int:
@@ -159,7 +159,7 @@ class _Run:
         norm = float(torch.nn.utils.clip_grad_norm_(self.network.parameters(), config.clip))
         if bad or not math.isfinite(norm):
             state.skipped += 1
-            self.console.say(f"step {state.step + 1} skipped: {int(bad)} scenes or the gradient not finite")
+            self.console.message(f"step {state.step + 1} skipped: {int(bad)} scenes or the gradient not finite")
         else:
             for group in self.optimizer.param_groups:
                 group["lr"] = pace

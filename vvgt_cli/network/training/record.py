@@ -56,7 +56,7 @@ class Recorder:
         if now - self.said >= SAY_EVERY or done == self.steps:
             self.said = now
             left = (now - self.began) / max(done - self.first, 1) * (self.steps - done)
-            self.console.say(
+            self.console.message(
                 f"step {done} of {self.steps}: loss {row['loss']:.4f}, gain {row['gain']:+.3f} dB, "
                 f"{row['skipped']} skipped, {left / 60:.1f} minutes left"
             )
@@ -66,7 +66,7 @@ class Recorder:
         self.held.add(row)
         self._plot("held", row)
         found = ", ".join(f"{key} {value:+.3f} dB" for key, value in row.items() if "gain" in key)
-        self.console.say(f"step {row['step']}, held out: {found}")
+        self.console.message(f"step {row['step']}, held out: {found}")
 
     def _plot(self, group: str, row: dict[str, Any]) -> None:
         if self.board is not None:
@@ -84,6 +84,6 @@ def _board(folder: Path, step: int, console: Console) -> Any:
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError:
-        console.say("tensorboard is not installed: metrics go to CSV alone")
+        console.message("tensorboard is not installed: metrics go to CSV alone")
         return None
     return SummaryWriter(str(folder / "tensorboard"), purge_step=step + 1)

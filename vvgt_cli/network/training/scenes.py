@@ -127,7 +127,7 @@ def make_scenes(folder: Path, config: SceneConfig, console: Console, share: tupl
             place = folder / "scenes" / _key(recipe, config)
             if number % share[1] == share[0] and not place.exists():
                 _make(place, recipe, config)
-                console.say(f"scene {number + 1} of {len(wanted)} ({part}): {_about(place)['name']}")
+                console.message(f"scene {number + 1} of {len(wanted)} ({part}): {_about(place)['name']}")
 
 
 def prepare_scenes(folder: Path, config: SceneConfig, console: Console) -> dict[str, list[TrainingScene]]:
@@ -144,7 +144,7 @@ def prepare_scenes(folder: Path, config: SceneConfig, console: Console) -> dict[
         out[part] = [_load(place, config) for place in places if _about(place)["gaussians"] >= FEWEST]
         if not out[part]:
             raise UsageError(f"--data {folder}: no scene left ({part}); other volumes may show more")
-        console.say(f"{part}: {len(out[part])} scenes, {len(places) - len(out[part])} left out as empty")
+        console.message(f"{part}: {len(out[part])} scenes, {len(places) - len(out[part])} left out as empty")
     return out
 
 
