@@ -83,7 +83,7 @@ def placed(field: Resident, gaussians: int) -> Gaussians:
     run = Run(Console(quiet=True), ConversionReport("convert"))
     request = ConvertRequest(SourceRequest("-"), None, FitOptions(max_gaussians=gaussians, size=SIZE), live=True)
     assert isinstance(source.tf, TransferFunction)
-    foggy = field.with_look(source.shown_by(fog(source.statistics, source.tf)))
+    foggy = field.with_look(source.with_function(fog(source.statistics, source.tf)))
     return widen_narrow(with_values(run, foggy, fog_start(run, foggy, request)), SIZE)
 
 
@@ -120,7 +120,7 @@ def measured(name: str, field: Resident, gaussians: int, beside: bool) -> list[d
     rows, pixel = [], pixel_width(SIZE)
     for title, tf in functions(source.statistics).items():
         spacing = float(np.mean(source.volume.spacing))
-        shown = field.with_look(source.shown_by(replace(tf, opacity_unit_distance=spacing)))
+        shown = field.with_look(source.with_function(replace(tf, opacity_unit_distance=spacing)))
         table = function_table(shown.source)
         looks = {
             "live": apply_look(live, table, pixel), "bytes": apply_look(packed, table, pixel),
