@@ -167,7 +167,7 @@ def test_compare_reads_reports_and_conversions(ladder, vvgt, tmp_path):
 @pytest.mark.parametrize(
     ("args", "message"),
     [
-        (("report", "-", "-o", "x"), "every run of the ladder reads it anew"),
+        (("report", "-", "-o", "x"), "every run reads it again"),
         (("report", "example:blob", "-o", "-"), "a folder of files"),
         (("report", "example:blob", "-o", "no/where"), "does not exist"),
         (("report", "example:blob", "-o", "file"), "is a file"),

@@ -42,4 +42,4 @@ def test_what_is_never_live_is_converted(monkeypatch: pytest.MonkeyPatch) -> Non
     volume.live(converter_process.Telling(told.append))
     assert [one for one in told if isinstance(one, Made | Scored)] == [Made(b"", {}), Scored(b"scored", 40.0)]
     assert asked == [False]
-    assert Said(f"not live, but converted: {why}") in told
+    assert Said(f"converted without a live form: {why}") in told

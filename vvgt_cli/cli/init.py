@@ -37,7 +37,6 @@ def command(volume: str, console: Console, blocks: dict[str, Any], **options: An
     Volumes larger than memory are processed in blocks, automatically or as set by --blocks, --workers, --scheduler
     and --shard. The output does not depend on the partition.
 
-    \b
     Examples:
       vvgt init example:frog -o frog-init.ply --max-gaussians 20000
       vvgt init huge.zarr -o huge.ply --blocks auto --workers 4 --memory 8G

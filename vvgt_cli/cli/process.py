@@ -1,4 +1,4 @@
-"""What the process has of the system: its three streams, whatever they are, and an end within seconds when asked."""
+"""Standard streams and signals of the process: streams that may be closed, and an exit within seconds of a signal."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ heard: list[int] = []  # signals that have ended the present run; what is raised
 
 
 def open_streams() -> None:
-    """Put something where standard input, output or error are closed, and let talk fail unheard.
+    """Replace closed standard streams, and ignore failures to write messages.
 
-    Otherwise the next file that is opened would get their numbers, and what libraries print would end in it. Writing
-    to a standard output that is closed fails, as it must.
+    Otherwise the next opened file would get a standard stream's number, and printed text would end up in it. Writing to
+    a closed standard output still fails.
     """
     for number, name, mode in ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w")):
         try:
@@ -38,13 +38,14 @@ def open_streams() -> None:
 
 
 def end_on_signals() -> None:
-    """Let SIGTERM, SIGINT and SIGHUP (unless it is ignored, as under nohup) end the process as an exception does.
+    """Make SIGTERM, SIGINT and SIGHUP (unless ignored, as under nohup) end the process like an exception.
 
-    A compiled kernel that is being called at that moment turns the exception into another, so the signal is noted in
-    `heard` as well, and `vvgt_cli.cli.main.run` goes by that.
-    Python runs handlers between two steps of its own, so that one second in a kernel would go by unanswered, or
-    twenty. So another thread listens too: what has not ended after `GRACE` seconds ends without unwinding, its
-    temporary files removed. Where somebody else has taken a signal over (training does), it is theirs.
+    A compiled kernel that is running may replace the exception, so the signal is also recorded in `heard`, which
+    `vvgt_cli.cli.main.run` reads.
+
+    Python runs signal handlers between its own instructions, so a long kernel would delay them. A second thread
+    therefore ends a process that has not ended after `GRACE` seconds, without unwinding but without temporary files
+    left. Signals that other code handles (training does) are left to it.
     """
     for number in ENDING:
         if signal.getsignal(number) is not signal.SIG_IGN:
@@ -59,13 +60,13 @@ def end_on_signals() -> None:
 
 
 def ended_by(status: int) -> str | None:
-    """Name of the signal that an exit status stands for, None where it is another's."""
+    """Return the name of the signal that an exit status stands for, None for other statuses."""
     return next((signal.Signals(number).name for number in ENDING if status == 128 + number), None)
 
 
 @contextmanager
 def interruption(say: Callable[[str], None]) -> Iterator[Callable[[], bool]]:
-    """Within the block a first interrupt (Ctrl-C) only makes the given function return True; a second one ends all."""
+    """Make the first interrupt (Ctrl-C) in the block only set the yielded function's result; a second one raises."""
     stopped = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield stopped.is_set  # handlers belong to the main thread
@@ -74,7 +75,7 @@ def interruption(say: Callable[[str], None]) -> Iterator[Callable[[], bool]]:
     def note(number: int, frame: object) -> None:
         stopped.set()
         signal.signal(signal.SIGINT, before)
-        say("interrupted: what there is will be written; once more to leave without")
+        say("interrupted: saving the result so far; press Ctrl-C again to quit without saving")
 
     before = signal.signal(signal.SIGINT, note)
     try:
@@ -85,7 +86,7 @@ def interruption(say: Callable[[str], None]) -> Iterator[Callable[[], bool]]:
 
 @contextmanager
 def ending() -> Iterator[list[int]]:
-    """Within the block signals to end only put their number into the list: the step ends first, and is saved."""
+    """Yield a list that receives the number of a signal to end, so that the current step can finish and be saved."""
     told: list[int] = []
     if threading.current_thread() is not threading.main_thread():
         yield told  # handlers belong to the main thread
@@ -102,7 +103,7 @@ def ending() -> Iterator[list[int]]:
 
 
 def first_of_group() -> bool:
-    """Whether this process is the one that talks, of those that `torchrun` has started; alone it is."""
+    """Return whether this process prints for those that `torchrun` started; true for a single process."""
     return os.environ.get("RANK", "0") == "0" or "TORCHELASTIC_RUN_ID" not in os.environ
 
 

@@ -67,7 +67,6 @@ def command(
     separately, including its views, and scored on the same ten test views. DIR gets report.html (one file, works
     offline), report.json, report.csv and four PNG plots.
 
-    \b
     Examples:
       vvgt report head.nrrd --tf bone.json -o head-report
       vvgt report example:frog --size 200 --max-gaussians 20000 --steps 25 --steps 100 -o frog-report

@@ -1,4 +1,4 @@
-"""What was typed on the command line."""
+"""Arguments typed on the command line."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ _PART = re.compile(r"\d+/\d+")  # of a job array: no folder
 
 
 def typed(ctx: click.Context) -> list[click.Parameter]:
-    """Parameters that were given on the command line."""
+    """Return the parameters given on the command line."""
     return [p for p in ctx.command.params if p.name and ctx.get_parameter_source(p.name) is ParameterSource.COMMANDLINE]
 
 
 def command_line(ctx: click.Context, without: Collection[str] = (), folders: bool = True) -> str:
-    """The call, arguments first; without ``--threads``, which reports record by themselves.
+    """Return the call, arguments first, without ``--threads``, which reports record separately.
 
     Args:
-        ctx: of the call.
-        without: names of parameters that are left out.
-        folders: paths as they were given; False: names alone.
+        ctx: context of the call.
+        without: names of parameters to omit.
+        folders: whether paths keep their folders.
     """
     words = ["vvgt", ctx.command.name or ""]
     for parameter in typed(ctx):

@@ -1,4 +1,4 @@
-"""The process of `converter`: reads a volume once, makes the live form of it, or converts it for a function."""
+"""Process of `converter`: reads a volume once, makes its live form, and converts it for one look after the other."""
 
 from __future__ import annotations
 
@@ -39,18 +39,19 @@ INTERVAL = 0.2  # seconds between two words of progress
 
 
 class Telling(Console):
-    """A console whose lines and bars are messages."""
+    """A console that sends its lines and bars as messages."""
 
     def __init__(self, tell: Callable[[Message], None]) -> None:
+        """Send messages by ``send``."""
         super().__init__()
         self.tell = tell
 
     def say(self, line: str) -> None:
-        """A line."""
+        """Send a line."""
         self.tell(Said(line))
 
     def bar(self, label: str) -> ProgressCallback | None:
-        """Progress in words."""
+        """Return a callback that sends progress in words, at most every `INTERVAL` seconds."""
         last = 0.0
         self.tell(Progress(label))
 
@@ -64,9 +65,10 @@ class Telling(Console):
 
 
 class Volume:
-    """The volume of a request, read once where it fits into memory."""
+    """Volume of a request, read once if it fits in memory."""
 
     def __init__(self, source: SourceRequest, name: str, console: Console) -> None:
+        """Read the volume, unless it is better processed in blocks."""
         self.source, self.name = source, name
         self.lighting: Lighting | None = None  # of the function to begin with
         self.table: LabelTable | None = None  # the labels to begin with
@@ -77,7 +79,7 @@ class Volume:
             self.source = replace(source, volume=content, read=ReadOptions())
 
     def live(self, console: Telling) -> None:
-        """Tell the live form, or of what has none an ordinary conversion."""
+        """Send the live form, or an ordinary conversion if the volume has none."""
         run = Run(console, ConversionReport("init"))
         request = ConvertRequest(self.source, live=True)
         with opened(run, request, INIT) as field:
@@ -87,11 +89,11 @@ class Volume:
                 self.table = field.source.tf if isinstance(field.source.tf, LabelTable) else None
                 console.tell(self._paged(live_conversion(run, request, field, ply, scored=False)))
                 return
-        console.say(f"not live, but converted: {why}")
+        console.say(f"converted without a live form: {why}")
         self._converted(replace(request, live=False), console, self._paged)
 
     def under(self, job: Job, console: Telling) -> None:
-        """Tell a conversion for labels, or a function, on data values, that says the distance its opacity is per."""
+        """Send a conversion for labels, or for a function on data values with an opacity unit distance."""
         assert job is not None
         if isinstance(job, LabelTable):
             source = replace(self.source, labels=self._labels(job))
@@ -101,28 +103,28 @@ class Volume:
         self.last = PreviousLook(self._converted(ConvertRequest(source), console, _plain_file))
 
     def _converted(self, request: ConvertRequest, console: Telling, made: Callable[[Conversion], Made]) -> Conversion:
-        """Tell what is ``made`` of a conversion as soon as it is there, and its scores when they are."""
+        """Convert; send ``message(conversion)`` before the scores are known, then the scores."""
         conversion = convert_in_memory(request, console, self.last, lambda unscored: console.tell(made(unscored)))
         assert conversion.scores is not None
         console.tell(Scored(_file(conversion), conversion.scores["psnr"]))
         return conversion
 
     def _labels(self, sent: LabelTable) -> LabelTable:
-        """The labels to begin with, in the colours and opacities of those that are sent."""
+        """Return the volume's labels with the colours and opacities of ``sent``."""
         assert self.table is not None
         new = {label.number: label for label in sent.labels}
         labels = tuple(replace(new.get(label.number, label), name=label.name) for label in self.table.labels)
         return replace(self.table, labels=labels)
 
     def _paged(self, conversion: Conversion) -> Made:
-        """With the page of it: here the libraries that it takes are there already."""
+        """Return a conversion with its page: the libraries that a page needs are loaded here already."""
         cloud = Cloud.of(_file(conversion), self.name)
         assert cloud.ply is not None
         return Made(cloud.ply, page_of(cloud, converts=True), cloud.live)
 
 
 def _missing() -> str | None:
-    """What a page of live Gaussians needs and is not installed."""
+    """Return why pages of live Gaussians cannot be written, None if they can."""
     try:
         ready("the page.html")
     except DataError as error:
@@ -131,7 +133,7 @@ def _missing() -> str | None:
 
 
 def _plain_file(conversion: Conversion) -> Made:
-    """With the `.ply` that a page swaps in."""
+    """Return a conversion with the `.ply` that an open page swaps in."""
     return Made(_file(conversion), {"ply": stored(conversion.gaussians, conversion.ply)})
 
 
@@ -142,7 +144,7 @@ def _file(conversion: Conversion) -> bytes:
 
 
 def main() -> None:
-    """Do one job after the other until the input ends; the folder for what is temporary then goes (first argument)."""
+    """Run jobs until the input ends; the first argument is the folder of temporary files, removed at the end."""
     folder = sys.argv[1]
     orders, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what libraries print
@@ -182,12 +184,12 @@ def main() -> None:
 
 
 def _note(tell: Callable[[Message], None]) -> Callable[..., None]:
-    """What shows warnings (`warnings.showwarning`)."""
+    """Return a replacement for `warnings.showwarning` that sends warnings as lines."""
     return lambda message, *rest: tell(Said(f"vvgt: note: {message}"))
 
 
 def _plain(error: VvgtError) -> VvgtError:
-    """Without what some errors say to programs beside their line."""
+    """Return an error with its line and exit status alone, which can be pickled."""
     found = VvgtError(str(error))
     found.exit_code = error.exit_code
     return found
@@ -202,7 +204,7 @@ def _send(stream: IO[bytes], folder: str, message: tuple[int, Message]) -> None:
 
 
 def _receive(stream: IO[bytes], folder: str, jobs: list[tuple[int, Job]], there: threading.Semaphore) -> None:
-    """Take jobs."""
+    """Append jobs to ``jobs`` as they arrive, and signal each."""
     while True:
         try:
             jobs.append(pickle.load(stream))
@@ -212,7 +214,7 @@ def _receive(stream: IO[bytes], folder: str, jobs: list[tuple[int, Job]], there:
 
 
 def _alone(folder: str) -> NoReturn:
-    """End where the other side has ended, with what lies in the temporary folder."""
+    """Exit because the other side has ended; remove the temporary folder."""
     for _ in range(10):  # for a job still writes into it
         shutil.rmtree(folder, ignore_errors=True)
         if not os.path.exists(folder):

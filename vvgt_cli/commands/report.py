@@ -1,4 +1,4 @@
-"""`report`: the ladder of a scene as JSON, CSV, plots and a page; or several reports over each other."""
+"""`report`: runs on one scene as JSON, CSV, plots and a page; or several reports compared."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ VIEWS, VIEW_BYTES = 24, 16  # test views, ours and those shown; a pixel: float32
 
 @dataclass(frozen=True)
 class ReportRequest:
-    """A ladder.
+    """A report.
 
     Attributes:
         source: the scene.
-        output: folder to write to; made if it is not there.
-        ladder: which rungs there are.
-        picture_size: pixels along an edge that pictures on the page are averaged down to.
+        output: folder to write to; created if missing.
+        runs: options of the runs.
+        picture_size: largest edge of the page's pictures, in pixels.
         overwrite: replace files that exist.
         command_line: what the user typed, for the page.
     """
@@ -56,15 +56,15 @@ class ReportRequest:
 
 
 def report(request: ReportRequest, console: Console | None = None) -> dict[str, Any]:
-    """Run the ladder and write `report.json`, `report.csv`, the plots and `report.html`; returns the JSON's content.
+    """Do all runs, write `report.json`, `report.csv`, the plots and `report.html`, and return the JSON's content.
 
     Raises:
-        UsageError: an output that may not be written, or standard input as the volume: every rung reads it anew.
-        DataError: input that is not what it must be.
+        UsageError: an output that may not be written, or standard input as the volume, which every run reads again.
+        DataError: invalid input.
     """
     console = console or Console()
     if request.source.volume == STDOUT:
-        raise UsageError("VOLUME is '-': every run of the ladder reads it anew; expected a file")
+        raise UsageError("VOLUME is '-', but every run reads it again; expected a file")
     folder = _folder(request.output, (DATA, TABLE, PAGE, *FILES), request.overwrite)
     request = replace(request, ladder=_with_model(request.ladder))
     size = request.ladder.size
@@ -99,7 +99,7 @@ def report(request: ReportRequest, console: Console | None = None) -> dict[str, 
 
 
 def _with_model(ladder: LadderOptions) -> LadderOptions:
-    """The shipped network where none is named and one is there."""
+    """Return the options with the shipped network if none is named and one is installed."""
     if ladder.model is not None:
         return ladder
     try:
@@ -128,15 +128,17 @@ def _document(request: ReportRequest, source: Any, reference: Reference, runs: l
 
 
 def compare(paths: Sequence[str], output: str, overwrite: bool, console: Console | None = None) -> None:
-    """Several reports over each other: `report.csv`, the plots and `report.html`.
+    """Compare several reports: write `report.csv`, the plots and `report.html`.
 
     Args:
         paths: `report.json` of `vvgt report`, or `--report` of `vvgt convert`.
-        output: folder to write to; made if it is not there.
+        output: folder to write to; created if missing.
+        overwrite: replace files that exist.
+        console: for messages.
 
     Raises:
-        UsageError: fewer than two, or outputs that may not be written.
-        DataError: a file that is neither.
+        UsageError: fewer than two reports, or outputs that may not be written.
+        DataError: a file that is not a report.
     """
     console = console or Console()
     if len(paths) < 2:
@@ -147,12 +149,12 @@ def compare(paths: Sequence[str], output: str, overwrite: bool, console: Console
     _write(folder, series, "Error against run time, compared", None, overwrite)
     for one in series:
         best = max(one.scored(), key=lambda run: psnr(run) or 0)
-        console.say(f"{one.name}: {len(one.runs)} runs, nearest {best['name']} with {psnr(best):.2f} dB")
+        console.say(f"{one.name}: {len(one.runs)} runs, best {best['name']} with {psnr(best):.2f} dB")
     console.say(f"{folder / PAGE}")
 
 
 def _distinct(series: list[Series]) -> list[Series]:
-    """Give reports of one name a number, and their runs the report's name."""
+    """Add numbers to reports that share a name, and put the report's name before those of its runs."""
     names, found = [one.name for one in series], []
     for n, one in enumerate(series):
         name = one.name if names.count(one.name) == 1 else f"{one.name} ({n + 1})"
@@ -162,7 +164,7 @@ def _distinct(series: list[Series]) -> list[Series]:
 
 
 def _folder(output: str, names: Sequence[str], overwrite: bool, inputs: Sequence[str] = ()) -> Path:
-    """The folder, if all files may be written there."""
+    """Return the folder if all files may be written there."""
     folder = Path(output)
     if output == STDOUT:
         raise UsageError("-o -: a report is a folder of files; expected a folder's name")
@@ -171,14 +173,14 @@ def _folder(output: str, names: Sequence[str], overwrite: bool, inputs: Sequence
     if not folder.parent.is_dir():
         raise UsageError(f"-o {folder}: the folder {folder.parent} does not exist; make it first")
     if not os.access(folder if folder.is_dir() else folder.parent, os.W_OK):
-        raise UsageError(f"-o {folder}: may not be written to; expected a folder of yours")
+        raise UsageError(f"-o {folder}: is not writable; choose another folder")
     if folder.is_dir():
         check_outputs([Output("-o", str(folder / name)) for name in names], list(inputs), overwrite)
     return folder
 
 
 def _pngs(images: Sequence[np.ndarray]) -> list[bytes]:
-    """8-bit PNG files of RGB images, as bytes."""
+    """Return RGB images as 8-bit PNG files, bytes each."""
     from vvgt_cli.images import write_png
 
     found = []

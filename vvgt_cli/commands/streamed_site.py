@@ -1,4 +1,4 @@
-"""What the server of `vvgt view` has of streamed SOG: the page, the manifest, and the files that it names."""
+"""Files that the server of `vvgt view` offers for streamed SOG: the page, the manifest, and what that names."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from vvgt_cli.gaussians.formats.streamed import MANIFEST, placed, read_manifest
 
 
 def streamed_parts(file: str) -> dict[str, Part]:
-    """By name; "" is the page.
+    """Return the resources by name; "" is the page.
 
     Raises:
-        DataError: not a manifest, or a file of it is missing.
+        DataError: not a manifest, or a file that it names is missing.
     """
     manifest, folder = read_manifest(file), Path(file).parent
     parts = {MANIFEST: Part(JSON, Path(file).read_bytes)}

@@ -1,4 +1,4 @@
-"""`view`: Gaussians in a browser, from a server on this machine, or written as what others can open."""
+"""`view`: Gaussians shown in a browser by a local server, or written in another format."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ LINGER = 1.0  # seconds in which such a page hears why nothing comes
 
 @dataclass(frozen=True)
 class ViewRequest:
-    """What to show.
+    """Gaussians or a volume to show.
 
     Attributes:
         files: of Gaussians, globs of them, or indexes of `vvgt convert`; several are a series. Or one volume.
-        source: how to read the volume, and its function; of files of Gaussians as it is by default.
-        output: file to write in place of showing, None for none.
+        source: how to read the volume, and its function; left at its defaults for files of Gaussians.
+        output: file to write instead of showing, None for none.
         port: of the server; 0 takes a free one.
-        browser: open one, where there is a display.
+        browser: open one, if there is a display.
         overwrite: replace the file if it exists.
     """
 
@@ -62,13 +62,14 @@ def view(request: ViewRequest, announce: Callable[[str], None], console: Console
     """Show Gaussians until an interrupt, or write them.
 
     Args:
-        request: what and how.
-        announce: is told the page's URL, once it can be opened.
-        console: for talk.
+        request: files and options.
+        announce: called with the page's URL once it can be opened.
+        console: for messages.
 
     Raises:
-        UsageError: several volumes, options of volumes with files of Gaussians, a port or an output that cannot be.
-        DataError: a file that is not what it must be.
+        UsageError: several volumes, options of volumes with files of Gaussians, or a port or an output that cannot be
+            used.
+        DataError: a file that is not valid.
     """
     run = Run(console or Console(), ConversionReport("view"))
     clouds = named_files(request.files)
@@ -87,13 +88,13 @@ def view(request: ViewRequest, announce: Callable[[str], None], console: Console
 
 
 def _join(run: Run, request: ViewRequest, clouds: Sequence[tuple[str, str]]) -> None:
-    """Several files into one page."""
+    """Write several files into one page."""
     files = [file for _, file in clouds]
     _only_gaussians(files)
     _refuse_reading(request.source, files[0])
     if request.output is None or not is_page(request.output):
         raise UsageError(
-            f"-o {request.output} is of one file, got {len(files)}; expected a page (.html), which takes them all"
+            f"-o {request.output}: holds one file, got {len(files)}; expected a page (.html), which holds several"
         )
     with claimed([Output("-o", request.output, (".html",), splats=True)], files, request.overwrite):
         names = [name for name, _ in clouds]
@@ -103,27 +104,27 @@ def _join(run: Run, request: ViewRequest, clouds: Sequence[tuple[str, str]]) -> 
 
 
 def _refuse_reading(given: SourceRequest, name: str) -> None:
-    """Options that are of volumes, with a file of Gaussians."""
+    """Refuse options for volumes with a file of Gaussians."""
     plain = SourceRequest(given.volume)
     if replace(given, volume=plain.volume, light=plain.light) != plain:
         raise UsageError(
-            f"{name} holds Gaussians: --tf, --labels, --layer and options of reading are of volumes; leave them out"
+            f"{name} holds Gaussians; --tf, --labels, --layer and reading options are for volumes only: omit them"
         )
 
 
 def _only_gaussians(files: Sequence[str]) -> None:
-    """Of several files."""
+    """Refuse several files that are not all ordinary files of Gaussians."""
     if any(map(is_streamed, files)):
-        raise UsageError(f"{next(filter(is_streamed, files))}: is shown by itself; expected no other file")
+        raise UsageError(f"{next(filter(is_streamed, files))}: streamed levels are shown alone; expected no other file")
     volumes = [name for name in files if name != STDIN and not is_splats(name)]
     if len(files) > 1 and (volumes or STDIN in files):
         raise UsageError(
-            f"{(volumes or [STDIN])[0]}: of several files expected all to hold Gaussians; convert it first"
+            f"{(volumes or [STDIN])[0]}: not Gaussians; a series needs files of Gaussians: convert it first"
         )
 
 
 def named_files(names: Sequence[str]) -> list[tuple[str, str]]:
-    """Name and file of what files, globs and indexes of `vvgt convert` hold.
+    """Return name and path of the files that names, globs and indexes of `vvgt convert` stand for.
 
     Raises:
         UsageError: as `expanded`.
@@ -137,7 +138,7 @@ def named_files(names: Sequence[str]) -> list[tuple[str, str]]:
 
 
 def expanded(names: Sequence[str]) -> list[str]:
-    """Files of names and globs; those of a glob by the numbers in their names.
+    """Return the files that names and globs stand for; those of a glob sorted by the numbers in their names.
 
     Raises:
         UsageError: a glob that matches nothing.
@@ -152,7 +153,7 @@ def expanded(names: Sequence[str]) -> list[str]:
 
 
 def _opened(run: Run, request: ViewRequest, name: str) -> tuple[Gaussians, PlyOptions]:
-    """Gaussians in the unit frame and how a file of them is laid out; a volume is converted."""
+    """Return Gaussians in the unit frame and how to write them; a volume is converted."""
     given = request.source
     if name == STDIN or is_splats(name):
         _refuse_reading(given, name)
@@ -194,7 +195,7 @@ def _serve(
         if desk.error is None:
             announce(url)
             opened = request.browser and display() and webbrowser.open(url)
-            run.console.say(f"{'shown in a browser' if opened else 'open this address in a browser'}; Ctrl-C ends")
+            run.console.say(f"{'shown in a browser' if opened else 'open this address in a browser'}; Ctrl-C stops")
         while desk.error is None:
             time.sleep(TICK)  # a signal may reach another thread, which wakes nobody here
         if desk.waited_for:
@@ -203,7 +204,7 @@ def _serve(
 
 
 def _series(clouds: Sequence[tuple[str, str]]) -> dict[str, Part]:
-    """The page of several files, and each as it is asked for."""
+    """Return the page of several files, and each file, read when it is requested."""
 
     def content(k: int) -> bytes:
         gaussians, header = open_gaussians(clouds[k][1])
@@ -216,5 +217,5 @@ def _series(clouds: Sequence[tuple[str, str]]) -> dict[str, Part]:
 
 
 def display() -> bool:
-    """Whether a browser would have a screen: else `webbrowser` may start one of those for terminals."""
+    """Return whether a browser would have a screen; without one `webbrowser` may start a text browser."""
     return sys.platform in ("darwin", "win32") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

@@ -1,4 +1,4 @@
-"""The look that live splats are placed by: all values but the background's, or all labels alike."""
+"""The look that places live splats: all values but the background's, or all labels alike."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ GOLDEN = 0.6180339887498949  # labels of neighbouring numbers get codes far from
 
 
 def fog(statistics: StatisticsLike, shown: TransferFunction | None = None) -> TransferFunction:
-    """A function that is transparent where the background is, and only there; thicker the farther from it.
+    """Return a function that is transparent only in the background, and denser the farther a value is from it.
 
     Args:
         statistics: range and histogram of the data.
-        shown: a function, on data values, whose visible values are not transparent.
+        shown: a function on data values whose visible values must not be transparent.
 
     Returns:
         Opacity per `UNIT_SHARE`; red is the value as a share of the range, green its square: their means over a cell
-        say how far its values are spread.
+        give the variance of its values.
     """
     counts = np.asarray(statistics.histogram, np.float64)
     lo, hi = float(statistics.lo), float(statistics.hi)
@@ -59,10 +59,10 @@ def fog(statistics: StatisticsLike, shown: TransferFunction | None = None) -> Tr
 
 
 def label_fog(table: LabelTable, voxels: Mapping[int, int]) -> LabelTable:
-    """A table in which the labels of ``voxels`` have the opacity `THIN`, and a code each of its own.
+    """Return a table that gives each label in ``voxels`` the opacity `THIN` and a code of its own.
 
-    Red is the code in [0, 1] and green its square: their means over a cell say whether it holds several labels. Blue is
-    how much the label counts, by its ``voxels``.
+    Red is the code in [0, 1] and green its square: their means over a cell show whether it holds several labels. Blue
+    is the weight of the label, from its number of ``voxels``.
     """
     least, labels = max(min(voxels.values(), default=1), 1), []
     for number, label in enumerate(table.labels):

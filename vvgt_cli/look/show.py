@@ -1,4 +1,4 @@
-"""A picture of a transfer function over the histogram."""
+"""Picture of a transfer function over the histogram."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def draw(
     Args:
         tf: the function; drawn over the data range with ``statistics`` (then on data values), else over its nodes.
         statistics: of the data, or None.
-        path: the PNG; written beside and renamed.
+        path: the PNG.
         overwrite: replace an existing file.
 
     Raises:
@@ -51,7 +51,7 @@ def draw(
 
 
 def _limits(tf: TransferFunction, statistics: StatisticsLike | None) -> tuple[float, float]:
-    """Ends of the horizontal axis: the data's range, or the nodes'."""
+    """Return the ends of the horizontal axis: the data's range, or the nodes'."""
     lo, hi = tf.node_range() if statistics is None else (float(statistics.lo), float(statistics.hi))
     if lo == hi:
         margin = abs(lo) * 0.5 or 0.5

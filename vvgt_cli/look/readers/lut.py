@@ -66,12 +66,12 @@ def _clut(text: str, path: Path) -> dict[str, Any]:
 
 
 def matches(parsed: Any) -> bool:
-    """Tell whether it is a colour map of niivue, or one that `load` returned."""
+    """Return whether it is a colour map of niivue, or one that `load` returned."""
     return isinstance(parsed, dict) and {"R", "G", "B"} <= set(parsed)
 
 
 def read(parsed: dict[str, Any], what: str, pick: str = "") -> TransferFunction:
-    """Make the function of a colour map; without ``A`` its opacity is niivue's, 0 at the first node and 64 at others.
+    """Return the function of a colour map; without ``A`` opacity is niivue's, 0 at the first node and 64 at others.
 
     Raises:
         DataError: lists of different lengths, positions that do not ascend from 0, values outside of 0 to 255,

@@ -30,7 +30,7 @@ _LIGHT = {"ambient": "ambient", "diffuse": "diffuse", "specular": "specular", "s
 
 
 def matches(parsed: Any) -> bool:
-    """Whether it is a volume property of any of the forms."""
+    """Return whether it is a volume property in any of the forms."""
     if isinstance(parsed, Lines):
         return True
     if isinstance(parsed, Elements):
@@ -42,15 +42,15 @@ def matches(parsed: Any) -> bool:
 
 
 def read(parsed: Any, what: str, pick: str = "") -> TransferFunction:
-    """The function of a volume property.
+    """Return the function of a volume property.
 
     Raises:
-        DataError: too few lines, a count that is not that of the numbers, a field that is not what it must be, several
-            presets and no ``pick``, or ``pick`` where there are none.
+        DataError: too few lines, a count that is not that of the numbers, an invalid field, several presets and no
+            ``pick``, or ``pick`` where there are none.
     """
     several = isinstance(parsed, list | Elements) or "colorTransfer" in getattr(parsed, "keys", dict)()
     if pick and not several:
-        raise DataError(f"{what}: one function, no presets to pick {pick!r} from; leave out #{pick}")
+        raise DataError(f"{what}: holds one function, no presets; omit #{pick}")
     try:
         if isinstance(parsed, Lines):
             if len(parsed.items) < 9:
@@ -72,7 +72,7 @@ def read(parsed: Any, what: str, pick: str = "") -> TransferFunction:
 
 
 def _counted(what: str, line: str, width: int) -> np.ndarray:
-    """A line of a count and as many numbers, as rows."""
+    """Return the numbers of a line, after their count, as rows."""
     count, *values = floats(what, line)
     if count != len(values) or not values or len(values) % width:
         raise DataError(f"{what}: {len(values)} numbers after the count {count:g}; expected that many, {width} a node")
@@ -80,7 +80,7 @@ def _counted(what: str, line: str, width: int) -> np.ndarray:
 
 
 def _of_fields(name: str, fields: Mapping[str, Any], what: str) -> TransferFunction:
-    """The function of a preset whose ``scalarOpacity``, ``gradientOpacity``, ``colorTransfer`` are lines of numbers."""
+    """Return the function of a preset with ``scalarOpacity``, ``gradientOpacity``, ``colorTransfer`` as lines."""
     opacity, gradient, color = (fields.get(key, "") for key in ("scalarOpacity", "gradientOpacity", "colorTransfer"))
     if not all(isinstance(field, str) for field in (opacity, gradient, color)):
         raise DataError("scalarOpacity, gradientOpacity and colorTransfer; expected text, a count and numbers each")
@@ -100,13 +100,13 @@ def _of_fields(name: str, fields: Mapping[str, Any], what: str) -> TransferFunct
 
 
 def _say_unused(what: str, gradient: bool) -> None:
-    """Say once what a file asks for and is not done."""
+    """Warn that a file's gradient opacity is not used."""
     if gradient:
         warnings.warn(f"{what}: gradient opacity not used", stacklevel=3)
 
 
 def _lighting(what: str, fields: Mapping[str, Any]) -> Lighting | None:
-    """The light of a volume property that is shaded."""
+    """Return the light of a shaded volume property, else None."""
     shade = str(fields.get("shade", "")).strip().lower() in ("1", "true")
     given = {name: floats(key, str(fields[key]))[0] for key, name in _LIGHT.items() if key in fields} if shade else {}
     return preset_lighting(what, shade, given)
