@@ -27,7 +27,8 @@ from vvgt_cli.volume.stored import Stored
 DIMS = (20, 18, 22)  # x, y, z
 FULL = Certificate(
     volume="head.nrrd", sha256="ab" * 32, look="0123456789ab", size=400, rule="inria", psnr=40.25, views=3,
-    seats=(("inria 400 px", 39.5), ("viser 800 px", 38.0)), texture=(0.61, 0.46), position_error=1e-5, seconds=12.5,
+    conditions=(("inria 400 px", 39.5), ("viser 800 px", 38.0)), texture=(0.61, 0.46), position_error=1e-5,
+    seconds=12.5,
     command="vvgt convert head.nrrd --tf 'a b.json'",
 )  # fmt: skip
 SMALL = ("--size", "64", "--max-gaussians", "300", "--steps", "8")
@@ -62,7 +63,7 @@ def made(vvgt, folder, tmp_path):
 
 def evaluated(vvgt, folder, ply, volume="ball.raw", tf="tf.json", *more):
     result = vvgt(
-        "evaluate", ply, "--volume", folder / volume, *RAW, "--tf", folder / tf, "--no-seats", "--json", *more
+        "evaluate", ply, "--volume", folder / volume, *RAW, "--tf", folder / tf, "--no-conditions", "--json", *more
     )
     assert result.code == 0, result.err
     return json.loads(result.out)["certificate"]
@@ -72,7 +73,7 @@ def test_a_line_gives_the_certificate_back() -> None:
     assert FULL.line().startswith("vvgt certificate {")
     assert "\n" not in FULL.line()
     assert Certificate.of(FULL.line().split(None, 2)[2]) == FULL
-    least = replace(FULL, sha256=None, seats=(), texture=None, seconds=None, command=None)
+    least = replace(FULL, sha256=None, conditions=(), texture=None, seconds=None, command=None)
     assert Certificate.of(least.line().split(None, 2)[2]) == least
 
 
@@ -85,7 +86,7 @@ def test_a_line_gives_the_certificate_back() -> None:
         FULL.line().split(None, 2)[2].replace('"size": 400', '"size": true'),
         FULL.line().split(None, 2)[2].replace('"volume"', '"volumes"'),
         FULL.line().split(None, 2)[2].replace('"inria 400 px": 39.5', '"inria 400 px": Infinity'),
-        json.dumps(FULL.facts() | {"seats": [1]}),
+        json.dumps(FULL.facts() | {"conditions": [1]}),
         json.dumps(FULL.facts() | {"texture": [1]}),
         json.dumps(FULL.facts() | {"texture": 1}),
         json.dumps(FULL.facts() | {"texture": [1, "2"]}),
@@ -107,8 +108,8 @@ def test_a_conversion_certifies_its_file(made) -> None:
     assert found is not None
     assert (found.volume, found.size, found.rule, found.views) == ("ball", 64, "inria", 3)
     assert found.psnr > 20
-    assert len(found.seats) == 10
-    assert found.seats[0][1] == min(dB for _, dB in found.seats)
+    assert len(found.conditions) == 10
+    assert found.conditions[0][1] == min(dB for _, dB in found.conditions)
     assert found.command is not None
     assert found.command.startswith("vvgt convert ball.raw --")
     assert "/" not in found.command
@@ -301,7 +302,7 @@ def test_texture_is_certified_as_it_is_measured_from_near(vvgt, folder, tmp_path
     from vvgt_cli.conversion.gaussian_files import open_gaussians
     from vvgt_cli.conversion.place import into_box
     from vvgt_cli.field.source import SourceRequest, load
-    from vvgt_cli.score.viewing import glance_cameras, score_texture
+    from vvgt_cli.score.viewing import score_texture, texture_cameras
     from vvgt_cli.volume import ReadOptions
 
     points = [{"x": 0, "opacity": 0, "rgb": [1, 0, 0]}, {"x": 60, "opacity": 1, "rgb": [1, 0.9, 0.8]}]
@@ -313,7 +314,7 @@ def test_texture_is_certified_as_it_is_measured_from_near(vvgt, folder, tmp_path
     gaussians, header = open_gaussians(str(tmp_path / "out.ply"))
     source = load(SourceRequest(str(folder / "ball.raw"), ReadOptions(dims=DIMS, dtype="uint8"),
                                 str(tmp_path / "solid.json")))  # fmt: skip
-    boxed, cameras = into_box(gaussians, source.volume), glance_cameras(256)
+    boxed, cameras = into_box(gaussians, source.volume), texture_cameras(256)
     assert [(c.width, c.height) for c in cameras] == [(128, 128)]
     found = score_texture(source.scene(), boxed, 256, header.rule, cameras=cameras)
     assert found.blocks >= 4

@@ -34,7 +34,7 @@ def tf(folder, name="dark"):
 
 
 def psnr(vvgt, ply, *more):
-    result = vvgt("evaluate", ply, "--volume", SOURCE, "--no-seats", "--step", "0.5", "--json", *more)
+    result = vvgt("evaluate", ply, "--volume", SOURCE, "--no-conditions", "--step", "0.5", "--json", *more)
     assert result.code == 0, result.err
     return json.loads(result.out)["scores"]["psnr"]
 

@@ -52,11 +52,11 @@ def steps_of(found):
     return 0 if stage is None else stage.steps
 
 
-def ending(edge=48.0, judge=0.06, glance=0.06, size=48):
-    """Seconds of three test views, the seats, texture and the file."""
+def ending(edge=48.0, judge=0.06, check_view=0.06, size=48):
+    """Seconds of three test views, the conditions, texture and the file."""
     near = (size // 2) ** 2  # pixels
     texture = judge * near / edge**2 + 0.05 * near / 400**2
-    return 3 * (judge + 0.03 * (edge / 400) ** 2) + 2 * glance + 0.15 + 0.155 + texture + 0.1
+    return 3 * (judge + 0.03 * (edge / 400) ** 2) + 2 * check_view + 0.15 + 0.155 + texture + 0.1
 
 
 def drawn(size, enough):
@@ -82,7 +82,7 @@ def names(report):
 def test_without_limits_the_default_steps_are_planned_and_back_projection_is_not():
     found = plan()
     assert [stage.name for stage in found.stages] == [
-        "closed form", "check views", "views", "refinement", "test views", "seats"
+        "closed form", "check views", "views", "refinement", "test views", "conditions"
     ]  # fmt: skip
     assert steps_of(found) == STEPS
     assert [name for name, _ in found.left_out] == ["network", "back-projection"]
@@ -98,19 +98,19 @@ def test_views_are_small_where_gaussians_are_wide(size, edge):
     found = plan(size=size)
     descent, views = of(found, Refinement), of(found, TrainingViews)
     assert (descent.small, descent.steps, views.edge) == (True, STEPS, edge)
-    judged, glanced, whole = drawn(size, ENOUGH), drawn(size, FEW), min(size, 300)
-    judge, glance = (1.2 * 0.05 * pixels / whole**2 for pixels in (judged, glanced))
+    judged, check_view_pixels, whole = drawn(size, ENOUGH), drawn(size, FEW), min(size, 300)
+    judge, check_view = (1.2 * 0.05 * pixels / whole**2 for pixels in (judged, check_view_pixels))
     step = 0.027 * (edge / 400) ** 2 + 0.0275
     seconds = (
         1
         + FORM
         + STEPS * step
         + 96 * (edge / whole) ** 2 * 0.05
-        + 4 * glance
-        + ending(judged**0.5, judge, glance, size)
+        + 4 * check_view
+        + ending(judged**0.5, judge, check_view, size)
     )
     assert found.seconds == pytest.approx(seconds)
-    bytes_ = 294e6 + 1240e5 + 32 * (96 * edge**2 + 4 * glanced + size**2)
+    bytes_ = 294e6 + 1240e5 + 32 * (96 * edge**2 + 4 * check_view_pixels + size**2)
     assert found.memory == pytest.approx(2e8 + bytes_, rel=1e-3)
     assert of(plan(size=size, time_budget=20.0), Refinement).small
     for other in (plan(size=size, wide=False), plan(size=size, steps=23)):
@@ -138,11 +138,11 @@ def test_a_large_screen_is_fitted_to_by_its_dilation_on_small_views(tmp_path):
     header = read_ply(tmp_path / "a.ply")[1]
     assert (header.made_for, header.rule) == (800, "inria")
     other = done(tmp_path, FitOptions(600, 800, steps=48, rule="playcanvas"), overwrite=True)
-    by = {(seat["rule"], seat["size"]): seat["psnr"] for seat in report.seats}
-    assert {(seat["rule"], seat["size"]): seat["psnr"] for seat in other.seats}["playcanvas", 800] > by[
+    by = {(one["rule"], one["size"]): one["psnr"] for one in report.conditions}
+    assert {(one["rule"], one["size"]): one["psnr"] for one in other.conditions}["playcanvas", 800] > by[
         "playcanvas", 800
     ]
-    assert report.seats == sorted(report.seats, key=lambda seat: seat["psnr"])
+    assert report.conditions == sorted(report.conditions, key=lambda one: one["psnr"])
     assert len(by) == 10
 
 
@@ -326,7 +326,7 @@ def test_a_target_that_the_closed_form_has_pays_for_nothing_else(tmp_path):
         "check views",
         "write",
         "test views",
-        "seats",
+        "conditions",
         "certificate",
     ]
     assert report.gaussians <= 400 // 8

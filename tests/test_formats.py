@@ -232,7 +232,7 @@ def test_convert_says_what_the_format_costs(tmp_path, vvgt):
     told = json.loads((tmp_path / "r.json").read_text())
     assert told["bytes"] == (tmp_path / "a.spz").stat().st_size
     scored = vvgt("evaluate", tmp_path / "a.spz", "--volume", "example:marschner-lobb:16", "--tf", "viridis", "--json",
-                  "--no-seats", "--step", 0.5)  # fmt: skip
+                  "--no-conditions", "--step", 0.5)  # fmt: skip
     assert scored.code == 0, scored.err
     assert json.loads(scored.out)["size"] == 64
 

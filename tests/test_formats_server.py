@@ -20,7 +20,7 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 
-from vvgt_cli.commands.server import Part, Site, served
+from vvgt_cli.commands.server import Resource, Site, served
 from vvgt_cli.commands.view import expanded
 from vvgt_cli.errors import DataError, UsageError
 from vvgt_cli.gaussians import Gaussians, PlyOptions, read_ply, write_ply
@@ -56,9 +56,9 @@ def site(tmp_path: Path) -> Iterator[str]:
 
     said: list[str] = []
     parts = {
-        "": Part("text/html", lambda: b"page"),
-        "viewer.js": Part("text/javascript", lambda: gzip.compress(b"program"), packed=True),
-        "bad.ply": Part("application/octet-stream", broken),
+        "": Resource("text/html", lambda: b"page"),
+        "viewer.js": Resource("text/javascript", lambda: gzip.compress(b"program"), packed=True),
+        "bad.ply": Resource("application/octet-stream", broken),
     }
     with served(Site(parts, said.append)) as url:
         yield url
@@ -136,7 +136,7 @@ def test_what_was_sent_with_a_request_that_is_refused_is_not_read_as_another(sit
 
 
 def test_two_servers_have_two_ports_and_two_words():
-    parts = {"": Part("text/html", lambda: b"page")}
+    parts = {"": Resource("text/html", lambda: b"page")}
     with served(Site(parts, print)) as one, served(Site(parts, print)) as other:
         assert urlsplit(one).port != urlsplit(other).port
         assert urlsplit(one).path != urlsplit(other).path

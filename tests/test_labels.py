@@ -147,7 +147,7 @@ def test_convert_evaluate_and_views(vvgt, tmp_path: Path, seg: Path) -> None:
     report = json.loads((tmp_path / "a-r.json").read_text())
     assert report["scores"]["psnr"] > 25
     assert np.abs(gaussians.colors[:, 1] - 0.2 * gaussians.colors[:, 0]).max() < 0.1  # no colour that is no mix of both
-    own = vvgt("evaluate", ply, "--volume", seg, "--labels", labels, "--no-seats", "--step", 0.5, "--json", "-q")
+    own = vvgt("evaluate", ply, "--volume", seg, "--labels", labels, "--no-conditions", "--step", 0.5, "--json", "-q")
     assert json.loads(own.out)["scores"]["psnr"] == pytest.approx(report["scores"]["psnr"], abs=1)
     views = ("--views", 2, "--test-views", 1, "--size", 32, "-q", "-o", tmp_path / "views")
     assert vvgt("render-views", seg, "--labels", labels, *views).code == 0
@@ -378,7 +378,7 @@ def test_evaluate_says_where_the_labels_are_others(vvgt, tmp_path: Path, seg: Pa
     again = table(
         tmp_path, JSON.replace("inner_core", "heart").replace("}}", '}, "7": {"color": [1, 1, 1]}}'), "b.json"
     )
-    asked = ("evaluate", ply, "--volume", seg, "--no-seats", "--step", 0.5, "-q")
+    asked = ("evaluate", ply, "--volume", seg, "--no-conditions", "--step", 0.5, "-q")
     for options, others in (
         (("--labels", labels), False),
         (("--labels", again), False),  # other names, and a label that the volume has not got

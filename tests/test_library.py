@@ -146,7 +146,7 @@ def test_results_are_drawn_scored_and_shown(field, converted):
     assert re.match(r'<iframe title="array" sandbox="allow-scripts allow-downloads" ', frame)
     page = html.unescape(re.search(r'srcdoc="([^"]*)"></iframe>$', frame)[1]).encode()
     assert len(read_html(page, "page")) == len(converted.gaussians)
-    scores = vvgt.evaluate(converted, field, TF, spacing=SPACING, seats=False, step=0.5)
+    scores = vvgt.evaluate(converted, field, TF, spacing=SPACING, conditions=False, step=0.5)
     ten = [view["psnr"] for view in scores.scores["per_view"]]
     three = [-10 * np.log10(np.mean([10 ** (-ten[n] / 10) for n in (0, 4, 9)])), np.mean([ten[n] for n in (0, 4, 9)])]
     assert min(three) - 0.3 < converted.scores["psnr"] < max(three) + 0.3

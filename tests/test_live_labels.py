@@ -216,7 +216,7 @@ def test_recolor_takes_another_table_and_hides_labels(vvgt, label_file, tmp_path
     scores = []
     for file in (label_file, tmp_path / "a.ply"):
         shown = ("evaluate", file, "--volume", label_file.parent / "map_label.npy", "--labels", tmp_path / "t.json")
-        scores.append(json.loads(vvgt(*shown, "--json", "--no-seats").out)["scores"]["psnr"])
+        scores.append(json.loads(vvgt(*shown, "--json", "--no-conditions").out)["scores"]["psnr"])
     assert scores[0] == pytest.approx(scores[1], abs=1e-6)
     assert scores[0] > 18
     told = json.loads(vvgt("info", label_file, "--json").out)["live_labels"]

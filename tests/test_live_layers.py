@@ -199,10 +199,10 @@ def test_layers_are_near_their_volume(vvgt, pair) -> None:
     source += ("--layer", f"{pair / 'right.nii'},tf={pair / 'tf.json'}")
     source += ("--layer", f"{pair / 'top_label.nii'},labels={pair / 't.json'}")
     for name in ("live.ply", "blocked.ply"):
-        done = vvgt("evaluate", pair / name, *source, "--json", "--no-seats")
+        done = vvgt("evaluate", pair / name, *source, "--json", "--no-conditions")
         assert done.code == 0, done.err
         assert json.loads(done.out)["scores"]["psnr"] > 21
-    done = vvgt("evaluate", pair / "live.ply", *source[:4], "--json", "--no-seats")
+    done = vvgt("evaluate", pair / "live.ply", *source[:4], "--json", "--no-conditions")
     assert (done.code, "the Gaussians carry values, values, labels" in done.error) == (2, True)
 
 
@@ -218,7 +218,7 @@ def test_a_layer_that_shows_nothing_is_scored_as_recolor_shows_it(vvgt, pair, tm
     for blocks in ((), ("--blocks", "16")):
         scores = []
         for file in (pair / "live.ply", tmp_path / "r.ply"):
-            done = vvgt("evaluate", file, "--volume", *one, "--json", "--no-seats", *blocks)
+            done = vvgt("evaluate", file, "--volume", *one, "--json", "--no-conditions", *blocks)
             assert done.code == 0, done.err
             scores.append(json.loads(done.out)["scores"]["psnr"])
         assert scores[0] == pytest.approx(scores[1], abs=0.01)

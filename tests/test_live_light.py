@@ -109,7 +109,7 @@ def test_recolor_lights_as_it_is_told_and_else_as_the_file_is_lit(vvgt, lit_file
     scores = {}
     for light in ("headlight", "none"):
         shown = ("evaluate", lit_file, "--volume", "example:marschner-lobb:20", "--tf", "viridis", "--light", light)
-        scores[light] = json.loads(vvgt(*shown, "--json", "--no-seats", "--size", 48).out)["scores"]["psnr"]
+        scores[light] = json.loads(vvgt(*shown, "--json", "--no-conditions", "--size", 48).out)["scores"]["psnr"]
     assert scores["headlight"] > scores["none"] - 2
     assert vvgt("render", lit_file, "--light", "x", "--orbit", 1, "--size", 32, "-o", tmp_path / "a").code == 0
     assert vvgt("render", lit_file, "--orbit", 1, "--size", 32, "-o", tmp_path / "b").code == 0

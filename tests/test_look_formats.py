@@ -180,7 +180,8 @@ def test_slicer_presets_xml(vvgt, file, tmp_path: Path) -> None:
     assert vvgt("tf", "convert", source + "#CT-AAA", tmp_path / "ct.json").code == 0
     assert read_transfer_function(str(tmp_path / "ct.json")).lighting == tf.lighting
     assert (
-        "stores no shading" in vvgt("tf", "convert", source + "#CT-AAA", tmp_path / "p.json", "--format", "paraview").err
+        "stores no shading"
+        in vvgt("tf", "convert", source + "#CT-AAA", tmp_path / "p.json", "--format", "paraview").err
     )
     assert vvgt("tf", "show", source + "#MR-Default", "-o", tmp_path / "mr.png").code == 0
 

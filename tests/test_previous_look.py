@@ -114,7 +114,7 @@ def test_what_is_too_far_is_converted_by_itself(session, earlier, look, goal, wh
     assert why in dict(onward.report.left_out)[WARM_START]
     assert np.array_equal(onward.gaussians.means, alone.gaussians.means)
     assert np.array_equal(onward.gaussians.colors, alone.gaussians.colors)
-    assert names(onward)[-1] == "seats"
+    assert names(onward)[-1] == "conditions"
 
 
 def test_refused(session, earlier):

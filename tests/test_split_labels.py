@@ -71,7 +71,7 @@ def test_what_others_hide_is_there_when_they_are_switched_off(vvgt, tmp_path: Pa
     assert len(core) > 50
     scores = json.loads((tmp_path / "r_3-label-3.json").read_text())
     assert scores["scores"]["psnr"] > 25
-    assert [stage["name"] for stage in scores["plan"]["stages"]] == ["test views", "seats"]
+    assert [stage["name"] for stage in scores["plan"]["stages"]] == ["test views", "conditions"]
     assert scores["gaussians"] == len(core)
 
 

@@ -16,7 +16,7 @@ import vvgt_cli
 from tests.test_formats_server import ask
 from tests.test_scale import bodies
 from vvgt_cli.commands.server import Site, served
-from vvgt_cli.commands.streamed_site import streamed_parts
+from vvgt_cli.commands.streamed_site import streamed_resources
 from vvgt_cli.commands.view import named_files
 from vvgt_cli.conversion.shards.apart import errors_apart
 from vvgt_cli.conversion.shards.ladder import Ladder
@@ -275,7 +275,7 @@ def test_info_lists_levels_with_their_errors(vvgt, folder: Path) -> None:
 
 def test_the_page_and_its_files_are_served(folder: Path, tmp_path: Path) -> None:
     assert [file for _, file in named_files([str(folder)])] == [str(folder / "lod-meta.json")]
-    with served(Site(streamed_parts(str(folder / "lod-meta.json")), print)) as url:
+    with served(Site(streamed_resources(str(folder / "lod-meta.json")), print)) as url:
         path = url[url.index("/", 8) :]
         status, text, _ = ask(url)
         assert (status, b'"streamed": true' in text) == (200, True)
@@ -321,10 +321,10 @@ def test_manifests_that_cannot_be_are_one_line(
 
 def test_a_level_is_one_cloud_for_every_command(vvgt, volume: Path, folder: Path, tmp_path: Path) -> None:
     assert vvgt("init", volume, *FIT, "--up", "z", "--blocks", "32", "-o", tmp_path / "a.ply").code == 0
-    alone = json.loads(vvgt("evaluate", tmp_path / "a.ply", "--volume", volume, "--no-seats", "--json").out)
+    alone = json.loads(vvgt("evaluate", tmp_path / "a.ply", "--volume", volume, "--no-conditions", "--json").out)
     found = []
     for name in (f"{folder}", f"{folder / 'lod-meta.json'}#1", f"{folder}#2"):
-        line = ("evaluate", name, "--volume", volume, "--no-seats", "--json")
+        line = ("evaluate", name, "--volume", volume, "--no-conditions", "--json")
         found.append(json.loads(vvgt(*line).out))
     counts = json.loads((folder / "lod-meta.json").read_text())["counts"]
     assert [scores["gaussians"] for scores in found] == counts[:3]

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from vvgt_cli.cli.blocks import block_options, chosen
+from vvgt_cli.cli.blocks import block_options, block_options_of
 from vvgt_cli.cli.fit import fit_options, limit_options, ply_options, rule_option
 from vvgt_cli.cli.options import common_options, light_options, overwrite_option, placed_read_options, tfs_options
 from vvgt_cli.cli.sections import SectionedCommand
@@ -94,8 +94,8 @@ def command(
 
     functions = options["optics"].pop("tf")
     options["optics"]["tf"] = functions[0] if functions else None
-    said = command_line(click.get_current_context(), ASIDE, folders=False)
-    request = replace(convert_request(volume, **options), blocks=chosen(blocks), live=live, command=said)
+    line = command_line(click.get_current_context(), ASIDE, folders=False)
+    request = replace(convert_request(volume, **options), blocks=block_options_of(blocks), live=live, command=line)
     plan = convert_files(
         request, functions, split_labels=split_labels, dry_run=dry_run, shard=shard, console=console
     )  # fmt: skip

@@ -22,7 +22,7 @@ from vvgt_cli.progress import Console
 )  # fmt: skip
 @rule_option("Viewer to imitate when drawing. Default: the one recorded in the file, or inria.")
 @click.option(
-    "--no-seats", "seats", is_flag=True, default=True, flag_value=False,
+    "--no-conditions", "conditions", is_flag=True, default=True, flag_value=False,
     help="Skip the table of viewing conditions (viewers, sizes, close-ups) and the texture of smooth areas.",
 )  # fmt: skip
 @click.option(
@@ -55,12 +55,12 @@ def command(ply: str, volume: str, as_json: bool, blocks: dict[str, Any], consol
     Example:
       vvgt evaluate head.ply --volume head.nrrd --tf bone.json --json
     """
-    from vvgt_cli.cli.blocks import chosen
+    from vvgt_cli.cli.blocks import block_options_of
     from vvgt_cli.cli.fit import source_request
     from vvgt_cli.commands.evaluate import EvaluateRequest, evaluate
 
     source = source_request(volume, options["read"], options["optics"], options["light"])
-    names = ("size", "rule", "step", "seats", "preview", "overwrite")
+    names = ("size", "rule", "step", "conditions", "preview", "overwrite")
     asked = {name: options[name] for name in names}
-    evaluation = evaluate(EvaluateRequest(ply, source, blocks=chosen(blocks), **asked), console)
+    evaluation = evaluate(EvaluateRequest(ply, source, blocks=block_options_of(blocks), **asked), console)
     click.echo(evaluation.to_json() if as_json else evaluation.table(), nl=False)

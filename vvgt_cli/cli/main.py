@@ -16,7 +16,7 @@ from difflib import get_close_matches
 import click
 
 from vvgt_cli.cli.numbers import expand
-from vvgt_cli.cli.process import end_on_signals, ended_by, first_of_group, heard, open_streams
+from vvgt_cli.cli.process import end_on_signals, ended_by, first_of_group, open_streams, received
 from vvgt_cli.errors import UsageError, VvgtError
 from vvgt_cli.version import VERSION
 
@@ -130,7 +130,7 @@ def _stdout_fails() -> bool:
 
 def run(args: Sequence[str] | None = None) -> int:
     """Run a command line and return its exit status; every error is one line on standard error."""
-    heard.clear()
+    received.clear()
     try:
         # not cli.main: it would turn a broken pipe and an interrupt into statuses of its own
         with cli.make_context("vvgt", expand(sys.argv[1:] if args is None else args)) as context:
@@ -140,7 +140,7 @@ def run(args: Sequence[str] | None = None) -> int:
     except BaseException as error:
         if os.environ.get(DEBUG):
             traceback.print_exc()
-        return _status(_ended(heard[0]) if heard else error)
+        return _status(_ended(received[0]) if received else error)
 
 
 def _ended(number: int) -> BaseException:

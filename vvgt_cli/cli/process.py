@@ -16,7 +16,7 @@ from vvgt_cli.progress import MessageStream
 
 GRACE = 0.5  # seconds to end as an exception does, after which the process ends as it is
 ENDING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
-heard: list[int] = []  # signals that have ended the present run; what is raised after one is its doing
+received: list[int] = []  # signals that ended the current run; later exceptions are their effect
 
 
 def open_streams() -> None:
@@ -40,7 +40,7 @@ def open_streams() -> None:
 def end_on_signals() -> None:
     """Make SIGTERM, SIGINT and SIGHUP (unless ignored, as under nohup) end the process like an exception.
 
-    A compiled kernel that is running may replace the exception, so the signal is also recorded in `heard`, which
+    A compiled kernel that is running may replace the exception, so the signal is also recorded in `received`, which
     `vvgt_cli.cli.main.run` reads.
 
     Python runs signal handlers between its own instructions, so a long kernel would delay them. A second thread
@@ -87,16 +87,16 @@ def interruption(say: Callable[[str], None]) -> Iterator[Callable[[], bool]]:
 @contextmanager
 def ending() -> Iterator[list[int]]:
     """Yield a list that receives the number of a signal to end, so that the current step can finish and be saved."""
-    told: list[int] = []
+    caught: list[int] = []
     if threading.current_thread() is not threading.main_thread():
-        yield told  # handlers belong to the main thread
+        yield caught  # handlers belong to the main thread
         return
     names = ("SIGTERM", "SIGINT", "SIGHUP")
     numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
     numbers = [number for number in numbers if signal.getsignal(number) is not signal.SIG_IGN]  # as under nohup
-    before = [signal.signal(number, lambda n, frame: told.append(n)) for number in numbers]
+    before = [signal.signal(number, lambda n, frame: caught.append(n)) for number in numbers]
     try:
-        yield told
+        yield caught
     finally:
         for number, handler in zip(numbers, before, strict=True):
             signal.signal(number, handler)
@@ -108,12 +108,12 @@ def first_of_group() -> bool:
 
 
 def _end(number: int, frame: object) -> None:
-    heard.append(number)
+    received.append(number)
     sys.exit(128 + number)
 
 
 def _interrupt(number: int, frame: object) -> None:
-    heard.append(number)
+    received.append(number)
     raise KeyboardInterrupt
 
 
@@ -122,10 +122,10 @@ def _listen(reader: int) -> None:
         for number in numbers:
             if number in ENDING and signal.getsignal(number) is _end:
                 time.sleep(GRACE)
-                _leave(number)
+                _exit_now(number)
 
 
-def _leave(number: int) -> None:
+def _exit_now(number: int) -> None:
     discard_leftovers()
     if first_of_group():
         with suppress(OSError):

@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from vvgt_cli.cli.blocks import block_options, chosen
+from vvgt_cli.cli.blocks import block_options, block_options_of
 from vvgt_cli.cli.fit import source_request
 from vvgt_cli.cli.options import (
     LABELS,
@@ -147,6 +147,6 @@ def command(
     source = source_request(volume, read, optics | {"tf": None}, light)
     request = ViewsRequest(
         source, optics["tf"], output, CameraRequest(**cameras), Layout(**layout),
-        shard=parse_shard(shard), overwrite=overwrite, blocks=chosen(blocks), **rays,
+        shard=parse_shard(shard), overwrite=overwrite, blocks=block_options_of(blocks), **rays,
     )  # fmt: skip
     render_view_sets(request, console)

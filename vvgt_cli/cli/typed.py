@@ -14,8 +14,8 @@ ASIDE = {  # parameters that do not change what a file of Gaussians holds
     *("threads", "memory", "workers", "scheduler", "block_size"),
 }
 _FOLDERS = re.compile(r".*/(?=[^/])", re.DOTALL)  # before a name
-_IN_PARTS = re.compile(r"[^,=]*/(?=[^/,])")  # before each name of a layer, FILE,tf=TF
-_PART = re.compile(r"\d+/\d+")  # of a job array: no folder
+_LAYER_FOLDERS = re.compile(r"[^,=]*/(?=[^/,])")  # before each name of a layer, FILE,tf=TF
+_SHARD = re.compile(r"\d+/\d+")  # of a job array: no folder
 
 
 def typed(ctx: click.Context) -> list[click.Parameter]:
@@ -34,8 +34,8 @@ def command_line(ctx: click.Context, without: Collection[str] = (), folders: boo
     words = ["vvgt", ctx.command.name or ""]
     for parameter in typed(ctx):
         value = ctx.params.get(parameter.name or "")
-        before = None if folders else _IN_PARTS if parameter.name == "layers" else _FOLDERS
-        values = [_told(str(v), before) for v in (value if isinstance(value, tuple) else [value])]
+        before = None if folders else _LAYER_FOLDERS if parameter.name == "layers" else _FOLDERS
+        values = [_without_folders(str(v), before) for v in (value if isinstance(value, tuple) else [value])]
         if parameter.name in without:
             continue
         if isinstance(parameter, click.Argument):
@@ -47,5 +47,5 @@ def command_line(ctx: click.Context, without: Collection[str] = (), folders: boo
     return shlex.join(words)
 
 
-def _told(value: str, folders: re.Pattern[str] | None) -> str:
-    return value if folders is None or _PART.fullmatch(value) else folders.sub("", value)
+def _without_folders(value: str, folders: re.Pattern[str] | None) -> str:
+    return value if folders is None or _SHARD.fullmatch(value) else folders.sub("", value)

@@ -30,7 +30,7 @@ from vvgt_cli.resources import asked_memory
 
 
 @dataclass(frozen=True)
-class Said:
+class ConsoleLine:
     """A line for the console."""
 
     line: str
@@ -44,7 +44,7 @@ class Progress:
 
 
 @dataclass(frozen=True)
-class Made:
+class Converted:
     """Gaussians that a job produced; `Scored` follows if they were converted.
 
     Attributes:
@@ -54,7 +54,7 @@ class Made:
     """
 
     ply: bytes
-    parts: dict[str, bytes]
+    files: dict[str, bytes]
     live: bool = False
 
 
@@ -78,7 +78,7 @@ class Failed:
     error: VvgtError
 
 
-Message = Said | Progress | Made | Scored | Failed
+Message = ConsoleLine | Progress | Converted | Scored | Failed
 
 
 @dataclass(frozen=True)
@@ -108,9 +108,9 @@ class Converter:
         on_message: called with a job's number and a message about it, on another thread, which holds ``lock``.
     """
 
-    def __init__(self, source: SourceRequest, name: str, heard: Callable[[int, Message], None]) -> None:
+    def __init__(self, source: SourceRequest, name: str, on_message: Callable[[int, Message], None]) -> None:
         """Create the converter; no process is started yet."""
-        self._source, self._name, self._heard = source, name, heard
+        self._source, self._name, self._on_message = source, name, on_message
         self.lock = threading.RLock()
         self._process: subprocess.Popen[bytes] | None = None
         self._number, self._busy, self._scoring = 0, False, False
@@ -138,7 +138,7 @@ class Converter:
             self._folder = None
             atexit.unregister(self._close)
 
-    def ask(self, job: Job) -> int:
+    def submit(self, job: Job) -> int:
         """Start a job in place of the running one, if any, and return its number.
 
         A process that only lacks scores is kept: the next job may continue from its result.
@@ -212,10 +212,10 @@ class Converter:
                     self._end()
                     message = Failed(DataError("out of memory? The system ended the conversion; try --crop"))
                     if awaited:
-                        self._heard(number, message)
+                        self._on_message(number, message)
                     return
                 if number != self._number:
                     continue
-                if isinstance(message, Made | Scored | Failed):
-                    self._busy, self._scoring = False, isinstance(message, Made) and not message.live
-                self._heard(number, message)
+                if isinstance(message, Converted | Scored | Failed):
+                    self._busy, self._scoring = False, isinstance(message, Converted) and not message.live
+                self._on_message(number, message)

@@ -14,7 +14,7 @@ from vvgt_cli.cameras.sets import SIZE
 from vvgt_cli.conversion.certify import checked
 from vvgt_cli.conversion.gaussian_files import STDIN, file_rule, layout_of, open_gaussians
 from vvgt_cli.conversion.place import into_box, preview, upright
-from vvgt_cli.conversion.recolored import SeveralLooks, light_of, under_function
+from vvgt_cli.conversion.recolored import SeveralLooks, apply_function, light_of
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.field import Field, Picture, Resident
 from vvgt_cli.field.open import Wanted, automatic, beside, blocked
@@ -32,11 +32,11 @@ from vvgt_cli.score.record import ConversionReport, Run, StageRecord, document
 from vvgt_cli.score.viewing import (
     CLOSE,
     ViewingCondition,
+    condition_pictures,
     condition_views,
     near_cameras,
     score_conditions,
     score_texture,
-    seat_pictures,
     texture_note,
     viewing_conditions,
     zoomed,
@@ -68,7 +68,7 @@ class EvaluateRequest:
     size: int | None = None
     rule: str | None = None
     step: float = 0.125
-    seats: bool = True
+    conditions: bool = True
     blocks: BlockOptions | None = None
     preview: str | None = None
     overwrite: bool = False
@@ -91,7 +91,7 @@ class Evaluation:
     transfer_function: dict[str, Any]
     reference_psnr: float
     scores: dict[str, Any] = field(default_factory=dict)
-    seats: list[dict[str, Any]] = field(default_factory=list)
+    conditions: list[dict[str, Any]] = field(default_factory=list)
     texture: dict[str, Any] | None = None
     certificate: dict[str, Any] | None = None
     stages: list[StageRecord] = field(default_factory=list)
@@ -112,9 +112,9 @@ class Evaluation:
             lines.append(f"texture on smooth areas, near: {texture_note(Texture(**self.texture))}")
         if self.certificate is not None:
             lines.append(f"certificate {self.certificate['text']}")
-        if self.seats:
-            lines.append(f"\n{'seat':<32}{'psnr':>10}")
-        lines += [f"{ViewingCondition(**seat).name():<32}{seat['psnr']:>10.2f}" for seat in self.seats]
+        if self.conditions:
+            lines.append(f"\n{'viewing condition':<32}{'psnr':>10}")
+        lines += [f"{ViewingCondition(**one).name():<32}{one['psnr']:>10.2f}" for one in self.conditions]
         return "\n".join(lines) + "\n"
 
 
@@ -190,7 +190,7 @@ def shown(gaussians: Gaussians, header: PlyHeader, source: Source, request: Sour
     looks = SeveralLooks(tuple((layer.tf, layer.unit_distance) for layer in source.layers))
     light = light_of(request.light, source.lighting, source.volume.space)
     options = replace(layout_of(header), unit_distance=source.unit_distance, light=light)
-    return under_function(gaussians, header, looks if header.live.others else source.tf, options)
+    return apply_function(gaussians, header, looks if header.live.others else source.tf, options)
 
 
 def evaluate(request: EvaluateRequest, console: Console | None = None) -> Evaluation:
@@ -257,7 +257,7 @@ def _scored(run: Run, request: EvaluateRequest, volume: Field, gaussians: Gaussi
         with run.stage("preview"):
             sheet = preview(volume.views, gaussians, [camera, zoomed(camera, CLOSE)], axes, rule)
             write_png(request.preview, sheet, request.overwrite)
-    if request.seats:
+    if request.conditions:
         _look_around(run, evaluation, volume, gaussians, rule)
     evaluation.stages = run.report.stages
     evaluation.seconds = run.finish().seconds
@@ -270,12 +270,12 @@ def _look_around(run: Run, evaluation: Evaluation, volume: Field, gaussians: Gau
 
     size, settings = evaluation.size, RenderSettings()
     places = viewing_conditions(size)
-    wanted = [Picture(camera, settings, blocks) for _, camera, blocks in seat_pictures(places)]
-    with run.stage("seats") as stage, _together(volume, wanted):
-        seen = condition_views(volume.views, places, settings, progress=run.console.bar("seats"))
-        seats = score_conditions(gaussians, seen)
-        evaluation.seats = [asdict(seat) for seat in seats]
-        stage.note = f"worst: {seats[0].name()}, {seats[0].psnr:.2f} dB"
+    wanted = [Picture(camera, settings, blocks) for _, camera, blocks in condition_pictures(places)]
+    with run.stage("conditions") as stage, _together(volume, wanted):
+        seen = condition_views(volume.views, places, settings, progress=run.console.bar("conditions"))
+        conditions = score_conditions(gaussians, seen)
+        evaluation.conditions = [asdict(condition) for condition in conditions]
+        stage.note = f"worst: {conditions[0].name()}, {conditions[0].psnr:.2f} dB"
     near = [Picture(camera, settings) for camera in near_cameras(size)]
     with run.stage("texture") as stage, _together(volume, near):
         found = score_texture(volume.views, gaussians, size, rule, settings, progress=run.console.bar("texture"))

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from vvgt_cli.cameras.files import read_cameras
 from vvgt_cli.conversion.gaussian_files import STDIN, open_gaussians
 from vvgt_cli.conversion.index import is_index, read_index
-from vvgt_cli.conversion.recolored import FunctionRequest, placed_function, under_function
+from vvgt_cli.conversion.recolored import FunctionRequest, apply_function, placed_function
 from vvgt_cli.errors import DataError, SeveralArrays, SeveralComponents, SeveralSteps, UsageError, VvgtError
 from vvgt_cli.files import seekable
 from vvgt_cli.gaussians import describe, read_ply, write_ply
@@ -89,7 +89,7 @@ def inspect(file: str, read: ReadOptions, function: FunctionRequest | None = Non
 def _shown(file: str, function: FunctionRequest) -> dict[str, Any]:
     gaussians, header = open_gaussians(file)
     tf, options = placed_function(file, header, function)
-    found = under_function(gaussians, header, tf, options)
+    found = apply_function(gaussians, header, tf, options)
     stream = io.BytesIO()
     write_ply(stream, found, options)
     stream.seek(0)

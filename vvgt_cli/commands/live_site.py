@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from vvgt_cli.cameras.sets import SIZE, pixel_width
-from vvgt_cli.commands.converter import Converter, Failed, Job, Made, Message, Progress, Said, Scored
-from vvgt_cli.commands.server import Part
+from vvgt_cli.commands.converter import ConsoleLine, Converted, Converter, Failed, Job, Message, Progress, Scored
+from vvgt_cli.commands.server import Resource
 from vvgt_cli.conversion.gaussian_files import layout_of, open_gaussians
 from vvgt_cli.errors import DataError, VvgtError
 from vvgt_cli.gaussians import Gaussians, PlyOptions, as_stored, write_ply
@@ -72,17 +72,17 @@ class Cloud:
         """Return whether they can be shown under any function."""
         return self.gaussians.live is not None and self.options.live is not None
 
-    def file(self, suffix: str) -> Part:
+    def file(self, suffix: str) -> Resource:
         """Return the file to save, in the format of an ending."""
         if (other := format_of(f"x.{suffix}")) is not None:
-            return Part(BYTES, lambda: encoded(other, self.gaussians, self.options, f"{self.name}.{suffix}"))
+            return Resource(BYTES, lambda: encoded(other, self.gaussians, self.options, f"{self.name}.{suffix}"))
         if self.ply is not None:
-            return Part(BYTES, lambda: self.ply or b"")
+            return Resource(BYTES, lambda: self.ply or b"")
         stream = io.BytesIO()
         write_ply(stream, self.gaussians, self.options)
-        return Part(BYTES, stream.getvalue)
+        return Resource(BYTES, stream.getvalue)
 
-    def under(self, tf: TransferFunction, light: Any = None) -> Cloud:
+    def with_function(self, tf: TransferFunction, light: Any = None) -> Cloud:
         """Return the cloud under another function, which is on data values and has an opacity_unit_distance.
 
         Args:
@@ -118,14 +118,14 @@ class Cloud:
 
     def _labels(self, facts: LiveFacts, sent: Any, distance: float) -> tuple[Palette, LiveFacts]:
         """Return a layer's palette and facts under labels that a page sends."""
-        entries = {label.number: label for label in labels_sent(sent).labels}
+        entries = {label.number: label for label in parse_labels(sent).labels}
         if sorted(entries) != sorted(label.number for label in facts.labels):
             raise DataError("the page's labels differ from the cloud's; expected all of these")
         labels = tuple(replace(entries[label.number], name=label.name) for label in facts.labels)
         return Palette.of_labels(labels, distance * (self.options.scale or 1.0)), replace(facts, labels=labels)
 
-    def labelled(self, sent: Any, light: Any = None) -> Cloud:
-        """Return the cloud with other colours and opacities of its labels (``sent`` as in `labels_sent`).
+    def with_labels(self, sent: Any, light: Any = None) -> Cloud:
+        """Return the cloud with other colours and opacities of its labels (``sent`` as in `parse_labels`).
 
         Raises:
             DataError, UsageError: labels or a light that are not valid, or labels of another cloud.
@@ -134,7 +134,7 @@ class Cloud:
         check_labels([LabelTable("the page's labels", facts.labels)])
         return self._shown(palette, light, replace(self.options, live=facts))
 
-    def layered(self, sent: Any, light: Any = None) -> Cloud:
+    def with_layers(self, sent: Any, light: Any = None) -> Cloud:
         """Return the cloud with other looks of its layers; ``sent`` has a function or labels for each.
 
         Raises:
@@ -150,7 +150,7 @@ class Cloud:
                 tables.append(palette)
                 facts.append(own)
                 continue
-            tf = function_sent(one.get("function"))
+            tf = parse_function(one.get("function"))
             table, own = self._function(layer, tf, len(layers))
             tables.append(table)
             facts.append(replace(own, distance=tf.opacity_unit_distance))
@@ -171,7 +171,7 @@ class Cloud:
         return replace(self, gaussians=found, options=options, ply=None)
 
 
-def labels_sent(sent: Any) -> LabelTable:
+def parse_labels(sent: Any) -> LabelTable:
     """Return the labels of a page: a list of number, color (RGB in [0, 1]) and opacity.
 
     Raises:
@@ -191,7 +191,7 @@ def labels_sent(sent: Any) -> LabelTable:
     return LabelTable(what, tuple(sorted(found, key=lambda label: label.number)))
 
 
-def function_sent(sent: Any) -> TransferFunction:
+def parse_function(sent: Any) -> TransferFunction:
     """Return the function of a page.
 
     Raises:
@@ -208,7 +208,7 @@ def function_sent(sent: Any) -> TransferFunction:
     return tf
 
 
-def page_of(cloud: Cloud, converts: bool) -> dict[str, bytes]:
+def page_files(cloud: Cloud, converts: bool) -> dict[str, bytes]:
     """Return the text of a page, named "", and the file that it loads.
 
     Args:
@@ -232,7 +232,7 @@ def page_of(cloud: Cloud, converts: bool) -> dict[str, bytes]:
     return {"": text.encode("utf-8"), name: file}
 
 
-class Desk:
+class PageController:
     """State of the page, and answers to its requests: progress, the live form, better conversions.
 
     Args:
@@ -242,16 +242,16 @@ class Desk:
     """
 
     def __init__(
-        self, parts: dict[str, Part], posts: dict[str, Callable[[Any], Part]], name: str, console: Console
+        self, resources: dict[str, Resource], posts: dict[str, Callable[[Any], Resource]], name: str, console: Console
     ) -> None:  # fmt: skip
         """Create the state of a page without Gaussians."""
-        self.parts, self.posts, self.name, self.console = parts, posts, name, console
+        self.resources, self.posts, self.name, self.console = resources, posts, name, console
         self.error: VvgtError | None = None
         self.first: Callable[[], Cloud] | None = None
         self.better: bytes | None = None
         self.converter: Converter | None = None
-        self.begun = threading.Event()  # the volume has been read, or cannot be
-        self.there = threading.Event()  # the first page, or an error
+        self.ready = threading.Event()  # the volume has been read, or cannot be
+        self.shown = threading.Event()  # the first page, or an error
         self.waited_for = False  # by a page, for the first one
         self.state: dict[str, Any] = {"number": 0, "state": "first", "said": "starting"}
 
@@ -259,35 +259,35 @@ class Desk:
         """Start the live form of a volume; pages opened meanwhile wait for it."""
         self.converter = converter
         text = waiting_page(self.name, SCRIPT).encode("utf-8")
-        self.parts[""] = Part(HTML, lambda: text)
-        self.parts["state"] = Part(JSON, self._told)
+        self.resources[""] = Resource(HTML, lambda: text)
+        self.resources["state"] = Resource(JSON, self._state_json)
         with converter.lock:
-            converter.ask(None)
+            converter.submit(None)
 
     def show(self, cloud: Cloud) -> None:
         """Show the Gaussians of a file, live if possible."""
         self.first = lambda: cloud
         try:
-            parts = page_of(cloud, converts=False)
+            files = page_files(cloud, converts=False)
         except DataError as error:
             self.console.say(f"{error}; shown under the file's own function")
-            parts = page_of(replace(cloud, gaussians=replace(cloud.gaussians, live=None)), converts=False)
-        self._show(parts, cloud.live)
+            files = page_files(replace(cloud, gaussians=replace(cloud.gaussians, live=None)), converts=False)
+        self._show(files, cloud.live)
 
-    def _show(self, parts: dict[str, bytes], live: bool) -> None:
+    def _show(self, files: dict[str, bytes], live: bool) -> None:
         if live:
             self.posts["save"] = self.save
         if live and self.converter is not None:
             self.posts["function"] = self.function
-        for name, content in parts.items():
-            self.parts[name] = _part(content, BYTES if name else HTML)
-        self.there.set()
+        for name, content in files.items():
+            self.resources[name] = _resource(content, BYTES if name else HTML)
+        self.shown.set()
 
-    def _told(self) -> bytes:
-        self.waited_for = self.waited_for or not self.there.is_set()
+    def _state_json(self) -> bytes:
+        self.waited_for = self.waited_for or not self.shown.is_set()
         return json.dumps(self.state).encode()
 
-    def function(self, sent: Any) -> Part:
+    def function(self, sent: Any) -> Resource:
         """Convert the volume for a function or labels that the page sends; None ends the running conversion.
 
         Raises:
@@ -296,21 +296,21 @@ class Desk:
         assert self.converter is not None
         tf: Job = None
         if sent is not None:
-            tf = labels_sent(sent["labels"]) if isinstance(sent, dict) and "labels" in sent else function_sent(sent)
+            tf = parse_labels(sent["labels"]) if isinstance(sent, dict) and "labels" in sent else parse_function(sent)
             check_labels([tf])
         with self.converter.lock:
-            self.parts.pop(f"{self.state['number']}.ply", None)
+            self.resources.pop(f"{self.state['number']}.ply", None)
             self.better = None
             if tf is None:
                 self.converter.cancel()
                 self.state = {"number": -1, "state": "none", "said": ""}
             else:
-                number = self.converter.ask(tf)
+                number = self.converter.submit(tf)
                 self.state = {"number": number, "state": "working", "said": "beginning"}
             answer = json.dumps({"number": self.state["number"]}).encode()
-        return Part(JSON, lambda: answer)
+        return Resource(JSON, lambda: answer)
 
-    def save(self, sent: Any) -> Part:
+    def save(self, sent: Any) -> Resource:
         """Return a file of what is shown: a conversion by its number, else the first cloud under the look that is sent.
 
         Raises:
@@ -327,20 +327,20 @@ class Desk:
         assert self.first is not None
         cloud = self.first() if number is None or better is None else Cloud.of(better, self.name)
         if sent.get("function") is not None and cloud.live:
-            cloud = cloud.under(function_sent(sent["function"]), sent.get("light"))
+            cloud = cloud.with_function(parse_function(sent["function"]), sent.get("light"))
         if sent.get("labels") is not None and cloud.live:
-            cloud = cloud.labelled(sent["labels"], sent.get("light"))
+            cloud = cloud.with_labels(sent["labels"], sent.get("light"))
         if sent.get("layers") is not None and cloud.live:
-            cloud = cloud.layered(sent["layers"], sent.get("light"))
+            cloud = cloud.with_layers(sent["layers"], sent.get("light"))
         return cloud.file(sent["file"])
 
-    def hear(self, number: int, message: Message) -> None:
+    def on_message(self, number: int, message: Message) -> None:
         """Handle a message of the converter, on its thread."""
-        first = not self.there.is_set()
-        if isinstance(message, Said):
+        first = not self.shown.is_set()
+        if isinstance(message, ConsoleLine):
             if first:
                 self.console.say(message.line)
-                self.begun.set()
+                self.ready.set()
         elif isinstance(message, Progress):
             if self.state["state"] in ("first", "working"):
                 self.state = {**self.state, "said": message.text}
@@ -353,24 +353,24 @@ class Desk:
         else:
             self._better(number, message)
 
-    def _first(self, made: Made) -> None:
+    def _first(self, made: Converted) -> None:
         self.first = cache(lambda: Cloud.of(made.ply, self.name))
-        self._show(made.parts, made.live)
+        self._show(made.files, made.live)
         self.state = {"number": 0, "state": "none", "said": ""}
 
-    def _better(self, number: int, made: Made) -> None:
+    def _better(self, number: int, made: Converted) -> None:
         self.better = made.ply
-        self.parts[f"{number}.ply"] = _part(made.parts["ply"], BYTES)
+        self.resources[f"{number}.ply"] = _resource(made.files["ply"], BYTES)
         self.state = {"number": number, "state": "done", "said": "converted", "file": f"{number}.ply", "scored": False}
         self.console.say("converted for the page's function")
 
     def _failed(self, number: int, error: VvgtError) -> None:
         if self.state["state"] in ("first", "working"):
-            if not self.there.is_set():
+            if not self.shown.is_set():
                 self.error = error
             self.state = {"number": number, "state": "failed", "said": str(error)}
-            self.there.set()
-            self.begun.set()
+            self.shown.set()
+            self.ready.set()
             return
         if self.state["state"] == "done":
             self.state = {**self.state, "said": f"converted, not scored: {error}", "scored": True}
@@ -383,8 +383,8 @@ class Desk:
         self.console.say(f"{scored.psnr:.1f} dB on the test views")
 
 
-def _part(content: bytes, kind: str) -> Part:
-    return Part(kind, lambda: content)
+def _resource(content: bytes, kind: str) -> Resource:
+    return Resource(kind, lambda: content)
 
 
 def plain_name(path: str) -> str:

@@ -110,9 +110,9 @@ def train(peer: Peer, views: PeerViews) -> tuple[ConversionReport, Gaussians]:
             raise UsageError(f"--peer {peer.name}: {peer.command[0]}: {error.strerror}; expected a program") from None
         stage.note = shlex.join(peer.command)
     if done.returncode or not out.is_file():
-        said = (done.stderr.strip() or done.stdout.strip()).decode("utf-8", "replace").splitlines()
+        output = (done.stderr.strip() or done.stdout.strip()).decode("utf-8", "replace").splitlines()
         why = f"exit status {done.returncode}" if done.returncode else f"left no {OUT}"
-        last = f": {said[-1][-TAIL:]}" if said else ""
+        last = f": {output[-1][-TAIL:]}" if output else ""
         raise DataError(f"--peer {peer.name}: {why}{last}; expected a .ply of Gaussians; run it alone to see why")
     gaussians, _ = open_gaussians(str(out))
     run.report.gaussians, run.report.bytes = len(gaussians), out.stat().st_size

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from vvgt_cli.conversion.gaussian_files import open_gaussians, write_gaussians
-from vvgt_cli.conversion.recolored import FunctionRequest, parse_layer_look, placed_function, under_function
+from vvgt_cli.conversion.recolored import FunctionRequest, apply_function, parse_layer_look, placed_function
 from vvgt_cli.gaussians.formats import SUFFIXES
 from vvgt_cli.gaussians.outputs import Output, claimed
 from vvgt_cli.look.lighting import LightOptions
@@ -48,7 +48,7 @@ def recolor(request: RecolorRequest, console: Console | None = None) -> None:
             stage.note = f"{len(gaussians)} Gaussians"
         with run.stage("recolor") as stage:
             tf, options = placed_function(request.ply, header, function)
-            found = under_function(gaussians, header, tf, options)
+            found = apply_function(gaussians, header, tf, options)
             stage.note = f"{len(found)} of them visible under {tf.name}"
         write_gaussians(run, request.output, found, options, request.overwrite)
     run.finish()

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from vvgt_cli.commands.infer import SHIPPED
-from vvgt_cli.commands.ladder import PICTURED, LadderOptions, Reference, pictures, run_rungs, rungs, warm_up
 from vvgt_cli.commands.peers import Peer
+from vvgt_cli.commands.report_runs import PICTURED, Reference, RunOptions, do_runs, pictures, plan_runs, warm_up
 from vvgt_cli.conversion.convert import opened
 from vvgt_cli.conversion.live import refusal
 from vvgt_cli.conversion.request import ConvertRequest, FitOptions
@@ -25,7 +25,7 @@ from vvgt_cli.jit.ahead import INIT
 from vvgt_cli.network.card import find_model
 from vvgt_cli.progress import Console
 from vvgt_cli.score.charts import FILES, draw, write_plots
-from vvgt_cli.score.curves import Series, cost, front, knee, psnr, read_series, table, unit_costs, worst_seat
+from vvgt_cli.score.curves import Series, cost, front, knee, psnr, read_series, table, unit_costs, worst_condition
 from vvgt_cli.score.page import Pictures, page
 from vvgt_cli.score.record import ConversionReport, Run, document
 from vvgt_cli.volume.blocks import check_memory
@@ -41,7 +41,7 @@ class ReportRequest:
     Attributes:
         source: the scene.
         output: folder to write to; created if missing.
-        runs: options of the runs.
+        options: of the runs.
         picture_size: largest edge of the page's pictures, in pixels.
         overwrite: replace files that exist.
         command_line: what the user typed, for the page.
@@ -49,7 +49,7 @@ class ReportRequest:
 
     source: SourceRequest
     output: str
-    ladder: LadderOptions = field(default_factory=LadderOptions)
+    options: RunOptions = field(default_factory=RunOptions)
     picture_size: int = 400
     overwrite: bool = False
     command_line: str = ""
@@ -66,24 +66,24 @@ def report(request: ReportRequest, console: Console | None = None) -> dict[str, 
     if request.source.volume == STDOUT:
         raise UsageError("VOLUME is '-', but every run reads it again; expected a file")
     folder = _folder(request.output, (DATA, TABLE, PAGE, *FILES), request.overwrite)
-    request = replace(request, ladder=_with_model(request.ladder))
-    size = request.ladder.size
+    request = replace(request, options=_with_model(request.options))
+    size = request.options.size
     check_memory(VIEWS * size**2 * VIEW_BYTES, f"--size {size}: test views and ours", "try a smaller --size")
-    fit = FitOptions(request.ladder.max_gaussians, size)
-    whole = ConvertRequest(request.source, fit=fit, blocks=request.ladder.blocks)
+    fit = FitOptions(request.options.max_gaussians, size)
+    whole = ConvertRequest(request.source, fit=fit, blocks=request.options.blocks)
     with opened(Run(console, ConversionReport("report")), whole, INIT) as volume:
         source = volume.source
         live = replace(whole, live=True, fit=FitOptions(fit.max_gaussians, size))
-        request = replace(request, ladder=replace(request.ladder, live=refusal(live, source) is None))
-        warm_up(request.source, request.ladder)
+        request = replace(request, options=replace(request.options, live=refusal(live, source) is None))
+        warm_up(request.source, request.options)
         reference = Reference.render(volume, size, console)
         ceiling = reference.psnr_of("vtk", volume)
     runs, ours = [], []
-    total = len(rungs(request.ladder))
-    for run, images in run_rungs(request.source, request.ladder, reference, console):
+    total = len(plan_runs(request.options))
+    for run, images in do_runs(request.source, request.options, reference, console):
         runs.append(run)
         ours.append(_pngs(pictures(images, PICTURED, request.picture_size)))
-        score = f"PSNR {psnr(run):.2f} dB, worst seat {worst_seat(run):.2f} dB"
+        score = f"PSNR {psnr(run):.2f} dB, worst condition {worst_condition(run):.2f} dB"
         megabytes = f"{run['gaussians']} Gaussians, {run['bytes'] / 1e6:.1f} MB"
         console.stage(f"{len(runs)}/{total}", cost(run), f"{run['name']}: {score}, {megabytes}")
     text = document("vvgt-report", _document(request, source, reference, runs) | {"vtk_psnr": ceiling})
@@ -98,15 +98,15 @@ def report(request: ReportRequest, console: Console | None = None) -> dict[str, 
     return found
 
 
-def _with_model(ladder: LadderOptions) -> LadderOptions:
+def _with_model(options: RunOptions) -> RunOptions:
     """Return the options with the shipped network if none is named and one is installed."""
-    if ladder.model is not None:
-        return ladder
+    if options.model is not None:
+        return options
     try:
         find_model(SHIPPED)
     except UsageError:
-        return ladder
-    return replace(ladder, model=SHIPPED)
+        return options
+    return replace(options, model=SHIPPED)
 
 
 def _document(request: ReportRequest, source: Any, reference: Reference, runs: list[dict[str, Any]]) -> dict[str, Any]:
@@ -115,9 +115,9 @@ def _document(request: ReportRequest, source: Any, reference: Reference, runs: l
         "command_line": request.command_line,
         "volume": volume_record(source),
         "transfer_function": tf_record(source, request.source),
-        "options": asdict(request.ladder),
+        "options": asdict(request.options),
         "reference": {
-            "views": len(reference.cameras), "size": request.ladder.size, "step": reference.step,
+            "views": len(reference.cameras), "size": request.options.size, "step": reference.step,
             "rays": reference.rays,
         },
         "front": best,
@@ -199,4 +199,4 @@ def _write(folder: Path, series: list[Series], title: str, shown: Pictures | Non
     write_text(str(folder / PAGE), page(series, charts, title, shown), overwrite)
 
 
-__all__ = ["LadderOptions", "Peer", "ReportRequest", "compare", "report"]
+__all__ = ["Peer", "ReportRequest", "RunOptions", "compare", "report"]

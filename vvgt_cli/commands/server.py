@@ -35,7 +35,7 @@ _HEADERS = {
 
 
 @dataclass(frozen=True)
-class Part:
+class Resource:
     """Content at a path.
 
     Attributes:
@@ -61,9 +61,9 @@ class Site:
         word: random part of the paths.
     """
 
-    parts: dict[str, Part]
+    resources: dict[str, Resource]
     failed: Callable[[str], None]
-    posts: dict[str, Callable[[Any], Part]] = field(default_factory=dict)
+    posts: dict[str, Callable[[Any], Resource]] = field(default_factory=dict)
     word: str = field(default_factory=lambda: secrets.token_urlsafe(12))
 
     def name(self, path: str) -> str | None:
@@ -114,17 +114,17 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         name = self.site.name(self.path) if self._ours() else None
-        part = None if name is None else self.site.parts.get(name)
-        if part is None:
+        resource = None if name is None else self.site.resources.get(name)
+        if resource is None:
             self.send_error(404 if self._ours() else 403)
             return
         try:
-            content = part.content()
+            content = resource.content()
         except (VvgtError, OSError) as error:
             self.site.failed(str(error))
             self.send_error(500)
             return
-        self._answer(200, part, content)
+        self._answer(200, resource, content)
 
     do_HEAD = do_GET
 
@@ -142,19 +142,19 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_error(413)
             return
         try:
-            part = taken(_parsed(self.rfile.read(int(length))))
-            content = part.content()
+            resource = taken(_parsed(self.rfile.read(int(length))))
+            content = resource.content()
         except VvgtError as error:
-            part = Part("text/plain; charset=utf-8", lambda: b"")
-            self._answer(400, part, " ".join(str(error).split()).encode())
+            resource = Resource("text/plain; charset=utf-8", lambda: b"")
+            self._answer(400, resource, " ".join(str(error).split()).encode())
             return
-        self._answer(200, part, content)
+        self._answer(200, resource, content)
 
-    def _answer(self, status: int, part: Part, content: bytes) -> None:
+    def _answer(self, status: int, resource: Resource, content: bytes) -> None:
         self.send_response_only(status)
-        self.send_header("Content-Type", part.kind)
+        self.send_header("Content-Type", resource.kind)
         self.send_header("Content-Length", str(len(content)))
-        if part.packed:
+        if resource.packed:
             self.send_header("Content-Encoding", "gzip")
         for name, value in _HEADERS.items():
             self.send_header(name, value)

@@ -13,12 +13,12 @@ from functools import partial
 from pathlib import Path
 
 from vvgt_cli.commands.converter import Converter
-from vvgt_cli.commands.live_site import BYTES, HTML, SCRIPT, Cloud, Desk, plain_name, stored
-from vvgt_cli.commands.server import Part, Site, served
-from vvgt_cli.commands.streamed_site import streamed_parts
+from vvgt_cli.commands.live_site import BYTES, HTML, SCRIPT, Cloud, PageController, plain_name, stored
+from vvgt_cli.commands.server import Resource, Site, served
+from vvgt_cli.commands.streamed_site import streamed_resources
 from vvgt_cli.conversion.gaussian_files import STDIN, is_page, layout_of, open_gaussians, write_gaussians, write_page
 from vvgt_cli.conversion.index import files_of, is_index
-from vvgt_cli.conversion.readback import tell_agreement
+from vvgt_cli.conversion.readback import report_agreement
 from vvgt_cli.errors import UsageError
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians import Gaussians, PlyOptions
@@ -84,7 +84,7 @@ def view(request: ViewRequest, announce: Callable[[str], None], console: Console
         gaussians, options = _opened(run, request, file)
         write_gaussians(run, request.output, gaussians, options, request.overwrite)
         run.compile(for_degree(DRAW, gaussians.degree))
-        tell_agreement(run, request.output, gaussians, options)
+        report_agreement(run, request.output, gaussians, options)
 
 
 def _join(run: Run, request: ViewRequest, clouds: Sequence[tuple[str, str]]) -> None:
@@ -172,38 +172,38 @@ def _serve(
     files = [file for _, file in clouds]
     if len(files) > 1:
         _only_gaussians(files)
-    parts = {"viewer.js": Part("text/javascript; charset=utf-8", lambda: asset(PROGRAM), packed=True)}
-    site = Site(parts, run.console.say)
-    desk = Desk(site.parts, site.posts, plain_name(files[0]), run.console)
+    resources = {"viewer.js": Resource("text/javascript; charset=utf-8", lambda: asset(PROGRAM), packed=True)}
+    site = Site(resources, run.console.say)
+    controller = PageController(site.resources, site.posts, plain_name(files[0]), run.console)
     with ExitStack() as stack:
         stack.enter_context(suppress(KeyboardInterrupt))
         if is_streamed(files[0]):
             _refuse_reading(request.source, files[0])
-            parts |= streamed_parts(files[0])
+            resources |= streamed_resources(files[0])
         elif len(files) > 1:
             _refuse_reading(request.source, files[0])
-            parts |= _series(clouds)
+            resources |= _series(clouds)
         elif files[0] == STDIN or is_splats(files[0]):
             _refuse_reading(request.source, files[0])
             gaussians, header = open_gaussians(files[0])
-            desk.show(Cloud(gaussians, layout_of(header), desk.name))
+            controller.show(Cloud(gaussians, layout_of(header), controller.name))
         url = stack.enter_context(served(site, request.port))
-        if not parts.get(""):
+        if not resources.get(""):
             source = replace(request.source, volume=files[0])
-            desk.await_volume(stack.enter_context(Converter(source, desk.name, desk.hear)))
-            desk.begun.wait(SOON)
-        if desk.error is None:
+            controller.await_volume(stack.enter_context(Converter(source, controller.name, controller.on_message)))
+            controller.ready.wait(SOON)
+        if controller.error is None:
             announce(url)
             opened = request.browser and display() and webbrowser.open(url)
             run.console.say(f"{'shown in a browser' if opened else 'open this address in a browser'}; Ctrl-C stops")
-        while desk.error is None:
+        while controller.error is None:
             time.sleep(TICK)  # a signal may reach another thread, which wakes nobody here
-        if desk.waited_for:
+        if controller.waited_for:
             time.sleep(LINGER)
-        raise desk.error
+        raise controller.error
 
 
-def _series(clouds: Sequence[tuple[str, str]]) -> dict[str, Part]:
+def _series(clouds: Sequence[tuple[str, str]]) -> dict[str, Resource]:
     """Return the page of several files, and each file, read when it is requested."""
 
     def content(k: int) -> bytes:
@@ -212,8 +212,8 @@ def _series(clouds: Sequence[tuple[str, str]]) -> dict[str, Part]:
 
     first, frames = content(0), [{"name": name, "file": f"{k}.ply"} for k, (name, _) in enumerate(clouds)]
     text = page(f"{clouds[0][0]} - vvgt", columns_of(first, clouds[0][1]), frames, SCRIPT)
-    parts = {f"{k}.ply": Part(BYTES, partial(content, k)) for k in range(len(clouds))}
-    return parts | {"": Part(HTML, lambda: text.encode("utf-8")), "0.ply": Part(BYTES, lambda: first)}
+    resources = {f"{k}.ply": Resource(BYTES, partial(content, k)) for k in range(len(clouds))}
+    return resources | {"": Resource(HTML, lambda: text.encode("utf-8")), "0.ply": Resource(BYTES, lambda: first)}
 
 
 def display() -> bool:

@@ -34,7 +34,7 @@ def certified(
         gaussians: as they are written, unit frame.
         command: as `Certificate.command`; ``live_psnr``: as of it, not rounded.
     """
-    scores, seats = run.report.scores, [ViewingCondition(**seat) for seat in run.report.seats or ()]
+    scores, conditions = run.report.scores, [ViewingCondition(**condition) for condition in run.report.conditions or ()]
     if not ply.comments or scores is None:
         return ply
     found = Certificate(
@@ -46,7 +46,7 @@ def certified(
         psnr=round(first_views(scores), 2),
         views=len(PREVIEW_VIEWS),
         live_psnr=None if live_psnr is None else round(live_psnr, 2),
-        seats=tuple((seat.name(), round(seat.psnr, 2)) for seat in seats),
+        conditions=tuple((condition.name(), round(condition.psnr, 2)) for condition in conditions),
         texture=_texture(run.report.texture),
         position_error=position_error(gaussians, ply),
         seconds=round(run.elapsed(), 1) if epoch() is None else None,

@@ -29,7 +29,7 @@ def _is_drawn(output: str, options: PlyOptions) -> bool:
     return found is not None and (found.suffix != ".html" or options.live is None)
 
 
-def tell_agreement(run: Run, output: str, gaussians: Gaussians, options: PlyOptions) -> None:
+def report_agreement(run: Run, output: str, gaussians: Gaussians, options: PlyOptions) -> None:
     """Say how near pictures of a file just written are to those of the Gaussians; of a `.ply` nothing.
 
     Args:

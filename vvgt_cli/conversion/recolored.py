@@ -91,7 +91,7 @@ def parse_layer_look(text: str) -> LayerLook:
     return LayerLook(name, given.get("tf"), given.get("labels"), given.get("distance"))
 
 
-def under_function(gaussians: Gaussians, facts: FileFacts, tf: Look, options: PlyOptions) -> Gaussians:
+def apply_function(gaussians: Gaussians, facts: FileFacts, tf: Look, options: PlyOptions) -> Gaussians:
     """What Gaussians that carry values are under a function on data values (or labels under a table) and the light of
     ``options``, unit frame.
 
@@ -330,9 +330,9 @@ def shown(name: str, gaussians: Gaussians, header: PlyHeader, function: Function
     """The Gaussians of a file under a function that is given, as they are without.
 
     Raises:
-        DataError, UsageError: as `placed_function` and `under_function`; a range or a distance without a function.
+        DataError, UsageError: as `placed_function` and `apply_function`; a range or a distance without a function.
     """
     if function is None:
         return gaussians
     tf, options = placed_function(name, header, function)
-    return under_function(gaussians, header, tf, options)
+    return apply_function(gaussians, header, tf, options)

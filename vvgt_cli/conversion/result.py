@@ -129,12 +129,12 @@ class Result:
             DataError: they carry none, or the function shows nothing of them.
             UsageError: a range, a distance or a light that is none.
         """
-        from vvgt_cli.conversion.recolored import FunctionRequest, layer_look, placed_function, under_function
+        from vvgt_cli.conversion.recolored import FunctionRequest, apply_function, layer_look, placed_function
 
         others = tuple(layer_look(self.ply, key, one) for key, one in (layers or {}).items())
         asked = FunctionRequest(look, range, unit_distance, labels, light or LightOptions(), others)
         tf, options = placed_function("result", self.ply, asked)
-        found = under_function(self.gaussians, self.ply, tf, options)
+        found = apply_function(self.gaussians, self.ply, tf, options)
         return Result(found, ConversionReport("recolor"), options)
 
     def normals(self) -> np.ndarray | None:

@@ -62,7 +62,7 @@ class Workload:
         return self._pixels(ENOUGH)
 
     @cached_property
-    def glanced(self) -> int:
+    def check_view_pixels(self) -> int:
         """Pixels of a check view that are drawn: all, or blocks."""
         return self._pixels(FEW)
 
@@ -75,9 +75,9 @@ class Workload:
         return FINER * self.view * pixels / self.edge**2
 
     @property
-    def glance(self) -> float:
+    def check_view_seconds(self) -> float:
         """Seconds of a check view's reference."""
-        return self.judging(self.glanced)
+        return self.judging(self.check_view_pixels)
 
     def at(self, pace: float) -> Workload:
         """The same on a machine that takes ``pace`` times as long; what was timed stays."""

@@ -31,7 +31,7 @@ class Certificate:
         psnr: dB, mean of the first scored views against the volume.
         views: number of these views.
         live_psnr: dB of a live file as `vvgt recolor` shows it under its own function; None of others.
-        seats: name of a viewing condition and dB of each that was scored, worst first.
+        conditions: name of a viewing condition and dB of each that was scored, worst first.
         texture: on smooth areas from near, of the Gaussians and of the volume, levels of 255; None where nothing is
             opaque and smooth.
         position_error: greatest distance of a centre in the file from where it was computed, in units of the world.
@@ -47,7 +47,7 @@ class Certificate:
     psnr: float
     views: int
     live_psnr: float | None = None
-    seats: tuple[tuple[str, float], ...] = ()
+    conditions: tuple[tuple[str, float], ...] = ()
     texture: tuple[float, float] | None = None
     position_error: float = 0.0
     seconds: float | None = None
@@ -55,7 +55,7 @@ class Certificate:
 
     def facts(self) -> dict[str, Any]:
         """By name, without what is not known."""
-        found = vars(self) | {"seats": dict(self.seats)}
+        found = vars(self) | {"conditions": dict(self.conditions)}
         return {key: value for key, value in found.items() if value not in (None, {})}
 
     def line(self) -> str:
@@ -70,9 +70,9 @@ class Certificate:
             ValueError: anything else.
         """
         found = json.loads(text)
-        if not isinstance(found, dict) or not isinstance(found.get("seats", {}), dict):
+        if not isinstance(found, dict) or not isinstance(found.get("conditions", {}), dict):
             raise ValueError(text)
-        seats = tuple((str(name), _number(value)) for name, value in found.pop("seats", {}).items())
+        conditions = tuple((str(name), _number(value)) for name, value in found.pop("conditions", {}).items())
         woven = found.pop("texture", None)
         if woven is not None and (not isinstance(woven, list) or len(woven) != 2):
             raise ValueError(text)
@@ -89,7 +89,7 @@ class Certificate:
             found[key] = _number(value) if kind is float else value
             if not isinstance(found[key], kind) or isinstance(value, bool):
                 raise ValueError(text)
-        return cls(**(known | found), seats=seats)
+        return cls(**(known | found), conditions=conditions)
 
 
 def _number(value: Any) -> float:

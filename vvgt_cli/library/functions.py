@@ -181,7 +181,7 @@ def evaluate(
     size: int | None = None,
     rule: str | None = None,
     step: float = 0.125,
-    seats: bool = True,
+    conditions: bool = True,
     blocks: int | str | None = None,
     progress: bool = False,
     **reading: Unpack[Reading],
@@ -193,7 +193,7 @@ def evaluate(
         volume, look, reading: as of `convert`.
         size, rule: to score at and draw by; None: the file's.
         step: of the reference, in voxels.
-        seats: every rule at several sizes and close up, too.
+        conditions: every rule at several sizes and close up, too.
         blocks: as of `convert`.
         progress: lines and bars on standard error.
 
@@ -203,7 +203,7 @@ def evaluate(
     from vvgt_cli.commands import evaluate as pipeline
 
     source = source_of(volume, look, reading)
-    request = pipeline.EvaluateRequest(ply_of(ply), source, size, rule, step, seats, _blocks(blocks))
+    request = pipeline.EvaluateRequest(ply_of(ply), source, size, rule, step, conditions, _blocks(blocks))
     return pipeline.evaluate(request, console_of(progress))
 
 

@@ -50,8 +50,8 @@ def to_text(tf: TransferFunction, form: str) -> str:
 def _linear(function: PiecewiseOpacity | ColorMap) -> bool:
     """Return whether values between nodes are linear, in their colour space."""
     inner = slice(0, -1)  # the last node's are of no segment
-    straight = (function.midpoint[inner] == 0.5) & (function.sharpness[inner] == 0)
-    return bool(straight.all())
+    linear = (function.midpoint[inner] == 0.5) & (function.sharpness[inner] == 0)
+    return bool(linear.all())
 
 
 def _refuse(tf: TransferFunction, what: str, form: str, hint: str) -> DataError:

@@ -17,7 +17,7 @@ NAME = "fog"
 THIN, THICK = 0.02, 0.3  # opacity per `UNIT_SHARE` of the box's edge, right beside the background and farthest from it
 BETWEEN = 9  # places around a node where the function that is given may show something
 NODES = 129  # of a function over 256 bins
-HIDDEN = 0.25  # how much a label of opacity 0 counts, which another table may show
+HIDDEN_WEIGHT = 0.25  # how much a label of opacity 0 counts, which another table may show
 SMALL = 2 / 3  # power of a label's voxels that its cells count less by: small ones are to keep their shape
 GOLDEN = 0.6180339887498949  # labels of neighbouring numbers get codes far from each other
 
@@ -67,6 +67,6 @@ def label_fog(table: LabelTable, voxels: Mapping[int, int]) -> LabelTable:
     least, labels = max(min(voxels.values(), default=1), 1), []
     for number, label in enumerate(table.labels):
         code, weight = (number * GOLDEN) % 1, (least / max(voxels.get(label.number, least), least)) ** SMALL
-        weight *= 1 if label.opacity > 0 else HIDDEN
+        weight *= 1 if label.opacity > 0 else HIDDEN_WEIGHT
         labels.append(replace(label, color=(code, code**2, weight), opacity=THIN if label.number in voxels else 0.0))
     return LabelTable(NAME, tuple(labels))

@@ -68,7 +68,7 @@ class PiecewiseOpacity:
 
     def __post_init__(self) -> None:
         """Check and sort the nodes."""
-        _settle(self, "opacity function", "y", "opacity")
+        _check_nodes(self, "opacity function", "y", "opacity")
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
         """Return the opacity at x of any shape, float64; 0 at NaN."""
@@ -136,7 +136,7 @@ class ColorMap:
         count = np.shape(self.x)[0] if np.ndim(self.x) else 0
         if np.shape(self.rgb) != (count, 3):
             raise DataError(f"colour function: {count} nodes, colours of shape {np.shape(self.rgb)}; expected (n, 3)")
-        _settle(self, "colour function", "rgb", "colour")
+        _check_nodes(self, "colour function", "rgb", "colour")
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
         """Return RGB at data values x of any shape, float64, one axis of 3 behind it; ``nan_color`` at NaN."""
@@ -163,7 +163,7 @@ class ColorMap:
         return found
 
 
-def _settle(nodes: PiecewiseOpacity | ColorMap, what: str, column: str, called: str) -> None:
+def _check_nodes(nodes: PiecewiseOpacity | ColorMap, what: str, column: str, called: str) -> None:
     """Check the arrays of a function and sort them as VTK does (equal positions keep their order), float64.
 
     Args:

@@ -65,7 +65,7 @@ def from_histogram(statistics: StatisticsLike, hounsfield: bool = False, density
     (`contours`). Hounsfield units (stated, or air near -1000 and tissue around 0) get `TISSUES`. For other values the
     peak with most voxels is background: its foot is found by the triangle method (Zack, Rogers, Latt 1977) on each side
     that leads to more data; a second dominant peak right behind it (air behind narrow padding) is skipped too. Every
-    other value contributes to an optical depth of `DEPTH`, by the square of its distance from the background and however
+    other value contributes to an optical depth of `DEPTH`, by the square of its distance from the background, however
     many voxels hold it: common values are thin, rare ones dense. Data without a dominant peak are shown whole.
 
     Args:

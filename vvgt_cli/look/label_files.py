@@ -45,7 +45,7 @@ EXPECTED = (
     "(index, name, R, G, B or color), .seg.nrrd, "
     'DICOM SEG, or JSON {"1": {"name": ..., "color": [r, g, b], "opacity": a}}'
 )
-_WHOLE, _PART = re.compile(r"-?[0-9]{1,10}"), re.compile(r"-?[0-9]{1,10}(\.[0-9]{1,20})?")
+_INTEGER, _DECIMAL = re.compile(r"-?[0-9]{1,10}"), re.compile(r"-?[0-9]{1,10}(\.[0-9]{1,20})?")
 Row = tuple[str, int, str, Any, float | None]  # place for errors, label, name, colour in [0, 1], A / 255 or None
 _SNAP = re.compile(
     r'(-?[0-9]{1,10})\s+([0-9]{1,3})\s+([0-9]{1,3})\s+([0-9]{1,3})\s+([0-9]{1,3}(?:\.[0-9]*)?)\s+([01])\s+([01])\s+"(.*)"'
@@ -66,7 +66,7 @@ def is_table(path: Path) -> bool:
         text = text_of(path, "a table of labels")
         if text.lstrip().startswith("{"):
             parsed = json_of(text, path, "a table of labels")
-            return bool(parsed) and all(_WHOLE.fullmatch(key) and isinstance(v, dict) for key, v in parsed.items())
+            return bool(parsed) and all(_INTEGER.fullmatch(key) and isinstance(v, dict) for key, v in parsed.items())
     except DataError:
         return False
     rows = (line.strip() for line in text.splitlines())
@@ -149,13 +149,13 @@ def _separated(text: str, path: Path) -> list[Label]:
     comma, rows, head = max("\t,;", key=lines[0].count), list[Row](), list[str]()
     try:
         head = [cell.strip().lower() for cell in next(csv.reader(lines, delimiter=comma), [])]
-        names, body = (NAMELESS, lines) if _WHOLE.fullmatch("".join(head[:1])) else (head, lines[1:])
+        names, body = (NAMELESS, lines) if _INTEGER.fullmatch("".join(head[:1])) else (head, lines[1:])
         for n, cells in enumerate(csv.DictReader(body, names, delimiter=comma), 1):
             texts = {key: " ".join(cell.splitlines()).strip() for key, cell in cells.items() if isinstance(cell, str)}
             found = {key: next((texts[k] for k in keys if texts.get(k)), "") for key, keys in COLUMNS.items()}
             value, color = found["number"].removesuffix(".0"), [found[key] for key in "rgb" if found[key]]
-            numbers = all(_PART.fullmatch(found[key] or "0") for key in "rgba")
-            if not _WHOLE.fullmatch(value) or len(color) in (1, 2) or not numbers:
+            numbers = all(_DECIMAL.fullmatch(found[key] or "0") for key in "rgba")
+            if not _INTEGER.fullmatch(value) or len(color) in (1, 2) or not numbers:
                 raise DataError(f"{path}: row {n}: label {value[:20]!r}, colour {', '.join(color)[:40]}; {EXPECTED}")
             shown = [float(v) / 255 for v in color] or _hex(found["color"])
             last = float(found["a"]) / 255 if found["a"] else None
@@ -168,8 +168,8 @@ def _separated(text: str, path: Path) -> list[Label]:
 def _labels(rows: list[Row], path: Path, text: str, opacity: bool) -> list[Label]:
     """Make labels from rows, with distinct colours for those without; ``opacity``: column A is known to be opacity."""
     opacity = opacity or _is_opacity([row[4] for row in rows if row[1] and row[4] is not None], path, text)
-    parts = [v * 255 for row in rows for v in row[3] or ()]
-    if parts and max(parts) <= 1 and any(v % 1 for v in parts):
+    channels = [v * 255 for row in rows for v in row[3] or ()]
+    if channels and max(channels) <= 1 and any(v % 1 for v in channels):
         raise DataError(f"{path}: no colour above 1; expected red, green and blue from 0 to 255")
     colors: dict[int, Any] = {}
     if blank := [row[1] for row in rows if row[3] is None]:
@@ -215,9 +215,9 @@ def _plain(line: str) -> tuple[str, str, Sequence[str], float | None] | None:
     expression would take cubic time on a line of blanks.
     """
     words = line.split()
-    last = next((k for k, word in enumerate(reversed(words)) if not _PART.fullmatch(word)), len(words))
+    last = next((k for k, word in enumerate(reversed(words)) if not _DECIMAL.fullmatch(word)), len(words))
     many = min(last, len(words) - 2, 4)  # of the numbers at the end; label and name come before
-    if many < 3 or not _WHOLE.fullmatch(words[0]):
+    if many < 3 or not _INTEGER.fullmatch(words[0]):
         return None
     name = line.split(None, 1)[1].rsplit(None, many)[0].strip('"')
     return words[0], name, words[-many:][:3], float(words[-1]) / 255 if many == 4 else None
@@ -225,17 +225,17 @@ def _plain(line: str) -> tuple[str, str, Sequence[str], float | None] | None:
 
 def _segments(header: str, what: str, layer: int | None = None) -> list[Label]:
     """Read the segments in a NRRD header, of one layer or of all."""
-    parts: dict[str, dict[str, str]] = {}
+    segments: dict[str, dict[str, str]] = {}
     for index, key, value in re.findall(r"^Segment([0-9]{1,9})_(\w+):=(.*)$", header, re.M):
-        parts.setdefault(index, {})[key] = value.strip()
+        segments.setdefault(index, {})[key] = value.strip()
     found = []
-    for index, part in parts.items():
-        if layer is not None and part.get("Layer", "0") != str(layer):
+    for index, segment in segments.items():
+        if layer is not None and segment.get("Layer", "0") != str(layer):
             continue
-        color, label = part.get("Color", "").split(), part.get("LabelValue", str(int(index) + 1))
+        color, label = segment.get("Color", "").split(), segment.get("LabelValue", str(int(index) + 1))
         if not re.fullmatch(r"\d{1,10}", label) or not all(_is_number(c) for c in color):
             raise DataError(f"{what}: segment {index}: label {label!r}, colour {color}; expected numbers")
-        name = part.get("Name", part.get("ID", f"label {label}"))
+        name = segment.get("Name", segment.get("ID", f"label {label}"))
         found.append(_label(f"{what}: segment {index}", int(label), name, [float(c) for c in color], SOLID))
     return found
 

@@ -28,8 +28,8 @@ def background_bins(counts: np.ndarray) -> tuple[int, int]:
     if first == 0 and last <= PADDING_BINS and rest.sum() > 0:
         a, b = _peak(rest)
         behind = rest[b:].sum()
-        apart = 0 < a <= counts.size // 2  # at 0 it is the padding's own falling tail
-        if apart and rest[a:b].sum() >= DOMINANT * total and behind >= BEHIND_AIR * rest.sum():
+        separate = 0 < a <= counts.size // 2  # at 0 it is the padding's own falling tail
+        if separate and rest[a:b].sum() >= DOMINANT * total and behind >= BEHIND_AIR * rest.sum():
             last += b
     return first, last
 

@@ -65,8 +65,8 @@ def _draw_curve(axes: Any, tf: TransferFunction, x: np.ndarray) -> None:
     y = tf.opacity(x)
     colors = tf.color(np.linspace(x[0], x[-1], SAMPLES))[None]  # (1, SAMPLES, 3)
     outline = np.concatenate([[(x[0], 0)], np.column_stack([x, y]), [(x[-1], 0)]])
-    under = Polygon(outline, closed=True, transform=axes.transData)
-    axes.imshow(colors, aspect="auto", extent=(x[0], x[-1], 0, 1.02), clip_path=under, zorder=1)
+    area = Polygon(outline, closed=True, transform=axes.transData)
+    axes.imshow(colors, aspect="auto", extent=(x[0], x[-1], 0, 1.02), clip_path=area, zorder=1)
     nodes = tf.opacity_nodes
     axes.plot(x, y, color="black", linewidth=1.2)
     axes.plot(nodes.x, nodes.y, "o", color="black", markerfacecolor="white", markersize=4, clip_on=False)

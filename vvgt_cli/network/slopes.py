@@ -20,7 +20,7 @@ from vvgt_cli.splat.half import halved
 FIELDS = ((0, 3), (3, 6), (6, 9), (9, 10), (10, 13))  # d, e, w, logit, colour: columns of a step
 
 
-def own_frame(
+def own_axes_gradients(
     quaternions: np.ndarray, axes: np.ndarray, scales: np.ndarray, gradients: Sequence[np.ndarray]
 ) -> np.ndarray:
     """Return (K, 13) gradients by a step in the own axes, from those by the fields of `Gaussians`, in their order.
@@ -66,7 +66,7 @@ def slope_rows(gaussians: Gaussians, cameras: Sequence[Camera], images: np.ndarr
         rest = image - view
         slope = render_backward(g, camera, projection, image, 2 * rest)
         fields = slope.means, slope.log_scales, slope.quaternions, slope.opacity_logits, slope.colors
-        own = own_frame(g.quaternions, axes, scales, fields)
+        own = own_axes_gradients(g.quaternions, axes, scales, fields)
         total += own
         squares += own * own
         size = np.sqrt((rest**2).mean(axis=2))  # (h, w) RMS over RGBA

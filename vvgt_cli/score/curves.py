@@ -19,13 +19,13 @@ from vvgt_cli.errors import DataError
 
 Run = dict[str, Any]
 FORMATS = ("vvgt-report", "vvgt-conversion")
-SCORING = ("test views", "seats", "certificate")  # stages that only measure, or write what has been measured
+SCORING = ("test views", "conditions", "certificate")  # stages that only measure, or write what has been measured
 KINDS = ("closed form", "network", "steps", "baseline", "live", "peer")
 STAGES = {  # colours of the stages that are known, in order
     "read": "#8a949e", "scene": "#b4bbc2", "samples": "#8f7bbf", "closed form": "#2f7fbf", "check views": "#f2c76b",
     "views": "#e69f00", "cells by error": "#0f8f8f", "back-projection": "#56b4e9", "network": "#cc79a7",
     "judge": "#e3b5cd", "refinement": "#009e73", "training": "#6b7fd1", "values": "#c9b458", "live look": "#dddddd",
-    "write": "#777c83", "test views": "#dddddd", "seats": "#e8e8e8", "certificate": "#c4c4c4",
+    "write": "#777c83", "test views": "#dddddd", "conditions": "#e8e8e8", "certificate": "#c4c4c4",
 }  # fmt: skip
 OTHER = "#a05d3b"
 SCORES = ("psnr", "psnr_foreground", "psnr_white", "psnr_alpha", "ssim", "flip")
@@ -60,9 +60,9 @@ def psnr(run: Run) -> float | None:
     return None if not run.get("scores") else run["scores"]["psnr"]
 
 
-def worst_seat(run: Run) -> float | None:
+def worst_condition(run: Run) -> float | None:
     """PSNR where the run looks least like the volume (`vvgt_cli.score.viewing`), dB; None without."""
-    return min((seat["psnr"] for seat in run.get("seats") or ()), default=None)
+    return min((condition["psnr"] for condition in run.get("conditions") or ()), default=None)
 
 
 def front(runs: Sequence[Run]) -> list[Run]:
@@ -125,7 +125,7 @@ def table(runs: Sequence[Run]) -> str:
         "gaussians",
         "bytes",
         *SCORES,
-        "worst_seat",
+        "worst_condition",
         "pareto",
         *(f"seconds: {s}" for s in stages),
     ]
@@ -134,7 +134,7 @@ def table(runs: Sequence[Run]) -> str:
     for run in runs:
         scores = run.get("scores") or {}
         row = [run["name"], run["kind"], f"{cost(run):.4f}", run["gaussians"], run["bytes"]]
-        numbers = [*(scores.get(key) for key in SCORES), worst_seat(run)]
+        numbers = [*(scores.get(key) for key in SCORES), worst_condition(run)]
         row += ["" if number is None else f"{number:.4f}" for number in numbers]
         seconds = _seconds(run)
         row += [int(id(run) in best), *(f"{seconds[s]:.4f}" if s in seconds else "" for s in stages)]

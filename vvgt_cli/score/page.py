@@ -9,7 +9,7 @@ from html import escape
 from typing import Any
 
 from vvgt_cli.score.charts import Chart
-from vvgt_cli.score.curves import Run, Series, cost, front, knee, psnr, short, worst_seat
+from vvgt_cli.score.curves import Run, Series, cost, front, knee, psnr, short, worst_condition
 from vvgt_cli.score.style import CSS, SCRIPT
 
 GAIN = 8  # of the difference at first
@@ -148,7 +148,7 @@ def _cell(value: Any, digits: int) -> str:
 
 
 def _table(series: Sequence[Series]) -> str:
-    heads = ("run", "seconds", "PSNR", "foreground", "worst seat", "SSIM", "FLIP", "Gaussians", "MB")
+    heads = ("run", "seconds", "PSNR", "foreground", "worst condition", "SSIM", "FLIP", "Gaussians", "MB")
     rows = []
     for one in series:
         best = {id(run) for run in front(one.scored())}
@@ -156,7 +156,7 @@ def _table(series: Sequence[Series]) -> str:
             scores = run.get("scores") or {}
             cells = [
                 f"{cost(run):.2f}", _cell(scores.get("psnr"), 2), _cell(scores.get("psnr_foreground"), 2),
-                _cell(worst_seat(run), 2), _cell(scores.get("ssim"), 4), _cell(scores.get("flip"), 4),
+                _cell(worst_condition(run), 2), _cell(scores.get("ssim"), 4), _cell(scores.get("flip"), 4),
                 f"{run['gaussians']:,}",
                 f"{run['bytes'] / 1e6:.2f}",
             ]  # fmt: skip
@@ -165,7 +165,7 @@ def _table(series: Sequence[Series]) -> str:
     head = "".join(f"<th>{name}</th>" for name in heads)
     return (
         f'<section><h2>All runs</h2><div class="scroll"><table><tr>{head}</tr>{"".join(rows)}</table></div>'
-        "<p><small>Bold: nothing is both faster and nearer. Worst seat: the lowest PSNR of every rule of drawing, "
+        "<p><small>Bold: nothing is both faster and nearer. Worst condition: the lowest PSNR of every rule of drawing, "
         "at the size made for and on the next larger screen, in one view.</small></p></section>"
     )
 

@@ -58,8 +58,8 @@ class ConversionReport:
         stages: in the order they ran.
         gaussians, bytes: of the file written.
         scores: on the test views, None for `init`.
-        seats: `convert`'s scores by every rule at the size made for and above (`vvgt_cli.score.viewing`), worst first.
-        texture: of `convert`, on smooth areas of its `glance_cameras`.
+        conditions: `convert`'s scores by every rule, at its size and above (`vvgt_cli.score.viewing`), worst first.
+        texture: of `convert`, on smooth areas of its `texture_cameras`.
         plan: estimates of `convert` (`vvgt_cli.conversion.plan.Plan`): stages, seconds, bytes, memory.
         left_out: (stage, why) of what was not done.
         refinement: what gradient descent did (`vvgt_cli.refine.OptimizeRecord`), None without it.
@@ -74,7 +74,7 @@ class ConversionReport:
     gaussians: int = 0
     bytes: int = 0
     scores: dict[str, Any] | None = None
-    seats: list[dict[str, Any]] | None = None
+    conditions: list[dict[str, Any]] | None = None
     texture: dict[str, Any] | None = None
     refinement: dict[str, Any] | None = None
     plan: dict[str, Any] | None = None

@@ -24,7 +24,7 @@ SIZES = (400, 800, 2160)  # pixels: a small window, half a screen, a 4K screen
 CLOSE = 10.0  # degrees: a quarter of the default views' field
 NEAR = 14.0  # degrees, of the pictures in which texture is measured: faces fill them, and cells are some pixels wide
 VIEWS = (0, 4, 9)  # test views: above, side, below
-SIDE = (4,)  # enough to find the worst seat
+SIDE = (4,)  # enough to find the worst condition
 PREVIEW_VIEWS = (0, 4, 9)  # test views of previews, and of the score without a report: above, side, below
 
 
@@ -67,10 +67,10 @@ def zoomed(camera: Camera, field_of_view: float) -> Camera:
 
 @dataclass(frozen=True)
 class ConditionView:
-    """What is to be seen from a seat in one view.
+    """Reference picture of one view under a viewing condition.
 
     Attributes:
-        size, field_of_view: of the seat, pixels and degrees.
+        size, field_of_view: of the condition, pixels and degrees.
         camera: of the view; ``blocks`` of it that are scored, None for all.
         reference: (h, w, 3) float32 of the blocks, or of the whole.
     """
@@ -82,7 +82,7 @@ class ConditionView:
     reference: np.ndarray
 
 
-def seat_pictures(
+def condition_pictures(
     places: Iterable[tuple[int, float]], views: Collection[int] = VIEWS, enough: int = ENOUGH
 ) -> list[tuple[tuple[int, float], Camera, Blocks | None]]:
     """Every place with the camera of each view from there, and the blocks of its picture that are scored."""
@@ -116,7 +116,7 @@ def condition_views(
     """
     from vvgt_cli.dvr import render_view
 
-    wanted = seat_pictures(places, views, enough)
+    wanted = condition_pictures(places, views, enough)
     for done, (place, camera, blocks) in enumerate(wanted, 1):
         image = render_view(scene, camera, settings, blocks)[..., :3]
         yield ConditionView(*place, camera, blocks, image if blocks is None else blocks.pick(image))
@@ -163,7 +163,7 @@ def near_cameras(size: int) -> list[Camera]:
     return [zoomed(cameras[i], NEAR) for i in VIEWS]
 
 
-def glance_cameras(size: int) -> list[Camera]:
+def texture_cameras(size: int) -> list[Camera]:
     """What a conversion measures texture in: the middle half of each edge of the near view from the side."""
     found = []
     for i in SIDE:

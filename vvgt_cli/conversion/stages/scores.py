@@ -1,4 +1,4 @@
-"""How near the result is: on the test views, and from the seats."""
+"""Scores of the result: on the test views, and under the viewing conditions."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from vvgt_cli.field.workload import Workload
 from vvgt_cli.score.viewing import (
     PREVIEW_VIEWS,
     SIDE,
+    condition_pictures,
     condition_views,
     from_above,
-    glance_cameras,
     score_conditions,
     score_texture,
-    seat_pictures,
+    texture_cameras,
 )
 from vvgt_cli.score.views import WHOLE, psnr_note, score_test_views, scored
 
 SCORE, SCORE_ALL = (3, 0, 0.03), (10, len(WHOLE), 0.1)  # views, whole ones of them, seconds beside per 400 x 400 px
 TEXTURE = 0.05  # seconds beside the reference per 400 x 400 px
-SEATS = 2, 0.15, 0.155  # check views, and seconds beside them: always, per 100,000 Gaussians
+CONDITIONS = 2, 0.15, 0.155  # check views, and seconds beside them: always, per 100,000 Gaussians
 
 
 @dataclass(frozen=True)
@@ -77,22 +77,22 @@ class TestViews(Stage):
 class ViewingConditions(Stage):
     """Every rule at the size made for and above, and texture on smooth areas; left out where time is up."""
 
-    name: ClassVar[str] = "seats"
+    name: ClassVar[str] = "conditions"
     scores: ClassVar[bool] = True
 
     def cost(self, case: Workload) -> Cost:
         """By pixels and Gaussians."""
         near = (case.size // 2) ** 2
-        beside = SEATS[1] + SEATS[2] * case.gaussians / 1e5 + TEXTURE * near / 400**2
-        return Cost(SEATS[0] * case.glance + case.judging(near) + case.pace * beside)
+        beside = CONDITIONS[1] + CONDITIONS[2] * case.gaussians / 1e5 + TEXTURE * near / 400**2
+        return Cost(CONDITIONS[0] * case.check_view_seconds + case.judging(near) + case.pace * beside)
 
     def views(self, fit: FitOptions) -> list[Picture]:
         """What is scored."""
         from vvgt_cli.dvr import RenderSettings
 
-        wanted = seat_pictures(from_above(fit.size), SIDE, FEW)
-        seats = [Picture(camera, RenderSettings(), blocks) for _, camera, blocks in wanted]
-        return [*seats, *(Picture(camera, RenderSettings()) for camera in glance_cameras(fit.size))]
+        wanted = condition_pictures(from_above(fit.size), SIDE, FEW)
+        conditions = [Picture(camera, RenderSettings(), blocks) for _, camera, blocks in wanted]
+        return [*conditions, *(Picture(camera, RenderSettings()) for camera in texture_cameras(fit.size))]
 
     def run(self, work: Work) -> None:
         """Score."""
@@ -105,8 +105,8 @@ class ViewingConditions(Stage):
         with run.stage(self.name) as stage:
             made, settings = work.made(), RenderSettings()
             seen = condition_views(work.field.views, from_above(fit.size), settings, views=SIDE, enough=FEW)
-            seats = score_conditions(made, seen)
-            run.report.seats = [asdict(seat) for seat in seats]
-            near, views = glance_cameras(fit.size), work.field.views
+            conditions = score_conditions(made, seen)
+            run.report.conditions = [asdict(condition) for condition in conditions]
+            near, views = texture_cameras(fit.size), work.field.views
             run.report.texture = asdict(score_texture(views, made, fit.size, fit.rule, settings, cameras=near))
-            stage.note = f"worst of {len(seats)}: {seats[0].name()}, {seats[0].psnr:.2f} dB"
+            stage.note = f"worst of {len(conditions)}: {conditions[0].name()}, {conditions[0].psnr:.2f} dB"

@@ -55,7 +55,7 @@ class CheckViews(Stage):
     def cost(self, case: Workload) -> Cost:
         """One of them is drawn whole, of which blocks are kept."""
         count = SET_VIEWS["check"]
-        return Cost(count * case.glance, (count * case.glanced + case.size**2) * VIEW_BYTES)
+        return Cost(count * case.check_view_seconds, (count * case.check_view_pixels + case.size**2) * VIEW_BYTES)
 
     def views(self, fit: FitOptions) -> list[Picture]:
         """They."""

@@ -61,8 +61,8 @@ def _clut(text: str, path: Path) -> dict[str, Any]:
         columns = dict(zip("RGBA", map(list, zip(*nodes, strict=True)), strict=True))
         return columns | {"I": places} | {key: float(found.get(key, 0)) for key in ("min", "max")}
     except (configparser.Error, KeyError, ValueError) as error:
-        said = " ".join(str(error).split())[:80]
-        raise DataError(f"{path}: {said}; expected numnodes, nodeintensity0=0, nodergba0=R|G|B|A, ...") from None
+        reason = " ".join(str(error).split())[:80]
+        raise DataError(f"{path}: {reason}; expected numnodes, nodeintensity0=0, nodergba0=R|G|B|A, ...") from None
 
 
 def matches(parsed: Any) -> bool:

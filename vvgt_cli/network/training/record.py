@@ -10,7 +10,7 @@ from typing import Any
 from vvgt_cli.files import atomic_write
 from vvgt_cli.progress import Console
 
-SAY_EVERY = 20.0  # seconds
+MESSAGE_SECONDS = 20.0  # seconds
 
 
 class Table:
@@ -48,15 +48,15 @@ class Recorder:
         self.metrics, self.held = Table(folder / "metrics.csv", step), Table(folder / "held.csv", step)
         self.board = _board(folder, step, console)
         self.console, self.first, self.steps = console, step, steps
-        self.began = self.said = time.monotonic()
+        self.began = self.reported = time.monotonic()
 
     def step(self, row: dict[str, Any]) -> None:
-        """Record a step; print a line with the remaining time every `SAY_EVERY` seconds."""
+        """Record a step; print a line with the remaining time every `MESSAGE_SECONDS` seconds."""
         self.metrics.add(row)
         self._plot("train", row)
         now, done = time.monotonic(), row["step"]
-        if now - self.said >= SAY_EVERY or done == self.steps:
-            self.said = now
+        if now - self.reported >= MESSAGE_SECONDS or done == self.steps:
+            self.reported = now
             left = (now - self.began) / max(done - self.first, 1) * (self.steps - done)
             self.console.say(
                 f"step {done} of {self.steps}: loss {row['loss']:.4f}, gain {row['gain']:+.3f} dB, "

@@ -34,7 +34,7 @@ def pair():
     return scene, initialise(scene, VbmOptions(60, 32)).gaussians
 
 
-def test_a_seat_close_up_is_the_same_place_with_a_narrower_field():
+def test_a_condition_close_up_is_the_same_place_with_a_narrower_field():
     camera = default_views("test", size=100)[4]
     near = zoomed(camera, 10.0)
     assert np.array_equal(near.position, camera.position)
@@ -44,17 +44,17 @@ def test_a_seat_close_up_is_the_same_place_with_a_narrower_field():
     assert zoomed(camera, 40.0).fy == pytest.approx(camera.fy)
 
 
-def test_seats_are_what_they_say_worst_first(pair):
+def test_conditions_are_what_they_say_worst_first(pair):
     scene, gaussians = pair
     rules, views = ("inria", "playcanvas"), (4, 9)
     found = score_conditions(gaussians, condition_views(scene, [(24, 40.0), (40, 10.0)], ONE_RAY, views=views), rules)
-    assert [seat.psnr for seat in found] == sorted(seat.psnr for seat in found)
+    assert [condition.psnr for condition in found] == sorted(condition.psnr for condition in found)
     assert len(found) == 4
-    for seat in found:
-        cameras = [zoomed(default_views("test", size=seat.size)[i], seat.field_of_view) for i in views]
-        pictures = [(render_view(scene, c, ONE_RAY), render(gaussians, c, seat.rule)) for c in cameras]
+    for condition in found:
+        cameras = [zoomed(default_views("test", size=condition.size)[i], condition.field_of_view) for i in views]
+        pictures = [(render_view(scene, c, ONE_RAY), render(gaussians, c, condition.rule)) for c in cameras]
         expected = np.mean([psnr(theirs[..., :3], np.clip(ours[..., :3], 0, 1)) for theirs, ours in pictures])
-        assert seat.psnr == pytest.approx(expected, abs=1e-6)
+        assert condition.psnr == pytest.approx(expected, abs=1e-6)
     assert ViewingCondition("inria", 400, 10.0, 30.0).name() == "inria 400 px close up"
     assert from_above(1080) == [(1080, 40), (2160, 40)]
     assert from_above(2160) == [(2160, 40), (4320, 40)]
@@ -62,7 +62,7 @@ def test_seats_are_what_they_say_worst_first(pair):
     assert viewing_conditions(1080) == [(400, 40), (800, 40), (1080, 40), (2160, 40), (1080, 10)]
 
 
-def test_texture_is_of_the_seats_views_from_near(pair):
+def test_texture_is_of_the_conditions_views_from_near(pair):
     _, gaussians = pair
     scene = scene_of(open_volume("example:blob:12"), Tent(width=0.45, top=0.9999))  # opaque inside
     ticks = []

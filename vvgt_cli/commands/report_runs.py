@@ -35,7 +35,14 @@ from vvgt_cli.refine import OptimizeOptions
 from vvgt_cli.score.checks import Views, judging_views
 from vvgt_cli.score.curves import short
 from vvgt_cli.score.record import ConversionReport, Run
-from vvgt_cli.score.viewing import SIDE, ConditionView, condition_views, from_above, score_conditions, seat_pictures
+from vvgt_cli.score.viewing import (
+    SIDE,
+    ConditionView,
+    condition_pictures,
+    condition_views,
+    from_above,
+    score_conditions,
+)
 from vvgt_cli.score.views import WHOLE, score_seen
 
 if TYPE_CHECKING:
@@ -49,7 +56,7 @@ NEIGHBOURS = 0.72  # mean distance to the three nearest of n random points, over
 
 
 @dataclass(frozen=True)
-class LadderOptions:
+class RunOptions:
     """Options of the runs.
 
     Attributes:
@@ -74,7 +81,7 @@ class LadderOptions:
 
 
 @dataclass(frozen=True)
-class Rung:
+class PlannedRun:
     """One run.
 
     Attributes:
@@ -93,28 +100,28 @@ class Rung:
     peer: Peer | None = None
 
 
-def rungs(options: LadderOptions) -> list[Rung]:
+def plan_runs(options: RunOptions) -> list[PlannedRun]:
     """List the runs: other trainers first, as they may fail; then ours from the cheapest on; then the baselines."""
     most, size, seed = options.max_gaussians, options.size, options.seed
     budgets = sorted({max(most // share, 1) for share in SHARES} | {most})
     found = [
-        Rung(f"closed form, K = {short(k)}", short(k), "closed form", FitOptions(k, size, seed=seed, steps=0))
+        PlannedRun(f"closed form, K = {short(k)}", short(k), "closed form", FitOptions(k, size, seed=seed, steps=0))
         for k in budgets
     ]
     if options.live:
-        found.append(Rung(f"live form, K = {short(most)}", "live", "live", FitOptions(most, size, seed=seed)))
+        found.append(PlannedRun(f"live form, K = {short(most)}", "live", "live", FitOptions(most, size, seed=seed)))
     if options.model:
         fit = FitOptions(most, size, seed=seed, steps=0, model=options.model)
-        found.append(Rung(f"network {Path(options.model).name}", "network", "network", fit))
+        found.append(PlannedRun(f"network {Path(options.model).name}", "network", "network", fit))
     for steps in sorted(set(options.steps)):
         fit = FitOptions(most, size, seed=seed, steps=steps)
-        found.append(Rung(f"{steps} steps", f"{steps} steps", "steps", fit))
+        found.append(PlannedRun(f"{steps} steps", f"{steps} steps", "steps", fit))
     most_steps = max(options.steps, default=0)
     longest = FitOptions(most, size, seed=seed, steps=most_steps)
     if most_steps:
         for name, start in (("3DGS", "points"), ("iVR-GS setting", "samples")):
-            found.append(Rung(f"{name}, {most_steps} steps", name, "baseline", longest, start))
-    return [Rung(peer.name, peer.name, "peer", longest, peer=peer) for peer in options.peers] + found
+            found.append(PlannedRun(f"{name}, {most_steps} steps", name, "baseline", longest, start))
+    return [PlannedRun(peer.name, peer.name, "peer", longest, peer=peer) for peer in options.peers] + found
 
 
 @dataclass(frozen=True)
@@ -137,7 +144,7 @@ class Reference:
     rays: int
     axes: np.ndarray
     shown: list[np.ndarray]
-    seats: list[ConditionView]
+    conditions: list[ConditionView]
 
     @classmethod
     def render(cls, volume: Field, size: int, console: Console) -> Reference:
@@ -146,7 +153,7 @@ class Reference:
 
         cameras, axes = default_views("test", size=size), volume.source.volume.axes
         blocks = [spread_blocks(size, size, i) for i in range(len(cameras))]
-        around = seat_pictures(from_above(size), SIDE)
+        around = condition_pictures(from_above(size), SIDE)
         volume.views.expect([Picture(camera, REFERENCE, _drawn(blocks, i)) for i, camera in enumerate(cameras)])
         volume.views.expect([Picture(camera, REFERENCE, part) for _, camera, part in around])
         images, bar = [], console.bar("reference")
@@ -155,9 +162,9 @@ class Reference:
             if bar:
                 bar(i + 1, len(cameras))
         shown = upright(images, cameras, axes, lambda camera: volume.views.view(camera, REFERENCE))
-        seats = list(condition_views(volume.views, from_above(size), REFERENCE, views=SIDE))
+        conditions = list(condition_views(volume.views, from_above(size), REFERENCE, views=SIDE))
         rays = max(rays for _, rays in REFERENCE.tiers)
-        return cls(cameras, blocks, images, REFERENCE.step, rays, axes, shown, seats)
+        return cls(cameras, blocks, images, REFERENCE.step, rays, axes, shown, conditions)
 
     def psnr_of(self, renderer: str, field: Field) -> float | None:
         """Return another renderer's mean PSNR on the views that are drawn whole, None if it cannot draw them."""
@@ -206,8 +213,8 @@ def upright(
     return [see(cameras[n]) if n in PICTURED else image for n, image in enumerate(images)]
 
 
-def run_rungs(
-    source: SourceRequest, options: LadderOptions, reference: Reference, console: Console
+def do_runs(
+    source: SourceRequest, options: RunOptions, reference: Reference, console: Console
 ) -> Iterator[tuple[dict[str, Any], list[np.ndarray]]]:
     """Yield each run (a dict, see `vvgt_cli.score.curves`) and its images of the reference's views.
 
@@ -219,44 +226,48 @@ def run_rungs(
 
     with tempfile.TemporaryDirectory() as folder:
         views = peer_views(source, options, Path(folder)) if options.peers else None
-        for rung in rungs(options):
-            report, gaussians = _run(source, rung, reference.axes, options.blocks, views)
+        for planned in plan_runs(options):
+            report, gaussians = _run(source, planned, reference.axes, options.blocks, views)
             if report.refinement and report.refinement["reason"] == "interrupted":
                 raise KeyboardInterrupt
             scores, images = reference.score(gaussians)
-            seats = score_conditions(gaussians, reference.seats)
-            report.scores, report.seats = asdict(scores), [asdict(seat) for seat in seats]
-            count = views.count if views is not None and rung.peer is not None else _views_of(report, rung.fit)
-            run = {"name": rung.name, "label": rung.label, "kind": rung.kind, "views": count}
+            conditions = score_conditions(gaussians, reference.conditions)
+            report.scores, report.conditions = asdict(scores), [asdict(condition) for condition in conditions]
+            count = views.count if views is not None and planned.peer is not None else _views_of(report, planned.fit)
+            run = {"name": planned.name, "label": planned.label, "kind": planned.kind, "views": count}
             run |= asdict(report)
             yield run, upright(images, reference.cameras, reference.axes, partial(render, gaussians))
 
 
-def peer_views(source: SourceRequest, options: LadderOptions, folder: Path) -> PeerViews:
+def peer_views(source: SourceRequest, options: RunOptions, folder: Path) -> PeerViews:
     """Render the views for other trainers: as many as our longest run has, at the screen's size."""
     count = views_of(max(options.steps, default=0), small=False)
     return PeerViews.render(source, folder / "views", count, options.size, options.blocks)
 
 
-def warm_up(source: SourceRequest, options: LadderOptions) -> None:
+def warm_up(source: SourceRequest, options: RunOptions) -> None:
     """Run every kind of run once at a tiny size, so that kernels are compiled or loaded before any clock starts."""
-    few = LadderOptions(100, 64, (2,) if options.steps else (), options.model, options.seed, live=options.live)
-    for rung in rungs(few)[-5:]:
-        _run(source, rung, np.eye(3), options.blocks)
+    few = RunOptions(100, 64, (2,) if options.steps else (), options.model, options.seed, live=options.live)
+    for planned in plan_runs(few)[-5:]:
+        _run(source, planned, np.eye(3), options.blocks)
 
 
 def _run(
-    source: SourceRequest, rung: Rung, axes: np.ndarray, blocks: BlockOptions | None, views: PeerViews | None = None
+    source: SourceRequest,
+    planned: PlannedRun,
+    axes: np.ndarray,
+    blocks: BlockOptions | None,
+    views: PeerViews | None = None,
 ) -> tuple[ConversionReport, Gaussians]:
     """Do one run; return its report and its Gaussians in the box frame (``axes`` as in `Reference`)."""
-    if rung.kind == "baseline":
-        return _baseline(source, rung, blocks)
-    if rung.peer is not None and views is not None:
-        report, gaussians = train(rung.peer, views)
+    if planned.kind == "baseline":
+        return _baseline(source, planned, blocks)
+    if planned.peer is not None and views is not None:
+        report, gaussians = train(planned.peer, views)
         return report, transform(gaussians, np.linalg.inv(axes))
     with tempfile.TemporaryDirectory() as folder:
-        path, live = str(Path(folder) / "rung.ply"), rung.kind == "live"
-        request = ConvertRequest(source, path, rung.fit, up="none", blocks=blocks, live=live)
+        path, live = str(Path(folder) / "run.ply"), planned.kind == "live"
+        request = ConvertRequest(source, path, planned.fit, up="none", blocks=blocks, live=live)
         report = convert(request, Console(quiet=True))
         return report, transform(read_ply(path)[0], np.linalg.inv(axes))
 
@@ -289,15 +300,17 @@ def _finish(run: Run, gaussians: Gaussians) -> tuple[ConversionReport, Gaussians
     return run.finish(), stored
 
 
-def _baseline(source: SourceRequest, rung: Rung, blocks: BlockOptions | None) -> tuple[ConversionReport, Gaussians]:
+def _baseline(
+    source: SourceRequest, planned: PlannedRun, blocks: BlockOptions | None
+) -> tuple[ConversionReport, Gaussians]:
     """Run 3DGS (Kerbl et al. 2023): its loss, rates and density control, from random points or volume samples."""
     from vvgt_cli.closed_form import VbmOptions
 
-    run, fit = Run(Console(quiet=True), ConversionReport("report")), rung.fit
+    run, fit = Run(Console(quiet=True), ConversionReport("report")), planned.fit
     count = max(fit.max_gaussians // STARTS, 1)
     with opened(run, ConvertRequest(source, fit=fit, blocks=blocks), INIT) as volume:
         with run.stage("samples"):
-            if rung.start == "points":
+            if planned.start == "points":
                 half = np.array(volume.source.volume.unit_frame().half)
                 start = random_points(half, count, fit.seed)
             else:
