@@ -13,7 +13,7 @@ from tests.test_view_volume import controller, send  # noqa: F401
 from vvgt_cli.cli.main import run
 from vvgt_cli.commands.converter import Converted, Message, Scored
 from vvgt_cli.commands.converter_process import MessageConsole
-from vvgt_cli.commands.converter_process import Volume as ConvertedVolume
+from vvgt_cli.commands.converter_process import LoadedVolume
 from vvgt_cli.commands.live_site import Cloud, PageController, parse_labels
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.gaussians.formats.page_file import read_html
@@ -65,9 +65,9 @@ def test_a_volume_is_converted_for_the_labels_of_the_page(tmp_path: Path) -> Non
     source = SourceRequest(str(tmp_path / "eight.npy"), labels="auto")
     told: list[Message] = []
     console = MessageConsole(told.append)
-    volume = ConvertedVolume(source, "eight", console)
-    volume.live(console)
-    volume.under(parse_labels(rows({2: 1.0})), console)
+    volume = LoadedVolume(source, "eight", console)
+    volume.send_live(console)
+    volume.convert(parse_labels(rows({2: 1.0})), console)
     _, made, scored = [one for one in told if isinstance(one, Converted | Scored)]
     assert isinstance(made, Converted)
     gaussians = Cloud.of(made.ply, "x").gaussians

@@ -33,13 +33,16 @@ def test_what_is_never_live_is_converted(monkeypatch: pytest.MonkeyPatch) -> Non
         unscored("conversion")
         return SimpleNamespace(scores={"psnr": 40.0})
 
-    monkeypatch.setattr(converter_process, "without_files", conversion)
+    monkeypatch.setattr(converter_process, "convert_in_memory", conversion)
     monkeypatch.setattr(converter_process, "_file", lambda found: b"scored")
-    monkeypatch.setattr(converter_process.Volume, "_with_page", lambda volume, found: Converted(b"", {}))
-    told: list[Message] = []
-    volume = converter_process.Volume.__new__(converter_process.Volume)
+    monkeypatch.setattr(converter_process.LoadedVolume, "_with_page", lambda volume, found: Converted(b"", {}))
+    messages: list[Message] = []
+    volume = converter_process.LoadedVolume.__new__(converter_process.LoadedVolume)
     volume.source, volume.last = request, None
-    volume.live(converter_process.MessageConsole(told.append))
-    assert [one for one in told if isinstance(one, Converted | Scored)] == [Converted(b"", {}), Scored(b"scored", 40.0)]
+    volume.send_live(converter_process.MessageConsole(messages.append))
+    assert [one for one in messages if isinstance(one, Converted | Scored)] == [
+        Converted(b"", {}),
+        Scored(b"scored", 40.0),
+    ]
     assert asked == [False]
-    assert ConsoleLine(f"converted without a live form: {why}") in told
+    assert ConsoleLine(f"converted without a live form: {why}") in messages

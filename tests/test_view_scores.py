@@ -17,7 +17,7 @@ from vvgt_cli.errors import DataError
 from vvgt_cli.field.source import SourceRequest
 from vvgt_cli.progress import Console
 
-TOLD = {"number": 1, "state": "done", "said": "converted", "file": "1.ply", "scored": False}
+DONE = {"number": 1, "state": "done", "said": "converted", "file": "1.ply", "scored": False}
 
 
 def test_a_page_shows_what_is_converted_before_its_scores(controller: tuple[str, PageController]) -> None:  # noqa: F811
@@ -27,10 +27,10 @@ def test_a_page_shows_what_is_converted_before_its_scores(controller: tuple[str,
     assert state_of(url) == {"number": 1, "state": "working", "said": "refining 33 %"}
     of.on_message(1, Converted(b"unscored", {"ply": b"shown"}))
     of.on_message(1, Progress("test views 33 %"))
-    assert state_of(url) == TOLD
+    assert state_of(url) == DONE
     assert ask(url, urlsplit(url).path + "1.ply")[1] == b"shown"
     of.on_message(1, Scored(b"certified", 41.23))
-    assert state_of(url) == {**TOLD, "said": "converted, 41.2 dB", "scored": True}
+    assert state_of(url) == {**DONE, "said": "converted, 41.2 dB", "scored": True}
     assert ask(url, urlsplit(url).path + "1.ply")[1] == b"shown"
     assert of.better == b"certified"
 
@@ -44,7 +44,7 @@ def test_what_is_converted_stays_without_scores(
     send(url, "function", FUNCTION)
     of.on_message(1, Converted(b"unscored", {"ply": b"shown"}))
     of.on_message(1, Failed(DataError("no memory")))
-    assert state_of(url) == {**TOLD, "said": "converted, not scored: no memory", "scored": True}
+    assert state_of(url) == {**DONE, "said": "converted, not scored: no memory", "scored": True}
     assert of.better == b"unscored"
     assert "not scored: no memory" in capsys.readouterr().err
 
@@ -60,17 +60,17 @@ def test_the_console_hears_that_what_has_no_live_form_is_not_scored(capsys: pyte
 
 
 def test_the_end_of_a_process_that_scores_is_told() -> None:
-    heard: list[Message] = []
+    messages: list[Message] = []
 
     def hear(number: int, message: Message) -> None:
-        heard.append(message)
+        messages.append(message)
         if isinstance(message, Converted):
             assert converter.process is not None
             os.kill(converter.process, signal.SIGKILL)
 
     with Converter(SourceRequest("example:blob:12", tf="viridis"), "x", hear) as converter:
         converter.submit(parse_function(FUNCTION))
-        until(lambda: any(isinstance(one, Converted | Failed) for one in heard))
-        until(lambda: isinstance(heard[-1], Failed), AT_ONCE)
-        assert any(isinstance(one, Converted) for one in heard)
-        assert not any(isinstance(one, Scored) for one in heard)
+        until(lambda: any(isinstance(one, Converted | Failed) for one in messages))
+        until(lambda: isinstance(messages[-1], Failed), AT_ONCE)
+        assert any(isinstance(one, Converted) for one in messages)
+        assert not any(isinstance(one, Scored) for one in messages)

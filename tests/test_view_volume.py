@@ -200,7 +200,7 @@ def controller(tmp_path: Path) -> Iterator[tuple[str, PageController]]:
     """The site of a live file, which says that it converts, without a process."""
 
     class Still(Converter):
-        def ask(self, job: Any) -> int:
+        def submit(self, job: Any) -> int:
             self._number += 1
             return self._number
 
@@ -217,9 +217,9 @@ def controller(tmp_path: Path) -> Iterator[tuple[str, PageController]]:
 @pytest.mark.parametrize(
     ("sent", "said"),
     [
-        (b"{", "no JSON"),
-        (b"\xff", "no JSON"),
-        (b"[" * 60000, "no JSON"),
+        (b"{", "not JSON"),
+        (b"\xff", "not JSON"),
+        (b"[" * 60000, "not JSON"),
         (b'{"points": NaN}', "NaN is no number"),
         ([], "a list of at most"),
         ({}, "a list of at most"),
@@ -271,7 +271,7 @@ def test_what_cannot_be_saved_is_refused(controller: tuple[str, PageController],
     assert send(controller[0], "save", sent)[0] == 400
 
 
-def test_the_page_hears_why_a_conversion_failed(controller: tuple[str, PageController]) -> None:
+def test_the_page_says_why_a_conversion_failed(controller: tuple[str, PageController]) -> None:
     url, of = controller
     send(url, "function", FUNCTION)
     of.on_message(1, Failed(DataError("mine: nothing is visible")))
@@ -343,7 +343,7 @@ def test_a_live_file_is_shown_live_and_an_ordinary_one_as_it_is(tmp_path: Path) 
         assert "live" not in scene_of(url)
 
 
-def test_a_page_that_waits_hears_how_far_it_is_and_why_nothing_comes(tmp_path: Path) -> None:
+def test_a_waiting_page_shows_progress_and_the_reason_of_a_failure(tmp_path: Path) -> None:
     site = Site({}, print)
     controller = PageController(site.resources, site.posts, "x", Console(quiet=True))
     with (
